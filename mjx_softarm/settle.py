@@ -1,0 +1,144 @@
+"""The quasi-static arm: spring references or pressures -> equilibrium under the sensor-space law.
+
+The law of `mjx_softarm.control` has integral action, so at rest each chamber either holds its spring at
+the reference or sits at a pressure limit. With V the potential of `mjx_softarm.statics`, rest is
+
+    grad V(q; p) = 0,    s_t(q) = reference_t  or  p_t = limit   for every chamber t,
+
+a nonlinear complementarity problem in (q, p), solved by Newton's method on the active set: the chambers
+whose p + c (reference - s) leaves the limits are held there, the others track, and one linear
+system gives the step in q and p together.
+
+Source: primal-dual active set as semismooth Newton, Hintermueller, Ito, Kunisch, SIAM J. Optim. 13 (2002).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from mjx_softarm.kinematics import DOFS_PER_LINK, Frames
+from mjx_softarm.statics import ArmParams, statics
+
+MAX_ITERATIONS = 12
+ACTIVE_SET_GAIN_KPA_PER_M = 1000.0
+MAX_STEP = 0.5  # largest entry of a Newton step [m, rad]
+SMALL_STEP = 3e-4  # [m, rad]; the next error is of its square
+RESIDUAL_TOLERANCE = 2e-3  # [N, N m], against stiffnesses of 2 N m/rad and more
+TRACKING_TOLERANCE_M = 1e-4
+
+
+class Settled(NamedTuple):
+    """An arm at rest, or the best that was found."""
+
+    q: Array  # (nv,) joint coordinates [m, rad, rad]
+    pressure_kpa: Array  # (n_chambers,)
+    spring_m: Array  # (n_chambers,) spring lengths
+    tip_position_m: Array  # (3,)
+    tip_rotation: Array  # (3, 3)
+    at_limit: Array  # (n_chambers,) bool, held at a pressure limit
+    residual: Array  # () largest entry of grad V [N, N m]
+    tracking_error_m: Array  # () largest spring error of a chamber that is not at a limit
+    settled: Array  # () bool, both below tolerance and everything finite
+    iterations: Array  # () int
+
+
+class _Iterate(NamedTuple):
+    q: Array
+    pressure: Array
+    at_limit: Array
+    moving: Array
+    iteration: Array
+
+
+def settle(kinematics: Callable[[Array], Frames], params: ArmParams, reference_m: Array) -> Settled:
+    """Equilibrium under the sensor-space law, started from the straight arm.
+
+    Args:
+        kinematics: joint coordinates (nv,) -> Frames, of either engine.
+        params: numbers of the arm.
+        reference_m (n_chambers,): spring lengths that the law tracks.
+    """
+    dtype = params.link_length_m.dtype
+    n_links = params.link_mass_kg.shape[0]
+    start = _Iterate(
+        q=jnp.zeros(n_links * DOFS_PER_LINK, dtype),
+        pressure=jnp.clip(jnp.zeros_like(params.area), params.pressure_min_kpa, params.pressure_max_kpa),
+        at_limit=jnp.zeros(params.area.shape, bool),
+        moving=jnp.array(True),
+        iteration=jnp.array(0),
+    )
+    end = jax.lax.while_loop(
+        lambda it: it.moving & (it.iteration < MAX_ITERATIONS),
+        lambda it: _newton_step(it, kinematics, params, reference_m),
+        start,
+    )
+    return _report(end, kinematics, params, reference_m)
+
+
+def settle_pressures(kinematics: Callable[[Array], Frames], params: ArmParams, pressure_kpa: Array) -> Settled:
+    """Equilibrium at given pressures (n_chambers,), clipped to the arm's limits: every chamber at its limit."""
+    pressure = jnp.clip(pressure_kpa, params.pressure_min_kpa, params.pressure_max_kpa)
+    pinned = params._replace(pressure_min_kpa=pressure, pressure_max_kpa=pressure)
+    return settle(kinematics, pinned, params.spring_rest_m)
+
+
+def _active_set(pressure: Array, error_m: Array, params: ArmParams) -> tuple[Array, Array]:
+    """Which chambers sit at a limit (n,), and the limit they sit at [kPa]."""
+    trial = pressure + ACTIVE_SET_GAIN_KPA_PER_M * error_m
+    limit = jnp.clip(trial, params.pressure_min_kpa, params.pressure_max_kpa)
+    return trial != limit, limit
+
+
+def _newton_step(it: _Iterate, kinematics, params: ArmParams, reference_m: Array) -> _Iterate:
+    now = statics(kinematics(it.q), it.q, it.pressure, params)
+    error = reference_m - now.springs.length
+    at_limit, limit = _active_set(it.pressure, error, params)
+    push = (now.chambers.jacobian * now.area[:, None]).T  # (nv, n) force per kPa
+    factor = jax.scipy.linalg.cho_factor(now.hessian, lower=True)
+    solved = jax.scipy.linalg.cho_solve(factor, jnp.column_stack([now.gradient, push]))
+    fall, gain = solved[:, 0], solved[:, 1:]  # dq = gain dp - fall
+    track = now.springs.jacobian @ gain  # (n, n) spring lengths per kPa
+    rows = jnp.where(at_limit[:, None], jnp.eye(track.shape[0], dtype=track.dtype), track)
+    wanted = jnp.where(at_limit, limit - it.pressure, error + now.springs.jacobian @ fall)
+    dp = jnp.linalg.solve(rows, wanted)
+    dq = gain @ dp - fall
+    largest = jnp.max(jnp.abs(dq))
+    scale = jnp.minimum(1.0, MAX_STEP / largest)
+    same = jnp.all(at_limit == it.at_limit)
+    return _Iterate(
+        q=it.q + scale * dq,
+        pressure=it.pressure + scale * dp,
+        at_limit=at_limit,
+        moving=~(same & (largest < SMALL_STEP)),
+        iteration=it.iteration + 1,
+    )
+
+
+def _report(it: _Iterate, kinematics, params: ArmParams, reference_m: Array) -> Settled:
+    pressure = jnp.clip(it.pressure, params.pressure_min_kpa, params.pressure_max_kpa)
+    frames = kinematics(it.q)
+    now = statics(frames, it.q, pressure, params)
+    error = reference_m - now.springs.length
+    at_limit = (pressure <= params.pressure_min_kpa) | (pressure >= params.pressure_max_kpa)
+    residual = jnp.max(jnp.abs(now.gradient))
+    outward = jnp.where(pressure >= params.pressure_max_kpa, error, -error)
+    pinned = params.pressure_min_kpa == params.pressure_max_kpa
+    off = jnp.where(pinned, 0.0, jnp.where(at_limit, jnp.maximum(-outward, 0.0), jnp.abs(error)))
+    tracking = jnp.max(off)
+    return Settled(
+        q=it.q,
+        pressure_kpa=pressure,
+        spring_m=now.springs.length,
+        tip_position_m=frames.plate_position[-1],
+        tip_rotation=frames.plate_rotation[-1],
+        at_limit=at_limit,
+        residual=residual,
+        tracking_error_m=tracking,
+        settled=(residual < RESIDUAL_TOLERANCE) & (tracking < TRACKING_TOLERANCE_M),
+        iterations=it.iteration,
+    )

@@ -1,0 +1,303 @@
+"""The arm's specification: every physical number once, with its unit, read from TOML.
+
+An `ArmSpec` is a tree of frozen dataclasses. The numbers live in a TOML file (the packaged
+`arms/paper.toml` is the arm of the paper and says where each number comes from); this module
+says which fields exist, what they mean and which values are allowed.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import tomllib
+from dataclasses import dataclass, field, fields
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import tomli_w
+
+N_CHAMBERS_PER_SECTION = 3
+
+
+class SpecError(ValueError):
+    """A specification that cannot be used; the message names file, field, value and what was expected."""
+
+
+@dataclass(frozen=True)
+class Rule:
+    """What a field accepts: a kind of number, its range, and whether one per chamber is allowed."""
+
+    kind: type = float
+    low: float = -math.inf
+    high: float = math.inf
+    low_open: bool = False
+    per_chamber: bool = False
+
+    @property
+    def text(self) -> str:
+        noun = {int: "a whole number", float: "a number", str: "a text"}[self.kind]
+        low = "" if self.low == -math.inf else f" {'>' if self.low_open else '>='} {self.low:g}"
+        high = "" if self.high == math.inf else f" and <= {self.high:g}" if low else f" <= {self.high:g}"
+        return noun + low + high + (", or a list with one per chamber" if self.per_chamber else "")
+
+    def accepts(self, value: Any) -> bool:
+        if self.kind is str:
+            return isinstance(value, str)
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            return False
+        if self.kind is int and not isinstance(value, int):
+            return False
+        above = value > self.low if self.low_open else value >= self.low
+        return math.isfinite(value) and above and value <= self.high
+
+
+def _positive(per_chamber: bool = False, high: float = math.inf) -> Any:
+    return field(metadata={"rule": Rule(low=0.0, low_open=True, per_chamber=per_chamber, high=high)})
+
+
+def _not_negative(per_chamber: bool = False) -> Any:
+    return field(metadata={"rule": Rule(low=0.0, per_chamber=per_chamber)})
+
+
+def _any(per_chamber: bool = False, low: float = -math.inf, high: float = math.inf) -> Any:
+    return field(metadata={"rule": Rule(low=low, high=high, per_chamber=per_chamber)})
+
+
+def _count() -> Any:
+    return field(metadata={"rule": Rule(kind=int, low=1)})
+
+
+PerChamber = float | tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Structure:
+    """Counts; they fix array shapes, so a new value compiles anew."""
+
+    n_sections: int = _count()
+    links_per_section: int = _count()
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Lengths of the unloaded arm at rest."""
+
+    section_length_m: float = _positive()
+    chamber_radius_m: float = _positive()
+    spring_radius_m: float = _positive()
+    first_chamber_deg: float = _any(low=-360.0, high=360.0)
+    chamber_diameter_m: float = _positive()
+
+
+@dataclass(frozen=True)
+class Mass:
+    """Masses; the arm's own is spread evenly over its links."""
+
+    arm_kg: float = _positive()
+    gripper_kg: float = _not_negative()
+    gripper_length_m: float = _positive()
+    payload_kg: float = _not_negative()
+
+
+@dataclass(frozen=True)
+class Chambers:
+    """Bellows: force = pressure * (area_m2 + area_slope_m * (length - section length))."""
+
+    area_m2: PerChamber = _positive(per_chamber=True)
+    area_slope_m: PerChamber = _any(per_chamber=True)
+    stiffness_n_per_m: PerChamber = _positive(per_chamber=True)
+    damping_ns_per_m: float = _not_negative()
+    length_offset_m: PerChamber = _any(per_chamber=True, low=-0.1, high=0.1)
+    pressure_min_kpa: float = _any(low=-101.325)
+    pressure_max_kpa: float = _any(low=-101.325)
+
+
+@dataclass(frozen=True)
+class Backbone:
+    """Stiffness and damping of one whole section besides its chambers and springs."""
+
+    axial_stiffness_n_per_m: float = _positive()
+    bending_stiffness_nm_per_rad: float = _positive()
+    axial_damping_ns_per_m: float = _not_negative()
+    bending_damping_nms_per_rad: float = _not_negative()
+
+
+@dataclass(frozen=True)
+class Springs:
+    """The inductive springs and the range of lengths that may be commanded."""
+
+    stiffness_n_per_m: float = _not_negative()
+    damping_ns_per_m: float = _not_negative()
+    rest_length_m: float = _positive()
+    length_min_m: float = _positive()
+    length_max_m: float = _positive()
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """Resonant circuit and coil of one spring; see `mjx_softarm.sensors`."""
+
+    capacitance_f: float = _positive()
+    compensation_h: float = _any()
+    turns: float = _positive()
+    coil_radius_m: float = _positive()
+    beta: PerChamber = _positive(per_chamber=True)
+    delta_m: PerChamber = _any(per_chamber=True)
+    frequency_min_hz: float = _positive()
+    frequency_max_hz: float = _positive()
+
+
+@dataclass(frozen=True)
+class Control:
+    """Gains of the sensor-space law; see `mjx_softarm.control`."""
+
+    rate_hz: float = _positive()
+    kp_kpa_per_m: float = _not_negative()
+    ki_kpa_per_ms: float = _positive()
+
+
+@dataclass(frozen=True)
+class ArmSpec:
+    """A pneumatic soft arm: sections in series, three chambers and three springs in each.
+
+    Build one with `ArmSpec.default()`, `ArmSpec.from_toml(path)` or `spec.replace(...)`; each of
+    them validates. A field marked per chamber holds one number or a tuple of `n_chambers`.
+    """
+
+    name: str
+    structure: Structure
+    geometry: Geometry
+    mass: Mass
+    chambers: Chambers
+    backbone: Backbone
+    springs: Springs
+    sensor: Sensor
+    control: Control
+
+    @property
+    def n_chambers(self) -> int:
+        return N_CHAMBERS_PER_SECTION * self.structure.n_sections
+
+    @property
+    def n_links(self) -> int:
+        return self.structure.n_sections * self.structure.links_per_section
+
+    @property
+    def link_length_m(self) -> float:
+        return self.geometry.section_length_m / self.structure.links_per_section
+
+    def per_chamber(self, value: PerChamber) -> tuple[float, ...]:
+        """One number per chamber, whichever way the field was written."""
+        return tuple(value) if isinstance(value, tuple) else (float(value),) * self.n_chambers
+
+    @classmethod
+    def default(cls) -> ArmSpec:
+        """The paper's arm."""
+        text = resources.files("mjx_softarm").joinpath("arms/paper.toml").read_text("utf-8")
+        return cls.from_dict(tomllib.loads(text), "arms/paper.toml")
+
+    @classmethod
+    def from_toml(cls, path: str | Path) -> ArmSpec:
+        """Read and validate a TOML file.
+
+        Raises:
+            SpecError: the file cannot be read or parsed, or a field is missing, unknown or out of range.
+        """
+        try:
+            data = tomllib.loads(Path(path).read_text("utf-8"))
+        except OSError as error:
+            raise SpecError(f"{path}: cannot be read: {error.strerror}") from error
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise SpecError(f"{path}: not a TOML file: {error}") from error
+        return cls.from_dict(data, str(path))
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any], source: str = "spec") -> ArmSpec:
+        """Build from nested dictionaries, as `to_dict` gives them.
+
+        Raises:
+            SpecError: a field is missing, unknown, of the wrong type or out of range.
+        """
+        parts = _read_fields(cls, data, source, "")
+        spec = cls(**parts)
+        spec.validate(source)
+        return spec
+
+    def to_dict(self) -> dict[str, Any]:
+        return dataclasses.asdict(self)
+
+    def to_toml(self, path: str | Path) -> None:
+        """Write the specification; `from_toml` of it gives an equal one."""
+        Path(path).write_text(tomli_w.dumps(self.to_dict()), "utf-8")
+
+    def replace(self, **groups: dict[str, Any] | str) -> ArmSpec:
+        """A new, validated specification with some fields changed.
+
+        Example: `spec.replace(mass={"payload_kg": 0.2}, structure={"links_per_section": 6})`.
+        """
+        data = self.to_dict()
+        for group, values in groups.items():
+            if group not in data:
+                raise SpecError(f"replace: unknown group {group!r}, expected one of {', '.join(data)}")
+            data[group] = {**data[group], **values} if isinstance(values, dict) else values
+        return self.from_dict(data, "replace")
+
+    def validate(self, source: str = "spec") -> None:
+        """Check what one field alone cannot tell.
+
+        Raises:
+            SpecError: two fields contradict each other.
+        """
+        for group in fields(self):
+            part = getattr(self, group.name)
+            if not dataclasses.is_dataclass(part):
+                continue
+            for item in fields(part):
+                value = getattr(part, item.name)
+                if isinstance(value, tuple) and len(value) != self.n_chambers:
+                    raise SpecError(
+                        f"{source}: {group.name}.{item.name}: got {len(value)} numbers, "
+                        f"expected one, or one for each of the {self.n_chambers} chambers"
+                    )
+        _ordered(source, "chambers", self.chambers, "pressure_min_kpa", "pressure_max_kpa")
+        _ordered(source, "springs", self.springs, "length_min_m", "length_max_m")
+        _ordered(source, "sensor", self.sensor, "frequency_min_hz", "frequency_max_hz")
+
+
+def _ordered(source: str, group: str, part: Any, low: str, high: str) -> None:
+    low_value, high_value = getattr(part, low), getattr(part, high)
+    if not low_value < high_value:
+        raise SpecError(f"{source}: {group}.{low}: got {low_value!r}, expected less than {high} ({high_value!r})")
+
+
+def _read_fields(cls: type, data: Any, source: str, prefix: str) -> dict[str, Any]:
+    """The keyword arguments of `cls` from a table, each checked against its rule."""
+    if not isinstance(data, dict):
+        raise SpecError(f"{source}: {prefix.rstrip('.')}: got {data!r}, expected a table")
+    known = [item.name for item in fields(cls)]
+    for name in data:
+        if name not in known:
+            raise SpecError(f"{source}: {prefix}{name}: unknown field, expected one of {', '.join(known)}")
+    groups = {item.name: globals()[item.type] for item in fields(cls) if item.type in globals() and not prefix}
+    values: dict[str, Any] = {}
+    for item in fields(cls):
+        path = prefix + item.name
+        if item.name not in data:
+            raise SpecError(f"{source}: {path}: missing")
+        value = data[item.name]
+        group = groups.get(item.name)
+        if group is not None and dataclasses.is_dataclass(group):
+            values[item.name] = group(**_read_fields(group, value, source, path + "."))
+        else:
+            values[item.name] = _read_value(item.metadata.get("rule", Rule(kind=str)), value, source, path)
+    return values
+
+
+def _read_value(rule: Rule, value: Any, source: str, path: str) -> Any:
+    many = rule.per_chamber and isinstance(value, (list, tuple))
+    if not all(map(rule.accepts, value)) if many else not rule.accepts(value):
+        raise SpecError(f"{source}: {path}: got {value!r}, expected {rule.text}")
+    if many:
+        return tuple(map(float, value))
+    return rule.kind(value)

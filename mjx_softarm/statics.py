@@ -1,0 +1,196 @@
+"""Potential energy of the arm in closed form: its gradient, its Hessian, its tendon lengths.
+
+At given pressures p the arm is conservative. With l the chamber lengths and s the spring lengths,
+
+    V(q) = gravity + backbone + sum k (l - l0)^2 / 2 + sum k_s (s - s0)^2 / 2 - sum p W(l),
+
+where W' = area_m2 + area_slope_m (l - l_rest) is a chamber's effective area, so that p W is the work of
+its air. A tendon runs from ring to ring, so the piece of it inside a link depends on that link's
+three joints alone; only gravity couples distant links.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.scipy.linalg import block_diag
+
+from mjx_softarm.kinematics import DOFS_PER_LINK, Frames
+from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
+
+GRAVITY_M_S2 = 9.81
+
+
+class ArmParams(NamedTuple):
+    """The numbers of an arm as arrays, so that a new value needs no new compilation.
+
+    Chambers and springs are ordered section by section, counter-clockwise within a section.
+    """
+
+    link_length_m: Array  # ()
+    chamber_site_m: Array  # (n_chambers, 2) holes of the chambers in their rings, x and y
+    spring_site_m: Array  # (n_chambers, 2)
+    link_mass_kg: Array  # (n_links,) at the hinges' anchor
+    tool_mass_kg: Array  # (2,) gripper and payload, below the last plate
+    tool_offset_m: Array  # (2,)
+    joint_stiffness: Array  # (3 * n_links,) [N/m, N m/rad, N m/rad]
+    chamber_stiffness: Array  # (n_chambers,) [N/m]
+    chamber_rest_m: Array  # (n_chambers,)
+    area: Array  # (n_chambers,) [N/kPa]
+    area_slope: Array  # (n_chambers,) [N/kPa/m]
+    spring_stiffness: Array  # (n_chambers,) [N/m]
+    spring_rest_m: Array  # (n_chambers,)
+    pressure_min_kpa: Array  # (n_chambers,)
+    pressure_max_kpa: Array  # (n_chambers,)
+
+    @property
+    def section_length_m(self) -> Array:
+        return self.link_length_m * (self.link_mass_kg.shape[0] // self.n_sections)
+
+    @property
+    def n_sections(self) -> int:
+        return self.area.shape[0] // N_CHAMBERS_PER_SECTION
+
+    @classmethod
+    def from_spec(cls, spec: ArmSpec, dtype: np.typing.DTypeLike = np.float32) -> ArmParams:
+        """Numbers of `spec`, in SI units but for the pressures [kPa]."""
+        n, per_section = spec.n_chambers, spec.structure.links_per_section
+        first = np.radians(spec.geometry.first_chamber_deg)
+        angle = first + 2 * np.pi * np.arange(n) / N_CHAMBERS_PER_SECTION
+        on_circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        axial = spec.backbone.axial_stiffness_n_per_m * per_section
+        bending = spec.backbone.bending_stiffness_nm_per_rad * per_section
+        values = cls(
+            link_length_m=spec.link_length_m,
+            chamber_site_m=spec.geometry.chamber_radius_m * on_circle,
+            spring_site_m=spec.geometry.spring_radius_m * on_circle,
+            link_mass_kg=np.full(spec.n_links, spec.mass.arm_kg / spec.n_links),
+            tool_mass_kg=[spec.mass.gripper_kg, spec.mass.payload_kg],
+            tool_offset_m=[spec.mass.gripper_length_m / 2, spec.mass.gripper_length_m],
+            joint_stiffness=np.tile([axial, bending, bending], spec.n_links),
+            chamber_stiffness=spec.per_chamber(spec.chambers.stiffness_n_per_m),
+            chamber_rest_m=spec.geometry.section_length_m
+            + np.array(spec.per_chamber(spec.chambers.length_offset_m)),
+            area=1e3 * np.array(spec.per_chamber(spec.chambers.area_m2)),
+            area_slope=1e3 * np.array(spec.per_chamber(spec.chambers.area_slope_m)),
+            spring_stiffness=np.full(n, spec.springs.stiffness_n_per_m),
+            spring_rest_m=np.full(n, spec.springs.rest_length_m),
+            pressure_min_kpa=np.full(n, spec.chambers.pressure_min_kpa),
+            pressure_max_kpa=np.full(n, spec.chambers.pressure_max_kpa),
+        )
+        return cls(*(np.asarray(value, dtype) for value in values))
+
+
+class Tendons(NamedTuple):
+    """Lengths of a set of tendons with their first and second derivatives."""
+
+    length: Array  # (n_chambers,) [m]
+    jacobian: Array  # (n_chambers, nv)
+    link_hessian: Array  # (n_links, 3 tendons, 3 dofs, 3 dofs)
+
+
+class Statics(NamedTuple):
+    """The potential's derivatives at given joint coordinates and pressures."""
+
+    gradient: Array  # (nv,) [N, N m]
+    hessian: Array  # (nv, nv)
+    chambers: Tendons
+    springs: Tendons
+    area: Array  # (n_chambers,) [N/kPa] effective areas at these lengths
+
+
+def statics(frames: Frames, q: Array, pressure_kpa: Array, params: ArmParams) -> Statics:
+    """Gradient and Hessian of V(q) at fixed pressures.
+
+    Args:
+        frames: of `q`, from either engine.
+        q (nv,): joint coordinates [m, rad, rad].
+        pressure_kpa (n_chambers,): chamber pressures.
+        params: numbers of the arm.
+    """
+    chambers = tendons(frames, params.chamber_site_m)
+    springs = tendons(frames, params.spring_site_m)
+    area = params.area + params.area_slope * (chambers.length - params.section_length_m)
+    tension = params.chamber_stiffness * (chambers.length - params.chamber_rest_m) - area * pressure_kpa
+    slope = params.chamber_stiffness - params.area_slope * pressure_kpa
+    spring_tension = params.spring_stiffness * (springs.length - params.spring_rest_m)
+
+    jacobian = jnp.concatenate([chambers.jacobian, springs.jacobian])  # (2 n_chambers, nv)
+    tensions = jnp.concatenate([tension, spring_tension])
+    slopes = jnp.concatenate([slope, params.spring_stiffness])
+    weight, weight_hessian = _gravity(frames, params)
+    gradient = weight + params.joint_stiffness * q + tensions @ jacobian
+    bend = _bending(tension, chambers, params) + _bending(spring_tension, springs, params)
+    hessian = (
+        weight_hessian
+        + jnp.diag(params.joint_stiffness)
+        + block_diag(*bend)
+        + (jacobian.T * slopes) @ jacobian
+    )
+    return Statics(gradient, hessian, chambers, springs, area)
+
+
+def _bending(tension: Array, lines: Tendons, params: ArmParams) -> Array:
+    """Tension times the second derivative of the length, (n_links, 3, 3)."""
+    n_links = lines.link_hessian.shape[0]
+    per_link = jnp.repeat(tension.reshape(-1, N_CHAMBERS_PER_SECTION), n_links // params.n_sections, axis=0)
+    return jnp.einsum("lt,ltij->lij", per_link, lines.link_hessian)
+
+
+def tendons(frames: Frames, site_m: Array) -> Tendons:
+    """Lengths of tendons through holes in the rings, with derivatives.
+
+    Args:
+        frames: plates and joints.
+        site_m (n_chambers, 2): x and y of each tendon's hole in every ring of its section.
+    """
+    n_links = frames.axis.shape[0]
+    n_sections = site_m.shape[0] // N_CHAMBERS_PER_SECTION
+    per_section = n_links // n_sections
+    site = jnp.repeat(site_m.reshape(n_sections, N_CHAMBERS_PER_SECTION, 2), per_section, axis=0)  # (L, 3, 2)
+    arm = jnp.einsum("lij,ltj->lti", frames.plate_rotation[1:, :, :2], site)
+    above = jnp.einsum("lij,ltj->lti", frames.plate_rotation[:-1, :, :2], site)
+    lower = frames.plate_position[1:, None] + arm  # (L, 3, 3)
+    segment = lower - (frames.plate_position[:-1, None] + above)
+    length = jnp.sqrt(jnp.sum(segment**2, axis=-1))  # (L, 3)
+    unit = segment / length[..., None]
+
+    lever = lower - frames.anchor[:, None]
+    slide, hinge = frames.axis[:, :1], frames.axis[:, 1:]  # (L, 1, 3), (L, 2, 3)
+    turn = jnp.cross(hinge[:, None], lever[:, :, None])  # (L, 3, 2, 3)
+    motion = jnp.concatenate([jnp.broadcast_to(slide[:, None], (n_links, 3, 1, 3)), turn], axis=2)
+    along = jnp.einsum("ltc,ltdc->ltd", unit, motion)  # d length / d q, (L, 3, 3)
+    twist = jnp.cross(hinge[:, None, :, None], turn[:, :, None, :])  # a_i x J_j, (L, 3, 2, 2, 3)
+    second = jnp.einsum("ltc,ltijc->ltij", unit, twist)
+    upper = jnp.triu(second)
+    second = upper + jnp.swapaxes(jnp.triu(second, 1), -1, -2)
+    curve = jnp.einsum("ltic,ltjc->ltij", motion, motion) - along[..., :, None] * along[..., None, :]
+    link_hessian = (curve / length[..., None, None]).at[..., 1:, 1:].add(second)
+
+    own = along.reshape(n_sections, per_section, N_CHAMBERS_PER_SECTION, DOFS_PER_LINK)
+    rows = jnp.moveaxis(own, 2, 1).reshape(n_sections, N_CHAMBERS_PER_SECTION, -1)
+    total = length.reshape(n_sections, per_section, -1).sum(1).reshape(-1)
+    return Tendons(total, block_diag(*rows), link_hessian)
+
+
+def _gravity(frames: Frames, params: ArmParams) -> tuple[Array, Array]:
+    """Gradient (nv,) and Hessian (nv, nv) of the weights' potential.
+
+    With M and c the mass and the centre of mass of all that hangs on a joint, and w = M a for a slide,
+    w = M a x (c - o) for a hinge: the gradient is g w_z; the second derivative by an earlier hinge i and
+    a joint j is g (a_i x w_j)_z, and none by an earlier slide.
+    """
+    tool = frames.plate_position[-1] - params.tool_offset_m[:, None] * frames.plate_rotation[-1, :, 2]
+    own = params.link_mass_kg[:, None] * frames.anchor
+    moment = jnp.flip(jnp.cumsum(jnp.flip(own, 0), 0), 0) + params.tool_mass_kg @ tool  # (L, 3)
+    mass = jnp.flip(jnp.cumsum(jnp.flip(params.link_mass_kg))) + jnp.sum(params.tool_mass_kg)  # (L,)
+    hung = moment - mass[:, None] * frames.anchor
+    turn = jnp.cross(frames.axis[:, 1:], hung[:, None])
+    w = jnp.concatenate([mass[:, None, None] * frames.axis[:, :1], turn], axis=1).reshape(-1, 3)
+    axis = frames.axis.at[:, 0].set(0.0).reshape(-1, 3)  # a slide turns nothing
+    upper = jnp.triu(axis[:, :1] * w[:, 1] - axis[:, 1:2] * w[:, 0])
+    hessian = upper + jnp.triu(upper, 1).T
+    return GRAVITY_M_S2 * w[:, 2], GRAVITY_M_S2 * hessian

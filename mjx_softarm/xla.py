@@ -1,0 +1,52 @@
+"""How this project compiles: options per platform and the persistent compilation cache."""
+
+from __future__ import annotations
+
+import functools
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+
+# Serial chains such as mjx.kinematics fall into a fusion trap of XLA's CPU emitters (jax >= 0.7), and
+# jaxlib 0.10 deadlocks on two cores with the concurrency-optimised scheduler.
+_CPU_OPTIONS = {
+    "xla_cpu_use_fusion_emitters": False,
+    "xla_cpu_enable_concurrency_optimized_scheduler": False,
+}
+
+
+@functools.cache
+def compiler_options() -> dict[str, Any]:
+    """Options for `jax.jit(f, compiler_options=...)` that the installed jaxlib accepts, empty off the CPU."""
+    if jax.default_backend() != "cpu":
+        return {}
+    accepted = {}
+    for name, value in _CPU_OPTIONS.items():
+        try:
+            jax.jit(lambda x: x + 1, compiler_options={name: value})(0)
+        except (jax.errors.JaxRuntimeError, ValueError):  # an option that this jaxlib does not know
+            continue
+        accepted[name] = value
+    return accepted
+
+
+def jit(function: Callable, **kwargs: Any) -> Callable:
+    """`jax.jit` with this platform's options; for simulation, where they matter."""
+    return jax.jit(function, compiler_options=compiler_options(), **kwargs)
+
+
+def enable_compilation_cache(directory: str | Path | None = None) -> Path:
+    """Keep compiled programs on disk, so that a second start is fast.
+
+    Args:
+        directory: defaults to `$XDG_CACHE_HOME/mjx_softarm/xla`, or `~/.cache/mjx_softarm/xla`.
+    """
+    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    path = Path(directory) if directory else base / "mjx_softarm" / "xla"
+    path.mkdir(parents=True, exist_ok=True)
+    jax.config.update("jax_compilation_cache_dir", str(path))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+    return path
