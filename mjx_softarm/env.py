@@ -1,0 +1,207 @@
+"""One arm that reaches for poses: a brax environment with the paper's state, action and reward.
+
+An action is nine sensor frequencies, scaled to [-1, 1]; the sensor-space law turns them into pressures.
+`mode="quasistatic"` goes straight to the equilibrium (kinematics from `engine`), `mode="dynamic"` steps
+`mjx.step` under the law at the control rate.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass, field
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from brax.envs.base import Env, State
+from jax import Array
+from mujoco import mjx
+
+from mjx_softarm import control, obs, rewards, sensors
+from mjx_softarm.dynamics import Motion, advance, with_params
+from mjx_softarm.kinematics import chain_frames, mjx_frames
+from mjx_softarm.mjcf import build_model
+from mjx_softarm.pose import pose_from_frame
+from mjx_softarm.settle import Settled, settle
+from mjx_softarm.spec import ArmSpec
+from mjx_softarm.statics import ArmParams
+from mjx_softarm.workspace import Pool, sample_workspace
+
+PAYLOAD = 1  # index in ArmParams.tool_mass_kg
+
+
+@dataclass(frozen=True)
+class Randomisation:
+    """What differs from episode to episode; all zero is the nominal arm."""
+
+    payload_max_kg: float = 0.0  # payload uniform from the spec's to this much more
+    stiffness_spread: float = 0.0  # each chamber's stiffness times 1 + uniform(-spread, spread)
+    sensor_noise_mm: float = 0.0  # standard deviation of each spring's reading, fixed within an episode
+
+
+@dataclass(frozen=True)
+class EnvConfig:
+    """How the arm is simulated and rewarded."""
+
+    engine: Literal["chain", "mjx"] = "chain"
+    mode: Literal["quasistatic", "dynamic"] = "quasistatic"
+    reward: rewards.RewardConfig = field(default_factory=rewards.RewardConfig)
+    randomisation: Randomisation = field(default_factory=Randomisation)
+    saturation_tolerance_mm: float = 1.0
+    n_poses: int = 8192  # poses of the reachable workspace that starts and goals are drawn from
+    workspace_seed: int = 0
+    dynamic_step_s: float = 0.5  # duration of one environment step in dynamic mode
+
+    def __post_init__(self):
+        for name, allowed in (("engine", ("chain", "mjx")), ("mode", ("quasistatic", "dynamic"))):
+            if getattr(self, name) not in allowed:
+                raise ValueError(f"EnvConfig.{name}: got {getattr(self, name)!r}, expected one of {allowed}")
+
+
+class ArmState(NamedTuple):
+    """One arm between two actions."""
+
+    params: ArmParams  # this episode's arm
+    sensor_offset_m: Array  # (n_chambers,) reading less true length, this episode's
+    motion: Motion
+    pose: Array  # (6,) [mm, deg]
+    spring_m: Array  # (n_chambers,) true lengths
+    pressure_kpa: Array  # (n_chambers,)
+    goal: Array  # (6,) [mm, deg]
+    n_steps: Array  # () actions taken in this episode
+
+
+class ReachEnv(Env):
+    """A soft arm reaching for poses of its workspace."""
+
+    def __init__(self, spec: ArmSpec | None = None, config: EnvConfig | None = None):
+        self.spec = spec or ArmSpec.default()
+        self.config = config or EnvConfig()
+        self.params = jax.tree.map(jnp.asarray, ArmParams.from_spec(self.spec))
+        self.scale = obs.ObsScale.from_spec(self.spec)
+        self.gains = control.Gains.from_spec(self.spec)
+        self.sensor = sensors.SensorParams.from_spec(self.spec)
+        springs = self.spec.springs
+        limits = [jnp.full(self.action_size, m) for m in (springs.length_min_m, springs.length_max_m)]
+        self._frequency_range = [sensors.frequency_from_length(limit, self.sensor) for limit in limits]
+        uses_mjx = self.config.engine == "mjx" or self.config.mode == "dynamic"
+        self.model = mjx.put_model(build_model(self.spec)) if uses_mjx else None
+        self.pool: Pool = sample_workspace(self.spec, self.config.n_poses, self.config.workspace_seed)
+
+    @property
+    def observation_size(self) -> int:
+        return obs.OBS_SIZE
+
+    @property
+    def action_size(self) -> int:
+        return self.spec.n_chambers
+
+    @property
+    def backend(self) -> str:
+        return "mjx"
+
+    def reference_m(self, action: Array) -> Array:
+        """Spring lengths (..., n_chambers) [m] that an action in [-1, 1] asks for: frequencies, linearly."""
+        low, high = self._frequency_range
+        frequency = low + 0.5 * (jnp.clip(action, -1.0, 1.0) + 1.0) * (high - low)
+        return sensors.length_from_frequency(frequency, self.sensor).length_m
+
+    def action_of(self, length_m: Array) -> Array:
+        """The action in [-1, 1] that asks for spring lengths (..., n_chambers) [m]; inverse of `reference_m`."""
+        low, high = self._frequency_range
+        frequency = sensors.frequency_from_length(length_m, self.sensor)
+        return jnp.clip(2.0 * (frequency - low) / (high - low) - 1.0, -1.0, 1.0)
+
+    def reset(self, rng: Array) -> State:
+        """A new episode: an arm of the randomisation, at a random pose, with a random goal."""
+        key_params, key_sensor, key_start, key_goal = jax.random.split(rng, 4)
+        spread = self.config.randomisation
+        start = jax.tree.map(lambda x: x[jax.random.randint(key_start, (), 0, self.config.n_poses)], self.pool)
+        goal = self.pool.pose[jax.random.randint(key_goal, (), 0, self.config.n_poses)]
+        noise = jax.random.normal(key_sensor, (self.action_size,))
+        arm = ArmState(
+            params=self._randomised(key_params),
+            sensor_offset_m=1e-3 * spread.sensor_noise_mm * noise,
+            motion=Motion(start.q, jnp.zeros_like(start.q), start.pressure_kpa),
+            pose=start.pose,
+            spring_m=start.spring_m,
+            pressure_kpa=start.pressure_kpa,
+            goal=goal,
+            n_steps=jnp.zeros((), jnp.int32),
+        )
+        zero = jnp.zeros(())
+        metrics = dict.fromkeys(("tip_error_mm", "reached", "saturated_chambers", "unsettled"), zero)
+        metrics |= {f"reward_{name}": zero for name in ("goal", "error", "steps", "saturation")}
+        info = {"saturated": jnp.array(False), "valid": jnp.array(True)}
+        return State(arm, self._observe(arm.pose, goal), zero, zero, metrics, info)
+
+    def step(self, state: State, action: Array) -> State:
+        """Move to the references of `action` (n_chambers,) in [-1, 1]; `done` is 1 where the goal is reached.
+
+        An arm that did not settle, or is not finite, keeps its last pose, earns nothing, ends its episode
+        and is marked by `info["valid"]`: such a transition must not be learned from.
+        """
+        arm: ArmState = state.pipeline_state
+        reference = self.reference_m(action)
+        motion, end = self._move(arm, reference - arm.sensor_offset_m)
+        valid = end.settled
+        moved = arm._replace(
+            motion=motion,
+            pose=pose_from_frame(end.tip_position_m, end.tip_rotation),
+            spring_m=end.spring_m,
+            pressure_kpa=end.pressure_kpa,
+            n_steps=arm.n_steps + 1,
+        )
+        arm = jax.tree.map(lambda new, old: jnp.where(valid, new, old), moved, arm)
+        tolerance = 1e-3 * self.config.saturation_tolerance_mm
+        reading = arm.spring_m + arm.sensor_offset_m
+        saturated = control.saturated(arm.pressure_kpa, reference, reading, self.gains, tolerance) & valid
+        value, reached, terms = rewards.reward(
+            arm.pose, arm.goal, arm.n_steps, jnp.any(saturated), self.config.reward
+        )
+        metrics = {
+            "tip_error_mm": jnp.linalg.norm(arm.pose[:3] - arm.goal[:3]),
+            "reached": (reached & valid).astype(jnp.float32),
+            "saturated_chambers": jnp.sum(saturated).astype(jnp.float32),
+            "unsettled": 1.0 - valid,
+        } | {f"reward_{name}": jnp.where(valid, term, 0.0) for name, term in terms.items()}
+        return state.replace(
+            pipeline_state=arm,
+            obs=self._observe(arm.pose, arm.goal),
+            reward=jnp.where(valid, value, 0.0),
+            done=(reached | ~valid).astype(jnp.float32),
+            metrics={**state.metrics, **metrics},
+            info={**state.info, "saturated": jnp.any(saturated), "valid": valid},
+        )
+
+    def _move(self, arm: ArmState, reference_m: Array) -> tuple[Motion, Settled]:
+        if self.config.mode == "dynamic":
+            return advance(
+                with_params(self.model, arm.params),
+                arm.motion,
+                reference_m,
+                self.gains,
+                self.config.dynamic_step_s,
+                1.0 / self.spec.control.rate_hz,
+            )
+        if self.config.engine == "mjx":
+            kinematics = functools.partial(mjx_frames, self.model)
+        else:
+            kinematics = functools.partial(chain_frames, link_length_m=arm.params.link_length_m)
+        end = settle(kinematics, arm.params, reference_m)
+        return Motion(end.q, jnp.zeros_like(end.q), end.pressure_kpa), end
+
+    def _observe(self, pose: Array, goal: Array) -> Array:
+        return obs.observe(pose, goal, self.scale, self.config.reward)
+
+    def _randomised(self, key: Array) -> ArmParams:
+        key_payload, key_stiffness = jax.random.split(key)
+        spread = self.config.randomisation
+        payload = spread.payload_max_kg * jax.random.uniform(key_payload)
+        factor = 1.0 + spread.stiffness_spread * jax.random.uniform(
+            key_stiffness, (self.action_size,), minval=-1.0
+        )
+        return self.params._replace(
+            tool_mass_kg=self.params.tool_mass_kg.at[PAYLOAD].add(payload),
+            chamber_stiffness=self.params.chamber_stiffness * factor,
+        )

@@ -1,0 +1,96 @@
+"""Poses of the arm's tip, as used everywhere.
+
+    pose (..., 6) = x, y, z [mm], yaw, pitch, roll [deg]
+
+in the base frame: z up, the arm hangs towards -z. The angles are intrinsic Z-Y-X, so the tip's axes are the
+columns of R = Rz(yaw) Ry(pitch) Rx(roll), and all three are zero where the arm hangs straight. Yaw and
+roll lie in [-180, 180], pitch in [-90, 90].
+
+Gimbal lock: where the tip's x axis is vertical, |pitch| = 90, yaw and roll turn about the same axis. There
+yaw is 0, roll takes the whole turn, and the yaw's gradient is 0; the pose still gives the rotation back.
+Close by, yaw and roll change as fast as 1 / cos(pitch), and so do their gradients.
+"""
+
+from __future__ import annotations
+
+from types import ModuleType
+
+from mjx_softarm._xp import Array, array_namespace
+
+_LOCKED_COS = 1e-6  # cos(pitch) below this is gimbal lock
+
+
+def pose_from_frame(position_m: Array, rotation: Array) -> Array:
+    """Pose of a frame given by its origin and axes.
+
+    Args:
+        position_m (..., 3) [m]: in the base frame.
+        rotation (..., 3, 3): columns are the frame's axes in the base frame.
+
+    Returns:
+        Pose (..., 6) [mm, deg].
+    """
+    xp = array_namespace(position_m, rotation)
+    (r00, r01, r02), (r10, r11, r12), (r20, _, _) = (
+        [rotation[..., row, column] for column in range(3)] for row in range(3)
+    )
+    locked = r00**2 + r10**2 < _LOCKED_COS**2
+    yaw = xp.atan2(xp.where(locked, 0.0, r10), xp.where(locked, 1.0, r00))
+    # Without its yaw the rotation is Ry(pitch) Rx(roll), whose entries are never all zero.
+    cos, sin = xp.cos(yaw), xp.sin(yaw)
+    pitch = xp.atan2(-r20, cos * r00 + sin * r10)
+    roll = xp.atan2(sin * r02 - cos * r12, cos * r11 - sin * r01)
+    angles_deg = xp.rad2deg(xp.stack([yaw, pitch, roll], axis=-1))
+    return xp.concat([1000.0 * position_m, angles_deg], axis=-1)
+
+
+def pose_from_quaternion(position_m: Array, quaternion: Array) -> Array:
+    """Pose of a frame given by its origin and a quaternion, as MuJoCo and motion capture give it.
+
+    Args:
+        position_m (..., 3) [m]: in the base frame.
+        quaternion (..., 4): w, x, y, z, of length 1; a small error of the length does not matter.
+
+    Returns:
+        Pose (..., 6) [mm, deg].
+    """
+    xp = array_namespace(position_m, quaternion)
+    w, x, y, z = (quaternion[..., k] for k in range(4))
+    rotation = _matrix(
+        xp,
+        [
+            [w * w + x * x - y * y - z * z, 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+            [2.0 * (x * y + w * z), w * w - x * x + y * y - z * z, 2.0 * (y * z - w * x)],
+            [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), w * w - x * x - y * y + z * z],
+        ],
+    )
+    return pose_from_frame(position_m, rotation)
+
+
+def frame_from_pose(pose: Array) -> tuple[Array, Array]:
+    """Origin (..., 3) [m] and axes (..., 3, 3) of a pose (..., 6) [mm, deg]; inverse of `pose_from_frame`."""
+    xp = array_namespace(pose)
+    angles = xp.deg2rad(pose[..., 3:])
+    (cy, cp, cr), (sy, sp, sr) = ([f(angles[..., k]) for k in range(3)] for f in (xp.cos, xp.sin))
+    rotation = _matrix(
+        xp,
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ],
+    )
+    return 0.001 * pose[..., :3], rotation
+
+
+def pose_error(pose: Array, goal: Array) -> Array:
+    """pose - goal, both (..., 6) [mm, deg], with the differences of angles wrapped into [-180, 180)."""
+    xp = array_namespace(pose, goal)
+    error = pose - goal
+    angles = error[..., 3:]
+    wrapped = angles - 360.0 * xp.floor((angles + 180.0) / 360.0)
+    return xp.concat([error[..., :3], wrapped], axis=-1)
+
+
+def _matrix(xp: ModuleType, rows: list[list[Array]]) -> Array:
+    return xp.stack([xp.stack(row, axis=-1) for row in rows], axis=-2)

@@ -1,0 +1,86 @@
+"""Poses that the arm can reach: drawn at random, or all combinations of the chambers' extremes."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from mjx_softarm import xla
+from mjx_softarm.kinematics import chain_frames
+from mjx_softarm.pose import pose_from_frame
+from mjx_softarm.settle import Settled, settle_pressures
+from mjx_softarm.spec import ArmSpec
+from mjx_softarm.statics import ArmParams
+
+BATCH = 1024
+CANDIDATES_PER_POSE = 2
+VOXEL_MM = 25.0
+
+
+class Pool(NamedTuple):
+    """Equilibria of the nominal arm, none of them saturated: every spring is where it is asked to be."""
+
+    q: Array  # (n, nv) [m, rad, rad]
+    pressure_kpa: Array  # (n, n_chambers)
+    spring_m: Array  # (n, n_chambers)
+    pose: Array  # (n, 6) [mm, deg]
+
+
+@functools.cache
+def _solver():
+    def solve(params: ArmParams, pressure_kpa: Array) -> Settled:
+        kinematics = functools.partial(chain_frames, link_length_m=params.link_length_m)
+        return settle_pressures(kinematics, params, pressure_kpa)
+
+    return xla.jit(jax.vmap(solve, in_axes=(None, 0)))
+
+
+def settle_many(spec: ArmSpec, pressure_kpa: np.ndarray) -> Settled:
+    """Equilibria at many pressures (n, n_chambers) [kPa], as NumPy arrays with a leading axis n."""
+    params = ArmParams.from_spec(spec)
+    n = len(pressure_kpa)
+    padded = np.resize(np.asarray(pressure_kpa, np.float32), (-(-n // BATCH) * BATCH, spec.n_chambers))
+    parts = [jax.device_get(_solver()(params, part)) for part in np.split(padded, len(padded) // BATCH)]
+    return jax.tree.map(lambda *x: np.concatenate(x)[:n], *parts)
+
+
+def sample_workspace(spec: ArmSpec, n: int, seed: int) -> Pool:
+    """Poses spread over the whole reachable workspace.
+
+    Pressures follow the arcsine law between their limits, which favours the extremes where the workspace
+    ends; of twice as many candidates, `n` are drawn with weights that even out the number of tips per
+    voxel of 25 mm. Candidates that did not settle are left out.
+
+    Args:
+        spec: the arm.
+        n: number of poses.
+        seed: of the draw; training and evaluation use different ones.
+    """
+    rng = np.random.default_rng(seed)
+    low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
+    swing = np.cos(rng.uniform(0.0, np.pi, (CANDIDATES_PER_POSE * n, spec.n_chambers)))
+    found = settle_many(spec, low + (high - low) * 0.5 * (1.0 + swing))
+    tip_mm = 1e3 * found.tip_position_m
+    _, voxel, count = np.unique(
+        np.floor(tip_mm / VOXEL_MM).astype(int), axis=0, return_inverse=True, return_counts=True
+    )
+    weight = found.settled / count[voxel.ravel()]
+    chosen = rng.choice(len(weight), n, replace=False, p=weight / weight.sum())
+    pose = jax.vmap(pose_from_frame)(found.tip_position_m[chosen], found.tip_rotation[chosen])
+    arrays = (found.q[chosen], found.pressure_kpa[chosen], found.spring_m[chosen], pose)
+    return Pool(*map(jnp.asarray, arrays))
+
+
+def extreme_poses(spec: ArmSpec) -> Settled:
+    """Equilibria at every combination of lowest, zero and highest pressure, 3 ** n_chambers of them.
+
+    Source: the paper's workspace figure.
+    """
+    levels = (spec.chambers.pressure_min_kpa, 0.0, spec.chambers.pressure_max_kpa)
+    return settle_many(spec, np.array(list(itertools.product(levels, repeat=spec.n_chambers))))

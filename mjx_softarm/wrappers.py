@@ -1,0 +1,57 @@
+"""Many arms at once, with a time limit and automatic resets."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from brax.envs.base import State
+from jax import Array
+
+from mjx_softarm.env import ReachEnv
+
+
+class Outcome(NamedTuple):
+    """What one action of each arm led to, before any reset."""
+
+    final_obs: Array  # (n, obs_size) the successor's observation, also where the episode ended
+    reward: Array  # (n,)
+    terminated: Array  # (n,) bool: goal reached; the value after it is zero
+    truncated: Array  # (n,) bool: time limit; the value after it is that of `final_obs`
+    valid: Array  # (n,) bool: the arm settled; learn from nothing else
+
+
+class VectorEnv:
+    """`n` independent arms; an arm whose episode ended starts a new one, with a new goal."""
+
+    def __init__(self, env: ReachEnv, n: int, episode_length: int):
+        self.env, self.n, self.episode_length = env, n, episode_length
+
+    def reset(self, key: Array) -> State:
+        """State of n fresh arms."""
+        return jax.vmap(self.env.reset)(jax.random.split(key, self.n))
+
+    def step(self, state: State, action: Array, key: Array) -> tuple[State, State, Outcome]:
+        """Act once.
+
+        Args:
+            state: of n arms.
+            action (n, action_size) in [-1, 1].
+            key: for the new episodes.
+
+        Returns:
+            The state to act on next (reset where an episode ended), the state that the action led to,
+            and how the episodes stand.
+        """
+        after = jax.vmap(self.env.step)(state, action)
+        valid = after.info["valid"]
+        terminated = (after.done > 0) & valid
+        truncated = (after.pipeline_state.n_steps >= self.episode_length) & ~terminated
+        over = terminated | truncated | ~valid
+        fresh = self.reset(key)
+        following = jax.tree.map(
+            lambda new, old: jnp.where(over.reshape((-1,) + (1,) * (old.ndim - 1)), new, old), fresh, after
+        )
+        following = following.replace(metrics=after.metrics)
+        return following, after, Outcome(after.obs, after.reward, terminated, truncated, valid)

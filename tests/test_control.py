@@ -1,0 +1,157 @@
+"""The sensor-space law on plants whose rest is known."""
+
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjx_softarm import ArmSpec
+from mjx_softarm.control import Gains, pressures, saturated
+
+DT_S = 0.02
+GAINS = Gains.from_spec(ArmSpec.default())
+LOW, HIGH = GAINS.pressure_min_kpa, GAINS.pressure_max_kpa
+FREE_M = 0.200
+M_PER_KPA = 2.0e-3
+UNCOUPLED = M_PER_KPA * np.eye(9)
+LAG_S = 0.1
+
+
+@pytest.fixture(autouse=True)
+def _strict():
+    with jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
+        yield
+
+
+def plant(length_m, pressure_kpa, compliance):
+    """Lengths a tick later of springs that follow their pressures with a first-order lag."""
+    rest_m = FREE_M + compliance @ pressure_kpa
+    return rest_m + (length_m - rest_m) * np.exp(-DT_S / LAG_S)
+
+
+def run(reference_m, gains, n_ticks, compliance=UNCOUPLED):
+    """Lengths, pressures and integral after so many ticks from the free length."""
+    length, integral = np.full(9, FREE_M), np.zeros(9)
+    for _ in range(n_ticks):
+        pressure, integral = pressures(reference_m, length, integral, gains, DT_S)
+        length = plant(length, pressure, compliance)
+    return length, pressure, integral
+
+
+def test_gains_come_from_the_spec():
+    spec = ArmSpec.default().replace(control={"kp_kpa_per_m": 7.0}, chambers={"pressure_max_kpa": 15.0})
+    assert Gains.from_spec(spec) == Gains(7.0, spec.control.ki_kpa_per_ms, -40.0, 15.0)
+
+
+def test_one_tick_by_hand():
+    gains = Gains(kp_kpa_per_m=100.0, ki_kpa_per_ms=500.0, pressure_min_kpa=-40.0, pressure_max_kpa=20.0)
+    reference, length = np.array([0.21, 0.20, 0.60, 0.10]), np.array([0.20, 0.21, 0.20, 0.20])
+    pressure, integral = pressures(reference, length, np.array([1.0, 1.0, 19.0, -39.5]), gains, 0.02)
+    # integral + 10 e, then + 100 e, each within the limits
+    np.testing.assert_allclose(integral, [1.1, 0.9, 20.0, -40.0])
+    np.testing.assert_allclose(pressure, [2.1, -0.1, 20.0, -40.0])
+
+
+def test_rest_is_tracking_or_a_limit():
+    reference = FREE_M + M_PER_KPA * np.array([0.0, 10.0, 19.9, 20.1, 60.0, -10.0, -39.9, -40.1, -80.0])
+    length, pressure, integral = run(reference, GAINS, 4000)
+    expected = np.clip((reference - FREE_M) / M_PER_KPA, LOW, HIGH)
+    np.testing.assert_allclose(pressure, expected, atol=1e-6)
+    np.testing.assert_allclose(integral, expected, atol=1e-6)
+    np.testing.assert_allclose(length, FREE_M + M_PER_KPA * expected, atol=1e-8)
+
+
+@pytest.mark.parametrize("gains", [GAINS, GAINS._replace(kp_kpa_per_m=0.0, ki_kpa_per_ms=100.0)])
+def test_rest_of_coupled_springs_is_complementary_whatever_the_gains(gains):
+    rng = np.random.default_rng(3)
+    mix = rng.normal(size=(9, 9))
+    compliance = M_PER_KPA * (np.eye(9) + 0.03 * (mix @ mix.T))
+    wanted_kpa = rng.uniform(-60.0, 40.0, 9)
+    reference = FREE_M + compliance @ wanted_kpa
+    length, pressure, integral = run(reference, gains, 8000, compliance=compliance)
+    error = reference - length
+    np.testing.assert_allclose(pressure, integral, atol=1e-6)
+    at_high, at_low = pressure >= HIGH, pressure <= LOW
+    assert at_high.any() and at_low.any() and (~at_high & ~at_low).any()
+    assert (error[at_high] >= 0).all() and (error[at_low] <= 0).all()
+    np.testing.assert_allclose(error[~at_high & ~at_low], 0.0, atol=1e-8)
+    tolerance = 1e-4
+    np.testing.assert_array_equal(
+        saturated(pressure, reference, length, gains, tolerance), np.abs(error) > tolerance
+    )
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_long_saturation_is_left_at_once(sign):
+    unlimited = GAINS._replace(pressure_min_kpa=-np.inf, pressure_max_kpa=np.inf)
+    limit = HIGH if sign > 0 else LOW
+    length = np.full(9, FREE_M + M_PER_KPA * limit)  # as far as the limit takes it
+    out_of_reach, back = np.full(9, FREE_M + sign * 0.2), length - sign * 0.005
+    integral = wound_up = np.zeros(9)
+    for _ in range(round(30.0 / DT_S)):
+        pressure, integral = pressures(out_of_reach, length, integral, GAINS, DT_S)
+        _, wound_up = pressures(out_of_reach, length, wound_up, unlimited, DT_S)
+    np.testing.assert_array_equal(pressure, limit)
+
+    def ticks_at_the_limit(state, gains):
+        for tick in range(100_000):
+            free, state = pressures(back, length, state, gains, DT_S)
+            if (np.clip(free, LOW, HIGH) != limit).all():
+                return tick
+        return None
+
+    assert ticks_at_the_limit(integral, GAINS) == 0
+    assert ticks_at_the_limit(wound_up, unlimited) > 1000
+
+
+def test_saturated_needs_the_limit_and_the_error_it_blocks():
+    #                   tracks  high    on it   inward  low     on it   inward  within  high
+    pressure = np.array([0.0, HIGH, HIGH, HIGH, LOW, LOW, LOW, 19.9, HIGH])
+    error = 1e-3 * np.array([9.0, 9.0, 0.4, -9.0, -9.0, -0.4, 9.0, 9.0, 0.6])
+    got = saturated(pressure, FREE_M + error, np.full(9, FREE_M), GAINS, 0.5e-3)
+    np.testing.assert_array_equal(got, [0, 1, 0, 0, 1, 0, 0, 0, 1])
+
+
+@pytest.mark.parametrize("to_library", [np.asarray, jnp.asarray])
+def test_limits_that_float32_rounds_are_still_limits(to_library):
+    gains = GAINS._replace(pressure_min_kpa=-40.1, pressure_max_kpa=20.1)
+    reference, length, integral = map(to_library, np.float32([[0.4, 0.0], [0.2, 0.2], [20.0, -40.0]]))
+    pressure, _ = pressures(reference, length, integral, gains, DT_S)
+    assert pressure.dtype == np.float32
+    assert saturated(pressure, reference, length, gains, 1e-3).all()
+
+
+def test_jax_vmapped_and_scanned_gives_numpy_s_pressures():
+    rng = np.random.default_rng(5)
+    reference = np.float32(rng.uniform(0.10, 0.26, (50, 6, 9)))  # ticks, arms, springs
+    length = np.float32(rng.uniform(0.10, 0.26, (50, 6, 9)))
+
+    def tick(integral, now):
+        pressure, integral = jax.vmap(lambda r, x, i: pressures(r, x, i, GAINS, DT_S))(*now, integral)
+        flags = jax.vmap(lambda p, r, x: saturated(p, r, x, GAINS, 1e-3))(pressure, *now)
+        return integral, (pressure, flags)
+
+    _, (got, flags) = jax.jit(lambda *now: jax.lax.scan(tick, jnp.zeros((6, 9)), now))(reference, length)
+    integral = np.zeros((6, 9), np.float32)
+    for k in range(50):
+        expected, integral = pressures(reference[k], length[k], integral, GAINS, DT_S)
+        np.testing.assert_allclose(got[k], expected, rtol=1e-6, atol=1e-6 * HIGH)
+        np.testing.assert_array_equal(flags[k], saturated(expected, reference[k], length[k], GAINS, 1e-3))
+    assert got.dtype == expected.dtype == np.float32
+
+
+def test_gains_may_be_traced_and_one_per_chamber():
+    high = jnp.linspace(10.0, 20.0, 9)
+    traced = GAINS._replace(pressure_max_kpa=high)
+    reference, length, integral = np.float32([np.full(9, 0.5), np.full(9, FREE_M), np.zeros(9)])
+    law = jax.jit(lambda gains: pressures(reference, length, integral, gains, DT_S)[0])
+    np.testing.assert_array_equal(law(traced), high)
+
+
+def test_a_deployed_arm_needs_no_jax():
+    modules = "mjx_softarm.sensors, mjx_softarm.pose, mjx_softarm.control"
+    code = f"import sys, {modules}; sys.exit('jax' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

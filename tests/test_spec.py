@@ -1,0 +1,216 @@
+"""The specification: the paper's numbers, the round trip, and messages that say what is wrong where."""
+
+import copy
+import dataclasses
+import math
+import re
+
+import pytest
+
+from mjx_softarm import ArmSpec, SpecError
+
+
+@pytest.fixture
+def spec():
+    return ArmSpec.default()
+
+
+@pytest.fixture
+def data(spec):
+    return spec.to_dict()
+
+
+def message_of(function, *args, **kwargs):
+    with pytest.raises(SpecError) as caught:
+        function(*args, **kwargs)
+    return str(caught.value)
+
+
+def changed(data, path, value):
+    """A copy of nested dictionaries with one field set."""
+    data = copy.deepcopy(data)
+    *groups, name = path.split(".")
+    part = data
+    for group in groups:
+        part = part[group]
+    part[name] = value
+    return data
+
+
+# --- the packaged arm ------------------------------------------------------------------------------
+
+
+def test_default_is_the_paper_s_arm(spec):
+    paper = {
+        "structure.n_sections": 3,
+        "geometry.section_length_m": 0.200,
+        "geometry.chamber_diameter_m": 0.060,
+        "mass.gripper_kg": 0.45,
+        "chambers.pressure_min_kpa": -40.0,
+        "chambers.pressure_max_kpa": 20.0,
+        "springs.stiffness_n_per_m": 54.0,
+        "springs.damping_ns_per_m": 30.0,
+        "sensor.beta": 0.93,
+        "sensor.delta_m": 2.45e-3,
+        "control.rate_hz": 50.0,
+    }
+    for path, value in paper.items():
+        group, name = path.split(".")
+        assert getattr(getattr(spec, group), name) == value, path
+    assert spec.name == "paper"
+    assert spec.mass.arm_kg + spec.mass.gripper_kg == pytest.approx(4.7)
+    assert spec.sensor.coil_radius_m == pytest.approx((4.0 - 0.4) / 2 * 1e-3)
+
+
+def test_derived_counts_and_lengths(spec):
+    assert spec.n_chambers == 9
+    assert spec.n_links == 3 * spec.structure.links_per_section
+    assert spec.n_links * spec.link_length_m == pytest.approx(3 * spec.geometry.section_length_m)
+
+
+def test_per_chamber_spreads_one_number_and_keeps_a_list(spec):
+    assert spec.per_chamber(spec.sensor.beta) == (0.93,) * 9
+    areas = tuple(1e-3 + 1e-5 * k for k in range(9))
+    assert spec.per_chamber(spec.replace(chambers={"area_m2": areas}).chambers.area_m2) == areas
+
+
+# --- round trips and replacement -------------------------------------------------------------------
+
+
+def test_toml_round_trip(tmp_path, spec):
+    beta = tuple(0.9 + 0.01 * k for k in range(9))
+    spec = spec.replace(name='mine: "ünï"', sensor={"beta": beta}, mass={"payload_kg": 0.1 + 0.2})
+    spec.to_toml(tmp_path / "arm.toml")
+    again = ArmSpec.from_toml(tmp_path / "arm.toml")
+    assert again == spec
+    assert again.sensor.beta == beta
+    assert ArmSpec.from_dict(spec.to_dict()) == spec
+
+
+def test_whole_numbers_are_read_as_floats(data):
+    spec = ArmSpec.from_dict(changed(data, "sensor.beta", [1] * 9))
+    assert isinstance(spec.sensor.beta[0], float)
+    spec = ArmSpec.from_dict(changed(data, "mass.arm_kg", 4))
+    assert isinstance(spec.mass.arm_kg, float)
+
+
+def test_replace_changes_only_what_it_names_and_leaves_the_original(spec):
+    before = spec.to_dict()
+    new = spec.replace(name="heavy", mass={"payload_kg": 0.2}, structure={"links_per_section": 6})
+    assert spec.to_dict() == before
+    assert (new.name, new.mass.payload_kg, new.n_links) == ("heavy", 0.2, 18)
+    assert new.replace(name=spec.name, mass={"payload_kg": 0.0}, structure={"links_per_section": 4}) == spec
+
+
+def test_a_spec_is_frozen_and_hashable(spec):
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        spec.mass.arm_kg = 1.0
+    assert hash(spec) == hash(ArmSpec.default())
+
+
+def test_another_number_of_sections_needs_no_new_scalars(spec):
+    assert spec.replace(structure={"n_sections": 2}).n_chambers == 6
+    beta = {"beta": [0.93] * 9}
+    text = message_of(spec.replace(sensor=beta).replace, structure={"n_sections": 2})
+    assert text == "replace: sensor.beta: got 9 numbers, expected one, or one for each of the 6 chambers"
+
+
+# --- what is refused -------------------------------------------------------------------------------
+
+REFUSED = [
+    # field, value, what the message expects
+    ("mass.arm_kg", "heavy", "a number > 0"),
+    ("mass.arm_kg", True, "a number > 0"),
+    ("mass.arm_kg", None, "a number > 0"),
+    ("mass.arm_kg", [4.25], "a number > 0"),
+    ("mass.arm_kg", 0.0, "a number > 0"),
+    ("mass.arm_kg", math.nan, "a number > 0"),
+    ("mass.arm_kg", math.inf, "a number > 0"),
+    ("mass.payload_kg", -0.1, "a number >= 0"),
+    ("sensor.compensation_h", math.nan, "a number"),
+    ("structure.n_sections", 3.0, "a whole number >= 1"),
+    ("structure.n_sections", True, "a whole number >= 1"),
+    ("structure.n_sections", 0, "a whole number >= 1"),
+    ("geometry.first_chamber_deg", 361.0, "a number >= -360 and <= 360"),
+    ("chambers.pressure_min_kpa", -102.0, "a number >= -101.325"),
+    ("chambers.length_offset_m", 0.2, "a number >= -0.1 and <= 0.1, or a list with one per chamber"),
+    ("sensor.beta", -0.93, "a number > 0, or a list with one per chamber"),
+    ("sensor.beta", [0.93] * 8 + [math.nan], "a number > 0, or a list with one per chamber"),
+    ("sensor.beta", [0.93] * 8 + [True], "a number > 0, or a list with one per chamber"),
+    ("sensor.beta", [[0.93]] * 9, "a number > 0, or a list with one per chamber"),
+    ("sensor.beta", [0.93] * 8, "one, or one for each of the 9 chambers"),
+    ("sensor.beta", [], "one, or one for each of the 9 chambers"),
+    ("name", 3, "a text"),
+    ("mass", 4.7, "a table"),
+]
+
+
+@pytest.mark.parametrize("path, value, expected", REFUSED, ids=lambda x: str(x)[:24])
+def test_a_refused_value_is_named_with_file_field_and_expectation(data, path, value, expected):
+    text = message_of(ArmSpec.from_dict, changed(data, path, value), "my.toml")
+    got = f"{len(value)} numbers" if "each of the 9" in expected else repr(value)
+    assert text == f"my.toml: {path}: got {got}, expected {expected}"
+
+
+@pytest.mark.parametrize(
+    "low, high",
+    [
+        ("chambers.pressure_min_kpa", "pressure_max_kpa"),
+        ("springs.length_min_m", "length_max_m"),
+        ("sensor.frequency_min_hz", "frequency_max_hz"),
+    ],
+)
+def test_a_range_must_not_be_empty(data, low, high):
+    group = low.split(".")[0]
+    top = data[group][high]
+    text = message_of(ArmSpec.from_dict, changed(data, low, top), "my.toml")
+    assert text == f"my.toml: {low}: got {top!r}, expected less than {high} ({top!r})"
+
+
+@pytest.mark.parametrize("path", ["mass.arm_kg", "sensor", "name"])
+def test_a_missing_field_is_named(data, path):
+    *groups, name = path.split(".")
+    part = data[groups[0]] if groups else data
+    del part[name]
+    assert message_of(ArmSpec.from_dict, data, "my.toml").startswith(f"my.toml: {path}: missing")
+
+
+def test_an_unknown_field_is_named_with_the_known_ones(data):
+    text = message_of(ArmSpec.from_dict, changed(data, "control.kd", 1.0), "my.toml")
+    assert text == (
+        "my.toml: control.kd: unknown field, expected one of rate_hz, kp_kpa_per_m, ki_kpa_per_ms"
+    )
+    text = message_of(ArmSpec.from_dict, changed(data, "motors", {}), "my.toml")
+    assert text.startswith("my.toml: motors: unknown field, expected one of name, structure,")
+
+
+def test_replace_refuses_like_a_file_does(spec):
+    text = message_of(spec.replace, mass={"payload_kg": -1.0})
+    assert text == "replace: mass.payload_kg: got -1.0, expected a number >= 0"
+    assert message_of(spec.replace, mass={"payload": 1.0}).startswith("replace: mass.payload: unknown field")
+    assert message_of(spec.replace, motors={}).startswith(
+        "replace: unknown group 'motors', expected one of name,"
+    )
+
+
+def test_a_file_that_is_no_toml_is_named(tmp_path):
+    path = tmp_path / "broken.toml"
+    path.write_text("name = \nmass", "utf-8")
+    assert re.match(
+        rf"{re.escape(str(path))}: not a TOML file: .*line 1", message_of(ArmSpec.from_toml, path)
+    )
+    path.write_bytes(b"name = '\xff'")
+    assert message_of(ArmSpec.from_toml, path).startswith(f"{path}: not a TOML file: ")
+
+
+def test_a_file_that_cannot_be_read_is_named(tmp_path):
+    path = tmp_path / "absent.toml"
+    assert message_of(ArmSpec.from_toml, path) == f"{path}: cannot be read: No such file or directory"
+    assert message_of(ArmSpec.from_toml, tmp_path).startswith(f"{tmp_path}: cannot be read: ")
+
+
+def test_a_value_in_a_file_is_refused_with_the_file_s_name(tmp_path, spec):
+    path = tmp_path / "arm.toml"
+    spec.to_toml(path)
+    path.write_text(path.read_text("utf-8").replace("gripper_kg = 0.45", "gripper_kg = nan"), "utf-8")
+    assert message_of(ArmSpec.from_toml, path) == f"{path}: mass.gripper_kg: got nan, expected a number >= 0"

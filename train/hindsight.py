@@ -1,0 +1,103 @@
+"""Hindsight relabelling: what was reached becomes a goal, what was sensed becomes an action.
+
+Of a batch, some transitions keep the goal they were made for. Some get the pose that they reached as
+their goal, and with it the goal bonus (the paper's relabelling). Some get a goal near that pose, at a
+distance drawn log-uniformly, which shows the critic how the reward falls off around a pose.
+
+A relabelled transition whose chambers had saturated also gets the action that asks for the spring
+lengths it ended at: they lead to the same equilibrium with no chamber off its reference
+(hindsight action transitions, Levy et al., ICLR 2019).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from mjx_softarm import obs, rewards
+from train.tqc import Transition
+
+
+class Experience(NamedTuple):
+    """A transition as stored: poses rather than observations, so that the goal can be exchanged."""
+
+    pose: Array  # (..., 6) [mm, deg]
+    goal: Array  # (..., 6) [mm, deg]
+    action: Array  # (..., n_chambers) in [-1, 1]
+    next_pose: Array  # (..., 6) [mm, deg]
+    sensed_action: Array  # (..., n_chambers) the action that asks for the spring lengths reached
+    saturated: Array  # (...,) bool
+    n_steps: Array  # (...,) actions taken in the episode, this one included
+
+
+@dataclass(frozen=True)
+class HindsightConfig:
+    """Shares of a batch; the rest keeps its own goal."""
+
+    reached_share: float = 0.5
+    near_share: float = 0.0
+    near_min_mm: float = 1.0
+    near_max_mm: float = 100.0
+    mm_per_deg: float = 1.0  # how far a near goal's angles are turned
+
+    def __post_init__(self):
+        if min(self.reached_share, self.near_share) < 0 or self.reached_share + self.near_share > 1:
+            raise ValueError(
+                "HindsightConfig: reached_share and near_share must be >= 0 and add up to 1 at most, "
+                f"got {self.reached_share} and {self.near_share}"
+            )
+
+
+def relabel(
+    batch: Experience,
+    key: Array,
+    config: HindsightConfig,
+    scale: obs.ObsScale,
+    reward_config: rewards.RewardConfig,
+    threshold: Array | float,
+) -> Transition:
+    """A batch to learn from; with both shares zero, its rewards are those the environment gave.
+
+    Args:
+        batch: B stored transitions.
+        key: for the draw.
+        config: shares.
+        scale: of the observations.
+        reward_config: weights of the reward.
+        threshold: theta of the reward, for a curriculum.
+    """
+    key_kind, key_near = jax.random.split(key)
+    n = batch.saturated.shape[0]
+    kind = jax.random.uniform(key_kind, (n,))
+    reached = kind < config.reached_share
+    near = ~reached & (kind < config.reached_share + config.near_share)
+    moved = batch.next_pose + _near_offsets(key_near, n, config).astype(batch.next_pose.dtype)
+    goal = jnp.where(reached[:, None], batch.next_pose, jnp.where(near[:, None], moved, batch.goal))
+    sensed = (reached | near) & batch.saturated
+    action = jnp.where(sensed[:, None], batch.sensed_action, batch.action)
+    saturated = batch.saturated & ~sensed
+    reward, done, _ = rewards.reward(
+        batch.next_pose, goal, batch.n_steps, saturated, reward_config, threshold
+    )
+    return Transition(
+        obs=obs.observe(batch.pose, goal, scale, reward_config),
+        action=action,
+        reward=reward,
+        next_obs=obs.observe(batch.next_pose, goal, scale, reward_config),
+        terminated=done.astype(reward.dtype),
+    )
+
+
+def _near_offsets(key: Array, n: int, config: HindsightConfig) -> Array:
+    """Offsets (n, 6) [mm, deg] in random directions, log-uniform in length."""
+    key_length, key_direction = jax.random.split(key)
+    low, high = jnp.log(config.near_min_mm), jnp.log(config.near_max_mm)
+    length = jnp.exp(jax.random.uniform(key_length, (n, 1), minval=low, maxval=high))
+    direction = jax.random.normal(key_direction, (n, 6))
+    direction = direction / jnp.linalg.norm(direction[:, :3], axis=-1, keepdims=True)
+    per_unit = jnp.array([1.0] * 3 + [1.0 / config.mm_per_deg] * 3)
+    return length * direction * per_unit
