@@ -133,7 +133,7 @@ class ReachEnv(Env):
         metrics = dict.fromkeys(("tip_error_mm", "reached", "saturated_chambers", "unsettled"), zero)
         metrics |= {f"reward_{name}": zero for name in ("goal", "error", "steps", "saturation")}
         info = {"saturated": jnp.array(False), "valid": jnp.array(True)}
-        return State(arm, self._observe(arm.pose, goal), zero, zero, metrics, info)
+        return State(arm, self.observe(arm.pose, goal), zero, zero, metrics, info)
 
     def step(self, state: State, action: Array) -> State:
         """Move to the references of `action` (n_chambers,) in [-1, 1]; `done` is 1 where the goal is reached.
@@ -167,7 +167,7 @@ class ReachEnv(Env):
         } | {f"reward_{name}": jnp.where(valid, term, 0.0) for name, term in terms.items()}
         return state.replace(
             pipeline_state=arm,
-            obs=self._observe(arm.pose, arm.goal),
+            obs=self.observe(arm.pose, arm.goal),
             reward=jnp.where(valid, value, 0.0),
             done=(reached | ~valid).astype(jnp.float32),
             metrics={**state.metrics, **metrics},
@@ -191,7 +191,8 @@ class ReachEnv(Env):
         end = settle(kinematics, arm.params, reference_m)
         return Motion(end.q, jnp.zeros_like(end.q), end.pressure_kpa), end
 
-    def _observe(self, pose: Array, goal: Array) -> Array:
+    def observe(self, pose: Array, goal: Array) -> Array:
+        """The observation (..., 18) of a pose and a goal (..., 6) [mm, deg]."""
         return obs.observe(pose, goal, self.scale, self.config.reward)
 
     def _randomised(self, key: Array) -> ArmParams:

@@ -21,12 +21,14 @@ from __future__ import annotations
 
 import math
 from enum import IntEnum
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from mjx_softarm._xp import Array, array_namespace
-from mjx_softarm.spec import ArmSpec
+
+if TYPE_CHECKING:
+    from mjx_softarm.spec import ArmSpec
 
 MU_0_H_PER_M = 1.26e-6  # the paper's value of the vacuum permeability; beta absorbs the last digit
 

@@ -10,12 +10,16 @@ from __future__ import annotations
 import dataclasses
 import math
 import tomllib
+import typing
 from dataclasses import dataclass, field, fields
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import tomli_w
+
+from mjx_softarm.sensors import SensorParams, frequency_from_length
 
 N_CHAMBERS_PER_SECTION = 3
 
@@ -46,7 +50,11 @@ class Rule:
             return isinstance(value, str)
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             return False
-        if self.kind is int and not isinstance(value, int):
+        if self.kind is int:
+            return isinstance(value, int) and self.low <= value <= self.high
+        try:
+            value = float(value)
+        except OverflowError:
             return False
         above = value > self.low if self.low_open else value >= self.low
         return math.isfinite(value) and above and value <= self.high
@@ -240,7 +248,8 @@ class ArmSpec:
         for group, values in groups.items():
             if group not in data:
                 raise SpecError(f"replace: unknown group {group!r}, expected one of {', '.join(data)}")
-            data[group] = {**data[group], **values} if isinstance(values, dict) else values
+            both_tables = isinstance(values, dict) and isinstance(data[group], dict)
+            data[group] = {**data[group], **values} if both_tables else values
         return self.from_dict(data, "replace")
 
     def validate(self, source: str = "spec") -> None:
@@ -263,6 +272,21 @@ class ArmSpec:
         _ordered(source, "chambers", self.chambers, "pressure_min_kpa", "pressure_max_kpa")
         _ordered(source, "springs", self.springs, "length_min_m", "length_max_m")
         _ordered(source, "sensor", self.sensor, "frequency_min_hz", "frequency_max_hz")
+        self._check_sensor(source)
+
+    def _check_sensor(self, source: str) -> None:
+        """The lengths that may be commanded must be lengths that the sensor can read."""
+        sensor = self.sensor
+        for name in ("length_min_m", "length_max_m"):
+            length_m = getattr(self.springs, name)
+            frequency_hz = frequency_from_length(np.full(self.n_chambers, length_m), SensorParams.from_spec(self))
+            readable = (frequency_hz >= sensor.frequency_min_hz) & (frequency_hz <= sensor.frequency_max_hz)
+            if not readable.all():
+                raise SpecError(
+                    f"{source}: springs.{name}: {length_m!r} reads {frequency_hz[~readable][0]:.6g} Hz, expected "
+                    f"sensor.frequency_min_hz to frequency_max_hz, {sensor.frequency_min_hz:g} to "
+                    f"{sensor.frequency_max_hz:g} Hz"
+                )
 
 
 def _ordered(source: str, group: str, part: Any, low: str, high: str) -> None:
@@ -274,24 +298,30 @@ def _ordered(source: str, group: str, part: Any, low: str, high: str) -> None:
 def _read_fields(cls: type, data: Any, source: str, prefix: str) -> dict[str, Any]:
     """The keyword arguments of `cls` from a table, each checked against its rule."""
     if not isinstance(data, dict):
-        raise SpecError(f"{source}: {prefix.rstrip('.')}: got {data!r}, expected a table")
+        raise SpecError(f"{source}: {prefix.rstrip('.') or 'specification'}: got {data!r}, expected a table")
     known = [item.name for item in fields(cls)]
     for name in data:
         if name not in known:
             raise SpecError(f"{source}: {prefix}{name}: unknown field, expected one of {', '.join(known)}")
-    groups = {item.name: globals()[item.type] for item in fields(cls) if item.type in globals() and not prefix}
+    hints = typing.get_type_hints(cls)
+    groups = {name: hint for name, hint in hints.items() if dataclasses.is_dataclass(hint)}
     values: dict[str, Any] = {}
     for item in fields(cls):
         path = prefix + item.name
         if item.name not in data:
-            raise SpecError(f"{source}: {path}: missing")
+            expected = "a table" if item.name in groups else _rule(item).text
+            raise SpecError(f"{source}: {path}: missing, expected {expected}")
         value = data[item.name]
         group = groups.get(item.name)
-        if group is not None and dataclasses.is_dataclass(group):
+        if group is not None:
             values[item.name] = group(**_read_fields(group, value, source, path + "."))
         else:
-            values[item.name] = _read_value(item.metadata.get("rule", Rule(kind=str)), value, source, path)
+            values[item.name] = _read_value(_rule(item), value, source, path)
     return values
+
+
+def _rule(item: dataclasses.Field) -> Rule:
+    return item.metadata.get("rule", Rule(kind=str))
 
 
 def _read_value(rule: Rule, value: Any, source: str, path: str) -> Any:

@@ -18,6 +18,8 @@ from mjx_softarm.sensors import (
 
 LENGTHS_M = np.linspace(0.060, 0.320, 9 * 29).reshape(29, 9)
 COMPENSATIONS_H = (1.0e-6, 0.0, -1.0e-6, 4.0e-6)
+# The converter's own range, so that each kind of fault can be reached.
+WIDE = ArmSpec.default().replace(sensor={"frequency_min_hz": 1.0e5, "frequency_max_hz": 1.0e7})
 
 
 @pytest.fixture(autouse=True)
@@ -29,7 +31,7 @@ def _strict():
 def make_spec(compensation_h=1.0e-6):
     beta = tuple(np.linspace(0.90, 0.98, 9))
     delta_m = tuple(np.linspace(-0.002, 0.003, 9))
-    return ArmSpec.default().replace(
+    return WIDE.replace(
         sensor={"compensation_h": compensation_h, "beta": beta, "delta_m": delta_m}
     )
 
@@ -51,7 +53,7 @@ def relative_error(got, expected):
 
 
 def test_default_sensor_at_the_free_length():
-    params = SensorParams.from_spec(ArmSpec.default())
+    params = SensorParams.from_spec(WIDE)
     # wire (200 - 2.45) / 0.93 = 212.4 mm; coil 3.774 uH; with 1 uH and 330 pF: 4.010 MHz
     frequency = frequency_from_length(np.full(9, 0.200), params)
     np.testing.assert_allclose(frequency, 4.010e6, rtol=1e-4)
@@ -142,7 +144,7 @@ def test_the_default_fallback_is_a_length_no_spring_has():
 
 
 def test_a_calibration_without_positive_length_is_reported():
-    params = SensorParams.from_spec(ArmSpec.default().replace(sensor={"delta_m": -0.05}))
+    params = SensorParams.from_spec(WIDE.replace(sensor={"delta_m": -0.05}))
     reading = length_from_frequency(np.full(9, 1.0e6), params)
     assert set(reading.fault) == {SensorFault.NO_LENGTH}
     assert "beta = 0.93 and delta = -0.05 m" in describe_faults(np.full(9, 1.0e6), reading.fault, params)
@@ -151,8 +153,8 @@ def test_a_calibration_without_positive_length_is_reported():
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("compensation_h, length_m", [(1e-6, 0.0), (1e-6, -0.9), (-1e-5, 0.2)])
 def test_a_length_no_coil_has_reads_nan_and_is_reported(compensation_h, length_m):
-    params = SensorParams.from_spec(make_spec(compensation_h))
-    frequency = frequency_from_length(np.full(9, length_m), params._replace(delta_m=np.zeros(9)))
+    params = SensorParams.from_spec(WIDE)._replace(compensation_h=compensation_h, delta_m=np.zeros(9))
+    frequency = frequency_from_length(np.full(9, length_m), params)
     assert np.isnan(frequency).all()
     assert set(length_from_frequency(frequency, params).fault) == {SensorFault.NOT_FINITE}
 
@@ -199,7 +201,7 @@ def test_gradient_of_an_impossible_length_is_finite():
 
 
 def test_faults_are_described_with_spring_reading_and_expectation():
-    params = SensorParams.from_spec(ArmSpec.default())
+    params = SensorParams.from_spec(WIDE)
     frequency = np.array([4.0e6, math.nan, 4.0e6, 1200.0, 4.0e6, 2.0e7, 9.0e6, 4.0e6, 4.0e6])
     text = describe_faults(frequency, length_from_frequency(frequency, params).fault, params)
     assert text.splitlines() == [

@@ -214,3 +214,26 @@ def test_a_value_in_a_file_is_refused_with_the_file_s_name(tmp_path, spec):
     spec.to_toml(path)
     path.write_text(path.read_text("utf-8").replace("gripper_kg = 0.45", "gripper_kg = nan"), "utf-8")
     assert message_of(ArmSpec.from_toml, path) == f"{path}: mass.gripper_kg: got nan, expected a number >= 0"
+
+
+@pytest.mark.parametrize(
+    "change, field",
+    [
+        ({"sensor": {"compensation_h": -1.0e-5}}, "length_min_m"),
+        ({"sensor": {"frequency_max_hz": 3.0e6}}, "length_max_m"),
+        ({"sensor": {"delta_m": 0.09}}, "length_min_m"),
+    ],
+)
+def test_lengths_that_the_sensor_cannot_read_are_refused(change, field):
+    with pytest.raises(SpecError, match=rf"springs\.{field}: .* reads .* expected sensor\.frequency_min_hz"):
+        ArmSpec.default().replace(**change)
+
+
+def test_a_number_too_large_for_a_float_is_refused():
+    with pytest.raises(SpecError, match=r"mass\.arm_kg: got 10+, expected a number > 0"):
+        ArmSpec.default().replace(mass={"arm_kg": 10**400})
+
+
+def test_a_table_in_the_place_of_a_text_is_refused():
+    with pytest.raises(SpecError, match="name: got .* expected a text"):
+        ArmSpec.default().replace(name={"first": "arm"})

@@ -1,0 +1,121 @@
+"""Command line: `python -m train reach | evaluate | export`."""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA logs a page for every program it takes from the cache
+
+import argparse  # noqa: E402
+import sys  # noqa: E402
+from pathlib import Path  # noqa: E402
+
+from rich.console import Console  # noqa: E402
+from rich.table import Table  # noqa: E402
+
+from mjx_softarm.spec import ArmSpec, SpecError  # noqa: E402
+from train.checkpoint import Run, RunError  # noqa: E402
+from train.config import PRESETS, ConfigError, override  # noqa: E402
+from train.evaluate import N_ACTIONS, N_GOALS, Summary  # noqa: E402
+
+PICTURES = ("learning_curve.png", "circle.png", "workspace_error.png")
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run a command; returns the exit status."""
+    options = _parser().parse_args(arguments)
+    console = Console()
+    try:
+        return options.command(options, console)
+    except (RunError, ConfigError, SpecError) as error:
+        Console(stderr=True).print(f"error: {error}", markup=False, highlight=False, soft_wrap=True)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m train", description="Train, evaluate and export policies.")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    reach = commands.add_parser("reach", help="train a policy that reaches poses of the workspace")
+    reach.add_argument("--preset", choices=PRESETS, default="quick", help="default: %(default)s")
+    reach.add_argument("--seed", type=int, default=0, help="of everything random; default: %(default)s")
+    reach.add_argument("--spec", type=Path, help="TOML file of the arm; default: the paper's arm")
+    reach.add_argument("--engine", choices=("chain", "mjx"), help="kinematics; default: chain")
+    reach.add_argument("--mode", choices=("quasistatic", "dynamic"), help="default: quasistatic")
+    reach.add_argument(
+        "--set", action="append", default=[], metavar="NAME=VALUE", help="any setting, e.g. tqc.gamma=0.95"
+    )
+    reach.add_argument("--out", type=Path, help="folder of the run; default: runs/reach-PRESET-seedSEED")
+    reach.add_argument("--resume", type=Path, metavar="RUN", help="continue this run; its own settings hold")
+    reach.set_defaults(command=_reach)
+    evaluate = commands.add_parser("evaluate", help="held-out goals and the circle, with pictures")
+    evaluate.add_argument("run", type=Path, help="folder of the run")
+    evaluate.set_defaults(command=_evaluate)
+    export = commands.add_parser("export", help="write the policy as one npz file")
+    export.add_argument("run", type=Path, help="folder of the run")
+    export.add_argument("--out", type=Path, help="default: RUN/policy.npz")
+    export.set_defaults(command=_export)
+    return parser
+
+
+def _reach(options: argparse.Namespace, console: Console) -> int:
+    from train.run import Interrupted, default_path, train
+
+    if options.resume:
+        run = Run.open(options.resume)
+    else:
+        shortcuts = {"seed": options.seed, "env.engine": options.engine, "env.mode": options.mode}
+        assignments = [f"{name}={value}" for name, value in shortcuts.items() if value is not None]
+        config = override(PRESETS[options.preset], [*assignments, *options.set])
+        spec = ArmSpec.from_toml(options.spec) if options.spec else ArmSpec.default()
+        path = options.out or default_path("reach", options.preset, config.seed)
+        run = Run.create(path, config, spec)
+    console.print(f"run: {run.path}", highlight=False)
+    try:
+        summary = train(run, console)
+    except Interrupted as stop:
+        console.print(str(stop), highlight=False)
+        return 130
+    _show(run, summary, console)
+    return 0
+
+
+def _evaluate(options: argparse.Namespace, console: Console) -> int:
+    from train.run import finish, load_policy
+
+    run = Run.open(options.run)
+    _show(run, finish(run, *load_policy(run)), console)
+    return 0
+
+
+def _export(options: argparse.Namespace, console: Console) -> int:
+    from train.export import export_run
+
+    path = export_run(Run.open(options.run), options.out)
+    console.print(f"policy: {path}", highlight=False)
+    return 0
+
+
+def _show(run: Run, summary: Summary, console: Console) -> None:
+    table = Table(title=f"{N_GOALS} held-out goals, at most {N_ACTIONS} actions each", title_justify="left")
+    table.add_column("figure")
+    table.add_column("value", justify="right")
+    for name, value in (
+        ("tip error, median", f"{summary.median_mm:.2f} mm"),
+        ("tip error, 95 %", f"{summary.p95_mm:.2f} mm"),
+        ("goals reached", f"{100 * summary.reached_share:.1f} %"),
+        ("goals with a saturated chamber", f"{100 * summary.saturated_share:.1f} %"),
+        ("arms that did not settle", f"{summary.unsettled}"),
+        ("circle, mean tip error", f"{summary.circle_mean_mm:.2f} mm"),
+        ("circle, largest tip error", f"{summary.circle_max_mm:.2f} mm"),
+        ("circle, saturated chambers", f"{summary.circle_saturated_chambers}"),
+    ):
+        table.add_row(name, value)
+    console.print(table)
+    for name in PICTURES:
+        console.print(f"picture: {run.path / name}", highlight=False, soft_wrap=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,154 @@
+"""A run's folder: its config with versions and commit, its checkpoints, its results."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import subprocess
+import sys
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import jax
+import orbax.checkpoint as ocp
+
+from mjx_softarm.spec import ArmSpec, SpecError
+from train.config import ConfigError, TrainConfig, from_dict, to_dict
+from train.job import TrainState
+
+PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "orbax-checkpoint", "numpy")
+N_KEPT = 2
+
+
+class RunError(ValueError):
+    """A folder that does not hold a run that can be used; the message names it and what is wrong."""
+
+
+def provenance() -> dict[str, Any]:
+    """Versions, machine and commit that a result depends on."""
+    versions = {}
+    for name in PACKAGES:
+        try:
+            versions[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            versions[name] = "absent"
+    return {
+        "python": platform.python_version(),
+        "packages": versions,
+        "machine": {"platform": platform.platform(), "cpus": os.cpu_count(), "device": str(jax.devices()[0])},
+        "command": " ".join(["python", "-m", "train", *sys.argv[1:]]),
+        "commit": _git("rev-parse", "HEAD"),
+        "uncommitted_changes": bool(_git("status", "--porcelain")),
+    }
+
+
+def _git(*arguments: str) -> str | None:
+    here = Path(__file__).resolve().parent
+    try:
+        done = subprocess.run(["git", *arguments], cwd=here, capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return done.stdout.strip()
+
+
+def write_json(path: Path, data: Any) -> None:
+    """Write a JSON file whole or not at all."""
+    temporary = path.with_name(path.name + ".part")
+    temporary.write_text(json.dumps(data, indent=2) + "\n", "utf-8")
+    os.replace(temporary, path)
+
+
+class Run:
+    """The folder of one run.
+
+    `config.json` (settings, arm, versions, commit), `checkpoints/`, `metrics.jsonl`, `evaluation.json`,
+    pictures, TensorBoard's event files and, once exported, `policy.npz`.
+    """
+
+    def __init__(self, path: Path, config: TrainConfig, spec: ArmSpec):
+        self.path, self.config, self.spec = path, config, spec
+        options = ocp.CheckpointManagerOptions(max_to_keep=N_KEPT, enable_async_checkpointing=False)
+        self._manager = ocp.CheckpointManager((path / "checkpoints").resolve(), options=options)
+
+    @classmethod
+    def create(cls, path: Path, config: TrainConfig, spec: ArmSpec) -> Run:
+        """Start a folder.
+
+        Raises:
+            RunError: the folder already holds a run, or cannot be made.
+        """
+        if (path / "config.json").exists():
+            raise RunError(f"{path}: already holds a run; continue it with --resume {path}, or choose another --out")
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+            data = {"train": to_dict(config), "spec": spec.to_dict(), "provenance": provenance()}
+            write_json(path / "config.json", data)
+        except OSError as error:
+            raise RunError(f"{path}: cannot be written: {error.strerror}") from error
+        return cls(path, config, spec)
+
+    @classmethod
+    def open(cls, path: Path) -> Run:
+        """An existing folder.
+
+        Raises:
+            RunError: there is no run in it, or its config cannot be read.
+        """
+        file = path / "config.json"
+        try:
+            data = json.loads(file.read_text("utf-8"))
+            return cls(path, from_dict(data["train"]), ArmSpec.from_dict(data["spec"], str(file)))
+        except OSError as error:
+            raise RunError(f"{path}: not the folder of a run: {file}: {error.strerror}") from error
+        except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, ConfigError, SpecError) as error:
+            raise RunError(f"{file}: not a run's config: {error!r}") from error
+
+    @property
+    def latest_epoch(self) -> int | None:
+        """Number of epochs behind the newest complete checkpoint, None if there is none."""
+        return self._manager.latest_step()
+
+    def save(self, epoch: int, state: TrainState) -> None:
+        """Write a checkpoint; an interrupted write leaves the one before it in force."""
+        self._manager.save(epoch, args=ocp.args.StandardSave(state))
+        self._manager.wait_until_finished()
+
+    def restore(self, like: TrainState) -> tuple[int, TrainState]:
+        """The newest checkpoint.
+
+        Args:
+            like: a state, or its shapes, structured as the run's.
+
+        Raises:
+            RunError: there is no checkpoint.
+        """
+        epoch = self.latest_epoch
+        if epoch is None:
+            raise RunError(f"{self.path}: holds no checkpoint; start it anew")
+        shapes = jax.tree.map(ocp.utils.to_shape_dtype_struct, like)
+        return epoch, self._manager.restore(epoch, args=ocp.args.StandardRestore(shapes))
+
+    def log(self, row: dict[str, Any]) -> None:
+        """Append a line to `metrics.jsonl`."""
+        with (self.path / "metrics.jsonl").open("a", encoding="utf-8") as file:
+            file.write(json.dumps(row) + "\n")
+
+    def metrics(self) -> list[dict[str, Any]]:
+        """The lines of `metrics.jsonl`, up to the first incomplete one."""
+        rows = []
+        file = self.path / "metrics.jsonl"
+        for line in file.read_text("utf-8").splitlines() if file.exists() else []:
+            try:
+                rows.append(json.loads(line))
+            except json.JSONDecodeError:
+                break
+        return rows
+
+    def truncate_metrics(self, epoch: int) -> None:
+        """Forget lines later than an epoch, before it is continued from there."""
+        rows = [row for row in self.metrics() if row["epoch"] <= epoch]
+        temporary = self.path / "metrics.jsonl.part"
+        temporary.write_text("".join(json.dumps(row) + "\n" for row in rows), "utf-8")
+        os.replace(temporary, self.path / "metrics.jsonl")

@@ -1,0 +1,177 @@
+"""What a run is made of, as frozen data; presets; overrides; JSON."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import types
+import typing
+from dataclasses import dataclass, field
+from typing import Any
+
+from mjx_softarm.env import EnvConfig
+from train.hindsight import HindsightConfig
+from train.tqc import TQCConfig
+
+
+class ConfigError(ValueError):
+    """A setting that cannot be used; the message names it, what it got and what was expected."""
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """A training run.
+
+    Attributes:
+        seed: of everything random in the run.
+        n_arms: arms simulated side by side.
+        episode_length: actions per episode at most.
+        total_env_steps: actions of all arms together.
+        updates_per_env_step: gradient steps per action of one arm.
+        warmup_env_steps: actions drawn uniformly before the first gradient step.
+        batch_size: transitions per gradient step.
+        replay_capacity: transitions kept.
+        threshold_start: theta of the reward that is learned from, at the start; it falls
+            geometrically, so that the policy is first led to the goal, then onto it.
+        threshold_end: theta at `threshold_share` of the run and after.
+        threshold_share: share of the run over which theta falls.
+        vector_steps_per_epoch: actions of each arm between two reports.
+        evaluation_epochs: epochs between two evaluations and checkpoints.
+    """
+
+    seed: int = 0
+    n_arms: int = 128
+    episode_length: int = 4
+    total_env_steps: int = 300_000
+    updates_per_env_step: float = 1.0
+    warmup_env_steps: int = 2_048
+    batch_size: int = 256
+    replay_capacity: int = 400_000
+    threshold_start: float = 0.03
+    threshold_end: float = 0.03
+    threshold_share: float = 0.5
+    vector_steps_per_epoch: int = 16
+    evaluation_epochs: int = 10
+    env: EnvConfig = field(default_factory=EnvConfig)
+    tqc: TQCConfig = field(default_factory=TQCConfig)
+    hindsight: HindsightConfig = field(default_factory=HindsightConfig)
+
+    def __post_init__(self) -> None:
+        for name in ("n_arms", "episode_length", "total_env_steps", "batch_size", "vector_steps_per_epoch"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"{name}: got {getattr(self, name)}, expected at least 1")
+        if self.replay_capacity < self.n_arms:
+            raise ConfigError(f"replay_capacity: got {self.replay_capacity}, expected at least n_arms = {self.n_arms}")
+        if self.n_updates_per_vector_step < 1:
+            raise ConfigError(
+                f"updates_per_env_step: got {self.updates_per_env_step}, expected at least one update per step "
+                f"of all {self.n_arms} arms, {1 / self.n_arms:.4g}"
+            )
+
+    @property
+    def n_updates_per_vector_step(self) -> int:
+        return round(self.updates_per_env_step * self.n_arms)
+
+    @property
+    def n_epochs(self) -> int:
+        return -(-self.total_env_steps // (self.n_arms * self.vector_steps_per_epoch))
+
+    @property
+    def n_updates(self) -> int:
+        """Gradient steps of the whole run, warm-up epochs counted as if they had any."""
+        return self.n_epochs * self.vector_steps_per_epoch * self.n_updates_per_vector_step
+
+
+_PAPER = TrainConfig()
+
+PRESETS: dict[str, TrainConfig] = {
+    "quick": dataclasses.replace(_PAPER, total_env_steps=40_000),
+    "paper": _PAPER,
+}
+
+
+def override(config: Any, assignments: list[str]) -> Any:
+    """A copy of a config with settings such as `tqc.gamma=0.95` changed.
+
+    Raises:
+        ConfigError: unknown setting, wrong type, or a value that the config refuses.
+    """
+    for assignment in assignments:
+        path, equals, text = assignment.partition("=")
+        if not equals:
+            raise ConfigError(f"{assignment}: expected NAME=VALUE, for example tqc.gamma=0.95")
+        config = _replace(config, path.split("."), text, path)
+    return config
+
+
+def _replace(config: Any, names: list[str], text: str, path: str) -> Any:
+    known = [item.name for item in dataclasses.fields(config)]
+    if names[0] not in known:
+        raise ConfigError(f"{path}: unknown setting, expected one of {', '.join(known)}")
+    value = getattr(config, names[0])
+    if len(names) > 1 and not dataclasses.is_dataclass(value):
+        raise ConfigError(f"{path}: {names[0]} has no settings of its own")
+    if len(names) == 1 and dataclasses.is_dataclass(value):
+        inner = ", ".join(f"{path}.{item.name}" for item in dataclasses.fields(value))
+        raise ConfigError(f"{path}: a group, expected one of {inner}")
+    kind = typing.get_type_hints(type(config))[names[0]]
+    new = _replace(value, names[1:], text, path) if len(names) > 1 else _parse(text, kind, path)
+    try:
+        return dataclasses.replace(config, **{names[0]: new})
+    except ValueError as error:
+        raise ConfigError(f"{path}={text}: {error}") from error
+
+
+def _parse(text: str, kind: Any, path: str) -> Any:
+    """A value of the setting's type from its text; JSON but for bare words."""
+    try:
+        value = json.loads(text)
+    except json.JSONDecodeError:
+        value = text
+    return _coerce(value, kind, path)
+
+
+def _coerce(value: Any, kind: Any, path: str) -> Any:
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin in (typing.Union, types.UnionType):
+        if value is None and type(None) in arguments:
+            return None
+        kind = next(argument for argument in arguments if argument is not type(None))
+        origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin is typing.Literal and value in arguments:
+        return value
+    if origin is tuple and isinstance(value, list):
+        return tuple(_coerce(item, arguments[0], path) for item in value)
+    if kind is float and isinstance(value, (int, float)) and not isinstance(value, bool):
+        return float(value)
+    if isinstance(kind, type) and type(value) is kind:
+        return value
+    raise ConfigError(f"{path}: got {value!r}, expected {getattr(kind, '__name__', kind)}")
+
+
+def to_dict(config: TrainConfig) -> dict[str, Any]:
+    """Nested dictionaries for JSON; tuples become lists."""
+    return json.loads(json.dumps(dataclasses.asdict(config)))
+
+
+def from_dict(data: dict[str, Any]) -> TrainConfig:
+    """The config that `to_dict` gave.
+
+    Raises:
+        ConfigError: a setting is missing, unknown or of the wrong type.
+    """
+    return _from_dict(TrainConfig, data, "config")
+
+
+def _from_dict(cls: type, data: Any, path: str) -> Any:
+    hints = typing.get_type_hints(cls)
+    if not isinstance(data, dict) or data.keys() != hints.keys():
+        got = sorted(data) if isinstance(data, dict) else data
+        raise ConfigError(f"{path}: got {got}, expected the settings {sorted(hints)}")
+    values = {
+        name: _from_dict(kind, data[name], f"{path}.{name}")
+        if dataclasses.is_dataclass(kind)
+        else _coerce(data[name], kind, f"{path}.{name}")
+        for name, kind in hints.items()
+    }
+    return cls(**values)

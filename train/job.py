@@ -1,0 +1,128 @@
+"""One epoch of training as one jitted, donated call: act, store, relabel, update."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from brax.envs.base import State
+from jax import Array
+
+from mjx_softarm import xla
+from mjx_softarm.env import ReachEnv
+from mjx_softarm.wrappers import VectorEnv
+from train import replay
+from train.config import TrainConfig
+from train.hindsight import Experience, relabel
+from train.tqc import TQC, TQCState
+
+
+class TrainState(NamedTuple):
+    """All that a run consists of; with it, a run continues bit for bit."""
+
+    arms: State  # n_arms
+    agent: TQCState
+    memory: replay.Replay  # of Experience
+    key: Array
+    n_env_steps: Array  # () int32 actions taken, invalid ones included
+    n_unsettled: Array  # () int32 arms that were masked and reset
+
+
+class Job:
+    """A run's fixed parts, and the two functions that change its state.
+
+    `n_traces` counts how often the epoch was traced: once in a run.
+    """
+
+    def __init__(self, config: TrainConfig, env: ReachEnv):
+        self.config = config
+        self.env = env
+        self.arms = VectorEnv(env, config.n_arms, config.episode_length)
+        self.agent = TQC(env.observation_size, env.action_size, config.tqc, config.n_updates)
+        self.n_traces = 0
+        self.init = xla.jit(self._init)
+        self.epoch = xla.jit(self._epoch, donate_argnums=0)
+
+    def _init(self, key: Array) -> TrainState:
+        key, key_arms, key_agent = jax.random.split(key, 3)
+        arms = self.arms.reset(key_arms)
+        experience = jax.eval_shape(lambda: self._experience(arms, jnp.zeros((self.arms.n, self.env.action_size)), arms))
+        one = jax.tree.map(lambda x: jnp.zeros(x.shape[1:], x.dtype), experience)
+        return TrainState(
+            arms=arms,
+            agent=self.agent.init(key_agent),
+            memory=replay.create(one, self.config.replay_capacity),
+            key=key,
+            n_env_steps=jnp.zeros((), jnp.int32),
+            n_unsettled=jnp.zeros((), jnp.int32),
+        )
+
+    def _epoch(self, state: TrainState) -> tuple[TrainState, dict[str, Array]]:
+        """Advance every arm by `vector_steps_per_epoch` actions, with the updates that go with them.
+
+        Returns:
+            The next state; means over the epoch by name, and `unsettled`, the number of masked arms.
+        """
+        self.n_traces += 1
+        state, metrics = jax.lax.scan(self._vector_step, state, None, length=self.config.vector_steps_per_epoch)
+        unsettled = jnp.sum(metrics.pop("env/unsettled")) * self.config.n_arms
+        return state, {**jax.tree.map(jnp.mean, metrics), "env/unsettled": unsettled}
+
+    def _vector_step(self, state: TrainState, _) -> tuple[TrainState, dict[str, Array]]:
+        key, key_act, key_random, key_reset, key_updates = jax.random.split(state.key, 5)
+        warm = state.n_env_steps >= self.config.warmup_env_steps
+        explored = jax.random.uniform(key_random, (self.arms.n, self.env.action_size), minval=-1.0)
+        action = self.agent.act(state.agent.actor_params, state.arms.obs, key_act)
+        action = jnp.where(warm, action, explored)
+        arms, after, outcome = self.arms.step(state.arms, action, key_reset)
+        experience = self._experience(state.arms, action, after)
+        valid = outcome.valid & replay.finite_rows(experience)
+        state = state._replace(
+            arms=arms,
+            memory=replay.add(state.memory, experience, valid),
+            key=key,
+            n_env_steps=state.n_env_steps + self.arms.n,
+            n_unsettled=state.n_unsettled + jnp.sum(~valid, dtype=jnp.int32),
+        )
+        agent, losses = self._updates(state, key_updates, warm)
+        env_metrics = {f"env/{name}": jnp.mean(value) for name, value in after.metrics.items()}
+        return state._replace(agent=agent), env_metrics | {f"tqc/{name}": x for name, x in losses.items()}
+
+    def _updates(self, state: TrainState, key: Array, warm: Array) -> tuple[TQCState, dict[str, Array]]:
+        keys = jax.random.split(key, self.config.n_updates_per_vector_step)
+        threshold = self.threshold(state.agent.step)
+
+        def update(agent: TQCState, key: Array):
+            key_sample, key_relabel, key_update = jax.random.split(key, 3)
+            stored = replay.sample(state.memory, key_sample, self.config.batch_size)
+            batch = relabel(
+                stored, key_relabel, self.config.hindsight, self.env.scale, self.config.env.reward, threshold
+            )
+            return self.agent.update(agent, batch, key_update)
+
+        def run(agent: TQCState):
+            agent, losses = jax.lax.scan(update, agent, keys)
+            return agent, jax.tree.map(jnp.mean, losses)
+
+        shapes = jax.eval_shape(run, state.agent)[1]
+        nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+        return jax.lax.cond(warm, run, lambda agent: (agent, nothing), state.agent)
+
+    def threshold(self, n_updates: Array) -> Array:
+        """Theta of the reward after some updates: geometric from start to end."""
+        config = self.config
+        share = jnp.clip(n_updates / (config.threshold_share * config.n_updates), 0.0, 1.0)
+        return config.threshold_start * (config.threshold_end / config.threshold_start) ** share
+
+    def _experience(self, before: State, action: Array, after: State) -> Experience:
+        start, end = before.pipeline_state, after.pipeline_state
+        return Experience(
+            pose=start.pose,
+            goal=start.goal,
+            action=action,
+            next_pose=end.pose,
+            sensed_action=self.env.action_of(end.spring_m + end.sensor_offset_m),
+            saturated=after.info["saturated"],
+            n_steps=end.n_steps,
+        )

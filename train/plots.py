@@ -1,0 +1,107 @@
+"""The pictures of a run: learning curve, circle, map of the error over the workspace."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.figure import Figure
+
+from train.evaluate import Reached
+
+INK, BLUE, ORANGE, GREY = "#222222", "#1f6fb4", "#e07b28", "#9aa0a6"
+DPI = 150
+
+
+def draw_all(folder: Path, rows: list[dict[str, Any]], workspace: Reached, circle: Reached) -> list[Path]:
+    """Write every picture into a run's folder; returns their paths."""
+    pictures = {
+        "learning_curve.png": learning_curve(rows),
+        "circle.png": circle_figure(circle),
+        "workspace_error.png": workspace_figure(workspace),
+    }
+    for name, figure in pictures.items():
+        figure.savefig(folder / name, dpi=DPI)
+    return [folder / name for name in pictures]
+
+
+def _axes(figure: Figure, position: Any, title: str, x: str, y: str) -> Any:
+    axes = figure.add_subplot(position)
+    axes.set_title(title, loc="left", fontsize=10, color=INK)
+    axes.set_xlabel(x)
+    axes.set_ylabel(y)
+    axes.grid(color="#e6e6e6", linewidth=0.6)
+    axes.spines[["top", "right"]].set_visible(False)
+    return axes
+
+
+def learning_curve(rows: list[dict[str, Any]]) -> Figure:
+    """Held-out tip error and success over environment steps."""
+    figure = Figure(figsize=(10, 4), layout="constrained")
+    evaluated = [row for row in rows if "evaluation/median_mm" in row]
+    steps = [row["env_steps"] for row in evaluated]
+    left = _axes(figure, 121, "tip error on held-out goals", "environment steps", "mm")
+    left.plot(steps, [row["evaluation/median_mm"] for row in evaluated], color=BLUE, label="median")
+    left.plot(steps, [row["evaluation/p95_mm"] for row in evaluated], color=ORANGE, label="95 %")
+    left.plot(steps, [row["evaluation/circle_mean_mm"] for row in evaluated], color=GREY, label="circle, mean")
+    left.set_yscale("log")
+    left.yaxis.set_major_formatter("{x:g}")
+    left.legend(frameon=False)
+    right = _axes(figure, 122, "goals reached, chambers saturated", "environment steps", "%")
+    for name, colour, label in (
+        ("reached_share", BLUE, "goals reached"),
+        ("saturated_share", ORANGE, "goals with a saturated chamber"),
+    ):
+        right.plot(steps, [100 * row[f"evaluation/{name}"] for row in evaluated], color=colour, label=label)
+    right.set_ylim(0, 100)
+    right.legend(frameon=False)
+    return figure
+
+
+def circle_figure(circle: Reached) -> Figure:
+    """The circle seen from above, the error and the pressures along it."""
+    figure = Figure(figsize=(12, 4), layout="constrained")
+    goal, pose = np.asarray(circle.goal), np.asarray(circle.pose)
+    error = circle.tip_error_mm
+    left = _axes(figure, 131, "circle from above", "x [mm]", "y [mm]")
+    left.plot(*np.vstack([goal, goal[:1]])[:, :2].T, color=GREY, label="goal")
+    left.plot(pose[:, 0], pose[:, 1], "o", markersize=3.5, color=BLUE, label="reached")
+    left.set_aspect("equal")
+    left.legend(frameon=False, loc="center")
+    title = f"tip error: mean {error.mean():.2f} mm, largest {error.max():.2f} mm"
+    middle = _axes(figure, 132, title, "point", "mm")
+    middle.bar(np.arange(len(error)), error, color=BLUE)
+    n_saturated = int(np.sum(circle.saturated_chambers))
+    right = _axes(figure, 133, f"pressures; {n_saturated} saturated chambers", "point", "kPa")
+    for k, line in enumerate(np.asarray(circle.pressure_kpa).T):
+        right.plot(line, color=colormaps["tab10"](k % 10), label=f"chamber {k}", linewidth=1.2)
+    right.legend(frameon=False, fontsize=6, ncols=3)
+    return figure
+
+
+def workspace_figure(workspace: Reached) -> Figure:
+    """Where in the workspace the tip error is how large, and its distribution."""
+    figure = Figure(figsize=(13, 4), layout="constrained")
+    goal, error = np.asarray(workspace.goal), workspace.tip_error_mm
+    order = np.argsort(error)
+    top = max(1.0, float(np.quantile(error, 0.98)))
+    for position, columns, title in ((131, (1, 2), "side view"), (132, (0, 1), "from above")):
+        names = [f"{'xyz'[k]} [mm]" for k in columns]
+        axes = _axes(figure, position, f"tip error at the goals, {title}", *names)
+        points = axes.scatter(
+            goal[order, columns[0]], goal[order, columns[1]], c=error[order], s=5, cmap="viridis", vmin=0, vmax=top
+        )
+        axes.set_aspect("equal")
+    figure.colorbar(points, ax=axes, label="mm", extend="max")
+    axes = _axes(figure, 133, f"distribution over {len(error)} held-out goals", "tip error [mm]", "share of goals [%]")
+    axes.plot(np.sort(error), 100 * np.arange(1, len(error) + 1) / len(error), color=BLUE)
+    for share, colour in ((50, GREY), (95, ORANGE)):
+        at = float(np.quantile(error, share / 100))
+        axes.plot([at, at], [0, share], color=colour, linewidth=1, label=f"{share} %: {at:.1f} mm")
+    axes.set_xlim(0, 3 * top)
+    axes.set_xscale("symlog", linthresh=1.0)
+    axes.set_ylim(0, 100)
+    axes.legend(frameon=False, loc="lower right")
+    return figure

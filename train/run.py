@@ -1,0 +1,149 @@
+"""The host's side of a training run: loop over epochs, show, log, checkpoint, stop when asked to."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from tensorboardX import SummaryWriter
+
+from mjx_softarm import xla
+from mjx_softarm.env import ReachEnv
+from train import plots
+from train.checkpoint import Run, write_json
+from train.evaluate import Evaluator, Summary
+from train.job import Job, TrainState
+
+
+class Interrupted(Exception):
+    """The user stopped the run; its state is saved."""
+
+
+def train(run: Run, console: Console) -> Summary:
+    """Train to the end of the run's config, from its newest checkpoint if it has one.
+
+    Args:
+        run: the folder; its config says everything.
+        console: where progress is shown.
+
+    Returns:
+        Figures of the final policy.
+
+    Raises:
+        Interrupted: after Ctrl-C or a termination signal, once the state is saved.
+    """
+    xla.enable_compilation_cache()
+    console.print("drawing goals from the reachable workspace ...")
+    env = ReachEnv(run.spec, run.config.env)
+    job = Job(run.config, env)
+    evaluator = Evaluator(env, job.agent)
+    epoch, state = 0, job.init(jax.random.PRNGKey(run.config.seed))
+    if run.latest_epoch is not None:
+        epoch, state = run.restore(state)
+        run.truncate_metrics(epoch)
+        console.print(f"continuing after epoch {epoch} of {run.config.n_epochs}")
+    console.print("compiling (cached for the next start) ...")
+    with _asked_to_stop() as asked, SummaryWriter(str(run.path)) as board, _progress(console) as progress:
+        bar = progress.add_task("training", total=run.config.n_epochs, completed=epoch, text="")
+        while epoch < run.config.n_epochs:
+            state, row = _timed_epoch(job, state)
+            epoch += 1
+            due = epoch % run.config.evaluation_epochs == 0 or epoch == run.config.n_epochs
+            if due:
+                row |= _evaluation(evaluator, state)
+            _record(run, board, epoch, state, row)
+            if due or asked:
+                run.save(epoch, state)
+            progress.update(bar, completed=epoch, text=_line(row))
+            if asked and epoch < run.config.n_epochs:
+                raise Interrupted(f"stopped after epoch {epoch}; continue with --resume {run.path}")
+    return finish(run, evaluator, state.agent.actor_params)
+
+
+def finish(run: Run, evaluator: Evaluator, actor_params: Any) -> Summary:
+    """Evaluate a policy, write `evaluation.json` and the pictures; returns the figures."""
+    summary, workspace, circle = evaluator(actor_params)
+    write_json(run.path / "evaluation.json", summary.to_dict())
+    plots.draw_all(run.path, run.metrics(), workspace, circle)
+    return summary
+
+
+def load_policy(run: Run) -> tuple[Evaluator, Any]:
+    """The evaluator of a run, and the actor of its newest checkpoint."""
+    xla.enable_compilation_cache()
+    env = ReachEnv(run.spec, run.config.env)
+    job = Job(run.config, env)
+    _, state = run.restore(jax.eval_shape(job.init, jax.random.PRNGKey(0)))
+    return Evaluator(env, job.agent), state.agent.actor_params
+
+
+def _timed_epoch(job: Job, state: TrainState) -> tuple[TrainState, dict[str, float]]:
+    start = time.perf_counter()
+    updates = int(state.agent.step)
+    state, metrics = job.epoch(state)
+    row = {name: float(value) for name, value in jax.device_get(metrics).items()}
+    seconds = time.perf_counter() - start
+    config = job.config
+    row["speed/env_steps_per_s"] = config.n_arms * config.vector_steps_per_epoch / seconds
+    row["speed/updates_per_s"] = (int(state.agent.step) - updates) / seconds
+    return state, row
+
+
+def _evaluation(evaluator: Evaluator, state: TrainState) -> dict[str, float]:
+    summary, _, _ = evaluator(state.agent.actor_params)
+    return {f"evaluation/{name}": value for name, value in summary.to_dict().items()}
+
+
+def _record(run: Run, board: SummaryWriter, epoch: int, state: TrainState, row: dict[str, float]) -> None:
+    steps = int(state.n_env_steps)
+    run.log({"epoch": epoch, "env_steps": steps, "updates": int(state.agent.step), **row})
+    for name, value in row.items():
+        board.add_scalar(name, np.float32(value), steps)
+
+
+def _line(row: dict[str, float]) -> str:
+    text = (
+        f"{row['speed/env_steps_per_s']:.0f} env steps/s  {row['speed/updates_per_s']:.0f} updates/s  "
+        f"success {100 * row['env/reached']:.0f} %"
+    )
+    if "evaluation/median_mm" in row:
+        text += f"  held-out median {row['evaluation/median_mm']:.1f} mm"
+    return text
+
+
+def _progress(console: Console) -> Progress:
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    return Progress(*columns, TextColumn("{task.fields[text]}"), console=console, speed_estimate_period=120)
+
+
+@contextmanager
+def _asked_to_stop() -> Iterator[list[int]]:
+    """A list that fills when the process is asked to stop; a second Ctrl-C stops at once."""
+    asked: list[int] = []
+
+    def note(number: int, _frame: Any) -> None:
+        if asked and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        asked.append(number)
+
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield asked
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def default_path(task: str, preset: str, seed: int) -> Path:
+    """`runs/TASK-PRESET-seedN`, or the first free one numbered after it."""
+    base = Path("runs") / f"{task}-{preset}-seed{seed}"
+    candidates = (base if k == 1 else base.with_name(f"{base.name}-{k}") for k in range(1, 10_000))
+    return next(path for path in candidates if not path.exists())
