@@ -144,7 +144,7 @@ class ReachEnv(Env):
         arm: ArmState = state.pipeline_state
         reference = self.reference_m(action)
         motion, end = self._move(arm, reference - arm.sensor_offset_m)
-        valid = end.settled
+        valid = end.settled & jnp.all(jnp.isfinite(action))  # a NaN would ask for a length of 0
         moved = arm._replace(
             motion=motion,
             pose=pose_from_frame(end.tip_position_m, end.tip_rotation),
@@ -163,8 +163,8 @@ class ReachEnv(Env):
             "tip_error_mm": jnp.linalg.norm(arm.pose[:3] - arm.goal[:3]),
             "reached": (reached & valid).astype(jnp.float32),
             "saturated_chambers": jnp.sum(saturated).astype(jnp.float32),
-            "unsettled": 1.0 - valid,
-        } | {f"reward_{name}": jnp.where(valid, term, 0.0) for name, term in terms.items()}
+            "unsettled": (~valid).astype(jnp.float32),
+        } | {f"reward_{name}": jnp.where(valid, term, 0.0).astype(jnp.float32) for name, term in terms.items()}
         return state.replace(
             pipeline_state=arm,
             obs=self.observe(arm.pose, arm.goal),

@@ -26,7 +26,7 @@ class RunError(ValueError):
     """A folder that does not hold a run that can be used; the message names it and what is wrong."""
 
 
-def provenance() -> dict[str, Any]:
+def provenance(program: str) -> dict[str, Any]:
     """Versions, machine and commit that a result depends on."""
     versions = {}
     for name in PACKAGES:
@@ -38,7 +38,7 @@ def provenance() -> dict[str, Any]:
         "python": platform.python_version(),
         "packages": versions,
         "machine": {"platform": platform.platform(), "cpus": os.cpu_count(), "device": str(jax.devices()[0])},
-        "command": " ".join(["python", "-m", "train", *sys.argv[1:]]),
+        "command": " ".join(["python", "-m", program, *sys.argv[1:]]),
         "commit": _git("rev-parse", "HEAD"),
         "uncommitted_changes": bool(_git("status", "--porcelain")),
     }
@@ -83,7 +83,7 @@ class Run:
             raise RunError(f"{path}: already holds a run; continue it with --resume {path}, or choose another --out")
         try:
             path.mkdir(parents=True, exist_ok=True)
-            data = {"train": to_dict(config), "spec": spec.to_dict(), "provenance": provenance()}
+            data = {"train": to_dict(config), "spec": spec.to_dict(), "provenance": provenance("train")}
             write_json(path / "config.json", data)
         except OSError as error:
             raise RunError(f"{path}: cannot be written: {error.strerror}") from error

@@ -16,7 +16,7 @@ Items = Any  # a pytree of arrays sharing a leading axis
 
 
 class Replay(NamedTuple):
-    """Ring of N = capacity slots. The filled ones are 0 ... size - 1, in any order of age once it has wrapped."""
+    """Ring of N = capacity slots, of which 0 ... size - 1 are filled."""
 
     data: Items  # leaves (N, ...)
     position: Array  # () int32, the next slot to write
@@ -111,8 +111,8 @@ def _check(replay: Replay, items: Items, valid: Array) -> int:
     rings, _ = jax.tree_util.tree_flatten_with_path(replay.data)
     for (path, ring), rows in zip(rings, jax.tree.leaves(items), strict=True):
         if rows.shape != (batch, *ring.shape[1:]) or rows.dtype != ring.dtype:
+            name, shape = jax.tree_util.keystr(path), (batch, *ring.shape[1:])
             raise ValueError(
-                f"Replay items{jax.tree_util.keystr(path)}: expected {(batch, *ring.shape[1:])} {ring.dtype}, "
-                f"got {rows.shape} {rows.dtype}"
+                f"Replay items{name}: expected {shape} {ring.dtype}, got {rows.shape} {rows.dtype}"
             )
     return capacity

@@ -24,7 +24,7 @@ Params = Any  # a flax parameter tree
 
 @dataclass(frozen=True)
 class TQCConfig:
-    """Hyperparameters, by default those of stable-baselines3-contrib. Raises ValueError naming a bad field."""
+    """Hyperparameters, by default stable-baselines3-contrib's. Raises ValueError naming a bad field."""
 
     hidden_actor: tuple[int, ...] = (256, 256)
     hidden_critic: tuple[int, ...] = (256, 256)  # of each critic
@@ -33,6 +33,7 @@ class TQCConfig:
     n_drop_per_critic: int = 2  # largest pooled target quantiles dropped, per critic
     layer_norm: bool = False  # in the critics
     learning_rate: float = 3e-4  # of actor and critics (Adam)
+    learning_rate_end: float = 1.0  # share of it left at the end; it falls along a half cosine
     learning_rate_alpha: float = 3e-4  # of the temperature; 0 holds it at initial_alpha
     gamma: float = 0.99  # discount per step
     tau: float = 0.005  # Polyak rate of the target critics, per update
@@ -45,6 +46,7 @@ class TQCConfig:
             "hidden_critic": (len(self.hidden_critic) > 0, "at least one layer"),
             "n_critics": (self.n_critics > 0, "a positive number"),
             "n_drop_per_critic": (0 <= self.n_drop_per_critic < self.n_quantiles, "0 to n_quantiles - 1"),
+            "learning_rate_end": (0.0 <= self.learning_rate_end <= 1.0, "a number in [0, 1]"),
             "gamma": (0.0 <= self.gamma <= 1.0, "a number in [0, 1]"),
             "tau": (0.0 < self.tau <= 1.0, "a number in (0, 1]"),
             "initial_alpha": (self.initial_alpha > 0.0, "a positive number"),
@@ -80,7 +82,7 @@ class TQCState(NamedTuple):
 def quantile_huber_loss(quantiles: Array, targets: Array) -> Array:
     """The critics' loss: regression of every predicted quantile m on every target k.
 
-    With delta = target_k - quantile_m, clip = delta limited to [-1, 1] and tau_m = (m + 1/2) / M, a pair costs
+    With delta = target_k - quantile_m, clip = delta limited to [-1, 1], tau_m = (m + 1/2) / M, a pair costs
     |tau_m - 1[delta < 0]| * Huber(delta), where Huber(delta) = clip * (delta - clip / 2) has the slope clip.
     The loss is the mean over B, K, C and M, as in stable-baselines3-contrib; the paper sums over M. Targets
     are constants. One pass over the pairs gives loss and slope, the slope attached by a term of value zero:
@@ -189,13 +191,18 @@ def alpha_loss(log_alpha: Array, log_prob: Array, target_entropy: float) -> Arra
 
 
 class TQC:
-    """The agent: networks and optimisers of fixed structure, and pure functions of a `TQCState`."""
+    """The agent: networks and optimisers of fixed structure, and pure functions of a `TQCState`.
 
-    def __init__(self, obs_size: int, action_size: int, config: TQCConfig = TQCConfig()) -> None:
+    `n_updates` is the length of the learning rate's decay, needed where it decays.
+    """
+
+    def __init__(
+        self, obs_size: int, action_size: int, config: TQCConfig = TQCConfig(), n_updates: int | None = None
+    ) -> None:
         self.obs_size, self.action_size, self.config = obs_size, action_size, config
         self.actor = Actor(action_size, config.hidden_actor)
         self.critics = Critics(config.n_critics, config.n_quantiles, config.hidden_critic, config.layer_norm)
-        self.optimizer = optax.adam(config.learning_rate)
+        self.optimizer = optax.adam(_learning_rate(config, n_updates))
         self.alpha_optimizer = optax.adam(config.learning_rate_alpha)
         self.target_entropy = -float(action_size) if config.target_entropy is None else config.target_entropy
 
@@ -293,6 +300,14 @@ class TQC:
             expected = (n, *sizes.get(name, ()))
             if value.shape != expected:
                 raise ValueError(f"Transition.{name}: expected shape {expected}, got {value.shape}")
+
+
+def _learning_rate(config: TQCConfig, n_updates: int | None) -> float | optax.Schedule:
+    if config.learning_rate_end == 1.0:
+        return config.learning_rate
+    if n_updates is None:
+        raise ValueError("TQC: learning_rate_end is not 1, so n_updates is needed, got None")
+    return optax.cosine_decay_schedule(config.learning_rate, n_updates, config.learning_rate_end)
 
 
 def _descend(

@@ -27,7 +27,7 @@ def relu(x):
 def test_actor_equals_the_same_layers_written_in_numpy():
     actor = Actor(ACTION, hidden=(5, 4))
     obs = jax.random.normal(jax.random.key(0), (6, OBS))
-    params = actor.init(jax.random.key(1), obs)
+    params = jax.jit(actor.init)(jax.random.key(1), obs)
     mean, log_std = actor.apply(params, obs)
 
     layers = params["params"]
@@ -52,7 +52,7 @@ def test_each_critic_equals_its_own_network_in_numpy():
     critics = Critics(n_critics, n_quantiles=4, hidden=(width, 6))
     obs = jax.random.normal(jax.random.key(0), (7, OBS))
     action = jax.random.uniform(jax.random.key(1), (7, ACTION))
-    params = critics.init(jax.random.key(2), obs, action)
+    params = jax.jit(critics.init)(jax.random.key(2), obs, action)
     quantiles = critics.apply(params, obs, action)
     assert quantiles.shape == (7, n_critics, 4)
 
@@ -69,7 +69,7 @@ def test_each_critic_equals_its_own_network_in_numpy():
 def test_layer_norm_makes_a_critic_blind_to_the_scale_of_its_first_layer():
     critics = Critics(2, n_quantiles=4, hidden=(8,), layer_norm=True)
     obs, action = jnp.ones((1, OBS)), jnp.full((1, ACTION), 0.5)
-    params = critics.init(jax.random.key(0), obs, action)
+    params = jax.jit(critics.init)(jax.random.key(0), obs, action)
     first = params["params"]["hidden_0"]
     scaled = {"params": {**params["params"], "hidden_0": jax.tree.map(lambda leaf: 10.0 * leaf, first)}}
     # LayerNorm adds 1e-6 to a variance of order one, hence equality up to about 1e-6.
@@ -81,8 +81,8 @@ def test_layer_norm_makes_a_critic_blind_to_the_scale_of_its_first_layer():
 def test_networks_map_over_any_leading_axes():
     actor, critics = Actor(ACTION, (4,)), Critics(2, 3, (4,))
     obs, action = jnp.ones((OBS,)), jnp.ones((ACTION,))
-    actor_params = actor.init(jax.random.key(0), obs)
-    critic_params = critics.init(jax.random.key(0), obs, action)
+    actor_params = jax.jit(actor.init)(jax.random.key(0), obs)
+    critic_params = jax.jit(critics.init)(jax.random.key(0), obs, action)
     batch_obs, batch_action = jnp.ones((5, 6, OBS)), jnp.ones((5, 6, ACTION))
     assert actor.apply(actor_params, obs)[0].shape == (ACTION,)
     assert actor.apply(actor_params, batch_obs)[1].shape == (5, 6, ACTION)

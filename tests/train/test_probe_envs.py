@@ -1,12 +1,12 @@
 """Five one- or two-step problems whose values are known, learned by the whole of `TQC.update`.
 
-Each isolates one thing that can break: the critics' regression, their input, discounting and bootstrapping, the
-actor's gradient, and the two together. Data are uniform random actions; no simulator is involved.
+Each isolates one thing that can break: the critics' regression, their input, discounting and bootstrapping,
+the actor's gradient, and the two together. Data are uniform random actions; no simulator is involved.
 
-The temperature is held at a known value. In a one-step problem the critics' target is the reward alone, so the
-entropy does not enter the value; the best stochastic policy is then proportional to exp(reward / alpha), narrow
-at a small alpha. In the two-step problem the value of the first state carries the entropy of the second action:
-the test adds it, with an alpha large enough to see it.
+The temperature is held at a known value. In a one-step problem the critics' target is the reward alone, so
+the entropy does not enter the value; the best stochastic policy is then proportional to exp(reward / alpha),
+narrow at a small alpha. In the two-step problem the value of the first state carries the entropy of the
+second action: the test adds it, with an alpha large enough to see it.
 """
 
 import jax
@@ -19,8 +19,9 @@ from train.tqc import TQC, TQCConfig, Transition
 GAMMA = 0.9
 ALPHA, ALPHA_TWO_STEP = 0.02, 0.5
 N_ITEMS, BATCH, N_UPDATES = 2048, 64, 1500
-# Over six seeds the one-step values are within 0.007 of the truth and the best actions within 0.04. The two-step
-# value is within 0.06: its targets carry the noise of alpha * log_prob; without its entropy it would be off by 0.31.
+# Over six seeds the one-step values are within 0.007 of the truth and the best actions within 0.04. The
+# two-step value is within 0.06, its targets carrying the noise of alpha * log_prob; were the entropy left
+# out, it would be off by 0.31.
 VALUE_TOLERANCE, ACTION_TOLERANCE, TWO_STEP_TOLERANCE = 0.03, 0.1, 0.1
 
 AGENT = TQC(
@@ -116,8 +117,8 @@ def test_critics_learn_a_reward_that_depends_on_the_observation(learn):
 
 
 def test_a_reward_one_step_later_is_discounted_and_carries_the_entropy_of_the_step_between(learn):
-    # The first state, 0, pays nothing and leads to the second, 1, which pays 1 and terminates. No action matters,
-    # so the policy takes the squashed Gaussian of greatest entropy: Q(0) = GAMMA * (1 + alpha * entropy).
+    # The first state, 0, pays nothing and leads to the second, 1, which pays 1 and terminates. No action
+    # matters, so the policy is the squashed Gaussian of greatest entropy: Q(0) = GAMMA (1 + alpha * entropy).
     second = random_signs() > 0.0
     data = transitions(obs=second, reward=second, next_obs=1.0, terminated=second)
     state = learn(data, alpha=ALPHA_TWO_STEP)

@@ -1,11 +1,8 @@
 """Losses against loops in NumPy, and one update against what it must and must not depend on."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
 
 from train.networks import squash
@@ -31,6 +28,7 @@ CONFIG = TQCConfig(
     learning_rate=1e-2,
     learning_rate_alpha=1e-2,
     tau=0.1,
+    reward_scale=2.0,
 )
 
 
@@ -53,8 +51,13 @@ def agent():
 
 
 @pytest.fixture(scope="module")
-def state(agent):
-    return agent.init(jax.random.key(0))
+def init(agent):
+    return jax.jit(agent.init)
+
+
+@pytest.fixture(scope="module")
+def state(init):
+    return init(jax.random.key(0))
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +81,7 @@ def make_batch(seed=0, terminated=0.0):
 
 
 def equal(tree_a, tree_b):
-    return jax.tree.all(jax.tree.map(lambda a, b: bool(jnp.array_equal(a, b)), tree_a, tree_b))
+    return jax.tree.all(jax.tree.map(np.array_equal, tree_a, tree_b))
 
 
 def quantile_huber_by_loops(quantiles, targets):
@@ -102,14 +105,16 @@ def quantiles_and_targets():
 
 def test_quantile_huber_loss_equals_loops_over_every_pair(quantiles_and_targets, strict_dtypes):
     quantiles, targets = quantiles_and_targets
-    loss = quantile_huber_loss(jnp.asarray(quantiles, jnp.float32), jnp.asarray(targets, jnp.float32))
+    loss = jax.jit(quantile_huber_loss)(
+        jnp.asarray(quantiles, jnp.float32), jnp.asarray(targets, jnp.float32)
+    )
     # 320 terms of order one in float32.
     assert loss == pytest.approx(quantile_huber_by_loops(quantiles, targets), rel=1e-5)
 
 
-def test_quantile_huber_gradient_equals_finite_differences_of_the_loops(quantiles_and_targets, strict_dtypes):
+def test_quantile_huber_gradient_equals_finite_differences(quantiles_and_targets, strict_dtypes):
     quantiles, targets = quantiles_and_targets
-    gradient = jax.grad(quantile_huber_loss)(
+    d_quantiles, d_targets = jax.jit(jax.grad(quantile_huber_loss, argnums=(0, 1)))(
         jnp.asarray(quantiles, jnp.float32), jnp.asarray(targets, jnp.float32)
     )
     h = 1e-5  # the loss is piecewise quadratic: a central difference is exact away from its corners
@@ -119,28 +124,24 @@ def test_quantile_huber_gradient_equals_finite_differences_of_the_loops(quantile
         step[index] = h
         above = quantile_huber_by_loops(quantiles + step, targets)
         expected[index] = (above - quantile_huber_by_loops(quantiles - step, targets)) / (2 * h)
-    # Each entry is a mean of order 1 / (B C M) = 0.025.
-    np.testing.assert_allclose(gradient, expected, atol=1e-6)
+    np.testing.assert_allclose(d_quantiles, expected, atol=1e-6)  # entries of order 1 / (B C M) = 0.025
+    np.testing.assert_array_equal(d_targets, 0.0)
 
 
 def test_quantile_huber_loss_is_least_at_the_quantiles_of_the_targets():
     # Targets a thousand times wider than the Huber corner: the loss is the plain quantile loss there.
     targets = 1e3 * jnp.arange(1.0, 101.0)[None, :]
     candidates = jnp.array([30e3, 50.5e3, 70e3])  # one quantile, hence the median is best
-    below, median, above = (quantile_huber_loss(q[None, None, None], targets) for q in candidates)
+    at_each = jax.jit(jax.vmap(lambda quantile: quantile_huber_loss(quantile[None, None, None], targets)))
+    below, median, above = at_each(candidates)
     assert median < below and median < above
-
-
-def test_targets_carry_no_gradient(quantiles_and_targets):
-    quantiles, targets = (jnp.asarray(x, jnp.float32) for x in quantiles_and_targets)
-    assert not np.any(jax.grad(quantile_huber_loss, argnums=1)(quantiles, targets))
 
 
 @pytest.mark.parametrize("n_drop", [0, 1, 4, 9])
 def test_drop_largest_keeps_what_a_sort_keeps_also_with_ties(n_drop, strict_dtypes):
     rng = np.random.default_rng(n_drop)
     samples = rng.integers(-3, 4, size=(50, 10)).astype(np.float32)
-    kept = np.asarray(drop_largest(jnp.asarray(samples), n_drop))
+    kept = np.asarray(jax.jit(drop_largest, static_argnums=1)(jnp.asarray(samples), n_drop))
     np.testing.assert_array_equal(np.sort(kept, axis=-1), np.sort(samples, axis=-1)[:, : 10 - n_drop])
 
 
@@ -184,41 +185,42 @@ def test_update_is_one_adam_step_on_each_loss_at_the_incoming_state(agent, state
     noise, next_noise = jax.random.normal(key, (2, B, ACTION))
     alpha = jnp.exp(state.log_alpha)
 
-    next_action, next_log_prob = squash(*agent.actor.apply(state.actor_params, batch.next_obs), next_noise)
-    next_quantiles = agent.critics.apply(state.target_params, batch.next_obs, next_action)
-    targets = []
-    for b in range(B):
-        pool = jnp.sort(next_quantiles[b].ravel())[:K]
-        targets.append(batch.reward[b] + CONFIG.gamma * (pool - alpha * next_log_prob[b]))
-    targets = jnp.stack(targets)
+    @jax.jit
+    def next_step(state):
+        action, log_prob = squash(*agent.actor.apply(state.actor_params, batch.next_obs), next_noise)
+        return agent.critics.apply(state.target_params, batch.next_obs, action), log_prob
+
+    next_quantiles, next_log_prob = map(np.asarray, next_step(state))
+    pools = np.sort(next_quantiles.reshape(B, C * M))[:, :K]
+    reward = CONFIG.reward_scale * np.asarray(batch.reward)[:, None]
+    targets = reward + CONFIG.gamma * (pools - alpha * next_log_prob[:, None])
 
     def critic_objective(params):
-        return quantile_huber_loss(agent.critics.apply(params, batch.obs, batch.action), targets)
+        return quantile_huber_loss(agent.critics.apply(params, batch.obs, batch.action), jnp.asarray(targets))
 
     def actor_objective(params):
         action, log_prob = squash(*agent.actor.apply(params, batch.obs), noise)
-        return actor_loss(log_prob, agent.critics.apply(state.critic_params, batch.obs, action), alpha)
+        quantiles = agent.critics.apply(state.critic_params, batch.obs, action)
+        return actor_loss(log_prob, quantiles, alpha), jnp.mean(log_prob)
 
-    _, log_prob = squash(*agent.actor.apply(state.actor_params, batch.obs), noise)
-    d_log_alpha = -jnp.mean(log_prob) + ACTION  # target entropy is minus the number of actions
-    adam = optax.adam(CONFIG.learning_rate)
-    cases = [
-        (state.critic_params, jax.grad(critic_objective)(state.critic_params), got.critic_params),
-        (state.actor_params, jax.grad(actor_objective)(state.actor_params), got.actor_params),
+    loss_critic, d_critic = jax.jit(jax.value_and_grad(critic_objective))(state.critic_params)
+    actor_grad = jax.jit(jax.value_and_grad(actor_objective, has_aux=True))
+    (loss_actor, mean_log_prob), d_actor = actor_grad(state.actor_params)
+    d_log_alpha = -mean_log_prob + ACTION  # the target entropy is minus the number of actions
+    assert metrics["critic_loss"] == pytest.approx(float(loss_critic), rel=1e-5)
+    assert metrics["actor_loss"] == pytest.approx(float(loss_actor), rel=1e-5)
+    assert metrics["entropy"] == pytest.approx(-float(mean_log_prob), rel=1e-5)
+    for before, grads, after in (
+        (state.critic_params, d_critic, got.critic_params),
+        (state.actor_params, d_actor, got.actor_params),
         (state.log_alpha, d_log_alpha, got.log_alpha),
-    ]
-    for params, grads, new_params in cases:
-        expected = optax.apply_updates(params, adam.update(grads, adam.init(params))[0])
-        # Adam's first step is learning_rate * g / (|g| + 1e-8); where g is rounding noise about zero (1e-9) the
-        # quotient is arbitrary, so compare to a hundredth of a step where it is not.
-        for new, want, g in zip(*map(jax.tree.leaves, (new_params, expected, grads)), strict=True):
-            np.testing.assert_allclose(
-                np.where(np.abs(g) > 1e-5, new, 0.0), np.where(np.abs(g) > 1e-5, want, 0.0), atol=1e-4
-            )
-    assert metrics["critic_loss"] == pytest.approx(float(critic_objective(state.critic_params)), rel=1e-5)
-    assert metrics["actor_loss"] == pytest.approx(float(actor_objective(state.actor_params)), rel=1e-5)
-    assert metrics["entropy"] == pytest.approx(-float(jnp.mean(log_prob)), rel=1e-5)
-    assert got.step == 1
+    ):
+        # Adam's first step is rate * g / (|g| + 1e-8), the gradient's sign but for rounding noise about zero.
+        for old, g, new in zip(*map(jax.tree.leaves, (before, grads, after)), strict=True):
+            old, g, new = (np.asarray(x, np.float64) for x in (old, g, new))
+            certain = np.abs(g) > 1e-6
+            expected = old - CONFIG.learning_rate * g / (np.abs(g) + 1e-8)
+            np.testing.assert_allclose(new[certain], expected[certain], atol=2e-2 * CONFIG.learning_rate)
 
 
 def test_target_critics_move_by_tau_towards_the_new_critics(state, update):
@@ -230,11 +232,11 @@ def test_target_critics_move_by_tau_towards_the_new_critics(state, update):
         np.testing.assert_allclose(target, expected, atol=1e-6)
 
 
-def test_actor_and_temperature_do_not_reach_the_critics_of_terminated_steps(agent, state, update):
+def test_actor_and_temperature_do_not_reach_the_critics_of_terminated_steps(init, state, update):
     # Where every step terminates the targets are the rewards, so another actor and temperature may change
     # nothing in the critics, unless the actor's loss leaked into their gradient.
     batch, key = make_batch(terminated=1.0), jax.random.key(1)
-    other = state._replace(actor_params=agent.init(jax.random.key(7)).actor_params, log_alpha=jnp.array(-3.0))
+    other = state._replace(actor_params=init(jax.random.key(7)).actor_params, log_alpha=jnp.float32(-3.0))
     got, _ = update(state, batch, key)
     got_other, _ = update(other, batch, key)
     assert equal(got.critic_params, got_other.critic_params)
@@ -251,16 +253,7 @@ def test_terminated_steps_ignore_the_next_observation_and_all_others_bootstrap_f
     assert not equal(critics_after(0.0, next_seed=0), critics_after(0.0, next_seed=5))
 
 
-def test_reward_scale_multiplies_rewards(state, update):
-    scaled = TQC(OBS, ACTION, dataclasses.replace(CONFIG, reward_scale=2.0))
-    batch = make_batch()
-    got, _ = scaled.update(state, batch, jax.random.key(1))
-    want, _ = update(state, batch._replace(reward=2.0 * batch.reward), jax.random.key(1))
-    for a, b in zip(jax.tree.leaves(got.critic_params), jax.tree.leaves(want.critic_params), strict=True):
-        np.testing.assert_allclose(a, b, atol=1e-5)
-
-
-def test_update_is_traced_once_over_many_calls_with_the_state_donated(agent):
+def test_update_is_traced_once_over_many_calls_with_the_state_donated(agent, init):
     n_traces = 0
 
     def counted(*args):
@@ -268,7 +261,7 @@ def test_update_is_traced_once_over_many_calls_with_the_state_donated(agent):
         n_traces += 1
         return agent.update(*args)
 
-    step, state = jax.jit(counted, donate_argnums=0), agent.init(jax.random.key(3))
+    step, state = jax.jit(counted, donate_argnums=0), init(jax.random.key(3))
     for i in range(5):
         state, metrics = step(state, make_batch(seed=i, terminated=float(i % 2)), jax.random.key(i))
     assert n_traces == 1

@@ -1,0 +1,44 @@
+"""Command line: `python -m benchmarks [NAME ...]`; without a name it lists what there is."""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+
+import argparse  # noqa: E402
+import importlib  # noqa: E402
+import json  # noqa: E402
+import sys  # noqa: E402
+
+NAMES = {
+    "throughput": "env steps/s of both engines, start-up time with an empty and a filled cache",
+    "settle": "error of the settled arm over Newton iterations, solves/s",
+    "learner": "gradient updates/s against SBX's TQC",
+    "learning": "tip errors of the presets over seeds, from finished runs",
+}
+
+
+def main() -> int:
+    """Run the named benchmarks; print their figures and write them to `benchmarks/results`."""
+    epilog = "\n".join(f"  {name:12} {text}" for name, text in NAMES.items())
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks", epilog=epilog, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("names", nargs="*", choices=[[], *NAMES], metavar="NAME")
+    parser.add_argument("--runs", nargs="*", default=[], help="folders of finished runs, for learning")
+    options = parser.parse_args()
+    if not options.names:
+        parser.print_help()
+    from benchmarks.common import save
+
+    for name in options.names:
+        module = importlib.import_module(f"benchmarks.{name}")
+        figures = module.measure(options.runs) if name == "learning" else module.measure()
+        print(json.dumps(figures, indent=2))
+        print(f"written: {save(name, figures)}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,45 @@
+"""What a driver of an arm has to offer; a real arm and its twin both implement it."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+
+
+class ArmIO(Protocol):
+    """Sensors and pumps of one arm with n springs and n chambers, both numbered as in the model.
+
+    The control loop calls `read_frequencies`, then `write_pressures`, once per tick of the policy's
+    `rate_hz`, from one thread. Neither repeats a failed exchange by itself, nor puts old or made-up values in
+    its place: whether the arm stops is for the loop to say.
+    """
+
+    def read_frequencies(self) -> np.ndarray:
+        """The springs' resonance frequencies (n,) [Hz], float64, each read after the last call.
+
+        Blocks until the readings are there, for less than one tick. They are raw: not calibrated, not
+        filtered, not clipped. A single spring that could not be read is NaN; `length_from_frequency`
+        reports it as a fault.
+
+        Raises:
+            TimeoutError: the readings did not come within a tick.
+            OSError: the sensors cannot be reached.
+        """
+        ...
+
+    def write_pressures(self, pressure_kpa: np.ndarray) -> None:
+        """Set what the chambers' pressures are regulated to.
+
+        Returns once the values are handed over, without waiting for the chambers to fill; they hold until the
+        next call.
+
+        Args:
+            pressure_kpa (n,) [kPa]: relative to the atmosphere, negative for vacuum.
+
+        Raises:
+            ValueError: wrong shape, not finite, or beyond what the hardware can stand; nothing was sent.
+            TimeoutError: the values were not accepted within a tick.
+            OSError: the pumps cannot be reached.
+        """
+        ...
