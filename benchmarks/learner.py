@@ -60,7 +60,7 @@ memory = replay.add(
 def update(agent_state, key):
     key_sample, key_relabel, key_update = jax.random.split(key, 3)
     stored = replay.sample(memory, key_sample, 256)
-    batch = relabel(stored, key_relabel, config.hindsight, scale, reward, 0.03)
+    batch = relabel(stored, key_relabel, config.hindsight, scale, reward)
     return agent.update(agent_state, batch, key_update)
 
 updates = xla.jit(lambda state, key: jax.lax.scan(update, state, jax.random.split(key, n)))

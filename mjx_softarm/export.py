@@ -30,7 +30,6 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import os
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -147,7 +146,7 @@ def save_policy(path: str | Path, policy: Policy) -> None:
     part = path.with_name(path.name + ".part")
     try:
         part.write_bytes(_sealed(arrays))
-        os.replace(part, path)
+        part.replace(path)
     except OSError as error:
         raise PolicyFileError(f"{path}: cannot be written: {error.strerror}") from error
     finally:
@@ -182,7 +181,7 @@ def load_policy(path: str | Path) -> Policy:
     return _unpack(arrays, str(path))
 
 
-def _sealed(arrays: Mapping[str, np.ndarray]) -> bytes:
+def _sealed(arrays: Mapping[str, Any]) -> bytes:
     """The file's bytes. Mark and digest are the zip archive's comment, so any npz reader takes the file."""
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)
@@ -230,7 +229,7 @@ class _Entries:
         """Layers that fit together, from so many inputs to so many outputs."""
         layers, n_layers = [], self.take("actor.n_layers", np.integer, ())
         for k in range(n_layers):
-            width = n_outputs if k == n_layers - 1 else np.size(self._arrays.get(f"actor.{k}.bias"))
+            width = n_outputs if k == n_layers - 1 else np.size(self._arrays.get(f"actor.{k}.bias", 0))
             bias = self.take(f"actor.{k}.bias", np.float32, (width,))
             layers.append((self.take(f"actor.{k}.weight", np.float32, (n_inputs, width)), bias))
             n_inputs = width

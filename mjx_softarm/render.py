@@ -10,9 +10,12 @@ variable `MUJOCO_GL` chooses one; while it is unset, EGL and OSMesa are tried in
 from __future__ import annotations
 
 import copy
+import functools
 import importlib
 import os
+import re
 import struct
+import subprocess
 import sys
 import zlib
 from dataclasses import dataclass
@@ -23,6 +26,7 @@ import mujoco
 import numpy as np
 
 _HEADLESS = ("egl", "osmesa")
+_ADVICE = "Install EGL or OSMesa (Debian: libegl1, libosmesa6) and set MUJOCO_GL=egl or MUJOCO_GL=osmesa"
 _MAX_GEOMS = 10_000
 _FOLDS_PER_LINK = 4  # convolutions of a bellows between two rings
 _CORE_RADIUS = 0.8  # of the bellows: what shows between its convolutions
@@ -88,7 +92,7 @@ class Renderer:
         mujoco.mjv_updateScene(self._model, self._data, self._option, None, view, everything, self._scene)
         _draw_bellows(self._scene, self._model)
         _draw_mount(self._scene)
-        _add_light(self._scene)
+        _add_light(self._scene, np.radians(view.azimuth))
         image = np.empty((self._view.height, self._view.width, 3), np.uint8)
         self._gl.make_current()
         mujoco.mjr_render(self._view, self._scene, self._context)
@@ -134,42 +138,51 @@ def write_png(path: str | Path, image: np.ndarray) -> None:
 
 
 def _open_context(model: mujoco.MjModel, width: int, height: int) -> tuple[Any, mujoco.MjrContext]:
-    """An OpenGL context and MuJoCo's resources in it, from the first library that works."""
+    """An OpenGL context and MuJoCo's resources in it."""
     asked = os.environ.get("MUJOCO_GL", "").lower().strip()
     if asked in _HEADLESS:
-        names = (asked,)
+        name = asked
     elif asked or sys.platform != "linux":
-        names = ("",)  # MuJoCo's own choice
+        name = ""  # MuJoCo's own choice
     else:
-        names = _HEADLESS
-    tried = []
-    for name in names:
-        try:
-            return _try_context(name, model, width, height)
-        except Exception as error:  # each library has its own; all are told below
-            tried.append(f"{name or 'MuJoCo default'}: {type(error).__name__}: {' '.join(str(error).split())}")
-            _forget_opengl()
-    raise RenderError(
-        f"no OpenGL to draw with ({'; '.join(tried)}). Install Mesa's EGL or OSMesa library "
-        "(Debian: libegl1, libosmesa6) and set MUJOCO_GL=egl or MUJOCO_GL=osmesa"
-    )
-
-
-def _try_context(name: str, model: mujoco.MjModel, width: int, height: int) -> tuple[Any, mujoco.MjrContext]:
-    module = importlib.import_module(f"mujoco.{name}") if name else mujoco
-    gl = module.GLContext(width, height)
-    gl.make_current()
-    context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_150)
-    mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, context)
+        name = _working_library()
+    try:
+        module = importlib.import_module(f"mujoco.{name}") if name else mujoco
+        gl = module.GLContext(width, height)
+        gl.make_current()
+        context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_150)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, context)
+    except Exception as error:  # each library has its own
+        message = " ".join(f"{type(error).__name__}: {error}".split())
+        raise RenderError(f"no OpenGL to draw with (MUJOCO_GL={asked or name}: {message}). {_ADVICE}") from error
     return gl, context
 
 
-def _forget_opengl() -> None:
-    """PyOpenGL binds to the first library that is tried; unload it, so that another can be."""
-    for name in list(sys.modules):
-        if name.split(".")[0] == "OpenGL" or name.startswith(("mujoco.egl", "mujoco.osmesa")):
-            del sys.modules[name]
-    os.environ.pop("PYOPENGL_PLATFORM", None)
+@functools.cache
+def _working_library() -> str:
+    """The first of the headless libraries that draws.
+
+    Each is tried in a process of its own: a library that was loaded, even in vain, shuts out the others.
+    """
+    program = (
+        "import mujoco; gl = mujoco.GLContext(8, 8); gl.make_current();"
+        "context = mujoco.MjrContext(mujoco.MjModel.from_xml_string('<mujoco/>'), 150); context.free(); gl.free()"
+    )
+    tried = []
+    for name in _HEADLESS:
+        environment = {**os.environ, "MUJOCO_GL": name}
+        probe = subprocess.run(
+            [sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=False
+        )
+        if probe.returncode == 0:
+            return name
+        tried.append(f"{name}: {next(filter(_is_error, probe.stderr.splitlines()), 'failed')}")
+    raise RenderError(f"no OpenGL to draw with ({'; '.join(tried)}). {_ADVICE}")
+
+
+def _is_error(line: str) -> bool:
+    """Whether this line of a traceback names the exception."""
+    return re.match(r"[\w.]+(Error|Exception)\b", line) is not None
 
 
 def _append(scene: mujoco.MjvScene, kind: mujoco.mjtGeom, size, position, rotation, rgba) -> None:
@@ -201,14 +214,15 @@ def _draw_mount(scene: mujoco.MjvScene) -> None:
     _append(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, size, position, np.eye(3), _MOUNT_COLOUR)
 
 
-def _add_light(scene: mujoco.MjvScene) -> None:
-    """A lamp beside the camera, which gives the round parts their shape."""
+def _add_light(scene: mujoco.MjvScene, azimuth: float) -> None:
+    """A lamp over the camera's left shoulder, which gives the round parts their shape."""
     if scene.nlight >= len(scene.lights):
         return
     light = scene.lights[scene.nlight]
     light.headlight, light.castshadow, light.type = 0, 0, mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
-    light.dir[:] = [0.3, -0.6, -0.75]
-    light.pos[:] = [-1.0, 2.0, 2.0]
-    light.ambient[:], light.diffuse[:], light.specular[:] = 0.0, 0.35, 0.25
+    heading = azimuth - np.radians(40.0)
+    light.dir[:] = [0.8 * np.cos(heading), 0.8 * np.sin(heading), -0.6]
+    light.pos[:] = -3.0 * light.dir
+    light.ambient[:], light.diffuse[:], light.specular[:] = 0.0, 0.4, 0.2
     light.attenuation[:] = [1.0, 0.0, 0.0]
     scene.nlight += 1

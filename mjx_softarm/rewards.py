@@ -42,7 +42,7 @@ def scaled_error(pose: Any, goal: Any, config: RewardConfig) -> Any:
 
 
 def reward(
-    pose: Any, goal: Any, n_steps: Any, saturated: Any, config: RewardConfig, threshold: Any = None
+    pose: Any, goal: Any, n_steps: Any, saturated: Any, config: RewardConfig
 ) -> tuple[Any, Any, dict[str, Any]]:
     """Reward of a pose after an action.
 
@@ -52,14 +52,13 @@ def reward(
         n_steps (...,): environment steps of the episode, this one included.
         saturated (...,) bool: any chamber at its pressure limit with its spring off its reference.
         config: the weights.
-        threshold (...,): overrides the config's, for a curriculum.
 
     Returns:
         Reward (...,); whether the goal is reached (...,) bool, which ends an episode; the terms by name.
     """
     xp = array_namespace(pose)
     norm = xp.sqrt(xp.sum(scaled_error(pose, goal, config) ** 2, axis=-1))
-    close = norm < (config.threshold if threshold is None else threshold)
+    close = norm < config.threshold
     reached = close & ~saturated
     on_the_way = ~close & ~saturated
     terms = {

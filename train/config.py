@@ -31,10 +31,6 @@ class TrainConfig:
         warmup_env_steps: actions drawn uniformly before the first gradient step.
         batch_size: transitions per gradient step.
         replay_capacity: transitions kept.
-        threshold_start: theta of the reward that is learned from, at the start; it falls
-            geometrically, so that the policy is first led to the goal, then onto it.
-        threshold_end: theta at `threshold_share` of the run and after.
-        threshold_share: share of the run over which theta falls.
         vector_steps_per_epoch: actions of each arm between two reports.
         evaluation_epochs: epochs between two evaluations and checkpoints.
     """
@@ -47,9 +43,6 @@ class TrainConfig:
     warmup_env_steps: int = 2_048
     batch_size: int = 256
     replay_capacity: int = 400_000
-    threshold_start: float = 0.03
-    threshold_end: float = 0.03
-    threshold_share: float = 0.5
     vector_steps_per_epoch: int = 16
     evaluation_epochs: int = 10
     env: EnvConfig = field(default_factory=EnvConfig)
@@ -84,8 +77,15 @@ class TrainConfig:
 
 # Settings that made learning faster or finer; the README has the measurements.
 _TUNED = TrainConfig(
-    tqc=TQCConfig(gamma=0.5, learning_rate_end=0.02, target_entropy=-30.0, reward_scale=0.1, initial_alpha=0.1),
-    hindsight=HindsightConfig(reached_share=0.25, near_share=0.25),
+    tqc=TQCConfig(
+        gamma=0.5,
+        learning_rate=1e-3,
+        learning_rate_end=0.02,
+        target_entropy=-30.0,
+        reward_scale=0.1,
+        initial_alpha=0.1,
+    ),
+    hindsight=HindsightConfig(reached_share=0.25, near_share=0.5),
 )
 
 PRESETS: dict[str, TrainConfig] = {

@@ -58,7 +58,6 @@ def relabel(
     config: HindsightConfig,
     scale: obs.ObsScale,
     reward_config: rewards.RewardConfig,
-    threshold: Array | float,
 ) -> Transition:
     """A batch to learn from; with both shares zero, its rewards are those the environment gave.
 
@@ -68,7 +67,6 @@ def relabel(
         config: shares.
         scale: of the observations.
         reward_config: weights of the reward.
-        threshold: theta of the reward, for a curriculum.
     """
     key_kind, key_near = jax.random.split(key)
     n = batch.saturated.shape[0]
@@ -80,9 +78,7 @@ def relabel(
     sensed = (reached | near) & batch.saturated
     action = jnp.where(sensed[:, None], batch.sensed_action, batch.action)
     saturated = batch.saturated & ~sensed
-    reward, done, _ = rewards.reward(
-        batch.next_pose, goal, batch.n_steps, saturated, reward_config, threshold
-    )
+    reward, done, _ = rewards.reward(batch.next_pose, goal, batch.n_steps, saturated, reward_config)
     return Transition(
         obs=obs.observe(batch.pose, goal, scale, reward_config),
         action=action,

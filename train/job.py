@@ -91,13 +91,12 @@ class Job:
 
     def _updates(self, state: TrainState, key: Array, warm: Array) -> tuple[TQCState, dict[str, Array]]:
         keys = jax.random.split(key, self.config.n_updates_per_vector_step)
-        threshold = self.threshold(state.agent.step)
 
         def update(agent: TQCState, key: Array):
             key_sample, key_relabel, key_update = jax.random.split(key, 3)
             stored = replay.sample(state.memory, key_sample, self.config.batch_size)
             batch = relabel(
-                stored, key_relabel, self.config.hindsight, self.env.scale, self.config.env.reward, threshold
+                stored, key_relabel, self.config.hindsight, self.env.scale, self.config.env.reward
             )
             return self.agent.update(agent, batch, key_update)
 
@@ -108,12 +107,6 @@ class Job:
         shapes = jax.eval_shape(run, state.agent)[1]
         nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
         return jax.lax.cond(warm, run, lambda agent: (agent, nothing), state.agent)
-
-    def threshold(self, n_updates: Array) -> Array:
-        """Theta of the reward after some updates: geometric from start to end."""
-        config = self.config
-        share = jnp.clip(n_updates / (config.threshold_share * config.n_updates), 0.0, 1.0)
-        return config.threshold_start * (config.threshold_end / config.threshold_start) ** share
 
     def _experience(self, before: State, action: Array, after: State) -> Experience:
         start, end = before.pipeline_state, after.pipeline_state

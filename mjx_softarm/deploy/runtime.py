@@ -54,8 +54,8 @@ class PolicyRunner:
         """The action (..., n) in [-1, 1], float32, of which `act` makes frequencies; arguments as there.
 
         Raises:
-            ValueError: pose or goal has the wrong shape or is not finite, or is so large that the actor
-                overflows; such an action would ask for springs of no length.
+            ValueError: pose or goal has the wrong shape or is not finite, or the actor overflows; what it
+                asks for would be springs without a length.
         """
         pose, goal = np.broadcast_arrays(_six("pose", pose), _six("goal", goal))
         x = observe(pose, goal, self._scale, self.policy.reward)  # (..., 18)
@@ -64,7 +64,7 @@ class PolicyRunner:
             x = np.maximum(x @ weight + bias, 0.0)  # (..., out)
         action = np.tanh(x @ head_weight + head_bias)  # (..., n)
         if not np.isfinite(action).all():
-            raise ValueError(f"the actor overflows at pose {pose.tolist()} and goal {goal.tolist()}")
+            raise ValueError("action: got nan, expected finite numbers; the actor overflows")
         return action
 
 
@@ -75,5 +75,5 @@ def _six(name: str, value: ArrayLike) -> np.ndarray:
             f"{name}: got shape {array.shape}, expected (..., 6): x, y, z [mm], yaw, pitch, roll [deg]"
         )
     if not np.isfinite(array).all():
-        raise ValueError(f"{name}: got {array.tolist()}, expected finite numbers")
+        raise ValueError(f"{name}: got {array[~np.isfinite(array)][0]}, expected finite numbers")
     return array

@@ -1,0 +1,58 @@
+"""Settings: overrides by name, messages that say what is wrong, and the round trip through JSON."""
+
+import json
+
+import pytest
+
+from train.config import PRESETS, ConfigError, TrainConfig, from_dict, override, to_dict
+
+
+def test_overrides_reach_every_level_and_leave_the_preset_alone():
+    before = PRESETS["quick"]
+    after = override(before, ["seed=3", "tqc.gamma=0.25", "tqc.hidden_actor=[64, 32]", "env.engine=mjx"])
+    assert (after.seed, after.tqc.gamma, after.tqc.hidden_actor, after.env.engine) == (3, 0.25, (64, 32), "mjx")
+    assert override(after, ["env.reward.threshold=1"]).env.reward.threshold == 1.0
+    assert before.seed == 0 and before.env.engine == "chain"
+
+
+@pytest.mark.parametrize(
+    "assignment, message",
+    [
+        ("seed", "seed: expected NAME=VALUE"),
+        ("sed=1", "sed: unknown setting, expected one of seed, n_arms"),
+        ("tqc.gama=1", "tqc.gama: unknown setting, expected one of hidden_actor"),
+        ("tqc=1", "tqc: a group, expected one of tqc.hidden_actor"),
+        ("seed.x=1", "seed.x: seed has no settings of its own"),
+        ("seed=one", "seed: got 'one', expected int"),
+        ("seed=1.5", "seed: got 1.5, expected int"),
+        ("n_arms=true", "n_arms: got True, expected int"),
+        ("n_arms=0", "n_arms=0: n_arms: got 0, expected at least 1"),
+        ("env.engine=fast", "env.engine: got 'fast', expected"),
+        ("tqc.gamma=2", "tqc.gamma=2: TQCConfig.gamma: expected a number in"),
+        ("hindsight.reached_share=0.9", "reached_share and near_share must be >= 0 and add up to 1 at most"),
+        ("updates_per_env_step=0.001", "expected at least one update per step of all 128 arms"),
+        ("replay_capacity=10", "replay_capacity: got 10, expected at least n_arms = 128"),
+    ],
+)
+def test_a_setting_that_cannot_be_is_named(assignment, message):
+    with pytest.raises(ConfigError) as error:
+        override(PRESETS["quick"], [assignment])
+    assert message in str(error.value)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_survive_json(name):
+    assert from_dict(json.loads(json.dumps(to_dict(PRESETS[name])))) == PRESETS[name]
+
+
+def test_json_with_a_setting_too_many_or_too_few_is_refused():
+    data = to_dict(TrainConfig())
+    with pytest.raises(ConfigError, match="config.tqc: got .* expected the settings"):
+        from_dict({**data, "tqc": {**data["tqc"], "extra": 1}})
+    with pytest.raises(ConfigError, match="config: got .* expected the settings"):
+        from_dict({name: value for name, value in data.items() if name != "seed"})
+
+
+def test_an_epoch_count_covers_the_steps_asked_for():
+    config = TrainConfig(total_env_steps=10_001, n_arms=100, vector_steps_per_epoch=10, updates_per_env_step=0.5)
+    assert (config.n_epochs, config.n_updates_per_vector_step, config.n_updates) == (11, 50, 11 * 10 * 50)
