@@ -23,8 +23,8 @@ test: $(INSTALLED)  ## the tests
 test-slow: $(INSTALLED)  ## the tests that take minutes
 	$(BIN)/python -m pytest -m slow
 
-lint: $(INSTALLED) .venv/.installed-dev  ## ruff and pyright on the whole tree
-	$(BIN)/pre-commit run --all-files --show-diff-on-failure
+lint: $(INSTALLED) .venv/.installed-dev  ## ruff, which corrects what it can, and pyright, on all files that git knows
+	$(BIN)/pre-commit run --all-files
 
 bench: $(INSTALLED)  ## the benchmarks
 	$(BIN)/python -m benchmarks
@@ -41,11 +41,11 @@ clean:  ## remove .venv, build outputs and caches; runs/ stays
 	@touch '$@'
 
 $(BIN)/python:
-	@command -v '$(PYTHON)' > /dev/null || { \
-	  echo "error: $(PYTHON): not found; name a Python from 3.11 to 3.13, e.g. make PYTHON=python3.12 ..." >&2; \
-	  exit 1; }
-	@'$(PYTHON)' -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' || { \
-	  echo "error: $(PYTHON) is $$('$(PYTHON)' --version 2>&1), expected Python 3.11 to 3.13;" \
-	    "name another, e.g. make PYTHON=python3.12 ..." >&2; \
-	  exit 1; }
+	@found=$$('$(PYTHON)' -c 'import sys; print("%d.%d" % sys.version_info[:2])' 2> /dev/null); \
+	case "$$found" in \
+	  3.11 | 3.12 | 3.13) ;; \
+	  '') echo "error: no Python runs as '$(PYTHON)'; name one, e.g. make PYTHON=python3.12 ..." >&2; exit 1;; \
+	  *) echo "error: '$(PYTHON)' is Python $$found, expected 3.11 to 3.13; name another," \
+	       "e.g. make PYTHON=python3.12 ..." >&2; exit 1;; \
+	esac
 	@'$(PYTHON)' -m venv --clear .venv || { rm -rf .venv; exit 1; }

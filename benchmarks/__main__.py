@@ -6,10 +6,10 @@ import os
 
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
-import argparse  # noqa: E402
-import importlib  # noqa: E402
-import json  # noqa: E402
-import sys  # noqa: E402
+import argparse
+import importlib
+import json
+import sys
 
 NAMES = {
     "throughput": "env steps/s of both engines, start-up time with an empty and a filled cache",

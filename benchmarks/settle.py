@@ -38,7 +38,9 @@ def measure() -> dict[str, Any]:
         with mock.patch.multiple(solver, MAX_ITERATIONS=n, SMALL_STEP=0.0):
             found = _settle(spec, np.float32, reference)
         error = np.linalg.norm(1e3 * np.asarray(found.tip_position_m, np.float64) - exact_mm, axis=-1)
-        quantiles = dict(zip(("median_mm", "p95_mm", "max_mm"), np.quantile(error, [0.5, 0.95, 1.0]), strict=True))
+        quantiles = dict(
+            zip(("median_mm", "p95_mm", "max_mm"), np.quantile(error, [0.5, 0.95, 1.0]), strict=True)
+        )
         rows.append({"iterations": n, **{k: float(f"{v:.3g}") for k, v in quantiles.items()}})
     found = _settle(spec, np.float32, reference)
     return {

@@ -23,7 +23,7 @@ ARMS = (32, 128, 512)
 
 
 def measure() -> dict[str, Any]:
-    """Env steps/s of both engines, and start-up times of a training epoch with an empty and a filled cache."""
+    """Env steps/s of both engines; start-up times of a training epoch, cache empty and filled."""
     rows = [_steps_per_second(engine, n) for engine in ("chain", "mjx") for n in ARMS]
     with tempfile.TemporaryDirectory() as cache:
         starts = [_start(cache) for _ in range(2)]
@@ -84,6 +84,10 @@ def _start(cache: str) -> dict[str, float]:
     """A new process up to a compiled training epoch."""
     environment = {**os.environ, "TF_CPP_MIN_LOG_LEVEL": "3"}
     done = subprocess.run(
-        [sys.executable, "-c", _START.format(cache=cache)], env=environment, capture_output=True, text=True, check=True
+        [sys.executable, "-c", _START.format(cache=cache)],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
     )
     return {name: round(value, 1) for name, value in json.loads(done.stdout.splitlines()[-1]).items()}

@@ -55,7 +55,9 @@ def _parser() -> argparse.ArgumentParser:
         help="write the default arm's specification, to start your own from",
         description="Write the default arm's specification: every number with its unit and its source.",
     )
-    spec.add_argument("--out", type=Path, default=Path("arm.toml"), help="file to write; default: %(default)s")
+    spec.add_argument(
+        "--out", type=Path, default=Path("arm.toml"), help="file to write; default: %(default)s"
+    )
     spec.add_argument("--force", action="store_true", help="replace the file if there is one")
     spec.set_defaults(run=_run_spec)
 
@@ -112,7 +114,9 @@ def _run_picture(args: argparse.Namespace) -> None:
     pressure_kpa = np.broadcast_to(np.asarray(args.pressures), (1, spec.n_chambers))
     rest = settle_many(spec, pressure_kpa)
     if not rest.settled[0]:
-        raise CommandError(f"the arm does not settle at these pressures: {rest.residual[0]:g} N or N m are left")
+        raise CommandError(
+            f"the arm does not settle at these pressures: {rest.residual[0]:g} N or N m are left"
+        )
     try:
         with Renderer(build_model(spec)) as renderer:
             image = renderer.draw(rest.q[0])
@@ -256,7 +260,9 @@ def _draw_plane(axes, tip_mm: np.ndarray, distance: np.ndarray) -> None:
 
 def _dimension(axes, start, end, size_mm: float, paper_mm: float) -> None:
     """A dimension line with its number and the paper's."""
-    axes.annotate("", start, end, arrowprops={"arrowstyle": "<->", "color": "0.2", "shrinkA": 0, "shrinkB": 0})
+    axes.annotate(
+        "", start, end, arrowprops={"arrowstyle": "<->", "color": "0.2", "shrinkA": 0, "shrinkB": 0}
+    )
     upright = start[0] == end[0]
     axes.annotate(
         f"{size_mm:.0f} mm (paper: {paper_mm:.0f})",

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -81,9 +81,7 @@ class ReachEnv(Env):
         self.scale = obs.ObsScale.from_spec(self.spec)
         self.gains = control.Gains.from_spec(self.spec)
         self.sensor = sensors.SensorParams.from_spec(self.spec)
-        springs = self.spec.springs
-        limits = [jnp.full(self.action_size, m) for m in (springs.length_min_m, springs.length_max_m)]
-        self._frequency_range = [sensors.frequency_from_length(limit, self.sensor) for limit in limits]
+        self.frequency_range_hz = jnp.asarray(sensors.frequency_range_hz(self.spec), jnp.float32)
         uses_mjx = self.config.engine == "mjx" or self.config.mode == "dynamic"
         self.model = mjx.put_model(build_model(self.spec)) if uses_mjx else None
         self.pool: Pool = sample_workspace(self.spec, self.config.n_poses, self.config.workspace_seed)
@@ -102,13 +100,13 @@ class ReachEnv(Env):
 
     def reference_m(self, action: Array) -> Array:
         """Spring lengths (..., n_chambers) [m] that an action in [-1, 1] asks for: frequencies, linearly."""
-        low, high = self._frequency_range
+        low, high = self.frequency_range_hz.T
         frequency = low + 0.5 * (jnp.clip(action, -1.0, 1.0) + 1.0) * (high - low)
         return sensors.length_from_frequency(frequency, self.sensor).length_m
 
     def action_of(self, length_m: Array) -> Array:
-        """The action in [-1, 1] that asks for spring lengths (..., n_chambers) [m]; inverse of `reference_m`."""
-        low, high = self._frequency_range
+        """The action in [-1, 1] that asks for spring lengths (..., n_chambers) [m]."""
+        low, high = self.frequency_range_hz.T
         frequency = sensors.frequency_from_length(length_m, self.sensor)
         return jnp.clip(2.0 * (frequency - low) / (high - low) - 1.0, -1.0, 1.0)
 
@@ -116,7 +114,9 @@ class ReachEnv(Env):
         """A new episode: an arm of the randomisation, at a random pose, with a random goal."""
         key_params, key_sensor, key_start, key_goal = jax.random.split(rng, 4)
         spread = self.config.randomisation
-        start = jax.tree.map(lambda x: x[jax.random.randint(key_start, (), 0, self.config.n_poses)], self.pool)
+        start = jax.tree.map(
+            lambda x: x[jax.random.randint(key_start, (), 0, self.config.n_poses)], self.pool
+        )
         goal = self.pool.pose[jax.random.randint(key_goal, (), 0, self.config.n_poses)]
         noise = jax.random.normal(key_sensor, (self.action_size,))
         arm = ArmState(
@@ -164,7 +164,9 @@ class ReachEnv(Env):
             "reached": (reached & valid).astype(jnp.float32),
             "saturated_chambers": jnp.sum(saturated).astype(jnp.float32),
             "unsettled": (~valid).astype(jnp.float32),
-        } | {f"reward_{name}": jnp.where(valid, term, 0.0).astype(jnp.float32) for name, term in terms.items()}
+        } | {
+            f"reward_{name}": jnp.where(valid, term, 0.0).astype(jnp.float32) for name, term in terms.items()
+        }
         return state.replace(
             pipeline_state=arm,
             obs=self.observe(arm.pose, arm.goal),

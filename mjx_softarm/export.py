@@ -39,16 +39,12 @@ from typing import Any, NoReturn
 import numpy as np
 
 from mjx_softarm.control import Gains
-from mjx_softarm.obs import OBS_SIZE, ObsScale
+from mjx_softarm.obs import OBS_LAYOUT, OBS_SIZE, ObsScale
 from mjx_softarm.rewards import RewardConfig
-from mjx_softarm.sensors import SensorFault, SensorParams, frequency_from_length, length_from_frequency
+from mjx_softarm.sensors import SensorFault, SensorParams, frequency_range_hz, length_from_frequency
 from mjx_softarm.spec import ArmSpec, SpecError
 
 SCHEMA_VERSION = 1
-
-# Units are those before scaling: of pose and goal by `ObsScale`, of the error by the reward's weights.
-_AXES = ("x_mm", "y_mm", "z_mm", "yaw_deg", "pitch_deg", "roll_deg")
-OBS_LAYOUT = tuple(f"{part}_{axis}" for part in ("pose", "goal", "error") for axis in _AXES)
 
 _MARK = b"mjx_softarm policy, sha256 "
 _N_DIGEST = 64  # hexadecimal digits, the last bytes of the file
@@ -96,14 +92,12 @@ def policy_from_actor(
         ValueError: the parameters are not those of an actor for this arm; as a PolicyFileError where an
             array has the wrong shape or is not finite.
     """
-    springs, sensor = spec.springs, SensorParams.from_spec(spec)
-    limits_m = [np.full(spec.n_chambers, limit) for limit in (springs.length_min_m, springs.length_max_m)]
     policy = Policy(
         layers=layers_from_flax(actor_params, spec.n_chambers),
         obs_scale=ObsScale.from_spec(spec),
         reward=reward,
-        frequency_hz=np.stack([frequency_from_length(limit, sensor) for limit in limits_m], axis=-1),
-        sensor=sensor,
+        frequency_hz=frequency_range_hz(spec),
+        sensor=SensorParams.from_spec(spec),
         gains=Gains.from_spec(spec),
         rate_hz=spec.control.rate_hz,
         spec=spec,

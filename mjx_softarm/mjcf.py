@@ -120,15 +120,20 @@ def _add_tools(last, params: ArmParams, spec: ArmSpec) -> None:
             _draw_gripper(tool, length)
     if spec.mass.payload_kg > 0:
         size = [0.03 * spec.mass.payload_kg ** (1 / 3) + 0.01, 0.0, 0.0]
-        tool.add_geom(name="payload", size=size, rgba=[0.2, 0.6, 0.25, 1.0], mass=0.0, contype=0, conaffinity=0)
+        tool.add_geom(
+            name="payload", size=size, rgba=[0.2, 0.6, 0.25, 1.0], mass=0.0, contype=0, conaffinity=0
+        )
 
 
 def _draw_gripper(body, length: float) -> None:
-    shapes = (([0.022, 0.022, 0.25 * length], [0.0, 0.0, 0.25 * length]),) + tuple(
-        ([0.005, 0.010, 0.25 * length], [side * 0.02, 0.0, -0.25 * length]) for side in (-1, 1)
-    )
-    for size, position in shapes:
+    shapes = {
+        "palm": ([0.022, 0.022, 0.25 * length], [0.0, 0.0, 0.25 * length]),
+        "finger0": ([0.005, 0.010, 0.25 * length], [-0.02, 0.0, -0.25 * length]),
+        "finger1": ([0.005, 0.010, 0.25 * length], [0.02, 0.0, -0.25 * length]),
+    }
+    for name, (size, position) in shapes.items():
         body.add_geom(
+            name=f"gripper_{name}",
             type=mujoco.mjtGeom.mjGEOM_BOX,
             size=size,
             pos=position,

@@ -14,7 +14,10 @@ from mjx_softarm.pose import array_namespace
 from mjx_softarm.rewards import RewardConfig, scaled_error
 from mjx_softarm.spec import ArmSpec
 
-OBS_SIZE = 18
+# Units are those before scaling: of pose and goal by `ObsScale`, of the error by the reward's weights.
+_AXES = ("x_mm", "y_mm", "z_mm", "yaw_deg", "pitch_deg", "roll_deg")
+OBS_LAYOUT = tuple(f"{part}_{axis}" for part in ("pose", "goal", "error") for axis in _AXES)
+OBS_SIZE = len(OBS_LAYOUT)
 
 
 class ObsScale(NamedTuple):

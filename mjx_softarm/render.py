@@ -125,7 +125,9 @@ class Renderer:
 def write_png(path: str | Path, image: np.ndarray) -> None:
     """Write an RGB image (height, width, 3) uint8 as PNG."""
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
-        raise ValueError(f"image: got {image.dtype} of shape {image.shape}, expected uint8 of (height, width, 3)")
+        raise ValueError(
+            f"image: got {image.dtype} of shape {image.shape}, expected uint8 of (height, width, 3)"
+        )
     height, width, _ = image.shape
     rows = np.concatenate([np.zeros((height, 1), np.uint8), image.reshape(height, -1)], axis=1)
 
@@ -154,7 +156,8 @@ def _open_context(model: mujoco.MjModel, width: int, height: int) -> tuple[Any, 
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, context)
     except Exception as error:  # each library has its own
         message = " ".join(f"{type(error).__name__}: {error}".split())
-        raise RenderError(f"no OpenGL to draw with (MUJOCO_GL={asked or name}: {message}). {_ADVICE}") from error
+        tried = f"MUJOCO_GL={asked or name}: {message}"
+        raise RenderError(f"no OpenGL to draw with ({tried}). {_ADVICE}") from error
     return gl, context
 
 
@@ -166,7 +169,8 @@ def _working_library() -> str:
     """
     program = (
         "import mujoco; gl = mujoco.GLContext(8, 8); gl.make_current();"
-        "context = mujoco.MjrContext(mujoco.MjModel.from_xml_string('<mujoco/>'), 150); context.free(); gl.free()"
+        "model = mujoco.MjModel.from_xml_string('<mujoco/>');"
+        "context = mujoco.MjrContext(model, 150); context.free(); gl.free()"
     )
     tried = []
     for name in _HEADLESS:
@@ -196,7 +200,8 @@ def _draw_bellows(scene: mujoco.MjvScene, model: mujoco.MjModel) -> None:
     """Replace the plain tubes that MuJoCo draws for the chambers' tendons by convolutions."""
     for k in range(scene.ngeom):
         tube = scene.geoms[k]
-        if tube.objtype != mujoco.mjtObj.mjOBJ_TENDON or not model.tendon(tube.objid).name.startswith("chamber"):
+        is_tendon = tube.objtype == mujoco.mjtObj.mjOBJ_TENDON
+        if not (is_tendon and model.tendon(tube.objid).name.startswith("chamber")):
             continue
         radius, half = float(tube.size[0]), float(tube.size[2])
         centre, rotation = np.array(tube.pos), np.array(tube.mat).reshape(3, 3)

@@ -125,6 +125,14 @@ def frequency_from_length(length_m: Array, params: SensorParams) -> Array:
     return xp.where(resonates, frequency_hz, math.nan)
 
 
+def frequency_range_hz(spec: ArmSpec) -> np.ndarray:
+    """Frequencies (n, 2) [Hz] of the shortest and the longest spring that may be commanded."""
+    limits_m = np.array([[spec.springs.length_min_m], [spec.springs.length_max_m]])
+    return frequency_from_length(
+        np.broadcast_to(limits_m, (2, spec.n_chambers)), SensorParams.from_spec(spec)
+    ).T
+
+
 def describe_faults(frequency_hz: Array, fault: Array, params: SensorParams) -> str:
     """A line for each faulty spring: its number as in the model, what it read and what was expected.
 

@@ -80,8 +80,10 @@ def settle(kinematics: Callable[[Array], Frames], params: ArmParams, reference_m
     return _report(end, kinematics, params, reference_m)
 
 
-def settle_pressures(kinematics: Callable[[Array], Frames], params: ArmParams, pressure_kpa: Array) -> Settled:
-    """Equilibrium at given pressures (n_chambers,), clipped to the arm's limits: every chamber at its limit."""
+def settle_pressures(
+    kinematics: Callable[[Array], Frames], params: ArmParams, pressure_kpa: Array
+) -> Settled:
+    """Equilibrium at given pressures (n_chambers,), clipped to the arm's limits."""
     pressure = jnp.clip(pressure_kpa, params.pressure_min_kpa, params.pressure_max_kpa)
     pinned = params._replace(pressure_min_kpa=pressure, pressure_max_kpa=pressure)
     return settle(kinematics, pinned, params.spring_rest_m)
@@ -110,11 +112,12 @@ def _newton_step(it: _Iterate, kinematics, params: ArmParams, reference_m: Array
     largest = jnp.max(jnp.abs(dq))
     scale = jnp.minimum(1.0, MAX_STEP / largest)
     same = jnp.all(at_limit == it.at_limit)
+    solvable = jnp.isfinite(largest)  # else the energy has no minimum here, or an input is not finite
     return _Iterate(
-        q=it.q + scale * dq,
-        pressure=it.pressure + scale * dp,
+        q=jnp.where(solvable, it.q + scale * dq, it.q),
+        pressure=jnp.where(solvable, it.pressure + scale * dp, it.pressure),
         at_limit=at_limit,
-        moving=~(same & (largest < SMALL_STEP)),
+        moving=solvable & ~(same & (largest < SMALL_STEP)),
         iteration=it.iteration + 1,
     )
 

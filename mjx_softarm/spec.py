@@ -16,10 +16,9 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import tomli_w
 
-from mjx_softarm.sensors import SensorParams, frequency_from_length
+from mjx_softarm.sensors import frequency_range_hz
 
 N_CHAMBERS_PER_SECTION = 3
 
@@ -277,14 +276,14 @@ class ArmSpec:
     def _check_sensor(self, source: str) -> None:
         """The lengths that may be commanded must be lengths that the sensor can read."""
         sensor = self.sensor
-        for name in ("length_min_m", "length_max_m"):
-            length_m = getattr(self.springs, name)
-            frequency_hz = frequency_from_length(np.full(self.n_chambers, length_m), SensorParams.from_spec(self))
+        frequencies_hz = frequency_range_hz(self)
+        for k, name in enumerate(("length_min_m", "length_max_m")):
+            length_m, frequency_hz = getattr(self.springs, name), frequencies_hz[:, k]
             readable = (frequency_hz >= sensor.frequency_min_hz) & (frequency_hz <= sensor.frequency_max_hz)
             if not readable.all():
                 raise SpecError(
-                    f"{source}: springs.{name}: {length_m!r} reads {frequency_hz[~readable][0]:.6g} Hz, expected "
-                    f"sensor.frequency_min_hz to frequency_max_hz, {sensor.frequency_min_hz:g} to "
+                    f"{source}: springs.{name}: {length_m!r} reads {frequency_hz[~readable][0]:.6g} Hz, "
+                    f"expected sensor.frequency_min_hz to frequency_max_hz, {sensor.frequency_min_hz:g} to "
                     f"{sensor.frequency_max_hz:g} Hz"
                 )
 
@@ -292,7 +291,9 @@ class ArmSpec:
 def _ordered(source: str, group: str, part: Any, low: str, high: str) -> None:
     low_value, high_value = getattr(part, low), getattr(part, high)
     if not low_value < high_value:
-        raise SpecError(f"{source}: {group}.{low}: got {low_value!r}, expected less than {high} ({high_value!r})")
+        raise SpecError(
+            f"{source}: {group}.{low}: got {low_value!r}, expected less than {high} ({high_value!r})"
+        )
 
 
 def _read_fields(cls: type, data: Any, source: str, prefix: str) -> dict[str, Any]:

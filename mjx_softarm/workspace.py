@@ -66,7 +66,7 @@ def sample_workspace(spec: ArmSpec, n: int, seed: int) -> Pool:
     low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
     swing = np.cos(rng.uniform(0.0, np.pi, (CANDIDATES_PER_POSE * n, spec.n_chambers)))
     found = settle_many(spec, low + (high - low) * 0.5 * (1.0 + swing))
-    tip_mm = 1e3 * found.tip_position_m
+    tip_mm = np.where(found.settled[:, None], 1e3 * found.tip_position_m, 0.0)
     _, voxel, count = np.unique(
         np.floor(tip_mm / VOXEL_MM).astype(int), axis=0, return_inverse=True, return_counts=True
     )

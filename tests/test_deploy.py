@@ -86,7 +86,7 @@ def test_equals_actor_and_environment_in_jax(spec, actor_params, runner, poses, 
     np.testing.assert_allclose(runner.action(*poses), action, rtol=0, atol=1e-5)
     np.testing.assert_allclose(reference.length_m, env.reference_m(action), rtol=0, atol=1e-5)
     np.testing.assert_allclose(env.action_of(jnp.asarray(reference.length_m)), action, rtol=0, atol=1e-5)
-    low, high = env._frequency_range
+    low, high = env.frequency_range_hz.T
     np.testing.assert_allclose(runner.policy.frequency_hz, np.stack([low, high], axis=-1), rtol=1e-6)
     np.testing.assert_allclose(
         reference.frequency_hz, low + 0.5 * (np.asarray(action) + 1.0) * (high - low), rtol=1e-6

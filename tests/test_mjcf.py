@@ -1,7 +1,6 @@
 """The compiled MuJoCo model has the paper's figures; its pictures show it."""
 
 import functools
-import importlib
 import itertools
 import os
 
@@ -11,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mjx_softarm import ArmSpec
+from mjx_softarm import ArmSpec, render
 from mjx_softarm.mjcf import build_model, build_spec
 
 LOW_KPA, FREE_KPA, HIGH_KPA = -40.0, 0.0, 20.0
@@ -29,7 +28,7 @@ def model(spec):
 
 @functools.cache
 def section_at_rest(*pressure_kpa):
-    """Length [mm] and bending angle [deg] of one section by itself, unloaded, stepped in time until at rest."""
+    """Length [mm] and bending angle [deg] of one unloaded section, stepped in time until at rest."""
     model = build_model(ArmSpec.default().replace(structure={"n_sections": 1}))
     model.opt.gravity[:] = 0.0
     data = mujoco.MjData(model)
@@ -146,7 +145,9 @@ def test_the_free_arm_hangs_straight_with_its_chambers_around_it(spec, model):
                 ("spring", spec.geometry.spring_radius_m),
             ):
                 hole = data.site(f"{kind}{3 * section + k}_plate{plate}").xpos
-                np.testing.assert_allclose(hole, radius * np.array(direction) + [0, 0, -0.05 * plate], atol=1e-9)
+                np.testing.assert_allclose(
+                    hole, radius * np.array(direction) + [0, 0, -0.05 * plate], atol=1e-9
+                )
 
 
 def test_a_tendon_feels_the_joints_of_its_own_section_alone(model):
@@ -221,7 +222,9 @@ def test_stiffness_and_damping_are_linear_since_mjx_uses_no_higher_terms(model):
 
 def test_an_environment_can_be_added_before_compiling(spec, model):
     mjspec = build_spec(spec)
-    mjspec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[1, 1, 0.1], pos=[0, 0, -1])
+    mjspec.worldbody.add_geom(
+        name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[1, 1, 0.1], pos=[0, 0, -1]
+    )
     with_floor = mjspec.compile()
     assert with_floor.geom("floor").id >= 0
     assert with_floor.nv == model.nv and with_floor.nu == model.nu
@@ -232,7 +235,6 @@ def test_an_environment_can_be_added_before_compiling(spec, model):
 
 @pytest.fixture(scope="module")
 def renderer(model):
-    render = importlib.import_module("mjx_softarm.render")
     try:
         opened = render.Renderer(model, 150, 200)
     except render.RenderError as error:
@@ -265,7 +267,7 @@ def test_a_picture_shows_three_sections_one_below_the_other(renderer):
 
 
 def test_a_picture_shows_where_the_arm_bends(renderer):
-    camera = importlib.import_module("mjx_softarm.render").Camera(azimuth_deg=0.0)  # looks along +x
+    camera = render.Camera(azimuth_deg=0.0)  # looks along +x
     columns = []
     for bend in (0.15, 0.0, -0.15):  # about +x: swings to +y, the picture's left
         image = renderer.draw(np.tile([0.0, bend, 0.0], 12), camera)
@@ -275,12 +277,11 @@ def test_a_picture_shows_where_the_arm_bends(renderer):
 
 @pytest.mark.parametrize("q", [np.zeros(35), np.full(36, np.nan)])
 def test_a_picture_of_nothing_is_refused(renderer, q):
-    with pytest.raises(ValueError, match="^q: got"):
+    with pytest.raises(ValueError, match=r"^q: got"):
         renderer.draw(q)
 
 
 def test_a_png_reads_back_as_it_was_written(tmp_path):
-    render = importlib.import_module("mjx_softarm.render")
     image = np.random.default_rng(0).integers(0, 256, (5, 7, 3), np.uint8)
     render.write_png(tmp_path / "image.png", image)
     back = matplotlib.image.imread(tmp_path / "image.png")
@@ -291,7 +292,6 @@ def test_a_png_reads_back_as_it_was_written(tmp_path):
 
 @pytest.mark.skipif(os.uname().sysname != "Linux", reason="EGL and OSMesa are Linux's")
 def test_without_opengl_the_message_says_what_was_tried_and_what_to_do(model, monkeypatch):
-    render = importlib.import_module("mjx_softarm.render")
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     monkeypatch.setattr(render, "_HEADLESS", ("no_such_library", "nor_this"))
     render._working_library.cache_clear()

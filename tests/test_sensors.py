@@ -31,9 +31,7 @@ def _strict():
 def make_spec(compensation_h=1.0e-6):
     beta = tuple(np.linspace(0.90, 0.98, 9))
     delta_m = tuple(np.linspace(-0.002, 0.003, 9))
-    return WIDE.replace(
-        sensor={"compensation_h": compensation_h, "beta": beta, "delta_m": delta_m}
-    )
+    return WIDE.replace(sensor={"compensation_h": compensation_h, "beta": beta, "delta_m": delta_m})
 
 
 def frequency_by_the_book(length_m, spec):
@@ -208,6 +206,7 @@ def test_faults_are_described_with_spring_reading_and_expectation():
         "spring1: read nan Hz, expected 100000 to 1e+07 Hz",
         "spring3: read 1200 Hz, expected 100000 to 1e+07 Hz",
         "spring5: read 2e+07 Hz, expected 100000 to 1e+07 Hz",
-        "spring6: read 9000000 Hz, expected below 8761191 Hz, where the compensation resonates without the coil",
+        "spring6: read 9000000 Hz, expected below 8761191 Hz, where the compensation resonates "
+        "without the coil",
     ]
     assert describe_faults(frequency, np.zeros(9, int), params) == ""

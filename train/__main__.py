@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import os
 
-os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA logs a page for every program it takes from the cache
+os.environ.setdefault(
+    "TF_CPP_MIN_LOG_LEVEL", "3"
+)  # XLA logs a page for every program it takes from the cache
 
-import argparse  # noqa: E402
-import sys  # noqa: E402
-from pathlib import Path  # noqa: E402
+import argparse
+import sys
+from pathlib import Path
 
-from rich.console import Console  # noqa: E402
-from rich.table import Table  # noqa: E402
+from rich.console import Console
+from rich.table import Table
 
-from mjx_softarm.spec import ArmSpec, SpecError  # noqa: E402
-from train.checkpoint import Run, RunError  # noqa: E402
-from train.config import PRESETS, ConfigError, override  # noqa: E402
-from train.evaluate import N_ACTIONS, N_GOALS, Summary  # noqa: E402
+from mjx_softarm.export import PolicyFileError
+from mjx_softarm.spec import ArmSpec, SpecError
+from train.checkpoint import Run, RunError
+from train.config import PRESETS, ConfigError, override
+from train.evaluate import N_ACTIONS, N_GOALS, Summary
 
 PICTURES = ("learning_curve.png", "circle.png", "workspace_error.png")
 
@@ -27,7 +30,7 @@ def main(arguments: list[str] | None = None) -> int:
     console = Console()
     try:
         return options.command(options, console)
-    except (RunError, ConfigError, SpecError) as error:
+    except (RunError, ConfigError, SpecError, PolicyFileError) as error:
         Console(stderr=True).print(f"error: {error}", markup=False, highlight=False, soft_wrap=True)
         return 2
     except KeyboardInterrupt:
@@ -35,7 +38,9 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m train", description="Train, evaluate and export policies.")
+    parser = argparse.ArgumentParser(
+        prog="python -m train", description="Train, evaluate and export policies."
+    )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     reach = commands.add_parser("reach", help="train a policy that reaches poses of the workspace")
     reach.add_argument("--preset", choices=PRESETS, default="quick", help="default: %(default)s")
@@ -82,10 +87,12 @@ def _reach(options: argparse.Namespace, console: Console) -> int:
 
 
 def _evaluate(options: argparse.Namespace, console: Console) -> int:
-    from train.run import finish, load_policy
+    from train.evaluate import Evaluator
+    from train.run import finish, restore_actor
 
     run = Run.open(options.run)
-    _show(run, finish(run, *load_policy(run)), console)
+    job, actor_params = restore_actor(run)
+    _show(run, finish(run, Evaluator(job.env, job.agent), actor_params), console)
     return 0
 
 

@@ -80,7 +80,9 @@ class Run:
             RunError: the folder already holds a run, or cannot be made.
         """
         if (path / "config.json").exists():
-            raise RunError(f"{path}: already holds a run; continue it with --resume {path}, or choose another --out")
+            raise RunError(
+                f"{path}: already holds a run; continue it with --resume {path}, or choose another --out"
+            )
         try:
             path.mkdir(parents=True, exist_ok=True)
             data = {"train": to_dict(config), "spec": spec.to_dict(), "provenance": provenance("train")}
@@ -102,7 +104,14 @@ class Run:
             return cls(path, from_dict(data["train"]), ArmSpec.from_dict(data["spec"], str(file)))
         except OSError as error:
             raise RunError(f"{path}: not the folder of a run: {file}: {error.strerror}") from error
-        except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, ConfigError, SpecError) as error:
+        except (
+            json.JSONDecodeError,
+            UnicodeDecodeError,
+            KeyError,
+            TypeError,
+            ConfigError,
+            SpecError,
+        ) as error:
             raise RunError(f"{file}: not a run's config: {error!r}") from error
 
     @property

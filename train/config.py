@@ -54,11 +54,13 @@ class TrainConfig:
             if getattr(self, name) < 1:
                 raise ConfigError(f"{name}: got {getattr(self, name)}, expected at least 1")
         if self.replay_capacity < self.n_arms:
-            raise ConfigError(f"replay_capacity: got {self.replay_capacity}, expected at least n_arms = {self.n_arms}")
+            raise ConfigError(
+                f"replay_capacity: got {self.replay_capacity}, expected at least n_arms = {self.n_arms}"
+            )
         if self.n_updates_per_vector_step < 1:
             raise ConfigError(
-                f"updates_per_env_step: got {self.updates_per_env_step}, expected at least one update per step "
-                f"of all {self.n_arms} arms, {1 / self.n_arms:.4g}"
+                f"updates_per_env_step: got {self.updates_per_env_step}, expected at least one update per "
+                f"step of all {self.n_arms} arms, {1 / self.n_arms:.4g}"
             )
 
     @property

@@ -10,7 +10,7 @@ import jax
 
 from mjx_softarm.export import policy_from_actor, save_policy
 from train.checkpoint import Run
-from train.run import load_policy
+from train.run import restore_actor
 
 
 def export_run(run: Run, path: Path | None = None) -> Path:
@@ -19,7 +19,7 @@ def export_run(run: Run, path: Path | None = None) -> Path:
     Raises:
         RunError: the run has no checkpoint.
     """
-    _, actor_params = load_policy(run)
+    _, actor_params = restore_actor(run)
     provenance = {
         **json.loads((run.path / "config.json").read_text("utf-8")),
         "epoch": run.latest_epoch,

@@ -47,7 +47,9 @@ class Job:
     def _init(self, key: Array) -> TrainState:
         key, key_arms, key_agent = jax.random.split(key, 3)
         arms = self.arms.reset(key_arms)
-        experience = jax.eval_shape(lambda: self._experience(arms, jnp.zeros((self.arms.n, self.env.action_size)), arms))
+        experience = jax.eval_shape(
+            lambda: self._experience(arms, jnp.zeros((self.arms.n, self.env.action_size)), arms)
+        )
         one = jax.tree.map(lambda x: jnp.zeros(x.shape[1:], x.dtype), experience)
         return TrainState(
             arms=arms,
@@ -65,7 +67,9 @@ class Job:
             The next state; means over the epoch by name, and `unsettled`, the number of masked arms.
         """
         self.n_traces += 1
-        state, metrics = jax.lax.scan(self._vector_step, state, None, length=self.config.vector_steps_per_epoch)
+        state, metrics = jax.lax.scan(
+            self._vector_step, state, None, length=self.config.vector_steps_per_epoch
+        )
         unsettled = jnp.sum(metrics.pop("env/unsettled")) * self.config.n_arms
         return state, {**jax.tree.map(jnp.mean, metrics), "env/unsettled": unsettled}
 

@@ -33,6 +33,7 @@ def _axes(figure: Figure, position: Any, title: str, x: str, y: str) -> Any:
     axes.set_xlabel(x)
     axes.set_ylabel(y)
     axes.grid(color="#e6e6e6", linewidth=0.6)
+    axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
     return axes
 
@@ -45,7 +46,9 @@ def learning_curve(rows: list[dict[str, Any]]) -> Figure:
     left = _axes(figure, 121, "tip error on held-out goals", "environment steps", "mm")
     left.plot(steps, [row["evaluation/median_mm"] for row in evaluated], color=BLUE, label="median")
     left.plot(steps, [row["evaluation/p95_mm"] for row in evaluated], color=ORANGE, label="95 %")
-    left.plot(steps, [row["evaluation/circle_mean_mm"] for row in evaluated], color=GREY, label="circle, mean")
+    left.plot(
+        steps, [row["evaluation/circle_mean_mm"] for row in evaluated], color=GREY, label="circle, mean"
+    )
     left.set_yscale("log")
     left.yaxis.set_major_formatter("{x:g}")
     left.legend(frameon=False)
@@ -91,11 +94,19 @@ def workspace_figure(workspace: Reached) -> Figure:
         names = [f"{'xyz'[k]} [mm]" for k in columns]
         axes = _axes(figure, position, f"tip error at the goals, {title}", *names)
         points = axes.scatter(
-            goal[order, columns[0]], goal[order, columns[1]], c=error[order], s=5, cmap="viridis", vmin=0, vmax=top
+            goal[order, columns[0]],
+            goal[order, columns[1]],
+            c=error[order],
+            s=5,
+            cmap="viridis",
+            vmin=0,
+            vmax=top,
         )
         axes.set_aspect("equal")
     figure.colorbar(points, ax=axes, label="mm", extend="max")
-    axes = _axes(figure, 133, f"distribution over {len(error)} held-out goals", "tip error [mm]", "share of goals [%]")
+    axes = _axes(
+        figure, 133, f"distribution over {len(error)} held-out goals", "tip error [mm]", "share of goals [%]"
+    )
     axes.plot(np.sort(error), 100 * np.arange(1, len(error) + 1) / len(error), color=BLUE)
     for share, colour in ((50, GREY), (95, ORANGE)):
         at = float(np.quantile(error, share / 100))

@@ -63,6 +63,8 @@ def train(run: Run, console: Console) -> Summary:
             if due or asked:
                 run.save(epoch, state)
             progress.update(bar, completed=epoch, text=_line(row))
+            if due and not console.is_terminal:  # a log file gets lines in the place of a bar
+                console.print(f"epoch {epoch} of {run.config.n_epochs}: {_line(row)}", highlight=False)
             if asked and epoch < run.config.n_epochs:
                 raise Interrupted(f"stopped after epoch {epoch}; continue with --resume {run.path}")
     return finish(run, evaluator, state.agent.actor_params)
@@ -76,13 +78,12 @@ def finish(run: Run, evaluator: Evaluator, actor_params: Any) -> Summary:
     return summary
 
 
-def load_policy(run: Run) -> tuple[Evaluator, Any]:
-    """The evaluator of a run, and the actor of its newest checkpoint."""
+def restore_actor(run: Run) -> tuple[Job, Any]:
+    """The job of a run, and the actor of its newest checkpoint."""
     xla.enable_compilation_cache()
-    env = ReachEnv(run.spec, run.config.env)
-    job = Job(run.config, env)
+    job = Job(run.config, ReachEnv(run.spec, run.config.env))
     _, state = run.restore(jax.eval_shape(job.init, jax.random.PRNGKey(0)))
-    return Evaluator(env, job.agent), state.agent.actor_params
+    return job, state.agent.actor_params
 
 
 def _timed_epoch(job: Job, state: TrainState) -> tuple[TrainState, dict[str, float]]:
@@ -121,7 +122,8 @@ def _line(row: dict[str, float]) -> str:
 
 def _progress(console: Console) -> Progress:
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
-    return Progress(*columns, TextColumn("{task.fields[text]}"), console=console, speed_estimate_period=120)
+    columns += (TextColumn("{task.fields[text]}"),)
+    return Progress(*columns, console=console, speed_estimate_period=120, disable=not console.is_terminal)
 
 
 @contextmanager

@@ -10,7 +10,12 @@ from train.config import PRESETS, ConfigError, TrainConfig, from_dict, override,
 def test_overrides_reach_every_level_and_leave_the_preset_alone():
     before = PRESETS["quick"]
     after = override(before, ["seed=3", "tqc.gamma=0.25", "tqc.hidden_actor=[64, 32]", "env.engine=mjx"])
-    assert (after.seed, after.tqc.gamma, after.tqc.hidden_actor, after.env.engine) == (3, 0.25, (64, 32), "mjx")
+    assert (after.seed, after.tqc.gamma, after.tqc.hidden_actor, after.env.engine) == (
+        3,
+        0.25,
+        (64, 32),
+        "mjx",
+    )
     assert override(after, ["env.reward.threshold=1"]).env.reward.threshold == 1.0
     assert before.seed == 0 and before.env.engine == "chain"
 
@@ -54,5 +59,7 @@ def test_json_with_a_setting_too_many_or_too_few_is_refused():
 
 
 def test_an_epoch_count_covers_the_steps_asked_for():
-    config = TrainConfig(total_env_steps=10_001, n_arms=100, vector_steps_per_epoch=10, updates_per_env_step=0.5)
+    config = TrainConfig(
+        total_env_steps=10_001, n_arms=100, vector_steps_per_epoch=10, updates_per_env_step=0.5
+    )
     assert (config.n_epochs, config.n_updates_per_vector_step, config.n_updates) == (11, 50, 11 * 10 * 50)

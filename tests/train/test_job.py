@@ -67,7 +67,9 @@ def test_an_arm_that_does_not_settle_is_reset_counted_and_never_stored(job):
     state, metrics = job.epoch(state._replace(arms=arms))
     assert int(state.n_unsettled) == 2 and metrics["env/unsettled"] == 2
     assert int(state.memory.size) == 2 * 8 - 2
-    jax.tree.map(lambda x: np.testing.assert_array_equal(np.isfinite(x), True), jax.device_get(state.memory.data))
+    jax.tree.map(
+        lambda x: np.testing.assert_array_equal(np.isfinite(x), True), jax.device_get(state.memory.data)
+    )
     assert np.isfinite(state.arms.pipeline_state.params.chamber_stiffness).all()
 
 
