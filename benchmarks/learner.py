@@ -40,7 +40,6 @@ _OURS = (
     _PREPARE
     + """
 import jax, jax.numpy as jnp
-from mjx_softarm import xla
 from mjx_softarm.obs import ObsScale
 from mjx_softarm.rewards import RewardConfig
 from mjx_softarm.spec import ArmSpec
@@ -63,7 +62,7 @@ def update(agent_state, key):
     batch = relabel(stored, key_relabel, config.hindsight, scale, reward)
     return agent.update(agent_state, batch, key_update)
 
-updates = xla.jit(lambda state, key: jax.lax.scan(update, state, jax.random.split(key, n)))
+updates = jax.jit(lambda state, key: jax.lax.scan(update, state, jax.random.split(key, n)))
 state = agent.init(jax.random.PRNGKey(0))
 
 def train():

@@ -44,9 +44,9 @@ def _steps_per_second(engine: str, n: int) -> dict[str, Any]:
 
         return jax.lax.scan(step, state, jax.random.split(key, N_STEPS))
 
-    state = xla.jit(arms.reset)(jax.random.PRNGKey(0))
+    state = xla.jit(arms.reset, env.uses_mjx)(jax.random.PRNGKey(0))
     start = time.perf_counter()
-    compiled = xla.jit(rollout)
+    compiled = xla.jit(rollout, env.uses_mjx)
     _, (unsettled, saturated) = jax.block_until_ready(compiled(state, jax.random.PRNGKey(1)))
     compile_s = time.perf_counter() - start
     rate = n * N_STEPS / seconds(lambda: compiled(state, jax.random.PRNGKey(1)))

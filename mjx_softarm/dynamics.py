@@ -7,9 +7,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import Array
-from mujoco import mjx
 
 from mjx_softarm import control
+from mjx_softarm._mjx import mjx
 from mjx_softarm.mjcf import TIMESTEP_S
 from mjx_softarm.settle import Settled
 from mjx_softarm.statics import ArmParams

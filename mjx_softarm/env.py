@@ -13,11 +13,10 @@ from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from brax.envs.base import Env, State
 from jax import Array
-from mujoco import mjx
 
 from mjx_softarm import control, obs, rewards, sensors
+from mjx_softarm._mjx import Env, State, mjx
 from mjx_softarm.dynamics import Motion, advance, with_params
 from mjx_softarm.kinematics import chain_frames, mjx_frames
 from mjx_softarm.mjcf import build_model
@@ -82,8 +81,8 @@ class ReachEnv(Env):
         self.gains = control.Gains.from_spec(self.spec)
         self.sensor = sensors.SensorParams.from_spec(self.spec)
         self.frequency_range_hz = jnp.asarray(sensors.frequency_range_hz(self.spec), jnp.float32)
-        uses_mjx = self.config.engine == "mjx" or self.config.mode == "dynamic"
-        self.model = mjx.put_model(build_model(self.spec)) if uses_mjx else None
+        self.uses_mjx = self.config.engine == "mjx" or self.config.mode == "dynamic"
+        self.model = mjx.put_model(build_model(self.spec)) if self.uses_mjx else None
         self.pool: Pool = sample_workspace(self.spec, self.config.n_poses, self.config.workspace_seed)
 
     @property

@@ -20,12 +20,12 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import gymnasium
 import jax
 import numpy as np
-from brax.envs.base import State
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from jax import Array
 
 from mjx_softarm import xla
+from mjx_softarm._mjx import State
 from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.spec import ArmSpec
 from mjx_softarm.wrappers import VectorEnv
@@ -65,8 +65,8 @@ class SoftArmVectorEnv(gymnasium.vector.VectorEnv):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._arms = VectorEnv(self.env, num_envs, max_episode_steps)
         self._state: State | None = None
-        self._reset_arms = xla.jit(self._arms.reset)
-        self._step_arms = xla.jit(self._traced_step, donate_argnums=0)
+        self._reset_arms = xla.jit(self._arms.reset, env.uses_mjx)
+        self._step_arms = xla.jit(self._traced_step, env.uses_mjx, donate_argnums=0)
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[np.ndarray, Info]:
         """Start an episode with every arm; a seed fixes all that follows. There are no options."""
@@ -219,7 +219,7 @@ def _reach_env(arm: ArmSpec, config: EnvConfig) -> ReachEnv:
 def _compiled(arm: ArmSpec, config: EnvConfig) -> tuple:
     """Reset and step of one arm, compiled once for all environments that share arm and config."""
     env = _reach_env(arm, config)
-    return xla.jit(env.reset), xla.jit(env.step, donate_argnums=0)
+    return xla.jit(env.reset, env.uses_mjx), xla.jit(env.step, env.uses_mjx)
 
 
 def _reset_info(state: State) -> dict[str, Array]:

@@ -13,7 +13,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import Array
-from mujoco import mjx
+
+from mjx_softarm._mjx import mjx
 
 DOFS_PER_LINK = 3
 

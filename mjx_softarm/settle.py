@@ -52,6 +52,7 @@ class _Iterate(NamedTuple):
     pressure: Array
     at_limit: Array
     moving: Array
+    stiffening: Array  # () of the joints, in their own stiffness, after the energy had no minimum
     iteration: Array
 
 
@@ -70,6 +71,7 @@ def settle(kinematics: Callable[[Array], Frames], params: ArmParams, reference_m
         pressure=jnp.clip(jnp.zeros_like(params.area), params.pressure_min_kpa, params.pressure_max_kpa),
         at_limit=jnp.zeros(params.area.shape, bool),
         moving=jnp.array(True),
+        stiffening=jnp.zeros((), dtype),
         iteration=jnp.array(0),
     )
     end = jax.lax.while_loop(
@@ -93,7 +95,8 @@ def _active_set(pressure: Array, error_m: Array, params: ArmParams) -> tuple[Arr
     """Which chambers sit at a limit (n,), and the limit they sit at [kPa]."""
     trial = pressure + ACTIVE_SET_GAIN_KPA_PER_M * error_m
     limit = jnp.clip(trial, params.pressure_min_kpa, params.pressure_max_kpa)
-    return trial != limit, limit
+    pinned = params.pressure_min_kpa == params.pressure_max_kpa  # even where the error happens to be zero
+    return (trial != limit) | pinned, limit
 
 
 def _newton_step(it: _Iterate, kinematics, params: ArmParams, reference_m: Array) -> _Iterate:
@@ -101,7 +104,8 @@ def _newton_step(it: _Iterate, kinematics, params: ArmParams, reference_m: Array
     error = reference_m - now.springs.length
     at_limit, limit = _active_set(it.pressure, error, params)
     push = (now.chambers.jacobian * now.area[:, None]).T  # (nv, n) force per kPa
-    factor = jax.scipy.linalg.cho_factor(now.hessian, lower=True)
+    hessian = now.hessian + jnp.diag(it.stiffening * params.joint_stiffness)
+    factor = jax.scipy.linalg.cho_factor(hessian, lower=True)
     solved = jax.scipy.linalg.cho_solve(factor, jnp.column_stack([now.gradient, push]))
     fall, gain = solved[:, 0], solved[:, 1:]  # dq = gain dp - fall
     track = now.springs.jacobian @ gain  # (n, n) spring lengths per kPa
@@ -112,12 +116,13 @@ def _newton_step(it: _Iterate, kinematics, params: ArmParams, reference_m: Array
     largest = jnp.max(jnp.abs(dq))
     scale = jnp.minimum(1.0, MAX_STEP / largest)
     same = jnp.all(at_limit == it.at_limit)
-    solvable = jnp.isfinite(largest)  # else the energy has no minimum here, or an input is not finite
+    convex = jnp.isfinite(largest)  # else stay here and stiffen the joints, until there is a step
     return _Iterate(
-        q=jnp.where(solvable, it.q + scale * dq, it.q),
-        pressure=jnp.where(solvable, it.pressure + scale * dp, it.pressure),
+        q=jnp.where(convex, it.q + scale * dq, it.q),
+        pressure=jnp.where(convex, it.pressure + scale * dp, it.pressure),
         at_limit=at_limit,
-        moving=solvable & ~(same & (largest < SMALL_STEP)),
+        moving=~(same & (largest < SMALL_STEP) & (it.stiffening == 0)),
+        stiffening=jnp.where(convex, 0.0, 4.0 * it.stiffening + 4.0),
         iteration=it.iteration + 1,
     )
 

@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from mjx_softarm import xla
 from mjx_softarm.kinematics import chain_frames
 from mjx_softarm.pose import pose_from_frame
 from mjx_softarm.settle import Settled, settle_pressures
@@ -38,7 +37,7 @@ def _solver():
         kinematics = functools.partial(chain_frames, link_length_m=params.link_length_m)
         return settle_pressures(kinematics, params, pressure_kpa)
 
-    return xla.jit(jax.vmap(solve, in_axes=(None, 0)))
+    return jax.jit(jax.vmap(solve, in_axes=(None, 0)))
 
 
 def settle_many(spec: ArmSpec, pressure_kpa: np.ndarray) -> Settled:

@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from brax.envs.base import State
 from jax import Array
 
+from mjx_softarm._mjx import State
 from mjx_softarm.env import ReachEnv
 
 

@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from brax.envs.base import State
 from jax import Array
 
 from mjx_softarm import rewards, xla
+from mjx_softarm._mjx import State
 from mjx_softarm.env import EnvConfig, Randomisation, ReachEnv
 from mjx_softarm.workspace import circle_poses, sample_workspace
 from train.tqc import TQC
@@ -67,8 +67,8 @@ class Evaluator:
         self.agent = agent
         self.goals = sample_workspace(env.spec, n_goals, HELD_OUT_SEED).pose
         self.circle = jnp.asarray(circle_poses())
-        self._workspace = xla.jit(self._reach_all)
-        self._circle = xla.jit(self._follow)
+        self._workspace = xla.jit(self._reach_all, env.uses_mjx)
+        self._circle = xla.jit(self._follow, env.uses_mjx)
 
     def __call__(self, actor_params: Any) -> tuple[Summary, Reached, Reached]:
         """Figures, and what was reached on the workspace and on the circle, as NumPy arrays."""

@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from brax.envs.base import State
 from jax import Array
 
 from mjx_softarm import xla
+from mjx_softarm._mjx import State
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.wrappers import VectorEnv
 from train import replay
@@ -41,8 +41,8 @@ class Job:
         self.arms = VectorEnv(env, config.n_arms, config.episode_length)
         self.agent = TQC(env.observation_size, env.action_size, config.tqc, config.n_updates)
         self.n_traces = 0
-        self.init = xla.jit(self._init)
-        self.epoch = xla.jit(self._epoch, donate_argnums=0)
+        self.init = xla.jit(self._init, env.uses_mjx)
+        self.epoch = xla.jit(self._epoch, env.uses_mjx, donate_argnums=0)
 
     def _init(self, key: Array) -> TrainState:
         key, key_arms, key_agent = jax.random.split(key, 3)

@@ -1,0 +1,25 @@
+"""MJX and brax, imported in one place.
+
+Without warp, which nothing here uses, `mujoco.mjx` prints two lines whenever it is imported; they are held
+back. Neither package is typed well enough to be checked, so type checkers see `Any`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+if TYPE_CHECKING:
+    Env: TypeAlias = Any
+    State: TypeAlias = Any
+    mjx: Any
+else:
+    with contextlib.redirect_stdout(io.StringIO()) as said:
+        from brax.envs.base import Env, State
+        from mujoco import mjx
+    for line in said.getvalue().splitlines():
+        if not line.startswith(("Failed to import warp:", "Failed to import mujoco_warp:")):
+            print(line)
+
+__all__ = ["Env", "State", "mjx"]

@@ -1,0 +1,66 @@
+"""brax's wrappers and brax's own agent on the environment, as they are."""
+
+import functools
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from brax.envs import training
+from brax.training.agents.sac import networks, train
+
+N_ARMS, EPISODE_LENGTH, N_STEPS = 8, 2, 96
+
+
+@pytest.fixture
+def quick_compilation():
+    """brax compiles without this project's options; these programs run for milliseconds only."""
+    before = jax.config.read("jax_disable_most_optimizations")
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", before)
+
+
+def test_brax_s_wrappers_keep_the_state_s_types(env):
+    wrapped = training.EvalWrapper(training.wrap(env, episode_length=EPISODE_LENGTH))
+    keys = jax.random.split(jax.random.PRNGKey(0), N_ARMS)  # brax's keys are of the old kind
+    before = jax.eval_shape(wrapped.reset, keys)
+    after = jax.eval_shape(wrapped.step, before, jnp.zeros((N_ARMS, env.action_size)))
+    assert after.obs.shape == (N_ARMS, env.observation_size)
+    described = [jax.tree.map(lambda x: (x.shape, x.dtype), state) for state in (before, after)]
+    assert described[0] == described[1]
+
+
+def test_brax_s_sac_trains(env, quick_compilation):
+    with warnings.catch_warnings(action="ignore", category=DeprecationWarning):
+        if not hasattr(jax, "device_put_replicated"):
+            pytest.skip(f"brax's agents call jax.device_put_replicated, which jax {jax.__version__} has not")
+    make_policy, params, metrics = train.train(
+        env,
+        num_timesteps=N_STEPS,
+        episode_length=EPISODE_LENGTH,
+        num_envs=N_ARMS,
+        num_eval_envs=N_ARMS,
+        batch_size=16,
+        max_replay_size=N_STEPS,
+        learning_rate=1e-2,
+        network_factory=functools.partial(networks.make_sac_networks, hidden_layer_sizes=(8,)),
+        seed=3,
+    )
+    assert metrics["training/buffer_current_size"] > 0
+    losses = [metrics[f"training/{name}_loss"] for name in ("critic", "actor", "alpha")]
+    assert np.isfinite(losses).all() and metrics["training/critic_loss"] > 0
+    assert metrics["training/alpha"] != 1.0  # where it starts
+    assert metrics["eval/avg_episode_length"] == EPISODE_LENGTH and metrics["eval/episode_unsettled"] == 0
+    # An episode of two actions: each earns 100, -100, or the cost of an error.
+    assert -200.0 <= metrics["eval/episode_reward"] <= 200.0
+
+    _, policy_params = params
+    start = networks.make_sac_networks(18, 9, hidden_layer_sizes=(8,)).policy_network.init(
+        jax.random.PRNGKey(0)
+    )
+    moved = jax.tree.map(lambda x, y: x.shape == y.shape and np.isfinite(x).all(), policy_params, start)
+    assert all(jax.tree.leaves(moved))
+    action, _ = make_policy(params, deterministic=True)(jnp.zeros((1, 18)), jax.random.PRNGKey(0))
+    assert action.shape == (1, 9) and float(jnp.abs(action).max()) <= 1.0
