@@ -65,8 +65,8 @@ class SoftArmVectorEnv(gymnasium.vector.VectorEnv):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._arms = VectorEnv(self.env, num_envs, max_episode_steps)
         self._state: State | None = None
-        self._reset_arms = xla.jit(self._arms.reset, env.uses_mjx)
-        self._step_arms = xla.jit(self._traced_step, env.uses_mjx, donate_argnums=0)
+        self._reset_arms = xla.jit(self._arms.reset, self.env.uses_mjx)
+        self._step_arms = xla.jit(self._traced_step, self.env.uses_mjx, donate_argnums=0)
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[np.ndarray, Info]:
         """Start an episode with every arm; a seed fixes all that follows. There are no options."""

@@ -60,6 +60,9 @@ def sample_workspace(spec: ArmSpec, n: int, seed: int) -> Pool:
         spec: the arm.
         n: number of poses.
         seed: of the draw; training and evaluation use different ones.
+
+    Raises:
+        ValueError: the arm settles at fewer than `n` of the candidates.
     """
     rng = np.random.default_rng(seed)
     low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
@@ -70,6 +73,11 @@ def sample_workspace(spec: ArmSpec, n: int, seed: int) -> Pool:
         np.floor(tip_mm / VOXEL_MM).astype(int), axis=0, return_inverse=True, return_counts=True
     )
     weight = found.settled / count[voxel.ravel()]
+    if np.count_nonzero(weight) < n:
+        raise ValueError(
+            f"the arm {spec.name!r} settles at {np.count_nonzero(weight)} of {len(weight)} random pressures, "
+            f"expected at {n} or more; is it stiff enough?"
+        )
     chosen = rng.choice(len(weight), n, replace=False, p=weight / weight.sum())
     pose = jax.vmap(pose_from_frame)(found.tip_position_m[chosen], found.tip_rotation[chosen])
     arrays = (found.q[chosen], found.pressure_kpa[chosen], found.spring_m[chosen], pose)
