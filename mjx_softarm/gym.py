@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium
 import jax
+import jax.numpy as jnp
 import numpy as np
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
@@ -31,7 +32,7 @@ from mjx_softarm.spec import ArmSpec
 from mjx_softarm.wrappers import VectorEnv
 
 if TYPE_CHECKING:
-    from stable_baselines3.common.vec_env import VecEnv
+    from stable_baselines3.common.vec_env import VecEnv  # pyright: ignore[reportMissingImports]
 
 ENV_ID = "SoftArmReach-v0"
 EPISODE_LENGTH = 4  # actions; each leads to a rest, so a policy that knows the arm needs one
@@ -72,9 +73,9 @@ class SoftArmVectorEnv(gymnasium.vector.VectorEnv):
         """Start an episode with every arm; a seed fixes all that follows. There are no options."""
         super().reset(seed=seed)
         _refuse_options(options)
-        self._state = self._reset_arms(_new_key(self.np_random))
+        self._state = state = self._reset_arms(_new_key(self.np_random))
         everywhere = np.ones(self.num_envs, bool)
-        return _to_numpy(self._state.obs), _where(everywhere, _to_numpy(_reset_info(self._state)))
+        return _to_numpy(state.obs), _where(everywhere, _to_numpy(_reset_info(state)))
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:
         """Act once with every arm, actions (num_envs, n_chambers) in [-1, 1].
@@ -84,7 +85,7 @@ class SoftArmVectorEnv(gymnasium.vector.VectorEnv):
         """
         if self._state is None:
             raise gymnasium.error.ResetNeeded("SoftArmVectorEnv.step: call reset first")
-        actions = _as_actions(actions, self.action_space)
+        actions = _as_actions(actions, self.action_space.shape)
         self._state, results = self._step_arms(self._state, actions, _new_key(self.np_random))
         obs, reward, terminated, truncated, started, last, final_obs = _to_numpy(results)
         over = terminated | truncated
@@ -132,15 +133,15 @@ class SoftArmEnv(gymnasium.Env):
         """Start an episode; a seed fixes all that follows. There are no options."""
         super().reset(seed=seed)
         _refuse_options(options)
-        self._state = self._reset_arm(_new_key(self.np_random))
-        return _to_numpy(self._state.obs), _to_numpy(_reset_info(self._state))
+        self._state = state = self._reset_arm(_new_key(self.np_random))
+        return _to_numpy(state.obs), _to_numpy(_reset_info(state))
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, Info]:
         """Act once, action (n_chambers,) in [-1, 1]."""
         if self._state is None:
             raise gymnasium.error.ResetNeeded("SoftArmEnv.step: call reset first")
-        self._state = self._step_arm(self._state, _as_actions(action, self.action_space))
-        obs, reward, info = _to_numpy((self._state.obs, self._state.reward, _step_info(self._state)))
+        self._state = state = self._step_arm(self._state, _as_actions(action, self.action_space.shape))
+        obs, reward, info = _to_numpy((state.obs, state.reward, _step_info(state)))
         info = {name: value if value.ndim else value.item() for name, value in info.items()}
         return obs, reward.item(), info["is_success"], not info["valid"], info
 
@@ -151,7 +152,7 @@ def as_sb3(envs: SoftArmVectorEnv) -> VecEnv:
     Stable-Baselines3 takes vector environments of its own class only. An arm's info is empty but where its
     episode ends. Wrap the result in SB3's `VecMonitor` to log returns.
     """
-    from stable_baselines3.common.vec_env import VecEnv
+    from stable_baselines3.common.vec_env import VecEnv  # pyright: ignore[reportMissingImports]
 
     class SB3VecEnv(VecEnv):
         def __init__(self):
@@ -246,13 +247,14 @@ def _to_numpy(tree: Any) -> Any:
 
 
 def _new_key(rng: np.random.Generator) -> Array:
-    return jax.random.wrap_key_data(rng.integers(2**32, size=2, dtype=np.uint32), impl="threefry2x32")
+    bits = rng.integers(2**32, size=2, dtype=np.uint32)
+    return jax.random.wrap_key_data(jnp.asarray(bits), impl="threefry2x32")
 
 
-def _as_actions(actions: Any, space: gymnasium.spaces.Box) -> np.ndarray:
+def _as_actions(actions: Any, shape: tuple[int, ...] | None) -> np.ndarray:
     actions = np.asarray(actions, np.float32)
-    if actions.shape != space.shape:
-        raise ValueError(f"actions: expected shape {space.shape}, got {actions.shape}")
+    if actions.shape != shape:
+        raise ValueError(f"actions: expected shape {shape}, got {actions.shape}")
     return actions
 
 

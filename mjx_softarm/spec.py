@@ -8,72 +8,18 @@ says which fields exist, what they mean and which values are allowed.
 from __future__ import annotations
 
 import dataclasses
-import math
 import tomllib
-import typing
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import tomli_w
 
+from mjx_softarm._fields import SpecError, anything, count, not_negative, positive, read_fields
 from mjx_softarm.sensors import frequency_range_hz
 
 N_CHAMBERS_PER_SECTION = 3
-
-
-class SpecError(ValueError):
-    """A specification that cannot be used; the message names file, field, value and what was expected."""
-
-
-@dataclass(frozen=True)
-class Rule:
-    """What a field accepts: a kind of number, its range, and whether one per chamber is allowed."""
-
-    kind: type = float
-    low: float = -math.inf
-    high: float = math.inf
-    low_open: bool = False
-    per_chamber: bool = False
-
-    @property
-    def text(self) -> str:
-        noun = {int: "a whole number", float: "a number", str: "a text"}[self.kind]
-        low = "" if self.low == -math.inf else f" {'>' if self.low_open else '>='} {self.low:g}"
-        high = "" if self.high == math.inf else f" and <= {self.high:g}" if low else f" <= {self.high:g}"
-        return noun + low + high + (", or a list with one per chamber" if self.per_chamber else "")
-
-    def accepts(self, value: Any) -> bool:
-        if self.kind is str:
-            return isinstance(value, str)
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
-            return False
-        if self.kind is int:
-            return isinstance(value, int) and self.low <= value <= self.high
-        try:
-            value = float(value)
-        except OverflowError:
-            return False
-        above = value > self.low if self.low_open else value >= self.low
-        return math.isfinite(value) and above and value <= self.high
-
-
-def _positive(per_chamber: bool = False, high: float = math.inf) -> Any:
-    return field(metadata={"rule": Rule(low=0.0, low_open=True, per_chamber=per_chamber, high=high)})
-
-
-def _not_negative(per_chamber: bool = False) -> Any:
-    return field(metadata={"rule": Rule(low=0.0, per_chamber=per_chamber)})
-
-
-def _any(per_chamber: bool = False, low: float = -math.inf, high: float = math.inf) -> Any:
-    return field(metadata={"rule": Rule(low=low, high=high, per_chamber=per_chamber)})
-
-
-def _count() -> Any:
-    return field(metadata={"rule": Rule(kind=int, low=1)})
-
 
 PerChamber = float | tuple[float, ...]
 
@@ -82,86 +28,86 @@ PerChamber = float | tuple[float, ...]
 class Structure:
     """Counts; they fix array shapes, so a new value compiles anew."""
 
-    n_sections: int = _count()
-    links_per_section: int = _count()
+    n_sections: int = count()
+    links_per_section: int = count()
 
 
 @dataclass(frozen=True)
 class Geometry:
     """Lengths of the unloaded arm at rest."""
 
-    section_length_m: float = _positive()
-    chamber_radius_m: float = _positive()
-    spring_radius_m: float = _positive()
-    first_chamber_deg: float = _any(low=-360.0, high=360.0)
-    chamber_diameter_m: float = _positive()
+    section_length_m: float = positive()
+    chamber_radius_m: float = positive()
+    spring_radius_m: float = positive()
+    first_chamber_deg: float = anything(low=-360.0, high=360.0)
+    chamber_diameter_m: float = positive()
 
 
 @dataclass(frozen=True)
 class Mass:
     """Masses; the arm's own is spread evenly over its links."""
 
-    arm_kg: float = _positive()
-    gripper_kg: float = _not_negative()
-    gripper_length_m: float = _positive()
-    payload_kg: float = _not_negative()
+    arm_kg: float = positive()
+    gripper_kg: float = not_negative()
+    gripper_length_m: float = positive()
+    payload_kg: float = not_negative()
 
 
 @dataclass(frozen=True)
 class Chambers:
     """Bellows: force = pressure * (area_m2 + area_slope_m * (length - section length))."""
 
-    area_m2: PerChamber = _positive(per_chamber=True)
-    area_slope_m: PerChamber = _any(per_chamber=True)
-    stiffness_n_per_m: PerChamber = _positive(per_chamber=True)
-    damping_ns_per_m: float = _not_negative()
-    length_offset_m: PerChamber = _any(per_chamber=True, low=-0.1, high=0.1)
-    pressure_min_kpa: float = _any(low=-101.325)
-    pressure_max_kpa: float = _any(low=-101.325)
+    area_m2: PerChamber = positive(per_chamber=True)
+    area_slope_m: PerChamber = anything(per_chamber=True)
+    stiffness_n_per_m: PerChamber = positive(per_chamber=True)
+    damping_ns_per_m: float = not_negative()
+    length_offset_m: PerChamber = anything(per_chamber=True, low=-0.1, high=0.1)
+    pressure_min_kpa: float = anything(low=-101.325)
+    pressure_max_kpa: float = anything(low=-101.325)
 
 
 @dataclass(frozen=True)
 class Backbone:
     """Stiffness and damping of one whole section besides its chambers and springs."""
 
-    axial_stiffness_n_per_m: float = _positive()
-    bending_stiffness_nm_per_rad: float = _positive()
-    axial_damping_ns_per_m: float = _not_negative()
-    bending_damping_nms_per_rad: float = _not_negative()
+    axial_stiffness_n_per_m: float = positive()
+    bending_stiffness_nm_per_rad: float = positive()
+    axial_damping_ns_per_m: float = not_negative()
+    bending_damping_nms_per_rad: float = not_negative()
 
 
 @dataclass(frozen=True)
 class Springs:
     """The inductive springs and the range of lengths that may be commanded."""
 
-    stiffness_n_per_m: float = _not_negative()
-    damping_ns_per_m: float = _not_negative()
-    rest_length_m: float = _positive()
-    length_min_m: float = _positive()
-    length_max_m: float = _positive()
+    stiffness_n_per_m: float = not_negative()
+    damping_ns_per_m: float = not_negative()
+    rest_length_m: float = positive()
+    length_min_m: float = positive()
+    length_max_m: float = positive()
 
 
 @dataclass(frozen=True)
 class Sensor:
     """Resonant circuit and coil of one spring; see `mjx_softarm.sensors`."""
 
-    capacitance_f: float = _positive()
-    compensation_h: float = _any()
-    turns: float = _positive()
-    coil_radius_m: float = _positive()
-    beta: PerChamber = _positive(per_chamber=True)
-    delta_m: PerChamber = _any(per_chamber=True)
-    frequency_min_hz: float = _positive()
-    frequency_max_hz: float = _positive()
+    capacitance_f: float = positive()
+    compensation_h: float = anything()
+    turns: float = positive()
+    coil_radius_m: float = positive()
+    beta: PerChamber = positive(per_chamber=True)
+    delta_m: PerChamber = anything(per_chamber=True)
+    frequency_min_hz: float = positive()
+    frequency_max_hz: float = positive()
 
 
 @dataclass(frozen=True)
 class Control:
     """Gains of the sensor-space law; see `mjx_softarm.control`."""
 
-    rate_hz: float = _positive()
-    kp_kpa_per_m: float = _not_negative()
-    ki_kpa_per_ms: float = _positive()
+    rate_hz: float = positive()
+    kp_kpa_per_m: float = not_negative()
+    ki_kpa_per_ms: float = positive()
 
 
 @dataclass(frozen=True)
@@ -226,7 +172,7 @@ class ArmSpec:
         Raises:
             SpecError: a field is missing, unknown, of the wrong type or out of range.
         """
-        parts = _read_fields(cls, data, source, "")
+        parts = read_fields(cls, data, source, "")
         spec = cls(**parts)
         spec.validate(source)
         return spec
@@ -294,41 +240,3 @@ def _ordered(source: str, group: str, part: Any, low: str, high: str) -> None:
         raise SpecError(
             f"{source}: {group}.{low}: got {low_value!r}, expected less than {high} ({high_value!r})"
         )
-
-
-def _read_fields(cls: type, data: Any, source: str, prefix: str) -> dict[str, Any]:
-    """The keyword arguments of `cls` from a table, each checked against its rule."""
-    if not isinstance(data, dict):
-        raise SpecError(f"{source}: {prefix.rstrip('.') or 'specification'}: got {data!r}, expected a table")
-    known = [item.name for item in fields(cls)]
-    for name in data:
-        if name not in known:
-            raise SpecError(f"{source}: {prefix}{name}: unknown field, expected one of {', '.join(known)}")
-    hints = typing.get_type_hints(cls)
-    groups = {name: hint for name, hint in hints.items() if dataclasses.is_dataclass(hint)}
-    values: dict[str, Any] = {}
-    for item in fields(cls):
-        path = prefix + item.name
-        if item.name not in data:
-            expected = "a table" if item.name in groups else _rule(item).text
-            raise SpecError(f"{source}: {path}: missing, expected {expected}")
-        value = data[item.name]
-        group = groups.get(item.name)
-        if group is not None:
-            values[item.name] = group(**_read_fields(group, value, source, path + "."))
-        else:
-            values[item.name] = _read_value(_rule(item), value, source, path)
-    return values
-
-
-def _rule(item: dataclasses.Field) -> Rule:
-    return item.metadata.get("rule", Rule(kind=str))
-
-
-def _read_value(rule: Rule, value: Any, source: str, path: str) -> Any:
-    many = rule.per_chamber and isinstance(value, (list, tuple))
-    if not all(map(rule.accepts, value)) if many else not rule.accepts(value):
-        raise SpecError(f"{source}: {path}: got {value!r}, expected {rule.text}")
-    if many:
-        return tuple(map(float, value))
-    return rule.kind(value)

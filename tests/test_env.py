@@ -231,7 +231,7 @@ def randomised(spec, env):
     """State of as many arms as the other fixtures', every kind of randomisation on."""
     spread = ReachEnv(spec, dataclasses.replace(env.config, randomisation=SPREAD))
     keys = jax.random.split(jax.random.key(0), env.config.n_poses)
-    return xla.jit(jax.vmap(spread.reset))(keys)
+    return xla.jit(jax.vmap(spread.reset), spread.uses_mjx)(keys)
 
 
 def test_without_randomisation_every_arm_is_the_nominal_one(spec, start):
@@ -337,7 +337,8 @@ def few(request):
 def compiled(env):
     """Four arms, reset, and step."""
     keys = jax.random.split(jax.random.key(0), 4)
-    return xla.jit(jax.vmap(env.reset))(keys), xla.jit(jax.vmap(env.step))
+    reset, step = (xla.jit(jax.vmap(function), env.uses_mjx) for function in (env.reset, env.step))
+    return reset(keys), step
 
 
 def test_engine_mjx_steps_like_engine_chain(few):

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from mujoco import mjx
 
 from mjx_softarm import ArmSpec, xla
+from mjx_softarm._mjx import mjx
 from mjx_softarm.kinematics import Frames, chain_frames, mjx_frames
 from mjx_softarm.mjcf import build_model
 
@@ -60,7 +60,7 @@ def assert_same_frames(got, expected, case):
 @functools.cache
 def chain(sections=3, links=4):
     length = arm(sections, links).link_length_m
-    return xla.jit(jax.vmap(functools.partial(chain_frames, link_length_m=length)))
+    return jax.jit(jax.vmap(functools.partial(chain_frames, link_length_m=length)))
 
 
 @pytest.mark.parametrize("structure", STRUCTURES, ids=str)

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_softarm import ArmSpec, xla
+from mjx_softarm import ArmSpec
 from mjx_softarm.kinematics import chain_frames
 from mjx_softarm.mjcf import build_model
 from mjx_softarm.settle import (
@@ -29,7 +29,7 @@ def solver(solve):
     def one(params, target):
         return solve(functools.partial(chain_frames, link_length_m=params.link_length_m), params, target)
 
-    return xla.jit(jax.vmap(one, in_axes=(None, 0)))
+    return jax.jit(jax.vmap(one, in_axes=(None, 0)))
 
 
 def settled(solve, target, spec=SPEC, params=None):
@@ -142,7 +142,7 @@ def test_mirrored_targets_give_the_mirrored_arm(solve, targets):
 def test_a_single_arm_settles_as_in_a_batch():
     reference = np.float32(references())
     params = ArmParams.from_spec(SPEC)
-    one = xla.jit(
+    one = jax.jit(
         lambda r: settle(functools.partial(chain_frames, link_length_m=params.link_length_m), params, r)
     )
     batch = settled(settle, reference)

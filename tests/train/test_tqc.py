@@ -6,7 +6,7 @@ import numpy as np
 import optax
 import pytest
 
-from train import tqc
+from train import losses
 from train.networks import squash
 from train.tqc import TQC, TQCConfig, Transition
 
@@ -99,7 +99,7 @@ def quantiles_and_targets():
 
 def test_quantile_huber_loss_equals_loops_over_every_pair(quantiles_and_targets, strict_dtypes):
     quantiles, targets = quantiles_and_targets
-    loss = jax.jit(tqc.quantile_huber_loss)(
+    loss = jax.jit(losses.quantile_huber_loss)(
         jnp.asarray(quantiles, jnp.float32), jnp.asarray(targets, jnp.float32)
     )
     # 320 terms of order one in float32.
@@ -108,7 +108,7 @@ def test_quantile_huber_loss_equals_loops_over_every_pair(quantiles_and_targets,
 
 def test_quantile_huber_gradient_equals_finite_differences(quantiles_and_targets, strict_dtypes):
     quantiles, targets = quantiles_and_targets
-    d_quantiles, d_targets = jax.jit(jax.grad(tqc.quantile_huber_loss, argnums=(0, 1)))(
+    d_quantiles, d_targets = jax.jit(jax.grad(losses.quantile_huber_loss, argnums=(0, 1)))(
         jnp.asarray(quantiles, jnp.float32), jnp.asarray(targets, jnp.float32)
     )
     h = 1e-5  # the loss is piecewise quadratic: a central difference is exact away from its corners
@@ -126,7 +126,9 @@ def test_quantile_huber_loss_is_least_at_the_quantiles_of_the_targets():
     # Targets a thousand times wider than the Huber corner: the loss is the plain quantile loss there.
     targets = 1e3 * jnp.arange(1.0, 101.0)[None, :]
     candidates = jnp.array([30e3, 50.5e3, 70e3])  # one quantile, hence the median is best
-    at_each = jax.jit(jax.vmap(lambda quantile: tqc.quantile_huber_loss(quantile[None, None, None], targets)))
+    at_each = jax.jit(
+        jax.vmap(lambda quantile: losses.quantile_huber_loss(quantile[None, None, None], targets))
+    )
     below, median, above = at_each(candidates)
     assert median < below and median < above
 
@@ -135,7 +137,7 @@ def test_quantile_huber_loss_is_least_at_the_quantiles_of_the_targets():
 def test_drop_largest_keeps_what_a_sort_keeps_also_with_ties(n_drop, strict_dtypes):
     rng = np.random.default_rng(n_drop)
     samples = rng.integers(-3, 4, size=(50, 10)).astype(np.float32)
-    kept = np.asarray(jax.jit(tqc.drop_largest, static_argnums=1)(jnp.asarray(samples), n_drop))
+    kept = np.asarray(jax.jit(losses.drop_largest, static_argnums=1)(jnp.asarray(samples), n_drop))
     np.testing.assert_array_equal(np.sort(kept, axis=-1), np.sort(samples, axis=-1)[:, : 10 - n_drop])
 
 
@@ -144,7 +146,7 @@ def test_truncated_targets_equal_loops_over_sorted_pools(strict_dtypes):
     next_quantiles, next_log_prob, reward = rng.normal(size=(B, C, M)), rng.normal(size=B), rng.normal(size=B)
     terminated, alpha, gamma = np.array([0.0, 1.0, 0.0, 1.0]), 0.3, 0.9
     inputs = (next_quantiles, next_log_prob, reward, terminated, alpha)
-    targets = tqc.truncated_targets(
+    targets = losses.truncated_targets(
         *(jnp.asarray(x, jnp.float32) for x in inputs), gamma=gamma, n_drop_per_critic=DROP
     )
     assert targets.shape == (B, K)
@@ -159,13 +161,13 @@ def test_actor_loss_equals_loops(strict_dtypes):
     rng = np.random.default_rng(2)
     log_prob, quantiles, alpha = rng.normal(size=B), rng.normal(size=(B, C, M)), 0.3
     expected = sum(alpha * log_prob[b] - sum(quantiles[b].ravel()) / (C * M) for b in range(B)) / B
-    got = tqc.actor_loss(*(jnp.asarray(x, jnp.float32) for x in (log_prob, quantiles, alpha)))
+    got = losses.actor_loss(*(jnp.asarray(x, jnp.float32) for x in (log_prob, quantiles, alpha)))
     assert got == pytest.approx(expected, rel=1e-5)
 
 
 def test_alpha_loss_equals_loops_and_its_gradient_is_the_entropy_above_target(strict_dtypes):
     log_prob, log_alpha, target = np.array([0.5, -1.5, 2.0, 1.0]), -0.7, -2.0
-    value, slope = jax.value_and_grad(tqc.alpha_loss)(
+    value, slope = jax.value_and_grad(losses.alpha_loss)(
         jnp.asarray(log_alpha, jnp.float32), jnp.asarray(log_prob, jnp.float32), target
     )
     assert value == pytest.approx(sum(-log_alpha * (p + target) for p in log_prob) / B, rel=1e-6)
@@ -190,14 +192,14 @@ def test_update_is_one_adam_step_on_each_loss_at_the_incoming_state(agent, state
     targets = reward + CONFIG.gamma * (pools - alpha * next_log_prob[:, None])
 
     def critic_objective(params):
-        return tqc.quantile_huber_loss(
+        return losses.quantile_huber_loss(
             agent.critics.apply(params, batch.obs, batch.action), jnp.asarray(targets)
         )
 
     def actor_objective(params):
         action, log_prob = squash(*agent.actor.apply(params, batch.obs), noise)
         quantiles = agent.critics.apply(state.critic_params, batch.obs, action)
-        return tqc.actor_loss(log_prob, quantiles, alpha), jnp.mean(log_prob)
+        return losses.actor_loss(log_prob, quantiles, alpha), jnp.mean(log_prob)
 
     loss_critic, d_critic = jax.jit(jax.value_and_grad(critic_objective))(state.critic_params)
     actor_grad = jax.jit(jax.value_and_grad(actor_objective, has_aux=True))

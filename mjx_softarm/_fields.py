@@ -1,0 +1,99 @@
+"""What the fields of a specification accept, and how they are read from tables."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import typing
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+
+class SpecError(ValueError):
+    """A specification that cannot be used; the message names file, field, value and what was expected."""
+
+
+@dataclass(frozen=True)
+class Rule:
+    """What a field accepts: a kind of number, its range, and whether one per chamber is allowed."""
+
+    kind: type = float
+    low: float = -math.inf
+    high: float = math.inf
+    low_open: bool = False
+    per_chamber: bool = False
+
+    @property
+    def text(self) -> str:
+        noun = {int: "a whole number", float: "a number", str: "a text"}[self.kind]
+        low = "" if self.low == -math.inf else f" {'>' if self.low_open else '>='} {self.low:g}"
+        high = "" if self.high == math.inf else f" and <= {self.high:g}" if low else f" <= {self.high:g}"
+        return noun + low + high + (", or a list with one per chamber" if self.per_chamber else "")
+
+    def accepts(self, value: Any) -> bool:
+        if self.kind is str:
+            return isinstance(value, str)
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            return False
+        if self.kind is int:
+            return isinstance(value, int) and self.low <= value <= self.high
+        try:
+            value = float(value)
+        except OverflowError:
+            return False
+        above = value > self.low if self.low_open else value >= self.low
+        return math.isfinite(value) and above and value <= self.high
+
+
+def positive(per_chamber: bool = False, high: float = math.inf) -> Any:
+    return field(metadata={"rule": Rule(low=0.0, low_open=True, per_chamber=per_chamber, high=high)})
+
+
+def not_negative(per_chamber: bool = False) -> Any:
+    return field(metadata={"rule": Rule(low=0.0, per_chamber=per_chamber)})
+
+
+def anything(per_chamber: bool = False, low: float = -math.inf, high: float = math.inf) -> Any:
+    return field(metadata={"rule": Rule(low=low, high=high, per_chamber=per_chamber)})
+
+
+def count() -> Any:
+    return field(metadata={"rule": Rule(kind=int, low=1)})
+
+
+def read_fields(cls: type, data: Any, source: str, prefix: str) -> dict[str, Any]:
+    """The keyword arguments of `cls` from a table, each checked against its rule."""
+    if not isinstance(data, dict):
+        raise SpecError(f"{source}: {prefix.rstrip('.') or 'specification'}: got {data!r}, expected a table")
+    known = [item.name for item in fields(cls)]
+    for name in data:
+        if name not in known:
+            raise SpecError(f"{source}: {prefix}{name}: unknown field, expected one of {', '.join(known)}")
+    hints = typing.get_type_hints(cls)
+    groups = {name: hint for name, hint in hints.items() if dataclasses.is_dataclass(hint)}
+    values: dict[str, Any] = {}
+    for item in fields(cls):
+        path = prefix + item.name
+        if item.name not in data:
+            expected = "a table" if item.name in groups else _rule(item).text
+            raise SpecError(f"{source}: {path}: missing, expected {expected}")
+        value = data[item.name]
+        group = groups.get(item.name)
+        if group is not None:
+            values[item.name] = group(**read_fields(group, value, source, path + "."))
+        else:
+            values[item.name] = _read_value(_rule(item), value, source, path)
+    return values
+
+
+def _rule(item: dataclasses.Field) -> Rule:
+    return item.metadata.get("rule", Rule(kind=str))
+
+
+def _read_value(rule: Rule, value: Any, source: str, path: str) -> Any:
+    many = rule.per_chamber and isinstance(value, (list, tuple))
+    if not all(map(rule.accepts, value)) if many else not rule.accepts(value):
+        raise SpecError(f"{source}: {path}: got {value!r}, expected {rule.text}")
+    if many:
+        return tuple(map(float, value))
+    return rule.kind(value)
