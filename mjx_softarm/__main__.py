@@ -8,6 +8,7 @@ import sys
 from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 
@@ -24,7 +25,7 @@ class CommandError(Exception):
 
 
 class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> None:
+    def error(self, message: str) -> NoReturn:
         self.exit(_ERROR, f"{self.prog}: error: {message} (--help tells more)\n")
 
 
@@ -45,7 +46,7 @@ def _parser() -> argparse.ArgumentParser:
         description="A pneumatic soft arm in MuJoCo and JAX: its specification, its picture, its workspace.",
     )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    arm = argparse.ArgumentParser(add_help=False)
+    arm = _Parser(add_help=False)
     arm.add_argument(
         "--spec", metavar="ARM.toml", type=Path, help="the arm's specification; default: the paper's arm"
     )
@@ -119,7 +120,7 @@ def _run_picture(args: argparse.Namespace) -> None:
         )
     try:
         with Renderer(build_model(spec)) as renderer:
-            image = renderer.draw(rest.q[0])
+            image = renderer.draw(np.asarray(rest.q[0]))
     except RenderError as error:
         raise CommandError(str(error)) from error
     write_png(args.out, image)
@@ -144,7 +145,7 @@ def _run_workspace(args: argparse.Namespace) -> None:
     n, n_lost = len(found.settled), int(np.sum(~found.settled))
     if n_lost == n:
         raise CommandError("the arm settles at none of the combinations of pressures")
-    tip_mm = 1e3 * found.tip_position_m[found.settled].astype(float)
+    tip_mm = 1e3 * np.asarray(found.tip_position_m, float)[found.settled]
     lateral, vertical = np.ptp(tip_mm[:, 1]), np.ptp(tip_mm[:, 2])
     path = args.out / "workspace.png"
     _draw_workspace(path, spec, tip_mm)
@@ -244,7 +245,7 @@ def _draw_plane(axes, tip_mm: np.ndarray, distance: np.ndarray) -> None:
 
     yz = tip_mm[:, 1:]
     axes.scatter(*yz.T, c=distance, s=4, alpha=0.5, linewidths=0)
-    boundary = LineCollection(outline(yz, _GAP_MM), colors="crimson", linewidths=1.6, capstyle="round")
+    boundary = LineCollection(list(outline(yz, _GAP_MM)), colors="crimson", linewidths=1.6, capstyle="round")
     axes.add_collection(boundary)
     axes.set(xlabel="y [mm]", ylabel="z [mm]", title="(b) projection on the YZ plane")
     axes.set_aspect("equal")

@@ -79,7 +79,10 @@ class Renderer:
 
         Raises:
             ValueError: q has the wrong shape or is not finite.
+            RenderError: the renderer is closed.
         """
+        if self._gl is None:
+            raise RenderError("the renderer is closed")
         q = np.asarray(q, float)
         if q.shape != (self._model.nq,):
             raise ValueError(f"q: got shape {q.shape}, expected ({self._model.nq},)")

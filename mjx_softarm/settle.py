@@ -118,8 +118,8 @@ def _newton_step(it: _Iterate, kinematics, params: ArmParams, reference_m: Array
     same = jnp.all(at_limit == it.at_limit)
     convex = jnp.isfinite(largest)  # else stay here and stiffen the joints, until there is a step
     return _Iterate(
-        q=jnp.where(convex, it.q + scale * dq, it.q),
-        pressure=jnp.where(convex, it.pressure + scale * dp, it.pressure),
+        q=jax.lax.select(convex, it.q + scale * dq, it.q),
+        pressure=jax.lax.select(convex, it.pressure + scale * dp, it.pressure),
         at_limit=at_limit,
         moving=~(same & (largest < SMALL_STEP) & (it.stiffening == 0)),
         stiffening=jnp.where(convex, 0.0, 4.0 * it.stiffening + 4.0),

@@ -48,7 +48,8 @@ def test_brax_s_sac_trains(env, quick_compilation):
         network_factory=functools.partial(networks.make_sac_networks, hidden_layer_sizes=(8,)),
         seed=3,
     )
-    assert metrics["training/buffer_current_size"] > 0
+    # Every action is stored, and the size is reported as its mean over the run.
+    assert metrics["training/buffer_current_size"] == np.arange(N_ARMS, N_STEPS + 1, N_ARMS).mean()
     losses = [metrics[f"training/{name}_loss"] for name in ("critic", "actor", "alpha")]
     assert np.isfinite(losses).all() and metrics["training/critic_loss"] > 0
     assert metrics["training/alpha"] != 1.0  # where it starts
@@ -56,11 +57,6 @@ def test_brax_s_sac_trains(env, quick_compilation):
     # An episode of two actions: each earns 100, -100, or the cost of an error.
     assert -200.0 <= metrics["eval/episode_reward"] <= 200.0
 
-    _, policy_params = params
-    start = networks.make_sac_networks(18, 9, hidden_layer_sizes=(8,)).policy_network.init(
-        jax.random.PRNGKey(0)
-    )
-    moved = jax.tree.map(lambda x, y: x.shape == y.shape and np.isfinite(x).all(), policy_params, start)
-    assert all(jax.tree.leaves(moved))
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(params))
     action, _ = make_policy(params, deterministic=True)(jnp.zeros((1, 18)), jax.random.PRNGKey(0))
     assert action.shape == (1, 9) and float(jnp.abs(action).max()) <= 1.0
