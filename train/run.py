@@ -48,8 +48,8 @@ def train(run: Run, console: Console) -> Summary:
     epoch, state = 0, job.init(jax.random.PRNGKey(run.config.seed))
     if run.latest_epoch is not None:
         epoch, state = run.restore(state)
-        run.truncate_metrics(epoch)
         console.print(f"continuing after epoch {epoch} of {run.config.n_epochs}")
+    run.truncate_metrics(epoch)
     console.print("compiling (cached for the next start) ...")
     with _asked_to_stop() as asked, SummaryWriter(str(run.path)) as board, _progress(console) as progress:
         bar = progress.add_task("training", total=run.config.n_epochs, completed=epoch, text="")
