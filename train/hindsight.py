@@ -89,7 +89,11 @@ def relabel(
 
 
 def _near_offsets(key: Array, n: int, config: HindsightConfig) -> Array:
-    """Offsets (n, 6) [mm, deg] in random directions, log-uniform in length."""
+    """Offsets (n, 6) [mm, deg]: translations in random directions, log-uniform in length, and turns.
+
+    A turn is a normal draw in proportion to the translation's length over its own norm, so it has a heavy
+    tail: some goals are turned further than the arm can, as goals that a user asks for may be.
+    """
     key_length, key_direction = jax.random.split(key)
     low, high = jnp.log(config.near_min_mm), jnp.log(config.near_max_mm)
     length = jnp.exp(jax.random.uniform(key_length, (n, 1), minval=low, maxval=high))
