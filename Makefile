@@ -27,7 +27,7 @@ lint: $(INSTALLED) .venv/.installed-dev  ## ruff, which corrects what it can, an
 	$(BIN)/pre-commit run --all-files
 
 bench: $(INSTALLED)  ## the benchmarks
-	$(BIN)/python -m benchmarks
+	$(BIN)/python -m benchmarks throughput settle learner
 
 clean:  ## remove .venv, build outputs and caches; runs/ stays
 	rm -rf .venv build dist *.egg-info .pytest_cache .ruff_cache

@@ -32,6 +32,8 @@ def main() -> int:
         parser.print_help()
     from benchmarks.common import save
 
+    if "learning" in options.names and not options.runs:
+        parser.error("learning: needs --runs FOLDER [FOLDER ...]")
     for name in options.names:
         module = importlib.import_module(f"benchmarks.{name}")
         figures = module.measure(options.runs) if name == "learning" else module.measure()

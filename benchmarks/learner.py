@@ -59,7 +59,7 @@ memory = replay.add(
 def update(agent_state, key):
     key_sample, key_relabel, key_update = jax.random.split(key, 3)
     stored = replay.sample(memory, key_sample, 256)
-    batch = relabel(stored, key_relabel, config.hindsight, scale, reward)
+    batch = relabel(stored, key_relabel, config.hindsight, scale, reward, exchange_actions=True)
     return agent.update(agent_state, batch, key_update)
 
 updates = jax.jit(lambda state, key: jax.lax.scan(update, state, jax.random.split(key, n)))

@@ -10,7 +10,7 @@ from jax import Array
 
 from mjx_softarm import control
 from mjx_softarm._mjx import mjx
-from mjx_softarm.mjcf import TIMESTEP_S
+from mjx_softarm.mjcf import steps_per_period
 from mjx_softarm.settle import Settled
 from mjx_softarm.statics import ArmParams
 
@@ -52,7 +52,7 @@ def advance(
         reference_m (n_chambers,): spring lengths that the law tracks.
         gains: of the law.
         duration_s: how long; a whole number of control periods.
-        period_s: of the control, a whole number of the model's time steps.
+        period_s: of the control, that of the model's specification.
 
     Returns:
         Where it ends, and the same as a report in which `settled` only says that everything is finite,
@@ -65,13 +65,14 @@ def advance(
         data, integral = carry
         pressure, integral = control.pressures(reference_m, data.ten_length[1::2], integral, gains, period_s)
         data = data.replace(ctrl=pressure)
-        data = jax.lax.fori_loop(0, round(period_s / TIMESTEP_S), lambda _, d: mjx.step(model, d), data)
+        data = jax.lax.fori_loop(0, steps_per_period(period_s), lambda _, d: mjx.step(model, d), data)
         data = mjx.tendon(model, mjx.com_pos(model, mjx.kinematics(model, data)))
         return (data, integral), None
 
-    (data, integral), _ = jax.lax.scan(
-        tick, (data, motion.integral_kpa), None, length=round(duration_s / period_s)
-    )
+    with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
+        (data, integral), _ = jax.lax.scan(
+            tick, (data, motion.integral_kpa), None, length=round(duration_s / period_s)
+        )
     end = Motion(data.qpos, data.qvel, integral)
     error = jnp.abs(reference_m - data.ten_length[1::2])
     at_limit = (data.ctrl <= gains.pressure_min_kpa) | (data.ctrl >= gains.pressure_max_kpa)

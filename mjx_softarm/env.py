@@ -24,7 +24,7 @@ from mjx_softarm.pose import pose_from_frame
 from mjx_softarm.settle import Settled, settle
 from mjx_softarm.spec import ArmSpec
 from mjx_softarm.statics import ArmParams
-from mjx_softarm.workspace import Pool, sample_workspace
+from mjx_softarm.workspace import HELD_OUT_SEED, Pool, sample_workspace
 
 PAYLOAD = 1  # index in ArmParams.tool_mass_kg
 
@@ -36,6 +36,14 @@ class Randomisation:
     payload_max_kg: float = 0.0  # payload uniform from the spec's to this much more
     stiffness_spread: float = 0.0  # each chamber's stiffness times 1 + uniform(-spread, spread)
     sensor_noise_mm: float = 0.0  # standard deviation of each spring's reading, fixed within an episode
+
+    def __post_init__(self):
+        if self.payload_max_kg < 0:
+            raise ValueError(f"Randomisation.payload_max_kg: got {self.payload_max_kg}, expected >= 0")
+        if not 0 <= self.stiffness_spread < 1:
+            raise ValueError(f"Randomisation.stiffness_spread: got {self.stiffness_spread}, expected 0 to 1")
+        if self.sensor_noise_mm < 0:
+            raise ValueError(f"Randomisation.sensor_noise_mm: got {self.sensor_noise_mm}, expected >= 0")
 
 
 @dataclass(frozen=True)
@@ -55,6 +63,10 @@ class EnvConfig:
         for name, allowed in (("engine", ("chain", "mjx")), ("mode", ("quasistatic", "dynamic"))):
             if getattr(self, name) not in allowed:
                 raise ValueError(f"EnvConfig.{name}: got {getattr(self, name)!r}, expected one of {allowed}")
+        if self.n_poses < 1:
+            raise ValueError(f"EnvConfig.n_poses: got {self.n_poses}, expected at least 1")
+        if self.workspace_seed == HELD_OUT_SEED:
+            raise ValueError(f"EnvConfig.workspace_seed: {HELD_OUT_SEED} draws the goals of the evaluation")
 
 
 class ArmState(NamedTuple):
@@ -76,6 +88,11 @@ class ReachEnv(Env):
     def __init__(self, spec: ArmSpec | None = None, config: EnvConfig | None = None):
         self.spec = spec or ArmSpec.default()
         self.config = config or EnvConfig()
+        if self.config.dynamic_step_s < 1.0 / self.spec.control.rate_hz:
+            raise ValueError(
+                f"EnvConfig.dynamic_step_s: got {self.config.dynamic_step_s}, expected at least one "
+                f"period of the control at control.rate_hz = {self.spec.control.rate_hz:g}"
+            )
         self.params = jax.tree.map(jnp.asarray, ArmParams.from_spec(self.spec))
         self.scale = obs.ObsScale.from_spec(self.spec)
         self.gains = control.Gains.from_spec(self.spec)

@@ -1,4 +1,4 @@
-"""ArmSpec -> MuJoCo model: links, chambers, springs and sensors, every object named.
+"""ArmSpec -> MuJoCo model: links, chambers and springs, every object named.
 
 Names: bodies `link{i}`, `gripper`, `payload`; joints `slide{i}`, `bend_x{i}`, `bend_y{i}`; tendons and
 actuators `chamber{i}`, tendons `spring{i}`; site `tip`. Links count from 0 at the base, chambers and
@@ -7,13 +7,15 @@ springs from 0 section by section. An actuator's control is its chamber's pressu
 
 from __future__ import annotations
 
+import math
+
 import mujoco
 import numpy as np
 
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
 from mjx_softarm.statics import GRAVITY_M_S2, ArmParams
 
-TIMESTEP_S = 0.004
+MAX_TIMESTEP_S = 0.004
 _SECTION_COLOURS = ([0.85, 0.33, 0.24, 1.0], [0.95, 0.68, 0.25, 1.0], [0.25, 0.55, 0.80, 1.0])
 _RING_COLOUR = [0.25, 0.27, 0.30, 1.0]
 _SPRING_COLOUR = [0.75, 0.77, 0.80, 1.0]
@@ -29,7 +31,8 @@ def build_spec(spec: ArmSpec) -> mujoco.MjSpec:
     mjspec = mujoco.MjSpec()
     mjspec.modelname = spec.name
     mjspec.option.gravity = [0.0, 0.0, -GRAVITY_M_S2]
-    mjspec.option.timestep = TIMESTEP_S
+    period_s = 1.0 / spec.control.rate_hz
+    mjspec.option.timestep = period_s / steps_per_period(period_s)
     mjspec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     mjspec.option.disableflags = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     mjspec.visual.global_.offwidth, mjspec.visual.global_.offheight = 1280, 960
@@ -46,6 +49,11 @@ def build_spec(spec: ArmSpec) -> mujoco.MjSpec:
     for chamber in range(spec.n_chambers):
         _add_chamber(mjspec, chamber, params, spec)
     return mjspec
+
+
+def steps_per_period(period_s: float) -> int:
+    """Time steps of the model in one period of the control: as few as `MAX_TIMESTEP_S` allows."""
+    return math.ceil(period_s / MAX_TIMESTEP_S - 1e-9)
 
 
 def build_model(spec: ArmSpec) -> mujoco.MjModel:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjx_softarm.pose import array_namespace
+from mjx_softarm._xp import array_namespace
 from mjx_softarm.rewards import RewardConfig, scaled_error
 from mjx_softarm.spec import ArmSpec
 

@@ -12,7 +12,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from mjx_softarm.pose import array_namespace, pose_error
+from mjx_softarm._xp import array_namespace
+from mjx_softarm.pose import pose_error
 
 
 @dataclass(frozen=True)

@@ -74,12 +74,13 @@ def settle(kinematics: Callable[[Array], Frames], params: ArmParams, reference_m
         stiffening=jnp.zeros((), dtype),
         iteration=jnp.array(0),
     )
-    end = jax.lax.while_loop(
-        lambda it: it.moving & (it.iteration < MAX_ITERATIONS),
-        lambda it: _newton_step(it, kinematics, params, reference_m),
-        start,
-    )
-    return _report(end, kinematics, params, reference_m)
+    with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
+        end = jax.lax.while_loop(
+            lambda it: it.moving & (it.iteration < MAX_ITERATIONS),
+            lambda it: _newton_step(it, kinematics, params, reference_m),
+            start,
+        )
+        return _report(end, kinematics, params, reference_m)
 
 
 def settle_pressures(

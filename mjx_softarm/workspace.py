@@ -14,12 +14,13 @@ from jax import Array
 from mjx_softarm.kinematics import chain_frames
 from mjx_softarm.pose import pose_from_frame
 from mjx_softarm.settle import Settled, settle_pressures
-from mjx_softarm.spec import ArmSpec
+from mjx_softarm.spec import ArmSpec, SpecError
 from mjx_softarm.statics import ArmParams
 
 BATCH = 1024
 CANDIDATES_PER_POSE = 2
 VOXEL_MM = 25.0
+HELD_OUT_SEED = 20_000  # of the goals that policies are evaluated on; training draws with other seeds
 
 
 class Pool(NamedTuple):
@@ -62,7 +63,7 @@ def sample_workspace(spec: ArmSpec, n: int, seed: int) -> Pool:
         seed: of the draw; training and evaluation use different ones.
 
     Raises:
-        ValueError: the arm settles at fewer than `n` of the candidates.
+        SpecError: the arm settles at fewer than `n` of the candidates.
     """
     rng = np.random.default_rng(seed)
     low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
@@ -74,7 +75,7 @@ def sample_workspace(spec: ArmSpec, n: int, seed: int) -> Pool:
     )
     weight = found.settled / count[voxel.ravel()]
     if np.count_nonzero(weight) < n:
-        raise ValueError(
+        raise SpecError(
             f"the arm {spec.name!r} settles at {np.count_nonzero(weight)} of {len(weight)} random pressures, "
             f"expected at {n} or more; is it stiff enough?"
         )

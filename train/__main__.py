@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import os
 
-os.environ.setdefault(
-    "TF_CPP_MIN_LOG_LEVEL", "3"
-)  # XLA logs a page for every program it takes from the cache
+# XLA logs a page for every program that it takes from the cache.
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 import argparse
 import sys
@@ -43,8 +42,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     reach = commands.add_parser("reach", help="train a policy that reaches poses of the workspace")
-    reach.add_argument("--preset", choices=PRESETS, default="quick", help="default: %(default)s")
-    reach.add_argument("--seed", type=int, default=0, help="of everything random; default: %(default)s")
+    reach.add_argument("--preset", choices=PRESETS, help="default: quick")
+    reach.add_argument("--seed", type=int, help="of networks, exploration, goals and batches; default: 0")
     reach.add_argument("--spec", type=Path, help="TOML file of the arm; default: the paper's arm")
     reach.add_argument("--engine", choices=("chain", "mjx"), help="kinematics; default: chain")
     reach.add_argument("--mode", choices=("quasistatic", "dynamic"), help="default: quasistatic")
@@ -65,25 +64,43 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _reach(options: argparse.Namespace, console: Console) -> int:
+    from mjx_softarm import xla
+    from mjx_softarm.env import ReachEnv
     from train.run import Interrupted, default_path, train
 
+    xla.enable_compilation_cache()
     if options.resume:
+        if _given(options):
+            raise ConfigError(f"--resume goes alone: the run's own settings hold, got {_given(options)} too")
         run = Run.open(options.resume)
+        env = ReachEnv(run.spec, run.config.env)
     else:
+        preset = options.preset or "quick"
         shortcuts = {"seed": options.seed, "env.engine": options.engine, "env.mode": options.mode}
         assignments = [f"{name}={value}" for name, value in shortcuts.items() if value is not None]
-        config = override(PRESETS[options.preset], [*assignments, *options.set])
+        config = override(PRESETS[preset], [*assignments, *options.set])
         spec = ArmSpec.from_toml(options.spec) if options.spec else ArmSpec.default()
-        path = options.out or default_path("reach", options.preset, config.seed)
+        path = options.out or default_path("reach", preset, config.seed)
+        console.print("drawing goals from the reachable workspace ...")
+        env = ReachEnv(spec, config.env)
         run = Run.create(path, config, spec)
     console.print(f"run: {run.path}", highlight=False)
     try:
-        summary = train(run, console)
+        summary = train(run, env, console)
     except Interrupted as stop:
         console.print(str(stop), highlight=False)
         return 130
     _show(run, summary, console)
     return 0
+
+
+def _given(options: argparse.Namespace) -> str:
+    """The options of a new run that the command line has."""
+    given = {
+        f"--{name}": getattr(options, name)
+        for name in ("preset", "seed", "spec", "engine", "mode", "set", "out")
+    }
+    return ", ".join(name for name, value in given.items() if value not in (None, []))
 
 
 def _evaluate(options: argparse.Namespace, console: Console) -> int:
@@ -105,7 +122,7 @@ def _export(options: argparse.Namespace, console: Console) -> int:
 
 
 def _show(run: Run, summary: Summary, console: Console) -> None:
-    table = Table(title=f"{N_GOALS} held-out goals, at most {N_ACTIONS} actions each", title_justify="left")
+    table = Table(title=f"{N_GOALS} held-out goals, {N_ACTIONS} actions each", title_justify="left")
     table.add_column("figure")
     table.add_column("value", justify="right")
     for name, value in (

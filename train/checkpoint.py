@@ -14,8 +14,8 @@ from typing import Any
 import jax
 import orbax.checkpoint as ocp
 
-from mjx_softarm.spec import ArmSpec, SpecError
-from train.config import ConfigError, TrainConfig, from_dict, to_dict
+from mjx_softarm.spec import ArmSpec
+from train.config import TrainConfig, from_dict, to_dict
 from train.job import TrainState
 
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "orbax-checkpoint", "numpy")
@@ -28,7 +28,7 @@ class RunError(ValueError):
 
 def provenance(program: str) -> dict[str, Any]:
     """Versions, machine and commit that a result depends on."""
-    versions = {}
+    versions, status = {}, _git("status", "--porcelain")
     for name in PACKAGES:
         try:
             versions[name] = metadata.version(name)
@@ -40,7 +40,7 @@ def provenance(program: str) -> dict[str, Any]:
         "machine": {"platform": platform.platform(), "cpus": os.cpu_count(), "device": str(jax.devices()[0])},
         "command": " ".join(["python", "-m", program, *sys.argv[1:]]),
         "commit": _git("rev-parse", "HEAD"),
-        "uncommitted_changes": bool(_git("status", "--porcelain")),
+        "uncommitted_changes": None if status is None else bool(status),
     }
 
 
@@ -104,14 +104,7 @@ class Run:
             return cls(path, from_dict(data["train"]), ArmSpec.from_dict(data["spec"], str(file)))
         except OSError as error:
             raise RunError(f"{path}: not the folder of a run: {file}: {error.strerror}") from error
-        except (
-            json.JSONDecodeError,
-            UnicodeDecodeError,
-            KeyError,
-            TypeError,
-            ConfigError,
-            SpecError,
-        ) as error:
+        except (ValueError, KeyError, TypeError) as error:
             raise RunError(f"{file}: not a run's config: {error!r}") from error
 
     @property

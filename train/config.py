@@ -23,7 +23,7 @@ class TrainConfig:
     """A training run.
 
     Attributes:
-        seed: of everything random in the run.
+        seed: of networks, exploration, goals and batches; the pool of poses has `env.workspace_seed`.
         n_arms: arms simulated side by side.
         episode_length: actions per episode at most.
         total_env_steps: actions of all arms together.
@@ -50,9 +50,18 @@ class TrainConfig:
     hindsight: HindsightConfig = field(default_factory=HindsightConfig)
 
     def __post_init__(self) -> None:
-        for name in ("n_arms", "episode_length", "total_env_steps", "batch_size", "vector_steps_per_epoch"):
+        for name in (
+            "n_arms",
+            "episode_length",
+            "total_env_steps",
+            "batch_size",
+            "vector_steps_per_epoch",
+            "evaluation_epochs",
+        ):
             if getattr(self, name) < 1:
                 raise ConfigError(f"{name}: got {getattr(self, name)}, expected at least 1")
+        if self.warmup_env_steps < 0:
+            raise ConfigError(f"warmup_env_steps: got {self.warmup_env_steps}, expected at least 0")
         if self.replay_capacity < self.n_arms:
             raise ConfigError(
                 f"replay_capacity: got {self.replay_capacity}, expected at least n_arms = {self.n_arms}"

@@ -14,11 +14,10 @@ from jax import Array
 from mjx_softarm import rewards, xla
 from mjx_softarm._mjx import State
 from mjx_softarm.env import EnvConfig, Randomisation, ReachEnv
-from mjx_softarm.workspace import circle_poses, sample_workspace
+from mjx_softarm.workspace import HELD_OUT_SEED, circle_poses, sample_workspace
 from train.tqc import TQC
 
 N_GOALS = 2_000
-HELD_OUT_SEED = 20_000  # of the workspace sample; training draws its goals with other seeds
 N_ACTIONS = 4
 
 
@@ -29,7 +28,7 @@ class Reached(NamedTuple):
     pose: Array  # (n, 6) [mm, deg]
     scaled_error: Array  # (n,) norm of e
     saturated_chambers: Array  # (n,)
-    settled: Array  # (n,) bool
+    settled: Array  # (n,) bool, after every action
     pressure_kpa: Array  # (n, n_chambers)
 
     @property
@@ -57,8 +56,9 @@ class Summary:
 class Evaluator:
     """Evaluates actors of one structure on one arm without randomisation; compiled once.
 
-    Every goal gets at most `N_ACTIONS` actions of the deterministic policy. On the workspace each arm starts
-    at a random pose; on the circle, a single arm goes from point to point, once around to get there.
+    Every goal gets `N_ACTIONS` actions of the deterministic policy, and what stands after the last counts. On
+    the workspace each arm starts at a random pose; on the circle, a single arm goes from point to point,
+    once around to get there.
     """
 
     def __init__(self, env: ReachEnv, agent: TQC, n_goals: int = N_GOALS):
@@ -77,22 +77,22 @@ class Evaluator:
         return summarise(workspace, circle, self.env.config.reward.threshold), workspace, circle
 
     def _act(self, actor_params: Any, state: State, goal: Array) -> tuple[State, Reached]:
-        """Up to N_ACTIONS towards one goal; the arm keeps still once it is there."""
+        """N_ACTIONS towards one goal."""
         arm = state.pipeline_state._replace(goal=goal)
         state = state.replace(pipeline_state=arm, obs=self.env.observe(arm.pose, goal))
 
         def act(state: State, _):
             after = self.env.step(state, self.agent.act_mode(actor_params, state.obs))
-            return after, None
+            return after, after.info["valid"]
 
-        state, _ = jax.lax.scan(act, state, None, length=N_ACTIONS)
+        state, settled = jax.lax.scan(act, state, None, length=N_ACTIONS)
         arm, config = state.pipeline_state, self.env.config.reward
         return state, Reached(
             goal=goal,
             pose=arm.pose,
             scaled_error=jnp.linalg.norm(rewards.scaled_error(arm.pose, goal, config)),
             saturated_chambers=state.metrics["saturated_chambers"],
-            settled=state.info["valid"],
+            settled=jnp.all(settled),
             pressure_kpa=arm.pressure_kpa,
         )
 

@@ -4,7 +4,7 @@ Of a batch, some transitions keep the goal they were made for. Some get the pose
 their goal, and with it the goal bonus (the paper's relabelling). Some get a goal near that pose, at a
 distance drawn log-uniformly, which shows the critic how the reward falls off around a pose.
 
-A relabelled transition whose chambers had saturated also gets the action that asks for the spring
+A relabelled transition to rest whose chambers had saturated also gets the action that asks for the spring
 lengths it ended at: they lead to the same equilibrium with no chamber off its reference
 (hindsight action transitions, Levy et al., ICLR 2019).
 """
@@ -50,6 +50,13 @@ class HindsightConfig:
                 "HindsightConfig: reached_share and near_share must be >= 0 and add up to 1 at most, "
                 f"got {self.reached_share} and {self.near_share}"
             )
+        if not 0 < self.near_min_mm <= self.near_max_mm:
+            raise ValueError(
+                "HindsightConfig: near_min_mm must be > 0 and near_max_mm at least as large, "
+                f"got {self.near_min_mm} and {self.near_max_mm}"
+            )
+        if self.mm_per_deg <= 0:
+            raise ValueError(f"HindsightConfig.mm_per_deg: got {self.mm_per_deg}, expected > 0")
 
 
 def relabel(
@@ -58,6 +65,8 @@ def relabel(
     config: HindsightConfig,
     scale: obs.ObsScale,
     reward_config: rewards.RewardConfig,
+    *,
+    exchange_actions: bool,
 ) -> Transition:
     """A batch to learn from; with both shares zero, its rewards are those the environment gave.
 
@@ -67,6 +76,8 @@ def relabel(
         config: shares.
         scale: of the observations.
         reward_config: weights of the reward.
+        exchange_actions: whether a saturated action may be exchanged for the sensed one. Right only where
+            an action leads to rest: the lengths sensed in the middle of a motion lead elsewhere.
     """
     key_kind, key_near = jax.random.split(key)
     n = batch.saturated.shape[0]
@@ -75,7 +86,7 @@ def relabel(
     near = ~reached & (kind < config.reached_share + config.near_share)
     moved = batch.next_pose + _near_offsets(key_near, n, config).astype(batch.next_pose.dtype)
     goal = jnp.where(reached[:, None], batch.next_pose, jnp.where(near[:, None], moved, batch.goal))
-    sensed = (reached | near) & batch.saturated
+    sensed = (reached | near) & batch.saturated & exchange_actions
     action = jnp.where(sensed[:, None], batch.sensed_action, batch.action)
     saturated = batch.saturated & ~sensed
     reward, done, _ = rewards.reward(batch.next_pose, goal, batch.n_steps, saturated, reward_config)

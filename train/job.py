@@ -75,10 +75,10 @@ class Job:
 
     def _vector_step(self, state: TrainState, _) -> tuple[TrainState, dict[str, Array]]:
         key, key_act, key_random, key_reset, key_updates = jax.random.split(state.key, 5)
-        warm = state.n_env_steps >= self.config.warmup_env_steps
+        warmed_up = state.n_env_steps >= self.config.warmup_env_steps
         explored = jax.random.uniform(key_random, (self.arms.n, self.env.action_size), minval=-1.0)
         action = self.agent.act(state.agent.actor_params, state.arms.obs, key_act)
-        action = jnp.where(warm, action, explored)
+        action = jnp.where(warmed_up, action, explored)
         arms, after, outcome = self.arms.step(state.arms, action, key_reset)
         experience = self._experience(state.arms, action, after)
         valid = outcome.valid & replay.finite_rows(experience)
@@ -89,18 +89,23 @@ class Job:
             n_env_steps=state.n_env_steps + self.arms.n,
             n_unsettled=state.n_unsettled + jnp.sum(~valid, dtype=jnp.int32),
         )
-        agent, losses = self._updates(state, key_updates, warm)
+        agent, losses = self._updates(state, key_updates, warmed_up)
         env_metrics = {f"env/{name}": jnp.mean(value) for name, value in after.metrics.items()}
         return state._replace(agent=agent), env_metrics | {f"tqc/{name}": x for name, x in losses.items()}
 
-    def _updates(self, state: TrainState, key: Array, warm: Array) -> tuple[TQCState, dict[str, Array]]:
+    def _updates(self, state: TrainState, key: Array, warmed_up: Array) -> tuple[TQCState, dict[str, Array]]:
         keys = jax.random.split(key, self.config.n_updates_per_vector_step)
 
         def update(agent: TQCState, key: Array):
             key_sample, key_relabel, key_update = jax.random.split(key, 3)
             stored = replay.sample(state.memory, key_sample, self.config.batch_size)
             batch = relabel(
-                stored, key_relabel, self.config.hindsight, self.env.scale, self.config.env.reward
+                stored,
+                key_relabel,
+                self.config.hindsight,
+                self.env.scale,
+                self.config.env.reward,
+                exchange_actions=self.config.env.mode == "quasistatic",
             )
             return self.agent.update(agent, batch, key_update)
 
@@ -110,7 +115,7 @@ class Job:
 
         shapes = jax.eval_shape(run, state.agent)[1]
         nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-        return jax.lax.cond(warm, run, lambda agent: (agent, nothing), state.agent)
+        return jax.lax.cond(warmed_up, run, lambda agent: (agent, nothing), state.agent)
 
     def _experience(self, before: State, action: Array, after: State) -> Experience:
         start, end = before.pipeline_state, after.pipeline_state

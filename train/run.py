@@ -27,11 +27,12 @@ class Interrupted(Exception):
     """The user stopped the run; its state is saved."""
 
 
-def train(run: Run, console: Console) -> Summary:
+def train(run: Run, env: ReachEnv, console: Console) -> Summary:
     """Train to the end of the run's config, from its newest checkpoint if it has one.
 
     Args:
         run: the folder; its config says everything.
+        env: of the run's arm and config.
         console: where progress is shown.
 
     Returns:
@@ -40,9 +41,6 @@ def train(run: Run, console: Console) -> Summary:
     Raises:
         Interrupted: after Ctrl-C or a termination signal, once the state is saved.
     """
-    xla.enable_compilation_cache()
-    console.print("drawing goals from the reachable workspace ...")
-    env = ReachEnv(run.spec, run.config.env)
     job = Job(run.config, env)
     evaluator = Evaluator(env, job.agent)
     epoch, state = 0, job.init(jax.random.PRNGKey(run.config.seed))
@@ -51,7 +49,7 @@ def train(run: Run, console: Console) -> Summary:
         console.print(f"continuing after epoch {epoch} of {run.config.n_epochs}")
     run.truncate_metrics(epoch)
     console.print("compiling (cached for the next start) ...")
-    with _asked_to_stop() as asked, SummaryWriter(str(run.path)) as board, _progress(console) as progress:
+    with _asked_to_stop() as asked, _board(run, state) as board, _progress(console) as progress:
         bar = progress.add_task("training", total=run.config.n_epochs, completed=epoch, text="")
         while epoch < run.config.n_epochs:
             state, row = _timed_epoch(job, state)
@@ -86,6 +84,12 @@ def restore_actor(run: Run) -> tuple[Job, Any]:
     return job, state.agent.actor_params
 
 
+def _board(run: Run, state: TrainState) -> SummaryWriter:
+    """TensorBoard's writer; what a stopped run wrote after its checkpoint is dropped."""
+    steps = int(state.n_env_steps)
+    return SummaryWriter(str(run.path), purge_step=steps + 1 if steps else None)
+
+
 def _timed_epoch(job: Job, state: TrainState) -> tuple[TrainState, dict[str, float]]:
     start = time.perf_counter()
     updates = int(state.agent.step)
@@ -113,7 +117,7 @@ def _record(run: Run, board: SummaryWriter, epoch: int, state: TrainState, row: 
 def _line(row: dict[str, float]) -> str:
     text = (
         f"{row['speed/env_steps_per_s']:.0f} env steps/s  {row['speed/updates_per_s']:.0f} updates/s  "
-        f"success {100 * row['env/reached']:.0f} %"
+        f"success {100 * row['env/reached']:.0f} % of actions"
     )
     if "evaluation/median_mm" in row:
         text += f"  held-out median {row['evaluation/median_mm']:.1f} mm"

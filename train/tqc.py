@@ -47,6 +47,7 @@ class TQCConfig:
             "hidden_critic": (len(self.hidden_critic) > 0, "at least one layer"),
             "n_critics": (self.n_critics > 0, "a positive number"),
             "n_drop_per_critic": (0 <= self.n_drop_per_critic < self.n_quantiles, "0 to n_quantiles - 1"),
+            "learning_rate": (self.learning_rate >= 0.0, "a number >= 0"),
             "learning_rate_end": (0.0 <= self.learning_rate_end <= 1.0, "a number in [0, 1]"),
             "gamma": (0.0 <= self.gamma <= 1.0, "a number in [0, 1]"),
             "tau": (0.0 < self.tau <= 1.0, "a number in (0, 1]"),

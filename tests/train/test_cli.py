@@ -105,6 +105,13 @@ def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path, environment):
         (["reach", "--set", "tqc.gama=1"], "tqc.gama: unknown setting"),
         (["reach", "--spec", "absent.toml"], "absent.toml: cannot be read: No such file or directory"),
         (["reach", "--resume", "absent"], "absent: not the folder of a run"),
+        (
+            ["reach", "--resume", "absent", "--seed", "0", "--set", "tqc.gamma=0.5"],
+            "--resume goes alone: the run's own settings hold, got --seed, --set too",
+        ),
+        (["reach", "--set", "env.workspace_seed=20000"], "20000 draws the goals of the evaluation"),
+        (["reach", "--set", "hindsight.near_min_mm=0"], "near_min_mm must be > 0"),
+        (["reach", "--set", "evaluation_epochs=0"], "evaluation_epochs: got 0, expected at least 1"),
         (["evaluate", "absent"], "absent: not the folder of a run"),
         (["export", "absent"], "absent: not the folder of a run"),
     ],

@@ -27,6 +27,22 @@ CONFIG = TrainConfig(
 )
 
 
+# A short arm compiles in seconds, with MJX too.
+SHORT = {"n_sections": 1, "links_per_section": 2}
+
+
+@pytest.mark.parametrize("change", [{"engine": "mjx"}, {"mode": "dynamic", "dynamic_step_s": 0.04}], ids=str)
+def test_the_other_engines_train_by_changing_a_word(change):
+    config = dataclasses.replace(CONFIG, env=dataclasses.replace(CONFIG.env, **change))
+    job = Job(config, ReachEnv(ArmSpec.default().replace(structure=SHORT), config.env))
+    state = job.init(jax.random.PRNGKey(0))
+    for _ in range(3):
+        state, metrics = job.epoch(state)
+    assert job.n_traces == 1 and int(state.agent.step) == 4 * (3 * 2 - 2)
+    assert int(state.memory.size) == 3 * 2 * 8 - int(state.n_unsettled) > 40
+    assert all(np.isfinite(value) for value in metrics.values())
+
+
 @pytest.fixture(scope="module")
 def job():
     return Job(CONFIG, ReachEnv(config=CONFIG.env))
