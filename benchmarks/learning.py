@@ -50,16 +50,11 @@ def _row(run: Run) -> dict[str, Any]:
     if not file.exists():
         raise RunError(f"{run.path}: not finished: no evaluation.json")
     rows = run.metrics()
-    speeds = {
-        name: round(float(np.median([row[f"speed/{name}"] for row in rows])))
-        for name in ("env_steps_per_s", "updates_per_s")
-    }
     return {
         "seed": run.config.seed,
         "env_steps": rows[-1]["env_steps"],
         "updates": rows[-1]["updates"],
         **json.loads(file.read_text("utf-8")),
-        **speeds,
     }
 
 
