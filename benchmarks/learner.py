@@ -126,7 +126,7 @@ class _Learner:
 
     def __init__(self, python: str | Path, program: str):
         environment = {**os.environ, "TF_CPP_MIN_LOG_LEVEL": "3"}
-        self._process = subprocess.Popen(
+        self._process: Any = subprocess.Popen(
             [str(python), "-c", program, str(N_UPDATES)],
             env=environment,
             stdin=subprocess.PIPE,

@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import contextlib
 import io
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    Env: TypeAlias = Any
-    State: TypeAlias = Any
-    mjx: Any
+    from mujoco import mjx
+
+    class Env(Any): ...
+
+    class State(Any): ...
+
 else:
     with contextlib.redirect_stdout(io.StringIO()) as said:
         from brax.envs.base import Env, State

@@ -11,7 +11,7 @@ three joints alone; only gravity couples distant links.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -63,25 +63,25 @@ class ArmParams(NamedTuple):
         on_circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
         axial = spec.backbone.axial_stiffness_n_per_m * per_section
         bending = spec.backbone.bending_stiffness_nm_per_rad * per_section
-        values = cls(
-            link_length_m=spec.link_length_m,
-            chamber_site_m=spec.geometry.chamber_radius_m * on_circle,
-            spring_site_m=spec.geometry.spring_radius_m * on_circle,
-            link_mass_kg=np.full(spec.n_links, spec.mass.arm_kg / spec.n_links),
-            tool_mass_kg=[spec.mass.gripper_kg, spec.mass.payload_kg],
-            tool_offset_m=[spec.mass.gripper_length_m / 2, spec.mass.gripper_length_m],
-            joint_stiffness=np.tile([axial, bending, bending], spec.n_links),
-            chamber_stiffness=spec.per_chamber(spec.chambers.stiffness_n_per_m),
-            chamber_rest_m=spec.geometry.section_length_m
+        values: dict[str, Any] = {
+            "link_length_m": spec.link_length_m,
+            "chamber_site_m": spec.geometry.chamber_radius_m * on_circle,
+            "spring_site_m": spec.geometry.spring_radius_m * on_circle,
+            "link_mass_kg": np.full(spec.n_links, spec.mass.arm_kg / spec.n_links),
+            "tool_mass_kg": [spec.mass.gripper_kg, spec.mass.payload_kg],
+            "tool_offset_m": [spec.mass.gripper_length_m / 2, spec.mass.gripper_length_m],
+            "joint_stiffness": np.tile([axial, bending, bending], spec.n_links),
+            "chamber_stiffness": spec.per_chamber(spec.chambers.stiffness_n_per_m),
+            "chamber_rest_m": spec.geometry.section_length_m
             + np.array(spec.per_chamber(spec.chambers.length_offset_m)),
-            area=1e3 * np.array(spec.per_chamber(spec.chambers.area_m2)),
-            area_slope=1e3 * np.array(spec.per_chamber(spec.chambers.area_slope_m)),
-            spring_stiffness=np.full(n, spec.springs.stiffness_n_per_m),
-            spring_rest_m=np.full(n, spec.springs.rest_length_m),
-            pressure_min_kpa=np.full(n, spec.chambers.pressure_min_kpa),
-            pressure_max_kpa=np.full(n, spec.chambers.pressure_max_kpa),
-        )
-        return cls(*(np.asarray(value, dtype) for value in values))
+            "area": 1e3 * np.array(spec.per_chamber(spec.chambers.area_m2)),
+            "area_slope": 1e3 * np.array(spec.per_chamber(spec.chambers.area_slope_m)),
+            "spring_stiffness": np.full(n, spec.springs.stiffness_n_per_m),
+            "spring_rest_m": np.full(n, spec.springs.rest_length_m),
+            "pressure_min_kpa": np.full(n, spec.chambers.pressure_min_kpa),
+            "pressure_max_kpa": np.full(n, spec.chambers.pressure_max_kpa),
+        }
+        return cls(**{name: np.asarray(value, dtype) for name, value in values.items()})  # type: ignore
 
 
 class Tendons(NamedTuple):

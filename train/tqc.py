@@ -91,8 +91,10 @@ class TQC:
         self, obs_size: int, action_size: int, config: TQCConfig = TQCConfig(), n_updates: int | None = None
     ) -> None:
         self.obs_size, self.action_size, self.config = obs_size, action_size, config
-        self.actor = Actor(action_size, config.hidden_actor)
-        self.critics = Critics(config.n_critics, config.n_quantiles, config.hidden_critic, config.layer_norm)
+        self.actor: Any = Actor(action_size, config.hidden_actor)
+        self.critics: Any = Critics(
+            config.n_critics, config.n_quantiles, config.hidden_critic, config.layer_norm
+        )
         self.optimizer = optax.adam(_learning_rate(config, n_updates))
         self.alpha_optimizer = optax.adam(config.learning_rate_alpha)
         self.target_entropy = -float(action_size) if config.target_entropy is None else config.target_entropy
