@@ -1,7 +1,7 @@
 """Held-out rows of a log, in contiguous blocks.
 
-Neighbouring rows of a log are nearly equal, so rows held out one by one have their neighbours in the training set
-and any fit looks good on them. Here whole stretches of time are held out.
+Neighbouring rows of a log are nearly equal, so rows held out one by one have their neighbours in the training
+set and any fit looks good on them. Here whole stretches of time are held out.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ import numpy as np
 def held_out_blocks(n: int, share: float = 0.2, block: int = 100, seed: int = 0) -> np.ndarray:
     """Mask (n,) of the rows to hold out: `share` of the blocks, drawn at random.
 
-    Rows 0 to block - 1 are the first block, and so on; the last may be shorter. At least one block is held out and
-    at least one is not. A log of fewer than two blocks is cut into blocks of a fifth of it.
+    Rows 0 to block - 1 are the first block, and so on; the last may be shorter. At least one block is held out
+    and at least one is not. A log of fewer than two blocks is cut into blocks of a fifth of it.
 
     Raises:
         ValueError: fewer than two rows, a share outside (0, 1), a block below one row.
@@ -25,7 +25,7 @@ def held_out_blocks(n: int, share: float = 0.2, block: int = 100, seed: int = 0)
     if block < 1:
         raise ValueError(f"held-out rows: expected blocks of at least 1 row, got {block}")
     if n < 2 * block:
-        block = max(n // 5, 1)
+        block = min(block, max(n // 5, 1))
     n_blocks = -(-n // block)
     n_held_out = min(max(round(share * n_blocks), 1), n_blocks - 1)
     chosen = np.random.default_rng(seed).choice(n_blocks, n_held_out, replace=False)
