@@ -54,9 +54,14 @@ def pose_from_quaternion(position_m: Array, quaternion: Array) -> Array:
     Returns:
         Pose (..., 6) [mm, deg].
     """
-    xp = array_namespace(position_m, quaternion)
+    return pose_from_frame(position_m, rotation_from_quaternion(quaternion))
+
+
+def rotation_from_quaternion(quaternion: Array) -> Array:
+    """Matrix (..., 3, 3) of a quaternion (..., 4) w, x, y, z; its entries scale with the length's square."""
+    xp = array_namespace(quaternion)
     w, x, y, z = (quaternion[..., k] for k in range(4))
-    rotation = _matrix(
+    return _matrix(
         xp,
         [
             [w * w + x * x - y * y - z * z, 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
@@ -64,7 +69,6 @@ def pose_from_quaternion(position_m: Array, quaternion: Array) -> Array:
             [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), w * w - x * x - y * y + z * z],
         ],
     )
-    return pose_from_frame(position_m, rotation)
 
 
 def frame_from_pose(pose: Array) -> tuple[Array, Array]:
