@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from mjx_softarm import ArmSpec, export
-from mjx_softarm.export import PolicyFileError, load_policy, policy_from_actor, save_policy
+from mjx_softarm.archive import SealedFileError, sealed
+from mjx_softarm.export import load_policy, policy_from_actor, save_policy
 from mjx_softarm.rewards import RewardConfig
 
 PROVENANCE = {"commit": "0123abc", "created": "2025-01-31", "packages": {"numpy": "2.0"}, "seed": 7}
@@ -49,7 +50,9 @@ def arrays_of(path):
 def reseal(path, drop=(), **changes):
     """The file with other entries, under a checksum that fits them."""
     arrays = {name: value for name, value in arrays_of(path).items() if name not in drop}
-    path.write_bytes(export._sealed(arrays | {name.replace("__", "."): v for name, v in changes.items()}))
+    path.write_bytes(
+        sealed(arrays | {name.replace("__", "."): v for name, v in changes.items()}, export.KIND)
+    )
 
 
 def assert_same(one, other):
@@ -68,7 +71,7 @@ def flat(value):
 
 def refusal(path):
     """The message with which a file is refused: one line that starts with the file's name."""
-    with pytest.raises(PolicyFileError) as caught:
+    with pytest.raises(SealedFileError) as caught:
         load_policy(path)
     message = str(caught.value)
     assert message.startswith(f"{path}: ") and "\n" not in message
@@ -137,7 +140,7 @@ def test_parameters_of_another_network_are_refused(names):
 
 def test_actor_of_another_arm_is_refused():
     with pytest.raises(
-        PolicyFileError, match=r"policy: actor.2.bias: got float32 \(6,\), expected float32 \(9,\)"
+        SealedFileError, match=r"policy: actor.2.bias: got float32 \(6,\), expected float32 \(9,\)"
     ):
         policy_from_actor(make_params(n_actions=3), ArmSpec.default(), RewardConfig(), {})
 
@@ -254,7 +257,7 @@ def test_policy_that_is_not_finite_is_not_written(file):
     before = file.read_bytes()
     layers = make_policy().layers
     layers[0][0][3, 2] = np.nan
-    with pytest.raises(PolicyFileError, match=r"actor\.0\.weight: got nan, expected finite numbers"):
+    with pytest.raises(SealedFileError, match=r"actor\.0\.weight: got nan, expected finite numbers"):
         save_policy(file, make_policy(layers=layers))
     assert file.read_bytes() == before
 
@@ -270,7 +273,7 @@ def test_failed_write_keeps_the_old_file_and_leaves_nothing(file, monkeypatch, s
         raise OSError(28, os.strerror(28))
 
     monkeypatch.setattr(type(file), step, fail)
-    with pytest.raises(PolicyFileError, match=r"policy\.npz: cannot be written: No space left on device"):
+    with pytest.raises(SealedFileError, match=r"policy\.npz: cannot be written: No space left on device"):
         save_policy(file, make_policy(rate_hz=25.0))
     assert [path.name for path in file.parent.iterdir()] == ["policy.npz"]
     assert file.read_bytes() == before
@@ -282,7 +285,7 @@ def test_places_that_cannot_be_written(file, tmp_path):
         (tmp_path, "Is a directory"),
         (file / "policy.npz", "Not a directory"),
     ):
-        with pytest.raises(PolicyFileError, match=f"{path}: cannot be written: {reason}"):
+        with pytest.raises(SealedFileError, match=f"{path}: cannot be written: {reason}"):
             save_policy(path, make_policy())
 
 

@@ -14,9 +14,10 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from mjx_softarm.export import PolicyFileError
+from mjx_softarm.archive import SealedFileError
+from mjx_softarm.s2r import S2R, load_s2r
 from mjx_softarm.spec import ArmSpec, SpecError
-from train.checkpoint import Run, RunError
+from train.checkpoint import S2R_FILE, Run, RunError
 from train.config import PRESETS, ConfigError, override
 from train.evaluate import N_ACTIONS, N_GOALS, Summary
 
@@ -29,7 +30,7 @@ def main(arguments: list[str] | None = None) -> int:
     console = Console()
     try:
         return options.command(options, console)
-    except (RunError, ConfigError, SpecError, PolicyFileError) as error:
+    except (RunError, ConfigError, SpecError, SealedFileError) as error:
         Console(stderr=True).print(f"error: {error}", markup=False, highlight=False, soft_wrap=True)
         return 2
     except KeyboardInterrupt:
@@ -45,6 +46,9 @@ def _parser() -> argparse.ArgumentParser:
     reach.add_argument("--preset", choices=PRESETS, help="default: quick")
     reach.add_argument("--seed", type=int, help="of networks, exploration, goals and batches; default: 0")
     reach.add_argument("--spec", type=Path, help="TOML file of the arm; default: the paper's arm")
+    reach.add_argument(
+        "--calibration", type=Path, metavar="DIR", help="folder that `python -m calib run` made, for --spec"
+    )
     reach.add_argument("--engine", choices=("chain", "mjx"), help="kinematics; default: chain")
     reach.add_argument("--mode", choices=("quasistatic", "dynamic"), help="default: quasistatic")
     reach.add_argument(
@@ -73,17 +77,17 @@ def _reach(options: argparse.Namespace, console: Console) -> int:
         if _given(options):
             raise ConfigError(f"--resume goes alone: the run's own settings hold, got {_given(options)} too")
         run = Run.open(options.resume)
-        env = ReachEnv(run.spec, run.config.env)
+        env = ReachEnv(run.spec, run.config.env, run.s2r)
     else:
         preset = options.preset or "quick"
         shortcuts = {"seed": options.seed, "env.engine": options.engine, "env.mode": options.mode}
         assignments = [f"{name}={value}" for name, value in shortcuts.items() if value is not None]
         config = override(PRESETS[preset], [*assignments, *options.set])
-        spec = ArmSpec.from_toml(options.spec) if options.spec else ArmSpec.default()
+        spec, s2r = _arm(options)
         path = options.out or default_path("reach", preset, config.seed)
         console.print("drawing goals from the reachable workspace ...")
-        env = ReachEnv(spec, config.env)
-        run = Run.create(path, config, spec)
+        env = ReachEnv(spec, config.env, s2r)
+        run = Run.create(path, config, spec, s2r)
     console.print(f"run: {run.path}", highlight=False)
     try:
         summary = train(run, env, console)
@@ -94,11 +98,21 @@ def _reach(options: argparse.Namespace, console: Console) -> int:
     return 0
 
 
+def _arm(options: argparse.Namespace) -> tuple[ArmSpec, S2R | None]:
+    """The arm to train for: calibrated, specified or the paper's."""
+    if options.calibration is None:
+        return ArmSpec.from_toml(options.spec) if options.spec else ArmSpec.default(), None
+    if options.spec:
+        raise ConfigError(f"--spec {options.spec}: got --calibration {options.calibration} too, expected one")
+    s2r = options.calibration / S2R_FILE
+    return ArmSpec.from_toml(options.calibration / "arm.toml"), load_s2r(s2r) if s2r.exists() else None
+
+
 def _given(options: argparse.Namespace) -> str:
     """The options of a new run that the command line has."""
     given = {
         f"--{name}": getattr(options, name)
-        for name in ("preset", "seed", "spec", "engine", "mode", "set", "out")
+        for name in ("preset", "seed", "spec", "calibration", "engine", "mode", "set", "out")
     }
     return ", ".join(name for name, value in given.items() if value not in (None, []))
 
