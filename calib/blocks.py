@@ -12,7 +12,7 @@ import numpy as np
 def held_out_blocks(n: int, share: float = 0.2, block: int = 100, seed: int = 0) -> np.ndarray:
     """Mask (n,) of the rows to hold out: `share` of the blocks, drawn at random.
 
-    Rows 0 to block - 1 are the first block, and so on; the last may be shorter. At least one block is held out
+    Rows 0 to block - 1 are the first block, and so on; the last may be shorter. At least one is held out
     and at least one is not. A log of fewer than two blocks is cut into blocks of a fifth of it.
 
     Raises:
