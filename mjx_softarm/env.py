@@ -21,6 +21,7 @@ from mjx_softarm.dynamics import Motion, advance, with_params
 from mjx_softarm.kinematics import chain_frames, mjx_frames
 from mjx_softarm.mjcf import build_model
 from mjx_softarm.pose import pose_from_frame
+from mjx_softarm.s2r import S2R, correct
 from mjx_softarm.settle import Settled, settle
 from mjx_softarm.spec import ArmSpec
 from mjx_softarm.statics import ArmParams
@@ -75,7 +76,7 @@ class ArmState(NamedTuple):
     params: ArmParams  # this episode's arm
     sensor_offset_m: Array  # (n_chambers,) reading less true length, this episode's
     motion: Motion
-    pose: Array  # (6,) [mm, deg]
+    pose: Array  # (6,) [mm, deg] as observed: the real arm's where there is a sim-to-real network
     spring_m: Array  # (n_chambers,) true lengths
     pressure_kpa: Array  # (n_chambers,)
     goal: Array  # (6,) [mm, deg]
@@ -83,11 +84,16 @@ class ArmState(NamedTuple):
 
 
 class ReachEnv(Env):
-    """A soft arm reaching for poses of its workspace."""
+    """A soft arm reaching for poses of its workspace.
 
-    def __init__(self, spec: ArmSpec | None = None, config: EnvConfig | None = None):
+    With a sim-to-real network, every pose that is observed, rewarded or drawn as a goal is the real arm's,
+    P_S2R, as the network tells it from the simulated pose and the spring lengths.
+    """
+
+    def __init__(self, spec: ArmSpec | None = None, config: EnvConfig | None = None, s2r: S2R | None = None):
         self.spec = spec or ArmSpec.default()
         self.config = config or EnvConfig()
+        self.s2r = s2r
         if self.config.dynamic_step_s < 1.0 / self.spec.control.rate_hz:
             raise ValueError(
                 f"EnvConfig.dynamic_step_s: got {self.config.dynamic_step_s}, expected at least one "
@@ -100,7 +106,7 @@ class ReachEnv(Env):
         self.frequency_range_hz = jnp.asarray(sensors.frequency_range_hz(self.spec), jnp.float32)
         self.uses_mjx = self.config.engine == "mjx" or self.config.mode == "dynamic"
         self.model = mjx.put_model(build_model(self.spec)) if self.uses_mjx else None
-        self.pool: Pool = sample_workspace(self.spec, self.config.n_poses, self.config.workspace_seed)
+        self.pool = self.sample_pool(self.config.n_poses, self.config.workspace_seed)
 
     @property
     def observation_size(self) -> int:
@@ -113,6 +119,14 @@ class ReachEnv(Env):
     @property
     def backend(self) -> str:
         return "mjx"
+
+    def sample_pool(self, n: int, seed: int) -> Pool:
+        """Poses of the workspace as `sample_workspace` draws them, the poses being those observed."""
+        pool = sample_workspace(self.spec, n, seed)
+        return pool._replace(pose=self._observed_pose(pool.pose, pool.spring_m))
+
+    def _observed_pose(self, pose: Array, spring_m: Array) -> Array:
+        return pose if self.s2r is None else correct(self.s2r, pose, spring_m)
 
     def reference_m(self, action: Array) -> Array:
         """Spring lengths (..., n_chambers) [m] that an action in [-1, 1] asks for: frequencies, linearly."""
@@ -163,7 +177,7 @@ class ReachEnv(Env):
         valid = end.settled & jnp.all(jnp.isfinite(action))  # a NaN would ask for a length of 0
         moved = arm._replace(
             motion=motion,
-            pose=pose_from_frame(end.tip_position_m, end.tip_rotation),
+            pose=self._observed_pose(pose_from_frame(end.tip_position_m, end.tip_rotation), end.spring_m),
             spring_m=end.spring_m,
             pressure_kpa=end.pressure_kpa,
             n_steps=arm.n_steps + 1,

@@ -14,12 +14,14 @@ from typing import Any
 import jax
 import orbax.checkpoint as ocp
 
+from mjx_softarm.s2r import S2R, load_s2r, save_s2r
 from mjx_softarm.spec import ArmSpec
 from train.config import TrainConfig, from_dict, to_dict
 from train.job import TrainState
 
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "orbax-checkpoint", "numpy")
 N_KEPT = 2
+S2R_FILE = "s2r.npz"  # in the folder of a run, and in that of a calibration
 
 
 class RunError(ValueError):
@@ -63,17 +65,18 @@ def write_json(path: Path, data: Any) -> None:
 class Run:
     """The folder of one run.
 
-    `config.json` (settings, arm, versions, commit), `checkpoints/`, `metrics.jsonl`, `evaluation.json`,
-    pictures, TensorBoard's event files and, once exported, `policy.npz`.
+    `config.json` (settings, arm, calibration, versions, commit), `s2r.npz` (the calibration's sim-to-real
+    network, if it has one), `checkpoints/`, `metrics.jsonl`, `evaluation.json`, pictures, TensorBoard's event
+    files and, once exported, `policy.npz`.
     """
 
-    def __init__(self, path: Path, config: TrainConfig, spec: ArmSpec):
-        self.path, self.config, self.spec = path, config, spec
+    def __init__(self, path: Path, config: TrainConfig, spec: ArmSpec, s2r: S2R | None = None):
+        self.path, self.config, self.spec, self.s2r = path, config, spec, s2r
         options = ocp.CheckpointManagerOptions(max_to_keep=N_KEPT, enable_async_checkpointing=False)
         self._manager = ocp.CheckpointManager((path / "checkpoints").resolve(), options=options)
 
     @classmethod
-    def create(cls, path: Path, config: TrainConfig, spec: ArmSpec) -> Run:
+    def create(cls, path: Path, config: TrainConfig, spec: ArmSpec, s2r: S2R | None = None) -> Run:
         """Start a folder.
 
         Raises:
@@ -85,11 +88,18 @@ class Run:
             )
         try:
             path.mkdir(parents=True, exist_ok=True)
-            data = {"train": to_dict(config), "spec": spec.to_dict(), "provenance": provenance("train")}
+            if s2r is not None:
+                save_s2r(path / S2R_FILE, s2r)
+            data = {
+                "train": to_dict(config),
+                "spec": spec.to_dict(),
+                "s2r": s2r is not None,
+                "provenance": provenance("train"),
+            }
             write_json(path / "config.json", data)
         except OSError as error:
             raise RunError(f"{path}: cannot be written: {error.strerror}") from error
-        return cls(path, config, spec)
+        return cls(path, config, spec, s2r)
 
     @classmethod
     def open(cls, path: Path) -> Run:
@@ -97,15 +107,18 @@ class Run:
 
         Raises:
             RunError: there is no run in it, or its config cannot be read.
+            SealedFileError: its sim-to-real network cannot be read.
         """
         file = path / "config.json"
         try:
             data = json.loads(file.read_text("utf-8"))
-            return cls(path, from_dict(data["train"]), ArmSpec.from_dict(data["spec"], str(file)))
+            config, has_s2r = from_dict(data["train"]), data["s2r"]
+            spec = ArmSpec.from_dict(data["spec"], str(file))
         except OSError as error:
             raise RunError(f"{path}: not the folder of a run: {file}: {error.strerror}") from error
         except (ValueError, KeyError, TypeError) as error:
             raise RunError(f"{file}: not a run's config: {error!r}") from error
+        return cls(path, config, spec, load_s2r(path / S2R_FILE) if has_s2r else None)
 
     @property
     def latest_epoch(self) -> int | None:

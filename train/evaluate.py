@@ -14,7 +14,7 @@ from jax import Array
 from mjx_softarm import rewards, xla
 from mjx_softarm._mjx import State
 from mjx_softarm.env import EnvConfig, Randomisation, ReachEnv
-from mjx_softarm.workspace import HELD_OUT_SEED, circle_poses, sample_workspace
+from mjx_softarm.workspace import HELD_OUT_SEED, circle_poses
 from train.tqc import TQC
 
 N_GOALS = 2_000
@@ -63,9 +63,9 @@ class Evaluator:
 
     def __init__(self, env: ReachEnv, agent: TQC, n_goals: int = N_GOALS):
         nominal: EnvConfig = dataclasses.replace(env.config, randomisation=Randomisation())
-        self.env = env if nominal == env.config else ReachEnv(env.spec, nominal)
+        self.env = env if nominal == env.config else ReachEnv(env.spec, nominal, env.s2r)
         self.agent = agent
-        self.goals = sample_workspace(env.spec, n_goals, HELD_OUT_SEED).pose
+        self.goals = self.env.sample_pool(n_goals, HELD_OUT_SEED).pose
         self.circle = jnp.asarray(circle_poses())
         self._workspace = xla.jit(self._reach_all, env.uses_mjx)
         self._circle = xla.jit(self._follow, env.uses_mjx)

@@ -79,7 +79,7 @@ def finish(run: Run, evaluator: Evaluator, actor_params: Any) -> Summary:
 def restore_actor(run: Run) -> tuple[Job, Any]:
     """The job of a run, and the actor of its newest checkpoint."""
     xla.enable_compilation_cache()
-    job = Job(run.config, ReachEnv(run.spec, run.config.env))
+    job = Job(run.config, ReachEnv(run.spec, run.config.env, run.s2r))
     _, state = run.restore(jax.eval_shape(job.init, jax.random.PRNGKey(0)))
     return job, state.agent.actor_params
 
