@@ -1,0 +1,136 @@
+"""What can be wrong with the rows of a log, and how it is found.
+
+Detectors take arrays and return a mask of the rows at fault; they know nothing of files. The logs of this
+project and the adapters of other people's logs share them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Finding(NamedTuple):
+    """One thing that is wrong with a log."""
+
+    file: str
+    rows: (
+        tuple[int, int] | None
+    )  # first and last line at fault, the header being line 1; None: the whole file
+    column: str  # "" where it is not about columns
+    problem: str  # what was got, and what was expected
+    n_dropped: int = 0  # rows that it cost; a row with two faults counts in both findings
+
+    def __str__(self) -> str:
+        first, last = self.rows or (0, 0)
+        rows = f"line {first}" if first == last else f"lines {first} to {last}"
+        dropped = f"; {self.n_dropped} rows dropped" if self.n_dropped else ""
+        return ": ".join([self.file, *([rows] if self.rows else []), *filter(None, [self.column])]) + (
+            f": {self.problem}{dropped}"
+        )
+
+
+class LogError(ValueError):
+    """A log that cannot be used; the message has a line for each finding."""
+
+    def __init__(self, findings: Sequence[Finding]):
+        super().__init__("\n".join(map(str, findings)))
+        self.findings = tuple(findings)
+
+
+_UNIT_TOLERANCE = 0.01  # of a quaternion's length
+_MOVES_M = 1e-3  # a body that stays within this cannot be told from a frozen one
+_TURN_DEG = 150.0  # a step of orientation that is a jump by 180 degrees
+_MOTION_DEG = 15.0  # larger typical steps are other poses, not motion, and may be turns
+_SPIKE_SIGMA = 20.0
+_SPIKE_LOCAL = 10.0
+_GAP_STEPS = 10.0
+
+
+def stale_rows(values: np.ndarray) -> np.ndarray:
+    """Mask (n,) of the rows of (n, k) that are equal to the row before: a reading that was not renewed."""
+    return np.concatenate([[False], (values[1:] == values[:-1]).all(axis=1)])
+
+
+def moves(position_m: np.ndarray) -> bool:
+    """Whether a body (n, 3) [m] leaves its place in a log."""
+    return bool(np.ptp(position_m, axis=0).max(initial=0.0) > _MOVES_M)
+
+
+def not_unit_rows(quaternion: np.ndarray) -> np.ndarray:
+    """Mask (n,) of the quaternions (n, 4) that are no rotation."""
+    return np.abs(np.linalg.norm(quaternion, axis=1) - 1.0) > _UNIT_TOLERANCE
+
+
+def turned_rows(quaternion: np.ndarray) -> np.ndarray:
+    """Mask (n,) of the rows where motion capture has a body turned by 180 degrees.
+
+    It confuses the markers of a symmetric body for some rows, then jumps back. Of the two orientations, the
+    one with fewer rows counts as turned. Where successive rows are other poses and not one motion there is no
+    telling, and none is.
+
+    Args:
+        quaternion (n, 4): unit, scalar first or last.
+    """
+    cos_half = np.abs((quaternion[1:] * quaternion[:-1]).sum(axis=1))
+    step_deg = 2.0 * np.degrees(np.arccos(np.minimum(cos_half, 1.0)))
+    moving_deg = step_deg[~stale_rows(quaternion)[1:]]
+    if len(moving_deg) == 0 or np.median(moving_deg) > _MOTION_DEG:
+        return np.zeros(len(quaternion), bool)
+    turned = np.cumsum(np.concatenate([[0], step_deg > _TURN_DEG])) % 2 == 1
+    return turned if turned.sum() <= len(turned) / 2 else ~turned
+
+
+def same_sign(quaternion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Quaternions (n, 4) with signs chosen so that successive ones are alike; q and -q are one rotation.
+
+    Returns:
+        The quaternions, and a mask (n,) of the rows where the sign flipped but the orientation hardly changed.
+    """
+    cos_half = (quaternion[1:] * quaternion[:-1]).sum(axis=1)
+    sign = np.cumprod(np.where(cos_half < 0.0, -1.0, 1.0))
+    flipped = cos_half < -np.cos(np.radians(_MOTION_DEG))
+    return quaternion * np.concatenate([[1.0], sign])[:, None], np.concatenate([[False], flipped])
+
+
+def late_rows(time_s: np.ndarray) -> np.ndarray:
+    """Mask (n,) of the rows whose time does not increase: repeated or backwards.
+
+    A row that is alone out of order, early or late, is at fault itself; otherwise the rows up to where the
+    time exceeds again all that came before.
+    """
+    alone = np.zeros(len(time_s), bool)
+    before, here, after = time_s[:-2], time_s[1:-1], time_s[2:]
+    alone[1:-1] = (before < after) & ((here <= before) | (here > after))
+    ordered = np.where(alone, -np.inf, time_s)
+    so_far = np.concatenate([[-np.inf], np.maximum.accumulate(ordered)[:-1]])
+    return alone | (time_s <= so_far)
+
+
+def gap_rows(time_s: np.ndarray) -> np.ndarray:
+    """Mask (n,) of the rows before which rows are missing, by increasing times (n,)."""
+    step_s = np.diff(time_s)
+    return np.concatenate([[False], step_s > _GAP_STEPS * np.median(step_s)])
+
+
+def outlier_rows(values: np.ndarray, least: float) -> np.ndarray:
+    """Mask (n,) of the spikes in a column (n,), one or two rows long.
+
+    A value is compared to the two before and the two after it. A spike is off their median by 20 times the
+    usual (by the median of absolute deviations), by 10 times the spread of the middle two, and by `least`. A
+    step or a fast swing moves the middle two apart, and constant or quantised columns stay below `least`.
+    """
+    outlier = np.zeros(len(values), bool)
+    if len(values) < 5:
+        return outlier
+    a, b, c, d = values[:-4], values[1:-3], values[3:-1], values[4:]
+    low = np.maximum(np.minimum(a, b), np.minimum(c, d))
+    high = np.minimum(np.maximum(a, b), np.maximum(c, d))
+    off = np.abs(values[2:-2] - 0.5 * (low + high))  # low and high are the middle two, in either order
+    sigma = 1.4826 * np.median(off)
+    outlier[2:-2] = off > np.maximum(
+        np.maximum(_SPIKE_SIGMA * sigma, least), _SPIKE_LOCAL * np.abs(high - low)
+    )
+    return outlier

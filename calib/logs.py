@@ -1,0 +1,201 @@
+"""Logs of an arm: read, checked, and reduced to the rows that can be believed.
+
+The schema is that of `mjx_softarm.logs`. A file that cannot be understood (a column missing, a wrong unit) is
+refused. Otherwise each row is believed whole or dropped whole: for a NaN, a reading out of range, a time that
+does not increase, motion capture that was not renewed or is turned, an outlier. So a log that was read has no
+holes in its columns, and its times say where rows are missing. Signs of quaternions are repaired; columns
+that never change, time gaps and unknown columns are only reported. Each finding says what it cost.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from calib.checks import Finding, LogError
+from calib.sheet import PLAUSIBLE, Sheet, clean, implausible, quantity
+from calib.tables import Table, read_table
+from mjx_softarm.logs import GROUPS, UNITS, Column, Log, log_columns, write_log
+from mjx_softarm.sensors import SensorParams, frequency_from_length
+from mjx_softarm.spec import ArmSpec
+
+_CELL = re.compile(r"(\w+)\s*(?:\[(.*)\])?")
+_FACTORS = {"frequency_hz": 1.25, "spring_m": 1.5, "tip_m": 1.5}  # between the ranges of two logs of one arm
+_NEEDED = ("frequency_hz", "spring_m", "pressure_kpa", "tip_m")  # one of them at least
+
+
+def read_log(path: str | Path, n_chambers: int = 9, strict: bool = False) -> tuple[Log, list[Finding]]:
+    """Read a log, keep the rows that can be believed, and say what is wrong with the others.
+
+    Args:
+        path: CSV, or npz by the end of its name.
+        n_chambers: of the arm; a log of another number is refused.
+        strict: refuse a log with any finding.
+
+    Returns:
+        The log, every number finite, and what was found.
+
+    Raises:
+        LogError: the log cannot be used, or is refused; the message has a line for each finding.
+    """
+    sheet, findings = _sheet(str(path), read_table(path), n_chambers)
+    _refuse(implausible(sheet))
+    sheet, found = clean(sheet)
+    findings += found
+    if strict:
+        _refuse(findings)
+    return _log(sheet), findings
+
+
+def _refuse(findings: Sequence[Finding]) -> None:
+    if findings:
+        raise LogError(findings)
+
+
+def _sheet(file: str, table: Table, n_chambers: int) -> tuple[Sheet, list[Finding]]:
+    """The known columns in their order, converted to the units used inside; unknown columns are findings."""
+    matches = [_CELL.fullmatch(cell) for cell in table.names]
+    names = [match[1] if match else cell for match, cell in zip(matches, table.names, strict=True)]
+    units = {name: match[2] if match else None for name, match in zip(names, matches, strict=True)}
+    markers = [int(match[1]) for name in names if (match := re.fullmatch(r"marker(\d+)_[xyz]", name))]
+    n_markers = min(1 + max(markers, default=-1), len(names))
+    known = {column.name: column for column in log_columns(n_chambers, n_markers)}
+
+    errors = [Finding(file, (1, 1), name, problem) for name, problem in _header_errors(names, units, known)]
+    _refuse(errors)
+    present = [column for name, column in known.items() if name in names]
+    columns = tuple(dataclasses.replace(column, unit=units[column.name]) for column in present)
+    values = table.values[:, [names.index(column.name) for column in columns]]
+    values *= [UNITS[column.kind][column.unit] for column in columns]
+    extra = [Finding(file, (1, 1), name, "unknown column, ignored") for name in names if name not in known]
+    return Sheet(file, columns, values, table.row), extra
+
+
+def _header_errors(names: list[str], units: dict, known: dict) -> Iterator[tuple[str, str]]:
+    if not any(name[:1].isalpha() for name in names):
+        yield "", f"expected a header such as `time [s],pressure0 [kPa],...`, got {', '.join(names)[:60]}"
+        return
+    for name, unit in units.items():
+        if names.count(name) > 1:
+            yield name, f"{names.count(name)} columns of this name, expected one"
+        if name in known and unit not in UNITS[known[name].kind]:
+            expected = ", ".join(f"[{unit}]" for unit in UNITS[known[name].kind])
+            yield name, f"got {'no unit' if unit is None else f'[{unit}]'}, expected one of {expected}"
+        if name not in known and re.fullmatch(r"(frequency|spring|pressure|reference)\d+", name):
+            n_chambers = sum(column.group == "spring_m" for column in known.values())
+            yield name, f"expected a log of {n_chambers} chambers, numbered from 0"
+    groups = {known[name].group for name in names if name in known}
+    for group in groups:
+        wanted = [name for name, column in known.items() if column.group == group]
+        if missing := [name for name in wanted if name not in names]:
+            beside = next(name for name in wanted if name in names)
+            yield ", ".join(missing), f"missing, expected beside {beside}"
+    if "time_s" not in groups:
+        yield "time", "missing, expected a column `time [s]`"
+    if not groups & set(_NEEDED):
+        yield (
+            "",
+            f"expected frequency0.., spring0.., pressure0.. or tip_x..; got only {', '.join(names)[:60]}",
+        )
+
+
+def _log(sheet: Sheet) -> Log:
+    groups = {name: sheet.values[:, chosen] for name in GROUPS if (chosen := sheet.of(name))}
+    for name in ("time_s", "payload_kg"):
+        if name in groups:
+            groups[name] = groups[name][:, 0]
+    if "marker_m" in groups:
+        groups["marker_m"] = groups["marker_m"].reshape(len(sheet.row), -1, 3)
+    return Log(source=sheet.file, row=sheet.row, **groups)
+
+
+def same_arm(logs: Sequence[Log]) -> None:
+    """Refuse logs that cannot be of one arm, as their columns or the ranges of their readings tell.
+
+    Raises:
+        LogError: names both files and what differs.
+    """
+    first = logs[0]
+    for other in logs[1:]:
+        file = f"{first.source} and {other.source}"
+        _refuse([Finding(file, None, name, problem) for name, problem in _differences(first, other)])
+
+
+def _differences(first: Log, other: Log) -> Iterator[tuple[str, str]]:
+    for name in (*_NEEDED, "tip_quaternion", "marker_m"):
+        a, b = getattr(first, name), getattr(other, name)
+        if (a is None) != (b is None):
+            yield name, f"only {(other if a is None else first).source} has it, expected logs of one arm"
+        elif a is not None and a.shape[1:] != b.shape[1:]:
+            yield name, f"{a.shape[1]} and {b.shape[1]} in a row, expected logs of one arm"
+        elif a is not None and name in _FACTORS:
+            sizes = [np.linalg.norm(value, axis=1) if name == "tip_m" else value for value in (a, b)]
+            low, high = zip(*(np.percentile(size, [1, 99]) for size in sizes), strict=True)
+            if max(low) > _FACTORS[name] * min(high):
+                ranges = " and ".join(f"{low[k]:.4g} to {high[k]:.4g}" for k in range(2))
+                yield name, f"{ranges}, expected ranges that meet in logs of one arm"
+
+
+def template(path: str | Path) -> str:
+    """Write a small log of the default arm that `read_log` finds nothing wrong with.
+
+    Returns:
+        How such a file is to be read, and what else it may hold: plain text.
+
+    Raises:
+        FileExistsError: there is such a file already.
+    """
+    if Path(path).exists():
+        raise FileExistsError(f"{path}: exists already, expected the name of a new file")
+    spec = ArmSpec.default()
+    n_sections = spec.structure.n_sections
+    phase = 2.0 * np.pi * (np.arange(10)[:, None] / 10.0 + np.arange(spec.n_chambers) / spec.n_chambers)
+    length_m = spec.geometry.section_length_m + 0.01 * np.sin(phase)
+    bend = np.stack([np.zeros(10), np.sin(phase[:, 0]), np.cos(phase[:, 0])], axis=1)
+    tip_m = [0.0, 0.0, -n_sections * spec.geometry.section_length_m] + bend * [0.0, 0.03, 0.01]
+    half = 0.1 * bend[:, 1]
+    share = np.arange(1, n_sections + 1)[:, None] / n_sections
+    log = Log(
+        source=str(path),
+        row=np.arange(10) + 2,
+        time_s=np.arange(10) / spec.control.rate_hz,
+        frequency_hz=np.round(frequency_from_length(length_m, SensorParams.from_spec(spec))),
+        pressure_kpa=np.round(5.0 * np.sin(phase + 1.0), 2),
+        tip_m=np.round(tip_m, 5),
+        tip_quaternion=np.stack([np.cos(half), np.sin(half), 0.0 * half, 0.0 * half], axis=1).round(6),
+        marker_m=np.round(tip_m[:, None] * share, 5),
+        payload_kg=np.zeros(10),
+    )
+    write_log(path, log)
+    return schema_text(spec.n_chambers, n_sections)
+
+
+def schema_text(n_chambers: int = 9, n_markers: int = 3) -> str:
+    """The columns a log may have, in words; from the schema itself."""
+    lines = [
+        "A log is a CSV file (commas, decimal points) or an npz file with arrays `columns` and `table`.",
+        "The header names each column with its unit, as in `pressure0 [kPa]`; the order does not matter. Needed",
+        "are time and one at least of frequency, spring, pressure, tip; a group is there whole or not at all.",
+        "Base frame: z up, the arm hangs from the origin towards -z. The tip is the centre of the last plate,",
+        "its quaternion 1, 0, 0, 0 where the arm hangs straight. Markers are numbered from base to tip, springs",
+        "and chambers as in the spec. A log of one row per pose should wait for the pose; else log at a fixed rate.",
+        "",
+        f"{'columns':<28} {'units':<28} plausible",
+    ]
+    groups: dict[tuple[str, str], list[Column]] = {}
+    for column in log_columns(n_chambers, n_markers):
+        groups.setdefault((column.group, column.kind), []).append(column)
+    for columns in groups.values():
+        first, last = columns[0], columns[-1]
+        names = first.name if first == last else f"{first.name} .. {last.name}"
+        units = list(UNITS[first.kind])
+        bounds = PLAUSIBLE[quantity(first)]
+        steps = " between rows" if first.kind == "time" else ""
+        lines.append(
+            f"{names:<28} {', '.join(units):<28} {bounds.low:g} to {bounds.high:g} {units[0]}{steps}"
+        )
+    return "\n".join(lines)
