@@ -18,7 +18,7 @@ class Finding(NamedTuple):
     file: str
     rows: (
         tuple[int, int] | None
-    )  # first and last line at fault, the header being line 1; None: the whole file
+    )  # first and last line at fault, line 1 being the header; None: the whole file
     column: str  # "" where it is not about columns
     problem: str  # what was got, and what was expected
     n_dropped: int = 0  # rows that it cost; a row with two faults counts in both findings
@@ -26,9 +26,9 @@ class Finding(NamedTuple):
     def __str__(self) -> str:
         first, last = self.rows or (0, 0)
         rows = f"line {first}" if first == last else f"lines {first} to {last}"
-        dropped = f"; {self.n_dropped} rows dropped" if self.n_dropped else ""
+        cost = f"; costs {self.n_dropped} rows" if self.n_dropped else ""
         return ": ".join([self.file, *([rows] if self.rows else []), *filter(None, [self.column])]) + (
-            f": {self.problem}{dropped}"
+            f": {self.problem}{cost}"
         )
 
 
@@ -87,7 +87,7 @@ def same_sign(quaternion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Quaternions (n, 4) with signs chosen so that successive ones are alike; q and -q are one rotation.
 
     Returns:
-        The quaternions, and a mask (n,) of the rows where the sign flipped but the orientation hardly changed.
+        The quaternions, and a mask (n,) of the rows where the sign flipped alone: q was about -q.
     """
     cos_half = (quaternion[1:] * quaternion[:-1]).sum(axis=1)
     sign = np.cumprod(np.where(cos_half < 0.0, -1.0, 1.0))

@@ -23,6 +23,14 @@ from mjx_softarm.logs import GROUPS, UNITS, Column, Log, log_columns, write_log
 from mjx_softarm.sensors import SensorParams, frequency_from_length
 from mjx_softarm.spec import ArmSpec
 
+_HELP = """\
+A log is a CSV file (commas, decimal points), or an npz file with the arrays `columns` and `table`.
+The header names each column with its unit, as in `pressure0 [kPa]`; the order does not matter.
+Needed are time and one at least of frequency, spring, pressure and tip. A group of columns is there
+whole or not at all. Markers are numbered from base to tip, springs and chambers as in the spec.
+Base frame: z up, the arm hangs from the origin towards -z. The tip is the centre of the last plate, its
+quaternion 1, 0, 0, 0 where the arm hangs straight.
+"""
 _CELL = re.compile(r"(\w+)\s*(?:\[(.*)\])?")
 _FACTORS = {"frequency_hz": 1.25, "spring_m": 1.5, "tip_m": 1.5}  # between the ranges of two logs of one arm
 _NEEDED = ("frequency_hz", "spring_m", "pressure_kpa", "tip_m")  # one of them at least
@@ -176,16 +184,7 @@ def template(path: str | Path) -> str:
 
 def schema_text(n_chambers: int = 9, n_markers: int = 3) -> str:
     """The columns a log may have, in words; from the schema itself."""
-    lines = [
-        "A log is a CSV file (commas, decimal points) or an npz file with arrays `columns` and `table`.",
-        "The header names each column with its unit, as in `pressure0 [kPa]`; the order does not matter. Needed",
-        "are time and one at least of frequency, spring, pressure, tip; a group is there whole or not at all.",
-        "Base frame: z up, the arm hangs from the origin towards -z. The tip is the centre of the last plate,",
-        "its quaternion 1, 0, 0, 0 where the arm hangs straight. Markers are numbered from base to tip, springs",
-        "and chambers as in the spec. A log of one row per pose should wait for the pose; else log at a fixed rate.",
-        "",
-        f"{'columns':<28} {'units':<28} plausible",
-    ]
+    lines = [_HELP, f"{'columns':<30} {'units':<26} plausible"]
     groups: dict[tuple[str, str], list[Column]] = {}
     for column in log_columns(n_chambers, n_markers):
         groups.setdefault((column.group, column.kind), []).append(column)
@@ -196,6 +195,6 @@ def schema_text(n_chambers: int = 9, n_markers: int = 3) -> str:
         bounds = PLAUSIBLE[quantity(first)]
         steps = " between rows" if first.kind == "time" else ""
         lines.append(
-            f"{names:<28} {', '.join(units):<28} {bounds.low:g} to {bounds.high:g} {units[0]}{steps}"
+            f"{names:<30} {', '.join(units):<26} {bounds.low:g} to {bounds.high:g} {units[0]}{steps}"
         )
     return "\n".join(lines)
