@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -41,5 +41,25 @@ class ArmIO(Protocol):
             ValueError: wrong shape, not finite, or beyond what the hardware can stand; nothing was sent.
             TimeoutError: the values were not accepted within a tick.
             OSError: the pumps cannot be reached.
+        """
+        ...
+
+
+class Capture(NamedTuple):
+    """What motion capture sees of an arm, in the base frame (see `mjx_softarm.pose`)."""
+
+    tip_m: np.ndarray  # (3,) centre of the last plate
+    tip_quaternion: np.ndarray  # (4,) w, x, y, z
+    marker_m: np.ndarray  # (n_markers, 3) from the base to the tip
+
+
+class MotionCapture(Protocol):
+    """For calibration logs and to verify; no controller may look at it."""
+
+    def motion_capture(self) -> Capture:
+        """Where tip and markers are now.
+
+        Raises:
+            OSError: the cameras cannot be reached.
         """
         ...

@@ -1,0 +1,39 @@
+"""Rate-independent hysteresis: springs in series with Coulomb sliders, many of them in parallel.
+
+Each of these stop operators follows the displacement x elastically until its force reaches its limit, then
+slides:
+
+    f'  = clip(f + k (x' - x), -limit, limit)
+
+Their sum is the Prandtl-Ishlinskii model. It is passive: what a slider takes up it never gives back, and what
+a spring stores it gives back once. A single stop is Coulomb friction with an elastic start.
+
+Source: Brokate, Sprekels, "Hysteresis and Phase Transitions", Springer 1996, chapter 2.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+class StopOperators:
+    """The state of m stop operators on each of n displacements."""
+
+    def __init__(self, stiffness: np.ndarray, limit: np.ndarray, x: np.ndarray):
+        """Start without force.
+
+        Args:
+            stiffness (n, m): of each spring, force per displacement.
+            limit (n, m): greatest force of each slider.
+            x (n,): displacements now.
+        """
+        self._stiffness, self._low, self._high = stiffness, -limit, limit
+        self._x = np.array(x, float)
+        self._force = np.zeros(np.shape(limit))
+
+    def move(self, x: np.ndarray) -> np.ndarray:
+        """Force (n,) that resists, positive where the displacement has grown, after moving to x (n,)."""
+        trial = self._force + self._stiffness * (x - self._x)[:, None]
+        self._force = np.minimum(np.maximum(trial, self._low), self._high)
+        self._x = np.array(x, float)
+        return self._force.sum(axis=1)
