@@ -1,0 +1,158 @@
+"""What can go wrong on an arm, how it is told, and what the control loop then does.
+
+    fault              detected by                                                      response
+    LOST_READING       a spring without a length this tick, or no readings in time      go on: the last good one
+    SENSOR_LOST        a spring lost in LOST_TICKS ticks in a row                       hold
+    SENSOR_STUCK       a spring that stands still, without its noise even, while its    hold
+                       chamber is driven or a spring of its section moves
+    CHAMBER_LOST       a chamber at its limit, its spring off the reference, and the    vent
+                       arm at rest in the shape of an arm without that pressure
+    GOAL_OUTSIDE       a goal further from all reachable poses than they are from       skip the goal
+                       each other, or not finite
+    MISSED_DEADLINE    a tick longer than the period, or pressures not taken in time    go on
+    ARM_LATE           LATE_TICKS of these in a row                                     hold
+    ARM_LOST           the driver cannot reach sensors or pumps, or refuses pressures   hold
+    NOT_SETTLED        springs neither on their references nor at rest at a limit       go on: act all the same
+                       within SETTLE_TIMEOUT_S
+    SATURATED          a chamber at its limit with its spring off the reference         go on
+    EXTRAPOLATION      the sim-to-real network asked far from its training rows         go on
+
+To hold is to end with the last pressures, which the pumps keep: the arm stays where it is, with what it carries. It
+is the answer where the arm's shape is no longer known. To vent is to bring all pressures to zero along a
+ramp: the answer where a chamber no longer does what it is told. The same happens at the end of a run and at Ctrl-C.
+Every fault is counted; `Event.message` says what was seen and what was expected.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import Enum
+from types import MappingProxyType
+from typing import NamedTuple
+
+import numpy as np
+
+from mjx_softarm.control import Gains, saturated
+from mjx_softarm.estimator import SpringModel, expected_springs
+from mjx_softarm.spec import N_CHAMBERS_PER_SECTION
+
+LOST_TICKS = 3
+LATE_TICKS = 5
+SETTLE_TIMEOUT_S = 10.0
+TOLERANCE_M = 1e-3  # of a spring on its reference, as in training
+STILL_M = 2e-4  # greatest difference between the means of a window's halves at rest; far above the noise
+
+# A live spring has noise of some 0.01 mm and more: over a window, this is none.
+STUCK_RANGE_M = 1e-5
+STUCK_PRESSURE_KPA = 2.0  # that its own chamber was driven by in the window,
+STUCK_NEIGHBOUR_M = 2e-3  # or a spring of its section moved
+
+LOST_SHARE = 0.5  # of a chamber's pressure, that the shape says is missing
+EXPLAINED_SHARE = 0.7  # of the springs' squared deviations, by that missing pressure
+LOST_EFFECT_M = 0.01  # on the chamber's own spring: less cannot be told from tolerances and payload
+
+
+class Response(Enum):
+    """What the control loop does about a fault."""
+
+    GO_ON = "go on"
+    SKIP = "skip the goal"
+    HOLD = "hold"
+    VENT = "vent"
+
+
+class Fault(Enum):
+    """What went wrong; the module's docstring is the table."""
+
+    LOST_READING = "lost reading"
+    SENSOR_LOST = "sensor lost"
+    SENSOR_STUCK = "sensor stuck"
+    CHAMBER_LOST = "chamber lost its pressure"
+    GOAL_OUTSIDE = "goal outside the workspace"
+    MISSED_DEADLINE = "missed deadline"
+    ARM_LATE = "arm late"
+    ARM_LOST = "arm lost"
+    NOT_SETTLED = "not settled"
+    SATURATED = "saturated"
+    EXTRAPOLATION = "extrapolation"
+
+
+RESPONSE: Mapping[Fault, Response] = MappingProxyType(
+    {
+        Fault.LOST_READING: Response.GO_ON,
+        Fault.SENSOR_LOST: Response.HOLD,
+        Fault.SENSOR_STUCK: Response.HOLD,
+        Fault.CHAMBER_LOST: Response.VENT,
+        Fault.GOAL_OUTSIDE: Response.SKIP,
+        Fault.MISSED_DEADLINE: Response.GO_ON,
+        Fault.ARM_LATE: Response.HOLD,
+        Fault.ARM_LOST: Response.HOLD,
+        Fault.NOT_SETTLED: Response.GO_ON,
+        Fault.SATURATED: Response.GO_ON,
+        Fault.EXTRAPOLATION: Response.GO_ON,
+    }
+)
+
+
+class Event(NamedTuple):
+    """A fault that was found."""
+
+    fault: Fault
+    message: str
+
+    @property
+    def response(self) -> Response:
+        return RESPONSE[self.fault]
+
+    def __str__(self) -> str:
+        return f"{self.fault.value}: {self.message} -> {self.response.value}"
+
+
+def still(spring_m: np.ndarray) -> bool:
+    """Whether springs came to rest over a window (ticks, n) [m]: both of its halves have the same mean."""
+    half = len(spring_m) // 2
+    return bool(np.all(np.abs(spring_m[-half:].mean(axis=0) - spring_m[:half].mean(axis=0)) < STILL_M))
+
+
+def stuck_springs(spring_m: np.ndarray, pressure_kpa: np.ndarray) -> np.ndarray:
+    """Which springs (n,) stand stock-still where they should not: bool.
+
+    Args:
+        spring_m (ticks, n) [m]: readings of the last ticks.
+        pressure_kpa (ticks, n) [kPa]: pressures commanded in them.
+    """
+    moved_m = np.ptp(spring_m, axis=0)  # (n,)
+    by_section = moved_m.reshape(-1, N_CHAMBERS_PER_SECTION)
+    near_m = np.repeat(by_section.max(axis=1), N_CHAMBERS_PER_SECTION)
+    asked = (np.ptp(pressure_kpa, axis=0) > STUCK_PRESSURE_KPA) | (near_m > STUCK_NEIGHBOUR_M)
+    return (moved_m < STUCK_RANGE_M) & asked
+
+
+def lost_chambers(
+    model: SpringModel, gains: Gains, pressure_kpa: np.ndarray, reference_m: np.ndarray, spring_m: np.ndarray
+) -> np.ndarray:
+    """Which chambers (n,) have lost their pressure, of an arm at rest: bool.
+
+    A chamber at its limit with its spring off the reference is saturated, or it no longer holds pressure. Then
+    the arm has the shape that it would have without that pressure: the springs' deviations from the
+    model are, for the most part, a good share of what the pressure's absence makes of them.
+
+    Args:
+        model: lengths to expect at pressures.
+        gains: with the limits.
+        pressure_kpa (n,) [kPa]: commanded.
+        reference_m (n,) [m]: asked of the springs.
+        spring_m (n,) [m]: read.
+    """
+    suspects = saturated(pressure_kpa, reference_m, spring_m, gains, TOLERANCE_M)
+    if not suspects.any():
+        return suspects
+    without = np.where(np.eye(len(pressure_kpa), dtype=bool), 0.0, pressure_kpa)  # (n, n)
+    expected_m, *absent_m = expected_springs(model, np.vstack([pressure_kpa, without]))
+    effect_m = np.array(absent_m) - expected_m  # (n chambers, n springs)
+    deviation_m = spring_m - expected_m  # (n,)
+    share = effect_m @ deviation_m / np.sum(effect_m**2, axis=1)  # (n,)
+    left_m = deviation_m - share[:, None] * effect_m
+    explained = 1.0 - np.sum(left_m**2, axis=1) / np.sum(deviation_m**2)
+    own_m = np.abs(share * np.diagonal(effect_m))
+    return suspects & (share > LOST_SHARE) & (explained > EXPLAINED_SHARE) & (own_m > LOST_EFFECT_M)
