@@ -41,7 +41,7 @@ def read_table(path: str | Path, names: Sequence[str] | None = None) -> Table:
     """
     path = Path(path)
     try:
-        if path.suffix == ".npz" and path.is_file():
+        if path.suffix == ".npz":
             return _read_npz(path)
         return _read_csv(path, names)
     except OSError as error:
@@ -55,8 +55,8 @@ def _error(path: Path, problem: str, line: int | None = None, column: str = "") 
 def _read_npz(path: Path) -> Table:
     expected = "expected an npz file with `columns` (k,) of text and `table` (n, k) of numbers"
     try:
-        with np.load(path, allow_pickle=False) as file:
-            columns, values = file["columns"], file["table"]
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+            columns, values = arrays["columns"], arrays["table"]
     except (ValueError, KeyError, EOFError, AttributeError, TypeError, zipfile.BadZipFile) as error:
         raise _error(path, f"{expected}, got: {error}") from error
     shapes = f"columns {columns.shape} of {columns.dtype}, table {values.shape} of {values.dtype}"
