@@ -106,8 +106,8 @@ def correction_between(pose: Any, real_pose: Any) -> Any:
     (_, r01, r02), (r10, _, r12), (r20, r21, _) = (
         [turn[..., row, column] for column in range(3)] for row in range(3)
     )
-    size = 1.0 + turn[..., 0, 0] + turn[..., 1, 1] + turn[..., 2, 2]  # 4 cos(angle / 2)^2
-    gibbs = xp.stack([r21 - r12, r02 - r20, r10 - r01], axis=-1) / size[..., None]
+    size = 1.0 + xp.trace(turn, axis1=-2, axis2=-1)  # 4 cos(angle / 2)^2
+    gibbs = xp.stack([r21 - r12, r02 - r20, r10 - r01], axis=-1) / xp.maximum(size, 1e-6)[..., None]
     return xp.concat([1000.0 * (end_m - start_m), gibbs], axis=-1)
 
 
