@@ -170,6 +170,7 @@ class Entries:
     ) -> Any:
         """A named tuple of float32 arrays in the `shapes` of its fields, and of `layers`."""
         values = {item: self.take(f"{name}.{item}", np.float32, shape) for item, shape in shapes.items()}
+        values = {item: np.asarray(value, np.float32) for item, value in values.items()}
         return kind(**values, layers=self.layers(name, n_inputs, n_outputs))
 
     def finish(self, schema: int) -> None:

@@ -15,6 +15,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from mjx_softarm._xp import array_namespace
+from mjx_softarm.archive import Entries
 from mjx_softarm.mlp import Layer, mlp
 from mjx_softarm.pose import pose_from_frame, rotation_from_quaternion
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION
@@ -63,7 +64,9 @@ def estimate_frame(estimator: PoseEstimator, spring_m: Any) -> Frame:
     downs = [plate.rotation[..., 2, :] for plate in chain(even)]  # of the base's z axis, (..., 3) each
     normalised = (spring_m - estimator.spring_centre_m) / estimator.spring_scale_m
     changes = mlp(estimator.layers, xp.concat([normalised, *downs], axis=-1))
-    changes = changes.reshape(*changes.shape[:-1], -1, N_CHANGES) * estimator.change_scale  # (..., sections, 6)
+    changes = (
+        changes.reshape(*changes.shape[:-1], -1, N_CHANGES) * estimator.change_scale
+    )  # (..., sections, 6)
     quaternion = xp.concat([xp.ones_like(changes[..., :1]), changes[..., 3:]], axis=-1)
     turn = rotation_from_quaternion(quaternion / xp.sqrt(xp.sum(quaternion**2, axis=-1))[..., None])
     return chain(Frame(even.position_m + changes[..., :3], turn @ even.rotation))[-1]
@@ -86,7 +89,9 @@ def constant_curvature(spring_site_m: Any, spring_m: Any) -> Frame:
     spring = spring_m.reshape(*spring_m.shape[:-1], -1, N_CHAMBERS_PER_SECTION)
     length = xp.mean(spring, axis=-1)[..., None]  # (..., n_sections, 1)
     # The arm turns towards its shorter springs by |bend|.
-    bend = -2.0 * xp.sum((spring - length)[..., None] * site, axis=-2) / xp.sum(site**2, axis=(-2, -1))[:, None]
+    bend = (
+        -2.0 * xp.sum((spring - length)[..., None] * site, axis=-2) / xp.sum(site**2, axis=(-2, -1))[:, None]
+    )
     square = xp.sum(bend**2, axis=-1)[..., None]
     angle = xp.sqrt(xp.where(square < _SMALL_BEND, _SMALL_BEND, square))
     aside, down = (1.0 - xp.cos(angle)) / angle**2, xp.sin(angle) / angle
@@ -117,3 +122,40 @@ def expected_springs(model: SpringModel, pressure_kpa: Any) -> Any:
     pressure_kpa = xp.asarray(pressure_kpa, dtype=model.pressure_centre_kpa.dtype)
     normalised = (pressure_kpa - model.pressure_centre_kpa) / model.pressure_scale_kpa
     return model.spring_centre_m + model.spring_scale_m * mlp(model.layers, normalised)
+
+
+def take_estimator(entries: Entries, name: str, n_springs: int) -> PoseEstimator:
+    """The estimator `name` among the entries of a file, checked.
+
+    Raises:
+        SealedFileError: an entry is missing, or of the wrong type, shape or range.
+    """
+    n_sections = n_springs // N_CHAMBERS_PER_SECTION
+    shapes = {
+        "spring_site_m": (n_springs, 2),
+        "spring_centre_m": (n_springs,),
+        "spring_scale_m": (n_springs,),
+        "change_scale": (N_CHANGES,),
+    }
+    n_in, n_out = n_springs + 3 * n_sections, N_CHANGES * n_sections
+    estimator = entries.network(name, PoseEstimator, shapes, n_in, n_out)
+    _check_scales(entries, name, estimator, "spring_scale_m", "change_scale")
+    return estimator
+
+
+def take_spring_model(entries: Entries, name: str, n_springs: int) -> SpringModel:
+    """The spring model `name` among the entries of a file, checked.
+
+    Raises:
+        SealedFileError: an entry is missing, or of the wrong type, shape or range.
+    """
+    shapes = {item: (n_springs,) for item in SpringModel._fields if item != "layers"}
+    model = entries.network(name, SpringModel, shapes, n_springs, n_springs)
+    _check_scales(entries, name, model, "pressure_scale_kpa", "spring_scale_m")
+    return model
+
+
+def _check_scales(entries: Entries, name: str, network: Any, *items: str) -> None:
+    for item in items:
+        if not (getattr(network, item) > 0.0).all():
+            entries.fail(f"{name}.{item}", f"got {getattr(network, item).tolist()}, expected numbers > 0")

@@ -1,8 +1,7 @@
 """A trained policy as one file: what is in it, and how it is written and read. NumPy only.
 
-The file is an npz archive, sealed: it ends in a mark and the SHA-256 of every byte before, so that a file
-that is incomplete or changed is never taken for a policy. n is the number of chambers; numbers are float64,
-the actor's weights float32.
+A sealed npz archive (`mjx_softarm.archive`). n is the number of chambers; numbers are float64, networks and
+the workspace float32.
 
     schema_version       () int
     spec_json            ()           the arm trained for, as `ArmSpec.to_dict` gives it
@@ -17,12 +16,16 @@ the actor's weights float32.
     sensor.<field>       () or (n,)   `SensorParams`: frequencies to lengths, and back
     gains.<field>        () or (n,)   `Gains`: the sensor-space law and the pressure limits
     rate_hz              ()           of the sensor-space law
-    s2r_kind             ()           "none"; slot of a network that corrects the estimated pose
+    workspace            (m, 6)       poses [mm, deg] that the arm reaches, spread over its workspace
+    estimator.<field>                 `PoseEstimator`: spring lengths to the simulated pose
+    spring_model.<field>              `SpringModel`: pressures to spring lengths, to find chambers that fail
+    s2r_kind             ()           "mlp", or "none": the policy was trained on simulated poses
+    s2r.<field>                       `S2R`, if there is one: simulated pose to the real one
     provenance_json      ()           how the policy came about: config, versions, commit, date
 
 The arm's numbers stand next to `spec_json` because the actor was trained with these, whatever a later version
 derives from a specification. To add an entry, or a field to a class named here (`ArmSpec` included), is to
-make a new schema: raise `SCHEMA_VERSION`, and let `load_policy` read the old one too.
+make a new schema: raise `SCHEMA_VERSION`. A file of another schema is refused; a run exports it anew.
 """
 
 from __future__ import annotations
@@ -31,15 +34,17 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from mjx_softarm.archive import Entries, SealedFileError, entries_of, layer_entries, read_sealed, write_sealed
 from mjx_softarm.control import Gains
+from mjx_softarm.estimator import PoseEstimator, SpringModel, take_estimator, take_spring_model
 from mjx_softarm.mlp import Layer
 from mjx_softarm.obs import OBS_LAYOUT, OBS_SIZE, ObsScale
 from mjx_softarm.rewards import RewardConfig
+from mjx_softarm.s2r import S2R, take_s2r
 from mjx_softarm.sensors import SensorFault, SensorParams, frequency_range_hz, length_from_frequency
 from mjx_softarm.spec import ArmSpec, SpecError
 
@@ -59,8 +64,21 @@ class Policy:
     sensor: SensorParams
     gains: Gains
     rate_hz: float
+    workspace: np.ndarray  # (m, 6)
+    estimator: PoseEstimator
+    spring_model: SpringModel
+    s2r: S2R | None
     spec: ArmSpec
     provenance: Mapping[str, Any]
+
+
+class ArmModel(NamedTuple):
+    """What the arm's computer has to know about the arm besides its specification."""
+
+    workspace: np.ndarray  # (m, 6) poses [mm, deg]
+    estimator: PoseEstimator
+    spring_model: SpringModel
+    s2r: S2R | None
 
 
 def action_layout(spec: ArmSpec) -> tuple[str, ...]:
@@ -69,7 +87,11 @@ def action_layout(spec: ArmSpec) -> tuple[str, ...]:
 
 
 def policy_from_actor(
-    actor_params: Mapping[str, Any], spec: ArmSpec, reward: RewardConfig, provenance: Mapping[str, Any]
+    actor_params: Mapping[str, Any],
+    spec: ArmSpec,
+    reward: RewardConfig,
+    model: ArmModel,
+    provenance: Mapping[str, Any],
 ) -> Policy:
     """The policy of an actor that was trained on an arm.
 
@@ -77,6 +99,7 @@ def policy_from_actor(
         actor_params: nested mappings of arrays, as flax initialises the actor; see `layers_from_flax`.
         spec: the arm; scales, limits, calibration and gains are its own, as in the environment.
         reward: the environment's.
+        model: networks and workspace of the arm.
         provenance: how the policy came about, in types that JSON has.
 
     Raises:
@@ -91,6 +114,7 @@ def policy_from_actor(
         sensor=SensorParams.from_spec(spec),
         gains=Gains.from_spec(spec),
         rate_hz=spec.control.rate_hz,
+        **model._asdict(),
         spec=spec,
         provenance=provenance,
     )
@@ -148,22 +172,27 @@ def _pack(policy: Policy) -> dict[str, np.ndarray]:
         "action_layout": action_layout(policy.spec),
         "frequency_hz": policy.frequency_hz,
         "rate_hz": policy.rate_hz,
-        "s2r_kind": "none",
+        "s2r_kind": "none" if policy.s2r is None else "mlp",
+        "workspace": policy.workspace,
         "provenance_json": json.dumps(policy.provenance),
     }
     entries |= layer_entries("actor", policy.layers)
     for name in ("obs_scale", "reward", "sensor", "gains"):
         numbers = entries_of(name, getattr(policy, name))
         entries |= {item: value.astype(np.float64) for item, value in numbers.items()}
+    for name in ("estimator", "spring_model") + (("s2r",) if policy.s2r is not None else ()):
+        entries |= entries_of(name, getattr(policy, name))
     return {name: np.asarray(value) for name, value in entries.items()}
 
 
 def _unpack(arrays: Mapping[str, np.ndarray], source: str) -> Policy:
     entries = Entries(arrays, source)
     version = entries.take("schema_version", np.integer, ())
-    if version > SCHEMA_VERSION:
-        text = f"made by a newer version: schema {version}, this one reads up to {SCHEMA_VERSION}"
-        entries.fail("schema_version", text)
+    if version != SCHEMA_VERSION:
+        entries.fail(
+            "schema_version",
+            f"got {version}, expected {SCHEMA_VERSION}; this version's `python -m train export` writes that",
+        )
     try:
         spec = ArmSpec.from_dict(entries.table("spec_json"), f"{source}: spec_json")
     except SpecError as error:
@@ -171,6 +200,7 @@ def _unpack(arrays: Mapping[str, np.ndarray], source: str) -> Policy:
     n = spec.n_chambers
     obs_layout = entries.take("obs_layout", np.str_, (OBS_SIZE,))
     names = entries.take("action_layout", np.str_, (n,))
+    s2r_kind = entries.take("s2r_kind", np.str_, ())
     policy = Policy(
         layers=entries.layers("actor", OBS_SIZE, n),
         obs_scale=entries.group("obs_scale", ObsScale, (6,)),
@@ -179,6 +209,10 @@ def _unpack(arrays: Mapping[str, np.ndarray], source: str) -> Policy:
         sensor=entries.group("sensor", SensorParams, (), (n,)),
         gains=entries.group("gains", Gains, (), (n,)),
         rate_hz=entries.take("rate_hz", np.float64, ()),
+        workspace=entries.take("workspace", np.float32, (None, 6)),
+        estimator=take_estimator(entries, "estimator", n),
+        spring_model=take_spring_model(entries, "spring_model", n),
+        s2r=take_s2r(entries, "s2r", n) if s2r_kind == "mlp" else None,
         spec=spec,
         provenance=entries.table("provenance_json"),
     )
@@ -186,14 +220,13 @@ def _unpack(arrays: Mapping[str, np.ndarray], source: str) -> Policy:
     low_hz, high_hz = policy.frequency_hz.T
     low_kpa, high_kpa = policy.gains.pressure_min_kpa, policy.gains.pressure_max_kpa
     for name, holds, expected in (
-        ("schema_version", version >= 1, "at least 1"),
         ("obs_layout", obs_layout == np.array(OBS_LAYOUT), list(OBS_LAYOUT)),
         ("action_layout", names == np.array(action_layout(spec)), list(action_layout(spec))),
         ("obs_scale.scale", policy.obs_scale.scale > 0.0, "numbers > 0"),
         ("frequency_hz", readable & (low_hz < high_hz), "two that have a length, the lower first"),
         ("gains.pressure_min_kpa", np.less(low_kpa, high_kpa), "less than gains.pressure_max_kpa"),
         ("rate_hz", policy.rate_hz > 0.0, "a number > 0"),
-        ("s2r_kind", entries.take("s2r_kind", np.str_, ()) == "none", "none"),
+        ("s2r_kind", s2r_kind in ("mlp", "none"), "mlp or none"),
     ):
         if not np.all(holds):
             entries.fail(name, f"got {arrays[name].tolist()}, expected {expected}")

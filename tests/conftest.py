@@ -1,10 +1,16 @@
 """What tests share: the paper's arm and its environment, built and compiled once."""
 
+import itertools
+
 import jax
+import numpy as np
 import pytest
 
 from mjx_softarm import ArmSpec, xla
 from mjx_softarm.env import EnvConfig, ReachEnv
+from mjx_softarm.estimator import N_CHANGES, PoseEstimator, SpringModel
+from mjx_softarm.export import ArmModel
+from mjx_softarm.s2r import N_POSE_INPUTS, N_POSE_OUTPUTS, S2R
 
 N_ARMS = 512  # of every call of `reset` and `step`: another number would compile anew
 
@@ -49,3 +55,39 @@ def start(reset):
 def random_actions(env):
     """Uniform in [-1, 1], (N_ARMS, 9): they saturate a chamber of nearly every arm."""
     return jax.random.uniform(jax.random.key(1), (N_ARMS, env.action_size), minval=-1.0)
+
+
+@pytest.fixture(scope="session")
+def make_arm_model():
+    """Number of chambers -> networks of a policy file, with random weights that change little."""
+
+    def make(n: int, s2r: bool = False) -> ArmModel:
+        rng = np.random.default_rng(3)
+
+        def layers(*sizes):
+            pairs = itertools.pairwise(sizes)
+            return tuple(
+                (np.float32(0.01 * rng.normal(size=(a, b))), np.float32(0.01 * rng.normal(size=b)))
+                for a, b in pairs
+            )
+
+        def row(value, size=n):
+            return np.full(size, value, np.float32)
+
+        angle = np.pi / 2 + 2 * np.pi * np.arange(n) / 3
+        site_m = np.float32(0.067 * np.stack([np.cos(angle), np.sin(angle)], -1))
+        estimator = PoseEstimator(
+            layers(2 * n, 4, N_CHANGES * n // 3), site_m, row(0.18), row(0.05), row(1e-3, 6)
+        )
+        springs = SpringModel(layers(n, 5, n), row(-10.0), row(30.0), row(0.18), row(0.05))
+        poses = np.float32([[0, 0, -600, 0, 0, 0], [80, 0, -575, 0, 0, 0], [0, 100, -500, 10, 40, -30]])
+        n_in = N_POSE_INPUTS + n
+        s2r_network = S2R(
+            layers(n_in, 6, N_POSE_OUTPUTS),
+            *(row(-1.0, n_in), row(1.0, n_in), row(-5.0, N_POSE_OUTPUTS), row(5.0, N_POSE_OUTPUTS)),
+            np.float32(rng.normal(size=(4, n_in))),
+            np.float32(0.3),
+        )
+        return ArmModel(poses, estimator, springs, s2r_network if s2r else None)
+
+    return make
