@@ -16,9 +16,7 @@ class Finding(NamedTuple):
     """One thing that is wrong with a log."""
 
     file: str
-    rows: (
-        tuple[int, int] | None
-    )  # first and last line at fault, line 1 being the header; None: the whole file
+    rows: tuple[int, int] | None  # first and last line at fault, counted from 1; None: the whole file
     column: str  # "" where it is not about columns
     problem: str  # what was got, and what was expected
     n_dropped: int = 0  # rows that it cost; a row with two faults counts in both findings
@@ -112,6 +110,8 @@ def late_rows(time_s: np.ndarray) -> np.ndarray:
 def gap_rows(time_s: np.ndarray) -> np.ndarray:
     """Mask (n,) of the rows before which rows are missing, by increasing times (n,)."""
     step_s = np.diff(time_s)
+    if len(step_s) == 0:
+        return np.zeros(len(time_s), bool)
     return np.concatenate([[False], step_s > _GAP_STEPS * np.median(step_s)])
 
 

@@ -6,6 +6,7 @@ is the file read again line by line, to say what is wrong with it.
 
 from __future__ import annotations
 
+import warnings
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -83,9 +84,11 @@ def _read_csv(path: Path, names: Sequence[str] | None) -> Table:
     if n_lines <= n_header:
         raise _error(path, "a header and no rows, expected at least 2 rows")
     try:
-        values = np.loadtxt(
-            path, delimiter=",", skiprows=n_header, ndmin=2, comments=None, encoding="utf-8-sig"
-        )
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "loadtxt: input contained no data")  # an error below
+            values = np.loadtxt(
+                path, delimiter=",", skiprows=n_header, ndmin=2, comments=None, encoding="utf-8-sig"
+            )
     except ValueError:
         return _read_lines(path, names, n_header)
     if values.shape != (n_lines - n_header, len(names)):  # blank lines, or a header of another length
