@@ -86,6 +86,26 @@ def test_clean_log_comes_back_without_findings(file, name, seed):
     assert log.goal is None and log.estimate is None and log.reference_m is None
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_a_row_per_pose_comes_back_without_findings(file, seed):
+    """Separate poses, seconds apart, some of them held: no motion, so no jump, turn or spike."""
+    rng = np.random.default_rng(seed)
+    hold = np.repeat(np.arange(N // 2), rng.integers(2, 4, N // 2))[:N]
+    quaternion = rng.standard_normal((N, 4)) * [1.0, 1.0, 1.0, 0.1]
+    quaternion[:, 0] = 0.5 + np.abs(quaternion[:, 0])
+    poses = {
+        "spring_m": rng.uniform(0.105, 0.235, (N, 9))[hold],
+        "frequency_hz": rng.uniform(3e6, 5e6, (N, 9))[hold],
+        "pressure_kpa": rng.choice([-40.0, 0.0, 20.0], (N, 9))[hold],
+        "tip_m": rng.uniform([-0.2, -0.2, -0.8], [0.2, 0.2, -0.4], (N, 3))[hold]
+        + rng.normal(0.0, 1e-5, (len(hold), 3)),
+        "tip_quaternion": (quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True))[hold],
+        "marker_m": None,
+        "time_s": 3.0 * np.arange(N),
+    }
+    assert read_log(file(**poses), strict=True)[1] == []
+
+
 def test_units_and_order_of_the_file_do_not_matter(text):
     """Each unit of UNITS gives the same log, against factors known apart from the code."""
     known = {"ms": 1e-3, "kHz": 1e3, "MHz": 1e6, "mm": 1e-3, "cm": 1e-2, "Pa": 1e-3, "bar": 1e2, "mbar": 0.1}
