@@ -1,10 +1,11 @@
 """What the springs tell about the tip, and what the pressures tell about the springs. NumPy and JAX.
 
-On the arm nobody sees the tip. Its pose is estimated from the spring lengths: three springs give a section's length
-and bend, a section of constant curvature has a closed form, and the sections follow one another. The real
-ones do not bend evenly, since all that hangs below pulls at them; a small network, distilled from the simulator, says
-by how much each section's end is off. Besides the springs it sees which way is down at each section's end.
-Changes, not poses, come from it, so nothing is discontinuous where yaw and roll are.
+On the arm nobody sees the tip. Its pose is estimated from the spring lengths: three springs give a
+section's length and bend, a section of constant curvature has a closed form, and the sections follow one
+another. The real ones do not bend evenly, since all that hangs below pulls at them; a small network,
+distilled from the simulator, says by how much each section's end is off. Besides the springs it sees which
+way is down at each section's end. Changes, not poses, come from it, so nothing is discontinuous where yaw
+and roll are.
 
 The other way around, `expected_springs` says which lengths the springs have at given pressures without a
 payload. The control loop holds it against the readings to find a chamber that has lost its pressure.

@@ -1,12 +1,14 @@
 """What the arm's computer has to know about the arm, distilled from the simulator into small networks.
 
-Equilibria over the whole workspace are the data, held-out ones the test. The networks' structure, and what they are
-for, stand in `mjx_softarm.estimator`. All equilibria are of the arm without more payload than its
-specification has: springs alone cannot tell a payload, and with payloads mixed in the unloaded arm would pay for it.
+Equilibria over the whole workspace are the data, held-out ones the test. The networks' structure, and what
+they are for, stand in `mjx_softarm.estimator`. All equilibria are of the arm without more payload than its
+specification has: springs alone cannot tell a payload, and with payloads mixed in the unloaded arm would
+pay for it.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -16,7 +18,13 @@ import numpy as np
 import optax
 from jax import Array
 
-from mjx_softarm.estimator import N_CHANGES, Frame, PoseEstimator, SpringModel, estimate_frame, expected_springs
+from mjx_softarm.estimator import (
+    N_CHANGES,
+    PoseEstimator,
+    SpringModel,
+    estimate_frame,
+    expected_springs,
+)
 from mjx_softarm.mlp import Layer
 from mjx_softarm.pose import frame_from_pose
 from mjx_softarm.spec import ArmSpec
@@ -99,7 +107,7 @@ def _first_spring_model(pool: Pool, key: Array) -> SpringModel:
 def _first_layers(key: Array, widths: tuple[int, ...]) -> tuple[Layer, ...]:
     """Random layers that keep the order of what goes through them."""
     layers = []
-    for k, (n_in, n_out) in enumerate(zip(widths[:-1], widths[1:], strict=True)):
+    for k, (n_in, n_out) in enumerate(itertools.pairwise(widths)):
         gain = np.sqrt(2.0 / n_in)  # He et al. 2015, arXiv:1502.01852
         weight = gain * jax.random.normal(jax.random.fold_in(key, k), (n_in, n_out))
         layers.append((weight, jnp.zeros(n_out)))

@@ -1,7 +1,7 @@
 """What can go wrong on an arm, how it is told, and what the control loop then does.
 
     fault              detected by                                                      response
-    LOST_READING       a spring without a length this tick, or no readings in time      go on: the last good one
+    LOST_READING       a spring without a length this tick, or no readings in time      go on with the last
     SENSOR_LOST        a spring lost in LOST_TICKS ticks in a row                       hold
     SENSOR_STUCK       a spring that stands still, without its noise even, while its    hold
                        chamber is driven or a spring of its section moves
@@ -12,15 +12,15 @@
     MISSED_DEADLINE    a tick longer than the period, or pressures not taken in time    go on
     ARM_LATE           LATE_TICKS of these in a row                                     hold
     ARM_LOST           the driver cannot reach sensors or pumps, or refuses pressures   hold
-    NOT_SETTLED        springs neither on their references nor at rest at a limit       go on: act all the same
+    NOT_SETTLED        springs neither on their references nor at rest at a limit       go on and act
                        within SETTLE_TIMEOUT_S
     SATURATED          a chamber at its limit with its spring off the reference         go on
     EXTRAPOLATION      the sim-to-real network asked far from its training rows         go on
 
-To hold is to end with the last pressures, which the pumps keep: the arm stays where it is, with what it carries. It
-is the answer where the arm's shape is no longer known. To vent is to bring all pressures to zero along a
-ramp: the answer where a chamber no longer does what it is told. The same happens at the end of a run and at Ctrl-C.
-Every fault is counted; `Event.message` says what was seen and what was expected.
+To hold is to end with the last pressures, which the pumps keep: the arm stays where it is, with what it
+carries. It is the answer where the arm's shape is no longer known. To vent is to bring all pressures to
+zero along a ramp: the answer where a chamber no longer does what it is told. The same happens at the end of
+a run and at Ctrl-C. Every fault is counted; `Event.message` says what was seen and what was expected.
 """
 
 from __future__ import annotations
@@ -133,8 +133,8 @@ def lost_chambers(
 ) -> np.ndarray:
     """Which chambers (n,) have lost their pressure, of an arm at rest: bool.
 
-    A chamber at its limit with its spring off the reference is saturated, or it no longer holds pressure. Then
-    the arm has the shape that it would have without that pressure: the springs' deviations from the
+    A chamber at its limit with its spring off the reference is saturated, or it no longer holds pressure.
+    Then the arm has the shape that it would have without that pressure: the springs' deviations from the
     model are, for the most part, a good share of what the pressure's absence makes of them.
 
     Args:

@@ -1,0 +1,61 @@
+"""Arms by name: `twin:SEED`, or `package.module:Class`, a driver of one's own."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+from typing import Any
+
+from mjx_softarm.spec import SpecError
+
+_METHODS = ("read_frequencies", "write_pressures")
+
+
+class ArmError(ValueError):
+    """No arm of this name can be had; the message says why."""
+
+
+def open_arm(name: str) -> Any:
+    """An arm: `ArmIO`, maybe with `pressures`, `motion_capture` or a clock of its own, `time_s`.
+
+    Args:
+        name: `twin:SEED`, or `package.module:Class`, whose class takes no arguments; modules in the working
+            directory are found.
+
+    Raises:
+        ArmError: the name is malformed, nothing of this name can be imported, or it is no arm.
+    """
+    module_name, _, item = name.partition(":")
+    if not module_name or not item:
+        raise ArmError(f"--arm: got {name!r}, expected twin:SEED or package.module:Class")
+    if module_name == "twin":
+        return _twin(item)
+    if (here := os.getcwd()) not in sys.path:
+        sys.path.insert(0, here)
+    try:
+        kind = getattr(importlib.import_module(module_name), item)
+    except ImportError as error:
+        raise ArmError(f"--arm: {module_name} cannot be imported: {error}") from error
+    except AttributeError as error:
+        raise ArmError(f"--arm: module {module_name} has no {item!r}") from error
+    missing = [method for method in _METHODS if not callable(getattr(kind, method, None))]
+    if missing:
+        raise ArmError(f"--arm: {name} has no method {' or '.join(missing)}; see mjx_softarm.deploy.ArmIO")
+    try:
+        return kind()
+    except (OSError, TypeError, ValueError) as error:
+        raise ArmError(f"--arm: {name} cannot be opened: {type(error).__name__}: {error}") from error
+
+
+def _twin(seed: str) -> Any:
+    if not seed.isdecimal():
+        raise ArmError(f"--arm: twin:SEED, got {seed!r}, expected an integer >= 0")
+    try:
+        from mjx_softarm.deploy.twin import Twin
+    except ImportError as error:
+        raise ArmError(f"--arm: the twin needs MuJoCo (pip install 'mjx-softarm[sim]'): {error}") from error
+    try:
+        return Twin(int(seed))
+    except SpecError as error:
+        raise ArmError(f"--arm: twin:{seed}: {error}") from error

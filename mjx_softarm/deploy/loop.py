@@ -1,0 +1,332 @@
+"""One tick of the control loop: readings in, pressures and faults out. Pure; NumPy only.
+
+    frequencies -> spring lengths -> pose of the tip (estimator, then sim-to-real network)
+    at rest: pose, goal -> policy -> references;    every tick: references -> sensor-space law -> pressures
+
+The policy was trained on arms at rest, so it acts on arms at rest: at once when a goal is new, and again
+whenever the springs have settled, `N_ACTIONS` times for a goal, as in its evaluation. Springs have settled
+when, for a window of half a second, each one is on its reference or its chamber at a limit, and none moves.
+Where that takes longer than `faults.SETTLE_TIMEOUT_S`, it is counted and the policy acts all the same. What
+stands when the springs have settled for the last time is the arrival.
+
+Gains, limits, calibration and rate are the policy file's. `mjx_softarm.deploy.faults` says what can go wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mjx_softarm.control import pressures, saturated
+from mjx_softarm.deploy import faults
+from mjx_softarm.deploy.faults import Event, Fault, Response
+from mjx_softarm.deploy.reach import Reachable, nearest
+from mjx_softarm.deploy.runtime import PolicyRunner
+from mjx_softarm.estimator import estimate
+from mjx_softarm.s2r import correct, extrapolation
+from mjx_softarm.sensors import SensorFault, describe_faults, length_from_frequency
+
+N_ACTIONS = 4  # for each goal, as in training's evaluation
+WINDOW_S = 0.5
+VENT_KPA_PER_S = 20.0
+_CHAMBER_WINDOWS = 2  # for so many a lost chamber must show without a break
+
+Plan = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+
+
+class Phase(Enum):
+    """What the loop is doing; it ends with HOLD and DONE."""
+
+    RUN = "run"
+    VENT = "vent"
+    HOLD = "hold"
+    DONE = "done"
+
+
+@dataclass(frozen=True, eq=False)
+class Controller:
+    """A policy made ready for the loop."""
+
+    policy: Any  # `export.Policy`
+    reachable: Reachable
+    plan: Plan  # pose and goal (6,), springs (n,) [m] -> references (n,) [m]
+    dt_s: float
+    window: int  # ticks
+
+    @classmethod
+    def of(cls, policy: Any, plan: Plan | None = None) -> Controller:
+        """Of a policy; `plan` takes the place of its actor, for another way to find references."""
+        runner = PolicyRunner(policy)
+        return cls(
+            policy=policy,
+            reachable=Reachable.from_poses(policy.workspace, policy.reward),
+            plan=plan or (lambda pose, goal, _: runner.act(pose, goal).length_m),
+            dt_s=1.0 / policy.rate_hz,
+            window=max(2, round(WINDOW_S * policy.rate_hz)),
+        )
+
+
+class State(NamedTuple):
+    """All that the loop remembers from tick to tick, of n springs and chambers."""
+
+    phase: Phase
+    goal: np.ndarray | None  # (6,) [mm, deg]
+    n_actions: int  # for this goal
+    n_ticks: int  # since the last action
+    n_late: int  # missed deadlines in a row
+    spring_m: np.ndarray  # (n,) last good lengths; NaN before the first
+    n_lost: np.ndarray  # (n,) lost readings in a row
+    n_suspect: np.ndarray  # (n,) ticks in a row in which a chamber seemed to have lost its pressure
+    reference_m: np.ndarray | None  # (n,)
+    integral_kpa: np.ndarray  # (n,) of the law
+    pressure_kpa: np.ndarray  # (n,) in force
+    springs_m: np.ndarray  # (ticks, n) readings of the last window, the newest last
+    pressures_kpa: np.ndarray  # (ticks, n) in force at these
+
+
+class Tick(NamedTuple):
+    """What a tick gives besides the next state."""
+
+    spring_m: np.ndarray  # (n,) lengths believed in; NaN before the first reading
+    estimate: np.ndarray  # (6,) [mm, deg] pose believed in, likewise
+    events: tuple[Event, ...]
+    arrived: bool  # the goal had all its actions and the springs have settled
+
+
+def start(controller: Controller) -> State:
+    """The state before the first tick, of an arm without pressure."""
+    n = controller.policy.spec.n_chambers
+    return State(
+        phase=Phase.RUN,
+        goal=None,
+        n_actions=0,
+        n_ticks=0,
+        n_late=0,
+        spring_m=np.full(n, np.nan),
+        n_lost=np.zeros(n, int),
+        n_suspect=np.zeros(n, int),
+        reference_m=None,
+        integral_kpa=np.zeros(n),
+        pressure_kpa=np.zeros(n),
+        springs_m=np.empty((0, n)),
+        pressures_kpa=np.empty((0, n)),
+    )
+
+
+def with_goal(controller: Controller, state: State, goal: np.ndarray) -> tuple[State, tuple[Event, ...]]:
+    """The state that goes for a goal (6,) [mm, deg]; unchanged, with an event, if the goal is refused."""
+    goal = np.asarray(goal, float)
+    text = ", ".join(f"{value:g}" for value in goal)
+    if goal.shape != (6,) or not np.isfinite(goal).all():
+        return state, (Event(Fault.GOAL_OUTSIDE, f"got {text}, expected six finite numbers"),)
+    pose, distance = nearest(controller.reachable, goal, controller.policy.reward)
+    if distance > 1.0:
+        near = ", ".join(f"{value:.0f}" for value in pose)
+        message = (
+            f"{text} is {distance:.1f} times as far from the nearest reachable pose as a goal may be; "
+            f"that pose is {near} [mm, deg]"
+        )
+        return state, (Event(Fault.GOAL_OUTSIDE, message),)
+    return state._replace(goal=goal, n_actions=0, n_ticks=0), ()
+
+
+def step(
+    controller: Controller, state: State, frequency_hz: np.ndarray | None, late: bool
+) -> tuple[State, Tick]:
+    """One tick.
+
+    Args:
+        controller: the policy.
+        state: after the last tick; its pressures are in force.
+        frequency_hz (n,) [Hz]: readings, or None where none came in time.
+        late: the last tick missed its deadline.
+
+    Returns:
+        The next state, whose pressures are to be written unless its phase is HOLD, and the tick.
+    """
+    events = list(_deadline(controller, late, state.n_late + 1))
+    state = state._replace(n_late=state.n_late + 1 if late else 0)
+    state, found = _sense(controller, state, frequency_hz)
+    events += found
+    pose = _pose(controller, state.spring_m)
+    if state.phase is Phase.VENT:
+        return _vent(controller, state), Tick(state.spring_m, pose, tuple(events), False)
+
+    arrived = False
+    known = not np.isnan(state.spring_m).any()
+    if known and not _stops(events):
+        state, found = _check_chambers(controller, state)
+        events += found
+    if known and not _stops(events) and state.goal is not None and not state.n_lost.any():
+        state, found, arrived = _go(controller, state, pose)
+        events += found
+    responses = [event.response for event in events]
+    if Response.VENT in responses:
+        state = _vent(controller, state._replace(phase=Phase.VENT))
+    elif Response.HOLD in responses:
+        state = state._replace(phase=Phase.HOLD)
+    elif state.reference_m is not None:
+        pressure_kpa, integral_kpa = pressures(
+            state.reference_m, state.spring_m, state.integral_kpa, controller.policy.gains, controller.dt_s
+        )
+        state = state._replace(
+            pressure_kpa=pressure_kpa, integral_kpa=integral_kpa, n_ticks=state.n_ticks + 1
+        )
+    return state, Tick(state.spring_m, pose, tuple(events), arrived)
+
+
+def _stops(events: list[Event]) -> bool:
+    return any(event.response in (Response.HOLD, Response.VENT) for event in events)
+
+
+def _deadline(controller: Controller, late: bool, n_late: int) -> tuple[Event, ...]:
+    if not late:
+        return ()
+    limit = f"expected at most {1e3 * controller.dt_s:g} ms"
+    missed = Event(Fault.MISSED_DEADLINE, f"the last tick took too long, {limit}")
+    if n_late < faults.LATE_TICKS:
+        return (missed,)
+    return missed, Event(Fault.ARM_LATE, f"{n_late} ticks in a row took too long, {limit}")
+
+
+def _sense(
+    controller: Controller, state: State, frequency_hz: np.ndarray | None
+) -> tuple[State, list[Event]]:
+    """Spring lengths, the last good one where there is none; faults of the sensors."""
+    sensor = controller.policy.sensor
+    if frequency_hz is None:
+        lost, spring_m, events = np.ones(len(state.spring_m), bool), state.spring_m, []
+        events.append(Event(Fault.LOST_READING, "no readings within the tick"))
+    else:
+        reading = length_from_frequency(frequency_hz, sensor, np.nan_to_num(state.spring_m))
+        lost, events = reading.fault != SensorFault.OK.value, []
+        spring_m = np.where(lost, state.spring_m, reading.length_m)
+        if lost.any():
+            text = describe_faults(frequency_hz, reading.fault, sensor).replace("\n", "; ")
+            events.append(Event(Fault.LOST_READING, text))
+    window = controller.window
+    state = state._replace(
+        spring_m=spring_m,
+        n_lost=np.where(lost, state.n_lost + 1, 0),
+        springs_m=np.vstack([state.springs_m, spring_m])[-window:],
+        pressures_kpa=np.vstack([state.pressures_kpa, state.pressure_kpa])[-window:],
+    )
+    if state.phase is not Phase.RUN:
+        return state, events
+    gone = state.n_lost >= faults.LOST_TICKS
+    if gone.any():
+        message = f"{_names('spring', gone)}: no length in {faults.LOST_TICKS} ticks in a row"
+        events.append(Event(Fault.SENSOR_LOST, message))
+    elif len(state.springs_m) == window:
+        stuck = faults.stuck_springs(state.springs_m, state.pressures_kpa)
+        if stuck.any():
+            seconds = window * controller.dt_s
+            message = (
+                f"{_names('spring', stuck)}: moved less than {1e3 * faults.STUCK_RANGE_M:g} mm in "
+                f"{seconds:g} s, noise included, while the chamber was driven or the section moved"
+            )
+            events.append(Event(Fault.SENSOR_STUCK, message))
+    return state, events
+
+
+def _pose(controller: Controller, spring_m: np.ndarray) -> np.ndarray:
+    policy = controller.policy
+    if np.isnan(spring_m).any():
+        return np.full(6, np.nan)
+    spring_m = spring_m.astype(np.float32)
+    pose = estimate(policy.estimator, spring_m)
+    return pose if policy.s2r is None else correct(policy.s2r, pose, spring_m)
+
+
+def _at_rest(controller: Controller, state: State) -> bool:
+    """Whether nothing has moved for a window; one after the last action, at the earliest."""
+    full = len(state.springs_m) == controller.window and state.n_ticks >= controller.window
+    return full and faults.still(state.springs_m)
+
+
+def _check_chambers(controller: Controller, state: State) -> tuple[State, list[Event]]:
+    if state.reference_m is None or not _at_rest(controller, state):
+        return state._replace(n_suspect=np.zeros_like(state.n_suspect)), []
+    policy = controller.policy
+    suspect = faults.lost_chambers(
+        policy.spring_model, policy.gains, state.pressure_kpa, state.reference_m, state.spring_m
+    )
+    state = state._replace(n_suspect=np.where(suspect, state.n_suspect + 1, 0))
+    lost = state.n_suspect >= _CHAMBER_WINDOWS * controller.window
+    if not lost.any():
+        return state, []
+    kpa = ", ".join(f"{value:.1f}" for value in state.pressure_kpa[lost])
+    message = f"{_names('chamber', lost)}: at {kpa} kPa, but the springs lie as they would without that"
+    return state, [Event(Fault.CHAMBER_LOST, message)]
+
+
+def _go(controller: Controller, state: State, pose: np.ndarray) -> tuple[State, list[Event], bool]:
+    """Act if the goal is new or the springs have settled; arrive when they have after the last action."""
+    events: list[Event] = []
+    if state.n_actions > 0:
+        settled = _at_rest(controller, state) and _on_reference(controller, state)
+        if not settled and state.n_ticks * controller.dt_s < faults.SETTLE_TIMEOUT_S:
+            return state, [], False
+        if state.n_suspect.any() and settled:  # whether a chamber is lost comes first
+            return state, [], False
+        events += _unsettled(controller, state, settled)
+        if state.n_actions == N_ACTIONS:
+            return state._replace(goal=None), events, True
+    policy = controller.policy
+    if policy.s2r is not None:
+        spring_m = state.spring_m.astype(np.float32)
+        distance = float(extrapolation(policy.s2r, estimate(policy.estimator, spring_m), spring_m))
+        if distance > 1.0:
+            message = f"{distance:.1f} times as far from the training rows as the network is believed"
+            events.append(Event(Fault.EXTRAPOLATION, message))
+    reference_m = controller.plan(pose, state.goal, state.spring_m)
+    state = state._replace(reference_m=reference_m, n_actions=state.n_actions + 1, n_ticks=0)
+    return state, events, False
+
+
+def _on_reference(controller: Controller, state: State) -> bool:
+    """Whether each spring is on its reference, in the window's mean, or its chamber at a limit."""
+    gains = controller.policy.gains
+    off_m = np.abs(state.springs_m.mean(axis=0) - state.reference_m)
+    kpa = state.pressure_kpa
+    at_limit = (kpa <= gains.pressure_min_kpa) | (kpa >= gains.pressure_max_kpa)
+    return bool(np.all((off_m < faults.TOLERANCE_M) | at_limit))
+
+
+def _unsettled(controller: Controller, state: State, settled: bool) -> list[Event]:
+    """Events of the springs as they stand before the next action."""
+    off_m = state.springs_m.mean(axis=0) - state.reference_m
+    mask = saturated(
+        state.pressure_kpa,
+        state.reference_m,
+        state.springs_m.mean(axis=0),
+        controller.policy.gains,
+        faults.TOLERANCE_M,
+    )
+    events = []
+    if not settled:
+        worst = int(np.argmax(np.where(mask, 0.0, np.abs(off_m))))
+        off = f"{1e3 * off_m[worst]:+.1f} mm"
+        message = f"after {faults.SETTLE_TIMEOUT_S:g} s, spring{worst} is {off} off its reference"
+        events.append(Event(Fault.NOT_SETTLED, message))
+    if mask.any():
+        off = ", ".join(f"{1e3 * value:+.1f}" for value in off_m[mask])
+        message = f"{_names('chamber', mask)}: at the limit, spring {off} mm off its reference"
+        events.append(Event(Fault.SATURATED, message))
+    return events
+
+
+def _vent(controller: Controller, state: State) -> State:
+    """One step of the ramp to zero."""
+    rate = VENT_KPA_PER_S * controller.dt_s
+    pressure_kpa = state.pressure_kpa - np.clip(state.pressure_kpa, -rate, rate)
+    phase = Phase.VENT if pressure_kpa.any() else Phase.DONE
+    return state._replace(phase=phase, pressure_kpa=pressure_kpa, goal=None)
+
+
+def _names(kind: str, mask: np.ndarray) -> str:
+    return ", ".join(f"{kind}{k}" for k in np.flatnonzero(mask))
