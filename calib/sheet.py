@@ -54,9 +54,7 @@ class Sheet(NamedTuple):
     """The known columns of a log."""
 
     file: str
-    columns: tuple[
-        Column, ...
-    ]  # (k,) with the file's units, in the order of `log_columns`; the first is time
+    columns: tuple[Column, ...]  # (k,) with the file's units, in the order of `log_columns`: time first
     values: np.ndarray  # (n, k) in the units used inside
     row: np.ndarray  # (n,) line of the file
 
