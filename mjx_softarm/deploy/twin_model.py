@@ -24,7 +24,7 @@ from mjx_softarm.sensors import SensorParams
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
 from mjx_softarm.statics import GRAVITY_M_S2
 
-GAP = 2.0
+GAP = 1.9
 LINKS_PER_SECTION = 10
 MAX_TIMESTEP_S = 0.005  # the tip within 0.13 mm RMS of 0.00125 s, over 30 s of random commands
 WIDEST_DRAW = 2.0  # standard deviations; a part further off would not have been mounted
@@ -38,7 +38,7 @@ class Tolerances:
     chamber_area: float = 0.015  # per chamber
     chamber_length_m: float = 0.001  # per chamber: rest length
     chamber_hysteresis: float = 0.1  # per chamber
-    backbone_stiffness: float = 0.08  # per section
+    backbone_stiffness: float = 0.05  # per section
     link_mass: float = 0.05  # per link
     gripper_mass: float = 0.02
     hole_angle_deg: float = 2.0  # per chamber, and per spring
