@@ -1,8 +1,8 @@
 """Real logs of two other soft arms, as their files are.
 
-All rows are kept, as transients need the pressures of each. `fresh` says which rows hold motion capture of their
-own, and a quaternion that motion capture has turned by 180 degrees is NaN. The faults
-are found by the detectors of `calib.checks`, as in any log.
+All rows are kept, as transients need the pressures of each. `fresh` says which rows hold motion capture of
+their own, and a quaternion that motion capture has turned by 180 degrees is NaN. The faults are found by the
+detectors of `calib.checks`, as in any log.
 
 Source: ASU-RISE-Lab/4-chamber-softarm-control (commit 6df7ec9d), StanfordASL/trunk-stack (commit 8b4b9234).
 """
