@@ -17,8 +17,9 @@ from mjx_softarm.deploy.hysteresis import StopOperators
 from mjx_softarm.deploy.pneumatics import ATMOSPHERE_KPA, PUMP_M3_PER_S, VALVE_S, Pneumatics
 from mjx_softarm.deploy.twin import EVALUATION_SEEDS, GAP_SEEDS, Twin
 from mjx_softarm.deploy.twin_model import Build, build_twin, draw_parts
+from mjx_softarm.pose import pose_error, pose_from_frame
 from mjx_softarm.sensors import SensorParams, length_from_frequency
-from mjx_softarm.workspace import settle_many
+from mjx_softarm.workspace import circle_poses, settle_many
 
 ROOT = Path(__file__).resolve().parent.parent
 IDEAL = Build(gap=0.0, losses=0.0, noise=0.0, links_per_section=4)  # training's model, moving
@@ -394,6 +395,40 @@ def test_survives_random_extremes():
 @pytest.mark.parametrize("seed", EVALUATION_SEEDS)
 def test_survives_ten_minutes_of_random_extremes(seed):
     bang_bang(seed, 600.0)
+
+
+# --- the gap ---------------------------------------------------------------------------------------
+
+
+def references_for(spec, goal):
+    """Spring lengths (n, 9) that bring training's model to poses (n, 6): Gauss-Newton over the pressures."""
+    pressure, step_kpa, pull = np.full((len(goal), 9), -8.0), 0.5, 0.02
+    moves = step_kpa * np.concatenate([np.zeros((1, 9)), np.eye(9), -np.eye(9)])
+    for _ in range(8):
+        rest = settle_many(spec, (moves[:, None] + pressure).reshape(-1, 9))
+        pose = pose_from_frame(rest.tip_position_m, rest.tip_rotation).reshape(19, -1, 6)
+        slope = np.moveaxis(pose[1:10] - pose[10:], 0, -1) / (2 * step_kpa)  # (n, 6, 9)
+        for k, error in enumerate(pose_error(pose[0], goal)):
+            rows = np.concatenate([slope[k], pull * np.eye(9)])
+            wanted = np.concatenate([-error, pull * (-10.0 - pressure[k])])
+            move = np.linalg.lstsq(rows, wanted)[0]
+            pressure[k] += move * min(1.0, 8.0 / np.abs(move).max())
+    rest = settle_many(spec, pressure)
+    error = pose_error(pose_from_frame(rest.tip_position_m, rest.tip_rotation), goal)
+    assert np.linalg.norm(error[:, :3], axis=1).max() < 0.05
+    return rest.spring_m.astype(float)
+
+
+@pytest.mark.slow
+def test_without_s2r_the_twins_miss_the_circle_by_the_paper_s_error(spec):
+    goal = circle_poses(8)
+    references, gains, errors_mm = references_for(spec, goal), Gains.from_spec(spec), []
+    for seed in GAP_SEEDS:
+        arm, integral_kpa = Twin(seed), np.zeros(9)
+        for reference_m, point in zip(references, goal, strict=True):
+            integral_kpa = hold_springs(arm, reference_m, integral_kpa, gains, 8.0, arm._parts.sensor)
+            errors_mm.append(np.linalg.norm(1e3 * arm.motion_capture().tip_m - point[:3]))
+    assert np.mean(errors_mm) == pytest.approx(21.0, abs=1.5)
 
 
 # --- who may import it -----------------------------------------------------------------------------

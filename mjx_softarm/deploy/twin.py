@@ -20,6 +20,7 @@ from mjx_softarm.deploy.arm_io import Capture
 from mjx_softarm.deploy.hysteresis import StopOperators
 from mjx_softarm.deploy.pneumatics import PUMP_M3_PER_S, VALVE_S, Pneumatics
 from mjx_softarm.deploy.twin_model import (
+    AS_BUILT,
     WIDEST_DRAW,
     Build,
     build_twin,
@@ -67,13 +68,13 @@ class Twin:
         spec: ArmSpec | None = None,
         payload_kg: float = 0.0,
         session: int = EVALUATION_SESSION,
-        build: Build = Build(),  # noqa: B008
+        build: Build = AS_BUILT,
     ):
         """Hang the arm up, unpressurised, and wait until it is at rest.
 
         Args:
             seed: chooses the twin, 0 or greater.
-            spec: the nominal arm that the twin deviates from; by default the paper's.
+            spec: the nominal arm that the twin deviates from; by default the paper's. Its payload is left out.
             payload_kg: attached from the start.
             session: chooses the noise.
             build: how far from ideal.

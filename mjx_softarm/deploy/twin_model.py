@@ -52,12 +52,15 @@ class Tolerances:
 
 
 class Build(NamedTuple):
-    """How the twin differs from an ideal arm; tests set some of these to zero."""
+    """How far the twin is from an ideal arm; tests set some of these to zero."""
 
     gap: float = GAP  # scale of the tolerances
     losses: float = 1.0  # scale of hysteresis and joint friction
     noise: float = 1.0  # scale of the noise of all sensors
     links_per_section: int = LINKS_PER_SECTION
+
+
+AS_BUILT = Build()
 
 
 class Parts(NamedTuple):
