@@ -1,0 +1,192 @@
+"""Logs of an arm that is not there, planted unlike the specification, so that calibration can be tried.
+
+What the calibration fits is planted with other values: springs' beta and delta, chambers' stiffness, area and
+length, damping. What it does not fit is off as well, so that the sim-to-real network has something to learn:
+where the chambers and springs sit, how stiff the backbone is, and links finer than the simulator's.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+
+from mjx_softarm.logs import Log, write_log
+from mjx_softarm.mjcf import build_model, steps_per_period
+from mjx_softarm.pose import rotation_from_quaternion
+from mjx_softarm.sensors import SensorParams, frequency_from_length
+from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
+from mjx_softarm.workspace import settle_many
+
+N_LENGTHS = 60  # of each spring on the ruler
+N_POSES = 1200
+POSE_S = 5.0
+N_STEPS = 12
+STEP_S = 4.0
+LENGTH_NOISE_M = 3e-4  # of a ruler, and of a spring's reading
+TIP_NOISE_M = 3e-4
+TURN_NOISE_RAD = 2e-3
+PRESSURE_NOISE_KPA = 0.05
+MARKERS_PER_SECTION = 3
+
+
+def planted_arm(spec: ArmSpec, seed: int) -> ArmSpec:
+    """The arm that the logs are of."""
+    rng = np.random.default_rng(seed)
+
+    def each(value: float | tuple[float, ...], spread: float) -> tuple[float, ...]:
+        values = np.array(spec.per_chamber(value))
+        return tuple(values * (1.0 + rng.uniform(-spread, spread, spec.n_chambers)))
+
+    chambers, geometry, backbone = spec.chambers, spec.geometry, spec.backbone
+    offset_m = np.array(spec.per_chamber(chambers.length_offset_m)) + rng.uniform(
+        -4e-3, 4e-3, spec.n_chambers
+    )
+    delta_m = np.array(spec.per_chamber(spec.sensor.delta_m)) + rng.uniform(-5e-3, 5e-3, spec.n_chambers)
+    return spec.replace(
+        name=f"{spec.name} planted {seed}",
+        structure={"links_per_section": spec.structure.links_per_section + 2},
+        geometry={
+            "chamber_radius_m": 1.02 * geometry.chamber_radius_m,
+            "spring_radius_m": 0.99 * geometry.spring_radius_m,
+            "first_chamber_deg": geometry.first_chamber_deg + 1.5,
+        },
+        backbone={"bending_stiffness_nm_per_rad": 1.1 * backbone.bending_stiffness_nm_per_rad},
+        chambers={
+            "area_m2": each(chambers.area_m2, 0.08),
+            "stiffness_n_per_m": each(chambers.stiffness_n_per_m, 0.2),
+            "length_offset_m": tuple(offset_m),
+            "damping_ns_per_m": 1.5 * chambers.damping_ns_per_m,
+        },
+        sensor={"beta": each(spec.sensor.beta, 0.05), "delta_m": tuple(delta_m)},
+    )
+
+
+def write_demo(folder: Path, spec: ArmSpec, seed: int) -> list[Path]:
+    """Write a complete set of logs.
+
+    `springs.csv`: each spring on a ruler. `poses.csv`: the arm at rest at random pressures.
+    `steps.csv`: the arm after steps of the pressures, at the control rate.
+
+    Args:
+        folder: made if it is not there.
+        spec: what the user believes of the arm.
+        seed: of the planted arm, the pressures and the noise.
+
+    Returns:
+        The files.
+
+    Raises:
+        OSError: the folder cannot be written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    planted, rng = planted_arm(spec, seed), np.random.default_rng([seed, 1])
+    logs = {
+        "springs.csv": _springs(planted, rng),
+        "poses.csv": _poses(planted, rng),
+        "steps.csv": _steps(planted, rng),
+    }
+    for name, log in logs.items():
+        write_log(folder / name, log)
+    return [folder / name for name in logs]
+
+
+def _springs(arm: ArmSpec, rng: np.random.Generator) -> Log:
+    low, high = arm.springs.length_min_m, arm.springs.length_max_m
+    length_m = np.linspace(low, high, N_LENGTHS)[:, None] * np.ones(arm.n_chambers)
+    return Log(
+        **_rows(2.0 * np.arange(N_LENGTHS)),
+        frequency_hz=_readings(arm, length_m, rng),
+        spring_m=length_m + LENGTH_NOISE_M * rng.normal(size=length_m.shape),
+    )
+
+
+def _poses(arm: ArmSpec, rng: np.random.Generator) -> Log:
+    low, high = arm.chambers.pressure_min_kpa, arm.chambers.pressure_max_kpa
+    swing = np.cos(rng.uniform(0.0, np.pi, (N_POSES, arm.n_chambers)))  # arcsine law: favours the extremes
+    pressure_kpa = low + (high - low) * 0.5 * (1.0 + swing)
+    model, data = _model(arm)
+    found = settle_many(arm, pressure_kpa)
+    seen = [_look(arm, model, data, q) for q in found.q[found.settled]]
+    return _measured(arm, POSE_S * np.arange(len(seen)), found.pressure_kpa[found.settled], seen, rng)
+
+
+def _steps(arm: ArmSpec, rng: np.random.Generator) -> Log:
+    """Pressures that jump, followed by C MuJoCo."""
+    low, high = arm.chambers.pressure_min_kpa, arm.chambers.pressure_max_kpa
+    model, data = _model(arm)
+    period_s = 1.0 / arm.control.rate_hz
+    targets = rng.uniform(0.8 * low, 0.8 * high, (N_STEPS, arm.n_chambers))
+    pressure_kpa, seen = np.repeat(targets, round(STEP_S / period_s), axis=0), []
+    data.qpos[:] = settle_many(arm, targets[-1:]).q[0]
+    for row in pressure_kpa:
+        seen.append(_look(arm, model, data, data.qpos))
+        data.ctrl[:] = row
+        mujoco.mj_step(model, data, steps_per_period(period_s))
+    return _measured(arm, period_s * np.arange(len(seen)), pressure_kpa, seen, rng)
+
+
+def _model(arm: ArmSpec) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    model = build_model(arm)
+    return model, mujoco.MjData(model)
+
+
+class _Seen(NamedTuple):
+    """What there is to measure of an arm, without noise."""
+
+    spring_m: np.ndarray  # (n,)
+    tip_m: np.ndarray  # (3,)
+    tip_rotation: np.ndarray  # (3, 3)
+    marker_m: np.ndarray  # (n_markers, 3)
+
+
+def _look(arm: ArmSpec, model: mujoco.MjModel, data: mujoco.MjData, qpos: np.ndarray) -> _Seen:
+    data.qpos[:] = qpos
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    mujoco.mj_tendon(model, data)
+    tip = data.site("tip")
+    marker_m = np.stack([data.site(name).xpos for name in _marker_sites(arm)])
+    return _Seen(data.ten_length[1::2].copy(), tip.xpos.copy(), tip.xmat.reshape(3, 3).copy(), marker_m)
+
+
+def _marker_sites(arm: ArmSpec) -> list[str]:
+    """Beside the first spring of each section, at its thirds, from the base to the tip."""
+    per_section, names = arm.structure.links_per_section, []
+    for section in range(arm.structure.n_sections):
+        for third in range(1, MARKERS_PER_SECTION + 1):
+            plate = section * per_section + round(third * per_section / MARKERS_PER_SECTION)
+            names.append(f"spring{N_CHAMBERS_PER_SECTION * section}_plate{plate}")
+    return names
+
+
+def _measured(
+    arm: ArmSpec, time_s: np.ndarray, pressure_kpa: np.ndarray, seen: list[_Seen], rng: np.random.Generator
+) -> Log:
+    """A log of what was seen, with noise."""
+    spring_m, tip_m, rotation, marker_m = map(np.stack, zip(*seen, strict=True))
+    turn = rng.normal(scale=0.5 * TURN_NOISE_RAD, size=(len(seen), 3))
+    small = np.column_stack([np.ones(len(seen)), turn])  # quaternion of a small turn
+    quaternion = np.empty((len(seen), 4))
+    for k, matrix in enumerate(rotation_from_quaternion(small) @ rotation):
+        mujoco.mju_mat2Quat(quaternion[k], matrix.ravel())
+    return Log(
+        **_rows(time_s),
+        frequency_hz=_readings(arm, spring_m, rng),
+        pressure_kpa=pressure_kpa + rng.normal(scale=PRESSURE_NOISE_KPA, size=pressure_kpa.shape),
+        tip_m=tip_m + rng.normal(scale=TIP_NOISE_M, size=tip_m.shape),
+        tip_quaternion=quaternion,
+        marker_m=marker_m + rng.normal(scale=TIP_NOISE_M, size=marker_m.shape),
+        payload_kg=np.zeros(len(seen)),
+    )
+
+
+def _rows(time_s: np.ndarray) -> dict[str, Any]:
+    return {"source": "demo", "row": np.arange(len(time_s)) + 2, "time_s": time_s}
+
+
+def _readings(arm: ArmSpec, length_m: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    noisy_m = length_m + rng.normal(scale=LENGTH_NOISE_M, size=length_m.shape)
+    return frequency_from_length(noisy_m, SensorParams.from_spec(arm))
