@@ -30,3 +30,18 @@ def held_out_blocks(n: int, share: float = 0.2, block: int = 100, seed: int = 0)
     n_held_out = min(max(round(share * n_blocks), 1), n_blocks - 1)
     chosen = np.random.default_rng(seed).choice(n_blocks, n_held_out, replace=False)
     return np.isin(np.arange(n) // block, chosen)
+
+
+def folds(n: int, block: int = 100, n_folds: int = 5, seed: int = 0) -> np.ndarray:
+    """The fold (n,) that holds out each row: every row once, whole blocks of rows together, drawn at random.
+
+    Blocks are as in `held_out_blocks`. A log of fewer blocks than folds is cut into one block for each.
+
+    Raises:
+        ValueError: fewer than two folds, or fewer rows than folds.
+    """
+    if not 2 <= n_folds <= n:
+        raise ValueError(f"held-out rows: expected 2 to {n} folds, as many as rows, got {n_folds}")
+    n_blocks = max(-(-n // block), n_folds)
+    fold_of_block = np.random.default_rng(seed).permutation(n_blocks) % n_folds
+    return fold_of_block[np.arange(n) * n_blocks // n]
