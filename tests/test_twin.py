@@ -15,7 +15,7 @@ from mjx_softarm.control import Gains, pressures
 from mjx_softarm.deploy import pneumatics, twin
 from mjx_softarm.deploy.hysteresis import StopOperators
 from mjx_softarm.deploy.pneumatics import ATMOSPHERE_KPA, PUMP_M3_PER_S, VALVE_S, Pneumatics
-from mjx_softarm.deploy.twin import EVALUATION_SEEDS, GAP_SEEDS, Twin
+from mjx_softarm.deploy.twin import EVALUATION_SEEDS, Twin
 from mjx_softarm.deploy.twin_model import Build, build_twin, draw_parts
 from mjx_softarm.pose import pose_error, pose_from_frame
 from mjx_softarm.sensors import SensorParams, length_from_frequency
@@ -329,7 +329,7 @@ def test_seed_chooses_the_twin_and_session_the_noise():
     np.testing.assert_allclose(first[:9], other_day[:9], atol=10 * twin.FREQUENCY_NOISE_HZ)
     silent = [records(7, session=session, build=Build(noise=0.0)) for session in (0, 1)]
     np.testing.assert_array_equal(*silent)
-    assert not set(GAP_SEEDS) & set(EVALUATION_SEEDS)
+    assert twin.S2R_SESSION != twin.EVALUATION_SESSION
 
 
 def test_one_write_is_one_control_period():
@@ -392,7 +392,7 @@ def test_survives_random_extremes():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", EVALUATION_SEEDS)
+@pytest.mark.parametrize("seed", EVALUATION_SEEDS[:2])
 def test_survives_ten_minutes_of_random_extremes(seed):
     bang_bang(seed, 600.0)
 
@@ -423,7 +423,7 @@ def references_for(spec, goal):
 def test_without_s2r_the_twins_miss_the_circle_by_the_paper_s_error(spec):
     goal = circle_poses(8)
     references, gains, errors_mm = references_for(spec, goal), Gains.from_spec(spec), []
-    for seed in GAP_SEEDS:
+    for seed in EVALUATION_SEEDS:
         arm, integral_kpa = Twin(seed), np.zeros(9)
         for reference_m, point in zip(references, goal, strict=True):
             integral_kpa = hold_springs(arm, reference_m, integral_kpa, gains, 8.0, arm._parts.sensor)

@@ -31,11 +31,10 @@ from mjx_softarm.deploy.twin_model import (
 from mjx_softarm.sensors import frequency_from_length
 from mjx_softarm.spec import ArmSpec
 
-# The size of the gap was set on these twins; no result is reported on them.
-GAP_SEEDS = (0, 1, 2, 3, 4, 5)
-# The twins that results are reported on. An S2R network belongs to one arm, so its data come from the same
-# twin, but from another session, whose noise is another, and from other motions than the evaluation's.
-EVALUATION_SEEDS = (7, 8, 9)
+# The twins that results are reported on; the size of the gap was set on these six, without S2R. An S2R
+# network belongs to one arm, so its data come from the same twin, but from another session, whose noise is
+# another, and from other motions than the evaluation's.
+EVALUATION_SEEDS = (0, 1, 2, 3, 4, 5)
 S2R_SESSION, EVALUATION_SESSION = 0, 1
 
 # Chambers: four stops of equal force; 3 % of the elastic force of a chamber at its shortest.
@@ -74,7 +73,7 @@ class Twin:
 
         Args:
             seed: chooses the twin, 0 or greater.
-            spec: the nominal arm that the twin deviates from; by default the paper's. Its payload is left out.
+            spec: the nominal arm that the twin deviates from, the paper's by default; its payload is ignored.
             payload_kg: attached from the start.
             session: chooses the noise.
             build: how far from ideal.
