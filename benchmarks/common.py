@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from train.checkpoint import provenance, write_json
+from mjx_softarm.provenance import provenance, write_json
 
 RESULTS = Path(__file__).parent / "results"
 

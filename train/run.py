@@ -17,8 +17,9 @@ from tensorboardX import SummaryWriter
 
 from mjx_softarm import xla
 from mjx_softarm.env import ReachEnv
+from mjx_softarm.provenance import write_json
 from train import plots
-from train.checkpoint import Run, write_json
+from train.checkpoint import Run
 from train.evaluate import Evaluator, Summary
 from train.job import Job, TrainState
 
