@@ -95,9 +95,9 @@ def constant_curvature(spring_site_m: Any, spring_m: Any) -> Frame:
     )
     square = xp.sum(bend**2, axis=-1)[..., None]
     angle = xp.sqrt(xp.where(square < _SMALL_BEND, _SMALL_BEND, square))
-    aside, down = (1.0 - xp.cos(angle)) / angle**2, xp.sin(angle) / angle
-    position_m = length * xp.concat([aside * bend, -down], axis=-1)
     half = xp.sin(0.5 * angle) / angle
+    aside, down = 2.0 * half**2, xp.sin(angle) / angle  # aside: (1 - cos) / angle^2, exact in float32 too
+    position_m = length * xp.concat([aside * bend, -down], axis=-1)
     axis = xp.stack([bend[..., 1], -bend[..., 0], xp.zeros_like(bend[..., 0])], axis=-1)
     quaternion = xp.concat([xp.cos(0.5 * angle), half * axis], axis=-1)
     return Frame(position_m, rotation_from_quaternion(quaternion))
