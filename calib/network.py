@@ -1,8 +1,8 @@
 """Small networks fitted to rows of a log: averaged, stopped early on contiguous blocks, bounded.
 
 A log is short for a network, so the fit leans to the smooth side: several small networks with decayed weights
-learn side by side, each is stopped by blocks of rows that it did not see, other blocks for each, and their mean
-is what counts. That mean is one network again, its layers side by side, and is stored and run as one.
+learn side by side, each is stopped by blocks of rows that it did not see, other blocks for each, and what
+counts is their mean. That mean is one network again, its layers side by side, and is stored and run as one.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class NetworkConfig:
 
     hidden: tuple[int, ...] = (64, 64)
     n_members: int = 5  # networks that are averaged
-    n_updates: int = 5_000  # of each
+    n_updates: int = 3_000  # of each
     learning_rate: float = 0.01  # of Adam at the start; it falls to zero along a half cosine
     batch_size: int = 128
     weight_decay: float = 0.3  # per update and learning rate

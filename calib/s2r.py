@@ -1,8 +1,9 @@
 """The sim-to-real network: (P, L_spring) -> P_S2R, fitted to a log.
 
-The steps of the paper: the log gives spring lengths and real tip poses; the calibrated simulation is asked for
-the same spring lengths and gives poses of its own; a network learns the difference. Contiguous blocks of rows
-take no part in the fit, early stopping included, and tell how good it is.
+The steps of the paper: the log gives spring lengths and real tip poses; the calibrated simulation is asked
+for the same spring lengths and gives poses of its own; a network learns the difference, which takes fewer
+rows than learning the real pose itself. Contiguous blocks of rows take no part in the fit, early stopping
+included, and tell how good it is.
 
 Source: Sim-to-Real Transfer in Meng et al.
 """
