@@ -1,12 +1,13 @@
-"""The springs' calibration: L = beta l + delta from measured lengths L, with l the length that a reading gives.
+"""The springs' calibration: L = beta l + delta from measured lengths L, l being the length that a reading gives.
 
-A straight line per spring (or one for all), fitted with Huber's loss, whose scale comes from the residuals, so
-that a few gross outliers hardly matter. Intervals are of the sandwich kind and take stretches of
+A straight line per spring (or one for all), fitted with Huber's loss, whose scale comes from the residuals,
+so that a few gross outliers hardly matter. Intervals are of the sandwich kind and take stretches of
 neighbouring rows as one piece of evidence each, since neighbouring rows of a log err alike.
 
-What lengths can tell of the circuit: L = beta K w / (1 - I_comp w) + delta with w = C (2 pi f)^2 stays the same
-when C grows by a factor and beta and I_comp shrink by it. So C stays at its given value and beta answers for it;
-I_comp, one for all springs, can be fitted, from the curvature of L against f^2, if the lengths reach far enough.
+What lengths can tell of the circuit: L = beta K w / (1 - I_comp w) + delta with w = C (2 pi f)^2 stays the
+same when C grows by a factor and beta and I_comp shrink by it. So C stays at its given value and beta answers
+for it; I_comp, one for all springs, can be fitted, from the curvature of L against f^2, if the lengths reach
+far enough.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from mjx_softarm.sensors import SensorParams
 
 HUBER = 1.345  # in standard deviations of the noise: 95 % of the efficiency of least squares
 DOWN_WEIGHTED = 2 * HUBER  # beyond it a row counts less than half
-ROUNDS = 8  # of scale and parameters in turn
+ROUNDS = 5  # of scale and parameters in turn
 ITERATIONS = 40
 STRETCHES = 50  # of neighbouring rows, for the intervals
 STUDENT = 2.0096  # 97.5 % quantile for STRETCHES - 1 degrees of freedom
@@ -145,8 +146,8 @@ def fit_springs(
 def still_rows(time_s: np.ndarray, x: np.ndarray, tolerance: float, window_s: float = 0.5) -> np.ndarray:
     """Mask (n,) of the rows around which x (n,) moves by less than the tolerance within the window.
 
-    Two instruments that are not triggered together differ by speed times delay while the arm moves; a
-    static calibration wants the other rows. Rows are chosen by the sensor alone, never by the target.
+    Two instruments that are not triggered together differ by speed times delay while the arm moves; a static
+    calibration wants rows at which both were still. A fit's residuals have no say in it.
     """
     before, after = (np.interp(time_s + shift, time_s, x) for shift in (-window_s, window_s))
     return (np.abs(x - before) < tolerance) & (np.abs(after - x) < tolerance)
@@ -158,7 +159,7 @@ def _identity(x: Array, q: Array) -> Array:
 
 def _wire_share(w: Array, q: Array) -> Array:
     """Wire length, but for a factor, from w = y / y_max and q = I_comp y_max."""
-    return w / (1.0 - q[0] * w)
+    return w / jnp.maximum(1.0 - q[0] * w, 1e-3)
 
 
 def _columns(x: Array, weight: Array) -> tuple[Array, Array]:
@@ -175,7 +176,7 @@ def _scale(residual: Array, weight: Array) -> Array:
 
 @functools.partial(jax.jit, static_argnums=0)
 def _robust(feature, x: Array, y: Array, q: Array, weight: Array) -> tuple[Array, Array, Array, Array]:
-    """Slope (k,), offset (k,), numbers of the feature (m,) and noise (k,); y of unit spread, weight 0 or 1."""
+    """Slope (k,), offset (k,), numbers of the feature (m,), noise (k,); y has unit spread, weight 0 or 1."""
 
     def residual(params):
         slope, offset, q = params
@@ -188,7 +189,7 @@ def _robust(feature, x: Array, y: Array, q: Array, weight: Array) -> tuple[Array
             loss = weight * optax.losses.huber_loss(residual(params) / scale, delta=HUBER)
             return jnp.min(scale) ** 2 * jnp.sum(loss) / jnp.sum(weight)
 
-        optimiser = optax.lbfgs()
+        optimiser = optax.lbfgs(linesearch=optax.scale_by_backtracking_linesearch(20, store_grad=True))
 
         def iterate(carry):
             params, state, count, _ = carry
@@ -204,11 +205,12 @@ def _robust(feature, x: Array, y: Array, q: Array, weight: Array) -> tuple[Array
         return jax.lax.while_loop(lambda c: (c[2] < ITERATIONS) & (c[3] > goal), iterate, start)[0]
 
     mean, _ = _columns(y, weight)
-    params = (jnp.ones_like(mean), mean, q)
-    params = descend(params, jnp.full_like(mean, 1e3))  # least squares
-    params = jax.lax.fori_loop(
-        0, ROUNDS, lambda _, p: descend(p, _scale(residual(p), weight)), params
-    )
+
+    def again(count, params):
+        least_squares = jnp.full_like(mean, 1e3)
+        return descend(params, jnp.where(count == 0, least_squares, _scale(residual(params), weight)))
+
+    params = jax.lax.fori_loop(0, ROUNDS, again, (jnp.ones_like(mean), mean, q))
     mean, spread = _columns(feature(x, params[2]), weight)
     slope = params[0] / spread
     return slope, params[1] - slope * mean, params[2], _scale(residual(params), weight)
@@ -262,7 +264,9 @@ def _fit(feature, x, y, q, name: str, shared: bool, block: int, seed: int):
         n_outliers=(np.abs(residual) > DOWN_WEIGHTED * noise).sum(0),
         warnings=(),
     )
-    fit = fit._replace(warnings=_warnings(fit, np.where(known, wire, np.nan), "all " + name + "s " if shared else name))
+    fit = fit._replace(
+        warnings=_warnings(fit, np.where(known, wire, np.nan), "all " + name + "s " if shared else name)
+    )
     if shared:
         fit = LineFit(*(np.repeat(value, n_columns, axis=0) for value in fit[:-1]), fit.warnings)
     return fit, best_q, None if q_half is None else best_q[0] + q_half * np.array([-1, 1])
@@ -330,6 +334,6 @@ def _compensation_warnings(interval_h: tuple[float, float], unit_h: float) -> tu
     if width_h < 0.02 * unit_h:
         return ()
     return (
-        f"compensation: known to {width_h:.3g} H only, beside {unit_h:.3g} H of the whole circuit: the lengths "
-        "do not reach far enough to tell it from beta and delta",
+        f"compensation: known to {width_h:.3g} H only, beside {unit_h:.3g} H of the whole circuit: the "
+        "lengths do not reach far enough to tell it from beta and delta",
     )
