@@ -38,7 +38,7 @@ from mjx_softarm.spec import N_CHAMBERS_PER_SECTION
 
 LOST_TICKS = 3
 LATE_TICKS = 5
-SETTLE_TIMEOUT_S = 10.0
+SETTLE_TIMEOUT_S = 15.0  # a pump of 12 L/min takes up to 10 s from one end of the workspace to the other
 TOLERANCE_M = 1e-3  # of a spring on its reference, as in training
 STILL_M = 2e-4  # greatest difference between the means of a window's halves at rest; far above the noise
 
