@@ -25,7 +25,8 @@ N_POSES = 1200
 POSE_S = 5.0
 N_STEPS = 12
 STEP_S = 4.0
-LENGTH_NOISE_M = 3e-4  # of a ruler, and of a spring's reading
+RULER_NOISE_M = 3e-4
+READING_NOISE_M = 1e-4  # of a spring, by its frequency
 TIP_NOISE_M = 3e-4
 TURN_NOISE_RAD = 2e-3
 PRESSURE_NOISE_KPA = 0.05
@@ -99,7 +100,7 @@ def _springs(arm: ArmSpec, rng: np.random.Generator) -> Log:
     return Log(
         **_rows(2.0 * np.arange(N_LENGTHS)),
         frequency_hz=_readings(arm, length_m, rng),
-        spring_m=length_m + LENGTH_NOISE_M * rng.normal(size=length_m.shape),
+        spring_m=length_m + RULER_NOISE_M * rng.normal(size=length_m.shape),
     )
 
 
@@ -188,5 +189,5 @@ def _rows(time_s: np.ndarray) -> dict[str, Any]:
 
 
 def _readings(arm: ArmSpec, length_m: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    noisy_m = length_m + rng.normal(scale=LENGTH_NOISE_M, size=length_m.shape)
+    noisy_m = length_m + rng.normal(scale=READING_NOISE_M, size=length_m.shape)
     return frequency_from_length(noisy_m, SensorParams.from_spec(arm))

@@ -1,0 +1,124 @@
+"""Command line: `python -m calib template | check | demo | run`."""
+
+from __future__ import annotations
+
+import os
+
+# XLA logs a page for every program that it takes from the cache.
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+
+import argparse
+import sys
+from pathlib import Path
+
+from calib.checks import Finding, LogError
+from mjx_softarm.logs import Log
+from mjx_softarm.spec import ArmSpec, SpecError
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run a command; returns the exit status: 0 done, 1 not to be trusted, 2 not done, 130 interrupted."""
+    options = _parser().parse_args(arguments)
+    try:
+        return options.command(options)
+    except LogError as error:
+        print(f"error: {error}", file=sys.stderr)
+    except (SpecError, FileExistsError) as error:
+        print(f"error: {error}", file=sys.stderr)
+    except OSError as error:
+        print(f"error: {error.filename}: {error.strerror}", file=sys.stderr)
+    except KeyboardInterrupt:
+        return 130
+    return 2
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m calib", description="Calibrate an arm from its logs.")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    template = commands.add_parser("template", help="write a small log to start from, and say what is in it")
+    template.add_argument("out", type=Path, nargs="?", default=Path("log.csv"), help="default: log.csv")
+    template.set_defaults(command=_template)
+    check = commands.add_parser("check", help="say what is wrong with logs")
+    _add_logs(check)
+    check.set_defaults(command=_check)
+    demo = commands.add_parser("demo", help="write logs of a planted arm, to try everything without hardware")
+    demo.add_argument("--out", type=Path, default=Path("calib-demo"), help="folder; default: calib-demo")
+    demo.add_argument("--seed", type=int, default=0, help="of the arm and the noise; default: 0")
+    demo.set_defaults(command=_demo)
+    run = commands.add_parser("run", help="calibrate springs, chambers, damping and the sim-to-real network")
+    _add_logs(run)
+    run.add_argument("--spec", type=Path, help="TOML file of the arm so far; default: the paper's arm")
+    run.add_argument("--out", type=Path, default=Path("calibration"), help="folder; default: calibration")
+    run.add_argument("--seed", type=int, default=0, help="of all that is drawn; default: 0")
+    run.set_defaults(command=_run)
+    return parser
+
+
+def _add_logs(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("logs", type=Path, nargs="+", metavar="LOG", help="CSV or npz; see `template`")
+    parser.add_argument(
+        "--strict", action="store_true", help="refuse logs with any fault; default: drop rows"
+    )
+
+
+def _template(options: argparse.Namespace) -> int:
+    from calib.logs import template
+
+    print(template(options.out))
+    return 0
+
+
+def _check(options: argparse.Namespace) -> int:
+    logs, findings = _read(options, ArmSpec.default().n_chambers)
+    for log in logs:
+        print(f"{log.source}: {len(log)} rows to use, {log.time_s[-1] - log.time_s[0]:.1f} s")
+    return 1 if findings else 0
+
+
+def _demo(options: argparse.Namespace) -> int:
+    from calib.demo import write_demo
+    from mjx_softarm import xla
+
+    xla.enable_compilation_cache()
+    print("simulating ...", flush=True)
+    files = write_demo(options.out, ArmSpec.default(), options.seed)
+    print("\n".join(f"log: {file}" for file in files))
+    print(f"next: python -m calib run {' '.join(map(str, files))}")
+    return 0
+
+
+def _run(options: argparse.Namespace) -> int:
+    from calib.run import calibrate, refuse_existing, write_calibration
+    from mjx_softarm import xla
+    from mjx_softarm.provenance import provenance
+
+    refuse_existing(options.out)
+    spec = ArmSpec.from_toml(options.spec) if options.spec else ArmSpec.default()
+    logs, findings = _read(options, spec.n_chambers)
+    xla.enable_compilation_cache()
+    calibration = calibrate(logs, spec, options.seed, lambda text: print(text, flush=True))
+    write_calibration(options.out, calibration, [str(finding) for finding in findings], provenance("calib"))
+    for part in calibration.parts:
+        for warning in part.warnings:
+            print(f"warning: {part.title}: {warning}")
+    print(f"report: {options.out / 'report.html'}")
+    print(f"next: python -m train reach --calibration {options.out}")
+    return 1 if any(part.warnings for part in calibration.parts) else 0
+
+
+def _read(options: argparse.Namespace, n_chambers: int) -> tuple[list[Log], list[Finding]]:
+    """The logs; what was found is printed."""
+    from calib.logs import read_log
+
+    logs, findings = [], []
+    for path in options.logs:
+        log, found = read_log(path, n_chambers, options.strict)
+        logs.append(log)
+        findings += found
+        for finding in found:
+            print(finding)
+    return logs, findings
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,144 @@
+"""The sections of a calibration's report: figures, tables, pictures."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from calib.chambers import ChamberFit
+from calib.report import Part, Table
+from calib.s2r import S2RFit
+from calib.sensors import SpringFit
+from mjx_softarm.s2r import correct
+
+_BINS = 40
+
+
+def springs(fit: SpringFit, calibrated_m: np.ndarray, length_m: np.ndarray) -> Part:
+    """Beta and delta of each spring; lengths (n, n_springs) by the calibrated sensors and as measured."""
+    half_beta = 0.5 * np.ptp(fit.beta_interval, axis=1)
+    half_delta = 0.5 * np.ptp(fit.delta_interval_m, axis=1)
+    rows = tuple(
+        (f"spring {k}", fit.beta[k], half_beta[k], 1e3 * fit.delta_m[k], 1e3 * half_delta[k])
+        + (1e3 * fit.held_out_rms_m[k], int(fit.n_rows[k]), int(fit.n_outliers[k]))
+        for k in range(len(fit.beta))
+    )
+    head = ("", "beta", "+-", "delta [mm]", "+- [mm]", "held-out RMS [mm]", "rows", "outliers")
+    figure, axes = _figure()
+    error_mm = 1e3 * (calibrated_m - length_m)
+    for k in range(length_m.shape[1]):
+        axes.plot(1e3 * length_m[:, k], error_mm[:, k], ".", ms=3, label=f"spring {k}")
+    _label(axes, "measured length [mm]", "calibrated less measured [mm]")
+    return Part(
+        "Springs",
+        "Lengths that were measured against lengths from the readings, L = beta l + delta, Huber's loss. "
+        "Intervals are 95 %; held out are contiguous blocks of rows.",
+        (Table(head, rows),),
+        fit.warnings,
+        _plain(fit),
+        (("what the lines leave", figure),),
+    )
+
+
+def chambers(fit: ChamberFit) -> Part:
+    """Stiffness, area and rest length of each chamber, and how well the arm's tip is met."""
+    spec = fit.spec
+    values = {
+        name: spec.per_chamber(getattr(spec.chambers, name))
+        for name in ("stiffness_n_per_m", "area_m2", "length_offset_m")
+    }
+    rows = tuple(
+        (
+            f"chamber {k}",
+            values["stiffness_n_per_m"][k],
+            100 * fit.stiffness_interval[k],
+            1e4 * values["area_m2"][k],
+            100 * fit.area_interval[k],
+            1e3 * values["length_offset_m"][k],
+            1e3 * fit.offset_interval_m[k],
+        )
+        for k in range(spec.n_chambers)
+    )
+    head = ("", "stiffness [N/m]", "+- [%]", "area [cm2]", "+- [%]", "rest length [mm]", "+- [mm]")
+    errors = (
+        ("held-out poses, before", *fit.held_out_before),
+        ("held-out poses, calibrated", *fit.held_out),
+        ("poses of the fit, calibrated", *fit.in_sample),
+    )
+    figure, axes = _figure()
+    error_mm = 1e3 * np.linalg.norm(fit.predicted_m - fit.measured_m, axis=1)
+    bins = np.linspace(0.0, np.nanquantile(error_mm, 0.99), _BINS).tolist()
+    axes.hist(error_mm[~fit.is_held_out], bins, density=True, alpha=0.5, label="fit")
+    axes.hist(error_mm[fit.is_held_out], bins, density=True, histtype="step", lw=2, label="held out")
+    _label(axes, "simulated to measured tip [mm]", "density")
+    return Part(
+        "Chambers",
+        f"{fit.n_poses} poses at rest: simulated at the measured pressures against the measured tip and "
+        "springs. Rest length is told as its difference from the section's. Intervals are 95 %.",
+        (Table(head, rows), Table(_ERROR_HEAD, errors)),
+        fit.warnings,
+        _plain(fit, "spec", "predicted_m", "measured_m", "is_held_out") | values,
+        (("simulated to measured tip", figure),),
+    )
+
+
+def s2r(fit: S2RFit, pose: np.ndarray, spring_m: np.ndarray, real: np.ndarray) -> Part:
+    """Simulated poses (n, 6) and spring lengths, and real poses, with and without the network."""
+    errors = tuple(
+        (name, e.translation_mean_mm, e.translation_95_mm, e.rotation_mean_deg)
+        for name, e in (
+            ("held-out poses, simulated", fit.test_uncorrected),
+            ("held-out poses, corrected", fit.test),
+            ("poses of the fit, corrected", fit.in_sample),
+        )
+    )
+    corrected = correct(fit.s2r, pose, spring_m)
+    figure, axes = _figure()
+    for label, poses in (("simulated", pose), ("corrected", corrected)):
+        distance_mm = np.linalg.norm((poses - real)[fit.held_out, :3], axis=1)
+        axes.hist(distance_mm, _BINS, alpha=0.5, label=label)
+    _label(axes, "distance to the real tip, held-out poses [mm]", "poses")
+    return Part(
+        "Sim-to-real network",
+        f"{len(pose)} poses at rest: the calibrated simulation is asked for the logged spring lengths, the "
+        f"network learns what its tip is off by. Of the held-out poses it flags "
+        f"{100 * fit.flagged_share:.1f} % as far from those it learned from.",
+        (Table(_ERROR_HEAD, errors),),
+        fit.warnings,
+        _plain(fit, "s2r", "held_out"),
+        (("held-out poses with and without the network", figure),),
+    )
+
+
+_ERROR_HEAD = ("tip", "mean [mm]", "95 % [mm]", "mean turn [deg]")
+
+
+def _plain(fit: Any, *left_out: str) -> dict[str, Any]:
+    """The fields of a fit as JSON has them."""
+    fields = fit._asdict() if hasattr(fit, "_asdict") else _fields(fit)
+    return {name: _json(value) for name, value in fields.items() if name not in (*left_out, "warnings")}
+
+
+def _fields(fit: Any) -> dict[str, Any]:
+    return {item.name: getattr(fit, item.name) for item in dataclasses.fields(fit)}
+
+
+def _json(value: Any) -> Any:
+    if hasattr(value, "_asdict") or dataclasses.is_dataclass(value):
+        return _plain(value)
+    return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
+
+
+def _figure() -> tuple[Figure, Axes]:
+    figure = Figure(figsize=(7.5, 3.6), layout="constrained")
+    return figure, figure.add_subplot()
+
+
+def _label(axes: Axes, x: str, y: str) -> None:
+    axes.set(xlabel=x, ylabel=y)
+    axes.legend(fontsize="small", ncols=3)
+    axes.grid(alpha=0.3)
