@@ -2,7 +2,7 @@
 
 A section does not follow its pressures at once. Air flows through a tube with a time constant (another one
 when it leaves than when it enters), and the wall holds on to the shape it had (a play: where the pressure
-turns round, nothing moves until it has turned by twice the half-width). With s the mean pressure of the section,
+turns round, nothing moves until it has turned by twice the half-width). With s the mean pressure:
 
     x' = (s - x) / tau,   tau = tau_fill where s > x, else tau_vent   lag, exact for a pressure held for a row
     y  = the nearest to y within [x - r, x + r]                       play

@@ -1,4 +1,4 @@
-"""The springs' calibration: L = beta l + delta from measured lengths L, l being the length that a reading gives.
+"""The springs' calibration: L = beta l + delta, L a measured length and l that of a reading.
 
 A straight line per spring (or one for all), fitted with Huber's loss, whose scale comes from the residuals,
 so that a few gross outliers hardly matter. Intervals are of the sandwich kind and take stretches of
