@@ -1,0 +1,111 @@
+"""The arm at rest as a differentiable function of its numbers: what a fit of them needs.
+
+Rest is where the potential's gradient vanishes, grad V(q; x) = 0, so by the implicit function theorem
+
+    dq = -H^-1 d(grad V)/dx dx,    H = d(grad V)/dq,
+
+with the closed-form gradient and Hessian of `mjx_softarm.statics`. This is the derivative of the equilibrium
+itself, exact to rounding however many Newton steps led there, and costs one solve with a matrix that is
+already there. Finite differences would need a settled arm for each of the numbers, and in single precision
+would have to choose between the rounding of a small step and the curvature of a large one; differentiating
+through the iterations would keep them all and would need a loop of fixed length.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from mjx_softarm.kinematics import chain_frames
+from mjx_softarm.settle import settle_pressures
+from mjx_softarm.statics import ArmParams, Statics, statics
+
+
+class Measured(NamedTuple):
+    """What was measured of an arm at rest; rows of it are poses."""
+
+    pressure_kpa: Array  # (n_chambers,)
+    payload_kg: Array  # ()
+    tip_m: Array  # (3,)
+    tip_rotation: Array  # (3, 3)
+    spring_m: Array  # (n_chambers,)
+
+
+@jax.custom_jvp
+def rest(params: ArmParams, pressure_kpa: Array) -> Array:
+    """Joint coordinates (nv,) at rest under pressures (n_chambers,) [kPa], which no limit of the arm clips.
+
+    Differentiable in both arguments, by the implicit function theorem.
+    """
+    free = params._replace(
+        pressure_min_kpa=jnp.full_like(pressure_kpa, -jnp.inf),
+        pressure_max_kpa=jnp.full_like(pressure_kpa, jnp.inf),
+    )
+    kinematics = functools.partial(chain_frames, link_length_m=params.link_length_m)
+    return settle_pressures(kinematics, free, pressure_kpa).q
+
+
+@rest.defjvp
+def _rest_jvp(primals, tangents):
+    params, pressure = primals
+    q = rest(params, pressure)
+
+    def gradient(params: ArmParams, pressure: Array) -> Array:
+        return _statics(q, params, pressure).gradient
+
+    factor = jax.scipy.linalg.cho_factor(_statics(q, params, pressure).hessian, lower=True)
+    _, change = jax.jvp(gradient, primals, tangents)
+    return q, -jax.scipy.linalg.cho_solve(factor, change)
+
+
+def with_numbers(x: Array, params: ArmParams) -> ArmParams:
+    """An arm whose chambers and backbone differ from those of `params`.
+
+    Args:
+        x (4 * n_chambers + 1,): per chamber the logarithm of the stiffness's ratio; the logarithm of the
+            area's; the change of the area's slope, in areas per section length; the change of the rest
+            length, in section lengths. Last, the logarithm of the ratio of the backbone's bending stiffness.
+        params: the arm at x = 0.
+    """
+    stiffness, area, slope, offset = x[:-1].reshape(4, -1)
+    bend = jnp.exp(x[-1])
+    joints = params.joint_stiffness.reshape(-1, 3) * jnp.stack([jnp.ones_like(bend), bend, bend])
+    return params._replace(
+        joint_stiffness=joints.reshape(-1),
+        chamber_stiffness=params.chamber_stiffness * jnp.exp(stiffness),
+        area=params.area * jnp.exp(area),
+        area_slope=params.area_slope + slope * params.area / params.section_length_m,
+        chamber_rest_m=params.chamber_rest_m + offset * params.section_length_m,
+    )
+
+
+def residuals(x: Array, params: ArmParams, measured: Measured) -> tuple[Array, Array]:
+    """Simulated less measured pose of one arm at rest.
+
+    Args:
+        x (4 * n_chambers + 1,): its numbers, see `with_numbers`.
+        params: the arm at x = 0; its payload is taken from `measured`.
+        measured: one pose.
+
+    Returns:
+        (6 + n_chambers,): tip [m]; rotation [rad], the axis times the sine of the angle; springs [m].
+        (): largest force [N, N m] that is left on the arm.
+    """
+    masses = jnp.stack([params.tool_mass_kg[0], measured.payload_kg])
+    arm = with_numbers(x, params._replace(tool_mass_kg=masses))
+    with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
+        q = rest(arm, measured.pressure_kpa)
+        frames = chain_frames(q, arm.link_length_m)
+        now = _statics(q, arm, measured.pressure_kpa)
+        turn = measured.tip_rotation.T @ frames.plate_rotation[-1]
+    angle = 0.5 * jnp.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+    error = [frames.plate_position[-1] - measured.tip_m, angle, now.springs.length - measured.spring_m]
+    return jnp.concatenate(error), jnp.max(jnp.abs(jax.lax.stop_gradient(now.gradient)))
+
+
+def _statics(q: Array, params: ArmParams, pressure_kpa: Array) -> Statics:
+    return statics(chain_frames(q, params.link_length_m), q, pressure_kpa, params)
