@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -47,41 +48,43 @@ def springs(fit: SpringFit, calibrated_m: np.ndarray, length_m: np.ndarray) -> P
 def chambers(fit: ChamberFit) -> Part:
     """Stiffness, area and rest length of each chamber, and how well the arm's tip is met."""
     spec = fit.spec
-    values = {
-        name: spec.per_chamber(getattr(spec.chambers, name))
-        for name in ("stiffness_n_per_m", "area_m2", "length_offset_m")
-    }
-    rows = tuple(
-        (
-            f"chamber {k}",
-            values["stiffness_n_per_m"][k],
-            100 * fit.stiffness_interval[k],
-            1e4 * values["area_m2"][k],
-            100 * fit.area_interval[k],
-            1e3 * values["length_offset_m"][k],
-            1e3 * fit.offset_interval_m[k],
-        )
-        for k in range(spec.n_chambers)
+    units = (
+        ("stiffness_n_per_m", "stiffness [N/m]", 1.0),
+        ("area_m2", "area [cm2]", 1e4),
+        ("area_slope_m", "its slope [cm2/mm]", 10.0),
+        ("length_offset_m", "rest length [mm]", 1e3),
     )
-    head = ("", "stiffness [N/m]", "+- [%]", "area [cm2]", "+- [%]", "rest length [mm]", "+- [mm]")
+    values = {name: spec.per_chamber(getattr(spec.chambers, name)) for name, _, _ in units}
+    rows = []
+    for k in range(spec.n_chambers):
+        pairs = (
+            (factor * values[name][k], float(factor * fit.half_width_95[name][k]))
+            for name, _, factor in units
+        )
+        rows.append((f"chamber {k}", *(number for pair in pairs for number in pair)))
+    head = ("", *(text for _, title, _ in units for text in (title, "+-")))
     errors = (
-        ("held-out poses, before", *fit.held_out_before),
-        ("held-out poses, calibrated", *fit.held_out),
-        ("poses of the fit, calibrated", *fit.in_sample),
+        ("held-out poses, before", fit.held_out_before),
+        ("held-out poses, calibrated", fit.held_out),
+        ("poses of the fit, calibrated", fit.in_sample),
+    )
+    error_rows = tuple(
+        (name, e.n, e.translation_mean_mm, e.translation_95_mm, e.rotation_mean_deg) for name, e in errors
     )
     figure, axes = _figure()
-    error_mm = 1e3 * np.linalg.norm(fit.predicted_m - fit.measured_m, axis=1)
-    bins = np.linspace(0.0, np.nanquantile(error_mm, 0.99), _BINS).tolist()
-    axes.hist(error_mm[~fit.is_held_out], bins, density=True, alpha=0.5, label="fit")
-    axes.hist(error_mm[fit.is_held_out], bins, density=True, histtype="step", lw=2, label="held out")
+    bins = np.linspace(0.0, np.nanquantile(fit.tip_error_mm, 0.99), _BINS).tolist()
+    axes.hist(fit.tip_error_mm[~fit.is_held_out], bins, density=True, alpha=0.5, label="fit")
+    axes.hist(fit.tip_error_mm[fit.is_held_out], bins, density=True, histtype="step", lw=2, label="held out")
     _label(axes, "simulated to measured tip [mm]", "density")
+    fates = ", ".join(f"{count} {fate}" for fate, count in fit.rows.items() if count)
     return Part(
         "Chambers",
-        f"{fit.n_poses} poses at rest: simulated at the measured pressures against the measured tip and "
-        "springs. Rest length is told as its difference from the section's. Intervals are 95 %.",
-        (Table(head, rows), Table(_ERROR_HEAD, errors)),
+        f"{fit.rests.n} poses at rest: simulated at the measured pressures against the measured tip and "
+        "springs. Rest length is told as its difference from the section's. Intervals are 95 %. "
+        f"Rows of the logs: {fates}.",
+        (Table(head, tuple(rows)), Table(_ERROR_HEAD, error_rows)),
         fit.warnings,
-        _plain(fit, "spec", "predicted_m", "measured_m", "is_held_out") | values,
+        _plain(fit, "spec", "rests", "is_held_out", "tip_error_mm") | values,
         (("simulated to measured tip", figure),),
     )
 
@@ -89,11 +92,11 @@ def chambers(fit: ChamberFit) -> Part:
 def s2r(fit: S2RFit, pose: np.ndarray, spring_m: np.ndarray, real: np.ndarray) -> Part:
     """Simulated poses (n, 6) and spring lengths, and real poses, with and without the network."""
     errors = tuple(
-        (name, e.translation_mean_mm, e.translation_95_mm, e.rotation_mean_deg)
-        for name, e in (
-            ("held-out poses, simulated", fit.test_uncorrected),
-            ("held-out poses, corrected", fit.test),
-            ("poses of the fit, corrected", fit.in_sample),
+        (name, n, e.translation_mean_mm, e.translation_95_mm, e.rotation_mean_deg)
+        for name, n, e in (
+            ("held-out poses, simulated", int(fit.held_out.sum()), fit.test_uncorrected),
+            ("held-out poses, corrected", int(fit.held_out.sum()), fit.test),
+            ("poses of the fit, corrected", int((~fit.held_out).sum()), fit.in_sample),
         )
     )
     corrected = correct(fit.s2r, pose, spring_m)
@@ -114,7 +117,7 @@ def s2r(fit: S2RFit, pose: np.ndarray, spring_m: np.ndarray, real: np.ndarray) -
     )
 
 
-_ERROR_HEAD = ("tip", "mean [mm]", "95 % [mm]", "mean turn [deg]")
+_ERROR_HEAD = ("tip", "poses", "mean [mm]", "95 % [mm]", "mean turn [deg]")
 
 
 def _plain(fit: Any, *left_out: str) -> dict[str, Any]:
@@ -130,6 +133,8 @@ def _fields(fit: Any) -> dict[str, Any]:
 def _json(value: Any) -> Any:
     if hasattr(value, "_asdict") or dataclasses.is_dataclass(value):
         return _plain(value)
+    if isinstance(value, Mapping):
+        return {name: _json(item) for name, item in value.items()}
     return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
 
 

@@ -20,19 +20,21 @@ from typing import Any
 import numpy as np
 
 from calib import parts
-from calib.chambers import MIN_POSES, Poses, fit_chambers
+from calib.chambers import MIN_POSES, calibrate_chambers
 from calib.logs import same_arm
 from calib.report import Part, to_html, to_json
-from calib.rest import rows_at_rest
+from calib.rests import Rests, find_rests
 from calib.s2r import fit_s2r, simulate_poses
 from calib.sensors import fit_springs
 from mjx_softarm.logs import Log
-from mjx_softarm.pose import pose_from_frame, rotation_from_quaternion
+from mjx_softarm.pose import pose_from_frame
 from mjx_softarm.provenance import write_json
 from mjx_softarm.s2r import S2R, save_s2r
 from mjx_softarm.sensors import SensorParams, length_from_frequency
 from mjx_softarm.spec import ArmSpec
 
+OF_POSES = ("pressure_kpa", "tip_m", "tip_quaternion")  # what a log of poses must have
+MIN_S2R_POSES = 60
 ARM_FILE, S2R_FILE = "arm.toml", "s2r.npz"
 NOT_FITTED = "Not fitted: the specification's values stay."
 
@@ -63,11 +65,11 @@ def calibrate(
     same_arm(logs)
     tell("springs ...")
     spec, springs = _springs(logs, spec, seed)
-    poses = _poses(logs, spec)
-    tell(f"chambers, {len(poses.tip_m)} poses at rest ...")
-    spec, chambers = _chambers(poses, spec, seed)
+    seen = [log for log in logs if not any(getattr(log, name) is None for name in OF_POSES)]
+    tell("chambers ...")
+    spec, chambers = _chambers(seen, spec, seed)
     tell("sim-to-real network ...")
-    s2r, network = _s2r(poses, spec, seed)
+    s2r, network = _s2r(seen, spec, seed)
     return Calibration(spec, s2r, (springs, chambers, network))
 
 
@@ -123,52 +125,29 @@ def _springs(logs: Sequence[Log], spec: ArmSpec, seed: int) -> tuple[ArmSpec, Pa
     return spec, parts.springs(fit, calibrated.length_m, length_m)
 
 
-def _poses(logs: Sequence[Log], spec: ArmSpec) -> Poses:
-    """Poses at rest of all logs, in the order of the logs; what a log has not is NaN."""
-    n, sensor = spec.n_chambers, SensorParams.from_spec(spec)
-    found = [Poses(np.zeros((0, n)), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, n)), np.zeros(0))]
-    for log in logs:
-        if log.tip_m is None or log.tip_quaternion is None:
-            continue
-        rest = log.take(rows_at_rest(log))
-        none = np.full((len(rest), n), np.nan)
-        spring_m = none
-        if rest.frequency_hz is not None:
-            spring_m = length_from_frequency(rest.frequency_hz, sensor, np.nan).length_m
-        found.append(
-            Poses(
-                none if rest.pressure_kpa is None else rest.pressure_kpa,
-                rest.tip_m,
-                rotation_from_quaternion(rest.tip_quaternion),
-                spring_m,
-                np.full(len(rest), spec.mass.payload_kg) if rest.payload_kg is None else rest.payload_kg,
-            )
-        )
-    return Poses(*(np.concatenate(x) for x in zip(*found, strict=True)))
-
-
-def _chambers(poses: Poses, spec: ArmSpec, seed: int) -> tuple[ArmSpec, Part]:
-    usable = poses.take(np.isfinite(poses.pressure_kpa).all(axis=1))
-    if len(usable.tip_m) < MIN_POSES:
-        needed = f"{NOT_FITTED} {_few(usable)} pressures and a tip."
+def _chambers(logs: Sequence[Log], spec: ArmSpec, seed: int) -> tuple[ArmSpec, Part]:
+    rests, _ = find_rests(logs, spec)
+    if rests.n < MIN_POSES:
+        needed = f"{NOT_FITTED} {_few(rests, MIN_POSES)}"
         return spec, Part("Chambers", needed, warnings=("stiffness, area and length are not this arm's",))
-    fit = fit_chambers(usable, spec, seed)
+    fit = calibrate_chambers(logs, spec, seed)
     return fit.spec, parts.chambers(fit)
 
 
-def _s2r(poses: Poses, spec: ArmSpec, seed: int) -> tuple[S2R | None, Part]:
+def _s2r(logs: Sequence[Log], spec: ArmSpec, seed: int) -> tuple[S2R | None, Part]:
     """The network of the unloaded arm: with a payload, the simulation is another."""
-    title = "Sim-to-real network"
-    usable = poses.take(np.isfinite(poses.spring_m).all(axis=1) & (poses.payload_kg == spec.mass.payload_kg))
-    if len(usable.tip_m) < MIN_POSES:
-        needed = f"Not fitted: {_few(usable)} frequencies and a tip."
-        return None, Part(title, needed, warnings=("policies will be trained on simulated poses",))
-    simulated = simulate_poses(spec, usable.spring_m)
-    real = pose_from_frame(usable.tip_m, usable.tip_rotation)
-    valid = simulated.valid
-    fit = fit_s2r(simulated.pose[valid], simulated.spring_m[valid], real[valid], seed)
-    return fit.s2r, parts.s2r(fit, simulated.pose[valid], simulated.spring_m[valid], real[valid])
+    rests, _ = find_rests(logs, spec)
+    rests = rests.take(np.isfinite(rests.spring_m).all(axis=1) & (rests.payload_kg == spec.mass.payload_kg))
+    if rests.n < MIN_S2R_POSES:
+        needed = f"Not fitted: {_few(rests, MIN_S2R_POSES)}"
+        warnings = ("policies will be trained on simulated poses",)
+        return None, Part("Sim-to-real network", needed, warnings=warnings)
+    simulated = simulate_poses(spec, rests.spring_m)
+    real = pose_from_frame(rests.tip_m, rests.tip_rotation)
+    pose, spring_m, real = (x[simulated.valid] for x in (simulated.pose, simulated.spring_m, real))
+    fit = fit_s2r(pose, spring_m, real, seed)
+    return fit.s2r, parts.s2r(fit, pose, spring_m, real)
 
 
-def _few(poses: Poses) -> str:
-    return f"{MIN_POSES} poses at rest are needed, and {len(poses.tip_m)} have"
+def _few(rests: Rests, n: int) -> str:
+    return f"{n} poses at rest with pressures, frequencies and tip are needed, and {rests.n} are there."

@@ -80,7 +80,7 @@ class Log:
     row: np.ndarray  # (n,) line of the file that a row came from, the header being line 1
     time_s: np.ndarray  # (n,)
     frequency_hz: np.ndarray | None = None  # (n, n_chambers)
-    spring_m: np.ndarray | None = None  # (n, n_chambers) calibrated spring lengths
+    spring_m: np.ndarray | None = None  # (n, n_chambers) measured otherwise than by their frequencies
     pressure_kpa: np.ndarray | None = None  # (n, n_chambers) relative to the atmosphere
     tip_m: np.ndarray | None = None  # (n, 3)
     tip_quaternion: np.ndarray | None = None  # (n, 4) w, x, y, z

@@ -14,7 +14,6 @@ Source: primal-dual active set as semismooth Newton, Hintermueller, Ito, Kunisch
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -22,7 +21,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from mjx_softarm.kinematics import DOFS_PER_LINK, Frames, chain_frames
+from mjx_softarm.kinematics import DOFS_PER_LINK, Frames
 from mjx_softarm.statics import ArmParams, statics
 
 MAX_ITERATIONS = 12
@@ -91,39 +90,6 @@ def settle_pressures(
     pressure = jnp.clip(pressure_kpa, params.pressure_min_kpa, params.pressure_max_kpa)
     pinned = params._replace(pressure_min_kpa=pressure, pressure_max_kpa=pressure)
     return settle(kinematics, pinned, params.spring_rest_m)
-
-
-@jax.custom_jvp
-def equilibrium(params: ArmParams, pressure_kpa: Array) -> Array:
-    """Joint coordinates (nv,) at rest at given pressures (n_chambers,), differentiable in all arguments.
-
-    Unlike `settle_pressures` it takes the pressures as they are, also beyond the arm's limits. Derivatives
-    come from the implicit function theorem: at rest grad V(q; params, p) = 0, so dq = -H^-1 d(grad V), with
-    the Hessian and the gradient in closed form. That is exact at a rest that was found, costs one linear
-    system however many iterations finding it took, and has no step to choose as finite differences in
-    float32 have.
-
-    Args:
-        params: numbers of the arm.
-        pressure_kpa (n_chambers,) [kPa]: of the chambers.
-    """
-    pinned = params._replace(pressure_min_kpa=pressure_kpa, pressure_max_kpa=pressure_kpa)
-    kinematics = functools.partial(chain_frames, link_length_m=params.link_length_m)
-    return settle(kinematics, pinned, params.spring_rest_m).q
-
-
-@equilibrium.defjvp
-def _equilibrium_jvp(primals, tangents):
-    q = equilibrium(*primals)
-
-    def gradient(params: ArmParams, pressure_kpa: Array) -> Array:
-        return statics(chain_frames(q, params.link_length_m), q, pressure_kpa, params).gradient
-
-    params, pressure_kpa = primals
-    with jax.default_matmul_precision("highest"):
-        _, change = jax.jvp(gradient, primals, tangents)
-        hessian = statics(chain_frames(q, params.link_length_m), q, pressure_kpa, params).hessian
-        return q, -jax.scipy.linalg.solve(hessian, change, assume_a="pos")
 
 
 def _active_set(pressure: Array, error_m: Array, params: ArmParams) -> tuple[Array, Array]:

@@ -23,7 +23,12 @@ from mjx_softarm.export import Policy, save_policy
 from mjx_softarm.logs import write_log
 from mjx_softarm.obs import ObsScale
 from mjx_softarm.rewards import RewardConfig
-from mjx_softarm.sensors import SensorParams, frequency_from_length, frequency_range_hz
+from mjx_softarm.sensors import (
+    SensorParams,
+    frequency_from_length,
+    frequency_range_hz,
+    length_from_frequency,
+)
 
 ROOT = Path(__file__).resolve().parent.parent
 SPEC = ArmSpec.default()
@@ -126,13 +131,18 @@ def go(arm, goals=GOALS, controller=CONTROLLER, **kwargs):
 # --- without faults --------------------------------------------------------------------------------
 
 
+def read_m(log):
+    """Spring lengths (rows, 9) [m] by the logged frequencies, NaN where a reading was lost."""
+    return length_from_frequency(log.frequency_hz, SENSOR, np.nan).length_m
+
+
 def test_reaches_goals_and_vents():
     arm, lines = LinearArm(), []
     run = go(arm, tell=lines.append)
     assert run.events == () and run.phase is Phase.DONE and not run.interrupted
     assert [arrival.goal.tolist() for arrival in run.arrivals] == GOALS.tolist()
     for arrival, spring_m in zip(run.arrivals, SPRINGS_M, strict=True):
-        np.testing.assert_allclose(run.log.spring_m[arrival.row], spring_m, atol=5e-4)
+        np.testing.assert_allclose(read_m(run.log)[arrival.row], spring_m, atol=5e-4)
         assert np.linalg.norm(arrival.estimate[:3] - arrival.goal[:3]) < 1.0
     np.testing.assert_array_equal(arm.command_kpa, 0.0)
     assert len(run.latency_s) == len(run.log) == len(arm.written) and len(lines) == len(GOALS)
@@ -180,9 +190,7 @@ def test_log_has_pressures_in_force_and_calibration_reads_it(tmp_path):
     )
     run = go(arm, goals=GOALS[:1])
     np.testing.assert_array_equal(run.log.pressure_kpa[1:], arm.written[:-1])
-    np.testing.assert_allclose(
-        -run.log.tip_m, run.log.spring_m[:, :3], atol=5 * NOISE_M
-    )  # of the same instant
+    np.testing.assert_allclose(-run.log.tip_m, read_m(run.log)[:, :3], atol=5 * NOISE_M)  # of one instant
     np.testing.assert_allclose(np.diff(run.log.time_s), DT_S, rtol=1e-6)
     write_log(tmp_path / "run.csv", run.log)
     log, _ = read_log(tmp_path / "run.csv")
@@ -230,7 +238,10 @@ def gone(frequency_hz):
 def test_one_lost_reading_holds_the_last_good_one(spoil):
     run = go(Blind({30, 40}, spoil))
     assert run.counts() == {Fault.LOST_READING: 2} and len(run.arrivals) == 2
-    assert run.log.spring_m[30, 4] == run.log.spring_m[29, 4] != run.log.spring_m[31, 4]
+    before_m, now_m, after_m = read_m(run.log)[29:32]
+    held_m = np.where(np.isnan(now_m), before_m, now_m)
+    assert held_m[4] == before_m[4] != after_m[4]
+    np.testing.assert_allclose(run.log.estimate[30], estimate(POLICY.estimator, held_m), atol=1e-3)
     assert np.isnan(run.log.frequency_hz[30, 4])
     assert ("spring4: read nan Hz" in run.events[0].message) == (spoil is nan)
 
@@ -467,7 +478,7 @@ def test_extrapolation_is_counted(monkeypatch):
     run = go(LinearArm(), goals=GOALS[:1], controller=Controller.of(policy, exact_plan))
     assert run.counts() == {Fault.EXTRAPOLATION: N_ACTIONS} and max(seen) == 0.0
     row = run.arrivals[0].row
-    plain = estimate(POLICY.estimator, run.log.spring_m[row])
+    plain = estimate(POLICY.estimator, read_m(run.log)[row])
     np.testing.assert_allclose(run.log.estimate[row], plain + 1.0, atol=1e-3)
 
 
@@ -488,7 +499,7 @@ def test_recorded_poses_are_at_rest(tmp_path):
     result = record(arm, SPEC, targets_kpa)
     assert (result.n_poses, result.n_unsettled, result.problem) == (5, 0, "")
     np.testing.assert_array_equal(result.log.pressure_kpa, targets_kpa)
-    np.testing.assert_allclose(result.log.spring_m, REST_M + targets_kpa @ GAIN_M_PER_KPA.T, atol=5e-4)
+    np.testing.assert_allclose(read_m(result.log), REST_M + targets_kpa @ GAIN_M_PER_KPA.T, atol=5e-4)
     np.testing.assert_array_equal(arm.command_kpa, 0.0)
     steps = np.abs(np.diff(np.array(arm.written), axis=0))
     assert steps.max() <= VENT_KPA_PER_S * DT_S + 1e-9

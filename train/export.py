@@ -17,7 +17,7 @@ from train.checkpoint import Run
 from train.estimator import Distilled, distil
 from train.run import restore_actor
 
-N_WORKSPACE = 1024  # poses that stand for the workspace
+N_WORKSPACE = 2048  # poses that stand for the workspace
 SEED = 0  # of the estimator
 
 

@@ -51,6 +51,7 @@ class Capture(NamedTuple):
     tip_m: np.ndarray  # (3,) centre of the last plate
     tip_quaternion: np.ndarray  # (4,) w, x, y, z
     marker_m: np.ndarray  # (n_markers, 3) from the base to the tip
+    spring_m: np.ndarray | None = None  # (n,) spring lengths between markers at their ends, if there are any
 
 
 class MotionCapture(Protocol):

@@ -126,7 +126,6 @@ class _Recording:
             spring_m, lost = reading.length_m, bool(np.any(reading.fault != SensorFault.OK.value))
             text = describe_faults(frequency_hz, reading.fault, self.sensor).replace("\n", "; ")
         row["frequency_hz"] = spring_m * np.nan if frequency_hz is None else frequency_hz
-        row["spring_m"] = spring_m
         self.n_lost = self.n_lost + 1 if lost else 0
         if self.n_lost >= LOST_TICKS:
             raise _Stop(f"readings lost in {self.n_lost} ticks in a row: {text}")

@@ -105,11 +105,7 @@ class Recorder:
         row["pressure_kpa"] = pressure_kpa if self._measured is None else self._measured()
         if self._capture is not None:
             seen = self._capture()
-            row |= {
-                "tip_m": seen.tip_m,
-                "tip_quaternion": seen.tip_quaternion,
-                "marker_m": seen.marker_m,
-            }
+            row |= {name: value for name, value in seen._asdict().items() if value is not None}
         return row
 
     def add(self, row: dict[str, Any]) -> None:
@@ -227,7 +223,7 @@ class _Session:
         self.latency_s.append(time.perf_counter() - began)
         nothing = np.full(len(self.state.pressure_kpa), np.nan)
         row["frequency_hz"] = nothing if frequency_hz is None else frequency_hz
-        row["spring_m"], row["estimate"] = tick.spring_m, tick.estimate
+        row["estimate"] = tick.estimate
         row["reference_m"] = nothing if self.state.reference_m is None else self.state.reference_m
         row["goal"] = np.full(6, np.nan) if goal is None else goal
         self.rows.add(row)

@@ -50,6 +50,7 @@ FREQUENCY_NOISE_HZ = 300.0  # assumed: 0.04 mm of a spring 0.2 m long; far above
 PRESSURE_NOISE_KPA = 0.05
 CAPTURE_NOISE_M = 2e-4
 CAPTURE_NOISE_DEG = 0.1
+SPRING_NOISE_M = 2**0.5 * CAPTURE_NOISE_M  # between two markers
 PRESSURE_TOLERANCE_KPA = 1e-3  # a float32 limit is not yet beyond the limit
 MARKERS_PER_SECTION = 3
 REST_S = 4.0  # hanging at atmospheric pressure before time starts
@@ -161,7 +162,8 @@ class Twin:
         quaternion = np.zeros(4)
         mujoco.mju_mat2Quat(quaternion, (turn @ tip).ravel())
         noise_m = self._draw(CAPTURE_NOISE_M, n_markers + 1, 3)
-        return Capture(tip_m + noise_m[0], quaternion, marker_m + noise_m[1:])
+        spring_m = data.ten_length[1::2] + self._draw(SPRING_NOISE_M, spec.n_chambers)
+        return Capture(tip_m + noise_m[0], quaternion, marker_m + noise_m[1:], spring_m)
 
     def attach(self, payload_kg: float) -> None:
         """Hang a payload to the finger tips, in place of what hung there.

@@ -1,0 +1,162 @@
+"""`python -m calib` as a user runs it: the demo calibrated and taken by training; bad input refused."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+import calib.demo
+from calib.__main__ import main
+from calib.demo import planted_arm, write_demo
+from calib.logs import read_log
+from mjx_softarm import ArmSpec
+from mjx_softarm.logs import write_log
+from mjx_softarm.s2r import load_s2r
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory):
+    """Logs of the planted arm of seed 0, fewer than the command writes."""
+    folder = tmp_path_factory.mktemp("demo") / "logs"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(calib.demo, "N_POSES", 400)
+        patch.setattr(calib.demo, "N_STEPS", 3)
+        files = write_demo(folder, ArmSpec.default(), seed=0)
+    return [str(file) for file in files]
+
+
+@pytest.fixture(scope="module")
+def calibrated(demo, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("calibrated") / "out"
+    status = main(["run", *demo, "--out", str(folder)])
+    return status, folder
+
+
+def test_demo_logs_have_no_fault(demo, capsys):
+    assert main(["check", *demo]) == 0
+    assert [line.split(":")[0] for line in capsys.readouterr().out.splitlines()] == demo
+
+
+def test_run_writes_the_whole_folder_and_nothing_beside_it(calibrated):
+    status, folder = calibrated
+    assert status in (0, 1)
+    assert sorted(p.name for p in folder.iterdir()) == ["arm.toml", "report.html", "report.json", "s2r.npz"]
+    assert [p.name for p in folder.parent.iterdir()] == ["out"]
+    report = json.loads((folder / "report.json").read_text())
+    assert status == (0 if report["trustworthy"] else 1)
+    load_s2r(folder / "s2r.npz")
+
+
+def test_springs_are_the_planted_ones(calibrated):
+    found, planted = (ArmSpec.from_toml(calibrated[1] / "arm.toml"), planted_arm(ArmSpec.default(), seed=0))
+    np.testing.assert_allclose(found.sensor.beta, planted.sensor.beta, rtol=0.005)
+
+
+def test_each_step_brings_the_simulated_tip_closer_to_held_out_poses(calibrated):
+    parts = json.loads((calibrated[1] / "report.json").read_text())["parts"]
+    chambers, network = parts["Chambers"]["figures"], parts["Sim-to-real network"]["figures"]
+    assert chambers["held_out"]["mean_mm"] < 0.5 * chambers["held_out_before"]["mean_mm"]
+    corrected, simulated = network["test"], network["test_uncorrected"]
+    assert corrected["translation_mean_mm"] < 0.8 * simulated["translation_mean_mm"]
+    assert corrected["rotation_mean_deg"] < 0.8 * simulated["rotation_mean_deg"]
+
+
+def test_nothing_is_overwritten(demo, calibrated, capsys):
+    before = (calibrated[1] / "arm.toml").read_bytes()
+    assert main(["run", *demo, "--out", str(calibrated[1])]) == 2
+    assert capsys.readouterr().err == f"error: {calibrated[1]}: is there already; choose another --out\n"
+    assert (calibrated[1] / "arm.toml").read_bytes() == before
+
+
+def test_training_takes_the_folder(calibrated, tmp_path, monkeypatch):
+    """The run has the calibrated arm and its network, and so has what is opened from it."""
+    from train import run as train_run
+    from train.__main__ import main as train_main
+    from train.checkpoint import Run
+
+    seen = {}
+    monkeypatch.setattr(train_run, "train", lambda run, env, console: seen.update(run=run, env=env))
+    monkeypatch.setattr("train.__main__._show", lambda *_: None)
+    out = tmp_path / "run"
+    small = ["--set", "env.n_poses=64", "--out", str(out)]
+    assert train_main(["reach", "--calibration", str(calibrated[1]), *small]) == 0
+    env, opened = seen["env"], Run.open(out)
+    assert env.spec == opened.spec == ArmSpec.from_toml(calibrated[1] / "arm.toml")
+    network = load_s2r(calibrated[1] / "s2r.npz")
+    for s2r in (env.s2r, opened.s2r):
+        np.testing.assert_array_equal(s2r.anchors, network.anchors)
+    plain = type(env)(env.spec, env.config)
+    assert np.abs(env.pool.pose - plain.pool.pose)[:, :3].max() > 0.5
+    np.testing.assert_array_equal(env.pool.spring_m, plain.pool.spring_m)
+
+
+def test_logs_without_poses_or_ruler_say_what_is_missing(demo, tmp_path, capsys):
+    """Springs alone: the rest of the arm stays as specified, nothing is invented."""
+    springs = tmp_path / "springs.csv"
+    shutil.copy(demo[0], springs)
+    assert main(["run", str(springs), "--out", str(tmp_path / "out")]) == 1
+    out = capsys.readouterr().out
+    assert "warning: Chambers: stiffness, area and length are not this arm's" in out
+    assert "warning: Sim-to-real network: policies will be trained on simulated poses" in out
+    assert not (tmp_path / "out" / "s2r.npz").exists()
+    found = ArmSpec.from_toml(tmp_path / "out" / "arm.toml")
+    assert found.chambers == ArmSpec.default().chambers
+
+
+def test_template_is_a_log(tmp_path, capsys):
+    path = tmp_path / "log.csv"
+    assert main(["template", str(path)]) == 0
+    assert "pressure" in capsys.readouterr().out
+    assert main(["check", str(path)]) == 0
+    assert main(["template", str(path)]) == 2
+    assert str(path) in capsys.readouterr().err
+
+
+BAD = {
+    "empty": b"",
+    "header only": b"time [s],pressure0 [kPa]\n",
+    "binary": bytes(range(256)) * 20,
+    "UTF-16": "time [s],pressure0 [kPa]\n0,1\n".encode("utf-16"),
+    "semicolons": b"time [s];pressure0 [kPa]\n0;1\n1;2\n",
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_files_give_one_line_and_leave_nothing(name, tmp_path, capsys):
+    path = tmp_path / "bad.csv"
+    path.write_bytes(BAD[name])
+    for command in (["run", "--out", str(tmp_path / "out")], ["check"]):
+        assert main([*command, str(path)]) == 2
+        error = capsys.readouterr().err
+        assert error.startswith(f"error: {path}") and len(error.splitlines()) == 1
+    assert [p.name for p in tmp_path.iterdir()] == ["bad.csv"]
+
+
+def test_folders_missing_files_and_other_arms_are_refused(demo, tmp_path, capsys):
+    log, _ = read_log(demo[1])
+    short = log.take(np.arange(20))
+    other = tmp_path / "other.csv"
+    write_log(other, short.__class__(**{**vars(short), "tip_m": 3.0 * short.tip_m}))
+    for arguments, words in (
+        ([str(tmp_path)], str(tmp_path)),
+        ([str(tmp_path / "absent.csv")], "absent.csv"),
+        ([demo[1], str(other)], "expected ranges that meet in logs of one arm"),
+        ([demo[1], "--spec", str(tmp_path / "absent.toml")], "absent.toml"),
+    ):
+        assert main(["run", *arguments, "--out", str(tmp_path / "out")]) == 2
+        error = capsys.readouterr().err
+        assert error.startswith("error: ") and words in error and len(error.splitlines()) == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_strict_refuses_a_log_with_a_fault(demo, tmp_path, capsys):
+    log, _ = read_log(demo[0])
+    frequency_hz = log.frequency_hz.copy()
+    frequency_hz[7, 3] = np.nan
+    path = tmp_path / "log.csv"
+    write_log(path, log.__class__(**{**vars(log), "frequency_hz": frequency_hz}))
+    assert main(["check", str(path)]) == 1
+    assert "frequency3" in capsys.readouterr().out
+    assert main(["check", "--strict", str(path)]) == 2
+    assert "frequency3" in capsys.readouterr().err
