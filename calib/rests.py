@@ -69,7 +69,7 @@ def find_rests(logs: Sequence[Log], spec: ArmSpec) -> tuple[Rests, dict[str, int
     poses = [pose for log in logs for pose in _rests_of(log, spec, n_markers, fates)]
     shapes = ((spec.n_chambers,), (), (3,), (3, 3), (spec.n_chambers,), (n_markers, 3), ())
     columns = zip(*poses, strict=True) if poses else [()] * len(shapes)
-    arrays = [np.array(list(c)).reshape(-1, *shape) for c, shape in zip(columns, shapes, strict=True)]
+    arrays = [np.reshape(list(c), (len(poses), *shape)) for c, shape in zip(columns, shapes, strict=True)]
     return Rests(*arrays[:-1], single=arrays[-1].astype(bool)), fates
 
 
