@@ -183,7 +183,7 @@ def test_state_is_not_changed_in_place():
 
 def test_log_has_pressures_in_force_and_calibration_reads_it(tmp_path):
     arm = LinearArm()
-    arm.motion_capture = lambda: SimpleNamespace(
+    arm.motion_capture = lambda: Capture(
         tip_m=-arm.spring_m[:3],
         tip_quaternion=np.array([1.0, 0, 0, 0]),
         marker_m=np.ones((2, 3)) * arm.time_s,

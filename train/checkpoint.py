@@ -74,7 +74,7 @@ class Run:
         file = path / "config.json"
         try:
             data = json.loads(file.read_text("utf-8"))
-            config, has_s2r = from_dict(data["train"]), data["s2r"]
+            config, has_s2r = from_dict(data["train"]), data.get("s2r", False)
             spec = ArmSpec.from_dict(data["spec"], str(file))
         except OSError as error:
             raise RunError(f"{path}: not the folder of a run: {file}: {error.strerror}") from error
