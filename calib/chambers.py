@@ -73,8 +73,8 @@ class ChamberFit:
         half_width_95: of the 95 % interval of each fitted field of `spec.chambers` (n_chambers,), and of
             `spec.backbone` ().
         direction_widths: half-widths of the 95 % intervals along the principal directions of the fit, in
-        is_held_out: which poses took no part (n,), bool.
-        weak: the directions that are not known, in words.
+            units of what counts as known, largest first (4 * n_chambers + 1,).
+        weak: the directions whose width is above 1, in words; in these the numbers are not known.
         in_sample, held_out: errors of the calibrated arm; held-out poses took no part in the fit.
         in_sample_before, held_out_before: errors of the specification that the fit started from.
         rows: number of rows of the logs by what became of them.
@@ -82,6 +82,7 @@ class ChamberFit:
         rests: the poses.
         is_held_out: which of them took no part (n,), bool.
         tip_error_mm: of the calibrated arm at each pose (n,); NaN where it found no rest.
+        chamber_m: chamber lengths of the calibrated arm at each pose (n, n_chambers).
         warnings: reasons not to trust the fit; none is good.
     """
 
@@ -98,6 +99,7 @@ class ChamberFit:
     rests: Rests
     is_held_out: np.ndarray
     tip_error_mm: np.ndarray
+    chamber_m: np.ndarray
     warnings: tuple[str, ...]
 
 
@@ -121,8 +123,10 @@ def calibrate_chambers(logs: Log | Sequence[Log], spec: ArmSpec, seed: int = 0) 
             f"chambers: got {rests.n} poses at rest, expected {MIN_POSES} or more; rows of the logs: {fates}"
         )
     held_out = held_out_blocks(rests.n, HELD_OUT_SHARE, HELD_OUT_BLOCK, seed)
-    solution = fit(_model(spec, rests.take(~held_out)), _problem(spec.n_chambers))
-    before, after = (_model(spec, rests)(x)[0] for x in (np.zeros_like(solution.x), solution.x))
+    fitted = rests.take(~held_out)
+    solution = fit(lambda x: _simulate(spec, fitted, x)[:2], _problem(spec.n_chambers))
+    before, _, _ = _simulate(spec, rests, np.zeros_like(solution.x))
+    after, _, chamber_m = _simulate(spec, rests, solution.x)
     calibrated = _calibrated(spec, solution.x, rests)
     widths, directions = principal(
         solution, np.append(np.repeat(TOLERANCE, spec.n_chambers), BENDING_TOLERANCE)
@@ -144,6 +148,7 @@ def calibrate_chambers(logs: Log | Sequence[Log], spec: ArmSpec, seed: int = 0) 
         rests=rests,
         is_held_out=held_out,
         tip_error_mm=np.where(np.isinf(after[:, 0]), np.nan, 1e3 * np.linalg.norm(after[:, :3], axis=1)),
+        chamber_m=chamber_m,
         warnings=(),
     )
     return dataclasses.replace(found, warnings=_warnings(found, spec, solution))
@@ -153,29 +158,25 @@ def calibrate_chambers(logs: Log | Sequence[Log], spec: ArmSpec, seed: int = 0) 
 def _jacobian():
     def one(x, params: ArmParams, measured: Measured):
         def errors(x):
-            error, left = residuals(x, params, measured)
-            return error, (error, left)
+            error, left, chamber_m = residuals(x, params, measured)
+            return error, (error, left, chamber_m)
 
-        slope, (error, left) = jax.jacfwd(errors, has_aux=True)(x)
-        return error, slope, left < RESIDUAL_TOLERANCE
+        slope, (error, left, chamber_m) = jax.jacfwd(errors, has_aux=True)(x)
+        return error, slope, left < RESIDUAL_TOLERANCE, chamber_m
 
     return jax.jit(jax.vmap(one, in_axes=(None, None, 0)))
 
 
-def _model(spec: ArmSpec, rests: Rests):
-    """The errors of all poses and their Jacobian as a function of the chambers, see `calib.leastsquares`."""
+def _simulate(spec: ArmSpec, rests: Rests, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """All poses with the numbers x: errors and their Jacobian, see `calib.leastsquares`; chamber lengths."""
     params = ArmParams.from_spec(spec)
     fields = (rests.pressure_kpa, rests.payload_kg, rests.tip_m, rests.tip_rotation, rests.spring_m)
     padded = -(-rests.n // BATCH) * BATCH
     measured = Measured(*(np.resize(np.float32(f), (padded, *f.shape[1:])) for f in fields))
     batches = [Measured(*(f[k : k + BATCH] for f in measured)) for k in range(0, padded, BATCH)]
-
-    def model(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        parts = [jax.device_get(_jacobian()(np.float32(x), params, batch)) for batch in batches]
-        error, slope, settled = (np.concatenate(part)[: rests.n] for part in zip(*parts, strict=True))
-        return np.where(settled[:, None], error.astype(float), np.inf), slope.astype(float)
-
-    return model
+    parts = [jax.device_get(_jacobian()(np.float32(x), params, batch)) for batch in batches]
+    error, slope, settled, chamber_m = (np.concatenate(part)[: rests.n] for part in zip(*parts, strict=True))
+    return np.where(settled[:, None], error.astype(float), np.inf), slope.astype(float), chamber_m
 
 
 def _problem(n_chambers: int) -> Problem:

@@ -83,7 +83,7 @@ def with_numbers(x: Array, params: ArmParams) -> ArmParams:
     )
 
 
-def residuals(x: Array, params: ArmParams, measured: Measured) -> tuple[Array, Array]:
+def residuals(x: Array, params: ArmParams, measured: Measured) -> tuple[Array, Array, Array]:
     """Simulated less measured pose of one arm at rest.
 
     Args:
@@ -94,6 +94,7 @@ def residuals(x: Array, params: ArmParams, measured: Measured) -> tuple[Array, A
     Returns:
         (6 + n_chambers,): tip [m]; rotation [rad], the axis times the sine of the angle; springs [m].
         (): largest force [N, N m] that is left on the arm.
+        (n_chambers,) [m]: chamber lengths.
     """
     masses = jnp.stack([params.tool_mass_kg[0], measured.payload_kg])
     arm = with_numbers(x, params._replace(tool_mass_kg=masses))
@@ -104,7 +105,8 @@ def residuals(x: Array, params: ArmParams, measured: Measured) -> tuple[Array, A
         turn = measured.tip_rotation.T @ frames.plate_rotation[-1]
     angle = 0.5 * jnp.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
     error = [frames.plate_position[-1] - measured.tip_m, angle, now.springs.length - measured.spring_m]
-    return jnp.concatenate(error), jnp.max(jnp.abs(jax.lax.stop_gradient(now.gradient)))
+    left = jnp.max(jnp.abs(jax.lax.stop_gradient(now.gradient)))
+    return jnp.concatenate(error), left, jax.lax.stop_gradient(now.chambers.length)
 
 
 def _statics(q: Array, params: ArmParams, pressure_kpa: Array) -> Statics:

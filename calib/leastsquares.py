@@ -54,9 +54,17 @@ class Solution(NamedTuple):
 
 
 class _Weighted(NamedTuple):
+    """Errors over their scales, times the roots of Huber's weights, zero where not known; so are the slopes."""
+
     cost: float
-    score: np.ndarray  # (n, p) of each row, its slope of the cost
-    information: np.ndarray  # (p, p) without the prior
+    error: np.ndarray  # (n, m)
+    slope: np.ndarray  # (n, m, p)
+
+    @property
+    def information(self) -> np.ndarray:
+        """Without the prior (p, p)."""
+        flat = self.slope.reshape(-1, self.slope.shape[-1])
+        return flat.T @ flat
 
 
 def fit(model: Model, problem: Problem) -> Solution:
@@ -69,7 +77,7 @@ def fit(model: Model, problem: Problem) -> Solution:
         for _ in range(MAX_ITERATIONS):
             now = _weigh(error, jacobian, scale, problem)
             hessian = now.information + np.diag(problem.prior**-2.0)
-            slope = now.score.sum(0) + x / problem.prior**2
+            slope = np.einsum("nmp,nm->p", now.slope, now.error) + x / problem.prior**2
             step = -np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), slope)
             tried = model(x + step)
             n_evaluations += 1
@@ -82,10 +90,7 @@ def fit(model: Model, problem: Problem) -> Solution:
                 converged = True
                 break
         scale = _scales(error, problem)
-    end = _weigh(error, jacobian, scale, problem)
-    inverse = np.linalg.inv(end.information + np.diag(problem.prior**-2.0))
-    scatter = end.score.T @ end.score * _small_sample(error, len(x))
-    covariance = inverse @ (scatter + np.diag(problem.prior**-2.0)) @ inverse
+    covariance = _covariance(_weigh(error, jacobian, scale, problem), problem)
     return Solution(x, covariance, scale, n_evaluations, converged)
 
 
@@ -113,9 +118,18 @@ def _weigh(error: np.ndarray, jacobian: np.ndarray, scale: np.ndarray, problem: 
     weight = np.minimum(1.0, HUBER / np.maximum(size, HUBER))
     loss = np.where(size <= HUBER, 0.5 * e**2, HUBER * (size - 0.5 * HUBER))
     missing = np.count_nonzero(~answered) * len(sigma) * HUBER * (NO_ANSWER - 0.5 * HUBER)
-    flat = (np.sqrt(weight)[..., None] * slope).reshape(-1, slope.shape[-1])
-    score = np.matmul((weight * e)[:, None, :], slope)[:, 0]
-    return _Weighted(float(loss.sum() + missing), score, flat.T @ flat)
+    root = np.sqrt(weight)
+    return _Weighted(float(loss.sum() + missing), root * e, root[..., None] * slope)
+
+
+def _covariance(end: _Weighted, problem: Problem) -> np.ndarray:
+    """Sandwich of the rows' scores; each row's errors as if the fit had been made without it."""
+    precision = np.diag(problem.prior**-2.0)
+    inverse = np.linalg.inv(end.information + precision)
+    leverage = end.slope @ inverse @ np.swapaxes(end.slope, 1, 2)  # (n, m, m)
+    left = np.linalg.solve(np.eye(leverage.shape[1]) - leverage, end.error[..., None])
+    score = (np.swapaxes(end.slope, 1, 2) @ left)[..., 0]
+    return inverse @ (score.T @ score + precision) @ inverse
 
 
 def _scales(error: np.ndarray, problem: Problem) -> np.ndarray:
@@ -126,9 +140,3 @@ def _scales(error: np.ndarray, problem: Problem) -> np.ndarray:
         if len(of_group):
             found[k] = max(SIGMA_PER_MEDIAN * np.median(np.abs(of_group)), problem.min_scale[k])
     return found
-
-
-def _small_sample(error: np.ndarray, n_numbers: int) -> float:
-    """Errors left after a fit are smaller than those of the truth."""
-    n = np.count_nonzero(np.isfinite(error))
-    return n / max(n - n_numbers, 1)

@@ -6,9 +6,9 @@ The rings turn with the curve without twisting about it, so any other place of t
 chamber passes, has a curve of its own beside it; a chamber's length is that of its section's part.
 
 A polynomial of fourth order is too smooth for three sections that bend apart, so the lengths are coarse: on
-simulated arms without noise they are off by 5 mm RMS with the markers in the middle of the rings, by 6 mm at
-the chambers and by 11 mm at the springs, and by tens of mm at worst. So here they only check: what a chamber can do
-follows from its pressure limits, stiffness and area, and what a spring may be asked for from what it did.
+simulated arms without noise they are off by 5 mm RMS with markers in the middle of the rings, by 6 mm at
+the chambers and by 11 mm at the springs, and by tens of mm at worst. So here they only check: what a chamber
+can do follows from its pressure limits, stiffness and area; what a spring may be asked for, from what it did.
 
 Source: Simulation Calibration and Validation in Meng et al.
 """

@@ -1,11 +1,12 @@
 """The poses of a log in which the arm is at rest: equilibria can be fitted to these alone.
 
 A log is cut into holds: stretches in which no pressure leaves 1 kPa around its first value, the payload
-stays, and no two rows are more than 2 s apart. The last second of a hold counts, provided that
+stays, and no two rows are more than 3 s apart. The last second of a hold counts, provided that
 
-- the hold had lasted for 2 s by then. Where rows are missing before a hold, the arm is taken to have been
-  held there meanwhile, as it is where somebody records one pose after the other;
-- the tip moves by less than 2 mm/s, or by no more than its own noise can explain, and stays within 2 mm.
+- the hold had lasted for 3 s by then, three times the slowest time constant of the paper's arm. Where rows
+  are missing before a hold, the arm is taken to have been held there meanwhile, as it is where somebody
+  records one pose after the other;
+- the tip moves by less than 1 mm/s, or by no more than its own noise can explain, and stays within 2 mm.
 
 The rows that count are averaged to one pose, so that a long hold weighs no more than a short one.
 """
@@ -23,9 +24,9 @@ from mjx_softarm.sensors import SensorFault, SensorParams, length_from_frequency
 from mjx_softarm.spec import ArmSpec
 
 HOLD_KPA = 1.0
-REST_S = 2.0
+REST_S = 3.0
 WINDOW_S = 1.0
-MAX_SPEED_M_S = 2e-3
+MAX_SPEED_M_S = 1e-3
 MAX_SPREAD_M = 2e-3
 SPEED_SIGMA = 3.0
 
