@@ -12,6 +12,7 @@ from calib.logs import read_log
 from mjx_softarm import ArmSpec
 from mjx_softarm.control import Gains
 from mjx_softarm.deploy import faults, session
+from mjx_softarm.deploy.arm_io import Capture
 from mjx_softarm.deploy.arms import ArmError, open_arm
 from mjx_softarm.deploy.faults import RESPONSE, Fault, Response
 from mjx_softarm.deploy.loop import N_ACTIONS, VENT_KPA_PER_S, Controller, Phase, start, step, with_goal
