@@ -54,7 +54,7 @@ class Solution(NamedTuple):
 
 
 class _Weighted(NamedTuple):
-    """Errors over their scales, times the roots of Huber's weights, zero where not known; so are the slopes."""
+    """Errors over their scales times the roots of Huber's weights, zero where not known; slopes alike."""
 
     cost: float
     error: np.ndarray  # (n, m)

@@ -11,9 +11,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from calib.chambers import ChamberFit
+from calib.markers import MarkerLimits
 from calib.report import Part, Table
 from calib.s2r import S2RFit
 from calib.sensors import SpringFit
+from calib.transients import DampingFit
 from mjx_softarm.s2r import correct
 
 _BINS = 40
@@ -45,8 +47,8 @@ def springs(fit: SpringFit, calibrated_m: np.ndarray, length_m: np.ndarray) -> P
     )
 
 
-def chambers(fit: ChamberFit) -> Part:
-    """Stiffness, area and rest length of each chamber, and how well the arm's tip is met."""
+def chambers(fit: ChamberFit, limits: MarkerLimits | None) -> Part:
+    """Stiffness, area and rest length of each chamber, how well the tip is met, and lengths from markers."""
     spec = fit.spec
     units = (
         ("stiffness_n_per_m", "stiffness [N/m]", 1.0),
@@ -76,16 +78,54 @@ def chambers(fit: ChamberFit) -> Part:
     axes.hist(fit.tip_error_mm[~fit.is_held_out], bins, density=True, alpha=0.5, label="fit")
     axes.hist(fit.tip_error_mm[fit.is_held_out], bins, density=True, histtype="step", lw=2, label="held out")
     _label(axes, "simulated to measured tip [mm]", "density")
+    pictures = [("simulated to measured tip", figure)]
+    tables = [Table(head, tuple(rows)), Table(_ERROR_HEAD, error_rows)]
+    if limits is not None:
+        figure, axes = _figure()
+        axes.plot(1e3 * limits.simulated_m.ravel(), 1e3 * limits.length_m.ravel(), ".")
+        axes.plot(*2 * [1e3 * np.array([limits.length_min_m, limits.length_max_m])], "k:", lw=1)
+        axes.set(xlabel="chambers, simulated [mm]", ylabel="from the curves through the markers [mm]")
+        pictures.append((f"chambers at the {len(limits.pose)} poses that bend most", figure))
+        lengths = (
+            "chamber at the poses that bend most",
+            1e3 * limits.length_min_m,
+            1e3 * limits.length_max_m,
+        )
+        simulated = ("the same, simulated", *(1e3 * f(limits.simulated_m) for f in (np.min, np.max)))
+        tables.append(Table(("", "shortest [mm]", "longest [mm]"), (lengths, simulated)))
     fates = ", ".join(f"{count} {fate}" for fate, count in fit.rows.items() if count)
     return Part(
         "Chambers",
         f"{fit.rests.n} poses at rest: simulated at the measured pressures against the measured tip and "
         "springs. Rest length is told as its difference from the section's. Intervals are 95 %. "
         f"Rows of the logs: {fates}.",
-        (Table(head, tuple(rows)), Table(_ERROR_HEAD, error_rows)),
+        tuple(tables),
         fit.warnings,
-        _plain(fit, "spec", "rests", "is_held_out", "tip_error_mm") | values,
-        (("simulated to measured tip", figure),),
+        _plain(fit, "spec", "rests", "is_held_out", "tip_error_mm", "chamber_m")
+        | {"values": values, "markers": None if limits is None else _plain(limits)},
+        tuple(pictures),
+    )
+
+
+def damping(fit: DampingFit) -> Part:
+    """Damping of chambers and backbone, and how well the moving tip is met."""
+    values = {
+        "damping_ns_per_m": fit.spec.chambers.damping_ns_per_m,
+        "bending_damping_nms_per_rad": fit.spec.backbone.bending_damping_nms_per_rad,
+    }
+    rows = tuple((name, values[name], float(fit.half_width_95[name])) for name in values)
+    errors = (
+        ("held-out seconds, before", fit.held_out_before_rms_mm),
+        ("held-out seconds, calibrated", fit.held_out_rms_mm),
+        ("seconds of the fit, calibrated", fit.in_sample_rms_mm),
+    )
+    return Part(
+        "Damping",
+        f"{fit.n_stretches} stretches of the moving arm, {fit.time_s:.0f} s in all: MuJoCo driven with the "
+        "measured pressures against the measured tip. Intervals are 95 %.",
+        (Table(("", "value", "+-"), rows), Table(("tip", "RMS [mm]"), errors)),
+        fit.warnings,
+        _plain(fit, "spec") | {"values": values},
     )
 
 

@@ -22,10 +22,12 @@ import numpy as np
 from calib import parts
 from calib.chambers import MIN_POSES, calibrate_chambers
 from calib.logs import same_arm
+from calib.markers import marker_limits
 from calib.report import Part, to_html, to_json
 from calib.rests import Rests, find_rests
 from calib.s2r import fit_s2r, simulate_poses
 from calib.sensors import fit_springs
+from calib.transients import calibrate_damping, find_stretches
 from mjx_softarm.logs import Log
 from mjx_softarm.pose import pose_from_frame
 from mjx_softarm.provenance import write_json
@@ -68,9 +70,11 @@ def calibrate(
     seen = [log for log in logs if not any(getattr(log, name) is None for name in OF_POSES)]
     tell("chambers ...")
     spec, chambers = _chambers(seen, spec, seed)
+    tell("damping ...")
+    spec, damping = _damping(seen, spec, seed)
     tell("sim-to-real network ...")
     s2r, network = _s2r(seen, spec, seed)
-    return Calibration(spec, s2r, (springs, chambers, network))
+    return Calibration(spec, s2r, (springs, chambers, damping, network))
 
 
 def refuse_existing(folder: Path) -> None:
@@ -131,7 +135,19 @@ def _chambers(logs: Sequence[Log], spec: ArmSpec, seed: int) -> tuple[ArmSpec, P
         needed = f"{NOT_FITTED} {_few(rests, MIN_POSES)}"
         return spec, Part("Chambers", needed, warnings=("stiffness, area and length are not this arm's",))
     fit = calibrate_chambers(logs, spec, seed)
-    return fit.spec, parts.chambers(fit)
+    n_markers = fit.rests.marker_m.shape[1]
+    limits = marker_limits(fit.rests, fit.chamber_m, fit.spec) if n_markers else None
+    return fit.spec, parts.chambers(fit, limits)
+
+
+def _damping(logs: Sequence[Log], spec: ArmSpec, seed: int) -> tuple[ArmSpec, Part]:
+    if not find_stretches(logs, spec):
+        needed = (
+            f"{NOT_FITTED} No log follows the moving arm; it decides how the arm swings, not where it rests."
+        )
+        return spec, Part("Damping", needed)
+    fit = calibrate_damping(logs, spec, seed)
+    return fit.spec, parts.damping(fit)
 
 
 def _s2r(logs: Sequence[Log], spec: ArmSpec, seed: int) -> tuple[S2R | None, Part]:
