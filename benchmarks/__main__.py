@@ -17,11 +17,14 @@ NAMES = {
     "learner": "gradient updates/s against SBX's TQC",
     "learning": "tip errors of the presets over seeds, from finished runs",
 }
+PAPER = "the paper's experiments on twins, in hours; it goes alone: paper --help"
 
 
 def main() -> int:
     """Run the named benchmarks; print their figures and write them to `benchmarks/results`."""
-    epilog = "\n".join(f"  {name:12} {text}" for name, text in NAMES.items())
+    if sys.argv[1:2] == ["paper"]:
+        return importlib.import_module("benchmarks.paper").main(sys.argv[2:])
+    epilog = "\n".join(f"  {name:12} {text}" for name, text in {**NAMES, "paper": PAPER}.items())
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks", epilog=epilog, formatter_class=argparse.RawDescriptionHelpFormatter
     )

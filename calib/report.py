@@ -69,14 +69,19 @@ def to_json(parts: Sequence[Part], findings: Sequence[str], provenance: dict[str
 
 def to_html(arm: str, parts: Sequence[Part], findings: Sequence[str], provenance: dict[str, Any]) -> str:
     """The report as one page that needs no other file."""
-    body = [f"<h1>Calibration of {html.escape(arm)}</h1>", _verdict(parts)]
+    logs = _list(findings) if findings else "<p>No fault was found in them.</p>"
+    return page(f"Calibration of {arm}", _verdict(parts), parts, f"<h2>Logs</h2>{logs}", provenance)
+
+
+def page(title: str, first: str, parts: Sequence[Part], last: str, provenance: dict[str, Any]) -> str:
+    """A page of parts that needs no other file; `first` and `last` are HTML that stands around the parts."""
+    body = [f"<h1>{html.escape(title)}</h1>", first]
     for part in parts:
         body += [f"<h2>{html.escape(part.title)}</h2>", f"<p>{html.escape(part.text)}</p>", _warnings(part)]
         body += [_table(table) for table in part.tables]
-        body += [_picture(title, figure) for title, figure in part.figures]
-    body += ["<h2>Logs</h2>", _list(findings) if findings else "<p>No fault was found in them.</p>"]
-    body += ["<h2>How it was made</h2>", "<pre>", html.escape(_lines(provenance)), "</pre>"]
-    head = f'<meta charset="utf-8"><title>Calibration of {html.escape(arm)}</title><style>{_STYLE}</style>'
+        body += [_picture(text, figure) for text, figure in part.figures]
+    body += [last, "<h2>How it was made</h2>", "<pre>", html.escape(_lines(provenance)), "</pre>"]
+    head = f'<meta charset="utf-8"><title>{html.escape(title)}</title><style>{_STYLE}</style>'
     return f"<!doctype html><html lang=en><head>{head}</head><body>{''.join(body)}</body></html>\n"
 
 

@@ -183,6 +183,20 @@ class Twin:
         """Let the payload go."""
         self.attach(0.0)
 
+    def renderer(self, width: int, height: int) -> Any:
+        """A `mjx_softarm.render.Renderer` of this twin, for `draw`.
+
+        Raises:
+            RenderError: there is no OpenGL to draw with.
+        """
+        from mjx_softarm.render import Renderer
+
+        return Renderer(self._model, width, height)
+
+    def draw(self, renderer: Any) -> np.ndarray:
+        """A picture of the twin as it is now: RGB, (height, width, 3) uint8."""
+        return renderer.draw(self._data.qpos)
+
     def describe(self) -> dict[str, Any]:
         """How the twins are distributed, for reports: nothing about the one that was drawn."""
         return {

@@ -1,0 +1,104 @@
+"""A film of a twin on the circle: its own model, drawn without a display, beside the path from above."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from benchmarks.paper_stages import Case, Settings, controller
+
+WIDTH, HEIGHT = 210, 280  # of each half [px]
+EVERY_S = 0.5  # of the twin's time between two pictures
+MAX_FRAMES = 120
+FRAME_MS = 80
+N_COLOURS = 48
+INK, GREY, BLUE, ORANGE = (34, 34, 34), (154, 160, 166), (31, 111, 180), (224, 123, 40)
+
+
+class FilmedTwin:
+    """A twin that has its picture taken now and then, as it is driven; else the twin itself."""
+
+    def __init__(self, twin: Any, renderer: Any):
+        self._twin, self._renderer, self._next_s = twin, renderer, 0.0
+        self.pictures: list[np.ndarray] = []
+        self.tips_mm: list[np.ndarray] = []
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._twin, name)
+
+    def write_pressures(self, pressure_kpa: np.ndarray) -> None:
+        """Drive the twin; see `ArmIO`."""
+        self._twin.write_pressures(pressure_kpa)
+        if self._twin.time_s >= self._next_s:
+            self._next_s += EVERY_S
+            self.pictures.append(self._twin.draw(self._renderer))
+            self.tips_mm.append(1e3 * self._twin.motion_capture().tip_m)
+
+
+def film_circle(folder: Path, settings: Settings) -> str:
+    """Write `circle.gif`, once around with S2R on the first twin; returns why it cannot be drawn, or ""."""
+    from mjx_softarm.deploy.session import follow
+    from mjx_softarm.deploy.twin import EVALUATION_SESSION, Twin
+    from mjx_softarm.render import RenderError
+    from mjx_softarm.workspace import circle_poses
+
+    path = folder / "circle.gif"
+    if path.exists():
+        return ""
+    case = Case("with", settings.twins[0], settings.seeds[0])
+    goals = circle_poses(settings.n_points).astype(float)
+    twin = Twin(case.twin, session=EVALUATION_SESSION)
+    try:
+        with twin.renderer(WIDTH, HEIGHT) as renderer:
+            filmed = FilmedTwin(twin, renderer)
+            follow(filmed, controller(folder, case), goals)
+    except RenderError as error:
+        return str(error)
+    write_gif(path, frames(filmed.pictures, np.array(filmed.tips_mm), goals, f"twin {case.twin}, with S2R"))
+    return ""
+
+
+def frames(
+    pictures: list[np.ndarray], tips_mm: np.ndarray, goals: np.ndarray, title: str
+) -> list[Image.Image]:
+    """At most `MAX_FRAMES` of the pictures, spread evenly, each beside the tip's path up to then."""
+    chosen = np.unique(np.linspace(0, len(pictures) - 1, min(MAX_FRAMES, len(pictures))).round().astype(int))
+    return [_frame(pictures[k], tips_mm[: k + 1], goals, title) for k in chosen]
+
+
+def _frame(picture: np.ndarray, tips_mm: np.ndarray, goals: np.ndarray, title: str) -> Image.Image:
+    height, width, _ = picture.shape
+    frame = Image.new("RGB", (2 * width, height), (255, 255, 255))
+    frame.paste(Image.fromarray(picture), (0, 0))
+    pen = ImageDraw.Draw(frame)
+    scale = 0.4 * width / np.abs(goals[:, :2]).max()
+
+    def at(point_mm: np.ndarray) -> tuple[float, float]:
+        return 1.5 * width + scale * point_mm[0], 0.5 * height - scale * point_mm[1]
+
+    pen.text((width + 8, 8), title, fill=INK)
+    pen.text((width + 8, 22), "reference (grey) and tip, from above", fill=GREY)
+    for goal in goals:
+        _dot(pen, at(goal), 2, GREY)
+    pen.line([at(tip) for tip in tips_mm], fill=BLUE, width=1)
+    _dot(pen, at(tips_mm[-1]), 4, ORANGE)
+    return frame
+
+
+def _dot(pen: ImageDraw.ImageDraw, centre: tuple[float, float], radius: float, colour: Any) -> None:
+    x, y = centre
+    pen.ellipse((x - radius, y - radius, x + radius, y + radius), fill=colour)
+
+
+def write_gif(path: Path, images: list[Image.Image]) -> None:
+    """Write a film that repeats, in one palette for all of its frames."""
+    palette = images[len(images) // 2].quantize(N_COLOURS)
+    first, *others = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images)
+    part = path.with_name(path.name + ".part")
+    first.save(
+        part, format="GIF", save_all=True, append_images=others, duration=FRAME_MS, loop=0, optimize=True
+    )
+    part.replace(path)

@@ -1,0 +1,263 @@
+"""What the open-space experiments gave: JSON, pictures, one HTML page."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from benchmarks.paper_measure import Followed
+from benchmarks.paper_plots import circle_figure, error_figure, loads_figure, trace_figure
+from benchmarks.paper_stages import (
+    CALIBRATION,
+    EVALUATION_FILE,
+    METHODS,
+    Case,
+    Settings,
+    policy_folder,
+)
+from benchmarks.paper_summary import (
+    AVERAGED,
+    PAPER_SIMULATED_MM,
+    Check,
+    check_goals,
+    rows,
+    spread,
+    summarise,
+)
+from calib.report import Part, Table, page
+from mjx_softarm.provenance import write_json
+from mjx_softarm.spec import ArmSpec
+
+JSON_FILE, HTML_FILE, FILM_FILE = "paper-open.json", "report.html", "circle.gif"
+DPI = 90
+HEADINGS = {
+    "translation_mm": "translation [mm]",
+    "rmse_mm": "RMSE [mm]",
+    "max_mm": "largest [mm]",
+    "yaw_deg": "yaw [deg]",
+    "pitch_deg": "pitch [deg]",
+    "roll_deg": "roll [deg]",
+    "believed_mm": "as estimated [mm]",
+    "saturated_points": "points with a saturated chamber",
+    "saturated_chambers_max": "saturated chambers of a point, largest",
+    "saturation_events": "saturation told by the loop",
+}
+
+
+def write_results(
+    folder: Path,
+    pictures: Path,
+    settings: Settings,
+    results: Mapping[Case, Followed],
+    no_film: str,
+    provenance: dict[str, Any],
+) -> dict[str, Any]:
+    """Write the page and the JSON file; returns what is in the JSON file.
+
+    Args:
+        folder: of the benchmark, with policies and calibrations; the page goes there.
+        pictures: where JSON file, pictures and film go.
+        settings: of the benchmark.
+        results: of all cases.
+        no_film: why there is no film, or "".
+        provenance: versions, machine and commit.
+    """
+    data = figures_of(folder, settings, results)
+    drawn = draw(results, data["runs"])
+    pictures.mkdir(parents=True, exist_ok=True)
+    for name, (_, figure) in drawn.items():
+        figure.savefig(pictures / f"paper-{name}.png", dpi=DPI)
+    film = folder / FILM_FILE
+    if film.exists() and not no_film:
+        shutil.copyfile(film, pictures / f"paper-{FILM_FILE}")
+    write_json(pictures / JSON_FILE, {"figures": data, **provenance})
+    text = to_html(data, drawn, film if film.exists() else None, no_film, provenance)
+    (folder / HTML_FILE).write_text(text, "utf-8")
+    return data
+
+
+def figures_of(folder: Path, settings: Settings, results: Mapping[Case, Followed]) -> dict[str, Any]:
+    """All figures: goals, spreads, simulated errors, calibrations, every run."""
+    table = rows(results)
+    return {
+        "arm": "twin",
+        "settings": {**settings.fixed(), "twins": list(settings.twins), "seeds": list(settings.seeds)},
+        "goals": [check._asdict() for check in check_goals(table)],
+        "spreads": summarise(table),
+        "simulated": simulated(folder, settings, table),
+        "calibrations": {f"twin {twin}": calibration_of(folder, twin) for twin in settings.twins},
+        "runs": table,
+    }
+
+
+def simulated(folder: Path, settings: Settings, table: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Each policy's mean error on the circle in its own simulation, beside that on the twins."""
+    found = []
+    for twin in (None, *settings.twins):
+        method = "without" if twin is None else "with"
+        for seed in settings.seeds:
+            file = policy_folder(folder, twin, seed) / EVALUATION_FILE
+            on_twins = [
+                row["translation_mm"]
+                for row in table
+                if (row["method"], row["seed"], row["load_g"]) == (method, seed, 0)
+                and twin in (None, row["twin"])
+            ]
+            found.append(
+                {
+                    "method": method,
+                    "twin": twin,
+                    "seed": seed,
+                    "simulated_mm": json.loads(file.read_text("utf-8"))["circle_mean_mm"],
+                    "on_twin_mm": spread(on_twins)._asdict(),
+                }
+            )
+    return found
+
+
+def calibration_of(folder: Path, twin: int) -> dict[str, list[str]]:
+    """Each step of a twin's calibration with its warnings."""
+    report = json.loads((folder / f"twin{twin}" / CALIBRATION / "report.json").read_text("utf-8"))
+    return {title: part["warnings"] for title, part in report["parts"].items()}
+
+
+def draw(
+    results: Mapping[Case, Followed], table: Sequence[Mapping[str, Any]]
+) -> dict[str, tuple[str, Figure]]:
+    """Name -> what is shown, and the drawing."""
+    chambers = ArmSpec.default().chambers
+    limits_kpa = (chambers.pressure_min_kpa, chambers.pressure_max_kpa)
+    drawn = {
+        "circle": ("Circle from above, first seed, no load (twins)", circle_figure(results)),
+        "error": ("Error at each point: mean and range over twins and seeds, no load", error_figure(results)),
+        "loads": ("Unknown loads, with S2R: every run and the mean (twins)", loads_figure(table)),
+    }
+    first = min((case for case in results if case.method == "with"), key=lambda case: (case.twin, case.seed))
+    for load_g in sorted({case.load_g for case in results if case.load_g}):
+        followed = results[first._replace(load_g=load_g)]
+        text = f"Springs and pressures with {load_g} g, twin {first.twin}, seed {first.seed}"
+        drawn[f"pressures-{load_g}g"] = (text, trace_figure(followed, limits_kpa))
+    return drawn
+
+
+def to_html(
+    data: Mapping[str, Any],
+    drawn: Mapping[str, tuple[str, Figure]],
+    film: Path | None,
+    no_film: str,
+    provenance: dict[str, Any],
+) -> str:
+    """The page; it needs no other file."""
+    checks = [Check(**check) for check in data["goals"]]
+    traces = tuple(item for name, item in drawn.items() if name.startswith("pressures"))
+    parts = (
+        _goals_part(checks),
+        _circle_part(data, (drawn["circle"], drawn["error"])),
+        _loads_part(data, (drawn["loads"], *traces)),
+        _simulated_part(data),
+        _calibration_part(data["calibrations"]),
+        Part("Every run", "Mean over the points arrived at.", (_runs_table(data["runs"]),)),
+    )
+    n_missed = sum(not check.met for check in checks)
+    verdict = (
+        '<p class="good">Every goal is met.</p>'
+        if n_missed == 0
+        else f'<p class="bad">{n_missed} of {len(checks)} goals are not met.</p>'
+    )
+    first = f"<p>All measured on the simulated arm called twin; no number is of a real arm.</p>{verdict}"
+    return page("The paper's open-space experiments", first, parts, _film(film, no_film), provenance)
+
+
+def _goals_part(checks: Sequence[Check]) -> Part:
+    table = Table(
+        ("goal", "twin", ""), tuple((c.text, c.value, "met" if c.met else "NOT MET") for c in checks)
+    )
+    missed = tuple(f"not met: {check.text}: {check.value}" for check in checks if not check.met)
+    return Part("Goals", "Set before anything was measured.", (table,), missed)
+
+
+def _circle_part(data: Mapping[str, Any], drawn: tuple[tuple[str, Figure], ...]) -> Part:
+    text = (
+        "Mean ± standard deviation over twins and training seeds; errors by motion capture at rest, averaged "
+        "over half a second. Without S2R, only the springs are calibrated. Gradient descent has no "
+        "training seed and runs once for each twin."
+    )
+    unloaded = [item for item in data["spreads"] if item["load_g"] == 0]
+    return Part("Circle", text, (_spreads_table(unloaded),), figures=drawn)
+
+
+def _loads_part(data: Mapping[str, Any], drawn: tuple[tuple[str, Figure], ...]) -> Part:
+    text = (
+        "The policy with S2R, which knows of no load. Solid: springs as read and pressures as measured; "
+        "shaded: points at which a chamber is saturated."
+    )
+    loaded = [item for item in data["spreads"] if item["method"] == "with"]
+    return Part("Unknown loads", text, (_spreads_table(loaded),), figures=drawn)
+
+
+def _spreads_table(spreads: Sequence[Mapping[str, Any]]) -> Table:
+    head = ["", "load [g]", "runs"]
+    for name in AVERAGED:
+        head.append(f"twin: {HEADINGS[name]}")
+        if any(name in item["paper"] for item in spreads):
+            head.append("paper")
+    body = []
+    for item in spreads:
+        row = [METHODS[item["method"]], item["load_g"], item["runs"]]
+        for name in AVERAGED:
+            row.append(f"{item[name]['mean']:.2f} ± {item[name]['std']:.2f}")
+            if any(name in other["paper"] for other in spreads):
+                row.append(item["paper"].get(name, "-"))
+        body.append(tuple(row))
+    return Table(tuple(head), tuple(body))
+
+
+def _simulated_part(data: Mapping[str, Any]) -> Part:
+    text = f"Mean error on the circle; the paper's, without S2R: {PAPER_SIMULATED_MM:g} mm in simulation."
+    body = tuple(
+        (
+            METHODS[item["method"]],
+            "all" if item["twin"] is None else item["twin"],
+            item["seed"],
+            item["simulated_mm"],
+            item["on_twin_mm"]["mean"],
+        )
+        for item in data["simulated"]
+    )
+    head = ("policy", "twin", "seed", "simulated [mm]", "on the twin [mm]")
+    return Part("Simulated against twin", text, (Table(head, body),))
+
+
+def _calibration_part(calibrations: Mapping[str, Mapping[str, Sequence[str]]]) -> Part:
+    warnings = tuple(
+        f"{twin}: {title}: {warning}"
+        for twin, steps in calibrations.items()
+        for title, found in steps.items()
+        for warning in found
+    )
+    return Part("Calibration", "One log of random poses at rest for each twin.", warnings=warnings)
+
+
+def _runs_table(table: Sequence[Mapping[str, Any]]) -> Table:
+    names = ("reached", *AVERAGED, "seconds")
+    head = ("", "twin", "seed", "load [g]", *(HEADINGS.get(name, name) for name in names), "told by the loop")
+    body = []
+    for row in table:
+        told = ", ".join(f"{name}: {n}" for name, n in row["events"].items()) or "-"
+        start = (METHODS[row["method"]], row["twin"], row["seed"], row["load_g"])
+        body.append((*start, *(row[name] for name in names), told))
+    return Table(head, tuple(body))
+
+
+def _film(film: Path | None, no_film: str) -> str:
+    if film is None:
+        return f"<h2>Film</h2><p>None: {html.escape(no_film)}</p>"
+    data = base64.b64encode(film.read_bytes()).decode()
+    return f'<h2>Film</h2><p><img alt="The twin on the circle" src="data:image/gif;base64,{data}"></p>'

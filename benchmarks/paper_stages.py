@@ -1,0 +1,205 @@
+"""What the paper's open-space experiments are made of: jobs, each of which leaves its result in a folder.
+
+    twinT/log.npz, twinT/calibration/     logged and calibrated through `ArmIO` and logs alone
+    nominal-seedS/, twinT-seedS/          trained, evaluated and exported; the nominal ones know no twin
+    results/CASE.npz                      a policy once around the circle on a twin
+
+A job whose result is there is not done again; training goes on where it stopped. A job runs in a process of
+its own, so it imports what it needs by itself.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from benchmarks.paper_measure import Followed, load_followed, measure, save_followed
+
+METHODS = {"without": "without S2R", "with": "with S2R", "gradient": "gradient descent"}
+LOG_FILE, CALIBRATION = "log.npz", "calibration"
+POLICY_FILE, EVALUATION_FILE = "policy.npz", "evaluation.json"
+
+
+class JobError(Exception):
+    """A job that cannot be done; the message says which, and why."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is done, and how large."""
+
+    twins: tuple[int, ...] = (0, 1, 2)
+    seeds: tuple[int, ...] = (0, 1, 2)
+    preset: str = "paper"
+    training: tuple[str, ...] = ()  # further settings, NAME=VALUE
+    n_poses: int = 700
+    n_points: int = 40
+    loads_g: tuple[int, ...] = (35, 105, 220, 330, 500, 1000)
+
+    def fixed(self) -> dict:
+        """All that a folder's results share; twins and seeds may be added later."""
+        data = json.loads(json.dumps(dataclasses.asdict(self)))
+        return {name: value for name, value in data.items() if name not in ("twins", "seeds")}
+
+
+SMOKE = Settings(
+    twins=(0,),
+    seeds=(0,),
+    preset="quick",
+    training=("total_env_steps=512", "warmup_env_steps=256", "n_arms=16", "updates_per_env_step=0.25"),
+    n_poses=80,
+    n_points=4,
+    loads_g=(500,),
+)
+
+
+class Case(NamedTuple):
+    """One experiment: a way to find references, on one twin, with one load, of one training seed."""
+
+    method: str  # key of METHODS
+    twin: int
+    seed: int
+    load_g: int = 0
+
+    @property
+    def name(self) -> str:
+        return f"{self.method}-twin{self.twin}-seed{self.seed}-{self.load_g}g"
+
+
+def cases(settings: Settings) -> list[Case]:
+    """All experiments; gradient descent has no training seed, so it runs once for each twin."""
+    found = []
+    for twin in settings.twins:
+        for seed in settings.seeds:
+            found += [Case("without", twin, seed), Case("with", twin, seed)]
+            found += [Case("with", twin, seed, load_g) for load_g in settings.loads_g]
+        found.append(Case("gradient", twin, settings.seeds[0]))
+    return found
+
+
+def learn_twin(folder: Path, settings: Settings, twin: int) -> None:
+    """Record a twin's log and calibrate it.
+
+    Raises:
+        JobError: the recording ended early.
+    """
+    from calib.logs import read_log
+    from calib.run import calibrate, write_calibration
+    from mjx_softarm import xla
+    from mjx_softarm.provenance import provenance
+    from mjx_softarm.spec import ArmSpec
+
+    here, spec = folder / f"twin{twin}", ArmSpec.default()
+    here.mkdir(parents=True, exist_ok=True)
+    if (here / CALIBRATION).exists():
+        return
+    if not (here / LOG_FILE).exists():
+        _record(here / LOG_FILE, spec, settings.n_poses, twin)
+    log, findings = read_log(here / LOG_FILE, spec.n_chambers)
+    xla.enable_compilation_cache()
+    calibration = calibrate([log], spec)
+    write_calibration(
+        here / CALIBRATION, calibration, [str(finding) for finding in findings], provenance("benchmarks")
+    )
+
+
+def _record(path: Path, spec, n_poses: int, twin: int) -> None:
+    from mjx_softarm.deploy.record import random_pressures, record
+    from mjx_softarm.deploy.twin import S2R_SESSION, Twin
+    from mjx_softarm.logs import write_log
+
+    recording = record(
+        Twin(twin, spec, session=S2R_SESSION), spec, random_pressures(spec, n_poses, seed=twin)
+    )
+    if recording.problem:
+        raise JobError(f"{path}: recording twin {twin} ended early: {recording.problem}")
+    write_log(path, recording.log)
+
+
+def train_policy(folder: Path, settings: Settings, twin: int | None, seed: int) -> None:
+    """Train and export a policy of the nominal arm, or of a twin's calibration.
+
+    Raises:
+        JobError: a command failed.
+    """
+    run = policy_folder(folder, twin, seed)
+    if not (run / EVALUATION_FILE).exists():
+        if (run / "config.json").exists():
+            _command(run, "reach", "--resume", str(run))
+        else:
+            arm = [] if twin is None else ["--calibration", str(folder / f"twin{twin}" / CALIBRATION)]
+            more = [part for text in settings.training for part in ("--set", text)]
+            options = ["--preset", settings.preset, "--seed", str(seed), "--out", str(run), *arm, *more]
+            _command(run, "reach", *options)
+    if not (run / POLICY_FILE).exists():
+        _command(run, "export", str(run))
+
+
+def policy_folder(folder: Path, twin: int | None, seed: int) -> Path:
+    """Where a policy is trained."""
+    return folder / f"{'nominal' if twin is None else f'twin{twin}'}-seed{seed}"
+
+
+def _command(run: Path, *arguments: str) -> None:
+    """`python -m train ...`, its output appended to a file beside the run."""
+    log = run.with_suffix(".log")
+    with log.open("a", encoding="utf-8") as file:
+        done = subprocess.run(
+            [sys.executable, "-m", "train", *arguments], stdout=file, stderr=subprocess.STDOUT, check=False
+        )
+    if done.returncode:
+        last = "\n".join(log.read_text("utf-8").splitlines()[-5:])
+        raise JobError(
+            f"python -m train {' '.join(arguments)}: exit status {done.returncode}; {log} ends with\n{last}"
+        )
+
+
+def follow_circle(folder: Path, settings: Settings, case: Case) -> None:
+    """Go around the circle on a twin in its evaluation session."""
+    from mjx_softarm.deploy.session import follow
+    from mjx_softarm.deploy.twin import EVALUATION_SESSION, Twin
+    from mjx_softarm.workspace import circle_poses
+
+    path = result_file(folder, case)
+    if path.exists():
+        return
+    path.parent.mkdir(exist_ok=True)
+    chosen, goals = controller(folder, case), circle_poses(settings.n_points).astype(float)
+    arm = Twin(case.twin, payload_kg=1e-3 * case.load_g, session=EVALUATION_SESSION)
+    save_followed(path, measure(follow(arm, chosen, goals), chosen, goals))
+
+
+def controller(folder: Path, case: Case):
+    """How a case finds its references, in the very same loop.
+
+    Without S2R, the policy of the nominal arm plans spring lengths, and only the springs are calibrated.
+    """
+    from mjx_softarm.deploy.gradient_descent import gradient_descent
+    from mjx_softarm.deploy.loop import Controller
+    from mjx_softarm.deploy.runtime import PolicyRunner
+    from mjx_softarm.export import load_policy
+
+    policy = load_policy(policy_folder(folder, case.twin, case.seed) / POLICY_FILE)
+    if case.method == "with":
+        return Controller.of(policy)
+    if case.method == "gradient":
+        return Controller.of(policy, gradient_descent(policy))
+    nominal = load_policy(policy_folder(folder, None, case.seed) / POLICY_FILE)
+    runner = PolicyRunner(nominal)
+    calibrated_springs = dataclasses.replace(nominal, sensor=policy.sensor)
+    return Controller.of(calibrated_springs, lambda pose, goal, _: runner.act(pose, goal).length_m)
+
+
+def result_file(folder: Path, case: Case) -> Path:
+    """Where `follow_circle` leaves what it measured."""
+    return folder / "results" / f"{case.name}.npz"
+
+
+def load_results(folder: Path, settings: Settings) -> dict[Case, Followed]:
+    """What all experiments measured."""
+    return {case: load_followed(result_file(folder, case)) for case in cases(settings)}
