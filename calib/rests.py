@@ -29,6 +29,7 @@ WINDOW_S = 1.0
 MAX_SPEED_M_S = 1e-3
 MAX_SPREAD_M = 2e-3
 SPEED_SIGMA = 3.0
+ROUNDING_S = 1e-6
 
 
 class Rests(NamedTuple):
@@ -96,9 +97,11 @@ def _rests_of(log: Log, spec: ArmSpec, n_markers: int, fates: dict[str, int]) ->
             fates["tip still moving"] += len(rows)
             continue
         fates["used"] += len(rows)
-        means = [np.mean(x[rows], axis=0) for x in (log.pressure_kpa, payload, log.tip_m, rotation, springs)]
-        means[3] = nearest_rotation(means[3])
-        found.append((*means, np.mean(markers[rows], axis=0), len(rows) == 1))
+        pressure, tip, turn, spring, marker = (
+            np.mean(x[rows], axis=0) for x in (log.pressure_kpa, log.tip_m, rotation, springs, markers)
+        )
+        kept = payload[rows[0]]  # the same in all, which a mean would round
+        found.append((pressure, kept, tip, nearest_rotation(turn), spring, marker, len(rows) == 1))
     return found
 
 
@@ -138,12 +141,12 @@ def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
 
 
 def _last_second(time_s: np.ndarray, start: int, stop: int) -> np.ndarray:
-    """Rows of a hold that count, in any."""
+    """Rows of a hold that count, if any."""
     gap = time_s[start] - time_s[start - 1] if start > 0 else 0.0
     since = time_s[start - 1] if gap > REST_S else time_s[start]
     rows = np.arange(start, stop)
-    window = time_s[rows] >= time_s[stop - 1] - WINDOW_S
-    return rows[window & (time_s[rows] - since >= REST_S)]
+    window = time_s[rows] >= time_s[stop - 1] - WINDOW_S - ROUNDING_S
+    return rows[window & (time_s[rows] - since >= REST_S - ROUNDING_S)]
 
 
 def _moves(time_s: np.ndarray, tip_m: np.ndarray) -> bool:
