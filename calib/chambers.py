@@ -31,7 +31,7 @@ from mjx_softarm.settle import RESIDUAL_TOLERANCE
 from mjx_softarm.spec import ArmSpec
 from mjx_softarm.statics import ArmParams
 
-BATCH = 256
+BATCH = 128
 MIN_POSES = 20
 ENOUGH_POSES = 100
 HELD_OUT_SHARE = 0.2
