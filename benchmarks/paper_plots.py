@@ -22,11 +22,14 @@ Results = Mapping[Case, Followed]
 
 
 def circle_figure(results: Results) -> Figure:
-    """The circle from above, reference and paths of each method: a panel for each twin, its first seed."""
+    """The circle from above, reference and paths of each method: a panel for each twin, its first seed.
+
+    Points at which a chamber is saturated are ringed.
+    """
     twins = sorted({case.twin for case in results})
     seed = min(case.seed for case in results)
-    figure = Figure(figsize=(4.2 * len(twins) + 0.2, 4.4), layout="constrained")
-    panels = figure.subplots(1, len(twins), squeeze=False)[0]
+    figure = Figure(figsize=(4.0 * len(twins) + 0.4, 3.9), layout="constrained")
+    panels = figure.subplots(1, len(twins), squeeze=False, sharex=True, sharey=True)[0]
     for panel, twin in zip(panels, twins, strict=True):
         _dress(panel, f"twin {twin}, from above", "x [mm]", "y [mm]")
         for method, name in METHODS.items():
@@ -35,9 +38,13 @@ def circle_figure(results: Results) -> Figure:
                 goal = np.vstack([followed.goal, followed.goal[:1]])
                 panel.plot(goal[:, 0], goal[:, 1], "--", color=INK, linewidth=1.2, label="reference")
             tip = followed.goal + followed.error
-            tip = np.vstack([tip, tip[:1]])
+            around = np.vstack([tip, tip[:1]])
             style = {"color": COLOURS[method], "linewidth": 1.0, "markersize": 3.0}
-            panel.plot(tip[:, 0], tip[:, 1], "o-", label=name, **style)
+            panel.plot(around[:, 0], around[:, 1], "o-", label=name, **style)
+            hit = tip[followed.saturated.any(axis=1)]
+            ring = {"color": RED, "markersize": 7.0, "fillstyle": "none", "linestyle": "none"}
+            label = "a chamber saturated" if method == list(METHODS)[-1] else None
+            panel.plot(hit[:, 0], hit[:, 1], "o", label=label, **ring)
         panel.set_aspect("equal")
     panels[0].legend(frameon=False, loc="center", fontsize=8)
     return figure
@@ -118,6 +125,7 @@ def trace_figure(followed: Followed, limits_kpa: tuple[float, float]) -> Figure:
                 _shade(panel, followed, np.flatnonzero(followed.saturated[:, chamber]), colour)
         for limit_kpa in limits_kpa:
             lower.axhline(limit_kpa, color=RED, linestyle="--", linewidth=1.0)
+        lower.set_ylim(limits_kpa[0] - 12.0, limits_kpa[1] + 4.0)
         lower.legend(frameon=False, fontsize=7, ncols=3, loc="lower left")
     return figure
 

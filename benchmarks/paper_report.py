@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import html
+import io
 import json
 import shutil
 from collections.abc import Mapping, Sequence
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
+from PIL import Image
 
 from benchmarks.paper_measure import Followed
 from benchmarks.paper_plots import circle_figure, error_figure, loads_figure, trace_figure
@@ -36,7 +38,7 @@ from mjx_softarm.provenance import write_json
 from mjx_softarm.spec import ArmSpec
 
 JSON_FILE, HTML_FILE, FILM_FILE = "paper-open.json", "report.html", "circle.gif"
-DPI = 90
+DPI, N_COLOURS = 110, 64
 HEADINGS = {
     "translation_mm": "translation [mm]",
     "rmse_mm": "RMSE [mm]",
@@ -72,8 +74,9 @@ def write_results(
     data = figures_of(folder, settings, results)
     drawn = draw(results, data["runs"])
     pictures.mkdir(parents=True, exist_ok=True)
-    for name, (_, figure) in drawn.items():
-        figure.savefig(pictures / f"paper-{name}.png", dpi=DPI)
+    kept = ["circle", "error", "loads", *(f"pressures-{load_g}g" for load_g in settings.loads_g[-2:])]
+    for name in kept:
+        save_picture(pictures / f"paper-{name}.png", drawn[name][1])
     film = folder / FILM_FILE
     if film.exists() and not no_film:
         shutil.copyfile(film, pictures / f"paper-{FILM_FILE}")
@@ -81,6 +84,13 @@ def write_results(
     text = to_html(data, drawn, film if film.exists() else None, no_film, provenance)
     (folder / HTML_FILE).write_text(text, "utf-8")
     return data
+
+
+def save_picture(path: Path, figure: Figure) -> None:
+    """Write a drawing as PNG with few colours, which halves it."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=DPI)
+    Image.open(buffer).convert("RGB").quantize(N_COLOURS).save(path, format="PNG", optimize=True)
 
 
 def figures_of(folder: Path, settings: Settings, results: Mapping[Case, Followed]) -> dict[str, Any]:

@@ -289,11 +289,13 @@ def test_results_are_written_and_nothing_is_hidden(tmp_path):
         "paper-pressures-1000g.png",
         "paper-pressures-500g.png",
     ]
+    assert all((tmp_path / "out" / name).stat().st_size < 150_000 for name in pictures)
     assert (tmp_path / "out" / "paper-circle.gif").read_bytes()[:6] == b"GIF89a"
 
 
 def no_pictures(*_):
-    return {name: (name, Figure()) for name in ("circle", "error", "loads")}
+    names = ("circle", "error", "loads", "pressures-500g", "pressures-1000g")
+    return {name: (name, Figure()) for name in names}
 
 
 def test_missed_goal_and_missing_film_stand_in_the_page(tmp_path, monkeypatch):
