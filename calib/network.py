@@ -1,8 +1,9 @@
 """Small networks fitted to rows of a log: averaged, stopped early on contiguous blocks, bounded.
 
-A log is short for a network, so the fit leans to the smooth side: several small networks with decayed weights
-learn side by side, each is stopped by blocks of rows that it did not see, other blocks for each, and what
-counts is their mean. That mean is one network again, its layers side by side, and is stored and run as one.
+A log is short for a network, so the fit leans to the smooth side: a straight line takes what it can; of what it
+leaves, several small networks with decayed weights learn, each stopped by blocks of rows that it did not see,
+other blocks for each, and what counts is their mean. Line and mean are one network again, layers side by side,
+and are stored and run as one.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from calib.blocks import held_out_blocks
 from mjx_softarm.mlp import Layer, mlp
 from mjx_softarm.s2r import S2R
 
+RIDGE = 1.0  # of the line, beside inputs from -1 to 1: as much as a row or two
 N_ANCHORS = 256
 LIMIT_PERCENTILE = 99.0
 ROWS_PER_BLOCK = 100
@@ -79,7 +81,9 @@ def fit_network(x: np.ndarray, y: np.ndarray, seed: int, config: NetworkConfig |
     z = (2.0 * (x - bounds["input_low"]) / (bounds["input_high"] - bounds["input_low"]) - 1.0).astype(
         np.float32
     )
-    centre, spread = y.mean(axis=0), y.std(axis=0)
+    linear = _line(z, y)
+    left = y - z @ linear
+    centre, spread = left.mean(axis=0), left.std(axis=0)
     spread = np.where(spread > 0.0, spread, 1.0)
     rows = _equally_many([np.flatnonzero(~stop) for stop in stopping])
     n_batches = max(rows.shape[1] // config.batch_size, 1)
@@ -87,7 +91,7 @@ def fit_network(x: np.ndarray, y: np.ndarray, seed: int, config: NetworkConfig |
     members, losses = _train(
         jax.random.key(seed),
         jnp.asarray(z),
-        jnp.asarray((y - centre) / spread, jnp.float32),
+        jnp.asarray((left - centre) / spread, jnp.float32),
         rows,
         _equally_many([np.flatnonzero(stop) for stop in stopping]),
         hidden=config.hidden,
@@ -97,7 +101,7 @@ def fit_network(x: np.ndarray, y: np.ndarray, seed: int, config: NetworkConfig |
         weight_decay=config.weight_decay,
     )
     losses = np.asarray(losses)  # (n_members, n_epochs)
-    layers = _side_by_side(jax.device_get(members), spread, centre)
+    layers = _side_by_side(jax.device_get(members), spread, centre, linear)
     anchors, limit = _anchors(z, stopping[0])
     network = S2R(layers=layers, **bounds, anchors=anchors, limit=np.float32(limit))
     return NetworkFit(network, losses.argmin(axis=1), n_epochs, losses.min(axis=1))
@@ -193,27 +197,41 @@ def _initial_layers(key: Array, sizes: tuple[int, ...]) -> tuple[Layer, ...]:
     )
 
 
-def _side_by_side(members: tuple[Layer, ...], scale: np.ndarray, offset: np.ndarray) -> tuple[Layer, ...]:
-    """One network whose output is `scale` times the members' mean plus `offset`.
+def _line(z: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Weights (n_in, n_out) of the straight line from inputs to outputs, whose offset is left to the rest."""
+    moved, wanted = z - z.mean(axis=0), y - y.mean(axis=0)
+    return np.linalg.solve(moved.T @ moved + RIDGE * np.eye(z.shape[1]), moved.T @ wanted)
+
+
+def _side_by_side(
+    members: tuple[Layer, ...], scale: np.ndarray, offset: np.ndarray, linear: np.ndarray
+) -> tuple[Layer, ...]:
+    """One network whose output is `scale` times the members' mean plus `offset` plus a line of its inputs.
+
+    The inputs z, which are never below -1, go through its layers as z + 1, which rectifying leaves as it is.
 
     Args:
         members: layers of weights (n_members, in, out) and biases (n_members, out).
         scale (n_out,): of the outputs.
         offset (n_out,): of the outputs.
+        linear (n_in, n_out): weights of the line.
     """
-    layers: list[Layer] = []
     *hidden, (weight, bias) = members
+    n_in = linear.shape[0]
+    layers: list[Layer] = []
     for k, (w, b) in enumerate(hidden):
-        n_members, n_in, n_out = w.shape
-        if k == 0:
-            joined = np.moveaxis(w, 0, 1).reshape(n_in, -1)
-        else:
-            joined = np.zeros((n_members, n_in, n_members, n_out), np.float32)
-            joined[np.arange(n_members), :, np.arange(n_members)] = w
-            joined = joined.reshape(n_members * n_in, -1)
-        layers.append((joined, b.reshape(-1)))
-    head = np.concatenate(list(weight)) * scale / len(weight)
-    layers.append((head, bias.mean(axis=0) * scale + offset))
+        n_members, n_before, n_after = w.shape
+        joined = np.zeros((n_members, n_before, n_members, n_after), np.float32)
+        joined[np.arange(n_members), :, np.arange(n_members)] = w
+        rows = n_members * n_before
+        block = np.zeros((rows + n_in, n_members * n_after + n_in), np.float32)
+        block[:rows, :-n_in] = joined.reshape(rows, -1)
+        block[rows:, -n_in:] = np.eye(n_in)
+        if k == 0:  # all members and the line read the same inputs
+            block = block.reshape(n_members + 1, n_in, -1).sum(axis=0)
+        layers.append((block, np.append(b.reshape(-1), np.full(n_in, float(k == 0)))))
+    head = np.concatenate([np.concatenate(list(weight)) * scale / len(weight), linear])
+    layers.append((head, bias.mean(axis=0) * scale + offset - linear.sum(axis=0)))
     return tuple((np.asarray(w, np.float32), np.asarray(b, np.float32)) for w, b in layers)
 
 

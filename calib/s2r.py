@@ -28,8 +28,9 @@ from mjx_softarm.statics import ArmParams
 
 HELD_OUT_SHARE = 0.2
 MIN_ROWS = 200
+PRESSURE_LIMIT_KPA = 200.0  # of the simulated arm, which no lengths of a real one need
 MAX_TURN_DEG = 90.0
-MAX_HELD_OUT_RATIO = 2.0
+MAX_HELD_OUT_RATIO = 3.0
 BATCH = 512
 
 
@@ -37,7 +38,7 @@ class SimulatedPoses(NamedTuple):
     """What the simulated arm does when asked for spring lengths."""
 
     pose: np.ndarray  # (n, 6) [mm, deg]
-    spring_m: np.ndarray  # (n, n_chambers) reached; those asked for, where no chamber is at its limit
+    spring_m: np.ndarray  # (n, n_chambers) reached: those asked for
     valid: np.ndarray  # (n,) bool, the arm settled
 
 
@@ -68,7 +69,10 @@ class S2RFit:
 
 
 def simulate_poses(spec: ArmSpec, reference_m: np.ndarray) -> SimulatedPoses:
-    """The simulated arm at rest under the sensor-space law.
+    """The simulated arm at rest under the sensor-space law, with pressures as high and low as it takes.
+
+    The real arm had these lengths, so the simulated one must have them too. Within its own limits it often
+    cannot: its pose is then one of other lengths, and what the network is to learn is lost in that.
 
     Args:
         spec: the calibrated arm.
@@ -86,6 +90,8 @@ def simulate_poses(spec: ArmSpec, reference_m: np.ndarray) -> SimulatedPoses:
         value = reference[row, column]
         raise ValueError(f"spring lengths: row {row}, spring {column}: expected a finite number, got {value}")
     n, params = len(reference), ArmParams.from_spec(spec)
+    limit = np.full(spec.n_chambers, PRESSURE_LIMIT_KPA, np.float32)
+    params = params._replace(pressure_min_kpa=-limit, pressure_max_kpa=limit)
     padded = np.resize(reference, (-(-n // BATCH) * BATCH, spec.n_chambers))
     parts = [jax.device_get(_settle()(params, part)) for part in np.split(padded, len(padded) // BATCH)]
     return SimulatedPoses(*(np.concatenate(column)[:n] for column in zip(*parts, strict=True)))

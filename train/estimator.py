@@ -32,6 +32,7 @@ from mjx_softarm.statics import ArmParams
 from mjx_softarm.workspace import HELD_OUT_SEED, Pool, sample_workspace
 
 N_TRAINING, N_HELD_OUT = 16_384, 2_048
+MORE_PRESSURE = 0.25  # of the range, at either end
 N_STEPS = 8_000
 BATCH = 256
 WIDTH = 128
@@ -72,12 +73,22 @@ def distil(spec: ArmSpec, seed: int) -> Distilled:
     """
     if seed == HELD_OUT_SEED:
         raise ValueError(f"seed: {HELD_OUT_SEED} draws the held-out equilibria")
-    pool = sample_workspace(spec, N_TRAINING, seed)
     key_estimator, key_springs = jax.random.split(jax.random.key(seed))
+    pool = sample_workspace(_stronger(spec), N_TRAINING, seed)
     estimator = _fit(_first_estimator(spec, pool, key_estimator), _pose_loss, pool, key_estimator)
+    pool = sample_workspace(spec, N_TRAINING, seed)
     springs = _fit(_first_spring_model(pool, key_springs), _spring_loss, pool, key_springs)
     as_numpy = jax.tree.map(lambda x: np.asarray(x, np.float32), (estimator, springs))
     return Distilled(*as_numpy, *_errors(*as_numpy, spec))
+
+
+def _stronger(spec: ArmSpec) -> ArmSpec:
+    """The arm with more pressure: a real one has spring lengths that the simulated one cannot quite reach."""
+    low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
+    more = MORE_PRESSURE * (high - low)
+    return spec.replace(
+        chambers={"pressure_min_kpa": max(low - more, -100.0), "pressure_max_kpa": high + more}
+    )
 
 
 def _first_estimator(spec: ArmSpec, pool: Pool, key: Array) -> PoseEstimator:

@@ -159,7 +159,11 @@ def test_one_network_says_the_mean_of_its_members():
     y = np.stack([np.sin(3.0 * x[:, 0]), 5.0 + x[:, 0] * x[:, 1]], axis=1)
     config = NetworkConfig(hidden=(8, 4), n_members=3, n_updates=50)
     network = fit_network(x, y, 0, config).network
-    assert [weight.shape for weight, _ in network.layers] == [(2, 24), (24, 12), (12, 2)]
+    assert [weight.shape for weight, _ in network.layers] == [
+        (2, 3 * 8 + 2),
+        (3 * 8 + 2, 3 * 4 + 2),
+        (3 * 4 + 2, 2),
+    ]  # three members and the line
     z = 2.0 * (x - network.input_low) / (network.input_high - network.input_low) - 1.0
     (w0, b0), (w1, b1), (w2, b2) = network.layers
     members = [
