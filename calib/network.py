@@ -1,9 +1,9 @@
 """Small networks fitted to rows of a log: averaged, stopped early on contiguous blocks, bounded.
 
-A log is short for a network, so the fit leans to the smooth side: a straight line takes what it can; of what it
-leaves, several small networks with decayed weights learn, each stopped by blocks of rows that it did not see,
-other blocks for each, and what counts is their mean. Line and mean are one network again, layers side by side,
-and are stored and run as one.
+A log is short for a network, so the fit leans to the smooth side: a straight line takes what it can; of what
+it leaves, several small networks with decayed weights learn, each stopped by blocks of rows that it did not
+see, other blocks for each, and what counts is their mean. Line and mean are one network again, layers side by
+side, and are stored and run as one.
 """
 
 from __future__ import annotations
