@@ -37,7 +37,7 @@ class Settings:
     seeds: tuple[int, ...] = (0, 1, 2)
     preset: str = "paper"
     training: tuple[str, ...] = ()  # further settings, NAME=VALUE
-    n_poses: int = 700
+    n_poses: int = 500
     n_points: int = 40
     loads_g: tuple[int, ...] = (35, 105, 220, 330, 500, 1000)
 
