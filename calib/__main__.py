@@ -11,9 +11,9 @@ import argparse
 import sys
 from pathlib import Path
 
-from calib.checks import Finding, LogError
+from calib.checks import Finding
 from mjx_softarm.logs import Log
-from mjx_softarm.spec import ArmSpec, SpecError
+from mjx_softarm.spec import ArmSpec
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -21,9 +21,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     try:
         return options.command(options)
-    except LogError as error:
-        print(f"error: {error}", file=sys.stderr)
-    except (SpecError, FileExistsError) as error:
+    except (ValueError, FileExistsError) as error:  # of logs, specification or a fit
         print(f"error: {error}", file=sys.stderr)
     except OSError as error:
         print(f"error: {error.filename}: {error.strerror}", file=sys.stderr)

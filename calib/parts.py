@@ -47,8 +47,8 @@ def springs(fit: SpringFit, calibrated_m: np.ndarray, length_m: np.ndarray) -> P
     )
 
 
-def chambers(fit: ChamberFit, limits: MarkerLimits | None) -> Part:
-    """Stiffness, area and rest length of each chamber, how well the tip is met, and lengths from markers."""
+def chambers(fit: ChamberFit) -> Part:
+    """Stiffness, area and rest length of each chamber, and how well the arm's tip is met."""
     spec = fit.spec
     units = (
         ("stiffness_n_per_m", "stiffness [N/m]", 1.0),
@@ -78,32 +78,34 @@ def chambers(fit: ChamberFit, limits: MarkerLimits | None) -> Part:
     axes.hist(fit.tip_error_mm[~fit.is_held_out], bins, density=True, alpha=0.5, label="fit")
     axes.hist(fit.tip_error_mm[fit.is_held_out], bins, density=True, histtype="step", lw=2, label="held out")
     _label(axes, "simulated to measured tip [mm]", "density")
-    pictures = [("simulated to measured tip", figure)]
-    tables = [Table(head, tuple(rows)), Table(_ERROR_HEAD, error_rows)]
-    if limits is not None:
-        figure, axes = _figure()
-        axes.plot(1e3 * limits.simulated_m.ravel(), 1e3 * limits.length_m.ravel(), ".")
-        axes.plot(*2 * [1e3 * np.array([limits.length_min_m, limits.length_max_m])], "k:", lw=1)
-        axes.set(xlabel="chambers, simulated [mm]", ylabel="from the curves through the markers [mm]")
-        pictures.append((f"chambers at the {len(limits.pose)} poses that bend most", figure))
-        lengths = (
-            "chamber at the poses that bend most",
-            1e3 * limits.length_min_m,
-            1e3 * limits.length_max_m,
-        )
-        simulated = ("the same, simulated", *(1e3 * f(limits.simulated_m) for f in (np.min, np.max)))
-        tables.append(Table(("", "shortest [mm]", "longest [mm]"), (lengths, simulated)))
     fates = ", ".join(f"{count} {fate}" for fate, count in fit.rows.items() if count)
     return Part(
         "Chambers",
         f"{fit.rests.n} poses at rest: simulated at the measured pressures against the measured tip and "
         "springs. Rest length is told as its difference from the section's. Intervals are 95 %. "
         f"Rows of the logs: {fates}.",
-        tuple(tables),
+        (Table(head, tuple(rows)), Table(_ERROR_HEAD, error_rows)),
         fit.warnings,
-        _plain(fit, "spec", "rests", "is_held_out", "tip_error_mm", "chamber_m")
-        | {"values": values, "markers": None if limits is None else _plain(limits)},
-        tuple(pictures),
+        _plain(fit, "spec", "rests", "is_held_out", "tip_error_mm", "chamber_m") | {"values": values},
+        (("simulated to measured tip", figure),),
+    )
+
+
+def with_markers(part: Part, limits: MarkerLimits) -> Part:
+    """The chambers' part with their lengths from markers at the poses that bend most."""
+    figure, axes = _figure()
+    axes.plot(1e3 * limits.simulated_m.ravel(), 1e3 * limits.length_m.ravel(), ".")
+    axes.plot(*2 * [1e3 * np.array([limits.length_min_m, limits.length_max_m])], "k:", lw=1)
+    axes.set(xlabel="chambers, simulated [mm]", ylabel="from the curves through the markers [mm]")
+    lengths = ("chamber at the poses that bend most", 1e3 * limits.length_min_m, 1e3 * limits.length_max_m)
+    simulated = ("the same, simulated", *(float(1e3 * f(limits.simulated_m)) for f in (np.min, np.max)))
+    table = Table(("", "shortest [mm]", "longest [mm]"), (lengths, simulated))
+    title = f"chambers at the {len(limits.pose)} poses that bend most"
+    return dataclasses.replace(
+        part,
+        tables=(*part.tables, table),
+        data=part.data | {"markers": _plain(limits)},
+        figures=(*part.figures, (title, figure)),
     )
 
 

@@ -135,9 +135,13 @@ def _chambers(logs: Sequence[Log], spec: ArmSpec, seed: int) -> tuple[ArmSpec, P
         needed = f"{NOT_FITTED} {_few(rests, MIN_POSES)}"
         return spec, Part("Chambers", needed, warnings=("stiffness, area and length are not this arm's",))
     fit = calibrate_chambers(logs, spec, seed)
-    n_markers = fit.rests.marker_m.shape[1]
-    limits = marker_limits(fit.rests, fit.chamber_m, fit.spec) if n_markers else None
-    return fit.spec, parts.chambers(fit, limits)
+    part = parts.chambers(fit)
+    if fit.rests.marker_m.shape[1]:
+        try:
+            part = parts.with_markers(part, marker_limits(fit.rests, fit.chamber_m, fit.spec))
+        except ValueError as error:  # markers only check, so a calibration does not fail for them
+            part = dataclasses.replace(part, warnings=(*part.warnings, str(error)))
+    return fit.spec, part
 
 
 def _damping(logs: Sequence[Log], spec: ArmSpec, seed: int) -> tuple[ArmSpec, Part]:
