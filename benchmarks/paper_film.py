@@ -10,11 +10,11 @@ from PIL import Image, ImageDraw
 
 from benchmarks.paper_stages import Case, Settings, controller
 
-WIDTH, HEIGHT = 210, 280  # of each half [px]
-EVERY_S = 0.5  # of the twin's time between two pictures
+WIDTH, HEIGHT = 240, 320  # of each half [px]
+EVERY_S = 1.0  # of the twin's time between two pictures
 MAX_FRAMES = 120
 FRAME_MS = 80
-N_COLOURS = 48
+N_COLOURS = 128
 INK, GREY, BLUE, ORANGE = (34, 34, 34), (154, 160, 166), (31, 111, 180), (224, 123, 40)
 
 
@@ -95,7 +95,7 @@ def _dot(pen: ImageDraw.ImageDraw, centre: tuple[float, float], radius: float, c
 
 def write_gif(path: Path, images: list[Image.Image]) -> None:
     """Write a film that repeats, in one palette for all of its frames."""
-    palette = images[len(images) // 2].quantize(N_COLOURS)
+    palette = images[len(images) // 2].quantize(N_COLOURS, Image.Quantize.MAXCOVERAGE)
     first, *others = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images)
     part = path.with_name(path.name + ".part")
     first.save(

@@ -80,7 +80,8 @@ def write_results(
     film = folder / FILM_FILE
     if film.exists() and not no_film:
         shutil.copyfile(film, pictures / f"paper-{FILM_FILE}")
-    write_json(pictures / JSON_FILE, {"figures": data, **provenance})
+    figures = json.loads(json.dumps(data), parse_constant=lambda _: None)  # JSON has no NaN
+    write_json(pictures / JSON_FILE, {"figures": figures, **provenance})
     text = to_html(data, drawn, film if film.exists() else None, no_film, provenance)
     (folder / HTML_FILE).write_text(text, "utf-8")
     return data

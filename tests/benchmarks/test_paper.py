@@ -4,6 +4,7 @@ import dataclasses
 import json
 import re
 from html.parser import HTMLParser
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -298,11 +299,46 @@ def no_pictures(*_):
     return {name: (name, Figure()) for name in names}
 
 
+class StillTwin:
+    """A twin whose pictures show the time."""
+
+    time_s = 0.0
+
+    def write_pressures(self, pressure_kpa):
+        self.time_s += 0.02
+
+    def draw(self, renderer):
+        return np.full((20, 15, 3), round(self.time_s), np.uint8)
+
+    def motion_capture(self):
+        return SimpleNamespace(tip_m=np.array([0.08, 0.0, -0.5]))
+
+
+def test_twin_is_filmed_at_equal_times(tmp_path):
+    filmed = paper_film.FilmedTwin(StillTwin(), None)
+    for _ in range(round(200 / 0.02)):
+        filmed.write_pressures(np.zeros(N))
+    assert np.isclose(filmed.time_s, 200.0)
+    taken = [picture[0, 0, 0] for picture in filmed.pictures]
+    assert taken[:3] == [0, 1, 2]
+    assert len(taken) == 201
+    assert np.allclose(filmed.tips_mm[0], [80.0, 0.0, -500.0])
+    images = paper_film.frames(filmed.pictures, np.array(filmed.tips_mm), circle_poses(4), "")
+    shown = [image.getpixel((0, 19))[0] for image in images]
+    assert len(images) == paper_film.MAX_FRAMES
+    assert (shown[0], shown[-1]) == (0, 200)
+    assert shown == sorted(shown)
+
+
 def test_missed_goal_and_missing_film_stand_in_the_page(tmp_path, monkeypatch):
     monkeypatch.setattr(paper_report, "draw", no_pictures)
     fill(tmp_path, TINY)
-    results = good_results() | {Case("with", 0, 0): made_up(60.0)}
+    lost = made_up(60.0)
+    lost.error[:] = np.nan
+    results = good_results() | {Case("with", 0, 0): lost}
     write_results(tmp_path, tmp_path, TINY, results, "no OpenGL <here>", {})
+    runs = json.loads((tmp_path / JSON_FILE).read_text("utf-8"))["figures"]["runs"]
+    assert [row["translation_mm"] is None for row in runs].count(True) == 1
     page = Tags()
     page.feed((tmp_path / HTML_FILE).read_text("utf-8"))
     assert "not met: with S2R, mean translation at most 5 mm" in page.text
