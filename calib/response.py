@@ -131,15 +131,6 @@ def fit_response(
     return fit._replace(warnings=_warnings(fit, np.diff(time_s)))
 
 
-def damping_ns_per_m(fit: ResponseFit, stiffness_n_per_m: float) -> float:
-    """Damping [N s/m] that gives one chamber the mean of the two time constants: c = k tau.
-
-    A chamber that is a spring and a damper side by side relaxes with tau = c / k. `stiffness_n_per_m` is the
-    whole stiffness that one chamber works against: its own, and its share of springs and backbone.
-    """
-    return stiffness_n_per_m * float(np.sqrt(fit.response.tau_fill_s * fit.response.tau_vent_s))
-
-
 def _steps(time_s: np.ndarray) -> Array:
     return jnp.asarray(np.diff(time_s, prepend=time_s[0]))
 
