@@ -45,7 +45,6 @@ def _parser() -> argparse.ArgumentParser:
     demo.set_defaults(command=_demo)
     run = commands.add_parser("run", help="calibrate springs, chambers, damping and the sim-to-real network")
     _add_logs(run)
-    run.add_argument("--spec", type=Path, help="TOML file of the arm so far; default: the paper's arm")
     run.add_argument("--out", type=Path, default=Path("calibration"), help="folder; default: calibration")
     run.add_argument("--seed", type=int, default=0, help="of all that is drawn; default: 0")
     run.set_defaults(command=_run)
@@ -54,6 +53,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _add_logs(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("logs", type=Path, nargs="+", metavar="LOG", help="CSV or npz; see `template`")
+    parser.add_argument("--spec", type=Path, help="TOML file of the arm so far; default: the paper's arm")
     parser.add_argument(
         "--strict", action="store_true", help="refuse logs with any fault; default: drop rows"
     )
@@ -67,7 +67,7 @@ def _template(options: argparse.Namespace) -> int:
 
 
 def _check(options: argparse.Namespace) -> int:
-    logs, findings = _read(options, ArmSpec.default().n_chambers)
+    logs, findings = _read(options, _spec(options))
     for log in logs:
         print(f"{log.source}: {len(log)} rows to use, {log.time_s[-1] - log.time_s[0]:.1f} s")
     return 1 if findings else 0
@@ -91,8 +91,8 @@ def _run(options: argparse.Namespace) -> int:
     from mjx_softarm.provenance import provenance
 
     refuse_existing(options.out)
-    spec = ArmSpec.from_toml(options.spec) if options.spec else ArmSpec.default()
-    logs, findings = _read(options, spec.n_chambers)
+    spec = _spec(options)
+    logs, findings = _read(options, spec)
     xla.enable_compilation_cache()
     calibration = calibrate(logs, spec, options.seed, lambda text: print(text, flush=True))
     write_calibration(options.out, calibration, [str(finding) for finding in findings], provenance("calib"))
@@ -104,13 +104,17 @@ def _run(options: argparse.Namespace) -> int:
     return 1 if any(part.warnings for part in calibration.parts) else 0
 
 
-def _read(options: argparse.Namespace, n_chambers: int) -> tuple[list[Log], list[Finding]]:
+def _spec(options: argparse.Namespace) -> ArmSpec:
+    return ArmSpec.from_toml(options.spec) if options.spec else ArmSpec.default()
+
+
+def _read(options: argparse.Namespace, spec: ArmSpec) -> tuple[list[Log], list[Finding]]:
     """The logs; what was found is printed."""
     from calib.logs import read_log
 
     logs, findings = [], []
     for path in options.logs:
-        log, found = read_log(path, n_chambers, options.strict)
+        log, found = read_log(path, spec.n_chambers, options.strict)
         logs.append(log)
         findings += found
         for finding in found:

@@ -31,6 +31,8 @@ Needed are time and one at least of frequency, spring, pressure and tip. A group
 whole or not at all. Markers are numbered from base to tip, springs and chambers as in the spec.
 Base frame: z up, the arm hangs from the origin towards -z. The tip is the centre of the last plate, its
 quaternion 1, 0, 0, 0 where the arm hangs straight.
+Chambers and the sim-to-real network are fitted to poses at rest: rows of which the pressures have been held
+for 3 s. One row per pose will do if the rows are more than 3 s apart.
 """
 _CELL = re.compile(r"(\w+)\s*(?:\[(.*)\])?")
 _FACTORS = {"frequency_hz": 1.25, "spring_m": 1.5, "tip_m": 1.5}  # between the ranges of two logs of one arm

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from calib.chambers import ChamberFit
+from calib.chambers import BENDING, ChamberFit
 from calib.markers import MarkerLimits
 from calib.report import Part, Table
 from calib.s2r import S2RFit
@@ -48,7 +48,7 @@ def springs(fit: SpringFit, calibrated_m: np.ndarray, length_m: np.ndarray) -> P
 
 
 def chambers(fit: ChamberFit) -> Part:
-    """Stiffness, area and rest length of each chamber, and how well the arm's tip is met."""
+    """Stiffness, area and rest length of each chamber, the backbone, and how well the arm's tip is met."""
     spec = fit.spec
     units = (
         ("stiffness_n_per_m", "stiffness [N/m]", 1.0),
@@ -65,6 +65,8 @@ def chambers(fit: ChamberFit) -> Part:
         )
         rows.append((f"chamber {k}", *(number for pair in pairs for number in pair)))
     head = ("", *(text for _, title, _ in units for text in (title, "+-")))
+    bending = spec.backbone.bending_stiffness_nm_per_rad
+    backbone = Table(("", "value", "+-"), ((BENDING, bending, float(fit.half_width_95[BENDING])),))
     errors = (
         ("held-out poses, before", fit.held_out_before),
         ("held-out poses, calibrated", fit.held_out),
@@ -84,9 +86,10 @@ def chambers(fit: ChamberFit) -> Part:
         f"{fit.rests.n} poses at rest: simulated at the measured pressures against the measured tip and "
         "springs. Rest length is told as its difference from the section's. Intervals are 95 %. "
         f"Rows of the logs: {fates}.",
-        (Table(head, tuple(rows)), Table(_ERROR_HEAD, error_rows)),
+        (Table(head, tuple(rows)), backbone, Table(_ERROR_HEAD, error_rows)),
         fit.warnings,
-        _plain(fit, "spec", "rests", "is_held_out", "tip_error_mm", "chamber_m") | {"values": values},
+        _plain(fit, "spec", "rests", "is_held_out", "tip_error_mm", "chamber_m")
+        | {"values": values | {BENDING: bending}},
         (("simulated to measured tip", figure),),
     )
 
@@ -131,8 +134,11 @@ def damping(fit: DampingFit) -> Part:
     )
 
 
-def s2r(fit: S2RFit, pose: np.ndarray, spring_m: np.ndarray, real: np.ndarray) -> Part:
-    """Simulated poses (n, 6) and spring lengths, and real poses, with and without the network."""
+def s2r(fit: S2RFit, pose: np.ndarray, spring_m: np.ndarray, real: np.ndarray, n_unsettled: int) -> Part:
+    """Simulated poses (n, 6) and spring lengths, and real poses, with and without the network.
+
+    `n_unsettled` others took no part, as the simulated arm found no rest at their spring lengths.
+    """
     errors = tuple(
         (name, n, e.translation_mean_mm, e.translation_95_mm, e.rotation_mean_deg)
         for name, n, e in (
@@ -151,10 +157,11 @@ def s2r(fit: S2RFit, pose: np.ndarray, spring_m: np.ndarray, real: np.ndarray) -
         "Sim-to-real network",
         f"{len(pose)} poses at rest: the calibrated simulation is asked for the logged spring lengths, the "
         f"network learns what its tip is off by. Of the held-out poses it flags "
-        f"{100 * fit.flagged_share:.1f} % as far from those it learned from.",
+        f"{100 * fit.flagged_share:.1f} % as far from those it learned from. "
+        f"At {n_unsettled} other poses the simulation found no rest; they took no part.",
         (Table(_ERROR_HEAD, errors),),
         fit.warnings,
-        _plain(fit, "s2r", "held_out"),
+        _plain(fit, "s2r", "held_out") | {"n_unsettled": n_unsettled},
         (("held-out poses with and without the network", figure),),
     )
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from calib.chambers import MIN_POSES, calibrate_chambers
 from calib.logs import same_arm
 from calib.markers import marker_limits
 from calib.report import Part, to_html, to_json
-from calib.rests import Rests, find_rests
+from calib.rests import REST_S, find_rests
 from calib.s2r import fit_s2r, simulate_poses
 from calib.sensors import fit_springs
 from calib.transients import calibrate_damping, find_stretches
@@ -81,9 +81,9 @@ def refuse_existing(folder: Path) -> None:
     """Nothing is overwritten.
 
     Raises:
-        FileExistsError: the folder is there already and not empty.
+        FileExistsError: the folder is there already and not empty, or is the current one.
     """
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+    if not folder.name or (folder.exists() and (not folder.is_dir() or any(folder.iterdir()))):
         raise FileExistsError(f"{folder}: is there already; choose another --out")
 
 
@@ -130,9 +130,9 @@ def _springs(logs: Sequence[Log], spec: ArmSpec, seed: int) -> tuple[ArmSpec, Pa
 
 
 def _chambers(logs: Sequence[Log], spec: ArmSpec, seed: int) -> tuple[ArmSpec, Part]:
-    rests, _ = find_rests(logs, spec)
+    rests, rows = find_rests(logs, spec)
     if rests.n < MIN_POSES:
-        needed = f"{NOT_FITTED} {_few(rests, MIN_POSES)}"
+        needed = f"{NOT_FITTED} {_few(MIN_POSES, 'pressures and tip poses', rests.n, rows)}"
         return spec, Part("Chambers", needed, warnings=("stiffness, area and length are not this arm's",))
     fit = calibrate_chambers(logs, spec, seed)
     part = parts.chambers(fit)
@@ -156,18 +156,27 @@ def _damping(logs: Sequence[Log], spec: ArmSpec, seed: int) -> tuple[ArmSpec, Pa
 
 def _s2r(logs: Sequence[Log], spec: ArmSpec, seed: int) -> tuple[S2R | None, Part]:
     """The network of the unloaded arm: with a payload, the simulation is another."""
-    rests, _ = find_rests(logs, spec)
-    rests = rests.take(np.isfinite(rests.spring_m).all(axis=1) & (rests.payload_kg == spec.mass.payload_kg))
-    if rests.n < MIN_S2R_POSES:
-        needed = f"Not fitted: {_few(rests, MIN_S2R_POSES)}"
+    rests, rows = find_rests(logs, spec)
+    unloaded = np.isclose(rests.payload_kg, spec.mass.payload_kg, rtol=0.0, atol=1e-6)
+    rests = rests.take(np.isfinite(rests.spring_m).all(axis=1) & unloaded)
+    simulated = simulate_poses(spec, rests.spring_m) if rests.n else None
+    n_settled = 0 if simulated is None else int(np.count_nonzero(simulated.valid))
+    if simulated is None or n_settled < MIN_S2R_POSES:
+        what = f"pressures, spring lengths and tip poses, a payload of {spec.mass.payload_kg:g} kg"
+        rows |= {"poses at which the simulated arm finds no rest": rests.n - n_settled}
+        needed = f"Not fitted: {_few(MIN_S2R_POSES, what, n_settled, rows)}"
         warnings = ("policies will be trained on simulated poses",)
         return None, Part("Sim-to-real network", needed, warnings=warnings)
-    simulated = simulate_poses(spec, rests.spring_m)
     real = pose_from_frame(rests.tip_m, rests.tip_rotation)
     pose, spring_m, real = (x[simulated.valid] for x in (simulated.pose, simulated.spring_m, real))
     fit = fit_s2r(pose, spring_m, real, seed)
-    return fit.s2r, parts.s2r(fit, pose, spring_m, real)
+    return fit.s2r, parts.s2r(fit, pose, spring_m, real, rests.n - n_settled)
 
 
-def _few(rests: Rests, n: int) -> str:
-    return f"{n} poses at rest with pressures, frequencies and tip are needed, and {rests.n} are there."
+def _few(n: int, what: str, n_found: int, rows: Mapping[str, int]) -> str:
+    """Which poses are needed, and what became of the rows of the logs."""
+    fates = ", ".join(f"{count} {fate}" for fate, count in rows.items() if count)
+    return (
+        f"{n} poses at rest with {what} are needed, and {n_found} are there; pressures must have been held "
+        f"for {REST_S:g} s. Rows of the logs: {fates or 'none with all of these columns'}."
+    )

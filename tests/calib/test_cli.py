@@ -58,6 +58,9 @@ def test_each_step_brings_the_simulated_tip_closer_to_held_out_poses(calibrated)
     mean = "translation_mean_mm"
     chambers, network = parts["Chambers"]["figures"], parts["Sim-to-real network"]["figures"]
     assert chambers["held_out"][mean] < 0.5 * chambers["held_out_before"][mean]
+    bending, found = "bending_stiffness_nm_per_rad", ArmSpec.from_toml(calibrated[1] / "arm.toml")
+    assert chambers["values"][bending] == found.backbone.bending_stiffness_nm_per_rad
+    assert network["n_unsettled"] >= 0
     corrected, simulated = network["test"], network["test_uncorrected"]
     assert corrected[mean] < 0.8 * simulated[mean]
     assert corrected["rotation_mean_deg"] < 0.8 * simulated["rotation_mean_deg"]
@@ -103,6 +106,33 @@ def test_logs_without_poses_or_ruler_say_what_is_missing(demo, tmp_path, capsys)
     assert not (tmp_path / "out" / "s2r.npz").exists()
     found = ArmSpec.from_toml(tmp_path / "out" / "arm.toml")
     assert found.chambers == ArmSpec.default().chambers
+
+
+def test_poses_that_were_not_held_are_said_not_to_be_at_rest(demo, tmp_path, capsys):
+    log, _ = read_log(demo[1])
+    path = tmp_path / "fast.csv"
+    write_log(path, log.__class__(**{**vars(log), "time_s": 0.4 * log.time_s}))  # a pose every 2 s
+    assert main(["run", str(path), "--out", str(tmp_path / "out")]) == 1
+    page = (tmp_path / "out" / "report.html").read_text()
+    fate = f"Rows of the logs: {len(log)} pressures not held long enough."
+    assert "20 poses at rest with pressures and tip poses are needed, and 0 are there; pressures must" in page
+    assert page.count(fate) == 2  # chambers and sim-to-real network
+
+
+def test_the_current_folder_is_refused_at_once(demo, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["run", *demo, "--out", "."]) == 2
+    assert capsys.readouterr() == ("", "error: .: is there already; choose another --out\n")
+
+
+def test_check_takes_the_arm_s_number_of_chambers(demo, tmp_path, capsys):
+    six = ArmSpec.default().replace(structure={"n_sections": 2})
+    six.to_toml(tmp_path / "six.toml")
+    log, _ = read_log(demo[0])
+    changes = {"frequency_hz": log.frequency_hz[:, :6], "spring_m": log.spring_m[:, :6]}
+    write_log(tmp_path / "six.csv", log.__class__(**{**vars(log), **changes}))
+    assert main(["check", str(tmp_path / "six.csv")]) == 2
+    assert main(["check", str(tmp_path / "six.csv"), "--spec", str(tmp_path / "six.toml")]) == 0
 
 
 def test_template_is_a_log(tmp_path, capsys):
