@@ -127,14 +127,14 @@ def save_s2r(path: str | Path, s2r: S2R) -> None:
     write_sealed(Path(path), arrays, KIND)
 
 
-def load_s2r(path: str | Path) -> S2R:
-    """Read a network and check all of it.
+def load_s2r(path: str | Path, n_springs: int | None = None) -> S2R:
+    """Read a network and check all of it; of any arm where `n_springs` is None.
 
     Raises:
         SealedFileError: the file cannot be read, is incomplete, damaged, of another kind, or an entry is
             missing, unknown, or of the wrong type, shape or range.
     """
-    return _unpack(read_sealed(Path(path), KIND, "python -m calib run"), str(path))
+    return _unpack(read_sealed(Path(path), KIND, "python -m calib run"), str(path), n_springs)
 
 
 def take_s2r(entries: Entries, name: str, n_springs: int | None = None) -> S2R:
@@ -165,8 +165,8 @@ def take_s2r(entries: Entries, name: str, n_springs: int | None = None) -> S2R:
     return s2r
 
 
-def _unpack(arrays: dict[str, np.ndarray], source: str) -> S2R:
+def _unpack(arrays: dict[str, np.ndarray], source: str, n_springs: int | None = None) -> S2R:
     entries = Entries(arrays, source)
-    s2r = take_s2r(entries, KIND)
+    s2r = take_s2r(entries, KIND, n_springs)
     entries.finish(1)
     return s2r

@@ -145,6 +145,9 @@ def test_file_gives_the_network_back(tmp_path):
         save_s2r(tmp_path / name, net)
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
     jax.tree.map(np.testing.assert_array_equal, load_s2r(tmp_path / "a.npz"), net)
+    jax.tree.map(np.testing.assert_array_equal, load_s2r(tmp_path / "a.npz", N_IN - 9), net)
+    with pytest.raises(SealedFileError, match=rf"s2r.input_low: got float32 \({N_IN},\), expected"):
+        load_s2r(tmp_path / "a.npz", N_IN - 12)
 
 
 @pytest.mark.parametrize(

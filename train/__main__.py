@@ -83,7 +83,7 @@ def _reach(options: argparse.Namespace, console: Console) -> int:
         shortcuts = {"seed": options.seed, "env.engine": options.engine, "env.mode": options.mode}
         assignments = [f"{name}={value}" for name, value in shortcuts.items() if value is not None]
         config = override(PRESETS[preset], [*assignments, *options.set])
-        spec, s2r = _arm(options)
+        spec, s2r = _arm(options, console)
         path = options.out or default_path("reach", preset, config.seed)
         console.print("drawing goals from the reachable workspace ...")
         env = ReachEnv(spec, config.env, s2r)
@@ -98,14 +98,17 @@ def _reach(options: argparse.Namespace, console: Console) -> int:
     return 0
 
 
-def _arm(options: argparse.Namespace) -> tuple[ArmSpec, S2R | None]:
+def _arm(options: argparse.Namespace, console: Console) -> tuple[ArmSpec, S2R | None]:
     """The arm to train for: calibrated, specified or the paper's."""
     if options.calibration is None:
         return ArmSpec.from_toml(options.spec) if options.spec else ArmSpec.default(), None
     if options.spec:
         raise ConfigError(f"--spec {options.spec}: got --calibration {options.calibration} too, expected one")
-    s2r = options.calibration / S2R_FILE
-    return ArmSpec.from_toml(options.calibration / "arm.toml"), load_s2r(s2r) if s2r.exists() else None
+    spec, file = ArmSpec.from_toml(options.calibration / "arm.toml"), options.calibration / S2R_FILE
+    if file.exists():
+        return spec, load_s2r(file, spec.n_chambers)
+    console.print(f"no {file}: training on simulated poses", highlight=False, soft_wrap=True)
+    return spec, None
 
 
 def _given(options: argparse.Namespace) -> str:

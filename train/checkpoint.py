@@ -80,7 +80,8 @@ class Run:
             raise RunError(f"{path}: not the folder of a run: {file}: {error.strerror}") from error
         except (ValueError, KeyError, TypeError) as error:
             raise RunError(f"{file}: not a run's config: {error!r}") from error
-        return cls(path, config, spec, load_s2r(path / S2R_FILE) if has_s2r else None)
+        s2r = load_s2r(path / S2R_FILE, spec.n_chambers) if has_s2r else None
+        return cls(path, config, spec, s2r)
 
     @property
     def latest_epoch(self) -> int | None:
