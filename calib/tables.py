@@ -145,7 +145,7 @@ def _read_lines(path: Path, names: tuple[str, ...], n_header: int) -> Table:
 
 def _ragged(line: str, n_cells: int, n_names: int) -> str:
     found = [text for mark, text in _OTHER_DELIMITERS.items() if mark in line]
-    hint = f", and {found[0]}" if found else "; decimal commas?" if n_cells >= 2 * n_names - 1 else ""
+    hint = f", and {found[0]}" if found else "; decimal commas?" if n_cells >= 1.5 * n_names else ""
     return f"got {n_cells} cells{hint}; expected {n_names}, as in the header"
 
 

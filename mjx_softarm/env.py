@@ -126,7 +126,10 @@ class ReachEnv(Env):
         return pool._replace(pose=self._observed_pose(pool.pose, pool.spring_m))
 
     def _observed_pose(self, pose: Array, spring_m: Array) -> Array:
-        return pose if self.s2r is None else correct(self.s2r, pose, spring_m)
+        if self.s2r is None:
+            return pose
+        with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
+            return correct(self.s2r, pose, spring_m)
 
     def reference_m(self, action: Array) -> Array:
         """Spring lengths (..., n_chambers) [m] that an action in [-1, 1] asks for: frequencies, linearly."""

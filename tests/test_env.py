@@ -11,6 +11,7 @@ import pytest
 from mjx_softarm import ArmSpec, xla
 from mjx_softarm._mjx import State
 from mjx_softarm.env import PAYLOAD, EnvConfig, Randomisation, ReachEnv
+from mjx_softarm.s2r import S2R
 from mjx_softarm.statics import ArmParams
 
 MM, KPA = 1e-3, 1.0
@@ -37,6 +38,49 @@ def leaves_equal(a, b):
 def types(state):
     """Shapes and types; a jitted function is compiled anew where they differ."""
     return jax.tree.map(jax.typeof, state)
+
+
+# --- sim-to-real network -----------------------------------------------------------------------------------
+
+
+def test_with_a_network_every_pose_is_the_real_one_and_the_arm_underneath_the_same():
+    """A network that looks at a spring: poses of reset, step, pool and reward are corrected."""
+    config = EnvConfig(n_poses=64, randomisation=Randomisation(sensor_noise_mm=2.0))
+    n_springs = SHORT_ARM.n_chambers
+    weight = np.zeros((9 + n_springs, 6), np.float32)
+    weight[9, 0] = 30.0  # mm for half the range of the first spring
+    bound = np.array([40.0] * 3 + [0.2] * 3, np.float32)
+    low, high = (np.r_[np.full(3, x), [-1.0 if x < 0 else 1.0] * 6] for x in (-0.5, 0.5))
+    network = S2R(
+        layers=((weight, np.array([0.0, -4.0, 0.0, 0.0, 0.0, 0.1], np.float32)),),
+        input_low=np.float32(np.r_[low, np.full(n_springs, 0.05)]),
+        input_high=np.float32(np.r_[high, np.full(n_springs, 0.35)]),
+        output_low=-bound,
+        output_high=bound,
+        anchors=np.zeros((1, 9 + n_springs), np.float32),
+        limit=np.float32(1.0),
+    )
+    plain, real = ReachEnv(SHORT_ARM, config), ReachEnv(SHORT_ARM, config, network)
+    keys = jax.random.split(jax.random.PRNGKey(0), 16)
+    actions = jax.random.uniform(jax.random.PRNGKey(1), (16, n_springs), minval=-0.5, maxval=0.5)
+    starts = [xla.jit(jax.vmap(e.reset))(keys) for e in (plain, real)]
+    ends = [xla.jit(jax.vmap(e.step))(s, actions) for e, s in zip((plain, real), starts, strict=True)]
+    assert ends[0].info["valid"].all()
+    for one, other in (starts, ends):
+        arm, seen = one.pipeline_state, other.pipeline_state
+        for name in ("spring_m", "pressure_kpa"):
+            np.testing.assert_allclose(getattr(seen, name), getattr(arm, name), rtol=1e-5, atol=1e-6)
+        shift_mm = 30.0 * (arm.spring_m[:, 0] - 0.2) / 0.15  # of the true lengths, not the noisy readings
+        np.testing.assert_allclose(seen.pose[:, 0] - arm.pose[:, 0], shift_mm, atol=0.01)
+        np.testing.assert_allclose(seen.pose[:, 1] - arm.pose[:, 1], -4.0, atol=0.01)
+        assert np.abs(seen.pose[:, 3:] - arm.pose[:, 3:]).max() > 1.0
+        np.testing.assert_allclose(other.obs, real.observe(seen.pose, seen.goal), atol=1e-5)
+    shift_mm = 30.0 * (plain.pool.spring_m[:, 0] - 0.2) / 0.15
+    np.testing.assert_allclose(real.pool.pose[:, 0] - plain.pool.pose[:, 0], shift_mm, atol=0.01)
+    goal = ends[1].pipeline_state.goal
+    assert np.isin(goal[:, 0], real.pool.pose[:, 0]).all()
+    tip_mm = np.linalg.norm(ends[1].pipeline_state.pose[:, :3] - goal[:, :3], axis=1)
+    np.testing.assert_allclose(ends[1].metrics["tip_error_mm"], tip_mm, rtol=1e-4)
 
 
 # --- action <-> frequency <-> length -----------------------------------------------------------------------

@@ -95,6 +95,20 @@ def test_training_takes_the_folder(calibrated, tmp_path, monkeypatch):
     np.testing.assert_array_equal(env.pool.spring_m, plain.pool.spring_m)
 
 
+def test_training_tells_that_a_folder_has_no_network(calibrated, tmp_path, monkeypatch, capsys):
+    from train import run as train_run
+    from train.__main__ import main as train_main
+
+    seen = {}
+    monkeypatch.setattr(train_run, "train", lambda run, env, console: seen.update(env=env))
+    monkeypatch.setattr("train.__main__._show", lambda *_: None)
+    shutil.copy(calibrated[1] / "arm.toml", tmp_path)
+    small = ["--set", "env.n_poses=64", "--out", str(tmp_path / "run")]
+    assert train_main(["reach", "--calibration", str(tmp_path), *small]) == 0
+    assert f"no {tmp_path / 's2r.npz'}: training on simulated poses" in capsys.readouterr().out
+    assert seen["env"].s2r is None
+
+
 def test_logs_without_poses_or_ruler_say_what_is_missing(demo, tmp_path, capsys):
     """Springs alone: the rest of the arm stays as specified, nothing is invented."""
     springs = tmp_path / "springs.csv"
