@@ -86,8 +86,8 @@ def fit(model: Model, problem: Problem) -> Solution:
                 x, (error, jacobian), damping = x + step, tried, 0.1 * damping
             else:
                 damping *= 10.0
-            if np.abs(step / problem.prior).max() < SMALL_STEP:
-                converged = True
+            if np.abs(step / problem.prior).max() < SMALL_STEP:  # small by damping alone is no end
+                converged = bool(np.abs(np.linalg.solve(hessian, slope) / problem.prior).max() < SMALL_STEP)
                 break
         scale = _scales(error, problem)
     covariance = _covariance(_weigh(error, jacobian, scale, problem), problem)
