@@ -10,11 +10,13 @@ import argparse
 import importlib
 import json
 import sys
+from pathlib import Path
 
 NAMES = {
     "throughput": "env steps/s of both engines, start-up time with an empty and a filled cache",
     "settle": "error of the settled arm over Newton iterations, solves/s",
     "learner": "gradient updates/s against SBX's TQC",
+    "calibration": "errors of springs, chambers and sim-to-real network on real logs and a planted arm",
     "learning": "tip errors of the presets over seeds, from finished runs",
 }
 PAPER = "the paper's experiments on twins, in hours; it goes alone: paper --help"
@@ -30,6 +32,9 @@ def main() -> int:
     )
     parser.add_argument("names", nargs="*", choices=[[], *NAMES], metavar="NAME")
     parser.add_argument("--runs", nargs="*", default=[], help="folders of finished runs, for learning")
+    parser.add_argument(
+        "--data", type=Path, default=Path("../shared/data"), help="folder of the real logs, for calibration"
+    )
     options = parser.parse_args()
     if not options.names:
         parser.print_help()
@@ -39,7 +44,8 @@ def main() -> int:
         parser.error("learning: needs --runs FOLDER [FOLDER ...]")
     for name in options.names:
         module = importlib.import_module(f"benchmarks.{name}")
-        figures = module.measure(options.runs) if name == "learning" else module.measure()
+        given = {"learning": [options.runs], "calibration": [options.data]}.get(name, [])
+        figures = module.measure(*given)
         print(json.dumps(figures, indent=2))
         print(f"written: {save(name, figures)}")
     return 0

@@ -62,7 +62,8 @@ def test_verdict_names_the_parts_with_warnings():
 
 
 def test_names_and_findings_are_text_not_markup():
-    page = Page(to_html("<b>arm</b>", make_parts(("<i>",)), ["a.csv: <script>alert(1)</script>"], {"x": "<u>"}))
+    findings = ["a.csv: <script>alert(1)</script>"]
+    page = Page(to_html("<b>arm</b>", make_parts(("<i>",)), findings, {"x": "<u>"}))
     assert page.texts["h1"] == ["Calibration of <b>arm</b>"]
     assert set(page.texts) <= {"h1", "h2", "p", "td", "th", "li", "pre", "title", "style"}
     assert "a.csv: <script>alert(1)</script>" in page.texts["li"]

@@ -1,14 +1,13 @@
 """The sim-to-real fit on a planted arm and on the logs of a real trunk."""
 
 import functools
-import itertools
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 
-from calib.adapters import read_trunk
+from benchmarks.calibration import trunk_errors
 from calib.blocks import held_out_blocks
 from calib.network import NetworkConfig, fit_network
 from calib.s2r import fit_s2r, pose_errors, simulate_poses
@@ -22,8 +21,8 @@ from mjx_softarm.workspace import sample_workspace
 
 N_ROWS, N_CLEAN = 1_000, 500
 BRIEF = NetworkConfig(hidden=(16,), n_members=2, n_updates=100)
-TRUNK = Path(__file__).parents[2].parent / "shared/data/asl_trunk"
-needs_trunk = pytest.mark.skipif(not TRUNK.is_dir(), reason=f"no trunk logs in {TRUNK}")
+DATA = Path(__file__).parents[2].parent / "shared/data"
+needs_data = pytest.mark.skipif(not DATA.is_dir(), reason=f"no logs of a real trunk in {DATA}")
 
 
 def measured(pose, rng, noise_mm=0.5, noise_deg=0.3):
@@ -188,71 +187,21 @@ def test_a_constant_input_and_a_constant_output_do_no_harm():
     assert np.sqrt(np.mean((fitted - y) ** 2)) < 0.02
 
 
-def polynomial(x, y, train, degree):
-    """Least squares on `train` rows by standardised inputs, predicted for all."""
-    z = (x - x[train].mean(axis=0)) / x[train].std(axis=0)
-    powers = [
-        list(chosen)
-        for d in range(degree + 1)
-        for chosen in itertools.combinations_with_replacement(range(x.shape[1]), d)
-    ]
-    terms = np.stack([z[:, chosen].prod(axis=1) for chosen in powers], axis=1)
-    return terms @ np.linalg.lstsq(terms[train], y[train], rcond=None)[0]
+@needs_data
+def test_polynomials_of_the_data_s_own_page():
+    """Their figures come back from the same blocks, so the network is compared with what it should be."""
+    errors = trunk_errors(DATA, "1", functools.partial(held_out_blocks, seed=1), history=False)
+    expected = [19.4, 12.3, 9.2]
+    np.testing.assert_allclose([errors[x] for x in ("linear", "quadratic", "cubic")], expected, atol=0.35)
 
 
-def motor_angles(measured_deg):
-    """Angles (n, 6) [deg] at the time of each row, from this row and those before.
-
-    The motors are read every 5 rows or so and their angles repeated in between, while the tip moves up to
-    2.5 mm a row. So the last two readings are continued by a straight line, taken as one row late.
-    """
-    row = np.arange(len(measured_deg))
-    read = np.flatnonzero(np.r_[True, (np.diff(measured_deg, axis=0) != 0.0).any(axis=1)])
-    last = np.searchsorted(read, row, side="right") - 1
-    now, before = read[last], read[np.maximum(last - 1, 0)]
-    rate = (measured_deg[now] - measured_deg[before]) / np.maximum(now - before, 1)[:, None]
-    return measured_deg[now] + rate * (row - now - 1)[:, None]
-
-
-def trunk_errors(name, held_out, read_angles=motor_angles):
-    """Tip error, 3D RMSE [mm] on fresh held-out rows: linear, cubic, network on top of linear.
-
-    Motor angles stand in for the springs, the linear model for the simulator.
-    """
-    log, _ = read_trunk(TRUNK / name)
-    x, tip_mm = read_angles(log.motor_deg), 1e3 * log.position_m[:, -1]
-    held_out = held_out(len(x))
-    train, test = ~held_out & log.fresh, held_out & log.fresh
-    linear, cubic = (polynomial(x, tip_mm, train, degree) for degree in (1, 3))
-    network = fit_network(x[train], (tip_mm - linear)[train], seed=0).network
-    predictions = (linear, cubic, linear + correction(network, x))
-    return [np.sqrt(np.mean(np.sum((p - tip_mm)[test] ** 2, axis=1))) for p in predictions]
-
-
-@needs_trunk
-def test_cubic_polynomial_of_the_data_s_own_page():
-    log, _ = read_trunk(TRUNK / "observations_controlled_1.csv")
-    tip_mm, held_out = 1e3 * log.position_m[:, -1], held_out_blocks(len(log.row), seed=1)
-    train, test = ~held_out & log.fresh, held_out & log.fresh
-    errors = [
-        np.sqrt(np.mean(np.sum((polynomial(log.motor_deg, tip_mm, train, d) - tip_mm)[test] ** 2, axis=1)))
-        for d in (1, 2, 3)
-    ]
-    np.testing.assert_allclose(errors, [19.4, 12.3, 9.2], atol=0.35)
-
-
-@needs_trunk
+@needs_data
 def test_real_trunk_beats_the_cubic_polynomial():
-    linear, cubic, network = trunk_errors(
-        "observations_controlled_1.csv", functools.partial(held_out_blocks, seed=1)
-    )
-    assert network <= 7.5 < cubic < linear
+    errors = trunk_errors(DATA, "1", functools.partial(held_out_blocks, seed=1))
+    assert errors["network"] <= 7.5 < errors["cubic"] < errors["linear"]
 
 
-@needs_trunk
+@needs_data
 def test_real_trunk_does_not_blow_up_outside_of_its_training_rows():
-    def last_fifth(n):
-        return np.arange(n) >= 0.8 * n
-
-    linear, cubic, network = trunk_errors("observations_controlled_11.csv", last_fifth)
-    assert network < linear < 100.0 < cubic
+    errors = trunk_errors(DATA, "11", lambda n: np.arange(n) >= 0.8 * n)
+    assert errors["network"] < errors["linear"] < 100.0 < errors["cubic"]
