@@ -11,9 +11,10 @@ import argparse
 import sys
 from pathlib import Path
 
-from calib.checks import Finding
+from calib.checks import Finding, FitError, LogError
+from mjx_softarm.archive import SealedFileError
 from mjx_softarm.logs import Log
-from mjx_softarm.spec import ArmSpec
+from mjx_softarm.spec import ArmSpec, SpecError
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -21,7 +22,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     try:
         return options.command(options)
-    except (ValueError, FileExistsError) as error:  # of logs, specification or a fit
+    except (LogError, FitError, SpecError, SealedFileError, FileExistsError) as error:
         print(f"error: {error}", file=sys.stderr)
     except OSError as error:
         print(f"error: {error.filename}: {error.strerror}", file=sys.stderr)
@@ -41,14 +42,24 @@ def _parser() -> argparse.ArgumentParser:
     check.set_defaults(command=_check)
     demo = commands.add_parser("demo", help="write logs of a planted arm, to try everything without hardware")
     demo.add_argument("--out", type=Path, default=Path("calib-demo"), help="folder; default: calib-demo")
-    demo.add_argument("--seed", type=int, default=0, help="of the arm and the noise; default: 0")
+    demo.add_argument("--seed", type=_seed, default=0, help="of the arm and the noise; default: 0")
     demo.set_defaults(command=_demo)
     run = commands.add_parser("run", help="calibrate springs, chambers, damping and the sim-to-real network")
     _add_logs(run)
     run.add_argument("--out", type=Path, default=Path("calibration"), help="folder; default: calibration")
-    run.add_argument("--seed", type=int, default=0, help="of all that is drawn; default: 0")
+    run.add_argument("--shared-springs", action="store_true", help="one beta and delta for all springs")
+    run.add_argument(
+        "--fit-compensation", action="store_true", help="fit the circuit's compensation inductance, too"
+    )
+    run.add_argument("--seed", type=_seed, default=0, help="of all that is drawn; default: 0")
     run.set_defaults(command=_run)
     return parser
+
+
+def _seed(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"got {text!r}, expected a whole number from 0")
+    return int(text)
 
 
 def _add_logs(parser: argparse.ArgumentParser) -> None:
@@ -94,7 +105,8 @@ def _run(options: argparse.Namespace) -> int:
     spec = _spec(options)
     logs, findings = _read(options, spec)
     xla.enable_compilation_cache()
-    calibration = calibrate(logs, spec, options.seed, lambda text: print(text, flush=True))
+    springs = {"shared": options.shared_springs, "fit_compensation": options.fit_compensation}
+    calibration = calibrate(logs, spec, options.seed, springs, lambda text: print(text, flush=True))
     write_calibration(options.out, calibration, [str(finding) for finding in findings], provenance("calib"))
     for part in calibration.parts:
         for warning in part.warnings:

@@ -23,6 +23,7 @@ import jax
 import numpy as np
 
 from calib.blocks import held_out_blocks
+from calib.checks import FitError
 from calib.equilibrium import Measured, residuals
 from calib.leastsquares import Problem, Solution, fit, principal
 from calib.rests import HOLD_KPA, Rests, find_rests
@@ -116,13 +117,13 @@ def calibrate_chambers(logs: Log | Sequence[Log], spec: ArmSpec, seed: int = 0) 
         seed: chooses the poses that are held out, in contiguous blocks.
 
     Raises:
-        ValueError: a log without pressures or tip poses, or too few poses at rest.
+        FitError: a log without pressures or tip poses, or too few poses at rest.
         SpecError: the calibrated numbers are not those of an arm.
     """
     rests, rows = find_rests([logs] if isinstance(logs, Log) else logs, spec)
     if rests.n < MIN_POSES:
         fates = ", ".join(f"{count} {fate}" for fate, count in rows.items())
-        raise ValueError(
+        raise FitError(
             f"chambers: got {rests.n} poses at rest, expected {MIN_POSES} or more; rows of the logs: {fates}"
         )
     rests = rests._replace(pressure_kpa=_held_or_changing(rests.pressure_kpa))

@@ -19,6 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from calib.checks import FitError
 from calib.rests import Rests
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
 from mjx_softarm.statics import ArmParams
@@ -52,17 +53,17 @@ def marker_limits(rests: Rests, simulated_m: np.ndarray, spec: ArmSpec) -> Marke
         spec: the arm.
 
     Raises:
-        ValueError: fewer than five markers, no pose that has them, or the last is not at the tip's plate.
+        FitError: fewer than five markers, no pose that has them, or the last is not at the tip's plate.
     """
     n_markers = rests.marker_m.shape[1]
     if n_markers < MIN_MARKERS or n_markers % spec.structure.n_sections:
-        raise ValueError(
+        raise FitError(
             f"markers: got {n_markers}, expected {MIN_MARKERS} or more, as many in each of "
             f"{spec.structure.n_sections} sections"
         )
     seen = np.flatnonzero(np.isfinite(rests.marker_m).all(axis=(1, 2)))
     if len(seen) == 0:
-        raise ValueError("markers: no pose at rest has them, expected one or more")
+        raise FitError("markers: no pose at rest has them, expected one or more")
     site_m = _marker_site(rests.take(seen))
     bending_deg = np.degrees(np.arccos(np.clip(rests.tip_rotation[seen, 2, 2], -1.0, 1.0)))
     order = np.argsort(-bending_deg)[:N_POSES]
@@ -141,7 +142,7 @@ def _marker_site(rests: Rests) -> np.ndarray:
     seen = np.einsum("nij,ni->nj", rests.tip_rotation, rests.marker_m[:, -1] - rests.tip_m)
     site_m = np.median(seen, axis=0)
     if abs(site_m[2]) > MAX_OFF_PLATE_M:
-        raise ValueError(
+        raise FitError(
             f"markers: the last is {1e3 * site_m[2]:+.1f} mm above the tip's plate, expected in it, within "
             f"{1e3 * MAX_OFF_PLATE_M:.0f} mm"
         )

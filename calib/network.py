@@ -19,6 +19,7 @@ import optax
 from jax import Array
 
 from calib.blocks import held_out_blocks
+from calib.checks import FitError
 from mjx_softarm.mlp import Layer, mlp
 from mjx_softarm.s2r import S2R
 
@@ -68,7 +69,7 @@ def fit_network(x: np.ndarray, y: np.ndarray, seed: int, config: NetworkConfig |
         config: how to train.
 
     Raises:
-        ValueError: fewer than two rows, arrays that do not fit together, or a number that is not finite.
+        FitError: fewer than two rows, arrays that do not fit together, or a number that is not finite.
     """
     config = config or NetworkConfig()
     _check(x, y)
@@ -109,12 +110,12 @@ def fit_network(x: np.ndarray, y: np.ndarray, seed: int, config: NetworkConfig |
 
 def _check(x: np.ndarray, y: np.ndarray) -> None:
     if x.ndim != 2 or y.ndim != 2 or len(x) != len(y) or len(x) < 2:
-        raise ValueError(f"network: expected two tables of as many rows, 2 or more; got {x.shape}, {y.shape}")
+        raise FitError(f"network: expected two tables of as many rows, 2 or more; got {x.shape}, {y.shape}")
     for name, table in (("inputs", x), ("outputs", y)):
         if not np.isfinite(table).all():
             row, column = np.argwhere(~np.isfinite(table))[0]
             value = table[row, column]
-            raise ValueError(
+            raise FitError(
                 f"network: {name}, row {row}, column {column}: expected a finite number, got {value}"
             )
 

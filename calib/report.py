@@ -88,7 +88,7 @@ def page(title: str, first: str, parts: Sequence[Part], last: str, provenance: d
 def _verdict(parts: Sequence[Part]) -> str:
     doubtful = [part.title for part in parts if part.warnings]
     if not doubtful:
-        return '<p class="good">Every step met its own checks on data that it was not fitted to.</p>'
+        return '<p class="good">Every fitted step met its own checks on data that it was not fitted to.</p>'
     return f'<p class="bad">Look at {html.escape(", ".join(doubtful))} before you trust this.</p>'
 
 

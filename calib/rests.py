@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from calib.checks import FitError
 from mjx_softarm.logs import Log
 from mjx_softarm.pose import rotation_from_quaternion
 from mjx_softarm.sensors import SensorFault, SensorParams, length_from_frequency
@@ -64,7 +65,7 @@ def find_rests(logs: Sequence[Log], spec: ArmSpec) -> tuple[Rests, dict[str, int
         The poses, and for each fate of a row, the number of rows that met it.
 
     Raises:
-        ValueError: a log without pressures or tip poses, or of another number of chambers.
+        FitError: a log without pressures or tip poses, or of another number of chambers.
     """
     n_markers = max((log.marker_m.shape[1] for log in logs if log.marker_m is not None), default=0)
     fates = {"used": 0, "not finite": 0, "pressures not held long enough": 0, "tip still moving": 0}
@@ -166,10 +167,8 @@ def _moves(time_s: np.ndarray, tip_m: np.ndarray) -> bool:
 def _check(log: Log, spec: ArmSpec) -> None:
     for name in ("pressure_kpa", "tip_m", "tip_quaternion"):
         if getattr(log, name) is None:
-            raise ValueError(f"{log.source}: no {name}, expected pressures and tip poses to fit chambers to")
+            raise FitError(f"{log.source}: no {name}, expected pressures and tip poses to fit chambers to")
     for name in ("pressure_kpa", "spring_m", "frequency_hz"):
         value = getattr(log, name)
         if value is not None and value.shape[1] != spec.n_chambers:
-            raise ValueError(
-                f"{log.source}: {name}: got {value.shape[1]} columns, expected {spec.n_chambers}"
-            )
+            raise FitError(f"{log.source}: {name}: got {value.shape[1]} columns, expected {spec.n_chambers}")

@@ -15,12 +15,14 @@ import dataclasses
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from calib import parts
 from calib.chambers import MIN_POSES, calibrate_chambers
+from calib.checks import FitError
 from calib.logs import same_arm
 from calib.markers import marker_limits
 from calib.report import Part, to_html, to_json
@@ -51,7 +53,11 @@ class Calibration:
 
 
 def calibrate(
-    logs: Sequence[Log], spec: ArmSpec, seed: int = 0, tell: Callable[[str], None] = lambda text: None
+    logs: Sequence[Log],
+    spec: ArmSpec,
+    seed: int = 0,
+    of_springs: Mapping[str, bool] = MappingProxyType({}),
+    tell: Callable[[str], None] = lambda text: None,
 ) -> Calibration:
     """Fit all that the logs allow.
 
@@ -59,14 +65,16 @@ def calibrate(
         logs: of one arm; see `calib.logs.read_log`.
         spec: what is believed of the arm so far.
         seed: of all that is drawn.
+        of_springs: `shared` and `fit_compensation` of `calib.sensors.fit_springs`.
         tell: takes a line before each step.
 
     Raises:
         LogError: the logs are of different arms.
+        FitError: a fit cannot be made of what the logs hold.
     """
     same_arm(logs)
     tell("springs ...")
-    spec, springs = _springs(logs, spec, seed)
+    spec, springs = _springs(logs, spec, seed, of_springs)
     seen = [log for log in logs if not any(getattr(log, name) is None for name in OF_POSES)]
     tell("chambers ...")
     spec, chambers = _chambers(seen, spec, seed)
@@ -112,7 +120,7 @@ def write_calibration(
         shutil.rmtree(part, ignore_errors=True)
 
 
-def _springs(logs: Sequence[Log], spec: ArmSpec, seed: int) -> tuple[ArmSpec, Part]:
+def _springs(logs: Sequence[Log], spec: ArmSpec, seed: int, how: Mapping[str, bool]) -> tuple[ArmSpec, Part]:
     pairs = [
         (log.frequency_hz, log.spring_m)
         for log in logs
@@ -122,9 +130,9 @@ def _springs(logs: Sequence[Log], spec: ArmSpec, seed: int) -> tuple[ArmSpec, Pa
         needed = f"{NOT_FITTED} No log has both frequencies and measured spring lengths."
         return spec, Part("Springs", needed, warnings=("beta and delta are not this arm's",))
     frequency_hz, length_m = (np.concatenate(x) for x in zip(*pairs, strict=True))
-    fit = fit_springs(frequency_hz, length_m, SensorParams.from_spec(spec), seed=seed)
+    fit = fit_springs(frequency_hz, length_m, SensorParams.from_spec(spec), seed=seed, **how)
     sensor = {"beta": tuple(map(float, fit.beta)), "delta_m": tuple(map(float, fit.delta_m))}
-    spec = spec.replace(sensor=sensor)
+    spec = spec.replace(sensor=sensor | {"compensation_h": fit.compensation_h})
     calibrated = length_from_frequency(frequency_hz, SensorParams.from_spec(spec), np.nan)
     return spec, parts.springs(fit, calibrated.length_m, length_m)
 
@@ -139,7 +147,7 @@ def _chambers(logs: Sequence[Log], spec: ArmSpec, seed: int) -> tuple[ArmSpec, P
     if fit.rests.marker_m.shape[1]:
         try:
             part = parts.with_markers(part, marker_limits(fit.rests, fit.chamber_m, fit.spec))
-        except ValueError as error:  # markers only check, so a calibration does not fail for them
+        except FitError as error:  # markers only check, so a calibration does not fail for them
             part = dataclasses.replace(part, warnings=(*part.warnings, str(error)))
     return fit.spec, part
 

@@ -18,6 +18,7 @@ import jax
 import numpy as np
 
 from calib.blocks import held_out_blocks
+from calib.checks import FitError
 from calib.network import NetworkConfig, block_rows, fit_network
 from mjx_softarm.kinematics import chain_frames
 from mjx_softarm.pose import pose_from_frame
@@ -79,16 +80,16 @@ def simulate_poses(spec: ArmSpec, reference_m: np.ndarray) -> SimulatedPoses:
         reference_m (n, n_chambers) [m]: spring lengths that the real arm had.
 
     Raises:
-        ValueError: a wrong number of columns, no row, or a length that is not finite.
+        FitError: a wrong number of columns, no row, or a length that is not finite.
     """
     reference = np.asarray(reference_m, np.float32)
     if reference.ndim != 2 or reference.shape[1] != spec.n_chambers or not len(reference):
         expected = f"(n, {spec.n_chambers}) with n at least 1"
-        raise ValueError(f"spring lengths: got an array {reference.shape}, expected {expected}")
+        raise FitError(f"spring lengths: got an array {reference.shape}, expected {expected}")
     if not np.isfinite(reference).all():
         row, column = np.argwhere(~np.isfinite(reference))[0]
         value = reference[row, column]
-        raise ValueError(f"spring lengths: row {row}, spring {column}: expected a finite number, got {value}")
+        raise FitError(f"spring lengths: row {row}, spring {column}: expected a finite number, got {value}")
     n, params = len(reference), ArmParams.from_spec(spec)
     limit = np.full(spec.n_chambers, PRESSURE_LIMIT_KPA, np.float32)
     params = params._replace(pressure_min_kpa=-limit, pressure_max_kpa=limit)
@@ -126,12 +127,12 @@ def fit_s2r(
         config: how to train.
 
     Raises:
-        ValueError: arrays that do not fit together, too few rows to hold some out, or numbers not finite.
+        FitError: arrays that do not fit together, too few rows to hold some out, or numbers not finite.
     """
     n = len(pose_sim)
     if np.shape(pose_sim) != (n, 6) or np.shape(pose_real) != (n, 6) or np.shape(spring_m)[:1] != (n,):
         shapes = f"{np.shape(pose_sim)}, {np.shape(spring_m)}, {np.shape(pose_real)}"
-        raise ValueError(f"sim-to-real: got {shapes}, expected (n, 6), (n, n_springs), (n, 6)")
+        raise FitError(f"sim-to-real: got {shapes}, expected (n, 6), (n, n_springs), (n, 6)")
     pose_sim, spring_m, pose_real = (np.asarray(a, np.float64) for a in (pose_sim, spring_m, pose_real))
     held_out = held_out_blocks(n, HELD_OUT_SHARE, block_rows(n), seed)
     x, y = inputs(pose_sim, spring_m), correction_between(pose_sim, pose_real)

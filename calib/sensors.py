@@ -23,6 +23,7 @@ import optax
 from jax import Array
 
 from calib.blocks import folds
+from calib.checks import FitError
 from mjx_softarm.sensors import SensorParams
 
 HUBER = 1.345  # in standard deviations of the noise: 95 % of the efficiency of least squares
@@ -81,7 +82,7 @@ def fit_line(
         seed: chooses which blocks form a fold.
 
     Raises:
-        ValueError: the shapes differ, or a column has fewer than 3 rows or one value of x only.
+        FitError: the shapes differ, or a column has fewer than 3 rows or one value of x only.
     """
     found = _fit(_identity, x, y, np.zeros(0), name, shared, block, seed)
     return found[0]
@@ -107,7 +108,7 @@ def fit_springs(
         block, seed: as in `fit_line`.
 
     Raises:
-        ValueError: the shapes differ, or a spring has fewer than 3 rows or one reading only.
+        FitError: the shapes differ, or a spring has fewer than 3 rows or one reading only.
     """
     frequency_hz = np.asarray(frequency_hz, float)
     believed = (frequency_hz >= params.frequency_min_hz) & (frequency_hz <= params.frequency_max_hz)
@@ -220,14 +221,14 @@ def _fit(feature, x, y, q, name: str, shared: bool, block: int, seed: int):
     """LineFit with regard to feature(x, q); the best q (m,), and its interval (2,) where m is 1."""
     x, y = np.asarray(x, float), np.asarray(y, float)
     if x.shape != y.shape or x.ndim != 2:
-        raise ValueError(f"{name}s: expected two tables of one shape, got {x.shape} and {y.shape}")
+        raise FitError(f"{name}s: expected two tables of one shape, got {x.shape} and {y.shape}")
     n_columns = x.shape[1]
     if shared:  # rows of one time stay neighbours
         x, y, block = x.reshape(-1, 1), y.reshape(-1, 1), block * n_columns
     known = np.isfinite(x) & np.isfinite(y)
     for k, column in enumerate(known.T):
         if column.sum() < 3 or np.ptp(x[column, k]) == 0 or np.ptp(y[column, k]) == 0:
-            raise ValueError(
+            raise FitError(
                 f"{name}{k}: {column.sum()} rows with a reading and a length, expected 3 or more that differ"
             )
     x, unit = np.where(known, x, x[known].mean()), y[known].std()

@@ -46,6 +46,7 @@ PLAUSIBLE: Mapping[str, Plausible] = MappingProxyType(
         "angle": Plausible(-360.0, 360.0),
     }
 )
+BY_HAND_ROWS, BY_HAND_S = 300, 600.0  # so few rows may be poses that somebody recorded at leisure
 HANGS_BELOW_M = -0.05  # of the tip, in the median: the base frame's z is up and the arm hangs
 SENSORS = ("frequency_hz", "spring_m", "pressure_kpa", "tip_m", "marker_m")
 
@@ -147,7 +148,8 @@ def _implausible_column(column: Column, values: np.ndarray) -> str:
         return "no number in the whole column"
     got = _typical(np.diff(values) if column.kind == "time" else values)
     low, high = _bounds(column)
-    if low <= got <= high:
+    by_hand = column.kind == "time" and len(values) < BY_HAND_ROWS and low <= got <= BY_HAND_S
+    if low <= got <= high or by_hand:
         return ""
     factors = UNITS[column.kind]
     factor = factors[column.unit]

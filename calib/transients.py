@@ -21,6 +21,7 @@ import mujoco
 import numpy as np
 
 from calib.blocks import held_out_blocks
+from calib.checks import FitError
 from calib.leastsquares import Problem, fit
 from calib.rests import HOLD_KPA
 from mjx_softarm.logs import Log
@@ -85,17 +86,16 @@ def calibrate_damping(logs: Log | Sequence[Log], spec: ArmSpec, seed: int = 0) -
         seed: chooses the seconds that are held out.
 
     Raises:
-        ValueError: a damping to start from that is zero, or no stretch of a log in which pressures change.
+        FitError: a damping to start from that is zero, or no stretch of a log in which pressures change.
     """
     if not (spec.chambers.damping_ns_per_m > 0 and spec.backbone.bending_damping_nms_per_rad > 0):
-        raise ValueError(
+        raise FitError(
             "damping: expected chambers.damping_ns_per_m and backbone.bending_damping_nms_per_rad above 0, "
             f"got {spec.chambers.damping_ns_per_m:g} and {spec.backbone.bending_damping_nms_per_rad:g}"
-            f"{spec.chambers.damping_ns_per_m:g} and {spec.backbone.bending_damping_nms_per_rad:g}"
         )
     found = find_stretches([logs] if isinstance(logs, Log) else logs, spec)
     if not found:
-        raise ValueError(
+        raise FitError(
             f"damping: no stretch of {FORGOTTEN_S + MIN_COUNTED_S:g} s, sampled every {MAX_STEP_S:g} s or "
             "faster, in which pressures change"
         )

@@ -149,6 +149,21 @@ def test_check_takes_the_arm_s_number_of_chambers(demo, tmp_path, capsys):
     assert main(["check", str(tmp_path / "six.csv"), "--spec", str(tmp_path / "six.toml")]) == 0
 
 
+def test_circuit_and_shared_springs(demo, tmp_path):
+    out = tmp_path / "out"
+    assert main(["run", demo[0], "--out", str(out), "--fit-compensation", "--shared-springs"]) == 1
+    sensor, default = ArmSpec.from_toml(out / "arm.toml").sensor, ArmSpec.default().sensor
+    assert len(set(sensor.beta)) == len(set(sensor.delta_m)) == 1
+    assert sensor.compensation_h != default.compensation_h
+
+
+@pytest.mark.parametrize("seed", ["-1", "x"])
+def test_seeds_are_whole_numbers(seed, demo, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        main(["run", demo[0], f"--seed={seed}"])
+    assert f"argument --seed: got '{seed}', expected a whole number from 0" in capsys.readouterr().err
+
+
 def test_template_is_a_log(tmp_path, capsys):
     path = tmp_path / "log.csv"
     assert main(["template", str(path)]) == 0

@@ -512,6 +512,16 @@ def test_logs_of_one_arm_and_of_two():
     same_arm([bare, first])  # a log need not have everything
 
 
+def test_poses_recorded_by_hand_may_be_far_apart(tmp_path):
+    slow = arm_log(n=40, rate_hz=1 / 30)
+    write_log(tmp_path / "slow.csv", slow)
+    assert len(read_log(tmp_path / "slow.csv")[0]) > 30
+    long = arm_log(n=600, rate_hz=1 / 20)  # 50 Hz in milliseconds
+    write_log(tmp_path / "long.csv", long)
+    with pytest.raises(LogError, match=r"time: median step 20 s \(plausible in ms\)"):
+        read_log(tmp_path / "long.csv")
+
+
 def test_too_few_rows_left_are_refused_with_the_reasons(file):
     path = file(**planted("spring_m", slice(1, None), np.nan, 0))
     with pytest.raises(LogError, match="spring0: 399 x NaN or inf.*\n.*1 rows left, expected 2 at least"):

@@ -56,7 +56,7 @@ def test_page_shows_every_part_with_its_figures_and_needs_no_other_file():
 
 def test_verdict_names_the_parts_with_warnings():
     good, bad = (Page(to_html("x", make_parts(w), [], {})) for w in ((), ("spring 3: too short a range",)))
-    assert good.texts["p"][0].startswith("Every step met its own checks")
+    assert good.texts["p"][0].startswith("Every fitted step met")
     assert bad.texts["p"][0] == "Look at Springs before you trust this."
     assert "spring 3: too short a range" in bad.texts["li"]
 
