@@ -170,13 +170,22 @@ def test_one_network_says_the_mean_of_its_members():
             (
                 (w0[:, 8 * k : 8 * k + 8], b0[8 * k : 8 * k + 8]),
                 (w1[8 * k : 8 * k + 8, 4 * k : 4 * k + 4], b1[4 * k : 4 * k + 4]),
-                (3.0 * w2[4 * k : 4 * k + 4], b2),
+                (3.0 * w2[4 * k : 4 * k + 4], 0.0),
             ),
             z,
         )
         for k in range(3)
     ]
-    np.testing.assert_allclose(mlp(network.layers, z), np.mean(members, axis=0), rtol=1e-5, atol=1e-5)
+    expected = np.mean(members, axis=0) + (z + 1.0) @ w2[-2:] + b2
+    np.testing.assert_allclose(mlp(network.layers, z), expected, rtol=1e-5, atol=1e-5)
+
+
+def test_a_straight_line_is_learned_exactly_enough():
+    """The line goes through the network's layers; what is left to the members is nothing."""
+    x = np.random.default_rng(0).uniform(-3.0, 5.0, (500, 3))
+    y = x @ [[2.0], [-1.0], [0.3]] + 7.0
+    fitted = correction(fit_network(x, y, 0, NetworkConfig(n_updates=50)).network, x)
+    assert np.abs(fitted - y).max() < 0.02 * np.ptp(y)
 
 
 def test_a_constant_input_and_a_constant_output_do_no_harm():
