@@ -15,6 +15,7 @@ from mjx_softarm.deploy import PolicyRunner, load_policy
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.export import policy_from_actor, save_policy
 from mjx_softarm.rewards import RewardConfig
+from mjx_softarm.workspace import Pool
 from train.networks import Actor, mode
 
 N = 1000
@@ -77,7 +78,8 @@ def test_loads_and_acts_without_jax(file):
 
 
 def test_equals_actor_and_environment_in_jax(spec, actor_params, runner, poses, monkeypatch):
-    monkeypatch.setattr("mjx_softarm.env.sample_workspace", lambda *_: None)  # the arm does not move here
+    nowhere = Pool(*[np.zeros((1, 6))] * 4)  # the arm does not move here
+    monkeypatch.setattr("mjx_softarm.env.sample_workspace", lambda *_: nowhere)
     env = ReachEnv(spec)
     action = mode(Actor(9).apply(actor_params, env.observe(*map(jnp.asarray, poses)))[0])
     reference = runner.act(*poses)
