@@ -33,13 +33,12 @@ from calib.transients import calibrate_damping, find_stretches
 from mjx_softarm.logs import Log
 from mjx_softarm.pose import pose_from_frame
 from mjx_softarm.provenance import write_json
-from mjx_softarm.s2r import S2R, save_s2r
+from mjx_softarm.s2r import S2R, S2R_FILE, save_s2r
 from mjx_softarm.sensors import SensorParams, length_from_frequency
-from mjx_softarm.spec import ArmSpec
+from mjx_softarm.spec import ARM_FILE, ArmSpec
 
 OF_POSES = ("pressure_kpa", "tip_m", "tip_quaternion")  # what a log of poses must have
 MIN_S2R_POSES = 60
-ARM_FILE, S2R_FILE = "arm.toml", "s2r.npz"
 NOT_FITTED = "Not fitted: the specification's values stay."
 
 

@@ -27,6 +27,7 @@ from mjx_softarm.pose import frame_from_pose, pose_from_frame, rotation_from_qua
 N_POSE_INPUTS = 9  # position and two columns of the rotation
 N_POSE_OUTPUTS = 6  # change of the position, Gibbs vector
 KIND = "s2r"
+S2R_FILE = "s2r.npz"  # in the folder of a calibration, and of a run that was trained with it
 
 
 class S2R(NamedTuple):

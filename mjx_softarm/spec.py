@@ -20,6 +20,7 @@ from mjx_softarm._fields import SpecError, anything, count, not_negative, positi
 from mjx_softarm.sensors import frequency_range_hz
 
 N_CHAMBERS_PER_SECTION = 3
+ARM_FILE = "arm.toml"  # in the folder of a calibration
 
 PerChamber = float | tuple[float, ...]
 

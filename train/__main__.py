@@ -15,9 +15,9 @@ from rich.console import Console
 from rich.table import Table
 
 from mjx_softarm.archive import SealedFileError
-from mjx_softarm.s2r import S2R, load_s2r
-from mjx_softarm.spec import ArmSpec, SpecError
-from train.checkpoint import S2R_FILE, Run, RunError
+from mjx_softarm.s2r import S2R, S2R_FILE, load_s2r
+from mjx_softarm.spec import ARM_FILE, ArmSpec, SpecError
+from train.checkpoint import Run, RunError
 from train.config import PRESETS, ConfigError, override
 from train.evaluate import N_ACTIONS, N_GOALS, Summary
 
@@ -104,7 +104,7 @@ def _arm(options: argparse.Namespace, console: Console) -> tuple[ArmSpec, S2R | 
         return ArmSpec.from_toml(options.spec) if options.spec else ArmSpec.default(), None
     if options.spec:
         raise ConfigError(f"--spec {options.spec}: got --calibration {options.calibration} too, expected one")
-    spec, file = ArmSpec.from_toml(options.calibration / "arm.toml"), options.calibration / S2R_FILE
+    spec, file = ArmSpec.from_toml(options.calibration / ARM_FILE), options.calibration / S2R_FILE
     if file.exists():
         return spec, load_s2r(file, spec.n_chambers)
     console.print(f"no {file}: training on simulated poses", highlight=False, soft_wrap=True)

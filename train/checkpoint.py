@@ -11,13 +11,12 @@ import jax
 import orbax.checkpoint as ocp
 
 from mjx_softarm.provenance import provenance, write_json
-from mjx_softarm.s2r import S2R, load_s2r, save_s2r
+from mjx_softarm.s2r import S2R, S2R_FILE, load_s2r, save_s2r
 from mjx_softarm.spec import ArmSpec
 from train.config import TrainConfig, from_dict, to_dict
 from train.job import TrainState
 
 N_KEPT = 2
-S2R_FILE = "s2r.npz"  # in the folder of a run, and in that of a calibration
 
 
 class RunError(ValueError):
