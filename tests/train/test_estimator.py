@@ -24,7 +24,7 @@ N, N_ARMS = SPEC.n_chambers, 512
 
 
 def small(monkeypatch, n_steps):
-    monkeypatch.setattr(module, "N_TRAINING", 4096)
+    monkeypatch.setattr(module, "N_TRAINING", 8192)
     monkeypatch.setattr(module, "N_HELD_OUT", 512)
     monkeypatch.setattr(module, "N_STEPS", n_steps)
 
@@ -32,7 +32,7 @@ def small(monkeypatch, n_steps):
 @pytest.fixture(scope="module")
 def distilled():
     with pytest.MonkeyPatch.context() as monkeypatch:
-        small(monkeypatch, 1500)
+        small(monkeypatch, 3000)
         return distil(SPEC, 0)
 
 
@@ -50,7 +50,7 @@ def test_tips_are_those_of_c_mujoco(distilled, pool):
         mujoco.mj_forward(model, data)
         frame = estimate_frame(distilled.estimator, data.ten_length[1::2])
         away_mm.append(1e3 * np.linalg.norm(frame.position_m - data.site("tip").xpos))
-    assert np.median(away_mm) < 1.5 and max(away_mm) < 10.0  # 0.4 and 1.5 mm after all of the training
+    assert np.median(away_mm) < 1.5 and max(away_mm) < 10.0  # 0.6 and 2.2 mm after all of the training
     assert np.median(away_mm) == pytest.approx(distilled.tip_mm[0.0].median, rel=0.25)
 
 
@@ -133,5 +133,5 @@ def test_lost_chambers_are_found(distilled, pool, payload_kg, share):
 @pytest.mark.slow
 def test_all_of_the_training_is_worth_it():
     errors = distil(SPEC, 0).tip_mm
-    assert errors[0.0].median < 0.5 and errors[0.0].p95 < 1.0
+    assert errors[0.0].median < 0.8 and errors[0.0].p95 < 1.6  # 0.5 and 1.0 without the pressure beyond
     assert errors[0.5].median < 3.5
