@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from benchmarks.paper_measure import Followed
 from benchmarks.paper_stages import METHODS, Case
 from benchmarks.paper_summary import PAPER_LOADS_MM
-from train.plots import BLUE, GREY, INK, ORANGE
+from train.plots import BLUE, GREY, INK, ORANGE, dress
 
 COLOURS = {"without": ORANGE, "with": BLUE, "gradient": "#2a9d6f"}
 RED = "#c43333"
@@ -31,7 +31,7 @@ def circle_figure(results: Results) -> Figure:
     figure = Figure(figsize=(4.0 * len(twins) + 0.4, 3.9), layout="constrained")
     panels = figure.subplots(1, len(twins), squeeze=False, sharex=True, sharey=True)[0]
     for panel, twin in zip(panels, twins, strict=True):
-        _dress(panel, f"twin {twin}, from above", "x [mm]", "y [mm]")
+        dress(panel, f"twin {twin}, from above", "x [mm]", "y [mm]")
         for method, name in METHODS.items():
             followed = results[Case(method, twin, seed)]
             if method == "without":
@@ -56,7 +56,7 @@ def error_figure(results: Results) -> Figure:
     panels = figure.subplots(2, 2).ravel()
     titles = ("translation", "yaw", "pitch", "roll")
     for k, (panel, title) in enumerate(zip(panels, titles, strict=True)):
-        _dress(panel, f"{title} error", "point", "deg" if k else "mm")
+        dress(panel, f"{title} error", "point", "deg" if k else "mm")
         for method, name in METHODS.items():
             runs = [item for case, item in results.items() if case.method == method and case.load_g == 0]
             error = np.array([run.error for run in runs])  # (runs, p, 6)
@@ -75,8 +75,8 @@ def loads_figure(table: Sequence[Mapping[str, Any]]) -> Figure:
     loads = sorted({row["load_g"] for row in rows})
     figure = Figure(figsize=(9, 3.8), layout="constrained")
     left, right = figure.subplots(1, 2)
-    _dress(left, "translation error with S2R", "load [g]", "mm")
-    _dress(right, "saturated chambers", "load [g]", "points of the circle")
+    dress(left, "translation error with S2R", "load [g]", "mm")
+    dress(right, "saturated chambers", "load [g]", "points of the circle")
     for name, colour, label in (
         ("translation_mm", BLUE, "mean of the circle"),
         ("max_mm", GREY, "largest"),
@@ -109,8 +109,8 @@ def trace_figure(followed: Followed, limits_kpa: tuple[float, float]) -> Figure:
     panels = figure.subplots(2, n_sections, sharex=True, squeeze=False)
     for section in range(n_sections):
         upper, lower = panels[:, section]
-        _dress(upper, f"section {section + 1}: springs, dashed as asked", "", "mm")
-        _dress(lower, "pressures, limits dashed", "time [s]", "kPa")
+        dress(upper, f"section {section + 1}: springs, dashed as asked", "", "mm")
+        dress(lower, "pressures, limits dashed", "time [s]", "kPa")
         for k in range(N_PER_SECTION):
             chamber = section * N_PER_SECTION + k
             colour = colormaps["tab10"](chamber)
@@ -135,12 +135,3 @@ def _shade(panel: Any, followed: Followed, points: np.ndarray, colour: Any) -> N
         during = followed.time_s[followed.point == point]
         if len(during):
             panel.axvspan(during[0], during[-1], color=colour, alpha=0.12, linewidth=0)
-
-
-def _dress(panel: Any, title: str, x: str, y: str) -> None:
-    panel.set_title(title, loc="left", fontsize=10, color=INK)
-    panel.set_xlabel(x)
-    panel.set_ylabel(y)
-    panel.grid(color="#e6e6e6", linewidth=0.6)
-    panel.set_axisbelow(True)
-    panel.spines[["top", "right"]].set_visible(False)

@@ -109,8 +109,9 @@ def learn_twin(folder: Path, settings: Settings, twin: int) -> None:
 
 
 def _record(path: Path, spec, n_poses: int, twin: int) -> None:
-    from mjx_softarm.deploy.record import random_pressures, record
+    from mjx_softarm.deploy.record import record
     from mjx_softarm.deploy.twin import S2R_SESSION, Twin
+    from mjx_softarm.excitation import random_pressures
     from mjx_softarm.logs import write_log
 
     recording = record(

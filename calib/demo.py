@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
+from mjx_softarm.excitation import random_pressures
 from mjx_softarm.logs import Log, write_log
 from mjx_softarm.mjcf import build_model, steps_per_period
 from mjx_softarm.pose import rotation_from_quaternion
@@ -105,9 +106,7 @@ def _springs(arm: ArmSpec, rng: np.random.Generator) -> Log:
 
 
 def _poses(arm: ArmSpec, rng: np.random.Generator) -> Log:
-    low, high = arm.chambers.pressure_min_kpa, arm.chambers.pressure_max_kpa
-    swing = np.cos(rng.uniform(0.0, np.pi, (N_POSES, arm.n_chambers)))  # arcsine law: favours the extremes
-    pressure_kpa = low + (high - low) * 0.5 * (1.0 + swing)
+    pressure_kpa = random_pressures(arm, N_POSES, rng)
     model, data = _model(arm)
     found = settle_many(arm, pressure_kpa)
     seen = [_look(arm, model, data, q) for q in found.q[found.settled]]

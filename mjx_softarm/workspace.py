@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from mjx_softarm.excitation import random_pressures
 from mjx_softarm.kinematics import chain_frames
 from mjx_softarm.pose import pose_from_frame
 from mjx_softarm.settle import Settled, settle_pressures
@@ -66,9 +67,7 @@ def sample_workspace(spec: ArmSpec, n: int, seed: int) -> Pool:
         SpecError: the arm settles at fewer than `n` of the candidates.
     """
     rng = np.random.default_rng(seed)
-    low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
-    swing = np.cos(rng.uniform(0.0, np.pi, (CANDIDATES_PER_POSE * n, spec.n_chambers)))
-    found = settle_many(spec, low + (high - low) * 0.5 * (1.0 + swing))
+    found = settle_many(spec, random_pressures(spec, CANDIDATES_PER_POSE * n, rng))
     tip_mm = np.where(found.settled[:, None], 1e3 * found.tip_position_m, 0.0)
     _, voxel, count = np.unique(
         np.floor(tip_mm / VOXEL_MM).astype(int), axis=0, return_inverse=True, return_counts=True

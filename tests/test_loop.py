@@ -17,9 +17,10 @@ from mjx_softarm.deploy.arms import ArmError, open_arm
 from mjx_softarm.deploy.faults import RESPONSE, Fault, Response
 from mjx_softarm.deploy.loop import N_ACTIONS, VENT_KPA_PER_S, Controller, Phase, start, step, with_goal
 from mjx_softarm.deploy.reach import Reachable, nearest
-from mjx_softarm.deploy.record import random_pressures, record
+from mjx_softarm.deploy.record import record
 from mjx_softarm.deploy.session import follow
 from mjx_softarm.estimator import PoseEstimator, SpringModel, estimate
+from mjx_softarm.excitation import random_pressures
 from mjx_softarm.export import Policy, save_policy
 from mjx_softarm.logs import write_log
 from mjx_softarm.obs import ObsScale

@@ -27,14 +27,19 @@ def draw_all(folder: Path, rows: list[dict[str, Any]], workspace: Reached, circl
     return [folder / name for name in pictures]
 
 
-def _axes(figure: Figure, position: Any, title: str, x: str, y: str) -> Any:
-    axes = figure.add_subplot(position)
+def dress(axes: Any, title: str, x: str, y: str) -> None:
+    """Title, labels and grid, as all pictures of the project have them."""
     axes.set_title(title, loc="left", fontsize=10, color=INK)
     axes.set_xlabel(x)
     axes.set_ylabel(y)
     axes.grid(color="#e6e6e6", linewidth=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
+
+
+def _axes(figure: Figure, position: Any, title: str, x: str, y: str) -> Any:
+    axes = figure.add_subplot(position)
+    dress(axes, title, x, y)
     return axes
 
 

@@ -17,8 +17,9 @@ import numpy as np
 from mjx_softarm.deploy.arms import ArmError, open_arm
 from mjx_softarm.deploy.faults import RESPONSE, Response
 from mjx_softarm.deploy.loop import Controller, Phase
-from mjx_softarm.deploy.record import random_pressures, record
+from mjx_softarm.deploy.record import record
 from mjx_softarm.deploy.session import Run, follow
+from mjx_softarm.excitation import random_pressures
 from mjx_softarm.export import SealedFileError, load_policy
 from mjx_softarm.logs import write_log
 from mjx_softarm.spec import ArmSpec, SpecError

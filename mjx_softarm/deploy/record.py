@@ -1,9 +1,8 @@
 """Random safe poses of an arm, logged for calibration. NumPy only: the arm need not be known yet.
 
-Each chamber's pressure follows the arcsine law between its limits, as the poses that policies are trained
-on do; from one set of pressures to the next goes a ramp. A pose is logged when the springs have come to
-rest, or, with `transients`, every tick is. The columns are the control loop's without references, goals and
-estimates.
+The pressures are drawn as those of the poses that policies are trained on; from one set to the next goes a
+ramp. A pose is logged when the springs have come to rest, or, with `transients`, every tick is. The columns
+are the control loop's without references, goals and estimates.
 """
 
 from __future__ import annotations
@@ -33,13 +32,6 @@ class Recording(NamedTuple):
 
 class _Stop(Exception):
     """The recording ends; the message says why."""
-
-
-def random_pressures(spec: ArmSpec, n_poses: int, seed: int) -> np.ndarray:
-    """Pressures (n_poses, n) [kPa] by the arcsine law between the arm's limits."""
-    low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
-    swing = np.cos(np.random.default_rng(seed).uniform(0.0, np.pi, (n_poses, spec.n_chambers)))
-    return low + (high - low) * 0.5 * (1.0 + swing)
 
 
 def record(
