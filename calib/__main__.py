@@ -11,8 +11,9 @@ import argparse
 import sys
 from pathlib import Path
 
-from calib.checks import Finding, FitError, LogError
+from calib.errors import FitError
 from mjx_softarm.archive import SealedFileError
+from mjx_softarm.checks import Finding, LogError
 from mjx_softarm.logs import Log
 from mjx_softarm.spec import ArmSpec, SpecError
 

@@ -2,7 +2,7 @@
 
 All rows are kept, as transients need the pressures of each. `fresh` says which rows hold motion capture of
 their own, and a quaternion that motion capture has turned by 180 degrees is NaN. The faults are found by the
-detectors of `calib.checks`, as in any log.
+detectors of `mjx_softarm.checks`, as in any log.
 
 Source: ASU-RISE-Lab/4-chamber-softarm-control (commit 6df7ec9d), StanfordASL/trunk-stack (commit 8b4b9234).
 """
@@ -14,10 +14,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calib import checks
-from calib.checks import Finding, LogError
-from calib.tables import Table, read_table
+from mjx_softarm import checks
+from mjx_softarm.checks import Finding, LogError
 from mjx_softarm.logs import UNITS
+from mjx_softarm.tables import Table, read_table
 
 N_BODIES = 3
 WIRE_M_PER_V = 1.0 / 5.0  # draw-wire encoders: 5 V at 1 m

@@ -1,7 +1,7 @@
 """Stiffness, effective area and length of each chamber, fitted to poses of the arm at rest.
 
 The simulated arm rests at the logged pressures; its chambers are changed until tip poses, and spring lengths
-where they were measured, agree. The Jacobian comes from the implicit function theorem (`calib.equilibrium`),
+where they were measured, agree. The Jacobian comes from the implicit function theorem (`mjx_softarm.rest`),
 and a Gauss-Newton method needs it seven times. Optax's L-BFGS on the same loss ends at the same numbers,
 within their intervals, but needs sixty gradients and compiles twice as long; the intervals need the Jacobian
 anyway.
@@ -23,8 +23,8 @@ import jax
 import numpy as np
 
 from calib.blocks import held_out_blocks
-from calib.checks import FitError
 from calib.equilibrium import Measured, residuals
+from calib.errors import FitError
 from calib.leastsquares import Problem, Solution, fit, principal
 from calib.rests import HOLD_KPA, Rests, find_rests
 from mjx_softarm.logs import Log

@@ -1,19 +1,7 @@
-"""The arm at rest as a differentiable function of its numbers: what a fit of them needs.
-
-Rest is where the potential's gradient vanishes, grad V(q; x) = 0, so by the implicit function theorem
-
-    dq = -H^-1 d(grad V)/dx dx,    H = d(grad V)/dq,
-
-with the closed-form gradient and Hessian of `mjx_softarm.statics`. This is the derivative of the equilibrium
-itself, exact to rounding however many Newton steps led there, and costs one solve with a matrix that is
-already there. Finite differences would need a settled arm for each of the numbers, and in single precision
-would have to choose between the rounding of a small step and the curvature of a large one; differentiating
-through the iterations would keep them all and would need a loop of fixed length.
-"""
+"""The arm at rest as a function of its numbers: what a fit of them needs."""
 
 from __future__ import annotations
 
-import functools
 from typing import NamedTuple
 
 import jax
@@ -21,8 +9,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from mjx_softarm.kinematics import chain_frames
-from mjx_softarm.settle import settle_pressures
-from mjx_softarm.statics import ArmParams, Statics, statics
+from mjx_softarm.rest import rest, statics_at
+from mjx_softarm.statics import ArmParams
 
 
 class Measured(NamedTuple):
@@ -33,33 +21,6 @@ class Measured(NamedTuple):
     tip_m: Array  # (3,)
     tip_rotation: Array  # (3, 3)
     spring_m: Array  # (n_chambers,)
-
-
-@jax.custom_jvp
-def rest(params: ArmParams, pressure_kpa: Array) -> Array:
-    """Joint coordinates (nv,) at rest under pressures (n_chambers,) [kPa], which no limit of the arm clips.
-
-    Differentiable in both arguments, by the implicit function theorem.
-    """
-    free = params._replace(
-        pressure_min_kpa=jnp.full_like(pressure_kpa, -jnp.inf),
-        pressure_max_kpa=jnp.full_like(pressure_kpa, jnp.inf),
-    )
-    kinematics = functools.partial(chain_frames, link_length_m=params.link_length_m)
-    return settle_pressures(kinematics, free, pressure_kpa).q
-
-
-@rest.defjvp
-def _rest_jvp(primals, tangents):
-    params, pressure = primals
-    q = rest(params, pressure)
-
-    def gradient(params: ArmParams, pressure: Array) -> Array:
-        return _statics(q, params, pressure).gradient
-
-    factor = jax.scipy.linalg.cho_factor(_statics(q, params, pressure).hessian, lower=True)
-    _, change = jax.jvp(gradient, primals, tangents)
-    return q, -jax.scipy.linalg.cho_solve(factor, change)
 
 
 def with_numbers(x: Array, params: ArmParams) -> ArmParams:
@@ -101,13 +62,9 @@ def residuals(x: Array, params: ArmParams, measured: Measured) -> tuple[Array, A
     with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
         q = rest(arm, measured.pressure_kpa)
         frames = chain_frames(q, arm.link_length_m)
-        now = _statics(q, arm, measured.pressure_kpa)
+        now = statics_at(q, arm, measured.pressure_kpa)
         turn = measured.tip_rotation.T @ frames.plate_rotation[-1]
     angle = 0.5 * jnp.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
     error = [frames.plate_position[-1] - measured.tip_m, angle, now.springs.length - measured.spring_m]
     left = jnp.max(jnp.abs(jax.lax.stop_gradient(now.gradient)))
     return jnp.concatenate(error), left, jax.lax.stop_gradient(now.chambers.length)
-
-
-def _statics(q: Array, params: ArmParams, pressure_kpa: Array) -> Statics:
-    return statics(chain_frames(q, params.link_length_m), q, pressure_kpa, params)

@@ -9,18 +9,16 @@ that never change, time gaps and unknown columns are only reported. Each finding
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
-import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from calib.checks import Finding, LogError
-from calib.sheet import PLAUSIBLE, Sheet, clean, implausible, quantity
-from calib.tables import Table, read_table
-from mjx_softarm.logs import GROUPS, UNITS, Column, Log, log_columns, write_log
+from calib.sheet import PLAUSIBLE, clean, implausible, quantity
+from mjx_softarm.checks import Finding
+from mjx_softarm.log_files import read_sheet, refuse
+from mjx_softarm.logs import UNITS, Column, Log, log_columns, write_log
 from mjx_softarm.sensors import SensorParams, frequency_from_length
 from mjx_softarm.spec import ArmSpec
 
@@ -34,7 +32,6 @@ quaternion 1, 0, 0, 0 where the arm hangs straight.
 Chambers and the sim-to-real network are fitted to poses at rest: rows of which the pressures have been held
 for 3 s. One row per pose will do if the rows are more than 3 s apart.
 """
-_CELL = re.compile(r"(\w+)\s*(?:\[(.*)\])?")
 _FACTORS = {"frequency_hz": 1.25, "spring_m": 1.5, "tip_m": 1.5}  # between the ranges of two logs of one arm
 _NEEDED = ("frequency_hz", "spring_m", "pressure_kpa", "tip_m")  # one of them at least
 
@@ -53,77 +50,14 @@ def read_log(path: str | Path, n_chambers: int = 9, strict: bool = False) -> tup
     Raises:
         LogError: the log cannot be used, or is refused; the message has a line for each finding.
     """
-    table = read_table(path)
+    sheet, findings = read_sheet(path, n_chambers, one_of=_NEEDED)
     with np.errstate(over="ignore", invalid="ignore"):  # any number may stand in a file
-        sheet, findings = _sheet(str(path), table, n_chambers)
-        _refuse(implausible(sheet))
+        refuse(implausible(sheet))
         sheet, found = clean(sheet)
     findings += found
     if strict:
-        _refuse(findings)
-    return _log(sheet), findings
-
-
-def _refuse(findings: Sequence[Finding]) -> None:
-    if findings:
-        raise LogError(findings)
-
-
-def _sheet(file: str, table: Table, n_chambers: int) -> tuple[Sheet, list[Finding]]:
-    """The known columns in their order, converted to the units used inside; unknown columns are findings."""
-    matches = [_CELL.fullmatch(cell) for cell in table.names]
-    names = [match[1] if match else cell for match, cell in zip(matches, table.names, strict=True)]
-    units = {name: match[2] if match else None for name, match in zip(names, matches, strict=True)}
-    markers = [int(match[1]) for name in names if (match := re.fullmatch(r"marker(\d+)_[xyz]", name))]
-    n_markers = min(1 + max(markers, default=-1), len(names))
-    known = {column.name: column for column in log_columns(n_chambers, n_markers)}
-
-    errors = [Finding(file, (1, 1), name, problem) for name, problem in _header_errors(names, units, known)]
-    _refuse(errors)
-    present = [column for name, column in known.items() if name in names]
-    columns = tuple(dataclasses.replace(column, unit=units[column.name]) for column in present)
-    values = table.values[:, [names.index(column.name) for column in columns]]
-    values *= [UNITS[column.kind][column.unit] for column in columns]
-    extra = [Finding(file, (1, 1), name, "unknown column, ignored") for name in names if name not in known]
-    return Sheet(file, columns, values, table.row), extra
-
-
-def _header_errors(names: list[str], units: dict, known: dict) -> Iterator[tuple[str, str]]:
-    if not any(name[:1].isalpha() for name in names):
-        yield "", f"expected a header such as `time [s],pressure0 [kPa],...`, got {', '.join(names)[:60]}"
-        return
-    for name, unit in units.items():
-        if names.count(name) > 1:
-            yield name, f"{names.count(name)} columns of this name, expected one"
-        if name in known and unit not in UNITS[known[name].kind]:
-            expected = ", ".join(f"[{unit}]" for unit in UNITS[known[name].kind])
-            yield name, f"got {'no unit' if unit is None else f'[{unit}]'}, expected one of {expected}"
-        if name not in known and re.fullmatch(r"(frequency|spring|pressure|reference)\d+", name):
-            n_chambers = sum(column.group == "spring_m" for column in known.values())
-            yield name, f"expected a log of {n_chambers} chambers, numbered from 0"
-    groups = {known[name].group for name in names if name in known}
-    for group in groups:
-        wanted = [name for name, column in known.items() if column.group == group]
-        if missing := [name for name in wanted if name not in names]:
-            beside = next(name for name in wanted if name in names)
-            yield ", ".join(missing), f"missing, expected beside {beside}"
-    if "time_s" not in groups:
-        yield "time", "missing, expected a column `time [s]`"
-    if not groups & set(_NEEDED):
-        yield (
-            "",
-            f"expected frequency0.., spring0.., pressure0.. or tip_x..; got only {', '.join(names)[:60]}",
-        )
-
-
-def _log(sheet: Sheet) -> Log:
-    groups = {name: sheet.values[:, chosen] for name in GROUPS if (chosen := sheet.of(name))}
-    for name in ("time_s", "payload_kg"):
-        if name in groups:
-            groups[name] = groups[name][:, 0]
-    if "marker_m" in groups:
-        groups["marker_m"] = groups["marker_m"].reshape(len(sheet.row), -1, 3)
-    return Log(source=sheet.file, row=sheet.row, **groups)
+        refuse(findings)
+    return sheet.log(), findings
 
 
 def same_arm(logs: Sequence[Log]) -> None:
@@ -134,7 +68,7 @@ def same_arm(logs: Sequence[Log]) -> None:
     """
     for first, other in itertools.combinations(logs, 2):
         file = f"{first.source} and {other.source}"
-        _refuse([Finding(file, None, name, problem) for name, problem in _differences(first, other)])
+        refuse([Finding(file, None, name, problem) for name, problem in _differences(first, other)])
 
 
 def _differences(first: Log, other: Log) -> Iterator[tuple[str, str]]:

@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calib.checks import FitError
+from calib.errors import FitError
 from calib.rests import Rests
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
 from mjx_softarm.statics import ArmParams

@@ -19,7 +19,7 @@ import optax
 from jax import Array
 
 from calib.blocks import held_out_blocks
-from calib.checks import FitError
+from calib.errors import FitError
 from mjx_softarm.mlp import Layer, mlp
 from mjx_softarm.s2r import S2R
 

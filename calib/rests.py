@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calib.checks import FitError
+from calib.errors import FitError
 from mjx_softarm.logs import Log
 from mjx_softarm.pose import rotation_from_quaternion
 from mjx_softarm.sensors import SensorFault, SensorParams, length_from_frequency

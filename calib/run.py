@@ -22,7 +22,7 @@ import numpy as np
 
 from calib import parts
 from calib.chambers import MIN_POSES, calibrate_chambers
-from calib.checks import FitError
+from calib.errors import FitError
 from calib.logs import same_arm
 from calib.markers import marker_limits
 from calib.report import Part, to_html, to_json

@@ -18,7 +18,7 @@ import jax
 import numpy as np
 
 from calib.blocks import held_out_blocks
-from calib.checks import FitError
+from calib.errors import FitError
 from calib.network import NetworkConfig, block_rows, fit_network
 from mjx_softarm.kinematics import chain_frames
 from mjx_softarm.pose import pose_from_frame

@@ -23,7 +23,7 @@ import optax
 from jax import Array
 
 from calib.blocks import folds
-from calib.checks import FitError
+from calib.errors import FitError
 from mjx_softarm.sensors import SensorParams
 
 HUBER = 1.345  # in standard deviations of the noise: 95 % of the efficiency of least squares

@@ -1,4 +1,4 @@
-"""A log as a matrix while it is checked: which units are plausible, which rows are believed, at what cost.
+"""Checks of a log as a matrix: which units are plausible, which rows are believed, at what cost.
 
 The checks of rows come in three stages, each on the rows that the one before has left: single rows (NaN,
 time, range); rows against the row before (motion capture that was not renewed or is turned); outliers.
@@ -12,8 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calib import checks
-from calib.checks import Finding, LogError
+from mjx_softarm import checks
+from mjx_softarm.checks import Finding, LogError
+from mjx_softarm.log_files import Sheet
 from mjx_softarm.logs import UNITS, Column
 
 
@@ -42,6 +43,7 @@ PLAUSIBLE: Mapping[str, Plausible] = MappingProxyType(
         ),  # vacuum to ten bar; valves ripple by less
         "mass": Plausible(0.0, 5.0, least=1e-3),
         "number": Plausible(-1.1, 1.1),  # part of a unit quaternion
+        "id": Plausible(0.0, 1e6),
         "pose_length": Plausible(-3000.0, 3000.0, least=100.0),
         "angle": Plausible(-360.0, 360.0),
     }
@@ -49,25 +51,6 @@ PLAUSIBLE: Mapping[str, Plausible] = MappingProxyType(
 BY_HAND_ROWS, BY_HAND_S = 300, 600.0  # so few rows may be poses that somebody recorded at leisure
 HANGS_BELOW_M = -0.05  # of the tip, in the median: the base frame's z is up and the arm hangs
 SENSORS = ("frequency_hz", "spring_m", "pressure_kpa", "tip_m", "marker_m")
-
-
-class Sheet(NamedTuple):
-    """The known columns of a log."""
-
-    file: str
-    columns: tuple[Column, ...]  # (k,) with the file's units, in the order of `log_columns`: time first
-    values: np.ndarray  # (n, k) in the units used inside
-    row: np.ndarray  # (n,) line of the file
-
-    def of(self, *groups: str) -> list[int]:
-        """Indices of the columns that are part of these fields of `Log`."""
-        return [k for k, column in enumerate(self.columns) if column.group in groups]
-
-    def bodies(self) -> Iterator[tuple[str, list[int]]]:
-        """Tip and markers, each with the indices of its coordinates."""
-        columns = self.of("tip_m", "marker_m")
-        for start in range(0, len(columns), 3):
-            yield self.columns[columns[start]].name[:-2], columns[start : start + 3]
 
 
 class Fault(NamedTuple):

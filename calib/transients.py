@@ -21,7 +21,7 @@ import mujoco
 import numpy as np
 
 from calib.blocks import held_out_blocks
-from calib.checks import FitError
+from calib.errors import FitError
 from calib.leastsquares import Problem, fit
 from calib.rests import HOLD_KPA
 from mjx_softarm.logs import Log

@@ -2,7 +2,7 @@
 
 A log is a CSV file whose header names each column with its unit, `pressure0 [kPa]`, or an npz file with the
 same: `columns` (k,) of text and `table` (n, k) of float64. Which columns there are, and which units a
-file may use, stands here alone; what is wrong with a file that somebody brings is for `calib.logs` to find.
+file may use, stands here alone; files that somebody brings are read by `mjx_softarm.log_files`.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ UNITS: Mapping[str, Mapping[str, float]] = MappingProxyType(
         "pressure": {"kPa": 1.0, "Pa": 1e-3, "bar": 100.0, "mbar": 0.1, "psi": 6.894757293168},
         "mass": {"kg": 1.0, "g": 1e-3},
         "number": {"1": 1.0},
+        "id": {"1": 1.0},
         "pose_length": {"mm": 1.0, "m": 1e3, "cm": 10.0},
         "angle": {"deg": 1.0, "rad": 180.0 / np.pi},
     }
@@ -65,6 +66,7 @@ def log_columns(n_chambers: int, n_markers: int = 0) -> tuple[Column, ...]:
         *(Column("reference_m", f"reference{k}", "length", "mm") for k in chambers),
         *(Column("goal", f"goal_{axis}", *_POSE[axis]) for axis in _POSE),
         *(Column("estimate", f"estimate_{axis}", *_POSE[axis]) for axis in _POSE),
+        Column("sequence", "sequence", "id", "1"),
     )
 
 
@@ -89,6 +91,7 @@ class Log:
     reference_m: np.ndarray | None = None  # (n, n_chambers) spring lengths that were asked for
     goal: np.ndarray | None = None  # (n, 6) [mm, deg]
     estimate: np.ndarray | None = None  # (n, 6) [mm, deg] tip pose that the controller believed in
+    sequence: np.ndarray | None = None  # (n,) which demonstration a row is part of, counted from 0
 
     def __len__(self) -> int:
         return len(self.time_s)

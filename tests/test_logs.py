@@ -50,7 +50,7 @@ def test_npz_holds_the_same_table(tmp_path):
 
 def test_column_names_are_unique_and_every_group_can_be_written():
     names = [column.name for column in log_columns(9, 3)]
-    assert len(set(names)) == len(names) == 1 + 9 + 9 + 9 + 3 + 4 + 9 + 1 + 9 + 6 + 6
+    assert len(set(names)) == len(names) == 1 + 9 + 9 + 9 + 3 + 4 + 9 + 1 + 9 + 6 + 6 + 1
 
 
 def test_rows_are_taken_by_mask_or_index():

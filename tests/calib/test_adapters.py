@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib import checks
 from calib.adapters import read_asu, read_trunk, wire_length_m
-from calib.checks import LogError
+from mjx_softarm import checks
+from mjx_softarm.checks import LogError
 
 DATA = Path(__file__).parents[2].parent / "shared/data"
 real = pytest.mark.skipif(not DATA.is_dir(), reason="the real logs are not beside the checkout")

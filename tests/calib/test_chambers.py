@@ -10,10 +10,11 @@ import pytest
 
 from calib.blocks import held_out_blocks
 from calib.chambers import BENDING, FIELDS, MIN_POSES, calibrate_chambers
-from calib.equilibrium import rest, with_numbers
+from calib.equilibrium import with_numbers
 from mjx_softarm import ArmSpec
 from mjx_softarm.kinematics import chain_frames
 from mjx_softarm.logs import Log
+from mjx_softarm.rest import rest
 from mjx_softarm.settle import settle_pressures
 from mjx_softarm.statics import ArmParams
 from mjx_softarm.workspace import settle_many

@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from calib import checks
-from calib.checks import LogError
 from calib.logs import read_log, same_arm, template
+from mjx_softarm import checks
+from mjx_softarm.checks import LogError
 from mjx_softarm.logs import UNITS, Log, log_columns, log_table, write_log
 
 N = 400
@@ -128,6 +128,13 @@ def test_units_and_order_of_the_file_do_not_matter(text):
         log, findings = read_log(text(f"{header}\n{body}\n", f"{trial}.csv"), strict=True)
         assert findings == []
         np.testing.assert_allclose(log_table(log)[1], table, rtol=1e-8, atol=1e-7)
+
+
+def test_ids_of_demonstrations_are_read(file):
+    sequence = np.repeat(np.arange(8.0), N // 8)
+    log, findings = read_log(file(sequence=sequence), strict=True)
+    assert findings == []
+    np.testing.assert_array_equal(log.sequence, sequence)
 
 
 def test_template_is_valid_and_its_text_names_all_columns(tmp_path):

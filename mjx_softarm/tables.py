@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calib.checks import Finding, LogError
+from mjx_softarm.checks import Finding, LogError
 
 _HEAD_BYTES = 1 << 16
 _OTHER_DELIMITERS = {";": "semicolons", "\t": "tabs", "|": "bars"}

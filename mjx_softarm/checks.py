@@ -30,10 +30,6 @@ class Finding(NamedTuple):
         )
 
 
-class FitError(ValueError):
-    """A fit that the data do not allow; the message says what was expected and what came."""
-
-
 class LogError(ValueError):
     """A log that cannot be used; the message has a line for each finding."""
 
