@@ -1,0 +1,131 @@
+"""Demonstrations: positions that an expert brought the arm to, as transitions to learn from.
+
+A file of demonstrations is a log (`mjx_softarm.logs`) of rows at rest, with the springs' frequencies, the
+tip's pose, and the id of the sequence that a row belongs to. A row's action is its own frequencies: they are
+what to ask of the springs to come to its pose, from wherever. So a row makes a transition from the row before
+it in its sequence, and one that stays where it is; the goal of both is the row's pose. There is nothing to
+repair in so few rows: whatever is wrong with one of them refuses the file.
+
+Source: the paper's representation of demonstration data, g' = the pose of s_{t+1}.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from mjx_softarm.checks import Finding, not_unit_rows
+from mjx_softarm.log_files import Sheet, read_sheet, refuse
+from mjx_softarm.logs import UNITS, Column, Log
+from mjx_softarm.pose import pose_from_quaternion
+from mjx_softarm.sensors import frequency_range_hz
+from mjx_softarm.spec import ArmSpec
+
+NEEDED = ("frequency_hz", "tip_m", "tip_quaternion", "sequence")
+
+
+class Demonstrations(NamedTuple):
+    """m demonstrated positions and the n transitions that they make; float32, ids int32."""
+
+    pose: np.ndarray  # (n, 6) [mm, deg] where a transition begins
+    action: np.ndarray  # (n, n_chambers) in [-1, 1]
+    goal: np.ndarray  # (n, 6) [mm, deg] where it ends
+    index: np.ndarray  # (n,) of the position where it ends
+    positions: np.ndarray  # (m, 6) [mm, deg]
+    actions: np.ndarray  # (m, n_chambers) in [-1, 1] that lead to a position
+    sequence: np.ndarray  # (m,)
+
+
+def load_demonstrations(path: str | Path, spec: ArmSpec) -> Demonstrations:
+    """Read a file, check all of it, and make its transitions.
+
+    Args:
+        path: CSV, or npz by the end of its name.
+        spec: the arm that is to learn from them.
+
+    Raises:
+        LogError: the file cannot be used; the message has a line for each finding.
+    """
+    return transitions(read_demonstrations(path, spec)[0], spec)
+
+
+def read_demonstrations(path: str | Path, spec: ArmSpec) -> tuple[Log, list[Finding]]:
+    """The checked rows of a file, and its unknown columns.
+
+    Raises:
+        LogError: the file cannot be used; the message has a line for each finding.
+    """
+    sheet, extra = read_sheet(path, spec.n_chambers, NEEDED)
+    refuse(list(_not_finite(sheet)))
+    refuse(list(_out_of_range(sheet, spec)))
+    refuse(list(_out_of_order(sheet)))
+    return sheet.log(), extra
+
+
+def transitions(log: Log, spec: ArmSpec) -> Demonstrations:
+    """Transitions of checked rows: each row's from itself, then each row's from the one before, if any."""
+    low, high = frequency_range_hz(spec).T
+    actions = np.clip(2.0 * (log.frequency_hz - low) / (high - low) - 1.0, -1.0, 1.0).astype(np.float32)
+    positions = pose_from_quaternion(log.tip_m, log.tip_quaternion).astype(np.float32)
+    sequence = log.sequence.astype(np.int32)
+    stays = np.arange(len(log))
+    moves = 1 + np.flatnonzero(sequence[1:] == sequence[:-1])
+    start, index = np.concatenate([stays, moves - 1]), np.concatenate([stays, moves]).astype(np.int32)
+    return Demonstrations(
+        positions[start], actions[index], positions[index], index, positions, actions, sequence
+    )
+
+
+def _not_finite(sheet: Sheet) -> Iterator[Finding]:
+    needed = sheet.of("time_s", *NEEDED)
+    for row, k in np.argwhere(~np.isfinite(sheet.values[:, needed])):
+        column = sheet.columns[needed[k]]
+        yield _finding(sheet, row, column.name, f"got {sheet.values[row, needed[k]]}, expected a number")
+
+
+def _out_of_range(sheet: Sheet, spec: ArmSpec) -> Iterator[Finding]:
+    for k, limits_hz in zip(sheet.of("frequency_hz"), frequency_range_hz(spec), strict=True):
+        column, values = sheet.columns[k], sheet.values[:, k]
+        low, high = (_shown(column, limit) for limit in limits_hz)
+        for row in np.flatnonzero((values < limits_hz[0]) | (values > limits_hz[1])):
+            got = f"got {_shown(column, values[row])} {column.unit}"
+            yield _finding(sheet, row, column.name, f"{got}, expected {low} to {high}, the arm's range")
+    tip_m, reach_m = sheet.values[:, sheet.of("tip_m")], spec.structure.n_sections * spec.springs.length_max_m
+    for row in np.flatnonzero((np.linalg.norm(tip_m, axis=1) > reach_m) | (tip_m[:, 2] > 0.0)):
+        got = ", ".join(f"{1e3 * value:.4g}" for value in tip_m[row])
+        expected = f"a tip below the base and within {1e3 * reach_m:.4g} mm of it"
+        yield _finding(sheet, row, "tip_x..z", f"got {got} mm, expected {expected}")
+    quaternion = sheet.values[:, sheet.of("tip_quaternion")]
+    for row in np.flatnonzero(not_unit_rows(quaternion)):
+        got = f"got length {np.linalg.norm(quaternion[row]):.4g}"
+        yield _finding(sheet, row, "tip_qw..qz", f"{got}, expected unit quaternions")
+    sequence = sheet.values[:, sheet.of("sequence")[0]]
+    for row in np.flatnonzero((sequence < 0.0) | (sequence != np.round(sequence))):
+        yield _finding(sheet, row, "sequence", f"got {sequence[row]:g}, expected an integer >= 0")
+
+
+def _out_of_order(sheet: Sheet) -> Iterator[Finding]:
+    time_s, sequence = sheet.values[:, 0], sheet.values[:, sheet.of("sequence")[0]]
+    same = sequence[1:] == sequence[:-1]
+    for row in 1 + np.flatnonzero(same & (time_s[1:] <= time_s[:-1])):
+        problem = f"got {time_s[row]:g} s after {time_s[row - 1]:g} s, expected time's order in a sequence"
+        yield _finding(sheet, row, "time", problem)
+    starts = np.concatenate([[0], 1 + np.flatnonzero(~same)])
+    for k in range(1, len(starts)):
+        now, before = sequence[starts[k]], sequence[starts[:k]]
+        if now in before:
+            problem = f"got {now:g} again after {before[-1]:g}, expected a sequence in one piece"
+            yield _finding(sheet, starts[k], "sequence", problem)
+
+
+def _finding(sheet: Sheet, row: int, column: str, problem: str) -> Finding:
+    line = int(sheet.row[row])
+    return Finding(sheet.file, (line, line), column, problem)
+
+
+def _shown(column: Column, value: float) -> str:
+    """A number of the unit used inside, as the file has it."""
+    return f"{value / UNITS[column.kind][column.unit]:.7g}"
