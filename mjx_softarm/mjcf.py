@@ -12,6 +12,7 @@ import math
 import mujoco
 import numpy as np
 
+from mjx_softarm.body import SPRING_WIDTH_M, gripper_boxes, ring_radius_m
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
 from mjx_softarm.statics import GRAVITY_M_S2, ArmParams
 
@@ -21,7 +22,6 @@ _RING_COLOUR = [0.25, 0.27, 0.30, 1.0]
 _SPRING_COLOUR = [0.75, 0.77, 0.80, 1.0]
 _GRIPPER_COLOUR = [0.15, 0.16, 0.18, 1.0]
 _RING_HALF_HEIGHT_M = 0.002
-_SPRING_WIDTH_M = 0.002
 _BELLOWS_DRAWN = 0.45  # of the outer diameter: the convolutions are not drawn
 
 
@@ -96,7 +96,7 @@ def _add_ring(body, plate: int, position, spec: ArmSpec) -> None:
     body.add_geom(
         name=f"ring{plate}",
         type=mujoco.mjtGeom.mjGEOM_CYLINDER,
-        size=[spec.geometry.spring_radius_m + _SPRING_WIDTH_M, _RING_HALF_HEIGHT_M, 0.0],
+        size=[ring_radius_m(spec), _RING_HALF_HEIGHT_M, 0.0],
         pos=position,
         rgba=_RING_COLOUR,
         mass=0.0,
@@ -125,7 +125,7 @@ def _add_tools(last, params: ArmParams, spec: ArmSpec) -> None:
         tool.mass, tool.ipos, tool.explicitinertial = mass, [0.0, 0.0, 0.0], True
         tool.inertia = [mass * length**2 / 12] * 3
         if name == "gripper":
-            _draw_gripper(tool, length)
+            _draw_gripper(tool, spec)
     if spec.mass.payload_kg > 0:
         size = [0.03 * spec.mass.payload_kg ** (1 / 3) + 0.01, 0.0, 0.0]
         tool.add_geom(
@@ -133,13 +133,8 @@ def _add_tools(last, params: ArmParams, spec: ArmSpec) -> None:
         )
 
 
-def _draw_gripper(body, length: float) -> None:
-    shapes = {
-        "palm": ([0.022, 0.022, 0.25 * length], [0.0, 0.0, 0.25 * length]),
-        "finger0": ([0.005, 0.010, 0.25 * length], [-0.02, 0.0, -0.25 * length]),
-        "finger1": ([0.005, 0.010, 0.25 * length], [0.02, 0.0, -0.25 * length]),
-    }
-    for name, (size, position) in shapes.items():
+def _draw_gripper(body, spec: ArmSpec) -> None:
+    for name, (size, position) in gripper_boxes(spec).items():
         body.add_geom(
             name=f"gripper_{name}",
             type=mujoco.mjtGeom.mjGEOM_BOX,
@@ -168,7 +163,7 @@ def _add_chamber(mjspec: mujoco.MjSpec, index: int, params: ArmParams, spec: Arm
         tendon.damping = _polynomial(damping)
         tendon.springlength = [float(rest[index])] * 2
         drawn = _BELLOWS_DRAWN * spec.geometry.chamber_diameter_m
-        tendon.width = drawn if kind == "chamber" else _SPRING_WIDTH_M
+        tendon.width = drawn if kind == "chamber" else SPRING_WIDTH_M
         colour = _SECTION_COLOURS[section % len(_SECTION_COLOURS)]
         tendon.rgba = colour if kind == "chamber" else _SPRING_COLOUR
         for plate in range(section * first, (section + 1) * first + 1):
