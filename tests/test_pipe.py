@@ -110,12 +110,13 @@ def test_gradient_points_away_from_the_wall():
     np.testing.assert_allclose(gradient, [-0.6, 0.8, 0.0], atol=1e-6)
 
 
-def test_gradient_of_the_body_is_finite(spec):
-    """Also hanging straight, where points of the gripper lie on the pipe's axis plane."""
-    plates = [jnp.array(part, jnp.float32) for part in hanging(spec)]
+@pytest.mark.parametrize("aside_m", [0.0, 0.05])
+def test_gradient_of_the_body(spec, aside_m):
+    """Finite where the arm hangs on the axis, all its rims as near; -1 along x where it is off the axis."""
+    plates = [jnp.array(part, jnp.float32) for part in hanging(spec, (aside_m, 0.0))]
     gradient = jax.jit(jax.grad(lambda *plates: body_clearance(PIPE, *plates, spec), (0, 1)))(*plates)
     assert all(np.isfinite(part).all() for part in gradient)
-    assert np.abs(gradient[0]).sum() > 0.1
+    np.testing.assert_allclose(gradient[0].sum(0), [-1.0 if aside_m else 0.0, 0.0, 0.0], atol=1e-5)
 
 
 @pytest.mark.parametrize("diameter_mm", [300.0, 250.0])
