@@ -1,0 +1,159 @@
+"""Drives an arm by any law, tick by tick, until its springs are at rest. NumPy only: for real arms, too.
+
+A law takes spring lengths to the pressures to write next. Here are a ramp of the pressures themselves, and
+the sensor-space law on references that move there along a ramp, all in step, so that the arm bends from one
+shape to the next by way of those between.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from mjx_softarm.control import Gains, pressures
+from mjx_softarm.deploy.arm_io import ArmIO
+from mjx_softarm.deploy.faults import LOST_TICKS, SETTLE_TIMEOUT_S, TOLERANCE_M, still
+from mjx_softarm.deploy.loop import VENT_KPA_PER_S, WINDOW_S
+from mjx_softarm.deploy.session import ArmLost, Clock, Pumps, Recorder, read
+from mjx_softarm.sensors import SensorFault, SensorParams, describe_faults, length_from_frequency
+from mjx_softarm.spec import ArmSpec
+
+RAMP_M_PER_S = 0.03  # of the reference that has furthest to go
+
+# Spring lengths (n,) [m], None where one was lost, and pressures in force (n,) [kPa] -> pressures to write,
+# and whether the arm is where it is to be, as far as the law can tell.
+Law = Callable[[np.ndarray | None, np.ndarray], tuple[np.ndarray, bool]]
+
+
+class ReadingsLost(Exception):
+    """The springs cannot be read any more; the message says which."""
+
+
+def ramp(target_kpa: np.ndarray, dt_s: float) -> Law:
+    """Pressures (n,) [kPa], reached along a ramp that is safe for the arm."""
+    step_kpa = VENT_KPA_PER_S * dt_s
+
+    def law(_spring_m: np.ndarray | None, in_force_kpa: np.ndarray) -> tuple[np.ndarray, bool]:
+        arrived = np.array_equal(in_force_kpa, target_kpa)
+        return np.clip(target_kpa, in_force_kpa - step_kpa, in_force_kpa + step_kpa), arrived
+
+    return law
+
+
+class Hold:
+    """The sensor-space law, from the springs as they are first read to references (n,) [m]."""
+
+    def __init__(self, gains: Gains, reference_m: np.ndarray, dt_s: float):
+        self._gains, self._goal_m, self._dt_s = gains, np.asarray(reference_m, float), dt_s
+        self.reference_m: np.ndarray | None = None  # on its way; None before the first reading
+        self._integral_kpa: Any = None
+
+    def __call__(self, spring_m: np.ndarray | None, in_force_kpa: np.ndarray) -> tuple[np.ndarray, bool]:
+        if spring_m is None:
+            return in_force_kpa, False
+        if self.reference_m is None:
+            self.reference_m, self._integral_kpa = spring_m, in_force_kpa
+        left_m = self._goal_m - self.reference_m
+        steps = np.abs(left_m).max() / (RAMP_M_PER_S * self._dt_s)
+        self.reference_m = self.reference_m + left_m / max(1.0, steps)
+        pressure_kpa, self._integral_kpa = pressures(
+            self.reference_m, spring_m, self._integral_kpa, self._gains, self._dt_s
+        )
+        return pressure_kpa, steps <= 1.0 and bool(np.all(np.abs(spring_m - self._goal_m) < TOLERANCE_M))
+
+
+class Drive:
+    """An arm, without pressure at first, as its driver gives it.
+
+    Args:
+        arm: sensors and pumps.
+        spec: the arm, for its rate and its sensors.
+        on_tick: takes what there is to log of every tick.
+    """
+
+    def __init__(self, arm: ArmIO, spec: ArmSpec, on_tick: Callable[[dict], None] = lambda row: None):
+        self.arm, self.on_tick = arm, on_tick
+        self.sensor, self.gains = SensorParams.from_spec(spec), Gains.from_spec(spec)
+        self.dt_s = 1.0 / spec.control.rate_hz
+        self.window = max(2, round(WINDOW_S * spec.control.rate_hz))
+        self.clock, self.looks = Clock(arm), Recorder(arm)
+        self.pumps = Pumps(arm, spec.n_chambers)
+        self.n_lost = 0
+
+    def to_rest(self, law: Law) -> dict | None:
+        """Drive until the springs are at rest where the law wants them.
+
+        Returns:
+            What there is to log of the last tick; None if that took more than `SETTLE_TIMEOUT_S`.
+
+        Raises:
+            ArmLost: the arm cannot be reached.
+            ReadingsLost: so many readings were lost in a row.
+        """
+        springs_m = np.empty((0, len(self.pumps.pressure_kpa)))
+        for _ in range(round(SETTLE_TIMEOUT_S / self.dt_s)):
+            row, spring_m, arrived = self._tick(law)
+            self.on_tick(row)
+            if spring_m is None or not arrived:
+                springs_m = springs_m[:0]
+                continue
+            springs_m = np.vstack([springs_m, spring_m])[-self.window :]
+            if len(springs_m) == self.window and still(springs_m):
+                return row
+        return None
+
+    def vent(self) -> None:
+        """Ramp to zero.
+
+        Raises:
+            ArmLost: the pumps cannot be reached.
+        """
+        law = ramp(np.zeros_like(self.pumps.pressure_kpa), self.dt_s)
+        while self.pumps.pressure_kpa.any():
+            begin_s = self.clock.now()
+            self.pumps.write(law(None, self.pumps.pressure_kpa)[0])
+            self.clock.wait_until(begin_s + self.dt_s)
+
+    def _tick(self, law: Law) -> tuple[dict, np.ndarray | None, bool]:
+        """One row, the spring lengths (n,) if none was lost, and whether the law has arrived."""
+        begin_s = self.clock.now()
+        n = len(self.pumps.pressure_kpa)
+        frequency_hz = read(self.arm, n)
+        row = self.looks.look(begin_s, self.pumps.pressure_kpa)
+        text = "no readings within the tick"
+        spring_m, lost = np.full(n, np.nan), True
+        if frequency_hz is not None:
+            reading = length_from_frequency(frequency_hz, self.sensor, np.nan)
+            spring_m, lost = reading.length_m, bool(np.any(reading.fault != SensorFault.OK.value))
+            text = describe_faults(frequency_hz, reading.fault, self.sensor).replace("\n", "; ")
+        row["frequency_hz"] = spring_m * np.nan if frequency_hz is None else frequency_hz
+        self.n_lost = self.n_lost + 1 if lost else 0
+        if self.n_lost >= LOST_TICKS:
+            raise ReadingsLost(f"readings lost in {self.n_lost} ticks in a row: {text}")
+        known_m = None if lost else spring_m
+        pressure_kpa, arrived = law(known_m, self.pumps.pressure_kpa)
+        self.pumps.write(pressure_kpa)
+        self.clock.wait_until(begin_s + self.dt_s)
+        return row, known_m, arrived
+
+
+def drive_to_end(drive: Drive, run: Callable[[], None]) -> str:
+    """Run, then vent, whatever happens; Ctrl-C vents and a second one ends at once.
+
+    Returns:
+        Why it ended early, or "".
+    """
+    problem = ""
+    try:
+        run()
+    except KeyboardInterrupt:
+        problem = "interrupted"
+    except (ReadingsLost, ArmLost) as error:
+        problem = str(error)
+    try:
+        drive.vent()
+    except (ArmLost, KeyboardInterrupt) as error:
+        problem = f"{problem}; not vented: {str(error) or 'interrupted'}".removeprefix("; ")
+    return problem
