@@ -21,7 +21,7 @@ from calib.blocks import held_out_blocks
 from calib.errors import FitError
 from calib.network import NetworkConfig, block_rows, fit_network
 from mjx_softarm.kinematics import chain_frames
-from mjx_softarm.pose import pose_from_frame
+from mjx_softarm.pose import frame_from_pose, pose_from_frame
 from mjx_softarm.s2r import S2R, correct, correction_between, extrapolation, inputs
 from mjx_softarm.settle import Settled, settle
 from mjx_softarm.spec import ArmSpec
@@ -135,7 +135,7 @@ def fit_s2r(
         raise FitError(f"sim-to-real: got {shapes}, expected (n, 6), (n, n_springs), (n, 6)")
     pose_sim, spring_m, pose_real = (np.asarray(a, np.float64) for a in (pose_sim, spring_m, pose_real))
     held_out = held_out_blocks(n, HELD_OUT_SHARE, block_rows(n), seed)
-    x, y = inputs(pose_sim, spring_m), correction_between(pose_sim, pose_real)
+    x, y = inputs(frame_from_pose(pose_sim), spring_m), correction_between(pose_sim, pose_real)
     fit = fit_network(x[~held_out], y[~held_out], seed, config)
     corrected = correct(fit.network, pose_sim, spring_m)
     errors = {

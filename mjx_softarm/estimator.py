@@ -62,15 +62,14 @@ def estimate_frame(estimator: PoseEstimator, spring_m: Any) -> Frame:
     xp = array_namespace(spring_m, estimator.spring_site_m)
     spring_m = xp.asarray(spring_m, dtype=estimator.spring_site_m.dtype)
     even = constant_curvature(estimator.spring_site_m, spring_m)  # (..., n_sections)
-    downs = [plate.rotation[..., 2, :] for plate in chain(even)]  # of the base's z axis, (..., 3) each
     normalised = (spring_m - estimator.spring_centre_m) / estimator.spring_scale_m
-    changes = mlp(estimator.layers, xp.concat([normalised, *downs], axis=-1))
+    changes = mlp(estimator.layers, xp.concat([normalised, *_downs(even.rotation)], axis=-1))
     changes = (
         changes.reshape(*changes.shape[:-1], -1, N_CHANGES) * estimator.change_scale
     )  # (..., sections, 6)
     quaternion = xp.concat([xp.ones_like(changes[..., :1]), changes[..., 3:]], axis=-1)
     turn = rotation_from_quaternion(quaternion / xp.sqrt(xp.sum(quaternion**2, axis=-1))[..., None])
-    return chain(Frame(even.position_m + changes[..., :3], turn @ even.rotation))[-1]
+    return chain(Frame(even.position_m + changes[..., :3], turn @ even.rotation))
 
 
 def constant_curvature(spring_site_m: Any, spring_m: Any) -> Frame:
@@ -98,23 +97,29 @@ def constant_curvature(spring_site_m: Any, spring_m: Any) -> Frame:
     half = xp.sin(0.5 * angle) / angle
     aside, down = 2.0 * half**2, xp.sin(angle) / angle  # aside: (1 - cos) / angle^2, exact in float32 too
     position_m = length * xp.concat([aside * bend, -down], axis=-1)
-    axis = xp.stack([bend[..., 1], -bend[..., 0], xp.zeros_like(bend[..., 0])], axis=-1)
-    quaternion = xp.concat([xp.cos(0.5 * angle), half * axis], axis=-1)
+    across = half * bend  # the axis of the turn is (bend y, -bend x, 0)
+    quaternion = xp.concat(
+        [xp.cos(0.5 * angle), across[..., 1:], -across[..., :1], xp.zeros_like(angle)], axis=-1
+    )
     return Frame(position_m, rotation_from_quaternion(quaternion))
 
 
-def chain(sections: Frame) -> list[Frame]:
-    """Plates in the base frame of sections (..., n_sections) that follow one another."""
-    first, *others = (
-        Frame(sections.position_m[..., k, :], sections.rotation[..., k, :, :])
-        for k in range(sections.position_m.shape[-2])
-    )
-    plates = [first]
-    for section in others:
-        above = plates[-1]
-        offset_m = (above.rotation @ section.position_m[..., None])[..., 0]
-        plates.append(Frame(above.position_m + offset_m, above.rotation @ section.rotation))
-    return plates
+def _downs(rotation: Any) -> list[Any]:
+    """The base's z axis (..., 3) at each section's end, if they turn by (..., n_sections, 3, 3)."""
+    downs = [rotation[..., 0, 2:, :]]
+    for section in range(1, rotation.shape[-3]):
+        downs.append(downs[-1] @ rotation[..., section, :, :])
+    return [down[..., 0, :] for down in downs]
+
+
+def chain(sections: Frame) -> Frame:
+    """The last plate in the base frame of sections (..., n_sections) that follow one another."""
+    position_m, rotation = sections.position_m[..., -1, :, None], sections.rotation[..., -1, :, :]
+    for section in reversed(range(sections.position_m.shape[-2] - 1)):  # from the tip up to the base
+        above = sections.rotation[..., section, :, :]
+        position_m = sections.position_m[..., section, :, None] + above @ position_m
+        rotation = above @ rotation
+    return Frame(position_m[..., 0], rotation)
 
 
 def expected_springs(model: SpringModel, pressure_kpa: Any) -> Any:

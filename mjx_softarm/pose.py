@@ -13,11 +13,15 @@ Close by, yaw and roll change as fast as 1 / cos(pitch), and so do their gradien
 
 from __future__ import annotations
 
-from types import ModuleType
+import numpy as np
 
 from mjx_softarm._xp import Array, array_namespace
 
 _LOCKED_COS = 1e-6  # cos(pitch) below this is gimbal lock
+
+# A quaternion q turns a vector v into q v q*: the matrices of these two products, as indices of (q, -q).
+_LEFT = np.array([[1, 0, 7, 2], [2, 3, 0, 5], [3, 6, 1, 0]])
+_RIGHT = np.array([[1, 2, 3], [0, 7, 2], [3, 0, 5], [6, 1, 0]])
 
 
 def pose_from_frame(position_m: Array, rotation: Array) -> Array:
@@ -60,15 +64,22 @@ def pose_from_quaternion(position_m: Array, quaternion: Array) -> Array:
 def rotation_from_quaternion(quaternion: Array) -> Array:
     """Matrix (..., 3, 3) of a quaternion (..., 4) w, x, y, z; its entries scale with the length's square."""
     xp = array_namespace(quaternion)
-    w, x, y, z = (quaternion[..., k] for k in range(4))
-    return _matrix(
-        xp,
-        [
-            [w * w + x * x - y * y - z * z, 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
-            [2.0 * (x * y + w * z), w * w - x * x + y * y - z * z, 2.0 * (y * z - w * x)],
-            [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), w * w - x * x - y * y + z * z],
-        ],
-    )
+    signed = xp.concat([quaternion, -quaternion], axis=-1)  # (..., 8)
+    return signed[..., _LEFT] @ signed[..., _RIGHT]
+
+
+def quaternion_from_pose(pose: Array) -> Array:
+    """Quaternion (..., 4) w, x, y, z of the angles of a pose (..., 6) [mm, deg]."""
+    xp = array_namespace(pose)
+    half = xp.deg2rad(0.5 * pose[..., 3:])
+    (cy, cp, cr), (sy, sp, sr) = ([f(half[..., k]) for k in range(3)] for f in (xp.cos, xp.sin))
+    parts = [
+        cy * cp * cr + sy * sp * sr,
+        cy * cp * sr - sy * sp * cr,
+        cy * sp * cr + sy * cp * sr,
+        sy * cp * cr - cy * sp * sr,
+    ]
+    return xp.stack(parts, axis=-1)
 
 
 def frame_from_pose(pose: Array) -> tuple[Array, Array]:
@@ -76,15 +87,12 @@ def frame_from_pose(pose: Array) -> tuple[Array, Array]:
     xp = array_namespace(pose)
     angles = xp.deg2rad(pose[..., 3:])
     (cy, cp, cr), (sy, sp, sr) = ([f(angles[..., k]) for k in range(3)] for f in (xp.cos, xp.sin))
-    rotation = _matrix(
-        xp,
-        [
-            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-            [-sp, cp * sr, cp * cr],
-        ],
+    rows = (
+        *(cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
+        *(sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
+        *(-sp, cp * sr, cp * cr),
     )
-    return 0.001 * pose[..., :3], rotation
+    return 0.001 * pose[..., :3], xp.stack(rows, axis=-1).reshape(*pose.shape[:-1], 3, 3)
 
 
 def pose_error(pose: Array, goal: Array) -> Array:
@@ -94,7 +102,3 @@ def pose_error(pose: Array, goal: Array) -> Array:
     angles = error[..., 3:]
     wrapped = angles - 360.0 * xp.floor((angles + 180.0) / 360.0)
     return xp.concat([error[..., :3], wrapped], axis=-1)
-
-
-def _matrix(xp: ModuleType, rows: list[list[Array]]) -> Array:
-    return xp.stack([xp.stack(row, axis=-1) for row in rows], axis=-2)

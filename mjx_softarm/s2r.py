@@ -53,7 +53,12 @@ def correct(s2r: S2R, pose: Any, spring_m: Any) -> Any:
     Returns:
         Pose (..., 6) [mm, deg].
     """
-    return apply_correction(pose, correction(s2r, inputs(pose, spring_m)))
+    return pose_from_frame(*correct_frame(s2r, frame_from_pose(pose), spring_m))
+
+
+def correct_frame(s2r: S2R, frame: tuple[Any, Any], spring_m: Any) -> tuple[Any, Any]:
+    """The same of a frame, origin (..., 3) [m] and axes (..., 3, 3); see `apply_correction`."""
+    return apply_correction(frame, correction(s2r, inputs(frame, spring_m)))
 
 
 def extrapolation(s2r: S2R, pose: Any, spring_m: Any) -> Any:
@@ -64,13 +69,13 @@ def extrapolation(s2r: S2R, pose: Any, spring_m: Any) -> Any:
         pose (..., 6) [mm, deg]: as for `correct`.
         spring_m (..., n) [m]: as for `correct`.
     """
-    return distance(s2r, inputs(pose, spring_m)) / s2r.limit
+    return distance(s2r, inputs(frame_from_pose(pose), spring_m)) / s2r.limit
 
 
-def inputs(pose: Any, spring_m: Any) -> Any:
+def inputs(frame: tuple[Any, Any], spring_m: Any) -> Any:
     """What the network looks at (..., 9 + n): position [m], the tip's x and y axes, spring lengths [m]."""
-    xp = array_namespace(pose, spring_m)
-    position_m, rotation = frame_from_pose(pose)
+    position_m, rotation = frame
+    xp = array_namespace(position_m, spring_m)
     return xp.concat([position_m, rotation[..., 0], rotation[..., 1], spring_m], axis=-1)
 
 
@@ -88,19 +93,21 @@ def distance(s2r: S2R, x: Any) -> Any:
     return xp.sqrt(xp.min(xp.mean(offset**2, axis=-1), axis=-1))
 
 
-def apply_correction(pose: Any, change: Any) -> Any:
-    """The pose (..., 6) [mm, deg] moved by (..., 3) [mm] and turned by a Gibbs vector (..., 3).
+def apply_correction(frame: tuple[Any, Any], change: Any) -> tuple[Any, Any]:
+    """A frame moved and turned in the base frame; its axes come out scaled, which no angle depends on.
 
-    Both are in the base frame.
+    Args:
+        frame: origin (..., 3) [m] and axes (..., 3, 3).
+        change (..., 6): shift [mm], Gibbs vector.
     """
-    xp = array_namespace(pose, change)
-    position_m, rotation = frame_from_pose(pose)
+    position_m, rotation = frame
+    xp = array_namespace(position_m, change)
     turn = rotation_from_quaternion(xp.concat([xp.ones_like(change[..., :1]), change[..., 3:]], axis=-1))
-    return pose_from_frame(position_m + 0.001 * change[..., :3], turn @ rotation)
+    return position_m + 0.001 * change[..., :3], turn @ rotation
 
 
 def correction_between(pose: Any, real_pose: Any) -> Any:
-    """The change (..., 6) with which `apply_correction` turns a pose into the real one, below 180 degrees."""
+    """The change (..., 6) with which `apply_correction` makes a pose the real one, below 180 degrees."""
     xp = array_namespace(pose, real_pose)
     (start_m, start), (end_m, end) = frame_from_pose(pose), frame_from_pose(real_pose)
     turn = end @ xp.swapaxes(start, -1, -2)

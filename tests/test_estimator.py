@@ -62,12 +62,10 @@ def test_section_of_constant_curvature(bend_rad, towards_rad):
 
 def test_sections_follow_one_another():
     shapes = [(0.15, 0.3, 0.9), (0.22, -2.0, 1.4), (0.2, 1.9, 0.6)]
+    even = constant_curvature(SITE_M, np.concatenate([springs_of(*shape) for shape in shapes]))
     position_m, rotation = np.zeros(3), np.eye(3)
-    for plate, shape in zip(
-        chain(constant_curvature(SITE_M, np.concatenate([springs_of(*shape) for shape in shapes]))),
-        shapes,
-        strict=True,
-    ):
+    for n_sections, shape in enumerate(shapes, 1):
+        plate = chain(Frame(even.position_m[:n_sections], even.rotation[:n_sections]))
         end_m, turn = integrated(*shape)
         position_m, rotation = position_m + rotation @ end_m, rotation @ turn
         np.testing.assert_allclose(plate.position_m, position_m, atol=1e-8)
@@ -86,7 +84,7 @@ def test_changes_move_and_turn_the_section_ends():
     angle = 2 * np.arctan(np.linalg.norm(changes[:, 3:], axis=1))
     axis = changes[:, 3:] / np.linalg.norm(changes[:, 3:], axis=1, keepdims=True)
     turn = Rotation.from_rotvec(angle[:, None] * axis).as_matrix()
-    expected = chain(Frame(even.position_m + changes[:, :3], turn @ even.rotation))[-1]
+    expected = chain(Frame(even.position_m + changes[:, :3], turn @ even.rotation))
     got = estimate_frame(estimator, spring_m)
     np.testing.assert_allclose(got.position_m, expected.position_m, atol=1e-12)
     np.testing.assert_allclose(got.rotation, expected.rotation, atol=1e-12)

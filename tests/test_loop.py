@@ -470,7 +470,9 @@ def test_every_fault_has_a_response_and_stands_in_the_table():
 def test_extrapolation_is_counted(monkeypatch):
     policy = SimpleNamespace(**{**vars(POLICY), "s2r": "network"})
     seen = []
-    monkeypatch.setattr("mjx_softarm.deploy.loop.correct", lambda s2r, pose, spring_m: pose + 1.0)
+    monkeypatch.setattr(
+        "mjx_softarm.deploy.loop.correct_frame", lambda s2r, frame, spring_m: (frame[0] + 0.001, frame[1])
+    )
 
     def extrapolation(s2r, pose, spring_m):
         seen.append(np.abs(pose - estimate(POLICY.estimator, spring_m)).max())
@@ -481,7 +483,7 @@ def test_extrapolation_is_counted(monkeypatch):
     assert run.counts() == {Fault.EXTRAPOLATION: N_ACTIONS} and max(seen) == 0.0
     row = run.arrivals[0].row
     plain = estimate(POLICY.estimator, read_m(run.log)[row])
-    np.testing.assert_allclose(run.log.estimate[row], plain + 1.0, atol=1e-3)
+    np.testing.assert_allclose(run.log.estimate[row], plain + [1.0, 1.0, 1.0, 0.0, 0.0, 0.0], atol=1e-3)
 
 
 # --- recording -------------------------------------------------------------------------------------
@@ -532,6 +534,10 @@ def test_recording_stops_and_vents_when_readings_are_lost():
     [
         ("twin", "got 'twin', expected twin:SEED or package.module:Class"),
         ("twin:-1", "got '-1', expected an integer >= 0"),
+        ("twin:0:pipe200", "twin:0:PIPE, got 'pipe200', expected pipe300 or pipe250"),
+        ("twin:0:", "twin:0:PIPE, got '', expected pipe300 or pipe250"),
+        ("twin::pipe300", "got '', expected an integer >= 0"),
+        ("twin:0:pipe300:x", "got 'pipe300:x', expected pipe300 or pipe250"),
         ("no_such_module:Arm", "no_such_module cannot be imported: No module named 'no_such_module'"),
         ("mjx_softarm.deploy.loop:Nothing", "module mjx_softarm.deploy.loop has no 'Nothing'"),
         ("mjx_softarm.deploy.loop:Phase", "has no method read_frequencies or write_pressures"),

@@ -55,12 +55,16 @@ def network(constant=None, seed=0):
     return S2R(layers, *(np.asarray(a, np.float32) for a in arrays))
 
 
+def moved(pose, change):
+    return pose_from_frame(*apply_correction(frame_from_pose(pose), change))
+
+
 def test_correction_is_a_shift_and_a_turn_in_the_base_frame():
     start, axis, angle = poses(200), RNG.normal(size=(200, 3)), RNG.uniform(-2.0, 2.0, (200, 1))
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
     shift_mm = RNG.normal(0.0, 20.0, (200, 3))
-    end = apply_correction(start, np.concatenate([shift_mm, axis * np.tan(angle / 2)], axis=1))
-    (start_m, start_axes), (end_m, end_axes) = frame_from_pose(start), frame_from_pose(end)
+    change = np.concatenate([shift_mm, axis * np.tan(angle / 2)], axis=1)
+    (start_m, start_axes), (end_m, end_axes) = frame_from_pose(start), frame_from_pose(moved(start, change))
     np.testing.assert_allclose(end_m, start_m + 1e-3 * shift_mm, atol=1e-12)
     np.testing.assert_allclose(
         end_axes, Rotation.from_rotvec(axis * angle).as_matrix() @ start_axes, atol=1e-12
@@ -72,7 +76,7 @@ def test_correction_between_two_poses_turns_one_into_the_other():
     turns = Rotation.random(500, random_state=2)
     turns = Rotation.from_rotvec(np.deg2rad(170.0) / np.pi * turns.as_rotvec())
     end = pose_from_frame(RNG.uniform(-0.3, 0.3, (500, 3)), turns.as_matrix() @ frame_from_pose(start)[1])
-    reached = apply_correction(start, correction_between(start, end))
+    reached = moved(start, correction_between(start, end))
     for got, expected in zip(frame_from_pose(reached), frame_from_pose(end), strict=True):
         np.testing.assert_allclose(got, expected, atol=1e-9)
 

@@ -26,8 +26,9 @@ from mjx_softarm.deploy import faults
 from mjx_softarm.deploy.faults import Event, Fault, Response
 from mjx_softarm.deploy.reach import Reachable, nearest
 from mjx_softarm.deploy.runtime import PolicyRunner
-from mjx_softarm.estimator import estimate
-from mjx_softarm.s2r import correct, extrapolation
+from mjx_softarm.estimator import Frame, estimate_frame
+from mjx_softarm.pose import pose_from_frame
+from mjx_softarm.s2r import correct_frame, extrapolation
 from mjx_softarm.sensors import SensorFault, describe_faults, length_from_frequency
 
 N_ACTIONS = 4  # for each goal, as in training's evaluation
@@ -152,17 +153,18 @@ def step(
     state = state._replace(n_late=state.n_late + 1 if late else 0)
     state, found = _sense(controller, state, frequency_hz)
     events += found
-    pose = _pose(controller, state.spring_m)
+    frame = _frame(controller, state.spring_m)
+    pose = _pose(controller, frame, state.spring_m)
     if state.phase is Phase.VENT:
         return _vent(controller, state), Tick(state.spring_m, pose, tuple(events), False)
 
     arrived = False
-    known = not np.isnan(state.spring_m).any()
-    if known and not _stops(events):
-        state, found = _check_chambers(controller, state)
+    at_rest = _at_rest(controller, state)
+    if frame is not None and not _stops(events):
+        state, found = _check_chambers(controller, state, at_rest)
         events += found
-    if known and not _stops(events) and state.goal is not None and not state.n_lost.any():
-        state, found, arrived = _go(controller, state, pose)
+    if frame is not None and not _stops(events) and state.goal is not None and not state.n_lost.any():
+        state, found, arrived = _go(controller, state, frame, pose, at_rest)
         events += found
     responses = [event.response for event in events]
     if Response.VENT in responses:
@@ -202,7 +204,7 @@ def _sense(
         lost, spring_m, events = np.ones(len(state.spring_m), bool), state.spring_m, []
         events.append(Event(Fault.LOST_READING, "no readings within the tick"))
     else:
-        reading = length_from_frequency(frequency_hz, sensor, np.nan_to_num(state.spring_m))
+        reading = length_from_frequency(frequency_hz, sensor)
         lost, events = reading.fault != SensorFault.OK.value, []
         spring_m = np.where(lost, state.spring_m, reading.length_m)
         if lost.any():
@@ -212,8 +214,8 @@ def _sense(
     state = state._replace(
         spring_m=spring_m,
         n_lost=np.where(lost, state.n_lost + 1, 0),
-        springs_m=np.vstack([state.springs_m, spring_m])[-window:],
-        pressures_kpa=np.vstack([state.pressures_kpa, state.pressure_kpa])[-window:],
+        springs_m=np.concat([state.springs_m[1 - window :], spring_m[None]]),
+        pressures_kpa=np.concat([state.pressures_kpa[1 - window :], state.pressure_kpa[None]]),
     )
     if state.phase is not Phase.RUN:
         return state, events
@@ -233,13 +235,19 @@ def _sense(
     return state, events
 
 
-def _pose(controller: Controller, spring_m: np.ndarray) -> np.ndarray:
-    policy = controller.policy
-    if np.isnan(spring_m).any():
+def _frame(controller: Controller, spring_m: np.ndarray) -> Frame | None:
+    """The simulated arm's tip; None before each spring has been read."""
+    return None if np.isnan(spring_m).any() else estimate_frame(controller.policy.estimator, spring_m)
+
+
+def _pose(controller: Controller, frame: Frame | None, spring_m: np.ndarray) -> np.ndarray:
+    """Pose (6,) [mm, deg] of the real tip; NaN where it is unknown."""
+    s2r = controller.policy.s2r
+    if frame is None:
         return np.full(6, np.nan)
-    spring_m = spring_m.astype(np.float32)
-    pose = estimate(policy.estimator, spring_m)
-    return pose if policy.s2r is None else correct(policy.s2r, pose, spring_m)
+    if s2r is None:
+        return pose_from_frame(*frame)
+    return pose_from_frame(*correct_frame(s2r, frame, spring_m.astype(np.float32)))
 
 
 def _at_rest(controller: Controller, state: State) -> bool:
@@ -248,8 +256,8 @@ def _at_rest(controller: Controller, state: State) -> bool:
     return full and faults.still(state.springs_m)
 
 
-def _check_chambers(controller: Controller, state: State) -> tuple[State, list[Event]]:
-    if state.reference_m is None or not _at_rest(controller, state):
+def _check_chambers(controller: Controller, state: State, at_rest: bool) -> tuple[State, list[Event]]:
+    if state.reference_m is None or not at_rest:
         return state._replace(n_suspect=np.zeros_like(state.n_suspect)), []
     policy = controller.policy
     suspect = faults.lost_chambers(
@@ -264,11 +272,13 @@ def _check_chambers(controller: Controller, state: State) -> tuple[State, list[E
     return state, [Event(Fault.CHAMBER_LOST, message)]
 
 
-def _go(controller: Controller, state: State, pose: np.ndarray) -> tuple[State, list[Event], bool]:
+def _go(
+    controller: Controller, state: State, frame: Frame, pose: np.ndarray, at_rest: bool
+) -> tuple[State, list[Event], bool]:
     """Act if the goal is new or the springs have settled; arrive when they have after the last action."""
     events: list[Event] = []
     if state.n_actions > 0:
-        settled = _at_rest(controller, state) and _on_reference(controller, state)
+        settled = at_rest and _on_reference(controller, state)
         if not settled and state.n_ticks * controller.dt_s < faults.SETTLE_TIMEOUT_S:
             return state, [], False
         if state.n_suspect.any() and settled:  # whether a chamber is lost comes first
@@ -279,7 +289,7 @@ def _go(controller: Controller, state: State, pose: np.ndarray) -> tuple[State, 
     policy = controller.policy
     if policy.s2r is not None:
         spring_m = state.spring_m.astype(np.float32)
-        distance = float(extrapolation(policy.s2r, estimate(policy.estimator, spring_m), spring_m))
+        distance = float(extrapolation(policy.s2r, pose_from_frame(*frame), spring_m))
         if distance > 1.0:
             message = f"{distance:.1f} times as far from the training rows as the network is believed"
             events.append(Event(Fault.EXTRAPOLATION, message))

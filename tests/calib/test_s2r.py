@@ -13,7 +13,7 @@ from calib.network import NetworkConfig, fit_network
 from calib.s2r import fit_s2r, pose_errors, simulate_poses
 from mjx_softarm.kinematics import chain_frames
 from mjx_softarm.mlp import mlp
-from mjx_softarm.pose import pose_from_frame
+from mjx_softarm.pose import frame_from_pose, pose_from_frame
 from mjx_softarm.s2r import apply_correction, correct, correction, extrapolation, load_s2r, save_s2r
 from mjx_softarm.settle import settle
 from mjx_softarm.statics import ArmParams
@@ -28,7 +28,11 @@ needs_data = pytest.mark.skipif(not DATA.is_dir(), reason=f"no logs of a real tr
 def measured(pose, rng, noise_mm=0.5, noise_deg=0.3):
     """Poses as motion capture would measure them."""
     turn = rng.normal(0.0, 0.5 * np.deg2rad(noise_deg), (len(pose), 3))
-    return apply_correction(pose, np.concatenate([rng.normal(0.0, noise_mm, (len(pose), 3)), turn], axis=1))
+    return moved(pose, np.concatenate([rng.normal(0.0, noise_mm, (len(pose), 3)), turn], axis=1))
+
+
+def moved(pose, change):
+    return pose_from_frame(*apply_correction(frame_from_pose(pose), change))
 
 
 @pytest.fixture(scope="module")
@@ -137,7 +141,7 @@ def test_warns_of_few_rows_no_gain_and_another_frame(arms):
     pose_sim, spring_m, true = (a[:150] for a in arms)
     perfect = fit_s2r(pose_sim, spring_m, pose_sim, config=BRIEF).warnings
     assert "150 rows are few" in perfect[0] and "no better than 0 without" in perfect[1]
-    turned = apply_correction(true, np.broadcast_to([0, 0, 0, 0, 0, np.tan(np.radians(60.0))], (150, 6)))
+    turned = moved(true, np.broadcast_to([0, 0, 0, 0, 0, np.tan(np.radians(60.0))], (150, 6)))
     assert any(
         "in 150 of 150 rows" in text for text in fit_s2r(pose_sim, spring_m, turned, config=BRIEF).warnings
     )
