@@ -1,4 +1,4 @@
-"""Command line: `python -m train reach | evaluate | export`."""
+"""Command line: `python -m train reach | evaluate | export | demos`."""
 
 from __future__ import annotations
 
@@ -15,11 +15,15 @@ from rich.console import Console
 from rich.table import Table
 
 from mjx_softarm.archive import SealedFileError
+from mjx_softarm.checks import LogError
+from mjx_softarm.deploy.arms import ArmError
 from mjx_softarm.s2r import S2R, S2R_FILE, load_s2r
 from mjx_softarm.spec import ARM_FILE, ArmSpec, SpecError
 from train.checkpoint import Run, RunError
 from train.config import PRESETS, ConfigError, override
+from train.demos import add_commands
 from train.evaluate import N_ACTIONS, N_GOALS, Summary
+from train.expert import ExpertError
 
 PICTURES = ("learning_curve.png", "circle.png", "workspace_error.png")
 
@@ -30,7 +34,7 @@ def main(arguments: list[str] | None = None) -> int:
     console = Console()
     try:
         return options.command(options, console)
-    except (RunError, ConfigError, SpecError, SealedFileError) as error:
+    except (RunError, ConfigError, SpecError, SealedFileError, LogError, ArmError, ExpertError) as error:
         Console(stderr=True).print(f"error: {error}", markup=False, highlight=False, soft_wrap=True)
         return 2
     except KeyboardInterrupt:
@@ -64,6 +68,7 @@ def _parser() -> argparse.ArgumentParser:
     export.add_argument("run", type=Path, help="folder of the run")
     export.add_argument("--out", type=Path, help="default: RUN/policy.npz")
     export.set_defaults(command=_export)
+    add_commands(commands, _arm)
     return parser
 
 

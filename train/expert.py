@@ -37,15 +37,15 @@ N_JITTERED = 8  # of the starts, about the posture before
 JITTER_KPA = 3.0
 WAY = (0.25, 0.5, 0.75)  # of the way from the posture before, where its clearance is looked at
 MARGIN_M = 0.004  # of the body to the wall
-COMFORT_M = 0.02  # beyond this, more clearance is worth nothing
-MARGIN_KPA = 1.0  # of the chambers to their limits
+MARGIN_KPA = 1.5  # of the chambers to their limits
+COMFORT_M, COMFORT_KPA = 0.02, 6.0  # beyond these, more distance is worth nothing
 SPRING_MARGIN_M = 1e-3
 TOLERANCE_M, TOLERANCE_RAD = 5e-4, 0.01  # of a waypoint that is met
 LIMIT_SHARE = 0.8  # of a margin, that must be kept: one-sided errors end a little inside of it
 
 # One unit of error.
 _POSITION_M, _TURN_RAD, _LIMIT_KPA, _LIMIT_M = 1e-4, 1e-3, 0.1, 1e-4
-_COMFORT_M, _NEAR_KPA = 0.02, 20.0
+_COMFORT_M, _COMFORT_KPA, _NEAR_KPA = 0.02, 3.0, 20.0
 _NO_WALL_M = 1.0  # clearance where there is no pipe
 
 
@@ -271,11 +271,14 @@ def _errors(posture: tuple[Posture, Array], target: Target, spec: ArmSpec) -> Ar
     chambers, springs = spec.chambers, spec.springs
     turn = now.rotation.T @ target.rotation
     angle = 0.5 * jnp.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+    room_kpa = jnp.concatenate(
+        [now.pressure_kpa - chambers.pressure_min_kpa, chambers.pressure_max_kpa - now.pressure_kpa]
+    )
+    room_m = jnp.concatenate([now.spring_m - springs.length_min_m, springs.length_max_m - now.spring_m])
     within = [
-        (now.pressure_kpa - chambers.pressure_min_kpa - MARGIN_KPA) / _LIMIT_KPA,
-        (chambers.pressure_max_kpa - MARGIN_KPA - now.pressure_kpa) / _LIMIT_KPA,
-        (now.spring_m - springs.length_min_m - SPRING_MARGIN_M) / _LIMIT_M,
-        (springs.length_max_m - SPRING_MARGIN_M - now.spring_m) / _LIMIT_M,
+        (room_kpa - MARGIN_KPA) / _LIMIT_KPA,
+        (room_kpa - COMFORT_KPA) / _COMFORT_KPA,
+        (room_m - SPRING_MARGIN_M) / _LIMIT_M,
         (wall_m - MARGIN_M) / _LIMIT_M,
         (wall_m - COMFORT_M) / _COMFORT_M,
     ]

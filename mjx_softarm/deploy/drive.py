@@ -27,8 +27,8 @@ RAMP_M_PER_S = 0.03  # of the reference that has furthest to go
 Law = Callable[[np.ndarray | None, np.ndarray], tuple[np.ndarray, bool]]
 
 
-class ReadingsLost(Exception):
-    """The springs cannot be read any more; the message says which."""
+class DriveError(Exception):
+    """The arm cannot be driven on; the message says why."""
 
 
 def ramp(target_kpa: np.ndarray, dt_s: float) -> Law:
@@ -90,7 +90,7 @@ class Drive:
 
         Raises:
             ArmLost: the arm cannot be reached.
-            ReadingsLost: so many readings were lost in a row.
+            DriveError: too many readings were lost in a row.
         """
         springs_m = np.empty((0, len(self.pumps.pressure_kpa)))
         for _ in range(round(SETTLE_TIMEOUT_S / self.dt_s)):
@@ -131,7 +131,7 @@ class Drive:
         row["frequency_hz"] = spring_m * np.nan if frequency_hz is None else frequency_hz
         self.n_lost = self.n_lost + 1 if lost else 0
         if self.n_lost >= LOST_TICKS:
-            raise ReadingsLost(f"readings lost in {self.n_lost} ticks in a row: {text}")
+            raise DriveError(f"readings lost in {self.n_lost} ticks in a row: {text}")
         known_m = None if lost else spring_m
         pressure_kpa, arrived = law(known_m, self.pumps.pressure_kpa)
         self.pumps.write(pressure_kpa)
@@ -140,7 +140,7 @@ class Drive:
 
 
 def drive_to_end(drive: Drive, run: Callable[[], None]) -> str:
-    """Run, then vent, whatever happens; Ctrl-C vents and a second one ends at once.
+    """Run, then vent, also where an error of the arm or Ctrl-C ends it; a second Ctrl-C ends at once.
 
     Returns:
         Why it ended early, or "".
@@ -150,7 +150,7 @@ def drive_to_end(drive: Drive, run: Callable[[], None]) -> str:
         run()
     except KeyboardInterrupt:
         problem = "interrupted"
-    except (ReadingsLost, ArmLost) as error:
+    except (DriveError, ArmLost) as error:
         problem = str(error)
     try:
         drive.vent()
