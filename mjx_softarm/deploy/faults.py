@@ -122,10 +122,13 @@ def stuck_springs(spring_m: np.ndarray, pressure_kpa: np.ndarray) -> np.ndarray:
         pressure_kpa (ticks, n) [kPa]: pressures commanded in them.
     """
     moved_m = np.ptp(spring_m, axis=0)  # (n,)
+    suspects = moved_m < STUCK_RANGE_M
+    if not suspects.any():
+        return suspects
     by_section = moved_m.reshape(-1, N_CHAMBERS_PER_SECTION)
     near_m = np.repeat(by_section.max(axis=1), N_CHAMBERS_PER_SECTION)
     asked = (np.ptp(pressure_kpa, axis=0) > STUCK_PRESSURE_KPA) | (near_m > STUCK_NEIGHBOUR_M)
-    return (moved_m < STUCK_RANGE_M) & asked
+    return suspects & asked
 
 
 def lost_chambers(

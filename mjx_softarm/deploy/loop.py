@@ -28,7 +28,7 @@ from mjx_softarm.deploy.reach import Reachable, nearest
 from mjx_softarm.deploy.runtime import PolicyRunner
 from mjx_softarm.estimator import Frame, estimate_frame
 from mjx_softarm.pose import pose_from_frame
-from mjx_softarm.s2r import correct_frame, extrapolation
+from mjx_softarm.s2r import correct_frame, distance, inputs
 from mjx_softarm.sensors import SensorFault, describe_faults, length_from_frequency
 
 N_ACTIONS = 4  # for each goal, as in training's evaluation
@@ -124,11 +124,11 @@ def with_goal(controller: Controller, state: State, goal: np.ndarray) -> tuple[S
     text = ", ".join(f"{value:g}" for value in goal)
     if goal.shape != (6,) or not np.isfinite(goal).all():
         return state, (Event(Fault.GOAL_OUTSIDE, f"got {text}, expected six finite numbers"),)
-    pose, distance = nearest(controller.reachable, goal, controller.policy.reward)
-    if distance > 1.0:
+    pose, away = nearest(controller.reachable, goal, controller.policy.reward)
+    if away > 1.0:
         near = ", ".join(f"{value:.0f}" for value in pose)
         message = (
-            f"{text} is {distance:.1f} times as far from the nearest reachable pose as a goal may be; "
+            f"{text} is {away:.1f} times as far from the nearest reachable pose as a goal may be; "
             f"that pose is {near} [mm, deg]"
         )
         return state, (Event(Fault.GOAL_OUTSIDE, message),)
@@ -289,9 +289,9 @@ def _go(
     policy = controller.policy
     if policy.s2r is not None:
         spring_m = state.spring_m.astype(np.float32)
-        distance = float(extrapolation(policy.s2r, pose_from_frame(*frame), spring_m))
-        if distance > 1.0:
-            message = f"{distance:.1f} times as far from the training rows as the network is believed"
+        away = float(distance(policy.s2r, inputs(frame, spring_m)) / policy.s2r.limit)
+        if away > 1.0:
+            message = f"{away:.1f} times as far from the training rows as the network is believed"
             events.append(Event(Fault.EXTRAPOLATION, message))
     reference_m = controller.plan(pose, state.goal, state.spring_m)
     state = state._replace(reference_m=reference_m, n_actions=state.n_actions + 1, n_ticks=0)
