@@ -18,6 +18,12 @@ def ring_radius_m(spec: ArmSpec) -> float:
     return spec.geometry.spring_radius_m + SPRING_WIDTH_M
 
 
+def rim_points(radius_m: float, n: int = 16) -> np.ndarray:
+    """Points (n, 3) [m] on a circle about z, at equal distances, the first on +x."""
+    angle = 2 * np.pi * np.arange(n) / n
+    return radius_m * np.stack([np.cos(angle), np.sin(angle), np.zeros(n)], axis=-1)
+
+
 def gripper_boxes(spec: ArmSpec) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Name -> half sizes (3,) and centre (3,) [m] of each box, from the middle of the gripper, z up."""
     quarter = 0.25 * spec.mass.gripper_length_m
@@ -26,3 +32,8 @@ def gripper_boxes(spec: ArmSpec) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         "finger0": (np.array([0.005, 0.010, quarter]), np.array([-0.02, 0.0, -quarter])),
         "finger1": (np.array([0.005, 0.010, quarter]), np.array([0.02, 0.0, -quarter])),
     }
+
+
+def payload_radius_m(payload_kg: float) -> float:
+    """Radius of the ball that stands for a payload in pictures; the room it takes is not modelled."""
+    return 0.03 * payload_kg ** (1 / 3) + 0.01

@@ -12,7 +12,7 @@ import math
 import mujoco
 import numpy as np
 
-from mjx_softarm.body import SPRING_WIDTH_M, gripper_boxes, ring_radius_m
+from mjx_softarm.body import SPRING_WIDTH_M, gripper_boxes, payload_radius_m, ring_radius_m
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
 from mjx_softarm.statics import GRAVITY_M_S2, ArmParams
 
@@ -127,7 +127,7 @@ def _add_tools(last, params: ArmParams, spec: ArmSpec) -> None:
         if name == "gripper":
             _draw_gripper(tool, spec)
     if spec.mass.payload_kg > 0:
-        size = [0.03 * spec.mass.payload_kg ** (1 / 3) + 0.01, 0.0, 0.0]
+        size = [payload_radius_m(spec.mass.payload_kg), 0.0, 0.0]
         tool.add_geom(
             name="payload", size=size, rgba=[0.2, 0.6, 0.25, 1.0], mass=0.0, contype=0, conaffinity=0
         )

@@ -13,9 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from mjx_softarm._xp import Array, array_namespace
-from mjx_softarm.body import gripper_boxes, ring_radius_m
+from mjx_softarm.body import gripper_boxes, rim_points, ring_radius_m
 from mjx_softarm.spec import ArmSpec
 
+# What the arm picks and places. Source: the paper's section on confined scenarios.
+BALL_KG = 0.035  # a sponge ball
+APPLE_KG = 0.220
 RIM_POINTS = 16  # of a ring; the rim is at most 1 - cos(pi / 16) = 1.9 % of its radius beyond them
 
 
@@ -92,7 +95,7 @@ def body_points(plate_position: Array, plate_rotation: Array, spec: ArmSpec) -> 
         (..., RIM_POINTS * (L + 1) + 24, 3) [m], in the frame of the plates.
     """
     xp = array_namespace(plate_position, plate_rotation)
-    rims = plate_position[..., None, :] + _turned(plate_rotation, _rim(spec))
+    rims = plate_position[..., None, :] + _turned(plate_rotation, rim_points(ring_radius_m(spec), RIM_POINTS))
     corners = plate_position[..., -1:, :] + _turned(plate_rotation[..., -1, :, :], _gripper(spec))
     return xp.concat([rims.reshape(*rims.shape[:-3], -1, 3), corners], axis=-2)
 
@@ -105,12 +108,6 @@ def _turned(rotation: Array, point: np.ndarray) -> Array:
 def body_clearance(pipe: CrossPipe, plate_position: Array, plate_rotation: Array, spec: ArmSpec) -> Array:
     """The least clearance (...) [m] over `body_points`; see there and `clearance`."""
     return clearance(pipe, body_points(plate_position, plate_rotation, spec)).min(axis=-1)
-
-
-def _rim(spec: ArmSpec) -> np.ndarray:
-    """(RIM_POINTS, 3) in the plate's frame."""
-    angle = 2 * np.pi * np.arange(RIM_POINTS) / RIM_POINTS
-    return ring_radius_m(spec) * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=-1)
 
 
 def _gripper(spec: ArmSpec) -> np.ndarray:

@@ -33,6 +33,7 @@ _CORE_RADIUS = 0.8  # of the bellows: what shows between its convolutions
 _MOUNT_RADIUS_M = 0.095
 _MOUNT_HALF_HEIGHT_M = 0.02
 _MOUNT_COLOUR = (0.55, 0.57, 0.60, 1.0)
+_PAYLOAD_COLOUR = (0.20, 0.60, 0.25, 1.0)
 
 
 class RenderError(RuntimeError):
@@ -74,8 +75,10 @@ class Renderer:
         self._scene = mujoco.MjvScene(self._model, _MAX_GEOMS)
         self._gl, self._context = _open_context(self._model, width, height)
 
-    def draw(self, q: np.ndarray, camera: Camera | None = None) -> np.ndarray:
+    def draw(self, q: np.ndarray, camera: Camera | None = None, payload_radius_m: float = 0.0) -> np.ndarray:
         """The arm at joint coordinates q (nq,) [m, rad]: RGB, (height, width, 3) uint8.
+
+        A payload that the model does not draw by itself is a ball of `payload_radius_m` at the finger tips.
 
         Raises:
             ValueError: q has the wrong shape or is not finite.
@@ -95,6 +98,10 @@ class Renderer:
         mujoco.mjv_updateScene(self._model, self._data, self._option, None, view, everything, self._scene)
         _draw_bellows(self._scene, self._model)
         _draw_mount(self._scene)
+        if payload_radius_m > 0.0:
+            held = self._data.body("payload").xpos
+            ball, size = mujoco.mjtGeom.mjGEOM_SPHERE, np.full(3, payload_radius_m)
+            _append(self._scene, ball, size, held, np.eye(3), _PAYLOAD_COLOUR)
         _add_light(self._scene, np.radians(view.azimuth))
         image = np.empty((self._view.height, self._view.width, 3), np.uint8)
         self._gl.make_current()

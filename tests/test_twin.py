@@ -433,7 +433,7 @@ def test_without_s2r_the_twins_miss_the_circle_by_the_paper_s_error(spec):
 
 # --- who may import it -----------------------------------------------------------------------------
 
-TWIN_MODULES = {"twin", "twin_model", "hysteresis", "pneumatics"}
+TWIN_MODULES = {"twin", "twin_model", "twin_pipe", "hysteresis", "pneumatics"}
 WITHOUT_TWIN = """
 import importlib, pkgutil, sys
 for name in ("train", "calib"):

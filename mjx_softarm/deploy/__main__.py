@@ -44,7 +44,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m mjx_softarm.deploy", description="A policy on an arm.")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    arm_help = "twin:SEED, a simulated arm, or package.module:Class, a driver of your own"
+    arm_help = (
+        "twin:SEED, a simulated arm; twin:SEED:pipe300, in a pipe; or package.module:Class, your driver"
+    )
 
     run = commands.add_parser("run", help="bring the tip to goals")
     run.add_argument("policy", type=Path, metavar="ACTOR.npz", help="file of `python -m train export`")

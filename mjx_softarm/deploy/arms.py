@@ -1,4 +1,4 @@
-"""Arms by name: `twin:SEED`, or `package.module:Class`, a driver of one's own."""
+"""Arms by name: `twin:SEED`, `twin:SEED:PIPE`, or `package.module:Class`, a driver of one's own."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ import os
 import sys
 from typing import Any
 
+from mjx_softarm.pipe import CrossPipe
 from mjx_softarm.spec import SpecError
 
+PIPES_MM = {"pipe300": 300.0, "pipe250": 250.0}  # diameters of the paper's pipes
 _METHODS = ("read_frequencies", "write_pressures")
 
 
@@ -20,8 +22,8 @@ def open_arm(name: str) -> Any:
     """An arm: `ArmIO`, maybe with `pressures`, `motion_capture` or a clock of its own, `time_s`.
 
     Args:
-        name: `twin:SEED`, or `package.module:Class`, whose class takes no arguments; modules in the working
-            directory are found.
+        name: `twin:SEED`, or in a pipe `twin:SEED:pipe300` or `twin:SEED:pipe250`; or `package.module:Class`,
+            whose class takes no arguments; modules in the working directory are found.
 
     Raises:
         ArmError: the name is malformed, nothing of this name can be imported, or it is no arm.
@@ -48,14 +50,17 @@ def open_arm(name: str) -> Any:
         raise ArmError(f"--arm: {name} cannot be opened: {type(error).__name__}: {error}") from error
 
 
-def _twin(seed: str) -> Any:
+def _twin(item: str) -> Any:
+    seed, colon, pipe = item.partition(":")
     if not seed.isdecimal():
         raise ArmError(f"--arm: twin:SEED, got {seed!r}, expected an integer >= 0")
+    if colon and pipe not in PIPES_MM:
+        raise ArmError(f"--arm: twin:{seed}:PIPE, got {pipe!r}, expected {' or '.join(PIPES_MM)}")
     try:
         from mjx_softarm.deploy.twin import Twin
     except ImportError as error:
         raise ArmError(f"--arm: the twin needs MuJoCo (pip install 'mjx-softarm[sim]'): {error}") from error
     try:
-        return Twin(int(seed))
+        return Twin(int(seed), pipe=CrossPipe.of_mm(PIPES_MM[pipe]) if pipe else None)
     except SpecError as error:
-        raise ArmError(f"--arm: twin:{seed}: {error}") from error
+        raise ArmError(f"--arm: twin:{item}: {error}") from error

@@ -16,6 +16,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from mjx_softarm.body import payload_radius_m
 from mjx_softarm.deploy.arm_io import Capture
 from mjx_softarm.deploy.hysteresis import StopOperators
 from mjx_softarm.deploy.pneumatics import PUMP_M3_PER_S, VALVE_S, Pneumatics
@@ -28,6 +29,8 @@ from mjx_softarm.deploy.twin_model import (
     rotation_matrix,
     scaled_tolerances,
 )
+from mjx_softarm.deploy.twin_pipe import WallForce, contact_force, is_container
+from mjx_softarm.pipe import CrossPipe
 from mjx_softarm.sensors import frequency_from_length
 from mjx_softarm.spec import ArmSpec
 
@@ -69,6 +72,7 @@ class Twin:
         payload_kg: float = 0.0,
         session: int = EVALUATION_SESSION,
         build: Build = AS_BUILT,
+        pipe: CrossPipe | None = None,
     ):
         """Hang the arm up, unpressurised, and wait until it is at rest.
 
@@ -78,13 +82,17 @@ class Twin:
             payload_kg: attached from the start.
             session: chooses the noise.
             build: how far from ideal.
+            pipe: around the arm, in the motion capture's frame; without one the arm touches nothing.
         """
         spec = spec or ArmSpec.default()
         self._parts = draw_parts(seed, spec, build)
         self._build = build
         self._noise = np.random.default_rng([session, seed])
-        self._model = build_twin(self._parts)
+        self._pipe = pipe
+        self._model = build_twin(self._parts, pipe)
         self._data = mujoco.MjData(self._model)
+        self._container = is_container(self._model)
+        self._wall_force = WallForce(0.0, 0.0)
         self._base_m = self._parts.base_position_m
         self._base_rotation = rotation_matrix(self._parts.base_tilt_rad)
         self._steps = round(1.0 / (spec.control.rate_hz * self._model.opt.timestep))
@@ -138,6 +146,7 @@ class Twin:
                 f"pressure_kpa[{chamber}]: got {command[chamber]:g}, expected {low:g} to {high:g} kPa"
             )
         self._air.command(np.clip(command, low, high))
+        self._wall_force = WallForce(0.0, 0.0)
         for _ in range(self._steps):
             self._step()
         if self._data.warning.number.any():  # MuJoCo would start anew by itself
@@ -183,6 +192,14 @@ class Twin:
         """Let the payload go."""
         self.attach(0.0)
 
+    def wall_force_n(self) -> WallForce:
+        """How hard the arm pressed against the pipe: each the largest of the last control period.
+
+        Returns:
+            Sums [N] of the normal contact forces of the walls, and of the containers; zeros without a pipe.
+        """
+        return self._wall_force
+
     def renderer(self, width: int, height: int) -> Any:
         """A `mjx_softarm.render.Renderer` of this twin, for `draw`.
 
@@ -194,8 +211,18 @@ class Twin:
         return Renderer(self._model, width, height)
 
     def draw(self, renderer: Any) -> np.ndarray:
-        """A picture of the twin as it is now: RGB, (height, width, 3) uint8."""
-        return renderer.draw(self._data.qpos)
+        """A picture of the twin as it is now: RGB, (height, width, 3) uint8.
+
+        A pipe is drawn cut open, seen from the front, along +y; a payload as a ball at the finger tips.
+        """
+        from mjx_softarm.render import Camera
+
+        payload_kg = float(self._model.body("payload").mass[0])
+        return renderer.draw(
+            self._data.qpos,
+            Camera(azimuth_deg=90.0, height=1.7, centre=0.66) if self._pipe else None,
+            payload_radius_m(payload_kg) if payload_kg else 0.0,
+        )
 
     def describe(self) -> dict[str, Any]:
         """How the twins are distributed, for reports: nothing about the one that was drawn."""
@@ -214,6 +241,7 @@ class Twin:
             ],
             "pump [L/min]": 6e4 * PUMP_M3_PER_S,
             "valve [ms]": 1e3 * VALVE_S,
+            **({} if self._pipe is None else {"pipe": dataclasses.asdict(self._pipe)}),
         }
 
     def _step(self) -> None:
@@ -224,6 +252,9 @@ class Twin:
         data.ctrl[n:] = -self._hysteresis.move(length_m)
         data.qfrc_applied[:] = -self._friction.move(data.qpos)
         mujoco.mj_step2(self._model, data)
+        if self._pipe is not None:
+            force = contact_force(data, self._container)
+            self._wall_force = WallForce(*map(max, self._wall_force, force))
         mujoco.mj_step1(self._model, data)
 
     def _draw(self, deviation: float, *shape: int) -> np.ndarray:

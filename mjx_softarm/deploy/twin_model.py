@@ -19,7 +19,9 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
+from mjx_softarm.deploy.twin_pipe import add_pipe
 from mjx_softarm.mjcf import build_spec
+from mjx_softarm.pipe import CrossPipe
 from mjx_softarm.sensors import SensorParams
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
 from mjx_softarm.statics import GRAVITY_M_S2
@@ -133,8 +135,8 @@ def scaled_tolerances(gap: float) -> Tolerances:
     return Tolerances(**{name: gap * value for name, value in dataclasses.asdict(Tolerances()).items()})
 
 
-def build_twin(parts: Parts) -> mujoco.MjModel:
-    """The compiled model, in the frame of the arm's own base.
+def build_twin(parts: Parts, pipe: CrossPipe | None = None) -> mujoco.MjModel:
+    """The compiled model, in the frame of the arm's own base, maybe inside a pipe; see `twin_pipe`.
 
     Besides the objects of `mjx_softarm.mjcf` it has an actuator `loss{i}` on each chamber's tendon, whose
     control is a force [N]. Pressures are not clipped: that is for the regulators.
@@ -160,6 +162,8 @@ def build_twin(parts: Parts) -> mujoco.MjModel:
         mjspec.actuator(f"chamber{chamber}").ctrllimited = False
         loss = mjspec.add_actuator(name=f"loss{chamber}", target=f"chamber{chamber}")
         loss.trntype = mujoco.mjtTrn.mjTRN_TENDON
+    if pipe is not None:
+        add_pipe(mjspec, pipe, spec, parts.base_position_m, rotation_matrix(parts.base_tilt_rad))
     return mjspec.compile()
 
 
