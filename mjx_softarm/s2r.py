@@ -53,12 +53,8 @@ def correct(s2r: S2R, pose: Any, spring_m: Any) -> Any:
     Returns:
         Pose (..., 6) [mm, deg].
     """
-    return pose_from_frame(*correct_frame(s2r, frame_from_pose(pose), spring_m))
-
-
-def correct_frame(s2r: S2R, frame: tuple[Any, Any], spring_m: Any) -> tuple[Any, Any]:
-    """The same of a frame, origin (..., 3) [m] and axes (..., 3, 3); see `apply_correction`."""
-    return apply_correction(frame, correction(s2r, inputs(frame, spring_m)))
+    frame = frame_from_pose(pose)
+    return pose_from_frame(*apply_correction(frame, correction(s2r, inputs(frame, spring_m))))
 
 
 def extrapolation(s2r: S2R, pose: Any, spring_m: Any) -> Any:

@@ -151,6 +151,12 @@ def test_reaches_goals_and_vents():
     assert len(run.latency_s) == len(run.log) == len(arm.written) and len(lines) == len(GOALS)
 
 
+def test_pressures_do_not_wait_for_the_log():
+    arm, n_written = LinearArm(), []
+    run = go(arm, goals=GOALS[:1], tell=lambda _: n_written.append(len(arm.written)))
+    assert n_written == [run.arrivals[0].row + 1]
+
+
 def test_acts_at_once_and_then_at_rest():
     arm, asked = LinearArm(), []
 

@@ -26,9 +26,9 @@ from mjx_softarm.deploy import faults
 from mjx_softarm.deploy.faults import Event, Fault, Response
 from mjx_softarm.deploy.reach import Reachable, nearest
 from mjx_softarm.deploy.runtime import PolicyRunner
-from mjx_softarm.estimator import Frame, estimate_frame
+from mjx_softarm.estimator import estimate_frame
 from mjx_softarm.pose import pose_from_frame
-from mjx_softarm.s2r import correct_frame, distance, inputs
+from mjx_softarm.s2r import apply_correction, correction, distance, inputs
 from mjx_softarm.sensors import SensorFault, describe_faults, length_from_frequency
 
 N_ACTIONS = 4  # for each goal, as in training's evaluation
@@ -93,7 +93,6 @@ class Tick(NamedTuple):
     """What a tick gives besides the next state."""
 
     spring_m: np.ndarray  # (n,) lengths believed in; NaN before the first reading
-    estimate: np.ndarray  # (6,) [mm, deg] pose believed in, likewise
     events: tuple[Event, ...]
     arrived: bool  # the goal had all its actions and the springs have settled
 
@@ -153,18 +152,16 @@ def step(
     state = state._replace(n_late=state.n_late + 1 if late else 0)
     state, found = _sense(controller, state, frequency_hz)
     events += found
-    frame = _frame(controller, state.spring_m)
-    pose = _pose(controller, frame, state.spring_m)
     if state.phase is Phase.VENT:
-        return _vent(controller, state), Tick(state.spring_m, pose, tuple(events), False)
+        return _vent(controller, state), Tick(state.spring_m, tuple(events), False)
 
     arrived = False
-    at_rest = _at_rest(controller, state)
-    if frame is not None and not _stops(events):
+    known, at_rest = not np.isnan(state.spring_m).any(), _at_rest(controller, state)
+    if known and not _stops(events):
         state, found = _check_chambers(controller, state, at_rest)
         events += found
-    if frame is not None and not _stops(events) and state.goal is not None and not state.n_lost.any():
-        state, found, arrived = _go(controller, state, frame, pose, at_rest)
+    if known and not _stops(events) and state.goal is not None and not state.n_lost.any():
+        state, found, arrived = _go(controller, state, at_rest)
         events += found
     responses = [event.response for event in events]
     if Response.VENT in responses:
@@ -178,7 +175,24 @@ def step(
         state = state._replace(
             pressure_kpa=pressure_kpa, integral_kpa=integral_kpa, n_ticks=state.n_ticks + 1
         )
-    return state, Tick(state.spring_m, pose, tuple(events), arrived)
+    return state, Tick(state.spring_m, tuple(events), arrived)
+
+
+def believed(controller: Controller, spring_m: np.ndarray) -> tuple[np.ndarray, float]:
+    """Where springs (n,) [m] say that the tip is.
+
+    Returns:
+        Pose (6,) [mm, deg], NaN where a length is; `s2r.extrapolation` of it, 0 without a network.
+    """
+    policy = controller.policy
+    if np.isnan(spring_m).any():
+        return np.full(6, np.nan), 0.0
+    frame, spring_m = estimate_frame(policy.estimator, spring_m), spring_m.astype(np.float32)
+    if policy.s2r is None:
+        return pose_from_frame(*frame), 0.0
+    x = inputs(frame, spring_m)
+    pose = pose_from_frame(*apply_correction(frame, correction(policy.s2r, x)))
+    return pose, float(distance(policy.s2r, x) / policy.s2r.limit)
 
 
 def _stops(events: list[Event]) -> bool:
@@ -235,21 +249,6 @@ def _sense(
     return state, events
 
 
-def _frame(controller: Controller, spring_m: np.ndarray) -> Frame | None:
-    """The simulated arm's tip; None before each spring has been read."""
-    return None if np.isnan(spring_m).any() else estimate_frame(controller.policy.estimator, spring_m)
-
-
-def _pose(controller: Controller, frame: Frame | None, spring_m: np.ndarray) -> np.ndarray:
-    """Pose (6,) [mm, deg] of the real tip; NaN where it is unknown."""
-    s2r = controller.policy.s2r
-    if frame is None:
-        return np.full(6, np.nan)
-    if s2r is None:
-        return pose_from_frame(*frame)
-    return pose_from_frame(*correct_frame(s2r, frame, spring_m.astype(np.float32)))
-
-
 def _at_rest(controller: Controller, state: State) -> bool:
     """Whether nothing has moved for a window; one after the last action, at the earliest."""
     full = len(state.springs_m) == controller.window and state.n_ticks >= controller.window
@@ -272,9 +271,7 @@ def _check_chambers(controller: Controller, state: State, at_rest: bool) -> tupl
     return state, [Event(Fault.CHAMBER_LOST, message)]
 
 
-def _go(
-    controller: Controller, state: State, frame: Frame, pose: np.ndarray, at_rest: bool
-) -> tuple[State, list[Event], bool]:
+def _go(controller: Controller, state: State, at_rest: bool) -> tuple[State, list[Event], bool]:
     """Act if the goal is new or the springs have settled; arrive when they have after the last action."""
     events: list[Event] = []
     if state.n_actions > 0:
@@ -286,13 +283,10 @@ def _go(
         events += _unsettled(controller, state, settled)
         if state.n_actions == N_ACTIONS:
             return state._replace(goal=None), events, True
-    policy = controller.policy
-    if policy.s2r is not None:
-        spring_m = state.spring_m.astype(np.float32)
-        away = float(distance(policy.s2r, inputs(frame, spring_m)) / policy.s2r.limit)
-        if away > 1.0:
-            message = f"{away:.1f} times as far from the training rows as the network is believed"
-            events.append(Event(Fault.EXTRAPOLATION, message))
+    pose, away = believed(controller, state.spring_m)
+    if away > 1.0:
+        message = f"{away:.1f} times as far from the training rows as the network is believed"
+        events.append(Event(Fault.EXTRAPOLATION, message))
     reference_m = controller.plan(pose, state.goal, state.spring_m)
     state = state._replace(reference_m=reference_m, n_actions=state.n_actions + 1, n_ticks=0)
     return state, events, False

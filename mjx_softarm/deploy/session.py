@@ -19,7 +19,7 @@ import numpy as np
 
 from mjx_softarm.deploy.arm_io import ArmIO
 from mjx_softarm.deploy.faults import LATE_TICKS, Event, Fault
-from mjx_softarm.deploy.loop import Controller, Phase, State, Tick, start, step, with_goal
+from mjx_softarm.deploy.loop import Controller, Phase, State, Tick, believed, start, step, with_goal
 from mjx_softarm.logs import Log
 from mjx_softarm.pose import pose_error
 
@@ -134,7 +134,7 @@ class Run(NamedTuple):
     log: Log
     arrivals: tuple[Arrival, ...]
     events: tuple[Event, ...]
-    latency_s: np.ndarray  # (ticks,) computing alone, without the arm's input and output
+    latency_s: np.ndarray  # (ticks,) from readings to pressures, without the arm's input and output
     phase: (
         Phase  # HOLD: ended with the last pressures in force; DONE: vented; else not even that could be done
     )
@@ -214,24 +214,31 @@ class _Session:
 
     def _tick(self, begin_s: float) -> bool:
         """Returns whether the arm took the pressures in time."""
+        self._next_goal(begin_s)
+        goal = self.state.goal
         frequency_hz = self._read()
         row = self.rows.look(begin_s, self.state.pressure_kpa)
         began = time.perf_counter()
-        self._next_goal(begin_s)
-        goal = self.state.goal
         self.state, tick = step(self.controller, self.state, frequency_hz, self.late)
         self.latency_s.append(time.perf_counter() - began)
+        try:
+            return self.state.phase is Phase.HOLD or self._write()
+        finally:  # whatever became of the pressures, they did not wait for this
+            self._keep(row, frequency_hz, goal, tick)
+
+    def _keep(self, row: dict[str, Any], frequency_hz: np.ndarray | None, goal: Any, tick: Tick) -> None:
+        """Log a tick and tell of it."""
         nothing = np.full(len(self.state.pressure_kpa), np.nan)
         row["frequency_hz"] = nothing if frequency_hz is None else frequency_hz
-        row["estimate"] = tick.estimate
+        row["estimate"], _ = believed(self.controller, tick.spring_m)
         row["reference_m"] = nothing if self.state.reference_m is None else self.state.reference_m
         row["goal"] = np.full(6, np.nan) if goal is None else goal
         self.rows.add(row)
         self._note(tick.events)
         if tick.arrived:
-            self._arrive(goal, tick)
-        if self.state.phase is Phase.HOLD:
-            return True
+            self._arrive(goal, row["estimate"])
+
+    def _write(self) -> bool:
         in_time = self.pumps.write(self.state.pressure_kpa)
         if not in_time:  # the ones before are still in force
             phase = Phase.VENT if self.state.phase is Phase.DONE else self.state.phase
@@ -265,9 +272,9 @@ class _Session:
         self.last = {event.fault for event in events}
         self.events.extend(events)
 
-    def _arrive(self, goal: np.ndarray, tick: Tick) -> None:
-        error = pose_error(np.asarray(tick.estimate, float), goal)
-        self.arrivals.append(Arrival(goal, tick.estimate, len(self.rows) - 1))
+    def _arrive(self, goal: np.ndarray, estimate: np.ndarray) -> None:
+        error = pose_error(np.asarray(estimate, float), goal)
+        self.arrivals.append(Arrival(goal, estimate, len(self.rows) - 1))
         self.tell(
             f"{len(self.rows) * self.controller.dt_s:.2f} s: goal {len(self.arrivals)}: estimated "
             f"{np.linalg.norm(error[:3]):.1f} mm off; yaw, pitch, roll "
