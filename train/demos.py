@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +20,11 @@ from train.waypoints import TASKS, task
 _STOPPED, _INTERRUPTED = 3, 130
 
 
-def add_commands(commands: argparse._SubParsersAction, arm_of) -> None:
-    """Add `demos` to a parser; `arm_of` gives spec and network of the options."""
+ArmOf = Callable[[argparse.Namespace, Console], tuple[ArmSpec, S2R | None]]
+
+
+def add_commands(commands: argparse._SubParsersAction, arm_of: ArmOf) -> None:
+    """Add `demos` to a parser; `arm_of` gives the arm of options `spec` and `calibration`."""
     demos = commands.add_parser("demos", help="record demonstrations on an arm, check files of them")
     kinds = demos.add_subparsers(required=True, metavar="COMMAND")
     record = kinds.add_parser("record", help="bring an arm's finger tips to positions, and log them")

@@ -26,6 +26,7 @@ from train.waypoints import Waypoint
 CLOSE_M = 1.5e-3  # of the finger tips to a waypoint; within that, nothing is corrected
 N_CORRECTIONS = 3
 STEPS_M = {"s": 0.005, "l": 0.02}
+AXES = dict(zip("xyz", np.eye(3), strict=True))
 KEYS = "x y z, X Y Z: a step forth, back; s, l: steps of 5, 20 mm; space: log; q: end"
 
 
@@ -77,29 +78,22 @@ class Teleoperation:
 
         def run() -> None:
             step_m, logged = STEPS_M["l"], True
-            row = self._rest("the start", ramp(np.zeros(self.expert.spec.n_chambers), self._drive.dt_s))
-            target = Target(self._now.finger_m, self._now.rotation, 0.0, self._now.pressure_kpa)
+            self._rest("the start", ramp(np.zeros(self.expert.spec.n_chambers), self._drive.dt_s))
+            finger_m = self._now.finger_m
             for key in keys:
                 if key == "q":
                     return
                 if key in STEPS_M:
                     step_m = STEPS_M[key]
-                elif key.lower() in ("x", "y", "z"):
-                    sign = 1.0 if key.islower() else -1.0
-                    moved_m = target.finger_m + sign * step_m * np.eye(3)["xyz".index(key.lower())]
-                    try:
-                        row = self._go("under the key", target._replace(finger_m=moved_m))
-                    except ExpertError as error:
-                        self.tell(str(error))
-                        continue
-                    target, logged = target._replace(finger_m=moved_m), False
-                    where = ", ".join(f"{1e3 * value:.0f}" for value in self._seen(row)[0])
-                    self.tell(f"finger tips at {where} mm")
+                elif key.lower() in AXES:
+                    moved_m = finger_m + (step_m if key.islower() else -step_m) * AXES[key.lower()]
+                    if self._step(moved_m):
+                        finger_m, logged = moved_m, False
                 elif key == " " and logged:
-                    self.tell("not moved since the start, or the last position was logged")
+                    self.tell("not moved since the start, or since the last position was logged")
                 elif key == " ":
                     logged = True
-                    self._add(row, sequence, np.nan)
+                    self._add(self._last, sequence, np.nan)
                     self.tell(f"position {len(self._rows)} logged")
                 elif key.strip():
                     self.tell(f"got key {key!r}; {KEYS}")
@@ -130,8 +124,17 @@ class Teleoperation:
                 break
         return row, off_m if self._sees else np.nan
 
-    def _go(self, name: str, target: Target) -> dict:
-        return self._hold(name, self.expert.reach(name, target, self._now.pressure_kpa))
+    def _step(self, finger_m: np.ndarray) -> bool:
+        """Bring the finger tips (3,) [m] there from where they are; False, told, where that cannot be."""
+        target = Target(finger_m, np.eye(3), 0.0, self._now.pressure_kpa)
+        try:
+            posture = self.expert.reach("of the key", target, self._now.pressure_kpa)
+        except ExpertError as error:
+            self.tell(str(error))
+            return False
+        seen_m, _ = self._seen(self._hold("of the key", posture))
+        self.tell(f"finger tips at {', '.join(f'{1e3 * value:.0f}' for value in seen_m)} mm")
+        return True
 
     def _hold(self, name: str, posture: Posture) -> dict:
         """Hold a posture's references; the row at rest."""
