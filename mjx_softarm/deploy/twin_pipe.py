@@ -23,9 +23,7 @@ from mjx_softarm.spec import ArmSpec
 
 N_PLANKS = 24  # around a branch; with a multiple of four none lies across the plane of the two axes
 THICKNESS_M = 0.04
-OVERLAP_M = (
-    0.02  # of a plank with its neighbours, behind their faces: what presses in at a seam gets out inwards
-)
+OVERLAP_M = 0.02  # of a plank, behind its neighbours' faces: what presses in at a seam gets out inwards
 RIM_ROUNDING_M = 0.01
 FLOOR_BELOW_M = 0.05  # a container's floor, below the finger tips: room for what they hold
 LEDGE_M = 0.02  # between the crossing and the floors left and right
