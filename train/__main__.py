@@ -1,4 +1,4 @@
-"""Command line: `python -m train reach | evaluate | export | demos`."""
+"""Command line: `python -m train reach | imitate | evaluate | export | demos`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 import argparse
 import sys
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.table import Table
@@ -20,12 +22,15 @@ from mjx_softarm.deploy.arms import ArmError
 from mjx_softarm.s2r import S2R, S2R_FILE, load_s2r
 from mjx_softarm.spec import ARM_FILE, ArmSpec, SpecError
 from train.checkpoint import Run, RunError
-from train.config import PRESETS, ConfigError, override
+from train.config import IMITATION_PRESETS, PRESETS, ConfigError, override
+from train.demonstrations import read_demonstrations
 from train.demos import add_commands
-from train.evaluate import N_ACTIONS, N_GOALS, Summary
+from train.evaluate import N_ACTIONS
 from train.expert import ExpertError
 
-PICTURES = ("learning_curve.png", "circle.png", "workspace_error.png")
+if TYPE_CHECKING:
+    from mjx_softarm.env import ReachEnv
+    from train.task import Task
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -47,21 +52,18 @@ def _parser() -> argparse.ArgumentParser:
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     reach = commands.add_parser("reach", help="train a policy that reaches poses of the workspace")
-    reach.add_argument("--preset", choices=PRESETS, help="default: quick")
-    reach.add_argument("--seed", type=int, help="of networks, exploration, goals and batches; default: 0")
-    reach.add_argument("--spec", type=Path, help="TOML file of the arm; default: the paper's arm")
-    reach.add_argument(
-        "--calibration", type=Path, metavar="DIR", help="folder that `python -m calib run` made, for --spec"
-    )
-    reach.add_argument("--engine", choices=("chain", "mjx"), help="kinematics; default: chain")
-    reach.add_argument("--mode", choices=("quasistatic", "dynamic"), help="default: quasistatic")
-    reach.add_argument(
-        "--set", action="append", default=[], metavar="NAME=VALUE", help="any setting, e.g. tqc.gamma=0.95"
-    )
-    reach.add_argument("--out", type=Path, help="folder of the run; default: runs/reach-PRESET-seedSEED")
-    reach.add_argument("--resume", type=Path, metavar="RUN", help="continue this run; its own settings hold")
+    _add_run(reach, PRESETS, "quick", "runs/reach-PRESET-seedSEED")
     reach.set_defaults(command=_reach)
-    evaluate = commands.add_parser("evaluate", help="held-out goals and the circle, with pictures")
+    imitate = commands.add_parser("imitate", help="train a policy that reaches positions as they were shown")
+    imitate.add_argument("demonstrations", type=Path, nargs="?", metavar="FILE", help="of `demos record`")
+    _add_run(imitate, IMITATION_PRESETS, "pipe", "runs/imitate-PRESET-seedSEED")
+    imitate.add_argument("--pipe", type=float, metavar="MM", help="diameter of the pipe; default: none")
+    imitate.add_argument("--agent", type=Path, metavar="RUN", help="begin with this run's actor and critics")
+    imitate.add_argument(
+        "--reward", type=Path, metavar="RUN", help="take the reward that this run learned, and leave it so"
+    )
+    imitate.set_defaults(command=_imitate)
+    evaluate = commands.add_parser("evaluate", help="a run's newest policy, with figures and pictures")
     evaluate.add_argument("run", type=Path, help="folder of the run")
     evaluate.set_defaults(command=_evaluate)
     export = commands.add_parser("export", help="write the policy as one npz file")
@@ -72,34 +74,91 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _add_run(parser: argparse.ArgumentParser, presets: Iterable[str], default: str, folder: str) -> None:
+    """The options that all runs have."""
+    parser.add_argument("--preset", choices=presets, help=f"default: {default}")
+    parser.add_argument("--seed", type=int, help="of networks, exploration, goals and batches; default: 0")
+    parser.add_argument("--spec", type=Path, help="TOML file of the arm; default: the paper's arm")
+    parser.add_argument(
+        "--calibration", type=Path, metavar="DIR", help="folder that `python -m calib run` made, for --spec"
+    )
+    parser.add_argument("--engine", choices=("chain", "mjx"), help="kinematics; default: chain")
+    parser.add_argument("--mode", choices=("quasistatic", "dynamic"), help="default: quasistatic")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="NAME=VALUE", help="any setting, e.g. tqc.gamma=0.95"
+    )
+    parser.add_argument("--out", type=Path, help=f"folder of the run; default: {folder}")
+    parser.add_argument("--resume", type=Path, metavar="RUN", help="continue this run; its own settings hold")
+
+
 def _reach(options: argparse.Namespace, console: Console) -> int:
-    from mjx_softarm import xla
     from mjx_softarm.env import ReachEnv
-    from train.run import Interrupted, default_path, train
+    from train.run import default_path
+
+    if options.resume:
+        return _resume(options, console)
+    preset = options.preset or "quick"
+    config = _config(PRESETS[preset], options)
+    spec, s2r = _arm(options, console)
+    console.print("drawing goals from the reachable workspace ...")
+    env = ReachEnv(spec, config.env, s2r)
+    run = Run.create(options.out or default_path("reach", preset, config.seed), config, spec, s2r)
+    return _train(run, env, console)
+
+
+def _imitate(options: argparse.Namespace, console: Console) -> int:
+    from mjx_softarm.env import ReachEnv
+    from train.run import begin_with, default_path
+
+    if options.resume:
+        return _resume(options, console)
+    if options.demonstrations is None:
+        raise ConfigError("FILE: missing, expected the demonstrations, or --resume RUN")
+    preset = options.preset or "pipe"
+    assignments = [] if options.pipe is None else [f"pipe_diameter_mm={options.pipe}"]
+    assignments += ["frozen=true"] if options.reward else []
+    config = _config(IMITATION_PRESETS[preset], options, assignments)
+    if config.frozen and not options.reward:
+        raise ConfigError("frozen: got true, expected --reward RUN with it")
+    spec, s2r = _arm(options, console)
+    log, _ = read_demonstrations(options.demonstrations, spec)
+    donors = {name: Run.open(path) for name in ("agent", "reward") if (path := getattr(options, name))}
+    env = ReachEnv(spec, config.env, s2r)
+    run = Run.create(options.out or default_path("imitate", preset, config.seed), config, spec, s2r, log)
+    begin_with(run, env, **donors)
+    return _train(run, env, console)
+
+
+def _resume(options: argparse.Namespace, console: Console) -> int:
+    from mjx_softarm.env import ReachEnv
+
+    if _given(options):
+        raise ConfigError(f"--resume goes alone: the run's own settings hold, got {_given(options)} too")
+    run = Run.open(options.resume)
+    return _train(run, ReachEnv(run.spec, run.config.env, run.s2r), console)
+
+
+def _config(preset: Any, options: argparse.Namespace, assignments: Sequence[str] = ()) -> Any:
+    """A preset with the settings of the command line."""
+    shortcuts = {"seed": options.seed, "env.engine": options.engine, "env.mode": options.mode}
+    given = [f"{name}={value}" for name, value in shortcuts.items() if value is not None]
+    return override(preset, [*assignments, *given, *options.set])
+
+
+def _train(run: Run, env: ReachEnv, console: Console) -> int:
+    from mjx_softarm import xla
+    from train.run import Interrupted, train
+    from train.task import task_of
 
     xla.enable_compilation_cache()
-    if options.resume:
-        if _given(options):
-            raise ConfigError(f"--resume goes alone: the run's own settings hold, got {_given(options)} too")
-        run = Run.open(options.resume)
-        env = ReachEnv(run.spec, run.config.env, run.s2r)
-    else:
-        preset = options.preset or "quick"
-        shortcuts = {"seed": options.seed, "env.engine": options.engine, "env.mode": options.mode}
-        assignments = [f"{name}={value}" for name, value in shortcuts.items() if value is not None]
-        config = override(PRESETS[preset], [*assignments, *options.set])
-        spec, s2r = _arm(options, console)
-        path = options.out or default_path("reach", preset, config.seed)
-        console.print("drawing goals from the reachable workspace ...")
-        env = ReachEnv(spec, config.env, s2r)
-        run = Run.create(path, config, spec, s2r)
     console.print(f"run: {run.path}", highlight=False)
+    task = task_of(run, env)
     try:
-        summary = train(run, env, console)
+        summary = train(run, task, console)
     except Interrupted as stop:
         console.print(str(stop), highlight=False)
         return 130
-    _show(run, summary, console)
+    _show(run, task, summary, console)
     return 0
 
 
@@ -118,20 +177,16 @@ def _arm(options: argparse.Namespace, console: Console) -> tuple[ArmSpec, S2R | 
 
 def _given(options: argparse.Namespace) -> str:
     """The options of a new run that the command line has."""
-    given = {
-        f"--{name}": getattr(options, name)
-        for name in ("preset", "seed", "spec", "calibration", "engine", "mode", "set", "out")
-    }
-    return ", ".join(name for name, value in given.items() if value not in (None, []))
+    given = {name: value for name, value in vars(options).items() if name not in ("command", "resume")}
+    return ", ".join(f"--{name}" for name, value in given.items() if value not in (None, []))
 
 
 def _evaluate(options: argparse.Namespace, console: Console) -> int:
-    from train.evaluate import Evaluator
-    from train.run import finish, restore_actor
+    from train.run import finish, restore
 
     run = Run.open(options.run)
-    job, actor_params = restore_actor(run)
-    _show(run, finish(run, Evaluator(job.env, job.agent), actor_params), console)
+    task, state = restore(run)
+    _show(run, task, finish(run, task, state.agent.actor_params), console)
     return 0
 
 
@@ -143,23 +198,14 @@ def _export(options: argparse.Namespace, console: Console) -> int:
     return 0
 
 
-def _show(run: Run, summary: Summary, console: Console) -> None:
-    table = Table(title=f"{N_GOALS} held-out goals, {N_ACTIONS} actions each", title_justify="left")
+def _show(run: Run, task: Task, summary: Any, console: Console) -> None:
+    table = Table(title=f"{task.title}, {N_ACTIONS} actions each", title_justify="left")
     table.add_column("figure")
     table.add_column("value", justify="right")
-    for name, value in (
-        ("tip error, median", f"{summary.median_mm:.2f} mm"),
-        ("tip error, 95 %", f"{summary.p95_mm:.2f} mm"),
-        ("goals reached", f"{100 * summary.reached_share:.1f} %"),
-        ("goals with a saturated chamber", f"{100 * summary.saturated_share:.1f} %"),
-        ("arms that did not settle", f"{summary.unsettled}"),
-        ("circle, mean tip error", f"{summary.circle_mean_mm:.2f} mm"),
-        ("circle, largest tip error", f"{summary.circle_max_mm:.2f} mm"),
-        ("circle, saturated chambers", f"{summary.circle_saturated_chambers}"),
-    ):
+    for name, value in summary.rows():
         table.add_row(name, value)
     console.print(table)
-    for name in PICTURES:
+    for name in task.picture_names:
         console.print(f"picture: {run.path / name}", highlight=False, soft_wrap=True)
 
 

@@ -10,13 +10,17 @@ from typing import Any
 import jax
 import orbax.checkpoint as ocp
 
+from mjx_softarm.log_files import LogError
+from mjx_softarm.logs import Log, write_log
 from mjx_softarm.provenance import provenance, write_json
 from mjx_softarm.s2r import S2R, S2R_FILE, load_s2r, save_s2r
 from mjx_softarm.spec import ArmSpec
 from train.config import TrainConfig, from_dict, to_dict
+from train.demonstrations import Demonstrations, load_demonstrations
 from train.job import TrainState
 
 N_KEPT = 2
+DEMONSTRATIONS_FILE = "demonstrations.npz"
 
 
 class RunError(ValueError):
@@ -27,8 +31,8 @@ class Run:
     """The folder of one run.
 
     `config.json` (settings, arm, calibration, versions, commit), `s2r.npz` (the calibration's sim-to-real
-    network, if it has one), `checkpoints/`, `metrics.jsonl`, `evaluation.json`, pictures, TensorBoard's event
-    files and, once exported, `policy.npz`.
+    network, if it has one), `demonstrations.npz` (if it learns from them), `checkpoints/`, `metrics.jsonl`,
+    `evaluation.json`, pictures, TensorBoard's event files and, once exported, `policy.npz`.
     """
 
     def __init__(self, path: Path, config: TrainConfig, spec: ArmSpec, s2r: S2R | None = None):
@@ -37,7 +41,14 @@ class Run:
         self._manager = ocp.CheckpointManager((path / "checkpoints").resolve(), options=options)
 
     @classmethod
-    def create(cls, path: Path, config: TrainConfig, spec: ArmSpec, s2r: S2R | None = None) -> Run:
+    def create(
+        cls,
+        path: Path,
+        config: TrainConfig,
+        spec: ArmSpec,
+        s2r: S2R | None = None,
+        demonstrations: Log | None = None,
+    ) -> Run:
         """Start a folder.
 
         Raises:
@@ -51,6 +62,8 @@ class Run:
             path.mkdir(parents=True, exist_ok=True)
             if s2r is not None:
                 save_s2r(path / S2R_FILE, s2r)
+            if demonstrations is not None:
+                write_log(path / DEMONSTRATIONS_FILE, demonstrations)
             data = {
                 "train": to_dict(config),
                 "spec": spec.to_dict(),
@@ -81,6 +94,17 @@ class Run:
             raise RunError(f"{file}: not a run's config: {error!r}") from error
         s2r = load_s2r(path / S2R_FILE, spec.n_chambers) if has_s2r else None
         return cls(path, config, spec, s2r)
+
+    def demonstrations(self) -> Demonstrations:
+        """What the run learns from.
+
+        Raises:
+            RunError: its file cannot be read.
+        """
+        try:
+            return load_demonstrations(self.path / DEMONSTRATIONS_FILE, self.spec)
+        except LogError as error:
+            raise RunError(str(error)) from error
 
     @property
     def latest_epoch(self) -> int | None:

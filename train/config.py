@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
+import math
 import types
 import typing
 from dataclasses import dataclass, field
 from typing import Any
 
 from mjx_softarm.env import EnvConfig
+from train.gail import GailConfig
 from train.hindsight import HindsightConfig
 from train.tqc import TQCConfig
 
@@ -86,6 +89,80 @@ class TrainConfig:
         return self.n_epochs * self.vector_steps_per_epoch * self.n_updates_per_vector_step
 
 
+@dataclass(frozen=True)
+class Stage:
+    """A part of the schedule of learning from demonstrations."""
+
+    share: float = 1.0  # of the run's environment steps
+    every: int = 1  # each so many-th demonstrated position is a goal; 1 is all of them
+    kept: float = 1.0  # share of what the replay holds that stays as the stage begins
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.share <= 1.0:
+            raise ConfigError(f"stages: share: got {self.share}, expected more than 0 and at most 1")
+        if self.every < 1:
+            raise ConfigError(f"stages: every: got {self.every}, expected at least 1")
+        if not 0.0 <= self.kept <= 1.0:
+            raise ConfigError(f"stages: kept: got {self.kept}, expected 0 to 1")
+
+
+@dataclass(frozen=True)
+class ImitationConfig(TrainConfig):
+    """A training run whose goals are demonstrated positions.
+
+    Attributes:
+        gail: the discriminator.
+        learned_weight: of the learned reward; without it, of the demonstrations the positions alone are seen.
+        hand_made_weight: of the environment's reward.
+        frozen: the discriminator is another run's and stays as it is, so the positions alone are seen too.
+        expert_share: of a batch of the critics that is the expert's, while the discriminator learns.
+        stages: in order; their shares add up to 1.
+        rebalance_env_steps: steps between two shifts of the goals towards those that are missed by most; 0
+            is never.
+        pipe_diameter_mm: of the cross-shaped pipe that the body has to stay inside for a goal to count as
+            reached; nothing that learns sees it. None is open space.
+    """
+
+    gail: GailConfig = field(default_factory=GailConfig)
+    learned_weight: float = 1.0
+    hand_made_weight: float = 0.0
+    frozen: bool = False
+    expert_share: float = 0.25
+    stages: tuple[Stage, ...] = (Stage(),)
+    rebalance_env_steps: int = 0
+    pipe_diameter_mm: float | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0.0 <= self.expert_share < 1.0:
+            raise ConfigError(f"expert_share: got {self.expert_share}, expected 0 or more and less than 1")
+        if min(self.learned_weight, self.hand_made_weight) < 0:
+            raise ConfigError(
+                f"learned_weight, hand_made_weight: got {self.learned_weight}, {self.hand_made_weight}, "
+                "expected numbers >= 0"
+            )
+        if self.learned_weight == self.hand_made_weight == 0:
+            raise ConfigError("learned_weight, hand_made_weight: got 0 for both, expected some reward")
+        total = sum(stage.share for stage in self.stages)
+        if not math.isclose(total, 1.0, abs_tol=1e-6):
+            raise ConfigError(f"stages: got shares that add up to {total:g}, expected 1")
+        if self.rebalance_env_steps < 0:
+            raise ConfigError(f"rebalance_env_steps: got {self.rebalance_env_steps}, expected at least 0")
+        if self.env.mode != "quasistatic":
+            raise ConfigError(f"env.mode: got {self.env.mode!r}, expected 'quasistatic' for demonstrations")
+
+    @property
+    def stage_epochs(self) -> tuple[int, ...]:
+        """The epoch that each stage begins before."""
+        shares = [0.0, *itertools.accumulate(stage.share for stage in self.stages[:-1])]
+        return tuple(round(share * self.n_epochs) for share in shares)
+
+    @property
+    def rebalance_epochs(self) -> int:
+        """Epochs between two shifts of the goals; 0 is never."""
+        return -(-self.rebalance_env_steps // (self.n_arms * self.vector_steps_per_epoch))
+
+
 # Settings that made learning faster or finer; the README has the measurements.
 _TUNED = TrainConfig(
     tqc=TQCConfig(
@@ -102,6 +179,33 @@ _TUNED = TrainConfig(
 PRESETS: dict[str, TrainConfig] = {
     "quick": dataclasses.replace(_TUNED, total_env_steps=40_000),
     "paper": dataclasses.replace(_TUNED, total_env_steps=300_000, updates_per_env_step=0.5),
+}
+
+# The paper's schedules: 8 of the circle's 16 points, then all; the pipe's positions, shifted to the worst.
+_PIPE = ImitationConfig(
+    total_env_steps=600_000,
+    updates_per_env_step=0.1,
+    warmup_env_steps=1_024,
+    replay_capacity=40_000,
+    tqc=dataclasses.replace(_TUNED.tqc, learning_rate_alpha=1e-3, reward_scale=10.0, initial_alpha=0.02),
+    hindsight=HindsightConfig(reached_share=0.0, near_share=0.0),
+    rebalance_env_steps=100_000,
+)
+IMITATION_PRESETS: dict[str, ImitationConfig] = {
+    "circle": dataclasses.replace(
+        _PIPE,
+        total_env_steps=300_000,
+        rebalance_env_steps=0,
+        stages=(Stage(share=1 / 3, every=2), Stage(share=2 / 3, kept=0.2)),
+    ),
+    "pipe": _PIPE,
+    "hand-made": dataclasses.replace(
+        _PIPE,
+        learned_weight=0.0,
+        hand_made_weight=1.0,
+        tqc=dataclasses.replace(_TUNED.tqc, learning_rate_alpha=1e-3),
+        hindsight=_TUNED.hindsight,
+    ),
 }
 
 
@@ -155,6 +259,8 @@ def _coerce(value: Any, kind: Any, path: str) -> Any:
         origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin is typing.Literal and value in arguments:
         return value
+    if dataclasses.is_dataclass(kind) and isinstance(value, dict):
+        return _from_dict(kind, value, path)
     if origin is tuple and isinstance(value, list):
         return tuple(_coerce(item, arguments[0], path) for item in value)
     if kind is float and isinstance(value, (int, float)) and not isinstance(value, bool):
@@ -170,15 +276,15 @@ def to_dict(config: TrainConfig) -> dict[str, Any]:
 
 
 def from_dict(data: dict[str, Any]) -> TrainConfig:
-    """The config that `to_dict` gave.
+    """The config that `to_dict` gave; of learning from demonstrations where it has their settings.
 
     Raises:
         ConfigError: a setting is missing, unknown or of the wrong type.
     """
-    return _from_dict(TrainConfig, data, "config")
+    return _from_dict(ImitationConfig if "stages" in data else TrainConfig, data, "config")
 
 
-def _from_dict(cls: type, data: Any, path: str) -> Any:
+def _from_dict(cls: Any, data: Any, path: str) -> Any:
     hints = typing.get_type_hints(cls)
     if not isinstance(data, dict) or data.keys() != hints.keys():
         got = sorted(data) if isinstance(data, dict) else data

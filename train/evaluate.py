@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -30,6 +31,7 @@ class Reached(NamedTuple):
     saturated_chambers: Array  # (n,)
     settled: Array  # (n,) bool, after every action
     pressure_kpa: Array  # (n, n_chambers)
+    q: Array  # (n, nv) joint coordinates [m, rad, rad]
 
     @property
     def tip_error_mm(self) -> Array:
@@ -52,6 +54,19 @@ class Summary:
     def to_dict(self) -> dict[str, Any]:
         return dataclasses.asdict(self)
 
+    def rows(self) -> list[tuple[str, str]]:
+        """What a table shows: name and value with its unit."""
+        return [
+            ("tip error, median", f"{self.median_mm:.2f} mm"),
+            ("tip error, 95 %", f"{self.p95_mm:.2f} mm"),
+            ("goals reached", f"{100 * self.reached_share:.1f} %"),
+            ("goals with a saturated chamber", f"{100 * self.saturated_share:.1f} %"),
+            ("arms that did not settle", f"{self.unsettled}"),
+            ("circle, mean tip error", f"{self.circle_mean_mm:.2f} mm"),
+            ("circle, largest tip error", f"{self.circle_max_mm:.2f} mm"),
+            ("circle, saturated chambers", f"{self.circle_saturated_chambers}"),
+        ]
+
 
 class Evaluator:
     """Evaluates actors of one structure on one arm without randomisation; compiled once.
@@ -68,7 +83,7 @@ class Evaluator:
         self.goals = self.env.sample_pool(n_goals, HELD_OUT_SEED).pose
         self.circle = jnp.asarray(circle_poses())
         self._workspace = xla.jit(self._reach_all, env.uses_mjx)
-        self._circle = xla.jit(self._follow, env.uses_mjx)
+        self._circle = xla.jit(functools.partial(follow, self.env, agent), env.uses_mjx)
 
     def __call__(self, actor_params: Any) -> tuple[Summary, Reached, Reached]:
         """Figures, and what was reached on the workspace and on the circle, as NumPy arrays."""
@@ -76,36 +91,40 @@ class Evaluator:
         circle = jax.device_get(self._circle(actor_params, self.circle))
         return summarise(workspace, circle, self.env.config.reward.threshold), workspace, circle
 
-    def _act(self, actor_params: Any, state: State, goal: Array) -> tuple[State, Reached]:
-        """N_ACTIONS towards one goal."""
-        arm = state.pipeline_state._replace(goal=goal)
-        state = state.replace(pipeline_state=arm, obs=self.env.observe(arm.pose, goal))
-
-        def act(state: State, _):
-            after = self.env.step(state, self.agent.act_mode(actor_params, state.obs))
-            return after, after.info["valid"]
-
-        state, settled = jax.lax.scan(act, state, None, length=N_ACTIONS)
-        arm, config = state.pipeline_state, self.env.config.reward
-        return state, Reached(
-            goal=goal,
-            pose=arm.pose,
-            scaled_error=jnp.linalg.norm(rewards.scaled_error(arm.pose, goal, config)),
-            saturated_chambers=state.metrics["saturated_chambers"],
-            settled=jnp.all(settled),
-            pressure_kpa=arm.pressure_kpa,
-        )
-
     def _reach_all(self, actor_params: Any, goals: Array) -> Reached:
         keys = jax.random.split(jax.random.PRNGKey(HELD_OUT_SEED), len(goals))
         starts = jax.vmap(self.env.reset)(keys)
-        return jax.vmap(lambda state, goal: self._act(actor_params, state, goal)[1])(starts, goals)
+        return jax.vmap(lambda *at: reach(self.env, self.agent, actor_params, *at)[1])(starts, goals)
 
-    def _follow(self, actor_params: Any, path: Array) -> Reached:
-        start = self.env.reset(jax.random.PRNGKey(HELD_OUT_SEED))
-        twice = jnp.concatenate([path, path])
-        _, reached = jax.lax.scan(lambda state, goal: self._act(actor_params, state, goal), start, twice)
-        return jax.tree.map(lambda x: x[len(path) :], reached)
+
+def reach(env: ReachEnv, agent: TQC, actor_params: Any, state: State, goal: Array) -> tuple[State, Reached]:
+    """What one arm reaches with N_ACTIONS towards a goal (6,), and its state then."""
+    arm = state.pipeline_state._replace(goal=goal)
+    state = state.replace(pipeline_state=arm, obs=env.observe(arm.pose, goal))
+
+    def act(state: State, _):
+        after = env.step(state, agent.act_mode(actor_params, state.obs))
+        return after, after.info["valid"]
+
+    state, settled = jax.lax.scan(act, state, None, length=N_ACTIONS)
+    arm = state.pipeline_state
+    return state, Reached(
+        goal=goal,
+        pose=arm.pose,
+        scaled_error=jnp.linalg.norm(rewards.scaled_error(arm.pose, goal, env.config.reward)),
+        saturated_chambers=state.metrics["saturated_chambers"],
+        settled=jnp.all(settled),
+        pressure_kpa=arm.pressure_kpa,
+        q=arm.motion.q,
+    )
+
+
+def follow(env: ReachEnv, agent: TQC, actor_params: Any, path: Array) -> Reached:
+    """What one arm reaches along a path (n, 6) of goals, once along it to get there."""
+    start = env.reset(jax.random.PRNGKey(HELD_OUT_SEED))
+    twice = jnp.concatenate([path, path])
+    _, reached = jax.lax.scan(lambda state, goal: reach(env, agent, actor_params, state, goal), start, twice)
+    return jax.tree.map(lambda x: x[len(path) :], reached)
 
 
 def summarise(workspace: Reached, circle: Reached, threshold: float) -> Summary:

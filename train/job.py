@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ from mjx_softarm.wrappers import VectorEnv
 from train import replay
 from train.config import TrainConfig
 from train.hindsight import Experience, relabel
-from train.tqc import TQC, TQCState
+from train.tqc import TQC, TQCState, Transition
 
 
 class TrainState(NamedTuple):
@@ -27,6 +27,7 @@ class TrainState(NamedTuple):
     key: Array
     n_env_steps: Array  # () int32 actions taken, invalid ones included
     n_unsettled: Array  # () int32 arms that were masked and reset
+    imitation: Any = None  # what learning from demonstrations has besides; see `train.imitation`
 
 
 class Job:
@@ -89,33 +90,48 @@ class Job:
             n_env_steps=state.n_env_steps + self.arms.n,
             n_unsettled=state.n_unsettled + jnp.sum(~valid, dtype=jnp.int32),
         )
-        agent, losses = self._updates(state, key_updates, warmed_up)
+        state, losses = self._updates(state, key_updates, warmed_up)
         env_metrics = {f"env/{name}": jnp.mean(value) for name, value in after.metrics.items()}
-        return state._replace(agent=agent), env_metrics | {f"tqc/{name}": x for name, x in losses.items()}
+        return state, env_metrics | losses
 
-    def _updates(self, state: TrainState, key: Array, warmed_up: Array) -> tuple[TQCState, dict[str, Array]]:
+    def _updates(
+        self, state: TrainState, key: Array, warmed_up: Array
+    ) -> tuple[TrainState, dict[str, Array]]:
         keys = jax.random.split(key, self.config.n_updates_per_vector_step)
 
-        def update(agent: TQCState, key: Array):
-            key_sample, key_relabel, key_update = jax.random.split(key, 3)
-            stored = replay.sample(state.memory, key_sample, self.config.batch_size)
-            batch = relabel(
-                stored,
-                key_relabel,
-                self.config.hindsight,
-                self.env.scale,
-                self.config.env.reward,
-                exchange_actions=self.config.env.mode == "quasistatic",
-            )
-            return self.agent.update(agent, batch, key_update)
+        def update(learner: tuple[TQCState, Any], key: Array):
+            return self._update(*learner, state.memory, key)
 
-        def run(agent: TQCState):
-            agent, losses = jax.lax.scan(update, agent, keys)
-            return agent, jax.tree.map(jnp.mean, losses)
+        def run(learner: tuple[TQCState, Any]):
+            learner, metrics = jax.lax.scan(update, learner, keys)
+            return learner, jax.tree.map(jnp.mean, metrics)
 
-        shapes = jax.eval_shape(run, state.agent)[1]
+        learner = (state.agent, state.imitation)
+        shapes = jax.eval_shape(run, learner)[1]
         nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-        return jax.lax.cond(warmed_up, run, lambda agent: (agent, nothing), state.agent)
+        (agent, imitation), metrics = jax.lax.cond(
+            warmed_up, run, lambda learner: (learner, nothing), learner
+        )
+        return state._replace(agent=agent, imitation=imitation), metrics
+
+    def _update(
+        self, agent: TQCState, imitation: Any, memory: replay.Replay, key: Array
+    ) -> tuple[tuple[TQCState, Any], dict[str, Array]]:
+        """One gradient step, and its metrics by name."""
+        key_sample, key_relabel, key_update = jax.random.split(key, 3)
+        stored = replay.sample(memory, key_sample, self.config.batch_size)
+        agent, losses = self.agent.update(agent, self._relabel(stored, key_relabel), key_update)
+        return (agent, imitation), {f"tqc/{name}": x for name, x in losses.items()}
+
+    def _relabel(self, stored: Experience, key: Array) -> Transition:
+        return relabel(
+            stored,
+            key,
+            self.config.hindsight,
+            self.env.scale,
+            self.config.env.reward,
+            exchange_actions=self.config.env.mode == "quasistatic",
+        )
 
     def _experience(self, before: State, action: Array, after: State) -> Experience:
         start, end = before.pipeline_state, after.pipeline_state

@@ -10,21 +10,30 @@ from matplotlib import colormaps
 from matplotlib.figure import Figure
 
 from train.evaluate import Reached
+from train.positions import AtPositions
 
 INK, BLUE, ORANGE, GREY = "#222222", "#1f6fb4", "#e07b28", "#9aa0a6"
 DPI = 150
+REACH_PICTURES = ("learning_curve.png", "circle.png", "workspace_error.png")
+IMITATION_PICTURES = ("learning_curve.png", "losses.png", "positions.png")
 
 
-def draw_all(folder: Path, rows: list[dict[str, Any]], workspace: Reached, circle: Reached) -> list[Path]:
-    """Write every picture into a run's folder; returns their paths."""
-    pictures = {
-        "learning_curve.png": learning_curve(rows),
-        "circle.png": circle_figure(circle),
-        "workspace_error.png": workspace_figure(workspace),
-    }
+def save(folder: Path, pictures: dict[str, Figure]) -> None:
+    """Write pictures, by their names, into a folder."""
     for name, figure in pictures.items():
         figure.savefig(folder / name, dpi=DPI)
-    return [folder / name for name in pictures]
+
+
+def reach_pictures(rows: list[dict[str, Any]], workspace: Reached, circle: Reached) -> dict[str, Figure]:
+    """The pictures of a run on the workspace, by file name."""
+    figures = (learning_curve(rows), circle_figure(circle), workspace_figure(workspace))
+    return dict(zip(REACH_PICTURES, figures, strict=True))
+
+
+def imitation_pictures(rows: list[dict[str, Any]], at: AtPositions) -> dict[str, Figure]:
+    """The pictures of a run on demonstrated positions, by file name."""
+    figures = (imitation_curve(rows), losses(rows), positions_figure(at))
+    return dict(zip(IMITATION_PICTURES, figures, strict=True))
 
 
 def dress(axes: Any, title: str, x: str, y: str) -> None:
@@ -38,7 +47,7 @@ def dress(axes: Any, title: str, x: str, y: str) -> None:
 
 
 def _axes(figure: Figure, position: Any, title: str, x: str, y: str) -> Any:
-    axes = figure.add_subplot(position)
+    axes = figure.add_subplot(*position) if isinstance(position, tuple) else figure.add_subplot(position)
     dress(axes, title, x, y)
     return axes
 
@@ -120,4 +129,59 @@ def workspace_figure(workspace: Reached) -> Figure:
     axes.set_xscale("symlog", linthresh=1.0)
     axes.set_ylim(0, 100)
     axes.legend(frameon=False, loc="lower right")
+    return figure
+
+
+def imitation_curve(rows: list[dict[str, Any]]) -> Figure:
+    """Success and tip error at the demonstrated positions over environment steps."""
+    figure = Figure(figsize=(10, 4), layout="constrained")
+    evaluated = [row for row in rows if "evaluation/success_share" in row]
+    steps = [row["env_steps"] for row in evaluated]
+    left = _axes(figure, 121, "demonstrated positions reached", "environment steps", "%")
+    for name, colour, label in (
+        ("success_share", BLUE, "unsaturated, inside the pipe"),
+        ("reached_share", GREY, "the pose alone"),
+    ):
+        left.plot(steps, [100 * row[f"evaluation/{name}"] for row in evaluated], color=colour, label=label)
+    left.set_ylim(0, 105)
+    left.legend(frameon=False)
+    right = _axes(figure, 122, "tip error at the positions", "environment steps", "mm")
+    right.plot(steps, [row["evaluation/median_mm"] for row in evaluated], color=BLUE, label="median")
+    right.plot(steps, [row["evaluation/max_mm"] for row in evaluated], color=ORANGE, label="largest")
+    right.set_yscale("log")
+    right.yaxis.set_major_formatter("{x:g}")
+    right.legend(frameon=False)
+    return figure
+
+
+def losses(rows: list[dict[str, Any]]) -> Figure:
+    """Losses of critics, actor and, where the reward is learned, discriminator over environment steps."""
+    names = ["tqc/critic_loss", "tqc/actor_loss", "gail/discriminator_loss"]
+    names = [name for name in names if any(name in row for row in rows)]
+    figure = Figure(figsize=(4 * len(names), 3.5), layout="constrained")
+    for k, name in enumerate(names):
+        title = name.split("/")[1].replace("_", " ")
+        axes = _axes(figure, (1, len(names), k + 1), title, "environment steps", "")
+        learned = [row for row in rows if row["updates"] > 0]
+        axes.plot([row["env_steps"] for row in learned], [row[name] for row in learned], color=BLUE)
+    return figure
+
+
+def positions_figure(at: AtPositions) -> Figure:
+    """Goals and what was reached from the front, errors and clearances along the positions."""
+    figure = Figure(figsize=(12, 4), layout="constrained")
+    goal, pose = np.asarray(at.reached.goal), np.asarray(at.reached.pose)
+    left = _axes(figure, 131, "positions from the front", "x [mm]", "z [mm]")
+    left.plot(goal[:, 0], goal[:, 2], color=GREY, marker="o", markerfacecolor="none", label="demonstrated")
+    left.plot(pose[:, 0], pose[:, 2], "o", markersize=3.5, color=BLUE, label="reached")
+    left.set_aspect("equal")
+    left.legend(frameon=False)
+    error = at.reached.tip_error_mm
+    middle = _axes(figure, 132, f"tip error: mean {error.mean():.2f} mm", "position", "mm")
+    middle.bar(np.arange(len(error)), error, color=np.where(at.success, BLUE, ORANGE))
+    right = _axes(figure, 133, "clearance of the body to the pipe", "position", "mm")
+    if np.isfinite(at.clearance_mm).all():
+        right.bar(np.arange(len(error)), at.clearance_mm, color=BLUE)
+    else:
+        right.text(0.5, 0.5, "no pipe", ha="center", transform=right.transAxes, color=GREY)
     return figure

@@ -98,6 +98,25 @@ def sample(replay: Replay, key: Array, batch_size: int) -> Items:
     return jax.tree.map(lambda ring: ring[slot], replay.data)
 
 
+def thin(replay: Replay, key: Array, share: Array) -> Replay:
+    """The ring with a random share of its items, oldest first; which is how a later task begins.
+
+    Args:
+        replay: ring of N slots.
+        key: PRNG key.
+        share (): of the filled slots to keep, 0 to 1.
+    """
+    capacity = jax.tree.leaves(replay.data)[0].shape[0]
+    age = (jnp.arange(capacity) - replay.position) % capacity  # oldest first, once the ring is full
+    filled = jnp.arange(capacity) < replay.size
+    n_kept = jnp.round(share * replay.size).astype(jnp.int32)
+    lot = jnp.where(filled, jax.random.uniform(key, (capacity,)), jnp.inf)
+    kept = jnp.argsort(jnp.argsort(lot)) < n_kept
+    order = jnp.argsort(jnp.where(kept, age, capacity + age))
+    data = jax.tree.map(lambda leaf: leaf[order], replay.data)
+    return Replay(data, position=n_kept % capacity, size=n_kept)
+
+
 def _check(replay: Replay, items: Items, valid: Array) -> int:
     """Static checks of `add`; returns the capacity."""
     expected_tree, got_tree = jax.tree.structure(replay.data), jax.tree.structure(items)

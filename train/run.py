@@ -19,21 +19,21 @@ from mjx_softarm import xla
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.provenance import write_json
 from train import plots
-from train.checkpoint import Run
-from train.evaluate import Evaluator, Summary
+from train.checkpoint import Run, RunError
 from train.job import Job, TrainState
+from train.task import Task, task_of
 
 
 class Interrupted(Exception):
     """The user stopped the run; its state is saved."""
 
 
-def train(run: Run, env: ReachEnv, console: Console) -> Summary:
+def train(run: Run, task: Task, console: Console) -> Any:
     """Train to the end of the run's config, from its newest checkpoint if it has one.
 
     Args:
         run: the folder; its config says everything.
-        env: of the run's arm and config.
+        task: of the run.
         console: where progress is shown.
 
     Returns:
@@ -42,47 +42,83 @@ def train(run: Run, env: ReachEnv, console: Console) -> Summary:
     Raises:
         Interrupted: after Ctrl-C or a termination signal, once the state is saved.
     """
-    job = Job(run.config, env)
-    evaluator = Evaluator(env, job.agent)
-    epoch, state = 0, job.init(jax.random.PRNGKey(run.config.seed))
+    epoch, state = 0, task.job.init(jax.random.PRNGKey(run.config.seed))
     if run.latest_epoch is not None:
         epoch, state = run.restore(state)
+    if epoch:
         console.print(f"continuing after epoch {epoch} of {run.config.n_epochs}")
     run.truncate_metrics(epoch)
     console.print("compiling (cached for the next start) ...")
     with _asked_to_stop() as asked, _board(run, state) as board, _progress(console) as progress:
         bar = progress.add_task("training", total=run.config.n_epochs, completed=epoch, text="")
         while epoch < run.config.n_epochs:
-            state, row = _timed_epoch(job, state)
+            state, row = _timed_epoch(task.job, task.prepare(state, epoch))
             epoch += 1
             due = epoch % run.config.evaluation_epochs == 0 or epoch == run.config.n_epochs
             if due:
-                row |= _evaluation(evaluator, state)
+                row |= _evaluation(task, state)
             _record(run, board, epoch, state, row)
             if due or asked:
                 run.save(epoch, state)
-            progress.update(bar, completed=epoch, text=_line(row))
+            progress.update(bar, completed=epoch, text=_line(task, row))
             if due and not console.is_terminal:  # a log file gets lines in the place of a bar
-                console.print(f"epoch {epoch} of {run.config.n_epochs}: {_line(row)}", highlight=False)
+                console.print(f"epoch {epoch} of {run.config.n_epochs}: {_line(task, row)}", highlight=False)
             if asked and epoch < run.config.n_epochs:
                 raise Interrupted(f"stopped after epoch {epoch}; continue with --resume {run.path}")
-    return finish(run, evaluator, state.agent.actor_params)
+    return finish(run, task, state.agent.actor_params)
 
 
-def finish(run: Run, evaluator: Evaluator, actor_params: Any) -> Summary:
+def finish(run: Run, task: Task, actor_params: Any) -> Any:
     """Evaluate a policy, write `evaluation.json` and the pictures; returns the figures."""
-    summary, workspace, circle = evaluator(actor_params)
+    summary, *reached = task.evaluate(actor_params)
     write_json(run.path / "evaluation.json", summary.to_dict())
-    plots.draw_all(run.path, run.metrics(), workspace, circle)
+    plots.save(run.path, task.pictures(run.metrics(), *reached))
     return summary
 
 
-def restore_actor(run: Run) -> tuple[Job, Any]:
-    """The job of a run, and the actor of its newest checkpoint."""
+def restore(run: Run) -> tuple[Task, TrainState]:
+    """The task of a run, and the state of its newest checkpoint."""
     xla.enable_compilation_cache()
-    job = Job(run.config, ReachEnv(run.spec, run.config.env, run.s2r))
-    _, state = run.restore(jax.eval_shape(job.init, jax.random.PRNGKey(0)))
-    return job, state.agent.actor_params
+    task = task_of(run, ReachEnv(run.spec, run.config.env, run.s2r))
+    _, state = run.restore(jax.eval_shape(task.job.init, jax.random.PRNGKey(0)))
+    return task, state
+
+
+def begin_with(run: Run, env: ReachEnv, agent: Run | None = None, reward: Run | None = None) -> None:
+    """Save the state that a new run begins with, where parts of it are another's.
+
+    Args:
+        run: the new one.
+        env: of the new one.
+        agent: whose actor, critics and temperature it begins with.
+        reward: whose discriminator it begins with.
+
+    Raises:
+        RunError: the other run has no such part, or one of another size.
+    """
+    if agent is None and reward is None:
+        return
+    state = task_of(run, env).job.init(jax.random.PRNGKey(run.config.seed))
+    if agent is not None:
+        given, own = restore(agent)[1].agent, state.agent
+        _same_shapes(agent, "networks", given, own)
+        names = ("actor_params", "critic_params", "target_params", "log_alpha")
+        state = state._replace(agent=own._replace(**{name: getattr(given, name) for name in names}))
+    if reward is not None:
+        given = restore(reward)[1].imitation
+        if given is None:
+            raise RunError(
+                f"{reward.path}: has no learned reward; expected a run of `python -m train imitate`"
+            )
+        _same_shapes(reward, "discriminator", given.discriminator, state.imitation.discriminator)
+        state = state._replace(imitation=state.imitation._replace(discriminator=given.discriminator))
+    run.save(0, state)
+
+
+def _same_shapes(run: Run, what: str, given: Any, own: Any) -> None:
+    given, own = ([leaf.shape for leaf in jax.tree.leaves(tree)] for tree in (given, own))
+    if given != own:
+        raise RunError(f"{run.path}: {what}: got layers of {given}, expected {own} as in the new run")
 
 
 def _board(run: Run, state: TrainState) -> SummaryWriter:
@@ -103,9 +139,9 @@ def _timed_epoch(job: Job, state: TrainState) -> tuple[TrainState, dict[str, flo
     return state, row
 
 
-def _evaluation(evaluator: Evaluator, state: TrainState) -> dict[str, float]:
-    summary, _, _ = evaluator(state.agent.actor_params)
-    return {f"evaluation/{name}": value for name, value in summary.to_dict().items()}
+def _evaluation(task: Task, state: TrainState) -> dict[str, float]:
+    figures = task.evaluate(state.agent.actor_params)[0].to_dict()
+    return {f"evaluation/{name}": x for name, x in figures.items() if not isinstance(x, tuple)}
 
 
 def _record(run: Run, board: SummaryWriter, epoch: int, state: TrainState, row: dict[str, float]) -> None:
@@ -115,14 +151,12 @@ def _record(run: Run, board: SummaryWriter, epoch: int, state: TrainState, row: 
         board.add_scalar(name, np.float32(value), steps)
 
 
-def _line(row: dict[str, float]) -> str:
+def _line(task: Task, row: dict[str, float]) -> str:
     text = (
         f"{row['speed/env_steps_per_s']:.0f} env steps/s  {row['speed/updates_per_s']:.0f} updates/s  "
         f"success {100 * row['env/reached']:.0f} % of actions"
     )
-    if "evaluation/median_mm" in row:
-        text += f"  held-out median {row['evaluation/median_mm']:.1f} mm"
-    return text
+    return f"{text}  {task.headline(row)}" if "evaluation/median_mm" in row else text
 
 
 def _progress(console: Console) -> Progress:

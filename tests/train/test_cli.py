@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 
 from mjx_softarm.env import ReachEnv
-from train.__main__ import PICTURES, main
+from train.__main__ import main
 from train.checkpoint import Run
 from train.job import Job
+from train.plots import REACH_PICTURES
 
 SMALL = {
     "n_arms": 8,
@@ -82,7 +83,7 @@ def test_a_run_survives_kill_9_and_ends_with_the_same_bits(tmp_path, environment
     assert main(["evaluate", str(whole)]) == 0
     figures = json.loads((whole / "evaluation.json").read_text())
     assert figures == json.loads((killed / "evaluation.json").read_text())
-    assert all((whole / name).stat().st_size > 10_000 for name in PICTURES)
+    assert all((whole / name).stat().st_size > 10_000 for name in REACH_PICTURES)
     assert list(whole.glob("events.out.tfevents.*"))
     config = json.loads((whole / "config.json").read_text())
     assert {"python", "packages", "commit"} <= config["provenance"].keys()

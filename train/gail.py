@@ -1,0 +1,141 @@
+"""The learned reward: a discriminator that tells the expert's actions from the agent's.
+
+The logit h(s, a, g) is high where the expert acts. It is trained by cross-entropy, expert 1 and agent 0, with
+a penalty that holds the length of its gradient near one between the two; the reward log sigmoid(h), never
+positive, is the paper's log(1 - D) with D the probability of the agent. As h moves with every update, a
+reward is never stored: it is computed when a batch is sampled.
+
+Source: Ho and Ermon 2016, arXiv:1606.03476; gradient penalty: Gulrajani et al. 2017, arXiv:1704.00028.
+
+Shapes: B batch, O observation (which holds the goal), A action.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import optax
+from jax import Array
+
+Logits = Callable[[Array, Array], Array]  # observations (..., O) and actions (..., A) -> (...), high: expert
+
+
+@dataclass(frozen=True)
+class GailConfig:
+    """Hyperparameters of the discriminator."""
+
+    hidden: tuple[int, ...] = (256, 256)
+    learning_rate: float = 3e-4  # Adam; 0 freezes the discriminator
+    gradient_penalty: float = 20.0  # the paper's lambda
+    input_scale: float = 10.0  # on observations and actions: the slope that the penalty asks of the logit
+
+    def __post_init__(self) -> None:
+        if self.input_scale <= 0.0:
+            raise ValueError(f"GailConfig.input_scale: expected a number > 0, got {self.input_scale}")
+        for name in ("learning_rate", "gradient_penalty"):
+            if getattr(self, name) < 0.0:
+                raise ValueError(f"GailConfig.{name}: expected a number >= 0, got {getattr(self, name)}")
+
+
+class DiscriminatorState(NamedTuple):
+    """All that an update changes."""
+
+    params: Any
+    opt_state: optax.OptState
+
+
+class Discriminator(nn.Module):
+    """ReLU network from observation and action to one logit, high for the expert."""
+
+    hidden: tuple[int, ...]
+
+    @nn.compact
+    def __call__(self, obs: Array, action: Array) -> Array:
+        x = jnp.concatenate([obs, action], axis=-1)  # (..., O + A)
+        for i, width in enumerate(self.hidden):
+            x = nn.relu(nn.Dense(width, name=f"hidden_{i}")(x))
+        return nn.Dense(1, name="head")(x)[..., 0]
+
+
+class Gail:
+    """Network and optimiser of fixed structure, and pure functions of a `DiscriminatorState`."""
+
+    def __init__(self, obs_size: int, action_size: int, config: GailConfig = GailConfig()) -> None:
+        self.obs_size, self.action_size, self.config = obs_size, action_size, config
+        self.network: Any = Discriminator(config.hidden)
+        self.optimizer = optax.adam(config.learning_rate)
+
+    def init(self, key: Array) -> DiscriminatorState:
+        """Fresh parameters."""
+        params = self.network.init(key, jnp.zeros((1, self.obs_size)), jnp.zeros((1, self.action_size)))
+        return DiscriminatorState(params, self.optimizer.init(params))
+
+    def logits(self, params: Any) -> Logits:
+        """The discriminator as a function of scaled observations and actions."""
+        return lambda obs, action: self.network.apply(params, obs, action)
+
+    def reward(self, params: Any, obs: Array, action: Array) -> Array:
+        """The learned reward (...) of actions (..., A) at observations (..., O)."""
+        return learned_reward(self.logits(params)(*self._scaled(obs, action)))
+
+    def update(
+        self,
+        state: DiscriminatorState,
+        expert: tuple[Array, Array],
+        agent: tuple[Array, Array],
+        key: Array,
+    ) -> tuple[DiscriminatorState, dict[str, Array]]:
+        """One gradient step.
+
+        Args:
+            state: of the discriminator.
+            expert, agent: observations (B, O) and actions (B, A); a pair of rows has the same goal, so that
+                what lies between them has it too.
+            key: for the points between.
+        """
+        expert, agent = self._scaled(*expert), self._scaled(*agent)
+        mix = jax.random.uniform(key, (expert[0].shape[0], 1))
+        between = jax.tree.map(lambda e, a: mix * e + (1.0 - mix) * a, expert, agent)
+
+        def loss(params: Any) -> tuple[Array, dict[str, Array]]:
+            logits = self.logits(params)
+            on_expert, on_agent = logits(*expert), logits(*agent)
+            entropy = cross_entropy(on_expert, on_agent)
+            penalty = gradient_penalty(logits, *between)
+            right = 0.5 * (jnp.mean(on_expert > 0.0) + jnp.mean(on_agent < 0.0))
+            metrics = {"discriminator_loss": entropy, "gradient_penalty": penalty, "accuracy": right}
+            return entropy + self.config.gradient_penalty * penalty, metrics
+
+        grads, metrics = jax.grad(loss, has_aux=True)(state.params)
+        updates, opt_state = self.optimizer.update(grads, state.opt_state, state.params)
+        return DiscriminatorState(optax.apply_updates(state.params, updates), opt_state), metrics
+
+    def _scaled(self, obs: Array, action: Array) -> tuple[Array, Array]:
+        return self.config.input_scale * obs, self.config.input_scale * action
+
+
+def learned_reward(logits_expert_is_high: Array) -> Array:
+    """log sigmoid(h), (...) and never positive; the paper's log(1 - D)."""
+    return jax.nn.log_sigmoid(logits_expert_is_high)
+
+
+def cross_entropy(expert_logits: Array, agent_logits: Array) -> Array:
+    """Mean of -log sigmoid(h) over the expert (B,) plus mean of -log(1 - sigmoid(h)) over the agent (B,)."""
+    return jnp.mean(jax.nn.softplus(-expert_logits)) + jnp.mean(jax.nn.softplus(agent_logits))
+
+
+def gradient_penalty(logits: Logits, obs: Array, action: Array) -> Array:
+    """Mean of (|grad h| - 1)^2 over points (B, O), (B, A), the gradient being that by both.
+
+    Where the gradient vanishes, that of its length is taken as zero.
+    """
+    d_obs, d_action = jax.grad(lambda o, a: jnp.sum(logits(o, a)), argnums=(0, 1))(obs, action)
+    square = jnp.sum(d_obs**2, axis=-1) + jnp.sum(d_action**2, axis=-1)  # (B,)
+    flat = square == 0.0
+    length = jnp.where(flat, 0.0, jnp.sqrt(jnp.where(flat, 1.0, square)))
+    return jnp.mean((length - 1.0) ** 2)

@@ -1,0 +1,111 @@
+"""How well a policy reaches demonstrated positions, the body inside the pipe."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from mjx_softarm import xla
+from mjx_softarm.env import ReachEnv
+from mjx_softarm.kinematics import chain_frames
+from mjx_softarm.pipe import CrossPipe, body_clearance
+from mjx_softarm.pose import pose_error
+from train.evaluate import Reached, follow
+from train.tqc import TQC
+
+
+class AtPositions(NamedTuple):
+    """What an arm reached at each of m demonstrated positions, in their order."""
+
+    reached: Reached
+    clearance_mm: Array  # (m,) of the body to the pipe's wall; infinite without a pipe
+    success: Array  # (m,) bool: close enough, no chamber saturated, the body inside the pipe
+
+
+@dataclass(frozen=True)
+class PositionSummary:
+    """The figures that stand in tables."""
+
+    success_share: float
+    reached_share: float  # close enough, whatever the chambers and the wall say
+    median_mm: float
+    max_mm: float
+    x_mm: float  # mean absolute errors
+    y_mm: float
+    z_mm: float
+    saturated_positions: int
+    outside_positions: int  # with part of the body beyond the pipe's wall
+    unsettled: int
+    error_mm: tuple[float, ...]  # tip error at each position
+
+    def to_dict(self) -> dict[str, Any]:
+        return dataclasses.asdict(self)
+
+    def rows(self) -> list[tuple[str, str]]:
+        """What a table shows: name and value with its unit."""
+        return [
+            ("positions with success", f"{100 * self.success_share:.1f} %"),
+            ("positions reached", f"{100 * self.reached_share:.1f} %"),
+            ("tip error, median", f"{self.median_mm:.2f} mm"),
+            ("tip error, largest", f"{self.max_mm:.2f} mm"),
+            ("mean absolute error in x, y, z", f"{self.x_mm:.2f}, {self.y_mm:.2f}, {self.z_mm:.2f} mm"),
+            ("positions with a saturated chamber", f"{self.saturated_positions}"),
+            ("positions with the body outside the pipe", f"{self.outside_positions}"),
+            ("arms that did not settle", f"{self.unsettled}"),
+        ]
+
+
+class PositionEvaluator:
+    """Evaluates actors on one path of positions (m, 6) [mm, deg]; compiled once.
+
+    A single arm goes from position to position, once along the path to get there.
+    """
+
+    def __init__(self, env: ReachEnv, agent: TQC, positions: Array, pipe: CrossPipe | None):
+        self.env, self.pipe = env, pipe
+        self.positions = jnp.asarray(positions)
+        self._follow = xla.jit(functools.partial(follow, env, agent), env.uses_mjx)
+        self._clearance = jax.jit(jax.vmap(self._clearance_m))
+
+    def __call__(self, actor_params: Any) -> tuple[PositionSummary, AtPositions]:
+        """Figures, and what was reached, as NumPy arrays."""
+        reached = self._follow(actor_params, self.positions)
+        clearance_mm = 1e3 * jax.device_get(self._clearance(reached.q))
+        reached = jax.device_get(reached)
+        close = reached.scaled_error < self.env.config.reward.threshold
+        free = reached.saturated_chambers == 0
+        success = close & free & (clearance_mm > 0.0) & reached.settled
+        return summarise(AtPositions(reached, clearance_mm, success), close)
+
+    def _clearance_m(self, q: Array) -> Array:
+        if self.pipe is None:
+            return jnp.inf
+        frames = chain_frames(q, self.env.spec.link_length_m)
+        return body_clearance(self.pipe, frames.plate_position, frames.plate_rotation, self.env.spec)
+
+
+def summarise(at: AtPositions, close: np.ndarray) -> tuple[PositionSummary, AtPositions]:
+    """Figures of what was reached; `close` (m,) says where the pose was."""
+    error_mm = at.reached.tip_error_mm
+    x, y, z = np.abs(pose_error(at.reached.pose, at.reached.goal))[:, :3].mean(axis=0)
+    figures = PositionSummary(
+        success_share=float(at.success.mean()),
+        reached_share=float(close.mean()),
+        median_mm=float(np.median(error_mm)),
+        max_mm=float(error_mm.max()),
+        x_mm=float(x),
+        y_mm=float(y),
+        z_mm=float(z),
+        saturated_positions=int(np.count_nonzero(at.reached.saturated_chambers)),
+        outside_positions=int(np.count_nonzero(at.clearance_mm <= 0.0)),
+        unsettled=int(np.count_nonzero(~at.reached.settled)),
+        error_mm=tuple(float(value) for value in error_mm),
+    )
+    return figures, at

@@ -1,0 +1,76 @@
+"""The two things that a run can learn: to reach the workspace, or to reach as an expert showed.
+
+A task is a job with all that differs around it: how it is evaluated, shown, and prepared for an epoch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from matplotlib.figure import Figure
+
+from mjx_softarm.env import ReachEnv
+from mjx_softarm.pipe import CrossPipe
+from train import plots
+from train.checkpoint import Run
+from train.config import ImitationConfig
+from train.evaluate import N_GOALS, Evaluator
+from train.imitation import ImitationJob
+from train.job import Job, TrainState
+from train.positions import PositionEvaluator
+
+
+class Task(NamedTuple):
+    """What a run learns."""
+
+    job: Job
+    title: str  # of the table of figures
+    evaluate: Callable[[Any], tuple[Any, ...]]  # actor -> figures (`to_dict`), and what was reached
+    picture_names: tuple[str, ...]
+    pictures: Callable[..., dict[str, Figure]]  # rows of metrics, what was reached -> by those names
+    headline: Callable[[dict[str, float]], str]  # row of metrics with an evaluation -> a few words
+    prepare: Callable[[TrainState, int], TrainState]  # before the epoch of that number
+
+
+def task_of(run: Run, env: ReachEnv) -> Task:
+    """What a run learns, by its config."""
+    if isinstance(run.config, ImitationConfig):
+        return _imitation(run, run.config, env)
+    job = Job(run.config, env)
+    return Task(
+        job=job,
+        title=f"{N_GOALS} held-out goals",
+        evaluate=Evaluator(env, job.agent),
+        picture_names=plots.REACH_PICTURES,
+        pictures=plots.reach_pictures,
+        headline=lambda row: f"held-out median {row['evaluation/median_mm']:.1f} mm",
+        prepare=lambda state, epoch: state,
+    )
+
+
+def _imitation(run: Run, config: ImitationConfig, env: ReachEnv) -> Task:
+    demonstrations = run.demonstrations()
+    job = ImitationJob(config, env, demonstrations)
+    pipe = None if config.pipe_diameter_mm is None else CrossPipe.of_mm(config.pipe_diameter_mm)
+    evaluate = PositionEvaluator(env, job.agent, demonstrations.positions, pipe)
+
+    def prepare(state: TrainState, epoch: int) -> TrainState:
+        every = config.rebalance_epochs
+        if every and epoch and epoch % every == 0 and epoch not in config.stage_epochs:
+            summary, _ = evaluate(state.agent.actor_params)
+            return job.rebalance(state, epoch, summary.error_mm)
+        return job.begin_stage(state, epoch)
+
+    return Task(
+        job=job,
+        title=f"{len(demonstrations.positions)} demonstrated positions",
+        evaluate=evaluate,
+        picture_names=plots.IMITATION_PICTURES,
+        pictures=plots.imitation_pictures,
+        headline=lambda row: (
+            f"success at {100 * row['evaluation/success_share']:.0f} % of the positions, "
+            f"median {row['evaluation/median_mm']:.1f} mm"
+        ),
+        prepare=prepare,
+    )
