@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from mjx_softarm._xp import array_namespace
 from mjx_softarm.excitation import random_pressures
 from mjx_softarm.kinematics import chain_frames
 from mjx_softarm.pipe import CrossPipe, body_points, clearance
@@ -36,6 +37,7 @@ N_POOL, N_STARTS, N_STEPS = 4096, 32, 25
 N_JITTERED = 8  # of the starts, about the posture before
 JITTER_KPA = 3.0
 WAY = (0.25, 0.5, 0.75)  # of the way from the posture before, where its clearance is looked at
+WAY_CLEAR_M = 0.01  # with more than this it is as good as any
 MARGIN_M = 0.004  # of the body to the wall
 MARGIN_KPA = 1.5  # of the chambers to their limits
 COMFORT_M, COMFORT_KPA = 0.02, 6.0  # beyond these, more distance is worth nothing
@@ -45,7 +47,7 @@ LIMIT_SHARE = 0.8  # of a margin, that must be kept: one-sided errors end a litt
 
 # One unit of error.
 _POSITION_M, _TURN_RAD, _LIMIT_KPA, _LIMIT_M = 1e-4, 1e-3, 0.1, 1e-4
-_COMFORT_M, _COMFORT_KPA, _NEAR_KPA = 0.02, 3.0, 20.0
+_COMFORT_M, _COMFORT_KPA, _NEAR_KPA = 0.01, 3.0, 20.0
 _NO_WALL_M = 1.0  # clearance where there is no pipe
 
 
@@ -70,7 +72,7 @@ class Target(NamedTuple):
 
     finger_m: Any  # (3,)
     rotation: Any  # (3, 3)
-    straight: Any  # () 1 where the rotation is wanted, else 0
+    turn: Any  # (3,) 1 for each of the gripper's axes about which it is not to turn from that, else 0
     near_kpa: Any  # (n_chambers,)
 
 
@@ -114,7 +116,7 @@ class Expert:
 
     def target(self, waypoint: Waypoint) -> Target:
         """What a waypoint asks for."""
-        return Target(np.asarray(waypoint.finger_m), np.eye(3), float(waypoint.straight), np.zeros(0))
+        return Target(np.asarray(waypoint.finger_m), np.eye(3), np.array(waypoint.turn), np.zeros(0))
 
     def reach(self, name: str, target: Target, before_kpa: np.ndarray) -> Posture:
         """The posture that meets a target, near the one at `before_kpa` (n_chambers,).
@@ -134,8 +136,7 @@ class Expert:
         way = [found.pressure_kpa[met] * share + before_kpa * (1.0 - share) for share in WAY]
         clear_m = self.look(np.concatenate(way)).clearance_m.reshape(len(WAY), -1).min(axis=0)
         far_kpa = np.linalg.norm(found.pressure_kpa[met] - before_kpa, axis=-1)
-        least_m = LIMIT_SHARE * MARGIN_M
-        best = met[np.lexsort([far_kpa, -np.minimum(clear_m, least_m)])[0]]
+        best = met[np.lexsort([far_kpa, -np.minimum(clear_m, WAY_CLEAR_M)])[0]]
         return jax.tree.map(lambda x: x[best], found)
 
     def _starts(self, target: Target) -> np.ndarray:
@@ -172,7 +173,7 @@ class Expert:
                 margin_kpa / MARGIN_KPA - LIMIT_SHARE,
                 margin_m.min(axis=-1) / SPRING_MARGIN_M - LIMIT_SHARE,
                 1.0 - off_m / TOLERANCE_M,
-                1.0 - target.straight * turn_rad / TOLERANCE_RAD,
+                1.0 - turn_rad / TOLERANCE_RAD,
             ]
         return np.nan_to_num(np.stack(demands, axis=-1), nan=-np.inf)
 
@@ -184,7 +185,7 @@ class Expert:
         kpa = found.pressure_kpa[best]
         chamber = int(np.argmin(np.minimum(kpa - low, high - kpa)))
         wanted = ", ".join(f"{1e3 * value:.0f}" for value in target.finger_m)
-        turned = f" and turned by {np.degrees(turn_rad):.1f} deg" if target.straight else ""
+        turned = f" and turned by {np.degrees(turn_rad):.1f} deg" if target.turn.any() else ""
         wall = "" if self.pipe is None else f", {1e3 * found.clearance_m[best]:.1f} mm from the wall"
         expected = "" if self.pipe is None else f", {1e3 * MARGIN_M:g} mm from the wall"
         return (
@@ -198,9 +199,17 @@ _BATCH = 256
 
 
 def _off(found: Posture, target: Target) -> tuple[np.ndarray, np.ndarray]:
-    """Distance (n,) [m] of the finger tips to the target, and angle (n,) [rad] of the gripper to its own."""
-    cos = 0.5 * (np.einsum("nij,ij->n", found.rotation, target.rotation) - 1.0)
-    return np.linalg.norm(found.finger_m - target.finger_m, axis=-1), np.arccos(np.clip(cos, -1.0, 1.0))
+    """Distance (n,) [m] of the finger tips to the target, and wrong turn (n,) [rad] of the gripper."""
+    angle = target.turn * _angle(found.rotation, target.rotation)
+    return np.linalg.norm(found.finger_m - target.finger_m, axis=-1), np.linalg.norm(angle, axis=-1)
+
+
+def _angle(rotation: Any, target: Any) -> Any:
+    """Sines (..., 3) of the turn of rotations (..., 3, 3) to a target (3, 3), about the gripper's axes."""
+    xp = array_namespace(rotation)
+    turn = xp.swapaxes(rotation, -1, -2) @ target
+    axes = ((2, 1), (0, 2), (1, 0))
+    return 0.5 * xp.stack([turn[..., i, j] - turn[..., j, i] for i, j in axes], axis=-1)
 
 
 def _posture(pressure_kpa: Array, params: ArmParams, s2r: S2R | None, spec: ArmSpec, pipe: CrossPipe | None):
@@ -269,8 +278,6 @@ def _errors(posture: tuple[Posture, Array], target: Target, spec: ArmSpec) -> Ar
     """What a posture is off by, each in its unit; limits count where they are not kept."""
     now, wall_m = posture
     chambers, springs = spec.chambers, spec.springs
-    turn = now.rotation.T @ target.rotation
-    angle = 0.5 * jnp.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
     room_kpa = jnp.concatenate(
         [now.pressure_kpa - chambers.pressure_min_kpa, chambers.pressure_max_kpa - now.pressure_kpa]
     )
@@ -285,7 +292,7 @@ def _errors(posture: tuple[Posture, Array], target: Target, spec: ArmSpec) -> Ar
     return jnp.concatenate(
         [
             (now.finger_m - target.finger_m) / _POSITION_M,
-            target.straight * angle / _TURN_RAD,
+            target.turn * _angle(now.rotation, target.rotation) / _TURN_RAD,
             *(jnp.minimum(value, 0.0) for value in within),
             (now.pressure_kpa - target.near_kpa) / _NEAR_KPA,
         ]

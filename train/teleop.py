@@ -21,7 +21,7 @@ from mjx_softarm.logs import Log
 from mjx_softarm.pose import quaternion_from_pose, rotation_from_quaternion
 from mjx_softarm.sensors import length_from_frequency
 from train.expert import Expert, ExpertError, Posture, Target
-from train.waypoints import Waypoint
+from train.waypoints import FREE, Waypoint
 
 CLOSE_M = 1.5e-3  # of the finger tips to a waypoint; within that, nothing is corrected
 N_CORRECTIONS = 3
@@ -126,7 +126,7 @@ class Teleoperation:
 
     def _step(self, finger_m: np.ndarray) -> bool:
         """Bring the finger tips (3,) [m] there from where they are; False, told, where that cannot be."""
-        target = Target(finger_m, np.eye(3), 0.0, self._now.pressure_kpa)
+        target = Target(finger_m, np.eye(3), np.array(FREE), self._now.pressure_kpa)
         try:
             posture = self.expert.reach("of the key", target, self._now.pressure_kpa)
         except ExpertError as error:

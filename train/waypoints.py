@@ -19,12 +19,18 @@ from mjx_softarm.workspace import circle_poses
 HOME_BELOW_M = 0.1  # of the finger tips below the crossing's centre, where the pipe's tasks begin and end
 
 
+# How the gripper is to hang.
+FREE = (0.0, 0.0, 0.0)
+STRAIGHT = (1.0, 1.0, 0.0)  # straight down
+SQUARE = (1.0, 1.0, 1.0)  # straight down, and its yaw zero
+
+
 class Waypoint(NamedTuple):
     """Where the finger tips are to be."""
 
     name: str  # "pick right", "place left" and the like where an object is taken or let go
     finger_m: np.ndarray  # (3,) in the base frame
-    straight: bool = False  # the gripper hangs straight down, its yaw zero; else as it comes
+    turn: tuple[float, float, float] = FREE  # 1 for each of the gripper's axes about which it is not to turn
 
     @property
     def operation(self) -> str:
@@ -58,10 +64,10 @@ def task(name: str, spec: ArmSpec) -> Task:
 
 
 def circle(n: int, spec: ArmSpec) -> tuple[Waypoint, ...]:
-    """Points of the circle, the gripper hanging straight."""
+    """Points of the circle, the gripper as in the circle's poses."""
     position_m, _ = frame_from_pose(circle_poses(n).astype(float))
     finger_m = position_m - [0.0, 0.0, spec.mass.gripper_length_m]
-    return tuple(Waypoint(f"circle {k}", point, straight=True) for k, point in enumerate(finger_m))
+    return tuple(Waypoint(f"circle {k}", point, SQUARE) for k, point in enumerate(finger_m))
 
 
 def pick_and_place(pipe: CrossPipe, stops: Sequence[tuple[str, int]]) -> tuple[Waypoint, ...]:
@@ -74,12 +80,12 @@ def pick_and_place(pipe: CrossPipe, stops: Sequence[tuple[str, int]]) -> tuple[W
     places = dict(pipe.containers())
     crossing = np.array([0.0, 0.0, places["right"][2]])
     places["home"] = np.array([0.0, 0.0, pipe.centre_z_m - HOME_BELOW_M])
-    waypoints = [Waypoint("home", places["home"], straight=True)]
+    waypoints = [Waypoint("home", places["home"], STRAIGHT)]
     for name, n_moves in stops:
         goal = places[name.split(" ")[-1]]
         way = _along(np.stack([waypoints[-1].finger_m, crossing, goal]), n_moves)
         waypoints += [Waypoint(f"to {name} {k + 1}", point) for k, point in enumerate(way[:-1])]
-        waypoints.append(Waypoint(name, goal, straight=name == "home"))
+        waypoints.append(Waypoint(name, goal, STRAIGHT if name == "home" else FREE))
     return tuple(waypoints)
 
 

@@ -11,7 +11,7 @@ from mjx_softarm.mjcf import build_model
 from mjx_softarm.pipe import CrossPipe, body_clearance
 from mjx_softarm.pose import pose_from_frame
 from train.expert import LIMIT_SHARE, MARGIN_KPA, MARGIN_M, SPRING_MARGIN_M, WAY, ExpertError
-from train.waypoints import TASKS, Waypoint, circle, task
+from train.waypoints import FREE, SQUARE, TASKS, Waypoint, circle, task
 
 PIPE = CrossPipe.of_mm(300)
 
@@ -20,7 +20,7 @@ PIPE = CrossPipe.of_mm(300)
 def waypoints(spec):
     """From home into the right container, and straight down half of the way to the bottom."""
     picked = task("pipe300", spec).waypoints[:5]
-    return (*picked, Waypoint("down", np.array([0.0, 0.0, -0.72]), straight=True))
+    return (*picked, Waypoint("down", np.array([0.0, 0.0, -0.72]), SQUARE))
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +61,9 @@ def test_held_references_bring_the_arm_to_the_waypoints(spec, plan, waypoints, s
         tip_m, rotation = data.site("tip").xpos, data.site("tip").xmat.reshape(3, 3)
         finger_m = tip_m - spec.mass.gripper_length_m * rotation[:, 2]
         np.testing.assert_allclose(finger_m + 1e-3 * shift_mm, waypoint.finger_m, atol=1e-4)
-        if waypoint.straight:
+        if waypoint.turn != FREE:
+            np.testing.assert_allclose(rotation[:, 2], [0.0, 0.0, 1.0], atol=0.01)
+        if waypoint.turn == SQUARE:
             np.testing.assert_allclose(rotation, np.eye(3), atol=0.01)
         pose = pose_from_frame(tip_m + 1e-3 * shift_mm, rotation)
         np.testing.assert_allclose(plan.pose[k], pose, atol=0.05)
@@ -132,4 +134,4 @@ def test_tasks_have_the_papers_positions(spec):
 def test_circle_is_below_the_circles_poses(spec):
     for waypoint in circle(16, spec):
         assert np.hypot(*waypoint.finger_m[:2]) == pytest.approx(0.08, abs=1e-6)
-        assert waypoint.finger_m[2] == pytest.approx(-0.675, abs=1e-6) and waypoint.straight
+        assert waypoint.finger_m[2] == pytest.approx(-0.675, abs=1e-6) and waypoint.turn == SQUARE
