@@ -34,6 +34,7 @@ from mjx_softarm.statics import ArmParams
 from train.waypoints import Waypoint
 
 N_POOL, N_STARTS, N_STEPS = 4096, 32, 25
+_BATCH = 256  # postures looked at in one call
 N_JITTERED = 8  # of the starts, about the posture before
 JITTER_KPA = 3.0
 WAY = (0.25, 0.5, 0.75)  # of the way from the posture before, where its clearance is looked at
@@ -193,9 +194,6 @@ class Expert:
             f"{1e3 * off_m:.1f} mm off{turned}{wall}, chamber {chamber} at {kpa[chamber]:.1f} kPa; expected "
             f"at most {1e3 * TOLERANCE_M:g} mm{expected}, {low + MARGIN_KPA:g} to {high - MARGIN_KPA:g} kPa"
         )
-
-
-_BATCH = 256
 
 
 def _off(found: Posture, target: Target) -> tuple[np.ndarray, np.ndarray]:
