@@ -10,19 +10,14 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-import multiprocessing
-import os
-import signal
 import sys
-from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from benchmarks.paper_stages import (
     SMOKE,
     Case,
-    JobError,
     Settings,
     cases,
     follow_circle,
@@ -30,12 +25,10 @@ from benchmarks.paper_stages import (
     load_results,
     train_policy,
 )
+from benchmarks.parallel import Job, JobError, in_parallel
 
-N_WORKERS = 2  # each on cores of its own: faster than one training on all of them
 SETTINGS_FILE = "settings.json"
 PRESETS = ("quick", "paper")
-
-Job = tuple[str, Callable[..., Any], tuple[Any, ...]]  # what to call it, function and arguments
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -143,44 +136,3 @@ def _claim(folder: Path, settings: Settings) -> None:
         differing = [name for name in wanted if found.get(name) != wanted[name]]
         got = ", ".join(f"{name} {found.get(name)}, now {wanted[name]}" for name in differing)
         raise JobError(f"{file}: was made with other settings ({got}); choose another --out")
-
-
-def in_parallel(jobs: Sequence[Job]) -> dict[str, Any]:
-    """Do jobs in processes of their own, a few at a time; returns what each gave, by its name.
-
-    Raises:
-        JobError: one failed; those under way are finished, the others are not begun.
-    """
-    context = multiprocessing.get_context("spawn")
-    cores = _shares(sorted(os.sched_getaffinity(0))) if hasattr(os, "sched_setaffinity") else [[]]
-    queue = context.Queue()
-    for share in cores:
-        queue.put(share)
-    given: dict[str, Any] = {}
-    pool = ProcessPoolExecutor(len(cores), context, _settle_worker, (queue,))
-    try:
-        waiting = {pool.submit(function, *arguments): name for name, function, arguments in jobs}
-        for done in as_completed(waiting):
-            name = waiting[done]
-            try:
-                given[name] = done.result()
-            except Exception as error:
-                pool.shutdown(wait=True, cancel_futures=True)
-                raise JobError(f"{name}: {type(error).__name__}: {error}") from error
-            print(f"{len(given)} of {len(jobs)}: {name}", flush=True)
-    finally:
-        pool.shutdown(wait=False, cancel_futures=True)
-    return given
-
-
-def _shares(cores: Sequence[int]) -> list[list[int]]:
-    """The cores of each worker."""
-    n = min(N_WORKERS, len(cores))
-    return [list(cores[k::n]) for k in range(n)]
-
-
-def _settle_worker(queue: Any) -> None:
-    """Keep a worker, and what it starts, to its cores; Ctrl-C ends it, and training saves by itself."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-    if share := queue.get():
-        os.sched_setaffinity(0, share)

@@ -6,6 +6,7 @@ Motion capture is noisy: an error is the mean over the window in which the sprin
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -85,19 +86,29 @@ def point_of(goal: np.ndarray, goals: np.ndarray) -> int:
 
 def save_followed(path: Path, followed: Followed) -> None:
     """Write a result whole or not at all."""
+    save_arrays(path, followed._asdict())
+
+
+def load_followed(path: Path) -> Followed:
+    """The result that `save_followed` wrote."""
+    return Followed(**load_arrays(path, Followed._fields))
+
+
+def save_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
+    """Write arrays by name as npz, whole or not at all."""
     part = path.with_name(path.name + ".part")
     try:
         with part.open("wb") as file:
-            np.savez_compressed(file, **followed._asdict())
+            np.savez_compressed(file, **arrays)
         os.replace(part, path)
     finally:
         part.unlink(missing_ok=True)
 
 
-def load_followed(path: Path) -> Followed:
-    """The result that `save_followed` wrote."""
+def load_arrays(path: Path, names: Iterable[str]) -> dict[str, Any]:
+    """Arrays of those names that `save_arrays` wrote."""
     with np.load(path) as file:
-        return Followed(**{name: file[name] for name in Followed._fields})
+        return {name: file[name] for name in names}
 
 
 def figures(followed: Followed) -> dict[str, Any]:

@@ -19,14 +19,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 from benchmarks.paper_measure import Followed, load_followed, measure, save_followed
+from benchmarks.parallel import JobError
 
 METHODS = {"without": "without S2R", "with": "with S2R", "gradient": "gradient descent"}
 LOG_FILE, CALIBRATION = "log.npz", "calibration"
 POLICY_FILE, EVALUATION_FILE = "policy.npz", "evaluation.json"
-
-
-class JobError(Exception):
-    """A job that cannot be done; the message says which, and why."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +34,7 @@ class Settings:
     seeds: tuple[int, ...] = (0, 1, 2)
     preset: str = "paper"
     training: tuple[str, ...] = ()  # further settings, NAME=VALUE
+    imitation: tuple[str, ...] = ()  # likewise, of learning from demonstrations
     n_poses: int = 500
     n_points: int = 40
     loads_g: tuple[int, ...] = (35, 105, 220, 330, 500, 1000)
@@ -129,16 +127,17 @@ def train_policy(folder: Path, settings: Settings, twin: int | None, seed: int) 
         JobError: a command failed.
     """
     run = policy_folder(folder, twin, seed)
+    log = run.with_suffix(".log")
     if not (run / EVALUATION_FILE).exists():
         if (run / "config.json").exists():
-            _command(run, "reach", "--resume", str(run))
+            command(log, "reach", "--resume", str(run))
         else:
             arm = [] if twin is None else ["--calibration", str(folder / f"twin{twin}" / CALIBRATION)]
             more = [part for text in settings.training for part in ("--set", text)]
             options = ["--preset", settings.preset, "--seed", str(seed), "--out", str(run), *arm, *more]
-            _command(run, "reach", *options)
+            command(log, "reach", *options)
     if not (run / POLICY_FILE).exists():
-        _command(run, "export", str(run))
+        command(log, "export", str(run))
 
 
 def policy_folder(folder: Path, twin: int | None, seed: int) -> Path:
@@ -146,9 +145,12 @@ def policy_folder(folder: Path, twin: int | None, seed: int) -> Path:
     return folder / f"{'nominal' if twin is None else f'twin{twin}'}-seed{seed}"
 
 
-def _command(run: Path, *arguments: str) -> None:
-    """`python -m train ...`, its output appended to a file beside the run."""
-    log = run.with_suffix(".log")
+def command(log: Path, *arguments: str) -> None:
+    """`python -m train ...`, its output appended to a file.
+
+    Raises:
+        JobError: it failed; the message has the last lines.
+    """
     with log.open("a", encoding="utf-8") as file:
         done = subprocess.run(
             [sys.executable, "-m", "train", *arguments], stdout=file, stderr=subprocess.STDOUT, check=False

@@ -191,6 +191,13 @@ _PIPE = ImitationConfig(
     hindsight=HindsightConfig(reached_share=0.0, near_share=0.0),
     rebalance_env_steps=100_000,
 )
+_HAND_MADE = dataclasses.replace(
+    _PIPE,
+    learned_weight=0.0,
+    hand_made_weight=1.0,
+    tqc=dataclasses.replace(_TUNED.tqc, learning_rate_alpha=1e-3),
+    hindsight=_TUNED.hindsight,
+)
 IMITATION_PRESETS: dict[str, ImitationConfig] = {
     "circle": dataclasses.replace(
         _PIPE,
@@ -199,13 +206,8 @@ IMITATION_PRESETS: dict[str, ImitationConfig] = {
         stages=(Stage(share=1 / 3, every=2), Stage(share=2 / 3, kept=0.2)),
     ),
     "pipe": _PIPE,
-    "hand-made": dataclasses.replace(
-        _PIPE,
-        learned_weight=0.0,
-        hand_made_weight=1.0,
-        tqc=dataclasses.replace(_TUNED.tqc, learning_rate_alpha=1e-3),
-        hindsight=_TUNED.hindsight,
-    ),
+    "hand-made": _HAND_MADE,
+    "frozen": dataclasses.replace(_HAND_MADE, learned_weight=5.0),  # which is another run's: `--reward`
 }
 
 

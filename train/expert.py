@@ -74,6 +74,7 @@ class Target(NamedTuple):
     finger_m: Any  # (3,)
     rotation: Any  # (3, 3)
     turn: Any  # (3,) 1 for each of the gripper's axes about which it is not to turn from that, else 0
+    bias_kpa: Any  # (n_chambers,) by which the real arm's pressures are above the simulated one's
     near_kpa: Any  # (n_chambers,)
 
 
@@ -117,7 +118,8 @@ class Expert:
 
     def target(self, waypoint: Waypoint) -> Target:
         """What a waypoint asks for."""
-        return Target(np.asarray(waypoint.finger_m), np.eye(3), np.array(waypoint.turn), np.zeros(0))
+        zero = np.zeros(self.spec.n_chambers)
+        return Target(np.asarray(waypoint.finger_m), np.eye(3), np.array(waypoint.turn), zero, zero)
 
     def reach(self, name: str, target: Target, before_kpa: np.ndarray) -> Posture:
         """The posture that meets a target, near the one at `before_kpa` (n_chambers,).
@@ -155,14 +157,18 @@ class Expert:
         chambers = self.spec.chambers
         return chambers.pressure_min_kpa, chambers.pressure_max_kpa
 
+    def _room_kpa(self, found: Posture, target: Target) -> np.ndarray:
+        """What is left to the next limit (n, n_chambers) of the real arm's pressures."""
+        low, high = self._limits_kpa()
+        real_kpa = found.pressure_kpa + target.bias_kpa
+        return np.minimum(real_kpa - low, high - real_kpa)
+
     def _slack(self, found: Posture, target: Target | None = None) -> np.ndarray:
         """How far within its tolerance each demand is, in units of that tolerance: (n, demands).
 
         Equilibrium, clearance, pressures, springs; then position and, where it is wanted, orientation.
         """
-        low, high = self._limits_kpa()
         springs = self.spec.springs
-        margin_kpa = np.minimum(found.pressure_kpa - low, high - found.pressure_kpa).min(axis=-1)
         margin_m = np.minimum(found.spring_m - springs.length_min_m, springs.length_max_m - found.spring_m)
         demands = [
             1.0 - found.residual / RESIDUAL_TOLERANCE,
@@ -171,7 +177,7 @@ class Expert:
         if target is not None:
             off_m, turn_rad = _off(found, target)
             demands += [
-                margin_kpa / MARGIN_KPA - LIMIT_SHARE,
+                self._room_kpa(found, target).min(axis=-1) / MARGIN_KPA - LIMIT_SHARE,
                 margin_m.min(axis=-1) / SPRING_MARGIN_M - LIMIT_SHARE,
                 1.0 - off_m / TOLERANCE_M,
                 1.0 - turn_rad / TOLERANCE_RAD,
@@ -183,15 +189,15 @@ class Expert:
         best = int(np.argmax(np.minimum(slack, 0.0).sum(axis=-1)))
         off_m, turn_rad = (value[best] for value in _off(found, target))
         low, high = self._limits_kpa()
-        kpa = found.pressure_kpa[best]
-        chamber = int(np.argmin(np.minimum(kpa - low, high - kpa)))
+        chamber = int(np.argmin(self._room_kpa(found, target)[best]))
+        kpa = (found.pressure_kpa[best] + target.bias_kpa)[chamber]
         wanted = ", ".join(f"{1e3 * value:.0f}" for value in target.finger_m)
         turned = f" and turned by {np.degrees(turn_rad):.1f} deg" if target.turn.any() else ""
         wall = "" if self.pipe is None else f", {1e3 * found.clearance_m[best]:.1f} mm from the wall"
         expected = "" if self.pipe is None else f", {1e3 * MARGIN_M:g} mm from the wall"
         return (
             f"waypoint {name!r} at {wanted} mm cannot be met: the best of {len(slack)} ends is "
-            f"{1e3 * off_m:.1f} mm off{turned}{wall}, chamber {chamber} at {kpa[chamber]:.1f} kPa; expected "
+            f"{1e3 * off_m:.1f} mm off{turned}{wall}, chamber {chamber} at {kpa:.1f} kPa; expected "
             f"at most {1e3 * TOLERANCE_M:g} mm{expected}, {low + MARGIN_KPA:g} to {high - MARGIN_KPA:g} kPa"
         )
 
@@ -276,9 +282,8 @@ def _errors(posture: tuple[Posture, Array], target: Target, spec: ArmSpec) -> Ar
     """What a posture is off by, each in its unit; limits count where they are not kept."""
     now, wall_m = posture
     chambers, springs = spec.chambers, spec.springs
-    room_kpa = jnp.concatenate(
-        [now.pressure_kpa - chambers.pressure_min_kpa, chambers.pressure_max_kpa - now.pressure_kpa]
-    )
+    real_kpa = now.pressure_kpa + target.bias_kpa
+    room_kpa = jnp.concatenate([real_kpa - chambers.pressure_min_kpa, chambers.pressure_max_kpa - real_kpa])
     room_m = jnp.concatenate([now.spring_m - springs.length_min_m, springs.length_max_m - now.spring_m])
     within = [
         (room_kpa - MARGIN_KPA) / _LIMIT_KPA,

@@ -1,9 +1,10 @@
 """Records demonstrations on an arm, through its springs, pumps and motion capture alone.
 
 The expert's references are held by the sensor-space law until the arm is at rest. Then, as an operator would,
-motion capture is looked at, and the target is moved by what the finger tips are off; what an arm without
-motion capture is off stays unknown, and the planned pose is logged. Or the finger tips are steered by keys,
-in steps, with the same expert finding the references. Between two moves the pumps keep the last pressures.
+motion capture is looked at, and the target is moved by what the finger tips are off, away from limits that
+chambers have come to; what an arm without motion capture is off stays unknown, and the planned pose is logged.
+Or the finger tips are steered by keys, in steps, with the same expert finding the references. Between two moves
+the pumps keep the last pressures.
 """
 
 from __future__ import annotations
@@ -14,17 +15,18 @@ from typing import Any, NamedTuple, TextIO
 import jax
 import numpy as np
 
-from mjx_softarm.deploy.drive import Drive, DriveError, Hold, drive_to_end, ramp
+from mjx_softarm.deploy.drive import Drive, DriveError, Hold, drive_to_end
 from mjx_softarm.deploy.faults import SETTLE_TIMEOUT_S
 from mjx_softarm.deploy.session import Recorder
 from mjx_softarm.logs import Log
 from mjx_softarm.pose import quaternion_from_pose, rotation_from_quaternion
 from mjx_softarm.sensors import length_from_frequency
-from train.expert import Expert, ExpertError, Posture, Target
-from train.waypoints import FREE, Waypoint
+from train.expert import Expert, ExpertError, Posture
+from train.waypoints import Waypoint
 
 CLOSE_M = 1.5e-3  # of the finger tips to a waypoint; within that, nothing is corrected
 N_CORRECTIONS = 3
+BEYOND_KPA = 3.0  # that a chamber at its limit is taken to need beyond it
 STEPS_M = {"s": 0.005, "l": 0.02}
 AXES = dict(zip("xyz", np.eye(3), strict=True))
 KEYS = "x y z, X Y Z: a step forth, back; s, l: steps of 5, 20 mm; space: log; q: end"
@@ -78,7 +80,6 @@ class Teleoperation:
 
         def run() -> None:
             step_m, logged = STEPS_M["l"], True
-            self._rest("the start", ramp(np.zeros(self.expert.spec.n_chambers), self._drive.dt_s))
             finger_m = self._now.finger_m
             for key in keys:
                 if key == "q":
@@ -107,52 +108,63 @@ class Teleoperation:
     def _reach(self, waypoint: Waypoint, posture: Posture) -> tuple[dict, float]:
         """The row at rest, and how far off [m] the finger tips are then; corrected as long as that helps."""
         target = asked = self.expert.target(waypoint)
+        row, off_m = None, np.nan
         for n_left in range(N_CORRECTIONS, -1, -1):
-            row = self._hold(waypoint.name, posture)
-            finger_m, rotation = self._seen(row)
-            off_m = float(np.linalg.norm(finger_m - target.finger_m))
-            if not self._sees or off_m < CLOSE_M or not n_left:
+            row = self._hold(posture)
+            if row is not None:
+                finger_m, rotation = self._seen(row)
+                off_m = float(np.linalg.norm(finger_m - target.finger_m)) if self._sees else np.nan
+                if not self._sees or off_m < CLOSE_M:
+                    break
+                asked = asked._replace(
+                    finger_m=asked.finger_m + target.finger_m - finger_m,
+                    rotation=target.rotation @ rotation.T @ asked.rotation,
+                )
+            if not n_left:
                 break
-            asked = asked._replace(
-                finger_m=asked.finger_m + target.finger_m - finger_m,
-                rotation=target.rotation @ rotation.T @ asked.rotation,
-            )
+            asked = asked._replace(bias_kpa=self._bias_kpa(posture))
             try:
                 posture = self.expert.reach(waypoint.name, asked, posture.pressure_kpa)
             except ExpertError as error:
                 self.tell(f"not corrected: {error}")
                 break
-        return row, off_m if self._sees else np.nan
+        if row is None:
+            raise self._not_at_rest(waypoint.name)
+        return row, off_m
 
     def _step(self, finger_m: np.ndarray) -> bool:
         """Bring the finger tips (3,) [m] there from where they are; False, told, where that cannot be."""
-        target = Target(finger_m, np.eye(3), np.array(FREE), self._now.pressure_kpa)
+        waypoint = Waypoint("of the key", finger_m)
         try:
-            posture = self.expert.reach("of the key", target, self._now.pressure_kpa)
+            posture = self.expert.reach(waypoint.name, self.expert.target(waypoint), self._now.pressure_kpa)
         except ExpertError as error:
             self.tell(str(error))
             return False
-        seen_m, _ = self._seen(self._hold("of the key", posture))
-        self.tell(f"finger tips at {', '.join(f'{1e3 * value:.0f}' for value in seen_m)} mm")
+        row = self._hold(posture)
+        if row is None:
+            raise self._not_at_rest(waypoint.name)
+        self.tell(f"finger tips at {', '.join(f'{1e3 * value:.0f}' for value in self._seen(row)[0])} mm")
         return True
 
-    def _hold(self, name: str, posture: Posture) -> dict:
-        """Hold a posture's references; the row at rest."""
-        row = self._rest(name, Hold(self._drive.gains, posture.spring_m, self._drive.dt_s), posture)
+    def _hold(self, posture: Posture) -> dict | None:
+        """Hold a posture's references; the row at rest, or None."""
         self._now = posture
-        return row
+        return self._drive.to_rest(Hold(self._drive.gains, posture.spring_m, self._drive.dt_s))
 
-    def _rest(self, name: str, law: Any, posture: Posture | None = None) -> dict:
-        row = self._drive.to_rest(law)
-        if row is not None:
-            return row
-        read_m = length_from_frequency(self._last["frequency_hz"], self._drive.sensor, np.nan).length_m
-        wanted_m = self._now.spring_m if posture is None else posture.spring_m
-        worst = int(np.nanargmax(np.abs(read_m - wanted_m)))
-        raise DriveError(
-            f"{name}: not at rest after {SETTLE_TIMEOUT_S:g} s: spring {worst} is "
-            f"{1e3 * (read_m - wanted_m)[worst]:+.1f} mm off, its chamber at "
-            f"{self._drive.pumps.pressure_kpa[worst]:.1f} kPa"
+    def _bias_kpa(self, posture: Posture) -> np.ndarray:
+        """By how much the arm's pressures are above the posture's; guessed of those that a limit keeps in."""
+        low, high = self._drive.gains.pressure_min_kpa, self._drive.gains.pressure_max_kpa
+        kpa = self._drive.pumps.pressure_kpa
+        beyond = np.where(kpa >= high, BEYOND_KPA, 0.0) - np.where(kpa <= low, BEYOND_KPA, 0.0)
+        return kpa + beyond - posture.pressure_kpa
+
+    def _not_at_rest(self, name: str) -> DriveError:
+        frequency_hz = self._last["frequency_hz"]
+        off_m = length_from_frequency(frequency_hz, self._drive.sensor, 0.0).length_m - self._now.spring_m
+        worst = int(np.argmax(np.abs(off_m)))
+        return DriveError(
+            f"{name}: not at rest after {SETTLE_TIMEOUT_S:g} s: spring {worst} is {1e3 * off_m[worst]:+.1f} mm "
+            f"off, its chamber at {self._drive.pumps.pressure_kpa[worst]:.1f} kPa"
         )
 
     def _look(self, row: dict) -> None:

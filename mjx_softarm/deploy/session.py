@@ -151,6 +151,7 @@ def follow(
     goals: Sequence[np.ndarray],
     duration_s: float | None = None,
     tell: Callable[[str], None] = lambda text: None,
+    arrived: Callable[[int], None] = lambda goal: None,
 ) -> Run:
     """Bring the tip to goals, one after the other, then vent.
 
@@ -162,8 +163,9 @@ def follow(
         goals: poses (6,) [mm, deg].
         duration_s: vent after so long, wherever the arm is.
         tell: takes a line for each arrival and each fault.
+        arrived: takes the index of each goal arrived at, as the arm rests there; for what a gripper does.
     """
-    session = _Session(arm, controller, goals, duration_s, tell)
+    session = _Session(arm, controller, goals, duration_s, tell, arrived)
     try:
         session.run()
     except KeyboardInterrupt:
@@ -187,9 +189,9 @@ def follow(
 class _Session:
     """The mutable middle of `follow`."""
 
-    def __init__(self, arm, controller: Controller, goals, duration_s: float | None, tell):
-        self.arm, self.controller, self.tell = arm, controller, tell
-        self.goals, self.duration_s = list(goals), duration_s
+    def __init__(self, arm, controller: Controller, goals, duration_s: float | None, tell, arrived):
+        self.arm, self.controller, self.tell, self.arrived = arm, controller, tell, arrived
+        self.goals, self.duration_s, self.n_taken = list(goals), duration_s, 0
         self.clock, self.rows = Clock(arm), Recorder(arm)
         self.state: State = start(controller)
         self.pumps = Pumps(arm, len(self.state.pressure_kpa))
@@ -257,8 +259,9 @@ class _Session:
         """Take the next goal that is not refused; vent where there is none, or no time."""
         if self.state.phase is not Phase.RUN:
             return
-        while self.state.goal is None and self.goals:
-            self.state, events = with_goal(self.controller, self.state, self.goals.pop(0))
+        while self.state.goal is None and self.n_taken < len(self.goals):
+            self.state, events = with_goal(self.controller, self.state, self.goals[self.n_taken])
+            self.n_taken += 1
             self._note(events)
         over = self.duration_s is not None and now_s - self.began_s >= self.duration_s
         if over or self.state.goal is None:
@@ -281,3 +284,4 @@ class _Session:
             + ", ".join(f"{value:+.1f}" for value in error[3:])
             + " deg off"
         )
+        self.arrived(self.n_taken - 1)

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from benchmarks import paper, paper_film, paper_report, paper_stages
+from benchmarks import paper, paper_film, paper_report, paper_stages, parallel
 from benchmarks.paper_measure import Followed, figures, load_followed, measure, save_followed
 from benchmarks.paper_report import HTML_FILE, JSON_FILE, write_results
-from benchmarks.paper_stages import SMOKE, Case, JobError, Settings, cases, policy_folder, result_file
+from benchmarks.paper_stages import SMOKE, Case, Settings, cases, policy_folder, result_file
 from benchmarks.paper_summary import check_goals, rows, spread, summarise
+from benchmarks.parallel import JobError
 from mjx_softarm import ArmSpec
 from mjx_softarm.deploy.faults import Event, Fault
 from mjx_softarm.deploy.loop import Controller, Phase
@@ -387,7 +388,7 @@ def test_folder_of_other_settings_is_refused(tmp_path):
 
 def test_training_starts_resumes_exports_or_does_nothing(tmp_path, monkeypatch):
     calls = []
-    monkeypatch.setattr(paper_stages, "_command", lambda run, *arguments: calls.append(arguments))
+    monkeypatch.setattr(paper_stages, "command", lambda log, *arguments: calls.append(arguments))
     settings = dataclasses.replace(TINY, preset="quick", training=("tqc.gamma=0.9",))
     run = policy_folder(tmp_path, 1, 2)
 
@@ -410,19 +411,19 @@ def test_training_starts_resumes_exports_or_does_nothing(tmp_path, monkeypatch):
 
 def test_failed_training_says_how(tmp_path):
     with pytest.raises(JobError, match=r"exit status 2; .*run.log ends with\n(.*\n)*error: .*not the folder"):
-        paper_stages._command(tmp_path / "run", "export", str(tmp_path / "nothing"))
+        paper_stages.command(tmp_path / "run.log", "export", str(tmp_path / "nothing"))
 
 
 def test_jobs_run_elsewhere_and_a_failure_is_named():
-    assert paper.in_parallel([("a", pow, (2, 3)), ("b", divmod, (7, 2))]) == {"a": 8, "b": (3, 1)}
+    assert parallel.in_parallel([("a", pow, (2, 3)), ("b", divmod, (7, 2))]) == {"a": 8, "b": (3, 1)}
     with pytest.raises(JobError, match="bad: ValueError: invalid literal"):
-        paper.in_parallel([("bad", int, ("x",))])
+        parallel.in_parallel([("bad", int, ("x",))])
 
 
 def test_cores_are_shared_out():
-    assert paper._shares([0, 1]) == [[0], [1]]
-    assert paper._shares([3]) == [[3]]
-    assert paper._shares(list(range(5))) == [[0, 2, 4], [1, 3]]
+    assert parallel._shares([0, 1]) == [[0], [1]]
+    assert parallel._shares([3]) == [[3]]
+    assert parallel._shares(list(range(5))) == [[0, 2, 4], [1, 3]]
 
 
 def test_without_s2r_the_nominal_policy_plans_and_the_springs_are_calibrated(tmp_path, make_arm_model):

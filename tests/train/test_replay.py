@@ -132,3 +132,32 @@ def test_add_names_what_does_not_fit(items, valid, message):
 def test_create_refuses_an_empty_capacity():
     with pytest.raises(ValueError, match="expected at least 1, got 0"):
         replay.create(EXAMPLE, 0)
+
+
+@pytest.mark.parametrize("n_added", [6, 13], ids=["partly filled", "wrapped"])
+def test_a_thinner_ring_keeps_a_share_oldest_first(n_added):
+    ring = replay.create(jnp.zeros(()), 10)
+    for k in range(n_added):
+        ring = replay.add(ring, jnp.array([float(k)]), jnp.array([True]))
+    thin = replay.thin(ring, jax.random.PRNGKey(0), 0.5)
+    n = int(thin.size)
+    kept = np.asarray(thin.data[:n])
+    assert n == min(n_added, 10) // 2 and int(thin.position) == n
+    assert np.all(np.diff(kept) > 0) and set(kept) <= set(range(max(0, n_added - 10), n_added))
+    again = replay.add(thin, jnp.array([99.0]), jnp.array([True]))
+    np.testing.assert_array_equal(again.data[: n + 1], [*kept, 99.0])
+
+
+def test_thinning_draws_every_item_alike():
+    ring = replay.add(replay.create(jnp.zeros(()), 8), jnp.arange(8.0), jnp.ones(8, bool))
+    draw = jax.vmap(lambda key: replay.thin(ring, key, 0.25).data[:2])
+    drawn = np.asarray(draw(jax.random.split(jax.random.PRNGKey(0), 2000)))
+    share = np.bincount(drawn.ravel().astype(int), minlength=8) / len(drawn)
+    np.testing.assert_allclose(share, 0.25, atol=4 * np.sqrt(0.25 * 0.75 / 2000))
+
+
+def test_thinning_to_all_or_nothing():
+    ring = replay.add(replay.create(jnp.zeros(()), 8), jnp.arange(8.0), jnp.ones(8, bool))
+    whole, empty = (replay.thin(ring, jax.random.PRNGKey(0), share) for share in (1.0, 0.0))
+    np.testing.assert_array_equal(whole.data, ring.data)
+    assert int(whole.position) == 0 and int(whole.size) == 8 and int(empty.size) == 0

@@ -1,0 +1,173 @@
+"""What the experiments in confined spaces are made of: jobs, each of which leaves its result in a folder.
+
+    twinT/demos-TASK.npz                recorded on the twin by the scripted expert, through `ArmIO` alone
+    KIND-twinT-seedS/                   learned from them; see `KINDS`
+    results/KIND-twinT-seedS-OBJECTS.npz   the policy on the twin, in its pipe, with things to pick and place
+
+Calibrations and the policies that know no demonstrations are those of the open-space experiments. A job whose
+result is there is not done again.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+from benchmarks.confined_measure import Operated, load_operated, operate, save_operated
+from benchmarks.paper_stages import (
+    CALIBRATION,
+    EVALUATION_FILE,
+    POLICY_FILE,
+    Settings,
+    command,
+    policy_folder,
+)
+
+
+class Kind(NamedTuple):
+    """A way to learn from demonstrations."""
+
+    title: str
+    task: str  # of `train.waypoints.TASKS`, whose positions it learns
+    preset: str  # of `python -m train imitate`
+    settings: tuple[str, ...] = ()
+    reward_of: str = ""  # kind whose learned reward it takes, and leaves as it is
+    from_reach: bool = False  # begins with the policy that knows no demonstrations
+
+
+KINDS = {
+    "pipe": Kind("learned reward", "pipe300", "pipe"),
+    "hand-made": Kind("hand-made reward", "pipe300", "hand-made"),
+    "no-penalty": Kind("no gradient penalty", "pipe300", "pipe", ("gail.gradient_penalty=0",)),
+    "narrow": Kind("learned reward of the wide pipe", "pipe250", "frozen", reward_of="pipe"),
+    "circle": Kind("with demonstrations", "circle16", "circle", from_reach=True),
+}
+TASKS = ("pipe300", "pipe250", "circle16")
+OBJECTS = ("as shown", "exchanged")
+
+
+class Trial(NamedTuple):
+    """One run of a policy on a twin."""
+
+    kind: str  # key of KINDS
+    twin: int
+    seed: int
+    objects: str = "as shown"  # one of OBJECTS
+
+    @property
+    def name(self) -> str:
+        return f"{self.kind}-twin{self.twin}-seed{self.seed}-{self.objects.replace(' ', '-')}"
+
+
+def trainings(settings: Settings) -> list[tuple[str, int, int]]:
+    """All (kind, twin, seed) to learn, those first that others build on."""
+    found = [(kind, t, s) for kind in KINDS for t in settings.twins for s in settings.seeds]
+    found = [item for item in found if item[0] != "no-penalty" or item[1] == settings.twins[0]]
+    return sorted(found, key=lambda item: bool(KINDS[item[0]].reward_of))
+
+
+def trials(settings: Settings) -> list[Trial]:
+    """All runs on twins; what a policy without penalty does is told by its training."""
+    found = []
+    for kind, twin, seed in trainings(settings):
+        if kind != "no-penalty":
+            found.append(Trial(kind, twin, seed))
+        if kind == "pipe":
+            found.append(Trial(kind, twin, seed, "exchanged"))
+    return found
+
+
+def pipe_mm(task: str) -> int | None:
+    """Diameter of a task's pipe."""
+    return int(task.removeprefix("pipe")) if task.startswith("pipe") else None
+
+
+def demonstrations_file(folder: Path, twin: int, task: str) -> Path:
+    """Where `demonstrate` leaves its file."""
+    return folder / f"twin{twin}" / f"demos-{task}.npz"
+
+
+def learned_folder(folder: Path, kind: str, twin: int, seed: int) -> Path:
+    """Where a policy is learned from demonstrations."""
+    return folder / f"{kind}-twin{twin}-seed{seed}"
+
+
+def demonstrate(folder: Path, twin: int, task: str) -> None:
+    """Record a task's demonstrations on a twin.
+
+    Raises:
+        JobError: the command failed.
+    """
+    file = demonstrations_file(folder, twin, task)
+    if file.exists():
+        return
+    arm = f"twin:{twin}" + (f":{task}" if pipe_mm(task) else "")
+    options = ["--arm", arm, "--task", task, "--calibration", str(file.parent / CALIBRATION)]
+    command(file.with_suffix(".log"), "demos", "record", *options, "--out", str(file))
+
+
+def learn(folder: Path, settings: Settings, kind: str, twin: int, seed: int) -> None:
+    """Train and export a policy from demonstrations.
+
+    Raises:
+        JobError: a command failed.
+    """
+    run, of = learned_folder(folder, kind, twin, seed), KINDS[kind]
+    log = run.with_suffix(".log")
+    if not (run / EVALUATION_FILE).exists():
+        if (run / "config.json").exists():
+            command(log, "imitate", "--resume", str(run))
+        else:
+            options = ["--preset", of.preset, "--seed", str(seed), "--out", str(run)]
+            options += ["--calibration", str(folder / f"twin{twin}" / CALIBRATION)]
+            if diameter_mm := pipe_mm(of.task):
+                options += ["--pipe", str(diameter_mm)]
+            if of.reward_of:
+                options += ["--reward", str(learned_folder(folder, of.reward_of, twin, seed))]
+            if of.from_reach:
+                options += ["--agent", str(policy_folder(folder, twin, seed))]
+            for text in (*of.settings, *settings.imitation):
+                options += ["--set", text]
+            command(log, "imitate", str(demonstrations_file(folder, twin, of.task)), *options)
+    if kind != "no-penalty" and not (run / POLICY_FILE).exists():
+        command(log, "export", str(run))
+
+
+def try_out(folder: Path, settings: Settings, trial: Trial) -> None:
+    """Run a policy on its twin in an evaluation session: pick and place in the pipe, or the whole circle."""
+    import numpy as np
+
+    from mjx_softarm.deploy.loop import Controller
+    from mjx_softarm.deploy.twin import EVALUATION_SESSION, Twin
+    from mjx_softarm.export import load_policy
+    from mjx_softarm.pipe import CrossPipe
+    from mjx_softarm.workspace import circle_poses
+    from train.demonstrations import load_demonstrations
+    from train.waypoints import task as task_of
+
+    path = trial_file(folder, trial)
+    if path.exists():
+        return
+    path.parent.mkdir(exist_ok=True)
+    run, of = learned_folder(folder, trial.kind, trial.twin, trial.seed), KINDS[trial.kind]
+    policy = load_policy(run / POLICY_FILE)
+    diameter_mm = pipe_mm(of.task)
+    pipe = CrossPipe.of_mm(diameter_mm) if diameter_mm else None
+    if pipe is None:
+        goals, names = circle_poses(settings.n_points).astype(float), [""] * settings.n_points
+    else:
+        demonstrations = load_demonstrations(demonstrations_file(folder, trial.twin, of.task), policy.spec)
+        goals = demonstrations.positions.astype(float)
+        names = [waypoint.name for waypoint in task_of(of.task, policy.spec).waypoints]
+    arm = Twin(trial.twin, session=EVALUATION_SESSION, pipe=pipe)
+    save_operated(path, operate(arm, Controller.of(policy), np.asarray(goals), names, trial.objects))
+
+
+def trial_file(folder: Path, trial: Trial) -> Path:
+    """Where `try_out` leaves what it measured."""
+    return folder / "results" / f"{trial.name}.npz"
+
+
+def load_trials(folder: Path, settings: Settings) -> dict[Trial, Operated]:
+    """What all trials measured."""
+    return {trial: load_operated(trial_file(folder, trial)) for trial in trials(settings)}

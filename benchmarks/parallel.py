@@ -1,0 +1,59 @@
+"""Jobs in processes of their own, a few at a time."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from typing import Any
+
+N_WORKERS = 2  # each on cores of its own: faster than one training on all of them
+
+Job = tuple[str, Callable[..., Any], tuple[Any, ...]]  # what to call it, function and arguments
+
+
+class JobError(Exception):
+    """A job that cannot be done; the message says which, and why."""
+
+
+def in_parallel(jobs: Sequence[Job]) -> dict[str, Any]:
+    """Do jobs in processes of their own, a few at a time; returns what each gave, by its name.
+
+    Raises:
+        JobError: one failed; those under way are finished, the others are not begun.
+    """
+    context = multiprocessing.get_context("spawn")
+    cores = _shares(sorted(os.sched_getaffinity(0))) if hasattr(os, "sched_setaffinity") else [[]]
+    queue = context.Queue()
+    for share in cores:
+        queue.put(share)
+    given: dict[str, Any] = {}
+    pool = ProcessPoolExecutor(len(cores), context, _settle_worker, (queue,))
+    try:
+        waiting = {pool.submit(function, *arguments): name for name, function, arguments in jobs}
+        for done in as_completed(waiting):
+            name = waiting[done]
+            try:
+                given[name] = done.result()
+            except Exception as error:
+                pool.shutdown(wait=True, cancel_futures=True)
+                raise JobError(f"{name}: {type(error).__name__}: {error}") from error
+            print(f"{len(given)} of {len(jobs)}: {name}", flush=True)
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
+    return given
+
+
+def _shares(cores: Sequence[int]) -> list[list[int]]:
+    """The cores of each worker."""
+    n = min(N_WORKERS, len(cores))
+    return [list(cores[k::n]) for k in range(n)]
+
+
+def _settle_worker(queue: Any) -> None:
+    """Keep a worker, and what it starts, to its cores; Ctrl-C ends it, and training saves by itself."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    if share := queue.get():
+        os.sched_setaffinity(0, share)
