@@ -127,15 +127,14 @@ class Expert:
         Raises:
             ExpertError: there is none; `name` is in its message.
         """
-        target = target._replace(near_kpa=np.asarray(before_kpa, float))
-        target = jax.tree.map(np.float32, target)
+        target = jax.tree.map(np.float32, target._replace(near_kpa=before_kpa))
         starts = np.float32(self._starts(target))
         ends = _solve_many(starts, target, self._params, self.s2r, self.spec, self.pipe)
         found = self.look(np.asarray(ends))
         slack = self._slack(found, target)
-        if not (slack >= 0.0).all(axis=-1).any():
-            raise ExpertError(self._why(name, target, found, slack))
         met = np.flatnonzero((slack >= 0.0).all(axis=-1))
+        if not len(met):
+            raise ExpertError(self._why(name, target, found, slack))
         way = [found.pressure_kpa[met] * share + before_kpa * (1.0 - share) for share in WAY]
         clear_m = self.look(np.concatenate(way)).clearance_m.reshape(len(WAY), -1).min(axis=0)
         far_kpa = np.linalg.norm(found.pressure_kpa[met] - before_kpa, axis=-1)

@@ -2,9 +2,9 @@
 
 The expert's references are held by the sensor-space law until the arm is at rest. Then, as an operator would,
 motion capture is looked at, and the target is moved by what the finger tips are off, away from limits that
-chambers have come to; what an arm without motion capture is off stays unknown, and the planned pose is logged.
-Or the finger tips are steered by keys, in steps, with the same expert finding the references. Between two moves
-the pumps keep the last pressures.
+chambers have come to. What an arm without motion capture is off stays unknown; the planned pose is logged.
+Or the finger tips are steered by keys, in steps, with the same expert finding the references. Between two
+moves the pumps keep the last pressures.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from train.expert import Expert, ExpertError, Posture
 from train.waypoints import Waypoint
 
 CLOSE_M = 1.5e-3  # of the finger tips to a waypoint; within that, nothing is corrected
+FAR_M = 0.01  # a position further from its waypoint is none that should be learned from
 N_CORRECTIONS = 3
 BEYOND_KPA = 3.0  # that a chamber at its limit is taken to need beyond it
 STEPS_M = {"s": 0.005, "l": 0.02}
@@ -130,6 +131,9 @@ class Teleoperation:
                 break
         if row is None:
             raise self._not_at_rest(waypoint.name)
+        if off_m > FAR_M:
+            off = f"{1e3 * off_m:.1f} mm off and not to be corrected, expected at most {1e3 * FAR_M:g} mm"
+            raise DriveError(f"{waypoint.name}: {off}; is the arm calibrated?")
         return row, off_m
 
     def _step(self, finger_m: np.ndarray) -> bool:
@@ -163,8 +167,8 @@ class Teleoperation:
         off_m = length_from_frequency(frequency_hz, self._drive.sensor, 0.0).length_m - self._now.spring_m
         worst = int(np.argmax(np.abs(off_m)))
         return DriveError(
-            f"{name}: not at rest after {SETTLE_TIMEOUT_S:g} s: spring {worst} is {1e3 * off_m[worst]:+.1f} mm "
-            f"off, its chamber at {self._drive.pumps.pressure_kpa[worst]:.1f} kPa"
+            f"{name}: not at rest after {SETTLE_TIMEOUT_S:g} s: spring {worst} is {1e3 * off_m[worst]:+.1f} "
+            f"mm off, its chamber at {self._drive.pumps.pressure_kpa[worst]:.1f} kPa"
         )
 
     def _look(self, row: dict) -> None:
