@@ -127,7 +127,7 @@ def test_position_far_from_its_waypoint_is_not_logged(expert, waypoints, plan):
 
     class Misplaced(IdealArm):
         def motion_capture(self):
-            tip_m, *others = super().motion_capture()
+            _, *others = super().motion_capture()
             return Capture(np.array([0.05, 0.0, -0.5]), *others)
 
     result = Teleoperation(Misplaced(), expert).record(waypoints, plan)
