@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mjx_softarm.pose import frame_from_pose, pose_error, pose_from_frame, pose_from_quaternion
+from mjx_softarm.pose import (
+    frame_from_pose,
+    pose_error,
+    pose_from_frame,
+    pose_from_quaternion,
+    quaternion_from_pose,
+)
 
 RNG = np.random.default_rng(0)
 ROTATIONS = Rotation.random(500, random_state=1)
@@ -50,6 +56,13 @@ def test_frame_from_pose_is_scipy_s_intrinsic_zyx():
     np.testing.assert_allclose(position_m, POSITIONS_M)
     expected = Rotation.from_euler("ZYX", pose[:, 3:], degrees=True).as_matrix()
     np.testing.assert_allclose(rotation, expected, atol=1e-12)
+
+
+def test_quaternion_from_pose_is_scipy_s():
+    angles = ROTATIONS.as_euler("ZYX", degrees=True)
+    ours = quaternion_from_pose(np.concatenate([POSITIONS_M, angles], axis=1))
+    theirs = ROTATIONS.as_quat(scalar_first=True)
+    np.testing.assert_allclose(np.abs((ours * theirs).sum(axis=1)), 1.0, atol=1e-12)  # q and -q are one
 
 
 def test_pose_from_quaternion_is_scalar_first_and_ignores_the_length():
