@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.paper_measure import load_arrays, measure, save_arrays
+from benchmarks.paper_measure import load_arrays, measure, point_of, save_arrays
 from mjx_softarm.deploy import faults
 from mjx_softarm.deploy.loop import Controller
 from mjx_softarm.deploy.session import follow
@@ -37,10 +37,11 @@ class Operated(NamedTuple):
     operation: Any  # (p,) bool: a thing is to be taken or let go here
     success: Any  # (p,) bool: and it was; False elsewhere
     name: Any  # (p,) of text
+    arrival_s: Any  # (p,)
+    time_s: Any  # (ticks,)
+    finger_m: Any  # (ticks, 3) finger tips by motion capture
     wall_n: Any  # (ticks,) contact force of the walls, the largest of each tick
     container_n: Any  # (ticks,) and of the containers
-    tip_m: Any  # (k, 3) by motion capture, now and then
-    time_s: Any  # (k,)
 
 
 class Hands:
@@ -75,8 +76,7 @@ class Hands:
     def finger_m(self) -> np.ndarray:
         """Where the finger tips (3,) are, by motion capture."""
         seen = self._arm.motion_capture()
-        down = -rotation_from_quaternion(seen.tip_quaternion)[:, 2]
-        return seen.tip_m + self._gripper_m * down
+        return finger_tips_seen(seen.tip_m, seen.tip_quaternion, self._gripper_m)
 
 
 def _container(name: str) -> str:
@@ -107,8 +107,11 @@ def operate(
     hands = Hands(watched, names, finger_tips(goals, gripper_m), objects, gripper_m)
     run = follow(watched, controller, goals, arrived=hands.arrived)
     followed = measure(run, controller, goals)
-    wall_n, container_n = np.array(watched.force_n).T
-    every = slice(None, None, max(1, round(0.5 / controller.dt_s)))
+    log, force_n = run.log, np.zeros((len(run.log), 2))
+    force_n[: len(watched.force_n)] = watched.force_n  # an arm that is lost takes no pressures any more
+    arrival_s = np.full(len(goals), np.nan)
+    for arrival in run.arrivals:
+        arrival_s[point_of(arrival.goal, goals)] = log.time_s[arrival.row]
     return Operated(
         goal=goals,
         error=followed.error,
@@ -117,10 +120,11 @@ def operate(
         operation=np.array([name.split(" ")[0] in ("pick", "place") for name in names]),
         success=hands.success,
         name=np.array(names),
-        wall_n=wall_n.astype(np.float32),
-        container_n=container_n.astype(np.float32),
-        tip_m=run.log.tip_m[every],
-        time_s=run.log.time_s[every],
+        arrival_s=arrival_s,
+        time_s=log.time_s,
+        finger_m=finger_tips_seen(log.tip_m, log.tip_quaternion, gripper_m).astype(np.float32),
+        wall_n=force_n[:, 0].astype(np.float32),
+        container_n=force_n[:, 1].astype(np.float32),
     )
 
 
@@ -128,6 +132,11 @@ def finger_tips(pose: np.ndarray, gripper_m: float) -> np.ndarray:
     """Finger tips (..., 3) [m] of poses (..., 6) [mm, deg]."""
     position_m, rotation = frame_from_pose(pose)
     return position_m - gripper_m * rotation[..., 2]
+
+
+def finger_tips_seen(tip_m: np.ndarray, quaternion: np.ndarray, gripper_m: float) -> np.ndarray:
+    """Finger tips (..., 3) [m] of tips (..., 3) [m] and their quaternions (..., 4) by motion capture."""
+    return tip_m - gripper_m * rotation_from_quaternion(quaternion)[..., 2]
 
 
 def save_operated(path: Path, operated: Operated) -> None:
@@ -160,7 +169,7 @@ def figures(operated: Operated) -> dict[str, Any]:
         "done": int(operated.success.sum()),
         "all_done": bool(n_operations) and bool(operated.success[operated.operation].all()),
         "saturated_positions": int(np.count_nonzero(operated.saturated.any(axis=1))),
-        "calm_share": float(np.mean(operated.wall_n < CALM_N)),
+        "calm_percent": 100 * float(np.mean(operated.wall_n < CALM_N)),
         "wall_max_n": float(operated.wall_n.max()),
         "container_max_n": float(operated.container_n.max()),
         "events": events,

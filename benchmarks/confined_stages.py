@@ -10,17 +10,23 @@ result is there is not done again.
 
 from __future__ import annotations
 
+import json
+import os
+import shutil
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from benchmarks.confined_measure import Operated, load_operated, operate, save_operated
+from benchmarks.paper_measure import Followed, load_followed
 from benchmarks.paper_stages import (
     CALIBRATION,
     EVALUATION_FILE,
     POLICY_FILE,
+    Case,
     Settings,
     command,
     policy_folder,
+    result_file,
 )
 
 
@@ -44,6 +50,8 @@ KINDS = {
 }
 TASKS = ("pipe300", "pipe250", "circle16")
 OBJECTS = ("as shown", "exchanged")
+METRICS_FILE, CHECKPOINTS = "metrics.jsonl", "checkpoints"
+TRIAL_SESSION = 2  # of the twins; demonstrations are recorded in their evaluation session, with other noise
 
 
 class Trial(NamedTuple):
@@ -59,11 +67,25 @@ class Trial(NamedTuple):
         return f"{self.kind}-twin{self.twin}-seed{self.seed}-{self.objects.replace(' ', '-')}"
 
 
+class Learned(NamedTuple):
+    """A training as it went."""
+
+    rows: list[dict[str, Any]]  # of its metrics
+    stage_ends: tuple[int, ...]  # epochs after which each stage but the last was over
+
+
+class Results(NamedTuple):
+    """All that was measured."""
+
+    trials: dict[Trial, Operated]
+    learned: dict[tuple[str, int, int], Learned]  # of kind, twin, seed
+    circles: dict[Case, Followed]  # of the policies that know no demonstrations
+
+
 def trainings(settings: Settings) -> list[tuple[str, int, int]]:
-    """All (kind, twin, seed) to learn, those first that others build on."""
+    """All (kind, twin, seed) to learn; without penalty on the first twin alone."""
     found = [(kind, t, s) for kind in KINDS for t in settings.twins for s in settings.seeds]
-    found = [item for item in found if item[0] != "no-penalty" or item[1] == settings.twins[0]]
-    return sorted(found, key=lambda item: bool(KINDS[item[0]].reward_of))
+    return [item for item in found if item[0] != "no-penalty" or item[1] == settings.twins[0]]
 
 
 def trials(settings: Settings) -> list[Trial]:
@@ -75,6 +97,11 @@ def trials(settings: Settings) -> list[Trial]:
         if kind == "pipe":
             found.append(Trial(kind, twin, seed, "exchanged"))
     return found
+
+
+def circles(settings: Settings) -> list[Case]:
+    """Runs around the circle of the policies that know no demonstrations."""
+    return [Case("with", twin, seed) for twin in settings.twins for seed in settings.seeds]
 
 
 def pipe_mm(task: str) -> int | None:
@@ -101,9 +128,11 @@ def demonstrate(folder: Path, twin: int, task: str) -> None:
     file = demonstrations_file(folder, twin, task)
     if file.exists():
         return
+    part = file.with_name(f"part-{file.name}")  # a recording that ends early leaves what it has
     arm = f"twin:{twin}" + (f":{task}" if pipe_mm(task) else "")
     options = ["--arm", arm, "--task", task, "--calibration", str(file.parent / CALIBRATION)]
-    command(file.with_suffix(".log"), "demos", "record", *options, "--out", str(file))
+    command(file.with_suffix(".log"), "demos", "record", *options, "--out", str(part))
+    os.replace(part, file)
 
 
 def learn(folder: Path, settings: Settings, kind: str, twin: int, seed: int) -> None:
@@ -115,9 +144,10 @@ def learn(folder: Path, settings: Settings, kind: str, twin: int, seed: int) -> 
     run, of = learned_folder(folder, kind, twin, seed), KINDS[kind]
     log = run.with_suffix(".log")
     if not (run / EVALUATION_FILE).exists():
-        if (run / "config.json").exists():
+        if any(path.name.isdecimal() for path in (run / CHECKPOINTS).glob("*")):
             command(log, "imitate", "--resume", str(run))
         else:
+            shutil.rmtree(run, ignore_errors=True)  # maybe without the parts that it begins with
             options = ["--preset", of.preset, "--seed", str(seed), "--out", str(run)]
             options += ["--calibration", str(folder / f"twin{twin}" / CALIBRATION)]
             if diameter_mm := pipe_mm(of.task):
@@ -133,34 +163,45 @@ def learn(folder: Path, settings: Settings, kind: str, twin: int, seed: int) -> 
         command(log, "export", str(run))
 
 
-def try_out(folder: Path, settings: Settings, trial: Trial) -> None:
-    """Run a policy on its twin in an evaluation session: pick and place in the pipe, or the whole circle."""
-    import numpy as np
+class Scene(NamedTuple):
+    """What a trial needs."""
 
+    twin: Any
+    controller: Any
+    goals: Any  # (p, 6) [mm, deg]
+    names: list[str]  # of the positions
+
+
+def scene_of(folder: Path, settings: Settings, trial: Trial) -> Scene:
+    """A trial's twin, in its pipe if it has one, its policy, and where it is to go."""
     from mjx_softarm.deploy.loop import Controller
-    from mjx_softarm.deploy.twin import EVALUATION_SESSION, Twin
+    from mjx_softarm.deploy.twin import Twin
     from mjx_softarm.export import load_policy
     from mjx_softarm.pipe import CrossPipe
     from mjx_softarm.workspace import circle_poses
     from train.demonstrations import load_demonstrations
     from train.waypoints import task as task_of
 
+    of = KINDS[trial.kind]
+    policy = load_policy(learned_folder(folder, trial.kind, trial.twin, trial.seed) / POLICY_FILE)
+    if diameter_mm := pipe_mm(of.task):
+        demonstrations = load_demonstrations(demonstrations_file(folder, trial.twin, of.task), policy.spec)
+        goals = demonstrations.positions.astype(float)
+        names = [waypoint.name for waypoint in task_of(of.task, policy.spec).waypoints]
+    else:
+        goals, names = circle_poses(settings.n_points).astype(float), [""] * settings.n_points
+    pipe = CrossPipe.of_mm(diameter_mm) if diameter_mm else None
+    twin = Twin(trial.twin, session=TRIAL_SESSION, pipe=pipe)
+    return Scene(twin, Controller.of(policy), goals, names)
+
+
+def try_out(folder: Path, settings: Settings, trial: Trial) -> None:
+    """Run a policy on its twin: pick and place in the pipe, or the whole circle."""
     path = trial_file(folder, trial)
     if path.exists():
         return
     path.parent.mkdir(exist_ok=True)
-    run, of = learned_folder(folder, trial.kind, trial.twin, trial.seed), KINDS[trial.kind]
-    policy = load_policy(run / POLICY_FILE)
-    diameter_mm = pipe_mm(of.task)
-    pipe = CrossPipe.of_mm(diameter_mm) if diameter_mm else None
-    if pipe is None:
-        goals, names = circle_poses(settings.n_points).astype(float), [""] * settings.n_points
-    else:
-        demonstrations = load_demonstrations(demonstrations_file(folder, trial.twin, of.task), policy.spec)
-        goals = demonstrations.positions.astype(float)
-        names = [waypoint.name for waypoint in task_of(of.task, policy.spec).waypoints]
-    arm = Twin(trial.twin, session=EVALUATION_SESSION, pipe=pipe)
-    save_operated(path, operate(arm, Controller.of(policy), np.asarray(goals), names, trial.objects))
+    save_operated(path, operate(*scene_of(folder, settings, trial), trial.objects))
 
 
 def trial_file(folder: Path, trial: Trial) -> Path:
@@ -168,6 +209,18 @@ def trial_file(folder: Path, trial: Trial) -> Path:
     return folder / "results" / f"{trial.name}.npz"
 
 
-def load_trials(folder: Path, settings: Settings) -> dict[Trial, Operated]:
-    """What all trials measured."""
-    return {trial: load_operated(trial_file(folder, trial)) for trial in trials(settings)}
+def load_results(folder: Path, settings: Settings) -> Results:
+    """What all trainings and trials gave."""
+    return Results(
+        trials={trial: load_operated(trial_file(folder, trial)) for trial in trials(settings)},
+        learned={item: _load_learned(learned_folder(folder, *item)) for item in trainings(settings)},
+        circles={case: load_followed(result_file(folder, case)) for case in circles(settings)},
+    )
+
+
+def _load_learned(run: Path) -> Learned:
+    from train.config import from_dict
+
+    config = from_dict(json.loads((run / "config.json").read_text("utf-8"))["train"])
+    lines = (run / METRICS_FILE).read_text("utf-8").splitlines()
+    return Learned([json.loads(line) for line in lines], tuple(e for e in config.stage_epochs if e))

@@ -1,34 +1,36 @@
-"""The paper's experiments on twins: `python -m benchmarks paper [--smoke]`.
+"""The paper's experiments on twins: `python -m benchmarks paper [--only PART] [--smoke]`.
 
 Logs are recorded, arms calibrated, policies trained and experiments run, two jobs at a time. What is done
 stays in the working folder: started again, an interrupted benchmark goes on where it stopped, and twins or
-seeds may be added.
+seeds may be added. The experiments in open space are here, those in confined spaces in `confined`; both share
+a folder, with its calibrations and the policies that know no demonstrations.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from benchmarks import confined
 from benchmarks.paper_stages import (
     SMOKE,
-    Case,
     Settings,
+    calibrations,
     cases,
+    claim,
     follow_circle,
-    learn_twin,
     load_results,
+    reach_policies,
     train_policy,
 )
 from benchmarks.parallel import Job, JobError, in_parallel
 
-SETTINGS_FILE = "settings.json"
 PRESETS = ("quick", "paper")
+PARTS = {"open": "report.html", "confined": "confined.html"}  # and the page of each
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -38,17 +40,19 @@ def main(arguments: Sequence[str]) -> int:
         options.out or Path("runs/paper-smoke" if options.smoke else "runs/paper"),
         _of(options),
     )
+    pictures = folder if options.smoke else _results()
     try:
-        data = run(folder, folder if options.smoke else _results(), settings)
+        for part in [options.only] if options.only else PARTS:
+            data = (run if part == "open" else confined.run)(folder, pictures, settings)
+            for check in data["goals"]:
+                print(f"{'met    ' if check['met'] else 'NOT MET'}  {check['text']}: {check['value']}")
+            print(f"report: {folder / PARTS[part]}")
     except (JobError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print(f"interrupted; the same command goes on, with --out {folder}", file=sys.stderr)
         return 130
-    for check in data["goals"]:
-        print(f"{'met    ' if check['met'] else 'NOT MET'}  {check['text']}: {check['value']}")
-    print(f"report: {folder / 'report.html'}")
     return 0
 
 
@@ -57,10 +61,12 @@ def _parser() -> argparse.ArgumentParser:
         prog="python -m benchmarks paper", description="The paper's experiments on twins, beside its numbers."
     )
     parser.add_argument("--smoke", action="store_true", help="everything, but tiny; says nothing of the arm")
-    parser.add_argument("--only", choices=("open",), default="open", help="part of the paper: in open space")
+    parser.add_argument(
+        "--only", choices=PARTS, help="part of the paper: in open space or confined; default: both"
+    )
     parser.add_argument("--twins", type=_numbers, metavar="T,T", help="default: 0,1,2")
     parser.add_argument("--seeds", type=_numbers, metavar="S,S", help="of training; default: 0,1,2")
-    parser.add_argument("--preset", choices=PRESETS, help="of training; default: paper")
+    parser.add_argument("--preset", choices=PRESETS, help="of training in open space; default: paper")
     parser.add_argument("--out", type=Path, metavar="DIR", help="working folder; default: runs/paper")
     return parser
 
@@ -85,7 +91,7 @@ def _results() -> Path:
 
 
 def run(folder: Path, pictures: Path, settings: Settings) -> dict[str, Any]:
-    """Do what is not done yet and write the results; returns the figures.
+    """Do what is not done yet in open space and write the results; returns the figures.
 
     Args:
         folder: what is worked in.
@@ -99,40 +105,16 @@ def run(folder: Path, pictures: Path, settings: Settings) -> dict[str, Any]:
     from benchmarks.paper_report import write_results
     from mjx_softarm.provenance import provenance
 
-    _claim(folder, settings)
-    twins, seeds = settings.twins, settings.seeds
-    in_parallel(
-        [(f"log and calibrate twin {t}", learn_twin, (folder, settings, t)) for t in twins]
-        + [(f"train nominal arm, seed {s}", train_policy, (folder, settings, None, s)) for s in seeds]
-    )
-    in_parallel(
-        [
-            (f"train for twin {t}, seed {s}", train_policy, (folder, settings, t, s))
-            for t in twins
-            for s in seeds
-        ]
-    )
-    follow: list[Job] = [(_title(case), follow_circle, (folder, settings, case)) for case in cases(settings)]
+    claim(folder, settings)
+    nominal: list[Job] = [
+        (f"train nominal arm, seed {s}", train_policy, (folder, settings, None, s)) for s in settings.seeds
+    ]
+    in_parallel([*calibrations(folder, settings), *nominal])
+    in_parallel(reach_policies(folder, settings))
+    follow: list[Job] = [
+        (f"follow {case.name}", follow_circle, (folder, settings, case)) for case in cases(settings)
+    ]
     no_film = in_parallel([*follow, ("film", film_circle, (folder, settings))])["film"]
     return write_results(
         folder, pictures, settings, load_results(folder, settings), no_film, provenance("benchmarks")
     )
-
-
-def _title(case: Case) -> str:
-    return f"follow {case.name}"
-
-
-def _claim(folder: Path, settings: Settings) -> None:
-    """Make the folder, or see that it is of these settings."""
-    file, wanted = folder / SETTINGS_FILE, settings.fixed()
-    if not file.exists():
-        from mjx_softarm.provenance import write_json
-
-        folder.mkdir(parents=True, exist_ok=True)
-        write_json(file, wanted)
-    found = json.loads(file.read_text("utf-8"))
-    if found != wanted:
-        differing = [name for name in wanted if found.get(name) != wanted[name]]
-        got = ", ".join(f"{name} {found.get(name)}, now {wanted[name]}" for name in differing)
-        raise JobError(f"{file}: was made with other settings ({got}); choose another --out")

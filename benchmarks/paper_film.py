@@ -1,9 +1,9 @@
-"""A film of a twin on the circle: its own model, drawn without a display, beside the path from above."""
+"""Films of a twin: its own model, drawn without a display, beside its path seen from one side."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from PIL import Image, ImageDraw
@@ -18,13 +18,23 @@ N_COLOURS = 128
 INK, GREY, BLUE, ORANGE = (34, 34, 34), (154, 160, 166), (31, 111, 180), (224, 123, 40)
 
 
+class Side(NamedTuple):
+    """What is drawn beside the pictures."""
+
+    title: str
+    text: str
+    axes: tuple[int, int]  # of x, y, z: which is to the right, and which upwards
+    goals_mm: np.ndarray  # (p, 3)
+    lines_mm: tuple[np.ndarray, ...] = ()  # (k, 2) each, along these axes
+
+
 class FilmedTwin:
     """A twin that has its picture taken now and then, as it is driven; else the twin itself."""
 
     def __init__(self, twin: Any, renderer: Any):
         self._twin, self._renderer, self._next_s = twin, renderer, 0.0
         self.pictures: list[np.ndarray] = []
-        self.tips_mm: list[np.ndarray] = []
+        self.seen: list[Any] = []  # by motion capture, as they were taken
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._twin, name)
@@ -35,7 +45,7 @@ class FilmedTwin:
         if self._twin.time_s >= self._next_s:
             self._next_s += EVERY_S
             self.pictures.append(self._twin.draw(self._renderer))
-            self.tips_mm.append(1e3 * self._twin.motion_capture().tip_m)
+            self.seen.append(self._twin.motion_capture())
 
 
 def film_circle(folder: Path, settings: Settings) -> str:
@@ -57,34 +67,40 @@ def film_circle(folder: Path, settings: Settings) -> str:
             follow(filmed, controller(folder, case), goals)
     except RenderError as error:
         return str(error)
-    write_gif(path, frames(filmed.pictures, np.array(filmed.tips_mm), goals, f"twin {case.twin}, with S2R"))
+    text = "reference (grey) and tip, from above"
+    side = Side(f"twin {case.twin}, with S2R", text, (0, 1), goals[:, :3])
+    write_gif(path, frames(filmed.pictures, 1e3 * np.array([seen.tip_m for seen in filmed.seen]), side))
     return ""
 
 
-def frames(
-    pictures: list[np.ndarray], tips_mm: np.ndarray, goals: np.ndarray, title: str
-) -> list[Image.Image]:
-    """At most `MAX_FRAMES` of the pictures, spread evenly, each beside the tip's path up to then."""
+def frames(pictures: list[np.ndarray], path_mm: np.ndarray, side: Side) -> list[Image.Image]:
+    """At most `MAX_FRAMES` of the pictures, spread evenly, each beside the path (n, 3) up to then."""
     chosen = np.unique(np.linspace(0, len(pictures) - 1, min(MAX_FRAMES, len(pictures))).round().astype(int))
-    return [_frame(pictures[k], tips_mm[: k + 1], goals, title) for k in chosen]
+    return [_frame(pictures[k], path_mm[: k + 1], side) for k in chosen]
 
 
-def _frame(picture: np.ndarray, tips_mm: np.ndarray, goals: np.ndarray, title: str) -> Image.Image:
+def _frame(picture: np.ndarray, path_mm: np.ndarray, side: Side) -> Image.Image:
     height, width, _ = picture.shape
     frame = Image.new("RGB", (2 * width, height), (255, 255, 255))
     frame.paste(Image.fromarray(picture), (0, 0))
     pen = ImageDraw.Draw(frame)
-    scale = 0.4 * width / np.abs(goals[:, :2]).max()
+    axes = list(side.axes)
+    shown = np.concatenate([side.goals_mm[:, axes], *side.lines_mm])
+    low, high = shown.min(axis=0), shown.max(axis=0)
+    scale = 0.8 * min(np.array([width, height]) / np.maximum(high - low, 1.0))
 
     def at(point_mm: np.ndarray) -> tuple[float, float]:
-        return 1.5 * width + scale * point_mm[0], 0.5 * height - scale * point_mm[1]
+        right, up = scale * (point_mm - 0.5 * (low + high))
+        return 1.5 * width + right, 0.53 * height - up
 
-    pen.text((width + 8, 8), title, fill=INK)
-    pen.text((width + 8, 22), "reference (grey) and tip, from above", fill=GREY)
-    for goal in goals:
+    for line in side.lines_mm:
+        pen.line([at(point) for point in line], fill=GREY, width=2)
+    pen.text((width + 8, 8), side.title, fill=INK)
+    pen.text((width + 8, 22), side.text, fill=GREY)
+    for goal in side.goals_mm[:, axes]:
         _dot(pen, at(goal), 2, GREY)
-    pen.line([at(tip) for tip in tips_mm], fill=BLUE, width=1)
-    _dot(pen, at(tips_mm[-1]), 4, ORANGE)
+    pen.line([at(point) for point in path_mm[:, axes]], fill=BLUE, width=1)
+    _dot(pen, at(path_mm[-1, axes]), 4, ORANGE)
     return frame
 
 

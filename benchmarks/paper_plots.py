@@ -34,13 +34,10 @@ def circle_figure(results: Results) -> Figure:
         dress(panel, f"twin {twin}, from above", "x [mm]", "y [mm]")
         for method, name in METHODS.items():
             followed = results[Case(method, twin, seed)]
-            if method == "without":
-                goal = np.vstack([followed.goal, followed.goal[:1]])
-                panel.plot(goal[:, 0], goal[:, 1], "--", color=INK, linewidth=1.2, label="reference")
             tip = followed.goal + followed.error
-            around = np.vstack([tip, tip[:1]])
-            style = {"color": COLOURS[method], "linewidth": 1.0, "markersize": 3.0}
-            panel.plot(around[:, 0], around[:, 1], "o-", label=name, **style)
+            if method == "without":
+                plot_around(panel, followed.goal, "--", color=INK, linewidth=1.2, label="reference")
+            plot_around(panel, tip, "o-", color=COLOURS[method], linewidth=1.0, markersize=3.0, label=name)
             hit = tip[followed.saturated.any(axis=1)]
             ring = {"color": RED, "markersize": 7.0, "fillstyle": "none", "linestyle": "none"}
             label = "a chamber saturated" if method == list(METHODS)[-1] else None
@@ -48,6 +45,12 @@ def circle_figure(results: Results) -> Figure:
         panel.set_aspect("equal")
     panels[0].legend(frameon=False, loc="center", fontsize=8)
     return figure
+
+
+def plot_around(panel: Any, pose: np.ndarray, line: str, **style: Any) -> None:
+    """Poses (p, 6) [mm, deg] from above, the last joined with the first."""
+    closed = np.vstack([pose, pose[:1]])
+    panel.plot(closed[:, 0], closed[:, 1], line, **style)
 
 
 def error_figure(results: Results) -> Figure:

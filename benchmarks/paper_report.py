@@ -2,28 +2,16 @@
 
 from __future__ import annotations
 
-import base64
-import html
-import io
 import json
-import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
-from PIL import Image
 
 from benchmarks.paper_measure import Followed
 from benchmarks.paper_plots import circle_figure, error_figure, loads_figure, trace_figure
-from benchmarks.paper_stages import (
-    CALIBRATION,
-    EVALUATION_FILE,
-    METHODS,
-    Case,
-    Settings,
-    policy_folder,
-)
+from benchmarks.paper_stages import EVALUATION_FILE, METHODS, Case, Settings, policy_folder
 from benchmarks.paper_summary import (
     AVERAGED,
     PAPER_SIMULATED_MM,
@@ -33,12 +21,21 @@ from benchmarks.paper_summary import (
     spread,
     summarise,
 )
+from benchmarks.report import (
+    Drawn,
+    calibration_of,
+    calibration_part,
+    film_part,
+    first_of_page,
+    goals_part,
+    keep_film,
+    save_picture,
+    write_figures,
+)
 from calib.report import Part, Table, page
-from mjx_softarm.provenance import write_json
 from mjx_softarm.spec import ArmSpec
 
 JSON_FILE, HTML_FILE, FILM_FILE = "paper-open.json", "report.html", "circle.gif"
-DPI, N_COLOURS = 110, 64
 HEADINGS = {
     "translation_mm": "translation [mm]",
     "rmse_mm": "RMSE [mm]",
@@ -77,21 +74,11 @@ def write_results(
     kept = ["circle", "error", "loads", *(f"pressures-{load_g}g" for load_g in settings.loads_g[-2:])]
     for name in kept:
         save_picture(pictures / f"paper-{name}.png", drawn[name][1])
-    film = folder / FILM_FILE
-    if film.exists() and not no_film:
-        shutil.copyfile(film, pictures / f"paper-{FILM_FILE}")
-    figures = json.loads(json.dumps(data), parse_constant=lambda _: None)  # JSON has no NaN
-    write_json(pictures / JSON_FILE, {"figures": figures, **provenance})
-    text = to_html(data, drawn, film if film.exists() else None, no_film, provenance)
+    film = keep_film(folder / FILM_FILE, no_film, pictures / f"paper-{FILM_FILE}")
+    write_figures(pictures / JSON_FILE, data, provenance)
+    text = to_html(data, drawn, film, no_film, provenance)
     (folder / HTML_FILE).write_text(text, "utf-8")
     return data
-
-
-def save_picture(path: Path, figure: Figure) -> None:
-    """Write a drawing as PNG with few colours, which halves it."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=DPI)
-    Image.open(buffer).convert("RGB").quantize(N_COLOURS).save(path, format="PNG", optimize=True)
 
 
 def figures_of(folder: Path, settings: Settings, results: Mapping[Case, Followed]) -> dict[str, Any]:
@@ -133,12 +120,6 @@ def simulated(folder: Path, settings: Settings, table: Sequence[Mapping[str, Any
     return found
 
 
-def calibration_of(folder: Path, twin: int) -> dict[str, list[str]]:
-    """Each step of a twin's calibration with its warnings."""
-    report = json.loads((folder / f"twin{twin}" / CALIBRATION / "report.json").read_text("utf-8"))
-    return {title: part["warnings"] for title, part in report["parts"].items()}
-
-
 def draw(
     results: Mapping[Case, Followed], table: Sequence[Mapping[str, Any]]
 ) -> dict[str, tuple[str, Figure]]:
@@ -160,7 +141,7 @@ def draw(
 
 def to_html(
     data: Mapping[str, Any],
-    drawn: Mapping[str, tuple[str, Figure]],
+    drawn: Drawn,
     film: Path | None,
     no_film: str,
     provenance: dict[str, Any],
@@ -169,29 +150,16 @@ def to_html(
     checks = [Check(**check) for check in data["goals"]]
     traces = tuple(item for name, item in drawn.items() if name.startswith("pressures"))
     parts = (
-        _goals_part(checks),
+        goals_part(checks),
         _circle_part(data, (drawn["circle"], drawn["error"])),
         _loads_part(data, (drawn["loads"], *traces)),
         _simulated_part(data),
-        _calibration_part(data["calibrations"]),
+        calibration_part(data["calibrations"]),
         Part("Every run", "Mean over the points arrived at.", (_runs_table(data["runs"]),)),
     )
-    n_missed = sum(not check.met for check in checks)
-    verdict = (
-        '<p class="good">Every goal is met.</p>'
-        if n_missed == 0
-        else f'<p class="bad">{n_missed} of {len(checks)} goals are not met.</p>'
-    )
-    first = f"<p>All measured on the simulated arm called twin; no number is of a real arm.</p>{verdict}"
-    return page("The paper's open-space experiments", first, parts, _film(film, no_film), provenance)
-
-
-def _goals_part(checks: Sequence[Check]) -> Part:
-    table = Table(
-        ("goal", "twin", ""), tuple((c.text, c.value, "met" if c.met else "NOT MET") for c in checks)
-    )
-    missed = tuple(f"not met: {check.text}: {check.value}" for check in checks if not check.met)
-    return Part("Goals", "Set before anything was measured.", (table,), missed)
+    film_html = film_part(film, no_film, "The twin on the circle")
+    title = "The paper's open-space experiments"
+    return page(title, first_of_page(checks), parts, film_html, provenance)
 
 
 def _circle_part(data: Mapping[str, Any], drawn: tuple[tuple[str, Figure], ...]) -> Part:
@@ -246,16 +214,6 @@ def _simulated_part(data: Mapping[str, Any]) -> Part:
     return Part("Simulated against twin", text, (Table(head, body),))
 
 
-def _calibration_part(calibrations: Mapping[str, Mapping[str, Sequence[str]]]) -> Part:
-    warnings = tuple(
-        f"{twin}: {title}: {warning}"
-        for twin, steps in calibrations.items()
-        for title, found in steps.items()
-        for warning in found
-    )
-    return Part("Calibration", "One log of random poses at rest for each twin.", warnings=warnings)
-
-
 def _runs_table(table: Sequence[Mapping[str, Any]]) -> Table:
     names = ("reached", *AVERAGED, "seconds")
     head = ("", "twin", "seed", "load [g]", *(HEADINGS.get(name, name) for name in names), "told by the loop")
@@ -265,10 +223,3 @@ def _runs_table(table: Sequence[Mapping[str, Any]]) -> Table:
         start = (METHODS[row["method"]], row["twin"], row["seed"], row["load_g"])
         body.append((*start, *(row[name] for name in names), told))
     return Table(head, tuple(body))
-
-
-def _film(film: Path | None, no_film: str) -> str:
-    if film is None:
-        return f"<h2>Film</h2><p>None: {html.escape(no_film)}</p>"
-    data = base64.b64encode(film.read_bytes()).decode()
-    return f'<h2>Film</h2><p><img alt="The twin on the circle" src="data:image/gif;base64,{data}"></p>'

@@ -19,11 +19,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 from benchmarks.paper_measure import Followed, load_followed, measure, save_followed
-from benchmarks.parallel import JobError
+from benchmarks.parallel import Job, JobError
 
 METHODS = {"without": "without S2R", "with": "with S2R", "gradient": "gradient descent"}
 LOG_FILE, CALIBRATION = "log.npz", "calibration"
 POLICY_FILE, EVALUATION_FILE = "policy.npz", "evaluation.json"
+SETTINGS_FILE = "settings.json"
 
 
 @dataclass(frozen=True)
@@ -50,10 +51,44 @@ SMOKE = Settings(
     seeds=(0,),
     preset="quick",
     training=("total_env_steps=512", "warmup_env_steps=256", "n_arms=16", "updates_per_env_step=0.25"),
+    imitation=("total_env_steps=512", "warmup_env_steps=128", "n_arms=16", "updates_per_env_step=0.25"),
     n_poses=80,
     n_points=4,
     loads_g=(500,),
 )
+
+
+def claim(folder: Path, settings: Settings) -> None:
+    """Make the folder, or see that it is of these settings; one it does not know yet is as by default.
+
+    Raises:
+        JobError: it is of others.
+    """
+    from mjx_softarm.provenance import write_json
+
+    file, wanted = folder / SETTINGS_FILE, settings.fixed()
+    if not file.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        write_json(file, wanted)
+    found = {**Settings().fixed(), **json.loads(file.read_text("utf-8"))}
+    if found != wanted:
+        differing = [name for name in wanted if found[name] != wanted[name]]
+        got = ", ".join(f"{name} {found[name]}, now {wanted[name]}" for name in differing)
+        raise JobError(f"{file}: was made with other settings ({got}); choose another --out")
+
+
+def calibrations(folder: Path, settings: Settings) -> list[Job]:
+    """A job for each twin: log and calibrate it."""
+    return [(f"log and calibrate twin {t}", learn_twin, (folder, settings, t)) for t in settings.twins]
+
+
+def reach_policies(folder: Path, settings: Settings) -> list[Job]:
+    """A job for each policy of a calibrated twin; they come after `calibrations`."""
+    return [
+        (f"train for twin {t}, seed {s}", train_policy, (folder, settings, t, s))
+        for t in settings.twins
+        for s in settings.seeds
+    ]
 
 
 class Case(NamedTuple):

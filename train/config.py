@@ -88,6 +88,10 @@ class TrainConfig:
         """Gradient steps of the whole run, warm-up epochs counted as if they had any."""
         return self.n_epochs * self.vector_steps_per_epoch * self.n_updates_per_vector_step
 
+    def evaluates_after(self, epoch: int) -> bool:
+        """Whether there is an evaluation and a checkpoint after so many epochs."""
+        return epoch % self.evaluation_epochs == 0 or epoch == self.n_epochs
+
 
 @dataclass(frozen=True)
 class Stage:
@@ -156,6 +160,10 @@ class ImitationConfig(TrainConfig):
         """The epoch that each stage begins before."""
         shares = [0.0, *itertools.accumulate(stage.share for stage in self.stages[:-1])]
         return tuple(round(share * self.n_epochs) for share in shares)
+
+    def evaluates_after(self, epoch: int) -> bool:
+        """Likewise, and as each stage ends."""
+        return super().evaluates_after(epoch) or epoch in self.stage_epochs
 
     @property
     def rebalance_epochs(self) -> int:

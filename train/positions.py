@@ -34,6 +34,7 @@ class PositionSummary:
     """The figures that stand in tables."""
 
     success_share: float
+    success_first_share: float  # of the positions that are goals from the start
     reached_share: float  # close enough, whatever the chambers and the wall say
     median_mm: float
     max_mm: float
@@ -52,6 +53,7 @@ class PositionSummary:
         """What a table shows: name and value with its unit."""
         return [
             ("positions with success", f"{100 * self.success_share:.1f} %"),
+            ("of those of the first stage", f"{100 * self.success_first_share:.1f} %"),
             ("positions reached", f"{100 * self.reached_share:.1f} %"),
             ("tip error, median", f"{self.median_mm:.2f} mm"),
             ("tip error, largest", f"{self.max_mm:.2f} mm"),
@@ -65,11 +67,14 @@ class PositionSummary:
 class PositionEvaluator:
     """Evaluates actors on one path of positions (m, 6) [mm, deg]; compiled once.
 
-    A single arm goes from position to position, once along the path to get there.
+    A single arm goes from position to position, once along the path to get there. `first` (m,) bool tells the
+    positions that are goals from the start.
     """
 
-    def __init__(self, env: ReachEnv, agent: TQC, positions: Array, pipe: CrossPipe | None):
-        self.env, self.pipe = env, pipe
+    def __init__(
+        self, env: ReachEnv, agent: TQC, positions: Array, pipe: CrossPipe | None, first: np.ndarray
+    ):
+        self.env, self.pipe, self.first = env, pipe, first
         self.positions = jnp.asarray(positions)
         self._follow = xla.jit(functools.partial(follow, env, agent), env.uses_mjx)
         self._clearance = jax.jit(jax.vmap(self._clearance_m))
@@ -82,7 +87,7 @@ class PositionEvaluator:
         close = reached.scaled_error < self.env.config.reward.threshold
         free = reached.saturated_chambers == 0
         success = close & free & (clearance_mm > 0.0) & reached.settled
-        return summarise(AtPositions(reached, clearance_mm, success), close)
+        return summarise(AtPositions(reached, clearance_mm, success), close, self.first)
 
     def _clearance_m(self, q: Array) -> Array:
         if self.pipe is None:
@@ -91,12 +96,13 @@ class PositionEvaluator:
         return body_clearance(self.pipe, frames.plate_position, frames.plate_rotation, self.env.spec)
 
 
-def summarise(at: AtPositions, close: np.ndarray) -> tuple[PositionSummary, AtPositions]:
-    """Figures of what was reached; `close` (m,) says where the pose was."""
+def summarise(at: AtPositions, close: np.ndarray, first: np.ndarray) -> tuple[PositionSummary, AtPositions]:
+    """Figures of what was reached; `close` (m,) says where the pose was, `first` as in the evaluator."""
     error_mm = at.reached.tip_error_mm
     x, y, z = np.abs(pose_error(at.reached.pose, at.reached.goal))[:, :3].mean(axis=0)
     figures = PositionSummary(
         success_share=float(at.success.mean()),
+        success_first_share=float(at.success[first].mean()),
         reached_share=float(close.mean()),
         median_mm=float(np.median(error_mm)),
         max_mm=float(error_mm.max()),

@@ -54,7 +54,7 @@ def train(run: Run, task: Task, console: Console) -> Any:
         while epoch < run.config.n_epochs:
             state, row = _timed_epoch(task.job, task.prepare(state, epoch))
             epoch += 1
-            due = epoch % run.config.evaluation_epochs == 0 or epoch == run.config.n_epochs
+            due = run.config.evaluates_after(epoch)
             if due:
                 row |= _evaluation(task, state)
             _record(run, board, epoch, state, row)

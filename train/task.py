@@ -53,7 +53,7 @@ def _imitation(run: Run, config: ImitationConfig, env: ReachEnv) -> Task:
     demonstrations = run.demonstrations()
     job = ImitationJob(config, env, demonstrations)
     pipe = None if config.pipe_diameter_mm is None else CrossPipe.of_mm(config.pipe_diameter_mm)
-    evaluate = PositionEvaluator(env, job.agent, demonstrations.positions, pipe)
+    evaluate = PositionEvaluator(env, job.agent, demonstrations.positions, pipe, job.goals_of(0))
 
     def prepare(state: TrainState, epoch: int) -> TrainState:
         every = config.rebalance_epochs

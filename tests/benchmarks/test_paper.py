@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from benchmarks import paper, paper_film, paper_report, paper_stages, parallel
 from benchmarks.paper_measure import Followed, figures, load_followed, measure, save_followed
 from benchmarks.paper_report import HTML_FILE, JSON_FILE, write_results
-from benchmarks.paper_stages import SMOKE, Case, Settings, cases, policy_folder, result_file
+from benchmarks.paper_stages import SMOKE, Case, Settings, cases, claim, policy_folder, result_file
 from benchmarks.paper_summary import check_goals, rows, spread, summarise
 from benchmarks.parallel import JobError
 from mjx_softarm import ArmSpec
@@ -266,7 +266,8 @@ def fill(folder, settings):
 def test_results_are_written_and_nothing_is_hidden(tmp_path):
     fill(tmp_path, TINY)
     results = good_results() | {Case("with", 0, 0): made_up(6.0)}
-    frames = paper_film.frames([np.zeros((20, 15, 3), np.uint8)] * 3, np.zeros((3, 3)), circle_poses(3), "")
+    side = paper_film.Side("", "", (0, 1), circle_poses(3)[:, :3])
+    frames = paper_film.frames([np.zeros((20, 15, 3), np.uint8)] * 3, np.zeros((3, 3)), side)
     paper_film.write_gif(tmp_path / "circle.gif", frames)
     data = write_results(tmp_path, tmp_path / "out", TINY, results, "", {"commit": "none"})
     page = Tags()
@@ -323,8 +324,10 @@ def test_twin_is_filmed_at_equal_times(tmp_path):
     taken = [picture[0, 0, 0] for picture in filmed.pictures]
     assert taken[:3] == [0, 1, 2]
     assert len(taken) == 201
-    assert np.allclose(filmed.tips_mm[0], [80.0, 0.0, -500.0])
-    images = paper_film.frames(filmed.pictures, np.array(filmed.tips_mm), circle_poses(4), "")
+    assert len(filmed.seen) == 201
+    path_mm = 1e3 * np.array([seen.tip_m for seen in filmed.seen])
+    side = paper_film.Side("", "", (0, 1), circle_poses(4)[:, :3])
+    images = paper_film.frames(filmed.pictures, path_mm, side)
     shown = [image.getpixel((0, 19))[0] for image in images]
     assert len(images) == paper_film.MAX_FRAMES
     assert (shown[0], shown[-1]) == (0, 200)
@@ -362,10 +365,11 @@ def test_interrupted_benchmark_does_only_what_is_missing(tmp_path, monkeypatch):
             save_followed(path, good_results()[case])
 
     fill(tmp_path, TINY)
-    stubs = {"in_parallel": inline, "follow_circle": follow}
-    stubs |= {"learn_twin": lambda *_: done.append("twin"), "train_policy": lambda *_: done.append("policy")}
-    for name, stub in stubs.items():
+    for name, stub in {"in_parallel": inline, "follow_circle": follow}.items():
         monkeypatch.setattr(paper, name, stub)
+    for module in (paper, paper_stages):
+        monkeypatch.setattr(module, "train_policy", lambda *_: done.append("policy"))
+    monkeypatch.setattr(paper_stages, "learn_twin", lambda *_: done.append("twin"))
     monkeypatch.setattr(paper_film, "film_circle", lambda *_: "not here")
     monkeypatch.setattr(paper_report, "draw", no_pictures)
     data = paper.run(tmp_path, tmp_path / "out", TINY)
@@ -380,10 +384,21 @@ def test_interrupted_benchmark_does_only_what_is_missing(tmp_path, monkeypatch):
 
 
 def test_folder_of_other_settings_is_refused(tmp_path):
-    paper._claim(tmp_path, TINY)
-    paper._claim(tmp_path, dataclasses.replace(TINY, twins=(0, 1, 2), seeds=(5,)))
+    claim(tmp_path, TINY)
+    claim(tmp_path, dataclasses.replace(TINY, twins=(0, 1, 2), seeds=(5,)))
     with pytest.raises(JobError, match=r"settings.json: .*\(n_points 3, now 40\); choose another --out"):
-        paper._claim(tmp_path, dataclasses.replace(TINY, n_points=40))
+        claim(tmp_path, dataclasses.replace(TINY, n_points=40))
+
+
+def test_folder_from_before_a_setting_existed_has_its_default(tmp_path):
+    claim(tmp_path, TINY)
+    file = tmp_path / "settings.json"
+    old = json.loads(file.read_text())
+    del old["imitation"]
+    file.write_text(json.dumps(old))
+    claim(tmp_path, TINY)
+    with pytest.raises(JobError, match=r"imitation \[\], now \['frozen=true'\]"):
+        claim(tmp_path, dataclasses.replace(TINY, imitation=("frozen=true",)))
 
 
 def test_training_starts_resumes_exports_or_does_nothing(tmp_path, monkeypatch):
@@ -465,7 +480,7 @@ def test_command_line_refuses_what_is_no_list_of_numbers(capsys):
 
 @pytest.mark.slow
 def test_smoke(tmp_path, capsys):
-    assert paper.main(["--smoke", "--out", str(tmp_path / "run")]) == 0
+    assert paper.main(["--smoke", "--only", "open", "--out", str(tmp_path / "run")]) == 0
     assert "goals" in json.loads((tmp_path / "run" / JSON_FILE).read_text("utf-8"))["figures"]
     assert len(list((tmp_path / "run" / "results").iterdir())) == len(cases(SMOKE))
     assert len(re.findall("^(met|NOT MET) ", capsys.readouterr().out, re.MULTILINE)) == 11

@@ -1,0 +1,47 @@
+"""A film of the pipe task: the pipe cut open, what is carried drawn, beside the finger tips' path."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.confined_measure import finger_tips, finger_tips_seen, operate
+from benchmarks.confined_plots import outline_mm
+from benchmarks.confined_stages import KINDS, Trial, pipe_mm, scene_of
+from benchmarks.paper_film import HEIGHT, WIDTH, FilmedTwin, Side, frames, write_gif
+from benchmarks.paper_stages import Settings
+
+FILM_FILE = "pipe.gif"
+
+
+def film_pipe(folder: Path, settings: Settings) -> str:
+    """Write `pipe.gif`, the pipe task on the first twin; returns why it cannot be drawn, or ""."""
+    from mjx_softarm.pipe import CrossPipe
+    from mjx_softarm.render import RenderError
+
+    path = folder / FILM_FILE
+    if path.exists():
+        return ""
+    trial = Trial("pipe", settings.twins[0], settings.seeds[0])
+    scene = scene_of(folder, settings, trial)
+    try:
+        with scene.twin.renderer(WIDTH, HEIGHT) as renderer:
+            filmed = FilmedTwin(scene.twin, renderer)
+            operate(filmed, *scene[1:], trial.objects)
+    except RenderError as error:
+        return str(error)
+    gripper_m = scene.controller.policy.spec.mass.gripper_length_m
+    path_mm = 1e3 * np.array(
+        [finger_tips_seen(seen.tip_m, seen.tip_quaternion, gripper_m) for seen in filmed.seen]
+    )
+    diameter_mm = pipe_mm(KINDS[trial.kind].task)
+    side = Side(
+        title=f"twin {trial.twin}, {diameter_mm} mm pipe",
+        text="demonstrated (grey), finger tips",
+        axes=(0, 2),
+        goals_mm=1e3 * finger_tips(scene.goals, gripper_m),
+        lines_mm=tuple(outline_mm(CrossPipe.of_mm(diameter_mm))),
+    )
+    write_gif(path, frames(filmed.pictures, path_mm, side))
+    return ""
