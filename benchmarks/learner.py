@@ -51,7 +51,9 @@ config, scale, reward = PRESETS["quick"], ObsScale.from_spec(ArmSpec.default()),
 agent = TQC(18, 9, TQCConfig())
 rng = np.random.default_rng(0)
 draw = lambda *shape: jnp.asarray(rng.normal(size=(10_000, *shape)), jnp.float32)
-items = Experience(draw(6), draw(6), jnp.tanh(draw(9)), draw(6), jnp.tanh(draw(9)), draw() > 1, draw())
+poses, actions = (draw(6), draw(6), draw(6)), (jnp.tanh(draw(9)), jnp.tanh(draw(9)))
+no_cost = jnp.zeros(10_000)
+items = Experience(poses[0], poses[1], actions[0], poses[2], actions[1], draw() > 1, no_cost, draw())
 memory = replay.add(
     replay.create(jax.tree.map(lambda x: x[0], items), 10_000), items, jnp.ones(10_000, bool)
 )

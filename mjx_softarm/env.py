@@ -20,6 +20,7 @@ from mjx_softarm._mjx import Env, State, mjx
 from mjx_softarm.dynamics import Motion, advance, with_params
 from mjx_softarm.kinematics import chain_frames, mjx_frames
 from mjx_softarm.mjcf import build_model
+from mjx_softarm.pipe import CrossPipe, body_clearance
 from mjx_softarm.pose import pose_from_frame
 from mjx_softarm.s2r import S2R, correct
 from mjx_softarm.settle import Settled, settle
@@ -59,11 +60,25 @@ class EnvConfig:
     n_poses: int = 8192  # poses of the reachable workspace that starts and goals are drawn from
     workspace_seed: int = 0
     dynamic_step_s: float = 0.5  # duration of one environment step in dynamic mode
+    pipe_diameter_mm: float | None = (
+        None  # of the cross-shaped pipe around the arm; it has no solid walls here
+    )
 
     def __post_init__(self):
         for name, allowed in (("engine", ("chain", "mjx")), ("mode", ("quasistatic", "dynamic"))):
             if getattr(self, name) not in allowed:
                 raise ValueError(f"EnvConfig.{name}: got {getattr(self, name)!r}, expected one of {allowed}")
+        if self.pipe_diameter_mm is not None:
+            CrossPipe.of_mm(self.pipe_diameter_mm)  # raises
+        elif self.clearance_cost_per_mm:
+            raise ValueError(
+                f"EnvConfig.clearance_cost_per_mm: got {self.clearance_cost_per_mm}, expected 0 without a "
+                "pipe_diameter_mm"
+            )
+        if self.clearance_cost_per_mm < 0:
+            raise ValueError(
+                f"EnvConfig.clearance_cost_per_mm: got {self.clearance_cost_per_mm}, expected >= 0"
+            )
         if self.n_poses < 1:
             raise ValueError(f"EnvConfig.n_poses: got {self.n_poses}, expected at least 1")
         if self.workspace_seed == HELD_OUT_SEED:
@@ -104,6 +119,8 @@ class ReachEnv(Env):
         self.gains = control.Gains.from_spec(self.spec)
         self.sensor = sensors.SensorParams.from_spec(self.spec)
         self.frequency_range_hz = jnp.asarray(sensors.frequency_range_hz(self.spec), jnp.float32)
+        diameter_mm = self.config.pipe_diameter_mm
+        self.pipe = None if diameter_mm is None else CrossPipe.of_mm(diameter_mm)
         self.uses_mjx = self.config.engine == "mjx" or self.config.mode == "dynamic"
         self.model = mjx.put_model(build_model(self.spec)) if self.uses_mjx else None
         self.pool = self.sample_pool(self.config.n_poses, self.config.workspace_seed)
@@ -164,8 +181,12 @@ class ReachEnv(Env):
         )
         zero = jnp.zeros(())
         metrics = dict.fromkeys(("tip_error_mm", "reached", "saturated_chambers", "unsettled"), zero)
-        metrics |= {f"reward_{name}": zero for name in ("goal", "error", "steps", "saturation")}
-        info = {"saturated": jnp.array(False), "valid": jnp.array(True)}
+        metrics |= {f"reward_{name}": zero for name in ("goal", "error", "steps", "saturation", "clearance")}
+        info = {
+            "saturated": jnp.array(False),
+            "valid": jnp.array(True),
+            "clearance_mm": self._clearance_mm(start.q),
+        }
         return State(arm, self.observe(arm.pose, goal), zero, zero, metrics, info)
 
     def step(self, state: State, action: Array) -> State:
@@ -189,8 +210,14 @@ class ReachEnv(Env):
         tolerance = 1e-3 * self.config.saturation_tolerance_mm
         reading = arm.spring_m + arm.sensor_offset_m
         saturated = control.saturated(arm.pressure_kpa, reference, reading, self.gains, tolerance) & valid
+        clearance_mm = self._clearance_mm(arm.motion.q)
         value, reached, terms = rewards.reward(
-            arm.pose, arm.goal, arm.n_steps, jnp.any(saturated), self.config.reward
+            arm.pose,
+            arm.goal,
+            arm.n_steps,
+            jnp.any(saturated),
+            self.config.reward,
+            self.clearance_cost(clearance_mm),
         )
         metrics = {
             "tip_error_mm": jnp.linalg.norm(arm.pose[:3] - arm.goal[:3]),
@@ -206,7 +233,12 @@ class ReachEnv(Env):
             reward=jnp.where(valid, value, 0.0),
             done=(reached | ~valid).astype(jnp.float32),
             metrics={**state.metrics, **metrics},
-            info={**state.info, "saturated": jnp.any(saturated), "valid": valid},
+            info={
+                **state.info,
+                "saturated": jnp.any(saturated),
+                "valid": valid,
+                "clearance_mm": clearance_mm,
+            },
         )
 
     def _move(self, arm: ArmState, reference_m: Array) -> tuple[Motion, Settled]:
@@ -225,6 +257,18 @@ class ReachEnv(Env):
             kinematics = functools.partial(chain_frames, link_length_m=arm.params.link_length_m)
         end = settle(kinematics, arm.params, reference_m)
         return Motion(end.q, jnp.zeros_like(end.q), end.pressure_kpa), end
+
+    def clearance_cost(self, clearance_mm: Array) -> Array:
+        """What the reward loses for clearances (...) [mm] of the body to the pipe's wall."""
+        within_mm = jnp.maximum(self.config.clearance_margin_mm - clearance_mm, 0.0)
+        return self.config.clearance_cost_per_mm * within_mm
+
+    def _clearance_mm(self, q: Array) -> Array:
+        """Of the body to the pipe's wall, (); infinite without a pipe."""
+        if self.pipe is None:
+            return jnp.asarray(jnp.inf, q.dtype)
+        frames = chain_frames(q, self.params.link_length_m)
+        return 1e3 * body_clearance(self.pipe, frames.plate_position, frames.plate_rotation, self.spec)
 
     def observe(self, pose: Array, goal: Array) -> Array:
         """The observation (..., 18) of a pose and a goal (..., 6) [mm, deg]."""

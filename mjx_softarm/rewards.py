@@ -5,6 +5,8 @@ Source: the paper's reward equation. Its three cases become terms that add up:
     saturated:  -saturation_cost
     reached:     goal_bonus
     otherwise:  -error_cost ||e|| - step_cost N,    e = w (pose - goal).
+
+An environment may also charge for a body close to a wall, in all three cases; the paper has no such term.
 """
 
 from __future__ import annotations
@@ -43,7 +45,7 @@ def scaled_error(pose: Any, goal: Any, config: RewardConfig) -> Any:
 
 
 def reward(
-    pose: Any, goal: Any, n_steps: Any, saturated: Any, config: RewardConfig
+    pose: Any, goal: Any, n_steps: Any, saturated: Any, config: RewardConfig, clearance_cost: Any = 0.0
 ) -> tuple[Any, Any, dict[str, Any]]:
     """Reward of a pose after an action.
 
@@ -53,6 +55,7 @@ def reward(
         n_steps (...,): environment steps of the episode, this one included.
         saturated (...,) bool: any chamber at its pressure limit with its spring off its reference.
         config: the weights.
+        clearance_cost (...,): for a body close to a wall.
 
     Returns:
         Reward (...,); whether the goal is reached (...,) bool, which ends an episode; the terms by name.
@@ -67,5 +70,6 @@ def reward(
         "error": xp.where(on_the_way, -config.error_cost * norm, 0.0),
         "steps": xp.where(on_the_way, -config.step_cost * n_steps, 0.0),
         "saturation": xp.where(saturated, -config.saturation_cost, 0.0),
+        "clearance": xp.zeros_like(norm) - clearance_cost,
     }
     return sum(terms.values()), reached, terms

@@ -115,7 +115,7 @@ def _imitate(options: argparse.Namespace, console: Console) -> int:
     if options.demonstrations is None:
         raise ConfigError("FILE: missing, expected the demonstrations, or --resume RUN")
     preset = options.preset or "pipe"
-    assignments = [] if options.pipe is None else [f"pipe_diameter_mm={options.pipe}"]
+    assignments = [] if options.pipe is None else [f"env.pipe_diameter_mm={options.pipe}"]
     assignments += ["frozen=true"] if options.reward else []
     config = _config(IMITATION_PRESETS[preset], options, assignments)
     if config.frozen and not options.reward:

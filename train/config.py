@@ -123,8 +123,6 @@ class ImitationConfig(TrainConfig):
         stages: in order; their shares add up to 1.
         rebalance_env_steps: steps between two shifts of the goals towards those that are missed by most; 0
             is never.
-        pipe_diameter_mm: of the cross-shaped pipe that the body has to stay inside for a goal to count as
-            reached; nothing that learns sees it. None is open space.
     """
 
     gail: GailConfig = field(default_factory=GailConfig)
@@ -134,7 +132,6 @@ class ImitationConfig(TrainConfig):
     expert_share: float = 0.25
     stages: tuple[Stage, ...] = (Stage(),)
     rebalance_env_steps: int = 0
-    pipe_diameter_mm: float | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -31,7 +31,7 @@ class Reached(NamedTuple):
     saturated_chambers: Array  # (n,)
     settled: Array  # (n,) bool, after every action
     pressure_kpa: Array  # (n, n_chambers)
-    q: Array  # (n, nv) joint coordinates [m, rad, rad]
+    clearance_mm: Array  # (n,) of the body to the pipe's wall; infinite without a pipe
 
     @property
     def tip_error_mm(self) -> Array:
@@ -115,7 +115,7 @@ def reach(env: ReachEnv, agent: TQC, actor_params: Any, state: State, goal: Arra
         saturated_chambers=state.metrics["saturated_chambers"],
         settled=jnp.all(settled),
         pressure_kpa=arm.pressure_kpa,
-        q=arm.motion.q,
+        clearance_mm=state.info["clearance_mm"],
     )
 
 

@@ -31,6 +31,7 @@ class Experience(NamedTuple):
     next_pose: Array  # (..., 6) [mm, deg]
     sensed_action: Array  # (..., n_chambers) the action that asks for the spring lengths reached
     saturated: Array  # (...,) bool
+    clearance_cost: Array  # (...,) for a body close to a wall
     n_steps: Array  # (...,) actions taken in the episode, this one included
 
 
@@ -89,7 +90,9 @@ def relabel(
     sensed = (reached | near) & batch.saturated & exchange_actions
     action = jnp.where(sensed[:, None], batch.sensed_action, batch.action)
     saturated = batch.saturated & ~sensed
-    reward, done, _ = rewards.reward(batch.next_pose, goal, batch.n_steps, saturated, reward_config)
+    reward, done, _ = rewards.reward(
+        batch.next_pose, goal, batch.n_steps, saturated, reward_config, batch.clearance_cost
+    )
     return Transition(
         obs=obs.observe(batch.pose, goal, scale, reward_config),
         action=action,

@@ -142,5 +142,6 @@ class Job:
             next_pose=end.pose,
             sensed_action=self.env.action_of(end.spring_m + end.sensor_offset_m),
             saturated=after.info["saturated"],
+            clearance_cost=self.env.clearance_cost(after.info["clearance_mm"]),
             n_steps=end.n_steps,
         )

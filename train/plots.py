@@ -180,8 +180,8 @@ def positions_figure(at: AtPositions) -> Figure:
     middle = _axes(figure, 132, f"tip error: mean {error.mean():.2f} mm", "position", "mm")
     middle.bar(np.arange(len(error)), error, color=np.where(at.success, BLUE, ORANGE))
     right = _axes(figure, 133, "clearance of the body to the pipe", "position", "mm")
-    if np.isfinite(at.clearance_mm).all():
-        right.bar(np.arange(len(error)), at.clearance_mm, color=BLUE)
+    if np.isfinite(at.reached.clearance_mm).all():
+        right.bar(np.arange(len(error)), at.reached.clearance_mm, color=BLUE)
     else:
         right.text(0.5, 0.5, "no pipe", ha="center", transform=right.transAxes, color=GREY)
     return figure

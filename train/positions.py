@@ -14,8 +14,6 @@ from jax import Array
 
 from mjx_softarm import xla
 from mjx_softarm.env import ReachEnv
-from mjx_softarm.kinematics import chain_frames
-from mjx_softarm.pipe import CrossPipe, body_clearance
 from mjx_softarm.pose import pose_error
 from train.evaluate import Reached, follow
 from train.tqc import TQC
@@ -25,7 +23,6 @@ class AtPositions(NamedTuple):
     """What an arm reached at each of m demonstrated positions, in their order."""
 
     reached: Reached
-    clearance_mm: Array  # (m,) of the body to the pipe's wall; infinite without a pipe
     success: Array  # (m,) bool: close enough, no chamber saturated, the body inside the pipe
 
 
@@ -71,47 +68,35 @@ class PositionEvaluator:
     positions that are goals from the start.
     """
 
-    def __init__(
-        self, env: ReachEnv, agent: TQC, positions: Array, pipe: CrossPipe | None, first: np.ndarray
-    ):
-        self.env, self.pipe, self.first = env, pipe, first
+    def __init__(self, env: ReachEnv, agent: TQC, positions: Array, first: np.ndarray):
+        self.env, self.first = env, first
         self.positions = jnp.asarray(positions)
         self._follow = xla.jit(functools.partial(follow, env, agent), env.uses_mjx)
-        self._clearance = jax.jit(jax.vmap(self._clearance_m))
 
     def __call__(self, actor_params: Any) -> tuple[PositionSummary, AtPositions]:
         """Figures, and what was reached, as NumPy arrays."""
-        reached = self._follow(actor_params, self.positions)
-        clearance_mm = 1e3 * jax.device_get(self._clearance(reached.q))
-        reached = jax.device_get(reached)
-        close = reached.scaled_error < self.env.config.reward.threshold
-        free = reached.saturated_chambers == 0
-        success = close & free & (clearance_mm > 0.0) & reached.settled
-        return summarise(AtPositions(reached, clearance_mm, success), close, self.first)
-
-    def _clearance_m(self, q: Array) -> Array:
-        if self.pipe is None:
-            return jnp.inf
-        frames = chain_frames(q, self.env.spec.link_length_m)
-        return body_clearance(self.pipe, frames.plate_position, frames.plate_rotation, self.env.spec)
+        reached = jax.device_get(self._follow(actor_params, self.positions))
+        return summarise(reached, self.env.config.reward.threshold, self.first)
 
 
-def summarise(at: AtPositions, close: np.ndarray, first: np.ndarray) -> tuple[PositionSummary, AtPositions]:
-    """Figures of what was reached; `close` (m,) says where the pose was, `first` as in the evaluator."""
-    error_mm = at.reached.tip_error_mm
-    x, y, z = np.abs(pose_error(at.reached.pose, at.reached.goal))[:, :3].mean(axis=0)
+def summarise(reached: Reached, threshold: float, first: np.ndarray) -> tuple[PositionSummary, AtPositions]:
+    """Figures of what was reached; a scaled error below the threshold is close enough."""
+    error_mm = reached.tip_error_mm
+    close = reached.scaled_error < threshold
+    success = close & (reached.saturated_chambers == 0) & (reached.clearance_mm > 0.0) & reached.settled
+    x, y, z = np.abs(pose_error(reached.pose, reached.goal))[:, :3].mean(axis=0)
     figures = PositionSummary(
-        success_share=float(at.success.mean()),
-        success_first_share=float(at.success[first].mean()),
+        success_share=float(success.mean()),
+        success_first_share=float(success[first].mean()),
         reached_share=float(close.mean()),
         median_mm=float(np.median(error_mm)),
         max_mm=float(error_mm.max()),
         x_mm=float(x),
         y_mm=float(y),
         z_mm=float(z),
-        saturated_positions=int(np.count_nonzero(at.reached.saturated_chambers)),
-        outside_positions=int(np.count_nonzero(at.clearance_mm <= 0.0)),
-        unsettled=int(np.count_nonzero(~at.reached.settled)),
+        saturated_positions=int(np.count_nonzero(reached.saturated_chambers)),
+        outside_positions=int(np.count_nonzero(reached.clearance_mm <= 0.0)),
+        unsettled=int(np.count_nonzero(~reached.settled)),
         error_mm=tuple(float(value) for value in error_mm),
     )
-    return figures, at
+    return figures, AtPositions(reached, success)

@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 from matplotlib.figure import Figure
 
 from mjx_softarm.env import ReachEnv
-from mjx_softarm.pipe import CrossPipe
 from train import plots
 from train.checkpoint import Run
 from train.config import ImitationConfig
@@ -52,8 +51,7 @@ def task_of(run: Run, env: ReachEnv) -> Task:
 def _imitation(run: Run, config: ImitationConfig, env: ReachEnv) -> Task:
     demonstrations = run.demonstrations()
     job = ImitationJob(config, env, demonstrations)
-    pipe = None if config.pipe_diameter_mm is None else CrossPipe.of_mm(config.pipe_diameter_mm)
-    evaluate = PositionEvaluator(env, job.agent, demonstrations.positions, pipe, job.goals_of(0))
+    evaluate = PositionEvaluator(env, job.agent, demonstrations.positions, job.goals_of(0))
 
     def prepare(state: TrainState, epoch: int) -> TrainState:
         every = config.rebalance_epochs

@@ -18,7 +18,7 @@ def reached(error_mm, scaled_error, saturated, settled):
         saturated_chambers=np.array(saturated),
         settled=np.array(settled),
         pressure_kpa=np.zeros((n, 9)),
-        q=np.zeros((n, 36)),
+        clearance_mm=np.full(n, np.inf),
     )
 
 

@@ -36,6 +36,7 @@ def stored(env, transition):
         next_pose=end.pose,
         sensed_action=env.action_of(end.spring_m),
         saturated=after.info["saturated"],
+        clearance_cost=jnp.zeros(len(after.reward)),
         n_steps=end.n_steps,
     )
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from mjx_softarm.env import EnvConfig, ReachEnv
-from mjx_softarm.pipe import CrossPipe
 from mjx_softarm.spec import ArmSpec
 from train.config import ConfigError, ImitationConfig, Stage, from_dict, override, to_dict
 from train.demonstrations import Demonstrations
@@ -16,7 +15,7 @@ from train.evaluate import Reached
 from train.gail import GailConfig
 from train.hindsight import HindsightConfig
 from train.imitation import ImitationJob, goal_weights
-from train.positions import AtPositions, PositionEvaluator, summarise
+from train.positions import PositionEvaluator, summarise
 from train.tqc import TQCConfig
 
 N = 6  # positions
@@ -160,35 +159,34 @@ def test_positions_are_evaluated_with_body_and_pressures(env, job, demonstration
             return job.actions[nearest]
 
     first = job.goals_of(0)
-    figures, at = PositionEvaluator(env, Perfect(), demonstrations.positions, None, first)({})
+    figures, at = PositionEvaluator(env, Perfect(), demonstrations.positions, first)({})
     assert figures.success_share == figures.reached_share == 1.0 and figures.max_mm < 0.05
-    assert len(figures.error_mm) == N and np.isinf(at.clearance_mm).all()
-    narrow = CrossPipe(0.13, centre_z_m=-2.0)  # narrower than the arm
-    figures, at = PositionEvaluator(env, Perfect(), demonstrations.positions, narrow, first)({})
+    assert len(figures.error_mm) == N and np.isinf(at.reached.clearance_mm).all()
+    narrow = ReachEnv(SPEC, dataclasses.replace(CONFIG.env, pipe_diameter_mm=130.0))  # narrower than the arm
+    figures, at = PositionEvaluator(narrow, Perfect(), demonstrations.positions, first)({})
     assert figures.reached_share == 1.0 and figures.success_share == 0.0 and figures.outside_positions == N
-    assert (at.clearance_mm < 0.0).all()
+    assert (at.reached.clearance_mm < 0.0).all()
 
 
 def test_success_at_the_first_stages_positions_is_told_apart():
-    at = AtPositions(
-        Reached(*np.zeros((2, 3, 6)), *np.zeros((2, 3)), np.ones(3, bool), *np.zeros((2, 3))),
-        np.zeros(3),
-        np.array([True, False, False]),
+    zero = np.zeros(3)
+    reached = Reached(
+        np.zeros((3, 6)), np.zeros((3, 6)), zero, zero, zero == 0, zero, np.array([5.0, -1, -1])
     )
-    figures, _ = summarise(at, np.ones(3, bool), np.array([True, True, False]))
+    figures, _ = summarise(reached, 0.03, np.array([True, True, False]))
     assert (figures.success_share, figures.success_first_share) == (pytest.approx(1 / 3), 0.5)
+    assert figures.outside_positions == 2
 
 
 def test_each_stages_end_is_evaluated():
-    config = dataclasses.replace(
-        CONFIG, total_env_steps=160, evaluation_epochs=4
-    )  # 10 epochs, 5 of them first
+    config = dataclasses.replace(CONFIG, total_env_steps=160, evaluation_epochs=4)  # 10 epochs, 5 first
     assert [epoch for epoch in range(1, 11) if config.evaluates_after(epoch)] == [4, 5, 8, 10]
 
 
 def test_config_survives_json():
     assert from_dict(to_dict(CONFIG)) == CONFIG
-    assert from_dict(to_dict(dataclasses.replace(CONFIG, pipe_diameter_mm=300.0))).pipe_diameter_mm == 300.0
+    piped = dataclasses.replace(CONFIG, env=dataclasses.replace(CONFIG.env, pipe_diameter_mm=300.0))
+    assert from_dict(to_dict(piped)) == piped
 
 
 @pytest.mark.parametrize(
