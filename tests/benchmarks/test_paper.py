@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import re
-from html.parser import HTMLParser
 from types import SimpleNamespace
 
 import numpy as np
@@ -230,25 +229,6 @@ def test_result_comes_back_from_its_file(tmp_path):
         assert np.array_equal(value, getattr(followed, name), equal_nan=True), name
 
 
-class Tags(HTMLParser):
-    """Sees that each tag is closed in its turn; counts pictures."""
-
-    def __init__(self):
-        super().__init__()
-        self.open, self.n_pictures, self.text = [], 0, ""
-
-    def handle_starttag(self, tag, attrs):
-        self.n_pictures += tag == "img" and dict(attrs)["src"].startswith("data:image/")
-        if tag not in ("meta", "img"):
-            self.open.append(tag)
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
-
-    def handle_data(self, data):
-        self.text += data
-
-
 def fill(folder, settings):
     """Leave in a folder what training and calibration would."""
     for twin in (None, *settings.twins):
@@ -263,16 +243,14 @@ def fill(folder, settings):
         (here / "report.json").write_text(json.dumps({"parts": parts}))
 
 
-def test_results_are_written_and_nothing_is_hidden(tmp_path):
+def test_results_are_written_and_nothing_is_hidden(tmp_path, read_page):
     fill(tmp_path, TINY)
     results = good_results() | {Case("with", 0, 0): made_up(6.0)}
     side = paper_film.Side("", "", (0, 1), circle_poses(3)[:, :3])
     frames = paper_film.frames([np.zeros((20, 15, 3), np.uint8)] * 3, np.zeros((3, 3)), side)
     paper_film.write_gif(tmp_path / "circle.gif", frames)
     data = write_results(tmp_path, tmp_path / "out", TINY, results, "", {"commit": "none"})
-    page = Tags()
-    page.feed((tmp_path / HTML_FILE).read_text("utf-8"))
-    assert page.open == []
+    page = read_page(tmp_path / HTML_FILE)
     assert page.n_pictures == 3 + len(TINY.loads_g) + 1
     assert "with S2R, mean translation at most 5 mm: 5.00 mm" not in page.text  # (5.5 + 4.5) / 2: is met
     assert "twin 1: Springs: off <by> much" in page.text
@@ -334,7 +312,7 @@ def test_twin_is_filmed_at_equal_times(tmp_path):
     assert shown == sorted(shown)
 
 
-def test_missed_goal_and_missing_film_stand_in_the_page(tmp_path, monkeypatch):
+def test_missed_goal_and_missing_film_stand_in_the_page(tmp_path, monkeypatch, read_page):
     monkeypatch.setattr(paper_report, "draw", no_pictures)
     fill(tmp_path, TINY)
     lost = made_up(60.0)
@@ -343,8 +321,7 @@ def test_missed_goal_and_missing_film_stand_in_the_page(tmp_path, monkeypatch):
     write_results(tmp_path, tmp_path, TINY, results, "no OpenGL <here>", {})
     runs = json.loads((tmp_path / JSON_FILE).read_text("utf-8"))["figures"]["runs"]
     assert [row["translation_mm"] is None for row in runs].count(True) == 1
-    page = Tags()
-    page.feed((tmp_path / HTML_FILE).read_text("utf-8"))
+    page = read_page(tmp_path / HTML_FILE)
     assert "not met: with S2R, mean translation at most 5 mm" in page.text
     assert "NOT MET" in page.text
     assert "no OpenGL <here>" in page.text
