@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
 
 from benchmarks.confined_measure import CALM_N, Operated, finger_tips
 from benchmarks.confined_stages import KINDS, Learned, Results, Trial, pipe_mm
@@ -19,6 +20,7 @@ from train.plots import BLUE, GREY, INK, ORANGE, dress
 
 GREEN = "#2a9d6f"
 LEAST_N = 0.1  # where the scale of forces ends
+SEEN_Z_MM = (-880.0, -330.0)  # of the pipe, around its crossing
 LOSSES = ("tqc/critic_loss", "tqc/actor_loss", "gail/discriminator_loss")
 
 
@@ -40,14 +42,15 @@ def outline_mm(pipe: CrossPipe) -> list[np.ndarray]:
 
 def positions_figure(results: Results, shown: Sequence[Trial]) -> Figure:
     """The finger tips from the front in the pipe: as demonstrated, on their way, and where they arrived."""
-    figure = Figure(figsize=(4.0 * len(shown) + 0.4, 5.6), layout="constrained")
+    figure = Figure(figsize=(4.0 * len(shown) + 0.4, 4.2), layout="constrained")
     panels = figure.subplots(1, len(shown), squeeze=False, sharex=True, sharey=True)[0]
     for panel, trial in zip(panels, shown, strict=True):
         diameter_mm = pipe_mm(KINDS[trial.kind].task)
         dress(panel, f"{diameter_mm} mm pipe, {trial.objects}, from the front", "x [mm]", "z [mm]")
         _positions(panel, results.trials[trial], CrossPipe.of_mm(diameter_mm))
         panel.set_aspect("equal")
-    panels[0].legend(frameon=False, fontsize=8, loc="upper left")
+        panel.set_ylim(*SEEN_Z_MM)
+    figure.legend(*panels[0].get_legend_handles_labels(), frameon=False, loc="outside lower center", ncols=5)
     return figure
 
 
@@ -60,12 +63,12 @@ def _positions(panel: Any, run: Operated, pipe: CrossPipe) -> None:
     style = {"linestyle": "none", "markersize": 7.0, "fillstyle": "none", "color": INK}
     panel.plot(asked[:, 0], asked[:, 2], "o", label="demonstrated", **style)
     panel.plot(arrived[:, 0], arrived[:, 2], "o", color=BLUE, markersize=3.5, label="reached")
-    for mask, colour, label in (
-        (run.success, GREEN, "picked or placed"),
-        (run.operation & ~run.success, RED, "not picked or placed"),
+    for mask, marker, colour, label in (
+        (run.success, "s", GREEN, "picked or placed"),
+        (run.operation & ~run.success, "x", RED, "not picked or placed"),
     ):
-        style = {"linestyle": "none", "markersize": 13.0, "fillstyle": "none", "color": colour}
-        panel.plot(asked[mask, 0], asked[mask, 2], "s", label=label, **style)
+        style = {"linestyle": "none", "markersize": 14.0, "fillstyle": "none", "color": colour}
+        panel.plot(asked[mask, 0], asked[mask, 2], marker, label=label, **style)
 
 
 def errors_figure(results: Results, kind: str, objects: str) -> Figure:
@@ -90,7 +93,7 @@ def errors_figure(results: Results, kind: str, objects: str) -> Figure:
         panel.plot(_mean(lines), "o-", color=BLUE, linewidth=1.5, markersize=3.0, label="mean of the runs")
         mean = np.nanmean(lines) if np.isfinite(lines).any() else np.nan
         panel.axhline(mean, color=ORANGE, linestyle="--", label=f"mean of all: {mean:.2f} mm")
-        panel.set_ylim(bottom=0)
+        panel.set_ylim(0, 1.25 * panel.get_ylim()[1])
         panel.legend(frameon=False, fontsize=8, loc="upper left", ncols=3)
     panels[0].set_title(panels[0].get_title(loc="left"), loc="left", fontsize=10, color=INK, pad=14)
     return figure
@@ -202,6 +205,7 @@ def _series(runs: Sequence[Learned], name: str) -> tuple[np.ndarray, np.ndarray]
 
 
 def _mean_and_spread(panel: Any, steps: np.ndarray, lines: np.ndarray, colour: str, label: str) -> None:
+    panel.xaxis.set_major_formatter(EngFormatter())
     mean, deviation = lines.mean(axis=0), lines.std(axis=0)
     panel.fill_between(steps, mean - deviation, mean + deviation, color=colour, alpha=0.2, linewidth=0)
     panel.plot(steps, mean, color=colour, label=label, linewidth=1.5)

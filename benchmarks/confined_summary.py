@@ -128,7 +128,13 @@ def _selector(table: Sequence[Row]) -> Callable[[str, str], list[Row]]:
 
 
 def _complete(members: Sequence[Row]) -> bool:
-    return all(row["reached"] == row["positions"] for row in members)
+    return not _missed(members)
+
+
+def _missed(members: Sequence[Row]) -> str:
+    """What a value has to be read with: positions that were not arrived at."""
+    missed = [row["positions"] - row["reached"] for row in members if row["reached"] < row["positions"]]
+    return f", {sum(missed)} positions missed in {len(missed)} of {len(members)} runs" if missed else ""
 
 
 def _all_done(row: Row) -> bool:
@@ -141,7 +147,7 @@ def _at_most_mm(name: str, members: Sequence[Row]) -> Check:
     if not members:
         return Check(text, "not measured", False)
     value = float(np.mean([row[name] for row in members]))
-    return Check(text, f"{value:.2f} mm", value <= MOST_MM and _complete(members))
+    return Check(text, f"{value:.2f} mm{_missed(members)}", value <= MOST_MM and _complete(members))
 
 
 def _both(shown: Sequence[Row], exchanged: Sequence[Row]) -> Check:
@@ -164,7 +170,7 @@ def _calm(where: str, members: Sequence[Row]) -> Check:
     if not members:
         return Check(text, "not measured", False)
     shares = [row["calm_percent"] for row in members]
-    value = f"{min(shares):.2f} % in the worst run, {np.mean(shares):.2f} % in the mean"
+    value = f"{min(shares):.2f} % in the worst run, {np.mean(shares):.2f} % in the mean{_missed(members)}"
     return Check(text, value, min(shares) >= CALM_PERCENT and _complete(members))
 
 
@@ -192,14 +198,13 @@ def _circle(members: Sequence[Row], without: Sequence[Row]) -> Check:
     if not (members and without):
         return Check(text, "not measured", False)
     means = [float(np.mean([row["translation_mm"] for row in rows])) for rows in (members, without)]
-    complete = _complete(members) and all(row["reached"] == row["points"] for row in without)
-    return Check(
-        text, f"{means[0]:.2f} mm with, {means[1]:.2f} mm without", means[0] <= means[1] and complete
-    )
+    everyone = [*members, *({**row, "positions": row["points"]} for row in without)]
+    value = f"{means[0]:.2f} mm with, {means[1]:.2f} mm without{_missed(everyone)}"
+    return Check(text, value, means[0] <= means[1] and _complete(everyone))
 
 
 def _kept(success: Sequence[Sequence[float] | None]) -> Check:
-    """What was learned in the first stage, after the second."""
+    """What was learned in the first stage, after the second; without success there is nothing to keep."""
     text = "circle: success at the first stage's points after stage two not lower than before, in every run"
     if not success or None in success:
         return Check(text, "not measured", False)
@@ -207,4 +212,4 @@ def _kept(success: Sequence[Sequence[float] | None]) -> Check:
     lower = int(np.sum(after[:, 1] < after[:, 0]))
     one, two = 100 * after.mean(axis=0)
     value = f"{one:.1f} % after stage one, {two:.1f} % after stage two; lower in {lower} of {len(after)} runs"
-    return Check(text, value, lower == 0)
+    return Check(text, value, lower == 0 and bool(one > 0))

@@ -59,6 +59,7 @@ from mjx_softarm.export import policy_from_actor, save_policy
 from mjx_softarm.pipe import APPLE_KG, BALL_KG, CrossPipe, clearance
 from mjx_softarm.rewards import RewardConfig
 from mjx_softarm.workspace import circle_poses
+from train import __main__ as train_main
 from train.config import IMITATION_PRESETS, to_dict
 from train.waypoints import task
 
@@ -334,6 +335,7 @@ def test_goal_that_is_missed_by_trials_is_named(changed, goal):
         ({("pipe", 0, 0): learned("pipe", reaches_at=11)}, STEPS),  # in one run, never
         ({("pipe", t, s): learned("pipe", reaches_at=8) for t in range(3) for s in range(3)}, STEPS),  # equal
         ({("circle", 1, 2): learned("circle", after_one=0.5, after_two=0.375)}, KEPT),
+        ({("circle", t, s): learned("circle", 4, 10, 0.0, 0.0) for t in range(3) for s in range(3)}, KEPT),
     ],
 )
 def test_goal_that_is_missed_by_trainings_is_named(changed, goal):
@@ -361,7 +363,14 @@ def test_run_that_missed_a_position_meets_no_goal_however_small_its_error():
     assert unmet(with_trials({Trial("pipe", 0, 0): broken})) == [X, Y, Z, CALM]
     broken = made_up("circle", (0.1, 0.1, 0.1))
     broken.error[2] = np.nan
-    assert unmet(with_trials({Trial("circle", 0, 0): broken})) == [CIRCLE]
+    given = with_trials({Trial("circle", 0, 0): broken})
+    assert unmet(given) == [CIRCLE]
+    value = {check.text: check.value for check in checks(given)}[CIRCLE]
+    assert value.endswith("4.00 mm without, 1 positions missed in 1 of 18 runs")
+    broken = followed(8.0)
+    broken.error[3] = np.nan
+    given = good_results()
+    assert unmet(given._replace(circles={**given.circles, Case("with", 1, 1): broken})) == [CIRCLE]
 
 
 def test_reward_that_never_leads_to_success_is_said():
@@ -428,7 +437,7 @@ def test_results_are_written_and_nothing_is_hidden(tmp_path, read_page):
     assert page.n_pictures == 7
     for text in ("8.93", "5.34", "5.13", "11.29", "11.59", "no OpenGL <here>"):
         assert text in page.text
-    assert f"not met: {X}: nan mm" in page.text
+    assert f"not met: {X}: nan mm, 28 positions missed in 1 of 2 runs" in page.text
     assert f"not met: {BOTH}: 1 of 2" in page.text
     assert "twin 1: Springs: off <by> much" in page.text
     assert "5 of 10 goals are not met." in page.text
@@ -610,9 +619,29 @@ def test_training_starts_with_what_it_builds_on_resumes_or_starts_anew(tmp_path,
     assert commands() == []
     agent = commands("circle")[0]
     assert agent[agent.index("--agent") + 1] == str(policy_folder(tmp_path, 1, 2))
+    assert parsed(agent).agent == policy_folder(tmp_path, 1, 2)
     assert "--pipe" not in agent
     assert len(commands("no-penalty")) == 1  # which nobody tries out
     assert "gail.gradient_penalty=0" in calls[0]
+
+
+def parsed(arguments):
+    """What the command line makes of them; it ends the test where it does not know one."""
+    return train_main._parser().parse_args(arguments)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_settings_of_each_kind_are_known(tmp_path, monkeypatch, kind):
+    calls = []
+    monkeypatch.setattr(confined_stages, "command", lambda log, *arguments: calls.append(arguments))
+    confined_stages.learn(tmp_path, SMOKE, kind, 0, 0)
+    options = parsed(calls[0])
+    config = train_main._config(IMITATION_PRESETS[options.preset], options)
+    assert config.n_epochs == 2
+    assert config.stage_epochs == ((0, 1) if kind == "circle" else (0,))
+    assert (config.gail.gradient_penalty == 0) == (kind == "no-penalty")
+    assert (options.reward is not None) == (kind == "narrow")
+    assert options.pipe == {"narrow": 250, "circle": None}.get(kind, 300)
 
 
 def test_recording_that_ends_early_is_no_demonstration(tmp_path, monkeypatch):
@@ -621,6 +650,7 @@ def test_recording_that_ends_early_is_no_demonstration(tmp_path, monkeypatch):
 
     def ends_early(log, *arguments):
         assert arguments[:4] == ("demos", "record", "--arm", "twin:3:pipe300")
+        assert parsed(arguments).task == "pipe300"
         (tmp_path / "twin3" / arguments[-1]).write_text("half of it")
         raise JobError("ended early")
 
