@@ -60,9 +60,9 @@ class EnvConfig:
     n_poses: int = 8192  # poses of the reachable workspace that starts and goals are drawn from
     workspace_seed: int = 0
     dynamic_step_s: float = 0.5  # duration of one environment step in dynamic mode
-    pipe_diameter_mm: float | None = (
-        None  # of the cross-shaped pipe around the arm; it has no solid walls here
-    )
+    pipe_diameter_mm: float | None = None  # of the cross-shaped pipe around the arm, which nothing touches
+    clearance_cost_per_mm: float = 0.0  # by which the body is closer to its wall than the margin
+    clearance_margin_mm: float = 10.0
 
     def __post_init__(self):
         for name, allowed in (("engine", ("chain", "mjx")), ("mode", ("quasistatic", "dynamic"))):

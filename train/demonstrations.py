@@ -1,10 +1,10 @@
-"""Demonstrations: positions that an expert brought the arm to, as transitions to learn from.
+"""Demonstrations: positions that an expert brought the arm to, each with the action that leads there.
 
 A file of demonstrations is a log (`mjx_softarm.logs`) of rows at rest, with the springs' frequencies, the
-tip's pose, and the id of the sequence that a row belongs to. A row's action is its own frequencies: they are
-what to ask of the springs to come to its pose, from wherever. So a row makes a transition from the row before
-it in its sequence, and one that stays where it is; the goal of both is the row's pose. There is nothing to
-repair in so few rows: whatever is wrong with one of them refuses the file.
+tip's pose, and the id of the sequence that a row belongs to. A row's action is its own frequencies: asked of
+the springs, they lead to the row's pose from wherever the arm is. So a row's pose is the goal of its action,
+and any other one its start. There is nothing to repair in so few rows: whatever is wrong with one of them
+refuses the file.
 
 Source: the paper's representation of demonstration data, g' = the pose of s_{t+1}.
 """
@@ -28,19 +28,15 @@ NEEDED = ("frequency_hz", "tip_m", "tip_quaternion", "sequence")
 
 
 class Demonstrations(NamedTuple):
-    """m demonstrated positions and the n transitions that they make; float32, ids int32."""
+    """m demonstrated positions; float32, ids int32."""
 
-    pose: np.ndarray  # (n, 6) [mm, deg] where a transition begins
-    action: np.ndarray  # (n, n_chambers) in [-1, 1]
-    goal: np.ndarray  # (n, 6) [mm, deg] where it ends
-    index: np.ndarray  # (n,) of the position where it ends
     positions: np.ndarray  # (m, 6) [mm, deg]
     actions: np.ndarray  # (m, n_chambers) in [-1, 1] that lead to a position
     sequence: np.ndarray  # (m,)
 
 
 def load_demonstrations(path: str | Path, spec: ArmSpec) -> Demonstrations:
-    """Read a file, check all of it, and make its transitions.
+    """Read a file and check all of it.
 
     Args:
         path: CSV, or npz by the end of its name.
@@ -49,7 +45,7 @@ def load_demonstrations(path: str | Path, spec: ArmSpec) -> Demonstrations:
     Raises:
         LogError: the file cannot be used; the message has a line for each finding.
     """
-    return transitions(read_demonstrations(path, spec)[0], spec)
+    return from_log(read_demonstrations(path, spec)[0], spec)
 
 
 def read_demonstrations(path: str | Path, spec: ArmSpec) -> tuple[Log, list[Finding]]:
@@ -65,17 +61,13 @@ def read_demonstrations(path: str | Path, spec: ArmSpec) -> tuple[Log, list[Find
     return sheet.log(), extra
 
 
-def transitions(log: Log, spec: ArmSpec) -> Demonstrations:
-    """Transitions of checked rows: each row's from itself, then each row's from the one before, if any."""
+def from_log(log: Log, spec: ArmSpec) -> Demonstrations:
+    """The demonstrations that checked rows are."""
     low, high = frequency_range_hz(spec).T
-    actions = np.clip(2.0 * (log.frequency_hz - low) / (high - low) - 1.0, -1.0, 1.0).astype(np.float32)
-    positions = pose_from_quaternion(log.tip_m, log.tip_quaternion).astype(np.float32)
-    sequence = log.sequence.astype(np.int32)
-    stays = np.arange(len(log))
-    moves = 1 + np.flatnonzero(sequence[1:] == sequence[:-1])
-    start, index = np.concatenate([stays, moves - 1]), np.concatenate([stays, moves]).astype(np.int32)
+    actions = np.clip(2.0 * (log.frequency_hz - low) / (high - low) - 1.0, -1.0, 1.0)
+    positions = pose_from_quaternion(log.tip_m, log.tip_quaternion)
     return Demonstrations(
-        positions[start], actions[index], positions[index], index, positions, actions, sequence
+        positions.astype(np.float32), actions.astype(np.float32), log.sequence.astype(np.int32)
     )
 
 

@@ -14,7 +14,7 @@ from mjx_softarm.logs import Log, write_log
 from mjx_softarm.s2r import S2R
 from mjx_softarm.spec import ArmSpec
 from train.config import ConfigError
-from train.demonstrations import read_demonstrations, transitions
+from train.demonstrations import from_log, read_demonstrations
 from train.waypoints import TASKS, task
 
 _STOPPED, _INTERRUPTED = 3, 130
@@ -91,7 +91,7 @@ def _check(options: argparse.Namespace, console: Console, spec: ArmSpec, _: S2R 
 
 
 def _summary(log: Log, spec: ArmSpec) -> list[str]:
-    demos = transitions(log, spec)
+    demos = from_log(log, spec)
     ids, counts = np.unique(demos.sequence, return_counts=True)
     sequences = ", ".join(f"{k} with {count}" for k, count in zip(ids, counts, strict=True))
     low, high = demos.positions.min(axis=0), demos.positions.max(axis=0)
@@ -99,7 +99,6 @@ def _summary(log: Log, spec: ArmSpec) -> list[str]:
     lines = [
         f"positions: {len(log)}, tip [mm]: {ranges}",
         f"sequences: {len(ids)}: {sequences}",
-        f"transitions: {len(demos.index)}, {len(log)} of them stay",
         f"actions: {demos.actions.min():.3f} to {demos.actions.max():.3f} of -1 to 1",
     ]
     if len(log) > 1:

@@ -45,8 +45,7 @@ def env():
 @pytest.fixture(scope="module")
 def demonstrations(env):
     positions, actions = env.pool.pose[:N], env.action_of(env.pool.spring_m[:N])
-    index = np.arange(N)
-    return Demonstrations(positions, actions, positions, index, positions, actions, np.zeros(N, np.int32))
+    return Demonstrations(positions, actions, np.zeros(N, np.int32))
 
 
 @pytest.fixture(scope="module")

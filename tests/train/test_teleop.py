@@ -176,7 +176,7 @@ def test_keys_move_the_finger_tips(expert, command, tmp_path):
     assert status == 0, told
     assert "not moved since the start" in told and "was logged" in told and "got key '?'" in told
     demos = load_demonstrations(out, SPEC)
-    assert demos.sequence.tolist() == [0, 0, 0] and len(demos.index) == 3 + 2
+    assert demos.sequence.tolist() == [0, 0, 0]
     start_m = IdealArm().finger_m
     moved_mm = np.cumsum([[20.0, 0.0, 0.0], [-5.0, 0.0, 5.0], [0.0, -20.0, 0.0]], axis=0)
     rows = np.loadtxt(out, delimiter=",", skiprows=1)
