@@ -186,8 +186,9 @@ def scene_of(folder: Path, settings: Settings, trial: Trial) -> Scene:
     policy = load_policy(learned_folder(folder, trial.kind, trial.twin, trial.seed) / POLICY_FILE)
     if diameter_mm := pipe_mm(of.task):
         demonstrations = load_demonstrations(demonstrations_file(folder, trial.twin, of.task), policy.spec)
-        goals = demonstrations.positions.astype(float)
-        names = [waypoint.name for waypoint in task_of(of.task, policy.spec).waypoints]
+        goals = demonstrations.positions[: settings.n_positions].astype(float)
+        waypoints = task_of(of.task, policy.spec).waypoints
+        names = [waypoint.name for waypoint in waypoints[: settings.n_positions]]
     else:
         goals, names = circle_poses(settings.n_points).astype(float), [""] * settings.n_points
     pipe = CrossPipe.of_mm(diameter_mm) if diameter_mm else None

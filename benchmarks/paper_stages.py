@@ -37,7 +37,8 @@ class Settings:
     training: tuple[str, ...] = ()  # further settings, NAME=VALUE
     imitation: tuple[str, ...] = ()  # likewise, of learning from demonstrations
     n_poses: int = 500
-    n_points: int = 40
+    n_points: int = 40  # of the circle
+    n_positions: int | None = None  # of a pipe's task, from the first; None is all
     loads_g: tuple[int, ...] = (35, 105, 220, 330, 500, 1000)
 
     def fixed(self) -> dict:
@@ -54,6 +55,7 @@ SMOKE = Settings(
     imitation=("total_env_steps=512", "warmup_env_steps=128", "n_arms=16", "updates_per_env_step=0.25"),
     n_poses=80,
     n_points=4,
+    n_positions=7,  # up to where the first thing lies
     loads_g=(500,),
 )
 

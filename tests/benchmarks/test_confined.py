@@ -678,6 +678,9 @@ def test_scene_is_the_twin_in_its_pipe(tmp_path, make_arm_model, monkeypatch):
         "pick right",
         "place left",
     ]
+    few = dataclasses.replace(TINY, n_positions=7)
+    scene = confined_stages.scene_of(tmp_path, few, Trial("narrow", 0, 0))
+    assert len(scene.goals) == 7 and scene.names[-1] == "pick left"
     scene = confined_stages.scene_of(tmp_path, TINY, Trial("circle", 0, 0))
     assert "pipe" not in scene.twin.describe()
     assert np.array_equal(scene.goals, circle_poses(TINY.n_points).astype(float))
