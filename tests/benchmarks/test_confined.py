@@ -428,10 +428,12 @@ def calibrate(folder, settings):
 
 def test_results_are_written_and_nothing_is_hidden(tmp_path, read_page):
     calibrate(tmp_path, TINY)
-    lost = made_up("pipe", fails=(0, 1, 2, 3))
-    lost.error[:] = np.nan
+    changed = {}
+    for trial in (Trial("pipe", 1, 0), Trial("narrow", 0, 0), Trial("narrow", 1, 0)):
+        changed[trial] = made_up(trial.kind, fails=(0, 1, 2, 3))
+        changed[trial].error[:] = changed[trial].arrival_s[:] = np.nan
     given = good_results(TINY)
-    given = given._replace(trials={**given.trials, Trial("pipe", 1, 0): lost})
+    given = given._replace(trials={**given.trials, **changed})
     data = write_results(tmp_path, tmp_path / "out", TINY, given, "no OpenGL <here>", {"commit": "none"})
     page = read_page(tmp_path / HTML_FILE)
     assert page.n_pictures == 7
@@ -440,12 +442,12 @@ def test_results_are_written_and_nothing_is_hidden(tmp_path, read_page):
     assert f"not met: {X}: nan mm, 28 positions missed in 1 of 2 runs" in page.text
     assert f"not met: {BOTH}: 1 of 2" in page.text
     assert "twin 1: Springs: off <by> much" in page.text
-    assert "5 of 10 goals are not met." in page.text
+    assert "7 of 10 goals are not met." in page.text
     written = json.loads((tmp_path / "out" / JSON_FILE).read_text("utf-8"))
     assert written["commit"] == "none"
     assert len(written["figures"]["runs"]) == len(trials(TINY)) == len(data["runs"])
     assert len(written["figures"]["trainings"]) == len(trainings(TINY))
-    assert [row["x_mm"] is None for row in written["figures"]["runs"]].count(True) == 1
+    assert [row["x_mm"] is None for row in written["figures"]["runs"]].count(True) == 3
     pictures = {path.name for path in (tmp_path / "out").glob("*.png")}
     names = ("positions", "errors", "errors-narrow", "force", "success", "losses", "circle")
     assert pictures == {f"paper-confined-{name}.png" for name in names}
