@@ -152,7 +152,7 @@ def _at_most_mm(name: str, members: Sequence[Row]) -> Check:
 
 def _both(shown: Sequence[Row], exchanged: Sequence[Row]) -> Check:
     """Of each policy, as shown and exchanged."""
-    done = [{(row["twin"], row["seed"]): _all_done(row) for row in rows} for rows in (shown, exchanged)]
+    done = [{(row["twin"], row["seed"]): _all_done(row) for row in of} for of in (shown, exchanged)]
     both = [done[0].get(key, False) and done[1].get(key, False) for key in done[0].keys() | done[1].keys()]
     text = "300 mm pipe: all four operations done, as shown and exchanged"
     return _done(text, WIDE_RUNS, both if shown and exchanged else [])
@@ -197,7 +197,7 @@ def _circle(members: Sequence[Row], without: Sequence[Row]) -> Check:
     text = "circle: mean translation with demonstrations not above that without"
     if not (members and without):
         return Check(text, "not measured", False)
-    means = [float(np.mean([row["translation_mm"] for row in rows])) for rows in (members, without)]
+    means = [float(np.mean([row["translation_mm"] for row in of])) for of in (members, without)]
     everyone = [*members, *({**row, "positions": row["points"]} for row in without)]
     value = f"{means[0]:.2f} mm with, {means[1]:.2f} mm without{_missed(everyone)}"
     return Check(text, value, means[0] <= means[1] and _complete(everyone))
