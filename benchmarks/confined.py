@@ -14,6 +14,7 @@ from benchmarks.confined_stages import (
     TASKS,
     circles,
     demonstrate,
+    export,
     learn,
     load_results,
     trainings,
@@ -54,6 +55,7 @@ def run(folder: Path, pictures: Path, settings: Settings) -> dict[str, Any]:
                 if bool(KINDS[kind].reward_of) == builds_on_others
             ]
         )
+    in_parallel([(f"export for twin {twin}", export, (folder, settings, twin)) for twin in settings.twins])
     no_film = in_parallel(_trials(folder, settings))["film"]
     return write_results(
         folder, pictures, settings, load_results(folder, settings), no_film, provenance("benchmarks")

@@ -136,7 +136,7 @@ def demonstrate(folder: Path, twin: int, task: str) -> None:
 
 
 def learn(folder: Path, settings: Settings, kind: str, twin: int, seed: int) -> None:
-    """Train and export a policy from demonstrations.
+    """Train a policy from demonstrations.
 
     Raises:
         JobError: a command failed.
@@ -159,8 +159,18 @@ def learn(folder: Path, settings: Settings, kind: str, twin: int, seed: int) -> 
             for text in (*of.settings, *settings.imitation):
                 options += ["--set", text]
             command(log, "imitate", str(demonstrations_file(folder, twin, of.task)), *options)
-    if kind != "no-penalty" and not (run / POLICY_FILE).exists():
-        command(log, "export", str(run))
+
+
+def export(folder: Path, settings: Settings, twin: int) -> None:
+    """Export all policies of a twin at once: they share what is distilled for its arm.
+
+    Raises:
+        JobError: the command failed.
+    """
+    tried = {(trial.kind, trial.seed) for trial in trials(settings) if trial.twin == twin}
+    runs = [learned_folder(folder, kind, twin, seed) for kind, seed in sorted(tried)]
+    if new := [str(run) for run in runs if not (run / POLICY_FILE).exists()]:
+        command(folder / f"export-twin{twin}.log", "export", *new)
 
 
 class Scene(NamedTuple):

@@ -66,8 +66,8 @@ def _parser() -> argparse.ArgumentParser:
     evaluate = commands.add_parser("evaluate", help="a run's newest policy, with figures and pictures")
     evaluate.add_argument("run", type=Path, help="folder of the run")
     evaluate.set_defaults(command=_evaluate)
-    export = commands.add_parser("export", help="write the policy as one npz file")
-    export.add_argument("run", type=Path, help="folder of the run")
+    export = commands.add_parser("export", help="write policies, each as one npz file")
+    export.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="folder of a run")
     export.add_argument("--out", type=Path, help="default: RUN/policy.npz")
     export.set_defaults(command=_export)
     add_commands(commands, _arm)
@@ -193,8 +193,10 @@ def _evaluate(options: argparse.Namespace, console: Console) -> int:
 def _export(options: argparse.Namespace, console: Console) -> int:
     from train.export import export_run
 
-    path = export_run(Run.open(options.run), options.out)
-    console.print(f"policy: {path}", highlight=False)
+    if options.out and len(options.runs) > 1:
+        raise ConfigError(f"--out {options.out}: got {len(options.runs)} runs, expected one with it")
+    for path in options.runs:
+        console.print(f"policy: {export_run(Run.open(path), options.out)}", highlight=False)
     return 0
 
 

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import re
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -556,6 +557,7 @@ def test_interrupted_benchmark_does_only_what_is_missing(tmp_path, monkeypatch):
     calibrate(tmp_path, TINY)
     stubs = {"in_parallel": inline, "try_out": try_out, "follow_circle": follow, "learn": learn}
     stubs["demonstrate"] = lambda folder, twin, task: done.append((task, twin))
+    stubs["export"] = lambda folder, settings, twin: done.append(("export", twin))
     for name, stub in stubs.items():
         monkeypatch.setattr(confined, name, stub)
     monkeypatch.setattr(paper_stages, "learn_twin", lambda *_: done.append("twin"))
@@ -609,22 +611,38 @@ def test_training_starts_with_what_it_builds_on_resumes_or_starts_anew(tmp_path,
     start = ["imitate", demonstrations, "--preset", "frozen", "--seed", "2", "--out", str(run)]
     start += ["--calibration", str(tmp_path / "twin1" / "calibration"), "--pipe", "250"]
     start += ["--reward", str(learned_folder(tmp_path, "pipe", 1, 2)), "--set", "n_arms=16"]
-    assert commands() == [tuple(start), ("export", str(run))]
+    assert commands() == [tuple(start)]
     (run / "checkpoints").mkdir(parents=True)
     (run / "config.json").touch()  # interrupted before it had the reward
     assert commands()[0] == tuple(start)
     assert not run.exists()
     (run / "checkpoints" / "0").mkdir(parents=True)
-    assert commands() == [("imitate", "--resume", str(run)), ("export", str(run))]
+    assert commands() == [("imitate", "--resume", str(run))]
     (run / "evaluation.json").touch()
-    (run / "policy.npz").touch()
     assert commands() == []
     agent = commands("circle")[0]
     assert agent[agent.index("--agent") + 1] == str(policy_folder(tmp_path, 1, 2))
     assert parsed(agent).agent == policy_folder(tmp_path, 1, 2)
     assert "--pipe" not in agent
-    assert len(commands("no-penalty")) == 1  # which nobody tries out
-    assert "gail.gradient_penalty=0" in calls[0]
+    assert "gail.gradient_penalty=0" in commands("no-penalty")[0]
+
+
+def test_policies_that_are_tried_out_are_exported_in_one_go(tmp_path, monkeypatch):
+    calls = []
+    monkeypatch.setattr(confined_stages, "command", lambda log, *arguments: calls.append(arguments))
+    settings = Settings(twins=(0, 1), seeds=(2,))
+    done = learned_folder(tmp_path, "circle", 0, 2) / "policy.npz"
+    done.parent.mkdir()
+    done.touch()
+    confined_stages.export(tmp_path, settings, 0)
+    wanted = [str(learned_folder(tmp_path, kind, 0, 2)) for kind in ("hand-made", "narrow", "pipe")]
+    assert calls == [("export", *wanted)]
+    assert parsed(calls[0]).runs == [Path(path) for path in wanted]
+    for path in wanted:
+        (Path(path) / "policy.npz").parent.mkdir()
+        (Path(path) / "policy.npz").touch()
+    confined_stages.export(tmp_path, settings, 0)
+    assert len(calls) == 1
 
 
 def parsed(arguments):
