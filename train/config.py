@@ -186,8 +186,9 @@ PRESETS: dict[str, TrainConfig] = {
     "paper": dataclasses.replace(_TUNED, total_env_steps=300_000, updates_per_env_step=0.5),
 }
 
-# The paper's schedules with a tenth or a fifth of its steps, which is enough: 8 of the circle's 16 points, then
-# all; the pipe's positions, shifted to the worst six times.
+# The paper's schedules with a tenth or a fifth of its steps, which is enough: the pipe's positions, shifted to
+# the worst six times; 8 of the circle's 16 points, then all, the environment's own reward beside the learned one,
+# so that points between them stay where they are.
 _PIPE = ImitationConfig(
     total_env_steps=60_000,
     updates_per_env_step=0.2,
@@ -207,7 +208,9 @@ _HAND_MADE = dataclasses.replace(
 )
 IMITATION_PRESETS: dict[str, ImitationConfig] = {
     "circle": dataclasses.replace(
-        _PIPE,
+        _HAND_MADE,
+        tqc=dataclasses.replace(_HAND_MADE.tqc, learning_rate=3e-4),
+        learned_weight=5.0,
         rebalance_env_steps=0,
         stages=(Stage(share=1 / 3, every=2), Stage(share=2 / 3, kept=0.2)),
     ),
