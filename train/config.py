@@ -187,8 +187,8 @@ PRESETS: dict[str, TrainConfig] = {
 }
 
 # The paper's schedules with a tenth or a fifth of its steps, which is enough: the pipe's positions, shifted to
-# the worst six times; 8 of the circle's 16 points, then all, the environment's own reward beside the learned one,
-# so that points between them stay where they are.
+# the worst six times; 8 of the circle's 16 points, then all, the environment's own reward beside the learned
+# one, so that points between them stay where they are.
 _PIPE = ImitationConfig(
     total_env_steps=60_000,
     updates_per_env_step=0.2,
