@@ -90,7 +90,7 @@ def test_a_bad_setting_is_named(change):
 
 
 def test_an_expert_is_recovered_from_its_actions_alone():
-    """Eight goals in the plane, two actions; the reward is the learned one, a quarter of a batch the expert's."""
+    """Eight goals in the plane; the reward is the learned one, a quarter of a batch the expert's."""
     goals = jnp.asarray(np.random.default_rng(1).uniform(-1.0, 1.0, (8, 2)), jnp.float32)
     answers = jnp.stack(
         [0.7 * jnp.sin(2.0 * goals[:, 0]), 0.5 * goals[:, 1] - 0.3 * goals[:, 0] ** 2], axis=-1
