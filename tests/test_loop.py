@@ -604,7 +604,7 @@ def test_command_line_runs_without_jax(folder):
         folder, "run", "policy.npz", "--arm", "driver:Arm", goal, "--log", "a.csv", "--duration", "1"
     )
     assert done.stderr == "" and done.stdout.endswith("0 []\n")
-    assert "computing per tick: median" in done.stdout and "the arm is vented" in done.stdout
+    assert "from readings to pressures: median" in done.stdout and "the arm is vented" in done.stdout
     assert len(read_log(folder / "a.csv")[0]) > 0
     done = command(folder, "record", "--arm", "driver:Arm", "--out", "b.csv", "--poses", "2")
     assert done.stderr == "" and done.stdout.endswith("0 []\n") and "no motion capture" in done.stdout

@@ -16,20 +16,26 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.table import Table
 
+from mjx_softarm import xla
 from mjx_softarm.archive import SealedFileError
 from mjx_softarm.checks import LogError
 from mjx_softarm.deploy.arms import ArmError
 from mjx_softarm.s2r import S2R, S2R_FILE, load_s2r
 from mjx_softarm.spec import ARM_FILE, ArmSpec, SpecError
 from train.checkpoint import Run, RunError
-from train.config import IMITATION_PRESETS, PRESETS, ConfigError, override
-from train.demonstrations import read_demonstrations
+from train.config import (
+    IMITATION_PRESETS,
+    IMITATION_PRESETS_HELP,
+    PRESETS,
+    ConfigError,
+    override,
+)
+from train.demonstrations import from_log, read_demonstrations
 from train.demos import add_commands
 from train.evaluate import N_ACTIONS
 from train.expert import ExpertError
 
 if TYPE_CHECKING:
-    from mjx_softarm.env import ReachEnv
     from train.task import Task
 
 
@@ -37,6 +43,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run a command; returns the exit status."""
     options = _parser().parse_args(arguments)
     console = Console()
+    xla.enable_compilation_cache()
     try:
         return options.command(options, console)
     except (RunError, ConfigError, SpecError, SealedFileError, LogError, ArmError, ExpertError) as error:
@@ -55,9 +62,16 @@ def _parser() -> argparse.ArgumentParser:
     _add_run(reach, PRESETS, "quick", "runs/reach-PRESET-seedSEED")
     reach.set_defaults(command=_reach)
     imitate = commands.add_parser("imitate", help="train a policy that reaches positions as they were shown")
-    imitate.add_argument("demonstrations", type=Path, nargs="?", metavar="FILE", help="of `demos record`")
-    _add_run(imitate, IMITATION_PRESETS, "pipe", "runs/imitate-PRESET-seedSEED")
-    imitate.add_argument("--pipe", type=float, metavar="MM", help="diameter of the pipe; default: none")
+    imitate.add_argument(
+        "file", type=Path, nargs="?", metavar="FILE", help="demonstrations as `demos record` writes them"
+    )
+    _add_run(imitate, IMITATION_PRESETS, "pipe", "runs/imitate-PRESET-seedSEED", IMITATION_PRESETS_HELP)
+    imitate.add_argument(
+        "--pipe",
+        type=float,
+        metavar="MM",
+        help="diameter of the pipe that the body is to stay inside, as the evaluation counts; default: none",
+    )
     imitate.add_argument("--agent", type=Path, metavar="RUN", help="begin with this run's actor and critics")
     imitate.add_argument(
         "--reward", type=Path, metavar="RUN", help="take the reward that this run learned, and leave it so"
@@ -74,9 +88,11 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _add_run(parser: argparse.ArgumentParser, presets: Iterable[str], default: str, folder: str) -> None:
+def _add_run(
+    parser: argparse.ArgumentParser, presets: Iterable[str], default: str, folder: str, more: str = ""
+) -> None:
     """The options that all runs have."""
-    parser.add_argument("--preset", choices=presets, help=f"default: {default}")
+    parser.add_argument("--preset", choices=presets, help=f"{more}default: {default}")
     parser.add_argument("--seed", type=int, help="of networks, exploration, goals and batches; default: 0")
     parser.add_argument("--spec", type=Path, help="TOML file of the arm; default: the paper's arm")
     parser.add_argument(
@@ -94,6 +110,7 @@ def _add_run(parser: argparse.ArgumentParser, presets: Iterable[str], default: s
 def _reach(options: argparse.Namespace, console: Console) -> int:
     from mjx_softarm.env import ReachEnv
     from train.run import default_path
+    from train.task import task_of
 
     if options.resume:
         return _resume(options, console)
@@ -101,41 +118,44 @@ def _reach(options: argparse.Namespace, console: Console) -> int:
     config = _config(PRESETS[preset], options)
     spec, s2r = _arm(options, console)
     console.print("drawing goals from the reachable workspace ...")
-    env = ReachEnv(spec, config.env, s2r)
-    run = Run.create(options.out or default_path("reach", preset, config.seed), config, spec, s2r)
-    return _train(run, env, console)
+    task = task_of(config, ReachEnv(spec, config.env, s2r))
+    path = options.out or default_path("reach", preset, config.seed)
+    return _train(Run.create(path, config, spec, s2r), task, console)
 
 
 def _imitate(options: argparse.Namespace, console: Console) -> int:
     from mjx_softarm.env import ReachEnv
     from train.run import begin_with, default_path
+    from train.task import task_of
 
     if options.resume:
         return _resume(options, console)
-    if options.demonstrations is None:
+    if options.file is None:
         raise ConfigError("FILE: missing, expected the demonstrations, or --resume RUN")
     preset = options.preset or "pipe"
     assignments = [] if options.pipe is None else [f"env.pipe_diameter_mm={options.pipe}"]
     assignments += ["frozen=true"] if options.reward else []
     config = _config(IMITATION_PRESETS[preset], options, assignments)
     if config.frozen and not options.reward:
-        raise ConfigError("frozen: got true, expected --reward RUN with it")
+        raise ConfigError("frozen: got true, expected --reward RUN, the run whose learned reward it takes")
+    if options.reward and not config.learned_weight:
+        raise ConfigError(f"--reward {options.reward}: got learned_weight 0, expected more, for its reward")
     spec, s2r = _arm(options, console)
-    log, _ = read_demonstrations(options.demonstrations, spec)
-    donors = {name: Run.open(path) for name in ("agent", "reward") if (path := getattr(options, name))}
-    env = ReachEnv(spec, config.env, s2r)
-    run = Run.create(options.out or default_path("imitate", preset, config.seed), config, spec, s2r, log)
-    begin_with(run, env, **donors)
-    return _train(run, env, console)
+    log, _ = read_demonstrations(options.file, spec)
+    donors = {name: path for name in ("agent", "reward") if (path := getattr(options, name))}
+    task = task_of(config, ReachEnv(spec, config.env, s2r), from_log(log, spec))
+    state = begin_with(task, config.seed, **{name: Run.open(path) for name, path in donors.items()})
+    path = options.out or default_path("imitate", preset, config.seed)
+    return _train(Run.create(path, config, spec, s2r, log, donors, state), task, console)
 
 
 def _resume(options: argparse.Namespace, console: Console) -> int:
-    from mjx_softarm.env import ReachEnv
+    from train.run import task_of_run
 
     if _given(options):
         raise ConfigError(f"--resume goes alone: the run's own settings hold, got {_given(options)} too")
     run = Run.open(options.resume)
-    return _train(run, ReachEnv(run.spec, run.config.env, run.s2r), console)
+    return _train(run, task_of_run(run), console)
 
 
 def _config(preset: Any, options: argparse.Namespace, assignments: Sequence[str] = ()) -> Any:
@@ -145,14 +165,10 @@ def _config(preset: Any, options: argparse.Namespace, assignments: Sequence[str]
     return override(preset, [*assignments, *given, *options.set])
 
 
-def _train(run: Run, env: ReachEnv, console: Console) -> int:
-    from mjx_softarm import xla
+def _train(run: Run, task: Task, console: Console) -> int:
     from train.run import Interrupted, train
-    from train.task import task_of
 
-    xla.enable_compilation_cache()
     console.print(f"run: {run.path}", highlight=False)
-    task = task_of(run, env)
     try:
         summary = train(run, task, console)
     except Interrupted as stop:
@@ -182,11 +198,11 @@ def _given(options: argparse.Namespace) -> str:
 
 
 def _evaluate(options: argparse.Namespace, console: Console) -> int:
-    from train.run import finish, restore
+    from train.run import finish, restore_actor
 
     run = Run.open(options.run)
-    task, state = restore(run)
-    _show(run, task, finish(run, task, state.agent.actor_params), console)
+    task, actor_params = restore_actor(run)
+    _show(run, task, finish(run, task, actor_params), console)
     return 0
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +16,12 @@ from mjx_softarm.logs import Log, write_log
 from mjx_softarm.provenance import provenance, write_json
 from mjx_softarm.s2r import S2R, S2R_FILE, load_s2r, save_s2r
 from mjx_softarm.spec import ArmSpec
-from train.config import TrainConfig, from_dict, to_dict
+from train.config import ImitationConfig, TrainConfig, from_dict, to_dict
 from train.demonstrations import Demonstrations, load_demonstrations
 from train.job import TrainState
 
 N_KEPT = 2
-DEMONSTRATIONS_FILE = "demonstrations.npz"
+CHECKPOINTS, DEMONSTRATIONS_FILE = "checkpoints", "demonstrations.npz"
 
 
 class RunError(ValueError):
@@ -38,7 +39,7 @@ class Run:
     def __init__(self, path: Path, config: TrainConfig, spec: ArmSpec, s2r: S2R | None = None):
         self.path, self.config, self.spec, self.s2r = path, config, spec, s2r
         options = ocp.CheckpointManagerOptions(max_to_keep=N_KEPT, enable_async_checkpointing=False)
-        self._manager = ocp.CheckpointManager((path / "checkpoints").resolve(), options=options)
+        self._manager = ocp.CheckpointManager((path / CHECKPOINTS).resolve(), options=options)
 
     @classmethod
     def create(
@@ -48,8 +49,19 @@ class Run:
         spec: ArmSpec,
         s2r: S2R | None = None,
         demonstrations: Log | None = None,
+        begins_with: dict[str, Path] | None = None,
+        state: TrainState | None = None,
     ) -> Run:
         """Start a folder.
+
+        Args:
+            path: of the folder.
+            config: all settings.
+            spec: the arm.
+            s2r: of its calibration, if it has one.
+            demonstrations: rows of the file that is learned from.
+            begins_with: folders of the runs that parts of the first state come from, by part.
+            state: that first state. The folder is a run's only once it holds it.
 
         Raises:
             RunError: the folder already holds a run, or cannot be made.
@@ -64,16 +76,21 @@ class Run:
                 save_s2r(path / S2R_FILE, s2r)
             if demonstrations is not None:
                 write_log(path / DEMONSTRATIONS_FILE, demonstrations)
+            shutil.rmtree(path / CHECKPOINTS, ignore_errors=True)  # of a start that was interrupted
+            run = cls(path, config, spec, s2r)
+            if state is not None:
+                run.save(0, state)
             data = {
                 "train": to_dict(config),
                 "spec": spec.to_dict(),
                 "s2r": s2r is not None,
+                "begins_with": {name: str(folder) for name, folder in (begins_with or {}).items()},
                 "provenance": provenance("train"),
             }
             write_json(path / "config.json", data)
         except OSError as error:
             raise RunError(f"{path}: cannot be written: {error.strerror}") from error
-        return cls(path, config, spec, s2r)
+        return run
 
     @classmethod
     def open(cls, path: Path) -> Run:
@@ -95,12 +112,14 @@ class Run:
         s2r = load_s2r(path / S2R_FILE, spec.n_chambers) if has_s2r else None
         return cls(path, config, spec, s2r)
 
-    def demonstrations(self) -> Demonstrations:
-        """What the run learns from.
+    def demonstrations(self) -> Demonstrations | None:
+        """What the run learns from, if it learns from demonstrations.
 
         Raises:
             RunError: its file cannot be read.
         """
+        if not isinstance(self.config, ImitationConfig):
+            return None
         try:
             return load_demonstrations(self.path / DEMONSTRATIONS_FILE, self.spec)
         except LogError as error:
@@ -125,11 +144,30 @@ class Run:
         Raises:
             RunError: there is no checkpoint.
         """
+        epoch, shapes = self._newest(), jax.tree.map(ocp.utils.to_shape_dtype_struct, like)
+        return epoch, self._manager.restore(epoch, args=ocp.args.StandardRestore(shapes))
+
+    def restore_part(self, name: str, like: Any) -> Any:
+        """One field of the newest checkpoint's state, without reading the others.
+
+        Args:
+            name: of the field.
+            like: its value, or shapes, structured as the run's.
+
+        Raises:
+            RunError: there is no checkpoint.
+        """
+        wanted = {name: jax.tree.map(ocp.utils.to_shape_dtype_struct, like)}
+        arguments = ocp.args.PyTreeRestore(
+            wanted, ocp.checkpoint_utils.construct_restore_args(wanted), partial_restore=True
+        )
+        return self._manager.restore(self._newest(), args=arguments)[name]
+
+    def _newest(self) -> int:
         epoch = self.latest_epoch
         if epoch is None:
             raise RunError(f"{self.path}: holds no checkpoint; start it anew")
-        shapes = jax.tree.map(ocp.utils.to_shape_dtype_struct, like)
-        return epoch, self._manager.restore(epoch, args=ocp.args.StandardRestore(shapes))
+        return epoch
 
     def log(self, row: dict[str, Any]) -> None:
         """Append a line to `metrics.jsonl`."""

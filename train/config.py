@@ -118,7 +118,8 @@ class ImitationConfig(TrainConfig):
         gail: the discriminator.
         learned_weight: of the learned reward; without it, of the demonstrations the positions alone are seen.
         hand_made_weight: of the environment's reward.
-        frozen: the discriminator is another run's and stays as it is, so the positions alone are seen too.
+        frozen: the discriminator is another run's and stays as it is; of the demonstrations, the positions
+            alone are seen then too.
         expert_share: of a batch of the critics that is the expert's, while the discriminator learns.
         stages: in order; their shares add up to 1.
         rebalance_env_steps: steps between two shifts of the goals towards those that are missed by most; 0
@@ -147,6 +148,11 @@ class ImitationConfig(TrainConfig):
         total = sum(stage.share for stage in self.stages)
         if not math.isclose(total, 1.0, abs_tol=1e-6):
             raise ConfigError(f"stages: got shares that add up to {total:g}, expected 1")
+        if len(set(self.stage_epochs)) < len(self.stages):
+            raise ConfigError(
+                f"stages: got stages that begin before epochs {self.stage_epochs}, expected an epoch or more "
+                f"for each; there are {self.n_epochs}"
+            )
         if self.rebalance_env_steps < 0:
             raise ConfigError(f"rebalance_env_steps: got {self.rebalance_env_steps}, expected at least 0")
         if self.env.mode != "quasistatic":
@@ -186,9 +192,9 @@ PRESETS: dict[str, TrainConfig] = {
     "paper": dataclasses.replace(_TUNED, total_env_steps=300_000, updates_per_env_step=0.5),
 }
 
-# The paper's schedules with a tenth or a fifth of its steps, which is enough: the pipe's positions, shifted to
-# the worst six times; 8 of the circle's 16 points, then all, the environment's own reward beside the learned
-# one, so that points between them stay where they are.
+# The paper's schedules with a tenth or a fifth of its steps, which is enough. In the pipe, goals shift to the
+# worst with each sixth of the run. Of the circle's 16 points 8 come first, then all, the environment's own
+# reward beside the learned one, so that points between them stay where they are.
 _PIPE = ImitationConfig(
     total_env_steps=60_000,
     updates_per_env_step=0.2,
@@ -216,8 +222,12 @@ IMITATION_PRESETS: dict[str, ImitationConfig] = {
     ),
     "pipe": _PIPE,
     "hand-made": _HAND_MADE,
-    "frozen": dataclasses.replace(_HAND_MADE, learned_weight=5.0),  # which is another run's: `--reward`
+    "frozen": dataclasses.replace(_HAND_MADE, learned_weight=5.0, frozen=True),
 }
+IMITATION_PRESETS_HELP = (
+    "pipe: the learned reward; circle: both, in two stages; hand-made: the environment's reward at the "
+    "same goals; frozen: that and another run's learned reward, with --reward; "
+)
 
 
 def override(config: Any, assignments: list[str]) -> Any:

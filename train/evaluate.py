@@ -14,7 +14,7 @@ from jax import Array
 
 from mjx_softarm import rewards, xla
 from mjx_softarm._mjx import State
-from mjx_softarm.env import EnvConfig, Randomisation, ReachEnv
+from mjx_softarm.env import Randomisation, ReachEnv
 from mjx_softarm.workspace import HELD_OUT_SEED, circle_poses
 from train.tqc import TQC
 
@@ -77,9 +77,7 @@ class Evaluator:
     """
 
     def __init__(self, env: ReachEnv, agent: TQC, n_goals: int = N_GOALS):
-        nominal: EnvConfig = dataclasses.replace(env.config, randomisation=Randomisation())
-        self.env = env if nominal == env.config else ReachEnv(env.spec, nominal, env.s2r)
-        self.agent = agent
+        self.env, self.agent = nominal(env), agent
         self.goals = self.env.sample_pool(n_goals, HELD_OUT_SEED).pose
         self.circle = jnp.asarray(circle_poses())
         self._workspace = xla.jit(self._reach_all, env.uses_mjx)
@@ -95,6 +93,12 @@ class Evaluator:
         keys = jax.random.split(jax.random.PRNGKey(HELD_OUT_SEED), len(goals))
         starts = jax.vmap(self.env.reset)(keys)
         return jax.vmap(lambda *at: reach(self.env, self.agent, actor_params, *at)[1])(starts, goals)
+
+
+def nominal(env: ReachEnv) -> ReachEnv:
+    """The environment without randomisation."""
+    config = dataclasses.replace(env.config, randomisation=Randomisation())
+    return env if config == env.config else ReachEnv(env.spec, config, env.s2r)
 
 
 def reach(env: ReachEnv, agent: TQC, actor_params: Any, state: State, goal: Array) -> tuple[State, Reached]:

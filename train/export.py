@@ -15,7 +15,7 @@ from mjx_softarm.export import ArmModel, policy_from_actor, save_policy
 from mjx_softarm.spec import ArmSpec
 from train.checkpoint import Run
 from train.estimator import Distilled, distil
-from train.run import restore
+from train.run import restore_actor
 
 N_WORKSPACE = 2048  # poses that stand for the workspace
 SEED = 0  # of the estimator
@@ -28,7 +28,7 @@ def export_run(run: Run, path: Path | None = None) -> Path:
         RunError: the run has no checkpoint.
         SealedFileError: the file cannot be written.
     """
-    task, state = restore(run)
+    task, actor_params = restore_actor(run)
     model, distilled = arm_model(task.job.env)
     errors = {name: getattr(distilled, name) for name in ("tip_mm", "turn_deg", "spring_mm")}
     provenance = {
@@ -40,7 +40,7 @@ def export_run(run: Run, path: Path | None = None) -> Path:
         },
         "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     }
-    actor_params = jax.device_get(state.agent.actor_params)
+    actor_params = jax.device_get(actor_params)
     policy = policy_from_actor(actor_params, run.spec, run.config.env.reward, model, provenance)
     path = path or run.path / "policy.npz"
     save_policy(path, policy)

@@ -5,6 +5,9 @@ expert's answer to its goal from any start, and the expert is put where the agen
 compares two actions for one observation, and nothing but the action can tell them apart. The expert's answers
 also take a share of each batch of the critics, with the learned reward like all others.
 
+Goals of the first stage are some of the positions; starts are all of them. The learned reward is for goals
+that were asked for, not for those of hindsight, which the discriminator does not know.
+
 Episodes end with the goal reached or by the clock, so a reward that is never positive rewards no delay.
 """
 
@@ -28,6 +31,9 @@ from train.hindsight import Experience
 from train.job import Job, TrainState
 from train.tqc import TQCState, Transition
 
+SAME_GOAL = (
+    1e-5  # in units of the observation; rounding, where hindsight moves a goal by a millimetre or more
+)
 EVEN_SHARE = 0.5  # of the goals that are drawn evenly, however well they are reached
 
 
@@ -64,7 +70,7 @@ class ImitationJob(Job):
         stage = self.config.stages[self.config.stage_epochs.index(epoch)]
         memory = state.memory
         if stage.kept < 1.0 and epoch:
-            key = jax.random.fold_in(state.key, epoch)
+            key = jax.random.fold_in(state.key, 6)
             memory = self._thin(memory, key, jnp.asarray(stage.kept, jnp.float32))
         weight = jnp.asarray(self.goals_of(epoch), jnp.float32)
         return state._replace(memory=memory, imitation=state.imitation._replace(goal_weight=weight))
@@ -77,14 +83,15 @@ class ImitationJob(Job):
     def _init(self, key: Array) -> TrainState:
         state = super()._init(key)
         weight = jnp.asarray(self.goals_of(0), jnp.float32)
-        discriminator = self.gail.init(jax.random.fold_in(key, 1))
+        key_discriminator, key_first = (jax.random.fold_in(key, k) for k in (3, 4))  # `Job` splits off 0 to 2
+        discriminator = self.gail.init(key_discriminator)
         imitation = Imitation(discriminator, weight)
         return state._replace(
-            arms=self._between_positions(state.arms, weight, jax.random.fold_in(key, 2)), imitation=imitation
+            arms=self._between_positions(state.arms, weight, key_first), imitation=imitation
         )
 
     def _vector_step(self, state: TrainState, _) -> tuple[TrainState, dict[str, Array]]:
-        key = jax.random.fold_in(state.key, 0)
+        key = jax.random.fold_in(state.key, 5)  # `Job` splits off 0 to 4
         state, metrics = super()._vector_step(state, None)
         arms = self._between_positions(state.arms, state.imitation.goal_weight, key)
         return state._replace(arms=arms), metrics
@@ -111,10 +118,16 @@ class ImitationJob(Job):
             start = self.env.observe(stored.pose, stored.goal)
             expert, own = (start, self.actions[index]), (start, stored.action)
             discriminator, told = self.gail.update(discriminator, expert, own, key_between)
-        reward = self.config.hand_made_weight * batch.reward
+        # What the body's clearance costs is charged whatever the weights; the expert keeps clear.
+        cost = stored.clearance_cost.at[: self.n_expert].set(0.0)
+        reward = self.config.hand_made_weight * (batch.reward + cost) - cost
         if self.config.learned_weight > 0:
             learned = self.gail.reward(discriminator.params, batch.obs, batch.action)
-            reward, told = reward + self.config.learned_weight * learned, told | {"reward": jnp.mean(learned)}
+            asked = jnp.all(
+                batch.obs == self.env.observe(stored.pose, stored.goal), axis=-1
+            )  # not in hindsight
+            reward = reward + self.config.learned_weight * jnp.where(asked, learned, 0.0)
+            told = told | {"reward": jnp.sum(learned * asked) / jnp.maximum(jnp.sum(asked), 1)}
         agent, losses = self.agent.update(agent, batch._replace(reward=reward), key_update)
         metrics = {f"tqc/{name}": x for name, x in losses.items()}
         metrics |= {f"gail/{name}": x for name, x in told.items()}

@@ -15,7 +15,7 @@ from jax import Array
 from mjx_softarm import xla
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.pose import pose_error
-from train.evaluate import Reached, follow
+from train.evaluate import Reached, follow, nominal
 from train.tqc import TQC
 
 
@@ -64,14 +64,14 @@ class PositionSummary:
 class PositionEvaluator:
     """Evaluates actors on one path of positions (m, 6) [mm, deg]; compiled once.
 
-    A single arm goes from position to position, once along the path to get there. `first` (m,) bool tells the
-    positions that are goals from the start.
+    A single arm without randomisation goes from position to position, once along the path to get there.
+    `first` (m,) bool tells the positions that are goals from the start.
     """
 
     def __init__(self, env: ReachEnv, agent: TQC, positions: Array, first: np.ndarray):
-        self.env, self.first = env, first
+        self.env, self.first = nominal(env), first
         self.positions = jnp.asarray(positions)
-        self._follow = xla.jit(functools.partial(follow, env, agent), env.uses_mjx)
+        self._follow = xla.jit(functools.partial(follow, self.env, agent), env.uses_mjx)
 
     def __call__(self, actor_params: Any) -> tuple[PositionSummary, AtPositions]:
         """Figures, and what was reached, as NumPy arrays."""

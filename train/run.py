@@ -15,11 +15,11 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from tensorboardX import SummaryWriter
 
-from mjx_softarm import xla
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.provenance import write_json
 from train import plots
 from train.checkpoint import Run, RunError
+from train.config import ImitationConfig
 from train.job import Job, TrainState
 from train.task import Task, task_of
 
@@ -76,43 +76,49 @@ def finish(run: Run, task: Task, actor_params: Any) -> Any:
     return summary
 
 
-def restore(run: Run) -> tuple[Task, TrainState]:
-    """The task of a run, and the state of its newest checkpoint."""
-    xla.enable_compilation_cache()
-    task = task_of(run, ReachEnv(run.spec, run.config.env, run.s2r))
-    _, state = run.restore(jax.eval_shape(task.job.init, jax.random.PRNGKey(0)))
-    return task, state
+def task_of_run(run: Run, env: ReachEnv | None = None) -> Task:
+    """What a run learns; its environment is made where it is not given."""
+    env = env or ReachEnv(run.spec, run.config.env, run.s2r)
+    return task_of(run.config, env, run.demonstrations())
 
 
-def begin_with(run: Run, env: ReachEnv, agent: Run | None = None, reward: Run | None = None) -> None:
-    """Save the state that a new run begins with, where parts of it are another's.
+def restore_actor(run: Run) -> tuple[Task, Any]:
+    """The task of a run, and the actor of its newest checkpoint."""
+    task = task_of_run(run)
+    return task, _restored(run, task, "agent").actor_params
+
+
+def begin_with(task: Task, seed: int, agent: Run | None = None, reward: Run | None = None) -> TrainState:
+    """The state that a new run begins with, where parts of it are another's.
 
     Args:
-        run: the new one.
-        env: of the new one.
+        task: of the new run.
+        seed: of the new run.
         agent: whose actor, critics and temperature it begins with.
         reward: whose discriminator it begins with.
 
     Raises:
         RunError: the other run has no such part, or one of another size.
     """
-    if agent is None and reward is None:
-        return
-    state = task_of(run, env).job.init(jax.random.PRNGKey(run.config.seed))
+    state = task.job.init(jax.random.PRNGKey(seed))
     if agent is not None:
-        given, own = restore(agent)[1].agent, state.agent
-        _same_shapes(agent, "networks", given, own)
+        given = _restored(agent, task_of_run(agent), "agent")
         names = ("actor_params", "critic_params", "target_params", "log_alpha")
-        state = state._replace(agent=own._replace(**{name: getattr(given, name) for name in names}))
+        parts = {name: getattr(given, name) for name in names}
+        _same_shapes(agent, "networks", parts, {name: getattr(state.agent, name) for name in names})
+        state = state._replace(agent=state.agent._replace(**parts))
     if reward is not None:
-        given = restore(reward)[1].imitation
-        if given is None:
-            raise RunError(
-                f"{reward.path}: has no learned reward; expected a run of `python -m train imitate`"
-            )
-        _same_shapes(reward, "discriminator", given.discriminator, state.imitation.discriminator)
-        state = state._replace(imitation=state.imitation._replace(discriminator=given.discriminator))
-    run.save(0, state)
+        if not (isinstance(reward.config, ImitationConfig) and reward.config.learned_weight):
+            raise RunError(f"{reward.path}: learned no reward; expected a run of `imitate` that did")
+        given = _restored(reward, task_of_run(reward), "imitation").discriminator
+        _same_shapes(reward, "discriminator", given, state.imitation.discriminator)
+        state = state._replace(imitation=state.imitation._replace(discriminator=given))
+    return state
+
+
+def _restored(run: Run, task: Task, part: str) -> Any:
+    shapes = jax.eval_shape(task.job.init, jax.random.PRNGKey(0))
+    return run.restore_part(part, getattr(shapes, part))
 
 
 def _same_shapes(run: Run, what: str, given: Any, own: Any) -> None:

@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 
 from mjx_softarm.env import ReachEnv
 from train import plots
-from train.checkpoint import Run
-from train.config import ImitationConfig
+from train.config import ImitationConfig, TrainConfig
+from train.demonstrations import Demonstrations
 from train.evaluate import N_GOALS, Evaluator
 from train.imitation import ImitationJob
 from train.job import Job, TrainState
@@ -32,11 +32,12 @@ class Task(NamedTuple):
     prepare: Callable[[TrainState, int], TrainState]  # before the epoch of that number
 
 
-def task_of(run: Run, env: ReachEnv) -> Task:
-    """What a run learns, by its config."""
-    if isinstance(run.config, ImitationConfig):
-        return _imitation(run, run.config, env)
-    job = Job(run.config, env)
+def task_of(config: TrainConfig, env: ReachEnv, demonstrations: Demonstrations | None = None) -> Task:
+    """What a run of this config learns; demonstrations are needed where it learns from them."""
+    if isinstance(config, ImitationConfig):
+        assert demonstrations is not None
+        return _imitation(config, env, demonstrations)
+    job = Job(config, env)
     return Task(
         job=job,
         title=f"{N_GOALS} held-out goals",
@@ -48,8 +49,7 @@ def task_of(run: Run, env: ReachEnv) -> Task:
     )
 
 
-def _imitation(run: Run, config: ImitationConfig, env: ReachEnv) -> Task:
-    demonstrations = run.demonstrations()
+def _imitation(config: ImitationConfig, env: ReachEnv, demonstrations: Demonstrations) -> Task:
     job = ImitationJob(config, env, demonstrations)
     evaluate = PositionEvaluator(env, job.agent, demonstrations.positions, job.goals_of(0))
 

@@ -121,7 +121,8 @@ def _summary(run: Run) -> None:
         print(f"fault: {fault.value}: {count} times, {RESPONSE[fault].value}")
     if len(run.latency_s):
         median, high = 1e3 * np.quantile(run.latency_s, (0.5, 0.999))
-        print(f"computing per tick: median {median:.2f} ms, 99.9 % {high:.2f} ms, {len(run.latency_s)} ticks")
+        n = len(run.latency_s)
+        print(f"from readings to pressures: median {median:.2f} ms, 99.9 % {high:.2f} ms of {n} ticks")
     left = "vented" if run.phase is Phase.DONE else "left at the last pressures"
     print(f"{len(run.arrivals)} goals done; the arm is {left}")
 

@@ -80,7 +80,7 @@ def test_training_takes_the_folder(calibrated, tmp_path, monkeypatch):
     from train.checkpoint import Run
 
     seen = {}
-    monkeypatch.setattr(train_run, "train", lambda run, env, console: seen.update(run=run, env=env))
+    monkeypatch.setattr(train_run, "train", lambda run, task, console: seen.update(run=run, env=task.job.env))
     monkeypatch.setattr("train.__main__._show", lambda *_: None)
     out = tmp_path / "run"
     small = ["--set", "env.n_poses=64", "--out", str(out)]
@@ -100,7 +100,7 @@ def test_training_tells_that_a_folder_has_no_network(calibrated, tmp_path, monke
     from train.__main__ import main as train_main
 
     seen = {}
-    monkeypatch.setattr(train_run, "train", lambda run, env, console: seen.update(env=env))
+    monkeypatch.setattr(train_run, "train", lambda run, task, console: seen.update(env=task.job.env))
     monkeypatch.setattr("train.__main__._show", lambda *_: None)
     shutil.copy(calibrated[1] / "arm.toml", tmp_path)
     small = ["--set", "env.n_poses=64", "--out", str(tmp_path / "run")]
