@@ -174,21 +174,29 @@ def _pipe_part(data: Mapping[str, Any], drawn: Drawn) -> Part:
 
 
 def _narrow_part(data: Mapping[str, Any], drawn: Drawn) -> Part:
-    text = "Learned with the reward of the 300 mm pipe, which stays as it is, and the positions alone."
+    text = (
+        "Of the demonstrations in this pipe, the positions alone are seen. The reward is the environment's "
+        "own, and, as it is, the one learned in the 300 mm pipe."
+    )
     chosen = [item for item in data["spreads"] if item["kind"] == "narrow"]
     return Part("250 mm pipe", text, (_spreads_table(chosen),), figures=(drawn["errors-narrow"],))
 
 
 def _training_part(data: Mapping[str, Any], drawn: Drawn) -> Part:
     text = (
-        f"Success: the pose reached, no chamber saturated, the body inside the pipe. Dotted: "
+        "Learned: a discriminator's reward alone, and a quarter of each batch of the critics the expert's "
+        "answers. Hand-made: the environment's reward at the same goals, with hindsight; no demonstrated "
+        "action is seen. Success: the pose reached, no chamber saturated, the body inside the pipe. Dotted: "
         f"{100 * SUCCESS:g} %. Bands: standard deviation over the runs."
     )
     return Part("Learned against hand-made reward", text, figures=(drawn["success"], drawn["losses"]))
 
 
 def _circle_part(data: Mapping[str, Any], drawn: Drawn) -> Part:
-    text = "Learned at 16 points, 8 of them first; followed at all points of the circle."
+    text = (
+        "The policy without demonstrations learns on with 16 demonstrated points, 8 of them first, by the "
+        "environment's reward and the learned one; followed at all points of the circle."
+    )
     chosen = [item for item in data["spreads"] if item["kind"] == "circle"]
     without = data["circle_without_demonstrations"]
     body = [(KINDS[item["kind"]].title, item["runs"], item) for item in chosen]

@@ -45,7 +45,7 @@ KINDS = {
     "pipe": Kind("learned reward", "pipe300", "pipe"),
     "hand-made": Kind("hand-made reward", "pipe300", "hand-made"),
     "no-penalty": Kind("no gradient penalty", "pipe300", "pipe", ("gail.gradient_penalty=0",)),
-    "narrow": Kind("learned reward of the wide pipe", "pipe250", "frozen", reward_of="pipe"),
+    "narrow": Kind("hand-made, and learned in the wide pipe", "pipe250", "frozen", reward_of="pipe"),
     "circle": Kind("with demonstrations", "circle16", "circle", from_reach=True),
 }
 TASKS = ("pipe300", "pipe250", "circle16")

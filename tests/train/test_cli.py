@@ -13,10 +13,16 @@ import numpy as np
 import pytest
 
 from mjx_softarm.env import ReachEnv
+from mjx_softarm.logs import Log, write_log
+from mjx_softarm.pose import frame_from_pose, quaternion_from_pose
+from mjx_softarm.sensors import SensorParams, frequency_from_length
+from mjx_softarm.spec import ArmSpec
+from mjx_softarm.workspace import sample_workspace
 from train.__main__ import main
 from train.checkpoint import Run
 from train.job import Job
-from train.plots import REACH_PICTURES
+from train.plots import IMITATION_PICTURES, REACH_PICTURES
+from train.run import task_of_run
 
 SMALL = {
     "n_arms": 8,
@@ -123,3 +129,71 @@ def test_misuse_is_one_line_and_leaves_nothing_behind(arguments, message, tmp_pa
     error = capsys.readouterr().err
     assert error.startswith("error: ") and message in error and error.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture(scope="module")
+def demonstrations(tmp_path_factory):
+    """A short arm's file, and a file of what it was shown."""
+    folder = tmp_path_factory.mktemp("demonstrations")
+    spec = ArmSpec.default().replace(structure={"n_sections": 1, "links_per_section": 2})
+    spec.to_toml(folder / "arm.toml")
+    pool = sample_workspace(spec, 6, seed=1)
+    log = Log(
+        source="demos",
+        row=np.arange(6) + 2,
+        time_s=np.arange(6.0),
+        frequency_hz=frequency_from_length(np.asarray(pool.spring_m, float), SensorParams.from_spec(spec)),
+        tip_m=frame_from_pose(np.asarray(pool.pose, float))[0],
+        tip_quaternion=quaternion_from_pose(np.asarray(pool.pose, float)),
+        sequence=np.zeros(6),
+    )
+    write_log(folder / "demos.npz", log)
+    return folder
+
+
+def test_imitation_resumes_across_stages_and_hands_its_reward_on(
+    demonstrations, tmp_path, monkeypatch, capsys
+):
+    stages = [{"share": 0.5, "every": 2, "kept": 1.0}, {"share": 0.5, "every": 1, "kept": 0.5}]
+    settings = SMALL | {
+        "total_env_steps": 128,  # 8 epochs, the second stage from the fourth
+        "evaluation_epochs": 2,
+        "rebalance_env_steps": 48,
+        "gail.hidden": [16],
+        "stages": stages,
+    }
+    flags = [part for name, value in settings.items() for part in ("--set", f"{name}={json.dumps(value)}")]
+    flags += ["--spec", str(demonstrations / "arm.toml")]
+    imitate = ["imitate", str(demonstrations / "demos.npz"), *flags, "--out"]
+    whole, killed, narrow = (tmp_path / name for name in ("whole", "killed", "narrow"))
+    assert main([*imitate, str(whole)]) == 0
+    assert all((whole / name).exists() for name in IMITATION_PICTURES)
+
+    save = Run.save
+
+    def save_and_die(run, epoch, state):
+        save(run, epoch, state)
+        if epoch == 4:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(Run, "save", save_and_die)
+    assert main([*imitate, str(killed)]) == 130
+    monkeypatch.setattr(Run, "save", save)
+    assert main(["imitate", "--resume", str(killed)]) == 0
+    figures = [json.loads((run / "evaluation.json").read_text()) for run in (whole, killed)]
+    assert figures[0] == figures[1] and len(figures[0]["error_mm"]) == 6
+
+    capsys.readouterr()
+    assert main([*imitate, str(narrow), "--preset", "frozen"]) == 2
+    assert "frozen: got true, expected --reward RUN" in capsys.readouterr().err
+    assert not narrow.exists()
+    assert main([*imitate, str(narrow), "--preset", "frozen", "--reward", str(whole)]) == 0
+    kept = [discriminator_of(run) for run in (whole, narrow)]
+    jax.tree.map(np.testing.assert_array_equal, *kept)
+    assert json.loads((narrow / "config.json").read_text())["begins_with"] == {"reward": str(whole)}
+
+
+def discriminator_of(path):
+    task = task_of_run(run := Run.open(path))
+    like = jax.eval_shape(task.job.init, jax.random.PRNGKey(0)).imitation
+    return run.restore_part("imitation", like).discriminator.params
