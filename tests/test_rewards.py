@@ -76,7 +76,7 @@ def test_saturation_overrules_all_else_even_a_reached_goal(mm):
     value, reached, terms = reward_of(away(mm), n_steps=3, saturated=True)
     assert value == -100.0
     assert not reached
-    assert terms == {"goal": 0.0, "error": 0.0, "steps": 0.0, "saturation": -100.0}
+    assert terms == {"goal": 0.0, "error": 0.0, "steps": 0.0, "saturation": -100.0, "clearance": 0.0}
 
 
 def test_every_weight_of_the_config_counts():

@@ -46,7 +46,16 @@ def main(arguments: list[str] | None = None) -> int:
     xla.enable_compilation_cache()
     try:
         return options.command(options, console)
-    except (RunError, ConfigError, SpecError, SealedFileError, LogError, ArmError, ExpertError) as error:
+    except (
+        RunError,
+        ConfigError,
+        SpecError,
+        SealedFileError,
+        LogError,
+        ArmError,
+        ExpertError,
+        OSError,
+    ) as error:
         Console(stderr=True).print(f"error: {error}", markup=False, highlight=False, soft_wrap=True)
         return 2
     except KeyboardInterrupt:

@@ -231,35 +231,47 @@ IMITATION_PRESETS_HELP = (
 
 
 def override(config: Any, assignments: list[str]) -> Any:
-    """A copy of a config with settings such as `tqc.gamma=0.95` changed.
+    """A copy of a config with settings such as `tqc.gamma=0.95` changed, all of them at once.
 
     Raises:
-        ConfigError: unknown setting, wrong type, or a value that the config refuses.
+        ConfigError: unknown setting, wrong type, or values that the config refuses.
     """
+    texts: dict[str, str] = {}
     for assignment in assignments:
         path, equals, text = assignment.partition("=")
         if not equals:
             raise ConfigError(f"{assignment}: expected NAME=VALUE, for example tqc.gamma=0.95")
-        config = _replace(config, path.split("."), text, path)
-    return config
+        texts[path] = text
+    return _replace(config, {tuple(path.split(".")): text for path, text in texts.items()}, "")
 
 
-def _replace(config: Any, names: list[str], text: str, path: str) -> Any:
-    known = [item.name for item in dataclasses.fields(config)]
-    if names[0] not in known:
-        raise ConfigError(f"{path}: unknown setting, expected one of {', '.join(known)}")
-    value = getattr(config, names[0])
-    if len(names) > 1 and not dataclasses.is_dataclass(value):
-        raise ConfigError(f"{path}: {names[0]} has no settings of its own")
-    if len(names) == 1 and dataclasses.is_dataclass(value):
-        inner = ", ".join(f"{path}.{item.name}" for item in dataclasses.fields(value))
-        raise ConfigError(f"{path}: a group, expected one of {inner}")
-    kind = typing.get_type_hints(type(config))[names[0]]
-    new = _replace(value, names[1:], text, path) if len(names) > 1 else _parse(text, kind, path)
+def _replace(config: Any, texts: dict[tuple[str, ...], str], prefix: str) -> Any:
+    """A copy with settings changed, which are given by their names from here on."""
+    known, hints = [item.name for item in dataclasses.fields(config)], typing.get_type_hints(type(config))
+    inner: dict[str, dict[tuple[str, ...], str]] = {}
+    values = {}
+    for (name, *names), text in texts.items():
+        path = f"{prefix}{'.'.join((name, *names))}"
+        if name not in known:
+            raise ConfigError(f"{path}: unknown setting, expected one of {', '.join(known)}")
+        value = getattr(config, name)
+        if names and not dataclasses.is_dataclass(value):
+            raise ConfigError(f"{path}: {name} has no settings of its own")
+        if names:
+            inner.setdefault(name, {})[tuple(names)] = text
+        elif dataclasses.is_dataclass(value):
+            settings = ", ".join(f"{path}.{item.name}" for item in dataclasses.fields(value))
+            raise ConfigError(f"{path}: a group, expected one of {settings}")
+        else:
+            values[name] = _parse(text, hints[name], path)
+    values |= {
+        name: _replace(getattr(config, name), those, f"{prefix}{name}.") for name, those in inner.items()
+    }
     try:
-        return dataclasses.replace(config, **{names[0]: new})
+        return dataclasses.replace(config, **values)
     except ValueError as error:
-        raise ConfigError(f"{path}={text}: {error}") from error
+        given = ", ".join(f"{prefix}{'.'.join(names)}={text}" for names, text in texts.items())
+        raise ConfigError(f"{given}: {error}") from error
 
 
 def _parse(text: str, kind: Any, path: str) -> Any:

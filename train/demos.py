@@ -33,8 +33,10 @@ def add_commands(commands: argparse._SubParsersAction, arm_of: ArmOf) -> None:
         required=True,
         help="twin:SEED, twin:SEED:pipe300, or package.module:Class, a driver of your own",
     )
-    record.add_argument("--task", choices=TASKS, help="positions and pipe; needed but with --keyboard")
-    record.add_argument("--keyboard", action="store_true", help="steer by keys instead, in the task's pipe")
+    record.add_argument("--task", choices=TASKS, help="its positions and its pipe; --keyboard does without")
+    record.add_argument(
+        "--keyboard", action="store_true", help="steer by keys, in the task's pipe if one is given"
+    )
     record.add_argument("--spec", type=Path, help="TOML file of the arm; default: the paper's arm")
     record.add_argument(
         "--calibration", type=Path, metavar="DIR", help="folder that `python -m calib run` made, for --spec"
@@ -61,6 +63,8 @@ def _record(options: argparse.Namespace, console: Console, spec: ArmSpec, s2r: S
         raise ConfigError(f"--task: missing, expected one of {', '.join(TASKS)}, or --keyboard")
     if not options.out.parent.is_dir() or options.out.is_dir():
         raise ConfigError(f"--out: got {options.out}, expected the name of a file in a folder that exists")
+    if options.out.exists():
+        raise ConfigError(f"--out: {options.out} is there already; choose another")
     arm = open_arm(options.arm)
     xla.enable_compilation_cache()
     waypoints, pipe = task(options.task, spec) if options.task else ((), None)

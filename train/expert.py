@@ -100,17 +100,16 @@ class Expert:
         ]
         return jax.tree.map(lambda *x: np.concatenate(x)[:n], *parts)
 
-    def plan(self, waypoints: Sequence[Waypoint], begin_kpa: np.ndarray | None = None) -> Posture:
+    def plan(self, waypoints: Sequence[Waypoint]) -> Posture:
         """Postures (n,) at waypoints, each near the one before.
 
         Args:
             waypoints: one after the other.
-            begin_kpa (n_chambers,) [kPa]: from where; without pressure by default.
 
         Raises:
             ExpertError: a waypoint cannot be met.
         """
-        found, before = [], np.zeros(self.spec.n_chambers) if begin_kpa is None else begin_kpa
+        found, before = [], np.zeros(self.spec.n_chambers)
         for waypoint in waypoints:
             found.append(self.reach(waypoint.name, self.target(waypoint), before))
             before = found[-1].pressure_kpa

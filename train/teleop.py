@@ -107,7 +107,7 @@ class Teleoperation:
         return Recording(self._rows.log("demonstrations"), np.array(self._off_m), problem)
 
     def _reach(self, waypoint: Waypoint, posture: Posture) -> tuple[dict, float]:
-        """The row at rest, and how far off [m] the finger tips are then; corrected as long as that helps."""
+        """The row at rest, and how far off [m] the finger tips are then, after `N_CORRECTIONS` at most."""
         target = asked = self.expert.target(waypoint)
         row, off_m = None, np.nan
         for n_left in range(N_CORRECTIONS, -1, -1):
