@@ -129,6 +129,7 @@ def demonstrate(folder: Path, twin: int, task: str) -> None:
     if file.exists():
         return
     part = file.with_name(f"part-{file.name}")  # a recording that ends early leaves what it has
+    part.unlink(missing_ok=True)
     arm = f"twin:{twin}" + (f":{task}" if pipe_mm(task) else "")
     options = ["--arm", arm, "--task", task, "--calibration", str(file.parent / CALIBRATION)]
     command(file.with_suffix(".log"), "demos", "record", *options, "--out", str(part))
