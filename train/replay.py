@@ -109,7 +109,7 @@ def thin(replay: Replay, key: Array, share: Array) -> Replay:
     capacity = jax.tree.leaves(replay.data)[0].shape[0]
     age = (jnp.arange(capacity) - replay.position) % capacity  # oldest first, once the ring is full
     filled = jnp.arange(capacity) < replay.size
-    n_kept = jnp.round(share * replay.size).astype(jnp.int32)
+    n_kept = jnp.round(share * replay.size.astype(jnp.float32)).astype(jnp.int32)
     lot = jnp.where(filled, jax.random.uniform(key, (capacity,)), jnp.inf)
     kept = jnp.argsort(jnp.argsort(lot)) < n_kept
     order = jnp.argsort(jnp.where(kept, age, capacity + age))
