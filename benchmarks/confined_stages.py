@@ -145,7 +145,8 @@ def learn(folder: Path, settings: Settings, kind: str, twin: int, seed: int) -> 
     run, of = learned_folder(folder, kind, twin, seed), KINDS[kind]
     log = run.with_suffix(".log")
     if not (run / EVALUATION_FILE).exists():
-        if any(path.name.isdecimal() for path in (run / CHECKPOINTS).glob("*")):
+        saved = any(path.name.isdecimal() for path in (run / CHECKPOINTS).glob("*"))
+        if saved and (run / "config.json").exists():  # which is written last
             command(log, "imitate", "--resume", str(run))
         else:
             shutil.rmtree(run, ignore_errors=True)  # maybe without the parts that it begins with

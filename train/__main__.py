@@ -203,7 +203,8 @@ def _arm(options: argparse.Namespace, console: Console) -> tuple[ArmSpec, S2R | 
 def _given(options: argparse.Namespace) -> str:
     """The options of a new run that the command line has."""
     given = {name: value for name, value in vars(options).items() if name not in ("command", "resume")}
-    return ", ".join(f"--{name}" for name, value in given.items() if value not in (None, []))
+    names = [name for name, value in given.items() if value not in (None, [])]
+    return ", ".join("FILE" if name == "file" else f"--{name}" for name in names)
 
 
 def _evaluate(options: argparse.Namespace, console: Console) -> int:

@@ -51,7 +51,6 @@ def add_commands(commands: argparse._SubParsersAction, arm_of: ArmOf) -> None:
 
 
 def _record(options: argparse.Namespace, console: Console, spec: ArmSpec, s2r: S2R | None) -> int:
-    from mjx_softarm import xla
     from mjx_softarm.deploy.arms import open_arm
     from train.expert import Expert
     from train.teleop import KEYS, Teleoperation, read_keys
@@ -66,7 +65,6 @@ def _record(options: argparse.Namespace, console: Console, spec: ArmSpec, s2r: S
     if options.out.exists():
         raise ConfigError(f"--out: {options.out} is there already; choose another")
     arm = open_arm(options.arm)
-    xla.enable_compilation_cache()
     waypoints, pipe = task(options.task, spec) if options.task else ((), None)
     expert = Expert(spec, s2r, pipe)
     plan = None if options.keyboard else expert.plan(waypoints)  # before the arm moves

@@ -78,10 +78,15 @@ class Evaluator:
 
     def __init__(self, env: ReachEnv, agent: TQC, n_goals: int = N_GOALS):
         self.env, self.agent = nominal(env), agent
-        self.goals = self.env.sample_pool(n_goals, HELD_OUT_SEED).pose
+        self.n_goals = n_goals
         self.circle = jnp.asarray(circle_poses())
         self._workspace = xla.jit(self._reach_all, env.uses_mjx)
         self._circle = xla.jit(functools.partial(follow, self.env, agent), env.uses_mjx)
+
+    @functools.cached_property
+    def goals(self) -> Array:
+        """Held-out poses (n_goals, 6) [mm, deg]; drawn when needed, as an export does without."""
+        return self.env.sample_pool(self.n_goals, HELD_OUT_SEED).pose
 
     def __call__(self, actor_params: Any) -> tuple[Summary, Reached, Reached]:
         """Figures, and what was reached on the workspace and on the circle, as NumPy arrays."""

@@ -30,7 +30,7 @@ class GailConfig:
     """Hyperparameters of the discriminator."""
 
     hidden: tuple[int, ...] = (256, 256)
-    learning_rate: float = 3e-4  # Adam; 0 freezes the discriminator
+    learning_rate: float = 3e-4  # Adam
     gradient_penalty: float = 20.0  # the paper's lambda
     input_scale: float = 10.0  # on observations and actions: the slope that the penalty asks of the logit
 

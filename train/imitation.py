@@ -31,9 +31,8 @@ from train.hindsight import Experience
 from train.job import Job, TrainState
 from train.tqc import TQCState, Transition
 
-SAME_GOAL = (
-    1e-5  # in units of the observation; rounding, where hindsight moves a goal by a millimetre or more
-)
+# Difference of observations that is rounding; hindsight moves a goal by a millimetre or more.
+SAME_GOAL = 1e-5
 EVEN_SHARE = 0.5  # of the goals that are drawn evenly, however well they are reached
 
 
@@ -123,9 +122,8 @@ class ImitationJob(Job):
         reward = self.config.hand_made_weight * (batch.reward + cost) - cost
         if self.config.learned_weight > 0:
             learned = self.gail.reward(discriminator.params, batch.obs, batch.action)
-            asked = jnp.all(
-                batch.obs == self.env.observe(stored.pose, stored.goal), axis=-1
-            )  # not in hindsight
+            moved = jnp.abs(batch.obs - self.env.observe(stored.pose, stored.goal))
+            asked = jnp.max(moved, axis=-1) < SAME_GOAL
             reward = reward + self.config.learned_weight * jnp.where(asked, learned, 0.0)
             told = told | {"reward": jnp.sum(learned * asked) / jnp.maximum(jnp.sum(asked), 1)}
         agent, losses = self.agent.update(agent, batch._replace(reward=reward), key_update)

@@ -76,10 +76,9 @@ def finish(run: Run, task: Task, actor_params: Any) -> Any:
     return summary
 
 
-def task_of_run(run: Run, env: ReachEnv | None = None) -> Task:
-    """What a run learns; its environment is made where it is not given."""
-    env = env or ReachEnv(run.spec, run.config.env, run.s2r)
-    return task_of(run.config, env, run.demonstrations())
+def task_of_run(run: Run) -> Task:
+    """What a run learns."""
+    return task_of(run.config, ReachEnv(run.spec, run.config.env, run.s2r), run.demonstrations())
 
 
 def restore_actor(run: Run) -> tuple[Task, Any]:

@@ -616,7 +616,10 @@ def test_training_starts_with_what_it_builds_on_resumes_or_starts_anew(tmp_path,
     (run / "config.json").touch()  # interrupted before it had the reward
     assert commands()[0] == tuple(start)
     assert not run.exists()
+    (run / "checkpoints" / "0").mkdir(parents=True)  # interrupted before it was a run
+    assert commands() == [tuple(start)]
     (run / "checkpoints" / "0").mkdir(parents=True)
+    (run / "config.json").touch()
     assert commands() == [("imitate", "--resume", str(run))]
     (run / "evaluation.json").touch()
     assert commands() == []
