@@ -112,24 +112,31 @@ class ImitationJob(Job):
         stored = replay.sample(memory, key_sample, self.config.batch_size)
         index = self._index_of(stored.goal)
         batch = self._with_expert(self._relabel(stored, key_relabel), stored, index)
-        discriminator, told = imitation.discriminator, {}
+        start, discriminator, told = self.env.observe(stored.pose, stored.goal), imitation.discriminator, {}
         if self.learns:
-            start = self.env.observe(stored.pose, stored.goal)
             expert, own = (start, self.actions[index]), (start, stored.action)
             discriminator, told = self.gail.update(discriminator, expert, own, key_between)
-        # What the body's clearance costs is charged whatever the weights; the expert keeps clear.
-        cost = stored.clearance_cost.at[: self.n_expert].set(0.0)
-        reward = self.config.hand_made_weight * (batch.reward + cost) - cost
-        if self.config.learned_weight > 0:
-            learned = self.gail.reward(discriminator.params, batch.obs, batch.action)
-            moved = jnp.abs(batch.obs - self.env.observe(stored.pose, stored.goal))
-            asked = jnp.max(moved, axis=-1) < SAME_GOAL
-            reward = reward + self.config.learned_weight * jnp.where(asked, learned, 0.0)
-            told = told | {"reward": jnp.sum(learned * asked) / jnp.maximum(jnp.sum(asked), 1)}
+        reward, learned = self._rewards(batch, stored, start, discriminator.params)
         agent, losses = self.agent.update(agent, batch._replace(reward=reward), key_update)
         metrics = {f"tqc/{name}": x for name, x in losses.items()}
-        metrics |= {f"gail/{name}": x for name, x in told.items()}
+        metrics |= {f"gail/{name}": x for name, x in (told | learned).items()}
         return (agent, imitation._replace(discriminator=discriminator)), metrics
+
+    def _rewards(
+        self, batch: Transition, stored: Experience, start: Array, params: Any
+    ) -> tuple[Array, dict[str, Array]]:
+        """Rewards (B,) of a batch made of `stored`, whose own observations are `start` (B, O); metrics.
+
+        What the body's clearance costs is charged whatever the weights; the expert keeps clear.
+        """
+        cost = stored.clearance_cost.at[: self.n_expert].set(0.0)
+        reward = self.config.hand_made_weight * (batch.reward + cost) - cost
+        if self.config.learned_weight == 0:
+            return reward, {}
+        asked = jnp.max(jnp.abs(batch.obs - start), axis=-1) < SAME_GOAL  # not a goal of hindsight
+        learned = jnp.where(asked, self.gail.reward(params, batch.obs, batch.action), 0.0)
+        mean = jnp.sum(learned) / jnp.maximum(jnp.sum(asked), 1)
+        return reward + self.config.learned_weight * learned, {"reward": mean}
 
     def _index_of(self, goal: Array) -> Array:
         """Index (B,) of the demonstrated position that is the goal (B, 6)."""

@@ -13,10 +13,10 @@ from train.config import ConfigError, ImitationConfig, Stage, from_dict, overrid
 from train.demonstrations import Demonstrations
 from train.evaluate import Reached
 from train.gail import GailConfig
-from train.hindsight import HindsightConfig
+from train.hindsight import Experience, HindsightConfig
 from train.imitation import ImitationJob, goal_weights
 from train.positions import PositionEvaluator, summarise
-from train.tqc import TQCConfig
+from train.tqc import TQCConfig, Transition
 
 N = 6  # positions
 SPEC = ArmSpec.default().replace(structure={"n_sections": 1, "links_per_section": 2})
@@ -122,6 +122,28 @@ def test_the_experts_rows_are_right_answers_to_their_goals(job):
     np.testing.assert_allclose(batch.next_obs[:4], expected, atol=1e-3)
     np.testing.assert_array_equal(batch.action[4:], stored.action[4:])
     assert np.all(batch.terminated[:4] == 1.0)
+
+
+def test_rewards_are_learned_for_goals_asked_for_and_clearance_is_always_charged(env, demonstrations):
+    config = dataclasses.replace(CONFIG, learned_weight=2.0, hand_made_weight=0.5)
+    job = ImitationJob(config, env, demonstrations)
+    params = job.gail.init(jax.random.PRNGKey(0)).params
+    n = 8
+    pose, goal = job.positions[jnp.arange(n) % N], job.positions[(jnp.arange(n) + 1) % N]
+    cost = jnp.arange(float(n))
+    given = -3.0 - cost  # the environment's reward, what clearance costs included, of all but the expert's
+    start = env.observe(pose, goal)
+    hindsight = jnp.array([False] * 6 + [True] * 2)
+    obs = jnp.where(hindsight[:, None], env.observe(pose, goal + jnp.array([1.0, 0, 0, 0, 0, 0])), start)
+    action, zero = jnp.zeros((n, job.env.action_size)), jnp.zeros(n)
+    first = jnp.arange(n) < job.n_expert
+    batch = Transition(obs, action, jnp.where(first, 100.0, given), obs, zero)
+    stored = Experience(pose, goal, action, pose, action, zero > 0, cost, zero)
+    rewards, _ = job._rewards(batch, stored, start, params)
+    learned = np.where(hindsight, 0.0, job.gail.reward(params, obs, action))
+    assert job.n_expert == 4 and np.all(learned[:6] < 0.0)
+    expected = np.where(first, 0.5 * 100.0, 0.5 * -3.0 - cost) + 2.0 * learned
+    np.testing.assert_allclose(rewards, expected, rtol=1e-5)
 
 
 def test_frozen_reward_stays_and_sees_no_experts_actions(env, demonstrations):
