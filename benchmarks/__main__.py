@@ -8,7 +8,6 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 import argparse
 import importlib
-import json
 import sys
 from pathlib import Path
 
@@ -38,7 +37,7 @@ def main() -> int:
     options = parser.parse_args()
     if not options.names:
         parser.print_help()
-    from benchmarks.common import save
+    from benchmarks.common import save, show
 
     if "learning" in options.names and not options.runs:
         parser.error("learning: needs --runs FOLDER [FOLDER ...]")
@@ -46,7 +45,7 @@ def main() -> int:
         module = importlib.import_module(f"benchmarks.{name}")
         given = {"learning": [options.runs], "calibration": [options.data]}.get(name, [])
         figures = module.measure(*given)
-        print(json.dumps(figures, indent=2))
+        show(figures, name)
         print(f"written: {save(name, figures)}")
     return 0
 

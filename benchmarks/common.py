@@ -1,18 +1,29 @@
-"""What every benchmark shares: timing, the machine it ran on, where results go."""
+"""What every benchmark shares: timing, memory, goals, tables, the machine it ran on, where results go.
+
+Figures are nested dictionaries of plain values, made for JSON. `show` prints any of them: a list of flat
+dictionaries becomes a table with their keys as its head, loose values become a table of names and values.
+"""
 
 from __future__ import annotations
 
+import resource
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
 from mjx_softarm.provenance import provenance, write_json
 
 RESULTS = Path(__file__).parent / "results"
+WIDTH = 140  # of what is printed elsewhere than to a terminal
+VERDICT = {True: "met", False: "NOT MET", None: "skipped"}
 
 
 def seconds(call: Callable[[], Any], repeats: int = 10) -> float:
@@ -24,6 +35,85 @@ def seconds(call: Callable[[], Any], repeats: int = 10) -> float:
         jax.block_until_ready(call())
         times.append(time.perf_counter() - start)
     return float(np.median(times))
+
+
+def peak_memory() -> dict[str, Any]:
+    """Most memory that this process has needed so far [MB]: on the device where it tells, else resident."""
+    on_device = (jax.local_devices()[0].memory_stats() or {}).get("peak_bytes_in_use")
+    if on_device is not None:
+        return {"peak_mb": round(on_device / 1e6), "memory": "device"}
+    unit = 1 if sys.platform == "darwin" else 1024
+    return {
+        "peak_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6),
+        "memory": "process",
+    }
+
+
+def goal(text: str, measured: str, met: bool | None) -> dict[str, str]:
+    """A goal beside what was measured; `met` is None where it could not be, and `measured` says why."""
+    return {"goal": text, "measured": measured, "verdict": VERDICT[met]}
+
+
+def show(figures: Mapping[str, Any], title: str = "", console: Console | None = None) -> None:
+    """Print figures as tables."""
+    console = console or Console(width=None if sys.stdout.isatty() else WIDTH)
+    loose = []
+    inner = []
+    for name, value in figures.items():
+        words = name.replace("_", " ")
+        path = f"{title}, {words}" if title else words
+        if rows := _rows(value):
+            inner.append((_print_table, (console, path, rows)))
+        elif parts := _parts(value):
+            inner.append((show, (parts, path, console)))
+        else:
+            loose.append({"figure": words, "value": value})
+    if loose:
+        _print_table(console, title, loose)
+    for function, arguments in inner:
+        function(*arguments)
+
+
+def _rows(value: Any) -> list[dict[str, Any]]:
+    """The rows of a table: dictionaries without others inside, in a list or, if their keys agree, by name."""
+    parts = _parts(value)
+    rows = list(parts.values())
+    if not rows or not all(isinstance(row, Mapping) and not any(map(_parts, row.values())) for row in rows):
+        return []
+    if not isinstance(value, Mapping):
+        return rows
+    alike = len({tuple(row) for row in rows}) == 1
+    return [{"": name.replace("_", " "), **row} for name, row in parts.items()] if alike else []
+
+
+def _parts(value: Any) -> dict[str, Any]:
+    """What a dictionary or a list of dictionaries holds, by name; nothing for any other value."""
+    if isinstance(value, Mapping):
+        return dict(value)
+    if isinstance(value, list | tuple) and all(isinstance(part, Mapping) for part in value):
+        return {str(k): part for k, part in enumerate(value, 1)}
+    return {}
+
+
+def _print_table(console: Console, title: str, rows: Sequence[Mapping[str, Any]]) -> None:
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    table = Table()
+    for name in names:
+        numbers = all(isinstance(row.get(name, 0), int | float) for row in rows)
+        table.add_column(Text(name.replace("_", " ")), justify="right" if numbers else "left")
+    for row in rows:
+        table.add_row(*(Text(_cell(row.get(name))) for name in names))
+    console.print()
+    console.print(Text(title, "bold"))
+    console.print(table)
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:,.0f}" if abs(value) >= 1e4 else f"{value:.4g}"
+    if isinstance(value, int) and not isinstance(value, bool):
+        return f"{value:,}"
+    return "" if value is None else str(value)
 
 
 def save(name: str, figures: dict[str, Any]) -> Path:
