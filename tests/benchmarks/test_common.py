@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from benchmarks.common import goal, peak_memory, show
+from benchmarks.common import goal, show
 
 
 def shown(figures, title=""):
