@@ -130,6 +130,17 @@ class Run:
         """Number of epochs behind the newest complete checkpoint, None if there is none."""
         return self._manager.latest_step()
 
+    @property
+    def epochs(self) -> list[int]:
+        """Numbers of epochs behind the complete checkpoints."""
+        return sorted(self._manager.all_steps())
+
+    def rewind(self, epoch: int) -> None:
+        """Forget checkpoints and metrics later than an epoch, before it is continued from there."""
+        for later in [saved for saved in self.epochs if saved > epoch]:
+            self._manager.delete(later)
+        self.truncate_metrics(epoch)
+
     def save(self, epoch: int, state: TrainState) -> None:
         """Write a checkpoint; an interrupted write leaves the one before it in force."""
         self._manager.save(epoch, args=ocp.args.StandardSave(state))

@@ -49,15 +49,15 @@ def train(run: Run, task: Task, console: Console) -> Any:
         console.print(f"continuing after epoch {epoch} of {run.config.n_epochs}")
     run.truncate_metrics(epoch)
     console.print("compiling (cached for the next start) ...")
-    with _asked_to_stop() as asked, _board(run, state) as board, _progress(console) as progress:
+    with asked_to_stop() as asked, open_board(run, state) as board, progress_bar(console) as progress:
         bar = progress.add_task("training", total=run.config.n_epochs, completed=epoch, text="")
         while epoch < run.config.n_epochs:
             state, row = _timed_epoch(task.job, task.prepare(state, epoch))
             epoch += 1
             due = run.config.evaluates_after(epoch)
             if due:
-                row |= _evaluation(task, state)
-            _record(run, board, epoch, state, row)
+                row |= evaluation(task, state.agent.actor_params)
+            record(run, board, epoch, counts(state), row)
             if due or asked:
                 run.save(epoch, state)
             progress.update(bar, completed=epoch, text=_line(task, row))
@@ -126,7 +126,7 @@ def _same_shapes(run: Run, what: str, given: Any, own: Any) -> None:
         raise RunError(f"{run.path}: {what}: got layers of {given}, expected {own} as in the new run")
 
 
-def _board(run: Run, state: TrainState) -> SummaryWriter:
+def open_board(run: Run, state: TrainState) -> SummaryWriter:
     """TensorBoard's writer; what a stopped run wrote after its checkpoint is dropped."""
     steps = int(state.n_env_steps)
     return SummaryWriter(str(run.path), purge_step=steps + 1 if steps else None)
@@ -144,16 +144,22 @@ def _timed_epoch(job: Job, state: TrainState) -> tuple[TrainState, dict[str, flo
     return state, row
 
 
-def _evaluation(task: Task, state: TrainState) -> dict[str, float]:
-    figures = task.evaluate(state.agent.actor_params)[0].to_dict()
+def evaluation(task: Task, actor_params: Any) -> dict[str, float]:
+    """Figures of a policy, as a row of metrics has them."""
+    figures = task.evaluate(actor_params)[0].to_dict()
     return {f"evaluation/{name}": x for name, x in figures.items() if not isinstance(x, tuple)}
 
 
-def _record(run: Run, board: SummaryWriter, epoch: int, state: TrainState, row: dict[str, float]) -> None:
-    steps = int(state.n_env_steps)
-    run.log({"epoch": epoch, "env_steps": steps, "updates": int(state.agent.step), **row})
+def counts(state: TrainState) -> dict[str, int]:
+    """What a run has done, as a row of metrics has it."""
+    return {"env_steps": int(state.n_env_steps), "updates": int(state.agent.step)}
+
+
+def record(run: Run, board: SummaryWriter, epoch: int, done: dict[str, int], row: dict[str, float]) -> None:
+    """Add a row to the run's metrics and to TensorBoard's."""
+    run.log({"epoch": epoch, **done, **row})
     for name, value in row.items():
-        board.add_scalar(name, np.float32(value), steps)
+        board.add_scalar(name, np.float32(value), done["env_steps"])
 
 
 def _line(task: Task, row: dict[str, float]) -> str:
@@ -164,14 +170,15 @@ def _line(task: Task, row: dict[str, float]) -> str:
     return f"{text}  {task.headline(row)}" if "evaluation/median_mm" in row else text
 
 
-def _progress(console: Console) -> Progress:
+def progress_bar(console: Console) -> Progress:
+    """Of epochs; hidden where the console is a file."""
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     columns += (TextColumn("{task.fields[text]}"),)
     return Progress(*columns, console=console, speed_estimate_period=120, disable=not console.is_terminal)
 
 
 @contextmanager
-def _asked_to_stop() -> Iterator[list[int]]:
+def asked_to_stop() -> Iterator[list[int]]:
     """A list that fills when the process is asked to stop; a second Ctrl-C stops at once."""
     asked: list[int] = []
 
