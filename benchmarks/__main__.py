@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # programs that take turns share a GPU
 
 import argparse
 import importlib
@@ -12,8 +13,8 @@ import sys
 from pathlib import Path
 
 NAMES = {
-    "throughput": "env steps/s of both engines, start-up time with an empty and a filled cache",
-    "settle": "error of the settled arm over Newton iterations, solves/s",
+    "throughput": "env steps/s of both engines over arms and links, beside C MuJoCo in time steps; start-up times",
+    "settle": "error, speed, compile time and memory of Newton against time stepping; floor against measured",
     "learner": "gradient updates/s against SBX's TQC",
     "calibration": "errors of springs, chambers and sim-to-real network on real logs and a planted arm",
     "learning": "tip errors of the presets over seeds, from finished runs",

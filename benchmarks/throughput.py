@@ -1,63 +1,214 @@
-"""How many env steps per second, settling included, and how long the first and the second start take."""
+"""How many environment steps a second, settling and resets included, ours and the peers', in one run.
+
+Each program is a process of its own, and they take turns round by round. Random actions saturate about half
+of the chambers. What a settle costs against its error is told by `settle`, the learner's speed by `learner`.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import importlib.util
 import json
 import os
 import subprocess
 import sys
 import tempfile
-import time
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
+import numpy as np
 
-from benchmarks.common import seconds
-from mjx_softarm import xla
-from mjx_softarm.env import EnvConfig, ReachEnv
-from mjx_softarm.wrappers import VectorEnv
+from benchmarks import gpu
+from benchmarks.peers import PeerError, peer_python
+from benchmarks.rounds import Facts, Worker, alternate, working
+from benchmarks.throughput_peers import write_arm
+from benchmarks.truth import error_figures, true_rest
+from mjx_softarm.spec import ArmSpec
 
-N_STEPS = 8
-ARMS = {"chain": (32, 128, 512), "mjx": (128,)}
+N_ROUNDS = 3
+N_LINKS = 4  # per section, of the paper's arm here
+PAPER_WORKERS, PAPER_STEP_S = 14, 0.03  # the paper's cost of an environment step; the workers may share cores
+SUBPROC = "SubprocVecEnv"
+ERROR = ("median_mm", "p95_mm", "max_mm")
+
+Point = tuple[str, str, int, int]  # engine, mode, arms, links per section
+
+
+def points(on_gpu: bool) -> list[list[Point]]:
+    """What is measured, in groups that take turns."""
+    most = 32_768 if on_gpu else 1024
+    chain = (1, 128, 1024, 8192, most) if on_gpu else (1, 8, 32, 128, 512, most)
+    mjx = (1, 1024, 8192, most) if on_gpu else (1, 128, most)  # half a minute to compile, each
+    fixed = 8192 if on_gpu else 128
+    groups: list[list[Point]] = []
+    for n in chain:
+        groups.append([("chain", "quasistatic", n, N_LINKS)])
+        if n in mjx:
+            groups[-1] += [("mjx", "quasistatic", n, N_LINKS), ("mjx", "dynamic", n, N_LINKS)]
+    for links in (2, 6, 8, 10):
+        groups.append([("chain", "quasistatic", fixed, links), ("mjx", "quasistatic", fixed, links)])
+        if links in (2, 6, 10):
+            groups[-1].append(("mjx", "dynamic", fixed, links))
+    return groups
 
 
 def measure() -> dict[str, Any]:
-    """Env steps/s of both engines; start-up times of a training epoch, cache empty and filled."""
-    rows = [_steps_per_second(engine, n) for engine, arms in ARMS.items() for n in arms]
+    """Rates over arms and over links per section; peers; start-up times of training; goals for a GPU."""
+    on_gpu = jax.default_backend() == "gpu"
+    rows = [row for group in points(on_gpu) for row in _group(group)]
+    peers = _side_by_side(ArmSpec.default(), on_gpu)
+    print("start of a training process, cache empty and filled", flush=True)
     with tempfile.TemporaryDirectory() as cache:
         starts = [_start(cache) for _ in range(2)]
-    return {"env_steps": rows, "start": {"cold": starts[0], "cached": starts[1]}}
-
-
-def _steps_per_second(engine: str, n: int) -> dict[str, Any]:
-    """Random actions, so that about half of the chambers saturate; resets included."""
-    env = ReachEnv(config=EnvConfig(engine=engine, n_poses=1024))
-    arms = VectorEnv(env, n, episode_length=4)
-
-    def rollout(state, key):
-        def step(state, key):
-            key_action, key_reset = jax.random.split(key)
-            action = jax.random.uniform(key_action, (n, env.action_size), minval=-1.0)
-            following, after, _ = arms.step(state, action, key_reset)
-            return following, (after.metrics["unsettled"].sum(), after.metrics["saturated_chambers"].mean())
-
-        return jax.lax.scan(step, state, jax.random.split(key, N_STEPS))
-
-    state = xla.jit(arms.reset, env.uses_mjx)(jax.random.PRNGKey(0))
-    start = time.perf_counter()
-    compiled = xla.jit(rollout, env.uses_mjx)
-    _, (unsettled, saturated) = jax.block_until_ready(compiled(state, jax.random.PRNGKey(1)))
-    compile_s = time.perf_counter() - start
-    rate = n * N_STEPS / seconds(lambda: compiled(state, jax.random.PRNGKey(1)))
     return {
-        "engine": engine,
-        "arms": n,
-        "env_steps_per_s": round(rate),
-        "first_call_s": round(compile_s, 1),
-        "unsettled": int(unsettled.sum()),
-        "saturated_chambers": round(float(jnp.mean(saturated)), 2),
+        "rounds": N_ROUNDS,
+        "over_arms": [row for row in rows if row["links_per_section"] == N_LINKS],
+        "over_links": sorted(
+            (row for row in rows if row["arms"] == (8192 if on_gpu else 128)),
+            key=lambda row: (row["engine"], row["mode"], row["links_per_section"]),
+        ),
+        "side_by_side": peers,
+        "start": {"cold": starts[0], "cached": starts[1]},
+        "goals": gpu.rate_goals(rows, on_gpu) + [gpu.training_goal(on_gpu)],
     }
+
+
+def _arms(point: Point, cache: str) -> Worker:
+    engine, mode, n, links = point
+    name = f"{engine}, {mode}, {n} arms, {links} links"
+    return Worker(name, ["benchmarks.throughput_arms", engine, mode, str(n), str(links), cache])
+
+
+def _group(group: Sequence[Point]) -> list[dict[str, Any]]:
+    """A row for each point, whose programs take turns."""
+    with contextlib.ExitStack() as stack:
+        caches = [stack.enter_context(tempfile.TemporaryDirectory()) for _ in group]
+        workers = [_arms(point, cache) for point, cache in zip(group, caches, strict=True)]
+        for worker in workers:
+            print(worker.name, flush=True)
+        stack.enter_context(working(*workers))
+        rounds = alternate(workers, N_ROUNDS)
+        return [
+            {
+                **dict(zip(("engine", "mode", "arms", "links_per_section"), point, strict=True)),
+                **over_rounds(rounds[worker.name]),
+                **{name: value for name, value in worker.facts.items() if name.endswith("_s")},
+            }
+            for point, worker in zip(group, workers, strict=True)
+        ]
+
+
+def over_rounds(rounds: Sequence[Facts]) -> dict[str, Any]:
+    """Medians of the rates of some rounds, and the rest as the last round told it."""
+    merged: dict[str, Any] = {}
+    for name, value in rounds[-1].items():
+        if name.endswith("_per_s"):
+            merged[name] = _digits(np.median([facts[name] for facts in rounds]))
+        elif name not in ("reference_m", "tip_mm"):
+            merged[name] = value
+    return merged
+
+
+def _digits(rate: Any) -> float | int:
+    """Three digits or more, no fractions beyond."""
+    return round(float(rate)) if rate >= 100 else round(float(rate), 2)
+
+
+def _side_by_side(spec: ArmSpec, on_gpu: bool) -> list[dict[str, Any]]:
+    """Ours beside the peers: rates in turns, and how far from the true equilibrium each comes to rest."""
+    n_cores, n_arms = len(os.sched_getaffinity(0)), 8192 if on_gpu else 1024
+    with contextlib.ExitStack() as stack:
+        folder, *caches = (stack.enter_context(tempfile.TemporaryDirectory()) for _ in range(3))
+        write_arm(Path(folder), spec)
+        ours = [
+            _arms((engine, "quasistatic", n, N_LINKS), cache)
+            for engine, n, cache in zip(
+                ("chain", "mjx"), (n_arms, n_arms if on_gpu else 128), caches, strict=True
+            )
+        ]
+        workers, rows = [], []
+        for worker in [
+            *ours,
+            _subproc(folder, n_cores),
+            _rollout(folder, n_cores),
+            _warp(folder, n_arms, on_gpu),
+        ]:
+            if isinstance(worker, str):
+                name, _, reason = worker.partition(": ")
+                rows.append({"program": name, "skipped": reason})
+                continue
+            print(f"side by side: {worker.name}", flush=True)
+            stack.enter_context(working(worker))
+            workers.append(worker)
+        rounds = alternate(workers, N_ROUNDS)
+    measured = [
+        {
+            "program": worker.name,
+            **over_rounds(rounds[worker.name]),
+            **_error(spec, [worker.facts, *rounds[worker.name]]),
+        }
+        for worker in workers
+    ]
+    return side_by_side([*measured, *rows])
+
+
+def side_by_side(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The paper's figure added, and each rate as a multiple of that of Stable-Baselines3's processes."""
+    paper = {
+        "program": f"the paper: {PAPER_WORKERS} workers, {PAPER_STEP_S} s a step, at most",
+        "env_steps_per_s": round(PAPER_WORKERS / PAPER_STEP_S),
+    }
+    base = next(
+        (row["env_steps_per_s"] for row in rows if SUBPROC in row["program"] and "skipped" not in row), None
+    )
+    names = ("program", "env_steps_per_s", "times_subproc", "physics_steps_per_s", *ERROR)
+    full = []
+    for row in [*rows, paper]:
+        rate = row.get("env_steps_per_s")
+        times = _digits(rate / base) if rate and base and row is not paper else None
+        full.append(
+            {name: {**row, "times_subproc": times}.get(name) for name in names}
+            | {"skipped": row.get("skipped", "")}
+        )
+    return full
+
+
+def _error(spec: ArmSpec, told: Sequence[Facts]) -> dict[str, float]:
+    """Of the tips that a program told of."""
+    told = [facts for facts in told if "tip_mm" in facts]
+    if not told:
+        return {}
+    reference_m, tip_mm = (
+        np.concatenate([facts[name] for facts in told]) for name in ("reference_m", "tip_mm")
+    )
+    return error_figures(tip_mm, true_rest(spec, reference_m).tip_mm)
+
+
+def _subproc(folder: str, n: int) -> Worker | str:
+    """SB3's processes; or its name and why there is none."""
+    name = f"C MuJoCo, {SUBPROC}, {n} processes"
+    try:
+        python = peer_python("sb3-contrib")
+    except PeerError as error:
+        return f"{name}: {error}"
+    return Worker(name, ["benchmarks.throughput_peers", "subproc", folder, str(n)], python)
+
+
+def _rollout(folder: str, n: int) -> Worker:
+    return Worker(
+        f"C MuJoCo, rollout, {n} threads", ["benchmarks.throughput_peers", "rollout", folder, str(n)]
+    )
+
+
+def _warp(folder: str, n: int, on_gpu: bool) -> Worker | str:
+    name = f"MJX-Warp, {n} arms, time steps alone"
+    if not on_gpu:
+        return f"{name}: {gpu.NO_DEVICE}"
+    if importlib.util.find_spec("warp") is None:
+        return f"{name}: warp is not installed; pip install 'mujoco-mjx[warp]'"
+    return Worker(name, ["benchmarks.throughput_peers", "warp", folder, str(n)])
 
 
 _START = """
@@ -82,10 +233,9 @@ print(json.dumps({{"import_s": imported - start, "workspace_s": pool - imported,
 
 def _start(cache: str) -> dict[str, float]:
     """A new process up to a compiled training epoch."""
-    environment = {**os.environ, "TF_CPP_MIN_LOG_LEVEL": "3"}
     done = subprocess.run(
         [sys.executable, "-c", _START.format(cache=cache)],
-        env=environment,
+        env={**os.environ, "TF_CPP_MIN_LOG_LEVEL": "3"},
         capture_output=True,
         text=True,
         check=True,

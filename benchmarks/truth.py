@@ -1,0 +1,84 @@
+"""The true equilibrium, what the settled arm is off it, and references that saturate more or fewer chambers.
+
+The truth is the solution in double precision; `tests/test_settle.py` holds it against C MuJoCo.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_softarm import settle as solver
+from mjx_softarm import xla
+from mjx_softarm._mjx import mjx
+from mjx_softarm.kinematics import chain_frames, mjx_frames
+from mjx_softarm.mjcf import build_model
+from mjx_softarm.spec import ArmSpec
+from mjx_softarm.statics import ArmParams
+
+
+class Truth(NamedTuple):
+    """Arms truly at rest."""
+
+    tip_mm: np.ndarray  # (n, 3)
+    share_at_limit: float  # of the chambers
+
+
+def settle_function(spec: ArmSpec, engine: str = "chain", dtype: Any = np.float32) -> Callable:
+    """References (n, n_chambers) -> `Settled`, not compiled yet: jitted, so that it can be lowered."""
+    params = jax.tree.map(jnp.asarray, ArmParams.from_spec(spec, dtype))
+    if engine == "mjx":
+        kinematics = functools.partial(mjx_frames, mjx.put_model(build_model(spec)))
+    else:
+        kinematics = functools.partial(chain_frames, link_length_m=params.link_length_m)
+    return xla.jit(jax.vmap(functools.partial(solver.settle, kinematics, params)), engine == "mjx")
+
+
+def settle_all(spec: ArmSpec, reference_m: np.ndarray, dtype: Any = np.float32) -> solver.Settled:
+    """The settled arms as NumPy arrays, by the chain."""
+    return jax.device_get(settle_function(spec, dtype=dtype)(jnp.asarray(reference_m, dtype)))
+
+
+def true_rest(spec: ArmSpec, reference_m: np.ndarray) -> Truth:
+    """Where arms truly rest under the law, at references (n, n_chambers) [m].
+
+    Raises:
+        RuntimeError: an arm does not settle even in double precision, so there is nothing to compare with.
+    """
+    with jax.enable_x64(True):
+        found = settle_all(spec, reference_m, np.float64)
+    n_unsettled = int(np.sum(~found.settled))
+    if n_unsettled:
+        raise RuntimeError(f"{n_unsettled} of {len(reference_m)} arms did not settle in double precision")
+    return Truth(1e3 * found.tip_position_m, float(np.mean(found.at_limit)))
+
+
+def error_figures(tip_mm: np.ndarray, true_mm: np.ndarray) -> dict[str, float]:
+    """Median, 95 % and largest distance of tips (n, 3) [mm] from where they truly are."""
+    error = np.linalg.norm(np.asarray(tip_mm, np.float64) - true_mm, axis=-1)
+    names = ("median_mm", "p95_mm", "max_mm")
+    return {
+        name: float(f"{x:.3g}") for name, x in zip(names, np.quantile(error, [0.5, 0.95, 1.0]), strict=True)
+    }
+
+
+def random_references(spec: ArmSpec, n: int, reach: float = 1.0, seed: int = 0) -> np.ndarray:
+    """Spring lengths (n, n_chambers) [m] that saturate the more chambers the further they reach.
+
+    Args:
+        spec: the arm.
+        n: how many.
+        reach: 1 draws uniformly from all lengths that may be commanded, 0.5 from the range half as wide about
+            the length at rest; the share of chambers at a limit follows and is to be measured.
+        seed: of the draw.
+    """
+    springs = spec.springs
+    length = np.random.default_rng(seed).uniform(
+        springs.length_min_m, springs.length_max_m, (n, spec.n_chambers)
+    )
+    return springs.rest_length_m + reach * (length - springs.rest_length_m)
