@@ -1,4 +1,4 @@
-"""Command line: `python -m train reach | imitate | evaluate | export | demos`."""
+"""Command line: `python -m train reach | imitate | evaluate | export | sweep | demos`."""
 
 from __future__ import annotations
 
@@ -34,6 +34,7 @@ from train.demonstrations import from_log, read_demonstrations
 from train.demos import add_commands
 from train.evaluate import N_ACTIONS
 from train.expert import ExpertError
+from train.sweep import add_sweep
 
 if TYPE_CHECKING:
     from train.task import Task
@@ -93,6 +94,7 @@ def _parser() -> argparse.ArgumentParser:
     export.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="folder of a run")
     export.add_argument("--out", type=Path, help="default: RUN/policy.npz")
     export.set_defaults(command=_export)
+    add_sweep(commands, _arm)
     add_commands(commands, _arm)
     return parser
 

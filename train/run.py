@@ -197,6 +197,10 @@ def asked_to_stop() -> Iterator[list[int]]:
 
 def default_path(task: str, preset: str, seed: int) -> Path:
     """`runs/TASK-PRESET-seedN`, or the first free one numbered after it."""
-    base = Path("runs") / f"{task}-{preset}-seed{seed}"
+    return free_path(Path("runs") / f"{task}-{preset}-seed{seed}")
+
+
+def free_path(base: Path) -> Path:
+    """A path that is not there: this one, or the first free one numbered after it."""
     candidates = (base if k == 1 else base.with_name(f"{base.name}-{k}") for k in range(1, 10_000))
     return next(path for path in candidates if not path.exists())
