@@ -13,7 +13,7 @@ import sys
 from pathlib import Path
 
 NAMES = {
-    "throughput": "env steps/s of both engines over arms and links, beside C MuJoCo in time steps; start-up times",
+    "throughput": "env steps/s over arms and links, beside C MuJoCo in time steps; start-up times",
     "settle": "error, speed, compile time and memory of Newton against time stepping; floor against measured",
     "learner": "gradient updates/s against SBX's TQC",
     "calibration": "errors of springs, chambers and sim-to-real network on real logs and a planted arm",

@@ -1,4 +1,4 @@
-"""What is asked of a GPU alone: rates, and the time to a trained policy. Elsewhere it is skipped and says so."""
+"""What is asked of a GPU alone: rates, and the time to a trained policy. Elsewhere it says so and skips."""
 
 from __future__ import annotations
 

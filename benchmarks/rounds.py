@@ -1,7 +1,7 @@
 """Programs that take turns, so that whatever else the machine does slows all of them alike.
 
-Each is a process of its own: its compilation starts from an empty cache, its memory is its own, and it may run
-in another virtual environment. It prepares itself, then does one round of work whenever it is told to.
+Each is a process of its own: compilation starts from an empty cache, memory is its own, and it may run in
+another virtual environment. It prepares itself, then does one round of work whenever it is told to.
 """
 
 from __future__ import annotations

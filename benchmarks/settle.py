@@ -1,70 +1,168 @@
-"""Error of the settled arm against the true equilibrium, over Newton iterations."""
+"""Ways to an arm's rest: what they cost, and how far from the true equilibrium they end.
+
+Newton's method with MJX kinematics, the same with the closed-form chain, and C MuJoCo stepped in time under
+the law, over links per section and over shares of saturated chambers. Each way is a process of its own, and
+they take turns round by round. Errors are those of the tip against the solution in double precision, which
+`tests/test_settle.py` holds against C MuJoCo stepped to rest.
+"""
 
 from __future__ import annotations
 
-import functools
+import contextlib
+import os
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 from unittest import mock
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.common import seconds
+from benchmarks.common import goal
+from benchmarks.floor import floor_rows
+from benchmarks.mujoco_rollout import RolloutArms, sensed_model
+from benchmarks.rounds import Facts, Worker, alternate, working
+from benchmarks.settle_methods import N_STEPPED
+from benchmarks.throughput import over_rounds
+from benchmarks.truth import Truth, error_figures, random_references, settle_all, told_error, true_rest
 from mjx_softarm import settle as solver
-from mjx_softarm import xla
-from mjx_softarm.kinematics import chain_frames
 from mjx_softarm.spec import ArmSpec
-from mjx_softarm.statics import ArmParams
 
 ITERATIONS = (2, 3, 4, 5, 6, 8, 12)
 N_ARMS = 512
+N_ROUNDS = 3
+METHODS = ("chain", "mjx", "stepping")
+LINKS = (2, 4, 6, 8, 10)
+N_LINKS = 4  # where shares of saturated chambers are tried
+REACHES = (0.1, 0.3, 0.42, 0.65, 0.85, 1.0, 1.4)  # of `random_references`; shares from about 0 to 60 %
+REST_M = (1e-3, 3e-4, 1e-4, 3e-5)  # within which a spring counts as at rest, in time steps
+GOAL_RATE, GOAL_P95_MM, GOAL_CORES = 10_000, 0.5, 2
+GOAL_ARMS = (128, 512, 1024)
 
 
 def measure() -> dict[str, Any]:
-    """Tip error [mm] after a fixed number of iterations, against the solution in double precision.
+    """Errors over iterations and over time, the three ways over links and saturation, floor, and the goal."""
+    spec, on_gpu = ArmSpec.default(), jax.default_backend() == "gpu"
+    reference = random_references(spec, N_ARMS)
+    truth = true_rest(spec, reference)
+    print("Newton iterations, one by one", flush=True)
+    figures: dict[str, Any] = {
+        "chambers_at_limit": round(truth.share_at_limit, 3),
+        "fixed": _over_iterations(spec, reference, truth),
+        "stepping_until_rest": _over_rest(spec, reference[:N_STEPPED], truth),
+    }
+    rows = [row for links in LINKS for row in _ways(links, REACHES if links == N_LINKS else (1.0,))]
+    figures["over_links"] = [row for row in rows if row["reach"] == 1.0]
+    figures["over_saturation"] = [row for row in rows if row["links_per_section"] == N_LINKS]
+    print("floor against measured", flush=True)
+    figures["floor"] = floor_rows(spec, (1, 128, 1024, 8192, 32_768) if on_gpu else (1, 32, 128, 512, 1024))
+    return {**figures, "goals": [_goal(spec)]}
 
-    `tests/test_settle.py` holds that solution against C MuJoCo stepped to rest.
-    """
-    spec = ArmSpec.default()
-    low, high = spec.springs.length_min_m, spec.springs.length_max_m
-    reference = np.random.default_rng(0).uniform(low, high, (N_ARMS, spec.n_chambers))
-    with jax.enable_x64(True):
-        truth = _settle(spec, np.float64, reference)
-        exact_mm = 1e3 * np.asarray(truth.tip_position_m)
-        saturated = float(np.mean(truth.at_limit))
+
+def _over_iterations(spec: ArmSpec, reference: np.ndarray, truth: Truth) -> list[dict[str, Any]]:
+    """Error after a fixed number of Newton iterations."""
     rows = []
     for n in ITERATIONS:
         with mock.patch.multiple(solver, MAX_ITERATIONS=n, SMALL_STEP=0.0):
-            found = _settle(spec, np.float32, reference)
-        error = np.linalg.norm(1e3 * np.asarray(found.tip_position_m, np.float64) - exact_mm, axis=-1)
-        quantiles = dict(
-            zip(("median_mm", "p95_mm", "max_mm"), np.quantile(error, [0.5, 0.95, 1.0]), strict=True)
+            found = settle_all(spec, reference)
+        rows.append({"iterations": n, **error_figures(1e3 * found.tip_position_m, truth)})
+    return rows
+
+
+def _over_rest(spec: ArmSpec, reference: np.ndarray, truth: Truth) -> list[dict[str, Any]]:
+    """Error and simulated time of C MuJoCo over what counts as at rest, from the straight arm."""
+    n = len(reference)
+    truth = truth._replace(tip_mm=truth.tip_mm[:n], settled=truth.settled[:n])
+    arms = RolloutArms(sensed_model(spec), spec, n, len(os.sched_getaffinity(0)))
+    rows = []
+    for rest_m in REST_M:
+        arms.place(np.ones(n, bool), np.zeros((n, arms.model.nq)), np.zeros((n, spec.n_chambers)))
+        end = arms.move(reference, rest_m)
+        simulated_s = round(end.physics_steps * arms.model.opt.timestep / n, 2)
+        rows.append(
+            {
+                "rest_mm": 1e3 * rest_m,
+                "mean_simulated_s": simulated_s,
+                **error_figures(end.pose[:, :3], truth),
+            }
         )
-        rows.append({"iterations": n, **{k: float(f"{v:.3g}") for k, v in quantiles.items()}})
-    found = _settle(spec, np.float32, reference)
-    return {
-        "chambers_at_limit": round(saturated, 3),
-        "fixed": rows,
-        "default": {
-            "mean_iterations": round(float(np.mean(found.iterations)), 2),
-            "unsettled": int(np.sum(~np.asarray(found.settled))),
-            "solves_per_s": round(_rate(spec, reference)),
-        },
-    }
+    arms.close()
+    return rows
 
 
-def _function(spec: ArmSpec, dtype: Any):
-    params = jax.tree.map(jnp.asarray, ArmParams.from_spec(spec, dtype))
-    kinematics = functools.partial(chain_frames, link_length_m=params.link_length_m)
-    return xla.jit(jax.vmap(functools.partial(solver.settle, kinematics, params)))
+def _ways(links: int, reaches: tuple[float, ...]) -> list[dict[str, Any]]:
+    """A row for each way and each reach of the references, at a number of links per section."""
+    spec = ArmSpec.default().replace(structure={"links_per_section": links})
+    references = {str(reach): random_references(spec, N_ARMS, reach) for reach in reaches}
+    truths = {name: true_rest(spec, reference) for name, reference in references.items()}
+    with contextlib.ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        np.savez(folder / "references.npz", **references)
+        workers = []
+        for method in METHODS:
+            arguments = [method, str(links), str(folder / "references.npz"), str(folder / method)]
+            worker = Worker(f"{method}, {links} links per section", ["benchmarks.settle_methods", *arguments])
+            print(worker.name, flush=True)
+            stack.enter_context(working(worker))
+            workers.append(worker)
+        rounds = alternate(workers, N_ROUNDS)
+    return [
+        {
+            "links_per_section": links,
+            "reach": float(name),
+            "share_at_limit": round(truth.share_at_limit, 3),
+            "method": method,
+            **way(rounds[worker.name], name, truth),
+            **worker.facts,
+        }
+        for name, truth in truths.items()
+        for method, worker in zip(METHODS, workers, strict=True)
+    ]
 
 
-def _settle(spec: ArmSpec, dtype: Any, reference: np.ndarray) -> solver.Settled:
-    return jax.device_get(_function(spec, dtype)(jnp.asarray(reference, dtype)))
+def way(rounds: list[Facts], name: str, truth: Truth) -> dict[str, Any]:
+    """One way's figures on one set of references, from the rounds that it told of."""
+    found = dict(rounds[-1]["sets"][name])
+    tip_mm = np.array(found.pop("tip_mm"))
+    first = Truth(truth.tip_mm[: len(tip_mm)], truth.settled[: len(tip_mm)], truth.share_at_limit)
+    rate = over_rounds([{"solves_per_s": told["solves_per_s"][name]} for told in rounds])
+    memory = {key: rounds[-1][key] for key in ("peak_mb", "memory")}
+    return {**error_figures(tip_mm, first), **rate, **found, **memory}
 
 
-def _rate(spec: ArmSpec, reference: np.ndarray) -> float:
-    function = _function(spec, np.float32)
-    batch = jnp.asarray(reference[:128], jnp.float32)
-    return len(batch) / seconds(lambda: function(batch))
+def _goal(spec: ArmSpec) -> dict[str, str]:
+    """Env steps/s of the chain on two cores, and the error of the very same programs."""
+    n_cores = len(os.sched_getaffinity(0))
+    if n_cores < GOAL_CORES or jax.default_backend() != "cpu":
+        return speed_goal({}, n_cores)
+    with contextlib.ExitStack() as stack:
+        workers = {}
+        for n in GOAL_ARMS:
+            print(f"goal: {n} arms on {GOAL_CORES} cores", flush=True)
+            cache = stack.enter_context(tempfile.TemporaryDirectory())
+            program = ["benchmarks.throughput_arms", "chain", "quasistatic", str(n), str(N_LINKS), cache]
+            workers[n] = Worker(f"goal, {n} arms", program, n_cores=GOAL_CORES)
+            stack.enter_context(working(workers[n]))
+        rounds = alternate(list(workers.values()), N_ROUNDS)
+    measured = {}
+    for n, worker in workers.items():
+        rate = over_rounds(rounds[worker.name])["env_steps_per_s"]
+        measured[n] = (rate, told_error(spec, [worker.facts])["p95_mm"])
+    return speed_goal(measured, n_cores)
+
+
+def speed_goal(measured: Mapping[int, tuple[float, float]], n_cores: int) -> dict[str, str]:
+    """The goal, by the number of arms that is fastest.
+
+    Args:
+        measured: arms -> env steps/s and 95 % of the tip's error [mm]; empty where it was not measured.
+        n_cores: that there are.
+    """
+    text = f"{GOAL_RATE:,} env steps/s on {GOAL_CORES} CPU cores, chain, tip within {GOAL_P95_MM} mm (95 %)"
+    if not measured:
+        reason = f"{n_cores} core here" if n_cores < GOAL_CORES else "jax does not run on the CPU here"
+        return goal(text, reason, None)
+    n, (rate, p95_mm) = max(measured.items(), key=lambda item: item[1][0])
+    met = rate >= GOAL_RATE and p95_mm <= GOAL_P95_MM
+    return goal(text, f"{rate:,} with {n:,} arms, {p95_mm:g} mm", met)

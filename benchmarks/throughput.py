@@ -24,14 +24,13 @@ from benchmarks import gpu
 from benchmarks.peers import PeerError, peer_python
 from benchmarks.rounds import Facts, Worker, alternate, working
 from benchmarks.throughput_peers import write_arm
-from benchmarks.truth import error_figures, true_rest
+from benchmarks.truth import ERROR, TOLD, told_error
 from mjx_softarm.spec import ArmSpec
 
 N_ROUNDS = 3
 N_LINKS = 4  # per section, of the paper's arm here
 PAPER_WORKERS, PAPER_STEP_S = 14, 0.03  # the paper's cost of an environment step; the workers may share cores
 SUBPROC = "SubprocVecEnv"
-ERROR = ("median_mm", "p95_mm", "max_mm")
 
 Point = tuple[str, str, int, int]  # engine, mode, arms, links per section
 
@@ -106,7 +105,7 @@ def over_rounds(rounds: Sequence[Facts]) -> dict[str, Any]:
     for name, value in rounds[-1].items():
         if name.endswith("_per_s"):
             merged[name] = _digits(np.median([facts[name] for facts in rounds]))
-        elif name not in ("reference_m", "tip_mm"):
+        elif name not in TOLD:
             merged[name] = value
     return merged
 
@@ -147,7 +146,7 @@ def _side_by_side(spec: ArmSpec, on_gpu: bool) -> list[dict[str, Any]]:
         {
             "program": worker.name,
             **over_rounds(rounds[worker.name]),
-            **_error(spec, [worker.facts, *rounds[worker.name]]),
+            **told_error(spec, [worker.facts, *rounds[worker.name]]),
         }
         for worker in workers
     ]
@@ -173,17 +172,6 @@ def side_by_side(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
             | {"skipped": row.get("skipped", "")}
         )
     return full
-
-
-def _error(spec: ArmSpec, told: Sequence[Facts]) -> dict[str, float]:
-    """Of the tips that a program told of."""
-    told = [facts for facts in told if "tip_mm" in facts]
-    if not told:
-        return {}
-    reference_m, tip_mm = (
-        np.concatenate([facts[name] for facts in told]) for name in ("reference_m", "tip_mm")
-    )
-    return error_figures(tip_mm, true_rest(spec, reference_m).tip_mm)
 
 
 def _subproc(folder: str, n: int) -> Worker | str:
