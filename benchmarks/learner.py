@@ -1,159 +1,119 @@
-"""Gradient updates per second against SBX's TQC, both in one run on the same machine.
+"""Gradient updates per second over batch sizes, against the peers' learners in one run on the same machine.
 
-SBX (Stable-Baselines Jax) gets its own virtual environment, made on first use in `.venv-sbx`. Both learners
-have two critics of 25 quantiles, networks of 256-256, batches of 256, and sample from a filled replay;
-ours relabels besides. Rounds alternate between the two, and the ratio is that of the medians.
+Stable-Baselines3-contrib's TQC and SBX's (Stable-Baselines Jax) run in virtual environments of their own,
+brax's SAC in this one; `benchmarks.learner_contestants` says what each does. At every size each has a process
+of its own; all prepare themselves, then rounds alternate between them. A rate is the median of the rounds,
+and ratios are those of the medians.
 """
 
 from __future__ import annotations
 
-import json
-import os
-import subprocess
-import sys
-import venv
+import contextlib
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmarks.peers import PINS, PeerError, peer_python
+from benchmarks.rounds import Worker, WorkerError
+
+CONTESTANTS = {
+    "ours": "ours",
+    "sb3-contrib": "sb3-contrib TQC",
+    "sbx": "SBX TQC",
+    "brax": "brax SAC",
+}
+BATCH_SIZES = (256, 1024, 4096, 16_384, 32_768)
 N_ROUNDS = 5
-N_UPDATES = 512
-SBX_HOME = Path(__file__).resolve().parents[1] / ".venv-sbx"
-SBX_PACKAGES = ("sbx-rl==0.28.0", "torch==2.13.0")
-
-_PREPARE = """
-import json, sys, time
-import numpy as np
-n = int(sys.argv[1])
-
-def report(train):
-    train()
-    print("ready", flush=True)
-    for _ in sys.stdin:
-        start = time.perf_counter()
-        train()
-        print(json.dumps(n / (time.perf_counter() - start)), flush=True)
-"""
-
-_OURS = (
-    _PREPARE
-    + """
-import jax, jax.numpy as jnp
-from mjx_softarm.obs import ObsScale
-from mjx_softarm.rewards import RewardConfig
-from mjx_softarm.spec import ArmSpec
-from train import replay
-from train.config import PRESETS
-from train.hindsight import Experience, relabel
-from train.tqc import TQC, TQCConfig
-config, scale, reward = PRESETS["quick"], ObsScale.from_spec(ArmSpec.default()), RewardConfig()
-agent = TQC(18, 9, TQCConfig())
-rng = np.random.default_rng(0)
-draw = lambda *shape: jnp.asarray(rng.normal(size=(10_000, *shape)), jnp.float32)
-poses, actions = (draw(6), draw(6), draw(6)), (jnp.tanh(draw(9)), jnp.tanh(draw(9)))
-no_cost = jnp.zeros(10_000)
-items = Experience(poses[0], poses[1], actions[0], poses[2], actions[1], draw() > 1, no_cost, draw())
-memory = replay.add(
-    replay.create(jax.tree.map(lambda x: x[0], items), 10_000), items, jnp.ones(10_000, bool)
-)
-
-def update(agent_state, key):
-    key_sample, key_relabel, key_update = jax.random.split(key, 3)
-    stored = replay.sample(memory, key_sample, 256)
-    batch = relabel(stored, key_relabel, config.hindsight, scale, reward, exchange_actions=True)
-    return agent.update(agent_state, batch, key_update)
-
-updates = jax.jit(lambda state, key: jax.lax.scan(update, state, jax.random.split(key, n)))
-state = agent.init(jax.random.PRNGKey(0))
-
-def train():
-    global state
-    state, _ = jax.block_until_ready(updates(state, jax.random.PRNGKey(1)))
-
-report(train)
-"""
-)
-
-_SBX = (
-    _PREPARE
-    + """
-import gymnasium as gym
-from sbx import TQC
-
-class Blank(gym.Env):
-    observation_space = gym.spaces.Box(-10, 10, (18,), np.float32)
-    action_space = gym.spaces.Box(-1, 1, (9,), np.float32)
-    def reset(self, seed=None, options=None):
-        return np.zeros(18, np.float32), {}
-    def step(self, action):
-        return np.zeros(18, np.float32), 0.0, False, False, {}
-
-model = TQC("MlpPolicy", Blank(), learning_starts=0, batch_size=256, buffer_size=10_000)
-model._setup_learn(1)
-rng = np.random.default_rng(0)
-for _ in range(10_000):
-    obs, following = rng.normal(size=(2, 1, 18)).astype(np.float32)
-    action = np.tanh(rng.normal(size=(1, 9))).astype(np.float32)
-    model.replay_buffer.add(obs, following, action, rng.normal(size=1), np.zeros(1), [{}])
-
-def train():
-    model.train(n, 256)  # records its losses, so it is done when it returns
-
-report(train)
-"""
-)
+N_FIRST = 256  # updates per round at the smallest batch
+ROUND_S = 1.5  # that a round at any other is to take
+SLOW_S = 15.0  # an update that is expected to take longer is left out
 
 
 def measure() -> dict[str, Any]:
-    """Updates/s of both, and their ratio."""
-    programs = {"ours": (sys.executable, _OURS), "sbx": (_sbx_python(), _SBX)}
-    running = {name: _Learner(*program) for name, program in programs.items()}
-    rates: dict[str, list[float]] = {name: [] for name in running}
-    for _ in range(N_ROUNDS):
-        for name, learner in running.items():
-            rates[name].append(learner.round())
-    for learner in running.values():
-        learner.close()
-    medians = {name: float(np.median(values)) for name, values in rates.items()}
+    """Updates/s at each batch size, ratios, and what was left out."""
+    left_out: dict[str, str] = {}
+    pythons = _pythons(left_out)
+    rates: dict[int, dict[str, list[float]]] = {}
+    rows_per_s = dict.fromkeys(pythons, BATCH_SIZES[0] * N_FIRST / ROUND_S)
+    for batch_size in BATCH_SIZES:
+        workers = {}
+        for name in [name for name in pythons if name not in left_out]:
+            update_s = batch_size / rows_per_s[name]
+            if update_s > SLOW_S:
+                left_out[name] = (
+                    f"from batch {batch_size:,} on: an update is expected to take {update_s:.0f} s"
+                )
+            else:
+                workers[name] = _worker(name, pythons[name], batch_size, updates_per_round(update_s))
+        print(f"batch {batch_size:,}: {', '.join(workers)} ...", flush=True)
+        rates[batch_size] = _alternate(workers, left_out, f"from batch {batch_size:,} on")
+        rows_per_s |= {name: batch_size * float(np.median(x)) for name, x in rates[batch_size].items()}
     return {
-        "updates_per_s": {name: round(value) for name, value in medians.items()},
-        "ratio": round(medians["ours"] / medians["sbx"], 2),
-        "rounds": {name: [round(value) for value in values] for name, values in rates.items()},
+        "updates_per_s": table(rates),
+        "left_out": [{"contestant": CONTESTANTS[name], "why": why} for name, why in left_out.items()],
+        "rounds": [{"batch": size, **rounds} for size, rounds in rates.items()],
     }
 
 
-class _Learner:
-    """A process that trains for one round whenever it is told to."""
-
-    def __init__(self, python: str | Path, program: str):
-        environment = {**os.environ, "TF_CPP_MIN_LOG_LEVEL": "3"}
-        self._process: Any = subprocess.Popen(
-            [str(python), "-c", program, str(N_UPDATES)],
-            env=environment,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        while (line := self._process.stdout.readline()) != "ready\n":
-            if not line:
-                raise RuntimeError("a learner stopped before its first round; its own message stands above")
-
-    def round(self) -> float:
-        """Updates/s of one round."""
-        self._process.stdin.write("\n")
-        self._process.stdin.flush()
-        return json.loads(self._process.stdout.readline())
-
-    def close(self) -> None:
-        self._process.stdin.close()
-        self._process.wait()
+def updates_per_round(update_s: float) -> int:
+    """A power of two that takes about `ROUND_S` where an update takes so long [s]."""
+    return 2 ** max(0, round(np.log2(ROUND_S / update_s)))
 
 
-def _sbx_python() -> Path:
-    python = SBX_HOME / "bin" / "python"
-    if not (SBX_HOME / "complete").exists():
-        venv.create(SBX_HOME, with_pip=True, clear=True)
-        subprocess.run([python, "-m", "pip", "install", "--quiet", *SBX_PACKAGES], check=True)
-        (SBX_HOME / "complete").touch()
-    return python
+def table(rates: Mapping[int, Mapping[str, Sequence[float]]]) -> list[dict[str, Any]]:
+    """A row for each batch size: medians, and how many times as fast ours is."""
+    rows = []
+    for batch_size, rounds in rates.items():
+        medians = {name: float(np.median(values)) for name, values in rounds.items()}
+        row: dict[str, Any] = {"batch": batch_size}
+        row |= {CONTESTANTS[name]: _rounded(value) for name, value in medians.items()}
+        if "ours" in medians:
+            row |= {
+                f"ours / {name}": _rounded(medians["ours"] / value)
+                for name, value in medians.items()
+                if name != "ours"
+            }
+        rows.append(row)
+    return rows
+
+
+def _pythons(left_out: dict[str, str]) -> dict[str, Path | None]:
+    """The interpreter of each contestant that there is; None is this one."""
+    pythons: dict[str, Path | None] = {}
+    for name in CONTESTANTS:
+        try:
+            pythons[name] = peer_python(name) if name in PINS else None
+        except PeerError as error:
+            left_out[name] = str(error)
+    return pythons
+
+
+def _worker(name: str, python: Path | None, batch_size: int, n_updates: int) -> Worker:
+    return Worker(name, ["benchmarks.learner_contestants", name, str(batch_size), str(n_updates)], python)
+
+
+def _alternate(workers: Mapping[str, Worker], left_out: dict[str, str], where: str) -> dict[str, list[float]]:
+    """Rates of the rounds by name; a peer that fails is left out from then on, ours is not allowed to."""
+    rates: dict[str, list[float]] = {}
+    with contextlib.ExitStack() as stack:
+        for turn in range(-1, N_ROUNDS):
+            for name, worker in workers.items():
+                if name in left_out:
+                    continue
+                try:
+                    if turn < 0:
+                        stack.callback(worker.close)
+                        worker.start()
+                    else:
+                        rates.setdefault(name, []).append(worker.round()["updates_per_s"])
+                except WorkerError as error:
+                    if name == "ours":
+                        raise
+                    left_out[name] = f"{where}: {error}"
+    return {name: rounds for name, rounds in rates.items() if name not in left_out}
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.3g}")

@@ -1,8 +1,8 @@
 """Virtual environments of the libraries that this project is compared with, made on first use.
 
-Each has the peer, and of what the simulator needs the very versions that run here, so that all contestants train on the
-same environment. They lie beside the checkout's own `.venv`, as `.venv-PEER`. A file in them says what they
-were made of: one that is incomplete, or made of anything else, is made anew.
+Each has the peer, and of what the simulator needs the very versions that run here, so that all contestants
+train on the same environment. They lie beside the checkout's own `.venv`, as `.venv-PEER`. A file in them
+says what they were made of: one that is incomplete, or made of anything else, is made anew.
 
 PyTorch comes as the package index has it, on Linux with gigabytes of CUDA. Where these are not wanted:
 `PIP_EXTRA_INDEX_URL=https://download.pytorch.org/whl/cpu`.
