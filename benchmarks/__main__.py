@@ -15,18 +15,21 @@ from pathlib import Path
 NAMES = {
     "throughput": "env steps/s over arms and links, beside C MuJoCo in time steps; start-up times",
     "settle": "error, speed, compile time and memory of Newton against time stepping; floor against measured",
-    "learner": "gradient updates/s against SBX's TQC",
+    "learner": "gradient updates/s over batch sizes, against sb3-contrib, SBX and brax",
     "calibration": "errors of springs, chambers and sim-to-real network on real logs and a planted arm",
     "learning": "tip errors of the presets over seeds, from finished runs",
 }
-PAPER = "the paper's experiments on twins, in hours; it goes alone: paper --help"
+ALONE = {
+    "race": "time to a tip error against sb3-contrib and SBX, in an hour; it goes alone: race --help",
+    "paper": "the paper's experiments on twins, in hours; it goes alone: paper --help",
+}
 
 
 def main() -> int:
     """Run the named benchmarks; print their figures and write them to `benchmarks/results`."""
-    if sys.argv[1:2] == ["paper"]:
-        return importlib.import_module("benchmarks.paper").main(sys.argv[2:])
-    epilog = "\n".join(f"  {name:12} {text}" for name, text in {**NAMES, "paper": PAPER}.items())
+    if sys.argv[1:2] and sys.argv[1] in ALONE:
+        return importlib.import_module(f"benchmarks.{sys.argv[1]}").main(sys.argv[2:])
+    epilog = "\n".join(f"  {name:12} {text}" for name, text in {**NAMES, **ALONE}.items())
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks", epilog=epilog, formatter_class=argparse.RawDescriptionHelpFormatter
     )
