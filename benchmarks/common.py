@@ -22,7 +22,7 @@ from rich.text import Text
 from mjx_softarm.provenance import provenance, write_json
 
 RESULTS = Path(__file__).parent / "results"
-WIDTH = 140  # of what is printed elsewhere than to a terminal
+WIDTH = 160  # of what is printed elsewhere than to a terminal
 VERDICT = {True: "met", False: "NOT MET", None: "skipped"}
 
 
@@ -37,16 +37,20 @@ def seconds(call: Callable[[], Any], repeats: int = 10) -> float:
     return float(np.median(times))
 
 
-def peak_memory() -> dict[str, Any]:
-    """Most memory that this process has needed so far [MB]: on the device where it tells, else resident."""
+def peak_memory() -> dict[str, int]:
+    """Most memory that this process has needed so far [MB]: on the device where that tells, else resident."""
     on_device = (jax.local_devices()[0].memory_stats() or {}).get("peak_bytes_in_use")
     if on_device is not None:
-        return {"peak_mb": round(on_device / 1e6), "memory": "device"}
-    unit = 1 if sys.platform == "darwin" else 1024
-    return {
-        "peak_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6),
-        "memory": "process",
-    }
+        return {"peak_device_mb": round(on_device / 1e6)}
+    return {"peak_rss_mb": round(_peak_rss_bytes() / 1e6)}
+
+
+def _peak_rss_bytes() -> int:
+    status = Path("/proc/self/status")
+    if status.exists():  # getrusage would give the parent's, where that is larger
+        line = next(line for line in status.read_text("utf-8").splitlines() if line.startswith("VmHWM:"))
+        return 1024 * int(line.split()[1])
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # bytes on macOS
 
 
 def goal(text: str, measured: str, met: bool | None) -> dict[str, str]:
@@ -100,7 +104,9 @@ def _print_table(console: Console, title: str, rows: Sequence[Mapping[str, Any]]
     table = Table()
     for name in names:
         numbers = all(isinstance(row.get(name, 0), int | float) for row in rows)
-        table.add_column(Text(name.replace("_", " ")), justify="right" if numbers else "left")
+        table.add_column(
+            Text(name.replace("_", " ")), justify="right" if numbers else "left", overflow="fold"
+        )
     for row in rows:
         table.add_row(*(Text(_cell(row.get(name))) for name in names))
     console.print()

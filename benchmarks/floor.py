@@ -3,9 +3,10 @@
 Operations and bytes are XLA's own count of the compiled function. It knows nothing of LAPACK or cuSOLVER,
 whose work is added from formulas, and counts the body of a loop once. So the count is taken times the
 iterations that the slowest arm of the batch needs, which all arms go through; what stands outside the loop is
-counted as often, so it is rather too high than too low. What the device can do is measured, too: a large product of
-matrices and a large copy. The bytes are those of every operation's operands, as if no cache held them.
-Where the time of a call hardly grows with the arms, it is the number of kernels that costs, not their work.
+counted as often, so it is rather too high than too low. What the device can do is measured, too: a large
+product of matrices and a large copy. The bytes are those of every operation's operands, as if no cache held
+them. Where the time of a call hardly grows with the arms, it is the number of kernels that costs, not their
+work.
 """
 
 from __future__ import annotations
@@ -40,9 +41,8 @@ def device_rates() -> dict[str, float]:
     }
 
 
-def counted(function: Callable, *arguments: Any) -> tuple[float, float]:
-    """Operations and bytes of one call of a jitted function, the body of a loop once."""
-    compiled = function.lower(*arguments).compile()
+def counted(function: Callable, compiled: Any, *arguments: Any) -> tuple[float, float]:
+    """Operations and bytes of one call of a jitted function that was compiled, the body of a loop once."""
     cost, text = compiled.cost_analysis(), compiled.as_text()
     library = sum(
         flop
@@ -77,9 +77,10 @@ def floor_rows(spec: ArmSpec, arms: Sequence[int]) -> list[dict[str, Any]]:
     rows = []
     for n in arms:
         reference = jnp.asarray(random_references(spec, n), jnp.float32)
-        iterations = np.asarray(function(reference).iterations)
-        flop, moved = (int(iterations.max()) * x for x in counted(function, reference))
-        measured_s = seconds(functools.partial(function, reference))
+        compiled = function.lower(reference).compile()
+        iterations = np.asarray(compiled(reference).iterations)
+        flop, moved = (int(iterations.max()) * x for x in counted(function, compiled, reference))
+        measured_s = seconds(functools.partial(compiled, reference))
         rows.append(
             {
                 "arms": n,

@@ -94,6 +94,7 @@ def working(*workers: Worker) -> Iterator[None]:
     """Workers that are started one after the other, and closed at the end."""
     try:
         for worker in workers:
+            print(f"starting: {worker.name}", flush=True)
             worker.start()
         yield
     finally:

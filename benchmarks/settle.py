@@ -34,7 +34,7 @@ N_ARMS = 512
 N_ROUNDS = 3
 METHODS = ("chain", "mjx", "stepping")
 LINKS = (2, 4, 6, 8, 10)
-N_LINKS = 4  # where shares of saturated chambers are tried
+N_LINKS = ArmSpec.default().structure.links_per_section  # where shares of saturated chambers are tried
 REACHES = (0.1, 0.3, 0.42, 0.65, 0.85, 1.0, 1.4)  # of `random_references`; shares from about 0 to 60 %
 REST_M = (1e-3, 3e-4, 1e-4, 3e-5)  # within which a spring counts as at rest, in time steps
 GOAL_RATE, GOAL_P95_MM, GOAL_CORES = 10_000, 0.5, 2
@@ -54,7 +54,12 @@ def measure() -> dict[str, Any]:
     }
     rows = [row for links in LINKS for row in _ways(links, REACHES if links == N_LINKS else (1.0,))]
     figures["over_links"] = [row for row in rows if row["reach"] == 1.0]
-    figures["over_saturation"] = [row for row in rows if row["links_per_section"] == N_LINKS]
+    at_start = ("tracing_s", "compiling_s", "both_from_cache_s", "peak_rss_mb", "peak_device_mb")
+    figures["over_saturation"] = [
+        {name: value for name, value in row.items() if name not in at_start}
+        for row in rows
+        if row["links_per_section"] == N_LINKS
+    ]
     print("floor against measured", flush=True)
     figures["floor"] = floor_rows(spec, (1, 128, 1024, 8192, 32_768) if on_gpu else (1, 32, 128, 512, 1024))
     return {**figures, "goals": [_goal(spec)]}
@@ -103,7 +108,6 @@ def _ways(links: int, reaches: tuple[float, ...]) -> list[dict[str, Any]]:
         for method in METHODS:
             arguments = [method, str(links), str(folder / "references.npz"), str(folder / method)]
             worker = Worker(f"{method}, {links} links per section", ["benchmarks.settle_methods", *arguments])
-            print(worker.name, flush=True)
             stack.enter_context(working(worker))
             workers.append(worker)
         rounds = alternate(workers, N_ROUNDS)
@@ -127,7 +131,7 @@ def way(rounds: list[Facts], name: str, truth: Truth) -> dict[str, Any]:
     tip_mm = np.array(found.pop("tip_mm"))
     first = Truth(truth.tip_mm[: len(tip_mm)], truth.settled[: len(tip_mm)], truth.share_at_limit)
     rate = over_rounds([{"solves_per_s": told["solves_per_s"][name]} for told in rounds])
-    memory = {key: rounds[-1][key] for key in ("peak_mb", "memory")}
+    memory = {key: value for key, value in rounds[-1].items() if key.startswith("peak")}
     return {**error_figures(tip_mm, first), **rate, **found, **memory}
 
 
@@ -139,10 +143,9 @@ def _goal(spec: ArmSpec) -> dict[str, str]:
     with contextlib.ExitStack() as stack:
         workers = {}
         for n in GOAL_ARMS:
-            print(f"goal: {n} arms on {GOAL_CORES} cores", flush=True)
             cache = stack.enter_context(tempfile.TemporaryDirectory())
             program = ["benchmarks.throughput_arms", "chain", "quasistatic", str(n), str(N_LINKS), cache]
-            workers[n] = Worker(f"goal, {n} arms", program, n_cores=GOAL_CORES)
+            workers[n] = Worker(f"chain, {n} arms, {GOAL_CORES} cores", program, n_cores=GOAL_CORES)
             stack.enter_context(working(workers[n]))
         rounds = alternate(list(workers.values()), N_ROUNDS)
     measured = {}

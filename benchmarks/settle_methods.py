@@ -4,8 +4,7 @@
 
 METHOD is `chain` or `mjx`, Newton's method with the kinematics of that engine, or `stepping`, C MuJoCo under
 the law until nothing moves. REFERENCES is an npz file with an array (n, n_chambers) [m] for each set of
-references; `stepping` takes the first `N_STEPPED` of each. A round tells rates, and where the arms are, set by
-set.
+references; `stepping` takes the first `N_STEPPED` of each. A round tells rates, and where the arms are.
 """
 
 from __future__ import annotations

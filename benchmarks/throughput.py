@@ -28,7 +28,7 @@ from benchmarks.truth import ERROR, TOLD, told_error
 from mjx_softarm.spec import ArmSpec
 
 N_ROUNDS = 3
-N_LINKS = 4  # per section, of the paper's arm here
+N_LINKS = ArmSpec.default().structure.links_per_section
 PAPER_WORKERS, PAPER_STEP_S = 14, 0.03  # the paper's cost of an environment step; the workers may share cores
 SUBPROC = "SubprocVecEnv"
 
@@ -58,7 +58,7 @@ def measure() -> dict[str, Any]:
     on_gpu = jax.default_backend() == "gpu"
     rows = [row for group in points(on_gpu) for row in _group(group)]
     peers = _side_by_side(ArmSpec.default(), on_gpu)
-    print("start of a training process, cache empty and filled", flush=True)
+    print("starting: a training process twice, cache empty and filled", flush=True)
     with tempfile.TemporaryDirectory() as cache:
         starts = [_start(cache) for _ in range(2)]
     return {
@@ -85,8 +85,6 @@ def _group(group: Sequence[Point]) -> list[dict[str, Any]]:
     with contextlib.ExitStack() as stack:
         caches = [stack.enter_context(tempfile.TemporaryDirectory()) for _ in group]
         workers = [_arms(point, cache) for point, cache in zip(group, caches, strict=True)]
-        for worker in workers:
-            print(worker.name, flush=True)
         stack.enter_context(working(*workers))
         rounds = alternate(workers, N_ROUNDS)
         return [
@@ -138,7 +136,6 @@ def _side_by_side(spec: ArmSpec, on_gpu: bool) -> list[dict[str, Any]]:
                 name, _, reason = worker.partition(": ")
                 rows.append({"program": name, "skipped": reason})
                 continue
-            print(f"side by side: {worker.name}", flush=True)
             stack.enter_context(working(worker))
             workers.append(worker)
         rounds = alternate(workers, N_ROUNDS)

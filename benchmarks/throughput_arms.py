@@ -32,7 +32,7 @@ ROUND_S = 1.0  # at least
 
 
 def compile_twice(function: Callable, *arguments: Any) -> tuple[Callable, Facts]:
-    """Compile a jitted function; returns it, and what that took with an empty cache and from a filled one.
+    """Compile a jitted function; returns it, and the seconds that took with an empty and with a filled cache.
 
     The compilation cache must have been enabled, on a folder that is empty.
     """
@@ -44,7 +44,7 @@ def compile_twice(function: Callable, *arguments: Any) -> tuple[Callable, Facts]
     jax.clear_caches()
     compiled = function.lower(*arguments).compile()
     again = time.perf_counter()
-    times = {"first_start_s": cold - start, "of_it_tracing_s": traced - start, "from_cache_s": again - cold}
+    times = {"tracing_s": traced - start, "compiling_s": cold - traced, "both_from_cache_s": again - cold}
     return compiled, {name: round(value, 2) for name, value in times.items()}
 
 

@@ -34,7 +34,7 @@ class Truth(NamedTuple):
 
 
 def settle_function(spec: ArmSpec, engine: str = "chain", dtype: Any = np.float32) -> Callable:
-    """References (n, n_chambers) -> `Settled`, not compiled yet: jitted, so that it can be lowered."""
+    """A jitted function: references (n, n_chambers) -> `Settled`."""
     params = jax.tree.map(jnp.asarray, ArmParams.from_spec(spec, dtype))
     if engine == "mjx":
         kinematics = functools.partial(mjx_frames, mjx.put_model(build_model(spec)))
@@ -43,15 +43,20 @@ def settle_function(spec: ArmSpec, engine: str = "chain", dtype: Any = np.float3
     return xla.jit(jax.vmap(functools.partial(solver.settle, kinematics, params)), engine == "mjx")
 
 
-def settle_all(spec: ArmSpec, reference_m: np.ndarray, dtype: Any = np.float32) -> solver.Settled:
-    """The settled arms as NumPy arrays, by the chain."""
-    return jax.device_get(settle_function(spec, dtype=dtype)(jnp.asarray(reference_m, dtype)))
+def settle_all(spec: ArmSpec, reference_m: np.ndarray) -> solver.Settled:
+    """The settled arms as NumPy arrays, by the chain in single precision, compiled anew."""
+    return jax.device_get(settle_function(spec)(jnp.asarray(reference_m, jnp.float32)))
+
+
+@functools.lru_cache(maxsize=8)
+def _solver(spec: ArmSpec) -> Callable:
+    return settle_function(spec, dtype=np.float64)
 
 
 def true_rest(spec: ArmSpec, reference_m: np.ndarray) -> Truth:
     """Where arms truly rest under the law, at references (n, n_chambers) [m]."""
     with jax.enable_x64(True):
-        found = settle_all(spec, reference_m, np.float64)
+        found = jax.device_get(_solver(spec)(jnp.asarray(reference_m, np.float64)))
     return Truth(1e3 * found.tip_position_m, found.settled, float(np.mean(found.at_limit[found.settled])))
 
 
