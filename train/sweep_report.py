@@ -51,13 +51,12 @@ def by_settings(runs: Sequence[Run], settings_of: Callable[[Run], dict[str, Any]
     Raises:
         RunError: a run is not finished.
     """
-    groups: dict[str, list[dict[str, Any]]] = {}
+    groups: dict[str, dict[str, Any]] = {}
     for run in runs:
-        groups.setdefault(json.dumps(settings_of(run), sort_keys=True), []).append(_figures(run))
-    return [
-        {"settings": json.loads(settings), "runs": rows, "over_seeds": _spread(rows)}
-        for settings, rows in groups.items()
-    ]
+        settings = settings_of(run)
+        group = groups.setdefault(json.dumps(settings, sort_keys=True), {"settings": settings, "runs": []})
+        group["runs"].append(_figures(run))
+    return [{**group, "over_seeds": _spread(group["runs"])} for group in groups.values()]
 
 
 def _figures(run: Run) -> dict[str, Any]:
@@ -97,8 +96,8 @@ def _varied(sweep: Sweep, run: Run) -> dict[str, Any]:
     return {path: setting(run.config, path) for path in sweep.varied}
 
 
-def _name(settings: dict[str, Any]) -> str:
-    return ", ".join(f"{path}={value:g}" for path, value in settings.items())
+def _name(settings: dict[str, Any], between: str = ", ") -> str:
+    return between.join(f"{path}={value:g}" for path, value in settings.items())
 
 
 def table(groups: Sequence[dict[str, Any]]) -> Table:
@@ -106,18 +105,18 @@ def table(groups: Sequence[dict[str, Any]]) -> Table:
     n_seeds = len(groups[0]["runs"])
     spread = f"mean of {n_seeds} seeds (least to greatest)" if n_seeds > 1 else "one seed"
     shown = Table(title=f"held-out figures, {spread}", title_justify="left")
-    for path in groups[0]["settings"]:
-        shown.add_column(path)
+    if groups[0]["settings"]:
+        shown.add_column("setting", no_wrap=True)
     for _, heading, _, _ in _COLUMNS:
-        shown.add_column(heading, justify="right")
+        shown.add_column(heading, justify="right", no_wrap=True)
     for group in groups:
-        cells = [f"{value:g}" for value in group["settings"].values()]
+        cells = [_name(group["settings"], "\n")] if group["settings"] else []
         for name, _, factor, decimals in _COLUMNS:
             mean, low, high = (
                 f"{factor * group['over_seeds'][name][which]:.{decimals}f}"
                 for which in ("mean", "min", "max")
             )
-            cells.append(f"{mean} ({low} to {high})" if n_seeds > 1 else mean)
+            cells.append(f"{mean}\n({low} to {high})" if n_seeds > 1 else mean)
         shown.add_row(*cells)
     return shown
 
