@@ -98,8 +98,22 @@ def _ours(batch_size: int, n_updates: int) -> tuple[Facts, Callable[[], Facts]]:
     return _timed(train, n_updates)
 
 
-def _sb3(algorithm: Any, batch_size: int, n_updates: int) -> tuple[Facts, Callable[[], Facts]]:
-    """`train` of a Stable-Baselines3 algorithm; it reads its losses, so it is done when it returns."""
+def choose_threads(train: Callable[[], Any]) -> None:
+    """Let PyTorch use all its threads, or one where that trains faster, as waiting for each other costs."""
+    import torch  # pyright: ignore[reportMissingImports]
+
+    times = {}
+    for n_threads in (torch.get_num_threads(), 1):
+        torch.set_num_threads(n_threads)
+        train()
+        start = time.perf_counter()
+        train()
+        times[n_threads] = time.perf_counter() - start
+    torch.set_num_threads(min(times, key=lambda n: times[n]))
+
+
+def _sb3(algorithm: Any) -> Any:
+    """An algorithm with a filled replay; its `train` reads its losses, so it is done when it returns."""
     import gymnasium
 
     class Blank(gymnasium.Env):
@@ -119,19 +133,22 @@ def _sb3(algorithm: Any, batch_size: int, n_updates: int) -> tuple[Facts, Callab
         rows[:] = rng.normal(size=rows.shape)
     stored.actions[:] = np.tanh(rng.normal(size=stored.actions.shape))
     stored.full = True
-    return _timed(lambda: model.train(gradient_steps=n_updates, batch_size=batch_size), n_updates)
+    return model
 
 
 def _sb3_contrib(batch_size: int, n_updates: int) -> tuple[Facts, Callable[[], Facts]]:
     from sb3_contrib import TQC  # pyright: ignore[reportMissingImports]
 
-    return _sb3(TQC, batch_size, n_updates)
+    model = _sb3(TQC)
+    choose_threads(lambda: model.train(min(n_updates, 8), batch_size))
+    return _timed(lambda: model.train(n_updates, batch_size), n_updates)
 
 
 def _sbx(batch_size: int, n_updates: int) -> tuple[Facts, Callable[[], Facts]]:
     from sbx import TQC  # pyright: ignore[reportMissingImports]
 
-    return _sb3(TQC, batch_size, n_updates)
+    model = _sb3(TQC)
+    return _timed(lambda: model.train(n_updates, batch_size), n_updates)
 
 
 def _brax(batch_size: int, n_updates: int) -> tuple[Facts, Callable[[], Facts]]:

@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from benchmarks.learner_contestants import choose_threads
 from benchmarks.rounds import Facts, serve
 
 START = time.perf_counter()
@@ -49,9 +50,7 @@ class HeldOut:
 
         from mjx_softarm import xla
         from mjx_softarm.workspace import HELD_OUT_SEED
-        from train.evaluate import nominal
 
-        env = nominal(env)
         goals = env.sample_pool(n_goals, HELD_OUT_SEED).pose
 
         def start(key, goal):
@@ -119,6 +118,8 @@ def peer(library: str, tuned: bool, seed: int) -> Contestant:
         n_steps = model.num_timesteps
 
     learn(model.learning_starts + n_arms)
+    if library == "sb3-contrib":
+        choose_threads(lambda: model.train(gradient_steps=8, batch_size=model.batch_size))
     return Contestant(
         train=lambda: learn(CHUNK, reset_num_timesteps=False),
         policy=lambda obs: model.predict(obs, deterministic=True)[0],
