@@ -13,10 +13,10 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.scipy.linalg import block_diag
 
 from mjx_softarm.kinematics import DOFS_PER_LINK, Frames
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
@@ -111,33 +111,49 @@ def statics(frames: Frames, q: Array, pressure_kpa: Array, params: ArmParams) ->
         pressure_kpa (n_chambers,): chamber pressures.
         params: numbers of the arm.
     """
-    chambers = tendons(frames, params.chamber_site_m)
-    springs = tendons(frames, params.spring_site_m)
+    sites = jnp.stack([params.chamber_site_m, params.spring_site_m])
+    both = jax.vmap(tendons, in_axes=(None, 0))(frames, sites)  # in one piece: fewer and larger operations
+    chambers, springs = (jax.tree.map(lambda x, k=k: x[k], both) for k in range(2))
     area = params.area + params.area_slope * (chambers.length - params.section_length_m)
-    tension = params.chamber_stiffness * (chambers.length - params.chamber_rest_m) - area * pressure_kpa
-    slope = params.chamber_stiffness - params.area_slope * pressure_kpa
-    spring_tension = params.spring_stiffness * (springs.length - params.spring_rest_m)
-
-    jacobian = jnp.concatenate([chambers.jacobian, springs.jacobian])  # (2 n_chambers, nv)
-    tensions = jnp.concatenate([tension, spring_tension])
-    slopes = jnp.concatenate([slope, params.spring_stiffness])
+    tension = jnp.stack(
+        [
+            params.chamber_stiffness * (chambers.length - params.chamber_rest_m) - area * pressure_kpa,
+            params.spring_stiffness * (springs.length - params.spring_rest_m),
+        ]
+    )  # (2, n_chambers)
+    slope = jnp.stack([params.chamber_stiffness - params.area_slope * pressure_kpa, params.spring_stiffness])
     weight, weight_hessian = _gravity(frames, params)
-    gradient = weight + params.joint_stiffness * q + tensions @ jacobian
-    bend = _bending(tension, chambers, params) + _bending(spring_tension, springs, params)
+    gradient = weight + params.joint_stiffness * q + jnp.einsum("kt,ktj->j", tension, both.jacobian)
     hessian = (
         weight_hessian
         + jnp.diag(params.joint_stiffness)
-        + block_diag(*bend)
-        + (jacobian.T * slopes) @ jacobian
+        + _bending(tension, both.link_hessian)
+        + _stretching(slope, both.jacobian)
     )
     return Statics(gradient, hessian, chambers, springs, area)
 
 
-def _bending(tension: Array, lines: Tendons, params: ArmParams) -> Array:
-    """Tension times the second derivative of the length, (n_links, 3, 3)."""
-    n_links = lines.link_hessian.shape[0]
-    per_link = jnp.repeat(tension.reshape(-1, N_CHAMBERS_PER_SECTION), n_links // params.n_sections, axis=0)
-    return jnp.einsum("lt,ltij->lij", per_link, lines.link_hessian)
+def _bending(tension: Array, link_hessian: Array) -> Array:
+    """Tensions (2, n_chambers) times the second derivatives of the lengths: (nv, nv), link by link."""
+    n_links = link_hessian.shape[1]
+    per_section = n_links * N_CHAMBERS_PER_SECTION // tension.shape[1]
+    per_link = jnp.repeat(tension.reshape(2, -1, N_CHAMBERS_PER_SECTION), per_section, axis=1)
+    return _on_diagonal(jnp.sum(per_link[..., None, None] * link_hessian, axis=(0, 2)))
+
+
+def _stretching(slope: Array, jacobian: Array) -> Array:
+    """sum_t slope_t dl_t dl_t^T for slopes (2, n_chambers), (nv, nv): section by section, as tendons are."""
+    n_sections = slope.shape[1] // N_CHAMBERS_PER_SECTION
+    rows = jacobian.reshape(2, n_sections, N_CHAMBERS_PER_SECTION, n_sections, -1)
+    own = jnp.einsum("kstsi->skti", rows)
+    per_section = jnp.swapaxes(slope.reshape(2, n_sections, N_CHAMBERS_PER_SECTION), 0, 1)
+    return _on_diagonal(jnp.einsum("skti,sktj->sij", per_section[..., None] * own, own))
+
+
+def _on_diagonal(blocks: Array) -> Array:
+    """The block-diagonal matrix (n m, n m) of blocks (n, m, m)."""
+    n, m, _ = blocks.shape
+    return (jnp.eye(n, dtype=blocks.dtype)[:, None, :, None] * blocks[:, :, None]).reshape(n * m, n * m)
 
 
 def tendons(frames: Frames, site_m: Array) -> Tendons:
@@ -151,8 +167,8 @@ def tendons(frames: Frames, site_m: Array) -> Tendons:
     n_sections = site_m.shape[0] // N_CHAMBERS_PER_SECTION
     per_section = n_links // n_sections
     site = jnp.repeat(site_m.reshape(n_sections, N_CHAMBERS_PER_SECTION, 2), per_section, axis=0)  # (L, 3, 2)
-    arm = jnp.einsum("lij,ltj->lti", frames.plate_rotation[1:, :, :2], site)
-    above = jnp.einsum("lij,ltj->lti", frames.plate_rotation[:-1, :, :2], site)
+    arm = _dot(frames.plate_rotation[1:, None, :, :2], site[:, :, None])
+    above = _dot(frames.plate_rotation[:-1, None, :, :2], site[:, :, None])
     lower = frames.plate_position[1:, None] + arm  # (L, 3, 3)
     segment = lower - (frames.plate_position[:-1, None] + above)
     length = jnp.sqrt(jnp.sum(segment**2, axis=-1))  # (L, 3)
@@ -162,18 +178,24 @@ def tendons(frames: Frames, site_m: Array) -> Tendons:
     slide, hinge = frames.axis[:, :1], frames.axis[:, 1:]  # (L, 1, 3), (L, 2, 3)
     turn = jnp.cross(hinge[:, None], lever[:, :, None])  # (L, 3, 2, 3)
     motion = jnp.concatenate([jnp.broadcast_to(slide[:, None], (n_links, 3, 1, 3)), turn], axis=2)
-    along = jnp.einsum("ltc,ltdc->ltd", unit, motion)  # d length / d q, (L, 3, 3)
+    along = _dot(unit[:, :, None], motion)  # d length / d q, (L, 3, 3)
     twist = jnp.cross(hinge[:, None, :, None], turn[:, :, None, :])  # a_i x J_j, (L, 3, 2, 2, 3)
-    second = jnp.einsum("ltc,ltijc->ltij", unit, twist)
+    second = _dot(unit[:, :, None, None], twist)
     upper = jnp.triu(second)
     second = upper + jnp.swapaxes(jnp.triu(second, 1), -1, -2)
-    curve = jnp.einsum("ltic,ltjc->ltij", motion, motion) - along[..., :, None] * along[..., None, :]
+    curve = _dot(motion[..., :, None, :], motion[..., None, :, :]) - along[..., :, None] * along[..., None, :]
     link_hessian = (curve / length[..., None, None]).at[..., 1:, 1:].add(second)
 
     own = along.reshape(n_sections, per_section, N_CHAMBERS_PER_SECTION, DOFS_PER_LINK)
     rows = jnp.moveaxis(own, 2, 1).reshape(n_sections, N_CHAMBERS_PER_SECTION, -1)
     total = length.reshape(n_sections, per_section, -1).sum(1).reshape(-1)
-    return Tendons(total, block_diag(*rows), link_hessian)
+    spread = jnp.eye(n_sections, dtype=rows.dtype)[:, None, :, None] * rows[:, :, None]
+    return Tendons(total, spread.reshape(total.shape[0], -1), link_hessian)
+
+
+def _dot(a: Array, b: Array) -> Array:
+    """Inner product over the last axis, others broadcast: many tiny ones, for which a matrix product is slow."""
+    return jnp.sum(a * b, axis=-1)
 
 
 def _gravity(frames: Frames, params: ArmParams) -> tuple[Array, Array]:
