@@ -173,7 +173,8 @@ def train(worker: Worker, limit_s: float, target_mm: float, n_points: int) -> di
     Returns:
         Start-up time, limit (None without one) and the curve's points.
     """
-    print(f"{worker.name}: starting; up to {limit_s:.0f} s of training ...", flush=True)
+    within = f" up to {limit_s:.0f} s," if math.isfinite(limit_s) else ""
+    print(f"{worker.name}:{within} evaluations not counted ...", flush=True)
     points: list[Point] = []
     try:
         worker.start()
