@@ -1,23 +1,24 @@
 """Floor against measured: the least time that the arithmetic of a settle could take, and the time it takes.
 
-Operations and bytes are XLA's own count of the compiled function. It knows nothing of LAPACK or cuSOLVER,
-whose work is added from formulas, and counts the body of a loop once. So the count is taken times the
-iterations that the slowest arm of the batch needs, which all arms go through; what stands outside the loop is
-counted as often, so it is rather too high than too low. What the device can do is measured, too: a large
-product of matrices and a large copy. The bytes are those of every operation's operands, as if no cache held
-them. Where the time of a call hardly grows with the arms, it is the number of kernels that costs, not their
-work.
+Operations and bytes are XLA's own count of the compiled function. It knows nothing of LAPACK or cuSOLVER, so
+their work is added from formulas. A loop it counts once, so one turn of the loop and what stands outside are
+counted apart, and the turns are those of the slowest arm of the batch, since all arms go through them. What
+the device can do is measured, too: a large product of matrices and a large copy. The bytes are those of every
+operation's operands, as if no cache held them. Where the time of a call hardly grows with the arms, it is the
+number of kernels that costs, not their work.
 """
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from benchmarks.common import seconds
 from benchmarks.truth import random_references, settle_function
@@ -41,15 +42,48 @@ def device_rates() -> dict[str, float]:
     }
 
 
-def counted(function: Callable, compiled: Any, *arguments: Any) -> tuple[float, float]:
-    """Operations and bytes of one call of a jitted function that was compiled, the body of a loop once."""
+class Cost(NamedTuple):
+    """Of one call."""
+
+    flop: float
+    moved: float  # bytes
+
+
+def counted(function: Callable, compiled: Any, *arguments: Any) -> Cost:
+    """Operations and bytes of a jitted function that was compiled, the body of a loop once."""
     cost, text = compiled.cost_analysis(), compiled.as_text()
     library = sum(
         flop
         for name, flop in _linear_algebra(jax.make_jaxpr(function)(*arguments).jaxpr)
         if LIBRARY[name] in text
     )
-    return cost["flops"] + library, cost["bytes accessed"]
+    return Cost(cost["flops"] + library, cost["bytes accessed"])
+
+
+def settle_cost(spec: ArmSpec, reference_m: Array) -> tuple[Cost, Cost, int]:
+    """What settling by the chain costs outside its loop, and a turn of it; iterations done outside.
+
+    Both are found by compiling it with the loop replaced by no turn, and by one.
+    """
+    costs, n_outside = [], 0
+    for n_turns in (0, 1):
+        with mock.patch.object(jax.lax, "while_loop", functools.partial(_turns, n_turns)):
+            function = settle_function(spec)
+            compiled = function.lower(reference_m).compile()
+            costs.append(counted(function, compiled, reference_m))
+        if n_turns == 0:
+            n_outside = int(np.max(compiled(reference_m).iterations))
+    turn = Cost(*(one - none for none, one in zip(*costs, strict=True)))
+    if turn.flop <= 0:
+        raise RuntimeError("settle: a turn of its loop costs nothing, so it has none by `jax.lax.while_loop`")
+    return costs[0], turn, n_outside
+
+
+def _turns(n: int, condition: Callable, body: Callable, state: Any) -> Any:
+    """So many turns of a loop, whatever the condition says."""
+    for _ in range(n):
+        state = body(state)
+    return state
 
 
 def _linear_algebra(jaxpr: Any) -> Iterator[tuple[str, float]]:
@@ -77,10 +111,12 @@ def floor_rows(spec: ArmSpec, arms: Sequence[int]) -> list[dict[str, Any]]:
     rows = []
     for n in arms:
         reference = jnp.asarray(random_references(spec, n), jnp.float32)
-        compiled = function.lower(reference).compile()
-        iterations = np.asarray(compiled(reference).iterations)
-        flop, moved = (int(iterations.max()) * x for x in counted(function, compiled, reference))
-        measured_s = seconds(functools.partial(compiled, reference))
+        iterations = np.asarray(function(reference).iterations)
+        outside, turn, n_outside = settle_cost(spec, reference)
+        flop, moved = (
+            a + (int(iterations.max()) - n_outside) * b for a, b in zip(outside, turn, strict=True)
+        )
+        measured_s = seconds(functools.partial(function, reference))
         rows.append(
             {
                 "arms": n,

@@ -32,15 +32,22 @@ def rate_goals(rows: Sequence[Mapping[str, Any]], on_gpu: bool) -> list[dict[str
     """Env steps/s of each engine, settling included, at the number of arms that is best.
 
     Args:
-        rows: with `engine`, `mode`, `arms` and `env_steps_per_s`.
+        rows: with `engine`, `mode`, `arms` and, where they did not fail, `env_steps_per_s`.
         on_gpu: whether they are a GPU's; if not, nothing is asked of them.
     """
     goals = []
     for engine, least in LEAST_RATE.items():
         text = f"{least:,} env steps/s on a GPU, {engine}"
-        mine = [row for row in rows if row["engine"] == engine and row["mode"] == "quasistatic"]
+        mine = [
+            row
+            for row in rows
+            if row["engine"] == engine and row["mode"] == "quasistatic" and "env_steps_per_s" in row
+        ]
         if not on_gpu:
             goals.append(goal(text, NO_DEVICE, None))
+            continue
+        if not mine:
+            goals.append(goal(text, "every run failed", False))
             continue
         best = max(mine, key=lambda row: row["env_steps_per_s"])
         measured = f"{best['env_steps_per_s']:,} with {best['arms']:,} arms"

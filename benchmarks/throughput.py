@@ -22,7 +22,7 @@ import numpy as np
 
 from benchmarks import gpu
 from benchmarks.peers import PeerError, peer_python
-from benchmarks.rounds import Facts, Worker, alternate, working
+from benchmarks.rounds import Facts, Worker, WorkerError, alternate, working
 from benchmarks.throughput_peers import write_arm
 from benchmarks.truth import ERROR, TOLD, told_error
 from mjx_softarm.spec import ArmSpec
@@ -81,7 +81,20 @@ def _arms(point: Point, cache: str) -> Worker:
 
 
 def _group(group: Sequence[Point]) -> list[dict[str, Any]]:
-    """A row for each point, whose programs take turns."""
+    """A row for each point, whose programs take turns; one that fails, for want of memory say, tells why."""
+    named = [
+        dict(zip(("engine", "mode", "arms", "links_per_section"), point, strict=True)) for point in group
+    ]
+    try:
+        return [{**name, **row} for name, row in zip(named, _turns(group), strict=True)]
+    except WorkerError as error:
+        print(error, flush=True)
+        if len(group) > 1:  # each alone, so that the others are not lost
+            return [row for point in group for row in _group([point])]
+        return [{**named[0], "failed": str(error).splitlines()[-1]}]
+
+
+def _turns(group: Sequence[Point]) -> list[dict[str, Any]]:
     with contextlib.ExitStack() as stack:
         caches = [stack.enter_context(tempfile.TemporaryDirectory()) for _ in group]
         workers = [_arms(point, cache) for point, cache in zip(group, caches, strict=True)]
@@ -89,11 +102,10 @@ def _group(group: Sequence[Point]) -> list[dict[str, Any]]:
         rounds = alternate(workers, N_ROUNDS)
         return [
             {
-                **dict(zip(("engine", "mode", "arms", "links_per_section"), point, strict=True)),
                 **over_rounds(rounds[worker.name]),
                 **{name: value for name, value in worker.facts.items() if name.endswith("_s")},
             }
-            for point, worker in zip(group, workers, strict=True)
+            for worker in workers
         ]
 
 

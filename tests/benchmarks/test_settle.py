@@ -6,7 +6,7 @@ import jax.scipy.linalg
 import numpy as np
 import pytest
 
-from benchmarks.floor import counted
+from benchmarks.floor import counted, settle_cost
 from benchmarks.settle import GOAL_ARMS, REACHES, speed_goal, way
 from benchmarks.truth import Truth, error_figures, random_references, told_error, true_rest
 from mjx_softarm import ArmSpec
@@ -104,3 +104,11 @@ def test_operations_are_counted_with_those_of_libraries():
     assert moved > 4 * batch * (n * n + n * k)
     product, rows = jax.jit(jnp.matmul), jnp.ones((n, n))
     assert counted(product, product.lower(rows, rows).compile(), rows, rows)[0] == 2 * n**3
+
+
+def test_a_turn_of_the_settling_loop_costs_a_factorisation_and_more():
+    n, n_arms = 3 * SPEC.n_links, 2
+    outside, turn, n_outside = settle_cost(SPEC, jnp.asarray(random_references(SPEC, n_arms), jnp.float32))
+    least = n_arms * (n**3 / 3 + 2 * n**2 * (1 + SPEC.n_chambers))
+    assert turn.flop > least and turn.moved > 4 * n_arms * n**2
+    assert outside.flop > 0 and 0 <= n_outside <= 1
