@@ -20,6 +20,7 @@ NAMES = {
     "learning": "tip errors of the presets over seeds, from finished runs",
 }
 ALONE = {
+    "guard": "whether something got slower than a stored baseline; it goes alone: guard --help",
     "race": "time to a tip error against sb3-contrib and SBX, in an hour; it goes alone: race --help",
     "paper": "the paper's experiments on twins, in hours; it goes alone: paper --help",
 }

@@ -85,6 +85,7 @@ class SweepJob:
         self._init_all = xla.jit(init, env.uses_mjx)
         self._epoch_all = xla.jit(epoch, env.uses_mjx, donate_argnums=0)
         self._take = jax.jit(lambda tree, k: jax.tree.map(lambda x: x[k], tree))
+        self._stack = jax.jit(lambda *trees: jax.tree.map(lambda *x: jnp.stack(x), *trees))
 
     def init(self) -> TrainState:
         """The state that all members begin with."""
@@ -109,7 +110,7 @@ class SweepJob:
 
     def together(self, members: Sequence[TrainState]) -> TrainState:
         """The state of all members from those of each."""
-        states = jax.tree.map(lambda *x: jnp.stack(x), *(own._replace(n_env_steps=None) for own in members))
+        states = self._stack(*(own._replace(n_env_steps=None) for own in members))
         return states._replace(n_env_steps=members[0].n_env_steps)
 
     def _init(self, key: Array, numbers: Mapping[str, Array]) -> TrainState:

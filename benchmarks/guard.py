@@ -1,0 +1,173 @@
+"""Whether something got slower: a small fixed benchmark against a stored one of the same kind of machine.
+
+    python -m benchmarks guard            compare; for use before a release, in about two minutes
+    python -m benchmarks guard --store    make this the baseline of this kind of machine
+
+Exit status 0 if nothing is worse, 1 if something is, 2 if there is no baseline. What is measured, and why it
+holds on a machine that is busy or faster, stands in `benchmarks.guard_work`. It runs in processes of its own,
+one after the other, since what differs from process to process, such as where memory lies, is a part of the
+spread. Tolerance is twice the furthest that a process of the baseline lay from their median.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from benchmarks.common import RESULTS, show
+from benchmarks.guard_work import REFERENCE, sizes_here
+from benchmarks.rounds import Facts, Worker, working
+from mjx_softarm.provenance import provenance, write_json
+
+FILE = RESULTS / "guard.json"
+N_PROCESSES, N_STORED = 3, 9  # of a comparison, of a baseline
+N_ROUNDS = 8
+MARGIN = 2.0
+WORSE, NO_BASELINE = 1, 2
+
+Samples = Mapping[str, Sequence[Facts]]  # cost, seconds and cores of each process, by what was measured
+
+
+class BaselineError(ValueError):
+    """There is nothing to compare with; the message says why."""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Compare or store; returns the exit status."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks guard", description=(__doc__ or "").split("\n")[0]
+    )
+    parser.add_argument("--store", action="store_true", help="make this the baseline of this kind of machine")
+    options = parser.parse_args(arguments)
+    kind, sizes = machine_kind(), sizes_here()._asdict()
+    if options.store:
+        costs = baseline_of(measure(N_STORED))
+        store(FILE, kind, {"costs": costs, "sizes": sizes, **provenance("benchmarks")})
+        show({"costs": _stored_rows(costs)}, f"baseline of {kind}")
+        print(f"written: {FILE}")
+        return 0
+    try:
+        baseline = read_baseline(FILE, kind, sizes)
+    except BaselineError as error:
+        print(f"{error}; store one, on a state that is known to be good: python -m benchmarks guard --store")
+        return NO_BASELINE
+    rows = compare(baseline["costs"], measure(N_PROCESSES))
+    show({"costs": rows}, f"guard, {kind}, baseline of commit {baseline['commit']}")
+    worse = [row["work"] for row in rows if row["verdict"] == "WORSE"]
+    print(f"worse: {', '.join(worse)}" if worse else "nothing is worse")
+    return WORSE if worse else 0
+
+
+def machine_kind() -> str:
+    """What baselines are kept by: the GPU's name, or the CPU's and the number of its cores."""
+    if jax.default_backend() == "gpu":
+        return jax.devices()[0].device_kind
+    info = Path("/proc/cpuinfo")
+    found = re.search(r"model name\s*: (.+)", info.read_text("utf-8")) if info.exists() else None
+    name = found[1].strip() if found else platform.processor() or platform.machine()
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return f"{name}, {cores} cores"
+
+
+def measure(n_processes: int) -> Samples:
+    """Medians over the rounds of each process, by what was measured."""
+    samples: dict[str, list[Facts]] = {name: [] for name in REFERENCE}
+    for k in range(n_processes):
+        print(f"process {k + 1} of {n_processes}: compiling, then {N_ROUNDS} rounds", flush=True)
+        worker = Worker("guard", ["benchmarks.guard_work"])
+        with working(worker):
+            rounds = [worker.facts | worker.round() for _ in range(N_ROUNDS)]
+        for name, own in samples.items():
+            own.append(
+                {item: float(np.median([row[name][item] for row in rounds])) for item in rounds[0][name]}
+            )
+    return samples
+
+
+def baseline_of(samples: Samples) -> dict[str, dict[str, Any]]:
+    """Median cost, tolerance and the processes' costs, by what was measured."""
+    costs = {name: [facts["cost"] for facts in own] for name, own in samples.items()}
+    return {
+        name: {
+            "cost": float(np.median(own)),
+            "tolerance": float(MARGIN * np.max(np.abs(np.array(own) / np.median(own) - 1.0))),
+            "processes": own,
+        }
+        for name, own in costs.items()
+    }
+
+
+def compare(baseline: Mapping[str, Mapping[str, Any]], samples: Samples) -> list[dict[str, Any]]:
+    """A row for each cost: baseline, now, change, the spread of now's processes, and what to think of it."""
+    rows = []
+    for name, stored in baseline.items():
+        costs = [facts["cost"] for facts in samples[name]]
+        now, tolerance = float(np.median(costs)), stored["tolerance"]
+        change = now / stored["cost"] - 1.0
+        verdict = "WORSE" if change > tolerance else "better" if change < -tolerance else "same"
+        rows.append(
+            {
+                "work": name,
+                "beside": REFERENCE[name],
+                "baseline": stored["cost"],
+                "now": now,
+                "change": f"{100 * change:+.1f} %",
+                "tolerance": f"{100 * tolerance:.1f} %",
+                "spread": f"{100 * (max(costs) - min(costs)) / now:.1f} %",
+                "wall_s": float(np.median([facts["wall_s"] for facts in samples[name]])),
+                "cores": round(float(np.median([facts["cores"] for facts in samples[name]])), 1),
+                "verdict": verdict,
+            }
+        )
+    return rows
+
+
+def _stored_rows(costs: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
+    return [
+        {
+            "work": name,
+            "beside": REFERENCE[name],
+            "cost": stored["cost"],
+            "tolerance": f"{100 * stored['tolerance']:.1f} %",
+        }
+        for name, stored in costs.items()
+    ]
+
+
+def store(file: Path, kind: str, baseline: Mapping[str, Any]) -> None:
+    """Write a baseline; those of other kinds of machines stay."""
+    write_json(file, {"kinds": {**_kinds(file), kind: dict(baseline)}})
+
+
+def read_baseline(file: Path, kind: str, sizes: Mapping[str, int]) -> dict[str, Any]:
+    """The baseline of a kind of machine.
+
+    Args:
+        file: of all baselines.
+        kind: of machine.
+        sizes: of the work that is to be compared.
+
+    Raises:
+        BaselineError: there is none, or of other work.
+    """
+    kinds = _kinds(file)
+    if kind not in kinds:
+        known = ", ".join(kinds) or "none"
+        raise BaselineError(f"{file}: no baseline for {kind}; it has: {known}")
+    baseline = kinds[kind]
+    if baseline["sizes"] != dict(sizes) or baseline["costs"].keys() != REFERENCE.keys():
+        raise BaselineError(f"{file}: the baseline for {kind} is of other work than what is measured now")
+    return baseline
+
+
+def _kinds(file: Path) -> dict[str, Any]:
+    return json.loads(file.read_text("utf-8"))["kinds"] if file.exists() else {}

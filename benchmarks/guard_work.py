@@ -1,0 +1,245 @@
+"""Worker of the regression guard: the work that must not get slower, each beside a reference, in rounds.
+
+    python -m benchmarks.guard_work
+
+A cost is the time of some work over that of a reference measured right before and right after it, so that a
+faster machine is faster at both. What uses all cores, or the GPU, is held against a matrix product that does
+the same; what runs on one core, against C MuJoCo's steps. No reference runs through this project's code.
+
+On cores, time is that of the processor, all threads added up: waiting for others, as on a loaded machine,
+is not in it. Measured with eight processes on two cores, such costs of gradient steps lay within 8 % of their
+median (quartiles), and within 55 % by the clock on the wall. What it cannot see is work that stands in line
+where it ran side by side; `cores`, its share of processor in the wall's time, tells that to a reader.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import itertools
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from benchmarks.rounds import Facts, serve
+from mjx_softarm import xla
+from mjx_softarm.deploy import loop
+from mjx_softarm.env import EnvConfig, ReachEnv
+from mjx_softarm.estimator import N_CHANGES, PoseEstimator, SpringModel
+from mjx_softarm.export import ArmModel, policy_from_actor
+from mjx_softarm.kinematics import chain_frames
+from mjx_softarm.sensors import SensorParams, frequency_from_length
+from mjx_softarm.settle import settle
+from mjx_softarm.spec import ArmSpec
+from train.config import PRESETS
+from train.job import Job, TrainState
+
+PRODUCT, MUJOCO = "matrix product", "C MuJoCo"
+REFERENCE = {  # of each cost, the one it varied less with
+    "settle": PRODUCT,
+    "env_steps": PRODUCT,
+    "updates": PRODUCT,
+    "tick": MUJOCO,
+    "compile": MUJOCO,
+}
+
+
+class Took(NamedTuple):
+    """How long something took."""
+
+    wall_s: float
+    processor_s: float  # of all threads
+
+
+class Sizes(NamedTuple):
+    """How much work there is in one measurement, a tenth of a second or more; fixed, or costs change."""
+
+    product: int  # rows and columns of the matrices
+    n_products: int
+    n_mujoco_steps: int
+    n_arms: int
+    n_settles: int  # of all arms
+    n_env_steps: int  # of each arm
+    n_updates: int
+    n_ticks: int
+
+
+SIZES = {
+    "cpu": Sizes(1024, 8, 3000, 128, 10, 8, 32, 400),
+    "gpu": Sizes(8192, 8, 3000, 8192, 50, 32, 512, 400),
+}
+
+
+def sizes_here() -> Sizes:
+    """Of this machine's benchmark."""
+    return SIZES["gpu" if jax.default_backend() == "gpu" else "cpu"]
+
+
+def prepare() -> tuple[Facts, Callable[[], Facts]]:
+    """Compile everything; tells the cost of compiling an epoch, then in rounds all other costs."""
+    jax.config.update("jax_enable_compilation_cache", False)
+    sizes = sizes_here()
+    references = {PRODUCT: _product(sizes), MUJOCO: _mujoco(sizes)}
+    for reference in references.values():
+        reference()
+    env = ReachEnv(config=EnvConfig(n_poses=1024))
+    config = dataclasses.replace(
+        PRESETS["quick"],
+        n_arms=sizes.n_arms,
+        updates_per_env_step=sizes.n_updates / sizes.n_arms,
+        warmup_env_steps=0,
+        env=env.config,
+    )
+    job = Job(config, env)
+    state, epoch = job.init(jax.random.PRNGKey(0)), []
+
+    def measure(name: str, work: Callable[[], Any]) -> dict[str, float]:
+        reference = REFERENCE[name]
+        on_gpu = reference == PRODUCT and jax.default_backend() == "gpu"
+        return cost(*(_took(call) for call in (references[reference], work, references[reference])), on_gpu)
+
+    compiling = measure("compile", lambda: epoch.append(job.epoch.lower(state).compile()))
+    state, _ = epoch[0](state)  # fills the replay
+    work = {
+        "settle": _settle(env, sizes),
+        "env_steps": _env_steps(job, state, sizes),
+        "updates": _updates(job, state),
+        "tick": _tick(job, state, sizes),
+    }
+    for call in work.values():
+        call()
+    return {"compile": compiling}, lambda: {name: measure(name, call) for name, call in work.items()}
+
+
+def cost(before: Took, work: Took, after: Took, on_gpu: bool) -> dict[str, float]:
+    """Cost of some work beside its reference, seconds and cores that it took."""
+    own, *references = (took.wall_s if on_gpu else took.processor_s for took in (work, before, after))
+    return {
+        "cost": 2.0 * own / sum(references),
+        "wall_s": work.wall_s,
+        "cores": work.processor_s / work.wall_s,
+    }
+
+
+def _took(call: Callable[[], Any]) -> Took:
+    start = time.perf_counter(), time.process_time()
+    call()
+    return Took(time.perf_counter() - start[0], time.process_time() - start[1])
+
+
+def _product(sizes: Sizes) -> Callable[[], Any]:
+    """Products of random matrices, by NumPy on all cores, or on the GPU."""
+    matrix = np.random.default_rng(0).normal(size=(sizes.product, sizes.product)).astype(np.float32)
+    if jax.default_backend() != "gpu":
+        return lambda: [matrix @ matrix for _ in range(sizes.n_products)]
+    on_device, product = jnp.asarray(matrix), jax.jit(lambda x: x @ x)
+    product(on_device)
+    return lambda: jax.block_until_ready([product(on_device) for _ in range(sizes.n_products)])
+
+
+def _mujoco(sizes: Sizes) -> Callable[[], Any]:
+    """Steps of a chain of 30 hinges that swings, on one core."""
+    link = '<body pos="0 0 -.1"><joint axis="{} {} 0" damping=".01"/><geom size=".02 .05" type="capsule"/>'
+    links = "".join(link.format(k % 2, 1 - k % 2) for k in range(30))
+    option = '<option integrator="implicitfast"><flag contact="disable"/></option>'
+    model = mujoco.MjModel.from_xml_string(
+        f"<mujoco>{option}<worldbody>{links}{'</body>' * 30}</worldbody></mujoco>"
+    )
+    data = mujoco.MjData(model)
+
+    def steps() -> None:
+        mujoco.mj_resetData(model, data)
+        data.qpos[:] = 0.1
+        mujoco.mj_step(model, data, sizes.n_mujoco_steps)
+
+    return steps
+
+
+def _settle(env: ReachEnv, sizes: Sizes) -> Callable[[], Any]:
+    """Rests at random references, about half of their chambers at a limit."""
+    springs = env.spec.springs
+    drawn = np.random.default_rng(0).uniform(
+        springs.length_min_m, springs.length_max_m, (sizes.n_arms, env.action_size)
+    )
+    kinematics = functools.partial(chain_frames, link_length_m=env.params.link_length_m)
+    solve = xla.jit(jax.vmap(functools.partial(settle, kinematics, env.params)), uses_mjx=False)
+    reference_m = jnp.asarray(drawn, jnp.float32)
+    return lambda: jax.block_until_ready([solve(reference_m) for _ in range(sizes.n_settles)])
+
+
+def _env_steps(job: Job, state: TrainState, sizes: Sizes) -> Callable[[], Any]:
+    """Random actions of all arms, resets included."""
+
+    def rollout(arms: Any, key: Any):
+        def step(arms: Any, key: Any):
+            key_action, key_reset = jax.random.split(key)
+            action = jax.random.uniform(key_action, (job.arms.n, job.env.action_size), minval=-1.0)
+            arms, _, outcome = job.arms.step(arms, action, key_reset)
+            return arms, jnp.sum(outcome.reward)
+
+        return jax.lax.scan(step, arms, jax.random.split(key, sizes.n_env_steps))
+
+    compiled, key = xla.jit(rollout, job.env.uses_mjx), jax.random.PRNGKey(1)
+    return lambda: jax.block_until_ready(compiled(state.arms, key))
+
+
+def _updates(job: Job, state: TrainState) -> Callable[[], Any]:
+    """Gradient steps at the preset's batch, sampled and relabelled, as within an epoch."""
+
+    def learn(state: TrainState, key: Any):
+        state, metrics = job._updates(state, key, jnp.array(True))
+        return state.agent, metrics
+
+    compiled, key = xla.jit(learn, job.env.uses_mjx), jax.random.PRNGKey(2)
+    return lambda: jax.block_until_ready(compiled(state, key))
+
+
+def _tick(job: Job, state: TrainState, sizes: Sizes) -> Callable[[], Any]:
+    """Ticks of the deployed loop in which the policy acts, on springs at rest with a little noise.
+
+    The networks have the sizes of a trained policy's, and all but the actor's are zero.
+    """
+    spec, pool = job.env.spec, job.env.pool
+    spring_m = np.asarray(pool.spring_m[0], float)
+    model = _model(spec, np.asarray(pool.pose, np.float32), spring_m)
+    actor = jax.device_get(state.agent.actor_params)
+    controller = loop.Controller.of(policy_from_actor(actor, spec, job.config.env.reward, model, {}))
+    noise_m = 4e-5 * np.random.default_rng(3).normal(size=(controller.window, spec.n_chambers))
+    frequency_hz = frequency_from_length(spring_m + noise_m, SensorParams.from_spec(spec))
+    before = loop.start(controller)
+    for reading in frequency_hz:
+        before, _ = loop.step(controller, before, reading, False)
+    before, refused = loop.with_goal(controller, before, np.asarray(pool.pose[0], float))
+    after, _ = loop.step(controller, before, frequency_hz[0], False)
+    if refused or after.phase is not loop.Phase.RUN or after.n_actions != 1:
+        raise RuntimeError(f"the tick is not one in which the policy acts: {refused}, {after}")
+    return lambda: [loop.step(controller, before, frequency_hz[0], False) for _ in range(sizes.n_ticks)]
+
+
+def _model(spec: ArmSpec, workspace: np.ndarray, spring_m: np.ndarray) -> ArmModel:
+    n, width = spec.n_chambers, 128
+
+    def zeros(*widths: int) -> Any:
+        pairs = itertools.pairwise(widths)
+        return tuple((np.zeros(pair, np.float32), np.zeros(pair[1], np.float32)) for pair in pairs)
+
+    def row(value: Any, size: int = n) -> np.ndarray:
+        return np.broadcast_to(np.float32(value), size).copy()
+
+    angle = np.pi / 2 + 2 * np.pi * np.arange(n) / 3
+    site_m = np.float32(0.067 * np.stack([np.cos(angle), np.sin(angle)], -1))
+    n_changes = N_CHANGES * spec.structure.n_sections
+    estimator = PoseEstimator(
+        zeros(2 * n, width, width, n_changes), site_m, row(spring_m), row(0.05), row(1e-3, N_CHANGES)
+    )
+    springs = SpringModel(zeros(n, width, width, n), row(-10.0), row(30.0), row(spring_m), row(0.05))
+    return ArmModel(workspace, estimator, springs, None)
+
+
+if __name__ == "__main__":
+    serve(prepare)

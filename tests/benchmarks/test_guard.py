@@ -1,0 +1,108 @@
+"""The regression guard's verdicts, on made-up figures."""
+
+import json
+
+import pytest
+
+from benchmarks import guard
+from benchmarks.guard import BaselineError, baseline_of, compare, read_baseline, store
+from benchmarks.guard_work import MUJOCO, PRODUCT, REFERENCE, Took, cost
+
+SIZES = {"n_arms": 4}
+
+
+def samples(**costs):
+    """Made-up processes: all of cost 1, but for those given."""
+    given = {name: costs.get(name, (1.0, 1.0, 1.0)) for name in REFERENCE}
+    return {
+        name: [{"cost": value, "wall_s": 2.0 * value, "cores": 1.5} for value in values]
+        for name, values in given.items()
+    }
+
+
+STORED = samples(settle=(0.96, 1.0, 1.02, 1.01, 0.99), tick=(2.0, 2.0, 2.2), updates=(4.0, 4.1, 3.9))
+
+
+def test_a_cost_is_the_processors_time_beside_the_reference_around_it():
+    before, work, after = Took(9.0, 0.4), Took(8.0, 1.5), Took(7.0, 0.6)
+    assert cost(before, work, after, on_gpu=False) == {"cost": 3.0, "wall_s": 8.0, "cores": 1.5 / 8.0}
+    assert cost(before, work, after, on_gpu=True)["cost"] == 1.0  # of a GPU's work, the wall's time
+
+
+def test_tolerance_is_twice_the_furthest_from_the_median():
+    baseline = baseline_of(STORED)
+    assert baseline["settle"]["cost"] == 1.0 and baseline["settle"]["tolerance"] == pytest.approx(0.08)
+    assert baseline["tick"]["cost"] == 2.0 and baseline["tick"]["tolerance"] == pytest.approx(0.2)
+    assert baseline["compile"] == {"cost": 1.0, "tolerance": 0.0, "processes": [1.0, 1.0, 1.0]}
+
+
+@pytest.mark.parametrize(
+    "settle, verdict, change",
+    [
+        ((1.0, 1.07, 1.2), "same", "+7.0 %"),  # the median counts, so one slow process does not
+        ((1.0, 1.09, 1.2), "WORSE", "+9.0 %"),
+        ((0.95, 0.93, 0.5), "same", "-7.0 %"),
+        ((0.9, 0.91, 1.0), "better", "-9.0 %"),
+    ],
+)
+def test_the_verdict_is_of_the_median_beyond_the_tolerance(settle, verdict, change):
+    now = samples(settle=settle, tick=(2.0, 2.0, 2.0), updates=(4.0, 4.0, 4.0))
+    rows = {row["work"]: row for row in compare(baseline_of(STORED), now)}
+    assert rows["settle"]["verdict"] == verdict and rows["settle"]["change"] == change
+    assert rows["settle"]["beside"] == PRODUCT and rows["tick"]["beside"] == MUJOCO
+    assert {row["verdict"] for name, row in rows.items() if name != "settle"} == {"same"}
+
+
+def test_a_row_tells_baseline_now_spread_and_seconds():
+    now = samples(updates=(4.0, 5.0, 6.0))
+    row = next(row for row in compare(baseline_of(STORED), now) if row["work"] == "updates")
+    assert row == {
+        "work": "updates",
+        "beside": PRODUCT,
+        "baseline": 4.0,
+        "now": 5.0,
+        "change": "+25.0 %",
+        "tolerance": "5.0 %",
+        "spread": "40.0 %",
+        "wall_s": 10.0,
+        "cores": 1.5,
+        "verdict": "WORSE",
+    }
+
+
+@pytest.fixture
+def machine(tmp_path, monkeypatch):
+    """A machine of a made-up kind, whose processes give what is put into the list."""
+    measured = []
+    monkeypatch.setattr(guard, "FILE", tmp_path / "guard.json")
+    monkeypatch.setattr(guard, "machine_kind", lambda: "Abacus, 2 cores")
+    monkeypatch.setattr(guard, "measure", lambda n_processes: measured.pop())
+    return measured
+
+
+def test_status_tells_stored_same_worse_and_no_baseline(machine, capsys):
+    assert guard.main([]) == 2  # before anything is measured
+    said = capsys.readouterr().out
+    assert "no baseline for Abacus, 2 cores; it has: none" in said and "guard --store" in said
+    machine.append(STORED)
+    assert guard.main(["--store"]) == 0
+    stored = json.loads(guard.FILE.read_text())["kinds"]["Abacus, 2 cores"]
+    assert {"commit", "packages", "machine"} <= stored.keys()
+    same = samples(tick=(2.0, 2.1, 2.0), updates=(4.0, 4.0, 4.0))
+    machine.append(same)
+    assert guard.main([]) == 0 and "nothing is worse" in capsys.readouterr().out
+    machine.append(same | {"compile": samples(compile=(1.0, 1.3, 1.4))["compile"]})
+    assert guard.main([]) == 1 and "worse: compile" in capsys.readouterr().out
+
+
+def test_baselines_of_other_machines_stay_and_are_not_compared_with(tmp_path):
+    file = tmp_path / "guard.json"
+    costs = baseline_of(STORED)
+    store(file, "Abacus, 2 cores", {"costs": costs, "sizes": SIZES})
+    store(file, "Abacus, 4 cores", {"costs": {}, "sizes": SIZES})
+    store(file, "Abacus, 4 cores", {"costs": costs, "sizes": {"n_arms": 8}})
+    assert read_baseline(file, "Abacus, 2 cores", SIZES)["costs"] == costs
+    with pytest.raises(BaselineError, match="no baseline for Slide rule; it has: Abacus, 2 cores, Abacus, 4"):
+        read_baseline(file, "Slide rule", SIZES)
+    with pytest.raises(BaselineError, match="the baseline for Abacus, 4 cores is of other work"):
+        read_baseline(file, "Abacus, 4 cores", SIZES)
