@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jax.sharding import Mesh, PartitionSpec
 
 from mjx_softarm._mjx import State
 from mjx_softarm.env import ReachEnv
@@ -23,14 +25,17 @@ class Outcome(NamedTuple):
 
 
 class VectorEnv:
-    """`n` independent arms; an arm whose episode ended starts a new one, with a new goal."""
+    """`n` independent arms; an arm whose episode ended starts a new one, with a new goal.
 
-    def __init__(self, env: ReachEnv, n: int, episode_length: int):
-        self.env, self.n, self.episode_length = env, n, episode_length
+    With a mesh of devices, each steps its share of the arms, which must be equal ones.
+    """
+
+    def __init__(self, env: ReachEnv, n: int, episode_length: int, mesh: Mesh | None = None):
+        self.env, self.n, self.episode_length, self.mesh = env, n, episode_length, mesh
 
     def reset(self, key: Array) -> State:
         """State of n fresh arms."""
-        return jax.vmap(self.env.reset)(jax.random.split(key, self.n))
+        return self._each(self.env.reset)(jax.random.split(key, self.n))
 
     def step(self, state: State, action: Array, key: Array) -> tuple[State, State, Outcome]:
         """Act once.
@@ -44,7 +49,7 @@ class VectorEnv:
             The state to act on next (reset where an episode ended), the state that the action led to,
             and how the episodes stand.
         """
-        after = jax.vmap(self.env.step)(state, action)
+        after = self._each(self.env.step)(state, action)
         valid = after.info["valid"]
         terminated = (after.done > 0) & valid
         truncated = (after.pipeline_state.n_steps >= self.episode_length) & ~terminated
@@ -55,3 +60,11 @@ class VectorEnv:
         )
         following = following.replace(metrics=after.metrics)
         return following, after, Outcome(after.obs, after.reward, terminated, truncated, valid)
+
+    def _each(self, function: Callable) -> Callable:
+        """A function of one arm as one of all; a device does not wait for the slowest arm of another."""
+        all_arms = jax.vmap(function)
+        if self.mesh is None:
+            return all_arms
+        spec = PartitionSpec(self.mesh.axis_names)
+        return jax.shard_map(all_arms, mesh=self.mesh, in_specs=spec, out_specs=spec, check_vma=False)

@@ -12,6 +12,7 @@ from mjx_softarm.estimator import N_CHANGES, PoseEstimator, SpringModel
 from mjx_softarm.export import ArmModel
 from mjx_softarm.s2r import N_POSE_INPUTS, N_POSE_OUTPUTS, S2R
 
+jax.config.update("jax_num_cpu_devices", 8)  # of which most tests use one
 N_ARMS = 512  # of every call of `reset` and `step`: another number would compile anew
 
 

@@ -22,6 +22,7 @@ from mjx_softarm.checks import LogError
 from mjx_softarm.deploy.arms import ArmError
 from mjx_softarm.s2r import S2R, S2R_FILE, load_s2r
 from mjx_softarm.spec import ARM_FILE, ArmSpec, SpecError
+from train import devices
 from train.checkpoint import Run, RunError
 from train.config import (
     IMITATION_PRESETS,
@@ -37,6 +38,8 @@ from train.expert import ExpertError
 from train.sweep import add_sweep
 
 if TYPE_CHECKING:
+    from jax.sharding import Mesh
+
     from train.task import Task
 
 
@@ -116,6 +119,7 @@ def _add_run(
     )
     parser.add_argument("--out", type=Path, help=f"folder of the run; default: {folder}")
     parser.add_argument("--resume", type=Path, metavar="RUN", help="continue this run; its own settings hold")
+    parser.add_argument("--devices", metavar="D", help=devices.HELP)
 
 
 def _reach(options: argparse.Namespace, console: Console) -> int:
@@ -123,13 +127,14 @@ def _reach(options: argparse.Namespace, console: Console) -> int:
     from train.run import default_path
     from train.task import task_of
 
+    mesh = devices.mesh_of(options.devices)
     if options.resume:
-        return _resume(options, console)
+        return _resume(options, mesh, console)
     preset = options.preset or "quick"
     config = _config(PRESETS[preset], options)
     spec, s2r = _arm(options, console)
     console.print("drawing goals from the reachable workspace ...")
-    task = task_of(config, ReachEnv(spec, config.env, s2r))
+    task = task_of(config, ReachEnv(spec, config.env, s2r), mesh=mesh)
     path = options.out or default_path("reach", preset, config.seed)
     return _train(Run.create(path, config, spec, s2r), task, console)
 
@@ -139,8 +144,9 @@ def _imitate(options: argparse.Namespace, console: Console) -> int:
     from train.run import begin_with, default_path
     from train.task import task_of
 
+    mesh = devices.mesh_of(options.devices)
     if options.resume:
-        return _resume(options, console)
+        return _resume(options, mesh, console)
     if options.file is None:
         raise ConfigError("FILE: missing, expected the demonstrations, or --resume RUN")
     preset = options.preset or "pipe"
@@ -154,19 +160,19 @@ def _imitate(options: argparse.Namespace, console: Console) -> int:
     spec, s2r = _arm(options, console)
     log, _ = read_demonstrations(options.file, spec)
     donors = {name: path for name in ("agent", "reward") if (path := getattr(options, name))}
-    task = task_of(config, ReachEnv(spec, config.env, s2r), from_log(log, spec))
+    task = task_of(config, ReachEnv(spec, config.env, s2r), from_log(log, spec), mesh)
     state = begin_with(task, config.seed, **{name: Run.open(path) for name, path in donors.items()})
     path = options.out or default_path("imitate", preset, config.seed)
     return _train(Run.create(path, config, spec, s2r, log, donors, state), task, console)
 
 
-def _resume(options: argparse.Namespace, console: Console) -> int:
+def _resume(options: argparse.Namespace, mesh: Mesh | None, console: Console) -> int:
     from train.run import task_of_run
 
     if _given(options):
         raise ConfigError(f"--resume goes alone: the run's own settings hold, got {_given(options)} too")
     run = Run.open(options.resume)
-    return _train(run, task_of_run(run), console)
+    return _train(run, task_of_run(run, mesh), console)
 
 
 def _config(preset: Any, options: argparse.Namespace, assignments: Sequence[str] = ()) -> Any:
@@ -179,6 +185,7 @@ def _config(preset: Any, options: argparse.Namespace, assignments: Sequence[str]
 def _train(run: Run, task: Task, console: Console) -> int:
     from train.run import Interrupted, train
 
+    console.quiet = not devices.is_first_process()
     console.print(f"run: {run.path}", highlight=False)
     try:
         summary = train(run, task, console)
@@ -204,7 +211,9 @@ def _arm(options: argparse.Namespace, console: Console) -> tuple[ArmSpec, S2R | 
 
 def _given(options: argparse.Namespace) -> str:
     """The options of a new run that the command line has."""
-    given = {name: value for name, value in vars(options).items() if name not in ("command", "resume")}
+    given = {
+        name: value for name, value in vars(options).items() if name not in ("command", "resume", "devices")
+    }
     names = [name for name, value in given.items() if value not in (None, [])]
     return ", ".join("FILE" if name == "file" else f"--{name}" for name in names)
 

@@ -18,6 +18,7 @@ from mjx_softarm.s2r import S2R, S2R_FILE, load_s2r, save_s2r
 from mjx_softarm.spec import ArmSpec
 from train.config import ImitationConfig, TrainConfig, from_dict, to_dict
 from train.demonstrations import Demonstrations, load_demonstrations
+from train.devices import is_first_process, wait_for_all
 from train.job import TrainState
 
 N_KEPT = 2
@@ -34,6 +35,9 @@ class Run:
     `config.json` (settings, arm, calibration, versions, commit), `s2r.npz` (the calibration's sim-to-real
     network, if it has one), `demonstrations.npz` (if it learns from them), `checkpoints/`, `metrics.jsonl`,
     `evaluation.json`, pictures, TensorBoard's event files and, once exported, `policy.npz`.
+
+    Where several processes train together, all of them open the folder, which they share, and save
+    checkpoints; the rest is written by the first alone.
     """
 
     def __init__(self, path: Path, config: TrainConfig, spec: ArmSpec, s2r: S2R | None = None):
@@ -70,13 +74,16 @@ class Run:
             raise RunError(
                 f"{path}: already holds a run; continue it with --resume {path}, or choose another --out"
             )
+        wait_for_all(f"{path} is free")
         try:
-            path.mkdir(parents=True, exist_ok=True)
-            if s2r is not None:
-                save_s2r(path / S2R_FILE, s2r)
-            if demonstrations is not None:
-                write_log(path / DEMONSTRATIONS_FILE, demonstrations)
-            shutil.rmtree(path / CHECKPOINTS, ignore_errors=True)  # of a start that was interrupted
+            if is_first_process():
+                path.mkdir(parents=True, exist_ok=True)
+                if s2r is not None:
+                    save_s2r(path / S2R_FILE, s2r)
+                if demonstrations is not None:
+                    write_log(path / DEMONSTRATIONS_FILE, demonstrations)
+                shutil.rmtree(path / CHECKPOINTS, ignore_errors=True)  # of a start that was interrupted
+            wait_for_all(f"{path} is begun")
             run = cls(path, config, spec, s2r)
             if state is not None:
                 run.save(0, state)
@@ -87,7 +94,8 @@ class Run:
                 "begins_with": {name: str(folder) for name, folder in (begins_with or {}).items()},
                 "provenance": provenance("train"),
             }
-            write_json(path / "config.json", data)
+            if is_first_process():
+                write_json(path / "config.json", data)
         except OSError as error:
             raise RunError(f"{path}: cannot be written: {error.strerror}") from error
         return run
@@ -182,8 +190,9 @@ class Run:
 
     def log(self, row: dict[str, Any]) -> None:
         """Append a line to `metrics.jsonl`."""
-        with (self.path / "metrics.jsonl").open("a", encoding="utf-8") as file:
-            file.write(json.dumps(row) + "\n")
+        if is_first_process():
+            with (self.path / "metrics.jsonl").open("a", encoding="utf-8") as file:
+                file.write(json.dumps(row) + "\n")
 
     def metrics(self) -> list[dict[str, Any]]:
         """The lines of `metrics.jsonl`, up to the first incomplete one."""
@@ -198,6 +207,8 @@ class Run:
 
     def truncate_metrics(self, epoch: int) -> None:
         """Forget lines later than an epoch, before it is continued from there."""
+        if not is_first_process():
+            return
         rows = [row for row in self.metrics() if row["epoch"] <= epoch]
         temporary = self.path / "metrics.jsonl.part"
         temporary.write_text("".join(json.dumps(row) + "\n" for row in rows), "utf-8")

@@ -90,6 +90,7 @@ class Evaluator:
 
     def __call__(self, actor_params: Any) -> tuple[Summary, Reached, Reached]:
         """Figures, and what was reached on the workspace and on the circle, as NumPy arrays."""
+        actor_params = jax.device_get(actor_params)  # maybe on many devices; one is enough
         workspace = jax.device_get(self._workspace(actor_params, self.goals))
         circle = jax.device_get(self._circle(actor_params, self.circle))
         return summarise(workspace, circle, self.env.config.reward.threshold), workspace, circle

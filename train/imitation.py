@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.sharding import Mesh
 
 from mjx_softarm import rewards, xla
 from mjx_softarm._mjx import State
@@ -48,8 +49,14 @@ class ImitationJob(Job):
 
     config: ImitationConfig
 
-    def __init__(self, config: ImitationConfig, env: ReachEnv, demonstrations: Demonstrations):
-        super().__init__(config, env)
+    def __init__(
+        self,
+        config: ImitationConfig,
+        env: ReachEnv,
+        demonstrations: Demonstrations,
+        mesh: Mesh | None = None,
+    ):
+        super().__init__(config, env, mesh)
         self.positions = jnp.asarray(demonstrations.positions)  # (m, 6) [mm, deg]
         self.actions = jnp.asarray(demonstrations.actions)  # (m, n_chambers)
         self.gail = Gail(env.observation_size, env.action_size, config.gail)
@@ -109,7 +116,7 @@ class ImitationJob(Job):
         self, agent: TQCState, imitation: Imitation, memory: replay.Replay, key: Array
     ) -> tuple[tuple[TQCState, Any], dict[str, Array]]:
         key_sample, key_between, key_relabel, key_update = jax.random.split(key, 4)
-        stored = replay.sample(memory, key_sample, self.config.batch_size)
+        stored = self._sample(memory, key_sample)
         index = self._index_of(stored.goal)
         batch = self._with_expert(self._relabel(stored, key_relabel), stored, index)
         start, discriminator, told = self.env.observe(stored.pose, stored.goal), imitation.discriminator, {}

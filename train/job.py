@@ -7,13 +7,15 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jax.sharding import Mesh
 
 from mjx_softarm import xla
 from mjx_softarm._mjx import State
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.wrappers import VectorEnv
 from train import replay
-from train.config import TrainConfig
+from train.config import ConfigError, TrainConfig
+from train.devices import everywhere, split, spread
 from train.hindsight import Experience, relabel
 from train.tqc import TQC, TQCState, Transition
 
@@ -33,17 +35,25 @@ class TrainState(NamedTuple):
 class Job:
     """A run's fixed parts, and the two functions that change its state.
 
-    `n_traces` counts how often the epoch was traced: once in a run.
+    `n_traces` counts how often the epoch was traced: once in a run. With a mesh of devices, the state is
+    spread over them; see `train.devices`. Raises ConfigError for what cannot be split evenly.
     """
 
-    def __init__(self, config: TrainConfig, env: ReachEnv):
+    def __init__(self, config: TrainConfig, env: ReachEnv, mesh: Mesh | None = None):
         self.config = config
         self.env = env
-        self.arms = VectorEnv(env, config.n_arms, config.episode_length)
+        self.mesh = mesh
+        self.arms = VectorEnv(env, config.n_arms, config.episode_length, mesh)
         self.agent = TQC(env.observation_size, env.action_size, config.tqc, config.n_updates)
         self.n_traces = 0
-        self.init = xla.jit(self._init, env.uses_mjx)
-        self.epoch = xla.jit(self._epoch, env.uses_mjx, donate_argnums=0)
+        self.sharding = None if mesh is None else _sharding(config, mesh)
+        results = None if mesh is None else (self.sharding, everywhere(mesh))
+        self.init = xla.jit(self._init, env.uses_mjx, out_shardings=self.sharding)
+        self.epoch = xla.jit(self._epoch, env.uses_mjx, donate_argnums=0, out_shardings=results)
+
+    def place(self, state: TrainState) -> TrainState:
+        """The state where the epoch expects it, after something else has touched it."""
+        return state if self.sharding is None else jax.device_put(state, self.sharding)
 
     def _init(self, key: Array) -> TrainState:
         key, key_arms, key_agent = jax.random.split(key, 3)
@@ -119,9 +129,12 @@ class Job:
     ) -> tuple[tuple[TQCState, Any], dict[str, Array]]:
         """One gradient step, and its metrics by name."""
         key_sample, key_relabel, key_update = jax.random.split(key, 3)
-        stored = replay.sample(memory, key_sample, self.config.batch_size)
+        stored = self._sample(memory, key_sample)
         agent, losses = self.agent.update(agent, self._relabel(stored, key_relabel), key_update)
         return (agent, imitation), {f"tqc/{name}": x for name, x in losses.items()}
+
+    def _sample(self, memory: replay.Replay, key: Array) -> Experience:
+        return spread(self.mesh, replay.sample(memory, key, self.config.batch_size))
 
     def _relabel(self, stored: Experience, key: Array) -> Transition:
         return relabel(
@@ -145,3 +158,22 @@ class Job:
             clearance_cost=self.env.clearance_cost(after.info["clearance_mm"]),
             n_steps=end.n_steps,
         )
+
+
+def _sharding(config: TrainConfig, mesh: Mesh) -> TrainState:
+    """Where the parts of a state are, as a prefix of its tree."""
+    for name in ("n_arms", "replay_capacity", "batch_size"):
+        if getattr(config, name) % mesh.size:
+            raise ConfigError(
+                f"{name}: got {getattr(config, name)}, expected a multiple of the {mesh.size} devices"
+            )
+    on_all, rows = everywhere(mesh), split(mesh)
+    return TrainState(
+        arms=rows,
+        agent=on_all,
+        memory=replay.Replay(data=rows, position=on_all, size=on_all),
+        key=on_all,
+        n_env_steps=on_all,
+        n_unsettled=on_all,
+        imitation=on_all,
+    )

@@ -75,6 +75,7 @@ class PositionEvaluator:
 
     def __call__(self, actor_params: Any) -> tuple[PositionSummary, AtPositions]:
         """Figures, and what was reached, as NumPy arrays."""
+        actor_params = jax.device_get(actor_params)  # maybe on many devices; one is enough
         reached = jax.device_get(self._follow(actor_params, self.positions))
         return summarise(reached, self.env.config.reward.threshold, self.first)
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.sharding import Mesh
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from tensorboardX import SummaryWriter
@@ -20,6 +21,7 @@ from mjx_softarm.provenance import write_json
 from train import plots
 from train.checkpoint import Run, RunError
 from train.config import ImitationConfig
+from train.devices import any_process, is_first_process
 from train.job import Job, TrainState
 from train.task import Task, task_of
 
@@ -54,16 +56,16 @@ def train(run: Run, task: Task, console: Console) -> Any:
         while epoch < run.config.n_epochs:
             state, row = _timed_epoch(task.job, task.prepare(state, epoch))
             epoch += 1
-            due = run.config.evaluates_after(epoch)
+            stop, due = any_process(bool(asked)), run.config.evaluates_after(epoch)
             if due:
                 row |= evaluation(task, state.agent.actor_params)
             record(run, board, epoch, counts(state), row)
-            if due or asked:
+            if due or stop:
                 run.save(epoch, state)
             progress.update(bar, completed=epoch, text=_line(task, row))
             if due and not console.is_terminal:  # a log file gets lines in the place of a bar
                 console.print(f"epoch {epoch} of {run.config.n_epochs}: {_line(task, row)}", highlight=False)
-            if asked and epoch < run.config.n_epochs:
+            if stop and epoch < run.config.n_epochs:
                 raise Interrupted(f"stopped after epoch {epoch}; continue with --resume {run.path}")
     return finish(run, task, state.agent.actor_params)
 
@@ -71,14 +73,20 @@ def train(run: Run, task: Task, console: Console) -> Any:
 def finish(run: Run, task: Task, actor_params: Any) -> Any:
     """Evaluate a policy, write `evaluation.json` and the pictures; returns the figures."""
     summary, *reached = task.evaluate(actor_params)
-    write_json(run.path / "evaluation.json", summary.to_dict())
-    plots.save(run.path, task.pictures(run.metrics(), *reached))
+    if is_first_process():
+        write_json(run.path / "evaluation.json", summary.to_dict())
+        plots.save(run.path, task.pictures(run.metrics(), *reached))
     return summary
 
 
-def task_of_run(run: Run) -> Task:
-    """What a run learns."""
-    return task_of(run.config, ReachEnv(run.spec, run.config.env, run.s2r), run.demonstrations())
+def task_of_run(run: Run, mesh: Mesh | None = None) -> Task:
+    """What a run learns.
+
+    Raises:
+        RunError: its demonstrations cannot be read.
+        ConfigError: it cannot be split evenly over the devices of the mesh.
+    """
+    return task_of(run.config, ReachEnv(run.spec, run.config.env, run.s2r), run.demonstrations(), mesh)
 
 
 def restore_actor(run: Run) -> tuple[Task, Any]:
@@ -112,7 +120,7 @@ def begin_with(task: Task, seed: int, agent: Run | None = None, reward: Run | No
         given = _restored(reward, task_of_run(reward), "imitation").discriminator
         _same_shapes(reward, "discriminator", given, state.imitation.discriminator)
         state = state._replace(imitation=state.imitation._replace(discriminator=given))
-    return state
+    return task.job.place(state)
 
 
 def _restored(run: Run, task: Task, part: str) -> Any:
@@ -129,7 +137,8 @@ def _same_shapes(run: Run, what: str, given: Any, own: Any) -> None:
 def open_board(run: Run, state: TrainState) -> SummaryWriter:
     """TensorBoard's writer; what a stopped run wrote after its checkpoint is dropped."""
     steps = int(state.n_env_steps)
-    return SummaryWriter(str(run.path), purge_step=steps + 1 if steps else None)
+    purge_step = steps + 1 if steps else None
+    return SummaryWriter(str(run.path), purge_step=purge_step, write_to_disk=is_first_process())
 
 
 def _timed_epoch(job: Job, state: TrainState) -> tuple[TrainState, dict[str, float]]:

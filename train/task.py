@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+from jax.sharding import Mesh
 from matplotlib.figure import Figure
 
 from mjx_softarm.env import ReachEnv
@@ -32,12 +33,21 @@ class Task(NamedTuple):
     prepare: Callable[[TrainState, int], TrainState]  # before the epoch of that number
 
 
-def task_of(config: TrainConfig, env: ReachEnv, demonstrations: Demonstrations | None = None) -> Task:
-    """What a run of this config learns; demonstrations are needed where it learns from them."""
+def task_of(
+    config: TrainConfig,
+    env: ReachEnv,
+    demonstrations: Demonstrations | None = None,
+    mesh: Mesh | None = None,
+) -> Task:
+    """What a run of this config learns; demonstrations are needed where it learns from them.
+
+    Raises:
+        ConfigError: it cannot be split evenly over the devices of the mesh.
+    """
     if isinstance(config, ImitationConfig):
         assert demonstrations is not None
-        return _imitation(config, env, demonstrations)
-    job = Job(config, env)
+        return _imitation(config, env, demonstrations, mesh)
+    job = Job(config, env, mesh)
     return Task(
         job=job,
         title=f"{N_GOALS} held-out goals",
@@ -49,16 +59,20 @@ def task_of(config: TrainConfig, env: ReachEnv, demonstrations: Demonstrations |
     )
 
 
-def _imitation(config: ImitationConfig, env: ReachEnv, demonstrations: Demonstrations) -> Task:
-    job = ImitationJob(config, env, demonstrations)
+def _imitation(
+    config: ImitationConfig, env: ReachEnv, demonstrations: Demonstrations, mesh: Mesh | None
+) -> Task:
+    job = ImitationJob(config, env, demonstrations, mesh)
     evaluate = PositionEvaluator(env, job.agent, demonstrations.positions, job.goals_of(0))
 
     def prepare(state: TrainState, epoch: int) -> TrainState:
         every = config.rebalance_epochs
         if every and epoch and epoch % every == 0 and epoch not in config.stage_epochs:
             summary, _ = evaluate(state.agent.actor_params)
-            return job.rebalance(state, epoch, summary.error_mm)
-        return job.begin_stage(state, epoch)
+            state = job.rebalance(state, epoch, summary.error_mm)
+        else:
+            state = job.begin_stage(state, epoch)
+        return job.place(state)
 
     return Task(
         job=job,
