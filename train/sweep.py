@@ -15,6 +15,8 @@ from mjx_softarm.spec import ArmSpec
 from train.config import PRESETS, ConfigError, TrainConfig, override
 from train.sweep_job import VARIABLE, setting
 
+_WIDTH = 160  # of the table where it is printed elsewhere than to a terminal
+
 ArmOf = Callable[[argparse.Namespace, Console], tuple[ArmSpec, S2R | None]]
 
 
@@ -68,7 +70,8 @@ def _sweep(options: argparse.Namespace, console: Console, arm_of: ArmOf) -> int:
     except Interrupted as stop:
         console.print(str(stop), highlight=False)
         return 130
-    console.print(report(sweep))
+    wide = console if console.is_terminal else Console(file=console.file, width=_WIDTH)
+    wide.print(report(sweep))
     for what, name in (("results", RESULTS_FILE), ("picture", CURVES_FILE)):
         console.print(f"{what}: {sweep.path / name}", highlight=False, soft_wrap=True)
     return 0

@@ -106,9 +106,9 @@ def table(groups: Sequence[dict[str, Any]]) -> Table:
     spread = f"mean of {n_seeds} seeds (least to greatest)" if n_seeds > 1 else "one seed"
     shown = Table(title=f"held-out figures, {spread}", title_justify="left")
     if groups[0]["settings"]:
-        shown.add_column("setting", no_wrap=True)
+        shown.add_column("setting", overflow="fold")
     for _, heading, _, _ in _COLUMNS:
-        shown.add_column(heading, justify="right", no_wrap=True)
+        shown.add_column(heading, justify="right")
     for group in groups:
         cells = [_name(group["settings"], "\n")] if group["settings"] else []
         for name, _, factor, decimals in _COLUMNS:
@@ -146,6 +146,7 @@ def curves(sweep: Sweep) -> Figure:
         )
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_formatter("{x:g}")
     if sweep.varied:
         axes.legend(frameon=False)
     return figure

@@ -124,18 +124,18 @@ def train(sweep: Sweep, console: Console) -> None:
         while epoch < config.n_epochs:
             states, rows = _timed_epoch(job, states)
             epoch += 1
-            due = config.evaluates_after(epoch)
+            stop, due = bool(asked), config.evaluates_after(epoch)
             done = {"env_steps": int(states.n_env_steps), "updates": int(states.agent.step[0])}
             for k, (run, board, row) in enumerate(zip(sweep.runs, boards, rows, strict=True)):
                 if due:
                     row |= evaluation(tasks[run.config.env], job.actor_params(states, k))
                 record(run, board, epoch, done, row)
-                if due or asked:
+                if due or stop:
                     run.save(epoch, job.member(states, k))
             progress.update(bar, completed=epoch, text=_line(rows))
             if due and not console.is_terminal:  # a log file gets lines in the place of a bar
                 console.print(f"epoch {epoch} of {config.n_epochs}: {_line(rows)}", highlight=False)
-            if asked and epoch < config.n_epochs:
+            if stop and epoch < config.n_epochs:
                 raise Interrupted(f"stopped after epoch {epoch}; continue with --resume {sweep.path}")
     for k, run in enumerate(sweep.runs):
         finish(run, tasks[run.config.env], job.actor_params(states, k))
@@ -176,8 +176,8 @@ def _timed_epoch(job: SweepJob, states: TrainState) -> tuple[TrainState, list[di
 
 def _line(rows: Sequence[Mapping[str, Any]]) -> str:
     n, row = len(rows), rows[0]
-    speeds = (row["speed/env_steps_per_s"], row["speed/updates_per_s"])
-    text = "{0} x {1:.0f} env steps/s  {0} x {2:.0f} updates/s".format(n, *speeds)
+    env_steps, updates = row["speed/env_steps_per_s"], row["speed/updates_per_s"]
+    text = f"{n} x {env_steps:.0f} env steps/s  {n} x {updates:.0f} updates/s"
     if "evaluation/median_mm" not in row:
         return text
     medians = [row["evaluation/median_mm"] for row in rows]
