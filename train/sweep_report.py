@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.figure import Figure
 from rich.table import Table
+from rich.text import Text
 
 from mjx_softarm.provenance import provenance, write_json
 from train import plots
@@ -108,7 +109,7 @@ def table(groups: Sequence[dict[str, Any]]) -> Table:
     if groups[0]["settings"]:
         shown.add_column("setting", overflow="fold")
     for _, heading, _, _ in _COLUMNS:
-        shown.add_column(heading, justify="right")
+        shown.add_column(Text(heading), justify="right")  # not markup: "[mm]"
     for group in groups:
         cells = [_name(group["settings"], "\n")] if group["settings"] else []
         for name, _, factor, decimals in _COLUMNS:

@@ -353,7 +353,7 @@ def finished(tmp_path):
 
 def test_the_table_has_mean_least_and_greatest_over_the_seeds(finished):
     shown = report(finished)
-    columns = {column.header.replace("\n", " "): list(column.cells) for column in shown.columns}
+    columns = {str(column.header).replace("\n", " "): list(column.cells) for column in shown.columns}
     assert columns == {
         "setting": ["tqc.gamma=0.5", "tqc.gamma=0.9"],
         "tip error, median [mm]": ["3.50\n(2.00 to 5.00)", "7.00\n(6.00 to 8.00)"],
@@ -362,6 +362,9 @@ def test_the_table_has_mean_least_and_greatest_over_the_seeds(finished):
         "saturated [%]": ["0.0\n(0.0 to 0.0)"] * 2,
         "circle, mean [mm]": ["1.00\n(1.00 to 1.00)"] * 2,
     }
+    console = Console(file=io.StringIO(), width=160)
+    console.print(shown)
+    assert "median [mm]" in console.file.getvalue()
     written = json.loads((finished.path / RESULTS_FILE).read_text())
     assert {"python", "packages", "commit"} <= written["provenance"].keys()
     first, second = written["groups"]
