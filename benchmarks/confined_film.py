@@ -9,7 +9,8 @@ import numpy as np
 from benchmarks.confined_measure import finger_tips, finger_tips_seen, operate
 from benchmarks.confined_plots import outline_mm
 from benchmarks.confined_stages import KINDS, Trial, pipe_mm, scene_of
-from benchmarks.paper_film import HEIGHT, WIDTH, FilmedTwin, Side, frames, write_gif
+from benchmarks.paper_film import HEIGHT, WIDTH, Film, Side, frames, write_gif
+from benchmarks.paper_measure import Driven
 from benchmarks.paper_stages import Settings
 
 FILM_FILE = "pipe.gif"
@@ -27,13 +28,13 @@ def film_pipe(folder: Path, settings: Settings) -> str:
     scene = scene_of(folder, settings, trial)
     try:
         with scene.twin.renderer(WIDTH, HEIGHT) as renderer:
-            filmed = FilmedTwin(scene.twin, renderer)
-            operate(filmed, *scene[1:], trial.objects)
+            film = Film(scene.twin, renderer)
+            operate(Driven(scene.twin, film.take), *scene[1:], trial.objects)
     except RenderError as error:
         return str(error)
     gripper_m = scene.controller.policy.spec.mass.gripper_length_m
     path_mm = 1e3 * np.array(
-        [finger_tips_seen(seen.tip_m, seen.tip_quaternion, gripper_m) for seen in filmed.seen]
+        [finger_tips_seen(seen.tip_m, seen.tip_quaternion, gripper_m) for seen in film.seen]
     )
     diameter_mm = pipe_mm(KINDS[trial.kind].task)
     side = Side(
@@ -43,5 +44,5 @@ def film_pipe(folder: Path, settings: Settings) -> str:
         goals_mm=1e3 * finger_tips(scene.goals, gripper_m),
         lines_mm=tuple(outline_mm(CrossPipe.of_mm(diameter_mm))),
     )
-    write_gif(path, frames(filmed.pictures, path_mm, side))
+    write_gif(path, frames(film.pictures, path_mm, side))
     return ""

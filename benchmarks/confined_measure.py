@@ -13,8 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.paper_measure import load_arrays, measure, point_of, save_arrays
-from mjx_softarm.deploy import faults
+from benchmarks.paper_measure import Driven, load_arrays, measure, point_of, reached, save_arrays, told
 from mjx_softarm.deploy.loop import Controller
 from mjx_softarm.deploy.session import follow
 from mjx_softarm.pipe import APPLE_KG, BALL_KG
@@ -83,32 +82,18 @@ def _container(name: str) -> str:
     return name.split(" ")[-1]
 
 
-class Watched:
-    """A twin whose contact forces are noted in every tick; else the twin itself."""
-
-    def __init__(self, twin: Any):
-        self._twin, self.force_n = twin, []
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._twin, name)
-
-    def write_pressures(self, pressure_kpa: np.ndarray) -> None:
-        """Drive the twin; see `ArmIO`."""
-        self._twin.write_pressures(pressure_kpa)
-        self.force_n.append(self._twin.wall_force_n())
-
-
 def operate(
     arm: Any, controller: Controller, goals: np.ndarray, names: Sequence[str], objects: str
 ) -> Operated:
     """Go along positions (p, 6) [mm, deg], taking and letting go what their names say."""
-    watched, spec = Watched(arm), controller.policy.spec
-    gripper_m = spec.mass.gripper_length_m
+    gripper_m = controller.policy.spec.mass.gripper_length_m
+    forces: list[tuple[float, float]] = []
+    watched = Driven(arm, lambda: forces.append(arm.wall_force_n()))
     hands = Hands(watched, names, finger_tips(goals, gripper_m), objects, gripper_m)
     run = follow(watched, controller, goals, arrived=hands.arrived)
     followed = measure(run, controller, goals)
     log, force_n = run.log, np.zeros((len(run.log), 2))
-    force_n[: len(watched.force_n)] = watched.force_n  # an arm that is lost takes no pressures any more
+    force_n[: len(forces)] = forces  # an arm that is lost takes no pressures any more
     arrival_s = np.full(len(goals), np.nan)
     for arrival in run.arrivals:
         arrival_s[point_of(arrival.goal, goals)] = log.time_s[arrival.row]
@@ -151,15 +136,13 @@ def load_operated(path: Path) -> Operated:
 
 def figures(operated: Operated) -> dict[str, Any]:
     """The figures of one run that stand in tables; errors over the positions that were reached."""
-    reached = np.isfinite(operated.error).all(axis=1)
-    error = operated.error[reached] if reached.any() else np.full((1, 6), np.nan)
+    n_reached, error = reached(operated.error)
     away = np.linalg.norm(error[:, :3], axis=1)
     x, y, z = np.abs(error[:, :3]).mean(axis=0)
     n_operations = int(operated.operation.sum())
-    events = {fault.value: int(n) for fault, n in zip(faults.Fault, operated.events, strict=True) if n}
     return {
         "positions": len(operated.goal),
-        "reached": int(reached.sum()),
+        "reached": n_reached,
         "x_mm": float(x),
         "y_mm": float(y),
         "z_mm": float(z),
@@ -172,6 +155,6 @@ def figures(operated: Operated) -> dict[str, Any]:
         "calm_percent": 100 * float(np.mean(operated.wall_n < CALM_N)),
         "wall_max_n": float(operated.wall_n.max()),
         "container_max_n": float(operated.container_n.max()),
-        "events": events,
+        "events": told(operated.events),
         "seconds": float(operated.time_s[-1]),
     }

@@ -18,7 +18,6 @@ from benchmarks.confined_plots import (
 from benchmarks.confined_stages import KINDS, Results, Trial
 from benchmarks.confined_summary import (
     AVERAGED,
-    PAPER_WITHOUT_MM,
     SUCCESS,
     check_goals,
     circle_rows,
@@ -27,6 +26,7 @@ from benchmarks.confined_summary import (
     training_rows,
 )
 from benchmarks.paper_stages import Settings
+from benchmarks.paper_summary import PAPER as PAPER_OPEN
 from benchmarks.paper_summary import Check, spread
 from benchmarks.report import (
     Drawn,
@@ -96,7 +96,7 @@ def figures_of(folder: Path, settings: Settings, results: Results) -> dict[str, 
         "circle_without_demonstrations": {
             "runs": len(without),
             "translation_mm": spread([row["translation_mm"] for row in without])._asdict(),
-            "paper": {"translation_mm": PAPER_WITHOUT_MM},
+            "paper": {"translation_mm": PAPER_OPEN["with"]["translation_mm"]},
         },
         "trainings": trainings,
         "calibrations": {f"twin {twin}": calibration_of(folder, twin) for twin in settings.twins},

@@ -28,6 +28,7 @@ from benchmarks.paper_stages import (
     policy_folder,
     result_file,
 )
+from mjx_softarm.pipe import PIPES_MM
 
 
 class Kind(NamedTuple):
@@ -106,7 +107,7 @@ def circles(settings: Settings) -> list[Case]:
 
 def pipe_mm(task: str) -> int | None:
     """Diameter of a task's pipe."""
-    return int(task.removeprefix("pipe")) if task.startswith("pipe") else None
+    return PIPES_MM.get(task)
 
 
 def demonstrations_file(folder: Path, twin: int, task: str) -> Path:

@@ -33,7 +33,6 @@ PAPER: Mapping[tuple[str, str], Mapping[str, float]] = {
     ("narrow", "as shown"): {"done": 4},
     ("circle", "as shown"): {"translation_mm": 11.29},
 }
-PAPER_WITHOUT_MM = 11.59  # around the circle, without demonstrations
 N_OPERATIONS = 4
 SUCCESS = 0.9  # share of the positions that counts as learned
 MOST_MM, CALM_PERCENT = 5.0, 99.0

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from PIL import Image, ImageDraw
 
+from benchmarks.paper_measure import Driven
 from benchmarks.paper_stages import Case, Settings, controller
 
 WIDTH, HEIGHT = 240, 320  # of each half [px]
@@ -28,20 +29,16 @@ class Side(NamedTuple):
     lines_mm: tuple[np.ndarray, ...] = ()  # (k, 2) each, along these axes
 
 
-class FilmedTwin:
-    """A twin that has its picture taken now and then, as it is driven; else the twin itself."""
+class Film:
+    """Pictures of a twin, taken now and then as it is driven, and where motion capture saw it then."""
 
     def __init__(self, twin: Any, renderer: Any):
         self._twin, self._renderer, self._next_s = twin, renderer, 0.0
         self.pictures: list[np.ndarray] = []
-        self.seen: list[Any] = []  # by motion capture, as they were taken
+        self.seen: list[Any] = []
 
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._twin, name)
-
-    def write_pressures(self, pressure_kpa: np.ndarray) -> None:
-        """Drive the twin; see `ArmIO`."""
-        self._twin.write_pressures(pressure_kpa)
+    def take(self) -> None:
+        """Take one, if it is time to."""
         if self._twin.time_s >= self._next_s:
             self._next_s += EVERY_S
             self.pictures.append(self._twin.draw(self._renderer))
@@ -63,13 +60,13 @@ def film_circle(folder: Path, settings: Settings) -> str:
     twin = Twin(case.twin, session=EVALUATION_SESSION)
     try:
         with twin.renderer(WIDTH, HEIGHT) as renderer:
-            filmed = FilmedTwin(twin, renderer)
-            follow(filmed, controller(folder, case), goals)
+            film = Film(twin, renderer)
+            follow(Driven(twin, film.take), controller(folder, case), goals)
     except RenderError as error:
         return str(error)
     text = "reference (grey) and tip, from above"
     side = Side(f"twin {case.twin}, with S2R", text, (0, 1), goals[:, :3])
-    write_gif(path, frames(filmed.pictures, 1e3 * np.array([seen.tip_m for seen in filmed.seen]), side))
+    write_gif(path, frames(film.pictures, 1e3 * np.array([seen.tip_m for seen in film.seen]), side))
     return ""
 
 

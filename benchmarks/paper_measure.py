@@ -6,7 +6,7 @@ Motion capture is noisy: an error is the mean over the window in which the sprin
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -37,6 +37,21 @@ class Followed(NamedTuple):
     reference_m: Any  # (k, n)
     spring_m: Any  # (k, n) as read
     pressure_kpa: Any  # (k, n) as measured
+
+
+class Driven:
+    """A twin of which something is noted each time it was driven; else the twin itself."""
+
+    def __init__(self, twin: Any, note: Callable[[], None]):
+        self._twin, self._note = twin, note
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._twin, name)
+
+    def write_pressures(self, pressure_kpa: np.ndarray) -> None:
+        """Drive the twin; see `ArmIO`."""
+        self._twin.write_pressures(pressure_kpa)
+        self._note()
 
 
 def measure(run: Run, controller: Controller, goals: np.ndarray) -> Followed:
@@ -113,17 +128,14 @@ def load_arrays(path: Path, names: Iterable[str]) -> dict[str, Any]:
 
 def figures(followed: Followed) -> dict[str, Any]:
     """The figures of one run that stand in tables, over the points that were reached."""
-    reached = np.isfinite(followed.error).all(axis=1)
-    error = followed.error[reached]
-    if not len(error):
-        error = np.full((1, 6), np.nan)
+    n_reached, error = reached(followed.error)
     away = np.linalg.norm(error[:, :3], axis=1)
     yaw, pitch, roll = np.abs(error[:, 3:]).mean(axis=0)
     per_point = followed.saturated.sum(axis=1)
-    events = {fault.value: int(n) for fault, n in zip(faults.Fault, followed.events, strict=True) if n}
+    events = told(followed.events)
     return {
         "points": len(followed.goal),
-        "reached": int(reached.sum()),
+        "reached": n_reached,
         "translation_mm": float(away.mean()),
         "rmse_mm": float(np.sqrt(np.mean(away**2))),
         "max_mm": float(away.max()),
@@ -138,6 +150,17 @@ def figures(followed: Followed) -> dict[str, Any]:
         "seconds": float(followed.time_s[-1]),
         "latency_ms": [round(1e3 * float(value), 3) for value in followed.latency_s],
     }
+
+
+def reached(error: np.ndarray) -> tuple[int, np.ndarray]:
+    """How many of the points were reached, and their rows of the errors (p, 6); without any, a row of NaN."""
+    rows = error[np.isfinite(error).all(axis=1)]
+    return len(rows), rows if len(rows) else np.full((1, error.shape[1]), np.nan)
+
+
+def told(events: np.ndarray) -> dict[str, int]:
+    """How often the loop told each fault (faults,) that it told at all, by name."""
+    return {fault.value: int(n) for fault, n in zip(faults.Fault, events, strict=True) if n}
 
 
 def _believed_mm(followed: Followed) -> float:

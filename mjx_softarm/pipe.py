@@ -19,6 +19,7 @@ from mjx_softarm.spec import ArmSpec
 # What the arm picks and places. Source: the paper's section on confined scenarios.
 BALL_KG = 0.035  # a sponge ball
 APPLE_KG = 0.220
+PIPES_MM = {"pipe300": 300, "pipe250": 250}  # diameters
 RIM_POINTS = 16  # of a ring; the rim is at most 1 - cos(pi / 16) = 1.9 % of its radius beyond them
 
 

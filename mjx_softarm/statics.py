@@ -194,7 +194,7 @@ def tendons(frames: Frames, site_m: Array) -> Tendons:
 
 
 def _dot(a: Array, b: Array) -> Array:
-    """Inner product over the last axis, others broadcast: many tiny ones, for which a matrix product is slow."""
+    """Inner products over the last axis, the others broadcast: as matrix products, tiny ones are slow."""
     return jnp.sum(a * b, axis=-1)
 
 

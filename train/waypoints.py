@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mjx_softarm.pipe import CrossPipe
+from mjx_softarm.pipe import PIPES_MM, CrossPipe
 from mjx_softarm.pose import frame_from_pose
 from mjx_softarm.spec import ArmSpec
 from mjx_softarm.workspace import circle_poses
@@ -49,18 +49,16 @@ class Task(NamedTuple):
 # Stops of a path with the moves that lead to each; "home" is where it begins.
 _PIPE300 = (("pick right", 4), ("place left", 7), ("pick bottom", 6), ("place right", 6), ("home", 4))
 _PIPE250 = (("pick left", 6), ("place bottom", 8), ("pick right", 8), ("place left", 8), ("home", 6))
-TASKS = ("circle16", "pipe300", "pipe250")
+_STOPS = {"pipe300": _PIPE300, "pipe250": _PIPE250}
+TASKS = ("circle16", *_STOPS)
 
 
 def task(name: str, spec: ArmSpec) -> Task:
     """The task of this name, one of `TASKS`, for an arm with the gripper of `spec`."""
     if name == "circle16":
         return Task(circle(16, spec))
-    pipe, stops = {
-        "pipe300": (CrossPipe.of_mm(300), _PIPE300),
-        "pipe250": (CrossPipe.of_mm(250), _PIPE250),
-    }[name]
-    return Task(pick_and_place(pipe, stops), pipe)
+    pipe = CrossPipe.of_mm(PIPES_MM[name])
+    return Task(pick_and_place(pipe, _STOPS[name]), pipe)
 
 
 def circle(n: int, spec: ArmSpec) -> tuple[Waypoint, ...]:

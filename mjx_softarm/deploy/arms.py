@@ -7,10 +7,9 @@ import os
 import sys
 from typing import Any
 
-from mjx_softarm.pipe import CrossPipe
+from mjx_softarm.pipe import PIPES_MM, CrossPipe
 from mjx_softarm.spec import SpecError
 
-PIPES_MM = {"pipe300": 300.0, "pipe250": 250.0}  # diameters of the paper's pipes
 _METHODS = ("read_frequencies", "write_pressures")
 
 

@@ -17,7 +17,6 @@ from benchmarks.confined_measure import (
     THINGS_KG,
     Hands,
     Operated,
-    Watched,
     figures,
     finger_tips,
     load_operated,
@@ -49,7 +48,7 @@ from benchmarks.confined_summary import (
     summarise,
     training_rows,
 )
-from benchmarks.paper_measure import Followed, save_followed
+from benchmarks.paper_measure import Driven, Followed, save_followed
 from benchmarks.paper_stages import SMOKE, Case, Settings, claim, policy_folder, result_file
 from benchmarks.parallel import JobError
 from mjx_softarm import ArmSpec
@@ -247,11 +246,12 @@ def test_thing_lies_where_it_was_let_go():
 def test_forces_of_every_tick_are_noted():
     ticks = iter([(0.0, 1.0), (2.0, 0.0)])
     twin = SimpleNamespace(write_pressures=lambda p: None, wall_force_n=lambda: next(ticks), time_s=3.0)
-    watched = Watched(twin)
+    forces = []
+    driven = Driven(twin, lambda: forces.append(twin.wall_force_n()))
     for _ in range(2):
-        watched.write_pressures(np.zeros(N))
-    assert watched.force_n == [(0.0, 1.0), (2.0, 0.0)]
-    assert watched.time_s == 3.0
+        driven.write_pressures(np.zeros(N))
+    assert forces == [(0.0, 1.0), (2.0, 0.0)]
+    assert driven.time_s == 3.0
 
 
 def test_finger_tips_are_below_the_tip():

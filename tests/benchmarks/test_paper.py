@@ -295,17 +295,18 @@ class StillTwin:
 
 
 def test_twin_is_filmed_at_equal_times(tmp_path):
-    filmed = paper_film.FilmedTwin(StillTwin(), None)
+    twin = StillTwin()
+    film = paper_film.Film(twin, None)
     for _ in range(round(200 / 0.02)):
-        filmed.write_pressures(np.zeros(N))
-    assert np.isclose(filmed.time_s, 200.0)
-    taken = [picture[0, 0, 0] for picture in filmed.pictures]
+        twin.write_pressures(np.zeros(N))
+        film.take()
+    taken = [picture[0, 0, 0] for picture in film.pictures]
     assert taken[:3] == [0, 1, 2]
     assert len(taken) == 201
-    assert len(filmed.seen) == 201
-    path_mm = 1e3 * np.array([seen.tip_m for seen in filmed.seen])
+    assert len(film.seen) == 201
+    path_mm = 1e3 * np.array([seen.tip_m for seen in film.seen])
     side = paper_film.Side("", "", (0, 1), circle_poses(4)[:, :3])
-    images = paper_film.frames(filmed.pictures, path_mm, side)
+    images = paper_film.frames(film.pictures, path_mm, side)
     shown = [image.getpixel((0, 19))[0] for image in images]
     assert len(images) == paper_film.MAX_FRAMES
     assert (shown[0], shown[-1]) == (0, 200)
