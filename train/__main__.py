@@ -127,7 +127,7 @@ def _reach(options: argparse.Namespace, console: Console) -> int:
     from train.run import default_path
     from train.task import task_of
 
-    mesh = devices.mesh_of(options.devices)
+    mesh = _mesh(options, console)
     if options.resume:
         return _resume(options, mesh, console)
     preset = options.preset or "quick"
@@ -144,7 +144,7 @@ def _imitate(options: argparse.Namespace, console: Console) -> int:
     from train.run import begin_with, default_path
     from train.task import task_of
 
-    mesh = devices.mesh_of(options.devices)
+    mesh = _mesh(options, console)
     if options.resume:
         return _resume(options, mesh, console)
     if options.file is None:
@@ -166,6 +166,13 @@ def _imitate(options: argparse.Namespace, console: Console) -> int:
     return _train(Run.create(path, config, spec, s2r, log, donors, state), task, console)
 
 
+def _mesh(options: argparse.Namespace, console: Console) -> Mesh | None:
+    """The devices to train on; of several processes, one speaks."""
+    mesh = devices.mesh_of(options.devices)
+    console.quiet = not devices.is_first_process()
+    return mesh
+
+
 def _resume(options: argparse.Namespace, mesh: Mesh | None, console: Console) -> int:
     from train.run import task_of_run
 
@@ -185,7 +192,6 @@ def _config(preset: Any, options: argparse.Namespace, assignments: Sequence[str]
 def _train(run: Run, task: Task, console: Console) -> int:
     from train.run import Interrupted, train
 
-    console.quiet = not devices.is_first_process()
     console.print(f"run: {run.path}", highlight=False)
     try:
         summary = train(run, task, console)
