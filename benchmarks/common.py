@@ -103,7 +103,7 @@ def _print_table(console: Console, title: str, rows: Sequence[Mapping[str, Any]]
     names = list(dict.fromkeys(name for row in rows for name in row))
     table = Table()
     for name in names:
-        numbers = all(isinstance(row.get(name, 0), int | float) for row in rows)
+        numbers = all(isinstance(row.get(name), int | float | None) for row in rows)
         table.add_column(
             Text(name.replace("_", " ")), justify="right" if numbers else "left", overflow="fold"
         )

@@ -30,6 +30,7 @@ def test_a_list_of_rows_is_a_table_with_a_column_for_every_name_in_any_row():
     )
     assert ["rates"] in [line.split(",") for line in text.splitlines()]
     assert ["1,024", "0.5", ""] in cells(text)
+    assert f"│ {'0.5':>15} │" in text  # numbers to the right, gaps or not
     assert ["1", "", "no [cuda] here"] in cells(text)
 
 
