@@ -29,8 +29,8 @@ lint: $(INSTALLED) .venv/.installed-dev  ## ruff, which corrects what it can, an
 bench: $(INSTALLED)  ## the benchmarks
 	$(BIN)/python -m benchmarks throughput settle learner
 
-clean:  ## remove .venv, build outputs and caches; runs/ stays
-	rm -rf .venv build dist *.egg-info .pytest_cache .ruff_cache
+clean:  ## remove virtual environments, build outputs and caches; runs/ stays
+	rm -rf .venv .venv-* build dist *.egg-info .pytest_cache .ruff_cache
 	find . -name __pycache__ -not -path './.git/*' -prune -exec rm -rf {} +
 
 .venv: $(INSTALLED)  ## the environment alone
