@@ -6,6 +6,7 @@ dictionaries becomes a table with their keys as its head, loose values become a 
 
 from __future__ import annotations
 
+import os
 import resource
 import sys
 import time
@@ -35,6 +36,11 @@ def seconds(call: Callable[[], Any], repeats: int = 10) -> float:
         jax.block_until_ready(call())
         times.append(time.perf_counter() - start)
     return float(np.median(times))
+
+
+def n_cores() -> int:
+    """How many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def peak_memory() -> dict[str, int]:

@@ -26,7 +26,11 @@ from mjx_softarm.spec import ArmSpec
 
 MATRIX = {"cpu": 2048, "gpu": 8192}  # rows of the product
 COPIED, N_COPIES = {"cpu": 2**24, "gpu": 2**28}, 8  # numbers
-LIBRARY = {"cholesky": "potrf", "triangular_solve": "trsm", "lu": "getrf"}  # as in custom calls' names
+LIBRARY = {  # as in the names of custom calls: LAPACK, cuBLAS, cuSOLVER
+    "cholesky": ("potrf", "cusolver$cholesky"),
+    "triangular_solve": ("trsm", "triangularSolve"),
+    "lu": ("getrf",),
+}
 
 
 def device_rates() -> dict[str, float]:
@@ -50,13 +54,19 @@ class Cost(NamedTuple):
 
 
 def counted(function: Callable, compiled: Any, *arguments: Any) -> Cost:
-    """Operations and bytes of a jitted function that was compiled, the body of a loop once."""
-    cost, text = compiled.cost_analysis(), compiled.as_text()
-    library = sum(
-        flop
-        for name, flop in _linear_algebra(jax.make_jaxpr(function)(*arguments).jaxpr)
-        if LIBRARY[name] in text
-    )
+    """Operations and bytes of a jitted function that was compiled, the body of a loop once.
+
+    Raises:
+        RuntimeError: it factorises or solves by a library that is not known here, or by none.
+    """
+    cost, text, library = compiled.cost_analysis(), compiled.as_text(), 0.0
+    for name, flop in _linear_algebra(jax.make_jaxpr(function)(*arguments).jaxpr):
+        if not any(called in text for called in LIBRARY[name]):
+            raise RuntimeError(
+                f"{name}: expected a call of {' or '.join(LIBRARY[name])} in the compiled function, found none, "
+                "so whether its operations are counted is not known"
+            )
+        library += flop
     return Cost(cost["flops"] + library, cost["bytes accessed"])
 
 

@@ -3,17 +3,17 @@
     python -m benchmarks guard            compare; for use before a release, in about two minutes
     python -m benchmarks guard --store    make this the baseline of this kind of machine
 
-Exit status 0 if nothing is worse, 1 if something is, 2 if there is no baseline. What is measured, and why it
-holds on a machine that is busy or faster, stands in `benchmarks.guard_work`. It runs in processes of its own,
-one after the other, since what differs from process to process, such as where memory lies, is a part of the
-spread. Tolerance is twice the furthest that a process of the baseline lay from their median.
+Exit status 0 if nothing is worse, 1 if something is, 2 if there is no baseline, or none worth storing. What is
+measured, and why it holds on a machine that is busy or faster, stands in `benchmarks.guard_work`. It runs in
+processes of its own, one after the other, since what differs from process to process, such as where memory
+lies, is a part of the spread. Tolerance is twice the furthest that a process of the baseline lay from their
+median; a baseline with one above a quarter is refused, since it would let through what it is there to stop.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import os
 import platform
 import re
 from collections.abc import Mapping, Sequence
@@ -23,7 +23,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from benchmarks.common import RESULTS, show
+from benchmarks.common import RESULTS, n_cores, show
 from benchmarks.guard_work import REFERENCE, sizes_here
 from benchmarks.rounds import Facts, Worker, working
 from mjx_softarm.provenance import provenance, write_json
@@ -32,6 +32,7 @@ FILE = RESULTS / "guard.json"
 N_PROCESSES, N_STORED = 3, 9  # of a comparison, of a baseline
 N_ROUNDS = 8
 MARGIN = 2.0
+MOST_TOLERANCE = 0.25  # of a baseline that is worth comparing with
 WORSE, NO_BASELINE = 1, 2
 
 Samples = Mapping[str, Sequence[Facts]]  # cost, seconds and cores of each process, by what was measured
@@ -51,8 +52,14 @@ def main(arguments: Sequence[str]) -> int:
     kind, sizes = machine_kind(), sizes_here()._asdict()
     if options.store:
         costs = baseline_of(measure(N_STORED))
-        store(FILE, kind, {"costs": costs, "sizes": sizes, **provenance("benchmarks")})
         show({"costs": _stored_rows(costs)}, f"baseline of {kind}")
+        if loose := [name for name, stored in costs.items() if stored["tolerance"] > MOST_TOLERANCE]:
+            print(
+                f"not stored: the tolerance of {', '.join(loose)} is above {100 * MOST_TOLERANCE:.0f} %, its "
+                "processes lie too far apart; try again while nothing else runs on this machine"
+            )
+            return NO_BASELINE
+        store(FILE, kind, {"costs": costs, "sizes": sizes, **provenance("benchmarks")})
         print(f"written: {FILE}")
         return 0
     try:
@@ -74,8 +81,7 @@ def machine_kind() -> str:
     info = Path("/proc/cpuinfo")
     found = re.search(r"model name\s*: (.+)", info.read_text("utf-8")) if info.exists() else None
     name = found[1].strip() if found else platform.processor() or platform.machine()
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return f"{name}, {cores} cores"
+    return f"{name}, {n_cores()} cores"
 
 
 def measure(n_processes: int) -> Samples:

@@ -7,15 +7,15 @@ faster machine is faster at both. What uses all cores, or the GPU, is held again
 the same; what runs on one core, against C MuJoCo's steps. No reference runs through this project's code.
 
 On cores, time is that of the processor, all threads added up: waiting for others, as on a loaded machine,
-is not in it. Measured with eight processes on two cores, such costs of gradient steps lay within 8 % of their
-median (quartiles), and within 55 % by the clock on the wall. What it cannot see is work that stands in line
-where it ran side by side; `cores`, its share of processor in the wall's time, tells that to a reader.
+is not in it. Measured on a loaded machine, with eight processes on two cores, such costs of gradient steps
+lay within 8 % of their median (quartiles), and within 55 % by the clock on the wall. What it cannot see is
+work that stands in line where it ran side by side; `cores`, its share of processor in the wall's time, tells
+that to a reader.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import functools
 import itertools
 import time
 from collections.abc import Callable
@@ -27,14 +27,13 @@ import mujoco
 import numpy as np
 
 from benchmarks.rounds import Facts, serve
+from benchmarks.truth import random_references, settle_function
 from mjx_softarm import xla
 from mjx_softarm.deploy import loop
 from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.estimator import N_CHANGES, PoseEstimator, SpringModel
 from mjx_softarm.export import ArmModel, policy_from_actor
-from mjx_softarm.kinematics import chain_frames
 from mjx_softarm.sensors import SensorParams, frequency_from_length
-from mjx_softarm.settle import settle
 from mjx_softarm.spec import ArmSpec
 from train.config import PRESETS
 from train.job import Job, TrainState
@@ -162,13 +161,8 @@ def _mujoco(sizes: Sizes) -> Callable[[], Any]:
 
 def _settle(env: ReachEnv, sizes: Sizes) -> Callable[[], Any]:
     """Rests at random references, about half of their chambers at a limit."""
-    springs = env.spec.springs
-    drawn = np.random.default_rng(0).uniform(
-        springs.length_min_m, springs.length_max_m, (sizes.n_arms, env.action_size)
-    )
-    kinematics = functools.partial(chain_frames, link_length_m=env.params.link_length_m)
-    solve = xla.jit(jax.vmap(functools.partial(settle, kinematics, env.params)), uses_mjx=False)
-    reference_m = jnp.asarray(drawn, jnp.float32)
+    solve = settle_function(env.spec)
+    reference_m = jnp.asarray(random_references(env.spec, sizes.n_arms), jnp.float32)
     return lambda: jax.block_until_ready([solve(reference_m) for _ in range(sizes.n_settles)])
 
 

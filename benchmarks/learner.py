@@ -8,7 +8,6 @@ and ratios are those of the medians.
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.peers import PINS, PeerError, peer_python
-from benchmarks.rounds import Worker, WorkerError
+from benchmarks.rounds import Worker, take_turns
 
 CONTESTANTS = {
     "ours": "ours",
@@ -95,24 +94,10 @@ def _worker(name: str, python: Path | None, batch_size: int, n_updates: int) -> 
 
 
 def _alternate(workers: Mapping[str, Worker], left_out: dict[str, str], where: str) -> dict[str, list[float]]:
-    """Rates of the rounds by name; a peer that fails is left out from then on, ours is not allowed to."""
-    rates: dict[str, list[float]] = {}
-    with contextlib.ExitStack() as stack:
-        for turn in range(-1, N_ROUNDS):
-            for name, worker in workers.items():
-                if name in left_out:
-                    continue
-                try:
-                    if turn < 0:
-                        stack.callback(worker.close)
-                        worker.start()
-                    else:
-                        rates.setdefault(name, []).append(worker.round()["updates_per_s"])
-                except WorkerError as error:
-                    if name == "ours":
-                        raise
-                    left_out[name] = f"{where}: {error}"
-    return {name: rounds for name, rounds in rates.items() if name not in left_out}
+    """Rates of the rounds by name; one that fails is left out from then on."""
+    rounds, failed = take_turns(list(workers.values()), N_ROUNDS)
+    left_out |= {name: f"{where}: {why}" for name, why in failed.items()}
+    return {name: [facts["updates_per_s"] for facts in told] for name, told in rounds.items()}
 
 
 def _rounded(value: float) -> float:

@@ -10,10 +10,6 @@ environment that does nothing.
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # several programs share a GPU
-
 import queue
 import sys
 import threading
@@ -34,9 +30,7 @@ def _timed(train: Callable[[], Any], n_updates: int) -> tuple[Facts, Callable[[]
     train()
 
     def work() -> Facts:
-        start = time.perf_counter()
-        train()
-        return {"updates_per_s": n_updates / (time.perf_counter() - start)}
+        return {"updates_per_s": n_updates / _seconds(train)}
 
     return {}, work
 
@@ -99,20 +93,28 @@ def _ours(batch_size: int, n_updates: int) -> tuple[Facts, Callable[[], Facts]]:
 
 
 def choose_threads(train: Callable[[], Any]) -> None:
-    """Let PyTorch use all its threads, or one where that trains faster, as waiting for each other costs."""
+    """Let PyTorch use all its threads, or one where that trains faster, as waiting for each other costs.
+
+    Args:
+        train: some updates; of each choice the fastest of three counts.
+    """
     import torch  # pyright: ignore[reportMissingImports]
 
     times = {}
     for n_threads in (torch.get_num_threads(), 1):
         torch.set_num_threads(n_threads)
         train()
-        start = time.perf_counter()
-        train()
-        times[n_threads] = time.perf_counter() - start
+        times[n_threads] = min(_seconds(train) for _ in range(3))
     torch.set_num_threads(min(times, key=lambda n: times[n]))
 
 
-def _sb3(algorithm: Any) -> Any:
+def _seconds(call: Callable[[], Any]) -> float:
+    start = time.perf_counter()
+    call()
+    return time.perf_counter() - start
+
+
+def filled_model(algorithm: Any) -> Any:
     """An algorithm with a filled replay; its `train` reads its losses, so it is done when it returns."""
     import gymnasium
 
@@ -139,7 +141,7 @@ def _sb3(algorithm: Any) -> Any:
 def _sb3_contrib(batch_size: int, n_updates: int) -> tuple[Facts, Callable[[], Facts]]:
     from sb3_contrib import TQC  # pyright: ignore[reportMissingImports]
 
-    model = _sb3(TQC)
+    model = filled_model(TQC)
     choose_threads(lambda: model.train(min(n_updates, 8), batch_size))
     return _timed(lambda: model.train(n_updates, batch_size), n_updates)
 
@@ -147,7 +149,7 @@ def _sb3_contrib(batch_size: int, n_updates: int) -> tuple[Facts, Callable[[], F
 def _sbx(batch_size: int, n_updates: int) -> tuple[Facts, Callable[[], Facts]]:
     from sbx import TQC  # pyright: ignore[reportMissingImports]
 
-    model = _sb3(TQC)
+    model = filled_model(TQC)
     return _timed(lambda: model.train(n_updates, batch_size), n_updates)
 
 

@@ -5,6 +5,7 @@ One threaded call a control period, with the arms that still move.
 
 from __future__ import annotations
 
+import time
 from typing import NamedTuple
 
 import mujoco
@@ -42,7 +43,7 @@ def sensed_model(spec: ArmSpec) -> mujoco.MjModel:
 
 
 class RolloutArms:
-    """Arms side by side.
+    """Arms side by side; `stepping_s` is the time spent in the rollout so far.
 
     Args:
         model: from `sensed_model`.
@@ -54,7 +55,7 @@ class RolloutArms:
     def __init__(self, model: mujoco.MjModel, spec: ArmSpec, n: int, n_threads: int):
         self.n, self.spec, self.model, self.task = n, spec, model, Task(spec)
         self._data = [mujoco.MjData(model) for _ in range(n_threads)]
-        self._rollout = rollout.Rollout(nthread=n_threads)
+        self._rollout, self.stepping_s = rollout.Rollout(nthread=n_threads), 0.0
         self._n_steps = round(self.task.period_s / model.opt.timestep)
         size = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)  # time, qpos, qvel
         self._state = np.zeros((n, size))
@@ -87,9 +88,11 @@ class RolloutArms:
                 self.task.gains,
                 self.task.period_s,
             )
+            start = time.perf_counter()
             state, sensed = self._rollout.rollout(
                 self.model, self._data, self._state[moving], pressure[:, None], nstep=self._n_steps
             )
+            self.stepping_s += time.perf_counter() - start
             self._state[moving], pressure_kpa[moving] = state[:, -1], pressure
             self.length_m[moving], tip[moving] = np.split(sensed[:, -1], [self.spec.n_chambers], axis=1)
             n_physics += len(moving) * self._n_steps

@@ -1,14 +1,16 @@
 """How long until a policy reaches, against the peers: `python -m benchmarks race [--seeds S,S] [--smoke]`.
 
 Wall time and env steps until the median tip error at the held-out goals is so many millimetres: ours, and TQC
-of SBX and of Stable-Baselines3-contrib on the same arms, goals and evaluation; `benchmarks.race_contestants`
-says how each trains. One after another, each in a process of its own with all cores. A level is reached where
-the line between two evaluations crosses it for the first time.
+of SBX and of Stable-Baselines3-contrib on the same arms, goals and evaluation. Hindsight: ours only; how fast
+ours is without it is seen of ours-plain. `benchmarks.race_contestants` says how each trains. One after
+another, each in a process of its own with all cores. A level is reached where the line between two evaluations
+crosses it for the first time.
 
-Ours goes first. A peer is stopped when it has had as many times our time to 5 mm as the goal asks for, since
-the goal is met then, or when it has reached all that ours has. What is measured stays in the working folder:
-started again, an interrupted benchmark goes on, and seeds may be added; another commit or machine wants
-another folder.
+Ours with the preset quick goes first. A peer is stopped when it has had as many times its time to 5 mm as the
+goal asks for, since the goal is met then, or when it has reached all that ours has; ours-plain has as long as
+SBX. The preset paper, which is for the finer levels, trains to the finest or to its end. What is measured
+stays in the working folder: started again, an interrupted benchmark goes on, and seeds may be added; another
+commit or kind of machine wants another folder.
 """
 
 from __future__ import annotations
@@ -17,21 +19,40 @@ import argparse
 import dataclasses
 import json
 import math
-import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from benchmarks.common import save, show
+from benchmarks.guard import machine_kind
 from benchmarks.peers import PINS, PeerError, peer_python
-from benchmarks.race_summary import GOAL_MM, GOALS, LEVELS_MM, VARIANTS, Point, crossing, median_mm, summarise
+from benchmarks.race_contestants import CONTESTANTS
+from benchmarks.race_summary import (
+    FIRST,
+    GOAL_MM,
+    GOALS,
+    LEVELS_MM,
+    PEERS,
+    Point,
+    crossing,
+    median_mm,
+    summarise,
+)
 from benchmarks.rounds import Worker, WorkerError
 from mjx_softarm.provenance import provenance, write_json
 
 N_STRETCHES = 40  # of training between evaluations, up to a peer's limit
 SETTINGS_FILE = "settings.json"
+
+
+class Limits(NamedTuple):
+    """What ends a contestant's training, whichever comes first, its own end besides."""
+
+    wall_s: float = math.inf  # start-up included and evaluations not
+    target_mm: float = 0.0  # median tip error
+    stretch_s: float = 0.0  # of training between evaluations, not a limit
 
 
 class RaceError(Exception):
@@ -51,13 +72,12 @@ SMOKE = Settings(n_goals=64, n_points=3)
 
 def main(arguments: Sequence[str]) -> int:
     """Run the benchmark; returns the exit status: 0 done, 2 not done, 130 interrupted."""
-    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # a GPU is the contestants'
     options = _parser().parse_args(arguments)
     folder = options.out or Path("runs/race-smoke" if options.smoke else "runs/race")
     try:
         claim(folder, settings := SMOKE if options.smoke else Settings())
         results = run(folder, options.seeds, settings)
-    except (RaceError, WorkerError, OSError) as error:
+    except (RaceError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
@@ -65,6 +85,9 @@ def main(arguments: Sequence[str]) -> int:
         return 130
     figures = summarise(results)
     show({name: value for name, value in figures.items() if name != "curves"}, "race")
+    if any(row["contestant"] == FIRST for row in figures["failed"]):
+        print(f"error: {FIRST} failed, without which there is no race; nothing is written", file=sys.stderr)
+        return 2
     if not options.smoke:
         print(f"written: {save('race', figures)}")
     return 0
@@ -73,7 +96,7 @@ def main(arguments: Sequence[str]) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks race",
-        description="Time and env steps to a tip error, against the peers; within the hour for each seed.",
+        description="Time and env steps to a tip error, against the peers; an hour and more for each seed.",
     )
     parser.add_argument("--seeds", type=_numbers, default=(0,), metavar="S,S", help="of training; default: 0")
     parser.add_argument("--smoke", action="store_true", help="everything, but tiny; says nothing of speed")
@@ -92,9 +115,14 @@ def claim(folder: Path, settings: Settings) -> None:
     """Make the folder, or see that what lies in it is comparable with what is measured now.
 
     Raises:
-        RaceError: it was made with other settings, versions, or on another machine or commit.
+        RaceError: it was made with other settings, versions, or on another kind of machine or commit.
     """
-    made = {**dataclasses.asdict(settings), "peers": PINS, **provenance("benchmarks")}
+    made = {
+        **dataclasses.asdict(settings),
+        "peers": PINS,
+        **provenance("benchmarks"),
+        "machine": machine_kind(),
+    }
     made = json.loads(
         json.dumps({k: v for k, v in made.items() if k not in ("command", "uncommitted_changes")})
     )
@@ -115,65 +143,83 @@ def claim(folder: Path, settings: Settings) -> None:
 def run(folder: Path, seeds: Sequence[int], settings: Settings) -> list[dict[str, Any]]:
     """The results of all contestants, those that the folder has not measured first.
 
-    Raises:
-        WorkerError: ours failed.
+    One that fails has `failed` in the place of points. If it is the first of a seed, there are no others: what
+    they are given follows from it.
     """
     results = []
     for seed in seeds:
-        first = _contest(folder, "ours", seed, settings)
+        first = _contest(folder, FIRST, seed, settings, Limits())
         results.append(first)
-        reached_mm = [level for level in LEVELS_MM if crossing(first["points"], level, "wall_s") is not None]
-        time_s = crossing(first["points"], GOAL_MM, "wall_s") or first["points"][-1]["wall_s"]
-        for library, times in GOALS.items():
-            for variant in VARIANTS:
-                limits = {"limit_s": times * time_s, "target_mm": min(reached_mm, default=0)}
-                results.append(_contest(folder, f"{library}-{variant}", seed, settings, library, **limits))
+        if "failed" not in first:
+            others = [name for name in CONTESTANTS if name != FIRST]
+            results += [
+                _contest(folder, name, seed, settings, limits_of(name, first["points"])) for name in others
+            ]
     return results
 
 
-def _contest(
-    folder: Path,
-    name: str,
-    seed: int,
-    settings: Settings,
-    library: str = "",
-    limit_s: float = math.inf,
-    target_mm: float = 0.0,
-) -> dict[str, Any]:
-    """The result of one contestant; a peer that fails has `failed` in the place of points."""
+def limits_of(name: str, first: Sequence[Point]) -> Limits:
+    """What a contestant is given, by the curve of the first."""
+    reached_mm = [level for level in LEVELS_MM if crossing(first, level, "wall_s") is not None]
+    time_s = crossing(first, GOAL_MM, "wall_s") or first[-1]["wall_s"]
+    if name == "ours-paper":
+        return Limits(target_mm=min(LEVELS_MM), stretch_s=GOALS["sbx"] * time_s / N_STRETCHES)
+    wall_s = GOALS[_library(name) or "sbx"] * time_s
+    return Limits(wall_s, min(reached_mm, default=0), wall_s / N_STRETCHES)
+
+
+def _library(name: str) -> str | None:
+    """Of a peer; None for ours."""
+    return next((library for library, variants in PEERS.items() if name in variants), None)
+
+
+def _contest(folder: Path, name: str, seed: int, settings: Settings, limits: Limits) -> dict[str, Any]:
+    """The result of one contestant, measured now or before."""
     file = folder / f"{name}-seed{seed}.json"
     if file.exists():
-        print(f"{name}, seed {seed}: measured before, in {file}")
-        return json.loads(file.read_text("utf-8"))
-    result: dict[str, Any] = {"contestant": name, "seed": seed}
+        result = json.loads(file.read_text("utf-8"))
+        print(f"{name}, seed {seed}: measured before, in {file}, {_state(result)}")
+        return result
+    made = provenance("benchmarks")
+    result = {"contestant": name, "seed": seed}
+    result |= {key: made[key] for key in ("commit", "uncommitted_changes")}
+    print(f"{name}, seed {seed}: {_state(result)}", flush=True)
     try:
-        python = peer_python(library) if library else None
-        stretch_s = limit_s / N_STRETCHES if library else 0.0
-        program = ["benchmarks.race_contestants", name, str(seed), str(stretch_s), str(settings.n_goals)]
-        worker = Worker(f"{name}, seed {seed}", program, python)
-        result |= train(worker, limit_s, target_mm, settings.n_points)
+        library = _library(name)
+        program = [
+            "benchmarks.race_contestants",
+            name,
+            str(seed),
+            str(limits.stretch_s),
+            str(settings.n_goals),
+        ]
+        worker = Worker(f"{name}, seed {seed}", program, peer_python(library) if library else None)
+        result |= train(worker, limits, settings.n_points)
     except (PeerError, WorkerError) as error:
-        if not library:
-            raise
         print(f"{name}, seed {seed}: failed: {error}", file=sys.stderr)
         return {**result, "failed": str(error)}
     write_json(file, result)
     return result
 
 
-def train(worker: Worker, limit_s: float, target_mm: float, n_points: int) -> dict[str, Any]:
-    """Let a contestant train until its end, its limit, its target, or so many evaluations.
+def _state(result: dict[str, Any]) -> str:
+    changed = " with uncommitted changes" if result["uncommitted_changes"] else ""
+    return f"commit {result['commit']}{changed}"
+
+
+def train(worker: Worker, limits: Limits, n_points: int) -> dict[str, Any]:
+    """Let a contestant train until its end, a limit, or so many evaluations.
 
     Args:
         worker: the contestant, not started.
-        limit_s: wall time, start-up included and evaluations not.
-        target_mm: median tip error.
+        limits: of wall time and error.
         n_points: evaluations at most.
 
     Returns:
-        Start-up time, limit (None without one) and the curve's points.
+        Start-up time, limit of wall time (None without one) and the curve's points.
     """
-    within = f" up to {limit_s:.0f} s," if math.isfinite(limit_s) else ""
+    limit_s = limits.wall_s if math.isfinite(limits.wall_s) else None
+    within = f" up to {limit_s:.0f} s," if limit_s else ""
     print(f"{worker.name}:{within} evaluations not counted ...", flush=True)
     points: list[Point] = []
     try:
@@ -188,9 +234,8 @@ def train(worker: Worker, limit_s: float, target_mm: float, n_points: int) -> di
                 f"{point['updates']:,} updates, median {error_mm:.2f} mm",
                 flush=True,
             )
-            if ended or point["wall_s"] >= limit_s or error_mm <= target_mm:
+            if ended or point["wall_s"] >= limits.wall_s or error_mm <= limits.target_mm:
                 break
     finally:
         worker.close()
-    limit = limit_s if math.isfinite(limit_s) else None
-    return {"start_up_s": worker.facts["start_up_s"], "limit_s": limit, "points": points}
+    return {"start_up_s": worker.facts["start_up_s"], "limit_s": limit_s, "points": points}

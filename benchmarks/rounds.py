@@ -12,17 +12,27 @@ import os
 import subprocess
 import sys
 import tempfile
+import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 
+ANSWER_S = 1800.0  # a program that says nothing for so long is stopped; compiling takes minutes
+
 Facts = dict[str, Any]
 
 
 class WorkerError(RuntimeError):
     """A program that stopped before it was told to; the message says which, and the last lines it wrote."""
+
+    @property
+    def reason(self) -> str:
+        """All of it in a line: its first and, if it has more, its last."""
+        lines = str(self).splitlines()
+        return " ".join(lines[:1] + lines[1:][-1:])
 
 
 class Worker:
@@ -33,6 +43,9 @@ class Worker:
         program: module and arguments, as after `python -m`.
         python: the interpreter; this one if None.
         n_cores: how many of this process's cores it may use; all if None.
+
+    Raises:
+        WorkerError: of `start` and `round`: it stopped, or said nothing for `ANSWER_S`.
     """
 
     def __init__(
@@ -47,8 +60,8 @@ class Worker:
         """Start it and wait until it is prepared; what it tells of that is in `facts`."""
         paths = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
         environment = {**os.environ, "TF_CPP_MIN_LOG_LEVEL": "3", "PYTHONPATH": os.pathsep.join(paths)}
-        self._said = tempfile.TemporaryFile("w+")  # noqa: SIM115  (closed with the worker)
         with _few_cores(self._n_cores):
+            self._said = tempfile.TemporaryFile("w+")  # noqa: SIM115  (closed with the worker)
             self._process = subprocess.Popen(
                 self._command,
                 env=environment,
@@ -67,6 +80,7 @@ class Worker:
         return self._answer()
 
     def close(self) -> None:
+        """Let it end, or make it; nothing happens to one that is not running."""
         if self._process is None:
             return
         with contextlib.suppress(BrokenPipeError):
@@ -78,14 +92,19 @@ class Worker:
             self._process.wait()
         self._process.stdout.close()
         self._said.close()
+        self._process = None
 
     def _answer(self) -> Facts:
+        start, timer = time.perf_counter(), threading.Timer(ANSWER_S, self._process.kill)
+        timer.start()
         line = self._process.stdout.readline()
+        timer.cancel()
         if not line:
             status = self._process.wait()
+            late = f" after {ANSWER_S:g} s in silence" if time.perf_counter() - start > ANSWER_S else ""
             self._said.seek(0)
             last = "\n".join(self._said.read().splitlines()[-15:])
-            raise WorkerError(f"{self.name}: stopped with status {status}, expected a result:\n{last}")
+            raise WorkerError(f"{self.name}: stopped with status {status}{late}, expected a result:\n{last}")
         return json.loads(line)
 
 
@@ -108,6 +127,8 @@ def _few_cores(n: int | None) -> Iterator[None]:
     if n is None:
         yield
         return
+    if not hasattr(os, "sched_setaffinity"):
+        raise WorkerError(f"programs cannot be kept to {n} cores on {sys.platform}")
     cores = os.sched_getaffinity(0)
     os.sched_setaffinity(0, sorted(cores)[:n])
     try:
@@ -116,13 +137,29 @@ def _few_cores(n: int | None) -> Iterator[None]:
         os.sched_setaffinity(0, cores)
 
 
-def alternate(workers: Sequence[Worker], n_rounds: int) -> dict[str, list[Facts]]:
-    """Rounds of each worker by its name, one of each in turn."""
+def take_turns(workers: Sequence[Worker], n_rounds: int) -> tuple[dict[str, list[Facts]], dict[str, str]]:
+    """Start workers, let them do rounds, one of each in turn, and close them.
+
+    Returns:
+        The rounds of each worker that did them all, and of each that failed why, by their names.
+    """
     rounds: dict[str, list[Facts]] = {worker.name: [] for worker in workers}
-    for _ in range(n_rounds):
-        for worker in workers:
-            rounds[worker.name].append(worker.round())
-    return rounds
+    failed: dict[str, str] = {}
+    with contextlib.ExitStack() as stack:
+        for turn in range(-1, n_rounds):
+            for worker in (worker for worker in workers if worker.name not in failed):
+                try:
+                    if turn < 0:
+                        print(f"starting: {worker.name}", flush=True)
+                        stack.callback(worker.close)
+                        worker.start()
+                    else:
+                        rounds[worker.name].append(worker.round())
+                except WorkerError as error:
+                    print(f"failed: {error}", flush=True)
+                    failed[worker.name] = error.reason
+                    worker.close()
+    return {name: told for name, told in rounds.items() if name not in failed}, failed
 
 
 def serve(prepare: Callable[[], tuple[Facts, Callable[[], Facts]]]) -> None:

@@ -9,7 +9,6 @@ references; `stepping` takes the first `N_STEPPED` of each. A round tells rates,
 
 from __future__ import annotations
 
-import os
 import sys
 import time
 from collections.abc import Callable
@@ -18,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.common import peak_memory
+from benchmarks.common import n_cores, peak_memory
 from benchmarks.mujoco_rollout import RolloutArms, sensed_model
 from benchmarks.rounds import Facts, serve
 from benchmarks.throughput_arms import compile_twice, repeats_for
@@ -64,8 +63,7 @@ def newton(
 
 def stepping(spec: ArmSpec, references: References) -> tuple[Facts, Callable[[], Facts]]:
     """Time stepping, from the straight arm as Newton's method, on all cores."""
-    n_threads = len(os.sched_getaffinity(0))
-    arms = RolloutArms(sensed_model(spec), spec, N_STEPPED, n_threads)
+    arms = RolloutArms(sensed_model(spec), spec, N_STEPPED, n_cores())
     everywhere = np.ones(N_STEPPED, bool)
     straight, empty = np.zeros((N_STEPPED, arms.model.nq)), np.zeros((N_STEPPED, spec.n_chambers))
 

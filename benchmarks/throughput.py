@@ -1,7 +1,13 @@
 """How many environment steps a second, settling and resets included, ours and the peers', in one run.
 
-Each program is a process of its own, and they take turns round by round. Random actions saturate about half
-of the chambers. What a settle costs against its error is told by `settle`, the learner's speed by `learner`.
+Each program is a process of its own, and they take turns round by round; one that fails has a row that says
+why. Random actions saturate about half of the chambers. What a settle costs against its error is told by
+`settle`, the learner's speed by `learner`.
+
+C MuJoCo's arm comes to rest in time steps, which takes it seconds of simulated time for each environment
+step: it swings until its own damping has had its due, and the law's integral action fills or empties a
+chamber no faster than its gains let it. How far it is from the true rest when it counts as resting stands
+beside its rate. The paper's 0.03 s for a step is taken at its word.
 """
 
 from __future__ import annotations
@@ -21,8 +27,9 @@ import jax
 import numpy as np
 
 from benchmarks import gpu
+from benchmarks.common import n_cores
 from benchmarks.peers import PeerError, peer_python
-from benchmarks.rounds import Facts, Worker, WorkerError, alternate, working
+from benchmarks.rounds import Facts, Worker, take_turns
 from benchmarks.throughput_peers import write_arm
 from benchmarks.truth import ERROR, TOLD, told_error
 from mjx_softarm.spec import ArmSpec
@@ -31,6 +38,15 @@ N_ROUNDS = 3
 N_LINKS = ArmSpec.default().structure.links_per_section
 PAPER_WORKERS, PAPER_STEP_S = 14, 0.03  # the paper's cost of an environment step; the workers may share cores
 SUBPROC = "SubprocVecEnv"
+NOTES = {
+    "simulated seconds per env step": "C MuJoCo's arm is stepped until it rests: it swings until its own "
+    "damping has had its due, and the law's integral action fills or empties a chamber no faster than its gains "
+    "let it",
+    "median, 95 %, max mm": "how far the tip then is from the true equilibrium",
+    "the paper": f"its {PAPER_STEP_S} s for an environment step is taken at its word; how far from rest its "
+    "arms are then is not known",
+}
+LOCKSTEP = "in lockstep: a step is over when the slowest arm rests"
 
 Point = tuple[str, str, int, int]  # engine, mode, arms, links per section
 
@@ -69,6 +85,7 @@ def measure() -> dict[str, Any]:
             key=lambda row: (row["engine"], row["mode"], row["links_per_section"]),
         ),
         "side_by_side": peers,
+        "notes": NOTES,
         "start": {"cold": starts[0], "cached": starts[1]},
         "goals": gpu.rate_goals(rows, on_gpu) + [gpu.training_goal(on_gpu)],
     }
@@ -81,32 +98,33 @@ def _arms(point: Point, cache: str) -> Worker:
 
 
 def _group(group: Sequence[Point]) -> list[dict[str, Any]]:
-    """A row for each point, whose programs take turns; one that fails, for want of memory say, tells why."""
-    named = [
-        dict(zip(("engine", "mode", "arms", "links_per_section"), point, strict=True)) for point in group
-    ]
-    try:
-        return [{**name, **row} for name, row in zip(named, _turns(group), strict=True)]
-    except WorkerError as error:
-        print(error, flush=True)
-        if len(group) > 1:  # each alone, so that the others are not lost
-            return [row for point in group for row in _group([point])]
-        return [{**named[0], "failed": str(error).splitlines()[-1]}]
+    """A row for each point, whose programs take turns.
+
+    One that fails among others, for want of memory say, is tried once more alone; then its row tells why.
+    """
+    rows = _turns(group)
+    if len(group) > 1:
+        rows = [
+            _turns([point])[0] if "failed" in row else row for point, row in zip(group, rows, strict=True)
+        ]
+    return rows
 
 
 def _turns(group: Sequence[Point]) -> list[dict[str, Any]]:
     with contextlib.ExitStack() as stack:
         caches = [stack.enter_context(tempfile.TemporaryDirectory()) for _ in group]
         workers = [_arms(point, cache) for point, cache in zip(group, caches, strict=True)]
-        stack.enter_context(working(*workers))
-        rounds = alternate(workers, N_ROUNDS)
-        return [
-            {
-                **over_rounds(rounds[worker.name]),
-                **{name: value for name, value in worker.facts.items() if name.endswith("_s")},
-            }
-            for worker in workers
-        ]
+        rounds, failed = take_turns(workers, N_ROUNDS)
+    rows = []
+    for point, worker in zip(group, workers, strict=True):
+        row: dict[str, Any] = dict(zip(("engine", "mode", "arms", "links_per_section"), point, strict=True))
+        if worker.name in failed:
+            row["failed"] = failed[worker.name]
+        else:
+            row |= over_rounds(rounds[worker.name])
+            row |= {name: value for name, value in worker.facts.items() if name.endswith("_s")}
+        rows.append(row)
+    return rows
 
 
 def over_rounds(rounds: Sequence[Facts]) -> dict[str, Any]:
@@ -127,69 +145,75 @@ def _digits(rate: Any) -> float | int:
 
 def _side_by_side(spec: ArmSpec, on_gpu: bool) -> list[dict[str, Any]]:
     """Ours beside the peers: rates in turns, and how far from the true equilibrium each comes to rest."""
-    n_cores, n_arms = len(os.sched_getaffinity(0)), 8192 if on_gpu else 1024
+    n, n_arms = n_cores(), 8192 if on_gpu else 1024
     with contextlib.ExitStack() as stack:
         folder, *caches = (stack.enter_context(tempfile.TemporaryDirectory()) for _ in range(3))
         write_arm(Path(folder), spec)
-        ours = [
-            _arms((engine, "quasistatic", n, N_LINKS), cache)
-            for engine, n, cache in zip(
-                ("chain", "mjx"), (n_arms, n_arms if on_gpu else 128), caches, strict=True
-            )
-        ]
-        workers, rows = [], []
-        for worker in [
-            *ours,
-            _subproc(folder, n_cores),
-            _rollout(folder, n_cores),
+        programs = [
+            _arms(("chain", "quasistatic", n_arms, N_LINKS), caches[0]),
+            _arms(("mjx", "quasistatic", n_arms if on_gpu else 128, N_LINKS), caches[1]),
+            _subproc(folder, n),
+            _rollout(folder, n),
             _warp(folder, n_arms, on_gpu),
-        ]:
-            if isinstance(worker, str):
-                name, _, reason = worker.partition(": ")
-                rows.append({"program": name, "skipped": reason})
-                continue
-            stack.enter_context(working(worker))
-            workers.append(worker)
-        rounds = alternate(workers, N_ROUNDS)
-    measured = [
-        {
-            "program": worker.name,
-            **over_rounds(rounds[worker.name]),
-            **told_error(spec, [worker.facts, *rounds[worker.name]]),
-        }
-        for worker in workers
-    ]
-    return side_by_side([*measured, *rows])
+        ]
+        workers = [program for program in programs if isinstance(program, Worker)]
+        rounds, failed = take_turns(workers, N_ROUNDS)
+    rows = []
+    for program in programs:
+        if not isinstance(program, Worker):
+            rows.append(program)
+        elif program.name in failed:
+            rows.append({"program": program.name, "failed": failed[program.name]})
+        else:
+            told = rounds[program.name]
+            error = told_error(spec, [program.facts, *told])
+            rows.append({"program": program.name, **over_rounds(told), **error})
+    return side_by_side(rows)
 
 
 def side_by_side(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The paper's figure added, and each rate as a multiple of that of Stable-Baselines3's processes."""
+    """The paper's figure added, and each rate as a multiple of it and of Stable-Baselines3's processes."""
+    paper_rate = round(PAPER_WORKERS / PAPER_STEP_S)
     paper = {
-        "program": f"the paper: {PAPER_WORKERS} workers, {PAPER_STEP_S} s a step, at most",
-        "env_steps_per_s": round(PAPER_WORKERS / PAPER_STEP_S),
+        "program": f"the paper: {PAPER_WORKERS} workers, {PAPER_STEP_S} s a step",
+        "env_steps_per_s": paper_rate,
+        "note": "at most, and at its word",
     }
-    base = next(
-        (row["env_steps_per_s"] for row in rows if SUBPROC in row["program"] and "skipped" not in row), None
+    base = next((row.get("env_steps_per_s") for row in rows if SUBPROC in row["program"]), None)
+    names = (
+        "program",
+        "env_steps_per_s",
+        "times_subproc",
+        "times_paper",
+        "physics_steps_per_s",
+        "physics_steps_per_env_step",
+        "simulated_s_per_env_step",
+        "share_in_time_steps",
+        *ERROR,
+        "note",
+        "skipped",
+        "failed",
     )
-    names = ("program", "env_steps_per_s", "times_subproc", "physics_steps_per_s", *ERROR)
     full = []
     for row in [*rows, paper]:
-        rate = row.get("env_steps_per_s")
-        times = _digits(rate / base) if rate and base and row is not paper else None
-        full.append(
-            {name: {**row, "times_subproc": times}.get(name) for name in names}
-            | {"skipped": row.get("skipped", "")}
-        )
+        rate = None if row is paper else row.get("env_steps_per_s")
+        row = {
+            "note": LOCKSTEP if "C MuJoCo" in row["program"] else None,
+            "times_subproc": _digits(rate / base) if rate and base else None,
+            "times_paper": _digits(rate / paper_rate) if rate else None,
+            **row,
+        }
+        full.append({name: row.get(name) for name in names})
     return full
 
 
-def _subproc(folder: str, n: int) -> Worker | str:
-    """SB3's processes; or its name and why there is none."""
+def _subproc(folder: str, n: int) -> Worker | dict[str, Any]:
+    """SB3's processes; or a row that says why there are none."""
     name = f"C MuJoCo, {SUBPROC}, {n} processes"
     try:
         python = peer_python("sb3-contrib")
     except PeerError as error:
-        return f"{name}: {error}"
+        return {"program": name, "skipped": str(error)}
     return Worker(name, ["benchmarks.throughput_peers", "subproc", folder, str(n)], python)
 
 
@@ -199,12 +223,12 @@ def _rollout(folder: str, n: int) -> Worker:
     )
 
 
-def _warp(folder: str, n: int, on_gpu: bool) -> Worker | str:
+def _warp(folder: str, n: int, on_gpu: bool) -> Worker | dict[str, Any]:
     name = f"MJX-Warp, {n} arms, time steps alone"
     if not on_gpu:
-        return f"{name}: {gpu.NO_DEVICE}"
+        return {"program": name, "skipped": gpu.NO_DEVICE}
     if importlib.util.find_spec("warp") is None:
-        return f"{name}: warp is not installed; pip install 'mujoco-mjx[warp]'"
+        return {"program": name, "skipped": "warp is not installed; pip install 'mujoco-mjx[warp]'"}
     return Worker(name, ["benchmarks.throughput_peers", "warp", folder, str(n)])
 
 
@@ -228,13 +252,15 @@ print(json.dumps({{"import_s": imported - start, "workspace_s": pool - imported,
 """
 
 
-def _start(cache: str) -> dict[str, float]:
-    """A new process up to a compiled training epoch."""
+def _start(cache: str) -> dict[str, Any]:
+    """A new process up to a compiled training epoch; or why it failed."""
     done = subprocess.run(
         [sys.executable, "-c", _START.format(cache=cache)],
         env={**os.environ, "TF_CPP_MIN_LOG_LEVEL": "3"},
         capture_output=True,
         text=True,
-        check=True,
     )
+    if done.returncode:
+        print(f"failed: the start of a training: {done.stderr}", flush=True)
+        return {"failed": " ".join([f"status {done.returncode}:", *done.stderr.splitlines()[-1:]])}
     return {name: round(value, 1) for name, value in json.loads(done.stdout.splitlines()[-1]).items()}

@@ -23,12 +23,12 @@ from benchmarks.rounds import Facts, serve
 from benchmarks.truth import TOLD
 from mjx_softarm import xla
 from mjx_softarm.env import EnvConfig, ReachEnv
+from mjx_softarm.gym import EPISODE_LENGTH
 from mjx_softarm.mjcf import steps_per_period
 from mjx_softarm.spec import ArmSpec
 from mjx_softarm.wrappers import VectorEnv
 
 N_STEPS = {"quasistatic": 8, "dynamic": 1}  # of each arm in one call
-EPISODE_LENGTH = 4
 N_POSES = 1024
 N_RESTS = 256  # told, for the error of the pose
 ROUND_S = 1.0  # at least

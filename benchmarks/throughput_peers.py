@@ -14,11 +14,12 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
-from benchmarks.mujoco_arm import EPISODE_LENGTH, MODEL_FILE, POOL_FILE, SteppedReach
+from benchmarks.mujoco_arm import MODEL_FILE, POOL_FILE, SteppedReach
 from benchmarks.mujoco_rollout import RolloutArms, RolloutReach, sensed_model
 from benchmarks.rounds import Facts, serve
 from mjx_softarm.spec import ARM_FILE, ArmSpec
@@ -38,21 +39,31 @@ def write_arm(folder: Path, spec: ArmSpec, n_poses: int = 1024) -> None:
     np.savez(folder / POOL_FILE, **{name: np.asarray(x, float) for name, x in pool._asdict().items()})
 
 
-def _timed(step: Callable[[], tuple[int, int, np.ndarray, np.ndarray]]) -> Facts:
-    """Rates over `ROUND_S`; a step gives its environment and time steps, its references and tips."""
-    n_env = n_physics = 0
-    reference, tip = [], []
+class Stepped(NamedTuple):
+    """What a step of all environments took, and where it led."""
+
+    n_env: int
+    n_physics: int  # time steps of all arms together
+    stepping_s: float  # of the call, spent in time steps; of processes their mean
+    reference_m: np.ndarray  # (n_env, n_chambers)
+    tip_mm: np.ndarray  # (n_env, 3)
+
+
+def _timed(step: Callable[[], Stepped], timestep_s: float) -> Facts:
+    """Rates over `ROUND_S`, and what an environment step is made of."""
+    steps = []
     start = time.perf_counter()
     while (spent := time.perf_counter() - start) < ROUND_S:
-        steps, physics, reference_m, tip_mm = step()
-        n_env, n_physics = n_env + steps, n_physics + physics
-        reference.append(reference_m)
-        tip.append(tip_mm)
+        steps.append(step())
+    n_env, n_physics = sum(one.n_env for one in steps), sum(one.n_physics for one in steps)
     return {
         "env_steps_per_s": n_env / spent,
         "physics_steps_per_s": n_physics / spent,
-        "reference_m": np.concatenate(reference).tolist(),
-        "tip_mm": np.concatenate(tip).tolist(),
+        "physics_steps_per_env_step": round(n_physics / n_env),
+        "simulated_s_per_env_step": round(timestep_s * n_physics / n_env, 2),
+        "share_in_time_steps": round(sum(one.stepping_s for one in steps) / spent, 2),
+        "reference_m": np.concatenate([one.reference_m for one in steps]).tolist(),
+        "tip_mm": np.concatenate([one.tip_mm for one in steps]).tolist(),
     }
 
 
@@ -60,20 +71,27 @@ def _subproc(folder: str, n: int) -> tuple[Facts, Callable[[], Facts]]:
     from stable_baselines3 import __version__  # pyright: ignore[reportMissingImports]
     from stable_baselines3.common.vec_env import SubprocVecEnv  # pyright: ignore[reportMissingImports]
 
-    envs = SubprocVecEnv([functools.partial(SteppedReach, folder, seed) for seed in range(n)])
+    from mjx_softarm.gym import EPISODE_LENGTH  # brings JAX, which its processes do without
+
+    makers = [functools.partial(SteppedReach, folder, seed, EPISODE_LENGTH) for seed in range(n)]
+    envs = SubprocVecEnv(makers)
     envs.reset()
+    model = mujoco.MjModel.from_binary_path(str(Path(folder) / MODEL_FILE))
     rng = np.random.default_rng(0)
 
     def step():
         *_, infos = envs.step(rng.uniform(-1.0, 1.0, (n, *envs.action_space.shape)))
-        arrays = (np.array([info[name] for info in infos]) for name in ("reference_m", "tip_mm"))
-        return n, sum(info["physics_steps"] for info in infos), *arrays
+        told = {name: np.array([info[name] for info in infos]) for name in infos[0]}
+        n_physics, stepping_s = told["physics_steps"].sum(), told["stepping_s"].mean()
+        return Stepped(n, int(n_physics), float(stepping_s), told["reference_m"], told["tip_mm"])
 
     step()
-    return {"stable_baselines3": __version__}, lambda: _timed(step)
+    return {"stable_baselines3": __version__}, lambda: _timed(step, model.opt.timestep)
 
 
 def _rollout(folder: str, n_threads: int) -> tuple[Facts, Callable[[], Facts]]:
+    from mjx_softarm.gym import EPISODE_LENGTH
+
     spec = ArmSpec.from_toml(Path(folder) / ARM_FILE)
     model = mujoco.MjModel.from_binary_path(str(Path(folder) / MODEL_FILE))
     arms = RolloutArms(model, spec, ARMS_PER_THREAD * n_threads, n_threads)
@@ -82,10 +100,11 @@ def _rollout(folder: str, n_threads: int) -> tuple[Facts, Callable[[], Facts]]:
     rng = np.random.default_rng(0)
 
     def step():
+        before_s = arms.stepping_s
         *_, reference_m, end = envs.step(rng.uniform(-1.0, 1.0, (arms.n, spec.n_chambers)))
-        return arms.n, end.physics_steps, reference_m, end.pose[:, :3]
+        return Stepped(arms.n, end.physics_steps, arms.stepping_s - before_s, reference_m, end.pose[:, :3])
 
-    return {"arms": arms.n}, lambda: _timed(step)
+    return {"arms": arms.n}, lambda: _timed(step, model.opt.timestep)
 
 
 def _warp(folder: str, n: int) -> tuple[Facts, Callable[[], Facts]]:

@@ -21,7 +21,8 @@ from mjx_softarm.mjcf import build_model
 from mjx_softarm.spec import ArmSpec
 from mjx_softarm.statics import ArmParams
 
-ERROR = ("median_mm", "p95_mm", "max_mm")
+QUANTILES = {"median_mm": 0.5, "p95_mm": 0.95, "max_mm": 1.0}
+ERROR = (*QUANTILES, "without_truth")  # what a table has of it
 TOLD = ("reference_m", "tip_mm")  # what a program tells of its arms at rest
 
 
@@ -29,7 +30,7 @@ class Truth(NamedTuple):
     """Arms truly at rest."""
 
     tip_mm: np.ndarray  # (n, 3)
-    settled: np.ndarray  # (n,) bool: the others have no known rest, and count in no error
+    settled: np.ndarray  # (n,) bool: the others' solution did not settle, so that their rest is not known
     share_at_limit: float  # of the chambers
 
 
@@ -41,11 +42,6 @@ def settle_function(spec: ArmSpec, engine: str = "chain", dtype: Any = np.float3
     else:
         kinematics = functools.partial(chain_frames, link_length_m=params.link_length_m)
     return xla.jit(jax.vmap(functools.partial(solver.settle, kinematics, params)), engine == "mjx")
-
-
-def settle_all(spec: ArmSpec, reference_m: np.ndarray) -> solver.Settled:
-    """The settled arms as NumPy arrays, by the chain in single precision, compiled anew."""
-    return jax.device_get(settle_function(spec)(jnp.asarray(reference_m, jnp.float32)))
 
 
 @functools.lru_cache(maxsize=8)
@@ -61,10 +57,13 @@ def true_rest(spec: ArmSpec, reference_m: np.ndarray) -> Truth:
 
 
 def error_figures(tip_mm: np.ndarray, truth: Truth) -> dict[str, float]:
-    """Median, 95 % and largest distance of tips (n, 3) [mm] from where they truly are."""
+    """Median, 95 % and largest distance of tips (n, 3) [mm] from where they truly are.
+
+    Arms without a truth are in none of these; `without_truth` is their number.
+    """
     error = np.linalg.norm(np.asarray(tip_mm, np.float64) - truth.tip_mm, axis=-1)[truth.settled]
-    quantiles = np.quantile(error, [0.5, 0.95, 1.0])
-    return {name: float(f"{x:.3g}") for name, x in zip(ERROR, quantiles, strict=True)}
+    errors = {name: float(f"{np.quantile(error, share):.3g}") for name, share in QUANTILES.items()}
+    return {**errors, "without_truth": int(np.sum(~truth.settled))}
 
 
 def told_error(spec: ArmSpec, told: Sequence[Mapping[str, Any]]) -> dict[str, float]:
