@@ -75,12 +75,10 @@ def settle(kinematics: Callable[[Array], Frames], params: ArmParams, reference_m
         iteration=jnp.array(0),
     )
     with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
-        # The first step, from the straight arm, stands before the loop: what it takes from the arm alone,
-        # its factorised Hessian included, is then computed once for all arms with the same numbers.
         end = jax.lax.while_loop(
             lambda it: it.moving & (it.iteration < MAX_ITERATIONS),
             lambda it: _newton_step(it, kinematics, params, reference_m),
-            _newton_step(start, kinematics, params, reference_m),
+            start,
         )
         return _report(end, kinematics, params, reference_m)
 

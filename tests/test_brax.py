@@ -47,6 +47,7 @@ def test_brax_s_sac_trains(env, quick_compilation):
         learning_rate=1e-2,
         network_factory=functools.partial(networks.make_sac_networks, hidden_layer_sizes=(8,)),
         seed=3,
+        max_devices_per_host=1,
     )
     # Every action is stored, and the size is reported as its mean over the run.
     assert metrics["training/buffer_current_size"] == np.arange(N_ARMS, N_STEPS + 1, N_ARMS).mean()

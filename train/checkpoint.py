@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 import orbax.checkpoint as ocp
 
 from mjx_softarm.log_files import LogError
@@ -163,11 +164,11 @@ class Run:
         Raises:
             RunError: there is no checkpoint.
         """
-        epoch, shapes = self._newest(), jax.tree.map(ocp.utils.to_shape_dtype_struct, like)
+        epoch, shapes = self._newest(), jax.tree.map(_shape_somewhere, like)
         return epoch, self._manager.restore(epoch, args=ocp.args.StandardRestore(shapes))
 
     def restore_part(self, name: str, like: Any) -> Any:
-        """One field of the newest checkpoint's state, without reading the others.
+        """One field of the newest checkpoint's state as NumPy arrays, without reading the others.
 
         Args:
             name: of the field.
@@ -177,9 +178,8 @@ class Run:
             RunError: there is no checkpoint.
         """
         wanted = {name: jax.tree.map(ocp.utils.to_shape_dtype_struct, like)}
-        arguments = ocp.args.PyTreeRestore(
-            wanted, ocp.checkpoint_utils.construct_restore_args(wanted), partial_restore=True
-        )
+        as_numpy = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), wanted)
+        arguments = ocp.args.PyTreeRestore(wanted, as_numpy, partial_restore=True)
         return self._manager.restore(self._newest(), args=arguments)[name]
 
     def _newest(self) -> int:
@@ -213,3 +213,15 @@ class Run:
         temporary = self.path / "metrics.jsonl.part"
         temporary.write_text("".join(json.dumps(row) + "\n" for row in rows), "utf-8")
         os.replace(temporary, self.path / "metrics.jsonl")
+
+
+def _shape_somewhere(x: Any) -> jax.ShapeDtypeStruct:
+    """Shape, type and place of an array; this process's first device where no place is given.
+
+    Else it would come back to the devices that it was saved from, which may not be here.
+    """
+    shape = ocp.utils.to_shape_dtype_struct(x)
+    if shape.sharding is not None:
+        return shape
+    device = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
+    return jax.ShapeDtypeStruct(shape.shape, shape.dtype, sharding=device)

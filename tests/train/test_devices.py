@@ -109,6 +109,33 @@ def test_a_checkpoint_of_many_devices_continues_on_one(tmp_path, jobs, trained):
         assert job.n_traces == 1  # so it came back as the epoch expects it
 
 
+_RESTORE = """
+import sys, jax, numpy as np
+from pathlib import Path
+from train.checkpoint import Run
+from train.tqc import TQC
+run = Run.open(Path(sys.argv[1]))
+assert len(jax.devices()) == 1
+agent = TQC(18, 3, run.config.tqc, run.config.n_updates)
+params = run.restore_part("agent", jax.eval_shape(agent.init, jax.random.PRNGKey(0))).actor_params
+print(sum(float(np.abs(x).sum()) for x in jax.tree.leaves(params)))
+"""
+
+
+def test_a_policy_of_many_devices_is_read_where_there_is_one(tmp_path, trained):
+    state, _ = trained[str(N_DEVICES)]
+    Run.create(tmp_path / "run", CONFIG, SHORT).save(4, state)
+    done = subprocess.run(
+        [sys.executable, "-c", _RESTORE, str(tmp_path / "run")],
+        env={**os.environ, "JAX_NUM_CPU_DEVICES": "1", "JAX_PLATFORMS": "cpu"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    leaves = jax.tree.leaves(jax.device_get(state.agent.actor_params))
+    np.testing.assert_allclose(float(done.stdout), sum(np.abs(x).sum() for x in leaves), rtol=1e-5)
+
+
 @pytest.mark.parametrize("name", ["n_arms", "replay_capacity", "batch_size"])
 def test_what_cannot_be_split_evenly_is_named(env, name):
     config = dataclasses.replace(CONFIG, **{name: getattr(CONFIG, name) + 4})
@@ -122,6 +149,7 @@ def test_devices_that_are_not_there_are_refused(devices, capsys):
     assert "--devices: got" in capsys.readouterr().err
 
 
+LONGEST_S = 900  # of a process, compilation included
 SETTINGS = [
     "n_arms=16",
     "total_env_steps=512",
@@ -136,58 +164,63 @@ SETTINGS = [
 ]
 
 
-class Pair:
-    """Two processes of one device each that train one run together."""
+def start(arguments, *devices):
+    """Processes of one device each that train one run together."""
+    environment = {**os.environ, "JAX_NUM_CPU_DEVICES": "1", "JAX_PLATFORMS": "cpu"}
+    command = [sys.executable, "-m", "train", "reach", *map(str, arguments)]
+    return [
+        subprocess.Popen([*command, f"--devices={name}"], env=environment, stdout=subprocess.PIPE, text=True)
+        for name in devices
+    ]
 
-    def __init__(self, *arguments):
-        with socket.socket() as free:
-            free.bind(("localhost", 0))
-            address = f"localhost:{free.getsockname()[1]}"
-        environment = {**os.environ, "JAX_NUM_CPU_DEVICES": "1", "JAX_PLATFORMS": "cpu"}
-        command = [sys.executable, "-m", "train", "reach", *map(str, arguments)]
-        self.processes = [
-            subprocess.Popen(
-                [*command, f"--devices={address}/{k}/2"],
-                env=environment,
-                stdout=subprocess.PIPE,
-                text=True,
-            )
-            for k in range(2)
-        ]
 
-    def ends(self):
-        """What each printed; both must have ended well."""
-        printed = [process.communicate()[0] for process in self.processes]
-        assert [process.returncode for process in self.processes] == [0, 0], printed
-        return printed
+def pair():
+    """Two processes' names for their meeting."""
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        return [f"localhost:{free.getsockname()[1]}/{k}/2" for k in range(2)]
+
+
+def end(processes):
+    """What each printed; all must end well, and in time."""
+    try:
+        printed = [process.communicate(timeout=LONGEST_S)[0] for process in processes]
+    finally:
+        for process in processes:
+            process.kill()
+    assert [process.returncode for process in processes] == [0] * len(processes), printed
+    return printed
 
 
 @pytest.mark.slow
-def test_two_processes_train_together_and_go_on_after_one_was_killed(tmp_path):
+def test_two_processes_train_as_one_and_go_on_after_one_was_killed(tmp_path):
     SHORT.to_toml(tmp_path / "arm.toml")
     new = ["--spec", tmp_path / "arm.toml", *(part for text in SETTINGS for part in ("--set", text))]
-    whole = Pair(*new, "--out", tmp_path / "whole").ends()
+    printed = end(start([*new, "--out", tmp_path / "whole"], *pair()))
     for text in ("run: ", "held-out median"):  # one speaks for both
-        assert text in whole[0] and text not in whole[1]
+        assert text in printed[0] and text not in printed[1]
+    end(start([*new, "--out", tmp_path / "alone"], "1"))
+    first, alone = (figures(tmp_path / name)[1][2] for name in ("whole", "alone"))  # soon after warm-up
+    assert first["updates"] == alone["updates"] > 0
+    np.testing.assert_allclose(list(first.values()), list(alone.values()), rtol=1e-3, atol=1e-3)
 
-    broken = Pair(*new, "--out", tmp_path / "broken")
-    while not (tmp_path / "broken" / "checkpoints" / "2").exists():
-        assert all(process.poll() is None for process in broken.processes)
-        time.sleep(0.05)
-    broken.processes[1].send_signal(signal.SIGKILL)
-    broken.processes[1].wait()
-    assert broken.processes[0].wait() != 0  # it cannot go on alone, and says so by ending
-    broken.processes[0].stdout.close()
-    broken.processes[1].stdout.close()
+    broken = start([*new, "--out", tmp_path / "broken"], *pair())
+    try:
+        while not (tmp_path / "broken" / "checkpoints" / "2").exists():
+            assert all(process.poll() is None for process in broken)
+            time.sleep(0.05)
+        broken[1].send_signal(signal.SIGKILL)
+        assert broken[0].wait(timeout=LONGEST_S) != 0  # it cannot go on alone, and says so by ending
+    finally:
+        for process in broken:
+            process.kill()
+            process.communicate()
     assert not (tmp_path / "broken" / "evaluation.json").exists()
+    end(start(["--resume", tmp_path / "broken"], *pair()))
+    assert figures(tmp_path / "whole") == figures(tmp_path / "broken")
 
-    Pair("--resume", tmp_path / "broken").ends()
-    one, other = (
-        json.loads((tmp_path / name / "evaluation.json").read_text()) for name in ("whole", "broken")
-    )
-    assert one == other
-    rows = [
-        [{k: v for k, v in row.items() if "speed" not in k} for row in Run.open(tmp_path / name).metrics()]
-        for name in ("whole", "broken")
-    ]
-    assert rows[0] == rows[1]
+
+def figures(path):
+    """All that a run measured but for speeds."""
+    rows = [{k: v for k, v in row.items() if "speed" not in k} for row in Run.open(path).metrics()]
+    return json.loads((path / "evaluation.json").read_text()), rows
