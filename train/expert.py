@@ -5,8 +5,8 @@ inside the pipe, its chambers and springs away from their limits, and that other
 close to the equilibrium of the waypoint before. That is a least-squares problem in the nine pressures, with
 one-sided errors for the limits, solved by a damped Gauss-Newton method from many starts at once: the posture
 before, and postures of a random pool that are near and clear. Of the ends that keep all limits, those are
-preferred whose straight way in pressures from the posture before is clear, and of these the nearest one. Where
-none keeps them with the gripper as it is asked to hang, the gripper may hang a little otherwise.
+preferred whose straight way in pressures from the posture before is clear, and of these the nearest one.
+Where none keeps them with the gripper as it is asked to hang, it may hang a little otherwise.
 
 Poses are the real arm's, P_S2R, where there is a sim-to-real network; the body is that of the simulated arm.
 """
