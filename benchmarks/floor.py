@@ -63,8 +63,8 @@ def counted(function: Callable, compiled: Any, *arguments: Any) -> Cost:
     for name, flop in _linear_algebra(jax.make_jaxpr(function)(*arguments).jaxpr):
         if not any(called in text for called in LIBRARY[name]):
             raise RuntimeError(
-                f"{name}: expected a call of {' or '.join(LIBRARY[name])} in the compiled function, found none, "
-                "so whether its operations are counted is not known"
+                f"{name}: expected a call of {' or '.join(LIBRARY[name])} in the compiled function, none is; "
+                "so nobody knows whether its operations are counted"
             )
         library += flop
     return Cost(cost["flops"] + library, cost["bytes accessed"])

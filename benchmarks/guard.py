@@ -3,9 +3,9 @@
     python -m benchmarks guard            compare; for use before a release, in about two minutes
     python -m benchmarks guard --store    make this the baseline of this kind of machine
 
-Exit status 0 if nothing is worse, 1 if something is, 2 if there is no baseline, or none worth storing. What is
-measured, and why it holds on a machine that is busy or faster, stands in `benchmarks.guard_work`. It runs in
-processes of its own, one after the other, since what differs from process to process, such as where memory
+Exit status 0 if nothing is worse, 1 if something is, 2 if there is no baseline, or none worth storing. What
+is measured, and why it holds on a machine that is busy or faster, stands in `benchmarks.guard_work`. It runs
+in processes of its own, one after the other, since what differs from process to process, such as where memory
 lies, is a part of the spread. Tolerance is twice the furthest that a process of the baseline lay from their
 median; a baseline with one above a quarter is refused, since it would let through what it is there to stop.
 """

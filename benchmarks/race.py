@@ -3,8 +3,8 @@
 Wall time and env steps until the median tip error at the held-out goals is so many millimetres: ours, and TQC
 of SBX and of Stable-Baselines3-contrib on the same arms, goals and evaluation. Hindsight: ours only; how fast
 ours is without it is seen of ours-plain. `benchmarks.race_contestants` says how each trains. One after
-another, each in a process of its own with all cores. A level is reached where the line between two evaluations
-crosses it for the first time.
+another, each in a process of its own with all cores. A level is reached where the line between two
+evaluations crosses it for the first time.
 
 Ours with the preset quick goes first. A peer is stopped when it has had as many times its time to 5 mm as the
 goal asks for, since the goal is met then, or when it has reached all that ours has; ours-plain has as long as
@@ -143,8 +143,8 @@ def claim(folder: Path, settings: Settings) -> None:
 def run(folder: Path, seeds: Sequence[int], settings: Settings) -> list[dict[str, Any]]:
     """The results of all contestants, those that the folder has not measured first.
 
-    One that fails has `failed` in the place of points. If it is the first of a seed, there are no others: what
-    they are given follows from it.
+    One that fails has `failed` in the place of points. If it is the first of a seed, there are no others:
+    what they are given follows from it.
     """
     results = []
     for seed in seeds:

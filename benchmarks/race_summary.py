@@ -21,8 +21,8 @@ GOALS = {"sbx": 5.0, "sb3-contrib": 15.0}  # times our wall time to GOAL_MM
 FIRST, OURS, PLAIN = "ours-quick", ("ours-quick", "ours-paper"), ("ours-plain",)
 PEERS = {library: (f"{library}-tuned", f"{library}-defaults") for library in GOALS}
 HINDSIGHT = (
-    f"ours only ({' and '.join(OURS)}): the Gymnasium wrapper's flat observations do not give it to the peers; "
-    f"{PLAIN[0]} goes without it, too"
+    f"ours only ({' and '.join(OURS)}): the Gymnasium wrapper's flat observations do not give it to the "
+    f"peers; {PLAIN[0]} goes without it, too"
 )
 
 Point = Mapping[str, Any]  # of a curve: wall_s, trained_s, env_steps, updates, median_mm (None if not finite)
@@ -137,7 +137,7 @@ def _best_of_theirs(times: Sequence[Time]) -> Time:
 
 
 def _levels(ran: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """A row for each seed and level: ours, without hindsight too, and how many times as long the peers took."""
+    """A row for each seed and level: ours, also without hindsight, and the peers' times as multiples."""
     rows = []
     for seed in sorted({result["seed"] for result in ran}):
         for level_mm in LEVELS_MM:

@@ -40,8 +40,8 @@ PAPER_WORKERS, PAPER_STEP_S = 14, 0.03  # the paper's cost of an environment ste
 SUBPROC = "SubprocVecEnv"
 NOTES = {
     "simulated seconds per env step": "C MuJoCo's arm is stepped until it rests: it swings until its own "
-    "damping has had its due, and the law's integral action fills or empties a chamber no faster than its gains "
-    "let it",
+    "damping has had its due, and the law's integral action fills or empties a chamber no faster than its "
+    "gains let it",
     "median, 95 %, max mm": "how far the tip then is from the true equilibrium",
     "the paper": f"its {PAPER_STEP_S} s for an environment step is taken at its word; how far from rest its "
     "arms are then is not known",

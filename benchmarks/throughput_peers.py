@@ -49,7 +49,7 @@ class Stepped(NamedTuple):
     tip_mm: np.ndarray  # (n_env, 3)
 
 
-def _timed(step: Callable[[], Stepped], timestep_s: float) -> Facts:
+def timed(step: Callable[[], Stepped], timestep_s: float) -> Facts:
     """Rates over `ROUND_S`, and what an environment step is made of."""
     steps = []
     start = time.perf_counter()
@@ -86,7 +86,7 @@ def _subproc(folder: str, n: int) -> tuple[Facts, Callable[[], Facts]]:
         return Stepped(n, int(n_physics), float(stepping_s), told["reference_m"], told["tip_mm"])
 
     step()
-    return {"stable_baselines3": __version__}, lambda: _timed(step, model.opt.timestep)
+    return {"stable_baselines3": __version__}, lambda: timed(step, model.opt.timestep)
 
 
 def _rollout(folder: str, n_threads: int) -> tuple[Facts, Callable[[], Facts]]:
@@ -104,7 +104,7 @@ def _rollout(folder: str, n_threads: int) -> tuple[Facts, Callable[[], Facts]]:
         *_, reference_m, end = envs.step(rng.uniform(-1.0, 1.0, (arms.n, spec.n_chambers)))
         return Stepped(arms.n, end.physics_steps, arms.stepping_s - before_s, reference_m, end.pose[:, :3])
 
-    return {"arms": arms.n}, lambda: _timed(step, model.opt.timestep)
+    return {"arms": arms.n}, lambda: timed(step, model.opt.timestep)
 
 
 def _warp(folder: str, n: int) -> tuple[Facts, Callable[[], Facts]]:

@@ -4,9 +4,9 @@ import json
 
 import pytest
 
-from benchmarks import guard
+from benchmarks import guard, guard_work
 from benchmarks.guard import BaselineError, baseline_of, compare, read_baseline, store
-from benchmarks.guard_work import MUJOCO, PRODUCT, REFERENCE, Took, cost
+from benchmarks.guard_work import MUJOCO, PRODUCT, REFERENCE, Sizes, Took, cost
 
 SIZES = {"n_arms": 4}
 
@@ -93,6 +93,36 @@ def test_status_tells_stored_same_worse_and_no_baseline(machine, capsys):
     assert guard.main([]) == 0 and "nothing is worse" in capsys.readouterr().out
     machine.append(same | {"compile": samples(compile=(1.0, 1.3, 1.4))["compile"]})
     assert guard.main([]) == 1 and "worse: compile" in capsys.readouterr().out
+
+
+def test_a_baseline_that_would_let_everything_through_is_not_stored(machine, capsys):
+    machine.append(samples(tick=(2.0, 2.0, 2.26), settle=(1.0, 1.0, 1.12)))  # 26 % and 24 %
+    assert guard.main(["--store"]) == 2
+    said = capsys.readouterr().out
+    assert "not stored: the tolerance of tick is above 25 %" in said and "nothing else runs" in said
+    assert not guard.FILE.exists()
+
+
+@pytest.fixture
+def tiny(monkeypatch):
+    """Next to no work in this process, with the compilation cache as it was."""
+    import jax
+
+    sizes = Sizes(64, 1, 10, 8, 1, 2, 8, 2)
+    monkeypatch.setattr(guard_work, "SIZES", {"cpu": sizes, "gpu": sizes})
+    before = jax.config.jax_enable_compilation_cache
+    yield
+    jax.config.update("jax_enable_compilation_cache", before)
+
+
+@pytest.mark.slow
+def test_every_cost_is_measured(tiny):
+    facts, work = guard_work.prepare()
+    told = facts | work()
+    assert told.keys() == REFERENCE.keys()
+    for own in told.values():
+        assert own["cost"] > 0.0 and own["wall_s"] > 0.0 and own["cores"] > 0.0
+    assert told["compile"]["wall_s"] > told["tick"]["wall_s"]
 
 
 def test_baselines_of_other_machines_stay_and_are_not_compared_with(tmp_path):

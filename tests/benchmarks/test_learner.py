@@ -1,11 +1,12 @@
 """The learner's benchmark: rounds that take turns, what is left out, ratios; with made-up programs."""
 
+import math
 import sys
 from types import SimpleNamespace
 
 import pytest
 
-from benchmarks import learner
+from benchmarks import learner, learner_contestants
 from benchmarks.learner import CONTESTANTS, table, updates_per_round
 from benchmarks.learner_contestants import choose_threads
 from benchmarks.peers import PINS, PeerError
@@ -120,10 +121,17 @@ def test_a_peer_that_fails_is_left_out_from_there_and_ours_goes_on(workers, monk
     assert not any(worker.open for worker in workers)
 
 
-def test_ours_is_not_left_out_in_silence(workers, monkeypatch):
+def test_ours_failing_is_told_and_loses_no_other_s_figures(workers, monkeypatch):
     monkeypatch.setattr(Made, "fails", ("ours", 1024, 1))
-    with pytest.raises(WorkerError, match="ours: out of memory"):
-        learner.measure()
+    figures = learner.measure()
+    assert figures["left_out"] == [{"contestant": "ours", "why": "from batch 1,024 on: ours: out of memory"}]
+    assert figures["updates_per_s"][0]["ours / sbx"] == 2.0
+    assert figures["updates_per_s"][1] == {
+        "batch": 1024,
+        "sb3-contrib TQC": 15.6,
+        "SBX TQC": 31.2,
+        "brax SAC": 125.0,
+    }
     assert not any(worker.open for worker in workers)
 
 
@@ -140,13 +148,35 @@ def test_a_peer_that_cannot_be_installed_is_left_out(workers, monkeypatch):
     assert set(PINS) <= set(CONTESTANTS)
 
 
-@pytest.mark.parametrize("seconds, chosen", [({4: 1.0, 1: 3.0}, 4), ({4: 50.0, 1: 3.0}, 1)])
-def test_pytorch_gets_the_threads_it_trains_fastest_with(monkeypatch, seconds, chosen):
+@pytest.mark.parametrize(
+    "times, chosen",
+    [
+        ({4: [9.0, 1.0, 1.0, 1.0], 1: [3.0] * 4}, 4),
+        ({4: [50.0] * 4, 1: [9.0, 60.0, 3.0, 70.0]}, 1),  # the best of three, after one that does not count
+        ({4: [50.0] * 4, 1: [3.0, 60.0, 60.0, 60.0]}, 4),
+    ],
+)
+def test_pytorch_gets_the_threads_it_trains_fastest_with(monkeypatch, times, chosen):
     threads, clock = [4], [0.0]
     torch = SimpleNamespace(
         get_num_threads=lambda: threads[0], set_num_threads=lambda n: threads.__setitem__(0, n)
     )
     monkeypatch.setitem(sys.modules, "torch", torch)
     monkeypatch.setattr("benchmarks.learner_contestants.time.perf_counter", lambda: clock[0])
-    choose_threads(lambda: clock.__setitem__(0, clock[0] + seconds[threads[0]]))
+    left = {n: iter(own) for n, own in times.items()}
+    choose_threads(lambda: clock.__setitem__(0, clock[0] + next(left[threads[0]])))
     assert threads == [chosen]
+
+
+@pytest.mark.slow
+def test_our_contestant_updates_its_networks_and_tells_how_fast(monkeypatch):
+    from train import replay
+
+    stored = []
+    monkeypatch.setattr(learner_contestants, "N_STORED", 256)
+    monkeypatch.setattr(
+        replay, "add", lambda *given, add=replay.add: stored.append(add(*given)) or stored[-1]
+    )
+    facts, work = learner_contestants.CONTESTANTS["ours"](32, 2)
+    assert facts == {} and int(stored[0].size) == 256
+    assert 0.0 < work()["updates_per_s"] < math.inf

@@ -1,5 +1,6 @@
-"""The race: curves with known crossings, when to stop and to go on, goals; with a made-up program."""
+"""The race: contestants and their processes, what each is given, what is kept; with a made-up program."""
 
+import dataclasses
 import json
 import sys
 
@@ -8,15 +9,16 @@ import numpy as np
 import pytest
 
 from benchmarks import race
-from benchmarks.race import RaceError, Settings, claim, run, train
+from benchmarks.race import Limits, RaceError, Settings, claim, limits_of, run, train
 from benchmarks.race_contestants import (
+    CONTESTANTS,
     Contestant,
     HeldOut,
+    our_config,
     prepare,
     scaled,
     tuned_settings,
 )
-from benchmarks.race_summary import crossing, judge, summarise
 from benchmarks.rounds import Worker, WorkerError
 from mjx_softarm.env import EnvConfig, ReachEnv
 from train.config import PRESETS
@@ -48,132 +50,19 @@ def fake(tmp_path, monkeypatch):
     return lambda name="fake": Worker(name, ["fake_contestant", name, "0", "1.0", "8"])
 
 
-def curve(*errors_mm):
-    """A point each 10 s."""
-    return [
-        {
-            "wall_s": 2.0 + 10 * k,
-            "trained_s": 10.0 * k,
-            "env_steps": 100 * k,
-            "updates": k,
-            "median_mm": error_mm,
-        }
-        for k, error_mm in enumerate(errors_mm, 1)
-    ]
-
-
-def result(name, *errors_mm, seed=0):
-    return {
-        "contestant": name,
-        "seed": seed,
-        "start_up_s": 2.0,
-        "limit_s": None,
-        "points": curve(*errors_mm),
-    }
-
-
-# --- curves ------------------------------------------------------------------------------------------------
-
-
-def test_a_level_is_reached_where_the_line_between_two_evaluations_crosses_it_first():
-    points = curve(20.0, 12.0, 8.0, 11.0, 4.0)
-    assert crossing(points, 10, "wall_s") == pytest.approx(27.0)  # half way from 22 to 32
-    assert crossing(points, 8, "trained_s") == pytest.approx(30.0)
-    assert crossing(points, 5, "env_steps") == pytest.approx(400 + 100 * 6 / 7)
-    assert crossing(points, 3, "wall_s") is None
-
-
-def test_a_curve_that_begins_below_a_level_has_it_at_its_first_evaluation():
-    assert crossing(curve(4.0, 3.0), 5, "wall_s") == 12.0
-
-
-def test_errors_that_are_not_finite_reach_nothing():
-    assert crossing(curve(None, None), 10, "wall_s") is None
-    assert crossing(curve(20.0, None, 4.0), 5, "wall_s") == 32.0  # nothing to draw the line from
-
-
-# --- goals -------------------------------------------------------------------------------------------------
-
-
-def others(*errors_mm):
-    """Both variants of both peers, which need as long as the curve says."""
-    names = ("sbx-tuned", "sbx-defaults", "sb3-contrib-tuned", "sb3-contrib-defaults")
-    return [result(name, *errors_mm) for name in names]
-
-
-def test_a_goal_is_met_by_the_better_variant_s_time_over_ours():
-    ours = result("ours", 6.0, 4.0)  # 5 mm at 17 s
-    slow = [9.0] * 8
-    results = [ours, result("sbx-tuned", *slow, 6.0, 4.0), result("sbx-defaults", *slow, 9.0, 9.0, 9.0)]
-    row = judge("sbx", results)  # 97 s against 17 s
-    assert (row["measured"], row["verdict"]) == ("5.71 times", "met")
-    assert "5 mm" in row["goal"] and "at least 5 times" in row["goal"]
-    results[2] = result("sbx-defaults", 9.0, 9.0, 6.0, 4.0)  # 37 s
-    assert judge("sbx", results)["measured"] == "2.18 times"
-    assert judge("sbx", results)["verdict"] == "NOT MET"
-
-
-def test_a_peer_that_was_stopped_counts_with_the_time_that_it_had():
-    row = judge("sbx", [result("ours", 4.0), *others(*[9.0] * 6)])  # 62 s against 12 s
-    assert (row["measured"], row["verdict"]) == ("not within 5.17 times", "met")
-    row = judge("sb3-contrib", [result("ours", 4.0), *others(*[9.0] * 6)])
-    assert (row["measured"], row["verdict"]) == ("not within 5.17 times", "NOT MET")
-
-
-def test_a_goal_that_ours_does_not_reach_is_not_met():
-    row = judge("sbx", [result("ours", 6.0), *others(*[9.0] * 60)])
-    assert row["verdict"] == "NOT MET" and "ours did not reach it with seed 0" in row["measured"]
-
-
-def test_a_goal_is_skipped_where_a_variant_failed_and_says_why():
-    results = [result("ours", 4.0), *others(*[9.0] * 60)]
-    results[1] = {"contestant": "sbx-tuned", "seed": 0, "failed": "no network"}
-    assert judge("sbx", results)["verdict"] == "skipped"
-    assert judge("sbx", results)["measured"] == "sbx-tuned: no network"
-    assert judge("sb3-contrib", results)["verdict"] == "met"
-    assert summarise(results)["failed"] == [results[1]]
-
-
-def test_the_median_over_seeds_is_what_counts():
-    times = {0: 6, 1: 3, 2: 7}  # evaluations until 4 mm
-    results = [result("ours", 4.0, seed=seed) for seed in times]
-    for seed, n in times.items():
-        results += [result(f"sbx-{v}", *[9.0] * n, 4.0, seed=seed) for v in ("tuned", "defaults")]
-    assert judge("sbx", results)["measured"] == "5.83 times"  # (2 + 68) / 12 of seed 0, at 4/5 of its last
-
-
-def test_tables_have_a_row_for_each_contestant_with_start_up_and_without():
-    figures = summarise([result("ours", 12.0, 8.0, 4.0), *others(20.0)])
-    assert figures["wall_s"][0] == {
-        "contestant": "ours",
-        "seed": 0,
-        "start_up": 2.0,
-        "to_10_mm": 17.0,
-        "to_5_mm": 29.5,
-        "to_3_mm": "not within 32",
-        "to_2_mm": "not within 32",
-        "best_mm": 4.0,
-        "in_all": 32,
-    }
-    assert figures["wall_s_without_start_up"][0]["to_10_mm"] == 15.0
-    assert figures["env_steps"][0]["to_5_mm"] == 275.0
-    assert [row["to_10_mm"] for row in figures["wall_s"][1:]] == ["not within 12"] * 4
-    json.dumps(figures, allow_nan=False)
-
-
 # --- a contestant and its process --------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     "limits, n_points",
     [
-        ({"limit_s": 93.0, "target_mm": 0.0}, 9),  # 3 + 10 k >= 93
-        ({"limit_s": 1e9, "target_mm": 20.0}, 5),  # 100 / k <= 20
-        ({"limit_s": float("inf"), "target_mm": 0.0}, 30),  # ended
+        (Limits(93.0), 9),  # 3 + 10 k >= 93
+        (Limits(target_mm=20.0), 5),  # 100 / k <= 20
+        (Limits(), 30),  # ended
     ],
 )
 def test_a_contestant_trains_until_its_limit_its_target_or_its_end(fake, limits, n_points):
-    found = train(fake(), **limits, n_points=1000)
+    found = train(fake(), limits, n_points=1000)
     assert [point["updates"] for point in found["points"]] == list(range(1, n_points + 1))
     assert found["start_up_s"] == 3.0 and "ended" not in found["points"][-1]
     json.dumps(found, allow_nan=False)
@@ -181,7 +70,7 @@ def test_a_contestant_trains_until_its_limit_its_target_or_its_end(fake, limits,
 
 def test_a_contestant_that_stops_by_itself_is_told_with_its_last_words(fake):
     with pytest.raises(WorkerError, match=r"(?s)broken: stopped with status 1.*RuntimeError: not today"):
-        train(fake("broken"), 100.0, 0.0, 10)
+        train(fake("broken"), Limits(100.0), 10)
 
 
 def test_time_counts_in_training_and_stands_while_the_policy_is_evaluated(monkeypatch):
@@ -231,6 +120,27 @@ def test_held_out_goals_are_evaluated_as_the_trainer_does_it():
     np.testing.assert_allclose(found, reached.tip_error_mm, atol=0.01)
 
 
+def test_ours_without_hindsight_differs_in_nothing_else():
+    quick, plain, paper = (our_config(f"ours-{name}") for name in ("quick", "plain", "paper"))
+    assert (plain.hindsight.reached_share, plain.hindsight.near_share) == (0.0, 0.0)
+    assert quick.hindsight == PRESETS["quick"].hindsight and quick.hindsight.near_share > 0
+    assert dataclasses.replace(plain, hindsight=quick.hindsight) == quick
+    assert (paper.total_env_steps, paper.hindsight) == (300_000, quick.hindsight)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["ours-quick", "ours-plain"])
+def test_ours_trains_and_is_evaluated(name):
+    facts, work = prepare(CONTESTANTS[name](0), 1.0, 0.0, 64)
+    points = [work() for _ in range(4)]
+    assert facts == {"start_up_s": 1.0}
+    assert [point["env_steps"] for point in points] == [1024, 2048, 3072, 4096]
+    assert [point["updates"] for point in points] == [0, 0, 1024, 2048]  # the first 2,048 steps are random
+    assert points[0]["median_mm"] == points[1]["median_mm"] != points[2]["median_mm"]
+    assert all(0.0 < point["median_mm"] < 500.0 and not point["ended"] for point in points)
+    assert np.diff([point["wall_s"] for point in points]).min() > 0.0
+
+
 def test_tuned_peers_have_the_quick_preset_s_settings():
     n_steps = [0]
     settings = tuned_settings(PRESETS["quick"], lambda: n_steps[0])
@@ -274,21 +184,22 @@ def test_rewards_are_scaled_and_nothing_else():
 
 # --- the folder --------------------------------------------------------------------------------------------
 
+POINTS = [  # 10 mm at 17 s, 5 mm at 29.5 s
+    {"wall_s": wall_s, "trained_s": wall_s - 2, "env_steps": 100, "updates": 1, "median_mm": error_mm}
+    for wall_s, error_mm in ((12.0, 12.0), (22.0, 8.0), (32.0, 4.0))
+]
+
 
 @pytest.fixture
 def asked(monkeypatch):
-    """What each contestant was asked, in place of training it."""
+    """What each contestant was given, in place of training it; one of them fails."""
     asked = {}
 
-    def made_up(worker, limit_s, target_mm, n_points):
-        asked[worker.name] = (limit_s, target_mm)
+    def made_up(worker, limits, n_points):
+        asked[worker.name] = limits
         if worker.name.startswith("sbx-tuned"):
             raise WorkerError("sbx-tuned: not today")
-        return {
-            key: value
-            for key, value in result("", 12.0, 8.0, 4.0).items()
-            if key not in ("contestant", "seed")
-        }
+        return {"start_up_s": 2.0, "limit_s": None, "points": POINTS}
 
     monkeypatch.setattr(race, "train", made_up)
     monkeypatch.setattr(race, "peer_python", lambda name: sys.executable)
@@ -297,14 +208,22 @@ def asked(monkeypatch):
 
 def test_peers_get_our_time_to_5_mm_as_often_as_the_goal_asks_and_stop_where_ours_did(asked, tmp_path):
     results = run(tmp_path, (4,), Settings())
+    sbx, sb3 = (Limits(n * 29.5, 5, n * 29.5 / 40) for n in (5, 15))
     assert asked == {
-        "ours, seed 4": (float("inf"), 0.0),
-        "sbx-tuned, seed 4": (5 * 29.5, 5),
-        "sbx-defaults, seed 4": (5 * 29.5, 5),
-        "sb3-contrib-tuned, seed 4": (15 * 29.5, 5),
-        "sb3-contrib-defaults, seed 4": (15 * 29.5, 5),
+        "ours-quick, seed 4": Limits(float("inf"), 0.0, 0.0),
+        "sbx-tuned, seed 4": sbx,
+        "sb3-contrib-tuned, seed 4": sb3,
+        "ours-plain, seed 4": sbx,
+        "ours-paper, seed 4": Limits(float("inf"), 2, sbx.stretch_s),
+        "sbx-defaults, seed 4": sbx,
+        "sb3-contrib-defaults, seed 4": sb3,
     }
+    assert list(asked) == [f"{name}, seed 4" for name in CONTESTANTS]  # the most telling first
     assert [one["contestant"] for one in results if "failed" in one] == ["sbx-tuned"]
+
+
+def test_peers_of_one_that_does_not_reach_5_mm_get_multiples_of_all_its_time():
+    assert limits_of("sbx-tuned", POINTS[:2]) == Limits(5 * 22.0, 10, 5 * 22.0 / 40)
 
 
 def test_what_was_measured_is_not_measured_again_but_what_failed_is(asked, tmp_path):
@@ -314,14 +233,27 @@ def test_what_was_measured_is_not_measured_again_but_what_failed_is(asked, tmp_p
     assert list(asked) == ["sbx-tuned, seed 0"]
     asked.clear()
     run(tmp_path, (0, 1), Settings())
-    assert len(asked) == 1 + 5
+    assert len(asked) == 1 + 7
+
+
+def test_each_file_has_the_state_of_the_code_it_was_measured_with(asked, monkeypatch, tmp_path, capsys):
+    made = {"commit": "a1b2", "uncommitted_changes": True, "machine": {}}
+    monkeypatch.setattr(race, "provenance", lambda program: made)
+    run(tmp_path, (0,), Settings())
+    kept = json.loads((tmp_path / "ours-plain-seed0.json").read_text())
+    assert (kept["commit"], kept["uncommitted_changes"]) == ("a1b2", True)
+    assert "ours-plain, seed 0: commit a1b2 with uncommitted changes" in capsys.readouterr().out
+    run(tmp_path, (0,), Settings())
+    said = capsys.readouterr().out
+    assert "ours-plain, seed 0: measured before" in said and said.count("commit a1b2 with") == 7
 
 
 def test_a_folder_of_another_commit_or_size_is_refused(monkeypatch, tmp_path):
     made = {"commit": "a", "machine": {"cpus": 2}, "command": "this", "uncommitted_changes": False}
     monkeypatch.setattr(race, "provenance", lambda program: dict(made))
+    monkeypatch.setattr(race, "machine_kind", lambda: "Abacus, 2 cores")
     claim(tmp_path / "race", Settings())
-    made |= {"command": "that", "uncommitted_changes": True}
+    made |= {"command": "that", "uncommitted_changes": True, "machine": {"cpus": 2, "kernel": "new"}}
     claim(tmp_path / "race", Settings())
     made["commit"] = "b"
     with pytest.raises(
@@ -331,16 +263,25 @@ def test_a_folder_of_another_commit_or_size_is_refused(monkeypatch, tmp_path):
     made["commit"] = "a"
     with pytest.raises(RaceError, match=r"n_goals 2000, now 8"):
         claim(tmp_path / "race", Settings(n_goals=8))
+    monkeypatch.setattr(race, "machine_kind", lambda: "Abacus, 4 cores")
+    with pytest.raises(RaceError, match=r"made with machine Abacus, 2 cores, now Abacus, 4 cores"):
+        claim(tmp_path / "race", Settings())
 
 
-def test_ours_failing_ends_the_race(monkeypatch, tmp_path, capsys):
-    def fail(*_):
-        raise WorkerError("ours, seed 0: stopped with status 1")
+def test_without_the_first_there_is_no_race_and_other_seeds_are_told(monkeypatch, tmp_path, capsys):
+    def fail(worker, *_):
+        if worker.name == "ours-quick, seed 0":
+            raise WorkerError("ours-quick, seed 0: stopped with status 1")
+        return {"start_up_s": 2.0, "limit_s": None, "points": POINTS}
 
     monkeypatch.setattr(race, "train", fail)
-    assert race.main(["--smoke", "--out", str(tmp_path)]) == 2
-    assert "error: ours, seed 0: stopped with status 1" in capsys.readouterr().err
-    assert not list(tmp_path.glob("*seed0.json"))
+    monkeypatch.setattr(race, "peer_python", lambda name: sys.executable)
+    monkeypatch.setattr(race, "save", lambda *_: pytest.fail("written"))
+    assert race.main(["--seeds", "0,1", "--out", str(tmp_path)]) == 2
+    said = capsys.readouterr()
+    assert "ours-quick failed, without which there is no race; nothing is written" in said.err
+    assert "stopped with status 1" in said.out and "29.5" in said.out
+    assert not list(tmp_path.glob("*seed0.json")) and len(list(tmp_path.glob("*seed1.json"))) == 7
 
 
 @pytest.mark.parametrize("seeds", ["", "1,", "-1", "a"])

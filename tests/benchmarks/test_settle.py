@@ -1,13 +1,17 @@
 """The settling benchmark's parts: truth, saturation, the goal by hand, counted operations."""
 
+from unittest import mock
+
 import jax
 import jax.numpy as jnp
 import jax.scipy.linalg
 import numpy as np
 import pytest
 
+from benchmarks import settle
 from benchmarks.floor import counted, settle_cost
-from benchmarks.settle import GOAL_ARMS, REACHES, speed_goal, way
+from benchmarks.rounds import Worker
+from benchmarks.settle import GOAL_ARMS, REACHES, no_goal, speed_goal, way
 from benchmarks.truth import Truth, error_figures, random_references, told_error, true_rest
 from mjx_softarm import ArmSpec
 
@@ -36,7 +40,7 @@ def test_the_whole_reach_is_what_may_be_commanded():
 def test_errors_are_distances_to_the_truth_without_the_arms_that_have_none():
     found = np.array([[3.0, 4.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]])
     errors = error_figures(found, truth(np.zeros((3, 3)), settled=[True, True, False]))
-    assert errors == {"median_mm": 3.0, "p95_mm": 4.8, "max_mm": 5.0}
+    assert errors == {"median_mm": 3.0, "p95_mm": 4.8, "max_mm": 5.0, "without_truth": 1}
 
 
 def test_the_error_of_what_a_program_told_is_that_of_its_tips():
@@ -67,6 +71,7 @@ def test_a_way_s_figures_are_those_of_its_set_of_references():
         "median_mm": 1.0,
         "p95_mm": 1.0,
         "max_mm": 1.0,
+        "without_truth": 0,
         "solves_per_s": 20.0,
         "unsettled": 3,
         "peak_rss_mb": 7,
@@ -74,19 +79,82 @@ def test_a_way_s_figures_are_those_of_its_set_of_references():
 
 
 @pytest.mark.parametrize(
-    "measured, n_cores, verdict, told",
+    "measured, failed, verdict, told",
     [
-        ({128: (9_000, 0.1), 512: (10_000, 0.5)}, 2, "met", "10,000 with 512 arms, 0.5 mm"),
-        ({128: (9_999, 0.1)}, 2, "NOT MET", "9,999 with 128 arms, 0.1 mm"),
-        ({128: (12_000, 0.51), 512: (3, 0.1)}, 8, "NOT MET", "12,000 with 128 arms, 0.51 mm"),
-        ({}, 1, "skipped", "1 core here"),
-        ({}, 8, "skipped", "jax does not run on the CPU here"),
+        ({128: (9_000, 0.1), 512: (10_000, 0.5)}, {}, "met", "10,000 with 512 arms, 0.5 mm"),
+        ({128: (9_999, 0.1)}, {}, "NOT MET", "9,999 with 128 arms, 0.1 mm"),
+        ({128: (12_000, 0.51), 512: (3, 0.1)}, {}, "NOT MET", "12,000 with 128 arms, 0.51 mm"),
+        ({128: (12_000, 0.2)}, {"b": "b: gone"}, "met", "12,000 with 128 arms, 0.2 mm; b: gone"),
+        ({}, {"a": "a: no memory", "b": "b: gone"}, "NOT MET", "a: no memory; b: gone"),
     ],
 )
-def test_the_goal_wants_speed_and_precision_at_once(measured, n_cores, verdict, told):
-    row = speed_goal(measured, n_cores)
+def test_the_goal_wants_speed_and_precision_at_once(measured, failed, verdict, told):
+    row = speed_goal(measured, failed)
     assert row["verdict"] == verdict and row["measured"] == told
     assert 1024 in GOAL_ARMS
+
+
+def test_the_goal_is_skipped_without_two_cores_or_on_a_gpu():
+    assert no_goal(1, "cpu") == "1 core here"
+    assert no_goal(8, "gpu") == "jax does not run on the CPU here"
+    assert no_goal(2, "cpu") == ""
+
+
+def told_by(method, references):
+    """What a made-up way tells: arms at the origin, ten solves a second."""
+    sets = {name: {"tip_mm": [[0.0, 0.0, 0.0]] * len(rows)} for name, rows in references.items()}
+    return {"solves_per_s": dict.fromkeys(references, 10.0), "sets": sets}
+
+
+@pytest.mark.parametrize("links, ways", [(2, {"chain", "stepping"}), (8, {"chain"})])
+def test_a_way_that_fails_or_takes_too_long_has_a_row_that_says_why(monkeypatch, links, ways):
+    monkeypatch.setattr(settle, "N_ARMS", 2)
+    given = []
+
+    def take_turns(workers, n_rounds):
+        given.extend(worker.name.split(",")[0] for worker in workers)
+        failing = {2: "mjx", 8: "stepping"}[links]
+        references = {"1.0": np.zeros((2, 9))}
+        rounds = {w.name: [told_by(w.name, references)] for w in workers if not w.name.startswith(failing)}
+        return rounds, {w.name: f"{w.name}: no memory" for w in workers if w.name.startswith(failing)}
+
+    monkeypatch.setattr(settle, "take_turns", take_turns)
+    rows = {row["method"]: row for row in settle._ways(links, (1.0,))}
+    assert rows.keys() == {"chain", "mjx", "stepping"}
+    assert {method for method, row in rows.items() if row.get("solves_per_s") == 10.0} == ways
+    if links == 2:
+        assert rows["mjx"]["failed"] == "mjx, 2 links per section: no memory"
+    else:
+        assert "mjx" not in given and "compiles for minutes" in rows["mjx"]["skipped"]
+        assert rows["stepping"]["failed"] == "stepping, 8 links per section: no memory"
+
+
+def test_more_iterations_come_closer_and_every_budget_has_its_rate(monkeypatch):
+    monkeypatch.setattr(settle, "ITERATIONS", (2, 8))
+    monkeypatch.setattr(settle, "N_CALLS", 2)
+    reference = random_references(SPEC, 8)
+    few, many = settle._over_iterations(SPEC, reference, true_rest(SPEC, reference))
+    assert (few["iterations"], many["iterations"]) == (2, 8)
+    assert many["median_mm"] < 0.5 < few["max_mm"]
+    assert few["solves_per_s"] > 0 and many["solves_per_s"] > 0
+
+
+@pytest.mark.slow
+def test_the_chain_s_worker_tells_where_the_arms_rest(tmp_path):
+    spec = ArmSpec.default().replace(structure={"links_per_section": 2})
+    reference = random_references(spec, 4)
+    np.savez(tmp_path / "references.npz", **{"1.0": reference})
+    arguments = ["chain", "2", str(tmp_path / "references.npz"), str(tmp_path / "cache")]
+    worker = Worker("chain", ["benchmarks.settle_methods", *arguments])
+    try:
+        worker.start()
+        told = worker.round()
+    finally:
+        worker.close()
+    assert worker.facts.keys() == {"tracing_s", "compiling_s", "both_from_cache_s"}
+    found = way([told], "1.0", true_rest(spec, reference))
+    assert found["max_mm"] < 0.5 and found["unsettled"] == found["without_truth"] == 0
+    assert found["solves_per_s"] > 0
 
 
 def test_operations_are_counted_with_those_of_libraries():
@@ -111,4 +179,22 @@ def test_a_turn_of_the_settling_loop_costs_a_factorisation_and_more():
     outside, turn, n_outside = settle_cost(SPEC, jnp.asarray(random_references(SPEC, n_arms), jnp.float32))
     least = n_arms * (n**3 / 3 + 2 * n**2 * (1 + SPEC.n_chambers))
     assert turn.flop > least and turn.moved > 4 * n_arms * n**2
-    assert outside.flop > 0 and 0 <= n_outside <= 1
+    assert outside.flop > 0 and n_outside == 1
+
+
+@pytest.mark.parametrize("name", ["__cublas$triangularSolve", "lapack_strsm_ffi", "cublas_trsm_batched"])
+def test_a_triangular_solve_is_found_by_any_library_s_name(name):
+    function, argument = jax.jit(lambda x: jax.scipy.linalg.solve_triangular(x, x[0])), jnp.eye(6)
+    compiled = mock.Mock()
+    compiled.cost_analysis.return_value = {"flops": 1.0, "bytes accessed": 2.0}
+    compiled.as_text.return_value = f"custom-call {name}"
+    assert counted(function, compiled, argument).flop == 1.0 + 6**2
+
+
+def test_a_library_that_is_not_known_is_no_silence():
+    function, argument = jax.jit(jnp.linalg.cholesky), jnp.eye(6)
+    compiled = mock.Mock()
+    compiled.cost_analysis.return_value = {"flops": 1.0, "bytes accessed": 2.0}
+    compiled.as_text.return_value = "custom-call newfangled"
+    with pytest.raises(RuntimeError, match=r"cholesky: expected a call of potrf or cusolver\$cholesky"):
+        counted(function, compiled, argument)

@@ -7,13 +7,13 @@ import sys
 import numpy as np
 import pytest
 
-from benchmarks import gpu
+from benchmarks import gpu, rounds, throughput
 from benchmarks.mujoco_arm import REST_S, Rest, SteppedArm, SteppedReach, Task
 from benchmarks.mujoco_rollout import RolloutArms, RolloutReach, sensed_model
-from benchmarks.rounds import Worker, WorkerError, alternate, working
+from benchmarks.rounds import Worker, WorkerError, take_turns, working
 from benchmarks.throughput import over_rounds, points, side_by_side
 from benchmarks.throughput_arms import compile_twice
-from benchmarks.throughput_peers import write_arm
+from benchmarks.throughput_peers import Stepped, timed, write_arm
 from benchmarks.truth import error_figures, random_references, true_rest
 from mjx_softarm import ArmSpec
 from mjx_softarm.env import EnvConfig, ReachEnv
@@ -102,7 +102,7 @@ def test_a_spring_that_swings_back_to_where_it_was_does_not_rest():
 
 def test_the_peers_environments_are_the_project_s(folder, model):
     env = ReachEnv(SPEC, EnvConfig(n_poses=16))
-    stepped = SteppedReach(str(folder), seed=0)
+    stepped = SteppedReach(str(folder), seed=0, episode_length=2)
     obs, _ = stepped.reset()
     rng = np.random.default_rng(0)
     action = rng.uniform(-1.0, 1.0, 9).astype(np.float32)
@@ -114,8 +114,9 @@ def test_the_peers_environments_are_the_project_s(folder, model):
         after, env.observe(pose.astype(np.float32), goal.astype(np.float32)), atol=1e-5
     )
     assert value == -100.0 and not terminated and not truncated  # a random action saturates
-    assert info["physics_steps"] > 100
+    assert info["physics_steps"] > 100 and 0.0 < info["stepping_s"] < 60.0
     np.testing.assert_allclose(info["tip_mm"], pose[:3])
+    assert stepped.step(action)[3]  # its time is over
 
 
 def test_an_arm_of_the_rollout_that_reached_its_goal_begins_anew(folder, model):
@@ -160,9 +161,8 @@ def program(tmp_path, monkeypatch, argument, **kwargs):
 
 def test_programs_take_turns_whatever_they_print(tmp_path, monkeypatch):
     first, second = (program(tmp_path, monkeypatch, x) for x in ("1", "2"))
-    with working(first, second):
-        rounds = alternate([first, second], 2)
-    assert rounds == {
+    told, failed = take_turns([first, second], 2)
+    assert failed == {} and told == {
         "turns of 1": [{"n": 0, "wanted": 1.0}, {"n": 1, "wanted": 1.0}],
         "turns of 2": [{"n": 0, "wanted": 0.5}, {"n": 1, "wanted": 0.5}],
     }
@@ -180,9 +180,70 @@ def test_a_program_that_stops_is_named_with_what_it_said(tmp_path, monkeypatch):
     worker = program(tmp_path, monkeypatch, "0")
     with (
         working(worker),
-        pytest.raises(WorkerError, match=r"turns of 0: stopped with status 1(.|\n)*ZeroDiv"),
+        pytest.raises(WorkerError, match=r"turns of 0: stopped with status 1(.|\n)*ZeroDiv") as caught,
     ):
-        alternate([worker], 1)
+        worker.round()
+    assert caught.value.reason == (
+        "turns of 0: stopped with status 1, expected a result: ZeroDivisionError: float division by zero"
+    )
+
+
+def test_a_program_that_fails_loses_no_other_s_rounds(tmp_path, monkeypatch):
+    monkeypatch.setattr("benchmarks.rounds.ANSWER_S", 20.0)
+    good, bad, none = (program(tmp_path, monkeypatch, x) for x in ("1", "0", "no number"))
+    missing = Worker("missing", ["no_such_module"])
+    told, failed = take_turns([bad, good, missing, none], 2)
+    assert told == {"turns of 1": [{"n": 0, "wanted": 1.0}, {"n": 1, "wanted": 1.0}]}
+    assert "ZeroDivisionError" in failed["turns of 0"] and "ValueError" in failed["turns of no number"]
+    assert failed["missing"].endswith("No module named no_such_module")
+
+
+def test_a_program_that_says_nothing_is_stopped(tmp_path, monkeypatch):
+    (tmp_path / "silent.py").write_text("import time\ntime.sleep(600)\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setattr(rounds, "ANSWER_S", 0.5)
+    told, failed = take_turns([Worker("silent", ["silent"])], 1)
+    assert told == {}
+    assert failed["silent"].startswith("silent: stopped with status -9 after 0.5 s in silence")
+
+
+def test_a_point_that_fails_in_company_is_tried_alone_and_then_tells_why(monkeypatch):
+    tried = []
+
+    def made_up(workers, n_rounds):
+        names = [worker.name.split(",")[0] for worker in workers]
+        tried.append(names)
+        failing = {w.name: f"{w.name}: no memory" for w in workers if "dynamic" in w.name}
+        if len(workers) > 1:
+            failing |= {w.name: "too many" for w in workers if w.name.startswith("mjx")}
+        return {w.name: [{"env_steps_per_s": 7.0}] for w in workers if w.name not in failing}, failing
+
+    monkeypatch.setattr(throughput, "take_turns", made_up)
+    group = [("chain", "quasistatic", 8, 4), ("mjx", "quasistatic", 8, 4), ("mjx", "dynamic", 8, 4)]
+    rows = throughput._group(group)
+    assert tried == [["chain", "mjx", "mjx"], ["mjx"], ["mjx"]]
+    assert [row.get("env_steps_per_s") for row in rows] == [7.0, 7.0, None]
+    assert rows[2]["failed"] == "mjx, dynamic, 8 arms, 4 links: no memory"
+    assert (rows[2]["engine"], rows[2]["mode"], rows[2]["arms"]) == ("mjx", "dynamic", 8)
+
+
+def test_side_by_side_a_program_that_fails_has_a_row_that_says_why(monkeypatch):
+    def made_up(workers, n_rounds):
+        names = [worker.name for worker in workers]
+        return {names[0]: [{"env_steps_per_s": 4670.0}]}, dict.fromkeys(names[1:], "no memory")
+
+    monkeypatch.setattr(throughput, "take_turns", made_up)
+    monkeypatch.setattr(throughput, "write_arm", lambda folder, spec: None)
+    monkeypatch.setattr(throughput, "peer_python", lambda name: sys.executable)
+    rows = throughput._side_by_side(SPEC, on_gpu=False)
+    assert rows[0]["env_steps_per_s"] == 4670 and rows[0]["times_paper"] == 10.0
+    assert [row["failed"] for row in rows] == [None, "no memory", "no memory", "no memory", None, None]
+    assert rows[4]["skipped"] == gpu.NO_DEVICE
+
+
+def test_a_start_that_fails_tells_why(monkeypatch):
+    monkeypatch.setattr(throughput, "_START", "raise RuntimeError('not {cache} today')")
+    assert throughput._start("here") == {"failed": "status 1: RuntimeError: not here today"}
 
 
 def test_rates_are_medians_over_rounds_and_arrays_are_left_out():
@@ -223,6 +284,8 @@ def test_rates_are_told_as_multiples_of_the_processes():
     assert [row["times_subproc"] for row in rows] == [100, 1.0, None, None]
     assert rows[2]["skipped"] == "no device" and rows[1]["p95_mm"] == 0.5
     assert rows[3]["env_steps_per_s"] == 467  # the paper's
+    assert [row["times_paper"] for row in rows] == [10.71, 0.11, None, None]
+    assert "lockstep" in rows[1]["note"] and rows[0]["note"] is None
     without = side_by_side([{"program": "chain", "env_steps_per_s": 5000}])
     assert without[0]["times_subproc"] is None
 
@@ -274,12 +337,47 @@ def test_time_to_a_median_is_read_from_the_metrics_of_a_run(tmp_path, median_mm,
     metrics = tmp_path / "metrics.jsonl"
     sleep = "60" if reached else "0"  # stopped as soon as it is there
     command = [sys.executable, "-c", TRAINING, str(metrics), sleep, "0"]
-    spent, best = gpu.seconds_to(median_mm, command, metrics, longest_s=30.0)
+    spent, best = gpu.seconds_to(median_mm, command, metrics, 30.0, {})
     assert (spent is not None) == reached and best == 2.5
     assert json.loads(metrics.read_text().splitlines()[0]) == {"evaluation/median_mm": 9.0}
 
 
-def test_a_training_that_fails_is_no_result(tmp_path):
+def test_a_training_that_says_a_lot_is_not_stopped_by_it(tmp_path):
+    loud = "import sys; sys.stderr.write('x' * 10**6)"
+    command = [sys.executable, "-c", loud]
+    assert gpu.seconds_to(1.0, command, tmp_path / "metrics.jsonl", 30.0, {}) == (None, float("inf"))
+
+
+def test_a_training_that_fails_is_a_goal_that_is_not_met(tmp_path, monkeypatch):
     metrics = tmp_path / "metrics.jsonl"
+    fails = [sys.executable, "-c", TRAINING, str(metrics), "0", "3"]
     with pytest.raises(RuntimeError, match="status 3"):
-        gpu.seconds_to(1.0, [sys.executable, "-c", TRAINING, str(metrics), "0", "3"], metrics, longest_s=30.0)
+        gpu.seconds_to(1.0, fails, metrics, 30.0, {})
+    given = []
+
+    def fail(median_mm, command, metrics, longest_s, environment):
+        given.append((metrics, environment))
+        raise RuntimeError("train reach: status 1: a\nRESOURCE_EXHAUSTED: no memory")
+
+    monkeypatch.setattr(gpu, "seconds_to", fail)
+    row = gpu.training_goal(on_gpu=True)
+    assert (row["measured"], row["verdict"]) == ("RESOURCE_EXHAUSTED: no memory", "NOT MET")
+    ((metrics, environment),) = given
+    assert environment["XDG_CACHE_HOME"] in str(metrics)  # new and empty, so compilation is in the time
+
+
+STEPS = [
+    Stepped(2, 400, 0.25, np.zeros((2, 9)), np.ones((2, 3))),
+    Stepped(2, 200, 0.05, np.zeros((2, 9)), np.ones((2, 3))),
+]
+
+
+def test_what_an_environment_step_of_a_peer_is_made_of(monkeypatch):
+    clock = iter([0.0, 0.0, 0.5, 1.0])
+    monkeypatch.setattr("benchmarks.throughput_peers.time.perf_counter", lambda: next(clock))
+    monkeypatch.setattr("benchmarks.throughput_peers.ROUND_S", 1.0)
+    steps = iter(STEPS)
+    told = timed(lambda: next(steps), timestep_s=0.002)
+    assert (told["env_steps_per_s"], told["physics_steps_per_s"]) == (4.0, 600.0)
+    assert (told["physics_steps_per_env_step"], told["simulated_s_per_env_step"]) == (150, 0.3)
+    assert told["share_in_time_steps"] == 0.3 and np.shape(told["tip_mm"]) == (4, 3)
