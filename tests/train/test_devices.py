@@ -197,7 +197,7 @@ def test_two_processes_train_as_one_and_go_on_after_one_was_killed(tmp_path):
     SHORT.to_toml(tmp_path / "arm.toml")
     new = ["--spec", tmp_path / "arm.toml", *(part for text in SETTINGS for part in ("--set", text))]
     printed = end(start([*new, "--out", tmp_path / "whole"], *pair()))
-    for text in ("run: ", "held-out median"):  # one speaks for both
+    for text in ("run: ", "circle.png"):  # one speaks for both
         assert text in printed[0] and text not in printed[1]
     end(start([*new, "--out", tmp_path / "alone"], "1"))
     first, alone = (figures(tmp_path / name)[1][2] for name in ("whole", "alone"))  # soon after warm-up
