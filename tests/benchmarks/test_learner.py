@@ -172,11 +172,14 @@ def test_pytorch_gets_the_threads_it_trains_fastest_with(monkeypatch, times, cho
 def test_our_contestant_updates_its_networks_and_tells_how_fast(monkeypatch):
     from train import replay
 
-    stored = []
+    stored, add = [], replay.add
+
+    def seen(*given):
+        stored.append(add(*given))
+        return stored[-1]
+
     monkeypatch.setattr(learner_contestants, "N_STORED", 256)
-    monkeypatch.setattr(
-        replay, "add", lambda *given, add=replay.add: stored.append(add(*given)) or stored[-1]
-    )
+    monkeypatch.setattr(replay, "add", seen)
     facts, work = learner_contestants.CONTESTANTS["ours"](32, 2)
     assert facts == {} and int(stored[0].size) == 256
     assert 0.0 < work()["updates_per_s"] < math.inf

@@ -129,13 +129,12 @@ def test_ours_without_hindsight_differs_in_nothing_else():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["ours-quick", "ours-plain"])
-def test_ours_trains_and_is_evaluated(name):
-    facts, work = prepare(CONTESTANTS[name](0), 1.0, 0.0, 64)
-    points = [work() for _ in range(4)]
+def test_ours_trains_and_is_evaluated():
+    facts, work = prepare(CONTESTANTS["ours-plain"](0), 1.0, 0.0, 64)
+    points = [work() for _ in range(3)]
     assert facts == {"start_up_s": 1.0}
-    assert [point["env_steps"] for point in points] == [1024, 2048, 3072, 4096]
-    assert [point["updates"] for point in points] == [0, 0, 1024, 2048]  # the first 2,048 steps are random
+    assert [point["env_steps"] for point in points] == [1024, 2048, 3072]
+    assert [point["updates"] for point in points] == [0, 0, 1024]  # the first 2,048 steps are random
     assert points[0]["median_mm"] == points[1]["median_mm"] != points[2]["median_mm"]
     assert all(0.0 < point["median_mm"] < 500.0 and not point["ended"] for point in points)
     assert np.diff([point["wall_s"] for point in points]).min() > 0.0
