@@ -1,23 +1,19 @@
-"""The throughput benchmark's parts: C MuJoCo's rest against the solver, programs in turns, goals by hand."""
+"""The throughput benchmark's parts: C MuJoCo's rest against the solver, rows of programs that take turns."""
 
-import json
-import os
 import sys
 
 import numpy as np
 import pytest
 
-from benchmarks import gpu, rounds, throughput
+from benchmarks import gpu, throughput
 from benchmarks.mujoco_arm import REST_S, Rest, SteppedArm, SteppedReach, Task
 from benchmarks.mujoco_rollout import RolloutArms, RolloutReach, sensed_model
-from benchmarks.rounds import Worker, WorkerError, take_turns, working
 from benchmarks.throughput import over_rounds, points, side_by_side
 from benchmarks.throughput_arms import compile_twice
 from benchmarks.throughput_peers import Stepped, timed, write_arm
 from benchmarks.truth import error_figures, random_references, true_rest
 from mjx_softarm import ArmSpec
 from mjx_softarm.env import EnvConfig, ReachEnv
-from train.config import PRESETS, override
 
 SPEC = ArmSpec.default()
 N = 4
@@ -136,75 +132,7 @@ def test_an_arm_of_the_rollout_that_reached_its_goal_begins_anew(folder, model):
     arms.close()
 
 
-# --- programs in turns -------------------------------------------------------------------------------------
-
-PROGRAM = """
-import os, sys
-from benchmarks.rounds import serve
-
-def prepare():
-    print("a library's chatter")
-    os.system("echo chatter of another process")
-    count = iter(range(100))
-    cores = len(os.sched_getaffinity(0))
-    return {"cores": cores}, lambda: {"n": next(count), "wanted": 1 / float(sys.argv[1])}
-
-serve(prepare)
-"""
-
-
-def program(tmp_path, monkeypatch, argument, **kwargs):
-    (tmp_path / "taking_turns.py").write_text(PROGRAM)
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    return Worker(f"turns of {argument}", ["taking_turns", argument], **kwargs)
-
-
-def test_programs_take_turns_whatever_they_print(tmp_path, monkeypatch):
-    first, second = (program(tmp_path, monkeypatch, x) for x in ("1", "2"))
-    told, failed = take_turns([first, second], 2)
-    assert failed == {} and told == {
-        "turns of 1": [{"n": 0, "wanted": 1.0}, {"n": 1, "wanted": 1.0}],
-        "turns of 2": [{"n": 0, "wanted": 0.5}, {"n": 1, "wanted": 0.5}],
-    }
-
-
-def test_a_program_keeps_to_its_cores_and_we_keep_ours(tmp_path, monkeypatch):
-    before = os.sched_getaffinity(0)
-    worker = program(tmp_path, monkeypatch, "1", n_cores=1)
-    with working(worker):
-        assert worker.facts == {"cores": 1}
-    assert os.sched_getaffinity(0) == before
-
-
-def test_a_program_that_stops_is_named_with_what_it_said(tmp_path, monkeypatch):
-    worker = program(tmp_path, monkeypatch, "0")
-    with (
-        working(worker),
-        pytest.raises(WorkerError, match=r"turns of 0: stopped with status 1(.|\n)*ZeroDiv") as caught,
-    ):
-        worker.round()
-    assert caught.value.reason == (
-        "turns of 0: stopped with status 1, expected a result: ZeroDivisionError: float division by zero"
-    )
-
-
-def test_a_program_that_fails_loses_no_other_s_rounds(tmp_path, monkeypatch):
-    monkeypatch.setattr("benchmarks.rounds.ANSWER_S", 20.0)
-    good, bad, none = (program(tmp_path, monkeypatch, x) for x in ("1", "0", "no number"))
-    missing = Worker("missing", ["no_such_module"])
-    told, failed = take_turns([bad, good, missing, none], 2)
-    assert told == {"turns of 1": [{"n": 0, "wanted": 1.0}, {"n": 1, "wanted": 1.0}]}
-    assert "ZeroDivisionError" in failed["turns of 0"] and "ValueError" in failed["turns of no number"]
-    assert failed["missing"].endswith("No module named no_such_module")
-
-
-def test_a_program_that_says_nothing_is_stopped(tmp_path, monkeypatch):
-    (tmp_path / "silent.py").write_text("import time\ntime.sleep(600)\n")
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    monkeypatch.setattr(rounds, "ANSWER_S", 0.5)
-    told, failed = take_turns([Worker("silent", ["silent"])], 1)
-    assert told == {}
-    assert failed["silent"].startswith("silent: stopped with status -9 after 0.5 s in silence")
+# --- programs side by side ---------------------------------------------------------------------------------
 
 
 def test_a_point_that_fails_in_company_is_tried_alone_and_then_tells_why(monkeypatch):
@@ -288,82 +216,6 @@ def test_rates_are_told_as_multiples_of_the_processes():
     assert "lockstep" in rows[1]["note"] and rows[0]["note"] is None
     without = side_by_side([{"program": "chain", "env_steps_per_s": 5000}])
     assert without[0]["times_subproc"] is None
-
-
-# --- goals of a GPU ----------------------------------------------------------------------------------------
-
-
-def rates(chain, mjx):
-    rows = [
-        {"engine": "chain", "mode": "quasistatic", "arms": n, "env_steps_per_s": x} for n, x in chain.items()
-    ]
-    rows += [
-        {"engine": "mjx", "mode": "quasistatic", "arms": n, "env_steps_per_s": x} for n, x in mjx.items()
-    ]
-    return [*rows, {"engine": "mjx", "mode": "dynamic", "arms": 1, "env_steps_per_s": 10**9}]
-
-
-def test_goals_of_a_gpu_are_met_at_the_best_number_of_arms_or_not():
-    goals = gpu.rate_goals(rates({1: 5, 8192: 300_000, 32_768: 7}, {8192: 29_999}), on_gpu=True)
-    assert [row["verdict"] for row in goals] == ["met", "NOT MET"]
-    assert goals[0]["measured"] == "300,000 with 8,192 arms"
-
-
-def test_goals_of_a_gpu_are_skipped_without_one_and_say_why():
-    goals = [*gpu.rate_goals(rates({1: 10**6}, {1: 10**6}), on_gpu=False), gpu.training_goal(on_gpu=False)]
-    assert {row["verdict"] for row in goals} == {"skipped"}
-    assert {row["measured"] for row in goals} == {gpu.NO_DEVICE}
-
-
-def test_the_training_for_a_gpu_has_settings_that_there_are():
-    config = override(PRESETS["quick"], list(gpu.TRAINING))
-    assert config.n_arms == 2048 and config.n_updates_per_vector_step == 64
-
-
-TRAINING = """
-import json, sys, time
-with open(sys.argv[1], "w", buffering=1) as file:
-    for median in (9.0, None, 4.0, 2.5):
-        file.write(json.dumps({"epoch": 1} if median is None else {"evaluation/median_mm": median}) + "\\n")
-    file.write('{"evaluation/median_mm": 1')
-    file.flush()
-    time.sleep(float(sys.argv[2]))
-sys.exit(int(sys.argv[3]))
-"""
-
-
-@pytest.mark.parametrize("median_mm, reached", [(3.0, True), (2.0, False)])
-def test_time_to_a_median_is_read_from_the_metrics_of_a_run(tmp_path, median_mm, reached):
-    metrics = tmp_path / "metrics.jsonl"
-    sleep = "60" if reached else "0"  # stopped as soon as it is there
-    command = [sys.executable, "-c", TRAINING, str(metrics), sleep, "0"]
-    spent, best = gpu.seconds_to(median_mm, command, metrics, 30.0, {})
-    assert (spent is not None) == reached and best == 2.5
-    assert json.loads(metrics.read_text().splitlines()[0]) == {"evaluation/median_mm": 9.0}
-
-
-def test_a_training_that_says_a_lot_is_not_stopped_by_it(tmp_path):
-    loud = "import sys; sys.stderr.write('x' * 10**6)"
-    command = [sys.executable, "-c", loud]
-    assert gpu.seconds_to(1.0, command, tmp_path / "metrics.jsonl", 30.0, {}) == (None, float("inf"))
-
-
-def test_a_training_that_fails_is_a_goal_that_is_not_met(tmp_path, monkeypatch):
-    metrics = tmp_path / "metrics.jsonl"
-    fails = [sys.executable, "-c", TRAINING, str(metrics), "0", "3"]
-    with pytest.raises(RuntimeError, match="status 3"):
-        gpu.seconds_to(1.0, fails, metrics, 30.0, {})
-    given = []
-
-    def fail(median_mm, command, metrics, longest_s, environment):
-        given.append((metrics, environment))
-        raise RuntimeError("train reach: status 1: a\nRESOURCE_EXHAUSTED: no memory")
-
-    monkeypatch.setattr(gpu, "seconds_to", fail)
-    row = gpu.training_goal(on_gpu=True)
-    assert (row["measured"], row["verdict"]) == ("RESOURCE_EXHAUSTED: no memory", "NOT MET")
-    ((metrics, environment),) = given
-    assert environment["XDG_CACHE_HOME"] in str(metrics)  # new and empty, so compilation is in the time
 
 
 STEPS = [
