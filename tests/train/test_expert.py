@@ -10,7 +10,16 @@ from mjx_softarm import control
 from mjx_softarm.mjcf import build_model
 from mjx_softarm.pipe import CrossPipe, body_clearance
 from mjx_softarm.pose import pose_from_frame
-from train.expert import LIMIT_SHARE, MARGIN_KPA, MARGIN_M, SPRING_MARGIN_M, WAY, ExpertError
+from train.expert import (
+    EASED,
+    LIMIT_SHARE,
+    MARGIN_KPA,
+    MARGIN_M,
+    SPRING_MARGIN_M,
+    TOLERANCE_RAD,
+    WAY,
+    ExpertError,
+)
 from train.waypoints import FREE, SQUARE, TASKS, Waypoint, circle, task
 
 PIPE = CrossPipe.of_mm(300)
@@ -107,6 +116,18 @@ def test_look_tells_what_is_not_in_the_pipe(expert, spec):
 def test_waypoint_that_cannot_be_met_is_named(expert, finger_m, message):
     with pytest.raises(ExpertError, match=message):
         expert.plan([Waypoint("far", np.array(finger_m))])
+
+
+def test_gripper_that_cannot_hang_as_asked_hangs_a_little_otherwise(expert, spec):
+    """Where no chamber is at its limit with the gripper square, it is turned; the position is kept."""
+    finger_m = np.array([0.127, 0.02, -0.66])
+    found = expert.reach("edge", expert.target(Waypoint("edge", finger_m, SQUARE)), np.zeros(spec.n_chambers))
+    turn = found.rotation.T - found.rotation
+    turn_rad = np.linalg.norm([turn[2, 1], turn[0, 2], turn[1, 0]]) / 2
+    assert TOLERANCE_RAD < turn_rad < TOLERANCE_RAD / EASED
+    np.testing.assert_allclose(found.finger_m, finger_m, atol=5e-4)
+    low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
+    assert np.minimum(found.pressure_kpa - low, high - found.pressure_kpa).min() >= LIMIT_SHARE * MARGIN_KPA
 
 
 def test_tasks_have_the_papers_positions(spec):
