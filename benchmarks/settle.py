@@ -28,7 +28,7 @@ from benchmarks.floor import floor_rows
 from benchmarks.mujoco_rollout import RolloutArms, sensed_model
 from benchmarks.rounds import Facts, Worker, take_turns
 from benchmarks.settle_methods import N_STEPPED
-from benchmarks.throughput import over_rounds
+from benchmarks.throughput import LINKS, MOST_LINKS_MJX, N_LINKS, NO_MJX, over_rounds
 from benchmarks.truth import (
     Truth,
     error_figures,
@@ -45,10 +45,6 @@ N_ARMS = 512
 N_ROUNDS = 3
 N_CALLS = 10  # of each number of iterations
 METHODS = ("chain", "mjx", "stepping")
-LINKS = (2, 4, 6, 8, 10)
-MOST_LINKS_MJX = 6
-NO_MJX = f"compiles for minutes and in gigabytes at {MOST_LINKS_MJX} links, and for longer at more"
-N_LINKS = ArmSpec.default().structure.links_per_section  # where shares of saturated chambers are tried
 REACHES = (0.1, 0.3, 0.42, 0.65, 0.85, 1.0, 1.4)  # of `random_references`; shares from about 0 to 60 %
 REST_M = (1e-3, 3e-4, 1e-4, 3e-5)  # within which a spring counts as at rest, in time steps
 GOAL_RATE, GOAL_P95_MM, GOAL_CORES = 10_000, 0.5, 2

@@ -35,6 +35,9 @@ from benchmarks.truth import ERROR, TOLD, told_error
 from mjx_softarm.spec import ArmSpec
 
 N_ROUNDS = 3
+LINKS = (2, 4, 6, 8, 10)  # per section
+MOST_LINKS_MJX = 6
+NO_MJX = f"compiles for minutes and in gigabytes at {MOST_LINKS_MJX} links, and for longer at more"
 N_LINKS = ArmSpec.default().structure.links_per_section
 PAPER_WORKERS, PAPER_STEP_S = 14, 0.03  # the paper's cost of an environment step; the workers may share cores
 SUBPROC = "SubprocVecEnv"
@@ -62,10 +65,10 @@ def points(on_gpu: bool) -> list[list[Point]]:
         groups.append([("chain", "quasistatic", n, N_LINKS)])
         if n in mjx:
             groups[-1] += [("mjx", "quasistatic", n, N_LINKS), ("mjx", "dynamic", n, N_LINKS)]
-    for links in (2, 6, 8, 10):
-        groups.append([("chain", "quasistatic", fixed, links), ("mjx", "quasistatic", fixed, links)])
-        if links in (2, 6, 10):
-            groups[-1].append(("mjx", "dynamic", fixed, links))
+    for links in (links for links in LINKS if links != N_LINKS):
+        groups.append([("chain", "quasistatic", fixed, links)])
+        if links <= MOST_LINKS_MJX:
+            groups[-1] += [("mjx", "quasistatic", fixed, links), ("mjx", "dynamic", fixed, links)]
     return groups
 
 
@@ -73,6 +76,11 @@ def measure() -> dict[str, Any]:
     """Rates over arms and over links per section; peers; start-up times of training; goals for a GPU."""
     on_gpu = jax.default_backend() == "gpu"
     rows = [row for group in points(on_gpu) for row in _group(group)]
+    without_mjx = [
+        {"engine": "mjx", "links_per_section": links, "skipped": NO_MJX}
+        for links in LINKS
+        if links > MOST_LINKS_MJX
+    ]
     peers = _side_by_side(ArmSpec.default(), on_gpu)
     print("starting: a training process twice, cache empty and filled", flush=True)
     with tempfile.TemporaryDirectory() as cache:
@@ -83,7 +91,8 @@ def measure() -> dict[str, Any]:
         "over_links": sorted(
             (row for row in rows if row["arms"] == (8192 if on_gpu else 128)),
             key=lambda row: (row["engine"], row["mode"], row["links_per_section"]),
-        ),
+        )
+        + without_mjx,
         "side_by_side": peers,
         "notes": NOTES,
         "start": {"cold": starts[0], "cached": starts[1]},
