@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import confined
+from benchmarks.options import numbers
 from benchmarks.paper_stages import (
     SMOKE,
     Settings,
@@ -64,18 +65,11 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--only", choices=PARTS, help="part of the paper: in open space or confined; default: both"
     )
-    parser.add_argument("--twins", type=_numbers, metavar="T,T", help="default: 0,1,2")
-    parser.add_argument("--seeds", type=_numbers, metavar="S,S", help="of training; default: 0,1,2")
+    parser.add_argument("--twins", type=numbers, metavar="T,T", help="default: 0,1,2")
+    parser.add_argument("--seeds", type=numbers, metavar="S,S", help="of training; default: 0,1,2")
     parser.add_argument("--preset", choices=PRESETS, help="of training in open space; default: paper")
     parser.add_argument("--out", type=Path, metavar="DIR", help="working folder; default: runs/paper")
     return parser
-
-
-def _numbers(text: str) -> tuple[int, ...]:
-    parts = text.split(",")
-    if not all(part.isdecimal() for part in parts):
-        raise argparse.ArgumentTypeError(f"got {text!r}, expected integers >= 0 with commas between them")
-    return tuple(sorted({int(part) for part in parts}))
 
 
 def _of(options: argparse.Namespace) -> Settings:

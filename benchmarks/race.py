@@ -27,6 +27,7 @@ from typing import Any, NamedTuple
 
 from benchmarks.common import save, show
 from benchmarks.guard import machine_kind
+from benchmarks.options import numbers
 from benchmarks.peers import PINS, PeerError, peer_python
 from benchmarks.race_contestants import CONTESTANTS
 from benchmarks.race_summary import (
@@ -98,17 +99,10 @@ def _parser() -> argparse.ArgumentParser:
         prog="python -m benchmarks race",
         description="Time and env steps to a tip error, against the peers; an hour and more for each seed.",
     )
-    parser.add_argument("--seeds", type=_numbers, default=(0,), metavar="S,S", help="of training; default: 0")
+    parser.add_argument("--seeds", type=numbers, default=(0,), metavar="S,S", help="of training; default: 0")
     parser.add_argument("--smoke", action="store_true", help="everything, but tiny; says nothing of speed")
     parser.add_argument("--out", type=Path, metavar="DIR", help="working folder; default: runs/race")
     return parser
-
-
-def _numbers(text: str) -> tuple[int, ...]:
-    parts = text.split(",")
-    if not all(part.isdecimal() for part in parts):
-        raise argparse.ArgumentTypeError(f"got {text!r}, expected integers >= 0 with commas between them")
-    return tuple(sorted({int(part) for part in parts}))
 
 
 def claim(folder: Path, settings: Settings) -> None:

@@ -151,9 +151,10 @@ def _stretching(slope: Array, jacobian: Array) -> Array:
 
 
 def _on_diagonal(blocks: Array) -> Array:
-    """The block-diagonal matrix (n m, n m) of blocks (n, m, m)."""
-    n, m, _ = blocks.shape
-    return (jnp.eye(n, dtype=blocks.dtype)[:, None, :, None] * blocks[:, :, None]).reshape(n * m, n * m)
+    """The block-diagonal matrix (n rows, n columns) of blocks (n, rows, columns)."""
+    n, rows, columns = blocks.shape
+    apart = jnp.eye(n, dtype=blocks.dtype)[:, None, :, None] * blocks[:, :, None]
+    return apart.reshape(n * rows, n * columns)
 
 
 def tendons(frames: Frames, site_m: Array) -> Tendons:
@@ -189,8 +190,7 @@ def tendons(frames: Frames, site_m: Array) -> Tendons:
     own = along.reshape(n_sections, per_section, N_CHAMBERS_PER_SECTION, DOFS_PER_LINK)
     rows = jnp.moveaxis(own, 2, 1).reshape(n_sections, N_CHAMBERS_PER_SECTION, -1)
     total = length.reshape(n_sections, per_section, -1).sum(1).reshape(-1)
-    spread = jnp.eye(n_sections, dtype=rows.dtype)[:, None, :, None] * rows[:, :, None]
-    return Tendons(total, spread.reshape(total.shape[0], -1), link_hessian)
+    return Tendons(total, _on_diagonal(rows), link_hessian)
 
 
 def _dot(a: Array, b: Array) -> Array:
