@@ -35,6 +35,7 @@ from train.demonstrations import from_log, read_demonstrations
 from train.demos import add_commands
 from train.evaluate import N_ACTIONS
 from train.expert import ExpertError
+from train.options import add_arm, check_resume_alone
 from train.sweep import add_sweep
 
 if TYPE_CHECKING:
@@ -108,10 +109,7 @@ def _add_run(
     """The options that all runs have."""
     parser.add_argument("--preset", choices=presets, help=f"{more}default: {default}")
     parser.add_argument("--seed", type=int, help="of networks, exploration, goals and batches; default: 0")
-    parser.add_argument("--spec", type=Path, help="TOML file of the arm; default: the paper's arm")
-    parser.add_argument(
-        "--calibration", type=Path, metavar="DIR", help="folder that `python -m calib run` made, for --spec"
-    )
+    add_arm(parser)
     parser.add_argument("--engine", choices=("chain", "mjx"), help="kinematics; default: chain")
     parser.add_argument("--mode", choices=("quasistatic", "dynamic"), help="default: quasistatic")
     parser.add_argument(
@@ -176,8 +174,7 @@ def _mesh(options: argparse.Namespace, console: Console) -> Mesh | None:
 def _resume(options: argparse.Namespace, mesh: Mesh | None, console: Console) -> int:
     from train.run import task_of_run
 
-    if _given(options):
-        raise ConfigError(f"--resume goes alone: the run's own settings hold, got {_given(options)} too")
+    check_resume_alone(options, "run")
     run = Run.open(options.resume)
     return _train(run, task_of_run(run, mesh), console)
 
@@ -213,15 +210,6 @@ def _arm(options: argparse.Namespace, console: Console) -> tuple[ArmSpec, S2R | 
         return spec, load_s2r(file, spec.n_chambers)
     console.print(f"no {file}: training on simulated poses", highlight=False, soft_wrap=True)
     return spec, None
-
-
-def _given(options: argparse.Namespace) -> str:
-    """The options of a new run that the command line has."""
-    given = {
-        name: value for name, value in vars(options).items() if name not in ("command", "resume", "devices")
-    }
-    names = [name for name, value in given.items() if value not in (None, [])]
-    return ", ".join("FILE" if name == "file" else f"--{name}" for name in names)
 
 
 def _evaluate(options: argparse.Namespace, console: Console) -> int:

@@ -15,6 +15,7 @@ from mjx_softarm.s2r import S2R
 from mjx_softarm.spec import ArmSpec
 from train.config import ConfigError
 from train.demonstrations import from_log, read_demonstrations
+from train.options import add_arm
 from train.waypoints import TASKS, task
 
 _STOPPED, _INTERRUPTED = 3, 130
@@ -37,10 +38,7 @@ def add_commands(commands: argparse._SubParsersAction, arm_of: ArmOf) -> None:
     record.add_argument(
         "--keyboard", action="store_true", help="steer by keys, in the task's pipe if one is given"
     )
-    record.add_argument("--spec", type=Path, help="TOML file of the arm; default: the paper's arm")
-    record.add_argument(
-        "--calibration", type=Path, metavar="DIR", help="folder that `python -m calib run` made, for --spec"
-    )
+    add_arm(record)
     record.add_argument("--out", type=Path, required=True, metavar="FILE", help="to write, CSV or npz")
     record.set_defaults(command=lambda options, console: _record(options, console, *arm_of(options, console)))
     check = kinds.add_parser("check", help="what a file has, and what is wrong with it")

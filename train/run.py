@@ -20,7 +20,7 @@ from mjx_softarm.env import ReachEnv
 from mjx_softarm.provenance import write_json
 from train import plots
 from train.checkpoint import Run, RunError
-from train.config import ImitationConfig
+from train.config import ImitationConfig, TrainConfig
 from train.devices import any_process, is_first_process
 from train.job import Job, TrainState
 from train.task import Task, task_of
@@ -147,10 +147,13 @@ def _timed_epoch(job: Job, state: TrainState) -> tuple[TrainState, dict[str, flo
     state, metrics = job.epoch(state)
     row = {name: float(value) for name, value in jax.device_get(metrics).items()}
     seconds = time.perf_counter() - start
-    config = job.config
-    row["speed/env_steps_per_s"] = config.n_arms * config.vector_steps_per_epoch / seconds
-    row["speed/updates_per_s"] = (int(state.agent.step) - updates) / seconds
-    return state, row
+    return state, row | speeds(job.config, int(state.agent.step) - updates, seconds)
+
+
+def speeds(config: TrainConfig, n_updates: int, seconds: float) -> dict[str, float]:
+    """How fast an epoch with so many updates was, as a row of metrics has it."""
+    n_env_steps = config.n_arms * config.vector_steps_per_epoch
+    return {"speed/env_steps_per_s": n_env_steps / seconds, "speed/updates_per_s": n_updates / seconds}
 
 
 def evaluation(task: Task, actor_params: Any) -> dict[str, float]:

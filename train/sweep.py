@@ -13,6 +13,7 @@ from rich.console import Console
 from mjx_softarm.s2r import S2R
 from mjx_softarm.spec import ArmSpec
 from train.config import PRESETS, ConfigError, TrainConfig, override
+from train.options import add_arm, check_resume_alone
 from train.sweep_job import VARIABLE, setting
 
 _WIDTH = 160  # of the table where it is printed elsewhere than to a terminal
@@ -32,10 +33,7 @@ def add_sweep(commands: argparse._SubParsersAction, arm_of: ArmOf) -> None:
         metavar="NAME=VALUE,VALUE,...",
         help="train with each of these values, e.g. tqc.gamma=0.5,0.9; with several, with each combination",
     )
-    sweep.add_argument("--spec", type=Path, help="TOML file of the arm; default: the paper's arm")
-    sweep.add_argument(
-        "--calibration", type=Path, metavar="DIR", help="folder that `python -m calib run` made, for --spec"
-    )
+    add_arm(sweep)
     sweep.add_argument(
         "--set",
         action="append",
@@ -56,7 +54,7 @@ def _sweep(options: argparse.Namespace, console: Console, arm_of: ArmOf) -> int:
     from train.sweep_run import create, open_sweep, train
 
     if options.resume:
-        _goes_alone(options)
+        check_resume_alone(options, "sweep")
         sweep = open_sweep(options.resume)
     else:
         preset = options.preset or "quick"
@@ -75,13 +73,6 @@ def _sweep(options: argparse.Namespace, console: Console, arm_of: ArmOf) -> int:
     for what, name in (("results", RESULTS_FILE), ("picture", CURVES_FILE)):
         console.print(f"{what}: {sweep.path / name}", highlight=False, soft_wrap=True)
     return 0
-
-
-def _goes_alone(options: argparse.Namespace) -> None:
-    names = ("preset", "seeds", "vary", "spec", "calibration", "set", "out")
-    given = ", ".join(f"--{name}" for name in names if getattr(options, name) not in (None, []))
-    if given:
-        raise ConfigError(f"--resume goes alone: the sweep's own settings hold, got {given} too")
 
 
 def members_of(

@@ -26,7 +26,7 @@ from mjx_softarm.spec import ArmSpec
 from train.checkpoint import Run, RunError
 from train.config import TrainConfig
 from train.job import TrainState
-from train.run import Interrupted, asked_to_stop, evaluation, finish, open_board, progress_bar, record
+from train.run import Interrupted, asked_to_stop, evaluation, finish, open_board, progress_bar, record, speeds
 from train.sweep_job import SweepJob, with_env_config
 from train.task import Task, task_of
 
@@ -166,11 +166,8 @@ def _timed_epoch(job: SweepJob, states: TrainState) -> tuple[TrainState, list[di
     updates = int(states.agent.step[0])
     states, metrics = job.epoch(states)
     metrics = jax.device_get(metrics)
-    seconds, config = time.perf_counter() - start, job.config
-    speed = {
-        "speed/env_steps_per_s": config.n_arms * config.vector_steps_per_epoch / seconds,
-        "speed/updates_per_s": (int(states.agent.step[0]) - updates) / seconds,
-    }
+    seconds = time.perf_counter() - start
+    speed = speeds(job.config, int(states.agent.step[0]) - updates, seconds)
     return states, [{name: float(x[k]) for name, x in metrics.items()} | speed for k in range(job.n)]
 
 
