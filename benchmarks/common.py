@@ -16,11 +16,13 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.sharding import Mesh
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 from mjx_softarm.provenance import provenance, write_json
+from train.devices import mesh_of
 
 RESULTS = Path(__file__).parent / "results"
 WIDTH = 160  # of what is printed elsewhere than to a terminal
@@ -41,6 +43,19 @@ def seconds(call: Callable[[], Any], repeats: int = 10) -> float:
 def n_cores() -> int:
     """How many cores this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def mesh_of_cores(n_arms: int) -> Mesh | None:
+    """This process's cores as devices, as many as n arms spread over evenly; call it before JAX is used.
+
+    XLA factorises many small matrices on one core alone, so a CPU that is one device leaves the others idle.
+
+    Returns:
+        None where a single device is meant: on a GPU, or where there is one core or one arm.
+    """
+    jax.config.update("jax_num_cpu_devices", n_cores())
+    n = max(n for n in range(1, n_cores() + 1) if n_arms % n == 0)
+    return mesh_of(str(n)) if jax.default_backend() == "cpu" else None
 
 
 def peak_memory() -> dict[str, int]:

@@ -17,13 +17,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.common import n_cores, peak_memory
+from benchmarks.common import mesh_of_cores, n_cores, peak_memory
 from benchmarks.mujoco_rollout import RolloutArms, sensed_model
 from benchmarks.rounds import Facts, serve
 from benchmarks.throughput_arms import compile_twice, repeats_for
 from benchmarks.truth import settle_function
 from mjx_softarm import xla
 from mjx_softarm.spec import ArmSpec
+from train.devices import split
 
 N_STEPPED = 64
 SET_S = 0.5  # of a round, for each set
@@ -34,12 +35,15 @@ References = dict[str, np.ndarray]
 def newton(
     spec: ArmSpec, engine: str, references: References, cache: str
 ) -> tuple[Facts, Callable[[], Facts]]:
-    """Newton's method: one compiled function for all sets."""
+    """Newton's method: one compiled function for all sets, on all cores."""
+    mesh = mesh_of_cores(len(next(iter(references.values()))))
     xla.enable_compilation_cache(cache)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     batches = {name: jnp.asarray(reference, jnp.float32) for name, reference in references.items()}
+    if mesh is not None:
+        batches = jax.device_put(batches, split(mesh))
     first = next(iter(batches.values()))
-    function, facts = compile_twice(settle_function(spec, engine), first)
+    function, facts = compile_twice(settle_function(spec, engine, mesh=mesh), first)
     repeats = repeats_for(lambda: function(first), SET_S)
 
     def work() -> Facts:

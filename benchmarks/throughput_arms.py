@@ -18,7 +18,7 @@ import numpy as np
 from jax import Array
 from jax.experimental.compilation_cache import compilation_cache
 
-from benchmarks.common import peak_memory
+from benchmarks.common import mesh_of_cores, peak_memory
 from benchmarks.rounds import Facts, serve
 from benchmarks.truth import TOLD
 from mjx_softarm import xla
@@ -61,13 +61,14 @@ def repeats_for(call: Callable[[], Any], round_s: float = ROUND_S) -> int:
 
 def prepare(engine: str, mode: str, n: int, links: int, cache: str) -> tuple[Facts, Callable[[], Facts]]:
     """Compile a rollout of n arms with random actions, which saturate about half of the chambers."""
+    mesh = mesh_of_cores(n)
     spec = ArmSpec.default().replace(structure={"links_per_section": links})
     xla.enable_compilation_cache()  # for the pool of poses, which is not what is measured
     env = ReachEnv(spec, EnvConfig(engine=engine, mode=mode, n_poses=N_POSES))  # type: ignore[arg-type]
     compilation_cache.reset_cache()
     xla.enable_compilation_cache(cache)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    arms = VectorEnv(env, n, EPISODE_LENGTH)
+    arms = VectorEnv(env, n, EPISODE_LENGTH, mesh)
 
     def rollout(state, key):
         def step(state, key):

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
 from mjx_softarm import settle as solver
 from mjx_softarm import xla
@@ -20,6 +21,7 @@ from mjx_softarm.kinematics import chain_frames, mjx_frames
 from mjx_softarm.mjcf import build_model
 from mjx_softarm.spec import ArmSpec
 from mjx_softarm.statics import ArmParams
+from mjx_softarm.wrappers import over_arms
 
 QUANTILES = {"median_mm": 0.5, "p95_mm": 0.95, "max_mm": 1.0}
 ERROR = (*QUANTILES, "without_truth")  # what a table has of it
@@ -34,14 +36,16 @@ class Truth(NamedTuple):
     share_at_limit: float  # of the chambers
 
 
-def settle_function(spec: ArmSpec, engine: str = "chain", dtype: Any = np.float32) -> Callable:
-    """A jitted function: references (n, n_chambers) -> `Settled`."""
+def settle_function(
+    spec: ArmSpec, engine: str = "chain", dtype: Any = np.float32, mesh: Mesh | None = None
+) -> Callable:
+    """A jitted function: references (n, n_chambers) -> `Settled`, spread over the devices of a mesh."""
     params = jax.tree.map(jnp.asarray, ArmParams.from_spec(spec, dtype))
     if engine == "mjx":
         kinematics = functools.partial(mjx_frames, mjx.put_model(build_model(spec)))
     else:
         kinematics = functools.partial(chain_frames, link_length_m=params.link_length_m)
-    return xla.jit(jax.vmap(functools.partial(solver.settle, kinematics, params)), engine == "mjx")
+    return xla.jit(over_arms(functools.partial(solver.settle, kinematics, params), mesh), engine == "mjx")
 
 
 @functools.lru_cache(maxsize=8)

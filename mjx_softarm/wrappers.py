@@ -14,6 +14,19 @@ from mjx_softarm._mjx import State
 from mjx_softarm.env import ReachEnv
 
 
+def over_arms(function: Callable, mesh: Mesh | None = None) -> Callable:
+    """A function of one arm as one of many, by their first axis.
+
+    With a mesh of devices, each does its share of the arms, which must be equal ones, and does not wait for
+    the slowest arm of another.
+    """
+    all_arms = jax.vmap(function)
+    if mesh is None:
+        return all_arms
+    spec = PartitionSpec(mesh.axis_names)
+    return jax.shard_map(all_arms, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
+
+
 class Outcome(NamedTuple):
     """What one action of each arm led to, before any reset."""
 
@@ -27,7 +40,7 @@ class Outcome(NamedTuple):
 class VectorEnv:
     """`n` independent arms; an arm whose episode ended starts a new one, with a new goal.
 
-    With a mesh of devices, each steps its share of the arms, which must be equal ones.
+    With a mesh of devices, each steps its share of the arms; see `over_arms`.
     """
 
     def __init__(self, env: ReachEnv, n: int, episode_length: int, mesh: Mesh | None = None):
@@ -35,7 +48,7 @@ class VectorEnv:
 
     def reset(self, key: Array) -> State:
         """State of n fresh arms."""
-        return self._each(self.env.reset)(jax.random.split(key, self.n))
+        return over_arms(self.env.reset, self.mesh)(jax.random.split(key, self.n))
 
     def step(self, state: State, action: Array, key: Array) -> tuple[State, State, Outcome]:
         """Act once.
@@ -49,7 +62,7 @@ class VectorEnv:
             The state to act on next (reset where an episode ended), the state that the action led to,
             and how the episodes stand.
         """
-        after = self._each(self.env.step)(state, action)
+        after = over_arms(self.env.step, self.mesh)(state, action)
         valid = after.info["valid"]
         terminated = (after.done > 0) & valid
         truncated = (after.pipeline_state.n_steps >= self.episode_length) & ~terminated
@@ -60,11 +73,3 @@ class VectorEnv:
         )
         following = following.replace(metrics=after.metrics)
         return following, after, Outcome(after.obs, after.reward, terminated, truncated, valid)
-
-    def _each(self, function: Callable) -> Callable:
-        """A function of one arm as one of all; a device does not wait for the slowest arm of another."""
-        all_arms = jax.vmap(function)
-        if self.mesh is None:
-            return all_arms
-        spec = PartitionSpec(self.mesh.axis_names)
-        return jax.shard_map(all_arms, mesh=self.mesh, in_specs=spec, out_specs=spec, check_vma=False)

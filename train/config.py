@@ -192,9 +192,9 @@ PRESETS: dict[str, TrainConfig] = {
     "paper": dataclasses.replace(_TUNED, total_env_steps=300_000, updates_per_env_step=0.5),
 }
 
-# The paper's schedules with a fifteenth or an eighth of its steps, which is enough. In the pipe, goals shift to
-# the worst with each fifth of the run. Of the circle's 16 points 8 come first, then all, the environment's own
-# reward beside the learned one, so that points between them stay where they are.
+# The paper's schedules with a fifteenth or an eighth of its steps, which is enough. In the pipe, goals shift
+# to the worst with each fifth of the run. Of the circle's 16 points 8 come first, then all, the environment's
+# own reward beside the learned one, so that points between them stay where they are.
 _PIPE = ImitationConfig(
     total_env_steps=40_000,
     updates_per_env_step=0.2,

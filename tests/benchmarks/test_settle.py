@@ -8,7 +8,7 @@ import jax.scipy.linalg
 import numpy as np
 import pytest
 
-from benchmarks import settle
+from benchmarks import common, settle
 from benchmarks.floor import counted, settle_cost
 from benchmarks.rounds import Worker
 from benchmarks.settle import GOAL_ARMS, REACHES, no_goal, speed_goal, way
@@ -22,6 +22,7 @@ from benchmarks.truth import (
 )
 from mjx_softarm import ArmSpec
 from mjx_softarm import settle as solver
+from train.devices import mesh_of
 
 SPEC = ArmSpec.default()
 SMALL = SPEC.replace(structure={"links_per_section": 2})
@@ -147,6 +148,23 @@ def test_more_iterations_come_closer_and_every_budget_has_its_rate(monkeypatch):
     assert (few["iterations"], many["iterations"]) == (2, 8)
     assert many["median_mm"] < 0.5 < few["max_mm"]
     assert few["solves_per_s"] > 0 and many["solves_per_s"] > 0
+
+
+@pytest.mark.parametrize("n_arms, n_devices", [(1, 1), (8, 2), (9, 3), (10, 2)])
+def test_arms_are_spread_evenly_over_the_cores(n_arms, n_devices, monkeypatch):
+    asked = {}
+    monkeypatch.setattr(common, "n_cores", lambda: 3)
+    monkeypatch.setattr(jax.config, "update", asked.__setitem__)  # JAX runs already
+    mesh = common.mesh_of_cores(n_arms)
+    assert asked == {"jax_num_cpu_devices": 3}
+    assert (1 if mesh is None else mesh.size) == n_devices
+
+
+def test_spread_arms_settle_as_on_one_device():
+    reference = jnp.asarray(random_references(SMALL, 8), jnp.float32)
+    one, spread = (settle_function(SMALL, mesh=mesh)(reference) for mesh in (None, mesh_of("2")))
+    assert len(spread.q.sharding.device_set) == 2
+    np.testing.assert_allclose(spread.q, one.q, atol=1e-5)
 
 
 @pytest.mark.slow
