@@ -22,7 +22,7 @@ from mjx_softarm.kinematics import chain_frames, mjx_frames
 from mjx_softarm.mjcf import build_model
 from mjx_softarm.pipe import CrossPipe, body_clearance
 from mjx_softarm.pose import pose_from_frame
-from mjx_softarm.s2r import S2R, correct
+from mjx_softarm.s2r import S2R, carry_body, correct
 from mjx_softarm.settle import Settled, settle
 from mjx_softarm.spec import ArmSpec
 from mjx_softarm.statics import ArmParams
@@ -102,7 +102,8 @@ class ReachEnv(Env):
     """A soft arm reaching for poses of its workspace.
 
     With a sim-to-real network, every pose that is observed, rewarded or drawn as a goal is the real arm's,
-    P_S2R, as the network tells it from the simulated pose and the spring lengths.
+    P_S2R, as the network tells it from the simulated pose and the spring lengths; so is the body, whose
+    distance to a pipe's wall is measured.
     """
 
     def __init__(self, spec: ArmSpec | None = None, config: EnvConfig | None = None, s2r: S2R | None = None):
@@ -185,7 +186,7 @@ class ReachEnv(Env):
         info = {
             "saturated": jnp.array(False),
             "valid": jnp.array(True),
-            "clearance_mm": self._clearance_mm(start.q),
+            "clearance_mm": self._clearance_mm(start.q, start.pose),
         }
         return State(arm, self.observe(arm.pose, goal), zero, zero, metrics, info)
 
@@ -210,7 +211,7 @@ class ReachEnv(Env):
         tolerance = 1e-3 * self.config.saturation_tolerance_mm
         reading = arm.spring_m + arm.sensor_offset_m
         saturated = control.saturated(arm.pressure_kpa, reference, reading, self.gains, tolerance) & valid
-        clearance_mm = self._clearance_mm(arm.motion.q)
+        clearance_mm = self._clearance_mm(arm.motion.q, arm.pose)
         value, reached, terms = rewards.reward(
             arm.pose,
             arm.goal,
@@ -263,12 +264,15 @@ class ReachEnv(Env):
         within_mm = jnp.maximum(self.config.clearance_margin_mm - clearance_mm, 0.0)
         return self.config.clearance_cost_per_mm * within_mm
 
-    def _clearance_mm(self, q: Array) -> Array:
-        """Of the body to the pipe's wall, (); infinite without a pipe."""
+    def _clearance_mm(self, q: Array, pose: Array) -> Array:
+        """Of the body, whose tip has this pose, to the pipe's wall, (); infinite without a pipe."""
         if self.pipe is None:
             return jnp.asarray(jnp.inf, q.dtype)
         frames = chain_frames(q, self.params.link_length_m)
-        return 1e3 * body_clearance(self.pipe, frames.plate_position, frames.plate_rotation, self.spec)
+        plates = frames.plate_position, frames.plate_rotation
+        if self.s2r is not None:
+            plates = carry_body(*plates, pose)
+        return 1e3 * body_clearance(self.pipe, *plates, self.spec)
 
     def observe(self, pose: Array, goal: Array) -> Array:
         """The observation (..., 18) of a pose and a goal (..., 6) [mm, deg]."""

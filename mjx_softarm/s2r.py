@@ -115,6 +115,29 @@ def correction_between(pose: Any, real_pose: Any) -> Any:
     return xp.concat([1000.0 * (end_m - start_m), gibbs], axis=-1)
 
 
+def carry_body(plate_position: Any, plate_rotation: Any, real_pose: Any) -> tuple[Any, Any]:
+    """Plates of the real arm, where the network knows of its tip alone.
+
+    What puts the real tip elsewhere, a base that is askew above all, moves a plate the more the further down
+    it is. So each plate is moved by its share of the tip's way, in proportion to its place along the arm, and
+    keeps its direction; the last one is the real tip's.
+
+    Args:
+        plate_position (..., L + 1, 3) [m]: simulated, as in `mjx_softarm.kinematics.Frames`.
+        plate_rotation (..., L + 1, 3, 3): likewise.
+        real_pose (..., 6) [mm, deg]: of the tip, from `correct`.
+
+    Returns:
+        The same of the real arm.
+    """
+    xp = array_namespace(plate_position, real_pose)
+    tip_m, rotation = frame_from_pose(real_pose)
+    share = xp.linspace(0.0, 1.0, plate_position.shape[-2], dtype=plate_position.dtype)
+    way_m = tip_m - plate_position[..., -1, :]
+    moved = plate_position + share[:, None] * way_m[..., None, :]
+    return moved, xp.concat([plate_rotation[..., :-1, :, :], rotation[..., None, :, :]], axis=-3)
+
+
 def _normalised(s2r: S2R, x: Any) -> Any:
     return 2.0 * (x - s2r.input_low) / (s2r.input_high - s2r.input_low) - 1.0
 

@@ -14,6 +14,7 @@ from mjx_softarm.pose import frame_from_pose, pose_from_frame
 from mjx_softarm.s2r import (
     S2R,
     apply_correction,
+    carry_body,
     correct,
     correction_between,
     extrapolation,
@@ -177,3 +178,15 @@ def test_a_bad_network_is_not_written(tmp_path):
     with pytest.raises(SealedFileError, match="limit"):
         save_s2r(path, network()._replace(limit=np.float32(np.nan)))
     assert not path.exists()
+
+
+def test_a_base_that_is_askew_moves_each_plate_by_its_share_of_the_tip_s_way():
+    n = 7
+    position = np.stack([np.zeros(n), np.zeros(n), -0.1 * np.arange(n)], axis=-1)
+    tilt = np.radians(2.0)
+    turn = np.array([[1.0, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]])
+    tip = pose_from_frame(turn @ position[-1], turn)
+    moved, rotation = carry_body(position, np.tile(np.eye(3), (n, 1, 1)), tip)
+    np.testing.assert_allclose(moved, position @ turn.T, atol=1e-9)
+    np.testing.assert_allclose(rotation[-1], turn, atol=1e-9)
+    np.testing.assert_array_equal(rotation[:-1], np.tile(np.eye(3), (n - 1, 1, 1)))

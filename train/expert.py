@@ -8,7 +8,8 @@ before, and postures of a random pool that are near and clear. Of the ends that 
 preferred whose straight way in pressures from the posture before is clear, and of these the nearest one.
 Where none keeps them with the gripper as it is asked to hang, it may hang a little otherwise.
 
-Poses are the real arm's, P_S2R, where there is a sim-to-real network; the body is that of the simulated arm.
+Poses are the real arm's, P_S2R, where there is a sim-to-real network, and so is the body, as far as the
+network tells; see `carry_body`.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from mjx_softarm.kinematics import chain_frames
 from mjx_softarm.pipe import CrossPipe, body_points, clearance
 from mjx_softarm.pose import frame_from_pose, pose_from_frame
 from mjx_softarm.rest import rest, statics_at
-from mjx_softarm.s2r import S2R, correct
+from mjx_softarm.s2r import S2R, carry_body, correct
 from mjx_softarm.settle import RESIDUAL_TOLERANCE
 from mjx_softarm.spec import ArmSpec
 from mjx_softarm.statics import ArmParams
@@ -227,11 +228,13 @@ def _posture(pressure_kpa: Array, params: ArmParams, s2r: S2R | None, spec: ArmS
         q = rest(params, pressure_kpa)
         frames = chain_frames(q, params.link_length_m)
         now = statics_at(q, params, pressure_kpa)
-        pose = pose_from_frame(frames.plate_position[-1], frames.plate_rotation[-1])
+        plates = frames.plate_position, frames.plate_rotation
+        pose = pose_from_frame(plates[0][-1], plates[1][-1])
         if s2r is not None:
             pose = correct(s2r, pose, now.springs.length)
+            plates = carry_body(*plates, pose)
         position_m, rotation = frame_from_pose(pose)
-        points = body_points(frames.plate_position, frames.plate_rotation, spec)
+        points = body_points(*plates, spec)
     wall_m = jnp.full(1, _NO_WALL_M) if pipe is None else clearance(pipe, points)
     return Posture(
         pressure_kpa=pressure_kpa,
