@@ -11,6 +11,9 @@ import pytest
 from mjx_softarm import ArmSpec, xla
 from mjx_softarm._mjx import State
 from mjx_softarm.env import PAYLOAD, EnvConfig, Randomisation, ReachEnv
+from mjx_softarm.kinematics import chain_frames
+from mjx_softarm.pipe import CrossPipe, body_clearance
+from mjx_softarm.pose import frame_from_pose
 from mjx_softarm.s2r import S2R
 from mjx_softarm.statics import ArmParams
 
@@ -44,8 +47,8 @@ def types(state):
 
 
 def test_with_a_network_every_pose_is_the_real_one_and_the_arm_underneath_the_same():
-    """A network that looks at a spring: poses of reset, step, pool and reward are corrected."""
-    config = EnvConfig(n_poses=64, randomisation=Randomisation(sensor_noise_mm=2.0))
+    """A network that looks at a spring: poses of reset, step, pool and reward are corrected, and the body."""
+    config = EnvConfig(n_poses=64, randomisation=Randomisation(sensor_noise_mm=2.0), pipe_diameter_mm=300.0)
     n_springs = SHORT_ARM.n_chambers
     weight = np.zeros((9 + n_springs, 6), np.float32)
     weight[9, 0] = 30.0  # mm for half the range of the first spring
@@ -75,6 +78,13 @@ def test_with_a_network_every_pose_is_the_real_one_and_the_arm_underneath_the_sa
         np.testing.assert_allclose(seen.pose[:, 1] - arm.pose[:, 1], -4.0, atol=0.01)
         assert np.abs(seen.pose[:, 3:] - arm.pose[:, 3:]).max() > 1.0
         np.testing.assert_allclose(other.obs, real.observe(seen.pose, seen.goal), atol=1e-5)
+        frames = jax.vmap(lambda q: chain_frames(q, SHORT_ARM.link_length_m))(arm.motion.q)
+        share = jnp.array([0.0, 0.5, 1.0])[:, None]  # base, between the two links, tip
+        plates_m = frames.plate_position + share * MM * (seen.pose - arm.pose)[:, None, :3]
+        rotation = frames.plate_rotation.at[:, -1].set(frame_from_pose(seen.pose)[1])
+        wall_m = body_clearance(CrossPipe.of_mm(300.0), plates_m, rotation, SHORT_ARM)
+        np.testing.assert_allclose(other.info["clearance_mm"], wall_m / MM, atol=0.02)
+        assert np.abs(other.info["clearance_mm"] - one.info["clearance_mm"]).max() > 1.0
     shift_mm = 30.0 * (plain.pool.spring_m[:, 0] - 0.2) / 0.15
     np.testing.assert_allclose(real.pool.pose[:, 0] - plain.pool.pose[:, 0], shift_mm, atol=0.01)
     goal = ends[1].pipeline_state.goal
