@@ -51,7 +51,7 @@ def mesh_of_cores(n_arms: int) -> Mesh | None:
     XLA factorises many small matrices on one core alone, so a CPU that is one device leaves the others idle.
 
     Returns:
-        None where a single device is meant: on a GPU, or where there is one core or one arm.
+        None where a single device is meant: on a GPU, or where the arms cannot be spread evenly.
     """
     jax.config.update("jax_num_cpu_devices", n_cores())
     n = max(n for n in range(1, n_cores() + 1) if n_arms % n == 0)

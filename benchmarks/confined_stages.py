@@ -4,8 +4,8 @@
     KIND-twinT-seedS/                   learned from them; see `KINDS`
     results/KIND-twinT-seedS-OBJECTS.npz   the policy on the twin, in its pipe, with things to pick and place
 
-Calibrations and the policies that know no demonstrations are those of the open-space experiments. A job whose
-result is there is not done again.
+Calibrations and the policies that know no demonstrations are those of the open-space experiments, where both
+are done in one folder. A job whose result is there is not done again.
 """
 
 from __future__ import annotations

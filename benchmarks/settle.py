@@ -2,8 +2,9 @@
 
 Newton's method with MJX kinematics, the same with the closed-form chain, and C MuJoCo stepped in time under
 the law, over links per section and over shares of saturated chambers. Each way is a process of its own, and
-they take turns round by round; one that fails has a row that says why. MJX is left out where it compiles for
-too long. Errors are those of the tip against the solution in double precision, which
+they take turns round by round, on all cores; one that fails has a row that says why. The rates over a fixed
+number of iterations and the floor are those of one device, which is one core of a CPU. MJX is left out where
+it compiles for too long. Errors are those of the tip against the solution in double precision, which
 `tests/test_settle.py` holds against C MuJoCo stepped to rest.
 """
 

@@ -118,9 +118,10 @@ def correction_between(pose: Any, real_pose: Any) -> Any:
 def carry_body(plate_position: Any, plate_rotation: Any, real_pose: Any) -> tuple[Any, Any]:
     """Plates of the real arm, where the network knows of its tip alone.
 
-    What puts the real tip elsewhere, a base that is askew above all, moves a plate the more the further down
-    it is. So each plate is moved by its share of the tip's way, in proportion to its place along the arm, and
-    keeps its direction; the last one is the real tip's.
+    An approximation: a base that is askew, which puts the real tip elsewhere most, moves a plate the more the
+    further down it is. So each plate is moved by its share of the tip's way, in proportion to its place along
+    the arm, and keeps its direction; the last one is the real tip's. A base that stands off, which moves all
+    plates alike, is not made up for at the base.
 
     Args:
         plate_position (..., L + 1, 3) [m]: simulated, as in `mjx_softarm.kinematics.Frames`.

@@ -150,14 +150,19 @@ def test_more_iterations_come_closer_and_every_budget_has_its_rate(monkeypatch):
     assert few["solves_per_s"] > 0 and many["solves_per_s"] > 0
 
 
-@pytest.mark.parametrize("n_arms, n_devices", [(1, 1), (8, 2), (9, 3), (10, 2)])
-def test_arms_are_spread_evenly_over_the_cores(n_arms, n_devices, monkeypatch):
+@pytest.mark.parametrize(
+    "n_arms, backend, n_devices",
+    [(1, "cpu", 1), (7, "cpu", 1), (8, "cpu", 2), (9, "cpu", 3), (10, "cpu", 2), (9, "gpu", 1)],
+)
+def test_arms_are_spread_evenly_over_the_cores(n_arms, backend, n_devices, monkeypatch):
     asked = {}
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    monkeypatch.setattr(common, "mesh_of", lambda devices: mock.Mock(size=int(devices)))
     monkeypatch.setattr(common, "n_cores", lambda: 3)
     monkeypatch.setattr(jax.config, "update", asked.__setitem__)  # JAX runs already
     mesh = common.mesh_of_cores(n_arms)
     assert asked == {"jax_num_cpu_devices": 3}
-    assert (1 if mesh is None else mesh.size) == n_devices
+    assert n_devices == (1 if mesh is None else mesh.size)
 
 
 def test_spread_arms_settle_as_on_one_device():

@@ -130,6 +130,7 @@ def test_gripper_that_cannot_hang_as_asked_hangs_a_little_otherwise(expert, spec
     np.testing.assert_allclose(found.finger_m, finger_m, atol=5e-4)
     low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
     assert np.minimum(found.pressure_kpa - low, high - found.pressure_kpa).min() >= LIMIT_SHARE * MARGIN_KPA
+    assert found.clearance_m >= LIMIT_SHARE * MARGIN_M
 
 
 def test_tasks_have_the_papers_positions(spec):
