@@ -591,7 +591,7 @@ def test_stage_ends_come_from_the_runs_config(tmp_path):
         save_operated(trial_file(tmp_path, trial), made_up(trial.kind))
     save_followed(result_file(tmp_path, circles(settings)[0]), followed(1.0))
     found = load_results(tmp_path, settings)
-    assert found.learned["circle", 0, 0].stage_ends == (10,)  # 30 epochs, a third of them first
+    assert found.learned["circle", 0, 0].stage_ends == (7,)  # 20 epochs, a third of them first
     assert found.learned["pipe", 0, 0].stage_ends == ()
     assert [row["epoch"] for row in found.learned["pipe", 0, 0].rows] == [1, 2]
 
