@@ -1,4 +1,4 @@
-"""Worker of the throughput benchmark: many arms in one compiled rollout, as training steps them, on all cores.
+"""Worker of the throughput benchmark: many arms in one compiled rollout on all cores, as training steps them.
 
     python -m benchmarks.throughput_arms ENGINE MODE N_ARMS LINKS_PER_SECTION CACHE
 
