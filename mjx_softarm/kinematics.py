@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from mjx_softarm._mjx import mjx
+from mjx_softarm.chain_hessian import product
 
 DOFS_PER_LINK = 3
 
@@ -37,7 +38,7 @@ def chain_frames(q: Array, link_length_m: Array | float) -> Frames:
     """
     slide, bend_x, bend_y = jnp.moveaxis(q.reshape(-1, DOFS_PER_LINK), -1, 0)  # (L,) each
     local = _rotation_xy(bend_x, bend_y)  # (L, 3, 3)
-    rotation = jax.lax.associative_scan(_product, local)  # (L, 3, 3)
+    rotation = jax.lax.associative_scan(product, local)  # (L, 3, 3)
     plate_rotation = jnp.concatenate([jnp.eye(3, dtype=q.dtype)[None], rotation])
     parent, child = plate_rotation[:-1], plate_rotation[1:]
     half = 0.5 * link_length_m
@@ -56,11 +57,6 @@ def _rotation_xy(x: Array, y: Array) -> Array:
     zero = jnp.zeros_like(x)
     rows = [[cy, zero, sy], [sx * sy, cx, -sx * cy], [-cx * sy, sx, cx * cy]]
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
-
-
-def _product(a: Array, b: Array) -> Array:
-    """a b of small matrices (..., 3, 3), as sums: a matrix product is slow for many tiny ones."""
-    return jnp.sum(a[..., :, :, None] * b[..., None, :, :], axis=-2)
 
 
 def mjx_frames(model: mjx.Model, q: Array) -> Frames:

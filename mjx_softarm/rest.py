@@ -46,7 +46,7 @@ def _rest_jvp(primals, tangents):
     def gradient(params: ArmParams, pressure: Array) -> Array:
         return statics_at(q, params, pressure).gradient
 
-    factor = jax.scipy.linalg.cho_factor(statics_at(q, params, pressure).hessian, lower=True)
+    factor = jax.scipy.linalg.cho_factor(statics_at(q, params, pressure).hessian.dense(), lower=True)
     _, change = jax.jvp(gradient, primals, tangents)
     return q, -jax.scipy.linalg.cho_solve(factor, change)
 

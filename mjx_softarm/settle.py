@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from mjx_softarm.chain_hessian import block_diagonal, eliminate, product
 from mjx_softarm.kinematics import DOFS_PER_LINK, Frames
 from mjx_softarm.statics import ArmParams, statics
 
@@ -104,16 +105,18 @@ def _newton_step(it: _Iterate, kinematics, params: ArmParams, reference_m: Array
     now = statics(kinematics(it.q), it.q, it.pressure, params)
     error = reference_m - now.springs.length
     at_limit, limit = _active_set(it.pressure, error, params)
-    push = (now.chambers.jacobian * now.area[:, None]).T  # (nv, n) force per kPa
-    hessian = now.hessian + jnp.diag(it.stiffening * params.joint_stiffness)
-    factor = jax.scipy.linalg.cho_factor(hessian, lower=True)
-    solved = jax.scipy.linalg.cho_solve(factor, jnp.column_stack([now.gradient, push]))
-    fall, gain = solved[:, 0], solved[:, 1:]  # dq = gain dp - fall
-    track = now.springs.jacobian @ gain  # (n, n) spring lengths per kPa
-    rows = jnp.where(at_limit[:, None], jnp.eye(track.shape[0], dtype=track.dtype), track)
-    wanted = jnp.where(at_limit, limit - it.pressure, error + now.springs.jacobian @ fall)
-    dp = jnp.linalg.solve(rows, wanted)
-    dq = gain @ dp - fall
+    hessian = now.hessian.plus_diagonal(it.stiffening * params.joint_stiffness)
+    n_sections, n_chambers = params.n_sections, reference_m.shape[0]
+    push = now.chambers.jacobian * now.area.reshape(n_sections, -1, 1)  # force per kPa
+    columns = block_diagonal(jnp.swapaxes(push, 1, 2)).reshape(n_sections, -1, n_chambers)
+    solved = hessian.solve(jnp.concatenate([now.gradient.reshape(n_sections, -1, 1), columns], axis=-1))
+    fall, gain = solved[..., 0], solved[..., 1:]  # dq = gain dp - fall
+    moved = product(now.springs.jacobian, solved).reshape(n_chambers, -1)
+    track = moved[:, 1:]  # (n, n) spring lengths per kPa
+    rows = jnp.where(at_limit[:, None], jnp.eye(n_chambers, dtype=track.dtype), track)
+    wanted = jnp.where(at_limit, limit - it.pressure, error + moved[:, 0])
+    dp = eliminate(rows, wanted[:, None])[:, 0]
+    dq = (jnp.sum(gain * dp, axis=-1) - fall).reshape(-1)
     largest = jnp.max(jnp.abs(dq))
     scale = jnp.minimum(1.0, MAX_STEP / largest)
     same = jnp.all(at_limit == it.at_limit)

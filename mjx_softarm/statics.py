@@ -6,7 +6,7 @@ At given pressures p the arm is conservative. With l the chamber lengths and s t
 
 where W' = area_m2 + area_slope_m (l - l_rest) is a chamber's effective area, so that p W is the work of
 its air. A tendon runs from ring to ring, so the piece of it inside a link depends on that link's
-three joints alone; only gravity couples distant links.
+three joints alone, and its length on those of its section; only gravity couples different sections.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from mjx_softarm.chain_hessian import ChainHessian, block_diagonal, product
 from mjx_softarm.kinematics import DOFS_PER_LINK, Frames
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
 
@@ -85,18 +86,18 @@ class ArmParams(NamedTuple):
 
 
 class Tendons(NamedTuple):
-    """Lengths of a set of tendons with their first and second derivatives."""
+    """Lengths of a set of tendons with their first and second derivatives, by the joints they depend on."""
 
     length: Array  # (n_chambers,) [m]
-    jacobian: Array  # (n_chambers, nv)
-    link_hessian: Array  # (n_links, 3 tendons, 3 dofs, 3 dofs)
+    jacobian: Array  # (n_sections, 3 tendons, n) by the n joints of the tendons' section
+    link_hessian: Array  # (n_links, 3 tendons, 3 dofs, 3 dofs) by the joints of a link
 
 
 class Statics(NamedTuple):
     """The potential's derivatives at given joint coordinates and pressures."""
 
     gradient: Array  # (nv,) [N, N m]
-    hessian: Array  # (nv, nv)
+    hessian: ChainHessian
     chambers: Tendons
     springs: Tendons
     area: Array  # (n_chambers,) [N/kPa] effective areas at these lengths
@@ -120,41 +121,36 @@ def statics(frames: Frames, q: Array, pressure_kpa: Array, params: ArmParams) ->
             params.chamber_stiffness * (chambers.length - params.chamber_rest_m) - area * pressure_kpa,
             params.spring_stiffness * (springs.length - params.spring_rest_m),
         ]
-    )  # (2, n_chambers)
-    slope = jnp.stack([params.chamber_stiffness - params.area_slope * pressure_kpa, params.spring_stiffness])
-    weight, weight_hessian = _gravity(frames, params)
-    gradient = weight + params.joint_stiffness * q + jnp.einsum("kt,ktj->j", tension, both.jacobian)
-    hessian = (
-        weight_hessian
-        + jnp.diag(params.joint_stiffness)
-        + _bending(tension, both.link_hessian)
-        + _stretching(slope, both.jacobian)
-    )
+    ).reshape(2, params.n_sections, N_CHAMBERS_PER_SECTION)
+    slope = jnp.stack(
+        [params.chamber_stiffness - params.area_slope * pressure_kpa, params.spring_stiffness]
+    ).reshape(tension.shape)
+    weight, hessian = _gravity(frames, params)
+    pull = jnp.sum(tension[..., None] * both.jacobian, axis=(0, 2))  # (n_sections, n)
+    gradient = weight + params.joint_stiffness * q + pull.reshape(-1)
+    own = hessian.own + _bending(tension, both.link_hessian) + _stretching(slope, both.jacobian)
+    hessian = hessian._replace(own=own).plus_diagonal(params.joint_stiffness)
     return Statics(gradient, hessian, chambers, springs, area)
 
 
 def _bending(tension: Array, link_hessian: Array) -> Array:
-    """Tensions (2, n_chambers) times the second derivatives of the lengths: (nv, nv), link by link."""
-    n_links = link_hessian.shape[1]
-    per_section = n_links * N_CHAMBERS_PER_SECTION // tension.shape[1]
-    per_link = jnp.repeat(tension.reshape(2, -1, N_CHAMBERS_PER_SECTION), per_section, axis=1)
-    return _on_diagonal(jnp.sum(per_link[..., None, None] * link_hessian, axis=(0, 2)))
+    """Tensions (2, n_sections, 3) times the second derivatives of the lengths: (n_sections, n, n)."""
+    n_sections = tension.shape[1]
+    per_section = link_hessian.shape[1] // n_sections
+    per_link = jnp.repeat(tension, per_section, axis=1)
+    links = jnp.sum(per_link[..., None, None] * link_hessian, axis=(0, 2))
+    return jax.vmap(block_diagonal)(links.reshape(n_sections, per_section, *links.shape[1:]))
 
 
 def _stretching(slope: Array, jacobian: Array) -> Array:
-    """sum_t slope_t dl_t dl_t^T for slopes (2, n_chambers), (nv, nv): section by section, as tendons are."""
-    n_sections = slope.shape[1] // N_CHAMBERS_PER_SECTION
-    rows = jacobian.reshape(2, n_sections, N_CHAMBERS_PER_SECTION, n_sections, -1)
-    own = jnp.einsum("kstsi->skti", rows)
-    per_section = jnp.swapaxes(slope.reshape(2, n_sections, N_CHAMBERS_PER_SECTION), 0, 1)
-    return _on_diagonal(jnp.einsum("skti,sktj->sij", per_section[..., None] * own, own))
+    """sum_t slope_t dl_t dl_t^T over the tendons of each section: (n_sections, n, n).
 
-
-def _on_diagonal(blocks: Array) -> Array:
-    """The block-diagonal matrix (n rows, n columns) of blocks (n, rows, columns)."""
-    n, rows, columns = blocks.shape
-    apart = jnp.eye(n, dtype=blocks.dtype)[:, None, :, None] * blocks[:, :, None]
-    return apart.reshape(n * rows, n * columns)
+    Args:
+        slope (2, n_sections, 3): of the tensions by the lengths.
+        jacobian (2, n_sections, 3, n): of the lengths.
+    """
+    rows, scaled = (jnp.concatenate(list(x), axis=1) for x in (jacobian, slope[..., None] * jacobian))
+    return product(jnp.swapaxes(rows, 1, 2), scaled)
 
 
 def tendons(frames: Frames, site_m: Array) -> Tendons:
@@ -190,7 +186,7 @@ def tendons(frames: Frames, site_m: Array) -> Tendons:
     own = along.reshape(n_sections, per_section, N_CHAMBERS_PER_SECTION, DOFS_PER_LINK)
     rows = jnp.moveaxis(own, 2, 1).reshape(n_sections, N_CHAMBERS_PER_SECTION, -1)
     total = length.reshape(n_sections, per_section, -1).sum(1).reshape(-1)
-    return Tendons(total, _on_diagonal(rows), link_hessian)
+    return Tendons(total, rows, link_hessian)
 
 
 def _dot(a: Array, b: Array) -> Array:
@@ -198,8 +194,8 @@ def _dot(a: Array, b: Array) -> Array:
     return jnp.sum(a * b, axis=-1)
 
 
-def _gravity(frames: Frames, params: ArmParams) -> tuple[Array, Array]:
-    """Gradient (nv,) and Hessian (nv, nv) of the weights' potential.
+def _gravity(frames: Frames, params: ArmParams) -> tuple[Array, ChainHessian]:
+    """Gradient (nv,) and Hessian of the weights' potential.
 
     With M and c the mass and the centre of mass of all that hangs on a joint, and w = M a for a slide,
     w = M a x (c - o) for a hinge: the gradient is g w_z; the second derivative by an earlier hinge i and
@@ -211,8 +207,11 @@ def _gravity(frames: Frames, params: ArmParams) -> tuple[Array, Array]:
     mass = jnp.flip(jnp.cumsum(jnp.flip(params.link_mass_kg))) + jnp.sum(params.tool_mass_kg)  # (L,)
     hung = moment - mass[:, None] * frames.anchor
     turn = jnp.cross(frames.axis[:, 1:], hung[:, None])
-    w = jnp.concatenate([mass[:, None, None] * frames.axis[:, :1], turn], axis=1).reshape(-1, 3)
-    axis = frames.axis.at[:, 0].set(0.0).reshape(-1, 3)  # a slide turns nothing
-    upper = jnp.triu(axis[:, :1] * w[:, 1] - axis[:, 1:2] * w[:, 0])
-    hessian = upper + jnp.triu(upper, 1).T
-    return GRAVITY_M_S2 * w[:, 2], GRAVITY_M_S2 * hessian
+    w = jnp.concatenate([mass[:, None, None] * frames.axis[:, :1], turn], axis=1)  # (L, 3 dofs, 3)
+    w = GRAVITY_M_S2 * w.reshape(params.n_sections, -1, 3)
+    axis = frames.axis.at[:, 0].set(0.0).reshape(w.shape)  # a slide turns nothing
+    above = jnp.stack([axis[..., 0], -axis[..., 1]], axis=-1)
+    below = jnp.stack([w[..., 1], w[..., 0]], axis=-1)
+    upper = jnp.triu(product(above, jnp.swapaxes(below, 1, 2)))
+    within = upper + jnp.swapaxes(jnp.triu(upper, 1), 1, 2)
+    return w[..., 2].reshape(-1), ChainHessian(within, above, below)

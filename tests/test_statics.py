@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from scipy import sparse
+from scipy import linalg, sparse
 
 from mjx_softarm import ArmSpec, xla
 from mjx_softarm.kinematics import chain_frames
@@ -56,14 +56,16 @@ def random_state(spec, seed, bend_rad=0.5):
 
 @jax.jit
 def _statics(q, pressure_kpa, params):
-    return statics(chain_frames(q, params.link_length_m), q, pressure_kpa, params)
+    found = statics(chain_frames(q, params.link_length_m), q, pressure_kpa, params)
+    return found, found.hessian.dense()
 
 
 def solved(spec, q, pressure_kpa, dtype=np.float64):
-    """`statics` of one arm, as NumPy arrays."""
+    """`statics` of one arm, as NumPy arrays, the Hessian a plain matrix."""
     params = ArmParams.from_spec(spec, dtype)
     with jax.enable_x64(dtype == np.float64):
-        return jax.device_get(_statics(dtype(q), dtype(pressure_kpa), params))
+        found, hessian = jax.device_get(_statics(dtype(q), dtype(pressure_kpa), params))
+    return found._replace(hessian=hessian)
 
 
 @functools.cache
@@ -125,7 +127,7 @@ def test_tendon_lengths_and_jacobians_are_c_mujoco_s(structure):
         found = solved(spec, q, pressure)
         for k, lines in enumerate((found.chambers, found.springs)):
             np.testing.assert_allclose(lines.length, data.ten_length[k::2], atol=1e-12)
-            np.testing.assert_allclose(lines.jacobian, jacobian[k::2], atol=1e-12)
+            np.testing.assert_allclose(linalg.block_diag(*lines.jacobian), jacobian[k::2], atol=1e-12)
 
 
 def test_the_effective_area_is_c_mujoco_s_force_per_pressure():
