@@ -1,8 +1,9 @@
 """Floor against measured: the least time that the arithmetic of a settle could take, and the time it takes.
 
-Operations and bytes are XLA's own count of the compiled function. It knows nothing of LAPACK or cuSOLVER, so
-their work is added from formulas. A loop it counts once, so one turn of the loop and what stands outside are
-counted apart, and the turns are those of the slowest arm of the batch, since all arms go through them. What
+Operations and bytes are XLA's own count of the compiled function. A loop it counts once. The one over Newton's
+steps is taken out: one turn of it and what stands outside are counted apart, and the turns are those of the
+slowest arm of the batch, since all arms go through them. To those that are left, the eliminations, the turns
+beyond the first are added: each multiplies, subtracts, reads and writes every number of the matrices once. What
 the device can do is measured, too: a large product of matrices and a large copy. The bytes are those of every
 operation's operands, as if no cache held them. Where the time of a call hardly grows with the arms, it is the
 number of kernels that costs, not their work.
@@ -26,11 +27,6 @@ from mjx_softarm.spec import ArmSpec
 
 MATRIX = {"cpu": 2048, "gpu": 8192}  # rows of the product
 COPIED, N_COPIES = {"cpu": 2**24, "gpu": 2**28}, 8  # numbers
-LIBRARY = {  # as in the names of custom calls: LAPACK, cuBLAS, cuSOLVER
-    "cholesky": ("potrf", "cusolver$cholesky"),
-    "triangular_solve": ("trsm", "triangularSolve"),
-    "lu": ("getrf",),
-}
 
 
 def device_rates() -> dict[str, float]:
@@ -54,20 +50,10 @@ class Cost(NamedTuple):
 
 
 def counted(function: Callable, compiled: Any, *arguments: Any) -> Cost:
-    """Operations and bytes of a jitted function that was compiled, the body of a loop once.
-
-    Raises:
-        RuntimeError: it factorises or solves by a library that is not known here, or by none.
-    """
-    cost, text, library = compiled.cost_analysis(), compiled.as_text(), 0.0
-    for name, flop in _linear_algebra(jax.make_jaxpr(function)(*arguments).jaxpr):
-        if not any(called in text for called in LIBRARY[name]):
-            raise RuntimeError(
-                f"{name}: expected a call of {' or '.join(LIBRARY[name])} in the compiled function, none is; "
-                "so nobody knows whether its operations are counted"
-            )
-        library += flop
-    return Cost(cost["flops"] + library, cost["bytes accessed"])
+    """Operations and bytes of a jitted function that was compiled, with all turns of its eliminations."""
+    cost = compiled.cost_analysis()
+    carried = sum(_carried_again(jax.make_jaxpr(function)(*arguments).jaxpr))
+    return Cost(cost["flops"] + 2 * carried, cost["bytes accessed"] + 8 * carried)
 
 
 def settle_cost(spec: ArmSpec, reference_m: Array) -> tuple[Cost, Cost, int]:
@@ -96,22 +82,17 @@ def _turns(n: int, condition: Callable, body: Callable, state: Any) -> Any:
     return state
 
 
-def _linear_algebra(jaxpr: Any) -> Iterator[tuple[str, float]]:
-    """Name and operations of each factorisation and triangular solve, however deep inside."""
+def _carried_again(jaxpr: Any) -> Iterator[int]:
+    """How many numbers each counted loop, however deep inside, carries through its turns but the first."""
     for equation in jaxpr.eqns:
-        name, shape = equation.primitive.name, equation.invars[0].aval.shape if equation.invars else ()
-        if name in LIBRARY:
-            n, batch = shape[-1], int(np.prod(shape[:-2]))
-            per = {"cholesky": n**3 / 3, "lu": 2 * n**3 / 3, "triangular_solve": n**2}[name]
-            columns = equation.invars[1].aval.shape[-1] if name == "triangular_solve" else 1
-            yield name, batch * per * columns
+        if equation.primitive.name == "scan":
+            sizes = [int(np.prod(result.aval.shape)) for result in equation.outvars]
+            yield (equation.params["length"] - 1) * sum(sizes)
         for parameter in equation.params.values():
-            if hasattr(parameter, "transpose_solve"):  # of a linear solve, whose other parts are derivatives
-                parameter = parameter.solve
             for part in parameter if isinstance(parameter, tuple | list) else (parameter,):
                 inner = getattr(part, "jaxpr", part)
                 if hasattr(inner, "eqns"):
-                    yield from _linear_algebra(inner)
+                    yield from _carried_again(inner)
 
 
 def floor_rows(spec: ArmSpec, arms: Sequence[int]) -> list[dict[str, Any]]:
