@@ -5,8 +5,8 @@
 NAME is one of `CONTESTANTS`. Ours is the loop of `python -m train reach` without its files, with the preset
 quick or paper. The peers train on the project's Gymnasium environment as their users would, through `learn`:
 with the defaults of their algorithm and one arm, or tuned as ours-quick is wherever they have a knob for it.
-They have none for the temperature's own learning rate. Our learning rate falls along a half cosine over
-40,000 env steps; theirs does so too, and begins anew each time.
+They have none for the temperature's own learning rate. Our learning rate falls along a half cosine over the
+preset's env steps; theirs does so too, and begins anew each time.
 
 Hindsight: ours only. The peers' wants observations as a dictionary, and those of the Gymnasium wrapper are
 flat. So ours-plain goes without it, too: no goal is exchanged and no action, the rest is as in ours-quick. It
@@ -32,7 +32,6 @@ from benchmarks.rounds import Facts, serve
 
 START = time.perf_counter()
 
-EPOCH_STEPS = 8  # actions of each arm in an epoch of ours: half of the preset's, for a finer curve
 CHUNK = 512  # env steps in a call of `learn`
 
 
@@ -85,7 +84,7 @@ def our_config(name: str) -> Any:
     if name == "ours-plain":
         without = dataclasses.replace(config.hindsight, reached_share=0.0, near_share=0.0)
         config = dataclasses.replace(config, hindsight=without)
-    return dataclasses.replace(config, vector_steps_per_epoch=EPOCH_STEPS)
+    return config
 
 
 def ours(name: str, seed: int) -> Contestant:
