@@ -17,8 +17,9 @@ help:  ## this list
 demo: $(INSTALLED)  ## train a small policy, show its figures, draw its pictures
 	$(BIN)/python -m train reach --preset quick
 
-test: $(INSTALLED)  ## the tests
-	$(BIN)/python -m pytest
+# A file's tests share compiled functions, so they stay in one process.
+test: $(INSTALLED)  ## the tests, on up to four cores
+	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
 
 test-slow: $(INSTALLED)  ## the tests that take minutes
 	$(BIN)/python -m pytest -m slow
