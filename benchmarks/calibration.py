@@ -57,6 +57,7 @@ def planted_arm() -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         files = demo.write_demo(Path(folder), spec, seed=0)
         springs, poses = (read_log(file)[0] for file in files[:2])
+    assert springs.frequency_hz is not None and springs.spring_m is not None  # as the demo writes them
     lines = fit_springs(springs.frequency_hz, springs.spring_m, SensorParams.from_spec(spec))
     sensor = {"beta": tuple(map(float, lines.beta)), "delta_m": tuple(map(float, lines.delta_m))}
     fit = calibrate_chambers(poses, spec.replace(sensor=sensor))

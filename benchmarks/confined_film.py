@@ -8,7 +8,7 @@ import numpy as np
 
 from benchmarks.confined_measure import finger_tips, finger_tips_seen, operate
 from benchmarks.confined_plots import outline_mm
-from benchmarks.confined_stages import KINDS, Trial, pipe_mm, scene_of
+from benchmarks.confined_stages import KINDS, Trial, scene_of
 from benchmarks.paper_film import HEIGHT, WIDTH, Film, Side, frames, write_gif
 from benchmarks.paper_measure import Driven
 from benchmarks.paper_stages import Settings
@@ -18,7 +18,7 @@ FILM_FILE = "pipe.gif"
 
 def film_pipe(folder: Path, settings: Settings) -> str:
     """Write `pipe.gif`, the pipe task on the first twin; returns why it cannot be drawn, or ""."""
-    from mjx_softarm.pipe import CrossPipe
+    from mjx_softarm.pipe import PIPES_MM, CrossPipe
     from mjx_softarm.render import RenderError
 
     path = folder / FILM_FILE
@@ -36,7 +36,7 @@ def film_pipe(folder: Path, settings: Settings) -> str:
     path_mm = 1e3 * np.array(
         [finger_tips_seen(seen.tip_m, seen.tip_quaternion, gripper_m) for seen in film.seen]
     )
-    diameter_mm = pipe_mm(KINDS[trial.kind].task)
+    diameter_mm = PIPES_MM[KINDS[trial.kind].task]
     side = Side(
         title=f"twin {trial.twin}, {diameter_mm} mm pipe",
         text="demonstrated (grey), finger tips",

@@ -94,6 +94,7 @@ def operate(
     followed = measure(run, controller, goals)
     log, force_n = run.log, np.zeros((len(run.log), 2))
     force_n[: len(forces)] = forces  # an arm that is lost takes no pressures any more
+    assert log.tip_m is not None and log.tip_quaternion is not None  # a twin has motion capture
     arrival_s = np.full(len(goals), np.nan)
     for arrival in run.arrivals:
         arrival_s[point_of(arrival.goal, goals)] = log.time_s[arrival.row]

@@ -14,7 +14,7 @@ from benchmarks.confined_stages import KINDS, Learned, Results, Trial, pipe_mm
 from benchmarks.confined_summary import SUCCESS
 from benchmarks.paper_plots import RED, plot_around
 from benchmarks.paper_stages import Case
-from mjx_softarm.pipe import CrossPipe
+from mjx_softarm.pipe import PIPES_MM, CrossPipe
 from mjx_softarm.spec import ArmSpec
 from train.plots import BLUE, GREY, INK, ORANGE, dress
 
@@ -45,7 +45,7 @@ def positions_figure(results: Results, shown: Sequence[Trial]) -> Figure:
     figure = Figure(figsize=(4.0 * len(shown) + 0.4, 4.2), layout="constrained")
     panels = figure.subplots(1, len(shown), squeeze=False, sharex=True, sharey=True)[0]
     for panel, trial in zip(panels, shown, strict=True):
-        diameter_mm = pipe_mm(KINDS[trial.kind].task)
+        diameter_mm = PIPES_MM[KINDS[trial.kind].task]
         dress(panel, f"{diameter_mm} mm pipe, {trial.objects}, from the front", "x [mm]", "z [mm]")
         _positions(panel, results.trials[trial], CrossPipe.of_mm(diameter_mm))
         panel.set_aspect("equal")

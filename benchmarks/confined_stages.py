@@ -233,8 +233,9 @@ def load_results(folder: Path, settings: Settings) -> Results:
 
 
 def _load_learned(run: Path) -> Learned:
-    from train.config import from_dict
+    from train.config import ImitationConfig, from_dict
 
     config = from_dict(json.loads((run / "config.json").read_text("utf-8"))["train"])
+    assert isinstance(config, ImitationConfig)  # as of all `trainings`
     lines = (run / METRICS_FILE).read_text("utf-8").splitlines()
     return Learned([json.loads(line) for line in lines], tuple(e for e in config.stage_epochs if e))

@@ -1,12 +1,12 @@
 """Floor against measured: the least time that the arithmetic of a settle could take, and the time it takes.
 
-Operations and bytes are XLA's own count of the compiled function. A loop it counts once. The one over Newton's
-steps is taken out: one turn of it and what stands outside are counted apart, and the turns are those of the
-slowest arm of the batch, since all arms go through them. To those that are left, the eliminations, the turns
-beyond the first are added: each multiplies, subtracts, reads and writes every number of the matrices once. What
-the device can do is measured, too: a large product of matrices and a large copy. The bytes are those of every
-operation's operands, as if no cache held them. Where the time of a call hardly grows with the arms, it is the
-number of kernels that costs, not their work.
+Operations and bytes are XLA's own count of the compiled function. A loop it counts once. The one over
+Newton's steps is taken out: one turn of it and what stands outside are counted apart, and the turns are those
+of the slowest arm of the batch, since all arms go through them. To those that are left, the eliminations, the
+turns beyond the first are added: each multiplies, subtracts, reads and writes every number of the matrices
+once. What the device can do is measured, too: a large product of matrices and a large copy. The bytes are
+those of every operation's operands, as if no cache held them. Where the time of a call hardly grows with the
+arms, it is the number of kernels that costs, not their work.
 """
 
 from __future__ import annotations

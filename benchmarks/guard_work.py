@@ -100,7 +100,9 @@ def prepare() -> tuple[Facts, Callable[[], Facts]]:
     def measure(name: str, work: Callable[[], Any]) -> dict[str, float]:
         reference = REFERENCE[name]
         on_gpu = reference == PRODUCT and jax.default_backend() == "gpu"
-        return cost(*(_took(call) for call in (references[reference], work, references[reference])), on_gpu)
+        return cost(
+            *(_took(call) for call in (references[reference], work, references[reference])), on_gpu=on_gpu
+        )
 
     compiling = measure("compile", lambda: epoch.append(job.epoch.lower(state).compile()))
     state, _ = epoch[0](state)  # fills the replay

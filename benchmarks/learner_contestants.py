@@ -14,7 +14,7 @@ import queue
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -160,20 +160,22 @@ def _brax(batch_size: int, n_updates: int) -> tuple[Facts, Callable[[], Facts]]:
     from brax.training.agents.sac import train as sac
 
     class Blank(Env):
-        observation_size, action_size, backend = OBS_SIZE, ACTION_SIZE, ""
+        observation_size: int = OBS_SIZE
+        action_size: int = ACTION_SIZE
+        backend: str = ""
 
         def reset(self, rng):
             zero = jnp.zeros(())
-            return State(zero, jnp.zeros(OBS_SIZE), zero, zero, {}, {})
+            return State(zero, jnp.zeros(OBS_SIZE), zero, zero, {}, {})  # pyright: ignore[reportArgumentType]
 
         def step(self, state, action):
             return state
 
     n_envs, n_epochs = 100, 10_000  # more than will be asked for
-    results: queue.Queue[dict[str, Any] | BaseException] = queue.Queue()
+    results: queue.Queue[Mapping[str, Any] | BaseException] = queue.Queue()
     asked = threading.Semaphore(0)
 
-    def progress(_: int, metrics: dict[str, Any]) -> None:
+    def progress(_: int, metrics: Mapping[str, Any]) -> None:
         if "training/sps" in metrics:  # not before the first epoch
             results.put(metrics)
             asked.acquire()

@@ -48,6 +48,10 @@ class Driven:
     def __getattr__(self, name: str) -> Any:
         return getattr(self._twin, name)
 
+    def read_frequencies(self) -> np.ndarray:
+        """Read the twin; see `ArmIO`."""
+        return self._twin.read_frequencies()
+
     def write_pressures(self, pressure_kpa: np.ndarray) -> None:
         """Drive the twin; see `ArmIO`."""
         self._twin.write_pressures(pressure_kpa)
@@ -57,6 +61,7 @@ class Driven:
 def measure(run: Run, controller: Controller, goals: np.ndarray) -> Followed:
     """Errors, saturation and traces of a run towards goals (p, 6) [mm, deg]."""
     log, policy, window = run.log, controller.policy, controller.window
+    assert log.pressure_kpa is not None and log.reference_m is not None and log.goal is not None
     spring_m = length_from_frequency(log.frequency_hz, policy.sensor, np.nan).length_m
     seen = pose_from_quaternion(log.tip_m, log.tip_quaternion)
     error, believed = np.full((2, *goals.shape), np.nan)

@@ -128,7 +128,7 @@ def _over_rest(spec: ArmSpec, reference: np.ndarray, truth: Truth) -> list[dict[
 def _ways(links: int, reaches: tuple[float, ...]) -> list[dict[str, Any]]:
     """A row for each way and each reach of the references, at a number of links per section."""
     spec = ArmSpec.default().replace(structure={"links_per_section": links})
-    references = {str(reach): random_references(spec, N_ARMS, reach) for reach in reaches}
+    references: dict[str, Any] = {str(reach): random_references(spec, N_ARMS, reach) for reach in reaches}
     truths = {name: true_rest(spec, reference) for name, reference in references.items()}
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder, "references.npz")

@@ -14,7 +14,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -36,7 +36,8 @@ def write_arm(folder: Path, spec: ArmSpec, n_poses: int = 1024) -> None:
     spec.to_toml(folder / ARM_FILE)
     mujoco.mj_saveModel(sensed_model(spec), str(folder / MODEL_FILE))
     pool = sample_workspace(spec, n_poses, seed=0)
-    np.savez(folder / POOL_FILE, **{name: np.asarray(x, float) for name, x in pool._asdict().items()})
+    arrays: dict[str, Any] = {name: np.asarray(x, float) for name, x in pool._asdict().items()}
+    np.savez(folder / POOL_FILE, **arrays)
 
 
 class Stepped(NamedTuple):

@@ -73,7 +73,7 @@ def read_asu(path: str | Path) -> tuple[AsuLog, list[Finding]]:
     body = table.values[:, 17:].reshape(-1, N_BODIES, 7)
     quaternion, findings = _orientation(str(path), table.row, body[..., [6, 3, 4, 5]])
     stale = np.stack([checks.stale_rows(body[:, k]) for k in range(N_BODIES)], axis=1)
-    findings = _stale(str(path), table.row, stale, stale.any(axis=1)) + findings
+    findings = _stale(str(path), table.row, stale, np.any(stale, axis=1)) + findings
     late = checks.late_rows(table.values[:, 0])
     if late.any():
         findings.append(
@@ -88,7 +88,7 @@ def read_asu(path: str | Path) -> tuple[AsuLog, list[Finding]]:
         wire_v=table.values[:, 13:17],
         position_m=body[..., :3],
         quaternion=quaternion,
-        fresh=~stale.any(axis=1),
+        fresh=~np.any(stale, axis=1),
     )
     return log, findings
 
@@ -149,7 +149,7 @@ def _stale(file: str, row: np.ndarray, stale: np.ndarray, dropped: np.ndarray) -
             row[stale[:, k]],
             f"body {k}",
             "equal to the row before, expected motion capture renewed in each row",
-            n_dropped=np.count_nonzero(stale[:, k] & dropped),
+            n_dropped=int(np.count_nonzero(stale[:, k] & dropped)),
         )
         for k in np.flatnonzero(stale.any(axis=0))
     ]

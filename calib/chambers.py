@@ -251,7 +251,8 @@ def _describe(width: float, vector: np.ndarray) -> str:
 def _errors(error: np.ndarray) -> Errors:
     settled = error[~np.isinf(error[:, 0])].reshape(-1, error.shape[1])
     if len(settled) == 0:
-        return Errors(0, *[float("nan")] * 4, None)
+        nan = float("nan")
+        return Errors(0, nan, nan, nan, nan, None)
     tip_mm = 1e3 * np.linalg.norm(settled[:, :3], axis=1)
     turn_deg = np.degrees(np.arcsin(np.minimum(np.linalg.norm(settled[:, 3:6], axis=1), 1.0)))
     spring = settled[:, 6:]

@@ -110,7 +110,8 @@ def _poses(arm: ArmSpec, rng: np.random.Generator) -> Log:
     model, data = _model(arm)
     found = settle_many(arm, pressure_kpa)
     seen = [_look(arm, model, data, q) for q in found.q[found.settled]]
-    return _measured(arm, POSE_S * np.arange(len(seen)), found.pressure_kpa[found.settled], seen, rng)
+    pressure_kpa = np.asarray(found.pressure_kpa)[found.settled]
+    return _measured(arm, POSE_S * np.arange(len(seen)), pressure_kpa, seen, rng)
 
 
 def _steps(arm: ArmSpec, rng: np.random.Generator) -> Log:

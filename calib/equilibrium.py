@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,11 +16,11 @@ from mjx_softarm.statics import ArmParams
 class Measured(NamedTuple):
     """What was measured of an arm at rest; rows of it are poses."""
 
-    pressure_kpa: Array  # (n_chambers,)
-    payload_kg: Array  # ()
-    tip_m: Array  # (3,)
-    tip_rotation: Array  # (3, 3)
-    spring_m: Array  # (n_chambers,)
+    pressure_kpa: Any  # (n_chambers,)
+    payload_kg: Any  # ()
+    tip_m: Any  # (3,)
+    tip_rotation: Any  # (3, 3)
+    spring_m: Any  # (n_chambers,)
 
 
 def with_numbers(x: Array, params: ArmParams) -> ArmParams:

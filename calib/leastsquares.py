@@ -110,7 +110,7 @@ def principal(solution: Solution, tolerance: np.ndarray) -> tuple[np.ndarray, np
 
 def _weigh(error: np.ndarray, jacobian: np.ndarray, scale: np.ndarray, problem: Problem) -> _Weighted:
     sigma = scale[problem.group]
-    answered = ~np.isinf(error).any(axis=1)
+    answered = ~np.any(np.isinf(error), axis=1)
     known = np.isfinite(error) & answered[:, None]
     e = np.where(known, error, 0.0) / sigma
     slope = np.where(known[..., None], jacobian, 0.0) / sigma[:, None]

@@ -17,7 +17,7 @@ Source: the play is the operator of Prandtl and Ishlinskii, here a single one.
 from __future__ import annotations
 
 import itertools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -135,7 +135,7 @@ def _steps(time_s: np.ndarray) -> Array:
     return jnp.asarray(np.diff(time_s, prepend=time_s[0]))
 
 
-def _simulate(taus: Array, play: Array, steps: Array, drive: Array) -> Array:
+def _simulate(taus: Array, play: Array | float, steps: Array, drive: Array) -> Array:
     """States (n,) of lag and play."""
 
     def row(state, now):
@@ -183,7 +183,7 @@ def _loss(q: Array, steps: Array, drive: Array, target: Array, weight: Array) ->
 def _fit(starts: Array, steps: Array, drive: Array, target: Array, keep: Array):
     """For each row of keep (m, n): the best free numbers (m, 3), polynomial (m, 3), predictions (m, n)."""
 
-    def descend(start, weight):
+    def descend(start, weight) -> Any:
         def loss(q):
             return _loss(q, steps, drive, target, weight)
 

@@ -80,9 +80,10 @@ def _rests_of(log: Log, spec: ArmSpec, n_markers: int, fates: dict[str, int]) ->
     _check(log, spec)
     payload = np.full(len(log), spec.mass.payload_kg) if log.payload_kg is None else log.payload_kg
     columns = [log.time_s[:, None], payload[:, None], log.pressure_kpa, log.tip_m, log.tip_quaternion]
-    finite = np.isfinite(np.concatenate(columns, axis=1)).all(axis=1)
+    finite = np.all(np.isfinite(np.concatenate(columns, axis=1)), axis=1)
     fates["not finite"] += int(np.count_nonzero(~finite))
     log, payload = log.take(finite), payload[finite]
+    assert log.pressure_kpa is not None and log.tip_m is not None  # else `_check` raises
     springs = spring_lengths(log, spec)
     markers = np.full((len(log), n_markers, 3), np.nan)
     if log.marker_m is not None and log.marker_m.shape[1] == n_markers:

@@ -100,12 +100,10 @@ def simulate_poses(spec: ArmSpec, reference_m: np.ndarray) -> SimulatedPoses:
 
 @functools.cache
 def _settle():
-    def one(params: ArmParams, reference: jax.Array) -> SimulatedPoses:
+    def one(params: ArmParams, reference: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         kinematics = functools.partial(chain_frames, link_length_m=params.link_length_m)
         end: Settled = settle(kinematics, params, reference)
-        return SimulatedPoses(
-            pose_from_frame(end.tip_position_m, end.tip_rotation), end.spring_m, end.settled
-        )
+        return pose_from_frame(end.tip_position_m, end.tip_rotation), end.spring_m, end.settled
 
     return jax.jit(jax.vmap(one, in_axes=(None, 0)))
 

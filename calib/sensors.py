@@ -120,6 +120,7 @@ def fit_springs(
         line, share, interval = _fit(
             _wire_share, w, length_m, np.array([given_h / unit_h]), "spring", shared, block, seed
         )
+        assert interval is not None  # one number besides the lines was fitted
         scale, compensation_h = unit_h / coil_hm, float(share[0] * unit_h)
         compensation_interval = (float(interval[0] * unit_h), float(interval[1] * unit_h))
         warnings = (*line.warnings, *_compensation_warnings(compensation_interval, unit_h))
@@ -269,7 +270,7 @@ def _fit(feature, x, y, q, name: str, shared: bool, block: int, seed: int):
         warnings=_warnings(fit, np.where(known, wire, np.nan), "all " + name + "s " if shared else name)
     )
     if shared:
-        fit = LineFit(*(np.repeat(value, n_columns, axis=0) for value in fit[:-1]), fit.warnings)
+        fit = LineFit(*(np.repeat(value, n_columns, axis=0) for value in fit[:-1]), warnings=fit.warnings)
     return fit, best_q, None if q_half is None else best_q[0] + q_half * np.array([-1, 1])
 
 

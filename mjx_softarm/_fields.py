@@ -70,7 +70,7 @@ def read_fields(cls: type, data: Any, source: str, prefix: str) -> dict[str, Any
         if name not in known:
             raise SpecError(f"{source}: {prefix}{name}: unknown field, expected one of {', '.join(known)}")
     hints = typing.get_type_hints(cls)
-    groups = {name: hint for name, hint in hints.items() if dataclasses.is_dataclass(hint)}
+    groups: dict[str, Any] = {name: hint for name, hint in hints.items() if dataclasses.is_dataclass(hint)}
     values: dict[str, Any] = {}
     for item in fields(cls):
         path = prefix + item.name

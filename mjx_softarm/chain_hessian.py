@@ -1,10 +1,10 @@
 """The Hessian of a chain of sections, and systems with it solved at a cost that is linear in the sections.
 
-The joints of one section are coupled by the tendons that run through it, those of different sections by gravity
-alone: its second derivative by a joint i and one j further down is a product of two numbers of i with two of j
-(see `mjx_softarm.statics`), so the block between two sections has rank two. Block elimination from the tip to the
-base keeps that form: what hangs below a section acts on it as a reaction of rank two, as in the articulated-body
-algorithm for rigid chains.
+The joints of one section are coupled by the tendons that run through it, those of different sections by
+gravity alone: its second derivative by a joint i and one j further down is a product of two numbers of i with
+two of j (see `mjx_softarm.statics`), so the block between two sections has rank two. Block elimination from
+the tip to the base keeps that form: what hangs below a section acts on it as a reaction of rank two, as in
+the articulated-body algorithm for rigid chains.
 
 Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, chapter 7 (articulated bodies).
 """
@@ -42,7 +42,7 @@ class ChainHessian(NamedTuple):
         return self._replace(own=self.own + added.reshape(n_sections, n, 1) * jnp.eye(n, dtype=added.dtype))
 
     def solve(self, columns: Array) -> Array:
-        """The inverse times columns (n_sections, n, k), in the same form; NaN if it is not positive definite."""
+        """The inverse times columns (n_sections, n, k), in the same form; NaN if not positive definite."""
         reaction = jnp.zeros((RANK, RANK), columns.dtype)  # of all that is further down
         pull = jnp.zeros((RANK, columns.shape[-1]), columns.dtype)  # likewise, of its columns
         reduced = []
@@ -62,7 +62,7 @@ class ChainHessian(NamedTuple):
 
 
 def product(a: Array, b: Array) -> Array:
-    """a b of small matrices (..., n, m) and (..., m, k), as sums: a matrix product is slow for many tiny ones."""
+    """a b of small matrices (..., n, m) and (..., m, k), as sums: a matrix product is slow for tiny ones."""
     return jnp.sum(a[..., :, :, None] * b[..., None, :, :], axis=-2)
 
 
@@ -77,8 +77,8 @@ def block_diagonal(blocks: Array) -> Array:
 def eliminate(matrix: Array, columns: Array) -> Array:
     """The inverse of a matrix (n, n) times columns (n, k), by Gauss-Jordan elimination without pivoting.
 
-    Made for many small matrices at once. Those of an arm are positive definite, or nearly symmetric and positive,
-    and need no pivoting.
+    Made for many small matrices at once. Those of an arm are positive definite, or nearly symmetric and
+    positive, and need no pivoting.
 
     Returns:
         (n, k), all NaN if a pivot is not positive, which is so where a symmetric matrix is not positive
@@ -97,7 +97,7 @@ def _eliminate_many(n: int, batched: list[bool], matrix: Array, columns: Array) 
 
 
 def _eliminate_last(augmented: Array) -> Array:
-    """Of matrices beside columns (n, n + k, batch): the batch is last, so that one instruction serves many."""
+    """Of matrices beside columns (n, n + k, batch): the batch is last: one instruction serves many."""
     n = augmented.shape[0]
     rows = jnp.arange(n)[:, None]
 

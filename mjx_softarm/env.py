@@ -212,6 +212,7 @@ class ReachEnv(Env):
         reading = arm.spring_m + arm.sensor_offset_m
         saturated = control.saturated(arm.pressure_kpa, reference, reading, self.gains, tolerance) & valid
         clearance_mm = self._clearance_mm(arm.motion.q, arm.pose)
+        terms: dict[str, Array]
         value, reached, terms = rewards.reward(
             arm.pose,
             arm.goal,

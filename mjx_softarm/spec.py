@@ -194,8 +194,9 @@ class ArmSpec:
         for group, values in groups.items():
             if group not in data:
                 raise SpecError(f"replace: unknown group {group!r}, expected one of {', '.join(data)}")
-            both_tables = isinstance(values, dict) and isinstance(data[group], dict)
-            data[group] = {**data[group], **values} if both_tables else values
+            if isinstance(values, dict) and isinstance(data[group], dict):
+                values = {**data[group], **values}
+            data[group] = values
         return self.from_dict(data, "replace")
 
     def validate(self, source: str = "spec") -> None:

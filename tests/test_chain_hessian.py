@@ -79,12 +79,17 @@ def test_the_diagonal_is_added_where_it_belongs():
     hessian, _ = chain(2)
     one = jax.tree.map(lambda x: jnp.asarray(x[0]), hessian)
     added = jnp.arange(2.0 * N)
-    np.testing.assert_allclose(one.plus_diagonal(added).dense(), dense(hessian)[0] + np.diag(added), atol=1e-5)
+    np.testing.assert_allclose(
+        one.plus_diagonal(added).dense(), dense(hessian)[0] + np.diag(added), atol=1e-5
+    )
 
 
 def test_elimination_takes_a_matrix_that_all_share():
     rng = np.random.default_rng(0)
-    matrix, columns = np.float32(np.eye(3) + 0.1 * rng.normal(size=(3, 3))), np.float32(rng.normal(size=(4, 3, 2)))
+    matrix, columns = (
+        np.float32(np.eye(3) + 0.1 * rng.normal(size=(3, 3))),
+        np.float32(rng.normal(size=(4, 3, 2))),
+    )
     found = jax.vmap(eliminate, in_axes=(None, 0))(matrix, columns)
     np.testing.assert_allclose(found, np.linalg.solve(matrix, columns), atol=1e-5)
 

@@ -6,7 +6,7 @@ import json
 import os
 import shutil
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import numpy as np
@@ -165,7 +165,8 @@ class Run:
             RunError: there is no checkpoint.
         """
         epoch, shapes = self._newest(), jax.tree.map(_shape_somewhere, like)
-        return epoch, self._manager.restore(epoch, args=ocp.args.StandardRestore(shapes))
+        state = self._manager.restore(epoch, args=ocp.args.StandardRestore(shapes))
+        return epoch, cast(TrainState, state)
 
     def restore_part(self, name: str, like: Any) -> Any:
         """One field of the newest checkpoint's state as NumPy arrays, without reading the others.
@@ -221,6 +222,7 @@ def _shape_somewhere(x: Any) -> jax.ShapeDtypeStruct:
     Else it would come back to the devices that it was saved from, which may not be here.
     """
     shape = ocp.utils.to_shape_dtype_struct(x)
+    assert isinstance(shape, jax.ShapeDtypeStruct)  # a state has no plain numbers
     if shape.sharding is not None:
         return shape
     device = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])

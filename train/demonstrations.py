@@ -65,6 +65,7 @@ def from_log(log: Log, spec: ArmSpec) -> Demonstrations:
     """The demonstrations that checked rows are."""
     low, high = frequency_range_hz(spec).T
     actions = np.clip(2.0 * (log.frequency_hz - low) / (high - low) - 1.0, -1.0, 1.0)
+    assert log.sequence is not None  # it is `NEEDED`
     positions = pose_from_quaternion(log.tip_m, log.tip_quaternion)
     return Demonstrations(
         positions.astype(np.float32), actions.astype(np.float32), log.sequence.astype(np.int32)
@@ -113,7 +114,7 @@ def _out_of_order(sheet: Sheet) -> Iterator[Finding]:
             yield _finding(sheet, starts[k], "sequence", problem)
 
 
-def _finding(sheet: Sheet, row: int, column: str, problem: str) -> Finding:
+def _finding(sheet: Sheet, row: int | np.integer, column: str, problem: str) -> Finding:
     line = int(sheet.row[row])
     return Finding(sheet.file, (line, line), column, problem)
 

@@ -48,17 +48,18 @@ def mesh_of(devices: str | None) -> Mesh | None:
     meeting = _MEETING.fullmatch(devices)
     if not meeting and devices != CLUSTER:
         raise ConfigError(f"--devices: got {devices!r}, expected a number, {CLUSTER} or HOST:PORT/K/N")
-    address, process, n_processes = meeting.groups() if meeting else (None, None, None)
     try:
-        jax.distributed.initialize(
-            address, *(None if number is None else int(number) for number in (n_processes, process))
-        )
+        if meeting:
+            address, process, n_processes = meeting.groups()
+            jax.distributed.initialize(address, int(n_processes), int(process))
+        else:
+            jax.distributed.initialize()
     except (ValueError, RuntimeError) as error:
         raise ConfigError(f"--devices {devices}: {error}") from error
     return Mesh(np.array(jax.devices()), (AXIS,))
 
 
-def _local(n: int) -> list[jax.Device]:
+def _local(n: int) -> list[jax.Device]:  # pyright: ignore[reportInvalidTypeForm]
     found = jax.local_devices()
     if len(found) < n:
         hint = "; the environment variable JAX_NUM_CPU_DEVICES makes more of a CPU" * (

@@ -78,8 +78,8 @@ def distil(spec: ArmSpec, seed: int) -> Distilled:
     estimator = _fit(_first_estimator(spec, pool, key_estimator), _pose_loss, pool, key_estimator)
     pool = sample_workspace(spec, N_TRAINING, seed)
     springs = _fit(_first_spring_model(pool, key_springs), _spring_loss, pool, key_springs)
-    as_numpy = jax.tree.map(lambda x: np.asarray(x, np.float32), (estimator, springs))
-    return Distilled(*as_numpy, *_errors(*as_numpy, spec))
+    estimator, springs = jax.tree.map(lambda x: np.asarray(x, np.float32), (estimator, springs))
+    return Distilled(estimator, springs, *_errors(estimator, springs, spec))
 
 
 def _stronger(spec: ArmSpec) -> ArmSpec:

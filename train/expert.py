@@ -267,7 +267,7 @@ def _solve_many(starts_kpa, target: Target, params: ArmParams, s2r, spec: ArmSpe
         jacobian, error = jax.jacfwd(errors, has_aux=True)(pressure_kpa)
         return error, jacobian
 
-    def step(_, state):
+    def step(_, state: Sequence[Array]):
         trial, *best, damping = state
         tried = (trial, *model(trial))
         better = jnp.sum(tried[1] ** 2) < jnp.sum(best[1] ** 2)  # not where it is NaN

@@ -13,6 +13,7 @@ Episodes end with the goal reached or by the clock, so a reward that is never po
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -81,7 +82,7 @@ class ImitationJob(Job):
         weight = jnp.asarray(self.goals_of(epoch), jnp.float32)
         return state._replace(memory=memory, imitation=state.imitation._replace(goal_weight=weight))
 
-    def rebalance(self, state: TrainState, epoch: int, error_mm: np.ndarray) -> TrainState:
+    def rebalance(self, state: TrainState, epoch: int, error_mm: Sequence[float] | np.ndarray) -> TrainState:
         """The state with goals shifted towards those that are missed by most; errors (m,) [mm]."""
         weight = jnp.asarray(goal_weights(error_mm, self.goals_of(epoch)))
         return state._replace(imitation=state.imitation._replace(goal_weight=weight))
@@ -166,7 +167,7 @@ class ImitationJob(Job):
         return jax.tree.map(lambda e, b: jnp.concatenate([e, b[n:]]), expert, batch)
 
 
-def goal_weights(error_mm: np.ndarray, goals: np.ndarray) -> np.ndarray:
+def goal_weights(error_mm: Sequence[float] | np.ndarray, goals: np.ndarray) -> np.ndarray:
     """How often each position is the goal: a share evenly, the rest in proportion to its error.
 
     Args:

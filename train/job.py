@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -167,7 +167,7 @@ def _sharding(config: TrainConfig, mesh: Mesh) -> TrainState:
             raise ConfigError(
                 f"{name}: got {getattr(config, name)}, expected a multiple of the {mesh.size} devices"
             )
-    on_all, rows = everywhere(mesh), split(mesh)
+    on_all, rows = cast(Any, everywhere(mesh)), split(mesh)  # in the places of arrays
     return TrainState(
         arms=rows,
         agent=on_all,

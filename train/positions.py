@@ -68,7 +68,7 @@ class PositionEvaluator:
     `first` (m,) bool tells the positions that are goals from the start.
     """
 
-    def __init__(self, env: ReachEnv, agent: TQC, positions: Array, first: np.ndarray):
+    def __init__(self, env: ReachEnv, agent: TQC, positions: np.ndarray, first: np.ndarray):
         self.env, self.first = nominal(env), first
         self.positions = jnp.asarray(positions)
         self._follow = xla.jit(functools.partial(follow, self.env, agent), env.uses_mjx)

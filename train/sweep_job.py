@@ -13,7 +13,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -48,7 +48,7 @@ VARIABLE = (
     "env.clearance_margin_mm",
 )
 
-_AXES = TrainState(arms=0, agent=0, memory=0, key=0, n_env_steps=None, n_unsettled=0)
+_AXES = cast(Any, TrainState)(arms=0, agent=0, memory=0, key=0, n_env_steps=None, n_unsettled=0)
 
 
 def setting(config: Any, path: str) -> Any:

@@ -121,7 +121,7 @@ class TQC:
 
     def act(self, actor_params: Params, obs: Array, key: Array) -> Array:
         """Samples an action (..., A) in (-1, 1) at obs (..., O)."""
-        return sample_action(*self.actor.apply(actor_params, obs), key)[0]
+        return sample_action(*self.actor.apply(actor_params, obs), key=key)[0]
 
     def act_mode(self, actor_params: Params, obs: Array) -> Array:
         """The deterministic action (..., A) in (-1, 1) at obs (..., O)."""
@@ -166,7 +166,9 @@ class TQC:
         return next_state, {**losses, **means, "alpha": jnp.exp(state.log_alpha)}
 
     def _targets(self, state: TQCState, batch: Transition, noise: Array) -> Array:
-        next_action, next_log_prob = squash(*self.actor.apply(state.actor_params, batch.next_obs), noise)
+        next_action, next_log_prob = squash(
+            *self.actor.apply(state.actor_params, batch.next_obs), noise=noise
+        )
         return truncated_targets(
             self.critics.apply(state.target_params, batch.next_obs, next_action),  # (B, C, M)
             next_log_prob,
@@ -182,7 +184,7 @@ class TQC:
         return quantile_huber_loss(quantiles, targets), jnp.mean(quantiles)
 
     def _actor_loss(self, params: Params, state: TQCState, obs: Array, noise: Array) -> tuple[Array, Array]:
-        action, log_prob = squash(*self.actor.apply(params, obs), noise)  # (B, A), (B,)
+        action, log_prob = squash(*self.actor.apply(params, obs), noise=noise)  # (B, A), (B,)
         quantiles = self.critics.apply(state.critic_params, obs, action)  # (B, C, M)
         return actor_loss(log_prob, quantiles, jnp.exp(state.log_alpha)), log_prob
 

@@ -283,6 +283,7 @@ def _go(controller: Controller, state: State, at_rest: bool) -> tuple[State, lis
         events += _unsettled(controller, state, settled)
         if state.n_actions == N_ACTIONS:
             return state._replace(goal=None), events, True
+    assert state.goal is not None  # `step` asks
     pose, away = believed(controller, state.spring_m)
     if away > 1.0:
         message = f"{away:.1f} times as far from the training rows as the network is believed"

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -148,7 +148,7 @@ class Run(NamedTuple):
 def follow(
     arm: ArmIO,
     controller: Controller,
-    goals: Sequence[np.ndarray],
+    goals: Iterable[np.ndarray],
     duration_s: float | None = None,
     tell: Callable[[str], None] = lambda text: None,
     arrived: Callable[[int], None] = lambda goal: None,
@@ -238,7 +238,7 @@ class _Session:
         self.rows.add(row)
         self._note(tick.events)
         if tick.arrived:
-            self._arrive(goal, row["estimate"])
+            self._arrive(row["goal"], row["estimate"])
 
     def _write(self) -> bool:
         in_time = self.pumps.write(self.state.pressure_kpa)
