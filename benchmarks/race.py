@@ -1,4 +1,4 @@
-"""How long until a policy reaches, against the peers: `python -m benchmarks race [--seeds S,S] [--smoke]`.
+"""How long until a policy reaches, against the peers: `python -m benchmarks race [--seeds S,S] [--tuned]`.
 
 Wall time and env steps until the median tip error at the held-out goals is so many millimetres: ours, and TQC
 of SBX and of Stable-Baselines3-contrib on the same arms, goals and evaluation. Hindsight: ours only; how fast
@@ -46,6 +46,7 @@ from mjx_softarm.provenance import provenance, write_json
 
 N_STRETCHES = 40  # of training between evaluations, up to a peer's limit
 SETTINGS_FILE = "settings.json"
+TUNED = ("ours-quick", "sbx-tuned", "sb3-contrib-tuned", "ours-plain")
 
 
 class Limits(NamedTuple):
@@ -77,7 +78,7 @@ def main(arguments: Sequence[str]) -> int:
     folder = options.out or Path("runs/race-smoke" if options.smoke else "runs/race")
     try:
         claim(folder, settings := SMOKE if options.smoke else Settings())
-        results = run(folder, options.seeds, settings)
+        results = run(folder, options.seeds, settings, TUNED if options.tuned else tuple(CONTESTANTS))
     except (RaceError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -100,6 +101,11 @@ def _parser() -> argparse.ArgumentParser:
         description="Time and env steps to a tip error, against the peers; an hour and more for each seed.",
     )
     parser.add_argument("--seeds", type=numbers, default=(0,), metavar="S,S", help="of training; default: 0")
+    parser.add_argument(
+        "--tuned",
+        action="store_true",
+        help=f"{', '.join(TUNED)} alone, in half of the time; the rest may follow",
+    )
     parser.add_argument("--smoke", action="store_true", help="everything, but tiny; says nothing of speed")
     parser.add_argument("--out", type=Path, metavar="DIR", help="working folder; default: runs/race")
     return parser
@@ -134,8 +140,10 @@ def claim(folder: Path, settings: Settings) -> None:
         )
 
 
-def run(folder: Path, seeds: Sequence[int], settings: Settings) -> list[dict[str, Any]]:
-    """The results of all contestants, those that the folder has not measured first.
+def run(
+    folder: Path, seeds: Sequence[int], settings: Settings, names: Sequence[str] = tuple(CONTESTANTS)
+) -> list[dict[str, Any]]:
+    """The results of contestants, those that the folder has not measured first.
 
     One that fails has `failed` in the place of points. If it is the first of a seed, there are no others:
     what they are given follows from it.
@@ -145,7 +153,7 @@ def run(folder: Path, seeds: Sequence[int], settings: Settings) -> list[dict[str
         first = _contest(folder, FIRST, seed, settings, Limits())
         results.append(first)
         if "failed" not in first:
-            others = [name for name in CONTESTANTS if name != FIRST]
+            others = [name for name in names if name != FIRST]
             results += [
                 _contest(folder, name, seed, settings, limits_of(name, first["points"])) for name in others
             ]

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks.common import goal
-from benchmarks.race_contestants import tuned_settings
+from benchmarks.race_contestants import CONTESTANTS, tuned_settings
 from train.config import PRESETS
 
 LEVELS_MM = (10, 5, 3, 2)
@@ -64,6 +64,9 @@ def summarise(results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "wall_s_without_start_up": [_row(result, "trained_s") for result in ran],
         "env_steps": [_row(result, "env_steps") for result in ran],
         "goals": [judge(library, results) for library in GOALS],
+        "not_raced": [
+            name for name in CONTESTANTS if name not in {result["contestant"] for result in results}
+        ],
         "failed": [
             {name: result[name] for name in ("contestant", "seed", "failed")}
             for result in results

@@ -221,6 +221,18 @@ def test_peers_get_our_time_to_5_mm_as_often_as_the_goal_asks_and_stop_where_our
     assert [one["contestant"] for one in results if "failed" in one] == ["sbx-tuned"]
 
 
+def test_tuned_ones_may_race_alone_and_the_others_follow(asked, monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(race, "save", lambda *_: tmp_path / "race.json")
+    assert race.main(["--tuned", "--out", str(tmp_path)]) == 0
+    assert list(asked) == [f"{name}, seed 0" for name in race.TUNED]
+    assert "['ours-paper', 'sbx-defaults', 'sb3-contrib-defaults']" in capsys.readouterr().out
+    asked.clear()
+    assert race.main(["--out", str(tmp_path)]) == 0
+    assert list(asked) == [
+        f"{name}, seed 0" for name in CONTESTANTS if name not in race.TUNED or "sbx" in name
+    ]
+
+
 def test_peers_of_one_that_does_not_reach_5_mm_get_multiples_of_all_its_time():
     assert limits_of("sbx-tuned", POINTS[:2]) == Limits(5 * 22.0, 10, 5 * 22.0 / 40)
 
