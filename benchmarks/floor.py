@@ -51,7 +51,7 @@ class Cost(NamedTuple):
 
 
 def counted(function: Callable, compiled: Any, *arguments: Any) -> Cost:
-    """Operations and bytes of a jitted float32 function that was compiled, with all turns of its eliminations.
+    """Operations and bytes of a compiled float32 function, with all turns of its eliminations.
 
     Raises:
         RuntimeError: it has a library's factorisation, or a loop whose turns are not known.

@@ -118,7 +118,7 @@ def test_half_the_chambers_at_a_limit_take_a_handful_of_steps():
 
 
 def test_a_newton_step_is_that_of_the_dense_system():
-    """[H, -P^T; S, 0] (dq, dp) = (-gradient, error) where a chamber tracks, dp = limit - p where it does not."""
+    """[H, -P^T; S, 0] (dq, dp) = (-gradient, error), but dp = limit - p where a chamber is held."""
     params = ArmParams.from_spec(SPEC, np.float64)
     chain = functools.partial(chain_frames, link_length_m=params.link_length_m)
     rng = np.random.default_rng(2)

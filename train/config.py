@@ -188,8 +188,8 @@ _TUNED = TrainConfig(
 )
 
 PRESETS: dict[str, TrainConfig] = {
-    # On a CPU a gradient step costs as much as many env steps, so there are eight of these to one of those, and
-    # the batch is small.
+    # On a CPU a gradient step costs as much as many env steps, so there are eight of these to one of those,
+    # and the batch is small.
     "quick": dataclasses.replace(
         _TUNED,
         total_env_steps=240_000,
