@@ -48,7 +48,7 @@ def n_cores() -> int:
 def mesh_of_cores(n_arms: int) -> Mesh | None:
     """This process's cores as devices, as many as n arms spread over evenly; call it before JAX is used.
 
-    XLA factorises many small matrices on one core alone, so a CPU that is one device leaves the others idle.
+    XLA runs most of settling on one core, so a CPU that is one device leaves the others idle.
 
     Returns:
         None where a single device is meant: on a GPU, or where the arms cannot be spread evenly.

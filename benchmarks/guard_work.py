@@ -65,12 +65,13 @@ class Sizes(NamedTuple):
     n_settles: int  # of all arms
     n_env_steps: int  # of each arm
     n_updates: int
+    batch_size: int  # of an update
     n_ticks: int
 
 
 SIZES = {
-    "cpu": Sizes(1024, 8, 3000, 128, 10, 8, 32, 400),
-    "gpu": Sizes(8192, 8, 3000, 8192, 50, 32, 512, 400),
+    "cpu": Sizes(1024, 8, 3000, 128, 10, 8, 32, 256, 400),
+    "gpu": Sizes(8192, 8, 3000, 8192, 50, 32, 512, 256, 400),
 }
 
 
@@ -90,6 +91,7 @@ def prepare() -> tuple[Facts, Callable[[], Facts]]:
     config = dataclasses.replace(
         PRESETS["quick"],
         n_arms=sizes.n_arms,
+        batch_size=sizes.batch_size,
         updates_per_env_step=sizes.n_updates / sizes.n_arms,
         warmup_env_steps=0,
         env=env.config,
@@ -185,7 +187,7 @@ def _env_steps(job: Job, state: TrainState, sizes: Sizes) -> Callable[[], Any]:
 
 
 def _updates(job: Job, state: TrainState) -> Callable[[], Any]:
-    """Gradient steps at the preset's batch, sampled and relabelled, as within an epoch."""
+    """Gradient steps, sampled and relabelled, as within an epoch."""
 
     def learn(state: TrainState, key: Any):
         state, metrics = job._updates(state, key, jnp.array(True))

@@ -1,4 +1,4 @@
-"""How long until a policy reaches, against the peers: `python -m benchmarks race [--seeds S,S] [--tuned]`.
+"""How long until a policy reaches, against the peers: `python -m benchmarks race [--seeds S,S]`.
 
 Wall time and env steps until the median tip error at the held-out goals is so many millimetres: ours, and TQC
 of SBX and of Stable-Baselines3-contrib on the same arms, goals and evaluation. Hindsight: ours only; how fast
@@ -143,7 +143,7 @@ def claim(folder: Path, settings: Settings) -> None:
 def run(
     folder: Path, seeds: Sequence[int], settings: Settings, names: Sequence[str] = tuple(CONTESTANTS)
 ) -> list[dict[str, Any]]:
-    """The results of contestants, those that the folder has not measured first.
+    """The results of contestants and of what else the folder has; what it has not is measured.
 
     One that fails has `failed` in the place of points. If it is the first of a seed, there are no others:
     what they are given follows from it.
@@ -153,7 +153,11 @@ def run(
         first = _contest(folder, FIRST, seed, settings, Limits())
         results.append(first)
         if "failed" not in first:
-            others = [name for name in names if name != FIRST]
+            others = [
+                name
+                for name in CONTESTANTS
+                if name != FIRST and (name in names or _file(folder, name, seed).exists())
+            ]
             results += [
                 _contest(folder, name, seed, settings, limits_of(name, first["points"])) for name in others
             ]
@@ -177,7 +181,7 @@ def _library(name: str) -> str | None:
 
 def _contest(folder: Path, name: str, seed: int, settings: Settings, limits: Limits) -> dict[str, Any]:
     """The result of one contestant, measured now or before."""
-    file = folder / f"{name}-seed{seed}.json"
+    file = _file(folder, name, seed)
     if file.exists():
         result = json.loads(file.read_text("utf-8"))
         print(f"{name}, seed {seed}: measured before, in {file}, {_state(result)}")
@@ -202,6 +206,10 @@ def _contest(folder: Path, name: str, seed: int, settings: Settings, limits: Lim
         return {**result, "failed": str(error)}
     write_json(file, result)
     return result
+
+
+def _file(folder: Path, name: str, seed: int) -> Path:
+    return folder / f"{name}-seed{seed}.json"
 
 
 def _state(result: dict[str, Any]) -> str:

@@ -120,7 +120,8 @@ def peer(library: str, tuned: bool, seed: int) -> Contestant:
     start = time.perf_counter()
     if library == "sb3-contrib":
         throwaway = filled_model(algorithm)
-        choose_threads(lambda: throwaway.train(gradient_steps=32, batch_size=config.batch_size))
+        batch_size = config.batch_size if tuned else throwaway.batch_size
+        choose_threads(lambda: throwaway.train(gradient_steps=32, batch_size=batch_size))
     uncounted_s = time.perf_counter() - start
     n_arms = config.n_arms if tuned else 1
     envs = as_sb3(SoftArmVectorEnv(n_arms, config.episode_length, config=config.env))

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from mjx_softarm._mjx import mjx
-from mjx_softarm.chain_hessian import product
+from mjx_softarm.small_matrices import product
 
 DOFS_PER_LINK = 3
 

@@ -46,6 +46,7 @@ def _rest_jvp(primals, tangents):
     def gradient(params: ArmParams, pressure: Array) -> Array:
         return statics_at(q, params, pressure).gradient
 
+    # A factorisation of the whole, since what `ChainHessian.solve` does cannot be transposed.
     factor = jax.scipy.linalg.cho_factor(statics_at(q, params, pressure).hessian.dense(), lower=True)
     _, change = jax.jvp(gradient, primals, tangents)
     return q, -jax.scipy.linalg.cho_solve(factor, change)

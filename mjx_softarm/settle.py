@@ -21,8 +21,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from mjx_softarm.chain_hessian import block_diagonal, eliminate, product
 from mjx_softarm.kinematics import DOFS_PER_LINK, Frames
+from mjx_softarm.small_matrices import block_diagonal, eliminate, product
 from mjx_softarm.statics import ArmParams, statics
 
 MAX_ITERATIONS = 12

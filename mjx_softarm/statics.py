@@ -18,8 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from mjx_softarm.chain_hessian import ChainHessian, block_diagonal, product
+from mjx_softarm.chain_hessian import ChainHessian
 from mjx_softarm.kinematics import DOFS_PER_LINK, Frames
+from mjx_softarm.small_matrices import block_diagonal, product
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
 
 GRAVITY_M_S2 = 9.81

@@ -1,11 +1,12 @@
-"""Systems with a chain's Hessian against NumPy's dense ones; what is not positive definite says so."""
+"""Systems with a chain's Hessian, and small matrices, against NumPy's; what is not positive says so."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_softarm.chain_hessian import ChainHessian, block_diagonal, eliminate, product
+from mjx_softarm.chain_hessian import ChainHessian
+from mjx_softarm.small_matrices import block_diagonal, eliminate, product
 
 N_ARMS, N, K = 5, 6, 4
 
@@ -73,6 +74,7 @@ def test_a_matrix_that_is_not_positive_definite_gives_nan_and_its_neighbours_do_
     assert lowest[2] < 0 < np.delete(lowest, 2).min()
     found = jax.jit(jax.vmap(ChainHessian.solve))(hessian, columns)
     np.testing.assert_array_equal(np.isfinite(found).all((1, 2, 3)), lowest > 0)
+    assert np.isnan(found[2]).all()
 
 
 def test_the_diagonal_is_added_where_it_belongs():
@@ -92,6 +94,23 @@ def test_elimination_takes_a_matrix_that_all_share():
     )
     found = jax.vmap(eliminate, in_axes=(None, 0))(matrix, columns)
     np.testing.assert_allclose(found, np.linalg.solve(matrix, columns), atol=1e-5)
+
+
+def test_elimination_of_rows_of_which_some_are_the_identity_s():
+    rng = np.random.default_rng(1)
+    matrix = np.float32(2.0 * np.eye(6) + 0.3 * rng.normal(size=(8, 6, 6)))  # not symmetric
+    given = rng.uniform(size=(8, 6)) < 0.5
+    matrix = np.where(given[..., None], np.eye(6, dtype=np.float32), matrix)
+    columns = np.float32(rng.normal(size=(8, 6, 1)))
+    found = np.asarray(jax.jit(jax.vmap(eliminate))(matrix, columns))
+    np.testing.assert_allclose(found, np.linalg.solve(matrix, columns), atol=1e-5)
+    np.testing.assert_array_equal(found[given], columns[given])
+
+
+@pytest.mark.parametrize("pivot", [0.0, -1.0])
+def test_a_pivot_that_is_not_positive_gives_nan(pivot):
+    matrix = np.diag(np.float32([1.0, pivot, 2.0]))
+    assert np.isnan(eliminate(matrix, np.ones((3, 2), np.float32))).all()
 
 
 def test_small_products_and_block_diagonals():

@@ -6,18 +6,23 @@ import jax
 import mujoco
 import numpy as np
 import pytest
+from scipy import linalg
 
 from mjx_softarm import ArmSpec
 from mjx_softarm.kinematics import chain_frames
 from mjx_softarm.mjcf import build_model
 from mjx_softarm.settle import (
+    ACTIVE_SET_GAIN_KPA_PER_M,
     MAX_ITERATIONS,
+    MAX_STEP,
     RESIDUAL_TOLERANCE,
     TRACKING_TOLERANCE_M,
+    _Iterate,
+    _newton_step,
     settle,
     settle_pressures,
 )
-from mjx_softarm.statics import ArmParams
+from mjx_softarm.statics import ArmParams, statics
 
 SPEC = ArmSpec.default()
 LOW_KPA, HIGH_KPA = SPEC.chambers.pressure_min_kpa, SPEC.chambers.pressure_max_kpa
@@ -105,6 +110,41 @@ def test_every_chamber_tracks_or_is_at_the_limit_that_stops_it():
     assert error[at_high].min() > -TRACKING_TOLERANCE_M  # full pressure, and the spring still too short
     assert error[at_low].max() < TRACKING_TOLERANCE_M
     assert (found.tracking_error_m < TRACKING_TOLERANCE_M).all()
+
+
+def test_half_the_chambers_at_a_limit_take_a_handful_of_steps():
+    found = settled(settle, references())
+    assert found.iterations.mean() < 4.5 and found.iterations.max() <= 7  # one of them finds that all is done
+
+
+def test_a_newton_step_is_that_of_the_dense_system():
+    """[H, -P^T; S, 0] (dq, dp) = (-gradient, error), but dp = limit - p where a chamber is held."""
+    params = ArmParams.from_spec(SPEC, np.float64)
+    chain = functools.partial(chain_frames, link_length_m=params.link_length_m)
+    rng = np.random.default_rng(2)
+    with jax.enable_x64(True):
+        for _ in range(4):
+            q, pressure = rng.normal(scale=0.02, size=36), rng.uniform(LOW_KPA, HIGH_KPA, 9)
+            reference = SPEC.springs.rest_length_m + rng.uniform(-0.03, 0.03, 9)
+            before = _Iterate(q, pressure, np.zeros(9, bool), np.array(True), np.zeros(()), np.array(0))
+            after = jax.device_get(_newton_step(before, chain, params, reference))
+            now = statics(chain(q), q, pressure, params)
+            error = reference - now.springs.length
+            trial = pressure + ACTIVE_SET_GAIN_KPA_PER_M * error
+            limit = np.clip(trial, LOW_KPA, HIGH_KPA)
+            held = trial != limit
+            assert 0 < held.sum() < 9
+            system = np.zeros((45, 45))
+            system[:36, :36] = now.hessian.dense()
+            system[:36, 36:] = -(linalg.block_diag(*now.chambers.jacobian) * now.area[:, None]).T
+            system[36:, :36] = np.where(held[:, None], 0.0, linalg.block_diag(*now.springs.jacobian))
+            system[36:, 36:] = np.diag(held.astype(float))
+            right = np.concatenate([-now.gradient, np.where(held, limit - pressure, error)])
+            step = np.linalg.solve(system, right)
+            step *= min(1.0, MAX_STEP / np.abs(step[:36]).max())
+            np.testing.assert_allclose(after.q - q, step[:36], atol=1e-9)
+            np.testing.assert_allclose(after.pressure - pressure, step[36:], atol=1e-6)
+            np.testing.assert_array_equal(after.at_limit, held)
 
 
 def test_the_report_is_the_pose_and_the_lengths_of_its_joint_coordinates():

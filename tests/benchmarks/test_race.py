@@ -145,7 +145,7 @@ def test_tuned_peers_have_the_quick_preset_s_settings():
     settings = tuned_settings(PRESETS["quick"], lambda: n_steps[0])
     rate = settings.pop("learning_rate")
     assert settings == {
-        "buffer_size": 400_000,
+        "buffer_size": 262_144,
         "learning_starts": 2048,
         "batch_size": 128,
         "tau": 0.005,

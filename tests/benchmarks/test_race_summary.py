@@ -63,6 +63,15 @@ def others(*errors_mm):
     return [result(name, *errors_mm) for name in names]
 
 
+def test_a_variant_that_did_not_race_is_told():
+    results = [result("ours-quick", 6.0, 4.0), *others(*[9.0] * 30)]
+    assert "without" not in judge("sbx", results)["measured"]
+    assert summarise(results)["not_raced"] == ["ours-plain", "ours-paper"]
+    tuned = [one for one in results if one["contestant"] != "sbx-defaults"]
+    assert judge("sbx", tuned)["measured"] == judge("sbx", results)["measured"] + ", without sbx-defaults"
+    assert judge("sb3-contrib", tuned) == judge("sb3-contrib", results)
+
+
 def test_a_goal_is_met_by_the_better_variant_s_time_over_ours():
     ours = result("ours-quick", 6.0, 4.0)  # 5 mm at 17 s
     slow = [9.0] * 8

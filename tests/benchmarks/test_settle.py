@@ -21,7 +21,8 @@ from benchmarks.truth import (
 )
 from mjx_softarm import ArmSpec
 from mjx_softarm import settle as solver
-from mjx_softarm.chain_hessian import RANK, eliminate
+from mjx_softarm.chain_hessian import RANK
+from mjx_softarm.small_matrices import eliminate
 from train.devices import mesh_of
 
 SPEC = ArmSpec.default()
@@ -211,3 +212,9 @@ def test_a_turn_of_the_settling_loop_costs_its_eliminations_and_more():
     with mock.patch.object(solver, "MAX_ITERATIONS", 0):  # what is done although the loop may do nothing
         exact = settle_function(SMALL)(reference).iterations
     assert outside.flop > 0 and (exact == n_outside).all()
+
+
+def test_what_cannot_be_counted_is_no_silence():
+    function, argument = jax.jit(jnp.linalg.cholesky), jnp.eye(6)
+    with pytest.raises(RuntimeError, match="cholesky: nobody knows"):
+        counted(function, function.lower(argument).compile(), argument)
