@@ -53,7 +53,7 @@ class _Iterate(NamedTuple):
     pressure: Array
     at_limit: Array
     moving: Array
-    stiffening: Array  # () of the joints, in their own stiffness, after the energy had no minimum
+    stiffening: Array  # () of the joints, in their own stiffness, where the arm would buckle
     iteration: Array
 
 
@@ -120,7 +120,8 @@ def _newton_step(it: _Iterate, kinematics, params: ArmParams, reference_m: Array
     largest = jnp.max(jnp.abs(dq))
     scale = jnp.minimum(1.0, MAX_STEP / largest)
     same = jnp.all(at_limit == it.at_limit)
-    convex = jnp.isfinite(largest)  # else stay here and stiffen the joints, until there is a step
+    # No step where the energy is not convex, or springs do not follow chambers: stay, stiffen the joints.
+    convex = jnp.isfinite(largest)
     return _Iterate(
         q=jax.lax.select(convex, it.q + scale * dq, it.q),
         pressure=jax.lax.select(convex, it.pressure + scale * dp, it.pressure),

@@ -11,7 +11,7 @@ from jax import Array
 
 
 def product(a: Array, b: Array) -> Array:
-    """a b of small matrices (..., n, m) and (..., m, k), as sums: a matrix product is slow for tiny ones."""
+    """a b of small matrices (..., n, m) and (..., m, k), as sums: products are slow for tiny ones."""
     return jnp.sum(a[..., :, :, None] * b[..., None, :, :], axis=-2)
 
 
@@ -26,8 +26,8 @@ def block_diagonal(blocks: Array) -> Array:
 def eliminate(matrix: Array, columns: Array) -> Array:
     """The inverse of a matrix (n, n) times columns (n, k), by Gauss-Jordan elimination without pivoting.
 
-    Made for many small matrices at once. Those of an arm are positive definite, or nearly symmetric and
-    positive, and need no pivoting.
+    Right for symmetric positive definite matrices, and for what is close to such: of the settling arm, how the
+    springs that track answer to their chambers, rows of the identity for the others.
 
     Returns:
         (n, k), all NaN if a pivot is not positive, which is so where a symmetric matrix is not positive
