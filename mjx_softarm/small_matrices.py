@@ -26,8 +26,8 @@ def block_diagonal(blocks: Array) -> Array:
 def eliminate(matrix: Array, columns: Array) -> Array:
     """The inverse of a matrix (n, n) times columns (n, k), by Gauss-Jordan elimination without pivoting.
 
-    Right for symmetric positive definite matrices, and for what is close to such: of the settling arm, how the
-    springs that track answer to their chambers, rows of the identity for the others.
+    Right for symmetric positive definite matrices, and for what is close to such: of a settling arm, how the
+    springs that track answer to their chambers, and rows of the identity for the others.
 
     Returns:
         (n, k), all NaN if a pivot is not positive, which is so where a symmetric matrix is not positive
