@@ -64,17 +64,18 @@ def counted(function: Callable, compiled: Any, *arguments: Any) -> Cost:
 def settle_cost(spec: ArmSpec, reference_m: Array) -> tuple[Cost, Cost, int]:
     """What settling by the chain costs outside its loop, and a turn of it; iterations done outside.
 
-    Both are found by compiling it with the loop replaced by no turn, and by one.
+    They are found by compiling it with the loop replaced by no turn, by one and by two: in the first turn all
+    arms are still alike, and much of it is done once for all of them.
     """
     costs, n_outside = [], 0
-    for n_turns in (0, 1):
+    for n_turns in (0, 1, 2):
         with mock.patch.object(jax.lax, "while_loop", functools.partial(_turns, n_turns)):
             function = settle_function(spec)
             compiled = function.lower(reference_m).compile()
             costs.append(counted(function, compiled, reference_m))
         if n_turns == 0:
             n_outside = int(np.max(compiled(reference_m).iterations))
-    turn = Cost(*(one - none for none, one in zip(*costs, strict=True)))
+    turn = Cost(*(two - one for one, two in zip(*costs[1:], strict=True)))
     if turn.flop <= 0:
         raise RuntimeError("settle: a turn of its loop costs nothing, so it has none by `jax.lax.while_loop`")
     return costs[0], turn, n_outside

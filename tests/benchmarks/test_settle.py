@@ -203,7 +203,7 @@ def test_operations_are_counted_with_all_turns_of_an_elimination():
 
 
 def test_a_turn_of_the_settling_loop_costs_its_eliminations_and_more():
-    sections, n, n_arms = SMALL.structure.n_sections, 3 * SMALL.structure.links_per_section, 2
+    sections, n, n_arms = SMALL.structure.n_sections, 3 * SMALL.structure.links_per_section, 16
     reference = jnp.asarray(random_references(SMALL, n_arms), jnp.float32)
     outside, turn, n_outside = settle_cost(SMALL, reference)
     m = SMALL.n_chambers
