@@ -1,4 +1,4 @@
-"""How long until a policy reaches, against the peers: `python -m benchmarks race [--seeds S,S]`.
+"""How long until a policy reaches, against the peers: `python -m benchmarks race [--tuned] [--smoke]`.
 
 Wall time and env steps until the median tip error at the held-out goals is so many millimetres: ours, and TQC
 of SBX and of Stable-Baselines3-contrib on the same arms, goals and evaluation. Hindsight: ours only; how fast

@@ -11,7 +11,7 @@ from jax import Array
 
 
 def product(a: Array, b: Array) -> Array:
-    """a b of small matrices (..., n, m) and (..., m, k), as sums: products are slow for tiny ones."""
+    """a b of small matrices (..., n, m) and (..., m, k), as sums: faster than products when tiny."""
     return jnp.sum(a[..., :, :, None] * b[..., None, :, :], axis=-2)
 
 
