@@ -7,7 +7,7 @@ cores. A level is reached where the line between two evaluations crosses it for 
 
 Ours with the preset quick goes first. A peer is stopped when it has had as many times its time to 5 mm as the
 goal asks for, since the goal is met then, or when it has reached all that ours has; ours-plain has as long as
-SBX. The preset paper, which is for the finer levels, trains to the finest or to its end. What is measured
+SBX, or its preset's env steps. The preset paper, which is for the finer levels, trains to the finest or to its end. What is measured
 stays in the working folder: started again, an interrupted benchmark goes on, and seeds may be added; another
 commit or kind of machine wants another folder.
 """
@@ -96,7 +96,7 @@ def main(arguments: Sequence[str]) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks race",
-        description="Time and env steps to a tip error, against the peers; an hour and more for each seed.",
+        description="Time and env steps to a tip error, against the peers; two hours for each seed.",
     )
     parser.add_argument("--seeds", type=numbers, default=(0,), metavar="S,S", help="of training; default: 0")
     parser.add_argument(
@@ -104,7 +104,7 @@ def _parser() -> argparse.ArgumentParser:
         type=contestants,
         default=tuple(CONTESTANTS),
         metavar="NAME,NAME",
-        help=f"beside {FIRST}, these of {', '.join(CONTESTANTS)}; the rest may follow",
+        help=f"beside {FIRST}, and what was measured before: these of {', '.join(CONTESTANTS)}",
     )
     parser.add_argument("--smoke", action="store_true", help="everything, but tiny; says nothing of speed")
     parser.add_argument("--out", type=Path, metavar="DIR", help="working folder; default: runs/race")

@@ -5,12 +5,12 @@
 NAME is one of `CONTESTANTS`. Ours is the loop of `python -m train reach` without its files, with the preset
 quick or paper. The peers train on the project's Gymnasium environment as their users would, through `learn`:
 with the defaults of their algorithm and one arm, or as ours-quick does wherever they have a knob for it. They
-have none for the temperature's own learning rate. Our learning rate falls along a half cosine over the
-preset's env steps; theirs does so too, and begins anew each time.
+have none for the temperature's own learning rate, which is that of all else. Our learning rate falls along a
+half cosine over the preset's env steps, which ends our training; theirs does so too, and begins anew.
 
 Hindsight: ours exchanges goals for the pose reached and for such near it, and actions for what was sensed;
-`benchmarks.race_hindsight` has the peers' own, for as large a share of a batch. The plain ones go without it,
-and are in all else as the others: what ours-plain is faster by than a peer is code, the rest is algorithm.
+`benchmarks.race_hindsight` has the peers' own, for as large a share of a batch. The plain ones go without
+any, the rest is as with it.
 
 A clock counts from the program's start; it stands while the policy is evaluated, and while PyTorch's threads
 are chosen. Start-up is over once the peers have done a first round of updates, and ours has compiled.
@@ -119,6 +119,8 @@ def peer(library: str, variant: str, seed: int) -> Contestant:
         variant: hindsight, plain (tuned likewise, without it) or defaults.
         seed: of training.
     """
+    from stable_baselines3.common.logger import Logger  # pyright: ignore[reportMissingImports]
+
     from mjx_softarm.gym import SoftArmVectorEnv, as_sb3
     from train.config import PRESETS
 
@@ -136,11 +138,17 @@ def peer(library: str, variant: str, seed: int) -> Contestant:
     if variant != "defaults":
         envs, settings = scaled(envs, config.tqc.reward_scale), tuned_settings(config, lambda: n_steps)
     if variant == "hindsight":
-        from benchmarks.race_hindsight import GoalEnvs, hindsight_settings, with_goals
+        from benchmarks.race_hindsight import GoalEnvs, HindsightBuffer, with_goals
 
         envs, kind, seen = GoalEnvs(envs), "MultiInputPolicy", with_goals
-        settings |= hindsight_settings(arms.env, config)
+        settings["replay_buffer_class"] = HindsightBuffer
+        settings["replay_buffer_kwargs"] = {
+            "arm": arms.env,
+            "share": hindsight_share(config),
+            "reward_scale": config.tqc.reward_scale,
+        }
     model = algorithm(kind, envs, seed=seed, **settings)
+    model.set_logger(Logger(None, []))  # or each call of `learn` would make a folder
 
     def learn(n: int, **more: Any) -> None:
         nonlocal n_steps
@@ -154,6 +162,11 @@ def peer(library: str, variant: str, seed: int) -> Contestant:
         done=lambda: (n_steps, model._n_updates),
         uncounted_s=uncounted_s,
     )
+
+
+def hindsight_share(config: Any) -> float:
+    """Share of a batch that gets another goal, with a `TrainConfig`."""
+    return config.hindsight.reached_share + config.hindsight.near_share
 
 
 def tuned_settings(config: Any, n_steps: Callable[[], int]) -> dict[str, Any]:
