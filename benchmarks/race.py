@@ -7,9 +7,9 @@ cores. A level is reached where the line between two evaluations crosses it for 
 
 Ours with the preset quick goes first. A peer is stopped when it has had as many times its time to 5 mm as the
 goal asks for, since the goal is met then, or when it has reached all that ours has; ours-plain has as long as
-SBX, or its preset's env steps. The preset paper, which is for the finer levels, trains to the finest or to its end. What is measured
-stays in the working folder: started again, an interrupted benchmark goes on, and seeds may be added; another
-commit or kind of machine wants another folder.
+SBX, or its preset's env steps. The preset paper, which is for the finer levels, trains to the finest or to
+its end. What is measured stays in the working folder: started again, an interrupted benchmark goes on, and
+seeds may be added; another commit or kind of machine wants another folder.
 """
 
 from __future__ import annotations
