@@ -1,16 +1,15 @@
-"""How long until a policy reaches, against the peers: `python -m benchmarks race [--tuned] [--smoke]`.
+"""How long until a policy reaches, against the peers: `python -m benchmarks race [--only NAMES] [--smoke]`.
 
 Wall time and env steps until the median tip error at the held-out goals is so many millimetres: ours, and TQC
-of SBX and of Stable-Baselines3-contrib on the same arms, goals and evaluation. Hindsight: ours only; how fast
-ours is without it is seen of ours-plain. `benchmarks.race_contestants` says how each trains. One after
-another, each in a process of its own with all cores. A level is reached where the line between two
-evaluations crosses it for the first time.
+of SBX and of Stable-Baselines3-contrib on the same arms, goals and evaluation.
+`benchmarks.race_contestants` says how each trains. One after another, each in a process of its own with all
+cores. A level is reached where the line between two evaluations crosses it for the first time.
 
 Ours with the preset quick goes first. A peer is stopped when it has had as many times its time to 5 mm as the
 goal asks for, since the goal is met then, or when it has reached all that ours has; ours-plain has as long as
-SBX. The preset paper, which is for the finer levels, trains to the finest or to its end. What is measured
-stays in the working folder: started again, an interrupted benchmark goes on, and seeds may be added; another
-commit or kind of machine wants another folder.
+SBX, or its preset's env steps. The preset paper, which is for the finer levels, trains to the finest or to
+its end. What is measured stays in the working folder: started again, an interrupted benchmark goes on, and
+seeds may be added; another commit or kind of machine wants another folder.
 """
 
 from __future__ import annotations
@@ -46,7 +45,6 @@ from mjx_softarm.provenance import provenance, write_json
 
 N_STRETCHES = 40  # of training between evaluations, up to a peer's limit
 SETTINGS_FILE = "settings.json"
-TUNED = ("ours-quick", "sbx-tuned", "sb3-contrib-tuned", "ours-plain")
 
 
 class Limits(NamedTuple):
@@ -78,7 +76,7 @@ def main(arguments: Sequence[str]) -> int:
     folder = options.out or Path("runs/race-smoke" if options.smoke else "runs/race")
     try:
         claim(folder, settings := SMOKE if options.smoke else Settings())
-        results = run(folder, options.seeds, settings, TUNED if options.tuned else tuple(CONTESTANTS))
+        results = run(folder, options.seeds, settings, options.only)
     except (RaceError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -98,17 +96,33 @@ def main(arguments: Sequence[str]) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks race",
-        description="Time and env steps to a tip error, against the peers; an hour and more for each seed.",
+        description="Time and env steps to a tip error, against the peers; two hours for each seed.",
     )
     parser.add_argument("--seeds", type=numbers, default=(0,), metavar="S,S", help="of training; default: 0")
     parser.add_argument(
-        "--tuned",
-        action="store_true",
-        help=f"{', '.join(TUNED)} alone, in half of the time; the rest may follow",
+        "--only",
+        type=contestants,
+        default=tuple(CONTESTANTS),
+        metavar="NAME,NAME",
+        help=f"beside {FIRST}, and what was measured before: these of {', '.join(CONTESTANTS)}",
     )
     parser.add_argument("--smoke", action="store_true", help="everything, but tiny; says nothing of speed")
     parser.add_argument("--out", type=Path, metavar="DIR", help="working folder; default: runs/race")
     return parser
+
+
+def contestants(text: str) -> tuple[str, ...]:
+    """Names, separated by commas.
+
+    Raises:
+        argparse.ArgumentTypeError: there is no such contestant.
+    """
+    names = tuple(text.split(","))
+    if unknown := [name for name in names if name not in CONTESTANTS]:
+        raise argparse.ArgumentTypeError(
+            f"got {', '.join(map(repr, unknown))}, expected {', '.join(CONTESTANTS)}"
+        )
+    return names
 
 
 def claim(folder: Path, settings: Settings) -> None:

@@ -4,13 +4,13 @@
 
 NAME is one of `CONTESTANTS`. Ours is the loop of `python -m train reach` without its files, with the preset
 quick or paper. The peers train on the project's Gymnasium environment as their users would, through `learn`:
-with the defaults of their algorithm and one arm, or tuned as ours-quick is wherever they have a knob for it.
-They have none for the temperature's own learning rate. Our learning rate falls along a half cosine over the
-preset's env steps; theirs does so too, and begins anew each time.
+with the defaults of their algorithm and one arm, or as ours-quick does wherever they have a knob for it. They
+have none for the temperature's own learning rate, which is that of all else. Our learning rate falls along a
+half cosine over the preset's env steps, which ends our training; theirs does so too, and begins anew.
 
-Hindsight: ours only. The peers' wants observations as a dictionary, and those of the Gymnasium wrapper are
-flat. So ours-plain goes without it, too: no goal is exchanged and no action, the rest is as in ours-quick. It
-is plain TQC, and what it is faster by than a peer is code, what ours-quick is faster by than it algorithm.
+Hindsight: ours exchanges goals for the pose reached and for such near it, and actions for what was sensed;
+`benchmarks.race_hindsight` has the peers' own, for as large a share of a batch. The plain ones go without
+any, the rest is as with it.
 
 A clock counts from the program's start; it stands while the policy is evaluated, and while PyTorch's threads
 are chosen. Start-up is over once the peers have done a first round of updates, and ours has compiled.
@@ -111,8 +111,16 @@ def ours(name: str, seed: int) -> Contestant:
     )
 
 
-def peer(library: str, tuned: bool, seed: int) -> Contestant:
-    """TQC of SBX or Stable-Baselines3-contrib, after its first round of updates."""
+def peer(library: str, variant: str, seed: int) -> Contestant:
+    """TQC of SBX or Stable-Baselines3-contrib, after its first round of updates.
+
+    Args:
+        library: key of `benchmarks.peers.PINS`.
+        variant: hindsight, plain (tuned likewise, without it) or defaults.
+        seed: of training.
+    """
+    from stable_baselines3.common.logger import Logger  # pyright: ignore[reportMissingImports]
+
     from mjx_softarm.gym import SoftArmVectorEnv, as_sb3
     from train.config import PRESETS
 
@@ -120,16 +128,27 @@ def peer(library: str, tuned: bool, seed: int) -> Contestant:
     start = time.perf_counter()
     if library == "sb3-contrib":
         throwaway = filled_model(algorithm)
-        batch_size = config.batch_size if tuned else throwaway.batch_size
+        batch_size = throwaway.batch_size if variant == "defaults" else config.batch_size
         choose_threads(lambda: throwaway.train(gradient_steps=32, batch_size=batch_size))
     uncounted_s = time.perf_counter() - start
-    n_arms = config.n_arms if tuned else 1
-    envs = as_sb3(SoftArmVectorEnv(n_arms, config.episode_length, config=config.env))
-    settings: dict[str, Any] = {}
+    n_arms = 1 if variant == "defaults" else config.n_arms
+    arms = SoftArmVectorEnv(n_arms, config.episode_length, config=config.env)
+    envs, settings, kind, seen = as_sb3(arms), {}, "MlpPolicy", lambda obs: obs
     n_steps = 0
-    if tuned:
+    if variant != "defaults":
         envs, settings = scaled(envs, config.tqc.reward_scale), tuned_settings(config, lambda: n_steps)
-    model = algorithm("MlpPolicy", envs, seed=seed, **settings)
+    if variant == "hindsight":
+        from benchmarks.race_hindsight import GoalEnvs, HindsightBuffer, with_goals
+
+        envs, kind, seen = GoalEnvs(envs), "MultiInputPolicy", with_goals
+        settings["replay_buffer_class"] = HindsightBuffer
+        settings["replay_buffer_kwargs"] = {
+            "arm": arms.env,
+            "share": hindsight_share(config),
+            "reward_scale": config.tqc.reward_scale,
+        }
+    model = algorithm(kind, envs, seed=seed, **settings)
+    model.set_logger(Logger(None, []))  # or each call of `learn` would make a folder
 
     def learn(n: int, **more: Any) -> None:
         nonlocal n_steps
@@ -139,10 +158,15 @@ def peer(library: str, tuned: bool, seed: int) -> Contestant:
     learn(model.learning_starts + n_arms)
     return Contestant(
         train=lambda: learn(CHUNK, reset_num_timesteps=False),
-        policy=lambda obs: model.predict(obs, deterministic=True)[0],
+        policy=lambda obs: model.predict(seen(obs), deterministic=True)[0],
         done=lambda: (n_steps, model._n_updates),
         uncounted_s=uncounted_s,
     )
+
+
+def hindsight_share(config: Any) -> float:
+    """Share of a batch that gets another goal, with a `TrainConfig`."""
+    return config.hindsight.reached_share + config.hindsight.near_share
 
 
 def tuned_settings(config: Any, n_steps: Callable[[], int]) -> dict[str, Any]:
@@ -198,12 +222,14 @@ def _algorithm(library: str) -> Any:
 
 CONTESTANTS: dict[str, Callable[[int], Contestant]] = {  # the most telling first
     "ours-quick": lambda seed: ours("ours-quick", seed),
-    "sbx-tuned": lambda seed: peer("sbx", True, seed),
-    "sb3-contrib-tuned": lambda seed: peer("sb3-contrib", True, seed),
+    "sbx-hindsight": lambda seed: peer("sbx", "hindsight", seed),
+    "sb3-contrib-hindsight": lambda seed: peer("sb3-contrib", "hindsight", seed),
+    "sbx-plain": lambda seed: peer("sbx", "plain", seed),
+    "sb3-contrib-plain": lambda seed: peer("sb3-contrib", "plain", seed),
     "ours-plain": lambda seed: ours("ours-plain", seed),
+    "sbx-defaults": lambda seed: peer("sbx", "defaults", seed),
+    "sb3-contrib-defaults": lambda seed: peer("sb3-contrib", "defaults", seed),
     "ours-paper": lambda seed: ours("ours-paper", seed),
-    "sbx-defaults": lambda seed: peer("sbx", False, seed),
-    "sb3-contrib-defaults": lambda seed: peer("sb3-contrib", False, seed),
 }
 
 

@@ -196,8 +196,8 @@ def asked(monkeypatch):
 
     def made_up(worker, limits, n_points):
         asked[worker.name] = limits
-        if worker.name.startswith("sbx-tuned"):
-            raise WorkerError("sbx-tuned: not today")
+        if worker.name.startswith("sbx-hindsight"):
+            raise WorkerError("sbx-hindsight: not today")
         return {"start_up_s": 2.0, "limit_s": None, "points": POINTS}
 
     monkeypatch.setattr(race, "train", made_up)
@@ -210,41 +210,49 @@ def test_peers_get_our_time_to_5_mm_as_often_as_the_goal_asks_and_stop_where_our
     sbx, sb3 = (Limits(n * 29.5, 5, n * 29.5 / 40) for n in (5, 15))
     assert asked == {
         "ours-quick, seed 4": Limits(float("inf"), 0.0, 0.0),
-        "sbx-tuned, seed 4": sbx,
-        "sb3-contrib-tuned, seed 4": sb3,
+        "sbx-hindsight, seed 4": sbx,
+        "sb3-contrib-hindsight, seed 4": sb3,
+        "sbx-plain, seed 4": sbx,
+        "sb3-contrib-plain, seed 4": sb3,
         "ours-plain, seed 4": sbx,
-        "ours-paper, seed 4": Limits(float("inf"), 2, sbx.stretch_s),
         "sbx-defaults, seed 4": sbx,
         "sb3-contrib-defaults, seed 4": sb3,
+        "ours-paper, seed 4": Limits(float("inf"), 2, sbx.stretch_s),
     }
     assert list(asked) == [f"{name}, seed 4" for name in CONTESTANTS]  # the most telling first
-    assert [one["contestant"] for one in results if "failed" in one] == ["sbx-tuned"]
+    assert [one["contestant"] for one in results if "failed" in one] == ["sbx-hindsight"]
 
 
-def test_tuned_ones_may_race_alone_and_the_others_follow(asked, monkeypatch, tmp_path, capsys):
+def test_some_may_race_alone_and_the_others_follow(asked, monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(race, "save", lambda *_: tmp_path / "race.json")
-    assert race.main(["--tuned", "--out", str(tmp_path)]) == 0
-    assert list(asked) == [f"{name}, seed 0" for name in race.TUNED]
-    assert "['ours-paper', 'sbx-defaults', 'sb3-contrib-defaults']" in capsys.readouterr().out
+    some = [name for name in CONTESTANTS if "hindsight" in name or "plain" in name]
+    assert race.main(["--only", ",".join(some), "--out", str(tmp_path)]) == 0
+    assert list(asked) == [f"{name}, seed 0" for name in ("ours-quick", *some)]
+    assert "['sbx-defaults', 'sb3-contrib-defaults', 'ours-paper']" in capsys.readouterr().out
     asked.clear()
     assert race.main(["--out", str(tmp_path)]) == 0
-    assert list(asked) == [
-        f"{name}, seed 0" for name in CONTESTANTS if name not in race.TUNED or "sbx" in name
-    ]
+    rest = ("sbx-hindsight", "sbx-defaults", "sb3-contrib-defaults", "ours-paper")  # the first had failed
+    assert list(asked) == [f"{name}, seed 0" for name in rest]
+
+
+def test_contestants_that_there_are_not_are_refused(capsys):
+    with pytest.raises(SystemExit):
+        race.main(["--only", "sbx-plain,sbx"])
+    assert "got 'sbx', expected ours-quick, sbx-hindsight" in capsys.readouterr().err
 
 
 def test_peers_of_one_that_does_not_reach_5_mm_get_multiples_of_all_its_time():
-    assert limits_of("sbx-tuned", POINTS[:2]) == Limits(5 * 22.0, 10, 5 * 22.0 / 40)
+    assert limits_of("sbx-plain", POINTS[:2]) == Limits(5 * 22.0, 10, 5 * 22.0 / 40)
 
 
 def test_what_was_measured_is_not_measured_again_but_what_failed_is(asked, tmp_path):
     before = run(tmp_path, (0,), Settings())
     asked.clear()
     assert run(tmp_path, (0,), Settings()) == before
-    assert list(asked) == ["sbx-tuned, seed 0"]
+    assert list(asked) == ["sbx-hindsight, seed 0"]
     asked.clear()
     run(tmp_path, (0, 1), Settings())
-    assert len(asked) == 1 + 7
+    assert len(asked) == 1 + len(CONTESTANTS)
 
 
 def test_each_file_has_the_state_of_the_code_it_was_measured_with(asked, monkeypatch, tmp_path, capsys):
@@ -256,7 +264,8 @@ def test_each_file_has_the_state_of_the_code_it_was_measured_with(asked, monkeyp
     assert "ours-plain, seed 0: commit a1b2 with uncommitted changes" in capsys.readouterr().out
     run(tmp_path, (0,), Settings())
     said = capsys.readouterr().out
-    assert "ours-plain, seed 0: measured before" in said and said.count("commit a1b2 with") == 7
+    assert "ours-plain, seed 0: measured before" in said
+    assert said.count("commit a1b2 with") == len(CONTESTANTS)
 
 
 def test_a_folder_of_another_commit_or_size_is_refused(monkeypatch, tmp_path):
@@ -292,7 +301,8 @@ def test_without_the_first_there_is_no_race_and_other_seeds_are_told(monkeypatch
     said = capsys.readouterr()
     assert "ours-quick failed, without which there is no race; nothing is written" in said.err
     assert "stopped with status 1" in said.out and "29.5" in said.out
-    assert not list(tmp_path.glob("*seed0.json")) and len(list(tmp_path.glob("*seed1.json"))) == 7
+    assert not list(tmp_path.glob("*seed0.json"))
+    assert len(list(tmp_path.glob("*seed1.json"))) == len(CONTESTANTS)
 
 
 @pytest.mark.parametrize("seeds", ["", "1,", "-1", "a"])
