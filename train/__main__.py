@@ -23,7 +23,7 @@ from mjx_softarm.deploy.arms import ArmError
 from mjx_softarm.s2r import S2R, S2R_FILE, load_s2r
 from mjx_softarm.spec import ARM_FILE, ArmSpec, SpecError
 from train import devices
-from train.checkpoint import Run, RunError
+from train.checkpoint import Run, RunError, sole_trainer
 from train.config import (
     IMITATION_PRESETS,
     IMITATION_PRESETS_HELP,
@@ -191,7 +191,8 @@ def _train(run: Run, task: Task, console: Console) -> int:
 
     console.print(f"run: {run.path}", highlight=False)
     try:
-        summary = train(run, task, console)
+        with sole_trainer(run.path):
+            summary = train(run, task, console)
     except Interrupted as stop:
         console.print(str(stop), highlight=False)
         return 130

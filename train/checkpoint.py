@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import json
 import os
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, cast
 
@@ -23,11 +26,30 @@ from train.devices import is_first_process, wait_for_all
 from train.job import TrainState
 
 N_KEPT = 2
-CHECKPOINTS, DEMONSTRATIONS_FILE = "checkpoints", "demonstrations.npz"
+CHECKPOINTS, DEMONSTRATIONS_FILE, LOCK_FILE = "checkpoints", "demonstrations.npz", "training.lock"
 
 
 class RunError(ValueError):
     """A folder that does not hold a run that can be used; the message names it and what is wrong."""
+
+
+@contextlib.contextmanager
+def sole_trainer(path: Path) -> Iterator[None]:
+    """Hold the folder of a run or of a sweep while training in it; a process that is killed lets go of it.
+
+    Where several processes train together, the first one holds it.
+
+    Raises:
+        RunError: another process holds it.
+    """
+    with contextlib.ExitStack() as stack:
+        if is_first_process():
+            file = stack.enter_context(open(path / LOCK_FILE, "w"))
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise RunError(f"{path}: another process is training in it; stop it, or wait") from error
+        yield
 
 
 class Run:

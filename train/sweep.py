@@ -12,6 +12,7 @@ from rich.console import Console
 
 from mjx_softarm.s2r import S2R
 from mjx_softarm.spec import ArmSpec
+from train.checkpoint import sole_trainer
 from train.config import PRESETS, ConfigError, TrainConfig, override
 from train.options import add_arm, check_resume_alone
 from train.sweep_job import VARIABLE, setting
@@ -64,7 +65,8 @@ def _sweep(options: argparse.Namespace, console: Console, arm_of: ArmOf) -> int:
         sweep = create(path, members, varied, spec, s2r)
     console.print(f"sweep: {sweep.path}, {len(sweep.runs)} members", highlight=False)
     try:
-        train(sweep, console)
+        with sole_trainer(sweep.path):
+            train(sweep, console)
     except Interrupted as stop:
         console.print(str(stop), highlight=False)
         return 130

@@ -19,7 +19,7 @@ from mjx_softarm.sensors import SensorParams, frequency_from_length
 from mjx_softarm.spec import ArmSpec
 from mjx_softarm.workspace import sample_workspace
 from train.__main__ import main
-from train.checkpoint import Run
+from train.checkpoint import Run, RunError, sole_trainer
 from train.job import Job
 from train.plots import IMITATION_PICTURES, REACH_PICTURES
 from train.run import task_of_run
@@ -96,6 +96,30 @@ def test_a_run_survives_kill_9_and_ends_with_the_same_bits(tmp_path, environment
 
     assert main(["export", str(whole)]) == 0
     assert (whole / "policy.npz").exists()
+
+
+HOLD = """
+import sys, time
+from pathlib import Path
+from train.checkpoint import sole_trainer
+with sole_trainer(Path(sys.argv[1])):
+    print("held", flush=True)
+    time.sleep(600)
+"""
+
+
+def test_a_folder_has_one_trainer_at_a_time_and_is_free_once_that_was_killed(tmp_path):
+    holder = subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path)], stdout=subprocess.PIPE, text=True)
+    assert holder.stdout.readline() == "held\n"
+    with (
+        pytest.raises(RunError, match=f"{tmp_path}: another process is training in it"),
+        sole_trainer(tmp_path),
+    ):
+        pass
+    holder.kill()
+    holder.communicate()
+    with sole_trainer(tmp_path):
+        pass
 
 
 def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path, environment):
