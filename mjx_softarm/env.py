@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from mjx_softarm import control, obs, rewards, sensors
+from mjx_softarm import control, draws, obs, rewards, sensors
 from mjx_softarm._mjx import Env, State, mjx
 from mjx_softarm.dynamics import Motion, advance, with_params
 from mjx_softarm.kinematics import chain_frames, mjx_frames
@@ -83,6 +83,13 @@ class EnvConfig:
             raise ValueError(f"EnvConfig.n_poses: got {self.n_poses}, expected at least 1")
         if self.workspace_seed == HELD_OUT_SEED:
             raise ValueError(f"EnvConfig.workspace_seed: {HELD_OUT_SEED} draws the goals of the evaluation")
+
+
+class Lot(NamedTuple):
+    """What chance decides of an episode."""
+
+    share: Array  # (3 + n_chambers,) from 0 to 1: start, goal, payload, stiffness of each chamber
+    noise: Array  # (n_chambers,) of the standard normal distribution, of each spring
 
 
 class ArmState(NamedTuple):
@@ -163,16 +170,25 @@ class ReachEnv(Env):
 
     def reset(self, rng: Array) -> State:
         """A new episode: an arm of the randomisation, at a random pose, with a random goal."""
-        key_params, key_sensor, key_start, key_goal = jax.random.split(rng, 4)
-        spread = self.config.randomisation
-        start = jax.tree.map(
-            lambda x: x[jax.random.randint(key_start, (), 0, self.config.n_poses)], self.pool
+        return self.begin(jax.tree.map(lambda x: x[0], self.draw(rng, 1)))
+
+    def draw(self, rng: Array, n: int) -> Lot:
+        """What chance decides of n new episodes: leaves (n, ...)."""
+        key_uniform, key_normal = jax.random.split(rng)
+        return Lot(
+            share=draws.uniform(key_uniform, (n, 3 + self.action_size)),
+            noise=draws.normal(key_normal, (n, self.action_size)),
         )
-        goal = self.pool.pose[jax.random.randint(key_goal, (), 0, self.config.n_poses)]
-        noise = jax.random.normal(key_sensor, (self.action_size,))
+
+    def begin(self, lot: Lot) -> State:
+        """A new episode."""
+        share = lot.share
+        start_row, goal_row = (self.config.n_poses * share[:2]).astype(jnp.int32)
+        start = jax.tree.map(lambda x: x[start_row], self.pool)
+        goal = self.pool.pose[goal_row]
         arm = ArmState(
-            params=self._randomised(key_params),
-            sensor_offset_m=1e-3 * spread.sensor_noise_mm * noise,
+            params=self._randomised(share[2], share[3:]),
+            sensor_offset_m=1e-3 * self.config.randomisation.sensor_noise_mm * lot.noise,
             motion=Motion(start.q, jnp.zeros_like(start.q), start.pressure_kpa),
             pose=start.pose,
             spring_m=start.spring_m,
@@ -279,14 +295,11 @@ class ReachEnv(Env):
         """The observation (..., 18) of a pose and a goal (..., 6) [mm, deg]."""
         return obs.observe(pose, goal, self.scale, self.config.reward)
 
-    def _randomised(self, key: Array) -> ArmParams:
-        key_payload, key_stiffness = jax.random.split(key)
+    def _randomised(self, payload: Array, stiffness: Array) -> ArmParams:
+        """The arm at shares, from 0 to 1, of the ranges of its payload () and stiffness (n_chambers,)."""
         spread = self.config.randomisation
-        payload = spread.payload_max_kg * jax.random.uniform(key_payload)
-        factor = 1.0 + spread.stiffness_spread * jax.random.uniform(
-            key_stiffness, (self.action_size,), minval=-1.0
-        )
+        factor = 1.0 + spread.stiffness_spread * (2.0 * stiffness - 1.0)
         return self.params._replace(
-            tool_mass_kg=self.params.tool_mass_kg.at[PAYLOAD].add(payload),
+            tool_mass_kg=self.params.tool_mass_kg.at[PAYLOAD].add(spread.payload_max_kg * payload),
             chamber_stiffness=self.params.chamber_stiffness * factor,
         )

@@ -48,7 +48,7 @@ class VectorEnv:
 
     def reset(self, key: Array) -> State:
         """State of n fresh arms."""
-        return over_arms(self.env.reset, self.mesh)(jax.random.split(key, self.n))
+        return over_arms(self.env.begin, self.mesh)(self.env.draw(key, self.n))
 
     def step(self, state: State, action: Array, key: Array) -> tuple[State, State, Outcome]:
         """Act once.

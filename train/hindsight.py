@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from mjx_softarm import obs, rewards
+from mjx_softarm import draws, obs, rewards
 from train.tqc import Transition
 
 
@@ -80,12 +80,13 @@ def relabel(
         exchange_actions: whether a saturated action may be exchanged for the sensed one. Right only where
             an action leads to rest: the lengths sensed in the middle of a motion lead elsewhere.
     """
-    key_kind, key_near = jax.random.split(key)
+    key_uniform, key_direction = jax.random.split(key)
     n = batch.saturated.shape[0]
-    kind = jax.random.uniform(key_kind, (n,))
+    kind, distance = draws.uniform(key_uniform, (2, n))
+    direction = draws.normal(key_direction, (n, 6))
     reached = kind < config.reached_share
     near = ~reached & (kind < config.reached_share + config.near_share)
-    moved = batch.next_pose + _near_offsets(key_near, n, config).astype(batch.next_pose.dtype)
+    moved = batch.next_pose + _near_offsets(distance, direction, config).astype(batch.next_pose.dtype)
     goal = jnp.where(reached[:, None], batch.next_pose, jnp.where(near[:, None], moved, batch.goal))
     sensed = (reached | near) & batch.saturated & exchange_actions
     action = jnp.where(sensed[:, None], batch.sensed_action, batch.action)
@@ -102,16 +103,19 @@ def relabel(
     )
 
 
-def _near_offsets(key: Array, n: int, config: HindsightConfig) -> Array:
+def _near_offsets(distance: Array, direction: Array, config: HindsightConfig) -> Array:
     """Offsets (n, 6) [mm, deg]: translations in random directions, log-uniform in length, and turns.
 
     A turn is a normal draw in proportion to the translation's length over its own norm, so it has a heavy
     tail: some goals are turned further than the arm can, as goals that a user asks for may be.
+
+    Args:
+        distance (n,): uniform draws.
+        direction (n, 6): normal draws.
+        config: nearest, furthest, and how far the angles are turned.
     """
-    key_length, key_direction = jax.random.split(key)
     low, high = jnp.log(config.near_min_mm), jnp.log(config.near_max_mm)
-    length = jnp.exp(jax.random.uniform(key_length, (n, 1), minval=low, maxval=high))
-    direction = jax.random.normal(key_direction, (n, 6))
+    length = jnp.exp(low + (high - low) * distance)[:, None]
     direction = direction / jnp.linalg.norm(direction[:, :3], axis=-1, keepdims=True)
     per_unit = jnp.array([1.0] * 3 + [1.0 / config.mm_per_deg] * 3)
     return length * direction * per_unit

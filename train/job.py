@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.sharding import Mesh
 
-from mjx_softarm import xla
+from mjx_softarm import draws, xla
 from mjx_softarm._mjx import State
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.wrappers import VectorEnv
@@ -87,7 +87,7 @@ class Job:
     def _vector_step(self, state: TrainState, _) -> tuple[TrainState, dict[str, Array]]:
         key, key_act, key_random, key_reset, key_updates = jax.random.split(state.key, 5)
         warmed_up = state.n_env_steps >= self.config.warmup_env_steps
-        explored = jax.random.uniform(key_random, (self.arms.n, self.env.action_size), minval=-1.0)
+        explored = draws.uniform(key_random, (self.arms.n, self.env.action_size), minval=-1.0)
         action = self.agent.act(state.agent.actor_params, state.arms.obs, key_act)
         action = jnp.where(warmed_up, action, explored)
         arms, after, outcome = self.arms.step(state.arms, action, key_reset)

@@ -4,6 +4,8 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from mjx_softarm import draws
+
 LOG_STD_MIN = -20.0
 LOG_STD_MAX = 2.0
 
@@ -119,7 +121,7 @@ def sample_action(mean: jax.Array, log_std: jax.Array, key: jax.Array) -> tuple[
     Returns:
         action (..., A) in (-1, 1) and log_prob (...).
     """
-    return squash(mean, log_std, jax.random.normal(key, mean.shape, mean.dtype))
+    return squash(mean, log_std, draws.normal(key, mean.shape))
 
 
 def mode(mean: jax.Array) -> jax.Array:

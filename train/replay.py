@@ -94,7 +94,8 @@ def sample(replay: Replay, key: Array, batch_size: int) -> Items:
     Returns:
         Pytree of leaves (B, ...).
     """
-    slot = jax.random.randint(key, (batch_size,), 0, replay.size)  # (B,)
+    # The remainder favours some slots by less than one in a thousand; it compiles faster than randint does.
+    slot = jax.random.bits(key, (batch_size,), jnp.uint32) % replay.size.astype(jnp.uint32)  # (B,)
     return jax.tree.map(lambda ring: ring[slot], replay.data)
 
 

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
+from mjx_softarm import draws
 from train.losses import actor_loss, alpha_loss, quantile_huber_loss, truncated_targets
 from train.networks import Actor, Critics, mode, sample_action, squash
 
@@ -139,7 +140,7 @@ class TQC:
             ValueError: a field of `batch` has the wrong shape.
         """
         self._check_shapes(batch)
-        noise, next_noise = jax.random.normal(key, (2, *batch.action.shape))  # (B, A) each
+        noise, next_noise = draws.normal(key, (2, *batch.action.shape))  # (B, A) each
         targets = self._targets(state, batch, next_noise)  # (B, K)
 
         critic_grad = jax.value_and_grad(self._critic_loss, has_aux=True)
