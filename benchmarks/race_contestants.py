@@ -105,7 +105,7 @@ def ours(name: str, seed: int) -> Contestant:
 
     return Contestant(
         train,
-        policy=lambda obs: np.asarray(act(state.agent.actor_params, obs)),
+        policy=lambda obs: np.asarray(act(state.agent.mean_actor_params, obs)),
         done=lambda: (int(state.n_env_steps), int(state.agent.step)),
         limit=config.total_env_steps,
     )

@@ -58,7 +58,7 @@ def train(run: Run, task: Task, console: Console) -> Any:
             epoch += 1
             stop, due = any_process(bool(asked)), run.config.evaluates_after(epoch)
             if due:
-                row |= evaluation(task, state.agent.actor_params)
+                row |= evaluation(task, state.agent.mean_actor_params)
             record(run, board, epoch, counts(state), row)
             if due or stop:
                 run.save(epoch, state)
@@ -67,7 +67,7 @@ def train(run: Run, task: Task, console: Console) -> Any:
                 console.print(f"epoch {epoch} of {run.config.n_epochs}: {_line(task, row)}", highlight=False)
             if stop and epoch < run.config.n_epochs:
                 raise Interrupted(f"stopped after epoch {epoch}; continue with --resume {run.path}")
-    return finish(run, task, state.agent.actor_params)
+    return finish(run, task, state.agent.mean_actor_params)
 
 
 def finish(run: Run, task: Task, actor_params: Any) -> Any:
@@ -92,7 +92,7 @@ def task_of_run(run: Run, mesh: Mesh | None = None) -> Task:
 def restore_actor(run: Run) -> tuple[Task, Any]:
     """The task of a run, and the actor of its newest checkpoint."""
     task = task_of_run(run)
-    return task, _restored(run, task, "agent").actor_params
+    return task, _restored(run, task, "agent").mean_actor_params
 
 
 def begin_with(task: Task, seed: int, agent: Run | None = None, reward: Run | None = None) -> TrainState:
@@ -110,7 +110,7 @@ def begin_with(task: Task, seed: int, agent: Run | None = None, reward: Run | No
     state = task.job.init(jax.random.PRNGKey(seed))
     if agent is not None:
         given = _restored(agent, task_of_run(agent), "agent")
-        names = ("actor_params", "critic_params", "target_params", "log_alpha")
+        names = ("actor_params", "mean_actor_params", "critic_params", "target_params", "log_alpha")
         parts = {name: getattr(given, name) for name in names}
         _same_shapes(agent, "networks", parts, {name: getattr(state.agent, name) for name in names})
         state = state._replace(agent=state.agent._replace(**parts))

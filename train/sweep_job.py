@@ -97,7 +97,7 @@ class SweepJob:
 
     def actor_params(self, states: TrainState, k: int) -> Any:
         """Parameters of a member's actor."""
-        return self._take(states.agent.actor_params, k)
+        return self._take(states.agent.mean_actor_params, k)
 
     def member(self, states: TrainState, k: int) -> TrainState:
         """The state of one member, as an ordinary run has it."""

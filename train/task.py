@@ -68,7 +68,7 @@ def _imitation(
     def prepare(state: TrainState, epoch: int) -> TrainState:
         every = config.rebalance_epochs
         if every and epoch and epoch % every == 0 and epoch not in config.stage_epochs:
-            summary, _ = evaluate(state.agent.actor_params)
+            summary, _ = evaluate(state.agent.mean_actor_params)
             state = job.rebalance(state, epoch, summary.error_mm)
         else:
             state = job.begin_stage(state, epoch)

@@ -9,6 +9,7 @@ Shapes: B batch, O observation, A action, C critics, M quantiles per critic, K k
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -38,7 +39,7 @@ class TQCConfig:
     learning_rate_end: float = 1.0  # share of it left at the end; it falls along a half cosine
     learning_rate_alpha: float = 3e-4  # of the temperature; 0 holds it at initial_alpha
     gamma: float = 0.99  # discount per step
-    tau: float = 0.005  # Polyak rate of the target critics, per update
+    tau: float = 0.005  # Polyak rate of the target critics and of the mean actor, per update
     initial_alpha: float = 1.0  # temperature
     target_entropy: float | None = None  # [nat]; None is minus the number of actions
     reward_scale: float = 1.0  # on every reward in the critics' targets
@@ -73,6 +74,7 @@ class TQCState(NamedTuple):
     """All that an update changes."""
 
     actor_params: Params
+    mean_actor_params: Params  # Polyak average of actor_params: the policy that comes of training
     critic_params: Params
     target_params: Params  # shaped as critic_params
     log_alpha: Array  # () log temperature
@@ -101,18 +103,18 @@ class TQC:
         self.target_entropy = -float(action_size) if config.target_entropy is None else config.target_entropy
 
     def init(self, key: Array) -> TQCState:
-        """Fresh parameters; the target critics start as a copy of the critics."""
+        """Fresh parameters; target critics and mean actor start as copies."""
         key_actor, key_critic = jax.random.split(key)
         obs = jnp.zeros((1, self.obs_size))
+        own_buffers = functools.partial(jax.tree.map, jnp.copy)  # so that a state can be donated
         actor_params = self.actor.init(key_actor, obs)
         critic_params = self.critics.init(key_critic, obs, jnp.zeros((1, self.action_size)))
         log_alpha = jnp.log(jnp.asarray(self.config.initial_alpha, obs.dtype))
         return TQCState(
             actor_params=actor_params,
+            mean_actor_params=own_buffers(actor_params),
             critic_params=critic_params,
-            target_params=jax.tree.map(
-                jnp.copy, critic_params
-            ),  # own buffers, so that a state can be donated
+            target_params=own_buffers(critic_params),
             log_alpha=log_alpha,
             actor_opt_state=self.optimizer.init(actor_params),
             critic_opt_state=self.optimizer.init(critic_params),
@@ -129,7 +131,7 @@ class TQC:
         return mode(self.actor.apply(actor_params, obs)[0])
 
     def update(self, state: TQCState, batch: Transition, key: Array) -> tuple[TQCState, dict[str, Array]]:
-        """One gradient step of critics, actor and temperature, then of the target critics.
+        """One gradient step of critics, actor and temperature, then of target critics and mean actor.
 
         All three gradients are taken at the incoming state, so none waits for another's optimiser.
 
@@ -154,6 +156,7 @@ class TQC:
         temperature = _descend(self.alpha_optimizer, d_alpha, state.alpha_opt_state, state.log_alpha)
         next_state = TQCState(
             actor_params=actor[0],
+            mean_actor_params=optax.incremental_update(actor[0], state.mean_actor_params, self.config.tau),
             critic_params=critic[0],
             target_params=optax.incremental_update(critic[0], state.target_params, self.config.tau),
             log_alpha=temperature[0],

@@ -222,13 +222,24 @@ def test_update_is_one_adam_step_on_each_loss_at_the_incoming_state(agent, state
             np.testing.assert_allclose((old - new)[certain], step[certain], atol=2e-2 * CONFIG.learning_rate)
 
 
-def test_target_critics_move_by_tau_towards_the_new_critics(state, update):
-    got, _ = update(state, make_batch(), jax.random.key(1))
-    for new, old, target in zip(
-        *map(jax.tree.leaves, (got.critic_params, state.target_params, got.target_params)), strict=True
-    ):
+@pytest.mark.parametrize(
+    "network, average", [("critic_params", "target_params"), ("actor_params", "mean_actor_params")]
+)
+def test_averages_move_by_tau_towards_the_new_networks(state, init, update, network, average):
+    before = state._replace(**{average: getattr(init(jax.random.key(7)), network)})
+    got, _ = update(before, make_batch(), jax.random.key(1))
+    trees = getattr(got, network), getattr(before, average), getattr(got, average)
+    for new, old, mean in zip(*map(jax.tree.leaves, trees), strict=True):
         expected = (1.0 - CONFIG.tau) * np.asarray(old) + CONFIG.tau * np.asarray(new)
-        np.testing.assert_allclose(target, expected, atol=1e-6)
+        np.testing.assert_allclose(mean, expected, atol=1e-6)
+
+
+def test_averages_begin_with_the_networks_in_buffers_of_their_own(state):
+    for network, average in (("critic_params", "target_params"), ("actor_params", "mean_actor_params")):
+        new, old = getattr(state, network), getattr(state, average)
+        assert equal(new, old)
+        pairs = zip(*map(jax.tree.leaves, (new, old)), strict=True)
+        assert all(a.unsafe_buffer_pointer() != b.unsafe_buffer_pointer() for a, b in pairs)
 
 
 def test_actor_and_temperature_do_not_reach_the_critics_of_terminated_steps(init, state, update):
