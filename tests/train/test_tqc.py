@@ -234,7 +234,8 @@ def test_averages_move_by_tau_towards_the_new_networks(state, init, update, netw
         np.testing.assert_allclose(mean, expected, atol=1e-6)
 
 
-def test_averages_begin_with_the_networks(state):
+def test_averages_begin_with_the_networks(init):
+    state = init(jax.random.key(2))
     assert equal(state.critic_params, state.target_params)
     assert equal(state.actor_params, state.mean_actor_params)
 
