@@ -37,7 +37,9 @@ class GoalEnvs(VecEnvWrapper):
 
     def __init__(self, venv: VecEnv):
         flat = venv.observation_space
-        boxes = {name: gymnasium.spaces.Box(flat.low[part], flat.high[part]) for name, part in PARTS.items()}
+        boxes = [
+            (name, gymnasium.spaces.Box(flat.low[part], flat.high[part])) for name, part in PARTS.items()
+        ]
         super().__init__(venv, gymnasium.spaces.Dict(boxes))
 
     def reset(self) -> dict[str, np.ndarray]:
