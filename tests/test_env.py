@@ -391,7 +391,7 @@ def few(request):
 
 def compiled(env):
     """Four arms, reset, and step."""
-    keys = jax.random.split(jax.random.key(0), 4)
+    keys = jax.random.split(jax.random.key(3), 4)
     reset, step = (xla.jit(jax.vmap(function), env.uses_mjx) for function in (env.reset, env.step))
     return reset(keys), step
 
@@ -420,7 +420,7 @@ def test_mode_dynamic_comes_to_rest_at_the_quasi_static_equilibrium(few):
     moving, resting, truth = (
         jax.tree.map(lambda x: np.asarray(x)[:3], state.pipeline_state) for state in (first, now, few.after)
     )
-    assert np.linalg.norm((moving.pose - truth.pose)[:, :3], axis=1).max() > 1.2  # a transient
+    assert np.linalg.norm((moving.pose - truth.pose)[:, :3], axis=1).max() > 3.0  # a transient
     assert np.linalg.norm((resting.pose - truth.pose)[:, :3], axis=1).max() < 1.0
     np.testing.assert_allclose(resting.spring_m, truth.spring_m, atol=0.5 * MM)
     np.testing.assert_allclose(resting.pressure_kpa, truth.pressure_kpa, atol=0.2 * KPA)

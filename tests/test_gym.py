@@ -132,10 +132,10 @@ def test_a_seed_fixes_all_that_follows(envs):
         first, _ = envs.reset(seed=seed)
         return [first] + [envs.step(still(envs))[0] for _ in range(2 * LIMIT)]
 
-    runs = np.array([play(3), play(3), play(4), play(None)])
+    runs = np.array([play(3), play(3), play(5), play(None)])
     np.testing.assert_array_equal(runs[0], runs[1])
-    for other in runs[2:]:  # a pool of 64 poses gives the same goal now and then
-        assert np.mean(np.all(runs[0] == other, axis=-1)) < 0.2
+    for other in runs[2:]:
+        assert not np.any(np.all(runs[0] == other, axis=-1))
 
 
 def test_vector_env_and_gymnasium_s_vector_of_single_arms_return_the_same_structure(envs):
