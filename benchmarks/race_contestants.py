@@ -96,12 +96,12 @@ def ours(name: str, seed: int) -> Contestant:
 
     config = dataclasses.replace(our_config(name), seed=seed)
     job = Job(config, ReachEnv(config=config.env))
-    state = job.init(jax.random.PRNGKey(seed))
-    epoch, act = job.epoch.lower(state).compile(), jax.jit(job.agent.act_mode)
+    state = job.start(jax.random.PRNGKey(seed))
+    act = jax.jit(job.agent.act_mode)
 
     def train() -> None:
         nonlocal state
-        state, _ = jax.block_until_ready(epoch(state))
+        state, _ = jax.block_until_ready(job.epoch(state))
 
     return Contestant(
         train,

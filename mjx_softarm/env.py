@@ -95,8 +95,9 @@ class Lot(NamedTuple):
 class ArmState(NamedTuple):
     """One arm between two actions."""
 
-    params: ArmParams  # this episode's arm
-    sensor_offset_m: Array  # (n_chambers,) reading less true length, this episode's
+    payload_kg: Array  # () this episode's, as are the two below
+    chamber_stiffness: Array  # (n_chambers,) [N/m]
+    sensor_offset_m: Array  # (n_chambers,) reading less true length
     motion: Motion
     pose: Array  # (6,) [mm, deg] as observed: the real arm's where there is a sim-to-real network
     spring_m: Array  # (n_chambers,) true lengths
@@ -174,11 +175,7 @@ class ReachEnv(Env):
 
     def draw(self, rng: Array, n: int) -> Lot:
         """What chance decides of n new episodes: leaves (n, ...)."""
-        key_uniform, key_normal = jax.random.split(rng)
-        return Lot(
-            share=draws.uniform(key_uniform, (n, 3 + self.action_size)),
-            noise=draws.normal(key_normal, (n, self.action_size)),
-        )
+        return Lot(*draws.both(rng, (n, 3 + self.action_size), (n, self.action_size)))
 
     def begin(self, lot: Lot) -> State:
         """A new episode."""
@@ -186,9 +183,12 @@ class ReachEnv(Env):
         start_row, goal_row = (self.config.n_poses * share[:2]).astype(jnp.int32)
         start = jax.tree.map(lambda x: x[start_row], self.pool)
         goal = self.pool.pose[goal_row]
+        spread = self.config.randomisation
         arm = ArmState(
-            params=self._randomised(share[2], share[3:]),
-            sensor_offset_m=1e-3 * self.config.randomisation.sensor_noise_mm * lot.noise,
+            payload_kg=self.params.tool_mass_kg[PAYLOAD] + spread.payload_max_kg * share[2],
+            chamber_stiffness=self.params.chamber_stiffness
+            * (1.0 + spread.stiffness_spread * (2.0 * share[3:] - 1.0)),
+            sensor_offset_m=1e-3 * spread.sensor_noise_mm * lot.noise,
             motion=Motion(start.q, jnp.zeros_like(start.q), start.pressure_kpa),
             pose=start.pose,
             spring_m=start.spring_m,
@@ -260,9 +260,10 @@ class ReachEnv(Env):
         )
 
     def _move(self, arm: ArmState, reference_m: Array) -> tuple[Motion, Settled]:
+        params = self.params_of(arm)
         if self.config.mode == "dynamic":
             return advance(
-                with_params(self.model, arm.params),
+                with_params(self.model, params),
                 arm.motion,
                 reference_m,
                 self.gains,
@@ -272,8 +273,8 @@ class ReachEnv(Env):
         if self.config.engine == "mjx":
             kinematics = functools.partial(mjx_frames, self.model)
         else:
-            kinematics = functools.partial(chain_frames, link_length_m=arm.params.link_length_m)
-        end = settle(kinematics, arm.params, reference_m)
+            kinematics = functools.partial(chain_frames, link_length_m=params.link_length_m)
+        end = settle(kinematics, params, reference_m)
         return Motion(end.q, jnp.zeros_like(end.q), end.pressure_kpa), end
 
     def clearance_cost(self, clearance_mm: Array) -> Array:
@@ -295,11 +296,9 @@ class ReachEnv(Env):
         """The observation (..., 18) of a pose and a goal (..., 6) [mm, deg]."""
         return obs.observe(pose, goal, self.scale, self.config.reward)
 
-    def _randomised(self, payload: Array, stiffness: Array) -> ArmParams:
-        """The arm at shares, from 0 to 1, of the ranges of its payload () and stiffness (n_chambers,)."""
-        spread = self.config.randomisation
-        factor = 1.0 + spread.stiffness_spread * (2.0 * stiffness - 1.0)
+    def params_of(self, arm: ArmState) -> ArmParams:
+        """The numbers of an arm, of which some are its episode's."""
         return self.params._replace(
-            tool_mass_kg=self.params.tool_mass_kg.at[PAYLOAD].add(spread.payload_max_kg * payload),
-            chamber_stiffness=self.params.chamber_stiffness * factor,
+            tool_mass_kg=self.params.tool_mass_kg.at[PAYLOAD].set(arm.payload_kg),
+            chamber_stiffness=arm.chamber_stiffness,
         )

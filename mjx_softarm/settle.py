@@ -23,7 +23,7 @@ from jax import Array
 
 from mjx_softarm.kinematics import DOFS_PER_LINK, Frames
 from mjx_softarm.small_matrices import block_diagonal, eliminate, product
-from mjx_softarm.statics import ArmParams, statics
+from mjx_softarm.statics import ArmParams, Statics, statics
 
 MAX_ITERATIONS = 12
 ACTIVE_SET_GAIN_KPA_PER_M = 1000.0
@@ -102,7 +102,7 @@ def _active_set(pressure: Array, error_m: Array, params: ArmParams) -> tuple[Arr
 
 
 def _newton_step(it: _Iterate, kinematics, params: ArmParams, reference_m: Array) -> _Iterate:
-    now = statics(kinematics(it.q), it.q, it.pressure, params)
+    now: Statics = statics(kinematics(it.q), it.q, it.pressure, params)
     error = reference_m - now.springs.length
     at_limit, limit = _active_set(it.pressure, error, params)
     hessian = now.hessian.plus_diagonal(it.stiffening * params.joint_stiffness)
@@ -135,7 +135,7 @@ def _newton_step(it: _Iterate, kinematics, params: ArmParams, reference_m: Array
 def _report(it: _Iterate, kinematics, params: ArmParams, reference_m: Array) -> Settled:
     pressure = jnp.clip(it.pressure, params.pressure_min_kpa, params.pressure_max_kpa)
     frames = kinematics(it.q)
-    now = statics(frames, it.q, pressure, params)
+    now: Statics = statics(frames, it.q, pressure, params)
     error = reference_m - now.springs.length
     at_limit = (pressure <= params.pressure_min_kpa) | (pressure >= params.pressure_max_kpa)
     residual = jnp.max(jnp.abs(now.gradient))

@@ -104,6 +104,7 @@ class Statics(NamedTuple):
     area: Array  # (n_chambers,) [N/kPa] effective areas at these lengths
 
 
+@jax.jit  # inlined where it is compiled; traced once for all of its callers
 def statics(frames: Frames, q: Array, pressure_kpa: Array, params: ArmParams) -> Statics:
     """Gradient and Hessian of V(q) at fixed pressures.
 

@@ -79,7 +79,7 @@ def sample_workspace(spec: ArmSpec, n: int, seed: int) -> Pool:
             f"expected at {n} or more; is it stiff enough?"
         )
     chosen = rng.choice(len(weight), n, replace=False, p=weight / weight.sum())
-    pose = jax.vmap(pose_from_frame)(found.tip_position_m[chosen], found.tip_rotation[chosen])
+    pose = pose_from_frame(found.tip_position_m[chosen], found.tip_rotation[chosen])
     arrays = (found.q[chosen], found.pressure_kpa[chosen], found.spring_m[chosen], pose)
     return Pool(*map(jnp.asarray, arrays))
 

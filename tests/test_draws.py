@@ -1,16 +1,32 @@
-"""Random numbers drawn as one row against jax.random's own."""
+"""Draws in one row against those of `jax.random`, and against the distributions that they are of."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+import pytest
+from scipy.stats import kstest
 
 from mjx_softarm import draws
 
-KEY = jax.random.PRNGKey(3)
 SHAPE = (7, 5, 3)
 
 
-def test_numbers_are_those_of_jax_random():
-    np.testing.assert_array_equal(draws.uniform(KEY, SHAPE), jax.random.uniform(KEY, SHAPE))
-    ranged = jax.random.uniform(KEY, SHAPE, minval=-1.0, maxval=2.0)
-    np.testing.assert_array_equal(draws.uniform(KEY, SHAPE, -1.0, 2.0), ranged)
-    np.testing.assert_array_equal(draws.normal(KEY, SHAPE), jax.random.normal(KEY, SHAPE))
+@pytest.mark.parametrize("name", ["uniform", "normal"])
+def test_numbers_are_those_that_jax_draws_for_the_shape(name):
+    drawn = getattr(draws, name)(jax.random.key(0), SHAPE)
+    np.testing.assert_array_equal(drawn, getattr(jax.random, name)(jax.random.key(0), SHAPE))
+
+
+def test_of_one_draw_come_independent_numbers_of_both_distributions():
+    uniform, normal = draws.both(jax.random.key(1), (100, 100), (10_000,))
+    assert uniform.dtype == normal.dtype == jnp.float32
+    assert kstest(np.ravel(uniform), "uniform").pvalue > 1e-3
+    assert kstest(normal, "norm").pvalue > 1e-3
+    assert abs(np.corrcoef(np.ravel(uniform), normal)[0, 1]) < 0.05  # five standard errors
+
+
+def test_the_smallest_share_is_a_finite_number(monkeypatch):
+    """A share of zero would be a normal number at minus infinity; one in 8 million is zero."""
+    monkeypatch.setattr(jax.random, "uniform", lambda key, shape: jnp.zeros(shape))
+    _, normal = draws.both(jax.random.key(2), (2,), (3,))
+    assert np.isfinite(normal).all() and (normal < -5).all()

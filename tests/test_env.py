@@ -224,15 +224,15 @@ FAILURES = {
     "a NaN in the action": lambda arm, action: (arm, action.at[3].set(jnp.nan)),
     "an infinity in the action": lambda arm, action: (arm, action.at[3].set(jnp.inf)),
     "a payload of a thousand tonnes": lambda arm, action: (
-        arm._replace(params=arm.params._replace(tool_mass_kg=jnp.array([0.45, 1e6]))),
+        arm._replace(payload_kg=jnp.array(1e6)),
         action,
     ),
     "chambers that push apart": lambda arm, action: (
-        arm._replace(params=arm.params._replace(chamber_stiffness=jnp.full(9, -1e4))),
+        arm._replace(chamber_stiffness=jnp.full(9, -1e4)),
         action,
     ),
     "a NaN among the numbers of the arm": lambda arm, action: (
-        arm._replace(params=arm.params._replace(link_length_m=jnp.array(jnp.nan))),
+        arm._replace(payload_kg=jnp.array(jnp.nan)),
         action,
     ),
     "a NaN in the calibration": lambda arm, action: (
@@ -289,16 +289,17 @@ def randomised(spec, env):
     return xla.jit(jax.vmap(spread.reset), spread.uses_mjx)(keys)
 
 
-def test_without_randomisation_every_arm_is_the_nominal_one(spec, start):
+def test_without_randomisation_every_arm_is_the_nominal_one(spec, env, start):
     nominal = ArmParams.from_spec(spec)
+    drawn = jax.vmap(env.params_of)(start.pipeline_state)
     for name, value in nominal._asdict().items():
-        drawn = np.asarray(getattr(start.pipeline_state.params, name))
-        np.testing.assert_array_equal(drawn, np.broadcast_to(value, drawn.shape), err_msg=name)
+        own = np.asarray(getattr(drawn, name))
+        np.testing.assert_array_equal(own, np.broadcast_to(value, own.shape), err_msg=name)
     np.testing.assert_array_equal(start.pipeline_state.sensor_offset_m, 0.0)
 
 
-def test_randomised_numbers_fill_their_bounds_and_no_other_number_changes(spec, randomised):
-    nominal, drawn = ArmParams.from_spec(spec), randomised.pipeline_state.params
+def test_randomised_numbers_fill_their_bounds_and_no_other_number_changes(spec, env, randomised):
+    nominal, drawn = ArmParams.from_spec(spec), jax.vmap(env.params_of)(randomised.pipeline_state)
     payload = np.asarray(drawn.tool_mass_kg[:, PAYLOAD]) - spec.mass.payload_kg
     assert payload.min() >= 0.0 and payload.max() <= SPREAD.payload_max_kg
     factor = np.asarray(drawn.chamber_stiffness) / nominal.chamber_stiffness
@@ -336,22 +337,23 @@ def test_the_law_holds_readings_on_their_references_so_that_noise_shifts_the_tru
 
 def test_an_arm_keeps_its_own_numbers_for_the_whole_episode(env, randomised, step, random_actions):
     after = step(step(randomised, env.action_of(env.pool.spring_m)), random_actions)
-    assert leaves_equal(after.pipeline_state.params, randomised.pipeline_state.params)
-    assert leaves_equal(after.pipeline_state.sensor_offset_m, randomised.pipeline_state.sensor_offset_m)
+    for name in ("payload_kg", "chamber_stiffness", "sensor_offset_m"):
+        assert leaves_equal(getattr(after.pipeline_state, name), getattr(randomised.pipeline_state, name))
 
 
 def test_a_payload_and_stiffer_chambers_ask_for_other_pressures_at_the_same_spring_lengths(env, start, step):
     """By the balance of forces along a straight arm: 3 chambers carry the payload and their own stretch."""
     action = jnp.broadcast_to(env.action_of(jnp.full(9, 0.19)), (len(start.obs), 9))
-    params = start.pipeline_state.params
-    heavy = params._replace(tool_mass_kg=params.tool_mass_kg.at[:, PAYLOAD].set(0.3))
-    stiff = params._replace(chamber_stiffness=1.1 * params.chamber_stiffness)
+    arm = start.pipeline_state
+    heavy = {"payload_kg": jnp.full_like(arm.payload_kg, 0.3)}
+    stiff = {"chamber_stiffness": 1.1 * arm.chamber_stiffness}
     nominal, loaded, stiffened = (
-        step(with_arm(start, params=p), action).pipeline_state.pressure_kpa[0] for p in (params, heavy, stiff)
+        step(with_arm(start, **changes), action).pipeline_state.pressure_kpa[0]
+        for changes in ({}, heavy, stiff)
     )
-    area = np.asarray(params.area[0] + params.area_slope[0] * (0.19 - 0.2))  # N/kPa at this length
+    area = np.asarray(env.params.area + env.params.area_slope * (0.19 - 0.2))  # N/kPa at this length
     np.testing.assert_allclose(loaded - nominal, -0.3 * 9.81 / (3 * area), rtol=1e-3)
-    stretch = 0.1 * np.asarray(params.chamber_stiffness[0]) * (0.19 - 0.2)
+    stretch = 0.1 * np.asarray(arm.chamber_stiffness[0]) * (0.19 - 0.2)
     np.testing.assert_allclose(stiffened - nominal, stretch / area, rtol=1e-3)
 
 
@@ -410,12 +412,12 @@ def test_engine_mjx_steps_like_engine_chain(few):
 
 
 def test_mode_dynamic_comes_to_rest_at_the_quasi_static_equilibrium(few):
-    env = ReachEnv(few.env.spec, dataclasses.replace(few.env.config, mode="dynamic", dynamic_step_s=2.0))
+    env = ReachEnv(few.env.spec, dataclasses.replace(few.env.config, mode="dynamic", dynamic_step_s=1.0))
     fresh, step = compiled(env)
     assert leaves_equal(fresh, few.fresh)
     first = now = step(few.before, few.actions)
     assert types(first) == types(few.before)
-    for _ in range(14):
+    for _ in range(29):
         now = step(now, few.actions)
     moving, resting, truth = (
         jax.tree.map(lambda x: np.asarray(x)[:3], state.pipeline_state) for state in (first, now, few.after)
@@ -424,7 +426,7 @@ def test_mode_dynamic_comes_to_rest_at_the_quasi_static_equilibrium(few):
     assert np.linalg.norm((resting.pose - truth.pose)[:, :3], axis=1).max() < 1.0
     np.testing.assert_allclose(resting.spring_m, truth.spring_m, atol=0.5 * MM)
     np.testing.assert_allclose(resting.pressure_kpa, truth.pressure_kpa, atol=0.2 * KPA)
-    np.testing.assert_array_equal(resting.n_steps, 15)
+    np.testing.assert_array_equal(resting.n_steps, 30)
     np.testing.assert_array_equal(now.info["saturated"], [False, False, True, False])
     # The fourth arm stays where it was, and its velocity and pressures do not turn into NaN.
     np.testing.assert_array_equal(first.info["valid"], [True, True, True, False])

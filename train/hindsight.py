@@ -14,7 +14,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -80,10 +79,8 @@ def relabel(
         exchange_actions: whether a saturated action may be exchanged for the sensed one. Right only where
             an action leads to rest: the lengths sensed in the middle of a motion lead elsewhere.
     """
-    key_uniform, key_direction = jax.random.split(key)
     n = batch.saturated.shape[0]
-    kind, distance = draws.uniform(key_uniform, (2, n))
-    direction = draws.normal(key_direction, (n, 6))
+    (kind, distance), direction = draws.both(key, (2, n), (n, 6))
     reached = kind < config.reached_share
     near = ~reached & (kind < config.reached_share + config.near_share)
     moved = batch.next_pose + _near_offsets(distance, direction, config).astype(batch.next_pose.dtype)

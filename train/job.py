@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple, cast
 
 import jax
@@ -50,6 +51,18 @@ class Job:
         results = None if mesh is None else (self.sharding, everywhere(mesh))
         self.init = xla.jit(self._init, env.uses_mjx, out_shardings=self.sharding)
         self.epoch = xla.jit(self._epoch, env.uses_mjx, donate_argnums=0, out_shardings=results)
+
+    def start(self, key: Array) -> TrainState:
+        """The state to begin with, and the epoch compiled beside it, as neither keeps all cores busy.
+
+        With a mesh of devices the epoch is compiled when it is called first.
+        """
+        if self.mesh is not None:
+            return self.init(key)
+        with ThreadPoolExecutor(1) as beside:
+            state = beside.submit(self.init, key)
+            self.epoch = self.epoch.lower(jax.eval_shape(self.init, key)).compile()
+            return state.result()
 
     def place(self, state: TrainState) -> TrainState:
         """The state where the epoch expects it, after something else has touched it."""

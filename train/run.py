@@ -44,30 +44,40 @@ def train(run: Run, task: Task, console: Console) -> Any:
     Raises:
         Interrupted: after Ctrl-C or a termination signal, once the state is saved.
     """
-    epoch, state = 0, task.job.init(jax.random.PRNGKey(run.config.seed))
-    if run.latest_epoch is not None:
-        epoch, state = run.restore(state)
+    with asked_to_stop() as asked:
+        epoch, state = _begin(run, task, console)
+        run.truncate_metrics(epoch)
+        with open_board(run, state) as board, progress_bar(console) as progress:
+            bar = progress.add_task("training", total=run.config.n_epochs, completed=epoch, text="")
+            while epoch < run.config.n_epochs:
+                state, row = _timed_epoch(task.job, task.prepare(state, epoch))
+                epoch += 1
+                stop, due = any_process(bool(asked)), run.config.evaluates_after(epoch)
+                if due:
+                    row |= evaluation(task, state.agent.mean_actor_params)
+                record(run, board, epoch, counts(state), row)
+                if due or stop:
+                    run.save(epoch, state)
+                progress.update(bar, completed=epoch, text=_line(task, row))
+                if due and not console.is_terminal:  # a log file gets lines in the place of a bar
+                    console.print(
+                        f"epoch {epoch} of {run.config.n_epochs}: {_line(task, row)}", highlight=False
+                    )
+                if stop and epoch < run.config.n_epochs:
+                    raise Interrupted(f"stopped after epoch {epoch}; continue with --resume {run.path}")
+    return finish(run, task, state.agent.mean_actor_params)
+
+
+def _begin(run: Run, task: Task, console: Console) -> tuple[int, TrainState]:
+    """The epochs that a run has done, and its state after them."""
+    key = jax.random.PRNGKey(run.config.seed)
+    console.print("compiling (cached for the next start) ...")
+    if run.latest_epoch is None:
+        return 0, task.job.start(key)
+    epoch, state = run.restore(task.job.init(key))
     if epoch:
         console.print(f"continuing after epoch {epoch} of {run.config.n_epochs}")
-    run.truncate_metrics(epoch)
-    console.print("compiling (cached for the next start) ...")
-    with asked_to_stop() as asked, open_board(run, state) as board, progress_bar(console) as progress:
-        bar = progress.add_task("training", total=run.config.n_epochs, completed=epoch, text="")
-        while epoch < run.config.n_epochs:
-            state, row = _timed_epoch(task.job, task.prepare(state, epoch))
-            epoch += 1
-            stop, due = any_process(bool(asked)), run.config.evaluates_after(epoch)
-            if due:
-                row |= evaluation(task, state.agent.mean_actor_params)
-            record(run, board, epoch, counts(state), row)
-            if due or stop:
-                run.save(epoch, state)
-            progress.update(bar, completed=epoch, text=_line(task, row))
-            if due and not console.is_terminal:  # a log file gets lines in the place of a bar
-                console.print(f"epoch {epoch} of {run.config.n_epochs}: {_line(task, row)}", highlight=False)
-            if stop and epoch < run.config.n_epochs:
-                raise Interrupted(f"stopped after epoch {epoch}; continue with --resume {run.path}")
-    return finish(run, task, state.agent.mean_actor_params)
+    return epoch, state
 
 
 def finish(run: Run, task: Task, actor_params: Any) -> Any:

@@ -77,16 +77,16 @@ def test_warm_up_explores_uniformly_and_does_not_learn(job):
 
 def test_an_arm_that_does_not_settle_is_reset_counted_and_never_stored(job):
     state = start(job)
-    params = state.arms.pipeline_state.params
-    poisoned = params._replace(chamber_stiffness=params.chamber_stiffness.at[jnp.array([1, 5])].set(jnp.nan))
-    arms = state.arms.replace(pipeline_state=state.arms.pipeline_state._replace(params=poisoned))
+    arm = state.arms.pipeline_state
+    poisoned = arm.chamber_stiffness.at[jnp.array([1, 5])].set(jnp.nan)
+    arms = state.arms.replace(pipeline_state=arm._replace(chamber_stiffness=poisoned))
     state, metrics = job.epoch(state._replace(arms=arms))
     assert int(state.n_unsettled) == 2 and metrics["env/unsettled"] == 2
     assert int(state.memory.size) == 2 * 8 - 2
     jax.tree.map(
         lambda x: np.testing.assert_array_equal(np.isfinite(x), True), jax.device_get(state.memory.data)
     )
-    assert np.isfinite(state.arms.pipeline_state.params.chamber_stiffness).all()
+    assert np.isfinite(state.arms.pipeline_state.chamber_stiffness).all()
 
 
 def test_a_restored_run_continues_bit_for_bit(job, tmp_path):
