@@ -96,7 +96,7 @@ def ours(name: str, seed: int) -> Contestant:
 
     config = dataclasses.replace(our_config(name), seed=seed)
     job = Job(config, ReachEnv(config=config.env))
-    state = job.start(jax.random.PRNGKey(seed))
+    state = job.start(lambda: job.init(jax.random.PRNGKey(seed)))
     act = jax.jit(job.agent.act_mode)
 
     def train() -> None:

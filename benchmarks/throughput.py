@@ -253,7 +253,7 @@ from train.job import Job
 imported = time.perf_counter()
 job = Job(PRESETS["quick"], ReachEnv())
 pool = time.perf_counter()
-job.start(jax.random.PRNGKey(0))
+job.start(lambda: job.init(jax.random.PRNGKey(0)))
 print(json.dumps({{"import_s": imported - start, "workspace_s": pool - imported,
                    "compile_epoch_s": time.perf_counter() - pool, "total_s": time.perf_counter() - start}}))
 """

@@ -11,10 +11,10 @@ from mjx_softarm import draws
 SHAPE = (7, 5, 3)
 
 
-@pytest.mark.parametrize("name", ["uniform", "normal"])
-def test_numbers_are_those_that_jax_draws_for_the_shape(name):
-    drawn = getattr(draws, name)(jax.random.key(0), SHAPE)
-    np.testing.assert_array_equal(drawn, getattr(jax.random, name)(jax.random.key(0), SHAPE))
+@pytest.mark.parametrize("name, bounds", [("uniform", {}), ("uniform", {"minval": -1.0}), ("normal", {})])
+def test_numbers_are_those_that_jax_draws_for_the_shape(name, bounds):
+    drawn = getattr(draws, name)(jax.random.key(0), SHAPE, **bounds)
+    np.testing.assert_array_equal(drawn, getattr(jax.random, name)(jax.random.key(0), SHAPE, **bounds))
 
 
 def test_of_one_draw_come_independent_numbers_of_both_distributions():

@@ -184,10 +184,16 @@ class Run:
             like: a state, or its shapes, structured as the run's.
 
         Raises:
-            RunError: there is no checkpoint.
+            RunError: there is no checkpoint, or it is not structured so.
         """
         epoch, shapes = self._newest(), jax.tree.map(_shape_somewhere, like)
-        state = self._manager.restore(epoch, args=ocp.args.StandardRestore(shapes))
+        try:
+            state = self._manager.restore(epoch, args=ocp.args.StandardRestore(shapes))
+        except ValueError as error:
+            raise RunError(
+                f"{self.path}: its checkpoint has other parts or sizes than the states of this version; "
+                "continue it with the commit that its config.json names"
+            ) from error
         return epoch, cast(TrainState, state)
 
     def restore_part(self, name: str, like: Any) -> Any:

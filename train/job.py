@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +20,8 @@ from train.config import ConfigError, TrainConfig
 from train.devices import everywhere, split, spread
 from train.hindsight import Experience, relabel
 from train.tqc import TQC, TQCState, Transition
+
+T = TypeVar("T")
 
 
 class TrainState(NamedTuple):
@@ -52,17 +55,18 @@ class Job:
         self.init = xla.jit(self._init, env.uses_mjx, out_shardings=self.sharding)
         self.epoch = xla.jit(self._epoch, env.uses_mjx, donate_argnums=0, out_shardings=results)
 
-    def start(self, key: Array) -> TrainState:
-        """The state to begin with, and the epoch compiled beside it, as neither keeps all cores busy.
+    def start(self, first: Callable[[], T]) -> T:
+        """What `first` returns, such as a state, with the epoch compiled beside it: neither needs all cores.
 
         With a mesh of devices the epoch is compiled when it is called first.
         """
         if self.mesh is not None:
-            return self.init(key)
+            return first()
+        shapes = jax.eval_shape(self.init, jax.random.PRNGKey(0))
         with ThreadPoolExecutor(1) as beside:
-            state = beside.submit(self.init, key)
-            self.epoch = self.epoch.lower(jax.eval_shape(self.init, key)).compile()
-            return state.result()
+            result = beside.submit(first)
+            self.epoch = self.epoch.lower(shapes).compile()
+            return result.result()
 
     def place(self, state: TrainState) -> TrainState:
         """The state where the epoch expects it, after something else has touched it."""

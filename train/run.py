@@ -70,11 +70,13 @@ def train(run: Run, task: Task, console: Console) -> Any:
 
 def _begin(run: Run, task: Task, console: Console) -> tuple[int, TrainState]:
     """The epochs that a run has done, and its state after them."""
-    key = jax.random.PRNGKey(run.config.seed)
     console.print("compiling (cached for the next start) ...")
-    if run.latest_epoch is None:
-        return 0, task.job.start(key)
-    epoch, state = run.restore(task.job.init(key))
+
+    def first() -> tuple[int, TrainState]:
+        state = task.job.init(jax.random.PRNGKey(run.config.seed))
+        return (0, state) if run.latest_epoch is None else run.restore(state)
+
+    epoch, state = task.job.start(first)
     if epoch:
         console.print(f"continuing after epoch {epoch} of {run.config.n_epochs}")
     return epoch, state

@@ -73,7 +73,7 @@ def interrupt_after_a_checkpoint(out, number, environment):
     return process
 
 
-def test_a_run_survives_kill_9_and_ends_with_the_same_bits(tmp_path, environment):
+def test_a_run_survives_kill_9_and_ends_with_the_same_bits(tmp_path, environment, monkeypatch):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     process = interrupt_after_a_checkpoint(killed, signal.SIGKILL, environment)
     assert process.returncode == -signal.SIGKILL and not (killed / "evaluation.json").exists()
@@ -94,6 +94,8 @@ def test_a_run_survives_kill_9_and_ends_with_the_same_bits(tmp_path, environment
     config = json.loads((whole / "config.json").read_text())
     assert {"python", "packages", "commit"} <= config["provenance"].keys()
 
+    for name, smaller in (("N_TRAINING", 512), ("N_STEPS", 10)):  # how exact it is, test_estimator asks
+        monkeypatch.setattr(f"train.estimator.{name}", smaller)
     assert main(["export", str(whole)]) == 0
     assert (whole / "policy.npz").exists()
 

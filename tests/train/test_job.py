@@ -68,6 +68,25 @@ def test_a_run_traces_its_epoch_once_and_counts_what_it_did(job):
     assert all(np.isfinite(value) for value in metrics.values())
 
 
+def test_a_start_compiles_the_epoch_once_beside_what_comes_first(job):
+    other = Job(CONFIG, job.env)
+    state = other.start(lambda: start(other))
+    assert_equal(state, start(job))
+    expected = start(job)
+    for _ in range(2):
+        (state, _), (expected, _) = other.epoch(state), job.epoch(expected)
+    assert_equal(state, expected)
+    assert other.n_traces == 1
+
+
+def test_what_fails_beside_the_compilation_is_raised(job):
+    def fail():
+        raise RunError("no such run")
+
+    with pytest.raises(RunError, match="no such run"):
+        Job(CONFIG, job.env).start(fail)
+
+
 def test_warm_up_explores_uniformly_and_does_not_learn(job):
     state, metrics = job.epoch(start(job))
     assert int(state.agent.step) == 0 and metrics["tqc/critic_loss"] == 0.0
@@ -119,6 +138,14 @@ def test_a_run_without_checkpoint_says_so(job, tmp_path):
     run = Run.create(tmp_path / "new", dataclasses.replace(CONFIG, seed=5), job.env.spec)
     with pytest.raises(RunError, match="holds no checkpoint"):
         run.restore(jax.eval_shape(job.init, jax.random.PRNGKey(0)))
+
+
+def test_a_checkpoint_of_another_structure_is_refused_in_words(job, tmp_path):
+    run = Run.create(tmp_path, CONFIG, job.env.spec)
+    run.save(0, state := start(job))
+    for other in (state._replace(imitation=state.key), state._replace(key=state.arms.obs)):
+        with pytest.raises(RunError, match=f"{tmp_path}: its checkpoint has other parts or sizes"):
+            run.restore(other)
 
 
 def test_metrics_later_than_the_checkpoint_are_forgotten(tmp_path):
