@@ -8,12 +8,14 @@ from typing import Any
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter, LogFormatter
 
 from train.evaluate import Reached
 from train.positions import AtPositions
 
 INK, BLUE, ORANGE, GREY = "#222222", "#1f6fb4", "#e07b28", "#9aa0a6"
 DPI = 150
+STEPS = "environment steps"
 REACH_PICTURES = ("learning_curve.png", "circle.png", "workspace_error.png")
 IMITATION_PICTURES = ("learning_curve.png", "losses.png", "positions.png")
 
@@ -49,7 +51,16 @@ def dress(axes: Any, title: str, x: str, y: str) -> None:
 def _axes(figure: Figure, position: Any, title: str, x: str, y: str) -> Any:
     axes = figure.add_subplot(*position) if isinstance(position, tuple) else figure.add_subplot(position)
     dress(axes, title, x, y)
+    if x == STEPS:
+        axes.xaxis.set_major_formatter(EngFormatter())
     return axes
+
+
+def _logarithmic(axes: Any) -> None:
+    """The y axis, with plain numbers."""
+    axes.set_yscale("log")
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_formatter(LogFormatter())
 
 
 def learning_curve(rows: list[dict[str, Any]]) -> Figure:
@@ -57,16 +68,15 @@ def learning_curve(rows: list[dict[str, Any]]) -> Figure:
     figure = Figure(figsize=(10, 4), layout="constrained")
     evaluated = [row for row in rows if "evaluation/median_mm" in row]
     steps = [row["env_steps"] for row in evaluated]
-    left = _axes(figure, 121, "tip error on held-out goals", "environment steps", "mm")
+    left = _axes(figure, 121, "tip error on held-out goals", STEPS, "mm")
     left.plot(steps, [row["evaluation/median_mm"] for row in evaluated], color=BLUE, label="median")
     left.plot(steps, [row["evaluation/p95_mm"] for row in evaluated], color=ORANGE, label="95 %")
     left.plot(
         steps, [row["evaluation/circle_mean_mm"] for row in evaluated], color=GREY, label="circle, mean"
     )
-    left.set_yscale("log")
-    left.yaxis.set_major_formatter("{x:g}")
+    _logarithmic(left)
     left.legend(frameon=False)
-    right = _axes(figure, 122, "goals reached, chambers saturated", "environment steps", "%")
+    right = _axes(figure, 122, "goals reached, chambers saturated", STEPS, "%")
     for name, colour, label in (
         ("reached_share", BLUE, "goals reached"),
         ("saturated_share", ORANGE, "goals with a saturated chamber"),
@@ -94,7 +104,7 @@ def circle_figure(circle: Reached) -> Figure:
     right = _axes(figure, 133, f"pressures; {n_saturated} saturated chambers", "point", "kPa")
     for k, line in enumerate(np.asarray(circle.pressure_kpa).T):
         right.plot(line, color=colormaps["tab10"](k % 10), label=f"chamber {k}", linewidth=1.2)
-    right.legend(frameon=False, fontsize=6, ncols=3)
+    right.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
 
 
@@ -127,8 +137,9 @@ def workspace_figure(workspace: Reached) -> Figure:
         axes.plot([at, at], [0, share], color=colour, linewidth=1, label=f"{share} %: {at:.1f} mm")
     axes.set_xlim(0, 3 * top)
     axes.set_xscale("symlog", linthresh=1.0)
+    axes.xaxis.set_major_formatter("{x:g}")
     axes.set_ylim(0, 100)
-    axes.legend(frameon=False, loc="lower right")
+    axes.legend(frameon=False, loc="upper left")
     return figure
 
 
@@ -137,7 +148,7 @@ def imitation_curve(rows: list[dict[str, Any]]) -> Figure:
     figure = Figure(figsize=(10, 4), layout="constrained")
     evaluated = [row for row in rows if "evaluation/success_share" in row]
     steps = [row["env_steps"] for row in evaluated]
-    left = _axes(figure, 121, "demonstrated positions reached", "environment steps", "%")
+    left = _axes(figure, 121, "demonstrated positions reached", STEPS, "%")
     for name, colour, label in (
         ("success_share", BLUE, "unsaturated, inside the pipe"),
         ("reached_share", GREY, "the pose alone"),
@@ -145,11 +156,10 @@ def imitation_curve(rows: list[dict[str, Any]]) -> Figure:
         left.plot(steps, [100 * row[f"evaluation/{name}"] for row in evaluated], color=colour, label=label)
     left.set_ylim(0, 105)
     left.legend(frameon=False)
-    right = _axes(figure, 122, "tip error at the positions", "environment steps", "mm")
+    right = _axes(figure, 122, "tip error at the positions", STEPS, "mm")
     right.plot(steps, [row["evaluation/median_mm"] for row in evaluated], color=BLUE, label="median")
     right.plot(steps, [row["evaluation/max_mm"] for row in evaluated], color=ORANGE, label="largest")
-    right.set_yscale("log")
-    right.yaxis.set_major_formatter("{x:g}")
+    _logarithmic(right)
     right.legend(frameon=False)
     return figure
 
@@ -161,7 +171,7 @@ def losses(rows: list[dict[str, Any]]) -> Figure:
     figure = Figure(figsize=(4 * len(names), 3.5), layout="constrained")
     for k, name in enumerate(names):
         title = name.split("/")[1].replace("_", " ")
-        axes = _axes(figure, (1, len(names), k + 1), title, "environment steps", "")
+        axes = _axes(figure, (1, len(names), k + 1), title, STEPS, "")
         learned = [row for row in rows if row["updates"] > 0]
         axes.plot([row["env_steps"] for row in learned], [row[name] for row in learned], color=BLUE)
     return figure
