@@ -143,7 +143,7 @@ def test_a_run_without_checkpoint_says_so(job, tmp_path):
 def test_a_checkpoint_of_another_structure_is_refused_in_words(job, tmp_path):
     run = Run.create(tmp_path, CONFIG, job.env.spec)
     run.save(0, state := start(job))
-    for other in (state._replace(imitation=state.key), state._replace(key=state.arms.obs)):
+    for other in ({**state._asdict(), "more": state.key}, state._replace(key=state.arms.obs)):
         with pytest.raises(RunError, match=f"{tmp_path}: its checkpoint has other parts or sizes"):
             run.restore(other)
 
