@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter
 
 from benchmarks.confined_measure import CALM_N, Operated, finger_tips
 from benchmarks.confined_stages import KINDS, Learned, Results, Trial, pipe_mm
@@ -16,7 +15,7 @@ from benchmarks.paper_plots import RED, plot_around
 from benchmarks.paper_stages import Case
 from mjx_softarm.pipe import PIPES_MM, CrossPipe
 from mjx_softarm.spec import ArmSpec
-from train.plots import BLUE, GREY, INK, ORANGE, dress
+from train.plots import BLUE, GREY, INK, ORANGE, STEPS, dress
 
 GREEN = "#2a9d6f"
 LEAST_N = 0.1  # where the scale of forces ends
@@ -113,7 +112,7 @@ def success_figure(results: Results, kinds: Sequence[str]) -> Figure:
     """Success over environment steps in each run's own simulation: mean, standard deviation, every run."""
     figure = Figure(figsize=(8, 4.2), layout="constrained")
     panel = figure.subplots()
-    dress(panel, "demonstrated positions with success, in simulation", "environment steps", "%")
+    dress(panel, "demonstrated positions with success, in simulation", STEPS, "%")
     for kind, colour in zip(kinds, (BLUE, ORANGE), strict=True):
         runs = _runs(results, kind)
         steps, share = _series(runs, "evaluation/success_share")
@@ -132,7 +131,7 @@ def losses_figure(results: Results, kinds: Sequence[str]) -> Figure:
     figure = Figure(figsize=(13, 3.8), layout="constrained")
     panels = figure.subplots(1, len(LOSSES))
     for panel, name in zip(panels, LOSSES, strict=True):
-        dress(panel, name.split("/")[1].replace("_", " "), "environment steps", "")
+        dress(panel, name.split("/")[1].replace("_", " "), STEPS, "")
         for kind, colour, label in zip(
             kinds, (BLUE, ORANGE), ("with gradient penalty", "without"), strict=True
         ):
@@ -205,7 +204,6 @@ def _series(runs: Sequence[Learned], name: str) -> tuple[np.ndarray, np.ndarray]
 
 
 def _mean_and_spread(panel: Any, steps: np.ndarray, lines: np.ndarray, colour: str, label: str) -> None:
-    panel.xaxis.set_major_formatter(EngFormatter())
     mean, deviation = lines.mean(axis=0), lines.std(axis=0)
     panel.fill_between(steps, mean - deviation, mean + deviation, color=colour, alpha=0.2, linewidth=0)
     panel.plot(steps, mean, color=colour, label=label, linewidth=1.5)

@@ -22,15 +22,16 @@ def normal(key: Array, shape: tuple[int, ...]) -> Array:
     return jax.random.normal(key, (math.prod(shape),)).reshape(shape)
 
 
-def both(key: Array, uniform: tuple[int, ...], normal: tuple[int, ...]) -> tuple[Array, Array]:
+def both(key: Array, shape_uniform: tuple[int, ...], shape_normal: tuple[int, ...]) -> tuple[Array, Array]:
     """Numbers uniform from 0 to below 1, and of the standard normal distribution, of one draw; float32.
 
     Args:
         key: for the draw.
-        uniform: shape of the ones.
-        normal: shape of the others.
+        shape_uniform: of the ones.
+        shape_normal: of the others.
     """
-    n_uniform = math.prod(uniform)
-    share = jax.random.uniform(key, (n_uniform + math.prod(normal),))
+    n_uniform = math.prod(shape_uniform)
+    share = uniform(key, (n_uniform + math.prod(shape_normal),))
     centred = jnp.maximum(2.0 * share[n_uniform:] - 1.0, jnp.nextafter(-1.0, 0.0))  # -1 is at minus infinity
-    return share[:n_uniform].reshape(uniform), (math.sqrt(2.0) * jax.lax.erf_inv(centred)).reshape(normal)
+    drawn = math.sqrt(2.0) * jax.lax.erf_inv(centred)
+    return share[:n_uniform].reshape(shape_uniform), drawn.reshape(shape_normal)

@@ -27,6 +27,6 @@ def test_of_one_draw_come_independent_numbers_of_both_distributions():
 
 def test_the_smallest_share_is_a_finite_number(monkeypatch):
     """A share of zero would be a normal number at minus infinity; one in 8 million is zero."""
-    monkeypatch.setattr(jax.random, "uniform", lambda key, shape: jnp.zeros(shape))
+    monkeypatch.setattr(jax.random, "uniform", lambda key, shape, minval: jnp.zeros(shape))
     _, normal = draws.both(jax.random.key(2), (2,), (3,))
     assert np.isfinite(normal).all() and (normal < -5).all()

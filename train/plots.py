@@ -46,17 +46,17 @@ def dress(axes: Any, title: str, x: str, y: str) -> None:
     axes.grid(color="#e6e6e6", linewidth=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
+    if x == STEPS:
+        axes.xaxis.set_major_formatter(EngFormatter())
 
 
 def _axes(figure: Figure, position: Any, title: str, x: str, y: str) -> Any:
     axes = figure.add_subplot(*position) if isinstance(position, tuple) else figure.add_subplot(position)
     dress(axes, title, x, y)
-    if x == STEPS:
-        axes.xaxis.set_major_formatter(EngFormatter())
     return axes
 
 
-def _logarithmic(axes: Any) -> None:
+def logarithmic(axes: Any) -> None:
     """The y axis, with plain numbers."""
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter("{x:g}")
@@ -74,7 +74,7 @@ def learning_curve(rows: list[dict[str, Any]]) -> Figure:
     left.plot(
         steps, [row["evaluation/circle_mean_mm"] for row in evaluated], color=GREY, label="circle, mean"
     )
-    _logarithmic(left)
+    logarithmic(left)
     left.legend(frameon=False)
     right = _axes(figure, 122, "goals reached, chambers saturated", STEPS, "%")
     for name, colour, label in (
@@ -159,7 +159,7 @@ def imitation_curve(rows: list[dict[str, Any]]) -> Figure:
     right = _axes(figure, 122, "tip error at the positions", STEPS, "mm")
     right.plot(steps, [row["evaluation/median_mm"] for row in evaluated], color=BLUE, label="median")
     right.plot(steps, [row["evaluation/max_mm"] for row in evaluated], color=ORANGE, label="largest")
-    _logarithmic(right)
+    logarithmic(right)
     right.legend(frameon=False)
     return figure
 

@@ -134,7 +134,7 @@ def curves(sweep: Sweep) -> Figure:
         lines.setdefault(_name(_varied(sweep, run)), []).append(points)
     figure = Figure(figsize=(8, 5), layout="constrained")
     axes = figure.add_subplot()
-    plots.dress(axes, "tip error on held-out goals, median", "environment steps", "mm")
+    plots.dress(axes, "tip error on held-out goals, median", plots.STEPS, "mm")
     for k, (name, seeds) in enumerate(lines.items()):
         colour = colormaps["tab10"](k % 10)
         values = np.array(seeds)  # (seeds, evaluations, 2)
@@ -145,9 +145,7 @@ def curves(sweep: Sweep) -> Figure:
         axes.fill_between(
             steps, medians.min(axis=0), medians.max(axis=0), color=colour, alpha=0.2, linewidth=0
         )
-    axes.set_yscale("log")
-    axes.yaxis.set_major_formatter("{x:g}")
-    axes.yaxis.set_minor_formatter("{x:g}")
+    plots.logarithmic(axes)
     if sweep.varied:
         axes.legend(frameon=False)
     return figure

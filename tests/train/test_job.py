@@ -71,6 +71,7 @@ def test_a_run_traces_its_epoch_once_and_counts_what_it_did(job):
 def test_a_start_compiles_the_epoch_once_beside_what_comes_first(job):
     other = Job(CONFIG, job.env)
     state = other.start(lambda: start(other))
+    assert other.n_traces == 1  # before it is called
     assert_equal(state, start(job))
     expected = start(job)
     for _ in range(2):
