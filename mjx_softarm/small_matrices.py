@@ -9,6 +9,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+BLOCK = 3  # pivots that are eliminated at once
+
 
 def product(a: Array, b: Array) -> Array:
     """a b of small matrices (..., n, m) and (..., m, k), as sums: faster than products when tiny."""
@@ -46,16 +48,32 @@ def _eliminate_many(n: int, batched: list[bool], matrix: Array, columns: Array) 
 
 
 def _eliminate_last(augmented: Array) -> Array:
-    """Of matrices beside columns (n, n + k, batch): the batch is last: one instruction serves many."""
+    """Of matrices beside columns (n, n + k, batch): the batch is last, so one instruction serves many.
+
+    A block of columns is cleared at once, so that each number is read and written a third as often. Barriers
+    keep the compiler from working out the pivots' rows again for each of the others.
+    """
     n = augmented.shape[0]
-    rows = jnp.arange(n)[:, None]
+    augmented = jax.lax.optimization_barrier(augmented)
+    for first in range(0, n, BLOCK):
+        block = slice(first, first + BLOCK)
+        rows = _product_last(_inverse_last(augmented[block, block]), augmented[block])
+        rows = jax.lax.optimization_barrier(rows)
+        augmented = (augmented - _product_last(augmented[:, block], rows)).at[block].set(rows)
+    return augmented[:, n:]
 
-    def step(k: Array, augmented: Array) -> Array:
-        row = jax.lax.dynamic_index_in_dim(augmented, k, 0, keepdims=False)
-        column = jax.lax.dynamic_index_in_dim(augmented, k, 1, keepdims=False)
-        pivot = jax.lax.dynamic_index_in_dim(row, k, 0, keepdims=False)
-        row = row / jnp.where(pivot > 0, pivot, jnp.nan)
-        others = jnp.where(rows == k, 0, column)
-        return jax.lax.dynamic_update_index_in_dim(augmented - others[:, None] * row, row, k, 0)
 
-    return jax.lax.fori_loop(0, n, step, augmented)[:, n:]
+def _inverse_last(matrix: Array) -> Array:
+    """Of matrices (n, n, batch) with positive pivots; n is small, since all is written out."""
+    n = matrix.shape[0]
+    identity = jnp.broadcast_to(jnp.eye(n, dtype=matrix.dtype)[..., None], matrix.shape)
+    rows = list(jnp.concatenate([matrix, identity], axis=1))
+    for k in range(n):
+        row = rows[k] / jnp.where(rows[k][k] > 0, rows[k][k], jnp.nan)
+        rows = [row if other == k else rows[other] - rows[other][k] * row for other in range(n)]
+    return jnp.stack(rows)[:, n:]
+
+
+def _product_last(a: Array, b: Array) -> Array:
+    """a b of matrices (n, m, batch) and (m, k, batch); m is small, since all is written out."""
+    return sum(a[:, j, None] * b[j] for j in range(len(b)))
