@@ -5,6 +5,8 @@ Libraries are called once for each matrix, which costs more than the arithmetic 
 
 from __future__ import annotations
 
+import functools
+
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -76,4 +78,4 @@ def _inverse_last(matrix: Array) -> Array:
 
 def _product_last(a: Array, b: Array) -> Array:
     """a b of matrices (n, m, batch) and (m, k, batch); m is small, since all is written out."""
-    return sum(a[:, j, None] * b[j] for j in range(len(b)))
+    return functools.reduce(jnp.add, [a[:, j, None] * b[j] for j in range(len(b))])
