@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from benchmarks import hlo
 from benchmarks.common import seconds
 from benchmarks.truth import random_references, settle_function
 from mjx_softarm.spec import ArmSpec
@@ -103,16 +104,19 @@ def _primitives(jaxpr: Any) -> Iterator[str]:
 def floor_rows(spec: ArmSpec, arms: Sequence[int]) -> list[dict[str, Any]]:
     """A row for each number of arms, settled by the chain."""
     rates = device_rates()
+    on_gpu = jax.default_backend() == "gpu"
     function = settle_function(spec)
     rows = []
     for n in arms:
         reference = jnp.asarray(random_references(spec, n), jnp.float32)
         iterations = np.asarray(function(reference).iterations)
+        compiled = function.lower(reference).compile()
+        kernels = hlo.read(compiled.as_text()).launches(int(iterations.max())) if on_gpu else None
         outside, turn, n_outside = settle_cost(spec, reference)
         flop, moved = (
             a + (int(iterations.max()) - n_outside) * b for a, b in zip(outside, turn, strict=True)
         )
-        measured_s = seconds(functools.partial(function, reference))
+        measured_s = seconds(functools.partial(compiled, reference))
         rows.append(
             {
                 "arms": n,
@@ -123,6 +127,9 @@ def floor_rows(spec: ArmSpec, arms: Sequence[int]) -> list[dict[str, Any]]:
                 "flop_ms": round(1e3 * flop / rates["product_flop_per_s"], 4),
                 "bytes_ms": round(1e3 * moved / rates["copy_bytes_per_s"], 4),
                 "measured_ms": round(1e3 * measured_s, 3),
+                **(
+                    {"kernels": kernels, "kernel_us": round(1e6 * measured_s / kernels, 2)} if kernels else {}
+                ),
                 "gflop_per_s": round(1e-9 * flop / measured_s, 2),
                 "product_gflop_per_s": round(1e-9 * rates["product_flop_per_s"], 1),
                 "copy_gb_per_s": round(1e-9 * rates["copy_bytes_per_s"], 1),

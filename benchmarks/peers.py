@@ -1,8 +1,9 @@
 """Virtual environments of the libraries that this project is compared with, made on first use.
 
 Each has the peer, and of what the simulator needs the very versions that run here, so that all contestants
-train on the same environment. They lie beside the checkout's own `.venv`, as `.venv-PEER`. A file in them
-says what they were made of: one that is incomplete, or made of anything else, is made anew.
+train on the same environment. One is no peer's: it has JAX's compiler for GPUs, for machines without one.
+They lie beside the checkout's own `.venv`, as `.venv-PEER`. A file in them says what they were made of: one
+that is incomplete, or made of anything else, is made anew.
 
 PyTorch comes as the package index has it, on Linux with gigabytes of CUDA. Where these are not wanted:
 `PIP_EXTRA_INDEX_URL=https://download.pytorch.org/whl/cpu`.
@@ -21,7 +22,8 @@ MARKER = "complete"
 
 _SB3 = ("stable-baselines3==2.9.2", "torch==2.13.0")
 PINS = {"sbx": ("sbx-rl==0.28.0", *_SB3), "sb3-contrib": ("sb3-contrib==2.9.2", *_SB3)}
-# What mjx_softarm and train.evaluate import.
+COMPILER = "gpu-compiler"
+# What mjx_softarm, train.evaluate and train.job import.
 SHARED = (
     "numpy",
     "tomli_w",
@@ -44,7 +46,7 @@ def peer_python(name: str, root: Path = ROOT) -> Path:
     """The interpreter of a peer's virtual environment.
 
     Args:
-        name: key of `PINS`.
+        name: key of `PINS`, or `COMPILER`.
         root: folder that the environment lies in.
 
     Raises:
@@ -55,9 +57,7 @@ def peer_python(name: str, root: Path = ROOT) -> Path:
     content = "\n".join([f"python {sys.version_info.major}.{sys.version_info.minor}", *packages]) + "\n"
     if marker.exists() and marker.read_text("utf-8") == content:
         return python
-    print(
-        f"making {home} for {name}, which brings PyTorch; the first time this takes minutes ...", flush=True
-    )
+    print(f"making {home} with {packages[0]}; the first time this takes minutes ...", flush=True)
     marker.unlink(missing_ok=True)
     try:
         _make(home, python, packages)
@@ -70,6 +70,9 @@ def peer_python(name: str, root: Path = ROOT) -> Path:
 
 def peer_packages(name: str) -> tuple[str, ...]:
     """What a peer's environment is made of; its jax is for CUDA where the one here is."""
+    if name == COMPILER:
+        shared = tuple(f"{package}=={metadata.version(package)}" for package in SHARED)
+        return (f"jax-cuda12-plugin=={metadata.version('jax')}", *shared)
     cuda = any(distribution.name == "jax-cuda12-plugin" for distribution in metadata.distributions())
     names = {package: "jax[cuda12]" if cuda and package == "jax" else package for package in SHARED}
     return (*PINS[name], *(f"{names[package]}=={metadata.version(package)}" for package in SHARED))

@@ -7,7 +7,7 @@ from importlib import metadata
 import pytest
 
 from benchmarks import peers
-from benchmarks.peers import MARKER, PINS, SHARED, PeerError, peer_packages, peer_python
+from benchmarks.peers import COMPILER, MARKER, PINS, SHARED, PeerError, peer_packages, peer_python
 
 
 @pytest.fixture
@@ -34,6 +34,14 @@ def test_every_requirement_is_pinned_and_the_simulator_s_are_those_that_run_here
     assert "sbx-rl" in "".join(peer_packages("sbx")) and "sb3-contrib" in "".join(
         peer_packages("sb3-contrib")
     )
+
+
+def test_the_compiler_for_gpus_is_that_of_the_jax_which_runs_here_without_cuda():
+    plugin, *shared = peer_packages(COMPILER)
+    assert plugin == f"jax-cuda12-plugin=={metadata.version('jax')}"
+    assert dict(package.split("==") for package in shared) == {
+        package: metadata.version(package) for package in SHARED
+    }
 
 
 def test_an_environment_is_made_once_and_each_peer_has_its_own(made, tmp_path):

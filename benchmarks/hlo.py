@@ -1,0 +1,112 @@
+"""What a compiled program makes a GPU do, loop by loop: kernels and bytes, read from the text of its HLO.
+
+A kernel is an instruction outside of fusions that computes or copies; a fusion is one. A library's call
+counts as one, although it may launch several. Bytes are those of operands and results as if each were read or
+written whole: at most what is moved, since an operand may be read in part.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+NO_KERNEL = ("parameter", "constant", "tuple", "get-tuple-element", "bitcast", "after-all")
+
+_COMPUTATION = re.compile(r"(ENTRY )?%(\S+) \(.*\{$")
+_INSTRUCTION = re.compile(r"\s+(?:ROOT )?%(\S+) = (\(.*?\)|\S+) ([\w-]+)\((.*)")
+_ARRAY = re.compile(r"(pred|[a-z]+(\d+)\w*)\[([\d,]*)\]")
+_TURNS = re.compile(r'"known_trip_count":\{"n":"(\d+)"')
+_BRANCHES = re.compile(
+    r"(?:to_apply|calls|true_computation|false_computation)=%([\w.-]+)|branch_computations=\{([^}]*)\}"
+)
+
+
+class Loop(NamedTuple):
+    """A loop of a program, or all of it, which is a loop of one turn."""
+
+    turns: int | None  # None: the program finds out
+    kernels: int  # of a turn, without those of the loops inside
+    moved: int  # [bytes] likewise
+    inside: tuple[Loop, ...]
+
+    def launches(self, turns: int) -> int:
+        """Kernels of all turns, those of loops inside included; `turns` is for loops of unknown length."""
+        own = self.kernels + sum(loop.launches(turns) for loop in self.inside)
+        return own * (turns if self.turns is None else self.turns)
+
+
+def read(text: str) -> Loop:
+    """The loops of a compiled program.
+
+    Args:
+        text: what `as_text()` of a compiled function gives.
+
+    Raises:
+        ValueError: it has no entry computation.
+    """
+    computations: dict[str, list[str]] = {}
+    entry, current = "", None
+    for line in text.splitlines():
+        if found := _COMPUTATION.match(line):
+            current = computations.setdefault(found[2], [])
+            entry = found[2] if found[1] else entry
+        elif line.startswith("}"):
+            current = None
+        elif current is not None:
+            current.append(line)
+    if not entry:
+        raise ValueError(f"HLO: expected an ENTRY computation, got {text[:60]!r} ...")
+    return _loop(computations, [entry], 1)
+
+
+def _loop(computations: Mapping[str, Sequence[str]], names: Sequence[str], turns: int | None) -> Loop:
+    """A loop whose turn is made of these computations."""
+    kernels = moved = 0
+    inside: list[Loop] = []
+    for name in names:
+        size: dict[str, int] = {}  # of results [bytes]
+        for found in filter(None, map(_INSTRUCTION.match, computations[name])):
+            result, kind, operation, rest = found.groups()
+            size[result] = _bytes(kind)
+            if operation == "while":
+                inside.append(_while(computations, rest))
+            elif operation in ("call", "conditional"):
+                branch = max(
+                    (_loop(computations, [branch], 1) for branch in _branches(rest)),
+                    key=lambda branch: branch.launches(1),
+                )
+                kernels, moved = kernels + branch.kernels, moved + branch.moved
+                inside += branch.inside
+            elif operation not in NO_KERNEL and not operation.endswith("-done"):
+                operands = re.findall(r"%([\w.-]+)", rest[: rest.index(")")])
+                kernels, moved = kernels + 1, moved + sum(size[x] for x in [result, *operands])
+    return Loop(turns, kernels, moved, tuple(inside))
+
+
+def _while(computations: Mapping[str, Sequence[str]], rest: str) -> Loop:
+    """A loop by its instruction; where the number of turns is known, its condition is not computed."""
+    body, condition = (re.search(rf"{part}=%([\w.-]+)", rest) for part in ("body", "condition"))
+    turns = _TURNS.search(rest)
+    if not body or not condition:
+        raise ValueError(f"HLO: expected body and condition of a while, got {rest[:60]!r} ...")
+    if turns:
+        return _loop(computations, [body[1]], int(turns[1]))
+    return _loop(computations, [body[1], condition[1]], None)
+
+
+def _branches(rest: str) -> list[str]:
+    """Names of the computations of which one is done."""
+    named = ",".join(one or several for one, several in _BRANCHES.findall(rest))
+    return [name.strip(" %") for name in named.split(",")]
+
+
+def _bytes(kind: str) -> int:
+    """Of an array's type, or of all of a tuple's."""
+    total = 0
+    for _, bits, shape in _ARRAY.findall(kind):
+        n = 1
+        for length in filter(None, shape.split(",")):
+            n *= int(length)
+        total += n * int(bits or 8) // 8
+    return total

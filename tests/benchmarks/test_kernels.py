@@ -1,0 +1,159 @@
+"""Kernels and bytes of programs, read from HLO written by hand and by XLA; what fails is told."""
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from benchmarks import kernels
+from benchmarks.hlo import Loop, read
+from benchmarks.peers import PeerError
+from benchmarks.rounds import WorkerError
+
+PROGRAM = """HloModule jit_f, is_scheduled=true
+
+%fused (p: f32[8,4]) -> f32[8,4] {
+  %p = f32[8,4]{1,0} parameter(0)
+  ROOT %twice = f32[8,4]{1,0} add(%p, %p)
+}
+
+%fixed.body (a: (s32[], f32[8,4])) -> (s32[], f32[8,4]) {
+  %a = (s32[], f32[8,4]{1,0}) parameter(0)
+  %x = f32[8,4]{1,0} get-tuple-element(%a), index=1
+  %i = s32[] get-tuple-element(%a), index=0
+  %y = f32[8,4]{1,0} fusion(%x), kind=kLoop, calls=%fused
+  ROOT %t = (s32[], f32[8,4]{1,0}) tuple(%i, %y)
+}
+
+%fixed.condition (b: (s32[], f32[8,4])) -> pred[] {
+  %b = (s32[], f32[8,4]{1,0}) parameter(0)
+  ROOT %c = pred[] fusion(%b), kind=kLoop, calls=%fused
+}
+
+%open.body (d: (s32[], f32[8,4])) -> (s32[], f32[8,4]) {
+  %d = (s32[], f32[8,4]{1,0}) parameter(0)
+  ROOT %w = (s32[], f32[8,4]{1,0}) while(%d), condition=%fixed.condition, body=%fixed.body, \
+backend_config={"known_trip_count":{"n":"12"}}
+}
+
+%open.condition (e: (s32[], f32[8,4])) -> pred[] {
+  %e = (s32[], f32[8,4]{1,0}) parameter(0)
+  %i.2 = s32[] get-tuple-element(%e), index=0
+  ROOT %less = pred[] compare(%i.2, %i.2), direction=LT
+}
+
+%one (g: bf16[8]) -> bf16[8] {
+  %g = bf16[8]{0} parameter(0)
+  ROOT %copied = bf16[8]{0} copy(%g)
+}
+
+%other (h: bf16[8]) -> bf16[8] {
+  ROOT %h = bf16[8]{0} parameter(0)
+}
+
+ENTRY %main (m: (s32[], f32[8,4]), n: bf16[8], o: pred[]) -> bf16[8] {
+  %m = (s32[], /*index=1*/f32[8,4]{1,0}) parameter(0)
+  %n = bf16[8]{0} parameter(1)
+  %o = pred[] parameter(2)
+  %v = (s32[], f32[8,4]{1,0}) while(%m), condition=%open.condition, body=%open.body
+  %started = (bf16[8]{0}, bf16[8]{0}) copy-start(%n)
+  %done = bf16[8]{0} copy-done(%started)
+  ROOT %r = bf16[8]{0} conditional(%o, %n, %n), true_computation=%other, false_computation=%one
+}
+"""
+FIXED = Loop(turns=12, kernels=1, moved=2 * 4 * 32, inside=())
+OPEN = Loop(turns=None, kernels=1, moved=1 + 2 * 4, inside=(FIXED,))
+
+
+def test_loops_of_a_program_with_their_kernels_and_bytes():
+    copies = 3 * 2 * 8 + 2 * 2 * 8  # one that is begun, with two results, and one in the larger branch
+    assert read(PROGRAM) == Loop(1, kernels=2, moved=copies, inside=(OPEN,))
+
+
+def test_launches_are_those_of_all_turns():
+    assert FIXED.launches(5) == 12
+    assert OPEN.launches(5) == 5 * (1 + 12)
+    assert read(PROGRAM).launches(5) == 2 + 5 * 13
+
+
+def test_what_xla_writes_is_read():
+    def until(x):
+        return jax.lax.while_loop(lambda x: jnp.sum(x) < 1e3, lambda x: jnp.sin(x) + 2.0, x)
+
+    def function(x):
+        return until(jax.lax.fori_loop(0, 7, lambda _, x: jnp.cos(x) * 3.0, x))
+
+    program = read(jax.jit(function).lower(jnp.ones((16, 16))).compile().as_text())
+    turns = [loop.turns for loop in program.inside]
+    assert turns == [7, None]
+    assert all(loop.kernels >= 1 and loop.moved >= 2 * 4 * 16 * 16 for loop in program.inside)
+
+
+@pytest.mark.parametrize("text", ["", "HloModule nothing\n"])
+def test_what_is_no_program_is_refused(text):
+    with pytest.raises(ValueError, match="expected an ENTRY computation"):
+        read(text)
+
+
+def test_each_loop_has_a_row_with_its_turns_and_those_around_it():
+    rows = list(kernels.rows(Loop(1, 2, 9_600_000, (Loop(4, 0, 0, (OPEN,)),))))
+    assert [row["turns"] for row in rows] == ["once", "4", "4 x until at rest", "4 x until at rest x 12"]
+    assert rows[0] == {"turns": "once", "kernels": 2, "mb": 9.6, "least_us": 1.0}
+
+
+class Told:
+    """In place of a worker: one program fails, the others tell a loop as it comes through JSON."""
+
+    made: list  # of where, program and interpreter
+
+    def __init__(self, name, program, python=None):
+        self.name, self.facts = name, {}
+        self.made.append((program[1], program[2], python))
+
+    def start(self):
+        if "mjx" in self.name:
+            raise WorkerError(f"{self.name}: stopped with status 1, expected a result:\nno memory")
+        self.facts = {"compiling_s": 1.0, "loops": [1, 2, 4_800_000, [[None, 3, 0, []]]]}
+
+    def close(self):
+        pass
+
+
+def test_programs_are_compiled_for_a_gpu_that_is_not_there_and_one_that_fails_costs_no_other(monkeypatch):
+    monkeypatch.setattr(Told, "made", [], raising=False)
+    monkeypatch.setattr(kernels, "Worker", Told)
+    monkeypatch.setattr(kernels, "peer_python", lambda name: name)
+    figures = kernels.measure()
+    assert Told.made == [("h200", program[0], "gpu-compiler") for program in kernels.PROGRAMS.values()]
+    failed = [row["program"] for row in figures["compiled"] if "failed" in row]
+    assert len(failed) == 1 and "mjx" in failed[0]
+    assert [row["kernels"] for row in figures["loops"]] == [2, 3] * (len(kernels.PROGRAMS) - 1)
+
+
+def test_a_gpu_that_is_there_needs_no_other_environment(monkeypatch):
+    monkeypatch.setattr(Told, "made", [], raising=False)
+    monkeypatch.setattr(kernels, "Worker", Told)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    kernels.measure()
+    assert {(where, python) for where, _, python in Told.made} == {("here", None)}
+
+
+def test_without_gpu_and_compiler_it_says_so(monkeypatch):
+    def no_environment(name):
+        raise PeerError(f"{name}: no matching distribution")
+
+    monkeypatch.setattr(kernels, "peer_python", no_environment)
+    told = kernels.measure()["skipped"]
+    assert "no CUDA device" in told and "no matching distribution" in told
+
+
+@pytest.mark.slow
+def test_a_step_of_arms_is_compiled_for_an_h200():
+    program = ["benchmarks.kernels_worker", "h200", "env-step", "chain", "64"]
+    worker = kernels.Worker("step", program, kernels.peer_python(kernels.COMPILER))
+    try:
+        worker.start()
+    finally:
+        worker.close()
+    step = kernels.told_loop(worker.facts["loops"])
+    assert [loop.turns for loop in step.inside] == [None]  # the eliminations have no loops of their own
+    assert 50 < step.inside[0].kernels < 300
