@@ -174,7 +174,7 @@ class ImitationConfig(TrainConfig):
         return -(-self.rebalance_env_steps // (self.n_arms * self.vector_steps_per_epoch))
 
 
-# Settings that made learning faster or finer; the README has the measurements.
+# Settings that made learning faster or finer.
 _TUNED = TrainConfig(
     tqc=TQCConfig(
         gamma=0.5,
