@@ -15,7 +15,7 @@ from pathlib import Path
 NAMES = {
     "throughput": "env steps/s over arms and links, beside C MuJoCo in time steps; start-up times",
     "settle": "error, speed, compile time and memory of Newton against time stepping; floor against measured",
-    "kernels": "what a GPU is given to do, kernel by kernel; compiled for an H200 where there is none",
+    "kernels": "what a GPU is given to do, loop by loop; compiled for an H200 where there is none",
     "learner": "gradient updates/s over batch sizes, against sb3-contrib, SBX and brax",
     "calibration": "errors of springs, chambers and sim-to-real network on real logs and a planted arm",
     "learning": "tip errors of the presets over seeds, from finished runs",

@@ -54,7 +54,7 @@ def counted(function: Callable, compiled: Any, *arguments: Any) -> Cost:
     """Operations and bytes of a compiled function.
 
     Raises:
-        RuntimeError: it has a library's factorisation, or a loop whose turns are not known.
+        RuntimeError: it has a library's factorisation, or a loop.
     """
     for name in _primitives(jax.make_jaxpr(function)(*arguments).jaxpr):
         if name in UNCOUNTED:
@@ -109,19 +109,18 @@ def floor_rows(spec: ArmSpec, arms: Sequence[int]) -> list[dict[str, Any]]:
     rows = []
     for n in arms:
         reference = jnp.asarray(random_references(spec, n), jnp.float32)
-        iterations = np.asarray(function(reference).iterations)
         compiled = function.lower(reference).compile()
-        kernels = hlo.read(compiled.as_text()).launches(int(iterations.max())) if on_gpu else None
+        iterations = np.asarray(compiled(reference).iterations)
         outside, turn, n_outside = settle_cost(spec, reference)
-        flop, moved = (
-            a + (int(iterations.max()) - n_outside) * b for a, b in zip(outside, turn, strict=True)
-        )
+        n_turns = int(iterations.max()) - n_outside
+        flop, moved = (a + n_turns * b for a, b in zip(outside, turn, strict=True))
+        kernels = hlo.read(compiled.as_text()).launches(n_turns) if on_gpu else 0
         measured_s = seconds(functools.partial(compiled, reference))
         rows.append(
             {
                 "arms": n,
                 "mean_iterations": round(float(iterations.mean()), 2),
-                "iterations_run": int(iterations.max()),
+                "iterations_run": n_turns + n_outside,
                 "kflop_per_arm": round(1e-3 * flop / n, 1),
                 "kb_per_arm": round(1e-3 * moved / n, 1),
                 "flop_ms": round(1e3 * flop / rates["product_flop_per_s"], 4),

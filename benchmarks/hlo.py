@@ -2,38 +2,50 @@
 
 A kernel is an instruction outside of fusions that computes or copies; a fusion is one. A library's call
 counts as one, although it may launch several. Bytes are those of operands and results as if each were read or
-written whole: at most what is moved, since an operand may be read in part.
+written whole: no more than these move, since an operand may be read in part, or still be in a cache.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
-NO_KERNEL = ("parameter", "constant", "tuple", "get-tuple-element", "bitcast", "after-all")
+NO_KERNEL = {
+    *("parameter", "constant", "tuple", "get-tuple-element", "bitcast"),
+    *("after-all", "add-dependency", "opt-barrier", "domain", "partition-id", "replica-id"),
+}
 
 _COMPUTATION = re.compile(r"(ENTRY )?%(\S+) \(.*\{$")
 _INSTRUCTION = re.compile(r"\s+(?:ROOT )?%(\S+) = (\(.*?\)|\S+) ([\w-]+)\((.*)")
 _ARRAY = re.compile(r"(pred|[a-z]+(\d+)\w*)\[([\d,]*)\]")
 _TURNS = re.compile(r'"known_trip_count":\{"n":"(\d+)"')
 _BRANCHES = re.compile(
-    r"(?:to_apply|calls|true_computation|false_computation)=%([\w.-]+)|branch_computations=\{([^}]*)\}"
+    r"(?:to_apply|true_computation|false_computation)=%([\w.-]+)|branch_computations=\{([^}]*)\}"
 )
+_SCRATCH = re.compile(r"[su]8\[\d*\]")  # of a library's call, among its results
 
 
 class Loop(NamedTuple):
     """A loop of a program, or all of it, which is a loop of one turn."""
 
     turns: int | None  # None: the program finds out
-    kernels: int  # of a turn, without those of the loops inside
-    moved: int  # [bytes] likewise
+    kernels: tuple[int, ...]  # [bytes] that each one of a turn touches, those of the loops inside left out
     inside: tuple[Loop, ...]
 
-    def launches(self, turns: int) -> int:
-        """Kernels of all turns, those of loops inside included; `turns` is for loops of unknown length."""
-        own = self.kernels + sum(loop.launches(turns) for loop in self.inside)
+    def total(self, cost: Callable[[int], float], turns: int) -> float:
+        """Of the costs of all kernels in all turns, those of loops inside included.
+
+        Args:
+            cost: of a kernel, by its bytes.
+            turns: of loops of unknown length.
+        """
+        own = sum(map(cost, self.kernels)) + sum(loop.total(cost, turns) for loop in self.inside)
         return own * (turns if self.turns is None else self.turns)
+
+    def launches(self, turns: int) -> int:
+        """How many kernels all turns have, likewise."""
+        return round(self.total(lambda _: 1, turns))
 
 
 def read(text: str) -> Loop:
@@ -43,7 +55,7 @@ def read(text: str) -> Loop:
         text: what `as_text()` of a compiled function gives.
 
     Raises:
-        ValueError: it has no entry computation.
+        ValueError: it is none, or names what it has not.
     """
     computations: dict[str, list[str]] = {}
     entry, current = "", None
@@ -57,18 +69,21 @@ def read(text: str) -> Loop:
             current.append(line)
     if not entry:
         raise ValueError(f"HLO: expected an ENTRY computation, got {text[:60]!r} ...")
-    return _loop(computations, [entry], 1)
+    try:
+        return _loop(computations, [entry], 1)
+    except KeyError as error:
+        raise ValueError(f"HLO: expected a computation or an instruction called {error}") from error
 
 
 def _loop(computations: Mapping[str, Sequence[str]], names: Sequence[str], turns: int | None) -> Loop:
     """A loop whose turn is made of these computations."""
-    kernels = moved = 0
+    kernels: list[int] = []
     inside: list[Loop] = []
     for name in names:
         size: dict[str, int] = {}  # of results [bytes]
         for found in filter(None, map(_INSTRUCTION.match, computations[name])):
             result, kind, operation, rest = found.groups()
-            size[result] = _bytes(kind)
+            size[result] = _bytes(_SCRATCH.sub("", kind) if operation == "custom-call" else kind)
             if operation == "while":
                 inside.append(_while(computations, rest))
             elif operation in ("call", "conditional"):
@@ -76,12 +91,12 @@ def _loop(computations: Mapping[str, Sequence[str]], names: Sequence[str], turns
                     (_loop(computations, [branch], 1) for branch in _branches(rest)),
                     key=lambda branch: branch.launches(1),
                 )
-                kernels, moved = kernels + branch.kernels, moved + branch.moved
+                kernels += branch.kernels
                 inside += branch.inside
             elif operation not in NO_KERNEL and not operation.endswith("-done"):
                 operands = re.findall(r"%([\w.-]+)", rest[: rest.index(")")])
-                kernels, moved = kernels + 1, moved + sum(size[x] for x in [result, *operands])
-    return Loop(turns, kernels, moved, tuple(inside))
+                kernels.append(sum(size[x] for x in [result, *operands]))
+    return Loop(turns, tuple(kernels), tuple(inside))
 
 
 def _while(computations: Mapping[str, Sequence[str]], rest: str) -> Loop:

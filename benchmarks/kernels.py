@@ -1,9 +1,9 @@
 """What a GPU is given to do: kernels and bytes of each loop of a step and of a training epoch.
 
-Launching a kernel takes some microseconds, in which a GPU is idle unless the kernel before takes longer.
-`least_us` is what a kernel of the loop takes in the mean if all that it touches goes through memory at the
-rate of the data sheet: where that is less than a launch, launches set the pace. Where there is no CUDA device
-the programs are compiled for an H200 all the same; nothing is run.
+A kernel is calculated to take a launch, or the time in which what it touches goes through memory at the rate
+of the data sheet, whichever is longer. That a launch takes 3 us is an assumption, of a GPU without CUDA
+graphs, which XLA uses where it can and which make it shorter; arithmetic and caches are left out. Where there
+is no CUDA device the programs are compiled for an H200 all the same, and run on none.
 """
 
 from __future__ import annotations
@@ -12,63 +12,94 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 
 from benchmarks import gpu, hlo
 from benchmarks.peers import COMPILER, PeerError, peer_python
 from benchmarks.rounds import Facts, Worker, WorkerError
+from benchmarks.truth import random_references, settle_function
+from mjx_softarm.spec import ArmSpec
 
-H200_BYTES_PER_S = 4.8e12  # data sheet
+LAUNCH_S, H200_BYTES_PER_S = 3e-6, 4.8e12
 N_ARMS = 8192
-PROGRAMS = {
-    f"env step, chain, {N_ARMS:,} arms": ("env-step", "chain", str(N_ARMS)),
-    f"env step, mjx, {N_ARMS:,} arms": ("env-step", "mjx", str(N_ARMS)),
-    "training epoch": ("epoch", *gpu.TRAINING),
+ENV_STEPS = {
+    f"env step, {engine}, {N_ARMS:,} arms": ("env-step", engine, str(N_ARMS)) for engine in ("chain", "mjx")
 }
+PROGRAMS = {**ENV_STEPS, "training epoch": ("epoch", *gpu.TRAINING)}
 NOTES = {
-    "turns": "of a loop; settling goes on until the slowest arm rests, which takes it six or seven",
-    "kernels, mb": "of one turn, those of loops inside not among them; bytes as if nothing were cached and "
-    "every operand read whole",
-    "least_us": f"mb / kernels at {1e-12 * H200_BYTES_PER_S:g} TB/s",
+    "turns": "of a loop; settling goes on until the slowest arm rests",
+    "kernels, mb": "of one turn, those of loops inside left out; bytes as if every operand were read whole",
+    "launch_bound": "share of the kernels that touch too little to take longer than a launch",
+    "calculated": f"a kernel takes {1e6 * LAUNCH_S:g} us, or its bytes at {1e-12 * H200_BYTES_PER_S:g} TB/s",
     "training epoch": " ".join(gpu.TRAINING),
 }
 
 
 def measure() -> dict[str, Any]:
-    """For each program what it takes to compile, and a row for each of its loops."""
+    """For each program what it takes to compile and, of a step, to run; and a row for each of its loops."""
     on_gpu = jax.default_backend() == "gpu"
     try:
         python = None if on_gpu else peer_python(COMPILER)
     except PeerError as error:
         return {"skipped": f"{gpu.NO_DEVICE}; {error}"}
-    programs, loops = [], []
+    turns, programs, loops = newton_steps(), [], []
     for name, program in PROGRAMS.items():
         worker = Worker(name, ["benchmarks.kernels_worker", "here" if on_gpu else "h200", *program], python)
         print(f"compiling: {name}", flush=True)
         try:
             worker.start()
             facts = dict(worker.facts)
-            loops += [{"program": name, **row} for row in rows(told_loop(facts.pop("loops")))]
+            loop = told_loop(facts.pop("loops"))
+            loops += [{"program": name, **row} for row in rows(loop)]
+            facts |= in_all(loop, turns) if name in ENV_STEPS else {}
         except WorkerError as error:
             facts = {"failed": error.reason}
         finally:
             worker.close()
         programs.append({"program": name, **facts})
-    return {"compiled": programs, "loops": loops, "notes": NOTES}
+    return {"newton_steps_of_the_slowest_arm": turns, "programs": programs, "loops": loops, "notes": NOTES}
+
+
+def newton_steps() -> int:
+    """Of the slowest of as many arms with random references."""
+    spec = ArmSpec.default()
+    reference = jnp.asarray(random_references(spec, N_ARMS), jnp.float32)
+    return int(np.max(settle_function(spec)(reference).iterations))
 
 
 def told_loop(told: Sequence[Any]) -> hlo.Loop:
     """A loop as a worker tells it, in JSON's lists."""
-    turns, kernels, moved, inside = told
-    return hlo.Loop(turns, kernels, moved, tuple(map(told_loop, inside)))
+    turns, kernels, inside = told
+    return hlo.Loop(turns, tuple(kernels), tuple(map(told_loop, inside)))
+
+
+def kernel_s(moved: int) -> float:
+    """Time that a kernel is calculated to take, by the bytes it touches."""
+    return max(LAUNCH_S, moved / H200_BYTES_PER_S)
+
+
+def in_all(loop: hlo.Loop, turns: int) -> Facts:
+    """An env step of `N_ARMS` whose slowest arm takes so many turns to settle."""
+    seconds = loop.total(kernel_s, turns)
+    return {
+        "kernels": loop.launches(turns),
+        "gb": round(1e-9 * loop.total(float, turns), 2),
+        "calculated_ms": round(1e3 * seconds, 2),
+        "calculated_env_steps_per_s": float(f"{N_ARMS / seconds:.2g}"),
+    }
 
 
 def rows(loop: hlo.Loop, turns: Sequence[str] = ()) -> Iterator[Facts]:
     """A row for a loop, whose turns are told with those of the loops around it, and for each inside it."""
-    yield {
-        "turns": " x ".join(turns) or "once",
-        "kernels": loop.kernels,
-        "mb": round(1e-6 * loop.moved, 1),
-        "least_us": round(1e6 * loop.moved / H200_BYTES_PER_S / max(loop.kernels, 1), 2),
-    }
+    n = len(loop.kernels)
+    if n:
+        yield {
+            "turns": " x ".join(turns) or "once",
+            "kernels": n,
+            "mb": round(1e-6 * sum(loop.kernels), 1),
+            "launch_bound": round(sum(kernel_s(moved) == LAUNCH_S for moved in loop.kernels) / n, 2),
+            "calculated_us": round(1e6 * sum(map(kernel_s, loop.kernels)), 1),
+        }
     for inner in loop.inside:
         yield from rows(inner, [*turns, "until at rest" if inner.turns is None else str(inner.turns)])

@@ -14,6 +14,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import venv
+from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
 
@@ -57,7 +58,8 @@ def peer_python(name: str, root: Path = ROOT) -> Path:
     content = "\n".join([f"python {sys.version_info.major}.{sys.version_info.minor}", *packages]) + "\n"
     if marker.exists() and marker.read_text("utf-8") == content:
         return python
-    print(f"making {home} with {packages[0]}; the first time this takes minutes ...", flush=True)
+    large = "" if name == COMPILER else " and PyTorch"
+    print(f"making {home} with {packages[0]}{large}; the first time this takes minutes ...", flush=True)
     marker.unlink(missing_ok=True)
     try:
         _make(home, python, packages)
@@ -71,11 +73,14 @@ def peer_python(name: str, root: Path = ROOT) -> Path:
 def peer_packages(name: str) -> tuple[str, ...]:
     """What a peer's environment is made of; its jax is for CUDA where the one here is."""
     if name == COMPILER:
-        shared = tuple(f"{package}=={metadata.version(package)}" for package in SHARED)
-        return (f"jax-cuda12-plugin=={metadata.version('jax')}", *shared)
+        return (f"jax-cuda12-plugin=={metadata.version('jax')}", *_pinned({}))
     cuda = any(distribution.name == "jax-cuda12-plugin" for distribution in metadata.distributions())
-    names = {package: "jax[cuda12]" if cuda and package == "jax" else package for package in SHARED}
-    return (*PINS[name], *(f"{names[package]}=={metadata.version(package)}" for package in SHARED))
+    return (*PINS[name], *_pinned({"jax": "jax[cuda12]"} if cuda else {}))
+
+
+def _pinned(names: Mapping[str, str]) -> list[str]:
+    """What is shared, at the versions that run here, under its own names or these."""
+    return [f"{names.get(package, package)}=={metadata.version(package)}" for package in SHARED]
 
 
 def _make(home: Path, python: Path, packages: tuple[str, ...]) -> None:

@@ -76,7 +76,7 @@ def measure() -> dict[str, Any]:
     try:
         arms = (1, 128, 1024, 8192, 32_768) if on_gpu else (1, 32, 128, 512, 1024)
         figures["floor"] = floor_rows(spec, arms)
-    except RuntimeError as error:  # must not lose what is above
+    except (RuntimeError, ValueError) as error:  # must not lose what is above
         figures["floor"] = [{"failed": str(error)}]
     return {**figures, "goals": [_goal(spec)]}
 

@@ -58,7 +58,7 @@ def _eliminate_last(augmented: Array) -> Array:
     n = augmented.shape[0]
     augmented = jax.lax.optimization_barrier(augmented)
     for first in range(0, n, BLOCK):
-        block = slice(first, first + BLOCK)
+        block = slice(first, min(first + BLOCK, n))
         rows = _product_last(_inverse_last(augmented[block, block]), augmented[block])
         rows = jax.lax.optimization_barrier(rows)
         augmented = (augmented - _product_last(augmented[:, block], rows)).at[block].set(rows)

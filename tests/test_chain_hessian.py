@@ -107,10 +107,23 @@ def test_elimination_of_rows_of_which_some_are_the_identity_s():
     np.testing.assert_array_equal(found[given], columns[given])
 
 
-@pytest.mark.parametrize("pivot", [0.0, -1.0])
-def test_a_pivot_that_is_not_positive_gives_nan(pivot):
-    matrix = np.diag(np.float32([1.0, pivot, 2.0]))
-    assert np.isnan(eliminate(matrix, np.ones((3, 2), np.float32))).all()
+@pytest.mark.parametrize("n", range(1, 8))
+def test_elimination_of_any_number_of_unknowns(n):
+    rng = np.random.default_rng(n)
+    root, columns = rng.normal(size=(4, n, n)), np.float32(rng.normal(size=(4, n, 3)))
+    matrix = np.float32(root @ root.swapaxes(1, 2) + np.eye(n))
+    found = jax.vmap(eliminate)(matrix, columns)
+    np.testing.assert_allclose(found, np.linalg.solve(matrix, columns), rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0])
+@pytest.mark.parametrize("n, which", [(3, 1), (6, 4), (7, 6)])
+def test_a_pivot_that_is_not_positive_gives_nan_and_its_neighbours_do_not(n, which, value):
+    matrix = np.stack(3 * [2.0 * np.eye(n, dtype=np.float32)])
+    matrix[1, which, which] = value
+    found = jax.vmap(eliminate)(matrix, np.ones((3, n, 2), np.float32))
+    assert np.isnan(found[1]).all() and np.isnan(eliminate(matrix[1], np.ones((n, 2), np.float32))).all()
+    np.testing.assert_allclose(found[::2], 0.5)
 
 
 def test_small_products_and_block_diagonals():

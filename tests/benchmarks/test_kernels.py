@@ -41,9 +41,16 @@ backend_config={"known_trip_count":{"n":"12"}}
   ROOT %less = pred[] compare(%i.2, %i.2), direction=LT
 }
 
+%called (k: bf16[8]) -> (bf16[8], s8[64]) {
+  %k = bf16[8]{0} parameter(0)
+  ROOT %library = (bf16[8]{0}, s8[64]{0}) custom-call(%k, %k), custom_call_target="product"
+}
+
 %one (g: bf16[8]) -> bf16[8] {
   %g = bf16[8]{0} parameter(0)
-  ROOT %copied = bf16[8]{0} copy(%g)
+  %graph = (bf16[8]{0}, s8[64]{0}) call(%g), to_apply=%called
+  %first = bf16[8]{0} get-tuple-element(%graph), index=0
+  ROOT %copied = bf16[8]{0:T(8,128)} copy(%first)
 }
 
 %other (h: bf16[8]) -> bf16[8] {
@@ -60,19 +67,26 @@ ENTRY %main (m: (s32[], f32[8,4]), n: bf16[8], o: pred[]) -> bf16[8] {
   ROOT %r = bf16[8]{0} conditional(%o, %n, %n), true_computation=%other, false_computation=%one
 }
 """
-FIXED = Loop(turns=12, kernels=1, moved=2 * 4 * 32, inside=())
-OPEN = Loop(turns=None, kernels=1, moved=1 + 2 * 4, inside=(FIXED,))
+FIXED = Loop(turns=12, kernels=(2 * 4 * 32,), inside=())
+OPEN = Loop(turns=None, kernels=(1 + 2 * 4,), inside=(FIXED,))
+ROW = 2 * 8  # bytes of bf16[8]
 
 
-def test_loops_of_a_program_with_their_kernels_and_bytes():
-    copies = 3 * 2 * 8 + 2 * 2 * 8  # one that is begun, with two results, and one in the larger branch
-    assert read(PROGRAM) == Loop(1, kernels=2, moved=copies, inside=(OPEN,))
+@pytest.mark.parametrize(
+    "conditional",
+    ["true_computation=%other, false_computation=%one", "branch_computations={%other, %other, %one}"],
+)
+def test_loops_of_a_program_with_their_kernels_and_bytes(conditional):
+    text = PROGRAM.replace("true_computation=%other, false_computation=%one", conditional)
+    begun, library, copied = 3 * ROW, 3 * ROW, 2 * ROW  # a library's scratch is not moved
+    assert read(text) == Loop(1, kernels=(begun, library, copied), inside=(OPEN,))
 
 
-def test_launches_are_those_of_all_turns():
+def test_launches_and_costs_are_those_of_all_turns():
     assert FIXED.launches(5) == 12
     assert OPEN.launches(5) == 5 * (1 + 12)
-    assert read(PROGRAM).launches(5) == 2 + 5 * 13
+    assert read(PROGRAM).launches(5) == 3 + 5 * 13
+    assert read(PROGRAM).total(float, 2) == 8 * ROW + 2 * (9 + 12 * 256)
 
 
 def test_what_xla_writes_is_read():
@@ -85,7 +99,7 @@ def test_what_xla_writes_is_read():
     program = read(jax.jit(function).lower(jnp.ones((16, 16))).compile().as_text())
     turns = [loop.turns for loop in program.inside]
     assert turns == [7, None]
-    assert all(loop.kernels >= 1 and loop.moved >= 2 * 4 * 16 * 16 for loop in program.inside)
+    assert all(sum(loop.kernels) >= 2 * 4 * 16 * 16 for loop in program.inside)
 
 
 @pytest.mark.parametrize("text", ["", "HloModule nothing\n"])
@@ -94,10 +108,26 @@ def test_what_is_no_program_is_refused(text):
         read(text)
 
 
-def test_each_loop_has_a_row_with_its_turns_and_those_around_it():
-    rows = list(kernels.rows(Loop(1, 2, 9_600_000, (Loop(4, 0, 0, (OPEN,)),))))
-    assert [row["turns"] for row in rows] == ["once", "4", "4 x until at rest", "4 x until at rest x 12"]
-    assert rows[0] == {"turns": "once", "kernels": 2, "mb": 9.6, "least_us": 1.0}
+@pytest.mark.parametrize("lost", ["%fixed.body (", "%one (", "  %x = "])
+def test_what_is_named_and_not_there_is_told(lost):
+    with pytest.raises(ValueError, match="expected a computation or an instruction called"):
+        read(PROGRAM.replace(lost, lost.replace("%", "%no.")))
+
+
+LARGE = 48_000_000  # bytes that take 10 us
+
+
+def test_each_loop_that_has_kernels_has_a_row_with_its_turns_and_those_around_it():
+    rows = list(kernels.rows(Loop(1, (LARGE, 0), (Loop(4, (), (OPEN,)),))))
+    assert [row["turns"] for row in rows] == ["once", "4 x until at rest", "4 x until at rest x 12"]
+    assert rows[0] == {"turns": "once", "kernels": 2, "mb": 48.0, "launch_bound": 0.5, "calculated_us": 13.0}
+
+
+def test_a_step_of_all_arms_takes_its_kernels_launches_or_its_bytes():
+    step = kernels.in_all(Loop(1, (LARGE,), (OPEN._replace(inside=()),)), turns=10)
+    assert step["kernels"] == 11 and step["gb"] == 0.05
+    assert step["calculated_ms"] == 0.04  # 10 us, and ten times 3
+    assert step["calculated_env_steps_per_s"] == pytest.approx(kernels.N_ARMS / 40e-6, rel=0.03)
 
 
 class Told:
@@ -112,38 +142,45 @@ class Told:
     def start(self):
         if "mjx" in self.name:
             raise WorkerError(f"{self.name}: stopped with status 1, expected a result:\nno memory")
-        self.facts = {"compiling_s": 1.0, "loops": [1, 2, 4_800_000, [[None, 3, 0, []]]]}
+        self.facts = {"compiling_s": 1.0, "loops": [1, [5, 5], [[None, [5, 5, 5], []]]]}
 
     def close(self):
         pass
 
 
-def test_programs_are_compiled_for_a_gpu_that_is_not_there_and_one_that_fails_costs_no_other(monkeypatch):
+@pytest.fixture
+def told(monkeypatch):
+    """Workers that compile nothing, on a machine without a GPU: a list of what they were asked for."""
     monkeypatch.setattr(Told, "made", [], raising=False)
     monkeypatch.setattr(kernels, "Worker", Told)
     monkeypatch.setattr(kernels, "peer_python", lambda name: name)
+    monkeypatch.setattr(kernels, "newton_steps", lambda: 2)
+    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
+    return Told.made
+
+
+def test_programs_are_compiled_for_a_gpu_that_is_not_there_and_one_that_fails_costs_no_other(told):
     figures = kernels.measure()
-    assert Told.made == [("h200", program[0], "gpu-compiler") for program in kernels.PROGRAMS.values()]
-    failed = [row["program"] for row in figures["compiled"] if "failed" in row]
-    assert len(failed) == 1 and "mjx" in failed[0]
-    assert [row["kernels"] for row in figures["loops"]] == [2, 3] * (len(kernels.PROGRAMS) - 1)
+    assert told == [("h200", program[0], "gpu-compiler") for program in kernels.PROGRAMS.values()]
+    chain, mjx, epoch = figures["programs"]
+    assert chain["kernels"] == 2 + 2 * 3 and "kernels" not in epoch
+    assert mjx["failed"].startswith("env step, mjx") and mjx["failed"].endswith("no memory")
+    assert [row["kernels"] for row in figures["loops"]] == [2, 3, 2, 3]
 
 
-def test_a_gpu_that_is_there_needs_no_other_environment(monkeypatch):
-    monkeypatch.setattr(Told, "made", [], raising=False)
-    monkeypatch.setattr(kernels, "Worker", Told)
+def test_a_gpu_that_is_there_needs_no_other_environment(told, monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     kernels.measure()
-    assert {(where, python) for where, _, python in Told.made} == {("here", None)}
+    assert {(where, python) for where, _, python in told} == {("here", None)}
 
 
-def test_without_gpu_and_compiler_it_says_so(monkeypatch):
+def test_without_gpu_and_compiler_it_says_so(told, monkeypatch):
     def no_environment(name):
         raise PeerError(f"{name}: no matching distribution")
 
     monkeypatch.setattr(kernels, "peer_python", no_environment)
-    told = kernels.measure()["skipped"]
-    assert "no CUDA device" in told and "no matching distribution" in told
+    why = kernels.measure()["skipped"]
+    assert "no CUDA device" in why and "no matching distribution" in why and not told
 
 
 @pytest.mark.slow
@@ -155,5 +192,6 @@ def test_a_step_of_arms_is_compiled_for_an_h200():
     finally:
         worker.close()
     step = kernels.told_loop(worker.facts["loops"])
-    assert [loop.turns for loop in step.inside] == [None]  # the eliminations have no loops of their own
-    assert 50 < step.inside[0].kernels < 300
+    (newton,) = step.inside
+    assert newton.turns is None and newton.inside == ()  # eliminations have no loops
+    assert 50 < len(newton.kernels) < 200
