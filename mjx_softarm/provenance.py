@@ -17,8 +17,8 @@ PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "o
 
 
 def provenance(program: str) -> dict[str, Any]:
-    """Versions, machine and commit that a result depends on."""
-    versions, status = {}, _git("status", "--porcelain")
+    """Versions, machine and commit that a result depends on; on what other benchmarks gave, it does not."""
+    versions, status = {}, _git("status", "--porcelain", "--", ":/", ":(top,exclude)benchmarks/results")
     for name in PACKAGES:
         try:
             versions[name] = metadata.version(name)
