@@ -1,0 +1,130 @@
+"""A linear arm whose every answer is known, a policy that is exact for it, and the loop that drives it."""
+
+import numpy as np
+
+from mjx_softarm import ArmSpec
+from mjx_softarm.control import Gains
+from mjx_softarm.deploy.loop import Controller
+from mjx_softarm.deploy.session import follow
+from mjx_softarm.estimator import PoseEstimator, SpringModel, estimate
+from mjx_softarm.export import Policy
+from mjx_softarm.obs import ObsScale
+from mjx_softarm.rewards import RewardConfig
+from mjx_softarm.sensors import SensorParams, frequency_from_length, frequency_range_hz, length_from_frequency
+
+SPEC = ArmSpec.default()
+N, DT_S = SPEC.n_chambers, 1.0 / SPEC.control.rate_hz
+SENSOR = SensorParams.from_spec(SPEC)
+LOW_KPA, HIGH_KPA = SPEC.chambers.pressure_min_kpa, SPEC.chambers.pressure_max_kpa
+REST_M = 0.2
+# A chamber lengthens its own spring and, by bending, shortens its section's others.
+GAIN_M_PER_KPA = np.kron(np.eye(3), np.full((3, 3), -3e-4) + 1.8e-3 * np.eye(3))
+NOISE_M = 4e-5
+LAG = 0.15  # of the way to the commanded pressure, per tick
+
+
+class LinearArm:
+    """Springs that follow the pressures linearly, with a lag, on a clock of its own."""
+
+    def __init__(self, noise_m=NOISE_M):
+        self.time_s, self.noise_m = 0.0, noise_m
+        self.command_kpa = self.actual_kpa = np.zeros(N)
+        self.written = []
+        self._rng = np.random.default_rng(0)
+
+    @property
+    def spring_m(self):
+        return REST_M + GAIN_M_PER_KPA @ self.actual_kpa
+
+    @property
+    def tick(self):
+        return round(self.time_s / DT_S)
+
+    def read_frequencies(self):
+        return frequency_from_length(self.spring_m + self.noise_m * self._rng.standard_normal(N), SENSOR)
+
+    def write_pressures(self, pressure_kpa):
+        self.command_kpa = np.array(pressure_kpa)
+        self.written.append(self.command_kpa)
+        self.actual_kpa = self.actual_kpa + LAG * (self.holds(self.command_kpa) - self.actual_kpa)
+        self.time_s += DT_S
+
+    def holds(self, pressure_kpa):
+        return pressure_kpa
+
+
+class Blind(LinearArm):
+    """Readings go wrong in some ticks."""
+
+    def __init__(self, ticks, spoil):
+        super().__init__()
+        self._ticks, self._spoil = ticks, spoil
+
+    def read_frequencies(self):
+        frequency_hz = super().read_frequencies()
+        return self._spoil(frequency_hz) if self.tick in self._ticks else frequency_hz
+
+
+def nan(frequency_hz):
+    return np.where(np.arange(N) == 4, np.nan, frequency_hz)
+
+
+def make_policy():
+    """A policy whose estimator and spring model are exact for the linear arm; its actor is not looked at."""
+    centre = np.zeros(N, np.float32)
+    angle = np.pi / 2 + 2 * np.pi * np.arange(N) / 3
+    site = SPEC.geometry.spring_radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    network = PoseEstimator(
+        layers=((np.zeros((2 * N, 18), np.float32), np.zeros(18, np.float32)),),
+        spring_site_m=site.astype(np.float32),
+        spring_centre_m=centre,
+        spring_scale_m=centre + 1,
+        change_scale=np.ones(6, np.float32),
+    )
+    model = SpringModel(
+        layers=((GAIN_M_PER_KPA.astype(np.float32), np.zeros(N, np.float32)),),
+        pressure_centre_kpa=centre,
+        pressure_scale_kpa=centre + 1,
+        spring_centre_m=centre + np.float32(REST_M),
+        spring_scale_m=centre + 1,
+    )
+    rng = np.random.default_rng(1)
+    return Policy(
+        layers=((np.zeros((18, N), np.float32), np.zeros(N, np.float32)),),
+        obs_scale=ObsScale(*(np.asarray(value, float) for value in ObsScale.from_spec(SPEC))),
+        reward=RewardConfig(),
+        frequency_hz=frequency_range_hz(SPEC),
+        sensor=SENSOR,
+        gains=Gains.from_spec(SPEC),
+        rate_hz=SPEC.control.rate_hz,
+        spec=SPEC,
+        workspace=estimate(network, REST_M + rng.uniform(-30, 15, (2000, N)) @ GAIN_M_PER_KPA.T),
+        estimator=network,
+        spring_model=model,
+        s2r=None,
+        provenance={},
+    )
+
+
+POLICY = make_policy()
+PRESSURES_KPA = np.random.default_rng(2).uniform(-20, 10, (2, N))
+SPRINGS_M = REST_M + PRESSURES_KPA @ GAIN_M_PER_KPA.T
+GOALS = estimate(POLICY.estimator, SPRINGS_M).astype(float)
+FAR = GOALS[0] + [0.0, 0.0, -400.0, 0.0, 0.0, 0.0]
+
+
+def exact_plan(pose, goal, spring_m):
+    """The springs of the goal."""
+    return SPRINGS_M[int(np.argmin(np.abs(GOALS - goal).sum(axis=1)))]
+
+
+CONTROLLER = Controller.of(POLICY, exact_plan)
+
+
+def go(arm, goals=GOALS, controller=CONTROLLER, **kwargs):
+    return follow(arm, controller, goals, **kwargs)
+
+
+def read_m(log):
+    """Spring lengths (rows, 9) [m] by the logged frequencies, NaN where a reading was lost."""
+    return length_from_frequency(log.frequency_hz, SENSOR, np.nan).length_m
