@@ -22,7 +22,7 @@ NAMES = {
 }
 ALONE = {
     "guard": "whether something got slower than a stored baseline; it goes alone: guard --help",
-    "race": "time to a tip error against sb3-contrib and SBX, in two hours; it goes alone: race --help",
+    "race": "time to a tip error against sb3-contrib and SBX, two hours a seed; it goes alone: race --help",
     "paper": "the paper's experiments on twins, in hours; it goes alone: paper --help",
 }
 
