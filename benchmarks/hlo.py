@@ -7,6 +7,7 @@ written whole: no more than these move, since an operand may be read in part, or
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
@@ -118,10 +119,7 @@ def _branches(rest: str) -> list[str]:
 
 def _bytes(kind: str) -> int:
     """Of an array's type, or of all of a tuple's."""
-    total = 0
-    for _, bits, shape in _ARRAY.findall(kind):
-        n = 1
-        for length in filter(None, shape.split(",")):
-            n *= int(length)
-        total += n * int(bits or 8) // 8
-    return total
+    return sum(
+        math.prod(map(int, filter(None, shape.split(",")))) * int(bits or 8) // 8
+        for _, bits, shape in _ARRAY.findall(kind)
+    )
