@@ -6,13 +6,15 @@
 Exit status 0 if nothing is worse, 1 if something is, 2 if there is no baseline, or none worth storing. What
 is measured, and why it holds on a machine that is busy or faster, stands in `benchmarks.guard_work`. It runs
 in processes of its own, one after the other, since what differs from process to process, such as where memory
-lies, is a part of the spread. Tolerance is twice the furthest that a process of the baseline lay from their
-median; a baseline with one above a quarter is refused, since it would let through what it is there to stop.
+lies, is a part of the spread. A comparison takes the median of three processes. Tolerance is twice the
+furthest that a median of three of the baseline's nine lies from the median of all; a baseline with one above
+a quarter is refused, since it would let through what it is there to stop.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import platform
 import re
@@ -101,15 +103,14 @@ def measure(n_processes: int) -> Samples:
 
 def baseline_of(samples: Samples) -> dict[str, dict[str, Any]]:
     """Median cost, tolerance and the processes' costs, by what was measured."""
-    costs = {name: [facts["cost"] for facts in own] for name, own in samples.items()}
-    return {
-        name: {
-            "cost": float(np.median(own)),
-            "tolerance": float(MARGIN * np.max(np.abs(np.array(own) / np.median(own) - 1.0))),
-            "processes": own,
-        }
-        for name, own in costs.items()
-    }
+    baseline = {}
+    for name, own in samples.items():
+        costs = [facts["cost"] for facts in own]
+        compared = np.median(list(itertools.combinations(costs, N_PROCESSES)), axis=1)
+        cost = float(np.median(costs))
+        tolerance = float(MARGIN * np.max(np.abs(compared / cost - 1.0)))
+        baseline[name] = {"cost": cost, "tolerance": tolerance, "processes": costs}
+    return baseline
 
 
 def compare(baseline: Mapping[str, Mapping[str, Any]], samples: Samples) -> list[dict[str, Any]]:
