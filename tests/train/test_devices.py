@@ -19,7 +19,7 @@ from mjx_softarm.spec import ArmSpec
 from train.__main__ import main
 from train.checkpoint import Run
 from train.config import ConfigError, TrainConfig
-from train.devices import mesh_of
+from train.devices import mesh_of, split
 from train.job import Job
 from train.tqc import TQCConfig
 
@@ -85,11 +85,22 @@ def test_each_device_has_its_share_of_arms_and_replay_and_all_of_the_networks(tr
     assert all(leaf.is_fully_replicated for leaf in jax.tree.leaves(state.agent))
 
 
+_MOVES = re.compile(r"= .* (all-gather|all-reduce|all-to-all|collective-permute|reduce-scatter)")
+
+
+def test_arms_step_and_start_anew_without_waiting_for_other_devices(jobs, trained):
+    arms, state = jobs[str(N_DEVICES)].arms, trained[str(N_DEVICES)][0]
+    action = jax.device_put(jax.numpy.zeros((arms.n, arms.env.action_size)), split(arms.mesh))
+    program = jax.jit(arms.step).lower(state.arms, action, jax.random.PRNGKey(0)).compile().as_text()
+    assert f"f32[{arms.n // N_DEVICES},{arms.env.action_size}]" in program  # each has its share
+    assert not [line for line in program.splitlines() if _MOVES.search(line)]
+
+
 def test_the_epoch_is_traced_once_and_the_replay_stays_where_it_is(jobs, trained):
     job = jobs[str(N_DEVICES)]
     assert job.n_traces == 1
     program = job.epoch.lower(trained[str(N_DEVICES)][0]).compile().as_text()
-    moves = [line for line in program.splitlines() if re.search(r"= .* (all-|collective-|reduce-)", line)]
+    moves = [line for line in program.splitlines() if _MOVES.search(line)]
     shapes = [shape for line in moves for shape in re.findall(r"\w\[([\d,]+)\]", line)]
     assert moves and any("all-reduce" in line for line in moves)  # of gradients
     assert max(int(n) for shape in shapes for n in shape.split(",")) < CAPACITY
