@@ -17,7 +17,8 @@ NAMES = {
     "settle": "error, speed, compile time and memory of Newton against time stepping; floor against measured",
     "kernels": "what a GPU is given to do, loop by loop; compiled for an H200 where there is none",
     "learner": "gradient updates/s over batch sizes, against sb3-contrib, SBX and brax",
-    "calibration": "errors of springs, chambers and sim-to-real network on real logs and a planted arm",
+    "calibration": "errors of springs and chambers on a planted arm",
+    "logs": "errors of calibration on public logs of real arms",
     "learning": "tip errors of the presets over seeds, from finished runs",
 }
 ALONE = {
@@ -37,20 +38,24 @@ def main() -> int:
     )
     parser.add_argument("names", nargs="*", choices=[[], *NAMES], metavar="NAME")
     parser.add_argument("--runs", nargs="*", default=[], help="folders of finished runs, for learning")
-    parser.add_argument(
-        "--data", type=Path, default=Path("../shared/data"), help="folder of the real logs, for calibration"
-    )
+    parser.add_argument("--data", type=Path, help="folder with asu_softarm and asl_trunk, for logs")
     options = parser.parse_args()
     if not options.names:
         parser.print_help()
     from benchmarks.common import save, show
+    from mjx_softarm.checks import LogError
 
     if "learning" in options.names and not options.runs:
         parser.error("learning: needs --runs FOLDER [FOLDER ...]")
+    if "logs" in options.names and options.data is None:
+        parser.error("logs: needs --data FOLDER, with the logs that docs/results.md names under Calibration")
     for name in options.names:
         module = importlib.import_module(f"benchmarks.{name}")
-        given = {"learning": [options.runs], "calibration": [options.data]}.get(name, [])
-        figures = module.measure(*given)
+        given = {"learning": [options.runs], "logs": [options.data]}.get(name, [])
+        try:
+            figures = module.measure(*given)
+        except LogError as error:
+            parser.error(f"{name}: {error}")
         show(figures, name)
         print(f"written: {save(name, figures)}")
     return 0

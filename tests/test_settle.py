@@ -251,6 +251,23 @@ def test_a_payload_moves_a_bent_arm_unless_its_springs_are_held():
     assert shift_mm(held) < 0.25 * shift_mm(sagged)  # what is left: the links bend unevenly
 
 
+def test_half_a_kilogram_moves_held_arms_by_as_much_as_the_readme_says():
+    """Pressures before it from the middle three quarters of their range, so that no chamber meets a limit."""
+    middle, share = 0.5 * (LOW_KPA + HIGH_KPA), 0.75
+    loaded = SPEC.replace(mass={"payload_kg": 0.5})
+    pressure = middle + share * (pressures() - middle)
+    free = settled(settle_pressures, pressure)
+    held, sagged = settled(settle, free.spring_m, loaded), settled(settle_pressures, pressure, loaded)
+
+    def shift_mm(other):
+        shift_m = np.linalg.norm(other.tip_position_m - free.tip_position_m, axis=1)
+        return np.quantile(1e3 * shift_m, [0.5, 0.95])
+
+    assert held.settled.all() and not held.at_limit.any()
+    np.testing.assert_allclose(shift_mm(held), [2.0, 3.5], rtol=0.1)
+    np.testing.assert_allclose(shift_mm(sagged), [17.0, 30.0], rtol=0.1)
+
+
 # --- failures --------------------------------------------------------------------------------------
 
 

@@ -98,7 +98,8 @@ def test_status_tells_stored_same_worse_and_no_baseline(machine, capsys):
 
 
 def test_a_baseline_that_would_let_everything_through_is_not_stored(machine, capsys):
-    machine.append(samples(tick=(2.0, 2.0, 2.0, 2.26, 2.26), settle=(1.0, 1.0, 1.0, 1.12, 1.12)))  # 26 % and 24 %
+    tick, settle = (2.0, 2.0, 2.0, 2.26, 2.26), (1.0, 1.0, 1.0, 1.12, 1.12)  # 26 % and 24 %
+    machine.append(samples(tick=tick, settle=settle))
     assert guard.main(["--store"]) == 2
     said = capsys.readouterr().out
     assert "not stored: the tolerance of tick is above 25 %" in said and "nothing else runs" in said

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 
-from benchmarks.calibration import trunk_errors
+from benchmarks.logs import trunk_errors
 from calib.blocks import held_out_blocks
 from calib.network import NetworkConfig, fit_network
 from calib.s2r import fit_s2r, pose_errors, simulate_poses
