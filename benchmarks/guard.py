@@ -1,6 +1,6 @@
 """Whether something got slower: a small fixed benchmark against a stored one of the same kind of machine.
 
-    python -m benchmarks guard            compare; for use before a release, in about two minutes
+    python -m benchmarks guard            compare; for use before a release, in about three minutes
     python -m benchmarks guard --store    make this the baseline of this kind of machine
 
 Exit status 0 if nothing is worse, 1 if something is, 2 if there is no baseline, or none worth storing. What
@@ -26,7 +26,7 @@ import jax
 import numpy as np
 
 from benchmarks.common import RESULTS, n_cores, show
-from benchmarks.guard_work import REFERENCE, sizes_here
+from benchmarks.guard_work import ON_DEVICE, ON_HOST, sizes_here
 from benchmarks.rounds import Facts, Worker, working
 from mjx_softarm.provenance import provenance, write_json
 
@@ -37,7 +37,9 @@ MARGIN = 2.0
 MOST_TOLERANCE = 0.25  # of a baseline that is worth comparing with
 WORSE, NO_BASELINE = 1, 2
 
-Samples = Mapping[str, Sequence[Facts]]  # cost, seconds and cores of each process, by what was measured
+MEASURED = (*ON_DEVICE, *ON_HOST)
+
+Samples = Mapping[str, Sequence[Facts]]  # cost and seconds of each process, by what was measured
 
 
 class BaselineError(ValueError):
@@ -88,10 +90,11 @@ def machine_kind() -> str:
 
 def measure(n_processes: int) -> Samples:
     """Medians over the rounds of each process, by what was measured."""
-    samples: dict[str, list[Facts]] = {name: [] for name in REFERENCE}
+    on_gpu = jax.default_backend() == "gpu"
+    samples: dict[str, list[Facts]] = {name: [] for name in MEASURED}
     for k in range(n_processes):
         print(f"process {k + 1} of {n_processes}: compiling, then {N_ROUNDS} rounds", flush=True)
-        worker = Worker("guard", ["benchmarks.guard_work"])
+        worker = Worker("guard", ["benchmarks.guard_work"], n_cores=None if on_gpu else 1)
         with working(worker):
             rounds = [worker.facts | worker.round() for _ in range(N_ROUNDS)]
         for name, own in samples.items():
@@ -124,14 +127,12 @@ def compare(baseline: Mapping[str, Mapping[str, Any]], samples: Samples) -> list
         rows.append(
             {
                 "work": name,
-                "beside": REFERENCE[name],
                 "baseline": stored["cost"],
                 "now": now,
                 "change": f"{100 * change:+.1f} %",
                 "tolerance": f"{100 * tolerance:.1f} %",
                 "spread": f"{100 * (max(costs) - min(costs)) / now:.1f} %",
                 "wall_s": float(np.median([facts["wall_s"] for facts in samples[name]])),
-                "cores": round(float(np.median([facts["cores"] for facts in samples[name]])), 1),
                 "verdict": verdict,
             }
         )
@@ -142,7 +143,6 @@ def _stored_rows(costs: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]
     return [
         {
             "work": name,
-            "beside": REFERENCE[name],
             "cost": stored["cost"],
             "tolerance": f"{100 * stored['tolerance']:.1f} %",
         }
@@ -171,7 +171,7 @@ def read_baseline(file: Path, kind: str, sizes: Mapping[str, int]) -> dict[str, 
         known = ", ".join(kinds) or "none"
         raise BaselineError(f"{file}: no baseline for {kind}; it has: {known}")
     baseline = kinds[kind]
-    if baseline["sizes"] != dict(sizes) or baseline["costs"].keys() != REFERENCE.keys():
+    if baseline["sizes"] != dict(sizes) or baseline["costs"].keys() != set(MEASURED):
         raise BaselineError(f"{file}: the baseline for {kind} is of other work than what is measured now")
     return baseline
 

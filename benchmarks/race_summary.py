@@ -137,11 +137,12 @@ def times_to(
 def _missing(
     variants: Sequence[str], seeds: Sequence[int], results: Sequence[Mapping[str, Any]]
 ) -> list[tuple[str, int]]:
-    """Which variants have yet to race, and with which seeds, for one to be known as the best with all seeds."""
+    """Which variants have yet to race with which seeds, for one to be known as the best with all seeds."""
     raced = {(result["contestant"], result["seed"]): result for result in results if "points" in result}
     compared = [seed for seed in seeds if all((name, seed) in raced for name in variants)]
     wanted = {min(variants, key=lambda name: _standing(raced[name, seed])) for seed in compared} or variants
-    return [(name, seed) for seed in seeds for name in variants if name in wanted and (name, seed) not in raced]
+    pairs = [(name, seed) for seed in seeds for name in variants if name in wanted]
+    return [pair for pair in pairs if pair not in raced]
 
 
 def _standing(result: Mapping[str, Any]) -> tuple[float, float]:
