@@ -2,12 +2,11 @@
 
     python -m benchmarks.guard_work
 
-A cost is the time of some work over that of matrix products right before and right after it, which do not
-run through this project's code, so that a faster machine is faster at both. Time on a CPU is that of the
-processor: waiting for others, as on a loaded machine, is not in it. The guard keeps this program to one core
-there, since threads of XLA that wait for each other are busy: on two cores settling took 2.3 times the
-processor time that it takes on one, and half of the rounds lay 17 to 35 % apart, on one 2 to 15 %. So what
-got to run side by side less than before is not seen.
+Beside it stand matrix products, before and after it, which do not run through this project's code, so that a
+faster machine is faster at both. Time on a CPU is that of the processor: waiting for others, as on a loaded
+machine, is not in it. The guard keeps this program to one core there, since threads of XLA that wait for each
+other are busy: on two cores settling took 2.3 times the processor time that it takes on one, and half of the
+rounds lay 17 to 35 % apart, on one 2 to 15 %. So what got to run side by side less than before is not seen.
 """
 
 from __future__ import annotations
@@ -71,7 +70,7 @@ def sizes_here() -> Sizes:
 
 
 def prepare() -> tuple[Facts, Callable[[], Facts]]:
-    """Compile everything; tells the cost of compiling an epoch, then in rounds all other costs."""
+    """Compile everything; tells what compiling an epoch took, then in rounds what all else took."""
     jax.config.update("jax_enable_compilation_cache", False)
     sizes = sizes_here()
     on_gpu = jax.default_backend() == "gpu"
@@ -93,7 +92,7 @@ def prepare() -> tuple[Facts, Callable[[], Facts]]:
     def measure(name: str, work: Callable[[], Any]) -> dict[str, float]:
         reference = on_device if name in ON_DEVICE else on_host
         took = [_took(call) for call in (reference, work, reference)]
-        return cost(*took, on_gpu=on_gpu and name in ON_DEVICE)
+        return times(*took, on_gpu=on_gpu and name in ON_DEVICE)
 
     compiling = measure("compile", lambda: epoch.append(job.epoch.lower(state).compile()))
     state, _ = epoch[0](state)  # fills the replay
@@ -108,10 +107,10 @@ def prepare() -> tuple[Facts, Callable[[], Facts]]:
     return {"compile": compiling}, lambda: {name: measure(name, call) for name, call in work.items()}
 
 
-def cost(before: Took, work: Took, after: Took, on_gpu: bool) -> dict[str, float]:
-    """Cost of some work beside its reference, and the seconds that it took."""
+def times(before: Took, work: Took, after: Took, on_gpu: bool) -> dict[str, float]:
+    """Seconds that some work took, and the lesser of what its reference did."""
     own, *references = (took.wall_s if on_gpu else took.processor_s for took in (work, before, after))
-    return {"cost": 2.0 * own / sum(references), "wall_s": work.wall_s}
+    return {"own_s": own, "reference_s": min(references)}
 
 
 def _took(call: Callable[[], Any]) -> Took:
