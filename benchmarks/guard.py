@@ -1,15 +1,15 @@
 """Whether something got slower: a small fixed benchmark against a stored one of the same kind of machine.
 
-    python -m benchmarks guard            compare; for use before a release, in about four minutes
+    python -m benchmarks guard            compare; for use before a release, in about five minutes
     python -m benchmarks guard --store    make this the baseline of this kind of machine
 
-Exit status 0 if nothing is worse, 1 if something is, 2 if there is no baseline, or none worth storing. What
-is measured stands in `benchmarks.guard_work`. A cost is the least time of some work over the least time of
-its reference in the rounds of a process: what disturbs only adds. Processes run one after the other, since
-what differs from one to the next, such as where memory lies, is a part of the spread. A comparison takes the
-median of three. Tolerance is twice the furthest that a median of three of the baseline's five lies from the
-median of all, and at least a tenth, since hours apart the same code differed by 4 %; a baseline with one
-above a quarter is refused, since it would let through what it is there to stop.
+Exit status 0 if nothing is worse, 1 if something is, 2 if there is no baseline, or none worth storing, or if
+a measurement failed. What is measured stands in `benchmarks.guard_work`. A cost is the least time of some
+work over the least of its reference in a process, since what disturbs only adds. Processes run one after the
+other, since what differs from one to the next, such as where memory lies, is a part of the spread. A
+comparison takes the median of three. Tolerance is twice the furthest that a median of three of the baseline's
+five lies from the median of all, and at least a tenth, since the spread of an hour is not that of a month; a
+baseline with one above a quarter is refused, since it would let through what it is there to stop.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ import jax
 import numpy as np
 
 from benchmarks.common import RESULTS, n_cores, show
-from benchmarks.guard_work import ON_DEVICE, ON_HOST, sizes_here
-from benchmarks.rounds import Facts, Worker, working
+from benchmarks.guard_work import ON_DEVICE, ON_HOST, reference_of, sizes_here
+from benchmarks.rounds import Facts, Worker, WorkerError, working
 from mjx_softarm.provenance import provenance, write_json
 
 FILE = RESULTS / "guard.json"
@@ -36,11 +36,11 @@ N_PROCESSES, N_STORED = 3, 5  # of a comparison, of a baseline
 N_ROUNDS = 12
 MARGIN = 2.0
 LEAST_TOLERANCE, MOST_TOLERANCE = 0.1, 0.25  # the latter of a baseline that is worth comparing with
-WORSE, NO_BASELINE = 1, 2
+WORSE, NO_RESULT = 1, 2
 
 MEASURED = (*ON_DEVICE, *ON_HOST)
 
-Samples = Mapping[str, Sequence[Facts]]  # cost, and seconds of its own, of each process, by what was measured
+Samples = Mapping[str, Sequence[Facts]]  # cost and seconds of each process, by what was measured
 
 
 class BaselineError(ValueError):
@@ -50,28 +50,38 @@ class BaselineError(ValueError):
 def main(arguments: Sequence[str]) -> int:
     """Compare or store; returns the exit status."""
     parser = argparse.ArgumentParser(
-        prog="python -m benchmarks guard", description=(__doc__ or "").split("\n")[0]
+        prog="python -m benchmarks guard",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--store", action="store_true", help="make this the baseline of this kind of machine")
     options = parser.parse_args(arguments)
-    kind, sizes = machine_kind(), sizes_here()._asdict()
-    if options.store:
-        costs = baseline_of(measure(N_STORED))
-        show({"costs": _stored_rows(costs)}, f"baseline of {kind}")
-        if loose := [name for name, stored in costs.items() if stored["tolerance"] > MOST_TOLERANCE]:
-            print(
-                f"not stored: the tolerance of {', '.join(loose)} is above {100 * MOST_TOLERANCE:.0f} %, its "
-                "processes lie too far apart; try again while nothing else runs on this machine"
-            )
-            return NO_BASELINE
-        store(FILE, kind, {"costs": costs, "sizes": sizes, **provenance("benchmarks")})
-        print(f"written: {FILE}")
-        return 0
+    kind, sizes = machine_kind(), {"n_rounds": N_ROUNDS, **sizes_here()._asdict()}
     try:
-        baseline = read_baseline(FILE, kind, sizes)
+        return _store(kind, sizes) if options.store else _compare(kind, sizes)
     except BaselineError as error:
         print(f"{error}; store one, on a state that is known to be good: python -m benchmarks guard --store")
-        return NO_BASELINE
+    except WorkerError as error:
+        print(f"error: {error.reason}")
+    return NO_RESULT
+
+
+def _store(kind: str, sizes: Mapping[str, int]) -> int:
+    costs = baseline_of(measure(N_STORED))
+    show({"costs": _stored_rows(costs)}, f"baseline of {kind}")
+    if loose := [name for name, stored in costs.items() if stored["tolerance"] > MOST_TOLERANCE]:
+        print(
+            f"not stored: the tolerance of {', '.join(loose)} is above {100 * MOST_TOLERANCE:.0f} %, its "
+            "processes lie too far apart; try again while nothing else runs on this machine"
+        )
+        return NO_RESULT
+    store(FILE, kind, {"costs": costs, "sizes": sizes, **provenance("benchmarks")})
+    print(f"written: {FILE}")
+    return 0
+
+
+def _compare(kind: str, sizes: Mapping[str, int]) -> int:
+    baseline = read_baseline(FILE, kind, sizes)
     rows = compare(baseline["costs"], measure(N_PROCESSES))
     show({"costs": rows}, f"guard, {kind}, baseline of commit {baseline['commit']}")
     worse = [row["work"] for row in rows if row["verdict"] == "WORSE"]
@@ -103,19 +113,16 @@ def measure(n_processes: int) -> Samples:
     return samples
 
 
-def costs_of(rounds: Sequence[Mapping[str, Facts]]) -> dict[str, Facts]:
-    """A process's costs, by what was measured.
+def costs_of(rounds: Sequence[Mapping[str, float]]) -> dict[str, Facts]:
+    """A process's costs, and the seconds that the work took at least, by what was measured.
 
     Args:
-        rounds: of each, what `benchmarks.guard_work.times` tells, by what was measured.
+        rounds: seconds of each, by name, with those of the references.
     """
-    costs = {}
-    for names in (ON_DEVICE, ON_HOST):  # whose references are the same
-        reference_s = min(row[name]["reference_s"] for row in rounds for name in names)
-        for name in names:
-            own_s = min(row[name]["own_s"] for row in rounds)
-            costs[name] = {"cost": own_s / reference_s, "own_s": own_s}
-    return costs
+    least = {name: min(seconds[name] for seconds in rounds) for name in rounds[0]}
+    return {
+        name: {"cost": least[name] / least[reference_of(name)], "seconds": least[name]} for name in MEASURED
+    }
 
 
 def baseline_of(samples: Samples) -> dict[str, dict[str, Any]]:
@@ -147,7 +154,7 @@ def compare(baseline: Mapping[str, Mapping[str, Any]], samples: Samples) -> list
                 "change": f"{100 * change:+.1f} %",
                 "tolerance": f"{100 * tolerance:.1f} %",
                 "spread": f"{100 * (max(costs) - min(costs)) / now:.1f} %",
-                "own_s": float(np.median([facts["own_s"] for facts in samples[name]])),
+                "seconds": float(np.median([facts["seconds"] for facts in samples[name]])),
                 "verdict": verdict,
             }
         )

@@ -2,11 +2,11 @@
 
     python -m benchmarks.guard_work
 
-Beside it stand matrix products, before and after it, which do not run through this project's code, so that a
-faster machine is faster at both. Time on a CPU is that of the processor: waiting for others, as on a loaded
-machine, is not in it. The guard keeps this program to one core there, since threads of XLA that wait for each
-other are busy: on two cores settling took 2.3 times the processor time that it takes on one, and half of the
-rounds lay 17 to 35 % apart, on one 2 to 15 %. So what got to run side by side less than before is not seen.
+The reference is matrix products, which do not run through this project's code, so that a faster machine is
+faster at both. Seconds are the processor's, all threads added up, so waiting for others on a loaded machine
+is not in them; those of work on a GPU are the clock's on the wall. On a CPU the guard keeps this program to
+one core: threads of XLA that wait for each other are busy, for how long differs from round to round. So a
+loss of parallelism is not seen. On a GPU's machine `tick` and `compile` have all cores.
 """
 
 from __future__ import annotations
@@ -33,23 +33,15 @@ from mjx_softarm.spec import ArmSpec
 from train.config import PRESETS
 from train.job import Job, TrainState
 
-ON_DEVICE = ("settle", "env_steps", "updates")  # of what is measured; the reference is there, too
-ON_HOST = ("tick", "compile")
-
-
-class Took(NamedTuple):
-    """How long something took."""
-
-    wall_s: float
-    processor_s: float  # of all threads
+ON_DEVICE, ON_HOST = ("settle", "env_steps", "updates"), ("tick", "compile")
+PRODUCT, PRODUCT_ON_GPU = "product", "product_on_gpu"  # NumPy's, and XLA's where there is a GPU
+N_ROWS, N_ROWS_ON_GPU, N_PRODUCTS = 1024, 8192, 8  # of the matrices
+N_COMPILES = 2
 
 
 class Sizes(NamedTuple):
     """How much work there is in one measurement, a tenth of a second or more; fixed, or costs change."""
 
-    product: int  # rows and columns of the matrices, on the device
-    product_on_host: int
-    n_products: int
     n_arms: int
     n_settles: int  # of all arms
     n_env_steps: int  # of each arm
@@ -59,8 +51,8 @@ class Sizes(NamedTuple):
 
 
 SIZES = {
-    "cpu": Sizes(1024, 1024, 8, 128, 20, 16, 16, 256, 400),
-    "gpu": Sizes(8192, 1024, 8, 8192, 50, 32, 512, 256, 400),
+    "cpu": Sizes(128, 20, 16, 16, 256, 400),
+    "gpu": Sizes(8192, 50, 32, 512, 256, 400),
 }
 
 
@@ -69,14 +61,15 @@ def sizes_here() -> Sizes:
     return SIZES["gpu" if jax.default_backend() == "gpu" else "cpu"]
 
 
+def reference_of(name: str) -> str:
+    """What some work stands beside: the product on the same device."""
+    return PRODUCT_ON_GPU if name in ON_DEVICE and jax.default_backend() == "gpu" else PRODUCT
+
+
 def prepare() -> tuple[Facts, Callable[[], Facts]]:
-    """Compile everything; tells what compiling an epoch took, then in rounds what all else took."""
+    """Compile everything; tells the seconds of compiling an epoch, then in rounds those of all else."""
     jax.config.update("jax_enable_compilation_cache", False)
     sizes = sizes_here()
-    on_gpu = jax.default_backend() == "gpu"
-    on_host = _product_on_host(sizes)
-    on_device = _product_on_gpu(sizes) if on_gpu else on_host
-    on_host()
     env = ReachEnv(config=EnvConfig(n_poses=1024))
     config = dataclasses.replace(
         PRESETS["quick"],
@@ -89,46 +82,43 @@ def prepare() -> tuple[Facts, Callable[[], Facts]]:
     job = Job(config, env)
     state, epoch = job.init(jax.random.PRNGKey(0)), []
 
-    def measure(name: str, work: Callable[[], Any]) -> dict[str, float]:
-        reference = on_device if name in ON_DEVICE else on_host
-        took = [_took(call) for call in (reference, work, reference)]
-        return times(*took, on_gpu=on_gpu and name in ON_DEVICE)
+    def compile_epoch() -> None:
+        jax.clear_caches()
+        epoch.append(job.epoch.lower(state).compile())
 
-    compiling = measure("compile", lambda: epoch.append(job.epoch.lower(state).compile()))
+    compiling_s = min(_seconds("compile", compile_epoch) for _ in range(N_COMPILES))
     state, _ = epoch[0](state)  # fills the replay
     work = {
+        PRODUCT: _product(),
         "settle": _settle(env, sizes),
         "env_steps": _env_steps(job, state, sizes),
         "updates": _updates(job, state),
         "tick": _tick(job, state, sizes),
     }
+    if jax.default_backend() == "gpu":
+        work[PRODUCT_ON_GPU] = _product_on_gpu()
     for call in work.values():
         call()
-    return {"compile": compiling}, lambda: {name: measure(name, call) for name, call in work.items()}
+    return {"compile": compiling_s}, lambda: {name: _seconds(name, call) for name, call in work.items()}
 
 
-def times(before: Took, work: Took, after: Took, on_gpu: bool) -> dict[str, float]:
-    """Seconds that some work took, and the lesser of what its reference did."""
-    own, *references = (took.wall_s if on_gpu else took.processor_s for took in (work, before, after))
-    return {"own_s": own, "reference_s": min(references)}
-
-
-def _took(call: Callable[[], Any]) -> Took:
-    start = time.perf_counter(), time.process_time()
+def _seconds(name: str, call: Callable[[], Any]) -> float:
+    on_gpu = PRODUCT_ON_GPU in (name, reference_of(name))
+    clock = time.perf_counter if on_gpu else time.process_time
+    start = clock()
     call()
-    return Took(time.perf_counter() - start[0], time.process_time() - start[1])
+    return clock() - start
 
 
-def _product_on_host(sizes: Sizes) -> Callable[[], Any]:
+def _product() -> Callable[[], Any]:
     """Products of a random matrix with itself, by NumPy."""
-    matrix = _random(sizes.product_on_host)
-    return lambda: [matrix @ matrix for _ in range(sizes.n_products)]
+    matrix = _random(N_ROWS)
+    return lambda: [matrix @ matrix for _ in range(N_PRODUCTS)]
 
 
-def _product_on_gpu(sizes: Sizes) -> Callable[[], Any]:
-    matrix, product = jnp.asarray(_random(sizes.product)), jax.jit(lambda x: x @ x)
-    product(matrix)
-    return lambda: jax.block_until_ready([product(matrix) for _ in range(sizes.n_products)])
+def _product_on_gpu() -> Callable[[], Any]:
+    matrix, product = jnp.asarray(_random(N_ROWS_ON_GPU)), jax.jit(lambda x: x @ x)
+    return lambda: jax.block_until_ready([product(matrix) for _ in range(N_PRODUCTS)])
 
 
 def _random(n: int) -> np.ndarray:

@@ -21,7 +21,7 @@ from jax.experimental.compilation_cache import compilation_cache
 from benchmarks.common import mesh_of_cores, peak_memory
 from benchmarks.rounds import Facts, serve
 from benchmarks.truth import TOLD
-from mjx_softarm import xla
+from mjx_softarm import draws, xla
 from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.gym import EPISODE_LENGTH
 from mjx_softarm.mjcf import steps_per_period
@@ -74,13 +74,14 @@ def prepare(engine: str, mode: str, n: int, links: int, cache: str) -> tuple[Fac
     def rollout(state, key):
         def step(state, key):
             key_action, key_reset = jax.random.split(key)
-            action = jax.random.uniform(key_action, (n, env.action_size), minval=-1.0)
+            action = draws.uniform(key_action, (n, env.action_size), minval=-1.0)
             following, after, _ = arms.step(state, action, key_reset)
             rests = env.reference_m(action), after.pipeline_state.pose[:, :3]
-            told = after.metrics["unsettled"].sum(), after.metrics["saturated_chambers"].mean()
+            told = after.metrics["unsettled"], after.metrics["saturated_chambers"]
             return following, (told, rests)
 
-        return jax.lax.scan(step, state, jax.random.split(key, N_STEPS[mode]))
+        with draws.on(mesh):
+            return jax.lax.scan(step, state, jax.random.split(key, N_STEPS[mode]))
 
     state = xla.jit(arms.reset, env.uses_mjx)(jax.random.PRNGKey(0))
     key = jax.random.PRNGKey(1)

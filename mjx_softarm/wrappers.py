@@ -8,8 +8,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.sharding import Mesh, PartitionSpec
 
+from mjx_softarm import draws
 from mjx_softarm._mjx import State
 from mjx_softarm.env import ReachEnv
 
@@ -48,9 +49,8 @@ class VectorEnv:
 
     def reset(self, key: Array) -> State:
         """State of n fresh arms."""
-        drawn = self.env.draw(key, self.n)
-        if self.mesh is not None:  # by each device for itself: parts of draws would have to be exchanged
-            drawn = jax.lax.with_sharding_constraint(drawn, NamedSharding(self.mesh, PartitionSpec()))
+        with draws.on(self.mesh):
+            drawn = self.env.draw(key, self.n)
         return over_arms(self.env.begin, self.mesh)(drawn)
 
     def step(self, state: State, action: Array, key: Array) -> tuple[State, State, Outcome]:

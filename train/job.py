@@ -95,9 +95,10 @@ class Job:
             The next state; means over the epoch by name, and `unsettled`, the number of masked arms.
         """
         self.n_traces += 1
-        state, metrics = jax.lax.scan(
-            self._vector_step, state, None, length=self.config.vector_steps_per_epoch
-        )
+        with draws.on(self.mesh):
+            state, metrics = jax.lax.scan(
+                self._vector_step, state, None, length=self.config.vector_steps_per_epoch
+            )
         unsettled = jnp.sum(metrics.pop("env/unsettled")) * self.config.n_arms
         return state, {**jax.tree.map(jnp.mean, metrics), "env/unsettled": unsettled}
 

@@ -12,6 +12,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from mjx_softarm import draws
+
 Items = Any  # a pytree of arrays sharing a leading axis
 
 
@@ -94,8 +96,7 @@ def sample(replay: Replay, key: Array, batch_size: int) -> Items:
     Returns:
         Pytree of leaves (B, ...).
     """
-    # The remainder favours some slots by less than one in a thousand; it compiles faster than randint does.
-    slot = jax.random.bits(key, (batch_size,), jnp.uint32) % replay.size.astype(jnp.uint32)  # (B,)
+    slot = draws.integers(key, batch_size, replay.size)
     return jax.tree.map(lambda ring: ring[slot], replay.data)
 
 

@@ -6,7 +6,8 @@ import pytest
 
 from benchmarks import guard, guard_work
 from benchmarks.guard import BaselineError, baseline_of, compare, costs_of, read_baseline, store
-from benchmarks.guard_work import ON_DEVICE, Sizes, Took, times
+from benchmarks.guard_work import PRODUCT, PRODUCT_ON_GPU, Sizes, reference_of
+from benchmarks.rounds import WorkerError
 
 SIZES = {"n_arms": 4}
 
@@ -15,7 +16,7 @@ def samples(**costs):
     """Made-up processes: all of cost 1, but for those given."""
     given = {name: costs.get(name, (1.0, 1.0, 1.0)) for name in guard.MEASURED}
     return {
-        name: [{"cost": value, "own_s": 2.0 * value} for value in values] for name, values in given.items()
+        name: [{"cost": value, "seconds": 2.0 * value} for value in values] for name, values in given.items()
     }
 
 
@@ -24,21 +25,45 @@ STORED = samples(  # medians of three of these lie from 0.92 to 1.02, from 2.0 t
 )
 
 
-def test_time_is_the_processor_s_but_of_a_gpu_s_work():
-    before, work, after = Took(9.0, 0.4), Took(8.0, 1.5), Took(7.0, 0.6)
-    assert times(before, work, after, on_gpu=False) == {"own_s": 1.5, "reference_s": 0.4}
-    assert times(before, work, after, on_gpu=True) == {"own_s": 8.0, "reference_s": 7.0}
+SECONDS = {PRODUCT: 2.0, PRODUCT_ON_GPU: 1.0, **dict.fromkeys(guard.MEASURED, 8.0)}
 
 
-def test_a_cost_is_the_least_time_over_the_least_of_the_references_on_the_same_device():
-    slow = {name: {"own_s": 8.0, "reference_s": 2.0} for name in guard.MEASURED}
-    rounds = [slow, slow | {"settle": {"own_s": 3.0, "reference_s": 9.0}}]
-    rounds += [slow | {"updates": {"own_s": 9.0, "reference_s": 0.5}}]
+def test_a_cost_is_the_least_time_over_the_least_of_its_reference():
+    rounds = [SECONDS, SECONDS | {"settle": 3.0}, SECONDS | {PRODUCT: 0.5}]
     costs = costs_of(rounds)
-    assert costs.pop("settle") == {"cost": 6.0, "own_s": 3.0}
-    on_device = {name for name, own in costs.items() if own == {"cost": 16.0, "own_s": 8.0}}
-    on_host = {name for name, own in costs.items() if own == {"cost": 4.0, "own_s": 8.0}}
-    assert on_device == {*ON_DEVICE} - {"settle"} and on_host == {*guard.ON_HOST}
+    assert costs.pop("settle") == {"cost": 6.0, "seconds": 3.0}
+    assert costs.keys() == set(guard.MEASURED) - {"settle"}
+    assert all(own == {"cost": 16.0, "seconds": 8.0} for own in costs.values())
+
+
+def test_on_a_gpu_its_own_product_is_the_reference_of_what_it_does(monkeypatch):
+    assert {reference_of(name) for name in guard.MEASURED} == {PRODUCT}
+    monkeypatch.setattr(guard_work.jax, "default_backend", lambda: "gpu")
+    costs = {name: own["cost"] for name, own in costs_of([SECONDS]).items()}
+    assert costs == {"settle": 8.0, "env_steps": 8.0, "updates": 8.0, "tick": 4.0, "compile": 4.0}
+
+
+class Program:
+    """In the place of a worker: each round takes a second less."""
+
+    def __init__(self, name, program, n_cores):
+        assert program == ["benchmarks.guard_work"] and n_cores == 1
+        self.name, self.facts, self.n = name, {"compile": 30.0}, 0
+
+    def start(self): ...
+
+    def close(self): ...
+
+    def round(self):
+        self.n += 1
+        return {name: 20.0 - self.n for name in SECONDS if name != "compile"}
+
+
+def test_each_process_is_kept_to_a_core_and_has_its_costs(monkeypatch):
+    monkeypatch.setattr(guard, "Worker", Program)
+    samples = guard.measure(3)
+    assert samples["compile"] == [{"cost": 30.0 / (20.0 - guard.N_ROUNDS), "seconds": 30.0}] * 3
+    assert samples["tick"] == [{"cost": 1.0, "seconds": 20.0 - guard.N_ROUNDS}] * 3
 
 
 def test_tolerance_is_twice_the_furthest_median_of_as_many_as_are_compared_or_a_tenth():
@@ -74,7 +99,7 @@ def test_a_row_tells_baseline_now_spread_and_seconds():
         "change": "+25.0 %",
         "tolerance": "10.0 %",
         "spread": "40.0 %",
-        "own_s": 10.0,
+        "seconds": 10.0,
         "verdict": "WORSE",
     }
 
@@ -113,12 +138,21 @@ def test_a_baseline_that_would_let_everything_through_is_not_stored(machine, cap
     assert not guard.FILE.exists()
 
 
+def test_a_program_that_stops_is_told_and_is_nothing_worse(machine, monkeypatch, capsys):
+    def stopped(n_processes):
+        raise WorkerError("guard: stopped with status 1, expected a result:\nno memory")
+
+    monkeypatch.setattr(guard, "measure", stopped)
+    assert guard.main(["--store"]) == 2
+    assert "error: guard: stopped with status 1" in capsys.readouterr().out
+
+
 @pytest.fixture
 def tiny(monkeypatch):
     """Next to no work in this process, with the compilation cache as it was."""
     import jax
 
-    sizes = Sizes(64, 64, 1, 8, 1, 2, 8, 32, 2)
+    sizes = Sizes(8, 1, 2, 8, 32, 2)
     monkeypatch.setattr(guard_work, "SIZES", {"cpu": sizes, "gpu": sizes})
     before = jax.config.jax_enable_compilation_cache
     yield
@@ -129,10 +163,8 @@ def tiny(monkeypatch):
 def test_every_cost_is_measured(tiny):
     facts, work = guard_work.prepare()
     told = facts | work()
-    assert told.keys() == set(guard.MEASURED)
-    for own in told.values():
-        assert own["own_s"] > 0.0 and own["reference_s"] > 0.0
-    assert told["compile"]["own_s"] > told["tick"]["own_s"]
+    assert told.keys() == {*guard.MEASURED, PRODUCT} and min(told.values()) > 0.0
+    assert told["compile"] > told["tick"]
 
 
 def test_baselines_of_other_machines_stay_and_are_not_compared_with(tmp_path):

@@ -103,6 +103,7 @@ def test_the_epoch_is_traced_once_and_the_replay_stays_where_it_is(jobs, trained
     moves = [line for line in program.splitlines() if _MOVES.search(line)]
     shapes = [shape for line in moves for shape in re.findall(r"\w\[([\d,]+)\]", line)]
     assert moves and any("all-reduce" in line for line in moves)  # of gradients
+    assert not any("collective-permute" in line for line in moves)  # of random numbers
     assert max(int(n) for shape in shapes for n in shape.split(",")) < CAPACITY
 
 
