@@ -36,14 +36,19 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks", epilog=epilog, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("names", nargs="*", choices=[[], *NAMES], metavar="NAME")
+    parser.add_argument("names", nargs="*", metavar="NAME")
     parser.add_argument("--runs", nargs="*", default=[], help="folders of finished runs, for learning")
     parser.add_argument("--data", type=Path, help="folder with asu_softarm and asl_trunk, for logs")
     options = parser.parse_args()
     if not options.names:
         parser.print_help()
+    for name in options.names:
+        if name not in NAMES:
+            alone = f", or one of {', '.join(ALONE)} alone"
+            parser.error(f"got {name!r}, expected some of {', '.join(NAMES)}{alone}")
     from benchmarks.common import save, show
     from mjx_softarm.checks import LogError
+    from train.checkpoint import RunError
 
     if "learning" in options.names and not options.runs:
         parser.error("learning: needs --runs FOLDER [FOLDER ...]")
@@ -54,7 +59,7 @@ def main() -> int:
         given = {"learning": [options.runs], "logs": [options.data]}.get(name, [])
         try:
             figures = module.measure(*given)
-        except LogError as error:
+        except (LogError, RunError) as error:
             parser.error(f"{name}: {error}")
         show(figures, name)
         print(f"written: {save(name, figures)}")

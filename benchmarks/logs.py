@@ -1,4 +1,4 @@
-"""How well calibration does on public logs of real soft arms; a straight line stands in for the simulator.
+"""How well calibration does on public logs of real soft arms.
 
 The logs: `asl_trunk`, a trunk of three segments and six motors (StanfordASL/trunk-stack), and `asu_softarm`,
 a pneumatic arm of two sections with draw wires (ASU-RISE-Lab/4-chamber-softarm-control). Errors are on
@@ -36,11 +36,13 @@ def measure(data: Path) -> dict[str, Any]:
     Raises:
         LogError: a log is missing, or cannot be read.
     """
-    trunk = {f"_1, seed {seed}": trunk_blocks(data, seed) for seed in SEEDS}
     return {
         "draw wires to section length, RMS": {name: wires(data, name) for name in ASU_LOGS},
         "pressures to section length, RMS": {name: sections(data, name) for name in ASU_LOGS},
-        "trunk, 3D RMSE": trunk | {"_11, last fifth": trunk_errors(data, "11", _last_fifth)},
+        "trunk, 3D RMSE": {
+            **{f"_1, seed {seed}": trunk_blocks(data, seed) for seed in SEEDS},
+            "_11, last fifth": trunk_errors(data, "11", _last_fifth),
+        },
     }
 
 

@@ -263,7 +263,7 @@ def test_half_a_kilogram_moves_held_arms_by_as_much_as_the_readme_says():
         shift_m = np.linalg.norm(other.tip_position_m - free.tip_position_m, axis=1)
         return np.quantile(1e3 * shift_m, [0.5, 0.95])
 
-    assert held.settled.all() and not held.at_limit.any()
+    assert free.settled.all() and sagged.settled.all() and held.settled.all() and not held.at_limit.any()
     np.testing.assert_allclose(shift_mm(held), [2.0, 3.5], rtol=0.1)
     np.testing.assert_allclose(shift_mm(sagged), [17.0, 30.0], rtol=0.1)
 
