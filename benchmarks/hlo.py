@@ -16,6 +16,7 @@ NO_KERNEL = {
     *("parameter", "constant", "tuple", "get-tuple-element", "bitcast"),
     *("after-all", "add-dependency", "opt-barrier", "domain", "partition-id", "replica-id"),
 }
+EXCHANGES = ("all-gather", "all-reduce", "all-to-all", "collective-permute", "reduce-scatter")
 
 _COMPUTATION = re.compile(r"(ENTRY )?%(\S+) \(.*\{$")
 _INSTRUCTION = re.compile(r"\s+(?:ROOT )?%(\S+) = (\(.*?\)|\S+) ([\w-]+)\((.*)")
@@ -27,12 +28,20 @@ _BRANCHES = re.compile(
 _SCRATCH = re.compile(r"[su]8\[\d*\]")  # of a library's call, among its results
 
 
+class Exchange(NamedTuple):
+    """Between devices."""
+
+    operation: str  # of EXCHANGES
+    size: int  # [bytes] what a device has of it before or after, whichever is more
+
+
 class Loop(NamedTuple):
     """A loop of a program, or all of it, which is a loop of one turn."""
 
     turns: int | None  # None: the program finds out
     kernels: tuple[int, ...]  # [bytes] that each one of a turn touches, those of the loops inside left out
     inside: tuple[Loop, ...]
+    exchanges: tuple[Exchange, ...] = ()  # among the kernels
 
     def total(self, cost: Callable[[int], float], turns: int) -> float:
         """Of the costs of all kernels in all turns, those of loops inside included.
@@ -80,6 +89,7 @@ def _loop(computations: Mapping[str, Sequence[str]], names: Sequence[str], turns
     """A loop whose turn is made of these computations."""
     kernels: list[int] = []
     inside: list[Loop] = []
+    exchanges: list[Exchange] = []
     for name in names:
         size: dict[str, int] = {}  # of results [bytes]
         for found in filter(None, map(_INSTRUCTION.match, computations[name])):
@@ -94,10 +104,15 @@ def _loop(computations: Mapping[str, Sequence[str]], names: Sequence[str], turns
                 )
                 kernels += branch.kernels
                 inside += branch.inside
+                exchanges += branch.exchanges
             elif operation not in NO_KERNEL and not operation.endswith("-done"):
                 operands = re.findall(r"%([\w.-]+)", rest[: rest.index(")")])
-                kernels.append(sum(size[x] for x in [result, *operands]))
-    return Loop(turns, tuple(kernels), tuple(inside))
+                given = sum(size[x] for x in operands)
+                kernels.append(size[result] + given)
+                if (exchange := operation.removesuffix("-start")) in EXCHANGES:
+                    made = size[result] - given * kind.startswith("((")  # what was given is in such a result
+                    exchanges.append(Exchange(exchange, max(given, made)))
+    return Loop(turns, tuple(kernels), tuple(inside), tuple(exchanges))
 
 
 def _while(computations: Mapping[str, Sequence[str]], rest: str) -> Loop:

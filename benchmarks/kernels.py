@@ -1,4 +1,4 @@
-"""What a GPU is given to do: kernels and bytes of each loop of a step and of a training epoch.
+"""What a GPU is given to do, and eight to exchange: kernels and bytes of each loop of a step and of an epoch.
 
 A kernel is calculated to take a launch, or the time in which what it touches goes through memory at the rate
 of the data sheet, whichever is longer. That a launch takes 3 us is an assumption, of a GPU without CUDA
@@ -26,13 +26,23 @@ N_ARMS = 8192
 ENV_STEPS = {
     f"env step, {engine}, {N_ARMS:,} arms": ("env-step", engine, str(N_ARMS)) for engine in ("chain", "mjx")
 }
-PROGRAMS = {**ENV_STEPS, "training epoch": ("epoch", *gpu.TRAINING)}
+EPOCH, EPOCH_OF_EIGHT = "training epoch", "training epoch on 8 GPUs"
+OF_EIGHT = (
+    "n_arms=65536",
+    "vector_steps_per_epoch=4",
+    "updates_per_env_step=0.0009765625",
+    "batch_size=32768",
+    "replay_capacity=4194304",
+)
+PROGRAMS = {**ENV_STEPS, EPOCH: ("epoch", *gpu.TRAINING), EPOCH_OF_EIGHT: ("epoch", *OF_EIGHT)}
 NOTES = {
     "turns": "of a loop; settling goes on until the slowest arm rests",
     "kernels, mb": "of one turn, those of loops inside left out; bytes as if every operand were read whole",
     "launch_bound": "share of the kernels that touch too little to take longer than a launch",
     "calculated": f"a kernel takes {1e6 * LAUNCH_S:g} us, or its bytes at {1e-12 * H200_BYTES_PER_S:g} TB/s",
-    "training epoch": " ".join(gpu.TRAINING),
+    "exchanges": "of one turn; bytes of what a device has of it before or after, whichever is more",
+    EPOCH: " ".join(gpu.TRAINING),
+    EPOCH_OF_EIGHT: " ".join(OF_EIGHT),
 }
 
 
@@ -43,22 +53,30 @@ def measure() -> dict[str, Any]:
         python = None if on_gpu else peer_python(COMPILER)
     except PeerError as error:
         return {"skipped": f"{gpu.NO_DEVICE}; {error}"}
-    turns, programs, loops = newton_steps(), [], []
+    turns, programs, loops, exchanged = newton_steps(), [], [], []
     for name, program in PROGRAMS.items():
-        worker = Worker(name, ["benchmarks.kernels_worker", "here" if on_gpu else "h200", *program], python)
+        where = "h200x8" if name == EPOCH_OF_EIGHT else "here" if on_gpu else "h200"
+        worker = Worker(name, ["benchmarks.kernels_worker", where, *program], python)
         print(f"compiling: {name}", flush=True)
         try:
             worker.start()
             facts = dict(worker.facts)
             loop = told_loop(facts.pop("loops"))
             loops += [{"program": name, **row} for row in rows(loop)]
+            exchanged += [{"program": name, **row} for row in exchanges(loop)]
             facts |= in_all(loop, turns) if name in ENV_STEPS else {}
         except WorkerError as error:
             facts = {"failed": error.reason}
         finally:
             worker.close()
         programs.append({"program": name, **facts})
-    return {"newton_steps_of_the_slowest_arm": turns, "programs": programs, "loops": loops, "notes": NOTES}
+    return {
+        "newton_steps_of_the_slowest_arm": turns,
+        "programs": programs,
+        "loops": loops,
+        "exchanges": exchanged,
+        "notes": NOTES,
+    }
 
 
 def newton_steps() -> int:
@@ -70,8 +88,9 @@ def newton_steps() -> int:
 
 def told_loop(told: Sequence[Any]) -> hlo.Loop:
     """A loop as a worker tells it, in JSON's lists."""
-    turns, kernels, inside = told
-    return hlo.Loop(turns, tuple(kernels), tuple(map(told_loop, inside)))
+    turns, kernels, inside, exchanges = told
+    made = tuple(hlo.Exchange(*exchange) for exchange in exchanges)
+    return hlo.Loop(turns, tuple(kernels), tuple(map(told_loop, inside)), made)
 
 
 def kernel_s(moved: int) -> float:
@@ -95,11 +114,31 @@ def rows(loop: hlo.Loop, turns: Sequence[str] = ()) -> Iterator[Facts]:
     n = len(loop.kernels)
     if n:
         yield {
-            "turns": " x ".join(turns) or "once",
+            "turns": _times(turns),
             "kernels": n,
             "mb": round(1e-6 * sum(loop.kernels), 1),
             "launch_bound": round(sum(kernel_s(moved) == LAUNCH_S for moved in loop.kernels) / n, 2),
             "calculated_us": round(1e6 * sum(map(kernel_s, loop.kernels)), 1),
         }
     for inner in loop.inside:
-        yield from rows(inner, [*turns, "until at rest" if inner.turns is None else str(inner.turns)])
+        yield from rows(inner, [*turns, _turns(inner)])
+
+
+def exchanges(loop: hlo.Loop, turns: Sequence[str] = ()) -> Iterator[Facts]:
+    """A row for each exchange between devices of a loop and of those inside it, likewise."""
+    for exchange in loop.exchanges:
+        yield {
+            "turns": _times(turns),
+            "exchange": exchange.operation,
+            "mb": float(f"{1e-6 * exchange.size:.3g}"),
+        }
+    for inner in loop.inside:
+        yield from exchanges(inner, [*turns, _turns(inner)])
+
+
+def _turns(loop: hlo.Loop) -> str:
+    return "until at rest" if loop.turns is None else str(loop.turns)
+
+
+def _times(turns: Sequence[str]) -> str:
+    return " x ".join(turns) or "once"

@@ -102,6 +102,36 @@ def test_what_xla_writes_is_read():
     assert all(sum(loop.kernels) >= 2 * 4 * 16 * 16 for loop in program.inside)
 
 
+EXCHANGED = """HloModule jit_g, is_scheduled=true
+
+ENTRY %main (p: f32[8], q: pred[32]) -> f32[8] {
+  %p = f32[8]{0} parameter(0)
+  %q = pred[32]{0} parameter(1)
+  %summed = f32[8]{0} all-reduce-start(%p), channel_id=1, to_apply=%add
+  %sum = f32[8]{0} all-reduce-done(%summed)
+  %gathered = ((f32[8]{0}, f32[8]{0}), (f32[64]{0}, f32[64]{0})) all-gather-start(%p, %sum), channel_id=2
+  %all = (f32[64]{0}, f32[64]{0}) all-gather-done(%gathered)
+  %scattered = ((pred[32]{0}), pred[4]{0}) reduce-scatter-start(%q), channel_id=3
+  %part = pred[4]{0} reduce-scatter-done(%scattered)
+  ROOT %moved = f32[8]{0} collective-permute(%sum), channel_id=4
+}
+"""
+
+
+def test_exchanges_have_the_bytes_of_their_larger_side():
+    expected = (("all-reduce", 32), ("all-gather", 512), ("reduce-scatter", 32), ("collective-permute", 32))
+    assert read(EXCHANGED).exchanges == expected
+
+
+def test_exchanges_that_xla_writes_are_read():
+    if len(jax.devices()) < 8:
+        pytest.skip("needs 8 devices, which a CPU can simulate")
+    mesh = jax.make_mesh((8,), ("devices",))
+    rows = jax.device_put(jnp.ones((16, 4)), jax.NamedSharding(mesh, jax.P("devices")))
+    program = jax.jit(lambda x: jnp.cos(x).sum(axis=0)).lower(rows).compile().as_text()
+    assert read(program).exchanges == (("all-reduce", 16),)
+
+
 @pytest.mark.parametrize("text", ["", "HloModule nothing\n"])
 def test_what_is_no_program_is_refused(text):
     with pytest.raises(ValueError, match="expected an ENTRY computation"):
@@ -142,7 +172,9 @@ class Told:
     def start(self):
         if "mjx" in self.name:
             raise WorkerError(f"{self.name}: stopped with status 1, expected a result:\nno memory")
-        self.facts = {"compiling_s": 1.0, "loops": [1, [5, 5], [[None, [5, 5, 5], []]]]}
+        self.facts = {"compiling_s": 1.0, "loops": [1, [5, 5], [[None, [5, 5, 5], [], []]], []]}
+        if "8 GPUs" in self.name:
+            self.facts["loops"] = [1, [], [[4, [9e6], [], [["all-reduce", 5e6]]]], []]
 
     def close(self):
         pass
@@ -161,17 +193,20 @@ def told(monkeypatch):
 
 def test_programs_are_compiled_for_a_gpu_that_is_not_there_and_one_that_fails_costs_no_other(told):
     figures = kernels.measure()
-    assert told == [("h200", program[0], "gpu-compiler") for program in kernels.PROGRAMS.values()]
-    chain, mjx, epoch = figures["programs"]
+    wheres = {name: "h200x8" if "8 GPUs" in name else "h200" for name in kernels.PROGRAMS}
+    assert told == [(wheres[name], program[0], "gpu-compiler") for name, program in kernels.PROGRAMS.items()]
+    chain, mjx, epoch, _ = figures["programs"]
     assert chain["kernels"] == 2 + 2 * 3 and "kernels" not in epoch
     assert mjx["failed"].startswith("env step, mjx") and mjx["failed"].endswith("no memory")
-    assert [row["kernels"] for row in figures["loops"]] == [2, 3, 2, 3]
+    assert [row["kernels"] for row in figures["loops"]] == [2, 3, 2, 3, 1]
+    of_eight = {"program": "training epoch on 8 GPUs", "turns": "4", "exchange": "all-reduce", "mb": 5.0}
+    assert figures["exchanges"] == [of_eight]
 
 
 def test_a_gpu_that_is_there_needs_no_other_environment(told, monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     kernels.measure()
-    assert {(where, python) for where, _, python in told} == {("here", None)}
+    assert {(where, python) for where, _, python in told} == {("here", None), ("h200x8", None)}
 
 
 def test_without_gpu_and_compiler_it_says_so(told, monkeypatch):
