@@ -18,7 +18,7 @@ NO_DEVICE = "no CUDA device here: jax runs on the CPU"
 LEAST_RATE = {"chain": 300_000, "mjx": 30_000}  # env steps/s at the best number of arms
 MEDIAN_MM, WITHIN_S = 3.0, 120.0
 LONGEST_S = 600.0
-# Many arms, few and large batches: what a GPU is good at. Some 6,300 gradient steps bring it to 3 mm.
+# Many arms, few and large batches: what a GPU is good at. Run on a CPU alone so far, see docs/scaling.md.
 TRAINING = (
     "n_arms=2048",
     "vector_steps_per_epoch=4",
