@@ -266,6 +266,8 @@ def test_half_a_kilogram_moves_held_arms_by_as_much_as_the_readme_says():
     assert free.settled.all() and sagged.settled.all() and held.settled.all() and not held.at_limit.any()
     np.testing.assert_allclose(shift_mm(held), [2.0, 3.5], rtol=0.1)
     np.testing.assert_allclose(shift_mm(sagged), [17.0, 30.0], rtol=0.1)
+    anywhere = settled(settle, settled(settle_pressures, pressures()).spring_m, loaded)
+    assert anywhere.at_limit.any(axis=1).mean() > 0.5
 
 
 # --- failures --------------------------------------------------------------------------------------
