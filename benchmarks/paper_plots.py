@@ -73,7 +73,7 @@ def error_figure(results: Results) -> Figure:
 
 
 def loads_figure(table: Sequence[Mapping[str, Any]]) -> Figure:
-    """Translation error over the load, with S2R: each run's mean and largest, saturated points below."""
+    """Translation error over the load, with S2R: each run's mean and largest; saturated points beside it."""
     rows = [row for row in table if row["method"] == "with"]
     loads = sorted({row["load_g"] for row in rows})
     figure = Figure(figsize=(9, 3.8), layout="constrained")
@@ -88,7 +88,7 @@ def loads_figure(table: Sequence[Mapping[str, Any]]) -> Figure:
     _dots(right, rows, loads, "saturated_points", RED, "a chamber saturated")
     left.axhline(PAPER_LOADS_MM, color=INK, linestyle=":", linewidth=1, label="paper's arm, 35 to 500 g")
     for panel in (left, right):
-        panel.set_xticks(range(len(loads)), [str(load) for load in loads])
+        panel.set_xticks(loads, [str(load) for load in loads], rotation=60)
         panel.set_ylim(bottom=0)
         panel.legend(frameon=False, fontsize=8)
     return figure
@@ -97,9 +97,9 @@ def loads_figure(table: Sequence[Mapping[str, Any]]) -> Figure:
 def _dots(panel: Any, rows, loads: Sequence[int], name: str, colour: str, label: str) -> None:
     """Every run as a dot, and a line through the means."""
     values = [[row[name] for row in rows if row["load_g"] == load] for load in loads]
-    for at, runs in enumerate(values):
-        panel.plot([at] * len(runs), runs, "o", color=colour, markersize=3, alpha=0.5)
-    panel.plot(range(len(loads)), [np.mean(runs) for runs in values], color=colour, label=label)
+    for load, runs in zip(loads, values, strict=True):
+        panel.plot([load] * len(runs), runs, "o", color=colour, markersize=3, alpha=0.5)
+    panel.plot(loads, [np.mean(runs) for runs in values], color=colour, label=label)
 
 
 def trace_figure(followed: Followed, limits_kpa: tuple[float, float]) -> Figure:
