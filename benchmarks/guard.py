@@ -1,6 +1,6 @@
 """Whether something got slower: a small fixed benchmark against a stored one of the same kind of machine.
 
-    python -m benchmarks guard            compare; for use before a release, in about five minutes
+    python -m benchmarks guard            compare; for use before a release, in about four minutes
     python -m benchmarks guard --store    make this the baseline of this kind of machine
 
 Exit status 0 if nothing is worse, 1 if something is, 2 if there is no baseline, or none worth storing, or if
