@@ -58,6 +58,7 @@ def both(key: Array, shape_uniform: tuple[int, ...], shape_normal: tuple[int, ..
 
 
 def _everywhere(numbers: Array) -> Array:
-    if jax.sharding.get_abstract_mesh().empty:
+    mesh = jax.sharding.get_abstract_mesh()
+    if mesh.empty or set(mesh.axis_types) != {jax.sharding.AxisType.Auto}:  # as within `jax.pmap`
         return numbers
     return jax.lax.with_sharding_constraint(numbers, PartitionSpec())
