@@ -33,6 +33,6 @@ def test_the_smallest_share_is_a_finite_number(monkeypatch):
 
 
 def test_what_each_device_does_by_itself_draws_there():
-    keys = jax.random.split(jax.random.key(3), 1)
-    local = jax.pmap(lambda key: draws.uniform(key, SHAPE))(keys)
-    np.testing.assert_array_equal(local[0], draws.uniform(keys[0], SHAPE))
+    keys = jax.random.split(jax.random.key(3), (1, 2))
+    local = jax.pmap(jax.vmap(lambda key: draws.uniform(key, SHAPE)))(keys)
+    np.testing.assert_array_equal(local[0, 1], draws.uniform(keys[0, 1], SHAPE))
