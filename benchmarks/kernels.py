@@ -109,36 +109,32 @@ def in_all(loop: hlo.Loop, turns: int) -> Facts:
     }
 
 
-def rows(loop: hlo.Loop, turns: Sequence[str] = ()) -> Iterator[Facts]:
+def rows(loop: hlo.Loop) -> Iterator[Facts]:
     """A row for a loop, whose turns are told with those of the loops around it, and for each inside it."""
-    n = len(loop.kernels)
-    if n:
-        yield {
-            "turns": _times(turns),
-            "kernels": n,
-            "mb": round(1e-6 * sum(loop.kernels), 1),
-            "launch_bound": round(sum(kernel_s(moved) == LAUNCH_S for moved in loop.kernels) / n, 2),
-            "calculated_us": round(1e6 * sum(map(kernel_s, loop.kernels)), 1),
-        }
-    for inner in loop.inside:
-        yield from rows(inner, [*turns, _turns(inner)])
+    for turns, one in _each(loop):
+        if n := len(one.kernels):
+            yield {
+                "turns": turns,
+                "kernels": n,
+                "mb": round(1e-6 * sum(one.kernels), 1),
+                "launch_bound": round(sum(kernel_s(moved) == LAUNCH_S for moved in one.kernels) / n, 2),
+                "calculated_us": round(1e6 * sum(map(kernel_s, one.kernels)), 1),
+            }
 
 
-def exchanges(loop: hlo.Loop, turns: Sequence[str] = ()) -> Iterator[Facts]:
+def exchanges(loop: hlo.Loop) -> Iterator[Facts]:
     """A row for each exchange between devices of a loop and of those inside it, likewise."""
-    for exchange in loop.exchanges:
-        yield {
-            "turns": _times(turns),
-            "exchange": exchange.operation,
-            "mb": float(f"{1e-6 * exchange.size:.3g}"),
-        }
+    for turns, one in _each(loop):
+        for exchange in one.exchanges:
+            yield {
+                "turns": turns,
+                "exchange": exchange.operation,
+                "mb": float(f"{1e-6 * exchange.size:.3g}"),
+            }
+
+
+def _each(loop: hlo.Loop, turns: Sequence[str] = ()) -> Iterator[tuple[str, hlo.Loop]]:
+    """A loop and those inside it, each after its turns and those of the loops around it."""
+    yield " x ".join(turns) or "once", loop
     for inner in loop.inside:
-        yield from exchanges(inner, [*turns, _turns(inner)])
-
-
-def _turns(loop: hlo.Loop) -> str:
-    return "until at rest" if loop.turns is None else str(loop.turns)
-
-
-def _times(turns: Sequence[str]) -> str:
-    return " x ".join(turns) or "once"
+        yield from _each(inner, [*turns, "until at rest" if inner.turns is None else str(inner.turns)])
