@@ -27,7 +27,7 @@ import jax
 import numpy as np
 
 from benchmarks.common import RESULTS, n_cores, show
-from benchmarks.guard_work import ON_DEVICE, ON_HOST, reference_of, sizes_here
+from benchmarks.guard_work import ON_DEVICE, ON_HOST, reference_of, work_here
 from benchmarks.rounds import Facts, Worker, WorkerError, working
 from mjx_softarm.provenance import provenance, write_json
 
@@ -56,7 +56,7 @@ def main(arguments: Sequence[str]) -> int:
     )
     parser.add_argument("--store", action="store_true", help="make this the baseline of this kind of machine")
     options = parser.parse_args(arguments)
-    kind, sizes = machine_kind(), {"n_rounds": N_ROUNDS, **sizes_here()._asdict()}
+    kind, sizes = machine_kind(), {"n_rounds": N_ROUNDS, **work_here()}
     try:
         return _store(kind, sizes) if options.store else _compare(kind, sizes)
     except BaselineError as error:

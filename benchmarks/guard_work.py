@@ -61,6 +61,12 @@ def sizes_here() -> Sizes:
     return SIZES["gpu" if jax.default_backend() == "gpu" else "cpu"]
 
 
+def work_here() -> dict[str, int]:
+    """All numbers by which this machine's costs are of other work than another's, by name."""
+    products = {"n_rows": N_ROWS, "n_rows_on_gpu": N_ROWS_ON_GPU, "n_products": N_PRODUCTS}
+    return {**sizes_here()._asdict(), **products, "n_compiles": N_COMPILES}
+
+
 def reference_of(name: str) -> str:
     """What some work stands beside: the product on the same device."""
     return PRODUCT_ON_GPU if name in ON_DEVICE and jax.default_backend() == "gpu" else PRODUCT

@@ -129,6 +129,13 @@ def test_status_tells_stored_same_worse_and_no_baseline(machine, capsys):
     assert guard.main([]) == 1 and "worse: compile" in capsys.readouterr().out
 
 
+def test_a_baseline_beside_another_reference_is_none(machine, monkeypatch, capsys):
+    machine.append(STORED)
+    assert guard.main(["--store"]) == 0
+    monkeypatch.setattr(guard_work, "N_PRODUCTS", 1 + guard_work.N_PRODUCTS)
+    assert guard.main([]) == 2 and "of other work" in capsys.readouterr().out
+
+
 def test_a_baseline_that_would_let_everything_through_is_not_stored(machine, capsys):
     tick, settle = (2.0, 2.0, 2.0, 2.26, 2.26), (1.0, 1.0, 1.0, 1.12, 1.12)  # 26 % and 24 %
     machine.append(samples(tick=tick, settle=settle))
