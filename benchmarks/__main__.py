@@ -12,6 +12,18 @@ import importlib
 import sys
 from pathlib import Path
 
+ROOMS = {
+    "throughput": "speed.throughput",
+    "settle": "speed.settle",
+    "kernels": "speed.kernels",
+    "learner": "speed.learner",
+    "guard": "speed.guard",
+    "calibration": "accuracy.calibration",
+    "logs": "accuracy.logs",
+    "learning": "accuracy.learning",
+    "race": "race.race",
+    "paper": "paper.experiments",
+}
 NAMES = {
     "throughput": "env steps/s over arms and links, beside C MuJoCo in time steps; start-up times",
     "settle": "error, speed, compile time and memory of Newton against time stepping; floor against measured",
@@ -31,7 +43,7 @@ ALONE = {
 def main() -> int:
     """Run the named benchmarks; print their figures and write them to `benchmarks/results`."""
     if sys.argv[1:2] and sys.argv[1] in ALONE:
-        return importlib.import_module(f"benchmarks.{sys.argv[1]}").main(sys.argv[2:])
+        return importlib.import_module(f"benchmarks.{ROOMS[sys.argv[1]]}").main(sys.argv[2:])
     epilog = "\n".join(f"  {name:12} {text}" for name, text in {**NAMES, **ALONE}.items())
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks", epilog=epilog, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -46,16 +58,16 @@ def main() -> int:
         if name not in NAMES:
             alone = f", or one of {', '.join(ALONE)} alone"
             parser.error(f"got {name!r}, expected some of {', '.join(NAMES)}{alone}")
-    from benchmarks.common import save, show
-    from mjx_softarm.checks import LogError
-    from train.checkpoint import RunError
+    from benchmarks.harness.common import save, show
+    from mjx_softarm.logs.checks import LogError
+    from train.runs.checkpoint import RunError
 
     if "learning" in options.names and not options.runs:
         parser.error("learning: needs --runs FOLDER [FOLDER ...]")
     if "logs" in options.names and options.data is None:
         parser.error("logs: needs --data FOLDER, with the logs that docs/results.md names under Calibration")
     for name in options.names:
-        module = importlib.import_module(f"benchmarks.{name}")
+        module = importlib.import_module(f"benchmarks.{ROOMS[name]}")
         given = {"learning": [options.runs], "logs": [options.data]}.get(name, [])
         try:
             figures = module.measure(*given)

@@ -12,9 +12,9 @@ import sys
 from pathlib import Path
 
 from calib.errors import FitError
-from mjx_softarm.archive import SealedFileError
-from mjx_softarm.checks import Finding, LogError
-from mjx_softarm.logs import Log
+from mjx_softarm._support.archive import SealedFileError
+from mjx_softarm.logs.checks import Finding, LogError
+from mjx_softarm.logs.schema import Log
 from mjx_softarm.spec import ArmSpec, SpecError
 
 
@@ -72,7 +72,7 @@ def _add_logs(parser: argparse.ArgumentParser) -> None:
 
 
 def _template(options: argparse.Namespace) -> int:
-    from calib.logs import template
+    from calib.read.logs import template
 
     print(template(options.out))
     return 0
@@ -87,7 +87,7 @@ def _check(options: argparse.Namespace) -> int:
 
 def _demo(options: argparse.Namespace) -> int:
     from calib.demo import write_demo
-    from mjx_softarm import xla
+    from mjx_softarm._support import xla
 
     xla.enable_compilation_cache()
     print("simulating ...", flush=True)
@@ -99,8 +99,8 @@ def _demo(options: argparse.Namespace) -> int:
 
 def _run(options: argparse.Namespace) -> int:
     from calib.run import calibrate, refuse_existing, write_calibration
-    from mjx_softarm import xla
-    from mjx_softarm.provenance import provenance
+    from mjx_softarm._support import xla
+    from mjx_softarm._support.provenance import provenance
 
     refuse_existing(options.out)
     spec = _spec(options)
@@ -123,7 +123,7 @@ def _spec(options: argparse.Namespace) -> ArmSpec:
 
 def _read(options: argparse.Namespace, spec: ArmSpec) -> tuple[list[Log], list[Finding]]:
     """The logs; what was found is printed."""
-    from calib.logs import read_log
+    from calib.read.logs import read_log
 
     logs, findings = [], []
     for path in options.logs:

@@ -13,13 +13,13 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from mjx_softarm.excitation import random_pressures
-from mjx_softarm.logs import Log, write_log
-from mjx_softarm.mjcf import build_model, steps_per_period
-from mjx_softarm.pose import rotation_from_quaternion
-from mjx_softarm.sensors import SensorParams, frequency_from_length
+from mjx_softarm.logs.schema import Log, write_log
+from mjx_softarm.mechanics.excitation import random_pressures
+from mjx_softarm.mechanics.mjcf import build_model, steps_per_period
+from mjx_softarm.mechanics.workspace import settle_many
+from mjx_softarm.sensing.pose import rotation_from_quaternion
+from mjx_softarm.sensing.sensors import SensorParams, frequency_from_length
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
-from mjx_softarm.workspace import settle_many
 
 N_LENGTHS = 60  # of each spring on the ruler
 N_POSES = 1200

@@ -20,21 +20,21 @@ from typing import Any
 
 import numpy as np
 
-from calib import parts
-from calib.chambers import MIN_POSES, calibrate_chambers
 from calib.errors import FitError
-from calib.logs import same_arm
-from calib.markers import marker_limits
-from calib.report import Part, to_html, to_json
-from calib.rests import REST_S, find_rests
-from calib.s2r import fit_s2r, simulate_poses
-from calib.sensors import fit_springs
-from calib.transients import calibrate_damping, find_stretches
-from mjx_softarm.logs import Log
-from mjx_softarm.pose import pose_from_frame
-from mjx_softarm.provenance import write_json
-from mjx_softarm.s2r import S2R, S2R_FILE, save_s2r
-from mjx_softarm.sensors import SensorParams, length_from_frequency
+from calib.fit.chambers import MIN_POSES, calibrate_chambers
+from calib.fit.markers import marker_limits
+from calib.fit.s2r import fit_s2r, simulate_poses
+from calib.fit.sensors import fit_springs
+from calib.fit.transients import calibrate_damping, find_stretches
+from calib.read.logs import same_arm
+from calib.read.rests import REST_S, find_rests
+from calib.report import sections as parts
+from calib.report.page import Part, to_html, to_json
+from mjx_softarm._support.provenance import write_json
+from mjx_softarm.logs.schema import Log
+from mjx_softarm.sensing.pose import pose_from_frame
+from mjx_softarm.sensing.s2r import S2R, S2R_FILE, save_s2r
+from mjx_softarm.sensing.sensors import SensorParams, length_from_frequency
 from mjx_softarm.spec import ARM_FILE, ArmSpec
 
 OF_POSES = ("pressure_kpa", "tip_m", "tip_quaternion")  # what a log of poses must have
@@ -61,10 +61,10 @@ def calibrate(
     """Fit all that the logs allow.
 
     Args:
-        logs: of one arm; see `calib.logs.read_log`.
+        logs: of one arm; see `calib.read.logs.read_log`.
         spec: what is believed of the arm so far.
         seed: of all that is drawn.
-        of_springs: `shared` and `fit_compensation` of `calib.sensors.fit_springs`.
+        of_springs: `shared` and `fit_compensation` of `calib.fit.sensors.fit_springs`.
         tell: takes a line before each step.
 
     Raises:

@@ -108,9 +108,9 @@ def _run_picture(args: argparse.Namespace) -> None:
     spec = _read_spec(args.spec)
     _check_pressures(spec, args.pressures)
     _import_mujoco()
-    from mjx_softarm.mjcf import build_model
-    from mjx_softarm.render import Renderer, RenderError, write_png
-    from mjx_softarm.workspace import settle_many
+    from mjx_softarm.mechanics.mjcf import build_model
+    from mjx_softarm.mechanics.render import Renderer, RenderError, write_png
+    from mjx_softarm.mechanics.workspace import settle_many
 
     pressure_kpa = np.broadcast_to(np.asarray(args.pressures), (1, spec.n_chambers))
     rest = settle_many(spec, pressure_kpa)
@@ -138,7 +138,7 @@ def _run_workspace(args: argparse.Namespace) -> None:
     except ImportError as error:
         raise CommandError(f"drawing needs matplotlib (pip install matplotlib): {error}") from error
     matplotlib.use("Agg")
-    from mjx_softarm.workspace import extreme_poses
+    from mjx_softarm.mechanics.workspace import extreme_poses
 
     args.out.mkdir(parents=True, exist_ok=True)
     found = extreme_poses(spec)

@@ -17,7 +17,7 @@ At rest (i' = i, constant e) each chamber is in one of three states, in each of 
     p = p_min           and e < 0    it can pull no further
 
 Neither kp nor ki nor dt is in there: they say how the arm comes to rest, not where.
-`mjx_softarm.settle` solves for exactly this rest.
+`mjx_softarm.mechanics.settle` solves for exactly this rest.
 
 There is no derivative term: a rate from readings at 50 Hz is mostly noise, and the arm's own damping
 already slows it.
@@ -27,7 +27,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from mjx_softarm._xp import Array, array_namespace
+from mjx_softarm._support.xp import Array, array_namespace
 from mjx_softarm.spec import ArmSpec
 
 

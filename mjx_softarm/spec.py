@@ -16,8 +16,8 @@ from typing import Any
 
 import tomli_w
 
-from mjx_softarm._fields import SpecError, anything, count, not_negative, positive, read_fields
-from mjx_softarm.sensors import frequency_range_hz
+from mjx_softarm._support.fields import SpecError, anything, count, not_negative, positive, read_fields
+from mjx_softarm.sensing.sensors import frequency_range_hz
 
 N_CHAMBERS_PER_SECTION = 3
 ARM_FILE = "arm.toml"  # in the folder of a calibration
@@ -90,7 +90,7 @@ class Springs:
 
 @dataclass(frozen=True)
 class Sensor:
-    """Resonant circuit and coil of one spring; see `mjx_softarm.sensors`."""
+    """Resonant circuit and coil of one spring; see `mjx_softarm.sensing.sensors`."""
 
     capacitance_f: float = positive()
     compensation_h: float = anything()

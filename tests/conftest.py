@@ -6,11 +6,12 @@ import jax
 import numpy as np
 import pytest
 
-from mjx_softarm import ArmSpec, xla
+from mjx_softarm import ArmSpec
+from mjx_softarm._support import xla
 from mjx_softarm.env import EnvConfig, ReachEnv
-from mjx_softarm.estimator import N_CHANGES, PoseEstimator, SpringModel
-from mjx_softarm.export import ArmModel
-from mjx_softarm.s2r import N_POSE_INPUTS, N_POSE_OUTPUTS, S2R
+from mjx_softarm.policy.file import ArmModel
+from mjx_softarm.sensing.estimator import N_CHANGES, PoseEstimator, SpringModel
+from mjx_softarm.sensing.s2r import N_POSE_INPUTS, N_POSE_OUTPUTS, S2R
 
 jax.config.update("jax_num_cpu_devices", 8)  # of which most tests use one
 N_ARMS = 512  # of every call of `reset` and `step`: another number would compile anew

@@ -6,11 +6,16 @@ from mjx_softarm import ArmSpec
 from mjx_softarm.control import Gains
 from mjx_softarm.deploy.loop import Controller
 from mjx_softarm.deploy.session import follow
-from mjx_softarm.estimator import PoseEstimator, SpringModel, estimate
-from mjx_softarm.export import Policy
-from mjx_softarm.obs import ObsScale
-from mjx_softarm.rewards import RewardConfig
-from mjx_softarm.sensors import SensorParams, frequency_from_length, frequency_range_hz, length_from_frequency
+from mjx_softarm.mdp.observation import ObsScale
+from mjx_softarm.mdp.rewards import RewardConfig
+from mjx_softarm.policy.file import Policy
+from mjx_softarm.sensing.estimator import PoseEstimator, SpringModel, estimate
+from mjx_softarm.sensing.sensors import (
+    SensorParams,
+    frequency_from_length,
+    frequency_range_hz,
+    length_from_frequency,
+)
 
 SPEC = ArmSpec.default()
 N, DT_S = SPEC.n_chambers, 1.0 / SPEC.control.rate_hz

@@ -152,6 +152,6 @@ def test_gains_may_be_traced_and_one_per_chamber():
 
 
 def test_a_deployed_arm_needs_no_jax():
-    modules = "mjx_softarm.sensors, mjx_softarm.pose, mjx_softarm.control"
+    modules = "mjx_softarm.sensing.sensors, mjx_softarm.sensing.pose, mjx_softarm.control"
     code = f"import sys, {modules}; sys.exit('jax' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -16,14 +16,12 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.table import Table
 
-from mjx_softarm import xla
-from mjx_softarm.archive import SealedFileError
-from mjx_softarm.checks import LogError
+from mjx_softarm._support import xla
+from mjx_softarm._support.archive import SealedFileError
 from mjx_softarm.deploy.arms import ArmError
-from mjx_softarm.s2r import S2R, S2R_FILE, load_s2r
+from mjx_softarm.logs.checks import LogError
+from mjx_softarm.sensing.s2r import S2R, S2R_FILE, load_s2r
 from mjx_softarm.spec import ARM_FILE, ArmSpec, SpecError
-from train import devices
-from train.checkpoint import Run, RunError, sole_trainer
 from train.config import (
     IMITATION_PRESETS,
     IMITATION_PRESETS_HELP,
@@ -31,17 +29,19 @@ from train.config import (
     ConfigError,
     override,
 )
-from train.demonstrations import from_log, read_demonstrations
-from train.demos import add_commands
-from train.evaluate import N_ACTIONS
-from train.expert import ExpertError
+from train.demos.command import add_commands
+from train.demos.demonstrations import from_log, read_demonstrations
+from train.demos.expert import ExpertError
+from train.epoch import devices
 from train.options import add_arm, check_resume_alone
-from train.sweep import add_sweep
+from train.runs.checkpoint import Run, RunError, sole_trainer
+from train.runs.evaluate import N_ACTIONS
+from train.sweep.command import add_sweep
 
 if TYPE_CHECKING:
     from jax.sharding import Mesh
 
-    from train.task import Task
+    from train.runs.task import Task
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -122,8 +122,8 @@ def _add_run(
 
 def _reach(options: argparse.Namespace, console: Console) -> int:
     from mjx_softarm.env import ReachEnv
-    from train.run import default_path
-    from train.task import task_of
+    from train.runs.run import default_path
+    from train.runs.task import task_of
 
     mesh = _mesh(options, console)
     if options.resume:
@@ -139,8 +139,8 @@ def _reach(options: argparse.Namespace, console: Console) -> int:
 
 def _imitate(options: argparse.Namespace, console: Console) -> int:
     from mjx_softarm.env import ReachEnv
-    from train.run import begin_with, default_path
-    from train.task import task_of
+    from train.runs.run import begin_with, default_path
+    from train.runs.task import task_of
 
     mesh = _mesh(options, console)
     if options.resume:
@@ -172,7 +172,7 @@ def _mesh(options: argparse.Namespace, console: Console) -> Mesh | None:
 
 
 def _resume(options: argparse.Namespace, mesh: Mesh | None, console: Console) -> int:
-    from train.run import task_of_run
+    from train.runs.run import task_of_run
 
     check_resume_alone(options, "run")
     run = Run.open(options.resume)
@@ -187,7 +187,7 @@ def _config(preset: Any, options: argparse.Namespace, assignments: Sequence[str]
 
 
 def _train(run: Run, task: Task, console: Console) -> int:
-    from train.run import Interrupted, train
+    from train.runs.run import Interrupted, train
 
     console.print(f"run: {run.path}", highlight=False)
     try:
@@ -214,7 +214,7 @@ def _arm(options: argparse.Namespace, console: Console) -> tuple[ArmSpec, S2R | 
 
 
 def _evaluate(options: argparse.Namespace, console: Console) -> int:
-    from train.run import finish, restore_actor
+    from train.runs.run import finish, restore_actor
 
     run = Run.open(options.run)
     task, actor_params = restore_actor(run)
@@ -223,7 +223,7 @@ def _evaluate(options: argparse.Namespace, console: Console) -> int:
 
 
 def _export(options: argparse.Namespace, console: Console) -> int:
-    from train.export import export_run
+    from train.runs.export import export_run
 
     if options.out and len(options.runs) > 1:
         raise ConfigError(f"--out {options.out}: got {len(options.runs)} runs, expected one with it")

@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from mjx_softarm.env import EnvConfig
-from train.gail import GailConfig
-from train.hindsight import HindsightConfig
-from train.tqc import TQCConfig
+from train.agent.gail import GailConfig
+from train.agent.tqc import TQCConfig
+from train.epoch.hindsight import HindsightConfig
 
 
 class ConfigError(ValueError):

@@ -19,9 +19,9 @@ from mjx_softarm.deploy.faults import RESPONSE, Response
 from mjx_softarm.deploy.loop import Controller, Phase
 from mjx_softarm.deploy.record import record
 from mjx_softarm.deploy.session import Run, follow
-from mjx_softarm.excitation import random_pressures
-from mjx_softarm.export import SealedFileError, load_policy
-from mjx_softarm.logs import write_log
+from mjx_softarm.logs.schema import write_log
+from mjx_softarm.mechanics.excitation import random_pressures
+from mjx_softarm.policy.file import SealedFileError, load_policy
 from mjx_softarm.spec import ArmSpec, SpecError
 
 _ERROR, _FAULT, _INTERRUPTED = 2, 3, 130

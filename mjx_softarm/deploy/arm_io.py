@@ -46,7 +46,7 @@ class ArmIO(Protocol):
 
 
 class Capture(NamedTuple):
-    """What motion capture sees of an arm, in the base frame (see `mjx_softarm.pose`)."""
+    """What motion capture sees of an arm, in the base frame (see `mjx_softarm.sensing.pose`)."""
 
     tip_m: np.ndarray  # (3,) centre of the last plate
     tip_quaternion: np.ndarray  # (4,) w, x, y, z

@@ -7,7 +7,7 @@ import os
 import sys
 from typing import Any
 
-from mjx_softarm.pipe import PIPES_MM, CrossPipe
+from mjx_softarm.mechanics.pipe import PIPES_MM, CrossPipe
 from mjx_softarm.spec import SpecError
 
 _METHODS = ("read_frequencies", "write_pressures")
@@ -56,7 +56,7 @@ def _twin(item: str) -> Any:
     if colon and pipe not in PIPES_MM:
         raise ArmError(f"--arm: twin:{seed}:PIPE, got {pipe!r}, expected {' or '.join(PIPES_MM)}")
     try:
-        from mjx_softarm.deploy.twin import Twin
+        from mjx_softarm.twin.arm import Twin
     except ImportError as error:
         raise ArmError(f"--arm: the twin needs MuJoCo (pip install 'mjx-softarm[sim]'): {error}") from error
     try:

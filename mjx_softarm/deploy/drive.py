@@ -17,7 +17,7 @@ from mjx_softarm.deploy.arm_io import ArmIO
 from mjx_softarm.deploy.faults import LOST_TICKS, SETTLE_TIMEOUT_S, still
 from mjx_softarm.deploy.loop import VENT_KPA_PER_S, WINDOW_S
 from mjx_softarm.deploy.session import ArmLost, Clock, Pumps, Recorder, read
-from mjx_softarm.sensors import SensorFault, SensorParams, describe_faults, length_from_frequency
+from mjx_softarm.sensing.sensors import SensorFault, SensorParams, describe_faults, length_from_frequency
 from mjx_softarm.spec import ArmSpec
 
 RAMP_M_PER_S = 0.03  # of the reference that has furthest to go

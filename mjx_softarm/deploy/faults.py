@@ -33,7 +33,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mjx_softarm.control import Gains, saturated
-from mjx_softarm.estimator import SpringModel, expected_springs
+from mjx_softarm.sensing.estimator import SpringModel, expected_springs
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION
 
 LOST_TICKS = 3

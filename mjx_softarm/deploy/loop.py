@@ -25,11 +25,11 @@ from mjx_softarm.control import pressures, saturated
 from mjx_softarm.deploy import faults
 from mjx_softarm.deploy.faults import Event, Fault, Response
 from mjx_softarm.deploy.reach import Reachable, nearest
-from mjx_softarm.deploy.runtime import PolicyRunner
-from mjx_softarm.estimator import estimate_frame
-from mjx_softarm.pose import pose_from_frame
-from mjx_softarm.s2r import apply_correction, correction, distance, inputs
-from mjx_softarm.sensors import SensorFault, describe_faults, length_from_frequency
+from mjx_softarm.policy.runtime import PolicyRunner
+from mjx_softarm.sensing.estimator import estimate_frame
+from mjx_softarm.sensing.pose import pose_from_frame
+from mjx_softarm.sensing.s2r import apply_correction, correction, distance, inputs
+from mjx_softarm.sensing.sensors import SensorFault, describe_faults, length_from_frequency
 
 N_ACTIONS = 4  # for each goal, as in training's evaluation
 WINDOW_S = 0.5

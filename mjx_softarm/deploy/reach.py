@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mjx_softarm.pose import frame_from_pose
-from mjx_softarm.rewards import RewardConfig
+from mjx_softarm.mdp.rewards import RewardConfig
+from mjx_softarm.sensing.pose import frame_from_pose
 
 _CHUNK = 256  # poses whose distances to all others are computed at once
 

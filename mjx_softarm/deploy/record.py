@@ -15,7 +15,7 @@ import numpy as np
 from mjx_softarm.deploy.arm_io import ArmIO
 from mjx_softarm.deploy.drive import Drive, drive_to_end, ramp
 from mjx_softarm.deploy.session import Recorder
-from mjx_softarm.logs import Log
+from mjx_softarm.logs.schema import Log
 from mjx_softarm.spec import ArmSpec
 
 

@@ -20,8 +20,8 @@ import numpy as np
 from mjx_softarm.deploy.arm_io import ArmIO
 from mjx_softarm.deploy.faults import LATE_TICKS, Event, Fault
 from mjx_softarm.deploy.loop import Controller, Phase, State, Tick, believed, start, step, with_goal
-from mjx_softarm.logs import Log
-from mjx_softarm.pose import pose_error
+from mjx_softarm.logs.schema import Log
+from mjx_softarm.sensing.pose import pose_error
 
 _ROUNDING_S = 1e-6  # by which a simulated tick may be longer than the period
 

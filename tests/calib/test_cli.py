@@ -9,10 +9,10 @@ import pytest
 import calib.demo
 from calib.__main__ import main
 from calib.demo import planted_arm, write_demo
-from calib.logs import read_log
+from calib.read.logs import read_log
 from mjx_softarm import ArmSpec
-from mjx_softarm.logs import write_log
-from mjx_softarm.s2r import load_s2r
+from mjx_softarm.logs.schema import write_log
+from mjx_softarm.sensing.s2r import load_s2r
 
 
 @pytest.fixture(scope="module")
@@ -75,9 +75,9 @@ def test_nothing_is_overwritten(demo, calibrated, capsys):
 
 def test_training_takes_the_folder(calibrated, tmp_path, monkeypatch):
     """The run has the calibrated arm and its network, and so has what is opened from it."""
-    from train import run as train_run
     from train.__main__ import main as train_main
-    from train.checkpoint import Run
+    from train.runs import run as train_run
+    from train.runs.checkpoint import Run
 
     seen = {}
     monkeypatch.setattr(train_run, "train", lambda run, task, console: seen.update(run=run, env=task.job.env))
@@ -96,8 +96,8 @@ def test_training_takes_the_folder(calibrated, tmp_path, monkeypatch):
 
 
 def test_training_tells_that_a_folder_has_no_network(calibrated, tmp_path, monkeypatch, capsys):
-    from train import run as train_run
     from train.__main__ import main as train_main
+    from train.runs import run as train_run
 
     seen = {}
     monkeypatch.setattr(train_run, "train", lambda run, task, console: seen.update(env=task.job.env))

@@ -13,16 +13,16 @@ import numpy as np
 import pytest
 
 from mjx_softarm.env import ReachEnv
-from mjx_softarm.logs import Log, write_log
-from mjx_softarm.pose import frame_from_pose, quaternion_from_pose
-from mjx_softarm.sensors import SensorParams, frequency_from_length
+from mjx_softarm.logs.schema import Log, write_log
+from mjx_softarm.mechanics.workspace import sample_workspace
+from mjx_softarm.sensing.pose import frame_from_pose, quaternion_from_pose
+from mjx_softarm.sensing.sensors import SensorParams, frequency_from_length
 from mjx_softarm.spec import ArmSpec
-from mjx_softarm.workspace import sample_workspace
 from train.__main__ import main
-from train.checkpoint import Run, RunError, sole_trainer
-from train.job import Job
-from train.plots import IMITATION_PICTURES, REACH_PICTURES
-from train.run import task_of_run
+from train.epoch.job import Job
+from train.runs.checkpoint import Run, RunError, sole_trainer
+from train.runs.plots import IMITATION_PICTURES, REACH_PICTURES
+from train.runs.run import task_of_run
 
 SMALL = {
     "n_arms": 8,
@@ -95,7 +95,7 @@ def test_a_run_survives_kill_9_and_ends_with_the_same_bits(tmp_path, environment
     assert {"python", "packages", "commit"} <= config["provenance"].keys()
 
     for name, smaller in (("N_TRAINING", 512), ("N_STEPS", 10)):  # how exact it is, test_estimator asks
-        monkeypatch.setattr(f"train.estimator.{name}", smaller)
+        monkeypatch.setattr(f"train.runs.estimator.{name}", smaller)
     assert main(["export", str(whole)]) == 0
     assert (whole / "policy.npz").exists()
 
@@ -103,7 +103,7 @@ def test_a_run_survives_kill_9_and_ends_with_the_same_bits(tmp_path, environment
 HOLD = """
 import sys, time
 from pathlib import Path
-from train.checkpoint import sole_trainer
+from train.runs.checkpoint import sole_trainer
 with sole_trainer(Path(sys.argv[1])):
     print("held", flush=True)
     time.sleep(600)

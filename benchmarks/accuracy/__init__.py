@@ -1,0 +1,1 @@
+"""Accuracy of calibration and of trained policies."""

@@ -1,0 +1,44 @@
+"""How well calibration does on a planted arm, whose numbers are known: that of `python -m calib demo`.
+
+Errors are on contiguous blocks of rows that took no part in the fit. Real logs are read in `benchmarks.accuracy.logs`.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib import demo
+from calib.fit.chambers import calibrate_chambers
+from calib.fit.sensors import fit_springs
+from calib.read.logs import read_log
+from mjx_softarm import ArmSpec
+from mjx_softarm.sensing.sensors import SensorParams
+
+
+def measure() -> dict[str, Any]:
+    """Springs and chambers of the demo's logs, other geometry than the simulator's included; tips in mm."""
+    spec = ArmSpec.default()
+    planted = demo.planted_arm(spec, seed=0)
+    with tempfile.TemporaryDirectory() as folder:
+        files = demo.write_demo(Path(folder), spec, seed=0)
+        springs, poses = (read_log(file)[0] for file in files[:2])
+    assert springs.frequency_hz is not None and springs.spring_m is not None  # as the demo writes them
+    lines = fit_springs(springs.frequency_hz, springs.spring_m, SensorParams.from_spec(spec))
+    sensor = {"beta": tuple(map(float, lines.beta)), "delta_m": tuple(map(float, lines.delta_m))}
+    fit = calibrate_chambers(poses, spec.replace(sensor=sensor))
+    return {
+        "beta, largest error [%]": 100 * _worst(lines.beta, planted.sensor.beta),
+        "stiffness, largest error [%]": 100
+        * _worst(fit.spec.chambers.stiffness_n_per_m, planted.chambers.stiffness_n_per_m),
+        "area, largest error [%]": 100 * _worst(fit.spec.chambers.area_m2, planted.chambers.area_m2),
+        "tip at held-out poses, before": fit.held_out_before.translation_mean_mm,
+        "tip at held-out poses, calibrated": fit.held_out.translation_mean_mm,
+    }
+
+
+def _worst(found: Any, true: Any) -> float:
+    return float(np.max(np.abs(np.array(found) / np.array(true) - 1.0)))

@@ -1,0 +1,28 @@
+"""Held-out figures of finished training runs, grouped by their settings, with the spread over seeds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from train.config import to_dict
+from train.runs.checkpoint import Run
+from train.sweep.report import by_settings
+
+
+def measure(folders: list[str]) -> dict[str, Any]:
+    """Figures of each run, and mean, least and greatest over the seeds of the same settings.
+
+    Args:
+        folders: of runs trained to their end.
+
+    Raises:
+        RunError: a folder holds no finished run.
+    """
+    return {"groups": by_settings([Run.open(Path(folder)) for folder in folders], _all_but_the_seed)}
+
+
+def _all_but_the_seed(run: Run) -> dict[str, Any]:
+    settings = to_dict(run.config)
+    del settings["seed"]
+    return settings

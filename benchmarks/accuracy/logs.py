@@ -1,0 +1,128 @@
+"""How well calibration does on public logs of real soft arms.
+
+The logs: `asl_trunk`, a trunk of three segments and six motors (StanfordASL/trunk-stack), and `asu_softarm`,
+a pneumatic arm of two sections with draw wires (ASU-RISE-Lab/4-chamber-softarm-control). Errors are on
+contiguous blocks of rows that took no part in the fit.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib.fit.blocks import held_out_blocks
+from calib.fit.network import fit_network
+from calib.fit.response import fit_response
+from calib.fit.sensors import fit_line, still_rows
+from calib.read.adapters import read_asu, read_trunk, wire_length_m
+from mjx_softarm.sensing.s2r import correction
+
+ASU_LOGS = {name: f"asu_softarm/{name}_data_collect_1.txt" for name in ("apr5", "apr4")}
+TRUNK_LOG = "asl_trunk/observations_controlled_{}.csv"
+STILL_M = 2e-3  # within half a second: the wires lag motion capture by a tenth of one
+SEEDS = (0, 1, 2)
+
+
+def measure(data: Path) -> dict[str, Any]:
+    """All figures, in mm.
+
+    Args:
+        data: folder that has `asl_trunk` and `asu_softarm`.
+
+    Raises:
+        LogError: a log is missing, or cannot be read.
+    """
+    return {
+        "draw wires to section length, RMS": {name: wires(data, name) for name in ASU_LOGS},
+        "pressures to section length, RMS": {name: sections(data, name) for name in ASU_LOGS},
+        "trunk, 3D RMSE": {
+            **{f"_1, seed {seed}": trunk_blocks(data, seed) for seed in SEEDS},
+            "_11, last fifth": trunk_errors(data, "11", _last_fifth),
+        },
+    }
+
+
+def wires(data: Path, name: str) -> dict[str, float]:
+    """The mean of section 1's draw wires to its length, on rows that are fresh, and on those also at rest."""
+    log, _ = read_asu(data / ASU_LOGS[name])
+    wire_m, length_m = wire_length_m(log.wire_v)[:, :2].mean(axis=1), section_length_m(log)
+    still = still_rows(log.time_s, wire_m, STILL_M) & still_rows(log.time_s, length_m, STILL_M)
+    rows = {"fresh rows": log.fresh, "fresh rows at rest": log.fresh & still}
+    fits = {kind: fit_line(wire_m[chosen, None], length_m[chosen, None]) for kind, chosen in rows.items()}
+    return {kind: 1e3 * float(fit.held_out_rms[0]) for kind, fit in fits.items()}
+
+
+def sections(data: Path, name: str) -> dict[str, float]:
+    """Section 1's pressures to its length: a straight line, and the response in time."""
+    log, _ = read_asu(data / ASU_LOGS[name])
+    length_m = section_length_m(log)[log.fresh]
+    fit = fit_response(log.time_s[log.fresh], log.pressure_kpa[log.fresh, :3], length_m)
+    return {"line": 1e3 * fit.line_held_out_rms_m, "response": 1e3 * fit.held_out_rms_m}
+
+
+def section_length_m(log: Any) -> np.ndarray:
+    """Length (n,) [m] of the first section: its base to its end."""
+    return np.linalg.norm(log.position_m[:, 1] - log.position_m[:, 0], axis=1)
+
+
+def trunk_blocks(data: Path, seed: int) -> dict[str, float]:
+    """The trunk's log `_1` with a fifth of its blocks of 100 rows held out."""
+    return trunk_errors(data, "1", lambda n: held_out_blocks(n, seed=seed))
+
+
+def _last_fifth(n: int) -> np.ndarray:
+    return np.arange(n) >= 0.8 * n
+
+
+def trunk_errors(
+    data: Path, log: str, held_out: Callable[[int], np.ndarray], history: bool = True
+) -> dict[str, float]:
+    """Errors of the tip on fresh held-out rows; motor angles stand in for springs, a line for the simulator.
+
+    Args:
+        data: folder of the real logs.
+        log: which, "1" or "11".
+        held_out: number of rows -> mask of those held out.
+        history: continue the angles by those before, see `motor_angles`.
+    """
+    trunk, _ = read_trunk(data / TRUNK_LOG.format(log))
+    x = motor_angles(trunk.motor_deg) if history else trunk.motor_deg
+    tip_mm, out = 1e3 * trunk.position_m[:, -1], held_out(len(x))
+    train, test = ~out & trunk.fresh, out & trunk.fresh
+    linear, quadratic, cubic = (polynomial(x, tip_mm, train, degree) for degree in (1, 2, 3))
+    network = linear + correction(fit_network(x[train], (tip_mm - linear)[train], seed=0).network, x)
+    predictions = {"linear": linear, "quadratic": quadratic, "cubic": cubic, "network": network}
+    return {
+        name: float(np.sqrt(np.mean(np.sum((predicted - tip_mm)[test] ** 2, axis=1))))
+        for name, predicted in predictions.items()
+    }
+
+
+def motor_angles(measured_deg: np.ndarray) -> np.ndarray:
+    """Angles (n, 6) [deg] at the time of each row, from this row and those before.
+
+    The motors are read every 5 rows or so and their angles repeated in between, while the tip moves up to
+    2.5 mm a row. So the last two readings are continued by a straight line, taken as one row late.
+    """
+    row = np.arange(len(measured_deg))
+    read = np.flatnonzero(np.r_[True, (np.diff(measured_deg, axis=0) != 0.0).any(axis=1)])
+    last = np.searchsorted(read, row, side="right") - 1
+    now, before = read[last], read[np.maximum(last - 1, 0)]
+    rate = (measured_deg[now] - measured_deg[before]) / np.maximum(now - before, 1)[:, None]
+    return measured_deg[now] + rate * (row - now - 1)[:, None]
+
+
+def polynomial(x: np.ndarray, y: np.ndarray, train: np.ndarray, degree: int) -> np.ndarray:
+    """Least squares on `train` rows by standardised inputs, predicted for all rows."""
+    z = (x - x[train].mean(axis=0)) / x[train].std(axis=0)
+    powers = [
+        list(chosen)
+        for d in range(degree + 1)
+        for chosen in itertools.combinations_with_replacement(range(x.shape[1]), d)
+    ]
+    terms = np.stack([z[:, chosen].prod(axis=1) for chosen in powers], axis=1)
+    return terms @ np.linalg.lstsq(terms[train], y[train], rcond=None)[0]

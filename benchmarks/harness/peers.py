@@ -1,0 +1,89 @@
+"""Virtual environments of the libraries that this project is compared with, made on first use.
+
+Each has the peer, and of what the simulator needs the very versions that run here, so that all contestants
+train on the same environment. One is no peer's: it has JAX's compiler for GPUs, for machines without one.
+They lie beside the checkout's own `.venv`, as `.venv-PEER`. A file in them says what they were made of: one
+that is incomplete, or made of anything else, is made anew.
+
+PyTorch comes as the package index has it, on Linux with gigabytes of CUDA. Where these are not wanted:
+`PIP_EXTRA_INDEX_URL=https://download.pytorch.org/whl/cpu`.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import venv
+from collections.abc import Mapping
+from importlib import metadata
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+MARKER = "complete"
+
+_SB3 = ("stable-baselines3==2.9.2", "torch==2.13.0")
+PINS = {"sbx": ("sbx-rl==0.28.0", *_SB3), "sb3-contrib": ("sb3-contrib==2.9.2", *_SB3)}
+COMPILER = "gpu-compiler"
+# What mjx_softarm, train.runs.evaluate and train.epoch.job import.
+SHARED = (
+    "numpy",
+    "tomli_w",
+    "jax",
+    "jaxlib",
+    "mujoco",
+    "mujoco-mjx",
+    "brax",
+    "flax",
+    "optax",
+    "gymnasium",
+)
+
+
+class PeerError(RuntimeError):
+    """A peer that cannot be had here; the message says which, and why."""
+
+
+def peer_python(name: str, root: Path = ROOT) -> Path:
+    """The interpreter of a peer's virtual environment.
+
+    Args:
+        name: key of `PINS`, or `COMPILER`.
+        root: folder that the environment lies in.
+
+    Raises:
+        PeerError: it could not be made.
+    """
+    home, packages = root / f".venv-{name}", peer_packages(name)
+    python, marker = home / "bin" / "python", home / MARKER
+    content = "\n".join([f"python {sys.version_info.major}.{sys.version_info.minor}", *packages]) + "\n"
+    if marker.exists() and marker.read_text("utf-8") == content:
+        return python
+    large = "" if name == COMPILER else " and PyTorch"
+    print(f"making {home} with {packages[0]}{large}; the first time this takes minutes ...", flush=True)
+    marker.unlink(missing_ok=True)
+    try:
+        _make(home, python, packages)
+    except (OSError, subprocess.CalledProcessError) as error:
+        said = (getattr(error, "stderr", None) or str(error)).strip().splitlines()
+        raise PeerError(f"{name}: no virtual environment in {home}: {said[-1] if said else error}") from error
+    marker.write_text(content, "utf-8")
+    return python
+
+
+def peer_packages(name: str) -> tuple[str, ...]:
+    """What a peer's environment is made of; its jax is for CUDA where the one here is."""
+    if name == COMPILER:
+        return (f"jax-cuda12-plugin=={metadata.version('jax')}", *_pinned({}))
+    cuda = any(distribution.name == "jax-cuda12-plugin" for distribution in metadata.distributions())
+    return (*PINS[name], *_pinned({"jax": "jax[cuda12]"} if cuda else {}))
+
+
+def _pinned(names: Mapping[str, str]) -> list[str]:
+    """What is shared, at the versions that run here, under its own names or these."""
+    return [f"{names.get(package, package)}=={metadata.version(package)}" for package in SHARED]
+
+
+def _make(home: Path, python: Path, packages: tuple[str, ...]) -> None:
+    venv.create(home, with_pip=True, clear=True)
+    install = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check", *packages]
+    subprocess.run(install, check=True, capture_output=True, text=True)

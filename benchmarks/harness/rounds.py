@@ -1,0 +1,176 @@
+"""Programs that take turns, so that whatever else the machine does slows all of them alike.
+
+Each is a process of its own: compilation starts from an empty cache, memory is its own, and it may run in
+another virtual environment. It prepares itself, then does one round of work whenever it is told to.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[2]
+
+ANSWER_S = 1800.0  # a program that says nothing for so long is stopped; compiling takes minutes
+
+Facts = dict[str, Any]
+
+
+class WorkerError(RuntimeError):
+    """A program that stopped before it was told to; the message says which, and the last lines it wrote."""
+
+    @property
+    def reason(self) -> str:
+        """All of it in a line: its first and, if it has more, its last."""
+        lines = str(self).splitlines()
+        return " ".join(lines[:1] + lines[1:][-1:])
+
+
+class Worker:
+    """A program at the other end: one line of JSON once it is ready, and one for each round.
+
+    Args:
+        name: for messages.
+        program: module and arguments, as after `python -m`.
+        python: the interpreter; this one if None.
+        n_cores: how many of this process's cores it may use; all if None.
+
+    Raises:
+        WorkerError: of `start` and `round`: it stopped, or said nothing for `ANSWER_S`.
+    """
+
+    def __init__(
+        self, name: str, program: Sequence[str], python: Path | None = None, n_cores: int | None = None
+    ):
+        self.name, self.facts = name, {}
+        self._command = [str(python or sys.executable), "-m", *program]
+        self._n_cores = n_cores
+        self._process: Any = None
+
+    def start(self) -> None:
+        """Start it and wait until it is prepared; what it tells of that is in `facts`."""
+        paths = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
+        environment = {**os.environ, "TF_CPP_MIN_LOG_LEVEL": "3", "PYTHONPATH": os.pathsep.join(paths)}
+        with _few_cores(self._n_cores):
+            self._said = tempfile.TemporaryFile("w+")  # noqa: SIM115  (closed with the worker)
+            self._process = subprocess.Popen(
+                self._command,
+                env=environment,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=self._said,
+                text=True,
+            )
+        self.facts = self._answer()
+
+    def round(self) -> Facts:
+        """What one round gave."""
+        with contextlib.suppress(BrokenPipeError):  # why it stopped is told below
+            self._process.stdin.write("\n")
+            self._process.stdin.flush()
+        return self._answer()
+
+    def close(self) -> None:
+        """Let it end, or make it; nothing happens to one that is not running."""
+        if self._process is None:
+            return
+        with contextlib.suppress(BrokenPipeError):
+            self._process.stdin.close()
+        try:
+            self._process.wait(timeout=30)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._process.stdout.close()
+        self._said.close()
+        self._process = None
+
+    def _answer(self) -> Facts:
+        start, timer = time.perf_counter(), threading.Timer(ANSWER_S, self._process.kill)
+        timer.start()
+        line = self._process.stdout.readline()
+        timer.cancel()
+        if not line:
+            status = self._process.wait()
+            late = f" after {ANSWER_S:g} s in silence" if time.perf_counter() - start > ANSWER_S else ""
+            self._said.seek(0)
+            last = "\n".join(self._said.read().splitlines()[-15:])
+            raise WorkerError(f"{self.name}: stopped with status {status}{late}, expected a result:\n{last}")
+        return json.loads(line)
+
+
+@contextlib.contextmanager
+def working(*workers: Worker) -> Iterator[None]:
+    """Workers that are started one after the other, and closed at the end."""
+    try:
+        for worker in workers:
+            print(f"starting: {worker.name}", flush=True)
+            worker.start()
+        yield
+    finally:
+        for worker in workers:
+            worker.close()
+
+
+@contextlib.contextmanager
+def _few_cores(n: int | None) -> Iterator[None]:
+    """Keep what is started inside to the first n cores."""
+    if n is None:
+        yield
+        return
+    if not hasattr(os, "sched_setaffinity"):
+        raise WorkerError(f"programs cannot be kept to {n} cores on {sys.platform}")
+    cores = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, sorted(cores)[:n])
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, cores)
+
+
+def take_turns(workers: Sequence[Worker], n_rounds: int) -> tuple[dict[str, list[Facts]], dict[str, str]]:
+    """Start workers, let them do rounds, one of each in turn, and close them.
+
+    Returns:
+        The rounds of each worker that did them all, and of each that failed why, by their names.
+    """
+    rounds: dict[str, list[Facts]] = {worker.name: [] for worker in workers}
+    failed: dict[str, str] = {}
+    with contextlib.ExitStack() as stack:
+        for turn in range(-1, n_rounds):
+            for worker in (worker for worker in workers if worker.name not in failed):
+                try:
+                    if turn < 0:
+                        print(f"starting: {worker.name}", flush=True)
+                        stack.callback(worker.close)
+                        worker.start()
+                    else:
+                        rounds[worker.name].append(worker.round())
+                except WorkerError as error:
+                    print(f"failed: {error}", flush=True)
+                    failed[worker.name] = error.reason
+                    worker.close()
+    return {name: told for name, told in rounds.items() if name not in failed}, failed
+
+
+def serve(prepare: Callable[[], tuple[Facts, Callable[[], Facts]]]) -> None:
+    """The worker's own end.
+
+    Args:
+        prepare: gives what is to be told at once, and the function that does a round.
+    """
+    channel = os.fdopen(os.dup(1), "w", buffering=1)
+    os.dup2(2, 1)  # what libraries print is no result
+    facts, work = prepare()
+    channel.write(json.dumps(facts) + "\n")
+    for _ in sys.stdin:
+        channel.write(json.dumps(work()) + "\n")

@@ -1,0 +1,109 @@
+"""Gradient descent on the springs: the solver that the policy is compared with. NumPy only.
+
+From the springs as they are, their lengths follow the slope of the squared pose error downhill, the pose
+being what estimator and sim-to-real network make of the springs. A degree weighs as much as a millimetre:
+with the reward's weights, which make it five times less, the search takes far longer to turn the tip. A step
+that does not bring the error down far enough is halved. Lengths stay within those that the policy may ask
+for. Nothing in it knows of pressures, so nothing keeps it from shapes that the pump cannot make; and where
+it ends depends on where it began.
+
+    Controller.of(policy, gradient_descent(policy))
+
+It takes the place of the actor in the very same loop, though a search lasts longer than a tick of a real arm.
+
+Source: the solver of Meng et al. 2023 as the paper describes it where it states the problem of saturation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from mjx_softarm.deploy.loop import Plan
+from mjx_softarm.policy.file import Policy
+from mjx_softarm.sensing.estimator import estimate
+from mjx_softarm.sensing.pose import pose_error
+from mjx_softarm.sensing.s2r import correct
+from mjx_softarm.sensing.sensors import length_from_frequency
+
+MAX_STEPS = 200
+FIRST_STEP = 1e-8  # [(m / mm)^2]; that the next search begins with is twice the last one's
+LEAST_STEP = 1e-15
+SUFFICIENT = 1e-4  # share of the decrease that the slope promises; Armijo's condition
+CLOSE = 0.05  # [mm, deg] error that counts as none
+DIFFERENCE_M = 1e-5
+
+Residual = Callable[[np.ndarray], np.ndarray]  # springs (..., n) [m] -> error (..., 6) [mm, deg]
+
+
+def gradient_descent(policy: Policy) -> Plan:
+    """A way to find references that takes the place of a policy's actor, for `Controller.of`."""
+    low_m, high_m = length_from_frequency(policy.frequency_hz.T, policy.sensor).length_m  # (n,) each
+    pose_of = forward_kinematics(policy)
+
+    def plan(_pose: np.ndarray, goal: np.ndarray, spring_m: np.ndarray) -> np.ndarray:
+        def residual(x: np.ndarray) -> np.ndarray:
+            return pose_error(pose_of(x), goal)
+
+        return descend(residual, spring_m, low_m, high_m)
+
+    return plan
+
+
+def forward_kinematics(policy: Policy) -> Callable[[np.ndarray], np.ndarray]:
+    """Springs (..., n) [m] -> pose (..., 6) [mm, deg] as the loop believes it, in double precision."""
+    estimator, s2r = _double(policy.estimator), _double(policy.s2r)
+
+    def pose_of(spring_m: np.ndarray) -> np.ndarray:
+        pose = estimate(estimator, spring_m)
+        return pose if s2r is None else correct(s2r, pose, spring_m)
+
+    return pose_of
+
+
+def descend(residual: Residual, spring_m: np.ndarray, low_m: np.ndarray, high_m: np.ndarray) -> np.ndarray:
+    """Springs (n,) [m] between limits with a locally least squared residual.
+
+    Args:
+        residual: to be made small.
+        spring_m (n,) [m]: where to begin; what is beyond the limits is brought to them.
+        low_m, high_m (n,) [m]: the limits.
+    """
+    x = np.clip(np.asarray(spring_m, float), low_m, high_m)
+    cost, step = _cost(residual, x), FIRST_STEP
+    for _ in range(MAX_STEPS):
+        if cost < 0.5 * CLOSE**2:
+            break
+        slope = gradient(residual, x)
+        trial, trial_cost = x, np.inf
+        while step > LEAST_STEP:
+            trial = np.clip(x - step * slope, low_m, high_m)
+            trial_cost = _cost(residual, trial)
+            if trial_cost <= cost - SUFFICIENT * slope @ (x - trial):
+                break
+            step *= 0.5
+        if step <= LEAST_STEP or np.array_equal(trial, x):
+            break
+        x, cost, step = trial, trial_cost, 2.0 * step
+    return x
+
+
+def gradient(residual: Residual, spring_m: np.ndarray) -> np.ndarray:
+    """Slope (n,) [1/m] of half the squared residual, its Jacobian by central differences."""
+    offset_m = DIFFERENCE_M * np.eye(len(spring_m))
+    ahead, behind = residual(spring_m + offset_m), residual(spring_m - offset_m)  # (n, 6) each
+    return (ahead - behind) @ residual(spring_m) / (2.0 * DIFFERENCE_M)
+
+
+def _cost(residual: Residual, x: np.ndarray) -> float:
+    return 0.5 * float(np.sum(residual(x) ** 2))
+
+
+def _double(network: Any) -> Any:
+    """Networks (named) tuples of float32 arrays -> the same in float64; None stays."""
+    if isinstance(network, tuple):
+        parts = [_double(part) for part in network]
+        return type(network)(*parts) if hasattr(network, "_fields") else tuple(parts)
+    return None if network is None else np.asarray(network, np.float64)

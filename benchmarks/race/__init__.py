@@ -1,0 +1,1 @@
+"""Time to a tip error, against the peers."""

@@ -1,0 +1,276 @@
+"""The contestants of the race: programs that learn to reach, and tell how well after each stretch of it.
+
+    python -m benchmarks.race.contestants NAME SEED STRETCH_S N_GOALS
+
+NAME is one of `CONTESTANTS`. Ours is the loop of `python -m train reach` without its files, with the preset
+quick or paper. The peers train on the project's Gymnasium environment as their users would, through `learn`:
+with the defaults of their algorithm and one arm, or as ours-quick does wherever they have a knob for it. They
+have none for the temperature's own learning rate, which is that of all else. Our learning rate falls along a
+half cosine over the preset's env steps, which ends our training; theirs does so too, and begins anew.
+
+Hindsight: ours exchanges goals for the pose reached and for such near it, and actions for what was sensed;
+`benchmarks.race.hindsight` has the peers' own, for as large a share of a batch. The plain ones go without
+any, the rest is as with it.
+
+A clock counts from the program's start; it stands while the policy is evaluated, and while PyTorch's threads
+are chosen. Start-up is over once the peers have done a first round of updates, and ours has compiled.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import sys
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from benchmarks.harness.rounds import Facts, serve
+from benchmarks.speed.learner_contestants import choose_threads, filled_model
+
+START = time.perf_counter()
+
+CHUNK = 512  # env steps in a call of `learn`
+
+
+class Contestant(NamedTuple):
+    """A training under way."""
+
+    train: Callable[[], None]  # a little further
+    policy: Callable[[np.ndarray], np.ndarray]  # observations (n, 18) -> its best actions (n, 9)
+    done: Callable[[], tuple[int, int]]  # env steps and updates so far
+    limit: float = math.inf  # env steps that it ends after
+    uncounted_s: float = 0.0  # of its start-up
+
+
+class HeldOut:
+    """The protocol of `train.runs.evaluate.Evaluator` on the workspace, for policies of any library."""
+
+    def __init__(self, env: Any, n_goals: int):
+        import jax
+
+        from mjx_softarm._support import xla
+        from mjx_softarm.mechanics.workspace import HELD_OUT_SEED
+
+        goals = env.sample_pool(n_goals, HELD_OUT_SEED).pose
+
+        def start(key, goal):
+            state = env.reset(key)
+            arm = state.pipeline_state._replace(goal=goal)
+            return state.replace(pipeline_state=arm, obs=env.observe(arm.pose, goal))
+
+        keys = jax.random.split(jax.random.PRNGKey(HELD_OUT_SEED), n_goals)
+        self._start = xla.jit(jax.vmap(start), env.uses_mjx)(keys, goals)
+        self._step = xla.jit(jax.vmap(env.step), env.uses_mjx)
+
+    def tip_error_mm(self, policy: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        """Of each goal (n_goals,), after the last action."""
+        from train.runs.evaluate import N_ACTIONS
+
+        state = self._start
+        for _ in range(N_ACTIONS):
+            state = self._step(state, policy(np.array(state.obs)))
+        arm = state.pipeline_state
+        return np.linalg.norm(np.asarray(arm.pose - arm.goal)[:, :3], axis=-1)
+
+
+def our_config(name: str) -> Any:
+    """The `TrainConfig` of ours-quick, ours-plain or ours-paper."""
+    from train.config import PRESETS
+
+    config = PRESETS["paper" if name == "ours-paper" else "quick"]
+    if name == "ours-plain":
+        without = dataclasses.replace(config.hindsight, reached_share=0.0, near_share=0.0)
+        config = dataclasses.replace(config, hindsight=without)
+    return config
+
+
+def ours(name: str, seed: int) -> Contestant:
+    """One of ours, compiled."""
+    import jax
+
+    from mjx_softarm.env import ReachEnv
+    from train.epoch.job import Job
+
+    config = dataclasses.replace(our_config(name), seed=seed)
+    job = Job(config, ReachEnv(config=config.env))
+    state = job.start(lambda: job.init(jax.random.PRNGKey(seed)))
+    act = jax.jit(job.agent.act_mode)
+
+    def train() -> None:
+        nonlocal state
+        state, _ = jax.block_until_ready(job.epoch(state))
+
+    return Contestant(
+        train,
+        policy=lambda obs: np.asarray(act(state.agent.mean_actor_params, obs)),
+        done=lambda: (int(state.n_env_steps), int(state.agent.step)),
+        limit=config.total_env_steps,
+    )
+
+
+def peer(library: str, variant: str, seed: int) -> Contestant:
+    """TQC of SBX or Stable-Baselines3-contrib, after its first round of updates.
+
+    Args:
+        library: key of `benchmarks.harness.peers.PINS`.
+        variant: hindsight, plain (tuned likewise, without it) or defaults.
+        seed: of training.
+    """
+    from stable_baselines3.common.logger import Logger  # pyright: ignore[reportMissingImports]
+
+    from mjx_softarm.env.gym import SoftArmVectorEnv, as_sb3
+    from train.config import PRESETS
+
+    config, algorithm = PRESETS["quick"], _algorithm(library)
+    start = time.perf_counter()
+    if library == "sb3-contrib":
+        throwaway = filled_model(algorithm)
+        batch_size = throwaway.batch_size if variant == "defaults" else config.batch_size
+        choose_threads(lambda: throwaway.train(gradient_steps=32, batch_size=batch_size))
+    uncounted_s = time.perf_counter() - start
+    n_arms = 1 if variant == "defaults" else config.n_arms
+    arms = SoftArmVectorEnv(n_arms, config.episode_length, config=config.env)
+    envs, settings, kind, seen = as_sb3(arms), {}, "MlpPolicy", lambda obs: obs
+    n_steps = 0
+    if variant != "defaults":
+        envs, settings = scaled(envs, config.tqc.reward_scale), tuned_settings(config, lambda: n_steps)
+    if variant == "hindsight":
+        from benchmarks.race.hindsight import GoalEnvs, HindsightBuffer, with_goals
+
+        envs, kind, seen = GoalEnvs(envs), "MultiInputPolicy", with_goals
+        settings["replay_buffer_class"] = HindsightBuffer
+        settings["replay_buffer_kwargs"] = {
+            "arm": arms.env,
+            "share": hindsight_share(config),
+            "reward_scale": config.tqc.reward_scale,
+        }
+    model = algorithm(kind, envs, seed=seed, **settings)
+    model.set_logger(Logger(None, []))  # or each call of `learn` would make a folder
+
+    def learn(n: int, **more: Any) -> None:
+        nonlocal n_steps
+        model.learn(n, **more)
+        n_steps = model.num_timesteps
+
+    learn(model.learning_starts + n_arms)
+    return Contestant(
+        train=lambda: learn(CHUNK, reset_num_timesteps=False),
+        policy=lambda obs: model.predict(seen(obs), deterministic=True)[0],
+        done=lambda: (n_steps, model._n_updates),
+        uncounted_s=uncounted_s,
+    )
+
+
+def hindsight_share(config: Any) -> float:
+    """Share of a batch that gets another goal, with a `TrainConfig`."""
+    return config.hindsight.reached_share + config.hindsight.near_share
+
+
+def tuned_settings(config: Any, n_steps: Callable[[], int]) -> dict[str, Any]:
+    """Our settings by the names that Stable-Baselines3's TQC and SBX's have for them.
+
+    Args:
+        config: a `TrainConfig`.
+        n_steps: env steps so far.
+    """
+    tqc = config.tqc
+    low = tqc.learning_rate_end
+
+    def learning_rate(_: float) -> float:
+        share = (n_steps() % config.total_env_steps) / config.total_env_steps
+        return tqc.learning_rate * (low + (1 - low) * 0.5 * (1 + math.cos(math.pi * share)))
+
+    return {
+        "learning_rate": learning_rate,
+        "buffer_size": config.replay_capacity,
+        "learning_starts": config.warmup_env_steps,
+        "batch_size": config.batch_size,
+        "tau": tqc.tau,
+        "gamma": tqc.gamma,
+        "train_freq": 1,
+        "gradient_steps": config.n_updates_per_vector_step,
+        "ent_coef": f"auto_{tqc.initial_alpha}",
+        "target_entropy": tqc.target_entropy,
+    }
+
+
+def scaled(envs: Any, factor: float) -> Any:
+    """A Stable-Baselines3 vector environment with its rewards times a factor."""
+    from stable_baselines3.common.vec_env import VecEnvWrapper  # pyright: ignore[reportMissingImports]
+
+    class Scaled(VecEnvWrapper):
+        def reset(self):
+            return self.venv.reset()
+
+        def step_wait(self):
+            obs, rewards, dones, infos = self.venv.step_wait()
+            return obs, factor * rewards, dones, infos
+
+    return Scaled(envs)
+
+
+def _algorithm(library: str) -> Any:
+    if library == "sbx":
+        from sbx import TQC  # pyright: ignore[reportMissingImports]
+    else:
+        from sb3_contrib import TQC  # pyright: ignore[reportMissingImports]
+    return TQC
+
+
+CONTESTANTS: dict[str, Callable[[int], Contestant]] = {  # the most telling first
+    "ours-quick": lambda seed: ours("ours-quick", seed),
+    "sbx-hindsight": lambda seed: peer("sbx", "hindsight", seed),
+    "sb3-contrib-hindsight": lambda seed: peer("sb3-contrib", "hindsight", seed),
+    "sbx-plain": lambda seed: peer("sbx", "plain", seed),
+    "sb3-contrib-plain": lambda seed: peer("sb3-contrib", "plain", seed),
+    "ours-plain": lambda seed: ours("ours-plain", seed),
+    "sbx-defaults": lambda seed: peer("sbx", "defaults", seed),
+    "sb3-contrib-defaults": lambda seed: peer("sb3-contrib", "defaults", seed),
+    "ours-paper": lambda seed: ours("ours-paper", seed),
+}
+
+
+def prepare(
+    contestant: Contestant, start_up_s: float, stretch_s: float, n_goals: int
+) -> tuple[Facts, Callable[[], Facts]]:
+    """A contestant as `benchmarks.harness.rounds` has it: each round is a stretch of training, and an evaluation."""
+    from mjx_softarm.env import ReachEnv
+
+    held_out = HeldOut(ReachEnv(), n_goals)
+    held_out.tip_error_mm(contestant.policy)  # compiles
+    trained_s = 0.0
+
+    def work() -> Facts:
+        nonlocal trained_s
+        start = time.perf_counter()
+        while True:
+            contestant.train()
+            n_env_steps, n_updates = contestant.done()
+            ended, passed_s = n_env_steps >= contestant.limit, time.perf_counter() - start
+            if ended or passed_s >= stretch_s:
+                break
+        trained_s += passed_s
+        median_mm = float(np.median(held_out.tip_error_mm(contestant.policy)))
+        return {
+            "wall_s": start_up_s + trained_s,
+            "trained_s": trained_s,
+            "env_steps": n_env_steps,
+            "updates": n_updates,
+            "median_mm": median_mm if math.isfinite(median_mm) else None,
+            "ended": ended,
+        }
+
+    return {"start_up_s": start_up_s}, work
+
+
+def _prepare(name: str, seed: str, stretch_s: str, n_goals: str) -> tuple[Facts, Callable[[], Facts]]:
+    contestant = CONTESTANTS[name](int(seed))
+    start_up_s = time.perf_counter() - START - contestant.uncounted_s
+    return prepare(contestant, start_up_s, float(stretch_s), int(n_goals))
+
+
+if __name__ == "__main__":
+    serve(lambda: _prepare(*sys.argv[1:]))

@@ -1,0 +1,112 @@
+"""Hindsight for the peers: the arms as they want them, and their own replay of hindsight on it.
+
+Stable-Baselines3's `HerReplayBuffer` wants observations as a dictionary, and chooses which transitions get
+a goal that was reached later in their episode. Of what follows from a goal it asks the environment for the
+reward alone; what else was observed, and whether the episode ended, it leaves as stored. Here all of that is
+told anew. What it does not know is an exchange of actions: a transition that saturated, as nearly all of
+the random ones do, costs as much with its new goal as with its own.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import jax
+import numpy as np
+import torch  # pyright: ignore[reportMissingImports]
+from stable_baselines3 import HerReplayBuffer  # pyright: ignore[reportMissingImports]
+from stable_baselines3.common.buffers import (  # pyright: ignore[reportMissingImports]
+    DictReplayBufferSamples,
+)
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper  # pyright: ignore[reportMissingImports]
+
+from mjx_softarm.env import ReachEnv
+from mjx_softarm.mdp import observation as obs
+from mjx_softarm.mdp import rewards
+
+PARTS = {"achieved_goal": slice(0, 6), "desired_goal": slice(6, 12), "observation": slice(12, 18)}
+
+
+def with_goals(flat: np.ndarray) -> dict[str, np.ndarray]:
+    """Observations (..., 18) as a dictionary: scaled pose, scaled goal, and scaled error, (..., 6) each."""
+    return {name: flat[..., part] for name, part in PARTS.items()}
+
+
+class GoalEnvs(VecEnvWrapper):
+    """A vector environment of arms whose observations are dictionaries."""
+
+    def __init__(self, venv: VecEnv):
+        flat = venv.observation_space
+        boxes = [
+            (name, gymnasium.spaces.Box(flat.low[part], flat.high[part])) for name, part in PARTS.items()
+        ]
+        super().__init__(venv, gymnasium.spaces.Dict(boxes))
+
+    def reset(self) -> dict[str, np.ndarray]:
+        """Observations of all arms."""
+        return with_goals(self.venv.reset())
+
+    def step_wait(self) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        """As that of the environment within, the last observation of an episode a dictionary, too."""
+        flat, reward, done, infos = self.venv.step_wait()
+        for info in infos:
+            if "terminal_observation" in info:
+                info["terminal_observation"] = with_goals(info["terminal_observation"])
+        return with_goals(flat), reward, done, infos
+
+
+class HindsightBuffer(HerReplayBuffer):
+    """`HerReplayBuffer` for arms at rest after each action, away from walls.
+
+    Args:
+        arm: whose scales and rewards it is.
+        share: of a batch that gets another goal.
+        reward_scale: on every reward that is stored.
+        settings: those of `HerReplayBuffer`.
+    """
+
+    def __init__(self, *positional: Any, arm: ReachEnv, share: float, reward_scale: float, **settings: Any):
+        super().__init__(*positional, **settings)
+        if arm.config.clearance_cost_per_mm:
+            raise ValueError("HindsightBuffer: expected an arm that is not charged for walls")
+        self.her_ratio = share
+        self._scale, self._config, self._reward_scale = arm.scale, arm.config.reward, reward_scale
+
+    def sample(self, batch_size: int, env: Any = None) -> DictReplayBufferSamples:
+        """Transitions in random order: SBX cuts what it draws at once into several batches."""
+        drawn, order = super().sample(batch_size, env), torch.randperm(batch_size)
+        return jax.tree.map(lambda part: part[order], drawn)
+
+    def _get_virtual_samples(
+        self, batch_indices: np.ndarray, env_indices: np.ndarray, env: Any = None
+    ) -> DictReplayBufferSamples:
+        """Transitions whose goals were reached later."""
+        where = batch_indices, env_indices
+        before, after, goals = (
+            poses * self._scale.scale + self._scale.centre
+            for poses in (
+                self.observations["achieved_goal"][where],
+                self.next_observations["achieved_goal"][where],
+                self._sample_goals(*where),
+            )
+        )
+        cost = self._reward_scale * self._config.saturation_cost
+        reward, reached, _ = rewards.reward(
+            after,
+            goals,
+            n_steps=(batch_indices - self.ep_start[where]) % self.buffer_size + 1,
+            saturated=np.isclose(self.rewards[where], -cost),
+            config=self._config,
+        )
+        return DictReplayBufferSamples(
+            observations=self._observed(before, goals),
+            actions=self.to_torch(self.actions[where]),
+            next_observations=self._observed(after, goals),
+            dones=self.to_torch(reached[:, None].astype(np.float32)),
+            rewards=self.to_torch((self._reward_scale * reward[:, None]).astype(np.float32)),
+        )
+
+    def _observed(self, poses: np.ndarray, goals: np.ndarray) -> dict[str, Any]:
+        flat = obs.observe(poses, goals, self._scale, self._config)
+        return {name: self.to_torch(part) for name, part in with_goals(flat).items()}

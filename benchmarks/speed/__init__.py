@@ -1,0 +1,1 @@
+"""Speed: settling, throughput, learner, kernels."""

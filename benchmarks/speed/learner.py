@@ -1,0 +1,106 @@
+"""Gradient updates per second over batch sizes, against the peers' learners in one run on the same machine.
+
+Stable-Baselines3-contrib's TQC and SBX's (Stable-Baselines Jax) run in virtual environments of their own,
+brax's SAC in this one; `benchmarks.speed.learner_contestants` says what each does. At every size each has a process
+of its own; all prepare themselves, then rounds alternate between them. A rate is the median of the rounds,
+and ratios are those of the medians.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.harness.peers import PINS, PeerError, peer_python
+from benchmarks.harness.rounds import Worker, take_turns
+
+CONTESTANTS = {
+    "ours": "ours",
+    "sb3-contrib": "sb3-contrib TQC",
+    "sbx": "SBX TQC",
+    "brax": "brax SAC",
+}
+BATCH_SIZES = (256, 1024, 4096, 16_384, 32_768)
+N_ROUNDS = 5
+N_FIRST = 256  # updates per round at the smallest batch
+ROUND_S = 1.5  # that a round at any other is to take
+SLOW_S = 15.0  # an update that is expected to take longer is left out
+
+
+def measure() -> dict[str, Any]:
+    """Updates/s at each batch size, ratios, and what was left out."""
+    left_out: dict[str, str] = {}
+    pythons = _pythons(left_out)
+    rates: dict[int, dict[str, list[float]]] = {}
+    rows_per_s = dict.fromkeys(pythons, BATCH_SIZES[0] * N_FIRST / ROUND_S)
+    for batch_size in BATCH_SIZES:
+        workers = {}
+        for name in [name for name in pythons if name not in left_out]:
+            update_s = batch_size / rows_per_s[name]
+            if update_s > SLOW_S:
+                left_out[name] = (
+                    f"from batch {batch_size:,} on: an update is expected to take {update_s:.0f} s"
+                )
+            else:
+                workers[name] = _worker(name, pythons[name], batch_size, updates_per_round(update_s))
+        print(f"batch {batch_size:,}: {', '.join(workers)} ...", flush=True)
+        rates[batch_size] = _alternate(workers, left_out, f"from batch {batch_size:,} on")
+        rows_per_s |= {name: batch_size * float(np.median(x)) for name, x in rates[batch_size].items()}
+    return {
+        "updates_per_s": table(rates),
+        "left_out": [{"contestant": CONTESTANTS[name], "why": why} for name, why in left_out.items()],
+        "rounds": [{"batch": size, **rounds} for size, rounds in rates.items()],
+    }
+
+
+def updates_per_round(update_s: float) -> int:
+    """A power of two that takes about `ROUND_S` where an update takes so long [s]."""
+    return 2 ** max(0, round(np.log2(ROUND_S / update_s)))
+
+
+def table(rates: Mapping[int, Mapping[str, Sequence[float]]]) -> list[dict[str, Any]]:
+    """A row for each batch size: medians, and how many times as fast ours is."""
+    rows = []
+    for batch_size, rounds in rates.items():
+        medians = {name: float(np.median(values)) for name, values in rounds.items()}
+        row: dict[str, Any] = {"batch": batch_size}
+        row |= {CONTESTANTS[name]: _rounded(value) for name, value in medians.items()}
+        if "ours" in medians:
+            row |= {
+                f"ours / {name}": _rounded(medians["ours"] / value)
+                for name, value in medians.items()
+                if name != "ours"
+            }
+        rows.append(row)
+    return rows
+
+
+def _pythons(left_out: dict[str, str]) -> dict[str, Path | None]:
+    """The interpreter of each contestant that there is; None is this one."""
+    pythons: dict[str, Path | None] = {}
+    for name in CONTESTANTS:
+        try:
+            pythons[name] = peer_python(name) if name in PINS else None
+        except PeerError as error:
+            left_out[name] = str(error)
+    return pythons
+
+
+def _worker(name: str, python: Path | None, batch_size: int, n_updates: int) -> Worker:
+    return Worker(
+        name, ["benchmarks.speed.learner_contestants", name, str(batch_size), str(n_updates)], python
+    )
+
+
+def _alternate(workers: Mapping[str, Worker], left_out: dict[str, str], where: str) -> dict[str, list[float]]:
+    """Rates of the rounds by name; one that fails is left out from then on."""
+    rounds, failed = take_turns(list(workers.values()), N_ROUNDS)
+    left_out |= {name: f"{where}: {why}" for name, why in failed.items()}
+    return {name: [facts["updates_per_s"] for facts in told] for name, told in rounds.items()}
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.3g}")

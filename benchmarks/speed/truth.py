@@ -1,0 +1,96 @@
+"""The true equilibrium, what the settled arm is off it, and references that saturate more or fewer chambers.
+
+The truth is the solution in double precision; `tests/mechanics/test_settle.py` holds it against C MuJoCo.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh
+
+from mjx_softarm._support import xla
+from mjx_softarm._support.mjx import mjx
+from mjx_softarm.env.vector import over_arms
+from mjx_softarm.mechanics import settle as solver
+from mjx_softarm.mechanics.kinematics import chain_frames, mjx_frames
+from mjx_softarm.mechanics.mjcf import build_model
+from mjx_softarm.mechanics.statics import ArmParams
+from mjx_softarm.spec import ArmSpec
+
+QUANTILES = {"median_mm": 0.5, "p95_mm": 0.95, "max_mm": 1.0}
+ERROR = (*QUANTILES, "without_truth")  # what a table has of it
+TOLD = ("reference_m", "tip_mm")  # what a program tells of its arms at rest
+
+
+class Truth(NamedTuple):
+    """Arms truly at rest."""
+
+    tip_mm: np.ndarray  # (n, 3)
+    settled: np.ndarray  # (n,) bool: the others' solution did not settle, so that their rest is not known
+    share_at_limit: float  # of the chambers
+
+
+def settle_function(
+    spec: ArmSpec, engine: str = "chain", dtype: Any = np.float32, mesh: Mesh | None = None
+) -> Callable:
+    """A jitted function: references (n, n_chambers) -> `Settled`, spread over the devices of a mesh."""
+    params = jax.tree.map(jnp.asarray, ArmParams.from_spec(spec, dtype))
+    if engine == "mjx":
+        kinematics = functools.partial(mjx_frames, mjx.put_model(build_model(spec)))
+    else:
+        kinematics = functools.partial(chain_frames, link_length_m=params.link_length_m)
+    return xla.jit(over_arms(functools.partial(solver.settle, kinematics, params), mesh), engine == "mjx")
+
+
+@functools.lru_cache(maxsize=8)
+def _solver(spec: ArmSpec) -> Callable:
+    return settle_function(spec, dtype=np.float64)
+
+
+def true_rest(spec: ArmSpec, reference_m: np.ndarray) -> Truth:
+    """Where arms truly rest under the law, at references (n, n_chambers) [m]."""
+    with jax.enable_x64(True):
+        found = jax.device_get(_solver(spec)(jnp.asarray(reference_m, np.float64)))
+    return Truth(1e3 * found.tip_position_m, found.settled, float(np.mean(found.at_limit[found.settled])))
+
+
+def error_figures(tip_mm: np.ndarray, truth: Truth) -> dict[str, float]:
+    """Median, 95 % and largest distance of tips (n, 3) [mm] from where they truly are.
+
+    Arms without a truth are in none of these; `without_truth` is their number.
+    """
+    error = np.linalg.norm(np.asarray(tip_mm, np.float64) - truth.tip_mm, axis=-1)[truth.settled]
+    errors = {name: float(f"{np.quantile(error, share):.3g}") for name, share in QUANTILES.items()}
+    return {**errors, "without_truth": int(np.sum(~truth.settled))}
+
+
+def told_error(spec: ArmSpec, told: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """Error of the tips that programs told of in rounds, those that told none left out."""
+    told = [facts for facts in told if "tip_mm" in facts]
+    if not told:
+        return {}
+    reference_m, tip_mm = (np.concatenate([facts[name] for facts in told]) for name in TOLD)
+    return error_figures(tip_mm, true_rest(spec, reference_m))
+
+
+def random_references(spec: ArmSpec, n: int, reach: float = 1.0, seed: int = 0) -> np.ndarray:
+    """Spring lengths (n, n_chambers) [m] that saturate the more chambers the further they reach.
+
+    Args:
+        spec: the arm.
+        n: how many.
+        reach: 1 draws uniformly from all lengths that may be commanded, 0.5 from the range half as wide about
+            the length at rest; the share of chambers at a limit follows and is to be measured.
+        seed: of the draw.
+    """
+    springs = spec.springs
+    length = np.random.default_rng(seed).uniform(
+        springs.length_min_m, springs.length_max_m, (n, spec.n_chambers)
+    )
+    return springs.rest_length_m + reach * (length - springs.rest_length_m)

@@ -1,0 +1,1 @@
+"""Fits: springs, chambers, damping and the sim-to-real network."""

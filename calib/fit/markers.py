@@ -1,0 +1,149 @@
+"""Length limits of the chambers from markers along the arm, at the poses in which it bends most.
+
+The markers sit at one place of every ring, evenly spaced from the base to the tip, the last at the tip's
+plate. Three polynomials of fourth order X(s), Y(s), Z(s) run through them and through that place of the base.
+The rings turn with the curve without twisting about it, so any other place of the rings, such as where a
+chamber passes, has a curve of its own beside it; a chamber's length is that of its section's part.
+
+A polynomial of fourth order is too smooth for three sections that bend apart, so the lengths are coarse: on
+simulated arms without noise they are off by 5 mm RMS with markers in the middle of the rings, by 6 mm at
+the chambers and by 11 mm at the springs, and by tens of mm at worst. So here they only check: what a chamber
+can do follows from its pressure limits, stiffness and area; what a spring may be asked for, from what it did.
+
+Source: Simulation Calibration and Validation in Meng et al.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from calib.errors import FitError
+from calib.read.rests import Rests
+from mjx_softarm.mechanics.statics import ArmParams
+from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
+
+ORDER = 4
+N_SAMPLES = 50  # of a curve, per section
+N_POSES = 10  # that bend most
+MAX_OFF_PLATE_M = 0.01
+MIN_MARKERS = 5
+
+
+class MarkerLimits(NamedTuple):
+    """Lengths of the chambers at the poses in which the arm bends most."""
+
+    pose: np.ndarray  # (n,) which poses, of the greatest bending first
+    bending_deg: np.ndarray  # (n,) between the tip's plate and the base
+    marker_site_m: np.ndarray  # (2,) place of the markers in the rings, x and y
+    length_m: np.ndarray  # (n, n_chambers) from the curves
+    simulated_m: np.ndarray  # (n, n_chambers) of the calibrated arm at the same pressures
+    residual_mm: np.ndarray  # (n,) RMS distance of the markers to the curve
+    length_min_m: float
+    length_max_m: float
+
+
+def marker_limits(rests: Rests, simulated_m: np.ndarray, spec: ArmSpec) -> MarkerLimits:
+    """Length limits from the poses that bend most.
+
+    Args:
+        rests: poses, with markers.
+        simulated_m (n, n_chambers) [m]: chamber lengths of the calibrated arm at all of the poses.
+        spec: the arm.
+
+    Raises:
+        FitError: fewer than five markers, no pose that has them, or the last is not at the tip's plate.
+    """
+    n_markers = rests.marker_m.shape[1]
+    if n_markers < MIN_MARKERS or n_markers % spec.structure.n_sections:
+        raise FitError(
+            f"markers: got {n_markers}, expected {MIN_MARKERS} or more, as many in each of "
+            f"{spec.structure.n_sections} sections"
+        )
+    seen = np.flatnonzero(np.isfinite(rests.marker_m).all(axis=(1, 2)))
+    if len(seen) == 0:
+        raise FitError("markers: no pose at rest has them, expected one or more")
+    site_m = _marker_site(rests.take(seen))
+    bending_deg = np.degrees(np.arccos(np.clip(rests.tip_rotation[seen, 2, 2], -1.0, 1.0)))
+    order = np.argsort(-bending_deg)[:N_POSES]
+    pose = seen[order]
+    curves = [fit_curve(rests.marker_m[k], site_m) for k in pose]
+    length_m = np.stack([chamber_lengths(curve, site_m, spec) for curve, _ in curves])
+    return MarkerLimits(
+        pose=pose,
+        bending_deg=bending_deg[order],
+        marker_site_m=site_m,
+        length_m=length_m,
+        simulated_m=simulated_m[pose],
+        residual_mm=1e3 * np.array([np.sqrt(np.mean(np.sum(left**2, axis=1))) for _, left in curves]),
+        length_min_m=float(length_m.min()),
+        length_max_m=float(length_m.max()),
+    )
+
+
+def fit_curve(marker_m: np.ndarray, site_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Polynomials of fourth order through the markers of one pose.
+
+    Args:
+        marker_m (n_markers, 3) [m]: evenly spaced along the arm, the last at the tip.
+        site_m (2,) [m]: where the markers sit in the rings, and so where the curve begins in the base.
+
+    Returns:
+        Coefficients (5, 3), highest power first, of the share s of the arm, 0 at the base and 1 at the tip;
+        what the curve leaves (n_markers + 1, 3) [m], the place in the base first.
+    """
+    points = np.vstack([[*site_m, 0.0], marker_m])
+    share = np.linspace(0.0, 1.0, len(points))
+    curve = np.polyfit(share, points, ORDER)
+    return curve, points - _at(curve, share)
+
+
+def chamber_lengths(curve: np.ndarray, site_m: np.ndarray, spec: ArmSpec) -> np.ndarray:
+    """Lengths (n_chambers,) [m] of the chambers beside a curve of markers.
+
+    Args:
+        curve (5, 3): from `fit_curve`.
+        site_m (2,) [m]: where the markers sit in the rings.
+        spec: the arm, which says where the chambers pass.
+    """
+    n_sections = spec.structure.n_sections
+    share = np.linspace(0.0, 1.0, n_sections * N_SAMPLES + 1)
+    points = _at(curve, share)
+    slope = _at(curve[:-1] * np.arange(ORDER, 0, -1)[:, None], share)
+    rotation = _untwisted(-slope / np.linalg.norm(slope, axis=1, keepdims=True))
+    beside = ArmParams.from_spec(spec, np.float64).chamber_site_m - site_m  # (n_chambers, 2)
+    lines = points + np.einsum("sij,cj->csi", rotation[:, :, :2], beside)
+    pieces = np.linalg.norm(np.diff(lines, axis=1), axis=2).reshape(spec.n_chambers, n_sections, N_SAMPLES)
+    section = np.arange(spec.n_chambers) // N_CHAMBERS_PER_SECTION
+    return pieces.sum(axis=2)[np.arange(spec.n_chambers), section]
+
+
+def _at(curve: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """Points (n, 3) of polynomials (k, 3)."""
+    return np.vander(share, len(curve)) @ curve
+
+
+def _untwisted(up: np.ndarray) -> np.ndarray:
+    """Axes (n, 3, 3) of rings with normals (n, 3), each turned by the least from the one before."""
+    rotation = np.eye(3)
+    found = []
+    for normal in up:
+        before = rotation[:, 2]
+        x, y, z = np.cross(before, normal)
+        cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        rotation = (np.eye(3) + cross + cross @ cross / (1.0 + before @ normal)) @ rotation
+        found.append(rotation)
+    return np.stack(found)
+
+
+def _marker_site(rests: Rests) -> np.ndarray:
+    """Where the markers sit in the rings (2,) [m], from the last one as seen from the tip."""
+    seen = np.einsum("nij,ni->nj", rests.tip_rotation, rests.marker_m[:, -1] - rests.tip_m)
+    site_m = np.median(seen, axis=0)
+    if abs(site_m[2]) > MAX_OFF_PLATE_M:
+        raise FitError(
+            f"markers: the last is {1e3 * site_m[2]:+.1f} mm above the tip's plate, expected in it, within "
+            f"{1e3 * MAX_OFF_PLATE_M:.0f} mm"
+        )
+    return site_m[:2]

@@ -1,0 +1,195 @@
+"""The sim-to-real network: (P, L_spring) -> P_S2R, fitted to a log.
+
+The steps of the paper: the log gives spring lengths and real tip poses; the calibrated simulation is asked
+for the same spring lengths and gives poses of its own; a network learns the difference, which takes fewer
+rows than learning the real pose itself. Contiguous blocks of rows take no part in the fit, early stopping
+included, and tell how good it is.
+
+Source: Sim-to-Real Transfer in Meng et al.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from calib.errors import FitError
+from calib.fit.blocks import held_out_blocks
+from calib.fit.network import NetworkConfig, block_rows, fit_network
+from mjx_softarm.mechanics.kinematics import chain_frames
+from mjx_softarm.mechanics.settle import Settled, settle
+from mjx_softarm.mechanics.statics import ArmParams
+from mjx_softarm.sensing.pose import frame_from_pose, pose_from_frame
+from mjx_softarm.sensing.s2r import S2R, correct, correction_between, extrapolation, inputs
+from mjx_softarm.spec import ArmSpec
+
+HELD_OUT_SHARE = 0.2
+MIN_ROWS = 200
+PRESSURE_LIMIT_KPA = 200.0  # of the simulated arm, which no lengths of a real one need
+MAX_TURN_DEG = 90.0
+MAX_HELD_OUT_RATIO = 3.0
+BATCH = 512
+
+
+class SimulatedPoses(NamedTuple):
+    """What the simulated arm does when asked for spring lengths."""
+
+    pose: np.ndarray  # (n, 6) [mm, deg]
+    spring_m: np.ndarray  # (n, n_chambers) reached: those asked for
+    valid: np.ndarray  # (n,) bool, the arm settled
+
+
+@dataclass(frozen=True)
+class PoseErrors:
+    """Distances between poses, over some rows."""
+
+    translation_mean_mm: float
+    translation_95_mm: float
+    rotation_mean_deg: float
+    rotation_95_deg: float
+
+
+@dataclass(frozen=True, eq=False)
+class S2RFit:
+    """A sim-to-real network and whether to trust it."""
+
+    s2r: S2R
+    held_out: np.ndarray  # (n,) bool, rows that took no part
+    in_sample: PoseErrors
+    test: PoseErrors  # held-out rows
+    in_sample_uncorrected: PoseErrors
+    test_uncorrected: PoseErrors
+    stop_epoch: tuple[int, ...]  # of each member
+    n_epochs: int
+    flagged_share: float  # of the held-out rows, extrapolation above 1
+    warnings: tuple[str, ...]
+
+
+def simulate_poses(spec: ArmSpec, reference_m: np.ndarray) -> SimulatedPoses:
+    """The simulated arm at rest under the sensor-space law, with pressures as high and low as it takes.
+
+    The real arm had these lengths, so the simulated one must have them too. Within its own limits it often
+    cannot: its pose is then one of other lengths, and what the network is to learn is lost in that.
+
+    Args:
+        spec: the calibrated arm.
+        reference_m (n, n_chambers) [m]: spring lengths that the real arm had.
+
+    Raises:
+        FitError: a wrong number of columns, no row, or a length that is not finite.
+    """
+    reference = np.asarray(reference_m, np.float32)
+    if reference.ndim != 2 or reference.shape[1] != spec.n_chambers or not len(reference):
+        expected = f"(n, {spec.n_chambers}) with n at least 1"
+        raise FitError(f"spring lengths: got an array {reference.shape}, expected {expected}")
+    if not np.isfinite(reference).all():
+        row, column = np.argwhere(~np.isfinite(reference))[0]
+        value = reference[row, column]
+        raise FitError(f"spring lengths: row {row}, spring {column}: expected a finite number, got {value}")
+    n, params = len(reference), ArmParams.from_spec(spec)
+    limit = np.full(spec.n_chambers, PRESSURE_LIMIT_KPA, np.float32)
+    params = params._replace(pressure_min_kpa=-limit, pressure_max_kpa=limit)
+    padded = np.resize(reference, (-(-n // BATCH) * BATCH, spec.n_chambers))
+    parts = [jax.device_get(_settle()(params, part)) for part in np.split(padded, len(padded) // BATCH)]
+    return SimulatedPoses(*(np.concatenate(column)[:n] for column in zip(*parts, strict=True)))
+
+
+@functools.cache
+def _settle():
+    def one(params: ArmParams, reference: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        kinematics = functools.partial(chain_frames, link_length_m=params.link_length_m)
+        end: Settled = settle(kinematics, params, reference)
+        return pose_from_frame(end.tip_position_m, end.tip_rotation), end.spring_m, end.settled
+
+    return jax.jit(jax.vmap(one, in_axes=(None, 0)))
+
+
+def fit_s2r(
+    pose_sim: np.ndarray,
+    spring_m: np.ndarray,
+    pose_real: np.ndarray,
+    seed: int = 0,
+    config: NetworkConfig | None = None,
+) -> S2RFit:
+    """A network from simulated poses and spring lengths to real poses.
+
+    Args:
+        pose_sim (n, 6) [mm, deg]: of `simulate_poses`, settled rows alone, in time's order.
+        spring_m (n, n_chambers) [m]: of the same.
+        pose_real (n, 6) [mm, deg]: measured, in the base frame.
+        seed: of everything that is drawn.
+        config: how to train.
+
+    Raises:
+        FitError: arrays that do not fit together, too few rows to hold some out, or numbers not finite.
+    """
+    n = len(pose_sim)
+    if np.shape(pose_sim) != (n, 6) or np.shape(pose_real) != (n, 6) or np.shape(spring_m)[:1] != (n,):
+        shapes = f"{np.shape(pose_sim)}, {np.shape(spring_m)}, {np.shape(pose_real)}"
+        raise FitError(f"sim-to-real: got {shapes}, expected (n, 6), (n, n_springs), (n, 6)")
+    pose_sim, spring_m, pose_real = (np.asarray(a, np.float64) for a in (pose_sim, spring_m, pose_real))
+    held_out = held_out_blocks(n, HELD_OUT_SHARE, block_rows(n), seed)
+    x, y = inputs(frame_from_pose(pose_sim), spring_m), correction_between(pose_sim, pose_real)
+    fit = fit_network(x[~held_out], y[~held_out], seed, config)
+    corrected = correct(fit.network, pose_sim, spring_m)
+    errors = {
+        "in_sample": pose_errors(corrected[~held_out], pose_real[~held_out]),
+        "test": pose_errors(corrected[held_out], pose_real[held_out]),
+        "in_sample_uncorrected": pose_errors(pose_sim[~held_out], pose_real[~held_out]),
+        "test_uncorrected": pose_errors(pose_sim[held_out], pose_real[held_out]),
+    }
+    flagged = extrapolation(fit.network, pose_sim[held_out], spring_m[held_out]) > 1.0
+    turn_deg = 2.0 * np.rad2deg(np.arctan(np.linalg.norm(y[:, 3:], axis=1)))
+    return S2RFit(
+        s2r=fit.network,
+        held_out=held_out,
+        **errors,
+        stop_epoch=tuple(map(int, fit.stop_epoch)),
+        n_epochs=fit.n_epochs,
+        flagged_share=float(flagged.mean()),
+        warnings=tuple(_warnings(n, turn_deg, **errors)),
+    )
+
+
+def pose_errors(pose: np.ndarray, real: np.ndarray) -> PoseErrors:
+    """Distances of poses (n, 6) to real ones, and angles of the rotations between them."""
+    change = correction_between(pose, real)
+    distance_mm = np.linalg.norm(change[:, :3], axis=1)
+    angle_deg = 2.0 * np.rad2deg(np.arctan(np.linalg.norm(change[:, 3:], axis=1)))
+    parts = (f(values) for values in (distance_mm, angle_deg) for f in (np.mean, _most))
+    return PoseErrors(*map(float, parts))
+
+
+def _most(values: np.ndarray) -> float:
+    return float(np.percentile(values, 95.0))
+
+
+def _warnings(
+    n: int,
+    turn_deg: np.ndarray,
+    in_sample: PoseErrors,
+    test: PoseErrors,
+    in_sample_uncorrected: PoseErrors,
+    test_uncorrected: PoseErrors,
+) -> list[str]:
+    found = []
+    if n < MIN_ROWS:
+        found.append(f"{n} rows are few for a network; {MIN_ROWS} or more are advised")
+    if turn_deg.max() > MAX_TURN_DEG:
+        rows = int((turn_deg > MAX_TURN_DEG).sum())
+        found.append(
+            f"in {rows} of {n} rows the real tip is turned by more than {MAX_TURN_DEG:g} degrees against the "
+            "simulated one; is motion capture in the base frame?"
+        )
+    for name, unit in (("translation_mean_mm", "mm"), ("rotation_mean_deg", "deg")):
+        what = name.split("_")[0]
+        got, without, seen = (getattr(e, name) for e in (test, test_uncorrected, in_sample))
+        if got >= without:
+            found.append(f"{what}: {got:.3g} {unit} on held-out rows, no better than {without:.3g} without")
+        if got > MAX_HELD_OUT_RATIO * seen:
+            found.append(f"{what}: {got:.3g} {unit} on held-out rows, far more than {seen:.3g} in training")
+    return found

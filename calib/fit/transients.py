@@ -1,0 +1,229 @@
+"""Damping of chambers and backbone, fitted to the tip's motion after the pressures changed.
+
+C MuJoCo is driven with the logged pressures, from the beginning of a stretch of the log to its end, and its
+tip compared with the measured one. The first seconds do not count: how the arm moved when the log began is
+not known, and is forgotten by then. There are two numbers, so their derivatives are differences of three runs
+side by side; derivatives through thousands of steps of MJX would cost far more and compile for minutes.
+
+The springs' damping and the backbone's axial damping stay as specified: beside the chambers' they are not
+seen apart, so the chambers get what these have too little.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from calib.errors import FitError
+from calib.fit.blocks import held_out_blocks
+from calib.fit.leastsquares import Problem, fit
+from calib.read.rests import HOLD_KPA
+from mjx_softarm.logs.schema import Log
+from mjx_softarm.mechanics.mjcf import build_model, steps_per_period
+from mjx_softarm.mechanics.workspace import settle_many
+from mjx_softarm.spec import ArmSpec
+
+MAX_STEP_S = 0.05  # between rows of a stretch
+FORGOTTEN_S = 5.0  # from the beginning of a stretch
+MIN_COUNTED_S = 2.0
+MAX_TOTAL_S = 24.0  # of all stretches
+CLUSTER_S = 1.0  # errors within it are not independent
+HELD_OUT_SHARE = 0.2
+PRIOR = 1.0  # of the logarithms: a factor of e
+DIFFERENCE = 0.01
+SCALE_M, MIN_SCALE_M = 2e-3, 1e-4
+KNOWN = 0.2  # half-width of an interval, relative
+MARGIN = 1.05  # by which the specification must be better than the fit to be worth a warning
+MAX_RATIO = 2.0  # of held-out to other errors
+
+
+class Stretch(NamedTuple):
+    """A part of a log without gaps, at the control rate."""
+
+    pressure_kpa: np.ndarray  # (n, n_chambers) that act from a row to the next
+    tip_m: np.ndarray  # (n, 3)
+    payload_kg: float
+
+
+@dataclass(frozen=True, eq=False)
+class DampingFit:
+    """Calibrated damping and whether to trust it.
+
+    Attributes:
+        spec: the calibrated arm.
+        half_width_95: of the 95 % interval of `chambers.damping_ns_per_m` and of
+            `backbone.bending_damping_nms_per_rad`, by their names.
+        in_sample_rms_mm, held_out_rms_mm: distance of simulated to measured tip; held-out seconds took no
+            part.
+        held_out_before_rms_mm: of the specification that the fit started from.
+        n_stretches: of the logs.
+        time_s: that was simulated, and counts but for the first seconds of each stretch.
+        warnings: reasons not to trust the fit; none is good.
+    """
+
+    spec: ArmSpec
+    half_width_95: Mapping[str, float]
+    in_sample_rms_mm: float
+    held_out_rms_mm: float
+    held_out_before_rms_mm: float
+    n_stretches: int
+    time_s: float
+    warnings: tuple[str, ...]
+
+
+def calibrate_damping(logs: Log | Sequence[Log], spec: ArmSpec, seed: int = 0) -> DampingFit:
+    """Fit the damping of chambers and backbone to the logs of a moving arm.
+
+    Args:
+        logs: with pressures and tip positions; what is not sampled 20 times a second or more is passed by.
+        spec: the arm, its chambers already calibrated.
+        seed: chooses the seconds that are held out.
+
+    Raises:
+        FitError: a damping to start from that is zero, or no stretch of a log in which pressures change.
+    """
+    if not (spec.chambers.damping_ns_per_m > 0 and spec.backbone.bending_damping_nms_per_rad > 0):
+        raise FitError(
+            "damping: expected chambers.damping_ns_per_m and backbone.bending_damping_nms_per_rad above 0, "
+            f"got {spec.chambers.damping_ns_per_m:g} and {spec.backbone.bending_damping_nms_per_rad:g}"
+        )
+    found = find_stretches([logs] if isinstance(logs, Log) else logs, spec)
+    if not found:
+        raise FitError(
+            f"damping: no stretch of {FORGOTTEN_S + MIN_COUNTED_S:g} s, sampled every {MAX_STEP_S:g} s or "
+            "faster, in which pressures change"
+        )
+    n_clusters = len(_clusters(found, [s.tip_m for s in found], spec))
+    held_out = held_out_blocks(n_clusters, HELD_OUT_SHARE, 2, seed)
+    problem = Problem(
+        prior=np.full(2, PRIOR),
+        group=np.zeros(3 * _rows(CLUSTER_S, spec), int),
+        scale=np.array([SCALE_M]),
+        min_scale=np.array([MIN_SCALE_M]),
+    )
+
+    def model(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        error, slope = _errors(found, spec, x)
+        return error[~held_out], slope[~held_out]
+
+    solution = fit(model, problem)
+    before, after = (_errors(found, spec, x)[0] for x in (np.zeros(2), solution.x))
+    calibrated = damped(spec, solution.x)
+    widths = solution.half_width
+    done = DampingFit(
+        spec=calibrated,
+        half_width_95={
+            "damping_ns_per_m": float(widths[0] * calibrated.chambers.damping_ns_per_m),
+            "bending_damping_nms_per_rad": float(widths[1] * calibrated.backbone.bending_damping_nms_per_rad),
+        },
+        in_sample_rms_mm=_rms_mm(after[~held_out]),
+        held_out_rms_mm=_rms_mm(after[held_out]),
+        held_out_before_rms_mm=_rms_mm(before[held_out]),
+        n_stretches=len(found),
+        time_s=sum(len(s.tip_m) for s in found) / spec.control.rate_hz,
+        warnings=(),
+    )
+    return dataclasses.replace(done, warnings=_warnings(done, widths, solution.converged))
+
+
+def find_stretches(logs: Sequence[Log], spec: ArmSpec) -> list[Stretch]:
+    """Parts of logs in which pressures change and rows follow one another closely, at the control rate.
+
+    Pressures are held from row to row, positions interpolated. In the order of the logs, as many as
+    `MAX_TOTAL_S` allows.
+    """
+    found, left = [], _rows(MAX_TOTAL_S, spec)
+    shortest = _rows(FORGOTTEN_S + MIN_COUNTED_S, spec)
+    for log in logs:
+        if log.pressure_kpa is None or log.tip_m is None or len(log) < 2:
+            continue
+        payload = np.full(len(log), spec.mass.payload_kg) if log.payload_kg is None else log.payload_kg
+        cuts = np.flatnonzero((np.diff(log.time_s) > MAX_STEP_S) | (np.diff(payload) != 0)) + 1
+        for rows in np.split(np.arange(len(log)), cuts):
+            time_s = log.time_s[rows]
+            grid = np.arange(time_s[0], time_s[-1], 1.0 / spec.control.rate_hz)[:left]
+            if len(grid) < shortest:
+                continue
+            held = rows[np.searchsorted(time_s, grid + 1e-6, side="right") - 1]
+            pressure = log.pressure_kpa[held]
+            if (np.ptp(pressure[_rows(FORGOTTEN_S, spec) :], axis=0) <= HOLD_KPA).all():
+                continue
+            tip = np.stack([np.interp(grid, time_s, log.tip_m[rows, k]) for k in range(3)], axis=1)
+            found.append(Stretch(pressure, tip, float(payload[rows[0]])))
+            left -= len(grid)
+    return found
+
+
+def damped(spec: ArmSpec, x: np.ndarray) -> ArmSpec:
+    """The arm with the damping of chambers and backbone times exp(x), (2,)."""
+    chambers, bending = np.exp(x)
+    backbone = spec.backbone.bending_damping_nms_per_rad
+    return spec.replace(
+        chambers={"damping_ns_per_m": float(chambers * spec.chambers.damping_ns_per_m)},
+        backbone={"bending_damping_nms_per_rad": float(bending * backbone)},
+    )
+
+
+def simulate(stretch: Stretch, spec: ArmSpec) -> np.ndarray:
+    """Tip positions (n, 3) [m] of C MuJoCo under a stretch's pressures, at rest in the beginning."""
+    spec = spec.replace(mass={"payload_kg": stretch.payload_kg})
+    model = build_model(spec)
+    data = mujoco.MjData(model)
+    data.qpos[:] = settle_many(spec, stretch.pressure_kpa[:1]).q[0]
+    n_steps, tip = steps_per_period(1.0 / spec.control.rate_hz), np.empty_like(stretch.tip_m)
+    for row, pressure in enumerate(stretch.pressure_kpa):
+        mujoco.mj_kinematics(model, data)
+        tip[row] = data.site("tip").xpos
+        data.ctrl[:] = pressure
+        mujoco.mj_step(model, data, n_steps)
+    return tip
+
+
+def _errors(found: list[Stretch], spec: ArmSpec, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Simulated less measured tip by clusters (n, m) [m], NaN at their end; slopes (n, m, 2)."""
+    arms = [damped(spec, x + d) for d in (np.zeros(2), *(DIFFERENCE * np.eye(2)))]
+    with ThreadPoolExecutor() as pool:  # MuJoCo steps without Python's lock
+        runs = list(pool.map(lambda job: simulate(*job), [(s, arm) for arm in arms for s in found]))
+    n = len(found)
+    here, *ahead = (_clusters(found, runs[k * n : (k + 1) * n], spec) for k in range(3))
+    return here, np.stack([(a - here) / DIFFERENCE for a in ahead], axis=-1)
+
+
+def _clusters(found: list[Stretch], tips: list[np.ndarray], spec: ArmSpec) -> np.ndarray:
+    """Errors of the rows that count, a second in each row; the last of a stretch ends in NaN."""
+    size, skip, parts = _rows(CLUSTER_S, spec), _rows(FORGOTTEN_S, spec), []
+    for stretch, tip in zip(found, tips, strict=True):
+        error = (tip - stretch.tip_m)[skip:]
+        padded = np.full((-(-len(error) // size) * size, 3), np.nan)
+        padded[: len(error)] = error
+        parts.append(padded.reshape(-1, size * 3))
+    return np.concatenate(parts)
+
+
+def _rows(time_s: float, spec: ArmSpec) -> int:
+    return max(round(time_s * spec.control.rate_hz), 1)
+
+
+def _rms_mm(error: np.ndarray) -> float:
+    return 1e3 * float(np.sqrt(3.0 * np.nanmean(error**2)))
+
+
+def _warnings(done: DampingFit, widths: np.ndarray, converged: bool) -> tuple[str, ...]:
+    said = [] if converged else ["the fit has not come to an end"]
+    for name, width in zip(done.half_width_95, widths, strict=True):
+        if width > KNOWN:
+            said.append(f"{name} is known to {100 * width:.0f} % only; log larger steps of the pressures")
+    if done.held_out_rms_mm > MAX_RATIO * done.in_sample_rms_mm:
+        said.append(
+            f"held-out error {done.held_out_rms_mm:.1f} mm is more than {MAX_RATIO:g} times the error of the "
+            f"other seconds, {done.in_sample_rms_mm:.1f} mm"
+        )
+    if done.held_out_rms_mm > MARGIN * done.held_out_before_rms_mm:
+        said.append("the damping that the fit started from is better on held-out seconds")
+    return tuple(said)

@@ -1,0 +1,1 @@
+"""Logs read, checked and reduced to rows that can be believed."""

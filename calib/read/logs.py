@@ -1,0 +1,138 @@
+"""Logs of an arm: read, checked, and reduced to the rows that can be believed.
+
+The schema is that of `mjx_softarm.logs.schema`. A file that cannot be understood (a column missing, a wrong unit) is
+refused. Otherwise each row is believed whole or dropped whole: for a NaN, a reading out of range, a time that
+does not increase, motion capture that was not renewed or is turned, an outlier. So a log that was read has no
+holes in its columns, and its times say where rows are missing. Signs of quaternions are repaired; columns
+that never change, time gaps and unknown columns are only reported. Each finding says what it cost.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from calib.read.sheet import PLAUSIBLE, clean, implausible, quantity
+from mjx_softarm.logs.checks import Finding
+from mjx_softarm.logs.files import read_sheet, refuse
+from mjx_softarm.logs.schema import UNITS, Column, Log, log_columns, write_log
+from mjx_softarm.sensing.sensors import SensorParams, frequency_from_length
+from mjx_softarm.spec import ArmSpec
+
+_HELP = """\
+A log is a CSV file (commas, decimal points), or an npz file with the arrays `columns` and `table`.
+The header names each column with its unit, as in `pressure0 [kPa]`; the order does not matter.
+Needed are time and one at least of frequency, spring, pressure and tip. A group of columns is there
+whole or not at all. Markers are numbered from base to tip, springs and chambers as in the spec.
+Base frame: z up, the arm hangs from the origin towards -z. The tip is the centre of the last plate, its
+quaternion 1, 0, 0, 0 where the arm hangs straight.
+Chambers and the sim-to-real network are fitted to poses at rest: rows of which the pressures have been held
+for 3 s. One row per pose will do if the rows are more than 3 s apart.
+"""
+_FACTORS = {"frequency_hz": 1.25, "spring_m": 1.5, "tip_m": 1.5}  # between the ranges of two logs of one arm
+_NEEDED = ("frequency_hz", "spring_m", "pressure_kpa", "tip_m")  # one of them at least
+
+
+def read_log(path: str | Path, n_chambers: int = 9, strict: bool = False) -> tuple[Log, list[Finding]]:
+    """Read a log, keep the rows that can be believed, and say what is wrong with the others.
+
+    Args:
+        path: CSV, or npz by the end of its name.
+        n_chambers: of the arm; a log of another number is refused.
+        strict: refuse a log with any finding.
+
+    Returns:
+        The log, every number finite, and what was found.
+
+    Raises:
+        LogError: the log cannot be used, or is refused; the message has a line for each finding.
+    """
+    sheet, findings = read_sheet(path, n_chambers, one_of=_NEEDED)
+    with np.errstate(over="ignore", invalid="ignore"):  # any number may stand in a file
+        refuse(implausible(sheet))
+        sheet, found = clean(sheet)
+    findings += found
+    if strict:
+        refuse(findings)
+    return sheet.log(), findings
+
+
+def same_arm(logs: Sequence[Log]) -> None:
+    """Refuse logs that cannot be of one arm, as the columns that they share or their ranges tell.
+
+    Raises:
+        LogError: names both files and what differs.
+    """
+    for first, other in itertools.combinations(logs, 2):
+        file = f"{first.source} and {other.source}"
+        refuse([Finding(file, None, name, problem) for name, problem in _differences(first, other)])
+
+
+def _differences(first: Log, other: Log) -> Iterator[tuple[str, str]]:
+    for name in (*_NEEDED, "tip_quaternion", "marker_m"):
+        a, b = getattr(first, name), getattr(other, name)
+        if a is None or b is None:
+            continue  # springs on a ruler need no motion capture, poses no ruler
+        if a.shape[1:] != b.shape[1:]:
+            yield name, f"{a.shape[1]} and {b.shape[1]} in a row, expected logs of one arm"
+        elif name in _FACTORS:
+            sizes = [np.linalg.norm(value, axis=1) if name == "tip_m" else value for value in (a, b)]
+            low, high = zip(*(np.percentile(size, [1, 99]) for size in sizes), strict=True)
+            if max(low) > _FACTORS[name] * min(high):
+                ranges = " and ".join(f"{low[k]:.4g} to {high[k]:.4g}" for k in range(2))
+                yield name, f"{ranges}, expected ranges that meet in logs of one arm"
+
+
+def template(path: str | Path) -> str:
+    """Write a small log of the default arm that `read_log` finds nothing wrong with.
+
+    Returns:
+        How such a file is to be read, and what else it may hold: plain text.
+
+    Raises:
+        FileExistsError: there is such a file already.
+    """
+    if Path(path).exists():
+        raise FileExistsError(f"{path}: exists already, expected the name of a new file")
+    spec = ArmSpec.default()
+    n_sections = spec.structure.n_sections
+    phase = 2.0 * np.pi * (np.arange(10)[:, None] / 10.0 + np.arange(spec.n_chambers) / spec.n_chambers)
+    length_m = spec.geometry.section_length_m + 0.01 * np.sin(phase)
+    bend = np.stack([np.zeros(10), np.sin(phase[:, 0]), np.cos(phase[:, 0])], axis=1)
+    tip_m = [0.0, 0.0, -n_sections * spec.geometry.section_length_m] + bend * [0.0, 0.03, 0.01]
+    half = 0.1 * bend[:, 1]
+    share = np.arange(1, n_sections + 1)[:, None] / n_sections
+    log = Log(
+        source=str(path),
+        row=np.arange(10) + 2,
+        time_s=np.arange(10) / spec.control.rate_hz,
+        frequency_hz=np.round(frequency_from_length(length_m, SensorParams.from_spec(spec))),
+        pressure_kpa=np.round(5.0 * np.sin(phase + 1.0), 2),
+        tip_m=np.round(tip_m, 5),
+        tip_quaternion=np.stack([np.cos(half), np.sin(half), 0.0 * half, 0.0 * half], axis=1).round(6),
+        marker_m=np.round(tip_m[:, None] * share, 5),
+        payload_kg=np.zeros(10),
+    )
+    write_log(path, log)
+    return schema_text(spec.n_chambers, n_sections)
+
+
+def schema_text(n_chambers: int = 9, n_markers: int = 3) -> str:
+    """The columns a log may have, in words; from the schema itself."""
+    lines = [_HELP, f"{'columns':<30} {'units':<26} plausible"]
+    groups: dict[tuple[str, str], list[Column]] = {}
+    for column in log_columns(n_chambers, n_markers):
+        groups.setdefault((column.group, column.kind), []).append(column)
+    for columns in groups.values():
+        first, last = columns[0], columns[-1]
+        names = first.name if first == last else f"{first.name} .. {last.name}"
+        units = list(UNITS[first.kind])
+        bounds = PLAUSIBLE[quantity(first)]
+        steps = " between rows" if first.kind == "time" else ""
+        lines.append(
+            f"{names:<30} {', '.join(units):<26} {bounds.low:g} to {bounds.high:g} {units[0]}{steps}"
+        )
+    return "\n".join(lines)

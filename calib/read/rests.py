@@ -1,0 +1,175 @@
+"""The poses of a log in which the arm is at rest: equilibria can be fitted to these alone.
+
+A log is cut into holds: stretches in which no pressure leaves 1 kPa around its first value, the payload
+stays, and no two rows are more than 3 s apart. The last second of a hold counts, provided that
+
+- the hold had lasted for 3 s by then, three times the slowest time constant of the paper's arm. Where rows
+  are missing before a hold, the arm is taken to have been held there meanwhile, as it is where somebody
+  records one pose after the other;
+- the tip moves by less than 1 mm/s, or by no more than its own noise can explain, and stays within 2 mm.
+
+The rows that count are averaged to one pose, so that a long hold weighs no more than a short one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from calib.errors import FitError
+from mjx_softarm.logs.schema import Log
+from mjx_softarm.sensing.pose import rotation_from_quaternion
+from mjx_softarm.sensing.sensors import SensorFault, SensorParams, length_from_frequency
+from mjx_softarm.spec import ArmSpec
+
+HOLD_KPA = 1.0
+REST_S = 3.0
+WINDOW_S = 1.0
+MAX_SPEED_M_S = 1e-3
+MAX_SPREAD_M = 2e-3
+SPEED_SIGMA = 3.0
+ROUNDING_S = 1e-6
+
+
+class Rests(NamedTuple):
+    """Poses at rest, in the order of the logs."""
+
+    pressure_kpa: np.ndarray  # (n, n_chambers)
+    payload_kg: np.ndarray  # (n,)
+    tip_m: np.ndarray  # (n, 3)
+    tip_rotation: np.ndarray  # (n, 3, 3)
+    spring_m: np.ndarray  # (n, n_chambers), NaN where not measured
+    marker_m: np.ndarray  # (n, n_markers, 3), NaN where not measured
+    single: np.ndarray  # (n,) bool, of one row, which does not tell whether the tip moved
+
+    @property
+    def n(self) -> int:
+        return len(self.payload_kg)
+
+    def take(self, poses: np.ndarray) -> Rests:
+        """Some of the poses, given by their indices or a mask (n,)."""
+        return Rests(*(value[poses] for value in self))
+
+
+def find_rests(logs: Sequence[Log], spec: ArmSpec) -> tuple[Rests, dict[str, int]]:
+    """Poses at rest of all logs together.
+
+    Args:
+        logs: each with pressures and tip poses; frequencies are read by the sensors of `spec` where a log
+            has no spring lengths.
+        spec: the arm; its payload is that of a log that does not say.
+
+    Returns:
+        The poses, and for each fate of a row, the number of rows that met it.
+
+    Raises:
+        FitError: a log without pressures or tip poses, or of another number of chambers.
+    """
+    n_markers = max((log.marker_m.shape[1] for log in logs if log.marker_m is not None), default=0)
+    fates = {"used": 0, "not finite": 0, "pressures not held long enough": 0, "tip still moving": 0}
+    poses = [pose for log in logs for pose in _rests_of(log, spec, n_markers, fates)]
+    shapes = ((spec.n_chambers,), (), (3,), (3, 3), (spec.n_chambers,), (n_markers, 3), ())
+    columns = zip(*poses, strict=True) if poses else [()] * len(shapes)
+    arrays = [np.reshape(list(c), (len(poses), *shape)) for c, shape in zip(columns, shapes, strict=True)]
+    return Rests(*arrays[:-1], single=arrays[-1].astype(bool)), fates
+
+
+def _rests_of(log: Log, spec: ArmSpec, n_markers: int, fates: dict[str, int]) -> list[tuple]:
+    _check(log, spec)
+    payload = np.full(len(log), spec.mass.payload_kg) if log.payload_kg is None else log.payload_kg
+    columns = [log.time_s[:, None], payload[:, None], log.pressure_kpa, log.tip_m, log.tip_quaternion]
+    finite = np.all(np.isfinite(np.concatenate(columns, axis=1)), axis=1)
+    fates["not finite"] += int(np.count_nonzero(~finite))
+    log, payload = log.take(finite), payload[finite]
+    assert log.pressure_kpa is not None and log.tip_m is not None  # else `_check` raises
+    springs = spring_lengths(log, spec)
+    markers = np.full((len(log), n_markers, 3), np.nan)
+    if log.marker_m is not None and log.marker_m.shape[1] == n_markers:
+        markers = log.marker_m
+    rotation = rotation_from_quaternion(log.tip_quaternion)
+    found = []
+    for start, stop in holds(log.time_s, log.pressure_kpa, payload):
+        rows = _last_second(log.time_s, start, stop)
+        fates["pressures not held long enough"] += stop - start - len(rows)
+        if len(rows) == 0:
+            continue
+        if _moves(log.time_s[rows], log.tip_m[rows]):
+            fates["tip still moving"] += len(rows)
+            continue
+        fates["used"] += len(rows)
+        pressure, tip, turn, spring, marker = (
+            np.mean(x[rows], axis=0) for x in (log.pressure_kpa, log.tip_m, rotation, springs, markers)
+        )
+        kept = payload[rows[0]]  # the same in all, which a mean would round
+        found.append((pressure, kept, tip, nearest_rotation(turn), spring, marker, len(rows) == 1))
+    return found
+
+
+def holds(time_s: np.ndarray, pressure_kpa: np.ndarray, payload_kg: np.ndarray) -> list[tuple[int, int]]:
+    """First row, and row after the last, of each stretch at constant pressures and payload."""
+    n, start, found = len(time_s), 0, []
+    breaks = np.flatnonzero((np.diff(time_s) > REST_S) | (np.diff(payload_kg) != 0)) + 1
+    while start < n:
+        later = breaks[np.searchsorted(breaks, start, side="right") :]
+        end = int(later[0]) if len(later) else n
+        stop, width = start + 1, 64
+        while stop < end:  # look further and further ahead
+            ahead = pressure_kpa[stop : min(stop + width, end)]
+            left = (np.abs(ahead - pressure_kpa[start]) > HOLD_KPA).any(axis=1)
+            stop += int(np.argmax(left)) if left.any() else len(left)
+            if left.any():
+                break
+            width *= 2
+        found.append((start, stop))
+        start = stop
+    return found
+
+
+def spring_lengths(log: Log, spec: ArmSpec) -> np.ndarray:
+    """Spring lengths (n, n_chambers) [m]: from the frequencies, else as logged, else NaN."""
+    if log.frequency_hz is None:
+        return np.full((len(log), spec.n_chambers), np.nan) if log.spring_m is None else log.spring_m
+    reading = length_from_frequency(log.frequency_hz, SensorParams.from_spec(spec))
+    return np.where(reading.fault == SensorFault.OK, reading.length_m, np.nan)
+
+
+def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
+    """The rotation (..., 3, 3) closest to a matrix, such as a mean of rotations that are alike."""
+    left, _, right = np.linalg.svd(matrix)
+    left[..., :, 2] *= np.linalg.det(left @ right)[..., None]
+    return left @ right
+
+
+def _last_second(time_s: np.ndarray, start: int, stop: int) -> np.ndarray:
+    """Rows of a hold that count, if any."""
+    gap = time_s[start] - time_s[start - 1] if start > 0 else 0.0
+    since = time_s[start - 1] if gap > REST_S else time_s[start]
+    rows = np.arange(start, stop)
+    window = time_s[rows] >= time_s[stop - 1] - WINDOW_S - ROUNDING_S
+    return rows[window & (time_s[rows] - since >= REST_S - ROUNDING_S)]
+
+
+def _moves(time_s: np.ndarray, tip_m: np.ndarray) -> bool:
+    """Whether the tip moves over some rows of a hold; never of a single one."""
+    off = tip_m - np.mean(tip_m, axis=0)
+    if len(off) < 2:
+        return False
+    if np.sqrt(np.mean(np.sum(off**2, axis=1))) > MAX_SPREAD_M:
+        return True
+    time = time_s - np.mean(time_s)
+    slope = time @ off / (time @ time)  # (3,) [m/s]
+    left = off - time[:, None] * slope
+    noise = np.sqrt(np.sum(left**2) / max(len(off) - 2, 1) / (time @ time))
+    return bool(np.linalg.norm(slope) > MAX_SPEED_M_S + SPEED_SIGMA * noise)
+
+
+def _check(log: Log, spec: ArmSpec) -> None:
+    for name in ("pressure_kpa", "tip_m", "tip_quaternion"):
+        if getattr(log, name) is None:
+            raise FitError(f"{log.source}: no {name}, expected pressures and tip poses to fit chambers to")
+    for name in ("pressure_kpa", "spring_m", "frequency_hz"):
+        value = getattr(log, name)
+        if value is not None and value.shape[1] != spec.n_chambers:
+            raise FitError(f"{log.source}: {name}: got {value.shape[1]} columns, expected {spec.n_chambers}")

@@ -1,0 +1,231 @@
+"""Checks of a log as a matrix: which units are plausible, which rows are believed, at what cost.
+
+The checks of rows come in three stages, each on the rows that the one before has left: single rows (NaN,
+time, range); rows against the row before (motion capture that was not renewed or is turned); outliers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from types import MappingProxyType
+from typing import NamedTuple
+
+import numpy as np
+
+from mjx_softarm.logs import checks
+from mjx_softarm.logs.checks import Finding, LogError
+from mjx_softarm.logs.files import Sheet
+from mjx_softarm.logs.schema import UNITS, Column
+
+
+class Plausible(NamedTuple):
+    """What a quantity of a soft arm a few decimetres long may read, in the unit used inside (`UNITS`)."""
+
+    low: float  # of any value
+    high: float
+    least: float = 0.0  # what the largest values reach, unless all are zero; 0: anything
+    spike: float = np.inf  # a value off its neighbours by less is not an outlier
+
+
+# A column whose median is outside has the wrong unit, or is another column; single values outside cost
+# their rows. The bounds are tight enough to tell mm, cm and m, or Pa, kPa and bar, apart for such an arm.
+# What they cannot tell: psi from kPa, rad from deg, one chamber from another.
+PLAUSIBLE: Mapping[str, Plausible] = MappingProxyType(
+    {
+        "time": Plausible(5e-4, 9.0),  # of the steps, in the median: 2 kHz down to a pose every 9 s
+        "frequency": Plausible(
+            1e4, 1e7, spike=1e3
+        ),  # the LDC1612 reads from 1 kHz, but no such coil is below 10
+        "length": Plausible(0.03, 1.0, spike=1e-3),  # of a spring
+        "position": Plausible(-3.0, 3.0, least=0.1, spike=2e-3),  # of tip and markers, from the base
+        "pressure": Plausible(
+            -105.0, 1000.0, least=0.5, spike=10.0
+        ),  # vacuum to ten bar; valves ripple by less
+        "mass": Plausible(0.0, 5.0, least=1e-3),
+        "number": Plausible(-1.1, 1.1),  # part of a unit quaternion
+        "id": Plausible(0.0, 1e6),
+        "pose_length": Plausible(-3000.0, 3000.0, least=100.0),
+        "angle": Plausible(-360.0, 360.0),
+    }
+)
+BY_HAND_ROWS, BY_HAND_S = 300, 600.0  # so few rows may be poses that somebody recorded at leisure
+HANGS_BELOW_M = -0.05  # of the tip, in the median: the base frame's z is up and the arm hangs
+SENSORS = ("frequency_hz", "spring_m", "pressure_kpa", "tip_m", "marker_m")
+
+
+class Fault(NamedTuple):
+    """Rows at fault for one reason."""
+
+    column: str
+    problem: str
+    mask: np.ndarray  # (n,)
+    drops: bool = True
+
+
+def clean(sheet: Sheet) -> tuple[Sheet, list[Finding]]:
+    """The rows that can be believed, quaternion signs repaired; and all that was found."""
+    findings = [_finding(sheet, fault) for fault in _gaps(sheet)]
+    for stage in (_single_rows, _renewal, _neighbours):
+        faults = [fault for fault in stage(sheet) if fault.mask.any()]
+        findings += [_finding(sheet, fault) for fault in faults]
+        dropped = [fault.mask for fault in faults if fault.drops]
+        if dropped:
+            keep = ~np.logical_or.reduce(dropped)
+            sheet = sheet._replace(values=sheet.values[keep], row=sheet.row[keep])
+        if len(sheet.row) < 2:
+            left = f"{len(sheet.row)} rows left, expected 2 at least"
+            raise LogError([*findings, Finding(sheet.file, None, "", left)])
+    if quaternion := sheet.of("tip_quaternion"):
+        sheet.values[:, quaternion], flipped = checks.same_sign(sheet.values[:, quaternion])
+        if flipped.any():
+            problem = f"{np.count_nonzero(flipped)} x sign flipped, repaired; expected neighbours of one sign"
+            findings.append(_finding(sheet, Fault("tip_qw..qz", problem, flipped, drops=False)))
+    return sheet, findings
+
+
+def _gaps(sheet: Sheet) -> Iterator[Fault]:
+    """Rows that the file itself lacks, by its times alone."""
+    time_s = sheet.values[:, 0]
+    finite = np.flatnonzero(np.isfinite(time_s))
+    ordered = finite[~checks.late_rows(time_s[finite])]
+    gap = np.zeros(len(time_s), bool)
+    gap[ordered] = checks.gap_rows(time_s[ordered])
+    if gap.any():
+        steps_s = np.diff(time_s[ordered])
+        got = f"{np.count_nonzero(gap)} x gap, longest {steps_s.max():.4g} s"
+        yield Fault("time", f"{got}, expected steps near {np.median(steps_s):.4g} s", gap, drops=False)
+
+
+def _finding(sheet: Sheet, fault: Fault) -> Finding:
+    rows = sheet.row[fault.mask]
+    n_dropped = len(rows) if fault.drops else 0
+    return Finding(sheet.file, (int(rows[0]), int(rows[-1])), fault.column, fault.problem, n_dropped)
+
+
+def implausible(sheet: Sheet) -> list[Finding]:
+    """Why the log cannot be used at all: columns without numbers, or that are not what their header says."""
+    if len(sheet.row) < 2:
+        return [Finding(sheet.file, None, "", f"{len(sheet.row)} row, expected 2 at least")]
+    problems = {}
+    for k, column in enumerate(sheet.columns):
+        problems[column.name] = _implausible_column(column, sheet.values[:, k])
+    for group in dict.fromkeys(column.group for column in sheet.columns[1:]):
+        problems[group] = _implausible_size(sheet, group)
+    if tip := sheet.of("tip_m"):
+        z_m = _typical(sheet.values[:, tip[2]])
+        if z_m > HANGS_BELOW_M:
+            expected = f"below {HANGS_BELOW_M} m, as z is up and the arm hangs from the base"
+            problems["tip_z"] = problems["tip_z"] or f"median {z_m:.3g} m, expected {expected}"
+    return [Finding(sheet.file, None, name, problem) for name, problem in problems.items() if problem]
+
+
+def _typical(values: np.ndarray) -> float:
+    """Median of the finite values; NaN where there is none."""
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if len(finite) else np.nan
+
+
+def _implausible_column(column: Column, values: np.ndarray) -> str:
+    what = "median step" if column.kind == "time" else "median"
+    if not np.isfinite(values).any():
+        return "no number in the whole column"
+    got = _typical(np.diff(values) if column.kind == "time" else values)
+    low, high = _bounds(column)
+    by_hand = column.kind == "time" and len(values) < BY_HAND_ROWS and low <= got <= BY_HAND_S
+    if low <= got <= high or by_hand:
+        return ""
+    factors = UNITS[column.kind]
+    factor = factors[column.unit]
+    fitting = [unit for unit, other in factors.items() if low <= got / factor * other <= high]
+    hint = f" (plausible in {' or '.join(fitting)})" if fitting else ""
+    expected = f"{low / factor:.4g} to {high / factor:.4g} {column.unit}"
+    return f"{what} {got / factor:.4g} {column.unit}{hint}, expected {expected}: wrong unit or column"
+
+
+def _bounds(column: Column) -> tuple[float, float]:
+    plausible = PLAUSIBLE[quantity(column)]
+    return plausible.low, plausible.high
+
+
+def quantity(column: Column) -> str:
+    """Key of `PLAUSIBLE`."""
+    return "position" if column.group in ("tip_m", "marker_m") else column.kind
+
+
+def _implausible_size(sheet: Sheet, group: str) -> str:
+    chosen = [k for k in sheet.of(group) if PLAUSIBLE[quantity(sheet.columns[k])].least > 0.0]
+    if not chosen:
+        return ""
+    column = sheet.columns[chosen[0]]
+    sizes = np.abs(sheet.values[:, chosen])
+    sizes = sizes[np.isfinite(sizes)]
+    largest = np.percentile(sizes, 99) if len(sizes) else 0.0
+    least, factor = PLAUSIBLE[quantity(column)].least, UNITS[column.kind][column.unit]
+    if largest == 0.0 or largest >= least:
+        return ""
+    got, expected = f"{largest / factor:.4g} {column.unit}", f"{least / factor:.4g} {column.unit} at least"
+    return f"99 % of the values are below {got}, expected the largest to reach {expected}: wrong unit"
+
+
+def _shown(column: Column, value: float) -> str:
+    """A value of the unit used inside, as the file has it."""
+    return f"{value / UNITS[column.kind][column.unit]:.6g} {column.unit}".removesuffix(" 1")
+
+
+def _single_rows(sheet: Sheet) -> Iterator[Fault]:
+    for k, column in enumerate(sheet.columns):
+        values = sheet.values[:, k]
+        finite = np.isfinite(values)
+        if not finite.all():
+            got = f"{np.count_nonzero(~finite)} x NaN or inf"
+            yield Fault(column.name, f"{got}, expected numbers", ~finite)
+        if column.kind == "time":
+            late = np.zeros(len(values), bool)
+            late[finite] = checks.late_rows(values[finite])
+            got = f"{np.count_nonzero(late)} x repeated or going back"
+            yield Fault("time", f"{got}, expected times that increase", late)
+            continue
+        low, high = _bounds(column)
+        outside = finite & ((values < low) | (values > high))
+        if outside.any():
+            got = f"{np.count_nonzero(outside)} x out of range, first {_shown(column, values[outside][0])}"
+            expected = f"{_shown(column, low)} to {_shown(column, high)}"
+            yield Fault(column.name, f"{got}, expected {expected}", outside)
+
+
+def _renewal(sheet: Sheet) -> Iterator[Fault]:
+    everywhere = np.ones(len(sheet.row), bool)
+    for k in sheet.of("frequency_hz", "spring_m", "pressure_kpa"):
+        if np.ptp(sheet.values[:, k]) == 0.0:
+            problem = f"always {_shown(sheet.columns[k], sheet.values[0, k])}, expected a sensor that changes"
+            yield Fault(sheet.columns[k].name, problem, everywhere, drops=False)
+    for name, axes in sheet.bodies():
+        body = sheet.values[:, axes]
+        if checks.moves(body):
+            # A quaternion that goes on shows that the tip was seen, though it is where it was.
+            seen = sheet.of("tip_quaternion") if name == "tip" else []
+            stale = checks.stale_rows(sheet.values[:, [*axes, *seen]])
+            got = f"{np.count_nonzero(stale)} x equal to the row before"
+            yield Fault(f"{name}_x..z", f"{got}, expected motion capture renewed in each row", stale)
+        elif name == "tip":
+            yield Fault("tip_x..z", "never moves by 1 mm, expected a tip that moves", everywhere, drops=False)
+    if quaternion := sheet.of("tip_quaternion"):
+        values = sheet.values[:, quaternion]
+        wrong = checks.not_unit_rows(values)
+        got = f"{np.count_nonzero(wrong)} x length not 1, first {np.linalg.norm(values[wrong][:1]):.4g}"
+        yield Fault("tip_qw..qz", f"{got}, expected unit quaternions", wrong)
+        turned = np.zeros(len(wrong), bool)
+        turned[~wrong] = checks.turned_rows(values[~wrong])
+        got = f"{np.count_nonzero(turned)} x turned by 180 degrees between jumps"
+        yield Fault("tip_qw..qz", f"{got}, expected a continuous orientation", turned)
+
+
+def _neighbours(sheet: Sheet) -> Iterator[Fault]:
+    for k in sheet.of(*SENSORS):
+        column = sheet.columns[k]
+        outlier = checks.outlier_rows(sheet.values[:, k], PLAUSIBLE[quantity(column)].spike)
+        if outlier.any():
+            got = (
+                f"{np.count_nonzero(outlier)} x outlier, first {_shown(column, sheet.values[outlier, k][0])}"
+            )
+            yield Fault(column.name, f"{got}, expected a value like its neighbours", outlier)

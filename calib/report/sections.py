@@ -1,0 +1,198 @@
+"""The sections of a calibration's report: figures, tables, pictures."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from calib.fit.chambers import BENDING, ChamberFit
+from calib.fit.markers import MarkerLimits
+from calib.fit.s2r import S2RFit
+from calib.fit.sensors import SpringFit
+from calib.fit.transients import DampingFit
+from calib.report.page import Part, Table
+from mjx_softarm.sensing.s2r import correct
+
+_BINS = 40
+
+
+def springs(fit: SpringFit, calibrated_m: np.ndarray, length_m: np.ndarray) -> Part:
+    """Beta and delta of each spring; lengths (n, n_springs) by the calibrated sensors and as measured."""
+    half_beta = 0.5 * np.ptp(fit.beta_interval, axis=1)
+    half_delta = 0.5 * np.ptp(fit.delta_interval_m, axis=1)
+    rows = tuple(
+        (f"spring {k}", fit.beta[k], half_beta[k], 1e3 * fit.delta_m[k], 1e3 * half_delta[k])
+        + (1e3 * fit.held_out_rms_m[k], int(fit.n_rows[k]), int(fit.n_outliers[k]))
+        for k in range(len(fit.beta))
+    )
+    head = ("", "beta", "+-", "delta [mm]", "+- [mm]", "held-out RMS [mm]", "rows", "outliers")
+    figure, axes = _figure()
+    error_mm = 1e3 * (calibrated_m - length_m)
+    for k in range(length_m.shape[1]):
+        axes.plot(1e3 * length_m[:, k], error_mm[:, k], ".", ms=3, label=f"spring {k}")
+    _label(axes, "measured length [mm]", "calibrated less measured [mm]")
+    return Part(
+        "Springs",
+        "Lengths that were measured against lengths from the readings, L = beta l + delta, Huber's loss. "
+        "Intervals are 95 %; held out are contiguous blocks of rows.",
+        (Table(head, rows),),
+        fit.warnings,
+        _plain(fit),
+        (("what the lines leave", figure),),
+    )
+
+
+def chambers(fit: ChamberFit) -> Part:
+    """Stiffness, area and rest length of each chamber, the backbone, and how well the arm's tip is met."""
+    spec = fit.spec
+    units = (
+        ("stiffness_n_per_m", "stiffness [N/m]", 1.0),
+        ("area_m2", "area [cm2]", 1e4),
+        ("area_slope_m", "its slope [cm2/mm]", 10.0),
+        ("length_offset_m", "rest length [mm]", 1e3),
+    )
+    values = {name: spec.per_chamber(getattr(spec.chambers, name)) for name, _, _ in units}
+    rows = []
+    for k in range(spec.n_chambers):
+        pairs = (
+            (factor * values[name][k], float(factor * fit.half_width_95[name][k]))
+            for name, _, factor in units
+        )
+        rows.append((f"chamber {k}", *(number for pair in pairs for number in pair)))
+    head = ("", *(text for _, title, _ in units for text in (title, "+-")))
+    bending = spec.backbone.bending_stiffness_nm_per_rad
+    backbone = Table(("", "value", "+-"), ((BENDING, bending, float(fit.half_width_95[BENDING])),))
+    errors = (
+        ("held-out poses, before", fit.held_out_before),
+        ("held-out poses, calibrated", fit.held_out),
+        ("poses of the fit, calibrated", fit.in_sample),
+    )
+    error_rows = tuple(
+        (name, e.n, e.translation_mean_mm, e.translation_95_mm, e.rotation_mean_deg) for name, e in errors
+    )
+    figure, axes = _figure()
+    bins = np.linspace(0.0, np.nanquantile(fit.tip_error_mm, 0.99), _BINS).tolist()
+    axes.hist(fit.tip_error_mm[~fit.is_held_out], bins, density=True, alpha=0.5, label="fit")
+    axes.hist(fit.tip_error_mm[fit.is_held_out], bins, density=True, histtype="step", lw=2, label="held out")
+    _label(axes, "simulated to measured tip [mm]", "density")
+    fates = ", ".join(f"{count} {fate}" for fate, count in fit.rows.items() if count)
+    return Part(
+        "Chambers",
+        f"{fit.rests.n} poses at rest: simulated at the measured pressures against the measured tip and "
+        "springs. Rest length is told as its difference from the section's. Intervals are 95 %. "
+        f"Rows of the logs: {fates}.",
+        (Table(head, tuple(rows)), backbone, Table(_ERROR_HEAD, error_rows)),
+        fit.warnings,
+        _plain(fit, "spec", "rests", "is_held_out", "tip_error_mm", "chamber_m")
+        | {"values": values | {BENDING: bending}},
+        (("simulated to measured tip", figure),),
+    )
+
+
+def with_markers(part: Part, limits: MarkerLimits) -> Part:
+    """The chambers' part with their lengths from markers at the poses that bend most."""
+    figure, axes = _figure()
+    axes.plot(1e3 * limits.simulated_m.ravel(), 1e3 * limits.length_m.ravel(), ".")
+    axes.plot(*2 * [1e3 * np.array([limits.length_min_m, limits.length_max_m])], "k:", lw=1)
+    axes.set(xlabel="chambers, simulated [mm]", ylabel="from the curves through the markers [mm]")
+    lengths = ("chamber at the poses that bend most", 1e3 * limits.length_min_m, 1e3 * limits.length_max_m)
+    simulated = ("the same, simulated", *(float(1e3 * f(limits.simulated_m)) for f in (np.min, np.max)))
+    table = Table(("", "shortest [mm]", "longest [mm]"), (lengths, simulated))
+    title = f"chambers at the {len(limits.pose)} poses that bend most"
+    return dataclasses.replace(
+        part,
+        tables=(*part.tables, table),
+        data=part.data | {"markers": _plain(limits)},
+        figures=(*part.figures, (title, figure)),
+    )
+
+
+def damping(fit: DampingFit) -> Part:
+    """Damping of chambers and backbone, and how well the moving tip is met."""
+    values = {
+        "damping_ns_per_m": fit.spec.chambers.damping_ns_per_m,
+        "bending_damping_nms_per_rad": fit.spec.backbone.bending_damping_nms_per_rad,
+    }
+    rows = tuple((name, values[name], float(fit.half_width_95[name])) for name in values)
+    errors = (
+        ("held-out seconds, before", fit.held_out_before_rms_mm),
+        ("held-out seconds, calibrated", fit.held_out_rms_mm),
+        ("seconds of the fit, calibrated", fit.in_sample_rms_mm),
+    )
+    return Part(
+        "Damping",
+        f"{fit.n_stretches} stretches of the moving arm, {fit.time_s:.0f} s in all: MuJoCo driven with the "
+        "measured pressures against the measured tip. Intervals are 95 %.",
+        (Table(("", "value", "+-"), rows), Table(("tip", "RMS [mm]"), errors)),
+        fit.warnings,
+        _plain(fit, "spec") | {"values": values},
+    )
+
+
+def s2r(fit: S2RFit, pose: np.ndarray, spring_m: np.ndarray, real: np.ndarray, n_unsettled: int) -> Part:
+    """Simulated poses (n, 6) and spring lengths, and real poses, with and without the network.
+
+    `n_unsettled` others took no part, as the simulated arm found no rest at their spring lengths.
+    """
+    errors = tuple(
+        (name, n, e.translation_mean_mm, e.translation_95_mm, e.rotation_mean_deg)
+        for name, n, e in (
+            ("held-out poses, simulated", int(fit.held_out.sum()), fit.test_uncorrected),
+            ("held-out poses, corrected", int(fit.held_out.sum()), fit.test),
+            ("poses of the fit, corrected", int((~fit.held_out).sum()), fit.in_sample),
+        )
+    )
+    corrected = correct(fit.s2r, pose, spring_m)
+    figure, axes = _figure()
+    for label, poses in (("simulated", pose), ("corrected", corrected)):
+        distance_mm = np.linalg.norm((poses - real)[fit.held_out, :3], axis=1)
+        axes.hist(distance_mm, _BINS, alpha=0.5, label=label)
+    _label(axes, "distance to the real tip, held-out poses [mm]", "poses")
+    return Part(
+        "Sim-to-real network",
+        f"{len(pose)} poses at rest: the calibrated simulation is asked for the logged spring lengths, the "
+        f"network learns what its tip is off by. Of the held-out poses it flags "
+        f"{100 * fit.flagged_share:.1f} % as far from those it learned from. "
+        f"At {n_unsettled} other poses the simulation found no rest; they took no part.",
+        (Table(_ERROR_HEAD, errors),),
+        fit.warnings,
+        _plain(fit, "s2r", "held_out") | {"n_unsettled": n_unsettled},
+        (("held-out poses with and without the network", figure),),
+    )
+
+
+_ERROR_HEAD = ("tip", "poses", "mean [mm]", "95 % [mm]", "mean turn [deg]")
+
+
+def _plain(fit: Any, *left_out: str) -> dict[str, Any]:
+    """The fields of a fit as JSON has them."""
+    fields = fit._asdict() if hasattr(fit, "_asdict") else _fields(fit)
+    return {name: _json(value) for name, value in fields.items() if name not in (*left_out, "warnings")}
+
+
+def _fields(fit: Any) -> dict[str, Any]:
+    return {item.name: getattr(fit, item.name) for item in dataclasses.fields(fit)}
+
+
+def _json(value: Any) -> Any:
+    if hasattr(value, "_asdict") or dataclasses.is_dataclass(value):
+        return _plain(value)
+    if isinstance(value, Mapping):
+        return {name: _json(item) for name, item in value.items()}
+    return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
+
+
+def _figure() -> tuple[Figure, Axes]:
+    figure = Figure(figsize=(7.5, 3.6), layout="constrained")
+    return figure, figure.add_subplot()
+
+
+def _label(axes: Axes, x: str, y: str) -> None:
+    axes.set(xlabel=x, ylabel=y)
+    axes.legend(fontsize="small", ncols=3)
+    axes.grid(alpha=0.3)

@@ -1,0 +1,188 @@
+"""Sealed files: named arrays in an npz archive that is never taken for what it is not. NumPy only.
+
+The archive's comment, its last bytes, is a mark that says what the file is and the SHA-256 of every byte
+before, so that a file that is incomplete, changed or of another kind is refused; any npz reader takes it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+
+from mjx_softarm._support.mlp import Layer
+
+_N_DIGEST = 64  # hexadecimal digits, the last bytes of the file
+
+
+class SealedFileError(ValueError):
+    """A sealed file that cannot be used; the message names file, entry, what it got and what it expected."""
+
+
+def write_sealed(path: Path, arrays: Mapping[str, Any], kind: str) -> None:
+    """Write arrays whole or not at all; the same arrays give the same bytes.
+
+    Args:
+        path: the file; one that was there before stays until the new one is complete.
+        arrays: by name.
+        kind: what the file is, in a word.
+
+    Raises:
+        SealedFileError: the file cannot be written.
+    """
+    part = path.with_name(path.name + ".part")
+    try:
+        part.write_bytes(sealed(arrays, kind))
+        part.replace(path)
+    except OSError as error:
+        raise SealedFileError(f"{path}: cannot be written: {error.strerror}") from error
+    finally:
+        if part.exists():
+            part.unlink()
+
+
+def read_sealed(path: Path, kind: str, made_by: str) -> dict[str, np.ndarray]:
+    """The arrays of a file that `write_sealed` wrote.
+
+    Args:
+        path: the file.
+        kind: what it must be.
+        made_by: the command that makes such files, for messages.
+
+    Raises:
+        SealedFileError: the file cannot be read, is incomplete, damaged or of another kind.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise SealedFileError(f"{path}: cannot be read: {error.strerror}") from error
+    content, digest = data[:-_N_DIGEST], data[-_N_DIGEST:]
+    if not content.endswith(_mark(kind)):
+        whole = zipfile.is_zipfile(io.BytesIO(data))
+        got = f"an archive without a {kind}'s mark at its end" if whole else "no complete npz archive"
+        expected = f"an unchanged file of `{made_by}`"
+        raise SealedFileError(f"{path}: got {got}, {len(data)} bytes, expected {expected}")
+    if hashlib.sha256(content).hexdigest().encode() != digest:
+        raise SealedFileError(f"{path}: damaged: its {len(data)} bytes do not have the checksum at their end")
+    try:
+        with np.load(io.BytesIO(data), allow_pickle=False) as npz:
+            return {name: np.asarray(npz[name]) for name in npz.files}
+    except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
+        raise SealedFileError(f"{path}: holds an array that cannot be read: {error}") from error
+
+
+def sealed(arrays: Mapping[str, Any], kind: str) -> bytes:
+    """The bytes of a file; mark and digest are the zip archive's comment."""
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    with zipfile.ZipFile(buffer, "a") as archive:
+        archive.comment = _mark(kind) + bytes(_N_DIGEST)
+    content = buffer.getvalue()[:-_N_DIGEST]
+    return content + hashlib.sha256(content).hexdigest().encode()
+
+
+def _mark(kind: str) -> bytes:
+    return f"mjx_softarm {kind}, sha256 ".encode()
+
+
+def entries_of(name: str, group: Any) -> dict[str, np.ndarray]:
+    """The entries of a dataclass or named tuple: `name.field`, and its `layers` one by one."""
+    entries: dict[str, Any] = {}
+    for item in type(group).__annotations__:
+        value = getattr(group, item)
+        if item == "layers":
+            entries |= layer_entries(name, value)
+        else:
+            entries[f"{name}.{item}"] = value
+    return {item: np.asarray(value) for item, value in entries.items()}
+
+
+def layer_entries(name: str, layers: tuple[Layer, ...]) -> dict[str, Any]:
+    """`name.n_layers`, `name.0.weight`, `name.0.bias`, ..."""
+    entries: dict[str, Any] = {f"{name}.n_layers": len(layers)}
+    for k, (weight, bias) in enumerate(layers):
+        entries |= {f"{name}.{k}.weight": weight, f"{name}.{k}.bias": bias}
+    return entries
+
+
+class Entries:
+    """The arrays of a file, each checked as it is taken."""
+
+    def __init__(self, arrays: Mapping[str, np.ndarray], source: str):
+        self._source, self._arrays, self._left = source, arrays, set(arrays)
+
+    def fail(self, name: str, problem: str) -> NoReturn:
+        raise SealedFileError(f"{self._source}: {name}: {problem}")
+
+    def take(self, name: str, kind: type, *shapes: tuple[int | None, ...]) -> Any:
+        """An array of `kind` in one of the `shapes`, finite; a single value as Python's own type.
+
+        A dimension of None is any number from 1.
+        """
+        if name not in self._arrays:
+            self.fail(name, "missing")
+        array = self._arrays[name]
+        self._left.discard(name)
+        expected = f"{kind.__name__.rstrip('_')} {' or '.join(map(_shape_text, shapes))}"
+        if not np.issubdtype(array.dtype, kind) or not any(_fits(array.shape, shape) for shape in shapes):
+            self.fail(name, f"got {array.dtype.name} {array.shape}, expected {expected}")
+        if np.issubdtype(kind, np.floating) and not np.isfinite(array).all():
+            self.fail(name, f"got {array[~np.isfinite(array)][0]}, expected finite numbers")
+        return array if array.shape else array.item()
+
+    def group(self, name: str, kind: type, *shapes: tuple[int, ...]) -> Any:
+        """A dataclass or named tuple of numbers, all of them in one of the `shapes`."""
+        return kind(*(self.take(f"{name}.{item}", np.float64, *shapes) for item in kind.__annotations__))
+
+    def table(self, name: str) -> dict[str, Any]:
+        """A JSON object."""
+        text = self.take(name, np.str_, ())
+        try:
+            return {**json.loads(text)}
+        except (ValueError, TypeError):
+            self.fail(name, f"got {text[:60]!r}, expected a JSON object")
+
+    def layers(self, name: str, n_inputs: int, n_outputs: int) -> tuple[Layer, ...]:
+        """At least one layer; they fit together, from so many inputs to so many outputs."""
+        layers, n_layers = [], self.take(f"{name}.n_layers", np.integer, ())
+        if n_layers < 1:
+            self.fail(f"{name}.n_layers", f"got {n_layers}, expected at least 1")
+        for k in range(n_layers):
+            width = n_outputs if k == n_layers - 1 else np.size(self._arrays.get(f"{name}.{k}.bias", 0))
+            bias = self.take(f"{name}.{k}.bias", np.float32, (width,))
+            layers.append((self.take(f"{name}.{k}.weight", np.float32, (n_inputs, width)), bias))
+            n_inputs = width
+        return tuple(layers)
+
+    def network(
+        self,
+        name: str,
+        kind: type,
+        shapes: Mapping[str, tuple[int | None, ...]],
+        n_inputs: int,
+        n_outputs: int,
+    ) -> Any:
+        """A named tuple of float32 arrays in the `shapes` of its fields, and of `layers`."""
+        values = {item: self.take(f"{name}.{item}", np.float32, shape) for item, shape in shapes.items()}
+        values = {item: np.asarray(value, np.float32) for item, value in values.items()}
+        return kind(**values, layers=self.layers(name, n_inputs, n_outputs))
+
+    def finish(self, schema: int) -> None:
+        """Refuse entries that nobody took."""
+        for name in sorted(self._left):
+            self.fail(name, f"unknown entry, schema {schema} has none of this name")
+
+
+def _fits(shape: tuple[int, ...], wanted: tuple[int | None, ...]) -> bool:
+    same = (n == m or (m is None and n > 0) for n, m in zip(shape, wanted, strict=False))
+    return len(shape) == len(wanted) and all(same)
+
+
+def _shape_text(shape: tuple[int | None, ...]) -> str:
+    return str(tuple("any" if n is None else n for n in shape)).replace("'", "")

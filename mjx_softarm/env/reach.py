@@ -1,0 +1,308 @@
+"""One arm that reaches for poses: a brax environment with the paper's state, action and reward.
+
+An action is nine sensor frequencies, scaled to [-1, 1]; the sensor-space law turns them into pressures.
+`mode="quasistatic"` goes straight to the equilibrium (kinematics from `engine`), `mode="dynamic"` steps
+`mjx.step` under the law at the control rate.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass, field
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from mjx_softarm import control
+from mjx_softarm._support import draws
+from mjx_softarm._support.mjx import Env, State, mjx
+from mjx_softarm.mdp import observation as obs
+from mjx_softarm.mdp import rewards
+from mjx_softarm.mechanics.dynamics import Motion, advance, with_params
+from mjx_softarm.mechanics.kinematics import chain_frames, mjx_frames
+from mjx_softarm.mechanics.mjcf import build_model
+from mjx_softarm.mechanics.pipe import CrossPipe, body_clearance
+from mjx_softarm.mechanics.settle import Settled, settle
+from mjx_softarm.mechanics.statics import ArmParams
+from mjx_softarm.mechanics.workspace import HELD_OUT_SEED, Pool, sample_workspace
+from mjx_softarm.sensing import sensors
+from mjx_softarm.sensing.pose import pose_from_frame
+from mjx_softarm.sensing.s2r import S2R, carry_body, correct
+from mjx_softarm.spec import ArmSpec
+
+PAYLOAD = 1  # index in ArmParams.tool_mass_kg
+
+
+@dataclass(frozen=True)
+class Randomisation:
+    """What differs from episode to episode; all zero is the nominal arm."""
+
+    payload_max_kg: float = 0.0  # payload uniform from the spec's to this much more
+    stiffness_spread: float = 0.0  # each chamber's stiffness times 1 + uniform(-spread, spread)
+    sensor_noise_mm: float = 0.0  # standard deviation of each spring's reading, fixed within an episode
+
+    def __post_init__(self):
+        if self.payload_max_kg < 0:
+            raise ValueError(f"Randomisation.payload_max_kg: got {self.payload_max_kg}, expected >= 0")
+        if not 0 <= self.stiffness_spread < 1:
+            raise ValueError(f"Randomisation.stiffness_spread: got {self.stiffness_spread}, expected 0 to 1")
+        if self.sensor_noise_mm < 0:
+            raise ValueError(f"Randomisation.sensor_noise_mm: got {self.sensor_noise_mm}, expected >= 0")
+
+
+@dataclass(frozen=True)
+class EnvConfig:
+    """How the arm is simulated and rewarded."""
+
+    engine: Literal["chain", "mjx"] = "chain"
+    mode: Literal["quasistatic", "dynamic"] = "quasistatic"
+    reward: rewards.RewardConfig = field(default_factory=rewards.RewardConfig)
+    randomisation: Randomisation = field(default_factory=Randomisation)
+    saturation_tolerance_mm: float = 1.0
+    n_poses: int = 8192  # poses of the reachable workspace that starts and goals are drawn from
+    workspace_seed: int = 0
+    dynamic_step_s: float = 0.5  # duration of one environment step in dynamic mode
+    pipe_diameter_mm: float | None = None  # of the cross-shaped pipe around the arm, which nothing touches
+    clearance_cost_per_mm: float = 0.0  # by which the body is closer to its wall than the margin
+    clearance_margin_mm: float = 10.0
+
+    def __post_init__(self):
+        for name, allowed in (("engine", ("chain", "mjx")), ("mode", ("quasistatic", "dynamic"))):
+            if getattr(self, name) not in allowed:
+                raise ValueError(f"EnvConfig.{name}: got {getattr(self, name)!r}, expected one of {allowed}")
+        if self.pipe_diameter_mm is not None:
+            CrossPipe.of_mm(self.pipe_diameter_mm)  # raises
+        elif self.clearance_cost_per_mm:
+            raise ValueError(
+                f"EnvConfig.clearance_cost_per_mm: got {self.clearance_cost_per_mm}, expected 0 without a "
+                "pipe_diameter_mm"
+            )
+        if self.clearance_cost_per_mm < 0:
+            raise ValueError(
+                f"EnvConfig.clearance_cost_per_mm: got {self.clearance_cost_per_mm}, expected >= 0"
+            )
+        if self.n_poses < 1:
+            raise ValueError(f"EnvConfig.n_poses: got {self.n_poses}, expected at least 1")
+        if self.workspace_seed == HELD_OUT_SEED:
+            raise ValueError(f"EnvConfig.workspace_seed: {HELD_OUT_SEED} draws the goals of the evaluation")
+
+
+class Lot(NamedTuple):
+    """What chance decides of an episode."""
+
+    share: Array  # (3 + n_chambers,) from 0 to 1: start, goal, payload, stiffness of each chamber
+    noise: Array  # (n_chambers,) of the standard normal distribution, of each spring
+
+
+class ArmState(NamedTuple):
+    """One arm between two actions."""
+
+    payload_kg: Array  # () this episode's, as are the two below
+    chamber_stiffness: Array  # (n_chambers,) [N/m]
+    sensor_offset_m: Array  # (n_chambers,) reading less true length
+    motion: Motion
+    pose: Array  # (6,) [mm, deg] as observed: the real arm's where there is a sim-to-real network
+    spring_m: Array  # (n_chambers,) true lengths
+    pressure_kpa: Array  # (n_chambers,)
+    goal: Array  # (6,) [mm, deg]
+    n_steps: Array  # () actions taken in this episode
+
+
+class ReachEnv(Env):
+    """A soft arm reaching for poses of its workspace.
+
+    With a sim-to-real network, every pose that is observed, rewarded or drawn as a goal is the real arm's,
+    P_S2R, as the network tells it from the simulated pose and the spring lengths; so is the body, whose
+    distance to a pipe's wall is measured.
+    """
+
+    def __init__(self, spec: ArmSpec | None = None, config: EnvConfig | None = None, s2r: S2R | None = None):
+        self.spec = spec or ArmSpec.default()
+        self.config = config or EnvConfig()
+        self.s2r = s2r
+        if self.config.dynamic_step_s < 1.0 / self.spec.control.rate_hz:
+            raise ValueError(
+                f"EnvConfig.dynamic_step_s: got {self.config.dynamic_step_s}, expected at least one "
+                f"period of the control at control.rate_hz = {self.spec.control.rate_hz:g}"
+            )
+        self.params = jax.tree.map(jnp.asarray, ArmParams.from_spec(self.spec))
+        self.scale = obs.ObsScale.from_spec(self.spec)
+        self.gains = control.Gains.from_spec(self.spec)
+        self.sensor = sensors.SensorParams.from_spec(self.spec)
+        self.frequency_range_hz = jnp.asarray(sensors.frequency_range_hz(self.spec), jnp.float32)
+        diameter_mm = self.config.pipe_diameter_mm
+        self.pipe = None if diameter_mm is None else CrossPipe.of_mm(diameter_mm)
+        self.uses_mjx = self.config.engine == "mjx" or self.config.mode == "dynamic"
+        self.model = mjx.put_model(build_model(self.spec)) if self.uses_mjx else None
+        self.pool = self.sample_pool(self.config.n_poses, self.config.workspace_seed)
+
+    @property
+    def observation_size(self) -> int:
+        return obs.OBS_SIZE
+
+    @property
+    def action_size(self) -> int:
+        return self.spec.n_chambers
+
+    @property
+    def backend(self) -> str:
+        return "mjx"
+
+    def sample_pool(self, n: int, seed: int) -> Pool:
+        """Poses of the workspace as `sample_workspace` draws them, the poses being those observed."""
+        pool = sample_workspace(self.spec, n, seed)
+        return pool._replace(pose=self._observed_pose(pool.pose, pool.spring_m))
+
+    def _observed_pose(self, pose: Array, spring_m: Array) -> Array:
+        if self.s2r is None:
+            return pose
+        with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
+            return correct(self.s2r, pose, spring_m)
+
+    def reference_m(self, action: Array) -> Array:
+        """Spring lengths (..., n_chambers) [m] that an action in [-1, 1] asks for: frequencies, linearly."""
+        low, high = self.frequency_range_hz.T
+        frequency = low + 0.5 * (jnp.clip(action, -1.0, 1.0) + 1.0) * (high - low)
+        return sensors.length_from_frequency(frequency, self.sensor).length_m
+
+    def action_of(self, length_m: Array) -> Array:
+        """The action in [-1, 1] that asks for spring lengths (..., n_chambers) [m]."""
+        low, high = self.frequency_range_hz.T
+        frequency = sensors.frequency_from_length(length_m, self.sensor)
+        return jnp.clip(2.0 * (frequency - low) / (high - low) - 1.0, -1.0, 1.0)
+
+    def reset(self, rng: Array) -> State:
+        """A new episode: an arm of the randomisation, at a random pose, with a random goal."""
+        return self.begin(jax.tree.map(lambda x: x[0], self.draw(rng, 1)))
+
+    def draw(self, rng: Array, n: int) -> Lot:
+        """What chance decides of n new episodes: leaves (n, ...)."""
+        return Lot(*draws.both(rng, (n, 3 + self.action_size), (n, self.action_size)))
+
+    def begin(self, lot: Lot) -> State:
+        """A new episode."""
+        share = lot.share
+        start_row, goal_row = (self.config.n_poses * share[:2]).astype(jnp.int32)
+        start = jax.tree.map(lambda x: x[start_row], self.pool)
+        goal = self.pool.pose[goal_row]
+        spread = self.config.randomisation
+        arm = ArmState(
+            payload_kg=self.params.tool_mass_kg[PAYLOAD] + spread.payload_max_kg * share[2],
+            chamber_stiffness=self.params.chamber_stiffness
+            * (1.0 + spread.stiffness_spread * (2.0 * share[3:] - 1.0)),
+            sensor_offset_m=1e-3 * spread.sensor_noise_mm * lot.noise,
+            motion=Motion(start.q, jnp.zeros_like(start.q), start.pressure_kpa),
+            pose=start.pose,
+            spring_m=start.spring_m,
+            pressure_kpa=start.pressure_kpa,
+            goal=goal,
+            n_steps=jnp.zeros((), jnp.int32),
+        )
+        zero = jnp.zeros(())
+        metrics = dict.fromkeys(("tip_error_mm", "reached", "saturated_chambers", "unsettled"), zero)
+        metrics |= {f"reward_{name}": zero for name in ("goal", "error", "steps", "saturation", "clearance")}
+        info = {
+            "saturated": jnp.array(False),
+            "valid": jnp.array(True),
+            "clearance_mm": self._clearance_mm(start.q, start.pose),
+        }
+        return State(arm, self.observe(arm.pose, goal), zero, zero, metrics, info)
+
+    def step(self, state: State, action: Array) -> State:
+        """Move to the references of `action` (n_chambers,) in [-1, 1]; `done` is 1 where the goal is reached.
+
+        An arm that did not settle, or is not finite, keeps its last pose, earns nothing, ends its episode
+        and is marked by `info["valid"]`: such a transition must not be learned from.
+        """
+        arm: ArmState = state.pipeline_state
+        reference = self.reference_m(action)
+        motion, end = self._move(arm, reference - arm.sensor_offset_m)
+        valid = end.settled & jnp.all(jnp.isfinite(action))  # a NaN would ask for a length of 0
+        moved = arm._replace(
+            motion=motion,
+            pose=self._observed_pose(pose_from_frame(end.tip_position_m, end.tip_rotation), end.spring_m),
+            spring_m=end.spring_m,
+            pressure_kpa=end.pressure_kpa,
+            n_steps=arm.n_steps + 1,
+        )
+        arm = jax.tree.map(lambda new, old: jnp.where(valid, new, old), moved, arm)
+        tolerance = 1e-3 * self.config.saturation_tolerance_mm
+        reading = arm.spring_m + arm.sensor_offset_m
+        saturated = control.saturated(arm.pressure_kpa, reference, reading, self.gains, tolerance) & valid
+        clearance_mm = self._clearance_mm(arm.motion.q, arm.pose)
+        terms: dict[str, Array]
+        value, reached, terms = rewards.reward(
+            arm.pose,
+            arm.goal,
+            arm.n_steps,
+            jnp.any(saturated),
+            self.config.reward,
+            self.clearance_cost(clearance_mm),
+        )
+        metrics = {
+            "tip_error_mm": jnp.linalg.norm(arm.pose[:3] - arm.goal[:3]),
+            "reached": (reached & valid).astype(jnp.float32),
+            "saturated_chambers": jnp.sum(saturated).astype(jnp.float32),
+            "unsettled": (~valid).astype(jnp.float32),
+        } | {
+            f"reward_{name}": jnp.where(valid, term, 0.0).astype(jnp.float32) for name, term in terms.items()
+        }
+        return state.replace(
+            pipeline_state=arm,
+            obs=self.observe(arm.pose, arm.goal),
+            reward=jnp.where(valid, value, 0.0),
+            done=(reached | ~valid).astype(jnp.float32),
+            metrics={**state.metrics, **metrics},
+            info={
+                **state.info,
+                "saturated": jnp.any(saturated),
+                "valid": valid,
+                "clearance_mm": clearance_mm,
+            },
+        )
+
+    def _move(self, arm: ArmState, reference_m: Array) -> tuple[Motion, Settled]:
+        params = self.params_of(arm)
+        if self.config.mode == "dynamic":
+            return advance(
+                with_params(self.model, params),
+                arm.motion,
+                reference_m,
+                self.gains,
+                self.config.dynamic_step_s,
+                1.0 / self.spec.control.rate_hz,
+            )
+        if self.config.engine == "mjx":
+            kinematics = functools.partial(mjx_frames, self.model)
+        else:
+            kinematics = functools.partial(chain_frames, link_length_m=params.link_length_m)
+        end = settle(kinematics, params, reference_m)
+        return Motion(end.q, jnp.zeros_like(end.q), end.pressure_kpa), end
+
+    def clearance_cost(self, clearance_mm: Array) -> Array:
+        """What the reward loses for clearances (...) [mm] of the body to the pipe's wall."""
+        within_mm = jnp.maximum(self.config.clearance_margin_mm - clearance_mm, 0.0)
+        return self.config.clearance_cost_per_mm * within_mm
+
+    def _clearance_mm(self, q: Array, pose: Array) -> Array:
+        """Of the body, whose tip has this pose, to the pipe's wall, (); infinite without a pipe."""
+        if self.pipe is None:
+            return jnp.asarray(jnp.inf, q.dtype)
+        frames = chain_frames(q, self.params.link_length_m)
+        plates = frames.plate_position, frames.plate_rotation
+        if self.s2r is not None:
+            plates = carry_body(*plates, pose)
+        return 1e3 * body_clearance(self.pipe, *plates, self.spec)
+
+    def observe(self, pose: Array, goal: Array) -> Array:
+        """The observation (..., 18) of a pose and a goal (..., 6) [mm, deg]."""
+        return obs.observe(pose, goal, self.scale, self.config.reward)
+
+    def params_of(self, arm: ArmState) -> ArmParams:
+        """The numbers of an arm, of which some are its episode's."""
+        return self.params._replace(
+            tool_mass_kg=self.params.tool_mass_kg.at[PAYLOAD].set(arm.payload_kg),
+            chamber_stiffness=arm.chamber_stiffness,
+        )

@@ -1,0 +1,78 @@
+"""Many arms at once, with a time limit and automatic resets."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.sharding import Mesh, PartitionSpec
+
+from mjx_softarm._support import draws
+from mjx_softarm._support.mjx import State
+from mjx_softarm.env import ReachEnv
+
+
+def over_arms(function: Callable, mesh: Mesh | None = None) -> Callable:
+    """A function of one arm as one of many, by their first axis.
+
+    With a mesh of devices, each does its share of the arms, which must be equal ones, and does not wait for
+    the slowest arm of another.
+    """
+    all_arms = jax.vmap(function)
+    if mesh is None:
+        return all_arms
+    spec = PartitionSpec(mesh.axis_names)
+    return jax.shard_map(all_arms, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
+
+
+class Outcome(NamedTuple):
+    """What one action of each arm led to, before any reset."""
+
+    final_obs: Array  # (n, obs_size) the successor's observation, also where the episode ended
+    reward: Array  # (n,)
+    terminated: Array  # (n,) bool: goal reached; the value after it is zero
+    truncated: Array  # (n,) bool: time limit; the value after it is that of `final_obs`
+    valid: Array  # (n,) bool: the arm settled; learn from nothing else
+
+
+class VectorEnv:
+    """`n` independent arms; an arm whose episode ended starts a new one, with a new goal.
+
+    With a mesh of devices, each steps its share of the arms; see `over_arms`.
+    """
+
+    def __init__(self, env: ReachEnv, n: int, episode_length: int, mesh: Mesh | None = None):
+        self.env, self.n, self.episode_length, self.mesh = env, n, episode_length, mesh
+
+    def reset(self, key: Array) -> State:
+        """State of n fresh arms."""
+        with draws.on(self.mesh):
+            drawn = self.env.draw(key, self.n)
+        return over_arms(self.env.begin, self.mesh)(drawn)
+
+    def step(self, state: State, action: Array, key: Array) -> tuple[State, State, Outcome]:
+        """Act once.
+
+        Args:
+            state: of n arms.
+            action (n, action_size) in [-1, 1].
+            key: for the new episodes.
+
+        Returns:
+            The state to act on next (reset where an episode ended), the state that the action led to,
+            and how the episodes stand.
+        """
+        after = over_arms(self.env.step, self.mesh)(state, action)
+        valid = after.info["valid"]
+        terminated = (after.done > 0) & valid
+        truncated = (after.pipeline_state.n_steps >= self.episode_length) & ~terminated
+        over = terminated | truncated | ~valid
+        fresh = self.reset(key)
+        following = jax.tree.map(
+            lambda new, old: jnp.where(over.reshape((-1,) + (1,) * (old.ndim - 1)), new, old), fresh, after
+        )
+        following = following.replace(metrics=after.metrics)
+        return following, after, Outcome(after.obs, after.reward, terminated, truncated, valid)

@@ -1,0 +1,137 @@
+"""Log files as matrices: the columns that the schema knows, in the units used inside, and nothing yet judged.
+
+What the readers of logs share. A file that cannot be understood is refused here, with a line for each column
+that is missing, has a wrong unit or stands there twice; which rows to believe is for the readers to say.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from mjx_softarm.logs.checks import Finding, LogError
+from mjx_softarm.logs.schema import GROUPS, UNITS, Column, Log, log_columns
+from mjx_softarm.logs.tables import Table, read_table
+
+_CELL = re.compile(r"(\w+)\s*(?:\[(.*)\])?")
+
+
+class Sheet(NamedTuple):
+    """The known columns of a log."""
+
+    file: str
+    columns: tuple[Column, ...]  # (k,) with the file's units, in the order of `log_columns`: time first
+    values: np.ndarray  # (n, k) in the units used inside
+    row: np.ndarray  # (n,) line of the file
+
+    def of(self, *groups: str) -> list[int]:
+        """Indices of the columns that are part of these fields of `Log`."""
+        return [k for k, column in enumerate(self.columns) if column.group in groups]
+
+    def bodies(self) -> Iterator[tuple[str, list[int]]]:
+        """Tip and markers, each with the indices of its coordinates."""
+        columns = self.of("tip_m", "marker_m")
+        for start in range(0, len(columns), 3):
+            yield self.columns[columns[start]].name[:-2], columns[start : start + 3]
+
+    def log(self) -> Log:
+        """The same as a log."""
+        groups = {name: self.values[:, chosen] for name in GROUPS if (chosen := self.of(name))}
+        for name in ("time_s", "payload_kg", "sequence"):
+            if name in groups:
+                groups[name] = groups[name][:, 0]
+        if "marker_m" in groups:
+            groups["marker_m"] = groups["marker_m"].reshape(len(self.row), -1, 3)
+        return Log(source=self.file, row=self.row, **groups)
+
+
+def read_sheet(
+    path: str | Path, n_chambers: int, needed: Sequence[str] = (), one_of: Sequence[str] = ()
+) -> tuple[Sheet, list[Finding]]:
+    """Read the known columns of a file; unknown ones are findings.
+
+    Args:
+        path: CSV, or npz by the end of its name.
+        n_chambers: of the arm; a log of another number is refused.
+        needed: fields of `Log` whose columns must be there, besides time.
+        one_of: fields of `Log` of which one at least must be there.
+
+    Raises:
+        LogError: the file cannot be understood; the message has a line for each finding.
+    """
+    table = read_table(path)
+    with np.errstate(over="ignore", invalid="ignore"):  # any number may stand in a file
+        return _sheet(str(path), table, n_chambers, ("time_s", *needed), one_of)
+
+
+def refuse(findings: Sequence[Finding]) -> None:
+    """Raise a `LogError` with all findings, if there are any."""
+    if findings:
+        raise LogError(findings)
+
+
+def _sheet(
+    file: str, table: Table, n_chambers: int, needed: Sequence[str], one_of: Sequence[str]
+) -> tuple[Sheet, list[Finding]]:
+    matches = [_CELL.fullmatch(cell) for cell in table.names]
+    names = [match[1] if match else cell for match, cell in zip(matches, table.names, strict=True)]
+    units = {name: match[2] if match else None for name, match in zip(names, matches, strict=True)}
+    markers = [int(match[1]) for name in names if (match := re.fullmatch(r"marker(\d+)_[xyz]", name))]
+    n_markers = min(1 + max(markers, default=-1), len(names))
+    known = {column.name: column for column in log_columns(n_chambers, n_markers)}
+
+    problems = [*_header_errors(names, units, known), *_absent(names, known, needed, one_of)]
+    refuse([Finding(file, (1, 1), name, problem) for name, problem in problems])
+    present = [column for name, column in known.items() if name in names]
+    columns = tuple(dataclasses.replace(column, unit=units[column.name]) for column in present)
+    values = table.values[:, [names.index(column.name) for column in columns]]
+    values *= [UNITS[column.kind][column.unit] for column in columns]
+    extra = [Finding(file, (1, 1), name, "unknown column, ignored") for name in names if name not in known]
+    return Sheet(file, columns, values, table.row), extra
+
+
+def _header_errors(names: list[str], units: dict, known: dict) -> Iterator[tuple[str, str]]:
+    if not _is_header(names):
+        yield "", f"expected a header such as `time [s],pressure0 [kPa],...`, got {', '.join(names)[:60]}"
+        return
+    for name, unit in units.items():
+        if names.count(name) > 1:
+            yield name, f"{names.count(name)} columns of this name, expected one"
+        if name in known and unit not in UNITS[known[name].kind]:
+            expected = ", ".join(f"[{unit}]" for unit in UNITS[known[name].kind])
+            yield name, f"got {'no unit' if unit is None else f'[{unit}]'}, expected one of {expected}"
+        if name not in known and re.fullmatch(r"(frequency|spring|pressure|reference)\d+", name):
+            n_chambers = sum(column.group == "spring_m" for column in known.values())
+            yield name, f"expected a log of {n_chambers} chambers, numbered from 0"
+    for group in {known[name].group for name in names if name in known}:
+        wanted = [name for name, column in known.items() if column.group == group]
+        if missing := [name for name in wanted if name not in names]:
+            beside = next(name for name in wanted if name in names)
+            yield ", ".join(missing), f"missing, expected beside {beside}"
+
+
+def _absent(
+    names: list[str], known: dict, needed: Sequence[str], one_of: Sequence[str]
+) -> Iterator[tuple[str, str]]:
+    """Groups of which not one column is there."""
+    if not _is_header(names):
+        return
+    groups = {known[name].group for name in names if name in known}
+    for group in needed:
+        if group not in groups:
+            first, *others = [column for column in known.values() if column.group == group]
+            expected = f"columns `{first.header}` to `{others[-1].name}`" if others else None
+            yield first.name, f"missing, expected {expected or f'a column `{first.header}`'}"
+    if one_of and not groups & set(one_of):
+        firsts = [next(column for column in known.values() if column.group == group) for group in one_of]
+        *most, last = [f"{column.name}.." for column in firsts]
+        yield "", f"expected {', '.join(most)} or {last}; got only {', '.join(names)[:60]}"
+
+
+def _is_header(names: list[str]) -> bool:
+    return any(name[:1].isalpha() for name in names)

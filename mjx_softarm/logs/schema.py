@@ -1,0 +1,138 @@
+"""Logs of an arm: one table of columns with units, written by the control loop and read by `calib`.
+
+A log is a CSV file whose header names each column with its unit, `pressure0 [kPa]`, or an npz file with the
+same: `columns` (k,) of text and `table` (n, k) of float64. Which columns there are, and which units a
+file may use, stands here alone; files that somebody brings are read by `mjx_softarm.logs.files`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+
+# Kind of quantity -> units a file may use, each with its factor to the unit used inside, which comes first.
+UNITS: Mapping[str, Mapping[str, float]] = MappingProxyType(
+    {
+        "time": {"s": 1.0, "ms": 1e-3},
+        "frequency": {"Hz": 1.0, "kHz": 1e3, "MHz": 1e6},
+        "length": {"m": 1.0, "mm": 1e-3, "cm": 1e-2},
+        "pressure": {"kPa": 1.0, "Pa": 1e-3, "bar": 100.0, "mbar": 0.1, "psi": 6.894757293168},
+        "mass": {"kg": 1.0, "g": 1e-3},
+        "number": {"1": 1.0},
+        "id": {"1": 1.0},
+        "pose_length": {"mm": 1.0, "m": 1e3, "cm": 10.0},
+        "angle": {"deg": 1.0, "rad": 180.0 / np.pi},
+    }
+)
+_XYZ = ("x", "y", "z")
+_POSE = {
+    **dict.fromkeys(_XYZ, ("pose_length", "mm")),
+    **dict.fromkeys(("yaw", "pitch", "roll"), ("angle", "deg")),
+}
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column of a log file."""
+
+    group: str  # the field of `Log` that it is part of
+    name: str  # as in the header, without the unit
+    kind: str  # key of UNITS
+    unit: str  # that `write_log` uses
+
+    @property
+    def header(self) -> str:
+        return f"{self.name} [{self.unit}]"
+
+
+def log_columns(n_chambers: int, n_markers: int = 0) -> tuple[Column, ...]:
+    """All columns that a log of such an arm may have, in the order in which they are written."""
+    chambers, markers = range(n_chambers), range(n_markers)
+    return (
+        Column("time_s", "time", "time", "s"),
+        *(Column("frequency_hz", f"frequency{k}", "frequency", "Hz") for k in chambers),
+        *(Column("spring_m", f"spring{k}", "length", "mm") for k in chambers),
+        *(Column("pressure_kpa", f"pressure{k}", "pressure", "kPa") for k in chambers),
+        *(Column("tip_m", f"tip_{axis}", "length", "mm") for axis in _XYZ),
+        *(Column("tip_quaternion", f"tip_q{part}", "number", "1") for part in "wxyz"),
+        *(Column("marker_m", f"marker{k}_{axis}", "length", "mm") for k in markers for axis in _XYZ),
+        Column("payload_kg", "payload", "mass", "g"),
+        *(Column("reference_m", f"reference{k}", "length", "mm") for k in chambers),
+        *(Column("goal", f"goal_{axis}", *_POSE[axis]) for axis in _POSE),
+        *(Column("estimate", f"estimate_{axis}", *_POSE[axis]) for axis in _POSE),
+        Column("sequence", "sequence", "id", "1"),
+    )
+
+
+@dataclass(frozen=True)
+class Log:
+    """Rows of one log, in time's order; a quantity that was not logged is None.
+
+    Chambers and springs are numbered as in the model. Positions and orientation are in the base frame (see
+    `mjx_softarm.sensing.pose`), the tip being the centre of the last plate.
+    """
+
+    source: str  # the file, for messages
+    row: np.ndarray  # (n,) line of the file that a row came from, the header being line 1
+    time_s: np.ndarray  # (n,)
+    frequency_hz: np.ndarray | None = None  # (n, n_chambers)
+    spring_m: np.ndarray | None = None  # (n, n_chambers) measured otherwise than by their frequencies
+    pressure_kpa: np.ndarray | None = None  # (n, n_chambers) relative to the atmosphere
+    tip_m: np.ndarray | None = None  # (n, 3)
+    tip_quaternion: np.ndarray | None = None  # (n, 4) w, x, y, z
+    marker_m: np.ndarray | None = None  # (n, n_markers, 3) from the base to the tip
+    payload_kg: np.ndarray | None = None  # (n,)
+    reference_m: np.ndarray | None = None  # (n, n_chambers) spring lengths that were asked for
+    goal: np.ndarray | None = None  # (n, 6) [mm, deg]
+    estimate: np.ndarray | None = None  # (n, 6) [mm, deg] tip pose that the controller believed in
+    sequence: np.ndarray | None = None  # (n,) which demonstration a row is part of, counted from 0
+
+    def __len__(self) -> int:
+        return len(self.time_s)
+
+    def take(self, rows: np.ndarray) -> Log:
+        """The same log with some rows alone, given by their indices or a mask (n,)."""
+        values = {name: getattr(self, name) for name in GROUPS}
+        kept = {name: None if value is None else value[rows] for name, value in values.items()}
+        return dataclasses.replace(self, row=self.row[rows], **kept)
+
+
+GROUPS = tuple(item.name for item in dataclasses.fields(Log) if item.name not in ("source", "row"))
+
+
+def log_table(log: Log) -> tuple[tuple[Column, ...], np.ndarray]:
+    """The columns (k,) that a log has, and its numbers (n, k) in the units of the columns."""
+    per_chamber = [getattr(log, name) for name in ("frequency_hz", "spring_m", "pressure_kpa", "reference_m")]
+    n_chambers = max((value.shape[1] for value in per_chamber if value is not None), default=0)
+    n_markers = 0 if log.marker_m is None else log.marker_m.shape[1]
+    columns = tuple(c for c in log_columns(n_chambers, n_markers) if getattr(log, c.group) is not None)
+    present = [value for name in GROUPS if (value := getattr(log, name)) is not None]
+    table = np.concatenate([np.reshape(value, (len(log), -1)) for value in present], axis=1)
+    return columns, table / np.array([UNITS[c.kind][c.unit] for c in columns])
+
+
+def write_log(path: str | Path, log: Log) -> None:
+    """Write a log as CSV, or as npz where the name ends so; whole or not at all.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    path = Path(path)
+    columns, table = log_table(log)
+    headers = [column.header for column in columns]
+    part = path.with_name(path.name + ".part")
+    try:
+        with part.open("wb") as file:
+            if path.suffix == ".npz":
+                np.savez(file, columns=np.array(headers), table=table)
+            else:
+                np.savetxt(file, table, "%.9g", ",", header=",".join(headers), comments="")
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)

@@ -1,0 +1,157 @@
+"""Numbers from files: CSV and npz into a matrix, or an error that names the line and the column.
+
+Well-formed text goes through NumPy's fast reader. Only where that fails, or where line numbers are in doubt,
+is the file read again line by line, to say what is wrong with it.
+"""
+
+from __future__ import annotations
+
+import warnings
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from mjx_softarm.logs.checks import Finding, LogError
+
+_HEAD_BYTES = 1 << 16
+_OTHER_DELIMITERS = {";": "semicolons", "\t": "tabs", "|": "bars"}
+
+
+class Table(NamedTuple):
+    """The numbers of a file."""
+
+    names: tuple[str, ...]  # (k,) as in the header
+    values: np.ndarray  # (n, k)
+    row: (
+        np.ndarray
+    )  # (n,) line of the file, the first being 1; of an npz file as if it had a header in line 1
+
+
+def read_table(path: str | Path, names: Sequence[str] | None = None) -> Table:
+    """Read a CSV file, or an npz file as `mjx_softarm.logs.schema` has it.
+
+    Args:
+        path: the file; npz where its name ends so.
+        names: the columns of a CSV file without a header.
+
+    Raises:
+        LogError: the file cannot be read as such.
+    """
+    path = Path(path)
+    try:
+        if path.suffix == ".npz":
+            return _read_npz(path)
+        return _read_csv(path, names)
+    except OSError as error:
+        raise _error(path, error.strerror or str(error)) from error
+
+
+def _error(path: Path, problem: str, line: int | None = None, column: str = "") -> LogError:
+    return LogError([Finding(str(path), None if line is None else (line, line), column, problem)])
+
+
+def _read_npz(path: Path) -> Table:
+    expected = "expected an npz file with `columns` (k,) of text and `table` (n, k) of numbers"
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+            columns, values = arrays["columns"], arrays["table"]
+    except (ValueError, KeyError, EOFError, AttributeError, TypeError, zipfile.BadZipFile) as error:
+        raise _error(path, f"{expected}, got: {error}") from error
+    shapes = f"columns {columns.shape} of {columns.dtype}, table {values.shape} of {values.dtype}"
+    fits = columns.dtype.kind == "U" and values.dtype.kind in "fiu" and values.ndim == 2
+    if not fits or columns.shape != values.shape[1:]:
+        raise _error(path, f"{expected}, got {shapes}")
+    if len(values) == 0:
+        raise _error(path, "no rows, expected at least 2")
+    return Table(tuple(map(str, columns)), values.astype(np.float64), np.arange(len(values)) + 2)
+
+
+def _read_csv(path: Path, names: Sequence[str] | None) -> Table:
+    with path.open("rb") as file:
+        head = file.read(_HEAD_BYTES)
+    _check_text(path, head)
+    first = head.decode("utf-8-sig", errors="replace").splitlines()[0]
+    n_header = 0 if names else 1
+    names = tuple(names or (name.strip() for name in first.split(",")))
+    if "," not in first:
+        found = [text for mark, text in _OTHER_DELIMITERS.items() if mark in first]
+        got = f"{found[0]} between the columns" if found else f"one column, {first[:60]!r}"
+        raise _error(path, f"expected columns parted by commas, and decimal points; got {got}", 1)
+    n_lines = _count_lines(path)
+    if n_lines <= n_header:
+        raise _error(path, "a header and no rows, expected at least 2 rows")
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "loadtxt: input contained no data")  # an error below
+            values = np.loadtxt(
+                path, delimiter=",", skiprows=n_header, ndmin=2, comments=None, encoding="utf-8-sig"
+            )
+    except ValueError:
+        return _read_lines(path, names, n_header)
+    if values.shape != (n_lines - n_header, len(names)):  # blank lines, or a header of another length
+        return _read_lines(path, names, n_header)
+    return Table(names, values, np.arange(len(values)) + 1 + n_header)
+
+
+def _check_text(path: Path, head: bytes) -> None:
+    if not head.strip():
+        raise _error(path, "an empty file, expected a header and rows")
+    if head.startswith((b"\xff\xfe", b"\xfe\xff")) or (
+        not head.startswith(b"PK") and 0.3 < head.count(0) / len(head) < 0.6 and head[:512].isascii()
+    ):
+        raise _error(path, "UTF-16 text, expected UTF-8; save the file again with that encoding")
+    if 0 in head:
+        raise _error(path, "a binary file, expected CSV text (or npz, by the end of its name)")
+    try:
+        head[: head.rfind(b"\n") + 1].decode("utf-8")
+    except UnicodeDecodeError as error:
+        got = f"byte 0x{head[error.start]:02x} at {error.start}"
+        line = head.count(b"\n", 0, error.start) + 1
+        raise _error(path, f"neither UTF-8 text nor npz: {got}", line) from error
+
+
+def _count_lines(path: Path) -> int:
+    n, last = 0, b"\n"
+    with path.open("rb") as file:
+        while chunk := file.read(1 << 22):
+            n, last = n + chunk.count(b"\n"), chunk[-1:]
+    return n + (last != b"\n")
+
+
+def _read_lines(path: Path, names: tuple[str, ...], n_header: int) -> Table:
+    """Line by line: blank lines are passed over, empty cells are NaN, anything else is an error."""
+    values, row = [], []
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
+        for number, line in enumerate(file, 1):
+            if number <= n_header or not line.strip():
+                continue
+            cells = line.rstrip("\r\n").split(",")
+            if len(cells) != len(names):
+                raise _error(path, _ragged(line, len(cells), len(names)), number)
+            try:
+                numbers = np.array([float(cell) if cell.strip() else np.nan for cell in cells])
+            except ValueError:
+                name, cell = next(pair for pair in zip(names, cells, strict=True) if not _is_number(pair[1]))
+                raise _error(path, f"got {cell.strip()[:40]!r}, expected a number", number, name) from None
+            values.append(numbers)
+            row.append(number)
+    if not values:
+        raise _error(path, "a header and no rows, expected at least 2 rows")
+    return Table(names, np.stack(values), np.array(row))
+
+
+def _ragged(line: str, n_cells: int, n_names: int) -> str:
+    found = [text for mark, text in _OTHER_DELIMITERS.items() if mark in line]
+    hint = f", and {found[0]}" if found else "; decimal commas?" if n_cells >= 1.5 * n_names else ""
+    return f"got {n_cells} cells{hint}; expected {n_names}, as in the header"
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return not cell.strip()
+    return True

@@ -1,0 +1,75 @@
+"""The reward of reaching: one function for simulation, relabelling, twin and deployed arm.
+
+Source: the paper's reward equation. Its three cases become terms that add up:
+
+    saturated:  -saturation_cost
+    reached:     goal_bonus
+    otherwise:  -error_cost ||e|| - step_cost N,    e = w (pose - goal).
+
+An environment may also charge for a body close to a wall, in all three cases; the paper has no such term.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from mjx_softarm._support.xp import array_namespace
+from mjx_softarm.sensing.pose import pose_error
+
+
+@dataclass(frozen=True)
+class RewardConfig:
+    """The paper's weights; `threshold` is theta, about 5.4 mm with no rotation error."""
+
+    goal_bonus: float = 100.0
+    error_cost: float = 10.0
+    step_cost: float = 0.1
+    saturation_cost: float = 100.0
+    threshold: float = 0.03
+    weight_per_mm: float = 0.0056
+    weight_per_deg: float = 0.001
+
+
+def scaled_error(pose: Any, goal: Any, config: RewardConfig) -> Any:
+    """e = w (pose - goal), (..., 6) without unit, angles wrapped.
+
+    Args:
+        pose (..., 6) [mm, deg]: where the tip is, or a goal reached in hindsight.
+        goal (..., 6) [mm, deg]: where it should be.
+        config: the weights.
+    """
+    xp = array_namespace(pose)
+    weight = xp.asarray([config.weight_per_mm] * 3 + [config.weight_per_deg] * 3, dtype=pose.dtype)
+    return weight * pose_error(pose, goal)
+
+
+def reward(
+    pose: Any, goal: Any, n_steps: Any, saturated: Any, config: RewardConfig, clearance_cost: Any = 0.0
+) -> tuple[Any, Any, dict[str, Any]]:
+    """Reward of a pose after an action.
+
+    Args:
+        pose (..., 6) [mm, deg]: achieved after the action.
+        goal (..., 6) [mm, deg]: wanted.
+        n_steps (...,): environment steps of the episode, this one included.
+        saturated (...,) bool: any chamber at its pressure limit with its spring off its reference.
+        config: the weights.
+        clearance_cost (...,): for a body close to a wall.
+
+    Returns:
+        Reward (...,); whether the goal is reached (...,) bool, which ends an episode; the terms by name.
+    """
+    xp = array_namespace(pose)
+    norm = xp.sqrt(xp.sum(scaled_error(pose, goal, config) ** 2, axis=-1))
+    close = norm < config.threshold
+    reached = close & ~saturated
+    on_the_way = ~close & ~saturated
+    terms = {
+        "goal": xp.where(reached, config.goal_bonus, 0.0),
+        "error": xp.where(on_the_way, -config.error_cost * norm, 0.0),
+        "steps": xp.where(on_the_way, -config.step_cost * n_steps, 0.0),
+        "saturation": xp.where(saturated, -config.saturation_cost, 0.0),
+        "clearance": xp.zeros_like(norm) - clearance_cost,
+    }
+    return sum(terms.values()), reached, terms

@@ -1,0 +1,90 @@
+"""Transients: MJX stepped in time under the sensor-space law at the control rate."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from mjx_softarm import control
+from mjx_softarm._support.mjx import mjx
+from mjx_softarm.mechanics.mjcf import steps_per_period
+from mjx_softarm.mechanics.settle import Settled
+from mjx_softarm.mechanics.statics import ArmParams
+
+
+class Motion(NamedTuple):
+    """What a moving arm carries from one instant to the next."""
+
+    q: Array  # (nv,) [m, rad, rad]
+    velocity: Array  # (nv,) [m/s, rad/s, rad/s]
+    integral_kpa: Array  # (n_chambers,) of the sensor-space law
+
+
+def with_params(model: mjx.Model, params: ArmParams) -> mjx.Model:
+    """The model with the masses and stiffnesses of `params`; damping and geometry stay the model's."""
+    stiffness = jnp.stack([params.chamber_stiffness, params.spring_stiffness], axis=1).reshape(-1)
+    mass = jnp.concatenate([jnp.zeros(1), params.link_mass_kg, params.tool_mass_kg])
+    scale = jnp.where(model.body_mass > 0, mass / jnp.maximum(model.body_mass, 1e-9), 0.0)
+    return model.replace(
+        body_mass=mass,
+        body_inertia=model.body_inertia * scale[:, None],
+        jnt_stiffness=params.joint_stiffness,
+        tendon_stiffness=stiffness,
+    )
+
+
+def advance(
+    model: mjx.Model,
+    motion: Motion,
+    reference_m: Array,
+    gains: control.Gains,
+    duration_s: float,
+    period_s: float,
+) -> tuple[Motion, Settled]:
+    """Run the arm for a while under the law.
+
+    Args:
+        model: the arm, from `mjx_softarm.mechanics.mjcf`.
+        motion: where it starts.
+        reference_m (n_chambers,): spring lengths that the law tracks.
+        gains: of the law.
+        duration_s: how long; a whole number of control periods.
+        period_s: of the control, that of the model's specification.
+
+    Returns:
+        Where it ends, and the same as a report in which `settled` only says that everything is finite,
+        and `residual` is the largest joint acceleration.
+    """
+    data = mjx.make_data(model).replace(qpos=motion.q, qvel=motion.velocity)
+    data = mjx.tendon(model, mjx.com_pos(model, mjx.kinematics(model, data)))
+
+    def tick(carry, _):
+        data, integral = carry
+        pressure, integral = control.pressures(reference_m, data.ten_length[1::2], integral, gains, period_s)
+        data = data.replace(ctrl=pressure)
+        data = jax.lax.fori_loop(0, steps_per_period(period_s), lambda _, d: mjx.step(model, d), data)
+        data = mjx.tendon(model, mjx.com_pos(model, mjx.kinematics(model, data)))
+        return (data, integral), None
+
+    with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
+        (data, integral), _ = jax.lax.scan(
+            tick, (data, motion.integral_kpa), None, length=round(duration_s / period_s)
+        )
+    end = Motion(data.qpos, data.qvel, integral)
+    error = jnp.abs(reference_m - data.ten_length[1::2])
+    at_limit = (data.ctrl <= gains.pressure_min_kpa) | (data.ctrl >= gains.pressure_max_kpa)
+    return end, Settled(
+        q=data.qpos,
+        pressure_kpa=data.ctrl,
+        spring_m=data.ten_length[1::2],
+        tip_position_m=data.site_xpos[-1],
+        tip_rotation=data.site_xmat[-1],
+        at_limit=at_limit,
+        residual=jnp.max(jnp.abs(data.qacc)),
+        tracking_error_m=jnp.max(jnp.where(at_limit, 0.0, error)),
+        settled=jnp.all(jnp.isfinite(data.qpos)) & jnp.all(jnp.isfinite(data.qvel)),
+        iterations=jnp.array(0),
+    )

@@ -1,0 +1,81 @@
+"""Poses of the plates and of the joints, from MJX or from the closed-form chain.
+
+The arm is a chain of links. Each link joins a plate to the next one by a slide along the
+parent plate's -z (positive = extension) and two perpendicular hinges, x then y, half a link below;
+joint coordinates are `q (3 * n_links,)`, ordered (slide [m], hinge x [rad], hinge y [rad]) link by link.
+Both functions of this module return the same `Frames`; everything downstream is shared.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from mjx_softarm._support.mjx import mjx
+from mjx_softarm._support.small_matrices import product
+
+DOFS_PER_LINK = 3
+
+
+class Frames(NamedTuple):
+    """Where the arm's plates and joints are, in the base frame (z up)."""
+
+    plate_position: Array  # (n_links + 1, 3) [m], the first is the base
+    plate_rotation: Array  # (n_links + 1, 3, 3), columns are the plate's axes
+    axis: Array  # (n_links, 3 dofs, 3), unit vectors: slide, hinge x, hinge y
+    anchor: Array  # (n_links, 3) [m], the point both hinges turn about
+
+
+def chain_frames(q: Array, link_length_m: Array | float) -> Frames:
+    """Frames in closed form: products of the links' rotations, sums of the links' vectors.
+
+    Args:
+        q (3 * n_links,): joint coordinates [m, rad, rad].
+        link_length_m: distance of two plates at rest.
+    """
+    slide, bend_x, bend_y = jnp.moveaxis(q.reshape(-1, DOFS_PER_LINK), -1, 0)  # (L,) each
+    local = _rotation_xy(bend_x, bend_y)  # (L, 3, 3)
+    rotation = jax.lax.associative_scan(product, local)  # (L, 3, 3)
+    plate_rotation = jnp.concatenate([jnp.eye(3, dtype=q.dtype)[None], rotation])
+    parent, child = plate_rotation[:-1], plate_rotation[1:]
+    half = 0.5 * link_length_m
+    to_anchor = -(half + slide)[:, None] * parent[:, :, 2]
+    to_plate = to_anchor - half * child[:, :, 2]
+    plate_position = jnp.concatenate([jnp.zeros((1, 3), q.dtype), jnp.cumsum(to_plate, axis=0)])
+    cos, sin = jnp.cos(bend_x)[:, None], jnp.sin(bend_x)[:, None]
+    axis_y = cos * parent[:, :, 1] + sin * parent[:, :, 2]
+    axis = jnp.stack([-parent[:, :, 2], parent[:, :, 0], axis_y], axis=1)
+    return Frames(plate_position, plate_rotation, axis, plate_position[:-1] + to_anchor)
+
+
+def _rotation_xy(x: Array, y: Array) -> Array:
+    """Rx(x) Ry(y), (..., 3, 3)."""
+    cx, sx, cy, sy = jnp.cos(x), jnp.sin(x), jnp.cos(y), jnp.sin(y)
+    zero = jnp.zeros_like(x)
+    rows = [[cy, zero, sy], [sx * sy, cx, -sx * cy], [-cx * sy, sx, cx * cy]]
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def mjx_frames(model: mjx.Model, q: Array) -> Frames:
+    """The same frames from `mjx.kinematics` of a model that `mjx_softarm.mechanics.mjcf` built.
+
+    Args:
+        model: the compiled arm on the device; its first bodies are the world and the links in order.
+        q (3 * n_links,): joint coordinates [m, rad, rad].
+    """
+    n_links = q.shape[-1] // DOFS_PER_LINK
+    data = mjx.kinematics(model, mjx.make_data(model).replace(qpos=q))
+    links = slice(1, n_links + 1)
+    rotation = data.xmat[links].reshape(n_links, 3, 3)
+    anchor = data.xpos[links]
+    half = -model.body_pos[1, 2]
+    position = anchor - half * rotation[:, :, 2]
+    return Frames(
+        plate_position=jnp.concatenate([jnp.zeros((1, 3), q.dtype), position]),
+        plate_rotation=jnp.concatenate([jnp.eye(3, dtype=q.dtype)[None], rotation]),
+        axis=data.xaxis[: n_links * DOFS_PER_LINK].reshape(n_links, DOFS_PER_LINK, 3),
+        anchor=anchor,
+    )

@@ -1,0 +1,178 @@
+"""ArmSpec -> MuJoCo model: links, chambers and springs, every object named.
+
+Names: bodies `link{i}`, `gripper`, `payload`; joints `slide{i}`, `bend_x{i}`, `bend_y{i}`; tendons and
+actuators `chamber{i}`, tendons `spring{i}`; site `tip`. Links count from 0 at the base, chambers and
+springs from 0 section by section. An actuator's control is its chamber's pressure in kPa.
+"""
+
+from __future__ import annotations
+
+import math
+
+import mujoco
+import numpy as np
+
+from mjx_softarm.mechanics.body import SPRING_WIDTH_M, gripper_boxes, payload_radius_m, ring_radius_m
+from mjx_softarm.mechanics.statics import GRAVITY_M_S2, ArmParams
+from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
+
+MAX_TIMESTEP_S = 0.004
+_SECTION_COLOURS = ([0.85, 0.33, 0.24, 1.0], [0.95, 0.68, 0.25, 1.0], [0.25, 0.55, 0.80, 1.0])
+_RING_COLOUR = [0.25, 0.27, 0.30, 1.0]
+_SPRING_COLOUR = [0.75, 0.77, 0.80, 1.0]
+_GRIPPER_COLOUR = [0.15, 0.16, 0.18, 1.0]
+_RING_HALF_HEIGHT_M = 0.002
+_BELLOWS_DRAWN = 0.45  # of the outer diameter: the convolutions are not drawn
+
+
+def build_spec(spec: ArmSpec) -> mujoco.MjSpec:
+    """The arm as an editable `mujoco.MjSpec`, for adding an environment before compiling."""
+    params = ArmParams.from_spec(spec, np.float64)
+    mjspec = mujoco.MjSpec()
+    mjspec.modelname = spec.name
+    mjspec.option.gravity = [0.0, 0.0, -GRAVITY_M_S2]
+    period_s = 1.0 / spec.control.rate_hz
+    mjspec.option.timestep = period_s / steps_per_period(period_s)
+    mjspec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    mjspec.option.disableflags = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    mjspec.visual.global_.offwidth, mjspec.visual.global_.offheight = 1280, 960
+    mjspec.visual.headlight.ambient = [0.45, 0.45, 0.45]
+    mjspec.visual.headlight.diffuse = [0.55, 0.55, 0.55]
+    sky = mjspec.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, width=64, height=384)
+    sky.builtin, sky.rgb1, sky.rgb2 = mujoco.mjtBuiltin.mjBUILTIN_GRADIENT, [1.0] * 3, [0.82, 0.86, 0.9]
+    _add_ring(mjspec.worldbody, 0, [0.0, 0.0, 0.0], spec)
+    _add_holes(mjspec.worldbody, 0, 0, np.zeros(3), params, spec)
+    body = mjspec.worldbody
+    for link in range(spec.n_links):
+        body = _add_link(body, link, params, spec)
+    _add_tools(body, params, spec)
+    for chamber in range(spec.n_chambers):
+        _add_chamber(mjspec, chamber, params, spec)
+    return mjspec
+
+
+def steps_per_period(period_s: float) -> int:
+    """Time steps of the model in one period of the control: as few as `MAX_TIMESTEP_S` allows."""
+    return math.ceil(period_s / MAX_TIMESTEP_S - 1e-9)
+
+
+def build_model(spec: ArmSpec) -> mujoco.MjModel:
+    """The compiled model of an arm."""
+    return build_spec(spec).compile()
+
+
+def _add_link(parent, link: int, params: ArmParams, spec: ArmSpec):
+    """One link: a slide along the parent plate's -z, then hinges x and y half a link below it."""
+    half = spec.link_length_m / 2
+    offset = -half if link == 0 else -2 * half
+    body = parent.add_body(name=f"link{link}", pos=[0.0, 0.0, offset])
+    mass, radius = float(params.link_mass_kg[link]), spec.geometry.spring_radius_m
+    sideways = mass * (3 * radius**2 + (2 * half) ** 2) / 12  # solid cylinder about its centre
+    body.mass, body.ipos, body.explicitinertial = mass, [0.0, 0.0, 0.0], True
+    body.inertia = [sideways, sideways, mass * radius**2 / 2]
+    section = spec.structure.links_per_section
+    joints = (
+        ("slide", mujoco.mjtJoint.mjJNT_SLIDE, [0.0, 0.0, -1.0], spec.backbone.axial_damping_ns_per_m),
+        ("bend_x", mujoco.mjtJoint.mjJNT_HINGE, [1.0, 0.0, 0.0], spec.backbone.bending_damping_nms_per_rad),
+        ("bend_y", mujoco.mjtJoint.mjJNT_HINGE, [0.0, 1.0, 0.0], spec.backbone.bending_damping_nms_per_rad),
+    )
+    for k, (name, kind, axis, damping) in enumerate(joints):
+        joint = body.add_joint(name=f"{name}{link}", type=kind, axis=axis)
+        joint.stiffness = _polynomial(float(params.joint_stiffness[3 * link + k]))
+        joint.damping = _polynomial(damping * section)
+    plate = np.array([0.0, 0.0, -half])
+    _add_ring(body, link + 1, plate, spec)
+    for part in {link // section, min((link + 1) // section, spec.structure.n_sections - 1)}:
+        _add_holes(body, link + 1, part, plate, params, spec)
+    return body
+
+
+def _polynomial(linear: float) -> list[float]:
+    """MuJoCo's stiffness and damping are polynomials; MJX uses the linear coefficient alone."""
+    return [linear, 0.0, 0.0]
+
+
+def _add_ring(body, plate: int, position, spec: ArmSpec) -> None:
+    body.add_geom(
+        name=f"ring{plate}",
+        type=mujoco.mjtGeom.mjGEOM_CYLINDER,
+        size=[ring_radius_m(spec), _RING_HALF_HEIGHT_M, 0.0],
+        pos=position,
+        rgba=_RING_COLOUR,
+        mass=0.0,
+        contype=0,
+        conaffinity=0,
+    )
+
+
+def _add_holes(body, plate: int, section: int, position, params: ArmParams, spec: ArmSpec) -> None:
+    """The sites that the chambers and springs of `section` pass on a plate."""
+    for k in range(N_CHAMBERS_PER_SECTION):
+        index = section * N_CHAMBERS_PER_SECTION + k
+        for kind, at in (("chamber", params.chamber_site_m), ("spring", params.spring_site_m)):
+            body.add_site(
+                name=f"{kind}{index}_plate{plate}", pos=position + [*at[index], 0.0], size=[0.001] * 3
+            )
+
+
+def _add_tools(last, params: ArmParams, spec: ArmSpec) -> None:
+    """Gripper and payload below the last plate, whose centre is the tip."""
+    half, length = spec.link_length_m / 2, spec.mass.gripper_length_m
+    last.add_site(name="tip", pos=[0.0, 0.0, -half], size=[0.004] * 3, rgba=[0.9, 0.1, 0.1, 1.0])
+    for k, name in enumerate(("gripper", "payload")):
+        tool = last.add_body(name=name, pos=[0.0, 0.0, -half - float(params.tool_offset_m[k])])
+        mass = float(params.tool_mass_kg[k])
+        tool.mass, tool.ipos, tool.explicitinertial = mass, [0.0, 0.0, 0.0], True
+        tool.inertia = [mass * length**2 / 12] * 3
+        if name == "gripper":
+            _draw_gripper(tool, spec)
+    if spec.mass.payload_kg > 0:
+        size = [payload_radius_m(spec.mass.payload_kg), 0.0, 0.0]
+        tool.add_geom(
+            name="payload", size=size, rgba=[0.2, 0.6, 0.25, 1.0], mass=0.0, contype=0, conaffinity=0
+        )
+
+
+def _draw_gripper(body, spec: ArmSpec) -> None:
+    for name, (size, position) in gripper_boxes(spec).items():
+        body.add_geom(
+            name=f"gripper_{name}",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=size,
+            pos=position,
+            rgba=_GRIPPER_COLOUR,
+            mass=0.0,
+            contype=0,
+            conaffinity=0,
+        )
+
+
+def _add_chamber(mjspec: mujoco.MjSpec, index: int, params: ArmParams, spec: ArmSpec) -> None:
+    """Chamber tendon, its pressure actuator, and the spring beside it.
+
+    The actuator's force on the tendon is pressure * (a + b length): MuJoCo's affine gain.
+    """
+    section, first = index // N_CHAMBERS_PER_SECTION, spec.structure.links_per_section
+    lines = (
+        ("chamber", params.chamber_stiffness, params.chamber_rest_m, spec.chambers.damping_ns_per_m),
+        ("spring", params.spring_stiffness, params.spring_rest_m, spec.springs.damping_ns_per_m),
+    )
+    for kind, stiffness, rest, damping in lines:
+        tendon = mjspec.add_tendon(name=f"{kind}{index}")
+        tendon.stiffness = _polynomial(float(stiffness[index]))
+        tendon.damping = _polynomial(damping)
+        tendon.springlength = [float(rest[index])] * 2
+        drawn = _BELLOWS_DRAWN * spec.geometry.chamber_diameter_m
+        tendon.width = drawn if kind == "chamber" else SPRING_WIDTH_M
+        colour = _SECTION_COLOURS[section % len(_SECTION_COLOURS)]
+        tendon.rgba = colour if kind == "chamber" else _SPRING_COLOUR
+        for plate in range(section * first, (section + 1) * first + 1):
+            tendon.wrap_site(f"{kind}{index}_plate{plate}")
+    slope = float(params.area_slope[index])
+    actuator = mjspec.add_actuator(name=f"chamber{index}", target=f"chamber{index}")
+    actuator.trntype = mujoco.mjtTrn.mjTRN_TENDON
+    actuator.gaintype = mujoco.mjtGain.mjGAIN_AFFINE
+    actuator.gainprm[:2] = [float(params.area[index]) - slope * spec.geometry.section_length_m, slope]
+    actuator.biastype = mujoco.mjtBias.mjBIAS_NONE
+    actuator.ctrllimited = True
+    actuator.ctrlrange = [float(params.pressure_min_kpa[index]), float(params.pressure_max_kpa[index])]

@@ -1,0 +1,118 @@
+"""The cross-shaped pipe: where its walls and containers are, and how far from the walls the arm's body is.
+
+Two cylinders of one diameter cross below the arm's base: a vertical one, which the arm enters from above,
+and a horizontal one along x. All is in the base frame (z up, the arm hangs towards -z), in metres, for one
+point or many at once, in NumPy or JAX. The distance to the wall ignores that the pipe ends at its outlets.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+
+from mjx_softarm._support.xp import Array, array_namespace
+from mjx_softarm.mechanics.body import gripper_boxes, rim_points, ring_radius_m
+from mjx_softarm.spec import ArmSpec
+
+# What the arm picks and places. Source: the paper's section on confined scenarios.
+BALL_KG = 0.035  # a sponge ball
+APPLE_KG = 0.220
+PIPES_MM = {"pipe300": 300, "pipe250": 250}  # diameters
+RIM_POINTS = 16  # of a ring; the rim is at most 1 - cos(pi / 16) = 1.9 % of its radius beyond them
+
+
+@dataclass(frozen=True)
+class CrossPipe:
+    """The pipe, in the base frame; its axes cross at x = y = 0."""
+
+    diameter_m: float
+    centre_z_m: float = -0.55
+    branch_m: float = 0.3  # from the centre to the outlets left, right and at the bottom
+    top_z_m: float = 0.0  # the outlet that the arm enters, level with its base
+    reach_m: float = (
+        0.06  # how far the finger tips reach into a branch: the nominal arm does with 5 mm to spare
+    )
+    drop_m: float = 0.05  # and how far below its axis, left and right
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.radius_m < self.branch_m - self.reach_m:
+            raise ValueError(
+                f"diameter_m: got {self.diameter_m!r}, expected more than 0 and less than "
+                f"{2 * (self.branch_m - self.reach_m):g}, so that the branches hold their containers"
+            )
+
+    @classmethod
+    def of_mm(cls, diameter_mm: float) -> CrossPipe:
+        """The pipe of this inner diameter."""
+        return cls(1e-3 * diameter_mm)
+
+    @property
+    def radius_m(self) -> float:
+        return 0.5 * self.diameter_m
+
+    def containers(self) -> dict[str, np.ndarray]:
+        """Where the finger tips (3,) [m] pick and place: in the left (-x), right and bottom container."""
+        far, side_z = self.radius_m + self.reach_m, self.centre_z_m - self.drop_m
+        return {
+            "left": np.array([-far, 0.0, side_z]),
+            "right": np.array([far, 0.0, side_z]),
+            "bottom": np.array([0.0, 0.0, self.centre_z_m - far]),
+        }
+
+
+def clearance(pipe: CrossPipe, position_m: Array) -> Array:
+    """Distance to the wall, positive inside; less than it, never more, near the edge where the pipes meet.
+
+    Args:
+        pipe: the pipe.
+        position_m (..., 3) [m]: in the base frame.
+
+    Returns:
+        (...) [m].
+    """
+    xp = array_namespace(position_m)
+    x, y, z = (position_m[..., k] for k in range(3))
+    vertical, horizontal = (_norm(xp, a, y) for a in (x, z - pipe.centre_z_m))
+    return pipe.radius_m - xp.minimum(vertical, horizontal)
+
+
+def _norm(xp, a: Array, b: Array) -> Array:
+    """Length of (a, b), whose gradient is zero at the origin."""
+    square = a * a + b * b
+    return xp.sqrt(xp.where(square > 0.0, square, 1.0)) * (square > 0.0)
+
+
+def body_points(plate_position: Array, plate_rotation: Array, spec: ArmSpec) -> Array:
+    """Points on the rims of all rings, then the corners of the gripper.
+
+    Args:
+        plate_position (..., L + 1, 3) [m]: from base to tip, as in `mjx_softarm.mechanics.kinematics.Frames`.
+        plate_rotation (..., L + 1, 3, 3): columns are a plate's axes.
+        spec: of the arm.
+
+    Returns:
+        (..., RIM_POINTS * (L + 1) + 24, 3) [m], in the frame of the plates.
+    """
+    xp = array_namespace(plate_position, plate_rotation)
+    rims = plate_position[..., None, :] + _turned(plate_rotation, rim_points(ring_radius_m(spec), RIM_POINTS))
+    corners = plate_position[..., -1:, :] + _turned(plate_rotation[..., -1, :, :], _gripper(spec))
+    return xp.concat([rims.reshape(*rims.shape[:-3], -1, 3), corners], axis=-2)
+
+
+def _turned(rotation: Array, point: np.ndarray) -> Array:
+    """Points (k, 3) turned by (..., 3, 3): (..., k, 3); no matrix product, which a GPU would round."""
+    return (rotation[..., None, :, :] * point[:, None, :].astype(rotation.dtype)).sum(axis=-1)
+
+
+def body_clearance(pipe: CrossPipe, plate_position: Array, plate_rotation: Array, spec: ArmSpec) -> Array:
+    """The least clearance (...) [m] over `body_points`; see there and `clearance`."""
+    return clearance(pipe, body_points(plate_position, plate_rotation, spec)).min(axis=-1)
+
+
+def _gripper(spec: ArmSpec) -> np.ndarray:
+    """Corners (24, 3) of the gripper's boxes in the last plate's frame."""
+    signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+    middle = np.array([0.0, 0.0, -0.5 * spec.mass.gripper_length_m])
+    return np.concatenate([middle + centre + signs * half for half, centre in gripper_boxes(spec).values()])

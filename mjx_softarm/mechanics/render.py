@@ -1,0 +1,243 @@
+"""Pictures of the arm: MuJoCo's renderer without a display, joint coordinates -> RGB.
+
+    with Renderer(build_model(spec)) as renderer:
+        write_png("arm.png", renderer.draw(q))
+
+Drawing off screen needs EGL (a GPU, or Mesa on the CPU) or OSMesa (Mesa on the CPU). The environment
+variable `MUJOCO_GL` chooses one; while it is unset, EGL and OSMesa are tried in this order.
+"""
+
+from __future__ import annotations
+
+import copy
+import functools
+import importlib
+import os
+import re
+import struct
+import subprocess
+import sys
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+_HEADLESS = ("egl", "osmesa")
+_ADVICE = "Install EGL or OSMesa (Debian: libegl1, libosmesa6) and set MUJOCO_GL=egl or MUJOCO_GL=osmesa"
+_MAX_GEOMS = 10_000
+_FOLDS_PER_LINK = 4  # convolutions of a bellows between two rings
+_CORE_RADIUS = 0.8  # of the bellows: what shows between its convolutions
+_MOUNT_RADIUS_M = 0.095
+_MOUNT_HALF_HEIGHT_M = 0.02
+_MOUNT_COLOUR = (0.55, 0.57, 0.60, 1.0)
+_PAYLOAD_COLOUR = (0.20, 0.60, 0.25, 1.0)
+
+
+class RenderError(RuntimeError):
+    """This machine cannot draw; the message says what was tried and what to do."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A view of the arm. Lengths are in arm lengths, from the base to the middle of the gripper at rest."""
+
+    azimuth_deg: float = 35.0  # 0 looks along +x; grows counter-clockwise seen from above
+    elevation_deg: float = -8.0  # negative looks down
+    height: float = 1.45  # seen at the arm's distance
+    centre: float = 0.57  # below the base, in the middle of the picture
+
+
+class Renderer:
+    """Draws one model. Holds an OpenGL context until closed, so that a film opens only one."""
+
+    def __init__(self, model: mujoco.MjModel, width: int = 900, height: int = 1200):
+        """Open the context.
+
+        Args:
+            model: from `mjx_softarm.mechanics.mjcf`, with or without an environment around the arm.
+            width, height: of the picture, in pixels.
+
+        Raises:
+            RenderError: there is no OpenGL to draw with.
+        """
+        self._model = copy.copy(model)
+        self._model.vis.global_.offwidth, self._model.vis.global_.offheight = width, height
+        self._model.vis.quality.offsamples = 8
+        self._data = mujoco.MjData(self._model)
+        mujoco.mj_kinematics(self._model, self._data)
+        self._arm_length_m = -float(self._data.body("gripper").xpos[2])
+        self._view = mujoco.MjrRect(0, 0, width, height)
+        self._option = mujoco.MjvOption()
+        self._option.sitegroup[:] = 0
+        self._scene = mujoco.MjvScene(self._model, _MAX_GEOMS)
+        self._gl, self._context = _open_context(self._model, width, height)
+
+    def draw(self, q: np.ndarray, camera: Camera | None = None, payload_radius_m: float = 0.0) -> np.ndarray:
+        """The arm at joint coordinates q (nq,) [m, rad]: RGB, (height, width, 3) uint8.
+
+        A payload that the model does not draw by itself is a ball of `payload_radius_m` at the finger tips.
+
+        Raises:
+            ValueError: q has the wrong shape or is not finite.
+            RenderError: the renderer is closed.
+        """
+        if self._gl is None:
+            raise RenderError("the renderer is closed")
+        q = np.asarray(q, float)
+        if q.shape != (self._model.nq,):
+            raise ValueError(f"q: got shape {q.shape}, expected ({self._model.nq},)")
+        if not np.isfinite(q).all():
+            raise ValueError("q: got numbers that are not finite; did the arm settle?")
+        self._data.qpos[:] = q
+        mujoco.mj_forward(self._model, self._data)
+        view = self._camera(camera or Camera())
+        everything = mujoco.mjtCatBit.mjCAT_ALL
+        mujoco.mjv_updateScene(self._model, self._data, self._option, None, view, everything, self._scene)
+        _draw_bellows(self._scene, self._model)
+        _draw_mount(self._scene)
+        if payload_radius_m > 0.0:
+            held = self._data.body("payload").xpos
+            ball, size = mujoco.mjtGeom.mjGEOM_SPHERE, np.full(3, payload_radius_m)
+            _append(self._scene, ball, size, held, np.eye(3), _PAYLOAD_COLOUR)
+        _add_light(self._scene, np.radians(view.azimuth))
+        image = np.empty((self._view.height, self._view.width, 3), np.uint8)
+        self._gl.make_current()
+        mujoco.mjr_render(self._view, self._scene, self._context)
+        mujoco.mjr_readPixels(image, None, self._view, self._context)
+        return np.ascontiguousarray(image[::-1])
+
+    def close(self) -> None:
+        """Free the context; the renderer draws no more."""
+        if self._gl is not None:
+            self._gl.make_current()
+            self._context.free()
+            self._gl.free()
+            self._gl = None
+
+    def __enter__(self) -> Renderer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _camera(self, camera: Camera) -> mujoco.MjvCamera:
+        view = mujoco.MjvCamera()
+        view.azimuth, view.elevation = camera.azimuth_deg, camera.elevation_deg
+        view.lookat[:] = [0.0, 0.0, -camera.centre * self._arm_length_m]
+        half_angle = np.radians(self._model.vis.global_.fovy) / 2
+        view.distance = camera.height * self._arm_length_m / (2 * np.tan(half_angle))
+        return view
+
+
+def write_png(path: str | Path, image: np.ndarray) -> None:
+    """Write an RGB image (height, width, 3) uint8 as PNG."""
+    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
+        raise ValueError(
+            f"image: got {image.dtype} of shape {image.shape}, expected uint8 of (height, width, 3)"
+        )
+    height, width, _ = image.shape
+    rows = np.concatenate([np.zeros((height, 1), np.uint8), image.reshape(height, -1)], axis=1)
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)  # 8 bit, RGB
+    body = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows.tobytes(), 9)) + chunk(b"IEND", b"")
+    Path(path).write_bytes(b"\x89PNG\r\n\x1a\n" + body)
+
+
+def _open_context(model: mujoco.MjModel, width: int, height: int) -> tuple[Any, mujoco.MjrContext]:
+    """An OpenGL context and MuJoCo's resources in it."""
+    asked = os.environ.get("MUJOCO_GL", "").lower().strip()
+    if asked in _HEADLESS:
+        name = asked
+    elif asked or sys.platform != "linux":
+        name = ""  # MuJoCo's own choice
+    else:
+        name = _working_library()
+    try:
+        module = importlib.import_module(f"mujoco.{name}") if name else mujoco
+        gl = module.GLContext(width, height)
+        gl.make_current()
+        context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_150)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, context)
+    except Exception as error:  # each library has its own
+        message = " ".join(f"{type(error).__name__}: {error}".split())
+        tried = f"MUJOCO_GL={asked or name}: {message}"
+        raise RenderError(f"no OpenGL to draw with ({tried}). {_ADVICE}") from error
+    return gl, context
+
+
+@functools.cache
+def _working_library() -> str:
+    """The first of the headless libraries that draws.
+
+    Each is tried in a process of its own: a library that was loaded, even in vain, shuts out the others.
+    """
+    program = (
+        "import mujoco; gl = mujoco.GLContext(8, 8); gl.make_current();"
+        "model = mujoco.MjModel.from_xml_string('<mujoco/>');"
+        "context = mujoco.MjrContext(model, 150); context.free(); gl.free()"
+    )
+    tried = []
+    for name in _HEADLESS:
+        environment = {**os.environ, "MUJOCO_GL": name}
+        probe = subprocess.run(
+            [sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=False
+        )
+        if probe.returncode == 0:
+            return name
+        tried.append(f"{name}: {next(filter(_is_error, probe.stderr.splitlines()), 'failed')}")
+    raise RenderError(f"no OpenGL to draw with ({'; '.join(tried)}). {_ADVICE}")
+
+
+def _is_error(line: str) -> bool:
+    """Whether this line of a traceback names the exception."""
+    return re.match(r"[\w.]+(Error|Exception)\b", line) is not None
+
+
+def _append(scene: mujoco.MjvScene, kind: mujoco.mjtGeom, size, position, rotation, rgba) -> None:
+    if scene.ngeom < scene.maxgeom:
+        geom = scene.geoms[scene.ngeom]
+        mujoco.mjv_initGeom(geom, kind, size, position, np.ravel(rotation), np.asarray(rgba, np.float32))
+        scene.ngeom += 1
+
+
+def _draw_bellows(scene: mujoco.MjvScene, model: mujoco.MjModel) -> None:
+    """Replace the plain tubes that MuJoCo draws for the chambers' tendons by convolutions."""
+    for k in range(scene.ngeom):
+        tube = scene.geoms[k]
+        is_tendon = tube.objtype == mujoco.mjtObj.mjOBJ_TENDON
+        if not (is_tendon and model.tendon(tube.objid).name.startswith("chamber")):
+            continue
+        radius, half = float(tube.size[0]), float(tube.size[2])
+        centre, rotation = np.array(tube.pos), np.array(tube.mat).reshape(3, 3)
+        tube.size[:2] = _CORE_RADIUS * radius
+        pitch = 2 * half / _FOLDS_PER_LINK
+        for fold in range(_FOLDS_PER_LINK):
+            position = centre + rotation[:, 2] * ((fold + 0.5) * pitch - half)
+            size = np.array([radius, radius, 0.6 * pitch])
+            _append(scene, mujoco.mjtGeom.mjGEOM_ELLIPSOID, size, position, rotation, tube.rgba)
+
+
+def _draw_mount(scene: mujoco.MjvScene) -> None:
+    size = np.array([_MOUNT_RADIUS_M, _MOUNT_HALF_HEIGHT_M, 0.0])
+    position = np.array([0.0, 0.0, _MOUNT_HALF_HEIGHT_M])
+    _append(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, size, position, np.eye(3), _MOUNT_COLOUR)
+
+
+def _add_light(scene: mujoco.MjvScene, azimuth: float) -> None:
+    """A lamp over the camera's left shoulder, which gives the round parts their shape."""
+    if scene.nlight >= len(scene.lights):
+        return
+    light = scene.lights[scene.nlight]
+    light.headlight, light.castshadow, light.type = 0, 0, mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+    heading = azimuth - np.radians(40.0)
+    light.dir[:] = [0.8 * np.cos(heading), 0.8 * np.sin(heading), -0.6]
+    light.pos[:] = -3.0 * light.dir
+    light.ambient[:], light.diffuse[:], light.specular[:] = 0.0, 0.4, 0.2
+    light.attenuation[:] = [1.0, 0.0, 0.0]
+    scene.nlight += 1

@@ -1,0 +1,219 @@
+"""Potential energy of the arm in closed form: its gradient, its Hessian, its tendon lengths.
+
+At given pressures p the arm is conservative. With l the chamber lengths and s the spring lengths,
+
+    V(q) = gravity + backbone + sum k (l - l0)^2 / 2 + sum k_s (s - s0)^2 / 2 - sum p W(l),
+
+where W' = area_m2 + area_slope_m (l - l_rest) is a chamber's effective area, so that p W is the work of
+its air. A tendon runs from ring to ring, so the piece of it inside a link depends on that link's
+three joints alone, and its length on those of its section; only gravity couples different sections.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from mjx_softarm._support.small_matrices import block_diagonal, product
+from mjx_softarm.mechanics.chain_hessian import ChainHessian
+from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK, Frames
+from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
+
+GRAVITY_M_S2 = 9.81
+
+
+class ArmParams(NamedTuple):
+    """The numbers of an arm as arrays, so that a new value needs no new compilation.
+
+    Chambers and springs are ordered section by section, counter-clockwise within a section.
+    """
+
+    link_length_m: Array  # ()
+    chamber_site_m: Array  # (n_chambers, 2) holes of the chambers in their rings, x and y
+    spring_site_m: Array  # (n_chambers, 2)
+    link_mass_kg: Array  # (n_links,) at the hinges' anchor
+    tool_mass_kg: Array  # (2,) gripper and payload, below the last plate
+    tool_offset_m: Array  # (2,)
+    joint_stiffness: Array  # (3 * n_links,) [N/m, N m/rad, N m/rad]
+    chamber_stiffness: Array  # (n_chambers,) [N/m]
+    chamber_rest_m: Array  # (n_chambers,)
+    area: Array  # (n_chambers,) [N/kPa]
+    area_slope: Array  # (n_chambers,) [N/kPa/m]
+    spring_stiffness: Array  # (n_chambers,) [N/m]
+    spring_rest_m: Array  # (n_chambers,)
+    pressure_min_kpa: Array  # (n_chambers,)
+    pressure_max_kpa: Array  # (n_chambers,)
+
+    @property
+    def section_length_m(self) -> Array:
+        return self.link_length_m * (self.link_mass_kg.shape[0] // self.n_sections)
+
+    @property
+    def n_sections(self) -> int:
+        return self.area.shape[0] // N_CHAMBERS_PER_SECTION
+
+    @classmethod
+    def from_spec(cls, spec: ArmSpec, dtype: np.typing.DTypeLike = np.float32) -> ArmParams:
+        """Numbers of `spec`, in SI units but for the pressures [kPa]."""
+        n, per_section = spec.n_chambers, spec.structure.links_per_section
+        first = np.radians(spec.geometry.first_chamber_deg)
+        angle = first + 2 * np.pi * np.arange(n) / N_CHAMBERS_PER_SECTION
+        on_circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        axial = spec.backbone.axial_stiffness_n_per_m * per_section
+        bending = spec.backbone.bending_stiffness_nm_per_rad * per_section
+        values: dict[str, Any] = {
+            "link_length_m": spec.link_length_m,
+            "chamber_site_m": spec.geometry.chamber_radius_m * on_circle,
+            "spring_site_m": spec.geometry.spring_radius_m * on_circle,
+            "link_mass_kg": np.full(spec.n_links, spec.mass.arm_kg / spec.n_links),
+            "tool_mass_kg": [spec.mass.gripper_kg, spec.mass.payload_kg],
+            "tool_offset_m": [spec.mass.gripper_length_m / 2, spec.mass.gripper_length_m],
+            "joint_stiffness": np.tile([axial, bending, bending], spec.n_links),
+            "chamber_stiffness": spec.per_chamber(spec.chambers.stiffness_n_per_m),
+            "chamber_rest_m": spec.geometry.section_length_m
+            + np.array(spec.per_chamber(spec.chambers.length_offset_m)),
+            "area": 1e3 * np.array(spec.per_chamber(spec.chambers.area_m2)),
+            "area_slope": 1e3 * np.array(spec.per_chamber(spec.chambers.area_slope_m)),
+            "spring_stiffness": np.full(n, spec.springs.stiffness_n_per_m),
+            "spring_rest_m": np.full(n, spec.springs.rest_length_m),
+            "pressure_min_kpa": np.full(n, spec.chambers.pressure_min_kpa),
+            "pressure_max_kpa": np.full(n, spec.chambers.pressure_max_kpa),
+        }
+        return cls(**{name: np.asarray(value, dtype) for name, value in values.items()})  # type: ignore
+
+
+class Tendons(NamedTuple):
+    """Lengths of a set of tendons with their first and second derivatives, by the joints they depend on."""
+
+    length: Array  # (n_chambers,) [m]
+    jacobian: Array  # (n_sections, 3 tendons, n) by the n joints of the tendons' section
+    link_hessian: Array  # (n_links, 3 tendons, 3 dofs, 3 dofs) by the joints of a link
+
+
+class Statics(NamedTuple):
+    """The potential's derivatives at given joint coordinates and pressures."""
+
+    gradient: Array  # (nv,) [N, N m]
+    hessian: ChainHessian
+    chambers: Tendons
+    springs: Tendons
+    area: Array  # (n_chambers,) [N/kPa] effective areas at these lengths
+
+
+@jax.jit  # inlined where it is compiled; traced once for all of its callers
+def statics(frames: Frames, q: Array, pressure_kpa: Array, params: ArmParams) -> Statics:
+    """Gradient and Hessian of V(q) at fixed pressures.
+
+    Args:
+        frames: of `q`, from either engine.
+        q (nv,): joint coordinates [m, rad, rad].
+        pressure_kpa (n_chambers,): chamber pressures.
+        params: numbers of the arm.
+    """
+    sites = jnp.stack([params.chamber_site_m, params.spring_site_m])
+    both = jax.vmap(tendons, in_axes=(None, 0))(frames, sites)  # in one piece: fewer and larger operations
+    chambers, springs = (jax.tree.map(lambda x, k=k: x[k], both) for k in range(2))
+    area = params.area + params.area_slope * (chambers.length - params.section_length_m)
+    tension = jnp.stack(
+        [
+            params.chamber_stiffness * (chambers.length - params.chamber_rest_m) - area * pressure_kpa,
+            params.spring_stiffness * (springs.length - params.spring_rest_m),
+        ]
+    ).reshape(2, params.n_sections, N_CHAMBERS_PER_SECTION)
+    slope = jnp.stack(
+        [params.chamber_stiffness - params.area_slope * pressure_kpa, params.spring_stiffness]
+    ).reshape(tension.shape)
+    weight, hessian = _gravity(frames, params)
+    pull = jnp.sum(tension[..., None] * both.jacobian, axis=(0, 2))  # (n_sections, n)
+    gradient = weight + params.joint_stiffness * q + pull.reshape(-1)
+    own = hessian.own + _bending(tension, both.link_hessian) + _stretching(slope, both.jacobian)
+    hessian = hessian._replace(own=own).plus_diagonal(params.joint_stiffness)
+    return Statics(gradient, hessian, chambers, springs, area)
+
+
+def _bending(tension: Array, link_hessian: Array) -> Array:
+    """Tensions (2, n_sections, 3) times the second derivatives of the lengths: (n_sections, n, n)."""
+    n_sections = tension.shape[1]
+    per_section = link_hessian.shape[1] // n_sections
+    per_link = jnp.repeat(tension, per_section, axis=1)
+    links = jnp.sum(per_link[..., None, None] * link_hessian, axis=(0, 2))
+    return jax.vmap(block_diagonal)(links.reshape(n_sections, per_section, *links.shape[1:]))
+
+
+def _stretching(slope: Array, jacobian: Array) -> Array:
+    """sum_t slope_t dl_t dl_t^T over the tendons of each section: (n_sections, n, n).
+
+    Args:
+        slope (2, n_sections, 3): of the tensions by the lengths.
+        jacobian (2, n_sections, 3, n): of the lengths.
+    """
+    rows, scaled = (jnp.concatenate(list(x), axis=1) for x in (jacobian, slope[..., None] * jacobian))
+    return product(jnp.swapaxes(rows, 1, 2), scaled)
+
+
+def tendons(frames: Frames, site_m: Array) -> Tendons:
+    """Lengths of tendons through holes in the rings, with derivatives.
+
+    Args:
+        frames: plates and joints.
+        site_m (n_chambers, 2): x and y of each tendon's hole in every ring of its section.
+    """
+    n_links = frames.axis.shape[0]
+    n_sections = site_m.shape[0] // N_CHAMBERS_PER_SECTION
+    per_section = n_links // n_sections
+    site = jnp.repeat(site_m.reshape(n_sections, N_CHAMBERS_PER_SECTION, 2), per_section, axis=0)  # (L, 3, 2)
+    arm = _dot(frames.plate_rotation[1:, None, :, :2], site[:, :, None])
+    above = _dot(frames.plate_rotation[:-1, None, :, :2], site[:, :, None])
+    lower = frames.plate_position[1:, None] + arm  # (L, 3, 3)
+    segment = lower - (frames.plate_position[:-1, None] + above)
+    length = jnp.sqrt(jnp.sum(segment**2, axis=-1))  # (L, 3)
+    unit = segment / length[..., None]
+
+    lever = lower - frames.anchor[:, None]
+    slide, hinge = frames.axis[:, :1], frames.axis[:, 1:]  # (L, 1, 3), (L, 2, 3)
+    turn = jnp.cross(hinge[:, None], lever[:, :, None])  # (L, 3, 2, 3)
+    motion = jnp.concatenate([jnp.broadcast_to(slide[:, None], (n_links, 3, 1, 3)), turn], axis=2)
+    along = _dot(unit[:, :, None], motion)  # d length / d q, (L, 3, 3)
+    twist = jnp.cross(hinge[:, None, :, None], turn[:, :, None, :])  # a_i x J_j, (L, 3, 2, 2, 3)
+    second = _dot(unit[:, :, None, None], twist)
+    upper = jnp.triu(second)
+    second = upper + jnp.swapaxes(jnp.triu(second, 1), -1, -2)
+    curve = _dot(motion[..., :, None, :], motion[..., None, :, :]) - along[..., :, None] * along[..., None, :]
+    link_hessian = (curve / length[..., None, None]).at[..., 1:, 1:].add(second)
+
+    own = along.reshape(n_sections, per_section, N_CHAMBERS_PER_SECTION, DOFS_PER_LINK)
+    rows = jnp.moveaxis(own, 2, 1).reshape(n_sections, N_CHAMBERS_PER_SECTION, -1)
+    total = length.reshape(n_sections, per_section, -1).sum(1).reshape(-1)
+    return Tendons(total, rows, link_hessian)
+
+
+def _dot(a: Array, b: Array) -> Array:
+    """Inner products over the last axis, the others broadcast: as matrix products, tiny ones are slow."""
+    return jnp.sum(a * b, axis=-1)
+
+
+def _gravity(frames: Frames, params: ArmParams) -> tuple[Array, ChainHessian]:
+    """Gradient (nv,) and Hessian of the weights' potential.
+
+    With M and c the mass and the centre of mass of all that hangs on a joint, and w = M a for a slide,
+    w = M a x (c - o) for a hinge: the gradient is g w_z; the second derivative by an earlier hinge i and
+    a joint j is g (a_i x w_j)_z, and none by an earlier slide.
+    """
+    tool = frames.plate_position[-1] - params.tool_offset_m[:, None] * frames.plate_rotation[-1, :, 2]
+    own = params.link_mass_kg[:, None] * frames.anchor
+    moment = jnp.flip(jnp.cumsum(jnp.flip(own, 0), 0), 0) + params.tool_mass_kg @ tool  # (L, 3)
+    mass = jnp.flip(jnp.cumsum(jnp.flip(params.link_mass_kg))) + jnp.sum(params.tool_mass_kg)  # (L,)
+    hung = moment - mass[:, None] * frames.anchor
+    turn = jnp.cross(frames.axis[:, 1:], hung[:, None])
+    w = jnp.concatenate([mass[:, None, None] * frames.axis[:, :1], turn], axis=1)  # (L, 3 dofs, 3)
+    w = GRAVITY_M_S2 * w.reshape(params.n_sections, -1, 3)
+    axis = frames.axis.at[:, 0].set(0.0).reshape(w.shape)  # a slide turns nothing
+    above = jnp.stack([axis[..., 0], -axis[..., 1]], axis=-1)
+    below = jnp.stack([w[..., 1], w[..., 0]], axis=-1)
+    upper = jnp.triu(product(above, jnp.swapaxes(below, 1, 2)))
+    within = upper + jnp.swapaxes(jnp.triu(upper, 1), 1, 2)
+    return w[..., 2].reshape(-1), ChainHessian(within, above, below)

@@ -1,0 +1,108 @@
+"""Poses that the arm can reach: drawn at random, or all combinations of the chambers' extremes."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from mjx_softarm.mechanics.excitation import random_pressures
+from mjx_softarm.mechanics.kinematics import chain_frames
+from mjx_softarm.mechanics.settle import Settled, settle_pressures
+from mjx_softarm.mechanics.statics import ArmParams
+from mjx_softarm.sensing.pose import pose_from_frame
+from mjx_softarm.spec import ArmSpec, SpecError
+
+BATCH = 1024
+CANDIDATES_PER_POSE = 2
+VOXEL_MM = 25.0
+HELD_OUT_SEED = 20_000  # of the goals that policies are evaluated on; training draws with other seeds
+
+
+class Pool(NamedTuple):
+    """Equilibria of the nominal arm, none of them saturated: every spring is where it is asked to be."""
+
+    q: Array  # (n, nv) [m, rad, rad]
+    pressure_kpa: Array  # (n, n_chambers)
+    spring_m: Array  # (n, n_chambers)
+    pose: Array  # (n, 6) [mm, deg]
+
+
+@functools.cache
+def _solver():
+    def solve(params: ArmParams, pressure_kpa: Array) -> Settled:
+        kinematics = functools.partial(chain_frames, link_length_m=params.link_length_m)
+        return settle_pressures(kinematics, params, pressure_kpa)
+
+    return jax.jit(jax.vmap(solve, in_axes=(None, 0)))
+
+
+def settle_many(spec: ArmSpec, pressure_kpa: np.ndarray) -> Settled:
+    """Equilibria at many pressures (n, n_chambers) [kPa], as NumPy arrays with a leading axis n."""
+    params = ArmParams.from_spec(spec)
+    n = len(pressure_kpa)
+    padded = np.resize(np.asarray(pressure_kpa, np.float32), (-(-n // BATCH) * BATCH, spec.n_chambers))
+    parts = [jax.device_get(_solver()(params, part)) for part in np.split(padded, len(padded) // BATCH)]
+    return jax.tree.map(lambda *x: np.concatenate(x)[:n], *parts)
+
+
+def sample_workspace(spec: ArmSpec, n: int, seed: int) -> Pool:
+    """Poses spread over the whole reachable workspace.
+
+    Pressures follow the arcsine law between their limits, which favours the extremes where the workspace
+    ends; of twice as many candidates, `n` are drawn with weights that even out the number of tips per
+    voxel of 25 mm. Candidates that did not settle are left out.
+
+    Args:
+        spec: the arm.
+        n: number of poses.
+        seed: of the draw; training and evaluation use different ones.
+
+    Raises:
+        SpecError: the arm settles at fewer than `n` of the candidates.
+    """
+    rng = np.random.default_rng(seed)
+    found = settle_many(spec, random_pressures(spec, CANDIDATES_PER_POSE * n, rng))
+    tip_mm = np.where(found.settled[:, None], 1e3 * found.tip_position_m, 0.0)
+    _, voxel, count = np.unique(
+        np.floor(tip_mm / VOXEL_MM).astype(int), axis=0, return_inverse=True, return_counts=True
+    )
+    weight = found.settled / count[voxel.ravel()]
+    if np.count_nonzero(weight) < n:
+        raise SpecError(
+            f"the arm {spec.name!r} settles at {np.count_nonzero(weight)} of {len(weight)} random pressures, "
+            f"expected at {n} or more; is it stiff enough?"
+        )
+    chosen = rng.choice(len(weight), n, replace=False, p=weight / weight.sum())
+    pose = pose_from_frame(found.tip_position_m[chosen], found.tip_rotation[chosen])
+    arrays = (found.q[chosen], found.pressure_kpa[chosen], found.spring_m[chosen], pose)
+    return Pool(*map(jnp.asarray, arrays))
+
+
+def extreme_poses(spec: ArmSpec) -> Settled:
+    """Equilibria at every combination of lowest, zero and highest pressure, 3 ** n_chambers of them.
+
+    Source: the paper's workspace figure.
+    """
+    levels = (spec.chambers.pressure_min_kpa, 0.0, spec.chambers.pressure_max_kpa)
+    return settle_many(spec, np.array(list(itertools.product(levels, repeat=spec.n_chambers))))
+
+
+CIRCLE_HEIGHT_MM = -575.0
+
+
+def circle_poses(n: int = 40, diameter_mm: float = 160.0, height_mm: float = CIRCLE_HEIGHT_MM) -> np.ndarray:
+    """Poses (n, 6) [mm, deg] along a horizontal circle below the base, the tip hanging straight down.
+
+    The paper gives diameter and number of points but no height; at the default one, the paper's arm reaches
+    every point with 2 kPa to spare in each chamber.
+    """
+    angle = 2 * np.pi * np.arange(n) / n
+    radius, zero = 0.5 * diameter_mm, np.zeros(n)
+    columns = [radius * np.cos(angle), radius * np.sin(angle), np.full(n, height_mm), zero, zero, zero]
+    return np.stack(columns, axis=-1).astype(np.float32)

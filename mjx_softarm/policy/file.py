@@ -1,0 +1,241 @@
+"""A trained policy as one file: what is in it, and how it is written and read. NumPy only.
+
+A sealed npz archive (`mjx_softarm._support.archive`). n is the number of chambers; numbers are float64, networks and
+the workspace float32.
+
+    schema_version       () int
+    spec_json            ()           the arm trained for, as `ArmSpec.to_dict` gives it
+    obs_layout           (18,) text   names of the observation's entries, `OBS_LAYOUT`
+    action_layout        (n,) text    names of the action's entries, `action_layout`
+    actor.n_layers       () int
+    actor.<k>.weight     (in, out)    layer k = 0, 1, ...; ReLU after each but the last,
+    actor.<k>.bias       (out,)       whose outputs (n,) are the actions before tanh
+    obs_scale.<field>    (6,)         `ObsScale`: centre and scale of poses and goals
+    reward.<field>       ()           `RewardConfig`: weights of the error, threshold of a goal
+    frequency_hz         (n, 2)       what the actions -1 and 1 stand for, linear in between
+    sensor.<field>       () or (n,)   `SensorParams`: frequencies to lengths, and back
+    gains.<field>        () or (n,)   `Gains`: the sensor-space law and the pressure limits
+    rate_hz              ()           of the sensor-space law
+    workspace            (m, 6)       poses [mm, deg] that the arm reaches, spread over its workspace
+    estimator.<field>                 `PoseEstimator`: spring lengths to the simulated pose
+    spring_model.<field>              `SpringModel`: pressures to spring lengths, to find chambers that fail
+    s2r_kind             ()           "mlp", or "none": the policy was trained on simulated poses
+    s2r.<field>                       `S2R`, if there is one: simulated pose to the real one
+    provenance_json      ()           how the policy came about: config, versions, commit, date
+
+The arm's numbers stand next to `spec_json` because the actor was trained with these, whatever a later version
+derives from a specification. To add an entry, or a field to a class named here (`ArmSpec` included), is to
+make a new schema: raise `SCHEMA_VERSION`. A file of another schema is refused; a run exports it anew.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mjx_softarm._support.archive import (
+    Entries,
+    SealedFileError,
+    entries_of,
+    layer_entries,
+    read_sealed,
+    write_sealed,
+)
+from mjx_softarm._support.mlp import Layer
+from mjx_softarm.control import Gains
+from mjx_softarm.mdp.observation import OBS_LAYOUT, OBS_SIZE, ObsScale
+from mjx_softarm.mdp.rewards import RewardConfig
+from mjx_softarm.sensing.estimator import PoseEstimator, SpringModel, take_estimator, take_spring_model
+from mjx_softarm.sensing.s2r import S2R, take_s2r
+from mjx_softarm.sensing.sensors import SensorFault, SensorParams, frequency_range_hz, length_from_frequency
+from mjx_softarm.spec import ArmSpec, SpecError
+
+SCHEMA_VERSION = 2
+
+KIND = "policy"
+
+
+@dataclass(frozen=True, eq=False)
+class Policy:
+    """A trained policy and all that its actions depend on; the module's docstring says what each part is."""
+
+    layers: tuple[Layer, ...]  # from the observation to the actions before tanh
+    obs_scale: ObsScale
+    reward: RewardConfig
+    frequency_hz: np.ndarray  # (n, 2)
+    sensor: SensorParams
+    gains: Gains
+    rate_hz: float
+    workspace: np.ndarray  # (m, 6)
+    estimator: PoseEstimator
+    spring_model: SpringModel
+    s2r: S2R | None
+    spec: ArmSpec
+    provenance: Mapping[str, Any]
+
+
+class ArmModel(NamedTuple):
+    """What the arm's computer has to know about the arm besides its specification."""
+
+    workspace: np.ndarray  # (m, 6) poses [mm, deg]
+    estimator: PoseEstimator
+    spring_model: SpringModel
+    s2r: S2R | None
+
+
+def action_layout(spec: ArmSpec) -> tuple[str, ...]:
+    """Names of the action's entries: the frequency of each spring, scaled from its two limits to [-1, 1]."""
+    return tuple(f"spring{k}_hz" for k in range(spec.n_chambers))
+
+
+def policy_from_actor(
+    actor_params: Mapping[str, Any],
+    spec: ArmSpec,
+    reward: RewardConfig,
+    model: ArmModel,
+    provenance: Mapping[str, Any],
+) -> Policy:
+    """The policy of an actor that was trained on an arm.
+
+    Args:
+        actor_params: nested mappings of arrays, as flax initialises the actor; see `layers_from_flax`.
+        spec: the arm; scales, limits, calibration and gains are its own, as in the environment.
+        reward: the environment's.
+        model: networks and workspace of the arm.
+        provenance: how the policy came about, in types that JSON has.
+
+    Raises:
+        ValueError: the parameters are not those of an actor for this arm; as a SealedFileError where an
+            array has the wrong shape or is not finite.
+    """
+    policy = Policy(
+        layers=layers_from_flax(actor_params, spec.n_chambers),
+        obs_scale=ObsScale.from_spec(spec),
+        reward=reward,
+        frequency_hz=frequency_range_hz(spec),
+        sensor=SensorParams.from_spec(spec),
+        gains=Gains.from_spec(spec),
+        rate_hz=spec.control.rate_hz,
+        **model._asdict(),
+        spec=spec,
+        provenance=provenance,
+    )
+    return _unpack(_pack(policy), "policy")
+
+
+def layers_from_flax(actor_params: Mapping[str, Any], n_actions: int) -> tuple[Layer, ...]:
+    """The actor's layers without its standard deviations; all that depends on how flax names them.
+
+    Args:
+        actor_params: `{"params": {"hidden_0": {"kernel", "bias"}, ..., "head": {"kernel", "bias"}}}`; the
+            head's first `n_actions` outputs are the mean, as many more the log standard deviation.
+        n_actions: number of actions.
+
+    Raises:
+        ValueError: the layers have other names.
+    """
+    dense = actor_params.get("params", {})
+    names = [*(f"hidden_{k}" for k in range(len(dense) - 1)), "head"]
+    if set(dense) != set(names):
+        raise ValueError(f"actor parameters: got {sorted(dense)}, expected hidden_0, hidden_1, ... and head")
+    arrays = [[np.asarray(dense[name][part], np.float32) for part in ("kernel", "bias")] for name in names]
+    arrays[-1] = [array[..., :n_actions] for array in arrays[-1]]
+    return tuple((weight, bias) for weight, bias in arrays)
+
+
+def save_policy(path: str | Path, policy: Policy) -> None:
+    """Check a policy and write it, whole or not at all; the same policy gives the same bytes.
+
+    Raises:
+        SealedFileError: the policy is not valid, such as a weight that is not finite, or the file cannot be
+            written. A file that was there before is then still there.
+        TypeError: the provenance holds something that JSON has not.
+    """
+    arrays = _pack(policy)
+    _unpack(arrays, str(path))
+    write_sealed(Path(path), arrays, KIND)
+
+
+def load_policy(path: str | Path) -> Policy:
+    """Read a policy and check all of it.
+
+    Raises:
+        SealedFileError: the file cannot be read, is incomplete, damaged, of another program or of another
+            version, or an entry is missing, unknown, or of the wrong type, shape or range.
+    """
+    return _unpack(read_sealed(Path(path), KIND, "python -m train export"), str(path))
+
+
+def _pack(policy: Policy) -> dict[str, np.ndarray]:
+    entries: dict[str, Any] = {
+        "schema_version": SCHEMA_VERSION,
+        "spec_json": json.dumps(policy.spec.to_dict()),
+        "obs_layout": OBS_LAYOUT,
+        "action_layout": action_layout(policy.spec),
+        "frequency_hz": policy.frequency_hz,
+        "rate_hz": policy.rate_hz,
+        "s2r_kind": "none" if policy.s2r is None else "mlp",
+        "workspace": policy.workspace,
+        "provenance_json": json.dumps(policy.provenance),
+    }
+    entries |= layer_entries("actor", policy.layers)
+    for name in ("obs_scale", "reward", "sensor", "gains"):
+        numbers = entries_of(name, getattr(policy, name))
+        entries |= {item: value.astype(np.float64) for item, value in numbers.items()}
+    for name in ("estimator", "spring_model") + (("s2r",) if policy.s2r is not None else ()):
+        entries |= entries_of(name, getattr(policy, name))
+    return {name: np.asarray(value) for name, value in entries.items()}
+
+
+def _unpack(arrays: Mapping[str, np.ndarray], source: str) -> Policy:
+    entries = Entries(arrays, source)
+    version = entries.take("schema_version", np.integer, ())
+    if version != SCHEMA_VERSION:
+        entries.fail(
+            "schema_version",
+            f"got {version}, expected {SCHEMA_VERSION}; this version's `python -m train export` writes that",
+        )
+    try:
+        spec = ArmSpec.from_dict(entries.table("spec_json"), f"{source}: spec_json")
+    except SpecError as error:
+        raise SealedFileError(str(error)) from error
+    n = spec.n_chambers
+    obs_layout = entries.take("obs_layout", np.str_, (OBS_SIZE,))
+    names = entries.take("action_layout", np.str_, (n,))
+    s2r_kind = entries.take("s2r_kind", np.str_, ())
+    policy = Policy(
+        layers=entries.layers("actor", OBS_SIZE, n),
+        obs_scale=entries.group("obs_scale", ObsScale, (6,)),
+        reward=entries.group("reward", RewardConfig, ()),
+        frequency_hz=entries.take("frequency_hz", np.float64, (n, 2)),
+        sensor=entries.group("sensor", SensorParams, (), (n,)),
+        gains=entries.group("gains", Gains, (), (n,)),
+        rate_hz=entries.take("rate_hz", np.float64, ()),
+        workspace=entries.take("workspace", np.float32, (None, 6)),
+        estimator=take_estimator(entries, "estimator", n),
+        spring_model=take_spring_model(entries, "spring_model", n),
+        s2r=take_s2r(entries, "s2r", n) if s2r_kind == "mlp" else None,
+        spec=spec,
+        provenance=entries.table("provenance_json"),
+    )
+    readable = length_from_frequency(policy.frequency_hz.T, policy.sensor).fault == SensorFault.OK.value
+    low_hz, high_hz = policy.frequency_hz.T
+    low_kpa, high_kpa = policy.gains.pressure_min_kpa, policy.gains.pressure_max_kpa
+    for name, holds, expected in (
+        ("obs_layout", obs_layout == np.array(OBS_LAYOUT), list(OBS_LAYOUT)),
+        ("action_layout", names == np.array(action_layout(spec)), list(action_layout(spec))),
+        ("obs_scale.scale", policy.obs_scale.scale > 0.0, "numbers > 0"),
+        ("frequency_hz", readable & (low_hz < high_hz), "two that have a length, the lower first"),
+        ("gains.pressure_min_kpa", np.less(low_kpa, high_kpa), "less than gains.pressure_max_kpa"),
+        ("rate_hz", policy.rate_hz > 0.0, "a number > 0"),
+        ("s2r_kind", s2r_kind in ("mlp", "none"), "mlp or none"),
+    ):
+        if not np.all(holds):
+            entries.fail(name, f"got {arrays[name].tolist()}, expected {expected}")
+    entries.finish(SCHEMA_VERSION)
+    return policy

@@ -1,0 +1,167 @@
+"""What the springs tell about the tip, and what the pressures tell about the springs. NumPy and JAX.
+
+On the arm nobody sees the tip. Its pose is estimated from the spring lengths: three springs give a
+section's length and bend, a section of constant curvature has a closed form, and the sections follow one
+another. The real ones do not bend evenly, since all that hangs below pulls at them; a small network,
+distilled from the simulator, says by how much each section's end is off. Besides the springs it sees which
+way is down at each section's end. Changes, not poses, come from it, so nothing is discontinuous where yaw
+and roll are.
+
+The other way around, `expected_springs` says which lengths the springs have at given pressures without a
+payload. The control loop holds it against the readings to find a chamber that has lost its pressure.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from mjx_softarm._support.archive import Entries
+from mjx_softarm._support.mlp import Layer, mlp
+from mjx_softarm._support.xp import array_namespace
+from mjx_softarm.sensing.pose import pose_from_frame, rotation_from_quaternion
+from mjx_softarm.spec import N_CHAMBERS_PER_SECTION
+
+N_CHANGES = 6  # of a section's end: position [m], Gibbs vector (axis times the tangent of half the angle)
+_SMALL_BEND = 1e-8  # square [rad^2] below which a section counts as straight
+
+
+class PoseEstimator(NamedTuple):
+    """Spring lengths to tip pose, for n springs in n / 3 sections. All float32."""
+
+    layers: tuple[Layer, ...]  # normalised springs (n,) and downs (n,) -> changes (n_sections * N_CHANGES,)
+    spring_site_m: Any  # (n, 2) holes of the springs in their rings, x and y
+    spring_centre_m: Any  # (n,) lengths that are normalised to 0,
+    spring_scale_m: Any  # (n,) and what is added to them for 1
+    change_scale: Any  # (N_CHANGES,) [m, 1] of the network's outputs
+
+
+class SpringModel(NamedTuple):
+    """Pressures to spring lengths at rest. All float32."""
+
+    layers: tuple[Layer, ...]  # normalised pressures (n,) -> normalised springs (n,)
+    pressure_centre_kpa: Any  # (n,)
+    pressure_scale_kpa: Any  # (n,)
+    spring_centre_m: Any  # (n,)
+    spring_scale_m: Any  # (n,)
+
+
+class Frame(NamedTuple):
+    """Plates of an arm, one for each section's end."""
+
+    position_m: Any  # (..., 3)
+    rotation: Any  # (..., 3, 3), columns are the plate's axes
+
+
+def estimate(estimator: PoseEstimator, spring_m: Any) -> Any:
+    """Pose (..., 6) [mm, deg] of the tip of an arm at rest whose springs are (..., n) [m] long."""
+    return pose_from_frame(*estimate_frame(estimator, spring_m))
+
+
+def estimate_frame(estimator: PoseEstimator, spring_m: Any) -> Frame:
+    """The same as origin [m] and axes."""
+    xp = array_namespace(spring_m, estimator.spring_site_m)
+    spring_m = xp.asarray(spring_m, dtype=estimator.spring_site_m.dtype)
+    even = constant_curvature(estimator.spring_site_m, spring_m)  # (..., n_sections)
+    normalised = (spring_m - estimator.spring_centre_m) / estimator.spring_scale_m
+    changes = mlp(estimator.layers, xp.concat([normalised, *_downs(even.rotation)], axis=-1))
+    changes = (
+        changes.reshape(*changes.shape[:-1], -1, N_CHANGES) * estimator.change_scale
+    )  # (..., sections, 6)
+    quaternion = xp.concat([xp.ones_like(changes[..., :1]), changes[..., 3:]], axis=-1)
+    turn = rotation_from_quaternion(quaternion / xp.sqrt(xp.sum(quaternion**2, axis=-1))[..., None])
+    return chain(Frame(even.position_m + changes[..., :3], turn @ even.rotation))
+
+
+def constant_curvature(spring_site_m: Any, spring_m: Any) -> Frame:
+    """Each section's end, in the frame of its start, if all of the section bends evenly.
+
+    Args:
+        spring_site_m (n, 2) [m]: holes of the springs, three to a section, evenly on a circle.
+        spring_m (..., n) [m]: lengths.
+
+    Returns:
+        Positions (..., n_sections, 3) and rotations (..., n_sections, 3, 3).
+
+    Source: Webster, Jones, "Design and Kinematic Modeling of Constant Curvature Continuum Robots", 2010.
+    """
+    xp = array_namespace(spring_m, spring_site_m)
+    site = spring_site_m.reshape(-1, N_CHAMBERS_PER_SECTION, 2)
+    spring = spring_m.reshape(*spring_m.shape[:-1], -1, N_CHAMBERS_PER_SECTION)
+    length = xp.mean(spring, axis=-1)[..., None]  # (..., n_sections, 1)
+    # The arm turns towards its shorter springs by |bend|.
+    bend = (
+        -2.0 * xp.sum((spring - length)[..., None] * site, axis=-2) / xp.sum(site**2, axis=(-2, -1))[:, None]
+    )
+    square = xp.sum(bend**2, axis=-1)[..., None]
+    angle = xp.sqrt(xp.where(square < _SMALL_BEND, _SMALL_BEND, square))
+    half = xp.sin(0.5 * angle) / angle
+    aside, down = 2.0 * half**2, xp.sin(angle) / angle  # aside: (1 - cos) / angle^2, exact in float32 too
+    position_m = length * xp.concat([aside * bend, -down], axis=-1)
+    across = half * bend  # the axis of the turn is (bend y, -bend x, 0)
+    quaternion = xp.concat(
+        [xp.cos(0.5 * angle), across[..., 1:], -across[..., :1], xp.zeros_like(angle)], axis=-1
+    )
+    return Frame(position_m, rotation_from_quaternion(quaternion))
+
+
+def _downs(rotation: Any) -> list[Any]:
+    """The base's z axis (..., 3) at each section's end, if they turn by (..., n_sections, 3, 3)."""
+    downs = [rotation[..., 0, 2:, :]]
+    for section in range(1, rotation.shape[-3]):
+        downs.append(downs[-1] @ rotation[..., section, :, :])
+    return [down[..., 0, :] for down in downs]
+
+
+def chain(sections: Frame) -> Frame:
+    """The last plate in the base frame of sections (..., n_sections) that follow one another."""
+    position_m, rotation = sections.position_m[..., -1, :, None], sections.rotation[..., -1, :, :]
+    for section in reversed(range(sections.position_m.shape[-2] - 1)):  # from the tip up to the base
+        above = sections.rotation[..., section, :, :]
+        position_m = sections.position_m[..., section, :, None] + above @ position_m
+        rotation = above @ rotation
+    return Frame(position_m[..., 0], rotation)
+
+
+def expected_springs(model: SpringModel, pressure_kpa: Any) -> Any:
+    """Spring lengths (..., n) [m] of the arm at rest at pressures (..., n) [kPa], without a payload."""
+    xp = array_namespace(pressure_kpa, model.pressure_centre_kpa)
+    pressure_kpa = xp.asarray(pressure_kpa, dtype=model.pressure_centre_kpa.dtype)
+    normalised = (pressure_kpa - model.pressure_centre_kpa) / model.pressure_scale_kpa
+    return model.spring_centre_m + model.spring_scale_m * mlp(model.layers, normalised)
+
+
+def take_estimator(entries: Entries, name: str, n_springs: int) -> PoseEstimator:
+    """The estimator `name` among the entries of a file, checked.
+
+    Raises:
+        SealedFileError: an entry is missing, or of the wrong type, shape or range.
+    """
+    n_sections = n_springs // N_CHAMBERS_PER_SECTION
+    shapes = {
+        "spring_site_m": (n_springs, 2),
+        "spring_centre_m": (n_springs,),
+        "spring_scale_m": (n_springs,),
+        "change_scale": (N_CHANGES,),
+    }
+    n_in, n_out = n_springs + 3 * n_sections, N_CHANGES * n_sections
+    estimator = entries.network(name, PoseEstimator, shapes, n_in, n_out)
+    _check_scales(entries, name, estimator, "spring_scale_m", "change_scale")
+    return estimator
+
+
+def take_spring_model(entries: Entries, name: str, n_springs: int) -> SpringModel:
+    """The spring model `name` among the entries of a file, checked.
+
+    Raises:
+        SealedFileError: an entry is missing, or of the wrong type, shape or range.
+    """
+    shapes = {item: (n_springs,) for item in SpringModel._fields if item != "layers"}
+    model = entries.network(name, SpringModel, shapes, n_springs, n_springs)
+    _check_scales(entries, name, model, "pressure_scale_kpa", "spring_scale_m")
+    return model
+
+
+def _check_scales(entries: Entries, name: str, network: Any, *items: str) -> None:
+    for item in items:
+        if not (getattr(network, item) > 0.0).all():
+            entries.fail(f"{name}.{item}", f"got {getattr(network, item).tolist()}, expected numbers > 0")

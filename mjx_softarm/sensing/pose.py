@@ -1,0 +1,104 @@
+"""Poses of the arm's tip, as used everywhere.
+
+    pose (..., 6) = x, y, z [mm], yaw, pitch, roll [deg]
+
+in the base frame: z up, the arm hangs towards -z. The angles are intrinsic Z-Y-X, so the tip's axes are the
+columns of R = Rz(yaw) Ry(pitch) Rx(roll), and all three are zero where the arm hangs straight. Yaw and
+roll lie in [-180, 180], pitch in [-90, 90].
+
+Gimbal lock: where the tip's x axis is vertical, |pitch| = 90, yaw and roll turn about the same axis. There
+yaw is 0, roll takes the whole turn, and the yaw's gradient is 0; the pose still gives the rotation back.
+Close by, yaw and roll change as fast as 1 / cos(pitch), and so do their gradients.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mjx_softarm._support.xp import Array, array_namespace
+
+_LOCKED_COS = 1e-6  # cos(pitch) below this is gimbal lock
+
+# A quaternion q turns a vector v into q v q*: the matrices of these two products, as indices of (q, -q).
+_LEFT = np.array([[1, 0, 7, 2], [2, 3, 0, 5], [3, 6, 1, 0]])
+_RIGHT = np.array([[1, 2, 3], [0, 7, 2], [3, 0, 5], [6, 1, 0]])
+
+
+def pose_from_frame(position_m: Array, rotation: Array) -> Array:
+    """Pose of a frame given by its origin and axes.
+
+    Args:
+        position_m (..., 3) [m]: in the base frame.
+        rotation (..., 3, 3): columns are the frame's axes in the base frame.
+
+    Returns:
+        Pose (..., 6) [mm, deg].
+    """
+    xp = array_namespace(position_m, rotation)
+    (r00, r01, r02), (r10, r11, r12), (r20, _, _) = (
+        [rotation[..., row, column] for column in range(3)] for row in range(3)
+    )
+    locked = r00**2 + r10**2 < _LOCKED_COS**2
+    yaw = xp.atan2(xp.where(locked, 0.0, r10), xp.where(locked, 1.0, r00))
+    # Without its yaw the rotation is Ry(pitch) Rx(roll), whose entries are never all zero.
+    cos, sin = xp.cos(yaw), xp.sin(yaw)
+    pitch = xp.atan2(-r20, cos * r00 + sin * r10)
+    roll = xp.atan2(sin * r02 - cos * r12, cos * r11 - sin * r01)
+    angles_deg = xp.rad2deg(xp.stack([yaw, pitch, roll], axis=-1))
+    return xp.concat([1000.0 * position_m, angles_deg], axis=-1)
+
+
+def pose_from_quaternion(position_m: Array, quaternion: Array) -> Array:
+    """Pose of a frame given by its origin and a quaternion, as MuJoCo and motion capture give it.
+
+    Args:
+        position_m (..., 3) [m]: in the base frame.
+        quaternion (..., 4): w, x, y, z, of length 1; a small error of the length does not matter.
+
+    Returns:
+        Pose (..., 6) [mm, deg].
+    """
+    return pose_from_frame(position_m, rotation_from_quaternion(quaternion))
+
+
+def rotation_from_quaternion(quaternion: Array) -> Array:
+    """Matrix (..., 3, 3) of a quaternion (..., 4) w, x, y, z; its entries scale with the length's square."""
+    xp = array_namespace(quaternion)
+    signed = xp.concat([quaternion, -quaternion], axis=-1)  # (..., 8)
+    return signed[..., _LEFT] @ signed[..., _RIGHT]
+
+
+def quaternion_from_pose(pose: Array) -> Array:
+    """Quaternion (..., 4) w, x, y, z of the angles of a pose (..., 6) [mm, deg]."""
+    xp = array_namespace(pose)
+    half = xp.deg2rad(0.5 * pose[..., 3:])
+    (cy, cp, cr), (sy, sp, sr) = ([f(half[..., k]) for k in range(3)] for f in (xp.cos, xp.sin))
+    parts = [
+        cy * cp * cr + sy * sp * sr,
+        cy * cp * sr - sy * sp * cr,
+        cy * sp * cr + sy * cp * sr,
+        sy * cp * cr - cy * sp * sr,
+    ]
+    return xp.stack(parts, axis=-1)
+
+
+def frame_from_pose(pose: Array) -> tuple[Array, Array]:
+    """Origin (..., 3) [m] and axes (..., 3, 3) of a pose (..., 6) [mm, deg]; inverse of `pose_from_frame`."""
+    xp = array_namespace(pose)
+    angles = xp.deg2rad(pose[..., 3:])
+    (cy, cp, cr), (sy, sp, sr) = ([f(angles[..., k]) for k in range(3)] for f in (xp.cos, xp.sin))
+    rows = (
+        *(cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
+        *(sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
+        *(-sp, cp * sr, cp * cr),
+    )
+    return 0.001 * pose[..., :3], xp.stack(rows, axis=-1).reshape(*pose.shape[:-1], 3, 3)
+
+
+def pose_error(pose: Array, goal: Array) -> Array:
+    """pose - goal, both (..., 6) [mm, deg], with the differences of angles wrapped into [-180, 180)."""
+    xp = array_namespace(pose, goal)
+    error = pose - goal
+    angles = error[..., 3:]
+    wrapped = angles - 360.0 * xp.floor((angles + 180.0) / 360.0)
+    return xp.concat([error[..., :3], wrapped], axis=-1)

@@ -1,0 +1,200 @@
+"""The sim-to-real network: simulated tip pose and spring lengths -> pose of the real tip.
+
+The network gives a correction, added to the simulated position and turned onto the simulated axes, so that a
+network that says nothing leaves the simulation as it is. Inside, orientation is two columns of the rotation
+matrix going in and a Gibbs vector (axis times the tangent of half the angle) coming out: both are smooth at
+pitch 90, where yaw and roll are not.
+
+Training in simulation visits arms far from all that was logged. There the network must not blow up: its
+inputs are held within the range of the training rows and its outputs within the range of their corrections.
+`extrapolation` tells how far away such an arm is.
+
+Source: Sim-to-Real Transfer in Meng et al., N_S2R: (P, L_spring) -> P_S2R.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mjx_softarm._support.archive import Entries, entries_of, read_sealed, write_sealed
+from mjx_softarm._support.mlp import Layer, mlp
+from mjx_softarm._support.xp import array_namespace
+from mjx_softarm.sensing.pose import frame_from_pose, pose_from_frame, rotation_from_quaternion
+
+N_POSE_INPUTS = 9  # position and two columns of the rotation
+N_POSE_OUTPUTS = 6  # change of the position, Gibbs vector
+KIND = "s2r"
+S2R_FILE = "s2r.npz"  # in the folder of a calibration, and of a run that was trained with it
+
+
+class S2R(NamedTuple):
+    """A network with the range it was trained in; n_in is 9 + n springs, n_out 6 for an arm. All float32."""
+
+    layers: tuple[Layer, ...]  # normalised inputs (n_in,) -> corrections (n_out,)
+    input_low: Any  # (n_in,) least and greatest of the training rows,
+    input_high: Any  # (n_in,) normalised to -1 and 1
+    output_low: Any  # (n_out,) the same of their corrections
+    output_high: Any  # (n_out,)
+    anchors: Any  # (n_anchors, n_in) normalised training rows that stand for all of them
+    limit: Any  # () greatest believable distance to the nearest anchor
+
+
+def correct(s2r: S2R, pose: Any, spring_m: Any) -> Any:
+    """Pose of the real tip.
+
+    Args:
+        s2r: the network.
+        pose (..., 6) [mm, deg]: simulated, in the base frame.
+        spring_m (..., n) [m]: simulated or sensed spring lengths.
+
+    Returns:
+        Pose (..., 6) [mm, deg].
+    """
+    frame = frame_from_pose(pose)
+    return pose_from_frame(*apply_correction(frame, correction(s2r, inputs(frame, spring_m))))
+
+
+def extrapolation(s2r: S2R, pose: Any, spring_m: Any) -> Any:
+    """Distance (...) to the training rows over its limit; above 1, the network is not to be believed.
+
+    Args:
+        s2r: the network.
+        pose (..., 6) [mm, deg]: as for `correct`.
+        spring_m (..., n) [m]: as for `correct`.
+    """
+    return distance(s2r, inputs(frame_from_pose(pose), spring_m)) / s2r.limit
+
+
+def inputs(frame: tuple[Any, Any], spring_m: Any) -> Any:
+    """What the network looks at (..., 9 + n): position [m], the tip's x and y axes, spring lengths [m]."""
+    position_m, rotation = frame
+    xp = array_namespace(position_m, spring_m)
+    return xp.concat([position_m, rotation[..., 0], rotation[..., 1], spring_m], axis=-1)
+
+
+def correction(s2r: S2R, x: Any) -> Any:
+    """Outputs (..., n_out) of inputs (..., n_in), never outside of the training rows' range."""
+    xp = array_namespace(x, s2r.input_low)
+    z = xp.clip(_normalised(s2r, x), -1.0, 1.0)
+    return xp.clip(mlp(s2r.layers, z), s2r.output_low, s2r.output_high)
+
+
+def distance(s2r: S2R, x: Any) -> Any:
+    """Distance (...) of inputs (..., n_in) to the nearest anchor, as root mean square over the inputs."""
+    xp = array_namespace(x, s2r.anchors)
+    offset = _normalised(s2r, x)[..., None, :] - s2r.anchors  # (..., n_anchors, n_in)
+    return xp.sqrt(xp.min(xp.mean(offset**2, axis=-1), axis=-1))
+
+
+def apply_correction(frame: tuple[Any, Any], change: Any) -> tuple[Any, Any]:
+    """A frame moved and turned in the base frame; its axes come out scaled, which no angle depends on.
+
+    Args:
+        frame: origin (..., 3) [m] and axes (..., 3, 3).
+        change (..., 6): shift [mm], Gibbs vector.
+    """
+    position_m, rotation = frame
+    xp = array_namespace(position_m, change)
+    turn = rotation_from_quaternion(xp.concat([xp.ones_like(change[..., :1]), change[..., 3:]], axis=-1))
+    return position_m + 0.001 * change[..., :3], turn @ rotation
+
+
+def correction_between(pose: Any, real_pose: Any) -> Any:
+    """The change (..., 6) with which `apply_correction` makes a pose the real one, below 180 degrees."""
+    xp = array_namespace(pose, real_pose)
+    (start_m, start), (end_m, end) = frame_from_pose(pose), frame_from_pose(real_pose)
+    turn = end @ xp.swapaxes(start, -1, -2)
+    (_, r01, r02), (r10, _, r12), (r20, r21, _) = (
+        [turn[..., row, column] for column in range(3)] for row in range(3)
+    )
+    size = 1.0 + xp.trace(turn, axis1=-2, axis2=-1)  # 4 cos(angle / 2)^2
+    gibbs = xp.stack([r21 - r12, r02 - r20, r10 - r01], axis=-1) / xp.maximum(size, 1e-6)[..., None]
+    return xp.concat([1000.0 * (end_m - start_m), gibbs], axis=-1)
+
+
+def carry_body(plate_position: Any, plate_rotation: Any, real_pose: Any) -> tuple[Any, Any]:
+    """Plates of the real arm, where the network knows of its tip alone.
+
+    An approximation: a base that is askew, which puts the real tip elsewhere most, moves a plate the more the
+    further down it is. So each plate is moved by its share of the tip's way, in proportion to its place along
+    the arm, and keeps its direction; the last one is the real tip's. A base that stands off, which moves all
+    plates alike, is not made up for at the base.
+
+    Args:
+        plate_position (..., L + 1, 3) [m]: simulated, as in `mjx_softarm.mechanics.kinematics.Frames`.
+        plate_rotation (..., L + 1, 3, 3): likewise.
+        real_pose (..., 6) [mm, deg]: of the tip, from `correct`.
+
+    Returns:
+        The same of the real arm.
+    """
+    xp = array_namespace(plate_position, real_pose)
+    tip_m, rotation = frame_from_pose(real_pose)
+    share = xp.linspace(0.0, 1.0, plate_position.shape[-2], dtype=plate_position.dtype)
+    way_m = tip_m - plate_position[..., -1, :]
+    moved = plate_position + share[:, None] * way_m[..., None, :]
+    return moved, xp.concat([plate_rotation[..., :-1, :, :], rotation[..., None, :, :]], axis=-3)
+
+
+def _normalised(s2r: S2R, x: Any) -> Any:
+    return 2.0 * (x - s2r.input_low) / (s2r.input_high - s2r.input_low) - 1.0
+
+
+def save_s2r(path: str | Path, s2r: S2R) -> None:
+    """Check a network and write it, whole or not at all; the same network gives the same bytes.
+
+    Raises:
+        SealedFileError: the network is not valid, such as a weight that is not finite, or the file cannot be
+            written. A file that was there before is then still there.
+    """
+    arrays = entries_of(KIND, s2r)
+    _unpack(arrays, str(path))
+    write_sealed(Path(path), arrays, KIND)
+
+
+def load_s2r(path: str | Path, n_springs: int | None = None) -> S2R:
+    """Read a network and check all of it; of any arm where `n_springs` is None.
+
+    Raises:
+        SealedFileError: the file cannot be read, is incomplete, damaged, of another kind, or an entry is
+            missing, unknown, or of the wrong type, shape or range.
+    """
+    return _unpack(read_sealed(Path(path), KIND, "python -m calib run"), str(path), n_springs)
+
+
+def take_s2r(entries: Entries, name: str, n_springs: int | None = None) -> S2R:
+    """The network `name` among the entries of a file, checked; of any arm where `n_springs` is None.
+
+    Raises:
+        SealedFileError: an entry is missing, or of the wrong type, shape or range.
+    """
+    wanted = None if n_springs is None else N_POSE_INPUTS + n_springs
+    low = entries.take(f"{name}.input_low", np.float32, (wanted,))
+    n_in, n_out = len(low), N_POSE_OUTPUTS
+    shapes: dict[str, tuple[int | None, ...]] = {
+        "input_low": (n_in,),
+        "input_high": (n_in,),
+        "output_low": (n_out,),
+        "output_high": (n_out,),
+        "anchors": (None, n_in),
+        "limit": (),
+    }
+    s2r = entries.network(name, S2R, shapes, n_in, n_out)
+    for item, holds, expected in (
+        ("input_high", s2r.input_low < s2r.input_high, "more than input_low"),
+        ("output_high", s2r.output_low <= s2r.output_high, "at least output_low"),
+        ("limit", s2r.limit > 0.0, "a number > 0"),
+    ):
+        if not np.all(holds):
+            entries.fail(f"{name}.{item}", f"got {getattr(s2r, item)}, expected {expected}")
+    return s2r
+
+
+def _unpack(arrays: dict[str, np.ndarray], source: str, n_springs: int | None = None) -> S2R:
+    entries = Entries(arrays, source)
+    s2r = take_s2r(entries, KIND, n_springs)
+    entries.finish(1)
+    return s2r

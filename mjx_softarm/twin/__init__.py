@@ -1,0 +1,1 @@
+"""Digital twins: simulated stand-ins for an arm that hide their parameters."""

@@ -1,0 +1,261 @@
+"""The twin: a stand-in for the physical arm, reached like one through `ArmIO` and logs alone.
+
+A finer model than training's, with parts that are off, chambers with hysteresis, joints with friction, air
+that has to be pumped and sensors that are noisy. Training and calibration never import it. Its parameters
+are drawn from one integer seed and stay private; `describe` tells how they are distributed.
+
+Clock: simulated time stands still but in `write_pressures`, which advances it by one control period of the
+specification. So a loop that reads, computes and writes runs at that rate however fast the machine is.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from mjx_softarm.deploy.arm_io import Capture
+from mjx_softarm.mechanics.body import payload_radius_m
+from mjx_softarm.mechanics.pipe import CrossPipe
+from mjx_softarm.sensing.sensors import frequency_from_length
+from mjx_softarm.spec import ArmSpec
+from mjx_softarm.twin.hysteresis import StopOperators
+from mjx_softarm.twin.model import (
+    AS_BUILT,
+    WIDEST_DRAW,
+    Build,
+    build_twin,
+    draw_parts,
+    rotation_matrix,
+    scaled_tolerances,
+)
+from mjx_softarm.twin.pipe import WallForce, contact_force, is_container
+from mjx_softarm.twin.pneumatics import PUMP_M3_PER_S, VALVE_S, Pneumatics
+
+# The twins that results are reported on; the size of the gap was set on these six, without S2R. An S2R
+# network belongs to one arm, so its data come from the same twin, but from another session, whose noise is
+# another, and from other motions than the evaluation's.
+EVALUATION_SEEDS = (0, 1, 2, 3, 4, 5)
+S2R_SESSION, EVALUATION_SESSION = 0, 1
+
+# Chambers: four stops of equal force; 3 % of the elastic force of a chamber at its shortest.
+HYSTERESIS_LIMIT_N = 1.5
+HYSTERESIS_STROKES_M = (0.003, 0.006, 0.012, 0.024)
+# Joints of a link (slide, hinges): Coulomb friction and the displacement at which it slides.
+FRICTION_LIMIT = (0.3, 0.01, 0.01)  # [N, N m, N m]
+FRICTION_STROKE = (2e-4, 5e-3, 5e-3)  # [m, rad, rad]
+
+REFERENCE_CLOCK_HZ = 40e6  # LDC1612 data sheet, TI SNOSCY9: a reading counts 2^-28 of it
+READING_BITS = 28
+FREQUENCY_NOISE_HZ = 300.0  # assumed: 0.04 mm of a spring 0.2 m long; far above the converter's own
+PRESSURE_NOISE_KPA = 0.05
+CAPTURE_NOISE_M = 2e-4
+CAPTURE_NOISE_DEG = 0.1
+SPRING_NOISE_M = 2**0.5 * CAPTURE_NOISE_M  # between two markers
+PRESSURE_TOLERANCE_KPA = 1e-3  # a float32 limit is not yet beyond the limit
+MARKERS_PER_SECTION = 3
+REST_S = 4.0  # hanging at atmospheric pressure before time starts
+
+
+class Twin:
+    """One arm and its pump, sensors and cameras; an `ArmIO` and a `MotionCapture`.
+
+    Example: `twin = Twin(7)`, then `twin.read_frequencies()` and `twin.write_pressures(p)` in turn.
+    """
+
+    def __init__(
+        self,
+        seed: int,
+        spec: ArmSpec | None = None,
+        payload_kg: float = 0.0,
+        session: int = EVALUATION_SESSION,
+        build: Build = AS_BUILT,
+        pipe: CrossPipe | None = None,
+    ):
+        """Hang the arm up, unpressurised, and wait until it is at rest.
+
+        Args:
+            seed: chooses the twin, 0 or greater.
+            spec: the nominal arm that the twin deviates from, the paper's by default; its payload is ignored.
+            payload_kg: attached from the start.
+            session: chooses the noise.
+            build: how far from ideal.
+            pipe: around the arm, in the motion capture's frame; without one the arm touches nothing.
+        """
+        spec = spec or ArmSpec.default()
+        self._parts = draw_parts(seed, spec, build)
+        self._build = build
+        self._noise = np.random.default_rng([session, seed])
+        self._pipe = pipe
+        self._model = build_twin(self._parts, pipe)
+        self._data = mujoco.MjData(self._model)
+        self._container = is_container(self._model)
+        self._wall_force = WallForce(0.0, 0.0)
+        self._base_m = self._parts.base_position_m
+        self._base_rotation = rotation_matrix(self._parts.base_tilt_rad)
+        self._steps = round(1.0 / (spec.control.rate_hz * self._model.opt.timestep))
+        self._gripper_length_m = spec.mass.gripper_length_m
+        self.time_s = 0.0
+        mujoco.mj_step1(self._model, self._data)
+        self._start_losses()
+        chambers, n = self._parts.spec.chambers, spec.n_chambers
+        self._air = Pneumatics(
+            np.array(self._parts.spec.per_chamber(chambers.area_m2)),
+            np.array(self._parts.spec.per_chamber(chambers.area_slope_m)),
+            spec.geometry.section_length_m,
+            self._data.ten_length[0::2],
+            self._model.opt.timestep,
+        )
+        self.attach(payload_kg)
+        for _ in range(round(REST_S * spec.control.rate_hz)):
+            self.write_pressures(np.zeros(n))
+        self.time_s = 0.0
+
+    def _start_losses(self) -> None:
+        per_link = self._model.nq // len(FRICTION_LIMIT)
+        limit = self._build.losses * np.tile(FRICTION_LIMIT, per_link)[:, None]
+        stroke = np.tile(FRICTION_STROKE, per_link)[:, None]
+        self._friction = StopOperators(limit / stroke, limit, self._data.qpos)
+        strokes = np.array(HYSTERESIS_STROKES_M)
+        scale = self._build.losses * self._parts.hysteresis[:, None]
+        limit = scale * np.full(len(strokes), HYSTERESIS_LIMIT_N / len(strokes))
+        self._hysteresis = StopOperators(limit / strokes, limit, self._data.ten_length[0::2])
+
+    def read_frequencies(self) -> np.ndarray:
+        """The springs' frequencies (n,) [Hz] now, counted by the converter; see `ArmIO`."""
+        true_hz = frequency_from_length(self._data.ten_length[1::2], self._parts.sensor)
+        noisy_hz = true_hz + self._draw(FREQUENCY_NOISE_HZ, len(true_hz))
+        step_hz = REFERENCE_CLOCK_HZ / 2**READING_BITS
+        return np.round(noisy_hz / step_hz) * step_hz
+
+    def write_pressures(self, pressure_kpa: np.ndarray) -> None:
+        """Command pressures (n,) [kPa], then let one control period pass; see `ArmIO`."""
+        chambers = self._parts.spec.chambers
+        low, high = chambers.pressure_min_kpa, chambers.pressure_max_kpa
+        command = np.asarray(pressure_kpa, float)
+        if command.shape != self._air.pressure_kpa.shape:
+            raise ValueError(
+                f"pressure_kpa: got shape {command.shape}, expected {self._air.pressure_kpa.shape}"
+            )
+        within = (command >= low - PRESSURE_TOLERANCE_KPA) & (command <= high + PRESSURE_TOLERANCE_KPA)
+        if not within.all():
+            chamber = int(np.flatnonzero(~within)[0])
+            raise ValueError(
+                f"pressure_kpa[{chamber}]: got {command[chamber]:g}, expected {low:g} to {high:g} kPa"
+            )
+        self._air.command(np.clip(command, low, high))
+        self._wall_force = WallForce(0.0, 0.0)
+        for _ in range(self._steps):
+            self._step()
+        if self._data.warning.number.any():  # MuJoCo would start anew by itself
+            raise FloatingPointError(f"the twin's model became unstable before {self.time_s:g} s")
+        self.time_s += self._steps * self._model.opt.timestep
+
+    def pressures(self) -> np.ndarray:
+        """Pressures (n,) [kPa] that the regulators' sensors measure in the chambers now."""
+        return self._air.pressure_kpa + self._draw(PRESSURE_NOISE_KPA, len(self._air.pressure_kpa))
+
+    def motion_capture(self) -> Capture:
+        """Tip, and the rings at each third of a section from the first to the tip; see `MotionCapture`."""
+        spec, data = self._parts.spec, self._data
+        n_markers = MARKERS_PER_SECTION * spec.structure.n_sections
+        thirds = np.arange(1, n_markers + 1) * spec.structure.links_per_section / MARKERS_PER_SECTION
+        bodies = np.round(thirds).astype(int)  # link k is body k + 1, its ring at its lower end
+        down = 0.5 * spec.link_length_m * data.xmat[bodies, 2::3]
+        marker_m = self._base_m + (data.xpos[bodies] - down) @ self._base_rotation.T
+        tip = self._base_rotation @ data.site("tip").xmat.reshape(3, 3)
+        tip_m = self._base_m + self._base_rotation @ data.site("tip").xpos
+        turn = rotation_matrix(np.radians(self._draw(CAPTURE_NOISE_DEG, 3)))
+        quaternion = np.zeros(4)
+        mujoco.mju_mat2Quat(quaternion, (turn @ tip).ravel())
+        noise_m = self._draw(CAPTURE_NOISE_M, n_markers + 1, 3)
+        spring_m = data.ten_length[1::2] + self._draw(SPRING_NOISE_M, spec.n_chambers)
+        return Capture(tip_m + noise_m[0], quaternion, marker_m + noise_m[1:], spring_m)
+
+    def attach(self, payload_kg: float) -> None:
+        """Hang a payload to the finger tips, in place of what hung there.
+
+        Raises:
+            ValueError: a mass that is negative or not finite.
+        """
+        if not (np.isfinite(payload_kg) and payload_kg >= 0.0):
+            raise ValueError(f"payload_kg: got {payload_kg!r}, expected a number >= 0")
+        body = self._model.body("payload").id
+        self._model.body_mass[body] = payload_kg
+        self._model.body_inertia[body] = payload_kg * self._gripper_length_m**2 / 12
+        mujoco.mj_setConst(self._model, mujoco.MjData(self._model))
+        mujoco.mj_step1(self._model, self._data)
+
+    def release(self) -> None:
+        """Let the payload go."""
+        self.attach(0.0)
+
+    def wall_force_n(self) -> WallForce:
+        """How hard the arm pressed against the pipe: each the largest of the last control period.
+
+        Returns:
+            Sums [N] of the normal contact forces of the walls, and of the containers; zeros without a pipe.
+        """
+        return self._wall_force
+
+    def renderer(self, width: int, height: int) -> Any:
+        """A `mjx_softarm.mechanics.render.Renderer` of this twin, for `draw`.
+
+        Raises:
+            RenderError: there is no OpenGL to draw with.
+        """
+        from mjx_softarm.mechanics.render import Renderer
+
+        return Renderer(self._model, width, height)
+
+    def draw(self, renderer: Any) -> np.ndarray:
+        """A picture of the twin as it is now: RGB, (height, width, 3) uint8.
+
+        A pipe is drawn cut open, seen from the front, along +y; a payload as a ball at the finger tips.
+        """
+        from mjx_softarm.mechanics.render import Camera
+
+        payload_kg = float(self._model.body("payload").mass[0])
+        return renderer.draw(
+            self._data.qpos,
+            Camera(azimuth_deg=90.0, height=1.7, centre=0.66) if self._pipe else None,
+            payload_radius_m(payload_kg) if payload_kg else 0.0,
+        )
+
+    def describe(self) -> dict[str, Any]:
+        """How the twins are distributed, for reports: nothing about the one that was drawn."""
+        return {
+            "gap": self._build.gap,
+            "standard deviations": dataclasses.asdict(scaled_tolerances(self._build.gap)),
+            "widest draw [standard deviations]": WIDEST_DRAW,
+            "links per section": self._build.links_per_section,
+            "hysteresis of a chamber [N]": self._build.losses * HYSTERESIS_LIMIT_N,
+            "friction of a link [N, N m, N m]": [self._build.losses * limit for limit in FRICTION_LIMIT],
+            "frequency noise [Hz]": self._build.noise * FREQUENCY_NOISE_HZ,
+            "pressure noise [kPa]": self._build.noise * PRESSURE_NOISE_KPA,
+            "motion capture noise [mm, deg]": [
+                self._build.noise * 1e3 * CAPTURE_NOISE_M,
+                self._build.noise * CAPTURE_NOISE_DEG,
+            ],
+            "pump [L/min]": 6e4 * PUMP_M3_PER_S,
+            "valve [ms]": 1e3 * VALVE_S,
+            **({} if self._pipe is None else {"pipe": dataclasses.asdict(self._pipe)}),
+        }
+
+    def _step(self) -> None:
+        """One time step; lengths and positions in the data are those of its end."""
+        data, n = self._data, len(self._parts.hysteresis)
+        length_m = data.ten_length[0::2]
+        data.ctrl[:n] = self._air.step(length_m)
+        data.ctrl[n:] = -self._hysteresis.move(length_m)
+        data.qfrc_applied[:] = -self._friction.move(data.qpos)
+        mujoco.mj_step2(self._model, data)
+        if self._pipe is not None:
+            force = contact_force(data, self._container)
+            self._wall_force = WallForce(*map(max, self._wall_force, force))
+        mujoco.mj_step1(self._model, data)
+
+    def _draw(self, deviation: float, *shape: int) -> np.ndarray:
+        return self._build.noise * deviation * self._noise.standard_normal(shape)

@@ -1,0 +1,187 @@
+"""The twin's body: a perturbed arm, drawn from a seed, as a MuJoCo model.
+
+Training's model has four links per section and ideal parts. The twin has ten, and each part is off by its own
+draw from `Tolerances`: chambers, rings and holes, the sections' mounting, the base, masses, springs. All
+standard deviations are multiplied by one number, `GAP`.
+
+How `GAP` was set: spring lengths that bring the tip of training's model to the 40 points of the paper's
+circle within 0.01 mm were given to the sensor-space law on six twins, springs calibrated, no S2R. Their mean
+tip error is the paper's 21 mm. It is not touched again.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from mjx_softarm.mechanics.mjcf import build_spec
+from mjx_softarm.mechanics.pipe import CrossPipe
+from mjx_softarm.mechanics.statics import GRAVITY_M_S2
+from mjx_softarm.sensing.sensors import SensorParams
+from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
+from mjx_softarm.twin.pipe import add_pipe
+
+GAP = 1.9
+LINKS_PER_SECTION = 10
+MAX_TIMESTEP_S = 0.005  # the tip within 0.13 mm RMS of 0.00125 s, over 30 s of random commands
+WIDEST_DRAW = 2.0  # standard deviations; a part further off would not have been mounted
+
+
+@dataclass(frozen=True)
+class Tolerances:
+    """Standard deviations at a gap of 1; relative where no unit is named."""
+
+    chamber_stiffness: float = 0.03  # per chamber
+    chamber_area: float = 0.015  # per chamber
+    chamber_length_m: float = 0.001  # per chamber: rest length
+    chamber_hysteresis: float = 0.1  # per chamber
+    backbone_stiffness: float = 0.05  # per section
+    link_mass: float = 0.05  # per link
+    gripper_mass: float = 0.02
+    hole_angle_deg: float = 2.0  # per chamber, and per spring
+    hole_radius_m: float = 0.0015  # per chamber, and per spring
+    ring_offset_m: float = 0.002  # per section and axis: the rings' centre off the section's axis
+    section_twist_deg: float = 1.75  # per section, against the one above
+    base_tilt_deg: float = 0.9  # per axis, against the frame of the motion capture
+    base_offset_m: float = 0.003  # per axis
+    spring_beta: float = 0.01  # per spring
+    spring_delta_m: float = 0.00075  # per spring
+
+
+class Build(NamedTuple):
+    """How far the twin is from an ideal arm; tests set some of these to zero."""
+
+    gap: float = GAP  # scale of the tolerances
+    losses: float = 1.0  # scale of hysteresis and joint friction
+    noise: float = 1.0  # scale of the noise of all sensors
+    links_per_section: int = LINKS_PER_SECTION
+
+
+AS_BUILT = Build()
+
+
+class Parts(NamedTuple):
+    """What was drawn."""
+
+    spec: ArmSpec  # chambers, springs, masses
+    sensor: SensorParams  # with the springs' own beta and delta
+    hole_m: dict[str, np.ndarray]  # "chamber", "spring" -> (n, 2) in the section's frame
+    twist_rad: np.ndarray  # (n_sections,)
+    backbone: np.ndarray  # (n_sections,) factor of the stiffness
+    link_mass: np.ndarray  # (n_links,) factor
+    hysteresis: np.ndarray  # (n,) factor
+    base_position_m: np.ndarray  # (3,)
+    base_tilt_rad: np.ndarray  # (3,) rotation vector
+
+
+def draw_parts(seed: int, spec: ArmSpec, build: Build) -> Parts:
+    """The parts of the twin of that seed; how noise and losses are scaled does not change them."""
+    rng = np.random.default_rng(seed)
+    std = scaled_tolerances(build.gap)
+    n, n_sections = spec.n_chambers, spec.structure.n_sections
+
+    def off(deviation: float, *shape: int) -> np.ndarray:
+        return deviation * np.clip(rng.standard_normal(shape), -WIDEST_DRAW, WIDEST_DRAW)
+
+    def per_chamber(value, deviation: float) -> tuple[float, ...]:
+        return tuple(np.array(spec.per_chamber(value)) * (1.0 + off(deviation, n)))
+
+    chambers, sensor = spec.chambers, spec.sensor
+    area_factor = 1.0 + off(std.chamber_area, n)
+    delta_m = np.array(spec.per_chamber(sensor.delta_m)) + off(std.spring_delta_m, n)
+    offset_m = np.array(spec.per_chamber(chambers.length_offset_m)) + off(std.chamber_length_m, n)
+    perturbed = spec.replace(
+        structure={"links_per_section": build.links_per_section},
+        chambers={
+            "stiffness_n_per_m": per_chamber(chambers.stiffness_n_per_m, std.chamber_stiffness),
+            "area_m2": tuple(area_factor * spec.per_chamber(chambers.area_m2)),
+            "area_slope_m": tuple(area_factor * spec.per_chamber(chambers.area_slope_m)),
+            "length_offset_m": tuple(offset_m),
+        },
+        mass={"gripper_kg": spec.mass.gripper_kg * (1.0 + off(std.gripper_mass)), "payload_kg": 0.0},
+    )
+    beta = np.array(per_chamber(sensor.beta, std.spring_beta))
+    ring_m = np.repeat(off(std.ring_offset_m, n_sections, 2), N_CHAMBERS_PER_SECTION, axis=0)
+    angle = np.radians(spec.geometry.first_chamber_deg) + 2 * np.pi * np.arange(n) / N_CHAMBERS_PER_SECTION
+    hole_m = {}
+    for kind, radius_m in (
+        ("chamber", spec.geometry.chamber_radius_m),
+        ("spring", spec.geometry.spring_radius_m),
+    ):
+        turned = angle + np.radians(off(std.hole_angle_deg, n))
+        on_circle = np.stack([np.cos(turned), np.sin(turned)], axis=-1)
+        hole_m[kind] = (radius_m + off(std.hole_radius_m, n))[:, None] * on_circle + ring_m
+    tilt_rad = np.radians(off(std.base_tilt_deg, 3)) * [1.0, 1.0, 0.0]  # about z: the first section's twist
+    return Parts(
+        spec=perturbed,
+        sensor=SensorParams.from_spec(spec)._replace(beta=beta, delta_m=delta_m),
+        hole_m=hole_m,
+        twist_rad=np.radians(off(std.section_twist_deg, n_sections)),
+        backbone=1.0 + off(std.backbone_stiffness, n_sections),
+        link_mass=1.0 + off(std.link_mass, perturbed.n_links),
+        hysteresis=1.0 + off(std.chamber_hysteresis, n),
+        base_position_m=off(std.base_offset_m, 3),
+        base_tilt_rad=tilt_rad,
+    )
+
+
+def scaled_tolerances(gap: float) -> Tolerances:
+    """The standard deviations at a gap."""
+    return Tolerances(**{name: gap * value for name, value in dataclasses.asdict(Tolerances()).items()})
+
+
+def build_twin(parts: Parts, pipe: CrossPipe | None = None) -> mujoco.MjModel:
+    """The compiled model, in the frame of the arm's own base, maybe inside a pipe; see `twin_pipe`.
+
+    Besides the objects of `mjx_softarm.mechanics.mjcf` it has an actuator `loss{i}` on each chamber's tendon, whose
+    control is a force [N]. Pressures are not clipped: that is for the regulators.
+    """
+    spec, per_section = parts.spec, parts.spec.structure.links_per_section
+    mjspec = build_spec(spec)
+    period_s = 1.0 / spec.control.rate_hz
+    mjspec.option.timestep = period_s / math.ceil(period_s / MAX_TIMESTEP_S - 1e-9)
+    mjspec.option.gravity = -GRAVITY_M_S2 * rotation_matrix(parts.base_tilt_rad)[2]
+    for link in range(spec.n_links):
+        section, first = divmod(link, per_section)
+        body = mjspec.body(f"link{link}")
+        factor = parts.link_mass[link]
+        body.mass, body.inertia = body.mass * factor, body.inertia * factor
+        for name in ("slide", "bend_x", "bend_y"):
+            joint = mjspec.joint(f"{name}{link}")
+            joint.stiffness = joint.stiffness * parts.backbone[section]
+        if first == 0:
+            half = parts.twist_rad[section] / 2
+            body.quat = [np.cos(half), 0.0, 0.0, np.sin(half)]
+    for chamber in range(spec.n_chambers):
+        _mount(mjspec, chamber, parts, per_section)
+        mjspec.actuator(f"chamber{chamber}").ctrllimited = False
+        loss = mjspec.add_actuator(name=f"loss{chamber}", target=f"chamber{chamber}")
+        loss.trntype = mujoco.mjtTrn.mjTRN_TENDON
+    if pipe is not None:
+        add_pipe(mjspec, pipe, spec, parts.base_position_m, rotation_matrix(parts.base_tilt_rad))
+    return mjspec.compile()
+
+
+def _mount(mjspec: mujoco.MjSpec, chamber: int, parts: Parts, per_section: int) -> None:
+    """Move the holes of a chamber and of its spring; the section's first plate is not twisted with it."""
+    section = chamber // N_CHAMBERS_PER_SECTION
+    cos, sin = np.cos(parts.twist_rad[section]), np.sin(parts.twist_rad[section])
+    for kind, hole_m in parts.hole_m.items():
+        x, y = hole_m[chamber]
+        for k in range(per_section + 1):
+            site = mjspec.site(f"{kind}{chamber}_plate{section * per_section + k}")
+            at = [cos * x - sin * y, sin * x + cos * y] if k == 0 else [x, y]
+            site.pos = [*at, site.pos[2]]
+
+
+def rotation_matrix(vector_rad: np.ndarray) -> np.ndarray:
+    """The rotation (3, 3) about a vector (3,) by its length [rad]."""
+    angle, quaternion, matrix = float(np.linalg.norm(vector_rad)), np.zeros(4), np.zeros(9)
+    mujoco.mju_axisAngle2Quat(quaternion, vector_rad / max(angle, np.finfo(float).tiny), angle)
+    mujoco.mju_quat2Mat(matrix, quaternion)
+    return matrix.reshape(3, 3)

@@ -1,0 +1,154 @@
+"""The pipe around the twin: walls and containers that its rings and its gripper touch, and how hard.
+
+Walls are planks: the sides of a prism around each of the two cylinders. Where these meet, a wall of the
+vertical pipe ends at |z - centre| = |x|, and so does one of the horizontal pipe, since at the same y both are
+as far from their axes. The prisms lie outside the cylinders, by 0.9 % of the radius at their edges, so what
+is clear of the pipe touches no plank.
+
+The arm touches as a row of balls as wide as the rings. Near the tip a ball would reach past the gripper, so
+the last rings are rounded rims instead. Only arm and pipe touch: nothing of the arm touches the arm.
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from mjx_softarm.mechanics.body import gripper_boxes, rim_points, ring_radius_m
+from mjx_softarm.mechanics.pipe import CrossPipe
+from mjx_softarm.spec import ArmSpec
+
+N_PLANKS = 24  # around a branch; with a multiple of four none lies across the plane of the two axes
+THICKNESS_M = 0.04
+OVERLAP_M = 0.02  # of a plank, behind its neighbours' faces: what presses in at a seam gets out inwards
+RIM_ROUNDING_M = 0.01
+FLOOR_BELOW_M = 0.05  # a container's floor, below the finger tips: room for what they hold
+LEDGE_M = 0.02  # between the crossing and the floors left and right
+END_HEIGHT_M = 0.05  # a side container's outer end, which stands at the outlet, above its floor
+SHEET_M = 0.02  # thickness of floors and ends
+
+# Contacts. Friction as of plastics on each other. The time constant is three of the twin's time steps (MuJoCo
+# wants two or more); impedances near 1 let a wall yield to a load at rest by less than 1 mm.
+FRICTION = 0.4
+TIME_CONSTANT_S = 0.015
+IMPEDANCE = (0.95, 0.99, 0.001, 0.5, 2.0)
+
+WALL, CONTAINER = "wall", "container"  # how the names of their geometries begin
+_UNSEEN = 3  # a group that pictures leave out
+_WALL_COLOUR = [0.56, 0.58, 0.62, 1.0]
+_CONTAINER_COLOURS = {
+    "left": [0.25, 0.50, 0.80, 1.0],
+    "right": [0.90, 0.55, 0.20, 1.0],
+    "bottom": [0.35, 0.65, 0.35, 1.0],
+}
+
+
+class WallForce(NamedTuple):
+    """Sums of normal contact forces."""
+
+    wall: float  # [N]
+    container: float  # [N]
+
+
+def add_pipe(
+    mjspec: mujoco.MjSpec, pipe: CrossPipe, spec: ArmSpec, base_m: np.ndarray, base_rotation: np.ndarray
+) -> None:
+    """Add a pipe to an arm's model and let the arm touch it.
+
+    Args:
+        mjspec: from `mjx_softarm.mechanics.mjcf.build_spec`, in the frame of the arm's own base.
+        pipe: in the base frame, which is the motion capture's.
+        spec: of the arm.
+        base_m (3,) [m], base_rotation (3, 3): the arm's own base in the base frame.
+    """
+    off = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    mjspec.option.disableflags &= ~int(off)
+    mjspec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC  # the first force of a contact is the normal one
+    mjspec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE  # faster: most joints move most contacts
+    for name, corner_m, colour, group in (*_walls(pipe), *_containers(pipe)):
+        mesh = mjspec.add_mesh(name=name, uservert=((corner_m - base_m) @ base_rotation).ravel())
+        solid = mjspec.worldbody.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name)
+        solid.rgba, solid.group = colour, group
+        _make_solid(solid, contype=1, conaffinity=0)
+    _add_skin(mjspec, spec)
+
+
+def _walls(pipe: CrossPipe):
+    """(name, corners (8, 3) [m], colour, group) of every plank; the half at y < 0 is left out of pictures."""
+    branches = {  # length, and the branch's (across, y, along) -> (x, y, z) from the centre
+        "up": (pipe.top_z_m - pipe.centre_z_m, lambda a, y, s: (a, y, s)),
+        "down": (pipe.branch_m, lambda a, y, s: (a, y, -s)),
+        "right": (pipe.branch_m, lambda a, y, s: (s, y, a)),
+        "left": (pipe.branch_m, lambda a, y, s: (-s, y, a)),
+    }
+    reach = pipe.radius_m * np.tan(np.pi / N_PLANKS) + OVERLAP_M
+    depth, aside = (x.ravel() for x in np.meshgrid([0.0, THICKNESS_M], [-reach, reach]))
+    centre = np.array([0.0, 0.0, pipe.centre_z_m])
+    for branch, (length, place) in branches.items():
+        for k in range(N_PLANKS):
+            angle = 2 * np.pi * (k + 0.5) / N_PLANKS
+            cos, sin = np.cos(angle), np.sin(angle)
+            inner = pipe.radius_m * cos - aside * sin  # across, at the plank's inner face
+            across, y = inner + depth * cos, (pipe.radius_m + depth) * sin + aside * cos
+            ends = np.sign(cos) * inner, np.full(4, length)
+            corners = [np.stack(place(across, y, along), axis=-1) for along in ends]
+            group = 0 if sin > 0.0 else _UNSEEN
+            yield f"{WALL}_{branch}{k}", centre + np.concatenate(corners), _WALL_COLOUR, group
+
+
+def _containers(pipe: CrossPipe):
+    """(name, corners (k, 3) [m], colour, group) of the floors, and of the outer ends left and right."""
+    at = pipe.containers()
+    width = np.sqrt(pipe.radius_m**2 - (pipe.drop_m + FLOOR_BELOW_M) ** 2)  # half of it
+    for side in ("left", "right"):
+        outwards, floor_z = np.sign(at[side][0]), at[side][2] - FLOOR_BELOW_M
+        for part, x, z in (
+            ("floor", (pipe.radius_m + LEDGE_M, pipe.branch_m), (floor_z - SHEET_M, floor_z)),
+            ("end", (pipe.branch_m, pipe.branch_m + SHEET_M), (floor_z - SHEET_M, floor_z + END_HEIGHT_M)),
+        ):
+            corners = [[outwards * a, b, c] for a, b, c in itertools.product(x, (-width, width), z)]
+            yield f"{CONTAINER}_{side}_{part}", np.array(corners), _CONTAINER_COLOURS[side], 0
+    rim = rim_points(pipe.radius_m, N_PLANKS) + at["bottom"] - [0.0, 0.0, FLOOR_BELOW_M]
+    plate = np.concatenate([rim, rim - [0.0, 0.0, SHEET_M]])
+    yield f"{CONTAINER}_bottom_floor", plate, _CONTAINER_COLOURS["bottom"], 0
+
+
+def _add_skin(mjspec: mujoco.MjSpec, spec: ArmSpec) -> None:
+    """What of the arm touches: balls or rims at the rings, and the gripper as it is drawn."""
+    radius = ring_radius_m(spec)
+    rim = rim_points(radius - RIM_ROUNDING_M)
+    for link in range(spec.n_links):
+        below = (spec.n_links - 1 - link) * spec.link_length_m  # the tip, below this link's ring
+        ring = mjspec.geom(f"ring{link + 1}").pos
+        centres, size = (ring + rim, RIM_ROUNDING_M) if below < radius else (ring[None], radius)
+        for k, centre in enumerate(centres):
+            ball = mjspec.body(f"link{link}").add_geom(name=f"skin{link}_{k}", size=[size, 0.0, 0.0])
+            ball.pos, ball.mass, ball.group = centre, 0.0, _UNSEEN
+            _make_solid(ball, contype=0, conaffinity=1)
+    for name in gripper_boxes(spec):
+        _make_solid(mjspec.geom(f"gripper_{name}"), contype=0, conaffinity=1)
+
+
+def _make_solid(geom: mujoco.MjsGeom, contype: int, conaffinity: int) -> None:
+    geom.contype, geom.conaffinity, geom.condim = contype, conaffinity, 3
+    geom.friction[0] = FRICTION
+    geom.solref, geom.solimp = [TIME_CONSTANT_S, 1.0], IMPEDANCE
+
+
+def is_container(model: mujoco.MjModel) -> np.ndarray:
+    """(ngeom,) bool."""
+    return np.array([model.geom(k).name.startswith(CONTAINER) for k in range(model.ngeom)])
+
+
+def contact_force(data: mujoco.MjData, container: np.ndarray) -> WallForce:
+    """The forces of the time step whose accelerations the data hold; `container` is from `is_container`."""
+    if data.ncon == 0:
+        return WallForce(0.0, 0.0)
+    contact = data.contact
+    active = contact.efc_address >= 0
+    force_n = np.where(active, data.efc_force[contact.efc_address], 0.0) if data.nefc else np.zeros(data.ncon)
+    in_container = container[contact.geom].any(axis=1)
+    return WallForce(float(force_n[~in_container].sum()), float(force_n[in_container].sum()))

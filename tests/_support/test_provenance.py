@@ -1,0 +1,37 @@
+"""What a result says that it depends on."""
+
+import subprocess
+
+import pytest
+
+from mjx_softarm._support import provenance as module
+from mjx_softarm._support.provenance import provenance
+
+
+@pytest.fixture
+def checkout(tmp_path, monkeypatch):
+    """A commit of a package and of a result, in which this package seems to lie."""
+    for name in ("package/code.py", "benchmarks/results/a.json"):
+        (tmp_path / name).parent.mkdir(parents=True)
+        (tmp_path / name).write_text("1")
+    who = ("-c", "user.name=a", "-c", "user.email=a@b")
+    for command in (("init", "-q"), ("add", "."), (*who, "commit", "-q", "-m", "a")):
+        subprocess.run(["git", *command], cwd=tmp_path, check=True)
+    monkeypatch.setattr(module, "__file__", str(tmp_path / "package" / "code.py"))
+    return tmp_path
+
+
+def test_code_that_is_not_committed_is_told_and_other_results_are_not(checkout):
+    assert provenance("a")["uncommitted_changes"] is False
+    (checkout / "benchmarks/results/a.json").write_text("2")
+    (checkout / "benchmarks/results/b.json").write_text("2")
+    assert provenance("a")["uncommitted_changes"] is False
+    (checkout / "package/code.py").write_text("2")
+    assert provenance("a")["uncommitted_changes"] is True
+
+
+def test_without_a_repository_there_is_no_commit(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "__file__", str(tmp_path / "code.py"))
+    monkeypatch.setenv("GIT_CEILING_DIRECTORIES", str(tmp_path.parent))
+    told = provenance("a")
+    assert told["commit"] is None and told["uncommitted_changes"] is None

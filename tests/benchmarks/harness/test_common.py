@@ -1,0 +1,75 @@
+"""Tables of figures, goals, memory."""
+
+import io
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from benchmarks.harness.common import goal, show
+
+
+def shown(figures, title=""):
+    console = Console(file=io.StringIO(), width=200)
+    show(figures, title, console)
+    return console.file.getvalue()
+
+
+def cells(text):
+    return [
+        [cell.strip() for cell in line.strip("│").split("│")] for line in text.splitlines() if "│" in line
+    ]
+
+
+def test_a_list_of_rows_is_a_table_with_a_column_for_every_name_in_any_row():
+    text = shown(
+        {"rates": [{"arms": 1024, "env_steps_per_s": 0.5}, {"arms": 1, "skipped": "no [cuda] here"}]}
+    )
+    assert ["rates"] in [line.split(",") for line in text.splitlines()]
+    assert ["1,024", "0.5", ""] in cells(text)
+    assert f"│ {'0.5':>15} │" in text  # numbers to the right, gaps or not
+    assert ["1", "", "no [cuda] here"] in cells(text)
+
+
+def test_dictionaries_alike_are_a_table_with_their_names_in_front():
+    text = shown({"start": {"cold": {"total_s": 16.5, "n": 1}, "from_cache": {"total_s": 5.75, "n": 2}}})
+    assert cells(text) == [["cold", "16.5", "1"], ["from cache", "5.75", "2"]]
+
+
+def test_other_dictionaries_are_titled_by_their_path_and_what_is_loose_comes_first():
+    figures = {
+        "inner": {"deep_down": {"x": 1, "groups": [{"y": 2, "z": {"a": 1}}]}},
+        "unsettled": 0,
+        "rounds": [3, 4],
+    }
+    text = shown(figures, "settle")
+    assert cells(text) == [["unsettled", "0"], ["rounds", "[3, 4]"], ["x", "1"], ["y", "2"], ["a", "1"]]
+    deep = "settle, inner, deep down"
+    titles = ["settle", deep, f"{deep}, groups, 1", f"{deep}, groups, 1, z"]
+    assert [line for line in text.splitlines() if line.startswith("settle")] == titles
+
+
+@pytest.mark.parametrize("met, verdict", [(True, "met"), (False, "NOT MET"), (None, "skipped")])
+def test_a_goal_tells_what_was_measured_and_whether_it_is_met(met, verdict):
+    row = goal("fast", "7 /s", met)
+    assert row == {"goal": "fast", "measured": "7 /s", "verdict": verdict}
+    assert ["fast", "7 /s", verdict] in cells(shown({"goals": [row]}))
+
+
+MEMORY = """
+import numpy as np
+from benchmarks.harness.common import peak_memory
+before = peak_memory()["peak_rss_mb"]
+held = np.ones(50_000_000)
+print(peak_memory()["peak_rss_mb"] - before)
+"""
+
+
+def test_peak_memory_grows_by_what_is_held():
+    run = [sys.executable, "-c", MEMORY]
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(Path(__file__).parents[3])}
+    done = subprocess.run(run, env=environment, capture_output=True, text=True, check=True)
+    assert 200 < int(done.stdout) < 600  # of 400

@@ -1,0 +1,108 @@
+"""The gradient-descent baseline against JAX's gradient, closed forms and its own forward kinematics."""
+
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from benchmarks.paper.gradient_descent import descend, forward_kinematics, gradient, gradient_descent
+from mjx_softarm import ArmSpec
+from mjx_softarm.control import Gains
+from mjx_softarm.deploy.loop import N_ACTIONS
+from mjx_softarm.mdp.observation import ObsScale
+from mjx_softarm.mdp.rewards import RewardConfig, scaled_error
+from mjx_softarm.policy.file import Policy
+from mjx_softarm.sensing.estimator import estimate
+from mjx_softarm.sensing.pose import pose_error
+from mjx_softarm.sensing.s2r import correct
+from mjx_softarm.sensing.sensors import SensorParams, frequency_range_hz
+
+SPEC = ArmSpec.default()
+N = SPEC.n_chambers
+LOW_M, HIGH_M = SPEC.springs.length_min_m, SPEC.springs.length_max_m
+
+
+@pytest.fixture(scope="module", params=[False, True], ids=["no S2R", "S2R"])
+def policy(request, make_arm_model):
+    return Policy(
+        layers=((np.zeros((18, N), np.float32), np.zeros(N, np.float32)),),
+        obs_scale=ObsScale.from_spec(SPEC),
+        reward=RewardConfig(),
+        frequency_hz=frequency_range_hz(SPEC),
+        sensor=SensorParams.from_spec(SPEC),
+        gains=Gains.from_spec(SPEC),
+        rate_hz=SPEC.control.rate_hz,
+        spec=SPEC,
+        provenance={},
+        **make_arm_model(N, request.param)._asdict(),
+    )
+
+
+def random_springs(n, seed=0):
+    return np.random.default_rng(seed).uniform(0.15, 0.23, (n, N))
+
+
+def test_forward_kinematics_are_the_loop_s(policy):
+    spring_m = random_springs(4).astype(np.float32)
+    pose = estimate(policy.estimator, spring_m)
+    expected = pose if policy.s2r is None else correct(policy.s2r, pose, spring_m)
+    assert np.allclose(forward_kinematics(policy)(spring_m), expected, atol=0.01)
+
+
+def test_gradient_is_that_of_automatic_differentiation(policy):
+    here, there = random_springs(2)
+    goal = forward_kinematics(policy)(there)
+
+    def cost(spring_m):
+        pose = estimate(policy.estimator, spring_m)
+        pose = pose if policy.s2r is None else correct(policy.s2r, pose, spring_m)
+        return 0.5 * jnp.sum(pose_error(pose, jnp.asarray(goal, jnp.float32)) ** 2)
+
+    expected = jax.grad(cost)(jnp.asarray(here, jnp.float32))
+    found = gradient(lambda x: pose_error(forward_kinematics(policy)(x), goal), here)
+    assert np.linalg.norm(found - expected) < 2e-3 * np.linalg.norm(expected)
+
+
+def test_gradient_of_a_linear_residual_is_the_closed_form():
+    rng = np.random.default_rng(1)
+    matrix, target, here = 1e3 * rng.normal(size=(6, N)), *rng.uniform(0.1, 0.2, (2, N))
+    found = gradient(lambda x: (x - target) @ matrix.T, here)
+    assert np.allclose(found, matrix.T @ matrix @ (here - target), rtol=1e-6)
+
+
+def test_goals_of_the_own_forward_kinematics_are_reached(policy):
+    plan, pose_of = gradient_descent(policy), forward_kinematics(policy)
+    goals = pose_of(random_springs(4, seed=5))
+    for goal in goals:
+        spring_m = np.full(N, 0.19)
+        for _ in range(N_ACTIONS):  # as the loop asks for them
+            spring_m = plan(np.zeros(6), goal, spring_m)
+        pose = pose_of(spring_m)
+        assert np.linalg.norm(pose[:3] - goal[:3]) < 0.2
+        # Yaw, which springs along the arm hardly turn, comes last; the paper's goal counts as reached at 1.
+        assert np.linalg.norm(scaled_error(pose, goal, policy.reward)) < 0.2 * policy.reward.threshold
+        assert np.all((spring_m >= LOW_M) & (spring_m <= HIGH_M))
+
+
+def test_search_beyond_the_limits_ends_at_them():
+    target = np.linspace(0.0, 0.3, N)
+    found = descend(lambda x: 1e3 * (x - target), np.full(N, 0.5), np.full(N, 0.1), np.full(N, 0.2))
+    assert np.allclose(found, np.clip(target, 0.1, 0.2), atol=5e-5)
+
+
+def test_where_it_ends_depends_on_where_it_began(policy):
+    plan, pose_of = gradient_descent(policy), forward_kinematics(policy)
+    starts = random_springs(2, seed=7)
+    goal = pose_of(random_springs(1, seed=8)[0])
+    first, second = (plan(np.zeros(6), goal, start) for start in starts)
+    assert np.linalg.norm(pose_of(first)[:3] - pose_of(second)[:3]) < 1.0
+    assert np.abs(first - second).max() > 5e-3
+
+
+def test_needs_neither_jax_nor_mujoco():
+    program = "import sys, benchmarks.paper.gradient_descent; print({'jax', 'mujoco'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"

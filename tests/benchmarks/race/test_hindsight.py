@@ -1,0 +1,150 @@
+"""Hindsight for Stable-Baselines3: what follows from an exchanged goal is what the environment would say."""
+
+import numpy as np
+import pytest
+
+from mjx_softarm.env import EnvConfig
+from mjx_softarm.env.gym import SoftArmVectorEnv, as_sb3
+from mjx_softarm.mdp import observation as obs
+from mjx_softarm.mdp import rewards
+
+pytest.importorskip("stable_baselines3", reason="Stable-Baselines3 is not installed")
+N_ARMS, LIMIT, N_STEPS, N_ROWS = 6, 3, 20, 8  # the ring is written over, and episodes cross its end
+SHARE, REWARD_SCALE = 0.75, 0.1
+
+
+class Played:
+    """Arms, a buffer of what they did, and of each row of it whether it saturated.
+
+    Half of the arms saturate most of the time; the first one goes to its goal at each step.
+    """
+
+    def __init__(self):
+        from benchmarks.race.contestants import scaled
+        from benchmarks.race.hindsight import GoalEnvs, HindsightBuffer
+
+        arms = SoftArmVectorEnv(N_ARMS, max_episode_steps=LIMIT, config=EnvConfig(n_poses=64))
+        self.arm = arms.env
+        envs = GoalEnvs(scaled(as_sb3(arms), REWARD_SCALE))
+        self.buffer = HindsightBuffer(
+            N_ROWS * N_ARMS,
+            envs.observation_space,
+            envs.action_space,
+            env=envs,
+            n_envs=N_ARMS,
+            arm=arms.env,
+            share=SHARE,
+            reward_scale=REWARD_SCALE,
+        )
+        self.saturated = np.zeros((N_ROWS, N_ARMS), bool)
+        envs.seed(0)
+        seen, rng = envs.reset(), np.random.default_rng(0)
+        still = np.asarray(self.arm.action_of(np.full(9, 0.17, np.float32)))
+        spread = np.where(np.arange(N_ARMS) % 2, 0.5, 0.02)[:, None]
+        for step in range(N_STEPS):
+            for name, parts in seen.items():
+                assert all(part in envs.observation_space[name] for part in parts)
+            actions = np.clip(still + spread * rng.uniform(-1, 1, (N_ARMS, 9)), -1, 1).astype(np.float32)
+            actions[0] = self.to_goal(seen["desired_goal"][0])
+            following, reward, done, infos = envs.step(actions)
+            self.saturated[step % N_ROWS] = arms._state.metrics["saturated_chambers"] > 0
+            after = {name: values.copy() for name, values in following.items()}
+            for arm in np.flatnonzero(done):
+                for name, last in infos[arm]["terminal_observation"].items():
+                    after[name][arm] = last
+            self.buffer.add(seen, after, actions, reward, done, infos)
+            seen = following
+
+    def to_goal(self, scaled):
+        """The action that leads to a goal, which is a pose of the pool."""
+        goal = self.pose(scaled)
+        row = np.argmin(np.linalg.norm(np.asarray(self.arm.pool.pose) - goal, axis=1))
+        return np.asarray(self.arm.action_of(self.arm.pool.spring_m[row]))
+
+    def pose(self, scaled):
+        return scaled * self.arm.scale.scale + self.arm.scale.centre
+
+    @property
+    def where(self):
+        """Indices of the transitions whose episodes are over."""
+        return np.nonzero(self.buffer.ep_length > 0)
+
+
+@pytest.fixture(scope="module")
+def played():
+    return Played()
+
+
+def test_each_part_of_a_batch_has_exchanged_goals_and_others(played):
+    own = {tuple(goal) for goal in played.buffer.observations["desired_goal"].reshape(-1, 6)}
+    batch = played.buffer.sample(16 * 64)
+    exchanged = [tuple(goal) not in own for goal in batch.observations["desired_goal"].numpy()]
+    np.testing.assert_array_equal(
+        batch.observations["desired_goal"].numpy(), batch.next_observations["desired_goal"].numpy()
+    )
+    assert np.mean(exchanged) == SHARE
+    shares = np.reshape(exchanged, (16, 64)).mean(axis=1)  # SBX makes batches of consecutive rows
+    assert shares.min() > 0.5 and shares.max() < 1.0
+
+
+def test_goals_of_their_own_would_have_given_what_the_environment_gave(played, monkeypatch):
+    buffer, where = played.buffer, played.where
+    monkeypatch.setattr(buffer, "_sample_goals", lambda *where: buffer.observations["desired_goal"][where])
+    told, own = buffer._get_virtual_samples(*where), buffer._get_real_samples(*where)
+    for name in told.observations:
+        np.testing.assert_allclose(told.observations[name], own.observations[name], atol=1e-5)
+        np.testing.assert_allclose(told.next_observations[name], own.next_observations[name], atol=1e-5)
+    np.testing.assert_allclose(told.rewards, own.rewards, atol=1e-4)
+    np.testing.assert_array_equal(told.dones, own.dones)
+    np.testing.assert_array_equal(told.actions, own.actions)
+    np.testing.assert_array_equal(np.isclose(own.rewards[:, 0], -10.0), played.saturated[where])
+    assert 0.1 < played.saturated[where].mean() < 0.9
+    assert 0.1 < own.dones.numpy().mean() < 0.9
+
+
+def test_a_pose_that_was_reached_ends_the_episode_with_the_bonus_unless_it_saturated(played, monkeypatch):
+    buffer, where = played.buffer, played.where
+    monkeypatch.setattr(
+        buffer, "_sample_goals", lambda *where: buffer.next_observations["achieved_goal"][where]
+    )
+    batch = buffer._get_virtual_samples(*where)
+    saturated = played.saturated[where][:, None]
+    np.testing.assert_allclose(batch.rewards, np.where(saturated, -10.0, 10.0), rtol=1e-6)
+    np.testing.assert_array_equal(batch.dones, ~saturated)
+    np.testing.assert_allclose(batch.next_observations["observation"], 0.0, atol=1e-6)
+
+
+def test_a_goal_elsewhere_gives_the_reward_and_the_observations_of_the_way_to_it(played, monkeypatch):
+    buffer, arm, where = played.buffer, played.arm, played.where
+    goal = np.array([30.0, -20.0, -590.0, 10.0, 5.0, -5.0], np.float32)
+    goals = np.tile((goal - arm.scale.centre) / arm.scale.scale, (len(where[0]), 1))
+    monkeypatch.setattr(buffer, "_sample_goals", lambda *where: goals)
+    batch = buffer._get_virtual_samples(*where)
+    before, after = (
+        played.pose(poses["achieved_goal"][where])
+        for poses in (buffer.observations, buffer.next_observations)
+    )
+    for found, poses in ((batch.observations, before), (batch.next_observations, after)):
+        flat = np.concatenate(
+            [found[name] for name in ("achieved_goal", "desired_goal", "observation")], axis=1
+        )
+        wanted = obs.observe(poses, np.broadcast_to(goal, poses.shape), arm.scale, arm.config.reward)
+        np.testing.assert_allclose(flat, wanted, atol=1e-5)
+    n_steps = np.zeros(len(after), int)  # counted back to the episode's first transition
+    for k, (row, i) in enumerate(zip(*where, strict=True)):
+        n_steps[k] = 1 + (row - buffer.ep_start[row, i]) % N_ROWS
+    assert set(n_steps) == {1, 2, 3}
+    error = np.linalg.norm(rewards.scaled_error(after, goal, arm.config.reward), axis=1)
+    wanted = np.where(played.saturated[where], -10.0, REWARD_SCALE * (-10 * error - 0.1 * n_steps))
+    np.testing.assert_allclose(batch.rewards[:, 0], wanted, atol=1e-4)
+    assert not batch.dones.any()
+
+
+def test_an_arm_that_is_charged_for_walls_is_refused(played):
+    from benchmarks.race.hindsight import HindsightBuffer
+
+    charged = EnvConfig(n_poses=8, pipe_diameter_mm=300.0, clearance_cost_per_mm=1.0)
+    arm = SoftArmVectorEnv(1, config=charged).env
+    spaces = played.buffer.observation_space, played.buffer.action_space
+    with pytest.raises(ValueError, match="not charged for walls"):
+        HindsightBuffer(8, *spaces, env=None, arm=arm, share=SHARE, reward_scale=1.0)

@@ -1,0 +1,312 @@
+"""The race: contestants and their processes, what each is given, what is kept; with a made-up program."""
+
+import dataclasses
+import json
+import sys
+
+import jax
+import numpy as np
+import pytest
+
+from benchmarks.harness.rounds import Worker, WorkerError
+from benchmarks.race import race
+from benchmarks.race.contestants import (
+    CONTESTANTS,
+    Contestant,
+    HeldOut,
+    our_config,
+    prepare,
+    scaled,
+    tuned_settings,
+)
+from benchmarks.race.race import Limits, RaceError, Settings, claim, limits_of, run, train
+from mjx_softarm.env import EnvConfig, ReachEnv
+from train.agent.tqc import TQC
+from train.config import PRESETS
+from train.runs.evaluate import Evaluator
+
+FAKE = '''
+"""A contestant whose curve is known: 100 mm / round, 10 s and 1,000 env steps each; or it stops by itself."""
+import sys
+from benchmarks.harness.rounds import serve
+name, seed, stretch_s, n_goals = sys.argv[1:]
+k = 0
+def work():
+    global k
+    k += 1
+    if "broken" in name and k == 2:
+        raise RuntimeError("not today")
+    return {"wall_s": 3 + 10.0 * k, "trained_s": 10.0 * k, "env_steps": 1000 * k, "updates": k,
+            "median_mm": 100 / k, "ended": k == 30}
+serve(lambda: ({"start_up_s": 3.0}, work))
+'''
+
+
+@pytest.fixture
+def fake(tmp_path, monkeypatch):
+    """A function: name -> a worker that is not started."""
+    (tmp_path / "fake_contestant.py").write_text(FAKE, "utf-8")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    return lambda name="fake": Worker(name, ["fake_contestant", name, "0", "1.0", "8"])
+
+
+# --- a contestant and its process --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "limits, n_points",
+    [
+        (Limits(93.0), 9),  # 3 + 10 k >= 93
+        (Limits(target_mm=20.0), 5),  # 100 / k <= 20
+        (Limits(), 30),  # ended
+    ],
+)
+def test_a_contestant_trains_until_its_limit_its_target_or_its_end(fake, limits, n_points):
+    found = train(fake(), limits, n_points=1000)
+    assert [point["updates"] for point in found["points"]] == list(range(1, n_points + 1))
+    assert found["start_up_s"] == 3.0 and "ended" not in found["points"][-1]
+    json.dumps(found, allow_nan=False)
+
+
+def test_a_contestant_that_stops_by_itself_is_told_with_its_last_words(fake):
+    with pytest.raises(WorkerError, match=r"(?s)broken: stopped with status 1.*RuntimeError: not today"):
+        train(fake("broken"), Limits(100.0), 10)
+
+
+def test_time_counts_in_training_and_stands_while_the_policy_is_evaluated(monkeypatch):
+    clock = [0.0]
+    steps = [0]
+    monkeypatch.setattr("benchmarks.race.contestants.time.perf_counter", lambda: clock[0])
+
+    class Slow:
+        def __init__(self, env, n_goals):
+            assert n_goals == 8
+            clock[0] += 1000
+
+        def tip_error_mm(self, policy):
+            clock[0] += 100
+            return np.array([1.0, 2.0, 9.0])
+
+    monkeypatch.setattr("benchmarks.race.contestants.HeldOut", Slow)
+    monkeypatch.setattr("mjx_softarm.env.ReachEnv", lambda: None)
+
+    def stretch():
+        clock[0] += 2.0
+        steps[0] += 10
+
+    contestant = Contestant(stretch, lambda obs: obs, lambda: (steps[0], 7), limit=60)
+    facts, work = prepare(contestant, 5.0, 3.0, 8)
+    assert facts == {"start_up_s": 5.0}
+    assert work() == {
+        "wall_s": 9.0,
+        "trained_s": 4.0,
+        "env_steps": 20,
+        "updates": 7,
+        "median_mm": 2.0,
+        "ended": False,
+    }
+    clock[0] += 1000  # nor while nobody asks
+    assert (work()["wall_s"], work()["ended"]) == (13.0, True)
+
+
+def test_held_out_goals_are_evaluated_as_the_trainer_does_it():
+    env = ReachEnv(config=EnvConfig(n_poses=16))
+    agent = TQC(env.observation_size, env.action_size)
+    params = agent.init(jax.random.PRNGKey(3)).actor_params
+    evaluator = Evaluator(env, agent, n_goals=12)
+    reached = evaluator._workspace(params, evaluator.goals)
+    found = HeldOut(env, 12).tip_error_mm(lambda obs: np.asarray(agent.act_mode(params, obs)))
+    assert np.ptp(found) > 10.0
+    np.testing.assert_allclose(found, reached.tip_error_mm, atol=0.01)
+
+
+def test_ours_without_hindsight_differs_in_nothing_else():
+    quick, plain, paper = (our_config(f"ours-{name}") for name in ("quick", "plain", "paper"))
+    assert (plain.hindsight.reached_share, plain.hindsight.near_share) == (0.0, 0.0)
+    assert quick.hindsight == PRESETS["quick"].hindsight and quick.hindsight.near_share > 0
+    assert dataclasses.replace(plain, hindsight=quick.hindsight) == quick
+    assert (paper.total_env_steps, paper.hindsight) == (300_000, quick.hindsight)
+
+
+@pytest.mark.slow
+def test_ours_trains_and_is_evaluated():
+    facts, work = prepare(CONTESTANTS["ours-plain"](0), 1.0, 0.0, 64)
+    points = [work() for _ in range(3)]
+    assert facts == {"start_up_s": 1.0}
+    assert [point["env_steps"] for point in points] == [2048, 4096, 6144]
+    assert [point["updates"] for point in points] == [0, 256, 512]  # the first 2,048 steps are random
+    assert len({point["median_mm"] for point in points}) == 3
+    assert all(0.0 < point["median_mm"] < 500.0 and not point["ended"] for point in points)
+    assert np.diff([point["wall_s"] for point in points]).min() > 0.0
+
+
+def test_tuned_peers_have_the_quick_preset_s_settings():
+    n_steps = [0]
+    settings = tuned_settings(PRESETS["quick"], lambda: n_steps[0])
+    rate = settings.pop("learning_rate")
+    assert settings == {
+        "buffer_size": 262_144,
+        "learning_starts": 2048,
+        "batch_size": 128,
+        "tau": 0.005,
+        "gamma": 0.5,
+        "train_freq": 1,
+        "gradient_steps": 16,
+        "ent_coef": "auto_0.1",
+        "target_entropy": -30.0,
+    }
+    for n_steps[0], expected in (
+        (0, 1e-3),
+        (120_000, 0.51e-3),
+        (239_999, 0.02e-3),
+        (240_000, 1e-3),
+        (360_000, 0.51e-3),
+    ):
+        assert rate(1.0) == pytest.approx(expected, rel=1e-3)
+
+
+def test_rewards_are_scaled_and_nothing_else():
+    vec_env = pytest.importorskip("stable_baselines3.common.vec_env", reason="stable-baselines3 is not here")
+    import gymnasium
+
+    envs = vec_env.DummyVecEnv([lambda: gymnasium.make("Pendulum-v1")] * 2)
+    envs.seed(0)
+    first, action = envs.reset(), np.zeros((2, 1))
+    obs, rewards, *_ = envs.step(action)
+    envs.seed(0)
+    again = scaled(envs, 0.1)
+    np.testing.assert_array_equal(again.reset(), first)
+    same, tenth, *_ = again.step(action)
+    np.testing.assert_array_equal(same, obs)
+    np.testing.assert_allclose(tenth, 0.1 * rewards, rtol=1e-6)
+
+
+# --- the folder --------------------------------------------------------------------------------------------
+
+POINTS = [  # 10 mm at 17 s, 5 mm at 29.5 s
+    {"wall_s": wall_s, "trained_s": wall_s - 2, "env_steps": 100, "updates": 1, "median_mm": error_mm}
+    for wall_s, error_mm in ((12.0, 12.0), (22.0, 8.0), (32.0, 4.0))
+]
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """What each contestant was given, in place of training it; one of them fails."""
+    asked = {}
+
+    def made_up(worker, limits, n_points):
+        asked[worker.name] = limits
+        if worker.name.startswith("sbx-hindsight"):
+            raise WorkerError("sbx-hindsight: not today")
+        return {"start_up_s": 2.0, "limit_s": None, "points": POINTS}
+
+    monkeypatch.setattr(race, "train", made_up)
+    monkeypatch.setattr(race, "peer_python", lambda name: sys.executable)
+    return asked
+
+
+def test_peers_get_our_time_to_5_mm_as_often_as_the_goal_asks_and_stop_where_ours_did(asked, tmp_path):
+    results = run(tmp_path, (4,), Settings())
+    sbx, sb3 = (Limits(n * 29.5, 5, n * 29.5 / 40) for n in (5, 15))
+    assert asked == {
+        "ours-quick, seed 4": Limits(float("inf"), 0.0, 0.0),
+        "sbx-hindsight, seed 4": sbx,
+        "sb3-contrib-hindsight, seed 4": sb3,
+        "sbx-plain, seed 4": sbx,
+        "sb3-contrib-plain, seed 4": sb3,
+        "ours-plain, seed 4": sbx,
+        "sbx-defaults, seed 4": sbx,
+        "sb3-contrib-defaults, seed 4": sb3,
+        "ours-paper, seed 4": Limits(float("inf"), 2, sbx.stretch_s),
+    }
+    assert list(asked) == [f"{name}, seed 4" for name in CONTESTANTS]  # the most telling first
+    assert [one["contestant"] for one in results if "failed" in one] == ["sbx-hindsight"]
+
+
+def test_some_may_race_alone_and_the_others_follow(asked, monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(race, "save", lambda *_: tmp_path / "race.json")
+    some = [name for name in CONTESTANTS if "hindsight" in name or "plain" in name]
+    assert race.main(["--only", ",".join(some), "--out", str(tmp_path)]) == 0
+    assert list(asked) == [f"{name}, seed 0" for name in ("ours-quick", *some)]
+    assert "['sbx-defaults', 'sb3-contrib-defaults', 'ours-paper']" in capsys.readouterr().out
+    asked.clear()
+    assert race.main(["--out", str(tmp_path)]) == 0
+    rest = ("sbx-hindsight", "sbx-defaults", "sb3-contrib-defaults", "ours-paper")  # the first had failed
+    assert list(asked) == [f"{name}, seed 0" for name in rest]
+
+
+def test_contestants_that_there_are_not_are_refused(capsys):
+    with pytest.raises(SystemExit):
+        race.main(["--only", "sbx-plain,sbx"])
+    assert "got 'sbx', expected ours-quick, sbx-hindsight" in capsys.readouterr().err
+
+
+def test_peers_of_one_that_does_not_reach_5_mm_get_multiples_of_all_its_time():
+    assert limits_of("sbx-plain", POINTS[:2]) == Limits(5 * 22.0, 10, 5 * 22.0 / 40)
+
+
+def test_what_was_measured_is_not_measured_again_but_what_failed_is(asked, tmp_path):
+    before = run(tmp_path, (0,), Settings())
+    asked.clear()
+    assert run(tmp_path, (0,), Settings()) == before
+    assert list(asked) == ["sbx-hindsight, seed 0"]
+    asked.clear()
+    run(tmp_path, (0, 1), Settings())
+    assert len(asked) == 1 + len(CONTESTANTS)
+
+
+def test_each_file_has_the_state_of_the_code_it_was_measured_with(asked, monkeypatch, tmp_path, capsys):
+    made = {"commit": "a1b2", "uncommitted_changes": True, "machine": {}}
+    monkeypatch.setattr(race, "provenance", lambda program: made)
+    run(tmp_path, (0,), Settings())
+    kept = json.loads((tmp_path / "ours-plain-seed0.json").read_text())
+    assert (kept["commit"], kept["uncommitted_changes"]) == ("a1b2", True)
+    assert "ours-plain, seed 0: commit a1b2 with uncommitted changes" in capsys.readouterr().out
+    run(tmp_path, (0,), Settings())
+    said = capsys.readouterr().out
+    assert "ours-plain, seed 0: measured before" in said
+    assert said.count("commit a1b2 with") == len(CONTESTANTS)
+
+
+def test_a_folder_of_another_commit_or_size_is_refused(monkeypatch, tmp_path):
+    made = {"commit": "a", "machine": {"cpus": 2}, "command": "this", "uncommitted_changes": False}
+    monkeypatch.setattr(race, "provenance", lambda program: dict(made))
+    monkeypatch.setattr(race, "machine_kind", lambda: "Abacus, 2 cores")
+    claim(tmp_path / "race", Settings())
+    made |= {"command": "that", "uncommitted_changes": True, "machine": {"cpus": 2, "kernel": "new"}}
+    claim(tmp_path / "race", Settings())
+    made["commit"] = "b"
+    with pytest.raises(
+        RaceError, match=r"settings.json: was made with commit a, now b; choose another --out"
+    ):
+        claim(tmp_path / "race", Settings())
+    made["commit"] = "a"
+    with pytest.raises(RaceError, match=r"n_goals 2000, now 8"):
+        claim(tmp_path / "race", Settings(n_goals=8))
+    monkeypatch.setattr(race, "machine_kind", lambda: "Abacus, 4 cores")
+    with pytest.raises(RaceError, match=r"made with machine Abacus, 2 cores, now Abacus, 4 cores"):
+        claim(tmp_path / "race", Settings())
+
+
+def test_without_the_first_there_is_no_race_and_other_seeds_are_told(monkeypatch, tmp_path, capsys):
+    def fail(worker, *_):
+        if worker.name == "ours-quick, seed 0":
+            raise WorkerError("ours-quick, seed 0: stopped with status 1")
+        return {"start_up_s": 2.0, "limit_s": None, "points": POINTS}
+
+    monkeypatch.setattr(race, "train", fail)
+    monkeypatch.setattr(race, "peer_python", lambda name: sys.executable)
+    monkeypatch.setattr(race, "save", lambda *_: pytest.fail("written"))
+    assert race.main(["--seeds", "0,1", "--out", str(tmp_path)]) == 2
+    said = capsys.readouterr()
+    assert "ours-quick failed, without which there is no race; nothing is written" in said.err
+    assert "stopped with status 1" in said.out and "29.5" in said.out
+    assert not list(tmp_path.glob("*seed0.json"))
+    assert len(list(tmp_path.glob("*seed1.json"))) == len(CONTESTANTS)
+
+
+@pytest.mark.parametrize("seeds", ["", "1,", "-1", "a"])
+def test_seeds_are_numbers(seeds, capsys):
+    with pytest.raises(SystemExit):
+        race.main([f"--seeds={seeds}"])
+    assert "expected integers >= 0" in capsys.readouterr().err

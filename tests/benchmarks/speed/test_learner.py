@@ -1,0 +1,185 @@
+"""The learner's benchmark: rounds that take turns, what is left out, ratios; with made-up programs."""
+
+import math
+import sys
+from types import SimpleNamespace
+
+import pytest
+
+from benchmarks.harness.peers import PINS, PeerError
+from benchmarks.harness.rounds import WorkerError
+from benchmarks.speed import learner, learner_contestants
+from benchmarks.speed.learner import CONTESTANTS, table, updates_per_round
+from benchmarks.speed.learner_contestants import choose_threads
+
+ROWS_PER_S = {"ours": 64_000.0, "sb3-contrib": 16_000.0, "sbx": 32_000.0, "brax": 128_000.0}
+
+
+class Made:
+    """A worker whose rate is known; one may fail at a batch size, in its `fails` (name, size, turn)."""
+
+    fails = None
+    turns: list = []  # noqa: RUF012  (of all of them)
+
+    def __init__(self, name, batch_size, n_updates):
+        self.name, self.batch_size, self.n_updates, self.turn, self.open = (
+            name,
+            batch_size,
+            n_updates,
+            0,
+            False,
+        )
+
+    def start(self):
+        self.open = True
+        self._go()
+
+    def round(self):
+        self._go()
+        return {"updates_per_s": ROWS_PER_S[self.name] / self.batch_size}
+
+    def close(self):
+        self.open = False
+
+    def _go(self):
+        if self.fails == (self.name, self.batch_size, self.turn):
+            raise WorkerError(f"{self.name}: out of memory")
+        self.turns.append((self.batch_size, self.turn, self.name))
+        self.turn += 1
+
+
+@pytest.fixture
+def workers(monkeypatch):
+    made = []
+
+    def worker(name, python, batch_size, n_updates):
+        made.append(Made(name, batch_size, n_updates))
+        return made[-1]
+
+    monkeypatch.setattr(learner, "_worker", worker)
+    monkeypatch.setattr(learner, "peer_python", lambda name: name)
+    monkeypatch.setattr(Made, "fails", None)
+    monkeypatch.setattr(Made, "turns", [])
+    return made
+
+
+def test_rounds_alternate_and_rates_are_medians_with_ratios_beside(workers):
+    figures = learner.measure()
+    first = [name for size, turn, name in Made.turns if size == 256 and turn]
+    assert first == [*CONTESTANTS] * learner.N_ROUNDS
+    row = figures["updates_per_s"][0]
+    assert row == {
+        "batch": 256,
+        "ours": 250.0,
+        "sb3-contrib TQC": 62.5,
+        "SBX TQC": 125.0,
+        "brax SAC": 500.0,
+        "ours / sb3-contrib": 4.0,
+        "ours / sbx": 2.0,
+        "ours / brax": 0.5,
+    }
+    assert [row["batch"] for row in figures["updates_per_s"]] == [256, 1024, 4096, 16_384, 32_768]
+    assert figures["left_out"] == []
+    assert not any(worker.open for worker in workers)
+
+
+def test_a_median_does_not_see_one_slow_round():
+    (row,) = table({64: {"ours": [10.0, 1.0, 11.0], "sbx": [4.0, 5.0, 6.0]}})
+    assert row == {"batch": 64, "ours": 10.0, "SBX TQC": 5.0, "ours / sbx": 2.0}
+
+
+def test_updates_per_round_keep_a_round_at_about_its_time(workers):
+    learner.measure()
+    for worker in workers:
+        if worker.batch_size > 256:  # the first is not known yet
+            round_s = worker.n_updates * worker.batch_size / ROWS_PER_S[worker.name]
+            assert learner.ROUND_S / 1.5 < round_s < learner.ROUND_S * 1.5 or worker.n_updates == 1
+    assert updates_per_round(1e-3) == 2048 and updates_per_round(60.0) == 1
+
+
+def test_a_contestant_that_would_be_too_slow_is_left_out_and_the_table_says_so(workers, monkeypatch):
+    monkeypatch.setattr(learner, "SLOW_S", 1.0)  # sb3-contrib needs 1.02 s at 16,384
+    figures = learner.measure()
+    assert [name for name in figures["updates_per_s"][3] if name == "sb3-contrib TQC"] == []
+    assert figures["updates_per_s"][2]["sb3-contrib TQC"] == 3.91
+    left_out = {row["contestant"]: row["why"] for row in figures["left_out"]}
+    assert left_out["sb3-contrib TQC"] == "from batch 16,384 on: an update is expected to take 1 s"
+    assert left_out["SBX TQC"].startswith("from batch 32,768 on")
+    assert "ours" in figures["updates_per_s"][3] and "brax SAC" in figures["updates_per_s"][4]
+
+
+@pytest.mark.parametrize("turn", [0, 2])  # as it starts, in its second round
+def test_a_peer_that_fails_is_left_out_from_there_and_ours_goes_on(workers, monkeypatch, turn):
+    monkeypatch.setattr(Made, "fails", ("sbx", 1024, turn))
+    figures = learner.measure()
+    assert "SBX TQC" in figures["updates_per_s"][0]
+    assert all("SBX TQC" not in row for row in figures["updates_per_s"][1:])
+    assert all("ours" in row for row in figures["updates_per_s"])
+    assert figures["left_out"] == [
+        {"contestant": "SBX TQC", "why": "from batch 1,024 on: sbx: out of memory"}
+    ]
+    assert not any(worker.open for worker in workers)
+
+
+def test_ours_failing_is_told_and_loses_no_other_s_figures(workers, monkeypatch):
+    monkeypatch.setattr(Made, "fails", ("ours", 1024, 1))
+    figures = learner.measure()
+    assert figures["left_out"] == [{"contestant": "ours", "why": "from batch 1,024 on: ours: out of memory"}]
+    assert figures["updates_per_s"][0]["ours / sbx"] == 2.0
+    assert figures["updates_per_s"][1] == {
+        "batch": 1024,
+        "sb3-contrib TQC": 15.6,
+        "SBX TQC": 31.2,
+        "brax SAC": 125.0,
+    }
+    assert not any(worker.open for worker in workers)
+
+
+def test_a_peer_that_cannot_be_installed_is_left_out(workers, monkeypatch):
+    def fail(name):
+        raise PeerError(f"{name}: no network")
+
+    monkeypatch.setattr(learner, "peer_python", fail)
+    figures = learner.measure()
+    assert set(figures["updates_per_s"][0]) == {"batch", "ours", "brax SAC", "ours / brax"}
+    assert [row["why"] for row in figures["left_out"]] == [
+        f"{name}: no network" for name in ("sb3-contrib", "sbx")
+    ]
+    assert set(PINS) <= set(CONTESTANTS)
+
+
+@pytest.mark.parametrize(
+    "times, chosen",
+    [
+        ({4: [9.0, 1.0, 1.0, 1.0], 1: [3.0] * 4}, 4),
+        ({4: [50.0] * 4, 1: [9.0, 60.0, 3.0, 70.0]}, 1),  # the best of three, after one that does not count
+        ({4: [50.0] * 4, 1: [3.0, 60.0, 60.0, 60.0]}, 4),
+    ],
+)
+def test_pytorch_gets_the_threads_it_trains_fastest_with(monkeypatch, times, chosen):
+    threads, clock = [4], [0.0]
+    torch = SimpleNamespace(
+        get_num_threads=lambda: threads[0], set_num_threads=lambda n: threads.__setitem__(0, n)
+    )
+    monkeypatch.setitem(sys.modules, "torch", torch)
+    monkeypatch.setattr("benchmarks.speed.learner_contestants.time.perf_counter", lambda: clock[0])
+    left = {n: iter(own) for n, own in times.items()}
+    choose_threads(lambda: clock.__setitem__(0, clock[0] + next(left[threads[0]])))
+    assert threads == [chosen]
+
+
+@pytest.mark.slow
+def test_our_contestant_updates_its_networks_and_tells_how_fast(monkeypatch):
+    from train.epoch import replay
+
+    stored, add = [], replay.add
+
+    def seen(*given):
+        stored.append(add(*given))
+        return stored[-1]
+
+    monkeypatch.setattr(learner_contestants, "N_STORED", 256)
+    monkeypatch.setattr(replay, "add", seen)
+    facts, work = learner_contestants.CONTESTANTS["ours"](32, 2)
+    assert facts == {} and int(stored[0].size) == 256
+    assert 0.0 < work()["updates_per_s"] < math.inf

@@ -1,0 +1,235 @@
+"""The settling benchmark's parts: truth, saturation, the goal by hand, counted operations."""
+
+from unittest import mock
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from benchmarks.harness import common
+from benchmarks.harness.rounds import Worker
+from benchmarks.speed import settle
+from benchmarks.speed.floor import counted, settle_cost
+from benchmarks.speed.settle import GOAL_ARMS, REACHES, no_goal, speed_goal, way
+from benchmarks.speed.truth import (
+    Truth,
+    error_figures,
+    random_references,
+    settle_function,
+    told_error,
+    true_rest,
+)
+from mjx_softarm import ArmSpec
+from mjx_softarm._support.small_matrices import BLOCK, eliminate
+from mjx_softarm.mechanics import settle as solver
+from mjx_softarm.mechanics.chain_hessian import RANK
+from train.epoch.devices import mesh_of
+
+SPEC = ArmSpec.default()
+SMALL = SPEC.replace(structure={"links_per_section": 2})
+N = 64
+
+
+def truth(tip_mm, settled=None):
+    tip_mm = np.array(tip_mm, float)
+    return Truth(tip_mm, np.ones(len(tip_mm), bool) if settled is None else np.array(settled), 0.5)
+
+
+def test_references_that_reach_further_saturate_more_chambers_from_none_to_most():
+    shares = [true_rest(SPEC, random_references(SPEC, N, reach)).share_at_limit for reach in REACHES]
+    assert (np.diff(shares) > 0.02).all()
+    assert shares[0] < 0.01 and shares[-1] > 0.55
+    assert 1.0 in REACHES  # the row of each number of links
+
+
+def test_the_whole_reach_is_what_may_be_commanded():
+    reference = random_references(SPEC, 1000)
+    assert reference.min() >= SPEC.springs.length_min_m and reference.max() <= SPEC.springs.length_max_m
+    assert np.ptp(reference) > 0.98 * (SPEC.springs.length_max_m - SPEC.springs.length_min_m)
+
+
+def test_errors_are_distances_to_the_truth_without_the_arms_that_have_none():
+    found = np.array([[3.0, 4.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]])
+    errors = error_figures(found, truth(np.zeros((3, 3)), settled=[True, True, False]))
+    assert errors == {"median_mm": 3.0, "p95_mm": 4.8, "max_mm": 5.0, "without_truth": 1}
+
+
+def test_the_error_of_what_a_program_told_is_that_of_its_tips():
+    reference = random_references(SPEC, 4)
+    exact_mm = true_rest(SPEC, reference).tip_mm
+    told = [
+        {"reference_m": reference[k : k + 2].tolist(), "tip_mm": (exact_mm[k : k + 2] + [0, 0, 2]).tolist()}
+        for k in (0, 2)
+    ]
+    assert told_error(SPEC, [{"arms": 2}, *told])["median_mm"] == pytest.approx(2.0, abs=1e-3)
+    assert told_error(SPEC, [{"arms": 2}]) == {}
+
+
+def test_a_way_s_figures_are_those_of_its_set_of_references():
+    rounds = [
+        {
+            "solves_per_s": {"0.1": 1.0, "1.0": rate},
+            "sets": {
+                "0.1": {"tip_mm": [[9.0, 9.0, 9.0]]},
+                "1.0": {"tip_mm": [[0.0, 0.0, 1.0]], "unsettled": 3},
+            },
+            "peak_rss_mb": 7,
+        }
+        for rate in (10.0, 30.0, 20.0)
+    ]
+    found = way(rounds, "1.0", truth(np.zeros((2, 3))))  # it was given fewer arms than there are truths
+    assert found == {
+        "median_mm": 1.0,
+        "p95_mm": 1.0,
+        "max_mm": 1.0,
+        "without_truth": 0,
+        "solves_per_s": 20.0,
+        "unsettled": 3,
+        "peak_rss_mb": 7,
+    }
+
+
+@pytest.mark.parametrize(
+    "measured, failed, verdict, told",
+    [
+        ({128: (9_000, 0.1), 512: (10_000, 0.5)}, {}, "met", "10,000 with 512 arms, 0.5 mm"),
+        ({128: (9_999, 0.1)}, {}, "NOT MET", "9,999 with 128 arms, 0.1 mm"),
+        ({128: (12_000, 0.51), 512: (3, 0.1)}, {}, "NOT MET", "12,000 with 128 arms, 0.51 mm"),
+        ({128: (12_000, 0.2)}, {"b": "b: gone"}, "met", "12,000 with 128 arms, 0.2 mm; b: gone"),
+        ({}, {"a": "a: no memory", "b": "b: gone"}, "NOT MET", "a: no memory; b: gone"),
+    ],
+)
+def test_the_goal_wants_speed_and_precision_at_once(measured, failed, verdict, told):
+    row = speed_goal(measured, failed)
+    assert row["verdict"] == verdict and row["measured"] == told
+    assert 1024 in GOAL_ARMS
+
+
+def test_the_goal_is_skipped_without_two_cores_or_on_a_gpu():
+    assert no_goal(1, "cpu") == "1 core here"
+    assert no_goal(8, "gpu") == "jax does not run on the CPU here"
+    assert no_goal(2, "cpu") == ""
+
+
+def told_by(method, references):
+    """What a made-up way tells: arms at the origin, ten solves a second."""
+    sets = {name: {"tip_mm": [[0.0, 0.0, 0.0]] * len(rows)} for name, rows in references.items()}
+    return {"solves_per_s": dict.fromkeys(references, 10.0), "sets": sets}
+
+
+@pytest.mark.parametrize("links, ways", [(2, {"chain", "stepping"}), (8, {"chain"})])
+def test_a_way_that_fails_or_takes_too_long_has_a_row_that_says_why(monkeypatch, links, ways):
+    monkeypatch.setattr(settle, "N_ARMS", 2)
+    monkeypatch.setattr(settle, "true_rest", lambda spec, reference_m: truth(np.zeros((2, 3))))
+    given = []
+
+    def take_turns(workers, n_rounds):
+        given.extend(worker.name.split(",")[0] for worker in workers)
+        failing = {2: "mjx", 8: "stepping"}[links]
+        references = {"1.0": np.zeros((2, 9))}
+        rounds = {w.name: [told_by(w.name, references)] for w in workers if not w.name.startswith(failing)}
+        return rounds, {w.name: f"{w.name}: no memory" for w in workers if w.name.startswith(failing)}
+
+    monkeypatch.setattr(settle, "take_turns", take_turns)
+    rows = {row["method"]: row for row in settle._ways(links, (1.0,))}
+    assert rows.keys() == {"chain", "mjx", "stepping"}
+    assert {method for method, row in rows.items() if row.get("solves_per_s") == 10.0} == ways
+    if links == 2:
+        assert rows["mjx"]["failed"] == "mjx, 2 links per section: no memory"
+    else:
+        assert "mjx" not in given and "compiles for minutes" in rows["mjx"]["skipped"]
+        assert rows["stepping"]["failed"] == "stepping, 8 links per section: no memory"
+
+
+def test_more_iterations_come_closer_and_every_budget_has_its_rate(monkeypatch):
+    monkeypatch.setattr(settle, "ITERATIONS", (2, 8))
+    monkeypatch.setattr(settle, "N_CALLS", 2)
+    reference = random_references(SMALL, 8)
+    few, many = settle._over_iterations(SMALL, reference, true_rest(SMALL, reference))
+    assert (few["iterations"], many["iterations"]) == (2, 8)
+    assert many["median_mm"] < 0.5 < few["max_mm"]
+    assert few["solves_per_s"] > 0 and many["solves_per_s"] > 0
+
+
+@pytest.mark.parametrize(
+    "n_arms, backend, n_devices",
+    [(1, "cpu", 1), (7, "cpu", 1), (8, "cpu", 2), (9, "cpu", 3), (10, "cpu", 2), (9, "gpu", 1)],
+)
+def test_arms_are_spread_evenly_over_the_cores(n_arms, backend, n_devices, monkeypatch):
+    asked = {}
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    monkeypatch.setattr(common, "mesh_of", lambda devices: mock.Mock(size=int(devices)))
+    monkeypatch.setattr(common, "n_cores", lambda: 3)
+    monkeypatch.setattr(jax.config, "update", asked.__setitem__)  # JAX runs already
+    mesh = common.mesh_of_cores(n_arms)
+    assert asked == {"jax_num_cpu_devices": 3}
+    assert n_devices == (1 if mesh is None else mesh.size)
+
+
+def test_spread_arms_settle_as_on_one_device():
+    reference = jnp.asarray(random_references(SMALL, 8), jnp.float32)
+    one, spread = (settle_function(SMALL, mesh=mesh)(reference) for mesh in (None, mesh_of("2")))
+    assert len(spread.q.sharding.device_set) == 2
+    np.testing.assert_allclose(spread.q, one.q, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_the_chain_s_worker_tells_where_the_arms_rest(tmp_path):
+    reference = random_references(SMALL, 4)
+    np.savez(tmp_path / "references.npz", **{"1.0": reference})
+    arguments = ["chain", "2", str(tmp_path / "references.npz"), str(tmp_path / "cache")]
+    worker = Worker("chain", ["benchmarks.speed.settle_methods", *arguments])
+    try:
+        worker.start()
+        told = worker.round()
+    finally:
+        worker.close()
+    assert worker.facts.keys() == {"tracing_s", "compiling_s", "both_from_cache_s"}
+    found = way([told], "1.0", true_rest(SMALL, reference))
+    assert found["max_mm"] < 0.5 and found["unsettled"] == found["without_truth"] == 0
+    assert found["solves_per_s"] > 0
+
+
+def elimination_flop(n, k):
+    """Of an elimination of n unknowns with k columns, and at most of its pivots: inverses and products."""
+    return 2 * n**2 * (n + k), n // BLOCK * 2 * BLOCK**2 * (2 * BLOCK + n + k)
+
+
+def test_all_operations_of_an_elimination_are_counted():
+    n, k, batch = 12, 3, 5
+    function = jax.jit(jax.vmap(eliminate))
+    arguments = (jnp.broadcast_to(jnp.eye(n), (batch, n, n)), jnp.ones((batch, n, k)))
+    flop, moved = counted(function, function.lower(*arguments).compile(), *arguments)
+    exact, pivots = (batch * flop for flop in elimination_flop(n, k))
+    assert exact <= flop < exact + pivots
+    once = 2 * 4 * batch * n * (n + k)  # all numbers read and written
+    assert n // BLOCK * once <= moved < 8 * n // BLOCK * once
+    product, rows = jax.jit(jnp.matmul), jnp.ones((n, n))
+    assert counted(product, product.lower(rows, rows).compile(), rows, rows)[0] == 2 * n**3
+
+
+def test_a_turn_of_the_settling_loop_costs_its_eliminations_and_more():
+    sections, n, n_arms = SMALL.structure.n_sections, 3 * SMALL.structure.links_per_section, 16
+    reference = jnp.asarray(random_references(SMALL, n_arms), jnp.float32)
+    outside, turn, n_outside = settle_cost(SMALL, reference)
+    m = SMALL.n_chambers
+    both = zip(elimination_flop(n, RANK + 1 + m), elimination_flop(m, 1), strict=True)
+    least, pivots = (n_arms * (sections * own + coupled) for own, coupled in both)
+    assert least < turn.flop < 5 * (least + pivots) and turn.moved > 4 * least
+    with mock.patch.object(solver, "MAX_ITERATIONS", 0):  # what is done although the loop may do nothing
+        exact = settle_function(SMALL)(reference).iterations
+    assert outside.flop > 0 and (exact == n_outside).all()
+
+
+@pytest.mark.parametrize(
+    "name, work", [("cholesky", jnp.linalg.cholesky), ("scan", lambda x: jax.lax.fori_loop(0, 3, _double, x))]
+)
+def test_what_cannot_be_counted_is_no_silence(name, work):
+    function, argument = jax.jit(work), jnp.eye(6)
+    with pytest.raises(RuntimeError, match=f"{name}: nobody knows"):
+        counted(function, function.lower(argument).compile(), argument)
+
+
+def _double(_, x):
+    return 2.0 * x

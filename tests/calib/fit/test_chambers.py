@@ -1,0 +1,280 @@
+"""Chambers of planted arms come back from noisy poses; what poses do not tell is said."""
+
+import dataclasses
+import functools
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+
+from calib.fit.blocks import held_out_blocks
+from calib.fit.chambers import BENDING, FIELDS, MIN_POSES, calibrate_chambers
+from calib.fit.equilibrium import with_numbers
+from mjx_softarm import ArmSpec
+from mjx_softarm.logs.schema import Log
+from mjx_softarm.mechanics.kinematics import chain_frames
+from mjx_softarm.mechanics.rest import rest
+from mjx_softarm.mechanics.settle import settle_pressures
+from mjx_softarm.mechanics.statics import ArmParams
+from mjx_softarm.mechanics.workspace import settle_many
+
+SPEC = ArmSpec.default()
+TIP_NOISE_M, TURN_NOISE_RAD, PRESSURE_NOISE_KPA, SPRING_NOISE_M = 5e-4, np.radians(0.3), 0.1, 5e-4
+
+
+def planted(seed=0):
+    """An arm whose chambers and backbone are unlike those of SPEC."""
+    rng, chambers = np.random.default_rng(seed), SPEC.chambers
+
+    def off(value, spread):
+        return tuple(float(x) for x in value * (1.0 + rng.uniform(-spread, spread, 9)))
+
+    return SPEC.replace(
+        chambers={
+            "stiffness_n_per_m": off(chambers.stiffness_n_per_m, 0.2),
+            "area_m2": off(chambers.area_m2, 0.1),
+            "area_slope_m": off(chambers.area_slope_m, 0.2),
+            "length_offset_m": tuple(float(x) for x in rng.uniform(-5e-3, 5e-3, 9)),
+        },
+        backbone={BENDING: 1.1 * SPEC.backbone.bending_stiffness_nm_per_rad},
+    )
+
+
+def random_pressures(n, seed):
+    swing = np.cos(np.random.default_rng(seed).uniform(0.0, np.pi, (n, 9)))
+    low, high = SPEC.chambers.pressure_min_kpa, SPEC.chambers.pressure_max_kpa
+    return low + (high - low) * 0.5 * (1.0 + swing)
+
+
+def quaternions(rotation):
+    found = np.empty((len(rotation), 4))
+    for k, matrix in enumerate(np.float64(rotation)):
+        mujoco.mju_mat2Quat(found[k], matrix.ravel())
+    return found
+
+
+def turned(quaternion, turn_rad):
+    """Quaternions (n, 4) after small turns (n, 3)."""
+    found = np.empty_like(quaternion)
+    for k, half in enumerate(0.5 * turn_rad):
+        small = np.append(1.0, half)
+        mujoco.mju_mulQuat(found[k], small / np.linalg.norm(small), quaternion[k])
+    return found
+
+
+def pose_log(arm, n, seed, pressure_kpa=None, **changes):
+    """One row every five seconds, each another pose at rest, with noise; the first cannot be at rest."""
+    pressure_kpa = random_pressures(n + 1, seed) if pressure_kpa is None else pressure_kpa
+    n = len(pressure_kpa)
+    found, rng = settle_many(arm, pressure_kpa), np.random.default_rng([seed, 1])
+    assert found.settled.all()
+
+    def noise(scale, *shape):
+        return rng.normal(scale=scale, size=(n, *shape))
+
+    log = Log(
+        source="poses.csv",
+        row=np.arange(n) + 2,
+        time_s=5.0 * np.arange(n),
+        spring_m=found.spring_m + noise(SPRING_NOISE_M, 9),
+        pressure_kpa=pressure_kpa + noise(PRESSURE_NOISE_KPA, 9),
+        tip_m=found.tip_position_m + noise(TIP_NOISE_M, 3),
+        tip_quaternion=turned(quaternions(found.tip_rotation), noise(TURN_NOISE_RAD, 3)),
+        payload_kg=np.full(n, arm.mass.payload_kg),
+    )
+    return dataclasses.replace(log, **changes)
+
+
+def off_by(found, arm):
+    """Largest relative errors of stiffness, area and slope, and largest error of the offsets [m]."""
+    pairs = [[np.array(getattr(x.chambers, name)) for x in (found, arm)] for name in FIELDS]
+    *relative, (offset, true_offset) = pairs
+    return *(np.abs(a / b - 1.0).max() for a, b in relative), np.abs(offset - true_offset).max()
+
+
+def tip_error_mm(found, arm, n=200):
+    """Distance of two arms' tips at pressures that no fit has seen, without noise."""
+    a, b = (settle_many(x, random_pressures(n, 99)).tip_position_m for x in (found, arm))
+    return 1e3 * np.linalg.norm(a - b, axis=1)
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    return calibrate_chambers(pose_log(planted(), 200, seed=0), SPEC)
+
+
+@pytest.fixture(scope="module")
+def fitted_without_springs():
+    return calibrate_chambers(pose_log(planted(), 200, seed=0, spring_m=None), SPEC)
+
+
+# --- gradients -------------------------------------------------------------------------------------
+
+
+def test_the_derivative_of_the_rest_is_that_of_finite_differences_of_settle_pressures():
+    """In double precision, where differences are exact to 1e-6."""
+    rng = np.random.default_rng(0)
+    direction = rng.normal(size=37) * np.append(np.repeat([0.1, 0.1, 0.1, 0.02], 9), 0.1)
+    with jax.enable_x64(True):
+        params = jax.tree.map(jax.numpy.asarray, ArmParams.from_spec(SPEC, np.float64))
+        kinematics = functools.partial(chain_frames, link_length_m=params.link_length_m)
+        unlimited = params._replace(pressure_min_kpa=np.full(9, -100.0), pressure_max_kpa=np.full(9, 100.0))
+
+        @jax.jit
+        def settled(x, pressure):
+            return settle_pressures(kinematics, with_numbers(x, unlimited), pressure).q
+
+        @jax.jit
+        def derivative(direction, change, pressure):
+            def q(x, p):
+                return rest(with_numbers(x, params), p)
+
+            return jax.jvp(q, (np.zeros(37), pressure), (direction, change))
+
+        for pressure in random_pressures(4, 1):
+            change = rng.normal(size=9)
+            found, slope = derivative(direction, change, pressure)
+            step = 1e-4
+            ahead, behind = (
+                settled(sign * step * direction, pressure + sign * step * change) for sign in (1, -1)
+            )
+            np.testing.assert_allclose(found, settled(np.zeros(37), pressure), atol=1e-9)
+            expected = (ahead - behind) / (2 * step)
+            np.testing.assert_allclose(slope, expected, atol=1e-5 * np.abs(expected).max())
+
+
+# --- planted arms ----------------------------------------------------------------------------------
+
+
+def test_planted_numbers_come_back(fitted):
+    stiffness, area, slope, offset_m = off_by(fitted.spec, planted())
+    assert stiffness < 0.05
+    assert area < 0.05
+    assert slope < 0.1
+    assert offset_m < 1e-3  # of offsets up to 5 mm
+    bending = fitted.spec.backbone.bending_stiffness_nm_per_rad
+    assert bending == pytest.approx(planted().backbone.bending_stiffness_nm_per_rad, rel=0.05)
+
+
+def test_without_springs_stiffness_and_area_come_back_and_the_offsets_are_said_to_be_unknown(
+    fitted_without_springs,
+):
+    stiffness, area, _, _ = off_by(fitted_without_springs.spec, planted())
+    assert stiffness < 0.05
+    assert area < 0.05
+    assert "offset" in fitted_without_springs.weak[0]
+    assert fitted_without_springs.direction_widths[0] > 3.0
+    assert any("directions" in warning for warning in fitted_without_springs.warnings)
+
+
+def test_the_calibrated_tip_is_the_planted_arm_s(fitted, fitted_without_springs):
+    assert tip_error_mm(SPEC, planted()).mean() > 5.0
+    for fit in (fitted, fitted_without_springs):
+        assert tip_error_mm(fit.spec, planted()).mean() < 0.5
+
+
+def test_held_out_error_is_that_of_the_noise(fitted):
+    """The mean length of three normal errors is 1.6 of one."""
+    assert fitted.held_out.n == fitted.is_held_out.sum() == 40
+    assert 1.0 < fitted.held_out.translation_mean_mm / (1e3 * 1.6 * TIP_NOISE_M) < 1.5
+    assert fitted.held_out_before.translation_mean_mm > 5.0
+    assert fitted.held_out.spring_rms_mm == pytest.approx(1e3 * SPRING_NOISE_M, rel=0.2)
+
+
+def test_nothing_to_warn_of_where_the_arm_is_as_simulated(fitted):
+    assert fitted.warnings == ()
+    assert fitted.weak == ()
+
+
+def test_intervals_hold_the_planted_numbers_as_often_as_they_say():
+    """Four sets of noise, 144 numbers, of which those of one set hang together."""
+    arm, pressure_kpa = planted(), random_pressures(101, 0)
+    inside = []
+    for seed in range(4):
+        fit = calibrate_chambers(pose_log(arm, 100, seed, pressure_kpa), SPEC)
+        for name in FIELDS:
+            error = np.array(getattr(fit.spec.chambers, name)) - np.array(getattr(arm.chambers, name))
+            inside.append(np.abs(error) < fit.half_width_95[name])
+    assert 0.9 < np.mean(inside) < 0.985
+
+
+def test_payload_hangs_at_the_gripper_row_by_row(fitted):
+    """Half of the poses with 0.5 kg: taken into account it changes nothing, left out it bends the arm."""
+    arm = planted()
+    loaded = pose_log(arm.replace(mass={"payload_kg": 0.5}), 60, seed=2)
+    light = pose_log(arm, 60, seed=3)
+    fit = calibrate_chambers([light, loaded], SPEC)
+    assert fit.held_out.translation_mean_mm < 1.3
+    assert tip_error_mm(fit.spec, arm).mean() < 0.5
+    left_out = calibrate_chambers([light, dataclasses.replace(loaded, payload_kg=None)], SPEC)
+    assert left_out.held_out.translation_mean_mm > 3.0
+
+
+def test_outliers_hardly_matter(fitted):
+    log = pose_log(planted(), 200, seed=0)
+    wrong = np.random.default_rng(0).choice(len(log), 10, replace=False)
+    tip_m = log.tip_m.copy()
+    tip_m[wrong] += 0.1
+    found = calibrate_chambers(dataclasses.replace(log, tip_m=tip_m), SPEC)
+    assert tip_error_mm(found.spec, planted()).mean() < 0.5
+
+
+def test_commanded_lengths_are_those_that_were_measured(fitted):
+    springs = fitted.spec.springs
+    assert springs.length_min_m == np.nanmin(fitted.rests.spring_m)
+    assert springs.length_max_m == np.nanmax(fitted.rests.spring_m)
+
+
+def test_every_row_is_counted_and_held_out_poses_are_contiguous(fitted):
+    assert sum(fitted.rows.values()) == 201
+    assert fitted.rows == {"used": 200, "not finite": 0, "pressures not held long enough": 1,
+                           "tip still moving": 0}  # fmt: skip
+    assert fitted.n_single == 200
+    np.testing.assert_array_equal(fitted.is_held_out, held_out_blocks(200, 0.2, 5, 0))
+
+
+def test_an_arm_that_does_not_settle_is_masked_and_counted():
+    """A payload of 50 kg written into three rows: no rest, or one far off; the others decide."""
+    log = pose_log(planted(), 100, seed=4)
+    payload = log.payload_kg.copy()
+    payload[[10, 50, 90]] = 5000.0
+    fit = calibrate_chambers(dataclasses.replace(log, payload_kg=payload), SPEC)
+    assert np.isnan(fit.tip_error_mm).sum() == 3
+    assert any("no rest at 3 of 100 poses" in warning for warning in fit.warnings)
+    assert tip_error_mm(fit.spec, planted()).mean() < 0.5
+
+
+# --- what the poses do not tell --------------------------------------------------------------------
+
+
+def test_a_chamber_that_never_changes_is_named_and_its_area_left_alone():
+    pressure_kpa = random_pressures(151, 5)
+    pressure_kpa[:, 4] = 0.0
+    fit = calibrate_chambers(pose_log(planted(), 150, 5, pressure_kpa), SPEC)
+    assert "area4" in fit.weak[0] or "slope4" in fit.weak[0]
+    assert fit.spec.chambers.area_m2[4] == pytest.approx(SPEC.chambers.area_m2, rel=0.2)
+    assert fit.half_width_95["area_m2"][4] > SPEC.chambers.area_m2
+    others = np.delete(fit.half_width_95["area_m2"], 4)
+    assert others.max() < 0.05 * SPEC.chambers.area_m2
+    assert any("pressures of chambers 4 stay away from" in warning for warning in fit.warnings)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"tip_m": None}, "poses.csv: no tip_m, expected"),
+        ({"pressure_kpa": None}, "poses.csv: no pressure_kpa, expected"),
+        ({"spring_m": np.ones((31, 6))}, "poses.csv: spring_m: got 6 columns, expected 9"),
+    ],
+)
+def test_refuses_a_log_that_cannot_be_used(changes, message):
+    with pytest.raises(ValueError, match=message):
+        calibrate_chambers(dataclasses.replace(pose_log(SPEC, 30, 0), **changes), SPEC)
+
+
+def test_refuses_too_few_poses():
+    with pytest.raises(
+        ValueError, match=f"got 9 poses at rest, expected {MIN_POSES} or more; rows .* 9 used"
+    ):
+        calibrate_chambers(pose_log(SPEC, 9, 0), SPEC)

@@ -1,0 +1,220 @@
+"""The sim-to-real fit on a planted arm and on the logs of a real trunk."""
+
+import functools
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from benchmarks.accuracy.logs import trunk_errors
+from calib.fit.blocks import held_out_blocks
+from calib.fit.network import NetworkConfig, fit_network
+from calib.fit.s2r import fit_s2r, pose_errors, simulate_poses
+from mjx_softarm._support.mlp import mlp
+from mjx_softarm.mechanics.kinematics import chain_frames
+from mjx_softarm.mechanics.settle import settle
+from mjx_softarm.mechanics.statics import ArmParams
+from mjx_softarm.mechanics.workspace import sample_workspace
+from mjx_softarm.sensing.pose import frame_from_pose, pose_from_frame
+from mjx_softarm.sensing.s2r import apply_correction, correct, correction, extrapolation, load_s2r, save_s2r
+
+N_ROWS, N_CLEAN = 1_000, 500
+BRIEF = NetworkConfig(hidden=(16,), n_members=2, n_updates=100)
+DATA = Path(__file__).parents[3].parent / "shared/data"
+needs_data = pytest.mark.skipif(not DATA.is_dir(), reason=f"no logs of a real trunk in {DATA}")
+
+
+def measured(pose, rng, noise_mm=0.5, noise_deg=0.3):
+    """Poses as motion capture would measure them."""
+    turn = rng.normal(0.0, 0.5 * np.deg2rad(noise_deg), (len(pose), 3))
+    return moved(pose, np.concatenate([rng.normal(0.0, noise_mm, (len(pose), 3)), turn], axis=1))
+
+
+def moved(pose, change):
+    return pose_from_frame(*apply_correction(frame_from_pose(pose), change))
+
+
+@pytest.fixture(scope="module")
+def arms(spec):
+    """Simulated poses and spring lengths, true poses of an arm that is built a little differently."""
+    rng = np.random.default_rng(1)
+    nominal, n = ArmParams.from_spec(spec), spec.n_chambers
+    turn = np.radians(rng.normal(0.0, 2.0, n))
+    x, y = nominal.spring_site_m.T
+    site = np.stack([np.cos(turn) * x - np.sin(turn) * y, np.sin(turn) * x + np.cos(turn) * y], axis=-1)
+    planted = nominal._replace(
+        chamber_stiffness=nominal.chamber_stiffness * rng.uniform(0.85, 1.15, n),
+        area=nominal.area * rng.uniform(0.9, 1.1, n),
+        chamber_rest_m=nominal.chamber_rest_m + rng.normal(0.0, 0.003, n),
+        joint_stiffness=1.1 * nominal.joint_stiffness,
+        spring_site_m=site * (1.0 + rng.normal(0.0, 0.03, (n, 1))),
+        tool_mass_kg=nominal.tool_mass_kg + np.array([0.0, 0.2]),
+    )
+    planted = jax.tree.map(lambda a: np.asarray(a, np.float32), planted)
+    kinematics = functools.partial(chain_frames, link_length_m=planted.link_length_m)
+    reference = sample_workspace(spec, N_ROWS + N_CLEAN, seed=5).spring_m
+    real = jax.jit(jax.vmap(lambda r: settle(kinematics, planted, r)))(reference)
+    simulated = simulate_poses(spec, np.asarray(real.spring_m))
+    keep = np.asarray(real.settled) & simulated.valid
+    assert keep.mean() > 0.99
+    true = np.asarray(jax.vmap(pose_from_frame)(real.tip_position_m, real.tip_rotation), np.float64)
+    return simulated.pose[keep], simulated.spring_m[keep], true[keep]
+
+
+@pytest.fixture(scope="module")
+def fit(arms):
+    pose_sim, spring_m, true = (a[:N_ROWS] for a in arms)
+    return fit_s2r(pose_sim, spring_m, measured(true, np.random.default_rng(2)))
+
+
+def test_simulation_holds_the_spring_lengths_of_unsaturated_poses(spec):
+    pool = sample_workspace(spec, 64, seed=3)
+    simulated = simulate_poses(spec, np.asarray(pool.spring_m))
+    assert simulated.valid.all()
+    np.testing.assert_allclose(simulated.spring_m, pool.spring_m, atol=1e-4)
+    errors = pose_errors(simulated.pose.astype(float), np.asarray(pool.pose, float))
+    assert errors.translation_95_mm < 0.1 and errors.rotation_95_deg < 0.05
+
+
+@pytest.mark.parametrize(
+    "reference, message",
+    [
+        (np.zeros((4, 8)), r"got an array \(4, 8\), expected \(n, 9\)"),
+        (np.zeros((0, 9)), r"got an array \(0, 9\)"),
+        (np.full((2, 9), np.nan), "row 0, spring 0: expected a finite number, got nan"),
+    ],
+)
+def test_simulation_refuses(spec, reference, message):
+    with pytest.raises(ValueError, match=message):
+        simulate_poses(spec, reference)
+
+
+def test_planted_arm_is_corrected_on_rows_that_took_no_part(arms, fit):
+    pose_sim, spring_m, true = (a[N_ROWS:] for a in arms)  # without noise
+    after, before = pose_errors(correct(fit.s2r, pose_sim, spring_m), true), pose_errors(pose_sim, true)
+    assert before.translation_mean_mm > 4.0 and before.rotation_mean_deg > 1.0
+    assert after.translation_mean_mm < 0.25 * before.translation_mean_mm
+    assert after.rotation_mean_deg < 0.3 * before.rotation_mean_deg
+    assert fit.warnings == ()
+
+
+def test_reported_error_is_that_of_the_held_out_rows(arms, fit):
+    pose_sim, spring_m = (a[:N_ROWS][fit.held_out].astype(float) for a in arms[:2])
+    real = measured(arms[2][:N_ROWS], np.random.default_rng(2))[fit.held_out]
+    error_mm = np.linalg.norm((correct(fit.s2r, pose_sim, spring_m) - real)[:, :3], axis=1)
+    assert fit.test.translation_mean_mm == pytest.approx(error_mm.mean(), rel=1e-6)
+    assert fit.test.translation_95_mm == pytest.approx(np.percentile(error_mm, 95.0), rel=1e-6)
+    assert 0.15 < fit.held_out.mean() < 0.25
+
+
+def test_states_far_from_the_log_are_flagged_and_stay_bounded(spec, arms, fit):
+    rng = np.random.default_rng(4)
+    low, high = spec.springs.length_min_m, spec.springs.length_max_m
+    wild = simulate_poses(spec, rng.choice([low, high], (512, spec.n_chambers)))
+    pose, spring_m = wild.pose[wild.valid].astype(float), wild.spring_m[wild.valid]
+    seen = extrapolation(fit.s2r, arms[0][N_ROWS:], arms[1][N_ROWS:])
+    assert np.mean(seen > 1.0) < 0.05 < 0.5 < np.mean(extrapolation(fit.s2r, pose, spring_m) > 1.0)
+    largest = np.abs([fit.s2r.output_low, fit.s2r.output_high]).max(axis=0)
+    change_mm = (correct(fit.s2r, pose, spring_m) - pose)[:, :3]
+    assert (np.abs(change_mm) <= largest[:3] + 1e-6).all()
+
+
+def test_fitted_network_goes_through_its_file(fit, tmp_path):
+    save_s2r(tmp_path / "s2r.npz", fit.s2r)
+    jax.tree.map(np.testing.assert_array_equal, load_s2r(tmp_path / "s2r.npz"), fit.s2r)
+
+
+def test_held_out_rows_take_no_part_and_the_seed_decides(arms):
+    pose_sim, spring_m, true = (a[:N_ROWS] for a in arms)
+    first = fit_s2r(pose_sim, spring_m, true, seed=7, config=BRIEF)
+    shifted, stretched = true + 0.0, spring_m + 0.0
+    shifted[first.held_out, :3] += 50.0
+    stretched[first.held_out] *= 3.0
+    again = fit_s2r(pose_sim, stretched, shifted, seed=7, config=BRIEF)
+    jax.tree.map(np.testing.assert_array_equal, again.s2r, first.s2r)
+    other = fit_s2r(pose_sim, spring_m, true, seed=8, config=BRIEF)
+    assert not np.array_equal(other.s2r.layers[0][0], first.s2r.layers[0][0])
+
+
+def test_warns_of_few_rows_no_gain_and_another_frame(arms):
+    pose_sim, spring_m, true = (a[:150] for a in arms)
+    perfect = fit_s2r(pose_sim, spring_m, pose_sim, config=BRIEF).warnings
+    assert "150 rows are few" in perfect[0] and "no better than 0 without" in perfect[1]
+    turned = moved(true, np.broadcast_to([0, 0, 0, 0, 0, np.tan(np.radians(60.0))], (150, 6)))
+    assert any(
+        "in 150 of 150 rows" in text for text in fit_s2r(pose_sim, spring_m, turned, config=BRIEF).warnings
+    )
+
+
+def test_fit_refuses_what_does_not_fit_together(arms):
+    pose_sim, spring_m, true = (a[:150] for a in arms)
+    with pytest.raises(ValueError, match=r"got \(150, 6\), \(150, 9\), \(149, 6\)"):
+        fit_s2r(pose_sim, spring_m, true[:-1])
+    with pytest.raises(ValueError, match="inputs, row 3, column 9: expected a finite number, got nan"):
+        broken = np.where(np.arange(150)[:, None] == 3, np.nan, spring_m)
+        fit_network(np.concatenate([np.zeros((150, 9)), broken], axis=1), true, seed=0)
+
+
+def test_one_network_says_the_mean_of_its_members():
+    rng = np.random.default_rng(0)
+    x = rng.uniform(-1.0, 1.0, (400, 2))
+    y = np.stack([np.sin(3.0 * x[:, 0]), 5.0 + x[:, 0] * x[:, 1]], axis=1)
+    config = NetworkConfig(hidden=(8, 4), n_members=3, n_updates=50)
+    network = fit_network(x, y, 0, config).network
+    assert [weight.shape for weight, _ in network.layers] == [
+        (2, 3 * 8 + 2),
+        (3 * 8 + 2, 3 * 4 + 2),
+        (3 * 4 + 2, 2),
+    ]  # three members and the line
+    z = 2.0 * (x - network.input_low) / (network.input_high - network.input_low) - 1.0
+    (w0, b0), (w1, b1), (w2, b2) = network.layers
+    members = [
+        mlp(
+            (
+                (w0[:, 8 * k : 8 * k + 8], b0[8 * k : 8 * k + 8]),
+                (w1[8 * k : 8 * k + 8, 4 * k : 4 * k + 4], b1[4 * k : 4 * k + 4]),
+                (3.0 * w2[4 * k : 4 * k + 4], 0.0),
+            ),
+            z,
+        )
+        for k in range(3)
+    ]
+    expected = np.mean(members, axis=0) + (z + 1.0) @ w2[-2:] + b2
+    np.testing.assert_allclose(mlp(network.layers, z), expected, rtol=1e-5, atol=1e-5)
+
+
+def test_a_straight_line_is_learned_exactly_enough():
+    """The line goes through the network's layers; what is left to the members is nothing."""
+    x = np.random.default_rng(0).uniform(-3.0, 5.0, (500, 3))
+    y = x @ [[2.0], [-1.0], [0.3]] + 7.0
+    fitted = correction(fit_network(x, y, 0, NetworkConfig(n_updates=50)).network, x)
+    assert np.abs(fitted - y).max() < 0.02 * np.ptp(y)
+
+
+def test_a_constant_input_and_a_constant_output_do_no_harm():
+    x = np.stack([np.linspace(0.0, 1.0, 300), np.full(300, 0.2)], axis=1)
+    y = np.stack([x[:, 0] ** 2, np.full(300, 4.0)], axis=1)
+    fitted = correction(fit_network(x, y, 0, NetworkConfig(n_updates=500)).network, x)
+    np.testing.assert_allclose(fitted[:, 1], 4.0, rtol=1e-6)
+    assert np.sqrt(np.mean((fitted - y) ** 2)) < 0.02
+
+
+@needs_data
+def test_polynomials_of_the_data_s_own_page():
+    """Their figures come back from the same blocks, so the network is compared with what it should be."""
+    errors = trunk_errors(DATA, "1", functools.partial(held_out_blocks, seed=1), history=False)
+    expected = [19.4, 12.3, 9.2]
+    np.testing.assert_allclose([errors[x] for x in ("linear", "quadratic", "cubic")], expected, atol=0.35)
+
+
+@needs_data
+def test_real_trunk_beats_the_cubic_polynomial():
+    errors = trunk_errors(DATA, "1", functools.partial(held_out_blocks, seed=1))
+    assert errors["network"] <= 7.5 < errors["cubic"] < errors["linear"]
+
+
+@needs_data
+def test_real_trunk_does_not_blow_up_outside_of_its_training_rows():
+    errors = trunk_errors(DATA, "11", lambda n: np.arange(n) >= 0.8 * n)
+    assert errors["network"] < errors["linear"] < 100.0 < errors["cubic"]

@@ -1,0 +1,82 @@
+"""The report: what stands in it, and that nothing of a log can break it."""
+
+import json
+from html.parser import HTMLParser
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from calib.report.page import Part, Table, to_html, to_json
+
+PROVENANCE = {"commit": "0123abc", "packages": {"numpy": "2.0"}}
+
+
+class Page(HTMLParser):
+    """Texts, by tag, and that every tag is closed."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.open, self.texts, self.images = [], {}, []
+        self.feed(page)
+        assert self.open == []
+
+    def handle_starttag(self, tag, attributes):
+        if tag == "img":
+            self.images.append(dict(attributes)["src"])
+        elif tag != "meta":
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open:
+            self.texts.setdefault(self.open[-1], []).append(data)
+
+
+def make_parts(warnings=()):
+    table = Table(("", "beta"), (("spring 0", 0.931234), ("spring 1", 7)))
+    figure = Figure()
+    figure.add_subplot().plot([0, 1])
+    return (
+        Part("Springs", "What was fitted.", (table,), warnings, {"beta": [0.93]}, (("a plot", figure),)),
+        Part("Chambers", "Not fitted."),
+    )
+
+
+def test_page_shows_every_part_with_its_figures_and_needs_no_other_file():
+    page = Page(to_html("paper", make_parts(), [], PROVENANCE))
+    assert page.texts["h1"] == ["Calibration of paper"]
+    assert page.texts["h2"] == ["Springs", "Chambers", "Logs", "How it was made"]
+    assert page.texts["td"] == ["spring 0", "0.9312", "spring 1", "7"]
+    assert [image[:22] for image in page.images] == ["data:image/png;base64,"]
+    assert "No fault was found in them." in page.texts["p"]
+    assert "commit: 0123abc" in page.texts["pre"][0]
+
+
+def test_verdict_names_the_parts_with_warnings():
+    good, bad = (Page(to_html("x", make_parts(w), [], {})) for w in ((), ("spring 3: too short a range",)))
+    assert good.texts["p"][0].startswith("Every fitted step met")
+    assert bad.texts["p"][0] == "Look at Springs before you trust this."
+    assert "spring 3: too short a range" in bad.texts["li"]
+
+
+def test_names_and_findings_are_text_not_markup():
+    findings = ["a.csv: <script>alert(1)</script>"]
+    page = Page(to_html("<b>arm</b>", make_parts(("<i>",)), findings, {"x": "<u>"}))
+    assert page.texts["h1"] == ["Calibration of <b>arm</b>"]
+    assert set(page.texts) <= {"h1", "h2", "p", "td", "th", "li", "pre", "title", "style"}
+    assert "a.csv: <script>alert(1)</script>" in page.texts["li"]
+
+
+def test_json_has_the_same_figures_and_says_whether_to_trust_them():
+    data = json.loads(json.dumps(to_json(make_parts(), ["a finding"], PROVENANCE)))
+    assert data["trustworthy"] is True and data["findings"] == ["a finding"]
+    assert data["parts"]["Springs"] == {"figures": {"beta": [0.93]}, "warnings": []}
+    assert data["provenance"] == PROVENANCE
+    assert to_json(make_parts(("no",)), [], {})["trustworthy"] is False
+
+
+def test_numbers_of_numpy_are_shown_like_python_s():
+    part = Part("x", "y", (Table(("a",), ((np.float64(0.123456),), (np.int64(3),))),))
+    assert Page(to_html("x", (part,), [], {})).texts["td"] == ["0.1235", "3"]

@@ -1,0 +1,97 @@
+"""Arms by name, and the command line that drives them, without JAX in its process."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib.read.logs import read_log
+from mjx_softarm.deploy.arms import ArmError, open_arm
+from mjx_softarm.policy.file import save_policy
+from mjx_softarm.sensing.sensors import frequency_from_length
+from tests.linear_arm import FAR, POLICY, REST_M, SENSOR, N
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("twin", "got 'twin', expected twin:SEED or package.module:Class"),
+        ("twin:-1", "got '-1', expected an integer >= 0"),
+        ("no_such_module:Arm", "no_such_module cannot be imported: No module named 'no_such_module'"),
+        ("mjx_softarm.deploy.loop:Nothing", "module mjx_softarm.deploy.loop has no 'Nothing'"),
+        ("mjx_softarm.deploy.loop:Phase", "has no method read_frequencies or write_pressures"),
+    ],
+)
+def test_arm_that_cannot_be_had(name, message):
+    with pytest.raises(ArmError, match=message):
+        open_arm(name)
+
+
+DRIVER = """
+import numpy as np
+
+class Arm:
+    time_s = 0.0
+    def read_frequencies(self):
+        return np.full(9, {frequency_hz}) + np.random.default_rng(round(50 * self.time_s)).normal(0, 300, 9)
+    def write_pressures(self, pressure_kpa):
+        self.time_s += 0.02
+"""
+WITHOUT_JAX = """
+import sys
+from mjx_softarm.deploy.__main__ import main
+
+status = main(sys.argv[1:])
+loaded = sorted({name.split(".")[0] for name in sys.modules} & {"jax", "mujoco", "train", "calib"})
+print(status, loaded)
+"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    frequency_hz = frequency_from_length(np.full(N, REST_M), SENSOR)[0]
+    (tmp_path / "driver.py").write_text(DRIVER.format(frequency_hz=frequency_hz))
+    save_policy(tmp_path / "policy.npz", POLICY)
+    return tmp_path
+
+
+def command(folder, *args):
+    return subprocess.run(
+        [sys.executable, "-c", WITHOUT_JAX, *args],
+        cwd=folder,
+        env={"PYTHONPATH": str(ROOT), "PATH": ""},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+
+
+def test_command_line_runs_without_jax(folder):
+    goal = "--goal=" + ",".join(map(str, POLICY.workspace[0]))
+    done = command(
+        folder, "run", "policy.npz", "--arm", "driver:Arm", goal, "--log", "a.csv", "--duration", "1"
+    )
+    assert done.stderr == "" and done.stdout.endswith("0 []\n")
+    assert "from readings to pressures: median" in done.stdout and "the arm is vented" in done.stdout
+    assert len(read_log(folder / "a.csv")[0]) > 0
+    done = command(folder, "record", "--arm", "driver:Arm", "--out", "b.csv", "--poses", "2")
+    assert done.stderr == "" and done.stdout.endswith("0 []\n") and "no motion capture" in done.stdout
+    assert (folder / "b.csv").read_text().count("\n") == 3
+
+
+def test_command_line_tells_what_is_wrong(folder):
+    goal = ("--goal", "0,0,-600,0,0,0")
+    for args, message in (
+        (("run", "no.npz", "--arm", "driver:Arm", *goal), "no.npz: cannot be read"),
+        (("run", "policy.npz", "--arm", "driver:Arms", *goal), "module driver has no 'Arms'"),
+        (("run", "policy.npz", "--arm", "driver:Arm", *goal, "--log", "no/a.csv"), "--log: no is no folder"),
+    ):
+        done = command(folder, *args)
+        assert done.stdout.startswith("2 ") and message in done.stderr and done.stderr.count("\n") == 1
+    far = "--goal=" + ",".join(map(str, FAR))
+    done = command(folder, "run", "policy.npz", "--arm", "driver:Arm", far)
+    assert done.stdout.endswith("3 []\n") and "goal outside the workspace" in done.stdout

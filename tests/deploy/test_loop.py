@@ -1,0 +1,153 @@
+"""The control loop on a linear arm whose every answer is known: what it does when all is well."""
+
+import numpy as np
+
+from calib.read.logs import read_log
+from mjx_softarm.deploy import session
+from mjx_softarm.deploy.arm_io import Capture
+from mjx_softarm.deploy.arms import open_arm
+from mjx_softarm.deploy.faults import Fault
+from mjx_softarm.deploy.loop import N_ACTIONS, VENT_KPA_PER_S, Controller, Phase, start, step, with_goal
+from mjx_softarm.logs.schema import write_log
+from mjx_softarm.sensing.estimator import estimate
+from mjx_softarm.sensing.sensors import frequency_from_length
+from tests.linear_arm import (
+    CONTROLLER,
+    DT_S,
+    GOALS,
+    HIGH_KPA,
+    NOISE_M,
+    POLICY,
+    SENSOR,
+    SPRINGS_M,
+    LinearArm,
+    exact_plan,
+    go,
+    read_m,
+)
+
+
+def test_reaches_goals_and_vents():
+    arm, lines = LinearArm(), []
+    run = go(arm, tell=lines.append)
+    assert run.events == () and run.phase is Phase.DONE and not run.interrupted
+    assert [arrival.goal.tolist() for arrival in run.arrivals] == GOALS.tolist()
+    for arrival, spring_m in zip(run.arrivals, SPRINGS_M, strict=True):
+        np.testing.assert_allclose(read_m(run.log)[arrival.row], spring_m, atol=5e-4)
+        assert np.linalg.norm(arrival.estimate[:3] - arrival.goal[:3]) < 1.0
+    np.testing.assert_array_equal(arm.command_kpa, 0.0)
+    assert len(run.latency_s) == len(run.log) == len(arm.written) and len(lines) == len(GOALS)
+
+
+def test_pressures_do_not_wait_for_the_log():
+    arm, n_written = LinearArm(), []
+    run = go(arm, goals=GOALS[:1], tell=lambda _: n_written.append(len(arm.written)))
+    assert n_written == [run.arrivals[0].row + 1]
+
+
+def test_acts_at_once_and_then_at_rest():
+    arm, asked = LinearArm(), []
+
+    def plan(pose, goal, spring_m):
+        asked.append((arm.tick, np.abs(arm.command_kpa - arm.actual_kpa).max()))
+        np.testing.assert_allclose(pose, estimate(POLICY.estimator, spring_m), atol=1e-3)
+        np.testing.assert_allclose(spring_m, arm.spring_m, atol=5 * NOISE_M)
+        return exact_plan(pose, goal, spring_m)
+
+    go(arm, controller=Controller.of(POLICY, plan))
+    assert len(asked) == N_ACTIONS * len(GOALS) and asked[0][0] == 0
+    assert max(lag_kpa for _, lag_kpa in asked) < 0.2  # the arm has followed the command
+    assert np.diff([tick for tick, _ in asked]).min() >= CONTROLLER.window or len(GOALS) > 1
+
+
+def test_policy_itself_plans_by_default():
+    run = go(LinearArm(), goals=GOALS[:1], controller=Controller.of(POLICY), duration_s=0.1)
+    middle_hz = POLICY.frequency_hz.mean(axis=1)  # the actor's weights are zero
+    got_hz = frequency_from_length(run.log.reference_m[1], SENSOR)
+    np.testing.assert_allclose(got_hz, middle_hz, rtol=1e-6)
+
+
+def test_state_is_not_changed_in_place():
+    state, _ = with_goal(CONTROLLER, start(CONTROLLER), GOALS[0])
+    arrays = [np.array(value, copy=True) for value in (state.integral_kpa, state.n_lost, state.springs_m)]
+    frequency_hz = LinearArm().read_frequencies()
+    first = step(CONTROLLER, state, frequency_hz, False)[0]
+    second = step(CONTROLLER, state, frequency_hz, False)[0]
+    np.testing.assert_array_equal(first.pressure_kpa, second.pressure_kpa)
+    for before, after in zip(arrays, (state.integral_kpa, state.n_lost, state.springs_m), strict=True):
+        np.testing.assert_array_equal(before, after)
+
+
+def test_log_has_pressures_in_force_and_calibration_reads_it(tmp_path):
+    arm = LinearArm()
+    arm.motion_capture = lambda: Capture(
+        tip_m=-arm.spring_m[:3],
+        tip_quaternion=np.array([1.0, 0, 0, 0]),
+        marker_m=np.ones((2, 3)) * arm.time_s,
+    )
+    run = go(arm, goals=GOALS[:1])
+    np.testing.assert_array_equal(run.log.pressure_kpa[1:], arm.written[:-1])
+    np.testing.assert_allclose(-run.log.tip_m, read_m(run.log)[:, :3], atol=5 * NOISE_M)  # of one instant
+    np.testing.assert_allclose(np.diff(run.log.time_s), DT_S, rtol=1e-6)
+    write_log(tmp_path / "run.csv", run.log)
+    log, _ = read_log(tmp_path / "run.csv")
+    assert len(log) > 0.5 * len(run.log)
+    np.testing.assert_allclose(log.reference_m[0], SPRINGS_M[0], atol=1e-7)
+    np.testing.assert_allclose(log.goal[0], GOALS[0], atol=1e-4)
+
+
+def test_duration_ends_with_venting():
+    arm = LinearArm()
+    run = go(arm, duration_s=2.0)
+    assert run.phase is Phase.DONE and run.arrivals == ()
+    assert 2.0 <= run.log.time_s[-1] <= 2.0 + HIGH_KPA / VENT_KPA_PER_S + 2.0
+    np.testing.assert_array_equal(arm.command_kpa, 0.0)
+
+
+def test_real_arm_is_waited_for(monkeypatch):
+    now = [5.0]
+    slept = []
+    monkeypatch.setattr(session.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(session.time, "sleep", lambda s: (slept.append(s), now.__setitem__(0, now[0] + s)))
+
+    class Real:
+        """Without a clock; each tick takes it 4 ms."""
+
+        read_frequencies = staticmethod(LinearArm().read_frequencies)
+
+        def write_pressures(self, pressure_kpa):
+            now[0] += 0.004
+
+    run = go(Real(), duration_s=1.0)
+    assert run.events == ()
+    np.testing.assert_allclose(slept, DT_S - 0.004, atol=1e-9)
+    np.testing.assert_allclose(np.diff(run.log.time_s), DT_S, atol=1e-9)
+
+
+def test_interrupt_vents_and_keeps_the_log():
+    class Interrupted(LinearArm):
+        n_interrupts = 1
+
+        def read_frequencies(self):
+            if self.tick == 60 and self.n_interrupts > 0:
+                self.n_interrupts -= 1
+                raise KeyboardInterrupt
+            return super().read_frequencies()
+
+    arm = Interrupted()
+    run = go(arm)
+    assert run.interrupted and run.phase is Phase.DONE and len(run.log) > 60
+    np.testing.assert_array_equal(arm.command_kpa, 0.0)
+    twice = Interrupted()
+    twice.n_interrupts = 2
+    run = go(twice)
+    assert run.interrupted and run.phase is Phase.VENT and len(run.log) == 60
+
+
+def test_loop_drives_the_twin():
+    twin = open_arm("twin:0")
+    run = go(twin, goals=GOALS[:1], duration_s=1.0)
+    assert run.phase is Phase.DONE and set(run.counts()) <= {Fault.SATURATED}
+    assert run.log.tip_m.shape == (len(run.log), 3) and np.isfinite(run.log.tip_quaternion).all()
+    assert np.ptp(run.log.tip_m, axis=0).max() > 1e-3  # it moved
+    np.testing.assert_allclose(np.diff(run.log.time_s), DT_S, atol=1e-9)

@@ -1,0 +1,188 @@
+"""The control loop with faults of chambers, goals and time injected, and its response to every fault."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from mjx_softarm.deploy import faults
+from mjx_softarm.deploy.faults import RESPONSE, Fault, Response
+from mjx_softarm.deploy.loop import N_ACTIONS, VENT_KPA_PER_S, Controller, Phase
+from mjx_softarm.deploy.reach import Reachable, nearest
+from mjx_softarm.mdp.rewards import RewardConfig
+from mjx_softarm.sensing.estimator import estimate
+from mjx_softarm.sensing.s2r import N_POSE_INPUTS, N_POSE_OUTPUTS, S2R, correct, extrapolation
+from tests.linear_arm import (
+    DT_S,
+    FAR,
+    GOALS,
+    HIGH_KPA,
+    POLICY,
+    PRESSURES_KPA,
+    SPRINGS_M,
+    LinearArm,
+    N,
+    exact_plan,
+    go,
+    read_m,
+)
+
+# --- chambers --------------------------------------------------------------------------------------
+
+
+class Leaking(LinearArm):
+    """A chamber falls to atmospheric pressure."""
+
+    def holds(self, pressure_kpa):
+        return np.where((np.arange(N) == 3) & (self.tick >= 150), 0.0, pressure_kpa)
+
+
+def test_lost_chamber_vents():
+    arm = Leaking()
+    run = go(arm)
+    assert abs(PRESSURES_KPA[0, 3]) > 5.0  # it matters
+    assert run.phase is Phase.DONE and run.counts()[Fault.CHAMBER_LOST] == 1
+    [event] = [event for event in run.events if event.fault is Fault.CHAMBER_LOST]
+    assert event.message.startswith("chamber3: at")
+    np.testing.assert_array_equal(arm.command_kpa, 0.0)
+    vented = np.abs(np.diff(np.array(arm.written)[-20:], axis=0))
+    assert 0.0 < vented.max() <= VENT_KPA_PER_S * DT_S + 1e-9
+
+
+def test_saturated_chamber_is_not_lost():
+    beyond = SPRINGS_M[0] + np.where(np.arange(N) == 3, 0.08, 0.0)
+    arm = LinearArm()
+    run = go(arm, goals=GOALS[:1], controller=Controller.of(POLICY, lambda *_: beyond))
+    assert set(run.counts()) == {Fault.SATURATED} and len(run.arrivals) == 1
+    assert "chamber3: at the limit, spring -" in run.events[0].message
+    assert max(written[3] for written in arm.written) == HIGH_KPA
+
+
+def test_arm_that_never_rests_is_counted():
+    class Swinging(LinearArm):
+        @property
+        def spring_m(self):
+            return super().spring_m + 5e-3 * np.sin(2 * np.pi * 0.7 * self.time_s)
+
+    run = go(Swinging(), goals=GOALS[:1])
+    assert run.counts()[Fault.NOT_SETTLED] == N_ACTIONS and len(run.arrivals) == 1
+    assert run.log.time_s[run.arrivals[0].row] >= N_ACTIONS * faults.SETTLE_TIMEOUT_S - 1.0
+
+
+# --- goals -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("goal", [FAR, np.full(6, np.nan), np.zeros(6)])
+def test_goal_outside_is_skipped(goal):
+    arm = LinearArm()
+    run = go(arm, goals=[goal, GOALS[1]])
+    assert run.counts() == {Fault.GOAL_OUTSIDE: 1}
+    assert [arrival.goal.tolist() for arrival in run.arrivals] == [GOALS[1].tolist()]
+
+
+def test_only_goal_outside_moves_nothing():
+    arm = LinearArm()
+    run = go(arm, goals=[FAR])
+    assert run.phase is Phase.DONE and "times as far" in run.events[0].message
+    np.testing.assert_array_equal(arm.written, 0.0)
+
+
+def test_distance_to_reachable_poses():
+    reward = RewardConfig()
+    pose = np.array([[0, 0, -600, 0, 0, 0], [0, 0, -590, 0, 0, 0], [0, 30, -600, 0, 0, 0]], float)
+    found = Reachable.from_poses(pose, reward)
+    assert found.limit == pytest.approx(30 * reward.weight_per_mm)
+    near, distance = nearest(found, np.array([0, 60, -600, 0, 0, 0]), reward)
+    np.testing.assert_array_equal(near, pose[2])
+    assert distance == pytest.approx(1.0)
+    _, turned = nearest(found, np.array([0, 0, -600, 0, 0, 90]), reward)
+    assert turned == pytest.approx(90 * reward.weight_per_deg / found.limit)
+
+
+# --- time ------------------------------------------------------------------------------------------
+
+
+class Slow(LinearArm):
+    """Some ticks take three periods."""
+
+    def __init__(self, ticks, refuse=False):
+        super().__init__()
+        self._slow, self._refuse, self.n_writes = ticks, refuse, 0
+
+    def write_pressures(self, pressure_kpa):
+        self.n_writes += 1
+        if self.n_writes not in self._slow:
+            return super().write_pressures(pressure_kpa)
+        if self._refuse:
+            self.time_s += DT_S
+            raise TimeoutError
+        super().write_pressures(pressure_kpa)
+        self.time_s += 2 * DT_S
+        return None
+
+
+@pytest.mark.parametrize("refuse", [False, True])
+def test_missed_deadlines(refuse):
+    run = go(Slow({20, 22, 23}, refuse))
+    assert run.counts() == {Fault.MISSED_DEADLINE: 3} and len(run.arrivals) == 2
+    arm = Slow(range(20, 60), refuse)
+    run = go(arm)
+    assert run.phase is Phase.HOLD
+    assert run.counts() == {Fault.MISSED_DEADLINE: faults.LATE_TICKS, Fault.ARM_LATE: 1}
+
+
+def test_refused_pressures_hold():
+    class Strict(LinearArm):
+        def write_pressures(self, pressure_kpa):
+            if pressure_kpa.min() < -5.0:
+                raise ValueError("below -5 kPa")
+            super().write_pressures(pressure_kpa)
+
+    run = go(Strict())
+    assert run.phase is Phase.HOLD and "write_pressures: below -5 kPa" in run.events[0].message
+    assert len(run.log) > 0
+
+
+def test_dead_pumps_do_not_vent_for_ever():
+    arm = Slow(range(100, 10**6), refuse=True)
+    run = go(arm, duration_s=1.99)
+    assert run.phase is Phase.HOLD and Fault.ARM_LOST in run.counts()
+
+
+# --- responses -------------------------------------------------------------------------------------
+
+
+def test_every_fault_has_a_response_and_stands_in_the_table():
+    assert set(RESPONSE) == set(Fault)
+    for fault, response in RESPONSE.items():
+        [line] = [line for line in faults.__doc__.splitlines() if line.strip().startswith(fault.name + " ")]
+        following = faults.__doc__.split(line)[1].split("\n")[1]
+        word = {Response.SKIP: "skip"}.get(response, response.value)
+        assert word in line[80:] + following[80:], fault
+
+
+def test_s2r_corrects_the_estimate_and_extrapolation_is_counted():
+    rng, edge = np.random.default_rng(3), np.ones(N_POSE_INPUTS + N, np.float32)
+    network = S2R(
+        layers=tuple(
+            (rng.normal(0.0, 0.2, shape).astype(np.float32), np.zeros(shape[1], np.float32))
+            for shape in ((len(edge), 16), (16, N_POSE_OUTPUTS))
+        ),
+        input_low=-edge,
+        input_high=edge,
+        output_low=np.float32([-9.0] * 3 + [-0.1] * 3),
+        output_high=np.float32([9.0] * 3 + [0.1] * 3),
+        anchors=edge[None],
+        limit=np.float32(0.002),
+    )
+    controller = Controller.of(dataclasses.replace(POLICY, s2r=network), exact_plan)
+    run = go(LinearArm(), goals=GOALS[:1], controller=controller)
+    assert run.counts() == {Fault.EXTRAPOLATION: N_ACTIONS}
+    spring_m = read_m(run.log).astype(np.float32)
+    simulated = estimate(POLICY.estimator, spring_m)
+    corrected = correct(network, simulated, spring_m)
+    assert np.abs(corrected - simulated).max() > 0.5
+    np.testing.assert_allclose(run.log.estimate, corrected, atol=2e-3)
+    away = extrapolation(network, simulated[0], spring_m[0])  # of the simulated pose, not the corrected one
+    assert abs(away - extrapolation(network, corrected[0], spring_m[0])) > 0.1
+    assert run.events[0].message.startswith(f"{away:.1f} times")

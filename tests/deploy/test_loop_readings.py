@@ -1,0 +1,75 @@
+"""The control loop with readings that are lost, late, stuck or wrong."""
+
+import numpy as np
+import pytest
+
+from mjx_softarm.deploy import faults
+from mjx_softarm.deploy.faults import Fault
+from mjx_softarm.deploy.loop import Phase
+from mjx_softarm.sensing.estimator import estimate
+from tests.linear_arm import POLICY, Blind, LinearArm, N, go, nan, read_m
+
+
+def late(frequency_hz):
+    raise TimeoutError
+
+
+def gone(frequency_hz):
+    raise OSError("bus error")
+
+
+@pytest.mark.parametrize("spoil", [nan, late])
+def test_one_lost_reading_holds_the_last_good_one(spoil):
+    run = go(Blind({30, 40}, spoil))
+    assert run.counts() == {Fault.LOST_READING: 2} and len(run.arrivals) == 2
+    before_m, now_m, after_m = read_m(run.log)[29:32]
+    held_m = np.where(np.isnan(now_m), before_m, now_m)
+    assert held_m[4] == before_m[4] != after_m[4]
+    np.testing.assert_allclose(run.log.estimate[30], estimate(POLICY.estimator, held_m), atol=1e-3)
+    assert np.isnan(run.log.frequency_hz[30, 4])
+    assert ("spring4: read nan Hz" in run.events[0].message) == (spoil is nan)
+
+
+@pytest.mark.parametrize("spoil", [nan, late])
+def test_several_lost_readings_hold(spoil):
+    arm = Blind(range(30, 100), spoil)
+    run = go(arm)
+    assert run.phase is Phase.HOLD and run.arrivals == ()
+    assert run.counts() == {Fault.LOST_READING: faults.LOST_TICKS, Fault.SENSOR_LOST: 1}
+    assert "spring4" in run.events[-1].message
+    assert len(run.log) == 30 + faults.LOST_TICKS and len(arm.written) == len(run.log) - 1
+    assert np.abs(arm.command_kpa).max() > 1.0  # not vented
+
+
+def test_no_reading_at_all_moves_nothing():
+    arm = Blind(range(100), nan)
+    assert go(arm).phase is Phase.HOLD
+    np.testing.assert_array_equal(arm.written, 0.0)
+
+
+def test_stuck_sensor_holds():
+    arm = LinearArm()
+    stuck_hz = arm.read_frequencies()[7]
+    blind = Blind(range(20, 10**6), lambda f_hz: np.where(np.arange(N) == 7, stuck_hz, f_hz))
+    run = go(blind)
+    assert run.phase is Phase.HOLD and run.counts()[Fault.SENSOR_STUCK] == 1
+    assert "spring7: moved less than 0.01 mm" in run.events[-1].message
+
+
+def test_noiseless_arm_at_rest_is_not_stuck():
+    run = go(LinearArm(noise_m=0.0))
+    assert run.events == () and len(run.arrivals) == 2
+
+
+def test_sensors_out_of_reach_hold_but_do_not_stop_venting():
+    run = go(Blind({50}, gone))
+    assert run.phase is Phase.HOLD and run.counts() == {Fault.ARM_LOST: 1}
+    assert "read_frequencies: bus error" in run.events[0].message
+    arm = Blind(range(105, 10**6), gone)
+    assert go(arm, duration_s=2.0).phase is Phase.DONE
+    np.testing.assert_array_equal(arm.command_kpa, 0.0)
+
+
+def test_wrong_number_of_readings():
+    run = go(Blind({0}, lambda frequency_hz: frequency_hz[:5]))
+    assert run.counts() == {Fault.ARM_LOST: 1} and "got shape (5,), expected (9,)" in run.events[0].message

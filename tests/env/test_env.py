@@ -1,0 +1,438 @@
+"""The environment against NumPy, against known equilibria, and against itself where it must agree."""
+
+import dataclasses
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjx_softarm import ArmSpec
+from mjx_softarm._support import xla
+from mjx_softarm._support.mjx import State
+from mjx_softarm.env import EnvConfig, Randomisation, ReachEnv
+from mjx_softarm.env.reach import PAYLOAD
+from mjx_softarm.mechanics.kinematics import chain_frames
+from mjx_softarm.mechanics.pipe import CrossPipe, body_clearance
+from mjx_softarm.mechanics.statics import ArmParams
+from mjx_softarm.sensing.pose import frame_from_pose
+from mjx_softarm.sensing.s2r import S2R
+
+MM, KPA = 1e-3, 1.0
+SHORT_ARM = ArmSpec.default().replace(structure={"n_sections": 1, "links_per_section": 2})
+SPREAD = Randomisation(payload_max_kg=0.5, stiffness_spread=0.2, sensor_noise_mm=2.0)
+
+
+def with_arm(state, **changes):
+    """The state with parts of its arms exchanged."""
+    return state.replace(pipeline_state=state.pipeline_state._replace(**changes))
+
+
+def numpy_error(pose, goal):
+    """The paper's weights, 0.0056 per mm and 0.001 per degree, on pose - goal with angles in [-180, 180]."""
+    error = np.float64(pose) - np.float64(goal)
+    error[:, 3:] = np.rad2deg(np.angle(np.exp(1j * np.deg2rad(error[:, 3:]))))
+    return error * ([0.0056] * 3 + [0.001] * 3)
+
+
+def leaves_equal(a, b):
+    return all(jax.tree.leaves(jax.tree.map(np.array_equal, a, b)))
+
+
+def types(state):
+    """Shapes and types; a jitted function is compiled anew where they differ."""
+    return jax.tree.map(jax.typeof, state)
+
+
+# --- sim-to-real network -----------------------------------------------------------------------------------
+
+
+def test_with_a_network_every_pose_is_the_real_one_and_the_arm_underneath_the_same():
+    """A network that looks at a spring: poses of reset, step, pool and reward are corrected, and the body."""
+    config = EnvConfig(n_poses=64, randomisation=Randomisation(sensor_noise_mm=2.0), pipe_diameter_mm=300.0)
+    n_springs = SHORT_ARM.n_chambers
+    weight = np.zeros((9 + n_springs, 6), np.float32)
+    weight[9, 0] = 30.0  # mm for half the range of the first spring
+    bound = np.array([40.0] * 3 + [0.2] * 3, np.float32)
+    low, high = (np.r_[np.full(3, x), [-1.0 if x < 0 else 1.0] * 6] for x in (-0.5, 0.5))
+    network = S2R(
+        layers=((weight, np.array([0.0, -4.0, 0.0, 0.0, 0.0, 0.1], np.float32)),),
+        input_low=np.float32(np.r_[low, np.full(n_springs, 0.05)]),
+        input_high=np.float32(np.r_[high, np.full(n_springs, 0.35)]),
+        output_low=-bound,
+        output_high=bound,
+        anchors=np.zeros((1, 9 + n_springs), np.float32),
+        limit=np.float32(1.0),
+    )
+    plain, real = ReachEnv(SHORT_ARM, config), ReachEnv(SHORT_ARM, config, network)
+    keys = jax.random.split(jax.random.PRNGKey(0), 16)
+    actions = jax.random.uniform(jax.random.PRNGKey(1), (16, n_springs), minval=-0.5, maxval=0.5)
+    starts = [xla.jit(jax.vmap(e.reset))(keys) for e in (plain, real)]
+    ends = [xla.jit(jax.vmap(e.step))(s, actions) for e, s in zip((plain, real), starts, strict=True)]
+    assert ends[0].info["valid"].all()
+    for one, other in (starts, ends):
+        arm, seen = one.pipeline_state, other.pipeline_state
+        for name in ("spring_m", "pressure_kpa"):
+            np.testing.assert_allclose(getattr(seen, name), getattr(arm, name), rtol=1e-5, atol=1e-6)
+        shift_mm = 30.0 * (arm.spring_m[:, 0] - 0.2) / 0.15  # of the true lengths, not the noisy readings
+        np.testing.assert_allclose(seen.pose[:, 0] - arm.pose[:, 0], shift_mm, atol=0.01)
+        np.testing.assert_allclose(seen.pose[:, 1] - arm.pose[:, 1], -4.0, atol=0.01)
+        assert np.abs(seen.pose[:, 3:] - arm.pose[:, 3:]).max() > 1.0
+        np.testing.assert_allclose(other.obs, real.observe(seen.pose, seen.goal), atol=1e-5)
+        frames = jax.vmap(lambda q: chain_frames(q, SHORT_ARM.link_length_m))(arm.motion.q)
+        share = jnp.array([0.0, 0.5, 1.0])[:, None]  # base, between the two links, tip
+        plates_m = frames.plate_position + share * MM * (seen.pose - arm.pose)[:, None, :3]
+        rotation = frames.plate_rotation.at[:, -1].set(frame_from_pose(seen.pose)[1])
+        wall_m = body_clearance(CrossPipe.of_mm(300.0), plates_m, rotation, SHORT_ARM)
+        np.testing.assert_allclose(other.info["clearance_mm"], wall_m / MM, atol=0.02)
+        assert np.abs(other.info["clearance_mm"] - one.info["clearance_mm"]).max() > 1.0
+    shift_mm = 30.0 * (plain.pool.spring_m[:, 0] - 0.2) / 0.15
+    np.testing.assert_allclose(real.pool.pose[:, 0] - plain.pool.pose[:, 0], shift_mm, atol=0.01)
+    goal = ends[1].pipeline_state.goal
+    assert np.isin(goal[:, 0], real.pool.pose[:, 0]).all()
+    tip_mm = np.linalg.norm(ends[1].pipeline_state.pose[:, :3] - goal[:, :3], axis=1)
+    np.testing.assert_allclose(ends[1].metrics["tip_error_mm"], tip_mm, rtol=1e-4)
+
+
+# --- action <-> frequency <-> length -----------------------------------------------------------------------
+
+
+def test_an_action_scales_the_frequency_linearly_between_those_of_the_shortest_and_longest_spring(env, spec):
+    sensor = spec.sensor
+    coil = 1.26e-6 * sensor.turns**2 * np.pi * sensor.coil_radius_m**2
+
+    def frequency(length):
+        inductance = coil / ((length - sensor.delta_m) / sensor.beta) + sensor.compensation_h
+        return 1 / (2 * np.pi * np.sqrt(sensor.capacitance_f * inductance))
+
+    lengths = np.linspace(spec.springs.length_min_m, spec.springs.length_max_m, 9)
+    ends = frequency(lengths[[0, -1]])
+    actions = 2 * (frequency(lengths) - ends[0]) / (ends[1] - ends[0]) - 1
+    assert actions[4] > 0.1  # the middle length is not the middle frequency
+    np.testing.assert_allclose(env.reference_m(jnp.float32(actions)), lengths, atol=1e-6)
+    np.testing.assert_allclose(env.action_of(jnp.float32(lengths)), actions, atol=1e-5)
+
+
+def test_action_of_is_the_inverse_of_reference(env, random_actions):
+    np.testing.assert_allclose(env.action_of(env.reference_m(random_actions)), random_actions, atol=1e-5)
+
+
+def test_actions_beyond_one_and_lengths_beyond_the_limits_are_clipped(env, spec):
+    shortest, longest = spec.springs.length_min_m, spec.springs.length_max_m
+    np.testing.assert_allclose(env.reference_m(jnp.full(9, -3.0)), shortest, atol=1e-7)
+    np.testing.assert_allclose(env.reference_m(jnp.full(9, 3.0)), longest, atol=1e-7)
+    np.testing.assert_array_equal(env.action_of(jnp.full(9, 0.5 * shortest)), -1.0)
+    np.testing.assert_array_equal(env.action_of(jnp.full(9, 2.0 * longest)), 1.0)
+
+
+# --- reset -------------------------------------------------------------------------------------------------
+
+
+def test_starts_and_goals_are_drawn_from_the_pool_each_on_its_own(env, start):
+    pool = np.asarray(env.pool.pose)
+    rows = {pose.tobytes(): index for index, pose in enumerate(pool)}
+    starts = [rows[pose.tobytes()] for pose in np.asarray(start.pipeline_state.pose)]
+    goals = [rows[pose.tobytes()] for pose in np.asarray(start.pipeline_state.goal)]
+    # 512 draws from 512 hit 1 - 1/e of them: 324, give or take 10.
+    assert all(270 < len(set(drawn)) < 380 for drawn in (starts, goals))
+    assert sum(a == b for a, b in zip(starts, goals, strict=True)) < 8  # one is expected
+    np.testing.assert_array_equal(start.pipeline_state.spring_m, env.pool.spring_m[np.array(starts)])
+    np.testing.assert_array_equal(start.pipeline_state.motion.q, env.pool.q[np.array(starts)])
+
+
+def test_every_goal_is_reached_to_a_tenth_of_a_millimetre_with_no_chamber_saturated(env, start, step):
+    after = step(with_arm(start, goal=env.pool.pose), env.action_of(env.pool.spring_m))
+    assert float(after.metrics["tip_error_mm"].max()) < 0.1
+    angles = np.abs(numpy_error(after.pipeline_state.pose, env.pool.pose)[:, 3:]) / 0.001
+    assert angles.max() < 0.1
+    np.testing.assert_array_equal(after.metrics["saturated_chambers"], 0)
+    np.testing.assert_array_equal(after.reward, 100.0)
+    np.testing.assert_array_equal(after.done, 1)
+    np.testing.assert_array_equal(after.metrics["reached"], 1)
+
+
+def test_goals_spread_over_the_workspace(env):
+    x, y, z = np.asarray(env.pool.pose[:, :3]).T
+    # The workspace is 400 mm wide (paper); 512 poses touch its rim in few places.
+    assert min(np.ptp(x), np.ptp(y), np.ptp(z)) > 0.65 * 400
+    voxels = np.unique(np.floor(np.asarray(env.pool.pose[:, :3]) / 25.0), axis=0)
+    assert len(voxels) > 350  # of about 1100 that can be reached
+
+
+def test_the_same_key_gives_the_same_episode_and_another_key_another_one(reset, step, random_actions):
+    first, again, other = (step(reset(seed), random_actions) for seed in (5, 5, 6))
+    assert leaves_equal(first, again)
+    assert not np.array_equal(first.pipeline_state.goal, other.pipeline_state.goal)
+    assert not np.array_equal(first.obs, other.obs)
+
+
+# --- step --------------------------------------------------------------------------------------------------
+
+
+def test_step_returns_the_types_it_takes_so_that_it_is_compiled_once(start, step, random_actions):
+    assert types(step(start, random_actions)) == types(start)
+
+
+def test_observation_is_scaled_pose_scaled_goal_and_error(start, step, random_actions):
+    for state in (start, step(start, random_actions)):
+        pose, goal = (np.float64(x) for x in (state.pipeline_state.pose, state.pipeline_state.goal))
+        centre, scale = np.array([0, 0, -600.0, 0, 0, 0]), np.array([200.0] * 3 + [90.0] * 3)
+        expected = [(pose - centre) / scale, (goal - centre) / scale, numpy_error(pose, goal)]
+        np.testing.assert_allclose(state.obs, np.concatenate(expected, axis=1), atol=2e-6)
+        assert state.obs.dtype == np.float32
+
+
+def test_reward_done_and_metrics_are_those_of_the_paper_s_three_cases(env, spec, start, step, random_actions):
+    # A third of the arms each: random actions, nearly all saturated; own goal; another arm's goal.
+    third = np.arange(len(start.obs)) % 3
+    other = jnp.roll(env.pool.spring_m, 1, axis=0)
+    sent = jnp.where((third == 1)[:, None], env.pool.spring_m, other)
+    actions = jnp.where((third == 0)[:, None], random_actions, env.action_of(sent))
+    n_steps = np.arange(len(third)) % 4
+    after = step(with_arm(start, goal=env.pool.pose, n_steps=jnp.asarray(n_steps, jnp.int32)), actions)
+    arm = after.pipeline_state
+
+    off = np.asarray(env.reference_m(actions)) - np.asarray(arm.spring_m)
+    pressure = np.asarray(arm.pressure_kpa)
+    saturated = ((pressure == spec.chambers.pressure_max_kpa) & (off > 1 * MM)) | (
+        (pressure == spec.chambers.pressure_min_kpa) & (off < -1 * MM)
+    )
+    norm = np.linalg.norm(numpy_error(arm.pose, arm.goal), axis=1)
+    blocked, close = saturated.any(axis=1), norm < 0.03
+    expected = np.where(blocked, -100.0, np.where(close, 100.0, -10 * norm - 0.1 * (n_steps + 1)))
+    assert min(blocked.sum(), (close & ~blocked).sum(), (~close & ~blocked).sum()) > 100  # all three occur
+
+    np.testing.assert_allclose(after.reward, expected, rtol=1e-5)
+    np.testing.assert_array_equal(after.done, close & ~blocked)
+    np.testing.assert_array_equal(after.metrics["reached"], close & ~blocked)
+    np.testing.assert_array_equal(after.metrics["saturated_chambers"], saturated.sum(axis=1))
+    np.testing.assert_array_equal(after.info["saturated"], blocked)
+    np.testing.assert_array_equal(arm.n_steps, n_steps + 1)
+    tip_error = np.linalg.norm(np.asarray(arm.pose - arm.goal)[:, :3], axis=1)
+    np.testing.assert_allclose(after.metrics["tip_error_mm"], tip_error, rtol=1e-5)
+    names = ("goal", "error", "steps", "saturation", "clearance")
+    terms = sum(after.metrics[f"reward_{name}"] for name in names)
+    np.testing.assert_allclose(after.reward, terms, rtol=1e-6)
+
+
+def test_where_an_arm_goes_does_not_depend_on_where_it_was(reset, step, random_actions):
+    """At rest the law has forgotten its past: the equilibrium is the references' alone."""
+    ends = [step(reset(seed), random_actions).pipeline_state for seed in (0, 1)]
+    np.testing.assert_array_equal(ends[0].pose, ends[1].pose)
+
+
+FAILURES = {
+    "a NaN in the action": lambda arm, action: (arm, action.at[3].set(jnp.nan)),
+    "an infinity in the action": lambda arm, action: (arm, action.at[3].set(jnp.inf)),
+    "a payload of a thousand tonnes": lambda arm, action: (
+        arm._replace(payload_kg=jnp.array(1e6)),
+        action,
+    ),
+    "chambers that push apart": lambda arm, action: (
+        arm._replace(chamber_stiffness=jnp.full(9, -1e4)),
+        action,
+    ),
+    "a NaN among the numbers of the arm": lambda arm, action: (
+        arm._replace(payload_kg=jnp.array(jnp.nan)),
+        action,
+    ),
+    "a NaN in the calibration": lambda arm, action: (
+        arm._replace(sensor_offset_m=arm.sensor_offset_m.at[0].set(jnp.nan)),
+        action,
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def broken(env, reset, step):
+    """Of a batch, the first arms each broken in one way and all at their goal: before, after, names."""
+    start = reset(0)
+    start = with_arm(start, goal=start.pipeline_state.pose)
+    arms, actions = start.pipeline_state, env.action_of(start.pipeline_state.spring_m)
+    for index, break_one in enumerate(FAILURES.values()):
+        arm, action = break_one(jax.tree.map(lambda x, i=index: x[i], arms), actions[index])
+        arms = jax.tree.map(lambda many, one, i=index: many.at[i].set(one), arms, arm)
+        actions = actions.at[index].set(action)
+    before = start.replace(pipeline_state=arms)
+    whole = step(start, env.action_of(start.pipeline_state.spring_m))
+    return before, step(before, actions), whole
+
+
+@pytest.mark.parametrize("index", range(len(FAILURES)), ids=FAILURES)
+def test_an_arm_that_cannot_settle_keeps_its_pose_earns_nothing_and_ends_its_episode(broken, index):
+    before, after, _ = jax.tree.map(lambda x: x[index], broken)
+    assert not after.info["valid"] and after.metrics["unsettled"] == 1
+    assert after.done == 1 and after.reward == 0
+    assert after.metrics["reached"] == 0  # it stands on its goal, but did not get there
+    assert not after.info["saturated"] and after.metrics["saturated_chambers"] == 0
+    assert all(after.metrics[name] == 0 for name in after.metrics if name.startswith("reward_"))
+    for name in ("pose", "spring_m", "pressure_kpa", "goal", "n_steps", "motion"):
+        unchanged = [getattr(state.pipeline_state, name) for state in (before, after)]
+        assert leaves_equal(*unchanged), name
+    np.testing.assert_array_equal(after.obs, before.obs.at[6:12].set(before.obs[:6]).at[12:].set(0.0))
+
+
+def test_an_arm_that_cannot_settle_leaves_the_others_alone(broken):
+    _, after, whole = jax.tree.map(lambda x: x[len(FAILURES) :], broken)
+    np.testing.assert_array_equal(after.info["valid"], True)
+    np.testing.assert_array_equal(after.done, 1)
+    assert leaves_equal(after, whole)
+
+
+# --- randomisation -----------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def randomised(spec, env):
+    """State of as many arms as the other fixtures', every kind of randomisation on."""
+    spread = ReachEnv(spec, dataclasses.replace(env.config, randomisation=SPREAD))
+    keys = jax.random.split(jax.random.key(0), env.config.n_poses)
+    return xla.jit(jax.vmap(spread.reset), spread.uses_mjx)(keys)
+
+
+def test_without_randomisation_every_arm_is_the_nominal_one(spec, env, start):
+    nominal = ArmParams.from_spec(spec)
+    drawn = jax.vmap(env.params_of)(start.pipeline_state)
+    for name, value in nominal._asdict().items():
+        own = np.asarray(getattr(drawn, name))
+        np.testing.assert_array_equal(own, np.broadcast_to(value, own.shape), err_msg=name)
+    np.testing.assert_array_equal(start.pipeline_state.sensor_offset_m, 0.0)
+
+
+def test_randomised_numbers_fill_their_bounds_and_no_other_number_changes(spec, env, randomised):
+    nominal, drawn = ArmParams.from_spec(spec), jax.vmap(env.params_of)(randomised.pipeline_state)
+    payload = np.asarray(drawn.tool_mass_kg[:, PAYLOAD]) - spec.mass.payload_kg
+    assert payload.min() >= 0.0 and payload.max() <= SPREAD.payload_max_kg
+    factor = np.asarray(drawn.chamber_stiffness) / nominal.chamber_stiffness
+    assert abs(factor - 1).max() <= SPREAD.stiffness_spread * (1 + 1e-6)
+    # 512 uniform draws leave less than one of 100 equal parts empty on average.
+    for value, low, high in ((payload, 0.0, 0.5), (factor, 0.8, 1.2)):
+        assert np.count_nonzero(np.histogram(value, 100, (low, high))[0]) > 90
+    assert np.ptp(factor, axis=1).min() > 0.02  # each chamber for itself
+    unchanged = {"tool_mass_kg", "chamber_stiffness"} ^ set(ArmParams._fields)
+    for name in unchanged:
+        value = np.asarray(getattr(drawn, name))
+        np.testing.assert_array_equal(
+            value, np.broadcast_to(getattr(nominal, name), value.shape), err_msg=name
+        )
+    np.testing.assert_array_equal(drawn.tool_mass_kg[:, 0], np.float32(spec.mass.gripper_kg))
+
+
+def test_sensor_noise_has_its_standard_deviation_and_no_mean(randomised):
+    offset_mm = 1e3 * np.asarray(randomised.pipeline_state.sensor_offset_m)
+    n = offset_mm.size  # the bounds are five standard errors
+    assert abs(offset_mm.mean()) < 5 * 2.0 / np.sqrt(n)
+    assert abs(offset_mm.std() - 2.0) < 5 * 2.0 / np.sqrt(2 * n)
+    assert abs(np.corrcoef(offset_mm.T) - np.eye(9)).max() < 0.25  # springs for themselves
+
+
+def test_the_law_holds_readings_on_their_references_so_that_noise_shifts_the_true_lengths(
+    env, randomised, step, random_actions
+):
+    wanted = 0.175 + 0.005 * random_actions  # well within reach
+    arm = step(randomised, env.action_of(wanted)).pipeline_state
+    reading = arm.spring_m + randomised.pipeline_state.sensor_offset_m
+    np.testing.assert_allclose(reading, wanted, atol=0.11 * MM)
+    assert float(jnp.abs(arm.spring_m - wanted).max()) > 5 * MM
+
+
+def test_an_arm_keeps_its_own_numbers_for_the_whole_episode(env, randomised, step, random_actions):
+    after = step(step(randomised, env.action_of(env.pool.spring_m)), random_actions)
+    for name in ("payload_kg", "chamber_stiffness", "sensor_offset_m"):
+        assert leaves_equal(getattr(after.pipeline_state, name), getattr(randomised.pipeline_state, name))
+
+
+def test_a_payload_and_stiffer_chambers_ask_for_other_pressures_at_the_same_spring_lengths(env, start, step):
+    """By the balance of forces along a straight arm: 3 chambers carry the payload and their own stretch."""
+    action = jnp.broadcast_to(env.action_of(jnp.full(9, 0.19)), (len(start.obs), 9))
+    arm = start.pipeline_state
+    heavy = {"payload_kg": jnp.full_like(arm.payload_kg, 0.3)}
+    stiff = {"chamber_stiffness": 1.1 * arm.chamber_stiffness}
+    nominal, loaded, stiffened = (
+        step(with_arm(start, **changes), action).pipeline_state.pressure_kpa[0]
+        for changes in ({}, heavy, stiff)
+    )
+    area = np.asarray(env.params.area + env.params.area_slope * (0.19 - 0.2))  # N/kPa at this length
+    np.testing.assert_allclose(loaded - nominal, -0.3 * 9.81 / (3 * area), rtol=1e-3)
+    stretch = 0.1 * np.asarray(arm.chamber_stiffness[0]) * (0.19 - 0.2)
+    np.testing.assert_allclose(stiffened - nominal, stretch / area, rtol=1e-3)
+
+
+# --- one word changes engine or mode -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("word", [{"engine": "mujoco"}, {"mode": "static"}])
+def test_an_unknown_engine_or_mode_is_refused_by_name(word):
+    (field, value), *_ = word.items()
+    with pytest.raises(ValueError, match=rf"EnvConfig\.{field}: got '{value}', expected one of"):
+        EnvConfig(**word)
+
+
+class Few(NamedTuple):
+    """Four randomised arms in the chain engine: two track, one saturates, one has a NaN among its numbers."""
+
+    env: ReachEnv
+    fresh: State  # as reset
+    before: State  # with the NaN
+    actions: jax.Array
+    after: State
+
+
+@pytest.fixture(
+    scope="module",
+    params=[SHORT_ARM, pytest.param(ArmSpec.default(), marks=pytest.mark.slow)],
+    ids=["short", "paper"],
+)
+def few(request):
+    env = ReachEnv(request.param, EnvConfig(n_poses=64, randomisation=SPREAD))
+    fresh, step = compiled(env)
+    before = with_arm(fresh, sensor_offset_m=fresh.pipeline_state.sensor_offset_m.at[3, 0].set(jnp.nan))
+    lengths = jax.random.uniform(jax.random.key(1), (4, env.action_size), minval=0.16, maxval=0.19)
+    actions = env.action_of(lengths).at[2].set(1.0)
+    return Few(env, fresh, before, actions, step(before, actions))
+
+
+def compiled(env):
+    """Four arms, reset, and step."""
+    keys = jax.random.split(jax.random.key(3), 4)
+    reset, step = (xla.jit(jax.vmap(function), env.uses_mjx) for function in (env.reset, env.step))
+    return reset(keys), step
+
+
+def test_engine_mjx_steps_like_engine_chain(few):
+    env = ReachEnv(few.env.spec, dataclasses.replace(few.env.config, engine="mjx"))
+    fresh, step = compiled(env)
+    assert leaves_equal(fresh, few.fresh)
+    after = step(few.before, few.actions)
+    assert types(after) == types(few.before)
+    np.testing.assert_allclose(after.pipeline_state.pose, few.after.pipeline_state.pose, atol=0.05)
+    np.testing.assert_allclose(after.reward, few.after.reward, atol=0.01)
+    for state in (after, few.after):
+        np.testing.assert_array_equal(state.info["saturated"], [False, False, True, False])
+        np.testing.assert_array_equal(state.info["valid"], [True, True, True, False])
+
+
+def test_mode_dynamic_comes_to_rest_at_the_quasi_static_equilibrium(few):
+    env = ReachEnv(few.env.spec, dataclasses.replace(few.env.config, mode="dynamic", dynamic_step_s=1.0))
+    fresh, step = compiled(env)
+    assert leaves_equal(fresh, few.fresh)
+    first = now = step(few.before, few.actions)
+    assert types(first) == types(few.before)
+    for _ in range(29):
+        now = step(now, few.actions)
+    moving, resting, truth = (
+        jax.tree.map(lambda x: np.asarray(x)[:3], state.pipeline_state) for state in (first, now, few.after)
+    )
+    assert np.linalg.norm((moving.pose - truth.pose)[:, :3], axis=1).max() > 3.0  # a transient
+    assert np.linalg.norm((resting.pose - truth.pose)[:, :3], axis=1).max() < 1.0
+    np.testing.assert_allclose(resting.spring_m, truth.spring_m, atol=0.5 * MM)
+    np.testing.assert_allclose(resting.pressure_kpa, truth.pressure_kpa, atol=0.2 * KPA)
+    np.testing.assert_array_equal(resting.n_steps, 30)
+    np.testing.assert_array_equal(now.info["saturated"], [False, False, True, False])
+    # The fourth arm stays where it was, and its velocity and pressures do not turn into NaN.
+    np.testing.assert_array_equal(first.info["valid"], [True, True, True, False])
+    assert first.done[3] == 1 and first.reward[3] == 0
+    for name in ("motion", "pose", "n_steps"):
+        unchanged = [getattr(state.pipeline_state, name) for state in (few.before, now)]
+        assert leaves_equal(*jax.tree.map(lambda x: x[3], unchanged)), name

@@ -1,0 +1,326 @@
+"""The Gymnasium environments against Gymnasium's own checks, its own vector environment, and SB3."""
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+from mjx_softarm.env import EnvConfig
+from mjx_softarm.env.gym import ENV_ID, EPISODE_LENGTH, SoftArmEnv, SoftArmVectorEnv, as_sb3
+
+CONFIG = EnvConfig(n_poses=64)
+N_ARMS, LIMIT = 6, 3
+
+
+@pytest.fixture(scope="module")
+def envs():
+    return SoftArmVectorEnv(N_ARMS, max_episode_steps=LIMIT, config=CONFIG)
+
+
+@pytest.fixture(scope="module")
+def arm():
+    """One arm, with the specification that `gymnasium.make` gives it but without wrappers."""
+    return gymnasium.make(ENV_ID, config=CONFIG).unwrapped
+
+
+def to_goals(env, goals):
+    """Actions that lead to goals (n, 6), which are poses of the pool."""
+    pool = np.asarray(env.pool.pose)
+    rows = [int(np.flatnonzero((pool == goal).all(axis=1))[0]) for goal in goals]
+    return np.asarray(env.action_of(env.pool.spring_m[np.array(rows)]))
+
+
+def still(envs):
+    """Actions that neither saturate nor reach, from any start."""
+    return np.array(envs.env.action_of(np.full((N_ARMS, 9), 0.17, np.float32)))
+
+
+# --- one arm -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.filterwarnings("error::UserWarning")
+def test_gymnasium_s_checker_has_nothing_to_say(arm):
+    check_env(arm)
+
+
+def test_make_adds_the_time_limit_and_the_passive_checks(arm):
+    env = gymnasium.make(ENV_ID, config=CONFIG)
+    assert env.spec.max_episode_steps == EPISODE_LENGTH
+    assert env.unwrapped._step_arm is arm._step_arm  # compiled once
+    env.reset(seed=0)
+    action = np.asarray(arm.env.action_of(np.full(9, 0.17, np.float32)))
+    steps = [env.step(action) for _ in range(EPISODE_LENGTH)]
+    assert [(terminated, truncated) for _, _, terminated, truncated, _ in steps] == [(False, False)] * (
+        EPISODE_LENGTH - 1
+    ) + [(False, True)]
+
+
+def test_an_arm_at_its_goal_terminates(arm):
+    _, info = arm.reset(seed=1)
+    _, reward, terminated, truncated, info = arm.step(to_goals(arm.env, [info["goal"]])[0])
+    assert info["tip_error_mm"] < 0.1
+    assert (reward, terminated, truncated) == (100.0, True, False)
+    assert info["is_success"] is True and info["valid"] is True
+
+
+def test_an_action_that_is_nan_truncates_without_a_reward_and_is_marked(arm):
+    before, _ = arm.reset(seed=2)
+    obs, reward, terminated, truncated, info = arm.step(np.full(9, np.nan, np.float32))
+    assert (reward, terminated, truncated) == (0.0, False, True)
+    assert info["valid"] is False and info["unsettled"] == 1.0 and info["is_success"] is False
+    np.testing.assert_array_equal(obs, before)
+
+
+@pytest.mark.parametrize("make", [lambda: SoftArmEnv(config=CONFIG), lambda: SoftArmVectorEnv(config=CONFIG)])
+def test_a_step_before_the_first_reset_is_refused(make):
+    env = make()
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(env.action_space.sample())
+
+
+def test_actions_of_another_shape_and_unknown_options_are_refused(arm, envs):
+    for env in (arm, envs):
+        env.reset()
+    with pytest.raises(ValueError, match=r"expected shape \(9,\), got \(8,\)"):
+        arm.step(np.zeros(8))
+    with pytest.raises(ValueError, match=r"expected shape \(6, 9\), got \(9,\)"):
+        envs.step(np.zeros(9))
+    for env in (arm, envs):
+        with pytest.raises(ValueError, match="expected no options, got speed"):
+            env.reset(options={"speed": 1})
+
+
+# --- many arms ---------------------------------------------------------------------------------------------
+
+
+def test_spaces_are_boxes_of_one_arm_and_of_all(envs):
+    assert envs.single_observation_space.shape == (18,) and envs.observation_space.shape == (N_ARMS, 18)
+    assert envs.single_observation_space.dtype == np.float32
+    assert envs.single_action_space == gymnasium.spaces.Box(-1.0, 1.0, (9,), np.float32)
+    assert envs.action_space == gymnasium.spaces.Box(-1.0, 1.0, (N_ARMS, 9), np.float32)
+    assert envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+
+
+def test_observations_stay_within_their_space(envs):
+    envs.reset(seed=0)
+    envs.action_space.seed(0)
+    for _ in range(50):
+        obs, *_, infos = envs.step(envs.action_space.sample())
+        assert obs in envs.observation_space
+        assert all(
+            final in envs.single_observation_space
+            for final in infos.get("final_obs", ())
+            if final is not None
+        )
+
+
+def test_results_are_numpy_arrays_of_one_entry_per_arm_that_the_caller_owns(envs):
+    first, _ = envs.reset(seed=0)
+    results = envs.step(still(envs))
+    for value, dtype in zip(results, (np.float32, np.float32, np.bool_, np.bool_), strict=False):
+        assert type(value) is np.ndarray and value.dtype == dtype and len(value) == N_ARMS
+    kept = results[0].copy()
+    results[0][:] = 7.0  # neither refused nor of any consequence
+    again, _ = envs.reset(seed=0)
+    np.testing.assert_array_equal(first, again)
+    np.testing.assert_array_equal(envs.step(still(envs))[0], kept)
+
+
+def test_a_seed_fixes_all_that_follows(envs):
+    def play(seed):
+        first, _ = envs.reset(seed=seed)
+        return [first] + [envs.step(still(envs))[0] for _ in range(2 * LIMIT)]
+
+    runs = np.array([play(3), play(3), play(5), play(None)])
+    np.testing.assert_array_equal(runs[0], runs[1])
+    for other in runs[2:]:  # no arm goes through the same episodes; single goals recur in a pool of 64
+        assert not np.any(np.all(runs[0] == other, axis=(0, 2)))
+
+
+def test_vector_env_and_gymnasium_s_vector_of_single_arms_return_the_same_structure(envs):
+    def single():
+        return gymnasium.wrappers.TimeLimit(SoftArmEnv(config=CONFIG), LIMIT)
+
+    reference = SyncVectorEnv([single] * N_ARMS, autoreset_mode=AutoresetMode.SAME_STEP)
+    assert reference.metadata == envs.metadata
+    assert reference.observation_space == envs.observation_space
+    assert reference.action_space == envs.action_space
+
+    def structure(value):
+        if isinstance(value, dict):
+            return {name: structure(item) for name, item in value.items()}
+        if value.dtype == object:
+            return [None if item is None else structure(item) for item in value]
+        return value.shape, value.dtype.kind
+
+    def masks(info):
+        return {name: value.tolist() for name, value in info.items() if name.startswith("_")}
+
+    both = [env.reset(seed=0) for env in (envs, reference)]
+    assert [structure(infos) for _, infos in both] == [structure(both[1][1])] * 2
+    for index in range(2 * LIMIT):
+        actions = still(envs)
+        if index == 1:
+            actions[2] = np.nan  # so that one arm ends its episode alone
+        both = [env.step(actions) for env in (envs, reference)]
+        for ours, theirs in zip(both[0][1:4], both[1][1:4], strict=True):
+            assert ours.shape == theirs.shape and ours.dtype.kind == theirs.dtype.kind
+        np.testing.assert_array_equal(both[0][3], both[1][3])  # truncated
+        assert structure(both[0][4]) == structure(both[1][4])
+        assert masks(both[0][4]) == masks(both[1][4])
+        if "final_info" in both[1][4]:
+            assert masks(both[0][4]["final_info"]) == masks(both[1][4]["final_info"])
+
+
+def test_time_runs_out_with_the_last_observation_in_final_obs_and_a_new_goal_in_obs(envs):
+    first, infos = envs.reset(seed=5)
+    goals = infos["goal"]
+    np.testing.assert_allclose(first[:, 6:9] * 200.0 + [0, 0, -600], goals[:, :3], atol=1e-3)
+    for index in range(LIMIT):
+        obs, reward, terminated, truncated, infos = envs.step(still(envs))
+        np.testing.assert_array_equal(truncated, index == LIMIT - 1)
+        assert not terminated.any()
+    final = np.stack(infos["final_obs"])
+    np.testing.assert_array_equal(final[:, 6:12], first[:, 6:12])
+    np.testing.assert_array_equal(infos["final_info"]["goal"], goals)
+    assert not np.any(np.all(obs[:, 6:12] == first[:, 6:12], axis=1))
+    assert not np.any(np.all(infos["goal"] == goals, axis=1))
+    np.testing.assert_allclose(obs[:, :3] * 200.0 + [0, 0, -600], infos["pose"][:, :3], atol=1e-3)
+    error = np.linalg.norm(final[:, 12:], axis=1)
+    np.testing.assert_allclose(reward, -10 * error - 0.1 * LIMIT, rtol=1e-5)
+
+
+def test_an_arm_at_its_goal_terminates_and_the_others_go_on(envs):
+    _, infos = envs.reset(seed=6)
+    actions = still(envs)
+    actions[[1, 4]] = to_goals(envs.env, infos["goal"][[1, 4]])
+    _, reward, terminated, truncated, infos = envs.step(actions)
+    np.testing.assert_array_equal(terminated, np.isin(np.arange(N_ARMS), [1, 4]))
+    np.testing.assert_array_equal(reward == 100.0, terminated)
+    np.testing.assert_array_equal(infos["final_info"]["is_success"], terminated)
+    assert not truncated.any()
+    np.testing.assert_array_equal(infos["_final_obs"], terminated)
+    np.testing.assert_array_equal(infos["_tip_error_mm"], ~terminated)
+
+
+def test_an_arm_that_cannot_settle_is_reset_and_marked_while_the_others_go_on(envs):
+    first, _ = envs.reset(seed=7)
+    actions = still(envs)
+    actions[3, 5] = np.nan
+    obs, reward, terminated, truncated, infos = envs.step(actions)
+    failed = np.arange(N_ARMS) == 3
+    np.testing.assert_array_equal(truncated, failed)
+    assert not terminated.any() and reward[3] == 0.0
+    final = infos["final_info"]
+    assert not final["valid"][3] and final["unsettled"][3] == 1.0
+    np.testing.assert_array_equal(infos["final_obs"][3], first[3])
+    np.testing.assert_array_equal(infos["valid"], ~failed)
+    assert np.isfinite(obs).all()
+    assert not np.array_equal(obs[3, 6:12], first[3, 6:12])  # a new goal
+    *_, infos = envs.step(still(envs))
+    assert infos["valid"].all()
+
+
+def test_make_vec_gives_the_vector_environment_with_the_registered_time_limit():
+    envs = gymnasium.make_vec(ENV_ID, num_envs=2, config=CONFIG)
+    assert type(envs) is SoftArmVectorEnv and envs.num_envs == 2
+    assert envs._arms.episode_length == EPISODE_LENGTH
+
+
+def test_gymnasium_s_episode_statistics_agree_with_the_rewards(envs):
+    recorded = gymnasium.wrappers.vector.RecordEpisodeStatistics(envs)
+    recorded.reset(seed=8)
+    total = np.zeros(N_ARMS)
+    for _ in range(LIMIT):
+        _, reward, _, truncated, infos = recorded.step(still(envs))
+        total += reward
+    assert truncated.all()
+    np.testing.assert_allclose(infos["episode"]["r"], total, rtol=1e-6)
+    np.testing.assert_array_equal(infos["episode"]["l"], LIMIT)
+
+
+# --- Stable-Baselines3 -------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def sb3():
+    return pytest.importorskip("stable_baselines3", reason="Stable-Baselines3 is not installed")
+
+
+@pytest.mark.filterwarnings("error::UserWarning")
+def test_sb3_s_checker_has_nothing_to_say(sb3, arm):
+    from stable_baselines3.common.env_checker import check_env as check_env_of_sb3
+
+    check_env_of_sb3(arm, skip_render_check=True)
+
+
+def test_sb3_s_view_of_the_arms_is_theirs(sb3, envs):
+    seen = as_sb3(envs)
+    seen.seed(9)
+    first = seen.reset()
+    np.testing.assert_array_equal(first, envs.reset(seed=9)[0])
+    actions = still(envs)
+    actions[0] = np.nan
+    for index in range(LIMIT):
+        obs, _, done, infos = seen.step(actions if index == 0 else still(envs))
+        expected = np.arange(N_ARMS) == 0 if index == 0 else np.full(N_ARMS, index == LIMIT - 1)
+        expected[0] &= index != LIMIT - 1  # it began anew a step later
+        np.testing.assert_array_equal(done, expected)
+        assert [bool(info) for info in infos] == done.tolist()
+        if index == 0:
+            assert infos[0]["valid"] == np.False_ and infos[0]["TimeLimit.truncated"] is True
+            np.testing.assert_array_equal(infos[0]["terminal_observation"], first[0])
+    np.testing.assert_array_equal(infos[1]["terminal_observation"][6:12], first[1, 6:12])
+    assert not np.array_equal(obs[1, 6:12], first[1, 6:12])
+    assert seen.env_is_wrapped(gymnasium.Wrapper) == [False] * N_ARMS
+    assert seen.get_attr("num_envs", indices=[0, 1]) == [N_ARMS] * 2
+
+
+@pytest.mark.parametrize("name", ["SAC", "TQC"])
+def test_sb3_learns_from_the_arms(sb3, envs, name):
+    library = sb3
+    if name == "TQC":
+        library = pytest.importorskip("sb3_contrib", reason="sb3-contrib is not installed")
+    from stable_baselines3.common.vec_env import VecMonitor
+
+    arms = VecMonitor(as_sb3(envs))
+    model = getattr(library, name)(
+        "MlpPolicy",
+        arms,
+        seed=0,
+        learning_starts=12,
+        batch_size=8,
+        policy_kwargs={"net_arch": [8]},
+        buffer_size=1000,
+    )
+    before = [p.detach().clone() for p in model.policy.parameters()]
+    model.learn(60)
+    assert model.num_timesteps == 60
+    changed = [not bool((p == q).all()) for p, q in zip(model.policy.parameters(), before, strict=True)]
+    assert any(changed) and all(bool(p.isfinite().all()) for p in model.policy.parameters())
+    buffer = model.replay_buffer
+    n = buffer.pos
+    assert n == 60 // N_ARMS
+    # The successor is the same episode's: it has the same goal, also where the next one has another.
+    np.testing.assert_array_equal(buffer.observations[:n, :, 6:12], buffer.next_observations[:n, :, 6:12])
+    ended = buffer.dones[:n].astype(bool)
+    np.testing.assert_array_equal(ended, buffer.timeouts[:n].astype(bool))
+    assert len(model.ep_info_buffer) == ended.sum() >= N_ARMS
+
+
+def test_sb3_learns_from_one_arm_without_an_adapter(sb3):
+    env = gymnasium.make(ENV_ID, config=CONFIG)
+    model = sb3.SAC(
+        "MlpPolicy", env, seed=0, learning_starts=4, batch_size=4, policy_kwargs={"net_arch": [8]}
+    )
+    model.learn(10)
+    assert model.replay_buffer.pos == 10
+
+
+def test_importing_the_module_does_not_import_sb3(sb3):
+    import subprocess
+    import sys
+
+    code = "import sys, mjx_softarm.env.gym; sys.exit('stable_baselines3' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,0 +1,121 @@
+"""How episodes end and begin anew, on arms that do as they are told."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from brax.envs.base import State
+
+from mjx_softarm.env.vector import VectorEnv
+
+GO_ON, REACH, FAIL = 0.0, 1.0, 2.0
+EPISODE_LENGTH = 3
+
+
+class Arm(NamedTuple):
+    n_steps: jax.Array  # ()
+    episode: jax.Array  # () a number that no other episode has
+
+
+class ObedientEnv:
+    """Its action says how a step ends; an observation is the number of the episode and of its steps."""
+
+    def draw(self, rng, n):
+        return jax.random.uniform(rng, (n,))
+
+    def begin(self, episode):
+        arm = Arm(jnp.zeros((), jnp.int32), episode)
+        zero = jnp.zeros(())
+        return State(arm, self._observe(arm), zero, zero, {"unsettled": zero}, {"valid": jnp.array(True)})
+
+    def step(self, state, action):
+        valid = action[0] != FAIL
+        arm = state.pipeline_state
+        arm = arm._replace(n_steps=arm.n_steps + valid)
+        return state.replace(
+            pipeline_state=arm,
+            obs=self._observe(arm),
+            reward=10.0 * action[0],
+            done=(action[0] != GO_ON).astype(jnp.float32),
+            metrics={"unsettled": 1.0 - valid},
+            info={"valid": valid},
+        )
+
+    def _observe(self, arm):
+        return jnp.stack([arm.episode, arm.n_steps.astype(jnp.float32)])
+
+
+def play(*script):
+    """Each arm acts by its column of the script; returns the start and what each step returned."""
+    arms = VectorEnv(ObedientEnv(), len(script[0]), EPISODE_LENGTH)
+    start = state = arms.reset(jax.random.key(0))
+    history = []
+    for index, row in enumerate(script):
+        state, after, outcome = arms.step(state, jnp.array(row)[:, None], jax.random.key(index + 1))
+        history.append((state, after, outcome))
+    return start, history
+
+
+def test_arms_start_episodes_of_their_own():
+    start, _ = play([GO_ON] * 4)
+    assert len(set(np.asarray(start.obs[:, 0]))) == 4
+    np.testing.assert_array_equal(start.obs[:, 1], 0)
+
+
+def test_an_arm_that_goes_on_is_not_touched():
+    start, [(state, after, outcome)] = play([GO_ON] * 3)
+    np.testing.assert_array_equal(state.obs, np.stack([start.obs[:, 0], np.ones(3)], axis=1))
+    np.testing.assert_array_equal(outcome.final_obs, state.obs)
+    assert jax.tree.all(jax.tree.map(np.array_equal, state, after))
+    for flag in (outcome.terminated, outcome.truncated, ~outcome.valid):
+        assert not flag.any()
+
+
+@pytest.mark.parametrize(
+    ("name", "script", "terminated", "truncated", "valid"),
+    [
+        ("reaches at once", [REACH], True, False, True),
+        ("reaches later", [GO_ON, REACH], True, False, True),
+        ("runs out of time", [GO_ON, GO_ON, GO_ON], False, True, True),
+        ("reaches with its last action", [GO_ON, GO_ON, REACH], True, False, True),
+        ("fails", [GO_ON, FAIL], False, False, False),
+        ("fails with its last action", [GO_ON, GO_ON, FAIL], False, False, False),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_an_episode_ends_in_one_way_and_the_next_one_begins(name, script, terminated, truncated, valid):
+    # The arm beside it only goes on, and has as long an episode as there is.
+    start, history = play(*[[action, GO_ON] for action in script])
+    state, after, outcome = history[-1]
+    ended = bool(outcome.terminated[0]), bool(outcome.truncated[0]), bool(outcome.valid[0])
+    assert ended == (terminated, truncated, valid)
+    # What the action led to belongs to the old episode, what follows to a new one without a step.
+    n_steps = len(script) - (not valid)
+    np.testing.assert_array_equal(outcome.final_obs[0], [start.obs[0, 0], n_steps])
+    np.testing.assert_array_equal(after.obs[0], outcome.final_obs[0])
+    assert state.obs[0, 0] != start.obs[0, 0] and state.obs[0, 1] == 0
+    assert state.pipeline_state.n_steps[0] == 0 and state.done[0] == 0 and state.info["valid"][0]
+    assert outcome.reward[0] == 10.0 * script[-1]
+    assert state.metrics["unsettled"][0] == (not valid)  # counted, though the arm is a new one
+    for _, _, before in history[:-1]:
+        assert not before.terminated[0] and not before.truncated[0] and before.valid[0]
+    assert bool(outcome.truncated[1]) is (len(script) == EPISODE_LENGTH)
+    assert not outcome.terminated[1] and outcome.valid[1]
+
+
+def test_a_new_episode_has_its_full_length():
+    _, history = play([REACH, GO_ON], *[[GO_ON, GO_ON]] * 5)
+    truncated = np.array([outcome.truncated for _, _, outcome in history])
+    np.testing.assert_array_equal(np.flatnonzero(truncated[:, 0]), [3])  # one step later than
+    np.testing.assert_array_equal(np.flatnonzero(truncated[:, 1]), [2, 5])
+
+
+def test_new_episodes_follow_from_the_key_and_differ_from_arm_to_arm():
+    arms = VectorEnv(ObedientEnv(), 3, EPISODE_LENGTH)
+    start = arms.reset(jax.random.key(0))
+    action = jnp.full((3, 1), REACH)
+    first, again, other = (arms.step(start, action, jax.random.key(seed))[0].obs for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    assert len(set(np.asarray(jnp.concatenate([start.obs, first, other])[:, 0]))) == 9

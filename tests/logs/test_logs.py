@@ -1,0 +1,76 @@
+"""Logs as files: what is written is what a plain reader finds, whole or not at all."""
+
+import csv
+
+import numpy as np
+import pytest
+
+from mjx_softarm.logs.schema import Log, log_columns, log_table, write_log
+
+
+def small_log(**changes):
+    rng = np.random.default_rng(0)
+    values = {
+        "time_s": 0.02 * np.arange(4),
+        "frequency_hz": 4e6 + rng.uniform(size=(4, 6)),
+        "spring_m": rng.uniform(0.1, 0.3, (4, 6)),
+        "tip_quaternion": np.tile([1.0, 0.0, 0.0, 0.0], (4, 1)),
+        "marker_m": rng.uniform(-1.0, 0.0, (4, 2, 3)),
+        "payload_kg": np.full(4, 0.105),
+        "goal": rng.uniform(-90.0, 90.0, (4, 6)),
+    }
+    return Log(source="small", row=np.arange(4) + 2, **(values | changes))
+
+
+def test_csv_is_what_a_plain_reader_expects(tmp_path):
+    log = small_log()
+    write_log(tmp_path / "log.csv", log)
+    with (tmp_path / "log.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 4
+    for n, row in enumerate(rows):
+        assert float(row["time [s]"]) == pytest.approx(0.02 * n)
+        assert float(row["frequency5 [Hz]"]) == pytest.approx(log.frequency_hz[n, 5], rel=1e-8)
+        assert float(row["spring2 [mm]"]) == pytest.approx(1e3 * log.spring_m[n, 2], rel=1e-8)
+        assert float(row["tip_qw [1]"]) == 1.0
+        assert float(row["marker1_y [mm]"]) == pytest.approx(1e3 * log.marker_m[n, 1, 1], rel=1e-8)
+        assert float(row["payload [g]"]) == pytest.approx(105.0)
+        assert float(row["goal_x [mm]"]) == pytest.approx(log.goal[n, 0], rel=1e-8)
+        assert float(row["goal_roll [deg]"]) == pytest.approx(log.goal[n, 5], rel=1e-8)
+
+
+def test_npz_holds_the_same_table(tmp_path):
+    log = small_log()
+    write_log(tmp_path / "log.npz", log)
+    columns, table = log_table(log)
+    with np.load(tmp_path / "log.npz", allow_pickle=False) as file:
+        assert file["columns"].tolist() == [column.header for column in columns]
+        np.testing.assert_array_equal(file["table"], table)
+
+
+def test_column_names_are_unique_and_every_group_can_be_written():
+    names = [column.name for column in log_columns(9, 3)]
+    assert len(set(names)) == len(names) == 1 + 9 + 9 + 9 + 3 + 4 + 9 + 1 + 9 + 6 + 6 + 1
+
+
+def test_rows_are_taken_by_mask_or_index():
+    log = small_log()
+    for rows in (np.array([False, True, False, True]), np.array([1, 3])):
+        taken = log.take(rows)
+        assert len(taken) == 2 and taken.row.tolist() == [3, 5]
+        np.testing.assert_array_equal(taken.marker_m, log.marker_m[[1, 3]])
+        assert taken.pressure_kpa is None
+
+
+def test_failed_write_leaves_the_old_file_and_no_part(tmp_path, monkeypatch):
+    def fail(file, *_, **__):
+        file.write(b"time [s]\n0.0")
+        raise OSError(28, "No space left on device")
+
+    path = tmp_path / "log.csv"
+    path.write_text("old")
+    monkeypatch.setattr(np, "savetxt", fail)
+    with pytest.raises(OSError, match="No space left"):
+        write_log(path, small_log())
+    assert path.read_text() == "old"
+    assert [item.name for item in tmp_path.iterdir()] == ["log.csv"]

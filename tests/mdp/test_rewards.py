@@ -1,0 +1,112 @@
+"""The reward's cases, worked out by hand."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjx_softarm.mdp.rewards import RewardConfig, reward, scaled_error
+
+CONFIG = RewardConfig()
+HERE = np.array([10.0, -20.0, -500.0, 30.0, -40.0, 50.0])
+
+
+def away(*offset):
+    """A goal so that pose - goal is the offset [mm, deg], with HERE the pose."""
+    return HERE - np.array(offset + (0.0,) * (6 - len(offset)))
+
+
+def reward_of(goal, n_steps=1, saturated=False, config=CONFIG):
+    return reward(HERE, goal, n_steps, np.asarray(saturated), config)
+
+
+def test_the_defaults_are_the_paper_s_weights():
+    expected = RewardConfig(
+        goal_bonus=100.0,
+        error_cost=10.0,
+        step_cost=0.1,
+        saturation_cost=100.0,
+        threshold=0.03,
+        weight_per_mm=0.0056,
+        weight_per_deg=0.001,
+    )
+    assert expected == CONFIG
+
+
+@pytest.mark.parametrize(("axis", "weight"), list(enumerate([0.0056] * 3 + [0.001] * 3)))
+def test_each_axis_has_its_own_weight_and_the_sign_of_pose_less_goal(axis, weight):
+    offset = np.zeros(6)
+    offset[axis] = 10.0
+    np.testing.assert_allclose(scaled_error(HERE, HERE - offset, CONFIG), weight * offset, atol=1e-12)
+
+
+def test_an_angle_across_the_half_turn_is_the_short_way_round():
+    pose, goal = np.zeros((2, 6))
+    pose[3], goal[3] = 179.0, -179.0
+    np.testing.assert_allclose(scaled_error(pose, goal, CONFIG), [0, 0, 0, -0.002, 0, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("offset", "n_steps", "expected"),
+    [
+        ((100.0,), 3, -10 * 0.56 - 0.3),
+        ((0.0, -100.0), 1, -10 * 0.56 - 0.1),
+        ((30.0, 0.0, 40.0), 2, -10 * 0.28 - 0.2),  # 50 mm
+        ((0.0, 0.0, 0.0, 0.0, 0.0, 90.0), 4, -10 * 0.09 - 0.4),
+        ((0.0, 0.0, 5.0, 0.0, 45.0), 1, -10 * np.hypot(0.028, 0.045) - 0.1),
+    ],
+)
+def test_on_the_way_the_error_and_each_step_cost(offset, n_steps, expected):
+    value, reached, terms = reward_of(away(*offset), n_steps)
+    assert value == pytest.approx(expected, rel=1e-9)
+    assert not reached
+    assert terms["steps"] == pytest.approx(-0.1 * n_steps)
+    assert terms["goal"] == terms["saturation"] == 0.0
+
+
+# 0.03 / 0.0056 = 5.357 mm
+@pytest.mark.parametrize(("mm", "expected"), [(0.0, True), (5.35, True), (5.36, False)])
+def test_the_goal_is_reached_within_the_threshold(mm, expected):
+    value, reached, terms = reward_of(away(mm), n_steps=7)
+    flags = reached, value == 100.0, terms["goal"] == 100.0, terms["steps"] == 0.0, terms["error"] == 0.0
+    assert {bool(flag) for flag in flags} == {expected}
+
+
+@pytest.mark.parametrize("mm", [0.0, 100.0])
+def test_saturation_overrules_all_else_even_a_reached_goal(mm):
+    value, reached, terms = reward_of(away(mm), n_steps=3, saturated=True)
+    assert value == -100.0
+    assert not reached
+    assert terms == {"goal": 0.0, "error": 0.0, "steps": 0.0, "saturation": -100.0, "clearance": 0.0}
+
+
+def test_every_weight_of_the_config_counts():
+    config = RewardConfig(
+        goal_bonus=7.0,
+        error_cost=2.0,
+        step_cost=0.5,
+        saturation_cost=3.0,
+        threshold=0.5,
+        weight_per_mm=0.1,
+        weight_per_deg=0.2,
+    )
+    assert reward_of(away(4.0), config=config)[0] == 7.0
+    assert reward_of(away(10.0), 3, config=config)[0] == pytest.approx(-2.0 * 1.0 - 0.5 * 3)
+    assert reward_of(away(0.0, 0.0, 0.0, 10.0), 3, config=config)[0] == pytest.approx(-2.0 * 2.0 - 0.5 * 3)
+    assert reward_of(away(0.0), saturated=True, config=config)[0] == -3.0
+
+
+def test_a_batch_in_jax_gives_what_numpy_gives_one_by_one():
+    rng = np.random.default_rng(0)
+    pose = rng.uniform(-180.0, 180.0, (4, 5, 6))
+    goal = np.where(rng.random((4, 5, 1)) < 0.3, pose, rng.uniform(-180.0, 180.0, (4, 5, 6)))
+    n_steps, saturated = rng.integers(1, 9, (4, 5)), rng.random((4, 5)) < 0.3
+    value, reached, terms = reward(
+        *map(jnp.float32, (pose, goal)), jnp.asarray(n_steps), jnp.asarray(saturated), CONFIG
+    )
+    for index in np.ndindex(4, 5):
+        one = reward(pose[index], goal[index], n_steps[index], saturated[index], CONFIG)
+        assert value[index] == pytest.approx(one[0], rel=1e-5)
+        assert bool(reached[index]) == bool(one[1])
+        for name, term in terms.items():
+            assert term[index] == pytest.approx(one[2][name], rel=1e-5)
+    assert len({float(x) for x in value.ravel() if abs(x) == 100.0}) == 2  # both bonus and penalty occur

@@ -1,0 +1,133 @@
+"""Systems with a chain's Hessian, and small matrices, against NumPy's; what is not positive says so."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjx_softarm._support.small_matrices import block_diagonal, eliminate, product
+from mjx_softarm.mechanics.chain_hessian import ChainHessian
+
+N_ARMS, N, K = 5, 6, 4
+
+
+@pytest.fixture(autouse=True)
+def _strict():
+    with jax.numpy_dtype_promotion("strict"):
+        yield
+
+
+def chain(n_sections, seed=0, coupling=0.3):
+    """`N_ARMS` random positive definite matrices, and columns for them."""
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(N_ARMS, n_sections, N, N))
+    own = root @ root.swapaxes(-1, -2) + 5.0 * np.eye(N)
+    above, below = coupling * rng.normal(size=(2, N_ARMS, n_sections, N, 2))
+    columns = rng.normal(size=(N_ARMS, n_sections, N, K))
+    return ChainHessian(*map(np.float32, (own, above, below))), np.float32(columns)
+
+
+def dense(hessian):
+    """The matrices by their definition, entry by entry."""
+    n_arms, n_sections = hessian.own.shape[:2]
+    full = np.zeros((n_arms, n_sections, N, n_sections, N))
+    for s in range(n_sections):
+        full[:, s, :, s] = hessian.own[:, s]
+        for t in range(s + 1, n_sections):
+            far = hessian.above[:, s] @ hessian.below[:, t].swapaxes(-1, -2)
+            full[:, s, :, t], full[:, t, :, s] = far, far.swapaxes(-1, -2)
+    return full.reshape(n_arms, n_sections * N, n_sections * N)
+
+
+@pytest.mark.parametrize("n_sections", [1, 2, 3, 5])
+def test_a_system_with_the_hessian_is_that_with_the_dense_matrix(n_sections):
+    hessian, columns = chain(n_sections)
+    assert np.linalg.eigvalsh(dense(hessian)).min() > 0
+    np.testing.assert_allclose(jax.vmap(ChainHessian.dense)(hessian), dense(hessian), atol=1e-6)
+    found = jax.jit(jax.vmap(ChainHessian.solve))(hessian, columns)
+    wanted = np.linalg.solve(dense(hessian), columns.reshape(N_ARMS, -1, K).astype(float))
+    np.testing.assert_allclose(found, wanted.reshape(found.shape), atol=1e-5 * np.abs(wanted).max())
+
+
+def test_one_alone_is_solved_as_in_a_batch():
+    hessian, columns = chain(3)
+    many = jax.jit(jax.vmap(ChainHessian.solve))(hessian, columns)
+    for k in range(N_ARMS):
+        one = jax.jit(ChainHessian.solve)(jax.tree.map(lambda x, k=k: x[k], hessian), columns[k])
+        np.testing.assert_allclose(one, many[k], atol=1e-6)
+
+
+def test_batches_of_batches_are_solved_as_one():
+    hessian, columns = chain(2)
+    twice = jax.tree.map(lambda x: np.stack([x, x[::-1]]), (hessian, columns))
+    found = jax.jit(jax.vmap(jax.vmap(ChainHessian.solve)))(*twice)
+    once = jax.jit(jax.vmap(ChainHessian.solve))(hessian, columns)
+    np.testing.assert_allclose(found, np.stack([once, once[::-1]]), atol=1e-6)
+
+
+def test_a_matrix_that_is_not_positive_definite_gives_nan_and_its_neighbours_do_not():
+    hessian, columns = chain(3)
+    coupled = hessian.above.copy()
+    coupled[2] *= 30.0  # its blocks stay positive definite, the whole does not
+    hessian = hessian._replace(above=coupled)
+    lowest = np.linalg.eigvalsh(dense(hessian))[:, 0]
+    assert lowest[2] < 0 < np.delete(lowest, 2).min()
+    found = jax.jit(jax.vmap(ChainHessian.solve))(hessian, columns)
+    np.testing.assert_array_equal(np.isfinite(found).all((1, 2, 3)), lowest > 0)
+    assert np.isnan(found[2]).all()
+
+
+def test_the_diagonal_is_added_where_it_belongs():
+    hessian, _ = chain(2)
+    one = jax.tree.map(lambda x: jnp.asarray(x[0]), hessian)
+    added = jnp.arange(2.0 * N)
+    np.testing.assert_allclose(
+        one.plus_diagonal(added).dense(), dense(hessian)[0] + np.diag(added), atol=1e-5
+    )
+
+
+def test_elimination_takes_a_matrix_that_all_share():
+    rng = np.random.default_rng(0)
+    matrix, columns = (
+        np.float32(np.eye(3) + 0.1 * rng.normal(size=(3, 3))),
+        np.float32(rng.normal(size=(4, 3, 2))),
+    )
+    found = jax.vmap(eliminate, in_axes=(None, 0))(matrix, columns)
+    np.testing.assert_allclose(found, np.linalg.solve(matrix, columns), atol=1e-5)
+
+
+def test_elimination_of_rows_of_which_some_are_the_identity_s():
+    rng = np.random.default_rng(1)
+    matrix = np.float32(2.0 * np.eye(6) + 0.3 * rng.normal(size=(8, 6, 6)))  # not symmetric
+    given = rng.uniform(size=(8, 6)) < 0.5
+    matrix = np.where(given[..., None], np.eye(6, dtype=np.float32), matrix)
+    columns = np.float32(rng.normal(size=(8, 6, 1)))
+    found = np.asarray(jax.jit(jax.vmap(eliminate))(matrix, columns))
+    np.testing.assert_allclose(found, np.linalg.solve(matrix, columns), atol=1e-5)
+    np.testing.assert_array_equal(found[given], columns[given])
+
+
+@pytest.mark.parametrize("n", range(1, 8))
+def test_elimination_of_any_number_of_unknowns(n):
+    rng = np.random.default_rng(n)
+    root, columns = rng.normal(size=(4, n, n)), np.float32(rng.normal(size=(4, n, 3)))
+    matrix = np.float32(root @ root.swapaxes(1, 2) + np.eye(n))
+    found = jax.vmap(eliminate)(matrix, columns)
+    np.testing.assert_allclose(found, np.linalg.solve(matrix, columns), rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0])
+@pytest.mark.parametrize("n, which", [(3, 1), (6, 4), (7, 6)])
+def test_a_pivot_that_is_not_positive_gives_nan_and_its_neighbours_do_not(n, which, value):
+    matrix = np.stack(3 * [2.0 * np.eye(n, dtype=np.float32)])
+    matrix[1, which, which] = value
+    found = jax.vmap(eliminate)(matrix, np.ones((3, n, 2), np.float32))
+    assert np.isnan(found[1]).all() and np.isnan(eliminate(matrix[1], np.ones((n, 2), np.float32))).all()
+    np.testing.assert_allclose(found[::2], 0.5)
+
+
+def test_small_products_and_block_diagonals():
+    a, b = np.arange(12.0, dtype=np.float32).reshape(2, 2, 3), np.ones((2, 3, 4), np.float32)
+    np.testing.assert_allclose(product(a, b), a @ b)
+    expected = np.array([[0, 1, 2, 0, 0, 0], [3, 4, 5, 0, 0, 0], [0, 0, 0, 6, 7, 8], [0, 0, 0, 9, 10, 11]])
+    np.testing.assert_array_equal(block_diagonal(a), expected)

@@ -1,0 +1,219 @@
+"""Settled arm, stepped MJX and stepped C MuJoCo come to the same rest under the sensor-space law.
+
+The truth is C MuJoCo with the law in the loop, stepped until nothing moves. A rest depends on neither the
+time step nor the damping nor the law's gains, so the truth is taken with those that come to rest soonest, and
+one test holds it against the arm's own.
+"""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from mjx_softarm import ArmSpec, control
+from mjx_softarm._support import xla
+from mjx_softarm._support.mjx import mjx
+from mjx_softarm.mechanics.kinematics import chain_frames, mjx_frames
+from mjx_softarm.mechanics.mjcf import build_model
+from mjx_softarm.mechanics.settle import settle
+from mjx_softarm.mechanics.statics import ArmParams
+
+SPEC = ArmSpec.default()
+GAINS = control.Gains.from_spec(SPEC)
+N_COMMANDS, N_MANY = 64, 512
+POSITION_MM, ANGLE_DEG = 0.1, 0.1
+
+# Soonest at rest: one second a step, every damper worth four seconds of its spring, and strong gains.
+FAST_STEP_S, FAST_DAMPING_S = 1.0, 4.0
+FAST_GAINS = GAINS._replace(kp_kpa_per_m=600.0, ki_kpa_per_ms=200.0)
+
+
+class Rest(NamedTuple):
+    """Arms at rest, one a row, of C MuJoCo."""
+
+    q: np.ndarray
+    pressure_kpa: np.ndarray
+    spring_m: np.ndarray
+    tip_position_m: np.ndarray
+    tip_rotation: np.ndarray
+    residual: np.ndarray  # () largest force that is left on the standing arm [N, N m]
+
+
+def references(n, seed):
+    """Spring lengths (n, 9) over all that may be commanded."""
+    low, high = SPEC.springs.length_min_m, SPEC.springs.length_max_m
+    return np.random.default_rng(seed).uniform(low, high, (n, 9))
+
+
+def fast_model():
+    model = build_model(SPEC)
+    model.opt.timestep = FAST_STEP_S
+    model.dof_damping[:] = FAST_DAMPING_S * model.jnt_stiffness[model.dof_jntid]
+    model.tendon_damping[:] = FAST_DAMPING_S * model.tendon_stiffness
+    return model
+
+
+def stepped_to_rest(model, reference_m, gains, steps_per_tick=1, tolerance=1e-11, max_ticks=3000):
+    """One arm in C MuJoCo, from the straight arm until neither it nor the law moves."""
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    period_s = steps_per_tick * model.opt.timestep
+    integral = np.zeros(9)
+    for _ in range(max_ticks):
+        before = integral
+        spring = data.ten_length[1::2]
+        data.ctrl[:], integral = control.pressures(reference_m, spring, integral, gains, period_s)
+        mujoco.mj_step(model, data, steps_per_tick)
+        drift = np.abs(integral - before).max() / period_s
+        # An acceleration settles long before a velocity; both are asked for.
+        if max(np.abs(data.qvel).max(), np.abs(data.qacc).max(), 1e-3 * drift) < tolerance:
+            break
+    else:
+        pytest.fail(f"C MuJoCo did not come to rest at {reference_m}")
+    data.qvel[:] = 0.0
+    mujoco.mj_forward(model, data)
+    left = data.qfrc_passive + data.qfrc_actuator - data.qfrc_bias
+    tip = data.site("tip")
+    return Rest(
+        q=data.qpos.copy(),
+        pressure_kpa=data.ctrl.copy(),
+        spring_m=data.ten_length[1::2].copy(),
+        tip_position_m=tip.xpos.copy(),
+        tip_rotation=tip.xmat.reshape(3, 3).copy(),
+        residual=np.abs(left).max(),
+    )
+
+
+@functools.cache
+def truth(n, seed):
+    """Rests of C MuJoCo at random references."""
+    model = fast_model()
+    rests = [stepped_to_rest(model, reference, FAST_GAINS) for reference in references(n, seed)]
+    return Rest(*map(np.stack, zip(*rests, strict=True)))
+
+
+@functools.cache
+def solver(engine):
+    """`settle` of many references with either engine."""
+    params = ArmParams.from_spec(SPEC)
+    if engine == "mjx":
+        kinematics = functools.partial(mjx_frames, mjx.put_model(build_model(SPEC)))
+    else:
+        kinematics = functools.partial(chain_frames, link_length_m=params.link_length_m)
+    many = jax.vmap(lambda reference: settle(kinematics, params, reference))
+    return xla.jit(many, uses_mjx=engine == "mjx")
+
+
+def settled(engine, reference_m):
+    return jax.device_get(solver(engine)(np.float32(reference_m)))
+
+
+def position_error_mm(a, b):
+    return 1e3 * np.linalg.norm(a.tip_position_m - b.tip_position_m, axis=-1)
+
+
+def angle_error_deg(a, b):
+    chord = np.linalg.norm(a.tip_rotation - b.tip_rotation, axis=(-2, -1))
+    return np.rad2deg(2.0 * np.arcsin(chord / np.sqrt(8.0)))
+
+
+# --- the truth -------------------------------------------------------------------------------------
+
+
+def test_the_truth_is_at_rest_and_a_good_part_of_its_chambers_saturated():
+    reference, rest = references(N_MANY, seed=0), truth(N_MANY, seed=0)
+    assert rest.residual.max() < 1e-6
+    at_high, at_low = rest.pressure_kpa >= GAINS.pressure_max_kpa, rest.pressure_kpa <= GAINS.pressure_min_kpa
+    error = reference - rest.spring_m
+    assert np.abs(error[~at_high & ~at_low]).max() < 1e-8
+    assert error[at_high].min() > 0 and error[at_low].max() < 0
+    assert 0.2 < (at_high | at_low).mean() < 0.8
+
+
+def test_neither_time_step_nor_damping_nor_gains_move_the_rest():
+    model, fast = build_model(SPEC), truth(N_MANY, seed=0)
+    steps = round(1.0 / (SPEC.control.rate_hz * model.opt.timestep))
+    for k in range(3):
+        own = stepped_to_rest(model, references(N_MANY, seed=0)[k], GAINS, steps, tolerance=1e-6)
+        np.testing.assert_allclose(own.q, fast.q[k], atol=1e-5)
+        np.testing.assert_allclose(own.tip_position_m, fast.tip_position_m[k], atol=2e-6)
+        np.testing.assert_allclose(own.pressure_kpa, fast.pressure_kpa[k], atol=1e-2)
+
+
+# --- what is held against it -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("engine", ["chain", "mjx"])
+def test_the_settled_arm_is_where_c_mujoco_comes_to_rest(engine):
+    reference, rest = references(N_MANY, seed=0)[:N_COMMANDS], truth(N_MANY, seed=0)
+    rest = Rest(*(field[:N_COMMANDS] for field in rest))
+    found = settled(engine, reference)
+    assert found.settled.all()
+    assert position_error_mm(found, rest).max() < POSITION_MM / 10
+    assert angle_error_deg(found, rest).max() < ANGLE_DEG / 10
+    np.testing.assert_allclose(found.spring_m, rest.spring_m, atol=1e-5)
+    np.testing.assert_allclose(found.pressure_kpa, rest.pressure_kpa, atol=0.02)
+
+
+def test_stepped_mjx_comes_to_rest_where_c_mujoco_does():
+    model = mjx.put_model(fast_model())
+    n_ticks = 300
+
+    def rest_of(reference):
+        def tick(carry, _):
+            data, integral = carry
+            pressure, integral = control.pressures(
+                reference, data.ten_length[1::2], integral, FAST_GAINS, FAST_STEP_S
+            )
+            return (mjx.step(model, data.replace(ctrl=pressure)), integral), None
+
+        start = mjx.make_data(model).replace(ten_length=jnp.full(18, SPEC.geometry.section_length_m))
+        (data, integral), _ = jax.lax.scan(tick, (start, jnp.zeros(9)), None, length=n_ticks)
+        return data.qpos, data.qvel, integral
+
+    q, velocity, pressure = xla.jit(jax.vmap(rest_of))(np.float32(references(N_MANY, seed=0)[:N_COMMANDS]))
+    assert np.abs(velocity).max() < 1e-6
+    rest = Rest(*(field[:N_COMMANDS] for field in truth(N_MANY, seed=0)))
+    found = at_q(q)
+    assert position_error_mm(found, rest).max() < POSITION_MM / 10
+    assert angle_error_deg(found, rest).max() < ANGLE_DEG / 10
+    np.testing.assert_allclose(pressure, rest.pressure_kpa, atol=0.02)
+
+
+def at_q(q):
+    """Tips of joint coordinates, from C MuJoCo; only the tips' fields are filled."""
+    model = build_model(SPEC)
+    data = mujoco.MjData(model)
+    position, rotation = [], []
+    for row in np.asarray(q):
+        data.qpos[:] = row
+        mujoco.mj_kinematics(model, data)
+        position.append(data.site("tip").xpos.copy())
+        rotation.append(data.site("tip").xmat.reshape(3, 3).copy())
+    return Rest(None, None, None, np.stack(position), np.stack(rotation), None)
+
+
+def assert_settles_accurately(reference, rest):
+    found = settled("chain", reference)
+    error_mm = position_error_mm(found, rest)
+    saturated = (rest.pressure_kpa <= GAINS.pressure_min_kpa) | (rest.pressure_kpa >= GAINS.pressure_max_kpa)
+    assert saturated.mean() > 0.2
+    assert found.settled.mean() > 0.999
+    assert np.median(error_mm) < 0.05
+    assert np.percentile(error_mm, 95) < 0.5
+    assert error_mm[found.settled].max() < POSITION_MM
+    assert np.abs(found.spring_m - reference)[~saturated].max() < 0.2e-3
+    np.testing.assert_array_equal(found.at_limit, saturated)
+
+
+def test_error_over_many_random_commands():
+    assert_settles_accurately(references(N_MANY, seed=0), truth(N_MANY, seed=0))
+
+
+@pytest.mark.slow
+def test_error_over_very_many_random_commands():
+    assert_settles_accurately(references(4096, seed=1), truth(4096, seed=1))

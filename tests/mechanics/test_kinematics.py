@@ -1,0 +1,137 @@
+"""Both engines place plates and joints where C MuJoCo does; by hand where that is possible."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from mjx_softarm import ArmSpec
+from mjx_softarm._support import xla
+from mjx_softarm._support.mjx import mjx
+from mjx_softarm.mechanics.kinematics import Frames, chain_frames, mjx_frames
+from mjx_softarm.mechanics.mjcf import build_model
+
+STRUCTURES = [(3, 4), (2, 3), (1, 1)]
+TOLERANCE_M = 1e-6  # float32 at 0.7 m
+
+
+@functools.cache
+def arm(sections=3, links=4):
+    structure = {"n_sections": sections, "links_per_section": links}
+    return ArmSpec.default().replace(structure=structure)
+
+
+@functools.cache
+def compiled(sections=3, links=4):
+    return build_model(arm(sections, links))
+
+
+def random_q(spec, n, seed=0, bend_rad=0.8):
+    """Joint coordinates of arms far more crooked than any that pressure makes: up to 45 deg a hinge."""
+    rng = np.random.default_rng(seed)
+    half = spec.link_length_m / 2
+    q = rng.uniform([-half, -bend_rad, -bend_rad], [half, bend_rad, bend_rad], (n, spec.n_links, 3))
+    return np.float32(q.reshape(n, -1))
+
+
+def mujoco_frames(model, q):
+    """The frames that C MuJoCo computes: rings, hinges and slides, by name."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = q
+    mujoco.mj_kinematics(model, data)
+    n_links = len(q) // 3
+    rings = [data.geom(f"ring{k}") for k in range(n_links + 1)]
+    joints = [[data.joint(f"{kind}{k}") for kind in ("slide", "bend_x", "bend_y")] for k in range(n_links)]
+    return Frames(
+        plate_position=np.array([ring.xpos for ring in rings]),
+        plate_rotation=np.array([ring.xmat.reshape(3, 3) for ring in rings]),
+        axis=np.array([[joint.xaxis for joint in link] for link in joints]),
+        anchor=np.array([link[1].xanchor for link in joints]),
+    )
+
+
+def assert_same_frames(got, expected, case):
+    for name, a, b in zip(Frames._fields, got, expected, strict=True):
+        np.testing.assert_allclose(a, b, atol=TOLERANCE_M, err_msg=f"{name} of {case}")
+
+
+@functools.cache
+def chain(sections=3, links=4):
+    length = arm(sections, links).link_length_m
+    return jax.jit(jax.vmap(functools.partial(chain_frames, link_length_m=length)))
+
+
+@pytest.mark.parametrize("structure", STRUCTURES, ids=str)
+def test_the_chain_is_where_c_mujoco_puts_it(structure):
+    spec, model = arm(*structure), compiled(*structure)
+    q = random_q(spec, 50)
+    with jax.numpy_dtype_promotion("strict"):
+        frames = jax.device_get(chain(*structure)(q))
+    assert all(field.dtype == np.float32 for field in frames)
+    for k in range(len(q)):
+        assert_same_frames([field[k] for field in frames], mujoco_frames(model, q[k]), f"arm {k}")
+
+
+@pytest.mark.parametrize("structure", [(3, 4), (1, 1)], ids=str)  # the compiler takes long over more
+def test_mjx_and_the_chain_agree(structure):
+    model = mjx.put_model(compiled(*structure))
+    q = random_q(arm(*structure), 64, seed=1)
+    frames = xla.jit(jax.vmap(lambda q: mjx_frames(model, q)))(q)
+    assert_same_frames(jax.device_get(frames), jax.device_get(chain(*structure)(q)), "64 arms")
+
+
+def test_a_straight_arm_by_hand():
+    frames = chain_frames(jnp.zeros(36), 0.05)
+    np.testing.assert_allclose(frames.plate_position[:, 2], -0.05 * np.arange(13), atol=1e-7)
+    np.testing.assert_allclose(frames.anchor[:, 2], -0.05 * np.arange(12) - 0.025, atol=1e-7)
+    np.testing.assert_array_equal(frames.plate_position[:, :2], 0.0)
+    np.testing.assert_array_equal(frames.plate_rotation, np.broadcast_to(np.eye(3), (13, 3, 3)))
+    np.testing.assert_array_equal(frames.axis, [[[0, 0, -1], [1, 0, 0], [0, 1, 0]]] * 12)
+
+
+@pytest.mark.parametrize(
+    "q, tip",
+    [
+        ([0.01, 0.0, 0.0], [0.0, 0.0, -0.06]),  # longer
+        ([0.0, np.pi / 2, 0.0], [0.0, 0.025, -0.025]),  # about x, towards +y
+        ([0.0, 0.0, np.pi / 2], [-0.025, 0.0, -0.025]),  # about y, towards -x
+        ([0.01, np.pi / 2, np.pi / 2], [-0.025, 0.0, -0.035]),  # x turns y's axis to +z
+    ],
+)
+def test_one_link_by_hand(q, tip):
+    frames = chain_frames(jnp.array(q), 0.05)
+    np.testing.assert_allclose(frames.plate_position[1], tip, atol=1e-7)
+
+
+def test_axes_and_anchors_give_c_mujoco_s_jacobian_of_the_tip():
+    model, data = compiled(), mujoco.MjData(compiled())
+    jacobian, turning = np.zeros((2, 3, model.nv))
+    q = random_q(arm(), 20, seed=2)
+    frames = jax.device_get(chain()(q))
+    for k in range(len(q)):
+        data.qpos[:] = q[k]
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_jacSite(model, data, jacobian, turning, model.site("tip").id)
+        axis, anchor, tip = frames.axis[k], frames.anchor[k], frames.plate_position[k, -1]
+        moves = np.cross(axis, (tip - anchor)[:, None])
+        moves[:, 0] = axis[:, 0]  # a slide moves along its axis and turns nothing
+        turns = axis * [[0.0], [1.0], [1.0]]
+        np.testing.assert_allclose(moves.reshape(-1, 3).T, jacobian, atol=2e-6)
+        np.testing.assert_allclose(turns.reshape(-1, 3).T, turning, atol=2e-6)
+
+
+def test_another_link_length_needs_no_new_compilation():
+    traces = []
+
+    @jax.jit
+    def tip(q, length):
+        traces.append(length)
+        return chain_frames(q, length).plate_position[-1]
+
+    for length in (0.05, 0.06):
+        np.testing.assert_allclose(tip(jnp.zeros(36), jnp.float32(length))[2], -12 * length, rtol=1e-6)
+    assert len(traces) == 1

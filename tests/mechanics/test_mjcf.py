@@ -1,0 +1,304 @@
+"""The compiled MuJoCo model has the paper's figures; its pictures show it."""
+
+import functools
+import itertools
+import os
+
+import matplotlib.image
+import mujoco
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from mjx_softarm import ArmSpec
+from mjx_softarm.mechanics import render
+from mjx_softarm.mechanics.mjcf import build_model, build_spec
+
+LOW_KPA, FREE_KPA, HIGH_KPA = -40.0, 0.0, 20.0
+
+
+@pytest.fixture(scope="module")
+def spec():
+    return ArmSpec.default()
+
+
+@pytest.fixture(scope="module")
+def model(spec):
+    return build_model(spec)
+
+
+@functools.cache
+def section_at_rest(*pressure_kpa):
+    """Length [mm] and bending angle [deg] of one unloaded section, stepped in time until at rest."""
+    model = build_model(ArmSpec.default().replace(structure={"n_sections": 1}))
+    model.opt.gravity[:] = 0.0
+    data = mujoco.MjData(model)
+    data.ctrl[:] = pressure_kpa
+    for _ in range(10_000):
+        mujoco.mj_step(model, data)
+        if max(np.abs(data.qvel).max(), np.abs(data.qacc).max()) < 1e-7:
+            break
+    else:
+        pytest.fail(f"a section at {pressure_kpa} kPa did not come to rest")
+    tip = data.site("tip")
+    angle = Rotation.from_matrix(tip.xmat.reshape(3, 3)).magnitude()
+    return 1e3 * np.linalg.norm(tip.xpos), np.rad2deg(angle)
+
+
+def names(count, name):
+    return [name(k).name for k in range(count)]
+
+
+# --- the paper's figures ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("pressure_kpa, length_mm", [(LOW_KPA, 105.0), (FREE_KPA, 200.0), (HIGH_KPA, 235.0)])
+def test_one_section_has_the_paper_s_lengths(pressure_kpa, length_mm):
+    length, angle = section_at_rest(pressure_kpa, pressure_kpa, pressure_kpa)
+    assert length == pytest.approx(length_mm, abs=0.5)
+    assert angle < 1e-6
+
+
+def test_one_section_bends_by_the_paper_s_95_deg_and_no_further():
+    # The paper prints the angle beside the shortest and the longest section; it is taken as a section's too.
+    levels = (LOW_KPA, FREE_KPA, HIGH_KPA)
+    angle = {p: section_at_rest(*p)[1] for p in itertools.product(levels, repeat=3)}
+    one_pushes, two_push = (HIGH_KPA, LOW_KPA, LOW_KPA), (LOW_KPA, HIGH_KPA, HIGH_KPA)
+    assert max(angle, key=angle.get) in set(itertools.permutations(one_pushes))
+    assert max(angle.values()) == pytest.approx(95.0, abs=5.0)
+    assert angle[two_push] < angle[one_pushes]
+    for pattern in (one_pushes, two_push):  # no direction is special but for the hinges' order, x before y
+        turned = [angle[p] for p in set(itertools.permutations(pattern))]
+        assert max(turned) - min(turned) < 1.0
+
+
+def test_masses(spec, model):
+    assert model.body_subtreemass[0] == pytest.approx(4.7)
+    assert model.body("gripper").mass == pytest.approx(0.45)
+    assert model.body("payload").mass == 0.0
+    links = [model.body(f"link{k}").mass[0] for k in range(12)]
+    np.testing.assert_allclose(links, 4.25 / 12)
+    loaded = build_model(spec.replace(mass={"payload_kg": 0.22}))
+    assert loaded.body_subtreemass[0] == pytest.approx(4.92)
+    assert loaded.body("payload").mass == pytest.approx(0.22)
+
+
+def test_springs_and_pressure_limits(model):
+    springs = [model.tendon(f"spring{k}").id for k in range(9)]
+    np.testing.assert_array_equal(model.tendon_stiffness[springs], 54.0)  # 0.054 N/mm
+    np.testing.assert_array_equal(model.tendon_damping[springs], 30.0)  # 0.03 N s/mm
+    np.testing.assert_array_equal(model.tendon_lengthspring[springs], 0.2)
+    np.testing.assert_array_equal(model.actuator_ctrlrange, [[LOW_KPA, HIGH_KPA]] * 9)
+    assert model.actuator_ctrllimited.all()
+
+
+# --- layout ----------------------------------------------------------------------------------------
+
+
+def test_every_object_has_its_name_and_place(model):
+    links = range(12)
+    bodies = ["world", *(f"link{k}" for k in links), "gripper", "payload"]
+    assert names(model.nbody, model.body) == bodies
+    joints = [f"{kind}{k}" for k in links for kind in ("slide", "bend_x", "bend_y")]
+    assert names(model.njnt, model.joint) == joints
+    tendons = [f"{kind}{k}" for k in range(9) for kind in ("chamber", "spring")]
+    assert names(model.ntendon, model.tendon) == tendons
+    assert names(model.nu, model.actuator) == [f"chamber{k}" for k in range(9)]
+    geoms = [f"ring{k}" for k in range(13)] + ["gripper_palm", "gripper_finger0", "gripper_finger1"]
+    assert names(model.ngeom, model.geom) == geoms
+    holes = {
+        f"{kind}{3 * section + k}_plate{plate}"
+        for section, k, kind in itertools.product(range(3), range(3), ("chamber", "spring"))
+        for plate in range(4 * section, 4 * section + 5)
+    }
+    sites = names(model.nsite, model.site)
+    assert set(sites) == holes | {"tip"} and len(sites) == len(holes) + 1
+    assert model.ntendon == 18 and model.nu == 9 and model.nv == 36
+
+
+@pytest.mark.parametrize("sections, links", [(1, 1), (2, 3), (4, 2)])
+def test_counts_follow_the_structure(spec, sections, links):
+    structure = {"n_sections": sections, "links_per_section": links}
+    model = build_model(spec.replace(structure=structure))
+    n = sections * links
+    assert (model.nv, model.nu, model.ntendon) == (3 * n, 3 * sections, 6 * sections)
+    assert names(model.nbody, model.body)[-3:] == [f"link{n - 1}", "gripper", "payload"]
+    assert model.body_subtreemass[0] == pytest.approx(4.7)
+
+
+def test_a_plate_pair_has_a_slide_and_two_perpendicular_hinges(model):
+    slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
+    np.testing.assert_array_equal(model.jnt_type.reshape(12, 3), [[slide, hinge, hinge]] * 12)
+    np.testing.assert_array_equal(model.jnt_axis.reshape(12, 3, 3), [[[0, 0, -1], [1, 0, 0], [0, 1, 0]]] * 12)
+    np.testing.assert_array_equal(model.jnt_bodyid, np.repeat(np.arange(1, 13), 3))
+
+
+def test_the_free_arm_hangs_straight_with_its_chambers_around_it(spec, model):
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    np.testing.assert_allclose(data.site("tip").xpos, [0.0, 0.0, -0.6], atol=1e-12)
+    np.testing.assert_allclose(data.ten_length, 0.2, atol=1e-12)
+    for plate, section in ((0, 0), (4, 0), (4, 1), (12, 2)):
+        for k, angle_deg in enumerate((90.0, 210.0, 330.0)):  # chamber 0 at +y, then counter-clockwise
+            direction = [np.cos(np.deg2rad(angle_deg)), np.sin(np.deg2rad(angle_deg)), 0.0]
+            for kind, radius in (
+                ("chamber", spec.geometry.chamber_radius_m),
+                ("spring", spec.geometry.spring_radius_m),
+            ):
+                hole = data.site(f"{kind}{3 * section + k}_plate{plate}").xpos
+                np.testing.assert_allclose(
+                    hole, radius * np.array(direction) + [0, 0, -0.05 * plate], atol=1e-9
+                )
+
+
+def test_a_tendon_feels_the_joints_of_its_own_section_alone(model):
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    straight = data.ten_length.copy()
+    data.qpos[12:24] = np.tile([0.01, 0.1, -0.2], 4)  # the four links of the middle section
+    mujoco.mj_forward(model, data)
+    moved = np.abs(data.ten_length - straight) > 1e-6
+    np.testing.assert_array_equal(moved, np.repeat([False, True, False], 6))
+
+
+def test_fields_with_one_number_per_chamber_reach_their_chamber(spec):
+    step = 1.0 + 0.01 * np.arange(9)
+    chambers = {
+        "stiffness_n_per_m": tuple(500.0 * step),
+        "length_offset_m": tuple(0.001 * step),
+        "area_m2": tuple(1.6e-3 * step),
+    }
+    model = build_model(spec.replace(chambers=chambers))
+    np.testing.assert_allclose(model.tendon_stiffness[0::2], 500.0 * step)
+    np.testing.assert_allclose(model.tendon_lengthspring[0::2, 0], 0.2 + 0.001 * step)
+    data = mujoco.MjData(model)
+    data.ctrl[:] = 10.0
+    mujoco.mj_forward(model, data)
+    np.testing.assert_allclose(data.actuator_force, 16.0 * step)  # 10 kPa on 16 cm2
+
+
+# --- forces ----------------------------------------------------------------------------------------
+
+
+def test_pressure_pushes_with_an_area_that_changes_with_length(spec, model):
+    data = mujoco.MjData(model)
+    data.ctrl[:] = HIGH_KPA
+    data.qpos[0:12:3] = 0.005  # lengthens the first section by 20 mm
+    mujoco.mj_forward(model, data)
+    area = spec.chambers.area_m2 + spec.chambers.area_slope_m * np.array([0.02, 0.0, 0.0])
+    np.testing.assert_allclose(data.actuator_force, np.repeat(20e3 * area, 3), rtol=1e-9)
+    assert (data.qfrc_actuator[0::3] > 0).all()  # of the slides: a positive force extends
+
+
+def test_a_control_beyond_the_limits_is_clipped(model):
+    data = mujoco.MjData(model)
+    data.ctrl[:] = 35.0
+    mujoco.mj_forward(model, data)
+    limit = mujoco.MjData(model)
+    limit.ctrl[:] = HIGH_KPA
+    mujoco.mj_forward(model, limit)
+    np.testing.assert_array_equal(data.actuator_force, limit.actuator_force)
+
+
+def test_a_section_is_as_stiff_as_its_backbone_chambers_and_springs_together(spec):
+    model = build_model(spec.replace(structure={"n_sections": 1}))
+    model.opt.gravity[:] = 0.0
+    data = mujoco.MjData(model)
+    stretch_m, bend_rad = 0.008, 0.04
+    data.qpos[:] = np.tile([stretch_m / 4, bend_rad / 4, 0.0], 4)
+    mujoco.mj_forward(model, data)
+    axial = 3 * (506.7 + 54.0) + 851.4
+    # chambers at radius r resist with k r^2 each, times 3/2 for three around the circle
+    bending = 1.5 * (506.7 * 0.035**2 + 54.0 * 0.067**2) + 1.0814
+    slide, bend_x, bend_y = data.qfrc_passive.reshape(4, 3).T
+    np.testing.assert_allclose(slide, -axial * stretch_m, rtol=2e-3)
+    np.testing.assert_allclose(bend_x, -bending * bend_rad, rtol=2e-2)
+    np.testing.assert_allclose(bend_y, 0.0, atol=1e-4)
+
+
+def test_stiffness_and_damping_are_linear_since_mjx_uses_no_higher_terms(model):
+    for field in ("jnt_stiffnesspoly", "tendon_stiffnesspoly", "dof_dampingpoly", "tendon_dampingpoly"):
+        assert not getattr(model, field).any(), field
+
+
+def test_an_environment_can_be_added_before_compiling(spec, model):
+    mjspec = build_spec(spec)
+    mjspec.worldbody.add_geom(
+        name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[1, 1, 0.1], pos=[0, 0, -1]
+    )
+    with_floor = mjspec.compile()
+    assert with_floor.geom("floor").id >= 0
+    assert with_floor.nv == model.nv and with_floor.nu == model.nu
+
+
+# --- pictures --------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def renderer(model):
+    try:
+        opened = render.Renderer(model, 150, 200)
+    except render.RenderError as error:
+        pytest.skip(f"no OpenGL here: {error}")
+    with opened:
+        yield opened
+
+
+def coloured(image, low, high):
+    """Rows and columns of the pixels whose hue, in turns, lies in a range."""
+    rgb = image.astype(float)
+    largest, smallest = rgb.max(-1), rgb.min(-1)
+    vivid = largest - smallest > 80
+    red, green, blue = np.moveaxis(rgb, -1, 0)
+    spread = np.maximum(largest - smallest, 1.0)
+    hue = np.select(
+        [largest == red, largest == green],
+        [((green - blue) / spread) % 6.0, (blue - red) / spread + 2.0],
+        (red - green) / spread + 4.0,
+    )
+    return np.argwhere(vivid & (hue / 6.0 >= low) & (hue / 6.0 < high))
+
+
+def test_a_picture_shows_three_sections_one_below_the_other(renderer):
+    image = renderer.draw(np.zeros(36))
+    assert image.shape == (200, 150, 3) and image.dtype == np.uint8
+    red, yellow, blue = (coloured(image, *hue) for hue in ((0.0, 0.07), (0.08, 0.17), (0.5, 0.7)))
+    assert min(map(len, (red, yellow, blue))) > 200
+    assert red[:, 0].mean() + 20 < yellow[:, 0].mean() < blue[:, 0].mean() - 20
+
+
+def test_a_picture_shows_where_the_arm_bends(renderer):
+    camera = render.Camera(azimuth_deg=0.0)  # looks along +x
+    columns = []
+    for bend in (0.15, 0.0, -0.15):  # about +x: swings to +y, the picture's left
+        image = renderer.draw(np.tile([0.0, bend, 0.0], 12), camera)
+        columns.append(coloured(image, 0.5, 0.7)[:, 1].mean())
+    assert columns[0] + 10 < columns[1] < columns[2] - 10
+
+
+@pytest.mark.parametrize("q", [np.zeros(35), np.full(36, np.nan)])
+def test_a_picture_of_nothing_is_refused(renderer, q):
+    with pytest.raises(ValueError, match=r"^q: got"):
+        renderer.draw(q)
+
+
+def test_a_png_reads_back_as_it_was_written(tmp_path):
+    image = np.random.default_rng(0).integers(0, 256, (5, 7, 3), np.uint8)
+    render.write_png(tmp_path / "image.png", image)
+    back = matplotlib.image.imread(tmp_path / "image.png")
+    np.testing.assert_array_equal(np.round(255 * back).astype(np.uint8), image)
+    with pytest.raises(ValueError, match=r"image: got float64 of shape \(5, 7\)"):
+        render.write_png(tmp_path / "image.png", np.zeros((5, 7)))
+
+
+@pytest.mark.skipif(os.uname().sysname != "Linux", reason="EGL and OSMesa are Linux's")
+def test_without_opengl_the_message_says_what_was_tried_and_what_to_do(model, monkeypatch):
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    monkeypatch.setattr(render, "_HEADLESS", ("no_such_library", "nor_this"))
+    render._working_library.cache_clear()
+    with pytest.raises(render.RenderError) as caught:
+        render.Renderer(model)
+    render._working_library.cache_clear()
+    message = str(caught.value)
+    assert "no_such_library: " in message and "nor_this: " in message and "MUJOCO_GL=egl" in message
+    assert "\n" not in message

@@ -1,0 +1,329 @@
+"""The settled arm: forces balance in C MuJoCo, the law is at rest, and what cannot settle says so."""
+
+import functools
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+from scipy import linalg
+
+from mjx_softarm import ArmSpec
+from mjx_softarm.mechanics.kinematics import chain_frames
+from mjx_softarm.mechanics.mjcf import build_model
+from mjx_softarm.mechanics.settle import (
+    ACTIVE_SET_GAIN_KPA_PER_M,
+    MAX_ITERATIONS,
+    MAX_STEP,
+    RESIDUAL_TOLERANCE,
+    TRACKING_TOLERANCE_M,
+    _Iterate,
+    _newton_step,
+    settle,
+    settle_pressures,
+)
+from mjx_softarm.mechanics.statics import ArmParams, statics
+
+SPEC = ArmSpec.default()
+LOW_KPA, HIGH_KPA = SPEC.chambers.pressure_min_kpa, SPEC.chambers.pressure_max_kpa
+N = 128  # arms a batch, always, so that little is compiled
+
+
+@functools.cache
+def solver(solve):
+    def one(params, target):
+        return solve(functools.partial(chain_frames, link_length_m=params.link_length_m), params, target)
+
+    return jax.jit(jax.vmap(one, in_axes=(None, 0)))
+
+
+def settled(solve, target, spec=SPEC, params=None):
+    """Settled arms, one for each row of targets, as NumPy arrays."""
+    params = ArmParams.from_spec(spec) if params is None else params
+    batch = np.resize(np.float32(target), (N, np.shape(target)[1]))
+    with jax.numpy_dtype_promotion("strict"):
+        found = solver(solve)(params, batch)
+    return jax.tree.map(lambda x: np.asarray(x)[: len(target)], found)
+
+
+def references(n_chambers=9, seed=0):
+    """Spring lengths (N, n_chambers) over all that may be commanded."""
+    low, high = SPEC.springs.length_min_m, SPEC.springs.length_max_m
+    return np.random.default_rng(seed).uniform(low, high, (N, n_chambers))
+
+
+def pressures(n_chambers=9, seed=0):
+    return np.random.default_rng(seed).uniform(LOW_KPA, HIGH_KPA, (N, n_chambers))
+
+
+def imbalance(spec, found):
+    """Largest force (N,) [N, N m] that C MuJoCo finds left on each standing arm."""
+    model = build_model(spec)
+    data = mujoco.MjData(model)
+    left = []
+    for q, pressure in zip(found.q, found.pressure_kpa, strict=True):
+        data.qpos[:], data.ctrl[:], data.qvel[:] = q, pressure, 0.0
+        mujoco.mj_forward(model, data)
+        left.append(np.abs(data.qfrc_passive + data.qfrc_actuator - data.qfrc_bias).max())
+    return np.array(left)
+
+
+ARMS = {
+    "the paper's": {},
+    "loaded": {"mass": {"payload_kg": 1.0}},
+    "overloaded": {"mass": {"payload_kg": 50.0}},
+    "two sections of three links": {"structure": {"n_sections": 2, "links_per_section": 3}},
+    "one section of two links": {"structure": {"n_sections": 1, "links_per_section": 2}},
+    "uneven": {
+        "chambers": {
+            "area_m2": tuple(1.62e-3 * (0.8 + 0.05 * k) for k in range(9)),
+            "stiffness_n_per_m": tuple(506.7 * (1.2 - 0.05 * k) for k in range(9)),
+            "length_offset_m": tuple(0.001 * (k - 4) for k in range(9)),
+        }
+    },
+}
+
+
+# --- rest ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("arm", ARMS)
+@pytest.mark.parametrize("solve, targets", [(settle, references), (settle_pressures, pressures)])
+def test_c_mujoco_finds_the_settled_arm_in_balance(arm, solve, targets):
+    spec = SPEC.replace(**ARMS[arm])
+    found = settled(solve, targets(spec.n_chambers), spec)
+    assert found.settled.all()
+    left = imbalance(spec, found)
+    assert left.max() < RESIDUAL_TOLERANCE
+    np.testing.assert_allclose(found.residual, left, atol=RESIDUAL_TOLERANCE / 4)
+
+
+def test_every_chamber_tracks_or_is_at_the_limit_that_stops_it():
+    reference = references()
+    found = settled(settle, reference)
+    error = reference - found.spring_m
+    at_high, at_low = found.pressure_kpa == HIGH_KPA, found.pressure_kpa == LOW_KPA
+    np.testing.assert_array_equal(found.at_limit, at_high | at_low)
+    assert ((found.pressure_kpa >= LOW_KPA) & (found.pressure_kpa <= HIGH_KPA)).all()
+    assert 0.2 < found.at_limit.mean() < 0.8  # both kinds are tested
+    assert np.abs(error[~found.at_limit]).max() < TRACKING_TOLERANCE_M
+    assert error[at_high].min() > -TRACKING_TOLERANCE_M  # full pressure, and the spring still too short
+    assert error[at_low].max() < TRACKING_TOLERANCE_M
+    assert (found.tracking_error_m < TRACKING_TOLERANCE_M).all()
+
+
+def test_half_the_chambers_at_a_limit_take_a_handful_of_steps():
+    found = settled(settle, references())
+    assert found.iterations.mean() < 4.5 and found.iterations.max() <= 7  # one of them finds that all is done
+
+
+def test_a_newton_step_is_that_of_the_dense_system():
+    """[H, -P^T; S, 0] (dq, dp) = (-gradient, error), but dp = limit - p where a chamber is held."""
+    params = ArmParams.from_spec(SPEC, np.float64)
+    chain = functools.partial(chain_frames, link_length_m=params.link_length_m)
+    rng = np.random.default_rng(2)
+    with jax.enable_x64(True):
+        for _ in range(4):
+            q, pressure = rng.normal(scale=0.005, size=36), rng.uniform(-10.0, 10.0, 9)
+            reference = SPEC.springs.rest_length_m + rng.uniform(-0.03, 0.03, 9)
+            before = _Iterate(q, pressure, np.zeros(9, bool), np.array(True), np.zeros(()), np.array(0))
+            after = jax.device_get(_newton_step(before, chain, params, reference))
+            now = statics(chain(q), q, pressure, params)
+            error = reference - now.springs.length
+            trial = pressure + ACTIVE_SET_GAIN_KPA_PER_M * error
+            limit = np.clip(trial, LOW_KPA, HIGH_KPA)
+            held = trial != limit
+            assert 0 < held.sum() < 9
+            system = np.zeros((45, 45))
+            system[:36, :36] = now.hessian.dense()
+            assert np.linalg.eigvalsh(system[:36, :36]).min() > 0
+            system[:36, 36:] = -(linalg.block_diag(*now.chambers.jacobian) * now.area[:, None]).T
+            system[36:, :36] = np.where(held[:, None], 0.0, linalg.block_diag(*now.springs.jacobian))
+            system[36:, 36:] = np.diag(held.astype(float))
+            right = np.concatenate([-now.gradient, np.where(held, limit - pressure, error)])
+            step = np.linalg.solve(system, right)
+            step *= min(1.0, MAX_STEP / np.abs(step[:36]).max())
+            np.testing.assert_allclose(after.q - q, step[:36], atol=1e-9)
+            np.testing.assert_allclose(after.pressure - pressure, step[36:], atol=1e-6)
+            np.testing.assert_array_equal(after.at_limit, held)
+
+
+def test_the_report_is_the_pose_and_the_lengths_of_its_joint_coordinates():
+    found = settled(settle, references())
+    model = build_model(SPEC)
+    data = mujoco.MjData(model)
+    for k in range(0, N, 8):
+        data.qpos[:] = found.q[k]
+        mujoco.mj_forward(model, data)
+        np.testing.assert_allclose(found.tip_position_m[k], data.site("tip").xpos, atol=1e-6)
+        np.testing.assert_allclose(found.tip_rotation[k], data.site("tip").xmat.reshape(3, 3), atol=1e-6)
+        np.testing.assert_allclose(found.spring_m[k], data.ten_length[1::2], atol=1e-6)
+
+
+def test_the_springs_that_pressures_give_ask_for_these_pressures():
+    pressure = 0.9 * pressures()  # within the limits
+    there = settled(settle_pressures, pressure)
+    back = settled(settle, there.spring_m)
+    assert back.settled.all() and not back.at_limit.any()
+    np.testing.assert_allclose(back.pressure_kpa, pressure, atol=0.02)
+    np.testing.assert_allclose(back.q, there.q, atol=1e-4)
+
+
+@pytest.mark.parametrize("solve, targets", [(settle, references), (settle_pressures, pressures)])
+def test_mirrored_targets_give_the_mirrored_arm(solve, targets):
+    target = targets()
+    mirrored = target.reshape(N, 3, 3)[:, :, [0, 2, 1]].reshape(N, 9)  # chamber 0 lies in the mirror, x = 0
+    plain, found = settled(solve, target), settled(solve, mirrored)
+    mirror = np.diag([-1.0, 1.0, 1.0])
+    assert np.abs(plain.tip_position_m[:, 0]).max() > 0.05
+    np.testing.assert_allclose(found.tip_position_m, plain.tip_position_m @ mirror, atol=2e-6)
+    np.testing.assert_allclose(found.tip_rotation, mirror @ plain.tip_rotation @ mirror, atol=2e-5)
+
+
+def test_a_single_arm_settles_as_in_a_batch():
+    reference = np.float32(references())
+    params = ArmParams.from_spec(SPEC)
+    one = jax.jit(
+        lambda r: settle(functools.partial(chain_frames, link_length_m=params.link_length_m), params, r)
+    )
+    batch = settled(settle, reference)
+    for k in (0, 1):
+        alone = jax.device_get(one(reference[k]))
+        np.testing.assert_allclose(alone.q, batch.q[k], atol=1e-6)
+        assert alone.settled.dtype == bool and alone.settled.shape == ()
+        assert {x.dtype for x in (alone.q, alone.residual, alone.tip_rotation)} == {np.dtype(np.float32)}
+
+
+# --- pressures -------------------------------------------------------------------------------------
+
+
+def test_pressures_beyond_the_limits_are_clipped_to_them():
+    beyond = np.where(pressures() > -10.0, 60.0, -101.0)
+    limit = np.clip(beyond, LOW_KPA, HIGH_KPA)
+    clipped, at_limit = settled(settle_pressures, beyond), settled(settle_pressures, limit)
+    np.testing.assert_array_equal(clipped.pressure_kpa, limit)
+    np.testing.assert_array_equal(clipped.q, at_limit.q)
+    assert clipped.settled.all()
+
+
+def test_pressures_are_kept_where_the_springs_happen_to_be_at_rest():
+    # A single link at rest has every spring at exactly its rest length, which is nothing to be tracked here.
+    spec = SPEC.replace(structure={"n_sections": 1, "links_per_section": 1})
+    pressure = np.random.default_rng(0).uniform(0.0, HIGH_KPA, (N, 3))
+    found = settled(settle_pressures, pressure, spec)
+    np.testing.assert_allclose(found.pressure_kpa, pressure, rtol=1e-6)
+    assert found.settled.all()
+    assert imbalance(spec, found).max() < RESIDUAL_TOLERANCE
+
+
+def test_full_pressure_lengthens_and_vacuum_shortens():
+    found = settled(settle_pressures, np.repeat([[LOW_KPA], [0.0], [HIGH_KPA]], 9, axis=1))
+    shortest, free, longest = -found.tip_position_m[:, 2]
+    assert shortest == pytest.approx(0.355, abs=0.01)  # 3 x 105 mm and the weight's stretch
+    assert free == pytest.approx(0.632, abs=0.01)
+    assert longest == pytest.approx(0.734, abs=0.01)
+    np.testing.assert_allclose(found.tip_position_m[:, :2], 0.0, atol=1e-6)
+
+
+def test_a_payload_pulls_the_arm_down_by_its_weight_over_the_stiffness():
+    pressure = np.zeros((1, 9))
+    height = [
+        settled(settle_pressures, pressure, SPEC.replace(mass={"payload_kg": kg})).tip_position_m[0, 2]
+        for kg in (0.0, 0.5)
+    ]
+    chambers, springs = SPEC.chambers.stiffness_n_per_m, SPEC.springs.stiffness_n_per_m
+    section = 3 * (chambers + springs) + SPEC.backbone.axial_stiffness_n_per_m
+    assert height[0] - height[1] == pytest.approx(3 * 0.5 * 9.81 / section, rel=1e-3)
+
+
+def test_a_payload_moves_a_bent_arm_unless_its_springs_are_held():
+    pressure = np.tile([10.0, -20.0, -10.0], (1, 3))
+    loaded = SPEC.replace(mass={"payload_kg": 0.5})
+    free = settled(settle_pressures, pressure)
+    sagged = settled(settle_pressures, pressure, loaded)
+    held = settled(settle, free.spring_m, loaded)
+
+    def shift_mm(other):
+        return 1e3 * np.linalg.norm(other.tip_position_m - free.tip_position_m)
+
+    assert held.settled.all() and not held.at_limit.any()
+    assert shift_mm(sagged) > 5.0
+    assert shift_mm(held) < 0.25 * shift_mm(sagged)  # what is left: the links bend unevenly
+
+
+def test_half_a_kilogram_moves_held_arms_by_as_much_as_the_readme_says():
+    """Pressures before it from the middle three quarters of their range, so that no chamber meets a limit."""
+    middle, share = 0.5 * (LOW_KPA + HIGH_KPA), 0.75
+    loaded = SPEC.replace(mass={"payload_kg": 0.5})
+    pressure = middle + share * (pressures() - middle)
+    free = settled(settle_pressures, pressure)
+    held, sagged = settled(settle, free.spring_m, loaded), settled(settle_pressures, pressure, loaded)
+
+    def shift_mm(other):
+        shift_m = np.linalg.norm(other.tip_position_m - free.tip_position_m, axis=1)
+        return np.quantile(1e3 * shift_m, [0.5, 0.95])
+
+    assert free.settled.all() and sagged.settled.all() and held.settled.all() and not held.at_limit.any()
+    np.testing.assert_allclose(shift_mm(held), [2.0, 3.5], rtol=0.1)
+    np.testing.assert_allclose(shift_mm(sagged), [17.0, 30.0], rtol=0.1)
+    anywhere = settled(settle, settled(settle_pressures, pressures()).spring_m, loaded)
+    assert anywhere.at_limit.any(axis=1).mean() > 0.5
+
+
+# --- failures --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("solve, targets", [(settle, references), (settle_pressures, pressures)])
+def test_one_target_that_is_not_a_number_fails_alone(solve, targets):
+    target = targets()
+    good = settled(solve, target)
+    target[5, 2] = np.nan
+    found = settled(solve, target)
+    others = np.arange(N) != 5
+    assert not found.settled[5] and found.settled[others].all()
+    np.testing.assert_array_equal(found.q[others], good.q[others])
+
+
+@pytest.mark.parametrize("name", ArmParams._fields)
+def test_parameters_that_are_not_numbers_settle_nothing(name):
+    params = ArmParams.from_spec(SPEC)
+    broken = params._replace(**{name: np.full_like(getattr(params, name), np.nan)})
+    found = settled(settle, references(), params=broken)
+    assert not found.settled.any()
+    assert (found.iterations <= MAX_ITERATIONS).all()
+
+
+IMPOSSIBLE = {
+    "limp": {
+        "chambers": {"stiffness_n_per_m": 1.0},
+        "backbone": {"axial_stiffness_n_per_m": 1.0, "bending_stiffness_nm_per_rad": 0.01},
+    },
+    "chambers that buckle the backbone": {"backbone": {"bending_stiffness_nm_per_rad": 1e-3}},
+    "pistons of a tenth of a square metre": {"chambers": {"area_m2": 0.1}},
+}
+
+
+@pytest.mark.parametrize("solve, targets", [(settle, references), (settle_pressures, pressures)])
+@pytest.mark.parametrize("arm", IMPOSSIBLE)
+def test_an_impossible_arm_is_reported_not_raised(arm, solve, targets):
+    spec = SPEC.replace(**IMPOSSIBLE[arm])
+    found = settled(solve, targets(), spec)
+    assert found.settled.mean() < 0.5
+    assert (found.iterations <= MAX_ITERATIONS).all()
+    assert np.isfinite(found.q).all() and np.isfinite(found.tip_position_m).all()
+    # The flag is right about every one of them, in both directions.
+    left = imbalance(spec, found)
+    assert (left[found.settled] < 2 * RESIDUAL_TOLERANCE).all()
+    off = (left > RESIDUAL_TOLERANCE / 2) | (found.tracking_error_m > TRACKING_TOLERANCE_M / 2)
+    assert off[~found.settled].all()
+
+
+# --- compilation -----------------------------------------------------------------------------------
+
+
+def test_new_numbers_need_no_new_compilation():
+    settled(settle, references())
+    n_compiled = solver(settle)._cache_size()
+    found = settled(settle, references(seed=1), SPEC.replace(mass={"payload_kg": 0.1}))
+    assert found.settled.all()
+    assert solver(settle)._cache_size() == n_compiled

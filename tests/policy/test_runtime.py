@@ -1,0 +1,138 @@
+"""The deployed policy against the one that was trained, without JAX in its process."""
+
+import dataclasses
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjx_softarm import ArmSpec
+from mjx_softarm.deploy import PolicyRunner, load_policy
+from mjx_softarm.env import ReachEnv
+from mjx_softarm.mdp.rewards import RewardConfig
+from mjx_softarm.mechanics.workspace import Pool
+from mjx_softarm.policy.file import policy_from_actor, save_policy
+from train.agent.networks import Actor, mode
+
+N = 1000
+WITHOUT_JAX = """
+import sys
+from mjx_softarm.deploy import PolicyRunner, load_policy
+
+reference = PolicyRunner(load_policy(sys.argv[1])).act([0, 0, -600, 0, 0, 0], [50, 0, -580, 0, 0, 0])
+assert reference.length_m.shape == (9,)
+loaded = {name.split(".")[0] for name in sys.modules}
+print(sorted(loaded & {"jax", "jaxlib", "flax", "brax", "mujoco", "train"}))
+"""
+
+
+@pytest.fixture(scope="module")
+def spec():
+    """An arm whose springs all differ."""
+    return ArmSpec.default().replace(
+        sensor={"beta": tuple(np.linspace(0.9, 0.98, 9)), "delta_m": tuple(np.linspace(-0.002, 0.003, 9))}
+    )
+
+
+@pytest.fixture(scope="module")
+def actor_params():
+    """The default actor, its parameters disturbed so that biases count and actions fill [-1, 1]."""
+    params = Actor(9).init(jax.random.key(0), jnp.zeros(18))
+    leaves, tree = jax.tree.flatten(params)
+    keys = jax.random.split(jax.random.key(1), len(leaves))
+    return tree.unflatten(
+        [x + 0.05 * jax.random.normal(k, x.shape) for x, k in zip(leaves, keys, strict=True)]
+    )
+
+
+@pytest.fixture(scope="module")
+def file(spec, actor_params, make_arm_model, tmp_path_factory):
+    path = tmp_path_factory.mktemp("export") / "policy.npz"
+    save_policy(path, policy_from_actor(actor_params, spec, RewardConfig(), make_arm_model(9), {}))
+    return path
+
+
+@pytest.fixture(scope="module")
+def runner(file):
+    return PolicyRunner(load_policy(file))
+
+
+@pytest.fixture(scope="module")
+def poses():
+    """Poses and goals (N, 6) [mm, deg], wider than the arm's workspace, all angles among them."""
+    rng = np.random.default_rng(2)
+    low, high = [-300, -300, -750, -180, -90, -180], [300, 300, -300, 180, 90, 180]
+    return rng.uniform(low, high, (2, N, 6)).astype(np.float32)
+
+
+def test_loads_and_acts_without_jax(file):
+    root = Path(__file__).resolve().parents[2]
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT_JAX, file], cwd=root, capture_output=True, text=True, timeout=60
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "[]\n", "")
+
+
+def test_equals_actor_and_environment_in_jax(spec, actor_params, runner, poses, monkeypatch):
+    nowhere = Pool(*[np.zeros((1, 6))] * 4)  # the arm does not move here
+    monkeypatch.setattr("mjx_softarm.env.sample_workspace", lambda *_: nowhere)
+    env = ReachEnv(spec)
+    action = mode(Actor(9).apply(actor_params, env.observe(*map(jnp.asarray, poses)))[0])
+    reference = runner.act(*poses)
+    assert np.min(action) < -0.9 and np.max(action) > 0.9 and np.ptp(action, axis=0).min() > 0.5
+    np.testing.assert_allclose(runner.action(*poses), action, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(reference.length_m, env.reference_m(action), rtol=0, atol=1e-5)
+    np.testing.assert_allclose(env.action_of(jnp.asarray(reference.length_m)), action, rtol=0, atol=1e-5)
+    low, high = env.frequency_range_hz.T
+    np.testing.assert_allclose(runner.policy.frequency_hz, np.stack([low, high], axis=-1), rtol=1e-6)
+    np.testing.assert_allclose(
+        reference.frequency_hz, low + 0.5 * (np.asarray(action) + 1.0) * (high - low), rtol=1e-6
+    )
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_full_action_is_the_shortest_or_longest_spring(spec, actor_params, make_arm_model, poses, sign):
+    head = actor_params["params"]["head"]
+    saturating = {"kernel": 0.0 * head["kernel"], "bias": jnp.full(18, 20.0 * sign)}
+    params = {"params": {**actor_params["params"], "head": saturating}}
+    policy = policy_from_actor(params, spec, RewardConfig(), make_arm_model(9), {})
+    reference = PolicyRunner(policy).act(*poses)
+    limit = spec.springs.length_min_m if sign < 0 else spec.springs.length_max_m
+    np.testing.assert_allclose(reference.length_m, np.full((N, 9), limit), rtol=1e-7)
+
+
+def test_one_pose_and_a_batch_agree(runner, poses):
+    batch = runner.act(*poses)
+    one = runner.act(poses[0, 3].tolist(), poses[1, 3].tolist())
+    assert one.frequency_hz.shape == one.length_m.shape == (9,)
+    np.testing.assert_allclose(one.length_m, batch.length_m[3], rtol=1e-6)
+    to_one_goal = runner.act(poses[0].reshape(10, 100, 6), poses[1, 3])
+    assert to_one_goal.length_m.shape == (10, 100, 9)
+    np.testing.assert_allclose(to_one_goal.length_m[0, 3], one.length_m, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["pose", "goal"])
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (np.zeros(3), r"got shape \(3,\), expected \(\.\.\., 6\)"),
+        (0.0, r"got shape \(\), expected \(\.\.\., 6\)"),
+        ([0.0, 0.0, np.nan, 0.0, 0.0, 0.0], "got nan, expected finite numbers"),
+        ([np.inf, 0.0, 0.0, 0.0, 0.0, 0.0], "got inf, expected finite numbers"),
+    ],
+)
+def test_malformed_pose_or_goal_is_refused(runner, name, value, message):
+    arguments = {"pose": np.zeros(6), "goal": np.zeros(6)} | {name: value}
+    with pytest.raises(ValueError, match=f"{name}: {message}"):
+        runner.act(**arguments)
+
+
+@pytest.mark.filterwarnings("ignore:overflow", "ignore:invalid value")
+def test_actor_that_overflows_is_refused(runner):
+    layers = tuple((np.float32(1e30) * weight, bias) for weight, bias in runner.policy.layers)
+    with pytest.raises(ValueError, match="action: got nan, expected finite numbers; the actor overflows"):
+        PolicyRunner(dataclasses.replace(runner.policy, layers=layers)).act(np.full(6, 100.0), np.zeros(6))

@@ -1,0 +1,138 @@
+"""The closed form of the estimator against curves integrated numerically, and NumPy against JAX."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from mjx_softarm.sensing.estimator import (
+    N_CHANGES,
+    Frame,
+    PoseEstimator,
+    SpringModel,
+    chain,
+    constant_curvature,
+    estimate,
+    estimate_frame,
+    expected_springs,
+)
+from mjx_softarm.sensing.pose import frame_from_pose
+
+N, RADIUS_M = 9, 0.067
+ANGLE = np.radians(90.0) + 2 * np.pi * np.arange(N) / 3
+SITE_M = RADIUS_M * np.stack([np.cos(ANGLE), np.sin(ANGLE)], axis=-1)
+STRAIGHT_M = np.full(N, 0.2, np.float32)
+
+
+def springs_of(length_m, towards_rad, bend_rad):
+    """Springs (3,) of one section that bends evenly: each is an arc at its own distance from the centre."""
+    along_m = SITE_M[:3] @ [np.cos(towards_rad), np.sin(towards_rad)]
+    return length_m - bend_rad * along_m
+
+
+def integrated(length_m, towards_rad, bend_rad, n=20_000):
+    """The section's end, by following its centre line downwards in small steps."""
+    axis = np.array([np.sin(towards_rad), -np.cos(towards_rad), 0.0])  # turns -z towards the direction
+    middle = Rotation.from_rotvec(bend_rad * (np.arange(n)[:, None] + 0.5) / n * axis)
+    return middle.apply([0, 0, -length_m]).mean(axis=0), Rotation.from_rotvec(bend_rad * axis).as_matrix()
+
+
+def network(seed, size=1.0, dtype=np.float32):
+    """An estimator with random layers."""
+    rng = np.random.default_rng(seed)
+    layers = tuple(
+        (size * rng.normal(size=(n_in, n_out)) / np.sqrt(n_in), size * 0.1 * rng.normal(size=n_out))
+        for n_in, n_out in ((2 * N, 32), (32, 3 * N_CHANGES))
+    )
+    arrays = (layers, SITE_M, STRAIGHT_M, np.full(N, 0.03), np.repeat([0.003, 0.015], 3))
+    return PoseEstimator(*jax.tree.map(lambda x: np.asarray(x, dtype), arrays))
+
+
+@pytest.mark.parametrize("bend_rad", [0.0, 1e-5, 3e-3, 0.4, 1.7])
+@pytest.mark.parametrize("towards_rad", [0.0, 2.2, -1.0])
+def test_section_of_constant_curvature(bend_rad, towards_rad):
+    spring_m = np.concatenate([springs_of(0.19, towards_rad, bend_rad), [0.2] * 6])
+    section = constant_curvature(SITE_M, spring_m)
+    position_m, rotation = integrated(0.19, towards_rad, bend_rad)
+    np.testing.assert_allclose(section.position_m[0], position_m, atol=1e-9)
+    np.testing.assert_allclose(section.rotation[0], rotation, atol=1e-9)
+    np.testing.assert_allclose(section.position_m[1:], [[0, 0, -0.2]] * 2, atol=1e-12)
+
+
+def test_sections_follow_one_another():
+    shapes = [(0.15, 0.3, 0.9), (0.22, -2.0, 1.4), (0.2, 1.9, 0.6)]
+    even = constant_curvature(SITE_M, np.concatenate([springs_of(*shape) for shape in shapes]))
+    position_m, rotation = np.zeros(3), np.eye(3)
+    for n_sections, shape in enumerate(shapes, 1):
+        plate = chain(Frame(even.position_m[:n_sections], even.rotation[:n_sections]))
+        end_m, turn = integrated(*shape)
+        position_m, rotation = position_m + rotation @ end_m, rotation @ turn
+        np.testing.assert_allclose(plate.position_m, position_m, atol=1e-8)
+        np.testing.assert_allclose(plate.rotation, rotation, atol=1e-8)
+
+
+def test_changes_move_and_turn_the_section_ends():
+    """A network whose outputs are constant: position added, Gibbs vector as a rotation on the left."""
+    rng = np.random.default_rng(0)
+    changes = rng.normal(size=(3, N_CHANGES)) * np.repeat([0.01, 0.2], 3)
+    estimator = network(0, dtype=np.float64)._replace(
+        layers=((np.zeros((2 * N, 18)), changes.ravel()),), change_scale=np.ones(6)
+    )
+    spring_m = 0.2 + 0.03 * rng.normal(size=N)
+    even = constant_curvature(SITE_M, spring_m)
+    angle = 2 * np.arctan(np.linalg.norm(changes[:, 3:], axis=1))
+    axis = changes[:, 3:] / np.linalg.norm(changes[:, 3:], axis=1, keepdims=True)
+    turn = Rotation.from_rotvec(angle[:, None] * axis).as_matrix()
+    expected = chain(Frame(even.position_m + changes[:, :3], turn @ even.rotation))
+    got = estimate_frame(estimator, spring_m)
+    np.testing.assert_allclose(got.position_m, expected.position_m, atol=1e-12)
+    np.testing.assert_allclose(got.rotation, expected.rotation, atol=1e-12)
+    np.testing.assert_allclose(got.rotation @ got.rotation.T, np.eye(3), atol=1e-12)
+
+
+def test_numpy_and_jax_agree_and_batches_are_rows():
+    estimator, rng = network(1), np.random.default_rng(1)
+    spring_m = (0.2 + 0.03 * rng.normal(size=(2, 50, N))).astype(np.float32)
+    pose = estimate(estimator, spring_m)
+    assert pose.shape == (2, 50, 6) and pose.dtype == np.float32
+    in_jax = jax.jit(estimate)(jax.tree.map(jnp.asarray, estimator), jnp.asarray(spring_m))
+    same = [
+        frame_from_pose(np.asarray(x, float)) for x in (pose, in_jax)
+    ]  # near gimbal lock, angles may differ
+    for one, other in zip(*same, strict=True):
+        np.testing.assert_allclose(one, other, atol=2e-5)
+    np.testing.assert_allclose(estimate(estimator, spring_m[1, 7]), pose[1, 7], atol=2e-2)
+    np.testing.assert_allclose(
+        estimate_frame(estimator, spring_m[1, 7]).rotation, same[0][1][1, 7], atol=1e-5
+    )
+    assert estimate(estimator, spring_m.astype(np.float64)).dtype == np.float32
+
+
+def test_straight_arm_has_a_slope():
+    slope = jax.jit(jax.jacobian(lambda s: estimate_frame(network(2), s).position_m))(jnp.asarray(STRAIGHT_M))
+    step = 1e-4 * np.eye(N)
+    double = network(2, dtype=np.float64)
+    ahead, back = (estimate_frame(double, STRAIGHT_M + sign * step).position_m for sign in (1, -1))
+    np.testing.assert_allclose(slope, (ahead - back).T / 2e-4, atol=2e-2)
+    assert np.abs(slope).max() > 0.5
+
+
+def test_nothing_jumps_through_gimbal_lock():
+    """The tip's x axis swept through the vertical: yaw and roll jump by 180 degrees, the frame does not."""
+    share = np.linspace(0.9, 1.1, 400)[:, None]
+    bent = np.concatenate([springs_of(0.2, 0.0, np.pi / 6)] * 3)
+    spring_m = (0.2 + share * (bent - 0.2)).astype(np.float32)
+    estimator = network(3, size=0.1)
+    assert np.abs(estimate(estimator, spring_m)[:, 4]).max() > 85.0
+    frame = estimate_frame(estimator, spring_m)
+    assert np.abs(np.diff(frame.rotation, axis=0)).max() < 2e-3
+    assert np.abs(np.diff(frame.position_m, axis=0)).max() < 1e-3
+
+
+def test_expected_springs_by_hand():
+    weight = np.diag(np.arange(1.0, 10.0)).astype(np.float32)
+    one = np.ones(N, np.float32)
+    model = SpringModel(((weight, 0.5 * one),), -10 * one, 30 * one, 0.2 * one, 0.01 * one)
+    got = expected_springs(model, np.full((4, N), 20.0))
+    np.testing.assert_allclose(got, np.tile(0.2 + 0.01 * (np.arange(1.0, 10.0) + 0.5), (4, 1)), rtol=1e-6)

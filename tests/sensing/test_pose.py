@@ -1,0 +1,148 @@
+"""Poses against SciPy's rotations."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from mjx_softarm.sensing.pose import (
+    frame_from_pose,
+    pose_error,
+    pose_from_frame,
+    pose_from_quaternion,
+    quaternion_from_pose,
+)
+
+RNG = np.random.default_rng(0)
+ROTATIONS = Rotation.random(500, random_state=1)
+POSITIONS_M = RNG.uniform(-1.0, 1.0, (500, 3))
+
+
+@pytest.fixture(autouse=True)
+def _strict():
+    with jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
+        yield
+
+
+def angle_deg(a, b):
+    """Angle of the rotation between two rotation matrices (..., 3, 3)."""
+    return np.rad2deg(Rotation.from_matrix(np.swapaxes(a, -1, -2) @ b).magnitude())
+
+
+def test_straight_arm_has_no_angles():
+    tip = np.array([0.0, 0.0, -0.6])
+    np.testing.assert_array_equal(pose_from_frame(tip, np.eye(3)), [0, 0, -600, 0, 0, 0])
+
+
+@pytest.mark.parametrize(
+    "angles", [(90, 0, 0), (0, 45, 0), (0, 0, 90), (-120, 0, 0), (0, -60, 0), (0, 0, 170)]
+)
+def test_each_angle_turns_about_its_own_axis(angles):
+    axis = int(np.flatnonzero(angles)[0])
+    rotation = Rotation.from_rotvec(np.deg2rad(angles[axis]) * np.eye(3)[2 - axis]).as_matrix()
+    np.testing.assert_allclose(pose_from_frame(np.zeros(3), rotation)[3:], angles, atol=1e-12)
+
+
+def test_pose_from_frame_is_scipy_s_intrinsic_zyx():
+    pose = pose_from_frame(POSITIONS_M, ROTATIONS.as_matrix())
+    np.testing.assert_allclose(pose[:, :3], 1000.0 * POSITIONS_M)
+    np.testing.assert_allclose(pose[:, 3:], ROTATIONS.as_euler("ZYX", degrees=True), atol=1e-9)
+
+
+def test_frame_from_pose_is_scipy_s_intrinsic_zyx():
+    pose = np.concatenate([1000.0 * POSITIONS_M, RNG.uniform(-400.0, 400.0, (500, 3))], axis=-1)
+    position_m, rotation = frame_from_pose(pose)
+    np.testing.assert_allclose(position_m, POSITIONS_M)
+    expected = Rotation.from_euler("ZYX", pose[:, 3:], degrees=True).as_matrix()
+    np.testing.assert_allclose(rotation, expected, atol=1e-12)
+
+
+def test_quaternion_from_pose_is_scipy_s():
+    angles = ROTATIONS.as_euler("ZYX", degrees=True)
+    ours = quaternion_from_pose(np.concatenate([POSITIONS_M, angles], axis=1))
+    theirs = ROTATIONS.as_quat(scalar_first=True)
+    np.testing.assert_allclose(np.abs((ours * theirs).sum(axis=1)), 1.0, atol=1e-12)  # q and -q are one
+
+
+def test_pose_from_quaternion_is_scalar_first_and_ignores_the_length():
+    quaternion = ROTATIONS.as_quat(scalar_first=True) * RNG.uniform(0.9, 1.1, (500, 1))
+    expected = pose_from_frame(POSITIONS_M, ROTATIONS.as_matrix())
+    np.testing.assert_allclose(pose_from_quaternion(POSITIONS_M, quaternion), expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("pitch", [90.0, -90.0, 90.0 - 1e-7, 90.0 - 1e-4, -90.0 + 1e-4, 89.9, -89.9])
+def test_rotation_survives_gimbal_lock_in_float32(pitch):
+    yaw, roll = RNG.uniform(-180.0, 180.0, (2, 100))
+    angles = np.stack([yaw, np.full(100, pitch), roll], axis=-1)
+    rotation = np.float32(Rotation.from_euler("ZYX", angles, degrees=True).as_matrix())
+    pose = jax.vmap(pose_from_frame)(jnp.zeros((100, 3)), jnp.asarray(rotation))
+    assert np.isfinite(pose).all()
+    assert np.abs(pose[:, 4] - pitch).max() < 1e-3
+    _, back = jax.vmap(frame_from_pose)(pose)
+    assert np.max(angle_deg(np.float64(rotation), np.float64(back))) < 1e-3
+
+
+def test_locked_pose_has_no_yaw():
+    rotation = Rotation.from_euler("ZYX", [130.0, 90.0, 10.0], degrees=True).as_matrix()
+    np.testing.assert_allclose(pose_from_frame(np.zeros(3), rotation)[3:], [0.0, 90.0, -120.0], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "angles", [(0, 90, 0), (0, -90, 0), (20, 90, 50), (180, 0, 0), (0, 0, 180), (0, 0, 0)]
+)
+def test_gradients_are_finite_everywhere(angles):
+    exact = Rotation.from_euler("ZYX", angles, degrees=True).as_matrix().round(6)  # true zeros at the lock
+    rotation = jnp.asarray(np.float32(exact))
+    jacobian = jax.jacobian(pose_from_frame, argnums=1)(jnp.zeros(3), rotation)
+    assert np.isfinite(jacobian).all()
+    assert np.any(jacobian[3]) == (abs(angles[1]) != 90)
+
+
+def test_gradient_equals_the_difference_quotient():
+    _, rotation = frame_from_pose(np.array([0.0, 0.0, 0.0, 40.0, -70.0, 110.0]))
+    with jax.enable_x64(True):
+        jacobian = jax.jacobian(pose_from_frame, argnums=1)(jnp.zeros(3), jnp.asarray(rotation))
+    step = 1e-6
+    for row, column in np.ndindex(3, 3):
+        change = np.zeros((3, 3))
+        change[row, column] = step
+        ends = [pose_from_frame(np.zeros(3), rotation + sign * change) for sign in (-1, 1)]
+        np.testing.assert_allclose(jacobian[:, row, column], (ends[1] - ends[0]) / (2 * step), atol=1e-5)
+
+
+def test_pose_error_wraps_angles_only():
+    pose = np.array([400.0, 0.0, -600.0, 179.0, -170.0, 90.0])
+    goal = np.array([0.0, 0.0, 0.0, -179.0, 170.0, -90.0])
+    np.testing.assert_allclose(pose_error(pose, goal), [400.0, 0.0, -600.0, -2.0, 20.0, -180.0])
+    np.testing.assert_allclose(pose_error(goal, pose)[3:], [2.0, -20.0, -180.0])
+    np.testing.assert_array_equal(pose_error(pose, pose), 0.0)
+
+
+def test_pose_error_keeps_small_float32_differences():
+    goal = np.zeros(6, np.float32)
+    pose = np.full(6, 1e-4, np.float32)
+    np.testing.assert_array_equal(pose_error(pose, goal), pose)
+
+
+def test_pose_error_does_not_depend_on_whole_turns():
+    pose, goal = RNG.uniform(-180.0, 180.0, (2, 200, 6))
+    turned = pose + 360.0 * np.array([0, 0, 0, 1, -2, 3])
+    error = pose_error(pose, goal)
+    np.testing.assert_allclose(pose_error(turned, goal), error, atol=1e-9)
+    assert (error[:, 3:] >= -180.0).all() and (error[:, 3:] < 180.0).all()
+    slope = jax.grad(lambda p: pose_error(p, jnp.zeros(6)).sum())(jnp.full(6, 270.0))
+    np.testing.assert_array_equal(slope, 1.0)
+
+
+def test_jax_gives_numpy_s_poses():
+    position, rotation = np.float32(POSITIONS_M), np.float32(ROTATIONS.as_matrix())
+    expected = pose_from_frame(position, rotation)
+    pose = jax.jit(jax.vmap(pose_from_frame))(position, rotation)
+    assert pose.dtype == expected.dtype == np.float32
+    difference = pose_error(np.asarray(pose), expected)
+    steep = np.abs(expected[:, 4]) > 85.0
+    np.testing.assert_allclose(difference[~steep], 0.0, atol=1e-3)
+    quaternion = np.float32(ROTATIONS.as_quat(scalar_first=True))
+    difference = pose_error(jax.jit(jax.vmap(pose_from_quaternion))(position, quaternion), expected)
+    np.testing.assert_allclose(difference[~steep], 0.0, atol=1e-3)

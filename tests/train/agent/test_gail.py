@@ -1,0 +1,130 @@
+"""The learned reward: losses against NumPy and closed forms, and an expert that is recovered by it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from train.agent.gail import Gail, GailConfig, cross_entropy, gradient_penalty, learned_reward
+from train.agent.tqc import TQC, TQCConfig, Transition
+
+RNG = np.random.default_rng(0)
+OBS, ACTION = RNG.normal(size=(64, 5)), RNG.normal(size=(64, 3))
+
+
+def test_cross_entropy_is_that_of_probabilities():
+    expert, agent = RNG.normal(size=40), RNG.normal(size=40)
+    of_expert = [1.0 / (1.0 + np.exp(-h)) for h in (expert, agent)]
+    expected = -np.mean(np.log(of_expert[0])) - np.mean(np.log(1.0 - of_expert[1]))
+    np.testing.assert_allclose(cross_entropy(jnp.array(expert), jnp.array(agent)), expected, rtol=1e-5)
+
+
+def test_cross_entropy_is_least_where_the_expert_is_high():
+    high, low = jnp.full(4, 3.0), jnp.full(4, -3.0)
+    assert cross_entropy(high, low) < cross_entropy(low, low) < cross_entropy(low, high)
+
+
+def test_reward_is_the_papers_log_of_one_minus_the_probability_of_the_agent():
+    logits = np.array([-3.0, -0.2, 0.0, 2.0])
+    probability_of_agent = 1.0 / (1.0 + np.exp(logits))
+    np.testing.assert_allclose(
+        learned_reward(jnp.array(logits)), np.log(1.0 - probability_of_agent), rtol=1e-5
+    )
+
+
+def test_reward_is_finite_far_out_and_never_positive():
+    reward = learned_reward(jnp.array([-1e4, -100.0, 100.0, 1e4]))
+    np.testing.assert_allclose(reward, [-1e4, -100.0, 0.0, 0.0], atol=1e-6)
+    assert (reward <= 0.0).all()
+
+
+def test_penalty_of_a_linear_discriminator():
+    on_obs, on_action = RNG.normal(size=5), RNG.normal(size=3)
+    length = np.sqrt(np.sum(on_obs**2) + np.sum(on_action**2))
+    penalty = gradient_penalty(lambda o, a: o @ on_obs + a @ on_action + 7.0, OBS, ACTION)
+    np.testing.assert_allclose(penalty, (length - 1.0) ** 2, rtol=1e-5)
+
+
+def test_penalty_of_a_quadratic_discriminator():
+    penalty = gradient_penalty(lambda o, a: 0.5 * jnp.sum(o**2, -1) - jnp.sum(a**2, -1), OBS, ACTION)
+    length = np.sqrt(np.sum(OBS**2, axis=1) + np.sum((2.0 * ACTION) ** 2, axis=1))
+    np.testing.assert_allclose(penalty, np.mean((length - 1.0) ** 2), rtol=1e-5)
+
+
+def test_slope_of_the_penalty_of_a_linear_discriminator():
+    # d/dw (|w| - 1)^2 = 2 (|w| - 1) w / |w|
+    w = np.array([0.3, -0.4, 1.2, 0.0, 0.5])
+    slope = jax.grad(lambda w: gradient_penalty(lambda o, a: o @ w + 0.0 * a[..., 0], OBS, ACTION))(w)
+    length = np.linalg.norm(w)
+    np.testing.assert_allclose(slope, 2.0 * (length - 1.0) * w / length, rtol=1e-4, atol=1e-6)
+
+
+def test_penalty_and_its_slope_are_finite_where_the_discriminator_is_flat():
+    value, slope = jax.value_and_grad(
+        lambda w: gradient_penalty(lambda o, a: w * jnp.sum(o, -1) + 0.0 * a[..., 0], OBS, ACTION)
+    )(0.0)
+    assert value == 1.0 and slope == 0.0
+
+
+def test_an_update_descends_on_the_loss_and_its_penalty():
+    gail = Gail(5, 3, GailConfig(hidden=(32, 32), learning_rate=1e-2, input_scale=1.0))
+    state = gail.init(jax.random.PRNGKey(0))
+    expert, agent = (jnp.array(OBS), jnp.array(ACTION)), (jnp.array(OBS), jnp.array(ACTION + 2.0))
+    update = jax.jit(lambda state, key: gail.update(state, expert, agent, key))
+    told = []
+    for key in jax.random.split(jax.random.PRNGKey(1), 100):
+        state, metrics = update(state, key)
+        told.append(metrics)
+    first, last = told[0], told[-1]
+    assert last["discriminator_loss"] < 0.6 * first["discriminator_loss"]
+    assert last["gradient_penalty"] < 0.05 < first["gradient_penalty"]
+    assert last["accuracy"] > 0.9
+
+
+@pytest.mark.parametrize(
+    "change", [{"learning_rate": -1.0}, {"gradient_penalty": -1.0}, {"input_scale": 0.0}]
+)
+def test_a_bad_setting_is_named(change):
+    with pytest.raises(ValueError, match=f"GailConfig.{next(iter(change))}: expected"):
+        GailConfig(**change)
+
+
+def test_an_expert_is_recovered_from_its_actions_alone():
+    """Eight goals in the plane; the reward is the learned one, a quarter of a batch the expert's."""
+    goals = jnp.asarray(np.random.default_rng(1).uniform(-1.0, 1.0, (8, 2)), jnp.float32)
+    answers = jnp.stack(
+        [0.7 * jnp.sin(2.0 * goals[:, 0]), 0.5 * goals[:, 1] - 0.3 * goals[:, 0] ** 2], axis=-1
+    )
+    n = 1600
+    gail = Gail(2, 2, GailConfig(hidden=(64, 64), learning_rate=1e-3))
+    config = TQCConfig(
+        hidden_actor=(64, 64),
+        hidden_critic=(64, 64),
+        learning_rate=1e-3,
+        learning_rate_end=0.02,
+        initial_alpha=0.02,
+        learning_rate_alpha=1e-2,
+        target_entropy=-6.0,
+        reward_scale=10.0,
+    )
+    tqc = TQC(2, 2, config, n_updates=n)
+
+    def update(states, key):
+        agent, discriminator = states
+        key_goal, key_act, key_gail, key_tqc = jax.random.split(key, 4)
+        k = jax.random.randint(key_goal, (64,), 0, 8)
+        goal, action = goals[k], tqc.act(agent.actor_params, goals[k], key_act)
+        discriminator, _ = gail.update(discriminator, (goal, answers[k]), (goal, action), key_gail)
+        action = jnp.concatenate([answers[k][:16], action[16:]])
+        reward = gail.reward(discriminator.params, goal, action)
+        batch = Transition(goal, action, reward, goal, jnp.ones(64))
+        return (tqc.update(agent, batch, key_tqc)[0], discriminator), None
+
+    def error(agent):
+        return float(jnp.mean(jnp.abs(tqc.act_mode(agent.actor_params, goals) - answers)))
+
+    states = (tqc.init(jax.random.PRNGKey(0)), gail.init(jax.random.PRNGKey(1)))
+    before = error(states[0])
+    run = jax.jit(lambda states, keys: jax.lax.scan(update, states, keys)[0])
+    agent, _ = run(states, jax.random.split(jax.random.PRNGKey(3), n))
+    assert error(agent) < 0.07 < 0.2 < before

@@ -1,0 +1,143 @@
+"""Networks against NumPy, and the squashed Gaussian against the change of variables."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from train.agent.networks import Actor, Critics, mode, sample_action, squash
+
+OBS, ACTION = 3, 2
+
+
+@pytest.fixture(autouse=True, scope="module")
+def strict():
+    with jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
+        yield
+
+
+def numpy_dense(layer, x):
+    return x @ np.asarray(layer["kernel"], np.float64) + np.asarray(layer["bias"], np.float64)
+
+
+def relu(x):
+    return np.maximum(x, 0.0)
+
+
+def test_actor_equals_the_same_layers_written_in_numpy():
+    actor = Actor(ACTION, hidden=(5, 4))
+    obs = jax.random.normal(jax.random.key(0), (6, OBS))
+    params = jax.jit(actor.init)(jax.random.key(1), obs)
+    mean, log_std = actor.apply(params, obs)
+
+    layers = params["params"]
+    x = np.asarray(obs, np.float64)
+    head = numpy_dense(
+        layers["head"], relu(numpy_dense(layers["hidden_1"], relu(numpy_dense(layers["hidden_0"], x))))
+    )
+    # Sums of fewer than 10 terms of order one, three layers deep: float32 leaves about 1e-6.
+    np.testing.assert_allclose(mean, head[:, :ACTION], atol=1e-5)
+    np.testing.assert_allclose(log_std, head[:, ACTION:], atol=1e-5)
+
+
+def test_log_std_is_clipped_at_both_ends():
+    actor = Actor(1, hidden=())
+    params = {"params": {"head": {"kernel": jnp.array([[0.0, 100.0]]), "bias": jnp.zeros(2)}}}
+    _, log_std = actor.apply(params, jnp.array([[-1.0], [1.0]]))
+    np.testing.assert_array_equal(log_std, [[-20.0], [2.0]])
+
+
+def test_each_critic_equals_its_own_network_in_numpy():
+    n_critics, width = 3, 5
+    critics = Critics(n_critics, n_quantiles=4, hidden=(width, 6))
+    obs = jax.random.normal(jax.random.key(0), (7, OBS))
+    action = jax.random.uniform(jax.random.key(1), (7, ACTION))
+    params = jax.jit(critics.init)(jax.random.key(2), obs, action)
+    quantiles = critics.apply(params, obs, action)
+    assert quantiles.shape == (7, n_critics, 4)
+
+    layers = params["params"]
+    x = np.concatenate([obs, action], axis=-1).astype(np.float64)
+    for c in range(n_critics):
+        first = relu(numpy_dense(layers["hidden_0"], x)[:, c * width : (c + 1) * width])
+        expected = numpy_dense(
+            layers[f"critic_{c}_head"], relu(numpy_dense(layers[f"critic_{c}_hidden_1"], first))
+        )
+        np.testing.assert_allclose(quantiles[:, c], expected, atol=1e-5)
+
+
+def test_layer_norm_makes_a_critic_blind_to_the_scale_of_its_first_layer():
+    critics = Critics(2, n_quantiles=4, hidden=(8,), layer_norm=True)
+    obs, action = jnp.ones((1, OBS)), jnp.full((1, ACTION), 0.5)
+    params = jax.jit(critics.init)(jax.random.key(0), obs, action)
+    first = params["params"]["hidden_0"]
+    scaled = {"params": {**params["params"], "hidden_0": jax.tree.map(lambda leaf: 10.0 * leaf, first)}}
+    # LayerNorm adds 1e-6 to a variance of order one, hence equality up to about 1e-6.
+    np.testing.assert_allclose(
+        critics.apply(scaled, obs, action), critics.apply(params, obs, action), atol=1e-5
+    )
+
+
+def test_networks_map_over_any_leading_axes():
+    actor, critics = Actor(ACTION, (4,)), Critics(2, 3, (4,))
+    obs, action = jnp.ones((OBS,)), jnp.ones((ACTION,))
+    actor_params = jax.jit(actor.init)(jax.random.key(0), obs)
+    critic_params = jax.jit(critics.init)(jax.random.key(0), obs, action)
+    batch_obs, batch_action = jnp.ones((5, 6, OBS)), jnp.ones((5, 6, ACTION))
+    assert actor.apply(actor_params, obs)[0].shape == (ACTION,)
+    assert actor.apply(actor_params, batch_obs)[1].shape == (5, 6, ACTION)
+    assert critics.apply(critic_params, obs, action).shape == (2, 3)
+    assert critics.apply(critic_params, batch_obs, batch_action).shape == (5, 6, 2, 3)
+
+
+def test_log_prob_equals_the_numerical_change_of_variables():
+    mean, log_std, noise = (np.array(x) for x in ([0.3, -0.8], [-0.5, 0.4], [1.1, -0.6]))
+    action, log_prob = squash(*(jnp.asarray(x, jnp.float32) for x in (mean, log_std, noise)))
+
+    std = np.exp(log_std)
+    u, h = mean + std * noise, 1e-6
+    density_u = np.exp(-0.5 * noise**2) / (std * np.sqrt(2 * np.pi))
+    da_du = (np.tanh(u + h) - np.tanh(u - h)) / (2 * h)  # central difference, good to about 1e-10
+    np.testing.assert_allclose(action, np.tanh(u), rtol=1e-6)
+    np.testing.assert_allclose(log_prob, np.sum(np.log(density_u / da_du)), rtol=1e-5)
+
+
+def test_density_over_actions_integrates_to_one():
+    mean, log_std = 0.4, -0.3
+    action = np.linspace(-1.0, 1.0, 20_001)[1:-1]
+    noise = (np.arctanh(action) - mean) / np.exp(log_std)
+    column = jnp.asarray(noise, jnp.float32)[:, None]
+    _, log_prob = squash(jnp.full_like(column, mean), jnp.full_like(column, log_std), column)
+    # Rectangle rule: the density vanishes smoothly at both ends.
+    assert np.sum(np.exp(np.asarray(log_prob, np.float64))) * 1e-4 == pytest.approx(1.0, abs=1e-4)
+
+
+@pytest.mark.parametrize("pre_squash", [-40.0, -12.0, 12.0, 40.0])
+def test_log_prob_and_its_gradient_stay_exact_where_tanh_rounds_to_one(pre_squash):
+    def log_prob(mean):
+        return squash(mean, jnp.zeros(1), jnp.zeros(1))[1]
+
+    value, gradient = jax.value_and_grad(log_prob)(jnp.array([pre_squash]))
+    log_cosh = np.logaddexp(pre_squash, -pre_squash) - np.log(2.0)
+    # log(1 - tanh(u)^2) = -2 log cosh u, with the derivative -2 tanh u.
+    assert value == pytest.approx(-0.5 * np.log(2 * np.pi) + 2.0 * log_cosh, rel=1e-6)
+    assert gradient[0] == pytest.approx(2.0 * np.tanh(pre_squash), rel=1e-6)
+
+
+def test_samples_follow_the_squashed_gaussian():
+    n, mean, log_std = 20_000, 0.5, -1.0
+    draw = jax.jit(lambda key: sample_action(jnp.full((n, 1), mean), jnp.full((n, 1), log_std), key))
+    action, log_prob = draw(jax.random.key(0))
+    assert action.shape == (n, 1) and log_prob.shape == (n,)
+    assert np.all(np.abs(action) < 1.0)
+    pre_squash = np.arctanh(np.asarray(action, np.float64))
+    std = np.exp(log_std)
+    # Five standard errors of a sample mean, std / sqrt(n), and of a sample deviation, std / sqrt(2 n).
+    assert np.mean(pre_squash) == pytest.approx(mean, abs=5 * std / np.sqrt(n))
+    assert np.std(pre_squash) == pytest.approx(std, abs=5 * std / np.sqrt(2 * n))
+
+
+def test_mode_is_the_action_without_noise():
+    mean = jnp.array([[-1.0, 0.0, 2.0]])
+    action, _ = squash(mean, jnp.ones_like(mean), jnp.zeros_like(mean))
+    np.testing.assert_array_equal(mode(mean), action)

@@ -1,0 +1,310 @@
+"""Losses against loops in NumPy, and one update against what it must and must not depend on."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from train.agent import losses
+from train.agent.networks import squash
+from train.agent.tqc import TQC, TQCConfig, Transition
+
+B, OBS, ACTION, C, M, DROP = 4, 3, 2, 2, 5, 1
+K = C * (M - DROP)
+CONFIG = TQCConfig(
+    hidden_actor=(8,),
+    hidden_critic=(8, 8),
+    n_critics=C,
+    n_quantiles=M,
+    n_drop_per_critic=DROP,
+    learning_rate=1e-2,
+    learning_rate_alpha=1e-2,
+    tau=0.1,
+    reward_scale=2.0,
+)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def strict():
+    # Ranks only: optax's Adam raises a float to an integer power, which strict dtypes refuse.
+    with jax.numpy_rank_promotion("raise"):
+        yield
+
+
+@pytest.fixture
+def strict_dtypes():
+    with jax.numpy_dtype_promotion("strict"):
+        yield
+
+
+@pytest.fixture(scope="module")
+def agent():
+    return TQC(OBS, ACTION, CONFIG)
+
+
+@pytest.fixture(scope="module")
+def init(agent):
+    return jax.jit(agent.init)
+
+
+@pytest.fixture(scope="module")
+def state(init):
+    """Target critics unlike the critics, as after some updates."""
+    return init(jax.random.key(0))._replace(target_params=init(jax.random.key(1)).critic_params)
+
+
+@pytest.fixture(scope="module")
+def update(agent):
+    return jax.jit(agent.update)
+
+
+def make_batch(seed=0, terminated=0.0):
+    rng = np.random.default_rng(seed)
+
+    def draw(*shape):
+        return jnp.asarray(rng.normal(size=shape), jnp.float32)
+
+    return Transition(
+        obs=draw(B, OBS),
+        action=jnp.tanh(draw(B, ACTION)),
+        reward=draw(B),
+        next_obs=draw(B, OBS),
+        terminated=jnp.full(B, terminated),
+    )
+
+
+def equal(tree_a, tree_b):
+    return jax.tree.all(jax.tree.map(np.array_equal, tree_a, tree_b))
+
+
+def quantile_huber_by_loops(quantiles, targets):
+    total, n = 0.0, 0
+    for b in range(quantiles.shape[0]):
+        for c in range(quantiles.shape[1]):
+            for m in range(quantiles.shape[2]):
+                for k in range(targets.shape[1]):
+                    delta = targets[b, k] - quantiles[b, c, m]
+                    huber = 0.5 * delta**2 if abs(delta) <= 1.0 else abs(delta) - 0.5
+                    total += abs((m + 0.5) / quantiles.shape[2] - (delta < 0.0)) * huber
+                    n += 1
+    return total / n
+
+
+@pytest.fixture
+def quantiles_and_targets():
+    rng = np.random.default_rng(0)  # differences on both sides of zero and of the Huber corner at one
+    return rng.normal(size=(B, C, M)), 2.0 * rng.normal(size=(B, K))
+
+
+def test_quantile_huber_loss_equals_loops_over_every_pair(quantiles_and_targets, strict_dtypes):
+    quantiles, targets = quantiles_and_targets
+    loss = jax.jit(losses.quantile_huber_loss)(
+        jnp.asarray(quantiles, jnp.float32), jnp.asarray(targets, jnp.float32)
+    )
+    # 320 terms of order one in float32.
+    assert loss == pytest.approx(quantile_huber_by_loops(quantiles, targets), rel=1e-5)
+
+
+def test_quantile_huber_gradient_equals_finite_differences(quantiles_and_targets, strict_dtypes):
+    quantiles, targets = quantiles_and_targets
+    d_quantiles, d_targets = jax.jit(jax.grad(losses.quantile_huber_loss, argnums=(0, 1)))(
+        jnp.asarray(quantiles, jnp.float32), jnp.asarray(targets, jnp.float32)
+    )
+    h = 1e-5  # the loss is piecewise quadratic: a central difference is exact away from its corners
+    expected = np.zeros_like(quantiles)
+    for index in np.ndindex(quantiles.shape):
+        step = np.zeros_like(quantiles)
+        step[index] = h
+        above = quantile_huber_by_loops(quantiles + step, targets)
+        expected[index] = (above - quantile_huber_by_loops(quantiles - step, targets)) / (2 * h)
+    np.testing.assert_allclose(d_quantiles, expected, atol=1e-6)  # entries of order 1 / (B C M) = 0.025
+    np.testing.assert_array_equal(d_targets, 0.0)
+
+
+def test_quantile_huber_loss_is_least_at_the_quantiles_of_the_targets():
+    # Targets a thousand times wider than the Huber corner: the loss is the plain quantile loss there.
+    targets = 1e3 * jnp.arange(1.0, 101.0)[None, :]
+    candidates = jnp.array([30e3, 50.5e3, 70e3])  # one quantile, hence the median is best
+    at_each = jax.jit(
+        jax.vmap(lambda quantile: losses.quantile_huber_loss(quantile[None, None, None], targets))
+    )
+    below, median, above = at_each(candidates)
+    assert median < below and median < above
+
+
+@pytest.mark.parametrize("n_drop", [0, 1, 4, 9])
+def test_drop_largest_keeps_what_a_sort_keeps_also_with_ties(n_drop, strict_dtypes):
+    rng = np.random.default_rng(n_drop)
+    samples = rng.integers(-3, 4, size=(50, 10)).astype(np.float32)
+    kept = np.asarray(jax.jit(losses.drop_largest, static_argnums=1)(jnp.asarray(samples), n_drop))
+    np.testing.assert_array_equal(np.sort(kept, axis=-1), np.sort(samples, axis=-1)[:, : 10 - n_drop])
+
+
+def test_truncated_targets_equal_loops_over_sorted_pools(strict_dtypes):
+    rng = np.random.default_rng(1)
+    next_quantiles, next_log_prob, reward = rng.normal(size=(B, C, M)), rng.normal(size=B), rng.normal(size=B)
+    terminated, alpha, gamma = np.array([0.0, 1.0, 0.0, 1.0]), 0.3, 0.9
+    inputs = (next_quantiles, next_log_prob, reward, terminated, alpha)
+    targets = losses.truncated_targets(
+        *(jnp.asarray(x, jnp.float32) for x in inputs), gamma=gamma, n_drop_per_critic=DROP
+    )
+    assert targets.shape == (B, K)
+    for b in range(B):
+        pool = sorted(next_quantiles[b].ravel())[:K]
+        soft = [z - alpha * next_log_prob[b] for z in pool]
+        expected = [reward[b] + gamma * (1.0 - terminated[b]) * z for z in soft]
+        np.testing.assert_allclose(np.sort(targets[b]), np.sort(expected), rtol=1e-5, atol=1e-6)
+
+
+def test_actor_loss_equals_loops(strict_dtypes):
+    rng = np.random.default_rng(2)
+    log_prob, quantiles, alpha = rng.normal(size=B), rng.normal(size=(B, C, M)), 0.3
+    expected = sum(alpha * log_prob[b] - sum(quantiles[b].ravel()) / (C * M) for b in range(B)) / B
+    got = losses.actor_loss(*(jnp.asarray(x, jnp.float32) for x in (log_prob, quantiles, alpha)))
+    assert got == pytest.approx(expected, rel=1e-5)
+
+
+def test_alpha_loss_equals_loops_and_its_gradient_is_the_entropy_above_target(strict_dtypes):
+    log_prob, log_alpha, target = np.array([0.5, -1.5, 2.0, 1.0]), -0.7, -2.0
+    value, slope = jax.value_and_grad(losses.alpha_loss)(
+        jnp.asarray(log_alpha, jnp.float32), jnp.asarray(log_prob, jnp.float32), target
+    )
+    assert value == pytest.approx(sum(-log_alpha * (p + target) for p in log_prob) / B, rel=1e-6)
+    # Entropy -0.5 is above its target -2: descending the positive slope lowers alpha.
+    assert slope == pytest.approx(-np.mean(log_prob) - target, rel=1e-6)
+
+
+def test_update_is_one_adam_step_on_each_loss_at_the_incoming_state(agent, state, update):
+    batch, key = make_batch(), jax.random.key(1)
+    got, metrics = update(state, batch, key)
+    noise, next_noise = jax.random.normal(key, (2, B, ACTION))
+    alpha = jnp.exp(state.log_alpha)
+
+    @jax.jit
+    def next_step(state):
+        action, log_prob = squash(*agent.actor.apply(state.actor_params, batch.next_obs), next_noise)
+        return agent.critics.apply(state.target_params, batch.next_obs, action), log_prob
+
+    next_quantiles, next_log_prob = map(np.asarray, next_step(state))
+    pools = np.sort(next_quantiles.reshape(B, C * M))[:, :K]
+    reward = CONFIG.reward_scale * np.asarray(batch.reward)[:, None]
+    targets = reward + CONFIG.gamma * (pools - alpha * next_log_prob[:, None])
+
+    def critic_objective(params):
+        return losses.quantile_huber_loss(
+            agent.critics.apply(params, batch.obs, batch.action), jnp.asarray(targets)
+        )
+
+    def actor_objective(params):
+        action, log_prob = squash(*agent.actor.apply(params, batch.obs), noise)
+        quantiles = agent.critics.apply(state.critic_params, batch.obs, action)
+        return losses.actor_loss(log_prob, quantiles, alpha), jnp.mean(log_prob)
+
+    loss_critic, d_critic = jax.jit(jax.value_and_grad(critic_objective))(state.critic_params)
+    actor_grad = jax.jit(jax.value_and_grad(actor_objective, has_aux=True))
+    (loss_actor, mean_log_prob), d_actor = actor_grad(state.actor_params)
+    d_log_alpha = -mean_log_prob + ACTION  # the target entropy is minus the number of actions
+    assert metrics["critic_loss"] == pytest.approx(float(loss_critic), rel=1e-5)
+    assert metrics["actor_loss"] == pytest.approx(float(loss_actor), rel=1e-5)
+    assert metrics["entropy"] == pytest.approx(-float(mean_log_prob), rel=1e-5)
+    for grads, opt_state, before, after in (
+        (d_critic, got.critic_opt_state, state.critic_params, got.critic_params),
+        (d_actor, got.actor_opt_state, state.actor_params, got.actor_params),
+        (d_log_alpha, got.alpha_opt_state, state.log_alpha, got.log_alpha),
+    ):
+        momentum = optax.tree.get(opt_state, "mu")
+        for g, mu, old, new in zip(*map(jax.tree.leaves, (grads, momentum, before, after)), strict=True):
+            g, mu, old, new = (np.asarray(x, np.float64) for x in (g, mu, old, new))
+            np.testing.assert_allclose(mu, 0.1 * g, rtol=1e-4, atol=1e-7)  # Adam's first moment, 1 - b1 = 0.1
+            # Adam's first step is rate * g / (|g| + 1e-8): the gradient's sign, but for rounding about zero.
+            step, certain = CONFIG.learning_rate * g / (np.abs(g) + 1e-8), np.abs(g) > 1e-6
+            np.testing.assert_allclose((old - new)[certain], step[certain], atol=2e-2 * CONFIG.learning_rate)
+
+
+@pytest.mark.parametrize(
+    "network, average", [("critic_params", "target_params"), ("actor_params", "mean_actor_params")]
+)
+def test_averages_move_by_tau_towards_the_new_networks(state, init, update, network, average):
+    before = state._replace(**{average: getattr(init(jax.random.key(7)), network)})
+    got, _ = update(before, make_batch(), jax.random.key(1))
+    trees = getattr(got, network), getattr(before, average), getattr(got, average)
+    for new, old, mean in zip(*map(jax.tree.leaves, trees), strict=True):
+        expected = (1.0 - CONFIG.tau) * np.asarray(old) + CONFIG.tau * np.asarray(new)
+        np.testing.assert_allclose(mean, expected, atol=1e-6)
+
+
+def test_averages_begin_with_the_networks(init):
+    state = init(jax.random.key(2))
+    assert equal(state.critic_params, state.target_params)
+    assert equal(state.actor_params, state.mean_actor_params)
+
+
+def test_actor_and_temperature_do_not_reach_the_critics_of_terminated_steps(init, state, update):
+    # Where every step terminates the targets are the rewards, so another actor and temperature may change
+    # nothing in the critics, unless the actor's loss leaked into their gradient.
+    batch, key = make_batch(terminated=1.0), jax.random.key(1)
+    other = state._replace(actor_params=init(jax.random.key(7)).actor_params, log_alpha=jnp.float32(-3.0))
+    got, _ = update(state, batch, key)
+    got_other, _ = update(other, batch, key)
+    assert equal(got.critic_params, got_other.critic_params)
+    assert equal(got.critic_opt_state, got_other.critic_opt_state)
+    assert not equal(got.actor_params, got_other.actor_params)
+
+
+def test_terminated_steps_ignore_the_next_observation_and_all_others_bootstrap_from_it(state, update):
+    def critics_after(terminated, next_seed):
+        batch = make_batch(terminated=terminated)._replace(next_obs=make_batch(next_seed).next_obs)
+        return update(state, batch, jax.random.key(1))[0].critic_params
+
+    assert equal(critics_after(1.0, next_seed=0), critics_after(1.0, next_seed=5))
+    assert not equal(critics_after(0.0, next_seed=0), critics_after(0.0, next_seed=5))
+
+
+def test_update_is_traced_once_over_many_calls_with_the_state_donated(agent, init):
+    n_traces = 0
+
+    def counted(*args):
+        nonlocal n_traces
+        n_traces += 1
+        return agent.update(*args)
+
+    step, state = jax.jit(counted, donate_argnums=0), init(jax.random.key(3))
+    for i in range(5):
+        state, metrics = step(state, make_batch(seed=i, terminated=float(i % 2)), jax.random.key(i))
+    assert n_traces == 1
+    assert state.step == 5
+    assert all(np.isfinite(value) and value.shape == () for value in metrics.values())
+
+
+def test_acting_samples_around_the_mode(agent, state):
+    obs = jnp.ones((OBS,))
+    mean, log_std = agent.actor.apply(state.actor_params, obs)
+    key = jax.random.key(4)
+    np.testing.assert_allclose(agent.act_mode(state.actor_params, obs), np.tanh(mean), rtol=1e-6)
+    expected = np.tanh(mean + np.exp(log_std) * jax.random.normal(key, (ACTION,)))
+    np.testing.assert_allclose(agent.act(state.actor_params, obs, key), expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("field", Transition._fields)
+def test_a_batch_field_of_the_wrong_shape_is_named(agent, state, field):
+    batch = make_batch()
+    wrong = batch._replace(**{field: getattr(batch, field)[..., None]})
+    with pytest.raises(ValueError, match=rf"Transition\.{field}: expected shape .* got "):
+        agent.update(state, wrong, jax.random.key(0))
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("hidden_critic", ()),
+        ("n_critics", 0),
+        ("n_drop_per_critic", 25),
+        ("gamma", 1.5),
+        ("tau", 0.0),
+        ("initial_alpha", 0.0),
+    ],
+)
+def test_config_names_the_field_out_of_range(field, value):
+    with pytest.raises(ValueError, match=rf"TQCConfig\.{field}: expected .* got"):
+        TQCConfig(**{field: value})

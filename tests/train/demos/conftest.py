@@ -1,0 +1,38 @@
+"""What tests of demonstrations share: one expert, compiled once."""
+
+import numpy as np
+import pytest
+
+from mjx_softarm.mechanics.pipe import CrossPipe
+from mjx_softarm.sensing.s2r import N_POSE_INPUTS, N_POSE_OUTPUTS, S2R
+from train.demos.expert import Expert
+
+SHIFT_MM = (4.0, -3.0, 2.0)
+
+
+@pytest.fixture(scope="session")
+def shift_mm():
+    """What the network of `expert` adds to every simulated tip."""
+    return np.array(SHIFT_MM)
+
+
+@pytest.fixture(scope="session")
+def shifting_s2r(spec):
+    """A sim-to-real network that moves every tip alike."""
+    n_in = N_POSE_INPUTS + spec.n_chambers
+    output = np.float32([*SHIFT_MM, 0.0, 0.0, 0.0])
+    return S2R(
+        layers=((np.zeros((n_in, N_POSE_OUTPUTS), np.float32), output),),
+        input_low=np.full(n_in, -1.0, np.float32),
+        input_high=np.full(n_in, 1.0, np.float32),
+        output_low=np.full(N_POSE_OUTPUTS, -10.0, np.float32),
+        output_high=np.full(N_POSE_OUTPUTS, 10.0, np.float32),
+        anchors=np.zeros((1, n_in), np.float32),
+        limit=np.float32(1.0),
+    )
+
+
+@pytest.fixture(scope="session")
+def expert(spec, shifting_s2r):
+    """The paper's arm in the 300 mm pipe, believed to be off by `shift_mm`."""
+    return Expert(spec, shifting_s2r, CrossPipe.of_mm(300))

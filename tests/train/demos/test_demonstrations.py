@@ -1,0 +1,141 @@
+"""Files of demonstrations: actions against the environment's actions; each planted mistake by name."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from mjx_softarm import ArmSpec
+from mjx_softarm.logs.checks import LogError
+from mjx_softarm.logs.schema import Log, log_table, write_log
+from mjx_softarm.sensing.pose import frame_from_pose
+from mjx_softarm.sensing.sensors import SensorParams, frequency_from_length
+from train.demos.demonstrations import load_demonstrations, read_demonstrations
+
+SPEC = ArmSpec.default()
+SEQUENCE = np.array([0, 0, 0, 5, 2, 2])
+
+
+def demonstration_log(**changes):
+    rng = np.random.default_rng(0)
+    spring_m = rng.uniform(0.12, 0.22, (6, 9))
+    values = {
+        "time_s": np.array([0.0, 3.0, 8.0, 2.0, 9.0, 9.5]),  # the fourth row was another recording
+        "frequency_hz": frequency_from_length(spring_m, SensorParams.from_spec(SPEC)),
+        "spring_m": spring_m,
+        "tip_m": rng.uniform([-0.1, -0.1, -0.6], [0.1, 0.1, -0.5], (6, 3)),
+        "tip_quaternion": np.tile([np.cos(0.1), 0.0, np.sin(0.1), 0.0], (6, 1)),
+        "sequence": SEQUENCE,
+    }
+    return Log(source="demos", row=np.arange(6) + 2, **(values | changes))
+
+
+@pytest.fixture
+def file(tmp_path):
+    """Writes a log with changes: group -> (row, column, value)."""
+
+    def write(name="demos.csv", without=(), **changes):
+        values = {group: np.array(getattr(demonstration_log(), group), float) for group in changes}
+        for group, (row, column, value) in changes.items():
+            values[group].reshape(6, -1)[row, column] = value
+        log = dataclasses.replace(demonstration_log(**values), **dict.fromkeys(without))
+        write_log(tmp_path / name, log)
+        return tmp_path / name
+
+    return write
+
+
+@pytest.mark.parametrize("name", ["demos.csv", "demos.npz"])
+def test_rows_are_positions_and_the_actions_that_lead_there(file, env, name):
+    log, demos = demonstration_log(), load_demonstrations(file(name), SPEC)
+    np.testing.assert_array_equal(demos.sequence, SEQUENCE)
+    assert demos.positions.dtype == demos.actions.dtype == np.float32
+    # The action is the one with which the environment asks for these springs, and with which it gets them.
+    np.testing.assert_allclose(demos.actions, env.action_of(log.spring_m.astype(np.float32)), atol=2e-5)
+    np.testing.assert_allclose(env.reference_m(demos.actions), log.spring_m, atol=1e-6)
+    position_m, rotation = frame_from_pose(demos.positions.astype(float))
+    np.testing.assert_allclose(position_m, log.tip_m, atol=1e-7)
+    turn = [[np.cos(0.2), 0, np.sin(0.2)], [0, 1, 0], [-np.sin(0.2), 0, np.cos(0.2)]]  # 0.2 rad about y
+    np.testing.assert_allclose(rotation, np.tile(turn, (6, 1, 1)), atol=1e-6)
+
+
+def test_a_single_row_is_enough(tmp_path):
+    write_log(tmp_path / "one.csv", demonstration_log().take([3]))
+    demos = load_demonstrations(tmp_path / "one.csv", SPEC)
+    assert demos.positions.shape == (1, 6) and demos.sequence.tolist() == [5]
+
+
+LOW, HIGH = (
+    1e-6
+    * frequency_from_length(
+        np.array([[SPEC.springs.length_min_m], [SPEC.springs.length_max_m]]), SensorParams.from_spec(SPEC)
+    )[:, 0]
+)
+MISTAKES = {
+    "NaN": ({"frequency_hz": (4, 3, np.nan)}, "line 6: frequency3: got nan, expected a number"),
+    "no orientation": ({"tip_quaternion": (1, 2, np.nan)}, "line 3: tip_qy: got nan, expected a number"),
+    "no time": ({"time_s": (2, 0, np.inf)}, "line 4: time: got inf, expected a number"),
+    "short": (
+        {"frequency_hz": (0, 8, 1e6 * LOW - 10)},
+        f"line 2: frequency8: got {1e6 * LOW - 10:.7g} Hz, expected {1e6 * LOW:.7g} to {1e6 * HIGH:.7g}",
+    ),
+    "long": ({"frequency_hz": (5, 0, 1e6 * HIGH + 10)}, "line 7: frequency0: got "),
+    "MHz for Hz": ({"frequency_hz": (5, 0, 4.2)}, "line 7: frequency0: got 4.2 Hz, expected "),
+    "m for mm": ({"tip_m": (2, 2, -600.0)}, "line 4: tip_x..z: got "),
+    "above the base": ({"tip_m": (2, 2, 0.3)}, "a tip below the base and within 825 mm of it"),
+    "no rotation": (
+        {"tip_quaternion": (3, 0, 0.5)},
+        "line 5: tip_qw..qz: got length 0.5099, expected unit quaternions",
+    ),
+    "no id": ({"sequence": (1, 0, 0.5)}, "line 3: sequence: got 0.5, expected an integer >= 0"),
+    "negative id": ({"sequence": (3, 0, -1)}, "line 5: sequence: got -1, expected an integer >= 0"),
+    "back in time": (
+        {"time_s": (1, 0, 8.5)},
+        "line 4: time: got 8 s after 8.5 s, expected time's order in a sequence",
+    ),
+    "in two pieces": (
+        {"sequence": (5, 0, 0)},
+        "line 7: sequence: got 0 again after 2, expected a sequence in one piece",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", ["demos.csv", "demos.npz"])
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_planted_mistake_is_named(file, mistake, name):
+    changes, message = MISTAKES[mistake]
+    path = file(name, **changes)
+    with pytest.raises(LogError) as error:
+        load_demonstrations(path, SPEC)
+    assert len(error.value.findings) == 1
+    assert str(error.value).startswith(f"{path}: line ") and message in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("group", "message"),
+    [
+        ("frequency_hz", "line 1: frequency0: missing, expected columns `frequency0 [Hz]` to `frequency8`"),
+        ("tip_m", "line 1: tip_x: missing, expected columns `tip_x [mm]` to `tip_z`"),
+        ("tip_quaternion", "line 1: tip_qw: missing, expected columns `tip_qw [1]` to `tip_qz`"),
+        ("sequence", "line 1: sequence: missing, expected a column `sequence [1]`"),
+    ],
+)
+def test_missing_columns(file, group, message):
+    with pytest.raises(LogError, match="demos.csv") as error:
+        load_demonstrations(file(without=[group]), SPEC)
+    assert message in str(error.value)
+
+
+def test_every_mistake_has_a_line_and_unknown_columns_are_told(tmp_path, file):
+    columns, table = log_table(demonstration_log())
+    table[2, 1] = table[4, 1] = 0.0
+    header = ",".join([*(column.header for column in columns), "colour [1]"])
+    path = tmp_path / "colour.csv"
+    np.savetxt(path, np.column_stack([table, np.zeros(6)]), "%.9g", ",", header=header, comments="")
+    with pytest.raises(LogError) as error:
+        load_demonstrations(path, SPEC)
+    assert [finding.rows for finding in error.value.findings] == [(4, 4), (6, 6)]
+    table[[2, 4], 1] = table[0, 1]
+    np.savetxt(path, np.column_stack([table, np.zeros(6)]), "%.9g", ",", header=header, comments="")
+    log, extra = read_demonstrations(path, SPEC)
+    assert len(log) == 6 and [finding.column for finding in extra] == ["colour"]

@@ -1,0 +1,218 @@
+"""Demonstrations recorded on an arm that is not where its expert believes it to be, by plan and by keys."""
+
+import functools
+import io
+
+import jax
+import numpy as np
+import pytest
+
+from mjx_softarm import ArmSpec
+from mjx_softarm.deploy.arm_io import Capture
+from mjx_softarm.mechanics.kinematics import chain_frames
+from mjx_softarm.mechanics.settle import settle_pressures
+from mjx_softarm.mechanics.statics import ArmParams
+from mjx_softarm.sensing.pose import pose_from_frame, quaternion_from_pose
+from mjx_softarm.sensing.s2r import S2R_FILE, save_s2r
+from mjx_softarm.sensing.sensors import SensorParams, frequency_from_length
+from train.__main__ import main
+from train.demos.demonstrations import load_demonstrations
+from train.demos.expert import Posture
+from train.demos.teleop import CLOSE_M, Teleoperation, read_keys
+from train.demos.waypoints import task
+
+SPEC = ArmSpec.default()
+SENSOR = SensorParams.from_spec(SPEC)
+DT_S, LAG = 1.0 / SPEC.control.rate_hz, 0.15  # of the way to the commanded pressure, per tick
+
+
+@functools.cache
+def equilibrium():
+    params = ArmParams.from_spec(SPEC)
+    kinematics = functools.partial(chain_frames, link_length_m=params.link_length_m)
+    return jax.jit(lambda pressure: settle_pressures(kinematics, params, pressure))
+
+
+class BlindArm:
+    """The nominal arm, always at rest, its chambers filling with a lag; nobody sees it."""
+
+    def __init__(self):
+        self.time_s, self.n_ticks_left = 0.0, np.inf
+        self.pressure_kpa = np.zeros(SPEC.n_chambers)
+        self.now = equilibrium()(np.float32(self.pressure_kpa))
+
+    def read_frequencies(self):
+        if self.n_ticks_left <= 0:
+            raise TimeoutError
+        return frequency_from_length(np.asarray(self.now.spring_m, float), SENSOR)
+
+    def write_pressures(self, pressure_kpa):
+        self.pressure_kpa = self.pressure_kpa + LAG * (pressure_kpa - self.pressure_kpa)
+        self.now = equilibrium()(np.float32(self.pressure_kpa))
+        self.time_s += DT_S
+        self.n_ticks_left -= 1
+
+    @property
+    def finger_m(self):
+        return np.asarray(self.now.tip_position_m) - 0.1 * np.asarray(self.now.tip_rotation)[:, 2]
+
+
+class IdealArm(BlindArm):
+    """The same, seen by motion capture."""
+
+    def motion_capture(self):
+        tip_m = np.asarray(self.now.tip_position_m, float)
+        pose = pose_from_frame(tip_m, np.asarray(self.now.tip_rotation, float))
+        return Capture(tip_m, quaternion_from_pose(pose), tip_m[None])
+
+
+@pytest.fixture(scope="module")
+def waypoints():
+    return task("pipe300", SPEC).waypoints[:4]
+
+
+@pytest.fixture(scope="module")
+def plan(expert, waypoints):
+    return expert.plan(waypoints)
+
+
+def fingers_m(log):
+    """Where the log has the finger tips: 100 mm below the tip, along its axis."""
+    x, y, z, w = (log.tip_quaternion[:, k] for k in (1, 2, 3, 0))
+    axis = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x**2 + y**2)], axis=-1)
+    return log.tip_m - 0.1 * axis
+
+
+def test_recorded_positions_are_the_waypoints(expert, waypoints, plan, shift_mm):
+    told = []
+    arm = IdealArm()
+    result = Teleoperation(arm, expert, told.append).record(waypoints, plan, sequence=3)
+    assert result.problem == "" and len(result.log) == len(told) == 4
+    wanted_m = np.stack([waypoint.finger_m for waypoint in waypoints])
+    off_m = np.linalg.norm(fingers_m(result.log) - wanted_m, axis=1)
+    assert off_m.max() < CLOSE_M < 1e-3 * np.linalg.norm(shift_mm)  # uncorrected, it is off by the shift
+    np.testing.assert_allclose(result.off_m, off_m, atol=1e-6)
+    assert result.log.sequence.tolist() == [3.0] * 4
+    assert np.abs(arm.pressure_kpa).max() < 10.0  # vented: falling with a lag
+
+
+def test_blind_arm_is_logged_where_it_was_planned(expert, waypoints, plan, shift_mm):
+    arm = BlindArm()
+    seen = []
+    result = Teleoperation(arm, expert, lambda _: seen.append(arm.finger_m)).record(waypoints[:2], plan)
+    assert result.problem == "" and np.isnan(result.off_m).all()
+    wanted_m = np.stack([waypoint.finger_m for waypoint in waypoints[:2]])
+    np.testing.assert_allclose(fingers_m(result.log), wanted_m, atol=1e-4)
+    np.testing.assert_allclose(np.stack(seen), wanted_m - 1e-3 * shift_mm, atol=1.5e-3)
+
+
+def test_what_was_logged_before_readings_are_lost_stays(expert, waypoints, plan):
+    arm = IdealArm()
+    teleoperation = Teleoperation(arm, expert, lambda _: setattr(arm, "n_ticks_left", 20))
+    result = teleoperation.record(waypoints, plan)
+    assert len(result.log) == 1 and "readings lost in 3 ticks in a row" in result.problem
+
+
+def test_posture_that_saturates_the_arm_gives_way_to_another(expert, waypoints, plan):
+    """The second posture asks for a spring that its chamber cannot make; the arm gets there all the same."""
+    spring_m = plan.spring_m.copy()
+    spring_m[1, 4] += 0.06
+    broken = Posture(**{**plan._asdict(), "spring_m": spring_m})
+    result = Teleoperation(IdealArm(), expert).record(waypoints[:2], broken)
+    assert result.problem == "" and result.off_m.max() < CLOSE_M
+
+
+def test_position_far_from_its_waypoint_is_not_logged(expert, waypoints, plan):
+    """Motion capture that does not follow: whatever is corrected, the arm seems to be elsewhere."""
+
+    class Misplaced(IdealArm):
+        def motion_capture(self):
+            _, *others = super().motion_capture()
+            return Capture(np.array([0.05, 0.0, -0.5]), *others)
+
+    result = Teleoperation(Misplaced(), expert).record(waypoints, plan)
+    assert len(result.log) == 0 and "home: 7" in result.problem and "mm off and not to be" in result.problem
+
+
+def test_chamber_without_pressure_is_named(expert, waypoints, plan):
+    class Leaking(IdealArm):
+        def write_pressures(self, pressure_kpa):
+            super().write_pressures(np.where(np.arange(SPEC.n_chambers) == 4, 0.0, pressure_kpa))
+
+    told = []
+    result = Teleoperation(Leaking(), expert, told.append).record(waypoints, plan)
+    assert len(result.log) == 0
+    assert "home: not at rest after 15 s: spring 4 is +" in result.problem
+    assert "chamber at -40.0 kPa" in result.problem
+
+
+@pytest.fixture
+def calibration(tmp_path, shifting_s2r):
+    SPEC.to_toml(tmp_path / "arm.toml")
+    save_s2r(tmp_path / S2R_FILE, shifting_s2r)
+    return tmp_path
+
+
+@pytest.fixture
+def command(calibration, monkeypatch, capsys):
+    """Runs `python -m train demos` on the ideal arm with keys on its standard input."""
+
+    def run(*args, keys=""):
+        monkeypatch.setattr("mjx_softarm.deploy.arms.open_arm", lambda name: IdealArm())
+        monkeypatch.setattr("sys.stdin", io.StringIO(keys))
+        status = main(["demos", *map(str, args), "--calibration", str(calibration)])
+        captured = capsys.readouterr()
+        return status, captured.out + captured.err
+
+    return run
+
+
+def test_keys_move_the_finger_tips(expert, command, tmp_path):
+    out = tmp_path / "keys.csv"
+    keys = " x \nsXz \n ?\nlY q x"
+    status, told = command(
+        "record", "--arm", "fake:Arm", "--task", "pipe300", "--keyboard", "--out", out, keys=keys
+    )
+    assert status == 0, told
+    assert "not moved since the start" in told and "was logged" in told and "got key '?'" in told
+    demos = load_demonstrations(out, SPEC)
+    assert demos.sequence.tolist() == [0, 0, 0]
+    start_m = IdealArm().finger_m
+    moved_mm = np.cumsum([[20.0, 0.0, 0.0], [-5.0, 0.0, 5.0], [0.0, -20.0, 0.0]], axis=0)
+    rows = np.loadtxt(out, delimiter=",", skiprows=1)
+    header = out.read_text().splitlines()[0].split(",")
+    tip = [header.index(f"tip_{axis} [mm]") for axis in "xyz"]
+    half = [header.index(f"tip_q{part} [1]") for part in "wxyz"]
+    w, x, y, z = rows[:, half].T
+    axis = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x**2 + y**2)], axis=-1)
+    np.testing.assert_allclose(rows[:, tip] - 100.0 * axis, 1e3 * start_m + moved_mm, atol=2.0)
+    status, told = command("check", out)
+    assert status == 0 and "positions: 3" in told and "sequences: 1: 0 with 3" in told
+
+
+def test_move_into_the_wall_is_refused_and_the_arm_stays(command, tmp_path):
+    keys = "y" * 8 + "Y q"
+    status, told = command(
+        "record", "--arm", "a:B", "--task", "pipe300", "--keyboard", "--out", tmp_path / "k.npz", keys=keys
+    )
+    assert status == 0 and "cannot be met" in told and "position 1 logged" in told
+
+
+def test_misuse_is_told_before_anything_moves(command, tmp_path):
+    for args, message in (
+        (
+            ("record", "--arm", "a:B", "--out", tmp_path / "x.csv"),
+            "--task: missing, expected one of circle16",
+        ),
+        (
+            ("record", "--arm", "a:B", "--task", "pipe300", "--out", tmp_path / "no" / "x.csv"),
+            "expected the name of a file in a folder that exists",
+        ),
+        (("check", tmp_path / "none.csv"), "none.csv: No such file"),
+    ):
+        status, told = command(*args)
+        assert status == 2 and message in told
+
+
+def test_keys_are_read_as_they_come():
+    assert list(read_keys(io.StringIO("x y\nq"))) == ["x", " ", "y", "\n", "q"]

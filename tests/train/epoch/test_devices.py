@@ -1,0 +1,238 @@
+"""Training on several devices and in several processes: the numbers of one, and little that travels."""
+
+import dataclasses
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import jax
+import numpy as np
+import pytest
+
+from mjx_softarm.env import EnvConfig, ReachEnv
+from mjx_softarm.spec import ArmSpec
+from train.__main__ import main
+from train.agent.tqc import TQCConfig
+from train.config import ConfigError, TrainConfig
+from train.epoch.devices import mesh_of, split
+from train.epoch.job import Job
+from train.runs.checkpoint import Run
+
+N_DEVICES = 8
+CAPACITY = 4096  # larger than all else that has an axis
+CONFIG = TrainConfig(
+    n_arms=16,
+    total_env_steps=256,
+    updates_per_env_step=0.5,
+    warmup_env_steps=32,
+    batch_size=32,
+    replay_capacity=CAPACITY,
+    vector_steps_per_epoch=2,
+    env=EnvConfig(n_poses=256),
+    tqc=TQCConfig(hidden_actor=(16, 16), hidden_critic=(16, 16)),
+)
+SHORT = ArmSpec.default().replace(structure={"n_sections": 1, "links_per_section": 2})
+
+pytestmark = pytest.mark.skipif(
+    len(jax.local_devices()) < N_DEVICES, reason=f"needs {N_DEVICES} devices, which a CPU can simulate"
+)
+
+
+@pytest.fixture(scope="module")
+def env():
+    return ReachEnv(SHORT, CONFIG.env)
+
+
+@pytest.fixture(scope="module")
+def jobs(env):
+    return {n: Job(CONFIG, env, mesh_of(n)) for n in ("1", str(N_DEVICES))}
+
+
+@pytest.fixture(scope="module")
+def trained(jobs):
+    """By number of devices: state and metrics after four epochs, of which three learn."""
+    results = {}
+    for n, job in jobs.items():
+        state = job.init(jax.random.PRNGKey(0))
+        for _ in range(4):
+            state, metrics = job.epoch(state)
+        results[n] = state, jax.device_get(metrics)
+    return results
+
+
+def test_many_devices_compute_what_one_does(trained):
+    (one, metrics_of_one), (many, metrics) = trained.values()
+    assert int(many.agent.step) == 4 * 16 * 2 / 2 - 16  # so the networks have moved
+    for name, value in metrics.items():
+        np.testing.assert_allclose(value, metrics_of_one[name], rtol=1e-4, atol=1e-4, err_msg=name)
+    close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-3)  # noqa: E731  # poses in mm
+    jax.tree.map(close, jax.device_get(many.memory), jax.device_get(one.memory))
+    close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6)  # noqa: E731
+    jax.tree.map(close, jax.device_get(many.agent.actor_params), jax.device_get(one.agent.actor_params))
+
+
+def test_each_device_has_its_share_of_arms_and_replay_and_all_of_the_networks(trained):
+    state, _ = trained[str(N_DEVICES)]
+    for leaf in jax.tree.leaves((state.arms, state.memory.data)):
+        shapes = {shard.data.shape for shard in leaf.addressable_shards}
+        assert shapes == {(leaf.shape[0] // N_DEVICES, *leaf.shape[1:])}
+        assert len({shard.device for shard in leaf.addressable_shards}) == N_DEVICES
+    assert all(leaf.is_fully_replicated for leaf in jax.tree.leaves(state.agent))
+
+
+_MOVES = re.compile(r"= .* (all-gather|all-reduce|all-to-all|collective-permute|reduce-scatter)")
+
+
+def test_arms_step_and_start_anew_without_waiting_for_other_devices(jobs, trained):
+    arms, state = jobs[str(N_DEVICES)].arms, trained[str(N_DEVICES)][0]
+    action = jax.device_put(jax.numpy.zeros((arms.n, arms.env.action_size)), split(arms.mesh))
+    program = jax.jit(arms.step).lower(state.arms, action, jax.random.PRNGKey(0)).compile().as_text()
+    assert f"f32[{arms.n // N_DEVICES},{arms.env.action_size}]" in program  # each has its share
+    assert not [line for line in program.splitlines() if _MOVES.search(line)]
+
+
+def test_the_epoch_is_traced_once_and_the_replay_stays_where_it_is(jobs, trained):
+    job = jobs[str(N_DEVICES)]
+    assert job.n_traces == 1
+    program = job.epoch.lower(trained[str(N_DEVICES)][0]).compile().as_text()
+    moves = [line for line in program.splitlines() if _MOVES.search(line)]
+    shapes = [shape for line in moves for shape in re.findall(r"\w\[([\d,]+)\]", line)]
+    assert moves and any("all-reduce" in line for line in moves)  # of gradients
+    assert not any("collective-permute" in line for line in moves)  # of random numbers
+    assert max(int(n) for shape in shapes for n in shape.split(",")) < CAPACITY
+
+
+def test_a_checkpoint_of_many_devices_continues_on_one(tmp_path, jobs, trained):
+    state, _ = trained[str(N_DEVICES)]
+    run = Run.create(tmp_path / "run", CONFIG, SHORT)
+    run.save(4, state)
+    expected = jax.device_get(state.agent.actor_params)
+    for n, job in jobs.items():
+        epoch, restored = run.restore(job.init(jax.random.PRNGKey(1)))
+        assert epoch == 4
+        jax.tree.map(np.testing.assert_array_equal, jax.device_get(restored.agent.actor_params), expected)
+        following, _ = job.epoch(restored)
+        assert int(following.agent.step) == int(state.agent.step) + 16, n
+        assert job.n_traces == 1  # so it came back as the epoch expects it
+
+
+_RESTORE = """
+import sys, jax, numpy as np
+from pathlib import Path
+from train.runs.checkpoint import Run
+from train.agent.tqc import TQC
+run = Run.open(Path(sys.argv[1]))
+assert len(jax.devices()) == 1
+agent = TQC(18, 3, run.config.tqc, run.config.n_updates)
+params = run.restore_part("agent", jax.eval_shape(agent.init, jax.random.PRNGKey(0))).actor_params
+print(sum(float(np.abs(x).sum()) for x in jax.tree.leaves(params)))
+"""
+
+
+def test_a_policy_of_many_devices_is_read_where_there_is_one(tmp_path, trained):
+    state, _ = trained[str(N_DEVICES)]
+    Run.create(tmp_path / "run", CONFIG, SHORT).save(4, state)
+    done = subprocess.run(
+        [sys.executable, "-c", _RESTORE, str(tmp_path / "run")],
+        env={**os.environ, "JAX_NUM_CPU_DEVICES": "1", "JAX_PLATFORMS": "cpu"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    leaves = jax.tree.leaves(jax.device_get(state.agent.actor_params))
+    np.testing.assert_allclose(float(done.stdout), sum(np.abs(x).sum() for x in leaves), rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["n_arms", "replay_capacity", "batch_size"])
+def test_what_cannot_be_split_evenly_is_named(env, name):
+    config = dataclasses.replace(CONFIG, **{name: getattr(CONFIG, name) + 4})
+    with pytest.raises(ConfigError, match=f"^{name}: got .* expected a multiple of the {N_DEVICES}"):
+        Job(config, env, mesh_of(str(N_DEVICES)))
+
+
+@pytest.mark.parametrize("devices", ["0", "-1", "two", "1000000", "localhost:1/0"])
+def test_devices_that_are_not_there_are_refused(devices, capsys):
+    assert main(["reach", f"--devices={devices}"]) == 2
+    assert "--devices: got" in capsys.readouterr().err
+
+
+LONGEST_S = 900  # of a process, compilation included
+SETTINGS = [
+    "n_arms=16",
+    "total_env_steps=512",
+    "vector_steps_per_epoch=2",
+    "warmup_env_steps=32",
+    "batch_size=32",
+    "evaluation_epochs=2",
+    "replay_capacity=4096",
+    "env.n_poses=256",
+    "tqc.hidden_actor=[16,16]",
+    "tqc.hidden_critic=[16,16]",
+]
+
+
+def start(arguments, *devices):
+    """Processes of one device each that train one run together."""
+    environment = {**os.environ, "JAX_NUM_CPU_DEVICES": "1", "JAX_PLATFORMS": "cpu"}
+    command = [sys.executable, "-m", "train", "reach", *map(str, arguments)]
+    return [
+        subprocess.Popen([*command, f"--devices={name}"], env=environment, stdout=subprocess.PIPE, text=True)
+        for name in devices
+    ]
+
+
+def pair():
+    """Two processes' names for their meeting."""
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        return [f"localhost:{free.getsockname()[1]}/{k}/2" for k in range(2)]
+
+
+def end(processes):
+    """What each printed; all must end well, and in time."""
+    try:
+        printed = [process.communicate(timeout=LONGEST_S)[0] for process in processes]
+    finally:
+        for process in processes:
+            process.kill()
+    assert [process.returncode for process in processes] == [0] * len(processes), printed
+    return printed
+
+
+@pytest.mark.slow
+def test_two_processes_train_as_one_and_go_on_after_one_was_killed(tmp_path):
+    SHORT.to_toml(tmp_path / "arm.toml")
+    new = ["--spec", tmp_path / "arm.toml", *(part for text in SETTINGS for part in ("--set", text))]
+    printed = end(start([*new, "--out", tmp_path / "whole"], *pair()))
+    for text in ("run: ", "circle.png"):  # one speaks for both
+        assert text in printed[0] and text not in printed[1]
+    end(start([*new, "--out", tmp_path / "alone"], "1"))
+    first, alone = (figures(tmp_path / name)[1][2] for name in ("whole", "alone"))  # soon after warm-up
+    assert first["updates"] == alone["updates"] > 0
+    np.testing.assert_allclose(list(first.values()), list(alone.values()), rtol=1e-3, atol=1e-3)
+
+    broken = start([*new, "--out", tmp_path / "broken"], *pair())
+    try:
+        while not (tmp_path / "broken" / "checkpoints" / "2").exists():
+            assert all(process.poll() is None for process in broken)
+            time.sleep(0.05)
+        broken[1].send_signal(signal.SIGKILL)
+        assert broken[0].wait(timeout=LONGEST_S) != 0  # it cannot go on alone, and says so by ending
+    finally:
+        for process in broken:
+            process.kill()
+            process.communicate()
+    assert not (tmp_path / "broken" / "evaluation.json").exists()
+    end(start(["--resume", tmp_path / "broken"], *pair()))
+    assert figures(tmp_path / "whole") == figures(tmp_path / "broken")
+
+
+def figures(path):
+    """All that a run measured but for speeds."""
+    rows = [{k: v for k, v in row.items() if "speed" not in k} for row in Run.open(path).metrics()]
+    return json.loads((path / "evaluation.json").read_text()), rows

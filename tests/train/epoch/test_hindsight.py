@@ -1,0 +1,169 @@
+"""Relabelling of what real arms did, against the environment that they did it in."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from train.epoch.hindsight import Experience, HindsightConfig, relabel
+
+N_COPIES = 8  # of every transition, for shares that are as they should be
+
+
+@pytest.fixture(scope="module")
+def transition(env, reset, step, random_actions):
+    """State, action and successor; half of the arms saturate, a quarter reach their goal."""
+    state = reset(0)
+    arm = state.pipeline_state._replace(n_steps=jnp.arange(len(state.obs), dtype=jnp.int32) % 4)
+    state = state.replace(pipeline_state=arm._replace(goal=env.pool.pose))
+    state = state.replace(obs=env.observe(arm.pose, env.pool.pose))
+    kind = (jnp.arange(len(state.obs)) % 4)[:, None]
+    elsewhere = env.action_of(jnp.roll(env.pool.spring_m, 1, axis=0))
+    action = jnp.where(
+        kind < 2, random_actions, jnp.where(kind == 2, elsewhere, env.action_of(env.pool.spring_m))
+    )
+    return state, action, step(state, action)
+
+
+@pytest.fixture(scope="module")
+def stored(env, transition):
+    state, action, after = transition
+    start, end = state.pipeline_state, after.pipeline_state
+    return Experience(
+        pose=start.pose,
+        goal=start.goal,
+        action=action,
+        next_pose=end.pose,
+        sensed_action=env.action_of(end.spring_m),
+        saturated=after.info["saturated"],
+        clearance_cost=jnp.zeros(len(after.reward)),
+        n_steps=end.n_steps,
+    )
+
+
+@pytest.fixture(scope="module")
+def relabelled(env, stored):
+    """Shares -> the stored transitions, and N_COPIES of them relabelled, as arrays (N_COPIES * n, ...)."""
+    many = jax.tree.map(lambda x: jnp.concatenate([x] * N_COPIES), stored)
+
+    def of(key=0, **shares):
+        config = HindsightConfig(**shares)
+        return many, relabel(
+            many, jax.random.key(key), config, env.scale, env.config.reward, exchange_actions=True
+        )
+
+    return of
+
+
+def goal_of(env, obs):
+    """Goals [mm, deg] that observations speak of."""
+    return obs[:, 6:12] * env.scale.scale + env.scale.centre
+
+
+def test_the_transitions_hold_every_case(transition):
+    _, _, after = transition
+    saturated, reached = (np.asarray(x) > 0 for x in (after.info["saturated"], after.done))
+    assert min(saturated.sum(), reached.sum(), (~saturated & ~reached).sum()) > 100
+    assert np.asarray(after.info["valid"]).all()
+
+
+def test_with_both_shares_zero_a_batch_is_what_the_environment_gave(transition, relabelled):
+    state, action, after = transition
+    _, batch = relabelled(reached_share=0.0, near_share=0.0)
+    for got, given in zip(
+        (batch.obs, batch.action, batch.next_obs, batch.terminated),
+        (state.obs, action, after.obs, after.done),
+        strict=True,
+    ):
+        np.testing.assert_allclose(got, jnp.concatenate([given] * N_COPIES), atol=1e-6)
+    np.testing.assert_allclose(batch.reward, jnp.concatenate([after.reward] * N_COPIES), rtol=1e-6)
+
+
+def test_a_pose_that_was_reached_as_a_goal_earns_the_bonus_and_ends_the_episode(env, relabelled):
+    many, batch = relabelled(reached_share=1.0)
+    np.testing.assert_array_equal(batch.reward, env.config.reward.goal_bonus)
+    np.testing.assert_array_equal(batch.terminated, 1.0)
+    np.testing.assert_array_equal(batch.obs, env.observe(many.pose, many.next_pose))
+    np.testing.assert_array_equal(batch.next_obs, env.observe(many.next_pose, many.next_pose))
+    np.testing.assert_array_equal(batch.next_obs[:, 12:], 0.0)
+
+
+def test_only_a_saturated_action_is_exchanged_for_the_sensed_one(relabelled):
+    many, batch = relabelled(reached_share=0.5, near_share=0.5)
+    np.testing.assert_array_equal(
+        batch.action, jnp.where(many.saturated[:, None], many.sensed_action, many.action)
+    )
+    assert float(jnp.abs(many.sensed_action - many.action)[many.saturated].max()) > 0.5
+    assert -100.0 not in np.asarray(batch.reward)
+
+
+def test_a_sensed_action_leads_to_the_same_rest_with_no_chamber_saturated(transition, stored, step):
+    state, _, after = transition
+    again = step(state, stored.sensed_action)
+    np.testing.assert_allclose(again.pipeline_state.pose, after.pipeline_state.pose, atol=0.05)
+    np.testing.assert_allclose(
+        again.pipeline_state.pressure_kpa, after.pipeline_state.pressure_kpa, atol=0.01
+    )
+    np.testing.assert_array_equal(again.metrics["saturated_chambers"], 0)
+    assert float(after.metrics["saturated_chambers"].sum()) > 500
+
+
+def test_near_goals_lie_at_log_uniform_distances_within_the_bounds(env, relabelled):
+    many, batch = relabelled(reached_share=0.0, near_share=1.0, near_min_mm=2.0, near_max_mm=50.0)
+    offset = np.asarray(goal_of(env, batch.obs) - many.next_pose)
+    distance = np.linalg.norm(offset[:, :3], axis=1)
+    assert distance.min() > 1.99 and distance.max() < 50.01
+    share = (np.log(distance) - np.log(2.0)) / np.log(25.0)  # uniform in [0, 1]
+    counts, _ = np.histogram(share, 16, (0.0, 1.0))
+    assert abs(counts / len(share) - 1 / 16).max() < 5 * np.sqrt(1 / 16 / len(share))
+    direction = offset[:, :3] / distance[:, None]
+    assert abs(direction.mean(axis=0)).max() < 5 * np.sqrt(1 / 3 / len(direction))
+    assert abs((direction**2).mean(axis=0) - 1 / 3).max() < 0.03
+
+
+def test_near_goals_are_turned_in_proportion(env, relabelled):
+    per_mm = [
+        np.abs(np.asarray(goal_of(env, batch.obs) - many.next_pose))[:, 3:]
+        for many, batch in (relabelled(reached_share=0.0, near_share=1.0, mm_per_deg=x) for x in (1.0, 4.0))
+    ]
+    clear = per_mm[0] > 1.0  # above rounding
+    np.testing.assert_allclose(per_mm[0][clear] / per_mm[1][clear], 4.0, rtol=1e-2)
+
+
+def test_near_goals_earn_what_their_distance_says(env, relabelled):
+    many, batch = relabelled(reached_share=0.0, near_share=1.0)
+    offset = np.asarray(many.next_pose - goal_of(env, batch.obs), np.float64)
+    offset[:, 3:] = (offset[:, 3:] + 180.0) % 360.0 - 180.0
+    norm = np.linalg.norm(offset * ([0.0056] * 3 + [0.001] * 3), axis=1)
+    clear = abs(norm - 0.03) > 1e-4  # of the threshold, where rounding decides
+    expected = np.where(norm < 0.03, 100.0, -10 * norm - 0.1 * np.asarray(many.n_steps))
+    np.testing.assert_allclose(np.asarray(batch.reward)[clear], expected[clear], atol=2e-3)
+    np.testing.assert_array_equal(np.asarray(batch.terminated)[clear], (norm < 0.03)[clear])
+    assert 0.05 < np.mean(norm < 0.03) < 0.95
+
+
+def test_shares_are_kept_and_the_rest_is_as_it_was(env, transition, relabelled):
+    many, batch = relabelled(reached_share=0.3, near_share=0.25)
+    goal, kept_goal = goal_of(env, batch.obs), env.observe(many.pose, many.goal)[:, 6:12]
+    reached = np.asarray(jnp.all(batch.next_obs[:, 12:] == 0.0, axis=1))
+    kept = np.asarray(jnp.all(batch.obs[:, 6:12] == kept_goal, axis=1)) & ~reached
+    n = len(kept)
+    for share, expected in ((reached, 0.3), (kept, 0.45), (~reached & ~kept, 0.25)):
+        assert abs(share.mean() - expected) < 5 * np.sqrt(expected * (1 - expected) / n)
+    given = np.concatenate([transition[2].reward] * N_COPIES)
+    np.testing.assert_allclose(np.asarray(batch.reward)[kept], given[kept], rtol=1e-6)
+    np.testing.assert_array_equal(np.asarray(batch.action)[kept], np.asarray(many.action)[kept])
+    assert (given[kept] == -100.0).any()  # a saturated action that keeps its goal keeps its price
+    assert np.isfinite(goal).all()
+
+
+def test_the_draw_follows_from_the_key(relabelled):
+    first, again, other = (relabelled(key, reached_share=0.5)[1].reward for key in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    assert not np.array_equal(first, other)
+
+
+@pytest.mark.parametrize("shares", [(-0.1, 0.5), (0.5, -0.1), (0.7, 0.4)])
+def test_shares_that_are_none_are_refused(shares):
+    with pytest.raises(ValueError, match="reached_share and near_share must be >= 0 and add up to 1 at most"):
+        HindsightConfig(*shares)

@@ -1,0 +1,163 @@
+"""The ring against a Python list that keeps the last items appended."""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from train.epoch import replay
+
+
+class Item(NamedTuple):
+    tag: jax.Array  # () int32
+    vector: jax.Array  # (2,) float32
+
+
+CAPACITY, BATCH = 7, 5
+EXAMPLE = Item(jnp.zeros((), jnp.int32), jnp.zeros(2))
+
+
+@pytest.fixture(autouse=True, scope="module")
+def strict():
+    with jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
+        yield
+
+
+@pytest.fixture(scope="module")
+def add():
+    return jax.jit(replay.add)
+
+
+def rows(tags):
+    """Items whose vector can be told from their tag."""
+    tags = np.asarray(tags, np.int32)
+    return Item(jnp.asarray(tags), jnp.asarray(np.stack([tags, -tags], axis=-1), jnp.float32))
+
+
+def oldest_first(ring):
+    """Tags of the filled slots from the oldest to the newest."""
+    size, position = int(ring.size), int(ring.position)
+    start = position if size == CAPACITY else 0
+    return [int(ring.data.tag[(start + i) % CAPACITY]) for i in range(size)]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_ring_keeps_the_last_valid_items_in_order_over_many_wraps(add, seed):
+    rng = np.random.default_rng(seed)
+    ring, model = replay.create(EXAMPLE, CAPACITY), []
+    for step in range(25):
+        tags = np.arange(step * BATCH, (step + 1) * BATCH)
+        valid = rng.random(BATCH) < rng.choice([0.0, 0.3, 0.8, 1.0])
+        ring = add(ring, rows(tags), jnp.asarray(valid))
+        model = (model + tags[valid].tolist())[-CAPACITY:]
+        assert oldest_first(ring) == model
+        filled = slice(0, int(ring.size))
+        expected = np.stack([ring.data.tag, -ring.data.tag], axis=-1)[filled]
+        np.testing.assert_array_equal(ring.data.vector[filled], expected)
+
+
+def test_batch_as_large_as_the_ring_replaces_all_of_it(add):
+    ring = add(replay.create(EXAMPLE, CAPACITY), rows(range(3)), jnp.ones(3, bool))
+    ring = add(ring, rows(range(10, 10 + CAPACITY)), jnp.ones(CAPACITY, bool))
+    assert oldest_first(ring) == list(range(10, 10 + CAPACITY))
+
+
+def test_nan_rows_marked_by_finite_rows_never_enter(add):
+    items = rows(range(BATCH))
+    items = items._replace(vector=items.vector.at[1, 0].set(jnp.nan).at[3, 1].set(jnp.inf))
+    finite = replay.finite_rows(items)
+    np.testing.assert_array_equal(finite, [True, False, True, False, True])
+    ring = add(replay.create(EXAMPLE, CAPACITY), items, finite)
+    assert oldest_first(ring) == [0, 2, 4]
+    assert np.all(np.isfinite(ring.data.vector))
+
+
+def test_sample_is_uniform_over_the_filled_slots_and_only_those(add):
+    n_filled, n_draws = 4, 20_000
+    ring = add(replay.create(EXAMPLE, CAPACITY), rows(range(1, 1 + n_filled)), jnp.ones(n_filled, bool))
+    draw = jax.jit(functools.partial(replay.sample, batch_size=n_draws))
+    items = draw(ring, jax.random.key(0))
+    np.testing.assert_array_equal(items.vector, np.stack([items.tag, -items.tag], axis=-1))
+    counts = np.bincount(items.tag, minlength=1 + n_filled)
+    assert counts[0] == 0 and counts.sum() == n_draws
+    # Binomial counts: five standard deviations.
+    p = 1 / n_filled
+    np.testing.assert_allclose(counts[1:], n_draws * p, atol=5 * np.sqrt(n_draws * p * (1 - p)))
+
+
+def test_adding_again_does_not_compile_again():
+    n_traces = 0
+
+    def counted(ring, items, valid):
+        nonlocal n_traces
+        n_traces += 1
+        return replay.add(ring, items, valid)
+
+    step, ring = jax.jit(counted, donate_argnums=0), replay.create(EXAMPLE, CAPACITY)
+    for i in range(4):
+        ring = step(ring, rows(range(BATCH)), jnp.arange(BATCH) >= i)
+    assert n_traces == 1
+
+
+def test_items_of_any_pytree_structure_are_stored_with_their_dtypes():
+    example = {"a": jax.ShapeDtypeStruct((), jnp.int8), "b": (jax.ShapeDtypeStruct((2, 3), jnp.bfloat16),)}
+    ring = replay.create(example, 3)
+    assert ring.data["a"].shape == (3,) and ring.data["a"].dtype == jnp.int8
+    assert ring.data["b"][0].shape == (3, 2, 3) and ring.data["b"][0].dtype == jnp.bfloat16
+
+
+@pytest.mark.parametrize(
+    ("items", "valid", "message"),
+    [
+        (rows(range(8)), np.ones(8, bool), "at most 7 rows .* got 8"),
+        (rows(range(5)), np.ones(4, bool), r"items.*tag: expected \(4,\) int32, got \(5,\)"),
+        (rows(range(5)), np.ones(5, np.float32), r"valid: expected \(B,\) bool, got \(5,\) float32"),
+        (
+            rows(range(5))._replace(tag=jnp.zeros(5)),
+            np.ones(5, bool),
+            r"tag: expected \(5,\) int32, got .*float32",
+        ),
+        (rows(range(5))._replace(vector=jnp.zeros((5, 3))), np.ones(5, bool), r"vector: expected \(5, 2\)"),
+        ((jnp.zeros(5),), np.ones(5, bool), "expected structure"),
+    ],
+)
+def test_add_names_what_does_not_fit(items, valid, message):
+    with pytest.raises(ValueError, match=message):
+        replay.add(replay.create(EXAMPLE, CAPACITY), items, valid)
+
+
+def test_create_refuses_an_empty_capacity():
+    with pytest.raises(ValueError, match="expected at least 1, got 0"):
+        replay.create(EXAMPLE, 0)
+
+
+@pytest.mark.parametrize("n_added", [6, 13], ids=["partly filled", "wrapped"])
+def test_a_thinner_ring_keeps_a_share_oldest_first(n_added):
+    ring = replay.create(jnp.zeros(()), 10)
+    for k in range(n_added):
+        ring = replay.add(ring, jnp.array([float(k)]), jnp.array([True]))
+    thin = replay.thin(ring, jax.random.PRNGKey(0), 0.5)
+    n = int(thin.size)
+    kept = np.asarray(thin.data[:n])
+    assert n == min(n_added, 10) // 2 and int(thin.position) == n
+    assert np.all(np.diff(kept) > 0) and set(kept) <= set(range(max(0, n_added - 10), n_added))
+    again = replay.add(thin, jnp.array([99.0]), jnp.array([True]))
+    np.testing.assert_array_equal(again.data[: n + 1], [*kept, 99.0])
+
+
+def test_thinning_draws_every_item_alike():
+    ring = replay.add(replay.create(jnp.zeros(()), 8), jnp.arange(8.0), jnp.ones(8, bool))
+    draw = jax.vmap(lambda key: replay.thin(ring, key, 0.25).data[:2])
+    drawn = np.asarray(draw(jax.random.split(jax.random.PRNGKey(0), 2000)))
+    share = np.bincount(drawn.ravel().astype(int), minlength=8) / len(drawn)
+    np.testing.assert_allclose(share, 0.25, atol=4 * np.sqrt(0.25 * 0.75 / 2000))
+
+
+def test_thinning_to_all_or_nothing():
+    ring = replay.add(replay.create(jnp.zeros(()), 8), jnp.arange(8.0), jnp.ones(8, bool))
+    whole, empty = (replay.thin(ring, jax.random.PRNGKey(0), share) for share in (1.0, 0.0))
+    np.testing.assert_array_equal(whole.data, ring.data)
+    assert int(whole.position) == 0 and int(whole.size) == 8 and int(empty.size) == 0

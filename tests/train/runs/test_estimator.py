@@ -1,0 +1,137 @@
+"""Distillation: held-out error, same networks from the same seed, chambers that lose their pressure."""
+
+import functools
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+
+from mjx_softarm import ArmSpec
+from mjx_softarm.control import Gains, saturated
+from mjx_softarm.deploy.faults import TOLERANCE_M, lost_chambers
+from mjx_softarm.mechanics.kinematics import chain_frames
+from mjx_softarm.mechanics.mjcf import build_model
+from mjx_softarm.mechanics.settle import settle
+from mjx_softarm.mechanics.statics import ArmParams
+from mjx_softarm.mechanics.workspace import HELD_OUT_SEED, sample_workspace
+from mjx_softarm.sensing.estimator import estimate_frame, expected_springs
+from train.runs import estimator as module
+from train.runs.estimator import PAYLOADS_KG, distil
+
+SPEC = ArmSpec.default()
+N, N_ARMS = SPEC.n_chambers, 512
+
+
+def small(monkeypatch, n_steps):
+    monkeypatch.setattr(module, "N_TRAINING", 8192)
+    monkeypatch.setattr(module, "N_HELD_OUT", 512)
+    monkeypatch.setattr(module, "N_STEPS", n_steps)
+
+
+@pytest.fixture(scope="module")
+def distilled():
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        small(monkeypatch, 3000)
+        return distil(SPEC, 0)
+
+
+@pytest.fixture(scope="module")
+def pool():
+    return jax.device_get(sample_workspace(SPEC, N_ARMS, 77))
+
+
+def test_tips_are_those_of_c_mujoco(distilled, pool):
+    model = build_model(SPEC)
+    data = mujoco.MjData(model)
+    away_mm = []
+    for k in range(0, N_ARMS, 4):
+        data.qpos[:] = pool.q[k]
+        mujoco.mj_forward(model, data)
+        frame = estimate_frame(distilled.estimator, data.ten_length[1::2])
+        away_mm.append(1e3 * np.linalg.norm(frame.position_m - data.site("tip").xpos))
+    assert np.median(away_mm) < 1.5 and max(away_mm) < 10.0  # 0.6 and 2.2 mm after all of the training
+    assert np.median(away_mm) == pytest.approx(distilled.tip_mm[0.0].median, rel=0.25)
+
+
+def test_springs_of_known_pressures(distilled, pool):
+    off_mm = 1e3 * np.abs(expected_springs(distilled.spring_model, pool.pressure_kpa) - pool.spring_m).max(1)
+    assert np.median(off_mm) < 5.0
+    assert np.median(off_mm) == pytest.approx(distilled.spring_mm[0.0].median, rel=0.25)
+
+
+def test_errors_are_told_by_payload_and_grow_with_it(distilled):
+    for errors in (distilled.tip_mm, distilled.turn_deg, distilled.spring_mm):
+        assert tuple(errors) == PAYLOADS_KG
+        assert all(0.0 < error.median < error.p95 < error.largest for error in errors.values())
+    medians = [distilled.tip_mm[payload_kg].median for payload_kg in PAYLOADS_KG]
+    assert medians == sorted(medians)
+
+
+def test_same_seed_same_networks(monkeypatch):
+    small(monkeypatch, 20)
+    monkeypatch.setattr(module, "PAYLOADS_KG", (0.0,))
+    one, same = (jax.tree.leaves(distil(SPEC, 3)[:2]) for _ in range(2))
+    assert all(x.dtype == np.float32 for x in one)
+    assert all(np.array_equal(x, y) for x, y in zip(one, same, strict=True))
+
+
+def test_held_out_seed_is_refused():
+    with pytest.raises(ValueError, match="seed: 20000 draws the held-out equilibria"):
+        distil(SPEC, HELD_OUT_SEED)
+
+
+def arms_at_rest(reference_m, payload_kg, dead):
+    """Arms of unequal chambers under the law; `dead` (n_arms, n) of them have no pressure."""
+    params = ArmParams.from_spec(SPEC.replace(mass={"payload_kg": payload_kg}))
+    many = jax.tree.map(lambda x: np.broadcast_to(x, (N_ARMS, *np.shape(x))), params)
+    spread = np.random.default_rng(8).uniform(0.9, 1.1, (2, N_ARMS, N)).astype(np.float32)
+    many = many._replace(
+        chamber_stiffness=many.chamber_stiffness * spread[0],
+        area=many.area * spread[1],
+        pressure_min_kpa=np.where(dead, 0.0, many.pressure_min_kpa).astype(np.float32),
+        pressure_max_kpa=np.where(dead, 0.0, many.pressure_max_kpa).astype(np.float32),
+    )
+    kinematics = functools.partial(chain_frames, link_length_m=params.link_length_m)
+    end = jax.device_get(jax.jit(jax.vmap(functools.partial(settle, kinematics)))(many, reference_m))
+    winds = np.where(reference_m > end.spring_m, params.pressure_max_kpa, params.pressure_min_kpa)
+    return end, np.where(dead, winds, end.pressure_kpa)
+
+
+def found(distilled, end, commanded_kpa, reference_m):
+    spring_m = end.spring_m + 4e-5 * np.random.default_rng(9).standard_normal(end.spring_m.shape)
+    return np.array(
+        [
+            lost_chambers(distilled.spring_model, Gains.from_spec(SPEC), *rows)
+            for rows in zip(commanded_kpa, reference_m, spring_m, strict=True)
+        ]
+    )
+
+
+@pytest.mark.parametrize("payload_kg", [0.0, 1.0])
+def test_saturated_arms_are_not_taken_for_leaking(distilled, payload_kg):
+    reference_m = np.random.default_rng(5).uniform(0.12, 0.26, (N_ARMS, N)).astype(np.float32)
+    end, commanded_kpa = arms_at_rest(reference_m, payload_kg, np.zeros((N_ARMS, N), bool))
+    full = saturated(commanded_kpa, reference_m, end.spring_m, Gains.from_spec(SPEC), TOLERANCE_M)
+    assert full.any(axis=1).mean() > 0.9
+    assert not found(distilled, end, commanded_kpa, reference_m).any()
+
+
+@pytest.mark.parametrize(("payload_kg", "share"), [(0.0, 0.95), (0.5, 0.85)])
+def test_lost_chambers_are_found(distilled, pool, payload_kg, share):
+    chamber = np.random.default_rng(6).integers(0, N, N_ARMS)
+    rows = np.arange(N_ARMS)
+    dead = np.zeros((N_ARMS, N), bool)
+    dead[rows, chamber] = True
+    end, commanded_kpa = arms_at_rest(pool.spring_m, payload_kg, dead)
+    matters = end.settled & (np.abs(pool.pressure_kpa[rows, chamber]) > 5.0)
+    lost = found(distilled, end, commanded_kpa, pool.spring_m)
+    assert lost[rows, chamber][matters].mean() > share
+    assert not (lost & ~dead).any()
+
+
+@pytest.mark.slow
+def test_all_of_the_training_is_worth_it():
+    errors = distil(SPEC, 0).tip_mm
+    assert errors[0.0].median < 0.8 and errors[0.0].p95 < 1.6  # 0.5 and 1.0 without the pressure beyond
+    assert errors[0.5].median < 3.5

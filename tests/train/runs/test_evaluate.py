@@ -1,0 +1,87 @@
+"""Evaluation: its arithmetic on results made by hand, and policies whose error is known beforehand."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from train.runs.evaluate import N_ACTIONS, Evaluator, Reached, summarise
+
+
+def reached(error_mm, scaled_error, saturated, settled):
+    n = len(error_mm)
+    goal = np.zeros((n, 6))
+    pose = goal + np.array(error_mm)[:, None] * np.array([0.6, 0.0, -0.8, 0.0, 0.0, 0.0])
+    return Reached(
+        goal=goal,
+        pose=pose,
+        scaled_error=np.array(scaled_error),
+        saturated_chambers=np.array(saturated),
+        settled=np.array(settled),
+        pressure_kpa=np.zeros((n, 9)),
+        clearance_mm=np.full(n, np.inf),
+    )
+
+
+def test_figures_of_results_made_by_hand():
+    workspace = reached(
+        error_mm=[1.0, 2.0, 3.0, 4.0, 50.0],
+        scaled_error=[0.01, 0.029, 0.03, 0.01, 0.01],
+        saturated=[0, 0, 0, 2, 0],
+        settled=[True, True, True, True, False],
+    )
+    circle = reached([1.0, 4.0], [0.01, 0.02], [1, 2], [True, False])
+    figures = summarise(workspace, circle, threshold=0.03)
+    assert figures.median_mm == pytest.approx(3.0)
+    assert figures.p95_mm == pytest.approx(4.0 + 0.8 * 46.0)  # linear between the fourth and the fifth
+    assert figures.reached_share == 2 / 5  # not at the threshold, not saturated, not unsettled
+    assert figures.saturated_share == 1 / 5
+    assert figures.unsettled == 2
+    assert (figures.circle_mean_mm, figures.circle_max_mm) == pytest.approx((2.5, 4.0))
+    assert figures.circle_saturated_chambers == 3
+
+
+class Scripted:
+    """An agent whose action is looked up by the goal in the observation."""
+
+    def __init__(self, env, goals, actions):
+        self._goals = jnp.stack([env.observe(goal, goal) for goal in goals])[:, 6:12]
+        self._actions = actions
+
+    def act_mode(self, _, obs):
+        distance = jnp.sum((self._goals - obs[6:12]) ** 2, axis=-1)
+        return self._actions[jnp.argmin(distance)]
+
+
+@pytest.fixture(scope="module")
+def pool_goals(env):
+    return env.pool.pose[:64], env.action_of(env.pool.spring_m[:64])
+
+
+def evaluate(env, goals, actions):
+    evaluator = Evaluator(env, Scripted(env, goals, actions), n_goals=len(goals))
+    evaluator.goals = goals
+    return evaluator(None)
+
+
+def test_a_policy_that_knows_the_answers_reaches_every_goal(env, pool_goals):
+    figures, workspace, _ = evaluate(env, *pool_goals)
+    assert figures.p95_mm < 0.1 and figures.reached_share == 1.0
+    assert figures.saturated_share == 0.0 and workspace.settled.all()
+
+
+def test_a_policy_that_never_moves_is_as_far_as_the_goals_are(env, pool_goals):
+    goals, actions = pool_goals
+    figures, workspace, circle = evaluate(env, goals, jnp.broadcast_to(actions[:1], actions.shape))
+    expected = np.linalg.norm(np.asarray(goals - goals[0])[:, :3], axis=-1)
+    np.testing.assert_allclose(workspace.tip_error_mm, expected, atol=0.1)
+    assert figures.median_mm == pytest.approx(np.median(expected), abs=0.1)
+    around = np.linalg.norm(np.asarray(circle.goal - np.asarray(goals[0]))[:, :3], axis=-1)
+    np.testing.assert_allclose(circle.tip_error_mm, around, atol=0.1)
+
+
+def test_an_arm_that_fails_on_the_way_counts_as_unsettled(env, pool_goals):
+    goals, actions = pool_goals
+    bad = actions.at[3].set(jnp.nan)
+    figures, workspace, _ = evaluate(env, goals, bad)
+    assert N_ACTIONS > 1 and not workspace.settled[3] and workspace.settled.sum() == len(goals) - 1
+    assert figures.unsettled == 1 and figures.reached_share == 1 - 1 / len(goals)

@@ -1,0 +1,391 @@
+"""Sweeps: a member is the ordinary run, all are traced once, and a killed sweep ends with the same bits."""
+
+import dataclasses
+import io
+import json
+import re
+import subprocess
+import sys
+import time
+
+import jax
+import numpy as np
+import pytest
+from rich.console import Console
+
+from benchmarks.accuracy import learning
+from mjx_softarm._support.provenance import write_json
+from mjx_softarm.env import EnvConfig, Randomisation, ReachEnv
+from mjx_softarm.spec import ArmSpec
+from train.__main__ import main
+from train.agent.tqc import TQCConfig
+from train.config import PRESETS, ConfigError, TrainConfig, override
+from train.epoch.job import Job
+from train.runs.checkpoint import Run, RunError
+from train.runs.task import Task
+from train.sweep import run as sweep_run
+from train.sweep.command import members_of
+from train.sweep.job import VARIABLE, SweepJob, setting
+from train.sweep.report import CURVES_FILE, FIGURES, RESULTS_FILE, curves, report
+from train.sweep.run import create, open_sweep
+
+SHORT = ArmSpec.default().replace(structure={"n_sections": 1, "links_per_section": 2})  # compiles in seconds
+CONFIG = TrainConfig(
+    n_arms=8,
+    total_env_steps=128,
+    updates_per_env_step=0.5,
+    warmup_env_steps=16,
+    batch_size=16,
+    replay_capacity=64,
+    vector_steps_per_epoch=2,
+    evaluation_epochs=2,
+    env=EnvConfig(
+        n_poses=64,
+        randomisation=Randomisation(0.1, 0.1, 0.1),
+        pipe_diameter_mm=250,
+        clearance_cost_per_mm=0.1,
+        clearance_margin_mm=60.0,
+    ),
+    tqc=TQCConfig(hidden_actor=(16, 16), hidden_critic=(16, 16), learning_rate_end=0.1, target_entropy=-9.0),
+)
+# Each setting that may be varied, at another value.
+OTHER = {
+    "tqc.learning_rate": 1e-2,
+    "tqc.learning_rate_alpha": 3e-2,
+    "tqc.gamma": 0.7,
+    "tqc.tau": 0.1,
+    "tqc.initial_alpha": 0.3,
+    "tqc.target_entropy": -20.0,
+    "tqc.reward_scale": 0.1,
+    "hindsight.reached_share": 0.2,
+    "hindsight.near_share": 0.6,
+    "hindsight.near_min_mm": 3.0,
+    "hindsight.near_max_mm": 50.0,
+    "hindsight.mm_per_deg": 2.0,
+    "env.reward.goal_bonus": 30.0,
+    "env.reward.error_cost": 4.0,
+    "env.reward.step_cost": 0.7,
+    "env.reward.saturation_cost": 20.0,
+    "env.reward.threshold": 0.2,
+    "env.reward.weight_per_mm": 0.003,
+    "env.reward.weight_per_deg": 0.004,
+    "env.randomisation.payload_max_kg": 0.3,
+    "env.randomisation.stiffness_spread": 0.2,
+    "env.randomisation.sensor_noise_mm": 0.5,
+    "env.saturation_tolerance_mm": 5.0,
+    "env.clearance_cost_per_mm": 0.3,
+    "env.clearance_margin_mm": 90.0,
+}
+N_EPOCHS = 5
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick_compiler():
+    """Twice as fast to compile what runs for milliseconds."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
+@pytest.fixture(scope="module")
+def env():
+    return ReachEnv(SHORT, CONFIG.env)
+
+
+@pytest.fixture(scope="module")
+def members():
+    other = override(CONFIG, [f"{path}={value}" for path, value in OTHER.items()])
+    return {"first": CONFIG, "other": dataclasses.replace(other, seed=3)}
+
+
+@pytest.fixture(scope="module")
+def job(members, env):
+    return SweepJob(list(members.values()), VARIABLE, env)
+
+
+@pytest.fixture(scope="module")
+def trained(job):
+    """States after some epochs, and the metrics of all of them."""
+    states, metrics = job.init(), []
+    for _ in range(N_EPOCHS):
+        states, row = job.epoch(states)
+        metrics.append(jax.device_get(row))
+    return states, metrics
+
+
+def test_each_setting_that_may_be_varied_is_looked_at(members):
+    assert OTHER.keys() == set(VARIABLE)
+    assert all(setting(members["first"], path) != value for path, value in OTHER.items())
+
+
+def test_a_member_is_the_ordinary_run(members, job, trained):
+    states, metrics = trained
+    alone = Job(members["other"], ReachEnv(SHORT, members["other"].env))
+    state = alone.init(jax.random.PRNGKey(members["other"].seed))
+    for row in metrics:
+        state, expected = alone.epoch(state)
+        for name, value in expected.items():
+            np.testing.assert_allclose(row[name][1], value, rtol=2e-4, atol=2e-5, err_msg=name)
+    first, own = job.member(states, 0), job.member(states, 1)
+    assert int(own.agent.step) > 0 and int(own.n_env_steps) == N_EPOCHS * 2 * 8
+    assert jax.tree.map(shape_of, own) == jax.tree.map(shape_of, state)
+    assert_close(own, state)
+    with pytest.raises(AssertionError):  # the comparison can tell members apart
+        assert_close(first.agent, state.agent)
+
+
+def assert_close(a, b):
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=2e-3, atol=2e-4), a, b)
+
+
+def assert_equal(a, b):
+    jax.tree.map(np.testing.assert_array_equal, jax.device_get(a), jax.device_get(b))
+
+
+def shape_of(x):
+    return (x.shape, x.dtype)
+
+
+def test_a_sweep_is_traced_once_and_warms_up_without_updates(job, trained):
+    states, metrics = trained
+    assert job.n_traces == 1
+    assert (metrics[0]["tqc/critic_loss"] == 0).all() and (metrics[1]["tqc/critic_loss"] > 0).all()
+    # A branch on a number of each member would have become a select, with both of its sides computed.
+    program = job._epoch_all.lower(states, job.numbers).as_text()
+    assert program.count("stablehlo.case") == 1
+
+
+def test_members_apart_and_together_again(job, trained):
+    states, _ = trained
+    assert_equal(states, job.together([job.member(states, k) for k in range(job.n)]))
+    assert jax.tree.map(shape_of, job.member_shapes()) == jax.tree.map(shape_of, job.member(states, 1))
+
+
+class MadeUp:
+    """Figures that depend on every parameter of an actor."""
+
+    def __init__(self, actor_params):
+        self.size = float(sum(np.abs(leaf).sum() for leaf in jax.tree.leaves(actor_params)))
+
+    def to_dict(self):
+        return dict.fromkeys(FIGURES, self.size)
+
+
+@pytest.fixture
+def ready(job, monkeypatch):
+    """Sweeps of the members train with the compiled job, and are evaluated by made-up figures."""
+    task = Task(
+        job=None,
+        title="",
+        evaluate=lambda actor_params: (MadeUp(actor_params),),
+        picture_names=(),
+        pictures=lambda rows: {},
+        headline=None,
+        prepare=None,
+    )
+    monkeypatch.setattr(sweep_run, "ReachEnv", lambda spec, config, s2r: job.env)
+    monkeypatch.setattr(sweep_run, "SweepJob", lambda configs, varied, env: job)
+    monkeypatch.setattr(sweep_run, "task_of", lambda config, env: task)
+
+
+def dying(run, epoch, state, save=Run.save):
+    """Saves until the second member is to be saved after the sixth epoch."""
+    if epoch == 6 and run.config.seed == 3:
+        raise KeyboardInterrupt
+    save(run, epoch, state)
+
+
+def test_a_stopped_sweep_ends_with_the_same_bits(ready, job, members, tmp_path, monkeypatch):
+    console = Console(file=io.StringIO())
+    whole, stopped = (create(tmp_path / name, members, VARIABLE, SHORT) for name in ("whole", "stopped"))
+    sweep_run.train(whole, console)
+    with monkeypatch.context() as patch:
+        patch.setattr(Run, "save", dying)
+        with pytest.raises(KeyboardInterrupt):
+            sweep_run.train(stopped, console)
+    resumed = open_sweep(stopped.path)
+    assert resumed.varied == VARIABLE and [run.config for run in resumed.runs] == list(members.values())
+    assert [run.epochs for run in resumed.runs] == [[4, 6], [2, 4]] and resumed.epoch == 4
+    sweep_run.train(resumed, console)
+    assert "continuing after epoch 4 of 8" in console.file.getvalue()
+
+    for one, other in zip(whole.runs, resumed.runs, strict=True):
+        (epoch, expected), (resumed_epoch, got) = (run.restore(job.member_shapes()) for run in (one, other))
+        assert epoch == resumed_epoch == 8
+        assert_equal(expected, got)
+        rows = [[without_speed(row) for row in run.metrics()] for run in (one, other)]
+        assert rows[0] == rows[1] and [row["epoch"] for row in rows[0]] == list(range(1, 9))
+        assert ["evaluation/median_mm" in row for row in rows[0]] == [False, True] * 4
+    for sweep in (whole, resumed):
+        report(dataclasses.replace(sweep, varied=("tqc.gamma",)))  # all settings would fill the plot
+    results = [json.loads((sweep.path / RESULTS_FILE).read_text())["groups"] for sweep in (whole, resumed)]
+    assert results[0] == results[1] and len(results[0]) == 2
+
+
+def without_speed(row):
+    return {name: value for name, value in row.items() if not name.startswith("speed/")}
+
+
+@pytest.mark.slow
+def test_a_sweep_as_a_user_runs_it_survives_kill_9(tmp_path, capsys):
+    SHORT.to_toml(tmp_path / "arm.toml")
+    small = {
+        "n_arms": 8,
+        "total_env_steps": 256,
+        "warmup_env_steps": 16,
+        "batch_size": 16,
+        "replay_capacity": 64,
+        "vector_steps_per_epoch": 2,
+        "evaluation_epochs": 4,
+        "env.n_poses": 64,
+        "tqc.hidden_actor": [16, 16],
+        "tqc.hidden_critic": [16, 16],
+    }
+    flags = [part for name, value in small.items() for part in ("--set", f"{name}={json.dumps(value)}")]
+    flags += ["--spec", str(tmp_path / "arm.toml"), "--seeds", "4,5", "--vary", "env.reward.goal_bonus=50,90"]
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    names = [f"seed{seed}-env.reward.goal_bonus={bonus}" for seed in (4, 5) for bonus in (50, 90)]
+    arguments = [sys.executable, "-m", "train", "sweep", *flags, "--out", str(killed)]
+    process = subprocess.Popen(arguments, stdout=subprocess.DEVNULL)
+    while not any(path.name.isdigit() for path in (killed / names[1]).glob("checkpoints/*")):
+        assert process.poll() is None, "no checkpoint before the sweep ended"
+        time.sleep(0.002)
+    process.kill()
+    process.wait()
+    assert open_sweep(killed).epoch < 16 and not (killed / RESULTS_FILE).exists()
+    assert main(["sweep", "--resume", str(killed)]) == 0
+    assert main(["sweep", *flags, "--out", str(whole)]) == 0
+    results = [json.loads((path / RESULTS_FILE).read_text())["groups"] for path in (whole, killed)]
+    assert results[0] == results[1] and [len(group["runs"]) for group in results[0]] == [2, 2]
+    assert (whole / CURVES_FILE).stat().st_size > 10_000
+
+    figures = (whole / names[1] / "evaluation.json").read_text()
+    assert main(["evaluate", str(whole / names[1])]) == 0
+    assert (whole / names[1] / "evaluation.json").read_text() == figures
+    capsys.readouterr()
+    assert main(["sweep", *flags, "--out", str(whole)]) == 2
+    assert "is there already; continue it with --resume" in capsys.readouterr().err
+
+
+def test_members_are_the_product_of_seeds_and_values():
+    members, varied = members_of(
+        PRESETS["quick"], ["n_arms=64"], "0,7", ["tqc.gamma=0.5, 0.9", "env.reward.goal_bonus=50"]
+    )
+    assert varied == ("tqc.gamma", "env.reward.goal_bonus")
+    got = {name: (c.seed, c.tqc.gamma, c.env.reward.goal_bonus, c.n_arms) for name, c in members.items()}
+    assert got == {
+        "seed0-tqc.gamma=0.5-env.reward.goal_bonus=50": (0, 0.5, 50.0, 64),
+        "seed0-tqc.gamma=0.9-env.reward.goal_bonus=50": (0, 0.9, 50.0, 64),
+        "seed7-tqc.gamma=0.5-env.reward.goal_bonus=50": (7, 0.5, 50.0, 64),
+        "seed7-tqc.gamma=0.9-env.reward.goal_bonus=50": (7, 0.9, 50.0, 64),
+    }
+
+
+@pytest.mark.parametrize(
+    "seeds, vary, message",
+    [
+        (
+            "0",
+            ["n_arms=64,128"],
+            "--vary n_arms: decides what is computed or on what shapes.*one of tqc.learn",
+        ),
+        ("0", ["tqc.hidden_actor=[16]"], "--vary tqc.hidden_actor: decides what is computed"),
+        ("0", ["tqc.learning_rate_end=0.1,1"], "--vary tqc.learning_rate_end: decides what is computed"),
+        ("0", ["warmup_env_steps=16,32"], "--vary warmup_env_steps: decides"),
+        ("0", ["tqc.gama=0.5"], "tqc.gama: unknown setting"),
+        ("0", ["tqc.gamma=0.5,1.5"], r"TQCConfig.gamma: expected a number in \[0, 1\], got 1.5"),
+        ("0", ["tqc.target_entropy=null"], "--vary tqc.target_entropy: got None, expected numbers"),
+        ("0", ["tqc.gamma"], "--vary tqc.gamma: expected NAME=VALUE,VALUE,..."),
+        ("0", ["tqc.gamma=0.5,"], "--vary tqc.gamma=0.5,: got an empty value"),
+        ("0", ["tqc.gamma=0.5", "tqc.gamma=0.6"], "tqc.gamma stands there already"),
+        ("0", ["tqc.tau=0.1,0.10"], "--seeds, --vary: a value comes twice"),
+        ("0,0", [], "--seeds, --vary: a value comes twice"),
+        ("a", [], "seed: got 'a', expected int"),
+        ("0", ["n_arms.x=1"], "n_arms has no settings of its own"),
+        ("0", ["seed=1,2"], "--vary seed=1,2: seed stands there already"),
+        ("0", ["total_env_steps=1,2"], "--set total_env_steps=9: a value for all"),
+    ],
+)
+def test_what_cannot_be_varied_is_refused_by_name(seeds, vary, message):
+    with pytest.raises(ConfigError, match=message):
+        members_of(PRESETS["quick"], ["total_env_steps=9"], seeds, vary)
+
+
+def test_resume_goes_alone(capsys):
+    assert main(["sweep", "--resume", "x", "--seeds", "1"]) == 2
+    assert "--resume goes alone: the sweep's own settings hold, got --seeds too" in capsys.readouterr().err
+
+
+def test_a_folder_that_is_no_sweep_is_named(tmp_path):
+    with pytest.raises(RunError, match="not the folder of a sweep: .*sweep.json: No such file"):
+        open_sweep(tmp_path)
+    (tmp_path / "sweep.json").write_text('{"members": 3}')
+    with pytest.raises(RunError, match="sweep.json: not what a sweep writes"):
+        open_sweep(tmp_path)
+
+
+MEDIANS = {(0, 0.5): [9.0, 2.0], (1, 0.5): [7.0, 5.0], (0, 0.9): [8.0, 6.0], (1, 0.9): [6.0, 8.0]}
+
+
+@pytest.fixture
+def finished(tmp_path):
+    """A sweep of two seeds and two settings with figures made up."""
+    members, varied = members_of(CONFIG, [], "0,1", ["tqc.gamma=0.5,0.9"])
+    sweep = create(tmp_path / "sweep", members, varied, SHORT)
+    for run in sweep.runs:
+        medians = MEDIANS[run.config.seed, run.config.tqc.gamma]
+        for epoch, median in enumerate(medians, start=1):
+            run.log({"epoch": epoch, "env_steps": 64 * epoch, "updates": 10, "evaluation/median_mm": median})
+        run.log({"epoch": 3, "env_steps": 192, "updates": 30})
+        figures = {
+            "median_mm": medians[-1],
+            "p95_mm": 10.0 + run.config.seed,
+            "reached_share": 0.25 * (1 + run.config.seed),
+            "saturated_share": 0.0,
+            "unsettled": 0,
+            "circle_mean_mm": 1.0,
+            "circle_max_mm": 2.0,
+            "circle_saturated_chambers": run.config.seed,
+        }
+        write_json(run.path / "evaluation.json", figures)
+    return sweep
+
+
+def test_the_table_has_mean_least_and_greatest_over_the_seeds(finished):
+    shown = report(finished)
+    columns = {str(column.header).replace("\n", " "): list(column.cells) for column in shown.columns}
+    assert columns == {
+        "setting": ["tqc.gamma=0.5", "tqc.gamma=0.9"],
+        "tip error, median [mm]": ["3.50\n(2.00 to 5.00)", "7.00\n(6.00 to 8.00)"],
+        "95 % [mm]": ["10.50\n(10.00 to 11.00)"] * 2,
+        "goals reached [%]": ["37.5\n(25.0 to 50.0)"] * 2,
+        "saturated [%]": ["0.0\n(0.0 to 0.0)"] * 2,
+        "circle, mean [mm]": ["1.00\n(1.00 to 1.00)"] * 2,
+    }
+    console = Console(file=io.StringIO(), width=160)
+    console.print(shown)
+    assert "median [mm]" in console.file.getvalue()
+    written = json.loads((finished.path / RESULTS_FILE).read_text())
+    assert {"python", "packages", "commit"} <= written["provenance"].keys()
+    first, second = written["groups"]
+    assert first["settings"] == {"tqc.gamma": 0.5} and second["settings"] == {"tqc.gamma": 0.9}
+    assert first["over_seeds"]["median_mm"] == {"mean": 3.5, "min": 2.0, "max": 5.0}
+    assert [run["env_steps"] for run in first["runs"]] == [192, 192]
+    groups = learning.measure([str(run.path) for run in finished.runs])["groups"]
+    assert [group["over_seeds"] for group in groups] == [first["over_seeds"], second["over_seeds"]]
+    assert groups[1]["settings"]["tqc"]["gamma"] == 0.9 and "seed" not in groups[1]["settings"]
+
+
+def test_the_plot_has_the_mean_and_the_spread(finished):
+    (axes,) = curves(finished).axes
+    lines = {line.get_label(): line.get_xydata().tolist() for line in axes.lines}
+    assert lines == {"tqc.gamma=0.5": [[64, 8.0], [128, 3.5]], "tqc.gamma=0.9": [[64, 7.0], [128, 7.0]]}
+    (band, _) = axes.collections
+    vertices = {tuple(vertex) for vertex in band.get_paths()[0].vertices}
+    assert {(64.0, 7.0), (64.0, 9.0), (128.0, 2.0), (128.0, 5.0)} <= vertices
+
+
+def test_an_unfinished_member_is_named(finished):
+    (finished.runs[2].path / "evaluation.json").unlink()
+    with pytest.raises(RunError, match=re.escape(f"{finished.runs[2].path}: not finished")):
+        report(finished)

@@ -1,0 +1,496 @@
+"""The twin against closed forms, hand calculations and the equilibrium solver; who may import it."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from mjx_softarm import ArmSpec
+from mjx_softarm.control import Gains, pressures
+from mjx_softarm.mechanics.workspace import circle_poses, settle_many
+from mjx_softarm.sensing.pose import pose_error, pose_from_frame
+from mjx_softarm.sensing.sensors import SensorParams, length_from_frequency
+from mjx_softarm.twin import arm as twin
+from mjx_softarm.twin import pneumatics
+from mjx_softarm.twin.arm import EVALUATION_SEEDS, Twin
+from mjx_softarm.twin.hysteresis import StopOperators
+from mjx_softarm.twin.model import Build, build_twin, draw_parts
+from mjx_softarm.twin.pneumatics import ATMOSPHERE_KPA, PUMP_M3_PER_S, VALVE_S, Pneumatics
+
+ROOT = Path(__file__).resolve().parents[2]
+IDEAL = Build(gap=0.0, losses=0.0, noise=0.0, links_per_section=4)  # training's model, moving
+PRESSURES_KPA = np.array(
+    [
+        [0, 0, 0, 0, 0, 0, 0, 0, 0],
+        [-12, 3, -20, -5, -30, 4, 2, -9, -14],
+        [5, -20, -8, -3, 8, -25, -15, 6, -6],
+    ],
+    float,
+)
+
+
+@pytest.fixture(scope="module")
+def spec():
+    return ArmSpec.default()
+
+
+@pytest.fixture(scope="module")
+def noiseless():
+    """A twin with everything but noise, brought to rest at some pressures; tests only read it."""
+    arm = Twin(3, build=Build(noise=0.0))
+    hold_pressures(arm, PRESSURES_KPA[1], 10.0)
+    return arm
+
+
+def hold_pressures(arm, pressure_kpa, duration_s):
+    for _ in range(round(50 * duration_s)):
+        arm.write_pressures(pressure_kpa)
+
+
+def hold_springs(arm, reference_m, integral_kpa, gains, duration_s, params):
+    """Run the sensor-space law; returns its integral."""
+    for _ in range(round(50 * duration_s)):
+        length_m = length_from_frequency(arm.read_frequencies(), params).length_m
+        command, integral_kpa = pressures(reference_m, length_m, integral_kpa, gains, 0.02)
+        arm.write_pressures(command)
+    return integral_kpa
+
+
+# --- the body --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("payload_kg", [0.0, 0.5])
+def test_ideal_twin_rests_where_settle_says(spec, payload_kg):
+    arm = Twin(0, payload_kg=payload_kg, build=IDEAL)
+    expected = settle_many(spec.replace(mass={"payload_kg": payload_kg}), PRESSURES_KPA)
+    assert expected.settled.all()
+    for pressure, tip_m, spring_m in zip(
+        PRESSURES_KPA, expected.tip_position_m, expected.spring_m, strict=True
+    ):
+        hold_pressures(arm, pressure, 12.0)
+        read_m = length_from_frequency(arm.read_frequencies(), SensorParams.from_spec(spec)).length_m
+        np.testing.assert_allclose(arm.motion_capture().tip_m, tip_m, atol=2e-5)
+        np.testing.assert_allclose(read_m, spring_m, atol=2e-5)
+        np.testing.assert_allclose(arm.pressures(), pressure, atol=1e-3)
+
+
+def test_payload_attached_and_released_moves_the_tip_as_settle_says(spec):
+    arm = Twin(0, build=IDEAL)
+    hold_pressures(arm, PRESSURES_KPA[1], 12.0)
+    for change, payload_kg in ((lambda: arm.attach(0.5), 0.5), (arm.release, 0.0)):
+        change()
+        hold_pressures(arm, PRESSURES_KPA[1], 12.0)
+        loaded = settle_many(spec.replace(mass={"payload_kg": payload_kg}), PRESSURES_KPA[1:2])
+        np.testing.assert_allclose(arm.motion_capture().tip_m, loaded.tip_position_m[0], atol=2e-5)
+
+
+@pytest.mark.parametrize("payload_kg", [-0.1, np.nan, np.inf])
+def test_impossible_payload_is_refused(payload_kg):
+    with pytest.raises(ValueError, match=r"payload_kg: got .*, expected a number >= 0"):
+        Twin(0, payload_kg=payload_kg, build=IDEAL)
+
+
+def test_finer_twin_is_near_the_ideal_one():
+    """Ten links differ from four by the bending of a link, not by more."""
+    tips_m = []
+    for links in (4, 10):
+        arm = Twin(0, build=IDEAL._replace(links_per_section=links))
+        hold_pressures(arm, PRESSURES_KPA[1], 12.0)
+        tips_m.append(arm.motion_capture().tip_m)
+    assert 1e-4 < np.linalg.norm(tips_m[0] - tips_m[1]) < 0.015
+
+
+def test_twisted_mounting_turns_the_sections_and_stretches_nothing(spec):
+    twist_rad = np.array([0.1, 0.2, -0.05])
+    parts = draw_parts(0, spec, Build(gap=0.0))._replace(twist_rad=twist_rad)
+    model = build_twin(parts)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    np.testing.assert_allclose(data.ten_length, 0.2, atol=1e-12)
+    yaw = [
+        Rotation.from_matrix(data.body(f"link{k}").xmat.reshape(3, 3)).as_euler("ZYX")[0] for k in (5, 15, 29)
+    ]
+    np.testing.assert_allclose(yaw, np.cumsum(twist_rad), atol=1e-12)
+
+
+def test_tolerances_reach_the_compiled_model(spec):
+    parts = draw_parts(4, spec, Build())
+    model = build_twin(parts)
+    stiffness = np.array(parts.spec.chambers.stiffness_n_per_m)
+    area = np.array(parts.spec.chambers.area_m2)
+    assert np.ptp(stiffness) > 10 and np.ptp(area) > 1e-5
+    np.testing.assert_allclose(model.tendon_stiffness[0::2], stiffness)
+    slope = np.array(parts.spec.chambers.area_slope_m)
+    gain = 1e3 * (area - slope * spec.geometry.section_length_m)
+    np.testing.assert_allclose(model.actuator_gainprm[:9, 0], gain)
+    mass = spec.mass.arm_kg / 30 * parts.link_mass
+    np.testing.assert_allclose(model.body_mass[1:31], mass)
+    axial = 10 * spec.backbone.axial_stiffness_n_per_m * parts.backbone
+    np.testing.assert_allclose(model.jnt_stiffness[0::3], np.repeat(axial, 10))
+    for kind, hole_m in parts.hole_m.items():
+        inside = np.array([model.site(f"{kind}{k}_plate{10 * (k // 3) + 5}").pos[:2] for k in range(9)])
+        np.testing.assert_allclose(inside, hole_m)
+    assert np.linalg.norm(model.opt.gravity) == pytest.approx(9.81)
+    np.testing.assert_allclose(
+        Rotation.from_rotvec(parts.base_tilt_rad).apply(model.opt.gravity), [0, 0, -9.81], atol=1e-12
+    )
+
+
+def test_markers_run_from_the_base_to_the_tip(noiseless):
+    capture = noiseless.motion_capture()
+    assert capture.marker_m.shape == (9, 3)
+    np.testing.assert_allclose(capture.marker_m[-1], capture.tip_m, atol=1e-12)
+    step_m = np.linalg.norm(np.diff(capture.marker_m, axis=0), axis=1)
+    assert step_m.min() > 0.02 and step_m.max() < 0.12
+
+
+# --- losses ----------------------------------------------------------------------------------------
+
+
+def test_hysteresis_loop_has_the_area_of_the_closed_form():
+    """A stop of stiffness k and limit k r, moved by +-a, loses 4 k r (a - r) a turn, or nothing."""
+    stiffness, stroke, a = np.array([100.0, 40.0, 7.0]), np.array([0.002, 0.01, 0.05]), 0.02
+    stops = StopOperators(stiffness[None], (stiffness * stroke)[None], np.zeros(1))
+    x = a * np.sin(2 * np.pi * np.linspace(0.0, 2.0, 80_001))
+    force = np.array([stops.move(x[k : k + 1])[0] for k in range(len(x))])
+    turn = slice(40_000, None)  # the second
+    area = np.sum(0.5 * (force[turn][1:] + force[turn][:-1]) * np.diff(x[turn]))
+    slides = stroke < a
+    assert area == pytest.approx(np.sum((4 * stiffness * stroke * (a - stroke))[slides]), rel=1e-4)
+
+
+def test_hysteresis_remembers_where_it_turned():
+    """Return-point memory: a small loop on the way closes, and leaves no trace."""
+    stops = [StopOperators(np.full((1, 3), 50.0), np.array([[0.1, 0.3, 0.7]]), np.zeros(1)) for _ in range(2)]
+    straight = [0.03, -0.02, 0.01]
+    detour = [0.03, -0.02, 0.0, -0.01, 0.0, 0.01]
+    for x in straight:
+        direct = stops[0].move(np.array([x]))
+    for x in detour:
+        around = stops[1].move(np.array([x]))
+    np.testing.assert_allclose(around, direct, atol=1e-12)
+
+
+def test_hysteresis_never_gives_more_than_it_took():
+    rng = np.random.default_rng(0)
+    limit = rng.uniform(0.1, 1.0, (5, 3))
+    stops = StopOperators(rng.uniform(10.0, 100.0, (5, 3)), limit, np.zeros(5))
+    step = 0.01 * rng.standard_normal((5000, 5))
+    force = np.array([stops.move(x) for x in np.cumsum(step, axis=0)])
+    assert (np.cumsum(force * step, axis=0) >= 0.0).all()
+    assert (np.abs(force) <= limit.sum(axis=1) + 1e-12).all()
+
+
+def test_closed_loop_in_pressure_dissipates():
+    """Work of the air over a closed loop: little in a nearly undamped arm, much with losses."""
+    work_j = []
+    for losses in (0.0, 1.0):
+        arm = Twin(1, build=Build(losses=losses))
+        arm._model.tendon_damping[:] *= 0.05
+        arm._model.dof_damping[:] *= 0.05
+        work_of_pressures(arm, 300)
+        work_j.append(work_of_pressures(arm, 300))
+    assert 0.0 < work_j[0] < 0.2 * work_j[1]
+
+
+def work_of_pressures(arm, n_ticks):
+    """Work [J] that the air does on the arm while three chambers go down to -20 kPa and back."""
+    work, length_m, pressure = 0.0, arm._data.ten_length[0::2].copy(), arm._air.pressure_kpa
+    for phase in np.linspace(0.0, 2 * np.pi, n_ticks):
+        arm.write_pressures(-10.0 * (1.0 - np.cos(phase)) * np.array([1, 0, 0, 0, 1, 0, 0, 0, 1]))
+        next_length_m, next_pressure = arm._data.ten_length[0::2].copy(), arm._air.pressure_kpa
+        grown_m3 = arm._air.volume_m3(next_length_m) - arm._air.volume_m3(length_m)
+        work += 1e3 * np.sum(0.5 * (pressure + next_pressure) * grown_m3)
+        length_m, pressure = next_length_m, next_pressure
+    return work
+
+
+def test_arm_that_is_pushed_comes_back_to_rest():
+    """No energy from the losses' delay of one time step: a twin at constant pressures stays at rest."""
+    arm = Twin(5, build=Build(noise=0.0))
+    hold_pressures(arm, PRESSURES_KPA[2], 5.0)
+    arm._data.qvel[:] += 0.3 * np.random.default_rng(0).standard_normal(arm._data.qvel.shape)
+    mujoco.mj_step1(arm._model, arm._data)
+    hold_pressures(arm, PRESSURES_KPA[2], 5.0)
+    assert np.abs(arm._data.qvel).max() < 1e-3
+
+
+# --- air -------------------------------------------------------------------------------------------
+
+AREA_M2, SLOPE_M, REST_M, DT_S = 1.62e-3, -4.06e-3, 0.2, 0.001
+
+
+def air(n=9, length_m=0.2):
+    return Pneumatics(np.full(n, AREA_M2), np.full(n, SLOPE_M), REST_M, np.full(n, length_m), DT_S)
+
+
+@pytest.mark.parametrize("n_filled", [1, 9])
+@pytest.mark.parametrize("target_kpa", [20.0, -40.0])
+def test_pump_fills_as_fast_as_by_hand(n_filled, target_kpa):
+    """12 L/min into 0.324 L chambers held at their length: half of the way after n V p / (2 p_atm) / Q."""
+    system = air()
+    system.command(np.where(np.arange(9) < n_filled, target_kpa, 0.0))
+    half_s = n_filled * (1.62e-3 * 0.2) * 0.5 * abs(target_kpa) / 101.325 / (12e-3 / 60)
+    track = [system.step(np.full(9, 0.2)).copy() for _ in range(round((half_s + VALVE_S) / DT_S))]
+    np.testing.assert_allclose(track[-1][:n_filled], 0.5 * target_kpa, rtol=0.03)
+    np.testing.assert_array_equal(track[-1][n_filled:], 0.0)
+
+
+def test_valve_answers_after_its_dead_time():
+    system = air()
+    system.command(np.full(9, -5.0))
+    track = np.array([system.step(np.full(9, 0.2)).copy() for _ in range(20)])
+    dead = round(VALVE_S / DT_S)
+    np.testing.assert_array_equal(track[:dead], 0.0)
+    assert (track[dead:] < 0.0).all()
+
+
+def test_pressures_arrive_and_stay():
+    system, target_kpa = air(), np.linspace(-40.0, 20.0, 9)
+    system.command(target_kpa)
+    for _ in range(8000):
+        system.step(np.full(9, 0.2))
+    np.testing.assert_allclose(system.pressure_kpa, target_kpa, atol=1e-9)
+
+
+def test_volume_grows_by_the_effective_area():
+    length_m, h = np.linspace(0.1, 0.27, 9), 1e-6
+    system = air(length_m=0.2)
+    slope = (system.volume_m3(length_m + h) - system.volume_m3(length_m - h)) / (2 * h)
+    np.testing.assert_allclose(slope, AREA_M2 + SLOPE_M * (length_m - REST_M), rtol=1e-8)
+    np.testing.assert_allclose(system.volume_m3(np.full(9, 0.2)), AREA_M2 * 0.2)
+
+
+def test_chamber_cut_off_from_the_pump_follows_boyle(monkeypatch):
+    monkeypatch.setattr(pneumatics, "PUMP_M3_PER_S", 0.0)
+    system = air()
+    before = system.volume_m3(np.full(9, 0.2))
+    after = system.volume_m3(np.full(9, 0.17))
+    pressure = ATMOSPHERE_KPA + system.step(np.full(9, 0.17))
+    np.testing.assert_allclose(pressure * after, ATMOSPHERE_KPA * before)
+
+
+def test_paper_s_pump_and_valves():
+    assert pytest.approx(12.0) == PUMP_M3_PER_S * 60e3
+    assert VALVE_S == 0.01
+
+
+# --- sensors ---------------------------------------------------------------------------------------
+
+
+def test_readings_are_counts_of_the_reference_clock(noiseless):
+    count = noiseless.read_frequencies() / (40e6 / 2**28)
+    np.testing.assert_array_equal(count, np.round(count))
+    assert (count < 2**28).all()
+
+
+def test_springs_have_their_own_calibration(spec, noiseless):
+    """The true beta and delta give the spring's length; the nominal ones are millimetres off."""
+    frequency_hz, true_m = noiseless.read_frequencies(), noiseless._data.ten_length[1::2]
+    calibrated = length_from_frequency(frequency_hz, noiseless._parts.sensor).length_m
+    nominal = length_from_frequency(frequency_hz, SensorParams.from_spec(spec)).length_m
+    np.testing.assert_allclose(calibrated, true_m, atol=3e-8)  # half a count is 1e-8 m
+    assert np.abs(nominal - true_m).max() > 1e-3
+
+
+def test_noise_is_as_large_as_documented():
+    arm = Twin(3)
+    frequency_hz = np.array([arm.read_frequencies() for _ in range(300)])
+    pressure_kpa = np.array([arm.pressures() for _ in range(300)])
+    captures = [arm.motion_capture() for _ in range(300)]
+    tip_m = np.array([capture.tip_m for capture in captures])
+    turn = Rotation.from_quat([capture.tip_quaternion for capture in captures], scalar_first=True)
+    off_deg = np.rad2deg((turn * turn.mean().inv()).as_rotvec())
+    assert frequency_hz.std(axis=0).mean() == pytest.approx(twin.FREQUENCY_NOISE_HZ, rel=0.1)
+    assert pressure_kpa.std(axis=0).mean() == pytest.approx(twin.PRESSURE_NOISE_KPA, rel=0.1)
+    assert 1e3 * tip_m.std(axis=0).mean() == pytest.approx(0.2, rel=0.15)
+    assert off_deg.std(axis=0).mean() == pytest.approx(0.1, rel=0.15)
+
+
+# --- seeds, clock and contract ---------------------------------------------------------------------
+
+
+def records(*args, **kwargs):
+    arm = Twin(*args, **kwargs)
+    hold_pressures(arm, PRESSURES_KPA[1], 0.1)
+    return np.concatenate([arm.read_frequencies(), arm.pressures(), arm.motion_capture().tip_m])
+
+
+def test_seed_chooses_the_twin_and_session_the_noise():
+    first = records(7)
+    np.testing.assert_array_equal(first, records(7))
+    assert (first != records(8)).all()
+    other_day = records(7, session=twin.S2R_SESSION)
+    assert (first != other_day).all()
+    np.testing.assert_allclose(first[:9], other_day[:9], atol=10 * twin.FREQUENCY_NOISE_HZ)
+    silent = [records(7, session=session, build=Build(noise=0.0)) for session in (0, 1)]
+    np.testing.assert_array_equal(*silent)
+    assert twin.S2R_SESSION != twin.EVALUATION_SESSION
+
+
+def test_one_write_is_one_control_period():
+    arm = Twin(0, build=IDEAL)
+    assert arm.time_s == 0.0
+    hold_pressures(arm, np.zeros(9), 1.0)
+    arm.read_frequencies(), arm.pressures(), arm.motion_capture()
+    assert arm.time_s == pytest.approx(1.0)
+    slower = Twin(0, ArmSpec.default().replace(control={"rate_hz": 30.0}), build=IDEAL)
+    slower.write_pressures(np.zeros(9))
+    assert slower.time_s == pytest.approx(1.0 / 30.0)
+
+
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        (np.zeros(8), r"pressure_kpa: got shape \(8,\), expected \(9,\)"),
+        ([0, 0, np.nan, 0, 0, 0, 0, 0, 0], r"pressure_kpa\[2\]: got nan, expected -40 to 20 kPa"),
+        ([0, 0, 0, 20.1, 0, 0, 0, 0, 0], r"pressure_kpa\[3\]: got 20.1, expected -40 to 20 kPa"),
+        ([-40.1, 0, 0, 0, 0, 0, 0, 0, 0], r"pressure_kpa\[0\]: got -40.1, expected -40 to 20 kPa"),
+    ],
+)
+def test_impossible_command_is_refused_and_nothing_moves(command, message):
+    arm = Twin(0, build=IDEAL)
+    with pytest.raises(ValueError, match=message):
+        arm.write_pressures(command)
+    assert arm.time_s == 0.0
+    arm.write_pressures(np.full(9, np.nextafter(np.float32(20.0), np.float32(21.0))))
+
+
+def test_describe_tells_distributions_not_draws():
+    assert Twin(1).describe() == Twin(2).describe()
+
+
+def test_springs_reach_their_references_from_any_side(spec):
+    """The law at 50 Hz; what hysteresis leaves at the tip once the springs are where they should be."""
+    gains, tips_m = Gains.from_spec(spec), []
+    reference_m = settle_many(spec, 0.5 * PRESSURES_KPA[1:2]).spring_m[0].astype(float)
+    arm = Twin(2)
+    for start_kpa in (-14.0, 4.0):
+        hold_pressures(arm, np.full(9, start_kpa), 3.0)
+        hold_springs(arm, reference_m, np.full(9, start_kpa), gains, 9.0, arm._parts.sensor)
+        np.testing.assert_allclose(arm._data.ten_length[1::2], reference_m, atol=3e-4)
+        tips_m.append(np.mean([arm.motion_capture().tip_m for _ in range(50)], axis=0))
+    assert np.linalg.norm(tips_m[0] - tips_m[1]) < 2e-3
+
+
+def bang_bang(seed, duration_s):
+    """Every chamber at one of its limits, redrawn at random after 1 to 50 ticks; a payload comes and goes."""
+    arm, rng = Twin(seed), np.random.default_rng(seed)
+    while arm.time_s < duration_s:
+        arm.attach(rng.choice([0.0, 1.0]))
+        hold_pressures(arm, rng.choice([-40.0, 20.0], 9), rng.integers(1, 51) / 50)
+        assert np.isfinite(arm.read_frequencies()).all()
+        assert np.linalg.norm(arm.motion_capture().tip_m) < 1.2
+
+
+def test_survives_random_extremes():
+    bang_bang(0, 20.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", EVALUATION_SEEDS[:2])
+def test_survives_ten_minutes_of_random_extremes(seed):
+    bang_bang(seed, 600.0)
+
+
+# --- the gap ---------------------------------------------------------------------------------------
+
+
+def references_for(spec, goal):
+    """Spring lengths (n, 9) that bring training's model to poses (n, 6): Gauss-Newton over the pressures."""
+    pressure, step_kpa, pull = np.full((len(goal), 9), -8.0), 0.5, 0.02
+    moves = step_kpa * np.concatenate([np.zeros((1, 9)), np.eye(9), -np.eye(9)])
+    for _ in range(8):
+        rest = settle_many(spec, (moves[:, None] + pressure).reshape(-1, 9))
+        pose = pose_from_frame(rest.tip_position_m, rest.tip_rotation).reshape(19, -1, 6)
+        slope = np.moveaxis(pose[1:10] - pose[10:], 0, -1) / (2 * step_kpa)  # (n, 6, 9)
+        for k, error in enumerate(pose_error(pose[0], goal)):
+            rows = np.concatenate([slope[k], pull * np.eye(9)])
+            wanted = np.concatenate([-error, pull * (-10.0 - pressure[k])])
+            move = np.linalg.lstsq(rows, wanted)[0]
+            pressure[k] += move * min(1.0, 8.0 / np.abs(move).max())
+    rest = settle_many(spec, pressure)
+    error = pose_error(pose_from_frame(rest.tip_position_m, rest.tip_rotation), goal)
+    assert np.linalg.norm(error[:, :3], axis=1).max() < 0.05
+    return rest.spring_m.astype(float)
+
+
+@pytest.mark.slow
+def test_without_s2r_the_twins_miss_the_circle_by_the_paper_s_error(spec):
+    goal = circle_poses(8)
+    references, gains, errors_mm = references_for(spec, goal), Gains.from_spec(spec), []
+    for seed in EVALUATION_SEEDS:
+        arm, integral_kpa = Twin(seed), np.zeros(9)
+        for reference_m, point in zip(references, goal, strict=True):
+            integral_kpa = hold_springs(arm, reference_m, integral_kpa, gains, 8.0, arm._parts.sensor)
+            errors_mm.append(np.linalg.norm(1e3 * arm.motion_capture().tip_m - point[:3]))
+    assert np.mean(errors_mm) == pytest.approx(21.0, abs=1.5)
+
+
+# --- who may import it -----------------------------------------------------------------------------
+
+WITHOUT_TWIN = """
+import importlib, pkgutil, sys
+for name in ("train", "calib"):
+    package = importlib.import_module(name)
+    for module in pkgutil.walk_packages(package.__path__, name + "."):
+        if not module.name.endswith("__main__"):
+            importlib.import_module(module.name)
+print(sorted(name for name in sys.modules if name.startswith("mjx_softarm.twin")))
+"""
+DEPLOY_ALONE = """
+import sys
+import mjx_softarm.deploy, mjx_softarm.twin.hysteresis, mjx_softarm.twin.pneumatics
+print(sorted({name.split(".")[0] for name in sys.modules} & {"jax", "jaxlib", "mujoco", "train", "calib"}))
+"""
+
+
+def imported(path):
+    """Every name that a file imports anywhere in it: modules, and what is taken from them."""
+    package = path.relative_to(ROOT).with_suffix("").parts[:-1]
+    for node in ast.walk(ast.parse(path.read_text("utf-8"), str(path))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else ()
+            module = ".".join([*base, *([node.module] if node.module else [])])
+            yield module
+            yield from (f"{module}.{alias.name}" for alias in node.names)
+
+
+@pytest.mark.parametrize("room", ["train", "calib"])
+def test_training_and_calibration_never_import_the_twin(room):
+    files = sorted((ROOT / room).rglob("*.py"))
+    assert files
+    assert not [
+        (path.name, name) for path in files for name in imported(path) if name.startswith("mjx_softarm.twin")
+    ]
+    texts = {path.name: path.read_text("utf-8") for path in files}
+    assert not [name for name, text in texts.items() if "softarm.twin" in text]  # importlib, by a string
+
+
+def test_the_import_check_sees_the_twin():
+    found = set(imported(ROOT / "mjx_softarm/twin/arm.py"))
+    assert {"mjx_softarm.twin.model", "mjx_softarm.twin.model.build_twin", "mujoco"} <= found
+
+
+def run_python(code):
+    return subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=120, check=False
+    )
+
+
+def test_importing_training_and_calibration_leaves_the_twin_out():
+    done = run_python(WITHOUT_TWIN)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == "[]"
+
+
+def test_deploy_is_imported_without_mujoco():
+    done = run_python(DEPLOY_ALONE)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "[]\n", "")

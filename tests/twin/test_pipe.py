@@ -1,0 +1,290 @@
+"""The twin's pipe against the pipe's closed form, weights, and known loads in place of walls."""
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+from scipy.spatial import ConvexHull
+
+from mjx_softarm import ArmSpec
+from mjx_softarm.deploy.arms import ArmError, open_arm
+from mjx_softarm.mechanics.kinematics import chain_frames
+from mjx_softarm.mechanics.mjcf import build_spec
+from mjx_softarm.mechanics.pipe import CrossPipe, body_clearance, clearance
+from mjx_softarm.mechanics.render import RenderError
+from mjx_softarm.twin.arm import Twin
+from mjx_softarm.twin.model import Build, build_twin, draw_parts
+from mjx_softarm.twin.pipe import (
+    CONTAINER,
+    N_PLANKS,
+    _walls,
+    add_pipe,
+    contact_force,
+    is_container,
+)
+
+PIPE = CrossPipe.of_mm(300.0)
+R, Z = 0.15, -0.55
+QUIET = Build(losses=0.0, noise=0.0)
+BENT_KPA = np.array([-12, 3, -20, -5, -30, 4, 2, -9, -14], float)
+
+
+def hold(arm, duration_s, pressure_kpa=0.0):
+    for _ in range(round(50 * duration_s)):
+        arm.write_pressures(np.full(9, pressure_kpa) if np.isscalar(pressure_kpa) else pressure_kpa)
+
+
+def push(arm, body, force_n):
+    arm._data.xfrc_applied[arm._model.body(body).id, :3] = force_n
+
+
+@pytest.fixture(scope="module")
+def pressed():
+    """A twin at rest, its middle pressed against the wall by 20 N; tests only read it."""
+    arm = Twin(3, build=QUIET, pipe=PIPE)
+    push(arm, "link14", [6.0, 19.0, 0.0])
+    hold(arm, 12.0)
+    return arm
+
+
+# --- where the walls are ---------------------------------------------------------------------------
+
+
+def test_walls_enclose_the_pipe_without_a_hole():
+    """Free points lie in no plank; points outside by 1 to 30 mm all lie in one."""
+    rng = np.random.default_rng(0)
+    point = np.array([0.0, 0.0, Z]) + rng.uniform(-1.0, 1.0, (60_000, 3)) * [0.29, 0.19, 0.29]
+    x, y, z = (point - [0.0, 0.0, Z]).T
+    vertical, horizontal = np.hypot(x, y) - R, np.hypot(z, y) - R  # outside, each
+    free = clearance(PIPE, point) > 0.0
+    edge = R / np.cos(np.pi / N_PLANKS) - R
+    # beside the vertical pipe, or beside the horizontal one, or in the corner of both
+    near = (vertical > edge) & (horizontal > edge) & (np.minimum(vertical, horizontal) < 0.03)
+    solid = np.zeros(len(point), bool)
+    for _, corner, _, _ in _walls(PIPE):
+        faces = ConvexHull(corner).equations
+        solid |= (point @ faces[:, :3].T + faces[:, 3] < 1e-9).all(axis=1)
+    assert free.sum() > 10_000 and near.sum() > 5_000
+    assert not solid[free].any()
+    assert solid[near].all()
+
+
+@pytest.mark.parametrize("diameter_mm", [300.0, 250.0])
+def test_arm_touches_where_its_body_has_no_clearance(diameter_mm):
+    """Bent at random, nominal; skin and planks differ from `body_clearance` by 2 mm at most."""
+    parts = draw_parts(0, ArmSpec.default(), Build(gap=0.0))
+    pipe, spec, rng = CrossPipe.of_mm(diameter_mm), parts.spec, np.random.default_rng(0)
+    section = np.concatenate(
+        [rng.uniform(-0.006, 0.002, (200, 3, 1)), rng.normal(0.0, 0.018, (200, 3, 2))], -1
+    )
+    q = np.repeat(section, spec.structure.links_per_section, axis=1).reshape(200, -1)
+    frames = jax.jit(jax.vmap(lambda q: chain_frames(q, spec.link_length_m)))(np.float32(q))
+    free_m = np.asarray(body_clearance(pipe, frames.plate_position, frames.plate_rotation, spec))
+    model = build_twin(parts, pipe)
+    data, wall = mujoco.MjData(model), (model.geom_bodyid == 0) & ~is_container(model)
+    touches = []
+    for bent in q:
+        data.qpos[:] = bent
+        mujoco.mj_forward(model, data)
+        touches.append(wall[data.contact.geom].any())
+    touches = np.array(touches)
+    assert (free_m > 0.002).sum() > 30 and (free_m < -0.002).sum() > 30
+    assert not touches[free_m > 0.002].any() and touches[free_m < -0.002].all()
+
+
+def test_pipe_stands_in_the_frame_of_the_motion_capture():
+    """Not in the twin's own: its base is off and tilted."""
+    arm = Twin(3, build=QUIET, pipe=PIPE)
+    model, data = arm._model, arm._data
+    assert np.abs(arm._parts.base_tilt_rad).max() > 0.005
+    for name, corner, _, _ in _walls(PIPE):
+        geom = model.geom(name)
+        mesh = model.mesh(geom.dataid[0])
+        local = model.mesh_vert[mesh.vertadr[0] : mesh.vertadr[0] + mesh.vertnum[0]]
+        here = data.geom_xpos[geom.id] + local @ data.geom_xmat[geom.id].reshape(3, 3).T
+        there = arm._base_m + here @ arm._base_rotation.T
+        gap = np.linalg.norm(there[:, None] - corner[None], axis=-1)
+        assert len(there) == len(corner) == 8 and gap.min(axis=0).max() < 1e-6
+
+
+def test_floors_are_below_where_the_finger_tips_pick():
+    model = Twin(0, build=Build(gap=0.0), pipe=PIPE)._model
+    assert is_container(model).sum() == 5
+    for side, at in PIPE.containers().items():
+        ray, hit = np.array([0.0, 0.0, -1.0]), np.zeros(1, np.int32)
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        distance = mujoco.mj_ray(model, data, at, ray, None, 1, -1, hit)
+        assert model.geom(hit[0]).name == f"{CONTAINER}_{side}_floor" and distance == pytest.approx(0.05)
+
+
+# --- what they do ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("at", "wall", "container"),
+    [
+        # on the lowest edge between two planks of the right branch
+        ((R + 0.012, 0.0, Z - R + 0.009), 1.0 / np.cos(np.pi / N_PLANKS), 0.0),
+        ((0.03, 0.02, Z - R - 0.06 - 0.05 + 0.009), 0.0, 1.0),  # on the bottom container's floor
+    ],
+)
+def test_forces_carry_the_weight_of_what_lies_in_the_pipe(at, wall, container):
+    spec = ArmSpec.default()
+    mjspec = build_spec(spec)
+    ball = mjspec.worldbody.add_body(name="ball", pos=at)
+    ball.add_freejoint()
+    ball.add_geom(name="ball", size=[0.008, 0.0, 0.0], mass=2.0, conaffinity=1, contype=0)
+    add_pipe(mjspec, PIPE, spec, np.zeros(3), np.eye(3))
+    model = mjspec.compile()
+    model.geom_friction[:] = 0.0
+    data = mujoco.MjData(model)
+    for _ in range(1500):
+        mujoco.mj_step2(model, data)
+        force = contact_force(data, is_container(model))
+        mujoco.mj_step1(model, data)
+    np.testing.assert_allclose(force, 2.0 * 9.81 * np.array([wall, container]), rtol=2e-3, atol=1e-9)
+
+
+def test_known_loads_in_place_of_the_walls_hold_the_arm_where_it_is(pressed):
+    """Statics: without a pipe, the contacts' forces as external loads give the same equilibrium."""
+    free = Twin(3, build=QUIET)
+    free._data.xfrc_applied[: free._model.nbody] = pressed._data.xfrc_applied
+    data, normal_n = pressed._data, 0.0
+    mujoco.mj_step2(pressed._model, data)  # forces of the contacts as they are now
+    for k in range(data.ncon):
+        contact, force = data.contact[k], np.zeros(6)
+        mujoco.mj_contactForce(pressed._model, data, k, force)
+        normal_n += force[0]
+        bodies = pressed._model.geom_bodyid[contact.geom]
+        body, sign = bodies.max(), np.sign(bodies[1] - bodies[0])  # the force is the one on the second
+        push_n = sign * contact.frame.reshape(3, 3).T @ force[:3]
+        free._data.xfrc_applied[body, :3] += push_n
+        free._data.xfrc_applied[body, 3:] += np.cross(contact.pos - data.xipos[body], push_n)
+    hold(free, 12.0)
+    untouched = Twin(3, build=QUIET)
+    push(untouched, "link14", [6.0, 19.0, 0.0])
+    hold(untouched, 12.0)
+    expected_m = pressed.motion_capture().tip_m
+    assert normal_n == pytest.approx(pressed.wall_force_n().wall, rel=0.02) and normal_n > 3.0
+    np.testing.assert_allclose(free.motion_capture().tip_m, expected_m, atol=5e-4)
+    assert np.linalg.norm(untouched.motion_capture().tip_m - expected_m) > 0.02
+
+
+def test_wall_yields_little_to_a_load_at_rest(pressed):
+    assert pressed._data.ncon > 0 and pressed.wall_force_n().container == 0.0
+    assert -1e-3 < pressed._data.contact.dist.min() < 0.0
+    assert np.abs(pressed._data.qvel).max() < 0.01
+
+
+@pytest.mark.parametrize("direction", [[0.0, 1.0, 0.0], [0.6, 0.8, 0.0], [1.0, 0.0, 0.0]])
+def test_gripper_pressed_against_the_wall(direction):
+    """By 20 N within 2 s; the third direction leads into a branch, and the arm against its edge."""
+    arm, deepest_m = Twin(3, build=QUIET, pipe=PIPE), []
+    for k in range(300):
+        push(arm, "gripper", min(1.0, k / 100) * 20.0 * np.array(direction))
+        hold(arm, 0.02)
+        deepest_m.append(-arm._data.contact.dist.min() if arm._data.ncon else 0.0)
+    assert max(deepest_m) < 5e-3 and deepest_m[-1] < 1e-3
+    assert 10.0 < sum(arm.wall_force_n()) < 25.0
+
+
+def test_force_is_the_largest_of_the_last_period():
+    arm = Twin(3, build=QUIET, pipe=PIPE)
+    assert arm.wall_force_n() == (0.0, 0.0)
+    push(arm, "link14", [0.0, 30.0, 0.0])
+    steps, step = [], arm._step
+
+    def counted():
+        before = arm._wall_force
+        arm._wall_force = type(before)(0.0, 0.0)
+        step()
+        steps.append(arm._wall_force)
+        arm._wall_force = type(before)(*map(max, before, steps[-1]))
+
+    arm._step = counted
+    for _ in range(40):
+        steps.clear()
+        hold(arm, 0.02)
+        assert len(steps) == 4 and arm.wall_force_n() == tuple(np.max(steps, axis=0))
+    assert arm.wall_force_n().wall > 1.0
+    push(arm, "link14", 0.0)
+    hold(arm, 4.0)
+    assert arm.wall_force_n() == (0.0, 0.0)
+
+
+def test_arm_that_touches_nothing_moves_as_without_a_pipe():
+    tips_m = []
+    for pipe in (None, PIPE):
+        arm = Twin(7, build=Build(noise=0.0), pipe=pipe)
+        hold(arm, 3.0, BENT_KPA)
+        assert arm.wall_force_n() == (0.0, 0.0)
+        tips_m.append(arm.motion_capture().tip_m)
+    np.testing.assert_allclose(*tips_m, atol=1e-9)
+
+
+def test_without_a_pipe_nothing_can_touch():
+    model = Twin(7)._model
+    assert not model.geom_contype.any() and not model.geom_conaffinity.any() and model.nmesh == 0
+    off = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    assert model.opt.disableflags & off == off
+
+
+@pytest.mark.parametrize("diameter_mm", [300.0, 250.0])
+def test_survives_random_extremes_in_the_pipe(diameter_mm):
+    """Chambers at their limits, redrawn at random; only arm and pipe touch, and the arm stays inside."""
+    pipe = CrossPipe.of_mm(diameter_mm)
+    arm, rng, touched = Twin(0, pipe=pipe), np.random.default_rng(0), 0
+    while arm.time_s < 16.0:
+        arm.attach(rng.choice([0.0, 0.22]))
+        ahead = np.cos(2 * np.pi * (np.arange(9) / 3 - rng.random()))  # bend to one side
+        for _ in range(rng.integers(10, 100)):
+            arm.write_pressures(np.where(ahead > 0.0, -40.0, 20.0))
+            contact, bodies = arm._data.contact, arm._model.geom_bodyid[arm._data.contact.geom]
+            touched += arm._data.ncon > 0
+            assert ((bodies == 0).sum(axis=1) == 1).all()
+            assert arm._data.ncon == 0 or contact.dist.min() > -0.02
+            assert (clearance(pipe, arm.motion_capture().marker_m) > 0.04).all()
+            assert np.isfinite(arm.wall_force_n()).all()
+    assert touched > 100
+
+
+# --- names and pictures ----------------------------------------------------------------------------
+
+
+def test_arms_in_pipes_by_name():
+    arm = open_arm("twin:7:pipe250")
+    assert arm.describe()["pipe"]["diameter_m"] == 0.25 and "pipe" not in open_arm("twin:7").describe()
+    assert open_arm("twin:7:pipe300").wall_force_n() == (0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("twin:0:pipe200", "twin:0:PIPE, got 'pipe200', expected pipe300 or pipe250"),
+        ("twin:0:", "twin:0:PIPE, got '', expected pipe300 or pipe250"),
+        ("twin:0:pipe300:x", "got 'pipe300:x', expected pipe300 or pipe250"),
+        ("twin::pipe300", "got '', expected an integer >= 0"),
+    ],
+)
+def test_pipe_that_cannot_be_had(name, message):
+    with pytest.raises(ArmError, match=message):
+        open_arm(name)
+
+
+def test_picture_shows_the_arm_in_the_open_pipe_and_what_it_holds():
+    arms = [Twin(0, build=Build(gap=0.0), pipe=pipe) for pipe in (None, PIPE)]
+    try:
+        with arms[1].renderer(140, 180) as renderer:
+            hanging = arms[1].draw(renderer).astype(int)
+            arms[1].attach(0.22)
+            holding = arms[1].draw(renderer).astype(int)
+    except RenderError as error:
+        pytest.skip(str(error))
+    red, _, blue = np.moveaxis(hanging, -1, 0)
+    third = [hanging.shape[0] * k // 6 for k in (0, 3, 6)]
+    assert (red > blue + 60)[: third[1], 55:85].sum() > 300  # the upper two sections are not hidden
+    left, right = np.s_[third[1] :, :50], np.s_[third[1] :, 90:]
+    assert (blue > red + 60)[left].sum() > 100 and (red > blue + 60)[right].sum() > 100  # the containers
+    assert (blue > red + 60)[right].sum() == 0
+    assert 10 < (np.abs(holding - hanging).max(axis=-1) > 40).sum() < 400  # the ball alone

@@ -1,0 +1,216 @@
+"""Truncated quantile critics: an off-policy actor-critic with a learned temperature.
+
+Kuznetsov et al. 2020, arXiv:2005.04269, on top of soft actor-critic, Haarnoja et al. 2018, arXiv:1812.05905.
+`TQC` joins the losses to networks and optimisers. Nothing here is jitted: wrap the outermost function,
+such as a scan of updates, and donate the state.
+
+Shapes: B batch, O observation, A action, C critics, M quantiles per critic, K kept target quantiles.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jax import Array
+
+from mjx_softarm._support import draws
+from train.agent.losses import actor_loss, alpha_loss, quantile_huber_loss, truncated_targets
+from train.agent.networks import Actor, Critics, mode, sample_action, squash
+
+Params = Any  # a flax parameter tree
+
+
+@dataclass(frozen=True)
+class TQCConfig:
+    """Hyperparameters, by default stable-baselines3-contrib's. Raises ValueError naming a bad field."""
+
+    hidden_actor: tuple[int, ...] = (256, 256)
+    hidden_critic: tuple[int, ...] = (256, 256)  # of each critic
+    n_critics: int = 2
+    n_quantiles: int = 25  # per critic
+    n_drop_per_critic: int = 2  # largest pooled target quantiles dropped, per critic
+    layer_norm: bool = False  # in the critics
+    learning_rate: float = 3e-4  # of actor and critics (Adam)
+    learning_rate_end: float = 1.0  # share of it left at the end; it falls along a half cosine
+    learning_rate_alpha: float = 3e-4  # of the temperature; 0 holds it at initial_alpha
+    gamma: float = 0.99  # discount per step
+    tau: float = 0.005  # Polyak rate of the target critics and of the mean actor, per update
+    initial_alpha: float = 1.0  # temperature
+    target_entropy: float | None = None  # [nat]; None is minus the number of actions
+    reward_scale: float = 1.0  # on every reward in the critics' targets
+
+    def __post_init__(self) -> None:
+        required = {
+            "hidden_critic": (len(self.hidden_critic) > 0, "at least one layer"),
+            "n_critics": (self.n_critics > 0, "a positive number"),
+            "n_drop_per_critic": (0 <= self.n_drop_per_critic < self.n_quantiles, "0 to n_quantiles - 1"),
+            "learning_rate": (self.learning_rate >= 0.0, "a number >= 0"),
+            "learning_rate_end": (0.0 <= self.learning_rate_end <= 1.0, "a number in [0, 1]"),
+            "gamma": (0.0 <= self.gamma <= 1.0, "a number in [0, 1]"),
+            "tau": (0.0 < self.tau <= 1.0, "a number in (0, 1]"),
+            "initial_alpha": (self.initial_alpha > 0.0, "a positive number"),
+        }
+        for name, (holds, expected) in required.items():
+            if not holds:
+                raise ValueError(f"TQCConfig.{name}: expected {expected}, got {getattr(self, name)}")
+
+
+class Transition(NamedTuple):
+    """A batch of steps. Truncation is absent by design: a step cut by the clock bootstraps like any other."""
+
+    obs: Array  # (B, O)
+    action: Array  # (B, A) in [-1, 1]
+    reward: Array  # (B,)
+    next_obs: Array  # (B, O) reached by the action, before any reset
+    terminated: Array  # (B,) float: 1 where the next value is zero, else 0
+
+
+class TQCState(NamedTuple):
+    """All that an update changes."""
+
+    actor_params: Params
+    mean_actor_params: Params  # Polyak average of actor_params: the policy that comes of training
+    critic_params: Params
+    target_params: Params  # shaped as critic_params
+    log_alpha: Array  # () log temperature
+    actor_opt_state: optax.OptState
+    critic_opt_state: optax.OptState
+    alpha_opt_state: optax.OptState
+    step: Array  # () int32, updates done
+
+
+class TQC:
+    """The agent: networks and optimisers of fixed structure, and pure functions of a `TQCState`.
+
+    `n_updates` is the length of the learning rate's decay, needed where it decays.
+    """
+
+    def __init__(
+        self, obs_size: int, action_size: int, config: TQCConfig = TQCConfig(), n_updates: int | None = None
+    ) -> None:
+        self.obs_size, self.action_size, self.config = obs_size, action_size, config
+        self.actor: Any = Actor(action_size, config.hidden_actor)
+        self.critics: Any = Critics(
+            config.n_critics, config.n_quantiles, config.hidden_critic, config.layer_norm
+        )
+        self.optimizer = optax.adam(_learning_rate(config, n_updates))
+        self.alpha_optimizer = optax.adam(config.learning_rate_alpha)
+        self.target_entropy = -float(action_size) if config.target_entropy is None else config.target_entropy
+
+    def init(self, key: Array) -> TQCState:
+        """Fresh parameters; target critics and mean actor start as copies."""
+        key_actor, key_critic = jax.random.split(key)
+        obs = jnp.zeros((1, self.obs_size))
+        own_buffers = functools.partial(jax.tree.map, jnp.copy)  # so that a state can be donated
+        actor_params = self.actor.init(key_actor, obs)
+        critic_params = self.critics.init(key_critic, obs, jnp.zeros((1, self.action_size)))
+        log_alpha = jnp.log(jnp.asarray(self.config.initial_alpha, obs.dtype))
+        return TQCState(
+            actor_params=actor_params,
+            mean_actor_params=own_buffers(actor_params),
+            critic_params=critic_params,
+            target_params=own_buffers(critic_params),
+            log_alpha=log_alpha,
+            actor_opt_state=self.optimizer.init(actor_params),
+            critic_opt_state=self.optimizer.init(critic_params),
+            alpha_opt_state=self.alpha_optimizer.init(log_alpha),
+            step=jnp.zeros((), jnp.int32),
+        )
+
+    def act(self, actor_params: Params, obs: Array, key: Array) -> Array:
+        """Samples an action (..., A) in (-1, 1) at obs (..., O)."""
+        return sample_action(*self.actor.apply(actor_params, obs), key=key)[0]
+
+    def act_mode(self, actor_params: Params, obs: Array) -> Array:
+        """The deterministic action (..., A) in (-1, 1) at obs (..., O)."""
+        return mode(self.actor.apply(actor_params, obs)[0])
+
+    def update(self, state: TQCState, batch: Transition, key: Array) -> tuple[TQCState, dict[str, Array]]:
+        """One gradient step of critics, actor and temperature, then of target critics and mean actor.
+
+        All three gradients are taken at the incoming state, so none waits for another's optimiser.
+
+        Returns:
+            The next state, and scalar metrics: the three losses, alpha, entropy [nat], q_mean, target_mean.
+
+        Raises:
+            ValueError: a field of `batch` has the wrong shape.
+        """
+        self._check_shapes(batch)
+        noise, next_noise = draws.normal(key, (2, *batch.action.shape))  # (B, A) each
+        targets = self._targets(state, batch, next_noise)  # (B, K)
+
+        critic_grad = jax.value_and_grad(self._critic_loss, has_aux=True)
+        actor_grad = jax.value_and_grad(self._actor_loss, has_aux=True)
+        (loss_critic, q_mean), d_critic = critic_grad(state.critic_params, batch, targets)
+        (loss_actor, log_prob), d_actor = actor_grad(state.actor_params, state, batch.obs, noise)
+        loss_alpha, d_alpha = jax.value_and_grad(alpha_loss)(state.log_alpha, log_prob, self.target_entropy)
+
+        critic = _descend(self.optimizer, d_critic, state.critic_opt_state, state.critic_params)
+        actor = _descend(self.optimizer, d_actor, state.actor_opt_state, state.actor_params)
+        temperature = _descend(self.alpha_optimizer, d_alpha, state.alpha_opt_state, state.log_alpha)
+        next_state = TQCState(
+            actor_params=actor[0],
+            mean_actor_params=optax.incremental_update(actor[0], state.mean_actor_params, self.config.tau),
+            critic_params=critic[0],
+            target_params=optax.incremental_update(critic[0], state.target_params, self.config.tau),
+            log_alpha=temperature[0],
+            actor_opt_state=actor[1],
+            critic_opt_state=critic[1],
+            alpha_opt_state=temperature[1],
+            step=state.step + 1,
+        )
+        losses = {"critic_loss": loss_critic, "actor_loss": loss_actor, "alpha_loss": loss_alpha}
+        means = {"entropy": -jnp.mean(log_prob), "q_mean": q_mean, "target_mean": jnp.mean(targets)}
+        return next_state, {**losses, **means, "alpha": jnp.exp(state.log_alpha)}
+
+    def _targets(self, state: TQCState, batch: Transition, noise: Array) -> Array:
+        next_action, next_log_prob = squash(
+            *self.actor.apply(state.actor_params, batch.next_obs), noise=noise
+        )
+        return truncated_targets(
+            self.critics.apply(state.target_params, batch.next_obs, next_action),  # (B, C, M)
+            next_log_prob,
+            self.config.reward_scale * batch.reward,
+            batch.terminated,
+            jnp.exp(state.log_alpha),
+            gamma=self.config.gamma,
+            n_drop_per_critic=self.config.n_drop_per_critic,
+        )
+
+    def _critic_loss(self, params: Params, batch: Transition, targets: Array) -> tuple[Array, Array]:
+        quantiles = self.critics.apply(params, batch.obs, batch.action)  # (B, C, M)
+        return quantile_huber_loss(quantiles, targets), jnp.mean(quantiles)
+
+    def _actor_loss(self, params: Params, state: TQCState, obs: Array, noise: Array) -> tuple[Array, Array]:
+        action, log_prob = squash(*self.actor.apply(params, obs), noise=noise)  # (B, A), (B,)
+        quantiles = self.critics.apply(state.critic_params, obs, action)  # (B, C, M)
+        return actor_loss(log_prob, quantiles, jnp.exp(state.log_alpha)), log_prob
+
+    def _check_shapes(self, batch: Transition) -> None:
+        n = batch.obs.shape[0]
+        sizes = {"obs": (self.obs_size,), "action": (self.action_size,), "next_obs": (self.obs_size,)}
+        for name, value in batch._asdict().items():
+            expected = (n, *sizes.get(name, ()))
+            if value.shape != expected:
+                raise ValueError(f"Transition.{name}: expected shape {expected}, got {value.shape}")
+
+
+def _learning_rate(config: TQCConfig, n_updates: int | None) -> float | optax.Schedule:
+    if config.learning_rate_end == 1.0:
+        return config.learning_rate
+    if n_updates is None:
+        raise ValueError("TQC: learning_rate_end is not 1, so n_updates is needed, got None")
+    return optax.cosine_decay_schedule(config.learning_rate, n_updates, config.learning_rate_end)
+
+
+def _descend(
+    optimizer: optax.GradientTransformation, grads: Params, opt_state: optax.OptState, params: Params
+) -> tuple[Params, optax.OptState]:
+    updates, opt_state = optimizer.update(grads, opt_state, params)
+    return optax.apply_updates(params, updates), opt_state

@@ -1,0 +1,124 @@
+"""Demonstrations: positions that an expert brought the arm to, each with the action that leads there.
+
+A file of demonstrations is a log (`mjx_softarm.logs.schema`) of rows at rest, with the springs' frequencies, the
+tip's pose, and the id of the sequence that a row belongs to. A row's action is its own frequencies: asked of
+the springs, they lead to the row's pose from wherever the arm is. So a row's pose is the goal of its action,
+and any other one its start. There is nothing to repair in so few rows: whatever is wrong with one of them
+refuses the file.
+
+Source: the paper's representation of demonstration data, g' = the pose of s_{t+1}.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from mjx_softarm.logs.checks import Finding, not_unit_rows
+from mjx_softarm.logs.files import Sheet, read_sheet, refuse
+from mjx_softarm.logs.schema import UNITS, Column, Log
+from mjx_softarm.sensing.pose import pose_from_quaternion
+from mjx_softarm.sensing.sensors import frequency_range_hz
+from mjx_softarm.spec import ArmSpec
+
+NEEDED = ("frequency_hz", "tip_m", "tip_quaternion", "sequence")
+
+
+class Demonstrations(NamedTuple):
+    """m demonstrated positions; float32, ids int32."""
+
+    positions: np.ndarray  # (m, 6) [mm, deg]
+    actions: np.ndarray  # (m, n_chambers) in [-1, 1] that lead to a position
+    sequence: np.ndarray  # (m,)
+
+
+def load_demonstrations(path: str | Path, spec: ArmSpec) -> Demonstrations:
+    """Read a file and check all of it.
+
+    Args:
+        path: CSV, or npz by the end of its name.
+        spec: the arm that is to learn from them.
+
+    Raises:
+        LogError: the file cannot be used; the message has a line for each finding.
+    """
+    return from_log(read_demonstrations(path, spec)[0], spec)
+
+
+def read_demonstrations(path: str | Path, spec: ArmSpec) -> tuple[Log, list[Finding]]:
+    """The checked rows of a file, and its unknown columns.
+
+    Raises:
+        LogError: the file cannot be used; the message has a line for each finding.
+    """
+    sheet, extra = read_sheet(path, spec.n_chambers, NEEDED)
+    refuse(list(_not_finite(sheet)))
+    refuse(list(_out_of_range(sheet, spec)))
+    refuse(list(_out_of_order(sheet)))
+    return sheet.log(), extra
+
+
+def from_log(log: Log, spec: ArmSpec) -> Demonstrations:
+    """The demonstrations that checked rows are."""
+    low, high = frequency_range_hz(spec).T
+    actions = np.clip(2.0 * (log.frequency_hz - low) / (high - low) - 1.0, -1.0, 1.0)
+    assert log.sequence is not None  # it is `NEEDED`
+    positions = pose_from_quaternion(log.tip_m, log.tip_quaternion)
+    return Demonstrations(
+        positions.astype(np.float32), actions.astype(np.float32), log.sequence.astype(np.int32)
+    )
+
+
+def _not_finite(sheet: Sheet) -> Iterator[Finding]:
+    needed = sheet.of("time_s", *NEEDED)
+    for row, k in np.argwhere(~np.isfinite(sheet.values[:, needed])):
+        column = sheet.columns[needed[k]]
+        yield _finding(sheet, row, column.name, f"got {sheet.values[row, needed[k]]}, expected a number")
+
+
+def _out_of_range(sheet: Sheet, spec: ArmSpec) -> Iterator[Finding]:
+    for k, limits_hz in zip(sheet.of("frequency_hz"), frequency_range_hz(spec), strict=True):
+        column, values = sheet.columns[k], sheet.values[:, k]
+        low, high = (_shown(column, limit) for limit in limits_hz)
+        for row in np.flatnonzero((values < limits_hz[0]) | (values > limits_hz[1])):
+            got = f"got {_shown(column, values[row])} {column.unit}"
+            yield _finding(sheet, row, column.name, f"{got}, expected {low} to {high}, the arm's range")
+    tip_m, reach_m = sheet.values[:, sheet.of("tip_m")], spec.structure.n_sections * spec.springs.length_max_m
+    for row in np.flatnonzero((np.linalg.norm(tip_m, axis=1) > reach_m) | (tip_m[:, 2] > 0.0)):
+        got = ", ".join(f"{1e3 * value:.4g}" for value in tip_m[row])
+        expected = f"a tip below the base and within {1e3 * reach_m:.4g} mm of it"
+        yield _finding(sheet, row, "tip_x..z", f"got {got} mm, expected {expected}")
+    quaternion = sheet.values[:, sheet.of("tip_quaternion")]
+    for row in np.flatnonzero(not_unit_rows(quaternion)):
+        got = f"got length {np.linalg.norm(quaternion[row]):.4g}"
+        yield _finding(sheet, row, "tip_qw..qz", f"{got}, expected unit quaternions")
+    sequence = sheet.values[:, sheet.of("sequence")[0]]
+    for row in np.flatnonzero((sequence < 0.0) | (sequence != np.round(sequence))):
+        yield _finding(sheet, row, "sequence", f"got {sequence[row]:g}, expected an integer >= 0")
+
+
+def _out_of_order(sheet: Sheet) -> Iterator[Finding]:
+    time_s, sequence = sheet.values[:, 0], sheet.values[:, sheet.of("sequence")[0]]
+    same = sequence[1:] == sequence[:-1]
+    for row in 1 + np.flatnonzero(same & (time_s[1:] <= time_s[:-1])):
+        problem = f"got {time_s[row]:g} s after {time_s[row - 1]:g} s, expected time's order in a sequence"
+        yield _finding(sheet, row, "time", problem)
+    starts = np.concatenate([[0], 1 + np.flatnonzero(~same)])
+    for k in range(1, len(starts)):
+        now, before = sequence[starts[k]], sequence[starts[:k]]
+        if now in before:
+            problem = f"got {now:g} again after {before[-1]:g}, expected a sequence in one piece"
+            yield _finding(sheet, starts[k], "sequence", problem)
+
+
+def _finding(sheet: Sheet, row: int | np.integer, column: str, problem: str) -> Finding:
+    line = int(sheet.row[row])
+    return Finding(sheet.file, (line, line), column, problem)
+
+
+def _shown(column: Column, value: float) -> str:
+    """A number of the unit used inside, as the file has it."""
+    return f"{value / UNITS[column.kind][column.unit]:.7g}"

@@ -1,0 +1,310 @@
+"""The scripted expert: chamber pressures that bring the finger tips to waypoints, as a careful operator does.
+
+For each waypoint, the equilibrium of the (calibrated) arm is sought that has its finger tips there, its body
+inside the pipe, its chambers and springs away from their limits, and that otherwise is clear of the wall and
+close to the equilibrium of the waypoint before. That is a least-squares problem in the nine pressures, with
+one-sided errors for the limits, solved by a damped Gauss-Newton method from many starts at once: the posture
+before, and postures of a random pool that are near and clear. Of the ends that keep all limits, those are
+preferred whose straight way in pressures from the posture before is clear, and of these the nearest one.
+Where none keeps them with the gripper as it is asked to hang, it may hang a little otherwise.
+
+Poses are the real arm's, P_S2R, where there is a sim-to-real network, and so is the body, as far as the
+network tells; see `carry_body`.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from mjx_softarm._support.xp import array_namespace
+from mjx_softarm.mechanics.excitation import random_pressures
+from mjx_softarm.mechanics.kinematics import chain_frames
+from mjx_softarm.mechanics.pipe import CrossPipe, body_points, clearance
+from mjx_softarm.mechanics.rest import rest, statics_at
+from mjx_softarm.mechanics.settle import RESIDUAL_TOLERANCE
+from mjx_softarm.mechanics.statics import ArmParams
+from mjx_softarm.sensing.pose import frame_from_pose, pose_from_frame
+from mjx_softarm.sensing.s2r import S2R, carry_body, correct
+from mjx_softarm.spec import ArmSpec
+from train.demos.waypoints import Waypoint
+
+N_POOL, N_STARTS, N_STEPS = 4096, 32, 25
+_BATCH = 256  # postures looked at in one call
+N_JITTERED = 8  # of the starts, about the posture before
+JITTER_KPA = 3.0
+WAY = (0.25, 0.5, 0.75)  # of the way from the posture before, where its clearance is looked at
+WAY_CLEAR_M = 0.01  # with more than this it is as good as any
+MARGIN_M = 0.004  # of the body to the wall
+MARGIN_KPA = 1.5  # of the chambers to their limits
+COMFORT_M, COMFORT_KPA = 0.02, 6.0  # beyond these, more distance is worth nothing
+SPRING_MARGIN_M = 1e-3
+TOLERANCE_M, TOLERANCE_RAD = 5e-4, 0.01  # of a waypoint that is met
+EASED = 0.2  # weight of the orientation where no posture meets it so: it may then be off by 5 times that
+LIMIT_SHARE = 0.8  # of a margin, that must be kept: one-sided errors end a little inside of it
+
+# One unit of error.
+_POSITION_M, _TURN_RAD, _LIMIT_KPA, _LIMIT_M = 1e-4, 1e-3, 0.1, 1e-4
+_COMFORT_M, _COMFORT_KPA, _NEAR_KPA = 0.01, 3.0, 20.0
+_NO_WALL_M = 1.0  # clearance where there is no pipe
+
+
+class ExpertError(ValueError):
+    """A waypoint that cannot be met; the message says which, how far off, and what is in the way."""
+
+
+class Posture(NamedTuple):
+    """An arm at rest; each field may have leading axes."""
+
+    pressure_kpa: Any  # (n_chambers,)
+    spring_m: Any  # (n_chambers,) which are the references to hold
+    pose: Any  # (6,) [mm, deg] of the tip, the real arm's where there is a network
+    finger_m: Any  # (3,)
+    rotation: Any  # (3, 3) of the gripper
+    clearance_m: Any  # () of the body to the wall
+    residual: Any  # () force [N, N m] that is left
+
+
+class Target(NamedTuple):
+    """What to solve for."""
+
+    finger_m: Any  # (3,)
+    rotation: Any  # (3, 3)
+    turn: Any  # (3,) 1 for each of the gripper's axes about which it is not to turn from that, else 0
+    bias_kpa: Any  # (n_chambers,) by which the real arm's pressures are above the simulated one's
+    near_kpa: Any  # (n_chambers,)
+
+
+class Expert:
+    """The solver for one arm in one pipe, or in the open."""
+
+    def __init__(self, spec: ArmSpec, s2r: S2R | None = None, pipe: CrossPipe | None = None, seed: int = 0):
+        self.spec, self.s2r, self.pipe = spec, s2r, pipe
+        self._params = ArmParams.from_spec(spec)
+        self._rng = np.random.default_rng(seed)
+        pool = self.look(random_pressures(spec, N_POOL, self._rng))
+        self._pool = jax.tree.map(lambda x: x[self._slack(pool).min(axis=-1) >= 0.0], pool)
+
+    def look(self, pressure_kpa: np.ndarray) -> Posture:
+        """Postures at pressures (n, n_chambers) [kPa]."""
+        n = len(pressure_kpa)
+        padded = np.resize(
+            np.asarray(pressure_kpa, np.float32), (-(-n // _BATCH) * _BATCH, self.spec.n_chambers)
+        )
+        parts = [
+            jax.device_get(_look_many(part, self._params, self.s2r, self.spec, self.pipe))
+            for part in np.split(padded, len(padded) // _BATCH)
+        ]
+        return jax.tree.map(lambda *x: np.concatenate(x)[:n], *parts)
+
+    def plan(self, waypoints: Sequence[Waypoint]) -> Posture:
+        """Postures (n,) at waypoints, each near the one before.
+
+        Args:
+            waypoints: one after the other.
+
+        Raises:
+            ExpertError: a waypoint cannot be met.
+        """
+        found, before = [], np.zeros(self.spec.n_chambers)
+        for waypoint in waypoints:
+            found.append(self.reach(waypoint.name, self.target(waypoint), before))
+            before = found[-1].pressure_kpa
+        return jax.tree.map(lambda *x: np.stack(x), *found)
+
+    def target(self, waypoint: Waypoint) -> Target:
+        """What a waypoint asks for."""
+        zero = np.zeros(self.spec.n_chambers)
+        return Target(np.asarray(waypoint.finger_m), np.eye(3), np.array(waypoint.turn), zero, zero)
+
+    def reach(self, name: str, target: Target, before_kpa: np.ndarray) -> Posture:
+        """The posture that meets a target, near the one at `before_kpa` (n_chambers,).
+
+        Raises:
+            ExpertError: there is none; `name` is in its message.
+        """
+        target = jax.tree.map(np.float32, target._replace(near_kpa=before_kpa))
+        starts = np.float32(self._starts(target))
+        for weight in (1.0, EASED) if target.turn.any() else (1.0,):
+            eased = target._replace(turn=np.float32(weight) * target.turn)
+            ends = _solve_many(starts, eased, self._params, self.s2r, self.spec, self.pipe)
+            found = self.look(np.asarray(ends))
+            slack = self._slack(found, eased)
+            met = np.flatnonzero((slack >= 0.0).all(axis=-1))
+            if len(met):
+                break
+        else:
+            raise ExpertError(self._why(name, target, found, slack))
+        way = [found.pressure_kpa[met] * share + before_kpa * (1.0 - share) for share in WAY]
+        clear_m = self.look(np.concatenate(way)).clearance_m.reshape(len(WAY), -1).min(axis=0)
+        far_kpa = np.linalg.norm(found.pressure_kpa[met] - before_kpa, axis=-1)
+        best = met[np.lexsort([far_kpa, -np.minimum(clear_m, WAY_CLEAR_M)])[0]]
+        return jax.tree.map(lambda x: x[best], found)
+
+    def _starts(self, target: Target) -> np.ndarray:
+        """Pressures (N_STARTS, n_chambers): about the posture before, and of the pool."""
+        low, high = self._limits_kpa()
+        jitter = JITTER_KPA * self._rng.standard_normal((N_JITTERED, len(target.near_kpa)))
+        jitter[0] = 0.0
+        near = np.clip(target.near_kpa + jitter, low, high)
+        off_m = np.linalg.norm(self._pool.finger_m - target.finger_m, axis=-1)
+        far = np.linalg.norm(self._pool.pressure_kpa - target.near_kpa, axis=-1) / (high - low)
+        chosen = np.argsort(off_m + 0.02 * far)[: N_STARTS - N_JITTERED]
+        return np.concatenate([near, self._pool.pressure_kpa[chosen]])
+
+    def _limits_kpa(self) -> tuple[float, float]:
+        chambers = self.spec.chambers
+        return chambers.pressure_min_kpa, chambers.pressure_max_kpa
+
+    def _room_kpa(self, found: Posture, target: Target) -> np.ndarray:
+        """What is left to the next limit (n, n_chambers) of the real arm's pressures."""
+        low, high = self._limits_kpa()
+        real_kpa = found.pressure_kpa + target.bias_kpa
+        return np.minimum(real_kpa - low, high - real_kpa)
+
+    def _slack(self, found: Posture, target: Target | None = None) -> np.ndarray:
+        """How far within its tolerance each demand is, in units of that tolerance: (n, demands).
+
+        Equilibrium, clearance, pressures, springs; then position and, where it is wanted, orientation.
+        """
+        springs = self.spec.springs
+        margin_m = np.minimum(found.spring_m - springs.length_min_m, springs.length_max_m - found.spring_m)
+        demands = [
+            1.0 - found.residual / RESIDUAL_TOLERANCE,
+            found.clearance_m / MARGIN_M - LIMIT_SHARE,
+        ]
+        if target is not None:
+            off_m, turn_rad = _off(found, target)
+            demands += [
+                self._room_kpa(found, target).min(axis=-1) / MARGIN_KPA - LIMIT_SHARE,
+                margin_m.min(axis=-1) / SPRING_MARGIN_M - LIMIT_SHARE,
+                1.0 - off_m / TOLERANCE_M,
+                1.0 - turn_rad / TOLERANCE_RAD,
+            ]
+        return np.nan_to_num(np.stack(demands, axis=-1), nan=-np.inf)
+
+    def _why(self, name: str, target: Target, found: Posture, slack: np.ndarray) -> str:
+        """Of the end that comes closest: how far off, its clearance, and the chamber next to a limit."""
+        best = int(np.argmax(np.minimum(slack, 0.0).sum(axis=-1)))
+        off_m, turn_rad = (value[best] for value in _off(found, target))
+        low, high = self._limits_kpa()
+        chamber = int(np.argmin(self._room_kpa(found, target)[best]))
+        kpa = (found.pressure_kpa[best] + target.bias_kpa)[chamber]
+        wanted = ", ".join(f"{1e3 * value:.0f}" for value in target.finger_m)
+        turned = f" and turned by {np.degrees(turn_rad):.1f} deg" if target.turn.any() else ""
+        wall = "" if self.pipe is None else f", {1e3 * found.clearance_m[best]:.1f} mm from the wall"
+        expected = f", {np.degrees(TOLERANCE_RAD / EASED):.1f} deg" if target.turn.any() else ""
+        expected += "" if self.pipe is None else f", {1e3 * MARGIN_M:g} mm from the wall"
+        return (
+            f"waypoint {name!r} at {wanted} mm cannot be met: the best of {len(slack)} ends is "
+            f"{1e3 * off_m:.1f} mm off{turned}{wall}, chamber {chamber} at {kpa:.1f} kPa; expected "
+            f"at most {1e3 * TOLERANCE_M:g} mm{expected}, {low + MARGIN_KPA:g} to {high - MARGIN_KPA:g} kPa"
+        )
+
+
+def _off(found: Posture, target: Target) -> tuple[np.ndarray, np.ndarray]:
+    """Distance (n,) [m] of the finger tips to the target, and wrong turn (n,) [rad] of the gripper."""
+    angle = target.turn * _angle(found.rotation, target.rotation)
+    return np.linalg.norm(found.finger_m - target.finger_m, axis=-1), np.linalg.norm(angle, axis=-1)
+
+
+def _angle(rotation: Any, target: Any) -> Any:
+    """Sines (..., 3) of the turn of rotations (..., 3, 3) to a target (3, 3), about the gripper's axes."""
+    xp = array_namespace(rotation)
+    turn = xp.swapaxes(rotation, -1, -2) @ target
+    axes = ((2, 1), (0, 2), (1, 0))
+    return 0.5 * xp.stack([turn[..., i, j] - turn[..., j, i] for i, j in axes], axis=-1)
+
+
+def _posture(pressure_kpa: Array, params: ArmParams, s2r: S2R | None, spec: ArmSpec, pipe: CrossPipe | None):
+    """Posture, and the clearance (k,) [m] of each point of the body; differentiable."""
+    with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
+        q = rest(params, pressure_kpa)
+        frames = chain_frames(q, params.link_length_m)
+        now = statics_at(q, params, pressure_kpa)
+        plates = frames.plate_position, frames.plate_rotation
+        pose = pose_from_frame(plates[0][-1], plates[1][-1])
+        if s2r is not None:
+            pose = correct(s2r, pose, now.springs.length)
+            plates = carry_body(*plates, pose)
+        position_m, rotation = frame_from_pose(pose)
+        points = body_points(*plates, spec)
+    wall_m = jnp.full(1, _NO_WALL_M) if pipe is None else clearance(pipe, points)
+    return Posture(
+        pressure_kpa=pressure_kpa,
+        spring_m=now.springs.length,
+        pose=pose,
+        finger_m=position_m - spec.mass.gripper_length_m * rotation[:, 2],
+        rotation=rotation,
+        clearance_m=jnp.min(wall_m),
+        residual=jnp.max(jnp.abs(now.gradient)),
+    ), wall_m
+
+
+@functools.partial(jax.jit, static_argnames=("spec", "pipe"))
+def _look_many(
+    pressure_kpa: Array, params: ArmParams, s2r: S2R | None, spec: ArmSpec, pipe: CrossPipe | None
+):
+    return jax.vmap(lambda p: _posture(p, params, s2r, spec, pipe)[0])(pressure_kpa)
+
+
+@functools.partial(jax.jit, static_argnames=("spec", "pipe"))
+def _solve_many(starts_kpa, target: Target, params: ArmParams, s2r, spec: ArmSpec, pipe: CrossPipe | None):
+    """Pressures (N_STARTS, n_chambers) after damped Gauss-Newton steps from each start."""
+    low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
+
+    def errors(pressure_kpa: Array) -> tuple[Array, Array]:
+        error = _errors(_posture(pressure_kpa, params, s2r, spec, pipe), target, spec)
+        return error, error
+
+    def model(pressure_kpa: Array) -> tuple[Array, Array]:
+        jacobian, error = jax.jacfwd(errors, has_aux=True)(pressure_kpa)
+        return error, jacobian
+
+    def step(_, state: Sequence[Array]):
+        trial, *best, damping = state
+        tried = (trial, *model(trial))
+        better = jnp.sum(tried[1] ** 2) < jnp.sum(best[1] ** 2)  # not where it is NaN
+        best = [jnp.where(better, new, old) for new, old in zip(tried, best, strict=True)]
+        damping = jnp.clip(damping * jnp.where(better, 0.2, 10.0), 1e-6, 1e6)
+        pressure, error, jacobian = best
+        hessian = jacobian.T @ jacobian
+        descent = jnp.linalg.solve(hessian + damping * jnp.diag(jnp.diag(hessian)), jacobian.T @ error)
+        return jnp.clip(pressure - descent, low, high), *best, damping
+
+    def solve(start):
+        error, jacobian = jax.eval_shape(model, start)
+        nothing = jnp.full(error.shape, jnp.inf), jnp.zeros(jacobian.shape)
+        return jax.lax.fori_loop(0, N_STEPS, step, (start, start, *nothing, jnp.float32(0.05)))[1]
+
+    return jax.vmap(solve)(starts_kpa)
+
+
+def _errors(posture: tuple[Posture, Array], target: Target, spec: ArmSpec) -> Array:
+    """What a posture is off by, each in its unit; limits count where they are not kept."""
+    now, wall_m = posture
+    chambers, springs = spec.chambers, spec.springs
+    real_kpa = now.pressure_kpa + target.bias_kpa
+    room_kpa = jnp.concatenate([real_kpa - chambers.pressure_min_kpa, chambers.pressure_max_kpa - real_kpa])
+    room_m = jnp.concatenate([now.spring_m - springs.length_min_m, springs.length_max_m - now.spring_m])
+    within = [
+        (room_kpa - MARGIN_KPA) / _LIMIT_KPA,
+        (room_kpa - COMFORT_KPA) / _COMFORT_KPA,
+        (room_m - SPRING_MARGIN_M) / _LIMIT_M,
+        (wall_m - MARGIN_M) / _LIMIT_M,
+        (wall_m - COMFORT_M) / _COMFORT_M,
+    ]
+    return jnp.concatenate(
+        [
+            (now.finger_m - target.finger_m) / _POSITION_M,
+            target.turn * _angle(now.rotation, target.rotation) / _TURN_RAD,
+            *(jnp.minimum(value, 0.0) for value in within),
+            (now.pressure_kpa - target.near_kpa) / _NEAR_KPA,
+        ]
+    )

@@ -1,0 +1,206 @@
+"""Records demonstrations on an arm, through its springs, pumps and motion capture alone.
+
+The expert's references are held by the sensor-space law until the arm is at rest. Then, as an operator would,
+motion capture is looked at, and the target is moved by what the finger tips are off, away from limits that
+chambers have come to. What an arm without motion capture is off stays unknown; the planned pose is logged.
+Or the finger tips are steered by keys, in steps, with the same expert finding the references. Between two
+moves the pumps keep the last pressures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, NamedTuple, TextIO
+
+import jax
+import numpy as np
+
+from mjx_softarm.deploy.drive import Drive, DriveError, Hold, drive_to_end
+from mjx_softarm.deploy.faults import SETTLE_TIMEOUT_S
+from mjx_softarm.deploy.session import Recorder
+from mjx_softarm.logs.schema import Log
+from mjx_softarm.sensing.pose import quaternion_from_pose, rotation_from_quaternion
+from mjx_softarm.sensing.sensors import length_from_frequency
+from train.demos.expert import Expert, ExpertError, Posture
+from train.demos.waypoints import Waypoint
+
+CLOSE_M = 1.5e-3  # of the finger tips to a waypoint; within that, nothing is corrected
+FAR_M = 0.01  # a position further from its waypoint is none that should be learned from
+N_CORRECTIONS = 3
+BEYOND_KPA = 3.0  # that a chamber at its limit is taken to need beyond it
+STEPS_M = {"s": 0.005, "l": 0.02}
+AXES = dict(zip("xyz", np.eye(3), strict=True))
+KEYS = "x y z, X Y Z: a step forth, back; s, l: steps of 5, 20 mm; space: log; q: end"
+
+
+class Recording(NamedTuple):
+    """What was logged."""
+
+    log: Log
+    off_m: np.ndarray  # (n,) of the finger tips from each waypoint, as seen; NaN where nobody saw
+    problem: str  # why it ended early, or ""
+
+
+class Teleoperation:
+    """One arm, without pressure at first, with its expert.
+
+    Args:
+        arm: an `ArmIO`, maybe with motion capture.
+        expert: of the arm.
+        tell: takes a line for each position.
+    """
+
+    def __init__(self, arm: Any, expert: Expert, tell: Callable[[str], None] = lambda text: None):
+        self.expert, self.tell = expert, tell
+        self._sees = hasattr(arm, "motion_capture")
+        self._drive = Drive(arm, expert.spec, self._look)
+        self._rows, self._off_m, self._last = Recorder(arm), [], {}
+        start = expert.look(np.zeros((1, expert.spec.n_chambers)))
+        self._now: Posture = jax.tree.map(lambda x: x[0], start)
+
+    def record(self, waypoints: Sequence[Waypoint], plan: Posture, sequence: int = 0) -> Recording:
+        """Bring the finger tips to waypoints, log each, and vent; Ctrl-C vents and keeps the log.
+
+        Args:
+            waypoints: one after the other.
+            plan: postures (n,) at them, as `Expert.plan` gives them.
+            sequence: id of the demonstration.
+        """
+
+        def run() -> None:
+            for k, waypoint in enumerate(waypoints):
+                row, off_m = self._reach(waypoint, jax.tree.map(lambda x, k=k: x[k], plan))
+                self._add(row, sequence, off_m)
+                seen = f"{1e3 * off_m:.1f} mm off" if self._sees else "not seen"
+                self.tell(f"{len(self._rows)} of {len(waypoints)}: {waypoint.name}: {seen}")
+
+        return self._end(run)
+
+    def steer(self, keys: Iterable[str], sequence: int = 0) -> Recording:
+        """Move by keys until they end; see `KEYS`."""
+
+        def run() -> None:
+            step_m, logged = STEPS_M["l"], True
+            finger_m = self._now.finger_m
+            for key in keys:
+                if key == "q":
+                    return
+                if key in STEPS_M:
+                    step_m = STEPS_M[key]
+                elif key.lower() in AXES:
+                    moved_m = finger_m + (step_m if key.islower() else -step_m) * AXES[key.lower()]
+                    if self._step(moved_m):
+                        finger_m, logged = moved_m, False
+                elif key == " " and logged:
+                    self.tell("not moved since the start, or since the last position was logged")
+                elif key == " ":
+                    logged = True
+                    self._add(self._last, sequence, np.nan)
+                    self.tell(f"position {len(self._rows)} logged")
+                elif key.strip():
+                    self.tell(f"got key {key!r}; {KEYS}")
+
+        return self._end(run)
+
+    def _end(self, run: Callable[[], None]) -> Recording:
+        problem = drive_to_end(self._drive, run)
+        return Recording(self._rows.log("demonstrations"), np.array(self._off_m), problem)
+
+    def _reach(self, waypoint: Waypoint, posture: Posture) -> tuple[dict, float]:
+        """The row at rest, and how far off [m] the finger tips are then, after `N_CORRECTIONS` at most."""
+        target = asked = self.expert.target(waypoint)
+        row, off_m = None, np.nan
+        for n_left in range(N_CORRECTIONS, -1, -1):
+            row = self._hold(posture)
+            if row is not None:
+                finger_m, rotation = self._seen(row)
+                off_m = float(np.linalg.norm(finger_m - target.finger_m)) if self._sees else np.nan
+                if not self._sees or off_m < CLOSE_M:
+                    break
+                asked = asked._replace(
+                    finger_m=asked.finger_m + target.finger_m - finger_m,
+                    rotation=target.rotation @ rotation.T @ asked.rotation,
+                )
+            if not n_left:
+                break
+            asked = asked._replace(bias_kpa=self._bias_kpa(posture))
+            try:
+                posture = self.expert.reach(waypoint.name, asked, posture.pressure_kpa)
+            except ExpertError as error:
+                self.tell(f"not corrected: {error}")
+                break
+        if row is None:
+            raise self._not_at_rest(waypoint.name)
+        if off_m > FAR_M:
+            off = f"{1e3 * off_m:.1f} mm off and not to be corrected, expected at most {1e3 * FAR_M:g} mm"
+            raise DriveError(f"{waypoint.name}: {off}; is the arm calibrated?")
+        return row, off_m
+
+    def _step(self, finger_m: np.ndarray) -> bool:
+        """Bring the finger tips (3,) [m] there from where they are; False, told, where that cannot be."""
+        waypoint = Waypoint("of the key", finger_m)
+        try:
+            posture = self.expert.reach(waypoint.name, self.expert.target(waypoint), self._now.pressure_kpa)
+        except ExpertError as error:
+            self.tell(str(error))
+            return False
+        row = self._hold(posture)
+        if row is None:
+            raise self._not_at_rest(waypoint.name)
+        self.tell(f"finger tips at {', '.join(f'{1e3 * value:.0f}' for value in self._seen(row)[0])} mm")
+        return True
+
+    def _hold(self, posture: Posture) -> dict | None:
+        """Hold a posture's references; the row at rest, or None."""
+        self._now = posture
+        return self._drive.to_rest(Hold(self._drive.gains, posture.spring_m, self._drive.dt_s))
+
+    def _bias_kpa(self, posture: Posture) -> np.ndarray:
+        """By how much the arm's pressures are above the posture's; guessed of those that a limit keeps in."""
+        low, high = self._drive.gains.pressure_min_kpa, self._drive.gains.pressure_max_kpa
+        kpa = self._drive.pumps.pressure_kpa
+        beyond = np.where(kpa >= high, BEYOND_KPA, 0.0) - np.where(kpa <= low, BEYOND_KPA, 0.0)
+        return kpa + beyond - posture.pressure_kpa
+
+    def _not_at_rest(self, name: str) -> DriveError:
+        frequency_hz = self._last["frequency_hz"]
+        off_m = length_from_frequency(frequency_hz, self._drive.sensor, 0.0).length_m - self._now.spring_m
+        worst = int(np.argmax(np.abs(off_m)))
+        return DriveError(
+            f"{name}: not at rest after {SETTLE_TIMEOUT_S:g} s: spring {worst} is {1e3 * off_m[worst]:+.1f} "
+            f"mm off, its chamber at {self._drive.pumps.pressure_kpa[worst]:.1f} kPa"
+        )
+
+    def _look(self, row: dict) -> None:
+        self._last = row
+
+    def _seen(self, row: dict) -> tuple[np.ndarray, np.ndarray]:
+        """Finger tips (3,) [m] and the gripper's rotation (3, 3): as seen, or as planned."""
+        if not self._sees:
+            return self._now.finger_m, self._now.rotation
+        rotation = rotation_from_quaternion(row["tip_quaternion"])
+        return row["tip_m"] - self.expert.spec.mass.gripper_length_m * rotation[:, 2], rotation
+
+    def _add(self, row: dict, sequence: int, off_m: float) -> None:
+        planned = {
+            "tip_m": 1e-3 * self._now.pose[:3].astype(float),
+            "tip_quaternion": quaternion_from_pose(self._now.pose.astype(float)),
+        }
+        self._rows.add((planned | row) | {"sequence": sequence})
+        self._off_m.append(off_m)
+
+
+def read_keys(stream: TextIO) -> Iterator[str]:
+    """Characters as they are typed, without waiting for the line's end where that is a terminal."""
+    if not stream.isatty():
+        yield from iter(lambda: stream.read(1), "")
+        return
+    import termios
+    import tty
+
+    before = termios.tcgetattr(stream)
+    try:
+        tty.setcbreak(stream)
+        yield from iter(lambda: stream.read(1), "")
+    finally:
+        termios.tcsetattr(stream, termios.TCSADRAIN, before)

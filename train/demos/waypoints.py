@@ -1,0 +1,95 @@
+"""Tasks as waypoints: where the finger tips are to be demonstrated, one short move after the other.
+
+The paper tells the operations and how many positions were recorded, not where: circle at the height that the
+arm reaches best, pipe positions along the axes of the pipe, evenly spaced between one container and the next.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from mjx_softarm.mechanics.pipe import PIPES_MM, CrossPipe
+from mjx_softarm.mechanics.workspace import circle_poses
+from mjx_softarm.sensing.pose import frame_from_pose
+from mjx_softarm.spec import ArmSpec
+
+HOME_BELOW_M = 0.1  # of the finger tips below the crossing's centre, where the pipe's tasks begin and end
+
+
+# How the gripper is to hang.
+FREE = (0.0, 0.0, 0.0)
+STRAIGHT = (1.0, 1.0, 0.0)  # straight down
+SQUARE = (1.0, 1.0, 1.0)  # straight down, and its yaw zero
+
+
+class Waypoint(NamedTuple):
+    """Where the finger tips are to be."""
+
+    name: str  # "pick right", "place left" and the like where an object is taken or let go
+    finger_m: np.ndarray  # (3,) in the base frame
+    turn: tuple[float, float, float] = FREE  # 1 for each of the gripper's axes about which it is not to turn
+
+    @property
+    def operation(self) -> str:
+        """What happens to an object there: "pick", "place" or ""."""
+        first = self.name.split(" ")[0]
+        return first if first in ("pick", "place") else ""
+
+
+class Task(NamedTuple):
+    """Waypoints of one demonstration, and the pipe that it happens in."""
+
+    waypoints: tuple[Waypoint, ...]
+    pipe: CrossPipe | None = None
+
+
+# Stops of a path with the moves that lead to each; "home" is where it begins.
+_PIPE300 = (("pick right", 4), ("place left", 7), ("pick bottom", 6), ("place right", 6), ("home", 4))
+_PIPE250 = (("pick left", 6), ("place bottom", 8), ("pick right", 8), ("place left", 8), ("home", 6))
+_STOPS = {"pipe300": _PIPE300, "pipe250": _PIPE250}
+TASKS = ("circle16", *_STOPS)
+
+
+def task(name: str, spec: ArmSpec) -> Task:
+    """The task of this name, one of `TASKS`, for an arm with the gripper of `spec`."""
+    if name == "circle16":
+        return Task(circle(16, spec))
+    pipe = CrossPipe.of_mm(PIPES_MM[name])
+    return Task(pick_and_place(pipe, _STOPS[name]), pipe)
+
+
+def circle(n: int, spec: ArmSpec) -> tuple[Waypoint, ...]:
+    """Points of the circle, the gripper as in the circle's poses."""
+    position_m, _ = frame_from_pose(circle_poses(n).astype(float))
+    finger_m = position_m - [0.0, 0.0, spec.mass.gripper_length_m]
+    return tuple(Waypoint(f"circle {k}", point, SQUARE) for k, point in enumerate(finger_m))
+
+
+def pick_and_place(pipe: CrossPipe, stops: Sequence[tuple[str, int]]) -> tuple[Waypoint, ...]:
+    """From home by way of the crossing to each stop, in so many moves of one length.
+
+    Args:
+        pipe: the pipe.
+        stops: names, whose last word is a container or "home", and how many moves lead there.
+    """
+    places = dict(pipe.containers())
+    crossing = np.array([0.0, 0.0, places["right"][2]])
+    places["home"] = np.array([0.0, 0.0, pipe.centre_z_m - HOME_BELOW_M])
+    waypoints = [Waypoint("home", places["home"], STRAIGHT)]
+    for name, n_moves in stops:
+        goal = places[name.split(" ")[-1]]
+        way = _along(np.stack([waypoints[-1].finger_m, crossing, goal]), n_moves)
+        waypoints += [Waypoint(f"to {name} {k + 1}", point) for k, point in enumerate(way[:-1])]
+        waypoints.append(Waypoint(name, goal, STRAIGHT if name == "home" else FREE))
+    return tuple(waypoints)
+
+
+def _along(corner_m: np.ndarray, n: int) -> np.ndarray:
+    """Points (n, 3) evenly spaced along a path with corners (k, 3), without its first."""
+    length_m = np.linalg.norm(np.diff(corner_m, axis=0), axis=1)
+    at = np.concatenate([[0.0], np.cumsum(length_m)])
+    where = at[-1] * np.arange(1, n + 1) / n
+    return np.stack([np.interp(where, at, corner_m[:, k]) for k in range(3)], axis=-1)

@@ -1,0 +1,1 @@
+"""One epoch of training: replay, hindsight and the jitted loop."""

@@ -1,0 +1,120 @@
+"""Hindsight relabelling: what was reached becomes a goal, what was sensed becomes an action.
+
+Of a batch, some transitions keep the goal they were made for. Some get the pose that they reached as
+their goal, and with it the goal bonus (the paper's relabelling). Some get a goal near that pose, at a
+distance drawn log-uniformly, which shows the critic how the reward falls off around a pose.
+
+A relabelled transition to rest whose chambers had saturated also gets the action that asks for the spring
+lengths it ended at: they lead to the same equilibrium with no chamber off its reference
+(hindsight action transitions, Levy et al., ICLR 2019).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+
+from mjx_softarm._support import draws
+from mjx_softarm.mdp import observation as obs
+from mjx_softarm.mdp import rewards
+from train.agent.tqc import Transition
+
+
+class Experience(NamedTuple):
+    """A transition as stored: poses rather than observations, so that the goal can be exchanged."""
+
+    pose: Array  # (..., 6) [mm, deg]
+    goal: Array  # (..., 6) [mm, deg]
+    action: Array  # (..., n_chambers) in [-1, 1]
+    next_pose: Array  # (..., 6) [mm, deg]
+    sensed_action: Array  # (..., n_chambers) the action that asks for the spring lengths reached
+    saturated: Array  # (...,) bool
+    clearance_cost: Array  # (...,) for a body close to a wall
+    n_steps: Array  # (...,) actions taken in the episode, this one included
+
+
+@dataclass(frozen=True)
+class HindsightConfig:
+    """Shares of a batch; the rest keeps its own goal."""
+
+    reached_share: float = 0.5
+    near_share: float = 0.0
+    near_min_mm: float = 1.0
+    near_max_mm: float = 100.0
+    mm_per_deg: float = 1.0  # how far a near goal's angles are turned
+
+    def __post_init__(self):
+        if min(self.reached_share, self.near_share) < 0 or self.reached_share + self.near_share > 1:
+            raise ValueError(
+                "HindsightConfig: reached_share and near_share must be >= 0 and add up to 1 at most, "
+                f"got {self.reached_share} and {self.near_share}"
+            )
+        if not 0 < self.near_min_mm <= self.near_max_mm:
+            raise ValueError(
+                "HindsightConfig: near_min_mm must be > 0 and near_max_mm at least as large, "
+                f"got {self.near_min_mm} and {self.near_max_mm}"
+            )
+        if self.mm_per_deg <= 0:
+            raise ValueError(f"HindsightConfig.mm_per_deg: got {self.mm_per_deg}, expected > 0")
+
+
+def relabel(
+    batch: Experience,
+    key: Array,
+    config: HindsightConfig,
+    scale: obs.ObsScale,
+    reward_config: rewards.RewardConfig,
+    *,
+    exchange_actions: bool,
+) -> Transition:
+    """A batch to learn from; with both shares zero, its rewards are those the environment gave.
+
+    Args:
+        batch: B stored transitions.
+        key: for the draw.
+        config: shares.
+        scale: of the observations.
+        reward_config: weights of the reward.
+        exchange_actions: whether a saturated action may be exchanged for the sensed one. Right only where
+            an action leads to rest: the lengths sensed in the middle of a motion lead elsewhere.
+    """
+    n = batch.saturated.shape[0]
+    (kind, distance), direction = draws.both(key, (2, n), (n, 6))
+    reached = kind < config.reached_share
+    near = ~reached & (kind < config.reached_share + config.near_share)
+    moved = batch.next_pose + _near_offsets(distance, direction, config).astype(batch.next_pose.dtype)
+    goal = jnp.where(reached[:, None], batch.next_pose, jnp.where(near[:, None], moved, batch.goal))
+    sensed = (reached | near) & batch.saturated & exchange_actions
+    action = jnp.where(sensed[:, None], batch.sensed_action, batch.action)
+    saturated = batch.saturated & ~sensed
+    reward, done, _ = rewards.reward(
+        batch.next_pose, goal, batch.n_steps, saturated, reward_config, batch.clearance_cost
+    )
+    return Transition(
+        obs=obs.observe(batch.pose, goal, scale, reward_config),
+        action=action,
+        reward=reward,
+        next_obs=obs.observe(batch.next_pose, goal, scale, reward_config),
+        terminated=done.astype(reward.dtype),
+    )
+
+
+def _near_offsets(distance: Array, direction: Array, config: HindsightConfig) -> Array:
+    """Offsets (n, 6) [mm, deg]: translations in random directions, log-uniform in length, and turns.
+
+    A turn is a normal draw in proportion to the translation's length over its own norm, so it has a heavy
+    tail: some goals are turned further than the arm can, as goals that a user asks for may be.
+
+    Args:
+        distance (n,): uniform draws.
+        direction (n, 6): normal draws.
+        config: nearest, furthest, and how far the angles are turned.
+    """
+    low, high = jnp.log(config.near_min_mm), jnp.log(config.near_max_mm)
+    length = jnp.exp(low + (high - low) * distance)[:, None]
+    direction = direction / jnp.linalg.norm(direction[:, :3], axis=-1, keepdims=True)
+    per_unit = jnp.array([1.0] * 3 + [1.0 / config.mm_per_deg] * 3)
+    return length * direction * per_unit

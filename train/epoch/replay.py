@@ -1,0 +1,139 @@
+"""A ring of past items on the device: a pytree of arrays with a leading capacity axis.
+
+`add` and `sample` have static shapes and no host work, so both live inside a jitted training step; donate the
+ring to update it in place.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from mjx_softarm._support import draws
+
+Items = Any  # a pytree of arrays sharing a leading axis
+
+
+class Replay(NamedTuple):
+    """Ring of N = capacity slots, of which 0 ... size - 1 are filled."""
+
+    data: Items  # leaves (N, ...)
+    position: Array  # () int32, the next slot to write
+    size: Array  # () int32, filled slots
+
+
+def create(example_item: Items, capacity: int) -> Replay:
+    """An empty ring.
+
+    Args:
+        example_item: pytree of one item (arrays or `jax.ShapeDtypeStruct`): structure, shapes and dtypes.
+        capacity: number of slots N.
+
+    Raises:
+        ValueError: `capacity` is not positive.
+    """
+    if capacity < 1:
+        raise ValueError(f"Replay capacity: expected at least 1, got {capacity}")
+    item = jax.eval_shape(lambda x: x, example_item)
+    data = jax.tree.map(lambda leaf: jnp.zeros((capacity, *leaf.shape), leaf.dtype), item)
+    return Replay(data, position=jnp.zeros((), jnp.int32), size=jnp.zeros((), jnp.int32))
+
+
+def finite_rows(items: Items) -> Array:
+    """Where every number of an item is finite, e.g. as part of `valid` in `add`.
+
+    Args:
+        items: pytree of leaves (B, ...).
+
+    Returns:
+        finite (B,) bool.
+    """
+    rows = [jnp.all(jnp.isfinite(leaf), axis=tuple(range(1, leaf.ndim))) for leaf in jax.tree.leaves(items)]
+    return jnp.all(jnp.stack(rows), axis=0)
+
+
+def add(replay: Replay, items: Items, valid: Array) -> Replay:
+    """Appends the valid rows in order, over the oldest ones once the ring is full.
+
+    Args:
+        replay: ring of N slots.
+        items: pytree of leaves (B, ...), structured as the ring's, with B <= N.
+        valid (B,) bool: rows to keep; the others never enter, and take no slot.
+
+    Returns:
+        The ring with the valid rows.
+
+    Raises:
+        ValueError: structure, shape or dtype of `items` or `valid` does not fit the ring, or B > N.
+    """
+    capacity = _check(replay, items, valid)
+    # Each valid row takes the slot after the previous one's; an invalid row's slot lies outside the ring,
+    # where a scatter in mode "drop" writes nothing. B <= N makes the slots distinct.
+    rank = jnp.cumsum(valid, dtype=jnp.int32) - 1  # (B,) among the valid
+    slot = jnp.where(valid, (replay.position + rank) % capacity, capacity)  # (B,)
+    data = jax.tree.map(lambda ring, rows: ring.at[slot].set(rows, mode="drop"), replay.data, items)
+    n_valid = jnp.sum(valid, dtype=jnp.int32)
+    return Replay(
+        data,
+        position=(replay.position + n_valid) % capacity,
+        size=jnp.minimum(replay.size + n_valid, capacity),
+    )
+
+
+def sample(replay: Replay, key: Array, batch_size: int) -> Items:
+    """Draws items uniformly, with replacement, from the filled slots.
+
+    The fill is known only at run time, so an empty ring cannot raise here: it yields zeros. Fill it first.
+
+    Args:
+        replay: ring with at least one item.
+        key: PRNG key.
+        batch_size: number of items B.
+
+    Returns:
+        Pytree of leaves (B, ...).
+    """
+    slot = draws.integers(key, batch_size, replay.size)
+    return jax.tree.map(lambda ring: ring[slot], replay.data)
+
+
+def thin(replay: Replay, key: Array, share: Array) -> Replay:
+    """The ring with a random share of its items, oldest first; which is how a later task begins.
+
+    Args:
+        replay: ring of N slots.
+        key: PRNG key.
+        share (): of the filled slots to keep, 0 to 1.
+    """
+    capacity = jax.tree.leaves(replay.data)[0].shape[0]
+    age = (jnp.arange(capacity) - replay.position) % capacity  # oldest first, once the ring is full
+    filled = jnp.arange(capacity) < replay.size
+    n_kept = jnp.round(share * replay.size.astype(jnp.float32)).astype(jnp.int32)
+    lot = jnp.where(filled, jax.random.uniform(key, (capacity,)), jnp.inf)
+    kept = jnp.argsort(jnp.argsort(lot)) < n_kept
+    order = jnp.argsort(jnp.where(kept, age, capacity + age))
+    data = jax.tree.map(lambda leaf: leaf[order], replay.data)
+    return Replay(data, position=n_kept % capacity, size=n_kept)
+
+
+def _check(replay: Replay, items: Items, valid: Array) -> int:
+    """Static checks of `add`; returns the capacity."""
+    expected_tree, got_tree = jax.tree.structure(replay.data), jax.tree.structure(items)
+    if expected_tree != got_tree:
+        raise ValueError(f"Replay items: expected structure {expected_tree}, got {got_tree}")
+    if valid.ndim != 1 or valid.dtype != jnp.bool_:
+        raise ValueError(f"Replay valid: expected (B,) bool, got {valid.shape} {valid.dtype}")
+    capacity, batch = jax.tree.leaves(replay.data)[0].shape[0], valid.shape[0]
+    if batch > capacity:
+        raise ValueError(f"Replay add: expected at most {capacity} rows (the capacity), got {batch}")
+    rings, _ = jax.tree_util.tree_flatten_with_path(replay.data)
+    for (path, ring), rows in zip(rings, jax.tree.leaves(items), strict=True):
+        if rows.shape != (batch, *ring.shape[1:]) or rows.dtype != ring.dtype:
+            name, shape = jax.tree_util.keystr(path), (batch, *ring.shape[1:])
+            raise ValueError(
+                f"Replay items{name}: expected {shape} {ring.dtype}, got {rows.shape} {rows.dtype}"
+            )
+    return capacity

@@ -1,0 +1,1 @@
+"""Runs: folders, checkpoints, evaluation, pictures and export."""

@@ -1,0 +1,257 @@
+"""A run's folder: its config with versions and commit, its checkpoints, its results."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, cast
+
+import jax
+import numpy as np
+import orbax.checkpoint as ocp
+
+from mjx_softarm._support.provenance import provenance, write_json
+from mjx_softarm.logs.files import LogError
+from mjx_softarm.logs.schema import Log, write_log
+from mjx_softarm.sensing.s2r import S2R, S2R_FILE, load_s2r, save_s2r
+from mjx_softarm.spec import ArmSpec
+from train.config import ImitationConfig, TrainConfig, from_dict, to_dict
+from train.demos.demonstrations import Demonstrations, load_demonstrations
+from train.epoch.devices import is_first_process, wait_for_all
+from train.epoch.job import TrainState
+
+N_KEPT = 2
+CHECKPOINTS, DEMONSTRATIONS_FILE, LOCK_FILE = "checkpoints", "demonstrations.npz", "training.lock"
+
+
+class RunError(ValueError):
+    """A folder that does not hold a run that can be used; the message names it and what is wrong."""
+
+
+@contextlib.contextmanager
+def sole_trainer(path: Path) -> Iterator[None]:
+    """Hold the folder of a run or of a sweep while training in it; a process that is killed lets go of it.
+
+    Where several processes train together, the first one holds it.
+
+    Raises:
+        RunError: another process holds it.
+    """
+    with contextlib.ExitStack() as stack:
+        if is_first_process():
+            file = stack.enter_context(open(path / LOCK_FILE, "w"))
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise RunError(f"{path}: another process is training in it; stop it, or wait") from error
+        yield
+
+
+class Run:
+    """The folder of one run.
+
+    `config.json` (settings, arm, calibration, versions, commit), `s2r.npz` (the calibration's sim-to-real
+    network, if it has one), `demonstrations.npz` (if it learns from them), `checkpoints/`, `metrics.jsonl`,
+    `evaluation.json`, pictures, TensorBoard's event files and, once exported, `policy.npz`.
+
+    Where several processes train together, all of them open the folder, which they share, and save
+    checkpoints; the rest is written by the first alone.
+    """
+
+    def __init__(self, path: Path, config: TrainConfig, spec: ArmSpec, s2r: S2R | None = None):
+        self.path, self.config, self.spec, self.s2r = path, config, spec, s2r
+        options = ocp.CheckpointManagerOptions(max_to_keep=N_KEPT, enable_async_checkpointing=False)
+        self._manager = ocp.CheckpointManager((path / CHECKPOINTS).resolve(), options=options)
+
+    @classmethod
+    def create(
+        cls,
+        path: Path,
+        config: TrainConfig,
+        spec: ArmSpec,
+        s2r: S2R | None = None,
+        demonstrations: Log | None = None,
+        begins_with: dict[str, Path] | None = None,
+        state: TrainState | None = None,
+    ) -> Run:
+        """Start a folder.
+
+        Args:
+            path: of the folder.
+            config: all settings.
+            spec: the arm.
+            s2r: of its calibration, if it has one.
+            demonstrations: rows of the file that is learned from.
+            begins_with: folders of the runs that parts of the first state come from, by part.
+            state: that first state. The folder is a run's only once it holds it.
+
+        Raises:
+            RunError: the folder already holds a run, or cannot be made.
+        """
+        if (path / "config.json").exists():
+            raise RunError(
+                f"{path}: already holds a run; continue it with --resume {path}, or choose another --out"
+            )
+        wait_for_all(f"{path} is free")
+        try:
+            if is_first_process():
+                path.mkdir(parents=True, exist_ok=True)
+                if s2r is not None:
+                    save_s2r(path / S2R_FILE, s2r)
+                if demonstrations is not None:
+                    write_log(path / DEMONSTRATIONS_FILE, demonstrations)
+                shutil.rmtree(path / CHECKPOINTS, ignore_errors=True)  # of a start that was interrupted
+            wait_for_all(f"{path} is begun")
+            run = cls(path, config, spec, s2r)
+            if state is not None:
+                run.save(0, state)
+            data = {
+                "train": to_dict(config),
+                "spec": spec.to_dict(),
+                "s2r": s2r is not None,
+                "begins_with": {name: str(folder) for name, folder in (begins_with or {}).items()},
+                "provenance": provenance("train"),
+            }
+            if is_first_process():
+                write_json(path / "config.json", data)
+        except OSError as error:
+            raise RunError(f"{path}: cannot be written: {error.strerror}") from error
+        return run
+
+    @classmethod
+    def open(cls, path: Path) -> Run:
+        """An existing folder.
+
+        Raises:
+            RunError: there is no run in it, or its config cannot be read.
+            SealedFileError: its sim-to-real network cannot be read.
+        """
+        file = path / "config.json"
+        try:
+            data = json.loads(file.read_text("utf-8"))
+            config, has_s2r = from_dict(data["train"]), data.get("s2r", False)
+            spec = ArmSpec.from_dict(data["spec"], str(file))
+        except OSError as error:
+            raise RunError(f"{path}: not the folder of a run: {file}: {error.strerror}") from error
+        except (ValueError, KeyError, TypeError) as error:
+            raise RunError(f"{file}: not a run's config: {error!r}") from error
+        s2r = load_s2r(path / S2R_FILE, spec.n_chambers) if has_s2r else None
+        return cls(path, config, spec, s2r)
+
+    def demonstrations(self) -> Demonstrations | None:
+        """What the run learns from, if it learns from demonstrations.
+
+        Raises:
+            RunError: its file cannot be read.
+        """
+        if not isinstance(self.config, ImitationConfig):
+            return None
+        try:
+            return load_demonstrations(self.path / DEMONSTRATIONS_FILE, self.spec)
+        except LogError as error:
+            raise RunError(str(error)) from error
+
+    @property
+    def latest_epoch(self) -> int | None:
+        """Number of epochs behind the newest complete checkpoint, None if there is none."""
+        return self._manager.latest_step()
+
+    @property
+    def epochs(self) -> list[int]:
+        """Numbers of epochs behind the complete checkpoints."""
+        return sorted(self._manager.all_steps())
+
+    def rewind(self, epoch: int) -> None:
+        """Forget checkpoints and metrics later than an epoch, before it is continued from there."""
+        for later in [saved for saved in self.epochs if saved > epoch]:
+            self._manager.delete(later)
+        self.truncate_metrics(epoch)
+
+    def save(self, epoch: int, state: TrainState) -> None:
+        """Write a checkpoint; an interrupted write leaves the one before it in force."""
+        self._manager.save(epoch, args=ocp.args.StandardSave(state))
+        self._manager.wait_until_finished()
+
+    def restore(self, like: TrainState) -> tuple[int, TrainState]:
+        """The newest checkpoint.
+
+        Args:
+            like: a state, or its shapes, structured as the run's.
+
+        Raises:
+            RunError: there is no checkpoint, or it is not structured so.
+        """
+        epoch, shapes = self._newest(), jax.tree.map(_shape_somewhere, like)
+        try:
+            state = self._manager.restore(epoch, args=ocp.args.StandardRestore(shapes))
+        except ValueError as error:
+            raise RunError(
+                f"{self.path}: its checkpoint has other parts or sizes than the states of this version; "
+                "continue it with the commit that its config.json names"
+            ) from error
+        return epoch, cast(TrainState, state)
+
+    def restore_part(self, name: str, like: Any) -> Any:
+        """One field of the newest checkpoint's state as NumPy arrays, without reading the others.
+
+        Args:
+            name: of the field.
+            like: its value, or shapes, structured as the run's.
+
+        Raises:
+            RunError: there is no checkpoint.
+        """
+        wanted = {name: jax.tree.map(ocp.utils.to_shape_dtype_struct, like)}
+        as_numpy = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), wanted)
+        arguments = ocp.args.PyTreeRestore(wanted, as_numpy, partial_restore=True)
+        return self._manager.restore(self._newest(), args=arguments)[name]
+
+    def _newest(self) -> int:
+        epoch = self.latest_epoch
+        if epoch is None:
+            raise RunError(f"{self.path}: holds no checkpoint; start it anew")
+        return epoch
+
+    def log(self, row: dict[str, Any]) -> None:
+        """Append a line to `metrics.jsonl`."""
+        if is_first_process():
+            with (self.path / "metrics.jsonl").open("a", encoding="utf-8") as file:
+                file.write(json.dumps(row) + "\n")
+
+    def metrics(self) -> list[dict[str, Any]]:
+        """The lines of `metrics.jsonl`, up to the first incomplete one."""
+        rows = []
+        file = self.path / "metrics.jsonl"
+        for line in file.read_text("utf-8").splitlines() if file.exists() else []:
+            try:
+                rows.append(json.loads(line))
+            except json.JSONDecodeError:
+                break
+        return rows
+
+    def truncate_metrics(self, epoch: int) -> None:
+        """Forget lines later than an epoch, before it is continued from there."""
+        if not is_first_process():
+            return
+        rows = [row for row in self.metrics() if row["epoch"] <= epoch]
+        temporary = self.path / "metrics.jsonl.part"
+        temporary.write_text("".join(json.dumps(row) + "\n" for row in rows), "utf-8")
+        os.replace(temporary, self.path / "metrics.jsonl")
+
+
+def _shape_somewhere(x: Any) -> jax.ShapeDtypeStruct:
+    """Shape, type and place of an array; this process's first device where no place is given.
+
+    Else it would come back to the devices that it was saved from, which may not be here.
+    """
+    shape = ocp.utils.to_shape_dtype_struct(x)
+    assert isinstance(shape, jax.ShapeDtypeStruct)  # a state has no plain numbers
+    if shape.sharding is not None:
+        return shape
+    device = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
+    return jax.ShapeDtypeStruct(shape.shape, shape.dtype, sharding=device)

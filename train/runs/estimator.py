@@ -1,0 +1,181 @@
+"""What the arm's computer has to know about the arm, distilled from the simulator into small networks.
+
+Equilibria over the whole workspace are the data, held-out ones the test. The networks' structure, and what
+they are for, stand in `mjx_softarm.sensing.estimator`. All equilibria are of the arm without more payload than its
+specification has: springs alone cannot tell a payload, and with payloads mixed in the unloaded arm would
+pay for it.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax import Array
+
+from mjx_softarm._support.mlp import Layer
+from mjx_softarm.mechanics.statics import ArmParams
+from mjx_softarm.mechanics.workspace import HELD_OUT_SEED, Pool, sample_workspace
+from mjx_softarm.sensing.estimator import (
+    N_CHANGES,
+    PoseEstimator,
+    SpringModel,
+    estimate_frame,
+    expected_springs,
+)
+from mjx_softarm.sensing.pose import frame_from_pose
+from mjx_softarm.spec import ArmSpec
+
+N_TRAINING, N_HELD_OUT = 16_384, 2_048
+MORE_PRESSURE = 0.25  # of the range, at either end
+N_STEPS = 8_000
+BATCH = 256
+WIDTH = 128
+LEARNING_RATE = 4e-3  # at the start; it falls to zero by a cosine
+PAYLOADS_KG = (0.0, 0.25, 0.5, 1.0)  # more than the specification's, at which errors are given
+TURN_MM = 50.0  # a turn by one radian costs as much as being so far away
+CHANGE_SCALE = 0.015  # of the network's outputs, in section lengths and half radians
+
+
+class Error(NamedTuple):
+    """How far off held-out arms are."""
+
+    median: float
+    p95: float
+    largest: float
+
+
+class Distilled(NamedTuple):
+    """The networks with their errors on held-out equilibria."""
+
+    estimator: PoseEstimator
+    spring_model: SpringModel
+    tip_mm: dict[float, Error]  # by payload [kg] on top of the specification's
+    turn_deg: dict[float, Error]
+    spring_mm: dict[float, Error]  # of the spring furthest off
+
+
+def distil(spec: ArmSpec, seed: int) -> Distilled:
+    """Pose estimator and spring model of an arm; the same seed gives the same networks.
+
+    Args:
+        spec: the arm, calibrated or not.
+        seed: of the equilibria, the first weights and the batches.
+
+    Raises:
+        ValueError: the seed is the held-out one.
+        SpecError: the arm settles at too few pressures.
+    """
+    if seed == HELD_OUT_SEED:
+        raise ValueError(f"seed: {HELD_OUT_SEED} draws the held-out equilibria")
+    key_estimator, key_springs = jax.random.split(jax.random.key(seed))
+    pool = sample_workspace(_stronger(spec), N_TRAINING, seed)
+    estimator = _fit(_first_estimator(spec, pool, key_estimator), _pose_loss, pool, key_estimator)
+    pool = sample_workspace(spec, N_TRAINING, seed)
+    springs = _fit(_first_spring_model(pool, key_springs), _spring_loss, pool, key_springs)
+    estimator, springs = jax.tree.map(lambda x: np.asarray(x, np.float32), (estimator, springs))
+    return Distilled(estimator, springs, *_errors(estimator, springs, spec))
+
+
+def _stronger(spec: ArmSpec) -> ArmSpec:
+    """The arm with more pressure: a real one has spring lengths that the simulated one cannot quite reach."""
+    low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
+    more = MORE_PRESSURE * (high - low)
+    return spec.replace(
+        chambers={"pressure_min_kpa": max(low - more, -100.0), "pressure_max_kpa": high + more}
+    )
+
+
+def _first_estimator(spec: ArmSpec, pool: Pool, key: Array) -> PoseEstimator:
+    n, n_sections = spec.n_chambers, spec.structure.n_sections
+    scale = np.full(N_CHANGES, CHANGE_SCALE)
+    scale[:3] *= spec.geometry.section_length_m
+    return PoseEstimator(
+        layers=_first_layers(key, (2 * n, WIDTH, WIDTH, N_CHANGES * n_sections)),
+        spring_site_m=jnp.asarray(ArmParams.from_spec(spec).spring_site_m),
+        spring_centre_m=jnp.mean(pool.spring_m, axis=0),
+        spring_scale_m=jnp.std(pool.spring_m, axis=0),
+        change_scale=jnp.asarray(scale),
+    )
+
+
+def _first_spring_model(pool: Pool, key: Array) -> SpringModel:
+    n = pool.spring_m.shape[1]
+    return SpringModel(
+        layers=_first_layers(key, (n, WIDTH, WIDTH, n)),
+        pressure_centre_kpa=jnp.mean(pool.pressure_kpa, axis=0),
+        pressure_scale_kpa=jnp.std(pool.pressure_kpa, axis=0),
+        spring_centre_m=jnp.mean(pool.spring_m, axis=0),
+        spring_scale_m=jnp.std(pool.spring_m, axis=0),
+    )
+
+
+def _first_layers(key: Array, widths: tuple[int, ...]) -> tuple[Layer, ...]:
+    """Random layers that keep the order of what goes through them."""
+    layers = []
+    for k, (n_in, n_out) in enumerate(itertools.pairwise(widths)):
+        gain = np.sqrt(2.0 / n_in)  # He et al. 2015, arXiv:1502.01852
+        weight = gain * jax.random.normal(jax.random.fold_in(key, k), (n_in, n_out))
+        layers.append((weight, jnp.zeros(n_out)))
+    return tuple(layers)
+
+
+def _pose_loss(estimator: PoseEstimator, pool: Pool) -> Array:
+    """Mean square of the tip's error [mm], with turns counted as `TURN_MM` a radian."""
+    position_m, rotation = frame_from_pose(pool.pose)
+    guess = estimate_frame(estimator, pool.spring_m)
+    away = jnp.sum((1e3 * (guess.position_m - position_m)) ** 2, axis=-1)  # (B,)
+    turned = jnp.sum((guess.rotation - rotation) ** 2, axis=(-2, -1)) / 2  # (B,) squared angle, if small
+    return jnp.mean(away + TURN_MM**2 * turned)
+
+
+def _spring_loss(model: SpringModel, pool: Pool) -> Array:
+    """Mean square of the springs' errors [mm]."""
+    return jnp.mean((1e3 * (expected_springs(model, pool.pressure_kpa) - pool.spring_m)) ** 2)
+
+
+def _fit(network: Any, loss: Callable[[Any, Pool], Array], pool: Pool, key: Array) -> Any:
+    """The network with its layers trained by Adam; its other fields stay."""
+    optimiser = optax.adam(optax.cosine_decay_schedule(LEARNING_RATE, N_STEPS))
+
+    def step(carry: tuple[Any, Any], key_batch: Array) -> tuple[tuple[Any, Any], None]:
+        layers, state = carry
+        rows = jax.random.randint(key_batch, (BATCH,), 0, len(pool.pose))
+        batch = jax.tree.map(lambda x: x[rows], pool)
+        slope = jax.grad(lambda layers: loss(network._replace(layers=layers), batch))(layers)
+        updates, state = optimiser.update(slope, state)
+        return (optax.apply_updates(layers, updates), state), None
+
+    @jax.jit
+    def run(layers: Any) -> Any:
+        keys = jax.random.split(key, N_STEPS)
+        return jax.lax.scan(step, (layers, optimiser.init(layers)), keys)[0][0]
+
+    return network._replace(layers=run(network.layers))
+
+
+def _errors(
+    estimator: PoseEstimator, spring_model: SpringModel, spec: ArmSpec
+) -> tuple[dict[float, Error], dict[float, Error], dict[float, Error]]:
+    """Of the tip [mm], of its axes [deg] and of the springs [mm], by payload."""
+    tip_mm, turn_deg, spring_mm = {}, {}, {}
+    for payload_kg in PAYLOADS_KG:
+        loaded = spec.replace(mass={"payload_kg": spec.mass.payload_kg + payload_kg})
+        pool = jax.tree.map(np.asarray, sample_workspace(loaded, N_HELD_OUT, HELD_OUT_SEED))
+        position_m, rotation = frame_from_pose(pool.pose)
+        guess = estimate_frame(estimator, pool.spring_m)
+        chord = np.sqrt(np.sum((guess.rotation - rotation) ** 2, axis=(-2, -1)) / 8)  # sin of half the angle
+        springs = np.abs(expected_springs(spring_model, pool.pressure_kpa) - pool.spring_m)
+        tip_mm[payload_kg] = _error(1e3 * np.linalg.norm(guess.position_m - position_m, axis=-1))
+        turn_deg[payload_kg] = _error(np.degrees(2.0 * np.arcsin(np.minimum(chord, 1.0))))
+        spring_mm[payload_kg] = _error(1e3 * springs.max(axis=-1))
+    return tip_mm, turn_deg, spring_mm
+
+
+def _error(values: np.ndarray) -> Error:
+    return Error(*(float(np.quantile(values, share)) for share in (0.5, 0.95, 1.0)))

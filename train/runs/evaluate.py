@@ -1,0 +1,154 @@
+"""How well a policy reaches: held-out goals over the whole workspace, and the paper's circle."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from mjx_softarm._support import xla
+from mjx_softarm._support.mjx import State
+from mjx_softarm.env import Randomisation, ReachEnv
+from mjx_softarm.mdp import rewards
+from mjx_softarm.mechanics.workspace import HELD_OUT_SEED, circle_poses
+from train.agent.tqc import TQC
+
+N_GOALS = 2_000
+N_ACTIONS = 4
+
+
+class Reached(NamedTuple):
+    """What an arm reached at each of n goals, after its last action."""
+
+    goal: Array  # (n, 6) [mm, deg]
+    pose: Array  # (n, 6) [mm, deg]
+    scaled_error: Array  # (n,) norm of e
+    saturated_chambers: Array  # (n,)
+    settled: Array  # (n,) bool, after every action
+    pressure_kpa: Array  # (n, n_chambers)
+    clearance_mm: Array  # (n,) of the body to the pipe's wall; infinite without a pipe
+
+    @property
+    def tip_error_mm(self) -> Array:
+        return np.linalg.norm(np.asarray(self.pose - self.goal)[:, :3], axis=-1)
+
+
+@dataclass(frozen=True)
+class Summary:
+    """The figures that stand in tables."""
+
+    median_mm: float
+    p95_mm: float
+    reached_share: float  # norm of e below theta, and no chamber saturated
+    saturated_share: float  # goals at which a chamber is saturated
+    unsettled: int
+    circle_mean_mm: float
+    circle_max_mm: float
+    circle_saturated_chambers: int  # summed over the circle's points
+
+    def to_dict(self) -> dict[str, Any]:
+        return dataclasses.asdict(self)
+
+    def rows(self) -> list[tuple[str, str]]:
+        """What a table shows: name and value with its unit."""
+        return [
+            ("tip error, median", f"{self.median_mm:.2f} mm"),
+            ("tip error, 95 %", f"{self.p95_mm:.2f} mm"),
+            ("goals reached", f"{100 * self.reached_share:.1f} %"),
+            ("goals with a saturated chamber", f"{100 * self.saturated_share:.1f} %"),
+            ("arms that did not settle", f"{self.unsettled}"),
+            ("circle, mean tip error", f"{self.circle_mean_mm:.2f} mm"),
+            ("circle, largest tip error", f"{self.circle_max_mm:.2f} mm"),
+            ("circle, saturated chambers", f"{self.circle_saturated_chambers}"),
+        ]
+
+
+class Evaluator:
+    """Evaluates actors of one structure on one arm without randomisation; compiled once.
+
+    Every goal gets `N_ACTIONS` actions of the deterministic policy, and what stands after the last counts. On
+    the workspace each arm starts at a random pose; on the circle, a single arm goes from point to point,
+    once around to get there.
+    """
+
+    def __init__(self, env: ReachEnv, agent: TQC, n_goals: int = N_GOALS):
+        self.env, self.agent = nominal(env), agent
+        self.n_goals = n_goals
+        self.circle = jnp.asarray(circle_poses())
+        self._workspace = xla.jit(self._reach_all, env.uses_mjx)
+        self._circle = xla.jit(functools.partial(follow, self.env, agent), env.uses_mjx)
+
+    @functools.cached_property
+    def goals(self) -> Array:
+        """Held-out poses (n_goals, 6) [mm, deg]; drawn when needed, as an export does without."""
+        return self.env.sample_pool(self.n_goals, HELD_OUT_SEED).pose
+
+    def __call__(self, actor_params: Any) -> tuple[Summary, Reached, Reached]:
+        """Figures, and what was reached on the workspace and on the circle, as NumPy arrays."""
+        actor_params = jax.device_get(actor_params)  # maybe on many devices; one is enough
+        workspace = jax.device_get(self._workspace(actor_params, self.goals))
+        circle = jax.device_get(self._circle(actor_params, self.circle))
+        return summarise(workspace, circle, self.env.config.reward.threshold), workspace, circle
+
+    def _reach_all(self, actor_params: Any, goals: Array) -> Reached:
+        keys = jax.random.split(jax.random.PRNGKey(HELD_OUT_SEED), len(goals))
+        starts = jax.vmap(self.env.reset)(keys)
+        return jax.vmap(lambda *at: reach(self.env, self.agent, actor_params, *at)[1])(starts, goals)
+
+
+def nominal(env: ReachEnv) -> ReachEnv:
+    """The environment without randomisation."""
+    config = dataclasses.replace(env.config, randomisation=Randomisation())
+    return env if config == env.config else ReachEnv(env.spec, config, env.s2r)
+
+
+def reach(env: ReachEnv, agent: TQC, actor_params: Any, state: State, goal: Array) -> tuple[State, Reached]:
+    """What one arm reaches with N_ACTIONS towards a goal (6,), and its state then."""
+    arm = state.pipeline_state._replace(goal=goal)
+    state = state.replace(pipeline_state=arm, obs=env.observe(arm.pose, goal))
+
+    def act(state: State, _):
+        after = env.step(state, agent.act_mode(actor_params, state.obs))
+        return after, after.info["valid"]
+
+    state, settled = jax.lax.scan(act, state, None, length=N_ACTIONS)
+    arm = state.pipeline_state
+    return state, Reached(
+        goal=goal,
+        pose=arm.pose,
+        scaled_error=jnp.linalg.norm(rewards.scaled_error(arm.pose, goal, env.config.reward)),
+        saturated_chambers=state.metrics["saturated_chambers"],
+        settled=jnp.all(settled),
+        pressure_kpa=arm.pressure_kpa,
+        clearance_mm=state.info["clearance_mm"],
+    )
+
+
+def follow(env: ReachEnv, agent: TQC, actor_params: Any, path: Array) -> Reached:
+    """What one arm reaches along a path (n, 6) of goals, once along it to get there."""
+    start = env.reset(jax.random.PRNGKey(HELD_OUT_SEED))
+    twice = jnp.concatenate([path, path])
+    _, reached = jax.lax.scan(lambda state, goal: reach(env, agent, actor_params, state, goal), start, twice)
+    return jax.tree.map(lambda x: x[len(path) :], reached)
+
+
+def summarise(workspace: Reached, circle: Reached, threshold: float) -> Summary:
+    """Figures of what was reached."""
+    error, around = workspace.tip_error_mm, circle.tip_error_mm
+    free = workspace.saturated_chambers == 0
+    return Summary(
+        median_mm=float(np.median(error)),
+        p95_mm=float(np.quantile(error, 0.95)),
+        reached_share=float(np.mean((workspace.scaled_error < threshold) & free & workspace.settled)),
+        saturated_share=float(np.mean(~free)),
+        unsettled=int(np.sum(~workspace.settled) + np.sum(~circle.settled)),
+        circle_mean_mm=float(np.mean(around)),
+        circle_max_mm=float(np.max(around)),
+        circle_saturated_chambers=int(np.sum(circle.saturated_chambers)),
+    )

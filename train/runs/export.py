@@ -1,0 +1,60 @@
+"""A run's newest policy as the one file that the deployed arm loads."""
+
+from __future__ import annotations
+
+import datetime
+import functools
+import json
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from mjx_softarm.env import ReachEnv
+from mjx_softarm.policy.file import ArmModel, policy_from_actor, save_policy
+from mjx_softarm.spec import ArmSpec
+from train.runs.checkpoint import Run
+from train.runs.estimator import Distilled, distil
+from train.runs.run import restore_actor
+
+N_WORKSPACE = 2048  # poses that stand for the workspace
+SEED = 0  # of the estimator
+
+
+def export_run(run: Run, path: Path | None = None) -> Path:
+    """Write the policy of a run's newest checkpoint; returns the file, `policy.npz` in the run by default.
+
+    Raises:
+        RunError: the run has no checkpoint.
+        SealedFileError: the file cannot be written.
+    """
+    task, actor_params = restore_actor(run)
+    model, distilled = arm_model(task.job.env)
+    errors = {name: getattr(distilled, name) for name in ("tip_mm", "turn_deg", "spring_mm")}
+    provenance = {
+        **json.loads((run.path / "config.json").read_text("utf-8")),
+        "epoch": run.latest_epoch,
+        "estimator_errors": {
+            name: {f"{payload_kg:g} kg": error._asdict() for payload_kg, error in by_payload.items()}
+            for name, by_payload in errors.items()
+        },
+        "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+    }
+    actor_params = jax.device_get(actor_params)
+    policy = policy_from_actor(actor_params, run.spec, run.config.env.reward, model, provenance)
+    path = path or run.path / "policy.npz"
+    save_policy(path, policy)
+    return path
+
+
+def arm_model(env: ReachEnv) -> tuple[ArmModel, Distilled]:
+    """What the arm's computer has to know about the environment's arm, and how exact it is."""
+    distilled = _distil(env.spec)
+    workspace = np.asarray(env.pool.pose[:N_WORKSPACE], np.float32)
+    return ArmModel(workspace, distilled.estimator, distilled.spring_model, env.s2r), distilled
+
+
+@functools.cache
+def _distil(spec: ArmSpec) -> Distilled:
+    """Once for all policies of an arm that a process exports."""
+    return distil(spec, SEED)

@@ -1,0 +1,197 @@
+"""The pictures of a run: learning curve, circle, map of the error over the workspace."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter, LogFormatter
+
+from train.runs.evaluate import Reached
+from train.runs.positions import AtPositions
+
+INK, BLUE, ORANGE, GREY = "#222222", "#1f6fb4", "#e07b28", "#9aa0a6"
+DPI = 150
+STEPS = "environment steps"
+REACH_PICTURES = ("learning_curve.png", "circle.png", "workspace_error.png")
+IMITATION_PICTURES = ("learning_curve.png", "losses.png", "positions.png")
+
+
+def save(folder: Path, pictures: dict[str, Figure]) -> None:
+    """Write pictures, by their names, into a folder."""
+    for name, figure in pictures.items():
+        figure.savefig(folder / name, dpi=DPI)
+
+
+def reach_pictures(rows: list[dict[str, Any]], workspace: Reached, circle: Reached) -> dict[str, Figure]:
+    """The pictures of a run on the workspace, by file name."""
+    figures = (learning_curve(rows), circle_figure(circle), workspace_figure(workspace))
+    return dict(zip(REACH_PICTURES, figures, strict=True))
+
+
+def imitation_pictures(rows: list[dict[str, Any]], at: AtPositions) -> dict[str, Figure]:
+    """The pictures of a run on demonstrated positions, by file name."""
+    figures = (imitation_curve(rows), losses(rows), positions_figure(at))
+    return dict(zip(IMITATION_PICTURES, figures, strict=True))
+
+
+def dress(axes: Any, title: str, x: str, y: str) -> None:
+    """Title, labels and grid, as all pictures of the project have them."""
+    axes.set_title(title, loc="left", fontsize=10, color=INK)
+    axes.set_xlabel(x)
+    axes.set_ylabel(y)
+    axes.grid(color="#e6e6e6", linewidth=0.6)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    if x == STEPS:
+        axes.xaxis.set_major_formatter(EngFormatter())
+
+
+def _axes(figure: Figure, position: Any, title: str, x: str, y: str) -> Any:
+    axes = figure.add_subplot(*position) if isinstance(position, tuple) else figure.add_subplot(position)
+    dress(axes, title, x, y)
+    return axes
+
+
+def logarithmic(axes: Any) -> None:
+    """The y axis, with plain numbers."""
+    axes.set_yscale("log")
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_formatter(LogFormatter())
+
+
+def learning_curve(rows: list[dict[str, Any]]) -> Figure:
+    """Held-out tip error and success over environment steps."""
+    figure = Figure(figsize=(10, 4), layout="constrained")
+    evaluated = [row for row in rows if "evaluation/median_mm" in row]
+    steps = [row["env_steps"] for row in evaluated]
+    left = _axes(figure, 121, "tip error on held-out goals", STEPS, "mm")
+    left.plot(steps, [row["evaluation/median_mm"] for row in evaluated], color=BLUE, label="median")
+    left.plot(steps, [row["evaluation/p95_mm"] for row in evaluated], color=ORANGE, label="95 %")
+    left.plot(
+        steps, [row["evaluation/circle_mean_mm"] for row in evaluated], color=GREY, label="circle, mean"
+    )
+    logarithmic(left)
+    left.legend(frameon=False)
+    right = _axes(figure, 122, "goals reached, chambers saturated", STEPS, "%")
+    for name, colour, label in (
+        ("reached_share", BLUE, "goals reached"),
+        ("saturated_share", ORANGE, "goals with a saturated chamber"),
+    ):
+        right.plot(steps, [100 * row[f"evaluation/{name}"] for row in evaluated], color=colour, label=label)
+    right.set_ylim(0, 100)
+    right.legend(frameon=False)
+    return figure
+
+
+def circle_figure(circle: Reached) -> Figure:
+    """The circle seen from above, the error and the pressures along it."""
+    figure = Figure(figsize=(12, 4), layout="constrained")
+    goal, pose = np.asarray(circle.goal), np.asarray(circle.pose)
+    error = circle.tip_error_mm
+    left = _axes(figure, 131, "circle from above", "x [mm]", "y [mm]")
+    left.plot(*np.vstack([goal, goal[:1]])[:, :2].T, color=GREY, label="goal")
+    left.plot(pose[:, 0], pose[:, 1], "o", markersize=3.5, color=BLUE, label="reached")
+    left.set_aspect("equal")
+    left.legend(frameon=False, loc="center")
+    title = f"tip error: mean {error.mean():.2f} mm, largest {error.max():.2f} mm"
+    middle = _axes(figure, 132, title, "point", "mm")
+    middle.bar(np.arange(len(error)), error, color=BLUE)
+    n_saturated = int(np.sum(circle.saturated_chambers))
+    right = _axes(figure, 133, f"pressures; {n_saturated} saturated chambers", "point", "kPa")
+    for k, line in enumerate(np.asarray(circle.pressure_kpa).T):
+        right.plot(line, color=colormaps["tab10"](k % 10), label=f"chamber {k}", linewidth=1.2)
+    right.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    return figure
+
+
+def workspace_figure(workspace: Reached) -> Figure:
+    """Where in the workspace the tip error is how large, and its distribution."""
+    figure = Figure(figsize=(13, 4), layout="constrained")
+    goal, error = np.asarray(workspace.goal), workspace.tip_error_mm
+    order = np.argsort(error)
+    top = max(1.0, float(np.quantile(error, 0.98)))
+    for position, columns, title in ((131, (1, 2), "side view"), (132, (0, 1), "from above")):
+        names = [f"{'xyz'[k]} [mm]" for k in columns]
+        axes = _axes(figure, position, f"tip error at the goals, {title}", *names)
+        points = axes.scatter(
+            goal[order, columns[0]],
+            goal[order, columns[1]],
+            c=error[order],
+            s=5,
+            cmap="viridis",
+            vmin=0,
+            vmax=top,
+        )
+        axes.set_aspect("equal")
+    figure.colorbar(points, ax=axes, label="mm", extend="max")
+    axes = _axes(
+        figure, 133, f"distribution over {len(error)} held-out goals", "tip error [mm]", "share of goals [%]"
+    )
+    axes.plot(np.sort(error), 100 * np.arange(1, len(error) + 1) / len(error), color=BLUE)
+    for share, colour in ((50, GREY), (95, ORANGE)):
+        at = float(np.quantile(error, share / 100))
+        axes.plot([at, at], [0, share], color=colour, linewidth=1, label=f"{share} %: {at:.1f} mm")
+    axes.set_xlim(0, 3 * top)
+    axes.set_xscale("symlog", linthresh=1.0)
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.set_ylim(0, 100)
+    axes.legend(frameon=False, loc="upper left")
+    return figure
+
+
+def imitation_curve(rows: list[dict[str, Any]]) -> Figure:
+    """Success and tip error at the demonstrated positions over environment steps."""
+    figure = Figure(figsize=(10, 4), layout="constrained")
+    evaluated = [row for row in rows if "evaluation/success_share" in row]
+    steps = [row["env_steps"] for row in evaluated]
+    left = _axes(figure, 121, "demonstrated positions reached", STEPS, "%")
+    for name, colour, label in (
+        ("success_share", BLUE, "unsaturated, inside the pipe"),
+        ("reached_share", GREY, "the pose alone"),
+    ):
+        left.plot(steps, [100 * row[f"evaluation/{name}"] for row in evaluated], color=colour, label=label)
+    left.set_ylim(0, 105)
+    left.legend(frameon=False)
+    right = _axes(figure, 122, "tip error at the positions", STEPS, "mm")
+    right.plot(steps, [row["evaluation/median_mm"] for row in evaluated], color=BLUE, label="median")
+    right.plot(steps, [row["evaluation/max_mm"] for row in evaluated], color=ORANGE, label="largest")
+    logarithmic(right)
+    right.legend(frameon=False)
+    return figure
+
+
+def losses(rows: list[dict[str, Any]]) -> Figure:
+    """Losses of critics, actor and, where the reward is learned, discriminator over environment steps."""
+    names = ["tqc/critic_loss", "tqc/actor_loss", "gail/discriminator_loss"]
+    names = [name for name in names if any(name in row for row in rows)]
+    figure = Figure(figsize=(4 * len(names), 3.5), layout="constrained")
+    for k, name in enumerate(names):
+        title = name.split("/")[1].replace("_", " ")
+        axes = _axes(figure, (1, len(names), k + 1), title, STEPS, "")
+        learned = [row for row in rows if row["updates"] > 0]
+        axes.plot([row["env_steps"] for row in learned], [row[name] for row in learned], color=BLUE)
+    return figure
+
+
+def positions_figure(at: AtPositions) -> Figure:
+    """Goals and what was reached from the front, errors and clearances along the positions."""
+    figure = Figure(figsize=(12, 4), layout="constrained")
+    goal, pose = np.asarray(at.reached.goal), np.asarray(at.reached.pose)
+    left = _axes(figure, 131, "positions from the front", "x [mm]", "z [mm]")
+    left.plot(goal[:, 0], goal[:, 2], color=GREY, marker="o", markerfacecolor="none", label="demonstrated")
+    left.plot(pose[:, 0], pose[:, 2], "o", markersize=3.5, color=BLUE, label="reached")
+    left.set_aspect("equal")
+    left.legend(frameon=False)
+    error = at.reached.tip_error_mm
+    middle = _axes(figure, 132, f"tip error: mean {error.mean():.2f} mm", "position", "mm")
+    middle.bar(np.arange(len(error)), error, color=np.where(at.success, BLUE, ORANGE))
+    right = _axes(figure, 133, "clearance of the body to the pipe", "position", "mm")
+    if np.isfinite(at.reached.clearance_mm).all():
+        right.bar(np.arange(len(error)), at.reached.clearance_mm, color=BLUE)
+    else:
+        right.text(0.5, 0.5, "no pipe", ha="center", transform=right.transAxes, color=GREY)
+    return figure

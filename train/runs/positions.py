@@ -1,0 +1,103 @@
+"""How well a policy reaches demonstrated positions, the body inside the pipe."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from mjx_softarm._support import xla
+from mjx_softarm.env import ReachEnv
+from mjx_softarm.sensing.pose import pose_error
+from train.agent.tqc import TQC
+from train.runs.evaluate import Reached, follow, nominal
+
+
+class AtPositions(NamedTuple):
+    """What an arm reached at each of m demonstrated positions, in their order."""
+
+    reached: Reached
+    success: Array  # (m,) bool: close enough, no chamber saturated, the body inside the pipe
+
+
+@dataclass(frozen=True)
+class PositionSummary:
+    """The figures that stand in tables."""
+
+    success_share: float
+    success_first_share: float  # of the positions that are goals from the start
+    reached_share: float  # close enough, whatever the chambers and the wall say
+    median_mm: float
+    max_mm: float
+    x_mm: float  # mean absolute errors
+    y_mm: float
+    z_mm: float
+    saturated_positions: int
+    outside_positions: int  # with part of the body beyond the pipe's wall
+    unsettled: int
+    error_mm: tuple[float, ...]  # tip error at each position
+
+    def to_dict(self) -> dict[str, Any]:
+        return dataclasses.asdict(self)
+
+    def rows(self) -> list[tuple[str, str]]:
+        """What a table shows: name and value with its unit."""
+        return [
+            ("positions with success", f"{100 * self.success_share:.1f} %"),
+            ("of those of the first stage", f"{100 * self.success_first_share:.1f} %"),
+            ("positions reached", f"{100 * self.reached_share:.1f} %"),
+            ("tip error, median", f"{self.median_mm:.2f} mm"),
+            ("tip error, largest", f"{self.max_mm:.2f} mm"),
+            ("mean absolute error in x, y, z", f"{self.x_mm:.2f}, {self.y_mm:.2f}, {self.z_mm:.2f} mm"),
+            ("positions with a saturated chamber", f"{self.saturated_positions}"),
+            ("positions with the body outside the pipe", f"{self.outside_positions}"),
+            ("arms that did not settle", f"{self.unsettled}"),
+        ]
+
+
+class PositionEvaluator:
+    """Evaluates actors on one path of positions (m, 6) [mm, deg]; compiled once.
+
+    A single arm without randomisation goes from position to position, once along the path to get there.
+    `first` (m,) bool tells the positions that are goals from the start.
+    """
+
+    def __init__(self, env: ReachEnv, agent: TQC, positions: np.ndarray, first: np.ndarray):
+        self.env, self.first = nominal(env), first
+        self.positions = jnp.asarray(positions)
+        self._follow = xla.jit(functools.partial(follow, self.env, agent), env.uses_mjx)
+
+    def __call__(self, actor_params: Any) -> tuple[PositionSummary, AtPositions]:
+        """Figures, and what was reached, as NumPy arrays."""
+        actor_params = jax.device_get(actor_params)  # maybe on many devices; one is enough
+        reached = jax.device_get(self._follow(actor_params, self.positions))
+        return summarise(reached, self.env.config.reward.threshold, self.first)
+
+
+def summarise(reached: Reached, threshold: float, first: np.ndarray) -> tuple[PositionSummary, AtPositions]:
+    """Figures of what was reached; a scaled error below the threshold is close enough."""
+    error_mm = reached.tip_error_mm
+    close = reached.scaled_error < threshold
+    success = close & (reached.saturated_chambers == 0) & (reached.clearance_mm > 0.0) & reached.settled
+    x, y, z = np.abs(pose_error(reached.pose, reached.goal))[:, :3].mean(axis=0)
+    figures = PositionSummary(
+        success_share=float(success.mean()),
+        success_first_share=float(success[first].mean()),
+        reached_share=float(close.mean()),
+        median_mm=float(np.median(error_mm)),
+        max_mm=float(error_mm.max()),
+        x_mm=float(x),
+        y_mm=float(y),
+        z_mm=float(z),
+        saturated_positions=int(np.count_nonzero(reached.saturated_chambers)),
+        outside_positions=int(np.count_nonzero(reached.clearance_mm <= 0.0)),
+        unsettled=int(np.count_nonzero(~reached.settled)),
+        error_mm=tuple(float(value) for value in error_mm),
+    )
+    return figures, AtPositions(reached, success)

@@ -1,0 +1,230 @@
+"""The host's side of a training run: loop over epochs, show, log, checkpoint, stop when asked to."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jax.sharding import Mesh
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from tensorboardX import SummaryWriter
+
+from mjx_softarm._support.provenance import write_json
+from mjx_softarm.env import ReachEnv
+from train.config import ImitationConfig, TrainConfig
+from train.epoch.devices import any_process, is_first_process
+from train.epoch.job import Job, TrainState
+from train.runs import plots
+from train.runs.checkpoint import Run, RunError
+from train.runs.task import Task, task_of
+
+
+class Interrupted(Exception):
+    """The user stopped the run; its state is saved."""
+
+
+def train(run: Run, task: Task, console: Console) -> Any:
+    """Train to the end of the run's config, from its newest checkpoint if it has one.
+
+    Args:
+        run: the folder; its config says everything.
+        task: of the run.
+        console: where progress is shown.
+
+    Returns:
+        Figures of the final policy.
+
+    Raises:
+        Interrupted: after Ctrl-C or a termination signal, once the state is saved.
+    """
+    with asked_to_stop() as asked:
+        epoch, state = _begin(run, task, console)
+        run.truncate_metrics(epoch)
+        with open_board(run, state) as board, progress_bar(console) as progress:
+            bar = progress.add_task("training", total=run.config.n_epochs, completed=epoch, text="")
+            while epoch < run.config.n_epochs:
+                state, row = _timed_epoch(task.job, task.prepare(state, epoch))
+                epoch += 1
+                stop, due = any_process(bool(asked)), run.config.evaluates_after(epoch)
+                if due:
+                    row |= evaluation(task, state.agent.mean_actor_params)
+                record(run, board, epoch, counts(state), row)
+                if due or stop:
+                    run.save(epoch, state)
+                progress.update(bar, completed=epoch, text=_line(task, row))
+                if due and not console.is_terminal:  # a log file gets lines in the place of a bar
+                    console.print(
+                        f"epoch {epoch} of {run.config.n_epochs}: {_line(task, row)}", highlight=False
+                    )
+                if stop and epoch < run.config.n_epochs:
+                    raise Interrupted(f"stopped after epoch {epoch}; continue with --resume {run.path}")
+    return finish(run, task, state.agent.mean_actor_params)
+
+
+def _begin(run: Run, task: Task, console: Console) -> tuple[int, TrainState]:
+    """The epochs that a run has done, and its state after them."""
+    console.print("compiling (cached for the next start) ...")
+
+    def first() -> tuple[int, TrainState]:
+        state = task.job.init(jax.random.PRNGKey(run.config.seed))
+        return (0, state) if run.latest_epoch is None else run.restore(state)
+
+    epoch, state = task.job.start(first)
+    if epoch:
+        console.print(f"continuing after epoch {epoch} of {run.config.n_epochs}")
+    return epoch, state
+
+
+def finish(run: Run, task: Task, actor_params: Any) -> Any:
+    """Evaluate a policy, write `evaluation.json` and the pictures; returns the figures."""
+    summary, *reached = task.evaluate(actor_params)
+    if is_first_process():
+        write_json(run.path / "evaluation.json", summary.to_dict())
+        plots.save(run.path, task.pictures(run.metrics(), *reached))
+    return summary
+
+
+def task_of_run(run: Run, mesh: Mesh | None = None) -> Task:
+    """What a run learns.
+
+    Raises:
+        RunError: its demonstrations cannot be read.
+        ConfigError: it cannot be split evenly over the devices of the mesh.
+    """
+    return task_of(run.config, ReachEnv(run.spec, run.config.env, run.s2r), run.demonstrations(), mesh)
+
+
+def restore_actor(run: Run) -> tuple[Task, Any]:
+    """The task of a run, and the actor of its newest checkpoint."""
+    task = task_of_run(run)
+    return task, _restored(run, task, "agent").mean_actor_params
+
+
+def begin_with(task: Task, seed: int, agent: Run | None = None, reward: Run | None = None) -> TrainState:
+    """The state that a new run begins with, where parts of it are another's.
+
+    Args:
+        task: of the new run.
+        seed: of the new run.
+        agent: whose actor, critics and temperature it begins with.
+        reward: whose discriminator it begins with.
+
+    Raises:
+        RunError: the other run has no such part, or one of another size.
+    """
+    state = task.job.init(jax.random.PRNGKey(seed))
+    if agent is not None:
+        given = _restored(agent, task_of_run(agent), "agent")
+        names = ("actor_params", "mean_actor_params", "critic_params", "target_params", "log_alpha")
+        parts = {name: getattr(given, name) for name in names}
+        _same_shapes(agent, "networks", parts, {name: getattr(state.agent, name) for name in names})
+        state = state._replace(agent=state.agent._replace(**parts))
+    if reward is not None:
+        if not (isinstance(reward.config, ImitationConfig) and reward.config.learned_weight):
+            raise RunError(f"{reward.path}: learned no reward; expected a run of `imitate` that did")
+        given = _restored(reward, task_of_run(reward), "imitation").discriminator
+        _same_shapes(reward, "discriminator", given, state.imitation.discriminator)
+        state = state._replace(imitation=state.imitation._replace(discriminator=given))
+    return task.job.place(state)
+
+
+def _restored(run: Run, task: Task, part: str) -> Any:
+    shapes = jax.eval_shape(task.job.init, jax.random.PRNGKey(0))
+    return run.restore_part(part, getattr(shapes, part))
+
+
+def _same_shapes(run: Run, what: str, given: Any, own: Any) -> None:
+    given, own = ([leaf.shape for leaf in jax.tree.leaves(tree)] for tree in (given, own))
+    if given != own:
+        raise RunError(f"{run.path}: {what}: got layers of {given}, expected {own} as in the new run")
+
+
+def open_board(run: Run, state: TrainState) -> SummaryWriter:
+    """TensorBoard's writer; what a stopped run wrote after its checkpoint is dropped."""
+    steps = int(state.n_env_steps)
+    purge_step = steps + 1 if steps else None
+    return SummaryWriter(str(run.path), purge_step=purge_step, write_to_disk=is_first_process())
+
+
+def _timed_epoch(job: Job, state: TrainState) -> tuple[TrainState, dict[str, float]]:
+    start = time.perf_counter()
+    updates = int(state.agent.step)
+    state, metrics = job.epoch(state)
+    row = {name: float(value) for name, value in jax.device_get(metrics).items()}
+    seconds = time.perf_counter() - start
+    return state, row | speeds(job.config, int(state.agent.step) - updates, seconds)
+
+
+def speeds(config: TrainConfig, n_updates: int, seconds: float) -> dict[str, float]:
+    """How fast an epoch with so many updates was, as a row of metrics has it."""
+    n_env_steps = config.n_arms * config.vector_steps_per_epoch
+    return {"speed/env_steps_per_s": n_env_steps / seconds, "speed/updates_per_s": n_updates / seconds}
+
+
+def evaluation(task: Task, actor_params: Any) -> dict[str, float]:
+    """Figures of a policy, as a row of metrics has them."""
+    figures = task.evaluate(actor_params)[0].to_dict()
+    return {f"evaluation/{name}": x for name, x in figures.items() if not isinstance(x, tuple)}
+
+
+def counts(state: TrainState) -> dict[str, int]:
+    """What a run has done, as a row of metrics has it."""
+    return {"env_steps": int(state.n_env_steps), "updates": int(state.agent.step)}
+
+
+def record(run: Run, board: SummaryWriter, epoch: int, done: dict[str, int], row: dict[str, float]) -> None:
+    """Add a row to the run's metrics and to TensorBoard's."""
+    run.log({"epoch": epoch, **done, **row})
+    for name, value in row.items():
+        board.add_scalar(name, np.float32(value), done["env_steps"])
+
+
+def _line(task: Task, row: dict[str, float]) -> str:
+    text = (
+        f"{row['speed/env_steps_per_s']:.0f} env steps/s  {row['speed/updates_per_s']:.0f} updates/s  "
+        f"success {100 * row['env/reached']:.0f} % of actions"
+    )
+    return f"{text}  {task.headline(row)}" if "evaluation/median_mm" in row else text
+
+
+def progress_bar(console: Console) -> Progress:
+    """Of epochs; hidden where the console is a file."""
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    columns += (TextColumn("{task.fields[text]}"),)
+    return Progress(*columns, console=console, speed_estimate_period=120, disable=not console.is_terminal)
+
+
+@contextmanager
+def asked_to_stop() -> Iterator[list[int]]:
+    """A list that fills when the process is asked to stop; a second Ctrl-C stops at once."""
+    asked: list[int] = []
+
+    def note(number: int, _frame: Any) -> None:
+        if asked and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        asked.append(number)
+
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield asked
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def default_path(task: str, preset: str, seed: int) -> Path:
+    """`runs/TASK-PRESET-seedN`, or the first free one numbered after it."""
+    return free_path(Path("runs") / f"{task}-{preset}-seed{seed}")
+
+
+def free_path(base: Path) -> Path:
+    """A path that is not there: this one, or the first free one numbered after it."""
+    candidates = (base if k == 1 else base.with_name(f"{base.name}-{k}") for k in range(1, 10_000))
+    return next(path for path in candidates if not path.exists())

@@ -1,0 +1,1 @@
+"""Sweeps: several runs trained as one job."""

@@ -1,0 +1,136 @@
+"""Several runs of one structure as one vmapped job: seeds, and settings that are plain numbers.
+
+The members of a sweep share everything that has a shape or decides what is computed. The settings that they
+differ in are traced: one compilation serves all members, and all values. `Job` is built anew inside the
+traced function, of a config that holds traced numbers, so that it need not know of sweeps.
+
+The members' counts of environment steps are one number, not one for each: a branch on a number of each
+would compute both of its sides, so that warm-up would cost as much as learning.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from mjx_softarm._support import xla
+from mjx_softarm.env import Randomisation, ReachEnv
+from mjx_softarm.mdp.rewards import RewardConfig
+from train.config import TrainConfig
+from train.epoch.hindsight import HindsightConfig
+from train.epoch.job import Job, TrainState
+
+
+def _numbers_of(group: str, config: Any) -> tuple[str, ...]:
+    return tuple(f"{group}.{field.name}" for field in dataclasses.fields(config))
+
+
+# Settings that are numbers in what is computed; the others decide what is computed, and on what shapes.
+VARIABLE = (
+    "tqc.learning_rate",
+    "tqc.learning_rate_alpha",
+    "tqc.gamma",
+    "tqc.tau",
+    "tqc.initial_alpha",
+    "tqc.target_entropy",
+    "tqc.reward_scale",
+    *_numbers_of("hindsight", HindsightConfig),
+    *_numbers_of("env.reward", RewardConfig),
+    *_numbers_of("env.randomisation", Randomisation),
+    "env.saturation_tolerance_mm",
+    "env.clearance_cost_per_mm",
+    "env.clearance_margin_mm",
+)
+
+_AXES = cast(Any, TrainState)(arms=0, agent=0, memory=0, key=0, n_env_steps=None, n_unsettled=0)
+
+
+def setting(config: Any, path: str) -> Any:
+    """The value of a setting such as `tqc.gamma`."""
+    for name in path.split("."):
+        config = getattr(config, name)
+    return config
+
+
+def with_env_config(env: ReachEnv, config: Any) -> ReachEnv:
+    """The environment with another config, which differs in nothing but `VARIABLE` settings."""
+    other = copy.copy(env)
+    other.config = config
+    return other
+
+
+class SweepJob:
+    """The members' fixed parts, and the functions that change the states of all.
+
+    A state of a sweep is a `TrainState` whose arrays have an axis of n members in front, all but
+    `n_env_steps`. `n_traces` counts how often the epoch was traced: once in a sweep.
+    """
+
+    def __init__(self, configs: Sequence[TrainConfig], varied: Sequence[str], env: ReachEnv):
+        """Of members whose configs differ in their seeds and in the settings `varied` alone."""
+        self.config, self.env, self.n = configs[0], env, len(configs)
+        self.keys = jnp.stack([jax.random.PRNGKey(config.seed) for config in configs])
+        self.numbers = {
+            path: jnp.asarray([setting(config, path) for config in configs], jnp.float32) for path in varied
+        }
+        self.n_traces = 0
+        init = jax.vmap(self._init, out_axes=_AXES)
+        epoch = jax.vmap(self._epoch, in_axes=(_AXES, 0), out_axes=(_AXES, 0))
+        self._init_all = xla.jit(init, env.uses_mjx)
+        self._epoch_all = xla.jit(epoch, env.uses_mjx, donate_argnums=0)
+        self._take = jax.jit(lambda tree, k: jax.tree.map(lambda x: x[k], tree))
+        self._stack = jax.jit(lambda *trees: jax.tree.map(lambda *x: jnp.stack(x), *trees))
+
+    def init(self) -> TrainState:
+        """The state that all members begin with."""
+        return self._init_all(self.keys, self.numbers)
+
+    def epoch(self, states: TrainState) -> tuple[TrainState, dict[str, Array]]:
+        """As `Job.epoch`, with metrics (n,)."""
+        return self._epoch_all(states, self.numbers)
+
+    def actor_params(self, states: TrainState, k: int) -> Any:
+        """Parameters of a member's actor."""
+        return self._take(states.agent.mean_actor_params, k)
+
+    def member(self, states: TrainState, k: int) -> TrainState:
+        """The state of one member, as an ordinary run has it."""
+        own = self._take(states._replace(n_env_steps=None), k)
+        return own._replace(n_env_steps=states.n_env_steps)
+
+    def member_shapes(self) -> TrainState:
+        """Shapes of a member's state."""
+        return jax.eval_shape(self.member, jax.eval_shape(self.init), 0)
+
+    def together(self, members: Sequence[TrainState]) -> TrainState:
+        """The state of all members from those of each."""
+        states = self._stack(*(own._replace(n_env_steps=None) for own in members))
+        return states._replace(n_env_steps=members[0].n_env_steps)
+
+    def _init(self, key: Array, numbers: Mapping[str, Array]) -> TrainState:
+        return self._job(numbers)._init(key)
+
+    def _epoch(self, state: TrainState, numbers: Mapping[str, Array]) -> tuple[TrainState, dict[str, Array]]:
+        self.n_traces += 1
+        return self._job(numbers)._epoch(state)
+
+    def _job(self, numbers: Mapping[str, Array]) -> Job:
+        config = self.config
+        for path, number in numbers.items():
+            config = _with_number(config, path, number)
+        return Job(config, with_env_config(self.env, config.env))
+
+
+def _with_number(config: Any, path: str, number: Array) -> Any:
+    """A copy of a config with a traced number, which its own checks cannot look at; they saw its values."""
+    name, _, rest = path.partition(".")
+    changed = copy.copy(config)
+    value = _with_number(getattr(config, name), rest, number) if rest else number
+    object.__setattr__(changed, name, value)  # it is frozen, and `replace` would check
+    return changed

@@ -1,0 +1,190 @@
+"""The host's side of a sweep: its folder, and the loop that trains all members at once.
+
+Each member has the folder of an ordinary run, so whatever takes a run takes a member. A killed process may
+have left them with checkpoints of different epochs; they continue from the newest that all of them have.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from rich.console import Console
+
+from mjx_softarm._support.provenance import provenance, write_json
+from mjx_softarm.env import EnvConfig, ReachEnv
+from mjx_softarm.sensing.s2r import S2R
+from mjx_softarm.spec import ArmSpec
+from train.config import TrainConfig
+from train.epoch.job import TrainState
+from train.runs.checkpoint import Run, RunError
+from train.runs.run import (
+    Interrupted,
+    asked_to_stop,
+    evaluation,
+    finish,
+    open_board,
+    progress_bar,
+    record,
+    speeds,
+)
+from train.runs.task import Task, task_of
+from train.sweep.job import SweepJob, with_env_config
+
+SWEEP_FILE = "sweep.json"
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """The folder of a sweep: `sweep.json`, its members' folders and, at the end, table and plot."""
+
+    path: Path
+    runs: tuple[Run, ...]
+    varied: tuple[str, ...]  # settings that the members differ in, besides their seeds
+
+    @property
+    def config(self) -> TrainConfig:
+        """Of any member, for what they have in common."""
+        return self.runs[0].config
+
+    @property
+    def epoch(self) -> int:
+        """The newest epoch that all members have a checkpoint of; 0 without any."""
+        return max(set.intersection(*(set(run.epochs) for run in self.runs)), default=0)
+
+
+def create(
+    path: Path,
+    members: Mapping[str, TrainConfig],
+    varied: Sequence[str],
+    spec: ArmSpec,
+    s2r: S2R | None = None,
+) -> Sweep:
+    """Start the folder of a sweep, whole or not at all.
+
+    Args:
+        path: of the folder.
+        members: configs by the names of their folders.
+        varied: settings that they differ in, besides their seeds.
+        spec: the arm.
+        s2r: of its calibration, if it has one.
+
+    Raises:
+        RunError: there is such a folder already, or it cannot be made.
+    """
+    if path.exists():
+        raise RunError(f"{path}: is there already; continue it with --resume {path}, or choose another --out")
+    part = path.with_name(path.name + ".part")
+    shutil.rmtree(part, ignore_errors=True)  # of a start that was interrupted
+    for name, config in members.items():
+        Run.create(part / name, config, spec, s2r)
+    data = {"members": list(members), "varied": list(varied), "provenance": provenance("train")}
+    try:
+        write_json(part / SWEEP_FILE, data)
+        part.replace(path)
+    except OSError as error:
+        raise RunError(f"{path}: cannot be written: {error.strerror}") from error
+    return open_sweep(path)
+
+
+def open_sweep(path: Path) -> Sweep:
+    """An existing folder.
+
+    Raises:
+        RunError: there is no sweep in it, or it cannot be read.
+    """
+    file = path / SWEEP_FILE
+    try:
+        data = json.loads(file.read_text("utf-8"))
+        members, varied = data["members"], tuple(data["varied"])
+    except OSError as error:
+        raise RunError(f"{path}: not the folder of a sweep: {file}: {error.strerror}") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise RunError(f"{file}: not what a sweep writes: {error!r}") from error
+    return Sweep(path, tuple(Run.open(path / name) for name in members), varied)
+
+
+def train(sweep: Sweep, console: Console) -> None:
+    """Train all members to their end, from the newest checkpoints that they have in common.
+
+    Raises:
+        Interrupted: after Ctrl-C or a termination signal, once the states are saved.
+    """
+    console.print("drawing goals from the reachable workspace ...")
+    run = sweep.runs[0]
+    env = ReachEnv(run.spec, run.config.env, run.s2r)
+    job = SweepJob([run.config for run in sweep.runs], sweep.varied, env)
+    tasks, config, epoch = _tasks(sweep, env), sweep.config, sweep.epoch
+    if epoch:
+        console.print(f"continuing after epoch {epoch} of {config.n_epochs}")
+    states = _start(sweep, job, epoch)
+    console.print("compiling (cached for the next start) ...")
+    with asked_to_stop() as asked, ExitStack() as stack, progress_bar(console) as progress:
+        boards = [stack.enter_context(open_board(run, states)) for run in sweep.runs]
+        bar = progress.add_task("training", total=config.n_epochs, completed=epoch, text="")
+        while epoch < config.n_epochs:
+            states, rows = _timed_epoch(job, states)
+            epoch += 1
+            stop, due = bool(asked), config.evaluates_after(epoch)
+            done = {"env_steps": int(states.n_env_steps), "updates": int(states.agent.step[0])}
+            for k, (run, board, row) in enumerate(zip(sweep.runs, boards, rows, strict=True)):
+                if due:
+                    row |= evaluation(tasks[run.config.env], job.actor_params(states, k))
+                record(run, board, epoch, done, row)
+                if due or stop:
+                    run.save(epoch, job.member(states, k))
+            progress.update(bar, completed=epoch, text=_line(rows))
+            if due and not console.is_terminal:  # a log file gets lines in the place of a bar
+                console.print(f"epoch {epoch} of {config.n_epochs}: {_line(rows)}", highlight=False)
+            if stop and epoch < config.n_epochs:
+                raise Interrupted(f"stopped after epoch {epoch}; continue with --resume {sweep.path}")
+    for k, run in enumerate(sweep.runs):
+        finish(run, tasks[run.config.env], job.actor_params(states, k))
+
+
+def _tasks(sweep: Sweep, env: ReachEnv) -> dict[EnvConfig, Task]:
+    """What evaluates the members, once for those of the same environment."""
+    configs = {run.config.env: run.config for run in sweep.runs}
+    return {
+        env_config: task_of(config, with_env_config(env, env_config))
+        for env_config, config in configs.items()
+    }
+
+
+def _start(sweep: Sweep, job: SweepJob, epoch: int) -> TrainState:
+    """The state after an epoch; what the members have of later ones is forgotten."""
+    for run in sweep.runs:
+        run.rewind(epoch)
+    if not epoch:
+        return job.init()
+    like = job.member_shapes()
+    return job.together([run.restore(like)[1] for run in sweep.runs])
+
+
+def _timed_epoch(job: SweepJob, states: TrainState) -> tuple[TrainState, list[dict[str, float]]]:
+    """The next states, and a row of metrics for each member; speeds are those of one member."""
+    start = time.perf_counter()
+    updates = int(states.agent.step[0])
+    states, metrics = job.epoch(states)
+    metrics = jax.device_get(metrics)
+    seconds = time.perf_counter() - start
+    speed = speeds(job.config, int(states.agent.step[0]) - updates, seconds)
+    return states, [{name: float(x[k]) for name, x in metrics.items()} | speed for k in range(job.n)]
+
+
+def _line(rows: Sequence[Mapping[str, Any]]) -> str:
+    n, row = len(rows), rows[0]
+    env_steps, updates = row["speed/env_steps_per_s"], row["speed/updates_per_s"]
+    text = f"{n} x {env_steps:.0f} env steps/s  {n} x {updates:.0f} updates/s"
+    if "evaluation/median_mm" not in row:
+        return text
+    medians = [row["evaluation/median_mm"] for row in rows]
+    return f"{text}  held-out medians {np.min(medians):.1f} to {np.max(medians):.1f} mm"
