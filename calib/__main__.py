@@ -109,12 +109,12 @@ def _run(options: argparse.Namespace) -> int:
     springs = {"shared": options.shared_springs, "fit_compensation": options.fit_compensation}
     calibration = calibrate(logs, spec, options.seed, springs, lambda text: print(text, flush=True))
     write_calibration(options.out, calibration, [str(finding) for finding in findings], provenance("calib"))
-    for part in calibration.parts:
-        for warning in part.warnings:
-            print(f"warning: {part.title}: {warning}")
+    for section in calibration.sections:
+        for warning in section.warnings:
+            print(f"warning: {section.title}: {warning}")
     print(f"report: {options.out / 'report.html'}")
     print(f"next: python -m train reach --calibration {options.out}")
-    return 1 if any(part.warnings for part in calibration.parts) else 0
+    return 1 if any(section.warnings for section in calibration.sections) else 0
 
 
 def _spec(options: argparse.Namespace) -> ArmSpec:

@@ -27,9 +27,9 @@ from calib.fit.s2r import fit_s2r, simulate_poses
 from calib.fit.sensors import fit_springs
 from calib.fit.transients import calibrate_damping, find_stretches
 from calib.read.logs import same_arm
-from calib.read.rests import REST_S, find_rests
-from calib.report import sections as parts
-from calib.report.page import Part, to_html, to_json
+from calib.read.static_poses import MIN_HOLD_S, find_static_poses
+from calib.report import sections
+from calib.report.page import Section, to_html, to_json
 from mjx_softarm._support.provenance import write_json
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.sensing.pose import pose_from_frame
@@ -48,15 +48,15 @@ class Calibration:
 
     spec: ArmSpec
     s2r: S2R | None
-    parts: tuple[Part, ...]
+    sections: tuple[Section, ...]
 
 
 def calibrate(
     logs: Sequence[Log],
     spec: ArmSpec,
     seed: int = 0,
-    of_springs: Mapping[str, bool] = MappingProxyType({}),
-    tell: Callable[[str], None] = lambda text: None,
+    spring_options: Mapping[str, bool] = MappingProxyType({}),
+    progress: Callable[[str], None] = lambda text: None,
 ) -> Calibration:
     """Fit all that the logs allow.
 
@@ -64,22 +64,22 @@ def calibrate(
         logs: of one arm; see `calib.read.logs.read_log`.
         spec: what is believed of the arm so far.
         seed: of all that is drawn.
-        of_springs: `shared` and `fit_compensation` of `calib.fit.sensors.fit_springs`.
-        tell: takes a line before each step.
+        spring_options: `shared` and `fit_compensation` of `calib.fit.sensors.fit_springs`.
+        progress: takes a line before each step.
 
     Raises:
         LogError: the logs are of different arms.
         FitError: a fit cannot be made of what the logs hold.
     """
     same_arm(logs)
-    tell("springs ...")
-    spec, springs = _springs(logs, spec, seed, of_springs)
+    progress("springs ...")
+    spec, springs = _springs(logs, spec, seed, spring_options)
     seen = [log for log in logs if not any(getattr(log, name) is None for name in OF_POSES)]
-    tell("chambers ...")
+    progress("chambers ...")
     spec, chambers = _chambers(seen, spec, seed)
-    tell("damping ...")
+    progress("damping ...")
     spec, damping = _damping(seen, spec, seed)
-    tell("sim-to-real network ...")
+    progress("sim-to-real network ...")
     s2r, network = _s2r(seen, spec, seed)
     return Calibration(spec, s2r, (springs, chambers, damping, network))
 
@@ -111,7 +111,7 @@ def write_calibration(
         calibration.spec.to_toml(part / ARM_FILE)
         if calibration.s2r is not None:
             save_s2r(part / S2R_FILE, calibration.s2r)
-        report = (calibration.parts, findings, provenance)
+        report = (calibration.sections, findings, provenance)
         write_json(part / "report.json", to_json(*report))
         (part / "report.html").write_text(to_html(calibration.spec.name, *report), "utf-8")
         part.replace(folder)
@@ -119,7 +119,9 @@ def write_calibration(
         shutil.rmtree(part, ignore_errors=True)
 
 
-def _springs(logs: Sequence[Log], spec: ArmSpec, seed: int, how: Mapping[str, bool]) -> tuple[ArmSpec, Part]:
+def _springs(
+    logs: Sequence[Log], spec: ArmSpec, seed: int, how: Mapping[str, bool]
+) -> tuple[ArmSpec, Section]:
     pairs = [
         (log.frequency_hz, log.spring_m)
         for log in logs
@@ -127,57 +129,57 @@ def _springs(logs: Sequence[Log], spec: ArmSpec, seed: int, how: Mapping[str, bo
     ]
     if not pairs:
         needed = f"{NOT_FITTED} No log has both frequencies and measured spring lengths."
-        return spec, Part("Springs", needed, warnings=("beta and delta are not this arm's",))
+        return spec, Section("Springs", needed, warnings=("beta and delta are not this arm's",))
     frequency_hz, length_m = (np.concatenate(x) for x in zip(*pairs, strict=True))
     fit = fit_springs(frequency_hz, length_m, SensorParams.from_spec(spec), seed=seed, **how)
     sensor = {"beta": tuple(map(float, fit.beta)), "delta_m": tuple(map(float, fit.delta_m))}
     spec = spec.replace(sensor=sensor | {"compensation_h": fit.compensation_h})
     calibrated = length_from_frequency(frequency_hz, SensorParams.from_spec(spec), np.nan)
-    return spec, parts.springs(fit, calibrated.length_m, length_m)
+    return spec, sections.springs(fit, calibrated.length_m, length_m)
 
 
-def _chambers(logs: Sequence[Log], spec: ArmSpec, seed: int) -> tuple[ArmSpec, Part]:
-    rests, rows = find_rests(logs, spec)
-    if rests.n < MIN_POSES:
-        needed = f"{NOT_FITTED} {_few(MIN_POSES, 'pressures and tip poses', rests.n, rows)}"
-        return spec, Part("Chambers", needed, warnings=("stiffness, area and length are not this arm's",))
+def _chambers(logs: Sequence[Log], spec: ArmSpec, seed: int) -> tuple[ArmSpec, Section]:
+    poses, rows = find_static_poses(logs, spec)
+    if poses.n < MIN_POSES:
+        needed = f"{NOT_FITTED} {_few(MIN_POSES, 'pressures and tip poses', poses.n, rows)}"
+        return spec, Section("Chambers", needed, warnings=("stiffness, area and length are not this arm's",))
     fit = calibrate_chambers(logs, spec, seed)
-    part = parts.chambers(fit)
-    if fit.rests.marker_m.shape[1]:
+    section = sections.chambers(fit)
+    if fit.poses.marker_m.shape[1]:
         try:
-            part = parts.with_markers(part, marker_limits(fit.rests, fit.chamber_m, fit.spec))
+            section = sections.with_markers(section, marker_limits(fit.poses, fit.chamber_m, fit.spec))
         except FitError as error:  # markers only check, so a calibration does not fail for them
-            part = dataclasses.replace(part, warnings=(*part.warnings, str(error)))
-    return fit.spec, part
+            section = dataclasses.replace(section, warnings=(*section.warnings, str(error)))
+    return fit.spec, section
 
 
-def _damping(logs: Sequence[Log], spec: ArmSpec, seed: int) -> tuple[ArmSpec, Part]:
+def _damping(logs: Sequence[Log], spec: ArmSpec, seed: int) -> tuple[ArmSpec, Section]:
     if not find_stretches(logs, spec):
         needed = (
             f"{NOT_FITTED} No log follows the moving arm; it decides how the arm swings, not where it rests."
         )
-        return spec, Part("Damping", needed)
+        return spec, Section("Damping", needed)
     fit = calibrate_damping(logs, spec, seed)
-    return fit.spec, parts.damping(fit)
+    return fit.spec, sections.damping(fit)
 
 
-def _s2r(logs: Sequence[Log], spec: ArmSpec, seed: int) -> tuple[S2R | None, Part]:
+def _s2r(logs: Sequence[Log], spec: ArmSpec, seed: int) -> tuple[S2R | None, Section]:
     """The network of the unloaded arm: with a payload, the simulation is another."""
-    rests, rows = find_rests(logs, spec)
-    unloaded = np.isclose(rests.payload_kg, spec.mass.payload_kg, rtol=0.0, atol=1e-6)
-    rests = rests.take(np.isfinite(rests.spring_m).all(axis=1) & unloaded)
-    simulated = simulate_poses(spec, rests.spring_m) if rests.n else None
+    poses, rows = find_static_poses(logs, spec)
+    unloaded = np.isclose(poses.payload_kg, spec.mass.payload_kg, rtol=0.0, atol=1e-6)
+    poses = poses.take(np.isfinite(poses.spring_m).all(axis=1) & unloaded)
+    simulated = simulate_poses(spec, poses.spring_m) if poses.n else None
     n_settled = 0 if simulated is None else int(np.count_nonzero(simulated.valid))
     if simulated is None or n_settled < MIN_S2R_POSES:
         what = f"pressures, spring lengths and tip poses, a payload of {spec.mass.payload_kg:g} kg"
-        rows |= {"poses at which the simulated arm finds no rest": rests.n - n_settled}
+        rows |= {"poses at which the simulated arm finds no rest": poses.n - n_settled}
         needed = f"Not fitted: {_few(MIN_S2R_POSES, what, n_settled, rows)}"
         warnings = ("policies will be trained on simulated poses",)
-        return None, Part("Sim-to-real network", needed, warnings=warnings)
-    real = pose_from_frame(rests.tip_m, rests.tip_rotation)
+        return None, Section("Sim-to-real network", needed, warnings=warnings)
+    real = pose_from_frame(poses.tip_m, poses.tip_rotation)
     pose, spring_m, real = (x[simulated.valid] for x in (simulated.pose, simulated.spring_m, real))
     fit = fit_s2r(pose, spring_m, real, seed)
-    return fit.s2r, parts.s2r(fit, pose, spring_m, real, rests.n - n_settled)
+    return fit.s2r, sections.s2r(fit, pose, spring_m, real, poses.n - n_settled)
 
 
 def _few(n: int, what: str, n_found: int, rows: Mapping[str, int]) -> str:
@@ -185,5 +187,5 @@ def _few(n: int, what: str, n_found: int, rows: Mapping[str, int]) -> str:
     fates = ", ".join(f"{count} {fate}" for fate, count in rows.items() if count)
     return (
         f"{n} poses at rest with {what} are needed, and {n_found} are there; pressures must have been held "
-        f"for {REST_S:g} s. Rows of the logs: {fates or 'none with all of these columns'}."
+        f"for {MIN_HOLD_S:g} s. Rows of the logs: {fates or 'none with all of these columns'}."
     )

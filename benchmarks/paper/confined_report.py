@@ -39,7 +39,7 @@ from benchmarks.paper.report import (
 from benchmarks.paper.stages import Settings
 from benchmarks.paper.summary import PAPER as PAPER_OPEN
 from benchmarks.paper.summary import Check, spread
-from calib.report.page import Part, Table, page
+from calib.report.page import Section, Table, page
 
 JSON_FILE, HTML_FILE = "paper-confined.json", "confined.html"
 HEADINGS = {
@@ -150,8 +150,8 @@ def to_html(
         _training_part(data, drawn),
         _circle_part(data, drawn),
         calibration_part(data["calibrations"]),
-        Part("Every run", "Mean over the positions arrived at.", (_runs_table(data["runs"]),)),
-        Part(
+        Section("Every run", "Mean over the positions arrived at.", (_runs_table(data["runs"]),)),
+        Section(
             "Every training",
             "In the simulation of the calibrated arm.",
             (_trainings_table(data["trainings"]),),
@@ -162,7 +162,7 @@ def to_html(
     return page(title, first_of_page(checks), parts, film_html, provenance)
 
 
-def _pipe_part(data: Mapping[str, Any], drawn: Drawn) -> Part:
+def _pipe_part(data: Mapping[str, Any], drawn: Drawn) -> Section:
     text = (
         "Mean ± standard deviation over twins and training seeds, with one policy for both tasks; errors by "
         "motion capture at rest, averaged over half a second. Squares and dotted lines: where a thing is "
@@ -170,29 +170,29 @@ def _pipe_part(data: Mapping[str, Any], drawn: Drawn) -> Part:
     )
     names = ("positions", "errors", "force")
     chosen = [item for item in data["spreads"] if item["kind"] in ("pipe", "hand-made")]
-    return Part("300 mm pipe", text, (_spreads_table(chosen),), figures=tuple(drawn[n] for n in names))
+    return Section("300 mm pipe", text, (_spreads_table(chosen),), figures=tuple(drawn[n] for n in names))
 
 
-def _narrow_part(data: Mapping[str, Any], drawn: Drawn) -> Part:
+def _narrow_part(data: Mapping[str, Any], drawn: Drawn) -> Section:
     text = (
         "Of the demonstrations in this pipe, the positions alone are seen. The reward is the environment's "
         "own, and, as it is, the one learned in the 300 mm pipe."
     )
     chosen = [item for item in data["spreads"] if item["kind"] == "narrow"]
-    return Part("250 mm pipe", text, (_spreads_table(chosen),), figures=(drawn["errors-narrow"],))
+    return Section("250 mm pipe", text, (_spreads_table(chosen),), figures=(drawn["errors-narrow"],))
 
 
-def _training_part(data: Mapping[str, Any], drawn: Drawn) -> Part:
+def _training_part(data: Mapping[str, Any], drawn: Drawn) -> Section:
     text = (
         "Learned: a discriminator's reward alone, and a quarter of each batch of the critics the expert's "
         "answers. Hand-made: the environment's reward at the same goals, with hindsight; no demonstrated "
         "action is seen. Success: the pose reached, no chamber saturated, the body inside the pipe. Dotted: "
         f"{100 * SUCCESS:g} %. Bands: standard deviation over the runs."
     )
-    return Part("Learned against hand-made reward", text, figures=(drawn["success"], drawn["losses"]))
+    return Section("Learned against hand-made reward", text, figures=(drawn["success"], drawn["losses"]))
 
 
-def _circle_part(data: Mapping[str, Any], drawn: Drawn) -> Part:
+def _circle_part(data: Mapping[str, Any], drawn: Drawn) -> Section:
     text = (
         "The policy without demonstrations learns on with 16 demonstrated points, 8 of them first, by the "
         "environment's reward and the learned one; followed at all points of the circle."
@@ -208,7 +208,7 @@ def _circle_part(data: Mapping[str, Any], drawn: Drawn) -> Part:
             for name, n, item in body
         ),
     )
-    return Part("Circle", text, (table,), figures=(drawn["circle"],))
+    return Section("Circle", text, (table,), figures=(drawn["circle"],))
 
 
 def _around(of: Mapping[str, float]) -> str:

@@ -16,7 +16,7 @@ from PIL import Image
 
 from benchmarks.paper.stages import CALIBRATION
 from benchmarks.paper.summary import Check
-from calib.report.page import Part, Table
+from calib.report.page import Section, Table
 from mjx_softarm._support.provenance import write_json
 
 DPI, N_COLOURS = 110, 64
@@ -62,16 +62,16 @@ def first_of_page(checks: Sequence[Check]) -> str:
     return f"<p>All measured on the simulated arm called twin; no number is of a real arm.</p>{verdict}"
 
 
-def goals_part(checks: Sequence[Check]) -> Part:
+def goals_part(checks: Sequence[Check]) -> Section:
     """The goals, those that are missed above the others."""
     table = Table(
         ("goal", "twin", ""), tuple((c.text, c.value, "met" if c.met else "NOT MET") for c in checks)
     )
     missed = tuple(f"not met: {check.text}: {check.value}" for check in checks if not check.met)
-    return Part("Goals", "Set before anything was measured.", (table,), missed)
+    return Section("Goals", "Set before anything was measured.", (table,), missed)
 
 
-def calibration_part(calibrations: Mapping[str, Mapping[str, Sequence[str]]]) -> Part:
+def calibration_part(calibrations: Mapping[str, Mapping[str, Sequence[str]]]) -> Section:
     """Warnings of the twins' calibrations, each from `calibration_of`."""
     warnings = tuple(
         f"{twin}: {title}: {warning}"
@@ -79,7 +79,7 @@ def calibration_part(calibrations: Mapping[str, Mapping[str, Sequence[str]]]) ->
         for title, found in steps.items()
         for warning in found
     )
-    return Part("Calibration", "One log of random poses at rest for each twin.", warnings=warnings)
+    return Section("Calibration", "One log of random poses at rest for each twin.", warnings=warnings)
 
 
 def film_part(film: Path | None, no_film: str, shown: str) -> str:

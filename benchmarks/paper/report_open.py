@@ -32,7 +32,7 @@ from benchmarks.paper.summary import (
     spread,
     summarise,
 )
-from calib.report.page import Part, Table, page
+from calib.report.page import Section, Table, page
 from mjx_softarm.spec import ArmSpec
 
 JSON_FILE, HTML_FILE, FILM_FILE = "paper-open.json", "report.html", "circle.gif"
@@ -155,30 +155,30 @@ def to_html(
         _loads_part(data, (drawn["loads"], *traces)),
         _simulated_part(data),
         calibration_part(data["calibrations"]),
-        Part("Every run", "Mean over the points arrived at.", (_runs_table(data["runs"]),)),
+        Section("Every run", "Mean over the points arrived at.", (_runs_table(data["runs"]),)),
     )
     film_html = film_part(film, no_film, "The twin on the circle")
     title = "The paper's open-space experiments"
     return page(title, first_of_page(checks), parts, film_html, provenance)
 
 
-def _circle_part(data: Mapping[str, Any], drawn: tuple[tuple[str, Figure], ...]) -> Part:
+def _circle_part(data: Mapping[str, Any], drawn: tuple[tuple[str, Figure], ...]) -> Section:
     text = (
         "Mean ± standard deviation over twins and training seeds; errors by motion capture at rest, averaged "
         "over half a second. Without S2R, only the springs are calibrated. Gradient descent has no "
         "training seed and runs once for each twin."
     )
     unloaded = [item for item in data["spreads"] if item["load_g"] == 0]
-    return Part("Circle", text, (_spreads_table(unloaded),), figures=drawn)
+    return Section("Circle", text, (_spreads_table(unloaded),), figures=drawn)
 
 
-def _loads_part(data: Mapping[str, Any], drawn: tuple[tuple[str, Figure], ...]) -> Part:
+def _loads_part(data: Mapping[str, Any], drawn: tuple[tuple[str, Figure], ...]) -> Section:
     text = (
         "The policy with S2R, which knows of no load. Solid: springs as read and pressures as measured; "
         "shaded: points at which a chamber is saturated."
     )
     loaded = [item for item in data["spreads"] if item["method"] == "with"]
-    return Part("Unknown loads", text, (_spreads_table(loaded),), figures=drawn)
+    return Section("Unknown loads", text, (_spreads_table(loaded),), figures=drawn)
 
 
 def _spreads_table(spreads: Sequence[Mapping[str, Any]]) -> Table:
@@ -198,7 +198,7 @@ def _spreads_table(spreads: Sequence[Mapping[str, Any]]) -> Table:
     return Table(tuple(head), tuple(body))
 
 
-def _simulated_part(data: Mapping[str, Any]) -> Part:
+def _simulated_part(data: Mapping[str, Any]) -> Section:
     text = f"Mean error on the circle; the paper's, without S2R: {PAPER_SIMULATED_MM:g} mm in simulation."
     body = tuple(
         (
@@ -211,7 +211,7 @@ def _simulated_part(data: Mapping[str, Any]) -> Part:
         for item in data["simulated"]
     )
     head = ("policy", "twin", "seed", "simulated [mm]", "on the twin [mm]")
-    return Part("Simulated against twin", text, (Table(head, body),))
+    return Section("Simulated against twin", text, (Table(head, body),))
 
 
 def _runs_table(table: Sequence[Mapping[str, Any]]) -> Table:

@@ -26,7 +26,7 @@ from calib.errors import FitError
 from calib.fit.blocks import held_out_blocks
 from calib.fit.equilibrium import Measured, residuals
 from calib.fit.leastsquares import Problem, Solution, fit, principal
-from calib.read.rests import HOLD_KPA, Rests, find_rests
+from calib.read.static_poses import HOLD_KPA, StaticPoses, find_static_poses
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mechanics.settle import RESIDUAL_TOLERANCE
 from mjx_softarm.mechanics.statics import ArmParams
@@ -83,7 +83,7 @@ class ChamberFit:
         in_sample_before, held_out_before: errors of the specification that the fit started from.
         rows: number of rows of the logs by what became of them.
         n_single: poses of one row, which does not tell whether the tip moved.
-        rests: the poses.
+        poses: static poses of the logs, in their order.
         is_held_out: which of them took no part (n,), bool.
         tip_error_mm: of the calibrated arm at each pose (n,); NaN where it found no rest.
         chamber_m: chamber lengths of the calibrated arm at each pose (n, n_chambers).
@@ -100,7 +100,7 @@ class ChamberFit:
     held_out_before: Errors
     rows: Mapping[str, int]
     n_single: int
-    rests: Rests
+    poses: StaticPoses
     is_held_out: np.ndarray
     tip_error_mm: np.ndarray
     chamber_m: np.ndarray
@@ -112,7 +112,7 @@ def calibrate_chambers(logs: Log | Sequence[Log], spec: ArmSpec, seed: int = 0) 
 
     Args:
         logs: with pressures and tip poses; frequencies or spring lengths help. Which rows count is said in
-            `calib.read.rests`.
+            `calib.read.static_poses`.
         spec: the arm as it is believed to be, its sensors already calibrated.
         seed: chooses the poses that are held out, in contiguous blocks.
 
@@ -120,19 +120,19 @@ def calibrate_chambers(logs: Log | Sequence[Log], spec: ArmSpec, seed: int = 0) 
         FitError: a log without pressures or tip poses, or too few poses at rest.
         SpecError: the calibrated numbers are not those of an arm.
     """
-    rests, rows = find_rests([logs] if isinstance(logs, Log) else logs, spec)
-    if rests.n < MIN_POSES:
+    poses, rows = find_static_poses([logs] if isinstance(logs, Log) else logs, spec)
+    if poses.n < MIN_POSES:
         fates = ", ".join(f"{count} {fate}" for fate, count in rows.items())
         raise FitError(
-            f"chambers: got {rests.n} poses at rest, expected {MIN_POSES} or more; rows of the logs: {fates}"
+            f"chambers: got {poses.n} poses at rest, expected {MIN_POSES} or more; rows of the logs: {fates}"
         )
-    rests = rests._replace(pressure_kpa=_held_or_changing(rests.pressure_kpa))
-    held_out = held_out_blocks(rests.n, HELD_OUT_SHARE, HELD_OUT_BLOCK, seed)
-    fitted = rests.take(~held_out)
+    poses = poses._replace(pressure_kpa=_held_or_changing(poses.pressure_kpa))
+    held_out = held_out_blocks(poses.n, HELD_OUT_SHARE, HELD_OUT_BLOCK, seed)
+    fitted = poses.take(~held_out)
     solution = fit(lambda x: _simulate(spec, fitted, x)[:2], _problem(spec.n_chambers))
-    before, _, _ = _simulate(spec, rests, np.zeros_like(solution.x))
-    after, _, chamber_m = _simulate(spec, rests, solution.x)
-    calibrated = _calibrated(spec, solution.x, rests)
+    before, _, _ = _simulate(spec, poses, np.zeros_like(solution.x))
+    after, _, chamber_m = _simulate(spec, poses, solution.x)
+    calibrated = _calibrated(spec, solution.x, poses)
     widths, directions = principal(
         solution, np.append(np.repeat(TOLERANCE, spec.n_chambers), BENDING_TOLERANCE)
     )
@@ -149,8 +149,8 @@ def calibrate_chambers(logs: Log | Sequence[Log], spec: ArmSpec, seed: int = 0) 
         in_sample_before=_errors(before[~held_out]),
         held_out_before=_errors(before[held_out]),
         rows=rows,
-        n_single=int(np.count_nonzero(rests.single)),
-        rests=rests,
+        n_single=int(np.count_nonzero(poses.single)),
+        poses=poses,
         is_held_out=held_out,
         tip_error_mm=np.where(np.isinf(after[:, 0]), np.nan, 1e3 * np.linalg.norm(after[:, :3], axis=1)),
         chamber_m=chamber_m,
@@ -178,15 +178,15 @@ def _jacobian():
     return jax.jit(jax.vmap(one, in_axes=(None, None, 0)))
 
 
-def _simulate(spec: ArmSpec, rests: Rests, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _simulate(spec: ArmSpec, poses: StaticPoses, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """All poses with the numbers x: errors and their Jacobian, see `calib.fit.leastsquares`; chamber lengths."""
     params = ArmParams.from_spec(spec)
-    fields = (rests.pressure_kpa, rests.payload_kg, rests.tip_m, rests.tip_rotation, rests.spring_m)
-    padded = -(-rests.n // BATCH) * BATCH
+    fields = (poses.pressure_kpa, poses.payload_kg, poses.tip_m, poses.tip_rotation, poses.spring_m)
+    padded = -(-poses.n // BATCH) * BATCH
     measured = Measured(*(np.resize(np.float32(f), (padded, *f.shape[1:])) for f in fields))
     batches = [Measured(*(f[k : k + BATCH] for f in measured)) for k in range(0, padded, BATCH)]
     parts = [jax.device_get(_jacobian()(np.float32(x), params, batch)) for batch in batches]
-    error, slope, settled, chamber_m = (np.concatenate(part)[: rests.n] for part in zip(*parts, strict=True))
+    error, slope, settled, chamber_m = (np.concatenate(part)[: poses.n] for part in zip(*parts, strict=True))
     return np.where(settled[:, None], error.astype(float), np.inf), slope.astype(float), chamber_m
 
 
@@ -199,12 +199,12 @@ def _problem(n_chambers: int) -> Problem:
     )
 
 
-def _calibrated(spec: ArmSpec, x: np.ndarray, rests: Rests) -> ArmSpec:
+def _calibrated(spec: ArmSpec, x: np.ndarray, poses: StaticPoses) -> ArmSpec:
     """The specification with fitted chambers and the range of the spring lengths that were measured."""
     values = _of_x(spec, x)
     springs = {}
-    if np.isfinite(rests.spring_m).any():
-        low, high = float(np.nanmin(rests.spring_m)), float(np.nanmax(rests.spring_m))
+    if np.isfinite(poses.spring_m).any():
+        low, high = float(np.nanmin(poses.spring_m)), float(np.nanmax(poses.spring_m))
         springs = {"length_min_m": low, "length_max_m": high}
     chambers = {name: tuple(map(float, values[name])) for name in FIELDS}
     return spec.replace(chambers=chambers, backbone={BENDING: float(values[BENDING])}, springs=springs)
@@ -271,10 +271,10 @@ def _warnings(found: ChamberFit, spec: ArmSpec, solution: Solution) -> tuple[str
     said = []
     if not solution.converged:
         said.append("the fit has not come to an end")
-    if found.rests.n < ENOUGH_POSES:
-        said.append(f"{found.rests.n} poses at rest are few; {ENOUGH_POSES} are better")
+    if found.poses.n < ENOUGH_POSES:
+        said.append(f"{found.poses.n} poses at rest are few; {ENOUGH_POSES} are better")
     if n_unsettled := np.count_nonzero(np.isnan(found.tip_error_mm)):
-        said.append(f"the simulated arm finds no rest at {n_unsettled} of {found.rests.n} poses")
+        said.append(f"the simulated arm finds no rest at {n_unsettled} of {found.poses.n} poses")
     if found.held_out.translation_mean_mm > MAX_RATIO * found.in_sample.translation_mean_mm:
         said.append(
             f"held-out tip error {found.held_out.translation_mean_mm:.2f} mm is more than {MAX_RATIO:g} "
@@ -291,7 +291,7 @@ def _warnings(found: ChamberFit, spec: ArmSpec, solution: Solution) -> tuple[str
     if found.weak:
         said.append(f"{len(found.weak)} directions of the numbers are not known, the first: {found.weak[0]}")
     low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
-    seen = found.rests.pressure_kpa
+    seen = found.poses.pressure_kpa
     gap = MAX_PRESSURE_GAP * (high - low)
     if (short := np.flatnonzero((seen.min(0) > low + gap) | (seen.max(0) < high - gap))).size:
         said.append(f"pressures of chambers {_list(short)} stay away from {low:g} or {high:g} kPa")

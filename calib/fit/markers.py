@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from calib.errors import FitError
-from calib.read.rests import Rests
+from calib.read.static_poses import StaticPoses
 from mjx_softarm.mechanics.statics import ArmParams
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
 
@@ -44,31 +44,31 @@ class MarkerLimits(NamedTuple):
     length_max_m: float
 
 
-def marker_limits(rests: Rests, simulated_m: np.ndarray, spec: ArmSpec) -> MarkerLimits:
+def marker_limits(poses: StaticPoses, simulated_m: np.ndarray, spec: ArmSpec) -> MarkerLimits:
     """Length limits from the poses that bend most.
 
     Args:
-        rests: poses, with markers.
+        poses: static poses with markers.
         simulated_m (n, n_chambers) [m]: chamber lengths of the calibrated arm at all of the poses.
         spec: the arm.
 
     Raises:
         FitError: fewer than five markers, no pose that has them, or the last is not at the tip's plate.
     """
-    n_markers = rests.marker_m.shape[1]
+    n_markers = poses.marker_m.shape[1]
     if n_markers < MIN_MARKERS or n_markers % spec.structure.n_sections:
         raise FitError(
             f"markers: got {n_markers}, expected {MIN_MARKERS} or more, as many in each of "
             f"{spec.structure.n_sections} sections"
         )
-    seen = np.flatnonzero(np.isfinite(rests.marker_m).all(axis=(1, 2)))
+    seen = np.flatnonzero(np.isfinite(poses.marker_m).all(axis=(1, 2)))
     if len(seen) == 0:
         raise FitError("markers: no pose at rest has them, expected one or more")
-    site_m = _marker_site(rests.take(seen))
-    bending_deg = np.degrees(np.arccos(np.clip(rests.tip_rotation[seen, 2, 2], -1.0, 1.0)))
+    site_m = _marker_site(poses.take(seen))
+    bending_deg = np.degrees(np.arccos(np.clip(poses.tip_rotation[seen, 2, 2], -1.0, 1.0)))
     order = np.argsort(-bending_deg)[:N_POSES]
     pose = seen[order]
-    curves = [fit_curve(rests.marker_m[k], site_m) for k in pose]
+    curves = [fit_curve(poses.marker_m[k], site_m) for k in pose]
     length_m = np.stack([chamber_lengths(curve, site_m, spec) for curve, _ in curves])
     return MarkerLimits(
         pose=pose,
@@ -137,9 +137,9 @@ def _untwisted(up: np.ndarray) -> np.ndarray:
     return np.stack(found)
 
 
-def _marker_site(rests: Rests) -> np.ndarray:
+def _marker_site(poses: StaticPoses) -> np.ndarray:
     """Where the markers sit in the rings (2,) [m], from the last one as seen from the tip."""
-    seen = np.einsum("nij,ni->nj", rests.tip_rotation, rests.marker_m[:, -1] - rests.tip_m)
+    seen = np.einsum("nij,ni->nj", poses.tip_rotation, poses.marker_m[:, -1] - poses.tip_m)
     site_m = np.median(seen, axis=0)
     if abs(site_m[2]) > MAX_OFF_PLATE_M:
         raise FitError(

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.read.sheet import PLAUSIBLE, clean, implausible, quantity
+from calib.read.table_checks import PLAUSIBLE, clean, implausible, quantity
 from mjx_softarm.logs.checks import Finding
 from mjx_softarm.logs.files import read_sheet, refuse
 from mjx_softarm.logs.schema import UNITS, Column, Log, log_columns, write_log

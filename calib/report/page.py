@@ -37,7 +37,7 @@ class Table:
 
 
 @dataclass(frozen=True)
-class Part:
+class Section:
     """One step of a calibration.
 
     Attributes:
@@ -57,43 +57,54 @@ class Part:
     figures: tuple[tuple[str, Figure], ...] = ()
 
 
-def to_json(parts: Sequence[Part], findings: Sequence[str], provenance: dict[str, Any]) -> dict[str, Any]:
+def to_json(
+    sections: Sequence[Section], findings: Sequence[str], provenance: dict[str, Any]
+) -> dict[str, Any]:
     """The report as data."""
     return {
-        "trustworthy": not any(part.warnings for part in parts),
-        "parts": {part.title: {"figures": part.data, "warnings": list(part.warnings)} for part in parts},
+        "trustworthy": not any(section.warnings for section in sections),
+        "parts": {
+            section.title: {"figures": section.data, "warnings": list(section.warnings)}
+            for section in sections
+        },
         "findings": list(findings),
         "provenance": provenance,
     }
 
 
-def to_html(arm: str, parts: Sequence[Part], findings: Sequence[str], provenance: dict[str, Any]) -> str:
+def to_html(
+    arm: str, sections: Sequence[Section], findings: Sequence[str], provenance: dict[str, Any]
+) -> str:
     """The report as one page that needs no other file."""
     logs = _list(findings) if findings else "<p>No fault was found in them.</p>"
-    return page(f"Calibration of {arm}", _verdict(parts), parts, f"<h2>Logs</h2>{logs}", provenance)
+    return page(f"Calibration of {arm}", _verdict(sections), sections, f"<h2>Logs</h2>{logs}", provenance)
 
 
-def page(title: str, first: str, parts: Sequence[Part], last: str, provenance: dict[str, Any]) -> str:
-    """A page of parts that needs no other file; `first` and `last` are HTML that stands around the parts."""
+def page(title: str, first: str, sections: Sequence[Section], last: str, provenance: dict[str, Any]) -> str:
+    """A page of sections that needs no other file; `first` and `last` are HTML that stands around the sections."""
     body = [f"<h1>{html.escape(title)}</h1>", first]
-    for part in parts:
-        body += [f"<h2>{html.escape(part.title)}</h2>", f"<p>{html.escape(part.text)}</p>", _warnings(part)]
-        body += [_table(table) for table in part.tables]
-        body += [_picture(text, figure) for text, figure in part.figures]
+    for section in sections:
+        body += [
+            f"<h2>{html.escape(section.title)}</h2>",
+            f"<p>{html.escape(section.text)}</p>",
+            _warnings(section),
+        ]
+        body += [_table(table) for table in section.tables]
+        body += [_picture(text, figure) for text, figure in section.figures]
     body += [last, "<h2>How it was made</h2>", "<pre>", html.escape(_lines(provenance)), "</pre>"]
     head = f'<meta charset="utf-8"><title>{html.escape(title)}</title><style>{_STYLE}</style>'
     return f"<!doctype html><html lang=en><head>{head}</head><body>{''.join(body)}</body></html>\n"
 
 
-def _verdict(parts: Sequence[Part]) -> str:
-    doubtful = [part.title for part in parts if part.warnings]
+def _verdict(sections: Sequence[Section]) -> str:
+    doubtful = [section.title for section in sections if section.warnings]
     if not doubtful:
         return '<p class="good">Every fitted step met its own checks on data that it was not fitted to.</p>'
     return f'<p class="bad">Look at {html.escape(", ".join(doubtful))} before you trust this.</p>'
 
 
-def _warnings(part: Part) -> str:
-    return f'<div class="bad">{_list(part.warnings)}</div>' if part.warnings else ""
+def _warnings(section: Section) -> str:
+    return f'<div class="bad">{_list(section.warnings)}</div>' if section.warnings else ""
 
 
 def _list(lines: Sequence[str]) -> str:

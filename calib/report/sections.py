@@ -15,13 +15,13 @@ from calib.fit.markers import MarkerLimits
 from calib.fit.s2r import S2RFit
 from calib.fit.sensors import SpringFit
 from calib.fit.transients import DampingFit
-from calib.report.page import Part, Table
+from calib.report.page import Section, Table
 from mjx_softarm.sensing.s2r import correct
 
 _BINS = 40
 
 
-def springs(fit: SpringFit, calibrated_m: np.ndarray, length_m: np.ndarray) -> Part:
+def springs(fit: SpringFit, calibrated_m: np.ndarray, length_m: np.ndarray) -> Section:
     """Beta and delta of each spring; lengths (n, n_springs) by the calibrated sensors and as measured."""
     half_beta = 0.5 * np.ptp(fit.beta_interval, axis=1)
     half_delta = 0.5 * np.ptp(fit.delta_interval_m, axis=1)
@@ -36,7 +36,7 @@ def springs(fit: SpringFit, calibrated_m: np.ndarray, length_m: np.ndarray) -> P
     for k in range(length_m.shape[1]):
         axes.plot(1e3 * length_m[:, k], error_mm[:, k], ".", ms=3, label=f"spring {k}")
     _label(axes, "measured length [mm]", "calibrated less measured [mm]")
-    return Part(
+    return Section(
         "Springs",
         "Lengths that were measured against lengths from the readings, L = beta l + delta, Huber's loss. "
         "Intervals are 95 %; held out are contiguous blocks of rows.",
@@ -47,7 +47,7 @@ def springs(fit: SpringFit, calibrated_m: np.ndarray, length_m: np.ndarray) -> P
     )
 
 
-def chambers(fit: ChamberFit) -> Part:
+def chambers(fit: ChamberFit) -> Section:
     """Stiffness, area and rest length of each chamber, the backbone, and how well the arm's tip is met."""
     spec = fit.spec
     units = (
@@ -81,21 +81,21 @@ def chambers(fit: ChamberFit) -> Part:
     axes.hist(fit.tip_error_mm[fit.is_held_out], bins, density=True, histtype="step", lw=2, label="held out")
     _label(axes, "simulated to measured tip [mm]", "density")
     fates = ", ".join(f"{count} {fate}" for fate, count in fit.rows.items() if count)
-    return Part(
+    return Section(
         "Chambers",
-        f"{fit.rests.n} poses at rest: simulated at the measured pressures against the measured tip and "
+        f"{fit.poses.n} poses at rest: simulated at the measured pressures against the measured tip and "
         "springs. Rest length is told as its difference from the section's. Intervals are 95 %. "
         f"Rows of the logs: {fates}.",
         (Table(head, tuple(rows)), backbone, Table(_ERROR_HEAD, error_rows)),
         fit.warnings,
-        _plain(fit, "spec", "rests", "is_held_out", "tip_error_mm", "chamber_m")
+        _plain(fit, "spec", "poses", "is_held_out", "tip_error_mm", "chamber_m")
         | {"values": values | {BENDING: bending}},
         (("simulated to measured tip", figure),),
     )
 
 
-def with_markers(part: Part, limits: MarkerLimits) -> Part:
-    """The chambers' part with their lengths from markers at the poses that bend most."""
+def with_markers(section: Section, limits: MarkerLimits) -> Section:
+    """The chambers' section with their lengths from markers at the poses that bend most."""
     figure, axes = _figure()
     axes.plot(1e3 * limits.simulated_m.ravel(), 1e3 * limits.length_m.ravel(), ".")
     axes.plot(*2 * [1e3 * np.array([limits.length_min_m, limits.length_max_m])], "k:", lw=1)
@@ -105,14 +105,14 @@ def with_markers(part: Part, limits: MarkerLimits) -> Part:
     table = Table(("", "shortest [mm]", "longest [mm]"), (lengths, simulated))
     title = f"chambers at the {len(limits.pose)} poses that bend most"
     return dataclasses.replace(
-        part,
-        tables=(*part.tables, table),
-        data=part.data | {"markers": _plain(limits)},
-        figures=(*part.figures, (title, figure)),
+        section,
+        tables=(*section.tables, table),
+        data=section.data | {"markers": _plain(limits)},
+        figures=(*section.figures, (title, figure)),
     )
 
 
-def damping(fit: DampingFit) -> Part:
+def damping(fit: DampingFit) -> Section:
     """Damping of chambers and backbone, and how well the moving tip is met."""
     values = {
         "damping_ns_per_m": fit.spec.chambers.damping_ns_per_m,
@@ -124,7 +124,7 @@ def damping(fit: DampingFit) -> Part:
         ("held-out seconds, calibrated", fit.held_out_rms_mm),
         ("seconds of the fit, calibrated", fit.in_sample_rms_mm),
     )
-    return Part(
+    return Section(
         "Damping",
         f"{fit.n_stretches} stretches of the moving arm, {fit.time_s:.0f} s in all: MuJoCo driven with the "
         "measured pressures against the measured tip. Intervals are 95 %.",
@@ -134,7 +134,7 @@ def damping(fit: DampingFit) -> Part:
     )
 
 
-def s2r(fit: S2RFit, pose: np.ndarray, spring_m: np.ndarray, real: np.ndarray, n_unsettled: int) -> Part:
+def s2r(fit: S2RFit, pose: np.ndarray, spring_m: np.ndarray, real: np.ndarray, n_unsettled: int) -> Section:
     """Simulated poses (n, 6) and spring lengths, and real poses, with and without the network.
 
     `n_unsettled` others took no part, as the simulated arm found no rest at their spring lengths.
@@ -153,7 +153,7 @@ def s2r(fit: S2RFit, pose: np.ndarray, spring_m: np.ndarray, real: np.ndarray, n
         distance_mm = np.linalg.norm((poses - real)[fit.held_out, :3], axis=1)
         axes.hist(distance_mm, _BINS, alpha=0.5, label=label)
     _label(axes, "distance to the real tip, held-out poses [mm]", "poses")
-    return Part(
+    return Section(
         "Sim-to-real network",
         f"{len(pose)} poses at rest: the calibrated simulation is asked for the logged spring lengths, the "
         f"network learns what its tip is off by. Of the held-out poses it flags "

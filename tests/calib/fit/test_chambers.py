@@ -222,8 +222,8 @@ def test_outliers_hardly_matter(fitted):
 
 def test_commanded_lengths_are_those_that_were_measured(fitted):
     springs = fitted.spec.springs
-    assert springs.length_min_m == np.nanmin(fitted.rests.spring_m)
-    assert springs.length_max_m == np.nanmax(fitted.rests.spring_m)
+    assert springs.length_min_m == np.nanmin(fitted.poses.spring_m)
+    assert springs.length_max_m == np.nanmax(fitted.poses.spring_m)
 
 
 def test_every_row_is_counted_and_held_out_poses_are_contiguous(fitted):

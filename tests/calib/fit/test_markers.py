@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from calib.fit.markers import N_POSES, chamber_lengths, fit_curve, marker_limits
-from calib.read.rests import Rests
+from calib.read.static_poses import StaticPoses
 from mjx_softarm import ArmSpec
 from mjx_softarm.mechanics.mjcf import build_model
 from mjx_softarm.mechanics.statics import ArmParams
@@ -26,7 +26,7 @@ def arm():
     return pressure_kpa, found, build_model(SPEC)
 
 
-def rests_with_markers(arm, kind):
+def poses_with_markers(arm, kind):
     """Poses with nine markers at the first chamber or spring of each section; true chamber lengths."""
     pressure_kpa, found, model = arm
     data = mujoco.MjData(model)
@@ -36,11 +36,11 @@ def rests_with_markers(arm, kind):
         mujoco.mj_forward(model, data)
         marker_m[k] = [data.site(f"{kind}{3 * (j // 3)}_plate{2 * (j + 1)}").xpos for j in range(9)]
         length_m[k] = data.ten_length[0::2]
-    rests = Rests(
+    poses = StaticPoses(
         pressure_kpa, np.zeros(N), np.float64(found.tip_position_m), np.float64(found.tip_rotation),
         found.spring_m, marker_m, np.zeros(N, bool),
     )  # fmt: skip
-    return rests, length_m
+    return poses, length_m
 
 
 def bent(bend_rad, length_m, site_m):
@@ -73,8 +73,8 @@ def test_a_circle_s_chambers_differ_by_their_distance_from_its_centre(site):
 
 @pytest.mark.parametrize(("kind", "rms_m", "residual_mm"), [("chamber", 0.008, 4.0), ("spring", 0.015, 5.0)])
 def test_simulated_arms_are_met_as_coarsely_as_the_module_says(arm, kind, rms_m, residual_mm):
-    rests, length_m = rests_with_markers(arm, kind)
-    limits = marker_limits(rests, length_m, SPEC)
+    poses, length_m = poses_with_markers(arm, kind)
+    limits = marker_limits(poses, length_m, SPEC)
     expected_site = getattr(ArmParams.from_spec(SPEC, np.float64), f"{kind}_site_m")[0]
     np.testing.assert_allclose(limits.marker_site_m, expected_site, atol=1e-6)
     assert len(limits.pose) == N_POSES
@@ -88,10 +88,10 @@ def test_simulated_arms_are_met_as_coarsely_as_the_module_says(arm, kind, rms_m,
 
 
 def test_poses_without_markers_are_left_out(arm):
-    rests, length_m = rests_with_markers(arm, "chamber")
-    most = marker_limits(rests, length_m, SPEC).pose[0]
-    rests.marker_m[most, 3] = np.nan
-    assert most not in marker_limits(rests, length_m, SPEC).pose
+    poses, length_m = poses_with_markers(arm, "chamber")
+    most = marker_limits(poses, length_m, SPEC).pose[0]
+    poses.marker_m[most, 3] = np.nan
+    assert most not in marker_limits(poses, length_m, SPEC).pose
 
 
 @pytest.mark.parametrize(
@@ -104,6 +104,6 @@ def test_poses_without_markers_are_left_out(arm):
     ],
 )
 def test_refuses(arm, change, message):
-    rests, length_m = rests_with_markers(arm, "chamber")
+    poses, length_m = poses_with_markers(arm, "chamber")
     with pytest.raises(ValueError, match=message):
-        marker_limits(rests._replace(marker_m=change(rests.marker_m)), length_m, SPEC)
+        marker_limits(poses._replace(marker_m=change(poses.marker_m)), length_m, SPEC)

@@ -6,7 +6,7 @@ from html.parser import HTMLParser
 import numpy as np
 from matplotlib.figure import Figure
 
-from calib.report.page import Part, Table, to_html, to_json
+from calib.report.page import Section, Table, to_html, to_json
 
 PROVENANCE = {"commit": "0123abc", "packages": {"numpy": "2.0"}}
 
@@ -39,8 +39,8 @@ def make_parts(warnings=()):
     figure = Figure()
     figure.add_subplot().plot([0, 1])
     return (
-        Part("Springs", "What was fitted.", (table,), warnings, {"beta": [0.93]}, (("a plot", figure),)),
-        Part("Chambers", "Not fitted."),
+        Section("Springs", "What was fitted.", (table,), warnings, {"beta": [0.93]}, (("a plot", figure),)),
+        Section("Chambers", "Not fitted."),
     )
 
 
@@ -78,5 +78,5 @@ def test_json_has_the_same_figures_and_says_whether_to_trust_them():
 
 
 def test_numbers_of_numpy_are_shown_like_python_s():
-    part = Part("x", "y", (Table(("a",), ((np.float64(0.123456),), (np.int64(3),))),))
+    part = Section("x", "y", (Table(("a",), ((np.float64(0.123456),), (np.int64(3),))),))
     assert Page(to_html("x", (part,), [], {})).texts["td"] == ["0.1235", "3"]

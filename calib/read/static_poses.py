@@ -25,7 +25,7 @@ from mjx_softarm.sensing.sensors import SensorFault, SensorParams, length_from_f
 from mjx_softarm.spec import ArmSpec
 
 HOLD_KPA = 1.0
-REST_S = 3.0
+MIN_HOLD_S = 3.0
 WINDOW_S = 1.0
 MAX_SPEED_M_S = 1e-3
 MAX_SPREAD_M = 2e-3
@@ -33,7 +33,7 @@ SPEED_SIGMA = 3.0
 ROUNDING_S = 1e-6
 
 
-class Rests(NamedTuple):
+class StaticPoses(NamedTuple):
     """Poses at rest, in the order of the logs."""
 
     pressure_kpa: np.ndarray  # (n, n_chambers)
@@ -48,12 +48,12 @@ class Rests(NamedTuple):
     def n(self) -> int:
         return len(self.payload_kg)
 
-    def take(self, poses: np.ndarray) -> Rests:
+    def take(self, poses: np.ndarray) -> StaticPoses:
         """Some of the poses, given by their indices or a mask (n,)."""
-        return Rests(*(value[poses] for value in self))
+        return StaticPoses(*(value[poses] for value in self))
 
 
-def find_rests(logs: Sequence[Log], spec: ArmSpec) -> tuple[Rests, dict[str, int]]:
+def find_static_poses(logs: Sequence[Log], spec: ArmSpec) -> tuple[StaticPoses, dict[str, int]]:
     """Poses at rest of all logs together.
 
     Args:
@@ -69,14 +69,14 @@ def find_rests(logs: Sequence[Log], spec: ArmSpec) -> tuple[Rests, dict[str, int
     """
     n_markers = max((log.marker_m.shape[1] for log in logs if log.marker_m is not None), default=0)
     fates = {"used": 0, "not finite": 0, "pressures not held long enough": 0, "tip still moving": 0}
-    poses = [pose for log in logs for pose in _rests_of(log, spec, n_markers, fates)]
+    poses = [pose for log in logs for pose in _static_poses_of(log, spec, n_markers, fates)]
     shapes = ((spec.n_chambers,), (), (3,), (3, 3), (spec.n_chambers,), (n_markers, 3), ())
     columns = zip(*poses, strict=True) if poses else [()] * len(shapes)
     arrays = [np.reshape(list(c), (len(poses), *shape)) for c, shape in zip(columns, shapes, strict=True)]
-    return Rests(*arrays[:-1], single=arrays[-1].astype(bool)), fates
+    return StaticPoses(*arrays[:-1], single=arrays[-1].astype(bool)), fates
 
 
-def _rests_of(log: Log, spec: ArmSpec, n_markers: int, fates: dict[str, int]) -> list[tuple]:
+def _static_poses_of(log: Log, spec: ArmSpec, n_markers: int, fates: dict[str, int]) -> list[tuple]:
     _check(log, spec)
     payload = np.full(len(log), spec.mass.payload_kg) if log.payload_kg is None else log.payload_kg
     columns = [log.time_s[:, None], payload[:, None], log.pressure_kpa, log.tip_m, log.tip_quaternion]
@@ -110,7 +110,7 @@ def _rests_of(log: Log, spec: ArmSpec, n_markers: int, fates: dict[str, int]) ->
 def holds(time_s: np.ndarray, pressure_kpa: np.ndarray, payload_kg: np.ndarray) -> list[tuple[int, int]]:
     """First row, and row after the last, of each stretch at constant pressures and payload."""
     n, start, found = len(time_s), 0, []
-    breaks = np.flatnonzero((np.diff(time_s) > REST_S) | (np.diff(payload_kg) != 0)) + 1
+    breaks = np.flatnonzero((np.diff(time_s) > MIN_HOLD_S) | (np.diff(payload_kg) != 0)) + 1
     while start < n:
         later = breaks[np.searchsorted(breaks, start, side="right") :]
         end = int(later[0]) if len(later) else n
@@ -145,10 +145,10 @@ def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
 def _last_second(time_s: np.ndarray, start: int, stop: int) -> np.ndarray:
     """Rows of a hold that count, if any."""
     gap = time_s[start] - time_s[start - 1] if start > 0 else 0.0
-    since = time_s[start - 1] if gap > REST_S else time_s[start]
+    since = time_s[start - 1] if gap > MIN_HOLD_S else time_s[start]
     rows = np.arange(start, stop)
     window = time_s[rows] >= time_s[stop - 1] - WINDOW_S - ROUNDING_S
-    return rows[window & (time_s[rows] - since >= REST_S - ROUNDING_S)]
+    return rows[window & (time_s[rows] - since >= MIN_HOLD_S - ROUNDING_S)]
 
 
 def _moves(time_s: np.ndarray, tip_m: np.ndarray) -> bool:

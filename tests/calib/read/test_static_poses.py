@@ -1,11 +1,11 @@
-"""Which rows of a log show the arm at rest, on logs whose rests are known."""
+"""Which rows of a log show the arm at rest, on logs whose static poses are known."""
 
 import dataclasses
 
 import numpy as np
 import pytest
 
-from calib.read.rests import REST_S, find_rests, holds, nearest_rotation
+from calib.read.static_poses import MIN_HOLD_S, find_static_poses, holds, nearest_rotation
 from mjx_softarm import ArmSpec
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.sensing.pose import rotation_from_quaternion
@@ -39,19 +39,19 @@ def steps(noise=1.0, tau_s=0.3, **changes):
 
 def test_each_hold_is_one_pose_averaged_over_its_last_second():
     log = steps()
-    rests, fates = find_rests([log], SPEC)
-    assert rests.n == 3
-    np.testing.assert_allclose(rests.pressure_kpa[:, 0], [0.0, 10.0, -20.0], atol=0.1)
-    np.testing.assert_allclose(rests.tip_m[:, 0], [0.0, 0.05, -0.1], atol=3e-4)  # noise of a row is 5e-4
-    np.testing.assert_allclose(rests.tip_m[1], log.tip_m[449:500].mean(0), atol=1e-12)
-    assert not rests.single.any()
+    poses, fates = find_static_poses([log], SPEC)
+    assert poses.n == 3
+    np.testing.assert_allclose(poses.pressure_kpa[:, 0], [0.0, 10.0, -20.0], atol=0.1)
+    np.testing.assert_allclose(poses.tip_m[:, 0], [0.0, 0.05, -0.1], atol=3e-4)  # noise of a row is 5e-4
+    np.testing.assert_allclose(poses.tip_m[1], log.tip_m[449:500].mean(0), atol=1e-12)
+    assert not poses.single.any()
     assert fates == {"used": 3 * 51, "not finite": 0, "pressures not held long enough": 750 - 3 * 51,
                      "tip still moving": 0}  # fmt: skip
 
 
 def test_an_arm_that_is_still_on_its_way_is_left_out():
-    rests, fates = find_rests([steps(tau_s=2.0)], SPEC)
-    np.testing.assert_allclose(rests.pressure_kpa[:, 0], [0.0], atol=0.1)  # where it did not have to go
+    poses, fates = find_static_poses([steps(tau_s=2.0)], SPEC)
+    np.testing.assert_allclose(poses.pressure_kpa[:, 0], [0.0], atol=0.1)  # where it did not have to go
     assert fates["tip still moving"] == 2 * 51
 
 
@@ -59,66 +59,66 @@ def test_a_swinging_arm_is_left_out():
     time_s = np.arange(300) / 50.0
     for amplitude_m, n in ((0.01, 0), (0.0003, 1)):
         swing = amplitude_m * np.sin(2 * np.pi * time_s)
-        assert find_rests([make_log(time_s, np.zeros(300), swing)], SPEC)[0].n == n
+        assert find_static_poses([make_log(time_s, np.zeros(300), swing)], SPEC)[0].n == n
 
 
 def test_slowly_changing_pressures_are_no_rest():
     time_s = np.arange(1000) / 50.0
-    assert find_rests([make_log(time_s, time_s, np.zeros(1000))], SPEC)[0].n == 0  # 1 kPa a second
+    assert find_static_poses([make_log(time_s, time_s, np.zeros(1000))], SPEC)[0].n == 0  # 1 kPa a second
 
 
 def test_poses_logged_one_by_one_were_held_meanwhile_but_for_the_first():
     log = make_log(5.0 * np.arange(6), [0, 20, -40, 3, 3, 5], 0.1 * np.arange(6))
-    rests, fates = find_rests([log], SPEC)
-    np.testing.assert_array_equal(rests.pressure_kpa[:, 0], [20, -40, 3, 3, 5])
-    assert rests.single.all()
+    poses, fates = find_static_poses([log], SPEC)
+    np.testing.assert_array_equal(poses.pressure_kpa[:, 0], [20, -40, 3, 3, 5])
+    assert poses.single.all()
     assert fates["used"] == 5 and fates["pressures not held long enough"] == 1
 
 
 def test_rows_close_together_are_one_pose():
     time_s = (5.0 * np.arange(4)[:, None] + 0.1 * np.arange(3)).ravel()
     log = make_log(time_s, np.repeat([0, 20, -40, 3], 3), np.repeat(0.1 * np.arange(4), 3), noise=1.0)
-    rests, _ = find_rests([log], SPEC)
-    assert rests.n == 3 and not rests.single.any()
-    np.testing.assert_allclose(rests.tip_m[0], log.tip_m[3:6].mean(0))
+    poses, _ = find_static_poses([log], SPEC)
+    assert poses.n == 3 and not poses.single.any()
+    np.testing.assert_allclose(poses.tip_m[0], log.tip_m[3:6].mean(0))
 
 
 def test_another_payload_is_another_hold():
     payload = np.repeat([0.0, 0.1, 0.2], [250, 250, 250])
     log = make_log(np.arange(750) / 50.0, np.zeros(750), np.zeros(750), payload_kg=payload)
-    rests, _ = find_rests([log], SPEC)
-    np.testing.assert_array_equal(rests.payload_kg, [0.0, 0.1, 0.2])
+    poses, _ = find_static_poses([log], SPEC)
+    np.testing.assert_array_equal(poses.payload_kg, [0.0, 0.1, 0.2])
     loaded = SPEC.replace(mass={"payload_kg": 0.3})
-    np.testing.assert_array_equal(find_rests([steps()], loaded)[0].payload_kg, [0.3] * 3)
+    np.testing.assert_array_equal(find_static_poses([steps()], loaded)[0].payload_kg, [0.3] * 3)
 
 
 def test_rows_that_are_not_finite_are_left_out_and_counted():
     log = steps()
     log.tip_m[260], log.pressure_kpa[10, 3] = np.nan, np.inf
-    rests, fates = find_rests([log], SPEC)
-    assert rests.n == 3 and fates["not finite"] == 2
+    poses, fates = find_static_poses([log], SPEC)
+    assert poses.n == 3 and fates["not finite"] == 2
     assert sum(fates.values()) == 750
 
 
 def test_springs_are_read_from_frequencies_by_the_sensors_of_the_spec():
     length_m = np.full((750, 9), 0.18)
     hz = frequency_from_length(length_m, SensorParams.from_spec(SPEC))
-    rests, _ = find_rests([steps(frequency_hz=hz)], SPEC)
-    np.testing.assert_allclose(rests.spring_m, 0.18, rtol=1e-6)
-    assert np.isnan(find_rests([steps()], SPEC)[0].spring_m).all()
+    poses, _ = find_static_poses([steps(frequency_hz=hz)], SPEC)
+    np.testing.assert_allclose(poses.spring_m, 0.18, rtol=1e-6)
+    assert np.isnan(find_static_poses([steps()], SPEC)[0].spring_m).all()
 
 
 def test_logs_with_and_without_markers_go_together():
     seen = steps(marker_m=np.ones((750, 9, 3)))
-    rests, _ = find_rests([seen, steps()], SPEC)
-    assert rests.marker_m.shape == (6, 9, 3)
-    assert np.isfinite(rests.marker_m[:3]).all() and np.isnan(rests.marker_m[3:]).all()
+    poses, _ = find_static_poses([seen, steps()], SPEC)
+    assert poses.marker_m.shape == (6, 9, 3)
+    assert np.isfinite(poses.marker_m[:3]).all() and np.isnan(poses.marker_m[3:]).all()
 
 
 def test_no_rest_is_empty_arrays():
-    rests, _ = find_rests([make_log([0.0], [0.0], [0.0])], SPEC)
-    assert rests.n == 0
-    assert rests.pressure_kpa.shape == (0, 9) and rests.marker_m.shape == (0, 0, 3)
+    poses, _ = find_static_poses([make_log([0.0], [0.0], [0.0])], SPEC)
+    assert poses.n == 0
+    assert poses.pressure_kpa.shape == (0, 9) and poses.marker_m.shape == (0, 0, 3)
 
 
 def test_holds_of_long_logs_are_those_found_row_by_row():
@@ -126,12 +126,12 @@ def test_holds_of_long_logs_are_those_found_row_by_row():
     n = 2000
     pressure = np.repeat(rng.uniform(-40, 20, (40, 9)), 50, axis=0) + rng.uniform(-0.3, 0.3, (n, 9))
     pressure[500:900] = pressure[500] + rng.uniform(-0.3, 0.3, (400, 9))
-    time_s = np.cumsum(rng.choice([0.02, REST_S + 1.0], n, p=[0.99, 0.01]))
+    time_s = np.cumsum(rng.choice([0.02, MIN_HOLD_S + 1.0], n, p=[0.99, 0.01]))
     payload = np.repeat([0.0, 0.1], n // 2)
     starts = [0]
     for k in range(1, n):
         if (
-            time_s[k] - time_s[k - 1] > REST_S
+            time_s[k] - time_s[k - 1] > MIN_HOLD_S
             or payload[k] != payload[k - 1]
             or np.abs(pressure[k] - pressure[starts[-1]]).max() > 1.0
         ):
