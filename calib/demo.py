@@ -15,7 +15,7 @@ import numpy as np
 
 from mjx_softarm.logs.schema import Log, write_log
 from mjx_softarm.mechanics.excitation import random_pressures
-from mjx_softarm.mechanics.mjcf import build_model, steps_per_period
+from mjx_softarm.mechanics.mjcf import build_model, spring_lengths, steps_per_period
 from mjx_softarm.mechanics.workspace import settle_many
 from mjx_softarm.sensing.pose import rotation_from_quaternion
 from mjx_softarm.sensing.sensors import SensorParams, frequency_from_length
@@ -150,7 +150,7 @@ def _look(arm: ArmSpec, model: mujoco.MjModel, data: mujoco.MjData, qpos: np.nda
     mujoco.mj_tendon(model, data)
     tip = data.site("tip")
     marker_m = np.stack([data.site(name).xpos for name in _marker_sites(arm)])
-    return _Seen(data.ten_length[1::2].copy(), tip.xpos.copy(), tip.xmat.reshape(3, 3).copy(), marker_m)
+    return _Seen(spring_lengths(data).copy(), tip.xpos.copy(), tip.xmat.reshape(3, 3).copy(), marker_m)
 
 
 def _marker_sites(arm: ArmSpec) -> list[str]:

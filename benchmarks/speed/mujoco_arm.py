@@ -22,6 +22,7 @@ import numpy as np
 from mjx_softarm import control
 from mjx_softarm.mdp.observation import OBS_SIZE, ObsScale, observe
 from mjx_softarm.mdp.rewards import RewardConfig, reward
+from mjx_softarm.mechanics.mjcf import spring_lengths
 from mjx_softarm.sensing import sensors
 from mjx_softarm.sensing.pose import pose_from_frame
 from mjx_softarm.spec import ARM_FILE, ArmSpec
@@ -114,7 +115,7 @@ class SteppedArm:
         done = False
         while not done:
             data.ctrl[:], self._integral_kpa = control.pressures(
-                reference_m, data.ten_length[1::2], self._integral_kpa, self.task.gains, self.task.period_s
+                reference_m, spring_lengths(data), self._integral_kpa, self.task.gains, self.task.period_s
             )
             start = time.perf_counter()
             mujoco.mj_step(self.model, data, self._n_steps)
@@ -168,7 +169,7 @@ class SteppedReach(gymnasium.Env):
         self._n_steps += 1
         data, pose = self._arm.data, self._arm.pose
         value, reached = self._task.reward(
-            pose, self._goal, self._n_steps, data.ctrl, reference_m, data.ten_length[1::2]
+            pose, self._goal, self._n_steps, data.ctrl, reference_m, spring_lengths(data)
         )
         info = {
             "physics_steps": n_physics,

@@ -14,6 +14,7 @@ from mujoco import rollout
 
 from benchmarks.speed.mujoco_arm import REST_M, Rest, Task
 from mjx_softarm import control
+from mjx_softarm.mechanics.mjcf import spring_lengths
 from mjx_softarm.sensing.pose import pose_from_quaternion
 from mjx_softarm.spec import ArmSpec
 
@@ -71,7 +72,7 @@ class RolloutArms:
         for index, coordinates in zip(np.flatnonzero(arms), q, strict=True):
             data.qpos[:] = coordinates
             mujoco.mj_fwdPosition(self.model, data)
-            self.length_m[index] = data.ten_length[1::2]
+            self.length_m[index] = spring_lengths(data)
 
     def move(self, reference_m: np.ndarray, rest_m: float = REST_M) -> Rested:
         """Hold references (n, n_chambers) until each arm rests.

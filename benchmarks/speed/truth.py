@@ -18,7 +18,7 @@ from mjx_softarm._support import xla
 from mjx_softarm._support.mjx import mjx
 from mjx_softarm.env.vector import over_arms
 from mjx_softarm.mechanics import settle as solver
-from mjx_softarm.mechanics.kinematics import chain_frames, mjx_frames
+from mjx_softarm.mechanics.kinematics import chain_kinematics, mjx_kinematics
 from mjx_softarm.mechanics.mjcf import build_model
 from mjx_softarm.mechanics.statics import ArmParams
 from mjx_softarm.spec import ArmSpec
@@ -42,9 +42,9 @@ def settle_function(
     """A jitted function: references (n, n_chambers) -> `Settled`, spread over the devices of a mesh."""
     params = jax.tree.map(jnp.asarray, ArmParams.from_spec(spec, dtype))
     if engine == "mjx":
-        kinematics = functools.partial(mjx_frames, mjx.put_model(build_model(spec)))
+        kinematics = mjx_kinematics(mjx.put_model(build_model(spec)))
     else:
-        kinematics = functools.partial(chain_frames, link_length_m=params.link_length_m)
+        kinematics = chain_kinematics(params)
     return xla.jit(over_arms(functools.partial(solver.settle, kinematics, params), mesh), engine == "mjx")
 
 

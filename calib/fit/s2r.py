@@ -20,7 +20,7 @@ import numpy as np
 from calib.errors import FitError
 from calib.fit.blocks import held_out_blocks
 from calib.fit.network import NetworkConfig, block_rows, fit_network
-from mjx_softarm.mechanics.kinematics import chain_frames
+from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.settle import Settled, settle
 from mjx_softarm.mechanics.statics import ArmParams
 from mjx_softarm.sensing.pose import frame_from_pose, pose_from_frame
@@ -101,7 +101,7 @@ def simulate_poses(spec: ArmSpec, reference_m: np.ndarray) -> SimulatedPoses:
 @functools.cache
 def _settle():
     def one(params: ArmParams, reference: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        kinematics = functools.partial(chain_frames, link_length_m=params.link_length_m)
+        kinematics = chain_kinematics(params)
         end: Settled = settle(kinematics, params, reference)
         return pose_from_frame(end.tip_position_m, end.tip_rotation), end.spring_m, end.settled
 

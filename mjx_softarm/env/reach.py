@@ -7,9 +7,7 @@ An action is nine sensor frequencies, scaled to [-1, 1]; the sensor-space law tu
 
 from __future__ import annotations
 
-import functools
-from dataclasses import dataclass, field
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,15 +16,16 @@ from jax import Array
 from mjx_softarm import control
 from mjx_softarm._support import draws
 from mjx_softarm._support.mjx import Env, State, mjx
+from mjx_softarm.env.config import EnvConfig
 from mjx_softarm.mdp import observation as obs
 from mjx_softarm.mdp import rewards
 from mjx_softarm.mechanics.dynamics import Motion, advance, with_params
-from mjx_softarm.mechanics.kinematics import chain_frames, mjx_frames
+from mjx_softarm.mechanics.kinematics import chain_frames, chain_kinematics, mjx_kinematics
 from mjx_softarm.mechanics.mjcf import build_model
 from mjx_softarm.mechanics.pipe import CrossPipe, body_clearance
 from mjx_softarm.mechanics.settle import Settled, settle
 from mjx_softarm.mechanics.statics import ArmParams
-from mjx_softarm.mechanics.workspace import HELD_OUT_SEED, Pool, sample_workspace
+from mjx_softarm.mechanics.workspace import Pool, sample_workspace
 from mjx_softarm.sensing import sensors
 from mjx_softarm.sensing.pose import pose_from_frame
 from mjx_softarm.sensing.s2r import S2R, carry_body, correct
@@ -35,65 +34,11 @@ from mjx_softarm.spec import ArmSpec
 PAYLOAD = 1  # index in ArmParams.tool_mass_kg
 
 
-@dataclass(frozen=True)
-class Randomisation:
-    """What differs from episode to episode; all zero is the nominal arm."""
+class EpisodeNoise(NamedTuple):
+    """Random numbers that fix one episode: start, goal, payload, stiffness, sensor bias."""
 
-    payload_max_kg: float = 0.0  # payload uniform from the spec's to this much more
-    stiffness_spread: float = 0.0  # each chamber's stiffness times 1 + uniform(-spread, spread)
-    sensor_noise_mm: float = 0.0  # standard deviation of each spring's reading, fixed within an episode
-
-    def __post_init__(self):
-        if self.payload_max_kg < 0:
-            raise ValueError(f"Randomisation.payload_max_kg: got {self.payload_max_kg}, expected >= 0")
-        if not 0 <= self.stiffness_spread < 1:
-            raise ValueError(f"Randomisation.stiffness_spread: got {self.stiffness_spread}, expected 0 to 1")
-        if self.sensor_noise_mm < 0:
-            raise ValueError(f"Randomisation.sensor_noise_mm: got {self.sensor_noise_mm}, expected >= 0")
-
-
-@dataclass(frozen=True)
-class EnvConfig:
-    """How the arm is simulated and rewarded."""
-
-    engine: Literal["chain", "mjx"] = "chain"
-    mode: Literal["quasistatic", "dynamic"] = "quasistatic"
-    reward: rewards.RewardConfig = field(default_factory=rewards.RewardConfig)
-    randomisation: Randomisation = field(default_factory=Randomisation)
-    saturation_tolerance_mm: float = 1.0
-    n_poses: int = 8192  # poses of the reachable workspace that starts and goals are drawn from
-    workspace_seed: int = 0
-    dynamic_step_s: float = 0.5  # duration of one environment step in dynamic mode
-    pipe_diameter_mm: float | None = None  # of the cross-shaped pipe around the arm, which nothing touches
-    clearance_cost_per_mm: float = 0.0  # by which the body is closer to its wall than the margin
-    clearance_margin_mm: float = 10.0
-
-    def __post_init__(self):
-        for name, allowed in (("engine", ("chain", "mjx")), ("mode", ("quasistatic", "dynamic"))):
-            if getattr(self, name) not in allowed:
-                raise ValueError(f"EnvConfig.{name}: got {getattr(self, name)!r}, expected one of {allowed}")
-        if self.pipe_diameter_mm is not None:
-            CrossPipe.of_mm(self.pipe_diameter_mm)  # raises
-        elif self.clearance_cost_per_mm:
-            raise ValueError(
-                f"EnvConfig.clearance_cost_per_mm: got {self.clearance_cost_per_mm}, expected 0 without a "
-                "pipe_diameter_mm"
-            )
-        if self.clearance_cost_per_mm < 0:
-            raise ValueError(
-                f"EnvConfig.clearance_cost_per_mm: got {self.clearance_cost_per_mm}, expected >= 0"
-            )
-        if self.n_poses < 1:
-            raise ValueError(f"EnvConfig.n_poses: got {self.n_poses}, expected at least 1")
-        if self.workspace_seed == HELD_OUT_SEED:
-            raise ValueError(f"EnvConfig.workspace_seed: {HELD_OUT_SEED} draws the goals of the evaluation")
-
-
-class Lot(NamedTuple):
-    """What chance decides of an episode."""
-
-    share: Array  # (3 + n_chambers,) from 0 to 1: start, goal, payload, stiffness of each chamber
-    noise: Array  # (n_chambers,) of the standard normal distribution, of each spring
+    uniform: Array  # (3 + n_chambers,) from 0 to 1: start, goal, payload, stiffness of each chamber
+    normal: Array  # (n_chambers,) standard normal: bias of each spring's reading
 
 
 class ArmState(NamedTuple):
@@ -175,15 +120,15 @@ class ReachEnv(Env):
 
     def reset(self, rng: Array) -> State:
         """A new episode: an arm of the randomisation, at a random pose, with a random goal."""
-        return self.begin(jax.tree.map(lambda x: x[0], self.draw(rng, 1)))
+        return self.reset_from(jax.tree.map(lambda x: x[0], self.sample_noise(rng, 1)))
 
-    def draw(self, rng: Array, n: int) -> Lot:
-        """What chance decides of n new episodes: leaves (n, ...)."""
-        return Lot(*draws.both(rng, (n, 3 + self.action_size), (n, self.action_size)))
+    def sample_noise(self, rng: Array, n: int) -> EpisodeNoise:
+        """Draw the random numbers of n episodes: leaves (n, ...)."""
+        return EpisodeNoise(*draws.both(rng, (n, 3 + self.action_size), (n, self.action_size)))
 
-    def begin(self, lot: Lot) -> State:
-        """A new episode."""
-        share = lot.share
+    def reset_from(self, noise: EpisodeNoise) -> State:
+        """Start the episode that `noise` fixes."""
+        share = noise.uniform
         start_row, goal_row = (self.config.n_poses * share[:2]).astype(jnp.int32)
         start = jax.tree.map(lambda x: x[start_row], self.pool)
         goal = self.pool.pose[goal_row]
@@ -192,7 +137,7 @@ class ReachEnv(Env):
             payload_kg=self.params.tool_mass_kg[PAYLOAD] + spread.payload_max_kg * share[2],
             chamber_stiffness=self.params.chamber_stiffness
             * (1.0 + spread.stiffness_spread * (2.0 * share[3:] - 1.0)),
-            sensor_offset_m=1e-3 * spread.sensor_noise_mm * lot.noise,
+            sensor_offset_m=1e-3 * spread.sensor_noise_mm * noise.normal,
             motion=Motion(start.q, jnp.zeros_like(start.q), start.pressure_kpa),
             pose=start.pose,
             spring_m=start.spring_m,
@@ -275,9 +220,9 @@ class ReachEnv(Env):
                 1.0 / self.spec.control.rate_hz,
             )
         if self.config.engine == "mjx":
-            kinematics = functools.partial(mjx_frames, self.model)
+            kinematics = mjx_kinematics(self.model)
         else:
-            kinematics = functools.partial(chain_frames, link_length_m=params.link_length_m)
+            kinematics = chain_kinematics(params)
         end = settle(kinematics, params, reference_m)
         return Motion(end.q, jnp.zeros_like(end.q), end.pressure_kpa), end
 

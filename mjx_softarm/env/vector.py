@@ -50,8 +50,8 @@ class VectorEnv:
     def reset(self, key: Array) -> State:
         """State of n fresh arms."""
         with draws.on(self.mesh):
-            drawn = self.env.draw(key, self.n)
-        return over_arms(self.env.begin, self.mesh)(drawn)
+            noise = self.env.sample_noise(key, self.n)
+        return over_arms(self.env.reset_from, self.mesh)(noise)
 
     def step(self, state: State, action: Array, key: Array) -> tuple[State, State, Outcome]:
         """Act once.

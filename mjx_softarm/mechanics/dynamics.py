@@ -10,7 +10,7 @@ from jax import Array
 
 from mjx_softarm import control
 from mjx_softarm._support.mjx import mjx
-from mjx_softarm.mechanics.mjcf import steps_per_period
+from mjx_softarm.mechanics.mjcf import spring_lengths, steps_per_period
 from mjx_softarm.mechanics.settle import Settled
 from mjx_softarm.mechanics.statics import ArmParams
 
@@ -63,7 +63,7 @@ def advance(
 
     def tick(carry, _):
         data, integral = carry
-        pressure, integral = control.pressures(reference_m, data.ten_length[1::2], integral, gains, period_s)
+        pressure, integral = control.pressures(reference_m, spring_lengths(data), integral, gains, period_s)
         data = data.replace(ctrl=pressure)
         data = jax.lax.fori_loop(0, steps_per_period(period_s), lambda _, d: mjx.step(model, d), data)
         data = mjx.tendon(model, mjx.com_pos(model, mjx.kinematics(model, data)))
@@ -74,12 +74,12 @@ def advance(
             tick, (data, motion.integral_kpa), None, length=round(duration_s / period_s)
         )
     end = Motion(data.qpos, data.qvel, integral)
-    error = jnp.abs(reference_m - data.ten_length[1::2])
+    error = jnp.abs(reference_m - spring_lengths(data))
     at_limit = (data.ctrl <= gains.pressure_min_kpa) | (data.ctrl >= gains.pressure_max_kpa)
     return end, Settled(
         q=data.qpos,
         pressure_kpa=data.ctrl,
-        spring_m=data.ten_length[1::2],
+        spring_m=spring_lengths(data),
         tip_position_m=data.site_xpos[-1],
         tip_rotation=data.site_xmat[-1],
         at_limit=at_limit,

@@ -8,7 +8,8 @@ Both functions of this module return the same `Frames`; everything downstream is
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +17,9 @@ from jax import Array
 
 from mjx_softarm._support.mjx import mjx
 from mjx_softarm._support.small_matrices import product
+
+if TYPE_CHECKING:
+    from mjx_softarm.mechanics.statics import ArmParams
 
 DOFS_PER_LINK = 3
 
@@ -27,6 +31,19 @@ class Frames(NamedTuple):
     plate_rotation: Array  # (n_links + 1, 3, 3), columns are the plate's axes
     axis: Array  # (n_links, 3 dofs, 3), unit vectors: slide, hinge x, hinge y
     anchor: Array  # (n_links, 3) [m], the point both hinges turn about
+
+
+Kinematics = Callable[[Array], Frames]  # joint coordinates (nv,) [m, rad, rad] -> Frames
+
+
+def chain_kinematics(params: ArmParams) -> Kinematics:
+    """Return the closed-form kinematics of an arm, a pytree of the numbers that it depends on."""
+    return jax.tree_util.Partial(chain_frames, link_length_m=params.link_length_m)
+
+
+def mjx_kinematics(model: mjx.Model) -> Kinematics:
+    """Return the kinematics of an MJX model, a pytree of the model's numbers."""
+    return jax.tree_util.Partial(mjx_frames, model)
 
 
 def chain_frames(q: Array, link_length_m: Array | float) -> Frames:

@@ -56,6 +56,16 @@ def steps_per_period(period_s: float) -> int:
     return math.ceil(period_s / MAX_TIMESTEP_S - 1e-9)
 
 
+def chamber_lengths(data):
+    """Return the chambers' lengths (n_chambers,) [m], a view, from the data of MuJoCo or MJX."""
+    return data.ten_length[0::2]
+
+
+def spring_lengths(data):
+    """Return the springs' lengths (n_chambers,) [m], a view, from the data of MuJoCo or MJX."""
+    return data.ten_length[1::2]
+
+
 def build_model(spec: ArmSpec) -> mujoco.MjModel:
     """The compiled model of an arm."""
     return build_spec(spec).compile()

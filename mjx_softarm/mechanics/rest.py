@@ -13,13 +13,11 @@ through the iterations would keep them all and would need a loop of fixed length
 
 from __future__ import annotations
 
-import functools
-
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-from mjx_softarm.mechanics.kinematics import chain_frames
+from mjx_softarm.mechanics.kinematics import chain_frames, chain_kinematics
 from mjx_softarm.mechanics.settle import settle_pressures
 from mjx_softarm.mechanics.statics import ArmParams, Statics, statics
 
@@ -34,7 +32,7 @@ def rest(params: ArmParams, pressure_kpa: Array) -> Array:
         pressure_min_kpa=jnp.full_like(pressure_kpa, -jnp.inf),
         pressure_max_kpa=jnp.full_like(pressure_kpa, jnp.inf),
     )
-    kinematics = functools.partial(chain_frames, link_length_m=params.link_length_m)
+    kinematics = chain_kinematics(params)
     return settle_pressures(kinematics, free, pressure_kpa).q
 
 

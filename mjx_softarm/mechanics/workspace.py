@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 
 from mjx_softarm.mechanics.excitation import random_pressures
-from mjx_softarm.mechanics.kinematics import chain_frames
+from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.settle import Settled, settle_pressures
 from mjx_softarm.mechanics.statics import ArmParams
 from mjx_softarm.sensing.pose import pose_from_frame
@@ -36,7 +36,7 @@ class Pool(NamedTuple):
 @functools.cache
 def _solver():
     def solve(params: ArmParams, pressure_kpa: Array) -> Settled:
-        kinematics = functools.partial(chain_frames, link_length_m=params.link_length_m)
+        kinematics = chain_kinematics(params)
         return settle_pressures(kinematics, params, pressure_kpa)
 
     return jax.jit(jax.vmap(solve, in_axes=(None, 0)))

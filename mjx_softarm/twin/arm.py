@@ -18,6 +18,7 @@ import numpy as np
 
 from mjx_softarm.deploy.arm_io import Capture
 from mjx_softarm.mechanics.body import payload_radius_m
+from mjx_softarm.mechanics.mjcf import chamber_lengths, spring_lengths
 from mjx_softarm.mechanics.pipe import CrossPipe
 from mjx_softarm.sensing.sensors import frequency_from_length
 from mjx_softarm.spec import ArmSpec
@@ -105,7 +106,7 @@ class Twin:
             np.array(self._parts.spec.per_chamber(chambers.area_m2)),
             np.array(self._parts.spec.per_chamber(chambers.area_slope_m)),
             spec.geometry.section_length_m,
-            self._data.ten_length[0::2],
+            chamber_lengths(self._data),
             self._model.opt.timestep,
         )
         self.attach(payload_kg)
@@ -121,11 +122,11 @@ class Twin:
         strokes = np.array(HYSTERESIS_STROKES_M)
         scale = self._build.losses * self._parts.hysteresis[:, None]
         limit = scale * np.full(len(strokes), HYSTERESIS_LIMIT_N / len(strokes))
-        self._hysteresis = StopOperators(limit / strokes, limit, self._data.ten_length[0::2])
+        self._hysteresis = StopOperators(limit / strokes, limit, chamber_lengths(self._data))
 
     def read_frequencies(self) -> np.ndarray:
         """The springs' frequencies (n,) [Hz] now, counted by the converter; see `ArmIO`."""
-        true_hz = frequency_from_length(self._data.ten_length[1::2], self._parts.sensor)
+        true_hz = frequency_from_length(spring_lengths(self._data), self._parts.sensor)
         noisy_hz = true_hz + self._draw(FREQUENCY_NOISE_HZ, len(true_hz))
         step_hz = REFERENCE_CLOCK_HZ / 2**READING_BITS
         return np.round(noisy_hz / step_hz) * step_hz
@@ -171,7 +172,7 @@ class Twin:
         quaternion = np.zeros(4)
         mujoco.mju_mat2Quat(quaternion, (turn @ tip).ravel())
         noise_m = self._draw(CAPTURE_NOISE_M, n_markers + 1, 3)
-        spring_m = data.ten_length[1::2] + self._draw(SPRING_NOISE_M, spec.n_chambers)
+        spring_m = spring_lengths(data) + self._draw(SPRING_NOISE_M, spec.n_chambers)
         return Capture(tip_m + noise_m[0], quaternion, marker_m + noise_m[1:], spring_m)
 
     def attach(self, payload_kg: float) -> None:
@@ -247,7 +248,7 @@ class Twin:
     def _step(self) -> None:
         """One time step; lengths and positions in the data are those of its end."""
         data, n = self._data, len(self._parts.hysteresis)
-        length_m = data.ten_length[0::2]
+        length_m = chamber_lengths(data)
         data.ctrl[:n] = self._air.step(length_m)
         data.ctrl[n:] = -self._hysteresis.move(length_m)
         data.qfrc_applied[:] = -self._friction.move(data.qpos)

@@ -22,10 +22,10 @@ class Arm(NamedTuple):
 class ObedientEnv:
     """Its action says how a step ends; an observation is the number of the episode and of its steps."""
 
-    def draw(self, rng, n):
+    def sample_noise(self, rng, n):
         return jax.random.uniform(rng, (n,))
 
-    def begin(self, episode):
+    def reset_from(self, episode):
         arm = Arm(jnp.zeros((), jnp.int32), episode)
         zero = jnp.zeros(())
         return State(arm, self._observe(arm), zero, zero, {"unsettled": zero}, {"valid": jnp.array(True)})

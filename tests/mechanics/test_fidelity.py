@@ -17,8 +17,8 @@ import pytest
 from mjx_softarm import ArmSpec, control
 from mjx_softarm._support import xla
 from mjx_softarm._support.mjx import mjx
-from mjx_softarm.mechanics.kinematics import chain_frames, mjx_frames
-from mjx_softarm.mechanics.mjcf import build_model
+from mjx_softarm.mechanics.kinematics import chain_kinematics, mjx_kinematics
+from mjx_softarm.mechanics.mjcf import build_model, spring_lengths
 from mjx_softarm.mechanics.settle import settle
 from mjx_softarm.mechanics.statics import ArmParams
 
@@ -65,7 +65,7 @@ def stepped_to_rest(model, reference_m, gains, steps_per_tick=1, tolerance=1e-11
     integral = np.zeros(9)
     for _ in range(max_ticks):
         before = integral
-        spring = data.ten_length[1::2]
+        spring = spring_lengths(data)
         data.ctrl[:], integral = control.pressures(reference_m, spring, integral, gains, period_s)
         mujoco.mj_step(model, data, steps_per_tick)
         drift = np.abs(integral - before).max() / period_s
@@ -81,7 +81,7 @@ def stepped_to_rest(model, reference_m, gains, steps_per_tick=1, tolerance=1e-11
     return Rest(
         q=data.qpos.copy(),
         pressure_kpa=data.ctrl.copy(),
-        spring_m=data.ten_length[1::2].copy(),
+        spring_m=spring_lengths(data).copy(),
         tip_position_m=tip.xpos.copy(),
         tip_rotation=tip.xmat.reshape(3, 3).copy(),
         residual=np.abs(left).max(),
@@ -101,9 +101,9 @@ def solver(engine):
     """`settle` of many references with either engine."""
     params = ArmParams.from_spec(SPEC)
     if engine == "mjx":
-        kinematics = functools.partial(mjx_frames, mjx.put_model(build_model(SPEC)))
+        kinematics = mjx_kinematics(mjx.put_model(build_model(SPEC)))
     else:
-        kinematics = functools.partial(chain_frames, link_length_m=params.link_length_m)
+        kinematics = chain_kinematics(params)
     many = jax.vmap(lambda reference: settle(kinematics, params, reference))
     return xla.jit(many, uses_mjx=engine == "mjx")
 
@@ -167,7 +167,7 @@ def test_stepped_mjx_comes_to_rest_where_c_mujoco_does():
         def tick(carry, _):
             data, integral = carry
             pressure, integral = control.pressures(
-                reference, data.ten_length[1::2], integral, FAST_GAINS, FAST_STEP_S
+                reference, spring_lengths(data), integral, FAST_GAINS, FAST_STEP_S
             )
             return (mjx.step(model, data.replace(ctrl=pressure)), integral), None
 

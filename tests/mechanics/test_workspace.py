@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from mjx_softarm import ArmSpec
 from mjx_softarm.__main__ import main, outline
-from mjx_softarm.mechanics.mjcf import build_model
+from mjx_softarm.mechanics.mjcf import build_model, spring_lengths
 from mjx_softarm.mechanics.workspace import (
     BATCH,
     VOXEL_MM,
@@ -56,7 +56,7 @@ def test_every_sampled_pose_is_a_rest_of_c_mujoco():
         angles = Rotation.from_matrix(tip.xmat.reshape(3, 3)).as_euler("ZYX", degrees=True)
         np.testing.assert_allclose(pool().pose[k, :3], 1e3 * tip.xpos, atol=1e-3)
         np.testing.assert_allclose(pool().pose[k, 3:], angles, atol=1e-3)
-        np.testing.assert_allclose(pool().spring_m[k], data.ten_length[1::2], atol=1e-6)
+        np.testing.assert_allclose(pool().spring_m[k], spring_lengths(data), atol=1e-6)
 
 
 def test_sampled_poses_can_be_commanded():

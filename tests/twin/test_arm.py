@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from mjx_softarm import ArmSpec
 from mjx_softarm.control import Gains, pressures
+from mjx_softarm.mechanics.mjcf import chamber_lengths, spring_lengths
 from mjx_softarm.mechanics.workspace import circle_poses, settle_many
 from mjx_softarm.sensing.pose import pose_error, pose_from_frame
 from mjx_softarm.sensing.sensors import SensorParams, length_from_frequency
@@ -200,10 +201,10 @@ def test_closed_loop_in_pressure_dissipates():
 
 def work_of_pressures(arm, n_ticks):
     """Work [J] that the air does on the arm while three chambers go down to -20 kPa and back."""
-    work, length_m, pressure = 0.0, arm._data.ten_length[0::2].copy(), arm._air.pressure_kpa
+    work, length_m, pressure = 0.0, chamber_lengths(arm._data).copy(), arm._air.pressure_kpa
     for phase in np.linspace(0.0, 2 * np.pi, n_ticks):
         arm.write_pressures(-10.0 * (1.0 - np.cos(phase)) * np.array([1, 0, 0, 0, 1, 0, 0, 0, 1]))
-        next_length_m, next_pressure = arm._data.ten_length[0::2].copy(), arm._air.pressure_kpa
+        next_length_m, next_pressure = chamber_lengths(arm._data).copy(), arm._air.pressure_kpa
         grown_m3 = arm._air.volume_m3(next_length_m) - arm._air.volume_m3(length_m)
         work += 1e3 * np.sum(0.5 * (pressure + next_pressure) * grown_m3)
         length_m, pressure = next_length_m, next_pressure
@@ -291,7 +292,7 @@ def test_readings_are_counts_of_the_reference_clock(noiseless):
 
 def test_springs_have_their_own_calibration(spec, noiseless):
     """The true beta and delta give the spring's length; the nominal ones are millimetres off."""
-    frequency_hz, true_m = noiseless.read_frequencies(), noiseless._data.ten_length[1::2]
+    frequency_hz, true_m = noiseless.read_frequencies(), spring_lengths(noiseless._data)
     calibrated = length_from_frequency(frequency_hz, noiseless._parts.sensor).length_m
     nominal = length_from_frequency(frequency_hz, SensorParams.from_spec(spec)).length_m
     np.testing.assert_allclose(calibrated, true_m, atol=3e-8)  # half a count is 1e-8 m
@@ -373,7 +374,7 @@ def test_springs_reach_their_references_from_any_side(spec):
     for start_kpa in (-14.0, 4.0):
         hold_pressures(arm, np.full(9, start_kpa), 3.0)
         hold_springs(arm, reference_m, np.full(9, start_kpa), gains, 9.0, arm._parts.sensor)
-        np.testing.assert_allclose(arm._data.ten_length[1::2], reference_m, atol=3e-4)
+        np.testing.assert_allclose(spring_lengths(arm._data), reference_m, atol=3e-4)
         tips_m.append(np.mean([arm.motion_capture().tip_m for _ in range(50)], axis=0))
     assert np.linalg.norm(tips_m[0] - tips_m[1]) < 2e-3
 

@@ -1,7 +1,6 @@
 """Chambers of planted arms come back from noisy poses; what poses do not tell is said."""
 
 import dataclasses
-import functools
 
 import jax
 import mujoco
@@ -13,7 +12,7 @@ from calib.fit.chambers import BENDING, FIELDS, MIN_POSES, calibrate_chambers
 from calib.fit.equilibrium import with_numbers
 from mjx_softarm import ArmSpec
 from mjx_softarm.logs.schema import Log
-from mjx_softarm.mechanics.kinematics import chain_frames
+from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.rest import rest
 from mjx_softarm.mechanics.settle import settle_pressures
 from mjx_softarm.mechanics.statics import ArmParams
@@ -118,7 +117,7 @@ def test_the_derivative_of_the_rest_is_that_of_finite_differences_of_settle_pres
     direction = rng.normal(size=37) * np.append(np.repeat([0.1, 0.1, 0.1, 0.02], 9), 0.1)
     with jax.enable_x64(True):
         params = jax.tree.map(jax.numpy.asarray, ArmParams.from_spec(SPEC, np.float64))
-        kinematics = functools.partial(chain_frames, link_length_m=params.link_length_m)
+        kinematics = chain_kinematics(params)
         unlimited = params._replace(pressure_min_kpa=np.full(9, -100.0), pressure_max_kpa=np.full(9, 100.0))
 
         @jax.jit

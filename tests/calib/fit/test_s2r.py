@@ -12,7 +12,7 @@ from calib.fit.blocks import held_out_blocks
 from calib.fit.network import NetworkConfig, fit_network
 from calib.fit.s2r import fit_s2r, pose_errors, simulate_poses
 from mjx_softarm._support.mlp import mlp
-from mjx_softarm.mechanics.kinematics import chain_frames
+from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.settle import settle
 from mjx_softarm.mechanics.statics import ArmParams
 from mjx_softarm.mechanics.workspace import sample_workspace
@@ -52,7 +52,7 @@ def arms(spec):
         tool_mass_kg=nominal.tool_mass_kg + np.array([0.0, 0.2]),
     )
     planted = jax.tree.map(lambda a: np.asarray(a, np.float32), planted)
-    kinematics = functools.partial(chain_frames, link_length_m=planted.link_length_m)
+    kinematics = chain_kinematics(planted)
     reference = sample_workspace(spec, N_ROWS + N_CLEAN, seed=5).spring_m
     real = jax.jit(jax.vmap(lambda r: settle(kinematics, planted, r)))(reference)
     simulated = simulate_poses(spec, np.asarray(real.spring_m))

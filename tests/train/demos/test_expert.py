@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mjx_softarm import control
-from mjx_softarm.mechanics.mjcf import build_model
+from mjx_softarm.mechanics.mjcf import build_model, spring_lengths
 from mjx_softarm.mechanics.pipe import CrossPipe, body_clearance
 from mjx_softarm.sensing.pose import pose_from_frame
 from train.demos.expert import (
@@ -47,7 +47,7 @@ def hold(spec, reference_m):
     data, integral = mujoco.MjData(model), np.zeros(spec.n_chambers)
     mujoco.mj_forward(model, data)
     for _ in range(3000):
-        data.ctrl[:], integral = control.pressures(reference_m, data.ten_length[1::2], integral, gains, 1.0)
+        data.ctrl[:], integral = control.pressures(reference_m, spring_lengths(data), integral, gains, 1.0)
         mujoco.mj_step(model, data)
         if max(np.abs(data.qvel).max(), np.abs(data.qacc).max()) < 1e-10:
             return model, data

@@ -10,8 +10,8 @@ import pytest
 from mjx_softarm import ArmSpec
 from mjx_softarm.control import Gains, saturated
 from mjx_softarm.deploy.faults import TOLERANCE_M, lost_chambers
-from mjx_softarm.mechanics.kinematics import chain_frames
-from mjx_softarm.mechanics.mjcf import build_model
+from mjx_softarm.mechanics.kinematics import chain_kinematics
+from mjx_softarm.mechanics.mjcf import build_model, spring_lengths
 from mjx_softarm.mechanics.settle import settle
 from mjx_softarm.mechanics.statics import ArmParams
 from mjx_softarm.mechanics.workspace import HELD_OUT_SEED, sample_workspace
@@ -48,7 +48,7 @@ def test_tips_are_those_of_c_mujoco(distilled, pool):
     for k in range(0, N_ARMS, 4):
         data.qpos[:] = pool.q[k]
         mujoco.mj_forward(model, data)
-        frame = estimate_frame(distilled.estimator, data.ten_length[1::2])
+        frame = estimate_frame(distilled.estimator, spring_lengths(data))
         away_mm.append(1e3 * np.linalg.norm(frame.position_m - data.site("tip").xpos))
     assert np.median(away_mm) < 1.5 and max(away_mm) < 10.0  # 0.6 and 2.2 mm after all of the training
     assert np.median(away_mm) == pytest.approx(distilled.tip_mm[0.0].median, rel=0.25)
@@ -92,7 +92,7 @@ def arms_at_rest(reference_m, payload_kg, dead):
         pressure_min_kpa=np.where(dead, 0.0, many.pressure_min_kpa).astype(np.float32),
         pressure_max_kpa=np.where(dead, 0.0, many.pressure_max_kpa).astype(np.float32),
     )
-    kinematics = functools.partial(chain_frames, link_length_m=params.link_length_m)
+    kinematics = chain_kinematics(params)
     end = jax.device_get(jax.jit(jax.vmap(functools.partial(settle, kinematics)))(many, reference_m))
     winds = np.where(reference_m > end.spring_m, params.pressure_max_kpa, params.pressure_min_kpa)
     return end, np.where(dead, winds, end.pressure_kpa)
