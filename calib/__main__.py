@@ -1,4 +1,7 @@
-"""Command line: `python -m calib template | check | demo | run`."""
+"""Command line: `python -m calib template | check | demo | run`.
+
+Exit status: 0 done, 1 done but not to be trusted, 2 not done, 130 interrupted.
+"""
 
 from __future__ import annotations
 
@@ -7,127 +10,124 @@ import os
 # XLA logs a page for every program that it takes from the cache.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
-import argparse
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
 
-from calib.errors import FitError
-from mjx_softarm._support.archive import SealedFileError
-from mjx_softarm.logs.checks import Finding, LogError
+import tyro
+
+from mjx_softarm._support import cli
+from mjx_softarm._support.errors import InputError
+from mjx_softarm.logs.checks import Finding
 from mjx_softarm.logs.schema import Log
-from mjx_softarm.spec import ArmSpec, SpecError
+from mjx_softarm.spec import ArmSpec
+
+Logs = Annotated[
+    tyro.conf.Positional[tuple[Path, ...]],
+    tyro.conf.arg(metavar="LOG [LOG ...]", help="logs, CSV or npz; see `template`"),
+]
+Strict = Annotated[
+    bool, tyro.conf.arg(help="refuse logs with any fault", help_behavior_hint="(default: drop rows)")
+]
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run a command; returns the exit status: 0 done, 1 not to be trusted, 2 not done, 130 interrupted."""
-    options = _parser().parse_args(arguments)
-    try:
-        return options.command(options)
-    except (LogError, FitError, SpecError, SealedFileError, FileExistsError) as error:
-        print(f"error: {error}", file=sys.stderr)
-    except OSError as error:
-        print(f"error: {error.filename}: {error.strerror}", file=sys.stderr)
-    except KeyboardInterrupt:
-        return 130
-    return 2
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command; returns the exit status."""
+    commands = {"template": _template, "check": _check, "demo": _demo, "run": _run}
+    return cli.main("python -m calib", "Calibrate an arm from its logs.", commands, arguments)
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m calib", description="Calibrate an arm from its logs.")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    template = commands.add_parser("template", help="write a small log to start from, and say what is in it")
-    template.add_argument("out", type=Path, nargs="?", default=Path("log.csv"), help="default: log.csv")
-    template.set_defaults(command=_template)
-    check = commands.add_parser("check", help="say what is wrong with logs")
-    _add_logs(check)
-    check.set_defaults(command=_check)
-    demo = commands.add_parser("demo", help="write logs of a planted arm, to try everything without hardware")
-    demo.add_argument("--out", type=Path, default=Path("calib-demo"), help="folder; default: calib-demo")
-    demo.add_argument("--seed", type=_seed, default=0, help="of the arm and the noise; default: 0")
-    demo.set_defaults(command=_demo)
-    run = commands.add_parser("run", help="calibrate springs, chambers, damping and the sim-to-real network")
-    _add_logs(run)
-    run.add_argument("--out", type=Path, default=Path("calibration"), help="folder; default: calibration")
-    run.add_argument("--shared-springs", action="store_true", help="one beta and delta for all springs")
-    run.add_argument(
-        "--fit-compensation", action="store_true", help="fit the circuit's compensation inductance, too"
-    )
-    run.add_argument("--seed", type=_seed, default=0, help="of all that is drawn; default: 0")
-    run.set_defaults(command=_run)
-    return parser
+def _template(out: tyro.conf.Positional[Path] = Path("log.csv")) -> int:
+    """Write a small log to start from, and tell what is in it.
 
-
-def _seed(text: str) -> int:
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"got {text!r}, expected a whole number from 0")
-    return int(text)
-
-
-def _add_logs(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("logs", type=Path, nargs="+", metavar="LOG", help="CSV or npz; see `template`")
-    parser.add_argument("--spec", type=Path, help="TOML file of the arm so far; default: the paper's arm")
-    parser.add_argument(
-        "--strict", action="store_true", help="refuse logs with any fault; default: drop rows"
-    )
-
-
-def _template(options: argparse.Namespace) -> int:
+    Args:
+        out: file to write
+    """
     from calib.read.logs import template
 
-    print(template(options.out))
+    print(template(out))
     return 0
 
 
-def _check(options: argparse.Namespace) -> int:
-    logs, findings = _read(options, _spec(options))
-    for log in logs:
+def _check(logs: Logs, spec: cli.SpecFile = None, strict: Strict = False) -> int:
+    """Tell what is wrong with logs."""
+    read, findings = _read(logs, cli.arm_of(spec), strict)
+    for log in read:
         print(f"{log.source}: {len(log)} rows to use, {log.time_s[-1] - log.time_s[0]:.1f} s")
     return 1 if findings else 0
 
 
-def _demo(options: argparse.Namespace) -> int:
+def _demo(out: Path = Path("calib-demo"), seed: int = 0) -> int:
+    """Write logs of a planted arm, to try everything without hardware.
+
+    Args:
+        out: folder to write
+        seed: seed of the arm and of the noise
+    """
     from calib.demo import write_demo
     from mjx_softarm._support import xla
 
+    _check_seed(seed)
     xla.enable_compilation_cache()
     print("simulating ...", flush=True)
-    files = write_demo(options.out, ArmSpec.default(), options.seed)
+    files = write_demo(out, ArmSpec.default(), seed)
     print("\n".join(f"log: {file}" for file in files))
     print(f"next: python -m calib run {' '.join(map(str, files))}")
     return 0
 
 
-def _run(options: argparse.Namespace) -> int:
+def _run(
+    logs: Logs,
+    spec: cli.SpecFile = None,
+    strict: Strict = False,
+    out: Path = Path("calibration"),
+    shared_springs: bool = False,
+    fit_compensation: bool = False,
+    seed: int = 0,
+) -> int:
+    """Calibrate springs, chambers, damping and the sim-to-real network.
+
+    Args:
+        out: folder to write
+        shared_springs: fit one beta and one delta for all springs
+        fit_compensation: fit the circuit's compensation inductance, too
+        seed: seed of all random draws
+    """
     from calib.run import calibrate, refuse_existing, write_calibration
     from mjx_softarm._support import xla
     from mjx_softarm._support.provenance import provenance
 
-    refuse_existing(options.out)
-    spec = _spec(options)
-    logs, findings = _read(options, spec)
+    _check_seed(seed)
+    refuse_existing(out)
+    arm = cli.arm_of(spec)
+    read, findings = _read(logs, arm, strict)
     xla.enable_compilation_cache()
-    springs = {"shared": options.shared_springs, "fit_compensation": options.fit_compensation}
-    calibration = calibrate(logs, spec, options.seed, springs, lambda text: print(text, flush=True))
-    write_calibration(options.out, calibration, [str(finding) for finding in findings], provenance("calib"))
+    springs = {"shared": shared_springs, "fit_compensation": fit_compensation}
+    calibration = calibrate(read, arm, seed, springs, lambda text: print(text, flush=True))
+    write_calibration(out, calibration, [str(finding) for finding in findings], provenance("calib"))
     for section in calibration.sections:
         for warning in section.warnings:
             print(f"warning: {section.title}: {warning}")
-    print(f"report: {options.out / 'report.html'}")
-    print(f"next: python -m train reach --calibration {options.out}")
+    print(f"report: {out / 'report.html'}")
+    print(f"next: python -m train reach --calibration {out}")
     return 1 if any(section.warnings for section in calibration.sections) else 0
 
 
-def _spec(options: argparse.Namespace) -> ArmSpec:
-    return ArmSpec.from_toml(options.spec) if options.spec else ArmSpec.default()
+def _check_seed(seed: int) -> None:
+    if seed < 0:
+        raise InputError(f"--seed: got {seed}, expected a whole number from 0")
 
 
-def _read(options: argparse.Namespace, spec: ArmSpec) -> tuple[list[Log], list[Finding]]:
-    """The logs; what was found is printed."""
+def _read(paths: Sequence[Path], spec: ArmSpec, strict: bool) -> tuple[list[Log], list[Finding]]:
+    """Read logs, and print what was found in them."""
     from calib.read.logs import read_log
 
+    if not paths:
+        raise InputError("LOG: got nothing, expected one log or more")
     logs, findings = [], []
-    for path in options.logs:
-        log, found = read_log(path, spec.n_chambers, options.strict)
+    for path in paths:
+        log, found = read_log(path, spec.n_chambers, strict)
         logs.append(log)
         findings += found
         for finding in found:

@@ -11,13 +11,14 @@ import typing
 from dataclasses import dataclass, field
 from typing import Any
 
+from mjx_softarm._support.errors import InputError
 from mjx_softarm.env import EnvConfig
 from train.agent.gail import GailConfig
 from train.agent.tqc import TQCConfig
 from train.epoch.hindsight import HindsightConfig
 
 
-class ConfigError(ValueError):
+class ConfigError(InputError):
     """A setting that cannot be used; the message names it, what it got and what was expected."""
 
 

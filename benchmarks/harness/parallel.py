@@ -9,12 +9,14 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from typing import Any
 
+from mjx_softarm._support.errors import InputError
+
 N_WORKERS = 2  # each on cores of its own: faster than one training on all of them
 
 Job = tuple[str, Callable[..., Any], tuple[Any, ...]]  # what to call it, function and arguments
 
 
-class JobError(Exception):
+class JobError(InputError):
     """A job that cannot be done; the message says which, and why."""
 
 

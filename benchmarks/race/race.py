@@ -41,6 +41,7 @@ from benchmarks.race.summary import (
     summarise,
 )
 from benchmarks.speed.guard import machine_kind
+from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.provenance import provenance, write_json
 
 N_STRETCHES = 40  # of training between evaluations, up to a peer's limit
@@ -55,7 +56,7 @@ class Limits(NamedTuple):
     stretch_s: float = 0.0  # of training between evaluations, not a limit
 
 
-class RaceError(Exception):
+class RaceError(InputError):
     """The race cannot be run in this folder; the message says why."""
 
 

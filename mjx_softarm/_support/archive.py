@@ -16,12 +16,13 @@ from typing import Any, NoReturn
 
 import numpy as np
 
+from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.mlp import Layer
 
 _N_DIGEST = 64  # hexadecimal digits, the last bytes of the file
 
 
-class SealedFileError(ValueError):
+class SealedFileError(InputError):
     """A sealed file that cannot be used; the message names file, entry, what it got and what it expected."""
 
 

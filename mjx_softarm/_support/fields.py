@@ -8,8 +8,10 @@ import typing
 from dataclasses import dataclass, field, fields
 from typing import Any
 
+from mjx_softarm._support.errors import InputError
 
-class SpecError(ValueError):
+
+class SpecError(InputError):
     """A specification that cannot be used; the message names file, field, value and what was expected."""
 
 

@@ -7,13 +7,14 @@ import os
 import sys
 from typing import Any
 
+from mjx_softarm._support.errors import InputError
 from mjx_softarm.mechanics.pipe import PIPES_MM, CrossPipe
 from mjx_softarm.spec import SpecError
 
 _METHODS = ("read_frequencies", "write_pressures")
 
 
-class ArmError(ValueError):
+class ArmError(InputError):
     """No arm of this name can be had; the message says why."""
 
 

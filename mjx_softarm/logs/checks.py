@@ -11,6 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mjx_softarm._support.errors import InputError
+
 
 class Finding(NamedTuple):
     """One thing that is wrong with a log."""
@@ -30,7 +32,7 @@ class Finding(NamedTuple):
         )
 
 
-class LogError(ValueError):
+class LogError(InputError):
     """A log that cannot be used; the message has a line for each finding."""
 
     def __init__(self, findings: Sequence[Finding]):

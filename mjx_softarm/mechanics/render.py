@@ -25,6 +25,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from mjx_softarm._support.errors import InputError
+
 _HEADLESS = ("egl", "osmesa")
 _ADVICE = "Install EGL or OSMesa (Debian: libegl1, libosmesa6) and set MUJOCO_GL=egl or MUJOCO_GL=osmesa"
 _MAX_GEOMS = 10_000
@@ -36,7 +38,7 @@ _MOUNT_COLOUR = (0.55, 0.57, 0.60, 1.0)
 _PAYLOAD_COLOUR = (0.20, 0.60, 0.25, 1.0)
 
 
-class RenderError(RuntimeError):
+class RenderError(InputError):
     """This machine cannot draw; the message says what was tried and what to do."""
 
 

@@ -88,7 +88,10 @@ def test_command_line_tells_what_is_wrong(folder):
     for args, message in (
         (("run", "no.npz", "--arm", "driver:Arm", *goal), "no.npz: cannot be read"),
         (("run", "policy.npz", "--arm", "driver:Arms", *goal), "module driver has no 'Arms'"),
-        (("run", "policy.npz", "--arm", "driver:Arm", *goal, "--log", "no/a.csv"), "--log: no is no folder"),
+        (
+            ("run", "policy.npz", "--arm", "driver:Arm", *goal, "--log", "no/a.csv"),
+            "--log: got no/a.csv, expected a file in a folder",
+        ),
     ):
         done = command(folder, *args)
         assert done.stdout.startswith("2 ") and message in done.stderr and done.stderr.count("\n") == 1

@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.xp import array_namespace
 from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.mechanics.kinematics import chain_frames
@@ -55,7 +56,7 @@ _COMFORT_M, _COMFORT_KPA, _NEAR_KPA = 0.01, 3.0, 20.0
 _NO_WALL_M = 1.0  # clearance where there is no pipe
 
 
-class ExpertError(ValueError):
+class ExpertError(InputError):
     """A waypoint that cannot be met; the message says which, how far off, and what is in the way."""
 
 

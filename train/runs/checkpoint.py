@@ -15,6 +15,7 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 
+from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.provenance import provenance, write_json
 from mjx_softarm.logs.files import LogError
 from mjx_softarm.logs.schema import Log, write_log
@@ -29,7 +30,7 @@ N_KEPT = 2
 CHECKPOINTS, DEMONSTRATIONS_FILE, LOCK_FILE = "checkpoints", "demonstrations.npz", "training.lock"
 
 
-class RunError(ValueError):
+class RunError(InputError):
     """A folder that does not hold a run that can be used; the message names it and what is wrong."""
 
 

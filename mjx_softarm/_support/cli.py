@@ -1,0 +1,205 @@
+"""Command lines: tyro reads the options of a command; an error is one line on stderr and exit status 2.
+
+A command is a function, or a dataclass that is called once its options are read. Type annotations say what an
+option may be, docstrings say what it means.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import importlib
+import inspect
+import io
+import os
+import re
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from tyro.constructors import PrimitiveConstructorSpec
+
+from mjx_softarm._support.errors import InputError
+from mjx_softarm.spec import ArmSpec
+
+ERROR, INTERRUPTED = 2, 130  # exit statuses
+
+# What tyro draws: colours, the sides of a box, and the rules between its parts, which a terminal without UTF-8
+# gets as hyphens.
+_COLOUR, _SIDE, _RULE = re.compile(r"\x1b\[[0-9;]*m"), " |\u2502", re.compile(r"\W?[-\u2500]{3,}\W?")
+_PLAINER = (
+    (r"^Error parsing (?:(-\S*: )|\S*: )", r"\1"),
+    (r"invalid literal for int\(\) with base 10: (.*)", r"got \1, expected a whole number"),
+    (r"could not convert string to float: (.*)", r"got \1, expected a number"),
+    (r"Could not find valid parse for arguments: (.*)", r"got \1, expected values as --help tells"),
+    (r"^Missing from (.*?):", r"\1: got nothing, expected"),
+    (r" \(required\)", ""),
+    (r"^invalid choice (\S+) for argument '(\S+)'. Expected", r"\2: got \1, expected"),
+)
+
+Command = Callable[..., Any] | tuple[str, str]
+
+
+def main(
+    prog: str,
+    about: str,
+    commands: Mapping[str, Command],
+    arguments: Sequence[str] | None = None,
+    finish: Callable[[str, Any], int] = lambda name, status: status,
+) -> int:
+    """Run the command that the arguments begin with; without any, list the commands.
+
+    Args:
+        prog: the program as its user calls it.
+        about: a sentence about the program.
+        commands: functions by name; or, instead of one, MODULE:NAME, imported only when it is run, and a line
+            of help.
+        arguments: words of the command line, by default those of this process.
+        finish: turns a command's name and what it returned into an exit status.
+
+    Returns:
+        The command's exit status; 2 after an error that its user can put right, 130 after Ctrl-C.
+    """
+    words = sys.argv[1:] if arguments is None else list(arguments)
+    if not words or words[0] in ("-h", "--help"):
+        width = max(map(len, commands))
+        lines = [f"  {name:{width}}  {_line(command)}" for name, command in commands.items()]
+        print("\n".join([f"usage: {prog} COMMAND [--help] ...", "", about, "", *lines]))
+        return 0
+    try:
+        name = next((name for name in commands if words[: len(name.split())] == name.split()), None)
+        if name is None:
+            raise InputError(f"{prog}: got {words[0]!r}, expected one of {', '.join(commands)}")
+        options = words[len(name.split()) :]
+        return finish(name, parse(_load(commands[name]), f"{prog} {name}", options)())
+    except InputError as error:
+        text = str(error)
+    except OSError as error:
+        text = f"{error.filename}: {error.strerror}" if error.filename else str(error)
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    print(f"error: {text}", file=sys.stderr)
+    return ERROR
+
+
+def _line(command: Command) -> str:
+    return command[1] if isinstance(command, tuple) else (inspect.getdoc(command) or "").partition("\n")[0]
+
+
+def _load(command: Command) -> Callable[..., Any]:
+    if not isinstance(command, tuple):
+        return command
+    module, _, name = command[0].partition(":")
+    return getattr(importlib.import_module(module), name)
+
+
+def parse(command: Any, prog: str, arguments: Sequence[str]) -> Callable[[], Any]:
+    """Read the options of a command.
+
+    Args:
+        command: a function or a dataclass. The classmethod `default` of a dataclass, if it has one, makes the
+            options to begin with from the words of the command line.
+        prog: the command as its user calls it.
+        arguments: words of the command line after the command.
+
+    Returns:
+        The command with its options, to be called.
+
+    Raises:
+        InputError: an option is unknown or missing, or has a value that it cannot have.
+    """
+    begin_with = {"default": command.default(arguments)} if hasattr(command, "default") else {}
+    kind = command if inspect.isclass(command) else _later(command)
+    boxes = io.StringIO()
+    try:
+        with _lines_unbroken(arguments), contextlib.redirect_stderr(boxes):
+            return tyro.cli(  # pyright: ignore[reportReturnType, reportCallIssue]
+                kind, prog=prog, args=arguments, config=(tyro.conf.FlagCreatePairsOff,), **begin_with
+            )
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+        raise InputError(_sentence(boxes.getvalue())) from None
+    except ValueError as error:  # a dataclass refuses its values
+        raise InputError(str(error)) from error
+
+
+def _later(function: Callable[..., Any]) -> Callable[..., Callable[[], Any]]:
+    """Return a function that binds options without the call, whose errors are not those of the options."""
+
+    @functools.wraps(function)
+    def bind(*args: Any, **options: Any) -> Callable[[], Any]:
+        return functools.partial(function, *args, **options)
+
+    return bind
+
+
+@contextlib.contextmanager
+def _lines_unbroken(arguments: Sequence[str]) -> Iterator[None]:
+    """Let tyro print messages as wide as they are; help stays as wide as the terminal."""
+    before = os.environ.get("COLUMNS")
+    if not {"-h", "--help"} & set(arguments):
+        os.environ["COLUMNS"] = "100000"
+    try:
+        yield
+    finally:
+        os.environ.pop("COLUMNS", None)
+        if before is not None:
+            os.environ["COLUMNS"] = before
+
+
+def _sentence(boxes: str) -> str:
+    """Return what stands in tyro's box as one line: what is wrong and, in short, what was expected."""
+    parts: list[list[str]] = [[]]
+    for line in boxes.splitlines()[1:]:  # below the title
+        text = _COLOUR.sub("", line).strip(_SIDE)
+        if _RULE.fullmatch(text):
+            parts.append([])
+        elif text:
+            parts[-1].append(text)
+    told = [part for part in parts if part]
+    message = " ".join(told[0])
+    for pattern, plainer in _PLAINER:
+        message = re.sub(pattern, plainer, message)
+    hints = [" ".join(part[:2]) for part in told[1:] if part[0].startswith("Perhaps")]
+    return "; ".join([message, *hints])
+
+
+def _integers(words: list[str]) -> tuple[int, ...]:
+    numbers = words[0].split(",")
+    if not all(number.isdecimal() for number in numbers):
+        raise ValueError(f"got {words[0]!r}, expected whole numbers from 0 with commas between them")
+    return tuple(sorted(set(map(int, numbers))))
+
+
+def listed(read: Callable[[list[str]], tuple], metavar: str) -> PrimitiveConstructorSpec:
+    """Return how an option is read whose value is one word with commas."""
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=metavar,
+        instance_from_str=read,
+        is_instance=lambda value: isinstance(value, tuple),
+        str_from_instance=lambda value: [",".join(map(str, value))],
+    )
+
+
+# Types of options.
+MaybePath = tyro.conf.DisallowNone[Path | None]
+Integers = Annotated[tuple[int, ...], listed(_integers, "N,N,...")]  # different ones, in rising order
+SpecFile = Annotated[
+    MaybePath,
+    tyro.conf.arg(
+        metavar="ARM.toml", help="specification of the arm", help_behavior_hint="(default: the paper's arm)"
+    ),
+]
+
+
+def arm_of(spec: Path | None) -> ArmSpec:
+    """Return the arm of a specification file, or the paper's arm where none is given.
+
+    Raises:
+        SpecError: the file is no specification.
+    """
+    return ArmSpec.default() if spec is None else ArmSpec.from_toml(spec)

@@ -1,0 +1,145 @@
+"""Command lines: options of every kind, and one line on stderr for each mistake."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import pytest
+import tyro
+
+from mjx_softarm._support import cli
+from mjx_softarm._support.errors import InputError
+
+PRESETS = {"small": 1.0, "large": 9.0}
+
+
+@dataclass(frozen=True)
+class Inner:
+    gamma: float = 0.5
+    """discount"""
+    widths: tuple[int, ...] = (2, 3)
+
+    def __post_init__(self):
+        if self.gamma > 1.0:
+            raise ValueError(f"Inner.gamma: got {self.gamma}, expected at most 1")
+
+
+@dataclass(frozen=True)
+class Settings:
+    n: int = 1
+    size: float = 0.0
+    inner: Inner = field(default_factory=Inner)
+
+    def __post_init__(self):
+        if self.n < 1:
+            raise ValueError(f"n: got {self.n}, expected at least 1")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Make:
+    """Make something."""
+
+    preset: Literal["small", "large"] = "small"
+    settings: Annotated[Settings, tyro.conf.arg(name="")] = field(default_factory=Settings)
+    out: cli.MaybePath = None
+    """file to write"""
+
+    @classmethod
+    def default(cls, arguments):
+        return cls(settings=Settings(size=PRESETS["large" if "large" in arguments else "small"]))
+
+    def __call__(self):
+        RESULTS.append(self)
+        return 0
+
+
+def show(
+    files: tyro.conf.Positional[tuple[Path, ...]], seeds: cli.Integers = (0,), strict: bool = False
+) -> int:
+    """Show files.
+
+    Args:
+        files: files to show
+        seeds: seeds of all
+        strict: refuse faults
+    """
+    RESULTS.append((files, seeds, strict))
+    return 3
+
+
+def fail(how: Literal["bug", "input", "file", "interrupt"]) -> int:
+    """Fail."""
+    if how == "file":
+        Path("absent/file").read_text()
+    raise {"bug": ValueError("a bug"), "input": InputError("x: got 1, expected 2")}.get(
+        how, KeyboardInterrupt()
+    )
+
+
+RESULTS = []
+COMMANDS = {"make": Make, "show files": show, "fail": fail, "late": ("absent.module:late", "fail to import")}
+
+
+def run(*words):
+    RESULTS.clear()
+    return cli.main("program", "About it.", COMMANDS, list(words))
+
+
+def test_options_reach_every_level_and_begin_with_the_preset(tmp_path):
+    words = ("--n", "3", "--inner.gamma", "0.9", "--inner.widths", "4", "5", "6", "--out", str(tmp_path))
+    assert run("make", "--preset", "large", *words) == 0
+    made = Make(preset="large", settings=Settings(3, 9.0, Inner(0.9, (4, 5, 6))), out=tmp_path)
+    assert [made] == RESULTS
+    assert run("make") == 0 and RESULTS[0].settings == Settings(size=1.0)
+
+
+def test_functions_of_two_words_get_lists_and_flags():
+    assert run("show", "files", "a", "b", "--seeds", "2,0,2", "--strict") == 3
+    assert [((Path("a"), Path("b")), (0, 2), True)] == RESULTS
+
+
+@pytest.mark.parametrize(
+    "words, message",
+    [
+        ("dance", "program: got 'dance', expected one of make, show files, fail, late"),
+        (
+            "make --inner.gama 1",
+            "Unrecognized options: --inner.gama, 1; Perhaps you meant: --inner.gamma FLOAT",
+        ),
+        ("make --n one", "--n: got 'one', expected a whole number"),
+        ("make --n", "'--n'"),
+        ("make --size wide", "--size: got 'wide', expected a number"),
+        ("make --inner.widths 1 x", "--inner.widths: got ['1', 'x'], expected"),
+        ("make --preset huge", "--preset: got 'huge', expected one of ('small', 'large')"),
+        ("make --n 0", "n: got 0, expected at least 1"),
+        ("make --inner.gamma 2", "Inner.gamma: got 2.0, expected at most 1"),
+        ("make more", "more"),
+        ("show files --seeds 0,a", "--seeds: got '0,a', expected whole numbers"),
+        ("fail", "program fail: got nothing, expected --how {bug,input,file,interrupt}"),
+        ("fail --how input", "x: got 1, expected 2"),
+        ("fail --how file", "absent/file: No such file or directory"),
+    ],
+)
+def test_a_mistake_is_one_line_and_status_2(words, message, capsys):
+    assert run(*words.split()) == 2 and RESULTS == []
+    out, err = capsys.readouterr()
+    assert out == "" and err.startswith("error: ") and message in err and err.count("\n") == 1
+
+
+def test_a_bug_is_not_taken_for_a_mistake_of_the_user():
+    with pytest.raises(ValueError, match="a bug"):
+        run("fail", "--how", "bug")
+    assert run("fail", "--how", "interrupt") == 130
+
+
+def test_help_tells_every_option_and_imports_no_command(capsys):
+    assert run() == run("--help") == 0
+    assert "show files  Show files." in (listed := capsys.readouterr().out) and "fail to import" in listed
+    with pytest.raises(SystemExit, match="0"):
+        run("make", "--help")
+    told = capsys.readouterr().out
+    assert all(
+        text in told for text in ("--inner.gamma FLOAT", "discount", "file to write", "(default: 0.5)")
+    )
