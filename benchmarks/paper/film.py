@@ -1,4 +1,4 @@
-"""Films of a twin: its own model, drawn without a display, beside its path seen from one side."""
+"""Films of a trial: the twin's model, drawn without a display, beside its path seen from one side."""
 
 from __future__ import annotations
 
@@ -8,79 +8,91 @@ from typing import Any, NamedTuple
 import numpy as np
 from PIL import Image, ImageDraw
 
-from benchmarks.paper.measure import Driven
-from benchmarks.paper.stages import Case, Settings, controller
+from benchmarks.paper.jobs import Scene
+from benchmarks.paper.kinds import KINDS, Trial
+from benchmarks.paper.measure import WatchedTwin, captured_finger_tips, finger_tips, operate
+from mjx_softarm.mechanics.pipe import PIPES_MM, CrossPipe
 
 WIDTH, HEIGHT = 240, 320  # of each half [px]
-EVERY_S = 1.0  # of the twin's time between two pictures
+PERIOD_S = 1.0  # simulated time between two pictures
 MAX_FRAMES = 120
 FRAME_MS = 80
 N_COLOURS = 128
 INK, GREY, BLUE, ORANGE = (34, 34, 34), (154, 160, 166), (31, 111, 180), (224, 123, 40)
 
 
-class Side(NamedTuple):
-    """What is drawn beside the pictures."""
+class SideView(NamedTuple):
+    """Drawing beside the pictures."""
 
     title: str
     text: str
-    axes: tuple[int, int]  # of x, y, z: which is to the right, and which upwards
+    axes: tuple[int, int]  # of x, y, z: the one to the right, and the one upwards
     goals_mm: np.ndarray  # (p, 3)
     lines_mm: tuple[np.ndarray, ...] = ()  # (k, 2) each, along these axes
 
 
-class Film:
-    """Pictures of a twin, taken now and then as it is driven, and where motion capture saw it then."""
+class Camera:
+    """Pictures of a twin at equal times as it is driven, with what motion capture saw then."""
 
     def __init__(self, twin: Any, renderer: Any):
         self._twin, self._renderer, self._next_s = twin, renderer, 0.0
         self.pictures: list[np.ndarray] = []
         self.seen: list[Any] = []
 
-    def take(self) -> None:
-        """Take one, if it is time to."""
+    def shoot(self) -> None:
+        """Take a picture, if it is time to."""
         if self._twin.time_s >= self._next_s:
-            self._next_s += EVERY_S
+            self._next_s += PERIOD_S
             self.pictures.append(self._twin.draw(self._renderer))
             self.seen.append(self._twin.motion_capture())
 
 
-def film_circle(folder: Path, settings: Settings) -> str:
-    """Write `circle.gif`, once around with S2R on the first twin; returns why it cannot be drawn, or ""."""
-    from mjx_softarm.deploy.session import follow
-    from mjx_softarm.mechanics.render import RenderError
-    from mjx_softarm.mechanics.workspace import circle_poses
-    from mjx_softarm.twin.arm import EVALUATION_SESSION, Twin
+def film_scene(path: Path, scene: Scene, trial: Trial) -> None:
+    """Write the film of a trial: its pipe cut open from the front, or the circle from above.
 
-    path = folder / "circle.gif"
-    if path.exists():
-        return ""
-    case = Case("with", settings.twins[0], settings.seeds[0])
-    goals = circle_poses(settings.n_points).astype(float)
-    twin = Twin(case.twin, session=EVALUATION_SESSION)
-    try:
-        with twin.renderer(WIDTH, HEIGHT) as renderer:
-            film = Film(twin, renderer)
-            follow(Driven(twin, film.take), controller(folder, case), goals)
-    except RenderError as error:
-        return str(error)
-    text = "reference (grey) and tip, from above"
-    side = Side(f"twin {case.twin}, with S2R", text, (0, 1), goals[:, :3])
-    write_gif(path, frames(film.pictures, 1e3 * np.array([seen.tip_m for seen in film.seen]), side))
-    return ""
+    Raises:
+        RenderError: there is no OpenGL.
+    """
+    with scene.twin.renderer(WIDTH, HEIGHT) as renderer:
+        camera = Camera(scene.twin, renderer)
+        operate(WatchedTwin(scene.twin, camera.shoot), *scene[1:], trial.objects)
+    diameter_mm = PIPES_MM.get(KINDS[trial.kind].task)
+    gripper_m = scene.controller.policy.spec.mass.gripper_length_m if diameter_mm else 0.0
+    path_mm = 1e3 * np.array(
+        [captured_finger_tips(seen.tip_m, seen.tip_quaternion, gripper_m) for seen in camera.seen]
+    )
+    goals_mm = 1e3 * finger_tips(scene.goals, gripper_m)
+    if diameter_mm:
+        lines, title = outline_mm(CrossPipe.of_mm(diameter_mm)), f"twin {trial.twin}, {diameter_mm} mm pipe"
+        side = SideView(title, "demonstrated (grey), finger tips", (0, 2), goals_mm, tuple(lines))
+    else:
+        title = f"twin {trial.twin}, {KINDS[trial.kind].title}"
+        side = SideView(title, "reference (grey) and tip, from above", (0, 1), goals_mm)
+    write_gif(path, frames(camera.pictures, path_mm, side))
 
 
-def frames(pictures: list[np.ndarray], path_mm: np.ndarray, side: Side) -> list[Image.Image]:
-    """At most `MAX_FRAMES` of the pictures, spread evenly, each beside the path (n, 3) up to then."""
+def outline_mm(pipe: CrossPipe) -> list[np.ndarray]:
+    """Return the cross from the front: lines (k, 2) of x and z [mm]."""
+    r, far, z = pipe.radius_m, pipe.branch_m, pipe.centre_z_m
+    lines = []
+    for side in (-1.0, 1.0):
+        lines.append([(side * r, pipe.top_z_m), (side * r, z + r), (side * far, z + r)])
+        lines.append([(side * far, z - r), (side * r, z - r), (side * r, z - far)])
+    return [1e3 * np.array(line) for line in lines]
+
+
+def frames(pictures: list[np.ndarray], path_mm: np.ndarray, side: SideView) -> list[Image.Image]:
+    """Return at most `MAX_FRAMES` pictures, evenly spread, each beside the path (n, 3) up to its time."""
     chosen = np.unique(np.linspace(0, len(pictures) - 1, min(MAX_FRAMES, len(pictures))).round().astype(int))
     return [_frame(pictures[k], path_mm[: k + 1], side) for k in chosen]
 
 
-def _frame(picture: np.ndarray, path_mm: np.ndarray, side: Side) -> Image.Image:
+def _frame(picture: np.ndarray, path_mm: np.ndarray, side: SideView) -> Image.Image:
     height, width, _ = picture.shape
     frame = Image.new("RGB", (2 * width, height), (255, 255, 255))
     frame.paste(Image.fromarray(picture), (0, 0))
     pen = ImageDraw.Draw(frame)
+    # Scale so that goals and lines fill 80 % of the right half.
     axes = list(side.axes)
     shown = np.concatenate([side.goals_mm[:, axes], *side.lines_mm])
     low, high = shown.min(axis=0), shown.max(axis=0)
@@ -95,19 +107,14 @@ def _frame(picture: np.ndarray, path_mm: np.ndarray, side: Side) -> Image.Image:
     pen.text((width + 8, 8), side.title, fill=INK)
     pen.text((width + 8, 22), side.text, fill=GREY)
     for goal in side.goals_mm[:, axes]:
-        _dot(pen, at(goal), 2, GREY)
+        pen.circle(at(goal), 2, fill=GREY)
     pen.line([at(point) for point in path_mm[:, axes]], fill=BLUE, width=1)
-    _dot(pen, at(path_mm[-1, axes]), 4, ORANGE)
+    pen.circle(at(path_mm[-1, axes]), 4, fill=ORANGE)
     return frame
 
 
-def _dot(pen: ImageDraw.ImageDraw, centre: tuple[float, float], radius: float, colour: Any) -> None:
-    x, y = centre
-    pen.ellipse((x - radius, y - radius, x + radius, y + radius), fill=colour)
-
-
 def write_gif(path: Path, images: list[Image.Image]) -> None:
-    """Write a film that repeats, in one palette for all of its frames."""
+    """Write a film that repeats, with one palette for all its frames."""
     palette = images[len(images) // 2].quantize(N_COLOURS, Image.Quantize.MAXCOVERAGE)
     first, *others = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images)
     part = path.with_name(path.name + ".part")

@@ -1,12 +1,16 @@
-"""What a run around the circle gave: errors by motion capture at each arrival, saturation, traces.
+"""A trial on a twin and its outcome: errors by motion capture, saturation, contact forces, objects moved.
 
 Motion capture is noisy: an error is the mean over the window in which the springs had settled.
+
+Whether an object is taken depends on where the finger tips are when the loop reports an arrival: near enough
+to the object, the twin gets its weight, else the object stays. An object released near enough to a
+container's place lies where the finger tips were; else it has fallen beside the container and is lost.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,35 +19,56 @@ import numpy as np
 from mjx_softarm.control import saturated
 from mjx_softarm.deploy import faults
 from mjx_softarm.deploy.loop import Controller
-from mjx_softarm.deploy.session import Run
-from mjx_softarm.sensing.pose import pose_error, pose_from_quaternion
+from mjx_softarm.deploy.session import Run, follow
+from mjx_softarm.mechanics.pipe import APPLE_KG, BALL_KG
+from mjx_softarm.sensing.pose import (
+    frame_from_pose,
+    pose_error,
+    pose_from_quaternion,
+    rotation_from_quaternion,
+)
 from mjx_softarm.sensing.sensors import length_from_frequency
 
-AT_LIMIT_KPA = 0.1  # from a limit, of a window's mean of measured pressures
-TRACE_S = 0.5  # between the rows of a trace
+AT_LIMIT_KPA = 0.1  # distance to a pressure limit that counts as at it, for a window's mean
+GRASP_M = 0.02  # finger tips to the object's middle: the jaws open 40 mm
+PLACE_M = 0.04  # finger tips to the middle of a container
+CALM_N = 1.0  # contact force that counts as none
+# Masses in the containers when a task begins: the one picked first, then the one picked second.
+OBJECTS_KG = {"as shown": (BALL_KG, APPLE_KG), "exchanged": (APPLE_KG, BALL_KG)}
 
 
-class Followed(NamedTuple):
-    """A run over p points, of an arm with n springs; what was not reached is NaN."""
+class Outcome(NamedTuple):
+    """Outcome of a trial with p goals and t ticks, on an arm with n springs; NaN where a goal was missed."""
 
-    goal: Any  # (p, 6) [mm, deg]
-    error: Any  # (p, 6) [mm, deg] of the tip by motion capture
-    believed: Any  # (p, 6) [mm, deg] pose that the loop believed in, less the goal
-    saturated: Any  # (p, n) chambers at a limit with their springs off the references, at the arrivals
-    events: Any  # (faults,) how often the loop told each of `faults.Fault`
-    latency_s: Any  # (2,) median and 99.9 % of a tick's computing
-    time_s: Any  # (k,) of the trace
-    point: Any  # (k,) index of the goal, -1 without one
-    reference_m: Any  # (k, n)
-    spring_m: Any  # (k, n) as read
-    pressure_kpa: Any  # (k, n) as measured
+    goal: np.ndarray  # (p, 6) [mm, deg]
+    name: np.ndarray  # (p,) text, such as "pick left"
+    error: np.ndarray  # (p, 6) [mm, deg] of the tip by motion capture
+    believed: np.ndarray  # (p, 6) [mm, deg] pose that the loop estimated, less the goal
+    saturated: np.ndarray  # (p, n) bool: chamber at a limit with its spring off the reference, on arrival
+    success: np.ndarray  # (p,) bool: an object was picked or placed
+    arrival_s: np.ndarray  # (p,)
+    events: np.ndarray  # (faults,) how often the loop reported each of `faults.Fault`
+    latency_s: np.ndarray  # (2,) median and 99.9 % of a tick's computing time
+    time_s: np.ndarray  # (t,)
+    point: np.ndarray  # (t,) index of the goal, -1 without one
+    reference_m: np.ndarray  # (t, n)
+    spring_m: np.ndarray  # (t, n) as read
+    pressure_kpa: np.ndarray  # (t, n) as measured
+    finger_m: np.ndarray  # (t, 3) finger tips by motion capture
+    wall_n: np.ndarray  # (t,) contact force of the walls, the largest within each tick
+    container_n: np.ndarray  # (t,) contact force of the containers
+
+    @property
+    def operation(self) -> np.ndarray:
+        """Mask (p,) of the goals at which an object is to be picked or placed."""
+        return np.char.startswith(self.name, "pick") | np.char.startswith(self.name, "place")
 
 
-class Driven:
-    """A twin of which something is noted each time it was driven; else the twin itself."""
+class WatchedTwin:
+    """A twin that calls a function each time it has been driven."""
 
-    def __init__(self, twin: Any, note: Callable[[], None]):
-        self._twin, self._note = twin, note
+    def __init__(self, twin: Any, on_driven: Callable[[], None]):
+        self._twin, self._on_driven = twin, on_driven
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._twin, name)
@@ -55,26 +80,101 @@ class Driven:
     def write_pressures(self, pressure_kpa: np.ndarray) -> None:
         """Drive the twin; see `ArmIO`."""
         self._twin.write_pressures(pressure_kpa)
-        self._note()
+        self._on_driven()
 
 
-def measure(run: Run, controller: Controller, goals: np.ndarray) -> Followed:
-    """Errors, saturation and traces of a run towards goals (p, 6) [mm, deg]."""
+class Gripper:
+    """The gripper of a twin, and the objects in the containers.
+
+    Objects lie where the demonstrations have the finger tips as they pick them, `goals_m` (p, 3).
+    """
+
+    def __init__(self, arm: Any, names: Sequence[str], goals_m: np.ndarray, objects: str, gripper_m: float):
+        self._arm, self._names, self._goals_m, self._gripper_m = arm, names, goals_m, gripper_m
+        picks = [k for k, name in enumerate(names) if name.startswith("pick")]
+        masses_kg = OBJECTS_KG.get(objects, ())
+        self._lying = {
+            _container(names[k]): (goals_m[k], kg) for k, kg in zip(picks, masses_kg, strict=False)
+        }
+        self._held_kg: float | None = None
+        self.success = np.zeros(len(names), bool)
+
+    def arrived(self, k: int) -> None:
+        """Pick or place, if that is what goal k is for."""
+        operation, container = self._names[k].split(" ")[0], _container(self._names[k])
+        if operation == "pick" and self._held_kg is None and container in self._lying:
+            object_m, kg = self._lying[container]
+            if np.linalg.norm(self.finger_m() - object_m) <= GRASP_M:
+                del self._lying[container]
+                self._held_kg, self.success[k] = kg, True
+                self._arm.attach(kg)
+        elif operation == "place" and self._held_kg is not None:
+            finger_m = self.finger_m()
+            if np.linalg.norm(finger_m - self._goals_m[k]) <= PLACE_M:
+                self._lying[container], self.success[k] = (finger_m, self._held_kg), True
+            self._held_kg = None
+            self._arm.release()
+
+    def finger_m(self) -> np.ndarray:
+        """Return the finger tips (3,) [m] by motion capture."""
+        seen = self._arm.motion_capture()
+        return captured_finger_tips(seen.tip_m, seen.tip_quaternion, self._gripper_m)
+
+
+def _container(name: str) -> str:
+    return name.split(" ")[-1]
+
+
+def finger_tips(pose: np.ndarray, gripper_m: float) -> np.ndarray:
+    """Return the finger tips (..., 3) [m] of poses (..., 6) [mm, deg]."""
+    position_m, rotation = frame_from_pose(pose)
+    return position_m - gripper_m * rotation[..., 2]
+
+
+def captured_finger_tips(tip_m: np.ndarray, quaternion: np.ndarray, gripper_m: float) -> np.ndarray:
+    """Return the finger tips (..., 3) [m] of tips (..., 3) [m] with quaternions (..., 4)."""
+    return tip_m - gripper_m * rotation_from_quaternion(quaternion)[..., 2]
+
+
+def operate(
+    twin: Any, controller: Controller, goals: np.ndarray, names: Sequence[str], objects: str = ""
+) -> Outcome:
+    """Follow goals (p, 6) [mm, deg], picking and placing as their names say."""
+    gripper_m = controller.policy.spec.mass.gripper_length_m
+    forces: list[tuple[float, float]] = []
+    watched = WatchedTwin(twin, lambda: forces.append(twin.wall_force_n()))
+    gripper = Gripper(watched, names, finger_tips(goals, gripper_m), objects, gripper_m)
+    run = follow(watched, controller, goals, arrived=gripper.arrived)
+    force_n = np.zeros((len(run.log), 2))
+    force_n[: len(forces)] = forces  # an arm that is lost takes no more pressures
+    return measure(run, controller, goals)._replace(
+        name=np.array(names),
+        success=gripper.success,
+        wall_n=force_n[:, 0].astype(np.float32),
+        container_n=force_n[:, 1].astype(np.float32),
+    )
+
+
+def measure(run: Run, controller: Controller, goals: np.ndarray) -> Outcome:
+    """Return the outcome of a run towards goals (p, 6) [mm, deg], without objects and contact forces."""
     log, policy, window = run.log, controller.policy, controller.window
     assert log.pressure_kpa is not None and log.reference_m is not None and log.goal is not None
+    assert log.tip_m is not None and log.tip_quaternion is not None  # a twin has motion capture
     spring_m = length_from_frequency(log.frequency_hz, policy.sensor, np.nan).length_m
     seen = pose_from_quaternion(log.tip_m, log.tip_quaternion)
     error, believed = np.full((2, *goals.shape), np.nan)
-    mask = np.zeros((len(goals), policy.spec.n_chambers), bool)
+    mask, arrival_s = np.zeros((len(goals), policy.spec.n_chambers), bool), np.full(len(goals), np.nan)
     gains = policy.gains._replace(
         pressure_min_kpa=policy.gains.pressure_min_kpa + AT_LIMIT_KPA,
         pressure_max_kpa=policy.gains.pressure_max_kpa - AT_LIMIT_KPA,
     )
+    # Means over the window that ends with each arrival.
     for arrival in run.arrivals:
-        point = point_of(arrival.goal, goals)
+        point = _point_of(arrival.goal, goals)
         rows = slice(max(0, arrival.row + 1 - window), arrival.row + 1)
         error[point] = pose_error(seen[rows], arrival.goal).mean(axis=0)
         believed[point] = pose_error(np.asarray(arrival.estimate, float), arrival.goal)
+        arrival_s[point] = log.time_s[arrival.row]
         mask[point] = saturated(
             log.pressure_kpa[rows].mean(axis=0),
             log.reference_m[arrival.row],
@@ -83,91 +183,79 @@ def measure(run: Run, controller: Controller, goals: np.ndarray) -> Followed:
             faults.TOLERANCE_M,
         )
     counts = run.counts()
-    every = slice(None, None, max(1, round(TRACE_S / controller.dt_s)))
-    return Followed(
+    finger_m = captured_finger_tips(log.tip_m, log.tip_quaternion, policy.spec.mass.gripper_length_m)
+    return Outcome(
         goal=goals,
+        name=np.full(len(goals), ""),
         error=error,
         believed=believed,
         saturated=mask,
+        success=np.zeros(len(goals), bool),
+        arrival_s=arrival_s,
         events=np.array([counts.get(fault, 0) for fault in faults.Fault]),
         latency_s=np.quantile(run.latency_s, (0.5, 0.999)),
-        time_s=log.time_s[every],
-        point=np.array([point_of(goal, goals) for goal in log.goal[every]]),
-        reference_m=log.reference_m[every],
-        spring_m=spring_m[every],
-        pressure_kpa=log.pressure_kpa[every],
+        time_s=log.time_s,
+        point=np.array([_point_of(goal, goals) for goal in log.goal]),
+        reference_m=log.reference_m.astype(np.float32),
+        spring_m=spring_m.astype(np.float32),
+        pressure_kpa=log.pressure_kpa.astype(np.float32),
+        finger_m=finger_m.astype(np.float32),
+        wall_n=np.zeros(len(log), np.float32),
+        container_n=np.zeros(len(log), np.float32),
     )
 
 
-def point_of(goal: np.ndarray, goals: np.ndarray) -> int:
-    """Index of a goal among the goals (p, 6); -1 where there is none."""
+def _point_of(goal: np.ndarray, goals: np.ndarray) -> int:
+    """Return the index of a goal among goals (p, 6); -1 where there is none."""
     return -1 if np.isnan(goal).any() else int(np.argmin(np.abs(goals - goal).sum(axis=1)))
 
 
-def save_followed(path: Path, followed: Followed) -> None:
-    """Write a result whole or not at all."""
-    save_arrays(path, followed._asdict())
-
-
-def load_followed(path: Path) -> Followed:
-    """The result that `save_followed` wrote."""
-    return Followed(**load_arrays(path, Followed._fields))
-
-
-def save_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
-    """Write arrays by name as npz, whole or not at all."""
+def save_outcome(path: Path, outcome: Outcome) -> None:
+    """Write an outcome whole or not at all."""
     part = path.with_name(path.name + ".part")
     try:
         with part.open("wb") as file:
-            np.savez_compressed(file, **arrays)
+            np.savez_compressed(file, **outcome._asdict())
         os.replace(part, path)
     finally:
         part.unlink(missing_ok=True)
 
 
-def load_arrays(path: Path, names: Iterable[str]) -> dict[str, Any]:
-    """Arrays of those names that `save_arrays` wrote."""
+def load_outcome(path: Path) -> Outcome:
+    """Read the outcome that `save_outcome` wrote."""
     with np.load(path) as file:
-        return {name: file[name] for name in names}
+        return Outcome(**{name: file[name] for name in Outcome._fields})
 
 
-def figures(followed: Followed) -> dict[str, Any]:
-    """The figures of one run that stand in tables, over the points that were reached."""
-    n_reached, error = reached(followed.error)
+def figures(outcome: Outcome) -> dict[str, Any]:
+    """Return the figures of one trial; errors over the goals that were reached, NaN without any."""
+    reached = np.isfinite(outcome.error).all(axis=1)
+    n_reached = int(reached.sum())
+    error, believed = (
+        values[reached] if n_reached else np.full((1, 6), np.nan)
+        for values in (outcome.error, outcome.believed)
+    )
     away = np.linalg.norm(error[:, :3], axis=1)
-    yaw, pitch, roll = np.abs(error[:, 3:]).mean(axis=0)
-    per_point = followed.saturated.sum(axis=1)
-    events = told(followed.events)
+    per_point = outcome.saturated.sum(axis=1)
+    events = {f.value: int(n) for f, n in zip(faults.Fault, outcome.events, strict=True) if n}
+    names = ("x_mm", "y_mm", "z_mm", "yaw_deg", "pitch_deg", "roll_deg")
     return {
-        "points": len(followed.goal),
+        "points": len(outcome.goal),
         "reached": n_reached,
         "translation_mm": float(away.mean()),
         "rmse_mm": float(np.sqrt(np.mean(away**2))),
         "max_mm": float(away.max()),
-        "yaw_deg": float(yaw),
-        "pitch_deg": float(pitch),
-        "roll_deg": float(roll),
-        "believed_mm": _believed_mm(followed),
+        **dict(zip(names, np.abs(error).mean(axis=0).tolist(), strict=True)),
+        "believed_mm": float(np.linalg.norm(believed[:, :3], axis=1).mean()),
         "saturated_points": int(np.count_nonzero(per_point)),
         "saturated_chambers_max": int(per_point.max()),
         "saturation_events": events.get(faults.Fault.SATURATED.value, 0),
+        "operations": int(outcome.operation.sum()),
+        "done": int(outcome.success.sum()),
+        "calm_percent": 100 * float(np.mean(outcome.wall_n < CALM_N)),
+        "wall_max_n": float(outcome.wall_n.max()),
+        "container_max_n": float(outcome.container_n.max()),
         "events": events,
-        "seconds": float(followed.time_s[-1]),
-        "latency_ms": [round(1e3 * float(value), 3) for value in followed.latency_s],
+        "seconds": float(outcome.time_s[-1]),
+        "latency_ms": [round(1e3 * float(value), 3) for value in outcome.latency_s],
     }
-
-
-def reached(error: np.ndarray) -> tuple[int, np.ndarray]:
-    """How many of the points were reached, and their rows of the errors (p, 6); without any, a row of NaN."""
-    rows = error[np.isfinite(error).all(axis=1)]
-    return len(rows), rows if len(rows) else np.full((1, error.shape[1]), np.nan)
-
-
-def told(events: np.ndarray) -> dict[str, int]:
-    """How often the loop told each fault (faults,) that it told at all, by name."""
-    return {fault.value: int(n) for fault, n in zip(faults.Fault, events, strict=True) if n}
-
-
-def _believed_mm(followed: Followed) -> float:
-    away = np.linalg.norm(followed.believed[:, :3], axis=1)
-    return float(away[np.isfinite(away)].mean()) if np.isfinite(away).any() else float("nan")

@@ -1,131 +1,190 @@
-"""The pictures of the open-space experiments, in the paper's form."""
+"""Pictures of the experiments, in the paper's form."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.figure import Figure
 
-from benchmarks.paper.measure import Followed
-from benchmarks.paper.stages import METHODS, Case
-from benchmarks.paper.summary import PAPER_LOADS_MM
-from train.runs.plots import BLUE, GREY, INK, ORANGE, dress
+from benchmarks.paper.film import outline_mm
+from benchmarks.paper.kinds import KINDS, Trial
+from benchmarks.paper.measure import CALM_N, Outcome, finger_tips
+from benchmarks.paper.summary import PAPER_LOADS_MM, SUCCESS, Results, Row, Training
+from mjx_softarm.mechanics.pipe import PIPES_MM, CrossPipe
+from mjx_softarm.spec import ArmSpec
+from train.runs.plots import BLUE, GREY, INK, ORANGE, STEPS, dress
 
-COLOURS = {"without": ORANGE, "with": BLUE, "gradient": "#2a9d6f"}
-RED = "#c43333"
+GREEN, RED = "#2a9d6f", "#c43333"
 N_PER_SECTION = 3
+TRACE_S = 0.5  # between the drawn ticks of a trace
+LEAST_N = 0.1  # lower end of the forces' axis
+SEEN_Z_MM = (-880.0, -330.0)  # part of the pipe that is drawn, around its crossing
+LOSSES = ("tqc/critic_loss", "tqc/actor_loss", "gail/discriminator_loss")
 
-Results = Mapping[Case, Followed]
+Outcomes = Mapping[Trial, Outcome]
+Style = tuple[str, str]  # label and colour
+OPEN_STYLES: Mapping[str, Style] = {
+    "without": (KINDS["without"].title, ORANGE),
+    "with": (KINDS["with"].title, BLUE),
+    "gradient": (KINDS["gradient"].title, GREEN),
+}
+CIRCLE_STYLES: Mapping[str, Style] = {
+    "with": ("without demonstrations", ORANGE),
+    "circle": (KINDS["circle"].title, BLUE),
+}
 
 
-def circle_figure(results: Results) -> Figure:
-    """The circle from above, reference and paths of each method: a panel for each twin, its first seed.
+# --- Helpers -----------------------------------------------------------------------------------------------
+
+
+def _band(
+    panel: Any, x: np.ndarray, line: np.ndarray, low: np.ndarray, high: np.ndarray, style: Style
+) -> None:
+    """Draw a line (k,) with the band between two others."""
+    label, colour = style
+    panel.fill_between(x, low, high, color=colour, alpha=0.15, linewidth=0)
+    panel.plot(x, line, color=colour, label=label, linewidth=1.5)
+
+
+def _range_band(panel: Any, lines: np.ndarray, style: Style) -> None:
+    """Draw mean and range over runs (runs, p) at each goal, over those that reached it."""
+    known = np.ma.masked_invalid(lines)
+    mean, low, high = (np.ma.filled(f(axis=0), np.nan) for f in (known.mean, known.min, known.max))
+    _band(panel, np.arange(lines.shape[1]), mean, low, high, style)
+
+
+def _deviation_band(panel: Any, steps: np.ndarray, lines: np.ndarray, style: Style) -> None:
+    """Draw mean and standard deviation over runs (runs, k)."""
+    mean, deviation = lines.mean(axis=0), lines.std(axis=0)
+    _band(panel, steps, mean, mean - deviation, mean + deviation, style)
+
+
+def _mark_operations(panel: Any, outcome: Outcome, x: np.ndarray, named: bool = True) -> None:
+    """Draw a dotted line at each operation that has a place x (p,), with its name above the panel."""
+    for k in np.flatnonzero(outcome.operation & np.isfinite(x)):
+        panel.axvline(x[k], color=GREY, linestyle=":", linewidth=1.0)
+        if named:
+            at, style = ("data", "axes fraction"), {"ha": "center", "fontsize": 7, "color": GREY}
+            panel.annotate(
+                str(outcome.name[k]),
+                (x[k], 1.0),
+                xycoords=at,
+                xytext=(0, 2),
+                textcoords="offset points",
+                **style,
+            )
+    if named:  # the title stands above the names
+        panel.set_title(panel.get_title(loc="left"), loc="left", fontsize=10, color=INK, pad=14)
+
+
+def _select(outcomes: Outcomes, kind: str, variant: str) -> list[Outcome]:
+    return [outcome for trial, outcome in outcomes.items() if (trial.kind, trial.variant) == (kind, variant)]
+
+
+# --- Circle and loads --------------------------------------------------------------------------------------
+
+
+def circle_figure(outcomes: Outcomes, styles: Mapping[str, Style]) -> Figure:
+    """Draw the circle from above, reference and path of each kind: a panel for each twin, its first seed.
 
     Points at which a chamber is saturated are ringed.
     """
-    twins = sorted({case.twin for case in results})
-    seed = min(case.seed for case in results)
-    figure = Figure(figsize=(4.0 * len(twins) + 0.4, 3.9), layout="constrained")
+    chosen = {t: outcome for t, outcome in outcomes.items() if t.kind in styles and not t.load_g}
+    twins, seed = sorted({trial.twin for trial in chosen}), min(trial.seed for trial in chosen)
+    figure = Figure(figsize=(4.0 * len(twins) + 0.4, 4.5), layout="compressed")
     panels = figure.subplots(1, len(twins), squeeze=False, sharex=True, sharey=True)[0]
     for panel, twin in zip(panels, twins, strict=True):
         dress(panel, f"twin {twin}, from above", "x [mm]", "y [mm]")
-        for method, name in METHODS.items():
-            followed = results[Case(method, twin, seed)]
-            tip = followed.goal + followed.error
-            if method == "without":
-                plot_around(panel, followed.goal, "--", color=INK, linewidth=1.2, label="reference")
-            plot_around(panel, tip, "o-", color=COLOURS[method], linewidth=1.0, markersize=3.0, label=name)
-            hit = tip[followed.saturated.any(axis=1)]
-            ring = {"color": RED, "markersize": 7.0, "fillstyle": "none", "linestyle": "none"}
-            label = "a chamber saturated" if method == list(METHODS)[-1] else None
-            panel.plot(hit[:, 0], hit[:, 1], "o", label=label, **ring)
         panel.set_aspect("equal")
-    panels[0].legend(frameon=False, loc="center", fontsize=8)
+        here = {trial.kind: outcome for trial, outcome in chosen.items() if trial[1:3] == (twin, seed)}
+        goal = next(iter(here.values())).goal
+        panel.plot(*_closed(goal), "--", color=INK, linewidth=1.2, label="reference")
+        for kind, (label, colour) in styles.items():
+            tip = here[kind].goal + here[kind].error
+            panel.plot(*_closed(tip), "o-", color=colour, linewidth=1.0, markersize=3.0, label=label)
+        hit = np.concatenate([(run.goal + run.error)[run.saturated.any(axis=1)] for run in here.values()])
+        ring = {"color": RED, "markersize": 7.0, "fillstyle": "none", "linestyle": "none"}
+        panel.plot(hit[:, 0], hit[:, 1], "o", label="a chamber saturated", **ring)
+    figure.legend(*panels[0].get_legend_handles_labels(), frameon=False, loc="outside lower center", ncols=5)
     return figure
 
 
-def plot_around(panel: Any, pose: np.ndarray, line: str, **style: Any) -> None:
-    """Poses (p, 6) [mm, deg] from above, the last joined with the first."""
-    closed = np.vstack([pose, pose[:1]])
-    panel.plot(closed[:, 0], closed[:, 1], line, **style)
+def _closed(pose: np.ndarray) -> np.ndarray:
+    """Return x and y (2, p + 1) of poses (p, 6), the last joined with the first."""
+    return np.vstack([pose, pose[:1]])[:, :2].T
 
 
-def error_figure(results: Results) -> Figure:
-    """Errors at each point of the unloaded circle: mean over the runs, and their range."""
+def error_figure(outcomes: Outcomes) -> Figure:
+    """Draw errors at each point of the unloaded circle: mean over the runs, and their range."""
     figure = Figure(figsize=(11, 5.6), layout="constrained")
     panels = figure.subplots(2, 2).ravel()
-    titles = ("translation", "yaw", "pitch", "roll")
-    for k, (panel, title) in enumerate(zip(panels, titles, strict=True)):
+    for k, (panel, title) in enumerate(zip(panels, ("translation", "yaw", "pitch", "roll"), strict=True)):
         dress(panel, f"{title} error", "point", "deg" if k else "mm")
-        for method, name in METHODS.items():
-            runs = [item for case, item in results.items() if case.method == method and case.load_g == 0]
-            error = np.array([run.error for run in runs])  # (runs, p, 6)
+        for kind, style in OPEN_STYLES.items():
+            error = np.array([run.error for run in _select(outcomes, kind, "0 g")])  # (runs, p, 6)
             size = np.abs(error[..., 2 + k]) if k else np.linalg.norm(error[..., :3], axis=-1)
-            at = np.arange(size.shape[1])
-            panel.fill_between(at, size.min(axis=0), size.max(axis=0), color=COLOURS[method], alpha=0.15)
-            panel.plot(at, size.mean(axis=0), color=COLOURS[method], label=name, linewidth=1.5)
+            _range_band(panel, size, style)
         panel.set_ylim(bottom=0)
     panels[0].legend(frameon=False, fontsize=8)
     return figure
 
 
-def loads_figure(table: Sequence[Mapping[str, Any]]) -> Figure:
-    """Translation error over the load, with S2R: each run's mean and largest; saturated points beside it."""
-    rows = [row for row in table if row["method"] == "with"]
-    loads = sorted({row["load_g"] for row in rows})
+def loads_figure(table: Sequence[Row]) -> Figure:
+    """Draw each run's mean and largest translation error over the load, with S2R, and saturated points."""
+    rows = [row for row in table if row["kind"] == "with"]
     figure = Figure(figsize=(9, 3.8), layout="constrained")
     left, right = figure.subplots(1, 2)
     dress(left, "translation error with S2R", "load [g]", "mm")
     dress(right, "saturated chambers", "load [g]", "points of the circle")
-    for name, colour, label in (
-        ("translation_mm", BLUE, "mean of the circle"),
-        ("max_mm", GREY, "largest"),
-    ):
-        _dots(left, rows, loads, name, colour, label)
-    _dots(right, rows, loads, "saturated_points", RED, "a chamber saturated")
+    _dots(left, rows, "translation_mm", ("mean of the circle", BLUE))
+    _dots(left, rows, "max_mm", ("largest", GREY))
+    _dots(right, rows, "saturated_points", ("a chamber saturated", RED))
     left.axhline(PAPER_LOADS_MM, color=INK, linestyle=":", linewidth=1, label="paper's arm, 35 to 500 g")
+    right.yaxis.get_major_locator().set_params(integer=True)
     for panel in (left, right):
-        panel.set_xticks(loads, [str(load) for load in loads], rotation=60)
+        panel.set_xticks(sorted({row["load_g"] for row in rows}))
+        panel.tick_params("x", rotation=60)
         panel.set_ylim(bottom=0)
         panel.legend(frameon=False, fontsize=8)
     return figure
 
 
-def _dots(panel: Any, rows, loads: Sequence[int], name: str, colour: str, label: str) -> None:
-    """Every run as a dot, and a line through the means."""
-    values = [[row[name] for row in rows if row["load_g"] == load] for load in loads]
-    for load, runs in zip(loads, values, strict=True):
-        panel.plot([load] * len(runs), runs, "o", color=colour, markersize=3, alpha=0.5)
-    panel.plot(loads, [np.mean(runs) for runs in values], color=colour, label=label)
+def _dots(panel: Any, rows: Sequence[Row], name: str, style: Style) -> None:
+    """Draw every run as a dot at its load, and a line through the means."""
+    label, colour = style
+    loads = sorted({row["load_g"] for row in rows})
+    means = [np.mean([row[name] for row in rows if row["load_g"] == load]) for load in loads]
+    at, values = [row["load_g"] for row in rows], [row[name] for row in rows]
+    panel.plot(at, values, "o", color=colour, markersize=3, alpha=0.5)
+    panel.plot(loads, means, color=colour, label=label)
 
 
-def trace_figure(followed: Followed, limits_kpa: tuple[float, float]) -> Figure:
-    """Spring lengths against their references, and pressures with their limits, section by section.
+def trace_figure(outcome: Outcome, limits_kpa: tuple[float, float]) -> Figure:
+    """Draw spring lengths against their references, and pressures with their limits, section by section.
 
-    Where a chamber is saturated at an arrival, its point is shaded.
+    Where a chamber is saturated on arrival, its point is shaded.
     """
-    n_sections = followed.spring_m.shape[1] // N_PER_SECTION
+    n_sections = outcome.spring_m.shape[1] // N_PER_SECTION
+    every = slice(None, None, max(1, round(TRACE_S / float(outcome.time_s[1] - outcome.time_s[0]))))
+    time_s, point = outcome.time_s[every], outcome.point[every]
     figure = Figure(figsize=(12, 5.6), layout="constrained")
     panels = figure.subplots(2, n_sections, sharex=True, squeeze=False)
     for section in range(n_sections):
         upper, lower = panels[:, section]
-        dress(upper, f"section {section + 1}: springs, dashed as asked", "", "mm")
+        dress(upper, f"section {section + 1}: springs, references dashed", "", "mm")
         dress(lower, "pressures, limits dashed", "time [s]", "kPa")
-        for k in range(N_PER_SECTION):
-            chamber = section * N_PER_SECTION + k
-            colour = colormaps["tab10"](chamber)
-            reference_mm, spring_mm = 1e3 * followed.reference_m, 1e3 * followed.spring_m
-            upper.plot(followed.time_s, reference_mm[:, chamber], "--", color=colour, linewidth=1.0)
-            upper.plot(followed.time_s, spring_mm[:, chamber], color=colour, linewidth=1.0, alpha=0.7)
-            label = f"chamber {chamber}"
-            lower.plot(
-                followed.time_s, followed.pressure_kpa[:, chamber], color=colour, linewidth=1.0, label=label
-            )
-            for panel in (upper, lower):
-                _shade(panel, followed, np.flatnonzero(followed.saturated[:, chamber]), colour)
+        for chamber in range(section * N_PER_SECTION, (section + 1) * N_PER_SECTION):
+            style = {"color": colormaps["tab10"](chamber), "linewidth": 1.0}
+            upper.plot(time_s, 1e3 * outcome.reference_m[every, chamber], "--", **style)
+            upper.plot(time_s, 1e3 * outcome.spring_m[every, chamber], alpha=0.7, **style)
+            lower.plot(time_s, outcome.pressure_kpa[every, chamber], label=f"chamber {chamber}", **style)
+            for hit in np.flatnonzero(outcome.saturated[:, chamber]):
+                if len(during := time_s[point == hit]):
+                    for panel in (upper, lower):
+                        panel.axvspan(during[0], during[-1], color=style["color"], alpha=0.12, linewidth=0)
         for limit_kpa in limits_kpa:
             lower.axhline(limit_kpa, color=RED, linestyle="--", linewidth=1.0)
         lower.set_ylim(limits_kpa[0] - 12.0, limits_kpa[1] + 4.0)
@@ -133,8 +192,114 @@ def trace_figure(followed: Followed, limits_kpa: tuple[float, float]) -> Figure:
     return figure
 
 
-def _shade(panel: Any, followed: Followed, points: np.ndarray, colour: Any) -> None:
-    for point in points:
-        during = followed.time_s[followed.point == point]
-        if len(during):
-            panel.axvspan(during[0], during[-1], color=colour, alpha=0.12, linewidth=0)
+# --- Pipes -------------------------------------------------------------------------------------------------
+
+
+def positions_figure(outcomes: Outcomes, shown: Sequence[Trial]) -> Figure:
+    """Draw the finger tips from the front in the pipe: demonstrated goals, path, and where they arrived."""
+    figure = Figure(figsize=(4.0 * len(shown) + 0.4, 4.6), layout="compressed")
+    panels = figure.subplots(1, len(shown), squeeze=False, sharex=True, sharey=True)[0]
+    gripper_m = ArmSpec.default().mass.gripper_length_m
+    for panel, trial in zip(panels, shown, strict=True):
+        run, diameter_mm = outcomes[trial], PIPES_MM[KINDS[trial.kind].task]
+        dress(panel, f"{diameter_mm} mm pipe, {trial.objects}, from the front", "x [mm]", "z [mm]")
+        panel.set_aspect("equal")
+        panel.set_ylim(*SEEN_Z_MM)
+        for line in outline_mm(CrossPipe.of_mm(diameter_mm)):
+            panel.plot(*line.T, color=GREY, linewidth=2.0)
+        asked, arrived = (1e3 * finger_tips(pose, gripper_m) for pose in (run.goal, run.goal + run.error))
+        panel.plot(*(1e3 * run.finger_m[:, [0, 2]]).T, color=BLUE, linewidth=0.7, alpha=0.6, label="path")
+        style = {"linestyle": "none", "fillstyle": "none"}
+        panel.plot(asked[:, 0], asked[:, 2], "o", color=INK, markersize=7.0, label="demonstrated", **style)
+        panel.plot(arrived[:, 0], arrived[:, 2], "o", color=BLUE, markersize=3.5, label="reached")
+        for mask, marker, colour, label in (
+            (run.success, "s", GREEN, "picked or placed"),
+            (run.operation & ~run.success, "x", RED, "not picked or placed"),
+        ):
+            panel.plot(
+                asked[mask, 0], asked[mask, 2], marker, color=colour, markersize=14.0, label=label, **style
+            )
+    figure.legend(*panels[0].get_legend_handles_labels(), frameon=False, loc="outside lower center", ncols=5)
+    return figure
+
+
+def axis_errors_figure(outcomes: Outcomes, kind: str) -> Figure:
+    """Draw absolute errors in X, Y, Z at each goal: mean and range over the runs, and the mean of all."""
+    runs = _select(outcomes, kind, "as shown")
+    size = np.abs([run.error[:, :3] for run in runs])  # (runs, p, 3)
+    figure = Figure(figsize=(11, 6.4), layout="constrained")
+    panels = figure.subplots(3, 1, sharex=True)
+    for k, (panel, axis) in enumerate(zip(panels, "XYZ", strict=True)):
+        dress(panel, f"absolute error in {axis}", "goal" if k == 2 else "", "mm")
+        _mark_operations(panel, runs[0], np.arange(size.shape[1], dtype=float), named=k == 0)
+        _range_band(panel, size[..., k], ("mean and range of the runs", BLUE))
+        mean = np.nanmean(size[..., k]) if np.isfinite(size).any() else np.nan
+        panel.axhline(mean, color=ORANGE, linestyle="--", label=f"mean of all: {mean:.2f} mm")
+        panel.set_ylim(0, 1.25 * panel.get_ylim()[1])
+        panel.legend(frameon=False, fontsize=8, loc="upper left", ncols=3)
+    return figure
+
+
+def force_figure(outcomes: Outcomes, shown: Sequence[Trial]) -> Figure:
+    """Draw contact forces over time, with the operations."""
+    figure = Figure(figsize=(11, 2.5 * len(shown) + 0.6), layout="constrained")
+    panels = figure.subplots(len(shown), 1, squeeze=False)[:, 0]
+    for panel, trial in zip(panels, shown, strict=True):
+        run, title = outcomes[trial], f"{PIPES_MM[KINDS[trial.kind].task]} mm pipe, {trial.objects}"
+        dress(panel, title, "time [s]" if trial == shown[-1] else "", "contact force [N]")
+        for force_n, colour, label in ((run.container_n, GREEN, "containers"), (run.wall_n, BLUE, "walls")):
+            panel.plot(run.time_s, np.maximum(force_n, LEAST_N), color=colour, linewidth=0.8, label=label)
+        panel.axhline(CALM_N, color=RED, linestyle="--", linewidth=1.0, label=f"{CALM_N:g} N")
+        _mark_operations(panel, run, run.arrival_s)
+        panel.set_yscale("log")
+        panel.set_ylim(LEAST_N, max(10.0, 2.0 * float(max(run.wall_n.max(), run.container_n.max()))))
+    panels[0].legend(frameon=False, fontsize=8, loc="upper right", ncols=3)
+    return figure
+
+
+# --- Training from demonstrations --------------------------------------------------------------------------
+
+
+def success_figure(results: Results) -> Figure:
+    """Draw success over environment steps in each run's own simulation: mean, deviation, every run."""
+    figure = Figure(figsize=(8, 4.2), layout="constrained")
+    panel = figure.subplots()
+    dress(panel, "demonstrated poses with success, in simulation", STEPS, "%")
+    for kind, colour in (("pipe", BLUE), ("hand-made", ORANGE)):
+        runs = _trainings(results, kind)
+        steps, share = _series(runs, "evaluation/success_share")
+        panel.plot(steps, 100 * share.T, color=colour, linewidth=0.5, alpha=0.4)
+        _deviation_band(panel, steps, 100 * share, (f"{KINDS[kind].title}: {len(runs)} runs", colour))
+    panel.axhline(100 * SUCCESS, color=GREY, linestyle=":", linewidth=1.0)
+    panel.set_ylim(0, 105)
+    panel.legend(frameon=False, loc="lower right")
+    return figure
+
+
+def losses_figure(results: Results) -> Figure:
+    """Draw losses over environment steps with and without gradient penalty, on the twins that have both."""
+    twins = {twin for kind, twin, _ in results.trainings if kind == "no-penalty"}
+    figure = Figure(figsize=(13, 3.8), layout="constrained")
+    panels = figure.subplots(1, len(LOSSES))
+    for panel, name in zip(panels, LOSSES, strict=True):
+        dress(panel, name.split("/")[1].replace("_", " "), STEPS, "")
+        for kind, style in (("pipe", ("with gradient penalty", BLUE)), ("no-penalty", ("without", ORANGE))):
+            steps, loss = _series(_trainings(results, kind, twins.__contains__), name)
+            _deviation_band(panel, steps, loss, style)
+    panels[-1].legend(frameon=False)
+    return figure
+
+
+def _trainings(
+    results: Results, kind: str, on_twin: Callable[[int], bool] = lambda twin: True
+) -> list[Training]:
+    return [training for (of, twin, _), training in results.trainings.items() if of == kind and on_twin(twin)]
+
+
+def _series(runs: Sequence[Training], name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return environment steps (k,) and a metric's values (runs, k), from the first update on."""
+    lines = [
+        [(row["env_steps"], row[name]) for row in run.rows if name in row and row["updates"]] for run in runs
+    ]
+    steps, values = np.moveaxis(np.array(lines, float), -1, 0)
+    return steps[0], values

@@ -1,0 +1,116 @@
+"""The engine of the paper's experiments: stages whose results stay in a folder.
+
+An experiment is a list of groups of stages. The stages of a group run in processes of their own, two at a
+time; the next group begins once all of them are done. A stage whose results exist is skipped, so the same
+command continues an interrupted benchmark, and twins or seeds may be added.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from benchmarks.harness.parallel import JobError, in_parallel
+from mjx_softarm._support.provenance import write_json
+
+SETTINGS_FILE = "settings.json"
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Size of the experiments, and how policies are trained."""
+
+    twins: tuple[int, ...] = (0, 1, 2)
+    seeds: tuple[int, ...] = (0, 1, 2)
+    preset: str = "paper"
+    training: tuple[str, ...] = ()  # further settings of `train reach`, NAME=VALUE
+    imitation: tuple[str, ...] = ()  # further settings of `train imitate`, NAME=VALUE
+    n_poses: int = 500  # of a calibration's log
+    n_points: int = 40  # of the circle
+    n_positions: int | None = None  # of a pipe's task, from the first; None is all
+    loads_g: tuple[int, ...] = (35, 105, 220, 330, 500, 1000)
+
+    def shared(self) -> dict[str, Any]:
+        """Return the settings that all results in a folder share; twins and seeds may be added later."""
+        data = json.loads(json.dumps(dataclasses.asdict(self)))
+        return {name: value for name, value in data.items() if name not in ("twins", "seeds")}
+
+
+SMOKE = Settings(
+    twins=(0,),
+    seeds=(0,),
+    preset="quick",
+    training=("total_env_steps=512", "warmup_env_steps=256", "n_arms=16", "updates_per_env_step=0.25"),
+    imitation=("total_env_steps=512", "warmup_env_steps=128", "n_arms=16", "updates_per_env_step=0.25"),
+    n_poses=80,
+    n_points=4,
+    n_positions=7,  # up to the first object
+    loads_g=(500,),
+)
+
+
+class Stage(NamedTuple):
+    """A job, called with the folder, the settings and its inputs; it is done once its results exist."""
+
+    name: str
+    results: tuple[str, ...]  # paths in the folder
+    function: Callable[..., Any]
+    inputs: tuple[Any, ...] = ()
+
+
+def claim(folder: Path, settings: Settings) -> None:
+    """Make the folder, or check that its results have these settings; one that it lacks has its default.
+
+    Raises:
+        JobError: the folder has other settings.
+    """
+    file, expected = folder / SETTINGS_FILE, settings.shared()
+    if not file.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        write_json(file, expected)
+    found = {**Settings().shared(), **json.loads(file.read_text("utf-8"))}
+    if differing := [name for name in expected if found[name] != expected[name]]:
+        got = ", ".join(f"{name} {found[name]}" for name in differing)
+        asked = ", ".join(f"{name} {expected[name]}" for name in differing)
+        raise JobError(f"{file}: got {got}, expected {asked}; choose another --out")
+
+
+def run_stages(folder: Path, settings: Settings, groups: Sequence[Sequence[Stage]]) -> dict[str, Any]:
+    """Run the stages that are not done, group by group.
+
+    Returns:
+        Stage name -> what its function returned, for those that ran.
+
+    Raises:
+        JobError: a stage failed.
+    """
+    returned: dict[str, Any] = {}
+    for group in groups:
+        pending = [stage for stage in group if not all((folder / path).exists() for path in stage.results)]
+        if pending:
+            jobs = [(stage.name, stage.function, (folder, settings, *stage.inputs)) for stage in pending]
+            returned |= in_parallel(jobs)
+    return returned
+
+
+def command(log: Path, *arguments: str) -> None:
+    """Run `python -m train ...` and append its output to a file.
+
+    Raises:
+        JobError: it failed; the message has the last lines of its output.
+    """
+    with log.open("a", encoding="utf-8") as file:
+        done = subprocess.run(
+            [sys.executable, "-m", "train", *arguments], stdout=file, stderr=subprocess.STDOUT, check=False
+        )
+    if done.returncode:
+        last = "\n".join(log.read_text("utf-8").splitlines()[-5:])
+        raise JobError(
+            f"python -m train {' '.join(arguments)}: exit status {done.returncode}; {log} ends with\n{last}"
+        )

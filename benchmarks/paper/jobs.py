@@ -1,0 +1,213 @@
+"""The stages' functions. Each runs in a process of its own, so it imports what it needs by itself."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import shutil
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from benchmarks.harness.parallel import JobError
+from benchmarks.paper.engine import Settings, command
+from benchmarks.paper.kinds import EVALUATION_FILE, KINDS, POLICY_FILE, Trial, learned_run, reach_run
+from benchmarks.paper.measure import operate, save_outcome
+from mjx_softarm.mechanics.pipe import PIPES_MM
+
+LOG_FILE, CALIBRATION, CHECKPOINTS = "log.npz", "calibration", "checkpoints"
+# Session of a twin in trials of demonstrated tasks; demonstrations are recorded in its evaluation session,
+# with other noise.
+TRIAL_SESSION = 2
+
+
+def demonstrations_path(twin: int, task: str) -> str:
+    """Return where a twin's demonstrations of a task are in the folder."""
+    return f"twin{twin}/demos-{task}.npz"
+
+
+def calibrate_twin(folder: Path, settings: Settings, twin: int) -> None:
+    """Record a twin's log, unless it exists, and calibrate the twin by it.
+
+    Raises:
+        JobError: the recording ended early.
+    """
+    from calib.read.logs import read_log
+    from calib.run import calibrate, write_calibration
+    from mjx_softarm._support import xla
+    from mjx_softarm._support.provenance import provenance
+    from mjx_softarm.spec import ArmSpec
+
+    here, spec = folder / f"twin{twin}", ArmSpec.default()
+    here.mkdir(parents=True, exist_ok=True)
+    if not (here / LOG_FILE).exists():
+        _record(here / LOG_FILE, spec, settings.n_poses, twin)
+    log, findings = read_log(here / LOG_FILE, spec.n_chambers)
+    xla.enable_compilation_cache()
+    calibration = calibrate([log], spec)
+    lines = [str(finding) for finding in findings]
+    write_calibration(here / CALIBRATION, calibration, lines, provenance("benchmarks"))
+
+
+def _record(path: Path, spec: Any, n_poses: int, twin: int) -> None:
+    from mjx_softarm.deploy.record import record
+    from mjx_softarm.logs.schema import write_log
+    from mjx_softarm.mechanics.excitation import random_pressures
+    from mjx_softarm.twin.arm import S2R_SESSION, Twin
+
+    arm = Twin(twin, spec, session=S2R_SESSION)
+    recording = record(arm, spec, random_pressures(spec, n_poses, seed=twin))
+    if recording.problem:
+        raise JobError(
+            f"{path}: got a recording that ended early ({recording.problem}), expected {n_poses} poses"
+        )
+    write_log(path, recording.log)
+
+
+def train_reach(folder: Path, settings: Settings, twin: int | None, seed: int) -> None:
+    """Train and export a policy of the nominal arm, or of a twin's calibration; resume what was interrupted.
+
+    Raises:
+        JobError: a command failed.
+    """
+    run = folder / reach_run(twin, seed)
+    log = run.with_suffix(".log")
+    if not (run / EVALUATION_FILE).exists():
+        if (run / "config.json").exists():
+            command(log, "reach", "--resume", str(run))
+        else:
+            options = ["--preset", settings.preset, "--seed", str(seed), "--out", str(run)]
+            if twin is not None:
+                options += ["--calibration", str(folder / f"twin{twin}" / CALIBRATION)]
+            command(log, "reach", *options, *_set(settings.training))
+    if not (run / POLICY_FILE).exists():
+        command(log, "export", str(run))
+
+
+def _set(settings: tuple[str, ...]) -> list[str]:
+    """Return the command line's options for settings NAME=VALUE."""
+    return [part for text in settings for part in ("--set", text)]
+
+
+def demonstrate(folder: Path, settings: Settings, twin: int, task: str) -> None:
+    """Record a task's demonstrations on a twin.
+
+    Raises:
+        JobError: the command failed.
+    """
+    file = folder / demonstrations_path(twin, task)
+    part = file.with_name(f"part-{file.name}")  # a recording that ends early keeps what it has
+    part.unlink(missing_ok=True)
+    arm = f"twin:{twin}:{task}" if task in PIPES_MM else f"twin:{twin}"
+    options = ["--arm", arm, "--task", task, "--calibration", str(file.parent / CALIBRATION)]
+    command(file.with_suffix(".log"), "demos", "record", *options, "--out", str(part))
+    os.replace(part, file)
+
+
+def learn(folder: Path, settings: Settings, name: str, twin: int, seed: int) -> None:
+    """Train a policy from demonstrations; resume what was interrupted.
+
+    Raises:
+        JobError: a command failed.
+    """
+    run, kind = folder / learned_run(name, twin, seed), KINDS[name]
+    log = run.with_suffix(".log")
+    saved = any(path.name.isdecimal() for path in (run / CHECKPOINTS).glob("*"))
+    if saved and (run / "config.json").exists():  # written last
+        command(log, "imitate", "--resume", str(run))
+        return
+    shutil.rmtree(run, ignore_errors=True)  # it may lack what it begins with
+    options = ["--preset", kind.preset, "--seed", str(seed), "--out", str(run)]
+    options += ["--calibration", str(folder / f"twin{twin}" / CALIBRATION)]
+    if diameter_mm := PIPES_MM.get(kind.task):
+        options += ["--pipe", str(diameter_mm)]
+    if kind.reward_of:
+        options += ["--reward", str(folder / learned_run(kind.reward_of, twin, seed))]
+    if kind.from_reach:
+        options += ["--agent", str(folder / reach_run(twin, seed))]
+    demonstrations = str(folder / demonstrations_path(twin, kind.task))
+    command(log, "imitate", demonstrations, *options, *_set((*kind.settings, *settings.imitation)))
+
+
+def export(folder: Path, settings: Settings, twin: int, runs: tuple[str, ...]) -> None:
+    """Export a twin's policies at once: they share what is distilled for its arm.
+
+    Raises:
+        JobError: the command failed.
+    """
+    pending = [str(folder / run) for run in runs if not (folder / run / POLICY_FILE).exists()]
+    command(folder / f"export-twin{twin}.log", "export", *pending)
+
+
+class Scene(NamedTuple):
+    """Inputs of a trial."""
+
+    twin: Any
+    controller: Any
+    goals: np.ndarray  # (p, 6) [mm, deg]
+    names: list[str]  # of the goals, such as "pick left"; "" on the circle
+
+
+def scene_of(folder: Path, settings: Settings, trial: Trial) -> Scene:
+    """Return a trial's twin, in its pipe if it has one, its controller and its goals."""
+    from mjx_softarm.mechanics.pipe import CrossPipe
+    from mjx_softarm.mechanics.workspace import circle_poses
+    from mjx_softarm.twin.arm import EVALUATION_SESSION, Twin
+    from train.demos.demonstrations import load_demonstrations
+    from train.demos.waypoints import task as task_of
+
+    controller, task = controller_of(folder, trial), KINDS[trial.kind].task
+    pipe = None
+    if task in PIPES_MM:
+        spec, pipe = controller.policy.spec, CrossPipe.of_mm(PIPES_MM[task])
+        demonstrations = load_demonstrations(folder / demonstrations_path(trial.twin, task), spec)
+        goals = demonstrations.positions[: settings.n_positions].astype(float)
+        names = [waypoint.name for waypoint in task_of(task, spec).waypoints[: settings.n_positions]]
+    else:
+        goals, names = circle_poses(settings.n_points).astype(float), [""] * settings.n_points
+    session = TRIAL_SESSION if task else EVALUATION_SESSION
+    twin = Twin(trial.twin, payload_kg=1e-3 * trial.load_g, session=session, pipe=pipe)
+    return Scene(twin, controller, goals, names)
+
+
+def controller_of(folder: Path, trial: Trial) -> Any:
+    """Return a trial's controller: its way to find references, in the same loop.
+
+    Without S2R, the policy of the nominal arm plans spring lengths, and only the springs are calibrated.
+    """
+    from benchmarks.paper.gradient_descent import gradient_descent
+    from mjx_softarm.deploy.loop import Controller
+    from mjx_softarm.policy.file import load_policy
+    from mjx_softarm.policy.runtime import PolicyRunner
+
+    kind, twin, seed = trial.kind, trial.twin, trial.seed
+    run = learned_run(kind, twin, seed) if KINDS[kind].task else reach_run(twin, seed)
+    policy = load_policy(folder / run / POLICY_FILE)
+    if kind == "gradient":
+        return Controller.of(policy, gradient_descent(policy))
+    if kind != "without":
+        return Controller.of(policy)
+    nominal = load_policy(folder / reach_run(None, seed) / POLICY_FILE)
+    runner = PolicyRunner(nominal)
+    calibrated_springs = dataclasses.replace(nominal, sensor=policy.sensor)
+    return Controller.of(calibrated_springs, lambda pose, goal, _: runner.act(pose, goal).length_m)
+
+
+def try_out(folder: Path, settings: Settings, trial: Trial) -> None:
+    """Run a trial and save its outcome."""
+    path = folder / trial.result
+    path.parent.mkdir(exist_ok=True)
+    save_outcome(path, operate(*scene_of(folder, settings, trial), trial.objects))
+
+
+def film(folder: Path, settings: Settings, trial: Trial, file: str) -> str:
+    """Film a trial; returns why it cannot be drawn, or ""."""
+    from benchmarks.paper.film import film_scene
+    from mjx_softarm.mechanics.render import RenderError
+
+    try:
+        film_scene(folder / file, scene_of(folder, settings, trial), trial)
+    except RenderError as error:
+        return str(error)
+    return ""

@@ -1,0 +1,105 @@
+"""The experiments as data: ways to find references, trials on twins, and the stages of each experiment.
+
+The folder of a benchmark, which both experiments share:
+
+    twinT/log.npz, twinT/calibration/      recorded and calibrated through `ArmIO` and logs alone
+    twinT/demos-TASK.npz                   demonstrations of the scripted expert on the twin
+    nominal-seedS/, twinT-seedS/           policies without demonstrations; the nominal ones know no twin
+    KIND-twinT-seedS/                      policies learned from demonstrations; see `KINDS`
+    trials/TRIAL.npz                       what a trial on a twin measured
+"""
+
+from __future__ import annotations
+
+from benchmarks.paper import jobs
+from benchmarks.paper.engine import Settings, Stage
+from benchmarks.paper.kinds import EVALUATION_FILE, KINDS, POLICY_FILE, TASKS, Trial, learned_run, reach_run
+
+FILMS = {"open": "circle.gif", "confined": "pipe.gif"}
+
+
+def trainings(settings: Settings) -> list[tuple[str, int, int]]:
+    """Return all (kind, twin, seed) learned from demonstrations; without penalty on the first twin alone."""
+    learned = [kind for kind in KINDS if KINDS[kind].task]
+    found = [(kind, twin, seed) for kind in learned for twin in settings.twins for seed in settings.seeds]
+    return [item for item in found if item[0] != "no-penalty" or item[1] == settings.twins[0]]
+
+
+def trials(experiment: str, settings: Settings) -> list[Trial]:
+    """Return the trials of an experiment, a key of `FILMS`.
+
+    In open space, gradient descent has no training seed, so it runs once for each twin. In confined spaces
+    the policy without gradient penalty is judged by its training alone, and the circle without demonstrations
+    is a trial of the open-space experiment.
+    """
+    found = []
+    if experiment == "open":
+        for twin in settings.twins:
+            for seed in settings.seeds:
+                found += [Trial("without", twin, seed), Trial("with", twin, seed)]
+                found += [Trial("with", twin, seed, load_g=load_g) for load_g in settings.loads_g]
+            found.append(Trial("gradient", twin, settings.seeds[0]))
+        return found
+    for kind, twin, seed in trainings(settings):
+        if kind != "no-penalty":
+            found.append(Trial(kind, twin, seed, "as shown"))
+        if kind == "pipe":
+            found.append(Trial(kind, twin, seed, "exchanged"))
+    return found + [Trial("with", twin, seed) for twin in settings.twins for seed in settings.seeds]
+
+
+def stages(experiment: str, settings: Settings) -> list[list[Stage]]:
+    """Return the stages of an experiment, group by group."""
+    calibrations = [
+        Stage(f"log and calibrate twin {t}", (f"twin{t}/{jobs.CALIBRATION}",), jobs.calibrate_twin, (t,))
+        for t in settings.twins
+    ]
+    on_twins = [_reach(twin, seed) for twin in settings.twins for seed in settings.seeds]
+    tried = [
+        Stage(f"try {trial.name}", (trial.result,), jobs.try_out, (trial,))
+        for trial in trials(experiment, settings)
+    ]
+    film = Stage("film", (FILMS[experiment],), jobs.film, (filmed(experiment, settings), FILMS[experiment]))
+    if experiment == "open":
+        nominal = [_reach(None, seed) for seed in settings.seeds]
+        return [[*calibrations, *nominal], on_twins, [*tried, film]]
+    demonstrations = [
+        Stage(
+            f"demonstrate {task} on twin {twin}",
+            (jobs.demonstrations_path(twin, task),),
+            jobs.demonstrate,
+            (twin, task),
+        )
+        for task in TASKS
+        for twin in settings.twins
+    ]
+    first = [_learn(*item) for item in trainings(settings) if not KINDS[item[0]].reward_of]
+    with_their_reward = [_learn(*item) for item in trainings(settings) if KINDS[item[0]].reward_of]
+    exports = [_export(settings, twin) for twin in settings.twins]
+    return [calibrations, [*demonstrations, *on_twins], first, with_their_reward, exports, [*tried, film]]
+
+
+def filmed(experiment: str, settings: Settings) -> Trial:
+    """Return the trial that an experiment's film shows."""
+    kind, objects = ("with", "") if experiment == "open" else ("pipe", "as shown")
+    return Trial(kind, settings.twins[0], settings.seeds[0], objects)
+
+
+def _reach(twin: int | None, seed: int) -> Stage:
+    name = f"train {'nominal arm' if twin is None else f'for twin {twin}'}, seed {seed}"
+    results = tuple(f"{reach_run(twin, seed)}/{file}" for file in (EVALUATION_FILE, POLICY_FILE))
+    return Stage(name, results, jobs.train_reach, (twin, seed))
+
+
+def _learn(kind: str, twin: int, seed: int) -> Stage:
+    result = f"{learned_run(kind, twin, seed)}/{EVALUATION_FILE}"
+    return Stage(f"learn {kind} for twin {twin}, seed {seed}", (result,), jobs.learn, (kind, twin, seed))
+
+
+def _export(settings: Settings, twin: int) -> Stage:
+    runs = tuple(
+        learned_run(*item) for item in trainings(settings) if item[0] != "no-penalty" and item[1] == twin
+    )
+    return Stage(
+        f"export for twin {twin}", tuple(f"{run}/{POLICY_FILE}" for run in runs), jobs.export, (twin, runs)
+    )

@@ -1,0 +1,68 @@
+"""The engine: stages run once, in their order, elsewhere; the folder keeps its settings."""
+
+import dataclasses
+import json
+
+import pytest
+
+from benchmarks.harness import parallel
+from benchmarks.harness.parallel import JobError
+from benchmarks.paper import engine
+from benchmarks.paper.engine import Stage, claim, command, run_stages
+from tests.benchmarks.paper.made_up import TINY
+
+
+def leave(folder, settings, name, done):
+    """Do what a stage does: leave its result."""
+    (folder / name).touch()
+    done.append(name)
+    return name.upper()
+
+
+def test_stages_run_group_by_group_and_only_where_a_result_is_missing(tmp_path, monkeypatch):
+    done = []
+    monkeypatch.setattr(engine, "in_parallel", lambda jobs: {name: f(*inputs) for name, f, inputs in jobs})
+    groups = [
+        [Stage(f"stage {name}", (name,), leave, (name, done)) for name in group] for group in ("ab", "c")
+    ]
+    assert run_stages(tmp_path, TINY, groups) == {"stage a": "A", "stage b": "B", "stage c": "C"}
+    assert done == ["a", "b", "c"]
+    (tmp_path / "b").unlink()
+    assert run_stages(tmp_path, TINY, groups) == {"stage b": "B"}
+    two = [[Stage("both", ("a", "d"), leave, ("d", done))]]
+    assert run_stages(tmp_path, TINY, two) == {"both": "D"}  # one of its results is missing
+
+
+def test_folder_of_other_settings_is_refused(tmp_path):
+    claim(tmp_path, TINY)
+    claim(tmp_path, dataclasses.replace(TINY, twins=(0, 1, 2), seeds=(5,)))
+    with pytest.raises(JobError, match=r"settings.json: got n_points 3, expected n_points 40;"):
+        claim(tmp_path, dataclasses.replace(TINY, n_points=40))
+
+
+def test_folder_from_before_a_setting_existed_has_its_default(tmp_path):
+    claim(tmp_path, TINY)
+    file = tmp_path / "settings.json"
+    old = json.loads(file.read_text())
+    del old["imitation"]
+    file.write_text(json.dumps(old))
+    claim(tmp_path, TINY)
+    with pytest.raises(JobError, match=r"got imitation \[\], expected imitation \['frozen=true'\]"):
+        claim(tmp_path, dataclasses.replace(TINY, imitation=("frozen=true",)))
+
+
+def test_failed_command_says_how(tmp_path):
+    with pytest.raises(JobError, match=r"exit status 2; .*run.log ends with\n(.*\n)*error: "):
+        command(tmp_path / "run.log", "export", str(tmp_path / "nothing"))
+
+
+def test_jobs_run_elsewhere_and_a_failure_is_named():
+    assert parallel.in_parallel([("a", pow, (2, 3)), ("b", divmod, (7, 2))]) == {"a": 8, "b": (3, 1)}
+    with pytest.raises(JobError, match="bad: ValueError: invalid literal"):
+        parallel.in_parallel([("bad", int, ("x",))])
+
+
+def test_cores_are_shared_out():
+    assert parallel._shares([0, 1]) == [[0], [1]]
+    assert parallel._shares([3]) == [[3]]
+    assert parallel._shares(list(range(5))) == [[0, 2, 4], [1, 3]]

@@ -1,0 +1,75 @@
+"""The benchmark from end to end: what it runs, what it does not run again, and its exit status."""
+
+import json
+import re
+
+import pytest
+from matplotlib.figure import Figure
+
+from benchmarks.paper import engine, experiments, report
+from benchmarks.paper.engine import SMOKE, claim
+from benchmarks.paper.measure import save_outcome
+from benchmarks.paper.trials import stages, trials
+from tests.benchmarks.paper.made_up import TINY, fill, good_results
+
+
+@pytest.mark.parametrize("experiment", ["open", "confined"])
+def test_interrupted_benchmark_runs_only_what_is_missing(tmp_path, monkeypatch, experiment):
+    done, results = [], good_results(experiment, TINY)
+    named = {stage.name: stage for group in stages(experiment, TINY) for stage in group}
+
+    def leave_results(jobs):
+        for name, _, _ in jobs:
+            done.append(name)
+            for path in named[name].results:
+                (tmp_path / path).parent.mkdir(exist_ok=True, parents=True)
+                (tmp_path / path).touch()
+            if name.startswith("try "):
+                trial = named[name].inputs[0]
+                save_outcome(tmp_path / trial.result, results.outcomes[trial])
+        return {name: "not here" if name == "film" else None for name, _, _ in jobs}
+
+    fill(tmp_path, TINY)
+    monkeypatch.setattr(engine, "in_parallel", leave_results)
+    monkeypatch.setattr(experiments, "load_results", lambda *_: results)
+    drawn = report.draw(experiment, TINY, results, report.trial_rows(results))
+    monkeypatch.setattr(report, "draw", lambda *_: {name: (name, Figure()) for name in drawn})
+    data = experiments.run(experiment, tmp_path, tmp_path / "out", TINY)
+    assert [check["text"] for check in data["goals"] if not check["met"]] == []
+    assert {f"try {trial.name}" for trial in trials(experiment, TINY)} | {"film"} <= set(done)
+    assert not any(name.startswith("log and calibrate") for name in done)  # `fill` left them
+    gone = trials(experiment, TINY)[3]
+    (tmp_path / gone.result).unlink()
+    done.clear()
+    experiments.run(experiment, tmp_path, tmp_path / "out", TINY)
+    assert done == [f"try {gone.name}"]
+
+
+def test_both_experiments_or_one(tmp_path, monkeypatch, capsys):
+    done = []
+
+    def run(experiment, folder, pictures, settings):
+        done.append((experiment, settings.twins))
+        return {"goals": [{"text": experiment, "value": "1", "met": True}]}
+
+    monkeypatch.setattr(experiments, "run", run)
+    smoke = ["--smoke", "--out", str(tmp_path)]
+    assert experiments.main(smoke) == 0
+    assert experiments.main(["--only", "confined", "--twins", "1", "2", *smoke]) == 0
+    assert done == [("open", (0,)), ("confined", (0,)), ("confined", (1, 2))]
+    assert f"report: {tmp_path / 'confined.html'}" in capsys.readouterr().out
+
+
+def test_folder_of_other_settings_is_an_error(tmp_path, capsys):
+    claim(tmp_path, TINY)
+    assert experiments.main(["--smoke", "--out", str(tmp_path)]) == 2
+    assert "choose another --out" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("experiment", "n_goals"), [("open", 11), ("confined", 10)])
+def test_smoke(tmp_path, capsys, experiment, n_goals):
+    assert experiments.main(["--smoke", "--only", experiment, "--out", str(tmp_path)]) == 0
+    assert "goals" in json.loads((tmp_path / f"paper-{experiment}.json").read_text("utf-8"))["figures"]
+    assert len(list((tmp_path / "trials").iterdir())) == len(trials(experiment, SMOKE))
+    assert len(re.findall("^(met|NOT MET) ", capsys.readouterr().out, re.MULTILINE)) == n_goals

@@ -1,0 +1,143 @@
+"""Goals that are met, just met and missed, on made-up results."""
+
+import pytest
+
+from benchmarks.paper.goals import check_goals
+from benchmarks.paper.kinds import Trial
+from benchmarks.paper.trials import trials
+from tests.benchmarks.paper.made_up import FULL, TINY, good_results, made_up, pipe_trial, tables, trained
+
+X, Y, Z = (f"300 mm pipe: mean absolute error in {a} at the goals at most 5 mm" for a in "XYZ")
+BOTH = "300 mm pipe: all four operations done, as shown and exchanged, in at least 8 of 9 runs"
+TASKS = "250 mm pipe: both tasks done, in at least 7 of 9 runs"
+CALM = "300 mm pipe, as shown and exchanged: wall force below 1 N for 99 % of the time of every run"
+CALM_NARROW = "250 mm pipe: wall force below 1 N for 99 % of the time of every run"
+STEPS = "learned reward: 90 % success in fewer environment steps than the hand-made one"
+CIRCLE = "circle: mean translation with demonstrations not above that without"
+KEPT = "circle: success at the first stage's points after stage two not lower than before, in every run"
+TRANSLATION = "with S2R, mean translation at most 5 mm"
+REACHED = "every point of every run is reached"
+EXCHANGED = pipe_trial(2, 1, "exchanged")
+FIRST = pipe_trial()
+
+
+def checks(experiment, changed=None):
+    settings = TINY if experiment == "open" else FULL
+    return check_goals(experiment, *tables(good_results(experiment, settings, changed)))
+
+
+def unmet(experiment, changed=None):
+    return [check.text for check in checks(experiment, changed) if not check.met]
+
+
+@pytest.mark.parametrize(("experiment", "n"), [("open", 11), ("confined", 10)])
+def test_goals_that_are_met(experiment, n):
+    assert unmet(experiment) == []
+    assert len(checks(experiment)) == n
+
+
+@pytest.mark.parametrize(
+    ("trial", "outcome", "goals"),
+    [
+        (Trial("with", 0, 0), made_up("with", (7.0,)), [TRANSLATION, "translation without S2R over"]),
+        (Trial("without", 0, 0), made_up("without", (1.0,)), ["translation without S2R over"]),
+        (
+            Trial("with", 0, 0, load_g=500),
+            made_up("with", (9.0,)),
+            ["35 to 500 g, mean translation at most 6"],
+        ),
+        (
+            Trial("with", 0, 0, load_g=1000),
+            made_up("with", (20.1,)),
+            ["1 kg, largest translation of all runs"],
+        ),
+        (
+            Trial("with", 0, 0, load_g=1000),
+            made_up("with", (4.0,), saturated=[(0, 0)]),  # and nothing reported
+            ["1 kg, saturation detected and reported"],
+        ),
+        (
+            Trial("with", 1, 0),
+            made_up("with", (4.0,), saturated=[(2, 8)]),
+            ["with S2R, unloaded: no saturated"],
+        ),
+        (Trial("with", 0, 0), made_up("with", (4.0, 0, 0, 0, -7.0)), ["with S2R, mean pitch at most 3 deg"]),
+        (
+            Trial("with", 1, 0),
+            made_up("with", (0.1,), missed=[2]),
+            [TRANSLATION, *(f"with S2R, mean {angle}" for angle in ("yaw", "pitch", "roll"))]
+            + ["translation without S2R over", "with S2R, unloaded: no saturated", REACHED],
+        ),
+    ],
+)
+def test_open_goals_that_are_missed_are_named(trial, outcome, goals):
+    found = unmet("open", {trial: outcome})
+    assert len(found) == len(goals)
+    assert all(text.startswith(goal) for text, goal in zip(found, goals, strict=True))
+
+
+def test_gradient_descent_without_saturation_misses_its_goal():
+    free = {trial: made_up("gradient", (5.0,)) for trial in trials("open", TINY) if trial.kind == "gradient"}
+    assert unmet("open", free) == ["gradient descent saturates at least one chamber"]
+
+
+@pytest.mark.parametrize(
+    ("changed", "goals"),
+    [
+        ({FIRST: made_up("pipe", (38.0, 0, 0))}, [X]),  # (8 + 38) / 9 = 5.1
+        ({FIRST: made_up("pipe", (0, -30.0, 0))}, [Y]),  # (16 + 30) / 9 = 5.1
+        ({FIRST: made_up("pipe", (0, 0, 22.0))}, [Z]),  # (24 + 22) / 9 = 5.1
+        ({FIRST: made_up("pipe", fails=(0,)), EXCHANGED: made_up("pipe", fails=(3,))}, [BOTH]),
+        ({pipe_trial(t, kind="narrow"): made_up("narrow", fails=(2,)) for t in range(3)}, [TASKS]),
+        ({EXCHANGED: made_up("pipe", pressed=0.02)}, [CALM]),
+        ({pipe_trial(1, 1, kind="narrow"): made_up("narrow", pressed=0.02)}, [CALM_NARROW]),
+        ({pipe_trial(kind="circle"): made_up("circle", (9.0, 0, 0))}, [CIRCLE]),  # 8 * 14^0.5 + 9 > 36
+        ({("pipe", 0, 0): trained("pipe", reaches_at=11)}, [STEPS]),  # in one run, never
+        (
+            {("pipe", t, s): trained("pipe", reaches_at=8) for t in range(3) for s in range(3)},
+            [STEPS],
+        ),  # equal
+        ({("circle", 1, 2): trained("circle", after_one=0.5, after_two=0.375)}, [KEPT]),
+        ({("circle", t, s): trained("circle", 4, 10, 0.0, 0.0) for t in range(3) for s in range(3)}, [KEPT]),
+        ({FIRST: made_up("pipe", (0.1, 0.1, 0.1), missed=[2])}, [X, Y, Z, CALM]),
+        ({pipe_trial(kind="circle"): made_up("circle", (0.1, 0.1, 0.1), missed=[2])}, [CIRCLE]),
+        ({Trial("with", 1, 1): made_up("with", (8.0, 0, 0), missed=[3])}, [CIRCLE]),
+        # Just met:
+        ({FIRST: made_up("pipe", fails=(0,))}, []),  # 8 of 9
+        ({pipe_trial(t, kind="narrow"): made_up("narrow", fails=(0, 1)) for t in (0, 1)}, []),  # 7 of 9
+        ({EXCHANGED: made_up("pipe", pressed=0.01)}, []),
+        ({pipe_trial(kind="hand-made"): made_up("pipe", (50.0, 50.0, 50.0), fails=(0, 1, 2, 3))}, []),
+        ({("hand-made", 0, 0): trained("hand-made", reaches_at=11)}, []),
+    ],
+)
+def test_confined_goals_that_are_missed_are_named(changed, goals):
+    assert unmet("confined", changed) == goals
+
+
+def test_values_say_what_was_missed():
+    values = {check.text: check.value for check in checks("confined", {FIRST: made_up("pipe", missed=[2])})}
+    assert values[X] == "1.00 mm, 1 points missed in 1 of 9 runs"
+    never = {("hand-made", 0, 0): trained("hand-made", reaches_at=11)}
+    values = {check.text: check.value for check in checks("confined", never)}
+    # Eight runs with 8000 steps, and one that counts as 10 001.
+    assert (
+        values[STEPS]
+        == "learned 4,000 in the mean; hand-made 8,222 in the mean or more: never in 1 of 9 runs"
+    )
+
+
+def test_what_was_not_measured_is_not_met():
+    assert {(check.value, check.met) for check in check_goals("confined", [], [])} == {
+        ("not measured", False)
+    }
+    assert not any(check.met for check in check_goals("open", [], []))
+    table, trainings = tables(good_results("confined"))
+
+    def left(keep):
+        rows = [row for row in table if keep(row)]
+        return [check.text for check in check_goals("confined", rows, trainings) if not check.met]
+
+    assert left(lambda row: row["objects"] != "exchanged") == [BOTH, CALM]
+    assert left(lambda row: row["kind"] != "with") == [CIRCLE]
+    one_stage = {("circle", t, s): trained("pipe") for t in range(3) for s in range(3)}
+    assert unmet("confined", one_stage) == [KEPT]

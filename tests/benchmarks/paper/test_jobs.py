@@ -1,0 +1,161 @@
+"""The stages' functions: what each asks of the command line, what it resumes, and the scene of a trial."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from benchmarks.harness.parallel import JobError
+from benchmarks.paper import jobs
+from benchmarks.paper.engine import SMOKE
+from benchmarks.paper.kinds import KINDS, Trial, learned_run, reach_run
+from benchmarks.paper.measure import load_outcome
+from mjx_softarm.mechanics.workspace import circle_poses
+from mjx_softarm.policy.file import save_policy
+from mjx_softarm.policy.runtime import PolicyRunner
+from mjx_softarm.sensing.sensors import SensorParams
+from tests.benchmarks.paper.made_up import SPEC, TINY, N, goals_of, make_policy, pipe_trial
+from train import __main__ as train_main
+from train.config import IMITATION_PRESETS
+
+
+@pytest.fixture
+def commands(monkeypatch):
+    """A function: job and its arguments -> the commands that it ran."""
+    calls = []
+    monkeypatch.setattr(jobs, "command", lambda log, *arguments: calls.append(arguments))
+
+    def run(job, *arguments):
+        calls.clear()
+        job(*arguments)
+        return list(calls)
+
+    return run
+
+
+def parsed(arguments):
+    """What the command line makes of them; it ends the test where it does not know one."""
+    return train_main._parser().parse_args(arguments)
+
+
+def test_training_starts_resumes_exports_or_does_nothing(tmp_path, commands):
+    settings = dataclasses.replace(TINY, preset="quick", training=("tqc.gamma=0.9",))
+    run, work = tmp_path / reach_run(1, 2), (jobs.train_reach, tmp_path, settings, 1, 2)
+    start, export = commands(*work)
+    options = parsed(start)
+    assert (options.preset, options.seed, options.out) == ("quick", 2, run)
+    assert options.calibration == tmp_path / "twin1" / "calibration"
+    assert options.set == ["tqc.gamma=0.9"]
+    assert parsed(export).runs == [run]
+    run.mkdir()
+    (run / "config.json").touch()
+    resume, export = commands(*work)
+    assert parsed(resume).resume == run and parsed(export).runs == [run]
+    (run / "evaluation.json").touch()
+    assert commands(*work) == [export]
+    (run / "policy.npz").touch()
+    assert commands(*work) == []
+
+
+def test_learning_starts_with_what_it_builds_on_resumes_or_starts_anew(tmp_path, commands):
+    run, work = tmp_path / learned_run("narrow", 1, 2), (jobs.learn, tmp_path, TINY, "narrow", 1, 2)
+    (start,) = commands(*work)
+    options = parsed(start)
+    assert options.demonstrations == tmp_path / jobs.demonstrations_path(1, "pipe250")
+    assert (options.preset, options.seed, options.out, options.pipe) == ("frozen", 2, run, 250)
+    assert options.reward == tmp_path / learned_run("pipe", 1, 2)
+    (run / "checkpoints").mkdir(parents=True)
+    (run / "config.json").touch()  # interrupted before it had the reward
+    assert commands(*work) == [start]
+    assert not run.exists()
+    (run / "checkpoints" / "0").mkdir(parents=True)  # interrupted before it was a run
+    assert commands(*work) == [start]
+    (run / "checkpoints" / "0").mkdir(parents=True)
+    (run / "config.json").touch()
+    assert parsed(commands(*work)[0]).resume == run
+    (agent,) = commands(jobs.learn, tmp_path, TINY, "circle", 1, 2)
+    assert parsed(agent).agent == tmp_path / reach_run(1, 2)
+
+
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if KINDS[kind].task])
+def test_settings_of_each_kind_are_known(tmp_path, commands, kind):
+    (arguments,) = commands(jobs.learn, tmp_path, SMOKE, kind, 0, 0)
+    options = parsed(arguments)
+    config = train_main._config(IMITATION_PRESETS[options.preset], options)
+    assert config.n_epochs == 2
+    assert config.stage_epochs == ((0, 1) if kind == "circle" else (0,))
+    assert (config.gail.gradient_penalty == 0) == (kind == "no-penalty")
+    assert (options.reward is not None) == (kind == "narrow")
+    assert options.pipe == {"narrow": 250, "circle": None}.get(kind, 300)
+
+
+def test_missing_policies_are_exported_in_one_go(tmp_path, commands):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "policy.npz").touch()
+    (export,) = commands(jobs.export, tmp_path, TINY, 0, ("a", "b", "c"))
+    assert parsed(export).runs == [tmp_path / "b", tmp_path / "c"]
+
+
+def test_recording_that_ends_early_is_no_demonstration(tmp_path, monkeypatch):
+    file = tmp_path / jobs.demonstrations_path(3, "pipe300")
+    file.parent.mkdir()
+
+    def ends_early(log, *arguments):
+        options = parsed(arguments)
+        assert (options.arm, options.task) == ("twin:3:pipe300", "pipe300")
+        options.out.write_text("half of it")
+        raise JobError("ended early")
+
+    monkeypatch.setattr(jobs, "command", ends_early)
+    with pytest.raises(JobError):
+        jobs.demonstrate(tmp_path, TINY, 3, "pipe300")
+    assert not file.exists()
+
+
+def test_scene_is_the_twin_in_its_pipe(tmp_path, make_arm_model, monkeypatch):
+    shown = SimpleNamespace(positions=np.float32(goals_of("narrow")[1]))
+    monkeypatch.setattr("train.demos.demonstrations.load_demonstrations", lambda path, spec: shown)
+    for kind in ("narrow", "circle"):
+        (tmp_path / learned_run(kind, 0, 0)).mkdir()
+        save_policy(tmp_path / learned_run(kind, 0, 0) / "policy.npz", make_policy(make_arm_model))
+    scene = jobs.scene_of(tmp_path, TINY, pipe_trial(kind="narrow"))
+    assert scene.twin.describe()["pipe"]["diameter_m"] == 0.25
+    assert len(scene.goals) == len(scene.names) == 37
+    operations = [name for name in scene.names if name.startswith(("pick", "place"))]
+    assert operations == ["pick left", "place bottom", "pick right", "place left"]
+    few = dataclasses.replace(TINY, n_positions=7)
+    scene = jobs.scene_of(tmp_path, few, pipe_trial(kind="narrow"))
+    assert len(scene.goals) == 7 and scene.names[-1] == "pick left"
+    scene = jobs.scene_of(tmp_path, TINY, pipe_trial(kind="circle"))
+    assert "pipe" not in scene.twin.describe()
+    assert np.array_equal(scene.goals, circle_poses(TINY.n_points).astype(float))
+
+
+def test_without_s2r_the_nominal_policy_plans_and_the_springs_are_calibrated(tmp_path, make_arm_model):
+    calibrated = SPEC.replace(sensor={"beta": 0.9, "delta_m": 0.004}, springs={"length_min_m": 0.1})
+    for twin, spec in ((None, SPEC), (0, calibrated)):
+        (tmp_path / reach_run(twin, 0)).mkdir()
+        save_policy(tmp_path / reach_run(twin, 0) / "policy.npz", make_policy(make_arm_model, spec))
+    chosen = jobs.controller_of(tmp_path, Trial("without", 0, 0))
+    assert np.array_equal(chosen.policy.sensor.beta, SensorParams.from_spec(calibrated).beta)
+    assert chosen.policy.spec == SPEC
+    pose, goal = circle_poses(2).astype(float)
+    expected = PolicyRunner(make_policy(make_arm_model)).act(pose, goal).length_m
+    assert np.allclose(chosen.plan(pose, goal, np.full(N, 0.2)), expected)
+    with_s2r = jobs.controller_of(tmp_path, Trial("with", 0, 0)).plan(pose, goal, 0)
+    assert not np.allclose(with_s2r, expected)
+
+
+def test_policy_goes_to_a_point_on_a_twin(tmp_path, make_arm_model):
+    settings, trial = dataclasses.replace(TINY, n_points=1), Trial("with", 0, 0)
+    (tmp_path / reach_run(0, 0)).mkdir()
+    save_policy(tmp_path / reach_run(0, 0) / "policy.npz", make_policy(make_arm_model))
+    jobs.try_out(tmp_path, settings, trial)
+    outcome = load_outcome(tmp_path / trial.result)
+    assert np.isfinite(outcome.error).all() and not outcome.operation.any()
+    # The actor asks for the same springs wherever the goal is, and these the twin holds.
+    last = np.flatnonzero(outcome.point == 0)[-1]
+    assert np.abs(outcome.spring_m[last] - outcome.reference_m[last]).max() < 2e-3
+    assert np.linalg.norm(outcome.error[0, :3]) > 10.0
+    assert not outcome.wall_n.any()

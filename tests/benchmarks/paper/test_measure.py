@@ -1,0 +1,196 @@
+"""Errors, saturation, contact forces, picking and placing, and the figures of a trial, by hand."""
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from benchmarks.paper.measure import (
+    GRASP_M,
+    PLACE_M,
+    Gripper,
+    WatchedTwin,
+    figures,
+    finger_tips,
+    load_outcome,
+    measure,
+    operate,
+    save_outcome,
+)
+from mjx_softarm.deploy.faults import Event, Fault
+from mjx_softarm.deploy.loop import Controller, Phase
+from mjx_softarm.deploy.session import Arrival, Run
+from mjx_softarm.logs.schema import Log
+from mjx_softarm.mechanics.pipe import APPLE_KG, BALL_KG
+from mjx_softarm.mechanics.workspace import circle_poses
+from mjx_softarm.sensing.sensors import frequency_from_length
+from mjx_softarm.twin.arm import Twin
+from tests.benchmarks.paper.made_up import GRIPPER_M, N, made_up, make_policy
+
+DOWN = np.array([1.0, 0.0, 0.0, 0.0])  # quaternion of a gripper that hangs straight
+NAMES = ("home", "pick right", "to place left 1", "place left", "pick bottom", "place right")
+GOALS_M = np.array([[0, 0, -6], [2, 0, -6], [0, 0, -6], [-2, 0, -6], [0, 0, -8], [2, 0, -6]]) / 10
+
+
+def test_errors_are_averaged_over_the_window_of_rest(make_arm_model):
+    policy = make_policy(make_arm_model)
+    controller = Controller.of(policy)
+    window, n_rows = controller.window, 3 * controller.window
+    goals = circle_poses(2).astype(float)
+    tip_mm = np.tile(goals[1, :3] + [3.0, 4.0, 0.0], (n_rows, 1))
+    tip_mm[:-window] += 500.0  # on its way: does not count
+    noise = np.where(np.arange(window) % 2, 1.0, -1.0)
+    tip_mm[-window:, 2] += noise - noise.mean()
+    pressure_kpa = np.zeros((n_rows, N))
+    pressure_kpa[:, 4], pressure_kpa[:, 5] = 19.97, -40.0
+    spring_m, reference_m = np.full((n_rows, N), 0.2), np.full((n_rows, N), 0.2)
+    reference_m[:, 4] += 0.005  # asked for longer than the greatest pressure makes it
+    reference_m[:, 5] -= 0.0005  # within the tolerance
+    reference_m[:, 6] += 0.005  # off, but not at a limit
+    log = Log(
+        source="made up",
+        row=np.arange(n_rows),
+        time_s=0.02 * np.arange(n_rows),
+        frequency_hz=frequency_from_length(spring_m, policy.sensor),
+        pressure_kpa=pressure_kpa,
+        tip_m=1e-3 * tip_mm,
+        tip_quaternion=np.tile([np.cos(np.radians(5)), 0, 0, np.sin(np.radians(5))], (n_rows, 1)),
+        reference_m=reference_m,
+        goal=np.tile(goals[1], (n_rows, 1)),
+    )
+    arrival = Arrival(goals[1], goals[1] + [1.0, 0, 0, 0, 0, 0], n_rows - 1)
+    events = (Event(Fault.SATURATED, ""), Event(Fault.SATURATED, ""))
+    run = Run(log, (arrival,), events, np.array([1e-4] * 10), Phase.DONE, False)
+    outcome = measure(run, controller, goals)
+    assert np.allclose(outcome.error[1], [3, 4, 0, 10, 0, 0], atol=1e-6)
+    assert np.isnan(outcome.error[0]).all() and np.isnan(outcome.arrival_s[0])
+    assert np.isclose(outcome.arrival_s[1], 0.02 * (n_rows - 1))
+    assert np.flatnonzero(outcome.saturated[1]).tolist() == [4]
+    assert not outcome.saturated[0].any()
+    assert np.allclose(outcome.spring_m, 0.2)
+    assert set(outcome.point) == {1}
+    row = figures(outcome)
+    assert (row["reached"], row["points"], row["saturation_events"]) == (1, 2, 2)
+    assert np.isclose(row["believed_mm"], 1.0)
+
+
+def test_figures_of_a_circle_by_hand():
+    outcome = made_up("with", saturated=[(0, 1), (0, 2), (1, 2)], missed=range(2, 6))
+    outcome.error[:2] = [[3, 4, 0, 1, -2, 0], [0, 0, 1, -3, 0, 3]]
+    row = figures(outcome)
+    assert np.isclose(row["translation_mm"], 3.0)
+    assert np.isclose(row["rmse_mm"], np.sqrt(13.0))
+    assert row["max_mm"] == 5.0
+    assert (row["yaw_deg"], row["pitch_deg"], row["roll_deg"]) == (2.0, 1.0, 1.5)
+    assert (row["saturated_points"], row["saturated_chambers_max"]) == (2, 2)
+    assert (row["reached"], row["points"], row["operations"]) == (2, 6, 0)
+
+
+def test_figures_of_a_task_by_hand():
+    outcome = made_up("pipe", (1.0, -2.0, 2.0), reported=3, fails=(3,), pressed=0.03, missed=(1, 2, 3))
+    outcome.error[0, :3] = 4.0, 0.0, 0.0
+    row = figures(outcome)
+    assert (row["points"], row["reached"], row["operations"], row["done"]) == (28, 25, 4, 3)
+    assert np.allclose([row["x_mm"], row["y_mm"], row["z_mm"]], [28 / 25, 48 / 25, 48 / 25])
+    assert np.isclose(row["translation_mm"], (4 + 24 * 3) / 25)
+    assert np.isclose(row["calm_percent"], 97.0)
+    assert (row["wall_max_n"], row["container_max_n"]) == (2.0, 5.0)
+    assert row["events"] == {Fault.SATURATED.value: 3}
+
+
+def test_trial_without_an_arrival_has_no_error():
+    row = figures(made_up("with", missed=range(6)))
+    assert np.isnan([row[name] for name in ("translation_mm", "x_mm", "max_mm", "believed_mm")]).all()
+    assert row["reached"] == 0
+
+
+def test_outcome_comes_back_from_its_file(tmp_path):
+    outcome = made_up("pipe", saturated=[(0, 3)], fails=(1,), missed=(2,))
+    save_outcome(tmp_path / "run.npz", outcome)
+    for name, value in load_outcome(tmp_path / "run.npz")._asdict().items():
+        expected = getattr(outcome, name)
+        assert np.array_equal(value, expected, equal_nan=value.dtype.kind == "f"), name
+
+
+def test_watched_twin_is_driven_and_tells_each_time():
+    ticks = iter([(0.0, 1.0), (2.0, 0.0)])
+    twin = SimpleNamespace(write_pressures=lambda p: None, wall_force_n=lambda: next(ticks), time_s=3.0)
+    forces = []
+    watched = WatchedTwin(twin, lambda: forces.append(twin.wall_force_n()))
+    for _ in range(2):
+        watched.write_pressures(np.zeros(N))
+    assert forces == [(0.0, 1.0), (2.0, 0.0)]
+    assert watched.time_s == 3.0
+
+
+def test_finger_tips_are_below_the_tip():
+    pose = np.array([[100.0, 0, -500, 0, 0, 0], [0, 0, -500, 0, 90, 0]])
+    expected = [[0.1, 0.0, -0.5 - GRIPPER_M], [-GRIPPER_M, 0.0, -0.5]]  # pitch 90: z points along +x
+    assert np.allclose(finger_tips(pose, GRIPPER_M), expected)
+
+
+class Arm:
+    """An arm whose finger tips are where one puts them."""
+
+    def __init__(self):
+        self.finger_m, self.did = np.zeros(3), []
+
+    def motion_capture(self):
+        return SimpleNamespace(tip_m=self.finger_m + [0.0, 0.0, GRIPPER_M], tip_quaternion=DOWN)
+
+    def attach(self, kg):
+        self.did.append(kg)
+
+    def release(self):
+        self.did.append("release")
+
+
+def gripped(off_m, objects="as shown", skip=(), order=range(6)):
+    """Success and deeds of a gripper, once at the goals in an order; `off_m` has how far off, if it is."""
+    arm, order = Arm(), list(order)
+    gripper = Gripper(arm, [NAMES[k] for k in order], GOALS_M[order], objects, GRIPPER_M)
+    for at, k in enumerate(order):
+        arm.finger_m = GOALS_M[k] + [0.0, off_m.get(at, 0.0), 0.0]
+        if k not in skip:
+            gripper.arrived(at)
+    return gripper.success.tolist(), arm.did
+
+
+ALL = [False, True, False, True, True, True]
+
+
+def test_objects_are_picked_and_placed():
+    assert gripped({}) == (ALL, [BALL_KG, "release", APPLE_KG, "release"])
+    assert gripped({}, "exchanged") == (ALL, [APPLE_KG, "release", BALL_KG, "release"])
+    near = {1: 0.99 * GRASP_M, 3: 0.99 * PLACE_M}
+    assert gripped(near) == (ALL, [BALL_KG, "release", APPLE_KG, "release"])
+
+
+def test_object_out_of_reach_stays_where_it_is():
+    missed = [False, False, False, False, True, True]
+    assert gripped({1: 1.01 * GRASP_M}) == (missed, [APPLE_KG, "release"])
+    assert gripped({}, skip=(1,)) == (missed, [APPLE_KG, "release"])
+
+
+def test_object_released_beside_its_place_is_lost():
+    beside = [False, True, False, False, True, True]
+    assert gripped({3: 1.01 * PLACE_M}) == (beside, [BALL_KG, "release", APPLE_KG, "release"])
+
+
+def test_full_gripper_picks_nothing_else():
+    success, did = gripped({}, skip=(3,))  # the ball comes to the bottom, and ends where the apple should
+    assert success == [False, True, False, False, False, True]
+    assert did == [BALL_KG, "release"]
+
+
+def test_object_lies_where_it_was_released(monkeypatch):
+    monkeypatch.setattr("tests.benchmarks.paper.test_measure.NAMES", (*NAMES, "pick left"))
+    monkeypatch.setattr("tests.benchmarks.paper.test_measure.GOALS_M", np.vstack([GOALS_M, GOALS_M[3]]))
+    assert gripped({1: 0.03}, order=(1, 3, 6)) == ([True, True, False], [BALL_KG, "release"])  # 30 mm away
+
+
+def test_policy_operates_a_twin(make_arm_model):
+    controller = Controller.of(make_policy(make_arm_model))
+    outcome = operate(Twin(0), controller, circle_poses(1).astype(float), ["pick right"], "as shown")
+    assert outcome.operation.tolist() == [True] and outcome.success.tolist() == [False]
+    assert len(outcome.wall_n) == len(outcome.container_n) == len(outcome.finger_m) == len(outcome.time_s)
+    assert not outcome.wall_n.any()

@@ -1,0 +1,227 @@
+"""Summary, report, pictures and film: nothing of made-up results is hidden."""
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from benchmarks.paper import film, report
+from benchmarks.paper.goals import Check
+from benchmarks.paper.jobs import Scene
+from benchmarks.paper.kinds import KINDS, Trial, learned_run
+from benchmarks.paper.measure import save_outcome
+from benchmarks.paper.report import write_report
+from benchmarks.paper.summary import (
+    first_stage_success,
+    load_results,
+    spread,
+    spreads,
+    steps_to_success,
+    trial_rows,
+)
+from benchmarks.paper.trials import trainings, trials
+from mjx_softarm.mechanics.pipe import CrossPipe, clearance
+from mjx_softarm.mechanics.workspace import circle_poses
+from tests.benchmarks.paper.made_up import (
+    SPEC,
+    TINY,
+    N,
+    fill,
+    goals_of,
+    good_results,
+    made_up,
+    pipe_trial,
+    trained,
+)
+from train.config import IMITATION_PRESETS, to_dict
+
+
+def test_spread_by_hand():
+    assert spread([1.0, 2.0, 6.0]) == pytest.approx((3.0, np.sqrt(14 / 3), 1.0, 6.0))
+    assert np.isnan(spread([1.0, np.nan])).all()
+
+
+def test_spreads_group_kinds_and_variants():
+    changed = {Trial("with", 1, 0): made_up("with", (6.0,), missed=[0])}
+    table = trial_rows(good_results("open", TINY, changed))
+    found = {(item["kind"], item["variant"]): item for item in spreads(table)}
+    loads = [("with", "0 g"), ("with", "500 g"), ("with", "1000 g")]
+    assert set(found) == {("without", "0 g"), ("gradient", "0 g"), *loads}
+    unloaded = found["with", "0 g"]
+    assert (unloaded["runs"], unloaded["incomplete_runs"]) == (2, 1)
+    assert unloaded["translation_mm"] == pytest.approx({"mean": 5.0, "std": 1.0, "min": 4.0, "max": 6.0})
+    assert unloaded["paper"]["translation_mm"] == 11.59
+    assert found["without", "0 g"]["paper"]["yaw_deg"] == 13.72
+    assert found["with", "1000 g"]["paper"] == {"max_mm": 23.76}
+    assert found["gradient", "0 g"]["paper"] == {}
+    table = trial_rows(good_results("confined", changed={pipe_trial(): made_up("pipe", fails=(0,))}))
+    found = {(item["kind"], item["variant"]): item for item in spreads(table)}
+    assert set(found) == {
+        *(("pipe", "as shown"), ("pipe", "exchanged"), ("hand-made", "as shown"), ("narrow", "as shown")),
+        *(("circle", "as shown"), ("with", "0 g")),
+    }
+    shown = found["pipe", "as shown"]
+    assert (shown["runs"], shown["all_done_runs"], shown["incomplete_runs"]) == (9, 8, 0)
+    assert shown["paper"]["x_mm"] == 8.93
+    assert found["circle", "as shown"]["paper"] == {"translation_mm": 11.29}
+
+
+def test_steps_and_stages_of_a_training_by_hand():
+    training = trained("circle", reaches_at=5, after_one=0.5, after_two=0.75)
+    assert steps_to_success(training) == 6000  # evaluated after every second epoch
+    assert steps_to_success(trained("pipe", reaches_at=99)) is None
+    assert first_stage_success(training) == [0.5, 0.75]
+    assert first_stage_success(trained("pipe")) is None
+
+
+def test_stage_ends_come_from_the_runs_config(tmp_path):
+    (tmp_path / "trials").mkdir()
+    for trial in trials("confined", TINY):
+        save_outcome(tmp_path / trial.result, made_up(trial.kind))
+    for item in trainings(TINY):
+        run = tmp_path / learned_run(*item)
+        run.mkdir()
+        config = to_dict(IMITATION_PRESETS[KINDS[item[0]].preset])
+        (run / "config.json").write_text(json.dumps({"train": config}))
+        (run / "metrics.jsonl").write_text('{"epoch": 1}\n{"epoch": 2}\n')
+    found = load_results(tmp_path, "confined", TINY)
+    assert set(found.outcomes) == set(trials("confined", TINY))
+    assert found.trainings["circle", 0, 0].stage_ends == (7,)  # 20 epochs, a third of them first
+    assert found.trainings["pipe", 0, 0].stage_ends == ()
+    assert [row["epoch"] for row in found.trainings["pipe", 0, 0].rows] == [1, 2]
+
+
+def test_open_results_are_written_and_nothing_is_hidden(tmp_path, read_page):
+    fill(tmp_path, TINY)
+    lost = made_up("with", missed=range(6))
+    results = good_results("open", TINY, {Trial("with", 0, 0): lost})
+    side = film.SideView("", "", (0, 1), circle_poses(3)[:, :3])
+    frames = film.frames([np.zeros((20, 15, 3), np.uint8)] * 3, np.zeros((3, 3)), side)
+    film.write_gif(tmp_path / "circle.gif", frames)
+    data = write_report("open", tmp_path, tmp_path / "out", TINY, results, "", {"commit": "none"})
+    page = read_page(tmp_path / "report.html")
+    assert page.n_pictures == 3 + len(TINY.loads_g) + 1
+    assert "not met: with S2R, mean translation at most 5 mm: nan mm, 6 points missed" in page.text
+    for text in ("NOT MET", "twin 1: Springs: off <by> much", "21.01", "3.89"):
+        assert text in page.text
+    written = json.loads((tmp_path / "out" / "paper-open.json").read_text("utf-8"))
+    assert written["commit"] == "none"
+    runs = written["figures"]["runs"]
+    assert len(runs) == len(trials("open", TINY)) == len(data["runs"])
+    assert [row["translation_mm"] is None for row in runs].count(True) == 1
+    simulated = written["figures"]["simulated"]
+    assert {item["simulated_mm"] for item in simulated} == {1.25}
+    assert (simulated[0]["on_twin_mm"]["min"], simulated[0]["on_twin_mm"]["max"]) == (10.0, 10.0)
+    pictures = {path.name for path in (tmp_path / "out").glob("paper-*.png")}
+    names = ("circle", "error", "loads", "pressures-500g", "pressures-1000g")
+    assert pictures == {f"paper-{name}.png" for name in names}
+    assert all((tmp_path / "out" / name).stat().st_size < 150_000 for name in pictures)
+    assert (tmp_path / "out" / "paper-circle.gif").read_bytes()[:6] == b"GIF89a"
+
+
+def test_confined_results_are_written_and_nothing_is_hidden(tmp_path, read_page):
+    fill(tmp_path, TINY)
+    lost = [pipe_trial(1), pipe_trial(0, kind="narrow"), pipe_trial(1, kind="narrow")]
+    changed = {t: made_up(t.kind, fails=range(4), missed=range(len(goals_of(t.kind)[1]))) for t in lost}
+    results = good_results("confined", TINY, changed)
+    write_report("confined", tmp_path, tmp_path / "out", TINY, results, "no OpenGL <here>", {})
+    page = read_page(tmp_path / "confined.html")
+    assert page.n_pictures == 7
+    assert ["", "at the goals at most 5 mm: nan mm, 28 points missed in 1 of 2 runs"][1] in page.text
+    for text in ("8.93", "5.34", "5.13", "11.29", "11.59", "no OpenGL <here>", "7 of 10 goals are not met."):
+        assert text in page.text
+    figures = json.loads((tmp_path / "out" / "paper-confined.json").read_text("utf-8"))["figures"]
+    assert len(figures["trainings"]) == len(trainings(TINY))
+    assert [row["x_mm"] is None for row in figures["runs"]].count(True) == 3
+    names = ("positions", "errors", "errors-narrow", "force", "success", "losses", "circle")
+    pictures = {path.name for path in (tmp_path / "out").glob("*.png")}
+    assert pictures == {f"paper-confined-{name}.png" for name in names}
+    assert all((tmp_path / "out" / name).stat().st_size < 150_000 for name in pictures)
+
+
+@pytest.mark.parametrize("experiment", ["open", "confined"])
+def test_titles_and_labels_lie_within_the_pictures(experiment):
+    settings, results = TINY, good_results(experiment, TINY)
+    for name, (_, figure) in report.draw(experiment, settings, results, trial_rows(results)).items():
+        figure.draw_without_rendering()
+        width, height = figure.bbox.size
+        for axes in figure.axes:
+            box = axes.get_tightbbox()
+            assert box is not None
+            inside = box.x0 >= -1 and box.y0 >= -1 and box.x1 <= width + 1 and box.y1 <= height + 1
+            assert inside, (name, axes.get_title(loc="left"), box)
+
+
+def test_verdict_counts_what_is_met():
+    section = report._goals_section([Check("a", "1", True), Check("b", "2", False)])
+    assert section.warnings == ("not met: b: 2",)
+    assert [row[2] for row in section.tables[0].rows] == ["met", "NOT MET"]
+
+
+# --- Film --------------------------------------------------------------------------------------------------
+
+
+class DrawnTwin:
+    """A twin whose pictures show the time, and whose tip goes to the right."""
+
+    time_s = 0.0
+
+    def write_pressures(self, pressure_kpa):
+        self.time_s += 0.02
+
+    def draw(self, renderer):
+        return np.full((320, 240, 3), round(self.time_s), np.uint8)
+
+    def motion_capture(self):
+        tip_m = np.array([0.01 * self.time_s, 0.0, -0.45])
+        return SimpleNamespace(tip_m=tip_m, tip_quaternion=np.array([1.0, 0.0, 0.0, 0.0]))
+
+    def renderer(self, width, height):
+        return open("/dev/null")
+
+
+def test_twin_is_filmed_at_equal_times():
+    twin = DrawnTwin()
+    camera = film.Camera(twin, None)
+    for _ in range(round(200 / 0.02)):
+        twin.write_pressures(np.zeros(N))
+        camera.shoot()
+    taken = [picture[0, 0, 0] for picture in camera.pictures]
+    assert taken[:3] == [0, 1, 2]
+    assert len(taken) == len(camera.seen) == 201
+    path_mm = 1e3 * np.array([seen.tip_m for seen in camera.seen])
+    images = film.frames(camera.pictures, path_mm, film.SideView("", "", (0, 1), circle_poses(4)[:, :3]))
+    shown = [image.getpixel((0, 319))[0] for image in images]
+    assert len(images) == film.MAX_FRAMES
+    assert (shown[0], shown[-1]) == (0, 200)
+    assert shown == sorted(shown)
+
+
+def test_outline_is_the_wall():
+    pipe = CrossPipe.of_mm(300)
+    for line in film.outline_mm(pipe):
+        for x, z in 0.5e-3 * (line[:-1] + line[1:]):
+            assert abs(clearance(pipe, np.array([x, 0.0, z]))) < 1e-9
+
+
+def test_film_shows_the_pipe_and_the_path(tmp_path, monkeypatch):
+    def operate(twin, controller, goals, names, objects):
+        for _ in range(500):
+            twin.write_pressures(np.zeros(N))
+
+    written = {}
+    names, goals = goals_of("pipe")
+    controller = SimpleNamespace(policy=SimpleNamespace(spec=SPEC))
+    monkeypatch.setattr(film, "operate", operate)
+    monkeypatch.setattr(film, "write_gif", lambda path, images: written.update({path: images}))
+    film.film_scene(tmp_path / "pipe.gif", Scene(DrawnTwin(), controller, goals, names), pipe_trial())
+    images = written[tmp_path / "pipe.gif"]
+    assert [image.getpixel((0, 0))[0] for image in images] == list(range(len(images)))
+    # The tip, at first straight below the crossing, then to the right; the wall on both sides.
+    orange = [(np.asarray(image) == (224, 123, 40)).all(axis=-1) for image in images]
+    across = np.array([np.argwhere(mask)[:, 1].mean() for mask in orange])
+    assert abs(across[0] - 360) < 1.0 and np.all(np.diff(across) > 0)
+    grey = (np.asarray(images[0])[:, 240:] == (154, 160, 166)).all(axis=-1)
+    assert grey[:, :120].sum() == pytest.approx(grey[:, 120:].sum(), rel=0.2)
+    assert grey.sum() > 28 * 21 + 500  # more than the goals' dots cover

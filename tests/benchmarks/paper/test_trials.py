@@ -1,0 +1,60 @@
+"""The lists of trials, trainings and stages of both experiments."""
+
+from benchmarks.paper.engine import Settings
+from benchmarks.paper.trials import stages, trainings, trials
+from tests.benchmarks.paper.made_up import TINY
+
+
+def test_three_twins_and_three_seeds():
+    found = trials("open", Settings())
+    assert len(found) == len(set(found)) == 3 * 3 * (2 + 6) + 3
+    assert sum(trial.kind == "gradient" for trial in found) == 3
+    found = trials("confined", Settings())
+    assert len(found) == len(set(found)) == 9 * 5 + 9
+    learned = trainings(Settings())
+    assert len(learned) == len(set(learned)) == 4 * 9 + 3
+    assert sum(kind == "no-penalty" for kind, _, _ in learned) == 3
+
+
+def test_stages_leave_every_trial_s_result_and_come_after_what_they_need():
+    for experiment in ("open", "confined"):
+        groups = stages(experiment, TINY)
+        at = {path: k for k, group in enumerate(groups) for stage in group for path in stage.results}
+        names = [stage.name for group in groups for stage in group]
+        assert len(names) == len(set(names)) and len(at) == sum(len(s.results) for g in groups for s in g)
+        for trial in trials(experiment, TINY):
+            run = f"{trial.kind}-twin{trial.twin}-seed0"
+            policies = {
+                "with": ["twin{}-seed0"],
+                "gradient": ["twin{}-seed0"],
+                "without": ["twin{}-seed0", "nominal-seed0"],
+            }.get(trial.kind, [run])
+            for folder in policies:
+                assert at[f"{folder.format(trial.twin)}/policy.npz"] < at[trial.result]
+            assert at[f"twin{trial.twin}/calibration"] < at[f"twin{trial.twin}-seed0/policy.npz"]
+        if experiment == "confined":
+            for twin in TINY.twins:
+                learned = {
+                    kind: at[f"{kind}-twin{twin}-seed0/evaluation.json"] for kind in ("pipe", "narrow")
+                }
+                assert at[f"twin{twin}/demos-pipe300.npz"] < learned["pipe"] < learned["narrow"]
+                circle = at[f"circle-twin{twin}-seed0/evaluation.json"]
+                assert at[f"twin{twin}/demos-circle16.npz"] < circle
+                assert at[f"twin{twin}-seed0/policy.npz"] < circle
+
+
+def test_both_experiments_share_calibrations_and_policies():
+    shared = [
+        {path for group in stages(experiment, TINY) for stage in group for path in stage.results}
+        for experiment in ("open", "confined")
+    ]
+    assert shared[0] & shared[1] == {
+        path
+        for twin in TINY.twins
+        for path in (
+            f"twin{twin}/calibration",
+            f"twin{twin}-seed0/evaluation.json",
+            f"twin{twin}-seed0/policy.npz",
+            f"trials/with-twin{twin}-seed0-0-g.npz",
+        )
+    }
