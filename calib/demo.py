@@ -18,7 +18,7 @@ from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.mechanics.mjcf import build_model, spring_lengths, steps_per_period
 from mjx_softarm.mechanics.workspace import settle_many
 from mjx_softarm.sensing.pose import rotation_from_quaternion
-from mjx_softarm.sensing.sensors import SensorParams, frequency_from_length
+from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
 
 N_LENGTHS = 60  # of each spring on the ruler
@@ -100,7 +100,7 @@ def _springs(arm: ArmSpec, rng: np.random.Generator) -> Log:
     length_m = np.linspace(low, high, N_LENGTHS)[:, None] * np.ones(arm.n_chambers)
     return Log(
         **_rows(2.0 * np.arange(N_LENGTHS)),
-        frequency_hz=_readings(arm, length_m, rng),
+        readings=_readings(arm, length_m, rng),
         spring_m=length_m + RULER_NOISE_M * rng.normal(size=length_m.shape),
     )
 
@@ -175,7 +175,7 @@ def _measured(
         mujoco.mju_mat2Quat(quaternion[k], matrix.ravel())
     return Log(
         **_rows(time_s),
-        frequency_hz=_readings(arm, spring_m, rng),
+        readings=_readings(arm, spring_m, rng),
         pressure_kpa=pressure_kpa + rng.normal(scale=PRESSURE_NOISE_KPA, size=pressure_kpa.shape),
         tip_m=tip_m + rng.normal(scale=TIP_NOISE_M, size=tip_m.shape),
         tip_quaternion=quaternion,
@@ -190,4 +190,4 @@ def _rows(time_s: np.ndarray) -> dict[str, Any]:
 
 def _readings(arm: ArmSpec, length_m: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     noisy_m = length_m + rng.normal(scale=READING_NOISE_M, size=length_m.shape)
-    return frequency_from_length(noisy_m, SensorParams.from_spec(arm))
+    return Sensor.from_spec(arm).readings(noisy_m)

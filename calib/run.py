@@ -34,7 +34,7 @@ from mjx_softarm._support.provenance import write_json
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.sensing.pose import pose_from_frame
 from mjx_softarm.sensing.s2r import S2R, S2R_FILE, save_s2r
-from mjx_softarm.sensing.sensors import SensorParams, length_from_frequency
+from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.spec import ARM_FILE, ArmSpec
 
 OF_POSES = ("pressure_kpa", "tip_m", "tip_quaternion")  # what a log of poses must have
@@ -123,18 +123,20 @@ def _springs(
     logs: Sequence[Log], spec: ArmSpec, seed: int, how: Mapping[str, bool]
 ) -> tuple[ArmSpec, Section]:
     pairs = [
-        (log.frequency_hz, log.spring_m)
+        (readings, log.spring_m)
         for log in logs
-        if log.frequency_hz is not None and log.spring_m is not None
+        if (readings := log.readings_of(spec.sensor)) is not None and log.spring_m is not None
     ]
     if not pairs:
-        needed = f"{NOT_FITTED} No log has both frequencies and measured spring lengths."
+        needed = f"{NOT_FITTED} No log has both readings and measured spring lengths."
         return spec, Section("Springs", needed, warnings=("beta and delta are not this arm's",))
-    frequency_hz, length_m = (np.concatenate(x) for x in zip(*pairs, strict=True))
-    fit = fit_springs(frequency_hz, length_m, SensorParams.from_spec(spec), seed=seed, **how)
-    sensor = {"beta": tuple(map(float, fit.beta)), "delta_m": tuple(map(float, fit.delta_m))}
-    spec = spec.replace(sensor=sensor | {"compensation_h": fit.compensation_h})
-    calibrated = length_from_frequency(frequency_hz, SensorParams.from_spec(spec), np.nan)
+    readings, length_m = (np.concatenate(x) for x in zip(*pairs, strict=True))
+    fit = fit_springs(readings, length_m, Sensor.from_spec(spec), seed=seed, **how)
+    sensor: dict[str, Any] = {"beta": tuple(map(float, fit.beta)), "delta_m": tuple(map(float, fit.delta_m))}
+    if fit.compensation_h is not None:
+        sensor["compensation_h"] = fit.compensation_h
+    spec = spec.replace(sensor=sensor)
+    calibrated = Sensor.from_spec(spec).lengths(readings, np.nan)
     return spec, sections.springs(fit, calibrated.length_m, length_m)
 
 

@@ -9,20 +9,27 @@ from __future__ import annotations
 
 import dataclasses
 import tomllib
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import tomli_w
 
-from mjx_softarm._support.fields import SpecError, anything, count, not_negative, positive, read_fields
-from mjx_softarm.sensing.sensors import frequency_range_hz
+from mjx_softarm._support.fields import (
+    PerChamber,
+    SpecError,
+    anything,
+    count,
+    not_negative,
+    positive,
+    read_fields,
+)
+from mjx_softarm.sensing.sensors import SENSORS, Sensor
 
 N_CHAMBERS_PER_SECTION = 3
 ARM_FILE = "arm.toml"  # in the folder of a calibration
-
-PerChamber = float | tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -89,20 +96,6 @@ class Springs:
 
 
 @dataclass(frozen=True)
-class Sensor:
-    """Resonant circuit and coil of one spring; see `mjx_softarm.sensing.sensors`."""
-
-    capacitance_f: float = positive()
-    compensation_h: float = anything()
-    turns: float = positive()
-    coil_radius_m: float = positive()
-    beta: PerChamber = positive(per_chamber=True)
-    delta_m: PerChamber = anything(per_chamber=True)
-    frequency_min_hz: float = positive()
-    frequency_max_hz: float = positive()
-
-
-@dataclass(frozen=True)
 class Control:
     """Gains of the sensor-space law; see `mjx_softarm.control`."""
 
@@ -126,7 +119,7 @@ class ArmSpec:
     chambers: Chambers
     backbone: Backbone
     springs: Springs
-    sensor: Sensor
+    sensor: Sensor = field(metadata={"kinds": SENSORS})  # without `kind` in a file: the first
     control: Control
 
     @property
@@ -179,7 +172,10 @@ class ArmSpec:
         return spec
 
     def to_dict(self) -> dict[str, Any]:
-        return dataclasses.asdict(self)
+        """Return nested dictionaries, as a TOML file has them."""
+        data = dataclasses.asdict(self)
+        data["sensor"] = {"kind": self.sensor.kind, **data["sensor"]}
+        return data
 
     def to_toml(self, path: str | Path) -> None:
         """Write the specification; `from_toml` of it gives an equal one."""
@@ -194,8 +190,10 @@ class ArmSpec:
         for group, values in groups.items():
             if group not in data:
                 raise SpecError(f"replace: unknown group {group!r}, expected one of {', '.join(data)}")
-            if isinstance(values, dict) and isinstance(data[group], dict):
-                values = {**data[group], **values}
+            before = data[group]
+            if isinstance(values, dict) and isinstance(before, dict):
+                same_kind = values.get("kind", before.get("kind")) == before.get("kind")
+                values = {**before, **values} if same_kind else values
             data[group] = values
         return self.from_dict(data, "replace")
 
@@ -218,21 +216,20 @@ class ArmSpec:
                     )
         _ordered(source, "chambers", self.chambers, "pressure_min_kpa", "pressure_max_kpa")
         _ordered(source, "springs", self.springs, "length_min_m", "length_max_m")
-        _ordered(source, "sensor", self.sensor, "frequency_min_hz", "frequency_max_hz")
+        _ordered(source, "sensor", self.sensor, *self.sensor.range_fields)
         self._check_sensor(source)
 
     def _check_sensor(self, source: str) -> None:
-        """The lengths that may be commanded must be lengths that the sensor can read."""
-        sensor = self.sensor
-        frequencies_hz = frequency_range_hz(self)
-        for k, name in enumerate(("length_min_m", "length_max_m")):
-            length_m, frequency_hz = getattr(self.springs, name), frequencies_hz[:, k]
-            readable = (frequency_hz >= sensor.frequency_min_hz) & (frequency_hz <= sensor.frequency_max_hz)
-            if not readable.all():
+        """Refuse lengths that may be commanded but that the sensor cannot read."""
+        sensor = Sensor.from_spec(self)
+        (low, high), unit = sensor.range, sensor.unit
+        for name in ("length_min_m", "length_max_m"):
+            length_m = getattr(self.springs, name)
+            readings = sensor.readings(np.full(self.n_chambers, length_m))
+            if not (readable := (readings >= low) & (readings <= high)).all():
                 raise SpecError(
-                    f"{source}: springs.{name}: {length_m!r} reads {frequency_hz[~readable][0]:.6g} Hz, "
-                    f"expected sensor.frequency_min_hz to frequency_max_hz, {sensor.frequency_min_hz:g} to "
-                    f"{sensor.frequency_max_hz:g} Hz"
+                    f"{source}: springs.{name}: {length_m!r} reads {readings[~readable][0]:.6g} {unit}, expected "
+                    f"sensor.{' to '.join(sensor.range_fields)}, {low:g} to {high:g} {unit}"
                 )
 
 

@@ -6,20 +6,16 @@ from mjx_softarm import ArmSpec
 from mjx_softarm.control import Gains
 from mjx_softarm.deploy.loop import Controller
 from mjx_softarm.deploy.session import follow
+from mjx_softarm.mdp.actions import ActionMap
 from mjx_softarm.mdp.observation import ObsScale
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.sensing.estimator import PoseEstimator, SpringModel, estimate
-from mjx_softarm.sensing.sensors import (
-    SensorParams,
-    frequency_from_length,
-    frequency_range_hz,
-    length_from_frequency,
-)
+from mjx_softarm.sensing.sensors import Sensor
 
 SPEC = ArmSpec.default()
 N, DT_S = SPEC.n_chambers, 1.0 / SPEC.control.rate_hz
-SENSOR = SensorParams.from_spec(SPEC)
+SENSOR = Sensor.from_spec(SPEC)
 LOW_KPA, HIGH_KPA = SPEC.chambers.pressure_min_kpa, SPEC.chambers.pressure_max_kpa
 REST_M = 0.2
 # A chamber lengthens its own spring and, by bending, shortens its section's others.
@@ -45,8 +41,8 @@ class LinearArm:
     def tick(self):
         return round(self.time_s / DT_S)
 
-    def read_frequencies(self):
-        return frequency_from_length(self.spring_m + self.noise_m * self._rng.standard_normal(N), SENSOR)
+    def read_sensors(self):
+        return SENSOR.readings(self.spring_m + self.noise_m * self._rng.standard_normal(N))
 
     def write_pressures(self, pressure_kpa):
         self.command_kpa = np.array(pressure_kpa)
@@ -65,13 +61,13 @@ class Blind(LinearArm):
         super().__init__()
         self._ticks, self._spoil = ticks, spoil
 
-    def read_frequencies(self):
-        frequency_hz = super().read_frequencies()
-        return self._spoil(frequency_hz) if self.tick in self._ticks else frequency_hz
+    def read_sensors(self):
+        readings = super().read_sensors()
+        return self._spoil(readings) if self.tick in self._ticks else readings
 
 
-def nan(frequency_hz):
-    return np.where(np.arange(N) == 4, np.nan, frequency_hz)
+def nan(readings):
+    return np.where(np.arange(N) == 4, np.nan, readings)
 
 
 def make_policy():
@@ -98,8 +94,7 @@ def make_policy():
         layers=((np.zeros((18, N), np.float32), np.zeros(N, np.float32)),),
         obs_scale=ObsScale(*(np.asarray(value, float) for value in ObsScale.from_spec(SPEC))),
         reward=RewardConfig(),
-        frequency_hz=frequency_range_hz(SPEC),
-        sensor=SENSOR,
+        actions=ActionMap.from_spec(SPEC),
         gains=Gains.from_spec(SPEC),
         rate_hz=SPEC.control.rate_hz,
         spec=SPEC,
@@ -132,4 +127,4 @@ def go(arm, goals=GOALS, controller=CONTROLLER, **kwargs):
 
 def read_m(log):
     """Spring lengths (rows, 9) [m] by the logged frequencies, NaN where a reading was lost."""
-    return length_from_frequency(log.frequency_hz, SENSOR, np.nan).length_m
+    return SENSOR.lengths(log.readings, np.nan).length_m

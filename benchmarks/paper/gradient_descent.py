@@ -26,7 +26,6 @@ from mjx_softarm.policy.file import Policy
 from mjx_softarm.sensing.estimator import estimate
 from mjx_softarm.sensing.pose import pose_error
 from mjx_softarm.sensing.s2r import correct
-from mjx_softarm.sensing.sensors import length_from_frequency
 
 MAX_STEPS = 200
 FIRST_STEP = 1e-8  # [(m / mm)^2]; that the next search begins with is twice the last one's
@@ -40,7 +39,7 @@ Residual = Callable[[np.ndarray], np.ndarray]  # springs (..., n) [m] -> error (
 
 def gradient_descent(policy: Policy) -> Plan:
     """A way to find references that takes the place of a policy's actor, for `Controller.of`."""
-    low_m, high_m = length_from_frequency(policy.frequency_hz.T, policy.sensor).length_m  # (n,) each
+    low_m, high_m = policy.sensor.lengths(np.stack(policy.actions[1:])).length_m  # (n,) each
     pose_of = forward_kinematics(policy)
 
     def plan(_pose: np.ndarray, goal: np.ndarray, spring_m: np.ndarray) -> np.ndarray:

@@ -27,7 +27,6 @@ from mjx_softarm.sensing.pose import (
     pose_from_quaternion,
     rotation_from_quaternion,
 )
-from mjx_softarm.sensing.sensors import length_from_frequency
 
 AT_LIMIT_KPA = 0.1  # distance to a pressure limit that counts as at it, for a window's mean
 GRASP_M = 0.02  # finger tips to the object's middle: the jaws open 40 mm
@@ -73,9 +72,9 @@ class WatchedTwin:
     def __getattr__(self, name: str) -> Any:
         return getattr(self._twin, name)
 
-    def read_frequencies(self) -> np.ndarray:
+    def read_sensors(self) -> np.ndarray:
         """Read the twin; see `ArmIO`."""
-        return self._twin.read_frequencies()
+        return self._twin.read_sensors()
 
     def write_pressures(self, pressure_kpa: np.ndarray) -> None:
         """Drive the twin; see `ArmIO`."""
@@ -160,7 +159,7 @@ def measure(run: Run, controller: Controller, goals: np.ndarray) -> Outcome:
     log, policy, window = run.log, controller.policy, controller.window
     assert log.pressure_kpa is not None and log.reference_m is not None and log.goal is not None
     assert log.tip_m is not None and log.tip_quaternion is not None  # a twin has motion capture
-    spring_m = length_from_frequency(log.frequency_hz, policy.sensor, np.nan).length_m
+    spring_m = policy.sensor.lengths(log.readings, np.nan).length_m
     seen = pose_from_quaternion(log.tip_m, log.tip_quaternion)
     error, believed = np.full((2, *goals.shape), np.nan)
     mask, arrival_s = np.zeros((len(goals), policy.spec.n_chambers), bool), np.full(len(goals), np.nan)

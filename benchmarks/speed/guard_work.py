@@ -28,7 +28,7 @@ from mjx_softarm.deploy import loop
 from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.policy.file import ArmModel, policy_from_actor
 from mjx_softarm.sensing.estimator import N_CHANGES, PoseEstimator, SpringModel
-from mjx_softarm.sensing.sensors import SensorParams, frequency_from_length
+from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.spec import ArmSpec
 from train.config import PRESETS
 from train.epoch.job import Job, TrainState
@@ -176,15 +176,15 @@ def _tick(job: Job, state: TrainState, sizes: Sizes) -> Callable[[], Any]:
     actor = jax.device_get(state.agent.actor_params)
     controller = loop.Controller.of(policy_from_actor(actor, spec, job.config.env.reward, model, {}))
     noise_m = 4e-5 * np.random.default_rng(3).normal(size=(controller.window, spec.n_chambers))
-    frequency_hz = frequency_from_length(spring_m + noise_m, SensorParams.from_spec(spec))
+    readings = Sensor.from_spec(spec).readings(spring_m + noise_m)
     before = loop.start(controller)
-    for reading in frequency_hz:
+    for reading in readings:
         before, _ = loop.step(controller, before, reading, False)
     before, refused = loop.with_goal(controller, before, np.asarray(pool.pose[0], float))
-    after, _ = loop.step(controller, before, frequency_hz[0], False)
+    after, _ = loop.step(controller, before, readings[0], False)
     if refused or after.phase is not loop.Phase.RUN or after.n_actions != 1:
         raise RuntimeError(f"the tick is not one in which the policy acts: {refused}, {after}")
-    return lambda: [loop.step(controller, before, frequency_hz[0], False) for _ in range(sizes.n_ticks)]
+    return lambda: [loop.step(controller, before, readings[0], False) for _ in range(sizes.n_ticks)]
 
 
 def _model(spec: ArmSpec, workspace: np.ndarray, spring_m: np.ndarray) -> ArmModel:

@@ -20,10 +20,10 @@ import mujoco
 import numpy as np
 
 from mjx_softarm import control
+from mjx_softarm.mdp.actions import ActionMap
 from mjx_softarm.mdp.observation import OBS_SIZE, ObsScale, observe
 from mjx_softarm.mdp.rewards import RewardConfig, reward
 from mjx_softarm.mechanics.mjcf import spring_lengths
-from mjx_softarm.sensing import sensors
 from mjx_softarm.sensing.pose import pose_from_frame
 from mjx_softarm.spec import ARM_FILE, ArmSpec
 
@@ -70,13 +70,11 @@ class Task:
         self.spec = spec
         self.gains = control.Gains.from_spec(spec)
         self.period_s = 1.0 / spec.control.rate_hz
-        self._sensor = sensors.SensorParams.from_spec(spec)
-        self._low_hz, self._high_hz = sensors.frequency_range_hz(spec).T
+        self._actions = ActionMap.from_spec(spec)
         self._scale, self._reward = ObsScale.from_spec(spec), RewardConfig()
 
     def reference_m(self, action: np.ndarray) -> np.ndarray:
-        frequency = self._low_hz + 0.5 * (np.clip(action, -1.0, 1.0) + 1.0) * (self._high_hz - self._low_hz)
-        return sensors.length_from_frequency(frequency, self._sensor).length_m
+        return self._actions.lengths(action)
 
     def observe(self, pose: np.ndarray, goal: np.ndarray) -> np.ndarray:
         return observe(pose, goal, self._scale, self._reward).astype(np.float32)

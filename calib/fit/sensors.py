@@ -13,7 +13,6 @@ far enough.
 from __future__ import annotations
 
 import functools
-import math
 from typing import NamedTuple
 
 import jax
@@ -24,7 +23,7 @@ from jax import Array
 
 from calib.errors import FitError
 from calib.fit.blocks import folds
-from mjx_softarm.sensing.sensors import SensorParams
+from mjx_softarm.sensing.sensors import Coil, Sensor
 
 HUBER = 1.345  # in standard deviations of the noise: 95 % of the efficiency of least squares
 DOWN_WEIGHTED = 2 * HUBER  # beyond it a row counts less than half
@@ -57,9 +56,8 @@ class SpringFit(NamedTuple):
     delta_m: np.ndarray  # (n,)
     beta_interval: np.ndarray  # (n, 2)
     delta_interval_m: np.ndarray  # (n, 2)
-    capacitance_f: float  # as given
-    compensation_h: float
-    compensation_interval_h: tuple[float, float] | None  # None where it was not fitted
+    compensation_h: float | None  # of coils, None where it was not fitted
+    compensation_interval_h: tuple[float, float] | None
     rms_m: np.ndarray
     held_out_rms_m: np.ndarray
     noise_m: np.ndarray
@@ -89,9 +87,9 @@ def fit_line(
 
 
 def fit_springs(
-    frequency_hz: np.ndarray,
+    readings: np.ndarray,
     length_m: np.ndarray,
-    params: SensorParams,
+    sensor: Sensor,
     fit_compensation: bool = False,
     shared: bool = False,
     block: int = 100,
@@ -100,40 +98,50 @@ def fit_springs(
     """Calibrate springs from readings and the lengths that were measured at them.
 
     Args:
-        frequency_hz (n, n_springs): readings; one that is not finite or not believed is left out.
+        readings (n, n_springs): readings; one that is not finite or not believed is left out.
         length_m (n, n_springs): measured lengths, NaN where there is none.
-        params: circuit and coil; its beta and delta are not used.
-        fit_compensation: fit I_comp, too, one for all springs.
+        sensor: which reads them; its beta and delta are not used.
+        fit_compensation: fit I_comp, too, one for all springs; for coils alone.
         shared: one beta and delta for all springs.
         block, seed: as in `fit_line`.
 
     Raises:
-        FitError: the shapes differ, or a spring has fewer than 3 rows or one reading only.
+        FitError: the shapes differ, a spring has fewer than 3 rows or one reading only, or a compensation is
+            to be fitted to sensors that have none.
     """
-    frequency_hz = np.asarray(frequency_hz, float)
-    believed = (frequency_hz >= params.frequency_min_hz) & (frequency_hz <= params.frequency_max_hz)
-    inverse_h = np.where(believed, float(params.capacitance_f) * (2 * math.pi * frequency_hz) ** 2, np.nan)
-    coil_hm, given_h = float(params.coil_hm), float(params.compensation_h)
+    readings = np.asarray(readings, float)
+    low, high = sensor.range
+    believed = (readings >= low) & (readings <= high)
+    scale, compensation_h, compensation_interval = 1.0, None, None
     if fit_compensation:
+        if not isinstance(sensor, Coil):
+            raise FitError(f"fit_compensation: got sensors of kind {sensor.kind}, expected {Coil.kind}")
+        inverse_h = np.where(believed, sensor.inverse_inductance(readings), np.nan)
         unit_h = 1.0 / np.nanmax(inverse_h)  # I_comp beyond it would leave no coil
         w = inverse_h * unit_h
         line, share, interval = _fit(
-            _wire_share, w, length_m, np.array([given_h / unit_h]), "spring", shared, block, seed
+            _wire_share,
+            w,
+            length_m,
+            np.array([sensor.compensation_h / unit_h]),
+            "spring",
+            shared,
+            block,
+            seed,
         )
         assert interval is not None  # one number besides the lines was fitted
-        scale, compensation_h = unit_h / coil_hm, float(share[0] * unit_h)
+        scale, compensation_h = unit_h / sensor.coil_hm, float(share[0] * unit_h)
         compensation_interval = (float(interval[0] * unit_h), float(interval[1] * unit_h))
         warnings = (*line.warnings, *_compensation_warnings(compensation_interval, unit_h))
     else:
-        wire_m = coil_hm * inverse_h / (1.0 - given_h * inverse_h)
-        line = fit_line(np.where(wire_m > 0, wire_m, np.nan), length_m, "spring", shared, block, seed)
-        scale, compensation_h, compensation_interval, warnings = 1.0, given_h, None, line.warnings
+        raw_m, exists = sensor.raw_length(np.where(believed, readings, low))
+        line = fit_line(np.where(believed & exists, raw_m, np.nan), length_m, "spring", shared, block, seed)
+        warnings = line.warnings
     return SpringFit(
         beta=line.slope * scale,
         delta_m=line.offset,
         beta_interval=line.slope_interval * scale,
         delta_interval_m=line.offset_interval,
-        capacitance_f=float(params.capacitance_f),
         compensation_h=compensation_h,
         compensation_interval_h=compensation_interval,
         rms_m=line.rms,

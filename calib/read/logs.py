@@ -19,21 +19,21 @@ from calib.read.table_checks import PLAUSIBLE, clean, implausible, quantity
 from mjx_softarm.logs.checks import Finding
 from mjx_softarm.logs.files import read_sheet, refuse
 from mjx_softarm.logs.schema import UNITS, Column, Log, log_columns, write_log
-from mjx_softarm.sensing.sensors import SensorParams, frequency_from_length
+from mjx_softarm.sensing.sensors import SENSORS, Sensor
 from mjx_softarm.spec import ArmSpec
 
 _HELP = """\
 A log is a CSV file (commas, decimal points), or an npz file with the arrays `columns` and `table`.
 The header names each column with its unit, as in `pressure0 [kPa]`; the order does not matter.
-Needed are time and one at least of frequency, spring, pressure and tip. A group of columns is there
+Needed are time and one at least of sensor readings (of one kind), spring, pressure and tip. A group of columns is there
 whole or not at all. Markers are numbered from base to tip, springs and chambers as in the spec.
 Base frame: z up, the arm hangs from the origin towards -z. The tip is the centre of the last plate, its
 quaternion 1, 0, 0, 0 where the arm hangs straight.
 Chambers and the sim-to-real network are fitted to poses at rest: rows of which the pressures have been held
 for 3 s. One row per pose will do if the rows are more than 3 s apart.
 """
-_FACTORS = {"frequency_hz": 1.25, "spring_m": 1.5, "tip_m": 1.5}  # between the ranges of two logs of one arm
-_NEEDED = ("frequency_hz", "spring_m", "pressure_kpa", "tip_m")  # one of them at least
+_FACTORS = {"readings": 1.25, "spring_m": 1.5, "tip_m": 1.5}  # between the ranges of two logs of one arm
+_NEEDED = ("readings", "spring_m", "pressure_kpa", "tip_m")  # one of them at least
 
 
 def read_log(path: str | Path, n_chambers: int = 9, strict: bool = False) -> tuple[Log, list[Finding]]:
@@ -109,7 +109,7 @@ def template(path: str | Path) -> str:
         source=str(path),
         row=np.arange(10) + 2,
         time_s=np.arange(10) / spec.control.rate_hz,
-        frequency_hz=np.round(frequency_from_length(length_m, SensorParams.from_spec(spec))),
+        readings=np.round(Sensor.from_spec(spec).readings(length_m)),
         pressure_kpa=np.round(5.0 * np.sin(phase + 1.0), 2),
         tip_m=np.round(tip_m, 5),
         tip_quaternion=np.stack([np.cos(half), np.sin(half), 0.0 * half, 0.0 * half], axis=1).round(6),
@@ -124,7 +124,8 @@ def schema_text(n_chambers: int = 9, n_markers: int = 3) -> str:
     """The columns a log may have, in words; from the schema itself."""
     lines = [_HELP, f"{'columns':<30} {'units':<26} plausible"]
     groups: dict[tuple[str, str], list[Column]] = {}
-    for column in log_columns(n_chambers, n_markers):
+    names = [sensor.reading_name for sensor in SENSORS.values()]
+    for column in dict.fromkeys(c for name in names for c in log_columns(n_chambers, n_markers, name)):
         groups.setdefault((column.group, column.kind), []).append(column)
     for columns in groups.values():
         first, last = columns[0], columns[-1]

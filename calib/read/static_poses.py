@@ -21,7 +21,7 @@ import numpy as np
 from calib.errors import FitError
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.sensing.pose import rotation_from_quaternion
-from mjx_softarm.sensing.sensors import SensorFault, SensorParams, length_from_frequency
+from mjx_softarm.sensing.sensors import Sensor, SensorFault
 from mjx_softarm.spec import ArmSpec
 
 HOLD_KPA = 1.0
@@ -57,7 +57,7 @@ def find_static_poses(logs: Sequence[Log], spec: ArmSpec) -> tuple[StaticPoses, 
     """Poses at rest of all logs together.
 
     Args:
-        logs: each with pressures and tip poses; frequencies are read by the sensors of `spec` where a log
+        logs: each with pressures and tip poses; readings are those of the sensors of `spec` where a log
             has no spring lengths.
         spec: the arm; its payload is that of a log that does not say.
 
@@ -128,10 +128,11 @@ def holds(time_s: np.ndarray, pressure_kpa: np.ndarray, payload_kg: np.ndarray) 
 
 
 def spring_lengths(log: Log, spec: ArmSpec) -> np.ndarray:
-    """Spring lengths (n, n_chambers) [m]: from the frequencies, else as logged, else NaN."""
-    if log.frequency_hz is None:
+    """Spring lengths (n, n_chambers) [m]: from the readings, else as logged, else NaN."""
+    readings = log.readings_of(spec.sensor)
+    if readings is None:
         return np.full((len(log), spec.n_chambers), np.nan) if log.spring_m is None else log.spring_m
-    reading = length_from_frequency(log.frequency_hz, SensorParams.from_spec(spec))
+    reading = Sensor.from_spec(spec).lengths(readings)
     return np.where(reading.fault == SensorFault.OK, reading.length_m, np.nan)
 
 
@@ -169,7 +170,7 @@ def _check(log: Log, spec: ArmSpec) -> None:
     for name in ("pressure_kpa", "tip_m", "tip_quaternion"):
         if getattr(log, name) is None:
             raise FitError(f"{log.source}: no {name}, expected pressures and tip poses to fit chambers to")
-    for name in ("pressure_kpa", "spring_m", "frequency_hz"):
+    for name in ("pressure_kpa", "spring_m", "readings"):
         value = getattr(log, name)
         if value is not None and value.shape[1] != spec.n_chambers:
             raise FitError(f"{log.source}: {name}: got {value.shape[1]} columns, expected {spec.n_chambers}")

@@ -16,6 +16,7 @@ from mjx_softarm.logs import checks
 from mjx_softarm.logs.checks import Finding, LogError
 from mjx_softarm.logs.files import Sheet
 from mjx_softarm.logs.schema import UNITS, Column
+from mjx_softarm.sensing.sensors import SENSORS as KINDS
 
 
 class Plausible(NamedTuple):
@@ -33,9 +34,6 @@ class Plausible(NamedTuple):
 PLAUSIBLE: Mapping[str, Plausible] = MappingProxyType(
     {
         "time": Plausible(5e-4, 9.0),  # of the steps, in the median: 2 kHz down to a pose every 9 s
-        "frequency": Plausible(
-            1e4, 1e7, spike=1e3
-        ),  # the LDC1612 reads from 1 kHz, but no such coil is below 10
         "length": Plausible(0.03, 1.0, spike=1e-3),  # of a spring
         "position": Plausible(-3.0, 3.0, least=0.1, spike=2e-3),  # of tip and markers, from the base
         "pressure": Plausible(
@@ -46,11 +44,12 @@ PLAUSIBLE: Mapping[str, Plausible] = MappingProxyType(
         "id": Plausible(0.0, 1e6),
         "pose_length": Plausible(-3000.0, 3000.0, least=100.0),
         "angle": Plausible(-360.0, 360.0),
+        **{kind.reading_name: Plausible(*kind.plausible, spike=kind.spike) for kind in KINDS.values()},
     }
 )
 BY_HAND_ROWS, BY_HAND_S = 300, 600.0  # so few rows may be poses that somebody recorded at leisure
 HANGS_BELOW_M = -0.05  # of the tip, in the median: the base frame's z is up and the arm hangs
-SENSORS = ("frequency_hz", "spring_m", "pressure_kpa", "tip_m", "marker_m")
+SENSORS = ("readings", "spring_m", "pressure_kpa", "tip_m", "marker_m")
 
 
 class Fault(NamedTuple):
@@ -195,7 +194,7 @@ def _single_rows(sheet: Sheet) -> Iterator[Fault]:
 
 def _renewal(sheet: Sheet) -> Iterator[Fault]:
     everywhere = np.ones(len(sheet.row), bool)
-    for k in sheet.of("frequency_hz", "spring_m", "pressure_kpa"):
+    for k in sheet.of("readings", "spring_m", "pressure_kpa"):
         if np.ptp(sheet.values[:, k]) == 0.0:
             problem = f"always {_shown(sheet.columns[k], sheet.values[0, k])}, expected a sensor that changes"
             yield Fault(sheet.columns[k].name, problem, everywhere, drops=False)

@@ -6,6 +6,7 @@ before, so that a file that is incomplete, changed or of another kind is refused
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import io
 import json
@@ -95,13 +96,19 @@ def _mark(kind: str) -> bytes:
 def entries_of(name: str, group: Any) -> dict[str, np.ndarray]:
     """The entries of a dataclass or named tuple: `name.field`, and its `layers` one by one."""
     entries: dict[str, Any] = {}
-    for item in type(group).__annotations__:
+    for item in _field_names(type(group)):
         value = getattr(group, item)
         if item == "layers":
             entries |= layer_entries(name, value)
         else:
             entries[f"{name}.{item}"] = value
     return {item: np.asarray(value) for item, value in entries.items()}
+
+
+def _field_names(kind: type) -> tuple[str, ...]:
+    """Return the names of the fields of a dataclass or named tuple, inherited ones too."""
+    fields = getattr(kind, "_fields", None)
+    return fields or tuple(item.name for item in dataclasses.fields(kind))
 
 
 def layer_entries(name: str, layers: tuple[Layer, ...]) -> dict[str, Any]:
@@ -139,7 +146,7 @@ class Entries:
 
     def group(self, name: str, kind: type, *shapes: tuple[int, ...]) -> Any:
         """A dataclass or named tuple of numbers, all of them in one of the `shapes`."""
-        return kind(*(self.take(f"{name}.{item}", np.float64, *shapes) for item in kind.__annotations__))
+        return kind(*(self.take(f"{name}.{item}", np.float64, *shapes) for item in _field_names(kind)))
 
     def table(self, name: str) -> dict[str, Any]:
         """A JSON object."""

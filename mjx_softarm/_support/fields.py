@@ -5,10 +5,13 @@ from __future__ import annotations
 import dataclasses
 import math
 import typing
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
 from mjx_softarm._support.errors import InputError
+
+PerChamber = float | tuple[float, ...]
 
 
 class SpecError(InputError):
@@ -77,18 +80,29 @@ def read_fields(cls: type, data: Any, source: str, prefix: str) -> dict[str, Any
     for item in fields(cls):
         path = prefix + item.name
         if item.name not in data:
-            expected = "a table" if item.name in groups else _rule(item).text
+            expected = "a table" if item.name in groups else rule_of(item).text
             raise SpecError(f"{source}: {path}: missing, expected {expected}")
         value = data[item.name]
         group = groups.get(item.name)
+        if "kinds" in item.metadata and isinstance(value, dict):
+            group, value = _choose(item.metadata["kinds"], value, source, path)
         if group is not None:
             values[item.name] = group(**read_fields(group, value, source, path + "."))
         else:
-            values[item.name] = _read_value(_rule(item), value, source, path)
+            values[item.name] = _read_value(rule_of(item), value, source, path)
     return values
 
 
-def _rule(item: dataclasses.Field) -> Rule:
+def _choose(kinds: Mapping[str, type], data: dict, source: str, path: str) -> tuple[type, dict]:
+    """Return the class that an entry `kind` names, and the other entries."""
+    kind = data.get("kind", next(iter(kinds)))
+    if not isinstance(kind, str) or kind not in kinds:
+        raise SpecError(f"{source}: {path}.kind: got {kind!r}, expected {' or '.join(kinds)}")
+    return kinds[kind], {name: value for name, value in data.items() if name != "kind"}
+
+
+def rule_of(item: dataclasses.Field) -> Rule:
+    """Return the rule of a field; one without is a text."""
     return item.metadata.get("rule", Rule(kind=str))
 
 

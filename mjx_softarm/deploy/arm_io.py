@@ -10,17 +10,19 @@ import numpy as np
 class ArmIO(Protocol):
     """Sensors and pumps of one arm with n springs and n chambers, both numbered as in the model.
 
-    The control loop calls `read_frequencies`, then `write_pressures`, once per tick of the policy's
+    The control loop calls `read_sensors`, then `write_pressures`, once per tick of the policy's
     `rate_hz`, from one thread. Neither repeats a failed exchange by itself, nor puts old or made-up values in
     its place: whether the arm stops is for the loop to say.
     """
 
-    def read_frequencies(self) -> np.ndarray:
-        """The springs' resonance frequencies (n,) [Hz], float64, each read after the last call.
+    def read_sensors(self) -> np.ndarray:
+        """Return what the springs' sensors read (n,), float64, each read after the last call.
+
+        In the unit of the specification's sensor: frequencies [Hz] of coils, voltages [V] of draw wires.
 
         Blocks until the readings are there, for less than one tick. They are raw: not calibrated, not
-        filtered, not clipped. A single spring that could not be read is NaN; `length_from_frequency`
-        reports it as a fault.
+        filtered, not clipped. A single spring that could not be read is NaN; `Sensor.lengths` reports
+        it as a fault.
 
         Raises:
             TimeoutError: the readings did not come within a tick.

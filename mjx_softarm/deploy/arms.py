@@ -11,7 +11,7 @@ from mjx_softarm._support.errors import InputError
 from mjx_softarm.mechanics.pipe import PIPES_MM, CrossPipe
 from mjx_softarm.spec import SpecError
 
-_METHODS = ("read_frequencies", "write_pressures")
+_METHODS = ("read_sensors", "write_pressures")
 
 
 class ArmError(InputError):
@@ -42,6 +42,8 @@ def open_arm(name: str) -> Any:
     except AttributeError as error:
         raise ArmError(f"--arm: module {module_name} has no {item!r}") from error
     missing = [method for method in _METHODS if not callable(getattr(kind, method, None))]
+    if missing == ["read_sensors"] and hasattr(kind, "read_frequencies"):
+        raise ArmError(f"--arm: {name}: got a method read_frequencies, expected it to be named read_sensors")
     if missing:
         raise ArmError(f"--arm: {name} has no method {' or '.join(missing)}; see mjx_softarm.deploy.ArmIO")
     try:

@@ -17,7 +17,7 @@ from mjx_softarm.deploy.arm_io import ArmIO
 from mjx_softarm.deploy.faults import LOST_TICKS, SETTLE_TIMEOUT_S, still
 from mjx_softarm.deploy.loop import VENT_KPA_PER_S, WINDOW_S
 from mjx_softarm.deploy.session import ArmLost, Clock, Pumps, Recorder, read
-from mjx_softarm.sensing.sensors import SensorFault, SensorParams, describe_faults, length_from_frequency
+from mjx_softarm.sensing.sensors import Sensor, SensorFault
 from mjx_softarm.spec import ArmSpec
 
 RAMP_M_PER_S = 0.03  # of the reference that has furthest to go
@@ -81,7 +81,7 @@ class Drive:
 
     def __init__(self, arm: ArmIO, spec: ArmSpec, on_tick: Callable[[dict], None] = lambda row: None):
         self.arm, self.on_tick = arm, on_tick
-        self.sensor, self.gains = SensorParams.from_spec(spec), Gains.from_spec(spec)
+        self.sensor, self.gains = Sensor.from_spec(spec), Gains.from_spec(spec)
         self.dt_s = 1.0 / spec.control.rate_hz
         self.window = max(2, round(WINDOW_S * spec.control.rate_hz))
         self.clock, self.looks = Clock(arm), Recorder(arm)
@@ -126,15 +126,15 @@ class Drive:
         """One row, the spring lengths (n,) if none was lost, and whether the law has arrived."""
         begin_s = self.clock.now()
         n = len(self.pumps.pressure_kpa)
-        frequency_hz = read(self.arm, n)
+        readings = read(self.arm, n)
         row = self.looks.look(begin_s, self.pumps.pressure_kpa)
         text = "no readings within the tick"
         spring_m, lost = np.full(n, np.nan), True
-        if frequency_hz is not None:
-            reading = length_from_frequency(frequency_hz, self.sensor, np.nan)
+        if readings is not None:
+            reading = self.sensor.lengths(readings, np.nan)
             spring_m, lost = reading.length_m, bool(np.any(reading.fault != SensorFault.OK.value))
-            text = describe_faults(frequency_hz, reading.fault, self.sensor).replace("\n", "; ")
-        row["frequency_hz"] = spring_m * np.nan if frequency_hz is None else frequency_hz
+            text = self.sensor.describe_faults(readings, reading.fault).replace("\n", "; ")
+        row["readings"] = spring_m * np.nan if readings is None else readings
         self.n_lost = self.n_lost + 1 if lost else 0
         if self.n_lost >= LOST_TICKS:
             raise DriveError(f"readings lost in {self.n_lost} ticks in a row: {text}")

@@ -1,6 +1,6 @@
 """One tick of the control loop: readings in, pressures and faults out. Pure; NumPy only.
 
-    frequencies -> spring lengths -> pose of the tip (estimator, then sim-to-real network)
+    readings -> spring lengths -> pose of the tip (estimator, then sim-to-real network)
     at rest: pose, goal -> policy -> references;    every tick: references -> sensor-space law -> pressures
 
 The policy was trained on arms at rest, so it acts on arms at rest: at once when a goal is new, and again
@@ -29,7 +29,7 @@ from mjx_softarm.policy.runtime import PolicyRunner
 from mjx_softarm.sensing.estimator import estimate_frame
 from mjx_softarm.sensing.pose import pose_from_frame
 from mjx_softarm.sensing.s2r import apply_correction, correction, distance, inputs
-from mjx_softarm.sensing.sensors import SensorFault, describe_faults, length_from_frequency
+from mjx_softarm.sensing.sensors import SensorFault
 
 N_ACTIONS = 4  # for each goal, as in training's evaluation
 WINDOW_S = 0.5
@@ -134,15 +134,13 @@ def with_goal(controller: Controller, state: State, goal: np.ndarray) -> tuple[S
     return state._replace(goal=goal, n_actions=0, n_ticks=0), ()
 
 
-def step(
-    controller: Controller, state: State, frequency_hz: np.ndarray | None, late: bool
-) -> tuple[State, Tick]:
+def step(controller: Controller, state: State, readings: np.ndarray | None, late: bool) -> tuple[State, Tick]:
     """One tick.
 
     Args:
         controller: the policy.
         state: after the last tick; its pressures are in force.
-        frequency_hz (n,) [Hz]: readings, or None where none came in time.
+        readings (n,): of the sensors, or None where none came in time.
         late: the last tick missed its deadline.
 
     Returns:
@@ -150,7 +148,7 @@ def step(
     """
     events = list(_deadline(controller, late, state.n_late + 1))
     state = state._replace(n_late=state.n_late + 1 if late else 0)
-    state, found = _sense(controller, state, frequency_hz)
+    state, found = _sense(controller, state, readings)
     events += found
     if state.phase is Phase.VENT:
         return _vent(controller, state), Tick(state.spring_m, tuple(events), False)
@@ -209,20 +207,18 @@ def _deadline(controller: Controller, late: bool, n_late: int) -> tuple[Event, .
     return missed, Event(Fault.ARM_LATE, f"{n_late} ticks in a row took too long, {limit}")
 
 
-def _sense(
-    controller: Controller, state: State, frequency_hz: np.ndarray | None
-) -> tuple[State, list[Event]]:
+def _sense(controller: Controller, state: State, readings: np.ndarray | None) -> tuple[State, list[Event]]:
     """Spring lengths, the last good one where there is none; faults of the sensors."""
     sensor = controller.policy.sensor
-    if frequency_hz is None:
+    if readings is None:
         lost, spring_m, events = np.ones(len(state.spring_m), bool), state.spring_m, []
         events.append(Event(Fault.LOST_READING, "no readings within the tick"))
     else:
-        reading = length_from_frequency(frequency_hz, sensor)
+        reading = sensor.lengths(readings)
         lost, events = reading.fault != SensorFault.OK.value, []
         spring_m = np.where(lost, state.spring_m, reading.length_m)
         if lost.any():
-            text = describe_faults(frequency_hz, reading.fault, sensor).replace("\n", "; ")
+            text = sensor.describe_faults(readings, reading.fault).replace("\n", "; ")
             events.append(Event(Fault.LOST_READING, text))
     window = controller.window
     state = state._replace(

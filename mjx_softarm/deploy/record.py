@@ -57,4 +57,4 @@ def record(
                 tell(f"{k + 1} of {len(targets_kpa)} poses")
 
     problem = drive_to_end(drive, run)
-    return Recording(rows.log("record"), sum(rest), len(rest) - sum(rest), problem)
+    return Recording(rows.log("record", spec.sensor), sum(rest), len(rest) - sum(rest), problem)

@@ -22,6 +22,7 @@ from mjx_softarm.deploy.faults import LATE_TICKS, Event, Fault
 from mjx_softarm.deploy.loop import Controller, Phase, State, Tick, believed, start, step, with_goal
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.sensing.pose import pose_error
+from mjx_softarm.sensing.sensors import Sensor
 
 _ROUNDING_S = 1e-6  # by which a simulated tick may be longer than the period
 
@@ -31,20 +32,20 @@ class ArmLost(Exception):
 
 
 def read(arm: ArmIO, n: int) -> np.ndarray | None:
-    """Frequencies (n,) [Hz], or None where they did not come in time.
+    """Return the sensors' readings (n,), or None where they did not come in time.
 
     Raises:
         ArmLost: the sensors cannot be reached, or it is another number of them.
     """
     try:
-        frequency_hz = np.asarray(arm.read_frequencies(), float)
+        readings = np.asarray(arm.read_sensors(), float)
     except TimeoutError:
         return None
     except OSError as error:
-        raise ArmLost(f"read_frequencies: {error}") from error
-    if frequency_hz.shape != (n,):
-        raise ArmLost(f"read_frequencies: got shape {frequency_hz.shape}, expected ({n},)")
-    return frequency_hz
+        raise ArmLost(f"read_sensors: {error}") from error
+    if readings.shape != (n,):
+        raise ArmLost(f"read_sensors: got shape {readings.shape}, expected ({n},)")
+    return readings
 
 
 class Pumps:
@@ -112,12 +113,13 @@ class Recorder:
         """Keep a row; all rows have the same entries."""
         self._rows.append(row)
 
-    def log(self, source: str) -> Log:
-        """The log so far, with time counted from its first row."""
+    def log(self, source: str, sensor: Sensor) -> Log:
+        """Return the log so far of an arm with this sensor, with time counted from its first row."""
         names = self._rows[0] if self._rows else {"time_s": 0.0}
         arrays = {name: np.array([row[name] for row in self._rows], float) for name in names}
         arrays["time_s"] = arrays["time_s"] - arrays["time_s"][:1]
-        return Log(source=source, row=np.arange(2, len(self) + 2), **arrays)
+        row = np.arange(2, len(self) + 2)
+        return Log(source=source, row=row, reading_name=sensor.reading_name, **arrays)
 
 
 class Arrival(NamedTuple):
@@ -177,7 +179,7 @@ def follow(
         except KeyboardInterrupt:
             tell("interrupted again -> end")
     return Run(
-        log=session.rows.log("run"),
+        log=session.rows.log("run", controller.policy.sensor),
         arrivals=tuple(session.arrivals),
         events=tuple(session.events),
         latency_s=np.array(session.latency_s),
@@ -218,20 +220,20 @@ class _Session:
         """Returns whether the arm took the pressures in time."""
         self._next_goal(begin_s)
         goal = self.state.goal
-        frequency_hz = self._read()
+        readings = self._read()
         row = self.rows.look(begin_s, self.state.pressure_kpa)
         began = time.perf_counter()
-        self.state, tick = step(self.controller, self.state, frequency_hz, self.late)
+        self.state, tick = step(self.controller, self.state, readings, self.late)
         self.latency_s.append(time.perf_counter() - began)
         try:
             return self.state.phase is Phase.HOLD or self._write()
         finally:  # whatever became of the pressures, they did not wait for this
-            self._keep(row, frequency_hz, goal, tick)
+            self._keep(row, readings, goal, tick)
 
-    def _keep(self, row: dict[str, Any], frequency_hz: np.ndarray | None, goal: Any, tick: Tick) -> None:
+    def _keep(self, row: dict[str, Any], readings: np.ndarray | None, goal: Any, tick: Tick) -> None:
         """Log a tick and tell of it."""
         nothing = np.full(len(self.state.pressure_kpa), np.nan)
-        row["frequency_hz"] = nothing if frequency_hz is None else frequency_hz
+        row["readings"] = nothing if readings is None else readings
         row["estimate"], _ = believed(self.controller, tick.spring_m)
         row["reference_m"] = nothing if self.state.reference_m is None else self.state.reference_m
         row["goal"] = np.full(6, np.nan) if goal is None else goal

@@ -1,6 +1,6 @@
 """One arm that reaches for poses: a brax environment with the paper's state, action and reward.
 
-An action is nine sensor frequencies, scaled to [-1, 1]; the sensor-space law turns them into pressures.
+An action is nine sensor readings, scaled to [-1, 1]; the sensor-space law turns them into pressures.
 `mode="quasistatic"` goes straight to the equilibrium (kinematics from `engine`), `mode="dynamic"` steps
 `mjx.step` under the law at the control rate.
 """
@@ -19,6 +19,7 @@ from mjx_softarm._support.mjx import Env, State, mjx
 from mjx_softarm.env.config import EnvConfig
 from mjx_softarm.mdp import observation as obs
 from mjx_softarm.mdp import rewards
+from mjx_softarm.mdp.actions import ActionMap
 from mjx_softarm.mechanics.dynamics import Motion, advance, with_params
 from mjx_softarm.mechanics.kinematics import chain_frames, chain_kinematics, mjx_kinematics
 from mjx_softarm.mechanics.mjcf import build_model
@@ -26,12 +27,15 @@ from mjx_softarm.mechanics.pipe import CrossPipe, body_clearance
 from mjx_softarm.mechanics.settle import Settled, settle
 from mjx_softarm.mechanics.statics import ArmParams
 from mjx_softarm.mechanics.workspace import Pool, sample_workspace
-from mjx_softarm.sensing import sensors
 from mjx_softarm.sensing.pose import pose_from_frame
 from mjx_softarm.sensing.s2r import S2R, carry_body, correct
+from mjx_softarm.sensing.sensors import SENSORS
 from mjx_softarm.spec import ArmSpec
 
 PAYLOAD = 1  # index in ArmParams.tool_mass_kg
+
+for _sensor in SENSORS.values():
+    jax.tree_util.register_dataclass(_sensor)  # numbers are traced, the kind is static
 
 
 class EpisodeNoise(NamedTuple):
@@ -75,8 +79,8 @@ class ReachEnv(Env):
         self.params = jax.tree.map(jnp.asarray, ArmParams.from_spec(self.spec))
         self.scale = obs.ObsScale.from_spec(self.spec)
         self.gains = control.Gains.from_spec(self.spec)
-        self.sensor = sensors.SensorParams.from_spec(self.spec)
-        self.frequency_range_hz = jnp.asarray(sensors.frequency_range_hz(self.spec), jnp.float32)
+        sensor, *limits = ActionMap.from_spec(self.spec)
+        self.action_map = ActionMap(sensor, *(jnp.asarray(limit, jnp.float32) for limit in limits))
         diameter_mm = self.config.pipe_diameter_mm
         self.pipe = None if diameter_mm is None else CrossPipe.of_mm(diameter_mm)
         self.uses_mjx = self.config.engine == "mjx" or self.config.mode == "dynamic"
@@ -107,16 +111,12 @@ class ReachEnv(Env):
             return correct(self.s2r, pose, spring_m)
 
     def reference_m(self, action: Array) -> Array:
-        """Spring lengths (..., n_chambers) [m] that an action in [-1, 1] asks for: frequencies, linearly."""
-        low, high = self.frequency_range_hz.T
-        frequency = low + 0.5 * (jnp.clip(action, -1.0, 1.0) + 1.0) * (high - low)
-        return sensors.length_from_frequency(frequency, self.sensor).length_m
+        """Return the spring lengths (..., n_chambers) [m] that an action in [-1, 1] asks for."""
+        return self.action_map.lengths(action)
 
     def action_of(self, length_m: Array) -> Array:
-        """The action in [-1, 1] that asks for spring lengths (..., n_chambers) [m]."""
-        low, high = self.frequency_range_hz.T
-        frequency = sensors.frequency_from_length(length_m, self.sensor)
-        return jnp.clip(2.0 * (frequency - low) / (high - low) - 1.0, -1.0, 1.0)
+        """Return the action in [-1, 1] that asks for spring lengths (..., n_chambers) [m]."""
+        return self.action_map.from_lengths(length_m)
 
     def reset(self, rng: Array) -> State:
         """A new episode: an arm of the randomisation, at a random pose, with a random goal."""

@@ -10,13 +10,14 @@ import dataclasses
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from mjx_softarm.logs.checks import Finding, LogError
 from mjx_softarm.logs.schema import GROUPS, UNITS, Column, Log, log_columns
 from mjx_softarm.logs.tables import Table, read_table
+from mjx_softarm.sensing.sensors import SENSORS
 
 _CELL = re.compile(r"(\w+)\s*(?:\[(.*)\])?")
 
@@ -41,17 +42,25 @@ class Sheet(NamedTuple):
 
     def log(self) -> Log:
         """The same as a log."""
-        groups = {name: self.values[:, chosen] for name in GROUPS if (chosen := self.of(name))}
+        groups: dict[str, Any] = {
+            name: self.values[:, chosen] for name in GROUPS if (chosen := self.of(name))
+        }
         for name in ("time_s", "payload_kg", "sequence"):
             if name in groups:
                 groups[name] = groups[name][:, 0]
         if "marker_m" in groups:
             groups["marker_m"] = groups["marker_m"].reshape(len(self.row), -1, 3)
+        if readings := self.of("readings"):
+            groups["reading_name"] = self.columns[readings[0]].kind
         return Log(source=self.file, row=self.row, **groups)
 
 
 def read_sheet(
-    path: str | Path, n_chambers: int, needed: Sequence[str] = (), one_of: Sequence[str] = ()
+    path: str | Path,
+    n_chambers: int,
+    needed: Sequence[str] = (),
+    one_of: Sequence[str] = (),
+    reading_name: str | None = None,
 ) -> tuple[Sheet, list[Finding]]:
     """Read the known columns of a file; unknown ones are findings.
 
@@ -60,13 +69,14 @@ def read_sheet(
         n_chambers: of the arm; a log of another number is refused.
         needed: fields of `Log` whose columns must be there, besides time.
         one_of: fields of `Log` of which one at least must be there.
+        reading_name: of the arm's sensors; by default the first that the file has columns of.
 
     Raises:
         LogError: the file cannot be understood; the message has a line for each finding.
     """
     table = read_table(path)
     with np.errstate(over="ignore", invalid="ignore"):  # any number may stand in a file
-        return _sheet(str(path), table, n_chambers, ("time_s", *needed), one_of)
+        return _sheet(str(path), table, n_chambers, ("time_s", *needed), one_of, reading_name)
 
 
 def refuse(findings: Sequence[Finding]) -> None:
@@ -76,16 +86,22 @@ def refuse(findings: Sequence[Finding]) -> None:
 
 
 def _sheet(
-    file: str, table: Table, n_chambers: int, needed: Sequence[str], one_of: Sequence[str]
+    file: str,
+    table: Table,
+    n_chambers: int,
+    needed: Sequence[str],
+    one_of: Sequence[str],
+    reading_name: str | None,
 ) -> tuple[Sheet, list[Finding]]:
     matches = [_CELL.fullmatch(cell) for cell in table.names]
     names = [match[1] if match else cell for match, cell in zip(matches, table.names, strict=True)]
     units = {name: match[2] if match else None for name, match in zip(names, matches, strict=True)}
     markers = [int(match[1]) for name in names if (match := re.fullmatch(r"marker(\d+)_[xyz]", name))]
     n_markers = min(1 + max(markers, default=-1), len(names))
-    known = {column.name: column for column in log_columns(n_chambers, n_markers)}
+    reading_name = reading_name or _reading_name(names)
+    known = {column.name: column for column in log_columns(n_chambers, n_markers, reading_name)}
 
-    problems = [*_header_errors(names, units, known), *_absent(names, known, needed, one_of)]
+    problems = [*_header_errors(names, units, known, reading_name), *_absent(names, known, needed, one_of)]
     refuse([Finding(file, (1, 1), name, problem) for name, problem in problems])
     present = [column for name, column in known.items() if name in names]
     columns = tuple(dataclasses.replace(column, unit=units[column.name]) for column in present)
@@ -95,7 +111,15 @@ def _sheet(
     return Sheet(file, columns, values, table.row), extra
 
 
-def _header_errors(names: list[str], units: dict, known: dict) -> Iterator[tuple[str, str]]:
+def _reading_name(names: list[str]) -> str:
+    """Return which sensors' readings a file has; the default arm's where it has none."""
+    found = [sensor.reading_name for sensor in SENSORS.values()]
+    return next((x for x in found if any(re.fullmatch(rf"{x}\d+", name) for name in names)), found[0])
+
+
+def _header_errors(
+    names: list[str], units: dict, known: dict, reading_name: str
+) -> Iterator[tuple[str, str]]:
     if not _is_header(names):
         yield "", f"expected a header such as `time [s],pressure0 [kPa],...`, got {', '.join(names)[:60]}"
         return
@@ -105,7 +129,7 @@ def _header_errors(names: list[str], units: dict, known: dict) -> Iterator[tuple
         if name in known and unit not in UNITS[known[name].kind]:
             expected = ", ".join(f"[{unit}]" for unit in UNITS[known[name].kind])
             yield name, f"got {'no unit' if unit is None else f'[{unit}]'}, expected one of {expected}"
-        if name not in known and re.fullmatch(r"(frequency|spring|pressure|reference)\d+", name):
+        if name not in known and re.fullmatch(rf"({reading_name}|spring|pressure|reference)\d+", name):
             n_chambers = sum(column.group == "spring_m" for column in known.values())
             yield name, f"expected a log of {n_chambers} chambers, numbered from 0"
     for group in {known[name].group for name in names if name in known}:

@@ -16,11 +16,13 @@ from types import MappingProxyType
 
 import numpy as np
 
+from mjx_softarm.logs.checks import Finding, LogError
+from mjx_softarm.sensing.sensors import SENSORS, Coil, Sensor
+
 # Kind of quantity -> units a file may use, each with its factor to the unit used inside, which comes first.
 UNITS: Mapping[str, Mapping[str, float]] = MappingProxyType(
     {
         "time": {"s": 1.0, "ms": 1e-3},
-        "frequency": {"Hz": 1.0, "kHz": 1e3, "MHz": 1e6},
         "length": {"m": 1.0, "mm": 1e-3, "cm": 1e-2},
         "pressure": {"kPa": 1.0, "Pa": 1e-3, "bar": 100.0, "mbar": 0.1, "psi": 6.894757293168},
         "mass": {"kg": 1.0, "g": 1e-3},
@@ -28,6 +30,7 @@ UNITS: Mapping[str, Mapping[str, float]] = MappingProxyType(
         "id": {"1": 1.0},
         "pose_length": {"mm": 1.0, "m": 1e3, "cm": 10.0},
         "angle": {"deg": 1.0, "rad": 180.0 / np.pi},
+        **{sensor.reading_name: sensor.units for sensor in SENSORS.values()},
     }
 )
 _XYZ = ("x", "y", "z")
@@ -51,12 +54,15 @@ class Column:
         return f"{self.name} [{self.unit}]"
 
 
-def log_columns(n_chambers: int, n_markers: int = 0) -> tuple[Column, ...]:
-    """All columns that a log of such an arm may have, in the order in which they are written."""
+def log_columns(
+    n_chambers: int, n_markers: int = 0, reading_name: str = Coil.reading_name
+) -> tuple[Column, ...]:
+    """Return all columns that a log of such an arm may have, in the order in which they are written."""
     chambers, markers = range(n_chambers), range(n_markers)
+    reading_unit = next(iter(UNITS[reading_name]))
     return (
         Column("time_s", "time", "time", "s"),
-        *(Column("frequency_hz", f"frequency{k}", "frequency", "Hz") for k in chambers),
+        *(Column("readings", f"{reading_name}{k}", reading_name, reading_unit) for k in chambers),
         *(Column("spring_m", f"spring{k}", "length", "mm") for k in chambers),
         *(Column("pressure_kpa", f"pressure{k}", "pressure", "kPa") for k in chambers),
         *(Column("tip_m", f"tip_{axis}", "length", "mm") for axis in _XYZ),
@@ -81,8 +87,8 @@ class Log:
     source: str  # the file, for messages
     row: np.ndarray  # (n,) line of the file that a row came from, the header being line 1
     time_s: np.ndarray  # (n,)
-    frequency_hz: np.ndarray | None = None  # (n, n_chambers)
-    spring_m: np.ndarray | None = None  # (n, n_chambers) measured otherwise than by their frequencies
+    readings: np.ndarray | None = None  # (n, n_chambers) of the springs' sensors
+    spring_m: np.ndarray | None = None  # (n, n_chambers) measured otherwise than by these
     pressure_kpa: np.ndarray | None = None  # (n, n_chambers) relative to the atmosphere
     tip_m: np.ndarray | None = None  # (n, 3)
     tip_quaternion: np.ndarray | None = None  # (n, 4) w, x, y, z
@@ -92,9 +98,21 @@ class Log:
     goal: np.ndarray | None = None  # (n, 6) [mm, deg]
     estimate: np.ndarray | None = None  # (n, 6) [mm, deg] tip pose that the controller believed in
     sequence: np.ndarray | None = None  # (n,) which demonstration a row is part of, counted from 0
+    reading_name: str = Coil.reading_name  # of what the readings are, as in the names of their columns
 
     def __len__(self) -> int:
         return len(self.time_s)
+
+    def readings_of(self, sensor: Sensor) -> np.ndarray | None:
+        """Return the readings, if there are any, of an arm with this sensor.
+
+        Raises:
+            LogError: they are readings of another one.
+        """
+        if self.readings is not None and self.reading_name != sensor.reading_name:
+            problem = f"got readings of {self.reading_name}, expected {sensor.reading_name}, which a {sensor.kind} reads"
+            raise LogError([Finding(self.source, None, f"{self.reading_name}0", problem)])
+        return self.readings
 
     def take(self, rows: np.ndarray) -> Log:
         """The same log with some rows alone, given by their indices or a mask (n,)."""
@@ -103,15 +121,19 @@ class Log:
         return dataclasses.replace(self, row=self.row[rows], **kept)
 
 
-GROUPS = tuple(item.name for item in dataclasses.fields(Log) if item.name not in ("source", "row"))
+GROUPS = tuple(
+    item.name for item in dataclasses.fields(Log) if item.name not in ("source", "row", "reading_name")
+)
 
 
 def log_table(log: Log) -> tuple[tuple[Column, ...], np.ndarray]:
     """The columns (k,) that a log has, and its numbers (n, k) in the units of the columns."""
-    per_chamber = [getattr(log, name) for name in ("frequency_hz", "spring_m", "pressure_kpa", "reference_m")]
+    per_chamber = [getattr(log, name) for name in ("readings", "spring_m", "pressure_kpa", "reference_m")]
     n_chambers = max((value.shape[1] for value in per_chamber if value is not None), default=0)
     n_markers = 0 if log.marker_m is None else log.marker_m.shape[1]
-    columns = tuple(c for c in log_columns(n_chambers, n_markers) if getattr(log, c.group) is not None)
+    columns = tuple(
+        c for c in log_columns(n_chambers, n_markers, log.reading_name) if getattr(log, c.group) is not None
+    )
     present = [value for name in GROUPS if (value := getattr(log, name)) is not None]
     table = np.concatenate([np.reshape(value, (len(log), -1)) for value in present], axis=1)
     return columns, table / np.array([UNITS[c.kind][c.unit] for c in columns])

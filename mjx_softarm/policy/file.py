@@ -12,8 +12,8 @@ the workspace float32.
     actor.<k>.bias       (out,)       whose outputs (n,) are the actions before tanh
     obs_scale.<field>    (6,)         `ObsScale`: centre and scale of poses and goals
     reward.<field>       ()           `RewardConfig`: weights of the error, threshold of a goal
-    frequency_hz         (n, 2)       what the actions -1 and 1 stand for, linear in between
-    sensor.<field>       () or (n,)   `SensorParams`: frequencies to lengths, and back
+    action.low, .high    (n,)         readings that the actions -1 and 1 stand for, linear in between
+    sensor.<field>       () or (n,)   the arm's `Sensor`: readings to lengths, and back
     gains.<field>        () or (n,)   `Gains`: the sensor-space law and the pressure limits
     rate_hz              ()           of the sensor-space law
     workspace            (m, 6)       poses [mm, deg] that the arm reaches, spread over its workspace
@@ -48,14 +48,15 @@ from mjx_softarm._support.archive import (
 )
 from mjx_softarm._support.mlp import Layer
 from mjx_softarm.control import Gains
+from mjx_softarm.mdp.actions import ActionMap
 from mjx_softarm.mdp.observation import OBS_LAYOUT, OBS_SIZE, ObsScale
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.sensing.estimator import PoseEstimator, SpringModel, take_estimator, take_spring_model
 from mjx_softarm.sensing.s2r import S2R, take_s2r
-from mjx_softarm.sensing.sensors import SensorFault, SensorParams, frequency_range_hz, length_from_frequency
+from mjx_softarm.sensing.sensors import Sensor, SensorFault
 from mjx_softarm.spec import ArmSpec, SpecError
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 
 KIND = "policy"
 
@@ -67,8 +68,7 @@ class Policy:
     layers: tuple[Layer, ...]  # from the observation to the actions before tanh
     obs_scale: ObsScale
     reward: RewardConfig
-    frequency_hz: np.ndarray  # (n, 2)
-    sensor: SensorParams
+    actions: ActionMap  # with the sensor
     gains: Gains
     rate_hz: float
     workspace: np.ndarray  # (m, 6)
@@ -77,6 +77,11 @@ class Policy:
     s2r: S2R | None
     spec: ArmSpec
     provenance: Mapping[str, Any]
+
+    @property
+    def sensor(self) -> Sensor:
+        """The arm's sensors, calibrated."""
+        return self.actions.sensor
 
 
 class ArmModel(NamedTuple):
@@ -89,8 +94,8 @@ class ArmModel(NamedTuple):
 
 
 def action_layout(spec: ArmSpec) -> tuple[str, ...]:
-    """Names of the action's entries: the frequency of each spring, scaled from its two limits to [-1, 1]."""
-    return tuple(f"spring{k}_hz" for k in range(spec.n_chambers))
+    """Name the action's entries: the reading of each spring, scaled from its two limits to [-1, 1]."""
+    return tuple(f"{spec.sensor.reading_name}{k}" for k in range(spec.n_chambers))
 
 
 def policy_from_actor(
@@ -117,8 +122,7 @@ def policy_from_actor(
         layers=layers_from_flax(actor_params, spec.n_chambers),
         obs_scale=ObsScale.from_spec(spec),
         reward=reward,
-        frequency_hz=frequency_range_hz(spec),
-        sensor=SensorParams.from_spec(spec),
+        actions=ActionMap.from_spec(spec),
         gains=Gains.from_spec(spec),
         rate_hz=spec.control.rate_hz,
         **model._asdict(),
@@ -177,13 +181,13 @@ def _pack(policy: Policy) -> dict[str, np.ndarray]:
         "spec_json": json.dumps(policy.spec.to_dict()),
         "obs_layout": OBS_LAYOUT,
         "action_layout": action_layout(policy.spec),
-        "frequency_hz": policy.frequency_hz,
         "rate_hz": policy.rate_hz,
         "s2r_kind": "none" if policy.s2r is None else "mlp",
         "workspace": policy.workspace,
         "provenance_json": json.dumps(policy.provenance),
     }
     entries |= layer_entries("actor", policy.layers)
+    entries |= {f"action.{name}": getattr(policy.actions, name) for name in ("low", "high")}
     for name in ("obs_scale", "reward", "sensor", "gains"):
         numbers = entries_of(name, getattr(policy, name))
         entries |= {item: value.astype(np.float64) for item, value in numbers.items()}
@@ -198,7 +202,7 @@ def _unpack(arrays: Mapping[str, np.ndarray], source: str) -> Policy:
     if version != SCHEMA_VERSION:
         entries.fail(
             "schema_version",
-            f"got {version}, expected {SCHEMA_VERSION}; this version's `python -m train export` writes that",
+            f"got {version}, expected {SCHEMA_VERSION}; `python -m train export RUN` writes the policy anew",
         )
     try:
         spec = ArmSpec.from_dict(entries.table("spec_json"), f"{source}: spec_json")
@@ -212,8 +216,10 @@ def _unpack(arrays: Mapping[str, np.ndarray], source: str) -> Policy:
         layers=entries.layers("actor", OBS_SIZE, n),
         obs_scale=entries.group("obs_scale", ObsScale, (6,)),
         reward=entries.group("reward", RewardConfig, ()),
-        frequency_hz=entries.take("frequency_hz", np.float64, (n, 2)),
-        sensor=entries.group("sensor", SensorParams, (), (n,)),
+        actions=ActionMap(
+            entries.group("sensor", type(spec.sensor), (), (n,)),
+            *(entries.take(f"action.{name}", np.float64, (n,)) for name in ("low", "high")),
+        ),
         gains=entries.group("gains", Gains, (), (n,)),
         rate_hz=entries.take("rate_hz", np.float64, ()),
         workspace=entries.take("workspace", np.float32, (None, 6)),
@@ -223,14 +229,14 @@ def _unpack(arrays: Mapping[str, np.ndarray], source: str) -> Policy:
         spec=spec,
         provenance=entries.table("provenance_json"),
     )
-    readable = length_from_frequency(policy.frequency_hz.T, policy.sensor).fault == SensorFault.OK.value
-    low_hz, high_hz = policy.frequency_hz.T
+    limits = policy.sensor.lengths(np.stack(policy.actions[1:]))  # (2, n)
+    readable = (limits.fault == SensorFault.OK.value) & (limits.length_m[0] < limits.length_m[1])
     low_kpa, high_kpa = policy.gains.pressure_min_kpa, policy.gains.pressure_max_kpa
     for name, holds, expected in (
         ("obs_layout", obs_layout == np.array(OBS_LAYOUT), list(OBS_LAYOUT)),
         ("action_layout", names == np.array(action_layout(spec)), list(action_layout(spec))),
         ("obs_scale.scale", policy.obs_scale.scale > 0.0, "numbers > 0"),
-        ("frequency_hz", readable & (low_hz < high_hz), "two that have a length, the lower first"),
+        ("action.low", readable, "readings that have a length, less than that of action.high"),
         ("gains.pressure_min_kpa", np.less(low_kpa, high_kpa), "less than gains.pressure_max_kpa"),
         ("rate_hz", policy.rate_hz > 0.0, "a number > 0"),
         ("s2r_kind", s2r_kind in ("mlp", "none"), "mlp or none"),

@@ -13,13 +13,12 @@ from numpy.typing import ArrayLike
 
 from mjx_softarm.mdp.observation import ObsScale, observe
 from mjx_softarm.policy.file import Policy
-from mjx_softarm.sensing.sensors import length_from_frequency
 
 
 class Reference(NamedTuple):
     """What the policy asks of the springs."""
 
-    frequency_hz: np.ndarray  # (..., n)
+    readings: np.ndarray  # (..., n) of the sensors
     length_m: np.ndarray  # (..., n) the same, as calibrated lengths: the reference of `control.pressures`
 
 
@@ -41,17 +40,17 @@ class PolicyRunner:
             goal (..., 6) [mm, deg]: where it should be; the leading axes broadcast against the pose's.
 
         Returns:
-            Frequencies (..., n) [Hz] and lengths (..., n) [m], both within the policy's limits.
+            Readings (..., n) and lengths (..., n) [m], both within the policy's limits.
 
         Raises:
             ValueError: as `action` does.
         """
-        low, high = self.policy.frequency_hz.T  # (n,) each
-        frequency_hz = low + 0.5 * (self.action(pose, goal) + 1.0) * (high - low)  # (..., n)
-        return Reference(frequency_hz, length_from_frequency(frequency_hz, self.policy.sensor).length_m)
+        actions = self.policy.actions
+        readings = actions.readings(self.action(pose, goal))  # (..., n)
+        return Reference(readings, actions.sensor.lengths(readings).length_m)
 
     def action(self, pose: ArrayLike, goal: ArrayLike) -> np.ndarray:
-        """The action (..., n) in [-1, 1], float32, of which `act` makes frequencies; arguments as there.
+        """The action (..., n) in [-1, 1], float32, of which `act` makes readings; arguments as there.
 
         Raises:
             ValueError: pose or goal has the wrong shape or is not finite, or the actor overflows; what it

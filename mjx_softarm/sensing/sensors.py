@@ -1,30 +1,28 @@
-"""The inductive springs: resonance frequency <-> calibrated length.
+"""The springs' sensors: readings <-> calibrated lengths, the range that is believed, and faults.
 
-A spring is a coil whose inductance falls as it stretches. It resonates with a capacitor, and with a
-compensation inductance in series, at the frequency that the converter reads:
+A sensor is one class. Its fields are the section `[sensor]` of a specification, chosen by `kind`; its class
+variables name the reading in logs; its two maps between a reading and a raw length l are all that differs
+from one sensor to another. The calibration is the same for all of them:
 
-    (2 pi f)^2 C (I + I_comp) = 1        resonance
-    I = mu_0 N^2 pi r^2 / l = K / l      a long air coil with wire length l
-    L = beta l + delta                   calibration
+    L = beta l + delta
 
-With y = C (2 pi f)^2, the inverse of the total inductance, both directions are quotients without
-overflow in float32 (y is about 1e5 / H, f about 3e6 Hz):
-
-    l = K y / (1 - I_comp y)             y = l / (K + I_comp l)
-
-Source: equations of the sections on sensing and calibration in Meng et al., "Sensor-Space Based Robust
-Kinematic Control of Redundant Soft Manipulator by Learning". Their combined mapping prints 4 pi^4 where
-the derivation gives 4 pi^3; this module follows the derivation.
+To add a sensor, write a subclass of `Sensor` and list it in `SENSORS`: specification, simulation, logs,
+calibration, twin, policy file and control loop take it from there.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from collections.abc import Mapping
+from dataclasses import dataclass
 from enum import IntEnum
-from typing import TYPE_CHECKING, NamedTuple
+from types import MappingProxyType
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 
+from mjx_softarm._support.fields import PerChamber, anything, not_negative, positive, rule_of
 from mjx_softarm._support.xp import Array, array_namespace
 
 if TYPE_CHECKING:
@@ -33,38 +31,12 @@ if TYPE_CHECKING:
 MU_0_H_PER_M = 1.26e-6  # the paper's value of the vacuum permeability; beta absorbs the last digit
 
 
-class SensorParams(NamedTuple):
-    """Circuit, coil and calibration of the springs; each number is () or (n,)."""
-
-    capacitance_f: Array
-    compensation_h: Array  # in series with the coil; may be zero or negative
-    coil_hm: Array  # K = mu_0 N^2 pi r^2 [H m]
-    beta: Array  # (n,)
-    delta_m: Array  # (n,)
-    frequency_min_hz: Array  # readings outside of these two are not believed
-    frequency_max_hz: Array
-
-    @classmethod
-    def from_spec(cls, spec: ArmSpec) -> SensorParams:
-        """Parameters in float64; JAX narrows them where they meet its arrays."""
-        sensor = spec.sensor
-        return cls(
-            capacitance_f=sensor.capacitance_f,
-            compensation_h=sensor.compensation_h,
-            coil_hm=MU_0_H_PER_M * sensor.turns**2 * math.pi * sensor.coil_radius_m**2,
-            beta=np.array(spec.per_chamber(sensor.beta)),
-            delta_m=np.array(spec.per_chamber(sensor.delta_m)),
-            frequency_min_hz=sensor.frequency_min_hz,
-            frequency_max_hz=sensor.frequency_max_hz,
-        )
-
-
 class SensorFault(IntEnum):
-    """Why a reading gives no length."""
+    """Reason why a reading gives no length."""
 
     OK = 0
     NOT_FINITE = 1  # NaN or infinite
-    TOO_LOW = 2  # below the believed range: zero, negative, or an open circuit
+    TOO_LOW = 2  # below the believed range
     TOO_HIGH = 3  # above the believed range
     NO_COIL = 4  # at or above the resonance of the compensation alone: a shorted coil
     NO_LENGTH = 5  # the calibration gives no positive length
@@ -77,87 +49,213 @@ class Reading(NamedTuple):
     fault: Array  # (..., n) int32, a `SensorFault`
 
 
-def length_from_frequency(frequency_hz: Array, params: SensorParams, fallback_m: Array = 0.0) -> Reading:
-    """Calibrated spring lengths of the frequencies that were read.
+@dataclass(frozen=True)
+class Sensor:
+    """One kind of length sensor, calibrated for each of n springs.
 
-    A reading that gives no length is reported in `fault`, never passed on: its length is `fallback_m`, and
-    no gradient flows through it. A control loop gives the last good lengths, so that one lost reading
-    holds its chamber for a tick; how many lost readings in a row stop the arm is for the loop to say. The
-    default, 0 m, is a length no spring has; use it where `fault` is looked at.
-
-    Args:
-        frequency_hz (..., n) [Hz]: readings, any number at all.
-        params: circuit, coil and calibration.
-        fallback_m () or (..., n) [m]: length of a faulty reading, finite.
+    In a specification, beta and delta are one number or one per chamber; `from_spec` spreads them to arrays
+    (n,). NumPy and JAX take it alike; `mjx_softarm.env` registers it as a pytree whose leaves are the fields.
     """
-    xp = array_namespace(frequency_hz, fallback_m, *params)
-    believed = (frequency_hz >= params.frequency_min_hz) & (frequency_hz <= params.frequency_max_hz)
-    safe_hz = xp.where(believed, frequency_hz, params.frequency_min_hz)
-    inverse_h = params.capacitance_f * (2.0 * math.pi * safe_hz) ** 2
-    coil_share = 1.0 - params.compensation_h * inverse_h  # of the total inductance
-    wire_m = params.coil_hm * inverse_h / xp.where(coil_share > 0.0, coil_share, 1.0)
-    length_m = params.beta * wire_m + params.delta_m
 
-    fault = xp.zeros(length_m.shape, xp.int32)
-    for bad, code in (  # a later one overrules
-        (length_m <= 0.0, SensorFault.NO_LENGTH),
-        (coil_share <= 0.0, SensorFault.NO_COIL),
-        (frequency_hz > params.frequency_max_hz, SensorFault.TOO_HIGH),
-        (frequency_hz < params.frequency_min_hz, SensorFault.TOO_LOW),
-        (~xp.isfinite(frequency_hz), SensorFault.NOT_FINITE),
-    ):
-        fault = xp.where(bad, int(code), fault)
-    return Reading(xp.where(fault == SensorFault.OK.value, length_m, fallback_m), fault)
+    kind: ClassVar[str]  # `kind` in the specification
+    reading_name: ClassVar[str]  # of the columns of a log, and of an action's entries
+    units: ClassVar[
+        Mapping[str, float]
+    ]  # that a log may use, with factors to the unit used inside, the first
+    range_fields: ClassVar[tuple[str, str]]  # fields that hold the least and the greatest believed reading
+    plausible: ClassVar[tuple[float, float]]  # a log's column with a median outside has another unit
+    spike: ClassVar[float]  # a reading that is off its neighbours by less is no outlier
+    noise: ClassVar[float]  # standard deviation of a twin's readings
+    resolution: ClassVar[float]  # step of a twin's converter
+
+    beta: PerChamber | Array = positive(per_chamber=True)
+    delta_m: PerChamber | Array = anything(per_chamber=True)
+
+    @staticmethod
+    def from_spec(spec: ArmSpec) -> Sensor:
+        """Return the specification's sensor with an array (n,) for each field that may be per chamber.
+
+        The arrays are float64; JAX narrows them where they meet its own.
+        """
+        names = [item.name for item in dataclasses.fields(spec.sensor) if rule_of(item).per_chamber]
+        arrays = {name: np.array(spec.per_chamber(getattr(spec.sensor, name))) for name in names}
+        return dataclasses.replace(spec.sensor, **arrays)
+
+    @property
+    def unit(self) -> str:
+        """Unit of the readings."""
+        return next(iter(self.units))
+
+    @property
+    def range(self) -> tuple[Array, Array]:
+        """Least and greatest reading that is believed."""
+        low, high = self.range_fields
+        return getattr(self, low), getattr(self, high)
+
+    def raw_length(self, readings: Array) -> tuple[Array, Array]:
+        """Map believed readings (..., n) to raw lengths [m], finite, and whether there are such (bool)."""
+        raise NotImplementedError
+
+    def raw_reading(self, raw_m: Array) -> tuple[Array, Array]:
+        """Map raw lengths (..., n) [m] to readings, finite, and whether there are such (bool)."""
+        raise NotImplementedError
+
+    def lengths(self, readings: Array, fallback_m: Array = 0.0) -> Reading:
+        """Return the calibrated spring lengths of readings.
+
+        A reading that gives no length is reported in `fault`, never passed on: its length is `fallback_m`,
+        and no gradient flows through it. A control loop gives the last good lengths, so that one lost reading
+        holds its chamber for a tick; how many lost readings in a row stop the arm is for the loop to say. The
+        default, 0 m, is a length no spring has; use it where `fault` is looked at.
+
+        Args:
+            readings (..., n) [unit]: any number at all.
+            fallback_m () or (..., n) [m]: length of a faulty reading, finite.
+        """
+        xp = array_namespace(readings, fallback_m, *vars(self).values())
+        low, high = self.range
+        believed = (readings >= low) & (readings <= high)
+        raw_m, exists = self.raw_length(xp.where(believed, readings, low))
+        length_m = self.beta * raw_m + self.delta_m
+
+        fault = xp.zeros(length_m.shape, xp.int32)
+        for bad, code in (  # a later one overrules
+            (length_m <= 0.0, SensorFault.NO_LENGTH),
+            (~exists, SensorFault.NO_COIL),
+            (readings > high, SensorFault.TOO_HIGH),
+            (readings < low, SensorFault.TOO_LOW),
+            (~xp.isfinite(readings), SensorFault.NOT_FINITE),
+        ):
+            fault = xp.where(bad, int(code), fault)
+        return Reading(xp.where(fault == SensorFault.OK.value, length_m, fallback_m), fault)
+
+    def readings(self, length_m: Array) -> Array:
+        """Return the readings (..., n) [unit] of springs of calibrated length (..., n) [m].
+
+        A length that the sensor cannot have reads NaN; `lengths` reports such a reading.
+        """
+        xp = array_namespace(length_m, *vars(self).values())
+        readings, exists = self.raw_reading((length_m - self.delta_m) / self.beta)
+        return xp.where(exists, readings, math.nan)
+
+    def describe_faults(self, readings: Array, fault: Array) -> str:
+        """Return a line for each faulty spring, "" where there is none.
+
+        A line names the spring as the model does, what was read and what was expected.
+
+        Args:
+            readings (n,) [unit]: of one arm.
+            fault (n,): as `lengths` reports.
+        """
+        lines = []
+        for index in np.flatnonzero(np.asarray(fault) != SensorFault.OK):
+            values = {name: np.broadcast_to(value, np.shape(fault)) for name, value in vars(self).items()}
+            one = dataclasses.replace(self, **{name: float(value[index]) for name, value in values.items()})
+            expected = one.expected(SensorFault(int(fault[index])))
+            lines.append(f"spring{index}: read {float(readings[index]):.7g} {self.unit}, expected {expected}")
+        return "\n".join(lines)
+
+    def expected(self, fault: SensorFault) -> str:
+        """Return the reading expected in place of a faulty one, in words, for the sensor of one spring."""
+        if fault == SensorFault.NO_LENGTH:
+            return f"a length > 0 m after beta = {self.beta:g} and delta = {self.delta_m:g} m"
+        low, high = self.range
+        return f"{low:g} to {high:g} {self.unit}"
 
 
-def frequency_from_length(length_m: Array, params: SensorParams) -> Array:
-    """The frequencies (..., n) [Hz] at which springs of calibrated length (..., n) [m] resonate.
+@dataclass(frozen=True)
+class Coil(Sensor):
+    """The paper's sensor: the spring is a coil, and its resonance frequency is read.
 
-    A length that no coil has reads NaN: a wire length that is not positive, or one that a negative
-    compensation leaves without inductance. `length_from_frequency` reports such a reading.
+    The coil's inductance falls as it stretches. It resonates with a capacitor, and with a compensation
+    inductance in series, at the frequency f that the converter reads:
+
+        (2 pi f)^2 C (I + I_comp) = 1        resonance
+        I = mu_0 N^2 pi r^2 / l = K / l      a long air coil with wire length l
+
+    With y = C (2 pi f)^2, the inverse of the total inductance, both directions are quotients without
+    overflow in float32 (y is about 1e5 / H, f about 3e6 Hz):
+
+        l = K y / (1 - I_comp y)             y = l / (K + I_comp l)
+
+    Source: equations of the sections on sensing and calibration in Meng et al., "Sensor-Space Based Robust
+    Kinematic Control of Redundant Soft Manipulator by Learning". Their combined mapping prints 4 pi^4 where
+    the derivation gives 4 pi^3; this class follows the derivation.
     """
-    xp = array_namespace(length_m, *params)
-    wire_m = (length_m - params.delta_m) / params.beta
-    total_hm = params.coil_hm + params.compensation_h * wire_m  # total inductance times wire length
-    resonates = (wire_m > 0.0) & (total_hm > 0.0)
-    inverse_h = xp.where(resonates, wire_m, 1.0) / xp.where(resonates, total_hm, 1.0)
-    frequency_hz = xp.sqrt(inverse_h / params.capacitance_f) / (2.0 * math.pi)
-    return xp.where(resonates, frequency_hz, math.nan)
 
+    kind = "coil"
+    reading_name = "frequency"
+    units = MappingProxyType({"Hz": 1.0, "kHz": 1e3, "MHz": 1e6})
+    range_fields = ("frequency_min_hz", "frequency_max_hz")
+    plausible = (1e4, 1e7)  # the LDC1612 reads from 1 kHz, but no such coil is below 10
+    spike = 1e3
+    noise = 300.0  # assumed: 0.04 mm of a spring 0.2 m long; far above the converter's own
+    resolution = 40e6 / 2**28  # LDC1612 data sheet, TI SNOSCY9: 28 bits of a reference clock of 40 MHz
 
-def frequency_range_hz(spec: ArmSpec) -> np.ndarray:
-    """Frequencies (n, 2) [Hz] of the shortest and the longest spring that may be commanded."""
-    limits_m = np.array([[spec.springs.length_min_m], [spec.springs.length_max_m]])
-    return frequency_from_length(
-        np.broadcast_to(limits_m, (2, spec.n_chambers)), SensorParams.from_spec(spec)
-    ).T
+    capacitance_f: float | Array = positive()
+    compensation_h: float | Array = anything()  # in series with the coil; may be zero or negative
+    turns: float | Array = positive()
+    coil_radius_m: float | Array = positive()
+    frequency_min_hz: float | Array = positive()
+    frequency_max_hz: float | Array = positive()
 
+    @property
+    def coil_hm(self) -> Array:
+        """K = mu_0 N^2 pi r^2 [H m]."""
+        return MU_0_H_PER_M * self.turns**2 * math.pi * self.coil_radius_m**2
 
-def describe_faults(frequency_hz: Array, fault: Array, params: SensorParams) -> str:
-    """A line for each faulty spring: its number as in the model, what it read and what was expected.
+    def inverse_inductance(self, readings: Array) -> Array:
+        """Return y [1/H] at frequencies (..., n) [Hz]."""
+        return self.capacitance_f * (2.0 * math.pi * readings) ** 2
 
-    Args:
-        frequency_hz (n,) [Hz]: readings of one arm.
-        fault (n,): as `length_from_frequency` reports.
-        params: those the readings were converted with.
+    def raw_length(self, readings: Array) -> tuple[Array, Array]:
+        """Map frequencies to wire lengths; there is none where the compensation resonates without a coil."""
+        xp = array_namespace(readings, *vars(self).values())
+        inverse_h = self.inverse_inductance(readings)
+        coil_share = 1.0 - self.compensation_h * inverse_h  # of the total inductance
+        exists = coil_share > 0.0
+        return self.coil_hm * inverse_h / xp.where(exists, coil_share, 1.0), exists
 
-    Returns:
-        The lines, or "" where there is no fault.
-    """
-    lines = []
-    for index, code in enumerate(np.asarray(fault)):
-        if code == SensorFault.OK:
-            continue
-        one = SensorParams(*(float(np.broadcast_to(value, np.shape(fault))[index]) for value in params))
-        expected = _expected(SensorFault(code), one)
-        lines.append(f"spring{index}: read {float(frequency_hz[index]):.7g} Hz, expected {expected}")
-    return "\n".join(lines)
+    def raw_reading(self, raw_m: Array) -> tuple[Array, Array]:
+        """Map wire lengths to frequencies; there is none where the total inductance is not positive."""
+        xp = array_namespace(raw_m, *vars(self).values())
+        total_hm = self.coil_hm + self.compensation_h * raw_m  # total inductance times wire length
+        exists = (raw_m > 0.0) & (total_hm > 0.0)
+        inverse_h = xp.where(exists, raw_m, 1.0) / xp.where(exists, total_hm, 1.0)
+        return xp.sqrt(inverse_h / self.capacitance_f) / (2.0 * math.pi), exists
 
-
-def _expected(fault: SensorFault, params: SensorParams) -> str:
-    if fault == SensorFault.NO_COIL:
-        limit_hz = 0.5 / math.pi / math.sqrt(params.capacitance_f * params.compensation_h)
+    def expected(self, fault: SensorFault) -> str:
+        if fault != SensorFault.NO_COIL:
+            return super().expected(fault)
+        limit_hz = 0.5 / math.pi / math.sqrt(self.capacitance_f * self.compensation_h)
         return f"below {limit_hz:.7g} Hz, where the compensation resonates without the coil"
-    if fault == SensorFault.NO_LENGTH:
-        return f"a length > 0 m after beta = {params.beta:g} and delta = {params.delta_m:g} m"
-    return f"{params.frequency_min_hz:g} to {params.frequency_max_hz:g} Hz"
+
+
+@dataclass(frozen=True)
+class DrawWire(Sensor):
+    """A draw-wire encoder, whose voltage is proportional to the length of wire that is drawn out."""
+
+    kind = "draw_wire"
+    reading_name = "voltage"
+    units = MappingProxyType({"V": 1.0, "mV": 1e-3})
+    range_fields = ("voltage_min_v", "voltage_max_v")
+    plausible = (0.02, 24.0)
+    spike = 5e-3
+    noise = 2e-4  # assumed: 0.04 mm of an encoder of 5 V at 1 m
+    resolution = 5.0 / 2**16  # assumed: a converter of 16 bits at 5 V
+
+    m_per_v: float | Array = positive()
+    voltage_min_v: float | Array = not_negative()
+    voltage_max_v: float | Array = positive()
+
+    def raw_length(self, readings: Array) -> tuple[Array, Array]:
+        """Map voltages to lengths of drawn wire."""
+        raw_m = self.m_per_v * readings
+        return raw_m, raw_m >= 0.0
+
+    def raw_reading(self, raw_m: Array) -> tuple[Array, Array]:
+        """Map lengths of drawn wire to voltages; there is none below zero."""
+        return raw_m / self.m_per_v, raw_m >= 0.0
+
+
+SENSORS: Mapping[str, type[Sensor]] = MappingProxyType({sensor.kind: sensor for sensor in (Coil, DrawWire)})

@@ -20,7 +20,6 @@ from mjx_softarm.deploy.arm_io import Capture
 from mjx_softarm.mechanics.body import payload_radius_m
 from mjx_softarm.mechanics.mjcf import chamber_lengths, spring_lengths
 from mjx_softarm.mechanics.pipe import CrossPipe
-from mjx_softarm.sensing.sensors import frequency_from_length
 from mjx_softarm.spec import ArmSpec
 from mjx_softarm.twin.hysteresis import StopOperators
 from mjx_softarm.twin.model import (
@@ -48,9 +47,6 @@ HYSTERESIS_STROKES_M = (0.003, 0.006, 0.012, 0.024)
 FRICTION_LIMIT = (0.3, 0.01, 0.01)  # [N, N m, N m]
 FRICTION_STROKE = (2e-4, 5e-3, 5e-3)  # [m, rad, rad]
 
-REFERENCE_CLOCK_HZ = 40e6  # LDC1612 data sheet, TI SNOSCY9: a reading counts 2^-28 of it
-READING_BITS = 28
-FREQUENCY_NOISE_HZ = 300.0  # assumed: 0.04 mm of a spring 0.2 m long; far above the converter's own
 PRESSURE_NOISE_KPA = 0.05
 CAPTURE_NOISE_M = 2e-4
 CAPTURE_NOISE_DEG = 0.1
@@ -63,7 +59,7 @@ REST_S = 4.0  # hanging at atmospheric pressure before time starts
 class Twin:
     """One arm and its pump, sensors and cameras; an `ArmIO` and a `MotionCapture`.
 
-    Example: `twin = Twin(7)`, then `twin.read_frequencies()` and `twin.write_pressures(p)` in turn.
+    Example: `twin = Twin(7)`, then `twin.read_sensors()` and `twin.write_pressures(p)` in turn.
     """
 
     def __init__(
@@ -124,12 +120,12 @@ class Twin:
         limit = scale * np.full(len(strokes), HYSTERESIS_LIMIT_N / len(strokes))
         self._hysteresis = StopOperators(limit / strokes, limit, chamber_lengths(self._data))
 
-    def read_frequencies(self) -> np.ndarray:
-        """The springs' frequencies (n,) [Hz] now, counted by the converter; see `ArmIO`."""
-        true_hz = frequency_from_length(spring_lengths(self._data), self._parts.sensor)
-        noisy_hz = true_hz + self._draw(FREQUENCY_NOISE_HZ, len(true_hz))
-        step_hz = REFERENCE_CLOCK_HZ / 2**READING_BITS
-        return np.round(noisy_hz / step_hz) * step_hz
+    def read_sensors(self) -> np.ndarray:
+        """Return what the springs' sensors read now (n,), noisy and in the converter's steps; see `ArmIO`."""
+        sensor = self._parts.sensor
+        true = sensor.readings(spring_lengths(self._data))
+        noisy = true + self._draw(sensor.noise, len(true))
+        return np.round(noisy / sensor.resolution) * sensor.resolution
 
     def write_pressures(self, pressure_kpa: np.ndarray) -> None:
         """Command pressures (n,) [kPa], then let one control period pass; see `ArmIO`."""
@@ -227,6 +223,7 @@ class Twin:
 
     def describe(self) -> dict[str, Any]:
         """How the twins are distributed, for reports: nothing about the one that was drawn."""
+        sensor = self._parts.sensor
         return {
             "gap": self._build.gap,
             "standard deviations": dataclasses.asdict(scaled_tolerances(self._build.gap)),
@@ -234,7 +231,7 @@ class Twin:
             "links per section": self._build.links_per_section,
             "hysteresis of a chamber [N]": self._build.losses * HYSTERESIS_LIMIT_N,
             "friction of a link [N, N m, N m]": [self._build.losses * limit for limit in FRICTION_LIMIT],
-            "frequency noise [Hz]": self._build.noise * FREQUENCY_NOISE_HZ,
+            f"{sensor.reading_name} noise [{sensor.unit}]": self._build.noise * sensor.noise,
             "pressure noise [kPa]": self._build.noise * PRESSURE_NOISE_KPA,
             "motion capture noise [mm, deg]": [
                 self._build.noise * 1e3 * CAPTURE_NOISE_M,

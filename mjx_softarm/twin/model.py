@@ -22,7 +22,7 @@ import numpy as np
 from mjx_softarm.mechanics.mjcf import build_spec
 from mjx_softarm.mechanics.pipe import CrossPipe
 from mjx_softarm.mechanics.statics import GRAVITY_M_S2
-from mjx_softarm.sensing.sensors import SensorParams
+from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
 from mjx_softarm.twin.pipe import add_pipe
 
@@ -69,7 +69,7 @@ class Parts(NamedTuple):
     """What was drawn."""
 
     spec: ArmSpec  # chambers, springs, masses
-    sensor: SensorParams  # with the springs' own beta and delta
+    sensor: Sensor  # with the springs' own beta and delta
     hole_m: dict[str, np.ndarray]  # "chamber", "spring" -> (n, 2) in the section's frame
     twist_rad: np.ndarray  # (n_sections,)
     backbone: np.ndarray  # (n_sections,) factor of the stiffness
@@ -119,7 +119,7 @@ def draw_parts(seed: int, spec: ArmSpec, build: Build) -> Parts:
     tilt_rad = np.radians(off(std.base_tilt_deg, 3)) * [1.0, 1.0, 0.0]  # about z: the first section's twist
     return Parts(
         spec=perturbed,
-        sensor=SensorParams.from_spec(spec)._replace(beta=beta, delta_m=delta_m),
+        sensor=dataclasses.replace(Sensor.from_spec(spec), beta=beta, delta_m=delta_m),
         hole_m=hole_m,
         twist_rad=np.radians(off(std.section_twist_deg, n_sections)),
         backbone=1.0 + off(std.backbone_stiffness, n_sections),

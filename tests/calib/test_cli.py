@@ -143,7 +143,7 @@ def test_check_takes_the_arm_s_number_of_chambers(demo, tmp_path, capsys):
     six = ArmSpec.default().replace(structure={"n_sections": 2})
     six.to_toml(tmp_path / "six.toml")
     log, _ = read_log(demo[0])
-    changes = {"frequency_hz": log.frequency_hz[:, :6], "spring_m": log.spring_m[:, :6]}
+    changes = {"readings": log.readings[:, :6], "spring_m": log.spring_m[:, :6]}
     write_log(tmp_path / "six.csv", log.__class__(**{**vars(log), **changes}))
     assert main(["check", str(tmp_path / "six.csv")]) == 2
     assert main(["check", str(tmp_path / "six.csv"), "--spec", str(tmp_path / "six.toml")]) == 0
@@ -211,10 +211,10 @@ def test_folders_missing_files_and_other_arms_are_refused(demo, tmp_path, capsys
 
 def test_strict_refuses_a_log_with_a_fault(demo, tmp_path, capsys):
     log, _ = read_log(demo[0])
-    frequency_hz = log.frequency_hz.copy()
-    frequency_hz[7, 3] = np.nan
+    readings = log.readings.copy()
+    readings[7, 3] = np.nan
     path = tmp_path / "log.csv"
-    write_log(path, log.__class__(**{**vars(log), "frequency_hz": frequency_hz}))
+    write_log(path, log.__class__(**{**vars(log), "readings": readings}))
     assert main(["check", str(path)]) == 1
     assert "frequency3" in capsys.readouterr().out
     assert main(["check", "--strict", str(path)]) == 2

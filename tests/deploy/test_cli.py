@@ -10,7 +10,6 @@ import pytest
 from calib.read.logs import read_log
 from mjx_softarm.deploy.arms import ArmError, open_arm
 from mjx_softarm.policy.file import save_policy
-from mjx_softarm.sensing.sensors import frequency_from_length
 from tests.linear_arm import FAR, POLICY, REST_M, SENSOR, N
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -23,7 +22,7 @@ ROOT = Path(__file__).resolve().parents[2]
         ("twin:-1", "got '-1', expected an integer >= 0"),
         ("no_such_module:Arm", "no_such_module cannot be imported: No module named 'no_such_module'"),
         ("mjx_softarm.deploy.loop:Nothing", "module mjx_softarm.deploy.loop has no 'Nothing'"),
-        ("mjx_softarm.deploy.loop:Phase", "has no method read_frequencies or write_pressures"),
+        ("mjx_softarm.deploy.loop:Phase", "has no method read_sensors or write_pressures"),
     ],
 )
 def test_arm_that_cannot_be_had(name, message):
@@ -36,8 +35,8 @@ import numpy as np
 
 class Arm:
     time_s = 0.0
-    def read_frequencies(self):
-        return np.full(9, {frequency_hz}) + np.random.default_rng(round(50 * self.time_s)).normal(0, 300, 9)
+    def read_sensors(self):
+        return np.full(9, {readings}) + np.random.default_rng(round(50 * self.time_s)).normal(0, 300, 9)
     def write_pressures(self, pressure_kpa):
         self.time_s += 0.02
 """
@@ -53,8 +52,8 @@ print(status, loaded)
 
 @pytest.fixture
 def folder(tmp_path):
-    frequency_hz = frequency_from_length(np.full(N, REST_M), SENSOR)[0]
-    (tmp_path / "driver.py").write_text(DRIVER.format(frequency_hz=frequency_hz))
+    readings = SENSOR.readings(np.full(N, REST_M))[0]
+    (tmp_path / "driver.py").write_text(DRIVER.format(readings=readings))
     save_policy(tmp_path / "policy.npz", POLICY)
     return tmp_path
 

@@ -10,7 +10,6 @@ from mjx_softarm.deploy.faults import Fault
 from mjx_softarm.deploy.loop import N_ACTIONS, VENT_KPA_PER_S, Controller, Phase, start, step, with_goal
 from mjx_softarm.logs.schema import write_log
 from mjx_softarm.sensing.estimator import estimate
-from mjx_softarm.sensing.sensors import frequency_from_length
 from tests.linear_arm import (
     CONTROLLER,
     DT_S,
@@ -62,17 +61,17 @@ def test_acts_at_once_and_then_at_rest():
 
 def test_policy_itself_plans_by_default():
     run = go(LinearArm(), goals=GOALS[:1], controller=Controller.of(POLICY), duration_s=0.1)
-    middle_hz = POLICY.frequency_hz.mean(axis=1)  # the actor's weights are zero
-    got_hz = frequency_from_length(run.log.reference_m[1], SENSOR)
+    middle_hz = np.mean(POLICY.actions[1:], axis=0)  # the actor's weights are zero
+    got_hz = SENSOR.readings(run.log.reference_m[1])
     np.testing.assert_allclose(got_hz, middle_hz, rtol=1e-6)
 
 
 def test_state_is_not_changed_in_place():
     state, _ = with_goal(CONTROLLER, start(CONTROLLER), GOALS[0])
     arrays = [np.array(value, copy=True) for value in (state.integral_kpa, state.n_lost, state.springs_m)]
-    frequency_hz = LinearArm().read_frequencies()
-    first = step(CONTROLLER, state, frequency_hz, False)[0]
-    second = step(CONTROLLER, state, frequency_hz, False)[0]
+    readings = LinearArm().read_sensors()
+    first = step(CONTROLLER, state, readings, False)[0]
+    second = step(CONTROLLER, state, readings, False)[0]
     np.testing.assert_array_equal(first.pressure_kpa, second.pressure_kpa)
     for before, after in zip(arrays, (state.integral_kpa, state.n_lost, state.springs_m), strict=True):
         np.testing.assert_array_equal(before, after)
@@ -113,7 +112,7 @@ def test_real_arm_is_waited_for(monkeypatch):
     class Real:
         """Without a clock; each tick takes it 4 ms."""
 
-        read_frequencies = staticmethod(LinearArm().read_frequencies)
+        read_sensors = staticmethod(LinearArm().read_sensors)
 
         def write_pressures(self, pressure_kpa):
             now[0] += 0.004
@@ -128,11 +127,11 @@ def test_interrupt_vents_and_keeps_the_log():
     class Interrupted(LinearArm):
         n_interrupts = 1
 
-        def read_frequencies(self):
+        def read_sensors(self):
             if self.tick == 60 and self.n_interrupts > 0:
                 self.n_interrupts -= 1
                 raise KeyboardInterrupt
-            return super().read_frequencies()
+            return super().read_sensors()
 
     arm = Interrupted()
     run = go(arm)

@@ -10,11 +10,11 @@ from mjx_softarm.sensing.estimator import estimate
 from tests.linear_arm import POLICY, Blind, LinearArm, N, go, nan, read_m
 
 
-def late(frequency_hz):
+def late(readings):
     raise TimeoutError
 
 
-def gone(frequency_hz):
+def gone(readings):
     raise OSError("bus error")
 
 
@@ -26,7 +26,7 @@ def test_one_lost_reading_holds_the_last_good_one(spoil):
     held_m = np.where(np.isnan(now_m), before_m, now_m)
     assert held_m[4] == before_m[4] != after_m[4]
     np.testing.assert_allclose(run.log.estimate[30], estimate(POLICY.estimator, held_m), atol=1e-3)
-    assert np.isnan(run.log.frequency_hz[30, 4])
+    assert np.isnan(run.log.readings[30, 4])
     assert ("spring4: read nan Hz" in run.events[0].message) == (spoil is nan)
 
 
@@ -49,7 +49,7 @@ def test_no_reading_at_all_moves_nothing():
 
 def test_stuck_sensor_holds():
     arm = LinearArm()
-    stuck_hz = arm.read_frequencies()[7]
+    stuck_hz = arm.read_sensors()[7]
     blind = Blind(range(20, 10**6), lambda f_hz: np.where(np.arange(N) == 7, stuck_hz, f_hz))
     run = go(blind)
     assert run.phase is Phase.HOLD and run.counts()[Fault.SENSOR_STUCK] == 1
@@ -64,12 +64,12 @@ def test_noiseless_arm_at_rest_is_not_stuck():
 def test_sensors_out_of_reach_hold_but_do_not_stop_venting():
     run = go(Blind({50}, gone))
     assert run.phase is Phase.HOLD and run.counts() == {Fault.ARM_LOST: 1}
-    assert "read_frequencies: bus error" in run.events[0].message
+    assert "read_sensors: bus error" in run.events[0].message
     arm = Blind(range(105, 10**6), gone)
     assert go(arm, duration_s=2.0).phase is Phase.DONE
     np.testing.assert_array_equal(arm.command_kpa, 0.0)
 
 
 def test_wrong_number_of_readings():
-    run = go(Blind({0}, lambda frequency_hz: frequency_hz[:5]))
+    run = go(Blind({0}, lambda readings: readings[:5]))
     assert run.counts() == {Fault.ARM_LOST: 1} and "got shape (5,), expected (9,)" in run.events[0].message

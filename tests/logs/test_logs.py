@@ -12,7 +12,7 @@ def small_log(**changes):
     rng = np.random.default_rng(0)
     values = {
         "time_s": 0.02 * np.arange(4),
-        "frequency_hz": 4e6 + rng.uniform(size=(4, 6)),
+        "readings": 4e6 + rng.uniform(size=(4, 6)),
         "spring_m": rng.uniform(0.1, 0.3, (4, 6)),
         "tip_quaternion": np.tile([1.0, 0.0, 0.0, 0.0], (4, 1)),
         "marker_m": rng.uniform(-1.0, 0.0, (4, 2, 3)),
@@ -30,7 +30,7 @@ def test_csv_is_what_a_plain_reader_expects(tmp_path):
     assert len(rows) == 4
     for n, row in enumerate(rows):
         assert float(row["time [s]"]) == pytest.approx(0.02 * n)
-        assert float(row["frequency5 [Hz]"]) == pytest.approx(log.frequency_hz[n, 5], rel=1e-8)
+        assert float(row["frequency5 [Hz]"]) == pytest.approx(log.readings[n, 5], rel=1e-8)
         assert float(row["spring2 [mm]"]) == pytest.approx(1e3 * log.spring_m[n, 2], rel=1e-8)
         assert float(row["tip_qw [1]"]) == 1.0
         assert float(row["marker1_y [mm]"]) == pytest.approx(1e3 * log.marker_m[n, 1, 1], rel=1e-8)

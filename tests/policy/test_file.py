@@ -15,8 +15,8 @@ from mjx_softarm.policy import file as export
 from mjx_softarm.policy.file import load_policy, policy_from_actor, save_policy
 
 PROVENANCE = {"commit": "0123abc", "created": "2025-01-31", "packages": {"numpy": "2.0"}, "seed": 7}
-# Of the names that schema 2 stores, and of the fields of the specification in it.
-SCHEMA_2 = "cc03effa"
+# Digest of the names that schema 3 stores and of the fields of its specification.
+SCHEMA_3 = "353f9930"
 
 
 def make_params(hidden=(7, 5), n_actions=9):
@@ -74,6 +74,8 @@ def assert_same(one, other):
 
 
 def flat(value):
+    if dataclasses.is_dataclass(value):
+        value = tuple(vars(value).values())
     return [x for part in value for x in flat(part)] if isinstance(value, tuple) else [np.asarray(value)]
 
 
@@ -119,18 +121,18 @@ def test_parts_are_those_of_the_arm(file):
         coil_h = 1.26e-6 * spec.sensor.turns**2 * np.pi * spec.sensor.coil_radius_m**2 / wire_m
         total_h = coil_h + spec.sensor.compensation_h
         expected = 1.0 / (2.0 * np.pi * np.sqrt(spec.sensor.capacitance_f * total_h))
-        np.testing.assert_allclose(policy.frequency_hz[:, column], expected, rtol=1e-12)
+        np.testing.assert_allclose(policy.actions[1 + column], expected, rtol=1e-12)
 
 
 def test_file_is_plain_npz_with_named_layouts(file):
     arrays = arrays_of(file)
-    assert arrays["schema_version"] == 2 and arrays["s2r_kind"] == "mlp"
+    assert arrays["schema_version"] == 3 and arrays["s2r_kind"] == "mlp"
     assert arrays["obs_layout"].tolist()[:7] == [
         *("pose_x_mm", "pose_y_mm", "pose_z_mm", "pose_yaw_deg", "pose_pitch_deg", "pose_roll_deg"),
         "goal_x_mm",
     ]
     assert arrays["obs_layout"].shape == (18,) and arrays["obs_layout"][17] == "error_roll_deg"
-    assert arrays["action_layout"].tolist() == [f"spring{k}_hz" for k in range(9)]
+    assert arrays["action_layout"].tolist() == [f"frequency{k}" for k in range(9)]
 
 
 def test_same_policy_gives_same_bytes(file, tmp_path):
@@ -206,11 +208,11 @@ def test_files_that_are_no_policy(tmp_path):
     assert refusal(path).startswith("got an archive without a policy's mark at its end")
 
 
-@pytest.mark.parametrize("version", [0, 1, 3])
+@pytest.mark.parametrize("version", [0, 1, 2])
 def test_another_schema_is_named_before_anything_else(file, version):
     reseal(file, drop=["gains.kp_kpa_per_m"], schema_version=np.array(version), nose=np.zeros(3))
     assert refusal(file) == (
-        f"schema_version: got {version}, expected 2; this version's `python -m train export` writes that"
+        f"schema_version: got {version}, expected 3; `python -m train export RUN` writes the policy anew"
     )
 
 
@@ -255,25 +257,25 @@ def test_every_type_and_shape_is_checked(file):
         ),
         ({"actor__0__bias": np.zeros(7)}, "actor.0.bias: got float64 (7,), expected float32 (7,)"),
         ({"obs_layout": np.array(export.OBS_LAYOUT[::-1])}, "obs_layout: got ['error_roll_deg', "),
-        ({"action_layout": np.array(["spring0_hz"] * 9)}, "action_layout: got ['spring0_hz', 'spring0_hz', "),
+        ({"action_layout": np.array(["voltage0"] * 9)}, "action_layout: got ['voltage0', 'voltage0', "),
         ({"obs_scale__scale": np.zeros(6)}, "obs_scale.scale: got [0.0, "),
-        ({"frequency_hz": np.tile([4e6, 3e6], (9, 1))}, "frequency_hz: got [[4000000.0, 3000000.0], "),
-        ({"frequency_hz": np.tile([1.0, 3e6], (9, 1))}, "frequency_hz: got [[1.0, 3000000.0], "),
-        ({"sensor__delta_m": np.full(9, -1.0)}, "frequency_hz: got "),
+        ({"action__low": np.full(9, 5e6)}, "action.low: got [5000000.0, "),
+        ({"action__low": np.full(9, 1.0)}, "action.low: got [1.0, "),
+        ({"sensor__delta_m": np.full(9, -1.0)}, "action.low: got "),
         (
             {"gains__pressure_min_kpa": np.array(20.0)},
             "gains.pressure_min_kpa: got 20.0, expected less than gains.pressure_max_kpa",
         ),
         ({"rate_hz": np.array(0.0)}, "rate_hz: got 0.0, expected a number > 0"),
         ({"s2r_kind": np.array("tree")}, "s2r_kind: got tree, expected mlp or none"),
-        ({"s2r_kind": np.array("none")}, "s2r.0.bias: unknown entry, schema 2 has none of this name"),
+        ({"s2r_kind": np.array("none")}, "s2r.0.bias: unknown entry, schema 3 has none of this name"),
         ({"workspace": np.zeros((0, 6), np.float32)}, "workspace: got float32 (0, 6), expected "),
         ({"estimator__spring_scale_m": np.zeros(9, np.float32)}, "estimator.spring_scale_m: got [0.0, "),
         ({"s2r__limit": np.float32(0.0)}, "s2r.limit: got 0.0, expected a number > 0"),
         ({"provenance_json": np.array("[1]")}, "provenance_json: got '[1]', expected a JSON object"),
         ({"spec_json": np.array("{")}, "spec_json: got '{', expected a JSON object"),
         ({"spec_json": np.array('{"nose": 1}')}, "spec_json: nose: unknown field, expected one of name, "),
-        ({"gains__kd": np.array(1.0)}, "gains.kd: unknown entry, schema 2 has none of this name"),
+        ({"gains__kd": np.array(1.0)}, "gains.kd: unknown entry, schema 3 has none of this name"),
         ({"rate_hz": np.array([{}])}, "holds an array that cannot be read: "),
     ],
 )
@@ -318,9 +320,9 @@ def test_places_that_cannot_be_written(file, make_policy, tmp_path):
             save_policy(path, make_policy())
 
 
-def test_schema_2_stays_as_it_is(file, make_policy):
+def test_schema_3_stays_as_it_is(file, make_policy):
     groups = make_policy().spec.to_dict().items()
     fields = [f"{name}.{item}" for name, group in groups if isinstance(group, dict) for item in group]
     names = "\n".join(sorted([*arrays_of(file), *fields]))
     digest = hashlib.sha256(names.encode()).hexdigest()[:8]
-    assert digest == SCHEMA_2, "other entries, or other fields of ArmSpec: raise export.SCHEMA_VERSION"
+    assert digest == SCHEMA_3, "other entries, or other fields of ArmSpec: raise export.SCHEMA_VERSION"

@@ -87,10 +87,10 @@ def test_equals_actor_and_environment_in_jax(spec, actor_params, runner, poses, 
     np.testing.assert_allclose(runner.action(*poses), action, rtol=0, atol=1e-5)
     np.testing.assert_allclose(reference.length_m, env.reference_m(action), rtol=0, atol=1e-5)
     np.testing.assert_allclose(env.action_of(jnp.asarray(reference.length_m)), action, rtol=0, atol=1e-5)
-    low, high = env.frequency_range_hz.T
-    np.testing.assert_allclose(runner.policy.frequency_hz, np.stack([low, high], axis=-1), rtol=1e-6)
+    _, low, high = env.action_map
+    np.testing.assert_allclose(runner.policy.actions[1:], [low, high], rtol=1e-6)
     np.testing.assert_allclose(
-        reference.frequency_hz, low + 0.5 * (np.asarray(action) + 1.0) * (high - low), rtol=1e-6
+        reference.readings, low + 0.5 * (np.asarray(action) + 1.0) * (high - low), rtol=1e-6
     )
 
 
@@ -108,7 +108,7 @@ def test_full_action_is_the_shortest_or_longest_spring(spec, actor_params, make_
 def test_one_pose_and_a_batch_agree(runner, poses):
     batch = runner.act(*poses)
     one = runner.act(poses[0, 3].tolist(), poses[1, 3].tolist())
-    assert one.frequency_hz.shape == one.length_m.shape == (9,)
+    assert one.readings.shape == one.length_m.shape == (9,)
     np.testing.assert_allclose(one.length_m, batch.length_m[3], rtol=1e-6)
     to_one_goal = runner.act(poses[0].reshape(10, 100, 6), poses[1, 3])
     assert to_one_goal.length_m.shape == (10, 100, 9)

@@ -1,5 +1,6 @@
 """Sensors against the paper's equations in float64, and every reading that is no length."""
 
+import dataclasses
 import math
 
 import jax
@@ -7,14 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import mjx_softarm.env  # noqa: F401  # registers the sensors as pytrees
 from mjx_softarm import ArmSpec
-from mjx_softarm.sensing.sensors import (
-    SensorFault,
-    SensorParams,
-    describe_faults,
-    frequency_from_length,
-    length_from_frequency,
-)
+from mjx_softarm.sensing.sensors import Sensor, SensorFault
 
 LENGTHS_M = np.linspace(0.060, 0.320, 9 * 29).reshape(29, 9)
 COMPENSATIONS_H = (1.0e-6, 0.0, -1.0e-6, 4.0e-6)
@@ -43,7 +39,7 @@ def frequency_by_the_book(length_m, spec):
 
 
 def narrow(params):
-    return SensorParams(*(np.float32(value) for value in params))
+    return dataclasses.replace(params, **{name: np.float32(value) for name, value in vars(params).items()})
 
 
 def relative_error(got, expected):
@@ -51,9 +47,9 @@ def relative_error(got, expected):
 
 
 def test_default_sensor_at_the_free_length():
-    params = SensorParams.from_spec(WIDE)
+    params = Sensor.from_spec(WIDE)
     # wire (200 - 2.45) / 0.93 = 212.4 mm; coil 3.774 uH; with 1 uH and 330 pF: 4.010 MHz
-    frequency = frequency_from_length(np.full(9, 0.200), params)
+    frequency = params.readings(np.full(9, 0.200))
     np.testing.assert_allclose(frequency, 4.010e6, rtol=1e-4)
     assert params.beta.shape == params.delta_m.shape == (9,)
 
@@ -65,16 +61,16 @@ def test_printed_formula_with_the_derivation_s_factor():
     numerator *= 1.26e-6 * sensor.coil_radius_m**2
     denominator = 1 - 4 * math.pi**2 * sensor.capacitance_f * sensor.compensation_h * f**2
     expected = numerator / denominator + np.array(sensor.delta_m)
-    np.testing.assert_allclose(length_from_frequency(f, SensorParams.from_spec(spec)).length_m, expected)
+    np.testing.assert_allclose(Sensor.from_spec(spec).lengths(f).length_m, expected)
 
 
 @pytest.mark.parametrize("compensation_h", COMPENSATIONS_H)
 def test_float64_follows_the_equations_both_ways(compensation_h):
     spec = make_spec(compensation_h)
-    params = SensorParams.from_spec(spec)
+    params = Sensor.from_spec(spec)
     frequency = frequency_by_the_book(LENGTHS_M, spec)
-    assert relative_error(frequency_from_length(LENGTHS_M, params), frequency) < 1e-14
-    reading = length_from_frequency(frequency, params)
+    assert relative_error(params.readings(LENGTHS_M), frequency) < 1e-14
+    reading = params.lengths(frequency)
     assert not reading.fault.any()
     assert relative_error(reading.length_m, LENGTHS_M) < 1e-13
 
@@ -83,10 +79,10 @@ def test_float64_follows_the_equations_both_ways(compensation_h):
 @pytest.mark.parametrize("library", ["numpy", "jax"])
 def test_float32_keeps_its_precision(compensation_h, library):
     spec = make_spec(compensation_h)
-    params = narrow(SensorParams.from_spec(spec))
+    params = narrow(Sensor.from_spec(spec))
     batched = {"numpy": lambda f: f, "jax": lambda f: jax.jit(jax.vmap(f))}[library]
-    to_frequency = batched(lambda x: frequency_from_length(x, params))
-    to_length = batched(lambda x: length_from_frequency(x, params).length_m)
+    to_frequency = batched(lambda x: params.readings(x))
+    to_length = batched(lambda x: params.lengths(x).length_m)
     lengths, book = np.float32(LENGTHS_M), frequency_by_the_book(LENGTHS_M, spec)
     frequency = to_frequency(lengths)
     assert frequency.dtype == to_length(frequency).dtype == np.float32
@@ -96,10 +92,10 @@ def test_float32_keeps_its_precision(compensation_h, library):
 
 
 def test_batches_of_readings_and_one_arm_agree():
-    params = SensorParams.from_spec(make_spec())
-    frequency = frequency_from_length(LENGTHS_M, params)
-    together = length_from_frequency(frequency, params).length_m
-    np.testing.assert_array_equal(together[7], length_from_frequency(frequency[7], params).length_m)
+    params = Sensor.from_spec(make_spec())
+    frequency = params.readings(LENGTHS_M)
+    together = params.lengths(frequency).length_m
+    np.testing.assert_array_equal(together[7], params.lengths(frequency[7]).length_m)
 
 
 # --- readings that are no length -------------------------------------------------------------------
@@ -121,13 +117,13 @@ BAD = {
 @pytest.mark.parametrize("value, fault", BAD.values(), ids=BAD.keys())
 @pytest.mark.filterwarnings("error")
 def test_a_bad_reading_is_reported_and_holds_its_fallback(library, value, fault):
-    params = SensorParams.from_spec(make_spec())
-    good = np.float32(frequency_from_length(np.full(9, 0.180), params))
+    params = Sensor.from_spec(make_spec())
+    good = np.float32(params.readings(np.full(9, 0.180)))
     bad = good.copy()
     bad[4] = value
     last_good = np.linspace(0.10, 0.18, 9, dtype=np.float32)
-    convert = length_from_frequency if library == "numpy" else jax.jit(length_from_frequency)
-    reading = convert(bad, params, last_good)
+    convert = Sensor.lengths if library == "numpy" else jax.jit(Sensor.lengths)
+    reading = convert(params, bad, last_good)
     assert reading.fault.dtype == np.int32
     np.testing.assert_array_equal(reading.fault, [0, 0, 0, 0, fault, 0, 0, 0, 0])
     expected = np.full(9, 0.180)
@@ -136,25 +132,25 @@ def test_a_bad_reading_is_reported_and_holds_its_fallback(library, value, fault)
 
 
 def test_the_default_fallback_is_a_length_no_spring_has():
-    params = SensorParams.from_spec(make_spec())
-    reading = length_from_frequency(np.full(9, math.nan), params)
+    params = Sensor.from_spec(make_spec())
+    reading = params.lengths(np.full(9, math.nan))
     np.testing.assert_array_equal(reading.length_m, 0.0)
 
 
 def test_a_calibration_without_positive_length_is_reported():
-    params = SensorParams.from_spec(WIDE.replace(sensor={"delta_m": -0.05}))
-    reading = length_from_frequency(np.full(9, 1.0e6), params)
+    params = Sensor.from_spec(WIDE.replace(sensor={"delta_m": -0.05}))
+    reading = params.lengths(np.full(9, 1.0e6))
     assert set(reading.fault) == {SensorFault.NO_LENGTH}
-    assert "beta = 0.93 and delta = -0.05 m" in describe_faults(np.full(9, 1.0e6), reading.fault, params)
+    assert "beta = 0.93 and delta = -0.05 m" in params.describe_faults(np.full(9, 1.0e6), reading.fault)
 
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("compensation_h, length_m", [(1e-6, 0.0), (1e-6, -0.9), (-1e-5, 0.2)])
 def test_a_length_no_coil_has_reads_nan_and_is_reported(compensation_h, length_m):
-    params = SensorParams.from_spec(WIDE)._replace(compensation_h=compensation_h, delta_m=np.zeros(9))
-    frequency = frequency_from_length(np.full(9, length_m), params)
+    params = dataclasses.replace(Sensor.from_spec(WIDE), compensation_h=compensation_h, delta_m=np.zeros(9))
+    frequency = params.readings(np.full(9, length_m))
     assert np.isnan(frequency).all()
-    assert set(length_from_frequency(frequency, params).fault) == {SensorFault.NOT_FINITE}
+    assert set(params.lengths(frequency).fault) == {SensorFault.NOT_FINITE}
 
 
 @pytest.mark.filterwarnings("error")
@@ -163,17 +159,19 @@ def test_a_reading_exactly_at_the_compensation_s_resonance_divides_by_nothing():
     inverse_h = 3.3e-10 * (2.0 * math.pi * frequency) ** 2
     exactly = 1.0 - (1.0 / inverse_h) * inverse_h == 0.0
     assert exactly.any()
-    params = SensorParams(3.3e-10, 1.0 / inverse_h, 8.0e-7, np.ones(200), np.zeros(200), 1.0e5, 1.0e7)
-    reading = length_from_frequency(frequency, params)
+    params = dataclasses.replace(
+        WIDE.sensor, compensation_h=1.0 / inverse_h, beta=np.ones(200), delta_m=np.zeros(200)
+    )
+    reading = params.lengths(frequency)
     assert (reading.fault[exactly] == SensorFault.NO_COIL).all()
 
 
 def test_a_bad_reading_leaks_no_gradient():
-    params = SensorParams.from_spec(make_spec())
+    params = Sensor.from_spec(make_spec())
     values = np.float32([4.0e6, math.nan, math.inf, -math.inf, 0.0, -4.0e6, 9.9e4, 2.0e7, 9.0e6])
 
     def total(frequency, delta_m, fallback_m):
-        reading = length_from_frequency(frequency, params._replace(delta_m=delta_m), fallback_m)
+        reading = dataclasses.replace(params, delta_m=delta_m).lengths(frequency, fallback_m)
         return jnp.sum(reading.length_m)
 
     delta_m, fallback_m = jnp.zeros(9), jnp.full(9, 0.2)
@@ -185,23 +183,23 @@ def test_a_bad_reading_leaks_no_gradient():
     np.testing.assert_array_equal(by_fallback, (~good).astype(float))
     np.testing.assert_array_equal(by_frequency[1:], 0.0)
     step_hz = 10.0
-    below, above = (length_from_frequency(np.full(9, 4.0e6 + h), params) for h in (-step_hz, step_hz))
+    below, above = (params.lengths(np.full(9, 4.0e6 + h)) for h in (-step_hz, step_hz))
     slope = (above.length_m[0] - below.length_m[0]) / (2 * step_hz)
     assert by_frequency[0] == pytest.approx(slope, rel=1e-4)
 
 
 def test_gradient_of_an_impossible_length_is_finite():
-    params = SensorParams.from_spec(make_spec())
+    params = Sensor.from_spec(make_spec())
     lengths = jnp.array([0.2, -0.1, -0.2, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1])
-    slope = jax.grad(lambda x: jnp.nansum(frequency_from_length(x, params)))(lengths)
+    slope = jax.grad(lambda x: jnp.nansum(params.readings(x)))(lengths)
     assert np.isfinite(slope).all()
     assert slope[0] > 0 and slope[1] == slope[2] == 0
 
 
 def test_faults_are_described_with_spring_reading_and_expectation():
-    params = SensorParams.from_spec(WIDE)
+    params = Sensor.from_spec(WIDE)
     frequency = np.array([4.0e6, math.nan, 4.0e6, 1200.0, 4.0e6, 2.0e7, 9.0e6, 4.0e6, 4.0e6])
-    text = describe_faults(frequency, length_from_frequency(frequency, params).fault, params)
+    text = params.describe_faults(frequency, params.lengths(frequency).fault)
     assert text.splitlines() == [
         "spring1: read nan Hz, expected 100000 to 1e+07 Hz",
         "spring3: read 1200 Hz, expected 100000 to 1e+07 Hz",
@@ -209,4 +207,4 @@ def test_faults_are_described_with_spring_reading_and_expectation():
         "spring6: read 9000000 Hz, expected below 8761191 Hz, where the compensation resonates "
         "without the coil",
     ]
-    assert describe_faults(frequency, np.zeros(9, int), params) == ""
+    assert params.describe_faults(frequency, np.zeros(9, int)) == ""

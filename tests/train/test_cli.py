@@ -16,7 +16,7 @@ from mjx_softarm.env import ReachEnv
 from mjx_softarm.logs.schema import Log, write_log
 from mjx_softarm.mechanics.workspace import sample_workspace
 from mjx_softarm.sensing.pose import frame_from_pose, quaternion_from_pose
-from mjx_softarm.sensing.sensors import SensorParams, frequency_from_length
+from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.spec import ArmSpec
 from train.__main__ import main
 from train.epoch.job import Job
@@ -168,7 +168,7 @@ def demonstrations(tmp_path_factory):
         source="demos",
         row=np.arange(6) + 2,
         time_s=np.arange(6.0),
-        frequency_hz=frequency_from_length(np.asarray(pool.spring_m, float), SensorParams.from_spec(spec)),
+        readings=Sensor.from_spec(spec).readings(np.asarray(pool.spring_m, float)),
         tip_m=frame_from_pose(np.asarray(pool.pose, float))[0],
         tip_quaternion=quaternion_from_pose(np.asarray(pool.pose, float)),
         sequence=np.zeros(6),

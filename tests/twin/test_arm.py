@@ -15,7 +15,7 @@ from mjx_softarm.control import Gains, pressures
 from mjx_softarm.mechanics.mjcf import chamber_lengths, spring_lengths
 from mjx_softarm.mechanics.workspace import circle_poses, settle_many
 from mjx_softarm.sensing.pose import pose_error, pose_from_frame
-from mjx_softarm.sensing.sensors import SensorParams, length_from_frequency
+from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.twin import arm as twin
 from mjx_softarm.twin import pneumatics
 from mjx_softarm.twin.arm import EVALUATION_SEEDS, Twin
@@ -56,7 +56,7 @@ def hold_pressures(arm, pressure_kpa, duration_s):
 def hold_springs(arm, reference_m, integral_kpa, gains, duration_s, params):
     """Run the sensor-space law; returns its integral."""
     for _ in range(round(50 * duration_s)):
-        length_m = length_from_frequency(arm.read_frequencies(), params).length_m
+        length_m = params.lengths(arm.read_sensors()).length_m
         command, integral_kpa = pressures(reference_m, length_m, integral_kpa, gains, 0.02)
         arm.write_pressures(command)
     return integral_kpa
@@ -74,7 +74,7 @@ def test_ideal_twin_rests_where_settle_says(spec, payload_kg):
         PRESSURES_KPA, expected.tip_position_m, expected.spring_m, strict=True
     ):
         hold_pressures(arm, pressure, 12.0)
-        read_m = length_from_frequency(arm.read_frequencies(), SensorParams.from_spec(spec)).length_m
+        read_m = Sensor.from_spec(spec).lengths(arm.read_sensors()).length_m
         np.testing.assert_allclose(arm.motion_capture().tip_m, tip_m, atol=2e-5)
         np.testing.assert_allclose(read_m, spring_m, atol=2e-5)
         np.testing.assert_allclose(arm.pressures(), pressure, atol=1e-3)
@@ -285,29 +285,29 @@ def test_paper_s_pump_and_valves():
 
 
 def test_readings_are_counts_of_the_reference_clock(noiseless):
-    count = noiseless.read_frequencies() / (40e6 / 2**28)
+    count = noiseless.read_sensors() / (40e6 / 2**28)
     np.testing.assert_array_equal(count, np.round(count))
     assert (count < 2**28).all()
 
 
 def test_springs_have_their_own_calibration(spec, noiseless):
     """The true beta and delta give the spring's length; the nominal ones are millimetres off."""
-    frequency_hz, true_m = noiseless.read_frequencies(), spring_lengths(noiseless._data)
-    calibrated = length_from_frequency(frequency_hz, noiseless._parts.sensor).length_m
-    nominal = length_from_frequency(frequency_hz, SensorParams.from_spec(spec)).length_m
+    readings, true_m = noiseless.read_sensors(), spring_lengths(noiseless._data)
+    calibrated = noiseless._parts.sensor.lengths(readings).length_m
+    nominal = Sensor.from_spec(spec).lengths(readings).length_m
     np.testing.assert_allclose(calibrated, true_m, atol=3e-8)  # half a count is 1e-8 m
     assert np.abs(nominal - true_m).max() > 1e-3
 
 
 def test_noise_is_as_large_as_documented():
     arm = Twin(3)
-    frequency_hz = np.array([arm.read_frequencies() for _ in range(300)])
+    readings = np.array([arm.read_sensors() for _ in range(300)])
     pressure_kpa = np.array([arm.pressures() for _ in range(300)])
     captures = [arm.motion_capture() for _ in range(300)]
     tip_m = np.array([capture.tip_m for capture in captures])
     turn = Rotation.from_quat([capture.tip_quaternion for capture in captures], scalar_first=True)
     off_deg = np.rad2deg((turn * turn.mean().inv()).as_rotvec())
-    assert frequency_hz.std(axis=0).mean() == pytest.approx(twin.FREQUENCY_NOISE_HZ, rel=0.1)
+    assert readings.std(axis=0).mean() == pytest.approx(arm._parts.sensor.noise, rel=0.1)
     assert pressure_kpa.std(axis=0).mean() == pytest.approx(twin.PRESSURE_NOISE_KPA, rel=0.1)
     assert 1e3 * tip_m.std(axis=0).mean() == pytest.approx(0.2, rel=0.15)
     assert off_deg.std(axis=0).mean() == pytest.approx(0.1, rel=0.15)
@@ -319,7 +319,7 @@ def test_noise_is_as_large_as_documented():
 def records(*args, **kwargs):
     arm = Twin(*args, **kwargs)
     hold_pressures(arm, PRESSURES_KPA[1], 0.1)
-    return np.concatenate([arm.read_frequencies(), arm.pressures(), arm.motion_capture().tip_m])
+    return np.concatenate([arm.read_sensors(), arm.pressures(), arm.motion_capture().tip_m])
 
 
 def test_seed_chooses_the_twin_and_session_the_noise():
@@ -328,7 +328,7 @@ def test_seed_chooses_the_twin_and_session_the_noise():
     assert (first != records(8)).all()
     other_day = records(7, session=twin.S2R_SESSION)
     assert (first != other_day).all()
-    np.testing.assert_allclose(first[:9], other_day[:9], atol=10 * twin.FREQUENCY_NOISE_HZ)
+    np.testing.assert_allclose(first[:9], other_day[:9], atol=10 * ArmSpec.default().sensor.noise)
     silent = [records(7, session=session, build=Build(noise=0.0)) for session in (0, 1)]
     np.testing.assert_array_equal(*silent)
     assert twin.S2R_SESSION != twin.EVALUATION_SESSION
@@ -338,7 +338,7 @@ def test_one_write_is_one_control_period():
     arm = Twin(0, build=IDEAL)
     assert arm.time_s == 0.0
     hold_pressures(arm, np.zeros(9), 1.0)
-    arm.read_frequencies(), arm.pressures(), arm.motion_capture()
+    arm.read_sensors(), arm.pressures(), arm.motion_capture()
     assert arm.time_s == pytest.approx(1.0)
     slower = Twin(0, ArmSpec.default().replace(control={"rate_hz": 30.0}), build=IDEAL)
     slower.write_pressures(np.zeros(9))
@@ -385,7 +385,7 @@ def bang_bang(seed, duration_s):
     while arm.time_s < duration_s:
         arm.attach(rng.choice([0.0, 1.0]))
         hold_pressures(arm, rng.choice([-40.0, 20.0], 9), rng.integers(1, 51) / 50)
-        assert np.isfinite(arm.read_frequencies()).all()
+        assert np.isfinite(arm.read_sensors()).all()
         assert np.linalg.norm(arm.motion_capture().tip_m) < 1.2
 
 

@@ -1,7 +1,7 @@
 """Demonstrations: positions that an expert brought the arm to, each with the action that leads there.
 
-A file of demonstrations is a log (`mjx_softarm.logs.schema`) of rows at rest, with the springs' frequencies, the
-tip's pose, and the id of the sequence that a row belongs to. A row's action is its own frequencies: asked of
+A file of demonstrations is a log (`mjx_softarm.logs.schema`) of rows at rest, with the sensors' readings, the
+tip's pose, and the id of the sequence that a row belongs to. A row's action is its own readings: asked of
 the springs, they lead to the row's pose from wherever the arm is. So a row's pose is the goal of its action,
 and any other one its start. There is nothing to repair in so few rows: whatever is wrong with one of them
 refuses the file.
@@ -20,11 +20,11 @@ import numpy as np
 from mjx_softarm.logs.checks import Finding, not_unit_rows
 from mjx_softarm.logs.files import Sheet, read_sheet, refuse
 from mjx_softarm.logs.schema import UNITS, Column, Log
+from mjx_softarm.mdp.actions import ActionMap
 from mjx_softarm.sensing.pose import pose_from_quaternion
-from mjx_softarm.sensing.sensors import frequency_range_hz
 from mjx_softarm.spec import ArmSpec
 
-NEEDED = ("frequency_hz", "tip_m", "tip_quaternion", "sequence")
+NEEDED = ("readings", "tip_m", "tip_quaternion", "sequence")
 
 
 class Demonstrations(NamedTuple):
@@ -54,7 +54,7 @@ def read_demonstrations(path: str | Path, spec: ArmSpec) -> tuple[Log, list[Find
     Raises:
         LogError: the file cannot be used; the message has a line for each finding.
     """
-    sheet, extra = read_sheet(path, spec.n_chambers, NEEDED)
+    sheet, extra = read_sheet(path, spec.n_chambers, NEEDED, reading_name=spec.sensor.reading_name)
     refuse(list(_not_finite(sheet)))
     refuse(list(_out_of_range(sheet, spec)))
     refuse(list(_out_of_order(sheet)))
@@ -63,8 +63,7 @@ def read_demonstrations(path: str | Path, spec: ArmSpec) -> tuple[Log, list[Find
 
 def from_log(log: Log, spec: ArmSpec) -> Demonstrations:
     """The demonstrations that checked rows are."""
-    low, high = frequency_range_hz(spec).T
-    actions = np.clip(2.0 * (log.frequency_hz - low) / (high - low) - 1.0, -1.0, 1.0)
+    actions = ActionMap.from_spec(spec).from_readings(log.readings)
     assert log.sequence is not None  # it is `NEEDED`
     positions = pose_from_quaternion(log.tip_m, log.tip_quaternion)
     return Demonstrations(
@@ -80,10 +79,11 @@ def _not_finite(sheet: Sheet) -> Iterator[Finding]:
 
 
 def _out_of_range(sheet: Sheet, spec: ArmSpec) -> Iterator[Finding]:
-    for k, limits_hz in zip(sheet.of("frequency_hz"), frequency_range_hz(spec), strict=True):
+    actions = ActionMap.from_spec(spec)
+    for k, *limits in zip(sheet.of("readings"), actions.low, actions.high, strict=True):
         column, values = sheet.columns[k], sheet.values[:, k]
-        low, high = (_shown(column, limit) for limit in limits_hz)
-        for row in np.flatnonzero((values < limits_hz[0]) | (values > limits_hz[1])):
+        low, high = (_shown(column, limit) for limit in limits)
+        for row in np.flatnonzero((values < min(limits)) | (values > max(limits))):
             got = f"got {_shown(column, values[row])} {column.unit}"
             yield _finding(sheet, row, column.name, f"{got}, expected {low} to {high}, the arm's range")
     tip_m, reach_m = sheet.values[:, sheet.of("tip_m")], spec.structure.n_sections * spec.springs.length_max_m

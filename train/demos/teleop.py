@@ -20,7 +20,6 @@ from mjx_softarm.deploy.faults import SETTLE_TIMEOUT_S
 from mjx_softarm.deploy.session import Recorder
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.sensing.pose import quaternion_from_pose, rotation_from_quaternion
-from mjx_softarm.sensing.sensors import length_from_frequency
 from train.demos.expert import Expert, ExpertError, Posture
 from train.demos.waypoints import Waypoint
 
@@ -104,7 +103,7 @@ class Teleoperation:
 
     def _end(self, run: Callable[[], None]) -> Recording:
         problem = drive_to_end(self._drive, run)
-        return Recording(self._rows.log("demonstrations"), np.array(self._off_m), problem)
+        return Recording(self._rows.log("demonstrations", self._drive.sensor), np.array(self._off_m), problem)
 
     def _reach(self, waypoint: Waypoint, posture: Posture) -> tuple[dict, float]:
         """The row at rest, and how far off [m] the finger tips are then, after `N_CORRECTIONS` at most."""
@@ -163,8 +162,8 @@ class Teleoperation:
         return kpa + beyond - posture.pressure_kpa
 
     def _not_at_rest(self, name: str) -> DriveError:
-        frequency_hz = self._last["frequency_hz"]
-        off_m = length_from_frequency(frequency_hz, self._drive.sensor, 0.0).length_m - self._now.spring_m
+        readings = self._last["readings"]
+        off_m = self._drive.sensor.lengths(readings, 0.0).length_m - self._now.spring_m
         worst = int(np.argmax(np.abs(off_m)))
         return DriveError(
             f"{name}: not at rest after {SETTLE_TIMEOUT_S:g} s: spring {worst} is {1e3 * off_m[worst]:+.1f} "

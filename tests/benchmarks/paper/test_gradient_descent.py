@@ -12,13 +12,13 @@ from benchmarks.paper.gradient_descent import descend, forward_kinematics, gradi
 from mjx_softarm import ArmSpec
 from mjx_softarm.control import Gains
 from mjx_softarm.deploy.loop import N_ACTIONS
+from mjx_softarm.mdp.actions import ActionMap
 from mjx_softarm.mdp.observation import ObsScale
 from mjx_softarm.mdp.rewards import RewardConfig, scaled_error
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.sensing.estimator import estimate
 from mjx_softarm.sensing.pose import pose_error
 from mjx_softarm.sensing.s2r import correct
-from mjx_softarm.sensing.sensors import SensorParams, frequency_range_hz
 
 SPEC = ArmSpec.default()
 N = SPEC.n_chambers
@@ -31,8 +31,7 @@ def policy(request, make_arm_model):
         layers=((np.zeros((18, N), np.float32), np.zeros(N, np.float32)),),
         obs_scale=ObsScale.from_spec(SPEC),
         reward=RewardConfig(),
-        frequency_hz=frequency_range_hz(SPEC),
-        sensor=SensorParams.from_spec(SPEC),
+        actions=ActionMap.from_spec(SPEC),
         gains=Gains.from_spec(SPEC),
         rate_hz=SPEC.control.rate_hz,
         spec=SPEC,

@@ -14,7 +14,7 @@ from benchmarks.paper.measure import load_outcome
 from mjx_softarm.mechanics.workspace import circle_poses
 from mjx_softarm.policy.file import save_policy
 from mjx_softarm.policy.runtime import PolicyRunner
-from mjx_softarm.sensing.sensors import SensorParams
+from mjx_softarm.sensing.sensors import Sensor
 from tests.benchmarks.paper.made_up import SPEC, TINY, N, goals_of, make_policy, pipe_trial
 from train import __main__ as train_main
 from train.config import IMITATION_PRESETS
@@ -138,7 +138,7 @@ def test_without_s2r_the_nominal_policy_plans_and_the_springs_are_calibrated(tmp
         (tmp_path / reach_run(twin, 0)).mkdir()
         save_policy(tmp_path / reach_run(twin, 0) / "policy.npz", make_policy(make_arm_model, spec))
     chosen = jobs.controller_of(tmp_path, Trial("without", 0, 0))
-    assert np.array_equal(chosen.policy.sensor.beta, SensorParams.from_spec(calibrated).beta)
+    assert np.array_equal(chosen.policy.sensor.beta, Sensor.from_spec(calibrated).beta)
     assert chosen.policy.spec == SPEC
     pose, goal = circle_poses(2).astype(float)
     expected = PolicyRunner(make_policy(make_arm_model)).act(pose, goal).length_m

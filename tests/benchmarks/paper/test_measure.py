@@ -22,7 +22,6 @@ from mjx_softarm.deploy.session import Arrival, Run
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mechanics.pipe import APPLE_KG, BALL_KG
 from mjx_softarm.mechanics.workspace import circle_poses
-from mjx_softarm.sensing.sensors import frequency_from_length
 from mjx_softarm.twin.arm import Twin
 from tests.benchmarks.paper.made_up import GRIPPER_M, N, made_up, make_policy
 
@@ -50,7 +49,7 @@ def test_errors_are_averaged_over_the_window_of_rest(make_arm_model):
         source="made up",
         row=np.arange(n_rows),
         time_s=0.02 * np.arange(n_rows),
-        frequency_hz=frequency_from_length(spring_m, policy.sensor),
+        readings=policy.sensor.readings(spring_m),
         pressure_kpa=pressure_kpa,
         tip_m=1e-3 * tip_mm,
         tip_quaternion=np.tile([np.cos(np.radians(5)), 0, 0, np.sin(np.radians(5))], (n_rows, 1)),

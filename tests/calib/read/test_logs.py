@@ -25,7 +25,7 @@ def arm_log(n=N, seed=0, rate_hz=50.0, **changes):
         source="arm.csv",
         row=np.arange(n) + 2,
         time_s=time_s,
-        frequency_hz=4e6 + 3e5 * swing + 1e3 * rng.standard_normal((n, 9)),
+        readings=4e6 + 3e5 * swing + 1e3 * rng.standard_normal((n, 9)),
         spring_m=0.2 + 0.03 * swing + 3e-4 * rng.standard_normal((n, 9)),
         pressure_kpa=-10.0 + 15.0 * swing + 0.1 * rng.standard_normal((n, 9)),
         tip_m=tip_m,
@@ -81,7 +81,7 @@ def test_clean_log_comes_back_without_findings(file, name, seed):
     assert findings == []
     expected = arm_log(seed=seed)
     np.testing.assert_array_equal(log.row, expected.row)
-    for group in ("time_s", "frequency_hz", "spring_m", "tip_m", "tip_quaternion", "marker_m", "payload_kg"):
+    for group in ("time_s", "readings", "spring_m", "tip_m", "tip_quaternion", "marker_m", "payload_kg"):
         np.testing.assert_allclose(getattr(log, group), getattr(expected, group), rtol=1e-8, atol=1e-9)
     assert log.goal is None and log.estimate is None and log.reference_m is None
 
@@ -95,7 +95,7 @@ def test_a_row_per_pose_comes_back_without_findings(file, seed):
     quaternion[:, 0] = 0.5 + np.abs(quaternion[:, 0])
     poses = {
         "spring_m": rng.uniform(0.105, 0.235, (N, 9))[hold],
-        "frequency_hz": rng.uniform(3e6, 5e6, (N, 9))[hold],
+        "readings": rng.uniform(3e6, 5e6, (N, 9))[hold],
         "pressure_kpa": rng.choice([-40.0, 0.0, 20.0], (N, 9))[hold],
         "tip_m": rng.uniform([-0.2, -0.2, -0.8], [0.2, 0.2, -0.4], (N, 3))[hold]
         + rng.normal(0.0, 1e-5, (len(hold), 3)),
@@ -151,10 +151,10 @@ def test_template_is_valid_and_its_text_names_all_columns(tmp_path):
 
 # Rows at fault: group, rows, value, column of the finding, line of the first, rows that it costs.
 FAULTS = {
-    "NaN": ("frequency_hz", [7, 9], np.nan, [3], "frequency3", "2 x NaN or inf", (9, 11), 2),
+    "NaN": ("readings", [7, 9], np.nan, [3], "frequency3", "2 x NaN or inf", (9, 11), 2),
     "inf": ("spring_m", [0], np.inf, [8], "spring8", "1 x NaN or inf", (2, 2), 1),
     "lost reading": (
-        "frequency_hz",
+        "readings",
         [50],
         0.0,
         [0],
@@ -507,7 +507,7 @@ def test_logs_of_one_arm_and_of_two():
     same_arm([first, arm_log(seed=1, source="b.csv"), arm_log(seed=2, source="c.csv")])
     for change, message in [
         ({"spring_m": 3.0 * first.spring_m}, "spring_m: 0.1.* and 0.5"),
-        ({"frequency_hz": 0.5 * first.frequency_hz}, "frequency_hz: "),
+        ({"readings": 0.5 * first.readings}, "readings: "),
         ({"tip_m": 2.0 * first.tip_m}, "tip_m: "),
         ({"pressure_kpa": first.pressure_kpa[:, :6]}, "pressure_kpa: 9 and 6 in a row"),
         ({"marker_m": first.marker_m[:, :2]}, "marker_m: 3 and 2 in a row"),

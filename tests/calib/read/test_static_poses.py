@@ -9,7 +9,7 @@ from calib.read.static_poses import MIN_HOLD_S, find_static_poses, holds, neares
 from mjx_softarm import ArmSpec
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.sensing.pose import rotation_from_quaternion
-from mjx_softarm.sensing.sensors import SensorParams, frequency_from_length
+from mjx_softarm.sensing.sensors import Sensor
 
 SPEC = ArmSpec.default()
 
@@ -102,8 +102,8 @@ def test_rows_that_are_not_finite_are_left_out_and_counted():
 
 def test_springs_are_read_from_frequencies_by_the_sensors_of_the_spec():
     length_m = np.full((750, 9), 0.18)
-    hz = frequency_from_length(length_m, SensorParams.from_spec(SPEC))
-    poses, _ = find_static_poses([steps(frequency_hz=hz)], SPEC)
+    hz = Sensor.from_spec(SPEC).readings(length_m)
+    poses, _ = find_static_poses([steps(readings=hz)], SPEC)
     np.testing.assert_allclose(poses.spring_m, 0.18, rtol=1e-6)
     assert np.isnan(find_static_poses([steps()], SPEC)[0].spring_m).all()
 

@@ -9,7 +9,7 @@ from mjx_softarm import ArmSpec
 from mjx_softarm.logs.checks import LogError
 from mjx_softarm.logs.schema import Log, log_table, write_log
 from mjx_softarm.sensing.pose import frame_from_pose
-from mjx_softarm.sensing.sensors import SensorParams, frequency_from_length
+from mjx_softarm.sensing.sensors import Sensor
 from train.demos.demonstrations import load_demonstrations, read_demonstrations
 
 SPEC = ArmSpec.default()
@@ -21,7 +21,7 @@ def demonstration_log(**changes):
     spring_m = rng.uniform(0.12, 0.22, (6, 9))
     values = {
         "time_s": np.array([0.0, 3.0, 8.0, 2.0, 9.0, 9.5]),  # the fourth row was another recording
-        "frequency_hz": frequency_from_length(spring_m, SensorParams.from_spec(SPEC)),
+        "readings": Sensor.from_spec(SPEC).readings(spring_m),
         "spring_m": spring_m,
         "tip_m": rng.uniform([-0.1, -0.1, -0.6], [0.1, 0.1, -0.5], (6, 3)),
         "tip_quaternion": np.tile([np.cos(0.1), 0.0, np.sin(0.1), 0.0], (6, 1)),
@@ -67,20 +67,20 @@ def test_a_single_row_is_enough(tmp_path):
 
 LOW, HIGH = (
     1e-6
-    * frequency_from_length(
-        np.array([[SPEC.springs.length_min_m], [SPEC.springs.length_max_m]]), SensorParams.from_spec(SPEC)
-    )[:, 0]
+    * Sensor.from_spec(SPEC).readings(np.array([[SPEC.springs.length_min_m], [SPEC.springs.length_max_m]]))[
+        :, 0
+    ]
 )
 MISTAKES = {
-    "NaN": ({"frequency_hz": (4, 3, np.nan)}, "line 6: frequency3: got nan, expected a number"),
+    "NaN": ({"readings": (4, 3, np.nan)}, "line 6: frequency3: got nan, expected a number"),
     "no orientation": ({"tip_quaternion": (1, 2, np.nan)}, "line 3: tip_qy: got nan, expected a number"),
     "no time": ({"time_s": (2, 0, np.inf)}, "line 4: time: got inf, expected a number"),
     "short": (
-        {"frequency_hz": (0, 8, 1e6 * LOW - 10)},
+        {"readings": (0, 8, 1e6 * LOW - 10)},
         f"line 2: frequency8: got {1e6 * LOW - 10:.7g} Hz, expected {1e6 * LOW:.7g} to {1e6 * HIGH:.7g}",
     ),
-    "long": ({"frequency_hz": (5, 0, 1e6 * HIGH + 10)}, "line 7: frequency0: got "),
-    "MHz for Hz": ({"frequency_hz": (5, 0, 4.2)}, "line 7: frequency0: got 4.2 Hz, expected "),
+    "long": ({"readings": (5, 0, 1e6 * HIGH + 10)}, "line 7: frequency0: got "),
+    "MHz for Hz": ({"readings": (5, 0, 4.2)}, "line 7: frequency0: got 4.2 Hz, expected "),
     "m for mm": ({"tip_m": (2, 2, -600.0)}, "line 4: tip_x..z: got "),
     "above the base": ({"tip_m": (2, 2, 0.3)}, "a tip below the base and within 825 mm of it"),
     "no rotation": (
@@ -114,7 +114,7 @@ def test_planted_mistake_is_named(file, mistake, name):
 @pytest.mark.parametrize(
     ("group", "message"),
     [
-        ("frequency_hz", "line 1: frequency0: missing, expected columns `frequency0 [Hz]` to `frequency8`"),
+        ("readings", "line 1: frequency0: missing, expected columns `frequency0 [Hz]` to `frequency8`"),
         ("tip_m", "line 1: tip_x: missing, expected columns `tip_x [mm]` to `tip_z`"),
         ("tip_quaternion", "line 1: tip_qw: missing, expected columns `tip_qw [1]` to `tip_qz`"),
         ("sequence", "line 1: sequence: missing, expected a column `sequence [1]`"),

@@ -14,7 +14,7 @@ from mjx_softarm.mechanics.settle import settle_pressures
 from mjx_softarm.mechanics.statics import ArmParams
 from mjx_softarm.sensing.pose import pose_from_frame, quaternion_from_pose
 from mjx_softarm.sensing.s2r import S2R_FILE, save_s2r
-from mjx_softarm.sensing.sensors import SensorParams, frequency_from_length
+from mjx_softarm.sensing.sensors import Sensor
 from train.__main__ import main
 from train.demos.demonstrations import load_demonstrations
 from train.demos.expert import Posture
@@ -22,7 +22,7 @@ from train.demos.teleop import CLOSE_M, Teleoperation, read_keys
 from train.demos.waypoints import task
 
 SPEC = ArmSpec.default()
-SENSOR = SensorParams.from_spec(SPEC)
+SENSOR = Sensor.from_spec(SPEC)
 DT_S, LAG = 1.0 / SPEC.control.rate_hz, 0.15  # of the way to the commanded pressure, per tick
 
 
@@ -41,10 +41,10 @@ class BlindArm:
         self.pressure_kpa = np.zeros(SPEC.n_chambers)
         self.now = equilibrium()(np.float32(self.pressure_kpa))
 
-    def read_frequencies(self):
+    def read_sensors(self):
         if self.n_ticks_left <= 0:
             raise TimeoutError
-        return frequency_from_length(np.asarray(self.now.spring_m, float), SENSOR)
+        return SENSOR.readings(np.asarray(self.now.spring_m, float))
 
     def write_pressures(self, pressure_kpa):
         self.pressure_kpa = self.pressure_kpa + LAG * (pressure_kpa - self.pressure_kpa)

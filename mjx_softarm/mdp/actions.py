@@ -1,0 +1,50 @@
+"""The one map between actions and spring lengths: an action in [-1, 1] is a sensor reading, scaled linearly.
+
+    reading = low + (action + 1) / 2 (high - low)
+
+low and high are the readings of the shortest and the longest spring that may be commanded. Source: the paper's
+action space, whose readings are the coils' frequencies.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from mjx_softarm._support.xp import Array, array_namespace
+from mjx_softarm.sensing.sensors import Sensor
+from mjx_softarm.spec import ArmSpec
+
+
+class ActionMap(NamedTuple):
+    """Actions of n springs and what they ask for. NumPy and JAX."""
+
+    sensor: Sensor
+    low: Array  # (n,) readings of the action -1
+    high: Array  # (n,) readings of the action 1
+
+    @classmethod
+    def from_spec(cls, spec: ArmSpec) -> ActionMap:
+        """Return the map of an arm, in float64."""
+        sensor = Sensor.from_spec(spec)
+        limits_m = spec.springs.length_min_m, spec.springs.length_max_m
+        return cls(sensor, *(sensor.readings(np.full(spec.n_chambers, limit_m)) for limit_m in limits_m))
+
+    def readings(self, action: Array) -> Array:
+        """Return the readings (..., n) that actions (..., n) ask for; an action beyond [-1, 1] is clipped."""
+        xp = array_namespace(action, self.low)
+        return self.low + 0.5 * (xp.clip(action, -1.0, 1.0) + 1.0) * (self.high - self.low)
+
+    def lengths(self, action: Array) -> Array:
+        """Return the spring lengths (..., n) [m] that actions (..., n) ask for."""
+        return self.sensor.lengths(self.readings(action)).length_m
+
+    def from_readings(self, readings: Array) -> Array:
+        """Return the actions (..., n) in [-1, 1] that ask for readings (..., n), or for the nearest allowed."""
+        xp = array_namespace(readings, self.low)
+        return xp.clip(2.0 * (readings - self.low) / (self.high - self.low) - 1.0, -1.0, 1.0)
+
+    def from_lengths(self, length_m: Array) -> Array:
+        """Return the actions (..., n) in [-1, 1] that ask for spring lengths (..., n) [m]."""
+        return self.from_readings(self.sensor.readings(length_m))
