@@ -26,7 +26,7 @@ ROOMS = {
 }
 NAMES = {
     "throughput": "env steps/s over arms and links, beside C MuJoCo in time steps; start-up times",
-    "settle": "error, speed, compile time and memory of Newton against time stepping; floor against measured",
+    "settle": "error, speed, compile time and memory of Newton against time stepping",
     "kernels": "what a GPU is given to do, loop by loop; compiled for an H200 where there is none",
     "learner": "gradient updates/s over batch sizes, against sb3-contrib, SBX and brax",
     "calibration": "errors of springs and chambers on a planted arm",
@@ -42,6 +42,12 @@ ALONE = {
 
 def main() -> int:
     """Run the named benchmarks; print their figures and write them to `benchmarks/results`."""
+    if sys.argv[1:2] == ["guard"]:
+        from benchmarks.speed import guard
+
+        guarded = argparse.ArgumentParser(prog="python -m benchmarks guard", description=guard.__doc__)
+        guarded.add_argument("--store", action="store_true")
+        return guard.main(**vars(guarded.parse_args(sys.argv[2:])))
     if sys.argv[1:2] and sys.argv[1] in ALONE:
         return importlib.import_module(f"benchmarks.{ROOMS[sys.argv[1]]}").main(sys.argv[2:])
     epilog = "\n".join(f"  {name:12} {text}" for name, text in {**NAMES, **ALONE}.items())

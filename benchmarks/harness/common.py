@@ -1,21 +1,21 @@
-"""What every benchmark shares: timing, memory, goals, tables, the machine it ran on, where results go.
+"""Shared parts of the benchmarks: the machine, memory, goals, tables, and where results go.
 
 Figures are nested dictionaries of plain values, made for JSON. `show` prints any of them: a list of flat
-dictionaries becomes a table with their keys as its head, loose values become a table of names and values.
+dictionaries becomes a table with their keys as its head, other values become a table of names and values.
 """
 
 from __future__ import annotations
 
 import os
+import platform
+import re
 import resource
 import sys
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
 from jax.sharding import Mesh
 from rich.console import Console
 from rich.table import Table
@@ -25,33 +25,34 @@ from mjx_softarm._support.provenance import provenance, write_json
 from train.epoch.devices import mesh_of
 
 RESULTS = Path(__file__).parents[1] / "results"
-WIDTH = 160  # of what is printed elsewhere than to a terminal
+WIDTH = 160  # of tables, where they are not printed to a terminal
 VERDICT = {True: "met", False: "NOT MET", None: "skipped"}
 
 
-def seconds(call: Callable[[], Any], repeats: int = 10) -> float:
-    """Median wall time of a call, after one that is not counted."""
-    jax.block_until_ready(call())
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        jax.block_until_ready(call())
-        times.append(time.perf_counter() - start)
-    return float(np.median(times))
-
-
 def n_cores() -> int:
-    """How many cores this process may use."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+def cpu_kind() -> str:
+    """Return the CPU's name and the number of its cores that this process may use."""
+    info = Path("/proc/cpuinfo")
+    found = re.search(r"model name\s*: (.+)", info.read_text("utf-8")) if info.exists() else None
+    return f"{found[1].strip() if found else platform.processor() or platform.machine()}, {n_cores()} cores"
+
+
+def machine_kind() -> str:
+    """Return the name of the GPU if JAX runs on one, else `cpu_kind`."""
+    return jax.devices()[0].device_kind if jax.default_backend() == "gpu" else cpu_kind()
+
+
 def mesh_of_cores(n_arms: int) -> Mesh | None:
-    """This process's cores as devices, as many as n arms spread over evenly; call it before JAX is used.
+    """Make devices of this process's cores, as many as n arms spread over evenly; call it before JAX is used.
 
     XLA runs most of settling on one core, so a CPU that is one device leaves the others idle.
 
     Returns:
-        None where a single device is meant: on a GPU, or where the arms cannot be spread evenly.
+        None for a single device: on a GPU, or where the arms cannot be spread evenly.
     """
     jax.config.update("jax_num_cpu_devices", n_cores())
     n = max(n for n in range(1, n_cores() + 1) if n_arms % n == 0)
@@ -59,51 +60,46 @@ def mesh_of_cores(n_arms: int) -> Mesh | None:
 
 
 def peak_memory() -> dict[str, int]:
-    """Most memory that this process has needed so far [MB]: on the device where that tells, else resident."""
+    """Return the most memory [MB] that this process has needed: on the device if it tells, else resident."""
     on_device = (jax.local_devices()[0].memory_stats() or {}).get("peak_bytes_in_use")
     if on_device is not None:
         return {"peak_device_mb": round(on_device / 1e6)}
-    return {"peak_rss_mb": round(_peak_rss_bytes() / 1e6)}
-
-
-def _peak_rss_bytes() -> int:
     status = Path("/proc/self/status")
     if status.exists():  # getrusage would give the parent's, where that is larger
         line = next(line for line in status.read_text("utf-8").splitlines() if line.startswith("VmHWM:"))
-        return 1024 * int(line.split()[1])
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # bytes on macOS
+        return {"peak_rss_mb": round(1024 * int(line.split()[1]) / 1e6)}
+    return {"peak_rss_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6)}  # bytes on macOS
 
 
 def goal(text: str, measured: str, met: bool | None) -> dict[str, str]:
-    """A goal beside what was measured; `met` is None where it could not be, and `measured` says why."""
+    """Return a row for a goal; if `met` is None it could not be measured, and `measured` says why."""
     return {"goal": text, "measured": measured, "verdict": VERDICT[met]}
 
 
 def show(figures: Mapping[str, Any], title: str = "", console: Console | None = None) -> None:
     """Print figures as tables."""
     console = console or Console(width=None if sys.stdout.isatty() else WIDTH)
-    loose = []
-    inner = []
+    loose, nested = [], []
     for name, value in figures.items():
         words = name.replace("_", " ")
-        path = f"{title}, {words}" if title else words
-        if rows := _rows(value):
-            inner.append((_print_table, (console, path, rows)))
-        elif parts := _parts(value):
-            inner.append((show, (parts, path, console)))
+        if _parts(value):
+            nested.append((f"{title}, {words}" if title else words, value))
         else:
             loose.append({"figure": words, "value": value})
     if loose:
         _print_table(console, title, loose)
-    for function, arguments in inner:
-        function(*arguments)
+    for path, value in nested:
+        if rows := _rows(value):
+            _print_table(console, path, rows)
+        else:
+            show(_parts(value), path, console)
 
 
 def _rows(value: Any) -> list[dict[str, Any]]:
-    """The rows of a table: dictionaries without others inside, in a list or, if their keys agree, by name."""
+    """Return rows of a table: flat dictionaries in a list or, if their keys agree, by name; else none."""
     parts = _parts(value)
     rows = list(parts.values())
-    if not rows or not all(isinstance(row, Mapping) and not any(map(_parts, row.values())) for row in rows):
+    if not all(isinstance(row, Mapping) and not any(map(_parts, row.values())) for row in rows):
         return []
     if not isinstance(value, Mapping):
         return rows
@@ -112,7 +108,7 @@ def _rows(value: Any) -> list[dict[str, Any]]:
 
 
 def _parts(value: Any) -> dict[str, Any]:
-    """What a dictionary or a list of dictionaries holds, by name; nothing for any other value."""
+    """Return the items of a dictionary or of a list of dictionaries by name; none for other values."""
     if isinstance(value, Mapping):
         return dict(value)
     if isinstance(value, list | tuple) and all(isinstance(part, Mapping) for part in value):
@@ -124,10 +120,8 @@ def _print_table(console: Console, title: str, rows: Sequence[Mapping[str, Any]]
     names = list(dict.fromkeys(name for row in rows for name in row))
     table = Table()
     for name in names:
-        numbers = all(isinstance(row.get(name), int | float | None) for row in rows)
-        table.add_column(
-            Text(name.replace("_", " ")), justify="right" if numbers else "left", overflow="fold"
-        )
+        side = "right" if all(isinstance(row.get(name), int | float | None) for row in rows) else "left"
+        table.add_column(Text(name.replace("_", " ")), justify=side, overflow="fold")
     for row in rows:
         table.add_row(*(Text(_cell(row.get(name))) for name in names))
     console.print()

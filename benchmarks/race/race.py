@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from benchmarks.harness.common import save, show
+from benchmarks.harness.common import machine_kind, save, show
 from benchmarks.harness.options import numbers
 from benchmarks.harness.peers import PINS, PeerError, peer_python
 from benchmarks.harness.rounds import Worker, WorkerError
@@ -40,7 +40,6 @@ from benchmarks.race.summary import (
     median_mm,
     summarise,
 )
-from benchmarks.speed.guard import machine_kind
 from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.provenance import provenance, write_json
 

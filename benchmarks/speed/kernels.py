@@ -1,140 +1,200 @@
-"""What a GPU is given to do, and eight to exchange: kernels and bytes of each loop of a step and of an epoch.
+"""Kernels, bytes and exchanges of each loop of an environment step and of a training epoch on a GPU.
 
-A kernel is calculated to take a launch, or the time in which what it touches goes through memory at the rate
-of the data sheet, whichever is longer. That a launch takes 3 us is an assumption, of a GPU without CUDA
-graphs, which XLA uses where it can and which make it shorter; arithmetic and caches are left out. Where there
-is no CUDA device the programs are compiled for an H200 all the same, and run on none.
+    python -m benchmarks.speed.kernels WHERE PROGRAM SETTING ...    the worker: compiles one program
+
+They are read from the compiled program's text. WHERE is `here`, this machine's GPU, or `h200x1` or `h200x8`,
+for one or eight GPUs that need not be there: that takes the package jax-cuda12-plugin but neither CUDA nor a
+driver, and XLA chooses by rule what it would choose by trying. PROGRAM is `env_step` or `epoch`.
+
+A kernel is an instruction outside of fusions that computes or copies; a fusion is one, and so is a library's
+call, although it may launch several. Its bytes are those of its operands and results, each read or written
+once as a whole: an upper bound, because an operand may be read in part or come from a cache.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import Any
+import math
+import os
+import re
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.harness.peers import COMPILER, PeerError, peer_python
-from benchmarks.harness.rounds import Facts, Worker, WorkerError
-from benchmarks.speed import gpu, hlo
-from benchmarks.speed.truth import random_references, settle_function
+from benchmarks.harness.rounds import Facts, Worker, WorkerError, serve, working
 from mjx_softarm.spec import ArmSpec
 
-LAUNCH_S, H200_BYTES_PER_S = 3e-6, 4.8e12
 N_ARMS = 8192
-ENV_STEPS = {
-    f"env step, {engine}, {N_ARMS:,} arms": ("env-step", engine, str(N_ARMS)) for engine in ("chain", "mjx")
-}
-EPOCH, EPOCH_OF_EIGHT = "training epoch", "training epoch on 8 GPUs"
 OF_EIGHT = (
-    "n_arms=65536",
-    "vector_steps_per_epoch=4",
-    "updates_per_env_step=0.0009765625",
-    "batch_size=32768",
-    "replay_capacity=4194304",
+    *("n_arms=65536", "vector_steps_per_epoch=4", "updates_per_env_step=0.0009765625"),
+    *("batch_size=32768", "replay_capacity=4194304"),
 )
-PROGRAMS = {**ENV_STEPS, EPOCH: ("epoch", *gpu.TRAINING), EPOCH_OF_EIGHT: ("epoch", *OF_EIGHT)}
-NOTES = {
-    "turns": "of a loop; settling goes on until the slowest arm rests",
-    "kernels, mb": "of one turn, those of loops inside left out; bytes as if every operand were read whole",
-    "launch_bound": "share of the kernels that touch too little to take longer than a launch",
-    "calculated": f"a kernel takes {1e6 * LAUNCH_S:g} us, or its bytes at {1e-12 * H200_BYTES_PER_S:g} TB/s",
-    "exchanges": "of one turn; bytes of what a device has of it before or after, whichever is more",
-    EPOCH: " ".join(gpu.TRAINING),
-    EPOCH_OF_EIGHT: " ".join(OF_EIGHT),
-}
+H200 = """gpu_device_info { core_count: 132 fpus_per_core: 128 clock_rate_ghz: 1.98
+threads_per_block_limit: 1024 threads_per_warp: 32 threads_per_core_limit: 2048 l2_cache_size: 52428800
+shared_memory_per_block: 49152 shared_memory_per_core: 233472 shared_memory_per_block_optin: 232448
+block_dim_limit_x: 2147483647 block_dim_limit_y: 65535 block_dim_limit_z: 65535
+registers_per_core_limit: 65536 registers_per_block_limit: 65536 device_memory_size: 151397597184
+memory_bandwidth: 4800000000000 cuda_compute_capability { major: 9 } } dnn_version_info { major: 9 minor: 10 }
+runtime_version { major: 12 minor: 9 } platform_name: "CUDA" device_description_str: "NVIDIA H200"
+"""  # Source: XLA, xla/backends/gpu/target_config/specs/h200.txtpb
+
+_NO_KERNEL = "parameter constant tuple get-tuple-element bitcast after-all partition-id replica-id domain"
+_EXCHANGES = ("all-gather", "all-reduce", "all-to-all", "collective-permute", "reduce-scatter")
+_COMPUTATION = re.compile(r"(ENTRY )?%(\S+) \(.*\{$")
+_INSTRUCTION = re.compile(r"\s+(?:ROOT )?%(\S+) = (\(.*?\)|\S+) ([\w-]+)\((.*)")
+_ARRAY = re.compile(r"(pred|[a-z]+(\d+)\w*)\[([\d,]*)\]")
+_N_TURNS = re.compile(r'"known_trip_count":\{"n":"(\d+)"')
+_BRANCHES = re.compile(r"(?:to_apply|(?:true|false)_computation)=%([\w.-]+)|branch_computations=\{([^}]*)\}")
+_SCRATCH = re.compile(r"[su]8\[\d*\]")  # working memory of a library's call, among its results
 
 
 def measure() -> dict[str, Any]:
-    """For each program what it takes to compile and, of a step, to run; and a row for each of its loops."""
-    on_gpu = jax.default_backend() == "gpu"
+    """Return a row for each loop, and kernels and bytes of whole steps, until the slowest arm has settled."""
+    import jax
+
+    from benchmarks.speed import gpu
+    from benchmarks.speed.truth import random_references, settle_function
+
+    on_gpu, spec = jax.default_backend() == "gpu", ArmSpec.default()
     try:
         python = None if on_gpu else peer_python(COMPILER)
     except PeerError as error:
         return {"skipped": f"{gpu.NO_DEVICE}; {error}"}
-    turns, programs, loops, exchanged = newton_steps(), [], [], []
-    for name, program in PROGRAMS.items():
-        where = "h200x8" if name == EPOCH_OF_EIGHT else "here" if on_gpu else "h200"
-        worker = Worker(name, ["benchmarks.speed.kernels_worker", where, *program], python)
-        print(f"compiling: {name}", flush=True)
+    settled = settle_function(spec)(random_references(spec, N_ARMS).astype(np.float32))
+    n_newton, one = int(settled.iterations.max()), "here" if on_gpu else "h200x1"
+    programs = {
+        "env step, chain": (one, "env_step", f"n_arms={N_ARMS}", "env.engine=chain"),
+        "env step, MJX": (one, "env_step", f"n_arms={N_ARMS}", "env.engine=mjx"),
+        "training epoch": (one, "epoch", *gpu.TRAINING),
+        "training epoch, 8 GPUs": ("h200x8", "epoch", *OF_EIGHT),
+    }
+    loops, rows = [], []
+    for name, program in programs.items():
+        worker, row = Worker(name, ["benchmarks.speed.kernels", *program], python), {"program": name}
         try:
-            worker.start()
-            facts = dict(worker.facts)
-            loop = told_loop(facts.pop("loops"))
-            loops += [{"program": name, **row} for row in rows(loop)]
-            exchanged += [{"program": name, **row} for row in exchanges(loop)]
-            facts |= in_all(loop, turns) if name in ENV_STEPS else {}
+            with working(worker):
+                loops += [row | facts for facts in worker.facts["loops"]]
+            if program[1] == "env_step":
+                outside, with_one = np.array(worker.facts["totals"])
+                n_kernels, n_bytes = outside + n_newton * (with_one - outside)
+                row |= {"kernels": int(n_kernels), "gb": round(1e-9 * n_bytes, 2)}
         except WorkerError as error:
-            facts = {"failed": error.reason}
-        finally:
-            worker.close()
-        programs.append({"program": name, **facts})
-    return {
-        "newton_steps_of_the_slowest_arm": turns,
-        "programs": programs,
-        "loops": loops,
-        "exchanges": exchanged,
-        "notes": NOTES,
-    }
+            row["failed"] = error.reason
+        rows.append(row | {"settings": " ".join(program[2:])})
+    return {"newton_steps_of_the_slowest_arm": n_newton, "programs": rows, "loops": loops}
 
 
-def newton_steps() -> int:
-    """Of the slowest of as many arms with random references."""
-    spec = ArmSpec.default()
-    reference = jnp.asarray(random_references(spec, N_ARMS), jnp.float32)
-    return int(np.max(settle_function(spec)(reference).iterations))
+class Loop(NamedTuple):
+    """A loop of a program, or the whole program as a loop of one turn; loops inside it are kept apart."""
 
+    n_turns: int | None  # None: the program decides
+    kernels: tuple[int, ...]  # [bytes] read and written by each kernel of a turn
+    exchanges: tuple[tuple[str, int], ...]  # operation and bytes of each exchange between devices in a turn
+    inside: tuple[Loop, ...]
 
-def told_loop(told: Sequence[Any]) -> hlo.Loop:
-    """A loop as a worker tells it, in JSON's lists."""
-    turns, kernels, inside, exchanges = told
-    made = tuple(hlo.Exchange(*exchange) for exchange in exchanges)
-    return hlo.Loop(turns, tuple(kernels), tuple(map(told_loop, inside)), made)
+    def over_turns(self, n_turns: int) -> np.ndarray:
+        """Return kernels and bytes (2,) of all turns, `n_turns` of them where the program decides."""
+        own = np.array([len(self.kernels), sum(self.kernels)])
+        turn = own + sum(loop.over_turns(n_turns) for loop in self.inside)
+        return turn * (n_turns if self.n_turns is None else self.n_turns)
 
-
-def kernel_s(moved: int) -> float:
-    """Time that a kernel is calculated to take, by the bytes it touches."""
-    return max(LAUNCH_S, moved / H200_BYTES_PER_S)
-
-
-def in_all(loop: hlo.Loop, turns: int) -> Facts:
-    """An env step of `N_ARMS` whose slowest arm takes so many turns to settle."""
-    seconds = loop.total(kernel_s, turns)
-    return {
-        "kernels": loop.launches(turns),
-        "gb": round(1e-9 * loop.total(float, turns), 2),
-        "calculated_ms": round(1e3 * seconds, 2),
-        "calculated_env_steps_per_s": float(f"{N_ARMS / seconds:.2g}"),
-    }
-
-
-def rows(loop: hlo.Loop) -> Iterator[Facts]:
-    """A row for a loop, whose turns are told with those of the loops around it, and for each inside it."""
-    for turns, one in _each(loop):
-        if n := len(one.kernels):
+    def rows(self, around: Sequence[str] = ()) -> Iterator[Facts]:
+        """Yield figures of one turn of this loop and of each one inside it, outermost first."""
+        if self.kernels:
             yield {
-                "turns": turns,
-                "kernels": n,
-                "mb": round(1e-6 * sum(one.kernels), 1),
-                "launch_bound": round(sum(kernel_s(moved) == LAUNCH_S for moved in one.kernels) / n, 2),
-                "calculated_us": round(1e6 * sum(map(kernel_s, one.kernels)), 1),
+                "turns": " x ".join(around) or "once",
+                "kernels": len(self.kernels),
+                "mb": round(1e-6 * sum(self.kernels), 1),
+                "exchanges": ", ".join(f"{name} {1e-6 * size:.3g} MB" for name, size in self.exchanges),
             }
+        for loop in self.inside:
+            yield from loop.rows([*around, "until settled" if loop.n_turns is None else str(loop.n_turns)])
 
 
-def exchanges(loop: hlo.Loop) -> Iterator[Facts]:
-    """A row for each exchange between devices of a loop and of those inside it, likewise."""
-    for turns, one in _each(loop):
-        for exchange in one.exchanges:
-            yield {
-                "turns": turns,
-                "exchange": exchange.operation,
-                "mb": float(f"{1e-6 * exchange.size:.3g}"),
-            }
+def read(text: str) -> Loop:
+    """Return the loops of a compiled program, given its HLO text."""
+    computations: dict[str, list[str]] = {}
+    entry, current = "", []
+    for line in text.splitlines():
+        if found := _COMPUTATION.match(line):
+            current = computations.setdefault(found[2], [])
+            entry = found[2] if found[1] else entry
+        current.append(line)
+    if not entry:
+        raise ValueError(f"HLO: got {text[:60]!r}, expected an ENTRY computation")
+    return _loop(computations, [entry], 1)
 
 
-def _each(loop: hlo.Loop, turns: Sequence[str] = ()) -> Iterator[tuple[str, hlo.Loop]]:
-    """A loop and those inside it, each after its turns and those of the loops around it."""
-    yield " x ".join(turns) or "once", loop
-    for inner in loop.inside:
-        yield from _each(inner, [*turns, "until at rest" if inner.turns is None else str(inner.turns)])
+def _loop(computations: Mapping[str, Sequence[str]], names: Sequence[str], n_turns: int | None) -> Loop:
+    """Return the loop whose turn does the named computations."""
+    kernels, exchanges, inside = [], [], []
+    for name in names:
+        size: dict[str, int] = {}  # [bytes] of each result
+        for found in filter(None, map(_INSTRUCTION.match, computations[name])):
+            result, kind, operation, rest = found.groups()
+            size[result] = _bytes(_SCRATCH.sub("", kind) if operation == "custom-call" else kind)
+            if operation == "while":
+                known = _N_TURNS.search(rest)  # then the condition is not computed
+                parts = re.findall(rf"{'body' if known else '(?:body|condition)'}=%([\w.-]+)", rest)
+                inside.append(_loop(computations, parts, int(known[1]) if known else None))
+            elif operation in ("call", "conditional"):
+                # Of the branches of a condition the largest counts.
+                named = ",".join(one or several for one, several in _BRANCHES.findall(rest)).split(",")
+                branches = [_loop(computations, [branch.strip(" %")], 1) for branch in named]
+                largest = max(branches, key=lambda branch: branch.over_turns(1)[0])
+                kernels += largest.kernels
+                exchanges += largest.exchanges
+                inside += largest.inside
+            elif operation not in _NO_KERNEL.split() and not operation.endswith("-done"):
+                operands = sum(size[x] for x in re.findall(r"%([\w.-]+)", rest[: rest.index(")")]))
+                kernels.append(size[result] + operands)
+                if (exchange := operation.removesuffix("-start")) in _EXCHANGES:
+                    made = size[result] - operands * kind.startswith("((")  # such results hold the operands
+                    exchanges.append((exchange, max(operands, made)))
+    return Loop(n_turns, tuple(kernels), tuple(exchanges), tuple(inside))
+
+
+def _bytes(kind: str) -> int:
+    """Return the bytes of an array's type, or of all arrays of a tuple's."""
+    return sum(
+        math.prod(map(int, filter(None, shape.split(",")))) * int(bits or 8) // 8
+        for _, bits, shape in _ARRAY.findall(kind)
+    )
+
+
+def compiled(where: str, program: str, *settings: str) -> Facts:
+    """Compile a program; return rows of its loops, and totals of zero and one turn where it decides."""
+    if where != "here":
+        os.environ["JAX_SKIP_CUDA_CONSTRAINTS_CHECK"] = "1"  # there is no driver to ask
+        os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_gpu_autotune_level=0"
+    import jax
+    from jax.experimental import topologies
+
+    from mjx_softarm.env import ReachEnv
+    from train.config import PRESETS, override
+    from train.epoch.devices import AXIS, everywhere
+    from train.epoch.job import Job
+
+    if where == "here":
+        mesh = jax.sharding.Mesh(np.array(jax.devices("gpu")[:1]), (AXIS,))
+    else:
+        n = int(where.removeprefix("h200x"))
+        gpus = topologies.get_topology_desc(platform="cuda", target_config=H200, topology=f"1x{n}x1")
+        mesh = topologies.make_mesh(gpus, (n,), (AXIS,))
+    config, key = override(PRESETS["quick"], list(settings)), jax.random.PRNGKey(0)
+    job = Job(config, ReachEnv(config=config.env), mesh if mesh.size > 1 else None)
+    if program == "epoch":
+        function, shapes = job.epoch, (jax.eval_shape(job.init, key),)
+    else:
+        function, action = jax.jit(job.arms.step), jax.numpy.zeros((config.n_arms, job.env.action_size))
+        shapes = jax.eval_shape(job.arms.reset, key), action, key
+    each = jax.tree.broadcast((job.sharding,) if job.sharding else everywhere(mesh), shapes)
+    placed = jax.tree.map(lambda x, on: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=on), shapes, each)
+    loop = read(str(function.lower(*placed).compile().as_text()))
+    return {"loops": list(loop.rows()), "totals": [loop.over_turns(n).tolist() for n in (0, 1)]}
+
+
+if __name__ == "__main__":
+    serve(lambda: (compiled(*sys.argv[1:]), dict))

@@ -3,7 +3,7 @@
 Newton's method with MJX kinematics, the same with the closed-form chain, and C MuJoCo stepped in time under
 the law, over links per section and over shares of saturated chambers. Each way is a process of its own, and
 they take turns round by round, on all cores; one that fails has a row that says why. The rates over a fixed
-number of iterations and the floor are those of one device, which is one core of a CPU. MJX is left out where
+number of iterations are those of one device, which is one core of a CPU. MJX is left out where
 it compiles for too long. Errors are those of the tip against the solution in double precision, which
 `tests/mechanics/test_settle.py` holds against C MuJoCo stepped to rest.
 """
@@ -26,7 +26,6 @@ import numpy as np
 
 from benchmarks.harness.common import goal, n_cores
 from benchmarks.harness.rounds import Facts, Worker, take_turns
-from benchmarks.speed.floor import floor_rows
 from benchmarks.speed.mujoco_rollout import RolloutArms, sensed_model
 from benchmarks.speed.settle_methods import N_STEPPED
 from benchmarks.speed.throughput import LINKS, MOST_LINKS_MJX, N_LINKS, NO_MJX, over_rounds
@@ -54,8 +53,8 @@ GOAL = f"{GOAL_RATE:,} env steps/s on {GOAL_CORES} CPU cores, chain, tip within 
 
 
 def measure() -> dict[str, Any]:
-    """Errors over iterations and over time, the three ways over links and saturation, floor, and the goal."""
-    spec, on_gpu = ArmSpec.default(), jax.default_backend() == "gpu"
+    """Errors over iterations and over time, the three ways over links and saturation, and the goal."""
+    spec = ArmSpec.default()
     reference = random_references(spec, N_ARMS)
     truth = true_rest(spec, reference)
     print("Newton iterations, one by one", flush=True)
@@ -72,12 +71,6 @@ def measure() -> dict[str, Any]:
         for row in rows
         if row["links_per_section"] == N_LINKS
     ]
-    print("floor against measured", flush=True)
-    try:
-        arms = (1, 128, 1024, 8192, 32_768) if on_gpu else (1, 32, 128, 512, 1024)
-        figures["floor"] = floor_rows(spec, arms)
-    except (RuntimeError, ValueError) as error:  # must not lose what is above
-        figures["floor"] = [{"failed": str(error)}]
     return {**figures, "goals": [_goal(spec)]}
 
 

@@ -1,4 +1,4 @@
-"""The settling benchmark's parts: truth, saturation, the goal by hand, counted operations."""
+"""The settling benchmark's parts: truth, saturation, the goal by hand."""
 
 from unittest import mock
 
@@ -10,7 +10,6 @@ import pytest
 from benchmarks.harness import common
 from benchmarks.harness.rounds import Worker
 from benchmarks.speed import settle
-from benchmarks.speed.floor import counted, settle_cost
 from benchmarks.speed.settle import GOAL_ARMS, REACHES, no_goal, speed_goal, way
 from benchmarks.speed.truth import (
     Truth,
@@ -21,9 +20,6 @@ from benchmarks.speed.truth import (
     true_rest,
 )
 from mjx_softarm import ArmSpec
-from mjx_softarm._support.small_matrices import BLOCK, eliminate
-from mjx_softarm.mechanics import settle as solver
-from mjx_softarm.mechanics.chain_hessian import RANK
 from train.epoch.devices import mesh_of
 
 SPEC = ArmSpec.default()
@@ -189,47 +185,3 @@ def test_the_chain_s_worker_tells_where_the_arms_rest(tmp_path):
     found = way([told], "1.0", true_rest(SMALL, reference))
     assert found["max_mm"] < 0.5 and found["unsettled"] == found["without_truth"] == 0
     assert found["solves_per_s"] > 0
-
-
-def elimination_flop(n, k):
-    """Of an elimination of n unknowns with k columns, and at most of its pivots: inverses and products."""
-    return 2 * n**2 * (n + k), n // BLOCK * 2 * BLOCK**2 * (2 * BLOCK + n + k)
-
-
-def test_all_operations_of_an_elimination_are_counted():
-    n, k, batch = 12, 3, 5
-    function = jax.jit(jax.vmap(eliminate))
-    arguments = (jnp.broadcast_to(jnp.eye(n), (batch, n, n)), jnp.ones((batch, n, k)))
-    flop, moved = counted(function, function.lower(*arguments).compile(), *arguments)
-    exact, pivots = (batch * flop for flop in elimination_flop(n, k))
-    assert exact <= flop < exact + pivots
-    once = 2 * 4 * batch * n * (n + k)  # all numbers read and written
-    assert n // BLOCK * once <= moved < 8 * n // BLOCK * once
-    product, rows = jax.jit(jnp.matmul), jnp.ones((n, n))
-    assert counted(product, product.lower(rows, rows).compile(), rows, rows)[0] == 2 * n**3
-
-
-def test_a_turn_of_the_settling_loop_costs_its_eliminations_and_more():
-    sections, n, n_arms = SMALL.structure.n_sections, 3 * SMALL.structure.links_per_section, 16
-    reference = jnp.asarray(random_references(SMALL, n_arms), jnp.float32)
-    outside, turn, n_outside = settle_cost(SMALL, reference)
-    m = SMALL.n_chambers
-    both = zip(elimination_flop(n, RANK + 1 + m), elimination_flop(m, 1), strict=True)
-    least, pivots = (n_arms * (sections * own + coupled) for own, coupled in both)
-    assert least < turn.flop < 5 * (least + pivots) and turn.moved > 4 * least
-    with mock.patch.object(solver, "MAX_ITERATIONS", 0):  # what is done although the loop may do nothing
-        exact = settle_function(SMALL)(reference).iterations
-    assert outside.flop > 0 and (exact == n_outside).all()
-
-
-@pytest.mark.parametrize(
-    "name, work", [("cholesky", jnp.linalg.cholesky), ("scan", lambda x: jax.lax.fori_loop(0, 3, _double, x))]
-)
-def test_what_cannot_be_counted_is_no_silence(name, work):
-    function, argument = jax.jit(work), jnp.eye(6)
-    with pytest.raises(RuntimeError, match=f"{name}: nobody knows"):
-        counted(function, function.lower(argument).compile(), argument)
-
-
-def _double(_, x):
-    return 2.0 * x
