@@ -4,7 +4,7 @@ import numpy as np
 
 from mjx_softarm import ArmSpec
 from mjx_softarm.control import Gains
-from mjx_softarm.deploy.loop import Controller
+from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.session import follow
 from mjx_softarm.mdp.actions import ActionMap
 from mjx_softarm.mdp.observation import ObsScale

@@ -177,7 +177,7 @@ def controller_of(folder: Path, trial: Trial) -> Any:
     Without S2R, the policy of the nominal arm plans spring lengths, and only the springs are calibrated.
     """
     from benchmarks.paper.gradient_descent import gradient_descent
-    from mjx_softarm.deploy.loop import Controller
+    from mjx_softarm.deploy.controller import Controller
     from mjx_softarm.policy.file import load_policy
     from mjx_softarm.policy.runtime import PolicyRunner
 

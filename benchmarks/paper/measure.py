@@ -18,7 +18,7 @@ import numpy as np
 
 from mjx_softarm.control import saturated
 from mjx_softarm.deploy import faults
-from mjx_softarm.deploy.loop import Controller
+from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.session import Run, follow
 from mjx_softarm.mechanics.pipe import APPLE_KG, BALL_KG
 from mjx_softarm.sensing.pose import (

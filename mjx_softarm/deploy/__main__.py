@@ -17,8 +17,8 @@ import tyro
 from mjx_softarm._support import cli
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.arms import open_arm
+from mjx_softarm.deploy.controller import Controller, Phase
 from mjx_softarm.deploy.faults import RESPONSE, Response
-from mjx_softarm.deploy.loop import Controller, Phase
 from mjx_softarm.deploy.record import record
 from mjx_softarm.deploy.session import Run, follow
 from mjx_softarm.logs.schema import write_log

@@ -14,8 +14,9 @@ import numpy as np
 
 from mjx_softarm.control import Gains, pressures
 from mjx_softarm.deploy.arm_io import ArmIO
+from mjx_softarm.deploy.controller import WINDOW_S
 from mjx_softarm.deploy.faults import LOST_TICKS, SETTLE_TIMEOUT_S, still
-from mjx_softarm.deploy.loop import VENT_KPA_PER_S, WINDOW_S
+from mjx_softarm.deploy.loop import VENT_KPA_PER_S
 from mjx_softarm.deploy.session import ArmLost, Clock, Pumps, Recorder, read
 from mjx_softarm.sensing.sensors import Sensor, SensorFault
 from mjx_softarm.spec import ArmSpec

@@ -18,8 +18,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjx_softarm.deploy.arm_io import ArmIO
+from mjx_softarm.deploy.controller import Controller, Phase, State, Tick, start
 from mjx_softarm.deploy.faults import LATE_TICKS, Event, Fault
-from mjx_softarm.deploy.loop import Controller, Phase, State, Tick, believed, start, step, with_goal
+from mjx_softarm.deploy.loop import believed, step, with_goal
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.sensing.pose import pose_error
 from mjx_softarm.sensing.sensors import Sensor

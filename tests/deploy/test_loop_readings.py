@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from mjx_softarm.deploy import faults
+from mjx_softarm.deploy.controller import Phase
 from mjx_softarm.deploy.faults import Fault
-from mjx_softarm.deploy.loop import Phase
 from mjx_softarm.sensing.estimator import estimate
 from tests.linear_arm import POLICY, Blind, LinearArm, N, go, nan, read_m
 

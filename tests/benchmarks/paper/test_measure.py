@@ -16,8 +16,8 @@ from benchmarks.paper.measure import (
     operate,
     save_outcome,
 )
+from mjx_softarm.deploy.controller import Controller, Phase
 from mjx_softarm.deploy.faults import Event, Fault
-from mjx_softarm.deploy.loop import Controller, Phase
 from mjx_softarm.deploy.session import Arrival, Run
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mechanics.pipe import APPLE_KG, BALL_KG

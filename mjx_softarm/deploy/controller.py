@@ -1,0 +1,97 @@
+"""The control loop's controller and what it remembers: settings, state and outcome of a tick. NumPy only."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+from typing import NamedTuple
+
+import numpy as np
+
+from mjx_softarm.deploy.faults import Event
+from mjx_softarm.deploy.reachability import Reachable
+from mjx_softarm.policy.file import Policy
+from mjx_softarm.policy.runtime import PolicyRunner
+
+WINDOW_S = 0.5
+
+Plan = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+
+
+class Phase(Enum):
+    """What the loop is doing; it ends with HOLD and DONE."""
+
+    RUN = "run"
+    VENT = "vent"
+    HOLD = "hold"
+    DONE = "done"
+
+
+@dataclass(frozen=True, eq=False)
+class Controller:
+    """A policy made ready for the loop."""
+
+    policy: Policy
+    reachable: Reachable
+    plan: Plan  # pose and goal (6,), springs (n,) [m] -> references (n,) [m]
+    dt_s: float
+    window: int  # ticks
+
+    @classmethod
+    def of(cls, policy: Policy, plan: Plan | None = None) -> Controller:
+        """Of a policy; `plan` takes the place of its actor, for another way to find references."""
+        runner = PolicyRunner(policy)
+        return cls(
+            policy=policy,
+            reachable=Reachable.from_poses(policy.workspace, policy.reward),
+            plan=plan or (lambda pose, goal, _: runner.act(pose, goal).length_m),
+            dt_s=1.0 / policy.rate_hz,
+            window=max(2, round(WINDOW_S * policy.rate_hz)),
+        )
+
+
+class State(NamedTuple):
+    """All that the loop remembers from tick to tick, of n springs and chambers."""
+
+    phase: Phase
+    goal: np.ndarray | None  # (6,) [mm, deg]
+    n_actions: int  # for this goal
+    n_ticks: int  # since the last action
+    n_late: int  # missed deadlines in a row
+    spring_m: np.ndarray  # (n,) last good lengths; NaN before the first
+    n_lost: np.ndarray  # (n,) lost readings in a row
+    n_suspect: np.ndarray  # (n,) ticks in a row in which a chamber seemed to have lost its pressure
+    reference_m: np.ndarray | None  # (n,)
+    integral_kpa: np.ndarray  # (n,) of the law
+    pressure_kpa: np.ndarray  # (n,) in force
+    springs_m: np.ndarray  # (ticks, n) readings of the last window, the newest last
+    pressures_kpa: np.ndarray  # (ticks, n) in force at these
+
+
+class Tick(NamedTuple):
+    """What a tick gives besides the next state."""
+
+    spring_m: np.ndarray  # (n,) lengths believed in; NaN before the first reading
+    events: tuple[Event, ...]
+    arrived: bool  # the goal had all its actions and the springs have settled
+
+
+def start(controller: Controller) -> State:
+    """The state before the first tick, of an arm without pressure."""
+    n = controller.policy.spec.n_chambers
+    return State(
+        phase=Phase.RUN,
+        goal=None,
+        n_actions=0,
+        n_ticks=0,
+        n_late=0,
+        spring_m=np.full(n, np.nan),
+        n_lost=np.zeros(n, int),
+        n_suspect=np.zeros(n, int),
+        reference_m=None,
+        integral_kpa=np.zeros(n),
+        pressure_kpa=np.zeros(n),
+        springs_m=np.empty((0, n)),
+        pressures_kpa=np.empty((0, n)),
+    )
