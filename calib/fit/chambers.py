@@ -1,10 +1,8 @@
 """Stiffness, effective area and length of each chamber, fitted to poses of the arm at rest.
 
-The simulated arm rests at the logged pressures; its chambers are changed until tip poses, and spring lengths
-where they were measured, agree. The Jacobian comes from the implicit function theorem (`mjx_softarm.mechanics.rest`),
-and a Gauss-Newton method needs it seven times. Optax's L-BFGS on the same loss ends at the same numbers,
-within their intervals, but needs sixty gradients and compiles twice as long; the intervals need the Jacobian
-anyway.
+The simulated arm settles at the logged pressures; its chambers are changed until tip poses agree, and spring
+lengths where they were measured. Robust least squares (`calib.fit.leastsquares`) take the Jacobian from the
+implicit function theorem, see `calib.fit.equilibrium`.
 
 Masses are known and set the scale of all forces. The backbone's bending stiffness is fitted along: with a
 wrong one, area and stiffness make up for it together. Its axial stiffness and that of the springs cannot be:
@@ -179,7 +177,7 @@ def _jacobian():
 
 
 def _simulate(spec: ArmSpec, poses: StaticPoses, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """All poses with the numbers x: errors and their Jacobian, see `calib.fit.leastsquares`; chamber lengths."""
+    """Return errors and Jacobian at x, see `calib.fit.leastsquares`; chamber lengths (n, n_chambers) [m]."""
     params = ArmParams.from_spec(spec)
     fields = (poses.pressure_kpa, poses.payload_kg, poses.tip_m, poses.tip_rotation, poses.spring_m)
     padded = -(-poses.n // BATCH) * BATCH

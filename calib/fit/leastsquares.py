@@ -1,105 +1,92 @@
-"""Robust least squares with intervals: a damped Gauss-Newton method with Huber's weights.
+"""Robust least squares with intervals, on `scipy.optimize.least_squares` with Huber's loss.
 
-The model gives errors and their Jacobian, from wherever; the small dense algebra is done in double precision.
-Scales of the errors are found along the way, one for each group of columns, so that what fits worse weighs
-less. A weak prior keeps what the data do not tell at the start.
+The model returns errors and their Jacobian. The scales of the errors are estimated between rounds of the fit,
+one for each group of columns, so that what fits worse weighs less. A weak prior keeps parameters at the start
+where the data do not determine them. The covariance is a sandwich whose clusters are the rows of errors: it
+adds up how the parameters change when one row is left out (jackknife, one Newton step).
 
-Source: Huber, "Robust Estimation of a Location Parameter", Ann. Math. Statist. 35 (1964); intervals: White,
-"A Heteroskedasticity-Consistent Covariance Matrix Estimator", Econometrica 48 (1980), a row being a cluster.
+Source: Huber, "Robust Estimation of a Location Parameter", Ann. Math. Statist. 35 (1964), and "Robust
+Statistics" (1981), section 7; clusters: Bell and McCaffrey, Survey Methodology 28 (2002).
 """
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.optimize import least_squares
 
-ROUNDS = 3  # the first with the scales that were given, the others with those of the errors left
-MAX_ITERATIONS = 12  # of each round
-SMALL_STEP = 1e-3  # of the prior's width
-HUBER = 2.0  # scales
-NO_ANSWER = 30.0  # scales of error that a row counts for which the model has no answer
+ROUNDS = ("linear", "huber", "huber")  # losses: the first with the given scales, the others with those found
+# Of a round: evaluations of the model; relative changes of the loss and of x, of which single precision gives
+# no less; SciPy's third test depends on the units of x.
+TOLERANCES: dict[str, Any] = {"max_nfev": 15, "ftol": 1e-6, "xtol": 1e-9, "gtol": None}
+SMALL_STEP = 0.1  # standard deviations that a converged fit is from its minimum, at most
+NO_ANSWER = 30.0  # error, in scales, of a row for which the model has no answer
 SIGMA_PER_MEDIAN = 1.4826  # of the absolute value of a normal variable
 QUANTILE = 1.96  # of 95 % intervals
 
-# x (p,) -> errors (n, m), NaN where nothing was measured, inf in rows without an answer; Jacobian (n, m, p)
+# x (p,) -> errors (n, m), NaN where not measured, inf in rows without an answer; Jacobian (n, m, p)
 Model = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 @dataclass(frozen=True)
 class Problem:
-    """What is known before the errors are looked at."""
+    """Scales and prior of a fit that starts at x = 0."""
 
-    prior: np.ndarray  # (p,) standard deviations about the start, x = 0
-    group: np.ndarray  # (m,) of each column of errors, counted from 0
+    prior: np.ndarray  # (p,) standard deviations about the start
+    group: np.ndarray  # (m,) group of each column of errors, counted from 0
     scale: np.ndarray  # (n_groups,) first guess of the errors' standard deviations
     min_scale: np.ndarray  # (n_groups,)
+    huber: float = 2.0  # scales at which Huber's loss becomes linear
 
 
 class Solution(NamedTuple):
-    """Where the fit ended."""
+    """Parameters at the end of a fit."""
 
     x: np.ndarray  # (p,)
     covariance: np.ndarray  # (p, p)
-    scale: np.ndarray  # (n_groups,) of the errors
-    n_evaluations: int
+    scale: np.ndarray  # (n_groups,) standard deviations of the errors
     converged: bool
 
     @property
     def half_width(self) -> np.ndarray:
-        """Of the 95 % interval of each number (p,)."""
+        """Half-widths (p,) of the 95 % intervals."""
         return QUANTILE * np.sqrt(np.diag(self.covariance))
-
-
-class _Weighted(NamedTuple):
-    """Errors over their scales times the roots of Huber's weights, zero where not known; slopes alike."""
-
-    cost: float
-    error: np.ndarray  # (n, m)
-    slope: np.ndarray  # (n, m, p)
-
-    @property
-    def information(self) -> np.ndarray:
-        """Without the prior (p, p)."""
-        flat = self.slope.reshape(-1, self.slope.shape[-1])
-        return flat.T @ flat
 
 
 def fit(model: Model, problem: Problem) -> Solution:
     """Minimise Huber's loss of the errors over their scales, started from x = 0."""
+    prior = np.diag(1.0 / problem.prior)
+
+    @functools.lru_cache(maxsize=2)  # SciPy asks for errors and Jacobian one after the other
+    def evaluate(x: bytes) -> tuple[np.ndarray, np.ndarray]:
+        return model(np.frombuffer(x))
+
+    def errors(x: np.ndarray) -> np.ndarray:
+        return np.append(_scaled(*evaluate(x.tobytes()), scale, problem)[0], x @ prior)
+
+    def jacobian(x: np.ndarray) -> np.ndarray:
+        slope = _scaled(*evaluate(x.tobytes()), scale, problem)[1]
+        return np.concatenate([slope.reshape(-1, len(x)), prior])
+
+    options: dict[str, Any] = {"jac": jacobian, "f_scale": problem.huber, "x_scale": problem.prior}
     x, scale = np.zeros(len(problem.prior)), problem.scale
-    error, jacobian = model(x)
-    n_evaluations, converged = 1, False
-    for _ in range(ROUNDS):
-        damping, converged = 1e-3, False
-        for _ in range(MAX_ITERATIONS):
-            now = _weigh(error, jacobian, scale, problem)
-            hessian = now.information + np.diag(problem.prior**-2.0)
-            slope = np.einsum("nmp,nm->p", now.slope, now.error) + x / problem.prior**2
-            step = -np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), slope)
-            tried = model(x + step)
-            n_evaluations += 1
-            cost = _weigh(*tried, scale, problem).cost + 0.5 * np.sum(((x + step) / problem.prior) ** 2)
-            if cost <= now.cost + 0.5 * np.sum((x / problem.prior) ** 2):
-                x, (error, jacobian), damping = x + step, tried, 0.1 * damping
-            else:
-                damping *= 10.0
-            if np.abs(step / problem.prior).max() < SMALL_STEP:  # small by damping alone is no end
-                converged = bool(np.abs(np.linalg.solve(hessian, slope) / problem.prior).max() < SMALL_STEP)
-                break
-        scale = _scales(error, problem)
-    covariance = _covariance(_weigh(error, jacobian, scale, problem), problem)
-    return Solution(x, covariance, scale, n_evaluations, converged)
+    for loss in ROUNDS:
+        x = least_squares(errors, x, loss=loss, **options, **TOLERANCES).x
+        scale = _scales(evaluate(x.tobytes())[0], problem)
+    covariance, decrement = _covariance(*evaluate(x.tobytes()), x, scale, problem)
+    return Solution(x, covariance, scale, decrement < 0.5 * SMALL_STEP**2)
 
 
 def principal(solution: Solution, tolerance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Directions of x from the least known to the best known.
+    """Return directions of x from the least known to the best known.
 
     Args:
-        solution: of a fit.
-        tolerance (p,): within which each number counts as known.
+        solution: result of a fit.
+        tolerance (p,): error within which each parameter counts as known.
 
     Returns:
         Half-widths (p,) of the 95 % intervals in units of the tolerance; directions (p, p) in its columns.
@@ -108,31 +95,36 @@ def principal(solution: Solution, tolerance: np.ndarray) -> tuple[np.ndarray, np
     return QUANTILE * np.sqrt(np.maximum(values[::-1], 0.0)), vectors[:, ::-1]
 
 
-def _weigh(error: np.ndarray, jacobian: np.ndarray, scale: np.ndarray, problem: Problem) -> _Weighted:
+def _scaled(
+    error: np.ndarray, jacobian: np.ndarray, scale: np.ndarray, problem: Problem
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return errors (n, m) and Jacobian (n, m, p) over the scales; constant where nothing is known."""
     sigma = scale[problem.group]
-    answered = ~np.any(np.isinf(error), axis=1)
-    known = np.isfinite(error) & answered[:, None]
-    e = np.where(known, error, 0.0) / sigma
-    slope = np.where(known[..., None], jacobian, 0.0) / sigma[:, None]
-    size = np.abs(e)
-    weight = np.minimum(1.0, HUBER / np.maximum(size, HUBER))
-    loss = np.where(size <= HUBER, 0.5 * e**2, HUBER * (size - 0.5 * HUBER))
-    missing = np.count_nonzero(~answered) * len(sigma) * HUBER * (NO_ANSWER - 0.5 * HUBER)
-    root = np.sqrt(weight)
-    return _Weighted(float(loss.sum() + missing), root * e, root[..., None] * slope)
+    answered = ~np.any(np.isinf(error), axis=1, keepdims=True)
+    known = np.isfinite(error) & answered
+    scaled = np.where(answered, np.where(known, error, 0.0) / sigma, NO_ANSWER)
+    return scaled, np.where(known[..., None], jacobian, 0.0) / sigma[:, None]
 
 
-def _covariance(end: _Weighted, problem: Problem) -> np.ndarray:
-    """Sandwich of the rows' scores; each row's errors as if the fit had been made without it."""
+def _covariance(
+    error: np.ndarray, jacobian: np.ndarray, x: np.ndarray, scale: np.ndarray, problem: Problem
+) -> tuple[np.ndarray, float]:
+    """Return the covariance (p, p), and how far a Newton step would still bring the loss down."""
+    error, slope = _scaled(error, jacobian, scale, problem)
     precision = np.diag(problem.prior**-2.0)
-    inverse = np.linalg.inv(end.information + precision)
-    leverage = end.slope @ inverse @ np.swapaxes(end.slope, 1, 2)  # (n, m, m)
-    left = np.linalg.solve(np.eye(leverage.shape[1]) - leverage, end.error[..., None])
-    score = (np.swapaxes(end.slope, 1, 2) @ left)[..., 0]
-    return inverse @ (score.T @ score + precision) @ inverse
+    inside = np.where(np.abs(error)[..., None] <= problem.huber, slope, 0.0)
+    curvature = np.swapaxes(inside, 1, 2) @ inside  # (n, p, p) of each row's loss
+    score = np.einsum("nmp,nm->np", slope, np.clip(error, -problem.huber, problem.huber))
+    hessian = curvature.sum(axis=0) + precision
+    change = np.linalg.solve(hessian - curvature, score[..., None])[..., 0]  # (n, p) without each row
+    inverse = np.linalg.inv(hessian)
+    gradient = score.sum(axis=0) + precision @ x
+    decrement = 0.5 * float(gradient @ inverse @ gradient)
+    return change.T @ change + inverse @ precision @ inverse, decrement
 
 
 def _scales(error: np.ndarray, problem: Problem) -> np.ndarray:
+    """Return the robust standard deviation of each group (n_groups,)."""
     found = problem.scale.copy()
     for k in range(len(found)):
         of_group = error[:, problem.group == k]

@@ -81,7 +81,7 @@ def to_html(
 
 
 def page(title: str, first: str, sections: Sequence[Section], last: str, provenance: dict[str, Any]) -> str:
-    """A page of sections that needs no other file; `first` and `last` are HTML that stands around the sections."""
+    """A page of sections that needs no other file; `first` and `last` are HTML that stands around them."""
     body = [f"<h1>{html.escape(title)}</h1>", first]
     for section in sections:
         body += [
