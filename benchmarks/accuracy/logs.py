@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from calib.fit.blocks import held_out_blocks
+from calib.fit.lines import fit_line, still_rows
 from calib.fit.network import fit_network
 from calib.fit.response import fit_response
-from calib.fit.lines import fit_line, still_rows
 from calib.read.adapters import read_asu, read_trunk, wire_length_m
 from mjx_softarm.sensing.s2r import correction
 

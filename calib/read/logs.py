@@ -1,10 +1,10 @@
 """Logs of an arm: read, checked, and reduced to the rows that can be believed.
 
 The schema is that of `mjx_softarm.logs.schema`. A file that cannot be understood (a column missing, a wrong
-unit) is refused. Otherwise each row is believed whole or dropped whole: for a NaN, a reading out of range, a time that
-does not increase, motion capture that was not renewed or is turned, an outlier. So a log that was read has no
-holes in its columns, and its times say where rows are missing. Signs of quaternions are repaired; columns
-that never change, time gaps and unknown columns are only reported. Each finding says what it cost.
+unit) is refused. Otherwise each row is believed whole or dropped whole: for a NaN, a reading out of range, a
+time that does not increase, motion capture that was not renewed or is turned, an outlier. So a log that was
+read has no holes in its columns, and its times say where rows are missing. Signs of quaternions are repaired;
+columns that never change, time gaps and unknown columns are only reported. Each finding says what it cost.
 """
 
 from __future__ import annotations
