@@ -35,7 +35,7 @@ def test_planted_calibration_within_half_a_percent_at_one_percent_of_length(spec
     assert (fit.n_outliers >= 0.9 * outliers * fit.n_rows).all()
 
 
-def test_compensation_is_told_apart_and_capacitance_is_not_touched(spec):
+def test_compensation_is_told_apart(spec):
     planted, frequency, _, noisy = springs(spec)
     half, guess = slice(None, None, 2), dataclasses.replace(planted, compensation_h=5e-7)
     fit = fit_springs(frequency[half], noisy[half], guess, fit_compensation=True)
