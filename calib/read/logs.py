@@ -26,11 +26,11 @@ _HELP = """\
 A log is a CSV file (commas, decimal points), or an npz file with the arrays `columns` and `table`.
 The header names each column with its unit, as in `pressure0 [kPa]`; the order does not matter.
 Needed are time and one at least of sensor readings (of one kind), spring, pressure and tip. A group of
-columns is there whole or not at all. Markers are numbered from base to tip, springs and chambers as in the spec.
-Base frame: z up, the arm hangs from the origin towards -z. The tip is the centre of the last plate, its
+columns is there whole or not at all. Markers are numbered from base to tip, springs and chambers as in the
+spec. Base frame: z up, the arm hangs from the origin towards -z. The tip is the centre of the last plate, its
 quaternion 1, 0, 0, 0 where the arm hangs straight.
-Chambers and the sim-to-real network are fitted to poses at rest: rows of which the pressures have been held
-for 3 s. One row per pose will do if the rows are more than 3 s apart.
+Chambers and the sim-to-real network are fitted to poses at rest: rows whose pressures have been held for 3 s.
+One row per pose will do if the rows are more than 3 s apart.
 """
 _FACTORS = {"readings": 1.25, "spring_m": 1.5, "tip_m": 1.5}  # between the ranges of two logs of one arm
 _NEEDED = ("readings", "spring_m", "pressure_kpa", "tip_m")  # one of them at least

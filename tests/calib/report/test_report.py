@@ -30,7 +30,7 @@ class Page(HTMLParser):
         assert self.open.pop() == tag
 
     def handle_data(self, data):
-        if self.open:
+        if self.open and data.strip():
             self.texts.setdefault(self.open[-1], []).append(data)
 
 
