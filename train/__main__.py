@@ -214,11 +214,11 @@ def _arm(options: argparse.Namespace, console: Console) -> tuple[ArmSpec, S2R | 
 
 
 def _evaluate(options: argparse.Namespace, console: Console) -> int:
-    from train.runs.run import finish, restore_actor
+    from train.runs.run import finish, restore_policy
 
     run = Run.open(options.run)
-    task, actor_params = restore_actor(run)
-    _show(run, task, finish(run, task, actor_params), console)
+    task, policy = restore_policy(run)
+    _show(run, task, finish(run, task, policy), console)
     return 0
 
 

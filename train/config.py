@@ -14,8 +14,8 @@ from typing import Any
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.env import EnvConfig
 from train.agent.gail import GailConfig
+from train.agent.hindsight import HindsightConfig
 from train.agent.tqc import TQCConfig
-from train.epoch.hindsight import HindsightConfig
 
 
 class ConfigError(InputError):

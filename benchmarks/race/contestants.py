@@ -92,12 +92,14 @@ def ours(name: str, seed: int) -> Contestant:
     import jax
 
     from mjx_softarm.env import ReachEnv
+    from train.agent.hindsight_tqc import HindsightTQC
     from train.epoch.job import Job
 
     config = dataclasses.replace(our_config(name), seed=seed)
-    job = Job(config, ReachEnv(config=config.env))
+    env = ReachEnv(config=config.env)
+    job = Job(config, env, HindsightTQC(config, env))
     state = job.start(lambda: job.init(jax.random.PRNGKey(seed)))
-    act = jax.jit(job.agent.act_mode)
+    act = jax.jit(job.learner.mode)
 
     def train() -> None:
         nonlocal state
@@ -105,8 +107,8 @@ def ours(name: str, seed: int) -> Contestant:
 
     return Contestant(
         train,
-        policy=lambda obs: np.asarray(act(state.agent.mean_actor_params, obs)),
-        done=lambda: (int(state.n_env_steps), int(state.agent.step)),
+        policy=lambda obs: np.asarray(act(job.policy(state), obs)),
+        done=lambda: (int(state.n_env_steps), int(state.n_updates)),
         limit=config.total_env_steps,
     )
 

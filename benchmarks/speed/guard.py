@@ -27,6 +27,7 @@ from benchmarks.harness.rounds import Facts, Worker, WorkerError, serve, working
 from benchmarks.speed.truth import random_references, settle_function
 from mjx_softarm._support.provenance import provenance, write_json
 from mjx_softarm.env import EnvConfig, ReachEnv
+from train.agent.hindsight_tqc import HindsightTQC
 from train.config import PRESETS
 from train.epoch.job import Job
 
@@ -118,7 +119,8 @@ def prepare() -> tuple[Facts, Callable[[], Facts]]:
         "updates_per_env_step": SIZES["n_updates"] / n_steps / n_arms,
     }
     size = {"n_arms": n_arms, "vector_steps_per_epoch": n_steps, "warmup_env_steps": 0, "env": env.config}
-    job, epochs = Job(dataclasses.replace(PRESETS["quick"], **updates, **size), env), []
+    config = dataclasses.replace(PRESETS["quick"], **updates, **size)
+    job, epochs = Job(config, env, HindsightTQC(config, env)), []
     states = [job.init(jax.random.PRNGKey(0))]
 
     def compile_epoch() -> None:

@@ -173,6 +173,7 @@ def compiled(where: str, program: str, *settings: str) -> Facts:
     from jax.experimental import topologies
 
     from mjx_softarm.env import ReachEnv
+    from train.agent.hindsight_tqc import HindsightTQC
     from train.config import PRESETS, override
     from train.epoch.devices import AXIS, everywhere
     from train.epoch.job import Job
@@ -184,7 +185,8 @@ def compiled(where: str, program: str, *settings: str) -> Facts:
         gpus = topologies.get_topology_desc(platform="cuda", target_config=H200, topology=f"1x{n}x1")
         mesh = topologies.make_mesh(gpus, (n,), (AXIS,))
     config, key = override(PRESETS["quick"], list(settings)), jax.random.PRNGKey(0)
-    job = Job(config, ReachEnv(config=config.env), mesh if mesh.size > 1 else None)
+    env = ReachEnv(config=config.env)
+    job = Job(config, env, HindsightTQC(config, env), mesh=mesh if mesh.size > 1 else None)
     if program == "epoch":
         function, shapes = job.epoch, (jax.eval_shape(job.init, key),)
     else:

@@ -44,10 +44,11 @@ def _ours(batch_size: int, n_updates: int) -> tuple[Facts, Callable[[], Facts]]:
     from mjx_softarm.mdp.observation import ObsScale
     from mjx_softarm.mdp.rewards import RewardConfig
     from mjx_softarm.spec import ArmSpec
+    from train.agent.hindsight import relabel
+    from train.agent.learner import Experience
     from train.agent.tqc import TQC, TQCConfig
     from train.config import PRESETS
     from train.epoch import replay
-    from train.epoch.hindsight import Experience, relabel
 
     hindsight, scale, reward = (
         PRESETS["quick"].hindsight,

@@ -248,10 +248,12 @@ import jax
 from mjx_softarm._support import xla
 xla.enable_compilation_cache({cache!r})
 from mjx_softarm.env import ReachEnv
+from train.agent.hindsight_tqc import HindsightTQC
 from train.config import PRESETS
 from train.epoch.job import Job
 imported = time.perf_counter()
-job = Job(PRESETS["quick"], ReachEnv())
+config, env = PRESETS["quick"], ReachEnv()
+job = Job(config, env, HindsightTQC(config, env))
 pool = time.perf_counter()
 job.start(lambda: job.init(jax.random.PRNGKey(0)))
 print(json.dumps({{"import_s": imported - start, "workspace_s": pool - imported,

@@ -19,6 +19,7 @@ from mjx_softarm.sensing.pose import frame_from_pose, quaternion_from_pose
 from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.spec import ArmSpec
 from train.__main__ import main
+from train.agent.hindsight_tqc import HindsightTQC
 from train.epoch.job import Job
 from train.runs.checkpoint import Run, RunError, sole_trainer
 from train.runs.plots import IMITATION_PICTURES, REACH_PICTURES
@@ -57,7 +58,8 @@ def resume(out):
 
 def final_state(out):
     run = Run.open(Path(out))
-    job = Job(run.config, ReachEnv(run.spec, run.config.env))
+    env = ReachEnv(run.spec, run.config.env)
+    job = Job(run.config, env, HindsightTQC(run.config, env))
     return run.restore(jax.eval_shape(job.init, jax.random.PRNGKey(0)))
 
 
@@ -221,5 +223,5 @@ def test_imitation_resumes_across_stages_and_hands_its_reward_on(
 
 def discriminator_of(path):
     task = task_of_run(run := Run.open(path))
-    like = jax.eval_shape(task.job.init, jax.random.PRNGKey(0)).imitation
-    return run.restore_part("imitation", like).discriminator.params
+    like = jax.eval_shape(task.job.init, jax.random.PRNGKey(0)).learner
+    return run.restore_part("learner", like).discriminator.params

@@ -19,6 +19,7 @@ import optax
 from jax import Array
 
 from mjx_softarm._support import draws
+from train.agent.learner import check_same_shapes
 from train.agent.losses import actor_loss, alpha_loss, quantile_huber_loss, truncated_targets
 from train.agent.networks import Actor, Critics, mode, sample_action, squash
 
@@ -81,7 +82,6 @@ class TQCState(NamedTuple):
     actor_opt_state: optax.OptState
     critic_opt_state: optax.OptState
     alpha_opt_state: optax.OptState
-    step: Array  # () int32, updates done
 
 
 class TQC:
@@ -119,15 +119,25 @@ class TQC:
             actor_opt_state=self.optimizer.init(actor_params),
             critic_opt_state=self.optimizer.init(critic_params),
             alpha_opt_state=self.alpha_optimizer.init(log_alpha),
-            step=jnp.zeros((), jnp.int32),
         )
 
+    def adopt(self, state: TQCState, donor: TQCState) -> TQCState:
+        """Return the state with a donor's networks and temperature; the optimisers begin anew.
+
+        Raises:
+            ValueError: the donor's networks are of another size.
+        """
+        names = ("actor_params", "mean_actor_params", "critic_params", "target_params", "log_alpha")
+        given, own = ({name: getattr(each, name) for name in names} for each in (donor, state))
+        check_same_shapes("networks", given, own)
+        return state._replace(**given)
+
     def act(self, actor_params: Params, obs: Array, key: Array) -> Array:
-        """Samples an action (..., A) in (-1, 1) at obs (..., O)."""
+        """Sample an action (..., A) in (-1, 1) at obs (..., O)."""
         return sample_action(*self.actor.apply(actor_params, obs), key=key)[0]
 
-    def act_mode(self, actor_params: Params, obs: Array) -> Array:
-        """The deterministic action (..., A) in (-1, 1) at obs (..., O)."""
+    def mode(self, actor_params: Params, obs: Array) -> Array:
+        """Return the deterministic action (..., A) in (-1, 1) at obs (..., O)."""
         return mode(self.actor.apply(actor_params, obs)[0])
 
     def update(self, state: TQCState, batch: Transition, key: Array) -> tuple[TQCState, dict[str, Array]]:
@@ -163,7 +173,6 @@ class TQC:
             actor_opt_state=actor[1],
             critic_opt_state=critic[1],
             alpha_opt_state=temperature[1],
-            step=state.step + 1,
         )
         losses = {"critic_loss": loss_critic, "actor_loss": loss_actor, "alpha_loss": loss_alpha}
         means = {"entropy": -jnp.mean(log_prob), "q_mean": q_mean, "target_mean": jnp.mean(targets)}

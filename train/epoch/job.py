@@ -1,10 +1,14 @@
-"""One epoch of training as one jitted, donated call: act, store, relabel, update."""
+"""One epoch of training as one jitted, donated call: act, store, update.
+
+An epoch is composed of arms, a distribution of their goals, a replay and a learner; see
+`train.agent.learner`. It knows no learner by name.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple, Protocol, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -15,48 +19,78 @@ from mjx_softarm._support import draws, xla
 from mjx_softarm._support.mjx import State
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.env.vector import VectorEnv
-from train.agent.tqc import TQC, TQCState, Transition
+from train.agent.learner import Experience, Learner
 from train.config import ConfigError, TrainConfig
 from train.epoch import replay
 from train.epoch.devices import everywhere, split, spread
-from train.epoch.hindsight import Experience, relabel
 
 T = TypeVar("T")
+
+
+class Goals(Protocol):
+    """Distribution of the starts and goals of new episodes."""
+
+    def init(self) -> Any:
+        """Return the first state of the distribution, a pytree of arrays."""
+        ...
+
+    def begin(self, state: Any, arms: State, key: Array) -> State:
+        """Return the states of n arms; those whose episode is new have the start and goal drawn here."""
+        ...
+
+
+class WorkspaceGoals:
+    """`Goals` as the environment's reset draws them."""
+
+    def init(self) -> Any:
+        """Return an empty state."""
+        return ()
+
+    def begin(self, state: Any, arms: State, key: Array) -> State:
+        """Return the arms as they are."""
+        return arms
 
 
 class TrainState(NamedTuple):
     """All that a run consists of; with it, a run continues bit for bit."""
 
     arms: State  # n_arms
-    agent: TQCState
+    learner: Any  # state of the learner
     memory: replay.Replay  # of Experience
+    goals: Any  # state of the goals' distribution
     key: Array
     n_env_steps: Array  # () int32 actions taken, invalid ones included
+    n_updates: Array  # () int32 gradient steps taken
     n_unsettled: Array  # () int32 arms that were masked and reset
-    imitation: Any = None  # what learning from demonstrations has besides; see `train.epoch.imitation`
 
 
 class Job:
-    """A run's fixed parts, and the two functions that change its state.
+    """Fixed parts of a run, and the two functions that change its state: `init` and `epoch`.
 
     `n_traces` counts how often the epoch was traced: once in a run. With a mesh of devices, the state is
     spread over them; see `train.epoch.devices`. Raises ConfigError for what cannot be split evenly.
     """
 
-    def __init__(self, config: TrainConfig, env: ReachEnv, mesh: Mesh | None = None):
-        self.config = config
-        self.env = env
-        self.mesh = mesh
+    def __init__(
+        self,
+        config: TrainConfig,
+        env: ReachEnv,
+        learner: Learner,
+        goals: Goals | None = None,
+        mesh: Mesh | None = None,
+    ):
+        self.config, self.env, self.learner, self.mesh = config, env, learner, mesh
+        self.goals = goals or WorkspaceGoals()
         self.arms = VectorEnv(env, config.n_arms, config.episode_length, mesh)
-        self.agent = TQC(env.observation_size, env.action_size, config.tqc, config.n_updates)
         self.n_traces = 0
         self.sharding = None if mesh is None else _sharding(config, mesh)
         results = None if mesh is None else (self.sharding, everywhere(mesh))
-        self.init = xla.jit(self._init, env.uses_mjx, out_shardings=self.sharding)
-        self.epoch = xla.jit(self._epoch, env.uses_mjx, donate_argnums=0, out_shardings=results)
+        self.init = xla.jit(self.first, env.uses_mjx, out_shardings=self.sharding)
+        self.epoch = xla.jit(self.advance, env.uses_mjx, donate_argnums=0, out_shardings=results)
+        self._thin = xla.jit(replay.thin, env.uses_mjx, donate_argnums=0)
 
     def start(self, first: Callable[[], T]) -> T:
-        """What `first` returns, such as a state, with the epoch compiled beside it: neither needs all cores.
+        """Return the result of `first`, such as a state, with the epoch compiled in another thread meanwhile.
 
         With a mesh of devices the epoch is compiled when it is called first.
         """
@@ -69,30 +103,44 @@ class Job:
             return result.result()
 
     def place(self, state: TrainState) -> TrainState:
-        """The state where the epoch expects it, after something else has touched it."""
+        """Return the state on the devices where the epoch expects it, after something else has touched it."""
         return state if self.sharding is None else jax.device_put(state, self.sharding)
 
-    def _init(self, key: Array) -> TrainState:
-        key, key_arms, key_agent = jax.random.split(key, 3)
-        arms = self.arms.reset(key_arms)
+    def policy(self, state: TrainState) -> Any:
+        """Return the parameters of the policy that is evaluated and exported."""
+        return self.learner.policy(state.learner)
+
+    def thin(self, state: TrainState, share: float) -> TrainState:
+        """Return the state with a random share of its replay; the state given is used up."""
+        key, key_thin = jax.random.split(state.key)
+        memory = self._thin(state.memory, key_thin, jnp.asarray(share, jnp.float32))
+        return state._replace(memory=memory, key=key)
+
+    def first(self, key: Array) -> TrainState:
+        """Return the state that a run begins with; `init` is this, jitted."""
+        key, key_arms, key_learner, key_goals = jax.random.split(key, 4)
+        goals = self.goals.init()
+        arms = self.goals.begin(goals, self.arms.reset(key_arms), key_goals)
         experience = jax.eval_shape(
             lambda: self._experience(arms, jnp.zeros((self.arms.n, self.env.action_size)), arms)
         )
         one = jax.tree.map(lambda x: jnp.zeros(x.shape[1:], x.dtype), experience)
         return TrainState(
             arms=arms,
-            agent=self.agent.init(key_agent),
+            learner=self.learner.init(key_learner),
             memory=replay.create(one, self.config.replay_capacity),
+            goals=goals,
             key=key,
             n_env_steps=jnp.zeros((), jnp.int32),
+            n_updates=jnp.zeros((), jnp.int32),
             n_unsettled=jnp.zeros((), jnp.int32),
         )
 
-    def _epoch(self, state: TrainState) -> tuple[TrainState, dict[str, Array]]:
-        """Advance every arm by `vector_steps_per_epoch` actions, with the updates that go with them.
+    def advance(self, state: TrainState) -> tuple[TrainState, dict[str, Array]]:
+        """Move every arm by `vector_steps_per_epoch` actions, with their updates; `epoch` is this, jitted.
 
         Returns:
-            The next state; means over the epoch by name, and `unsettled`, the number of masked arms.
+            The next state; means over the epoch by name, and `env/unsettled`, the number of masked arms.
         """
         self.n_traces += 1
         with draws.on(self.mesh):
@@ -103,14 +151,22 @@ class Job:
         return state, {**jax.tree.map(jnp.mean, metrics), "env/unsettled": unsettled}
 
     def _vector_step(self, state: TrainState, _) -> tuple[TrainState, dict[str, Array]]:
-        key, key_act, key_random, key_reset, key_updates = jax.random.split(state.key, 5)
+        """Take one action of every arm, and the updates that follow it."""
+        key, key_act, key_random, key_reset, key_updates, key_goals = jax.random.split(state.key, 6)
+
+        # Act: uniformly at random during warm-up, then as the learner explores.
         warmed_up = state.n_env_steps >= self.config.warmup_env_steps
         explored = draws.uniform(key_random, (self.arms.n, self.env.action_size), minval=-1.0)
-        action = self.agent.act(state.agent.actor_params, state.arms.obs, key_act)
+        action = self.learner.act(state.learner, state.arms.obs, key_act)  # (n_arms, n_chambers)
         action = jnp.where(warmed_up, action, explored)
+
+        # Step the arms; where an episode ended, begin the next one.
         arms, after, outcome = self.arms.step(state.arms, action, key_reset)
+        arms = self.goals.begin(state.goals, arms, key_goals)
+
+        # Store what is valid and finite.
         experience = self._experience(state.arms, action, after)
-        valid = outcome.valid & replay.finite_rows(experience)
+        valid = outcome.valid & replay.finite_rows(experience)  # (n_arms,)
         state = state._replace(
             arms=arms,
             memory=replay.add(state.memory, experience, valid),
@@ -118,53 +174,38 @@ class Job:
             n_env_steps=state.n_env_steps + self.arms.n,
             n_unsettled=state.n_unsettled + jnp.sum(~valid, dtype=jnp.int32),
         )
-        state, losses = self._updates(state, key_updates, warmed_up)
+
+        # Learn.
+        state, losses = self.learn(state, key_updates, warmed_up)
         env_metrics = {f"env/{name}": jnp.mean(value) for name, value in after.metrics.items()}
         return state, env_metrics | losses
 
-    def _updates(
-        self, state: TrainState, key: Array, warmed_up: Array
-    ) -> tuple[TrainState, dict[str, Array]]:
+    def learn(self, state: TrainState, key: Array, warmed_up: Array) -> tuple[TrainState, dict[str, Array]]:
+        """Take the updates of one vector step, none before the end of warm-up.
+
+        Returns:
+            The next state; means over the updates by name, zeros during warm-up.
+        """
         keys = jax.random.split(key, self.config.n_updates_per_vector_step)
 
-        def update(learner: tuple[TQCState, Any], key: Array):
-            return self._update(*learner, state.memory, key)
+        def sample(key: Array) -> Experience:
+            return spread(self.mesh, replay.sample(state.memory, key, self.config.batch_size))
 
-        def run(learner: tuple[TQCState, Any]):
-            learner, metrics = jax.lax.scan(update, learner, keys)
+        def run(learner: Any) -> tuple[Any, dict[str, Array]]:
+            learner, metrics = jax.lax.scan(
+                lambda learner, key: self.learner.update(learner, sample, key), learner, keys
+            )
             return learner, jax.tree.map(jnp.mean, metrics)
 
-        learner = (state.agent, state.imitation)
-        shapes = jax.eval_shape(run, learner)[1]
+        # A branch has to return metrics of the same shapes, whether it learns or not.
+        shapes = jax.eval_shape(run, state.learner)[1]
         nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-        (agent, imitation), metrics = jax.lax.cond(
-            warmed_up, run, lambda learner: (learner, nothing), learner
-        )
-        return state._replace(agent=agent, imitation=imitation), metrics
-
-    def _update(
-        self, agent: TQCState, imitation: Any, memory: replay.Replay, key: Array
-    ) -> tuple[tuple[TQCState, Any], dict[str, Array]]:
-        """One gradient step, and its metrics by name."""
-        key_sample, key_relabel, key_update = jax.random.split(key, 3)
-        stored = self._sample(memory, key_sample)
-        agent, losses = self.agent.update(agent, self._relabel(stored, key_relabel), key_update)
-        return (agent, imitation), {f"tqc/{name}": x for name, x in losses.items()}
-
-    def _sample(self, memory: replay.Replay, key: Array) -> Experience:
-        return spread(self.mesh, replay.sample(memory, key, self.config.batch_size))
-
-    def _relabel(self, stored: Experience, key: Array) -> Transition:
-        return relabel(
-            stored,
-            key,
-            self.config.hindsight,
-            self.env.scale,
-            self.config.env.reward,
-            exchange_actions=self.config.env.mode == "quasistatic",
-        )
+        learner, metrics = jax.lax.cond(warmed_up, run, lambda learner: (learner, nothing), state.learner)
+        n_updates = state.n_updates + jnp.where(warmed_up, len(keys), 0)
+        return state._replace(learner=learner, n_updates=n_updates), metrics
 
     def _experience(self, before: State, action: Array, after: State) -> Experience:
+        """Return the transitions of n arms as they are stored."""
         start, end = before.pipeline_state, after.pipeline_state
         return Experience(
             pose=start.pose,
@@ -179,19 +220,13 @@ class Job:
 
 
 def _sharding(config: TrainConfig, mesh: Mesh) -> TrainState:
-    """Where the parts of a state are, as a prefix of its tree."""
+    """Return where the parts of a state are, as a prefix of its tree."""
     for name in ("n_arms", "replay_capacity", "batch_size"):
         if getattr(config, name) % mesh.size:
             raise ConfigError(
                 f"{name}: got {getattr(config, name)}, expected a multiple of the {mesh.size} devices"
             )
     on_all, rows = cast(Any, everywhere(mesh)), split(mesh)  # in the places of arrays
-    return TrainState(
-        arms=rows,
-        agent=on_all,
-        memory=replay.Replay(data=rows, position=on_all, size=on_all),
-        key=on_all,
-        n_env_steps=on_all,
-        n_unsettled=on_all,
-        imitation=on_all,
-    )
+    everything = dict.fromkeys(TrainState._fields, on_all)
+    memory = replay.Replay(data=rows, position=on_all, size=on_all)
+    return TrainState(**{**everything, "arms": rows, "memory": memory})

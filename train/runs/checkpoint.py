@@ -191,10 +191,7 @@ class Run:
         try:
             state = self._manager.restore(epoch, args=ocp.args.StandardRestore(shapes))
         except ValueError as error:
-            raise RunError(
-                f"{self.path}: its checkpoint has other parts or sizes than the states of this version; "
-                "continue it with the commit that its config.json names"
-            ) from error
+            raise self._of_another_version() from error
         return epoch, cast(TrainState, state)
 
     def restore_part(self, name: str, like: Any) -> Any:
@@ -205,12 +202,21 @@ class Run:
             like: its value, or shapes, structured as the run's.
 
         Raises:
-            RunError: there is no checkpoint.
+            RunError: there is no checkpoint, or it is not structured so.
         """
         wanted = {name: jax.tree.map(ocp.utils.to_shape_dtype_struct, like)}
         as_numpy = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), wanted)
         arguments = ocp.args.PyTreeRestore(wanted, as_numpy, partial_restore=True)
-        return self._manager.restore(self._newest(), args=arguments)[name]
+        try:
+            return self._manager.restore(self._newest(), args=arguments)[name]
+        except (ValueError, KeyError) as error:
+            raise self._of_another_version() from error
+
+    def _of_another_version(self) -> RunError:
+        return RunError(
+            f"{self.path}: its checkpoint has other parts or sizes than the states of this version; "
+            "continue it with the commit that its config.json names"
+        )
 
     def _newest(self) -> int:
         epoch = self.latest_epoch

@@ -17,7 +17,7 @@ from mjx_softarm._support.mjx import State
 from mjx_softarm.env import Randomisation, ReachEnv
 from mjx_softarm.mdp import rewards
 from mjx_softarm.mechanics.workspace import HELD_OUT_SEED, circle_poses
-from train.agent.tqc import TQC
+from train.agent.learner import Learner
 
 N_GOALS = 2_000
 N_ACTIONS = 4
@@ -70,36 +70,36 @@ class Summary:
 
 
 class Evaluator:
-    """Evaluates actors of one structure on one arm without randomisation; compiled once.
+    """Evaluate policies of one learner on one arm without randomisation; compiled once.
 
     Every goal gets `N_ACTIONS` actions of the deterministic policy, and what stands after the last counts. On
     the workspace each arm starts at a random pose; on the circle, a single arm goes from point to point,
     once around to get there.
     """
 
-    def __init__(self, env: ReachEnv, agent: TQC, n_goals: int = N_GOALS):
-        self.env, self.agent = nominal(env), agent
+    def __init__(self, env: ReachEnv, learner: Learner, n_goals: int = N_GOALS):
+        self.env, self.learner = nominal(env), learner
         self.n_goals = n_goals
         self.circle = jnp.asarray(circle_poses())
         self._workspace = xla.jit(self._reach_all, env.uses_mjx)
-        self._circle = xla.jit(functools.partial(follow, self.env, agent), env.uses_mjx)
+        self._circle = xla.jit(functools.partial(follow, self.env, learner), env.uses_mjx)
 
     @functools.cached_property
     def goals(self) -> Array:
         """Held-out poses (n_goals, 6) [mm, deg]; drawn when needed, as an export does without."""
         return self.env.sample_pool(self.n_goals, HELD_OUT_SEED).pose
 
-    def __call__(self, actor_params: Any) -> tuple[Summary, Reached, Reached]:
+    def __call__(self, policy: Any) -> tuple[Summary, Reached, Reached]:
         """Figures, and what was reached on the workspace and on the circle, as NumPy arrays."""
-        actor_params = jax.device_get(actor_params)  # maybe on many devices; one is enough
-        workspace = jax.device_get(self._workspace(actor_params, self.goals))
-        circle = jax.device_get(self._circle(actor_params, self.circle))
+        policy = jax.device_get(policy)  # maybe on many devices; one is enough
+        workspace = jax.device_get(self._workspace(policy, self.goals))
+        circle = jax.device_get(self._circle(policy, self.circle))
         return summarise(workspace, circle, self.env.config.reward.threshold), workspace, circle
 
-    def _reach_all(self, actor_params: Any, goals: Array) -> Reached:
+    def _reach_all(self, policy: Any, goals: Array) -> Reached:
         keys = jax.random.split(jax.random.PRNGKey(HELD_OUT_SEED), len(goals))
         starts = jax.vmap(self.env.reset)(keys)
-        return jax.vmap(lambda *at: reach(self.env, self.agent, actor_params, *at)[1])(starts, goals)
+        return jax.vmap(lambda *at: reach(self.env, self.learner, policy, *at)[1])(starts, goals)
 
 
 def nominal(env: ReachEnv) -> ReachEnv:
@@ -108,13 +108,13 @@ def nominal(env: ReachEnv) -> ReachEnv:
     return env if config == env.config else ReachEnv(env.spec, config, env.s2r)
 
 
-def reach(env: ReachEnv, agent: TQC, actor_params: Any, state: State, goal: Array) -> tuple[State, Reached]:
+def reach(env: ReachEnv, learner: Learner, policy: Any, state: State, goal: Array) -> tuple[State, Reached]:
     """What one arm reaches with N_ACTIONS towards a goal (6,), and its state then."""
     arm = state.pipeline_state._replace(goal=goal)
     state = state.replace(pipeline_state=arm, obs=env.observe(arm.pose, goal))
 
     def act(state: State, _):
-        after = env.step(state, agent.act_mode(actor_params, state.obs))
+        after = env.step(state, learner.mode(policy, state.obs))
         return after, after.info["valid"]
 
     state, settled = jax.lax.scan(act, state, None, length=N_ACTIONS)
@@ -130,11 +130,11 @@ def reach(env: ReachEnv, agent: TQC, actor_params: Any, state: State, goal: Arra
     )
 
 
-def follow(env: ReachEnv, agent: TQC, actor_params: Any, path: Array) -> Reached:
+def follow(env: ReachEnv, learner: Learner, policy: Any, path: Array) -> Reached:
     """What one arm reaches along a path (n, 6) of goals, once along it to get there."""
     start = env.reset(jax.random.PRNGKey(HELD_OUT_SEED))
     twice = jnp.concatenate([path, path])
-    _, reached = jax.lax.scan(lambda state, goal: reach(env, agent, actor_params, state, goal), start, twice)
+    _, reached = jax.lax.scan(lambda state, goal: reach(env, learner, policy, state, goal), start, twice)
     return jax.tree.map(lambda x: x[len(path) :], reached)
 
 

@@ -13,22 +13,28 @@ import numpy as np
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.policy.file import ArmModel, policy_from_actor, save_policy
 from mjx_softarm.spec import ArmSpec
-from train.runs.checkpoint import Run
+from train.runs.checkpoint import Run, RunError
 from train.runs.estimator import Distilled, distil
-from train.runs.run import restore_actor
+from train.runs.run import restore_policy
+from train.runs.task import Task
 
 N_WORKSPACE = 2048  # poses that stand for the workspace
 SEED = 0  # of the estimator
 
 
-def export_run(run: Run, path: Path | None = None) -> Path:
-    """Write the policy of a run's newest checkpoint; returns the file, `policy.npz` in the run by default.
+def export_run(run: Run, path: Path | None = None, task: Task | None = None) -> Path:
+    """Write the policy of a run's newest checkpoint; return the file.
+
+    Args:
+        run: its config and checkpoint.
+        path: of the file; `policy.npz` in the run by default.
+        task: of the run, where its learner is not the one that its config names.
 
     Raises:
-        RunError: the run has no checkpoint.
+        RunError: the run has no checkpoint, or its learner's policy is not a network that the file can hold.
         SealedFileError: the file cannot be written.
     """
-    task, actor_params = restore_actor(run)
+    task, params = restore_policy(run, task)
     model, distilled = arm_model(task.job.env)
     errors = {name: getattr(distilled, name) for name in ("tip_mm", "turn_deg", "spring_mm")}
     provenance = {
@@ -40,8 +46,10 @@ def export_run(run: Run, path: Path | None = None) -> Path:
         },
         "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     }
-    actor_params = jax.device_get(actor_params)
-    policy = policy_from_actor(actor_params, run.spec, run.config.env.reward, model, provenance)
+    try:
+        policy = policy_from_actor(jax.device_get(params), run.spec, run.config.env.reward, model, provenance)
+    except (ValueError, AttributeError) as error:
+        raise RunError(f"{run.path}: {error}") from error
     path = path or run.path / "policy.npz"
     save_policy(path, policy)
     return path

@@ -15,7 +15,7 @@ from jax import Array
 from mjx_softarm._support import xla
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.sensing.pose import pose_error
-from train.agent.tqc import TQC
+from train.agent.learner import Learner
 from train.runs.evaluate import Reached, follow, nominal
 
 
@@ -68,15 +68,15 @@ class PositionEvaluator:
     `first` (m,) bool tells the positions that are goals from the start.
     """
 
-    def __init__(self, env: ReachEnv, agent: TQC, positions: np.ndarray, first: np.ndarray):
+    def __init__(self, env: ReachEnv, learner: Learner, positions: np.ndarray, first: np.ndarray):
         self.env, self.first = nominal(env), first
         self.positions = jnp.asarray(positions)
-        self._follow = xla.jit(functools.partial(follow, self.env, agent), env.uses_mjx)
+        self._follow = xla.jit(functools.partial(follow, self.env, learner), env.uses_mjx)
 
-    def __call__(self, actor_params: Any) -> tuple[PositionSummary, AtPositions]:
+    def __call__(self, policy: Any) -> tuple[PositionSummary, AtPositions]:
         """Figures, and what was reached, as NumPy arrays."""
-        actor_params = jax.device_get(actor_params)  # maybe on many devices; one is enough
-        reached = jax.device_get(self._follow(actor_params, self.positions))
+        policy = jax.device_get(policy)  # maybe on many devices; one is enough
+        reached = jax.device_get(self._follow(policy, self.positions))
         return summarise(reached, self.env.config.reward.threshold, self.first)
 
 

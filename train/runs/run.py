@@ -18,7 +18,7 @@ from tensorboardX import SummaryWriter
 
 from mjx_softarm._support.provenance import write_json
 from mjx_softarm.env import ReachEnv
-from train.config import ImitationConfig, TrainConfig
+from train.config import TrainConfig
 from train.epoch.devices import any_process, is_first_process
 from train.epoch.job import Job, TrainState
 from train.runs import plots
@@ -54,7 +54,7 @@ def train(run: Run, task: Task, console: Console) -> Any:
                 epoch += 1
                 stop, due = any_process(bool(asked)), run.config.evaluates_after(epoch)
                 if due:
-                    row |= evaluation(task, state.agent.mean_actor_params)
+                    row |= evaluation(task, task.job.policy(state))
                 record(run, board, epoch, counts(state), row)
                 if due or stop:
                     run.save(epoch, state)
@@ -65,7 +65,7 @@ def train(run: Run, task: Task, console: Console) -> Any:
                     )
                 if stop and epoch < run.config.n_epochs:
                     raise Interrupted(f"stopped after epoch {epoch}; continue with --resume {run.path}")
-    return finish(run, task, state.agent.mean_actor_params)
+    return finish(run, task, task.job.policy(state))
 
 
 def _begin(run: Run, task: Task, console: Console) -> tuple[int, TrainState]:
@@ -82,9 +82,9 @@ def _begin(run: Run, task: Task, console: Console) -> tuple[int, TrainState]:
     return epoch, state
 
 
-def finish(run: Run, task: Task, actor_params: Any) -> Any:
+def finish(run: Run, task: Task, policy: Any) -> Any:
     """Evaluate a policy, write `evaluation.json` and the pictures; returns the figures."""
-    summary, *reached = task.evaluate(actor_params)
+    summary, *reached = task.evaluate(policy)
     if is_first_process():
         write_json(run.path / "evaluation.json", summary.to_dict())
         plots.save(run.path, task.pictures(run.metrics(), *reached))
@@ -101,49 +101,44 @@ def task_of_run(run: Run, mesh: Mesh | None = None) -> Task:
     return task_of(run.config, ReachEnv(run.spec, run.config.env, run.s2r), run.demonstrations(), mesh)
 
 
-def restore_actor(run: Run) -> tuple[Task, Any]:
-    """The task of a run, and the actor of its newest checkpoint."""
-    task = task_of_run(run)
-    return task, _restored(run, task, "agent").mean_actor_params
+def restore_policy(run: Run, task: Task | None = None) -> tuple[Task, Any]:
+    """Return the task of a run, or that given, and the policy of the run's newest checkpoint.
+
+    Raises:
+        RunError: the run has no checkpoint, or one of another learner.
+    """
+    task = task or task_of_run(run)
+    return task, task.job.learner.policy(_restored_learner(run, task))
 
 
-def begin_with(task: Task, seed: int, agent: Run | None = None, reward: Run | None = None) -> TrainState:
-    """The state that a new run begins with, where parts of it are another's.
+def begin_with(task: Task, seed: int, **donors: Run) -> TrainState:
+    """Return the state that a new run begins with, where parts of its learner are other runs'.
 
     Args:
         task: of the new run.
         seed: of the new run.
-        agent: whose actor, critics and temperature it begins with.
-        reward: whose discriminator it begins with.
+        donors: runs by what their learners give, such as `agent` or `reward`; see the learner's `adopt`.
 
     Raises:
-        RunError: the other run has no such part, or one of another size.
+        RunError: a donor has no such part, or one of another size.
     """
     state = task.job.init(jax.random.PRNGKey(seed))
-    if agent is not None:
-        given = _restored(agent, task_of_run(agent), "agent")
-        names = ("actor_params", "mean_actor_params", "critic_params", "target_params", "log_alpha")
-        parts = {name: getattr(given, name) for name in names}
-        _same_shapes(agent, "networks", parts, {name: getattr(state.agent, name) for name in names})
-        state = state._replace(agent=state.agent._replace(**parts))
-    if reward is not None:
-        if not (isinstance(reward.config, ImitationConfig) and reward.config.learned_weight):
-            raise RunError(f"{reward.path}: learned no reward; expected a run of `imitate` that did")
-        given = _restored(reward, task_of_run(reward), "imitation").discriminator
-        _same_shapes(reward, "discriminator", given, state.imitation.discriminator)
-        state = state._replace(imitation=state.imitation._replace(discriminator=given))
+    adopt = getattr(task.job.learner, "adopt", None)
+    for name, donor in donors.items():
+        if adopt is None:
+            raise RunError(f"{donor.path}: got a donor of {name}, expected none for this learner")
+        given = _restored_learner(donor, task_of_run(donor))
+        try:
+            state = state._replace(learner=adopt(state.learner, **{name: given}))
+        except ValueError as error:
+            raise RunError(f"{donor.path}: {error}") from error
     return task.job.place(state)
 
 
-def _restored(run: Run, task: Task, part: str) -> Any:
+def _restored_learner(run: Run, task: Task) -> Any:
+    """Return the learner's state of a run's newest checkpoint."""
     shapes = jax.eval_shape(task.job.init, jax.random.PRNGKey(0))
-    return run.restore_part(part, getattr(shapes, part))
-
-
-def _same_shapes(run: Run, what: str, given: Any, own: Any) -> None:
-    given, own = ([leaf.shape for leaf in jax.tree.leaves(tree)] for tree in (given, own))
-    if given != own:
-        raise RunError(f"{run.path}: {what}: got layers of {given}, expected {own} as in the new run")
+    return run.restore_part("learner", shapes.learner)
 
 
 def open_board(run: Run, state: TrainState) -> SummaryWriter:
@@ -155,11 +150,11 @@ def open_board(run: Run, state: TrainState) -> SummaryWriter:
 
 def _timed_epoch(job: Job, state: TrainState) -> tuple[TrainState, dict[str, float]]:
     start = time.perf_counter()
-    updates = int(state.agent.step)
+    updates = int(state.n_updates)
     state, metrics = job.epoch(state)
     row = {name: float(value) for name, value in jax.device_get(metrics).items()}
     seconds = time.perf_counter() - start
-    return state, row | speeds(job.config, int(state.agent.step) - updates, seconds)
+    return state, row | speeds(job.config, int(state.n_updates) - updates, seconds)
 
 
 def speeds(config: TrainConfig, n_updates: int, seconds: float) -> dict[str, float]:
@@ -168,15 +163,15 @@ def speeds(config: TrainConfig, n_updates: int, seconds: float) -> dict[str, flo
     return {"speed/env_steps_per_s": n_env_steps / seconds, "speed/updates_per_s": n_updates / seconds}
 
 
-def evaluation(task: Task, actor_params: Any) -> dict[str, float]:
+def evaluation(task: Task, policy: Any) -> dict[str, float]:
     """Figures of a policy, as a row of metrics has them."""
-    figures = task.evaluate(actor_params)[0].to_dict()
+    figures = task.evaluate(policy)[0].to_dict()
     return {f"evaluation/{name}": x for name, x in figures.items() if not isinstance(x, tuple)}
 
 
 def counts(state: TrainState) -> dict[str, int]:
     """What a run has done, as a row of metrics has it."""
-    return {"env_steps": int(state.n_env_steps), "updates": int(state.agent.step)}
+    return {"env_steps": int(state.n_env_steps), "updates": int(state.n_updates)}
 
 
 def record(run: Run, board: SummaryWriter, epoch: int, done: dict[str, int], row: dict[str, float]) -> None:

@@ -12,9 +12,12 @@ from jax.sharding import Mesh
 from matplotlib.figure import Figure
 
 from mjx_softarm.env import ReachEnv
+from train.agent.hindsight_tqc import HindsightTQC
+from train.agent.imitation import Imitation
+from train.agent.learner import Learner
 from train.config import ImitationConfig, TrainConfig
 from train.demos.demonstrations import Demonstrations
-from train.epoch.imitation import ImitationJob
+from train.epoch.goals import DemonstratedGoals
 from train.epoch.job import Job, TrainState
 from train.runs import plots
 from train.runs.evaluate import N_GOALS, Evaluator
@@ -26,11 +29,16 @@ class Task(NamedTuple):
 
     job: Job
     title: str  # of the table of figures
-    evaluate: Callable[[Any], tuple[Any, ...]]  # actor -> figures (`to_dict`), and what was reached
+    evaluate: Callable[[Any], tuple[Any, ...]]  # policy -> figures (`to_dict`), and what was reached
     picture_names: tuple[str, ...]
     pictures: Callable[..., dict[str, Figure]]  # rows of metrics, what was reached -> by those names
     headline: Callable[[dict[str, float]], str]  # row of metrics with an evaluation -> a few words
     prepare: Callable[[TrainState, int], TrainState]  # before the epoch of that number
+
+
+def learner_of(config: TrainConfig, env: ReachEnv) -> Learner:
+    """Return the learner that a config of a reach run names."""
+    return HindsightTQC(config, env)
 
 
 def task_of(
@@ -38,20 +46,28 @@ def task_of(
     env: ReachEnv,
     demonstrations: Demonstrations | None = None,
     mesh: Mesh | None = None,
+    learner: Learner | None = None,
 ) -> Task:
-    """What a run of this config learns; demonstrations are needed where it learns from them.
+    """Return what a run of this config learns.
+
+    Args:
+        config: of the run.
+        env: of its arms.
+        demonstrations: needed where the config is of learning from them.
+        mesh: devices to train on; None is one device.
+        learner: in the place of the config's.
 
     Raises:
-        ConfigError: it cannot be split evenly over the devices of the mesh.
+        ConfigError: the run cannot be split evenly over the devices of the mesh.
     """
     if isinstance(config, ImitationConfig):
         assert demonstrations is not None
-        return _imitation(config, env, demonstrations, mesh)
-    job = Job(config, env, mesh)
+        return _imitation(config, env, demonstrations, mesh, learner)
+    job = Job(config, env, learner or learner_of(config, env), mesh=mesh)
     return Task(
         job=job,
         title=f"{N_GOALS} held-out goals",
-        evaluate=Evaluator(env, job.agent),
+        evaluate=Evaluator(env, job.learner),
         picture_names=plots.REACH_PICTURES,
         pictures=plots.reach_pictures,
         headline=lambda row: f"held-out median {row['evaluation/median_mm']:.1f} mm",
@@ -60,18 +76,24 @@ def task_of(
 
 
 def _imitation(
-    config: ImitationConfig, env: ReachEnv, demonstrations: Demonstrations, mesh: Mesh | None
+    config: ImitationConfig,
+    env: ReachEnv,
+    demonstrations: Demonstrations,
+    mesh: Mesh | None,
+    learner: Learner | None,
 ) -> Task:
-    job = ImitationJob(config, env, demonstrations, mesh)
-    evaluate = PositionEvaluator(env, job.agent, demonstrations.positions, job.goals_of(0))
+    learner = learner or Imitation(HindsightTQC(config, env), config, env, demonstrations)
+    goals = DemonstratedGoals(config, env, demonstrations.positions)
+    job = Job(config, env, learner, goals, mesh)
+    evaluate = PositionEvaluator(env, learner, demonstrations.positions, goals.of_stage(0))
 
     def prepare(state: TrainState, epoch: int) -> TrainState:
         every = config.rebalance_epochs
         if every and epoch and epoch % every == 0 and epoch not in config.stage_epochs:
-            summary, _ = evaluate(state.agent.mean_actor_params)
-            state = job.rebalance(state, epoch, summary.error_mm)
+            summary, _ = evaluate(job.policy(state))
+            state = goals.rebalance(state, epoch, summary.error_mm)
         else:
-            state = job.begin_stage(state, epoch)
+            state = goals.begin_stage(job, state, epoch)
         return job.place(state)
 
     return Task(

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, cast
 
 import jax
@@ -22,8 +22,9 @@ from jax import Array
 from mjx_softarm._support import xla
 from mjx_softarm.env import Randomisation, ReachEnv
 from mjx_softarm.mdp.rewards import RewardConfig
+from train.agent.hindsight import HindsightConfig
+from train.agent.learner import Learner
 from train.config import TrainConfig
-from train.epoch.hindsight import HindsightConfig
 from train.epoch.job import Job, TrainState
 
 
@@ -48,7 +49,7 @@ VARIABLE = (
     "env.clearance_margin_mm",
 )
 
-_AXES = cast(Any, TrainState)(arms=0, agent=0, memory=0, key=0, n_env_steps=None, n_unsettled=0)
+_AXES = TrainState(**{**dict.fromkeys(TrainState._fields, cast(Any, 0)), "n_env_steps": cast(Any, None)})
 
 
 def setting(config: Any, path: str) -> Any:
@@ -72,9 +73,23 @@ class SweepJob:
     `n_env_steps`. `n_traces` counts how often the epoch was traced: once in a sweep.
     """
 
-    def __init__(self, configs: Sequence[TrainConfig], varied: Sequence[str], env: ReachEnv):
-        """Of members whose configs differ in their seeds and in the settings `varied` alone."""
+    def __init__(
+        self,
+        configs: Sequence[TrainConfig],
+        varied: Sequence[str],
+        env: ReachEnv,
+        learner_of: Callable[[TrainConfig, ReachEnv], Learner],
+    ):
+        """Compile nothing yet.
+
+        Args:
+            configs: of the members, which differ in their seeds and in the settings `varied` alone.
+            varied: names of settings.
+            env: of the first member.
+            learner_of: config and environment of a member -> its learner.
+        """
         self.config, self.env, self.n = configs[0], env, len(configs)
+        self.learner_of, self.learner = learner_of, learner_of(configs[0], env)
         self.keys = jnp.stack([jax.random.PRNGKey(config.seed) for config in configs])
         self.numbers = {
             path: jnp.asarray([setting(config, path) for config in configs], jnp.float32) for path in varied
@@ -95,9 +110,9 @@ class SweepJob:
         """As `Job.epoch`, with metrics (n,)."""
         return self._epoch_all(states, self.numbers)
 
-    def actor_params(self, states: TrainState, k: int) -> Any:
-        """Parameters of a member's actor."""
-        return self._take(states.agent.mean_actor_params, k)
+    def policy(self, states: TrainState, k: int) -> Any:
+        """Return the parameters of a member's policy."""
+        return self.learner.policy(self._take(states.learner, k))
 
     def member(self, states: TrainState, k: int) -> TrainState:
         """The state of one member, as an ordinary run has it."""
@@ -114,17 +129,18 @@ class SweepJob:
         return states._replace(n_env_steps=members[0].n_env_steps)
 
     def _init(self, key: Array, numbers: Mapping[str, Array]) -> TrainState:
-        return self._job(numbers)._init(key)
+        return self._job(numbers).first(key)
 
     def _epoch(self, state: TrainState, numbers: Mapping[str, Array]) -> tuple[TrainState, dict[str, Array]]:
         self.n_traces += 1
-        return self._job(numbers)._epoch(state)
+        return self._job(numbers).advance(state)
 
     def _job(self, numbers: Mapping[str, Array]) -> Job:
         config = self.config
         for path, number in numbers.items():
             config = _with_number(config, path, number)
-        return Job(config, with_env_config(self.env, config.env))
+        env = with_env_config(self.env, config.env)
+        return Job(config, env, self.learner_of(config, env))
 
 
 def _with_number(config: Any, path: str, number: Array) -> Any:

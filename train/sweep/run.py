@@ -36,7 +36,7 @@ from train.runs.run import (
     record,
     speeds,
 )
-from train.runs.task import Task, task_of
+from train.runs.task import Task, learner_of, task_of
 from train.sweep.job import SweepJob, with_env_config
 
 SWEEP_FILE = "sweep.json"
@@ -121,7 +121,7 @@ def train(sweep: Sweep, console: Console) -> None:
     console.print("drawing goals from the reachable workspace ...")
     run = sweep.runs[0]
     env = ReachEnv(run.spec, run.config.env, run.s2r)
-    job = SweepJob([run.config for run in sweep.runs], sweep.varied, env)
+    job = SweepJob([run.config for run in sweep.runs], sweep.varied, env, learner_of)
     tasks, config, epoch = _tasks(sweep, env), sweep.config, sweep.epoch
     if epoch:
         console.print(f"continuing after epoch {epoch} of {config.n_epochs}")
@@ -134,10 +134,10 @@ def train(sweep: Sweep, console: Console) -> None:
             states, rows = _timed_epoch(job, states)
             epoch += 1
             stop, due = bool(asked), config.evaluates_after(epoch)
-            done = {"env_steps": int(states.n_env_steps), "updates": int(states.agent.step[0])}
+            done = {"env_steps": int(states.n_env_steps), "updates": int(states.n_updates[0])}
             for k, (run, board, row) in enumerate(zip(sweep.runs, boards, rows, strict=True)):
                 if due:
-                    row |= evaluation(tasks[run.config.env], job.actor_params(states, k))
+                    row |= evaluation(tasks[run.config.env], job.policy(states, k))
                 record(run, board, epoch, done, row)
                 if due or stop:
                     run.save(epoch, job.member(states, k))
@@ -147,7 +147,7 @@ def train(sweep: Sweep, console: Console) -> None:
             if stop and epoch < config.n_epochs:
                 raise Interrupted(f"stopped after epoch {epoch}; continue with --resume {sweep.path}")
     for k, run in enumerate(sweep.runs):
-        finish(run, tasks[run.config.env], job.actor_params(states, k))
+        finish(run, tasks[run.config.env], job.policy(states, k))
 
 
 def _tasks(sweep: Sweep, env: ReachEnv) -> dict[EnvConfig, Task]:
@@ -172,11 +172,11 @@ def _start(sweep: Sweep, job: SweepJob, epoch: int) -> TrainState:
 def _timed_epoch(job: SweepJob, states: TrainState) -> tuple[TrainState, list[dict[str, float]]]:
     """The next states, and a row of metrics for each member; speeds are those of one member."""
     start = time.perf_counter()
-    updates = int(states.agent.step[0])
+    updates = int(states.n_updates[0])
     states, metrics = job.epoch(states)
     metrics = jax.device_get(metrics)
     seconds = time.perf_counter() - start
-    speed = speeds(job.config, int(states.agent.step[0]) - updates, seconds)
+    speed = speeds(job.config, int(states.n_updates[0]) - updates, seconds)
     return states, [{name: float(x[k]) for name, x in metrics.items()} | speed for k in range(job.n)]
 
 

@@ -115,7 +115,7 @@ def test_held_out_goals_are_evaluated_as_the_trainer_does_it():
     params = agent.init(jax.random.PRNGKey(3)).actor_params
     evaluator = Evaluator(env, agent, n_goals=12)
     reached = evaluator._workspace(params, evaluator.goals)
-    found = HeldOut(env, 12).tip_error_mm(lambda obs: np.asarray(agent.act_mode(params, obs)))
+    found = HeldOut(env, 12).tip_error_mm(lambda obs: np.asarray(agent.mode(params, obs)))
     assert np.ptp(found) > 10.0
     np.testing.assert_allclose(found, reached.tip_error_mm, atol=0.01)
 

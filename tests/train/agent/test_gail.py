@@ -121,7 +121,7 @@ def test_an_expert_is_recovered_from_its_actions_alone():
         return (tqc.update(agent, batch, key_tqc)[0], discriminator), None
 
     def error(agent):
-        return float(jnp.mean(jnp.abs(tqc.act_mode(agent.actor_params, goals) - answers)))
+        return float(jnp.mean(jnp.abs(tqc.mode(agent.actor_params, goals) - answers)))
 
     states = (tqc.init(jax.random.PRNGKey(0)), gail.init(jax.random.PRNGKey(1)))
     before = error(states[0])

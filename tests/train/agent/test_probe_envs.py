@@ -85,7 +85,7 @@ def value(state, obs, action):
 
 
 def best_action(state, obs):
-    return np.asarray(AGENT.act_mode(state.actor_params, jnp.asarray(obs, jnp.float32)[:, None]))[:, 0]
+    return np.asarray(AGENT.mode(state.actor_params, jnp.asarray(obs, jnp.float32)[:, None]))[:, 0]
 
 
 def greatest_entropy():

@@ -17,6 +17,7 @@ import pytest
 from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.spec import ArmSpec
 from train.__main__ import main
+from train.agent.hindsight_tqc import HindsightTQC
 from train.agent.tqc import TQCConfig
 from train.config import ConfigError, TrainConfig
 from train.epoch.devices import mesh_of, split
@@ -48,9 +49,13 @@ def env():
     return ReachEnv(SHORT, CONFIG.env)
 
 
+def new_job(config, env, devices):
+    return Job(config, env, HindsightTQC(config, env), mesh=mesh_of(devices))
+
+
 @pytest.fixture(scope="module")
 def jobs(env):
-    return {n: Job(CONFIG, env, mesh_of(n)) for n in ("1", str(N_DEVICES))}
+    return {n: new_job(CONFIG, env, n) for n in ("1", str(N_DEVICES))}
 
 
 @pytest.fixture(scope="module")
@@ -67,13 +72,13 @@ def trained(jobs):
 
 def test_many_devices_compute_what_one_does(trained):
     (one, metrics_of_one), (many, metrics) = trained.values()
-    assert int(many.agent.step) == 4 * 16 * 2 / 2 - 16  # so the networks have moved
+    assert int(many.n_updates) == 4 * 16 * 2 / 2 - 16  # so the networks have moved
     for name, value in metrics.items():
         np.testing.assert_allclose(value, metrics_of_one[name], rtol=1e-4, atol=1e-4, err_msg=name)
     close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-3)  # noqa: E731  # poses in mm
     jax.tree.map(close, jax.device_get(many.memory), jax.device_get(one.memory))
     close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6)  # noqa: E731
-    jax.tree.map(close, jax.device_get(many.agent.actor_params), jax.device_get(one.agent.actor_params))
+    jax.tree.map(close, jax.device_get(many.learner.actor_params), jax.device_get(one.learner.actor_params))
 
 
 def test_each_device_has_its_share_of_arms_and_replay_and_all_of_the_networks(trained):
@@ -82,7 +87,7 @@ def test_each_device_has_its_share_of_arms_and_replay_and_all_of_the_networks(tr
         shapes = {shard.data.shape for shard in leaf.addressable_shards}
         assert shapes == {(leaf.shape[0] // N_DEVICES, *leaf.shape[1:])}
         assert len({shard.device for shard in leaf.addressable_shards}) == N_DEVICES
-    assert all(leaf.is_fully_replicated for leaf in jax.tree.leaves(state.agent))
+    assert all(leaf.is_fully_replicated for leaf in jax.tree.leaves(state.learner))
 
 
 _MOVES = re.compile(r"= .* (all-gather|all-reduce|all-to-all|collective-permute|reduce-scatter)")
@@ -111,13 +116,13 @@ def test_a_checkpoint_of_many_devices_continues_on_one(tmp_path, jobs, trained):
     state, _ = trained[str(N_DEVICES)]
     run = Run.create(tmp_path / "run", CONFIG, SHORT)
     run.save(4, state)
-    expected = jax.device_get(state.agent.actor_params)
+    expected = jax.device_get(state.learner.actor_params)
     for n, job in jobs.items():
         epoch, restored = run.restore(job.init(jax.random.PRNGKey(1)))
         assert epoch == 4
-        jax.tree.map(np.testing.assert_array_equal, jax.device_get(restored.agent.actor_params), expected)
+        jax.tree.map(np.testing.assert_array_equal, jax.device_get(restored.learner.actor_params), expected)
         following, _ = job.epoch(restored)
-        assert int(following.agent.step) == int(state.agent.step) + 16, n
+        assert int(following.n_updates) == int(state.n_updates) + 16, n
         assert job.n_traces == 1  # so it came back as the epoch expects it
 
 
@@ -129,7 +134,7 @@ from train.agent.tqc import TQC
 run = Run.open(Path(sys.argv[1]))
 assert len(jax.devices()) == 1
 agent = TQC(18, 3, run.config.tqc, run.config.n_updates)
-params = run.restore_part("agent", jax.eval_shape(agent.init, jax.random.PRNGKey(0))).actor_params
+params = run.restore_part("learner", jax.eval_shape(agent.init, jax.random.PRNGKey(0))).actor_params
 print(sum(float(np.abs(x).sum()) for x in jax.tree.leaves(params)))
 """
 
@@ -144,7 +149,7 @@ def test_a_policy_of_many_devices_is_read_where_there_is_one(tmp_path, trained):
         text=True,
     )
     assert done.returncode == 0, done.stderr
-    leaves = jax.tree.leaves(jax.device_get(state.agent.actor_params))
+    leaves = jax.tree.leaves(jax.device_get(state.learner.actor_params))
     np.testing.assert_allclose(float(done.stdout), sum(np.abs(x).sum() for x in leaves), rtol=1e-5)
 
 
@@ -152,7 +157,7 @@ def test_a_policy_of_many_devices_is_read_where_there_is_one(tmp_path, trained):
 def test_what_cannot_be_split_evenly_is_named(env, name):
     config = dataclasses.replace(CONFIG, **{name: getattr(CONFIG, name) + 4})
     with pytest.raises(ConfigError, match=f"^{name}: got .* expected a multiple of the {N_DEVICES}"):
-        Job(config, env, mesh_of(str(N_DEVICES)))
+        new_job(config, env, str(N_DEVICES))
 
 
 @pytest.mark.parametrize("devices", ["0", "-1", "two", "1000000", "localhost:1/0"])

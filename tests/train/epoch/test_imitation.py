@@ -10,12 +10,16 @@ import pytest
 from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.spec import ArmSpec
 from train.agent.gail import GailConfig
+from train.agent.hindsight import HindsightConfig
+from train.agent.hindsight_tqc import HindsightTQC
+from train.agent.imitation import Imitation
+from train.agent.learner import Experience
 from train.agent.tqc import TQCConfig, Transition
 from train.config import ConfigError, ImitationConfig, Stage, from_dict, override, to_dict
 from train.demos.demonstrations import Demonstrations
 from train.epoch.devices import mesh_of
-from train.epoch.hindsight import Experience, HindsightConfig
-from train.epoch.imitation import ImitationJob, goal_weights
+from train.epoch.goals import DemonstratedGoals, goal_weights
+from train.epoch.job import Job
 from train.runs.evaluate import Reached
 from train.runs.positions import PositionEvaluator, summarise
 
@@ -49,15 +53,20 @@ def demonstrations(env):
     return Demonstrations(positions, actions, np.zeros(N, np.int32))
 
 
+def new_job(config, env, demonstrations, mesh=None):
+    learner = Imitation(HindsightTQC(config, env), config, env, demonstrations)
+    return Job(config, env, learner, DemonstratedGoals(config, env, demonstrations.positions), mesh)
+
+
 @pytest.fixture(scope="module")
 def job(env, demonstrations):
-    return ImitationJob(CONFIG, env, demonstrations)
+    return new_job(CONFIG, env, demonstrations)
 
 
 def run(job, state, first, last):
     told = []
     for epoch in range(first, last):
-        state, metrics = job.epoch(job.begin_stage(state, epoch))
+        state, metrics = job.epoch(job.goals.begin_stage(job, state, epoch))
         told.append(metrics)
     return state, told
 
@@ -67,7 +76,7 @@ def copy(state):
 
 
 def indices(job, poses):
-    distance = np.linalg.norm(np.asarray(poses)[:, None] - np.asarray(job.positions), axis=-1)
+    distance = np.linalg.norm(np.asarray(poses)[:, None] - np.asarray(job.goals.positions), axis=-1)
     assert np.all(distance.min(axis=1) == 0.0)
     return distance.argmin(axis=1)
 
@@ -84,18 +93,18 @@ def test_stages_change_the_goals_and_thin_the_replay(job):
     state, _ = run(job, job.init(jax.random.PRNGKey(0)), 0, 4)
     n = int(state.memory.size)
     assert n == 64 and set(indices(job, state.memory.data.goal)) <= {0, 2, 4}
-    later = job.begin_stage(copy(state), 4)
-    assert int(later.memory.size) == n // 4 and np.all(later.imitation.goal_weight == 1.0)
+    later = job.goals.begin_stage(job, copy(state), 4)
+    assert int(later.memory.size) == n // 4 and np.all(later.goals == 1.0)
     state, _ = run(job, state, 4, 8)
     assert {1, 3, 5} & set(indices(job, state.memory.data.goal))
 
 
 def test_a_run_traces_its_epoch_once_and_learns_in_it(job):
     state = job.init(jax.random.PRNGKey(1))
-    before = jax.device_get(state.imitation.discriminator.params)
+    before = jax.device_get(state.learner.discriminator.params)
     state, told = run(job, state, 0, 8)
     assert job.n_traces == 1
-    after = jax.device_get(state.imitation.discriminator.params)
+    after = jax.device_get(state.learner.discriminator.params)
     assert not np.array_equal(before["params"]["head"]["kernel"], after["params"]["head"]["kernel"])
     assert all(np.isfinite(value) for value in told[-1].values())
     assert float(told[-1]["gail/reward"]) < 0.0
@@ -110,16 +119,16 @@ def test_a_run_continues_bit_for_bit_across_a_stage(job):
 
 
 def test_many_devices_learn_as_one_does_across_a_stage_and_a_balance(env, demonstrations, job):
-    spread = ImitationJob(CONFIG, env, demonstrations, mesh_of("8"))
+    spread = new_job(CONFIG, env, demonstrations, mesh_of("8"))
     figures = []
     for each in (job, spread):
         state = each.init(jax.random.PRNGKey(5))
         for epoch in range(6):
-            state = each.begin_stage(state, epoch)
+            state = each.goals.begin_stage(each, state, epoch)
             if epoch == 5:
-                state = each.rebalance(state, epoch, np.arange(float(N)))
+                state = each.goals.rebalance(state, epoch, np.arange(float(N)))
             state, metrics = each.epoch(each.place(state))
-        figures.append((jax.device_get(metrics), jax.device_get(state.agent.actor_params)))
+        figures.append((jax.device_get(metrics), jax.device_get(each.policy(state))))
     assert spread.n_traces == 1
     for one, many in zip(*map(jax.tree.leaves, figures), strict=True):
         np.testing.assert_allclose(many, one, rtol=1e-3, atol=1e-4)
@@ -129,9 +138,10 @@ def test_the_experts_rows_are_right_answers_to_their_goals(job):
     """What the arm reaches with an expert's action, from the start of that row, is the row's goal."""
     state, _ = run(job, job.init(jax.random.PRNGKey(3)), 0, 2)
     stored = jax.tree.map(lambda x: x[:16], state.memory.data)
-    index = job._index_of(stored.goal)
-    batch = job._with_expert(job._relabel(stored, jax.random.PRNGKey(0)), stored, index)
-    assert job.n_expert == 4
+    index = indices(job, stored.goal)
+    own = job.learner.learner.transitions(stored, jax.random.PRNGKey(0))
+    batch = job.learner.with_expert(own, stored, index)
+    assert job.learner.n_expert == 4
     arms = jax.vmap(job.env.reset)(jax.random.split(jax.random.PRNGKey(4), 4))
     after = jax.vmap(job.env.step)(arms, batch.action[:4])
     np.testing.assert_allclose(after.pipeline_state.pose[:, :3], stored.goal[:4, :3], atol=0.01)
@@ -143,33 +153,33 @@ def test_the_experts_rows_are_right_answers_to_their_goals(job):
 
 def test_rewards_are_learned_for_goals_asked_for_and_clearance_is_always_charged(env, demonstrations):
     config = dataclasses.replace(CONFIG, learned_weight=2.0, hand_made_weight=0.5)
-    job = ImitationJob(config, env, demonstrations)
-    params = job.gail.init(jax.random.PRNGKey(0)).params
+    learner = new_job(config, env, demonstrations).learner
+    discriminator = learner.init(jax.random.PRNGKey(0)).discriminator
     n = 8
-    pose, goal = job.positions[jnp.arange(n) % N], job.positions[(jnp.arange(n) + 1) % N]
+    pose, goal = learner.positions[jnp.arange(n) % N], learner.positions[(jnp.arange(n) + 1) % N]
     cost = jnp.arange(float(n))
     given = -3.0 - cost  # the environment's reward, what clearance costs included, of all but the expert's
     start = env.observe(pose, goal)
     hindsight = jnp.array([False] * 6 + [True] * 2)
     obs = jnp.where(hindsight[:, None], env.observe(pose, goal + jnp.array([1.0, 0, 0, 0, 0, 0])), start)
-    action, zero = jnp.zeros((n, job.env.action_size)), jnp.zeros(n)
-    first = jnp.arange(n) < job.n_expert
+    action, zero = jnp.zeros((n, env.action_size)), jnp.zeros(n)
+    first = jnp.arange(n) < learner.n_expert
     batch = Transition(obs, action, jnp.where(first, 100.0, given), obs, zero)
     stored = Experience(pose, goal, action, pose, action, zero > 0, cost, zero)
-    rewards, _ = job._rewards(batch, stored, start, params)
-    learned = np.where(hindsight, 0.0, job.gail.reward(params, obs, action))
-    assert job.n_expert == 4 and np.all(learned[:6] < 0.0)
+    rewards, _ = learner.rewards(batch, stored, start, discriminator)
+    learned = np.where(hindsight, 0.0, learner.gail.reward(discriminator.params, obs, action))
+    assert learner.n_expert == 4 and np.all(learned[:6] < 0.0)
     expected = np.where(first, 0.5 * 100.0, 0.5 * -3.0 - cost) + 2.0 * learned
     np.testing.assert_allclose(rewards, expected, rtol=1e-5)
 
 
 def test_frozen_reward_stays_and_sees_no_experts_actions(env, demonstrations):
-    frozen = ImitationJob(dataclasses.replace(CONFIG, frozen=True), env, demonstrations)
+    frozen = new_job(dataclasses.replace(CONFIG, frozen=True), env, demonstrations)
     state = frozen.init(jax.random.PRNGKey(0))
-    before = jax.device_get(state.imitation.discriminator)
+    before = jax.device_get(state.learner.discriminator)
     state, _ = run(frozen, state, 0, 3)
-    jax.tree.map(np.testing.assert_array_equal, before, jax.device_get(state.imitation.discriminator))
-    assert frozen.n_expert == 0 and int(state.agent.step) > 0
+    jax.tree.map(np.testing.assert_array_equal, before, jax.device_get(state.learner.discriminator))
+    assert frozen.learner.n_expert == 0 and int(state.n_updates) > 0
 
 
 def test_goals_shift_to_the_positions_that_are_missed_by_most():
@@ -180,8 +190,8 @@ def test_goals_shift_to_the_positions_that_are_missed_by_most():
 
 
 def test_rebalanced_goals_are_drawn_by_their_weights(job):
-    state = job.rebalance(job.init(jax.random.PRNGKey(0)), 4, np.array([0.0, 0, 0, 0, 0, 10.0]))
-    arms = jax.vmap(lambda key: job._between_positions(state.arms, state.imitation.goal_weight, key))
+    state = job.goals.rebalance(job.init(jax.random.PRNGKey(0)), 4, np.array([0.0, 0, 0, 0, 0, 10.0]))
+    arms = jax.vmap(lambda key: job.goals.begin(state.goals, state.arms, key))
     goals = arms(jax.random.split(jax.random.PRNGKey(5), 500)).pipeline_state.goal.reshape(-1, 6)
     share = np.mean(indices(job, goals) == 5)
     assert abs(share - (0.5 / 6 + 0.5)) < 4 * np.sqrt(0.25 / len(goals))
@@ -191,12 +201,12 @@ def test_positions_are_evaluated_with_body_and_pressures(env, job, demonstration
     class Perfect:
         """An agent whose actor knows every answer."""
 
-        def act_mode(self, actor_params, obs):
+        def mode(self, policy, obs):
             goal = obs[6:12] * job.env.scale.scale + job.env.scale.centre
-            nearest = jnp.argmin(jnp.sum((job.positions - goal) ** 2, axis=-1))
-            return job.actions[nearest]
+            nearest = jnp.argmin(jnp.sum((job.learner.positions - goal) ** 2, axis=-1))
+            return job.learner.actions[nearest]
 
-    first = job.goals_of(0)
+    first = job.goals.of_stage(0)
     figures, at = PositionEvaluator(env, Perfect(), demonstrations.positions, first)({})
     assert figures.success_share == figures.reached_share == 1.0 and figures.max_mm < 0.05
     assert len(figures.error_mm) == N and np.isinf(at.reached.clearance_mm).all()

@@ -9,6 +9,7 @@ import pytest
 
 from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.spec import ArmSpec
+from train.agent.hindsight_tqc import HindsightTQC
 from train.agent.tqc import TQCConfig
 from train.config import TrainConfig
 from train.epoch.job import Job
@@ -27,6 +28,10 @@ CONFIG = TrainConfig(
 )
 
 
+def new_job(config, env):
+    return Job(config, env, HindsightTQC(config, env))
+
+
 # A short arm compiles in seconds, with MJX too.
 SHORT = {"n_sections": 1, "links_per_section": 2}
 
@@ -34,18 +39,18 @@ SHORT = {"n_sections": 1, "links_per_section": 2}
 @pytest.mark.parametrize("change", [{"engine": "mjx"}, {"mode": "dynamic", "dynamic_step_s": 0.04}], ids=str)
 def test_the_other_engines_train_by_changing_a_word(change):
     config = dataclasses.replace(CONFIG, env=dataclasses.replace(CONFIG.env, **change))
-    job = Job(config, ReachEnv(ArmSpec.default().replace(structure=SHORT), config.env))
+    job = new_job(config, ReachEnv(ArmSpec.default().replace(structure=SHORT), config.env))
     state = job.init(jax.random.PRNGKey(0))
     for _ in range(3):
         state, metrics = job.epoch(state)
-    assert job.n_traces == 1 and int(state.agent.step) == 4 * (3 * 2 - 2)
+    assert job.n_traces == 1 and int(state.n_updates) == 4 * (3 * 2 - 2)
     assert int(state.memory.size) == 3 * 2 * 8 - int(state.n_unsettled) > 40
     assert all(np.isfinite(value) for value in metrics.values())
 
 
 @pytest.fixture(scope="module")
 def job():
-    return Job(CONFIG, ReachEnv(config=CONFIG.env))
+    return new_job(CONFIG, ReachEnv(config=CONFIG.env))
 
 
 def start(job):
@@ -63,13 +68,13 @@ def test_a_run_traces_its_epoch_once_and_counts_what_it_did(job):
     assert job.n_traces == 1
     assert int(state.n_env_steps) == 4 * 2 * 8
     # Warm-up lasts until 16 steps are stored: the update after the second vector step is the first.
-    assert int(state.agent.step) == 4 * (4 * 2 - 2)
+    assert int(state.n_updates) == 4 * (4 * 2 - 2)
     assert int(state.memory.size) == 64 and int(state.n_unsettled) == 0
     assert all(np.isfinite(value) for value in metrics.values())
 
 
 def test_a_start_compiles_the_epoch_once_beside_what_comes_first(job):
-    other = Job(CONFIG, job.env)
+    other = new_job(CONFIG, job.env)
     state = other.start(lambda: start(other))
     assert other.n_traces == 1  # before it is called
     assert_equal(state, start(job))
@@ -85,12 +90,12 @@ def test_what_fails_beside_the_compilation_is_raised(job):
         raise RunError("no such run")
 
     with pytest.raises(RunError, match="no such run"):
-        Job(CONFIG, job.env).start(fail)
+        new_job(CONFIG, job.env).start(fail)
 
 
 def test_warm_up_explores_uniformly_and_does_not_learn(job):
     state, metrics = job.epoch(start(job))
-    assert int(state.agent.step) == 0 and metrics["tqc/critic_loss"] == 0.0
+    assert int(state.n_updates) == 0 and metrics["tqc/critic_loss"] == 0.0
     action = np.asarray(state.memory.data.action)[:16]
     assert np.abs(action).max() > 0.9 and abs(action.mean()) < 0.15
 

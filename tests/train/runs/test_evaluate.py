@@ -47,7 +47,7 @@ class Scripted:
         self._goals = jnp.stack([env.observe(goal, goal) for goal in goals])[:, 6:12]
         self._actions = actions
 
-    def act_mode(self, _, obs):
+    def mode(self, _, obs):
         distance = jnp.sum((self._goals - obs[6:12]) ** 2, axis=-1)
         return self._actions[jnp.argmin(distance)]
 

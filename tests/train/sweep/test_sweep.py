@@ -18,6 +18,7 @@ from mjx_softarm._support.provenance import write_json
 from mjx_softarm.env import EnvConfig, Randomisation, ReachEnv
 from mjx_softarm.spec import ArmSpec
 from train.__main__ import main
+from train.agent.hindsight_tqc import HindsightTQC
 from train.agent.tqc import TQCConfig
 from train.config import PRESETS, ConfigError, TrainConfig, override
 from train.epoch.job import Job
@@ -100,7 +101,7 @@ def members():
 
 @pytest.fixture(scope="module")
 def job(members, env):
-    return SweepJob(list(members.values()), VARIABLE, env)
+    return SweepJob(list(members.values()), VARIABLE, env, HindsightTQC)
 
 
 @pytest.fixture(scope="module")
@@ -120,18 +121,19 @@ def test_each_setting_that_may_be_varied_is_looked_at(members):
 
 def test_a_member_is_the_ordinary_run(members, job, trained):
     states, metrics = trained
-    alone = Job(members["other"], ReachEnv(SHORT, members["other"].env))
+    config, other_env = members["other"], ReachEnv(SHORT, members["other"].env)
+    alone = Job(config, other_env, HindsightTQC(config, other_env))
     state = alone.init(jax.random.PRNGKey(members["other"].seed))
     for row in metrics:
         state, expected = alone.epoch(state)
         for name, value in expected.items():
             np.testing.assert_allclose(row[name][1], value, rtol=2e-4, atol=2e-5, err_msg=name)
     first, own = job.member(states, 0), job.member(states, 1)
-    assert int(own.agent.step) > 0 and int(own.n_env_steps) == N_EPOCHS * 2 * 8
+    assert int(own.n_updates) > 0 and int(own.n_env_steps) == N_EPOCHS * 2 * 8
     assert jax.tree.map(shape_of, own) == jax.tree.map(shape_of, state)
     assert_close(own, state)
     with pytest.raises(AssertionError):  # the comparison can tell members apart
-        assert_close(first.agent, state.agent)
+        assert_close(first.learner, state.learner)
 
 
 def assert_close(a, b):
@@ -184,7 +186,7 @@ def ready(job, monkeypatch):
         prepare=None,
     )
     monkeypatch.setattr(sweep_run, "ReachEnv", lambda spec, config, s2r: job.env)
-    monkeypatch.setattr(sweep_run, "SweepJob", lambda configs, varied, env: job)
+    monkeypatch.setattr(sweep_run, "SweepJob", lambda configs, varied, env, learner_of: job)
     monkeypatch.setattr(sweep_run, "task_of", lambda config, env: task)
 
 

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from train.epoch.hindsight import Experience, HindsightConfig, relabel
+from train.agent.hindsight import HindsightConfig, relabel
+from train.agent.learner import Experience
 
 N_COPIES = 8  # of every transition, for shares that are as they should be
 

@@ -12,7 +12,6 @@ lengths it ended at: they lead to the same equilibrium with no chamber off its r
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
@@ -20,20 +19,8 @@ from jax import Array
 from mjx_softarm._support import draws
 from mjx_softarm.mdp import observation as obs
 from mjx_softarm.mdp import rewards
+from train.agent.learner import Experience
 from train.agent.tqc import Transition
-
-
-class Experience(NamedTuple):
-    """A transition as stored: poses rather than observations, so that the goal can be exchanged."""
-
-    pose: Array  # (..., 6) [mm, deg]
-    goal: Array  # (..., 6) [mm, deg]
-    action: Array  # (..., n_chambers) in [-1, 1]
-    next_pose: Array  # (..., 6) [mm, deg]
-    sensed_action: Array  # (..., n_chambers) the action that asks for the spring lengths reached
-    saturated: Array  # (...,) bool
-    clearance_cost: Array  # (...,) for a body close to a wall
-    n_steps: Array  # (...,) actions taken in the episode, this one included
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,140 @@
+"""A user's own learner, handed to the epoch: trained, evaluated, resumed and exported like any other."""
+
+import io
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from rich.console import Console
+
+from mjx_softarm.env import EnvConfig, ReachEnv
+from mjx_softarm.policy.file import load_policy
+from mjx_softarm.spec import ArmSpec
+from train.agent.networks import Actor
+from train.config import TrainConfig
+from train.runs import export
+from train.runs.checkpoint import Run, RunError
+from train.runs.estimator import Distilled
+from train.runs.evaluate import Evaluator
+from train.runs.run import train
+from train.runs.task import task_of
+
+SHORT = ArmSpec.default().replace(structure={"n_sections": 1, "links_per_section": 2})
+CONFIG = TrainConfig(
+    n_arms=16,
+    total_env_steps=512,
+    updates_per_env_step=1.0,
+    warmup_env_steps=32,
+    batch_size=64,
+    replay_capacity=512,
+    vector_steps_per_epoch=4,
+    evaluation_epochs=2,
+    env=EnvConfig(n_poses=256),
+)
+
+
+class Regression:
+    """A network fitted to the actions that led to the poses reached."""
+
+    def __init__(self, env):
+        self.env, self.network, self.optimizer = env, Actor(env.action_size, (16,)), optax.adam(1e-2)
+
+    def init(self, key):
+        params = self.network.init(key, jnp.zeros(self.env.observation_size))
+        return params, self.optimizer.init(params)
+
+    def act(self, state, obs, key):
+        action = self.mode(state[0], obs)
+        return jnp.clip(action + 0.3 * jax.random.normal(key, action.shape), -1.0, 1.0)
+
+    def policy(self, state):
+        return state[0]
+
+    def mode(self, policy, obs):
+        return jnp.tanh(self.network.apply(policy, obs)[0])
+
+    def update(self, state, sample, key):
+        stored = sample(key)
+        obs = self.env.observe(stored.pose, stored.next_pose)
+        error = lambda params: jnp.mean((self.mode(params, obs) - stored.sensed_action) ** 2)  # noqa: E731
+        loss, grads = jax.value_and_grad(error)(state[0])
+        updates, opt_state = self.optimizer.update(grads, state[1])
+        return (optax.apply_updates(state[0], updates), opt_state), {"regression/loss": loss}
+
+
+@pytest.fixture(scope="module")
+def task():
+    env = ReachEnv(SHORT, CONFIG.env)
+    task = task_of(CONFIG, env, learner=Regression(env))
+    return task._replace(evaluate=Evaluator(env, task.job.learner, n_goals=64))
+
+
+@pytest.fixture(scope="module")
+def run(task, tmp_path_factory):
+    """A run that was trained in one go."""
+    run = Run.create(tmp_path_factory.mktemp("own") / "run", CONFIG, SHORT)
+    train(run, task, Console(file=io.StringIO()))
+    return run
+
+
+def measured(run):
+    """All that a run measured but for speeds."""
+    rows = [{name: x for name, x in row.items() if "speed" not in name} for row in run.metrics()]
+    return rows, json.loads((run.path / "evaluation.json").read_text())
+
+
+def test_it_learns_in_the_epoch_and_is_evaluated(run):
+    rows, figures = measured(run)
+    assert rows[-1]["updates"] == 512 - 2 * 16  # those of the first two vector steps, before warm-up ended
+    assert rows[-1]["regression/loss"] < 0.3 * rows[1]["regression/loss"]
+    assert figures["median_mm"] < 0.5 * rows[1]["evaluation/median_mm"]
+
+
+def test_a_killed_run_of_it_ends_with_the_same_bits(run, task, tmp_path, monkeypatch):
+    killed, save = Run.create(tmp_path / "killed", CONFIG, SHORT), Run.save
+
+    def save_and_die(run, epoch, state):
+        save(run, epoch, state)
+        if epoch == 4:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(Run, "save", save_and_die)
+    with pytest.raises(KeyboardInterrupt):
+        train(killed, task, Console(file=io.StringIO()))
+    monkeypatch.setattr(Run, "save", save)
+    resumed = Run.open(killed.path)
+    train(resumed, task, Console(file=io.StringIO()))
+    assert measured(resumed) == measured(run)
+    shapes = jax.eval_shape(task.job.init, jax.random.PRNGKey(0))
+    jax.tree.map(np.testing.assert_array_equal, resumed.restore(shapes), run.restore(shapes))
+
+
+@pytest.fixture
+def quick_export(make_arm_model, monkeypatch):
+    model = make_arm_model(SHORT.n_chambers)
+    nothing = Distilled(model.estimator, model.spring_model, {}, {}, {})
+    monkeypatch.setattr(export, "arm_model", lambda env: (model, nothing))
+
+
+def test_the_exported_policy_acts_as_it_does(run, task, tmp_path, quick_export):
+    policy = load_policy(export.export_run(run, tmp_path / "policy.npz", task))
+    shapes = jax.eval_shape(task.job.init, jax.random.PRNGKey(0))
+    params = task.job.policy(run.restore(shapes)[1])
+    obs = np.random.default_rng(0).normal(size=(8, 18)).astype(np.float32)
+    (first, bias), (head, head_bias) = policy.layers
+    expected = np.tanh(np.maximum(obs @ first + bias, 0.0) @ head + head_bias)
+    np.testing.assert_allclose(task.job.learner.mode(params, obs), expected, atol=1e-5)
+
+
+def test_a_policy_that_the_file_cannot_hold_is_refused(run, task, tmp_path, quick_export, monkeypatch):
+    monkeypatch.setattr(task.job.learner, "policy", lambda state: {"params": {"other": state[0]}})
+    with pytest.raises(RunError, match="got .*'other'.* expected hidden_0"):
+        export.export_run(run, tmp_path / "policy.npz", task)
+
+
+def test_a_checkpoint_of_another_learner_is_refused(run, tmp_path):
+    with pytest.raises(RunError, match=f"{run.path}: its checkpoint has other parts or sizes"):
+        export.export_run(run, tmp_path / "policy.npz")

@@ -1,0 +1,170 @@
+"""Learning from demonstrations: a learned reward around an off-policy learner.
+
+An action of an arm at rest leads to the same pose from wherever it begins. So each demonstrated action is the
+expert's answer to its goal from any start, and the expert is put where the agent stood: the discriminator
+compares two actions for one observation, and nothing but the action can tell them apart. The expert's answers
+also take a share of each batch of the critics, with the learned reward like all others.
+
+The learned reward is for goals that were asked for, not for those of hindsight, which the discriminator does
+not know. Episodes end with the goal reached or by the clock, so a reward that is never positive rewards no
+delay.
+
+Shapes: B batch, O observation, A action, m demonstrated positions.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from mjx_softarm.env import ReachEnv
+from mjx_softarm.mdp import rewards
+from train.agent.gail import DiscriminatorState, Gail
+from train.agent.hindsight_tqc import OffPolicyLearner
+from train.agent.learner import Experience, Sample, check_same_shapes
+from train.agent.tqc import Transition
+from train.config import ImitationConfig
+from train.demos.demonstrations import Demonstrations
+
+# Difference of observations that is rounding; hindsight moves a goal by a millimetre or more.
+SAME_GOAL = 1e-5
+
+
+class ImitationState(NamedTuple):
+    """All that an update changes."""
+
+    agent: Any  # state of the wrapped learner
+    discriminator: DiscriminatorState | None  # None where no reward is learned or taken
+
+
+class Imitation:
+    """`Learner` that wraps an off-policy one and replaces its rewards and some rows of its batches."""
+
+    def __init__(
+        self,
+        learner: OffPolicyLearner,
+        config: ImitationConfig,
+        env: ReachEnv,
+        demonstrations: Demonstrations,
+    ):
+        self.learner, self.config, self.env = learner, config, env
+        self.positions = jnp.asarray(demonstrations.positions)  # (m, 6) [mm, deg]
+        self.actions = jnp.asarray(demonstrations.actions)  # (m, A)
+        self.gail = Gail(env.observation_size, env.action_size, config.gail)
+        expert_share = config.expert_share if config.learned_weight and not config.frozen else 0.0
+        self.n_expert = round(expert_share * config.batch_size)  # rows of a batch
+
+    def init(self, key: Array) -> ImitationState:
+        """Return fresh networks."""
+        key_agent, key_discriminator = jax.random.split(key)
+        discriminator = self.gail.init(key_discriminator) if self.config.learned_weight else None
+        return ImitationState(self.learner.init(key_agent), discriminator)
+
+    def act(self, state: ImitationState, obs: Array, key: Array) -> Array:
+        """Return the wrapped learner's exploring actions (..., A) at obs (..., O)."""
+        return self.learner.act(state.agent, obs, key)
+
+    def policy(self, state: ImitationState) -> Any:
+        """Return the parameters of the wrapped learner's policy."""
+        return self.learner.policy(state.agent)
+
+    def mode(self, policy: Any, obs: Array) -> Array:
+        """Return the wrapped learner's deterministic actions (..., A) at obs (..., O)."""
+        return self.learner.mode(policy, obs)
+
+    def update(
+        self, state: ImitationState, sample: Sample, key: Array
+    ) -> tuple[ImitationState, dict[str, Array]]:
+        """Take one gradient step of the discriminator, and with its reward one of the wrapped learner."""
+        key_sample, key_between, key_relabel, key_update = jax.random.split(key, 4)
+        discriminator, metrics = state.discriminator, {}
+
+        # Batch: stored transitions, relabelled, the first rows exchanged for the expert's.
+        stored = sample(key_sample)
+        index = self._index_of(stored.goal)  # (B,)
+        batch = self.with_expert(self.learner.transitions(stored, key_relabel), stored, index)
+
+        # Discriminator: the expert's actions against the agent's, at the same observations.
+        start = self.env.observe(stored.pose, stored.goal)  # (B, O)
+        if discriminator is not None and not self.config.frozen:
+            expert, agent = (start, self.actions[index]), (start, stored.action)
+            discriminator, metrics = self.gail.update(discriminator, expert, agent, key_between)
+
+        # Agent: the batch with rewards of the updated discriminator.
+        reward, of_reward = self.rewards(batch, stored, start, discriminator)
+        agent, losses = self.learner.learn(state.agent, batch._replace(reward=reward), key_update)
+        metrics = {f"gail/{name}": x for name, x in (metrics | of_reward).items()}
+        return ImitationState(agent, discriminator), losses | metrics
+
+    def adopt(self, state: ImitationState, agent: Any = None, reward: Any = None) -> ImitationState:
+        """Return the state with parts of other runs' learners.
+
+        Args:
+            state: of this learner.
+            agent: state whose networks are taken, of the wrapped learner or of one like this.
+            reward: state whose discriminator is taken.
+
+        Raises:
+            ValueError: a donor has no such part, or one of another size.
+        """
+        if agent is not None:
+            donor = agent.agent if isinstance(agent, ImitationState) else agent
+            state = state._replace(agent=self.learner.adopt(state.agent, donor))
+        if reward is not None:
+            if not isinstance(reward, ImitationState) or reward.discriminator is None:
+                raise ValueError("learned no reward; expected a run of `imitate` that did")
+            check_same_shapes("discriminator", reward.discriminator, state.discriminator)
+            state = state._replace(discriminator=reward.discriminator)
+        return state
+
+    def rewards(
+        self, batch: Transition, stored: Experience, start: Array, discriminator: DiscriminatorState | None
+    ) -> tuple[Array, dict[str, Array]]:
+        """Return the rewards (B,) of a batch, and metrics.
+
+        The cost of the body's clearance is charged whatever the weights; the expert keeps clear.
+
+        Args:
+            batch: made of `stored`, the expert's rows first.
+            stored: B transitions.
+            start (B, O): their own observations.
+            discriminator: that gives the learned reward, if there is one.
+        """
+        cost = stored.clearance_cost.at[: self.n_expert].set(0.0)  # (B,)
+        reward = self.config.hand_made_weight * (batch.reward + cost) - cost  # (B,)
+        if discriminator is None:
+            return reward, {}
+        asked = jnp.max(jnp.abs(batch.obs - start), axis=-1) < SAME_GOAL  # (B,) not a goal of hindsight
+        learned = self.gail.reward(discriminator.params, batch.obs, batch.action)  # (B,)
+        learned = jnp.where(asked, learned, 0.0)
+        mean = jnp.sum(learned) / jnp.maximum(jnp.sum(asked), 1)
+        return reward + self.config.learned_weight * learned, {"reward": mean}
+
+    def with_expert(self, batch: Transition, stored: Experience, index: Array) -> Transition:
+        """Return a batch whose first rows are the expert's answers, from the same starts to the same goals.
+
+        Args:
+            batch: made of `stored`.
+            stored: B transitions.
+            index (B,): of the demonstrated positions that are their goals.
+        """
+        n = self.n_expert
+        goal = self.positions[index[:n]]  # (n, 6)
+        reward, reached, _ = rewards.reward(
+            goal, goal, stored.n_steps[:n], jnp.zeros(n, bool), self.config.env.reward
+        )
+        expert = Transition(
+            obs=self.env.observe(stored.pose[:n], goal),
+            action=self.actions[index[:n]],
+            reward=reward,
+            next_obs=self.env.observe(goal, goal),
+            terminated=reached.astype(reward.dtype),
+        )
+        return jax.tree.map(lambda e, b: jnp.concatenate([e, b[n:]]), expert, batch)
+
+    def _index_of(self, goal: Array) -> Array:
+        """Return the indices (B,) of the demonstrated positions that are the goals (B, 6)."""
+        return jnp.argmin(jnp.sum((goal[:, None] - self.positions) ** 2, axis=-1), axis=-1)

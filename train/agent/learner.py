@@ -1,0 +1,67 @@
+"""The interface of a learner: what the epoch, evaluation, sweeps, checkpoints and export need of it.
+
+An epoch steps the arms, stores their transitions and calls `update` some times after each action. The learner
+decides what to do with the replay: sample it as it is stored, relabel it, or leave it and learn from its own
+rollouts. Anything that has the methods of `Learner` can be handed to `train.epoch.job.Job`; nothing need
+inherit from it.
+
+Shapes: O observation, A action.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol
+
+import jax
+from jax import Array
+
+
+class Experience(NamedTuple):
+    """A transition as stored: poses rather than observations, so that the goal can be exchanged."""
+
+    pose: Array  # (..., 6) [mm, deg]
+    goal: Array  # (..., 6) [mm, deg]
+    action: Array  # (..., n_chambers) in [-1, 1]
+    next_pose: Array  # (..., 6) [mm, deg]
+    sensed_action: Array  # (..., n_chambers) the action that asks for the spring lengths reached
+    saturated: Array  # (...,) bool
+    clearance_cost: Array  # (...,) for a body close to a wall
+    n_steps: Array  # (...,) actions taken in the episode, this one included
+
+
+Sample = Callable[[Array], Experience]  # key -> a batch of the replay, drawn uniformly with replacement
+
+
+class Learner(Protocol):
+    """Pure functions of a state, which is any pytree of arrays and all that an update changes."""
+
+    def init(self, key: Array) -> Any:
+        """Return the first state; no two of its leaves share a buffer, since the state is donated."""
+        ...
+
+    def act(self, state: Any, obs: Array, key: Array) -> Array:
+        """Return exploring actions (..., A) in [-1, 1] at observations (..., O)."""
+        ...
+
+    def policy(self, state: Any) -> Any:
+        """Return the parameters of the policy that is evaluated and exported.
+
+        Export needs them named and shaped as those of `train.agent.networks.Actor`.
+        """
+        ...
+
+    def mode(self, policy: Any, obs: Array) -> Array:
+        """Return the policy's deterministic actions (..., A) in [-1, 1] at observations (..., O)."""
+        ...
+
+    def update(self, state: Any, sample: Sample, key: Array) -> tuple[Any, dict[str, Array]]:
+        """Take one gradient step; return the next state and scalar metrics by name, such as "tqc/entropy"."""
+        ...
+
+
+def check_same_shapes(name: str, given: Any, own: Any) -> None:
+    """Raise ValueError where a donor's tree of arrays has other shapes than a run's own."""
+    got, expected = ([leaf.shape for leaf in jax.tree.leaves(tree)] for tree in (given, own))
+    if got != expected:
+        raise ValueError(f"{name}: got layers of {got}, expected {expected} as in the new run")
