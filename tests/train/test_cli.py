@@ -145,7 +145,7 @@ def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path, environment):
             "--resume goes alone: the run's own settings hold, got --seed, --set too",
         ),
         (["reach", "--set", "env.workspace_seed=20000"], "20000 draws the goals of the evaluation"),
-        (["reach", "--set", "hindsight.near_min_mm=0"], "near_min_mm must be > 0"),
+        (["reach", "--set", "hindsight.near_min_mm=0"], "expected 0 < near_min_mm"),
         (["reach", "--set", "evaluation_epochs=0"], "evaluation_epochs: got 0, expected at least 1"),
         (["evaluate", "absent"], "absent: not the folder of a run"),
         (["export", "absent"], "absent: not the folder of a run"),

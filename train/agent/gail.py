@@ -1,4 +1,4 @@
-"""The learned reward: a discriminator that tells the expert's actions from the agent's.
+"""Discriminator that tells the expert's actions from the agent's, and the reward learned by it.
 
 The logit h(s, a, g) is high where the expert acts. It is trained by cross-entropy, expert 1 and agent 0, with
 a penalty that holds the length of its gradient near one between the two; the reward log sigmoid(h), never
@@ -32,18 +32,18 @@ class GailConfig:
     hidden: tuple[int, ...] = (256, 256)
     learning_rate: float = 3e-4  # Adam
     gradient_penalty: float = 20.0  # the paper's lambda
-    input_scale: float = 10.0  # on observations and actions: the slope that the penalty asks of the logit
+    input_scale: float = 10.0  # factor on observations and actions, hence on the logit's slope
 
     def __post_init__(self) -> None:
         if self.input_scale <= 0.0:
-            raise ValueError(f"GailConfig.input_scale: expected a number > 0, got {self.input_scale}")
+            raise ValueError(f"GailConfig.input_scale: got {self.input_scale}, expected a number > 0")
         for name in ("learning_rate", "gradient_penalty"):
             if getattr(self, name) < 0.0:
-                raise ValueError(f"GailConfig.{name}: expected a number >= 0, got {getattr(self, name)}")
+                raise ValueError(f"GailConfig.{name}: got {getattr(self, name)}, expected a number >= 0")
 
 
 class DiscriminatorState(NamedTuple):
-    """All that an update changes."""
+    """Parameters and optimiser state: all that an update changes."""
 
     params: Any
     opt_state: optax.OptState
@@ -71,16 +71,16 @@ class Gail:
         self.optimizer = optax.adam(config.learning_rate)
 
     def init(self, key: Array) -> DiscriminatorState:
-        """Fresh parameters."""
+        """Return fresh parameters."""
         params = self.network.init(key, jnp.zeros((1, self.obs_size)), jnp.zeros((1, self.action_size)))
         return DiscriminatorState(params, self.optimizer.init(params))
 
     def logits(self, params: Any) -> Logits:
-        """The discriminator as a function of scaled observations and actions."""
+        """Return the discriminator as a function of scaled observations and actions."""
         return lambda obs, action: self.network.apply(params, obs, action)
 
     def reward(self, params: Any, obs: Array, action: Array) -> Array:
-        """The learned reward (...) of actions (..., A) at observations (..., O)."""
+        """Return the learned reward (...) of actions (..., A) at observations (..., O)."""
         return learned_reward(self.logits(params)(*self._scaled(obs, action)))
 
     def update(
@@ -90,25 +90,28 @@ class Gail:
         agent: tuple[Array, Array],
         key: Array,
     ) -> tuple[DiscriminatorState, dict[str, Array]]:
-        """One gradient step.
+        """Take one gradient step.
 
         Args:
             state: of the discriminator.
             expert, agent: observations (B, O) and actions (B, A); a pair of rows has the same goal, so that
-                what lies between them has it too.
-            key: for the points between.
+                the points between them have it too.
+            key: draws the points between expert and agent, where the gradient is penalised.
+
+        Returns:
+            The next state, and scalar metrics: the loss without penalty, the penalty, the accuracy.
         """
         expert, agent = self._scaled(*expert), self._scaled(*agent)
-        mix = jax.random.uniform(key, (expert[0].shape[0], 1))
-        between = jax.tree.map(lambda e, a: mix * e + (1.0 - mix) * a, expert, agent)
+        mix = jax.random.uniform(key, (expert[0].shape[0], 1))  # (B, 1)
+        between = jax.tree.map(lambda e, a: mix * e + (1.0 - mix) * a, expert, agent)  # (B, O), (B, A)
 
         def loss(params: Any) -> tuple[Array, dict[str, Array]]:
             logits = self.logits(params)
             on_expert, on_agent = logits(*expert), logits(*agent)
             entropy = cross_entropy(on_expert, on_agent)
             penalty = gradient_penalty(logits, *between)
-            right = 0.5 * (jnp.mean(on_expert > 0.0) + jnp.mean(on_agent < 0.0))
-            metrics = {"discriminator_loss": entropy, "gradient_penalty": penalty, "accuracy": right}
+            accuracy = 0.5 * (jnp.mean(on_expert > 0.0) + jnp.mean(on_agent < 0.0))
+            metrics = {"discriminator_loss": entropy, "gradient_penalty": penalty, "accuracy": accuracy}
             return entropy + self.config.gradient_penalty * penalty, metrics
 
         grads, metrics = jax.grad(loss, has_aux=True)(state.params)
@@ -120,22 +123,22 @@ class Gail:
 
 
 def learned_reward(logits_expert_is_high: Array) -> Array:
-    """log sigmoid(h), (...) and never positive; the paper's log(1 - D)."""
+    """Return log sigmoid(h) (...), which is never positive: the paper's log(1 - D)."""
     return jax.nn.log_sigmoid(logits_expert_is_high)
 
 
 def cross_entropy(expert_logits: Array, agent_logits: Array) -> Array:
-    """Mean of -log sigmoid(h) over the expert (B,) plus mean of -log(1 - sigmoid(h)) over the agent (B,)."""
+    """Return mean -log sigmoid(h) over expert logits (B,) plus mean -log(1 - sigmoid(h)) over agent ones."""
     return jnp.mean(jax.nn.softplus(-expert_logits)) + jnp.mean(jax.nn.softplus(agent_logits))
 
 
 def gradient_penalty(logits: Logits, obs: Array, action: Array) -> Array:
-    """Mean of (|grad h| - 1)^2 over points (B, O), (B, A), the gradient being that by both.
+    """Return the mean of (|grad h| - 1)^2 over points (B, O), (B, A), with the gradient by both.
 
-    Where the gradient vanishes, that of its length is taken as zero.
+    Where the gradient vanishes, the derivative of its length is taken as zero.
     """
     d_obs, d_action = jax.grad(lambda o, a: jnp.sum(logits(o, a)), argnums=(0, 1))(obs, action)
     square = jnp.sum(d_obs**2, axis=-1) + jnp.sum(d_action**2, axis=-1)  # (B,)
-    flat = square == 0.0
-    length = jnp.where(flat, 0.0, jnp.sqrt(jnp.where(flat, 1.0, square)))
+    flat = square == 0.0  # (B,)
+    length = jnp.where(flat, 0.0, jnp.sqrt(jnp.where(flat, 1.0, square)))  # (B,)
     return jnp.mean((length - 1.0) ** 2)

@@ -1,8 +1,8 @@
-"""Hindsight relabelling: what was reached becomes a goal, what was sensed becomes an action.
+"""Hindsight relabelling: a pose that was reached becomes the goal, sensed lengths become the action.
 
-Of a batch, some transitions keep the goal they were made for. Some get the pose that they reached as
-their goal, and with it the goal bonus (the paper's relabelling). Some get a goal near that pose, at a
-distance drawn log-uniformly, which shows the critic how the reward falls off around a pose.
+Some transitions of a batch keep the goal they were made for. Some get the pose that they reached as their
+goal, and with it the goal bonus (the paper's relabelling). Some get a goal near that pose, at a distance
+drawn log-uniformly, which shows the critic how the reward falls off around a pose.
 
 A relabelled transition to rest whose chambers had saturated also gets the action that asks for the spring
 lengths it ended at: they lead to the same equilibrium with no chamber off its reference
@@ -25,7 +25,7 @@ from train.agent.tqc import Transition
 
 @dataclass(frozen=True)
 class HindsightConfig:
-    """Shares of a batch; the rest keeps its own goal."""
+    """Shares of a batch that get another goal; the rest keeps its own."""
 
     reached_share: float = 0.5
     near_share: float = 0.0
@@ -36,13 +36,13 @@ class HindsightConfig:
     def __post_init__(self):
         if min(self.reached_share, self.near_share) < 0 or self.reached_share + self.near_share > 1:
             raise ValueError(
-                "HindsightConfig: reached_share and near_share must be >= 0 and add up to 1 at most, "
-                f"got {self.reached_share} and {self.near_share}"
+                f"HindsightConfig: got reached_share {self.reached_share} and near_share {self.near_share}, "
+                "expected numbers >= 0 that add up to 1 at most"
             )
         if not 0 < self.near_min_mm <= self.near_max_mm:
             raise ValueError(
-                "HindsightConfig: near_min_mm must be > 0 and near_max_mm at least as large, "
-                f"got {self.near_min_mm} and {self.near_max_mm}"
+                f"HindsightConfig: got near_min_mm {self.near_min_mm} and near_max_mm {self.near_max_mm}, "
+                "expected 0 < near_min_mm <= near_max_mm"
             )
         if self.mm_per_deg <= 0:
             raise ValueError(f"HindsightConfig.mm_per_deg: got {self.mm_per_deg}, expected > 0")
@@ -57,26 +57,31 @@ def relabel(
     *,
     exchange_actions: bool,
 ) -> Transition:
-    """A batch to learn from; with both shares zero, its rewards are those the environment gave.
+    """Return a batch to learn from; with both shares zero, its rewards are those the environment gave.
 
     Args:
         batch: B stored transitions.
-        key: for the draw.
+        key: draws which transitions get another goal, and the goals near a pose.
         config: shares.
         scale: of the observations.
         reward_config: weights of the reward.
-        exchange_actions: whether a saturated action may be exchanged for the sensed one. Right only where
-            an action leads to rest: the lengths sensed in the middle of a motion lead elsewhere.
+        exchange_actions: whether a saturated action is exchanged for the sensed one. Right only where an
+            action leads to rest: the lengths sensed in the middle of a motion lead elsewhere.
     """
+    # Goals: own, reached, or near the pose reached.
     n = batch.saturated.shape[0]
     (kind, distance), direction = draws.both(key, (2, n), (n, 6))
     reached = kind < config.reached_share
     near = ~reached & (kind < config.reached_share + config.near_share)
-    moved = batch.next_pose + _near_offsets(distance, direction, config).astype(batch.next_pose.dtype)
-    goal = jnp.where(reached[:, None], batch.next_pose, jnp.where(near[:, None], moved, batch.goal))
+    near_pose = batch.next_pose + _near_offsets(distance, direction, config).astype(batch.next_pose.dtype)
+    goal = jnp.where(reached[:, None], batch.next_pose, jnp.where(near[:, None], near_pose, batch.goal))
+
+    # Actions: where a chamber saturated, the one that asks for the lengths it reached.
     sensed = (reached | near) & batch.saturated & exchange_actions
     action = jnp.where(sensed[:, None], batch.sensed_action, batch.action)
     saturated = batch.saturated & ~sensed
+
+    # Error, reward and termination recomputed for the goals.
     reward, done, _ = rewards.reward(
         batch.next_pose, goal, batch.n_steps, saturated, reward_config, batch.clearance_cost
     )
@@ -90,10 +95,10 @@ def relabel(
 
 
 def _near_offsets(distance: Array, direction: Array, config: HindsightConfig) -> Array:
-    """Offsets (n, 6) [mm, deg]: translations in random directions, log-uniform in length, and turns.
+    """Return offsets (n, 6) [mm, deg]: random directions, log-uniform lengths, and turns.
 
     A turn is a normal draw in proportion to the translation's length over its own norm, so it has a heavy
-    tail: some goals are turned further than the arm can, as goals that a user asks for may be.
+    tail: some goals are turned further than the arm can turn, as a user's goals may be.
 
     Args:
         distance (n,): uniform draws.
@@ -101,7 +106,7 @@ def _near_offsets(distance: Array, direction: Array, config: HindsightConfig) ->
         config: nearest, furthest, and how far the angles are turned.
     """
     low, high = jnp.log(config.near_min_mm), jnp.log(config.near_max_mm)
-    length = jnp.exp(low + (high - low) * distance)[:, None]
-    direction = direction / jnp.linalg.norm(direction[:, :3], axis=-1, keepdims=True)
+    length = jnp.exp(low + (high - low) * distance)[:, None]  # (n, 1) [mm]
+    direction = direction / jnp.linalg.norm(direction[:, :3], axis=-1, keepdims=True)  # (n, 6)
     per_unit = jnp.array([1.0] * 3 + [1.0 / config.mm_per_deg] * 3)
     return length * direction * per_unit

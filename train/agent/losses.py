@@ -1,4 +1,4 @@
-"""The losses of truncated quantile critics, as pure functions of network outputs.
+"""Losses of truncated quantile critics, as pure functions of network outputs.
 
 Shapes: B batch, C critics, M quantiles per critic, K kept target quantiles.
 """
@@ -11,7 +11,7 @@ from jax import Array
 
 
 def quantile_huber_loss(quantiles: Array, targets: Array) -> Array:
-    """The critics' loss: regression of every predicted quantile m on every target k.
+    """Return the critics' loss: regression of every predicted quantile m on every target k.
 
     With delta = target_k - quantile_m, clip = delta limited to [-1, 1], tau_m = (m + 1/2) / M, a pair costs
     |tau_m - 1[delta < 0]| * Huber(delta), where Huber(delta) = clip * (delta - clip / 2) has the slope clip.
@@ -40,7 +40,7 @@ def quantile_huber_loss(quantiles: Array, targets: Array) -> Array:
 
 
 def drop_largest(samples: Array, n_drop: int) -> Array:
-    """Rows (B, N) without their `n_drop` largest entries, order kept: (B, N - n_drop).
+    """Return rows (B, N) without their `n_drop` largest entries, in their order: (B, N - n_drop).
 
     Finding a few maxima and closing the gaps costs a fraction of sorting the row.
     """
@@ -61,7 +61,7 @@ def truncated_targets(
     gamma: float,
     n_drop_per_critic: int,
 ) -> Array:
-    """Samples of the soft target distribution, truncated from above against overestimation.
+    """Return samples of the soft target distribution, truncated from above against overestimation.
 
     The C * M quantiles z of the target critics are pooled, the C * n_drop_per_critic largest dropped, and the
     K others become y = reward + gamma * (1 - terminated) * (z - alpha * next_log_prob).
@@ -88,7 +88,7 @@ def truncated_targets(
 
 
 def actor_loss(log_prob: Array, quantiles: Array, alpha: Array) -> Array:
-    """Mean of alpha * log_prob - Q over the actor's own actions, Q the mean of all quantiles, none dropped.
+    """Return the mean of alpha * log_prob - Q over the actor's actions; Q is the mean of all quantiles.
 
     Args:
         log_prob (B,): log-density of the actions.
@@ -105,7 +105,7 @@ def actor_loss(log_prob: Array, quantiles: Array, alpha: Array) -> Array:
 
 
 def alpha_loss(log_alpha: Array, log_prob: Array, target_entropy: float) -> Array:
-    """Mean of -log_alpha * (log_prob + target_entropy): alpha rises while the entropy is below its target.
+    """Return the mean of -log_alpha * (log_prob + target_entropy); alpha rises while entropy is too low.
 
     Args:
         log_alpha (): log temperature.

@@ -1,4 +1,4 @@
-"""Actor and critic networks, and the tanh-squashed Gaussian the actor parametrises."""
+"""Actor and critic networks, and the tanh-squashed Gaussian that the actor parametrises."""
 
 import flax.linen as nn
 import jax
@@ -26,7 +26,7 @@ class Actor(nn.Module):
 
     @nn.compact
     def __call__(self, obs: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Evaluates the policy's parameters.
+        """Return the parameters of the action's distribution.
 
         Args:
             obs (..., O): observation.
@@ -63,7 +63,7 @@ class Critics(nn.Module):
 
     @nn.compact
     def __call__(self, obs: jax.Array, action: jax.Array) -> jax.Array:
-        """Evaluates every critic.
+        """Return the quantiles of every critic.
 
         Args:
             obs (..., O): observation.
@@ -88,7 +88,7 @@ class Critics(nn.Module):
 
 
 def squash(mean: jax.Array, log_std: jax.Array, noise: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Reparametrised action a = tanh(u), u = mean + exp(log_std) * noise, and its log-density.
+    """Return the action a = tanh(u), u = mean + exp(log_std) * noise, and its log-density.
 
     The Jacobian term uses log(1 - tanh(u)^2) = 2 (log 2 - u - softplus(-2u)), which stays finite and
     differentiable where tanh has already rounded to one.
@@ -111,7 +111,7 @@ def squash(mean: jax.Array, log_std: jax.Array, noise: jax.Array) -> tuple[jax.A
 
 
 def sample_action(mean: jax.Array, log_std: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Draws an action and its log-density; see `squash`.
+    """Draw an action and its log-density; see `squash`.
 
     Args:
         mean (..., A): mean before squashing.
@@ -125,7 +125,7 @@ def sample_action(mean: jax.Array, log_std: jax.Array, key: jax.Array) -> tuple[
 
 
 def mode(mean: jax.Array) -> jax.Array:
-    """The deterministic action: the squashed mean (also the median of each action).
+    """Return the deterministic action: the squashed mean, which is also the median of each action.
 
     Args:
         mean (..., A): mean before squashing.

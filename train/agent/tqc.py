@@ -37,7 +37,7 @@ class TQCConfig:
     n_drop_per_critic: int = 2  # largest pooled target quantiles dropped, per critic
     layer_norm: bool = False  # in the critics
     learning_rate: float = 3e-4  # of actor and critics (Adam)
-    learning_rate_end: float = 1.0  # share of it left at the end; it falls along a half cosine
+    learning_rate_end: float = 1.0  # share of the learning rate left at the end of a half-cosine decay
     learning_rate_alpha: float = 3e-4  # of the temperature; 0 holds it at initial_alpha
     gamma: float = 0.99  # discount per step
     tau: float = 0.005  # Polyak rate of the target critics and of the mean actor, per update
@@ -58,7 +58,7 @@ class TQCConfig:
         }
         for name, (holds, expected) in required.items():
             if not holds:
-                raise ValueError(f"TQCConfig.{name}: expected {expected}, got {getattr(self, name)}")
+                raise ValueError(f"TQCConfig.{name}: got {getattr(self, name)}, expected {expected}")
 
 
 class Transition(NamedTuple):
@@ -72,10 +72,10 @@ class Transition(NamedTuple):
 
 
 class TQCState(NamedTuple):
-    """All that an update changes."""
+    """Networks, temperature and optimiser states: all that an update changes."""
 
     actor_params: Params
-    mean_actor_params: Params  # Polyak average of actor_params: the policy that comes of training
+    mean_actor_params: Params  # Polyak average of actor_params: the policy that is evaluated
     critic_params: Params
     target_params: Params  # shaped as critic_params
     log_alpha: Array  # () log temperature
@@ -85,7 +85,7 @@ class TQCState(NamedTuple):
 
 
 class TQC:
-    """The agent: networks and optimisers of fixed structure, and pure functions of a `TQCState`.
+    """Networks and optimisers of fixed structure, and pure functions of a `TQCState`.
 
     `n_updates` is the length of the learning rate's decay, needed where it decays.
     """
@@ -103,7 +103,7 @@ class TQC:
         self.target_entropy = -float(action_size) if config.target_entropy is None else config.target_entropy
 
     def init(self, key: Array) -> TQCState:
-        """Fresh parameters; target critics and mean actor start as copies."""
+        """Return fresh parameters; target critics and mean actor start as copies."""
         key_actor, key_critic = jax.random.split(key)
         obs = jnp.zeros((1, self.obs_size))
         own_buffers = functools.partial(jax.tree.map, jnp.copy)  # so that a state can be donated
@@ -141,7 +141,7 @@ class TQC:
         return mode(self.actor.apply(actor_params, obs)[0])
 
     def update(self, state: TQCState, batch: Transition, key: Array) -> tuple[TQCState, dict[str, Array]]:
-        """One gradient step of critics, actor and temperature, then of target critics and mean actor.
+        """Take one gradient step of critics, actor and temperature, then average critics and actor.
 
         All three gradients are taken at the incoming state, so none waits for another's optimiser.
 
@@ -152,15 +152,18 @@ class TQC:
             ValueError: a field of `batch` has the wrong shape.
         """
         self._check_shapes(batch)
+        # Targets of the critics, constants of the step.
         noise, next_noise = draws.normal(key, (2, *batch.action.shape))  # (B, A) each
         targets = self._targets(state, batch, next_noise)  # (B, K)
 
+        # Losses and gradients.
         critic_grad = jax.value_and_grad(self._critic_loss, has_aux=True)
         actor_grad = jax.value_and_grad(self._actor_loss, has_aux=True)
         (loss_critic, q_mean), d_critic = critic_grad(state.critic_params, batch, targets)
         (loss_actor, log_prob), d_actor = actor_grad(state.actor_params, state, batch.obs, noise)
         loss_alpha, d_alpha = jax.value_and_grad(alpha_loss)(state.log_alpha, log_prob, self.target_entropy)
 
+        # Optimiser steps, and Polyak averages of their results.
         critic = _descend(self.optimizer, d_critic, state.critic_opt_state, state.critic_params)
         actor = _descend(self.optimizer, d_actor, state.actor_opt_state, state.actor_params)
         temperature = _descend(self.alpha_optimizer, d_alpha, state.alpha_opt_state, state.log_alpha)
@@ -179,7 +182,7 @@ class TQC:
         return next_state, {**losses, **means, "alpha": jnp.exp(state.log_alpha)}
 
     def _targets(self, state: TQCState, batch: Transition, noise: Array) -> Array:
-        next_action, next_log_prob = squash(
+        next_action, next_log_prob = squash(  # (B, A), (B,)
             *self.actor.apply(state.actor_params, batch.next_obs), noise=noise
         )
         return truncated_targets(
@@ -207,14 +210,14 @@ class TQC:
         for name, value in batch._asdict().items():
             expected = (n, *sizes.get(name, ()))
             if value.shape != expected:
-                raise ValueError(f"Transition.{name}: expected shape {expected}, got {value.shape}")
+                raise ValueError(f"Transition.{name}: got shape {value.shape}, expected {expected}")
 
 
 def _learning_rate(config: TQCConfig, n_updates: int | None) -> float | optax.Schedule:
     if config.learning_rate_end == 1.0:
         return config.learning_rate
     if n_updates is None:
-        raise ValueError("TQC: learning_rate_end is not 1, so n_updates is needed, got None")
+        raise ValueError("TQC: got n_updates None, expected a number, since learning_rate_end is not 1")
     return optax.cosine_decay_schedule(config.learning_rate, n_updates, config.learning_rate_end)
 
 

@@ -1,11 +1,11 @@
-"""Training on several devices: arms, replay and batches are spread over them, networks are everywhere.
+"""Training on several devices: arms, replay and batches are spread over them, networks are on all of them.
 
-The devices form one axis. What has a row for each arm, and the slots of the replay, are split along it; a
-batch is split once it is drawn, so each device computes the gradients of its share and XLA adds them up.
+The devices form one axis. Arrays with a row for each arm and the slots of the replay are split along it. A
+batch is split once it is drawn, so that each device computes the gradients of its share and XLA adds them up.
 Arms settle on their device by themselves. The numbers are those of one device but for the order of sums.
 
 Several processes, on one host or on many, form one such axis too, once they have met. All of them do the
-same; the first alone writes, but for checkpoints, which all of them write to one folder.
+same; only the first writes, except for checkpoints, which all of them write to one folder.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ HELP = (
 
 
 def mesh_of(devices: str | None) -> Mesh | None:
-    """The devices to train on; call it before anything is computed.
+    """Return the devices to train on; call it before anything is computed.
 
     Args:
-        devices: what `HELP` says.
+        devices: as `HELP` has it.
 
     Returns:
-        The axis of devices; None is one device.
+        Mesh with one axis of devices; None is one device.
 
     Raises:
-        ConfigError: there are fewer, or the processes do not meet.
+        ConfigError: there are fewer devices, or the processes do not meet.
     """
     if devices is None or devices == "1":
         return None
@@ -70,33 +70,33 @@ def _local(n: int) -> list[jax.Device]:  # pyright: ignore[reportInvalidTypeForm
 
 
 def split(mesh: Mesh) -> NamedSharding:
-    """Arrays whose first axis is spread over the devices."""
+    """Return the sharding of arrays whose first axis is spread over the devices."""
     return NamedSharding(mesh, PartitionSpec(AXIS))
 
 
 def everywhere(mesh: Mesh) -> NamedSharding:
-    """Arrays that each device has."""
+    """Return the sharding of arrays that each device has whole."""
     return NamedSharding(mesh, PartitionSpec())
 
 
 def spread(mesh: Mesh | None, tree: Any) -> Any:
-    """Within a traced function: arrays spread over the devices by their first axis."""
+    """Spread arrays over the devices by their first axis, within a traced function."""
     return tree if mesh is None else jax.lax.with_sharding_constraint(tree, split(mesh))
 
 
 def is_first_process() -> bool:
-    """Whether this process is the one that writes."""
+    """Return whether this process is the one that writes."""
     return jax.process_index() == 0
 
 
 def wait_for_all(what: str) -> None:
-    """Wait until all processes are here."""
+    """Wait until all processes have come here."""
     if jax.process_count() > 1:
         multihost_utils.sync_global_devices(what)
 
 
 def any_process(value: bool) -> bool:
-    """Whether it is true in any process."""
+    """Return whether a value is true in any process."""
     if jax.process_count() == 1:
         return value
     return bool(np.any(multihost_utils.process_allgather(np.array(value))))

@@ -1,4 +1,4 @@
-"""A ring of past items on the device: a pytree of arrays with a leading capacity axis.
+"""Ring of past items on the device: a pytree of arrays with a leading capacity axis.
 
 `add` and `sample` have static shapes and no host work, so both live inside a jitted training step; donate the
 ring to update it in place.
@@ -26,7 +26,7 @@ class Replay(NamedTuple):
 
 
 def create(example_item: Items, capacity: int) -> Replay:
-    """An empty ring.
+    """Return an empty ring.
 
     Args:
         example_item: pytree of one item (arrays or `jax.ShapeDtypeStruct`): structure, shapes and dtypes.
@@ -36,14 +36,14 @@ def create(example_item: Items, capacity: int) -> Replay:
         ValueError: `capacity` is not positive.
     """
     if capacity < 1:
-        raise ValueError(f"Replay capacity: expected at least 1, got {capacity}")
+        raise ValueError(f"Replay capacity: got {capacity}, expected at least 1")
     item = jax.eval_shape(lambda x: x, example_item)
     data = jax.tree.map(lambda leaf: jnp.zeros((capacity, *leaf.shape), leaf.dtype), item)
     return Replay(data, position=jnp.zeros((), jnp.int32), size=jnp.zeros((), jnp.int32))
 
 
 def finite_rows(items: Items) -> Array:
-    """Where every number of an item is finite, e.g. as part of `valid` in `add`.
+    """Return which items have finite numbers alone, as part of `valid` in `add`.
 
     Args:
         items: pytree of leaves (B, ...).
@@ -56,7 +56,7 @@ def finite_rows(items: Items) -> Array:
 
 
 def add(replay: Replay, items: Items, valid: Array) -> Replay:
-    """Appends the valid rows in order, over the oldest ones once the ring is full.
+    """Append the valid rows in order, over the oldest ones once the ring is full.
 
     Args:
         replay: ring of N slots.
@@ -84,7 +84,7 @@ def add(replay: Replay, items: Items, valid: Array) -> Replay:
 
 
 def sample(replay: Replay, key: Array, batch_size: int) -> Items:
-    """Draws items uniformly, with replacement, from the filled slots.
+    """Draw items uniformly, with replacement, from the filled slots.
 
     The fill is known only at run time, so an empty ring cannot raise here: it yields zeros. Fill it first.
 
@@ -101,39 +101,40 @@ def sample(replay: Replay, key: Array, batch_size: int) -> Items:
 
 
 def thin(replay: Replay, key: Array, share: Array) -> Replay:
-    """The ring with a random share of its items, oldest first; which is how a later task begins.
+    """Return the ring with a random share of its items, oldest first, for a stage with other goals.
 
     Args:
         replay: ring of N slots.
         key: PRNG key.
-        share (): of the filled slots to keep, 0 to 1.
+        share (): share of the filled slots to keep, 0 to 1.
     """
     capacity = jax.tree.leaves(replay.data)[0].shape[0]
     age = (jnp.arange(capacity) - replay.position) % capacity  # oldest first, once the ring is full
     filled = jnp.arange(capacity) < replay.size
     n_kept = jnp.round(share * replay.size.astype(jnp.float32)).astype(jnp.int32)
-    lot = jnp.where(filled, jax.random.uniform(key, (capacity,)), jnp.inf)
-    kept = jnp.argsort(jnp.argsort(lot)) < n_kept
-    order = jnp.argsort(jnp.where(kept, age, capacity + age))
+    # The filled slots of lowest rank in a random order stay; they move to the front, oldest first.
+    priority = jnp.where(filled, jax.random.uniform(key, (capacity,)), jnp.inf)  # (N,)
+    kept = jnp.argsort(jnp.argsort(priority)) < n_kept  # (N,)
+    order = jnp.argsort(jnp.where(kept, age, capacity + age))  # (N,)
     data = jax.tree.map(lambda leaf: leaf[order], replay.data)
     return Replay(data, position=n_kept % capacity, size=n_kept)
 
 
 def _check(replay: Replay, items: Items, valid: Array) -> int:
-    """Static checks of `add`; returns the capacity."""
+    """Check structure, shapes and dtypes of what `add` gets; return the capacity."""
     expected_tree, got_tree = jax.tree.structure(replay.data), jax.tree.structure(items)
     if expected_tree != got_tree:
-        raise ValueError(f"Replay items: expected structure {expected_tree}, got {got_tree}")
+        raise ValueError(f"Replay items: got structure {got_tree}, expected {expected_tree}")
     if valid.ndim != 1 or valid.dtype != jnp.bool_:
-        raise ValueError(f"Replay valid: expected (B,) bool, got {valid.shape} {valid.dtype}")
+        raise ValueError(f"Replay valid: got {valid.shape} {valid.dtype}, expected (B,) bool")
     capacity, batch = jax.tree.leaves(replay.data)[0].shape[0], valid.shape[0]
     if batch > capacity:
-        raise ValueError(f"Replay add: expected at most {capacity} rows (the capacity), got {batch}")
+        raise ValueError(f"Replay add: got {batch} rows, expected at most {capacity}, the capacity")
     rings, _ = jax.tree_util.tree_flatten_with_path(replay.data)
     for (path, ring), rows in zip(rings, jax.tree.leaves(items), strict=True):
         if rows.shape != (batch, *ring.shape[1:]) or rows.dtype != ring.dtype:
             name, shape = jax.tree_util.keystr(path), (batch, *ring.shape[1:])
             raise ValueError(
-                f"Replay items{name}: expected {shape} {ring.dtype}, got {rows.shape} {rows.dtype}"
+                f"Replay items{name}: got {rows.shape} {rows.dtype}, expected {shape} {ring.dtype}"
             )
     return capacity

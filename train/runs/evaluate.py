@@ -1,4 +1,4 @@
-"""How well a policy reaches: held-out goals over the whole workspace, and the paper's circle."""
+"""Evaluation of a policy on held-out goals over the whole workspace, and on the paper's circle."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ N_ACTIONS = 4
 
 
 class Reached(NamedTuple):
-    """What an arm reached at each of n goals, after its last action."""
+    """Results of an arm at each of n goals, after its last action."""
 
     goal: Array  # (n, 6) [mm, deg]
     pose: Array  # (n, 6) [mm, deg]
@@ -41,11 +41,11 @@ class Reached(NamedTuple):
 
 @dataclass(frozen=True)
 class Summary:
-    """The figures that stand in tables."""
+    """Figures of an evaluation, as tables show them."""
 
     median_mm: float
     p95_mm: float
-    reached_share: float  # norm of e below theta, and no chamber saturated
+    reached_share: float  # goals with the norm of e below theta and no chamber saturated
     saturated_share: float  # goals at which a chamber is saturated
     unsettled: int
     circle_mean_mm: float
@@ -56,7 +56,7 @@ class Summary:
         return dataclasses.asdict(self)
 
     def rows(self) -> list[tuple[str, str]]:
-        """What a table shows: name and value with its unit."""
+        """Return the rows of a table: name, and value with its unit."""
         return [
             ("tip error, median", f"{self.median_mm:.2f} mm"),
             ("tip error, 95 %", f"{self.p95_mm:.2f} mm"),
@@ -72,9 +72,9 @@ class Summary:
 class Evaluator:
     """Evaluate policies of one learner on one arm without randomisation; compiled once.
 
-    Every goal gets `N_ACTIONS` actions of the deterministic policy, and what stands after the last counts. On
-    the workspace each arm starts at a random pose; on the circle, a single arm goes from point to point,
-    once around to get there.
+    Every goal gets `N_ACTIONS` actions of the deterministic policy, and the state after the last counts. On
+    the workspace each arm starts at a random pose. On the circle, a single arm goes from point to point in a
+    second lap, which is evaluated; the first brings it there.
     """
 
     def __init__(self, env: ReachEnv, learner: Learner, n_goals: int = N_GOALS):
@@ -86,11 +86,11 @@ class Evaluator:
 
     @functools.cached_property
     def goals(self) -> Array:
-        """Held-out poses (n_goals, 6) [mm, deg]; drawn when needed, as an export does without."""
+        """Held-out poses (n_goals, 6) [mm, deg]; drawn when first needed, since an export does without."""
         return self.env.sample_pool(self.n_goals, HELD_OUT_SEED).pose
 
     def __call__(self, policy: Any) -> tuple[Summary, Reached, Reached]:
-        """Figures, and what was reached on the workspace and on the circle, as NumPy arrays."""
+        """Return figures, and the results on the workspace and on the circle as NumPy arrays."""
         policy = jax.device_get(policy)  # maybe on many devices; one is enough
         workspace = jax.device_get(self._workspace(policy, self.goals))
         circle = jax.device_get(self._circle(policy, self.circle))
@@ -103,13 +103,13 @@ class Evaluator:
 
 
 def nominal(env: ReachEnv) -> ReachEnv:
-    """The environment without randomisation."""
+    """Return the environment without randomisation."""
     config = dataclasses.replace(env.config, randomisation=Randomisation())
     return env if config == env.config else ReachEnv(env.spec, config, env.s2r)
 
 
 def reach(env: ReachEnv, learner: Learner, policy: Any, state: State, goal: Array) -> tuple[State, Reached]:
-    """What one arm reaches with N_ACTIONS towards a goal (6,), and its state then."""
+    """Take N_ACTIONS with one arm towards a goal (6,); return its state and the result."""
     arm = state.pipeline_state._replace(goal=goal)
     state = state.replace(pipeline_state=arm, obs=env.observe(arm.pose, goal))
 
@@ -131,7 +131,7 @@ def reach(env: ReachEnv, learner: Learner, policy: Any, state: State, goal: Arra
 
 
 def follow(env: ReachEnv, learner: Learner, policy: Any, path: Array) -> Reached:
-    """What one arm reaches along a path (n, 6) of goals, once along it to get there."""
+    """Return the results of one arm along a path (n, 6) of goals, in a second pass; the first leads there."""
     start = env.reset(jax.random.PRNGKey(HELD_OUT_SEED))
     twice = jnp.concatenate([path, path])
     _, reached = jax.lax.scan(lambda state, goal: reach(env, learner, policy, state, goal), start, twice)
@@ -139,7 +139,7 @@ def follow(env: ReachEnv, learner: Learner, policy: Any, path: Array) -> Reached
 
 
 def summarise(workspace: Reached, circle: Reached, threshold: float) -> Summary:
-    """Figures of what was reached."""
+    """Return the figures of results on the workspace and on the circle."""
     error, around = workspace.tip_error_mm, circle.tip_error_mm
     free = workspace.saturated_chambers == 0
     return Summary(

@@ -1,4 +1,4 @@
-"""How well a policy reaches demonstrated positions, the body inside the pipe."""
+"""Evaluation of a policy on demonstrated positions, with the body inside the pipe."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from train.runs.evaluate import Reached, follow, nominal
 
 
 class AtPositions(NamedTuple):
-    """What an arm reached at each of m demonstrated positions, in their order."""
+    """Results of an arm at each of m demonstrated positions, in their order."""
 
     reached: Reached
     success: Array  # (m,) bool: close enough, no chamber saturated, the body inside the pipe
@@ -28,7 +28,7 @@ class AtPositions(NamedTuple):
 
 @dataclass(frozen=True)
 class PositionSummary:
-    """The figures that stand in tables."""
+    """Figures of an evaluation, as tables show them."""
 
     success_share: float
     success_first_share: float  # of the positions that are goals from the start
@@ -47,7 +47,7 @@ class PositionSummary:
         return dataclasses.asdict(self)
 
     def rows(self) -> list[tuple[str, str]]:
-        """What a table shows: name and value with its unit."""
+        """Return the rows of a table: name, and value with its unit."""
         return [
             ("positions with success", f"{100 * self.success_share:.1f} %"),
             ("of those of the first stage", f"{100 * self.success_first_share:.1f} %"),
@@ -62,9 +62,9 @@ class PositionSummary:
 
 
 class PositionEvaluator:
-    """Evaluates actors on one path of positions (m, 6) [mm, deg]; compiled once.
+    """Evaluate policies on one path of positions (m, 6) [mm, deg]; compiled once.
 
-    A single arm without randomisation goes from position to position, once along the path to get there.
+    A single arm without randomisation goes from position to position. It is evaluated in its second pass.
     `first` (m,) bool tells the positions that are goals from the start.
     """
 
@@ -74,14 +74,14 @@ class PositionEvaluator:
         self._follow = xla.jit(functools.partial(follow, self.env, learner), env.uses_mjx)
 
     def __call__(self, policy: Any) -> tuple[PositionSummary, AtPositions]:
-        """Figures, and what was reached, as NumPy arrays."""
+        """Return figures, and results as NumPy arrays."""
         policy = jax.device_get(policy)  # maybe on many devices; one is enough
         reached = jax.device_get(self._follow(policy, self.positions))
         return summarise(reached, self.env.config.reward.threshold, self.first)
 
 
 def summarise(reached: Reached, threshold: float, first: np.ndarray) -> tuple[PositionSummary, AtPositions]:
-    """Figures of what was reached; a scaled error below the threshold is close enough."""
+    """Return the figures of results; a scaled error below the threshold is close enough."""
     error_mm = reached.tip_error_mm
     close = reached.scaled_error < threshold
     success = close & (reached.saturated_chambers == 0) & (reached.clearance_mm > 0.0) & reached.settled

@@ -1,6 +1,7 @@
-"""The two things that a run can learn: to reach the workspace, or to reach as an expert showed.
+"""Tasks of a run: to reach the whole workspace, or to reach positions as an expert showed.
 
-A task is a job with all that differs around it: how it is evaluated, shown, and prepared for an epoch.
+A task composes a job of arms, goals and learner, and says how it is evaluated, shown, and prepared for an
+epoch.
 """
 
 from __future__ import annotations
@@ -25,15 +26,15 @@ from train.runs.positions import PositionEvaluator
 
 
 class Task(NamedTuple):
-    """What a run learns."""
+    """A job with all that differs around it from task to task."""
 
     job: Job
     title: str  # of the table of figures
-    evaluate: Callable[[Any], tuple[Any, ...]]  # policy -> figures (`to_dict`), and what was reached
+    evaluate: Callable[[Any], tuple[Any, ...]]  # policy -> figures (`to_dict`), then results
     picture_names: tuple[str, ...]
-    pictures: Callable[..., dict[str, Figure]]  # rows of metrics, what was reached -> by those names
-    headline: Callable[[dict[str, float]], str]  # row of metrics with an evaluation -> a few words
-    prepare: Callable[[TrainState, int], TrainState]  # before the epoch of that number
+    pictures: Callable[..., dict[str, Figure]]  # rows of metrics, results -> figures by name
+    headline: Callable[[dict[str, float]], str]  # row of metrics with an evaluation -> a short text
+    prepare: Callable[[TrainState, int], TrainState]  # state, epoch that follows -> state
 
 
 def learner_of(config: TrainConfig, env: ReachEnv) -> Learner:
@@ -48,14 +49,14 @@ def task_of(
     mesh: Mesh | None = None,
     learner: Learner | None = None,
 ) -> Task:
-    """Return what a run of this config learns.
+    """Return the task of a run.
 
     Args:
         config: of the run.
         env: of its arms.
-        demonstrations: needed where the config is of learning from them.
+        demonstrations: to learn from; needed where the config is an `ImitationConfig`.
         mesh: devices to train on; None is one device.
-        learner: in the place of the config's.
+        learner: a learner of one's own in the place of the config's.
 
     Raises:
         ConfigError: the run cannot be split evenly over the devices of the mesh.

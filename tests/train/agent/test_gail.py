@@ -85,7 +85,7 @@ def test_an_update_descends_on_the_loss_and_its_penalty():
     "change", [{"learning_rate": -1.0}, {"gradient_penalty": -1.0}, {"input_scale": 0.0}]
 )
 def test_a_bad_setting_is_named(change):
-    with pytest.raises(ValueError, match=f"GailConfig.{next(iter(change))}: expected"):
+    with pytest.raises(ValueError, match=f"GailConfig.{next(iter(change))}: got"):
         GailConfig(**change)
 
 

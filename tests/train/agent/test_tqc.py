@@ -289,7 +289,7 @@ def test_acting_samples_around_the_mode(agent, state):
 def test_a_batch_field_of_the_wrong_shape_is_named(agent, state, field):
     batch = make_batch()
     wrong = batch._replace(**{field: getattr(batch, field)[..., None]})
-    with pytest.raises(ValueError, match=rf"Transition\.{field}: expected shape .* got "):
+    with pytest.raises(ValueError, match=rf"Transition\.{field}: got shape .* expected "):
         agent.update(state, wrong, jax.random.key(0))
 
 
@@ -305,5 +305,5 @@ def test_a_batch_field_of_the_wrong_shape_is_named(agent, state, field):
     ],
 )
 def test_config_names_the_field_out_of_range(field, value):
-    with pytest.raises(ValueError, match=rf"TQCConfig\.{field}: expected .* got"):
+    with pytest.raises(ValueError, match=rf"TQCConfig\.{field}: got .* expected"):
         TQCConfig(**{field: value})

@@ -130,7 +130,7 @@ def test_add_names_what_does_not_fit(items, valid, message):
 
 
 def test_create_refuses_an_empty_capacity():
-    with pytest.raises(ValueError, match="expected at least 1, got 0"):
+    with pytest.raises(ValueError, match="got 0, expected at least 1"):
         replay.create(EXAMPLE, 0)
 
 
