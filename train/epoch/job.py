@@ -92,9 +92,9 @@ class Job:
     def start(self, first: Callable[[], T]) -> T:
         """Return the result of `first`, such as a state, with the epoch compiled in another thread meanwhile.
 
-        With a mesh of devices the epoch is compiled when it is called first.
+        With a mesh of devices the epoch is compiled when it is called first; a second call compiles nothing.
         """
-        if self.mesh is not None:
+        if self.mesh is not None or self.n_traces:
             return first()
         shapes = jax.eval_shape(self.init, jax.random.PRNGKey(0))
         with ThreadPoolExecutor(1) as beside:
