@@ -30,6 +30,8 @@ from typing import NamedTuple
 from mjx_softarm._support.xp import Array, array_namespace
 from mjx_softarm.spec import ArmSpec
 
+TOLERANCE_M = 1e-3  # greatest error of a spring that counts as on its reference, unless a run says otherwise
+
 
 class Gains(NamedTuple):
     """Numbers of the law; each is () or (n,)."""

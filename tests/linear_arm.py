@@ -27,8 +27,8 @@ LAG = 0.15  # of the way to the commanded pressure, per tick
 class LinearArm:
     """Springs that follow the pressures linearly, with a lag, on a clock of its own."""
 
-    def __init__(self, noise_m=NOISE_M):
-        self.time_s, self.noise_m = 0.0, noise_m
+    def __init__(self, noise_m=NOISE_M, sensor=SENSOR):
+        self.time_s, self.noise_m, self.sensor = 0.0, noise_m, sensor
         self.command_kpa = self.actual_kpa = np.zeros(N)
         self.written = []
         self._rng = np.random.default_rng(0)
@@ -42,7 +42,7 @@ class LinearArm:
         return round(self.time_s / DT_S)
 
     def read_sensors(self):
-        return SENSOR.readings(self.spring_m + self.noise_m * self._rng.standard_normal(N))
+        return self.sensor.readings(self.spring_m + self.noise_m * self._rng.standard_normal(N))
 
     def write_pressures(self, pressure_kpa):
         self.command_kpa = np.array(pressure_kpa)
@@ -70,7 +70,7 @@ def nan(readings):
     return np.where(np.arange(N) == 4, np.nan, readings)
 
 
-def make_policy():
+def make_policy(spec=SPEC):
     """A policy whose estimator and spring model are exact for the linear arm; its actor is not looked at."""
     centre = np.zeros(N, np.float32)
     angle = np.pi / 2 + 2 * np.pi * np.arange(N) / 3
@@ -94,10 +94,10 @@ def make_policy():
         layers=((np.zeros((18, N), np.float32), np.zeros(N, np.float32)),),
         obs_scale=ObsScale(*(np.asarray(value, float) for value in ObsScale.from_spec(SPEC))),
         reward=RewardConfig(),
-        actions=ActionMap.from_spec(SPEC),
+        actions=ActionMap.from_spec(spec),
         gains=Gains.from_spec(SPEC),
         rate_hz=SPEC.control.rate_hz,
-        spec=SPEC,
+        spec=spec,
         workspace=estimate(network, REST_M + rng.uniform(-30, 15, (2000, N)) @ GAIN_M_PER_KPA.T),
         estimator=network,
         spring_model=model,

@@ -179,7 +179,7 @@ def measure(run: Run, controller: Controller, goals: np.ndarray) -> Outcome:
             log.reference_m[arrival.row],
             spring_m[rows].mean(axis=0),
             gains,
-            faults.TOLERANCE_M,
+            policy.tolerance_m,
         )
     counts = run.counts()
     finger_m = captured_finger_tips(log.tip_m, log.tip_quaternion, policy.spec.mass.gripper_length_m)

@@ -39,7 +39,6 @@ from mjx_softarm.spec import N_CHAMBERS_PER_SECTION
 LOST_TICKS = 3
 LATE_TICKS = 5
 SETTLE_TIMEOUT_S = 15.0  # a pump of 12 L/min takes up to 10 s from one end of the workspace to the other
-TOLERANCE_M = 1e-3  # of a spring on its reference, as in training
 STILL_M = 2e-4  # greatest difference between the means of a window's halves at rest; far above the noise
 
 # A live spring has noise of some 0.01 mm and more: over a window, this is none.
@@ -132,7 +131,12 @@ def stuck_springs(spring_m: np.ndarray, pressure_kpa: np.ndarray) -> np.ndarray:
 
 
 def lost_chambers(
-    model: SpringModel, gains: Gains, pressure_kpa: np.ndarray, reference_m: np.ndarray, spring_m: np.ndarray
+    model: SpringModel,
+    gains: Gains,
+    pressure_kpa: np.ndarray,
+    reference_m: np.ndarray,
+    spring_m: np.ndarray,
+    tolerance_m: float,
 ) -> np.ndarray:
     """Which chambers (n,) have lost their pressure, of an arm at rest: bool.
 
@@ -146,8 +150,9 @@ def lost_chambers(
         pressure_kpa (n,) [kPa]: commanded.
         reference_m (n,) [m]: asked of the springs.
         spring_m (n,) [m]: read.
+        tolerance_m: greatest error of a spring that counts as on its reference.
     """
-    suspects = saturated(pressure_kpa, reference_m, spring_m, gains, TOLERANCE_M)
+    suspects = saturated(pressure_kpa, reference_m, spring_m, gains, tolerance_m)
     if not suspects.any():
         return suspects
     without = np.where(np.eye(len(pressure_kpa), dtype=bool), 0.0, pressure_kpa)  # (n, n)

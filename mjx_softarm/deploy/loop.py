@@ -4,12 +4,12 @@
     at rest: pose, goal -> policy -> references;    every tick: references -> sensor-space law -> pressures
 
 The policy was trained on arms at rest, so it acts on arms at rest: at once when a goal is new, and again
-whenever the springs have settled, `N_ACTIONS` times for a goal, as in its evaluation. Springs have settled
+whenever the springs have settled, `Policy.n_actions` times for a goal, as in its evaluation. Springs have settled
 when, for a window of half a second, each one is on its reference or its chamber at a limit, and none moves.
 Where that takes longer than `faults.SETTLE_TIMEOUT_S`, it is counted and the policy acts all the same. What
 stands when the springs have settled for the last time is the arrival.
 
-Gains, limits, calibration and rate are the policy file's. `mjx_softarm.deploy.faults` says what can go wrong.
+Gains, limits, calibration, rate, tolerance and number of actions are the policy file's. `mjx_softarm.deploy.faults` says what can go wrong.
 """
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ from mjx_softarm.sensing.pose import pose_from_frame
 from mjx_softarm.sensing.s2r import apply_correction, correction, distance, inputs
 from mjx_softarm.sensing.sensors import SensorFault
 
-N_ACTIONS = 4  # for each goal, as in training's evaluation
 VENT_KPA_PER_S = 20.0
 _CHAMBER_WINDOWS = 2  # for so many a lost chamber must show without a break
 
@@ -170,7 +169,12 @@ def _check_chambers(controller: Controller, state: State, at_rest: bool) -> tupl
         return state._replace(n_suspect=np.zeros_like(state.n_suspect)), []
     policy = controller.policy
     suspect = faults.lost_chambers(
-        policy.spring_model, policy.gains, state.pressure_kpa, state.reference_m, state.spring_m
+        policy.spring_model,
+        policy.gains,
+        state.pressure_kpa,
+        state.reference_m,
+        state.spring_m,
+        policy.tolerance_m,
     )
     state = state._replace(n_suspect=np.where(suspect, state.n_suspect + 1, 0))
     lost = state.n_suspect >= _CHAMBER_WINDOWS * controller.window
@@ -191,7 +195,7 @@ def _go(controller: Controller, state: State, at_rest: bool) -> tuple[State, lis
         if state.n_suspect.any() and settled:  # whether a chamber is lost comes first
             return state, [], False
         events += _unsettled(controller, state, settled)
-        if state.n_actions == N_ACTIONS:
+        if state.n_actions == controller.policy.n_actions:
             return state._replace(goal=None), events, True
     assert state.goal is not None  # `step` asks
     pose, away = believed(controller, state.spring_m)
@@ -209,7 +213,7 @@ def _on_reference(controller: Controller, state: State) -> bool:
     off_m = np.abs(state.springs_m.mean(axis=0) - state.reference_m)
     kpa = state.pressure_kpa
     at_limit = (kpa <= gains.pressure_min_kpa) | (kpa >= gains.pressure_max_kpa)
-    return bool(np.all((off_m < faults.TOLERANCE_M) | at_limit))
+    return bool(np.all((off_m < controller.policy.tolerance_m) | at_limit))
 
 
 def _unsettled(controller: Controller, state: State, settled: bool) -> list[Event]:
@@ -220,7 +224,7 @@ def _unsettled(controller: Controller, state: State, settled: bool) -> list[Even
         state.reference_m,
         state.springs_m.mean(axis=0),
         controller.policy.gains,
-        faults.TOLERANCE_M,
+        controller.policy.tolerance_m,
     )
     events = []
     if not settled:

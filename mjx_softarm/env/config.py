@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from mjx_softarm.control import TOLERANCE_M
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.mechanics.pipe import CrossPipe
 from mjx_softarm.mechanics.workspace import HELD_OUT_SEED
@@ -35,7 +36,9 @@ class EnvConfig:
     mode: Literal["quasistatic", "dynamic"] = "quasistatic"
     reward: RewardConfig = field(default_factory=RewardConfig)
     randomisation: Randomisation = field(default_factory=Randomisation)
-    saturation_tolerance_mm: float = 1.0  # spring error at which a chamber at its limit counts as saturated
+    saturation_tolerance_mm: float = (
+        1e3 * TOLERANCE_M
+    )  # spring error at which a chamber at its limit counts as saturated
     n_poses: int = 8192  # poses of the reachable workspace that starts and goals are drawn from
     workspace_seed: int = 0
     dynamic_step_s: float = 0.5  # duration of one environment step in dynamic mode

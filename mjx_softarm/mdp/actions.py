@@ -16,6 +16,8 @@ from mjx_softarm._support.xp import Array, array_namespace
 from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.spec import ArmSpec
 
+N_ACTIONS = 4  # towards each goal, in evaluations and on the arm
+
 
 class ActionMap(NamedTuple):
     """Actions of n springs and what they ask for. NumPy and JAX."""

@@ -16,6 +16,8 @@ the workspace float32.
     sensor.<field>       () or (n,)   the arm's `Sensor`: readings to lengths, and back
     gains.<field>        () or (n,)   `Gains`: the sensor-space law and the pressure limits
     rate_hz              ()           of the sensor-space law
+    n_actions            () int       towards each goal, as in the evaluation of the run
+    tolerance_m          ()           greatest error of a spring that counts as on its reference
     workspace            (m, 6)       poses [mm, deg] that the arm reaches, spread over its workspace
     estimator.<field>                 `PoseEstimator`: spring lengths to the simulated pose
     spring_model.<field>              `SpringModel`: pressures to spring lengths, to find chambers that fail
@@ -47,8 +49,8 @@ from mjx_softarm._support.archive import (
     write_sealed,
 )
 from mjx_softarm._support.mlp import Layer
-from mjx_softarm.control import Gains
-from mjx_softarm.mdp.actions import ActionMap
+from mjx_softarm.control import TOLERANCE_M, Gains
+from mjx_softarm.mdp.actions import N_ACTIONS, ActionMap
 from mjx_softarm.mdp.observation import OBS_LAYOUT, OBS_SIZE, ObsScale
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.sensing.estimator import PoseEstimator, SpringModel, take_estimator, take_spring_model
@@ -77,6 +79,8 @@ class Policy:
     s2r: S2R | None
     spec: ArmSpec
     provenance: Mapping[str, Any]
+    tolerance_m: float = TOLERANCE_M
+    n_actions: int = N_ACTIONS
 
     @property
     def sensor(self) -> Sensor:
@@ -104,6 +108,8 @@ def policy_from_actor(
     reward: RewardConfig,
     model: ArmModel,
     provenance: Mapping[str, Any],
+    tolerance_m: float = TOLERANCE_M,
+    n_actions: int = N_ACTIONS,
 ) -> Policy:
     """The policy of an actor that was trained on an arm.
 
@@ -113,6 +119,8 @@ def policy_from_actor(
         reward: the environment's.
         model: networks and workspace of the arm.
         provenance: how the policy came about, in types that JSON has.
+        tolerance_m: greatest error of a spring that counts as on its reference; the environment's.
+        n_actions: towards each goal; the evaluation's.
 
     Raises:
         ValueError: the parameters are not those of an actor for this arm; as a SealedFileError where an
@@ -128,6 +136,8 @@ def policy_from_actor(
         **model._asdict(),
         spec=spec,
         provenance=provenance,
+        tolerance_m=tolerance_m,
+        n_actions=n_actions,
     )
     return _unpack(_pack(policy), "policy")
 
@@ -182,6 +192,8 @@ def _pack(policy: Policy) -> dict[str, np.ndarray]:
         "obs_layout": OBS_LAYOUT,
         "action_layout": action_layout(policy.spec),
         "rate_hz": policy.rate_hz,
+        "tolerance_m": policy.tolerance_m,
+        "n_actions": policy.n_actions,
         "s2r_kind": "none" if policy.s2r is None else "mlp",
         "workspace": policy.workspace,
         "provenance_json": json.dumps(policy.provenance),
@@ -228,6 +240,8 @@ def _unpack(arrays: Mapping[str, np.ndarray], source: str) -> Policy:
         s2r=take_s2r(entries, "s2r", n) if s2r_kind == "mlp" else None,
         spec=spec,
         provenance=entries.table("provenance_json"),
+        tolerance_m=entries.take("tolerance_m", np.float64, ()),
+        n_actions=entries.take("n_actions", np.integer, ()),
     )
     limits = policy.sensor.lengths(np.stack(policy.actions[1:]))  # (2, n)
     readable = (limits.fault == SensorFault.OK.value) & (limits.length_m[0] < limits.length_m[1])
@@ -239,6 +253,8 @@ def _unpack(arrays: Mapping[str, np.ndarray], source: str) -> Policy:
         ("action.low", readable, "readings that have a length, less than that of action.high"),
         ("gains.pressure_min_kpa", np.less(low_kpa, high_kpa), "less than gains.pressure_max_kpa"),
         ("rate_hz", policy.rate_hz > 0.0, "a number > 0"),
+        ("tolerance_m", policy.tolerance_m > 0.0, "a number > 0"),
+        ("n_actions", policy.n_actions > 0, "a whole number > 0"),
         ("s2r_kind", s2r_kind in ("mlp", "none"), "mlp or none"),
     ):
         if not np.all(holds):

@@ -8,8 +8,9 @@ from mjx_softarm.deploy.arm_io import Capture
 from mjx_softarm.deploy.arms import open_arm
 from mjx_softarm.deploy.controller import Controller, Phase, start
 from mjx_softarm.deploy.faults import Fault
-from mjx_softarm.deploy.loop import N_ACTIONS, VENT_KPA_PER_S, step, with_goal
+from mjx_softarm.deploy.loop import VENT_KPA_PER_S, step, with_goal
 from mjx_softarm.logs.schema import write_log
+from mjx_softarm.mdp.actions import N_ACTIONS
 from mjx_softarm.sensing.estimator import estimate
 from tests.linear_arm import (
     CONTROLLER,

@@ -8,8 +8,9 @@ import pytest
 from mjx_softarm.deploy import faults
 from mjx_softarm.deploy.controller import Controller, Phase
 from mjx_softarm.deploy.faults import RESPONSE, Fault, Response
-from mjx_softarm.deploy.loop import N_ACTIONS, VENT_KPA_PER_S
+from mjx_softarm.deploy.loop import VENT_KPA_PER_S
 from mjx_softarm.deploy.reachability import Reachable, nearest
+from mjx_softarm.mdp.actions import N_ACTIONS
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.sensing.estimator import estimate
 from mjx_softarm.sensing.s2r import N_POSE_INPUTS, N_POSE_OUTPUTS, S2R, correct, extrapolation

@@ -16,7 +16,7 @@ from mjx_softarm.policy.file import load_policy, policy_from_actor, save_policy
 
 PROVENANCE = {"commit": "0123abc", "created": "2025-01-31", "packages": {"numpy": "2.0"}, "seed": 7}
 # Digest of the names that schema 3 stores and of the fields of its specification.
-SCHEMA_3 = "353f9930"
+SCHEMA_3 = "92ad30f1"
 
 
 def make_params(hidden=(7, 5), n_actions=9):
@@ -267,6 +267,8 @@ def test_every_type_and_shape_is_checked(file):
             "gains.pressure_min_kpa: got 20.0, expected less than gains.pressure_max_kpa",
         ),
         ({"rate_hz": np.array(0.0)}, "rate_hz: got 0.0, expected a number > 0"),
+        ({"tolerance_m": np.array(-1e-3)}, "tolerance_m: got -0.001, expected a number > 0"),
+        ({"n_actions": np.array(0)}, "n_actions: got 0, expected a whole number > 0"),
         ({"s2r_kind": np.array("tree")}, "s2r_kind: got tree, expected mlp or none"),
         ({"s2r_kind": np.array("none")}, "s2r.0.bias: unknown entry, schema 3 has none of this name"),
         ({"workspace": np.zeros((0, 6), np.float32)}, "workspace: got float32 (0, 6), expected "),

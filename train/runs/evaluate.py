@@ -16,11 +16,11 @@ from mjx_softarm._support import xla
 from mjx_softarm._support.mjx import State
 from mjx_softarm.env import Randomisation, ReachEnv
 from mjx_softarm.mdp import rewards
+from mjx_softarm.mdp.actions import N_ACTIONS
 from mjx_softarm.mechanics.workspace import HELD_OUT_SEED, circle_poses
 from train.agent.learner import Learner
 
 N_GOALS = 2_000
-N_ACTIONS = 4
 
 
 class Reached(NamedTuple):

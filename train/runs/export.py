@@ -11,6 +11,7 @@ import jax
 import numpy as np
 
 from mjx_softarm.env import ReachEnv
+from mjx_softarm.mdp.actions import N_ACTIONS
 from mjx_softarm.policy.file import ArmModel, policy_from_actor, save_policy
 from mjx_softarm.spec import ArmSpec
 from train.runs.checkpoint import Run, RunError
@@ -47,7 +48,15 @@ def export_run(run: Run, path: Path | None = None, task: Task | None = None) -> 
         "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     }
     try:
-        policy = policy_from_actor(jax.device_get(params), run.spec, run.config.env.reward, model, provenance)
+        policy = policy_from_actor(
+            jax.device_get(params),
+            run.spec,
+            run.config.env.reward,
+            model,
+            provenance,
+            tolerance_m=1e-3 * run.config.env.saturation_tolerance_mm,
+            n_actions=N_ACTIONS,
+        )
     except (ValueError, AttributeError) as error:
         raise RunError(f"{run.path}: {error}") from error
     path = path or run.path / "policy.npz"

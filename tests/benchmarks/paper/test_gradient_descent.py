@@ -11,8 +11,7 @@ import pytest
 from benchmarks.paper.gradient_descent import descend, forward_kinematics, gradient, gradient_descent
 from mjx_softarm import ArmSpec
 from mjx_softarm.control import Gains
-from mjx_softarm.deploy.loop import N_ACTIONS
-from mjx_softarm.mdp.actions import ActionMap
+from mjx_softarm.mdp.actions import N_ACTIONS, ActionMap
 from mjx_softarm.mdp.observation import ObsScale
 from mjx_softarm.mdp.rewards import RewardConfig, scaled_error
 from mjx_softarm.policy.file import Policy

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from mjx_softarm import ArmSpec
-from mjx_softarm.control import Gains, saturated
-from mjx_softarm.deploy.faults import TOLERANCE_M, lost_chambers
+from mjx_softarm.control import TOLERANCE_M, Gains, saturated
+from mjx_softarm.deploy.faults import lost_chambers
 from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.mjcf import build_model, spring_lengths
 from mjx_softarm.mechanics.settle import settle
@@ -102,7 +102,7 @@ def found(distilled, end, commanded_kpa, reference_m):
     spring_m = end.spring_m + 4e-5 * np.random.default_rng(9).standard_normal(end.spring_m.shape)
     return np.array(
         [
-            lost_chambers(distilled.spring_model, Gains.from_spec(SPEC), *rows)
+            lost_chambers(distilled.spring_model, Gains.from_spec(SPEC), *rows, TOLERANCE_M)
             for rows in zip(commanded_kpa, reference_m, spring_m, strict=True)
         ]
     )

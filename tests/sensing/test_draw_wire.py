@@ -1,0 +1,113 @@
+"""Another sensor, from one end to the other: an arm whose springs are read by draw-wire encoders."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+from calib.fit.sensors import fit_springs
+from calib.read.logs import read_log
+from mjx_softarm import ArmSpec
+from mjx_softarm.deploy.arm_io import Capture
+from mjx_softarm.deploy.controller import Controller
+from mjx_softarm.deploy.faults import Fault
+from mjx_softarm.deploy.record import record
+from mjx_softarm.env import EnvConfig, ReachEnv
+from mjx_softarm.logs.checks import LogError
+from mjx_softarm.logs.schema import write_log
+from mjx_softarm.policy.file import load_policy, save_policy
+from mjx_softarm.sensing.sensors import DrawWire, Sensor, SensorFault
+from mjx_softarm.twin.arm import Twin
+from tests.linear_arm import GOALS, LinearArm, exact_plan, go, make_policy
+
+WIRE = {"kind": "draw_wire", "m_per_v": 0.2, "voltage_min_v": 0.05, "voltage_max_v": 4.95}
+SPEC = ArmSpec.default().replace(sensor=WIRE | {"beta": 1.0, "delta_m": 0.0})
+BETA, DELTA_M = np.linspace(0.94, 1.03, 9), np.linspace(-0.13, 0.02, 9)
+PLANTED = dataclasses.replace(Sensor.from_spec(SPEC), beta=BETA, delta_m=DELTA_M)
+
+
+class WireArm(LinearArm):
+    """The linear arm with draw wires, seen by cameras."""
+
+    def __init__(self):
+        super().__init__(sensor=PLANTED)
+
+    def motion_capture(self):
+        return Capture(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros((1, 3)), self.spring_m)
+
+
+def test_voltages_are_lengths_by_scale_and_calibration():
+    volts = np.array([0.5, 1.0, 1.5, 2.0, 0.04, 5.0, np.nan, 2.0, 2.0])
+    length_m, fault = PLANTED.lengths(volts, 0.1)
+    short, *bad = [SensorFault.NO_LENGTH, SensorFault.TOO_LOW, SensorFault.TOO_HIGH, SensorFault.NOT_FINITE]
+    np.testing.assert_array_equal(fault, [short, 0, 0, 0, *bad, 0, 0])
+    np.testing.assert_allclose(length_m[4:7], 0.1)
+    good = fault == 0
+    np.testing.assert_allclose(length_m[good], (BETA * volts / 5.0 * 1.0 + DELTA_M)[good])
+    np.testing.assert_allclose(PLANTED.readings(length_m)[good], volts[good])
+    assert "spring4: read 0.04 V, expected 0.05 to 4.95 V" in PLANTED.describe_faults(volts, fault)
+
+
+def test_specification_is_written_and_read(tmp_path):
+    spec = SPEC.replace(sensor={"beta": tuple(BETA), "delta_m": tuple(DELTA_M)})
+    assert isinstance(spec.sensor, DrawWire)
+    spec.to_toml(tmp_path / "arm.toml")
+    assert 'kind = "draw_wire"' in (tmp_path / "arm.toml").read_text()
+    assert ArmSpec.from_toml(tmp_path / "arm.toml") == spec
+
+
+def test_actions_are_voltages_and_lead_where_they_say():
+    env = ReachEnv(SPEC, EnvConfig(n_poses=16))
+    shortest_v, middle_v, longest_v = 0.085 / 0.2, 0.18 / 0.2, 0.275 / 0.2  # beta is 1, delta 0
+    np.testing.assert_allclose(
+        env.action_map.readings(np.linspace(-1, 1, 3)[:, None]),
+        np.outer([shortest_v, middle_v, longest_v], np.ones(9)),
+        rtol=1e-6,
+    )
+    state = jax.jit(env.reset)(jax.random.key(0))
+    goal_m = env.pool.spring_m[3]
+    after = jax.jit(env.step)(state, env.action_of(goal_m))
+    assert after.info["valid"]
+    np.testing.assert_allclose(after.pipeline_state.spring_m, goal_m, atol=1e-4)
+    np.testing.assert_allclose(after.pipeline_state.pose[:3], env.pool.pose[3, :3], atol=0.5)
+
+
+def test_recorded_voltages_calibrate_the_wires(tmp_path):
+    targets_kpa = np.random.default_rng(0).uniform(-20.0, 10.0, (60, 9))
+    log = record(WireArm(), SPEC.replace(springs={"length_min_m": 0.1}), targets_kpa).log
+    write_log(
+        tmp_path / "springs.csv", dataclasses.replace(log, tip_m=None, tip_quaternion=None, marker_m=None)
+    )
+    assert "voltage0 [V]" in (tmp_path / "springs.csv").read_text().splitlines()[0]
+    log, _ = read_log(tmp_path / "springs.csv")
+    fit = fit_springs(log.readings_of(SPEC.sensor), log.spring_m, Sensor.from_spec(SPEC))
+    np.testing.assert_allclose(fit.beta, BETA, rtol=5e-3)
+    np.testing.assert_allclose(fit.delta_m, DELTA_M, atol=1e-3)
+    with pytest.raises(LogError, match="voltage0: got readings of voltage, expected frequency"):
+        log.readings_of(ArmSpec.default().sensor)
+
+
+def test_policy_is_written_read_and_run(tmp_path):
+    spec = SPEC.replace(sensor={"beta": tuple(BETA), "delta_m": tuple(DELTA_M)})
+    save_policy(tmp_path / "policy.npz", make_policy(spec))
+    policy = load_policy(tmp_path / "policy.npz")
+    np.testing.assert_array_equal(policy.sensor.beta, BETA)
+    run = go(WireArm(), GOALS[:1], Controller.of(policy, exact_plan))
+    assert len(run.arrivals) == 1 and run.log.reading_name == "voltage"
+    np.testing.assert_allclose(run.arrivals[0].estimate[:3], GOALS[0, :3], atol=0.5)
+
+    class Unplugged(WireArm):
+        def read_sensors(self):
+            volts = super().read_sensors()
+            return np.where((np.arange(9) == 2) & (self.tick > 20), 0.0, volts)
+
+    run = go(Unplugged(), GOALS[:1], Controller.of(policy, exact_plan))
+    assert {Fault.LOST_READING, Fault.SENSOR_LOST} <= set(run.counts())
+    assert "spring2: read 0 V" in run.events[0].message
+
+
+def test_twin_reads_volts():
+    spring_v = Twin(0, SPEC).read_sensors()
+    assert np.all((spring_v > 0.5) & (spring_v < 1.5))
+    np.testing.assert_allclose(spring_v / SPEC.sensor.resolution, np.round(spring_v / SPEC.sensor.resolution))
