@@ -1,6 +1,6 @@
-"""How well calibration does on a planted arm, whose numbers are known: that of `python -m calib demo`.
+"""Accuracy of calibration on a planted arm with known numbers, that of `python -m calib demo`.
 
-Errors are on contiguous blocks of rows that took no part in the fit. Real logs are read in `benchmarks.accuracy.logs`.
+Errors are on contiguous blocks of rows that took no part in the fit. See `logs` for real arms.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from mjx_softarm.sensing.sensors import Sensor
 
 
 def measure() -> dict[str, Any]:
-    """Springs and chambers of the demo's logs, other geometry than the simulator's included; tips in mm."""
+    """Calibrate the demo's springs and chambers, whose geometry differs from the simulator's; tips in mm."""
     spec = ArmSpec.default()
     planted = demo.planted_arm(spec, seed=0)
     with tempfile.TemporaryDirectory() as folder:

@@ -11,10 +11,10 @@ from train.sweep.report import by_settings
 
 
 def measure(folders: list[str]) -> dict[str, Any]:
-    """Figures of each run, and mean, least and greatest over the seeds of the same settings.
+    """Return figures of each run, and mean, minimum and maximum over the seeds of the same settings.
 
     Args:
-        folders: of runs trained to their end.
+        folders: finished runs.
 
     Raises:
         RunError: a folder holds no finished run.

@@ -1,4 +1,4 @@
-"""How well calibration does on public logs of real soft arms.
+"""Accuracy of calibration on public logs of real soft arms.
 
 The logs: `asl_trunk`, a trunk of three segments and six motors (StanfordASL/trunk-stack), and `asu_softarm`,
 a pneumatic arm of two sections with draw wires (ASU-RISE-Lab/4-chamber-softarm-control). Errors are on
@@ -28,10 +28,10 @@ SEEDS = (0, 1, 2)
 
 
 def measure(data: Path) -> dict[str, Any]:
-    """All figures, in mm.
+    """Return all figures, in mm.
 
     Args:
-        data: folder that has `asl_trunk` and `asu_softarm`.
+        data: folder with `asl_trunk` and `asu_softarm`.
 
     Raises:
         LogError: a log is missing, or cannot be read.
@@ -40,14 +40,14 @@ def measure(data: Path) -> dict[str, Any]:
         "draw wires to section length, RMS": {name: wires(data, name) for name in ASU_LOGS},
         "pressures to section length, RMS": {name: sections(data, name) for name in ASU_LOGS},
         "trunk, 3D RMSE": {
-            **{f"_1, seed {seed}": trunk_blocks(data, seed) for seed in SEEDS},
-            "_11, last fifth": trunk_errors(data, "11", _last_fifth),
+            **{f"_1, seed {seed}": trunk_errors(data, "1", _blocks(seed)) for seed in SEEDS},
+            "_11, last fifth": trunk_errors(data, "11", lambda n: np.arange(n) >= 0.8 * n),
         },
     }
 
 
 def wires(data: Path, name: str) -> dict[str, float]:
-    """The mean of section 1's draw wires to its length, on rows that are fresh, and on those also at rest."""
+    """Return errors from section 1's draw wires to its length, on fresh rows and on those at rest."""
     log, _ = read_asu(data / ASU_LOGS[name])
     wire_m, length_m = wire_length_m(log.wire_v)[:, :2].mean(axis=1), section_length_m(log)
     still = still_rows(log.time_s, wire_m, STILL_M) & still_rows(log.time_s, length_m, STILL_M)
@@ -57,7 +57,7 @@ def wires(data: Path, name: str) -> dict[str, float]:
 
 
 def sections(data: Path, name: str) -> dict[str, float]:
-    """Section 1's pressures to its length: a straight line, and the response in time."""
+    """Return errors from section 1's pressures to its length, of a line and of the response in time."""
     log, _ = read_asu(data / ASU_LOGS[name])
     length_m = section_length_m(log)[log.fresh]
     fit = fit_response(log.time_s[log.fresh], log.pressure_kpa[log.fresh, :3], length_m)
@@ -65,29 +65,24 @@ def sections(data: Path, name: str) -> dict[str, float]:
 
 
 def section_length_m(log: Any) -> np.ndarray:
-    """Length (n,) [m] of the first section: its base to its end."""
+    """Return the length (n,) [m] of the first section, from its base to its end."""
     return np.linalg.norm(log.position_m[:, 1] - log.position_m[:, 0], axis=1)
 
 
-def trunk_blocks(data: Path, seed: int) -> dict[str, float]:
-    """The trunk's log `_1` with a fifth of its blocks of 100 rows held out."""
-    return trunk_errors(data, "1", lambda n: held_out_blocks(n, seed=seed))
-
-
-def _last_fifth(n: int) -> np.ndarray:
-    return np.arange(n) >= 0.8 * n
+def _blocks(seed: int) -> Callable[[int], np.ndarray]:
+    return lambda n: held_out_blocks(n, seed=seed)  # a fifth of the blocks of 100 rows
 
 
 def trunk_errors(
     data: Path, log: str, held_out: Callable[[int], np.ndarray], history: bool = True
 ) -> dict[str, float]:
-    """Errors of the tip on fresh held-out rows; motor angles stand in for springs, a line for the simulator.
+    """Return tip errors on fresh held-out rows; motor angles replace springs, a line the simulator.
 
     Args:
         data: folder of the real logs.
-        log: which, "1" or "11".
-        held_out: number of rows -> mask of those held out.
-        history: continue the angles by those before, see `motor_angles`.
+        log: "1" or "11".
+        held_out: number of rows -> mask of held-out rows.
+        history: extrapolate the angles, see `motor_angles`.
     """
     trunk, _ = read_trunk(data / TRUNK_LOG.format(log))
     x = motor_angles(trunk.motor_deg) if history else trunk.motor_deg
@@ -103,10 +98,10 @@ def trunk_errors(
 
 
 def motor_angles(measured_deg: np.ndarray) -> np.ndarray:
-    """Angles (n, 6) [deg] at the time of each row, from this row and those before.
+    """Return angles (n, 6) [deg] at the time of each row, from this row and those before.
 
-    The motors are read every 5 rows or so and their angles repeated in between, while the tip moves up to
-    2.5 mm a row. So the last two readings are continued by a straight line, taken as one row late.
+    The motors are read about every 5 rows and their angles repeated in between, while the tip moves up to
+    2.5 mm a row. So the last two readings are extrapolated by a straight line, taken as one row late.
     """
     row = np.arange(len(measured_deg))
     read = np.flatnonzero(np.r_[True, (np.diff(measured_deg, axis=0) != 0.0).any(axis=1)])
@@ -117,7 +112,7 @@ def motor_angles(measured_deg: np.ndarray) -> np.ndarray:
 
 
 def polynomial(x: np.ndarray, y: np.ndarray, train: np.ndarray, degree: int) -> np.ndarray:
-    """Least squares on `train` rows by standardised inputs, predicted for all rows."""
+    """Fit a polynomial in standardised inputs to `train` rows; returns predictions for all rows."""
     z = (x - x[train].mean(axis=0)) / x[train].std(axis=0)
     powers = [
         list(chosen)

@@ -3,34 +3,31 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-import tyro
-
 from benchmarks.harness.common import RESULTS
-from benchmarks.harness.parallel import JobError
 from benchmarks.paper.engine import SMOKE, Settings, claim, run_stages
 from benchmarks.paper.report import PAGES, write_report
 from benchmarks.paper.summary import load_results
 from benchmarks.paper.trials import stages
+from mjx_softarm._support import cli
 from mjx_softarm._support.provenance import provenance
 
 
 def main(arguments: Sequence[str]) -> int:
     """Run the benchmark with command-line arguments; returns the exit status."""
-    return tyro.cli(paper, args=arguments, prog="python -m benchmarks paper")
+    return cli.main("python -m benchmarks", "", {"paper": paper}, ["paper", *arguments])
 
 
 def paper(
     smoke: bool = False,
     only: Literal["open", "confined"] | None = None,
-    twins: tuple[int, ...] | None = None,
-    seeds: tuple[int, ...] | None = None,
+    twins: cli.Integers | None = None,
+    seeds: cli.Integers | None = None,
     preset: Literal["quick", "paper"] | None = None,
-    out: Path | None = None,
+    out: cli.MaybePath = None,
 ) -> int:
     """Run the paper's experiments on twins, beside its numbers, in hours.
 
@@ -38,32 +35,22 @@ def paper(
     working folder: the same command continues an interrupted benchmark, and twins or seeds may be added.
 
     Args:
-        smoke: run everything, but tiny; says nothing about the arm.
-        only: one experiment; both by default.
-        twins: which twins; 0 1 2 by default.
-        seeds: of training; 0 1 2 by default.
-        preset: of training in open space; paper by default.
-        out: working folder; runs/paper by default.
-
-    Returns:
-        Exit status: 0 done, 2 failed, 130 interrupted.
+        smoke: run everything, but tiny; says nothing about the arm
+        only: one experiment; None: both
+        twins: which twins; None: 0,1,2
+        seeds: of training; None: 0,1,2
+        preset: of training in open space; None: paper
+        out: working folder; None: runs/paper
     """
     given = {"twins": twins, "seeds": seeds, "preset": preset}
     chosen = {name: value for name, value in given.items() if value is not None}
     settings = dataclasses.replace(SMOKE if smoke else Settings(), **chosen)
     folder = out or Path("runs/paper-smoke" if smoke else "runs/paper")
-    try:
-        for experiment in [only] if only else PAGES:
-            data = run(experiment, folder, folder if smoke else RESULTS, settings)
-            for check in data["goals"]:
-                print(f"{'met    ' if check['met'] else 'NOT MET'}  {check['text']}: {check['value']}")
-            print(f"report: {folder / PAGES[experiment]}")
-    except (JobError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print(f"interrupted; the same command continues with --out {folder}", file=sys.stderr)
-        return 130
+    for experiment in [only] if only else PAGES:
+        data = run(experiment, folder, folder if smoke else RESULTS, settings)
+        for check in data["goals"]:
+            print(f"{'met    ' if check['met'] else 'NOT MET'}  {check['text']}: {check['value']}")
+        print(f"report: {folder / PAGES[experiment]}")
     return 0
 
 

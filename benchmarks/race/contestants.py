@@ -1,24 +1,24 @@
-"""The contestants of the race: programs that learn to reach, and tell how well after each stretch of it.
+"""Contestants of the race: programs that learn to reach and are evaluated after each stretch of training.
 
     python -m benchmarks.race.contestants NAME SEED STRETCH_S N_GOALS
 
 NAME is one of `CONTESTANTS`. Ours is the loop of `python -m train reach` without its files, with the preset
-quick or paper. The peers train on the project's Gymnasium environment as their users would, through `learn`:
-with the defaults of their algorithm and one arm, or as ours-quick does wherever they have a knob for it. They
-have none for the temperature's own learning rate, which is that of all else. Our learning rate falls along a
-half cosine over the preset's env steps, which ends our training; theirs does so too, and begins anew.
+quick or paper. The peers train on the project's Gymnasium environment through `learn`: with the defaults of
+their algorithm and one arm, or with the settings of ours-quick wherever they have one. They have none for the
+temperature's own learning rate. Our learning rate falls along a half cosine over the preset's env steps, at
+which our training ends; theirs does so too, and begins anew.
 
-Hindsight: ours exchanges goals for the pose reached and for such near it, and actions for what was sensed;
-`benchmarks.race.hindsight` has the peers' own, for as large a share of a batch. The plain ones go without
-any, the rest is as with it.
+Hindsight: ours exchanges goals for the pose reached and for poses near it, and actions for the sensed ones;
+`benchmarks.race.hindsight` has the peers' own, for as large a share of a batch. Plain is without hindsight.
 
-A clock counts from the program's start; it stands while the policy is evaluated, and while PyTorch's threads
-are chosen. Start-up is over once the peers have done a first round of updates, and ours has compiled.
+The clock counts from the program's start. It stands while the policy is evaluated and while PyTorch's threads
+are chosen. Start-up ends when a peer has done a first round of updates, and when ours has compiled.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import math
 import sys
 import time
@@ -38,15 +38,15 @@ CHUNK = 512  # env steps in a call of `learn`
 class Contestant(NamedTuple):
     """A training under way."""
 
-    train: Callable[[], None]  # a little further
-    policy: Callable[[np.ndarray], np.ndarray]  # observations (n, 18) -> its best actions (n, 9)
-    done: Callable[[], tuple[int, int]]  # env steps and updates so far
-    limit: float = math.inf  # env steps that it ends after
-    uncounted_s: float = 0.0  # of its start-up
+    train: Callable[[], None]  # trains a little further
+    policy: Callable[[np.ndarray], np.ndarray]  # observations (n, 18) -> deterministic actions (n, 9)
+    done: Callable[[], tuple[int, int]]  # returns env steps and updates so far
+    limit: float = math.inf  # env steps after which it ends
+    uncounted_s: float = 0.0  # part of the start-up that does not count
 
 
 class HeldOut:
-    """The protocol of `train.runs.evaluate.Evaluator` on the workspace, for policies of any library."""
+    """Evaluation at held-out goals as in `train.runs.evaluate`, for policies of any library."""
 
     def __init__(self, env: Any, n_goals: int):
         import jax
@@ -66,7 +66,7 @@ class HeldOut:
         self._step = xla.jit(jax.vmap(env.step), env.uses_mjx)
 
     def tip_error_mm(self, policy: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-        """Of each goal (n_goals,), after the last action."""
+        """Return the tip error at each goal (n_goals,), after the last action."""
         from train.runs.evaluate import N_ACTIONS
 
         state = self._start
@@ -77,7 +77,7 @@ class HeldOut:
 
 
 def our_config(name: str) -> Any:
-    """The `TrainConfig` of ours-quick, ours-plain or ours-paper."""
+    """Return the `TrainConfig` of ours-quick, ours-plain or ours-paper."""
     from train.config import PRESETS
 
     config = PRESETS["paper" if name == "ours-paper" else "quick"]
@@ -88,7 +88,7 @@ def our_config(name: str) -> Any:
 
 
 def ours(name: str, seed: int) -> Contestant:
-    """One of ours, compiled."""
+    """Return one of ours, compiled."""
     import jax
 
     from mjx_softarm.env import ReachEnv
@@ -114,11 +114,11 @@ def ours(name: str, seed: int) -> Contestant:
 
 
 def peer(library: str, variant: str, seed: int) -> Contestant:
-    """TQC of SBX or Stable-Baselines3-contrib, after its first round of updates.
+    """Return TQC of SBX or Stable-Baselines3-contrib, after its first round of updates.
 
     Args:
         library: key of `benchmarks.harness.peers.PINS`.
-        variant: hindsight, plain (tuned likewise, without it) or defaults.
+        variant: hindsight, plain (tuned, without hindsight) or defaults.
         seed: of training.
     """
     from stable_baselines3.common.logger import Logger  # pyright: ignore[reportMissingImports]
@@ -126,7 +126,8 @@ def peer(library: str, variant: str, seed: int) -> Contestant:
     from mjx_softarm.env.gym import SoftArmVectorEnv, as_sb3
     from train.config import PRESETS
 
-    config, algorithm = PRESETS["quick"], _algorithm(library)
+    config, module = PRESETS["quick"], {"sbx": "sbx", "sb3-contrib": "sb3_contrib"}[library]
+    algorithm = importlib.import_module(module).TQC
     start = time.perf_counter()
     if library == "sb3-contrib":
         throwaway = filled_model(algorithm)
@@ -167,12 +168,12 @@ def peer(library: str, variant: str, seed: int) -> Contestant:
 
 
 def hindsight_share(config: Any) -> float:
-    """Share of a batch that gets another goal, with a `TrainConfig`."""
+    """Return the share of a batch that gets another goal, with a `TrainConfig`."""
     return config.hindsight.reached_share + config.hindsight.near_share
 
 
 def tuned_settings(config: Any, n_steps: Callable[[], int]) -> dict[str, Any]:
-    """Our settings by the names that Stable-Baselines3's TQC and SBX's have for them.
+    """Return our settings by the names that the TQC of Stable-Baselines3 and SBX has for them.
 
     Args:
         config: a `TrainConfig`.
@@ -200,7 +201,7 @@ def tuned_settings(config: Any, n_steps: Callable[[], int]) -> dict[str, Any]:
 
 
 def scaled(envs: Any, factor: float) -> Any:
-    """A Stable-Baselines3 vector environment with its rewards times a factor."""
+    """Return a Stable-Baselines3 vector environment with its rewards times a factor."""
     from stable_baselines3.common.vec_env import VecEnvWrapper  # pyright: ignore[reportMissingImports]
 
     class Scaled(VecEnvWrapper):
@@ -214,31 +215,29 @@ def scaled(envs: Any, factor: float) -> Any:
     return Scaled(envs)
 
 
-def _algorithm(library: str) -> Any:
-    if library == "sbx":
-        from sbx import TQC  # pyright: ignore[reportMissingImports]
-    else:
-        from sb3_contrib import TQC  # pyright: ignore[reportMissingImports]
-    return TQC
+CONTESTANTS = (  # the most telling first
+    "ours-quick",
+    "sbx-hindsight",
+    "sb3-contrib-hindsight",
+    "sbx-plain",
+    "sb3-contrib-plain",
+    "ours-plain",
+    "sbx-defaults",
+    "sb3-contrib-defaults",
+    "ours-paper",
+)
 
 
-CONTESTANTS: dict[str, Callable[[int], Contestant]] = {  # the most telling first
-    "ours-quick": lambda seed: ours("ours-quick", seed),
-    "sbx-hindsight": lambda seed: peer("sbx", "hindsight", seed),
-    "sb3-contrib-hindsight": lambda seed: peer("sb3-contrib", "hindsight", seed),
-    "sbx-plain": lambda seed: peer("sbx", "plain", seed),
-    "sb3-contrib-plain": lambda seed: peer("sb3-contrib", "plain", seed),
-    "ours-plain": lambda seed: ours("ours-plain", seed),
-    "sbx-defaults": lambda seed: peer("sbx", "defaults", seed),
-    "sb3-contrib-defaults": lambda seed: peer("sb3-contrib", "defaults", seed),
-    "ours-paper": lambda seed: ours("ours-paper", seed),
-}
+def contestant_of(name: str, seed: int) -> Contestant:
+    """Return a contestant of CONTESTANTS, started."""
+    library, variant = name.rsplit("-", 1)
+    return ours(name, seed) if library == "ours" else peer(library, variant, seed)
 
 
 def prepare(
     contestant: Contestant, start_up_s: float, stretch_s: float, n_goals: int
 ) -> tuple[Facts, Callable[[], Facts]]:
-    """A contestant as `benchmarks.harness.rounds` has it: each round is a stretch of training, and an evaluation."""
+    """Return the facts and the rounds of a worker: each round is a stretch of training and an evaluation."""
     from mjx_softarm.env import ReachEnv
 
     held_out = HeldOut(ReachEnv(), n_goals)
@@ -269,7 +268,7 @@ def prepare(
 
 
 def _prepare(name: str, seed: str, stretch_s: str, n_goals: str) -> tuple[Facts, Callable[[], Facts]]:
-    contestant = CONTESTANTS[name](int(seed))
+    contestant = contestant_of(name, int(seed))
     start_up_s = time.perf_counter() - START - contestant.uncounted_s
     return prepare(contestant, start_up_s, float(stretch_s), int(n_goals))
 

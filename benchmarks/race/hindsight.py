@@ -1,10 +1,9 @@
-"""Hindsight for the peers: the arms as they want them, and their own replay of hindsight on it.
+"""Hindsight for the peers: the arms in the form they need, and their own hindsight replay on it.
 
-Stable-Baselines3's `HerReplayBuffer` wants observations as a dictionary, and chooses which transitions get
-a goal that was reached later in their episode. Of what follows from a goal it asks the environment for the
-reward alone; what else was observed, and whether the episode ended, it leaves as stored. Here all of that is
-told anew. What it does not know is an exchange of actions: a transition that saturated, as nearly all of
-the random ones do, costs as much with its new goal as with its own.
+Stable-Baselines3's `HerReplayBuffer` needs observations as a dictionary, and chooses which transitions get a
+goal that was reached later in their episode. It recomputes only the reward for the new goal. Here observed
+error, reward and termination are recomputed. It cannot exchange actions: a transition that saturated, as
+nearly all random ones do, costs as much with its new goal as with its own.
 """
 
 from __future__ import annotations
@@ -25,12 +24,12 @@ from mjx_softarm.env import ReachEnv
 from mjx_softarm.mdp import observation as obs
 from mjx_softarm.mdp import rewards
 
-PARTS = {"achieved_goal": slice(0, 6), "desired_goal": slice(6, 12), "observation": slice(12, 18)}
+SLICES = {"achieved_goal": slice(0, 6), "desired_goal": slice(6, 12), "observation": slice(12, 18)}
 
 
 def with_goals(flat: np.ndarray) -> dict[str, np.ndarray]:
-    """Observations (..., 18) as a dictionary: scaled pose, scaled goal, and scaled error, (..., 6) each."""
-    return {name: flat[..., part] for name, part in PARTS.items()}
+    """Return observations (..., 18) as a dictionary: scaled pose, goal and error, (..., 6) each."""
+    return {name: flat[..., part] for name, part in SLICES.items()}
 
 
 class GoalEnvs(VecEnvWrapper):
@@ -39,16 +38,16 @@ class GoalEnvs(VecEnvWrapper):
     def __init__(self, venv: VecEnv):
         flat = venv.observation_space
         boxes = [
-            (name, gymnasium.spaces.Box(flat.low[part], flat.high[part])) for name, part in PARTS.items()
+            (name, gymnasium.spaces.Box(flat.low[part], flat.high[part])) for name, part in SLICES.items()
         ]
         super().__init__(venv, gymnasium.spaces.Dict(boxes))
 
     def reset(self) -> dict[str, np.ndarray]:
-        """Observations of all arms."""
+        """Reset all arms; returns their observations."""
         return with_goals(self.venv.reset())
 
     def step_wait(self) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """As that of the environment within, the last observation of an episode a dictionary, too."""
+        """Step the inner environment; terminal observations become dictionaries, too."""
         flat, reward, done, infos = self.venv.step_wait()
         for info in infos:
             if "terminal_observation" in info:
@@ -60,28 +59,30 @@ class HindsightBuffer(HerReplayBuffer):
     """`HerReplayBuffer` for arms at rest after each action, away from walls.
 
     Args:
-        arm: whose scales and rewards it is.
+        arm: environment that gives scales and rewards.
         share: of a batch that gets another goal.
-        reward_scale: on every reward that is stored.
+        reward_scale: factor of every stored reward.
         settings: those of `HerReplayBuffer`.
     """
 
     def __init__(self, *positional: Any, arm: ReachEnv, share: float, reward_scale: float, **settings: Any):
         super().__init__(*positional, **settings)
         if arm.config.clearance_cost_per_mm:
-            raise ValueError("HindsightBuffer: expected an arm that is not charged for walls")
+            raise ValueError(
+                "HindsightBuffer: got an arm that is charged for walls, expected one that is not"
+            )
         self.her_ratio = share
         self._scale, self._config, self._reward_scale = arm.scale, arm.config.reward, reward_scale
 
     def sample(self, batch_size: int, env: Any = None) -> DictReplayBufferSamples:
-        """Transitions in random order: SBX cuts what it draws at once into several batches."""
+        """Sample transitions in random order: SBX cuts one sample into several batches."""
         drawn, order = super().sample(batch_size, env), torch.randperm(batch_size)
         return jax.tree.map(lambda part: part[order], drawn)
 
     def _get_virtual_samples(
         self, batch_indices: np.ndarray, env_indices: np.ndarray, env: Any = None
     ) -> DictReplayBufferSamples:
-        """Transitions whose goals were reached later."""
+        """Return transitions with goals that were reached later."""
         where = batch_indices, env_indices
         before, after, goals = (
             poses * self._scale.scale + self._scale.centre

@@ -55,7 +55,7 @@ def test_both_experiments_or_one(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(experiments, "run", run)
     smoke = ["--smoke", "--out", str(tmp_path)]
     assert experiments.main(smoke) == 0
-    assert experiments.main(["--only", "confined", "--twins", "1", "2", *smoke]) == 0
+    assert experiments.main(["--only", "confined", "--twins", "1,2", *smoke]) == 0
     assert done == [("open", (0,)), ("confined", (0,)), ("confined", (1, 2))]
     assert f"report: {tmp_path / 'confined.html'}" in capsys.readouterr().out
 

@@ -196,32 +196,6 @@ def test_tables_have_a_row_for_each_contestant_with_start_up_and_without():
     json.dumps(figures, allow_nan=False)
 
 
-def test_each_level_tells_what_is_algorithm_and_what_is_code():
-    results = [
-        result("ours-quick", 9.0, 4.0, 4.0),  # 10 mm at 12 s, 5 mm at 20 s
-        result("ours-paper", 12.0, 9.0, 2.5),
-        result("ours-plain", 12.0, 9.0, 9.0, 4.0),  # 5 mm at 40 s
-        result("sbx-hindsight", *[12.0] * 6, 9.0),
-        result("sbx-plain", *[9.0] * 8),
-        result("sbx-defaults", *[12.0] * 7, 9.0),
-        failed("sb3-contrib-hindsight"),
-    ]
-    rows = {row["level_mm"]: row for row in summarise(results)["levels"]}
-    assert rows[5] == {
-        "seed": 0,
-        "level_mm": 5,
-        "ours": "ours-quick",
-        "ours_s": 20.0,
-        "plain": "ours-plain",
-        "plain_s": 40.0,
-        "sbx_of_ours": "> 3.60",
-        "sbx_of_plain": "> 2.05",
-    }
-    assert (rows[10]["sbx_of_ours"], rows[10]["plain_s"]) == ("1.00", 18.7)
-    assert (rows[3]["ours"], rows[3]["sbx_of_plain"]) == ("ours-paper", "")
-    assert rows[2]["ours_s"].startswith("not within")
-
-
 def test_the_figures_say_who_has_hindsight_and_at_what_commit_each_was_measured():
     figures = summarise([result("ours-quick", 4.0), result("ours-plain", 4.0), *others(9.0)])
     assert [row["hindsight"] for row in figures["wall_s"]] == [True, False] + [True, False, False] * 2
