@@ -80,6 +80,12 @@ def _mark_operations(panel: Any, outcome: Outcome, x: np.ndarray, named: bool = 
         panel.set_title(panel.get_title(loc="left"), loc="left", fontsize=10, color=INK, pad=14)
 
 
+def _legend_below(figure: Figure, panels: Sequence[Any]) -> None:
+    """Draw the first panel's legend below all panels, two entries wide for each."""
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, frameon=False, loc="outside lower center", ncols=2 * len(panels))
+
+
 def _select(outcomes: Outcomes, kind: str, variant: str) -> list[Outcome]:
     return [outcome for trial, outcome in outcomes.items() if (trial.kind, trial.variant) == (kind, variant)]
 
@@ -94,7 +100,7 @@ def circle_figure(outcomes: Outcomes, styles: Mapping[str, Style]) -> Figure:
     """
     chosen = {t: outcome for t, outcome in outcomes.items() if t.kind in styles and not t.load_g}
     twins, seed = sorted({trial.twin for trial in chosen}), min(trial.seed for trial in chosen)
-    figure = Figure(figsize=(4.0 * len(twins) + 0.4, 4.5), layout="compressed")
+    figure = Figure(figsize=(4.0 * len(twins) + 0.4, 4.7), layout="compressed")
     panels = figure.subplots(1, len(twins), squeeze=False, sharex=True, sharey=True)[0]
     for panel, twin in zip(panels, twins, strict=True):
         dress(panel, f"twin {twin}, from above", "x [mm]", "y [mm]")
@@ -108,7 +114,7 @@ def circle_figure(outcomes: Outcomes, styles: Mapping[str, Style]) -> Figure:
         hit = np.concatenate([(run.goal + run.error)[run.saturated.any(axis=1)] for run in here.values()])
         ring = {"color": RED, "markersize": 7.0, "fillstyle": "none", "linestyle": "none"}
         panel.plot(hit[:, 0], hit[:, 1], "o", label="a chamber saturated", **ring)
-    figure.legend(*panels[0].get_legend_handles_labels(), frameon=False, loc="outside lower center", ncols=5)
+    _legend_below(figure, panels)
     return figure
 
 
@@ -219,7 +225,7 @@ def positions_figure(outcomes: Outcomes, shown: Sequence[Trial]) -> Figure:
             panel.plot(
                 asked[mask, 0], asked[mask, 2], marker, color=colour, markersize=14.0, label=label, **style
             )
-    figure.legend(*panels[0].get_legend_handles_labels(), frameon=False, loc="outside lower center", ncols=5)
+    _legend_below(figure, panels)
     return figure
 
 

@@ -171,7 +171,9 @@ def _save_picture(path: Path, figure: Figure) -> None:
     """Write a drawing as PNG with few colours, which halves its size."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=DPI)
-    Image.open(buffer).convert("RGB").quantize(N_COLOURS).save(path, format="PNG", optimize=True)
+    Image.open(buffer).convert("RGB").quantize(N_COLOURS, Image.Quantize.MAXCOVERAGE).save(
+        path, format="PNG", optimize=True
+    )
 
 
 def _film_html(film: Path, no_film: str) -> str:

@@ -143,21 +143,19 @@ def _result(folder: Path, name: str, seed: int, limits: Limits, n_goals: int) ->
     """Return the result of one contestant, measured now or before."""
     file, who = _file(folder, name, seed), f"{name}, seed {seed}"
     made = provenance("benchmarks")
-    conditions = {
+    conditions: dict[str, Any] = {
         "n_goals": n_goals,
         "n_points": limits.n_points,
-        "peers": PINS,
+        "peers": {library: list(packages) for library, packages in PINS.items()},
         "packages": made["packages"],
         "machine": machine_kind(),
         "commit": made["commit"],
     }
     if file.exists():
         result = json.loads(file.read_text("utf-8"))
-        expected = json.loads(json.dumps(conditions))
-        if differing := [key for key in expected if result.get("conditions", {}).get(key) != expected[key]]:
-            got = ", ".join(
-                f"{key} {result['conditions'].get(key)}, now {expected[key]}" for key in differing
-            )
+        found = result.get("conditions", {})
+        if differing := [key for key in conditions if found.get(key) != conditions[key]]:
+            got = ", ".join(f"{key} {found.get(key)}, now {conditions[key]}" for key in differing)
             raise RaceError(f"{file}: was made with {got}; choose another --out, or remove the file")
         print(f"{who}: measured before, in {file}")
         return result

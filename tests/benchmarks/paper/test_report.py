@@ -146,11 +146,10 @@ def test_titles_and_labels_lie_within_the_pictures(experiment):
     for name, (_, figure) in report.draw(experiment, settings, results, trial_rows(results)).items():
         figure.draw_without_rendering()
         width, height = figure.bbox.size
-        for axes in figure.axes:
-            box = axes.get_tightbbox()
-            assert box is not None
+        for artist in (*figure.axes, *figure.legends):
+            box = artist.get_tightbbox()
             inside = box.x0 >= -1 and box.y0 >= -1 and box.x1 <= width + 1 and box.y1 <= height + 1
-            assert inside, (name, axes.get_title(loc="left"), box)
+            assert inside, (name, artist, box)
 
 
 def test_verdict_counts_what_is_met():
