@@ -155,7 +155,7 @@ class ArmSpec:
             data = tomllib.loads(Path(path).read_text("utf-8"))
         except OSError as error:
             raise SpecError(f"{path}: cannot be read: {error.strerror}") from error
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        except (ValueError, RecursionError) as error:  # no TOML, no UTF-8, or nested too deeply
             raise SpecError(f"{path}: not a TOML file: {error}") from error
         return cls.from_dict(data, str(path))
 

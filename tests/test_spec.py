@@ -1,13 +1,18 @@
 """The specification: the paper's numbers, the round trip, and messages that say what is wrong where."""
 
+import contextlib
 import copy
 import dataclasses
 import math
 import re
 
 import pytest
+import tomli_w
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from mjx_softarm import ArmSpec, SpecError
+from tests.properties import damaged, few
 
 
 @pytest.fixture
@@ -128,9 +133,12 @@ REFUSED = [
     ("mass.arm_kg", math.inf, "a number > 0"),
     ("mass.payload_kg", -0.1, "a number >= 0"),
     ("sensor.compensation_h", math.nan, "a number"),
-    ("structure.n_sections", 3.0, "a whole number >= 1"),
-    ("structure.n_sections", True, "a whole number >= 1"),
-    ("structure.n_sections", 0, "a whole number >= 1"),
+    ("structure.n_sections", 3.0, "a whole number >= 1 and <= 100"),
+    ("structure.n_sections", True, "a whole number >= 1 and <= 100"),
+    ("structure.n_sections", 0, "a whole number >= 1 and <= 100"),
+    ("structure.links_per_section", 10**40, "a whole number >= 1 and <= 100"),
+    ("mass.arm_kg", 1e39, "sizes from 1.2e-38 to 3.4e+38, which float32 holds"),
+    ("sensor.compensation_h", -1e-40, "sizes from 1.2e-38 to 3.4e+38, which float32 holds"),
     ("geometry.first_chamber_deg", 361.0, "a number >= -360 and <= 360"),
     ("chambers.pressure_min_kpa", -102.0, "a number >= -101.325"),
     ("chambers.length_offset_m", 0.2, "a number >= -0.1 and <= 0.1, or a list with one per chamber"),
@@ -237,3 +245,55 @@ def test_a_number_too_large_for_a_float_is_refused():
 def test_a_table_in_the_place_of_a_text_is_refused():
     with pytest.raises(SpecError, match="name: got .* expected a text"):
         ArmSpec.default().replace(name={"first": "arm"})
+
+
+# --- all specifications ------------------------------------------------------------------------------------
+
+POSITIVE = st.floats(1e-6, 1e6)
+
+
+@few
+@given(
+    name=st.text(max_size=12),
+    mass_kg=POSITIVE,
+    stiffness=st.one_of(POSITIVE, st.lists(POSITIVE, min_size=9, max_size=9).map(tuple)),
+    gains=st.tuples(POSITIVE, POSITIVE, POSITIVE),
+)
+def test_any_specification_is_written_and_read_again(tmp_path, name, mass_kg, stiffness, gains):
+    spec = ArmSpec.default().replace(
+        name=name,
+        mass={"arm_kg": mass_kg},
+        chambers={"stiffness_n_per_m": stiffness},
+        control=dict(zip(("rate_hz", "kp_kpa_per_m", "ki_kpa_per_ms"), gains, strict=True)),
+    )
+    spec.to_toml(tmp_path / "arm.toml")
+    assert ArmSpec.from_toml(tmp_path / "arm.toml") == spec
+
+
+@settings(few, max_examples=200)
+@given(data=damaged(tomli_w.dumps(ArmSpec.default().to_dict()).encode()))
+@pytest.mark.filterwarnings("error")
+def test_a_damaged_file_is_read_or_refused_as_a_specification(tmp_path, data):
+    (tmp_path / "arm.toml").write_bytes(data)
+    with contextlib.suppress(SpecError):
+        assert ArmSpec.from_toml(tmp_path / "arm.toml").n_chambers > 0
+
+
+NUMBERS = [
+    f"{group}.{name}"
+    for group, fields in ArmSpec.default().to_dict().items()
+    if isinstance(fields, dict)
+    for name in fields
+    if name != "kind"
+]
+
+
+@settings(few, max_examples=200)
+@given(path=st.sampled_from(NUMBERS), value=st.one_of(st.floats(), st.integers(), st.text(), st.none()))
+@pytest.mark.filterwarnings("error")
+def test_any_value_of_a_field_is_taken_or_refused_by_the_field_s_name(path, value):
+    group, name = path.split(".")
+    try:
+        ArmSpec.default().replace(**{group: {name: value}})
+    except SpecError as error:
+        assert re.match(rf"replace: ({re.escape(path)}|springs\.|chambers\.|sensor\.)", str(error))

@@ -10,7 +10,9 @@ import dataclasses
 import hashlib
 import io
 import json
+import struct
 import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NoReturn
@@ -18,8 +20,19 @@ from typing import Any, NoReturn
 import numpy as np
 
 from mjx_softarm._support.errors import InputError
+from mjx_softarm._support.fields import FLOAT32_MAX
 from mjx_softarm._support.mlp import Layer
 
+# Raised by NumPy and zipfile on archives that are damaged or of a kind that they do not read.
+ZIP_ERRORS = (
+    ValueError,
+    EOFError,
+    MemoryError,
+    NotImplementedError,
+    struct.error,
+    zipfile.BadZipFile,
+    zlib.error,
+)
 _N_DIGEST = 64  # hexadecimal digits, the last bytes of the file
 
 
@@ -75,7 +88,7 @@ def read_sealed(path: Path, kind: str, made_by: str) -> dict[str, np.ndarray]:
     try:
         with np.load(io.BytesIO(data), allow_pickle=False) as npz:
             return {name: np.asarray(npz[name]) for name in npz.files}
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, *ZIP_ERRORS) as error:
         raise SealedFileError(f"{path}: holds an array that cannot be read: {error}") from error
 
 
@@ -140,8 +153,8 @@ class Entries:
         expected = f"{kind.__name__.rstrip('_')} {' or '.join(map(_shape_text, shapes))}"
         if not np.issubdtype(array.dtype, kind) or not any(_fits(array.shape, shape) for shape in shapes):
             self.fail(name, f"got {array.dtype.name} {array.shape}, expected {expected}")
-        if np.issubdtype(kind, np.floating) and not np.isfinite(array).all():
-            self.fail(name, f"got {array[~np.isfinite(array)][0]}, expected finite numbers")
+        if np.issubdtype(kind, np.floating) and not (held := np.abs(array) <= FLOAT32_MAX).all():
+            self.fail(name, f"got {array[~held][0]}, expected finite numbers that float32 holds")
         return array if array.shape else array.item()
 
     def group(self, name: str, kind: type, *shapes: tuple[int, ...]) -> Any:
@@ -153,7 +166,7 @@ class Entries:
         text = self.take(name, np.str_, ())
         try:
             return {**json.loads(text)}
-        except (ValueError, TypeError):
+        except (ValueError, TypeError, RecursionError):
             self.fail(name, f"got {text[:60]!r}, expected a JSON object")
 
     def layers(self, name: str, n_inputs: int, n_outputs: int) -> tuple[Layer, ...]:

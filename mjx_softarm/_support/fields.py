@@ -1,4 +1,4 @@
-"""What the fields of a specification accept, and how they are read from tables."""
+"""Rules of the fields of a specification, and the reader that checks tables against them."""
 
 from __future__ import annotations
 
@@ -12,6 +12,16 @@ from typing import Any
 from mjx_softarm._support.errors import InputError
 
 PerChamber = float | tuple[float, ...]
+MAX_COUNT = 100  # of sections, and of links in each; beyond it arrays of the mechanics do not fit a memory
+FLOAT32_MIN, FLOAT32_MAX = (
+    1.1754944e-38,
+    3.4028235e38,
+)  # sizes of a normal float32, in which arms are simulated
+
+
+def in_float32(value: float) -> bool:
+    """Return whether a number is zero or of a size that float32 holds."""
+    return value == 0.0 or FLOAT32_MIN <= abs(value) <= FLOAT32_MAX
 
 
 class SpecError(InputError):
@@ -20,7 +30,7 @@ class SpecError(InputError):
 
 @dataclass(frozen=True)
 class Rule:
-    """What a field accepts: a kind of number, its range, and whether one per chamber is allowed."""
+    """Values that a field accepts: a kind of number, its range, and whether one per chamber is allowed."""
 
     kind: type = float
     low: float = -math.inf
@@ -30,12 +40,14 @@ class Rule:
 
     @property
     def text(self) -> str:
+        """The rule in words."""
         noun = {int: "a whole number", float: "a number", str: "a text"}[self.kind]
         low = "" if self.low == -math.inf else f" {'>' if self.low_open else '>='} {self.low:g}"
         high = "" if self.high == math.inf else f" and <= {self.high:g}" if low else f" <= {self.high:g}"
         return noun + low + high + (", or a list with one per chamber" if self.per_chamber else "")
 
     def accepts(self, value: Any) -> bool:
+        """Return whether a value is of the kind and in the range."""
         if self.kind is str:
             return isinstance(value, str)
         if isinstance(value, bool) or not isinstance(value, (int, float)):
@@ -51,23 +63,31 @@ class Rule:
 
 
 def positive(per_chamber: bool = False, high: float = math.inf) -> Any:
+    """Declare a number > 0."""
     return field(metadata={"rule": Rule(low=0.0, low_open=True, per_chamber=per_chamber, high=high)})
 
 
 def not_negative(per_chamber: bool = False) -> Any:
+    """Declare a number >= 0."""
     return field(metadata={"rule": Rule(low=0.0, per_chamber=per_chamber)})
 
 
 def anything(per_chamber: bool = False, low: float = -math.inf, high: float = math.inf) -> Any:
+    """Declare a number in a range, by default any."""
     return field(metadata={"rule": Rule(low=low, high=high, per_chamber=per_chamber)})
 
 
 def count() -> Any:
-    return field(metadata={"rule": Rule(kind=int, low=1)})
+    """Declare a count from 1."""
+    return field(metadata={"rule": Rule(kind=int, low=1, high=MAX_COUNT)})
 
 
 def read_fields(cls: type, data: Any, source: str, prefix: str) -> dict[str, Any]:
-    """The keyword arguments of `cls` from a table, each checked against its rule."""
+    """Return the keyword arguments of `cls` from a table, each checked against its rule.
+
+    Raises:
+        SpecError: a field is missing, unknown or breaks its rule.
+    """
     if not isinstance(data, dict):
         raise SpecError(f"{source}: {prefix.rstrip('.') or 'specification'}: got {data!r}, expected a table")
     known = [item.name for item in fields(cls)]
@@ -108,8 +128,12 @@ def rule_of(item: dataclasses.Field) -> Rule:
 
 def _read_value(rule: Rule, value: Any, source: str, path: str) -> Any:
     many = rule.per_chamber and isinstance(value, (list, tuple))
-    if not all(map(rule.accepts, value)) if many else not rule.accepts(value):
+    items = value if many else [value]
+    if not all(map(rule.accepts, items)):
         raise SpecError(f"{source}: {path}: got {value!r}, expected {rule.text}")
+    if rule.kind is float and not all(map(in_float32, items)):
+        sizes = f"sizes from {FLOAT32_MIN:.2g} to {FLOAT32_MAX:.2g}, which float32 holds"
+        raise SpecError(f"{source}: {path}: got {value!r}, expected {sizes}")
     if many:
         return tuple(map(float, value))
     return rule.kind(value)

@@ -7,13 +7,14 @@ is the file read again line by line, to say what is wrong with it.
 from __future__ import annotations
 
 import warnings
-import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from mjx_softarm._support.archive import ZIP_ERRORS
+from mjx_softarm._support.fields import FLOAT32_MAX
 from mjx_softarm.logs.checks import Finding, LogError
 
 _HEAD_BYTES = 1 << 16
@@ -33,6 +34,8 @@ class Table(NamedTuple):
 def read_table(path: str | Path, names: Sequence[str] | None = None) -> Table:
     """Read a CSV file, or an npz file as `mjx_softarm.logs.schema` has it.
 
+    A number that float32 cannot hold becomes infinite, which the readers of logs refuse.
+
     Args:
         path: the file; npz where its name ends so.
         names: the columns of a CSV file without a header.
@@ -42,11 +45,11 @@ def read_table(path: str | Path, names: Sequence[str] | None = None) -> Table:
     """
     path = Path(path)
     try:
-        if path.suffix == ".npz":
-            return _read_npz(path)
-        return _read_csv(path, names)
+        table = _read_npz(path) if path.suffix == ".npz" else _read_csv(path, names)
     except OSError as error:
         raise _error(path, error.strerror or str(error)) from error
+    table.values[np.abs(table.values) > FLOAT32_MAX] = np.inf
+    return table
 
 
 def _error(path: Path, problem: str, line: int | None = None, column: str = "") -> LogError:
@@ -58,7 +61,7 @@ def _read_npz(path: Path) -> Table:
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             columns, values = arrays["columns"], arrays["table"]
-    except (ValueError, KeyError, EOFError, AttributeError, TypeError, zipfile.BadZipFile) as error:
+    except (*ZIP_ERRORS, KeyError, AttributeError, TypeError) as error:
         raise _error(path, f"{expected}, got: {error}") from error
     shapes = f"columns {columns.shape} of {columns.dtype}, table {values.shape} of {values.dtype}"
     fits = columns.dtype.kind == "U" and values.dtype.kind in "fiu" and values.ndim == 2

@@ -68,7 +68,8 @@ class PolicyRunner:
 
 
 def _six(name: str, value: ArrayLike) -> np.ndarray:
-    array = np.asarray(value, np.float32)
+    with np.errstate(over="ignore"):  # refused below
+        array = np.asarray(value, np.float32)
     if array.shape[-1:] != (6,):
         raise ValueError(
             f"{name}: got shape {array.shape}, expected (..., 6): x, y, z [mm], yaw, pitch, roll [deg]"

@@ -1,11 +1,19 @@
 """Logs as files: what is written is what a plain reader finds, whole or not at all."""
 
+import contextlib
 import csv
+import io
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
 
+from mjx_softarm.logs.checks import LogError
+from mjx_softarm.logs.files import read_sheet
 from mjx_softarm.logs.schema import Log, log_columns, log_table, write_log
+from tests.properties import damaged, few
 
 
 def small_log(**changes):
@@ -74,3 +82,53 @@ def test_failed_write_leaves_the_old_file_and_no_part(tmp_path, monkeypatch):
         write_log(path, small_log())
     assert path.read_text() == "old"
     assert [item.name for item in tmp_path.iterdir()] == ["log.csv"]
+
+
+def numbers(*shape):
+    return npst.arrays(float, shape, elements=st.floats(-1e30, 1e30))
+
+
+@few
+@given(
+    groups=st.fixed_dictionaries(
+        {"readings": numbers(4, 6)},
+        optional={"spring_m": numbers(4, 6), "tip_m": numbers(4, 3), "goal": numbers(4, 6)},
+    ),
+    reading_name=st.sampled_from(("frequency", "voltage")),
+    name=st.sampled_from(("log.csv", "log.npz")),
+)
+def test_any_log_is_written_and_read_again(tmp_path, groups, reading_name, name):
+    log = Log("any", np.arange(4) + 2, 0.02 * np.arange(4), reading_name=reading_name, **groups)
+    write_log(tmp_path / name, log)
+    sheet, findings = read_sheet(tmp_path / name, 6)
+    again = sheet.log()
+    assert not findings and again.reading_name == reading_name
+    for group in ("time_s", *groups):
+        np.testing.assert_allclose(getattr(again, group), getattr(log, group), rtol=1e-8)
+    assert again.pressure_kpa is None
+
+
+def file_bytes(name, log):
+    buffer = io.BytesIO()
+    columns, table = log_table(log)
+    headers = [column.header for column in columns]
+    if name.endswith(".npz"):
+        np.savez(buffer, columns=np.array(headers), table=table)
+    else:
+        np.savetxt(buffer, table, "%.9g", ",", header=",".join(headers), comments="")
+    return buffer.getvalue()
+
+
+FILES = st.sampled_from(("log.csv", "log.npz")).flatmap(
+    lambda name: st.tuples(st.just(name), damaged(file_bytes(name, small_log())))
+)
+
+
+@settings(few, max_examples=200)
+@given(file=FILES)
+@pytest.mark.filterwarnings("error")
+def test_a_damaged_log_is_read_or_refused(tmp_path, file):
+    name, data = file
+    (tmp_path / name).write_bytes(data)
+    with contextlib.suppress(LogError):
+        assert len(read_sheet(tmp_path / name, 6)[0].log()) > 0

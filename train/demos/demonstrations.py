@@ -96,8 +96,10 @@ def _out_of_range(sheet: Sheet, spec: ArmSpec) -> Iterator[Finding]:
         got = f"got length {np.linalg.norm(quaternion[row]):.4g}"
         yield _finding(sheet, row, "tip_qw..qz", f"{got}, expected unit quaternions")
     sequence = sheet.values[:, sheet.of("sequence")[0]]
-    for row in np.flatnonzero((sequence < 0.0) | (sequence != np.round(sequence))):
-        yield _finding(sheet, row, "sequence", f"got {sequence[row]:g}, expected an integer >= 0")
+    for row in np.flatnonzero((sequence < 0.0) | (sequence > 1e6) | (sequence != np.round(sequence))):
+        yield _finding(
+            sheet, row, "sequence", f"got {sequence[row]:g}, expected a whole number from 0 to 1000000"
+        )
 
 
 def _out_of_order(sheet: Sheet) -> Iterator[Finding]:

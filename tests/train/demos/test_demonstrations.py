@@ -87,8 +87,14 @@ MISTAKES = {
         {"tip_quaternion": (3, 0, 0.5)},
         "line 5: tip_qw..qz: got length 0.5099, expected unit quaternions",
     ),
-    "no id": ({"sequence": (1, 0, 0.5)}, "line 3: sequence: got 0.5, expected an integer >= 0"),
-    "negative id": ({"sequence": (3, 0, -1)}, "line 5: sequence: got -1, expected an integer >= 0"),
+    "no id": (
+        {"sequence": (1, 0, 0.5)},
+        "line 3: sequence: got 0.5, expected a whole number from 0 to 1000000",
+    ),
+    "negative id": (
+        {"sequence": (3, 0, -1)},
+        "line 5: sequence: got -1, expected a whole number from 0 to 1000000",
+    ),
     "back in time": (
         {"time_s": (1, 0, 8.5)},
         "line 4: time: got 8 s after 8.5 s, expected time's order in a sequence",
