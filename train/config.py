@@ -1,4 +1,4 @@
-"""What a run is made of, as frozen data; presets; overrides; JSON."""
+"""Settings of a training run, presets, and both as JSON."""
 
 from __future__ import annotations
 
@@ -6,10 +6,12 @@ import dataclasses
 import itertools
 import json
 import math
-import types
 import typing
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any
+
+from tyro.constructors import PrimitiveConstructorSpec
 
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.env import EnvConfig
@@ -24,34 +26,34 @@ class ConfigError(InputError):
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """A training run.
-
-    Attributes:
-        seed: of networks, exploration, goals and batches; the pool of poses has `env.workspace_seed`.
-        n_arms: arms simulated side by side.
-        episode_length: actions per episode at most.
-        total_env_steps: actions of all arms together.
-        updates_per_env_step: gradient steps per action of one arm.
-        warmup_env_steps: actions drawn uniformly before the first gradient step.
-        batch_size: transitions per gradient step.
-        replay_capacity: transitions kept.
-        vector_steps_per_epoch: actions of each arm between two reports.
-        evaluation_epochs: epochs between two evaluations and checkpoints.
-    """
+    """A training run that reaches poses."""
 
     seed: int = 0
+    """seed of networks, exploration, goals and batches; the pool of poses has env.workspace_seed"""
     n_arms: int = 128
+    """arms simulated side by side"""
     episode_length: int = 4
+    """actions per episode at most"""
     total_env_steps: int = 300_000
+    """actions of all arms together"""
     updates_per_env_step: float = 1.0
+    """gradient steps per action of one arm"""
     warmup_env_steps: int = 2_048
+    """actions drawn uniformly before the first gradient step"""
     batch_size: int = 256
+    """transitions per gradient step"""
     replay_capacity: int = 400_000
+    """transitions kept"""
     vector_steps_per_epoch: int = 16
+    """actions of each arm between two reports"""
     evaluation_epochs: int = 10
+    """epochs between two evaluations and checkpoints"""
     env: EnvConfig = field(default_factory=EnvConfig)
+    """environment"""
     tqc: TQCConfig = field(default_factory=TQCConfig)
+    """actor and critics"""
     hindsight: HindsightConfig = field(default_factory=HindsightConfig)
+    """relabelled goals, as shares of a batch; the rest keeps its own goals"""
 
     def __post_init__(self) -> None:
         for name in (
@@ -86,11 +88,11 @@ class TrainConfig:
 
     @property
     def n_updates(self) -> int:
-        """Gradient steps of the whole run, warm-up epochs counted as if they had any."""
+        """Number of gradient steps of the run, warm-up epochs counted as if they had any."""
         return self.n_epochs * self.vector_steps_per_epoch * self.n_updates_per_vector_step
 
     def evaluates_after(self, epoch: int) -> bool:
-        """Whether there is an evaluation and a checkpoint after so many epochs."""
+        """Return whether an evaluation and a checkpoint follow the n-th epoch."""
         return epoch % self.evaluation_epochs == 0 or epoch == self.n_epochs
 
 
@@ -98,9 +100,9 @@ class TrainConfig:
 class Stage:
     """A part of the schedule of learning from demonstrations."""
 
-    share: float = 1.0  # of the run's environment steps
-    every: int = 1  # each so many-th demonstrated position is a goal; 1 is all of them
-    kept: float = 1.0  # share of what the replay holds that stays as the stage begins
+    share: float = 1.0  # share of the run's environment steps
+    every: int = 1  # every n-th demonstrated pose is a goal; 1 is all of them
+    kept: float = 1.0  # share of the replay's transitions that is kept as the stage begins
 
     def __post_init__(self) -> None:
         if not 0.0 < self.share <= 1.0:
@@ -111,29 +113,42 @@ class Stage:
             raise ConfigError(f"stages: kept: got {self.kept}, expected 0 to 1")
 
 
+def _stages(words: list[str]) -> tuple[Stage, ...]:
+    stages = []
+    for word in words:
+        share, every, kept = word.split(",")
+        stages.append(Stage(float(share), int(every), float(kept)))
+    return tuple(stages)
+
+
+_STAGES_OPTION = PrimitiveConstructorSpec(
+    nargs="*",
+    metavar="SHARE,EVERY,KEPT",
+    instance_from_str=_stages,
+    is_instance=lambda value: isinstance(value, tuple),
+    str_from_instance=lambda stages: [f"{stage.share:.3g},{stage.every},{stage.kept:g}" for stage in stages],
+)
+
+
 @dataclass(frozen=True)
 class ImitationConfig(TrainConfig):
-    """A training run whose goals are demonstrated positions.
-
-    Attributes:
-        gail: the discriminator.
-        learned_weight: of the learned reward; without it, of the demonstrations the positions alone are seen.
-        hand_made_weight: of the environment's reward.
-        frozen: the discriminator is another run's and stays as it is; of the demonstrations, the positions
-            alone are seen then too.
-        expert_share: of a batch of the critics that is the expert's, while the discriminator learns.
-        stages: in order; their shares add up to 1.
-        rebalance_env_steps: steps between two shifts of the goals towards those that are missed by most; 0
-            is never.
-    """
+    """A training run whose goals are demonstrated poses."""
 
     gail: GailConfig = field(default_factory=GailConfig)
+    """discriminator"""
     learned_weight: float = 1.0
+    """weight of the learned reward; with 0, only the poses of the demonstrations are used"""
     hand_made_weight: float = 0.0
+    """weight of the environment's reward"""
     frozen: bool = False
+    """keep the discriminator of another run as it is; only the poses of the demonstrations are used"""
     expert_share: float = 0.25
-    stages: tuple[Stage, ...] = (Stage(),)
+    """share of the critics' batches that is the expert's while the discriminator learns"""
+    stages: Annotated[tuple[Stage, ...], _STAGES_OPTION] = (Stage(),)
+    """stages in order: share of the env steps (all add up to 1), every n-th pose is a goal, share of the
+    replay that is kept as the stage begins"""
     rebalance_env_steps: int = 0
+    """env steps between two shifts of the goals towards those missed by most; 0 is never"""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -161,181 +176,76 @@ class ImitationConfig(TrainConfig):
 
     @property
     def stage_epochs(self) -> tuple[int, ...]:
-        """The epoch that each stage begins before."""
+        """Number of epochs before each stage."""
         shares = [0.0, *itertools.accumulate(stage.share for stage in self.stages[:-1])]
         return tuple(round(share * self.n_epochs) for share in shares)
 
     def evaluates_after(self, epoch: int) -> bool:
-        """Likewise, and as each stage ends."""
+        """Return whether to evaluate after this epoch: every n-th, and at the end of each stage."""
         return super().evaluates_after(epoch) or epoch in self.stage_epochs
 
     @property
     def rebalance_epochs(self) -> int:
-        """Epochs between two shifts of the goals; 0 is never."""
+        """Number of epochs between two shifts of the goals; 0 is never."""
         return -(-self.rebalance_env_steps // (self.n_arms * self.vector_steps_per_epoch))
 
 
-# Settings that made learning faster or finer.
-_TUNED = TrainConfig(
-    tqc=TQCConfig(
-        gamma=0.5,
-        learning_rate=1e-3,
-        learning_rate_end=0.02,
-        target_entropy=-30.0,
-        reward_scale=0.1,
-        initial_alpha=0.1,
-    ),
-    hindsight=HindsightConfig(reached_share=0.25, near_share=0.5),
-)
-
-PRESETS: dict[str, TrainConfig] = {
-    # On a CPU a gradient step costs as much as many env steps, so there are eight of these to one of those,
-    # and the batch is small.
-    "quick": dataclasses.replace(
-        _TUNED,
-        total_env_steps=240_000,
-        updates_per_env_step=0.125,
-        batch_size=128,
-        replay_capacity=262_144,
-        evaluation_epochs=30,
-    ),
-    "paper": dataclasses.replace(_TUNED, total_env_steps=300_000, updates_per_env_step=0.5),
-}
-
-# The paper's schedules with a fifteenth or an eighth of its steps, which is enough. In the pipe, goals shift
-# to the worst with each fifth of the run. Of the circle's 16 points 8 come first, then all, the environment's
-# own reward beside the learned one, so that points between them stay where they are.
-_PIPE = ImitationConfig(
-    total_env_steps=40_000,
-    updates_per_env_step=0.2,
-    warmup_env_steps=1_024,
-    replay_capacity=40_000,
-    tqc=dataclasses.replace(_TUNED.tqc, learning_rate_alpha=1e-3, reward_scale=10.0, initial_alpha=0.02),
-    hindsight=HindsightConfig(reached_share=0.0, near_share=0.0),
-    rebalance_env_steps=8_000,
-    evaluation_epochs=2,
-)
-_HAND_MADE = dataclasses.replace(
-    _PIPE,
-    learned_weight=0.0,
-    hand_made_weight=1.0,
-    tqc=dataclasses.replace(_TUNED.tqc, learning_rate_alpha=1e-3),
-    hindsight=_TUNED.hindsight,
-)
-IMITATION_PRESETS: dict[str, ImitationConfig] = {
-    "circle": dataclasses.replace(
-        _HAND_MADE,
-        tqc=dataclasses.replace(_HAND_MADE.tqc, learning_rate=3e-4),
-        learned_weight=5.0,
-        rebalance_env_steps=0,
-        stages=(Stage(share=1 / 3, every=2), Stage(share=2 / 3, kept=0.2)),
-    ),
-    "pipe": _PIPE,
-    "hand-made": _HAND_MADE,
-    "frozen": dataclasses.replace(_HAND_MADE, learned_weight=5.0, frozen=True),
-}
-IMITATION_PRESETS_HELP = (
-    "pipe: the learned reward; circle: both, in two stages; hand-made: the environment's reward at the "
-    "same goals; frozen: that and another run's learned reward, with --reward; "
-)
-
-
-def override(config: Any, assignments: list[str]) -> Any:
-    """A copy of a config with settings such as `tqc.gamma=0.95` changed, all of them at once.
+def override(config: Any, assignments: Sequence[str]) -> Any:
+    """Return a copy of a config with settings such as `tqc.gamma=0.95` changed, all of them at once.
 
     Raises:
-        ConfigError: unknown setting, wrong type, or values that the config refuses.
+        ConfigError: a setting is unknown or of the wrong type, or the config refuses its value.
     """
-    texts: dict[str, str] = {}
+    data = to_dict(config)
     for assignment in assignments:
         path, equals, text = assignment.partition("=")
-        if not equals:
-            raise ConfigError(f"{assignment}: expected NAME=VALUE, for example tqc.gamma=0.95")
-        texts[path] = text
-    return _replace(config, {tuple(path.split(".")): text for path, text in texts.items()}, "")
-
-
-def _replace(config: Any, texts: dict[tuple[str, ...], str], prefix: str) -> Any:
-    """A copy with settings changed, which are given by their names from here on."""
-    known, hints = [item.name for item in dataclasses.fields(config)], typing.get_type_hints(type(config))
-    inner: dict[str, dict[tuple[str, ...], str]] = {}
-    values = {}
-    for (name, *names), text in texts.items():
-        path = f"{prefix}{'.'.join((name, *names))}"
-        if name not in known:
-            raise ConfigError(f"{path}: unknown setting, expected one of {', '.join(known)}")
-        value = getattr(config, name)
-        if names and not dataclasses.is_dataclass(value):
-            raise ConfigError(f"{path}: {name} has no settings of its own")
-        if names:
-            inner.setdefault(name, {})[tuple(names)] = text
-        elif dataclasses.is_dataclass(value):
-            settings = ", ".join(f"{path}.{item.name}" for item in dataclasses.fields(value))
-            raise ConfigError(f"{path}: a group, expected one of {settings}")
-        else:
-            values[name] = _parse(text, hints[name], path)
-    values |= {
-        name: _replace(getattr(config, name), those, f"{prefix}{name}.") for name, those in inner.items()
-    }
-    try:
-        return dataclasses.replace(config, **values)
-    except ValueError as error:
-        given = ", ".join(f"{prefix}{'.'.join(names)}={text}" for names, text in texts.items())
-        raise ConfigError(f"{given}: {error}") from error
-
-
-def _parse(text: str, kind: Any, path: str) -> Any:
-    """A value of the setting's type from its text; JSON but for bare words."""
-    try:
-        value = json.loads(text)
-    except json.JSONDecodeError:
-        value = text
-    return _coerce(value, kind, path)
-
-
-def _coerce(value: Any, kind: Any, path: str) -> Any:
-    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
-    if origin in (typing.Union, types.UnionType):
-        if value is None and type(None) in arguments:
-            return None
-        kind = next(argument for argument in arguments if argument is not type(None))
-        origin, arguments = typing.get_origin(kind), typing.get_args(kind)
-    if origin is typing.Literal and value in arguments:
-        return value
-    if dataclasses.is_dataclass(kind) and isinstance(value, dict):
-        return _from_dict(kind, value, path)
-    if origin is tuple and isinstance(value, list):
-        return tuple(_coerce(item, arguments[0], path) for item in value)
-    if kind is float and isinstance(value, (int, float)) and not isinstance(value, bool):
-        return float(value)
-    if isinstance(kind, type) and type(value) is kind:
-        return value
-    raise ConfigError(f"{path}: got {value!r}, expected {getattr(kind, '__name__', kind)}")
+        *groups, name = path.replace("-", "_").split(".")
+        settings: Any = data
+        for group in groups:
+            settings = settings.get(group) if isinstance(settings, dict) else None
+        if not equals or not isinstance(settings, dict) or isinstance(settings.get(name, {}), dict):
+            known = ", ".join(settings if isinstance(settings, dict) else data)
+            raise ConfigError(f"{path}: got {assignment!r}, expected NAME=VALUE for one of {known}")
+        try:
+            settings[name] = json.loads(text)
+        except json.JSONDecodeError:  # a bare word
+            settings[name] = text
+    return _read(type(config), data, "")
 
 
 def to_dict(config: TrainConfig) -> dict[str, Any]:
-    """Nested dictionaries for JSON; tuples become lists."""
+    """Return nested dictionaries for JSON; tuples become lists."""
     return json.loads(json.dumps(dataclasses.asdict(config)))
 
 
 def from_dict(data: dict[str, Any]) -> TrainConfig:
-    """The config that `to_dict` gave; of learning from demonstrations where it has their settings.
+    """Return the config that `to_dict` gave; an `ImitationConfig` where its settings are there.
 
     Raises:
         ConfigError: a setting is missing, unknown or of the wrong type.
     """
-    return _from_dict(ImitationConfig if "stages" in data else TrainConfig, data, "config")
+    return _read(ImitationConfig if "stages" in data else TrainConfig, data, "config")
 
 
-def _from_dict(cls: Any, data: Any, path: str) -> Any:
-    hints = typing.get_type_hints(cls)
-    if not isinstance(data, dict) or data.keys() != hints.keys():
-        got = sorted(data) if isinstance(data, dict) else data
-        raise ConfigError(f"{path}: got {got}, expected the settings {sorted(hints)}")
-    values = {
-        name: _from_dict(kind, data[name], f"{path}.{name}")
-        if dataclasses.is_dataclass(kind)
-        else _coerce(data[name], kind, f"{path}.{name}")
-        for name, kind in hints.items()
-    }
-    return cls(**values)
+def _read(kind: Any, value: Any, path: str) -> Any:
+    """Return the value of a setting, or of a group of settings, whose type is `kind`, from what JSON gave."""
+    if dataclasses.is_dataclass(kind) and isinstance(kind, type):
+        hints = typing.get_type_hints(kind)
+        if not isinstance(value, dict) or value.keys() != hints.keys():
+            got = sorted(value) if isinstance(value, dict) else value
+            raise ConfigError(f"{path}: got {got}, expected the settings {sorted(hints)}")
+        prefix = f"{path}." if path else ""
+        values = {name: _read(hint, value[name], prefix + name) for name, hint in hints.items()}
+        try:
+            return kind(**values)
+        except ValueError as error:
+            raise ConfigError(str(error)) from error
+    if typing.get_origin(kind) is tuple and isinstance(value, list):
+        return tuple(_read(typing.get_args(kind)[0], item, path) for item in value)
+    allowed = typing.get_args(kind) or (kind,)  # types of a union, or values of a Literal
+    if float in allowed and type(value) is int:
+        return float(value)
+    if type(value) not in allowed and value not in allowed:
+        names = ", ".join(getattr(item, "__name__", repr(item)) for item in allowed)
+        raise ConfigError(f"{path}: got {value!r}, expected {names}")
+    return value

@@ -78,7 +78,7 @@ class HeldOut:
 
 def our_config(name: str) -> Any:
     """Return the `TrainConfig` of ours-quick, ours-plain or ours-paper."""
-    from train.config import PRESETS
+    from train.presets import PRESETS
 
     config = PRESETS["paper" if name == "ours-paper" else "quick"]
     if name == "ours-plain":
@@ -124,7 +124,7 @@ def peer(library: str, variant: str, seed: int) -> Contestant:
     from stable_baselines3.common.logger import Logger  # pyright: ignore[reportMissingImports]
 
     from mjx_softarm.env.gym import SoftArmVectorEnv, as_sb3
-    from train.config import PRESETS
+    from train.presets import PRESETS
 
     config, module = PRESETS["quick"], {"sbx": "sbx", "sb3-contrib": "sb3_contrib"}[library]
     algorithm = importlib.import_module(module).TQC

@@ -13,7 +13,7 @@ import numpy as np
 
 from benchmarks.harness.common import goal
 from benchmarks.race.contestants import CONTESTANTS, hindsight_share, tuned_settings
-from train.config import PRESETS
+from train.presets import PRESETS
 
 LEVELS_MM = (10, 5, 3, 2)
 GOAL_MM = 5

@@ -47,8 +47,8 @@ def _ours(batch_size: int, n_updates: int) -> tuple[Facts, Callable[[], Facts]]:
     from train.agent.hindsight import relabel
     from train.agent.learner import Experience
     from train.agent.tqc import TQC, TQCConfig
-    from train.config import PRESETS
     from train.epoch import replay
+    from train.presets import PRESETS
 
     hindsight, scale, reward = (
         PRESETS["quick"].hindsight,

@@ -249,7 +249,7 @@ from mjx_softarm._support import xla
 xla.enable_compilation_cache({cache!r})
 from mjx_softarm.env import ReachEnv
 from train.agent.hindsight_tqc import HindsightTQC
-from train.config import PRESETS
+from train.presets import PRESETS
 from train.epoch.job import Job
 imported = time.perf_counter()
 config, env = PRESETS["quick"], ReachEnv()

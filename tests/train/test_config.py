@@ -4,7 +4,8 @@ import json
 
 import pytest
 
-from train.config import PRESETS, ConfigError, TrainConfig, from_dict, override, to_dict
+from train.config import ConfigError, TrainConfig, from_dict, override, to_dict
+from train.presets import PRESETS
 
 
 def test_overrides_reach_every_level_and_leave_the_preset_alone():

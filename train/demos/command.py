@@ -2,92 +2,90 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
-from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
+import tyro
 from rich.console import Console
 
+from mjx_softarm._support import cli
+from mjx_softarm.deploy import arms
 from mjx_softarm.logs.schema import Log, write_log
-from mjx_softarm.sensing.s2r import S2R
 from mjx_softarm.spec import ArmSpec
 from train.config import ConfigError
 from train.demos.demonstrations import from_log, read_demonstrations
+from train.demos.expert import Expert
+from train.demos.teleop import KEYS, Teleoperation, read_keys
 from train.demos.waypoints import TASKS, task
-from train.options import add_arm
+from train.options import ArmOptions, start
 
-_STOPPED, _INTERRUPTED = 3, 130
-
-
-ArmOf = Callable[[argparse.Namespace, Console], tuple[ArmSpec, S2R | None]]
+_STOPPED = 3  # exit status
 
 
-def add_commands(commands: argparse._SubParsersAction, arm_of: ArmOf) -> None:
-    """Add `demos` to a parser; `arm_of` gives the arm of options `spec` and `calibration`."""
-    demos = commands.add_parser("demos", help="record demonstrations on an arm, check files of them")
-    kinds = demos.add_subparsers(required=True, metavar="COMMAND")
-    record = kinds.add_parser("record", help="bring an arm's finger tips to positions, and log them")
-    record.add_argument(
-        "--arm",
-        required=True,
-        help="twin:SEED, twin:SEED:pipe300, or package.module:Class, a driver of your own",
-    )
-    record.add_argument("--task", choices=TASKS, help="its positions and its pipe; --keyboard does without")
-    record.add_argument(
-        "--keyboard", action="store_true", help="steer by keys, in the task's pipe if one is given"
-    )
-    add_arm(record)
-    record.add_argument("--out", type=Path, required=True, metavar="FILE", help="to write, CSV or npz")
-    record.set_defaults(command=lambda options, console: _record(options, console, *arm_of(options, console)))
-    check = kinds.add_parser("check", help="what a file has, and what is wrong with it")
-    check.add_argument("file", type=Path, help="CSV or npz")
-    check.add_argument("--spec", type=Path, help="TOML file of the arm; default: the paper's arm")
-    check.add_argument("--calibration", type=Path, metavar="DIR", help="folder with the arm, for --spec")
-    check.set_defaults(command=lambda options, console: _check(options, console, *arm_of(options, console)))
+@dataclass(frozen=True, kw_only=True)
+class Record(ArmOptions):
+    """Bring an arm's finger tips to waypoints, and log the static poses there."""
+
+    arm_name: Annotated[str, tyro.conf.arg(name="arm")]
+    """twin:SEED, twin:SEED:pipe300, or package.module:Class, a driver of your own"""
+    task: Literal["circle16", "pipe300", "pipe250"] | None = None
+    """task with its waypoints and its pipe; --keyboard does without"""
+    keyboard: bool = False
+    """steer by keys, in the task's pipe if one is given"""
+    out: Path
+    """file to write, CSV or npz"""
+
+    def __call__(self) -> int:
+        console = start()
+        if not (self.task or self.keyboard):
+            raise ConfigError(f"--task: got nothing, expected one of {', '.join(TASKS)}, or --keyboard")
+        if not self.out.parent.is_dir() or self.out.exists():
+            raise ConfigError(
+                f"--out: got {self.out}, expected the name of a new file in a folder that exists"
+            )
+        spec, s2r = self.arm(console)
+        arm = arms.open_arm(self.arm_name)
+        waypoints, pipe = task(self.task, spec) if self.task else ((), None)
+        expert = Expert(spec, s2r, pipe)
+        plan = None if self.keyboard else expert.plan(waypoints)  # before the arm moves
+        teleop = Teleoperation(arm, expert, lambda text: _tell(console, text))
+        if plan is None:
+            _tell(console, KEYS)
+            result = teleop.steer(read_keys(sys.stdin))
+        else:
+            result = teleop.record(waypoints, plan)
+        if len(result.log):
+            write_log(self.out, result.log)
+            _tell(console, f"demonstrations: {self.out}, {len(result.log)} poses")
+            if np.isfinite(result.off_m).any():
+                _tell(console, f"furthest from its waypoint: {1e3 * np.nanmax(result.off_m):.1f} mm")
+        if result.problem:
+            _tell(console, f"ended early: {result.problem}")
+            return cli.INTERRUPTED if result.problem == "interrupted" else _STOPPED
+        return 0 if len(result.log) else _STOPPED
 
 
-def _record(options: argparse.Namespace, console: Console, spec: ArmSpec, s2r: S2R | None) -> int:
-    from mjx_softarm.deploy.arms import open_arm
-    from train.demos.expert import Expert
-    from train.demos.teleop import KEYS, Teleoperation, read_keys
+@dataclass(frozen=True, kw_only=True)
+class Check(ArmOptions):
+    """Tell what a file of demonstrations has, and what is wrong with it."""
 
-    def tell(text: str) -> None:
-        console.print(text, markup=False, highlight=False, soft_wrap=True)
+    file: tyro.conf.Positional[Path]
+    """CSV or npz"""
 
-    if not (options.task or options.keyboard):
-        raise ConfigError(f"--task: missing, expected one of {', '.join(TASKS)}, or --keyboard")
-    if not options.out.parent.is_dir() or options.out.is_dir():
-        raise ConfigError(f"--out: got {options.out}, expected the name of a file in a folder that exists")
-    if options.out.exists():
-        raise ConfigError(f"--out: {options.out} is there already; choose another")
-    arm = open_arm(options.arm)
-    waypoints, pipe = task(options.task, spec) if options.task else ((), None)
-    expert = Expert(spec, s2r, pipe)
-    plan = None if options.keyboard else expert.plan(waypoints)  # before the arm moves
-    teleop = Teleoperation(arm, expert, tell)
-    if plan is None:
-        tell(KEYS)
-        result = teleop.steer(read_keys(sys.stdin))
-    else:
-        result = teleop.record(waypoints, plan)
-    if len(result.log):
-        write_log(options.out, result.log)
-        tell(f"demonstrations: {options.out}, {len(result.log)} positions")
-        if np.isfinite(result.off_m).any():
-            tell(f"furthest from its waypoint: {1e3 * np.nanmax(result.off_m):.1f} mm")
-    if result.problem:
-        tell(f"ended early: {result.problem}")
-        return _INTERRUPTED if result.problem == "interrupted" else _STOPPED
-    return 0 if len(result.log) else _STOPPED
+    def __call__(self) -> int:
+        console = start()
+        spec, _ = self.arm(console)
+        log, findings = read_demonstrations(self.file, spec)
+        for text in (*_summary(log, spec), *map(str, findings)):
+            _tell(console, text)
+        return 0
 
 
-def _check(options: argparse.Namespace, console: Console, spec: ArmSpec, _: S2R | None) -> int:
-    log, findings = read_demonstrations(options.file, spec)
-    for text in (*_summary(log, spec), *map(str, findings)):
-        console.print(text, markup=False, highlight=False, soft_wrap=True)
-    return 0
+def _tell(console: Console, text: str) -> None:
+    console.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
 def _summary(log: Log, spec: ArmSpec) -> list[str]:

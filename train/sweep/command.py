@@ -2,90 +2,82 @@
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Any, Literal, Self
 
+import tyro
 from rich.console import Console
 
-from mjx_softarm.sensing.s2r import S2R
-from mjx_softarm.spec import ArmSpec
-from train.config import PRESETS, ConfigError, TrainConfig, override
-from train.options import add_arm, check_resume_alone
+from mjx_softarm._support import cli
+from train.config import ConfigError, TrainConfig, override
+from train.options import NewRunOptions, named_preset, start
+from train.presets import PRESETS
 from train.runs.checkpoint import sole_trainer
+from train.runs.run import Interrupted, free_path
 from train.sweep.job import VARIABLE, setting
+from train.sweep.report import CURVES_FILE, RESULTS_FILE, report
+from train.sweep.run import create, open_sweep, train
 
 _WIDTH = 160  # of the table where it is printed elsewhere than to a terminal
 
-ArmOf = Callable[[argparse.Namespace, Console], tuple[ArmSpec, S2R | None]]
 
+@dataclass(frozen=True, kw_only=True)
+class SweepCommand(NewRunOptions):
+    """Train `reach` with several seeds and settings, all at once.
 
-def add_sweep(commands: argparse._SubParsersAction, arm_of: ArmOf) -> None:
-    """Add `sweep` to a parser; `arm_of` gives the arm of options `spec` and `calibration`."""
-    sweep = commands.add_parser("sweep", help="train `reach` with several seeds and settings, all at once")
-    sweep.add_argument("--preset", choices=PRESETS, help="default: quick")
-    sweep.add_argument("--seeds", metavar="SEED,SEED,...", help="of each setting; default: 0")
-    sweep.add_argument(
-        "--vary",
-        action="append",
-        default=[],
-        metavar="NAME=VALUE,VALUE,...",
-        help="train with each of these values, e.g. tqc.gamma=0.5,0.9; with several, with each combination",
-    )
-    add_arm(sweep)
-    sweep.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
-        help="any setting of all members, e.g. total_env_steps=10000",
-    )
-    sweep.add_argument("--out", type=Path, help="folder of the sweep; default: runs/sweep-PRESET")
-    sweep.add_argument(
-        "--resume", type=Path, metavar="SWEEP", help="continue this one; its own settings hold"
-    )
-    sweep.set_defaults(command=lambda options, console: _sweep(options, console, arm_of))
+    --engine and --mode are short for --env.engine and --env.mode. --seeds and --vary stand in the place of the
+    settings' own values.
+    """
 
+    preset: Literal["quick", "paper"] = "quick"
+    """settings to begin with; the defaults below are this preset's"""
+    config: Annotated[TrainConfig, tyro.conf.arg(name="")]
+    seeds: cli.Integers = (0,)
+    """seeds of each setting"""
+    vary: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME=VALUE,...")] = ()
+    """train with each of these values, e.g. tqc.gamma=0.5,0.9; with several, with each combination"""
 
-def _sweep(options: argparse.Namespace, console: Console, arm_of: ArmOf) -> int:
-    from train.runs.run import Interrupted, free_path
-    from train.sweep.report import CURVES_FILE, RESULTS_FILE, report
-    from train.sweep.run import create, open_sweep, train
+    @classmethod
+    def default(cls, arguments: Sequence[str]) -> Self:
+        preset: Any = named_preset(arguments, PRESETS, "quick")
+        return cls(preset=preset, config=PRESETS[preset])
 
-    if options.resume:
-        check_resume_alone(options, "sweep")
-        sweep = open_sweep(options.resume)
-    else:
-        preset = options.preset or "quick"
-        members, varied = members_of(PRESETS[preset], options.set, options.seeds or "0", options.vary)
-        spec, s2r = arm_of(options, console)
-        path = options.out or free_path(Path("runs") / f"sweep-{preset}")
-        sweep = create(path, members, varied, spec, s2r)
-    console.print(f"sweep: {sweep.path}, {len(sweep.runs)} members", highlight=False)
-    try:
-        with sole_trainer(sweep.path):
-            train(sweep, console)
-    except Interrupted as stop:
-        console.print(str(stop), highlight=False)
-        return 130
-    wide = console if console.is_terminal else Console(file=console.file, width=_WIDTH)
-    wide.print(report(sweep))
-    for what, name in (("results", RESULTS_FILE), ("picture", CURVES_FILE)):
-        console.print(f"{what}: {sweep.path / name}", highlight=False, soft_wrap=True)
-    return 0
+    def __call__(self) -> int:
+        console = start()
+        if self.resume:
+            self.check_resume_alone(self.default([]))
+            sweep = open_sweep(self.resume)
+        else:
+            members, varied = members_of(self.config, self.seeds, self.vary)
+            spec, s2r = self.arm(console)
+            path = self.out or free_path(Path("runs") / f"sweep-{self.preset}")
+            sweep = create(path, members, varied, spec, s2r)
+        console.print(f"sweep: {sweep.path}, {len(sweep.runs)} members", highlight=False)
+        try:
+            with sole_trainer(sweep.path):
+                train(sweep, console)
+        except Interrupted as stop:
+            console.print(str(stop), highlight=False)
+            return cli.INTERRUPTED
+        wide = console if console.is_terminal else Console(file=console.file, width=_WIDTH)
+        wide.print(report(sweep))
+        for what, name in (("results", RESULTS_FILE), ("picture", CURVES_FILE)):
+            console.print(f"{what}: {sweep.path / name}", highlight=False, soft_wrap=True)
+        return 0
 
 
 def members_of(
-    preset: TrainConfig, assignments: Sequence[str], seeds: str, vary: Sequence[str]
+    config: TrainConfig, seeds: Sequence[int], vary: Sequence[str]
 ) -> tuple[dict[str, TrainConfig], tuple[str, ...]]:
-    """The members of a sweep: each seed with each combination of the varied settings.
+    """Return the members of a sweep: each seed with each combination of the varied settings.
 
     Args:
-        preset: what they have in common,
-        assignments: but for these settings, NAME=VALUE.
-        seeds: N,N,...
+        config: settings that all members have.
+        seeds: seeds.
         vary: NAME=VALUE,VALUE,... for each setting that is varied.
 
     Returns:
@@ -94,44 +86,26 @@ def members_of(
     Raises:
         ConfigError: a setting is unknown or cannot be varied, a value cannot be used or comes twice.
     """
-    texts = {"seed": _values("--seeds", seeds)}
+    values: dict[str, list[str]] = {}
     for assignment in vary:
-        path, equals, values = assignment.partition("=")
-        if not equals:
-            raise ConfigError(f"--vary {assignment}: expected NAME=VALUE,VALUE,...")
-        if path in texts:
+        path, _, text = assignment.partition("=")
+        path = path.replace("-", "_")
+        if path not in VARIABLE:
             raise ConfigError(
-                f"--vary {assignment}: {path} stands there already; expected all its values in one"
+                f"--vary {assignment}: got a setting that decides what is computed or on what shapes, the same "
+                f"for all members, expected NAME=VALUE,... for one of {', '.join(VARIABLE)}"
             )
-        texts[path] = _values(f"--vary {assignment}", values)
-    for assignment in assignments:
-        if assignment.partition("=")[0] in texts:
-            raise ConfigError(f"--set {assignment}: a value for all, but --seeds or --vary has one for each")
-    varied = tuple(texts)[1:]
+        if path in values:
+            raise ConfigError(f"--vary {assignment}: got {path} again, expected all its values in one")
+        values[path] = [value.strip() for value in text.split(",")]
     members = {}
-    for combination in itertools.product(*texts.values()):
-        own = [f"{path}={text}" for path, text in zip(texts, combination, strict=True)]
-        config = override(preset, [*assignments, *own])
-        for path in varied:
-            _check_variable(path, setting(config, path))
-        members["-".join([f"seed{combination[0]}", *own[1:]])] = config
-    if len(set(members.values())) < math.prod(map(len, texts.values())):
-        raise ConfigError("--seeds, --vary: a value comes twice; expected different ones")
-    return members, varied
-
-
-def _values(option: str, text: str) -> list[str]:
-    values = [value.strip() for value in text.split(",")]
-    if "" in values:
-        raise ConfigError(f"{option}: got an empty value, expected values with commas between them")
-    return values
-
-
-def _check_variable(path: str, value: object) -> None:
-    if path not in VARIABLE:
-        raise ConfigError(
-            f"--vary {path}: decides what is computed or on what shapes, so it is the same for all members, "
-            f"set by --set; expected one of {', '.join(VARIABLE)}"
-        )
-    if not isinstance(value, float):
-        raise ConfigError(f"--vary {path}: got {value}, expected numbers")
+    for seed, *combination in itertools.product(seeds, *values.values()):
+        own = [f"{path}={text}" for path, text in zip(values, combination, strict=True)]
+        member = override(config, [f"seed={seed}", *own])
+        for path in values:
+            if not isinstance(setting(member, path), float):
+                raise ConfigError(f"--vary {path}: got {setting(member, path)}, expected numbers")
+        members["-".join([f"seed{seed}", *own])] = member
+    if len(set(members.values())) < len(seeds) * math.prod(map(len, values.values())):
+        raise ConfigError("--vary: got a value twice, expected different ones")
+    return members, tuple(values)

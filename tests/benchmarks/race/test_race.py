@@ -23,7 +23,7 @@ from benchmarks.race.contestants import (
 from benchmarks.race.race import Limits, RaceError, limits_of, run, train
 from mjx_softarm.env import EnvConfig, ReachEnv
 from train.agent.tqc import TQC
-from train.config import PRESETS
+from train.presets import PRESETS
 from train.runs.evaluate import Evaluator
 
 FAKE = '''

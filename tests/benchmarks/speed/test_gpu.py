@@ -6,7 +6,8 @@ import sys
 import pytest
 
 from benchmarks.speed import gpu
-from train.config import PRESETS, override
+from train.config import override
+from train.presets import PRESETS
 
 
 def rates(chain, mjx):

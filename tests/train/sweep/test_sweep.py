@@ -20,8 +20,9 @@ from mjx_softarm.spec import ArmSpec
 from train.__main__ import main
 from train.agent.hindsight_tqc import HindsightTQC
 from train.agent.tqc import TQCConfig
-from train.config import PRESETS, ConfigError, TrainConfig, override
+from train.config import ConfigError, TrainConfig, override
 from train.epoch.job import Job
+from train.presets import PRESETS
 from train.runs.checkpoint import Run, RunError
 from train.runs.task import Task
 from train.sweep import run as sweep_run

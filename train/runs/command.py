@@ -1,0 +1,172 @@
+"""Commands `python -m train reach | imitate | evaluate | export`."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import tyro
+from jax.sharding import Mesh
+from rich.console import Console
+from rich.table import Table
+
+from mjx_softarm._support import cli
+from mjx_softarm.env import ReachEnv
+from train.config import ConfigError, ImitationConfig, TrainConfig
+from train.demos.demonstrations import from_log, read_demonstrations
+from train.epoch import devices
+from train.options import NewRunOptions, named_preset, start
+from train.presets import IMITATION_PRESETS, PRESETS
+from train.runs import run as runs
+from train.runs.checkpoint import Run, RunError, sole_trainer
+from train.runs.evaluate import N_ACTIONS
+from train.runs.export import export_run
+from train.runs.task import Task, task_of
+
+Devices = Annotated[str | None, tyro.conf.DisallowNone, tyro.conf.arg(metavar="D", help=devices.HELP)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reach(NewRunOptions):
+    """Train a policy that reaches poses of the workspace.
+
+    --engine and --mode are short for --env.engine and --env.mode.
+    """
+
+    preset: Literal["quick", "paper"] = "quick"
+    """settings to begin with; the defaults below are this preset's"""
+    config: Annotated[TrainConfig, tyro.conf.arg(name="")]
+    devices: Devices = None
+
+    @classmethod
+    def default(cls, arguments: Sequence[str]) -> Self:
+        preset: Any = named_preset(arguments, PRESETS, "quick")
+        return cls(preset=preset, config=PRESETS[preset])
+
+    def __call__(self) -> int:
+        console = start()
+        mesh = _mesh(self.devices, console)
+        if self.resume:
+            self.check_resume_alone(self.default([]))
+            return _resume(self.resume, mesh, console)
+        spec, s2r = self.arm(console)
+        console.print("drawing goals from the reachable workspace ...")
+        task = task_of(self.config, ReachEnv(spec, self.config.env, s2r), mesh=mesh)
+        path = self.out or runs.default_path("reach", self.preset, self.config.seed)
+        return _train(Run.create(path, self.config, spec, s2r), task, console)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Imitate(NewRunOptions):
+    """Train a policy that reaches poses as they were shown.
+
+    --pipe MM, --engine and --mode are short for --env.pipe-diameter-mm, --env.engine and --env.mode. With a
+    pipe, the evaluation counts poses whose body is not inside it.
+    """
+
+    file: tyro.conf.Positional[cli.MaybePath] = None
+    """demonstrations as `demos record` writes them"""
+    preset: Literal["pipe", "circle", "hand-made", "frozen"] = "pipe"
+    """settings to begin with. pipe: the learned reward; circle: both, in two stages; hand-made: the
+    environment's reward at the same goals; frozen: that and another run's learned reward, with --reward"""
+    config: Annotated[ImitationConfig, tyro.conf.arg(name="")]
+    agent: cli.MaybePath = None
+    """run whose actor and critics this one begins with"""
+    reward: cli.MaybePath = None
+    """run whose learned reward this one takes, and leaves as it is"""
+    devices: Devices = None
+
+    @classmethod
+    def default(cls, arguments: Sequence[str]) -> Self:
+        preset: Any = named_preset(arguments, IMITATION_PRESETS, "pipe")
+        return cls(preset=preset, config=IMITATION_PRESETS[preset])
+
+    def __call__(self) -> int:
+        console = start()
+        mesh = _mesh(self.devices, console)
+        if self.resume:
+            self.check_resume_alone(self.default([]))
+            return _resume(self.resume, mesh, console)
+        if self.file is None:
+            raise ConfigError("FILE: got nothing, expected the demonstrations, or --resume RUN")
+        config = dataclasses.replace(self.config, frozen=self.config.frozen or self.reward is not None)
+        if config.frozen and not self.reward:
+            raise ConfigError(
+                "frozen: got true, expected --reward RUN, the run whose learned reward it takes"
+            )
+        if self.reward and not config.learned_weight:
+            raise ConfigError(f"--reward {self.reward}: got learned_weight 0, expected more, for its reward")
+        spec, s2r = self.arm(console)
+        log, _ = read_demonstrations(self.file, spec)
+        donors = {name: path for name in ("agent", "reward") if (path := getattr(self, name))}
+        task = task_of(config, ReachEnv(spec, config.env, s2r), from_log(log, spec), mesh)
+        state = runs.begin_with(task, config.seed, **{name: Run.open(path) for name, path in donors.items()})
+        path = self.out or runs.default_path("imitate", self.preset, config.seed)
+        return _train(Run.create(path, config, spec, s2r, log, donors, state), task, console)
+
+
+def evaluate(run: tyro.conf.Positional[Path]) -> int:
+    """Evaluate a run's newest policy, with figures and pictures.
+
+    Args:
+        run: folder of the run
+    """
+    console = start()
+    opened = Run.open(run)
+    task, actor_params = runs.restore_actor(opened)
+    _show(opened, task, runs.finish(opened, task, actor_params), console)
+    return 0
+
+
+def export(folders: tyro.conf.Positional[tuple[Path, ...]], out: cli.MaybePath = None) -> int:
+    """Write policies, each as one npz file.
+
+    Args:
+        folders: folders of runs
+        out: file to write, for one run; None: policy.npz in its folder
+    """
+    if not folders or (out and len(folders) > 1):
+        expected = "one folder of a run" + ("" if out else " or more")
+        raise RunError(f"RUN: got {len(folders)}, expected {expected}")
+    console = start()
+    for path in folders:
+        console.print(f"policy: {export_run(Run.open(path), out)}", highlight=False)
+    return 0
+
+
+def _mesh(text: str | None, console: Console) -> Mesh | None:
+    """Return the devices to train on, and keep the console of all processes but the first quiet."""
+    mesh = devices.mesh_of(text)
+    console.quiet = not devices.is_first_process()
+    return mesh
+
+
+def _resume(path: Path, mesh: Mesh | None, console: Console) -> int:
+    run = Run.open(path)
+    return _train(run, runs.task_of_run(run, mesh), console)
+
+
+def _train(run: Run, task: Task, console: Console) -> int:
+    console.print(f"run: {run.path}", highlight=False)
+    try:
+        with sole_trainer(run.path):
+            summary = runs.train(run, task, console)
+    except runs.Interrupted as stop:
+        console.print(str(stop), highlight=False)
+        return cli.INTERRUPTED
+    _show(run, task, summary, console)
+    return 0
+
+
+def _show(run: Run, task: Task, summary: Any, console: Console) -> None:
+    table = Table(title=f"{task.title}, {N_ACTIONS} actions each", title_justify="left")
+    table.add_column("figure")
+    table.add_column("value", justify="right")
+    for name, value in summary.rows():
+        table.add_row(name, value)
+    console.print(table)
+    for name in task.picture_names:
+        console.print(f"picture: {run.path / name}", highlight=False, soft_wrap=True)
