@@ -29,9 +29,14 @@ _SHORT = {"--engine": "--env.engine", "--mode": "--env.mode", "--pipe": "--env.p
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit status."""
-    words = [word.partition("=") for word in (sys.argv[1:] if arguments is None else arguments)]
-    words = [_SHORT.get(name, name) + equals + value for name, equals, value in words]
+    words = in_full(sys.argv[1:] if arguments is None else arguments)
     return cli.main("python -m train", "Train, evaluate and export policies.", COMMANDS, words)
+
+
+def in_full(words: Sequence[str]) -> list[str]:
+    """Return the words of a command line with short names of options replaced by their full names."""
+    parts = [word.partition("=") for word in words]
+    return [_SHORT.get(name, name) + equals + value for name, equals, value in parts]
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ class ArmOptions:
     calibration: cli.MaybePath = None
     """folder that `python -m calib run` made, in the place of --spec"""
 
-    def arm(self, console: Console) -> tuple[ArmSpec, S2R | None]:
+    def read_arm(self, console: Console) -> tuple[ArmSpec, S2R | None]:
         """Return the arm, and the sim-to-real network of its calibration if there is one."""
         if self.calibration is None:
             return cli.arm_of(self.spec), None

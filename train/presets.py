@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 
+from train.agent.hindsight import HindsightConfig
 from train.agent.tqc import TQCConfig
 from train.config import ImitationConfig, Stage, TrainConfig
-from train.epoch.hindsight import HindsightConfig
 
 # Settings that made learning faster or finer.
 _TUNED = TrainConfig(

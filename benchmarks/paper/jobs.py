@@ -87,7 +87,7 @@ def train_reach(folder: Path, settings: Settings, twin: int | None, seed: int) -
 
 def _set(settings: tuple[str, ...]) -> list[str]:
     """Return the command line's options for settings NAME=VALUE."""
-    return [part for text in settings for part in ("--set", text)]
+    return [f"--{text}" for text in settings]
 
 
 def demonstrate(folder: Path, settings: Settings, twin: int, task: str) -> None:

@@ -65,7 +65,7 @@ def training_goal(on_gpu: bool) -> dict[str, str]:
         return goal(text, NO_DEVICE, None)
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "run"
-        settings = [part for setting in TRAINING for part in ("--set", setting)]
+        settings = [f"--{setting}" for setting in TRAINING]
         command = [sys.executable, "-m", "train", "reach", "--preset", "quick", *settings, "--out", str(run)]
         cache = {"XDG_CACHE_HOME": folder}  # empty, so that compilation is in the time
         try:

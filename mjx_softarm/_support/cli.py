@@ -69,11 +69,8 @@ def main(
         print("\n".join([f"usage: {prog} COMMAND [--help] ...", "", about, "", *lines]))
         return 0
     try:
-        name = next((name for name in commands if words[: len(name.split())] == name.split()), None)
-        if name is None:
-            raise InputError(f"{prog}: got {words[0]!r}, expected one of {', '.join(commands)}")
-        options = words[len(name.split()) :]
-        return finish(name, parse(_load(commands[name]), f"{prog} {name}", options)())
+        name, command = read(prog, commands, words)
+        return finish(name, command())
     except InputError as error:
         text = str(error)
     except OSError as error:
@@ -82,6 +79,18 @@ def main(
         return INTERRUPTED
     print(f"error: {text}", file=sys.stderr)
     return ERROR
+
+
+def read(prog: str, commands: Mapping[str, Command], words: Sequence[str]) -> tuple[str, Callable[[], Any]]:
+    """Return the name of the command that the words begin with, and the command with its options.
+
+    Raises:
+        InputError: there is no such command, or one of its options cannot be used.
+    """
+    name = next((name for name in commands if list(words[: len(name.split())]) == name.split()), None)
+    if name is None:
+        raise InputError(f"{prog}: got {words[0]!r}, expected one of {', '.join(commands)}")
+    return name, parse(_load(commands[name]), f"{prog} {name}", words[len(name.split()) :])
 
 
 def _line(command: Command) -> str:

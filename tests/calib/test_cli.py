@@ -81,9 +81,9 @@ def test_training_takes_the_folder(calibrated, tmp_path, monkeypatch):
 
     seen = {}
     monkeypatch.setattr(train_run, "train", lambda run, task, console: seen.update(run=run, env=task.job.env))
-    monkeypatch.setattr("train.__main__._show", lambda *_: None)
+    monkeypatch.setattr("train.runs.command._show", lambda *_: None)
     out = tmp_path / "run"
-    small = ["--set", "env.n_poses=64", "--out", str(out)]
+    small = ["--env.n-poses", "64", "--out", str(out)]
     assert train_main(["reach", "--calibration", str(calibrated[1]), *small]) == 0
     env, opened = seen["env"], Run.open(out)
     assert env.spec == opened.spec == ArmSpec.from_toml(calibrated[1] / "arm.toml")
@@ -101,9 +101,9 @@ def test_training_tells_that_a_folder_has_no_network(calibrated, tmp_path, monke
 
     seen = {}
     monkeypatch.setattr(train_run, "train", lambda run, task, console: seen.update(env=task.job.env))
-    monkeypatch.setattr("train.__main__._show", lambda *_: None)
+    monkeypatch.setattr("train.runs.command._show", lambda *_: None)
     shutil.copy(calibrated[1] / "arm.toml", tmp_path)
-    small = ["--set", "env.n_poses=64", "--out", str(tmp_path / "run")]
+    small = ["--env.n-poses", "64", "--out", str(tmp_path / "run")]
     assert train_main(["reach", "--calibration", str(tmp_path), *small]) == 0
     assert f"no {tmp_path / 's2r.npz'}: training on simulated poses" in capsys.readouterr().out
     assert seen["env"].s2r is None

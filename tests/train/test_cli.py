@@ -34,8 +34,8 @@ SMALL = {
     "vector_steps_per_epoch": 2,
     "evaluation_epochs": 4,
     "env.n_poses": 256,
-    "tqc.hidden_actor": [16, 16],
-    "tqc.hidden_critic": [16, 16],
+    "tqc.hidden_actor": 16,
+    "tqc.hidden_critic": 16,
 }
 
 
@@ -46,9 +46,8 @@ def environment(tmp_path_factory):
     return {**os.environ, "XDG_CACHE_HOME": str(cache)}
 
 
-def command(out, **changes):
-    settings = {**SMALL, **{name.replace("__", "."): value for name, value in changes.items()}}
-    flags = [part for name, value in settings.items() for part in ("--set", f"{name}={json.dumps(value)}")]
+def command(out):
+    flags = [f"--{name}={value}" for name, value in SMALL.items()]
     return [sys.executable, "-m", "train", "reach", *flags, "--out", str(out)]
 
 
@@ -137,16 +136,22 @@ def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path, environment):
 @pytest.mark.parametrize(
     "arguments, message",
     [
-        (["reach", "--set", "tqc.gama=1"], "tqc.gama: unknown setting"),
+        (["reach", "--tqc.gama", "1"], "Unrecognized options: --tqc.gama, 1; Perhaps you meant: --tqc.gamma"),
+        (["reach", "--preset", "slow"], "--preset: got 'slow', expected one of ('quick', 'paper')"),
+        (["reach", "--n-arms", "1.5"], "--n-arms: got '1.5', expected a whole number"),
+        (["imitate"], "FILE: got nothing, expected the demonstrations"),
+        (["imitate", "absent.npz", "--stages", "0.5,1"], "--stages: "),
+        (["demos", "record", "--task", "circle16"], "train demos record: got nothing, expected --arm"),
+        (["export"], "RUN: got 0, expected one folder of a run or more"),
         (["reach", "--spec", "absent.toml"], "absent.toml: cannot be read: No such file or directory"),
         (["reach", "--resume", "absent"], "absent: not the folder of a run"),
         (
-            ["reach", "--resume", "absent", "--seed", "0", "--set", "tqc.gamma=0.5"],
-            "--resume goes alone: the run's own settings hold, got --seed, --set too",
+            ["reach", "--resume", "absent", "--seed", "1", "--tqc.gamma", "0.4", "--out", "run"],
+            "--resume absent: got --out, --seed, --tqc too, expected none: its own settings hold",
         ),
-        (["reach", "--set", "env.workspace_seed=20000"], "20000 draws the goals of the evaluation"),
-        (["reach", "--set", "hindsight.near_min_mm=0"], "expected 0 < near_min_mm"),
-        (["reach", "--set", "evaluation_epochs=0"], "evaluation_epochs: got 0, expected at least 1"),
+        (["reach", "--env.workspace-seed", "20000"], "20000 draws the goals of the evaluation"),
+        (["reach", "--hindsight.near-min-mm", "0"], "near_min_mm"),
+        (["reach", "--evaluation-epochs", "0"], "evaluation_epochs: got 0, expected at least 1"),
         (["evaluate", "absent"], "absent: not the folder of a run"),
         (["export", "absent"], "absent: not the folder of a run"),
     ],
@@ -182,15 +187,14 @@ def demonstrations(tmp_path_factory):
 def test_imitation_resumes_across_stages_and_hands_its_reward_on(
     demonstrations, tmp_path, monkeypatch, capsys
 ):
-    stages = [{"share": 0.5, "every": 2, "kept": 1.0}, {"share": 0.5, "every": 1, "kept": 0.5}]
     settings = SMALL | {
         "total_env_steps": 128,  # 8 epochs, the second stage from the fourth
         "evaluation_epochs": 2,
         "rebalance_env_steps": 48,
-        "gail.hidden": [16],
-        "stages": stages,
+        "gail.hidden": 16,
     }
-    flags = [part for name, value in settings.items() for part in ("--set", f"{name}={json.dumps(value)}")]
+    flags = [f"--{name}={value}" for name, value in settings.items()]
+    flags += ["--stages", "0.5,2,1", "0.5,1,0.5"]
     flags += ["--spec", str(demonstrations / "arm.toml")]
     imitate = ["imitate", str(demonstrations / "demos.npz"), *flags, "--out"]
     whole, killed, narrow = (tmp_path / name for name in ("whole", "killed", "narrow"))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
 import tyro
@@ -29,7 +29,7 @@ _STOPPED = 3  # exit status
 class Record(ArmOptions):
     """Bring an arm's finger tips to waypoints, and log the static poses there."""
 
-    arm_name: Annotated[str, tyro.conf.arg(name="arm")]
+    arm: str
     """twin:SEED, twin:SEED:pipe300, or package.module:Class, a driver of your own"""
     task: Literal["circle16", "pipe300", "pipe250"] | None = None
     """task with its waypoints and its pipe; --keyboard does without"""
@@ -46,8 +46,8 @@ class Record(ArmOptions):
             raise ConfigError(
                 f"--out: got {self.out}, expected the name of a new file in a folder that exists"
             )
-        spec, s2r = self.arm(console)
-        arm = arms.open_arm(self.arm_name)
+        spec, s2r = self.read_arm(console)
+        arm = arms.open_arm(self.arm)
         waypoints, pipe = task(self.task, spec) if self.task else ((), None)
         expert = Expert(spec, s2r, pipe)
         plan = None if self.keyboard else expert.plan(waypoints)  # before the arm moves
@@ -77,7 +77,7 @@ class Check(ArmOptions):
 
     def __call__(self) -> int:
         console = start()
-        spec, _ = self.arm(console)
+        spec, _ = self.read_arm(console)
         log, findings = read_demonstrations(self.file, spec)
         for text in (*_summary(log, spec), *map(str, findings)):
             _tell(console, text)

@@ -52,7 +52,7 @@ class Reach(NewRunOptions):
         if self.resume:
             self.check_resume_alone(self.default([]))
             return _resume(self.resume, mesh, console)
-        spec, s2r = self.arm(console)
+        spec, s2r = self.read_arm(console)
         console.print("drawing goals from the reachable workspace ...")
         task = task_of(self.config, ReachEnv(spec, self.config.env, s2r), mesh=mesh)
         path = self.out or runs.default_path("reach", self.preset, self.config.seed)
@@ -99,7 +99,7 @@ class Imitate(NewRunOptions):
             )
         if self.reward and not config.learned_weight:
             raise ConfigError(f"--reward {self.reward}: got learned_weight 0, expected more, for its reward")
-        spec, s2r = self.arm(console)
+        spec, s2r = self.read_arm(console)
         log, _ = read_demonstrations(self.file, spec)
         donors = {name: path for name in ("agent", "reward") if (path := getattr(self, name))}
         task = task_of(config, ReachEnv(spec, config.env, s2r), from_log(log, spec), mesh)
@@ -116,8 +116,8 @@ def evaluate(run: tyro.conf.Positional[Path]) -> int:
     """
     console = start()
     opened = Run.open(run)
-    task, actor_params = runs.restore_actor(opened)
-    _show(opened, task, runs.finish(opened, task, actor_params), console)
+    task, policy = runs.restore_policy(opened)
+    _show(opened, task, runs.finish(opened, task, policy), console)
     return 0
 
 

@@ -29,8 +29,8 @@ _WIDTH = 160  # of the table where it is printed elsewhere than to a terminal
 class SweepCommand(NewRunOptions):
     """Train `reach` with several seeds and settings, all at once.
 
-    --engine and --mode are short for --env.engine and --env.mode. --seeds and --vary stand in the place of the
-    settings' own values.
+    --engine and --mode are short for --env.engine and --env.mode. --seeds and --vary replace the settings'
+    own values.
     """
 
     preset: Literal["quick", "paper"] = "quick"
@@ -53,7 +53,7 @@ class SweepCommand(NewRunOptions):
             sweep = open_sweep(self.resume)
         else:
             members, varied = members_of(self.config, self.seeds, self.vary)
-            spec, s2r = self.arm(console)
+            spec, s2r = self.read_arm(console)
             path = self.out or free_path(Path("runs") / f"sweep-{self.preset}")
             sweep = create(path, members, varied, spec, s2r)
         console.print(f"sweep: {sweep.path}, {len(sweep.runs)} members", highlight=False)
@@ -92,8 +92,8 @@ def members_of(
         path = path.replace("-", "_")
         if path not in VARIABLE:
             raise ConfigError(
-                f"--vary {assignment}: got a setting that decides what is computed or on what shapes, the same "
-                f"for all members, expected NAME=VALUE,... for one of {', '.join(VARIABLE)}"
+                f"--vary {assignment}: got a setting that decides what is computed or on what shapes, which all "
+                f"members share, expected NAME=VALUE,... for one of {', '.join(VARIABLE)}"
             )
         if path in values:
             raise ConfigError(f"--vary {assignment}: got {path} again, expected all its values in one")

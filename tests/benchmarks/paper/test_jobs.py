@@ -11,13 +11,13 @@ from benchmarks.paper import jobs
 from benchmarks.paper.engine import SMOKE
 from benchmarks.paper.kinds import KINDS, Trial, learned_run, reach_run
 from benchmarks.paper.measure import load_outcome
+from mjx_softarm._support import cli
 from mjx_softarm.mechanics.workspace import circle_poses
 from mjx_softarm.policy.file import save_policy
 from mjx_softarm.policy.runtime import PolicyRunner
 from mjx_softarm.sensing.sensors import Sensor
 from tests.benchmarks.paper.made_up import SPEC, TINY, N, goals_of, make_policy, pipe_trial
-from train import __main__ as train_main
-from train.config import IMITATION_PRESETS
+from train.__main__ import COMMANDS, in_full
 
 
 @pytest.fixture
@@ -35,8 +35,8 @@ def commands(monkeypatch):
 
 
 def parsed(arguments):
-    """What the command line makes of them; it ends the test where it does not know one."""
-    return train_main._parser().parse_args(arguments)
+    """Return the command with its options; an unknown one ends the test."""
+    return cli.read("train", COMMANDS, in_full(arguments))[1]
 
 
 def test_training_starts_resumes_exports_or_does_nothing(tmp_path, commands):
@@ -44,14 +44,14 @@ def test_training_starts_resumes_exports_or_does_nothing(tmp_path, commands):
     run, work = tmp_path / reach_run(1, 2), (jobs.train_reach, tmp_path, settings, 1, 2)
     start, export = commands(*work)
     options = parsed(start)
-    assert (options.preset, options.seed, options.out) == ("quick", 2, run)
+    assert (options.preset, options.config.seed, options.out) == ("quick", 2, run)
     assert options.calibration == tmp_path / "twin1" / "calibration"
-    assert options.set == ["tqc.gamma=0.9"]
-    assert parsed(export).runs == [run]
+    assert options.config.tqc.gamma == 0.9
+    assert parsed(export).keywords["folders"] == (run,)
     run.mkdir()
     (run / "config.json").touch()
     resume, export = commands(*work)
-    assert parsed(resume).resume == run and parsed(export).runs == [run]
+    assert parsed(resume).resume == run and parsed(export).keywords["folders"] == (run,)
     (run / "evaluation.json").touch()
     assert commands(*work) == [export]
     (run / "policy.npz").touch()
@@ -62,8 +62,9 @@ def test_learning_starts_with_what_it_builds_on_resumes_or_starts_anew(tmp_path,
     run, work = tmp_path / learned_run("narrow", 1, 2), (jobs.learn, tmp_path, TINY, "narrow", 1, 2)
     (start,) = commands(*work)
     options = parsed(start)
-    assert options.demonstrations == tmp_path / jobs.demonstrations_path(1, "pipe250")
-    assert (options.preset, options.seed, options.out, options.pipe) == ("frozen", 2, run, 250)
+    assert options.file == tmp_path / jobs.demonstrations_path(1, "pipe250")
+    config = options.config
+    assert (options.preset, config.seed, options.out, config.env.pipe_diameter_mm) == ("frozen", 2, run, 250)
     assert options.reward == tmp_path / learned_run("pipe", 1, 2)
     (run / "checkpoints").mkdir(parents=True)
     (run / "config.json").touch()  # interrupted before it had the reward
@@ -82,19 +83,19 @@ def test_learning_starts_with_what_it_builds_on_resumes_or_starts_anew(tmp_path,
 def test_settings_of_each_kind_are_known(tmp_path, commands, kind):
     (arguments,) = commands(jobs.learn, tmp_path, SMOKE, kind, 0, 0)
     options = parsed(arguments)
-    config = train_main._config(IMITATION_PRESETS[options.preset], options)
+    config = options.config
     assert config.n_epochs == 2
     assert config.stage_epochs == ((0, 1) if kind == "circle" else (0,))
     assert (config.gail.gradient_penalty == 0) == (kind == "no-penalty")
     assert (options.reward is not None) == (kind == "narrow")
-    assert options.pipe == {"narrow": 250, "circle": None}.get(kind, 300)
+    assert config.env.pipe_diameter_mm == {"narrow": 250, "circle": None}.get(kind, 300)
 
 
 def test_missing_policies_are_exported_in_one_go(tmp_path, commands):
     (tmp_path / "a").mkdir()
     (tmp_path / "a" / "policy.npz").touch()
     (export,) = commands(jobs.export, tmp_path, TINY, 0, ("a", "b", "c"))
-    assert parsed(export).runs == [tmp_path / "b", tmp_path / "c"]
+    assert parsed(export).keywords["folders"] == (tmp_path / "b", tmp_path / "c")
 
 
 def test_recording_that_ends_early_is_no_demonstration(tmp_path, monkeypatch):

@@ -34,7 +34,8 @@ from tests.benchmarks.paper.made_up import (
     pipe_trial,
     trained,
 )
-from train.config import IMITATION_PRESETS, to_dict
+from train.config import to_dict
+from train.presets import IMITATION_PRESETS
 
 
 def test_spread_by_hand():

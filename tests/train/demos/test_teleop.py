@@ -202,11 +202,11 @@ def test_misuse_is_told_before_anything_moves(command, tmp_path):
     for args, message in (
         (
             ("record", "--arm", "a:B", "--out", tmp_path / "x.csv"),
-            "--task: missing, expected one of circle16",
+            "--task: got nothing, expected one of circle16",
         ),
         (
             ("record", "--arm", "a:B", "--task", "pipe300", "--out", tmp_path / "no" / "x.csv"),
-            "expected the name of a file in a folder that exists",
+            "expected the name of a new file in a folder that exists",
         ),
         (("check", tmp_path / "none.csv"), "none.csv: No such file"),
     ):

@@ -212,7 +212,7 @@ def end(processes):
 @pytest.mark.slow
 def test_two_processes_train_as_one_and_go_on_after_one_was_killed(tmp_path):
     SHORT.to_toml(tmp_path / "arm.toml")
-    new = ["--spec", tmp_path / "arm.toml", *(part for text in SETTINGS for part in ("--set", text))]
+    new = ["--spec", tmp_path / "arm.toml", *(f"--{text}" for text in SETTINGS)]
     printed = end(start([*new, "--out", tmp_path / "whole"], *pair()))
     for text in ("run: ", "circle.png"):  # one speaks for both
         assert text in printed[0] and text not in printed[1]
