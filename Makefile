@@ -28,7 +28,9 @@ lint: $(INSTALLED) .venv/.installed-dev  ## ruff, which corrects what it can, an
 	$(BIN)/pre-commit run --all-files
 
 bench: $(INSTALLED)  ## the benchmarks
-	$(BIN)/python -m benchmarks throughput settle learner
+	$(BIN)/python -m benchmarks throughput
+	$(BIN)/python -m benchmarks settle
+	$(BIN)/python -m benchmarks learner
 
 clean:  ## remove virtual environments, build outputs and caches; runs/ stays
 	rm -rf .venv .venv-* build dist *.egg-info .pytest_cache .ruff_cache

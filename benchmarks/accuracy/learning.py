@@ -10,16 +10,16 @@ from train.runs.checkpoint import Run
 from train.sweep.report import by_settings
 
 
-def measure(folders: list[str]) -> dict[str, Any]:
+def measure(runs: tuple[Path, ...]) -> dict[str, Any]:
     """Return figures of each run, and mean, minimum and maximum over the seeds of the same settings.
 
     Args:
-        folders: finished runs.
+        runs: folders of finished runs
 
     Raises:
         RunError: a folder holds no finished run.
     """
-    return {"groups": by_settings([Run.open(Path(folder)) for folder in folders], _all_but_the_seed)}
+    return {"groups": by_settings([Run.open(folder) for folder in runs], _all_but_the_seed)}
 
 
 def _all_but_the_seed(run: Run) -> dict[str, Any]:

@@ -28,8 +28,8 @@ from benchmarks.speed.truth import random_references, settle_function
 from mjx_softarm._support.provenance import provenance, write_json
 from mjx_softarm.env import EnvConfig, ReachEnv
 from train.agent.hindsight_tqc import HindsightTQC
-from train.config import PRESETS
 from train.epoch.job import Job
+from train.presets import PRESETS
 
 FILE = RESULTS / "guard.json"
 N_PROCESSES, N_STORED, N_ROUNDS = 3, 5, 12  # of a comparison, of a baseline; rounds of each

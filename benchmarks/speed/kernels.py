@@ -174,9 +174,10 @@ def compiled(where: str, program: str, *settings: str) -> Facts:
 
     from mjx_softarm.env import ReachEnv
     from train.agent.hindsight_tqc import HindsightTQC
-    from train.config import PRESETS, override
+    from train.config import override
     from train.epoch.devices import AXIS, everywhere
     from train.epoch.job import Job
+    from train.presets import PRESETS
 
     if where == "here":
         mesh = jax.sharding.Mesh(np.array(jax.devices("gpu")[:1]), (AXIS,))
