@@ -1,7 +1,7 @@
-"""What can keep a calibration from its end, besides logs that cannot be used."""
+"""Errors of a calibration, besides those of logs."""
 
 from mjx_softarm._support.errors import InputError
 
 
 class FitError(InputError):
-    """A fit that the data do not allow; the message says what was expected and what came."""
+    """Fit that the data do not allow; the message names what came and what was expected."""

@@ -1,11 +1,11 @@
-"""From logs to a calibrated arm: springs, then chambers, then damping, then the sim-to-real network.
+"""Calibration of an arm from its logs: springs, then chambers, then damping, then the sim-to-real network.
 
-Each step uses what the steps before it found, and says what it had to go by; a step without data leaves the
-specification's values in force and says so. What comes out is a folder that training takes:
+Each step uses the results of those before it. A step without data keeps the specification's values, and
+warns. The result is a folder that training takes:
 
     arm.toml      the calibrated specification
     s2r.npz       the sim-to-real network, if there were poses to fit it to
-    report.html   what was found, with pictures, and whether to trust it
+    report.html   results with pictures, and whether to trust them
     report.json   the same for programs
 """
 
@@ -37,14 +37,14 @@ from mjx_softarm.sensing.s2r import S2R, S2R_FILE, save_s2r
 from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.spec import ARM_FILE, ArmSpec
 
-OF_POSES = ("pressure_kpa", "tip_m", "tip_quaternion")  # what a log of poses must have
+POSE_COLUMNS = ("pressure_kpa", "tip_m", "tip_quaternion")  # needed in a log of poses
 MIN_S2R_POSES = 60
 NOT_FITTED = "Not fitted: the specification's values stay."
 
 
 @dataclasses.dataclass(frozen=True)
 class Calibration:
-    """A calibrated arm and the report on it."""
+    """Calibrated arm, and the sections of its report."""
 
     spec: ArmSpec
     s2r: S2R | None
@@ -58,23 +58,23 @@ def calibrate(
     spring_options: Mapping[str, bool] = MappingProxyType({}),
     progress: Callable[[str], None] = lambda text: None,
 ) -> Calibration:
-    """Fit all that the logs allow.
+    """Fit everything that the logs allow.
 
     Args:
-        logs: of one arm; see `calib.read.logs.read_log`.
-        spec: what is believed of the arm so far.
-        seed: of all that is drawn.
+        logs: logs of one arm, see `calib.read.logs.read_log`.
+        spec: arm as believed so far.
+        seed: seed of all random draws.
         spring_options: `shared` and `fit_compensation` of `calib.fit.sensors.fit_springs`.
-        progress: takes a line before each step.
+        progress: called with a line of text before each step.
 
     Raises:
         LogError: the logs are of different arms.
-        FitError: a fit cannot be made of what the logs hold.
+        FitError: the logs do not allow a fit.
     """
     same_arm(logs)
     progress("springs ...")
     spec, springs = _springs(logs, spec, seed, spring_options)
-    seen = [log for log in logs if not any(getattr(log, name) is None for name in OF_POSES)]
+    seen = [log for log in logs if not any(getattr(log, name) is None for name in POSE_COLUMNS)]
     progress("chambers ...")
     spec, chambers = _chambers(seen, spec, seed)
     progress("damping ...")
@@ -85,10 +85,10 @@ def calibrate(
 
 
 def refuse_existing(folder: Path) -> None:
-    """Nothing is overwritten.
+    """Refuse to overwrite a folder.
 
     Raises:
-        FileExistsError: the folder is there already and not empty, or is the current one.
+        FileExistsError: the folder exists and is not empty, or is the current one.
     """
     if not folder.name or (folder.exists() and (not folder.is_dir() or any(folder.iterdir()))):
         raise FileExistsError(f"{folder}: is there already; choose another --out")
@@ -100,7 +100,7 @@ def write_calibration(
     """Write the folder, whole or not at all.
 
     Raises:
-        FileExistsError: the folder is there already and not empty.
+        FileExistsError: the folder exists and is not empty.
         OSError: it cannot be written.
     """
     refuse_existing(folder)
@@ -129,7 +129,8 @@ def _springs(
     ]
     if not pairs:
         needed = f"{NOT_FITTED} No log has both readings and measured spring lengths."
-        return spec, Section("Springs", needed, warnings=("beta and delta are not this arm's",))
+        remedy = "beta and delta are not this arm's: log readings beside spring lengths on a ruler"
+        return spec, Section("Springs", needed, warnings=(remedy,))
     readings, length_m = (np.concatenate(x) for x in zip(*pairs, strict=True))
     fit = fit_springs(readings, length_m, Sensor.from_spec(spec), seed=seed, **how)
     sensor: dict[str, Any] = {"beta": tuple(map(float, fit.beta)), "delta_m": tuple(map(float, fit.delta_m))}
@@ -144,7 +145,8 @@ def _chambers(logs: Sequence[Log], spec: ArmSpec, seed: int) -> tuple[ArmSpec, S
     poses, rows = find_static_poses(logs, spec)
     if poses.n < MIN_POSES:
         needed = f"{NOT_FITTED} {_few(MIN_POSES, 'pressures and tip poses', poses.n, rows)}"
-        return spec, Section("Chambers", needed, warnings=("stiffness, area and length are not this arm's",))
+        remedy = f"stiffness, area and length are not this arm's: log {MIN_POSES} poses at rest or more"
+        return spec, Section("Chambers", needed, warnings=(remedy,))
     fit = calibrate_chambers(logs, spec, seed)
     section = sections.chambers(fit)
     if fit.poses.marker_m.shape[1]:
@@ -166,7 +168,7 @@ def _damping(logs: Sequence[Log], spec: ArmSpec, seed: int) -> tuple[ArmSpec, Se
 
 
 def _s2r(logs: Sequence[Log], spec: ArmSpec, seed: int) -> tuple[S2R | None, Section]:
-    """The network of the unloaded arm: with a payload, the simulation is another."""
+    """Fit the network of the unloaded arm: with a payload, the simulation differs."""
     poses, rows = find_static_poses(logs, spec)
     unloaded = np.isclose(poses.payload_kg, spec.mass.payload_kg, rtol=0.0, atol=1e-6)
     poses = poses.take(np.isfinite(poses.spring_m).all(axis=1) & unloaded)
@@ -176,7 +178,9 @@ def _s2r(logs: Sequence[Log], spec: ArmSpec, seed: int) -> tuple[S2R | None, Sec
         what = f"pressures, spring lengths and tip poses, a payload of {spec.mass.payload_kg:g} kg"
         rows |= {"poses at which the simulated arm finds no rest": poses.n - n_settled}
         needed = f"Not fitted: {_few(MIN_S2R_POSES, what, n_settled, rows)}"
-        warnings = ("policies will be trained on simulated poses",)
+        warnings = (
+            f"policies will be trained on simulated poses: log {MIN_S2R_POSES} poses at rest or more",
+        )
         return None, Section("Sim-to-real network", needed, warnings=warnings)
     real = pose_from_frame(poses.tip_m, poses.tip_rotation)
     pose, spring_m, real = (x[simulated.valid] for x in (simulated.pose, simulated.spring_m, real))
@@ -185,9 +189,9 @@ def _s2r(logs: Sequence[Log], spec: ArmSpec, seed: int) -> tuple[S2R | None, Sec
 
 
 def _few(n: int, what: str, n_found: int, rows: Mapping[str, int]) -> str:
-    """Which poses are needed, and what became of the rows of the logs."""
+    """Say which poses are needed, and what became of the rows of the logs."""
     fates = ", ".join(f"{count} {fate}" for fate, count in rows.items() if count)
     return (
-        f"{n} poses at rest with {what} are needed, and {n_found} are there; pressures must have been held "
-        f"for {MIN_HOLD_S:g} s. Rows of the logs: {fates or 'none with all of these columns'}."
+        f"Got {n_found} poses at rest with {what}, expected {n} or more; pressures must have been held for "
+        f"{MIN_HOLD_S:g} s. Rows of the logs: {fates or 'none with all of these columns'}."
     )

@@ -1,7 +1,7 @@
 """Held-out rows of a log, in contiguous blocks.
 
-Neighbouring rows of a log are nearly equal, so rows held out one by one have their neighbours in the training
-set and any fit looks good on them. Here whole stretches of time are held out.
+Neighbouring rows of a log are nearly equal, so a row held out alone has its neighbours in the training set,
+and any fit looks good on it. Here whole stretches of time are held out.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import numpy as np
 
 
 def held_out_blocks(n: int, share: float = 0.2, block: int = 100, seed: int = 0) -> np.ndarray:
-    """Mask (n,) of the rows to hold out: `share` of the blocks, drawn at random.
+    """Return a mask (n,) of the rows to hold out: a share of the blocks, drawn at random.
 
     Rows 0 to block - 1 are the first block, and so on; the last may be shorter. At least one is held out
     and at least one is not. A log of fewer than two blocks is cut into blocks of a fifth of it.
@@ -19,11 +19,11 @@ def held_out_blocks(n: int, share: float = 0.2, block: int = 100, seed: int = 0)
         ValueError: fewer than two rows, a share outside (0, 1), a block below one row.
     """
     if n < 2:
-        raise ValueError(f"held-out rows: expected a log of at least 2 rows, got {n}")
+        raise ValueError(f"held-out rows: got a log of {n} rows, expected 2 or more")
     if not 0 < share < 1:
-        raise ValueError(f"held-out rows: expected a share between 0 and 1, got {share}")
+        raise ValueError(f"held-out rows: got a share of {share}, expected one between 0 and 1")
     if block < 1:
-        raise ValueError(f"held-out rows: expected blocks of at least 1 row, got {block}")
+        raise ValueError(f"held-out rows: got blocks of {block} rows, expected 1 or more")
     if n < 2 * block:
         block = min(block, max(n // 5, 1))
     n_blocks = -(-n // block)
@@ -33,7 +33,7 @@ def held_out_blocks(n: int, share: float = 0.2, block: int = 100, seed: int = 0)
 
 
 def folds(n: int, block: int = 100, n_folds: int = 5, seed: int = 0) -> np.ndarray:
-    """The fold (n,) that holds out each row: every row once, whole blocks of rows together, drawn at random.
+    """Return the fold (n,) that holds out each row: every row once, in whole blocks, drawn at random.
 
     Blocks are as in `held_out_blocks`. A log of fewer blocks than folds is cut into one block for each.
 
@@ -41,7 +41,7 @@ def folds(n: int, block: int = 100, n_folds: int = 5, seed: int = 0) -> np.ndarr
         ValueError: fewer than two folds, or fewer rows than folds.
     """
     if not 2 <= n_folds <= n:
-        raise ValueError(f"held-out rows: expected 2 to {n} folds, as many as rows, got {n_folds}")
+        raise ValueError(f"held-out rows: got {n_folds} folds, expected 2 to {n}, the number of rows")
     n_blocks = max(-(-n // block), n_folds)
     fold_of_block = np.random.default_rng(seed).permutation(n_blocks) % n_folds
     return fold_of_block[np.arange(n) * n_blocks // n]

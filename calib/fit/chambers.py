@@ -4,58 +4,48 @@ The simulated arm settles at the logged pressures; its chambers are changed unti
 lengths where they were measured. Robust least squares (`calib.fit.leastsquares`) take the Jacobian from the
 implicit function theorem, see `calib.fit.equilibrium`.
 
-Masses are known and set the scale of all forces. The backbone's bending stiffness is fitted along: with a
-wrong one, area and stiffness make up for it together. Its axial stiffness and that of the springs cannot be:
-they stand side by side with the chambers and only the sum is seen, so what they have too little the chambers
-get. What the poses do not tell stays near the specification, by a weak prior, and is named.
+Masses are known and set the scale of all forces. The bending stiffness of the backbone is fitted too, as area
+and stiffness would otherwise absorb its error. Its axial stiffness and that of the springs cannot be fitted:
+they act in parallel with the chambers and only the sum is seen, so the chambers absorb their error. A weak
+prior keeps what the poses do not determine near the specification, and the warnings name it.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import jax
 import numpy as np
 
 from calib.errors import FitError
 from calib.fit.blocks import held_out_blocks
-from calib.fit.equilibrium import Measured, residuals
+from calib.fit.equilibrium import simulate
 from calib.fit.leastsquares import Problem, Solution, fit, principal
 from calib.read.static_poses import HOLD_KPA, StaticPoses, find_static_poses
 from mjx_softarm.logs.schema import Log
-from mjx_softarm.mechanics.settle import RESIDUAL_TOLERANCE
-from mjx_softarm.mechanics.statics import ArmParams
 from mjx_softarm.spec import ArmSpec
 
-BATCH = 128
 MIN_POSES = 20
 ENOUGH_POSES = 100
 HELD_OUT_SHARE = 0.2
 HELD_OUT_BLOCK = 5  # poses
 SCALE = (1e-3, 0.01, 1e-3)  # of tip [m], rotation [rad] and springs [m]
 MIN_SCALE = (1e-4, 1e-3, 1e-4)
-# Of the four numbers of a chamber, see `calib.fit.equilibrium.with_numbers`.
+# The four parameters of a chamber, see `calib.fit.equilibrium.with_numbers`.
 FIELDS = ("stiffness_n_per_m", "area_m2", "area_slope_m", "length_offset_m")
 SHORT = dict(zip(FIELDS, ("stiffness", "area", "slope", "offset"), strict=True))
 PRIOR = (1.0, 1.0, 1.0, 0.25)  # a factor of e; an area per section length; a quarter of a section
-TOLERANCE = (
-    0.05,
-    0.05,
-    0.05,
-    0.005,
-)  # known: 5 %; 5 % of an area a section; 1 mm of 200 mm
-BENDING = "bending_stiffness_nm_per_rad"  # of the backbone, the last of the numbers
+TOLERANCE = (0.05, 0.05, 0.05, 0.005)  # known to 5 %; 5 % of an area a section; 1 mm of 200 mm
+BENDING = "bending_stiffness_nm_per_rad"  # of the backbone, the last of the parameters
 BENDING_PRIOR, BENDING_TOLERANCE = 1.0, 0.05  # a factor of e; 5 %
-MAX_RATIO = 2.0  # of a calibrated number to the specified one, and of held-out to other errors
-MAX_PRESSURE_GAP = 0.1  # of the range, that may be missing at its end
+MAX_RATIO = 2.0  # calibrated to specified value, and held-out to other errors
+MAX_PRESSURE_GAP = 0.1  # share of the range that may be missing at either end
 
 
 @dataclass(frozen=True)
 class Errors:
-    """Simulated against measured tips, over some poses."""
+    """Errors of simulated against measured tips over n poses."""
 
     n: int
     translation_mean_mm: float
@@ -70,22 +60,22 @@ class ChamberFit:
     """Calibrated chambers and whether to trust them.
 
     Attributes:
-        spec: the calibrated arm: chambers, the backbone's bending stiffness, and the range of spring lengths
-            that may be commanded, which is what was measured at rest.
-        half_width_95: of the 95 % interval of each fitted field of `spec.chambers` (n_chambers,), and of
-            `spec.backbone` ().
+        spec: calibrated arm: chambers, bending stiffness of the backbone, and the range of spring lengths
+            that may be commanded, which is the range measured at rest.
+        half_width_95: half-width of the 95 % interval of each fitted field of `spec.chambers` (n_chambers,)
+            and of `spec.backbone` ().
         direction_widths: half-widths of the 95 % intervals along the principal directions of the fit, in
-            units of what counts as known, largest first (4 * n_chambers + 1,).
-        weak: the directions whose width is above 1, in words; in these the numbers are not known.
+            units of TOLERANCE, largest first (4 * n_chambers + 1,).
+        weak: unknown directions, whose width is above 1, in words.
         in_sample, held_out: errors of the calibrated arm; held-out poses took no part in the fit.
         in_sample_before, held_out_before: errors of the specification that the fit started from.
-        rows: number of rows of the logs by what became of them.
-        n_single: poses of one row, which does not tell whether the tip moved.
+        rows: number of rows of the logs, by use.
+        n_single: number of poses of one row, which cannot show whether the tip moved.
         poses: static poses of the logs, in their order.
-        is_held_out: which of them took no part (n,), bool.
-        tip_error_mm: of the calibrated arm at each pose (n,); NaN where it found no rest.
-        chamber_m: chamber lengths of the calibrated arm at each pose (n, n_chambers).
-        warnings: reasons not to trust the fit; none is good.
+        is_held_out: mask (n,) of the poses that took no part.
+        tip_error_mm: tip error (n,) of the calibrated arm at each pose; NaN where it did not settle.
+        chamber_m: chamber lengths (n, n_chambers) of the calibrated arm at each pose.
+        warnings: reasons not to trust the fit, each with its remedy; none is good.
     """
 
     spec: ArmSpec
@@ -109,14 +99,14 @@ def calibrate_chambers(logs: Log | Sequence[Log], spec: ArmSpec, seed: int = 0) 
     """Fit the chambers of an arm to its logs.
 
     Args:
-        logs: with pressures and tip poses; frequencies or spring lengths help. Which rows count is said in
-            `calib.read.static_poses`.
-        spec: the arm as it is believed to be, its sensors already calibrated.
-        seed: chooses the poses that are held out, in contiguous blocks.
+        logs: logs with pressures and tip poses; readings or spring lengths help. `calib.read.static_poses`
+            tells which rows count.
+        spec: arm as believed so far, its sensors already calibrated.
+        seed: seed that chooses the held-out poses, in contiguous blocks.
 
     Raises:
         FitError: a log without pressures or tip poses, or too few poses at rest.
-        SpecError: the calibrated numbers are not those of an arm.
+        SpecError: the calibrated values are not those of an arm.
     """
     poses, rows = find_static_poses([logs] if isinstance(logs, Log) else logs, spec)
     if poses.n < MIN_POSES:
@@ -127,9 +117,9 @@ def calibrate_chambers(logs: Log | Sequence[Log], spec: ArmSpec, seed: int = 0) 
     poses = poses._replace(pressure_kpa=_held_or_changing(poses.pressure_kpa))
     held_out = held_out_blocks(poses.n, HELD_OUT_SHARE, HELD_OUT_BLOCK, seed)
     fitted = poses.take(~held_out)
-    solution = fit(lambda x: _simulate(spec, fitted, x)[:2], _problem(spec.n_chambers))
-    before, _, _ = _simulate(spec, poses, np.zeros_like(solution.x))
-    after, _, chamber_m = _simulate(spec, poses, solution.x)
+    solution = fit(lambda x: simulate(spec, fitted, x)[:2], _problem(spec.n_chambers))
+    before, _, _ = simulate(spec, poses, np.zeros_like(solution.x))
+    after, _, chamber_m = simulate(spec, poses, solution.x)
     calibrated = _calibrated(spec, solution.x, poses)
     widths, directions = principal(
         solution, np.append(np.repeat(TOLERANCE, spec.n_chambers), BENDING_TOLERANCE)
@@ -158,34 +148,9 @@ def calibrate_chambers(logs: Log | Sequence[Log], spec: ArmSpec, seed: int = 0) 
 
 
 def _held_or_changing(pressure_kpa: np.ndarray) -> np.ndarray:
-    """Pressures (n, n_chambers), without the noise of one that was held: it would pass for a change."""
+    """Return pressures (n, n_chambers) without the noise of held ones, which would pass for changes."""
     held = np.ptp(pressure_kpa, axis=0) < HOLD_KPA
     return np.where(held, np.mean(pressure_kpa, axis=0), pressure_kpa)
-
-
-@functools.cache
-def _jacobian():
-    def one(x, params: ArmParams, measured: Measured):
-        def errors(x):
-            error, left, chamber_m = residuals(x, params, measured)
-            return error, (error, left, chamber_m)
-
-        slope, (error, left, chamber_m) = jax.jacfwd(errors, has_aux=True)(x)
-        return error, slope, left < RESIDUAL_TOLERANCE, chamber_m
-
-    return jax.jit(jax.vmap(one, in_axes=(None, None, 0)))
-
-
-def _simulate(spec: ArmSpec, poses: StaticPoses, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return errors and Jacobian at x, see `calib.fit.leastsquares`; chamber lengths (n, n_chambers) [m]."""
-    params = ArmParams.from_spec(spec)
-    fields = (poses.pressure_kpa, poses.payload_kg, poses.tip_m, poses.tip_rotation, poses.spring_m)
-    padded = -(-poses.n // BATCH) * BATCH
-    measured = Measured(*(np.resize(np.float32(f), (padded, *f.shape[1:])) for f in fields))
-    batches = [Measured(*(f[k : k + BATCH] for f in measured)) for k in range(0, padded, BATCH)]
-    parts = [jax.device_get(_jacobian()(np.float32(x), params, batch)) for batch in batches]
-    error, slope, settled, chamber_m = (np.concatenate(part)[: poses.n] for part in zip(*parts, strict=True))
-    return np.where(settled[:, None], error.astype(float), np.inf), slope.astype(float), chamber_m
 
 
 def _problem(n_chambers: int) -> Problem:
@@ -198,7 +163,7 @@ def _problem(n_chambers: int) -> Problem:
 
 
 def _calibrated(spec: ArmSpec, x: np.ndarray, poses: StaticPoses) -> ArmSpec:
-    """The specification with fitted chambers and the range of the spring lengths that were measured."""
+    """Return the specification with fitted chambers and the range of the measured spring lengths."""
     values = _of_x(spec, x)
     springs = {}
     if np.isfinite(poses.spring_m).any():
@@ -209,7 +174,7 @@ def _calibrated(spec: ArmSpec, x: np.ndarray, poses: StaticPoses) -> ArmSpec:
 
 
 def _of_x(spec: ArmSpec, x: np.ndarray) -> dict[str, np.ndarray]:
-    """Fields of the specification that x (4 * n_chambers + 1,) stands for, as in `with_numbers`."""
+    """Return the fields of the specification at x (4 * n_chambers + 1,), see `with_numbers`."""
     stiffness, area, slope, offset = x[:-1].reshape(len(FIELDS), -1)
     old = {name: np.array(spec.per_chamber(getattr(spec.chambers, name))) for name in FIELDS}
     length_m = spec.geometry.section_length_m
@@ -237,13 +202,13 @@ def _half_widths(spec: ArmSpec, solution: Solution) -> dict[str, np.ndarray]:
 
 
 def _describe(width: float, vector: np.ndarray) -> str:
-    """A principal direction by its largest parts, in units of TOLERANCE."""
+    """Describe a principal direction by its largest components, in units of TOLERANCE."""
     n_chambers = len(vector) // len(FIELDS)
     names = [f"{SHORT[name]}{k}" for name in FIELDS for k in range(n_chambers)] + [BENDING]
     largest = np.argsort(-np.abs(vector))[:4]
     sign = np.sign(vector[largest[0]])
-    parts = (f"{sign * vector[k]:+.2f} {names[k]}" for k in largest)
-    return f"known to {width:.1f} times the tolerance: {' '.join(parts)}"
+    components = (f"{sign * vector[k]:+.2f} {names[k]}" for k in largest)
+    return f"known to {width:.1f} times the tolerance: {' '.join(components)}"
 
 
 def _errors(error: np.ndarray) -> Errors:
@@ -268,31 +233,38 @@ def _errors(error: np.ndarray) -> Errors:
 def _warnings(found: ChamberFit, spec: ArmSpec, solution: Solution) -> tuple[str, ...]:
     said = []
     if not solution.converged:
-        said.append("the fit has not come to an end")
+        said.append("the fit did not converge: start from a specification closer to the arm (--spec)")
     if found.poses.n < ENOUGH_POSES:
-        said.append(f"{found.poses.n} poses at rest are few; {ENOUGH_POSES} are better")
+        said.append(f"got {found.poses.n} poses at rest, expected {ENOUGH_POSES} or more: log more poses")
     if n_unsettled := np.count_nonzero(np.isnan(found.tip_error_mm)):
-        said.append(f"the simulated arm finds no rest at {n_unsettled} of {found.poses.n} poses")
+        said.append(
+            f"the simulated arm finds no rest at {n_unsettled} of {found.poses.n} poses: check payload and "
+            "pressures of these rows"
+        )
     if found.held_out.translation_mean_mm > MAX_RATIO * found.in_sample.translation_mean_mm:
         said.append(
             f"held-out tip error {found.held_out.translation_mean_mm:.2f} mm is more than {MAX_RATIO:g} "
-            f"times the error of the other poses, {found.in_sample.translation_mean_mm:.2f} mm"
+            f"times that of the other poses, {found.in_sample.translation_mean_mm:.2f} mm: log more poses"
         )
     if not found.held_out.translation_mean_mm < found.held_out_before.translation_mean_mm:
-        said.append("the specification that the fit started from is better on held-out poses")
+        said.append("the specification itself is better on held-out poses: keep it, or log more poses")
     stiffness, area = (np.exp(np.abs(solution.x[:-1].reshape(len(FIELDS), -1)[k])) for k in (0, 1))
     for name, ratio in (("stiffness", stiffness), ("area", area)):
         if (far := np.flatnonzero(ratio > MAX_RATIO)).size:
             said.append(
-                f"{name} of chambers {_list(far)} is {MAX_RATIO:g} times off the specification or more"
+                f"{name} of chambers {_list(far)} is {MAX_RATIO:g} times off the specification or more: "
+                "check the unit of pressure, the order of the columns, and the payload"
             )
     if found.weak:
-        said.append(f"{len(found.weak)} directions of the numbers are not known, the first: {found.weak[0]}")
+        n_weak, springs = len(found.weak), ", with spring lengths" * np.isnan(found.poses.spring_m).any()
+        said.append(f"{n_weak} unknown directions, the first {found.weak[0]}: log more poses{springs}")
     low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
-    seen = found.poses.pressure_kpa
     gap = MAX_PRESSURE_GAP * (high - low)
-    if (short := np.flatnonzero((seen.min(0) > low + gap) | (seen.max(0) < high - gap))).size:
-        said.append(f"pressures of chambers {_list(short)} stay away from {low:g} or {high:g} kPa")
+    lowest, highest = found.poses.pressure_kpa.min(0), found.poses.pressure_kpa.max(0)
+    if (short := np.flatnonzero((lowest > low + gap) | (highest < high - gap))).size:
+        said.append(
+            f"pressures of chambers {_list(short)} stay away from {low:g} or {high:g} kPa: log poses there"
+        )
     return tuple(said)
 
 

@@ -1,36 +1,43 @@
-"""The arm at rest as a function of its numbers: what a fit of them needs."""
+"""Static equilibrium of the arm as a differentiable function of its parameters, beside measured poses."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+import functools
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
+from calib.read.static_poses import StaticPoses
 from mjx_softarm.mechanics.kinematics import chain_frames
 from mjx_softarm.mechanics.rest import rest, statics_at
+from mjx_softarm.mechanics.settle import RESIDUAL_TOLERANCE
 from mjx_softarm.mechanics.statics import ArmParams
+from mjx_softarm.spec import ArmSpec
+
+BATCH = 128  # poses simulated together
 
 
 class Measured(NamedTuple):
-    """What was measured of an arm at rest; rows of it are poses."""
+    """Measurements of an arm at rest, for one pose; with a leading axis for several."""
 
-    pressure_kpa: Any  # (n_chambers,)
-    payload_kg: Any  # ()
-    tip_m: Any  # (3,)
-    tip_rotation: Any  # (3, 3)
-    spring_m: Any  # (n_chambers,)
+    pressure_kpa: Array | np.ndarray  # (n_chambers,)
+    payload_kg: Array | np.ndarray  # ()
+    tip_m: Array | np.ndarray  # (3,)
+    tip_rotation: Array | np.ndarray  # (3, 3)
+    spring_m: Array | np.ndarray  # (n_chambers,)
 
 
 def with_numbers(x: Array, params: ArmParams) -> ArmParams:
-    """An arm whose chambers and backbone differ from those of `params`.
+    """Return an arm whose chambers and backbone differ from those of `params`.
 
     Args:
-        x (4 * n_chambers + 1,): per chamber the logarithm of the stiffness's ratio; the logarithm of the
-            area's; the change of the area's slope, in areas per section length; the change of the rest
-            length, in section lengths. Last, the logarithm of the ratio of the backbone's bending stiffness.
-        params: the arm at x = 0.
+        x (4 * n_chambers + 1,): for each chamber the logarithm of the ratio of stiffness; that of area; the
+            change of the area's slope, in areas per section length; the change of the rest length, in section
+            lengths. Last, the logarithm of the ratio of the backbone's bending stiffness.
+        params: arm at x = 0.
     """
     stiffness, area, slope, offset = x[:-1].reshape(4, -1)
     bend = jnp.exp(x[-1])
@@ -45,16 +52,16 @@ def with_numbers(x: Array, params: ArmParams) -> ArmParams:
 
 
 def residuals(x: Array, params: ArmParams, measured: Measured) -> tuple[Array, Array, Array]:
-    """Simulated less measured pose of one arm at rest.
+    """Return simulated minus measured pose of one arm at rest.
 
     Args:
-        x (4 * n_chambers + 1,): its numbers, see `with_numbers`.
-        params: the arm at x = 0; its payload is taken from `measured`.
-        measured: one pose.
+        x (4 * n_chambers + 1,): parameters, see `with_numbers`.
+        params: arm at x = 0, but for the payload.
+        measured: measurements of one pose.
 
     Returns:
         (6 + n_chambers,): tip [m]; rotation [rad], the axis times the sine of the angle; springs [m].
-        (): largest force [N, N m] that is left on the arm.
+        (): largest residual force [N, N m].
         (n_chambers,) [m]: chamber lengths.
     """
     masses = jnp.stack([params.tool_mass_kg[0], measured.payload_kg])
@@ -68,3 +75,40 @@ def residuals(x: Array, params: ArmParams, measured: Measured) -> tuple[Array, A
     error = [frames.plate_position[-1] - measured.tip_m, angle, now.springs.length - measured.spring_m]
     left = jnp.max(jnp.abs(jax.lax.stop_gradient(now.gradient)))
     return jnp.concatenate(error), left, jax.lax.stop_gradient(now.chambers.length)
+
+
+def simulate(spec: ArmSpec, poses: StaticPoses, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Simulate all poses at x.
+
+    Args:
+        spec: arm at x = 0.
+        poses: n measured poses.
+        x (4 * n_chambers + 1,): parameters, see `with_numbers`.
+
+    Returns:
+        Errors (n, 6 + n_chambers) of `residuals`, inf where the arm does not settle; their Jacobian
+        (n, 6 + n_chambers, 4 * n_chambers + 1); chamber lengths (n, n_chambers) [m].
+    """
+    params = ArmParams.from_spec(spec)
+    fields = (poses.pressure_kpa, poses.payload_kg, poses.tip_m, poses.tip_rotation, poses.spring_m)
+    padded = -(-poses.n // BATCH) * BATCH
+    measured = Measured(*(np.resize(np.float32(f), (padded, *f.shape[1:])) for f in fields))
+    batches = [Measured(*(f[k : k + BATCH] for f in measured)) for k in range(0, padded, BATCH)]
+    found = [jax.device_get(_jacobian()(np.float32(x), params, batch)) for batch in batches]
+    error, slope, settled, chamber_m = (np.concatenate(a)[: poses.n] for a in zip(*found, strict=True))
+    return np.where(settled[:, None], error.astype(float), np.inf), slope.astype(float), chamber_m
+
+
+@functools.cache
+def _jacobian():
+    """Return the compiled errors, Jacobian, mask of settled arms and chamber lengths of a batch."""
+
+    def one(x, params: ArmParams, measured: Measured):
+        def errors(x):
+            error, left, chamber_m = residuals(x, params, measured)
+            return error, (error, left, chamber_m)
+
+        slope, (error, left, chamber_m) = jax.jacfwd(errors, has_aux=True)(x)
+        return error, slope, left < RESIDUAL_TOLERANCE, chamber_m
+
+    return jax.jit(jax.vmap(one, in_axes=(None, None, 0)))

@@ -1,14 +1,14 @@
-"""Length limits of the chambers from markers along the arm, at the poses in which it bends most.
+"""Length limits of the chambers from markers along the arm, at its most bent poses.
 
-The markers sit at one place of every ring, evenly spaced from the base to the tip, the last at the tip's
-plate. Three polynomials of fourth order X(s), Y(s), Z(s) run through them and through that place of the base.
-The rings turn with the curve without twisting about it, so any other place of the rings, such as where a
-chamber passes, has a curve of its own beside it; a chamber's length is that of its section's part.
+The markers sit at one site of every ring, evenly spaced from the base to the tip, the last on the tip's
+plate. Three polynomials of fourth order X(s), Y(s), Z(s) run through them and through that site of the base.
+The rings turn with the curve without twisting about it, so any other site of the rings, such as that of a
+chamber, has a parallel curve. The length of a chamber is the length of its curve within its section.
 
-A polynomial of fourth order is too smooth for three sections that bend apart, so the lengths are coarse: on
-simulated arms without noise they are off by 5 mm RMS with markers in the middle of the rings, by 6 mm at
-the chambers and by 11 mm at the springs, and by tens of mm at worst. So here they only check: what a chamber
-can do follows from its pressure limits, stiffness and area; what a spring may be asked for, from what it did.
+A polynomial of fourth order is too smooth for three sections that bend independently, so the lengths are
+coarse: on simulated arms without noise they are off by 5 mm RMS with markers in the middle of the rings, by
+6 mm at the chambers and by 11 mm at the springs, and by tens of mm at worst. So they only check the fit. The
+range of a chamber follows from its pressure limits, stiffness and area; that of a spring, from measurements.
 
 Source: Simulation Calibration and Validation in Meng et al.
 """
@@ -32,28 +32,28 @@ MIN_MARKERS = 5
 
 
 class MarkerLimits(NamedTuple):
-    """Lengths of the chambers at the poses in which the arm bends most."""
+    """Lengths of the chambers at the most bent poses."""
 
-    pose: np.ndarray  # (n,) which poses, of the greatest bending first
+    pose: np.ndarray  # (n,) indices of the poses, most bent first
     bending_deg: np.ndarray  # (n,) between the tip's plate and the base
-    marker_site_m: np.ndarray  # (2,) place of the markers in the rings, x and y
+    marker_site_m: np.ndarray  # (2,) site of the markers in the rings, x and y
     length_m: np.ndarray  # (n, n_chambers) from the curves
-    simulated_m: np.ndarray  # (n, n_chambers) of the calibrated arm at the same pressures
+    simulated_m: np.ndarray  # (n, n_chambers) simulated by the calibrated arm at the same pressures
     residual_mm: np.ndarray  # (n,) RMS distance of the markers to the curve
     length_min_m: float
     length_max_m: float
 
 
 def marker_limits(poses: StaticPoses, simulated_m: np.ndarray, spec: ArmSpec) -> MarkerLimits:
-    """Length limits from the poses that bend most.
+    """Compute length limits from the most bent poses.
 
     Args:
         poses: static poses with markers.
-        simulated_m (n, n_chambers) [m]: chamber lengths of the calibrated arm at all of the poses.
+        simulated_m (n, n_chambers) [m]: chamber lengths of the calibrated arm at all poses.
         spec: the arm.
 
     Raises:
-        FitError: fewer than five markers, no pose that has them, or the last is not at the tip's plate.
+        FitError: there are fewer than five markers, no pose has them, or the last is off the tip's plate.
     """
     n_markers = poses.marker_m.shape[1]
     if n_markers < MIN_MARKERS or n_markers % spec.structure.n_sections:
@@ -63,7 +63,7 @@ def marker_limits(poses: StaticPoses, simulated_m: np.ndarray, spec: ArmSpec) ->
         )
     seen = np.flatnonzero(np.isfinite(poses.marker_m).all(axis=(1, 2)))
     if len(seen) == 0:
-        raise FitError("markers: no pose at rest has them, expected one or more")
+        raise FitError("markers: got no pose at rest that has them, expected one or more")
     site_m = _marker_site(poses.take(seen))
     bending_deg = np.degrees(np.arccos(np.clip(poses.tip_rotation[seen, 2, 2], -1.0, 1.0)))
     order = np.argsort(-bending_deg)[:N_POSES]
@@ -83,15 +83,15 @@ def marker_limits(poses: StaticPoses, simulated_m: np.ndarray, spec: ArmSpec) ->
 
 
 def fit_curve(marker_m: np.ndarray, site_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Polynomials of fourth order through the markers of one pose.
+    """Fit polynomials of fourth order through the markers of one pose.
 
     Args:
         marker_m (n_markers, 3) [m]: evenly spaced along the arm, the last at the tip.
-        site_m (2,) [m]: where the markers sit in the rings, and so where the curve begins in the base.
+        site_m (2,) [m]: site of the markers in the rings, where the curve begins in the base.
 
     Returns:
-        Coefficients (5, 3), highest power first, of the share s of the arm, 0 at the base and 1 at the tip;
-        what the curve leaves (n_markers + 1, 3) [m], the place in the base first.
+        Coefficients (5, 3), highest power first, in the share s of the arm, 0 at the base and 1 at the tip;
+        residuals (n_markers + 1, 3) [m], that of the base first.
     """
     points = np.vstack([[*site_m, 0.0], marker_m])
     share = np.linspace(0.0, 1.0, len(points))
@@ -100,12 +100,12 @@ def fit_curve(marker_m: np.ndarray, site_m: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def chamber_lengths(curve: np.ndarray, site_m: np.ndarray, spec: ArmSpec) -> np.ndarray:
-    """Lengths (n_chambers,) [m] of the chambers beside a curve of markers.
+    """Return the lengths (n_chambers,) [m] of the chambers parallel to a curve of markers.
 
     Args:
-        curve (5, 3): from `fit_curve`.
-        site_m (2,) [m]: where the markers sit in the rings.
-        spec: the arm, which says where the chambers pass.
+        curve (5, 3): coefficients from `fit_curve`.
+        site_m (2,) [m]: site of the markers in the rings.
+        spec: arm, with the sites of the chambers.
     """
     n_sections = spec.structure.n_sections
     share = np.linspace(0.0, 1.0, n_sections * N_SAMPLES + 1)
@@ -120,12 +120,12 @@ def chamber_lengths(curve: np.ndarray, site_m: np.ndarray, spec: ArmSpec) -> np.
 
 
 def _at(curve: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """Points (n, 3) of polynomials (k, 3)."""
+    """Return points (n, 3) of polynomials (k, 3)."""
     return np.vander(share, len(curve)) @ curve
 
 
 def _untwisted(up: np.ndarray) -> np.ndarray:
-    """Axes (n, 3, 3) of rings with normals (n, 3), each turned by the least from the one before."""
+    """Return axes (n, 3, 3) of rings with normals (n, 3), each rotated the least from the one before."""
     rotation = np.eye(3)
     found = []
     for normal in up:
@@ -138,12 +138,12 @@ def _untwisted(up: np.ndarray) -> np.ndarray:
 
 
 def _marker_site(poses: StaticPoses) -> np.ndarray:
-    """Where the markers sit in the rings (2,) [m], from the last one as seen from the tip."""
+    """Return the site of the markers in the rings (2,) [m], from the last one in the tip's frame."""
     seen = np.einsum("nij,ni->nj", poses.tip_rotation, poses.marker_m[:, -1] - poses.tip_m)
     site_m = np.median(seen, axis=0)
     if abs(site_m[2]) > MAX_OFF_PLATE_M:
         raise FitError(
-            f"markers: the last is {1e3 * site_m[2]:+.1f} mm above the tip's plate, expected in it, within "
-            f"{1e3 * MAX_OFF_PLATE_M:.0f} mm"
+            f"markers: got the last {1e3 * site_m[2]:+.1f} mm above the tip's plate, expected it in the "
+            f"plate within {1e3 * MAX_OFF_PLATE_M:.0f} mm: number the markers from base to tip"
         )
     return site_m[:2]

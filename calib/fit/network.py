@@ -1,9 +1,9 @@
 """Small networks fitted to rows of a log: averaged, stopped early on contiguous blocks, bounded.
 
-A log is short for a network, so the fit leans to the smooth side: a straight line takes what it can; of what
-it leaves, several small networks with decayed weights learn, each stopped by blocks of rows that it did not
-see, other blocks for each, and what counts is their mean. Line and mean are one network again, layers side by
-side, and are stored and run as one.
+A log is short for a network, so the fit prefers smooth functions. A linear map is fitted first. Several small
+networks with weight decay learn its residual, each stopped early on blocks of rows that it did not see, and
+their outputs are averaged. The linear map and the members are joined to one network, layers side by side,
+which is stored and run as one.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from calib.fit.blocks import held_out_blocks
 from mjx_softarm._support.mlp import Layer, mlp
 from mjx_softarm.sensing.s2r import S2R
 
-RIDGE = 1.0  # of the line, beside inputs from -1 to 1: as much as a row or two
+RIDGE = 1.0  # of the linear map; inputs are from -1 to 1, so it weighs as much as a row or two
 N_ANCHORS = 256
 LIMIT_PERCENTILE = 99.0
 ROWS_PER_BLOCK = 100
@@ -32,7 +32,7 @@ MIN_BLOCKS = 20  # shorter blocks rather than fewer
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """How the networks are trained. Learning rate and batch are the paper's."""
+    """Training settings. Learning rate and batch are the paper's."""
 
     hidden: tuple[int, ...] = (64, 64)
     n_members: int = 5  # networks that are averaged
@@ -44,7 +44,7 @@ class NetworkConfig:
 
 
 class NetworkFit(NamedTuple):
-    """A fitted network and how its training went."""
+    """Fitted network, and the course of its training."""
 
     network: S2R
     stop_epoch: np.ndarray  # (n_members,) epoch whose weights were best on the member's own blocks
@@ -53,20 +53,18 @@ class NetworkFit(NamedTuple):
 
 
 def block_rows(n: int) -> int:
-    """Rows in a held-out block of a log of `n` rows."""
+    """Return the number of rows in a held-out block of a log of n rows."""
     return max(min(ROWS_PER_BLOCK, n // MIN_BLOCKS), 1)
 
 
 def fit_network(x: np.ndarray, y: np.ndarray, seed: int, config: NetworkConfig | None = None) -> NetworkFit:
-    """A network from inputs to outputs, by mean squared error.
-
-    Rows that are to measure the result must not be among these.
+    """Fit a network from inputs to outputs by mean squared error.
 
     Args:
-        x (n, n_in): inputs, in time's order.
+        x (n, n_in): inputs in order of time, without the rows that will test the network.
         y (n, n_out): outputs.
-        seed: of weights, batches and blocks; the same one gives the same network.
-        config: how to train.
+        seed: seed of weights, batches and blocks.
+        config: training settings.
 
     Raises:
         FitError: fewer than two rows, arrays that do not fit together, or a number that is not finite.
@@ -110,18 +108,20 @@ def fit_network(x: np.ndarray, y: np.ndarray, seed: int, config: NetworkConfig |
 
 def _check(x: np.ndarray, y: np.ndarray) -> None:
     if x.ndim != 2 or y.ndim != 2 or len(x) != len(y) or len(x) < 2:
-        raise FitError(f"network: expected two tables of as many rows, 2 or more; got {x.shape}, {y.shape}")
+        raise FitError(
+            f"network: got tables {x.shape} and {y.shape}, expected as many rows in both, 2 or more"
+        )
     for name, table in (("inputs", x), ("outputs", y)):
         if not np.isfinite(table).all():
             row, column = np.argwhere(~np.isfinite(table))[0]
             value = table[row, column]
             raise FitError(
-                f"network: {name}, row {row}, column {column}: expected a finite number, got {value}"
+                f"network: {name}, row {row}, column {column}: got {value}, expected a finite number"
             )
 
 
 def _bounds(x: np.ndarray, y: np.ndarray) -> dict[str, np.ndarray]:
-    """Ranges of the training rows; an input that never changed gets a width, since it is divided by."""
+    """Return ranges of the training rows; an input that never changes gets a width above zero."""
     low, high = (f(x, axis=0).astype(np.float32) for f in (np.min, np.max))
     narrow = high - low <= 1e-5 * np.maximum(np.abs(low), np.abs(high))
     margin = np.where(narrow, np.maximum(1e-3 * np.abs(low), 1e-3), 0.0).astype(np.float32)
@@ -136,7 +136,7 @@ def _bounds(x: np.ndarray, y: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _equally_many(rows: list[np.ndarray]) -> np.ndarray:
-    """Row numbers of each member (n_members, n), the shorter ones repeating their first."""
+    """Stack row numbers of the members (n_members, n); shorter ones repeat their first."""
     return np.stack([np.resize(row, max(map(len, rows))) for row in rows])
 
 
@@ -154,7 +154,7 @@ def _train(
     learning_rate: float,
     weight_decay: float,
 ) -> tuple[tuple[Layer, ...], Array]:
-    """Layers of the members, stacked, and their losses (n_members, n_epochs) on the rows that stop them."""
+    """Return stacked layers of the members, and their losses (n_members, n_epochs) on the stopping rows."""
     sizes = (x.shape[1], *hidden, y.shape[1])
     n_batches = rows.shape[1] // batch_size
     schedule = optax.cosine_decay_schedule(learning_rate, n_epochs * n_batches)
@@ -190,7 +190,7 @@ def _train(
 
 
 def _initial_layers(key: Array, sizes: tuple[int, ...]) -> tuple[Layer, ...]:
-    """He's initialisation."""
+    """Draw layers with He's initialisation."""
     keys = jax.random.split(key, len(sizes) - 1)
     return tuple(
         (jnp.sqrt(2.0 / n_in) * jax.random.normal(key, (n_in, n_out)), jnp.zeros(n_out))
@@ -199,23 +199,22 @@ def _initial_layers(key: Array, sizes: tuple[int, ...]) -> tuple[Layer, ...]:
 
 
 def _line(z: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Weights (n_in, n_out) of the straight line from inputs to outputs, whose offset is left to the rest."""
-    moved, wanted = z - z.mean(axis=0), y - y.mean(axis=0)
-    return np.linalg.solve(moved.T @ moved + RIDGE * np.eye(z.shape[1]), moved.T @ wanted)
+    """Return weights (n_in, n_out) of the linear map from inputs to outputs, without its offset."""
+    z, y = z - z.mean(axis=0), y - y.mean(axis=0)
+    return np.linalg.solve(z.T @ z + RIDGE * np.eye(z.shape[1]), z.T @ y)
 
 
 def _side_by_side(
     members: tuple[Layer, ...], scale: np.ndarray, offset: np.ndarray, linear: np.ndarray
 ) -> tuple[Layer, ...]:
-    """One network whose output is `scale` times the members' mean plus `offset` plus a line of its inputs.
+    """Join members to one network: `scale` times their mean, plus `offset`, plus a linear map of the inputs.
 
-    The inputs z, which are never below -1, go through its layers as z + 1, which rectifying leaves as it is.
+    The inputs z are -1 or more, so z + 1 passes through the rectified layers unchanged.
 
     Args:
         members: layers of weights (n_members, in, out) and biases (n_members, out).
-        scale (n_out,): of the outputs.
-        offset (n_out,): of the outputs.
-        linear (n_in, n_out): weights of the line.
+        scale, offset (n_out,): scale and offset of the outputs.
+        linear (n_in, n_out): weights of the linear map.
     """
     *hidden, (weight, bias) = members
     n_in = linear.shape[0]
@@ -237,9 +236,9 @@ def _side_by_side(
 
 
 def _anchors(z: np.ndarray, left_out: np.ndarray) -> tuple[np.ndarray, float]:
-    """Rows that stand for all rows z (n, n_in), and the greatest distance to believe.
+    """Return rows that represent all rows z (n, n_in), and the greatest distance to believe.
 
-    That is the distance of nearly all rows that were left out, to anchors chosen without them.
+    Nearly all left-out rows are within this distance of anchors chosen without them.
     """
     without = _spread_rows(z[~left_out])
     gap = np.min(np.mean((z[left_out, None] - without) ** 2, axis=-1), axis=-1)
@@ -248,7 +247,7 @@ def _anchors(z: np.ndarray, left_out: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def _spread_rows(z: np.ndarray) -> np.ndarray:
-    """Up to N_ANCHORS rows, each the farthest from those before it."""
+    """Choose up to N_ANCHORS rows, each the farthest from those before it."""
     chosen, gap = [0], np.full(len(z), np.inf)
     while len(chosen) < min(N_ANCHORS, len(z)):
         gap = np.minimum(gap, np.mean((z - z[chosen[-1]]) ** 2, axis=-1))

@@ -1,17 +1,17 @@
-"""Pressures of a section to its length, over time: what a pneumatic section does between its rests.
+"""Response of a pneumatic section: from its pressures over time to its length.
 
-A section does not follow its pressures at once. Air flows through a tube with a time constant (another one
-when it leaves than when it enters), and the wall holds on to the shape it had (a play: where the pressure
-turns round, nothing moves until it has turned by twice the half-width). With s the mean pressure:
+A section lags behind its pressures. Air fills and vents through a tube with two time constants, and the wall
+has hysteresis (a play: when the pressure reverses, nothing moves until it has changed by twice the
+half-width). With s the mean pressure:
 
     x' = (s - x) / tau,   tau = tau_fill where s > x, else tau_vent   lag, exact for a pressure held for a row
     y  = the nearest to y within [x - r, x + r]                       play
     L  = c0 + c1 y + c2 y^2                                           rest length
 
-The record is simulated from its first row to its last with measured pressures alone; measured lengths only
-choose the numbers. The c follow from the others by least squares, so three numbers are left to optax.
+The record is simulated from its first row to its last with measured pressures only. The c follow from the
+other parameters by least squares, so optax fits three numbers.
 
-Source: the play is the operator of Prandtl and Ishlinskii, here a single one.
+Source: the play operator of Prandtl and Ishlinskii.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from calib.fit.blocks import folds
 ITERATIONS = 150
 LEARNING_RATE = 0.1  # falls to zero over the iterations
 RIDGE = 1e-6  # on c1 and c2 in normalised variables
-# Points of which the best is the start: time constants to fill and to vent [s], half-width of the play over
+# The fit starts from the best of these: time constants to fill and to vent [s], half-width of the play over
 # the range of s.
 STARTS = tuple(itertools.product((0.2, 0.7, 2.0), (0.2, 0.7, 2.0, 6.0), (0.02, 0.1, 0.25)))
 TAU_RANGE_S = (0.02, 20.0)
 
 
 class Response(NamedTuple):
-    """A section's length as a function of the history of its mean pressure."""
+    """Length of a section as a function of the history of its mean pressure."""
 
     tau_fill_s: float
     tau_vent_s: float
@@ -46,25 +46,25 @@ class Response(NamedTuple):
 
 
 class ResponseFit(NamedTuple):
-    """A response, and how well it predicts rows that it was not fitted to."""
+    """Fitted response, and its errors on rows that it was not fitted to."""
 
     response: Response
     rms_m: float
     held_out_rms_m: float
-    line_rms_m: float  # of a straight line in all pressures of the section
+    line_rms_m: float  # error of a straight line in all pressures of the section
     line_held_out_rms_m: float  # on the same rows as held_out_rms_m
     predicted_m: np.ndarray  # (n,) held-out prediction of each row
     n_rows: int
-    warnings: tuple[str, ...]  # reasons not to trust the fit
+    warnings: tuple[str, ...]  # reasons not to trust the fit, each with its remedy
 
 
 def simulate(response: Response, time_s: np.ndarray, pressure_kpa: np.ndarray) -> np.ndarray:
-    """Lengths (n,) [m] of a section that rests at the first row's pressures, after a slow rise to them.
+    """Return lengths (n,) [m] of a section that starts at rest, after a slow rise to the first pressures.
 
     Args:
-        response: numbers of the section.
+        response: response of the section.
         time_s (n,): increasing, at any spacing.
-        pressure_kpa (n, n_chambers): of this section, finite.
+        pressure_kpa (n, n_chambers): pressures of this section, finite.
     """
     with jax.enable_x64(True):
         drive = jnp.asarray(np.mean(pressure_kpa, axis=1))
@@ -83,12 +83,12 @@ def fit_response(
         time_s (n,): increasing.
         pressure_kpa (n, n_chambers): measured pressures of this section, finite.
         length_m (n,): measured lengths; a NaN is a missing one.
-        block: rows that are held out together; they should last for several seconds.
-        seed: chooses which blocks form a fold.
+        block: number of rows held out together; they should last for several seconds.
+        seed: seed that chooses which blocks form a fold.
 
     Raises:
-        ValueError: shapes that do not fit, time that does not increase, a pressure that is not finite, too
-            few measured lengths, or pressures that never change.
+        ValueError: the shapes do not match, time does not increase, a pressure is not finite, there are too
+            few measured lengths, or pressures never change.
     """
     _check(time_s, pressure_kpa, length_m)
     known = np.isfinite(length_m)
@@ -136,7 +136,7 @@ def _steps(time_s: np.ndarray) -> Array:
 
 
 def _simulate(taus: Array, play: Array | float, steps: Array, drive: Array) -> Array:
-    """States (n,) of lag and play."""
+    """Return states (n,) after lag and play."""
 
     def row(state, now):
         lagged, held = state
@@ -156,7 +156,7 @@ def _to_free(tau_fill: float, tau_vent: float, play: float) -> tuple[float, floa
 
 
 def _from_free(q: Array) -> tuple[Array, Array]:
-    """Time constants (2,) [s] within their range; half-width of the play, below half of the range."""
+    """Return time constants (2,) [s] in their range, and the half-width of the play, below half the range."""
     low, high = np.log(TAU_RANGE_S)
     return jnp.exp(low + (high - low) * jax.nn.sigmoid(q[:2])), 0.5 * jax.nn.sigmoid(q[2])
 
@@ -181,7 +181,7 @@ def _loss(q: Array, steps: Array, drive: Array, target: Array, weight: Array) ->
 
 @jax.jit
 def _fit(starts: Array, steps: Array, drive: Array, target: Array, keep: Array):
-    """For each row of keep (m, n): the best free numbers (m, 3), polynomial (m, 3), predictions (m, n)."""
+    """Return free parameters (m, 3), polynomials (m, 3), predictions (m, n) for the rows of keep (m, n)."""
 
     def descend(start, weight) -> Any:
         def loss(q):
@@ -207,7 +207,7 @@ def _fit(starts: Array, steps: Array, drive: Array, target: Array, keep: Array):
 
 
 def _lines(pressure_kpa: np.ndarray, length_m: np.ndarray, keep: np.ndarray) -> np.ndarray:
-    """Predictions (m, n) of the straight line in all pressures, for each row of keep (m, n)."""
+    """Return predictions (m, n) of a straight line in all pressures, for each row of keep (m, n)."""
     features = np.column_stack([pressure_kpa, np.ones(len(length_m))])
     return np.stack(
         [features @ np.linalg.lstsq(features[kept], length_m[kept], rcond=None)[0] for kept in keep]
@@ -222,8 +222,8 @@ def _check(time_s: np.ndarray, pressure_kpa: np.ndarray, length_m: np.ndarray) -
     n = len(time_s)
     if np.ndim(pressure_kpa) != 2 or len(pressure_kpa) != n or np.shape(length_m) != (n,):
         raise ValueError(
-            f"response: expected pressures ({n}, n_chambers) and lengths ({n},) for {n} times, "
-            f"got {np.shape(pressure_kpa)} and {np.shape(length_m)}"
+            f"response: got pressures {np.shape(pressure_kpa)} and lengths {np.shape(length_m)}, "
+            f"expected ({n}, n_chambers) and ({n},) for {n} times"
         )
     for name, bad, expected in (
         ("time_s", np.flatnonzero(~(np.diff(time_s) > 0)) + 1, "a time after the row before"),
@@ -237,7 +237,7 @@ def _check(time_s: np.ndarray, pressure_kpa: np.ndarray, length_m: np.ndarray) -
             f"response: length_m: got {np.isfinite(length_m).sum()} measured lengths, expected 20 or more"
         )
     if np.ptp(np.mean(pressure_kpa, axis=1)) == 0 or np.nanstd(length_m) == 0:
-        raise ValueError("response: pressures or lengths never change, expected at least one step")
+        raise ValueError("response: got pressures or lengths that never change, expected at least one step")
 
 
 def _warnings(fit: ResponseFit, steps_s: np.ndarray) -> tuple[str, ...]:
@@ -245,13 +245,19 @@ def _warnings(fit: ResponseFit, steps_s: np.ndarray) -> tuple[str, ...]:
     if fit.held_out_rms_m > 2 * fit.rms_m:
         found.append(
             f"held-out error {1e3 * fit.held_out_rms_m:.2f} mm is more than twice the error on its own rows, "
-            f"{1e3 * fit.rms_m:.2f} mm: too few steps in the log to tell the numbers apart"
+            f"{1e3 * fit.rms_m:.2f} mm: log more steps of the pressures"
         )
     if fit.held_out_rms_m > fit.line_held_out_rms_m:
-        found.append("the straight line predicts held-out rows better")
+        found.append(
+            "the straight line predicts held-out rows better: use it, or log more steps of the pressures"
+        )
     for name, tau in (("fill", fit.response.tau_fill_s), ("vent", fit.response.tau_vent_s)):
         if not 1.5 * TAU_RANGE_S[0] < tau < TAU_RANGE_S[1] / 1.5:
-            found.append(f"time constant to {name}, {tau:.3g} s, is at the edge of what is tried")
+            found.append(
+                f"time constant to {name}, {tau:.3g} s, is at the edge of what is tried: log longer steps"
+            )
         elif tau < np.median(steps_s):
-            found.append(f"time constant to {name}, {tau:.3g} s, is shorter than the time between rows")
+            found.append(
+                f"time constant to {name}, {tau:.3g} s, is shorter than the time between rows: log faster"
+            )
     return tuple(found)

@@ -1,9 +1,9 @@
 """The sim-to-real network: (P, L_spring) -> P_S2R, fitted to a log.
 
-The steps of the paper: the log gives spring lengths and real tip poses; the calibrated simulation is asked
-for the same spring lengths and gives poses of its own; a network learns the difference, which takes fewer
-rows than learning the real pose itself. Contiguous blocks of rows take no part in the fit, early stopping
-included, and tell how good it is.
+As in the paper, the log gives spring lengths and real tip poses, the calibrated simulation gives its own
+poses at the same spring lengths, and a network learns the difference, which takes fewer rows than learning
+the real pose itself. Contiguous blocks of rows take no part in the fit or its early stopping, and measure its
+error.
 
 Source: Sim-to-Real Transfer in Meng et al.
 """
@@ -29,23 +29,23 @@ from mjx_softarm.spec import ArmSpec
 
 HELD_OUT_SHARE = 0.2
 MIN_ROWS = 200
-PRESSURE_LIMIT_KPA = 200.0  # of the simulated arm, which no lengths of a real one need
+PRESSURE_LIMIT_KPA = 200.0  # limit of the simulated arm, beyond what any length of a real one needs
 MAX_TURN_DEG = 90.0
 MAX_HELD_OUT_RATIO = 3.0
 BATCH = 512
 
 
 class SimulatedPoses(NamedTuple):
-    """What the simulated arm does when asked for spring lengths."""
+    """Poses of the simulated arm at commanded spring lengths."""
 
     pose: np.ndarray  # (n, 6) [mm, deg]
-    spring_m: np.ndarray  # (n, n_chambers) reached: those asked for
-    valid: np.ndarray  # (n,) bool, the arm settled
+    spring_m: np.ndarray  # (n, n_chambers) lengths reached
+    valid: np.ndarray  # (n,) bool, whether the arm settled
 
 
 @dataclass(frozen=True)
 class PoseErrors:
-    """Distances between poses, over some rows."""
+    """Distances between poses, mean and 95th percentile."""
 
     translation_mean_mm: float
     translation_95_mm: float
@@ -55,29 +55,29 @@ class PoseErrors:
 
 @dataclass(frozen=True, eq=False)
 class S2RFit:
-    """A sim-to-real network and whether to trust it."""
+    """Sim-to-real network and whether to trust it."""
 
     s2r: S2R
-    held_out: np.ndarray  # (n,) bool, rows that took no part
+    held_out: np.ndarray  # (n,) mask of rows that took no part
     in_sample: PoseErrors
     test: PoseErrors  # held-out rows
     in_sample_uncorrected: PoseErrors
     test_uncorrected: PoseErrors
-    stop_epoch: tuple[int, ...]  # of each member
+    stop_epoch: tuple[int, ...]  # epoch at which each member stopped
     n_epochs: int
-    flagged_share: float  # of the held-out rows, extrapolation above 1
-    warnings: tuple[str, ...]
+    flagged_share: float  # share of the held-out rows with extrapolation above 1
+    warnings: tuple[str, ...]  # reasons not to trust it, each with its remedy
 
 
 def simulate_poses(spec: ArmSpec, reference_m: np.ndarray) -> SimulatedPoses:
-    """The simulated arm at rest under the sensor-space law, with pressures as high and low as it takes.
+    """Settle the simulated arm at spring lengths under the sensor-space law, without pressure limits.
 
-    The real arm had these lengths, so the simulated one must have them too. Within its own limits it often
-    cannot: its pose is then one of other lengths, and what the network is to learn is lost in that.
+    The real arm had these lengths, so the simulated one must reach them too. Within its own pressure limits
+    it often cannot; its poses would then belong to other lengths, and hide the difference to be learned.
 
     Args:
-        spec: the calibrated arm.
-        reference_m (n, n_chambers) [m]: spring lengths that the real arm had.
+        spec: calibrated arm.
+        reference_m (n, n_chambers) [m]: spring lengths of the real arm.
 
     Raises:
         FitError: a wrong number of columns, no row, or a length that is not finite.
@@ -89,13 +89,13 @@ def simulate_poses(spec: ArmSpec, reference_m: np.ndarray) -> SimulatedPoses:
     if not np.isfinite(reference).all():
         row, column = np.argwhere(~np.isfinite(reference))[0]
         value = reference[row, column]
-        raise FitError(f"spring lengths: row {row}, spring {column}: expected a finite number, got {value}")
+        raise FitError(f"spring lengths: row {row}, spring {column}: got {value}, expected a finite number")
     n, params = len(reference), ArmParams.from_spec(spec)
     limit = np.full(spec.n_chambers, PRESSURE_LIMIT_KPA, np.float32)
     params = params._replace(pressure_min_kpa=-limit, pressure_max_kpa=limit)
     padded = np.resize(reference, (-(-n // BATCH) * BATCH, spec.n_chambers))
-    parts = [jax.device_get(_settle()(params, part)) for part in np.split(padded, len(padded) // BATCH)]
-    return SimulatedPoses(*(np.concatenate(column)[:n] for column in zip(*parts, strict=True)))
+    found = [jax.device_get(_settle()(params, batch)) for batch in np.split(padded, len(padded) // BATCH)]
+    return SimulatedPoses(*(np.concatenate(column)[:n] for column in zip(*found, strict=True)))
 
 
 @functools.cache
@@ -115,14 +115,14 @@ def fit_s2r(
     seed: int = 0,
     config: NetworkConfig | None = None,
 ) -> S2RFit:
-    """A network from simulated poses and spring lengths to real poses.
+    """Fit a network from simulated poses and spring lengths to real poses.
 
     Args:
-        pose_sim (n, 6) [mm, deg]: of `simulate_poses`, settled rows alone, in time's order.
-        spring_m (n, n_chambers) [m]: of the same.
-        pose_real (n, 6) [mm, deg]: measured, in the base frame.
-        seed: of everything that is drawn.
-        config: how to train.
+        pose_sim (n, 6) [mm, deg]: poses from `simulate_poses`, settled rows only, in order of time.
+        spring_m (n, n_chambers) [m]: their spring lengths.
+        pose_real (n, 6) [mm, deg]: measured poses in the base frame.
+        seed: seed of all random draws.
+        config: training settings.
 
     Raises:
         FitError: arrays that do not fit together, too few rows to hold some out, or numbers not finite.
@@ -156,16 +156,12 @@ def fit_s2r(
 
 
 def pose_errors(pose: np.ndarray, real: np.ndarray) -> PoseErrors:
-    """Distances of poses (n, 6) to real ones, and angles of the rotations between them."""
+    """Return distances of poses (n, 6) to real ones, and angles of the rotations between them."""
     change = correction_between(pose, real)
     distance_mm = np.linalg.norm(change[:, :3], axis=1)
     angle_deg = 2.0 * np.rad2deg(np.arctan(np.linalg.norm(change[:, 3:], axis=1)))
-    parts = (f(values) for values in (distance_mm, angle_deg) for f in (np.mean, _most))
-    return PoseErrors(*map(float, parts))
-
-
-def _most(values: np.ndarray) -> float:
-    return float(np.percentile(values, 95.0))
+    both = ((values.mean(), np.percentile(values, 95.0)) for values in (distance_mm, angle_deg))
+    return PoseErrors(*(float(value) for pair in both for value in pair))
 
 
 def _warnings(
@@ -178,18 +174,24 @@ def _warnings(
 ) -> list[str]:
     found = []
     if n < MIN_ROWS:
-        found.append(f"{n} rows are few for a network; {MIN_ROWS} or more are advised")
+        found.append(f"got {n} rows, expected {MIN_ROWS} or more for a network: log more poses")
     if turn_deg.max() > MAX_TURN_DEG:
         rows = int((turn_deg > MAX_TURN_DEG).sum())
         found.append(
             f"in {rows} of {n} rows the real tip is turned by more than {MAX_TURN_DEG:g} degrees against the "
-            "simulated one; is motion capture in the base frame?"
+            "simulated one: bring motion capture into the base frame"
         )
     for name, unit in (("translation_mean_mm", "mm"), ("rotation_mean_deg", "deg")):
         what = name.split("_")[0]
         got, without, seen = (getattr(e, name) for e in (test, test_uncorrected, in_sample))
         if got >= without:
-            found.append(f"{what}: {got:.3g} {unit} on held-out rows, no better than {without:.3g} without")
+            found.append(
+                f"{what}: {got:.3g} {unit} on held-out rows, no better than {without:.3g} without: "
+                "log more poses, or train without the network"
+            )
         if got > MAX_HELD_OUT_RATIO * seen:
-            found.append(f"{what}: {got:.3g} {unit} on held-out rows, far more than {seen:.3g} in training")
+            found.append(
+                f"{what}: {got:.3g} {unit} on held-out rows, far more than {seen:.3g} in training: "
+                "log more poses"
+            )
     return found

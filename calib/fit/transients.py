@@ -1,12 +1,12 @@
 """Damping of chambers and backbone, fitted to the tip's motion after the pressures changed.
 
 C MuJoCo is driven with the logged pressures, from the beginning of a stretch of the log to its end, and its
-tip compared with the measured one. The first seconds do not count: how the arm moved when the log began is
-not known, and is forgotten by then. There are two numbers, so their derivatives are differences of three runs
-side by side; derivatives through thousands of steps of MJX would cost far more and compile for minutes.
+tip is compared with the measured one. The first seconds do not count, as the arm's motion when the log began
+is unknown and decays meanwhile. Only two parameters are fitted, so their derivatives are differences of three
+parallel runs; derivatives through thousands of steps of MJX would cost far more and compile for minutes.
 
-The springs' damping and the backbone's axial damping stay as specified: beside the chambers' they are not
-seen apart, so the chambers get what these have too little.
+The damping of the springs and the axial damping of the backbone stay as specified: they act in parallel with
+the chambers, which absorb their error.
 """
 
 from __future__ import annotations
@@ -29,22 +29,22 @@ from mjx_softarm.mechanics.mjcf import build_model, steps_per_period
 from mjx_softarm.mechanics.workspace import settle_many
 from mjx_softarm.spec import ArmSpec
 
-MAX_STEP_S = 0.05  # between rows of a stretch
-FORGOTTEN_S = 5.0  # from the beginning of a stretch
+MAX_STEP_S = 0.05  # largest time between rows of a stretch
+SETTLING_S = 5.0  # start of a stretch that does not count
 MIN_COUNTED_S = 2.0
-MAX_TOTAL_S = 24.0  # of all stretches
+MAX_TOTAL_S = 24.0  # length of all stretches together
 CLUSTER_S = 1.0  # errors within it are not independent
 HELD_OUT_SHARE = 0.2
-PRIOR = 1.0  # of the logarithms: a factor of e
+PRIOR = 1.0  # standard deviation of the logarithms: a factor of e
 DIFFERENCE = 0.01
 SCALE_M, MIN_SCALE_M = 2e-3, 1e-4
-KNOWN = 0.2  # half-width of an interval, relative
+KNOWN = 0.2  # relative half-width of an interval up to which a damping counts as known
 MARGIN = 1.05  # by which the specification must be better than the fit to be worth a warning
-MAX_RATIO = 2.0  # of held-out to other errors
+MAX_RATIO = 2.0  # held-out to other errors
 
 
 class Stretch(NamedTuple):
-    """A part of a log without gaps, at the control rate."""
+    """Part of a log without gaps, resampled at the control rate."""
 
     pressure_kpa: np.ndarray  # (n, n_chambers) that act from a row to the next
     tip_m: np.ndarray  # (n, 3)
@@ -56,15 +56,15 @@ class DampingFit:
     """Calibrated damping and whether to trust it.
 
     Attributes:
-        spec: the calibrated arm.
-        half_width_95: of the 95 % interval of `chambers.damping_ns_per_m` and of
+        spec: calibrated arm.
+        half_width_95: half-widths of the 95 % intervals of `chambers.damping_ns_per_m` and
             `backbone.bending_damping_nms_per_rad`, by their names.
-        in_sample_rms_mm, held_out_rms_mm: distance of simulated to measured tip; held-out seconds took no
-            part.
-        held_out_before_rms_mm: of the specification that the fit started from.
-        n_stretches: of the logs.
-        time_s: that was simulated, and counts but for the first seconds of each stretch.
-        warnings: reasons not to trust the fit; none is good.
+        in_sample_rms_mm, held_out_rms_mm: RMS distance of simulated to measured tip; held-out seconds took
+            no part.
+        held_out_before_rms_mm: RMS distance with the specification that the fit started from.
+        n_stretches: number of stretches.
+        time_s: simulated time, the first seconds of each stretch included.
+        warnings: reasons not to trust the fit, each with its remedy; none is good.
     """
 
     spec: ArmSpec
@@ -81,23 +81,24 @@ def calibrate_damping(logs: Log | Sequence[Log], spec: ArmSpec, seed: int = 0) -
     """Fit the damping of chambers and backbone to the logs of a moving arm.
 
     Args:
-        logs: with pressures and tip positions; what is not sampled 20 times a second or more is passed by.
-        spec: the arm, its chambers already calibrated.
-        seed: chooses the seconds that are held out.
+        logs: logs with pressures and tip positions; stretches sampled below 20 Hz are skipped.
+        spec: arm, its chambers already calibrated.
+        seed: seed that chooses the held-out seconds.
 
     Raises:
-        FitError: a damping to start from that is zero, or no stretch of a log in which pressures change.
+        FitError: the specified damping is zero, or no stretch of a log has changing pressures.
     """
     if not (spec.chambers.damping_ns_per_m > 0 and spec.backbone.bending_damping_nms_per_rad > 0):
         raise FitError(
-            "damping: expected chambers.damping_ns_per_m and backbone.bending_damping_nms_per_rad above 0, "
-            f"got {spec.chambers.damping_ns_per_m:g} and {spec.backbone.bending_damping_nms_per_rad:g}"
+            f"damping: got chambers.damping_ns_per_m {spec.chambers.damping_ns_per_m:g} and "
+            f"backbone.bending_damping_nms_per_rad {spec.backbone.bending_damping_nms_per_rad:g}, "
+            "expected both above 0"
         )
     found = find_stretches([logs] if isinstance(logs, Log) else logs, spec)
     if not found:
         raise FitError(
-            f"damping: no stretch of {FORGOTTEN_S + MIN_COUNTED_S:g} s, sampled every {MAX_STEP_S:g} s or "
-            "faster, in which pressures change"
+            f"damping: got no stretch of {SETTLING_S + MIN_COUNTED_S:g} s sampled every {MAX_STEP_S:g} s or "
+            "faster, expected one in which pressures change"
         )
     n_clusters = len(_clusters(found, [s.tip_m for s in found], spec))
     held_out = held_out_blocks(n_clusters, HELD_OUT_SHARE, 2, seed)
@@ -133,13 +134,13 @@ def calibrate_damping(logs: Log | Sequence[Log], spec: ArmSpec, seed: int = 0) -
 
 
 def find_stretches(logs: Sequence[Log], spec: ArmSpec) -> list[Stretch]:
-    """Parts of logs in which pressures change and rows follow one another closely, at the control rate.
+    """Return densely sampled parts of logs in which pressures change, resampled at the control rate.
 
-    Pressures are held from row to row, positions interpolated. In the order of the logs, as many as
-    `MAX_TOTAL_S` allows.
+    Pressures are held from row to row, positions interpolated. The stretches are in the order of the logs, as
+    many as `MAX_TOTAL_S` allows.
     """
     found, left = [], _rows(MAX_TOTAL_S, spec)
-    shortest = _rows(FORGOTTEN_S + MIN_COUNTED_S, spec)
+    shortest = _rows(SETTLING_S + MIN_COUNTED_S, spec)
     for log in logs:
         if log.pressure_kpa is None or log.tip_m is None or len(log) < 2:
             continue
@@ -152,7 +153,7 @@ def find_stretches(logs: Sequence[Log], spec: ArmSpec) -> list[Stretch]:
                 continue
             held = rows[np.searchsorted(time_s, grid + 1e-6, side="right") - 1]
             pressure = log.pressure_kpa[held]
-            if (np.ptp(pressure[_rows(FORGOTTEN_S, spec) :], axis=0) <= HOLD_KPA).all():
+            if (np.ptp(pressure[_rows(SETTLING_S, spec) :], axis=0) <= HOLD_KPA).all():
                 continue
             tip = np.stack([np.interp(grid, time_s, log.tip_m[rows, k]) for k in range(3)], axis=1)
             found.append(Stretch(pressure, tip, float(payload[rows[0]])))
@@ -161,7 +162,7 @@ def find_stretches(logs: Sequence[Log], spec: ArmSpec) -> list[Stretch]:
 
 
 def damped(spec: ArmSpec, x: np.ndarray) -> ArmSpec:
-    """The arm with the damping of chambers and backbone times exp(x), (2,)."""
+    """Return the arm with the damping of chambers and backbone times exp(x), (2,)."""
     chambers, bending = np.exp(x)
     backbone = spec.backbone.bending_damping_nms_per_rad
     return spec.replace(
@@ -171,7 +172,7 @@ def damped(spec: ArmSpec, x: np.ndarray) -> ArmSpec:
 
 
 def simulate(stretch: Stretch, spec: ArmSpec) -> np.ndarray:
-    """Tip positions (n, 3) [m] of C MuJoCo under a stretch's pressures, at rest in the beginning."""
+    """Return tip positions (n, 3) [m] of C MuJoCo under the pressures of a stretch, started at rest."""
     spec = spec.replace(mass={"payload_kg": stretch.payload_kg})
     model = build_model(spec)
     data = mujoco.MjData(model)
@@ -186,7 +187,7 @@ def simulate(stretch: Stretch, spec: ArmSpec) -> np.ndarray:
 
 
 def _errors(found: list[Stretch], spec: ArmSpec, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Simulated less measured tip by clusters (n, m) [m], NaN at their end; slopes (n, m, 2)."""
+    """Return simulated minus measured tip by clusters (n, m) [m], NaN-padded; Jacobian (n, m, 2)."""
     arms = [damped(spec, x + d) for d in (np.zeros(2), *(DIFFERENCE * np.eye(2)))]
     with ThreadPoolExecutor() as pool:  # MuJoCo steps without Python's lock
         runs = list(pool.map(lambda job: simulate(*job), [(s, arm) for arm in arms for s in found]))
@@ -196,8 +197,8 @@ def _errors(found: list[Stretch], spec: ArmSpec, x: np.ndarray) -> tuple[np.ndar
 
 
 def _clusters(found: list[Stretch], tips: list[np.ndarray], spec: ArmSpec) -> np.ndarray:
-    """Errors of the rows that count, a second in each row; the last of a stretch ends in NaN."""
-    size, skip, parts = _rows(CLUSTER_S, spec), _rows(FORGOTTEN_S, spec), []
+    """Return errors of the rows that count, one second a row; the last of a stretch is NaN-padded."""
+    size, skip, parts = _rows(CLUSTER_S, spec), _rows(SETTLING_S, spec), []
     for stretch, tip in zip(found, tips, strict=True):
         error = (tip - stretch.tip_m)[skip:]
         padded = np.full((-(-len(error) // size) * size, 3), np.nan)
@@ -215,15 +216,19 @@ def _rms_mm(error: np.ndarray) -> float:
 
 
 def _warnings(done: DampingFit, widths: np.ndarray, converged: bool) -> tuple[str, ...]:
-    said = [] if converged else ["the fit has not come to an end"]
+    said = (
+        []
+        if converged
+        else ["the fit did not converge: start from a specification closer to the arm (--spec)"]
+    )
     for name, width in zip(done.half_width_95, widths, strict=True):
         if width > KNOWN:
-            said.append(f"{name} is known to {100 * width:.0f} % only; log larger steps of the pressures")
+            said.append(f"{name} is known to {100 * width:.0f} % only: log larger steps of the pressures")
     if done.held_out_rms_mm > MAX_RATIO * done.in_sample_rms_mm:
         said.append(
             f"held-out error {done.held_out_rms_mm:.1f} mm is more than {MAX_RATIO:g} times the error of the "
-            f"other seconds, {done.in_sample_rms_mm:.1f} mm"
+            f"other seconds, {done.in_sample_rms_mm:.1f} mm: log a longer motion"
         )
     if done.held_out_rms_mm > MARGIN * done.held_out_before_rms_mm:
-        said.append("the damping that the fit started from is better on held-out seconds")
+        said.append("the specified damping is better on held-out seconds: keep it, or log a longer motion")
     return tuple(said)

@@ -1,4 +1,4 @@
-"""The sections of a calibration's report: figures, tables, pictures."""
+"""Sections of the report of a calibration: numbers, tables, drawings."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _BINS = 40
 
 
 def springs(fit: SpringFit, calibrated_m: np.ndarray, length_m: np.ndarray) -> Section:
-    """Beta and delta of each spring; lengths (n, n_springs) by the calibrated sensors and as measured."""
+    """Show beta and delta of each spring; lengths (n, n_springs) from calibrated sensors, and measured."""
     half_beta = 0.5 * np.ptp(fit.beta_interval, axis=1)
     half_delta = 0.5 * np.ptp(fit.delta_interval_m, axis=1)
     rows = tuple(
@@ -35,20 +35,20 @@ def springs(fit: SpringFit, calibrated_m: np.ndarray, length_m: np.ndarray) -> S
     error_mm = 1e3 * (calibrated_m - length_m)
     for k in range(length_m.shape[1]):
         axes.plot(1e3 * length_m[:, k], error_mm[:, k], ".", ms=3, label=f"spring {k}")
-    _label(axes, "measured length [mm]", "calibrated less measured [mm]")
+    _label(axes, "measured length [mm]", "calibrated minus measured [mm]")
     return Section(
         "Springs",
-        "Lengths that were measured against lengths from the readings, L = beta l + delta, Huber's loss. "
-        "Intervals are 95 %; held out are contiguous blocks of rows.",
+        "Measured lengths L against lengths l from the readings, L = beta l + delta, by Huber's loss. "
+        "Intervals are 95 %; contiguous blocks of rows are held out.",
         (Table(head, rows),),
         fit.warnings,
         _plain(fit),
-        (("what the lines leave", figure),),
+        (("residuals of the lines", figure),),
     )
 
 
 def chambers(fit: ChamberFit) -> Section:
-    """Stiffness, area and rest length of each chamber, the backbone, and how well the arm's tip is met."""
+    """Show stiffness, area and rest length of each chamber, the backbone, and the errors of the tip."""
     spec = fit.spec
     units = (
         ("stiffness_n_per_m", "stiffness [N/m]", 1.0),
@@ -84,7 +84,7 @@ def chambers(fit: ChamberFit) -> Section:
     return Section(
         "Chambers",
         f"{fit.poses.n} poses at rest: simulated at the measured pressures against the measured tip and "
-        "springs. Rest length is told as its difference from the section's. Intervals are 95 %. "
+        "springs. Rest lengths are relative to the section's. Intervals are 95 %. "
         f"Rows of the logs: {fates}.",
         (Table(head, tuple(rows)), backbone, Table(_ERROR_HEAD, error_rows)),
         fit.warnings,
@@ -95,15 +95,18 @@ def chambers(fit: ChamberFit) -> Section:
 
 
 def with_markers(section: Section, limits: MarkerLimits) -> Section:
-    """The chambers' section with their lengths from markers at the poses that bend most."""
+    """Return the section of the chambers with their lengths from markers at the most bent poses."""
     figure, axes = _figure()
     axes.plot(1e3 * limits.simulated_m.ravel(), 1e3 * limits.length_m.ravel(), ".")
     axes.plot(*2 * [1e3 * np.array([limits.length_min_m, limits.length_max_m])], "k:", lw=1)
     axes.set(xlabel="chambers, simulated [mm]", ylabel="from the curves through the markers [mm]")
-    lengths = ("chamber at the poses that bend most", 1e3 * limits.length_min_m, 1e3 * limits.length_max_m)
-    simulated = ("the same, simulated", *(float(1e3 * f(limits.simulated_m)) for f in (np.min, np.max)))
+    lengths = ("chambers at the most bent poses", 1e3 * limits.length_min_m, 1e3 * limits.length_max_m)
+    simulated = (
+        "simulated at the same poses",
+        *(float(1e3 * f(limits.simulated_m)) for f in (np.min, np.max)),
+    )
     table = Table(("", "shortest [mm]", "longest [mm]"), (lengths, simulated))
-    title = f"chambers at the {len(limits.pose)} poses that bend most"
+    title = f"chambers at the {len(limits.pose)} most bent poses"
     return dataclasses.replace(
         section,
         tables=(*section.tables, table),
@@ -113,7 +116,7 @@ def with_markers(section: Section, limits: MarkerLimits) -> Section:
 
 
 def damping(fit: DampingFit) -> Section:
-    """Damping of chambers and backbone, and how well the moving tip is met."""
+    """Show damping of chambers and backbone, and the errors of the moving tip."""
     values = {
         "damping_ns_per_m": fit.spec.chambers.damping_ns_per_m,
         "bending_damping_nms_per_rad": fit.spec.backbone.bending_damping_nms_per_rad,
@@ -135,9 +138,9 @@ def damping(fit: DampingFit) -> Section:
 
 
 def s2r(fit: S2RFit, pose: np.ndarray, spring_m: np.ndarray, real: np.ndarray, n_unsettled: int) -> Section:
-    """Simulated poses (n, 6) and spring lengths, and real poses, with and without the network.
+    """Show distances of simulated poses (n, 6) to real ones, with and without the network.
 
-    `n_unsettled` others took no part, as the simulated arm found no rest at their spring lengths.
+    `n_unsettled` other poses took no part, as the simulated arm did not settle at their spring lengths.
     """
     errors = tuple(
         (name, n, e.translation_mean_mm, e.translation_95_mm, e.rotation_mean_deg)
@@ -155,9 +158,9 @@ def s2r(fit: S2RFit, pose: np.ndarray, spring_m: np.ndarray, real: np.ndarray, n
     _label(axes, "distance to the real tip, held-out poses [mm]", "poses")
     return Section(
         "Sim-to-real network",
-        f"{len(pose)} poses at rest: the calibrated simulation is asked for the logged spring lengths, the "
-        f"network learns what its tip is off by. Of the held-out poses it flags "
-        f"{100 * fit.flagged_share:.1f} % as far from those it learned from. "
+        f"{len(pose)} poses at rest: the calibrated simulation settles at the logged spring lengths, and "
+        f"the network learns the error of its tip. It flags {100 * fit.flagged_share:.1f} % of the held-out poses "
+        "as far from those it learned from. "
         f"At {n_unsettled} other poses the simulation found no rest; they took no part.",
         (Table(_ERROR_HEAD, errors),),
         fit.warnings,
@@ -170,7 +173,7 @@ _ERROR_HEAD = ("tip", "poses", "mean [mm]", "95 % [mm]", "mean turn [deg]")
 
 
 def _plain(fit: Any, *left_out: str) -> dict[str, Any]:
-    """The fields of a fit as JSON has them."""
+    """Return the fields of a fit as JSON has them."""
     fields = fit._asdict() if hasattr(fit, "_asdict") else _fields(fit)
     return {name: _json(value) for name, value in fields.items() if name not in (*left_out, "warnings")}
 

@@ -28,10 +28,10 @@ def test_seed_chooses_the_blocks():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"n": 1}, "at least 2 rows, got 1"),
-        ({"n": 100, "share": 0.0}, "between 0 and 1, got 0.0"),
-        ({"n": 100, "share": 1.0}, "between 0 and 1, got 1.0"),
-        ({"n": 100, "block": 0}, "at least 1 row, got 0"),
+        ({"n": 1}, "got a log of 1 rows"),
+        ({"n": 100, "share": 0.0}, "got a share of 0.0"),
+        ({"n": 100, "share": 1.0}, "got a share of 1.0"),
+        ({"n": 100, "block": 0}, "got blocks of 0 rows"),
     ],
 )
 def test_refuses(arguments, message):

@@ -140,7 +140,7 @@ def test_held_out_rows_take_no_part_and_the_seed_decides(arms):
 def test_warns_of_few_rows_no_gain_and_another_frame(arms):
     pose_sim, spring_m, true = (a[:150] for a in arms)
     perfect = fit_s2r(pose_sim, spring_m, pose_sim, config=BRIEF).warnings
-    assert "150 rows are few" in perfect[0] and "no better than 0 without" in perfect[1]
+    assert "got 150 rows" in perfect[0] and "no better than 0 without" in perfect[1]
     turned = moved(true, np.broadcast_to([0, 0, 0, 0, 0, np.tan(np.radians(60.0))], (150, 6)))
     assert any(
         "in 150 of 150 rows" in text for text in fit_s2r(pose_sim, spring_m, turned, config=BRIEF).warnings
@@ -151,7 +151,7 @@ def test_fit_refuses_what_does_not_fit_together(arms):
     pose_sim, spring_m, true = (a[:150] for a in arms)
     with pytest.raises(ValueError, match=r"got \(150, 6\), \(150, 9\), \(149, 6\)"):
         fit_s2r(pose_sim, spring_m, true[:-1])
-    with pytest.raises(ValueError, match="inputs, row 3, column 9: expected a finite number, got nan"):
+    with pytest.raises(ValueError, match="inputs, row 3, column 9: got nan, expected a finite number"):
         broken = np.where(np.arange(150)[:, None] == 3, np.nan, spring_m)
         fit_network(np.concatenate([np.zeros((150, 9)), broken], axis=1), true, seed=0)
 
