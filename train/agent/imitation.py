@@ -1,4 +1,4 @@
-"""Learning from demonstrations: a learned reward around an off-policy learner.
+"""Learner from demonstrations: a learned reward around TQC.
 
 An action of an arm at rest leads to the same pose from wherever it begins. So each demonstrated action is the
 expert's answer to its goal from any start, and the expert is put where the agent stood: the discriminator
@@ -23,7 +23,7 @@ from jax import Array
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.mdp import rewards
 from train.agent.gail import DiscriminatorState, Gail
-from train.agent.hindsight_tqc import OffPolicyLearner
+from train.agent.hindsight_tqc import HindsightTQC
 from train.agent.learner import Experience, Sample, check_same_shapes
 from train.agent.tqc import Transition
 from train.config import ImitationConfig
@@ -41,14 +41,10 @@ class ImitationState(NamedTuple):
 
 
 class Imitation:
-    """`Learner` that wraps an off-policy one and replaces its rewards and some rows of its batches."""
+    """`Learner` that wraps another and replaces its rewards and some rows of its batches."""
 
     def __init__(
-        self,
-        learner: OffPolicyLearner,
-        config: ImitationConfig,
-        env: ReachEnv,
-        demonstrations: Demonstrations,
+        self, learner: HindsightTQC, config: ImitationConfig, env: ReachEnv, demonstrations: Demonstrations
     ):
         self.learner, self.config, self.env = learner, config, env
         self.positions = jnp.asarray(demonstrations.positions)  # (m, 6) [mm, deg]
@@ -64,15 +60,15 @@ class Imitation:
         return ImitationState(self.learner.init(key_agent), discriminator)
 
     def act(self, state: ImitationState, obs: Array, key: Array) -> Array:
-        """Return the wrapped learner's exploring actions (..., A) at obs (..., O)."""
+        """Return the wrapped learner's exploring actions."""
         return self.learner.act(state.agent, obs, key)
 
     def policy(self, state: ImitationState) -> Any:
-        """Return the parameters of the wrapped learner's policy."""
+        """Return the wrapped learner's policy."""
         return self.learner.policy(state.agent)
 
     def mode(self, policy: Any, obs: Array) -> Array:
-        """Return the wrapped learner's deterministic actions (..., A) at obs (..., O)."""
+        """Return the wrapped learner's deterministic actions."""
         return self.learner.mode(policy, obs)
 
     def update(
@@ -100,12 +96,7 @@ class Imitation:
         return ImitationState(agent, discriminator), losses | metrics
 
     def adopt(self, state: ImitationState, agent: Any = None, reward: Any = None) -> ImitationState:
-        """Return the state with parts of other runs' learners.
-
-        Args:
-            state: of this learner.
-            agent: state whose networks are taken, of the wrapped learner or of one like this.
-            reward: state whose discriminator is taken.
+        """Return the state with the networks of the state `agent` and the discriminator of `reward`.
 
         Raises:
             ValueError: a donor has no such part, or one of another size.
@@ -146,10 +137,7 @@ class Imitation:
     def with_expert(self, batch: Transition, stored: Experience, index: Array) -> Transition:
         """Return a batch whose first rows are the expert's answers, from the same starts to the same goals.
 
-        Args:
-            batch: made of `stored`.
-            stored: B transitions.
-            index (B,): of the demonstrated positions that are their goals.
+        `index` (B,) tells which demonstrated positions are the goals of the B transitions `stored`.
         """
         n = self.n_expert
         goal = self.positions[index[:n]]  # (n, 6)

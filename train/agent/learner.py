@@ -3,7 +3,7 @@
 An epoch steps the arms, stores their transitions and calls `update` some times after each action. The learner
 decides what to do with the replay: sample it as it is stored, relabel it, or leave it and learn from its own
 rollouts. Anything that has the methods of `Learner` can be handed to `train.epoch.job.Job`; nothing need
-inherit from it.
+inherit from it. On several devices, batches are spread over them and the learner's state is on all of them.
 
 Shapes: O observation, A action.
 """

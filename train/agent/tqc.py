@@ -132,9 +132,13 @@ class TQC:
         check_same_shapes("networks", given, own)
         return state._replace(**given)
 
-    def act(self, actor_params: Params, obs: Array, key: Array) -> Array:
+    def act(self, state: TQCState, obs: Array, key: Array) -> Array:
         """Sample an action (..., A) in (-1, 1) at obs (..., O)."""
-        return sample_action(*self.actor.apply(actor_params, obs), key=key)[0]
+        return sample_action(*self.actor.apply(state.actor_params, obs), key=key)[0]
+
+    def policy(self, state: TQCState) -> Params:
+        """Return the parameters of the mean actor."""
+        return state.mean_actor_params
 
     def mode(self, actor_params: Params, obs: Array) -> Array:
         """Return the deterministic action (..., A) in (-1, 1) at obs (..., O)."""

@@ -207,10 +207,17 @@ class Run:
         wanted = {name: jax.tree.map(ocp.utils.to_shape_dtype_struct, like)}
         as_numpy = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), wanted)
         arguments = ocp.args.PyTreeRestore(wanted, as_numpy, partial_restore=True)
+        # Not by the manager, which reads a checkpoint in no other way than it has saved one.
+        path = self._manager.directory / str(self._newest()) / "default"
         try:
-            return self._manager.restore(self._newest(), args=arguments)[name]
-        except (ValueError, KeyError) as error:
+            part = ocp.Checkpointer(ocp.PyTreeCheckpointHandler()).restore(path, args=arguments)[name]
+        except (ValueError, KeyError, TypeError) as error:
             raise self._of_another_version() from error
+        # What the checkpoint lacks comes back as it was asked for, and arrays with the shapes that they have.
+        for got, expected in zip(jax.tree.leaves(part), jax.tree.leaves(like), strict=True):
+            if isinstance(got, jax.ShapeDtypeStruct) or got.shape != expected.shape:
+                raise self._of_another_version()
+        return part
 
     def _of_another_version(self) -> RunError:
         return RunError(

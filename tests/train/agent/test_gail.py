@@ -19,36 +19,32 @@ def test_cross_entropy_is_that_of_probabilities():
     np.testing.assert_allclose(cross_entropy(jnp.array(expert), jnp.array(agent)), expected, rtol=1e-5)
 
 
-def test_cross_entropy_is_least_where_the_expert_is_high():
-    high, low = jnp.full(4, 3.0), jnp.full(4, -3.0)
-    assert cross_entropy(high, low) < cross_entropy(low, low) < cross_entropy(low, high)
-
-
-def test_reward_is_the_papers_log_of_one_minus_the_probability_of_the_agent():
+def test_reward_is_the_papers_log_of_one_minus_the_probability_of_the_agent_and_finite_far_out():
     logits = np.array([-3.0, -0.2, 0.0, 2.0])
-    probability_of_agent = 1.0 / (1.0 + np.exp(logits))
-    np.testing.assert_allclose(
-        learned_reward(jnp.array(logits)), np.log(1.0 - probability_of_agent), rtol=1e-5
-    )
+    expected = np.log(1.0 - 1.0 / (1.0 + np.exp(logits)))
+    np.testing.assert_allclose(learned_reward(jnp.array(logits)), expected, rtol=1e-5)
+    far = learned_reward(jnp.array([-1e4, -100.0, 100.0, 1e4]))
+    np.testing.assert_allclose(far, [-1e4, -100.0, 0.0, 0.0], atol=1e-6)
+    assert (far <= 0.0).all()
 
 
-def test_reward_is_finite_far_out_and_never_positive():
-    reward = learned_reward(jnp.array([-1e4, -100.0, 100.0, 1e4]))
-    np.testing.assert_allclose(reward, [-1e4, -100.0, 0.0, 0.0], atol=1e-6)
-    assert (reward <= 0.0).all()
+W_OBS, W_ACTION = RNG.normal(size=5), RNG.normal(size=3)
 
 
-def test_penalty_of_a_linear_discriminator():
-    on_obs, on_action = RNG.normal(size=5), RNG.normal(size=3)
-    length = np.sqrt(np.sum(on_obs**2) + np.sum(on_action**2))
-    penalty = gradient_penalty(lambda o, a: o @ on_obs + a @ on_action + 7.0, OBS, ACTION)
-    np.testing.assert_allclose(penalty, (length - 1.0) ** 2, rtol=1e-5)
-
-
-def test_penalty_of_a_quadratic_discriminator():
-    penalty = gradient_penalty(lambda o, a: 0.5 * jnp.sum(o**2, -1) - jnp.sum(a**2, -1), OBS, ACTION)
-    length = np.sqrt(np.sum(OBS**2, axis=1) + np.sum((2.0 * ACTION) ** 2, axis=1))
-    np.testing.assert_allclose(penalty, np.mean((length - 1.0) ** 2), rtol=1e-5)
+@pytest.mark.parametrize(
+    ("logits", "square"),
+    [
+        (lambda o, a: o @ W_OBS + a @ W_ACTION + 7.0, np.sum(W_OBS**2) + np.sum(W_ACTION**2)),
+        (
+            lambda o, a: 0.5 * jnp.sum(o**2, -1) - jnp.sum(a**2, -1),
+            np.sum(OBS**2, axis=1) + np.sum((2.0 * ACTION) ** 2, axis=1),
+        ),
+    ],
+    ids=["linear", "quadratic"],
+)
+def test_penalty_of_a_discriminator_of_known_slope(logits, square):
+    expected = np.mean((np.sqrt(square) - 1.0) ** 2)
+    np.testing.assert_allclose(gradient_penalty(logits, OBS, ACTION), expected, rtol=1e-5)
 
 
 def test_slope_of_the_penalty_of_a_linear_discriminator():
@@ -113,7 +109,7 @@ def test_an_expert_is_recovered_from_its_actions_alone():
         agent, discriminator = states
         key_goal, key_act, key_gail, key_tqc = jax.random.split(key, 4)
         k = jax.random.randint(key_goal, (64,), 0, 8)
-        goal, action = goals[k], tqc.act(agent.actor_params, goals[k], key_act)
+        goal, action = goals[k], tqc.act(agent, goals[k], key_act)
         discriminator, _ = gail.update(discriminator, (goal, answers[k]), (goal, action), key_gail)
         action = jnp.concatenate([answers[k][:16], action[16:]])
         reward = gail.reward(discriminator.params, goal, action)

@@ -158,12 +158,6 @@ def test_shares_are_kept_and_the_rest_is_as_it_was(env, transition, relabelled):
     assert np.isfinite(goal).all()
 
 
-def test_the_draw_follows_from_the_key(relabelled):
-    first, again, other = (relabelled(key, reached_share=0.5)[1].reward for key in (1, 1, 2))
-    np.testing.assert_array_equal(first, again)
-    assert not np.array_equal(first, other)
-
-
 @pytest.mark.parametrize("shares", [(-0.1, 0.5), (0.5, -0.1), (0.7, 0.4)])
 def test_shares_that_are_none_are_refused(shares):
     with pytest.raises(ValueError, match="got reached_share .* expected numbers >= 0 that add up to 1"):

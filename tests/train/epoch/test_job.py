@@ -130,16 +130,6 @@ def test_a_restored_run_continues_bit_for_bit(job, tmp_path):
     assert_equal(direct, resumed)
 
 
-def test_a_folder_that_is_no_run_is_named(tmp_path):
-    with pytest.raises(RunError, match="not the folder of a run: .*config.json: No such file"):
-        Run.open(tmp_path)
-    (tmp_path / "config.json").write_text("{")
-    with pytest.raises(RunError, match="config.json: not a run's config"):
-        Run.open(tmp_path)
-    with pytest.raises(RunError, match="already holds a run; continue it with --resume"):
-        Run.create(tmp_path, CONFIG, ArmSpec.default())
-
-
 def test_a_run_without_checkpoint_says_so(job, tmp_path):
     run = Run.create(tmp_path / "new", dataclasses.replace(CONFIG, seed=5), job.env.spec)
     with pytest.raises(RunError, match="holds no checkpoint"):
@@ -152,13 +142,3 @@ def test_a_checkpoint_of_another_structure_is_refused_in_words(job, tmp_path):
     for other in ({**state._asdict(), "more": state.key}, state._replace(key=state.arms.obs)):
         with pytest.raises(RunError, match=f"{tmp_path}: its checkpoint has other parts or sizes"):
             run.restore(other)
-
-
-def test_metrics_later_than_the_checkpoint_are_forgotten(tmp_path):
-    run = Run.create(tmp_path, CONFIG, ArmSpec.default())
-    for epoch in range(1, 5):
-        run.log({"epoch": epoch})
-    with (tmp_path / "metrics.jsonl").open("a") as file:
-        file.write('{"epoch": 5, "cut')
-    run.truncate_metrics(2)
-    assert run.metrics() == [{"epoch": 1}, {"epoch": 2}]

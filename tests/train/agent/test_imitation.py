@@ -1,0 +1,104 @@
+"""Learning from demonstrations: the expert's rows, the rewards, the discriminator, and parts of other runs."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from train.agent.hindsight_tqc import HindsightTQC
+from train.agent.imitation import Imitation
+from train.agent.learner import Experience
+from train.agent.tqc import TQCConfig, Transition
+
+B = 16
+
+
+@pytest.fixture
+def new(imitation_config, short_env, shown):
+    """Changes of the config -> a learner."""
+
+    def make(**changes):
+        config = dataclasses.replace(imitation_config, **changes)
+        return Imitation(HindsightTQC(config, short_env), config, short_env, shown)
+
+    return make
+
+
+@pytest.fixture
+def stored(short_env, shown):
+    """Random actions from one demonstrated position towards another."""
+    row = jnp.arange(B)
+    pose, goal = (jnp.asarray(shown.positions)[(row + k) % len(shown.positions)] for k in (0, 1))
+    action = jax.random.uniform(jax.random.key(0), (B, short_env.action_size), minval=-1.0)
+    cost = row.astype(jnp.float32)
+    return Experience(pose, goal, action, pose, action, row < 0, cost, jnp.ones(B))
+
+
+def test_the_experts_rows_are_right_answers_to_their_goals(new, short_env, stored):
+    """The arm reaches a row's goal with the expert's action of that row."""
+    learner = new()
+    own = learner.learner.transitions(stored, jax.random.PRNGKey(0))
+    batch = learner.with_expert(own, stored, (jnp.arange(B) + 1) % 6)
+    assert learner.n_expert == 4
+    arms = jax.vmap(short_env.reset)(jax.random.split(jax.random.PRNGKey(4), 4))
+    after = jax.vmap(short_env.step)(arms, batch.action[:4])
+    np.testing.assert_allclose(after.pipeline_state.pose[:, :3], stored.goal[:4, :3], atol=0.01)
+    expected = short_env.observe(after.pipeline_state.pose, stored.goal[:4])
+    np.testing.assert_allclose(batch.next_obs[:4], expected, atol=1e-3)
+    np.testing.assert_array_equal(batch.action[4:], stored.action[4:])
+    assert np.all(batch.terminated[:4] == 1.0)
+
+
+def test_rewards_are_learned_for_goals_asked_for_and_clearance_is_always_charged(new, short_env, stored):
+    learner = new(learned_weight=2.0, hand_made_weight=0.5)
+    discriminator = learner.init(jax.random.PRNGKey(0)).discriminator
+    given = -3.0 - stored.clearance_cost  # the environment's, costs included, of all rows but the expert's
+    hindsight, expert = jnp.arange(B) >= 12, jnp.arange(B) < learner.n_expert
+    start = short_env.observe(stored.pose, stored.goal)
+    elsewhere = short_env.observe(stored.pose, stored.goal + jnp.array([1.0, 0, 0, 0, 0, 0]))
+    obs = jnp.where(hindsight[:, None], elsewhere, start)
+    batch = Transition(obs, stored.action, jnp.where(expert, 100.0, given), obs, jnp.zeros(B))
+    rewards, _ = learner.rewards(batch, stored, start, discriminator)
+    learned = np.where(hindsight, 0.0, learner.gail.reward(discriminator.params, obs, stored.action))
+    assert np.all(learned[:12] < 0.0)
+    expected = np.where(expert, 0.5 * 100.0, 0.5 * -3.0 - stored.clearance_cost) + 2.0 * learned
+    np.testing.assert_allclose(rewards, expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("frozen", [False, True])
+def test_an_update_moves_the_discriminator_unless_it_is_frozen(new, stored, frozen):
+    learner = new(frozen=frozen)
+    before = learner.init(jax.random.PRNGKey(0))
+    after, metrics = jax.jit(lambda state, key: learner.update(state, lambda _: stored, key))(
+        before, jax.random.PRNGKey(1)
+    )
+    heads = [state.discriminator.params["params"]["head"]["kernel"] for state in (before, after)]
+    assert np.array_equal(*heads) == frozen and ("gail/accuracy" in metrics) != frozen
+    assert float(metrics["gail/reward"]) < 0.0 and learner.n_expert == (0 if frozen else 4)
+    policies = [jax.tree.leaves(learner.policy(state)) for state in (before, after)]
+    assert not np.array_equal(policies[0][-1], policies[1][-1])
+
+
+def test_parts_of_other_runs_are_taken(new):
+    learner, reach = new(), new().learner
+    state, donor = learner.init(jax.random.PRNGKey(0)), learner.init(jax.random.PRNGKey(1))
+    same = lambda a, b: jax.tree.map(np.testing.assert_array_equal, a, b)  # noqa: E731
+    for agent in (donor, reach.init(jax.random.PRNGKey(2))):  # of `imitate` and of `reach`
+        taken = learner.adopt(state, agent=agent)
+        same(learner.policy(taken), (learner if agent is donor else reach).policy(agent))
+        same(taken.discriminator, state.discriminator)
+    same(learner.adopt(state, reward=donor), state._replace(discriminator=donor.discriminator))
+
+
+def test_parts_that_do_not_fit_are_refused(new):
+    learner = new()
+    state = learner.init(jax.random.PRNGKey(0))
+    other = new(tqc=TQCConfig(hidden_actor=(8,))).init(jax.random.PRNGKey(0))
+    with pytest.raises(ValueError, match="networks: got layers of .* expected"):
+        learner.adopt(state, agent=other)
+    without = new(learned_weight=0.0, hand_made_weight=1.0).init(jax.random.PRNGKey(0))
+    for donor in (without, state.agent):
+        with pytest.raises(ValueError, match="learned no reward"):
+            learner.adopt(state, reward=donor)

@@ -1,0 +1,127 @@
+"""Demonstrated goals: episodes, stages, balance, and a run that continues bit for bit."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from train.agent.hindsight_tqc import HindsightTQC
+from train.agent.imitation import Imitation
+from train.config import ConfigError, from_dict, override, to_dict
+from train.epoch.devices import mesh_of
+from train.epoch.goals import DemonstratedGoals, goal_weights
+from train.epoch.job import Job
+
+
+def new_job(config, env, shown, mesh=None):
+    learner = Imitation(HindsightTQC(config, env), config, env, shown)
+    return Job(config, env, learner, DemonstratedGoals(config, env, shown.positions), mesh)
+
+
+@pytest.fixture(scope="module")
+def job(imitation_config, short_env, shown):
+    return new_job(imitation_config, short_env, shown)
+
+
+def run(job, state, first, last):
+    """State and metrics after the epochs from `first` to before `last`."""
+    metrics = {}
+    for epoch in range(first, last):
+        state, metrics = job.epoch(job.goals.begin_stage(job, state, epoch))
+    return state, metrics
+
+
+def indices(job, poses):
+    distance = np.linalg.norm(np.asarray(poses)[:, None] - np.asarray(job.goals.positions), axis=-1)
+    assert np.all(distance.min(axis=1) == 0.0)
+    return distance.argmin(axis=1)
+
+
+def test_an_episode_goes_from_one_demonstrated_position_to_another(job):
+    state = job.init(jax.random.PRNGKey(0))
+    arm = state.arms.pipeline_state
+    assert len(set(indices(job, arm.pose))) > 1
+    assert set(indices(job, arm.goal)) <= {0, 2, 4}  # the first stage has every second position
+    np.testing.assert_allclose(state.arms.obs, job.env.observe(arm.pose, arm.goal), atol=1e-6)
+
+
+def test_stages_change_the_goals_and_thin_the_replay(job):
+    state, _ = run(job, job.init(jax.random.PRNGKey(0)), 0, 4)
+    n = int(state.memory.size)
+    assert n == 64 and set(indices(job, state.memory.data.goal)) <= {0, 2, 4}
+    later = job.goals.begin_stage(job, jax.tree.map(jnp.copy, state), 4)
+    assert int(later.memory.size) == n // 4 and np.all(later.goals == 1.0)
+    state, _ = run(job, state, 4, 8)
+    assert {1, 3, 5} & set(indices(job, state.memory.data.goal))
+
+
+def test_a_run_is_traced_once_and_continues_bit_for_bit_across_a_stage(job):
+    whole, metrics = run(job, job.init(jax.random.PRNGKey(2)), 0, 6)
+    part, _ = run(job, job.init(jax.random.PRNGKey(2)), 0, 4)
+    part = jax.tree.map(jnp.asarray, jax.device_get(part))
+    resumed, _ = run(job, part, 4, 6)
+    assert job.n_traces == 1 and all(np.isfinite(value) for value in metrics.values())
+    jax.tree.map(np.testing.assert_array_equal, jax.device_get(whole), jax.device_get(resumed))
+
+
+def test_many_devices_learn_as_one_does_across_a_stage_and_a_balance(imitation_config, short_env, shown, job):
+    spread = new_job(imitation_config, short_env, shown, mesh_of("8"))
+    figures = []
+    for each in (job, spread):
+        state = each.init(jax.random.PRNGKey(5))
+        for epoch in range(6):
+            state = each.goals.begin_stage(each, state, epoch)
+            if epoch == 5:
+                state = each.goals.rebalance(state, epoch, np.arange(6.0))
+            state, metrics = each.epoch(each.place(state))
+        figures.append((jax.device_get(metrics), jax.device_get(each.policy(state))))
+    assert spread.n_traces == 1
+    for one, many in zip(*map(jax.tree.leaves, figures), strict=True):
+        np.testing.assert_allclose(many, one, rtol=1e-3, atol=1e-4)
+
+
+def test_goals_shift_to_the_positions_that_are_missed_by_most():
+    weight = goal_weights(np.array([1.0, 9.0, 3.0, 0.0]), np.array([True, False, True, True]))
+    np.testing.assert_allclose(weight, [1 / 6 + 1 / 8, 0.0, 1 / 6 + 3 / 8, 1 / 6])
+    even = goal_weights(np.zeros(4), np.array([True, False, True, True]))
+    np.testing.assert_allclose(even, [1 / 3, 0.0, 1 / 3, 1 / 3])
+
+
+def test_rebalanced_goals_are_drawn_by_their_weights(job):
+    state = job.goals.rebalance(job.init(jax.random.PRNGKey(0)), 4, np.array([0.0, 0, 0, 0, 0, 10.0]))
+    arms = jax.vmap(lambda key: job.goals.begin(state.goals, state.arms, key))
+    goals = arms(jax.random.split(jax.random.PRNGKey(5), 500)).pipeline_state.goal.reshape(-1, 6)
+    share = np.mean(indices(job, goals) == 5)
+    assert abs(share - (0.5 / 6 + 0.5)) < 4 * np.sqrt(0.25 / len(goals))
+
+
+def test_each_stages_end_is_evaluated(imitation_config):
+    config = dataclasses.replace(imitation_config, total_env_steps=160, evaluation_epochs=4)  # 10 epochs
+    assert [epoch for epoch in range(1, 11) if config.evaluates_after(epoch)] == [4, 5, 8, 10]
+
+
+def test_config_survives_json(imitation_config):
+    piped = dataclasses.replace(
+        imitation_config, env=dataclasses.replace(imitation_config.env, pipe_diameter_mm=300.0)
+    )
+    assert from_dict(to_dict(piped)) == piped
+
+
+@pytest.mark.parametrize(
+    ("assignment", "message"),
+    [
+        ("stages=[{}]", "settings"),
+        ('stages=[{"share": 0.5, "every": 1, "kept": 1.0}]', "add up to 0.5, expected 1"),
+        ('stages=[{"share": 1.0, "every": 0, "kept": 1.0}]', "every: got 0"),
+        ("expert_share=1.0", "expert_share: got 1.0"),
+        ("learned_weight=0", "expected some reward"),
+        ("learned_weight=-1", "expected numbers >= 0"),
+        ("rebalance_env_steps=-1", "rebalance_env_steps: got -1"),
+        ("env.mode=dynamic", "expected 'quasistatic'"),
+    ],
+)
+def test_a_bad_setting_is_told(imitation_config, assignment, message):
+    with pytest.raises(ConfigError, match=message):
+        override(imitation_config, [assignment])
