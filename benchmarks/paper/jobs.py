@@ -58,9 +58,9 @@ def _record(path: Path, spec: Any, n_poses: int, twin: int) -> None:
 
     arm = Twin(twin, spec, session=S2R_SESSION)
     recording = record(arm, spec, random_pressures(spec, n_poses, seed=twin))
-    if recording.problem:
+    if recording.ending.cause:
         raise JobError(
-            f"{path}: got a recording that ended early ({recording.problem}), expected {n_poses} poses"
+            f"{path}: got a recording that ended early ({recording.ending.cause}), expected {n_poses} poses"
         )
     write_log(path, recording.log)
 

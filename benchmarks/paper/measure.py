@@ -145,7 +145,8 @@ def operate(
     gripper = Gripper(watched, names, finger_tips(goals, gripper_m), objects, gripper_m)
     run = follow(watched, controller, goals, arrived=gripper.arrived)
     force_n = np.zeros((len(run.log), 2))
-    force_n[: len(forces)] = forces  # an arm that is lost takes no more pressures
+    n = min(len(forces), len(force_n))  # a lost arm takes no more pressures; venting is not logged
+    force_n[:n] = forces[:n]
     return measure(run, controller, goals)._replace(
         name=np.array(names),
         success=gripper.success,

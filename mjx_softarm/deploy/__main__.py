@@ -1,13 +1,13 @@
 """Command line: `python -m mjx_softarm.deploy run | record`.
 
-Exit status: 0 done, 2 it could not begin or its log not be written, 3 a fault ended the run or refused a
-goal, 130 Ctrl-C. The log is written in every case but 2.
+However a command ends, the arm is vented and what was logged is written.
 """
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -17,15 +17,17 @@ import tyro
 from mjx_softarm._support import cli
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.arms import open_arm
-from mjx_softarm.deploy.controller import Controller, Phase
-from mjx_softarm.deploy.faults import RESPONSE, Response
+from mjx_softarm.deploy.controller import Controller
+from mjx_softarm.deploy.ending import FAULT, save_log
+from mjx_softarm.deploy.faults import RESPONSE
 from mjx_softarm.deploy.record import record
 from mjx_softarm.deploy.session import Run, follow
-from mjx_softarm.logs.schema import write_log
 from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.policy.file import load_policy
 
-_FAULT = 3
+_STATUS = """Exit status: 0 done, 2 it could not begin or its log not be written, 3 a fault ended it or refused a goal,
+130 Ctrl-C, 143 SIGTERM."""
+_ABOUT = f"A policy on an arm.\n\n{_STATUS}"
 
 
 def _goal(words: list[str]) -> tuple[float, ...]:
@@ -47,7 +49,7 @@ Arm = Annotated[
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit status."""
     commands = {"run": _run, "record": _record}
-    return cli.main("python -m mjx_softarm.deploy", "A policy on an arm.", commands, arguments)
+    return cli.main("python -m mjx_softarm.deploy", _ABOUT, commands, arguments)
 
 
 def _run(
@@ -72,15 +74,12 @@ def _run(
     controller = Controller.of(load_policy(policy))
     _check_file("--log", log)
     limit_s = None if np.isinf(duration) else duration
-    run = follow(open_arm(arm), controller, list(map(np.array, goal)), limit_s, _tell)
-    if log:
-        write_log(log, run.log)
+    save = partial(save_log, log) if log else lambda log: None
+    run = follow(open_arm(arm), controller, list(map(np.array, goal)), limit_s, _tell, save=save)
+    if log and run.ending.status != cli.ERROR:
         print(f"log: {log}, {len(run.log)} rows")
     _summary(run)
-    if run.interrupted:
-        return cli.INTERRUPTED
-    stopped = any(RESPONSE[fault] is not Response.GO_ON for fault in run.counts())
-    return _FAULT if stopped else 0
+    return run.status
 
 
 def _summary(run: Run) -> None:
@@ -90,8 +89,7 @@ def _summary(run: Run) -> None:
         median, high = 1e3 * np.quantile(run.latency_s, (0.5, 0.999))
         n = len(run.latency_s)
         print(f"from readings to pressures: median {median:.2f} ms, 99.9 % {high:.2f} ms of {n} ticks")
-    left = "vented" if run.phase is Phase.DONE else "left at the last pressures"
-    print(f"{len(run.arrivals)} goals done; the arm is {left}")
+    print(f"{len(run.arrivals)} goals done; the arm is {'' if run.ending.vented else 'NOT '}vented")
 
 
 def _record(
@@ -114,20 +112,22 @@ def _record(
         raise InputError(f"--poses: got {poses}, expected at least 1")
     arm_spec = cli.arm_of(spec)
     _check_file("--out", out)
+    if out.exists():
+        raise InputError(f"--out: got {out}, which is there already, expected a new file")
     targets_kpa = random_pressures(arm_spec, poses, seed)
-    result = record(open_arm(arm), arm_spec, targets_kpa, transients, _tell)
+    result = record(open_arm(arm), arm_spec, targets_kpa, transients, _tell, partial(save_log, out))
     if not len(result.log):
-        raise InputError(f"no pose was logged: {result.problem or 'none came to rest'}")
-    write_log(out, result.log)
+        print(f"no pose was logged: {result.ending.cause or 'none came to rest'}", file=sys.stderr)
+        return result.ending.status or FAULT
     unseen = "; the arm has no motion capture, so tip and markers are missing"
     unseen = unseen if result.log.tip_m is None else ""
-    print(f"log: {out}, {len(result.log)} rows, {result.n_poses} poses at rest{unseen}")
+    if result.ending.status != cli.ERROR:
+        print(f"log: {out}, {len(result.log)} rows, {result.n_poses} poses at rest{unseen}")
     if result.n_unsettled:
         print(f"{result.n_unsettled} poses did not come to rest in time")
-    if result.problem:
-        print(f"ended early: {result.problem}", file=sys.stderr)
-        return cli.INTERRUPTED if result.problem == "interrupted" else _FAULT
-    return 0
+    if result.ending.cause:
+        print(f"ended early: {result.ending.cause}", file=sys.stderr)
+    return result.ending.status
 
 
 def _tell(text: str) -> None:

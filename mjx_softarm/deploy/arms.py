@@ -8,18 +8,17 @@ import sys
 from typing import Any
 
 from mjx_softarm._support.errors import InputError
-from mjx_softarm.mechanics.pipe import PIPES_MM, CrossPipe
-from mjx_softarm.spec import SpecError
 
+_TWIN = "mjx_softarm.twin.arm"  # imported by name and where it is asked for alone: it needs MuJoCo
 _METHODS = ("read_sensors", "write_pressures")
 
 
 class ArmError(InputError):
-    """No arm of this name can be had; the message says why."""
+    """A name of which no arm can be had; the message says why."""
 
 
 def open_arm(name: str) -> Any:
-    """An arm: `ArmIO`, maybe with `pressures`, `motion_capture` or a clock of its own, `time_s`.
+    """Open an arm: an `ArmIO`, maybe with `pressures`, `motion_capture` or a clock of its own, `time_s`.
 
     Args:
         name: `twin:SEED`, or in a pipe `twin:SEED:pipe300` or `twin:SEED:pipe250`; or `package.module:Class`,
@@ -53,16 +52,9 @@ def open_arm(name: str) -> Any:
 
 
 def _twin(item: str) -> Any:
-    seed, colon, pipe = item.partition(":")
-    if not seed.isdecimal():
-        raise ArmError(f"--arm: twin:SEED, got {seed!r}, expected an integer >= 0")
-    if colon and pipe not in PIPES_MM:
-        raise ArmError(f"--arm: twin:{seed}:PIPE, got {pipe!r}, expected {' or '.join(PIPES_MM)}")
     try:
-        from mjx_softarm.twin.arm import Twin
+        return importlib.import_module(_TWIN).twin_of(item)
     except ImportError as error:
         raise ArmError(f"--arm: the twin needs MuJoCo (pip install 'mjx-softarm[sim]'): {error}") from error
-    try:
-        return Twin(int(seed), pipe=CrossPipe.of_mm(PIPES_MM[pipe]) if pipe else None)
-    except SpecError as error:
-        raise ArmError(f"--arm: twin:{item}: {error}") from error
+    except ValueError as error:
+        raise ArmError(f"--arm: {error}") from error

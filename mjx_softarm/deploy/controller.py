@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
 
-from mjx_softarm.deploy.faults import Event
+from mjx_softarm.deploy.faults import Event, Response
 from mjx_softarm.deploy.reachability import Reachable
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.policy.runtime import PolicyRunner
@@ -17,15 +16,6 @@ from mjx_softarm.policy.runtime import PolicyRunner
 WINDOW_S = 0.5
 
 Plan = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
-
-
-class Phase(Enum):
-    """What the loop is doing; it ends with HOLD and DONE."""
-
-    RUN = "run"
-    VENT = "vent"
-    HOLD = "hold"
-    DONE = "done"
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +30,7 @@ class Controller:
 
     @classmethod
     def of(cls, policy: Policy, plan: Plan | None = None) -> Controller:
-        """Of a policy; `plan` takes the place of its actor, for another way to find references."""
+        """Make a policy ready; `plan` replaces its actor, for another way to find references."""
         runner = PolicyRunner(policy)
         return cls(
             policy=policy,
@@ -52,9 +42,8 @@ class Controller:
 
 
 class State(NamedTuple):
-    """All that the loop remembers from tick to tick, of n springs and chambers."""
+    """Memory of the loop from tick to tick, for n springs and chambers."""
 
-    phase: Phase
     goal: np.ndarray | None  # (6,) [mm, deg]
     n_actions: int  # for this goal
     n_ticks: int  # since the last action
@@ -63,25 +52,29 @@ class State(NamedTuple):
     n_lost: np.ndarray  # (n,) lost readings in a row
     n_suspect: np.ndarray  # (n,) ticks in a row in which a chamber seemed to have lost its pressure
     reference_m: np.ndarray | None  # (n,)
-    integral_kpa: np.ndarray  # (n,) of the law
+    integral_kpa: np.ndarray  # (n,) integral part of the sensor-space law
     pressure_kpa: np.ndarray  # (n,) in force
     springs_m: np.ndarray  # (ticks, n) readings of the last window, the newest last
     pressures_kpa: np.ndarray  # (ticks, n) in force at these
 
 
 class Tick(NamedTuple):
-    """What a tick gives besides the next state."""
+    """Results of a tick besides the next state."""
 
     spring_m: np.ndarray  # (n,) lengths believed in; NaN before the first reading
     events: tuple[Event, ...]
     arrived: bool  # the goal had all its actions and the springs have settled
 
+    @property
+    def stop(self) -> Event | None:
+        """First event that ends the run, if there is one."""
+        return next((event for event in self.events if event.response is Response.VENT), None)
+
 
 def start(controller: Controller) -> State:
-    """The state before the first tick, of an arm without pressure."""
+    """Return the state before the first tick, of an arm without pressure."""
     n = controller.policy.spec.n_chambers
     return State(
-        phase=Phase.RUN,
         goal=None,
         n_actions=0,
         n_ticks=0,

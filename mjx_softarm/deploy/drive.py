@@ -1,4 +1,4 @@
-"""Drives an arm by any law, tick by tick, until its springs are at rest. NumPy only: for real arms, too.
+"""Drive an arm by any law, tick by tick, until its springs are at rest. NumPy only: for real arms, too.
 
 A law takes spring lengths to the pressures to write next. Here are a ramp of the pressures themselves, and
 the sensor-space law on references that move there along a ramp, all in step, so that the arm bends from one
@@ -16,8 +16,7 @@ from mjx_softarm.control import Gains, pressures
 from mjx_softarm.deploy.arm_io import ArmIO
 from mjx_softarm.deploy.controller import WINDOW_S
 from mjx_softarm.deploy.faults import LOST_TICKS, SETTLE_TIMEOUT_S, still
-from mjx_softarm.deploy.loop import VENT_KPA_PER_S
-from mjx_softarm.deploy.session import ArmLost, Clock, Pumps, Recorder, read
+from mjx_softarm.deploy.link import VENT_KPA_PER_S, ArmFault, Link
 from mjx_softarm.sensing.sensors import Sensor, SensorFault
 from mjx_softarm.spec import ArmSpec
 
@@ -31,12 +30,8 @@ HELD_M, MEAN_S = 1e-4, 0.2
 Law = Callable[[np.ndarray | None, np.ndarray], tuple[np.ndarray, bool]]
 
 
-class DriveError(Exception):
-    """The arm cannot be driven on; the message says why."""
-
-
 def ramp(target_kpa: np.ndarray, dt_s: float) -> Law:
-    """Pressures (n,) [kPa], reached along a ramp that is safe for the arm."""
+    """Return the law that reaches pressures (n,) [kPa] along a ramp that is safe for the arm."""
     step_kpa = VENT_KPA_PER_S * dt_s
 
     def law(_spring_m: np.ndarray | None, in_force_kpa: np.ndarray) -> tuple[np.ndarray, bool]:
@@ -47,7 +42,7 @@ def ramp(target_kpa: np.ndarray, dt_s: float) -> Law:
 
 
 class Hold:
-    """The sensor-space law, from the springs as they are first read to references (n,) [m]."""
+    """Sensor-space law, from the springs as they are first read to references (n,) [m]."""
 
     def __init__(self, gains: Gains, reference_m: np.ndarray, dt_s: float):
         self._gains, self._goal_m, self._dt_s = gains, np.asarray(reference_m, float), dt_s
@@ -72,7 +67,7 @@ class Hold:
 
 
 class Drive:
-    """An arm, without pressure at first, as its driver gives it.
+    """Drive of one arm, which is without pressure at first, as its driver gives it.
 
     Args:
         arm: sensors and pumps.
@@ -81,54 +76,44 @@ class Drive:
     """
 
     def __init__(self, arm: ArmIO, spec: ArmSpec, on_tick: Callable[[dict], None] = lambda row: None):
-        self.arm, self.on_tick = arm, on_tick
+        self.on_tick = on_tick
         self.sensor, self.gains = Sensor.from_spec(spec), Gains.from_spec(spec)
         self.dt_s = 1.0 / spec.control.rate_hz
         self.window = max(2, round(WINDOW_S * spec.control.rate_hz))
-        self.clock, self.looks = Clock(arm), Recorder(arm)
-        self.pumps = Pumps(arm, spec.n_chambers)
+        self.link = Link(arm, spec.n_chambers, self.dt_s)
         self.n_lost = 0
 
     def to_rest(self, law: Law) -> dict | None:
         """Drive until the springs are at rest where the law wants them.
 
+        Where the arm has motion capture, it is given another window to see the arm at rest.
+
         Returns:
             What there is to log of the last tick; None if that took more than `SETTLE_TIMEOUT_S`.
 
         Raises:
-            ArmLost: the arm cannot be reached.
-            DriveError: too many readings were lost in a row.
+            ArmFault: the arm cannot be reached, or too many readings were lost in a row.
         """
-        springs_m = np.empty((0, len(self.pumps.pressure_kpa)))
+        n_unseen = 0
+        springs_m = np.empty((0, len(self.link.pressure_kpa)))
         for _ in range(round(SETTLE_TIMEOUT_S / self.dt_s)):
             row, spring_m, arrived = self._tick(law)
-            self.on_tick(row)
             if spring_m is None or not arrived:
                 springs_m = springs_m[:0]
                 continue
             springs_m = np.vstack([springs_m, spring_m])[-self.window :]
             if len(springs_m) == self.window and still(springs_m):
-                return row
+                n_unseen += 1
+                if not self.link.sees or "tip_m" in row or n_unseen > self.window:
+                    return row
         return None
 
-    def vent(self) -> None:
-        """Ramp to zero.
-
-        Raises:
-            ArmLost: the pumps cannot be reached.
-        """
-        law = ramp(np.zeros_like(self.pumps.pressure_kpa), self.dt_s)
-        while self.pumps.pressure_kpa.any():
-            begin_s = self.clock.now()
-            self.pumps.write(law(None, self.pumps.pressure_kpa)[0])
-            self.clock.wait_until(begin_s + self.dt_s)
-
     def _tick(self, law: Law) -> tuple[dict, np.ndarray | None, bool]:
-        """One row, the spring lengths (n,) if none was lost, and whether the law has arrived."""
-        begin_s = self.clock.now()
-        n = len(self.pumps.pressure_kpa)
-        readings = read(self.arm, n)
-        row = self.looks.look(begin_s, self.pumps.pressure_kpa)
+        """Return the row, the spring lengths (n,) if none was lost, and whether the law has arrived."""
+        begin_s = self.link.now()
+        n = len(self.link.pressure_kpa)
+        readings = self.link.read()
+        row = self.link.look(begin_s)
         text = "no readings within the tick"
         spring_m, lost = np.full(n, np.nan), True
         if readings is not None:
@@ -137,30 +122,13 @@ class Drive:
             text = self.sensor.describe_faults(readings, reading.fault).replace("\n", "; ")
         row["readings"] = spring_m * np.nan if readings is None else readings
         self.n_lost = self.n_lost + 1 if lost else 0
-        if self.n_lost >= LOST_TICKS:
-            raise DriveError(f"readings lost in {self.n_lost} ticks in a row: {text}")
         known_m = None if lost else spring_m
-        pressure_kpa, arrived = law(known_m, self.pumps.pressure_kpa)
-        self.pumps.write(pressure_kpa)
-        self.clock.wait_until(begin_s + self.dt_s)
+        try:
+            if self.n_lost >= LOST_TICKS:
+                raise ArmFault(f"readings lost in {self.n_lost} ticks in a row: {text}")
+            pressure_kpa, arrived = law(known_m, self.link.pressure_kpa)
+            self.link.write(pressure_kpa)
+        finally:
+            self.on_tick(row)
+        self.link.wait_until(begin_s + self.dt_s)
         return row, known_m, arrived
-
-
-def drive_to_end(drive: Drive, run: Callable[[], None]) -> str:
-    """Run, then vent, also where an error of the arm or Ctrl-C ends it; a second Ctrl-C ends at once.
-
-    Returns:
-        Why it ended early, or "".
-    """
-    problem = ""
-    try:
-        run()
-    except KeyboardInterrupt:
-        problem = "interrupted"
-    except (DriveError, ArmLost) as error:
-        problem = str(error)
-    try:
-        drive.vent()
-    except (ArmLost, KeyboardInterrupt) as error:
-        problem = f"{problem}; not vented: {str(error) or 'interrupted'}".removeprefix("; ")
-    return problem

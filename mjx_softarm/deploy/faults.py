@@ -1,26 +1,25 @@
-"""What can go wrong on an arm, how it is told, and what the control loop then does.
+"""Faults of an arm: how each is detected, and the control loop's response.
 
     fault              detected by                                                      response
     LOST_READING       a spring without a length this tick, or no readings in time      go on with the last
-    SENSOR_LOST        a spring lost in LOST_TICKS ticks in a row                       hold
-    SENSOR_STUCK       a spring that stands still, without its noise even, while its    hold
+    SENSOR_LOST        a spring lost in LOST_TICKS ticks in a row                       vent
+    SENSOR_STUCK       a spring that stands still, without its noise even, while its    vent
                        chamber is driven or a spring of its section moves
     CHAMBER_LOST       a chamber at its limit, its spring off the reference, and the    vent
                        arm at rest in the shape of an arm without that pressure
     GOAL_OUTSIDE       a goal further from all reachable poses than they are from       skip the goal
                        each other, or not finite
     MISSED_DEADLINE    a tick longer than the period, or pressures not taken in time    go on
-    ARM_LATE           LATE_TICKS of these in a row                                     hold
-    ARM_LOST           the driver cannot reach sensors or pumps, or refuses pressures   hold
+    ARM_LATE           LATE_TICKS of these in a row                                     vent
+    ARM_LOST           the driver cannot reach sensors or pumps, or refuses pressures   vent
     NOT_SETTLED        springs neither on their references nor at rest at a limit       go on and act
                        within SETTLE_TIMEOUT_S
     SATURATED          a chamber at its limit with its spring off the reference         go on
     EXTRAPOLATION      the sim-to-real network asked far from its training rows         go on
 
-To hold is to end with the last pressures, which the pumps keep: the arm stays where it is, with what it
-carries. It is the answer where the arm's shape is no longer known. To vent is to bring all pressures to
-zero along a ramp: the answer where a chamber no longer does what it is told. The same happens at the end of
-a run and at Ctrl-C. Every fault is counted; `Event.message` says what was seen and what was expected.
+To vent is to end the run and bring all pressures to zero along a ramp, as at every end of a run
+(`mjx_softarm.deploy.ending`). Every fault is counted; `Event.message` says what was seen and what was
+expected.
 """
 
 from __future__ import annotations
@@ -52,16 +51,15 @@ LOST_EFFECT_M = 0.01  # on the chamber's own spring: less cannot be told from to
 
 
 class Response(Enum):
-    """What the control loop does about a fault."""
+    """Response of the control loop to a fault."""
 
     GO_ON = "go on"
     SKIP = "skip the goal"
-    HOLD = "hold"
     VENT = "vent"
 
 
 class Fault(Enum):
-    """What went wrong; the module's docstring is the table."""
+    """Kinds of faults; the table stands in the module's docstring."""
 
     LOST_READING = "lost reading"
     SENSOR_LOST = "sensor lost"
@@ -79,13 +77,13 @@ class Fault(Enum):
 RESPONSE: Mapping[Fault, Response] = MappingProxyType(
     {
         Fault.LOST_READING: Response.GO_ON,
-        Fault.SENSOR_LOST: Response.HOLD,
-        Fault.SENSOR_STUCK: Response.HOLD,
+        Fault.SENSOR_LOST: Response.VENT,
+        Fault.SENSOR_STUCK: Response.VENT,
         Fault.CHAMBER_LOST: Response.VENT,
         Fault.GOAL_OUTSIDE: Response.SKIP,
         Fault.MISSED_DEADLINE: Response.GO_ON,
-        Fault.ARM_LATE: Response.HOLD,
-        Fault.ARM_LOST: Response.HOLD,
+        Fault.ARM_LATE: Response.VENT,
+        Fault.ARM_LOST: Response.VENT,
         Fault.NOT_SETTLED: Response.GO_ON,
         Fault.SATURATED: Response.GO_ON,
         Fault.EXTRAPOLATION: Response.GO_ON,
@@ -108,13 +106,13 @@ class Event(NamedTuple):
 
 
 def still(spring_m: np.ndarray) -> bool:
-    """Whether springs came to rest over a window (ticks, n) [m]: both of its halves have the same mean."""
+    """Return whether springs came to rest over a window (ticks, n) [m]: its halves have the same mean."""
     half = len(spring_m) // 2
     return bool(np.all(np.abs(spring_m[-half:].mean(axis=0) - spring_m[:half].mean(axis=0)) < STILL_M))
 
 
 def stuck_springs(spring_m: np.ndarray, pressure_kpa: np.ndarray) -> np.ndarray:
-    """Which springs (n,) stand stock-still where they should not: bool.
+    """Return which springs (n,) stand stock-still where they should not.
 
     Args:
         spring_m (ticks, n) [m]: readings of the last ticks.
@@ -138,7 +136,7 @@ def lost_chambers(
     spring_m: np.ndarray,
     tolerance_m: float,
 ) -> np.ndarray:
-    """Which chambers (n,) have lost their pressure, of an arm at rest: bool.
+    """Return which chambers (n,) of an arm at rest have lost their pressure.
 
     A chamber at its limit with its spring off the reference is saturated, or it no longer holds pressure.
     Then the arm has the shape that it would have without that pressure: the springs' deviations from the

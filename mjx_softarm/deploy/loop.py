@@ -18,7 +18,7 @@ import numpy as np
 
 from mjx_softarm.control import pressures, saturated
 from mjx_softarm.deploy import faults
-from mjx_softarm.deploy.controller import Controller, Phase, State, Tick
+from mjx_softarm.deploy.controller import Controller, State, Tick
 from mjx_softarm.deploy.faults import Event, Fault, Response
 from mjx_softarm.deploy.reachability import nearest
 from mjx_softarm.sensing.estimator import estimate_frame
@@ -26,12 +26,11 @@ from mjx_softarm.sensing.pose import pose_from_frame
 from mjx_softarm.sensing.s2r import apply_correction, correction, distance, inputs
 from mjx_softarm.sensing.sensors import SensorFault
 
-VENT_KPA_PER_S = 20.0
 _CHAMBER_WINDOWS = 2  # for so many a lost chamber must show without a break
 
 
 def with_goal(controller: Controller, state: State, goal: np.ndarray) -> tuple[State, tuple[Event, ...]]:
-    """The state that goes for a goal (6,) [mm, deg]; unchanged, with an event, if the goal is refused."""
+    """Return the state with a goal (6,) [mm, deg]; unchanged, with an event, if the goal is refused."""
     goal = np.asarray(goal, float)
     text = ", ".join(f"{value:g}" for value in goal)
     if goal.shape != (6,) or not np.isfinite(goal).all():
@@ -48,7 +47,7 @@ def with_goal(controller: Controller, state: State, goal: np.ndarray) -> tuple[S
 
 
 def step(controller: Controller, state: State, readings: np.ndarray | None, late: bool) -> tuple[State, Tick]:
-    """One tick.
+    """Take one tick.
 
     Args:
         controller: the policy.
@@ -57,14 +56,12 @@ def step(controller: Controller, state: State, readings: np.ndarray | None, late
         late: the last tick missed its deadline.
 
     Returns:
-        The next state, whose pressures are to be written unless its phase is HOLD, and the tick.
+        The next state, whose pressures are to be written unless the tick says stop, and the tick.
     """
     events = list(_deadline(controller, late, state.n_late + 1))
     state = state._replace(n_late=state.n_late + 1 if late else 0)
     state, found = _sense(controller, state, readings)
     events += found
-    if state.phase is Phase.VENT:
-        return _vent(controller, state), Tick(state.spring_m, tuple(events), False)
 
     arrived = False
     known, at_rest = not np.isnan(state.spring_m).any(), _at_rest(controller, state)
@@ -74,12 +71,7 @@ def step(controller: Controller, state: State, readings: np.ndarray | None, late
     if known and not _stops(events) and state.goal is not None and not state.n_lost.any():
         state, found, arrived = _go(controller, state, at_rest)
         events += found
-    responses = [event.response for event in events]
-    if Response.VENT in responses:
-        state = _vent(controller, state._replace(phase=Phase.VENT))
-    elif Response.HOLD in responses:
-        state = state._replace(phase=Phase.HOLD)
-    elif state.reference_m is not None:
+    if not _stops(events) and state.reference_m is not None:
         pressure_kpa, integral_kpa = pressures(
             state.reference_m, state.spring_m, state.integral_kpa, controller.policy.gains, controller.dt_s
         )
@@ -90,7 +82,7 @@ def step(controller: Controller, state: State, readings: np.ndarray | None, late
 
 
 def believed(controller: Controller, spring_m: np.ndarray) -> tuple[np.ndarray, float]:
-    """Where springs (n,) [m] say that the tip is.
+    """Return the tip pose that springs (n,) [m] tell.
 
     Returns:
         Pose (6,) [mm, deg], NaN where a length is; `s2r.extrapolation` of it, 0 without a network.
@@ -107,7 +99,7 @@ def believed(controller: Controller, spring_m: np.ndarray) -> tuple[np.ndarray, 
 
 
 def _stops(events: list[Event]) -> bool:
-    return any(event.response in (Response.HOLD, Response.VENT) for event in events)
+    return any(event.response is Response.VENT for event in events)
 
 
 def _deadline(controller: Controller, late: bool, n_late: int) -> tuple[Event, ...]:
@@ -121,7 +113,7 @@ def _deadline(controller: Controller, late: bool, n_late: int) -> tuple[Event, .
 
 
 def _sense(controller: Controller, state: State, readings: np.ndarray | None) -> tuple[State, list[Event]]:
-    """Spring lengths, the last good one where there is none; faults of the sensors."""
+    """Return the state with new spring lengths, the last good one where there is none, and sensor faults."""
     sensor = controller.policy.sensor
     if readings is None:
         lost, spring_m, events = np.ones(len(state.spring_m), bool), state.spring_m, []
@@ -140,8 +132,6 @@ def _sense(controller: Controller, state: State, readings: np.ndarray | None) ->
         springs_m=np.concat([state.springs_m[1 - window :], spring_m[None]]),
         pressures_kpa=np.concat([state.pressures_kpa[1 - window :], state.pressure_kpa[None]]),
     )
-    if state.phase is not Phase.RUN:
-        return state, events
     gone = state.n_lost >= faults.LOST_TICKS
     if gone.any():
         message = f"{_names('spring', gone)}: no length in {faults.LOST_TICKS} ticks in a row"
@@ -159,7 +149,7 @@ def _sense(controller: Controller, state: State, readings: np.ndarray | None) ->
 
 
 def _at_rest(controller: Controller, state: State) -> bool:
-    """Whether nothing has moved for a window; one after the last action, at the earliest."""
+    """Return whether nothing has moved for a window; one after the last action, at the earliest."""
     full = len(state.springs_m) == controller.window and state.n_ticks >= controller.window
     return full and faults.still(state.springs_m)
 
@@ -208,7 +198,7 @@ def _go(controller: Controller, state: State, at_rest: bool) -> tuple[State, lis
 
 
 def _on_reference(controller: Controller, state: State) -> bool:
-    """Whether each spring is on its reference, in the window's mean, or its chamber at a limit."""
+    """Return whether each spring is on its reference, in the window's mean, or its chamber at a limit."""
     gains = controller.policy.gains
     off_m = np.abs(state.springs_m.mean(axis=0) - state.reference_m)
     kpa = state.pressure_kpa
@@ -217,7 +207,7 @@ def _on_reference(controller: Controller, state: State) -> bool:
 
 
 def _unsettled(controller: Controller, state: State, settled: bool) -> list[Event]:
-    """Events of the springs as they stand before the next action."""
+    """Return the faults of the springs as they stand before the next action."""
     off_m = state.springs_m.mean(axis=0) - state.reference_m
     mask = saturated(
         state.pressure_kpa,
@@ -237,14 +227,6 @@ def _unsettled(controller: Controller, state: State, settled: bool) -> list[Even
         message = f"{_names('chamber', mask)}: at the limit, spring {off} mm off its reference"
         events.append(Event(Fault.SATURATED, message))
     return events
-
-
-def _vent(controller: Controller, state: State) -> State:
-    """One step of the ramp to zero."""
-    rate = VENT_KPA_PER_S * controller.dt_s
-    pressure_kpa = state.pressure_kpa - np.clip(state.pressure_kpa, -rate, rate)
-    phase = Phase.VENT if pressure_kpa.any() else Phase.DONE
-    return state._replace(phase=phase, pressure_kpa=pressure_kpa, goal=None)
 
 
 def _names(kind: str, mask: np.ndarray) -> str:

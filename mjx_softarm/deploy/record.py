@@ -7,25 +7,29 @@ are the control loop's without references, goals and estimates.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
 from mjx_softarm.deploy.arm_io import ArmIO
-from mjx_softarm.deploy.drive import Drive, drive_to_end, ramp
-from mjx_softarm.deploy.session import Recorder
+from mjx_softarm.deploy.drive import Drive, ramp
+from mjx_softarm.deploy.ending import Ending, vent_at_end
+from mjx_softarm.deploy.link import Recorder
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.spec import ArmSpec
 
+PROGRESS_S = 10.0  # between lines of progress
+
 
 class Recording(NamedTuple):
-    """What was logged."""
+    """Results of a recording."""
 
     log: Log
     n_poses: int  # that came to rest
     n_unsettled: int  # that did not within SETTLE_TIMEOUT_S; not logged, transients apart
-    problem: str  # why it ended early, or ""
+    ending: Ending
 
 
 def record(
@@ -34,27 +38,37 @@ def record(
     targets_kpa: np.ndarray,
     transients: bool = False,
     tell: Callable[[str], None] = lambda text: None,
+    save: Callable[[Log], None] = lambda log: None,
 ) -> Recording:
-    """Drive an arm through pressures, log it, and vent; Ctrl-C vents and keeps the log.
+    """Drive an arm through pressures, log it, and vent; `vent_at_end` says what else ends a recording.
 
     Args:
         arm: without pressure, as its driver gives it.
         spec: the arm, for its rate, its limits and the range of its sensors.
         targets_kpa (m, n) [kPa]: one set of pressures after the other.
-        transients: log every tick instead of the poses at rest.
-        tell: takes a line now and then.
+        transients: log every tick instead of the static poses.
+        tell: takes a line of progress now and then.
+        save: writes the log, if it has rows, once the arm is vented.
     """
-    rows, rest = Recorder(arm), []
+    rows, rest = Recorder(), []
     drive = Drive(arm, spec, rows.add if transients else lambda row: None)
+    began_s = told_s = time.monotonic()
 
     def run() -> None:
-        for k, target_kpa in enumerate(targets_kpa):
+        nonlocal told_s
+        for k, target_kpa in enumerate(targets_kpa, 1):
             row = drive.to_rest(ramp(target_kpa, drive.dt_s))
             rest.append(row is not None)
             if row is not None and not transients:
                 rows.add(row)
-            if (k + 1) % max(1, len(targets_kpa) // 10) == 0:
-                tell(f"{k + 1} of {len(targets_kpa)} poses")
+            now_s = time.monotonic()
+            if now_s - told_s >= PROGRESS_S or k == len(targets_kpa):
+                left_min = (now_s - began_s) / k * (len(targets_kpa) - k) / 60
+                tell(f"{k} of {len(targets_kpa)} poses, about {left_min:.1f} min left")
+                told_s = now_s
 
-    problem = drive_to_end(drive, run)
-    return Recording(rows.log("record", spec.sensor), sum(rest), len(rest) - sum(rest), problem)
+    def log() -> Log:
+        return rows.log("record", drive.sensor)
+
+    ending = vent_at_end(run, drive.link, tell, lambda: save(log()) if len(rows) else None)
+    return Recording(log(), sum(rest), len(rest) - sum(rest), ending)

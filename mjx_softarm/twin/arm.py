@@ -19,7 +19,7 @@ import numpy as np
 from mjx_softarm.deploy.arm_io import Capture
 from mjx_softarm.mechanics.body import payload_radius_m
 from mjx_softarm.mechanics.mjcf import chamber_lengths, spring_lengths
-from mjx_softarm.mechanics.pipe import CrossPipe
+from mjx_softarm.mechanics.pipe import PIPES_MM, CrossPipe
 from mjx_softarm.spec import ArmSpec
 from mjx_softarm.twin.hysteresis import StopOperators
 from mjx_softarm.twin.model import (
@@ -257,3 +257,17 @@ class Twin:
 
     def _draw(self, deviation: float, *shape: int) -> np.ndarray:
         return self._build.noise * deviation * self._noise.standard_normal(shape)
+
+
+def twin_of(name: str) -> Twin:
+    """Make the twin of a name, `SEED` or `SEED:PIPE`.
+
+    Raises:
+        ValueError: the name is malformed, or the arm of this seed does not fit into the pipe.
+    """
+    seed, colon, pipe = name.partition(":")
+    if not seed.isdecimal():
+        raise ValueError(f"twin:SEED: got {seed!r}, expected an integer >= 0")
+    if colon and pipe not in PIPES_MM:
+        raise ValueError(f"twin:{seed}:PIPE: got {pipe!r}, expected {' or '.join(PIPES_MM)}")
+    return Twin(int(seed), pipe=CrossPipe.of_mm(PIPES_MM[pipe]) if pipe else None)

@@ -22,7 +22,7 @@ ROOT = Path(__file__).resolve().parents[2]
         ("twin:-1", "got '-1', expected an integer >= 0"),
         ("no_such_module:Arm", "no_such_module cannot be imported: No module named 'no_such_module'"),
         ("mjx_softarm.deploy.loop:Nothing", "module mjx_softarm.deploy.loop has no 'Nothing'"),
-        ("mjx_softarm.deploy.loop:Phase", "has no method read_sensors or write_pressures"),
+        ("mjx_softarm.deploy.session:Run", "has no method read_sensors or write_pressures"),
     ],
 )
 def test_arm_that_cannot_be_had(name, message):
@@ -79,6 +79,9 @@ def test_command_line_runs_without_jax(folder):
     assert len(read_log(folder / "a.csv")[0]) > 0
     done = command(folder, "record", "--arm", "driver:Arm", "--out", "b.csv", "--poses", "2")
     assert done.stderr == "" and done.stdout.endswith("0 []\n") and "no motion capture" in done.stdout
+    assert (folder / "b.csv").read_text().count("\n") == 3
+    done = command(folder, "record", "--arm", "driver:Arm", "--out", "b.csv", "--poses", "3")
+    assert done.stdout.startswith("2 ") and done.stderr.count("\n") == 1 and "--out: got b.csv" in done.stderr
     assert (folder / "b.csv").read_text().count("\n") == 3
 
 

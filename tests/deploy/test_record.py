@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from calib.read.logs import read_log
-from mjx_softarm.deploy.loop import VENT_KPA_PER_S
+from mjx_softarm.deploy.ending import Ending
+from mjx_softarm.deploy.link import VENT_KPA_PER_S
 from mjx_softarm.deploy.record import record
 from mjx_softarm.logs.schema import write_log
 from mjx_softarm.mechanics.excitation import random_pressures
@@ -32,9 +33,10 @@ def test_random_pressures_follow_the_arcsine_law():
 
 
 def test_recorded_poses_are_at_rest(tmp_path):
-    arm, targets_kpa = LinearArm(), random_pressures(SPEC, 5, 3)
-    result = record(arm, SPEC, targets_kpa)
-    assert (result.n_poses, result.n_unsettled, result.problem) == (5, 0, "")
+    arm, targets_kpa, lines = LinearArm(), random_pressures(SPEC, 5, 3), []
+    result = record(arm, SPEC, targets_kpa, tell=lines.append)
+    assert lines == ["5 of 5 poses, about 0.0 min left"]
+    assert (result.n_poses, result.n_unsettled, result.ending) == (5, 0, Ending())
     np.testing.assert_array_equal(result.log.pressure_kpa, targets_kpa)
     np.testing.assert_allclose(read_m(result.log), REST_M + targets_kpa @ GAIN_M_PER_KPA.T, atol=5e-4)
     np.testing.assert_array_equal(arm.command_kpa, 0.0)
@@ -54,6 +56,9 @@ def test_recorded_transients_are_whole():
 def test_recording_stops_and_vents_when_readings_are_lost():
     arm = Blind(range(150, 10**6), nan)
     result = record(arm, SPEC, random_pressures(SPEC, 50, 3))
-    assert "readings lost in 3 ticks in a row: spring4: read nan Hz" in result.problem
+    assert (
+        "readings lost in 3 ticks in a row: spring4: read nan Hz" in result.ending.cause
+        and result.ending.status == 3
+    )
     assert 0 < result.n_poses == len(result.log) < 50
     np.testing.assert_array_equal(arm.command_kpa, 0.0)

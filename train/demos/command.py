@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -11,9 +12,9 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from mjx_softarm._support import cli
 from mjx_softarm.deploy import arms
-from mjx_softarm.logs.schema import Log, write_log
+from mjx_softarm.deploy.ending import DONE, FAULT, NOT_WRITTEN, save_log
+from mjx_softarm.logs.schema import Log
 from mjx_softarm.spec import ArmSpec
 from train.config import ConfigError
 from train.demos.demonstrations import from_log, read_demonstrations
@@ -21,8 +22,6 @@ from train.demos.expert import Expert
 from train.demos.teleop import KEYS, Teleoperation, read_keys
 from train.demos.waypoints import TASKS, task
 from train.options import ArmOptions, start
-
-_STOPPED = 3  # exit status
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,21 +50,19 @@ class Record(ArmOptions):
         waypoints, pipe = task(self.task, spec) if self.task else ((), None)
         expert = Expert(spec, s2r, pipe)
         plan = None if self.keyboard else expert.plan(waypoints)  # before the arm moves
-        teleop = Teleoperation(arm, expert, lambda text: _tell(console, text))
+        teleop = Teleoperation(arm, expert, lambda text: _tell(console, text), partial(save_log, self.out))
         if plan is None:
             _tell(console, KEYS)
             result = teleop.steer(read_keys(sys.stdin))
         else:
             result = teleop.record(waypoints, plan)
-        if len(result.log):
-            write_log(self.out, result.log)
+        if len(result.log) and result.ending.status != NOT_WRITTEN:
             _tell(console, f"demonstrations: {self.out}, {len(result.log)} poses")
             if np.isfinite(result.off_m).any():
                 _tell(console, f"furthest from its waypoint: {1e3 * np.nanmax(result.off_m):.1f} mm")
-        if result.problem:
-            _tell(console, f"ended early: {result.problem}")
-            return cli.INTERRUPTED if result.problem == "interrupted" else _STOPPED
-        return 0 if len(result.log) else _STOPPED
+        if result.ending.cause:
+            _tell(console, f"ended early: {result.ending.cause}")
+        return result.ending.status or (DONE if len(result.log) else FAULT)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,9 +15,10 @@ from typing import Any, NamedTuple, TextIO
 import jax
 import numpy as np
 
-from mjx_softarm.deploy.drive import Drive, DriveError, Hold, drive_to_end
+from mjx_softarm.deploy.drive import Drive, Hold
+from mjx_softarm.deploy.ending import Ending, vent_at_end
 from mjx_softarm.deploy.faults import SETTLE_TIMEOUT_S
-from mjx_softarm.deploy.session import Recorder
+from mjx_softarm.deploy.link import ArmFault, Recorder
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.sensing.pose import quaternion_from_pose, rotation_from_quaternion
 from train.demos.expert import Expert, ExpertError, Posture
@@ -37,7 +38,7 @@ class Recording(NamedTuple):
 
     log: Log
     off_m: np.ndarray  # (n,) of the finger tips from each waypoint, as seen; NaN where nobody saw
-    problem: str  # why it ended early, or ""
+    ending: Ending
 
 
 class Teleoperation:
@@ -47,18 +48,25 @@ class Teleoperation:
         arm: an `ArmIO`, maybe with motion capture.
         expert: of the arm.
         tell: takes a line for each position.
+        save: writes the log, if it has rows, once the arm is vented.
     """
 
-    def __init__(self, arm: Any, expert: Expert, tell: Callable[[str], None] = lambda text: None):
-        self.expert, self.tell = expert, tell
+    def __init__(
+        self,
+        arm: Any,
+        expert: Expert,
+        tell: Callable[[str], None] = lambda text: None,
+        save: Callable[[Log], None] = lambda log: None,
+    ):
+        self.expert, self.tell, self._save = expert, tell, save
         self._sees = hasattr(arm, "motion_capture")
         self._drive = Drive(arm, expert.spec, self._look)
-        self._rows, self._off_m, self._last = Recorder(arm), [], {}
+        self._rows, self._off_m, self._last = Recorder(), [], {}
         start = expert.look(np.zeros((1, expert.spec.n_chambers)))
         self._now: Posture = jax.tree.map(lambda x: x[0], start)
 
     def record(self, waypoints: Sequence[Waypoint], plan: Posture, sequence: int = 0) -> Recording:
-        """Bring the finger tips to waypoints, log each, and vent; Ctrl-C vents and keeps the log.
+        """Bring the finger tips to waypoints, log each, and vent; `vent_at_end` says what else ends it.
 
         Args:
             waypoints: one after the other.
@@ -70,7 +78,7 @@ class Teleoperation:
             for k, waypoint in enumerate(waypoints):
                 row, off_m = self._reach(waypoint, jax.tree.map(lambda x, k=k: x[k], plan))
                 self._add(row, sequence, off_m)
-                seen = f"{1e3 * off_m:.1f} mm off" if self._sees else "not seen"
+                seen = f"{1e3 * off_m:.1f} mm off" if np.isfinite(off_m) else "not seen"
                 self.tell(f"{len(self._rows)} of {len(waypoints)}: {waypoint.name}: {seen}")
 
         return self._end(run)
@@ -102,8 +110,13 @@ class Teleoperation:
         return self._end(run)
 
     def _end(self, run: Callable[[], None]) -> Recording:
-        problem = drive_to_end(self._drive, run)
-        return Recording(self._rows.log("demonstrations", self._drive.sensor), np.array(self._off_m), problem)
+        ending = vent_at_end(
+            run, self._drive.link, self.tell, lambda: self._save(self._log()) if self._rows else None
+        )
+        return Recording(self._log(), np.array(self._off_m), ending)
+
+    def _log(self) -> Log:
+        return self._rows.log("demonstrations", self._drive.sensor)
 
     def _reach(self, waypoint: Waypoint, posture: Posture) -> tuple[dict, float]:
         """The row at rest, and how far off [m] the finger tips are then, after `N_CORRECTIONS` at most."""
@@ -113,8 +126,9 @@ class Teleoperation:
             row = self._hold(posture)
             if row is not None:
                 finger_m, rotation = self._seen(row)
-                off_m = float(np.linalg.norm(finger_m - target.finger_m)) if self._sees else np.nan
-                if not self._sees or off_m < CLOSE_M:
+                seen = "tip_m" in row
+                off_m = float(np.linalg.norm(finger_m - target.finger_m)) if seen else np.nan
+                if not seen or off_m < CLOSE_M:
                     break
                 asked = asked._replace(
                     finger_m=asked.finger_m + target.finger_m - finger_m,
@@ -132,7 +146,7 @@ class Teleoperation:
             raise self._not_at_rest(waypoint.name)
         if off_m > FAR_M:
             off = f"{1e3 * off_m:.1f} mm off and not to be corrected, expected at most {1e3 * FAR_M:g} mm"
-            raise DriveError(f"{waypoint.name}: {off}; is the arm calibrated?")
+            raise ArmFault(f"{waypoint.name}: {off}; is the arm calibrated?")
         return row, off_m
 
     def _step(self, finger_m: np.ndarray) -> bool:
@@ -157,34 +171,38 @@ class Teleoperation:
     def _bias_kpa(self, posture: Posture) -> np.ndarray:
         """By how much the arm's pressures are above the posture's; guessed of those that a limit keeps in."""
         low, high = self._drive.gains.pressure_min_kpa, self._drive.gains.pressure_max_kpa
-        kpa = self._drive.pumps.pressure_kpa
+        kpa = self._drive.link.pressure_kpa
         beyond = np.where(kpa >= high, BEYOND_KPA, 0.0) - np.where(kpa <= low, BEYOND_KPA, 0.0)
         return kpa + beyond - posture.pressure_kpa
 
-    def _not_at_rest(self, name: str) -> DriveError:
+    def _not_at_rest(self, name: str) -> ArmFault:
         readings = self._last["readings"]
         off_m = self._drive.sensor.lengths(readings, 0.0).length_m - self._now.spring_m
         worst = int(np.argmax(np.abs(off_m)))
-        return DriveError(
+        return ArmFault(
             f"{name}: not at rest after {SETTLE_TIMEOUT_S:g} s: spring {worst} is {1e3 * off_m[worst]:+.1f} "
-            f"mm off, its chamber at {self._drive.pumps.pressure_kpa[worst]:.1f} kPa"
+            f"mm off, its chamber at {self._drive.link.pressure_kpa[worst]:.1f} kPa"
         )
 
     def _look(self, row: dict) -> None:
         self._last = row
 
     def _seen(self, row: dict) -> tuple[np.ndarray, np.ndarray]:
-        """Finger tips (3,) [m] and the gripper's rotation (3, 3): as seen, or as planned."""
-        if not self._sees:
+        """Finger tips (3,) [m] and the gripper's rotation (3, 3): as seen, or as planned where no frame came."""
+        if "tip_m" not in row:
             return self._now.finger_m, self._now.rotation
         rotation = rotation_from_quaternion(row["tip_quaternion"])
         return row["tip_m"] - self.expert.spec.mass.gripper_length_m * rotation[:, 2], rotation
 
     def _add(self, row: dict, sequence: int, off_m: float) -> None:
-        planned = {
-            "tip_m": 1e-3 * self._now.pose[:3].astype(float),
-            "tip_quaternion": quaternion_from_pose(self._now.pose.astype(float)),
-        }
+        planned = (
+            {}
+            if self._sees
+            else {
+                "tip_m": 1e-3 * self._now.pose[:3].astype(float),
+                "tip_quaternion": quaternion_from_pose(self._now.pose.astype(float)),
+            }
+        )
         self._rows.add((planned | row) | {"sequence": sequence})
         self._off_m.append(off_m)
 

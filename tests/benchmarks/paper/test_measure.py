@@ -16,7 +16,8 @@ from benchmarks.paper.measure import (
     operate,
     save_outcome,
 )
-from mjx_softarm.deploy.controller import Controller, Phase
+from mjx_softarm.deploy.controller import Controller
+from mjx_softarm.deploy.ending import Ending
 from mjx_softarm.deploy.faults import Event, Fault
 from mjx_softarm.deploy.session import Arrival, Run
 from mjx_softarm.logs.schema import Log
@@ -58,7 +59,7 @@ def test_errors_are_averaged_over_the_window_of_rest(make_arm_model):
     )
     arrival = Arrival(goals[1], goals[1] + [1.0, 0, 0, 0, 0, 0], n_rows - 1)
     events = (Event(Fault.SATURATED, ""), Event(Fault.SATURATED, ""))
-    run = Run(log, (arrival,), events, np.array([1e-4] * 10), Phase.DONE, False)
+    run = Run(log, (arrival,), events, np.array([1e-4] * 10), Ending())
     outcome = measure(run, controller, goals)
     assert np.allclose(outcome.error[1], [3, 4, 0, 10, 0, 0], atol=1e-6)
     assert np.isnan(outcome.error[0]).all() and np.isnan(outcome.arrival_s[0])

@@ -87,7 +87,7 @@ def test_recorded_positions_are_the_waypoints(expert, waypoints, plan, shift_mm)
     told = []
     arm = IdealArm()
     result = Teleoperation(arm, expert, told.append).record(waypoints, plan, sequence=3)
-    assert result.problem == "" and len(result.log) == len(told) == 4
+    assert result.ending.status == 0 and len(result.log) == len(told) == 4
     wanted_m = np.stack([waypoint.finger_m for waypoint in waypoints])
     off_m = np.linalg.norm(fingers_m(result.log) - wanted_m, axis=1)
     assert off_m.max() < CLOSE_M < 1e-3 * np.linalg.norm(shift_mm)  # uncorrected, it is off by the shift
@@ -100,7 +100,7 @@ def test_blind_arm_is_logged_where_it_was_planned(expert, waypoints, plan, shift
     arm = BlindArm()
     seen = []
     result = Teleoperation(arm, expert, lambda _: seen.append(arm.finger_m)).record(waypoints[:2], plan)
-    assert result.problem == "" and np.isnan(result.off_m).all()
+    assert result.ending.status == 0 and np.isnan(result.off_m).all()
     wanted_m = np.stack([waypoint.finger_m for waypoint in waypoints[:2]])
     np.testing.assert_allclose(fingers_m(result.log), wanted_m, atol=1e-4)
     np.testing.assert_allclose(np.stack(seen), wanted_m - 1e-3 * shift_mm, atol=1.5e-3)
@@ -110,7 +110,7 @@ def test_what_was_logged_before_readings_are_lost_stays(expert, waypoints, plan)
     arm = IdealArm()
     teleoperation = Teleoperation(arm, expert, lambda _: setattr(arm, "n_ticks_left", 20))
     result = teleoperation.record(waypoints, plan)
-    assert len(result.log) == 1 and "readings lost in 3 ticks in a row" in result.problem
+    assert len(result.log) == 1 and "readings lost in 3 ticks in a row" in result.ending.cause
 
 
 def test_posture_that_saturates_the_arm_gives_way_to_another(expert, waypoints, plan):
@@ -119,7 +119,7 @@ def test_posture_that_saturates_the_arm_gives_way_to_another(expert, waypoints, 
     spring_m[1, 4] += 0.06
     broken = Posture(**{**plan._asdict(), "spring_m": spring_m})
     result = Teleoperation(IdealArm(), expert).record(waypoints[:2], broken)
-    assert result.problem == "" and result.off_m.max() < CLOSE_M
+    assert result.ending.status == 0 and result.off_m.max() < CLOSE_M
 
 
 def test_position_far_from_its_waypoint_is_not_logged(expert, waypoints, plan):
@@ -131,7 +131,11 @@ def test_position_far_from_its_waypoint_is_not_logged(expert, waypoints, plan):
             return Capture(np.array([0.05, 0.0, -0.5]), *others)
 
     result = Teleoperation(Misplaced(), expert).record(waypoints, plan)
-    assert len(result.log) == 0 and "home: 7" in result.problem and "mm off and not to be" in result.problem
+    assert (
+        len(result.log) == 0
+        and "home: 7" in result.ending.cause
+        and "mm off and not to be" in result.ending.cause
+    )
 
 
 def test_chamber_without_pressure_is_named(expert, waypoints, plan):
@@ -142,8 +146,8 @@ def test_chamber_without_pressure_is_named(expert, waypoints, plan):
     told = []
     result = Teleoperation(Leaking(), expert, told.append).record(waypoints, plan)
     assert len(result.log) == 0
-    assert "home: not at rest after 15 s: spring 4 is +" in result.problem
-    assert "chamber at -40.0 kPa" in result.problem
+    assert "home: not at rest after 15 s: spring 4 is +" in result.ending.cause
+    assert "chamber at -40.0 kPa" in result.ending.cause
 
 
 @pytest.fixture

@@ -1,0 +1,199 @@
+"""One arm behind its driver: guarded calls, the pressures in force, time, and the ramp to zero.
+
+Drivers are written by others, so that any of their methods may raise anything. Here every call names the
+method that failed, checks what came back, and keeps which pressures the arm has taken.
+
+A simulated arm has a clock of its own, `time_s`, that passes as pressures are written; a run on it is as
+fast as the machine. A real arm has none: there the loop waits for each tick.
+"""
+
+from __future__ import annotations
+
+import time
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mjx_softarm.deploy.arm_io import ArmIO
+from mjx_softarm.deploy.faults import LATE_TICKS
+from mjx_softarm.logs.schema import Log
+from mjx_softarm.sensing.sensors import Sensor
+
+VENT_KPA_PER_S = 20.0
+VENT_TRIES = 10  # failed writes in a row after which the arm counts as not vented
+
+
+class ArmFault(Exception):
+    """The arm cannot be driven on; the message names the cause."""
+
+
+class Link:
+    """An arm of n chambers, without pressure at first.
+
+    Args:
+        arm: the driver; `pressures`, `motion_capture` and `time_s` are used if it has them.
+        n: number of springs and of chambers.
+        dt_s: period of the control loop.
+    """
+
+    def __init__(self, arm: ArmIO, n: int, dt_s: float):
+        self._arm: Any = arm
+        self._n, self._dt_s, self._n_late = n, dt_s, 0
+        self._simulated = hasattr(arm, "time_s")
+        self._measures, self.sees = hasattr(arm, "pressures"), hasattr(arm, "motion_capture")
+        # Shapes of what is logged; those of markers are the first frame's.
+        self._shapes: dict[str, tuple[int, ...]] = {
+            "pressure_kpa": (n,),
+            "tip_m": (3,),
+            "tip_quaternion": (4,),
+        }
+        self._unsure = False  # whether the arm may have taken the last pressures, though it did not say so
+        self.pressure_kpa = np.zeros(n)  # in force
+
+    def now(self) -> float:
+        """Return the time [s].
+
+        Raises:
+            ArmFault: the arm's own clock failed.
+        """
+        if not self._simulated:
+            return time.monotonic()
+        time_s = self._call("time_s", lambda: float(self._arm.time_s))
+        if not np.isfinite(time_s):
+            raise ArmFault(f"time_s: got {time_s}, expected a finite number")
+        return time_s
+
+    def wait_until(self, time_s: float) -> None:
+        """Sleep; a simulated arm is never waited for."""
+        if not self._simulated:
+            time.sleep(max(0.0, time_s - time.monotonic()))
+
+    def read(self) -> np.ndarray | None:
+        """Return the readings (n,), or None where they did not come in time.
+
+        Raises:
+            ArmFault: the sensors cannot be reached, or there is another number of them.
+        """
+        try:
+            readings = self._call("read_sensors", lambda: np.array(self._arm.read_sensors(), float))
+        except TimeoutError:
+            return None
+        return self._shaped("read_sensors", readings, (self._n,))
+
+    def write(self, pressure_kpa: np.ndarray) -> bool:
+        """Command pressures (n,) [kPa]; return whether they were taken in time.
+
+        Raises:
+            ArmFault: the pressures are not finite, the driver refuses them, or the pumps cannot be reached.
+        """
+        if not np.isfinite(pressure_kpa).all():
+            raise ArmFault(f"write_pressures: got {pressure_kpa} kPa, expected finite numbers")
+        self._unsure = True
+        try:
+            self._call("write_pressures", lambda: self._arm.write_pressures(pressure_kpa))
+        except TimeoutError as error:
+            self._n_late += 1
+            if self._n_late > 2 * LATE_TICKS:
+                raise ArmFault(f"write_pressures: not in time {self._n_late} times in a row") from error
+            return False
+        self._unsure, self._n_late, self.pressure_kpa = False, 0, pressure_kpa
+        return True
+
+    def look(self, time_s: float) -> dict[str, Any]:
+        """Return what there is to log besides the readings; nothing of motion capture that missed a frame.
+
+        The pressures are those commanded, if the arm measures none.
+
+        Raises:
+            ArmFault: a method failed, or gave arrays of another shape than before.
+        """
+        row: dict[str, Any] = {"time_s": time_s, "pressure_kpa": self.pressure_kpa}
+        if self._measures:
+            kpa = self._call("pressures", lambda: np.array(self._arm.pressures(), float), timeouts=False)
+            row["pressure_kpa"] = self._shaped("pressures", kpa, (self._n,))
+        if self.sees:
+            for name, value in self._call("motion_capture", self._frame).items():
+                shape = self._shapes.setdefault(name, value.shape)
+                row[name] = self._shaped(f"motion_capture: {name}", value, shape)
+        return row
+
+    def vent(self) -> None:
+        """Ramp all pressures to zero; needs the pumps alone, and tries writes again that fail.
+
+        Raises:
+            ArmFault: the pumps took no pressures for VENT_TRIES ticks.
+        """
+        step_kpa, n_failed = VENT_KPA_PER_S * self._dt_s, 0
+        while self._unsure or self.pressure_kpa.any():
+            begin_s = time.monotonic()
+            try:
+                in_time = self.write(self.pressure_kpa - np.clip(self.pressure_kpa, -step_kpa, step_kpa))
+                why = "not in time"
+            except ArmFault as error:
+                in_time, why = False, str(error)
+            n_failed = 0 if in_time else n_failed + 1
+            if n_failed == VENT_TRIES:
+                raise ArmFault(f"{n_failed} writes failed in a row, the last: {why}")
+            self.wait_until(begin_s + self._dt_s)
+
+    def _frame(self) -> dict[str, np.ndarray]:
+        try:
+            seen = self._arm.motion_capture()
+        except OSError:  # a missed frame is a gap in the log
+            return {}
+        return {name: np.array(value, float) for name, value in seen._asdict().items() if value is not None}
+
+    def _call(self, name: str, method: Callable[[], Any], timeouts: bool = True) -> Any:
+        """Call the driver; a TimeoutError passes where the caller can go on without an answer."""
+        try:
+            return method()
+        except Exception as error:
+            if timeouts and isinstance(error, TimeoutError):
+                raise
+            raise ArmFault(f"{name}: {describe(error)}") from error
+
+    @staticmethod
+    def _shaped(name: str, value: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+        if value.shape != shape:
+            raise ArmFault(f"{name}: got shape {value.shape}, expected {shape}")
+        return value
+
+
+def describe(error: BaseException) -> str:
+    """Return an error's message, with its type and place where it is none of the documented ones."""
+    if isinstance(error, (ArmFault, OSError, ValueError)) and str(error):
+        return str(error)
+    place = traceback.extract_tb(error.__traceback__)[-1:]
+    where = "".join(f" ({Path(frame.filename).name}, line {frame.lineno})" for frame in place)
+    return ": ".join(filter(None, [type(error).__name__, str(error)])) + where
+
+
+class Recorder:
+    """Rows of a log in the making."""
+
+    def __init__(self) -> None:
+        self._rows: list[dict[str, Any]] = []
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def add(self, row: dict[str, Any]) -> None:
+        """Keep a row."""
+        self._rows.append(row)
+
+    def log(self, source: str, sensor: Sensor) -> Log:
+        """Return the log so far of an arm with this sensor; NaN where a row has no value.
+
+        Time is counted from the first row.
+        """
+        shapes = {name: np.shape(value) for row in reversed(self._rows) for name, value in row.items()}
+        arrays = {
+            name: np.array([row.get(name, np.full(shape, np.nan)) for row in self._rows], float)
+            for name, shape in (shapes or {"time_s": ()}).items()
+        }
+        arrays["time_s"] = arrays["time_s"] - arrays["time_s"][:1]
+        row = np.arange(2, len(self) + 2)
+        return Log(source=source, row=row, reading_name=sensor.reading_name, **arrays)
