@@ -261,8 +261,8 @@ def test_arms_in_pipes_by_name():
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("twin:0:pipe200", "twin:0:PIPE, got 'pipe200', expected pipe300 or pipe250"),
-        ("twin:0:", "twin:0:PIPE, got '', expected pipe300 or pipe250"),
+        ("twin:0:pipe200", "twin:0:PIPE: got 'pipe200', expected pipe300 or pipe250"),
+        ("twin:0:", "twin:0:PIPE: got '', expected pipe300 or pipe250"),
         ("twin:0:pipe300:x", "got 'pipe300:x', expected pipe300 or pipe250"),
         ("twin::pipe300", "got '', expected an integer >= 0"),
     ],
