@@ -158,7 +158,7 @@ def s2r(fit: S2RFit, pose: np.ndarray, spring_m: np.ndarray, real: np.ndarray, n
     _label(axes, "distance to the real tip, held-out poses [mm]", "poses")
     return Section(
         "Sim-to-real network",
-        f"{len(pose)} poses at rest: the calibrated simulation settles at the logged spring lengths, and "
+        f"{len(pose)} poses at rest: the calibrated simulation settles at the logged lengths, and "
         f"the network learns the error of its tip. It flags {100 * fit.flagged_share:.1f} % of the held-out poses "
         "as far from those it learned from. "
         f"At {n_unsettled} other poses the simulation found no rest; they took no part.",
