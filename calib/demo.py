@@ -1,8 +1,9 @@
-"""Logs of an arm that is not there, planted unlike the specification, so that calibration can be tried.
+"""Logs of a simulated arm with known parameters, to try the calibration without hardware.
 
-What the calibration fits is planted with other values: springs' beta and delta, chambers' stiffness, area and
-length, damping. What it does not fit is off as well, so that the sim-to-real network has something to learn:
-where the chambers and springs sit, how stiff the backbone is, and links finer than the simulator's.
+The planted arm differs from the specification in what the calibration fits: beta and delta of the springs;
+stiffness, area and length of the chambers; bending stiffness; damping. It also differs in what the
+calibration does not fit, so that the sim-to-real network has something to learn: the sites of chambers and
+springs, and finer links.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ POSE_S = 5.0
 N_STEPS = 12
 STEP_S = 4.0
 RULER_NOISE_M = 3e-4
-READING_NOISE_M = 1e-4  # of a spring, by its frequency
+READING_NOISE_M = 1e-4  # of a spring, by its reading
 TIP_NOISE_M = 3e-4
 TURN_NOISE_RAD = 2e-3
 PRESSURE_NOISE_KPA = 0.05
@@ -35,7 +36,7 @@ MARKERS_PER_SECTION = 3
 
 
 def planted_arm(spec: ArmSpec, seed: int) -> ArmSpec:
-    """The arm that the logs are of."""
+    """Return the arm of the logs."""
     rng = np.random.default_rng(seed)
 
     def each(value: float | tuple[float, ...], spread: float) -> tuple[float, ...]:
@@ -73,9 +74,9 @@ def write_demo(folder: Path, spec: ArmSpec, seed: int) -> list[Path]:
     `steps.csv`: the arm after steps of the pressures, at the control rate.
 
     Args:
-        folder: made if it is not there.
-        spec: what the user believes of the arm.
-        seed: of the planted arm, the pressures and the noise.
+        folder: folder to write, created if it does not exist.
+        spec: arm as the user believes it to be.
+        seed: seed of the planted arm, the pressures and the noise.
 
     Returns:
         The files.
@@ -115,7 +116,7 @@ def _poses(arm: ArmSpec, rng: np.random.Generator) -> Log:
 
 
 def _steps(arm: ArmSpec, rng: np.random.Generator) -> Log:
-    """Pressures that jump, followed by C MuJoCo."""
+    """Simulate steps of the pressures with C MuJoCo."""
     low, high = arm.chambers.pressure_min_kpa, arm.chambers.pressure_max_kpa
     model, data = _model(arm)
     period_s = 1.0 / arm.control.rate_hz
@@ -135,7 +136,7 @@ def _model(arm: ArmSpec) -> tuple[mujoco.MjModel, mujoco.MjData]:
 
 
 class _Seen(NamedTuple):
-    """What there is to measure of an arm, without noise."""
+    """Measurable quantities of an arm, without noise."""
 
     spring_m: np.ndarray  # (n,)
     tip_m: np.ndarray  # (3,)
@@ -154,7 +155,7 @@ def _look(arm: ArmSpec, model: mujoco.MjModel, data: mujoco.MjData, qpos: np.nda
 
 
 def _marker_sites(arm: ArmSpec) -> list[str]:
-    """Beside the first spring of each section, at its thirds, from the base to the tip."""
+    """Return sites of the markers: at the first spring of each section, at its thirds, from base to tip."""
     per_section, names = arm.structure.links_per_section, []
     for section in range(arm.structure.n_sections):
         for third in range(1, MARKERS_PER_SECTION + 1):
@@ -166,7 +167,7 @@ def _marker_sites(arm: ArmSpec) -> list[str]:
 def _measured(
     arm: ArmSpec, time_s: np.ndarray, pressure_kpa: np.ndarray, seen: list[_Seen], rng: np.random.Generator
 ) -> Log:
-    """A log of what was seen, with noise."""
+    """Return a log of the measured quantities, with noise."""
     spring_m, tip_m, rotation, marker_m = map(np.stack, zip(*seen, strict=True))
     turn = rng.normal(scale=0.5 * TURN_NOISE_RAD, size=(len(seen), 3))
     small = np.column_stack([np.ones(len(seen)), turn])  # quaternion of a small turn

@@ -190,8 +190,8 @@ def _s2r(logs: Sequence[Log], spec: ArmSpec, seed: int) -> tuple[S2R | None, Sec
 
 def _few(n: int, what: str, n_found: int, rows: Mapping[str, int]) -> str:
     """Say which poses are needed, and what became of the rows of the logs."""
-    fates = ", ".join(f"{count} {fate}" for fate, count in rows.items() if count)
+    row_uses = ", ".join(f"{count} {use}" for use, count in rows.items() if count)
     return (
         f"Got {n_found} poses at rest with {what}, expected {n} or more; pressures must have been held for "
-        f"{MIN_HOLD_S:g} s. Rows of the logs: {fates or 'none with all of these columns'}."
+        f"{MIN_HOLD_S:g} s. Rows of the logs: {row_uses or 'none with all of these columns'}."
     )

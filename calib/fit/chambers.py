@@ -110,9 +110,10 @@ def calibrate_chambers(logs: Log | Sequence[Log], spec: ArmSpec, seed: int = 0) 
     """
     poses, rows = find_static_poses([logs] if isinstance(logs, Log) else logs, spec)
     if poses.n < MIN_POSES:
-        fates = ", ".join(f"{count} {fate}" for fate, count in rows.items())
+        row_uses = ", ".join(f"{count} {use}" for use, count in rows.items())
         raise FitError(
-            f"chambers: got {poses.n} poses at rest, expected {MIN_POSES} or more; rows of the logs: {fates}"
+            f"chambers: got {poses.n} poses at rest, expected {MIN_POSES} or more; "
+            f"rows of the logs: {row_uses}"
         )
     poses = poses._replace(pressure_kpa=_held_or_changing(poses.pressure_kpa))
     held_out = held_out_blocks(poses.n, HELD_OUT_SHARE, HELD_OUT_BLOCK, seed)

@@ -1,1 +1,1 @@
-"""Logs read, checked and reduced to rows that can be believed."""
+"""Reading of logs: checks, and reduction to rows that can be believed."""

@@ -1,8 +1,8 @@
-"""Real logs of two other soft arms, as their files are.
+"""Readers of public logs of two other soft arms, in their own formats.
 
-All rows are kept, as transients need the pressures of each. `fresh` says which rows hold motion capture of
-their own, and a quaternion that motion capture has turned by 180 degrees is NaN. The faults are found by the
-detectors of `mjx_softarm.logs.checks`, as in any log.
+All rows are kept, as transients need the pressures of each. `fresh` marks rows with renewed motion capture,
+and a quaternion that motion capture turned by 180 degrees is NaN. The faults are found by the detectors of
+`mjx_softarm.logs.checks`, as in any log.
 
 Source: ASU-RISE-Lab/4-chamber-softarm-control (commit 6df7ec9d), StanfordASL/trunk-stack (commit 8b4b9234).
 """
@@ -24,34 +24,32 @@ WIRE_M_PER_V = 1.0 / 5.0  # draw-wire encoders: 5 V at 1 m
 
 
 class AsuLog(NamedTuple):
-    """A log of the two-section pneumatic arm of ASU RISE."""
+    """Log of the two-section pneumatic arm of ASU RISE."""
 
     source: str
     row: np.ndarray  # (n,) line of the file
     time_s: np.ndarray  # (n,)
     desired_kpa: np.ndarray  # (n, 6) section 1, then section 2
     pressure_kpa: np.ndarray  # (n, 6) measured, relative to the atmosphere
-    wire_v: (
-        np.ndarray
-    )  # (n, 4) draw-wires: section 1 left, 1 right, 2 right, 2 left; section 2's from the base
+    wire_v: np.ndarray  # (n, 4) draw wires from the base: section 1 left, 1 right, 2 right, 2 left
     position_m: np.ndarray  # (n, 3, 3) base, middle, tip
     quaternion: np.ndarray  # (n, 3, 4) w, x, y, z; NaN where turned
-    fresh: np.ndarray  # (n,) no body is where it was in the row before
+    fresh: np.ndarray  # (n,) whether every body has moved since the row before
 
 
 class TrunkLog(NamedTuple):
-    """A log of the three-segment tendon-driven trunk of Stanford ASL."""
+    """Log of the three-segment tendon-driven trunk of Stanford ASL."""
 
     source: str
     row: np.ndarray  # (n,) line of the file
     motor_deg: np.ndarray  # (n, 6) measured
     position_m: np.ndarray  # (n, 3, 3) disks from the base, the last being the tip; y up
     quaternion: np.ndarray | None  # (n, 3, 4) w, x, y, z; NaN where turned
-    fresh: np.ndarray  # (n,) the tip is not where it was in the row before
+    fresh: np.ndarray  # (n,) whether the tip has moved since the row before
 
 
 def wire_length_m(wire_v: np.ndarray) -> np.ndarray:
-    """Length that a draw-wire encoder reads, less an offset that differs from day to day."""
+    """Return the length [m] of a draw-wire encoder, up to an offset that differs from day to day."""
     return WIRE_M_PER_V * wire_v
 
 
@@ -59,7 +57,7 @@ def read_asu(path: str | Path) -> tuple[AsuLog, list[Finding]]:
     """Read one `*_data_collect_*.txt`: 38 columns, no header, pressures in psi, quaternions scalar last.
 
     Raises:
-        LogError: not such a file; the message names line and column.
+        LogError: the file is not such a log; the message names line and column.
     """
     pressures = [
         f"{kind}{k}" for half in (0, 3) for kind in ("desired", "measured") for k in range(half, half + 3)
@@ -97,7 +95,7 @@ def read_trunk(path: str | Path) -> tuple[TrunkLog, list[Finding]]:
     """Read one `observations_controlled_*.csv`, with or without quaternions (scalar last).
 
     Raises:
-        LogError: not such a file; the message names line and column.
+        LogError: the file is not such a log; the message names line and column.
     """
     table = read_table(path)
     disks = range(1, N_BODIES + 1)
@@ -131,7 +129,7 @@ def _finding(file: str, rows: np.ndarray, column: str, problem: str, n_dropped: 
 
 
 def _finite(file: str, table: Table) -> Table:
-    """The same table, or an error that names each column with a NaN."""
+    """Return the table, or raise an error that names each column with a NaN."""
     bad = ~np.isfinite(table.values)
     found = [
         _finding(file, table.row[bad[:, k]], table.names[k], "NaN or inf, expected numbers")
@@ -156,7 +154,7 @@ def _stale(file: str, row: np.ndarray, stale: np.ndarray, dropped: np.ndarray) -
 
 
 def _orientation(file: str, row: np.ndarray, quaternion: np.ndarray) -> tuple[np.ndarray, list[Finding]]:
-    """Quaternions (n, bodies, 4) with signs repaired and turned ones voided."""
+    """Return quaternions (n, bodies, 4), signs repaired and turned ones NaN, and the findings."""
     repaired, findings = np.full(quaternion.shape, np.nan), []
     for k in range(quaternion.shape[1]):
         turned = checks.turned_rows(quaternion[:, k])

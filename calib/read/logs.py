@@ -1,10 +1,11 @@
-"""Logs of an arm: read, checked, and reduced to the rows that can be believed.
+"""Reading of logs: checks, and reduction to the rows that can be believed.
 
 The schema is that of `mjx_softarm.logs.schema`. A file that cannot be understood (a column missing, a wrong
 unit) is refused. Otherwise each row is believed whole or dropped whole: for a NaN, a reading out of range, a
 time that does not increase, motion capture that was not renewed or is turned, an outlier. So a log that was
-read has no holes in its columns, and its times say where rows are missing. Signs of quaternions are repaired;
-columns that never change, time gaps and unknown columns are only reported. Each finding says what it cost.
+read has no holes in its columns, and its times show where rows are missing. Signs of quaternions are
+repaired; columns that never change, time gaps and unknown columns are only reported. Each finding tells how
+many rows it dropped.
 """
 
 from __future__ import annotations
@@ -37,18 +38,18 @@ _NEEDED = ("readings", "spring_m", "pressure_kpa", "tip_m")  # one of them at le
 
 
 def read_log(path: str | Path, n_chambers: int = 9, strict: bool = False) -> tuple[Log, list[Finding]]:
-    """Read a log, keep the rows that can be believed, and say what is wrong with the others.
+    """Read a log, keep the rows that can be believed, and report the faults of the others.
 
     Args:
-        path: CSV, or npz by the end of its name.
-        n_chambers: of the arm; a log of another number is refused.
+        path: CSV file, or npz file by its suffix.
+        n_chambers: number of chambers; a log of another number is refused.
         strict: refuse a log with any finding.
 
     Returns:
-        The log, every number finite, and what was found.
+        The log, with finite numbers only, and the findings.
 
     Raises:
-        LogError: the log cannot be used, or is refused; the message has a line for each finding.
+        LogError: the log cannot be used or is refused; the message has a line for each finding.
     """
     sheet, findings = read_sheet(path, n_chambers, one_of=_NEEDED)
     with np.errstate(over="ignore", invalid="ignore"):  # any number may stand in a file
@@ -61,10 +62,10 @@ def read_log(path: str | Path, n_chambers: int = 9, strict: bool = False) -> tup
 
 
 def same_arm(logs: Sequence[Log]) -> None:
-    """Refuse logs that cannot be of one arm, as the columns that they share or their ranges tell.
+    """Refuse logs whose shared columns or ranges show that they are of different arms.
 
     Raises:
-        LogError: names both files and what differs.
+        LogError: the logs differ; the message names both files and the column.
     """
     for first, other in itertools.combinations(logs, 2):
         file = f"{first.source} and {other.source}"
@@ -87,13 +88,13 @@ def _differences(first: Log, other: Log) -> Iterator[tuple[str, str]]:
 
 
 def template(path: str | Path) -> str:
-    """Write a small log of the default arm that `read_log` finds nothing wrong with.
+    """Write a small log of the default arm, without faults.
 
     Returns:
-        How such a file is to be read, and what else it may hold: plain text.
+        A text on the format of the file, and the columns it may have.
 
     Raises:
-        FileExistsError: there is such a file already.
+        FileExistsError: the file exists already.
     """
     if Path(path).exists():
         raise FileExistsError(f"{path}: exists already, expected the name of a new file")
@@ -121,7 +122,7 @@ def template(path: str | Path) -> str:
 
 
 def schema_text(n_chambers: int = 9, n_markers: int = 3) -> str:
-    """The columns a log may have, in words; from the schema itself."""
+    """Describe the columns that a log may have, from the schema."""
     lines = [_HELP, f"{'columns':<30} {'units':<26} plausible"]
     groups: dict[tuple[str, str], list[Column]] = {}
     names = [sensor.reading_name for sensor in SENSORS.values()]

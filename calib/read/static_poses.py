@@ -1,11 +1,11 @@
-"""The poses of a log in which the arm is at rest: equilibria can be fitted to these alone.
+"""Static poses of a log: poses of the arm at rest, to which equilibria are fitted.
 
 A log is cut into holds: stretches in which no pressure leaves 1 kPa around its first value, the payload
 stays, and no two rows are more than 3 s apart. The last second of a hold counts, provided that
 
 - the hold had lasted for 3 s by then, three times the slowest time constant of the paper's arm. Where rows
-  are missing before a hold, the arm is taken to have been held there meanwhile, as it is where somebody
-  records one pose after the other;
+  are missing before a hold, the pressures are assumed to have been held meanwhile, as when somebody records
+  one pose after the other;
 - the tip moves by less than 1 mm/s, or by no more than its own noise can explain, and stays within 2 mm.
 
 The rows that count are averaged to one pose, so that a long hold weighs no more than a short one.
@@ -24,17 +24,17 @@ from mjx_softarm.sensing.pose import rotation_from_quaternion
 from mjx_softarm.sensing.sensors import Sensor, SensorFault
 from mjx_softarm.spec import ArmSpec
 
-HOLD_KPA = 1.0
-MIN_HOLD_S = 3.0
-WINDOW_S = 1.0
-MAX_SPEED_M_S = 1e-3
-MAX_SPREAD_M = 2e-3
-SPEED_SIGMA = 3.0
-ROUNDING_S = 1e-6
+HOLD_KPA = 1.0  # a held pressure stays this close to its first value
+MIN_HOLD_S = 3.0  # before the rows that count
+WINDOW_S = 1.0  # end of a hold, whose rows count
+MAX_SPEED_M_S = 1e-3  # of a tip at rest
+MAX_SPREAD_M = 2e-3  # RMS distance to the mean position of a tip at rest
+SPEED_SIGMA = 3.0  # standard deviations by which noise may exceed the speed
+ROUNDING_S = 1e-6  # of logged times
 
 
 class StaticPoses(NamedTuple):
-    """Poses at rest, in the order of the logs."""
+    """Poses of the arm at rest, in the order of the logs."""
 
     pressure_kpa: np.ndarray  # (n, n_chambers)
     payload_kg: np.ndarray  # (n,)
@@ -42,19 +42,19 @@ class StaticPoses(NamedTuple):
     tip_rotation: np.ndarray  # (n, 3, 3)
     spring_m: np.ndarray  # (n, n_chambers), NaN where not measured
     marker_m: np.ndarray  # (n, n_markers, 3), NaN where not measured
-    single: np.ndarray  # (n,) bool, of one row, which does not tell whether the tip moved
+    single: np.ndarray  # (n,) bool, whether it is one row, which cannot show whether the tip moved
 
     @property
     def n(self) -> int:
         return len(self.payload_kg)
 
     def take(self, poses: np.ndarray) -> StaticPoses:
-        """Some of the poses, given by their indices or a mask (n,)."""
+        """Return some of the poses, chosen by indices or a mask (n,)."""
         return StaticPoses(*(value[poses] for value in self))
 
 
 def find_static_poses(logs: Sequence[Log], spec: ArmSpec) -> tuple[StaticPoses, dict[str, int]]:
-    """Poses at rest of all logs together.
+    """Find the static poses of all logs together.
 
     Args:
         logs: each with pressures and tip poses; readings are those of the sensors of `spec` where a log
@@ -62,26 +62,26 @@ def find_static_poses(logs: Sequence[Log], spec: ArmSpec) -> tuple[StaticPoses, 
         spec: the arm; its payload is that of a log that does not say.
 
     Returns:
-        The poses, and for each fate of a row, the number of rows that met it.
+        The poses, and the number of rows by use.
 
     Raises:
-        FitError: a log without pressures or tip poses, or of another number of chambers.
+        FitError: a log has no pressures or tip poses, or another number of chambers.
     """
     n_markers = max((log.marker_m.shape[1] for log in logs if log.marker_m is not None), default=0)
-    fates = {"used": 0, "not finite": 0, "pressures not held long enough": 0, "tip still moving": 0}
-    poses = [pose for log in logs for pose in _static_poses_of(log, spec, n_markers, fates)]
+    row_uses = {"used": 0, "not finite": 0, "pressures not held long enough": 0, "tip still moving": 0}
+    poses = [pose for log in logs for pose in _static_poses_of(log, spec, n_markers, row_uses)]
     shapes = ((spec.n_chambers,), (), (3,), (3, 3), (spec.n_chambers,), (n_markers, 3), ())
     columns = zip(*poses, strict=True) if poses else [()] * len(shapes)
     arrays = [np.reshape(list(c), (len(poses), *shape)) for c, shape in zip(columns, shapes, strict=True)]
-    return StaticPoses(*arrays[:-1], single=arrays[-1].astype(bool)), fates
+    return StaticPoses(*arrays[:-1], single=arrays[-1].astype(bool)), row_uses
 
 
-def _static_poses_of(log: Log, spec: ArmSpec, n_markers: int, fates: dict[str, int]) -> list[tuple]:
+def _static_poses_of(log: Log, spec: ArmSpec, n_markers: int, row_uses: dict[str, int]) -> list[tuple]:
     _check(log, spec)
     payload = np.full(len(log), spec.mass.payload_kg) if log.payload_kg is None else log.payload_kg
     columns = [log.time_s[:, None], payload[:, None], log.pressure_kpa, log.tip_m, log.tip_quaternion]
     finite = np.all(np.isfinite(np.concatenate(columns, axis=1)), axis=1)
-    fates["not finite"] += int(np.count_nonzero(~finite))
+    row_uses["not finite"] += int(np.count_nonzero(~finite))
     log, payload = log.take(finite), payload[finite]
     assert log.pressure_kpa is not None and log.tip_m is not None  # else `_check` raises
     springs = spring_lengths(log, spec)
@@ -92,13 +92,13 @@ def _static_poses_of(log: Log, spec: ArmSpec, n_markers: int, fates: dict[str, i
     found = []
     for start, stop in holds(log.time_s, log.pressure_kpa, payload):
         rows = _last_second(log.time_s, start, stop)
-        fates["pressures not held long enough"] += stop - start - len(rows)
+        row_uses["pressures not held long enough"] += stop - start - len(rows)
         if len(rows) == 0:
             continue
         if _moves(log.time_s[rows], log.tip_m[rows]):
-            fates["tip still moving"] += len(rows)
+            row_uses["tip still moving"] += len(rows)
             continue
-        fates["used"] += len(rows)
+        row_uses["used"] += len(rows)
         pressure, tip, turn, spring, marker = (
             np.mean(x[rows], axis=0) for x in (log.pressure_kpa, log.tip_m, rotation, springs, markers)
         )
@@ -108,7 +108,7 @@ def _static_poses_of(log: Log, spec: ArmSpec, n_markers: int, fates: dict[str, i
 
 
 def holds(time_s: np.ndarray, pressure_kpa: np.ndarray, payload_kg: np.ndarray) -> list[tuple[int, int]]:
-    """First row, and row after the last, of each stretch at constant pressures and payload."""
+    """Return first row, and row after the last, of each stretch at constant pressures and payload."""
     n, start, found = len(time_s), 0, []
     breaks = np.flatnonzero((np.diff(time_s) > MIN_HOLD_S) | (np.diff(payload_kg) != 0)) + 1
     while start < n:
@@ -128,7 +128,7 @@ def holds(time_s: np.ndarray, pressure_kpa: np.ndarray, payload_kg: np.ndarray) 
 
 
 def spring_lengths(log: Log, spec: ArmSpec) -> np.ndarray:
-    """Spring lengths (n, n_chambers) [m]: from the readings, else as logged, else NaN."""
+    """Return spring lengths (n, n_chambers) [m]: from the readings, else as logged, else NaN."""
     readings = log.readings_of(spec.sensor)
     if readings is None:
         return np.full((len(log), spec.n_chambers), np.nan) if log.spring_m is None else log.spring_m
@@ -137,14 +137,14 @@ def spring_lengths(log: Log, spec: ArmSpec) -> np.ndarray:
 
 
 def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
-    """The rotation (..., 3, 3) closest to a matrix, such as a mean of rotations that are alike."""
+    """Return the rotation (..., 3, 3) closest to a matrix, such as a mean of similar rotations."""
     left, _, right = np.linalg.svd(matrix)
     left[..., :, 2] *= np.linalg.det(left @ right)[..., None]
     return left @ right
 
 
 def _last_second(time_s: np.ndarray, start: int, stop: int) -> np.ndarray:
-    """Rows of a hold that count, if any."""
+    """Return the rows of a hold that count, if any."""
     gap = time_s[start] - time_s[start - 1] if start > 0 else 0.0
     since = time_s[start - 1] if gap > MIN_HOLD_S else time_s[start]
     rows = np.arange(start, stop)
@@ -153,7 +153,7 @@ def _last_second(time_s: np.ndarray, start: int, stop: int) -> np.ndarray:
 
 
 def _moves(time_s: np.ndarray, tip_m: np.ndarray) -> bool:
-    """Whether the tip moves over some rows of a hold; never of a single one."""
+    """Return whether the tip moves over some rows of a hold; False for a single row."""
     off = tip_m - np.mean(tip_m, axis=0)
     if len(off) < 2:
         return False
@@ -169,7 +169,7 @@ def _moves(time_s: np.ndarray, tip_m: np.ndarray) -> bool:
 def _check(log: Log, spec: ArmSpec) -> None:
     for name in ("pressure_kpa", "tip_m", "tip_quaternion"):
         if getattr(log, name) is None:
-            raise FitError(f"{log.source}: no {name}, expected pressures and tip poses to fit chambers to")
+            raise FitError(f"{log.source}: {name}: got no such columns, expected pressures and tip poses")
     for name in ("pressure_kpa", "spring_m", "readings"):
         value = getattr(log, name)
         if value is not None and value.shape[1] != spec.n_chambers:

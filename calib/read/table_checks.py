@@ -1,7 +1,7 @@
-"""Checks of a log as a matrix: which units are plausible, which rows are believed, at what cost.
+"""Checks of a log as a table: plausible units, and rows that can be believed.
 
-The checks of rows come in three stages, each on the rows that the one before has left: single rows (NaN,
-time, range); rows against the row before (motion capture that was not renewed or is turned); outliers.
+Rows are checked in three stages, each on the rows left by the one before: single rows (NaN, time, range);
+rows against the row before (motion capture that was not renewed or is turned); outliers.
 """
 
 from __future__ import annotations
@@ -20,25 +20,23 @@ from mjx_softarm.sensing.sensors import SENSORS as KINDS
 
 
 class Plausible(NamedTuple):
-    """What a quantity of a soft arm a few decimetres long may read, in the unit used inside (`UNITS`)."""
+    """Plausible values of a quantity of a soft arm a few decimetres long, in the first unit of `UNITS`."""
 
-    low: float  # of any value
+    low: float  # least and greatest plausible value
     high: float
-    least: float = 0.0  # what the largest values reach, unless all are zero; 0: anything
-    spike: float = np.inf  # a value off its neighbours by less is not an outlier
+    least: float = 0.0  # size that the largest values reach, unless all are zero; 0: any size
+    spike: float = np.inf  # distance from its neighbours up to which a value is no outlier
 
 
-# A column whose median is outside has the wrong unit, or is another column; single values outside cost
-# their rows. The bounds are tight enough to tell mm, cm and m, or Pa, kPa and bar, apart for such an arm.
-# What they cannot tell: psi from kPa, rad from deg, one chamber from another.
+# A column whose median is outside has the wrong unit, or is another column; rows with single values outside
+# are dropped. The bounds tell mm, cm and m apart for such an arm, and Pa, kPa and bar. They cannot tell psi
+# from kPa, rad from deg, or one chamber from another.
 PLAUSIBLE: Mapping[str, Plausible] = MappingProxyType(
     {
         "time": Plausible(5e-4, 9.0),  # of the steps, in the median: 2 kHz down to a pose every 9 s
         "length": Plausible(0.03, 1.0, spike=1e-3),  # of a spring
         "position": Plausible(-3.0, 3.0, least=0.1, spike=2e-3),  # of tip and markers, from the base
-        "pressure": Plausible(
-            -105.0, 1000.0, least=0.5, spike=10.0
-        ),  # vacuum to ten bar; valves ripple by less
+        "pressure": Plausible(-105.0, 1000.0, least=0.5, spike=10.0),  # vacuum to ten bar
         "mass": Plausible(0.0, 5.0, least=1e-3),
         "number": Plausible(-1.1, 1.1),  # part of a unit quaternion
         "id": Plausible(0.0, 1e6),
@@ -47,13 +45,13 @@ PLAUSIBLE: Mapping[str, Plausible] = MappingProxyType(
         **{kind.reading_name: Plausible(*kind.plausible, spike=kind.spike) for kind in KINDS.values()},
     }
 )
-BY_HAND_ROWS, BY_HAND_S = 300, 600.0  # so few rows may be poses that somebody recorded at leisure
+BY_HAND_ROWS, BY_HAND_S = 300, 600.0  # so few rows may be poses recorded by hand, so far apart
 HANGS_BELOW_M = -0.05  # of the tip, in the median: the base frame's z is up and the arm hangs
 SENSORS = ("readings", "spring_m", "pressure_kpa", "tip_m", "marker_m")
 
 
 class Fault(NamedTuple):
-    """Rows at fault for one reason."""
+    """Rows with one fault."""
 
     column: str
     problem: str
@@ -62,7 +60,7 @@ class Fault(NamedTuple):
 
 
 def clean(sheet: Sheet) -> tuple[Sheet, list[Finding]]:
-    """The rows that can be believed, quaternion signs repaired; and all that was found."""
+    """Return the rows that can be believed, quaternion signs repaired, and all findings."""
     findings = [_finding(sheet, fault) for fault in _gaps(sheet)]
     for stage in (_single_rows, _renewal, _neighbours):
         faults = [fault for fault in stage(sheet) if fault.mask.any()]
@@ -83,7 +81,7 @@ def clean(sheet: Sheet) -> tuple[Sheet, list[Finding]]:
 
 
 def _gaps(sheet: Sheet) -> Iterator[Fault]:
-    """Rows that the file itself lacks, by its times alone."""
+    """Find rows missing in the file, by its times."""
     time_s = sheet.values[:, 0]
     finite = np.flatnonzero(np.isfinite(time_s))
     ordered = finite[~checks.late_rows(time_s[finite])]
@@ -102,7 +100,7 @@ def _finding(sheet: Sheet, fault: Fault) -> Finding:
 
 
 def implausible(sheet: Sheet) -> list[Finding]:
-    """Why the log cannot be used at all: columns without numbers, or that are not what their header says."""
+    """Find reasons to refuse the log: columns without numbers, or that contradict their header."""
     if len(sheet.row) < 2:
         return [Finding(sheet.file, None, "", f"{len(sheet.row)} row, expected 2 at least")]
     problems = {}
@@ -119,7 +117,7 @@ def implausible(sheet: Sheet) -> list[Finding]:
 
 
 def _typical(values: np.ndarray) -> float:
-    """Median of the finite values; NaN where there is none."""
+    """Return the median of the finite values; NaN if there is none."""
     finite = values[np.isfinite(values)]
     return float(np.median(finite)) if len(finite) else np.nan
 
@@ -147,7 +145,7 @@ def _bounds(column: Column) -> tuple[float, float]:
 
 
 def quantity(column: Column) -> str:
-    """Key of `PLAUSIBLE`."""
+    """Return the key of a column in `PLAUSIBLE`."""
     return "position" if column.group in ("tip_m", "marker_m") else column.kind
 
 
@@ -167,7 +165,7 @@ def _implausible_size(sheet: Sheet, group: str) -> str:
 
 
 def _shown(column: Column, value: float) -> str:
-    """A value of the unit used inside, as the file has it."""
+    """Format a value in the unit of the file."""
     return f"{value / UNITS[column.kind][column.unit]:.6g} {column.unit}".removesuffix(" 1")
 
 

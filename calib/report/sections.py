@@ -80,12 +80,12 @@ def chambers(fit: ChamberFit) -> Section:
     axes.hist(fit.tip_error_mm[~fit.is_held_out], bins, density=True, alpha=0.5, label="fit")
     axes.hist(fit.tip_error_mm[fit.is_held_out], bins, density=True, histtype="step", lw=2, label="held out")
     _label(axes, "simulated to measured tip [mm]", "density")
-    fates = ", ".join(f"{count} {fate}" for fate, count in fit.rows.items() if count)
+    row_uses = ", ".join(f"{count} {use}" for use, count in fit.rows.items() if count)
     return Section(
         "Chambers",
         f"{fit.poses.n} poses at rest: simulated at the measured pressures against the measured tip and "
         "springs. Rest lengths are relative to the section's. Intervals are 95 %. "
-        f"Rows of the logs: {fates}.",
+        f"Rows of the logs: {row_uses}.",
         (Table(head, tuple(rows)), backbone, Table(_ERROR_HEAD, error_rows)),
         fit.warnings,
         _plain(fit, "spec", "poses", "is_held_out", "tip_error_mm", "chamber_m")
@@ -159,8 +159,8 @@ def s2r(fit: S2RFit, pose: np.ndarray, spring_m: np.ndarray, real: np.ndarray, n
     return Section(
         "Sim-to-real network",
         f"{len(pose)} poses at rest: the calibrated simulation settles at the logged lengths, and "
-        f"the network learns the error of its tip. It flags {100 * fit.flagged_share:.1f} % of the held-out poses "
-        "as far from those it learned from. "
+        f"the network learns the error of its tip. It flags {100 * fit.flagged_share:.1f} % of the held-out "
+        "poses as far from those it learned from. "
         f"At {n_unsettled} other poses the simulation found no rest; they took no part.",
         (Table(_ERROR_HEAD, errors),),
         fit.warnings,

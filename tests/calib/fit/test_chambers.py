@@ -262,8 +262,8 @@ def test_a_chamber_that_never_changes_is_named_and_its_area_left_alone():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"tip_m": None}, "poses.csv: no tip_m, expected"),
-        ({"pressure_kpa": None}, "poses.csv: no pressure_kpa, expected"),
+        ({"tip_m": None}, "poses.csv: tip_m: got no such columns"),
+        ({"pressure_kpa": None}, "poses.csv: pressure_kpa: got no such columns"),
         ({"spring_m": np.ones((31, 6))}, "poses.csv: spring_m: got 6 columns, expected 9"),
     ],
 )

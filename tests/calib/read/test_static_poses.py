@@ -39,20 +39,20 @@ def steps(noise=1.0, tau_s=0.3, **changes):
 
 def test_each_hold_is_one_pose_averaged_over_its_last_second():
     log = steps()
-    poses, fates = find_static_poses([log], SPEC)
+    poses, row_uses = find_static_poses([log], SPEC)
     assert poses.n == 3
     np.testing.assert_allclose(poses.pressure_kpa[:, 0], [0.0, 10.0, -20.0], atol=0.1)
     np.testing.assert_allclose(poses.tip_m[:, 0], [0.0, 0.05, -0.1], atol=3e-4)  # noise of a row is 5e-4
     np.testing.assert_allclose(poses.tip_m[1], log.tip_m[449:500].mean(0), atol=1e-12)
     assert not poses.single.any()
-    assert fates == {"used": 3 * 51, "not finite": 0, "pressures not held long enough": 750 - 3 * 51,
+    assert row_uses == {"used": 3 * 51, "not finite": 0, "pressures not held long enough": 750 - 3 * 51,
                      "tip still moving": 0}  # fmt: skip
 
 
 def test_an_arm_that_is_still_on_its_way_is_left_out():
-    poses, fates = find_static_poses([steps(tau_s=2.0)], SPEC)
+    poses, row_uses = find_static_poses([steps(tau_s=2.0)], SPEC)
     np.testing.assert_allclose(poses.pressure_kpa[:, 0], [0.0], atol=0.1)  # where it did not have to go
-    assert fates["tip still moving"] == 2 * 51
+    assert row_uses["tip still moving"] == 2 * 51
 
 
 def test_a_swinging_arm_is_left_out():
@@ -69,10 +69,10 @@ def test_slowly_changing_pressures_are_no_rest():
 
 def test_poses_logged_one_by_one_were_held_meanwhile_but_for_the_first():
     log = make_log(5.0 * np.arange(6), [0, 20, -40, 3, 3, 5], 0.1 * np.arange(6))
-    poses, fates = find_static_poses([log], SPEC)
+    poses, row_uses = find_static_poses([log], SPEC)
     np.testing.assert_array_equal(poses.pressure_kpa[:, 0], [20, -40, 3, 3, 5])
     assert poses.single.all()
-    assert fates["used"] == 5 and fates["pressures not held long enough"] == 1
+    assert row_uses["used"] == 5 and row_uses["pressures not held long enough"] == 1
 
 
 def test_rows_close_together_are_one_pose():
@@ -95,9 +95,9 @@ def test_another_payload_is_another_hold():
 def test_rows_that_are_not_finite_are_left_out_and_counted():
     log = steps()
     log.tip_m[260], log.pressure_kpa[10, 3] = np.nan, np.inf
-    poses, fates = find_static_poses([log], SPEC)
-    assert poses.n == 3 and fates["not finite"] == 2
-    assert sum(fates.values()) == 750
+    poses, row_uses = find_static_poses([log], SPEC)
+    assert poses.n == 3 and row_uses["not finite"] == 2
+    assert sum(row_uses.values()) == 750
 
 
 def test_springs_are_read_from_frequencies_by_the_sensors_of_the_spec():
