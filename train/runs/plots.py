@@ -165,10 +165,9 @@ def imitation_curve(rows: list[dict[str, Any]]) -> Figure:
 
 
 def losses(rows: list[dict[str, Any]]) -> Figure:
-    """Losses of critics, actor and, where the reward is learned, discriminator over environment steps."""
-    names = ["tqc/critic_loss", "tqc/actor_loss", "gail/discriminator_loss"]
-    names = [name for name in names if any(name in row for row in rows)]
-    figure = Figure(figsize=(4 * len(names), 3.5), layout="constrained")
+    """Plot all metrics of the learner that are losses over environment steps."""
+    names = list(dict.fromkeys(name for row in rows for name in row if name.endswith("loss")))
+    figure = Figure(figsize=(4 * max(len(names), 1), 3.5), layout="constrained")
     for k, name in enumerate(names):
         title = name.split("/")[1].replace("_", " ")
         axes = _axes(figure, (1, len(names), k + 1), title, STEPS, "")
