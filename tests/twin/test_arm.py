@@ -1,9 +1,4 @@
-"""The twin against closed forms, hand calculations and the equilibrium solver; who may import it."""
-
-import ast
-import subprocess
-import sys
-from pathlib import Path
+"""The twin against closed forms, hand calculations and the equilibrium solver."""
 
 import mujoco
 import numpy as np
@@ -17,13 +12,9 @@ from mjx_softarm.mechanics.workspace import circle_poses, settle_many
 from mjx_softarm.sensing.pose import pose_error, pose_from_frame
 from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.twin import arm as twin
-from mjx_softarm.twin import pneumatics
 from mjx_softarm.twin.arm import EVALUATION_SEEDS, Twin
-from mjx_softarm.twin.hysteresis import StopOperators
 from mjx_softarm.twin.model import Build, build_twin, draw_parts
-from mjx_softarm.twin.pneumatics import ATMOSPHERE_KPA, PUMP_M3_PER_S, VALVE_S, Pneumatics
 
-ROOT = Path(__file__).resolve().parents[2]
 IDEAL = Build(gap=0.0, losses=0.0, noise=0.0, links_per_section=4)  # training's model, moving
 PRESSURES_KPA = np.array(
     [
@@ -153,40 +144,6 @@ def test_markers_run_from_the_base_to_the_tip(noiseless):
 # --- losses ----------------------------------------------------------------------------------------
 
 
-def test_hysteresis_loop_has_the_area_of_the_closed_form():
-    """A stop of stiffness k and limit k r, moved by +-a, loses 4 k r (a - r) a turn, or nothing."""
-    stiffness, stroke, a = np.array([100.0, 40.0, 7.0]), np.array([0.002, 0.01, 0.05]), 0.02
-    stops = StopOperators(stiffness[None], (stiffness * stroke)[None], np.zeros(1))
-    x = a * np.sin(2 * np.pi * np.linspace(0.0, 2.0, 80_001))
-    force = np.array([stops.move(x[k : k + 1])[0] for k in range(len(x))])
-    turn = slice(40_000, None)  # the second
-    area = np.sum(0.5 * (force[turn][1:] + force[turn][:-1]) * np.diff(x[turn]))
-    slides = stroke < a
-    assert area == pytest.approx(np.sum((4 * stiffness * stroke * (a - stroke))[slides]), rel=1e-4)
-
-
-def test_hysteresis_remembers_where_it_turned():
-    """Return-point memory: a small loop on the way closes, and leaves no trace."""
-    stops = [StopOperators(np.full((1, 3), 50.0), np.array([[0.1, 0.3, 0.7]]), np.zeros(1)) for _ in range(2)]
-    straight = [0.03, -0.02, 0.01]
-    detour = [0.03, -0.02, 0.0, -0.01, 0.0, 0.01]
-    for x in straight:
-        direct = stops[0].move(np.array([x]))
-    for x in detour:
-        around = stops[1].move(np.array([x]))
-    np.testing.assert_allclose(around, direct, atol=1e-12)
-
-
-def test_hysteresis_never_gives_more_than_it_took():
-    rng = np.random.default_rng(0)
-    limit = rng.uniform(0.1, 1.0, (5, 3))
-    stops = StopOperators(rng.uniform(10.0, 100.0, (5, 3)), limit, np.zeros(5))
-    step = 0.01 * rng.standard_normal((5000, 5))
-    force = np.array([stops.move(x) for x in np.cumsum(step, axis=0)])
-    assert (np.cumsum(force * step, axis=0) >= 0.0).all()
-    assert (np.abs(force) <= limit.sum(axis=1) + 1e-12).all()
-
-
 def test_closed_loop_in_pressure_dissipates():
     """Work of the air over a closed loop: little in a nearly undamped arm, much with losses."""
     work_j = []
@@ -219,66 +176,6 @@ def test_arm_that_is_pushed_comes_back_to_rest():
     mujoco.mj_step1(arm._model, arm._data)
     hold_pressures(arm, PRESSURES_KPA[2], 5.0)
     assert np.abs(arm._data.qvel).max() < 1e-3
-
-
-# --- air -------------------------------------------------------------------------------------------
-
-AREA_M2, SLOPE_M, REST_M, DT_S = 1.62e-3, -4.06e-3, 0.2, 0.001
-
-
-def air(n=9, length_m=0.2):
-    return Pneumatics(np.full(n, AREA_M2), np.full(n, SLOPE_M), REST_M, np.full(n, length_m), DT_S)
-
-
-@pytest.mark.parametrize("n_filled", [1, 9])
-@pytest.mark.parametrize("target_kpa", [20.0, -40.0])
-def test_pump_fills_as_fast_as_by_hand(n_filled, target_kpa):
-    """12 L/min into 0.324 L chambers held at their length: half of the way after n V p / (2 p_atm) / Q."""
-    system = air()
-    system.command(np.where(np.arange(9) < n_filled, target_kpa, 0.0))
-    half_s = n_filled * (1.62e-3 * 0.2) * 0.5 * abs(target_kpa) / 101.325 / (12e-3 / 60)
-    track = [system.step(np.full(9, 0.2)).copy() for _ in range(round((half_s + VALVE_S) / DT_S))]
-    np.testing.assert_allclose(track[-1][:n_filled], 0.5 * target_kpa, rtol=0.03)
-    np.testing.assert_array_equal(track[-1][n_filled:], 0.0)
-
-
-def test_valve_answers_after_its_dead_time():
-    system = air()
-    system.command(np.full(9, -5.0))
-    track = np.array([system.step(np.full(9, 0.2)).copy() for _ in range(20)])
-    dead = round(VALVE_S / DT_S)
-    np.testing.assert_array_equal(track[:dead], 0.0)
-    assert (track[dead:] < 0.0).all()
-
-
-def test_pressures_arrive_and_stay():
-    system, target_kpa = air(), np.linspace(-40.0, 20.0, 9)
-    system.command(target_kpa)
-    for _ in range(8000):
-        system.step(np.full(9, 0.2))
-    np.testing.assert_allclose(system.pressure_kpa, target_kpa, atol=1e-9)
-
-
-def test_volume_grows_by_the_effective_area():
-    length_m, h = np.linspace(0.1, 0.27, 9), 1e-6
-    system = air(length_m=0.2)
-    slope = (system.volume_m3(length_m + h) - system.volume_m3(length_m - h)) / (2 * h)
-    np.testing.assert_allclose(slope, AREA_M2 + SLOPE_M * (length_m - REST_M), rtol=1e-8)
-    np.testing.assert_allclose(system.volume_m3(np.full(9, 0.2)), AREA_M2 * 0.2)
-
-
-def test_chamber_cut_off_from_the_pump_follows_boyle(monkeypatch):
-    monkeypatch.setattr(pneumatics, "PUMP_M3_PER_S", 0.0)
-    system = air()
-    before = system.volume_m3(np.full(9, 0.2))
-    after = system.volume_m3(np.full(9, 0.17))
-    pressure = ATMOSPHERE_KPA + system.step(np.full(9, 0.17))
-    np.testing.assert_allclose(pressure * after, ATMOSPHERE_KPA * before)
-
-
-def test_paper_s_pump_and_valves():
-    assert pytest.approx(12.0) == PUMP_M3_PER_S * 60e3
-    assert VALVE_S == 0.01
 
 
 # --- sensors ---------------------------------------------------------------------------------------
@@ -431,67 +328,3 @@ def test_without_s2r_the_twins_miss_the_circle_by_the_paper_s_error(spec):
             integral_kpa = hold_springs(arm, reference_m, integral_kpa, gains, 8.0, arm._parts.sensor)
             errors_mm.append(np.linalg.norm(1e3 * arm.motion_capture().tip_m - point[:3]))
     assert np.mean(errors_mm) == pytest.approx(21.0, abs=1.5)
-
-
-# --- who may import it -----------------------------------------------------------------------------
-
-WITHOUT_TWIN = """
-import importlib, pkgutil, sys
-for name in ("train", "calib"):
-    package = importlib.import_module(name)
-    for module in pkgutil.walk_packages(package.__path__, name + "."):
-        if not module.name.endswith("__main__"):
-            importlib.import_module(module.name)
-print(sorted(name for name in sys.modules if name.startswith("mjx_softarm.twin")))
-"""
-DEPLOY_ALONE = """
-import sys
-import mjx_softarm.deploy, mjx_softarm.twin.hysteresis, mjx_softarm.twin.pneumatics
-print(sorted({name.split(".")[0] for name in sys.modules} & {"jax", "jaxlib", "mujoco", "train", "calib"}))
-"""
-
-
-def imported(path):
-    """Every name that a file imports anywhere in it: modules, and what is taken from them."""
-    package = path.relative_to(ROOT).with_suffix("").parts[:-1]
-    for node in ast.walk(ast.parse(path.read_text("utf-8"), str(path))):
-        if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            base = package[: len(package) - node.level + 1] if node.level else ()
-            module = ".".join([*base, *([node.module] if node.module else [])])
-            yield module
-            yield from (f"{module}.{alias.name}" for alias in node.names)
-
-
-@pytest.mark.parametrize("room", ["train", "calib"])
-def test_training_and_calibration_never_import_the_twin(room):
-    files = sorted((ROOT / room).rglob("*.py"))
-    assert files
-    assert not [
-        (path.name, name) for path in files for name in imported(path) if name.startswith("mjx_softarm.twin")
-    ]
-    texts = {path.name: path.read_text("utf-8") for path in files}
-    assert not [name for name, text in texts.items() if "softarm.twin" in text]  # importlib, by a string
-
-
-def test_the_import_check_sees_the_twin():
-    found = set(imported(ROOT / "mjx_softarm/twin/arm.py"))
-    assert {"mjx_softarm.twin.model", "mjx_softarm.twin.model.build_twin", "mujoco"} <= found
-
-
-def run_python(code):
-    return subprocess.run(
-        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=120, check=False
-    )
-
-
-def test_importing_training_and_calibration_leaves_the_twin_out():
-    done = run_python(WITHOUT_TWIN)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.strip() == "[]"
-
-
-def test_deploy_is_imported_without_mujoco():
-    done = run_python(DEPLOY_ALONE)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "[]\n", "")

@@ -1,0 +1,157 @@
+"""Imports between the rooms run one way, as the files' import statements and fresh processes show."""
+
+import ast
+import graphlib
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+# Rooms of a level may import those of the levels before, and others of their own level without a circle.
+# The bottom: `_support`, the specification, and the sensor classes, one of which a specification holds.
+LEVELS = (
+    ("bottom",),
+    ("sensing", "mechanics", "control", "logs"),
+    ("mdp",),
+    ("env", "policy"),
+    ("deploy", "twin"),
+    ("__init__", "__main__"),
+    ("calib",),
+    ("train",),
+    ("benchmarks",),
+)
+BOTTOM = ("_support", "spec", "sensing.sensors")
+LEVEL = {room: level for level, rooms in enumerate(LEVELS) for room in rooms}
+JOBS = ("calib", "train", "benchmarks")
+HEAVY = {"jax", "jaxlib", "mujoco"}
+# Functions that need JAX import it where they are called; the room itself is imported without.
+LIGHT = ("deploy", "policy", "sensing", "mdp", "logs")
+
+
+def imported(tree, path):
+    """Every name that a part of a file imports anywhere in it: modules, and what is taken from them."""
+    package = path.relative_to(ROOT).with_suffix("").parts[:-1]
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else ()
+            module = ".".join([*base, *([node.module] if node.module else [])])
+            yield module
+            yield from (f"{module}.{alias.name}" for alias in node.names)
+
+
+def room_of(name):
+    """The room of a module or of a path's parts, or None for a library."""
+    top, *below = name.split(".")
+    if top == "mjx_softarm":
+        if any(f"{'.'.join(below)}.".startswith(f"{part}.") for part in BOTTOM):
+            return "bottom"
+        return below[0] if below and below[0] in LEVEL else None
+    return top if top in JOBS else None
+
+
+def files():
+    """(room, path) of every file of the product and of the benchmarks."""
+    for top in ("mjx_softarm", *JOBS):
+        for path in sorted((ROOT / top).rglob("*.py")):
+            yield room_of(".".join(path.relative_to(ROOT).with_suffix("").parts)), path
+
+
+def is_type_checking(node):
+    return isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+
+
+ARROWS = [
+    (room, other, path)
+    for room, path in files()
+    for name in imported(ast.parse(path.read_text("utf-8")), path)
+    if (other := room_of(name))
+]
+
+
+def test_every_file_stands_in_a_room():
+    assert not [path for room, path in files() if room is None]
+    assert len(ARROWS) > 300
+
+
+def test_imports_run_one_way():
+    backward = {
+        (str(path.relative_to(ROOT)), other)
+        for room, other, path in ARROWS
+        if LEVEL[other] > LEVEL[room] or (room == "deploy" and other == "twin")
+    }
+    assert not backward
+
+
+def test_no_circle_between_rooms():
+    graph = {room: {b for a, b, _ in ARROWS if a == room and b != room} for room in LEVEL}
+    assert set(graphlib.TopologicalSorter(graph).static_order()) >= set(LEVEL)
+
+
+def test_no_circle_between_modules():
+    """By what is imported as a module is imported, not by functions or for types alone."""
+    graph = {}
+    for _, path in files():
+        name = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+        top = [node for node in ast.parse(path.read_text("utf-8")).body if not is_type_checking(node)]
+        taken = [node for node in top if isinstance(node, ast.Import | ast.ImportFrom)]
+        graph[name] = {found for node in taken for found in imported(node, path)}
+    graph = {name: found & graph.keys() for name, found in graph.items()}
+    assert sum(map(len, graph.values())) > 200
+    assert len(list(graphlib.TopologicalSorter(graph).static_order())) == len(graph)
+
+
+@pytest.mark.parametrize("room", ["train", "calib"])
+def test_training_and_calibration_never_import_the_twin(room):
+    assert "twin" not in {other for top, other, _ in ARROWS if top == room}
+    texts = {path: path.read_text("utf-8") for top, path in files() if top == room}
+    assert not [path for path, text in texts.items() if "softarm.twin" in text]  # importlib, by a string
+
+
+def test_the_import_check_sees_the_twin():
+    path = ROOT / "mjx_softarm/twin/arm.py"
+    found = set(imported(ast.parse(path.read_text("utf-8")), path))
+    assert {"mjx_softarm.twin.model", "mjx_softarm.twin.model.build_twin", "mujoco"} <= found
+    assert ("benchmarks", "twin") in {(room, other) for room, other, _ in ARROWS}
+
+
+@pytest.mark.parametrize("room", LIGHT)
+def test_light_rooms_name_no_simulator(room):
+    paths = [path for top, path in files() if top == room]
+    trees = {path: ast.parse(path.read_text("utf-8")) for path in paths}
+    names = {(path.name, name) for path, tree in trees.items() for name in imported(tree, path)}
+    assert paths and not {(path, name) for path, name in names if name.split(".")[0] in HEAVY}
+
+
+LOADED = """
+import importlib, pkgutil, sys
+for name in sys.argv[1:]:
+    package = importlib.import_module(name)
+    for module in pkgutil.walk_packages(package.__path__, name + "."):
+        if not module.name.endswith("__main__"):
+            importlib.import_module(module.name)
+print(*sorted(sys.modules))
+"""
+
+
+def loaded(*packages):
+    """Modules in a fresh process after the import of all modules of some packages."""
+    done = subprocess.run(
+        [sys.executable, "-c", LOADED, *packages], cwd=ROOT, capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+    return set(done.stdout.split())
+
+
+def test_importing_training_and_calibration_leaves_the_twin_out():
+    modules = loaded("train", "calib")
+    assert not {name for name in modules if name.startswith("mjx_softarm.twin")}
+    assert "train.agent.tqc" in modules
+
+
+def test_light_rooms_are_imported_without_jax_and_mujoco():
+    modules = loaded(*(f"mjx_softarm.{room}" for room in LIGHT))
+    assert not modules & {*HEAVY, *JOBS} and "mjx_softarm.deploy.session" in modules
