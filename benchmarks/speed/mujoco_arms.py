@@ -1,0 +1,225 @@
+"""Arms without this project's solver: C MuJoCo's threaded rollout, stepped in time until each arm settles.
+
+An environment step holds the references until no spring has moved by more than `REST_M` within `REST_S`,
+under the control law of `ReachEnv` at its rate and with the arm's own damping. Task, observation and reward
+are its own, too. JAX is not imported, so that processes start fast and stay small.
+
+That takes seconds of simulated time for each environment step: the arm swings until its damping has stopped
+it, and the law's integral action fills or empties a chamber no faster than its gains allow. Stopping earlier
+is cheaper but ends further from the equilibrium, so each rate comes with the error of where the arms stopped.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium
+import mujoco
+import numpy as np
+from mujoco import rollout
+
+from mjx_softarm import control
+from mjx_softarm.mdp.actions import ActionMap
+from mjx_softarm.mdp.observation import OBS_SIZE, ObsScale, observe
+from mjx_softarm.mdp.rewards import RewardConfig, reward
+from mjx_softarm.mechanics.mjcf import build_spec, spring_lengths
+from mjx_softarm.sensing.pose import pose_from_quaternion
+from mjx_softarm.spec import ARM_FILE, ArmSpec
+
+REST_S, REST_M = 0.5, 1e-4
+LONGEST_S = 12.0  # an arm that still moves after this is taken as it is
+SATURATION_TOLERANCE_M = 1e-3
+MODEL_FILE, POOL_FILE = "model.mjb", "pool.npz"
+
+
+def sensed_model(spec: ArmSpec) -> mujoco.MjModel:
+    """Return the arm's model with sensors of its springs and its tip, which a rollout records."""
+    mjspec = build_spec(spec)
+    for chamber in range(spec.n_chambers):
+        mjspec.add_sensor(
+            type=mujoco.mjtSensor.mjSENS_TENDONPOS,
+            objtype=mujoco.mjtObj.mjOBJ_TENDON,
+            objname=f"spring{chamber}",
+        )
+    for kind in (mujoco.mjtSensor.mjSENS_FRAMEPOS, mujoco.mjtSensor.mjSENS_FRAMEQUAT):
+        mjspec.add_sensor(type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname="tip")
+    return mjspec.compile()
+
+
+class RestDetector:
+    """Detector of settled arms (n), judged by their springs control period by control period.
+
+    Args:
+        n: number of arms.
+        spec: the arm.
+        rest_m: largest movement of a spring within `REST_S` that counts as none.
+    """
+
+    def __init__(self, n: int, spec: ArmSpec, rest_m: float = REST_M):
+        self._rest_m = rest_m
+        self._longest = round(LONGEST_S * spec.control.rate_hz)
+        self._past_m = np.empty((round(REST_S * spec.control.rate_hz) + 1, n, spec.n_chambers))
+        self._tick = 0
+
+    def after(self, length_m: np.ndarray, arms: slice | np.ndarray = slice(None)) -> np.ndarray:
+        """Take the springs (k, n_chambers) of some arms after a period; return which arms are done (k,)."""
+        self._past_m[self._tick % len(self._past_m), arms] = length_m
+        self._tick += 1
+        if self._tick >= self._longest:
+            return np.ones(len(length_m), bool)
+        if self._tick < len(self._past_m):
+            return np.zeros(len(length_m), bool)
+        return (np.ptp(self._past_m[:, arms], axis=0) <= self._rest_m).all(axis=-1)
+
+
+class Settled(NamedTuple):
+    """Arms after holding references."""
+
+    pose: np.ndarray  # (n, 6) [mm, deg]
+    pressure_kpa: np.ndarray  # (n, n_chambers)
+    physics_steps: int  # of all arms together
+
+
+class SteppedArms:
+    """Arms side by side in a threaded rollout; `stepping_s` is the time spent in the rollout so far.
+
+    Args:
+        model: made by `sensed_model`.
+        spec: the same arm.
+        n: number of arms.
+        n_threads: threads of the rollout; 0 computes in the calling one.
+    """
+
+    def __init__(self, model: mujoco.MjModel, spec: ArmSpec, n: int, n_threads: int):
+        self.n, self.spec, self.model = n, spec, model
+        self.gains, self.period_s = control.Gains.from_spec(spec), 1.0 / spec.control.rate_hz
+        self._data = [mujoco.MjData(model) for _ in range(max(1, n_threads))]
+        self._rollout, self.stepping_s = rollout.Rollout(nthread=n_threads), 0.0
+        self._n_steps = round(self.period_s / model.opt.timestep)
+        size = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)  # time, qpos, qvel
+        self._state = np.zeros((n, size))
+        self._integral_kpa, self.length_m = np.zeros((2, n, spec.n_chambers))
+        self.place(np.ones(n, bool), np.zeros((n, model.nq)), np.zeros((n, model.nu)))
+
+    def place(self, arms: np.ndarray, q: np.ndarray, pressure_kpa: np.ndarray) -> None:
+        """Put the arms of a mask (n,) to rest at joint coordinates (k, nq) that balance pressures [kPa]."""
+        self._state[arms] = 0.0
+        self._state[arms, 1 : self.model.nq + 1] = q
+        self._integral_kpa[arms] = pressure_kpa
+        data = self._data[0]
+        for index, coordinates in zip(np.flatnonzero(arms), q, strict=True):
+            data.qpos[:] = coordinates
+            mujoco.mj_fwdPosition(self.model, data)
+            self.length_m[index] = spring_lengths(data)
+
+    def settle(self, reference_m: np.ndarray, rest_m: float = REST_M) -> Settled:
+        """Hold references (n, n_chambers) until each arm rests.
+
+        Springs are read as a rollout leaves them, one time step old.
+        """
+        rest, moving, n_physics = RestDetector(self.n, self.spec, rest_m), np.arange(self.n), 0
+        pressure_kpa, tip = np.zeros_like(reference_m), np.zeros((self.n, 7))
+        while len(moving):
+            pressure, self._integral_kpa[moving] = control.pressures(
+                reference_m[moving],
+                self.length_m[moving],
+                self._integral_kpa[moving],
+                self.gains,
+                self.period_s,
+            )
+            start = time.perf_counter()
+            state, sensed = self._rollout.rollout(
+                self.model, self._data, self._state[moving], pressure[:, None], nstep=self._n_steps
+            )
+            self.stepping_s += time.perf_counter() - start
+            self._state[moving], pressure_kpa[moving] = state[:, -1], pressure
+            self.length_m[moving], tip[moving] = np.split(sensed[:, -1], [self.spec.n_chambers], axis=1)
+            n_physics += len(moving) * self._n_steps
+            moving = moving[~rest.after(self.length_m[moving], moving)]
+        return Settled(pose_from_quaternion(tip[:, :3], tip[:, 3:]), pressure_kpa, n_physics)
+
+    def close(self) -> None:
+        """End the rollout's threads."""
+        self._rollout.close()
+
+
+def write_arm(folder: Path, spec: ArmSpec, n_poses: int = 1024) -> None:
+    """Write what `SteppedReach` needs: specification, model, and poses to start at and to reach."""
+    from mjx_softarm.mechanics.workspace import sample_workspace  # imports JAX
+
+    spec.to_toml(folder / ARM_FILE)
+    mujoco.mj_saveModel(sensed_model(spec), str(folder / MODEL_FILE))
+    pool = sample_workspace(spec, n_poses, seed=0)
+    arrays: dict[str, Any] = {name: np.asarray(x, float) for name, x in pool._asdict().items()}
+    np.savez(folder / POOL_FILE, **arrays)
+
+
+class SteppedReach:
+    """Reaching for poses as `ReachEnv` defines it, with arms that are stepped in time.
+
+    Args:
+        folder: specification, model and pool of poses, as `write_arm` makes it.
+        n: number of arms.
+        n_threads: threads of the rollout.
+        seed: of starts and goals.
+        episode_length: environment steps.
+    """
+
+    def __init__(self, folder: str, n: int, n_threads: int, seed: int, episode_length: int):
+        spec = ArmSpec.from_toml(Path(folder) / ARM_FILE)
+        model = mujoco.MjModel.from_binary_path(str(Path(folder) / MODEL_FILE))
+        self.arms = SteppedArms(model, spec, n, n_threads)
+        with np.load(Path(folder) / POOL_FILE) as pool:
+            self._pool = {name: pool[name] for name in pool.files}
+        self._rng, self._episode_length = np.random.default_rng(seed), episode_length
+        self._scale, self._reward = ObsScale.from_spec(spec), RewardConfig()
+        self.reference_m = ActionMap.from_spec(spec).lengths  # of actions
+        self.goal, self.n_taken = np.zeros((n, 6)), np.zeros(n, int)
+
+    def reset(self, arms: np.ndarray) -> np.ndarray:
+        """Start episodes of the arms of a mask (n,) at random poses; return observations (k, OBS_SIZE)."""
+        start, goal = self._rng.integers(len(self._pool["pose"]), size=(2, np.count_nonzero(arms)))
+        self.arms.place(arms, self._pool["q"][start], self._pool["pressure_kpa"][start])
+        self.goal[arms], self.n_taken[arms] = self._pool["pose"][goal], 0
+        return observe(self._pool["pose"][start], self.goal[arms], self._scale, self._reward)
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Settled]:
+        """Act with all arms (n, n_chambers): observations, rewards, reached, over, where they are."""
+        reference_m = self.reference_m(action)
+        end = self.arms.settle(reference_m)
+        self.n_taken += 1
+        saturated = control.saturated(
+            end.pressure_kpa, reference_m, self.arms.length_m, self.arms.gains, SATURATION_TOLERANCE_M
+        ).any(axis=-1)
+        value, reached, *_ = reward(end.pose, self.goal, self.n_taken, saturated, self._reward)
+        obs = observe(end.pose, self.goal, self._scale, self._reward)
+        return obs, value, reached, self.n_taken >= self._episode_length, end
+
+
+class SteppedReachGym(gymnasium.Env):
+    """`SteppedReach` of one arm; an info has references and tip, to find the error of where it stopped."""
+
+    def __init__(self, folder: str, seed: int, episode_length: int):
+        self._reach = SteppedReach(folder, 1, 0, seed, episode_length)
+        n_chambers = self._reach.arms.spec.n_chambers
+        self.timestep_s = self._reach.arms.model.opt.timestep
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (OBS_SIZE,), np.float32)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (n_chambers,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
+        """Start an episode; its random numbers continue the last one's."""
+        return self._reach.reset(np.ones(1, bool))[0].astype(np.float32), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        """Hold the references of an action until the arm rests."""
+        before_s = self._reach.arms.stepping_s
+        (obs,), (value,), (reached,), (over,), end = self._reach.step(action[None])
+        info: dict[str, Any] = {
+            "n_physics": end.physics_steps,
+            "stepping_s": self._reach.arms.stepping_s - before_s,
+            "reference_m": self._reach.reference_m(action),
+            "tip_mm": end.pose[0, :3],
+        }
+        return obs.astype(np.float32), float(value), bool(reached), bool(over), info
