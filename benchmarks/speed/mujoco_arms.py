@@ -24,7 +24,6 @@ from mjx_softarm import control
 from mjx_softarm.mdp.actions import ActionMap
 from mjx_softarm.mdp.observation import OBS_SIZE, ObsScale, observe
 from mjx_softarm.mdp.rewards import RewardConfig, reward
-from mjx_softarm.mechanics.mjcf import build_spec, spring_lengths
 from mjx_softarm.sensing.pose import pose_from_quaternion
 from mjx_softarm.spec import ARM_FILE, ArmSpec
 
@@ -36,6 +35,8 @@ MODEL_FILE, POOL_FILE = "model.mjb", "pool.npz"
 
 def sensed_model(spec: ArmSpec) -> mujoco.MjModel:
     """Return the arm's model with sensors of its springs and its tip, which a rollout records."""
+    from mjx_softarm.mechanics.mjcf import build_spec  # imports JAX
+
     mjspec = build_spec(spec)
     for chamber in range(spec.n_chambers):
         mjspec.add_sensor(
@@ -112,7 +113,8 @@ class SteppedArms:
         for index, coordinates in zip(np.flatnonzero(arms), q, strict=True):
             data.qpos[:] = coordinates
             mujoco.mj_fwdPosition(self.model, data)
-            self.length_m[index] = spring_lengths(data)
+            mujoco.mj_sensorPos(self.model, data)
+            self.length_m[index] = data.sensordata[: self.spec.n_chambers]
 
     def settle(self, reference_m: np.ndarray, rest_m: float = REST_M) -> Settled:
         """Hold references (n, n_chambers) until each arm rests.

@@ -1,16 +1,26 @@
-"""The throughput benchmark's parts: C MuJoCo's rest against the solver, rows of programs that take turns."""
+"""The throughput benchmark: C MuJoCo's rest against the solver, rows of programs that take turns."""
 
+import subprocess
 import sys
 
+import jax
 import numpy as np
 import pytest
 
-from benchmarks.speed import gpu, throughput
-from benchmarks.speed.mujoco_arm import REST_S, Rest, SteppedArm, SteppedReach, Task
-from benchmarks.speed.mujoco_rollout import RolloutArms, RolloutReach, sensed_model
+from benchmarks.harness.rounds import WorkerError
+from benchmarks.speed import throughput
+from benchmarks.speed.jax_worker import compile_twice
+from benchmarks.speed.mujoco_arms import (
+    REST_S,
+    RestDetector,
+    SteppedArms,
+    SteppedReach,
+    SteppedReachGym,
+    sensed_model,
+    write_arm,
+)
+from benchmarks.speed.mujoco_worker import Step, timed
 from benchmarks.speed.throughput import over_rounds, points, side_by_side
-from benchmarks.speed.throughput_arms import compile_twice
-from benchmarks.speed.throughput_peers import Stepped, timed, write_arm
 from benchmarks.speed.truth import error_figures, random_references, true_rest
 from mjx_softarm import ArmSpec
 from mjx_softarm.env import EnvConfig, ReachEnv
@@ -44,42 +54,29 @@ def truth(reference):
 # --- C MuJoCo in time steps --------------------------------------------------------------------------------
 
 
-def test_the_arm_stepped_in_time_rests_where_the_solver_says(model, reference, truth):
-    arm = SteppedArm(model, Task(SPEC))
-    tips_mm = []
-    for row in reference:
-        n_steps = arm.move(row)
-        tips_mm.append(1e3 * arm.tip_m)
-        assert n_steps * model.opt.timestep > REST_S
+def test_arms_stepped_in_time_rest_where_the_solver_says_alone_and_in_company(model, reference, truth):
+    arms = SteppedArms(model, SPEC, N, n_threads=2)
+    end = arms.settle(reference)
+    arms.close()
     assert truth.settled.all() and 0.2 < truth.share_at_limit < 0.8
-    assert error_figures(np.array(tips_mm), truth)["max_mm"] < 1.5  # the springs may still creep by 0.1 mm
+    assert error_figures(end.pose[:, :3], truth)["max_mm"] < 1.5  # the springs may still creep by 0.1 mm
+    assert end.physics_steps * model.opt.timestep > N * REST_S
+    alone = [SteppedArms(model, SPEC, 1, n_threads=0).settle(row[None]) for row in reference]
+    np.testing.assert_allclose(end.pose, [one.pose[0] for one in alone], atol=1e-6)
+    assert end.physics_steps == sum(one.physics_steps for one in alone)
 
 
 def test_a_stricter_rest_takes_longer_and_is_closer(model, reference, truth):
     found = []
     for rest_m in (1e-3, 1e-5):
-        arm = SteppedArm(model, Task(SPEC), rest_m)
-        found.append((arm.move(reference[0]), np.linalg.norm(1e3 * arm.tip_m - truth.tip_mm[0])))
+        end = SteppedArms(model, SPEC, 1, n_threads=0).settle(reference[:1], rest_m)
+        found.append((end.physics_steps, np.linalg.norm(end.pose[0, :3] - truth.tip_mm[0])))
     (fast_steps, fast_mm), (slow_steps, slow_mm) = found
     assert slow_steps > fast_steps and slow_mm < 0.2 < fast_mm
 
 
-def test_the_rollout_rests_as_single_arms_do(model, reference, truth):
-    arms = RolloutArms(model, SPEC, N, n_threads=2)
-    end = arms.move(reference)
-    arms.close()
-    single = SteppedArm(model, Task(SPEC))
-    total = 0
-    for k in range(N):
-        single.place(np.zeros(model.nq), np.zeros(9))
-        total += single.move(reference[k])
-        np.testing.assert_allclose(end.pose[k], single.pose, atol=0.02)
-    assert abs(end.physics_steps - total) < 0.02 * total
-    assert error_figures(end.pose[:, :3], truth)["max_mm"] < 1.5
-
-
-def test_rest_is_when_no_spring_has_moved_for_long_enough():
-    rest = Rest(2, SPEC, rest_m=1e-3)
+def test_an_arm_rests_when_no_spring_has_moved_for_long_enough():
+    rest = RestDetector(2, SPEC, rest_m=1e-3)
     n_quiet = round(REST_S * SPEC.control.rate_hz)
     still, ticks = np.zeros(9), []
     for tick in range(3 * n_quiet):
@@ -90,69 +87,77 @@ def test_rest_is_when_no_spring_has_moved_for_long_enough():
 
 
 def test_a_spring_that_swings_back_to_where_it_was_does_not_rest():
-    rest = Rest(1, SPEC, rest_m=1e-3)
+    rest = RestDetector(1, SPEC, rest_m=1e-3)
     period = round(REST_S * SPEC.control.rate_hz)
     swing = 2e-3 * np.sin(2 * np.pi * np.arange(4 * period) / period)
     assert not any(rest.after(np.full((1, 9), value))[0] for value in swing)
 
 
-def test_the_peers_environments_are_the_project_s(folder, model):
-    env = ReachEnv(SPEC, EnvConfig(n_poses=16))
-    stepped = SteppedReach(str(folder), seed=0, episode_length=2)
+def test_the_stepped_environment_is_the_project_s(folder):
+    env, envs = ReachEnv(SPEC, EnvConfig(n_poses=16)), SteppedReach(str(folder), 1, 0, 0, episode_length=2)
+    obs = envs.reset(np.ones(1, bool))
+    action = np.random.default_rng(0).uniform(-1.0, 1.0, 9).astype(np.float32)
+    np.testing.assert_allclose(envs.reference_m(action), env.reference_m(action), atol=1e-6)
+    after, value, reached, over, end = envs.step(action[None])
+    np.testing.assert_allclose(obs[:, 6:12], after[:, 6:12])  # the goal
+    pose, goal = (x[0].astype(np.float32) for x in (end.pose, envs.goal))
+    np.testing.assert_allclose(after[0], env.observe(pose, goal), atol=1e-5)
+    assert value == -100.0 and not reached and not over  # a random action saturates
+
+
+def test_as_a_gymnasium_environment_it_tells_costs_and_where_it_stopped(folder):
+    stepped, action = SteppedReachGym(str(folder), seed=0, episode_length=2), np.zeros(9, np.float32)
     obs, _ = stepped.reset()
-    rng = np.random.default_rng(0)
-    action = rng.uniform(-1.0, 1.0, 9).astype(np.float32)
-    np.testing.assert_allclose(stepped._task.reference_m(action), env.reference_m(action), atol=1e-6)
-    after, value, terminated, truncated, info = stepped.step(action)
-    pose, goal = stepped._arm.pose, stepped._goal
-    np.testing.assert_allclose(obs[6:12], after[6:12])
-    np.testing.assert_allclose(
-        after, env.observe(pose.astype(np.float32), goal.astype(np.float32)), atol=1e-5
-    )
-    assert value == -100.0 and not terminated and not truncated  # a random action saturates
-    assert info["physics_steps"] > 100 and 0.0 < info["stepping_s"] < 60.0
-    np.testing.assert_allclose(info["tip_mm"], pose[:3])
-    assert stepped.step(action)[3]  # its time is over
+    after, _, terminated, truncated, info = stepped.step(action)
+    assert stepped.observation_space.contains(obs) and stepped.observation_space.contains(after)
+    assert not terminated and not truncated and stepped.step(action)[3]
+    assert info.keys() == set(Step._fields) and info["tip_mm"].shape == (3,)
+    assert info["n_physics"] > 100 and 0.0 < info["stepping_s"] < 60.0
 
 
-def test_an_arm_of_the_rollout_that_reached_its_goal_begins_anew(folder, model):
-    with np.load(folder / "pool.npz") as stored:
-        pool = {name: stored[name] for name in stored.files}
-    arms = RolloutArms(model, SPEC, N, n_threads=1)
-    envs = RolloutReach(arms, pool, episode_length=2)
-    envs._goal[:] = pool["pose"][:N]
-    task_action = ReachEnv(SPEC, EnvConfig(n_poses=16)).action_of(pool["spring_m"][:N].astype(np.float32))
-    action = np.array(task_action)
-    action[1] = 1.0  # the longest springs: not there
-    _, value, *_ = envs.step(action)
+def test_arms_that_reach_their_goals_are_told_from_those_whose_time_is_over(folder):
+    envs = SteppedReach(str(folder), N, 1, seed=0, episode_length=2)
+    envs.reset(np.ones(N, bool))
+    with np.load(folder / "pool.npz") as pool:
+        envs.goal[:] = pool["pose"][:N]
+        spring_m = pool["spring_m"][:N]
+    action = np.array(ReachEnv(SPEC, EnvConfig(n_poses=16)).action_of(spring_m.astype(np.float32)))
+    action[1] = 1.0  # the longest springs: not at its goal
+    _, value, reached, over, _ = envs.step(action)
     assert (value[[0, 2, 3]] == 100.0).all() and value[1] < 0.0
-    np.testing.assert_array_equal(envs._n_taken, [0, 1, 0, 0])
-    envs.step(action)
-    assert envs._n_taken[1] == 0  # its time was over
-    arms.close()
+    assert reached.tolist() == [True, False, True, True] and not over.any()
+    envs.reset(reached | over)
+    assert envs.step(action)[3].tolist() == [False, True, False, False]
+
+
+def test_the_stepped_arms_need_no_jax():
+    check = "import sys, benchmarks.speed.mujoco_arms; sys.exit('jax' in sys.modules)"
+    assert (
+        subprocess.run(
+            [sys.executable, "-c", check], cwd=throughput.__file__.split("/benchmarks")[0]
+        ).returncode
+        == 0
+    )
 
 
 # --- programs side by side ---------------------------------------------------------------------------------
 
 
-def test_a_point_that_fails_in_company_is_tried_alone_and_then_tells_why(monkeypatch):
-    tried = []
-
+def test_a_point_that_fails_tells_why_and_costs_no_other(monkeypatch):
     def made_up(workers, n_rounds):
-        names = [worker.name.split(",")[0] for worker in workers]
-        tried.append(names)
         failing = {w.name: f"{w.name}: no memory" for w in workers if "dynamic" in w.name}
-        if len(workers) > 1:
-            failing |= {w.name: "too many" for w in workers if w.name.startswith("mjx")}
         return {w.name: [{"env_steps_per_s": 7.0}] for w in workers if w.name not in failing}, failing
 
     monkeypatch.setattr(throughput, "take_turns", made_up)
-    group = [("chain", "quasistatic", 8, 4), ("mjx", "quasistatic", 8, 4), ("mjx", "dynamic", 8, 4)]
-    rows = throughput._group(group)
-    assert tried == [["chain", "mjx", "mjx"], ["mjx"], ["mjx"]]
-    assert [row.get("env_steps_per_s") for row in rows] == [7.0, 7.0, None]
-    assert rows[2]["failed"] == "mjx, dynamic, 8 arms, 4 links: no memory"
-    assert (rows[2]["engine"], rows[2]["mode"], rows[2]["arms"]) == ("mjx", "dynamic", 8)
+    rows = throughput.turns([("chain", "quasistatic", 8, 4), ("mjx", "dynamic", 8, 4)])
+    assert [row.get("env_steps_per_s") for row in rows] == [7.0, None]
+    assert rows[1] == {
+        "engine": "mjx",
+        "mode": "dynamic",
+        "arms": 8,
+        "links_per_section": 4,
+        "failed": "mjx, dynamic, 8 arms, 4 links: no memory",
+    }
 
 
 def test_side_by_side_a_program_that_fails_has_a_row_that_says_why(monkeypatch):
@@ -165,13 +170,19 @@ def test_side_by_side_a_program_that_fails_has_a_row_that_says_why(monkeypatch):
     monkeypatch.setattr(throughput, "peer_python", lambda name: sys.executable)
     rows = throughput._side_by_side(SPEC, on_gpu=False)
     assert rows[0]["env_steps_per_s"] == 4670 and rows[0]["times_paper"] == 10.0
-    assert [row["failed"] for row in rows] == [None, "no memory", "no memory", "no memory", None, None]
-    assert rows[4]["skipped"] == gpu.NO_DEVICE
+    assert [row["failed"] for row in rows] == [None, "no memory", "no memory", "no memory", None]
 
 
 def test_a_start_that_fails_tells_why(monkeypatch):
-    monkeypatch.setattr(throughput, "_START", "raise RuntimeError('not {cache} today')")
-    assert throughput._start("here") == {"failed": "status 1: RuntimeError: not here today"}
+    def fail(worker):
+        raise WorkerError(f"{worker.name}: stopped with status 1, expected a result:\nno memory")
+
+    monkeypatch.setattr(throughput.Worker, "start", fail)
+    starts = throughput._starts()
+    assert {state: row["failed"].endswith("no memory") for state, row in starts.items()} == {
+        "empty_cache": True,
+        "filled_cache": True,
+    }
 
 
 def test_rates_are_medians_over_rounds_and_arrays_are_left_out():
@@ -184,8 +195,6 @@ def test_rates_are_medians_over_rounds_and_arrays_are_left_out():
 
 
 def test_compiling_anew_and_from_the_cache_gives_a_function_that_computes():
-    import jax
-
     compiled, facts = compile_twice(jax.jit(lambda x: 2 * x), 3.0)
     assert compiled(4.0) == 8.0
     assert facts.keys() == {"tracing_s", "compiling_s", "both_from_cache_s"}
@@ -202,34 +211,26 @@ def test_everything_asked_for_is_measured():
     assert {n for group in points(on_gpu=True) for *_, n, _ in group} >= {1, 8192, 32_768}
 
 
-def test_rates_are_told_as_multiples_of_the_processes():
+def test_rates_are_told_as_multiples_of_the_processes_and_of_the_paper():
     rows = side_by_side(
         [
             {"program": "chain", "env_steps_per_s": 5000},
             {"program": "C MuJoCo, SubprocVecEnv, 2 processes", "env_steps_per_s": 50, "p95_mm": 0.5},
-            {"program": "MJX-Warp", "skipped": "no device"},
+            {"program": "C MuJoCo, rollout", "skipped": "no device"},
         ]
     )
     assert [row["times_subproc"] for row in rows] == [100, 1.0, None, None]
+    assert [row["times_paper"] for row in rows] == [10.71, 0.11, None, None]
     assert rows[2]["skipped"] == "no device" and rows[1]["p95_mm"] == 0.5
     assert rows[3]["env_steps_per_s"] == 467  # the paper's
-    assert [row["times_paper"] for row in rows] == [10.71, 0.11, None, None]
-    assert "lockstep" in rows[1]["note"] and rows[0]["note"] is None
-    without = side_by_side([{"program": "chain", "env_steps_per_s": 5000}])
-    assert without[0]["times_subproc"] is None
+    assert side_by_side([{"program": "chain", "env_steps_per_s": 5000}])[0]["times_subproc"] is None
 
 
-STEPS = [
-    Stepped(2, 400, 0.25, np.zeros((2, 9)), np.ones((2, 3))),
-    Stepped(2, 200, 0.05, np.zeros((2, 9)), np.ones((2, 3))),
-]
-
-
-def test_what_an_environment_step_of_a_peer_is_made_of(monkeypatch):
+def test_an_environment_step_is_taken_apart(monkeypatch):
     clock = iter([0.0, 0.0, 0.5, 1.0])
-    monkeypatch.setattr("benchmarks.speed.throughput_peers.time.perf_counter", lambda: next(clock))
-    monkeypatch.setattr("benchmarks.speed.throughput_peers.ROUND_S", 1.0)
-    steps = iter(STEPS)
+    monkeypatch.setattr("benchmarks.speed.mujoco_worker.time.perf_counter", lambda: next(clock))
+    monkeypatch.setattr("benchmarks.speed.mujoco_worker.ROUND_S", 1.0)
+    steps = iter(Step(n, s, np.zeros((2, 9)), np.ones((2, 3))) for n, s in ((400, 0.25), (200, 0.05)))
     told = timed(lambda: next(steps), timestep_s=0.002)
     assert (told["env_steps_per_s"], told["physics_steps_per_s"]) == (4.0, 600.0)
     assert (told["physics_steps_per_env_step"], told["simulated_s_per_env_step"]) == (150, 0.3)
