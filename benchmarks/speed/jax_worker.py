@@ -31,9 +31,9 @@ from mjx_softarm.env.vector import VectorEnv
 from mjx_softarm.mechanics.mjcf import steps_per_period
 from mjx_softarm.spec import ArmSpec
 from train.agent.hindsight_tqc import HindsightTQC
-from train.config import PRESETS
 from train.epoch.devices import split
 from train.epoch.job import Job
+from train.presets import PRESETS
 
 N_STEPS = {"quasistatic": 8, "dynamic": 1}  # environment steps of each arm in a call
 N_POSES = 1024

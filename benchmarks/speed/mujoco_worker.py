@@ -102,19 +102,20 @@ def settle(references: str, links: str) -> tuple[Facts, Callable[[], Facts]]:
     spec = ArmSpec.default().replace(structure={"links_per_section": int(links)})
     with np.load(references) as stored:
         sets = {name: stored[name][:N_STEPPED] for name in stored.files}
-    arms = SteppedArms(sensed_model(spec), spec, N_STEPPED, n_cores())
-    straight, empty = np.zeros((N_STEPPED, arms.model.nq)), np.zeros((N_STEPPED, spec.n_chambers))
+    n = len(next(iter(sets.values())))
+    arms = SteppedArms(sensed_model(spec), spec, n, n_cores())
+    straight, empty = np.zeros((n, arms.model.nq)), np.zeros((n, spec.n_chambers))
 
     def work() -> Facts:
         told = {}
         for name, reference in sets.items():
             start = time.perf_counter()
-            arms.place(np.ones(N_STEPPED, bool), straight, empty)
+            arms.place(np.ones(n, bool), straight, empty)
             end = arms.settle(reference)
             told[name] = {
-                "solves_per_s": N_STEPPED / (time.perf_counter() - start),
+                "solves_per_s": n / (time.perf_counter() - start),
                 "tip_mm": end.pose[:, :3].tolist(),
-                "mean_simulated_s": round(end.physics_steps * arms.model.opt.timestep / N_STEPPED, 2),
+                "mean_simulated_s": round(end.physics_steps * arms.model.opt.timestep / n, 2),
             }
         return told
 
