@@ -13,7 +13,7 @@ from mjx_softarm._support.errors import InputError
 
 N_WORKERS = 2  # each on cores of its own: faster than one training on all of them
 
-Job = tuple[str, Callable[..., Any], tuple[Any, ...]]  # what to call it, function and arguments
+Job = tuple[str, Callable[..., Any], tuple[Any, ...]]  # name, function, arguments
 
 
 class JobError(InputError):
@@ -21,7 +21,7 @@ class JobError(InputError):
 
 
 def in_parallel(jobs: Sequence[Job]) -> dict[str, Any]:
-    """Do jobs in processes of their own, a few at a time; returns what each gave, by its name.
+    """Do jobs in processes of their own, a few at a time; return their results by name.
 
     Raises:
         JobError: one failed; those under way are finished, the others are not begun.
@@ -49,13 +49,13 @@ def in_parallel(jobs: Sequence[Job]) -> dict[str, Any]:
 
 
 def _shares(cores: Sequence[int]) -> list[list[int]]:
-    """The cores of each worker."""
+    """Return the cores of each worker."""
     n = min(N_WORKERS, len(cores))
     return [list(cores[k::n]) for k in range(n)]
 
 
 def _settle_worker(queue: Any) -> None:
-    """Keep a worker, and what it starts, to its cores; Ctrl-C ends it, and training saves by itself."""
+    """Keep a worker and its children to its cores; Ctrl-C ends it, as training saves by itself."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     if share := queue.get():
         os.sched_setaffinity(0, share)

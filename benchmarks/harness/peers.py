@@ -1,11 +1,11 @@
 """Virtual environments of the libraries that this project is compared with, made on first use.
 
-Each has the peer, and of what the simulator needs the very versions that run here, so that all contestants
-train on the same environment. One is no peer's: it has JAX's compiler for GPUs, for machines without one.
-They lie beside the checkout's own `.venv`, as `.venv-PEER`. A file in them says what they were made of: one
-that is incomplete, or made of anything else, is made anew.
+Each has the peer and the simulator's packages in the versions that run here, so that all contestants train
+on the same environment. One more has JAX's compiler for GPUs, for machines without a GPU. They lie beside the
+checkout's own `.venv`, as `.venv-PEER`. A file in each lists its packages: an incomplete environment, or one
+of other packages, is made anew.
 
-PyTorch comes as the package index has it, on Linux with gigabytes of CUDA. Where these are not wanted:
+On Linux, PyTorch comes with gigabytes of CUDA. To do without them, set
 `PIP_EXTRA_INDEX_URL=https://download.pytorch.org/whl/cpu`.
 """
 
@@ -24,7 +24,7 @@ MARKER = "complete"
 _SB3 = ("stable-baselines3==2.9.2", "torch==2.13.0")
 PINS = {"sbx": ("sbx-rl==0.28.0", *_SB3), "sb3-contrib": ("sb3-contrib==2.9.2", *_SB3)}
 COMPILER = "gpu-compiler"
-# What mjx_softarm, train.runs.evaluate and train.epoch.job import.
+# Packages that mjx_softarm, train.runs.evaluate and train.epoch.job import.
 SHARED = (
     "numpy",
     "tomli_w",
@@ -40,15 +40,15 @@ SHARED = (
 
 
 class PeerError(RuntimeError):
-    """A peer that cannot be had here; the message says which, and why."""
+    """A peer that cannot be installed; the message says which, and why."""
 
 
 def peer_python(name: str, root: Path = ROOT) -> Path:
-    """The interpreter of a peer's virtual environment.
+    """Return the interpreter of a peer's virtual environment, which is made if there is none.
 
     Args:
         name: key of `PINS`, or `COMPILER`.
-        root: folder that the environment lies in.
+        root: folder of the environment.
 
     Raises:
         PeerError: it could not be made.
@@ -71,7 +71,7 @@ def peer_python(name: str, root: Path = ROOT) -> Path:
 
 
 def peer_packages(name: str) -> tuple[str, ...]:
-    """What a peer's environment is made of; its jax is for CUDA where the one here is."""
+    """Return the packages of a peer's environment; its JAX is for CUDA if this one is."""
     if name == COMPILER:
         return (f"jax-cuda12-plugin=={metadata.version('jax')}", *_pinned({}))
     cuda = any(distribution.name == "jax-cuda12-plugin" for distribution in metadata.distributions())
@@ -79,7 +79,7 @@ def peer_packages(name: str) -> tuple[str, ...]:
 
 
 def _pinned(names: Mapping[str, str]) -> list[str]:
-    """What is shared, at the versions that run here, under its own names or these."""
+    """Return the shared packages in the versions that run here, some under other names."""
     return [f"{names.get(package, package)}=={metadata.version(package)}" for package in SHARED]
 
 

@@ -1,7 +1,7 @@
 """Programs that take turns, so that whatever else the machine does slows all of them alike.
 
 Each is a process of its own: compilation starts from an empty cache, memory is its own, and it may run in
-another virtual environment. It prepares itself, then does one round of work whenever it is told to.
+another virtual environment. It prepares itself, then does one round of work on each request.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 
-ANSWER_S = 1800.0  # a program that says nothing for so long is stopped; compiling takes minutes
+ANSWER_S = 1800.0  # a program that is silent for longer is stopped; compiling takes minutes
 
 Facts = dict[str, Any]
 
@@ -30,22 +30,22 @@ class WorkerError(RuntimeError):
 
     @property
     def reason(self) -> str:
-        """All of it in a line: its first and, if it has more, its last."""
+        """The message in a line: its first and, if it has more, its last."""
         lines = str(self).splitlines()
         return " ".join(lines[:1] + lines[1:][-1:])
 
 
 class Worker:
-    """A program at the other end: one line of JSON once it is ready, and one for each round.
+    """A program that answers with one line of JSON once it is ready, and with one for each round.
 
     Args:
-        name: for messages.
+        name: its name in messages.
         program: module and arguments, as after `python -m`.
         python: the interpreter; this one if None.
-        n_cores: how many of this process's cores it may use; all if None.
+        n_cores: number of this process's cores that it may use; all if None.
 
     Raises:
-        WorkerError: of `start` and `round`: it stopped, or said nothing for `ANSWER_S`.
+        WorkerError: in `start` and `round`, the program stopped or was silent for `ANSWER_S`.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class Worker:
         self._process: Any = None
 
     def start(self) -> None:
-        """Start it and wait until it is prepared; what it tells of that is in `facts`."""
+        """Start the program and wait until it is prepared; its first answer is in `facts`."""
         paths = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
         environment = {**os.environ, "TF_CPP_MIN_LOG_LEVEL": "3", "PYTHONPATH": os.pathsep.join(paths)}
         with _few_cores(self._n_cores):
@@ -73,14 +73,14 @@ class Worker:
         self.facts = self._answer()
 
     def round(self) -> Facts:
-        """What one round gave."""
-        with contextlib.suppress(BrokenPipeError):  # why it stopped is told below
+        """Do one round and return its answer."""
+        with contextlib.suppress(BrokenPipeError):  # the answer says why it stopped
             self._process.stdin.write("\n")
             self._process.stdin.flush()
         return self._answer()
 
     def close(self) -> None:
-        """Let it end, or make it; nothing happens to one that is not running."""
+        """Let the program end, or kill it; do nothing if it is not running."""
         if self._process is None:
             return
         with contextlib.suppress(BrokenPipeError):
@@ -110,7 +110,7 @@ class Worker:
 
 @contextlib.contextmanager
 def working(*workers: Worker) -> Iterator[None]:
-    """Workers that are started one after the other, and closed at the end."""
+    """Start workers one after the other, and close them at the end."""
     try:
         for worker in workers:
             print(f"starting: {worker.name}", flush=True)
@@ -123,7 +123,7 @@ def working(*workers: Worker) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _few_cores(n: int | None) -> Iterator[None]:
-    """Keep what is started inside to the first n cores."""
+    """Keep programs that are started inside to the first n cores."""
     if n is None:
         yield
         return
@@ -138,10 +138,10 @@ def _few_cores(n: int | None) -> Iterator[None]:
 
 
 def take_turns(workers: Sequence[Worker], n_rounds: int) -> tuple[dict[str, list[Facts]], dict[str, str]]:
-    """Start workers, let them do rounds, one of each in turn, and close them.
+    """Start workers, do rounds, one of each worker in turn, and close them.
 
     Returns:
-        The rounds of each worker that did them all, and of each that failed why, by their names.
+        The rounds of each worker that did them all, and the reason of each that failed, by name.
     """
     rounds: dict[str, list[Facts]] = {worker.name: [] for worker in workers}
     failed: dict[str, str] = {}
@@ -163,13 +163,13 @@ def take_turns(workers: Sequence[Worker], n_rounds: int) -> tuple[dict[str, list
 
 
 def serve(prepare: Callable[[], tuple[Facts, Callable[[], Facts]]]) -> None:
-    """The worker's own end.
+    """Answer requests for rounds, in the worker's process.
 
     Args:
-        prepare: gives what is to be told at once, and the function that does a round.
+        prepare: returns the first answer, and the function that does a round.
     """
     channel = os.fdopen(os.dup(1), "w", buffering=1)
-    os.dup2(2, 1)  # what libraries print is no result
+    os.dup2(2, 1)  # output of libraries is no answer
     facts, work = prepare()
     channel.write(json.dumps(facts) + "\n")
     for _ in sys.stdin:

@@ -1,4 +1,4 @@
-"""What is asked of a GPU alone: rates, and the time to a trained policy. Elsewhere it says so and skips."""
+"""Goals for a GPU: rates, and the time to a trained policy; skipped where there is none."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ TRAINING = (
 
 
 def rate_goals(rows: Sequence[Mapping[str, Any]], on_gpu: bool) -> list[dict[str, str]]:
-    """Env steps/s of each engine, settling included, at the number of arms that is best.
+    """Return the goals for env steps/s of each engine, settling included, at the best number of arms.
 
     Args:
         rows: with `engine`, `mode`, `arms` and, where they did not fail, `env_steps_per_s`.
-        on_gpu: whether they are a GPU's; if not, nothing is asked of them.
+        on_gpu: whether they were measured on a GPU; if not, the goals are skipped.
     """
     goals = []
     for engine, least in LEAST_RATE.items():
@@ -57,7 +57,7 @@ def rate_goals(rows: Sequence[Mapping[str, Any]], on_gpu: bool) -> list[dict[str
 
 
 def training_goal(on_gpu: bool) -> dict[str, str]:
-    """Wall time of a training process from its start, imports and compilation included."""
+    """Return the goal for the wall time of a training process, imports and compilation included."""
     text = (
         f"{MEDIAN_MM:g} mm median over the workspace in under {WITHIN_S:g} s on a GPU, compilation included"
     )
@@ -88,11 +88,11 @@ def seconds_to(
     """Start a training process, watch its metrics until the median is reached, and stop it.
 
     Args:
-        median_mm: to be reached.
-        command: of the process.
+        median_mm: median to reach.
+        command: command of the process.
         metrics: file that it writes.
-        longest_s: that it gets.
-        environment: variables that it has besides ours.
+        longest_s: time limit.
+        environment: variables that it has besides this process's.
 
     Returns:
         Seconds since its start, None if it ended or `longest_s` went by before; the least median so far.
@@ -125,7 +125,7 @@ def seconds_to(
 
 
 def least_median(metrics: Path) -> float:
-    """Least median error [mm] of a run's evaluations so far, infinite before the first."""
+    """Return the least median error [mm] of a run's evaluations so far, infinite before the first."""
     if not metrics.exists():
         return float("inf")
     lines = metrics.read_text("utf-8").splitlines(keepends=True)

@@ -35,7 +35,6 @@ FILE = RESULTS / "guard.json"
 N_PROCESSES, N_STORED, N_ROUNDS = 3, 5, 12  # of a comparison, of a baseline; rounds of each
 MARGIN, LEAST_TOLERANCE, MOST_TOLERANCE = 2.0, 0.1, 0.25
 WORSE, NO_RESULT = 1, 2
-# Costs of other sizes are not comparable.
 SIZES = {"n_arms": 128, "n_settles": 20, "n_env_steps": 16, "n_updates": 16, "batch_size": 256}
 SIZES |= {"n_rows": 1024, "n_products": 8, "n_compiles": 2}
 WORK = ("settle", "epoch", "compile")

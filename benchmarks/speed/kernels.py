@@ -2,13 +2,12 @@
 
     python -m benchmarks.speed.kernels WHERE PROGRAM SETTING ...    the worker: compiles one program
 
-They are read from the compiled program's text. WHERE is `here`, this machine's GPU, or `h200x1` or `h200x8`,
-for one or eight GPUs that need not be there: that takes the package jax-cuda12-plugin but neither CUDA nor a
+They are read from the compiled text. WHERE is `here`, this machine's GPU, or `1x1x1` or `1x8x1`, for
+one or eight H200s that need not be there: that takes the package jax-cuda12-plugin but neither CUDA nor a
 driver, and XLA chooses by rule what it would choose by trying. PROGRAM is `env_step` or `epoch`.
 
-A kernel is an instruction outside of fusions that computes or copies; a fusion is one, and so is a library's
-call, although it may launch several. Its bytes are those of its operands and results, each read or written
-once as a whole: an upper bound, because an operand may be read in part or come from a cache.
+A kernel is an instruction outside of fusions that computes or copies; a fusion or a library's call is one.
+Its bytes are those of its operands and results, read and written whole: an upper bound.
 """
 
 from __future__ import annotations
@@ -31,13 +30,13 @@ OF_EIGHT = (
     *("n_arms=65536", "vector_steps_per_epoch=4", "updates_per_env_step=0.0009765625"),
     *("batch_size=32768", "replay_capacity=4194304"),
 )
-H200 = """gpu_device_info { core_count: 132 fpus_per_core: 128 clock_rate_ghz: 1.98
-threads_per_block_limit: 1024 threads_per_warp: 32 threads_per_core_limit: 2048 l2_cache_size: 52428800
+H200 = """gpu_device_info { core_count: 132 fpus_per_core: 128 memory_bandwidth: 4800000000000
+threads_per_block_limit: 1024 threads_per_warp: 32 threads_per_core_limit: 2048 clock_rate_ghz: 1.98
 shared_memory_per_block: 49152 shared_memory_per_core: 233472 shared_memory_per_block_optin: 232448
-block_dim_limit_x: 2147483647 block_dim_limit_y: 65535 block_dim_limit_z: 65535
+block_dim_limit_x: 2147483647 block_dim_limit_y: 65535 block_dim_limit_z: 65535 l2_cache_size: 52428800
 registers_per_core_limit: 65536 registers_per_block_limit: 65536 device_memory_size: 151397597184
-memory_bandwidth: 4800000000000 cuda_compute_capability { major: 9 } } dnn_version_info { major: 9 minor: 10 }
-runtime_version { major: 12 minor: 9 } platform_name: "CUDA" device_description_str: "NVIDIA H200"
+cuda_compute_capability { major: 9 } } dnn_version_info { major: 9 minor: 10 } platform_name: "CUDA"
+runtime_version { major: 12 minor: 9 } device_description_str: "NVIDIA H200"
 """  # Source: XLA, xla/backends/gpu/target_config/specs/h200.txtpb
 
 _NO_KERNEL = "parameter constant tuple get-tuple-element bitcast after-all partition-id replica-id domain"
@@ -63,12 +62,12 @@ def measure() -> dict[str, Any]:
     except PeerError as error:
         return {"skipped": f"{gpu.NO_DEVICE}; {error}"}
     settled = settle_function(spec)(random_references(spec, N_ARMS).astype(np.float32))
-    n_newton, one = int(settled.iterations.max()), "here" if on_gpu else "h200x1"
+    n_newton, one = int(settled.iterations.max()), "here" if on_gpu else "1x1x1"
     programs = {
         "env step, chain": (one, "env_step", f"n_arms={N_ARMS}", "env.engine=chain"),
         "env step, MJX": (one, "env_step", f"n_arms={N_ARMS}", "env.engine=mjx"),
         "training epoch": (one, "epoch", *gpu.TRAINING),
-        "training epoch, 8 GPUs": ("h200x8", "epoch", *OF_EIGHT),
+        "training epoch, 8 GPUs": ("1x8x1", "epoch", *OF_EIGHT),
     }
     loops, rows = [], []
     for name, program in programs.items():
@@ -82,7 +81,7 @@ def measure() -> dict[str, Any]:
                 row |= {"kernels": int(n_kernels), "gb": round(1e-9 * n_bytes, 2)}
         except WorkerError as error:
             row["failed"] = error.reason
-        rows.append(row | {"settings": " ".join(program[2:])})
+        rows.append(row)
     return {"newton_steps_of_the_slowest_arm": n_newton, "programs": rows, "loops": loops}
 
 
@@ -182,17 +181,15 @@ def compiled(where: str, program: str, *settings: str) -> Facts:
     if where == "here":
         mesh = jax.sharding.Mesh(np.array(jax.devices("gpu")[:1]), (AXIS,))
     else:
-        n = int(where.removeprefix("h200x"))
-        gpus = topologies.get_topology_desc(platform="cuda", target_config=H200, topology=f"1x{n}x1")
-        mesh = topologies.make_mesh(gpus, (n,), (AXIS,))
-    config, key = override(PRESETS["quick"], list(settings)), jax.random.PRNGKey(0)
-    env = ReachEnv(config=config.env)
-    job = Job(config, env, HindsightTQC(config, env), mesh=mesh if mesh.size > 1 else None)
-    if program == "epoch":
-        function, shapes = job.epoch, (jax.eval_shape(job.init, key),)
-    else:
-        function, action = jax.jit(job.arms.step), jax.numpy.zeros((config.n_arms, job.env.action_size))
-        shapes = jax.eval_shape(job.arms.reset, key), action, key
+        gpus = topologies.get_topology_desc(platform="cuda", target_config=H200, topology=where)
+        mesh = jax.sharding.Mesh(np.array(gpus.devices), (AXIS,))
+    config, key = override(PRESETS["quick"], settings), jax.random.PRNGKey(0)
+    learner = HindsightTQC(config, env := ReachEnv(config=config.env))
+    job = Job(config, env, learner, mesh=mesh if mesh.size > 1 else None)
+    function, shapes = job.epoch, (jax.eval_shape(job.init, key),)
+    if program == "env_step":
+        action = jax.numpy.zeros((config.n_arms, env.action_size))
+        function, shapes = jax.jit(job.arms.step), (jax.eval_shape(job.arms.reset, key), action, key)
     each = jax.tree.broadcast((job.sharding,) if job.sharding else everywhere(mesh), shapes)
     placed = jax.tree.map(lambda x, on: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=on), shapes, each)
     loop = read(str(function.lower(*placed).compile().as_text()))

@@ -1,9 +1,8 @@
-"""Gradient updates per second over batch sizes, against the peers' learners in one run on the same machine.
+"""Gradient updates a second over batch sizes, against the peers' learners in one run on the same machine.
 
-Stable-Baselines3-contrib's TQC and SBX's (Stable-Baselines Jax) run in virtual environments of their own,
-brax's SAC in this one; `benchmarks.speed.learner_contestants` says what each does. At every size each has a process
-of its own; all prepare themselves, then rounds alternate between them. A rate is the median of the rounds,
-and ratios are those of the medians.
+The TQC of Stable-Baselines3-contrib and of SBX (Stable-Baselines Jax) run in virtual environments of their
+own, brax's SAC in this one; `benchmarks.speed.learner_contestants` describes each. At every size each has a
+process of its own; all prepare themselves, then they take turns. A rate is the median of the rounds.
 """
 
 from __future__ import annotations
@@ -25,13 +24,13 @@ CONTESTANTS = {
 }
 BATCH_SIZES = (256, 1024, 4096, 16_384, 32_768)
 N_ROUNDS = 5
-N_FIRST = 256  # updates per round at the smallest batch
-ROUND_S = 1.5  # that a round at any other is to take
-SLOW_S = 15.0  # an update that is expected to take longer is left out
+N_FIRST = 256  # updates a round at the smallest batch
+ROUND_S = 1.5  # time that a round at any other batch should take
+SLOW_S = 15.0  # a contestant whose update is expected to take longer is left out
 
 
 def measure() -> dict[str, Any]:
-    """Updates/s at each batch size, ratios, and what was left out."""
+    """Return updates/s at each batch size, ratios, and what was left out."""
     left_out: dict[str, str] = {}
     pythons = _pythons(left_out)
     rates: dict[int, dict[str, list[float]]] = {}
@@ -57,12 +56,12 @@ def measure() -> dict[str, Any]:
 
 
 def updates_per_round(update_s: float) -> int:
-    """A power of two that takes about `ROUND_S` where an update takes so long [s]."""
+    """Return the power of two of updates that takes about `ROUND_S`, given the time [s] of one."""
     return 2 ** max(0, round(np.log2(ROUND_S / update_s)))
 
 
 def table(rates: Mapping[int, Mapping[str, Sequence[float]]]) -> list[dict[str, Any]]:
-    """A row for each batch size: medians, and how many times as fast ours is."""
+    """Return a row for each batch size: medians, and how many times as fast this project is."""
     rows = []
     for batch_size, rounds in rates.items():
         medians = {name: float(np.median(values)) for name, values in rounds.items()}
@@ -79,7 +78,7 @@ def table(rates: Mapping[int, Mapping[str, Sequence[float]]]) -> list[dict[str, 
 
 
 def _pythons(left_out: dict[str, str]) -> dict[str, Path | None]:
-    """The interpreter of each contestant that there is; None is this one."""
+    """Return the interpreter of each contestant that can be had; None is this one."""
     pythons: dict[str, Path | None] = {}
     for name in CONTESTANTS:
         try:
@@ -96,7 +95,7 @@ def _worker(name: str, python: Path | None, batch_size: int, n_updates: int) -> 
 
 
 def _alternate(workers: Mapping[str, Worker], left_out: dict[str, str], where: str) -> dict[str, list[float]]:
-    """Rates of the rounds by name; one that fails is left out from then on."""
+    """Return the rates of the rounds by name; one that fails is left out from then on."""
     rounds, failed = take_turns(list(workers.values()), N_ROUNDS)
     left_out |= {name: f"{where}: {why}" for name, why in failed.items()}
     return {name: [facts["updates_per_s"] for facts in told] for name, told in rounds.items()}

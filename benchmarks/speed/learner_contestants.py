@@ -1,10 +1,10 @@
-"""The contestants of the learner benchmark: programs that do nothing but gradient updates, in rounds.
+"""Worker of the learner benchmark: a contestant that does nothing but gradient updates, in rounds.
 
     python -m benchmarks.speed.learner_contestants NAME BATCH N_UPDATES
 
 NAME is ours, sb3-contrib, sbx or brax. All have two critics and networks of 256-256, and sample each batch
-from 100,000 stored transitions of the arm's sizes; what is in them is random. TQC has 25 quantiles a critic.
-Ours relabels besides. brax's SAC, whose critics give one value, runs through brax's own `train`, with an
+from 100,000 stored transitions of the arm's sizes with random content. TQC has 25 quantiles a critic. Ours
+relabels besides. The SAC of brax, whose critics give one value, runs through brax's own `train` with an
 environment that does nothing.
 """
 
@@ -26,7 +26,7 @@ N_STORED = 100_000
 
 
 def _timed(train: Callable[[], Any], n_updates: int) -> tuple[Facts, Callable[[], Facts]]:
-    """A round of `train`, which is done when it returns, after one that is not counted."""
+    """Return rounds of `train`, which blocks until it is done; the first call does not count."""
     train()
 
     def work() -> Facts:
@@ -36,7 +36,7 @@ def _timed(train: Callable[[], Any], n_updates: int) -> tuple[Facts, Callable[[]
 
 
 def _ours(batch_size: int, n_updates: int) -> tuple[Facts, Callable[[], Facts]]:
-    """A scan of updates as in `train.epoch.job`, with the quick preset's relabelling."""
+    """Prepare a scan of updates as in `train.epoch.job`, with the relabelling of the preset `quick`."""
     import jax
     import jax.numpy as jnp
 
@@ -97,7 +97,7 @@ def choose_threads(train: Callable[[], Any]) -> None:
     """Let PyTorch use all its threads, or one where that trains faster, as waiting for each other costs.
 
     Args:
-        train: some updates; of each choice the fastest of three counts.
+        train: some updates; the fastest of three calls counts.
     """
     import torch  # pyright: ignore[reportMissingImports]
 
@@ -116,7 +116,7 @@ def _seconds(call: Callable[[], Any]) -> float:
 
 
 def filled_model(algorithm: Any) -> Any:
-    """An algorithm with a filled replay; its `train` reads its losses, so it is done when it returns."""
+    """Return an algorithm with a filled replay; its `train` reads its losses and so blocks."""
     import gymnasium
 
     class Blank(gymnasium.Env):
@@ -155,7 +155,7 @@ def _sbx(batch_size: int, n_updates: int) -> tuple[Facts, Callable[[], Facts]]:
 
 
 def _brax(batch_size: int, n_updates: int) -> tuple[Facts, Callable[[], Facts]]:
-    """brax's `sac.train`, in a thread: after each of its epochs it reports, and waits for the next round."""
+    """Prepare brax's `sac.train` in a thread: after each of its epochs it reports and waits for a round."""
     import jax.numpy as jnp
     from brax.envs.base import Env, State
     from brax.training.agents.sac import train as sac

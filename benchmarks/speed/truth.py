@@ -1,4 +1,4 @@
-"""The true equilibrium, what the settled arm is off it, and references that saturate more or fewer chambers.
+"""The true equilibrium, the settled arm's distance from it, and references with chosen saturation.
 
 The truth is the solution in double precision; `tests/mechanics/test_settle.py` holds it against C MuJoCo.
 """
@@ -24,22 +24,22 @@ from mjx_softarm.mechanics.statics import ArmParams
 from mjx_softarm.spec import ArmSpec
 
 QUANTILES = {"median_mm": 0.5, "p95_mm": 0.95, "max_mm": 1.0}
-ERROR = (*QUANTILES, "without_truth")  # what a table has of it
-TOLD = ("reference_m", "tip_mm")  # what a program tells of its arms at rest
+ERROR = (*QUANTILES, "without_truth")  # columns of a table
+TOLD = ("reference_m", "tip_mm")  # facts that a worker tells of its settled arms
 
 
 class Truth(NamedTuple):
-    """Arms truly at rest."""
+    """Equilibria of arms, solved in double precision."""
 
     tip_mm: np.ndarray  # (n, 3)
-    settled: np.ndarray  # (n,) bool: the others' solution did not settle, so that their rest is not known
+    settled: np.ndarray  # (n,) bool; where false, the equilibrium is not known
     share_at_limit: float  # of the chambers
 
 
 def settle_function(
     spec: ArmSpec, engine: str = "chain", dtype: Any = np.float32, mesh: Mesh | None = None
 ) -> Callable:
-    """A jitted function: references (n, n_chambers) -> `Settled`, spread over the devices of a mesh."""
+    """Return a jitted function, references (n, n_chambers) -> `Settled`, spread over a mesh of devices."""
     params = jax.tree.map(jnp.asarray, ArmParams.from_spec(spec, dtype))
     if engine == "mjx":
         kinematics = mjx_kinematics(mjx.put_model(build_model(spec)))
@@ -54,14 +54,14 @@ def _solver(spec: ArmSpec) -> Callable:
 
 
 def true_rest(spec: ArmSpec, reference_m: np.ndarray) -> Truth:
-    """Where arms truly rest under the law, at references (n, n_chambers) [m]."""
+    """Return the equilibria of arms under the control law, at references (n, n_chambers) [m]."""
     with jax.enable_x64(True):
         found = jax.device_get(_solver(spec)(jnp.asarray(reference_m, np.float64)))
     return Truth(1e3 * found.tip_position_m, found.settled, float(np.mean(found.at_limit[found.settled])))
 
 
 def error_figures(tip_mm: np.ndarray, truth: Truth) -> dict[str, float]:
-    """Median, 95 % and largest distance of tips (n, 3) [mm] from where they truly are.
+    """Return median, 95 % and largest distance of tips (n, 3) [mm] from their equilibria.
 
     Arms without a truth are in none of these; `without_truth` is their number.
     """
@@ -71,7 +71,7 @@ def error_figures(tip_mm: np.ndarray, truth: Truth) -> dict[str, float]:
 
 
 def told_error(spec: ArmSpec, told: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """Error of the tips that programs told of in rounds, those that told none left out."""
+    """Return the error of the tips that workers told; nothing if they told none."""
     told = [facts for facts in told if "tip_mm" in facts]
     if not told:
         return {}
@@ -79,18 +79,18 @@ def told_error(spec: ArmSpec, told: Sequence[Mapping[str, Any]]) -> dict[str, fl
     return error_figures(tip_mm, true_rest(spec, reference_m))
 
 
-def random_references(spec: ArmSpec, n: int, reach: float = 1.0, seed: int = 0) -> np.ndarray:
-    """Spring lengths (n, n_chambers) [m] that saturate the more chambers the further they reach.
+def random_references(spec: ArmSpec, n: int, spread: float = 1.0, seed: int = 0) -> np.ndarray:
+    """Return random spring lengths (n, n_chambers) [m], which saturate more chambers the wider they spread.
 
     Args:
         spec: the arm.
-        n: how many.
-        reach: 1 draws uniformly from all lengths that may be commanded, 0.5 from the range half as wide about
-            the length at rest; the share of chambers at a limit follows and is to be measured.
-        seed: of the draw.
+        n: number of arms.
+        spread: 1 draws uniformly from all lengths that may be commanded, 0.5 from a range half as wide about
+            the length at rest.
+        seed: seed of the draw.
     """
     springs = spec.springs
     length = np.random.default_rng(seed).uniform(
         springs.length_min_m, springs.length_max_m, (n, spec.n_chambers)
     )
-    return springs.rest_length_m + reach * (length - springs.rest_length_m)
+    return springs.rest_length_m + spread * (length - springs.rest_length_m)

@@ -178,7 +178,7 @@ def told(monkeypatch):
 
 def test_programs_are_compiled_for_an_absent_gpu_and_one_that_fails_costs_no_other(told):
     figures = kernels.measure()
-    asked = [("h200x1", "env_step"), ("h200x1", "env_step"), ("h200x1", "epoch"), ("h200x8", "epoch")]
+    asked = [("1x1x1", "env_step"), ("1x1x1", "env_step"), ("1x1x1", "epoch"), ("1x8x1", "epoch")]
     assert told == [(*program, COMPILER) for program in asked]
     chain, mjx, epoch, _ = figures["programs"]
     n = figures["newton_steps_of_the_slowest_arm"]
@@ -190,7 +190,7 @@ def test_programs_are_compiled_for_an_absent_gpu_and_one_that_fails_costs_no_oth
 def test_a_present_gpu_needs_no_other_environment(told, monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     kernels.measure()
-    assert {(where, python) for where, _, python in told} == {("here", None), ("h200x8", None)}
+    assert {(where, python) for where, _, python in told} == {("here", None), ("1x8x1", None)}
 
 
 def test_without_gpu_and_compiler_the_benchmark_is_skipped_with_the_reason(told, monkeypatch):
@@ -204,7 +204,7 @@ def test_without_gpu_and_compiler_the_benchmark_is_skipped_with_the_reason(told,
 
 @pytest.mark.slow
 def test_a_step_of_arms_is_compiled_for_an_h200():
-    program = ["benchmarks.speed.kernels", "h200x1", "env_step", "n_arms=64", "env.engine=chain"]
+    program = ["benchmarks.speed.kernels", "1x1x1", "env_step", "n_arms=64", "env.engine=chain"]
     worker = Worker("step", program, peer_python(COMPILER))
     with working(worker):
         _, newton = worker.facts["loops"]
