@@ -36,6 +36,7 @@ SHARED = (
     "flax",
     "optax",
     "gymnasium",
+    "tyro",
 )
 
 
