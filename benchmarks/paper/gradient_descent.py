@@ -1,15 +1,14 @@
 """Gradient descent on the springs: the solver that the policy is compared with. NumPy only.
 
-From the springs as they are, their lengths follow the slope of the squared pose error downhill, the pose
-being what estimator and sim-to-real network make of the springs. A degree weighs as much as a millimetre:
-with the reward's weights, which make it five times less, the search takes far longer to turn the tip. A step
-that does not bring the error down far enough is halved. Lengths stay within those that the policy may ask
-for. Nothing in it knows of pressures, so nothing keeps it from shapes that the pump cannot make; and where
-it ends depends on where it began.
+From the measured springs, their lengths follow the negative gradient of the squared pose error; the pose is
+what estimator and sim-to-real network make of the springs. A degree weighs as much as a millimetre: with the
+reward's weights, which make it five times less, the search takes far longer to turn the tip. A step that does
+not reduce the error enough is halved. Lengths stay within the policy's range. The search knows no pressures,
+so nothing keeps it from shapes that the pump cannot make, and its result depends on its start.
 
     Controller.of(policy, gradient_descent(policy))
 
-It takes the place of the actor in the very same loop, though a search lasts longer than a tick of a real arm.
+It replaces the actor in the same loop, though a search lasts longer than a tick of a real arm.
 
 Source: the solver of Meng et al. 2023 as the paper describes it where it states the problem of saturation.
 """
@@ -28,9 +27,9 @@ from mjx_softarm.sensing.pose import pose_error
 from mjx_softarm.sensing.s2r import correct
 
 MAX_STEPS = 200
-FIRST_STEP = 1e-8  # [(m / mm)^2]; that the next search begins with is twice the last one's
+FIRST_STEP = 1e-8  # [(m / mm)^2]; each accepted step is followed by one of twice its size
 LEAST_STEP = 1e-15
-SUFFICIENT = 1e-4  # share of the decrease that the slope promises; Armijo's condition
+SUFFICIENT = 1e-4  # share of the decrease that the gradient promises; Armijo's condition
 CLOSE = 0.05  # [mm, deg] error that counts as none
 DIFFERENCE_M = 1e-5
 
@@ -38,7 +37,7 @@ Residual = Callable[[np.ndarray], np.ndarray]  # springs (..., n) [m] -> error (
 
 
 def gradient_descent(policy: Policy) -> Plan:
-    """A way to find references that takes the place of a policy's actor, for `Controller.of`."""
+    """Return a plan for `Controller.of` that replaces the policy's actor."""
     low_m, high_m = policy.sensor.lengths(np.stack(policy.actions[1:])).length_m  # (n,) each
     pose_of = forward_kinematics(policy)
 
@@ -52,7 +51,7 @@ def gradient_descent(policy: Policy) -> Plan:
 
 
 def forward_kinematics(policy: Policy) -> Callable[[np.ndarray], np.ndarray]:
-    """Springs (..., n) [m] -> pose (..., 6) [mm, deg] as the loop believes it, in double precision."""
+    """Return the map of springs (..., n) [m] to the loop's pose estimate (..., 6) [mm, deg], in float64."""
     estimator, s2r = _double(policy.estimator), _double(policy.s2r)
 
     def pose_of(spring_m: np.ndarray) -> np.ndarray:
@@ -63,11 +62,11 @@ def forward_kinematics(policy: Policy) -> Callable[[np.ndarray], np.ndarray]:
 
 
 def descend(residual: Residual, spring_m: np.ndarray, low_m: np.ndarray, high_m: np.ndarray) -> np.ndarray:
-    """Springs (n,) [m] between limits with a locally least squared residual.
+    """Return springs (n,) [m] within limits that minimise the squared residual locally.
 
     Args:
-        residual: to be made small.
-        spring_m (n,) [m]: where to begin; what is beyond the limits is brought to them.
+        residual: function to minimise.
+        spring_m (n,) [m]: start, clipped to the limits.
         low_m, high_m (n,) [m]: the limits.
     """
     x = np.clip(np.asarray(spring_m, float), low_m, high_m)
@@ -90,7 +89,7 @@ def descend(residual: Residual, spring_m: np.ndarray, low_m: np.ndarray, high_m:
 
 
 def gradient(residual: Residual, spring_m: np.ndarray) -> np.ndarray:
-    """Slope (n,) [1/m] of half the squared residual, its Jacobian by central differences."""
+    """Return the gradient (n,) [1/m] of half the squared residual, by central differences."""
     offset_m = DIFFERENCE_M * np.eye(len(spring_m))
     ahead, behind = residual(spring_m + offset_m), residual(spring_m - offset_m)  # (n, 6) each
     return (ahead - behind) @ residual(spring_m) / (2.0 * DIFFERENCE_M)
@@ -101,7 +100,7 @@ def _cost(residual: Residual, x: np.ndarray) -> float:
 
 
 def _double(network: Any) -> Any:
-    """Networks (named) tuples of float32 arrays -> the same in float64; None stays."""
+    """Return a network, nested tuples of arrays, in float64; None stays None."""
     if isinstance(network, tuple):
         parts = [_double(part) for part in network]
         return type(network)(*parts) if hasattr(network, "_fields") else tuple(parts)

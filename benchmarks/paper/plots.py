@@ -27,17 +27,13 @@ LOSSES = ("tqc/critic_loss", "tqc/actor_loss", "gail/discriminator_loss")
 Outcomes = Mapping[Trial, Outcome]
 Style = tuple[str, str]  # label and colour
 OPEN_STYLES: Mapping[str, Style] = {
-    "without": (KINDS["without"].title, ORANGE),
-    "with": (KINDS["with"].title, BLUE),
-    "gradient": (KINDS["gradient"].title, GREEN),
+    kind: (KINDS[kind].title, colour)
+    for kind, colour in (("without", ORANGE), ("with", BLUE), ("gradient", GREEN))
 }
 CIRCLE_STYLES: Mapping[str, Style] = {
     "with": ("without demonstrations", ORANGE),
     "circle": (KINDS["circle"].title, BLUE),
 }
-
-
-# --- Helpers -----------------------------------------------------------------------------------------------
 
 
 def _band(
@@ -88,9 +84,6 @@ def _legend_below(figure: Figure, panels: Sequence[Any]) -> None:
 
 def _select(outcomes: Outcomes, kind: str, variant: str) -> list[Outcome]:
     return [outcome for trial, outcome in outcomes.items() if (trial.kind, trial.variant) == (kind, variant)]
-
-
-# --- Circle and loads --------------------------------------------------------------------------------------
 
 
 def circle_figure(outcomes: Outcomes, styles: Mapping[str, Style]) -> Figure:
@@ -198,9 +191,6 @@ def trace_figure(outcome: Outcome, limits_kpa: tuple[float, float]) -> Figure:
     return figure
 
 
-# --- Pipes -------------------------------------------------------------------------------------------------
-
-
 def positions_figure(outcomes: Outcomes, shown: Sequence[Trial]) -> Figure:
     """Draw the finger tips from the front in the pipe: demonstrated goals, path, and where they arrived."""
     figure = Figure(figsize=(4.0 * len(shown) + 0.4, 4.6), layout="compressed")
@@ -261,9 +251,6 @@ def force_figure(outcomes: Outcomes, shown: Sequence[Trial]) -> Figure:
         panel.set_ylim(LEAST_N, max(10.0, 2.0 * float(max(run.wall_n.max(), run.container_n.max()))))
     panels[0].legend(frameon=False, fontsize=8, loc="upper right", ncols=3)
     return figure
-
-
-# --- Training from demonstrations --------------------------------------------------------------------------
 
 
 def success_figure(results: Results) -> Figure:

@@ -16,11 +16,11 @@ from PIL import Image
 
 from benchmarks.paper import plots
 from benchmarks.paper.engine import Settings
-from benchmarks.paper.goals import Check, check_goals
+from benchmarks.paper.goals import check_goals
 from benchmarks.paper.jobs import CALIBRATION
 from benchmarks.paper.kinds import KINDS, Trial
 from benchmarks.paper.summary import (
-    HEADINGS,
+    FIGURES,
     PAPER_SIMULATED_MM,
     SUCCESS,
     Results,
@@ -41,7 +41,7 @@ TITLES = {
     "confined": "The paper's experiments in confined spaces",
 }
 PREFIXES = {"open": "paper", "confined": "paper-confined"}  # of files beside the JSON
-COLUMNS = {  # figures in the tables, keys of HEADINGS
+COLUMNS = {  # figures in the tables, keys of FIGURES
     "open": (
         *("translation_mm", "rmse_mm", "max_mm", "yaw_deg", "pitch_deg", "roll_deg", "believed_mm"),
         *("saturated_points", "saturated_chambers_max", "saturation_events"),
@@ -51,8 +51,19 @@ COLUMNS = {  # figures in the tables, keys of HEADINGS
         *("calm_percent", "wall_max_n", "container_max_n"),
     ),
 }
+HEADINGS = {  # of other columns
+    "kind": "",
+    "variant": "load or objects",
+    "events": "faults reported",
+    "all_done_runs": "runs with all operations done",
+    "simulated_mm": "simulated [mm]",
+    "on_twin_mm": "on the twin [mm]",
+    "steps_to_success": f"steps to {100 * SUCCESS:g} % success",
+    "stages_first_success": "success of the first stage as it ended, and at the end",
+}
 
-Drawn = Mapping[str, tuple[str, Figure]]  # name -> caption, and the drawing
+Row = Mapping[str, Any]
+Drawn = Mapping[str, tuple[str, Figure]]  # name -> caption and drawing
 
 
 def write_report(
@@ -64,7 +75,7 @@ def write_report(
     no_film: str,
     provenance: dict[str, Any],
 ) -> dict[str, Any]:
-    """Write page, JSON, pictures and film; returns what is in the JSON file.
+    """Write page, JSON, pictures and film; returns the figures.
 
     Args:
         experiment: key of PAGES.
@@ -78,27 +89,44 @@ def write_report(
     data = figures_of(experiment, folder, settings, results)
     drawn = draw(experiment, settings, results, data["runs"])
     pictures.mkdir(parents=True, exist_ok=True)
+    # JSON, which has no NaN, pictures and film.
+    finite = json.loads(json.dumps(data), parse_constant=lambda _: None)
+    write_json(pictures / f"paper-{experiment}.json", {"figures": finite, **provenance})
     prefix, film = PREFIXES[experiment], folder / FILMS[experiment]
     for name, (_, figure) in drawn.items():
         _save_picture(pictures / f"{prefix}-{name}.png", figure)
+    film_html = f"<p>None: {html.escape(no_film)}</p>"
     if film.exists():
         shutil.copyfile(film, pictures / f"{prefix}-{film.name}")
-    finite = json.loads(json.dumps(data), parse_constant=lambda _: None)  # JSON has no NaN
-    write_json(pictures / f"paper-{experiment}.json", {"figures": finite, **provenance})
-    checks = [Check(**check) for check in data["goals"]]
-    n_missed = sum(not check.met for check in checks)
-    verdict = "Every goal is met." if not n_missed else f"{n_missed} of {len(checks)} goals are not met."
+        encoded = base64.b64encode(film.read_bytes()).decode()
+        film_html = f'<p><img alt="The twin, filmed" src="data:image/gif;base64,{encoded}"></p>'
+    # Page.
+    missed = [f"{check['text']}: {check['value']}" for check in data["goals"] if not check["met"]]
+    verdict = f"{len(missed)} of {len(data['goals'])} goals are not met." if missed else "Every goal is met."
     first = (
         "<p>All measured on simulated arms called twins; no number is of a real arm.</p>"
-        f'<p class="{"bad" if n_missed else "good"}">{verdict}</p>'
+        f'<p class="{"bad" if missed else "good"}">{verdict}</p>'
     )
+    goals = [{**goal, "met": "met" if goal["met"] else "NOT MET"} for goal in data["goals"]]
+    warnings = tuple(
+        f"{twin}: {title}: {warning}"
+        for twin, steps in data["calibrations"].items()
+        for title, found in steps.items()
+        for warning in found
+    )
+    columns = ("kind", "variant", "twin", "seed", "reached", *COLUMNS[experiment], "seconds", "events")
     sections = (
-        _goals_section(checks),
+        Section(
+            "Goals",
+            "Set before anything was measured.",
+            (_table(goals, ("text", "value", "met")),),
+            tuple(f"not met: {text}" for text in missed),
+        ),
         *(_open_sections if experiment == "open" else _confined_sections)(data, drawn),
-        _calibration_section(data["calibrations"]),
-        Section("Every run", "Mean over the goals reached.", (_runs_table(experiment, data["runs"]),)),
+        Section("Calibration", "One log of random static poses for each twin.", warnings=warnings),
+        Section("Every run", "Mean over the goals reached.", (_table(data["runs"], columns),)),
     )
-    text = page(TITLES[experiment], first, sections, _film_html(film, no_film), provenance)
+    text = page(TITLES[experiment], first, sections, f"<h2>Film</h2>{film_html}", provenance)
     (folder / PAGES[experiment]).write_text(text, "utf-8")
     return data
 
@@ -107,26 +135,25 @@ def figures_of(experiment: str, folder: Path, settings: Settings, results: Resul
     """Return all figures: goals, spreads, trainings or simulated errors, calibrations, every run."""
     table, trainings = trial_rows(results), training_rows(results)
     shared = {**settings.shared(), "twins": list(settings.twins), "seeds": list(settings.seeds)}
-    data = {
+    calibrations = {}
+    for twin in settings.twins:
+        report = json.loads((folder / f"twin{twin}" / CALIBRATION / "report.json").read_text("utf-8"))
+        calibrations[f"twin {twin}"] = {title: part["warnings"] for title, part in report["parts"].items()}
+    more = {"simulated": simulated_rows(folder, settings, table)} if experiment == "open" else {}
+    return {
         "arm": "twin",
         "settings": shared,
         "goals": [check._asdict() for check in check_goals(experiment, table, trainings)],
         "spreads": spreads(table),
-        "calibrations": {f"twin {twin}": _calibration_warnings(folder, twin) for twin in settings.twins},
+        "calibrations": calibrations,
         "runs": table,
+        "trainings": trainings,
+        **more,
     }
-    if experiment == "open":
-        return data | {"simulated": simulated_rows(folder, settings, table)}
-    return data | {"trainings": trainings}
-
-
-def _calibration_warnings(folder: Path, twin: int) -> dict[str, list[str]]:
-    report = json.loads((folder / f"twin{twin}" / CALIBRATION / "report.json").read_text("utf-8"))
-    return {title: section["warnings"] for title, section in report["parts"].items()}
 
 
 def draw(
-    experiment: str, settings: Settings, results: Results, table: Sequence[Mapping[str, Any]]
+    experiment: str, settings: Settings, results: Results, table: Sequence[Row]
 ) -> dict[str, tuple[str, Figure]]:
     """Return name -> caption and drawing."""
     outcomes, first = results.outcomes, filmed(experiment, settings)
@@ -176,43 +203,10 @@ def _save_picture(path: Path, figure: Figure) -> None:
     )
 
 
-def _film_html(film: Path, no_film: str) -> str:
-    if not film.exists():
-        return f"<h2>Film</h2><p>None: {html.escape(no_film)}</p>"
-    data = base64.b64encode(film.read_bytes()).decode()
-    return f'<h2>Film</h2><p><img alt="The twin, filmed" src="data:image/gif;base64,{data}"></p>'
-
-
-def _goals_section(checks: Sequence[Check]) -> Section:
-    rows = tuple((check.text, check.value, "met" if check.met else "NOT MET") for check in checks)
-    missed = tuple(f"not met: {check.text}: {check.value}" for check in checks if not check.met)
-    return Section("Goals", "Set before anything was measured.", (Table(("goal", "twin", ""), rows),), missed)
-
-
-def _calibration_section(calibrations: Mapping[str, Mapping[str, Sequence[str]]]) -> Section:
-    warnings = tuple(
-        f"{twin}: {title}: {warning}"
-        for twin, steps in calibrations.items()
-        for title, found in steps.items()
-        for warning in found
-    )
-    return Section("Calibration", "One log of random poses at rest for each twin.", warnings=warnings)
-
-
-def _open_sections(data: Mapping[str, Any], drawn: Drawn) -> tuple[Section, ...]:
+def _open_sections(data: Row, drawn: Drawn) -> tuple[Section, ...]:
+    circle, error, *loads = drawn.values()
     unloaded = [item for item in data["spreads"] if not item["load_g"]]
     with_s2r = [item for item in data["spreads"] if item["kind"] == "with"]
-    traces = tuple(item for name, item in drawn.items() if name.startswith("pressures"))
-    simulated = tuple(
-        (
-            KINDS[row["kind"]].title,
-            "all" if row["twin"] is None else row["twin"],
-            row["seed"],
-            row["simulated_mm"],
-            row["on_twin_mm"]["mean"],
-        )
-        for row in data["simulated"]
-    )
     return (
         Section(
             "Circle",
@@ -220,24 +214,24 @@ def _open_sections(data: Mapping[str, Any], drawn: Drawn) -> tuple[Section, ...]
             "averaged over half a second. Without S2R, only the springs are calibrated. Gradient descent has "
             "no training seed and runs once for each twin.",
             (_spreads_table("open", unloaded),),
-            figures=(drawn["circle"], drawn["error"]),
+            figures=(circle, error),
         ),
         Section(
             "Unknown loads",
             "The policy with S2R, which does not know the load. Solid: springs as read and pressures as "
             "measured; shaded: points at which a chamber is saturated.",
             (_spreads_table("open", with_s2r),),
-            figures=(drawn["loads"], *traces),
+            figures=tuple(loads),
         ),
         Section(
             "Simulated against twin",
             f"Mean error on the circle; the paper's, without S2R: {PAPER_SIMULATED_MM:g} mm in simulation.",
-            (Table(("policy", "twin", "seed", "simulated [mm]", "on the twin [mm]"), simulated),),
+            (_table(data["simulated"], ("kind", "twin", "seed", "simulated_mm", "on_twin_mm")),),
         ),
     )
 
 
-def _confined_sections(data: Mapping[str, Any], drawn: Drawn) -> tuple[Section, ...]:
+def _confined_sections(data: Row, drawn: Drawn) -> tuple[Section, ...]:
     def table(*kinds: str) -> tuple[Table, ...]:
         return (_spreads_table("confined", [item for item in data["spreads"] if item["kind"] in kinds]),)
 
@@ -263,7 +257,7 @@ def _confined_sections(data: Mapping[str, Any], drawn: Drawn) -> tuple[Section, 
             "actions. Hand-made: the environment's reward at the same goals, with hindsight and without "
             "demonstrated actions. Success: pose reached, no chamber saturated, the body inside the pipe. "
             f"Dotted: {100 * SUCCESS:g} %. Bands: standard deviation over the runs.",
-            (_trainings_table(data["trainings"]),),
+            (_table(data["trainings"], tuple(data["trainings"][0])),),
             figures=(drawn["success"], drawn["losses"]),
         ),
         Section(
@@ -277,42 +271,30 @@ def _confined_sections(data: Mapping[str, Any], drawn: Drawn) -> tuple[Section, 
     )
 
 
-def _spreads_table(experiment: str, items: Sequence[Mapping[str, Any]]) -> Table:
-    """Return figures down, kinds across, each beside the paper's numbers where it has any."""
-    head, rows = [""], [["runs"], *([HEADINGS[name]] for name in COLUMNS[experiment])]
-    if experiment == "confined":
-        rows.append(["runs with all operations done"])
+def _spreads_table(experiment: str, items: Sequence[Row]) -> Table:
+    """Return a row for each kind and variant, followed by the paper's numbers where it has any."""
+    columns = ("kind", "variant", "runs", *COLUMNS[experiment])
+    columns += ("all_done_runs",) if experiment == "confined" else ()
+    rows = []
     for item in items:
-        cells = [item["runs"]]
-        cells += [f"{item[name]['mean']:.2f} ± {item[name]['std']:.2f}" for name in COLUMNS[experiment]]
-        columns = [[*cells, item["all_done_runs"]]]
-        head.append(f"twin: {KINDS[item['kind']].title}, {item['variant']}")
+        rows.append(item)
         if item["paper"]:
-            head.append("paper")
-            columns.append(["-", *(item["paper"].get(name, "-") for name in COLUMNS[experiment]), "-"])
-        for column in columns:
-            for row, cell in zip(rows, column, strict=False):
-                row.append(cell)
-    return Table(tuple(head), tuple(map(tuple, rows)))
+            rows.append({**dict.fromkeys(columns), "kind": "the paper's arm", **item["paper"]})
+    return _table(rows, columns)
 
 
-def _runs_table(experiment: str, table: Sequence[Mapping[str, Any]]) -> Table:
-    names = ("reached", *COLUMNS[experiment], "seconds")
-    head = ("", "", "twin", "seed", *(HEADINGS.get(name, name) for name in names), "faults reported")
-    body = []
-    for row in table:
-        faults = ", ".join(f"{name}: {n}" for name, n in row["events"].items()) or "-"
-        start = (KINDS[row["kind"]].title, row["variant"], row["twin"], row["seed"])
-        body.append((*start, *(row[name] for name in names), faults))
-    return Table(head, tuple(body))
+def _table(rows: Sequence[Row], columns: Sequence[str]) -> Table:
+    """Return a table of the columns of rows."""
+    head = tuple({**FIGURES, **HEADINGS}.get(name, name.replace("_", " ")) for name in columns)
+    return Table(head, tuple(tuple(_cell(row[name]) for name in columns) for row in rows))
 
 
-def _trainings_table(trainings: Sequence[Mapping[str, Any]]) -> Table:
-    success = f"steps to {100 * SUCCESS:g} % success"
-    head = ("", "twin", "seed", "steps", success, "success", "first stage's, as it ended", "at the end")
-    body = []
-    for row in trainings:
-        steps = "never" if row["steps_to_success"] is None else row["steps_to_success"]
-        start = (KINDS[row["kind"]].title, row["twin"], row["seed"], row["env_steps"])
-        body.append((*start, steps, row["final_success"], *(row["stages_first_success"] or ("-", "-"))))
-    return Table(head, tuple(body))
+def _cell(value: Any) -> Any:
+    """Return a spread as mean and deviation, the name of a kind as its title, None as a hyphen."""
+    if isinstance(value, Mapping) and "mean" in value:
+        return f"{value['mean']:.2f} ± {value['std']:.2f}"
+    if isinstance(value, Mapping):
+        return ", ".join(f"{name}: {n}" for name, n in value.items()) or "-"
+    if isinstance(value, list):
+        return ", ".join(map(str, value))
+    return KINDS[value].title if value in KINDS else "-" if value is None else value

@@ -16,7 +16,7 @@ from benchmarks.paper.trials import trainings, trials
 
 Row = Mapping[str, Any]
 
-HEADINGS = {
+FIGURES = {  # names and headings
     "translation_mm": "translation [mm]",
     "rmse_mm": "RMSE [mm]",
     "max_mm": "largest [mm]",
@@ -63,15 +63,6 @@ class Results(NamedTuple):
 
     outcomes: dict[Trial, Outcome]
     trainings: dict[tuple[str, int, int], Training]  # by kind, twin, seed; none in open space
-
-
-class Spread(NamedTuple):
-    """Spread of one figure over runs."""
-
-    mean: float
-    std: float  # of the runs, not of their mean
-    min: float
-    max: float
 
 
 def load_results(folder: Path, experiment: str, settings: Settings) -> Results:
@@ -146,14 +137,14 @@ def simulated_rows(folder: Path, settings: Settings, table: Sequence[Row]) -> li
             ]
             simulated_mm = json.loads(file.read_text("utf-8"))["circle_mean_mm"]
             row = {"kind": kind, "twin": twin, "seed": seed, "simulated_mm": simulated_mm}
-            rows.append(row | {"on_twin_mm": spread(on_twins)._asdict()})
+            rows.append(row | {"on_twin_mm": spread(on_twins)})
     return rows
 
 
-def spread(values: Sequence[float]) -> Spread:
-    """Return mean, standard deviation, minimum and maximum; NaN where any value is NaN."""
+def spread(values: Sequence[float]) -> dict[str, float]:
+    """Return mean, standard deviation (of the runs), minimum and maximum; NaN where any value is NaN."""
     x = np.asarray(values, float)
-    return Spread(*(float(f(x)) for f in (np.mean, np.std, np.min, np.max)))
+    return {"mean": float(x.mean()), "std": float(x.std()), "min": float(x.min()), "max": float(x.max())}
 
 
 def spreads(table: Sequence[Row]) -> list[dict[str, Any]]:
@@ -169,7 +160,7 @@ def spreads(table: Sequence[Row]) -> list[dict[str, Any]]:
             "runs": len(rows),
             "incomplete_runs": sum(row["reached"] < row["points"] for row in rows),
             "all_done_runs": sum(map(all_done, rows)),
-            **{name: spread([row[name] for row in rows])._asdict() for name in HEADINGS},
+            **{name: spread([row[name] for row in rows]) for name in FIGURES},
             "paper": paper_numbers(kind, variant, load_g),
         }
         for (kind, load_g, variant), rows in sorted(groups.items())

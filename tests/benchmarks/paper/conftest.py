@@ -1,4 +1,4 @@
-"""What the tests of the paper's experiments share."""
+"""Fixtures of the tests of the paper's experiments."""
 
 from html.parser import HTMLParser
 
@@ -6,7 +6,7 @@ import pytest
 
 
 class Tags(HTMLParser):
-    """Sees that each tag is closed in its turn; counts pictures."""
+    """Parser that checks that each tag is closed in its turn, and counts pictures."""
 
     def __init__(self):
         super().__init__()
@@ -26,7 +26,7 @@ class Tags(HTMLParser):
 
 @pytest.fixture(scope="session")
 def read_page():
-    """A function: HTML file -> its text and number of pictures, once its tags are seen to be closed."""
+    """Return a function: HTML file -> parsed page, with its text and number of pictures."""
 
     def read(path):
         page = Tags()

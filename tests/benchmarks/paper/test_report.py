@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from benchmarks.paper import film, report
-from benchmarks.paper.goals import Check
 from benchmarks.paper.jobs import Scene
 from benchmarks.paper.kinds import KINDS, Trial, learned_run
 from benchmarks.paper.measure import save_outcome
@@ -39,8 +38,9 @@ from train.presets import IMITATION_PRESETS
 
 
 def test_spread_by_hand():
-    assert spread([1.0, 2.0, 6.0]) == pytest.approx((3.0, np.sqrt(14 / 3), 1.0, 6.0))
-    assert np.isnan(spread([1.0, np.nan])).all()
+    expected = {"mean": 3.0, "std": np.sqrt(14 / 3), "min": 1.0, "max": 6.0}
+    assert spread([1.0, 2.0, 6.0]) == pytest.approx(expected)
+    assert np.isnan(list(spread([1.0, np.nan]).values())).all()
 
 
 def test_spreads_group_kinds_and_variants():
@@ -151,12 +151,6 @@ def test_titles_and_labels_lie_within_the_pictures(experiment):
             box = artist.get_tightbbox()
             inside = box.x0 >= -1 and box.y0 >= -1 and box.x1 <= width + 1 and box.y1 <= height + 1
             assert inside, (name, artist, box)
-
-
-def test_verdict_counts_what_is_met():
-    section = report._goals_section([Check("a", "1", True), Check("b", "2", False)])
-    assert section.warnings == ("not met: b: 2",)
-    assert [row[2] for row in section.tables[0].rows] == ["met", "NOT MET"]
 
 
 # --- Film --------------------------------------------------------------------------------------------------
