@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,11 +13,6 @@ from benchmarks.paper.summary import load_results
 from benchmarks.paper.trials import stages
 from mjx_softarm._support import cli
 from mjx_softarm._support.provenance import provenance
-
-
-def main(arguments: Sequence[str]) -> int:
-    """Run the benchmark with command-line arguments; returns the exit status."""
-    return cli.main("python -m benchmarks", "", {"paper": paper}, ["paper", *arguments])
 
 
 def paper(

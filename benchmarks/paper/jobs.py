@@ -86,7 +86,7 @@ def train_reach(folder: Path, settings: Settings, twin: int | None, seed: int) -
 
 
 def _set(settings: tuple[str, ...]) -> list[str]:
-    """Return the command line's options for settings NAME=VALUE."""
+    """Return the options of settings NAME=VALUE."""
     return [f"--{text}" for text in settings]
 
 

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.paper.film import outline_mm
 from benchmarks.paper.kinds import KINDS, Trial
-from benchmarks.paper.measure import CALM_N, Outcome, finger_tips
+from benchmarks.paper.measure import Outcome, finger_tips
 from benchmarks.paper.summary import PAPER_LOADS_MM, SUCCESS, Results, Row, Training
 from mjx_softarm.mechanics.pipe import PIPES_MM, CrossPipe
 from mjx_softarm.spec import ArmSpec
@@ -20,7 +20,6 @@ from train.runs.plots import BLUE, GREY, INK, ORANGE, STEPS, dress
 GREEN, RED = "#2a9d6f", "#c43333"
 N_PER_SECTION = 3
 TRACE_S = 0.5  # between the drawn ticks of a trace
-LEAST_N = 0.1  # lower end of the forces' axis
 SEEN_Z_MM = (-880.0, -330.0)  # part of the pipe that is drawn, around its crossing
 LOSSES = ("tqc/critic_loss", "tqc/actor_loss", "gail/discriminator_loss")
 
@@ -36,54 +35,18 @@ CIRCLE_STYLES: Mapping[str, Style] = {
 }
 
 
-def _band(
-    panel: Any, x: np.ndarray, line: np.ndarray, low: np.ndarray, high: np.ndarray, style: Style
-) -> None:
-    """Draw a line (k,) with the band between two others."""
-    label, colour = style
-    panel.fill_between(x, low, high, color=colour, alpha=0.15, linewidth=0)
-    panel.plot(x, line, color=colour, label=label, linewidth=1.5)
-
-
-def _range_band(panel: Any, lines: np.ndarray, style: Style) -> None:
-    """Draw mean and range over runs (runs, p) at each goal, over those that reached it."""
-    known = np.ma.masked_invalid(lines)
-    mean, low, high = (np.ma.filled(f(axis=0), np.nan) for f in (known.mean, known.min, known.max))
-    _band(panel, np.arange(lines.shape[1]), mean, low, high, style)
-
-
-def _deviation_band(panel: Any, steps: np.ndarray, lines: np.ndarray, style: Style) -> None:
+def _band(panel: Any, steps: np.ndarray, lines: np.ndarray, style: Style) -> None:
     """Draw mean and standard deviation over runs (runs, k)."""
+    label, colour = style
     mean, deviation = lines.mean(axis=0), lines.std(axis=0)
-    _band(panel, steps, mean, mean - deviation, mean + deviation, style)
-
-
-def _mark_operations(panel: Any, outcome: Outcome, x: np.ndarray, named: bool = True) -> None:
-    """Draw a dotted line at each operation that has a place x (p,), with its name above the panel."""
-    for k in np.flatnonzero(outcome.operation & np.isfinite(x)):
-        panel.axvline(x[k], color=GREY, linestyle=":", linewidth=1.0)
-        if named:
-            at, style = ("data", "axes fraction"), {"ha": "center", "fontsize": 7, "color": GREY}
-            panel.annotate(
-                str(outcome.name[k]),
-                (x[k], 1.0),
-                xycoords=at,
-                xytext=(0, 2),
-                textcoords="offset points",
-                **style,
-            )
-    if named:  # the title stands above the names
-        panel.set_title(panel.get_title(loc="left"), loc="left", fontsize=10, color=INK, pad=14)
+    panel.fill_between(steps, mean - deviation, mean + deviation, color=colour, alpha=0.2, linewidth=0)
+    panel.plot(steps, mean, color=colour, label=label, linewidth=1.5)
 
 
 def _legend_below(figure: Figure, panels: Sequence[Any]) -> None:
     """Draw the first panel's legend below all panels, two entries wide for each."""
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, frameon=False, loc="outside lower center", ncols=2 * len(panels))
-
-
-def _select(outcomes: Outcomes, kind: str, variant: str) -> list[Outcome]:
-    return [outcome for trial, outcome in outcomes.items() if (trial.kind, trial.variant) == (kind, variant)]
 
 
 def circle_figure(outcomes: Outcomes, styles: Mapping[str, Style]) -> Figure:
@@ -114,21 +77,6 @@ def circle_figure(outcomes: Outcomes, styles: Mapping[str, Style]) -> Figure:
 def _closed(pose: np.ndarray) -> np.ndarray:
     """Return x and y (2, p + 1) of poses (p, 6), the last joined with the first."""
     return np.vstack([pose, pose[:1]])[:, :2].T
-
-
-def error_figure(outcomes: Outcomes) -> Figure:
-    """Draw errors at each point of the unloaded circle: mean over the runs, and their range."""
-    figure = Figure(figsize=(11, 5.6), layout="constrained")
-    panels = figure.subplots(2, 2).ravel()
-    for k, (panel, title) in enumerate(zip(panels, ("translation", "yaw", "pitch", "roll"), strict=True)):
-        dress(panel, f"{title} error", "point", "deg" if k else "mm")
-        for kind, style in OPEN_STYLES.items():
-            error = np.array([run.error for run in _select(outcomes, kind, "0 g")])  # (runs, p, 6)
-            size = np.abs(error[..., 2 + k]) if k else np.linalg.norm(error[..., :3], axis=-1)
-            _range_band(panel, size, style)
-        panel.set_ylim(bottom=0)
-    panels[0].legend(frameon=False, fontsize=8)
-    return figure
 
 
 def loads_figure(table: Sequence[Row]) -> Figure:
@@ -219,40 +167,6 @@ def positions_figure(outcomes: Outcomes, shown: Sequence[Trial]) -> Figure:
     return figure
 
 
-def axis_errors_figure(outcomes: Outcomes, kind: str) -> Figure:
-    """Draw absolute errors in X, Y, Z at each goal: mean and range over the runs, and the mean of all."""
-    runs = _select(outcomes, kind, "as shown")
-    size = np.abs([run.error[:, :3] for run in runs])  # (runs, p, 3)
-    figure = Figure(figsize=(11, 6.4), layout="constrained")
-    panels = figure.subplots(3, 1, sharex=True)
-    for k, (panel, axis) in enumerate(zip(panels, "XYZ", strict=True)):
-        dress(panel, f"absolute error in {axis}", "goal" if k == 2 else "", "mm")
-        _mark_operations(panel, runs[0], np.arange(size.shape[1], dtype=float), named=k == 0)
-        _range_band(panel, size[..., k], ("mean and range of the runs", BLUE))
-        mean = np.nanmean(size[..., k]) if np.isfinite(size).any() else np.nan
-        panel.axhline(mean, color=ORANGE, linestyle="--", label=f"mean of all: {mean:.2f} mm")
-        panel.set_ylim(0, 1.25 * panel.get_ylim()[1])
-        panel.legend(frameon=False, fontsize=8, loc="upper left", ncols=3)
-    return figure
-
-
-def force_figure(outcomes: Outcomes, shown: Sequence[Trial]) -> Figure:
-    """Draw contact forces over time, with the operations."""
-    figure = Figure(figsize=(11, 2.5 * len(shown) + 0.6), layout="constrained")
-    panels = figure.subplots(len(shown), 1, squeeze=False)[:, 0]
-    for panel, trial in zip(panels, shown, strict=True):
-        run, title = outcomes[trial], f"{PIPES_MM[KINDS[trial.kind].task]} mm pipe, {trial.objects}"
-        dress(panel, title, "time [s]" if trial == shown[-1] else "", "contact force [N]")
-        for force_n, colour, label in ((run.container_n, GREEN, "containers"), (run.wall_n, BLUE, "walls")):
-            panel.plot(run.time_s, np.maximum(force_n, LEAST_N), color=colour, linewidth=0.8, label=label)
-        panel.axhline(CALM_N, color=RED, linestyle="--", linewidth=1.0, label=f"{CALM_N:g} N")
-        _mark_operations(panel, run, run.arrival_s)
-        panel.set_yscale("log")
-        panel.set_ylim(LEAST_N, max(10.0, 2.0 * float(max(run.wall_n.max(), run.container_n.max()))))
-    panels[0].legend(frameon=False, fontsize=8, loc="upper right", ncols=3)
-    return figure
-
-
 def success_figure(results: Results) -> Figure:
     """Draw success over environment steps in each run's own simulation: mean, deviation, every run."""
     figure = Figure(figsize=(8, 4.2), layout="constrained")
@@ -262,7 +176,7 @@ def success_figure(results: Results) -> Figure:
         runs = _trainings(results, kind)
         steps, share = _series(runs, "evaluation/success_share")
         panel.plot(steps, 100 * share.T, color=colour, linewidth=0.5, alpha=0.4)
-        _deviation_band(panel, steps, 100 * share, (f"{KINDS[kind].title}: {len(runs)} runs", colour))
+        _band(panel, steps, 100 * share, (f"{KINDS[kind].title}: {len(runs)} runs", colour))
     panel.axhline(100 * SUCCESS, color=GREY, linestyle=":", linewidth=1.0)
     panel.set_ylim(0, 105)
     panel.legend(frameon=False, loc="lower right")
@@ -278,7 +192,7 @@ def losses_figure(results: Results) -> Figure:
         dress(panel, name.split("/")[1].replace("_", " "), STEPS, "")
         for kind, style in (("pipe", ("with gradient penalty", BLUE)), ("no-penalty", ("without", ORANGE))):
             steps, loss = _series(_trainings(results, kind, twins.__contains__), name)
-            _deviation_band(panel, steps, loss, style)
+            _band(panel, steps, loss, style)
     panels[-1].legend(frameon=False)
     return figure
 

@@ -171,7 +171,6 @@ def draw(
         circle = plots.circle_figure(outcomes, plots.OPEN_STYLES)
         return {
             "circle": ("Circle from above, first seed, no load", circle),
-            "error": (f"Error at each point: mean and range {every}, no load", plots.error_figure(outcomes)),
             "loads": ("Unknown loads, with S2R: every run and the mean", plots.loads_figure(table)),
             **traces,
         }
@@ -179,12 +178,6 @@ def draw(
     circle = plots.circle_figure(outcomes, plots.CIRCLE_STYLES)
     return {
         "positions": (f"Finger tips from the front, {one}", plots.positions_figure(outcomes, shown)),
-        "errors": (f"Errors in the 300 mm pipe, {every}", plots.axis_errors_figure(outcomes, "pipe")),
-        "force": (f"Contact forces, {one}", plots.force_figure(outcomes, shown)),
-        "errors-narrow": (
-            f"Errors in the 250 mm pipe, {every}",
-            plots.axis_errors_figure(outcomes, "narrow"),
-        ),
         "success": (f"Success over training, {every}", plots.success_figure(results)),
         "losses": (
             f"Losses with and without gradient penalty, twin {first.twin}",
@@ -204,7 +197,7 @@ def _save_picture(path: Path, figure: Figure) -> None:
 
 
 def _open_sections(data: Row, drawn: Drawn) -> tuple[Section, ...]:
-    circle, error, *loads = drawn.values()
+    circle, *loads = drawn.values()
     unloaded = [item for item in data["spreads"] if not item["load_g"]]
     with_s2r = [item for item in data["spreads"] if item["kind"] == "with"]
     return (
@@ -214,7 +207,7 @@ def _open_sections(data: Row, drawn: Drawn) -> tuple[Section, ...]:
             "averaged over half a second. Without S2R, only the springs are calibrated. Gradient descent has "
             "no training seed and runs once for each twin.",
             (_spreads_table("open", unloaded),),
-            figures=(circle, error),
+            figures=(circle,),
         ),
         Section(
             "Unknown loads",
@@ -239,17 +232,16 @@ def _confined_sections(data: Row, drawn: Drawn) -> tuple[Section, ...]:
         Section(
             "300 mm pipe",
             "Mean ± standard deviation over twins and training seeds, with one policy for both tasks; errors "
-            "by motion capture at rest, averaged over half a second. Squares and dotted lines: where an "
-            "object is picked or placed. Dashed in the forces: what counts as none.",
+            "by motion capture at rest, averaged over half a second. Squares: where an object is picked or "
+            "placed.",
             table("pipe", "hand-made"),
-            figures=tuple(drawn[name] for name in ("positions", "errors", "force")),
+            figures=(drawn["positions"],),
         ),
         Section(
             "250 mm pipe",
             "The policy sees only the poses of the demonstrations in this pipe. Its reward is the "
             "environment's own plus the one learned in the 300 mm pipe, unchanged.",
             table("narrow"),
-            figures=(drawn["errors-narrow"],),
         ),
         Section(
             "Learned against hand-made reward",

@@ -63,11 +63,6 @@ def _names(words: list[str]) -> tuple[str, ...]:
     return names
 
 
-def main(arguments: Sequence[str]) -> int:
-    """Run the benchmark with command-line arguments; returns the exit status."""
-    return cli.main("python -m benchmarks", "", {"race": race}, ["race", *arguments])
-
-
 def race(
     seeds: cli.Integers = (0,),
     only: Annotated[tuple[str, ...], cli.listed(_names, "NAME,NAME,...")] = CONTESTANTS,

@@ -12,8 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks.harness.common import goal
-from benchmarks.race.contestants import CONTESTANTS, hindsight_share, tuned_settings
-from train.presets import PRESETS
+from benchmarks.race.contestants import CONTESTANTS
 
 LEVELS_MM = (10, 5, 3, 2)
 GOAL_MM = 5
@@ -59,7 +58,6 @@ def summarise(results: Sequence[Result]) -> dict[str, Any]:
     raced = {result["contestant"] for result in results}
     who = ("contestant", "seed")
     return {
-        "tuned": _tuned(),
         "wall_s": [_row(result, "wall_s") for result in ran],
         "wall_s_without_start_up": [_row(result, "trained_s") for result in ran],
         "env_steps": [_row(result, "env_steps") for result in ran],
@@ -68,20 +66,6 @@ def summarise(results: Sequence[Result]) -> dict[str, Any]:
         "failed": [{key: r[key] for key in (*who, "failed")} for r in results if "failed" in r],
         "measured_at": [{key: r[key] for key in (*who, "commit", "uncommitted_changes")} for r in ran],
         "curves": results,
-    }
-
-
-def _tuned() -> dict[str, Any]:
-    """Return the peers' settings, tuned as ours; the last two are for hindsight."""
-    config = PRESETS["quick"]
-    fastest = config.tqc.learning_rate
-    return {
-        "arms": config.n_arms,
-        "reward_scale": config.tqc.reward_scale,
-        **tuned_settings(config, lambda: 0),
-        "learning_rate": f"{fastest:g} to {fastest * config.tqc.learning_rate_end:g}",
-        "her_ratio": hindsight_share(config),
-        "goal_selection_strategy": "future",
     }
 
 

@@ -6,6 +6,7 @@ import re
 import pytest
 from matplotlib.figure import Figure
 
+from benchmarks.__main__ import main
 from benchmarks.paper import engine, experiments, report
 from benchmarks.paper.engine import SMOKE, claim
 from benchmarks.paper.measure import save_outcome
@@ -54,22 +55,22 @@ def test_both_experiments_or_one(tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr(experiments, "run", run)
     smoke = ["--smoke", "--out", str(tmp_path)]
-    assert experiments.main(smoke) == 0
-    assert experiments.main(["--only", "confined", "--twins", "1,2", *smoke]) == 0
+    assert main(["paper", *smoke]) == 0
+    assert main(["paper", "--only", "confined", "--twins", "1,2", *smoke]) == 0
     assert done == [("open", (0,)), ("confined", (0,)), ("confined", (1, 2))]
     assert f"report: {tmp_path / 'confined.html'}" in capsys.readouterr().out
 
 
 def test_folder_of_other_settings_is_an_error(tmp_path, capsys):
     claim(tmp_path, TINY)
-    assert experiments.main(["--smoke", "--out", str(tmp_path)]) == 2
+    assert main(["paper", "--smoke", "--out", str(tmp_path)]) == 2
     assert "choose another --out" in capsys.readouterr().err
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("experiment", "n_goals"), [("open", 11), ("confined", 10)])
 def test_smoke(tmp_path, capsys, experiment, n_goals):
-    assert experiments.main(["--smoke", "--only", experiment, "--out", str(tmp_path)]) == 0
+    assert main(["paper", "--smoke", "--only", experiment, "--out", str(tmp_path)]) == 0
     assert "goals" in json.loads((tmp_path / f"paper-{experiment}.json").read_text("utf-8"))["figures"]
     assert len(list((tmp_path / "trials").iterdir())) == len(trials(experiment, SMOKE))
     assert len(re.findall("^(met|NOT MET) ", capsys.readouterr().out, re.MULTILINE)) == n_goals

@@ -102,7 +102,7 @@ def test_open_results_are_written_and_nothing_is_hidden(tmp_path, read_page):
     film.write_gif(tmp_path / "circle.gif", frames)
     data = write_report("open", tmp_path, tmp_path / "out", TINY, results, "", {"commit": "none"})
     page = read_page(tmp_path / "report.html")
-    assert page.n_pictures == 3 + len(TINY.loads_g) + 1
+    assert page.n_pictures == 2 + len(TINY.loads_g) + 1
     assert "not met: with S2R, mean translation at most 5 mm: nan mm, 6 points missed" in page.text
     for text in ("NOT MET", "twin 1: Springs: off <by> much", "21.01", "3.89"):
         assert text in page.text
@@ -115,7 +115,7 @@ def test_open_results_are_written_and_nothing_is_hidden(tmp_path, read_page):
     assert {item["simulated_mm"] for item in simulated} == {1.25}
     assert (simulated[0]["on_twin_mm"]["min"], simulated[0]["on_twin_mm"]["max"]) == (10.0, 10.0)
     pictures = {path.name for path in (tmp_path / "out").glob("paper-*.png")}
-    names = ("circle", "error", "loads", "pressures-500g", "pressures-1000g")
+    names = ("circle", "loads", "pressures-500g", "pressures-1000g")
     assert pictures == {f"paper-{name}.png" for name in names}
     assert all((tmp_path / "out" / name).stat().st_size < 150_000 for name in pictures)
     assert (tmp_path / "out" / "paper-circle.gif").read_bytes()[:6] == b"GIF89a"
@@ -128,14 +128,14 @@ def test_confined_results_are_written_and_nothing_is_hidden(tmp_path, read_page)
     results = good_results("confined", TINY, changed)
     write_report("confined", tmp_path, tmp_path / "out", TINY, results, "no OpenGL <here>", {})
     page = read_page(tmp_path / "confined.html")
-    assert page.n_pictures == 7
+    assert page.n_pictures == 4
     assert ["", "at the goals at most 5 mm: nan mm, 28 points missed in 1 of 2 runs"][1] in page.text
     for text in ("8.93", "5.34", "5.13", "11.29", "11.59", "no OpenGL <here>", "7 of 10 goals are not met."):
         assert text in page.text
     figures = json.loads((tmp_path / "out" / "paper-confined.json").read_text("utf-8"))["figures"]
     assert len(figures["trainings"]) == len(trainings(TINY))
     assert [row["x_mm"] is None for row in figures["runs"]].count(True) == 3
-    names = ("positions", "errors", "errors-narrow", "force", "success", "losses", "circle")
+    names = ("positions", "success", "losses", "circle")
     pictures = {path.name for path in (tmp_path / "out").glob("*.png")}
     assert pictures == {f"paper-confined-{name}.png" for name in names}
     assert all((tmp_path / "out" / name).stat().st_size < 150_000 for name in pictures)

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 import pytest
 
+from benchmarks.__main__ import main
 from benchmarks.harness.rounds import Worker, WorkerError
 from benchmarks.race import race
 from benchmarks.race.contestants import (
@@ -29,6 +30,7 @@ from train.runs.evaluate import Evaluator
 FAKE = '''
 """A contestant whose curve is known: 100 mm / round, 10 s and 1,000 env steps each; or it stops by itself."""
 import sys
+from benchmarks.__main__ import main
 from benchmarks.harness.rounds import serve
 name, seed, stretch_s, n_goals = sys.argv[1:]
 k = 0
@@ -232,18 +234,18 @@ def test_some_may_race_alone_and_the_others_and_those_that_failed_follow(
 ):
     monkeypatch.setattr(race, "save", lambda *_: tmp_path / "race.json")
     some = [name for name in CONTESTANTS if "hindsight" in name or "plain" in name]
-    assert race.main(["--only", ",".join(some), "--out", str(tmp_path)]) == 0
+    assert main(["race", "--only", ",".join(some), "--out", str(tmp_path)]) == 0
     assert list(asked) == [f"{name}, seed 0" for name in ("ours-quick", *some)]
     assert "['sbx-defaults', 'sb3-contrib-defaults', 'ours-paper']" in capsys.readouterr().out
     asked.clear()
-    assert race.main(["--out", str(tmp_path)]) == 0
+    assert main(["race", "--out", str(tmp_path)]) == 0
     rest = ("sbx-hindsight", "sbx-defaults", "sb3-contrib-defaults", "ours-paper")  # the first had failed
     assert list(asked) == [f"{name}, seed 0" for name in rest]
 
 
 @pytest.mark.parametrize("arguments", [["--only", "sbx-plain,sbx"], ["--seeds", "1,"], ["--seeds", "a"]])
 def test_contestants_and_seeds_that_there_are_not_are_refused(asked, arguments, capsys):
-    assert race.main(arguments) == 2
+    assert main(["race", *arguments]) == 2
     assert "expected" in capsys.readouterr().err and not asked
 
 
@@ -270,7 +272,7 @@ def test_results_of_another_commit_size_or_machine_are_refused(asked, monkeypatc
 
 def test_without_the_first_there_is_no_race_and_other_seeds_are_told(asked, monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(race, "save", lambda *_: pytest.fail("written"))
-    assert race.main(["--seeds", "1,3", "--out", str(tmp_path)]) == 2
+    assert main(["race", "--seeds", "1,3", "--out", str(tmp_path)]) == 2
     said = capsys.readouterr()
     assert "ours-quick" in said.err
     assert "stopped with status 1" in said.out and "29.5" in said.out
