@@ -1,4 +1,4 @@
-"""Command line: `python -m train reach | imitate | evaluate | export | sweep | demos record | demos check`."""
+"""Command line: `python -m train COMMAND`."""
 
 from __future__ import annotations
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -65,7 +66,7 @@ def _differing(one: Any, other: Any, ignored: Sequence[str] = ()) -> list[str]:
 def named_preset(arguments: Sequence[str], presets: Mapping[str, Any], default: str) -> str:
     """Return the preset that the words of a command line name, or the default where they name none."""
     words = [part for word in arguments for part in word.split("=", 1)]
-    name = dict(zip(words, words[1:], strict=False)).get("--preset", default)
+    name = dict(itertools.pairwise(words)).get("--preset", default)
     return name if name in presets else default  # an unknown one is refused as all options are read
 
 

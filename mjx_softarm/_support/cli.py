@@ -26,8 +26,7 @@ from mjx_softarm.spec import ArmSpec
 
 ERROR, INTERRUPTED = 2, 130  # exit statuses
 
-# What tyro draws: colours, the sides of a box, and the rules between its parts, which a terminal without UTF-8
-# gets as hyphens.
+# Parts of tyro's boxes: colours, sides, and the rules between parts, which are hyphens without UTF-8.
 _COLOUR, _SIDE, _RULE = re.compile(r"\x1b\[[0-9;]*m"), " |\u2502", re.compile(r"\W?[-\u2500]{3,}\W?")
 _PLAINER = (
     (r"^Error parsing (?:(-\S*: )|\S*: )", r"\1"),

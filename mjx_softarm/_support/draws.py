@@ -1,7 +1,7 @@
 """Random numbers in any shape, drawn as one row, and on several devices by each of them.
 
-Of a shape whose last axis is short, XLA unrolls the generator on a CPU, and compiles it three times as long.
-Of numbers that are wanted in parts, one on each device, it lets devices draw for each other, and swap them.
+For a shape with a short last axis XLA unrolls the generator on a CPU, and compiles it three times as long.
+For numbers split over devices it lets devices draw for each other, and exchange the numbers.
 """
 
 from __future__ import annotations
@@ -16,24 +16,27 @@ from jax.sharding import Mesh, PartitionSpec
 
 
 def on(mesh: Mesh | None) -> contextlib.AbstractContextManager:
-    """Within it, in a traced function, each device of the mesh draws all numbers; None is one device."""
+    """Return a context in which, in a traced function, each device of the mesh draws all numbers.
+
+    None is one device.
+    """
     if mesh is None:
         return contextlib.nullcontext()
     return jax.sharding.use_abstract_mesh(mesh.abstract_mesh)
 
 
 def uniform(key: Array, shape: tuple[int, ...], minval: float = 0.0) -> Array:
-    """Uniform from `minval` to below 1, float32: the numbers of `jax.random.uniform`."""
+    """Return numbers of `jax.random.uniform`, from `minval` to below 1, float32."""
     return _everywhere(jax.random.uniform(key, (math.prod(shape),), minval=minval).reshape(shape))
 
 
 def normal(key: Array, shape: tuple[int, ...]) -> Array:
-    """Of the standard normal distribution, float32: the numbers of `jax.random.normal`."""
+    """Return numbers of `jax.random.normal`, of the standard normal distribution, float32."""
     return _everywhere(jax.random.normal(key, (math.prod(shape),)).reshape(shape))
 
 
 def integers(key: Array, n: int, below: Array) -> Array:
-    """Integers (n,) from 0 to below `below` (), uint32.
+    """Return integers (n,) from 0 to below `below` (), uint32.
 
     They are the remainders of random bits, which favours some by less than one in a thousand where `below` is
     at most four million, and compiles faster than `jax.random.randint`.
@@ -42,12 +45,12 @@ def integers(key: Array, n: int, below: Array) -> Array:
 
 
 def both(key: Array, shape_uniform: tuple[int, ...], shape_normal: tuple[int, ...]) -> tuple[Array, Array]:
-    """Numbers uniform from 0 to below 1, and of the standard normal distribution, of one draw; float32.
+    """Return uniform numbers from 0 to below 1, and standard normal numbers, from one draw; float32.
 
     Args:
-        key: for the draw.
-        shape_uniform: of the ones.
-        shape_normal: of the others.
+        key: key of the draw.
+        shape_uniform: shape of the uniform numbers.
+        shape_normal: shape of the normal numbers.
     """
     n_uniform = math.prod(shape_uniform)
     share = uniform(key, (n_uniform + math.prod(shape_normal),))

@@ -1,4 +1,4 @@
-"""What a result depends on besides its inputs, and how it is written down."""
+"""Provenance of a result: versions, machine and commit; and JSON files."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "o
 
 
 def provenance(program: str) -> dict[str, Any]:
-    """Versions, machine and commit that a result depends on; on what other benchmarks gave, it does not."""
+    """Return versions, machine and commit; changes of other benchmarks' results do not count."""
     versions, status = {}, _git("status", "--porcelain", "--", ":/", ":(top,exclude)benchmarks/results")
     for name in PACKAGES:
         try:

@@ -1,4 +1,4 @@
-"""How this project compiles: options per platform and the persistent compilation cache."""
+"""Compilation: options per platform, and the persistent cache of compiled programs."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _CPU_OPTIONS = {
 
 @functools.cache
 def compiler_options() -> dict[str, Any]:
-    """Options for `jax.jit(f, compiler_options=...)` that the installed jaxlib accepts, empty off the CPU."""
+    """Return the options for `jax.jit` that the installed jaxlib accepts; none on other devices than CPUs."""
     if jax.default_backend() != "cpu":
         return {}
     accepted = {}
@@ -34,9 +34,9 @@ def compiler_options() -> dict[str, Any]:
 
 
 def jit(function: Callable, uses_mjx: bool = True, **kwargs: Any) -> Callable:
-    """`jax.jit`, with this platform's options where MJX is in the function.
+    """Compile with `jax.jit`, with this platform's options where the function uses MJX.
 
-    Without MJX they do not help: the closed-form chain compiles well, and networks train about a tenth
+    Without MJX the options do not help: the closed-form chain compiles well, and networks train about a tenth
     slower with them.
     """
     return jax.jit(function, compiler_options=compiler_options() if uses_mjx else None, **kwargs)

@@ -33,20 +33,18 @@ class EnvConfig:
     """Simulation, reward and randomisation of `ReachEnv`."""
 
     engine: Literal["chain", "mjx"] = "chain"  # kinematics of the quasi-static mode
-    mode: Literal["quasistatic", "dynamic"] = "quasistatic"
+    mode: Literal["quasistatic", "dynamic"] = "quasistatic"  # equilibrium of each action, or its motion
     reward: RewardConfig = field(default_factory=RewardConfig)
     randomisation: Randomisation = field(default_factory=Randomisation)
     saturation_tolerance_mm: float = (
         1e3 * TOLERANCE_M
     )  # spring error at which a chamber at its limit counts as saturated
     n_poses: int = 8192  # poses of the reachable workspace that starts and goals are drawn from
-    workspace_seed: int = 0
+    workspace_seed: int = 0  # seed of these poses
     dynamic_step_s: float = 0.5  # duration of one environment step in dynamic mode
-    pipe_diameter_mm: float | None = (
-        None  # cross-shaped pipe around the arm; the arm does not collide with it
-    )
+    pipe_diameter_mm: float | None = None  # cross-shaped pipe around the arm, without contact
     clearance_cost_per_mm: float = 0.0  # reward lost per mm by which the clearance falls below the margin
-    clearance_margin_mm: float = 10.0
+    clearance_margin_mm: float = 10.0  # clearance of the body to the wall that costs nothing
 
     def __post_init__(self):
         for name, allowed in (("engine", ("chain", "mjx")), ("mode", ("quasistatic", "dynamic"))):

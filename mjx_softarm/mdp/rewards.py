@@ -22,13 +22,13 @@ from mjx_softarm.sensing.pose import pose_error
 class RewardConfig:
     """The paper's weights; `threshold` is theta, about 5.4 mm with no rotation error."""
 
-    goal_bonus: float = 100.0
-    error_cost: float = 10.0
-    step_cost: float = 0.1
-    saturation_cost: float = 100.0
-    threshold: float = 0.03
-    weight_per_mm: float = 0.0056
-    weight_per_deg: float = 0.001
+    goal_bonus: float = 100.0  # reward of a goal that is reached
+    error_cost: float = 10.0  # cost of a weighted error of 1
+    step_cost: float = 0.1  # cost of each action of the episode so far
+    saturation_cost: float = 100.0  # cost of a saturated chamber
+    threshold: float = 0.03  # weighted error below which a goal is reached
+    weight_per_mm: float = 0.0056  # weight of the tip's position
+    weight_per_deg: float = 0.001  # weight of the tip's angles
 
 
 def scaled_error(pose: Any, goal: Any, config: RewardConfig) -> Any:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -99,6 +100,15 @@ def test_a_run_survives_kill_9_and_ends_with_the_same_bits(tmp_path, environment
         monkeypatch.setattr(f"train.runs.estimator.{name}", smaller)
     assert main(["export", str(whole)]) == 0
     assert (whole / "policy.npz").exists()
+
+
+@pytest.mark.parametrize("command", ["reach", "imitate", "sweep"])
+def test_help_explains_every_setting(command, capsys):
+    with pytest.raises(SystemExit, match="0"):
+        main([command, "--help"])
+    shown = capsys.readouterr().out
+    assert shown.count("\n  --") > 45
+    assert re.findall(r"(--[a-z]\S+)(?: [A-Z\[{.]\S*)*\s+\(default", shown) == []  # a default without a text
 
 
 HOLD = """

@@ -29,9 +29,9 @@ Logits = Callable[[Array, Array], Array]  # observations (..., O) and actions (.
 class GailConfig:
     """Hyperparameters of the discriminator."""
 
-    hidden: tuple[int, ...] = (256, 256)
-    learning_rate: float = 3e-4  # Adam
-    gradient_penalty: float = 20.0  # the paper's lambda
+    hidden: tuple[int, ...] = (256, 256)  # widths of the hidden layers
+    learning_rate: float = 3e-4  # learning rate (Adam)
+    gradient_penalty: float = 20.0  # weight of the gradient penalty, the paper's lambda
     input_scale: float = 10.0  # factor on observations and actions, hence on the logit's slope
 
     def __post_init__(self) -> None:

@@ -27,11 +27,11 @@ from train.agent.tqc import Transition
 class HindsightConfig:
     """Shares of a batch that get another goal; the rest keeps its own."""
 
-    reached_share: float = 0.5
-    near_share: float = 0.0
-    near_min_mm: float = 1.0
-    near_max_mm: float = 100.0
-    mm_per_deg: float = 1.0  # how far a near goal's angles are turned
+    reached_share: float = 0.5  # share whose goal becomes the pose reached
+    near_share: float = 0.0  # share whose goal becomes a pose near the one reached
+    near_min_mm: float = 1.0  # smallest distance of a near goal
+    near_max_mm: float = 100.0  # largest distance of a near goal
+    mm_per_deg: float = 1.0  # distance that goes with a turn of one degree of a near goal
 
     def __post_init__(self):
         if min(self.reached_share, self.near_share) < 0 or self.reached_share + self.near_share > 1:

@@ -30,20 +30,20 @@ Params = Any  # a flax parameter tree
 class TQCConfig:
     """Hyperparameters, by default stable-baselines3-contrib's. Raises ValueError naming a bad field."""
 
-    hidden_actor: tuple[int, ...] = (256, 256)
-    hidden_critic: tuple[int, ...] = (256, 256)  # of each critic
-    n_critics: int = 2
-    n_quantiles: int = 25  # per critic
+    hidden_actor: tuple[int, ...] = (256, 256)  # widths of the actor's hidden layers
+    hidden_critic: tuple[int, ...] = (256, 256)  # widths of each critic's hidden layers
+    n_critics: int = 2  # number of critics
+    n_quantiles: int = 25  # quantiles per critic
     n_drop_per_critic: int = 2  # largest pooled target quantiles dropped, per critic
-    layer_norm: bool = False  # in the critics
-    learning_rate: float = 3e-4  # of actor and critics (Adam)
+    layer_norm: bool = False  # layer normalisation in the critics
+    learning_rate: float = 3e-4  # learning rate of actor and critics (Adam)
     learning_rate_end: float = 1.0  # share of the learning rate left at the end of a half-cosine decay
-    learning_rate_alpha: float = 3e-4  # of the temperature; 0 holds it at initial_alpha
+    learning_rate_alpha: float = 3e-4  # learning rate of the temperature; 0 holds it at initial_alpha
     gamma: float = 0.99  # discount per step
     tau: float = 0.005  # Polyak rate of the target critics and of the mean actor, per update
-    initial_alpha: float = 1.0  # temperature
-    target_entropy: float | None = None  # [nat]; None is minus the number of actions
-    reward_scale: float = 1.0  # on every reward in the critics' targets
+    initial_alpha: float = 1.0  # initial temperature
+    target_entropy: float | None = None  # target entropy [nat]; None is minus the number of actions
+    reward_scale: float = 1.0  # factor on every reward in the critics' targets
 
     def __post_init__(self) -> None:
         required = {

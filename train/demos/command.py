@@ -92,7 +92,7 @@ def _summary(log: Log, spec: ArmSpec) -> list[str]:
     low, high = demos.positions.min(axis=0), demos.positions.max(axis=0)
     ranges = ", ".join(f"{axis} {low[k]:.0f} to {high[k]:.0f}" for k, axis in enumerate("xyz"))
     lines = [
-        f"positions: {len(log)}, tip [mm]: {ranges}",
+        f"poses: {len(log)}, tip [mm]: {ranges}",
         f"sequences: {len(ids)}: {sequences}",
         f"actions: {demos.actions.min():.3f} to {demos.actions.max():.3f} of -1 to 1",
     ]

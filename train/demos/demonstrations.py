@@ -1,10 +1,9 @@
-"""Demonstrations: positions that an expert brought the arm to, each with the action that leads there.
+"""Demonstrations: static poses that an expert brought the arm to, each with the action that leads there.
 
 A file of demonstrations is a log (`mjx_softarm.logs.schema`) of rows at rest, with the sensors' readings, the
-tip's pose, and the id of the sequence that a row belongs to. A row's action is its own readings: asked of
-the springs, they lead to the row's pose from wherever the arm is. So a row's pose is the goal of its action,
-and any other one its start. There is nothing to repair in so few rows: whatever is wrong with one of them
-refuses the file.
+tip's pose, and the id of the sequence that a row belongs to. A row's action is its own readings: as spring
+references they lead to the row's pose from any start. So a row's pose is the goal of its action, and every
+other pose may be its start. With so few rows, a fault in one of them refuses the file.
 
 Source: the paper's representation of demonstration data, g' = the pose of s_{t+1}.
 """
@@ -28,10 +27,10 @@ NEEDED = ("readings", "tip_m", "tip_quaternion", "sequence")
 
 
 class Demonstrations(NamedTuple):
-    """m demonstrated positions; float32, ids int32."""
+    """m demonstrated poses; float32, ids int32."""
 
     positions: np.ndarray  # (m, 6) [mm, deg]
-    actions: np.ndarray  # (m, n_chambers) in [-1, 1] that lead to a position
+    actions: np.ndarray  # (m, n_chambers) in [-1, 1] that lead to the poses
     sequence: np.ndarray  # (m,)
 
 
@@ -49,7 +48,7 @@ def load_demonstrations(path: str | Path, spec: ArmSpec) -> Demonstrations:
 
 
 def read_demonstrations(path: str | Path, spec: ArmSpec) -> tuple[Log, list[Finding]]:
-    """The checked rows of a file, and its unknown columns.
+    """Return the checked rows of a file, and findings on its unknown columns.
 
     Raises:
         LogError: the file cannot be used; the message has a line for each finding.
@@ -62,7 +61,7 @@ def read_demonstrations(path: str | Path, spec: ArmSpec) -> tuple[Log, list[Find
 
 
 def from_log(log: Log, spec: ArmSpec) -> Demonstrations:
-    """The demonstrations that checked rows are."""
+    """Return the demonstrations of checked rows."""
     actions = ActionMap.from_spec(spec).from_readings(log.readings)
     assert log.sequence is not None  # it is `NEEDED`
     positions = pose_from_quaternion(log.tip_m, log.tip_quaternion)
@@ -122,5 +121,5 @@ def _finding(sheet: Sheet, row: int | np.integer, column: str, problem: str) -> 
 
 
 def _shown(column: Column, value: float) -> str:
-    """A number of the unit used inside, as the file has it."""
+    """Return a number in the file's unit, as text."""
     return f"{value / UNITS[column.kind][column.unit]:.7g}"

@@ -1,15 +1,14 @@
-"""The scripted expert: chamber pressures that bring the finger tips to waypoints, as a careful operator does.
+"""The scripted expert: chamber pressures that bring the finger tips to waypoints.
 
-For each waypoint, the equilibrium of the (calibrated) arm is sought that has its finger tips there, its body
-inside the pipe, its chambers and springs away from their limits, and that otherwise is clear of the wall and
-close to the equilibrium of the waypoint before. That is a least-squares problem in the nine pressures, with
-one-sided errors for the limits, solved by a damped Gauss-Newton method from many starts at once: the posture
-before, and postures of a random pool that are near and clear. Of the ends that keep all limits, those are
-preferred whose straight way in pressures from the posture before is clear, and of these the nearest one.
-Where none keeps them with the gripper as it is asked to hang, it may hang a little otherwise.
+For each waypoint the expert seeks an equilibrium of the (calibrated) arm with the finger tips there, the body
+inside the pipe, chambers and springs away from their limits, and otherwise clear of the wall and close to the
+posture before. This is a least-squares problem in the nine pressures, with one-sided errors for the
+limits. A damped Gauss-Newton method solves it from many starts at once: around the posture before, and from a
+random pool. Of the solutions within all limits it prefers those whose straight path in pressures from the
+posture before is clear, and of these the nearest. If there is none, the gripper's orientation may be a little
+off.
 
-Poses are the real arm's, P_S2R, where there is a sim-to-real network, and so is the body, as far as the
-network tells; see `carry_body`.
+With a sim-to-real network, poses and body are the real arm's, P_S2R; see `carry_body`.
 """
 
 from __future__ import annotations
@@ -37,49 +36,47 @@ from mjx_softarm.spec import ArmSpec
 from train.demos.waypoints import Waypoint
 
 N_POOL, N_STARTS, N_STEPS = 4096, 32, 25
-_BATCH = 256  # postures looked at in one call
-N_JITTERED = 8  # of the starts, about the posture before
-JITTER_KPA = 3.0
-WAY = (0.25, 0.5, 0.75)  # of the way from the posture before, where its clearance is looked at
-WAY_CLEAR_M = 0.01  # with more than this it is as good as any
-MARGIN_M = 0.004  # of the body to the wall
-MARGIN_KPA = 1.5  # of the chambers to their limits
-COMFORT_M, COMFORT_KPA = 0.02, 6.0  # beyond these, more distance is worth nothing
-SPRING_MARGIN_M = 1e-3
-TOLERANCE_M, TOLERANCE_RAD = 5e-4, 0.01  # of a waypoint that is met
-EASED = 0.2  # weight of the orientation where no posture meets it so: it may then be off by 5 times that
-LIMIT_SHARE = 0.8  # of a margin, that must be kept: one-sided errors end a little inside of it
+_BATCH = 256  # postures computed in one call
+N_JITTERED, JITTER_KPA = 8, 3.0  # starts around the posture before
+WAY = (0.25, 0.5, 0.75)  # shares of the path from the posture before at which clearance is checked
+WAY_CLEAR_M = 0.01  # more clearance than this counts the same
+MARGIN_M, SPRING_MARGIN_M = 0.004, 1e-3  # clearance of the body, distance of the springs to their limits
+MARGIN_KPA = 1.5  # distance of the chambers to their limits
+COMFORT_M, COMFORT_KPA = 0.02, 6.0  # more distance than these counts the same
+TOLERANCE_M, TOLERANCE_RAD = 5e-4, 0.01  # errors at which a waypoint counts as met
+EASED = 0.2  # weight of the orientation in a second try: its error may then be 5 times larger
+LIMIT_SHARE = 0.8  # share of a margin that must be kept: one-sided errors end a little inside of it
 
-# One unit of error.
+# Errors that count as one.
 _POSITION_M, _TURN_RAD, _LIMIT_KPA, _LIMIT_M = 1e-4, 1e-3, 0.1, 1e-4
 _COMFORT_M, _COMFORT_KPA, _NEAR_KPA = 0.01, 3.0, 20.0
 _NO_WALL_M = 1.0  # clearance where there is no pipe
 
 
 class ExpertError(InputError):
-    """A waypoint that cannot be met; the message says which, how far off, and what is in the way."""
+    """A waypoint that cannot be met; the message names it, the best errors and the limits."""
 
 
 class Posture(NamedTuple):
     """An arm at rest; each field may have leading axes."""
 
     pressure_kpa: Any  # (n_chambers,)
-    spring_m: Any  # (n_chambers,) which are the references to hold
-    pose: Any  # (6,) [mm, deg] of the tip, the real arm's where there is a network
+    spring_m: Any  # (n_chambers,) references to hold
+    pose: Any  # (6,) [mm, deg] pose of the tip, the real arm's where there is a network
     finger_m: Any  # (3,)
-    rotation: Any  # (3, 3) of the gripper
-    clearance_m: Any  # () of the body to the wall
-    residual: Any  # () force [N, N m] that is left
+    rotation: Any  # (3, 3) orientation of the gripper
+    clearance_m: Any  # () clearance of the body
+    residual: Any  # () residual of the equilibrium [N, N m]
 
 
 class Target(NamedTuple):
-    """What to solve for."""
+    """A problem to solve."""
 
     finger_m: Any  # (3,)
     rotation: Any  # (3, 3)
-    turn: Any  # (3,) 1 for each of the gripper's axes about which it is not to turn from that, else 0
-    bias_kpa: Any  # (n_chambers,) by which the real arm's pressures are above the simulated one's
-    near_kpa: Any  # (n_chambers,)
+    turn: Any  # (3,) 1 for each axis of the gripper whose rotation is fixed, else 0
+    bias_kpa: Any  # (n_chambers,) real arm's pressures less the simulated arm's
+    near_kpa: Any  # (n_chambers,) pressures to stay close to
 
 
 class Expert:
@@ -93,22 +90,17 @@ class Expert:
         self._pool = jax.tree.map(lambda x: x[self._slack(pool).min(axis=-1) >= 0.0], pool)
 
     def look(self, pressure_kpa: np.ndarray) -> Posture:
-        """Postures at pressures (n, n_chambers) [kPa]."""
-        n = len(pressure_kpa)
-        padded = np.resize(
-            np.asarray(pressure_kpa, np.float32), (-(-n // _BATCH) * _BATCH, self.spec.n_chambers)
-        )
+        """Return the postures at pressures (n, n_chambers) [kPa]."""
+        n, n_batches = len(pressure_kpa), -(-len(pressure_kpa) // _BATCH)
+        padded = np.resize(np.float32(pressure_kpa), (n_batches * _BATCH, self.spec.n_chambers))
         parts = [
             jax.device_get(_look_many(part, self._params, self.s2r, self.spec, self.pipe))
-            for part in np.split(padded, len(padded) // _BATCH)
+            for part in np.split(padded, n_batches)
         ]
         return jax.tree.map(lambda *x: np.concatenate(x)[:n], *parts)
 
     def plan(self, waypoints: Sequence[Waypoint]) -> Posture:
-        """Postures (n,) at waypoints, each near the one before.
-
-        Args:
-            waypoints: one after the other.
+        """Return postures (n,) at waypoints, each near the one before.
 
         Raises:
             ExpertError: a waypoint cannot be met.
@@ -120,18 +112,19 @@ class Expert:
         return jax.tree.map(lambda *x: np.stack(x), *found)
 
     def target(self, waypoint: Waypoint) -> Target:
-        """What a waypoint asks for."""
+        """Return the problem of a waypoint."""
         zero = np.zeros(self.spec.n_chambers)
         return Target(np.asarray(waypoint.finger_m), np.eye(3), np.array(waypoint.turn), zero, zero)
 
     def reach(self, name: str, target: Target, before_kpa: np.ndarray) -> Posture:
-        """The posture that meets a target, near the one at `before_kpa` (n_chambers,).
+        """Return the posture that meets a target, near the one at `before_kpa` (n_chambers,).
 
         Raises:
             ExpertError: there is none; `name` is in its message.
         """
         target = jax.tree.map(np.float32, target._replace(near_kpa=before_kpa))
         starts = np.float32(self._starts(target))
+        # Solve from all starts; with the orientation eased if nothing meets it.
         for weight in (1.0, EASED) if target.turn.any() else (1.0,):
             eased = target._replace(turn=np.float32(weight) * target.turn)
             ends = _solve_many(starts, eased, self._params, self.s2r, self.spec, self.pipe)
@@ -142,6 +135,7 @@ class Expert:
                 break
         else:
             raise ExpertError(self._why(name, target, found, slack))
+        # Of the solutions, take the clearest path, then the nearest.
         way = [found.pressure_kpa[met] * share + before_kpa * (1.0 - share) for share in WAY]
         clear_m = self.look(np.concatenate(way)).clearance_m.reshape(len(WAY), -1).min(axis=0)
         far_kpa = np.linalg.norm(found.pressure_kpa[met] - before_kpa, axis=-1)
@@ -149,7 +143,7 @@ class Expert:
         return jax.tree.map(lambda x: x[best], found)
 
     def _starts(self, target: Target) -> np.ndarray:
-        """Pressures (N_STARTS, n_chambers): about the posture before, and of the pool."""
+        """Return pressures (N_STARTS, n_chambers): around the posture before, and from the pool."""
         low, high = self._limits_kpa()
         jitter = JITTER_KPA * self._rng.standard_normal((N_JITTERED, len(target.near_kpa)))
         jitter[0] = 0.0
@@ -164,22 +158,18 @@ class Expert:
         return chambers.pressure_min_kpa, chambers.pressure_max_kpa
 
     def _room_kpa(self, found: Posture, target: Target) -> np.ndarray:
-        """What is left to the next limit (n, n_chambers) of the real arm's pressures."""
-        low, high = self._limits_kpa()
-        real_kpa = found.pressure_kpa + target.bias_kpa
+        """Return the distance (n, n_chambers) of the real arm's pressures to the nearest limit."""
+        (low, high), real_kpa = self._limits_kpa(), found.pressure_kpa + target.bias_kpa
         return np.minimum(real_kpa - low, high - real_kpa)
 
     def _slack(self, found: Posture, target: Target | None = None) -> np.ndarray:
-        """How far within its tolerance each demand is, in units of that tolerance: (n, demands).
+        """Return the slack (n, demands) of each demand, in units of its tolerance.
 
-        Equilibrium, clearance, pressures, springs; then position and, where it is wanted, orientation.
+        Demands are equilibrium and clearance and, with a target, pressures, springs, position, orientation.
         """
         springs = self.spec.springs
         margin_m = np.minimum(found.spring_m - springs.length_min_m, springs.length_max_m - found.spring_m)
-        demands = [
-            1.0 - found.residual / RESIDUAL_TOLERANCE,
-            found.clearance_m / MARGIN_M - LIMIT_SHARE,
-        ]
+        demands = [1.0 - found.residual / RESIDUAL_TOLERANCE, found.clearance_m / MARGIN_M - LIMIT_SHARE]
         if target is not None:
             off_m, turn_rad = _off(found, target)
             demands += [
@@ -191,32 +181,32 @@ class Expert:
         return np.nan_to_num(np.stack(demands, axis=-1), nan=-np.inf)
 
     def _why(self, name: str, target: Target, found: Posture, slack: np.ndarray) -> str:
-        """Of the end that comes closest: how far off, its clearance, and the chamber next to a limit."""
+        """Return errors, clearance and tightest chamber of the best solution."""
         best = int(np.argmax(np.minimum(slack, 0.0).sum(axis=-1)))
         off_m, turn_rad = (value[best] for value in _off(found, target))
         low, high = self._limits_kpa()
         chamber = int(np.argmin(self._room_kpa(found, target)[best]))
         kpa = (found.pressure_kpa[best] + target.bias_kpa)[chamber]
-        wanted = ", ".join(f"{1e3 * value:.0f}" for value in target.finger_m)
+        finger = ", ".join(f"{1e3 * value:.0f}" for value in target.finger_m)
         turned = f" and turned by {np.degrees(turn_rad):.1f} deg" if target.turn.any() else ""
         wall = "" if self.pipe is None else f", {1e3 * found.clearance_m[best]:.1f} mm from the wall"
         expected = f", {np.degrees(TOLERANCE_RAD / EASED):.1f} deg" if target.turn.any() else ""
         expected += "" if self.pipe is None else f", {1e3 * MARGIN_M:g} mm from the wall"
         return (
-            f"waypoint {name!r} at {wanted} mm cannot be met: the best of {len(slack)} ends is "
+            f"waypoint {name!r} at {finger} mm cannot be met: got at best "
             f"{1e3 * off_m:.1f} mm off{turned}{wall}, chamber {chamber} at {kpa:.1f} kPa; expected "
             f"at most {1e3 * TOLERANCE_M:g} mm{expected}, {low + MARGIN_KPA:g} to {high - MARGIN_KPA:g} kPa"
         )
 
 
 def _off(found: Posture, target: Target) -> tuple[np.ndarray, np.ndarray]:
-    """Distance (n,) [m] of the finger tips to the target, and wrong turn (n,) [rad] of the gripper."""
+    """Return the errors of the finger tips (n,) [m] and of the gripper's orientation (n,) [rad]."""
     angle = target.turn * _angle(found.rotation, target.rotation)
     return np.linalg.norm(found.finger_m - target.finger_m, axis=-1), np.linalg.norm(angle, axis=-1)
 
 
 def _angle(rotation: Any, target: Any) -> Any:
-    """Sines (..., 3) of the turn of rotations (..., 3, 3) to a target (3, 3), about the gripper's axes."""
+    """Return sines (..., 3) of the turn from rotations (..., 3, 3) to a target (3, 3), in gripper axes."""
     xp = array_namespace(rotation)
     turn = xp.swapaxes(rotation, -1, -2) @ target
     axes = ((2, 1), (0, 2), (1, 0))
@@ -224,7 +214,7 @@ def _angle(rotation: Any, target: Any) -> Any:
 
 
 def _posture(pressure_kpa: Array, params: ArmParams, s2r: S2R | None, spec: ArmSpec, pipe: CrossPipe | None):
-    """Posture, and the clearance (k,) [m] of each point of the body; differentiable."""
+    """Return a posture, and the clearance (k,) [m] of each point of the body; differentiable."""
     with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
         q = rest(params, pressure_kpa)
         frames = chain_frames(q, params.link_length_m)
@@ -249,15 +239,13 @@ def _posture(pressure_kpa: Array, params: ArmParams, s2r: S2R | None, spec: ArmS
 
 
 @functools.partial(jax.jit, static_argnames=("spec", "pipe"))
-def _look_many(
-    pressure_kpa: Array, params: ArmParams, s2r: S2R | None, spec: ArmSpec, pipe: CrossPipe | None
-):
+def _look_many(pressure_kpa: Array, params: ArmParams, s2r, spec: ArmSpec, pipe: CrossPipe | None):
     return jax.vmap(lambda p: _posture(p, params, s2r, spec, pipe)[0])(pressure_kpa)
 
 
 @functools.partial(jax.jit, static_argnames=("spec", "pipe"))
 def _solve_many(starts_kpa, target: Target, params: ArmParams, s2r, spec: ArmSpec, pipe: CrossPipe | None):
-    """Pressures (N_STARTS, n_chambers) after damped Gauss-Newton steps from each start."""
+    """Return pressures (N_STARTS, n_chambers) after damped Gauss-Newton steps from each start."""
     low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
 
     def errors(pressure_kpa: Array) -> tuple[Array, Array]:
@@ -288,7 +276,7 @@ def _solve_many(starts_kpa, target: Target, params: ArmParams, s2r, spec: ArmSpe
 
 
 def _errors(posture: tuple[Posture, Array], target: Target, spec: ArmSpec) -> Array:
-    """What a posture is off by, each in its unit; limits count where they are not kept."""
+    """Return the errors of a posture, each in its unit; limits count where they are violated."""
     now, wall_m = posture
     chambers, springs = spec.chambers, spec.springs
     real_kpa = now.pressure_kpa + target.bias_kpa

@@ -1,10 +1,9 @@
-"""Records demonstrations on an arm, through its springs, pumps and motion capture alone.
+"""Demonstrations recorded on an arm, through its springs, pumps and motion capture alone.
 
-The expert's references are held by the sensor-space law until the arm is at rest. Then, as an operator would,
-motion capture is looked at, and the target is moved by what the finger tips are off, away from limits that
-chambers have come to. What an arm without motion capture is off stays unknown; the planned pose is logged.
-Or the finger tips are steered by keys, in steps, with the same expert finding the references. Between two
-moves the pumps keep the last pressures.
+The sensor-space law holds the expert's references until the arm is at rest. Then motion capture gives the
+error of the finger tips, and the target is shifted by it, away from the limits of chambers.
+Without motion capture the error stays unknown, and the planned pose is logged. Alternatively keys steer the
+finger tips in steps, and the same expert finds the references. Between moves the pumps keep their pressures.
 """
 
 from __future__ import annotations
@@ -24,20 +23,20 @@ from mjx_softarm.sensing.pose import quaternion_from_pose, rotation_from_quatern
 from train.demos.expert import Expert, ExpertError, Posture
 from train.demos.waypoints import Waypoint
 
-CLOSE_M = 1.5e-3  # of the finger tips to a waypoint; within that, nothing is corrected
-FAR_M = 0.01  # a position further from its waypoint is none that should be learned from
+CLOSE_M = 1.5e-3  # error of the finger tips below which nothing is corrected
+FAR_M = 0.01  # error of the finger tips above which a pose is not worth learning from
 N_CORRECTIONS = 3
-BEYOND_KPA = 3.0  # that a chamber at its limit is taken to need beyond it
+BEYOND_KPA = 3.0  # pressure that a chamber at its limit is assumed to lack
 STEPS_M = {"s": 0.005, "l": 0.02}
 AXES = dict(zip("xyz", np.eye(3), strict=True))
 KEYS = "x y z, X Y Z: a step forth, back; s, l: steps of 5, 20 mm; space: log; q: end"
 
 
 class Recording(NamedTuple):
-    """What was logged."""
+    """Logged poses, with their errors."""
 
     log: Log
-    off_m: np.ndarray  # (n,) of the finger tips from each waypoint, as seen; NaN where nobody saw
+    off_m: np.ndarray  # (n,) error of the finger tips by motion capture; NaN without it
     ending: Ending
 
 
@@ -46,8 +45,8 @@ class Teleoperation:
 
     Args:
         arm: an `ArmIO`, maybe with motion capture.
-        expert: of the arm.
-        tell: takes a line for each position.
+        expert: expert for the arm.
+        tell: takes a line for each pose.
         save: writes the log, if it has rows, once the arm is vented.
     """
 
@@ -70,7 +69,7 @@ class Teleoperation:
 
         Args:
             waypoints: one after the other.
-            plan: postures (n,) at them, as `Expert.plan` gives them.
+            plan: postures (n,) at the waypoints, by `Expert.plan`.
             sequence: id of the demonstration.
         """
 
@@ -84,7 +83,7 @@ class Teleoperation:
         return self._end(run)
 
     def steer(self, keys: Iterable[str], sequence: int = 0) -> Recording:
-        """Move by keys until they end; see `KEYS`."""
+        """Move by keys until the keys end; see `KEYS`."""
 
         def run() -> None:
             step_m, logged = STEPS_M["l"], True
@@ -95,15 +94,15 @@ class Teleoperation:
                 if key in STEPS_M:
                     step_m = STEPS_M[key]
                 elif key.lower() in AXES:
-                    moved_m = finger_m + (step_m if key.islower() else -step_m) * AXES[key.lower()]
-                    if self._step(moved_m):
-                        finger_m, logged = moved_m, False
+                    goal_m = finger_m + (step_m if key.islower() else -step_m) * AXES[key.lower()]
+                    if self._step(goal_m):
+                        finger_m, logged = goal_m, False
                 elif key == " " and logged:
-                    self.tell("not moved since the start, or since the last position was logged")
+                    self.tell("not moved since the start, or since the last pose was logged")
                 elif key == " ":
                     logged = True
                     self._add(self._last, sequence, np.nan)
-                    self.tell(f"position {len(self._rows)} logged")
+                    self.tell(f"pose {len(self._rows)} logged")
                 elif key.strip():
                     self.tell(f"got key {key!r}; {KEYS}")
 
@@ -119,7 +118,7 @@ class Teleoperation:
         return self._rows.log("demonstrations", self._drive.sensor)
 
     def _reach(self, waypoint: Waypoint, posture: Posture) -> tuple[dict, float]:
-        """The row at rest, and how far off [m] the finger tips are then, after `N_CORRECTIONS` at most."""
+        """Return the row at rest and the error [m] of the finger tips, after at most `N_CORRECTIONS`."""
         target = asked = self.expert.target(waypoint)
         row, off_m = None, np.nan
         for n_left in range(N_CORRECTIONS, -1, -1):
@@ -145,12 +144,12 @@ class Teleoperation:
         if row is None:
             raise self._not_at_rest(waypoint.name)
         if off_m > FAR_M:
-            off = f"{1e3 * off_m:.1f} mm off and not to be corrected, expected at most {1e3 * FAR_M:g} mm"
+            off = f"got {1e3 * off_m:.1f} mm off after corrections, expected at most {1e3 * FAR_M:g} mm"
             raise ArmFault(f"{waypoint.name}: {off}; is the arm calibrated?")
         return row, off_m
 
     def _step(self, finger_m: np.ndarray) -> bool:
-        """Bring the finger tips (3,) [m] there from where they are; False, told, where that cannot be."""
+        """Bring the finger tips to a point (3,) [m]; False, with a message, where that cannot be done."""
         waypoint = Waypoint("of the key", finger_m)
         try:
             posture = self.expert.reach(waypoint.name, self.expert.target(waypoint), self._now.pressure_kpa)
@@ -164,12 +163,12 @@ class Teleoperation:
         return True
 
     def _hold(self, posture: Posture) -> dict | None:
-        """Hold a posture's references; the row at rest, or None."""
+        """Hold a posture's references; return the row at rest, or None."""
         self._now = posture
         return self._drive.to_rest(Hold(self._drive.gains, posture.spring_m, self._drive.dt_s))
 
     def _bias_kpa(self, posture: Posture) -> np.ndarray:
-        """By how much the arm's pressures are above the posture's; guessed of those that a limit keeps in."""
+        """Return the arm's pressures less the posture's; guessed where a limit cuts them off."""
         low, high = self._drive.gains.pressure_min_kpa, self._drive.gains.pressure_max_kpa
         kpa = self._drive.link.pressure_kpa
         beyond = np.where(kpa >= high, BEYOND_KPA, 0.0) - np.where(kpa <= low, BEYOND_KPA, 0.0)
@@ -188,7 +187,7 @@ class Teleoperation:
         self._last = row
 
     def _seen(self, row: dict) -> tuple[np.ndarray, np.ndarray]:
-        """Finger tips (3,) [m] and the gripper's rotation (3, 3): as seen, or as planned where no frame came."""
+        """Return finger tips (3,) [m] and the gripper's rotation (3, 3), measured, or planned without a frame."""
         if "tip_m" not in row:
             return self._now.finger_m, self._now.rotation
         rotation = rotation_from_quaternion(row["tip_quaternion"])
@@ -208,7 +207,7 @@ class Teleoperation:
 
 
 def read_keys(stream: TextIO) -> Iterator[str]:
-    """Characters as they are typed, without waiting for the line's end where that is a terminal."""
+    """Yield characters as they are typed; on a terminal without waiting for the end of the line."""
     if not stream.isatty():
         yield from iter(lambda: stream.read(1), "")
         return

@@ -1,7 +1,7 @@
-"""Tasks as waypoints: where the finger tips are to be demonstrated, one short move after the other.
+"""Tasks as waypoints of the finger tips, one short move after the other.
 
-The paper tells the operations and how many positions were recorded, not where: circle at the height that the
-arm reaches best, pipe positions along the axes of the pipe, evenly spaced between one container and the next.
+The paper gives the operations and the number of poses, not where they are. Here the circle is at the height
+that the arm reaches best; waypoints in a pipe are evenly spaced along its axes from container to container.
 """
 
 from __future__ import annotations
@@ -16,37 +16,37 @@ from mjx_softarm.mechanics.workspace import circle_poses
 from mjx_softarm.sensing.pose import frame_from_pose
 from mjx_softarm.spec import ArmSpec
 
-HOME_BELOW_M = 0.1  # of the finger tips below the crossing's centre, where the pipe's tasks begin and end
+HOME_BELOW_M = 0.1  # finger tips below the crossing's centre, where the pipe's tasks begin and end
 
 
-# How the gripper is to hang.
+# Orientation of the gripper.
 FREE = (0.0, 0.0, 0.0)
 STRAIGHT = (1.0, 1.0, 0.0)  # straight down
 SQUARE = (1.0, 1.0, 1.0)  # straight down, and its yaw zero
 
 
 class Waypoint(NamedTuple):
-    """Where the finger tips are to be."""
+    """A target of the finger tips."""
 
     name: str  # "pick right", "place left" and the like where an object is taken or let go
     finger_m: np.ndarray  # (3,) in the base frame
-    turn: tuple[float, float, float] = FREE  # 1 for each of the gripper's axes about which it is not to turn
+    turn: tuple[float, float, float] = FREE  # 1 for each axis of the gripper whose rotation is fixed
 
     @property
     def operation(self) -> str:
-        """What happens to an object there: "pick", "place" or ""."""
+        """Operation on an object there: "pick", "place" or ""."""
         first = self.name.split(" ")[0]
         return first if first in ("pick", "place") else ""
 
 
 class Task(NamedTuple):
-    """Waypoints of one demonstration, and the pipe that it happens in."""
+    """Waypoints of one demonstration, and the pipe around the arm."""
 
     waypoints: tuple[Waypoint, ...]
     pipe: CrossPipe | None = None
 
 
-# Stops of a path with the moves that lead to each; "home" is where it begins.
+# Stops of a path, each with the number of moves to it; the path begins at "home".
 _PIPE300 = (("pick right", 4), ("place left", 7), ("pick bottom", 6), ("place right", 6), ("home", 4))
 _PIPE250 = (("pick left", 6), ("place bottom", 8), ("pick right", 8), ("place left", 8), ("home", 6))
 _STOPS = {"pipe300": _PIPE300, "pipe250": _PIPE250}
@@ -54,7 +54,7 @@ TASKS = ("circle16", *_STOPS)
 
 
 def task(name: str, spec: ArmSpec) -> Task:
-    """The task of this name, one of `TASKS`, for an arm with the gripper of `spec`."""
+    """Return the task of this name, one of `TASKS`, for an arm with the gripper of `spec`."""
     if name == "circle16":
         return Task(circle(16, spec))
     pipe = CrossPipe.of_mm(PIPES_MM[name])
@@ -62,18 +62,18 @@ def task(name: str, spec: ArmSpec) -> Task:
 
 
 def circle(n: int, spec: ArmSpec) -> tuple[Waypoint, ...]:
-    """Points of the circle, the gripper as in the circle's poses."""
+    """Return n waypoints on the circle, with the gripper as in the circle's poses."""
     position_m, _ = frame_from_pose(circle_poses(n).astype(float))
     finger_m = position_m - [0.0, 0.0, spec.mass.gripper_length_m]
     return tuple(Waypoint(f"circle {k}", point, SQUARE) for k, point in enumerate(finger_m))
 
 
 def pick_and_place(pipe: CrossPipe, stops: Sequence[tuple[str, int]]) -> tuple[Waypoint, ...]:
-    """From home by way of the crossing to each stop, in so many moves of one length.
+    """Return waypoints from home through the crossing to each stop, in moves of equal length.
 
     Args:
         pipe: the pipe.
-        stops: names, whose last word is a container or "home", and how many moves lead there.
+        stops: name, whose last word is a container or "home", and number of moves, of each stop.
     """
     places = dict(pipe.containers())
     crossing = np.array([0.0, 0.0, places["right"][2]])
@@ -88,7 +88,7 @@ def pick_and_place(pipe: CrossPipe, stops: Sequence[tuple[str, int]]) -> tuple[W
 
 
 def _along(corner_m: np.ndarray, n: int) -> np.ndarray:
-    """Points (n, 3) evenly spaced along a path with corners (k, 3), without its first."""
+    """Return points (n, 3) evenly spaced along a path with corners (k, 3), without its first point."""
     length_m = np.linalg.norm(np.diff(corner_m, axis=0), axis=1)
     at = np.concatenate([[0.0], np.cumsum(length_m)])
     where = at[-1] * np.arange(1, n + 1) / n

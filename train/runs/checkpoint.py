@@ -31,12 +31,12 @@ CHECKPOINTS, DEMONSTRATIONS_FILE, LOCK_FILE = "checkpoints", "demonstrations.npz
 
 
 class RunError(InputError):
-    """A folder that does not hold a run that can be used; the message names it and what is wrong."""
+    """A folder without a usable run; the message names the folder and the fault."""
 
 
 @contextlib.contextmanager
 def sole_trainer(path: Path) -> Iterator[None]:
-    """Hold the folder of a run or of a sweep while training in it; a process that is killed lets go of it.
+    """Lock the folder of a run or a sweep while training in it; a killed process releases the lock.
 
     Where several processes train together, the first one holds it.
 
@@ -83,10 +83,10 @@ class Run:
         """Start a folder.
 
         Args:
-            path: of the folder.
+            path: folder to make.
             config: all settings.
             spec: the arm.
-            s2r: of its calibration, if it has one.
+            s2r: sim-to-real network of the arm's calibration, if there is one.
             demonstrations: rows of the file that is learned from.
             begins_with: folders of the runs that parts of the first state come from, by part.
             state: that first state. The folder is a run's only once it holds it.
@@ -96,7 +96,7 @@ class Run:
         """
         if (path / "config.json").exists():
             raise RunError(
-                f"{path}: already holds a run; continue it with --resume {path}, or choose another --out"
+                f"{path}: got a folder with a run, expected a new one; continue it with --resume {path}"
             )
         wait_for_all(f"{path} is free")
         try:
@@ -126,7 +126,7 @@ class Run:
 
     @classmethod
     def open(cls, path: Path) -> Run:
-        """An existing folder.
+        """Open an existing folder.
 
         Raises:
             RunError: there is no run in it, or its config cannot be read.
@@ -140,12 +140,14 @@ class Run:
         except OSError as error:
             raise RunError(f"{path}: not the folder of a run: {file}: {error.strerror}") from error
         except (ValueError, KeyError, TypeError) as error:
-            raise RunError(f"{file}: not a run's config: {error!r}") from error
+            raise RunError(
+                f"{file}: got a config of another version: {error}; expected this version's"
+            ) from error
         s2r = load_s2r(path / S2R_FILE, spec.n_chambers) if has_s2r else None
         return cls(path, config, spec, s2r)
 
     def demonstrations(self) -> Demonstrations | None:
-        """What the run learns from, if it learns from demonstrations.
+        """Return the demonstrations that the run learns from, or None.
 
         Raises:
             RunError: its file cannot be read.
@@ -168,7 +170,7 @@ class Run:
         return sorted(self._manager.all_steps())
 
     def rewind(self, epoch: int) -> None:
-        """Forget checkpoints and metrics later than an epoch, before it is continued from there."""
+        """Delete checkpoints and metrics later than an epoch, before the run continues from there."""
         for later in [saved for saved in self.epochs if saved > epoch]:
             self._manager.delete(later)
         self.truncate_metrics(epoch)
@@ -179,7 +181,7 @@ class Run:
         self._manager.wait_until_finished()
 
     def restore(self, like: TrainState) -> tuple[int, TrainState]:
-        """The newest checkpoint.
+        """Return the newest checkpoint: epochs done, and state.
 
         Args:
             like: a state, or its shapes, structured as the run's.
@@ -195,7 +197,7 @@ class Run:
         return epoch, cast(TrainState, state)
 
     def restore_part(self, name: str, like: Any) -> Any:
-        """One field of the newest checkpoint's state as NumPy arrays, without reading the others.
+        """Return one field of the newest checkpoint's state as NumPy arrays, without reading the others.
 
         Args:
             name: of the field.
@@ -204,9 +206,9 @@ class Run:
         Raises:
             RunError: there is no checkpoint, or it is not structured so.
         """
-        wanted = {name: jax.tree.map(ocp.utils.to_shape_dtype_struct, like)}
-        as_numpy = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), wanted)
-        arguments = ocp.args.PyTreeRestore(wanted, as_numpy, partial_restore=True)
+        shapes = {name: jax.tree.map(ocp.utils.to_shape_dtype_struct, like)}
+        as_numpy = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), shapes)
+        arguments = ocp.args.PyTreeRestore(shapes, as_numpy, partial_restore=True)
         # Not by the manager, which reads a checkpoint in no other way than it has saved one.
         path = self._manager.directory / str(self._newest()) / "default"
         try:
@@ -238,7 +240,7 @@ class Run:
                 file.write(json.dumps(row) + "\n")
 
     def metrics(self) -> list[dict[str, Any]]:
-        """The lines of `metrics.jsonl`, up to the first incomplete one."""
+        """Return the lines of `metrics.jsonl`, up to the first incomplete one."""
         rows = []
         file = self.path / "metrics.jsonl"
         for line in file.read_text("utf-8").splitlines() if file.exists() else []:
@@ -249,7 +251,7 @@ class Run:
         return rows
 
     def truncate_metrics(self, epoch: int) -> None:
-        """Forget lines later than an epoch, before it is continued from there."""
+        """Delete lines later than an epoch, before the run continues from there."""
         if not is_first_process():
             return
         rows = [row for row in self.metrics() if row["epoch"] <= epoch]
@@ -259,9 +261,9 @@ class Run:
 
 
 def _shape_somewhere(x: Any) -> jax.ShapeDtypeStruct:
-    """Shape, type and place of an array; this process's first device where no place is given.
+    """Return shape, type and device of an array; by default this process's first device.
 
-    Else it would come back to the devices that it was saved from, which may not be here.
+    Otherwise orbax restores to the devices of the saved array, which may not exist here.
     """
     shape = ocp.utils.to_shape_dtype_struct(x)
     assert isinstance(shape, jax.ShapeDtypeStruct)  # a state has no plain numbers

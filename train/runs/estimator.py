@@ -1,9 +1,8 @@
-"""What the arm's computer has to know about the arm, distilled from the simulator into small networks.
+"""Small networks for the arm's computer, distilled from the simulator: pose estimator and spring model.
 
-Equilibria over the whole workspace are the data, held-out ones the test. The networks' structure, and what
-they are for, stand in `mjx_softarm.sensing.estimator`. All equilibria are of the arm without more payload than its
-specification has: springs alone cannot tell a payload, and with payloads mixed in the unloaded arm would
-pay for it.
+Equilibria over the whole workspace are the data, held-out ones the test. `mjx_softarm.sensing.estimator`
+describes the networks. All equilibria have the payload of the specification: springs alone cannot tell a
+payload, and payloads in the data would cost accuracy for the unloaded arm.
 """
 
 from __future__ import annotations
@@ -32,18 +31,18 @@ from mjx_softarm.sensing.pose import frame_from_pose
 from mjx_softarm.spec import ArmSpec
 
 N_TRAINING, N_HELD_OUT = 16_384, 2_048
-MORE_PRESSURE = 0.25  # of the range, at either end
+MORE_PRESSURE = 0.25  # share of the pressure range that is added at either end
 N_STEPS = 8_000
 BATCH = 256
 WIDTH = 128
-LEARNING_RATE = 4e-3  # at the start; it falls to zero by a cosine
-PAYLOADS_KG = (0.0, 0.25, 0.5, 1.0)  # more than the specification's, at which errors are given
-TURN_MM = 50.0  # a turn by one radian costs as much as being so far away
-CHANGE_SCALE = 0.015  # of the network's outputs, in section lengths and half radians
+LEARNING_RATE = 4e-3  # at the start, with a cosine decay to zero
+PAYLOADS_KG = (0.0, 0.25, 0.5, 1.0)  # added to the specification's, at which errors are given
+TURN_MM = 50.0  # tip distance that costs as much as a turn by one radian
+CHANGE_SCALE = 0.015  # scale of the network's outputs, in section lengths and half radians
 
 
 class Error(NamedTuple):
-    """How far off held-out arms are."""
+    """Errors on held-out equilibria."""
 
     median: float
     p95: float
@@ -57,22 +56,22 @@ class Distilled(NamedTuple):
     spring_model: SpringModel
     tip_mm: dict[float, Error]  # by payload [kg] on top of the specification's
     turn_deg: dict[float, Error]
-    spring_mm: dict[float, Error]  # of the spring furthest off
+    spring_mm: dict[float, Error]  # of the spring with the largest error
 
 
 def distil(spec: ArmSpec, seed: int) -> Distilled:
-    """Pose estimator and spring model of an arm; the same seed gives the same networks.
+    """Return pose estimator and spring model of an arm; the same seed gives the same networks.
 
     Args:
         spec: the arm, calibrated or not.
-        seed: of the equilibria, the first weights and the batches.
+        seed: seed of the equilibria, the initial weights and the batches.
 
     Raises:
         ValueError: the seed is the held-out one.
         SpecError: the arm settles at too few pressures.
     """
     if seed == HELD_OUT_SEED:
-        raise ValueError(f"seed: {HELD_OUT_SEED} draws the held-out equilibria")
+        raise ValueError(f"seed: got {seed}, which draws the held-out equilibria, expected another")
     key_estimator, key_springs = jax.random.split(jax.random.key(seed))
     pool = sample_workspace(_stronger(spec), N_TRAINING, seed)
     estimator = _fit(_first_estimator(spec, pool, key_estimator), _pose_loss, pool, key_estimator)
@@ -83,7 +82,7 @@ def distil(spec: ArmSpec, seed: int) -> Distilled:
 
 
 def _stronger(spec: ArmSpec) -> ArmSpec:
-    """The arm with more pressure: a real one has spring lengths that the simulated one cannot quite reach."""
+    """Return the arm with more pressure: a real one reaches spring lengths just beyond the simulated."""
     low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
     more = MORE_PRESSURE * (high - low)
     return spec.replace(
@@ -116,7 +115,7 @@ def _first_spring_model(pool: Pool, key: Array) -> SpringModel:
 
 
 def _first_layers(key: Array, widths: tuple[int, ...]) -> tuple[Layer, ...]:
-    """Random layers that keep the order of what goes through them."""
+    """Return random layers that preserve the magnitude of their input."""
     layers = []
     for k, (n_in, n_out) in enumerate(itertools.pairwise(widths)):
         gain = np.sqrt(2.0 / n_in)  # He et al. 2015, arXiv:1502.01852
@@ -126,7 +125,7 @@ def _first_layers(key: Array, widths: tuple[int, ...]) -> tuple[Layer, ...]:
 
 
 def _pose_loss(estimator: PoseEstimator, pool: Pool) -> Array:
-    """Mean square of the tip's error [mm], with turns counted as `TURN_MM` a radian."""
+    """Return the mean square of the tip error [mm], where a radian of turn counts as `TURN_MM`."""
     position_m, rotation = frame_from_pose(pool.pose)
     guess = estimate_frame(estimator, pool.spring_m)
     away = jnp.sum((1e3 * (guess.position_m - position_m)) ** 2, axis=-1)  # (B,)
@@ -135,20 +134,20 @@ def _pose_loss(estimator: PoseEstimator, pool: Pool) -> Array:
 
 
 def _spring_loss(model: SpringModel, pool: Pool) -> Array:
-    """Mean square of the springs' errors [mm]."""
+    """Return the mean square of the springs' errors [mm]."""
     return jnp.mean((1e3 * (expected_springs(model, pool.pressure_kpa) - pool.spring_m)) ** 2)
 
 
 def _fit(network: Any, loss: Callable[[Any, Pool], Array], pool: Pool, key: Array) -> Any:
-    """The network with its layers trained by Adam; its other fields stay."""
+    """Return the network with its layers trained by Adam; its other fields stay."""
     optimiser = optax.adam(optax.cosine_decay_schedule(LEARNING_RATE, N_STEPS))
 
     def step(carry: tuple[Any, Any], key_batch: Array) -> tuple[tuple[Any, Any], None]:
         layers, state = carry
         rows = jax.random.randint(key_batch, (BATCH,), 0, len(pool.pose))
         batch = jax.tree.map(lambda x: x[rows], pool)
-        slope = jax.grad(lambda layers: loss(network._replace(layers=layers), batch))(layers)
-        updates, state = optimiser.update(slope, state)
+        gradient = jax.grad(lambda layers: loss(network._replace(layers=layers), batch))(layers)
+        updates, state = optimiser.update(gradient, state)
         return (optax.apply_updates(layers, updates), state), None
 
     @jax.jit
@@ -162,7 +161,7 @@ def _fit(network: Any, loss: Callable[[Any, Pool], Array], pool: Pool, key: Arra
 def _errors(
     estimator: PoseEstimator, spring_model: SpringModel, spec: ArmSpec
 ) -> tuple[dict[float, Error], dict[float, Error], dict[float, Error]]:
-    """Of the tip [mm], of its axes [deg] and of the springs [mm], by payload."""
+    """Return errors of the tip [mm], of its axes [deg] and of the springs [mm], by payload."""
     tip_mm, turn_deg, spring_mm = {}, {}, {}
     for payload_kg in PAYLOADS_KG:
         loaded = spec.replace(mass={"payload_kg": spec.mass.payload_kg + payload_kg})

@@ -20,16 +20,16 @@ from train.runs.run import restore_policy
 from train.runs.task import Task
 
 N_WORKSPACE = 2048  # poses that stand for the workspace
-SEED = 0  # of the estimator
+SEED = 0  # seed of the estimator
 
 
 def export_run(run: Run, path: Path | None = None, task: Task | None = None) -> Path:
     """Write the policy of a run's newest checkpoint; return the file.
 
     Args:
-        run: its config and checkpoint.
-        path: of the file; `policy.npz` in the run by default.
-        task: of the run, where its learner is not the one that its config names.
+        run: folder with config and checkpoint.
+        path: file to write; `policy.npz` in the run by default.
+        task: task of the run, where its learner is not the one that its config names.
 
     Raises:
         RunError: the run has no checkpoint, or its learner's policy is not a network that the file can hold.
@@ -65,7 +65,7 @@ def export_run(run: Run, path: Path | None = None, task: Task | None = None) -> 
 
 
 def arm_model(env: ReachEnv) -> tuple[ArmModel, Distilled]:
-    """What the arm's computer has to know about the environment's arm, and how exact it is."""
+    """Return the deployed arm's model of an environment's arm, and its errors."""
     distilled = _distil(env.spec)
     workspace = np.asarray(env.pool.pose[:N_WORKSPACE], np.float32)
     return ArmModel(workspace, distilled.estimator, distilled.spring_model, env.s2r), distilled
@@ -73,5 +73,5 @@ def arm_model(env: ReachEnv) -> tuple[ArmModel, Distilled]:
 
 @functools.cache
 def _distil(spec: ArmSpec) -> Distilled:
-    """Once for all policies of an arm that a process exports."""
+    """Return the arm's networks, distilled once for all policies that a process exports."""
     return distil(spec, SEED)

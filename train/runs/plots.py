@@ -1,4 +1,4 @@
-"""The pictures of a run: learning curve, circle, map of the error over the workspace."""
+"""Pictures of a run: learning curve, circle, map of the error over the workspace."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ def save(folder: Path, pictures: dict[str, Figure]) -> None:
 
 
 def reach_pictures(rows: list[dict[str, Any]], workspace: Reached, circle: Reached) -> dict[str, Figure]:
-    """The pictures of a run on the workspace, by file name."""
+    """Return the pictures of a run on the workspace, by file name."""
     figures = (learning_curve(rows), circle_figure(circle), workspace_figure(workspace))
     return dict(zip(REACH_PICTURES, figures, strict=True))
 
 
 def imitation_pictures(rows: list[dict[str, Any]], at: AtPositions) -> dict[str, Figure]:
-    """The pictures of a run on demonstrated positions, by file name."""
+    """Return the pictures of a run on demonstrated poses, by file name."""
     figures = (imitation_curve(rows), losses(rows), positions_figure(at))
     return dict(zip(IMITATION_PICTURES, figures, strict=True))
 
 
 def dress(axes: Any, title: str, x: str, y: str) -> None:
-    """Title, labels and grid, as all pictures of the project have them."""
+    """Give axes the title, labels and grid of all pictures of the project."""
     axes.set_title(title, loc="left", fontsize=10, color=INK)
     axes.set_xlabel(x)
     axes.set_ylabel(y)
@@ -57,14 +57,14 @@ def _axes(figure: Figure, position: Any, title: str, x: str, y: str) -> Any:
 
 
 def logarithmic(axes: Any) -> None:
-    """The y axis, with plain numbers."""
+    """Make the y axis logarithmic, with plain numbers."""
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter("{x:g}")
     axes.yaxis.set_minor_formatter(LogFormatter())
 
 
 def learning_curve(rows: list[dict[str, Any]]) -> Figure:
-    """Held-out tip error and success over environment steps."""
+    """Draw held-out tip error and success over environment steps."""
     figure = Figure(figsize=(10, 4), layout="constrained")
     evaluated = [row for row in rows if "evaluation/median_mm" in row]
     steps = [row["env_steps"] for row in evaluated]
@@ -88,7 +88,7 @@ def learning_curve(rows: list[dict[str, Any]]) -> Figure:
 
 
 def circle_figure(circle: Reached) -> Figure:
-    """The circle seen from above, the error and the pressures along it."""
+    """Draw the circle from above, and the error and the pressures along it."""
     figure = Figure(figsize=(12, 4), layout="constrained")
     goal, pose = np.asarray(circle.goal), np.asarray(circle.pose)
     error = circle.tip_error_mm
@@ -109,7 +109,7 @@ def circle_figure(circle: Reached) -> Figure:
 
 
 def workspace_figure(workspace: Reached) -> Figure:
-    """Where in the workspace the tip error is how large, and its distribution."""
+    """Draw the tip error over the workspace, and its distribution."""
     figure = Figure(figsize=(13, 4), layout="constrained")
     goal, error = np.asarray(workspace.goal), workspace.tip_error_mm
     order = np.argsort(error)
@@ -144,11 +144,11 @@ def workspace_figure(workspace: Reached) -> Figure:
 
 
 def imitation_curve(rows: list[dict[str, Any]]) -> Figure:
-    """Success and tip error at the demonstrated positions over environment steps."""
+    """Draw success and tip error at the demonstrated poses over environment steps."""
     figure = Figure(figsize=(10, 4), layout="constrained")
     evaluated = [row for row in rows if "evaluation/success_share" in row]
     steps = [row["env_steps"] for row in evaluated]
-    left = _axes(figure, 121, "demonstrated positions reached", STEPS, "%")
+    left = _axes(figure, 121, "demonstrated poses reached", STEPS, "%")
     for name, colour, label in (
         ("success_share", BLUE, "unsaturated, inside the pipe"),
         ("reached_share", GREY, "the pose alone"),
@@ -156,7 +156,7 @@ def imitation_curve(rows: list[dict[str, Any]]) -> Figure:
         left.plot(steps, [100 * row[f"evaluation/{name}"] for row in evaluated], color=colour, label=label)
     left.set_ylim(0, 105)
     left.legend(frameon=False)
-    right = _axes(figure, 122, "tip error at the positions", STEPS, "mm")
+    right = _axes(figure, 122, "tip error at the poses", STEPS, "mm")
     right.plot(steps, [row["evaluation/median_mm"] for row in evaluated], color=BLUE, label="median")
     right.plot(steps, [row["evaluation/max_mm"] for row in evaluated], color=ORANGE, label="largest")
     logarithmic(right)
@@ -165,7 +165,7 @@ def imitation_curve(rows: list[dict[str, Any]]) -> Figure:
 
 
 def losses(rows: list[dict[str, Any]]) -> Figure:
-    """Plot all metrics of the learner that are losses over environment steps."""
+    """Draw all metrics of the learner that are losses over environment steps."""
     names = list(dict.fromkeys(name for row in rows for name in row if name.endswith("loss")))
     figure = Figure(figsize=(4 * max(len(names), 1), 3.5), layout="constrained")
     for k, name in enumerate(names):
@@ -177,10 +177,10 @@ def losses(rows: list[dict[str, Any]]) -> Figure:
 
 
 def positions_figure(at: AtPositions) -> Figure:
-    """Goals and what was reached from the front, errors and clearances along the positions."""
+    """Draw demonstrated and reached poses from the front, and errors and clearances along them."""
     figure = Figure(figsize=(12, 4), layout="constrained")
     goal, pose = np.asarray(at.reached.goal), np.asarray(at.reached.pose)
-    left = _axes(figure, 131, "positions from the front", "x [mm]", "z [mm]")
+    left = _axes(figure, 131, "poses from the front", "x [mm]", "z [mm]")
     left.plot(goal[:, 0], goal[:, 2], color=GREY, marker="o", markerfacecolor="none", label="demonstrated")
     left.plot(pose[:, 0], pose[:, 2], "o", markersize=3.5, color=BLUE, label="reached")
     left.set_aspect("equal")

@@ -1,4 +1,4 @@
-"""The host's side of a training run: loop over epochs, show, log, checkpoint, stop when asked to."""
+"""Host side of a training run: loop over epochs, show, log, checkpoint, stop on request."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ def train(run: Run, task: Task, console: Console) -> Any:
     """Train to the end of the run's config, from its newest checkpoint if it has one.
 
     Args:
-        run: the folder; its config says everything.
-        task: of the run.
-        console: where progress is shown.
+        run: the folder, with all settings.
+        task: task of the run.
+        console: shows progress.
 
     Returns:
         Figures of the final policy.
@@ -59,7 +59,7 @@ def train(run: Run, task: Task, console: Console) -> Any:
                 if due or stop:
                     run.save(epoch, state)
                 progress.update(bar, completed=epoch, text=_line(task, row))
-                if due and not console.is_terminal:  # a log file gets lines in the place of a bar
+                if due and not console.is_terminal:  # a log file gets lines instead of a bar
                     console.print(
                         f"epoch {epoch} of {run.config.n_epochs}: {_line(task, row)}", highlight=False
                     )
@@ -69,7 +69,7 @@ def train(run: Run, task: Task, console: Console) -> Any:
 
 
 def _begin(run: Run, task: Task, console: Console) -> tuple[int, TrainState]:
-    """The epochs that a run has done, and its state after them."""
+    """Return the number of epochs that a run has done, and its state after them."""
     console.print("compiling (cached for the next start) ...")
 
     def first() -> tuple[int, TrainState]:
@@ -92,7 +92,7 @@ def finish(run: Run, task: Task, policy: Any) -> Any:
 
 
 def task_of_run(run: Run, mesh: Mesh | None = None) -> Task:
-    """What a run learns.
+    """Return the task of a run.
 
     Raises:
         RunError: its demonstrations cannot be read.
@@ -115,8 +115,8 @@ def begin_with(task: Task, seed: int, **donors: Run) -> TrainState:
     """Return the state that a new run begins with, where parts of its learner are other runs'.
 
     Args:
-        task: of the new run.
-        seed: of the new run.
+        task: task of the new run.
+        seed: seed of the new run.
         donors: runs by what their learners give, such as `agent` or `reward`; see the learner's `adopt`.
 
     Raises:
@@ -142,7 +142,7 @@ def _restored_learner(run: Run, task: Task) -> Any:
 
 
 def open_board(run: Run, state: TrainState) -> SummaryWriter:
-    """TensorBoard's writer; what a stopped run wrote after its checkpoint is dropped."""
+    """Return TensorBoard's writer; events of a stopped run later than its checkpoint are dropped."""
     steps = int(state.n_env_steps)
     purge_step = steps + 1 if steps else None
     return SummaryWriter(str(run.path), purge_step=purge_step, write_to_disk=is_first_process())
@@ -158,19 +158,19 @@ def _timed_epoch(job: Job, state: TrainState) -> tuple[TrainState, dict[str, flo
 
 
 def speeds(config: TrainConfig, n_updates: int, seconds: float) -> dict[str, float]:
-    """How fast an epoch with so many updates was, as a row of metrics has it."""
+    """Return the speeds of an epoch with n updates, named as in a row of metrics."""
     n_env_steps = config.n_arms * config.vector_steps_per_epoch
     return {"speed/env_steps_per_s": n_env_steps / seconds, "speed/updates_per_s": n_updates / seconds}
 
 
 def evaluation(task: Task, policy: Any) -> dict[str, float]:
-    """Figures of a policy, as a row of metrics has them."""
+    """Return the figures of a policy, named as in a row of metrics."""
     figures = task.evaluate(policy)[0].to_dict()
     return {f"evaluation/{name}": x for name, x in figures.items() if not isinstance(x, tuple)}
 
 
 def counts(state: TrainState) -> dict[str, int]:
-    """What a run has done, as a row of metrics has it."""
+    """Return the numbers of env steps and updates so far, named as in a row of metrics."""
     return {"env_steps": int(state.n_env_steps), "updates": int(state.n_updates)}
 
 
@@ -190,7 +190,7 @@ def _line(task: Task, row: dict[str, float]) -> str:
 
 
 def progress_bar(console: Console) -> Progress:
-    """Of epochs; hidden where the console is a file."""
+    """Return a progress bar over epochs, hidden where the console is a file."""
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     columns += (TextColumn("{task.fields[text]}"),)
     return Progress(*columns, console=console, speed_estimate_period=120, disable=not console.is_terminal)
@@ -198,7 +198,7 @@ def progress_bar(console: Console) -> Progress:
 
 @contextmanager
 def asked_to_stop() -> Iterator[list[int]]:
-    """A list that fills when the process is asked to stop; a second Ctrl-C stops at once."""
+    """Yield a list that fills when the process is asked to stop; a second Ctrl-C stops at once."""
     asked: list[int] = []
 
     def note(number: int, _frame: Any) -> None:
@@ -215,11 +215,11 @@ def asked_to_stop() -> Iterator[list[int]]:
 
 
 def default_path(task: str, preset: str, seed: int) -> Path:
-    """`runs/TASK-PRESET-seedN`, or the first free one numbered after it."""
+    """Return `runs/TASK-PRESET-seedN`, or the first free path numbered after it."""
     return free_path(Path("runs") / f"{task}-{preset}-seed{seed}")
 
 
 def free_path(base: Path) -> Path:
-    """A path that is not there: this one, or the first free one numbered after it."""
+    """Return this path, or the first path numbered after it, that does not exist."""
     candidates = (base if k == 1 else base.with_name(f"{base.name}-{k}") for k in range(1, 10_000))
     return next(path for path in candidates if not path.exists())

@@ -92,8 +92,8 @@ def members_of(
         path = path.replace("-", "_")
         if path not in VARIABLE:
             raise ConfigError(
-                f"--vary {assignment}: got a setting that decides what is computed or on what shapes, which all "
-                f"members share, expected NAME=VALUE,... for one of {', '.join(VARIABLE)}"
+                f"--vary {assignment}: got a setting that decides what is computed or on what shapes, "
+                f"expected NAME=VALUE,... for one of {', '.join(VARIABLE)}"
             )
         if path in values:
             raise ConfigError(f"--vary {assignment}: got {path} again, expected all its values in one")

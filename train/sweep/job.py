@@ -53,21 +53,21 @@ _AXES = TrainState(**{**dict.fromkeys(TrainState._fields, cast(Any, 0)), "n_env_
 
 
 def setting(config: Any, path: str) -> Any:
-    """The value of a setting such as `tqc.gamma`."""
+    """Return the value of a setting such as `tqc.gamma`."""
     for name in path.split("."):
         config = getattr(config, name)
     return config
 
 
 def with_env_config(env: ReachEnv, config: Any) -> ReachEnv:
-    """The environment with another config, which differs in nothing but `VARIABLE` settings."""
+    """Return the environment with a config that differs in `VARIABLE` settings alone."""
     other = copy.copy(env)
     other.config = config
     return other
 
 
 class SweepJob:
-    """The members' fixed parts, and the functions that change the states of all.
+    """Fixed parts of the members, and functions that change the states of all of them.
 
     A state of a sweep is a `TrainState` whose arrays have an axis of n members in front, all but
     `n_env_steps`. `n_traces` counts how often the epoch was traced: once in a sweep.
@@ -103,11 +103,11 @@ class SweepJob:
         self._stack = jax.jit(lambda *trees: jax.tree.map(lambda *x: jnp.stack(x), *trees))
 
     def init(self) -> TrainState:
-        """The state that all members begin with."""
+        """Return the initial state of all members."""
         return self._init_all(self.keys, self.numbers)
 
     def epoch(self, states: TrainState) -> tuple[TrainState, dict[str, Array]]:
-        """As `Job.epoch`, with metrics (n,)."""
+        """Run an epoch of all members, with metrics (n,)."""
         return self._epoch_all(states, self.numbers)
 
     def policy(self, states: TrainState, k: int) -> Any:
@@ -115,16 +115,16 @@ class SweepJob:
         return self.learner.policy(self._take(states.learner, k))
 
     def member(self, states: TrainState, k: int) -> TrainState:
-        """The state of one member, as an ordinary run has it."""
+        """Return the state of one member, as an ordinary run has it."""
         own = self._take(states._replace(n_env_steps=None), k)
         return own._replace(n_env_steps=states.n_env_steps)
 
     def member_shapes(self) -> TrainState:
-        """Shapes of a member's state."""
+        """Return the shapes of a member's state."""
         return jax.eval_shape(self.member, jax.eval_shape(self.init), 0)
 
     def together(self, members: Sequence[TrainState]) -> TrainState:
-        """The state of all members from those of each."""
+        """Return the state of all members from the states of each."""
         states = self._stack(*(own._replace(n_env_steps=None) for own in members))
         return states._replace(n_env_steps=members[0].n_env_steps)
 
@@ -144,7 +144,7 @@ class SweepJob:
 
 
 def _with_number(config: Any, path: str, number: Array) -> Any:
-    """A copy of a config with a traced number, which its own checks cannot look at; they saw its values."""
+    """Return a copy of a config with a traced number; its checks, which need values, have passed before."""
     name, _, rest = path.partition(".")
     changed = copy.copy(config)
     value = _with_number(getattr(config, name), rest, number) if rest else number

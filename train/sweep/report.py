@@ -1,4 +1,4 @@
-"""What came of several runs: their figures, and these over the seeds of the same settings."""
+"""Results of several runs: their figures, and mean and range over the seeds of the same settings."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ _COLUMNS = (
 
 
 def by_settings(runs: Sequence[Run], settings_of: Callable[[Run], dict[str, Any]]) -> list[dict[str, Any]]:
-    """Figures of finished runs, grouped.
+    """Return the figures of finished runs, grouped by settings.
 
     Args:
         runs: trained to their end.
-        settings_of: what the runs of a group have in common.
+        settings_of: settings that the runs of a group share.
 
     Returns:
         For each group `settings`, `runs` with their figures, and `over_seeds`: mean, least and greatest.
@@ -102,7 +102,7 @@ def _name(settings: dict[str, Any], between: str = ", ") -> str:
 
 
 def table(groups: Sequence[dict[str, Any]]) -> Table:
-    """Mean over the seeds and, of several, least and greatest, for each setting."""
+    """Return a table with, for each setting, the mean over the seeds and their range."""
     n_seeds = len(groups[0]["runs"])
     spread = f"mean of {n_seeds} seeds (least to greatest)" if n_seeds > 1 else "one seed"
     shown = Table(title=f"held-out figures, {spread}", title_justify="left")
@@ -123,7 +123,7 @@ def table(groups: Sequence[dict[str, Any]]) -> Table:
 
 
 def curves(sweep: Sweep) -> Figure:
-    """Held-out median over environment steps: a line for each setting, a band from least to greatest seed."""
+    """Draw the held-out median over environment steps: a line for each setting, a band over its seeds."""
     lines: dict[str, list[list[tuple[int, float]]]] = {}
     for run in sweep.runs:
         points = [

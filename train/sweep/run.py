@@ -1,7 +1,7 @@
-"""The host's side of a sweep: its folder, and the loop that trains all members at once.
+"""Host side of a sweep: its folder, and the loop that trains all members at once.
 
-Each member has the folder of an ordinary run, so whatever takes a run takes a member. A killed process may
-have left them with checkpoints of different epochs; they continue from the newest that all of them have.
+Each member has the folder of an ordinary run, so every command on a run works on a member. After a killed
+process the members may have checkpoints of different epochs; they continue from the newest common one.
 """
 
 from __future__ import annotations
@@ -52,12 +52,12 @@ class Sweep:
 
     @property
     def config(self) -> TrainConfig:
-        """Of any member, for what they have in common."""
+        """Config of the first member, for settings that all members share."""
         return self.runs[0].config
 
     @property
     def epoch(self) -> int:
-        """The newest epoch that all members have a checkpoint of; 0 without any."""
+        """Newest epoch that all members have a checkpoint of; 0 without any."""
         return max(set.intersection(*(set(run.epochs) for run in self.runs)), default=0)
 
 
@@ -71,11 +71,11 @@ def create(
     """Start the folder of a sweep, whole or not at all.
 
     Args:
-        path: of the folder.
+        path: folder to make.
         members: configs by the names of their folders.
-        varied: settings that they differ in, besides their seeds.
+        varied: settings that the members differ in, besides their seeds.
         spec: the arm.
-        s2r: of its calibration, if it has one.
+        s2r: sim-to-real network of the arm's calibration, if there is one.
 
     Raises:
         RunError: there is such a folder already, or it cannot be made.
@@ -96,7 +96,7 @@ def create(
 
 
 def open_sweep(path: Path) -> Sweep:
-    """An existing folder.
+    """Open an existing folder.
 
     Raises:
         RunError: there is no sweep in it, or it cannot be read.
@@ -142,7 +142,7 @@ def train(sweep: Sweep, console: Console) -> None:
                 if due or stop:
                     run.save(epoch, job.member(states, k))
             progress.update(bar, completed=epoch, text=_line(rows))
-            if due and not console.is_terminal:  # a log file gets lines in the place of a bar
+            if due and not console.is_terminal:  # a log file gets lines instead of a bar
                 console.print(f"epoch {epoch} of {config.n_epochs}: {_line(rows)}", highlight=False)
             if stop and epoch < config.n_epochs:
                 raise Interrupted(f"stopped after epoch {epoch}; continue with --resume {sweep.path}")
@@ -151,7 +151,7 @@ def train(sweep: Sweep, console: Console) -> None:
 
 
 def _tasks(sweep: Sweep, env: ReachEnv) -> dict[EnvConfig, Task]:
-    """What evaluates the members, once for those of the same environment."""
+    """Return the tasks that evaluate the members, one for each environment."""
     configs = {run.config.env: run.config for run in sweep.runs}
     return {
         env_config: task_of(config, with_env_config(env, env_config))
@@ -160,7 +160,7 @@ def _tasks(sweep: Sweep, env: ReachEnv) -> dict[EnvConfig, Task]:
 
 
 def _start(sweep: Sweep, job: SweepJob, epoch: int) -> TrainState:
-    """The state after an epoch; what the members have of later ones is forgotten."""
+    """Return the state after an epoch; later checkpoints and metrics of the members are deleted."""
     for run in sweep.runs:
         run.rewind(epoch)
     if not epoch:
@@ -170,7 +170,7 @@ def _start(sweep: Sweep, job: SweepJob, epoch: int) -> TrainState:
 
 
 def _timed_epoch(job: SweepJob, states: TrainState) -> tuple[TrainState, list[dict[str, float]]]:
-    """The next states, and a row of metrics for each member; speeds are those of one member."""
+    """Return the next states, and a row of metrics for each member; speeds are those of one member."""
     start = time.perf_counter()
     updates = int(states.n_updates[0])
     states, metrics = job.epoch(states)

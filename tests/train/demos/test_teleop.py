@@ -191,7 +191,7 @@ def test_keys_move_the_finger_tips(expert, command, tmp_path):
     axis = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x**2 + y**2)], axis=-1)
     np.testing.assert_allclose(rows[:, tip] - 100.0 * axis, 1e3 * start_m + moved_mm, atol=2.0)
     status, told = command("check", out)
-    assert status == 0 and "positions: 3" in told and "sequences: 1: 0 with 3" in told
+    assert status == 0 and "poses: 3" in told and "sequences: 1: 0 with 3" in told
 
 
 def test_move_into_the_wall_is_refused_and_the_arm_stays(command, tmp_path):
@@ -199,7 +199,7 @@ def test_move_into_the_wall_is_refused_and_the_arm_stays(command, tmp_path):
     status, told = command(
         "record", "--arm", "a:B", "--task", "pipe300", "--keyboard", "--out", tmp_path / "k.npz", keys=keys
     )
-    assert status == 0 and "cannot be met" in told and "position 1 logged" in told
+    assert status == 0 and "cannot be met" in told and "pose 1 logged" in told
 
 
 def test_misuse_is_told_before_anything_moves(command, tmp_path):
