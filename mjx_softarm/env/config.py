@@ -36,9 +36,8 @@ class EnvConfig:
     mode: Literal["quasistatic", "dynamic"] = "quasistatic"  # equilibrium of each action, or its motion
     reward: RewardConfig = field(default_factory=RewardConfig)
     randomisation: Randomisation = field(default_factory=Randomisation)
-    saturation_tolerance_mm: float = (
-        1e3 * TOLERANCE_M
-    )  # spring error at which a chamber at its limit counts as saturated
+    saturation_tolerance_mm: float = 1e3 * TOLERANCE_M
+    """spring error at which a chamber at its limit counts as saturated"""
     n_poses: int = 8192  # poses of the reachable workspace that starts and goals are drawn from
     workspace_seed: int = 0  # seed of these poses
     dynamic_step_s: float = 0.5  # duration of one environment step in dynamic mode

@@ -108,7 +108,9 @@ def test_help_explains_every_setting(command, capsys):
         main([command, "--help"])
     shown = capsys.readouterr().out
     assert shown.count("\n  --") > 45
-    assert re.findall(r"(--[a-z]\S+)(?: [A-Z\[{.]\S*)*\s+\(default", shown) == []  # a default without a text
+    assert (
+        re.findall(r"\n  (--[a-z]\S+)(?: [A-Z\[{.]\S*)*\s+\(default", shown) == []
+    )  # a default without a text
 
 
 HOLD = """
