@@ -11,10 +11,9 @@ import numpy as np
 from jax import Array
 
 from calib.read.static_poses import StaticPoses
-from mjx_softarm.mechanics.kinematics import chain_frames
-from mjx_softarm.mechanics.rest import rest, statics_at
-from mjx_softarm.mechanics.settle import RESIDUAL_TOLERANCE
-from mjx_softarm.mechanics.statics import ArmParams
+from mjx_softarm.mechanics.kinematics import chain_kinematics
+from mjx_softarm.mechanics.settle import RESIDUAL_TOLERANCE, settle_pressures
+from mjx_softarm.mechanics.statics import ArmParams, tendons
 from mjx_softarm.spec import ArmSpec
 
 BATCH = 128  # poses simulated together
@@ -67,14 +66,13 @@ def residuals(x: Array, params: ArmParams, measured: Measured) -> tuple[Array, A
     masses = jnp.stack([params.tool_mass_kg[0], measured.payload_kg])
     arm = with_numbers(x, params._replace(tool_mass_kg=masses))
     with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
-        q = rest(arm, measured.pressure_kpa)
-        frames = chain_frames(q, arm.link_length_m)
-        now = statics_at(q, arm, measured.pressure_kpa)
-        turn = measured.tip_rotation.T @ frames.plate_rotation[-1]
+        kinematics = chain_kinematics(arm)
+        found = settle_pressures(kinematics, arm.without_pressure_limits(), measured.pressure_kpa)
+        chamber_m = tendons(kinematics(jax.lax.stop_gradient(found.q)), arm.chamber_site_m).length
+        turn = measured.tip_rotation.T @ found.tip_rotation
     angle = 0.5 * jnp.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
-    error = [frames.plate_position[-1] - measured.tip_m, angle, now.springs.length - measured.spring_m]
-    left = jnp.max(jnp.abs(jax.lax.stop_gradient(now.gradient)))
-    return jnp.concatenate(error), left, jax.lax.stop_gradient(now.chambers.length)
+    error = [found.tip_position_m - measured.tip_m, angle, found.spring_m - measured.spring_m]
+    return jnp.concatenate(error), found.residual, jax.lax.stop_gradient(chamber_m)
 
 
 def simulate(spec: ArmSpec, poses: StaticPoses, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

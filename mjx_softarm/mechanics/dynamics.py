@@ -11,20 +11,30 @@ from jax import Array
 from mjx_softarm import control
 from mjx_softarm._support.mjx import mjx
 from mjx_softarm.mechanics.mjcf import spring_lengths, steps_per_period
-from mjx_softarm.mechanics.settle import Settled
+from mjx_softarm.mechanics.result import MotionResult
 from mjx_softarm.mechanics.statics import ArmParams
 
 
 class Motion(NamedTuple):
-    """What a moving arm carries from one instant to the next."""
+    """State of a moving arm between two instants."""
 
     q: Array  # (nv,) [m, rad, rad]
     velocity: Array  # (nv,) [m/s, rad/s, rad/s]
-    integral_kpa: Array  # (n_chambers,) of the sensor-space law
+    integral_kpa: Array  # (n_chambers,) integral part of the sensor-space law
+
+
+class Moved(NamedTuple):
+    """Observables of an arm at the end of a motion."""
+
+    pressure_kpa: Array  # (n_chambers,) at the end
+    spring_m: Array  # (n_chambers,) spring lengths
+    tip_position_m: Array  # (3,)
+    tip_rotation: Array  # (3, 3)
+    result: Array  # () int32, a `MotionResult`
 
 
 def with_params(model: mjx.Model, params: ArmParams) -> mjx.Model:
-    """The model with the masses and stiffnesses of `params`; damping and geometry stay the model's."""
+    """Return the model with the masses and stiffnesses of `params`; damping and geometry stay the model's."""
     stiffness = jnp.stack([params.chamber_stiffness, params.spring_stiffness], axis=1).reshape(-1)
     mass = jnp.concatenate([jnp.zeros(1), params.link_mass_kg, params.tool_mass_kg])
     scale = jnp.where(model.body_mass > 0, mass / jnp.maximum(model.body_mass, 1e-9), 0.0)
@@ -43,20 +53,19 @@ def advance(
     gains: control.Gains,
     duration_s: float,
     period_s: float,
-) -> tuple[Motion, Settled]:
+) -> tuple[Motion, Moved]:
     """Run the arm for a while under the law.
 
     Args:
         model: the arm, from `mjx_softarm.mechanics.mjcf`.
-        motion: where it starts.
+        motion: state at the start.
         reference_m (n_chambers,): spring lengths that the law tracks.
         gains: of the law.
-        duration_s: how long; a whole number of control periods.
-        period_s: of the control, that of the model's specification.
+        duration_s: a whole number of control periods.
+        period_s: control period of the model's specification.
 
     Returns:
-        Where it ends, and the same as a report in which `settled` only says that everything is finite,
-        and `residual` is the largest joint acceleration.
+        State and observables at the end.
     """
     data = mjx.make_data(model).replace(qpos=motion.q, qvel=motion.velocity)
     data = mjx.tendon(model, mjx.com_pos(model, mjx.kinematics(model, data)))
@@ -74,17 +83,12 @@ def advance(
             tick, (data, motion.integral_kpa), None, length=round(duration_s / period_s)
         )
     end = Motion(data.qpos, data.qvel, integral)
-    error = jnp.abs(reference_m - spring_lengths(data))
-    at_limit = (data.ctrl <= gains.pressure_min_kpa) | (data.ctrl >= gains.pressure_max_kpa)
-    return end, Settled(
-        q=data.qpos,
+    finite = jnp.all(jnp.isfinite(data.qpos)) & jnp.all(jnp.isfinite(data.qvel))
+    result = jnp.where(finite, MotionResult.FINITE.value, MotionResult.NOT_FINITE.value)
+    return end, Moved(
         pressure_kpa=data.ctrl,
         spring_m=spring_lengths(data),
         tip_position_m=data.site_xpos[-1],
         tip_rotation=data.site_xmat[-1],
-        at_limit=at_limit,
-        residual=jnp.max(jnp.abs(data.qacc)),
-        tracking_error_m=jnp.max(jnp.where(at_limit, 0.0, error)),
-        settled=jnp.all(jnp.isfinite(data.qpos)) & jnp.all(jnp.isfinite(data.qvel)),
-        iterations=jnp.array(0),
+        result=result.astype(jnp.int32),
     )

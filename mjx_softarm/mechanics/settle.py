@@ -14,16 +14,18 @@ Source: primal-dual active set as semismooth Newton, Hintermueller, Ito, Kunisch
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jax.custom_derivatives import zero_from_primal
 
-from mjx_softarm._support.small_matrices import block_diagonal, eliminate, product
-from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK, Frames
-from mjx_softarm.mechanics.statics import ArmParams, Statics, statics
+from mjx_softarm._support.small_matrices import eliminate, product
+from mjx_softarm.mechanics.implicit import equilibrium_tangents
+from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK, Kinematics
+from mjx_softarm.mechanics.result import SettleResult
+from mjx_softarm.mechanics.statics import ArmParams, statics
 
 MAX_ITERATIONS = 12
 ACTIVE_SET_GAIN_KPA_PER_M = 1000.0
@@ -34,7 +36,7 @@ TRACKING_TOLERANCE_M = 1e-4
 
 
 class Settled(NamedTuple):
-    """An arm at rest, or the best that was found."""
+    """An arm at rest, or the last iterate where `result` says that none was found."""
 
     q: Array  # (nv,) joint coordinates [m, rad, rad]
     pressure_kpa: Array  # (n_chambers,)
@@ -44,24 +46,36 @@ class Settled(NamedTuple):
     at_limit: Array  # (n_chambers,) bool, held at a pressure limit
     residual: Array  # () largest entry of grad V [N, N m]
     tracking_error_m: Array  # () largest spring error of a chamber that is not at a limit
-    settled: Array  # () bool, both below tolerance and everything finite
+    result: Array  # () int32, a `SettleResult`
     iterations: Array  # () int
+
+    @property
+    def settled(self) -> Array:
+        """() bool, converged: residual and tracking error are finite and below tolerance."""
+        return self.result == SettleResult.CONVERGED.value
 
 
 class _Iterate(NamedTuple):
-    q: Array
-    pressure: Array
-    at_limit: Array
-    moving: Array
-    stiffening: Array  # () of the joints, in their own stiffness, where the arm would buckle
-    iteration: Array
+    q: Array  # (nv,)
+    pressure: Array  # (n_chambers,) [kPa]
+    at_limit: Array  # (n_chambers,) bool, the active set of the last step
+    moving: Array  # () bool, the last step was large or changed the active set
+    stiffening: (
+        Array  # () added to the joints' stiffness, as a multiple of it, where the energy is not convex
+    )
+    iteration: Array  # ()
 
 
-def settle(kinematics: Callable[[Array], Frames], params: ArmParams, reference_m: Array) -> Settled:
-    """Equilibrium under the sensor-space law, started from the straight arm.
+@jax.custom_jvp
+def settle(kinematics: Kinematics, params: ArmParams, reference_m: Array) -> Settled:
+    """Find the equilibrium under the sensor-space law, starting from the straight arm.
+
+    The result is differentiable in all arguments, forward and in reverse: joint coordinates, pressures, springs and
+    tip by the implicit function theorem at the final active set (see `mjx_softarm.mechanics.implicit`). Derivatives
+    of the other fields are zero, and all are zero where the arm did not settle.
 
     Args:
-        kinematics: joint coordinates (nv,) -> Frames, of either engine.
+        kinematics: of either engine, `chain_kinematics(params)` or `mjx_kinematics(model)`.
         params: numbers of the arm.
         reference_m (n_chambers,): spring lengths that the law tracks.
     """
@@ -84,74 +98,100 @@ def settle(kinematics: Callable[[Array], Frames], params: ArmParams, reference_m
         return _report(end, kinematics, params, reference_m)
 
 
-def settle_pressures(
-    kinematics: Callable[[Array], Frames], params: ArmParams, pressure_kpa: Array
-) -> Settled:
-    """Equilibrium at given pressures (n_chambers,), clipped to the arm's limits."""
+def _settle_jvp(primals: tuple, tangents: tuple) -> tuple[Settled, Settled]:
+    found = settle(*primals)
+    with jax.default_matmul_precision("highest"):
+        change = equilibrium_tangents(
+            primals, tangents, found.q, found.pressure_kpa, found.at_limit, found.settled
+        )
+    none = Settled(*(zero_from_primal(field, symbolic_zeros=True) for field in found))
+    return found, none._replace(**change._asdict())
+
+
+settle.defjvp(_settle_jvp, symbolic_zeros=True)
+
+
+def settle_pressures(kinematics: Kinematics, params: ArmParams, pressure_kpa: Array) -> Settled:
+    """Find the equilibrium at given pressures (n_chambers,), clipped to the arm's limits.
+
+    The pressures are limits that leave no room, so this is `settle`, derivatives included.
+    """
     pressure = jnp.clip(pressure_kpa, params.pressure_min_kpa, params.pressure_max_kpa)
     pinned = params._replace(pressure_min_kpa=pressure, pressure_max_kpa=pressure)
     return settle(kinematics, pinned, params.spring_rest_m)
 
 
 def _active_set(pressure: Array, error_m: Array, params: ArmParams) -> tuple[Array, Array]:
-    """Which chambers sit at a limit (n,), and the limit they sit at [kPa]."""
+    """Return the chambers to be held at a limit (n,) bool, and each one's limit (n,) [kPa]."""
     trial = pressure + ACTIVE_SET_GAIN_KPA_PER_M * error_m
     limit = jnp.clip(trial, params.pressure_min_kpa, params.pressure_max_kpa)
-    pinned = params.pressure_min_kpa == params.pressure_max_kpa  # even where the error happens to be zero
-    return (trial != limit) | pinned, limit
+    return (trial != limit) | params.pinned, limit  # pinned ones even where the error happens to be zero
 
 
-def _newton_step(it: _Iterate, kinematics, params: ArmParams, reference_m: Array) -> _Iterate:
-    now: Statics = statics(kinematics(it.q), it.q, it.pressure, params)
-    error = reference_m - now.springs.length
+def _newton_step(it: _Iterate, kinematics: Kinematics, params: ArmParams, reference_m: Array) -> _Iterate:
+    # Forces, springs and the active set at the iterate
+    here = statics(kinematics(it.q), it.q, it.pressure, params)
+    error = reference_m - here.springs.length
     at_limit, limit = _active_set(it.pressure, error, params)
-    hessian = now.hessian.plus_diagonal(it.stiffening * params.joint_stiffness)
-    n_sections, n_chambers = params.n_sections, reference_m.shape[0]
-    push = now.chambers.jacobian * now.area.reshape(n_sections, -1, 1)  # force per kPa
-    columns = block_diagonal(jnp.swapaxes(push, 1, 2)).reshape(n_sections, -1, n_chambers)
-    solved = hessian.solve(jnp.concatenate([now.gradient.reshape(n_sections, -1, 1), columns], axis=-1))
-    fall, gain = solved[..., 0], solved[..., 1:]  # dq = gain dp - fall
-    moved = product(now.springs.jacobian, solved).reshape(n_chambers, -1)
-    track = moved[:, 1:]  # (n, n) spring lengths per kPa
-    rows = jnp.where(at_limit[:, None], jnp.eye(n_chambers, dtype=track.dtype), track)
-    wanted = jnp.where(at_limit, limit - it.pressure, error + moved[:, 0])
-    dp = eliminate(rows, wanted[:, None])[:, 0]
-    dq = (jnp.sum(gain * dp, axis=-1) - fall).reshape(-1)
+
+    # Joints: H dq = B dp - grad V, so that dq = newton_step + dq_dp dp
+    hessian = here.hessian.plus_diagonal(it.stiffening * params.joint_stiffness)
+    gradient = here.gradient.reshape(params.n_sections, -1, 1)
+    solved = hessian.solve(jnp.concatenate([-gradient, here.push_per_kpa], axis=-1))
+    newton_step, dq_dp = solved[..., 0], solved[..., 1:]
+
+    # Pressures: each chamber closes its spring's error or goes to its limit
+    spring_response = product(here.springs.jacobian, solved).reshape(len(error), -1)
+    newton_spring, dspring_dp = spring_response[:, 0], spring_response[:, 1:]
+    rows = jnp.where(at_limit[:, None], jnp.eye(len(error), dtype=dspring_dp.dtype), dspring_dp)
+    residual = jax.lax.select(at_limit, limit - it.pressure, error - newton_spring)
+    dp = eliminate(rows, residual[:, None])[:, 0]
+    dq = (newton_step + jnp.sum(dq_dp * dp, axis=-1)).reshape(-1)
+
+    # Step length; no step where the energy is not convex or springs do not follow chambers: stiffen the joints.
     largest = jnp.max(jnp.abs(dq))
     scale = jnp.minimum(1.0, MAX_STEP / largest)
-    same = jnp.all(at_limit == it.at_limit)
-    # No step where the energy is not convex, or springs do not follow chambers: stay, stiffen the joints.
     convex = jnp.isfinite(largest)
+    same_set = jnp.all(at_limit == it.at_limit)
     return _Iterate(
         q=jax.lax.select(convex, it.q + scale * dq, it.q),
         pressure=jax.lax.select(convex, it.pressure + scale * dp, it.pressure),
         at_limit=at_limit,
-        moving=~(same & (largest < SMALL_STEP) & (it.stiffening == 0)),
+        moving=~(same_set & (largest < SMALL_STEP) & (it.stiffening == 0)),
         stiffening=jnp.where(convex, 0.0, 4.0 * it.stiffening + 4.0),
         iteration=it.iteration + 1,
     )
 
 
-def _report(it: _Iterate, kinematics, params: ArmParams, reference_m: Array) -> Settled:
+def _report(it: _Iterate, kinematics: Kinematics, params: ArmParams, reference_m: Array) -> Settled:
+    # Forces and springs at the end
     pressure = jnp.clip(it.pressure, params.pressure_min_kpa, params.pressure_max_kpa)
     frames = kinematics(it.q)
-    now: Statics = statics(frames, it.q, pressure, params)
-    error = reference_m - now.springs.length
+    here = statics(frames, it.q, pressure, params)
+    residual = jnp.max(jnp.abs(here.gradient))
+
+    # Errors of the law: of a chamber at a limit only those that would take it away from the limit
+    error = reference_m - here.springs.length
     at_limit = (pressure <= params.pressure_min_kpa) | (pressure >= params.pressure_max_kpa)
-    residual = jnp.max(jnp.abs(now.gradient))
     outward = jnp.where(pressure >= params.pressure_max_kpa, error, -error)
-    pinned = params.pressure_min_kpa == params.pressure_max_kpa
-    off = jnp.where(pinned, 0.0, jnp.where(at_limit, jnp.maximum(-outward, 0.0), jnp.abs(error)))
-    tracking = jnp.max(off)
+    off = jnp.where(at_limit, jnp.maximum(-outward, 0.0), jnp.abs(error))
+    tracking = jnp.max(jnp.where(params.pinned, 0.0, off))
+
+    good = (residual < RESIDUAL_TOLERANCE) & (tracking < TRACKING_TOLERANCE_M)
+    result = jnp.select(
+        [~(jnp.isfinite(residual) & jnp.isfinite(tracking)), good, it.stiffening > 0],
+        [SettleResult.NOT_FINITE.value, SettleResult.CONVERGED.value, SettleResult.NOT_CONVEX.value],
+        SettleResult.OUT_OF_ITERATIONS.value,
+    )
     return Settled(
         q=it.q,
         pressure_kpa=pressure,
-        spring_m=now.springs.length,
+        spring_m=here.springs.length,
         tip_position_m=frames.plate_position[-1],
         tip_rotation=frames.plate_rotation[-1],
         at_limit=at_limit,
         residual=residual,
         tracking_error_m=tracking,
-        settled=(residual < RESIDUAL_TOLERANCE) & (tracking < TRACKING_TOLERANCE_M),
+        result=result.astype(jnp.int32),
         iterations=it.iteration,
     )

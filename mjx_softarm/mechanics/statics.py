@@ -56,6 +56,16 @@ class ArmParams(NamedTuple):
     def n_sections(self) -> int:
         return self.area.shape[0] // N_CHAMBERS_PER_SECTION
 
+    @property
+    def pinned(self) -> Array:
+        """(n_chambers,) bool, chambers whose limits leave one pressure."""
+        return self.pressure_min_kpa == self.pressure_max_kpa
+
+    def without_pressure_limits(self) -> ArmParams:
+        """Return the arm with limits that no pressure meets."""
+        limit = jnp.full_like(self.area, jnp.inf)
+        return self._replace(pressure_min_kpa=-limit, pressure_max_kpa=limit)
+
     @classmethod
     def from_spec(cls, spec: ArmSpec, dtype: np.typing.DTypeLike = np.float32) -> ArmParams:
         """Numbers of `spec`, in SI units but for the pressures [kPa]."""
@@ -102,6 +112,13 @@ class Statics(NamedTuple):
     chambers: Tendons
     springs: Tendons
     area: Array  # (n_chambers,) [N/kPa] effective areas at these lengths
+
+    @property
+    def push_per_kpa(self) -> Array:
+        """(n_sections, n, n_chambers) generalised force of each chamber on the joints of each section."""
+        n_sections, n_chambers = self.area.shape[0] // N_CHAMBERS_PER_SECTION, self.area.shape[0]
+        push = self.chambers.jacobian * self.area.reshape(n_sections, -1, 1)
+        return block_diagonal(jnp.swapaxes(push, 1, 2)).reshape(n_sections, -1, n_chambers)
 
 
 @jax.jit  # inlined where it is compiled; traced once for all of its callers

@@ -25,10 +25,9 @@ from jax import Array
 from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.xp import array_namespace
 from mjx_softarm.mechanics.excitation import random_pressures
-from mjx_softarm.mechanics.kinematics import chain_frames
+from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.pipe import CrossPipe, body_points, clearance
-from mjx_softarm.mechanics.rest import rest, statics_at
-from mjx_softarm.mechanics.settle import RESIDUAL_TOLERANCE
+from mjx_softarm.mechanics.settle import RESIDUAL_TOLERANCE, settle_pressures
 from mjx_softarm.mechanics.statics import ArmParams
 from mjx_softarm.sensing.pose import frame_from_pose, pose_from_frame
 from mjx_softarm.sensing.s2r import S2R, carry_body, correct
@@ -216,25 +215,25 @@ def _angle(rotation: Any, target: Any) -> Any:
 def _posture(pressure_kpa: Array, params: ArmParams, s2r: S2R | None, spec: ArmSpec, pipe: CrossPipe | None):
     """Return a posture, and the clearance (k,) [m] of each point of the body; differentiable."""
     with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
-        q = rest(params, pressure_kpa)
-        frames = chain_frames(q, params.link_length_m)
-        now = statics_at(q, params, pressure_kpa)
+        kinematics = chain_kinematics(params)
+        found = settle_pressures(kinematics, params.without_pressure_limits(), pressure_kpa)
+        frames = kinematics(found.q)
         plates = frames.plate_position, frames.plate_rotation
         pose = pose_from_frame(plates[0][-1], plates[1][-1])
         if s2r is not None:
-            pose = correct(s2r, pose, now.springs.length)
+            pose = correct(s2r, pose, found.spring_m)
             plates = carry_body(*plates, pose)
         position_m, rotation = frame_from_pose(pose)
         points = body_points(*plates, spec)
     wall_m = jnp.full(1, _NO_WALL_M) if pipe is None else clearance(pipe, points)
     return Posture(
         pressure_kpa=pressure_kpa,
-        spring_m=now.springs.length,
+        spring_m=found.spring_m,
         pose=pose,
         finger_m=position_m - spec.mass.gripper_length_m * rotation[:, 2],
         rotation=rotation,
         clearance_m=jnp.min(wall_m),
-        residual=jnp.max(jnp.abs(now.gradient)),
+        residual=found.residual,
     ), wall_m
 
 

@@ -1,0 +1,155 @@
+"""Derivative of the equilibrium by the implicit function theorem, at the active set it ended with.
+
+An equilibrium (q, p) of `mjx_softarm.mechanics.settle` solves, for every chamber t,
+
+    grad V(q; p, x) = 0,    s_t(q; x) = reference_t  if t tracks,  p_t = limit_t  if t is at a limit,
+
+with the arm's numbers x. Where the set of chambers at a limit stays as it is, these equations differentiate to
+
+    H dq = B dp - d_x grad V,    S dq = dreference - d_x s  or  dp = dlimit,
+
+with H the Hessian of V, B the chambers' push per kPa and S the springs' Jacobian. With K = H^-1 B, and R with the
+rows of S K where chambers track and of the identity where they are at a limit,
+
+    dp = R^-1 r,    dq = K dp - H^-1 d_x grad V,    r = dreference - d_x s + S H^-1 d_x grad V  or  dlimit.
+
+This is exact however many Newton steps led to the equilibrium. K and R^-1 are computed with the primal, so that
+derivatives in either direction are products with them; H^-1 itself is needed for the arm's numbers alone.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.custom_derivatives import SymbolicZero
+
+from mjx_softarm._support.small_matrices import eliminate, product
+from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK, Frames
+from mjx_softarm.mechanics.statics import statics
+
+
+class EquilibriumTangents(NamedTuple):
+    """Derivatives of the fields of the same names of `Settled`."""
+
+    q: Array  # (nv,)
+    pressure_kpa: Array  # (n_chambers,)
+    spring_m: Array  # (n_chambers,)
+    tip_position_m: Array  # (3,)
+    tip_rotation: Array  # (3, 3)
+
+
+def equilibrium_tangents(
+    primals: tuple, tangents: tuple, q: Array, pressure_kpa: Array, at_limit: Array, settled: Array
+) -> EquilibriumTangents:
+    """Differentiate an equilibrium along a direction.
+
+    Args:
+        primals: kinematics, params (`ArmParams`) and reference_m (n_chambers,) of `settle`.
+        tangents: the direction, of the same structure, with `SymbolicZero` where nothing changes.
+        q (nv,): joint coordinates of the equilibrium.
+        pressure_kpa (n_chambers,): its pressures.
+        at_limit (n_chambers,) bool: its active set.
+        settled () bool: false for a zero derivative.
+    """
+    kinematics, params, reference = primals
+    _, params_dot, reference_dot = tangents
+    q = _masked(q, settled)  # the straight arm, whose numbers are finite
+    n_sections, n_chambers = params.n_sections, len(at_limit)
+    frames = kinematics(q)
+    here = statics(frames, q, pressure_kpa, params)
+    explicit = _explicit_tangents(primals, tangents, q, pressure_kpa)
+
+    # Response matrices: K, and the inverse of H where the arm's numbers change
+    columns = [here.push_per_kpa]
+    if explicit is not None:
+        columns.append(jnp.eye(len(q), dtype=q.dtype).reshape(n_sections, -1, len(q)))
+    solved = _masked(here.hessian.solve(jnp.concatenate(columns, axis=-1)), settled)
+    dq_dp = solved[..., :n_chambers]
+    dspring_dp = product(here.springs.jacobian, dq_dp).reshape(n_chambers, n_chambers)
+    identity = jnp.eye(n_chambers, dtype=q.dtype)
+    rows = jnp.where(at_limit[:, None], identity, dspring_dp)
+    inverse = _masked(eliminate(rows, identity), settled)
+
+    # Right-hand side of each chamber's equation
+    at_high = pressure_kpa >= params.pressure_max_kpa
+    low_dot = _array(params_dot.pressure_min_kpa, params.pressure_min_kpa)
+    high_dot = _array(params_dot.pressure_max_kpa, params.pressure_max_kpa)
+    tracking_dot = _array(reference_dot, reference)
+    dq_held = jnp.zeros_like(q)  # at held pressures
+    if explicit is not None:
+        dq_held = -jnp.sum(solved[..., n_chambers:] * explicit.gradient, axis=-1).reshape(-1)
+        tracking_dot = tracking_dot - explicit.spring_m - _along(here.springs.jacobian, dq_held)
+    limit_dot = jax.lax.select(at_high, high_dot, low_dot)
+    right = jax.lax.select(at_limit, limit_dot, tracking_dot)
+
+    # Pressures, joints, and what follows from them
+    dp = jnp.sum(inverse * right, axis=-1)
+    dq = jnp.sum(dq_dp * dp, axis=-1).reshape(-1) + dq_held
+    tip_dot, rotation_dot = _tip_tangents(frames, dq)
+    spring_dot = _along(here.springs.jacobian, dq)
+    if explicit is not None:
+        spring_dot = spring_dot + explicit.spring_m
+        tip_dot, rotation_dot = tip_dot + explicit.tip_position_m, rotation_dot + explicit.tip_rotation
+    found = EquilibriumTangents(dq, dp, spring_dot, tip_dot, rotation_dot)
+    return EquilibriumTangents(*(_masked(x, settled) for x in found))
+
+
+class _Explicit(NamedTuple):
+    """Derivatives by the arm's numbers at fixed joint coordinates and pressures."""
+
+    gradient: Array  # (nv,) of V's gradient
+    spring_m: Array  # (n_chambers,)
+    tip_position_m: Array  # (3,)
+    tip_rotation: Array  # (3, 3)
+
+
+def _explicit_tangents(primals: tuple, tangents: tuple, q: Array, pressure_kpa: Array) -> _Explicit | None:
+    """Differentiate along the arm's numbers, pressure limits aside; None where none of them changes."""
+    numbers, structure = jax.tree.flatten(_without_limits(primals))
+    directions = jax.tree.leaves(_without_limits(tangents))
+    changing = [k for k, direction in enumerate(directions) if not isinstance(direction, SymbolicZero)]
+    if not changing:
+        return None
+
+    def observables(*values: Array) -> _Explicit:
+        merged = list(numbers)
+        for k, value in zip(changing, values, strict=True):
+            merged[k] = value
+        kinematics, params = jax.tree.unflatten(structure, merged)
+        frames = kinematics(q)
+        here = statics(frames, q, pressure_kpa, params)
+        tip = frames.plate_position[-1], frames.plate_rotation[-1]
+        return _Explicit(here.gradient, here.springs.length, *tip)
+
+    return jax.jvp(observables, [numbers[k] for k in changing], [directions[k] for k in changing])[1]
+
+
+def _without_limits(arguments: tuple) -> tuple:
+    kinematics, params, _ = arguments
+    return kinematics, params._replace(pressure_min_kpa=None, pressure_max_kpa=None)
+
+
+def _array(tangent: Any, primal: Array) -> Array:
+    return jnp.zeros_like(primal) if isinstance(tangent, SymbolicZero) else tangent
+
+
+def _masked(x: Array, settled: Array) -> Array:
+    return jax.lax.select(settled, x, jnp.zeros_like(x))
+
+
+def _along(jacobian: Array, dq: Array) -> Array:
+    """Multiply a tendons' Jacobian (n_sections, 3, n) by joint coordinates (nv,): (n_chambers,)."""
+    return jnp.sum(jacobian * dq.reshape(jacobian.shape[0], 1, -1), axis=-1).reshape(-1)
+
+
+def _tip_tangents(frames: Frames, dq: Array) -> tuple[Array, Array]:
+    """Return the tip's velocity (3,) and its rotation's derivative (3, 3) for joint velocities (nv,)."""
+    joint = frames.axis * dq.reshape(-1, DOFS_PER_LINK, 1)
+    turn = joint[:, 1] + joint[:, 2]  # (n_links, 3)
+    tip = frames.plate_position[-1]
+    velocity = jnp.sum(joint[:, 0] + jnp.cross(turn, tip - frames.anchor), axis=0)
+    rotation = jnp.cross(jnp.sum(turn, axis=0)[:, None], frames.plate_rotation[-1], axis=0)
+    return velocity, rotation

@@ -1,0 +1,188 @@
+"""The derivative of `settle` against finite differences in double precision, in both directions and engines."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjx_softarm import ArmSpec
+from mjx_softarm._support import xla
+from mjx_softarm._support.mjx import mjx
+from mjx_softarm.mechanics.kinematics import chain_kinematics, mjx_kinematics
+from mjx_softarm.mechanics.mjcf import build_model
+from mjx_softarm.mechanics.settle import settle, settle_pressures
+from mjx_softarm.mechanics.statics import ArmParams, statics
+
+SPEC = ArmSpec.default()
+N = 512
+SEEN = (
+    "q",
+    "pressure_kpa",
+    "spring_m",
+    "tip_position_m",
+    "tip_rotation",
+)  # the fields that have a derivative
+
+
+def references(seed=0):
+    """Spring lengths (N, 9) [m] that hold half of the chambers at a limit."""
+    return np.random.default_rng(seed).uniform(0.09, 0.285, (N, 9))
+
+
+def seen(found):
+    return {name: getattr(found, name) for name in SEEN}
+
+
+def chain_settle(params, reference):
+    return settle(chain_kinematics(params), params, reference)
+
+
+def equilibrium_of_set(params, reference, q, pressure, at_limit, at_high):
+    """Fields of the equilibrium that holds the chambers `at_limit`, by dense Newton steps from near it."""
+    limit = jnp.where(at_high, params.pressure_max_kpa, params.pressure_min_kpa)
+    kinematics, n = chain_kinematics(params), len(reference)
+
+    def equations(q, pressure):
+        here = statics(kinematics(q), q, pressure, params)
+        law = jnp.where(at_limit, pressure - limit, here.springs.length - reference)
+        return jnp.concatenate([here.gradient, law]), here
+
+    for _ in range(4):
+        left, here = equations(q, pressure)
+        push = -here.push_per_kpa.reshape(len(q), n)
+        springs = jax.scipy.linalg.block_diag(*here.springs.jacobian)
+        law = [jnp.where(at_limit[:, None], 0.0, springs), jnp.diag(at_limit.astype(q.dtype))]
+        system = jnp.block([[here.hessian.dense(), push], law])
+        step = jnp.linalg.solve(system, left)
+        q, pressure = q - step[: len(q)], pressure - step[len(q) :]
+    left, here = equations(q, pressure)
+    frames = kinematics(q)
+    fields = q, pressure, here.springs.length, frames.plate_position[-1], frames.plate_rotation[-1]
+    return dict(zip(SEEN, fields, strict=True)), jnp.max(jnp.abs(left))
+
+
+@functools.cache
+def directions():
+    """A change of the arm's numbers, each in parts of itself, and changes (N, 9) [m] of the references."""
+    rng = np.random.default_rng(1)
+    arm = jax.tree.map(lambda x: rng.normal(size=np.shape(x)), ArmParams.from_spec(SPEC, np.float64))
+    return arm, 0.01 * rng.normal(size=(N, 9))
+
+
+@functools.cache
+def comparison():
+    """Shares of the two directions -> settled arms, their derivative, and the quotient of differences."""
+    arm, turn = directions()
+
+    def compare(shares, reference, turn):
+        def moved(step):
+            params = ArmParams.from_spec(SPEC, np.float64)
+            params = jax.tree.map(lambda x, d: x * (1.0 + shares[1] * step * d), params, arm)
+            return params, reference + shares[0] * step * turn
+
+        found, slope = jax.jvp(lambda step: chain_settle(*moved(step)), (jnp.zeros(()),), (jnp.ones(()),))
+        at_high = found.pressure_kpa >= SPEC.chambers.pressure_max_kpa
+        start, step = (found.q, found.pressure_kpa, found.at_limit, at_high), 1e-5
+        signs = jnp.array([1.0, -1.0])
+        ends, left = jax.vmap(lambda sign: equilibrium_of_set(*moved(sign * step), *start))(signs)
+        quotient = jax.tree.map(lambda x: (x[0] - x[1]) / (2 * step), ends)
+        return found, seen(slope), quotient, jnp.max(left)
+
+    jitted = jax.jit(jax.vmap(compare, in_axes=(None, 0, 0)))
+
+    @functools.cache
+    def of(*shares):
+        with jax.enable_x64(True):
+            return jax.device_get(jitted(np.array(shares), references(), turn))
+
+    return of
+
+
+def relative_error(found, expected):
+    """Largest error (N,) of each arm, in parts of its largest entry, which is not taken for less than 1e-4."""
+    error, size = (np.abs(x).reshape(N, -1).max(axis=1) for x in (found - expected, expected))
+    return error / np.maximum(size, 1e-4)
+
+
+@pytest.mark.parametrize("shares", [(1.0, 0.0), (0.0, 1.0)], ids=["reference", "params"])
+def test_the_derivative_is_that_of_finite_differences_at_the_same_active_set(shares):
+    found, slope, quotient, left = comparison()(*shares)
+    assert found.settled.all() and left.max() < 1e-9
+    assert 0.4 < found.at_limit.mean() < 0.6
+    for name in SEEN:
+        assert relative_error(slope[name], quotient[name]).max() < 1e-4, name
+        assert np.abs(quotient[name]).max() > 1e-2
+
+
+def test_reverse_mode_is_the_transpose_of_forward_mode():
+    params, reference = ArmParams.from_spec(SPEC), np.float32(references()[:8])
+    rng = np.random.default_rng(2)
+    direction = jax.tree.map(lambda x: np.float32(x * rng.normal(size=np.shape(x))), params)
+    turn = np.float32(0.01 * rng.normal(size=reference.shape))
+
+    def both(reference, turn):
+        def fields(params, reference):
+            return seen(chain_settle(params, reference))
+
+        primals, tangents = (params, reference), (direction, turn)
+        _, forward = jax.jvp(fields, primals, tangents)
+        _, pull = jax.vjp(fields, *primals)
+        weight = jax.tree.map(lambda x: jnp.cos(jnp.arange(x.size, dtype=x.dtype)).reshape(x.shape), forward)
+        return inner(weight, forward), inner(pull(weight), tangents)
+
+    def inner(a, b):
+        return sum(jnp.vdot(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+
+    forward, reverse = jax.jit(jax.vmap(both))(reference, turn)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-3)
+
+
+@pytest.mark.parametrize("engine", ["chain", "mjx"])
+def test_both_engines_have_it_in_single_precision(engine):
+    params = ArmParams.from_spec(SPEC)
+    kinematics = (
+        chain_kinematics(params) if engine == "chain" else mjx_kinematics(mjx.put_model(build_model(SPEC)))
+    )
+
+    @functools.partial(xla.jit, uses_mjx=engine == "mjx")
+    @jax.vmap
+    def slope(reference, turn):
+        return jax.jvp(lambda r: seen(settle(kinematics, params, r)), (reference,), (turn,))[1]
+
+    _, turn = directions()
+    found, (_, _, quotient, _) = slope(np.float32(references()), np.float32(turn)), comparison()(1.0, 0.0)
+    for name in SEEN:
+        assert np.quantile(relative_error(found[name], quotient[name]), 0.99) < 1e-2, name
+
+
+def test_held_pressures_have_the_derivative_of_their_own_equilibrium():
+    """dq = H^-1 B dp, since pressures are limits that leave no room."""
+    with jax.enable_x64(True):
+        params = ArmParams.from_spec(SPEC, np.float64)
+        kinematics = chain_kinematics(params)
+        pressure = np.random.default_rng(3).uniform(-35.0, 15.0, 9)
+        slope = jax.jacfwd(lambda p: settle_pressures(kinematics, params, p).q)(pressure)
+        q = settle_pressures(kinematics, params, pressure).q
+        here = statics(kinematics(q), q, pressure, params)
+        expected = np.linalg.solve(here.hessian.dense(), here.push_per_kpa.reshape(36, 9))
+        np.testing.assert_allclose(slope, expected, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+def test_an_arm_that_does_not_settle_has_a_zero_derivative(mode):
+    params = ArmParams.from_spec(SPEC.replace(backbone={"bending_stiffness_nm_per_rad": 1e-3}))
+    reference = np.float32(references()[:8])
+    reference[3, 0] = np.nan
+
+    def fields(reference, spring_rest_m):
+        return seen(chain_settle(params._replace(spring_rest_m=spring_rest_m), reference))
+
+    slope = jax.jit(jax.vmap(mode(fields, argnums=(0, 1)), in_axes=(0, None)))(
+        reference, params.spring_rest_m
+    )
+    found = jax.jit(jax.vmap(chain_settle, in_axes=(None, 0)))(params, reference)
+    assert not found.settled[3] and not found.settled.all()
+    for x in jax.tree.leaves(slope):
+        assert (x[~found.settled] == 0).all() and np.isfinite(x).all()
