@@ -53,14 +53,15 @@ def _picture(
     _import_mujoco()
     from mjx_softarm.mechanics.mjcf import build_model
     from mjx_softarm.mechanics.render import Renderer, write_png
+    from mjx_softarm.mechanics.settle import SettleResult
     from mjx_softarm.mechanics.workspace import settle_many
 
     pressure_kpa = np.broadcast_to(np.asarray(pressures), (1, arm.n_chambers))
     found = settle_many(arm, pressure_kpa)
     if not found.settled[0]:
         raise InputError(
-            f"--pressures: got an arm that does not settle, with {found.residual[0]:g} N or N m left, "
-            "expected an equilibrium"
+            f"--pressures: got an arm that does not settle, with {found.residual[0]:g} N or N m left: "
+            f"{SettleResult(found.result[0]).text}; expected an equilibrium"
         )
     with Renderer(build_model(arm)) as renderer:
         image = renderer.draw(np.asarray(found.q[0]))

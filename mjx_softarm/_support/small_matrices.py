@@ -15,12 +15,12 @@ BLOCK = 3  # pivots that are eliminated at once
 
 
 def product(a: Array, b: Array) -> Array:
-    """a b of small matrices (..., n, m) and (..., m, k), as sums: faster than products when tiny."""
+    """Multiply small matrices (..., n, m) and (..., m, k), as sums: faster than products when tiny."""
     return jnp.sum(a[..., :, :, None] * b[..., None, :, :], axis=-2)
 
 
 def block_diagonal(blocks: Array) -> Array:
-    """The block-diagonal matrix (n rows, n columns) of blocks (n, rows, columns)."""
+    """Return the block-diagonal matrix (n rows, n columns) of blocks (n, rows, columns)."""
     n, rows, columns = blocks.shape
     apart = jnp.eye(n, dtype=blocks.dtype)[:, None, :, None] * blocks[:, :, None]
     return apart.reshape(n * rows, n * columns)
@@ -28,10 +28,10 @@ def block_diagonal(blocks: Array) -> Array:
 
 @jax.custom_batching.custom_vmap
 def eliminate(matrix: Array, columns: Array) -> Array:
-    """The inverse of a matrix (n, n) times columns (n, k), by Gauss-Jordan elimination without pivoting.
+    """Multiply the inverse of a matrix (n, n) by columns (n, k): Gauss-Jordan, without pivoting.
 
-    Right for symmetric positive definite matrices, and for what is close to such: of a settling arm, how the
-    springs that track answer to their chambers, and rows of the identity for the others.
+    It is meant for symmetric positive definite matrices and for nearly such ones: the response of a settling
+    arm's springs to their chambers, with rows of the identity for chambers at a limit.
 
     Returns:
         (n, k), all NaN if a pivot is not positive, which is so where a symmetric matrix is not positive
@@ -50,7 +50,7 @@ def _eliminate_many(n: int, batched: list[bool], matrix: Array, columns: Array) 
 
 
 def _eliminate_last(augmented: Array) -> Array:
-    """Of matrices beside columns (n, n + k, batch): the batch is last, so one instruction serves many.
+    """Eliminate in matrices beside columns (n, n + k, batch); with the batch last, one instruction serves it.
 
     A block of columns is cleared at once, so that each number is read and written a third as often. Barriers
     keep the compiler from working out the pivots' rows again for each of the others.
@@ -66,7 +66,7 @@ def _eliminate_last(augmented: Array) -> Array:
 
 
 def _inverse_last(matrix: Array) -> Array:
-    """Of matrices (n, n, batch) with positive pivots; n is small, since all is written out."""
+    """Invert matrices (n, n, batch) with positive pivots; n is small, since all is written out."""
     n = matrix.shape[0]
     identity = jnp.broadcast_to(jnp.eye(n, dtype=matrix.dtype)[..., None], matrix.shape)
     rows = list(jnp.concatenate([matrix, identity], axis=1))
@@ -77,5 +77,5 @@ def _inverse_last(matrix: Array) -> Array:
 
 
 def _product_last(a: Array, b: Array) -> Array:
-    """a b of matrices (n, m, batch) and (m, k, batch); m is small, since all is written out."""
+    """Multiply matrices (n, m, batch) and (m, k, batch); m is small, since all is written out."""
     return functools.reduce(jnp.add, [a[:, j, None] * b[j] for j in range(len(b))])

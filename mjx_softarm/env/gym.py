@@ -147,7 +147,7 @@ class SoftArmEnv(gymnasium.Env):
 
 
 def as_sb3(envs: SoftArmVectorEnv) -> VecEnv:
-    """The same arms as a Stable-Baselines3 `VecEnv`, for its algorithms and its vector wrappers.
+    """Return the arms as a Stable-Baselines3 `VecEnv`, for its algorithms and its vector wrappers.
 
     Stable-Baselines3 takes vector environments of its own class only. An arm's info is empty but where its
     episode ends. Wrap the result in SB3's `VecMonitor` to log returns.
@@ -198,7 +198,7 @@ def as_sb3(envs: SoftArmVectorEnv) -> VecEnv:
 
 
 def spaces(env: ReachEnv) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
-    """Observations and actions of one arm. No section stretches to twice its length at rest."""
+    """Return the spaces of observations and actions; no section stretches to twice its length at rest."""
     rest_mm = 1e3 * env.spec.structure.n_sections * env.spec.geometry.section_length_m
     limit = 1.01 * np.array([2 * rest_mm] * 3 + [180.0] * 3)  # of a pose
     reward = env.config.reward
@@ -218,7 +218,7 @@ def _reach_env(arm: ArmSpec, config: EnvConfig) -> ReachEnv:
 
 @functools.lru_cache(maxsize=8)
 def _compiled(arm: ArmSpec, config: EnvConfig) -> tuple:
-    """Reset and step of one arm, compiled once for all environments that share arm and config."""
+    """Return reset and step of one arm, compiled once for all environments that share arm and config."""
     env = _reach_env(arm, config)
     return xla.jit(env.reset, env.uses_mjx), xla.jit(env.step, env.uses_mjx)
 
@@ -233,7 +233,7 @@ def _step_info(state: State) -> dict[str, Array]:
 
 
 def _where(mask: np.ndarray, info: dict[str, np.ndarray]) -> Info:
-    """Gymnasium's vector info: values where the mask is set, zeros elsewhere, and the mask with each."""
+    """Return Gymnasium's vector info: values where the mask is set, zeros elsewhere, and the masks."""
     if not mask.any():
         return {}
     shaped = {name: mask.reshape((-1,) + (1,) * (value.ndim - 1)) for name, value in info.items()}
@@ -242,7 +242,7 @@ def _where(mask: np.ndarray, info: dict[str, np.ndarray]) -> Info:
 
 
 def _to_numpy(tree: Any) -> Any:
-    """Copies that the caller may write to."""
+    """Copy arrays to NumPy, where the caller may write to them."""
     return jax.tree.map(np.array, jax.device_get(tree))
 
 
@@ -254,13 +254,13 @@ def _new_key(rng: np.random.Generator) -> Array:
 def _as_actions(actions: Any, shape: tuple[int, ...] | None) -> np.ndarray:
     actions = np.asarray(actions, np.float32)
     if actions.shape != shape:
-        raise ValueError(f"actions: expected shape {shape}, got {actions.shape}")
+        raise ValueError(f"actions: got shape {actions.shape}, expected {shape}")
     return actions
 
 
 def _refuse_options(options: Info | None) -> None:
     if options:
-        raise ValueError(f"reset: expected no options, got {', '.join(options)}")
+        raise ValueError(f"reset: got options {', '.join(options)}, expected none")
 
 
 gymnasium.register(

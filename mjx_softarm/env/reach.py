@@ -20,11 +20,11 @@ from mjx_softarm.env.config import EnvConfig
 from mjx_softarm.mdp import observation as obs
 from mjx_softarm.mdp import rewards
 from mjx_softarm.mdp.actions import ActionMap
-from mjx_softarm.mechanics.dynamics import Motion, advance, with_params
+from mjx_softarm.mechanics.dynamics import Motion, MotionResult, Moved, advance, with_params
 from mjx_softarm.mechanics.kinematics import chain_frames, chain_kinematics, mjx_kinematics
 from mjx_softarm.mechanics.mjcf import build_model
 from mjx_softarm.mechanics.pipe import CrossPipe, body_clearance
-from mjx_softarm.mechanics.settle import Settled, settle
+from mjx_softarm.mechanics.settle import Settled, SettleResult, settle
 from mjx_softarm.mechanics.statics import ArmParams
 from mjx_softarm.mechanics.workspace import Pool, sample_workspace
 from mjx_softarm.sensing.pose import pose_from_frame
@@ -48,10 +48,10 @@ class EpisodeNoise(NamedTuple):
 class ArmState(NamedTuple):
     """One arm between two actions."""
 
-    payload_kg: Array  # () this episode's, as are the two below
-    chamber_stiffness: Array  # (n_chambers,) [N/m]
-    sensor_offset_m: Array  # (n_chambers,) reading less true length
-    motion: Motion
+    payload_kg: Array  # () payload of this episode
+    chamber_stiffness: Array  # (n_chambers,) [N/m] stiffnesses of this episode
+    sensor_offset_m: Array  # (n_chambers,) reading less true length, in this episode
+    motion: Motion  # joint coordinates, velocities, integral of the law
     pose: Array  # (6,) [mm, deg] as observed: the real arm's where there is a sim-to-real network
     spring_m: Array  # (n_chambers,) true lengths
     pressure_kpa: Array  # (n_chambers,)
@@ -60,10 +60,39 @@ class ArmState(NamedTuple):
 
 
 class ReachEnv(Env):
-    """A soft arm reaching for poses of its workspace.
+    """A soft arm that reaches for poses of its workspace.
+
+    A pose is the tip's x, y, z [mm] and yaw, pitch, roll [deg] in the base frame, z up. For the paper's arm:
+
+    Observation (18,), without unit, in the order of `mjx_softarm.mdp.observation.OBS_LAYOUT`:
+        0-5    pose of the tip, relative to the straight arm; positions divided by a third of its length,
+               angles by 90 deg
+        6-11   pose of the goal, scaled in this way, too
+        12-17  error w (pose - goal), by the reward's weights per mm and per degree, angles wrapped
+
+    Action (n_chambers,), each in [-1, 1]: readings of the springs' sensors to be reached, from that of the
+        shortest to that of the longest spring (`mjx_softarm.mdp.actions`). The sensor-space law then sets the
+        pressures.
+
+    Reward (), without unit: the sum of the terms of `mjx_softarm.mdp.rewards.reward`.
+
+    Done (): 1 where the goal is reached with no chamber saturated, or where the simulation failed.
+
+    Info:
+        valid () bool            the simulation succeeded; learn from no other step
+        saturated () bool        a chamber is at a pressure limit with its spring off its reference
+        clearance_mm ()          distance of the body to the pipe's wall; infinite without a pipe
+
+    Metrics, each () float32:
+        tip_error_mm             distance of the tip to the goal
+        reached                  1 where the goal is reached
+        saturated_chambers       number of them
+        unsettled                1 where the step is not valid
+        invalid_REASON           1 for that reason, a code of `SettleResult`, or in motion of `MotionResult`
+        reward_TERM              terms of the reward: goal, error, steps, saturation, clearance
 
     With a sim-to-real network, every pose that is observed, rewarded or drawn as a goal is the real arm's,
-    P_S2R, as the network tells it from the simulated pose and the spring lengths; so is the body, whose
+    P_S2R, as the network predicts it from the simulated pose and the spring lengths; so is the body, whose
     distance to a pipe's wall is measured.
     """
 
@@ -85,6 +114,8 @@ class ReachEnv(Env):
         self.pipe = None if diameter_mm is None else CrossPipe.of_mm(diameter_mm)
         self.uses_mjx = self.config.engine == "mjx" or self.config.mode == "dynamic"
         self.model = mjx.put_model(build_model(self.spec)) if self.uses_mjx else None
+        self._results = MotionResult if self.config.mode == "dynamic" else SettleResult
+        self._failures = {f"invalid_{r.name.lower()}": r.value for r in self._results if r.value != 0}
         self.pool = self.sample_pool(self.config.n_poses, self.config.workspace_seed)
 
     @property
@@ -97,10 +128,11 @@ class ReachEnv(Env):
 
     @property
     def backend(self) -> str:
-        return "mjx"
+        """Simulation that runs: "chain" or "mjx" kinematics of the equilibrium, or "mjx dynamic" steps."""
+        return "mjx dynamic" if self.config.mode == "dynamic" else self.config.engine
 
     def sample_pool(self, n: int, seed: int) -> Pool:
-        """Poses of the workspace as `sample_workspace` draws them, the poses being those observed."""
+        """Draw n poses of the workspace as `sample_workspace` does, and correct them to those observed."""
         pool = sample_workspace(self.spec, n, seed)
         return pool._replace(pose=self._observed_pose(pool.pose, pool.spring_m))
 
@@ -119,7 +151,7 @@ class ReachEnv(Env):
         return self.action_map.from_lengths(length_m)
 
     def reset(self, rng: Array) -> State:
-        """A new episode: an arm of the randomisation, at a random pose, with a random goal."""
+        """Start an episode: an arm of the randomisation, at a random pose, with a random goal."""
         return self.reset_from(jax.tree.map(lambda x: x[0], self.sample_noise(rng, 1)))
 
     def sample_noise(self, rng: Array, n: int) -> EpisodeNoise:
@@ -146,7 +178,8 @@ class ReachEnv(Env):
             n_steps=jnp.zeros((), jnp.int32),
         )
         zero = jnp.zeros(())
-        metrics = dict.fromkeys(("tip_error_mm", "reached", "saturated_chambers", "unsettled"), zero)
+        names = ("tip_error_mm", "reached", "saturated_chambers", "unsettled", *self._failures)
+        metrics = dict.fromkeys(names, zero)
         metrics |= {f"reward_{name}": zero for name in ("goal", "error", "steps", "saturation", "clearance")}
         info = {
             "saturated": jnp.array(False),
@@ -158,13 +191,15 @@ class ReachEnv(Env):
     def step(self, state: State, action: Array) -> State:
         """Move to the references of `action` (n_chambers,) in [-1, 1]; `done` is 1 where the goal is reached.
 
-        An arm that did not settle, or is not finite, keeps its last pose, earns nothing, ends its episode
-        and is marked by `info["valid"]`: such a transition must not be learned from.
+        An arm that did not settle, or is not finite, keeps its last pose, earns nothing and ends its episode;
+        `info["valid"]` is then false, and the transition must not be learned from.
         """
         arm: ArmState = state.pipeline_state
         reference = self.reference_m(action)
         motion, end = self._move(arm, reference - arm.sensor_offset_m)
-        valid = end.settled & jnp.all(jnp.isfinite(action))  # a NaN would ask for a length of 0
+        finite = jnp.all(jnp.isfinite(action))  # a NaN would ask for a length of 0
+        result = jnp.where(finite, end.result, self._results.NOT_FINITE.value)
+        valid = result == 0
         moved = arm._replace(
             motion=motion,
             pose=self._observed_pose(pose_from_frame(end.tip_position_m, end.tip_rotation), end.spring_m),
@@ -191,6 +226,7 @@ class ReachEnv(Env):
             "reached": (reached & valid).astype(jnp.float32),
             "saturated_chambers": jnp.sum(saturated).astype(jnp.float32),
             "unsettled": (~valid).astype(jnp.float32),
+            **{name: (result == code).astype(jnp.float32) for name, code in self._failures.items()},
         } | {
             f"reward_{name}": jnp.where(valid, term, 0.0).astype(jnp.float32) for name, term in terms.items()
         }
@@ -208,7 +244,7 @@ class ReachEnv(Env):
             },
         )
 
-    def _move(self, arm: ArmState, reference_m: Array) -> tuple[Motion, Settled]:
+    def _move(self, arm: ArmState, reference_m: Array) -> tuple[Motion, Settled | Moved]:
         params = self.params_of(arm)
         if self.config.mode == "dynamic":
             return advance(
@@ -219,20 +255,18 @@ class ReachEnv(Env):
                 self.config.dynamic_step_s,
                 1.0 / self.spec.control.rate_hz,
             )
-        if self.config.engine == "mjx":
-            kinematics = mjx_kinematics(self.model)
-        else:
-            kinematics = chain_kinematics(params)
+        uses_mjx = self.config.engine == "mjx"
+        kinematics = mjx_kinematics(self.model) if uses_mjx else chain_kinematics(params)
         end = settle(kinematics, params, reference_m)
         return Motion(end.q, jnp.zeros_like(end.q), end.pressure_kpa), end
 
     def clearance_cost(self, clearance_mm: Array) -> Array:
-        """What the reward loses for clearances (...) [mm] of the body to the pipe's wall."""
+        """Return the cost (...) of clearances (...) [mm] of the body to the pipe's wall."""
         within_mm = jnp.maximum(self.config.clearance_margin_mm - clearance_mm, 0.0)
         return self.config.clearance_cost_per_mm * within_mm
 
     def _clearance_mm(self, q: Array, pose: Array) -> Array:
-        """Of the body, whose tip has this pose, to the pipe's wall, (); infinite without a pipe."""
+        """Return the distance () of the body, whose tip has this pose, to the pipe's wall."""
         if self.pipe is None:
             return jnp.asarray(jnp.inf, q.dtype)
         frames = chain_frames(q, self.params.link_length_m)
@@ -242,11 +276,11 @@ class ReachEnv(Env):
         return 1e3 * body_clearance(self.pipe, *plates, self.spec)
 
     def observe(self, pose: Array, goal: Array) -> Array:
-        """The observation (..., 18) of a pose and a goal (..., 6) [mm, deg]."""
+        """Return the observation (..., 18) of a pose and a goal (..., 6) [mm, deg]."""
         return obs.observe(pose, goal, self.scale, self.config.reward)
 
     def params_of(self, arm: ArmState) -> ArmParams:
-        """The numbers of an arm, of which some are its episode's."""
+        """Return the numbers of an arm, with those of its episode in their places."""
         return self.params._replace(
             tool_mass_kg=self.params.tool_mass_kg.at[PAYLOAD].set(arm.payload_kg),
             chamber_stiffness=arm.chamber_stiffness,

@@ -16,7 +16,7 @@ from mjx_softarm.env import ReachEnv
 
 
 def over_arms(function: Callable, mesh: Mesh | None = None) -> Callable:
-    """A function of one arm as one of many, by their first axis.
+    """Return the function of many arms, by their first axis, that a function of one arm makes.
 
     With a mesh of devices, each does its share of the arms, which must be equal ones, and does not wait for
     the slowest arm of another.
@@ -29,7 +29,7 @@ def over_arms(function: Callable, mesh: Mesh | None = None) -> Callable:
 
 
 class Outcome(NamedTuple):
-    """What one action of each arm led to, before any reset."""
+    """Outcome of one action of each arm, before any reset."""
 
     final_obs: Array  # (n, obs_size) the successor's observation, also where the episode ended
     reward: Array  # (n,)
@@ -48,7 +48,7 @@ class VectorEnv:
         self.env, self.n, self.episode_length, self.mesh = env, n, episode_length, mesh
 
     def reset(self, key: Array) -> State:
-        """State of n fresh arms."""
+        """Start an episode with each of the n arms."""
         with draws.on(self.mesh):
             noise = self.env.sample_noise(key, self.n)
         return over_arms(self.env.reset_from, self.mesh)(noise)
@@ -63,7 +63,7 @@ class VectorEnv:
 
         Returns:
             The state to act on next (reset where an episode ended), the state that the action led to,
-            and how the episodes stand.
+            and the outcome.
         """
         after = over_arms(self.env.step, self.mesh)(state, action)
         valid = after.info["valid"]

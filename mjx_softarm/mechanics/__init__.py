@@ -1,1 +1,1 @@
-"""The arm as physics: its model, its rest, its motion, its pictures."""
+"""The arm as physics: model, equilibrium, motion, pictures."""

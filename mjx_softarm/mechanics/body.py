@@ -14,18 +14,18 @@ SPRING_WIDTH_M = 0.002  # radius of a spring, outside the circle that the spring
 
 
 def ring_radius_m(spec: ArmSpec) -> float:
-    """Outer radius of a ring."""
+    """Return the outer radius of a ring."""
     return spec.geometry.spring_radius_m + SPRING_WIDTH_M
 
 
 def rim_points(radius_m: float, n: int = 16) -> np.ndarray:
-    """Points (n, 3) [m] on a circle about z, at equal distances, the first on +x."""
+    """Return points (n, 3) [m] on a circle about z, at equal distances, the first on +x."""
     angle = 2 * np.pi * np.arange(n) / n
     return radius_m * np.stack([np.cos(angle), np.sin(angle), np.zeros(n)], axis=-1)
 
 
 def gripper_boxes(spec: ArmSpec) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Name -> half sizes (3,) and centre (3,) [m] of each box, from the middle of the gripper, z up."""
+    """Return each box by name: half sizes (3,) and centre (3,) [m] from the gripper's middle, z up."""
     quarter = 0.25 * spec.mass.gripper_length_m
     return {
         "palm": (np.array([0.022, 0.022, quarter]), np.array([0.0, 0.0, quarter])),
@@ -35,5 +35,5 @@ def gripper_boxes(spec: ArmSpec) -> dict[str, tuple[np.ndarray, np.ndarray]]:
 
 
 def payload_radius_m(payload_kg: float) -> float:
-    """Radius of the ball that stands for a payload in pictures; the room it takes is not modelled."""
+    """Return the radius of the ball drawn for a payload; the ball collides with nothing."""
     return 0.03 * payload_kg ** (1 / 3) + 0.01

@@ -2,9 +2,9 @@
 
 The joints of one section are coupled by the tendons that run through it, those of different sections by
 gravity alone: its second derivative by a joint i and one j further down is a product of two numbers of i with
-two of j (see `mjx_softarm.mechanics.statics`), so the block between two sections has rank two. Block elimination from
-the tip to the base keeps that form: what hangs below a section acts on it as a reaction of rank two, as in
-the articulated-body algorithm for rigid chains.
+two of j (see `mjx_softarm.mechanics.statics`), so the block between two sections has rank two. Block
+elimination from the tip to the base keeps that form: the sections below act on a section as a reaction of
+rank two, as in the articulated-body algorithm for rigid chains.
 
 Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, chapter 7 (articulated bodies).
 """
@@ -22,14 +22,14 @@ RANK = 2  # of what couples two sections
 
 
 class ChainHessian(NamedTuple):
-    """A symmetric matrix in blocks; between sections s < t stands `above[s] @ below[t].T`."""
+    """A symmetric matrix in blocks; the block of sections s < t is `above[s] @ below[t].T`."""
 
-    own: Array  # (n_sections, n, n) of each section's n joints
+    own: Array  # (n_sections, n, n) blocks of each section's n joints
     above: Array  # (n_sections, n, 2)
     below: Array  # (n_sections, n, 2)
 
     def dense(self) -> Array:
-        """All of it, (nv, nv)."""
+        """Return the whole matrix (nv, nv)."""
         n_sections, n, _ = self.own.shape
         section = jnp.repeat(jnp.arange(n_sections), n)
         above, below = (x.reshape(-1, RANK) for x in (self.above, self.below))
@@ -38,14 +38,15 @@ class ChainHessian(NamedTuple):
         return block_diagonal(self.own) + far + far.T
 
     def plus_diagonal(self, added: Array) -> ChainHessian:
-        """The matrix with `added` (nv,) on its diagonal."""
+        """Return the matrix with `added` (nv,) on its diagonal."""
         n_sections, n, _ = self.own.shape
         return self._replace(own=self.own + added.reshape(n_sections, n, 1) * jnp.eye(n, dtype=added.dtype))
 
     def solve(self, columns: Array) -> Array:
-        """The inverse times columns (n_sections, n, k), in the same form; NaN if not positive definite."""
-        reaction = jnp.zeros((RANK, RANK), columns.dtype)  # of all that is further down
-        pull = jnp.zeros((RANK, columns.shape[-1]), columns.dtype)  # likewise, of its columns
+        """Return the inverse times columns (n_sections, n, k), in that form; NaN if not positive definite."""
+        # From the tip to the base: eliminate each section, and add its reaction to those above
+        reaction = jnp.zeros((RANK, RANK), columns.dtype)  # of all sections further down
+        pull = jnp.zeros((RANK, columns.shape[-1]), columns.dtype)  # of their columns
         reduced = []
         for own, above, below, column in reversed(list(zip(*self, columns, strict=True))):
             acted = product(above, reaction)
@@ -54,7 +55,8 @@ class ChainHessian(NamedTuple):
             passed_on = product((below - acted).T, solved)
             reaction, pull = reaction + passed_on[:, :RANK], pull + passed_on[:, RANK:]
             reduced.append(solved)
-        motion = jnp.zeros_like(pull)  # of all that is further up
+        # From the base to the tip: substitute
+        motion = jnp.zeros_like(pull)  # of all sections further up
         found = []
         for above, solved in zip(self.above, reversed(reduced), strict=True):
             found.append(solved[:, RANK:] - product(solved[:, :RANK], motion))

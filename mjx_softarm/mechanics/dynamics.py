@@ -11,8 +11,15 @@ from jax import Array
 from mjx_softarm import control
 from mjx_softarm._support.mjx import mjx
 from mjx_softarm.mechanics.mjcf import spring_lengths, steps_per_period
-from mjx_softarm.mechanics.result import MotionResult
+from mjx_softarm.mechanics.settle import Result
 from mjx_softarm.mechanics.statics import ArmParams
+
+
+class MotionResult(Result):
+    """Results of `advance`."""
+
+    FINITE = 0, "every joint coordinate and velocity is finite"
+    NOT_FINITE = 1, "a joint coordinate or velocity is not a finite number"
 
 
 class Motion(NamedTuple):

@@ -8,7 +8,7 @@ from mjx_softarm.spec import ArmSpec
 
 
 def random_pressures(spec: ArmSpec, n_poses: int, seed: int | np.random.Generator) -> np.ndarray:
-    """Pressures (n_poses, n) [kPa] by the arcsine law between the arm's limits.
+    """Draw pressures (n_poses, n) [kPa] by the arcsine law between the arm's limits.
 
     It favours the extremes, where the workspace ends.
 

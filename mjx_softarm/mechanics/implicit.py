@@ -4,17 +4,17 @@ An equilibrium (q, p) of `mjx_softarm.mechanics.settle` solves, for every chambe
 
     grad V(q; p, x) = 0,    s_t(q; x) = reference_t  if t tracks,  p_t = limit_t  if t is at a limit,
 
-with the arm's numbers x. Where the set of chambers at a limit stays as it is, these equations differentiate to
+with the arm's numbers x. As long as the set of chambers at a limit stays, these equations differentiate to
 
     H dq = B dp - d_x grad V,    S dq = dreference - d_x s  or  dp = dlimit,
 
-with H the Hessian of V, B the chambers' push per kPa and S the springs' Jacobian. With K = H^-1 B, and R with the
-rows of S K where chambers track and of the identity where they are at a limit,
+with H the Hessian of V, B the chambers' push per kPa and S the springs' Jacobian. With K = H^-1 B, and R with
+the rows of S K where chambers track and of the identity where they are at a limit,
 
     dp = R^-1 r,    dq = K dp - H^-1 d_x grad V,    r = dreference - d_x s + S H^-1 d_x grad V  or  dlimit.
 
-This is exact however many Newton steps led to the equilibrium. K and R^-1 are computed with the primal, so that
-derivatives in either direction are products with them; H^-1 itself is needed for the arm's numbers alone.
+This is exact however many Newton steps led to the equilibrium. K and R^-1 are computed with the primal, so
+that derivatives in either direction are products with them; H^-1 is needed for the arm's numbers alone.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from jax.custom_derivatives import SymbolicZero
 
 from mjx_softarm._support.small_matrices import eliminate, product
 from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK, Frames
-from mjx_softarm.mechanics.statics import statics
+from mjx_softarm.mechanics.statics import Statics, statics
 
 
 class EquilibriumTangents(NamedTuple):
@@ -42,24 +42,30 @@ class EquilibriumTangents(NamedTuple):
 
 
 def equilibrium_tangents(
-    primals: tuple, tangents: tuple, q: Array, pressure_kpa: Array, at_limit: Array, settled: Array
+    primals: tuple,
+    tangents: tuple,
+    frames: Frames,
+    here: Statics,
+    q: Array,
+    pressure_kpa: Array,
+    at_limit: Array,
+    settled: Array,
 ) -> EquilibriumTangents:
     """Differentiate an equilibrium along a direction.
 
     Args:
         primals: kinematics, params (`ArmParams`) and reference_m (n_chambers,) of `settle`.
         tangents: the direction, of the same structure, with `SymbolicZero` where nothing changes.
+        frames: plates and joints at the equilibrium.
+        here: statics at the equilibrium.
         q (nv,): joint coordinates of the equilibrium.
         pressure_kpa (n_chambers,): its pressures.
         at_limit (n_chambers,) bool: its active set.
         settled () bool: false for a zero derivative.
     """
-    kinematics, params, reference = primals
+    _, params, reference = primals
     _, params_dot, reference_dot = tangents
-    q = _masked(q, settled)  # the straight arm, whose numbers are finite
     n_sections, n_chambers = params.n_sections, len(at_limit)
-    frames = kinematics(q)
-    here = statics(frames, q, pressure_kpa, params)
     explicit = _explicit_tangents(primals, tangents, q, pressure_kpa)
 
     # Response matrices: K, and the inverse of H where the arm's numbers change

@@ -25,7 +25,7 @@ DOFS_PER_LINK = 3
 
 
 class Frames(NamedTuple):
-    """Where the arm's plates and joints are, in the base frame (z up)."""
+    """Poses of the arm's plates and joints in the base frame (z up)."""
 
     plate_position: Array  # (n_links + 1, 3) [m], the first is the base
     plate_rotation: Array  # (n_links + 1, 3, 3), columns are the plate's axes
@@ -47,7 +47,7 @@ def mjx_kinematics(model: mjx.Model) -> Kinematics:
 
 
 def chain_frames(q: Array, link_length_m: Array | float) -> Frames:
-    """Frames in closed form: products of the links' rotations, sums of the links' vectors.
+    """Return the frames in closed form: products of the links' rotations, sums of the links' vectors.
 
     Args:
         q (3 * n_links,): joint coordinates [m, rad, rad].
@@ -69,7 +69,7 @@ def chain_frames(q: Array, link_length_m: Array | float) -> Frames:
 
 
 def _rotation_xy(x: Array, y: Array) -> Array:
-    """Rx(x) Ry(y), (..., 3, 3)."""
+    """Return Rx(x) Ry(y), (..., 3, 3)."""
     cx, sx, cy, sy = jnp.cos(x), jnp.sin(x), jnp.cos(y), jnp.sin(y)
     zero = jnp.zeros_like(x)
     rows = [[cy, zero, sy], [sx * sy, cx, -sx * cy], [-cx * sy, sx, cx * cy]]
@@ -77,7 +77,7 @@ def _rotation_xy(x: Array, y: Array) -> Array:
 
 
 def mjx_frames(model: mjx.Model, q: Array) -> Frames:
-    """The same frames from `mjx.kinematics` of a model that `mjx_softarm.mechanics.mjcf` built.
+    """Return the frames of `mjx.kinematics`, for a model that `mjx_softarm.mechanics.mjcf` built.
 
     Args:
         model: the compiled arm on the device; its first bodies are the world and the links in order.

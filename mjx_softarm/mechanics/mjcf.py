@@ -26,7 +26,7 @@ _BELLOWS_DRAWN = 0.45  # of the outer diameter: the convolutions are not drawn
 
 
 def build_spec(spec: ArmSpec) -> mujoco.MjSpec:
-    """The arm as an editable `mujoco.MjSpec`, for adding an environment before compiling."""
+    """Return the arm as an editable `mujoco.MjSpec`, for adding an environment before compiling."""
     params = ArmParams.from_spec(spec, np.float64)
     mjspec = mujoco.MjSpec()
     mjspec.modelname = spec.name
@@ -52,7 +52,7 @@ def build_spec(spec: ArmSpec) -> mujoco.MjSpec:
 
 
 def steps_per_period(period_s: float) -> int:
-    """Time steps of the model in one period of the control: as few as `MAX_TIMESTEP_S` allows."""
+    """Return the number of time steps in one control period: as few as `MAX_TIMESTEP_S` allows."""
     return math.ceil(period_s / MAX_TIMESTEP_S - 1e-9)
 
 
@@ -67,12 +67,12 @@ def spring_lengths(data):
 
 
 def build_model(spec: ArmSpec) -> mujoco.MjModel:
-    """The compiled model of an arm."""
+    """Return the compiled model of an arm."""
     return build_spec(spec).compile()
 
 
 def _add_link(parent, link: int, params: ArmParams, spec: ArmSpec):
-    """One link: a slide along the parent plate's -z, then hinges x and y half a link below it."""
+    """Add one link: a slide along the parent plate's -z, then hinges x and y half a link below it."""
     half = spec.link_length_m / 2
     offset = -half if link == 0 else -2 * half
     body = parent.add_body(name=f"link{link}", pos=[0.0, 0.0, offset])
@@ -98,7 +98,7 @@ def _add_link(parent, link: int, params: ArmParams, spec: ArmSpec):
 
 
 def _polynomial(linear: float) -> list[float]:
-    """MuJoCo's stiffness and damping are polynomials; MJX uses the linear coefficient alone."""
+    """Return the polynomial that MuJoCo takes for stiffness or damping; MJX uses its linear term alone."""
     return [linear, 0.0, 0.0]
 
 
@@ -116,7 +116,7 @@ def _add_ring(body, plate: int, position, spec: ArmSpec) -> None:
 
 
 def _add_holes(body, plate: int, section: int, position, params: ArmParams, spec: ArmSpec) -> None:
-    """The sites that the chambers and springs of `section` pass on a plate."""
+    """Add the sites that the chambers and springs of `section` pass on a plate."""
     for k in range(N_CHAMBERS_PER_SECTION):
         index = section * N_CHAMBERS_PER_SECTION + k
         for kind, at in (("chamber", params.chamber_site_m), ("spring", params.spring_site_m)):
@@ -126,7 +126,7 @@ def _add_holes(body, plate: int, section: int, position, params: ArmParams, spec
 
 
 def _add_tools(last, params: ArmParams, spec: ArmSpec) -> None:
-    """Gripper and payload below the last plate, whose centre is the tip."""
+    """Add gripper and payload below the last plate, whose centre is the tip."""
     half, length = spec.link_length_m / 2, spec.mass.gripper_length_m
     last.add_site(name="tip", pos=[0.0, 0.0, -half], size=[0.004] * 3, rgba=[0.9, 0.1, 0.1, 1.0])
     for k, name in enumerate(("gripper", "payload")):
@@ -158,7 +158,7 @@ def _draw_gripper(body, spec: ArmSpec) -> None:
 
 
 def _add_chamber(mjspec: mujoco.MjSpec, index: int, params: ArmParams, spec: ArmSpec) -> None:
-    """Chamber tendon, its pressure actuator, and the spring beside it.
+    """Add a chamber's tendon, its pressure actuator, and the spring beside it.
 
     The actuator's force on the tendon is pressure * (a + b length): MuJoCo's affine gain.
     """

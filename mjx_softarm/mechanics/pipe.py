@@ -1,4 +1,4 @@
-"""The cross-shaped pipe: where its walls and containers are, and how far from the walls the arm's body is.
+"""The cross-shaped pipe: its walls, its containers, and the clearance of the arm's body.
 
 Two cylinders of one diameter cross below the arm's base: a vertical one, which the arm enters from above,
 and a horizontal one along x. All is in the base frame (z up, the arm hangs towards -z), in metres, for one
@@ -45,7 +45,7 @@ class CrossPipe:
 
     @classmethod
     def of_mm(cls, diameter_mm: float) -> CrossPipe:
-        """The pipe of this inner diameter."""
+        """Return the pipe of this inner diameter."""
         return cls(1e-3 * diameter_mm)
 
     @property
@@ -53,7 +53,7 @@ class CrossPipe:
         return 0.5 * self.diameter_m
 
     def containers(self) -> dict[str, np.ndarray]:
-        """Where the finger tips (3,) [m] pick and place: in the left (-x), right and bottom container."""
+        """Return the finger tips' positions (3,) [m] in the left (-x), right and bottom container."""
         far, side_z = self.radius_m + self.reach_m, self.centre_z_m - self.drop_m
         return {
             "left": np.array([-far, 0.0, side_z]),
@@ -63,7 +63,7 @@ class CrossPipe:
 
 
 def clearance(pipe: CrossPipe, position_m: Array) -> Array:
-    """Distance to the wall, positive inside; less than it, never more, near the edge where the pipes meet.
+    """Return the distance to the wall, positive inside; a lower bound near the edge where the pipes meet.
 
     Args:
         pipe: the pipe.
@@ -79,13 +79,13 @@ def clearance(pipe: CrossPipe, position_m: Array) -> Array:
 
 
 def _norm(xp, a: Array, b: Array) -> Array:
-    """Length of (a, b), whose gradient is zero at the origin."""
+    """Return the length of (a, b), whose gradient is zero at the origin."""
     square = a * a + b * b
     return xp.sqrt(xp.where(square > 0.0, square, 1.0)) * (square > 0.0)
 
 
 def body_points(plate_position: Array, plate_rotation: Array, spec: ArmSpec) -> Array:
-    """Points on the rims of all rings, then the corners of the gripper.
+    """Return points on the rims of all rings, then the corners of the gripper.
 
     Args:
         plate_position (..., L + 1, 3) [m]: from base to tip, as in `mjx_softarm.mechanics.kinematics.Frames`.
@@ -102,17 +102,17 @@ def body_points(plate_position: Array, plate_rotation: Array, spec: ArmSpec) -> 
 
 
 def _turned(rotation: Array, point: np.ndarray) -> Array:
-    """Points (k, 3) turned by (..., 3, 3): (..., k, 3); no matrix product, which a GPU would round."""
+    """Turn points (k, 3) by (..., 3, 3): (..., k, 3); no matrix product, which a GPU would round."""
     return (rotation[..., None, :, :] * point[:, None, :].astype(rotation.dtype)).sum(axis=-1)
 
 
 def body_clearance(pipe: CrossPipe, plate_position: Array, plate_rotation: Array, spec: ArmSpec) -> Array:
-    """The least clearance (...) [m] over `body_points`; see there and `clearance`."""
+    """Return the least `clearance` (...) [m] of the `body_points`."""
     return clearance(pipe, body_points(plate_position, plate_rotation, spec)).min(axis=-1)
 
 
 def _gripper(spec: ArmSpec) -> np.ndarray:
-    """Corners (24, 3) of the gripper's boxes in the last plate's frame."""
+    """Return the corners (24, 3) of the gripper's boxes in the last plate's frame."""
     signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
     middle = np.array([0.0, 0.0, -0.5 * spec.mass.gripper_length_m])
     return np.concatenate([middle + centre + signs * half for half, centre in gripper_boxes(spec).values()])

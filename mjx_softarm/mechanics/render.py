@@ -14,16 +14,15 @@ import functools
 import importlib
 import os
 import re
-import struct
 import subprocess
 import sys
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
+from mujoco import gl_context
+from PIL import Image
 
 from mjx_softarm._support.errors import InputError
 
@@ -39,7 +38,7 @@ _PAYLOAD_COLOUR = (0.20, 0.60, 0.25, 1.0)
 
 
 class RenderError(InputError):
-    """This machine cannot draw; the message says what was tried and what to do."""
+    """Error of a machine that cannot draw; the message says what was tried and what to do."""
 
 
 @dataclass(frozen=True)
@@ -71,14 +70,12 @@ class Renderer:
         self._data = mujoco.MjData(self._model)
         mujoco.mj_kinematics(self._model, self._data)
         self._arm_length_m = -float(self._data.body("gripper").xpos[2])
-        self._view = mujoco.MjrRect(0, 0, width, height)
         self._option = mujoco.MjvOption()
         self._option.sitegroup[:] = 0
-        self._scene = mujoco.MjvScene(self._model, _MAX_GEOMS)
-        self._gl, self._context = _open_context(self._model, width, height)
+        self._renderer: mujoco.Renderer | None = _open_renderer(self._model, width, height)
 
     def draw(self, q: np.ndarray, camera: Camera | None = None, payload_radius_m: float = 0.0) -> np.ndarray:
-        """The arm at joint coordinates q (nq,) [m, rad]: RGB, (height, width, 3) uint8.
+        """Draw the arm at joint coordinates q (nq,) [m, rad]: RGB, (height, width, 3) uint8.
 
         A payload that the model does not draw by itself is a ball of `payload_radius_m` at the finger tips.
 
@@ -86,7 +83,7 @@ class Renderer:
             ValueError: q has the wrong shape or is not finite.
             RenderError: the renderer is closed.
         """
-        if self._gl is None:
+        if self._renderer is None:
             raise RenderError("the renderer is closed")
         q = np.asarray(q, float)
         if q.shape != (self._model.nq,):
@@ -96,28 +93,22 @@ class Renderer:
         self._data.qpos[:] = q
         mujoco.mj_forward(self._model, self._data)
         view = self._camera(camera or Camera())
-        everything = mujoco.mjtCatBit.mjCAT_ALL
-        mujoco.mjv_updateScene(self._model, self._data, self._option, None, view, everything, self._scene)
-        _draw_bellows(self._scene, self._model)
-        _draw_mount(self._scene)
+        self._renderer.update_scene(self._data, view, self._option)
+        scene = self._renderer.scene
+        _draw_bellows(scene, self._model)
+        _draw_mount(scene)
         if payload_radius_m > 0.0:
             held = self._data.body("payload").xpos
             ball, size = mujoco.mjtGeom.mjGEOM_SPHERE, np.full(3, payload_radius_m)
-            _append(self._scene, ball, size, held, np.eye(3), _PAYLOAD_COLOUR)
-        _add_light(self._scene, np.radians(view.azimuth))
-        image = np.empty((self._view.height, self._view.width, 3), np.uint8)
-        self._gl.make_current()
-        mujoco.mjr_render(self._view, self._scene, self._context)
-        mujoco.mjr_readPixels(image, None, self._view, self._context)
-        return np.ascontiguousarray(image[::-1])
+            _append(scene, ball, size, held, np.eye(3), _PAYLOAD_COLOUR)
+        _add_light(scene, np.radians(view.azimuth))
+        return self._renderer.render()
 
     def close(self) -> None:
         """Free the context; the renderer draws no more."""
-        if self._gl is not None:
-            self._gl.make_current()
-            self._context.free()
-            self._gl.free()
-            self._gl = None
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
 
     def __enter__(self) -> Renderer:
         return self
@@ -140,42 +131,26 @@ def write_png(path: str | Path, image: np.ndarray) -> None:
         raise ValueError(
             f"image: got {image.dtype} of shape {image.shape}, expected uint8 of (height, width, 3)"
         )
-    height, width, _ = image.shape
-    rows = np.concatenate([np.zeros((height, 1), np.uint8), image.reshape(height, -1)], axis=1)
-
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)  # 8 bit, RGB
-    body = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows.tobytes(), 9)) + chunk(b"IEND", b"")
-    Path(path).write_bytes(b"\x89PNG\r\n\x1a\n" + body)
+    Image.fromarray(image).save(path, "PNG")
 
 
-def _open_context(model: mujoco.MjModel, width: int, height: int) -> tuple[Any, mujoco.MjrContext]:
-    """An OpenGL context and MuJoCo's resources in it."""
-    asked = os.environ.get("MUJOCO_GL", "").lower().strip()
-    if asked in _HEADLESS:
-        name = asked
-    elif asked or sys.platform != "linux":
-        name = ""  # MuJoCo's own choice
-    else:
+def _open_renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Renderer:
+    """Open MuJoCo's renderer with the OpenGL that MUJOCO_GL names, or with a headless one that works."""
+    name = os.environ.get("MUJOCO_GL", "").lower().strip()
+    if not name and sys.platform == "linux":
         name = _working_library()
     try:
-        module = importlib.import_module(f"mujoco.{name}") if name else mujoco
-        gl = module.GLContext(width, height)
-        gl.make_current()
-        context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_150)
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, context)
+        if name in _HEADLESS:
+            gl_context.GLContext = importlib.import_module(f"mujoco.{name}").GLContext
+        return mujoco.Renderer(model, height, width, _MAX_GEOMS)
     except Exception as error:  # each library has its own
         message = " ".join(f"{type(error).__name__}: {error}".split())
-        tried = f"MUJOCO_GL={asked or name}: {message}"
-        raise RenderError(f"no OpenGL to draw with ({tried}). {_ADVICE}") from error
-    return gl, context
+        raise RenderError(f"no OpenGL to draw with (MUJOCO_GL={name}: {message}). {_ADVICE}") from error
 
 
 @functools.cache
 def _working_library() -> str:
-    """The first of the headless libraries that draws.
+    """Return the first of the headless libraries that draws.
 
     Each is tried in a process of its own: a library that was loaded, even in vain, shuts out the others.
     """
@@ -197,7 +172,7 @@ def _working_library() -> str:
 
 
 def _is_error(line: str) -> bool:
-    """Whether this line of a traceback names the exception."""
+    """Return whether a line of a traceback names the exception."""
     return re.match(r"[\w.]+(Error|Exception)\b", line) is not None
 
 
@@ -232,7 +207,7 @@ def _draw_mount(scene: mujoco.MjvScene) -> None:
 
 
 def _add_light(scene: mujoco.MjvScene, azimuth: float) -> None:
-    """A lamp over the camera's left shoulder, which gives the round parts their shape."""
+    """Add a lamp over the camera's left shoulder, which gives the round parts their shape."""
     if scene.nlight >= len(scene.lights):
         return
     light = scene.lights[scene.nlight]

@@ -14,6 +14,7 @@ Source: primal-dual active set as semismooth Newton, Hintermueller, Ito, Kunisch
 
 from __future__ import annotations
 
+import enum
 from typing import NamedTuple
 
 import jax
@@ -23,9 +24,8 @@ from jax.custom_derivatives import zero_from_primal
 
 from mjx_softarm._support.small_matrices import eliminate, product
 from mjx_softarm.mechanics.implicit import equilibrium_tangents
-from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK, Kinematics
-from mjx_softarm.mechanics.result import SettleResult
-from mjx_softarm.mechanics.statics import ArmParams, statics
+from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK, Frames, Kinematics
+from mjx_softarm.mechanics.statics import ArmParams, Statics, statics
 
 MAX_ITERATIONS = 12
 ACTIVE_SET_GAIN_KPA_PER_M = 1000.0
@@ -33,6 +33,30 @@ MAX_STEP = 0.5  # largest entry of a Newton step [m, rad]
 SMALL_STEP = 3e-4  # [m, rad]; the next error is of its square
 RESIDUAL_TOLERANCE = 2e-3  # [N, N m], against stiffnesses of 2 N m/rad and more
 TRACKING_TOLERANCE_M = 1e-4
+
+
+class Result(enum.IntEnum):
+    """A code of how a simulation ended, an int32 in arrays, with a text for messages."""
+
+    text: str
+
+    def __new__(cls, code: int, text: str) -> Result:
+        member = int.__new__(cls, code)
+        member._value_ = code
+        member.text = text
+        return member
+
+
+class SettleResult(Result):
+    """Results of `settle`."""
+
+    CONVERGED = 0, "forces balance, and every spring is at its reference or its chamber at a limit"
+    OUT_OF_ITERATIONS = (
+        1,
+        "forces or springs are off by more than the tolerance after the last iteration",
+    )
+    NOT_CONVEX = 2, "its energy is not convex there, so it buckles, or its springs do not follow its chambers"
+    NOT_FINITE = 3, "a force or a length is not a finite number"
 
 
 class Settled(NamedTuple):
@@ -60,9 +84,7 @@ class _Iterate(NamedTuple):
     pressure: Array  # (n_chambers,) [kPa]
     at_limit: Array  # (n_chambers,) bool, the active set of the last step
     moving: Array  # () bool, the last step was large or changed the active set
-    stiffening: (
-        Array  # () added to the joints' stiffness, as a multiple of it, where the energy is not convex
-    )
+    stiffening: Array  # () joint stiffness added, in parts of it, where the energy is not convex
     iteration: Array  # ()
 
 
@@ -70,15 +92,33 @@ class _Iterate(NamedTuple):
 def settle(kinematics: Kinematics, params: ArmParams, reference_m: Array) -> Settled:
     """Find the equilibrium under the sensor-space law, starting from the straight arm.
 
-    The result is differentiable in all arguments, forward and in reverse: joint coordinates, pressures, springs and
-    tip by the implicit function theorem at the final active set (see `mjx_softarm.mechanics.implicit`). Derivatives
-    of the other fields are zero, and all are zero where the arm did not settle.
+    Joint coordinates, pressures, springs and tip are differentiable in all arguments, forward and in reverse,
+    by the implicit function theorem at the final active set (see `mjx_softarm.mechanics.implicit`). The other
+    fields have a zero derivative, and all fields have where the arm did not settle.
 
     Args:
         kinematics: of either engine, `chain_kinematics(params)` or `mjx_kinematics(model)`.
         params: numbers of the arm.
         reference_m (n_chambers,): spring lengths that the law tracks.
     """
+    return _solve(kinematics, params, reference_m)[0]
+
+
+def _settle_jvp(primals: tuple, tangents: tuple) -> tuple[Settled, Settled]:
+    found, frames, here = _solve(*primals)
+    with jax.default_matmul_precision("highest"):
+        change = equilibrium_tangents(
+            primals, tangents, frames, here, found.q, found.pressure_kpa, found.at_limit, found.settled
+        )
+    none = Settled(*(zero_from_primal(field, symbolic_zeros=True) for field in found))
+    return found, none._replace(**change._asdict())
+
+
+settle.defjvp(_settle_jvp, symbolic_zeros=True)
+
+
+def _solve(kinematics: Kinematics, params: ArmParams, reference_m: Array) -> tuple[Settled, Frames, Statics]:
+    """Return the equilibrium, and frames and statics of its joint coordinates."""
     dtype = params.link_length_m.dtype
     n_links = params.link_mass_kg.shape[0]
     start = _Iterate(
@@ -96,19 +136,6 @@ def settle(kinematics: Kinematics, params: ArmParams, reference_m: Array) -> Set
             start,
         )
         return _report(end, kinematics, params, reference_m)
-
-
-def _settle_jvp(primals: tuple, tangents: tuple) -> tuple[Settled, Settled]:
-    found = settle(*primals)
-    with jax.default_matmul_precision("highest"):
-        change = equilibrium_tangents(
-            primals, tangents, found.q, found.pressure_kpa, found.at_limit, found.settled
-        )
-    none = Settled(*(zero_from_primal(field, symbolic_zeros=True) for field in found))
-    return found, none._replace(**change._asdict())
-
-
-settle.defjvp(_settle_jvp, symbolic_zeros=True)
 
 
 def settle_pressures(kinematics: Kinematics, params: ArmParams, pressure_kpa: Array) -> Settled:
@@ -148,7 +175,7 @@ def _newton_step(it: _Iterate, kinematics: Kinematics, params: ArmParams, refere
     dp = eliminate(rows, residual[:, None])[:, 0]
     dq = (newton_step + jnp.sum(dq_dp * dp, axis=-1)).reshape(-1)
 
-    # Step length; no step where the energy is not convex or springs do not follow chambers: stiffen the joints.
+    # Step length; where the energy is not convex, or springs do not follow chambers: no step, stiffer joints
     largest = jnp.max(jnp.abs(dq))
     scale = jnp.minimum(1.0, MAX_STEP / largest)
     convex = jnp.isfinite(largest)
@@ -163,7 +190,9 @@ def _newton_step(it: _Iterate, kinematics: Kinematics, params: ArmParams, refere
     )
 
 
-def _report(it: _Iterate, kinematics: Kinematics, params: ArmParams, reference_m: Array) -> Settled:
+def _report(
+    it: _Iterate, kinematics: Kinematics, params: ArmParams, reference_m: Array
+) -> tuple[Settled, Frames, Statics]:
     # Forces and springs at the end
     pressure = jnp.clip(it.pressure, params.pressure_min_kpa, params.pressure_max_kpa)
     frames = kinematics(it.q)
@@ -183,7 +212,7 @@ def _report(it: _Iterate, kinematics: Kinematics, params: ArmParams, reference_m
         [SettleResult.NOT_FINITE.value, SettleResult.CONVERGED.value, SettleResult.NOT_CONVEX.value],
         SettleResult.OUT_OF_ITERATIONS.value,
     )
-    return Settled(
+    found = Settled(
         q=it.q,
         pressure_kpa=pressure,
         spring_m=here.springs.length,
@@ -195,3 +224,4 @@ def _report(it: _Iterate, kinematics: Kinematics, params: ArmParams, reference_m
         result=result.astype(jnp.int32),
         iterations=it.iteration,
     )
+    return found, frames, here

@@ -27,7 +27,7 @@ GRAVITY_M_S2 = 9.81
 
 
 class ArmParams(NamedTuple):
-    """The numbers of an arm as arrays, so that a new value needs no new compilation.
+    """Numbers of an arm as arrays, so that a new value needs no new compilation.
 
     Chambers and springs are ordered section by section, counter-clockwise within a section.
     """
@@ -68,7 +68,7 @@ class ArmParams(NamedTuple):
 
     @classmethod
     def from_spec(cls, spec: ArmSpec, dtype: np.typing.DTypeLike = np.float32) -> ArmParams:
-        """Numbers of `spec`, in SI units but for the pressures [kPa]."""
+        """Return the numbers of `spec`, in SI units but for the pressures [kPa]."""
         n, per_section = spec.n_chambers, spec.structure.links_per_section
         first = np.radians(spec.geometry.first_chamber_deg)
         angle = first + 2 * np.pi * np.arange(n) / N_CHAMBERS_PER_SECTION
@@ -105,7 +105,7 @@ class Tendons(NamedTuple):
 
 
 class Statics(NamedTuple):
-    """The potential's derivatives at given joint coordinates and pressures."""
+    """Derivatives of the potential at given joint coordinates and pressures."""
 
     gradient: Array  # (nv,) [N, N m]
     hessian: ChainHessian
@@ -123,7 +123,7 @@ class Statics(NamedTuple):
 
 @jax.jit  # inlined where it is compiled; traced once for all of its callers
 def statics(frames: Frames, q: Array, pressure_kpa: Array, params: ArmParams) -> Statics:
-    """Gradient and Hessian of V(q) at fixed pressures.
+    """Return gradient and Hessian of V(q) at fixed pressures.
 
     Args:
         frames: of `q`, from either engine.
@@ -153,7 +153,7 @@ def statics(frames: Frames, q: Array, pressure_kpa: Array, params: ArmParams) ->
 
 
 def _bending(tension: Array, link_hessian: Array) -> Array:
-    """Tensions (2, n_sections, 3) times the second derivatives of the lengths: (n_sections, n, n)."""
+    """Sum tensions (2, n_sections, 3) times second derivatives of the lengths: (n_sections, n, n)."""
     n_sections = tension.shape[1]
     per_section = link_hessian.shape[1] // n_sections
     per_link = jnp.repeat(tension, per_section, axis=1)
@@ -162,7 +162,7 @@ def _bending(tension: Array, link_hessian: Array) -> Array:
 
 
 def _stretching(slope: Array, jacobian: Array) -> Array:
-    """sum_t slope_t dl_t dl_t^T over the tendons of each section: (n_sections, n, n).
+    """Return sum_t slope_t dl_t dl_t^T over the tendons of each section: (n_sections, n, n).
 
     Args:
         slope (2, n_sections, 3): of the tensions by the lengths.
@@ -173,7 +173,7 @@ def _stretching(slope: Array, jacobian: Array) -> Array:
 
 
 def tendons(frames: Frames, site_m: Array) -> Tendons:
-    """Lengths of tendons through holes in the rings, with derivatives.
+    """Return lengths of tendons through holes in the rings, with derivatives.
 
     Args:
         frames: plates and joints.
@@ -209,12 +209,12 @@ def tendons(frames: Frames, site_m: Array) -> Tendons:
 
 
 def _dot(a: Array, b: Array) -> Array:
-    """Inner products over the last axis, the others broadcast: as matrix products, tiny ones are slow."""
+    """Return inner products over the last axis as sums, since tiny matrix products are slow."""
     return jnp.sum(a * b, axis=-1)
 
 
 def _gravity(frames: Frames, params: ArmParams) -> tuple[Array, ChainHessian]:
-    """Gradient (nv,) and Hessian of the weights' potential.
+    """Return gradient (nv,) and Hessian of the weights' potential.
 
     With M and c the mass and the centre of mass of all that hangs on a joint, and w = M a for a slide,
     w = M a x (c - o) for a hinge: the gradient is g w_z; the second derivative by an earlier hinge i and

@@ -21,11 +21,11 @@ from mjx_softarm.spec import ArmSpec, SpecError
 BATCH = 1024
 CANDIDATES_PER_POSE = 2
 VOXEL_MM = 25.0
-HELD_OUT_SEED = 20_000  # of the goals that policies are evaluated on; training draws with other seeds
+HELD_OUT_SEED = 20_000  # seed of the goals that policies are evaluated on; training uses other seeds
 
 
 class Pool(NamedTuple):
-    """Equilibria of the nominal arm, none of them saturated: every spring is where it is asked to be."""
+    """Equilibria of the nominal arm, none of them saturated: every spring is at its reference."""
 
     q: Array  # (n, nv) [m, rad, rad]
     pressure_kpa: Array  # (n, n_chambers)
@@ -43,7 +43,7 @@ def _solver():
 
 
 def settle_many(spec: ArmSpec, pressure_kpa: np.ndarray) -> Settled:
-    """Equilibria at many pressures (n, n_chambers) [kPa], as NumPy arrays with a leading axis n."""
+    """Return equilibria at many pressures (n, n_chambers) [kPa], as NumPy arrays with a leading axis n."""
     params = ArmParams.from_spec(spec)
     n = len(pressure_kpa)
     padded = np.resize(np.asarray(pressure_kpa, np.float32), (-(-n // BATCH) * BATCH, spec.n_chambers))
@@ -52,7 +52,7 @@ def settle_many(spec: ArmSpec, pressure_kpa: np.ndarray) -> Settled:
 
 
 def sample_workspace(spec: ArmSpec, n: int, seed: int) -> Pool:
-    """Poses spread over the whole reachable workspace.
+    """Draw poses spread over the whole reachable workspace.
 
     Pressures follow the arcsine law between their limits, which favours the extremes where the workspace
     ends; of twice as many candidates, `n` are drawn with weights that even out the number of tips per
@@ -85,7 +85,7 @@ def sample_workspace(spec: ArmSpec, n: int, seed: int) -> Pool:
 
 
 def extreme_poses(spec: ArmSpec) -> Settled:
-    """Equilibria at every combination of lowest, zero and highest pressure, 3 ** n_chambers of them.
+    """Return equilibria at every combination of lowest, zero and highest pressure, 3 ** n_chambers of them.
 
     Source: the paper's workspace figure.
     """
@@ -97,7 +97,7 @@ CIRCLE_HEIGHT_MM = -575.0
 
 
 def circle_poses(n: int = 40, diameter_mm: float = 160.0, height_mm: float = CIRCLE_HEIGHT_MM) -> np.ndarray:
-    """Poses (n, 6) [mm, deg] along a horizontal circle below the base, the tip hanging straight down.
+    """Return poses (n, 6) [mm, deg] along a horizontal circle below the base, the tip hanging straight down.
 
     The paper gives diameter and number of points but no height; at the default one, the paper's arm reaches
     every point with 2 kPa to spare in each chamber.

@@ -263,6 +263,8 @@ def broken(env, reset, step):
 def test_an_arm_that_cannot_settle_keeps_its_pose_earns_nothing_and_ends_its_episode(broken, index):
     before, after, _ = jax.tree.map(lambda x: x[index], broken)
     assert not after.info["valid"] and after.metrics["unsettled"] == 1
+    reasons = {name: float(after.metrics[name]) for name in after.metrics if name.startswith("invalid_")}
+    assert sum(reasons.values()) == 1, reasons
     assert after.done == 1 and after.reward == 0
     assert after.metrics["reached"] == 0  # it stands on its goal, but did not get there
     assert not after.info["saturated"] and after.metrics["saturated_chambers"] == 0

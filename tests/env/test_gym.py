@@ -82,12 +82,12 @@ def test_a_step_before_the_first_reset_is_refused(make):
 def test_actions_of_another_shape_and_unknown_options_are_refused(arm, envs):
     for env in (arm, envs):
         env.reset()
-    with pytest.raises(ValueError, match=r"expected shape \(9,\), got \(8,\)"):
+    with pytest.raises(ValueError, match=r"got shape \(8,\), expected \(9,\)"):
         arm.step(np.zeros(8))
-    with pytest.raises(ValueError, match=r"expected shape \(6, 9\), got \(9,\)"):
+    with pytest.raises(ValueError, match=r"got shape \(9,\), expected \(6, 9\)"):
         envs.step(np.zeros(9))
     for env in (arm, envs):
-        with pytest.raises(ValueError, match="expected no options, got speed"):
+        with pytest.raises(ValueError, match="got options speed, expected none"):
             env.reset(options={"speed": 1})
 
 

@@ -1,4 +1,4 @@
-"""The derivative of `settle` against finite differences in double precision, in both directions and engines."""
+"""The derivative of `settle` against finite differences in double precision, forward and in reverse."""
 
 import functools
 
@@ -101,7 +101,7 @@ def comparison():
 
 
 def relative_error(found, expected):
-    """Largest error (N,) of each arm, in parts of its largest entry, which is not taken for less than 1e-4."""
+    """Largest error (N,) of each arm, in parts of its largest entry, or of 1e-4 if that is larger."""
     error, size = (np.abs(x).reshape(N, -1).max(axis=1) for x in (found - expected, expected))
     return error / np.maximum(size, 1e-4)
 
@@ -139,22 +139,22 @@ def test_reverse_mode_is_the_transpose_of_forward_mode():
     np.testing.assert_allclose(reverse, forward, rtol=1e-3)
 
 
-@pytest.mark.parametrize("engine", ["chain", "mjx"])
-def test_both_engines_have_it_in_single_precision(engine):
-    params = ArmParams.from_spec(SPEC)
-    kinematics = (
-        chain_kinematics(params) if engine == "chain" else mjx_kinematics(mjx.put_model(build_model(SPEC)))
-    )
+def test_both_engines_have_the_same_derivative():
+    spec = SPEC.replace(structure={"n_sections": 2, "links_per_section": 2})
+    params = ArmParams.from_spec(spec)
+    reference, turn = np.float32(references()[:, :6]), np.float32(directions()[1][:, :6])
 
-    @functools.partial(xla.jit, uses_mjx=engine == "mjx")
-    @jax.vmap
-    def slope(reference, turn):
-        return jax.jvp(lambda r: seen(settle(kinematics, params, r)), (reference,), (turn,))[1]
+    def slopes(kinematics, uses_mjx=False):
+        def one(reference, turn):
+            return jax.jvp(lambda r: seen(settle(kinematics, params, r)), (reference,), (turn,))[1]
 
-    _, turn = directions()
-    found, (_, _, quotient, _) = slope(np.float32(references()), np.float32(turn)), comparison()(1.0, 0.0)
+        return xla.jit(jax.vmap(one), uses_mjx)(reference, turn)
+
+    chain = slopes(chain_kinematics(params))
+    mjx_slope = slopes(mjx_kinematics(mjx.put_model(build_model(spec))), uses_mjx=True)
     for name in SEEN:
-        assert np.quantile(relative_error(found[name], quotient[name]), 0.99) < 1e-2, name
+        assert np.abs(chain[name]).max() > 1e-2
+        assert np.quantile(relative_error(mjx_slope[name], chain[name]), 0.99) < 1e-2, name
 
 
 def test_held_pressures_have_the_derivative_of_their_own_equilibrium():

@@ -2,20 +2,14 @@
 
 import dataclasses
 
-import jax
 import mujoco
 import numpy as np
 import pytest
 
 from calib.fit.blocks import held_out_blocks
 from calib.fit.chambers import BENDING, FIELDS, MIN_POSES, calibrate_chambers
-from calib.fit.equilibrium import with_numbers
 from mjx_softarm import ArmSpec
 from mjx_softarm.logs.schema import Log
-from mjx_softarm.mechanics.kinematics import chain_kinematics
-from mjx_softarm.mechanics.rest import rest
-from mjx_softarm.mechanics.settle import settle_pressures
-from mjx_softarm.mechanics.statics import ArmParams
 from mjx_softarm.mechanics.workspace import settle_many
 
 SPEC = ArmSpec.default()
@@ -106,41 +100,6 @@ def fitted():
 @pytest.fixture(scope="module")
 def fitted_without_springs():
     return calibrate_chambers(pose_log(planted(), 200, seed=0, spring_m=None), SPEC)
-
-
-# --- gradients -------------------------------------------------------------------------------------
-
-
-def test_the_derivative_of_the_rest_is_that_of_finite_differences_of_settle_pressures():
-    """In double precision, where differences are exact to 1e-6."""
-    rng = np.random.default_rng(0)
-    direction = rng.normal(size=37) * np.append(np.repeat([0.1, 0.1, 0.1, 0.02], 9), 0.1)
-    with jax.enable_x64(True):
-        params = jax.tree.map(jax.numpy.asarray, ArmParams.from_spec(SPEC, np.float64))
-        kinematics = chain_kinematics(params)
-        unlimited = params._replace(pressure_min_kpa=np.full(9, -100.0), pressure_max_kpa=np.full(9, 100.0))
-
-        @jax.jit
-        def settled(x, pressure):
-            return settle_pressures(kinematics, with_numbers(x, unlimited), pressure).q
-
-        @jax.jit
-        def derivative(direction, change, pressure):
-            def q(x, p):
-                return rest(with_numbers(x, params), p)
-
-            return jax.jvp(q, (np.zeros(37), pressure), (direction, change))
-
-        for pressure in random_pressures(4, 1):
-            change = rng.normal(size=9)
-            found, slope = derivative(direction, change, pressure)
-            step = 1e-4
-            ahead, behind = (
-                settled(sign * step * direction, pressure + sign * step * change) for sign in (1, -1)
-            )
-            np.testing.assert_allclose(found, settled(np.zeros(37), pressure), atol=1e-9)
-            expected = (ahead - behind) / (2 * step)
-            np.testing.assert_allclose(slope, expected, atol=1e-5 * np.abs(expected).max())
 
 
 # --- planted arms ----------------------------------------------------------------------------------
