@@ -257,7 +257,8 @@ def _warnings(found: ChamberFit, spec: ArmSpec, solution: Solution) -> tuple[str
                 "check the unit of pressure, the order of the columns, and the payload"
             )
     if found.weak:
-        n_weak, springs = len(found.weak), ", with spring lengths" * np.isnan(found.poses.spring_m).any()
+        n_weak = len(found.weak)
+        springs = ", with spring lengths" if np.isnan(found.poses.spring_m).any() else ""
         said.append(f"{n_weak} unknown directions, the first {found.weak[0]}: log more poses{springs}")
     low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
     gap = MAX_PRESSURE_GAP * (high - low)

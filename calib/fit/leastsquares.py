@@ -77,7 +77,13 @@ def fit(model: Model, problem: Problem) -> Solution:
     for loss in ROUNDS:
         x = least_squares(errors, x, loss=loss, **options, **TOLERANCES).x
         scale = _scales(evaluate(x.tobytes())[0], problem)
-    covariance, decrement = _covariance(*evaluate(x.tobytes()), x, scale, problem)
+    return solution_at(x, *evaluate(x.tobytes()), problem)
+
+
+def solution_at(x: np.ndarray, error: np.ndarray, jacobian: np.ndarray, problem: Problem) -> Solution:
+    """Return scales and covariance of a fit that ended at x, with the errors and Jacobian there."""
+    scale = _scales(error, problem)
+    covariance, decrement = _covariance(error, jacobian, x, scale, problem)
     return Solution(x, covariance, scale, decrement < 0.5 * SMALL_STEP**2)
 
 

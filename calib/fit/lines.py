@@ -1,22 +1,30 @@
 """Robust straight lines y = slope x + offset, with intervals and held-out errors.
 
-Huber's loss, whose scale comes from the residuals, so that a few gross outliers hardly matter. Intervals take
-stretches of neighbouring rows as one piece of evidence each, since neighbouring rows of a log err alike.
+Optax's L-BFGS minimises Huber's loss, whose scale comes from the residuals, so that a few gross outliers
+hardly matter. Intervals take stretches of neighbouring rows as one piece of evidence each, since neighbouring
+rows of a log err alike.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import functools
+from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+import optax
+from jax import Array
 
 from calib.errors import FitError
 from calib.fit.blocks import folds
-from calib.fit.leastsquares import Problem, fit
+from calib.fit.leastsquares import SIGMA_PER_MEDIAN, Problem, solution_at
 
 HUBER = 1.345  # in standard deviations of the noise: 95 % of the efficiency of least squares
 DOWN_WEIGHTED = 2 * HUBER  # beyond it a row counts less than half
 PRIOR = 10.0  # of the parameters of normalised columns: next to nothing
+ROUNDS = 5  # of scale and parameters in turn
+ITERATIONS = 40  # of L-BFGS in each round
 STRETCHES = 50  # of neighbouring rows, for the intervals
 STUDENT = 2.0096  # 97.5 % quantile for STRETCHES - 1 degrees of freedom
 MIN_ROWS = 50
@@ -94,7 +102,7 @@ def fit_curved_line(
     for k in range(fold.max() + 1):
         out = fold == k
         if (known[~out].sum(axis=0) >= 2).all():  # else the warnings say that there are too few rows
-            others = _robust_lines(x[~out], y[~out], share, fit_share)
+            others = _robust_lines(x, np.where(out[:, None], np.nan, y), share, fit_share)
             held_out[out] = others.slope * _wire(x[out], others.share) + others.offset
     wire = _wire(x, lines.share)
     residual = y - lines.slope * wire - lines.offset
@@ -161,7 +169,11 @@ def _robust_lines(x: np.ndarray, y: np.ndarray, share: float, fit_share: bool) -
         min_scale=np.full(k, 1e-9),
         huber=HUBER,
     )
-    found = fit(model, problem)
+    with jax.enable_x64(True):
+        start = np.asarray(_descend(x.reshape(-1, k), y.reshape(-1, k), share, fit_share))
+    slope, offset = start[:k], start[k : 2 * k]
+    p = np.concatenate([slope * spread, offset + slope * centre, start[2 * k :]])
+    found = solution_at(p, *model(p), problem)
     slope, offset = y_spread * found.x[:k] / spread, y_spread * found.x[k : 2 * k]
     variance, lever = np.diag(found.covariance), centre / spread
     both = np.diag(found.covariance[:k, k : 2 * k])
@@ -176,9 +188,60 @@ def _robust_lines(x: np.ndarray, y: np.ndarray, share: float, fit_share: bool) -
     )
 
 
-def _wire(x: np.ndarray, share: float) -> np.ndarray:
+@functools.partial(jax.jit, static_argnames="fit_share")
+def _descend(x: Array, y: Array, share: Array, fit_share: bool) -> Array:
+    """Return slopes (k,), offsets (k,) and, if fitted, the change of the share that minimise Huber's loss.
+
+    Args:
+        x, y (n, k): columns, NaN where missing; y has unit spread.
+        share (): start of the share.
+        fit_share: whether to fit the share.
+    """
+    known = jnp.isfinite(x) & jnp.isfinite(y)
+    n, k = known.sum(axis=0), x.shape[1]
+    x, y = jnp.where(known, x, 0.0), jnp.where(known, y, 0.0)
+
+    def features(p: Array) -> tuple[Array, Array, Array]:  # standardised, with mean and spread
+        wire = _wire(x, share + p[2 * k :].sum())
+        mean = jnp.sum(known * wire, axis=0) / n
+        spread = jnp.sqrt(jnp.maximum(jnp.sum(known * (wire - mean) ** 2, axis=0) / n, 1e-300))
+        return (wire - mean) / spread, mean, spread
+
+    def residual(p: Array) -> Array:
+        return jnp.where(known, p[:k] * features(p)[0] + p[k : 2 * k] - y, 0.0)
+
+    def descend(p: Array, scale: Array) -> Array:
+        def loss(p):
+            huber = jnp.where(known, optax.losses.huber_loss(residual(p) / scale, delta=HUBER), 0.0)
+            return jnp.min(scale) ** 2 * jnp.sum(huber) / jnp.sum(n)
+
+        optimiser = optax.lbfgs(linesearch=optax.scale_by_backtracking_linesearch(20, store_grad=True))
+
+        def iterate(carry):
+            p, state, count, _ = carry
+            value, slope = optax.value_and_grad_from_state(loss)(p, state=state)
+            step, state = optimiser.update(slope, state, p, value=value, grad=slope, value_fn=loss)
+            return optax.apply_updates(p, step), state, count + 1, optax.tree.norm(slope)
+
+        start = (p, optimiser.init(p), 0, jnp.inf)
+        goal = 1e-10 * jnp.min(scale)
+        return jax.lax.while_loop(lambda c: (c[2] < ITERATIONS) & (c[3] > goal), iterate, start)[0]
+
+    def next_round(count: Array, p: Array) -> Array:
+        size = jnp.nanmedian(jnp.where(known, jnp.abs(residual(p)), jnp.nan), axis=0)
+        return descend(p, jnp.where(count == 0, 1e3, jnp.maximum(SIGMA_PER_MEDIAN * size, 1e-9)))
+
+    start = jnp.concatenate([jnp.ones(k), jnp.zeros(k + fit_share)])
+    p = jax.lax.fori_loop(0, ROUNDS, next_round, start)  # least squares first, then Huber's loss
+    _, mean, spread = features(p)
+    slope = p[:k] / spread
+    return jnp.concatenate([slope, p[k : 2 * k] - slope * mean, p[2 * k :]])
+
+
+def _wire(x: Any, share: Any) -> Any:
     """Return the wire length, but for a factor, from x = w / w_max and share = I_comp w_max."""
-    return x / np.maximum(1.0 - share * x, 1e-3)
+    rest = 1.0 - share * x
+    return x / (jnp if isinstance(rest, Array) else np).maximum(rest, 1e-3)
 
 
 def _stretches(table: np.ndarray) -> np.ndarray:

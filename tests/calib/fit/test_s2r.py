@@ -82,7 +82,7 @@ def test_simulation_holds_the_spring_lengths_of_unsaturated_poses(spec):
     [
         (np.zeros((4, 8)), r"got an array \(4, 8\), expected \(n, 9\)"),
         (np.zeros((0, 9)), r"got an array \(0, 9\)"),
-        (np.full((2, 9), np.nan), "row 0, spring 0: expected a finite number, got nan"),
+        (np.full((2, 9), np.nan), "row 0, spring 0: got nan, expected a finite number"),
     ],
 )
 def test_simulation_refuses(spec, reference, message):

@@ -105,11 +105,11 @@ def test_stretches_do_not_last_longer_than_they_may(log):
 def test_logs_that_do_not_show_motion_are_passed_by(log, changes, why):
     changed = dataclasses.replace(log, **changes)
     assert find_stretches([changed], SPEC) == [], why
-    with pytest.raises(ValueError, match="no stretch of 7 s, sampled every 0.05 s or faster"):
+    with pytest.raises(ValueError, match="got no stretch of 7 s"):
         calibrate_damping(changed, SPEC)
 
 
 def test_refuses_to_start_from_no_damping(log):
     spec = SPEC.replace(chambers={"damping_ns_per_m": 0.0})
-    with pytest.raises(ValueError, match="above 0, got 0 and 1"):
+    with pytest.raises(ValueError, match="damping_ns_per_m 0 and .* expected both above 0"):
         calibrate_damping(log, spec)
