@@ -22,13 +22,8 @@ class Made:
     turns: list = []  # noqa: RUF012  (of all of them)
 
     def __init__(self, name, batch_size, n_updates):
-        self.name, self.batch_size, self.n_updates, self.turn, self.open = (
-            name,
-            batch_size,
-            n_updates,
-            0,
-            False,
-        )
+        self.name, self.batch_size, self.n_updates = name, batch_size, n_updates
+        self.turn, self.open = 0, False
 
     def start(self):
         self.open = True
@@ -109,29 +104,21 @@ def test_a_contestant_that_would_be_too_slow_is_left_out_and_the_table_says_so(w
 
 
 @pytest.mark.parametrize("turn", [0, 2])  # as it starts, in its second round
-def test_a_peer_that_fails_is_left_out_from_there_and_ours_goes_on(workers, monkeypatch, turn):
-    monkeypatch.setattr(Made, "fails", ("sbx", 1024, turn))
+@pytest.mark.parametrize("name", ["sbx", "ours"])
+def test_a_contestant_that_fails_is_left_out_from_there_and_the_others_go_on(
+    workers, monkeypatch, name, turn
+):
+    monkeypatch.setattr(Made, "fails", (name, 1024, turn))
     figures = learner.measure()
-    assert "SBX TQC" in figures["updates_per_s"][0]
-    assert all("SBX TQC" not in row for row in figures["updates_per_s"][1:])
-    assert all("ours" in row for row in figures["updates_per_s"])
-    assert figures["left_out"] == [
-        {"contestant": "SBX TQC", "why": "from batch 1,024 on: sbx: out of memory"}
-    ]
-    assert not any(worker.open for worker in workers)
-
-
-def test_ours_failing_is_told_and_loses_no_other_s_figures(workers, monkeypatch):
-    monkeypatch.setattr(Made, "fails", ("ours", 1024, 1))
-    figures = learner.measure()
-    assert figures["left_out"] == [{"contestant": "ours", "why": "from batch 1,024 on: ours: out of memory"}]
-    assert figures["updates_per_s"][0]["ours / sbx"] == 2.0
-    assert figures["updates_per_s"][1] == {
-        "batch": 1024,
-        "sb3-contrib TQC": 15.6,
-        "SBX TQC": 31.2,
-        "brax SAC": 125.0,
+    first, second, *later = figures["updates_per_s"]
+    assert CONTESTANTS[name] in first and first["ours / sbx"] == 2.0
+    assert all(CONTESTANTS[name] not in row and "ours / sbx" not in row for row in (second, *later))
+    rates = {"ours": 62.5, "sb3-contrib TQC": 15.6, "SBX TQC": 31.2, "brax SAC": 125.0}
+    assert {k: v for k, v in second.items() if k in rates} == {
+        k: v for k, v in rates.items() if k != CONTESTANTS[name]
     }
+    why = f"from batch 1,024 on: {name}: out of memory"
+    assert figures["left_out"] == [{"contestant": CONTESTANTS[name], "why": why}]
     assert not any(worker.open for worker in workers)
 
 
