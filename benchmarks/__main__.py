@@ -21,7 +21,7 @@ BENCHMARKS = {
     ),
     "settle": (
         "benchmarks.speed.settle:measure",
-        "error, speed, compile time and memory of Newton against time stepping",
+        "error, speed and compile time of Newton against time stepping",
     ),
     "kernels": (
         "benchmarks.speed.kernels:measure",
