@@ -54,7 +54,7 @@ class Gains(NamedTuple):
 def pressures(
     reference_m: Array, length_m: Array, integral_kpa: Array, gains: Gains, dt_s: float
 ) -> tuple[Array, Array]:
-    """One tick of the law.
+    """Compute one tick of the law.
 
     Args:
         reference_m (..., n) [m]: spring lengths to reach.
@@ -76,7 +76,7 @@ def pressures(
 def saturated(
     pressure_kpa: Array, reference_m: Array, length_m: Array, gains: Gains, tolerance_m: float
 ) -> Array:
-    """Which chambers (..., n) cannot reach their reference: bool.
+    """Return which chambers (..., n) cannot reach their reference: bool.
 
     A chamber is saturated at its greatest pressure with its spring too short, or at its least pressure with
     its spring too long, by more than the tolerance. At a limit but on its reference, it is not.

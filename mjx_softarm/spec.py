@@ -34,7 +34,7 @@ ARM_FILE = "arm.toml"  # in the folder of a calibration
 
 @dataclass(frozen=True)
 class Structure:
-    """Counts; they fix array shapes, so a new value compiles anew."""
+    """Counts of sections and links. They fix array shapes, so a new value compiles anew."""
 
     n_sections: int = count()
     links_per_section: int = count()
@@ -53,7 +53,7 @@ class Geometry:
 
 @dataclass(frozen=True)
 class Mass:
-    """Masses; the arm's own is spread evenly over its links."""
+    """Masses. The arm's own mass is spread evenly over its links."""
 
     arm_kg: float = positive()
     gripper_kg: float = not_negative()
@@ -86,7 +86,7 @@ class Backbone:
 
 @dataclass(frozen=True)
 class Springs:
-    """The inductive springs and the range of lengths that may be commanded."""
+    """Springs whose lengths are sensed, and the range of lengths that may be commanded."""
 
     stiffness_n_per_m: float = not_negative()
     damping_ns_per_m: float = not_negative()
@@ -135,12 +135,12 @@ class ArmSpec:
         return self.geometry.section_length_m / self.structure.links_per_section
 
     def per_chamber(self, value: PerChamber) -> tuple[float, ...]:
-        """One number per chamber, whichever way the field was written."""
+        """Return one number per chamber, however the field was written."""
         return tuple(value) if isinstance(value, tuple) else (float(value),) * self.n_chambers
 
     @classmethod
     def default(cls) -> ArmSpec:
-        """The paper's arm."""
+        """Return the paper's arm."""
         text = resources.files("mjx_softarm").joinpath("arms/paper.toml").read_text("utf-8")
         return cls.from_dict(tomllib.loads(text), "arms/paper.toml")
 
@@ -182,14 +182,14 @@ class ArmSpec:
         Path(path).write_text(tomli_w.dumps(self.to_dict()), "utf-8")
 
     def replace(self, **groups: dict[str, Any] | str) -> ArmSpec:
-        """A new, validated specification with some fields changed.
+        """Return a new, validated specification with some fields changed.
 
         Example: `spec.replace(mass={"payload_kg": 0.2}, structure={"links_per_section": 6})`.
         """
         data = self.to_dict()
         for group, values in groups.items():
             if group not in data:
-                raise SpecError(f"replace: unknown group {group!r}, expected one of {', '.join(data)}")
+                raise SpecError(f"replace: got unknown group {group!r}, expected one of {', '.join(data)}")
             before = data[group]
             if isinstance(values, dict) and isinstance(before, dict):
                 same_kind = values.get("kind", before.get("kind")) == before.get("kind")
@@ -198,7 +198,7 @@ class ArmSpec:
         return self.from_dict(data, "replace")
 
     def validate(self, source: str = "spec") -> None:
-        """Check what one field alone cannot tell.
+        """Check fields against each other.
 
         Raises:
             SpecError: two fields contradict each other.

@@ -197,7 +197,7 @@ def test_replace_refuses_like_a_file_does(spec):
     assert text == "replace: mass.payload_kg: got -1.0, expected a number >= 0"
     assert message_of(spec.replace, mass={"payload": 1.0}).startswith("replace: mass.payload: unknown field")
     assert message_of(spec.replace, motors={}).startswith(
-        "replace: unknown group 'motors', expected one of name,"
+        "replace: got unknown group 'motors', expected one of name,"
     )
 
 

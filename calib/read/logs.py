@@ -18,7 +18,7 @@ import numpy as np
 
 from calib.read.table_checks import PLAUSIBLE, clean, implausible, quantity
 from mjx_softarm.logs.checks import Finding
-from mjx_softarm.logs.files import read_sheet, refuse
+from mjx_softarm.logs.files import read_matrix, refuse
 from mjx_softarm.logs.schema import UNITS, Column, Log, log_columns, write_log
 from mjx_softarm.sensing.sensors import SENSORS, Sensor
 from mjx_softarm.spec import ArmSpec
@@ -51,14 +51,14 @@ def read_log(path: str | Path, n_chambers: int = 9, strict: bool = False) -> tup
     Raises:
         LogError: the log cannot be used or is refused; the message has a line for each finding.
     """
-    sheet, findings = read_sheet(path, n_chambers, one_of=_NEEDED)
+    matrix, findings = read_matrix(path, n_chambers, one_of=_NEEDED)
     with np.errstate(over="ignore", invalid="ignore"):  # any number may stand in a file
-        refuse(implausible(sheet))
-        sheet, found = clean(sheet)
+        refuse(implausible(matrix))
+        matrix, found = clean(matrix)
     findings += found
     if strict:
         refuse(findings)
-    return sheet.log(), findings
+    return matrix.log(), findings
 
 
 def same_arm(logs: Sequence[Log]) -> None:

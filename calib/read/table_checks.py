@@ -14,7 +14,7 @@ import numpy as np
 
 from mjx_softarm.logs import checks
 from mjx_softarm.logs.checks import Finding, LogError
-from mjx_softarm.logs.files import Sheet
+from mjx_softarm.logs.files import LogMatrix
 from mjx_softarm.logs.schema import UNITS, Column
 from mjx_softarm.sensing.sensors import SENSORS as KINDS
 
@@ -59,30 +59,30 @@ class Fault(NamedTuple):
     drops: bool = True
 
 
-def clean(sheet: Sheet) -> tuple[Sheet, list[Finding]]:
+def clean(matrix: LogMatrix) -> tuple[LogMatrix, list[Finding]]:
     """Return the rows that can be believed, quaternion signs repaired, and all findings."""
-    findings = [_finding(sheet, fault) for fault in _gaps(sheet)]
+    findings = [_finding(matrix, fault) for fault in _gaps(matrix)]
     for stage in (_single_rows, _renewal, _neighbours):
-        faults = [fault for fault in stage(sheet) if fault.mask.any()]
-        findings += [_finding(sheet, fault) for fault in faults]
+        faults = [fault for fault in stage(matrix) if fault.mask.any()]
+        findings += [_finding(matrix, fault) for fault in faults]
         dropped = [fault.mask for fault in faults if fault.drops]
         if dropped:
             keep = ~np.logical_or.reduce(dropped)
-            sheet = sheet._replace(values=sheet.values[keep], row=sheet.row[keep])
-        if len(sheet.row) < 2:
-            left = f"{len(sheet.row)} rows left, expected 2 at least"
-            raise LogError([*findings, Finding(sheet.file, None, "", left)])
-    if quaternion := sheet.of("tip_quaternion"):
-        sheet.values[:, quaternion], flipped = checks.same_sign(sheet.values[:, quaternion])
+            matrix = matrix._replace(values=matrix.values[keep], row=matrix.row[keep])
+        if len(matrix.row) < 2:
+            left = f"{len(matrix.row)} rows left, expected 2 at least"
+            raise LogError([*findings, Finding(matrix.file, None, "", left)])
+    if quaternion := matrix.indices("tip_quaternion"):
+        matrix.values[:, quaternion], flipped = checks.same_sign(matrix.values[:, quaternion])
         if flipped.any():
             problem = f"{np.count_nonzero(flipped)} x sign flipped, repaired; expected neighbours of one sign"
-            findings.append(_finding(sheet, Fault("tip_qw..qz", problem, flipped, drops=False)))
-    return sheet, findings
+            findings.append(_finding(matrix, Fault("tip_qw..qz", problem, flipped, drops=False)))
+    return matrix, findings
 
 
-def _gaps(sheet: Sheet) -> Iterator[Fault]:
+def _gaps(matrix: LogMatrix) -> Iterator[Fault]:
     """Find rows missing in the file, by its times."""
-    time_s = sheet.values[:, 0]
+    time_s = matrix.values[:, 0]
     finite = np.flatnonzero(np.isfinite(time_s))
     ordered = finite[~checks.late_rows(time_s[finite])]
     gap = np.zeros(len(time_s), bool)
@@ -93,27 +93,27 @@ def _gaps(sheet: Sheet) -> Iterator[Fault]:
         yield Fault("time", f"{got}, expected steps near {np.median(steps_s):.4g} s", gap, drops=False)
 
 
-def _finding(sheet: Sheet, fault: Fault) -> Finding:
-    rows = sheet.row[fault.mask]
+def _finding(matrix: LogMatrix, fault: Fault) -> Finding:
+    rows = matrix.row[fault.mask]
     n_dropped = len(rows) if fault.drops else 0
-    return Finding(sheet.file, (int(rows[0]), int(rows[-1])), fault.column, fault.problem, n_dropped)
+    return Finding(matrix.file, (int(rows[0]), int(rows[-1])), fault.column, fault.problem, n_dropped)
 
 
-def implausible(sheet: Sheet) -> list[Finding]:
+def implausible(matrix: LogMatrix) -> list[Finding]:
     """Find reasons to refuse the log: columns without numbers, or that contradict their header."""
-    if len(sheet.row) < 2:
-        return [Finding(sheet.file, None, "", f"{len(sheet.row)} row, expected 2 at least")]
+    if len(matrix.row) < 2:
+        return [Finding(matrix.file, None, "", f"{len(matrix.row)} row, expected 2 at least")]
     problems = {}
-    for k, column in enumerate(sheet.columns):
-        problems[column.name] = _implausible_column(column, sheet.values[:, k])
-    for group in dict.fromkeys(column.group for column in sheet.columns[1:]):
-        problems[group] = _implausible_size(sheet, group)
-    if tip := sheet.of("tip_m"):
-        z_m = _typical(sheet.values[:, tip[2]])
+    for k, column in enumerate(matrix.columns):
+        problems[column.name] = _implausible_column(column, matrix.values[:, k])
+    for group in dict.fromkeys(column.group for column in matrix.columns[1:]):
+        problems[group] = _implausible_size(matrix, group)
+    if tip := matrix.indices("tip_m"):
+        z_m = _typical(matrix.values[:, tip[2]])
         if z_m > HANGS_BELOW_M:
             expected = f"below {HANGS_BELOW_M} m, as z is up and the arm hangs from the base"
             problems["tip_z"] = problems["tip_z"] or f"median {z_m:.3g} m, expected {expected}"
-    return [Finding(sheet.file, None, name, problem) for name, problem in problems.items() if problem]
+    return [Finding(matrix.file, None, name, problem) for name, problem in problems.items() if problem]
 
 
 def _typical(values: np.ndarray) -> float:
@@ -149,12 +149,12 @@ def quantity(column: Column) -> str:
     return "position" if column.group in ("tip_m", "marker_m") else column.kind
 
 
-def _implausible_size(sheet: Sheet, group: str) -> str:
-    chosen = [k for k in sheet.of(group) if PLAUSIBLE[quantity(sheet.columns[k])].least > 0.0]
+def _implausible_size(matrix: LogMatrix, group: str) -> str:
+    chosen = [k for k in matrix.indices(group) if PLAUSIBLE[quantity(matrix.columns[k])].least > 0.0]
     if not chosen:
         return ""
-    column = sheet.columns[chosen[0]]
-    sizes = np.abs(sheet.values[:, chosen])
+    column = matrix.columns[chosen[0]]
+    sizes = np.abs(matrix.values[:, chosen])
     sizes = sizes[np.isfinite(sizes)]
     largest = np.percentile(sizes, 99) if len(sizes) else 0.0
     least, factor = PLAUSIBLE[quantity(column)].least, UNITS[column.kind][column.unit]
@@ -169,9 +169,9 @@ def _shown(column: Column, value: float) -> str:
     return f"{value / UNITS[column.kind][column.unit]:.6g} {column.unit}".removesuffix(" 1")
 
 
-def _single_rows(sheet: Sheet) -> Iterator[Fault]:
-    for k, column in enumerate(sheet.columns):
-        values = sheet.values[:, k]
+def _single_rows(matrix: LogMatrix) -> Iterator[Fault]:
+    for k, column in enumerate(matrix.columns):
+        values = matrix.values[:, k]
         finite = np.isfinite(values)
         if not finite.all():
             got = f"{np.count_nonzero(~finite)} x NaN or inf"
@@ -190,24 +190,26 @@ def _single_rows(sheet: Sheet) -> Iterator[Fault]:
             yield Fault(column.name, f"{got}, expected {expected}", outside)
 
 
-def _renewal(sheet: Sheet) -> Iterator[Fault]:
-    everywhere = np.ones(len(sheet.row), bool)
-    for k in sheet.of("readings", "spring_m", "pressure_kpa"):
-        if np.ptp(sheet.values[:, k]) == 0.0:
-            problem = f"always {_shown(sheet.columns[k], sheet.values[0, k])}, expected a sensor that changes"
-            yield Fault(sheet.columns[k].name, problem, everywhere, drops=False)
-    for name, axes in sheet.bodies():
-        body = sheet.values[:, axes]
+def _renewal(matrix: LogMatrix) -> Iterator[Fault]:
+    everywhere = np.ones(len(matrix.row), bool)
+    for k in matrix.indices("readings", "spring_m", "pressure_kpa"):
+        if np.ptp(matrix.values[:, k]) == 0.0:
+            problem = (
+                f"always {_shown(matrix.columns[k], matrix.values[0, k])}, expected a sensor that changes"
+            )
+            yield Fault(matrix.columns[k].name, problem, everywhere, drops=False)
+    for name, axes in matrix.bodies():
+        body = matrix.values[:, axes]
         if checks.moves(body):
             # A quaternion that goes on shows that the tip was seen, though it is where it was.
-            seen = sheet.of("tip_quaternion") if name == "tip" else []
-            stale = checks.stale_rows(sheet.values[:, [*axes, *seen]])
+            seen = matrix.indices("tip_quaternion") if name == "tip" else []
+            stale = checks.stale_rows(matrix.values[:, [*axes, *seen]])
             got = f"{np.count_nonzero(stale)} x equal to the row before"
             yield Fault(f"{name}_x..z", f"{got}, expected motion capture renewed in each row", stale)
         elif name == "tip":
             yield Fault("tip_x..z", "never moves by 1 mm, expected a tip that moves", everywhere, drops=False)
-    if quaternion := sheet.of("tip_quaternion"):
-        values = sheet.values[:, quaternion]
+    if quaternion := matrix.indices("tip_quaternion"):
+        values = matrix.values[:, quaternion]
         wrong = checks.not_unit_rows(values)
         got = f"{np.count_nonzero(wrong)} x length not 1, first {np.linalg.norm(values[wrong][:1]):.4g}"
         yield Fault("tip_qw..qz", f"{got}, expected unit quaternions", wrong)
@@ -217,12 +219,12 @@ def _renewal(sheet: Sheet) -> Iterator[Fault]:
         yield Fault("tip_qw..qz", f"{got}, expected a continuous orientation", turned)
 
 
-def _neighbours(sheet: Sheet) -> Iterator[Fault]:
-    for k in sheet.of(*SENSORS):
-        column = sheet.columns[k]
-        outlier = checks.outlier_rows(sheet.values[:, k], PLAUSIBLE[quantity(column)].spike)
+def _neighbours(matrix: LogMatrix) -> Iterator[Fault]:
+    for k in matrix.indices(*SENSORS):
+        column = matrix.columns[k]
+        outlier = checks.outlier_rows(matrix.values[:, k], PLAUSIBLE[quantity(column)].spike)
         if outlier.any():
             got = (
-                f"{np.count_nonzero(outlier)} x outlier, first {_shown(column, sheet.values[outlier, k][0])}"
+                f"{np.count_nonzero(outlier)} x outlier, first {_shown(column, matrix.values[outlier, k][0])}"
             )
             yield Fault(column.name, f"{got}, expected a value like its neighbours", outlier)

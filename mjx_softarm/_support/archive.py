@@ -1,4 +1,4 @@
-"""Sealed files: named arrays in an npz archive that is never taken for what it is not. NumPy only.
+"""Sealed files: named arrays in an npz archive with a checksum and the name of its kind. NumPy only.
 
 The archive's comment, its last bytes, is a mark that says what the file is and the SHA-256 of every byte
 before, so that a file that is incomplete, changed or of another kind is refused; any npz reader takes it.
@@ -63,7 +63,7 @@ def write_sealed(path: Path, arrays: Mapping[str, Any], kind: str) -> None:
 
 
 def read_sealed(path: Path, kind: str, made_by: str) -> dict[str, np.ndarray]:
-    """The arrays of a file that `write_sealed` wrote.
+    """Read the arrays of a file that `write_sealed` wrote.
 
     Args:
         path: the file.
@@ -93,7 +93,7 @@ def read_sealed(path: Path, kind: str, made_by: str) -> dict[str, np.ndarray]:
 
 
 def sealed(arrays: Mapping[str, Any], kind: str) -> bytes:
-    """The bytes of a file; mark and digest are the zip archive's comment."""
+    """Return the bytes of a file; mark and digest are the zip archive's comment."""
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)
     with zipfile.ZipFile(buffer, "a") as archive:
@@ -107,7 +107,7 @@ def _mark(kind: str) -> bytes:
 
 
 def entries_of(name: str, group: Any) -> dict[str, np.ndarray]:
-    """The entries of a dataclass or named tuple: `name.field`, and its `layers` one by one."""
+    """Return the entries of a dataclass or named tuple: `name.field`, and its `layers` one by one."""
     entries: dict[str, Any] = {}
     for item in _field_names(type(group)):
         value = getattr(group, item)
@@ -125,7 +125,7 @@ def _field_names(kind: type) -> tuple[str, ...]:
 
 
 def layer_entries(name: str, layers: tuple[Layer, ...]) -> dict[str, Any]:
-    """`name.n_layers`, `name.0.weight`, `name.0.bias`, ..."""
+    """Return the entries `name.n_layers`, `name.0.weight`, `name.0.bias`, ..."""
     entries: dict[str, Any] = {f"{name}.n_layers": len(layers)}
     for k, (weight, bias) in enumerate(layers):
         entries |= {f"{name}.{k}.weight": weight, f"{name}.{k}.bias": bias}
@@ -133,7 +133,7 @@ def layer_entries(name: str, layers: tuple[Layer, ...]) -> dict[str, Any]:
 
 
 class Entries:
-    """The arrays of a file, each checked as it is taken."""
+    """Arrays of a file, each checked as it is taken."""
 
     def __init__(self, arrays: Mapping[str, np.ndarray], source: str):
         self._source, self._arrays, self._left = source, arrays, set(arrays)
@@ -142,9 +142,9 @@ class Entries:
         raise SealedFileError(f"{self._source}: {name}: {problem}")
 
     def take(self, name: str, kind: type, *shapes: tuple[int | None, ...]) -> Any:
-        """An array of `kind` in one of the `shapes`, finite; a single value as Python's own type.
+        """Return an array of `kind` in one of the `shapes`, finite; a single value as Python's own type.
 
-        A dimension of None is any number from 1.
+        A dimension of None stands for any number from 1.
         """
         if name not in self._arrays:
             self.fail(name, "missing")
@@ -158,11 +158,11 @@ class Entries:
         return array if array.shape else array.item()
 
     def group(self, name: str, kind: type, *shapes: tuple[int, ...]) -> Any:
-        """A dataclass or named tuple of numbers, all of them in one of the `shapes`."""
+        """Return a dataclass or named tuple of numbers, each in one of the `shapes`."""
         return kind(*(self.take(f"{name}.{item}", np.float64, *shapes) for item in _field_names(kind)))
 
     def table(self, name: str) -> dict[str, Any]:
-        """A JSON object."""
+        """Return a JSON object."""
         text = self.take(name, np.str_, ())
         try:
             return {**json.loads(text)}
@@ -170,7 +170,7 @@ class Entries:
             self.fail(name, f"got {text[:60]!r}, expected a JSON object")
 
     def layers(self, name: str, n_inputs: int, n_outputs: int) -> tuple[Layer, ...]:
-        """At least one layer; they fit together, from so many inputs to so many outputs."""
+        """Return the layers, at least one, of a network with so many inputs and outputs."""
         layers, n_layers = [], self.take(f"{name}.n_layers", np.integer, ())
         if n_layers < 1:
             self.fail(f"{name}.n_layers", f"got {n_layers}, expected at least 1")
@@ -189,20 +189,20 @@ class Entries:
         n_inputs: int,
         n_outputs: int,
     ) -> Any:
-        """A named tuple of float32 arrays in the `shapes` of its fields, and of `layers`."""
+        """Return a named tuple of float32 arrays in the `shapes` of its fields, and of `layers`."""
         values = {item: self.take(f"{name}.{item}", np.float32, shape) for item, shape in shapes.items()}
         values = {item: np.asarray(value, np.float32) for item, value in values.items()}
         return kind(**values, layers=self.layers(name, n_inputs, n_outputs))
 
     def finish(self, schema: int) -> None:
-        """Refuse entries that nobody took."""
+        """Refuse entries that were not taken."""
         for name in sorted(self._left):
             self.fail(name, f"unknown entry, schema {schema} has none of this name")
 
 
-def _fits(shape: tuple[int, ...], wanted: tuple[int | None, ...]) -> bool:
-    same = (n == m or (m is None and n > 0) for n, m in zip(shape, wanted, strict=False))
-    return len(shape) == len(wanted) and all(same)
+def _fits(shape: tuple[int, ...], expected: tuple[int | None, ...]) -> bool:
+    same = (n == m or (m is None and n > 0) for n, m in zip(shape, expected, strict=False))
+    return len(shape) == len(expected) and all(same)
 
 
 def _shape_text(shape: tuple[int | None, ...]) -> str:

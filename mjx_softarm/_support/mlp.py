@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
-from mjx_softarm._support.xp import array_namespace
+from mjx_softarm._support.xp import Array, array_namespace
 
-Layer = tuple[Any, Any]  # weight (in, out) and bias (out,)
+Layer = tuple[Array, Array]  # weight (in, out) and bias (out,)
 
 
-def mlp(layers: Sequence[Layer], x: Any) -> Any:
-    """Outputs (..., out) of inputs (..., in): rectified linear hidden layers, linear output."""
+def mlp(layers: Sequence[Layer], x: Array) -> Array:
+    """Return outputs (..., out) of inputs (..., in): rectified linear hidden layers, linear output."""
     xp = array_namespace(x, *layers[0])
     *hidden, (head_weight, head_bias) = layers
     for weight, bias in hidden:

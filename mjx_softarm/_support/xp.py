@@ -11,7 +11,7 @@ Array = Any  # a NumPy or a JAX array; JAX itself is never imported here
 
 
 def array_namespace(*arrays: Array) -> ModuleType:
-    """`jax.numpy` if any argument is a JAX array or tracer, else `numpy`; plain numbers may be among them."""
+    """Return `jax.numpy` if any argument is a JAX array or tracer, else `numpy`; numbers are allowed."""
     for array in arrays:
         if hasattr(array, "__array_namespace__") and not isinstance(array, (np.ndarray, np.generic)):
             return array.__array_namespace__()

@@ -1,1 +1,1 @@
-"""Logs of an arm: their columns, their files, and what can be wrong with them."""
+"""Logs of an arm: their columns, their files, and the checks of their rows."""

@@ -1,4 +1,4 @@
-"""What can be wrong with the rows of a log, and how it is found.
+"""Checks of the rows of a log.
 
 Detectors take arrays and return a mask of the rows at fault; they know nothing of files. The logs of this
 project and the adapters of other people's logs share them.
@@ -15,7 +15,7 @@ from mjx_softarm._support.errors import InputError
 
 
 class Finding(NamedTuple):
-    """One thing that is wrong with a log."""
+    """A fault of a log."""
 
     file: str
     rows: tuple[int, int] | None  # first and last line at fault, counted from 1; None: the whole file
@@ -50,22 +50,22 @@ _GAP_STEPS = 10.0
 
 
 def stale_rows(values: np.ndarray) -> np.ndarray:
-    """Mask (n,) of the rows of (n, k) that are equal to the row before: a reading that was not renewed."""
+    """Mask (n,) the rows of (n, k) that are equal to the row before: a reading that was not renewed."""
     return np.concatenate([[False], (values[1:] == values[:-1]).all(axis=1)])
 
 
 def moves(position_m: np.ndarray) -> bool:
-    """Whether a body (n, 3) [m] leaves its place in a log."""
+    """Return whether a body (n, 3) [m] leaves its place in a log."""
     return bool(np.ptp(position_m, axis=0).max(initial=0.0) > _MOVES_M)
 
 
 def not_unit_rows(quaternion: np.ndarray) -> np.ndarray:
-    """Mask (n,) of the quaternions (n, 4) that are no rotation."""
+    """Mask (n,) the quaternions (n, 4) that are no rotation."""
     return np.abs(np.linalg.norm(quaternion, axis=1) - 1.0) > _UNIT_TOLERANCE
 
 
 def turned_rows(quaternion: np.ndarray) -> np.ndarray:
-    """Mask (n,) of the rows where motion capture has a body turned by 180 degrees.
+    """Mask (n,) the rows where motion capture has a body turned by 180 degrees.
 
     It confuses the markers of a symmetric body for some rows, then jumps back. Of the two orientations, the
     one with fewer rows counts as turned. Where successive rows are other poses and not one motion there is no
@@ -84,7 +84,7 @@ def turned_rows(quaternion: np.ndarray) -> np.ndarray:
 
 
 def same_sign(quaternion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Quaternions (n, 4) with signs chosen so that successive ones are alike; q and -q are one rotation.
+    """Choose the signs of quaternions (n, 4) so that successive ones are alike; q and -q are one rotation.
 
     Returns:
         The quaternions, and a mask (n,) of the rows where the sign flipped alone: q was about -q.
@@ -96,7 +96,7 @@ def same_sign(quaternion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def late_rows(time_s: np.ndarray) -> np.ndarray:
-    """Mask (n,) of the rows whose time does not increase: repeated or backwards.
+    """Mask (n,) the rows whose time does not increase: repeated or backwards.
 
     A row that is alone out of order, early or late, is at fault itself; otherwise the rows up to where the
     time exceeds again all that came before.
@@ -110,7 +110,7 @@ def late_rows(time_s: np.ndarray) -> np.ndarray:
 
 
 def gap_rows(time_s: np.ndarray) -> np.ndarray:
-    """Mask (n,) of the rows before which rows are missing, by increasing times (n,)."""
+    """Mask (n,) the rows before which rows are missing, by increasing times (n,)."""
     step_s = np.diff(time_s)
     if len(step_s) == 0:
         return np.zeros(len(time_s), bool)
@@ -118,7 +118,7 @@ def gap_rows(time_s: np.ndarray) -> np.ndarray:
 
 
 def outlier_rows(values: np.ndarray, least: float) -> np.ndarray:
-    """Mask (n,) of the spikes in a column (n,), one or two rows long.
+    """Mask (n,) the spikes in a column (n,), one or two rows long.
 
     A value is compared to the two before and the two after it. A spike is off their median by 20 times the
     usual (by the median of absolute deviations), by 10 times the spread of the middle two, and by `least`. A

@@ -1,7 +1,7 @@
-"""Log files as matrices: the columns that the schema knows, in the units used inside, and nothing yet judged.
+"""Log files as matrices: the columns that the schema knows, in the units used inside, rows not yet checked.
 
-What the readers of logs share. A file that cannot be understood is refused here, with a line for each column
-that is missing, has a wrong unit or stands there twice; which rows to believe is for the readers to say.
+All readers of logs use it. A file that cannot be understood is refused here, with a line for each column that
+is missing, has a wrong unit or stands there twice; which rows to believe is for the readers to say.
 """
 
 from __future__ import annotations
@@ -22,46 +22,46 @@ from mjx_softarm.sensing.sensors import SENSORS
 _CELL = re.compile(r"(\w+)\s*(?:\[(.*)\])?")
 
 
-class Sheet(NamedTuple):
-    """The known columns of a log."""
+class LogMatrix(NamedTuple):
+    """Known columns of a log."""
 
     file: str
     columns: tuple[Column, ...]  # (k,) with the file's units, in the order of `log_columns`: time first
     values: np.ndarray  # (n, k) in the units used inside
     row: np.ndarray  # (n,) line of the file
 
-    def of(self, *groups: str) -> list[int]:
-        """Indices of the columns that are part of these fields of `Log`."""
+    def indices(self, *groups: str) -> list[int]:
+        """Return the indices of the columns that are part of these fields of `Log`."""
         return [k for k, column in enumerate(self.columns) if column.group in groups]
 
     def bodies(self) -> Iterator[tuple[str, list[int]]]:
-        """Tip and markers, each with the indices of its coordinates."""
-        columns = self.of("tip_m", "marker_m")
+        """Yield tip and markers, each with the indices of its coordinates."""
+        columns = self.indices("tip_m", "marker_m")
         for start in range(0, len(columns), 3):
             yield self.columns[columns[start]].name[:-2], columns[start : start + 3]
 
     def log(self) -> Log:
-        """The same as a log."""
+        """Return the columns as a log."""
         groups: dict[str, Any] = {
-            name: self.values[:, chosen] for name in GROUPS if (chosen := self.of(name))
+            name: self.values[:, chosen] for name in GROUPS if (chosen := self.indices(name))
         }
         for name in ("time_s", "payload_kg", "sequence"):
             if name in groups:
                 groups[name] = groups[name][:, 0]
         if "marker_m" in groups:
             groups["marker_m"] = groups["marker_m"].reshape(len(self.row), -1, 3)
-        if readings := self.of("readings"):
+        if readings := self.indices("readings"):
             groups["reading_name"] = self.columns[readings[0]].kind
         return Log(source=self.file, row=self.row, **groups)
 
 
-def read_sheet(
+def read_matrix(
     path: str | Path,
     n_chambers: int,
     needed: Sequence[str] = (),
     one_of: Sequence[str] = (),
     reading_name: str | None = None,
-) -> tuple[Sheet, list[Finding]]:
+) -> tuple[LogMatrix, list[Finding]]:
     """Read the known columns of a file; unknown ones are findings.
 
     Args:
@@ -76,7 +76,7 @@ def read_sheet(
     """
     table = read_table(path)
     with np.errstate(over="ignore", invalid="ignore"):  # any number may stand in a file
-        return _sheet(str(path), table, n_chambers, ("time_s", *needed), one_of, reading_name)
+        return _matrix(str(path), table, n_chambers, ("time_s", *needed), one_of, reading_name)
 
 
 def refuse(findings: Sequence[Finding]) -> None:
@@ -85,14 +85,14 @@ def refuse(findings: Sequence[Finding]) -> None:
         raise LogError(findings)
 
 
-def _sheet(
+def _matrix(
     file: str,
     table: Table,
     n_chambers: int,
     needed: Sequence[str],
     one_of: Sequence[str],
     reading_name: str | None,
-) -> tuple[Sheet, list[Finding]]:
+) -> tuple[LogMatrix, list[Finding]]:
     matches = [_CELL.fullmatch(cell) for cell in table.names]
     names = [match[1] if match else cell for match, cell in zip(matches, table.names, strict=True)]
     units = {name: match[2] if match else None for name, match in zip(names, matches, strict=True)}
@@ -108,11 +108,11 @@ def _sheet(
     values = table.values[:, [names.index(column.name) for column in columns]]
     values *= [UNITS[column.kind][column.unit] for column in columns]
     extra = [Finding(file, (1, 1), name, "unknown column, ignored") for name in names if name not in known]
-    return Sheet(file, columns, values, table.row), extra
+    return LogMatrix(file, columns, values, table.row), extra
 
 
 def _reading_name(names: list[str]) -> str:
-    """Return which sensors' readings a file has; the default arm's where it has none."""
+    """Return the name of a file's readings; the default arm's where it has none."""
     found = [sensor.reading_name for sensor in SENSORS.values()]
     return next((x for x in found if any(re.fullmatch(rf"{x}\d+", name) for name in names)), found[0])
 
@@ -133,16 +133,16 @@ def _header_errors(
             n_chambers = sum(column.group == "spring_m" for column in known.values())
             yield name, f"expected a log of {n_chambers} chambers, numbered from 0"
     for group in {known[name].group for name in names if name in known}:
-        wanted = [name for name, column in known.items() if column.group == group]
-        if missing := [name for name in wanted if name not in names]:
-            beside = next(name for name in wanted if name in names)
-            yield ", ".join(missing), f"missing, expected beside {beside}"
+        columns = [name for name, column in known.items() if column.group == group]
+        if missing := [name for name in columns if name not in names]:
+            beside = next(name for name in columns if name in names)
+            yield ", ".join(missing), f"got no such column, expected it beside {beside}"
 
 
 def _absent(
     names: list[str], known: dict, needed: Sequence[str], one_of: Sequence[str]
 ) -> Iterator[tuple[str, str]]:
-    """Groups of which not one column is there."""
+    """Yield the groups that have no column, with the problem."""
     if not _is_header(names):
         return
     groups = {known[name].group for name in names if name in known}

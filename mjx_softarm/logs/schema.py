@@ -1,8 +1,8 @@
 """Logs of an arm: one table of columns with units, written by the control loop and read by `calib`.
 
 A log is a CSV file whose header names each column with its unit, `pressure0 [kPa]`, or an npz file with the
-same: `columns` (k,) of text and `table` (n, k) of float64. Which columns there are, and which units a
-file may use, stands here alone; files that somebody brings are read by `mjx_softarm.logs.files`.
+same: `columns` (k,) of text and `table` (n, k) of float64. This module alone says which columns there are and
+which units a file may use; `mjx_softarm.logs.files` reads files from elsewhere.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def log_columns(
 
 @dataclass(frozen=True)
 class Log:
-    """Rows of one log, in time's order; a quantity that was not logged is None.
+    """Rows of one log, ordered by time; a quantity that was not logged is None.
 
     Chambers and springs are numbered as in the model. Positions and orientation are in the base frame (see
     `mjx_softarm.sensing.pose`), the tip being the centre of the last plate.
@@ -110,12 +110,14 @@ class Log:
             LogError: they are readings of another one.
         """
         if self.readings is not None and self.reading_name != sensor.reading_name:
-            problem = f"got readings of {self.reading_name}, expected {sensor.reading_name}, which a {sensor.kind} reads"
+            problem = (
+                f"got readings of {self.reading_name}, expected {sensor.reading_name} of a {sensor.kind}"
+            )
             raise LogError([Finding(self.source, None, f"{self.reading_name}0", problem)])
         return self.readings
 
     def take(self, rows: np.ndarray) -> Log:
-        """The same log with some rows alone, given by their indices or a mask (n,)."""
+        """Return a log of some of the rows, given by their indices or a mask (n,)."""
         values = {name: getattr(self, name) for name in GROUPS}
         kept = {name: None if value is None else value[rows] for name, value in values.items()}
         return dataclasses.replace(self, row=self.row[rows], **kept)
@@ -127,7 +129,7 @@ GROUPS = tuple(
 
 
 def log_table(log: Log) -> tuple[tuple[Column, ...], np.ndarray]:
-    """The columns (k,) that a log has, and its numbers (n, k) in the units of the columns."""
+    """Return the columns (k,) that a log has, and its numbers (n, k) in the units of the columns."""
     per_chamber = [getattr(log, name) for name in ("readings", "spring_m", "pressure_kpa", "reference_m")]
     n_chambers = max((value.shape[1] for value in per_chamber if value is not None), default=0)
     n_markers = 0 if log.marker_m is None else log.marker_m.shape[1]

@@ -1,4 +1,4 @@
-"""Numbers from files: CSV and npz into a matrix, or an error that names the line and the column.
+"""Tables of numbers from CSV and npz files, or an error that names the line and the column.
 
 Well-formed text goes through NumPy's fast reader. Only where that fails, or where line numbers are in doubt,
 is the file read again line by line, to say what is wrong with it.
@@ -22,13 +22,11 @@ _OTHER_DELIMITERS = {";": "semicolons", "\t": "tabs", "|": "bars"}
 
 
 class Table(NamedTuple):
-    """The numbers of a file."""
+    """Numbers of a file."""
 
     names: tuple[str, ...]  # (k,) as in the header
     values: np.ndarray  # (n, k)
-    row: (
-        np.ndarray
-    )  # (n,) line of the file, the first being 1; of an npz file as if it had a header in line 1
+    row: np.ndarray  # (n,) line of the file, counted from 1; an npz file counts as if it had a header
 
 
 def read_table(path: str | Path, names: Sequence[str] | None = None) -> Table:
@@ -125,7 +123,7 @@ def _count_lines(path: Path) -> int:
 
 
 def _read_lines(path: Path, names: tuple[str, ...], n_header: int) -> Table:
-    """Line by line: blank lines are passed over, empty cells are NaN, anything else is an error."""
+    """Read line by line: blank lines are passed over, empty cells are NaN, anything else is an error."""
     values, row = [], []
     with path.open(encoding="utf-8-sig", errors="replace") as file:
         for number, line in enumerate(file, 1):

@@ -2,8 +2,9 @@
 
     reading = low + (action + 1) / 2 (high - low)
 
-low and high are the readings of the shortest and the longest spring that may be commanded. Source: the paper's
-action space, whose readings are the coils' frequencies.
+low and high are the readings of the shortest and the longest spring that may be commanded.
+
+Source: the paper's action space, whose readings are the coils' frequencies.
 """
 
 from __future__ import annotations
@@ -43,10 +44,10 @@ class ActionMap(NamedTuple):
         return self.sensor.lengths(self.readings(action)).length_m
 
     def from_readings(self, readings: Array) -> Array:
-        """Return the actions (..., n) in [-1, 1] that ask for readings (..., n), or for the nearest allowed."""
+        """Return the actions (..., n) that ask for readings (..., n), clipped to [-1, 1]."""
         xp = array_namespace(readings, self.low)
         return xp.clip(2.0 * (readings - self.low) / (self.high - self.low) - 1.0, -1.0, 1.0)
 
     def from_lengths(self, length_m: Array) -> Array:
-        """Return the actions (..., n) in [-1, 1] that ask for spring lengths (..., n) [m]."""
+        """Return the actions (..., n) that ask for spring lengths (..., n) [m], clipped to [-1, 1]."""
         return self.from_readings(self.sensor.readings(length_m))

@@ -12,9 +12,8 @@ An environment may also charge for a body close to a wall, in all three cases; t
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
-from mjx_softarm._support.xp import array_namespace
+from mjx_softarm._support.xp import Array, array_namespace
 from mjx_softarm.sensing.pose import pose_error
 
 
@@ -31,12 +30,12 @@ class RewardConfig:
     weight_per_deg: float = 0.001  # weight of the tip's angles
 
 
-def scaled_error(pose: Any, goal: Any, config: RewardConfig) -> Any:
-    """e = w (pose - goal), (..., 6) without unit, angles wrapped.
+def scaled_error(pose: Array, goal: Array, config: RewardConfig) -> Array:
+    """Return e = w (pose - goal), (..., 6) without unit, angles wrapped.
 
     Args:
-        pose (..., 6) [mm, deg]: where the tip is, or a goal reached in hindsight.
-        goal (..., 6) [mm, deg]: where it should be.
+        pose (..., 6) [mm, deg]: of the tip, or a goal achieved in hindsight.
+        goal (..., 6) [mm, deg]: target of the tip.
         config: the weights.
     """
     xp = array_namespace(pose)
@@ -45,17 +44,22 @@ def scaled_error(pose: Any, goal: Any, config: RewardConfig) -> Any:
 
 
 def reward(
-    pose: Any, goal: Any, n_steps: Any, saturated: Any, config: RewardConfig, clearance_cost: Any = 0.0
-) -> tuple[Any, Any, dict[str, Any]]:
-    """Reward of a pose after an action.
+    pose: Array,
+    goal: Array,
+    n_steps: Array,
+    saturated: Array,
+    config: RewardConfig,
+    clearance_cost: Array = 0.0,
+) -> tuple[Array, Array, dict[str, Array]]:
+    """Compute the reward of a pose after an action.
 
     Args:
         pose (..., 6) [mm, deg]: achieved after the action.
-        goal (..., 6) [mm, deg]: wanted.
+        goal (..., 6) [mm, deg]: target of the tip.
         n_steps (...,): environment steps of the episode, this one included.
         saturated (...,) bool: any chamber at its pressure limit with its spring off its reference.
         config: the weights.
-        clearance_cost (...,): for a body close to a wall.
+        clearance_cost (...,): charged for a body close to a wall.
 
     Returns:
         Reward (...,); whether the goal is reached (...,) bool, which ends an episode; the terms by name.

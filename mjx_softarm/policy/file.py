@@ -1,7 +1,7 @@
-"""A trained policy as one file: what is in it, and how it is written and read. NumPy only.
+"""A trained policy as one file: its entries, its writer and its reader. NumPy only.
 
-A sealed npz archive (`mjx_softarm._support.archive`). n is the number of chambers; numbers are float64, networks and
-the workspace float32.
+A sealed npz archive (`mjx_softarm._support.archive`). n is the number of chambers; numbers are float64,
+networks and the workspace float32.
 
     schema_version       () int
     spec_json            ()           the arm trained for, as `ArmSpec.to_dict` gives it
@@ -26,8 +26,8 @@ the workspace float32.
     provenance_json      ()           how the policy came about: config, versions, commit, date
 
 The arm's numbers stand next to `spec_json` because the actor was trained with these, whatever a later version
-derives from a specification. To add an entry, or a field to a class named here (`ArmSpec` included), is to
-make a new schema: raise `SCHEMA_VERSION`. A file of another schema is refused; a run exports it anew.
+derives from a specification. A new entry, or a new field of a class named here (`ArmSpec` included), makes
+a new schema: raise `SCHEMA_VERSION`. A file of another schema is refused; its run can be exported again.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ KIND = "policy"
 
 @dataclass(frozen=True, eq=False)
 class Policy:
-    """A trained policy and all that its actions depend on; the module's docstring says what each part is."""
+    """A trained policy and all that its actions depend on; the module's docstring lists the entries."""
 
     layers: tuple[Layer, ...]  # from the observation to the actions before tanh
     obs_scale: ObsScale
@@ -89,7 +89,7 @@ class Policy:
 
 
 class ArmModel(NamedTuple):
-    """What the arm's computer has to know about the arm besides its specification."""
+    """Networks and poses that the arm's computer needs besides the specification."""
 
     workspace: np.ndarray  # (m, 6) poses [mm, deg]
     estimator: PoseEstimator
@@ -111,7 +111,7 @@ def policy_from_actor(
     tolerance_m: float = TOLERANCE_M,
     n_actions: int = N_ACTIONS,
 ) -> Policy:
-    """The policy of an actor that was trained on an arm.
+    """Make the policy of an actor that was trained on an arm.
 
     Args:
         actor_params: nested mappings of arrays, as flax initialises the actor; see `layers_from_flax`.
@@ -143,7 +143,7 @@ def policy_from_actor(
 
 
 def layers_from_flax(actor_params: Mapping[str, Any], n_actions: int) -> tuple[Layer, ...]:
-    """The actor's layers without its standard deviations; all that depends on how flax names them.
+    """Return the actor's layers without its standard deviations; the one place that knows flax's names.
 
     Args:
         actor_params: `{"params": {"hidden_0": {"kernel", "bias"}, ..., "head": {"kernel", "bias"}}}`; the

@@ -1,7 +1,6 @@
-"""The policy in NumPy: pose and goal -> the spring lengths that the sensor-space law holds.
+"""The policy in NumPy: pose and goal -> spring lengths for the sensor-space law.
 
-The observation, the sensors and the law are the functions that training uses; only the actor's layers are
-written out here.
+Observation, sensors and law are the functions that training uses; only the actor's layers are evaluated here.
 """
 
 from __future__ import annotations
@@ -16,14 +15,14 @@ from mjx_softarm.policy.file import Policy
 
 
 class Reference(NamedTuple):
-    """What the policy asks of the springs."""
+    """Spring references of the policy."""
 
     readings: np.ndarray  # (..., n) of the sensors
     length_m: np.ndarray  # (..., n) the same, as calibrated lengths: the reference of `control.pressures`
 
 
 class PolicyRunner:
-    """The deterministic policy, as evaluated in training; it has no state.
+    """The deterministic policy, as evaluated in training. It has no state.
 
     Example: `PolicyRunner(load_policy("policy.npz")).act(pose, goal).length_m`.
     """
@@ -33,11 +32,11 @@ class PolicyRunner:
         self._scale = ObsScale(*(np.asarray(value, np.float32) for value in policy.obs_scale))
 
     def act(self, pose: ArrayLike, goal: ArrayLike) -> Reference:
-        """References of the springs that bring the tip from a pose towards a goal.
+        """Return the spring references that bring the tip from a pose towards a goal.
 
         Args:
-            pose (..., 6) [mm, deg]: where the tip is; see `mjx_softarm.sensing.pose`.
-            goal (..., 6) [mm, deg]: where it should be; the leading axes broadcast against the pose's.
+            pose (..., 6) [mm, deg]: of the tip; see `mjx_softarm.sensing.pose`.
+            goal (..., 6) [mm, deg]: target of the tip; the leading axes broadcast against the pose's.
 
         Returns:
             Readings (..., n) and lengths (..., n) [m], both within the policy's limits.
@@ -50,7 +49,7 @@ class PolicyRunner:
         return Reference(readings, actions.sensor.lengths(readings).length_m)
 
     def action(self, pose: ArrayLike, goal: ArrayLike) -> np.ndarray:
-        """The action (..., n) in [-1, 1], float32, of which `act` makes readings; arguments as there.
+        """Return the action (..., n) in [-1, 1], float32, that `act` maps to readings; arguments as there.
 
         Raises:
             ValueError: pose or goal has the wrong shape or is not finite, or the actor overflows; what it

@@ -1,1 +1,1 @@
-"""From readings of the springs to their lengths, and from these to the pose of the tip."""
+"""Sensing: readings of the springs to their lengths, and lengths to the pose of the tip."""

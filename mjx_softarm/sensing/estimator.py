@@ -1,23 +1,22 @@
-"""What the springs tell about the tip, and what the pressures tell about the springs. NumPy and JAX.
+"""Estimators of an arm at rest: tip pose from spring lengths, spring lengths from pressures. NumPy and JAX.
 
-On the arm nobody sees the tip. Its pose is estimated from the spring lengths: three springs give a
-section's length and bend, a section of constant curvature has a closed form, and the sections follow one
-another. The real ones do not bend evenly, since all that hangs below pulls at them; a small network,
-distilled from the simulator, says by how much each section's end is off. Besides the springs it sees which
-way is down at each section's end. Changes, not poses, come from it, so nothing is discontinuous where yaw
-and roll are.
+No sensor of the arm sees the tip. Its pose is estimated from the spring lengths: three springs give a
+section's length and bend, a section of constant curvature has a closed form, and the sections are in series.
+Real sections do not bend evenly, since the weight below pulls at them. A small network, distilled from the
+simulator, corrects each section's end. Its inputs are the springs and the direction of gravity at each
+section's end; its outputs are changes, which stay continuous where yaw and roll do not.
 
-The other way around, `expected_springs` says which lengths the springs have at given pressures without a
-payload. The control loop holds it against the readings to find a chamber that has lost its pressure.
+In the other direction, `expected_springs` predicts the spring lengths at given pressures without a payload.
+The control loop compares them with the readings to find a chamber that has lost its pressure.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from mjx_softarm._support.archive import Entries
 from mjx_softarm._support.mlp import Layer, mlp
-from mjx_softarm._support.xp import array_namespace
+from mjx_softarm._support.xp import Array, array_namespace
 from mjx_softarm.sensing.pose import pose_from_frame, rotation_from_quaternion
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION
 
@@ -29,36 +28,36 @@ class PoseEstimator(NamedTuple):
     """Spring lengths to tip pose, for n springs in n / 3 sections. All float32."""
 
     layers: tuple[Layer, ...]  # normalised springs (n,) and downs (n,) -> changes (n_sections * N_CHANGES,)
-    spring_site_m: Any  # (n, 2) holes of the springs in their rings, x and y
-    spring_centre_m: Any  # (n,) lengths that are normalised to 0,
-    spring_scale_m: Any  # (n,) and what is added to them for 1
-    change_scale: Any  # (N_CHANGES,) [m, 1] of the network's outputs
+    spring_site_m: Array  # (n, 2) holes of the springs in their rings, x and y
+    spring_centre_m: Array  # (n,) lengths that are normalised to 0,
+    spring_scale_m: Array  # (n,) and what is added to them for 1
+    change_scale: Array  # (N_CHANGES,) [m, 1] of the network's outputs
 
 
 class SpringModel(NamedTuple):
     """Pressures to spring lengths at rest. All float32."""
 
     layers: tuple[Layer, ...]  # normalised pressures (n,) -> normalised springs (n,)
-    pressure_centre_kpa: Any  # (n,)
-    pressure_scale_kpa: Any  # (n,)
-    spring_centre_m: Any  # (n,)
-    spring_scale_m: Any  # (n,)
+    pressure_centre_kpa: Array  # (n,)
+    pressure_scale_kpa: Array  # (n,)
+    spring_centre_m: Array  # (n,)
+    spring_scale_m: Array  # (n,)
 
 
 class Frame(NamedTuple):
-    """Plates of an arm, one for each section's end."""
+    """Frames of plates."""
 
-    position_m: Any  # (..., 3)
-    rotation: Any  # (..., 3, 3), columns are the plate's axes
+    position_m: Array  # (..., 3)
+    rotation: Array  # (..., 3, 3), columns are the plate's axes
 
 
-def estimate(estimator: PoseEstimator, spring_m: Any) -> Any:
-    """Pose (..., 6) [mm, deg] of the tip of an arm at rest whose springs are (..., n) [m] long."""
+def estimate(estimator: PoseEstimator, spring_m: Array) -> Array:
+    """Return the tip pose (..., 6) [mm, deg] of an arm at rest with springs (..., n) [m]."""
     return pose_from_frame(*estimate_frame(estimator, spring_m))
 
 
-def estimate_frame(estimator: PoseEstimator, spring_m: Any) -> Frame:
-    """The same as origin [m] and axes."""
+def estimate_frame(estimator: PoseEstimator, spring_m: Array) -> Frame:
+    """Return the tip frame of an arm at rest with springs (..., n) [m]."""
     xp = array_namespace(spring_m, estimator.spring_site_m)
     spring_m = xp.asarray(spring_m, dtype=estimator.spring_site_m.dtype)
     even = constant_curvature(estimator.spring_site_m, spring_m)  # (..., n_sections)
@@ -72,8 +71,8 @@ def estimate_frame(estimator: PoseEstimator, spring_m: Any) -> Frame:
     return chain(Frame(even.position_m + changes[..., :3], turn @ even.rotation))
 
 
-def constant_curvature(spring_site_m: Any, spring_m: Any) -> Frame:
-    """Each section's end, in the frame of its start, if all of the section bends evenly.
+def constant_curvature(spring_site_m: Array, spring_m: Array) -> Frame:
+    """Return each section's end in the frame of its start, for sections of constant curvature.
 
     Args:
         spring_site_m (n, 2) [m]: holes of the springs, three to a section, evenly on a circle.
@@ -104,8 +103,8 @@ def constant_curvature(spring_site_m: Any, spring_m: Any) -> Frame:
     return Frame(position_m, rotation_from_quaternion(quaternion))
 
 
-def _downs(rotation: Any) -> list[Any]:
-    """The base's z axis (..., 3) at each section's end, if they turn by (..., n_sections, 3, 3)."""
+def _downs(rotation: Array) -> list[Array]:
+    """Return the base's z axis (..., 3) in the frame of each section's end."""
     downs = [rotation[..., 0, 2:, :]]
     for section in range(1, rotation.shape[-3]):
         downs.append(downs[-1] @ rotation[..., section, :, :])
@@ -113,7 +112,7 @@ def _downs(rotation: Any) -> list[Any]:
 
 
 def chain(sections: Frame) -> Frame:
-    """The last plate in the base frame of sections (..., n_sections) that follow one another."""
+    """Return the last plate in the base frame of sections (..., n_sections) in series."""
     position_m, rotation = sections.position_m[..., -1, :, None], sections.rotation[..., -1, :, :]
     for section in reversed(range(sections.position_m.shape[-2] - 1)):  # from the tip up to the base
         above = sections.rotation[..., section, :, :]
@@ -122,8 +121,8 @@ def chain(sections: Frame) -> Frame:
     return Frame(position_m[..., 0], rotation)
 
 
-def expected_springs(model: SpringModel, pressure_kpa: Any) -> Any:
-    """Spring lengths (..., n) [m] of the arm at rest at pressures (..., n) [kPa], without a payload."""
+def expected_springs(model: SpringModel, pressure_kpa: Array) -> Array:
+    """Return spring lengths (..., n) [m] at rest at pressures (..., n) [kPa], without a payload."""
     xp = array_namespace(pressure_kpa, model.pressure_centre_kpa)
     pressure_kpa = xp.asarray(pressure_kpa, dtype=model.pressure_centre_kpa.dtype)
     normalised = (pressure_kpa - model.pressure_centre_kpa) / model.pressure_scale_kpa
@@ -131,7 +130,7 @@ def expected_springs(model: SpringModel, pressure_kpa: Any) -> Any:
 
 
 def take_estimator(entries: Entries, name: str, n_springs: int) -> PoseEstimator:
-    """The estimator `name` among the entries of a file, checked.
+    """Take the estimator `name` from the entries of a file, checked.
 
     Raises:
         SealedFileError: an entry is missing, or of the wrong type, shape or range.
@@ -150,7 +149,7 @@ def take_estimator(entries: Entries, name: str, n_springs: int) -> PoseEstimator
 
 
 def take_spring_model(entries: Entries, name: str, n_springs: int) -> SpringModel:
-    """The spring model `name` among the entries of a file, checked.
+    """Take the spring model `name` from the entries of a file, checked.
 
     Raises:
         SealedFileError: an entry is missing, or of the wrong type, shape or range.
@@ -161,7 +160,7 @@ def take_spring_model(entries: Entries, name: str, n_springs: int) -> SpringMode
     return model
 
 
-def _check_scales(entries: Entries, name: str, network: Any, *items: str) -> None:
+def _check_scales(entries: Entries, name: str, network: NamedTuple, *items: str) -> None:
     for item in items:
         if not (getattr(network, item) > 0.0).all():
             entries.fail(f"{name}.{item}", f"got {getattr(network, item).tolist()}, expected numbers > 0")

@@ -1,4 +1,4 @@
-"""Poses of the arm's tip, as used everywhere.
+"""Poses of the arm's tip, in the convention of the whole project.
 
     pose (..., 6) = x, y, z [mm], yaw, pitch, roll [deg]
 
@@ -25,7 +25,7 @@ _RIGHT = np.array([[1, 2, 3], [0, 7, 2], [3, 0, 5], [6, 1, 0]])
 
 
 def pose_from_frame(position_m: Array, rotation: Array) -> Array:
-    """Pose of a frame given by its origin and axes.
+    """Return the pose of a frame given by its origin and axes.
 
     Args:
         position_m (..., 3) [m]: in the base frame.
@@ -49,7 +49,7 @@ def pose_from_frame(position_m: Array, rotation: Array) -> Array:
 
 
 def pose_from_quaternion(position_m: Array, quaternion: Array) -> Array:
-    """Pose of a frame given by its origin and a quaternion, as MuJoCo and motion capture give it.
+    """Return the pose of a frame given by origin and quaternion, as from MuJoCo and motion capture.
 
     Args:
         position_m (..., 3) [m]: in the base frame.
@@ -62,14 +62,14 @@ def pose_from_quaternion(position_m: Array, quaternion: Array) -> Array:
 
 
 def rotation_from_quaternion(quaternion: Array) -> Array:
-    """Matrix (..., 3, 3) of a quaternion (..., 4) w, x, y, z; its entries scale with the length's square."""
+    """Return the matrix (..., 3, 3) of quaternions (..., 4) w, x, y, z; it scales with their squared length."""
     xp = array_namespace(quaternion)
     signed = xp.concat([quaternion, -quaternion], axis=-1)  # (..., 8)
     return signed[..., _LEFT] @ signed[..., _RIGHT]
 
 
 def quaternion_from_pose(pose: Array) -> Array:
-    """Quaternion (..., 4) w, x, y, z of the angles of a pose (..., 6) [mm, deg]."""
+    """Return the quaternion (..., 4) w, x, y, z of the angles of a pose (..., 6) [mm, deg]."""
     xp = array_namespace(pose)
     half = xp.deg2rad(0.5 * pose[..., 3:])
     (cy, cp, cr), (sy, sp, sr) = ([f(half[..., k]) for k in range(3)] for f in (xp.cos, xp.sin))
@@ -83,7 +83,7 @@ def quaternion_from_pose(pose: Array) -> Array:
 
 
 def frame_from_pose(pose: Array) -> tuple[Array, Array]:
-    """Origin (..., 3) [m] and axes (..., 3, 3) of a pose (..., 6) [mm, deg]; inverse of `pose_from_frame`."""
+    """Return origin (..., 3) [m] and axes (..., 3, 3) of a pose (..., 6); inverse of `pose_from_frame`."""
     xp = array_namespace(pose)
     angles = xp.deg2rad(pose[..., 3:])
     (cy, cp, cr), (sy, sp, sr) = ([f(angles[..., k]) for k in range(3)] for f in (xp.cos, xp.sin))
@@ -96,7 +96,7 @@ def frame_from_pose(pose: Array) -> tuple[Array, Array]:
 
 
 def pose_error(pose: Array, goal: Array) -> Array:
-    """pose - goal, both (..., 6) [mm, deg], with the differences of angles wrapped into [-180, 180)."""
+    """Return pose - goal, both (..., 6) [mm, deg], with angle differences wrapped into [-180, 180)."""
     xp = array_namespace(pose, goal)
     error = pose - goal
     angles = error[..., 3:]

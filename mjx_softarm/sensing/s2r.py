@@ -1,11 +1,11 @@
 """The sim-to-real network: simulated tip pose and spring lengths -> pose of the real tip.
 
-The network gives a correction, added to the simulated position and turned onto the simulated axes, so that a
-network that says nothing leaves the simulation as it is. Inside, orientation is two columns of the rotation
+The network gives a correction, added to the simulated position and turned onto the simulated axes, so that
+zero outputs leave the simulation as it is. Inside, orientation is two columns of the rotation
 matrix going in and a Gibbs vector (axis times the tangent of half the angle) coming out: both are smooth at
 pitch 90, where yaw and roll are not.
 
-Training in simulation visits arms far from all that was logged. There the network must not blow up: its
+Training in simulation visits arms far from the logged ones. There the network must not diverge: its
 inputs are held within the range of the training rows and its outputs within the range of their corrections.
 `extrapolation` tells how far away such an arm is.
 
@@ -15,13 +15,13 @@ Source: Sim-to-Real Transfer in Meng et al., N_S2R: (P, L_spring) -> P_S2R.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from mjx_softarm._support.archive import Entries, entries_of, read_sealed, write_sealed
 from mjx_softarm._support.mlp import Layer, mlp
-from mjx_softarm._support.xp import array_namespace
+from mjx_softarm._support.xp import Array, array_namespace
 from mjx_softarm.sensing.pose import frame_from_pose, pose_from_frame, rotation_from_quaternion
 
 N_POSE_INPUTS = 9  # position and two columns of the rotation
@@ -34,16 +34,16 @@ class S2R(NamedTuple):
     """A network with the range it was trained in; n_in is 9 + n springs, n_out 6 for an arm. All float32."""
 
     layers: tuple[Layer, ...]  # normalised inputs (n_in,) -> corrections (n_out,)
-    input_low: Any  # (n_in,) least and greatest of the training rows,
-    input_high: Any  # (n_in,) normalised to -1 and 1
-    output_low: Any  # (n_out,) the same of their corrections
-    output_high: Any  # (n_out,)
-    anchors: Any  # (n_anchors, n_in) normalised training rows that stand for all of them
-    limit: Any  # () greatest believable distance to the nearest anchor
+    input_low: Array  # (n_in,) least and greatest of the training rows,
+    input_high: Array  # (n_in,) normalised to -1 and 1
+    output_low: Array  # (n_out,) the same of their corrections
+    output_high: Array  # (n_out,)
+    anchors: Array  # (n_anchors, n_in) normalised training rows that stand for all of them
+    limit: Array  # () greatest believable distance to the nearest anchor
 
 
-def correct(s2r: S2R, pose: Any, spring_m: Any) -> Any:
-    """Pose of the real tip.
+def correct(s2r: S2R, pose: Array, spring_m: Array) -> Array:
+    """Return the pose of the real tip.
 
     Args:
         s2r: the network.
@@ -57,8 +57,8 @@ def correct(s2r: S2R, pose: Any, spring_m: Any) -> Any:
     return pose_from_frame(*apply_correction(frame, correction(s2r, inputs(frame, spring_m))))
 
 
-def extrapolation(s2r: S2R, pose: Any, spring_m: Any) -> Any:
-    """Distance (...) to the training rows over its limit; above 1, the network is not to be believed.
+def extrapolation(s2r: S2R, pose: Array, spring_m: Array) -> Array:
+    """Return the distance (...) to the training rows over its limit; above 1, do not trust the network.
 
     Args:
         s2r: the network.
@@ -68,29 +68,29 @@ def extrapolation(s2r: S2R, pose: Any, spring_m: Any) -> Any:
     return distance(s2r, inputs(frame_from_pose(pose), spring_m)) / s2r.limit
 
 
-def inputs(frame: tuple[Any, Any], spring_m: Any) -> Any:
-    """What the network looks at (..., 9 + n): position [m], the tip's x and y axes, spring lengths [m]."""
+def inputs(frame: tuple[Array, Array], spring_m: Array) -> Array:
+    """Return the network's inputs (..., 9 + n): position [m], the tip's x and y axes, spring lengths [m]."""
     position_m, rotation = frame
     xp = array_namespace(position_m, spring_m)
     return xp.concat([position_m, rotation[..., 0], rotation[..., 1], spring_m], axis=-1)
 
 
-def correction(s2r: S2R, x: Any) -> Any:
-    """Outputs (..., n_out) of inputs (..., n_in), never outside of the training rows' range."""
+def correction(s2r: S2R, x: Array) -> Array:
+    """Return outputs (..., n_out) of inputs (..., n_in), never outside the range of the training rows."""
     xp = array_namespace(x, s2r.input_low)
     z = xp.clip(_normalised(s2r, x), -1.0, 1.0)
     return xp.clip(mlp(s2r.layers, z), s2r.output_low, s2r.output_high)
 
 
-def distance(s2r: S2R, x: Any) -> Any:
-    """Distance (...) of inputs (..., n_in) to the nearest anchor, as root mean square over the inputs."""
+def distance(s2r: S2R, x: Array) -> Array:
+    """Return the root-mean-square distance (...) of inputs (..., n_in) to the nearest anchor."""
     xp = array_namespace(x, s2r.anchors)
     offset = _normalised(s2r, x)[..., None, :] - s2r.anchors  # (..., n_anchors, n_in)
     return xp.sqrt(xp.min(xp.mean(offset**2, axis=-1), axis=-1))
 
 
-def apply_correction(frame: tuple[Any, Any], change: Any) -> tuple[Any, Any]:
-    """A frame moved and turned in the base frame; its axes come out scaled, which no angle depends on.
+def apply_correction(frame: tuple[Array, Array], change: Array) -> tuple[Array, Array]:
+    """Move and turn a frame in the base frame; its axes come out scaled, which no angle depends on.
 
     Args:
         frame: origin (..., 3) [m] and axes (..., 3, 3).
@@ -102,8 +102,8 @@ def apply_correction(frame: tuple[Any, Any], change: Any) -> tuple[Any, Any]:
     return position_m + 0.001 * change[..., :3], turn @ rotation
 
 
-def correction_between(pose: Any, real_pose: Any) -> Any:
-    """The change (..., 6) with which `apply_correction` makes a pose the real one, below 180 degrees."""
+def correction_between(pose: Array, real_pose: Array) -> Array:
+    """Return the change (..., 6) with which `apply_correction` makes a pose the real one, below 180 degrees."""
     xp = array_namespace(pose, real_pose)
     (start_m, start), (end_m, end) = frame_from_pose(pose), frame_from_pose(real_pose)
     turn = end @ xp.swapaxes(start, -1, -2)
@@ -115,31 +115,31 @@ def correction_between(pose: Any, real_pose: Any) -> Any:
     return xp.concat([1000.0 * (end_m - start_m), gibbs], axis=-1)
 
 
-def carry_body(plate_position: Any, plate_rotation: Any, real_pose: Any) -> tuple[Any, Any]:
-    """Plates of the real arm, where the network knows of its tip alone.
+def carry_body(plate_position: Array, plate_rotation: Array, real_pose: Array) -> tuple[Array, Array]:
+    """Estimate the plates of the real arm from the correction of its tip.
 
-    An approximation: a base that is askew, which puts the real tip elsewhere most, moves a plate the more the
-    further down it is. So each plate is moved by its share of the tip's way, in proportion to its place along
-    the arm, and keeps its direction; the last one is the real tip's. A base that stands off, which moves all
-    plates alike, is not made up for at the base.
+    An approximation: a tilted base, the main cause of the tip's offset, moves a plate the more the further
+    down it is. So each plate moves by a share of the tip's offset, in proportion to its place along the arm,
+    and keeps its direction; the last plate is the real tip's. A shifted base, which moves all plates alike, is
+    not corrected at the base.
 
     Args:
         plate_position (..., L + 1, 3) [m]: simulated, as in `mjx_softarm.mechanics.kinematics.Frames`.
-        plate_rotation (..., L + 1, 3, 3): likewise.
+        plate_rotation (..., L + 1, 3, 3): axes of these plates.
         real_pose (..., 6) [mm, deg]: of the tip, from `correct`.
 
     Returns:
-        The same of the real arm.
+        Positions and rotations of the real arm's plates, in the same shapes.
     """
     xp = array_namespace(plate_position, real_pose)
     tip_m, rotation = frame_from_pose(real_pose)
     share = xp.linspace(0.0, 1.0, plate_position.shape[-2], dtype=plate_position.dtype)
-    way_m = tip_m - plate_position[..., -1, :]
-    moved = plate_position + share[:, None] * way_m[..., None, :]
-    return moved, xp.concat([plate_rotation[..., :-1, :, :], rotation[..., None, :, :]], axis=-3)
+    offset_m = tip_m - plate_position[..., -1, :]
+    real_position = plate_position + share[:, None] * offset_m[..., None, :]
+    return real_position, xp.concat([plate_rotation[..., :-1, :, :], rotation[..., None, :, :]], axis=-3)
 
 
-def _normalised(s2r: S2R, x: Any) -> Any:
+def _normalised(s2r: S2R, x: Array) -> Array:
     return 2.0 * (x - s2r.input_low) / (s2r.input_high - s2r.input_low) - 1.0
 
 
@@ -156,7 +156,7 @@ def save_s2r(path: str | Path, s2r: S2R) -> None:
 
 
 def load_s2r(path: str | Path, n_springs: int | None = None) -> S2R:
-    """Read a network and check all of it; of any arm where `n_springs` is None.
+    """Read a network and check all of it; `n_springs` of None accepts any arm.
 
     Raises:
         SealedFileError: the file cannot be read, is incomplete, damaged, of another kind, or an entry is
@@ -166,13 +166,13 @@ def load_s2r(path: str | Path, n_springs: int | None = None) -> S2R:
 
 
 def take_s2r(entries: Entries, name: str, n_springs: int | None = None) -> S2R:
-    """The network `name` among the entries of a file, checked; of any arm where `n_springs` is None.
+    """Take the network `name` from the entries of a file, checked; `n_springs` of None accepts any arm.
 
     Raises:
         SealedFileError: an entry is missing, or of the wrong type, shape or range.
     """
-    wanted = None if n_springs is None else N_POSE_INPUTS + n_springs
-    low = entries.take(f"{name}.input_low", np.float32, (wanted,))
+    n_inputs = None if n_springs is None else N_POSE_INPUTS + n_springs
+    low = entries.take(f"{name}.input_low", np.float32, (n_inputs,))
     n_in, n_out = len(low), N_POSE_OUTPUTS
     shapes: dict[str, tuple[int | None, ...]] = {
         "input_low": (n_in,),

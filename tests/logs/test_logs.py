@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
 from mjx_softarm.logs.checks import LogError
-from mjx_softarm.logs.files import read_sheet
+from mjx_softarm.logs.files import read_matrix
 from mjx_softarm.logs.schema import Log, log_columns, log_table, write_log
 from tests.properties import damaged, few
 
@@ -100,8 +100,8 @@ def numbers(*shape):
 def test_any_log_is_written_and_read_again(tmp_path, groups, reading_name, name):
     log = Log("any", np.arange(4) + 2, 0.02 * np.arange(4), reading_name=reading_name, **groups)
     write_log(tmp_path / name, log)
-    sheet, findings = read_sheet(tmp_path / name, 6)
-    again = sheet.log()
+    matrix, findings = read_matrix(tmp_path / name, 6)
+    again = matrix.log()
     assert not findings and again.reading_name == reading_name
     for group in ("time_s", *groups):
         np.testing.assert_allclose(getattr(again, group), getattr(log, group), rtol=1e-8)
@@ -131,4 +131,4 @@ def test_a_damaged_log_is_read_or_refused(tmp_path, file):
     name, data = file
     (tmp_path / name).write_bytes(data)
     with contextlib.suppress(LogError):
-        assert len(read_sheet(tmp_path / name, 6)[0].log()) > 0
+        assert len(read_matrix(tmp_path / name, 6)[0].log()) > 0

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mjx_softarm.logs.checks import Finding, not_unit_rows
-from mjx_softarm.logs.files import Sheet, read_sheet, refuse
+from mjx_softarm.logs.files import LogMatrix, read_matrix, refuse
 from mjx_softarm.logs.schema import UNITS, Column, Log
 from mjx_softarm.mdp.actions import ActionMap
 from mjx_softarm.sensing.pose import pose_from_quaternion
@@ -53,11 +53,11 @@ def read_demonstrations(path: str | Path, spec: ArmSpec) -> tuple[Log, list[Find
     Raises:
         LogError: the file cannot be used; the message has a line for each finding.
     """
-    sheet, extra = read_sheet(path, spec.n_chambers, NEEDED, reading_name=spec.sensor.reading_name)
-    refuse(list(_not_finite(sheet)))
-    refuse(list(_out_of_range(sheet, spec)))
-    refuse(list(_out_of_order(sheet)))
-    return sheet.log(), extra
+    matrix, extra = read_matrix(path, spec.n_chambers, NEEDED, reading_name=spec.sensor.reading_name)
+    refuse(list(_not_finite(matrix)))
+    refuse(list(_out_of_range(matrix, spec)))
+    refuse(list(_out_of_order(matrix)))
+    return matrix.log(), extra
 
 
 def from_log(log: Log, spec: ArmSpec) -> Demonstrations:
@@ -70,54 +70,57 @@ def from_log(log: Log, spec: ArmSpec) -> Demonstrations:
     )
 
 
-def _not_finite(sheet: Sheet) -> Iterator[Finding]:
-    needed = sheet.of("time_s", *NEEDED)
-    for row, k in np.argwhere(~np.isfinite(sheet.values[:, needed])):
-        column = sheet.columns[needed[k]]
-        yield _finding(sheet, row, column.name, f"got {sheet.values[row, needed[k]]}, expected a number")
+def _not_finite(matrix: LogMatrix) -> Iterator[Finding]:
+    needed = matrix.indices("time_s", *NEEDED)
+    for row, k in np.argwhere(~np.isfinite(matrix.values[:, needed])):
+        column = matrix.columns[needed[k]]
+        yield _finding(matrix, row, column.name, f"got {matrix.values[row, needed[k]]}, expected a number")
 
 
-def _out_of_range(sheet: Sheet, spec: ArmSpec) -> Iterator[Finding]:
+def _out_of_range(matrix: LogMatrix, spec: ArmSpec) -> Iterator[Finding]:
     actions = ActionMap.from_spec(spec)
-    for k, *limits in zip(sheet.of("readings"), actions.low, actions.high, strict=True):
-        column, values = sheet.columns[k], sheet.values[:, k]
+    for k, *limits in zip(matrix.indices("readings"), actions.low, actions.high, strict=True):
+        column, values = matrix.columns[k], matrix.values[:, k]
         low, high = (_shown(column, limit) for limit in limits)
         for row in np.flatnonzero((values < min(limits)) | (values > max(limits))):
             got = f"got {_shown(column, values[row])} {column.unit}"
-            yield _finding(sheet, row, column.name, f"{got}, expected {low} to {high}, the arm's range")
-    tip_m, reach_m = sheet.values[:, sheet.of("tip_m")], spec.structure.n_sections * spec.springs.length_max_m
+            yield _finding(matrix, row, column.name, f"{got}, expected {low} to {high}, the arm's range")
+    tip_m, reach_m = (
+        matrix.values[:, matrix.indices("tip_m")],
+        spec.structure.n_sections * spec.springs.length_max_m,
+    )
     for row in np.flatnonzero((np.linalg.norm(tip_m, axis=1) > reach_m) | (tip_m[:, 2] > 0.0)):
         got = ", ".join(f"{1e3 * value:.4g}" for value in tip_m[row])
         expected = f"a tip below the base and within {1e3 * reach_m:.4g} mm of it"
-        yield _finding(sheet, row, "tip_x..z", f"got {got} mm, expected {expected}")
-    quaternion = sheet.values[:, sheet.of("tip_quaternion")]
+        yield _finding(matrix, row, "tip_x..z", f"got {got} mm, expected {expected}")
+    quaternion = matrix.values[:, matrix.indices("tip_quaternion")]
     for row in np.flatnonzero(not_unit_rows(quaternion)):
         got = f"got length {np.linalg.norm(quaternion[row]):.4g}"
-        yield _finding(sheet, row, "tip_qw..qz", f"{got}, expected unit quaternions")
-    sequence = sheet.values[:, sheet.of("sequence")[0]]
+        yield _finding(matrix, row, "tip_qw..qz", f"{got}, expected unit quaternions")
+    sequence = matrix.values[:, matrix.indices("sequence")[0]]
     for row in np.flatnonzero((sequence < 0.0) | (sequence > 1e6) | (sequence != np.round(sequence))):
         yield _finding(
-            sheet, row, "sequence", f"got {sequence[row]:g}, expected a whole number from 0 to 1000000"
+            matrix, row, "sequence", f"got {sequence[row]:g}, expected a whole number from 0 to 1000000"
         )
 
 
-def _out_of_order(sheet: Sheet) -> Iterator[Finding]:
-    time_s, sequence = sheet.values[:, 0], sheet.values[:, sheet.of("sequence")[0]]
+def _out_of_order(matrix: LogMatrix) -> Iterator[Finding]:
+    time_s, sequence = matrix.values[:, 0], matrix.values[:, matrix.indices("sequence")[0]]
     same = sequence[1:] == sequence[:-1]
     for row in 1 + np.flatnonzero(same & (time_s[1:] <= time_s[:-1])):
         problem = f"got {time_s[row]:g} s after {time_s[row - 1]:g} s, expected time's order in a sequence"
-        yield _finding(sheet, row, "time", problem)
+        yield _finding(matrix, row, "time", problem)
     starts = np.concatenate([[0], 1 + np.flatnonzero(~same)])
     for k in range(1, len(starts)):
         now, before = sequence[starts[k]], sequence[starts[:k]]
         if now in before:
             problem = f"got {now:g} again after {before[-1]:g}, expected a sequence in one piece"
-            yield _finding(sheet, starts[k], "sequence", problem)
+            yield _finding(matrix, starts[k], "sequence", problem)
 
 
-def _finding(sheet: Sheet, row: int | np.integer, column: str, problem: str) -> Finding:
-    line = int(sheet.row[row])
-    return Finding(sheet.file, (line, line), column, problem)
+def _finding(matrix: LogMatrix, row: int | np.integer, column: str, problem: str) -> Finding:
+    line = int(matrix.row[row])
+    return Finding(matrix.file, (line, line), column, problem)
 
 
 def _shown(column: Column, value: float) -> str:
