@@ -228,8 +228,8 @@ class ArmSpec:
             readings = sensor.readings(np.full(self.n_chambers, length_m))
             if not (readable := (readings >= low) & (readings <= high)).all():
                 raise SpecError(
-                    f"{source}: springs.{name}: {length_m!r} reads {readings[~readable][0]:.6g} {unit}, expected "
-                    f"sensor.{' to '.join(sensor.range_fields)}, {low:g} to {high:g} {unit}"
+                    f"{source}: springs.{name}: got {length_m!r}, which reads {readings[~readable][0]:.6g} "
+                    f"{unit}, expected sensor.{' to '.join(sensor.range_fields)}, {low:g} to {high:g} {unit}"
                 )
 
 

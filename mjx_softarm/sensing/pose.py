@@ -62,7 +62,7 @@ def pose_from_quaternion(position_m: Array, quaternion: Array) -> Array:
 
 
 def rotation_from_quaternion(quaternion: Array) -> Array:
-    """Return the matrix (..., 3, 3) of quaternions (..., 4) w, x, y, z; it scales with their squared length."""
+    """Return the matrix (..., 3, 3) of quaternions (..., 4) w, x, y, z; scales with their squared length."""
     xp = array_namespace(quaternion)
     signed = xp.concat([quaternion, -quaternion], axis=-1)  # (..., 8)
     return signed[..., _LEFT] @ signed[..., _RIGHT]
