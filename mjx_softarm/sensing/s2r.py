@@ -103,7 +103,7 @@ def apply_correction(frame: tuple[Array, Array], change: Array) -> tuple[Array, 
 
 
 def correction_between(pose: Array, real_pose: Array) -> Array:
-    """Return the change (..., 6) that `apply_correction` turns into the real pose; turns below 180 degrees."""
+    """Return the change (..., 6) that `apply_correction` needs to reach the real pose; below 180 degrees."""
     xp = array_namespace(pose, real_pose)
     (start_m, start), (end_m, end) = frame_from_pose(pose), frame_from_pose(real_pose)
     turn = end @ xp.swapaxes(start, -1, -2)
@@ -120,7 +120,7 @@ def carry_body(plate_position: Array, plate_rotation: Array, real_pose: Array) -
 
     An approximation: a tilted base, the main cause of the offset, moves a plate the more the further
     down it is. So each plate moves by a share of the tip's offset, in proportion to its place along the arm,
-    and keeps its direction; the last plate is the real tip's. A shifted base, which moves all plates alike, is
+    and keeps its direction; the last plate is that of the real tip. A shifted base, which moves all plates, is
     not corrected at the base.
 
     Args:
