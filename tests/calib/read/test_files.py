@@ -44,7 +44,7 @@ UNREADABLE = {
     "nothing measured": (simple(["0,1", "1,1"], "time [s],payload [g]"), "expected frequency0.., spring0.."),
     "part of a group": (
         simple(["0,1", "1,1"], "time [s],tip_x [m]"),
-        "tip_y, tip_z: missing, expected beside tip_x",
+        "tip_y, tip_z: got no such column, expected it beside tip_x",
     ),
     "twice": (simple([f"{r},1" for r in moving(4)], HEADER + ",tip_x [m]"), "tip_x: 2 columns of this name"),
     "no unit": (
