@@ -176,8 +176,8 @@ SETTINGS = [
     "evaluation_epochs=2",
     "replay_capacity=4096",
     "env.n_poses=256",
-    "tqc.hidden_actor=[16,16]",
-    "tqc.hidden_critic=[16,16]",
+    "tqc.hidden_actor=16",
+    "tqc.hidden_critic=16",
 ]
 
 
