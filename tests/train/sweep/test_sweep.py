@@ -327,7 +327,7 @@ MEDIANS = {(0, 0.5): [9.0, 2.0], (1, 0.5): [7.0, 5.0], (0, 0.9): [8.0, 6.0], (1,
 @pytest.fixture
 def finished(tmp_path):
     """A sweep of two seeds and two settings with figures made up."""
-    members, varied = members_of(CONFIG, [], "0,1", ["tqc.gamma=0.5,0.9"])
+    members, varied = members_of(CONFIG, (0, 1), ["tqc.gamma=0.5,0.9"])
     sweep = create(tmp_path / "sweep", members, varied, SHORT)
     for run in sweep.runs:
         medians = MEDIANS[run.config.seed, run.config.tqc.gamma]
