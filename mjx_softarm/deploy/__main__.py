@@ -25,8 +25,8 @@ from mjx_softarm.deploy.session import Run, follow
 from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.policy.file import load_policy
 
-_STATUS = """Exit status: 0 done, 2 it could not begin or its log not be written, 3 a fault ended it or refused a goal,
-130 Ctrl-C, 143 SIGTERM."""
+_STATUS = """Exit status: 0 done; 2 it could not begin, or its log could not be written; 3 a fault ended it or
+refused a goal; 130 Ctrl-C; 143 SIGTERM. In all cases the arm is vented and what was logged is written."""
 _ABOUT = f"A policy on an arm.\n\n{_STATUS}"
 
 

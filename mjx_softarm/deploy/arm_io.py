@@ -1,4 +1,7 @@
-"""What a driver of an arm has to offer; a real arm and its twin both implement it."""
+"""Interface of an arm's driver, which a real arm and its twin both implement.
+
+Whatever else a driver raises ends the run as a fault: the arm is vented and the log is written.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +51,7 @@ class ArmIO(Protocol):
 
 
 class Capture(NamedTuple):
-    """What motion capture sees of an arm, in the base frame (see `mjx_softarm.sensing.pose`)."""
+    """One frame of motion capture, in the base frame (see `mjx_softarm.sensing.pose`)."""
 
     tip_m: np.ndarray  # (3,) centre of the last plate
     tip_quaternion: np.ndarray  # (4,) w, x, y, z
@@ -57,12 +60,12 @@ class Capture(NamedTuple):
 
 
 class MotionCapture(Protocol):
-    """For calibration logs and to verify; no controller may look at it."""
+    """Motion capture of an arm, for calibration logs and to verify; no controller may look at it."""
 
     def motion_capture(self) -> Capture:
-        """Where tip and markers are now.
+        """Return where tip and markers are now.
 
         Raises:
-            OSError: the cameras cannot be reached.
+            OSError: this frame is missing; it becomes a gap in the log.
         """
         ...

@@ -1,4 +1,4 @@
-"""The end of whatever drives an arm: pressures at zero and the log written, however it came to an end."""
+"""The one end of all that drives an arm: pressures ramped to zero and the log written, whatever happened."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Terminated(BaseException):
 
 
 class Ending(NamedTuple):
-    """How a drive ended."""
+    """End of a drive: its cause, exit status, and whether the arm was vented."""
 
     cause: str = ""  # why it ended early, or was not vented or saved; or ""
     status: int = DONE  # exit status

@@ -27,7 +27,7 @@ VENT_TRIES = 10  # failed writes in a row after which the arm counts as not vent
 
 
 class ArmFault(Exception):
-    """The arm cannot be driven on; the message names the cause."""
+    """A fault after which the arm cannot be driven on; the message names the cause."""
 
 
 class Link:

@@ -4,12 +4,13 @@
     at rest: pose, goal -> policy -> references;    every tick: references -> sensor-space law -> pressures
 
 The policy was trained on arms at rest, so it acts on arms at rest: at once when a goal is new, and again
-whenever the springs have settled, `Policy.n_actions` times for a goal, as in its evaluation. Springs have settled
-when, for a window of half a second, each one is on its reference or its chamber at a limit, and none moves.
-Where that takes longer than `faults.SETTLE_TIMEOUT_S`, it is counted and the policy acts all the same. What
-stands when the springs have settled for the last time is the arrival.
+whenever the springs have settled, `Policy.n_actions` times for a goal, as in its evaluation. Springs have
+settled when, for a window of half a second, each one is on its reference or its chamber at a limit, and none
+moves. Where that takes longer than `faults.SETTLE_TIMEOUT_S`, it is counted and the policy acts all the same.
+What stands when the springs have settled for the last time is the arrival.
 
-Gains, limits, calibration, rate, tolerance and number of actions are the policy file's. `mjx_softarm.deploy.faults` says what can go wrong.
+Gains, limits, calibration, rate, tolerance and number of actions are the policy file's.
+`mjx_softarm.deploy.faults` says what can go wrong.
 """
 
 from __future__ import annotations

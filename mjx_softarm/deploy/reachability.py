@@ -1,4 +1,4 @@
-"""Whether a goal lies within the workspace, told from poses that the simulated arm reached."""
+"""Test of whether a goal lies within the workspace, by poses that the simulated arm reached."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Reachable(NamedTuple):
 
     @classmethod
     def from_poses(cls, pose: np.ndarray, reward: RewardConfig) -> Reachable:
-        """Of poses (m, 6) [mm, deg] spread over the workspace, two thousand or more of them."""
+        """Make it from poses (m, 6) [mm, deg] spread over the workspace, two thousand or more."""
         pose = np.asarray(pose, np.float64)
         position_m, rotation = frame_from_pose(pose)
         flat = rotation.reshape(len(pose), 9)
@@ -38,7 +38,7 @@ class Reachable(NamedTuple):
 
 
 def nearest(reachable: Reachable, goal: np.ndarray, reward: RewardConfig) -> tuple[np.ndarray, float]:
-    """The reachable pose (6,) [mm, deg] nearest to a goal (6,), and its distance over the limit."""
+    """Return the reachable pose (6,) [mm, deg] nearest to a goal (6,), and its distance over the limit."""
     position_m, rotation = frame_from_pose(np.asarray(goal, np.float64))
     position = 1e3 * reward.weight_per_mm * position_m
     distance = _distances(reachable, position[None], rotation.reshape(1, 9))[0]  # (m,)
@@ -47,7 +47,7 @@ def nearest(reachable: Reachable, goal: np.ndarray, reward: RewardConfig) -> tup
 
 
 def _distances(reachable: Reachable, position: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    """Distances (k, m) of positions (k, 3) and rotations (k, 9) to the poses, turns by their angle."""
+    """Return distances (k, m) of positions (k, 3) and rotations (k, 9) to the poses, turns by their angle."""
     squares = np.sum(position**2, axis=1)[:, None] + np.sum(reachable.position**2, axis=1)
     away = np.maximum(squares - 2.0 * position @ reachable.position.T, 0.0)
     cos = np.clip(0.5 * (rotation @ reachable.rotation.T - 1.0), -1.0, 1.0)

@@ -1,4 +1,4 @@
-"""Random safe poses of an arm, logged for calibration. NumPy only: the arm need not be known yet.
+"""Record random safe poses of an arm for calibration. NumPy only: the arm need not be known yet.
 
 The pressures are drawn as those of the poses that policies are trained on; from one set to the next goes a
 ramp. A pose is logged when the springs have come to rest, or, with `transients`, every tick is. The columns

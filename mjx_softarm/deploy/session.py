@@ -1,4 +1,4 @@
-"""The control loop on an arm: the thin shell of input, output and time around `mjx_softarm.deploy.loop`.
+"""The control loop on an arm: input, output and time around the pure `mjx_softarm.deploy.loop`.
 
 An arm that offers `pressures()`, what its regulators measure, or `motion_capture()` has both logged;
 neither is used for control.
@@ -34,7 +34,7 @@ class Arrival(NamedTuple):
 
 
 class Run(NamedTuple):
-    """What a run gave."""
+    """Results of a run."""
 
     log: Log
     arrivals: tuple[Arrival, ...]
@@ -85,7 +85,7 @@ def follow(
 
 
 class _Session:
-    """The mutable middle of `follow`."""
+    """Mutable state of `follow`."""
 
     def __init__(self, arm: ArmIO, controller: Controller, goals, duration_s: float | None, tell, arrived):
         self.controller, self.tell, self.arrived = controller, tell, arrived
@@ -153,7 +153,7 @@ class _Session:
             self._arrive(row["goal"], row["estimate"])
 
     def _next_goal(self, now_s: float) -> bool:
-        """Take the next goal that is not refused, if the last one is done; False at the end of goals or time."""
+        """Take the next accepted goal once the last is done; return False when goals or time are over."""
         while self.state.goal is None and self.n_taken < len(self.goals):
             self.state, events = with_goal(self.controller, self.state, self.goals[self.n_taken])
             self.n_taken += 1
@@ -182,4 +182,4 @@ class _Session:
 
 
 class _Stopped(ArmFault):
-    """A fault that the loop found and that ends the run; its event is counted already."""
+    """A fault that the loop found and counted, and that ends the run."""

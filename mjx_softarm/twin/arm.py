@@ -1,4 +1,4 @@
-"""The twin: a stand-in for the physical arm, reached like one through `ArmIO` and logs alone.
+"""The twin: a simulated stand-in for the physical arm, reached through `ArmIO` and logs alone.
 
 A finer model than training's, with parts that are off, chambers with hysteresis, joints with friction, air
 that has to be pumped and sensors that are noisy. Training and calibration never import it. Its parameters
@@ -151,11 +151,11 @@ class Twin:
         self.time_s += self._steps * self._model.opt.timestep
 
     def pressures(self) -> np.ndarray:
-        """Pressures (n,) [kPa] that the regulators' sensors measure in the chambers now."""
+        """Return pressures (n,) [kPa] that the regulators' sensors measure in the chambers now."""
         return self._air.pressure_kpa + self._draw(PRESSURE_NOISE_KPA, len(self._air.pressure_kpa))
 
     def motion_capture(self) -> Capture:
-        """Tip, and the rings at each third of a section from the first to the tip; see `MotionCapture`."""
+        """Return the tip and the rings at each third of a section, from the first to the tip."""
         spec, data = self._parts.spec, self._data
         n_markers = MARKERS_PER_SECTION * spec.structure.n_sections
         thirds = np.arange(1, n_markers + 1) * spec.structure.links_per_section / MARKERS_PER_SECTION
@@ -190,7 +190,7 @@ class Twin:
         self.attach(0.0)
 
     def wall_force_n(self) -> WallForce:
-        """How hard the arm pressed against the pipe: each the largest of the last control period.
+        """Return how hard the arm pressed against the pipe at most in the last control period.
 
         Returns:
             Sums [N] of the normal contact forces of the walls, and of the containers; zeros without a pipe.
@@ -198,7 +198,7 @@ class Twin:
         return self._wall_force
 
     def renderer(self, width: int, height: int) -> Any:
-        """A `mjx_softarm.mechanics.render.Renderer` of this twin, for `draw`.
+        """Return a `mjx_softarm.mechanics.render.Renderer` of this twin, for `draw`.
 
         Raises:
             RenderError: there is no OpenGL to draw with.
@@ -208,7 +208,7 @@ class Twin:
         return Renderer(self._model, width, height)
 
     def draw(self, renderer: Any) -> np.ndarray:
-        """A picture of the twin as it is now: RGB, (height, width, 3) uint8.
+        """Draw the twin as it is now: RGB, (height, width, 3) uint8.
 
         A pipe is drawn cut open, seen from the front, along +y; a payload as a ball at the finger tips.
         """
@@ -222,7 +222,7 @@ class Twin:
         )
 
     def describe(self) -> dict[str, Any]:
-        """How the twins are distributed, for reports: nothing about the one that was drawn."""
+        """Return how the twins are distributed, for reports: nothing about the one that was drawn."""
         sensor = self._parts.sensor
         return {
             "gap": self._build.gap,
@@ -243,7 +243,7 @@ class Twin:
         }
 
     def _step(self) -> None:
-        """One time step; lengths and positions in the data are those of its end."""
+        """Take one time step; lengths and positions in the data are those of its end."""
         data, n = self._data, len(self._parts.hysteresis)
         length_m = chamber_lengths(data)
         data.ctrl[:n] = self._air.step(length_m)

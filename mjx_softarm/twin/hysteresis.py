@@ -17,7 +17,7 @@ import numpy as np
 
 
 class StopOperators:
-    """The state of m stop operators on each of n displacements."""
+    """State of m stop operators on each of n displacements."""
 
     def __init__(self, stiffness: np.ndarray, limit: np.ndarray, x: np.ndarray):
         """Start without force.
@@ -32,7 +32,7 @@ class StopOperators:
         self._force = np.zeros(np.shape(limit))
 
     def move(self, x: np.ndarray) -> np.ndarray:
-        """Force (n,) that resists, positive where the displacement has grown, after moving to x (n,)."""
+        """Move to x (n,); return the resisting force (n,), positive where the displacement has grown."""
         trial = self._force + self._stiffness * (x - self._x)[:, None]
         self._force = np.minimum(np.maximum(trial, self._low), self._high)
         self._x = np.array(x, float)

@@ -54,7 +54,7 @@ class Tolerances:
 
 
 class Build(NamedTuple):
-    """How far the twin is from an ideal arm; tests set some of these to zero."""
+    """Distance of the twin from an ideal arm; tests set some of these to zero."""
 
     gap: float = GAP  # scale of the tolerances
     losses: float = 1.0  # scale of hysteresis and joint friction
@@ -66,7 +66,7 @@ AS_BUILT = Build()
 
 
 class Parts(NamedTuple):
-    """What was drawn."""
+    """Random parts of one twin."""
 
     spec: ArmSpec  # chambers, springs, masses
     sensor: Sensor  # with the springs' own beta and delta
@@ -80,7 +80,7 @@ class Parts(NamedTuple):
 
 
 def draw_parts(seed: int, spec: ArmSpec, build: Build) -> Parts:
-    """The parts of the twin of that seed; how noise and losses are scaled does not change them."""
+    """Draw the parts of the twin of a seed; the scales of noise and losses do not change them."""
     rng = np.random.default_rng(seed)
     std = scaled_tolerances(build.gap)
     n, n_sections = spec.n_chambers, spec.structure.n_sections
@@ -131,15 +131,15 @@ def draw_parts(seed: int, spec: ArmSpec, build: Build) -> Parts:
 
 
 def scaled_tolerances(gap: float) -> Tolerances:
-    """The standard deviations at a gap."""
+    """Return the standard deviations at a gap."""
     return Tolerances(**{name: gap * value for name, value in dataclasses.asdict(Tolerances()).items()})
 
 
 def build_twin(parts: Parts, pipe: CrossPipe | None = None) -> mujoco.MjModel:
-    """The compiled model, in the frame of the arm's own base, maybe inside a pipe; see `twin_pipe`.
+    """Compile the model, in the frame of the arm's own base, maybe inside a pipe; see `twin_pipe`.
 
-    Besides the objects of `mjx_softarm.mechanics.mjcf` it has an actuator `loss{i}` on each chamber's tendon, whose
-    control is a force [N]. Pressures are not clipped: that is for the regulators.
+    Besides the objects of `mjx_softarm.mechanics.mjcf` it has an actuator `loss{i}` on each chamber's
+    tendon, whose control is a force [N]. Pressures are not clipped: that is for the regulators.
     """
     spec, per_section = parts.spec, parts.spec.structure.links_per_section
     mjspec = build_spec(spec)
@@ -180,7 +180,7 @@ def _mount(mjspec: mujoco.MjSpec, chamber: int, parts: Parts, per_section: int) 
 
 
 def rotation_matrix(vector_rad: np.ndarray) -> np.ndarray:
-    """The rotation (3, 3) about a vector (3,) by its length [rad]."""
+    """Return the rotation (3, 3) about a vector (3,) by its length [rad]."""
     angle, quaternion, matrix = float(np.linalg.norm(vector_rad)), np.zeros(4), np.zeros(9)
     mujoco.mju_axisAngle2Quat(quaternion, vector_rad / max(angle, np.finfo(float).tiny), angle)
     mujoco.mju_quat2Mat(matrix, quaternion)

@@ -77,7 +77,7 @@ def add_pipe(
 
 
 def _walls(pipe: CrossPipe):
-    """(name, corners (8, 3) [m], colour, group) of every plank; the half at y < 0 is left out of pictures."""
+    """Yield (name, corners (8, 3) [m], colour, group) of planks; pictures leave out the half at y < 0."""
     branches = {  # length, and the branch's (across, y, along) -> (x, y, z) from the centre
         "up": (pipe.top_z_m - pipe.centre_z_m, lambda a, y, s: (a, y, s)),
         "down": (pipe.branch_m, lambda a, y, s: (a, y, -s)),
@@ -100,7 +100,7 @@ def _walls(pipe: CrossPipe):
 
 
 def _containers(pipe: CrossPipe):
-    """(name, corners (k, 3) [m], colour, group) of the floors, and of the outer ends left and right."""
+    """Yield (name, corners (k, 3) [m], colour, group) of the floors, and of the outer ends left and right."""
     at = pipe.containers()
     width = np.sqrt(pipe.radius_m**2 - (pipe.drop_m + FLOOR_BELOW_M) ** 2)  # half of it
     for side in ("left", "right"):
@@ -117,7 +117,7 @@ def _containers(pipe: CrossPipe):
 
 
 def _add_skin(mjspec: mujoco.MjSpec, spec: ArmSpec) -> None:
-    """What of the arm touches: balls or rims at the rings, and the gripper as it is drawn."""
+    """Add what the arm touches with: balls or rims at the rings, and the gripper as it is drawn."""
     radius = ring_radius_m(spec)
     rim = rim_points(radius - RIM_ROUNDING_M)
     for link in range(spec.n_links):
@@ -139,12 +139,12 @@ def _make_solid(geom: mujoco.MjsGeom, contype: int, conaffinity: int) -> None:
 
 
 def is_container(model: mujoco.MjModel) -> np.ndarray:
-    """(ngeom,) bool."""
+    """Return which geoms (ngeom,) are containers."""
     return np.array([model.geom(k).name.startswith(CONTAINER) for k in range(model.ngeom)])
 
 
 def contact_force(data: mujoco.MjData, container: np.ndarray) -> WallForce:
-    """The forces of the time step whose accelerations the data hold; `container` is from `is_container`."""
+    """Return the forces of the time step in the data; `container` is from `is_container`."""
     if data.ncon == 0:
         return WallForce(0.0, 0.0)
     contact = data.contact

@@ -46,7 +46,7 @@ class Pneumatics:
         self._under_way = deque([self._commanded_kpa] * (steps + 1), steps + 1)
 
     def volume_m3(self, length_m: np.ndarray) -> np.ndarray:
-        """Volumes (n,) of chambers of lengths (n,)."""
+        """Return volumes (n,) of chambers of lengths (n,)."""
         return self._area_m2 * length_m + 0.5 * self._slope_m * (length_m - self._rest_m) ** 2
 
     def command(self, pressure_kpa: np.ndarray) -> None:
@@ -54,7 +54,7 @@ class Pneumatics:
         self._commanded_kpa = np.array(pressure_kpa, float)
 
     def step(self, length_m: np.ndarray) -> np.ndarray:
-        """Pressures (n,) [kPa, relative to the atmosphere] a time step later, in chambers (n,) [m] long."""
+        """Take a time step in chambers (n,) [m] long; return pressures (n,) [kPa] above the atmosphere's."""
         self._under_way.append(self._commanded_kpa)
         volume_m3 = self.volume_m3(length_m)
         wanted_m3 = volume_m3 * (1.0 + self._under_way[0] / ATMOSPHERE_KPA)

@@ -100,3 +100,34 @@ def test_command_line_tells_what_is_wrong(folder):
     far = "--goal=" + ",".join(map(str, FAR))
     done = command(folder, "run", "policy.npz", "--arm", "driver:Arm", far)
     assert done.stdout.endswith("3 []\n") and "goal outside the workspace" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("fault", "status", "message"),
+    [
+        (
+            "raise RuntimeError('valve')",
+            3,
+            "ended early: write_pressures: RuntimeError: valve (driver.py, line ",
+        ),
+        ("os.kill(os.getpid(), signal.SIGTERM)", 143, "ended early: ended by SIGTERM"),
+        ("os.kill(os.getpid(), signal.SIGINT)", 130, "ended early: interrupted"),
+    ],
+)
+def test_recording_that_ends_early_vents_and_has_its_log(folder, fault, status, message):
+    """The driver writes each command to a file; the fault comes once, half a second after the start."""
+    driver = (
+        (folder / "driver.py").read_text()
+        + f"""
+        with open("written.txt", "a") as file:
+            print(*pressure_kpa, file=file)
+        if abs(self.time_s - 0.5) < 1e-6:
+            {fault}
+"""
+    )
+    (folder / "driver.py").write_text("import os, signal\n" + driver)
+    done = command(folder, "record", "--arm", "driver:Arm", "--out", "a.csv", "--poses", "9", "--transients")
+    assert done.stdout.endswith(f"{status} []\n") and message in done.stderr
+    written = np.loadtxt(folder / "written.txt")
+    assert np.abs(written).max() > 5.0 and not written[-1].any()
+    assert (folder / "a.csv").read_text().count("\n") == 1 + 25
