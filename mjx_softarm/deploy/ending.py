@@ -78,7 +78,7 @@ class _Finish:
         step = self._left[0] if self._left else ""
         signalled = isinstance(error, (KeyboardInterrupt, Terminated))
         self._n_interrupts += isinstance(error, KeyboardInterrupt)
-        text = "interrupted" if isinstance(error, KeyboardInterrupt) else describe(error)
+        text = (str(error) or "interrupted") if signalled else describe(error)
         goes_on = signalled and step != "drive" and self._n_interrupts <= _INTERRUPTS.get(step, 2)
         if signalled:
             number = error.number if isinstance(error, Terminated) else signal.SIGINT

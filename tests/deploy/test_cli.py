@@ -108,7 +108,7 @@ def test_command_line_tells_what_is_wrong(folder):
         (
             "raise RuntimeError('valve')",
             3,
-            "ended early: write_pressures: RuntimeError: valve (driver.py, line ",
+            "write_pressures: RuntimeError: valve (driver.py, line ",
         ),
         ("os.kill(os.getpid(), signal.SIGTERM)", 143, "ended early: ended by SIGTERM"),
         ("os.kill(os.getpid(), signal.SIGINT)", 130, "ended early: interrupted"),
