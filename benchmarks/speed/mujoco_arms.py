@@ -90,14 +90,14 @@ class SteppedArms:
         model: made by `sensed_model`.
         spec: the same arm.
         n: number of arms.
-        n_threads: threads of the rollout; 0 computes in the calling one.
+        n_threads: threads of the rollout; 0 steps a single arm without one, which is faster for one.
     """
 
     def __init__(self, model: mujoco.MjModel, spec: ArmSpec, n: int, n_threads: int):
         self.n, self.spec, self.model = n, spec, model
         self.gains, self.period_s = control.Gains.from_spec(spec), 1.0 / spec.control.rate_hz
         self._data = [mujoco.MjData(model) for _ in range(max(1, n_threads))]
-        self._rollout, self.stepping_s = rollout.Rollout(nthread=n_threads), 0.0
+        self._rollout, self.stepping_s = rollout.Rollout(nthread=n_threads) if n_threads else None, 0.0
         self._n_steps = round(self.period_s / model.opt.timestep)
         size = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)  # time, qpos, qvel
         self._state = np.zeros((n, size))
@@ -111,6 +111,7 @@ class SteppedArms:
         self._integral_kpa[arms] = pressure_kpa
         data = self._data[0]
         for index, coordinates in zip(np.flatnonzero(arms), q, strict=True):
+            mujoco.mj_resetData(self.model, data)
             data.qpos[:] = coordinates
             mujoco.mj_fwdPosition(self.model, data)
             mujoco.mj_sensorPos(self.model, data)
@@ -132,19 +133,30 @@ class SteppedArms:
                 self.period_s,
             )
             start = time.perf_counter()
-            state, sensed = self._rollout.rollout(
-                self.model, self._data, self._state[moving], pressure[:, None], nstep=self._n_steps
-            )
+            sensed = self._step(moving, pressure)
             self.stepping_s += time.perf_counter() - start
-            self._state[moving], pressure_kpa[moving] = state[:, -1], pressure
-            self.length_m[moving], tip[moving] = np.split(sensed[:, -1], [self.spec.n_chambers], axis=1)
+            pressure_kpa[moving] = pressure
+            self.length_m[moving], tip[moving] = np.split(sensed, [self.spec.n_chambers], axis=1)
             n_physics += len(moving) * self._n_steps
             moving = moving[~rest.after(self.length_m[moving], moving)]
         return Settled(pose_from_quaternion(tip[:, :3], tip[:, 3:]), pressure_kpa, n_physics)
 
+    def _step(self, moving: np.ndarray, pressure_kpa: np.ndarray) -> np.ndarray:
+        """Hold pressures (k, n_chambers) for a control period; return what the sensors read (k, n_sensed)."""
+        if self._rollout is None:
+            self._data[0].ctrl[:] = pressure_kpa[0]
+            mujoco.mj_step(self.model, self._data[0], self._n_steps)
+            return self._data[0].sensordata[None].copy()
+        state, sensed = self._rollout.rollout(
+            self.model, self._data, self._state[moving], pressure_kpa[:, None], nstep=self._n_steps
+        )
+        self._state[moving] = state[:, -1]
+        return sensed[:, -1]
+
     def close(self) -> None:
         """End the rollout's threads."""
-        self._rollout.close()
+        if self._rollout is not None:
+            self._rollout.close()
 
 
 def write_arm(folder: Path, spec: ArmSpec, n_poses: int = 1024) -> None:
@@ -164,7 +176,7 @@ class SteppedReach:
     Args:
         folder: specification, model and pool of poses, as `write_arm` makes it.
         n: number of arms.
-        n_threads: threads of the rollout.
+        n_threads: threads of the rollout; 0 for a single arm.
         seed: of starts and goals.
         episode_length: environment steps.
     """
