@@ -9,12 +9,13 @@ import math
 import typing
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from tyro.constructors import PrimitiveConstructorSpec
 
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.env import EnvConfig
+from train.agent.analytic import AnalyticConfig
 from train.agent.gail import GailConfig
 from train.agent.hindsight import HindsightConfig
 from train.agent.tqc import TQCConfig
@@ -28,6 +29,8 @@ class ConfigError(InputError):
 class TrainConfig:
     """A training run that reaches poses."""
 
+    learner: Literal["tqc", "analytic"] = "tqc"
+    """tqc: from transitions, by critics; analytic: by the gradient of the equilibrium, for arms at rest"""
     seed: int = 0
     """seed of networks, exploration, goals and batches; the pool of poses has env.workspace_seed"""
     n_arms: int = 128
@@ -54,6 +57,8 @@ class TrainConfig:
     """actor and critics"""
     hindsight: HindsightConfig = field(default_factory=HindsightConfig)
     """relabelled goals, as shares of a batch; the rest keeps its own goals"""
+    analytic: AnalyticConfig = field(default_factory=AnalyticConfig)
+    """policy and descent of the analytic learner"""
 
     def __post_init__(self) -> None:
         for name in (
@@ -66,6 +71,10 @@ class TrainConfig:
         ):
             if getattr(self, name) < 1:
                 raise ConfigError(f"{name}: got {getattr(self, name)}, expected at least 1")
+        if self.learner == "analytic" and self.env.mode != "quasistatic":
+            raise ConfigError(
+                f"learner: got 'analytic' with env.mode {self.env.mode!r}, expected 'quasistatic'"
+            )
         if self.warmup_env_steps < 0:
             raise ConfigError(f"warmup_env_steps: got {self.warmup_env_steps}, expected at least 0")
         if self.replay_capacity < self.n_arms:

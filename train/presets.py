@@ -32,6 +32,17 @@ PRESETS: dict[str, TrainConfig] = {
         replay_capacity=262_144,
         evaluation_epochs=30,
     ),
+    # The analytic learner needs neither replay nor warm-up. It has arms of its own, so few act beside them.
+    "analytic": TrainConfig(
+        learner="analytic",
+        n_arms=64,
+        total_env_steps=51_200,
+        updates_per_env_step=0.25,
+        warmup_env_steps=0,
+        batch_size=64,
+        replay_capacity=64,
+        evaluation_epochs=10,
+    ),
     "paper": dataclasses.replace(_TUNED, total_env_steps=300_000, updates_per_env_step=0.5),
 }
 

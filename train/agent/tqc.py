@@ -140,9 +140,9 @@ class TQC:
         """Return the parameters of the mean actor."""
         return state.mean_actor_params
 
-    def mode(self, actor_params: Params, obs: Array) -> Array:
+    def mode(self, policy: Params, obs: Array) -> Array:
         """Return the deterministic action (..., A) in (-1, 1) at obs (..., O)."""
-        return mode(self.actor.apply(actor_params, obs)[0])
+        return mode(self.actor.apply(policy, obs)[0])
 
     def update(self, state: TQCState, batch: Transition, key: Array) -> tuple[TQCState, dict[str, Array]]:
         """Take one gradient step of critics, actor and temperature, then average critics and actor.

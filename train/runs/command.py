@@ -36,7 +36,7 @@ class Reach(NewRunOptions):
     --engine and --mode are short for --env.engine and --env.mode.
     """
 
-    preset: Literal["quick", "paper"] = "quick"
+    preset: Literal["quick", "paper", "analytic"] = "quick"
     """settings to begin with; the defaults below are this preset's"""
     config: Annotated[TrainConfig, tyro.conf.arg(name="")]
     devices: Devices = None

@@ -13,6 +13,7 @@ from jax.sharding import Mesh
 from matplotlib.figure import Figure
 
 from mjx_softarm.env import ReachEnv
+from train.agent.analytic import Analytic
 from train.agent.hindsight_tqc import HindsightTQC
 from train.agent.imitation import Imitation
 from train.agent.learner import Learner
@@ -37,8 +38,10 @@ class Task(NamedTuple):
     prepare: Callable[[TrainState, int], TrainState]  # state, epoch that follows -> state
 
 
-def learner_of(config: TrainConfig, env: ReachEnv) -> Learner:
+def learner_of(config: TrainConfig, env: ReachEnv, mesh: Mesh | None = None) -> Learner:
     """Return the learner that a config of a reach run names."""
+    if config.learner == "analytic":
+        return Analytic(config.analytic, env, config.n_updates, mesh)
     return HindsightTQC(config, env)
 
 
@@ -64,7 +67,7 @@ def task_of(
     if isinstance(config, ImitationConfig):
         assert demonstrations is not None
         return _imitation(config, env, demonstrations, mesh, learner)
-    job = Job(config, env, learner or learner_of(config, env), mesh=mesh)
+    job = Job(config, env, learner or learner_of(config, env, mesh), mesh=mesh)
     return Task(
         job=job,
         title=f"{N_GOALS} held-out goals",

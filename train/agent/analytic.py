@@ -1,0 +1,169 @@
+"""Learning through the equilibrium: the simulator's own gradient teaches the policy.
+
+The pose at rest is a differentiable function of the spring references (`mjx_softarm.mechanics.implicit`), so
+the policy's parameters descend the error of the pose itself: no critic, no replay, no exploration. With
+a = pi(s) the action in state s, e(a) the scaled pose error after it, theta the tolerance of the goal and
+d_t(a) the distance of spring t from its reference [mm],
+
+    loss = E[ ||e(a)|| / theta + c sum_t d_t(a) ].
+
+A chamber at a pressure limit does not follow its reference, so the first term has no gradient with respect
+to it; the second pulls the reference back to what the chamber can reach. The law holds all other springs on
+their references. The learner has arms of its own that go on from where its actions led them, so it sees the
+states that the policy leads to, disturbances of the randomisation included. A part of them begins anew at
+each step. An environment's cost of clearance, where it has one, adds to the loss.
+
+Shapes: B arms, O observation, A action.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jax import Array
+from jax.sharding import Mesh
+
+from mjx_softarm._support import draws
+from mjx_softarm._support.mjx import State
+from mjx_softarm.env import ReachEnv
+from mjx_softarm.env.vector import VectorEnv, over_arms
+from mjx_softarm.mdp import rewards
+from train.agent.learner import Sample
+from train.agent.networks import Actor, mode
+
+Params = Any  # a flax parameter tree
+
+
+@dataclass(frozen=True)
+class AnalyticConfig:
+    """Hyperparameters of learning through the equilibrium. Raises ValueError naming a bad field."""
+
+    n_arms: int = 64  # arms of a gradient step
+    hidden: tuple[int, ...] = (256, 256, 256)  # width of each hidden layer of the policy
+    learning_rate: float = 2e-3  # of Adam
+    learning_rate_end: float = 0.01  # share of it left at the end; it falls along a half cosine
+    max_gradient_norm: float = 1.0  # a longer gradient is shortened to this
+    tau: float = 0.005  # Polyak rate of the mean policy, per gradient step
+    new_share: float = 0.33  # share of the arms that get a new start and goal after each step
+    saturation_cost_per_mm: float = 0.1  # c of the loss
+
+    def __post_init__(self) -> None:
+        required = {
+            "n_arms": (self.n_arms >= 1, "at least 1"),
+            "learning_rate": (self.learning_rate >= 0.0, "a number >= 0"),
+            "learning_rate_end": (0.0 <= self.learning_rate_end <= 1.0, "a number in [0, 1]"),
+            "max_gradient_norm": (self.max_gradient_norm > 0.0, "a number > 0"),
+            "tau": (0.0 < self.tau <= 1.0, "a number in (0, 1]"),
+            "new_share": (0.0 <= self.new_share <= 1.0, "a number in [0, 1]"),
+            "saturation_cost_per_mm": (self.saturation_cost_per_mm >= 0.0, "a number >= 0"),
+        }
+        for name, (holds, expected) in required.items():
+            if not holds:
+                raise ValueError(f"AnalyticConfig.{name}: got {getattr(self, name)}, expected {expected}")
+
+
+class AnalyticState(NamedTuple):
+    """All that an update changes."""
+
+    actor_params: Params
+    mean_actor_params: Params  # Polyak average of actor_params: the policy that comes of training
+    opt_state: optax.OptState
+    arms: State  # B
+
+
+class Analytic:
+    """`Learner` by the gradient of the equilibrium; it uses no replay.
+
+    Args:
+        config: hyperparameters.
+        env: the arm, at rest.
+        n_updates: gradient steps of the run, over which the learning rate falls.
+        mesh: devices over which the learner's arms are spread.
+    """
+
+    def __init__(self, config: AnalyticConfig, env: ReachEnv, n_updates: int, mesh: Mesh | None = None):
+        self.config, self.env, self.mesh = config, env, mesh
+        self.actor: Any = Actor(env.action_size, config.hidden)
+        self.arms = VectorEnv(env, config.n_arms, episode_length=1, mesh=mesh)
+        rate = optax.cosine_decay_schedule(config.learning_rate, n_updates, config.learning_rate_end)
+        self.optimizer = optax.chain(optax.clip_by_global_norm(config.max_gradient_norm), optax.adam(rate))
+
+    def init(self, key: Array) -> AnalyticState:
+        """Return a fresh policy, and arms at random poses."""
+        key_actor, key_arms = jax.random.split(key)
+        params = self.actor.init(key_actor, jnp.zeros((1, self.env.observation_size)))
+        return AnalyticState(
+            actor_params=params,
+            mean_actor_params=jax.tree.map(jnp.copy, params),  # so that the state can be donated
+            opt_state=self.optimizer.init(params),
+            arms=self.arms.reset(key_arms),
+        )
+
+    def act(self, state: AnalyticState, obs: Array, key: Array) -> Array:
+        """Return the policy's actions (..., A) at obs (..., O): nothing needs to be explored."""
+        return self.mode(state.actor_params, obs)
+
+    def policy(self, state: AnalyticState) -> Params:
+        """Return the parameters of the mean policy."""
+        return state.mean_actor_params
+
+    def mode(self, policy: Params, obs: Array) -> Array:
+        """Return the deterministic actions (..., A) in [-1, 1] at obs (..., O)."""
+        return mode(self.actor.apply(policy, obs)[0])
+
+    def update(
+        self, state: AnalyticState, sample: Sample, key: Array
+    ) -> tuple[AnalyticState, dict[str, Array]]:
+        """Take one gradient step, and one action of the learner's own arms."""
+        # Act and settle; the gradient of each arm's loss with respect to its own action.
+        action, pull_back = jax.vjp(lambda params: self.mode(params, state.arms.obs), state.actor_params)
+        step = over_arms(jax.value_and_grad(self._loss, has_aux=True), self.mesh)
+        (loss, after), d_action = step(action, state.arms)  # (B,), state, (B, A)
+
+        # Leave out arms that did not settle and gradients that are not finite, as at a pitch of 90 degrees.
+        valid = after.info["valid"] & jnp.all(jnp.isfinite(d_action), axis=-1)  # (B,)
+        d_action = jnp.where(valid[:, None], d_action, jnp.zeros_like(d_action)) / self.config.n_arms
+        (gradient,) = pull_back(d_action)
+
+        # Descend.
+        change, opt_state = self.optimizer.update(gradient, state.opt_state, state.actor_params)
+        actor_params = optax.apply_updates(state.actor_params, change)
+        next_state = AnalyticState(
+            actor_params=actor_params,
+            mean_actor_params=optax.incremental_update(
+                actor_params, state.mean_actor_params, self.config.tau
+            ),
+            opt_state=opt_state,
+            arms=self._go_on(after, key),
+        )
+        metrics = {
+            "loss": jnp.sum(loss, where=valid) / jnp.maximum(jnp.sum(valid), 1),
+            "gradient_norm": optax.global_norm(gradient),
+            "left_out": jnp.mean(~valid),
+        }
+        return next_state, {f"analytic/{name}": x for name, x in metrics.items()}
+
+    def _loss(self, action: Array, arm: State) -> tuple[Array, State]:
+        """Return the loss of an action (A,) of one arm, and the state that it leads to."""
+        after = self.env.step(arm, action)
+        end = after.pipeline_state
+        error = rewards.scaled_error(end.pose, end.goal, self.env.config.reward)  # (6,)
+        norm = jnp.sqrt(jnp.sum(error**2) + 1e-12)
+        off_m = self.env.reference_m(action) - (end.spring_m + end.sensor_offset_m)  # (A,)
+        cost = self.config.saturation_cost_per_mm * 1e3 * jnp.sum(jnp.abs(off_m))
+        cost += self.env.clearance_cost(after.info["clearance_mm"])
+        return norm / self.env.config.reward.threshold + cost, after
+
+    def _go_on(self, after: State, key: Array) -> State:
+        """Return the arms as they stand, some of them with a new start and goal."""
+        key_new, key_reset = jax.random.split(key)
+        new = draws.uniform(key_new, (self.config.n_arms,)) < self.config.new_share
+        new |= ~after.info["valid"]
+        fresh = self.arms.reset(key_reset)
+        return jax.tree.map(
+            lambda x, y: jnp.where(new.reshape((-1,) + (1,) * (x.ndim - 1)), x, y), fresh, after
+        )
