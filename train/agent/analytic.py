@@ -122,6 +122,7 @@ class Analytic:
         # Act and settle; the gradient of each arm's loss with respect to its own action.
         action, pull_back = jax.vjp(lambda params: self.mode(params, state.arms.obs), state.actor_params)
         step = over_arms(jax.value_and_grad(self._loss, has_aux=True), self.mesh)
+        d_action: Array
         (loss, after), d_action = step(action, state.arms)  # (B,), state, (B, A)
 
         # Leave out arms that did not settle and gradients that are not finite, as at a pitch of 90 degrees.
