@@ -47,15 +47,13 @@ def bent(bend_rad, length_m, site_m):
     """Markers (9, 3) of an arm bent to a circle about the x axis, towards +y."""
     angle = bend_rad * np.arange(1, 10) / 9
     radius = length_m / bend_rad - site_m[1]  # to the markers, from the circle's centre
-    centre_y = length_m / bend_rad
-    return np.column_stack(
-        [np.full(9, site_m[0]), centre_y - radius * np.cos(angle), -radius * np.sin(angle)]
-    )
+    y_m = length_m / bend_rad - radius * np.cos(angle)
+    return np.column_stack([np.full(9, site_m[0]), y_m, -radius * np.sin(angle)])
 
 
 def test_a_straight_arm_has_its_length_everywhere():
     site = np.array([0.03, 0.02])
-    marker_m = np.column_stack([np.full(9, site[0]), np.full(9, site[1]), -0.63 * np.arange(1, 10) / 9])
+    marker_m = np.outer(np.arange(1, 10) / 9, [0.0, 0.0, -0.63]) + [*site, 0.0]
     curve, left = fit_curve(marker_m, site)
     np.testing.assert_allclose(chamber_lengths(curve, site, SPEC), 0.21, rtol=1e-9)
     assert np.abs(left).max() < 1e-12
@@ -64,9 +62,8 @@ def test_a_straight_arm_has_its_length_everywhere():
 @pytest.mark.parametrize("site", [(0.0, 0.0), (0.0, 0.067), (0.03, -0.02)])
 def test_a_circle_s_chambers_differ_by_their_distance_from_its_centre(site):
     """A chamber y nearer to the centre of a bend by b is shorter by y b."""
-    bend, length = 1.2, 0.6
-    curve, left = fit_curve(bent(bend, length, np.array(site)), np.array(site))
-    expected = (length - bend * SITE_M[:, 1]) / 3
+    curve, left = fit_curve(bent(1.2, 0.6, site), np.array(site))
+    expected = (0.6 - 1.2 * SITE_M[:, 1]) / 3
     np.testing.assert_allclose(chamber_lengths(curve, np.array(site), SPEC), expected, rtol=0.01)
     assert np.abs(left).max() < 3e-4
 
@@ -99,8 +96,8 @@ def test_poses_without_markers_are_left_out(arm):
     [
         (lambda m: m[:, :4], "got 4, expected 5 or more"),
         (lambda m: m[:, :8], "got 8, expected .* as many in each of 3 sections"),
-        (lambda m: m + np.nan, "no pose at rest has them"),
-        (lambda m: m + [0.0, 0.0, 0.3], "mm above the tip's plate, expected in it"),
+        (lambda m: m + np.nan, "got no pose at rest that has them"),
+        (lambda m: m + [0.0, 0.0, 0.3], "mm above the tip's plate, expected it in the"),
     ],
 )
 def test_refuses(arm, change, message):

@@ -17,7 +17,7 @@ from mjx_softarm.mechanics.settle import settle
 from mjx_softarm.mechanics.statics import ArmParams
 from mjx_softarm.mechanics.workspace import sample_workspace
 from mjx_softarm.sensing.pose import frame_from_pose, pose_from_frame
-from mjx_softarm.sensing.s2r import apply_correction, correct, correction, extrapolation, load_s2r, save_s2r
+from mjx_softarm.sensing.s2r import apply_correction, correct, correction, extrapolation
 
 N_ROWS, N_CLEAN = 1_000, 500
 BRIEF = NetworkConfig(hidden=(16,), n_members=2, n_updates=100)
@@ -77,19 +77,6 @@ def test_simulation_holds_the_spring_lengths_of_unsaturated_poses(spec):
     assert errors.translation_95_mm < 0.1 and errors.rotation_95_deg < 0.05
 
 
-@pytest.mark.parametrize(
-    "reference, message",
-    [
-        (np.zeros((4, 8)), r"got an array \(4, 8\), expected \(n, 9\)"),
-        (np.zeros((0, 9)), r"got an array \(0, 9\)"),
-        (np.full((2, 9), np.nan), "row 0, spring 0: got nan, expected a finite number"),
-    ],
-)
-def test_simulation_refuses(spec, reference, message):
-    with pytest.raises(ValueError, match=message):
-        simulate_poses(spec, reference)
-
-
 def test_planted_arm_is_corrected_on_rows_that_took_no_part(arms, fit):
     pose_sim, spring_m, true = (a[N_ROWS:] for a in arms)  # without noise
     after, before = pose_errors(correct(fit.s2r, pose_sim, spring_m), true), pose_errors(pose_sim, true)
@@ -120,11 +107,6 @@ def test_states_far_from_the_log_are_flagged_and_stay_bounded(spec, arms, fit):
     assert (np.abs(change_mm) <= largest[:3] + 1e-6).all()
 
 
-def test_fitted_network_goes_through_its_file(fit, tmp_path):
-    save_s2r(tmp_path / "s2r.npz", fit.s2r)
-    jax.tree.map(np.testing.assert_array_equal, load_s2r(tmp_path / "s2r.npz"), fit.s2r)
-
-
 def test_held_out_rows_take_no_part_and_the_seed_decides(arms):
     pose_sim, spring_m, true = (a[:N_ROWS] for a in arms)
     first = fit_s2r(pose_sim, spring_m, true, seed=7, config=BRIEF)
@@ -142,12 +124,16 @@ def test_warns_of_few_rows_no_gain_and_another_frame(arms):
     perfect = fit_s2r(pose_sim, spring_m, pose_sim, config=BRIEF).warnings
     assert "got 150 rows" in perfect[0] and "no better than 0 without" in perfect[1]
     turned = moved(true, np.broadcast_to([0, 0, 0, 0, 0, np.tan(np.radians(60.0))], (150, 6)))
-    assert any(
-        "in 150 of 150 rows" in text for text in fit_s2r(pose_sim, spring_m, turned, config=BRIEF).warnings
-    )
+    assert "in 150 of 150 rows" in fit_s2r(pose_sim, spring_m, turned, config=BRIEF).warnings[1]
 
 
-def test_fit_refuses_what_does_not_fit_together(arms):
+def test_refuses_what_does_not_fit_together(spec, arms):
+    for reference, message in (
+        (np.zeros((4, 8)), r"\(4, 8\)"),
+        (np.full((2, 9), np.nan), "spring 0: got nan"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            simulate_poses(spec, reference)
     pose_sim, spring_m, true = (a[:150] for a in arms)
     with pytest.raises(ValueError, match=r"got \(150, 6\), \(150, 9\), \(149, 6\)"):
         fit_s2r(pose_sim, spring_m, true[:-1])
@@ -162,24 +148,12 @@ def test_one_network_says_the_mean_of_its_members():
     y = np.stack([np.sin(3.0 * x[:, 0]), 5.0 + x[:, 0] * x[:, 1]], axis=1)
     config = NetworkConfig(hidden=(8, 4), n_members=3, n_updates=50)
     network = fit_network(x, y, 0, config).network
-    assert [weight.shape for weight, _ in network.layers] == [
-        (2, 3 * 8 + 2),
-        (3 * 8 + 2, 3 * 4 + 2),
-        (3 * 4 + 2, 2),
-    ]  # three members and the line
+    shapes = [weight.shape for weight, _ in network.layers]  # three members and the line
+    assert shapes == [(2, 3 * 8 + 2), (3 * 8 + 2, 3 * 4 + 2), (3 * 4 + 2, 2)]
     z = 2.0 * (x - network.input_low) / (network.input_high - network.input_low) - 1.0
     (w0, b0), (w1, b1), (w2, b2) = network.layers
-    members = [
-        mlp(
-            (
-                (w0[:, 8 * k : 8 * k + 8], b0[8 * k : 8 * k + 8]),
-                (w1[8 * k : 8 * k + 8, 4 * k : 4 * k + 4], b1[4 * k : 4 * k + 4]),
-                (3.0 * w2[4 * k : 4 * k + 4], 0.0),
-            ),
-            z,
-        )
-        for k in range(3)
-    ]
+    slices = [(slice(8 * k, 8 * k + 8), slice(4 * k, 4 * k + 4)) for k in range(3)]
+    members = [mlp(((w0[:, a], b0[a]), (w1[a, b], b1[b]), (3.0 * w2[b], 0.0)), z) for a, b in slices]
     expected = np.mean(members, axis=0) + (z + 1.0) @ w2[-2:] + b2
     np.testing.assert_allclose(mlp(network.layers, z), expected, rtol=1e-5, atol=1e-5)
 

@@ -53,7 +53,7 @@ def test_trunk_turned_tip():
     ("name", "n_rows", "share", "jumps"),
     [("apr5", 4_338, 0.70, {1: 0, 2: 40}), ("apr4", 1_773, 0.59, {1: 6, 2: 298})],
 )
-def test_asu_faults(name, n_rows, share, jumps):
+def test_asu_faults_and_units(name, n_rows, share, jumps):
     path = DATA / f"asu_softarm/{name}_data_collect_1.txt"
     log, findings = read_asu(path)
     raw = np.loadtxt(path, delimiter=",")
@@ -70,13 +70,7 @@ def test_asu_faults(name, n_rows, share, jumps):
         np.testing.assert_allclose(np.abs((kept * file).sum(axis=1)), 1.0, atol=1e-5)
     assert not np.isnan(log.quaternion[:, 0]).any()
 
-
-@real
-@pytest.mark.parametrize("name", ["apr5", "apr4"])
-def test_asu_units(name):
-    """Pressures step between 1 and 15 psi; the wires of section 1 move as the distance of base and middle."""
-    log, _ = read_asu(DATA / f"asu_softarm/{name}_data_collect_1.txt")
-    raw = np.loadtxt(DATA / f"asu_softarm/{name}_data_collect_1.txt", delimiter=",")
+    # Pressures step between 1 and 15 psi; the wires of section 1 move as the distance of base and middle.
     assert log.desired_kpa.min() == pytest.approx(PSI) and log.desired_kpa.max() == pytest.approx(15.0 * PSI)
     np.testing.assert_allclose(log.desired_kpa / PSI, raw[:, [1, 2, 3, 7, 8, 9]], rtol=1e-9)
     np.testing.assert_allclose(log.pressure_kpa / PSI, raw[:, [4, 5, 6, 10, 11, 12]], rtol=1e-9)
@@ -137,12 +131,8 @@ def test_asu_columns(asu_file):
     np.testing.assert_array_equal(log.row, np.arange(60) + 1)
     np.testing.assert_allclose(log.desired_kpa.mean(axis=0) / PSI, [1, 2, 3, 7, 8, 9], atol=0.01)
     np.testing.assert_allclose(log.pressure_kpa.mean(axis=0) / PSI, [4, 5, 6, 10, 11, 12], atol=0.01)
-    np.testing.assert_allclose(
-        wire_length_m(log.wire_v).mean(axis=0), np.array([13, 14, 15, 16]) / 5.0, atol=0.01
-    )
-    np.testing.assert_allclose(
-        log.position_m.mean(axis=0), np.outer([0.0, -0.1, -0.2], np.ones(3)), atol=0.001
-    )
+    np.testing.assert_allclose(wire_length_m(log.wire_v).mean(axis=0), np.arange(13, 17) / 5.0, atol=0.01)
+    np.testing.assert_allclose(log.position_m.mean(axis=0), [[0.0] * 3, [-0.1] * 3, [-0.2] * 3], atol=0.001)
     np.testing.assert_allclose(log.quaternion[:, 1], quaternions(60)[:, [3, 0, 1, 2]], atol=1e-8)
 
 
@@ -166,9 +156,7 @@ def trunk_file(tmp_path):
             columns |= {f"{axis}{disk}": disk + 0.01 * rng.standard_normal(n) for axis in "xyz"}
         for disk in (1, 2, 3):
             parts = quaternions(n, turned if disk == 3 else ()).T
-            columns |= {
-                f"{name}{disk}": part for name, part in zip(("qx", "qy", "qz", "w"), parts, strict=True)
-            }
+            columns |= {f"{n}{disk}": q for n, q in zip(("qx", "qy", "qz", "w"), parts, strict=True)}
         columns |= {f"phi{k}": 10.0 * k + rng.standard_normal(n) for k in range(1, 7)}
         for row in stale:
             for name in ("x3", "y3", "z3"):
@@ -185,10 +173,8 @@ def test_trunk_planted_faults(trunk_file):
     log, findings = read_trunk(trunk_file(turned=(30, 31), stale=(10, 59)))
     assert np.flatnonzero(~log.fresh).tolist() == [10, 59]
     assert np.flatnonzero(np.isnan(log.quaternion[:, 2, 0])).tolist() == [30, 31]
-    assert [(f.column, f.rows, f.n_dropped) for f in findings] == [
-        ("body 2", (12, 61), 2),
-        ("body 2 quaternion", (32, 33), 0),
-    ]
+    faults = [(f.column, f.rows, f.n_dropped) for f in findings]
+    assert faults == [("body 2", (12, 61), 2), ("body 2 quaternion", (32, 33), 0)]
     np.testing.assert_allclose(log.quaternion[:, 0], quaternions(60)[:, [3, 0, 1, 2]], atol=1e-8)
     np.testing.assert_allclose(log.motor_deg.mean(axis=0), 10.0 * np.arange(1, 7), atol=0.5)
     np.testing.assert_allclose(log.position_m.mean(axis=0), np.outer([1, 2, 3], np.ones(3)), atol=0.01)

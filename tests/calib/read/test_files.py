@@ -13,27 +13,18 @@ UNREADABLE = {
     "header only": (HEADER + "\n", "a header and no rows"),
     "header without newline": (HEADER, "a header and no rows"),
     "one row": (simple(moving(1)), "1 row, expected 2 at least"),
-    "all NaN": (
-        simple([f"{0.1 * k},0.{k},nan,-0.6{k}" for k in range(9)]),
-        "tip_y: no number in the whole column",
-    ),
+    "all NaN": (simple([f"{0.1 * k},0.{k},nan,-0.6" for k in range(9)]), "tip_y: no number in the whole col"),
     "semicolons": (simple(moving(9)).replace(",", ";"), "line 1: .*got semicolons"),
     "tabs": (simple(moving(9)).replace(",", "\t"), "line 1: .*got tabs"),
     "semicolons in rows": (
         simple([r.replace(",", ";") for r in moving(9)]),
-        "line 2: got 1 cells, and semicolons",
+        "2: got 1 cells, and semicolons",
     ),
-    "decimal commas": (
-        simple([r.replace(".", ",") for r in moving(9)]),
-        "line 2: got 8 cells; decimal commas?",
-    ),
+    "decimal commas": (simple([r.replace(".", ",") for r in moving(9)]), "2: got 8 cells; decimal commas"),
     "UTF-16": (simple(moving(9)).encode("utf-16"), "UTF-16 text, expected UTF-8"),
     "UTF-16 without mark": (simple(moving(9)).encode("utf-16-le"), "UTF-16 text, expected UTF-8"),
     "binary": (bytes(range(256)) * 40, "a binary file, expected CSV"),
-    "latin-1": (
-        "t\xe9mps [s],tip_x [m]\n".encode("latin-1"),
-        "line 1: neither UTF-8 text nor npz: byte 0xe9 at 1",
-    ),
+    "latin-1": (b"t\xe9mps [s],tip_x [m]\n", "line 1: neither UTF-8 text nor npz: byte 0xe9 at 1"),
     "late binary": ((simple(moving(4000)) + "\x00\x01,2,3,4\n").encode(), r"line 4002: time \[s\]: got"),
     "ragged": (simple([*moving(5), "0.1,0.2,0.3", *moving(9, 6)]), "line 7: got 3 cells; expected 4"),
     "cut off": (simple(moving(5)) + "0.1,0.0", "line 7: got 2 cells; expected 4"),
@@ -42,19 +33,10 @@ UNREADABLE = {
     "no time": (simple(["0.1,0.2,-0.6"] * 3, HEADER[9:]), "time: missing, expected a column `time"),
     "time alone": ("time [s]\n0\n1\n", "parted by commas"),
     "nothing measured": (simple(["0,1", "1,1"], "time [s],payload [g]"), "expected frequency0.., spring0.."),
-    "part of a group": (
-        simple(["0,1", "1,1"], "time [s],tip_x [m]"),
-        "tip_y, tip_z: got no such column, expected it beside tip_x",
-    ),
+    "part of a group": (simple(["0,1", "1,1"], "time [s],tip_x [m]"), "tip_y, tip_z: got no .* beside tip_x"),
     "twice": (simple([f"{r},1" for r in moving(4)], HEADER + ",tip_x [m]"), "tip_x: 2 columns of this name"),
-    "no unit": (
-        simple(moving(9), HEADER.replace(" [s]", "")),
-        r"time: got no unit, expected one of \[s\], \[ms\]",
-    ),
-    "unknown unit": (
-        simple(moving(9), HEADER.replace("[s]", "[h]")),
-        r"time: got \[h\], expected one of \[s\]",
-    ),
+    "no unit": (simple(moving(9), HEADER.replace(" [s]", "")), r"time: got no unit, expected one of \[s\]"),
+    "unknown unit": (simple(moving(9), HEADER.replace("[s]", "[h]")), r"got \[h\], expected one of \[s\]"),
     "other arm": (simple(["0,1", "1,1"], "time [s],spring9 [mm]"), "spring9: expected a log of 9 chambers"),
 }
 
@@ -68,48 +50,32 @@ def test_unreadable_file_is_refused_in_readable_lines(text, case):
     assert all(line.startswith(f"{path}: ") for line in str(error.value).splitlines())
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "message"),
-    [
-        ("a.npz", b"not a zip file", "expected an npz file"),
-        ("a.npz", b"", "expected an npz file"),
-        ("a.npz", b"PK\x03\x04" + b"\x00" * 50, "expected an npz file"),
-        ("a.csv", b"PK\x03\x04" + b"\x00" * 50, "a binary file"),
-    ],
-)
-def test_broken_npz(text, name, content, message):
-    with pytest.raises(LogError, match=message):
-        read_log(text(content, name))
+@pytest.mark.parametrize("content", [b"not a zip file", b"", b"PK\x03\x04" + b"\x00" * 50])
+def test_broken_npz(text, content):
+    with pytest.raises(LogError, match="expected an npz file"):
+        read_log(text(content, "a.npz"))
 
 
 @pytest.mark.parametrize(
-    ("arrays", "message"),
+    ("columns", "table", "message"),
     [
-        ({"columns": np.array(["time [s]"])}, "table is not a file"),
-        (
-            {"columns": np.array(["time [s]"]), "table": np.zeros((3, 2))},
-            r"got columns \(1,\) of <U8, table \(3, 2\)",
-        ),
-        ({"columns": np.array(["time [s]"]), "table": np.array([["a"]])}, "of <U1"),
-        ({"columns": np.array(["time [s]"]), "table": np.zeros((0, 1))}, "no rows"),
-        ({"columns": np.array([{}]), "table": np.zeros((3, 1))}, "allow_pickle=False"),
+        (["time [s]"], None, "table is not a file"),
+        (["time [s]"], np.zeros((3, 2)), r"got columns \(1,\) of <U8, table \(3, 2\)"),
+        (["time [s]"], [["a"]], "of <U1"),
+        (["time [s]"], np.zeros((0, 1)), "no rows"),
+        ([{}], np.zeros((3, 1)), "allow_pickle=False"),
     ],
 )
-def test_npz_of_other_things(tmp_path, arrays, message):
-    np.savez(tmp_path / "a.npz", **arrays)
+def test_npz_of_other_things(tmp_path, columns, table, message):
+    np.savez(tmp_path / "a.npz", columns=np.array(columns), **({} if table is None else {"table": table}))
     with pytest.raises(LogError, match=message):
         read_log(tmp_path / "a.npz")
 
 
 def test_folder_missing_file_and_missing_permission(tmp_path, monkeypatch):
-    for path, message in [
-        (tmp_path, "Is a directory"),
-        (tmp_path / "no.csv", "No such file"),
-        (tmp_path / "no.npz", "No such"),
-    ]:
-        with pytest.raises(LogError, match=message) as error:
-            read_log(path)
-        assert str(error.value).startswith(f"{path}: ")
+    for name, message in (("", "Is a directory"), ("no.csv", "No such file"), ("no.npz", "No such")):
+        with pytest.raises(LogError, match=f"^{tmp_path / name}: .*{message}"):
+            read_log(tmp_path / name)
 
     def refuse(*_, **__):
         raise PermissionError(13, "Permission denied")
@@ -119,43 +85,21 @@ def test_folder_missing_file_and_missing_permission(tmp_path, monkeypatch):
         read_log(tmp_path / "a.csv")
 
 
-def test_empty_cells_blank_lines_and_marks_of_other_programs(text):
+def test_empty_cells_blank_lines_unknown_columns_and_marks_of_other_programs(text):
     rows = moving(9)
     rows[3] = rows[3].split(",")[0] + ",,0.1,-0.6"
-    content = "\ufeff" + simple(rows).replace("\n", "\r\n").replace("0.04,", "\r\n0.04,") + "\r\n"
-    log, findings = read_log(text(content))
-    assert [(f.column, f.rows) for f in findings] == [("tip_x", (6, 6))]
+    rows = [f"{row},5" for row in rows]
+    content = simple(rows, HEADER + ",operator").replace("\n", "\r\n").replace("0.04,", "\r\n0.04,")
+    log, findings = read_log(text("\ufeff" + content + "\r\n"))
+    assert [(f.column, f.rows) for f in findings] == [("operator", (1, 1)), ("tip_x", (6, 6))]
     assert list(log.row) == [2, 3, 5, 7, 8, 9, 10, 11]
 
 
-def test_unknown_column_is_reported_and_ignored(text):
-    log, findings = read_log(text(simple([f"{row},5" for row in moving(9)], HEADER + ",operator")))
-    assert [(f.column, f.problem) for f in findings] == [("operator", "unknown column, ignored")]
-    assert len(log) == 9
-
-
-@pytest.mark.slow
-def test_a_million_rows(tmp_path):
-    """One of 23 columns, 0.2 GB; every row is there, and a fault near the end has its line."""
-    rng = np.random.default_rng(0)
-    tails = []
-    for _ in range(997):
-        values = (rng.uniform(100, 300, 9), rng.uniform(-40, 20, 9), rng.uniform(-200, 200, 2))
-        tails.append(
-            "".join(f",{value:.3f}" for value in np.concatenate(values)) + f",{-rng.uniform(500, 600):.3f}\n"
-        )
-    header = ["time [s]", *(f"spring{k} [mm]" for k in range(9)), *(f"pressure{k} [kPa]" for k in range(9))]
-    header += [f"tip_{axis} [mm]" for axis in "xyz"]
-    n = 1_000_000
-    with (tmp_path / "long.csv").open("w") as out:
-        out.write(",".join(header) + "\n")
-        for start in range(0, n, 10_000):
-            out.writelines(f"{0.02 * k:.2f}{tails[k % 997]}" for k in range(start, start + 10_000))
-    with (tmp_path / "long.csv").open("r+b") as out:
-        content = f"{0.02 * (n - 1):.2f}{tails[(n - 1) % 997]}"
-        out.seek(-len(content), 2)
-        out.write(content.replace(content.split(",")[1], "nan".ljust(len(content.split(",")[1])), 1).encode())
-    log, findings = read_log(tmp_path / "long.csv")
-    assert [(f.column, f.rows, f.n_dropped) for f in findings] == [("spring0", (n + 1, n + 1), 1)]
-    assert len(log) == n - 1
-    np.testing.assert_allclose(log.time_s[-1], 0.02 * (n - 2))
+def test_a_long_file_is_read_whole_and_a_late_fault_has_its_line(text):
+    """More than the 4 MiB that are searched at once for the number of lines."""
+    n = 150_000
+    rows = [f"{0.02 * k:.2f},{0.2 * np.sin(0.01 * k):.9f},0.1,-0.6" for k in range(n)]
+    rows[-2] = f"{0.02 * (n - 2):.2f},nan,0.1,-0.6"
+    log, findings = read_log(text(simple(rows)))
+    assert [(f.column, f.rows, f.n_dropped) for f in findings] == [("tip_x", (n, n), 1)]
+    assert len(log) == n - 1 and log.time_s[-1] == pytest.approx(0.02 * (n - 1))

@@ -14,11 +14,22 @@ from tests.calib.read.arm_logs import N, arm_log, csv, planted
 @pytest.mark.parametrize("name", ["arm.csv", "arm.npz"])
 @pytest.mark.parametrize("seed", range(3))
 def test_clean_log_comes_back_without_findings(file, name, seed):
-    log, findings = read_log(file(name, seed=seed), strict=True)
+    changes = {"seed": seed, "sequence": np.repeat(np.arange(8.0), N // 8)}
+    log, findings = read_log(file(name, **changes), strict=True)
     assert findings == []
-    expected = arm_log(seed=seed)
+    expected = arm_log(**changes)
     np.testing.assert_array_equal(log.row, expected.row)
-    for group in ("time_s", "readings", "spring_m", "tip_m", "tip_quaternion", "marker_m", "payload_kg"):
+    groups = (
+        "time_s",
+        "readings",
+        "spring_m",
+        "tip_m",
+        "tip_quaternion",
+        "marker_m",
+        "payload_kg",
+        "sequence",
+    )
+    for group in groups:
         np.testing.assert_allclose(getattr(log, group), getattr(expected, group), rtol=1e-8, atol=1e-9)
     assert log.goal is None and log.estimate is None and log.reference_m is None
 
@@ -47,30 +58,21 @@ def test_units_and_order_of_the_file_do_not_matter(text):
     """Each unit of UNITS gives the same log, against factors known apart from the code."""
     known = {"ms": 1e-3, "kHz": 1e3, "MHz": 1e6, "mm": 1e-3, "cm": 1e-2, "Pa": 1e-3, "bar": 1e2, "mbar": 0.1}
     known |= {"psi": 6.894757293, "g": 1e-3, "rad": 57.29577951}
+    pose_mm = {"m": 1e3, "cm": 10.0, "mm": 1.0}
     expected = arm_log(n=20, goal=np.tile([0.0, 120.0, -500.0, 10.0, -20.0, 30.0], (20, 1)))
     columns, table = log_table(expected)
     inside = table * [UNITS[c.kind][c.unit] for c in columns]
     rng = np.random.default_rng(0)
     for trial in range(8):
         units = [rng.choice(list(UNITS[c.kind])) for c in columns]
-        pose_mm = {"m": 1e3, "cm": 10.0, "mm": 1.0}
-        factors = [
-            pose_mm[u] if c.kind == "pose_length" else known.get(u, 1.0)
-            for c, u in zip(columns, units, strict=True)
-        ]
+        pairs = zip(columns, units, strict=True)
+        factors = [pose_mm[u] if c.kind == "pose_length" else known.get(u, 1.0) for c, u in pairs]
         order = rng.permutation(len(columns))
         headers = [f"{columns[k].name} [{units[k]}]" for k in order]
         content = csv(headers, (inside / factors)[:, order])
         log, findings = read_log(text(content, f"{trial}.csv"), strict=True)
         assert findings == []
         np.testing.assert_allclose(log_table(log)[1], table, rtol=1e-8, atol=1e-7)
-
-
-def test_ids_of_demonstrations_are_read(file):
-    sequence = np.repeat(np.arange(8.0), N // 8)
-    log, findings = read_log(file(sequence=sequence), strict=True)
-    assert findings == []
-    np.testing.assert_array_equal(log.sequence, sequence)
 
 
 def test_template_is_valid_and_its_text_names_all_columns(tmp_path):
@@ -89,10 +91,8 @@ def test_all_findings_are_in_the_message_of_strict(file):
     changes = planted("spring_m", [4], np.nan, 1) | planted("pressure_kpa", [8], np.nan, 2)
     with pytest.raises(LogError) as error:
         read_log(file(**changes), strict=True)
-    assert [line.split(": ")[1:3] for line in str(error.value).splitlines()] == [
-        ["line 6", "spring1"],
-        ["line 10", "pressure2"],
-    ]
+    found = [line.split(": ")[1:3] for line in str(error.value).splitlines()]
+    assert found == [["line 6", "spring1"], ["line 10", "pressure2"]]
 
 
 def test_logs_of_one_arm_and_of_two():
