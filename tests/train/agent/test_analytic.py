@@ -14,7 +14,7 @@ from train.config import ConfigError, TrainConfig
 
 SHORT = ArmSpec.default().replace(structure={"n_sections": 1, "links_per_section": 2})
 CONFIG = AnalyticConfig(n_arms=32, hidden=(32, 32), tau=0.05)
-N_UPDATES = 100
+N_UPDATES = 150
 
 
 @pytest.fixture(scope="module")
