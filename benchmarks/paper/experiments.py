@@ -6,13 +6,12 @@ import dataclasses
 from pathlib import Path
 from typing import Any, Literal
 
-from benchmarks.harness.common import RESULTS
+from benchmarks.harness.common import RESULTS, show
 from benchmarks.paper.engine import SMOKE, Settings, claim, run_stages
-from benchmarks.paper.report import PAGES, write_report
+from benchmarks.paper.report import printed_rows, write_report
 from benchmarks.paper.summary import load_results
-from benchmarks.paper.trials import stages
+from benchmarks.paper.trials import FILMS, stages
 from mjx_softarm._support import cli
-from mjx_softarm._support.provenance import provenance
 
 
 def paper(
@@ -40,11 +39,13 @@ def paper(
     chosen = {name: value for name, value in given.items() if value is not None}
     settings = dataclasses.replace(SMOKE if smoke else Settings(), **chosen)
     folder = out or Path("runs/paper-smoke" if smoke else "runs/paper")
-    for experiment in [only] if only else PAGES:
-        data = run(experiment, folder, folder if smoke else RESULTS, settings)
+    pictures = folder if smoke else RESULTS
+    for experiment in [only] if only else FILMS:
+        data = run(experiment, folder, pictures, settings)
+        show({"mean and deviation over runs": printed_rows(experiment, data["spreads"])}, experiment)
         for check in data["goals"]:
             print(f"{'met    ' if check['met'] else 'NOT MET'}  {check['text']}: {check['value']}")
-        print(f"report: {folder / PAGES[experiment]}")
+        print(f"written: {pictures / f'paper-{experiment}.json'}")
     return 0
 
 
@@ -55,6 +56,6 @@ def run(experiment: str, folder: Path, pictures: Path, settings: Settings) -> di
         JobError: a stage failed, or the folder has other settings.
     """
     claim(folder, settings)
-    no_film = run_stages(folder, settings, stages(experiment, settings)).get("film", "")
-    results = load_results(folder, experiment, settings)
-    return write_report(experiment, folder, pictures, settings, results, no_film, provenance("benchmarks"))
+    if no_film := run_stages(folder, settings, stages(experiment, settings)).get("film"):
+        print(f"no film: {no_film}")
+    return write_report(experiment, folder, pictures, settings, load_results(folder, experiment, settings))

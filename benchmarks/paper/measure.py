@@ -9,7 +9,6 @@ container's place lies where the finger tips were; else it has fallen beside the
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -213,12 +212,9 @@ def _point_of(goal: np.ndarray, goals: np.ndarray) -> int:
 def save_outcome(path: Path, outcome: Outcome) -> None:
     """Write an outcome whole or not at all."""
     part = path.with_name(path.name + ".part")
-    try:
-        with part.open("wb") as file:
-            np.savez_compressed(file, **outcome._asdict())
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
+    with part.open("wb") as file:
+        np.savez_compressed(file, **outcome._asdict())
+    part.replace(path)
 
 
 def load_outcome(path: Path) -> Outcome:

@@ -6,33 +6,19 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib import colormaps
 from matplotlib.figure import Figure
 
-from benchmarks.paper.film import outline_mm
 from benchmarks.paper.kinds import KINDS, Trial
-from benchmarks.paper.measure import Outcome, finger_tips
+from benchmarks.paper.measure import Outcome
 from benchmarks.paper.summary import PAPER_LOADS_MM, SUCCESS, Results, Row, Training
-from mjx_softarm.mechanics.pipe import PIPES_MM, CrossPipe
-from mjx_softarm.spec import ArmSpec
 from train.runs.plots import BLUE, GREY, INK, ORANGE, STEPS, dress
 
 GREEN, RED = "#2a9d6f", "#c43333"
-N_PER_SECTION = 3
-TRACE_S = 0.5  # between the drawn ticks of a trace
-SEEN_Z_MM = (-880.0, -330.0)  # part of the pipe that is drawn, around its crossing
 LOSSES = ("tqc/critic_loss", "tqc/actor_loss", "gail/discriminator_loss")
 
-Outcomes = Mapping[Trial, Outcome]
+COLOURS = {"without": ORANGE, "with": BLUE, "gradient": GREEN}  # of the kinds that follow the circle
+
 Style = tuple[str, str]  # label and colour
-OPEN_STYLES: Mapping[str, Style] = {
-    kind: (KINDS[kind].title, colour)
-    for kind, colour in (("without", ORANGE), ("with", BLUE), ("gradient", GREEN))
-}
-CIRCLE_STYLES: Mapping[str, Style] = {
-    "with": ("without demonstrations", ORANGE),
-    "circle": (KINDS["circle"].title, BLUE),
-}
 
 
 def _band(panel: Any, steps: np.ndarray, lines: np.ndarray, style: Style) -> None:
@@ -43,18 +29,12 @@ def _band(panel: Any, steps: np.ndarray, lines: np.ndarray, style: Style) -> Non
     panel.plot(steps, mean, color=colour, label=label, linewidth=1.5)
 
 
-def _legend_below(figure: Figure, panels: Sequence[Any]) -> None:
-    """Draw the first panel's legend below all panels, two entries wide for each."""
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, frameon=False, loc="outside lower center", ncols=2 * len(panels))
-
-
-def circle_figure(outcomes: Outcomes, styles: Mapping[str, Style]) -> Figure:
+def circle_figure(outcomes: Mapping[Trial, Outcome]) -> Figure:
     """Draw the circle from above, reference and path of each kind: a panel for each twin, its first seed.
 
     Points at which a chamber is saturated are ringed.
     """
-    chosen = {t: outcome for t, outcome in outcomes.items() if t.kind in styles and not t.load_g}
+    chosen = {t: outcome for t, outcome in outcomes.items() if not t.load_g}
     twins, seed = sorted({trial.twin for trial in chosen}), min(trial.seed for trial in chosen)
     figure = Figure(figsize=(4.0 * len(twins) + 0.4, 4.7), layout="compressed")
     panels = figure.subplots(1, len(twins), squeeze=False, sharex=True, sharey=True)[0]
@@ -64,13 +44,14 @@ def circle_figure(outcomes: Outcomes, styles: Mapping[str, Style]) -> Figure:
         here = {trial.kind: outcome for trial, outcome in chosen.items() if trial[1:3] == (twin, seed)}
         goal = next(iter(here.values())).goal
         panel.plot(*_closed(goal), "--", color=INK, linewidth=1.2, label="reference")
-        for kind, (label, colour) in styles.items():
-            tip = here[kind].goal + here[kind].error
-            panel.plot(*_closed(tip), "o-", color=colour, linewidth=1.0, markersize=3.0, label=label)
+        for kind, colour in COLOURS.items():
+            tip, style = here[kind].goal + here[kind].error, {"linewidth": 1.0, "markersize": 3.0}
+            panel.plot(*_closed(tip), "o-", color=colour, label=KINDS[kind].title, **style)
         hit = np.concatenate([(run.goal + run.error)[run.saturated.any(axis=1)] for run in here.values()])
         ring = {"color": RED, "markersize": 7.0, "fillstyle": "none", "linestyle": "none"}
         panel.plot(hit[:, 0], hit[:, 1], "o", label="a chamber saturated", **ring)
-    _legend_below(figure, panels)
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, frameon=False, loc="outside lower center", ncols=2 * len(panels))
     return figure
 
 
@@ -107,64 +88,6 @@ def _dots(panel: Any, rows: Sequence[Row], name: str, style: Style) -> None:
     at, values = [row["load_g"] for row in rows], [row[name] for row in rows]
     panel.plot(at, values, "o", color=colour, markersize=3, alpha=0.5)
     panel.plot(loads, means, color=colour, label=label)
-
-
-def trace_figure(outcome: Outcome, limits_kpa: tuple[float, float]) -> Figure:
-    """Draw spring lengths against their references, and pressures with their limits, section by section.
-
-    Where a chamber is saturated on arrival, its point is shaded.
-    """
-    n_sections = outcome.spring_m.shape[1] // N_PER_SECTION
-    every = slice(None, None, max(1, round(TRACE_S / float(outcome.time_s[1] - outcome.time_s[0]))))
-    time_s, point = outcome.time_s[every], outcome.point[every]
-    figure = Figure(figsize=(12, 5.6), layout="constrained")
-    panels = figure.subplots(2, n_sections, sharex=True, squeeze=False)
-    for section in range(n_sections):
-        upper, lower = panels[:, section]
-        dress(upper, f"section {section + 1}: springs, references dashed", "", "mm")
-        dress(lower, "pressures, limits dashed", "time [s]", "kPa")
-        for chamber in range(section * N_PER_SECTION, (section + 1) * N_PER_SECTION):
-            style = {"color": colormaps["tab10"](chamber), "linewidth": 1.0}
-            upper.plot(time_s, 1e3 * outcome.reference_m[every, chamber], "--", **style)
-            upper.plot(time_s, 1e3 * outcome.spring_m[every, chamber], alpha=0.7, **style)
-            lower.plot(time_s, outcome.pressure_kpa[every, chamber], label=f"chamber {chamber}", **style)
-            for hit in np.flatnonzero(outcome.saturated[:, chamber]):
-                if len(during := time_s[point == hit]):
-                    for panel in (upper, lower):
-                        panel.axvspan(during[0], during[-1], color=style["color"], alpha=0.12, linewidth=0)
-        for limit_kpa in limits_kpa:
-            lower.axhline(limit_kpa, color=RED, linestyle="--", linewidth=1.0)
-        lower.set_ylim(limits_kpa[0] - 12.0, limits_kpa[1] + 4.0)
-        lower.legend(frameon=False, fontsize=7, ncols=3, loc="lower left")
-    return figure
-
-
-def positions_figure(outcomes: Outcomes, shown: Sequence[Trial]) -> Figure:
-    """Draw the finger tips from the front in the pipe: demonstrated goals, path, and where they arrived."""
-    figure = Figure(figsize=(4.0 * len(shown) + 0.4, 4.6), layout="compressed")
-    panels = figure.subplots(1, len(shown), squeeze=False, sharex=True, sharey=True)[0]
-    gripper_m = ArmSpec.default().mass.gripper_length_m
-    for panel, trial in zip(panels, shown, strict=True):
-        run, diameter_mm = outcomes[trial], PIPES_MM[KINDS[trial.kind].task]
-        dress(panel, f"{diameter_mm} mm pipe, {trial.objects}, from the front", "x [mm]", "z [mm]")
-        panel.set_aspect("equal")
-        panel.set_ylim(*SEEN_Z_MM)
-        for line in outline_mm(CrossPipe.of_mm(diameter_mm)):
-            panel.plot(*line.T, color=GREY, linewidth=2.0)
-        asked, arrived = (1e3 * finger_tips(pose, gripper_m) for pose in (run.goal, run.goal + run.error))
-        panel.plot(*(1e3 * run.finger_m[:, [0, 2]]).T, color=BLUE, linewidth=0.7, alpha=0.6, label="path")
-        style = {"linestyle": "none", "fillstyle": "none"}
-        panel.plot(asked[:, 0], asked[:, 2], "o", color=INK, markersize=7.0, label="demonstrated", **style)
-        panel.plot(arrived[:, 0], arrived[:, 2], "o", color=BLUE, markersize=3.5, label="reached")
-        for mask, marker, colour, label in (
-            (run.success, "s", GREEN, "picked or placed"),
-            (run.operation & ~run.success, "x", RED, "not picked or placed"),
-        ):
-            panel.plot(
-                asked[mask, 0], asked[mask, 2], marker, color=colour, markersize=14.0, label=label, **style
-            )
-    _legend_below(figure, panels)
-    return figure
 
 
 def success_figure(results: Results) -> Figure:

@@ -126,8 +126,7 @@ def peer(library: str, variant: str, seed: int) -> Contestant:
     from mjx_softarm.env.gym import SoftArmVectorEnv, as_sb3
     from train.presets import PRESETS
 
-    config, module = PRESETS["quick"], {"sbx": "sbx", "sb3-contrib": "sb3_contrib"}[library]
-    algorithm = importlib.import_module(module).TQC
+    config, algorithm = PRESETS["quick"], importlib.import_module(library.replace("-", "_")).TQC
     start = time.perf_counter()
     if library == "sb3-contrib":
         throwaway = filled_model(algorithm)
@@ -136,8 +135,7 @@ def peer(library: str, variant: str, seed: int) -> Contestant:
     uncounted_s = time.perf_counter() - start
     n_arms = 1 if variant == "defaults" else config.n_arms
     arms = SoftArmVectorEnv(n_arms, config.episode_length, config=config.env)
-    envs, settings, kind, seen = as_sb3(arms), {}, "MlpPolicy", lambda obs: obs
-    n_steps = 0
+    envs, settings, kind, seen, n_steps = as_sb3(arms), {}, "MlpPolicy", lambda obs: obs, 0
     if variant != "defaults":
         envs, settings = scaled(envs, config.tqc.reward_scale), tuned_settings(config, lambda: n_steps)
     if variant == "hindsight":
@@ -147,7 +145,7 @@ def peer(library: str, variant: str, seed: int) -> Contestant:
         settings["replay_buffer_class"] = HindsightBuffer
         settings["replay_buffer_kwargs"] = {
             "arm": arms.env,
-            "share": hindsight_share(config),
+            "share": config.hindsight.reached_share + config.hindsight.near_share,
             "reward_scale": config.tqc.reward_scale,
         }
     model = algorithm(kind, envs, seed=seed, **settings)
@@ -165,11 +163,6 @@ def peer(library: str, variant: str, seed: int) -> Contestant:
         done=lambda: (n_steps, model._n_updates),
         uncounted_s=uncounted_s,
     )
-
-
-def hindsight_share(config: Any) -> float:
-    """Return the share of a batch that gets another goal, with a `TrainConfig`."""
-    return config.hindsight.reached_share + config.hindsight.near_share
 
 
 def tuned_settings(config: Any, n_steps: Callable[[], int]) -> dict[str, Any]:

@@ -119,15 +119,10 @@ def limits_of(name: str, first: Sequence[Point]) -> Limits:
     """Return a contestant's limits, by the curve of the first."""
     reached_mm = [level for level in LEVELS_MM if crossing(first, level, "wall_s") is not None]
     time_s = crossing(first, GOAL_MM, "wall_s") or first[-1]["wall_s"]
-    wall_s = GOALS[_library(name) or "sbx"] * time_s
+    wall_s = GOALS.get(name.rsplit("-", 1)[0], GOALS["sbx"]) * time_s
     if name == "ours-paper":
         return Limits(target_mm=min(LEVELS_MM), stretch_s=wall_s / N_STRETCHES)
     return Limits(wall_s, min(reached_mm, default=0), wall_s / N_STRETCHES)
-
-
-def _library(name: str) -> str | None:
-    """Return a peer's library; None for ours."""
-    return next((library for library, variants in PEERS.items() if name in variants), None)
 
 
 def _file(folder: Path, name: str, seed: int) -> Path:
@@ -154,12 +149,12 @@ def _result(folder: Path, name: str, seed: int, limits: Limits, n_goals: int) ->
             raise RaceError(f"{file}: was made with {got}; choose another --out, or remove the file")
         print(f"{who}: measured before, in {file}")
         return result
-    library = _library(name)
     program = ["benchmarks.race.contestants", name, str(seed), str(limits.stretch_s), str(n_goals)]
     result = {"contestant": name, "seed": seed, "conditions": conditions}
     result |= {key: made[key] for key in ("commit", "uncommitted_changes")}
     try:
-        worker = Worker(who, program, peer_python(library) if library else None)
+        library = name.rsplit("-", 1)[0]
+        worker = Worker(who, program, peer_python(library) if library in PEERS else None)
         result |= train(worker, limits)
     except (PeerError, WorkerError) as error:
         print(f"{who}: failed: {error}", file=sys.stderr)

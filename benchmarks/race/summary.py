@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from benchmarks.race.contestants import CONTESTANTS
 LEVELS_MM = (10, 5, 3, 2)
 GOAL_MM = 5
 GOALS = {"sbx": 5.0, "sb3-contrib": 15.0}  # times our wall time to GOAL_MM
-FIRST, OURS, PLAIN = "ours-quick", ("ours-quick", "ours-paper"), ("ours-plain",)
+FIRST, OURS = "ours-quick", ("ours-quick", "ours-paper")
 PEERS = {
     library: tuple(f"{library}-{variant}" for variant in ("hindsight", "plain", "defaults"))
     for library in GOALS
@@ -55,14 +55,15 @@ def median_mm(point: Point) -> float:
 def summarise(results: Sequence[Result]) -> dict[str, Any]:
     """Return times to each level with start-up and without, env steps, goals, failures and the curves."""
     ran = [result for result in results if "points" in result]
-    raced = {result["contestant"] for result in results}
     who = ("contestant", "seed")
     return {
         "wall_s": [_row(result, "wall_s") for result in ran],
         "wall_s_without_start_up": [_row(result, "trained_s") for result in ran],
         "env_steps": [_row(result, "env_steps") for result in ran],
         "goals": [judge(library, results) for library in GOALS],
-        "not_raced": [name for name in CONTESTANTS if name not in raced],
+        "not_raced": sorted(
+            set(CONTESTANTS) - {result["contestant"] for result in results}, key=CONTESTANTS.index
+        ),
         "failed": [{key: r[key] for key in (*who, "failed")} for r in results if "failed" in r],
         "measured_at": [{key: r[key] for key in (*who, "commit", "uncommitted_changes")} for r in ran],
         "curves": results,
@@ -82,21 +83,10 @@ def _row(result: Result, axis: str) -> dict[str, Any]:
     return row | {"best_mm": round(min(map(median_mm, points)), 2), "in_all": round(last)}
 
 
-class Time(NamedTuple):
-    """Wall time to the goal's level, or that in which it was not reached."""
-
-    wall_s: float
-    reached: bool
-
-
-def _times(names: Sequence[str], seed: int, results: Sequence[Result]) -> list[Time]:
-    """Return the times of those contestants that ran with a seed."""
-    times = []
-    for result in results:
-        if result["contestant"] in names and result["seed"] == seed and "points" in result:
-            found = crossing(result["points"], GOAL_MM, "wall_s")
-            times.append(Time(result["points"][-1]["wall_s"] if found is None else found, found is not None))
-    return times
+def _time(result: Result) -> tuple[bool, float]:
+    """Return whether a contestant missed the goal's level, and its wall time there, or in all."""
+    found = crossing(result["points"], GOAL_MM, "wall_s")
+    return found is None, result["points"][-1]["wall_s"] if found is None else found
 
 
 def judge(library: str, results: Sequence[Result]) -> dict[str, str]:
@@ -112,19 +102,21 @@ def judge(library: str, results: Sequence[Result]) -> dict[str, str]:
         if "failed" in result and result["contestant"] in (FIRST, *PEERS[library]):
             told = f"{result['contestant']}, seed {result['seed']}: {result['failed']}"
             return goal(text, told, False if result["contestant"] == FIRST else None)
-    seeds = sorted({result["seed"] for result in results})
-    missing = _missing(PEERS[library], seeds, results)
-    ratios, all_reached = [], True
-    for seed in seeds:
-        ours = min(_times(OURS, seed, results), key=lambda time: (not time.reached, time.wall_s))
-        peers = _times(PEERS[library], seed, results)
-        if not ours.reached:
+    raced = {(result["contestant"], result["seed"]): result for result in results if "points" in result}
+    missing, ratios, all_reached = _missing(PEERS[library], raced), [], True
+    for seed in sorted({seed for _, seed in raced}):
+        ours, theirs = (
+            [_time(raced[name, seed]) for name in names if (name, seed) in raced]
+            for names in (OURS, PEERS[library])
+        )
+        ours_missed, ours_s = min(ours)
+        if ours_missed:
             return goal(text, f"ours did not reach it with seed {seed}", False)
-        if not peers:
+        if not theirs:
             return goal(text, f"not raced: {missing}", None)
-        theirs = min(peers, key=lambda time: time.wall_s)
-        ratios.append(theirs.wall_s / ours.wall_s)
-        all_reached &= theirs.reached
+        they_missed, their_s = min(theirs, key=lambda time: time[1])
+        ratios.append(their_s / ours_s)
+        all_reached &= not they_missed
     ratio = float(np.median(ratios))
     measured = f"{ratio:.2f} times" if all_reached else f"not within {ratio:.2f} times"
     if ratio >= times and missing:
@@ -132,17 +124,16 @@ def judge(library: str, results: Sequence[Result]) -> dict[str, str]:
     return goal(text, measured, ratio >= times)
 
 
-def _missing(variants: Sequence[str], seeds: Sequence[int], results: Sequence[Result]) -> str:
+def _missing(variants: Sequence[str], raced: Mapping[tuple[str, int], Result]) -> str:
     """Return the races still to be run: all variants with one seed, the best of it with the other seeds."""
-    raced = {(result["contestant"], result["seed"]): result for result in results if "points" in result}
+    seeds = sorted({seed for _, seed in raced})
     compared = [seed for seed in seeds if all((name, seed) in raced for name in variants)]
 
-    def standing(name: str, seed: int) -> tuple[float, float]:
-        points = raced[name, seed]["points"]
-        found = crossing(points, GOAL_MM, "wall_s")
-        return math.inf if found is None else found, min(map(median_mm, points))
+    def standing(who: tuple[str, int]) -> tuple[bool, float]:
+        missed, wall_s = _time(raced[who])
+        return missed, min(map(median_mm, raced[who]["points"])) if missed else wall_s
 
-    best = {min(variants, key=lambda name, seed=seed: standing(name, seed)) for seed in compared}
+    best = {min(((name, seed) for name in variants), key=standing)[0] for seed in compared}
     expected = [(name, seed) for seed in seeds for name in variants if name in best]
     if not compared:
         expected = [(name, seeds[0]) for name in variants]

@@ -4,7 +4,6 @@ import json
 import re
 
 import pytest
-from matplotlib.figure import Figure
 
 from benchmarks.__main__ import main
 from benchmarks.paper import engine, experiments, report
@@ -33,8 +32,7 @@ def test_interrupted_benchmark_runs_only_what_is_missing(tmp_path, monkeypatch, 
     fill(tmp_path, TINY)
     monkeypatch.setattr(engine, "in_parallel", leave_results)
     monkeypatch.setattr(experiments, "load_results", lambda *_: results)
-    drawn = report.draw(experiment, TINY, results, report.trial_rows(results))
-    monkeypatch.setattr(report, "draw", lambda *_: {name: (name, Figure()) for name in drawn})
+    monkeypatch.setattr(report, "draw", lambda *_: {})
     data = experiments.run(experiment, tmp_path, tmp_path / "out", TINY)
     assert [check["text"] for check in data["goals"] if not check["met"]] == []
     assert {f"try {trial.name}" for trial in trials(experiment, TINY)} | {"film"} <= set(done)
@@ -51,14 +49,14 @@ def test_both_experiments_or_one(tmp_path, monkeypatch, capsys):
 
     def run(experiment, folder, pictures, settings):
         done.append((experiment, settings.twins))
-        return {"goals": [{"text": experiment, "value": "1", "met": True}]}
+        return {"goals": [{"text": experiment, "value": "1", "met": True}], "spreads": []}
 
     monkeypatch.setattr(experiments, "run", run)
     smoke = ["--smoke", "--out", str(tmp_path)]
     assert main(["paper", *smoke]) == 0
     assert main(["paper", "--only", "confined", "--twins", "1,2", *smoke]) == 0
     assert done == [("open", (0,)), ("confined", (0,)), ("confined", (1, 2))]
-    assert f"report: {tmp_path / 'confined.html'}" in capsys.readouterr().out
+    assert f"written: {tmp_path / 'paper-confined.json'}" in capsys.readouterr().out
 
 
 def test_folder_of_other_settings_is_an_error(tmp_path, capsys):

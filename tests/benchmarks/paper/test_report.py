@@ -10,7 +10,6 @@ from benchmarks.paper import film, report
 from benchmarks.paper.jobs import Scene
 from benchmarks.paper.kinds import KINDS, Trial, learned_run
 from benchmarks.paper.measure import save_outcome
-from benchmarks.paper.report import write_report
 from benchmarks.paper.summary import (
     first_stage_success,
     load_results,
@@ -19,7 +18,7 @@ from benchmarks.paper.summary import (
     steps_to_success,
     trial_rows,
 )
-from benchmarks.paper.trials import trainings, trials
+from benchmarks.paper.trials import FILMS, trainings, trials
 from mjx_softarm.mechanics.pipe import CrossPipe, clearance
 from mjx_softarm.mechanics.workspace import circle_poses
 from tests.benchmarks.paper.made_up import (
@@ -93,58 +92,57 @@ def test_stage_ends_come_from_the_runs_config(tmp_path):
     assert [row["epoch"] for row in found.trainings["pipe", 0, 0].rows] == [1, 2]
 
 
-def test_open_results_are_written_and_nothing_is_hidden(tmp_path, read_page):
-    fill(tmp_path, TINY)
-    lost = made_up("with", missed=range(6))
-    results = good_results("open", TINY, {Trial("with", 0, 0): lost})
-    side = film.SideView("", "", (0, 1), circle_poses(3)[:, :3])
-    frames = film.frames([np.zeros((20, 15, 3), np.uint8)] * 3, np.zeros((3, 3)), side)
-    film.write_gif(tmp_path / "circle.gif", frames)
-    data = write_report("open", tmp_path, tmp_path / "out", TINY, results, "", {"commit": "none"})
-    page = read_page(tmp_path / "report.html")
-    assert page.n_pictures == 2 + len(TINY.loads_g) + 1
-    assert "not met: with S2R, mean translation at most 5 mm: nan mm, 6 points missed" in page.text
-    for text in ("NOT MET", "twin 1: Springs: off <by> much", "21.01", "3.89"):
-        assert text in page.text
-    written = json.loads((tmp_path / "out" / "paper-open.json").read_text("utf-8"))
-    assert written["commit"] == "none"
-    runs = written["figures"]["runs"]
-    assert len(runs) == len(trials("open", TINY)) == len(data["runs"])
-    assert [row["translation_mm"] is None for row in runs].count(True) == 1
-    simulated = written["figures"]["simulated"]
+def write(experiment, folder, results, filmed=False):
+    """Write a report; returns its figures by the JSON file, and the names of all its files."""
+    fill(folder, TINY)
+    if filmed:
+        side = film.SideView("", "", (0, 1), circle_poses(3)[:, :3])
+        images = film.frames([np.zeros((20, 15, 3), np.uint8)] * 3, np.zeros((3, 3)), side)
+        film.write_gif(folder / FILMS[experiment], images)
+    report.write_report(experiment, folder, folder / "out", TINY, results)
+    written = json.loads((folder / "out" / f"paper-{experiment}.json").read_text("utf-8"))
+    assert "commit" in written
+    assert all(path.stat().st_size < 150_000 for path in (folder / "out").glob("*.png"))
+    return written["figures"], {path.name for path in (folder / "out").iterdir()}
+
+
+def test_open_results_are_written_and_nothing_is_hidden(tmp_path):
+    results = good_results("open", TINY, {Trial("with", 0, 0): made_up("with", missed=range(6))})
+    figures, files = write("open", tmp_path, results, filmed=True)
+    assert files == {"paper-open.json", "paper-circle.gif", "paper-circle.png", "paper-loads.png"}
+    assert (tmp_path / "out" / "paper-circle.gif").read_bytes()[:6] == b"GIF89a"
+    assert figures["goals"][0]["value"] == "nan mm, 6 points missed in 1 of 2 runs"
+    assert not figures["goals"][0]["met"]
+    assert figures["calibrations"] == {"twin 0": {"Springs": []}, "twin 1": {"Springs": ["off <by> much"]}}
+    assert len(figures["runs"]) == len(trials("open", TINY))
+    assert [row["translation_mm"] is None for row in figures["runs"]].count(True) == 1
+    simulated = figures["simulated"]
     assert {item["simulated_mm"] for item in simulated} == {1.25}
     assert (simulated[0]["on_twin_mm"]["min"], simulated[0]["on_twin_mm"]["max"]) == (10.0, 10.0)
-    pictures = {path.name for path in (tmp_path / "out").glob("paper-*.png")}
-    names = ("circle", "loads", "pressures-500g", "pressures-1000g")
-    assert pictures == {f"paper-{name}.png" for name in names}
-    assert all((tmp_path / "out" / name).stat().st_size < 150_000 for name in pictures)
-    assert (tmp_path / "out" / "paper-circle.gif").read_bytes()[:6] == b"GIF89a"
 
 
-def test_confined_results_are_written_and_nothing_is_hidden(tmp_path, read_page):
-    fill(tmp_path, TINY)
+def test_confined_results_are_written_and_nothing_is_hidden(tmp_path):
     lost = [pipe_trial(1), pipe_trial(0, kind="narrow"), pipe_trial(1, kind="narrow")]
     changed = {t: made_up(t.kind, fails=range(4), missed=range(len(goals_of(t.kind)[1]))) for t in lost}
-    results = good_results("confined", TINY, changed)
-    write_report("confined", tmp_path, tmp_path / "out", TINY, results, "no OpenGL <here>", {})
-    page = read_page(tmp_path / "confined.html")
-    assert page.n_pictures == 4
-    assert ["", "at the goals at most 5 mm: nan mm, 28 points missed in 1 of 2 runs"][1] in page.text
-    for text in ("8.93", "5.34", "5.13", "11.29", "11.59", "no OpenGL <here>", "7 of 10 goals are not met."):
-        assert text in page.text
-    figures = json.loads((tmp_path / "out" / "paper-confined.json").read_text("utf-8"))["figures"]
+    figures, files = write("confined", tmp_path, good_results("confined", TINY, changed))
+    assert files == {"paper-confined.json", "paper-confined-success.png", "paper-confined-losses.png"}
+    assert figures["goals"][0]["value"] == "nan mm, 28 points missed in 1 of 2 runs"
+    assert [goal["met"] for goal in figures["goals"]].count(False) == 7
     assert len(figures["trainings"]) == len(trainings(TINY))
     assert [row["x_mm"] is None for row in figures["runs"]].count(True) == 3
-    names = ("positions", "success", "losses", "circle")
-    pictures = {path.name for path in (tmp_path / "out").glob("*.png")}
-    assert pictures == {f"paper-confined-{name}.png" for name in names}
-    assert all((tmp_path / "out" / name).stat().st_size < 150_000 for name in pictures)
+
+
+def test_printed_rows_have_the_paper_s_numbers_below():
+    table = spreads(trial_rows(good_results("open", TINY)))
+    rows = report.printed_rows("open", [item for item in table if item["kind"] == "without"])
+    assert [row["kind"] for row in rows] == ["without S2R", "the paper's arm"]
+    assert (rows[0]["translation_mm"], rows[1]["translation_mm"]) == ("10.00 ± 0.00", 21.01)
 
 
 @pytest.mark.parametrize("experiment", ["open", "confined"])
 def test_titles_and_labels_lie_within_the_pictures(experiment):
-    settings, results = TINY, good_results(experiment, TINY)
-    for name, (_, figure) in report.draw(experiment, settings, results, trial_rows(results)).items():
+    results = good_results(experiment, TINY)
+    for name, figure in report.draw(experiment, results, trial_rows(results)).items():
         figure.draw_without_rendering()
         width, height = figure.bbox.size
         for artist in (*figure.axes, *figure.legends):
