@@ -21,7 +21,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-from mujoco import gl_context
+from mujoco.rendering.classic import gl_context
 from PIL import Image
 
 from mjx_softarm._support.errors import InputError
