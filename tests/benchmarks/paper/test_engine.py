@@ -60,9 +60,3 @@ def test_jobs_run_elsewhere_and_a_failure_is_named():
     assert parallel.in_parallel([("a", pow, (2, 3)), ("b", divmod, (7, 2))]) == {"a": 8, "b": (3, 1)}
     with pytest.raises(JobError, match="bad: ValueError: invalid literal"):
         parallel.in_parallel([("bad", int, ("x",))])
-
-
-def test_cores_are_shared_out():
-    assert parallel._shares([0, 1]) == [[0], [1]]
-    assert parallel._shares([3]) == [[3]]
-    assert parallel._shares(list(range(5))) == [[0, 2, 4], [1, 3]]

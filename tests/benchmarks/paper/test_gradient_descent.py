@@ -9,45 +9,34 @@ import numpy as np
 import pytest
 
 from benchmarks.paper.gradient_descent import descend, forward_kinematics, gradient, gradient_descent
-from mjx_softarm import ArmSpec
-from mjx_softarm.control import Gains
-from mjx_softarm.mdp.actions import N_ACTIONS, ActionMap
-from mjx_softarm.mdp.observation import ObsScale
-from mjx_softarm.mdp.rewards import RewardConfig, scaled_error
-from mjx_softarm.policy.file import Policy
+from mjx_softarm.mdp.actions import N_ACTIONS
+from mjx_softarm.mdp.rewards import scaled_error
 from mjx_softarm.sensing.estimator import estimate
 from mjx_softarm.sensing.pose import pose_error
 from mjx_softarm.sensing.s2r import correct
+from tests.benchmarks.paper.made_up import SPEC, N, make_policy
 
-SPEC = ArmSpec.default()
-N = SPEC.n_chambers
 LOW_M, HIGH_M = SPEC.springs.length_min_m, SPEC.springs.length_max_m
 
 
 @pytest.fixture(scope="module", params=[False, True], ids=["no S2R", "S2R"])
 def policy(request, make_arm_model):
-    return Policy(
-        layers=((np.zeros((18, N), np.float32), np.zeros(N, np.float32)),),
-        obs_scale=ObsScale.from_spec(SPEC),
-        reward=RewardConfig(),
-        actions=ActionMap.from_spec(SPEC),
-        gains=Gains.from_spec(SPEC),
-        rate_hz=SPEC.control.rate_hz,
-        spec=SPEC,
-        provenance={},
-        **make_arm_model(N, request.param)._asdict(),
-    )
+    return make_policy(make_arm_model, s2r=request.param)
 
 
 def random_springs(n, seed=0):
     return np.random.default_rng(seed).uniform(0.15, 0.23, (n, N))
 
 
+def forward(policy, spring_m):
+    """The loop's estimate, in float32 as the loop has it."""
+    pose = estimate(policy.estimator, spring_m)
+    return pose if policy.s2r is None else correct(policy.s2r, pose, spring_m)
+
+
 def test_forward_kinematics_are_the_loop_s(policy):
     spring_m = random_springs(4).astype(np.float32)
-    pose = estimate(policy.estimator, spring_m)
-    expected = pose if policy.s2r is None else correct(policy.s2r, pose, spring_m)
-    assert np.allclose(forward_kinematics(policy)(spring_m), expected, atol=0.01)
+    assert np.allclose(forward_kinematics(policy)(spring_m), forward(policy, spring_m), atol=0.01)
 
 
 def test_gradient_is_that_of_automatic_differentiation(policy):
@@ -55,9 +44,7 @@ def test_gradient_is_that_of_automatic_differentiation(policy):
     goal = forward_kinematics(policy)(there)
 
     def cost(spring_m):
-        pose = estimate(policy.estimator, spring_m)
-        pose = pose if policy.s2r is None else correct(policy.s2r, pose, spring_m)
-        return 0.5 * jnp.sum(pose_error(pose, jnp.asarray(goal, jnp.float32)) ** 2)
+        return 0.5 * jnp.sum(pose_error(forward(policy, spring_m), jnp.asarray(goal, jnp.float32)) ** 2)
 
     expected = jax.grad(cost)(jnp.asarray(here, jnp.float32))
     found = gradient(lambda x: pose_error(forward_kinematics(policy)(x), goal), here)

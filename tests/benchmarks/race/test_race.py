@@ -18,7 +18,6 @@ from benchmarks.race.contestants import (
     contestant_of,
     our_config,
     prepare,
-    scaled,
     tuned_settings,
 )
 from benchmarks.race.race import Limits, RaceError, limits_of, run, train
@@ -78,9 +77,7 @@ def test_a_contestant_that_stops_by_itself_is_told_with_its_last_words(fake):
 
 
 def test_time_counts_in_training_and_stands_while_the_policy_is_evaluated(monkeypatch):
-    clock = [0.0]
-    steps = [0]
-    monkeypatch.setattr("benchmarks.race.contestants.time.perf_counter", lambda: clock[0])
+    clock, steps = [0.0], [0]
 
     class Slow:
         def __init__(self, env, n_goals):
@@ -91,24 +88,18 @@ def test_time_counts_in_training_and_stands_while_the_policy_is_evaluated(monkey
             clock[0] += 100
             return np.array([1.0, 2.0, 9.0])
 
-    monkeypatch.setattr("benchmarks.race.contestants.HeldOut", Slow)
-    monkeypatch.setattr("mjx_softarm.env.ReachEnv", lambda: None)
-
     def stretch():
         clock[0] += 2.0
         steps[0] += 10
 
+    monkeypatch.setattr("benchmarks.race.contestants.time.perf_counter", lambda: clock[0])
+    monkeypatch.setattr("benchmarks.race.contestants.HeldOut", Slow)
+    monkeypatch.setattr("mjx_softarm.env.ReachEnv", lambda: None)
     contestant = Contestant(stretch, lambda obs: obs, lambda: (steps[0], 7), limit=60)
     facts, work = prepare(contestant, 5.0, 3.0, 8)
     assert facts == {"start_up_s": 5.0}
-    assert work() == {
-        "wall_s": 9.0,
-        "trained_s": 4.0,
-        "env_steps": 20,
-        "updates": 7,
-        "median_mm": 2.0,
-        "ended": False,
-    }
+    expected = {"wall_s": 9.0, "trained_s": 4.0, "env_steps": 20, "updates": 7, "median_mm": 2.0}
+    assert work() == expected | {"ended": False}
     clock[0] += 1000  # nor while nobody asks
     assert (work()["wall_s"], work()["ended"]) == (13.0, True)
 
@@ -148,41 +139,12 @@ def test_tuned_peers_have_the_quick_preset_s_settings():
     n_steps = [0]
     settings = tuned_settings(PRESETS["quick"], lambda: n_steps[0])
     rate = settings.pop("learning_rate")
-    assert settings == {
-        "buffer_size": 262_144,
-        "learning_starts": 2048,
-        "batch_size": 128,
-        "tau": 0.005,
-        "gamma": 0.5,
-        "train_freq": 1,
-        "gradient_steps": 16,
-        "ent_coef": "auto_0.1",
-        "target_entropy": -30.0,
-    }
-    for n_steps[0], expected in (
-        (0, 1e-3),
-        (120_000, 0.51e-3),
-        (239_999, 0.02e-3),
-        (240_000, 1e-3),
-        (360_000, 0.51e-3),
-    ):
+    names = ("buffer_size", "learning_starts", "batch_size", "tau", "gamma", "train_freq", "gradient_steps")
+    values = (262_144, 2048, 128, 0.005, 0.5, 1, 16, "auto_0.1", -30.0)
+    assert settings == dict(zip((*names, "ent_coef", "target_entropy"), values, strict=True))
+    rates = {0: 1e-3, 120_000: 0.51e-3, 239_999: 0.02e-3, 240_000: 1e-3, 360_000: 0.51e-3}
+    for n_steps[0], expected in rates.items():
         assert rate(1.0) == pytest.approx(expected, rel=1e-3)
-
-
-def test_rewards_are_scaled_and_nothing_else():
-    vec_env = pytest.importorskip("stable_baselines3.common.vec_env", reason="stable-baselines3 is not here")
-    import gymnasium
-
-    envs = vec_env.DummyVecEnv([lambda: gymnasium.make("Pendulum-v1")] * 2)
-    envs.seed(0)
-    first, action = envs.reset(), np.zeros((2, 1))
-    obs, rewards, *_ = envs.step(action)
-    envs.seed(0)
-    again = scaled(envs, 0.1)
-    np.testing.assert_array_equal(again.reset(), first)
-    same, tenth, *_ = again.step(action)
-    np.testing.assert_array_equal(same, obs)
-    np.testing.assert_allclose(tenth, 0.1 * rewards, rtol=1e-6)
 
 
 # --- the folder --------------------------------------------------------------------------------------------
