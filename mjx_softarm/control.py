@@ -43,12 +43,8 @@ class Gains(NamedTuple):
 
     @classmethod
     def from_spec(cls, spec: ArmSpec) -> Gains:
-        return cls(
-            kp_kpa_per_m=spec.control.kp_kpa_per_m,
-            ki_kpa_per_ms=spec.control.ki_kpa_per_ms,
-            pressure_min_kpa=spec.chambers.pressure_min_kpa,
-            pressure_max_kpa=spec.chambers.pressure_max_kpa,
-        )
+        limits_kpa = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
+        return cls(spec.control.kp_kpa_per_m, spec.control.ki_kpa_per_ms, *limits_kpa)
 
 
 def pressures(

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import tomllib
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -166,9 +166,8 @@ class ArmSpec:
         Raises:
             SpecError: a field is missing, unknown, of the wrong type or out of range.
         """
-        parts = read_fields(cls, data, source, "")
-        spec = cls(**parts)
-        spec.validate(source)
+        spec = cls(**read_fields(cls, data, source, ""))
+        spec._check_together(source)
         return spec
 
     def to_dict(self) -> dict[str, Any]:
@@ -197,30 +196,26 @@ class ArmSpec:
             data[group] = values
         return self.from_dict(data, "replace")
 
-    def validate(self, source: str = "spec") -> None:
-        """Check fields against each other.
-
-        Raises:
-            SpecError: two fields contradict each other.
-        """
-        for group in fields(self):
-            part = getattr(self, group.name)
-            if not dataclasses.is_dataclass(part):
-                continue
-            for item in fields(part):
-                value = getattr(part, item.name)
+    def _check_together(self, source: str) -> None:
+        """Refuse fields that contradict each other."""
+        for group, values in self.to_dict().items():
+            for name, value in values.items() if isinstance(values, dict) else ():
                 if isinstance(value, tuple) and len(value) != self.n_chambers:
                     raise SpecError(
-                        f"{source}: {group.name}.{item.name}: got {len(value)} numbers, "
+                        f"{source}: {group}.{name}: got {len(value)} numbers, "
                         f"expected one, or one for each of the {self.n_chambers} chambers"
                     )
-        _ordered(source, "chambers", self.chambers, "pressure_min_kpa", "pressure_max_kpa")
-        _ordered(source, "springs", self.springs, "length_min_m", "length_max_m")
-        _ordered(source, "sensor", self.sensor, *self.sensor.range_fields)
-        self._check_sensor(source)
-
-    def _check_sensor(self, source: str) -> None:
-        """Refuse lengths that may be commanded but that the sensor cannot read."""
+        for group, low, high in (
+            ("chambers", "pressure_min_kpa", "pressure_max_kpa"),
+            ("springs", "length_min_m", "length_max_m"),
+            ("sensor", *self.sensor.range_fields),
+        ):
+            least, greatest = (getattr(getattr(self, group), name) for name in (low, high))
+            if not least < greatest:
+                raise SpecError(
+                    f"{source}: {group}.{low}: got {least!r}, expected less than {high} ({greatest!r})"
+                )
+        # Lengths that may be commanded must be lengths that the sensor can read.
         sensor = Sensor.from_spec(self)
         (low, high), unit = sensor.range, sensor.unit
         for name in ("length_min_m", "length_max_m"):
@@ -231,11 +226,3 @@ class ArmSpec:
                     f"{source}: springs.{name}: got {length_m!r}, which reads {readings[~readable][0]:.6g} "
                     f"{unit}, expected sensor.{' to '.join(sensor.range_fields)}, {low:g} to {high:g} {unit}"
                 )
-
-
-def _ordered(source: str, group: str, part: Any, low: str, high: str) -> None:
-    low_value, high_value = getattr(part, low), getattr(part, high)
-    if not low_value < high_value:
-        raise SpecError(
-            f"{source}: {group}.{low}: got {low_value!r}, expected less than {high} ({high_value!r})"
-        )

@@ -24,15 +24,8 @@ from mjx_softarm._support.fields import FLOAT32_MAX
 from mjx_softarm._support.mlp import Layer
 
 # Raised by NumPy and zipfile on archives that are damaged or of a kind that they do not read.
-ZIP_ERRORS = (
-    ValueError,
-    EOFError,
-    MemoryError,
-    NotImplementedError,
-    struct.error,
-    zipfile.BadZipFile,
-    zlib.error,
-)
+ZIP_ERRORS = (ValueError, EOFError, MemoryError, NotImplementedError)
+ZIP_ERRORS += (struct.error, zipfile.BadZipFile, zlib.error)
 _N_DIGEST = 64  # hexadecimal digits, the last bytes of the file
 
 
@@ -58,7 +51,7 @@ def write_sealed(path: Path, arrays: Mapping[str, Any], kind: str) -> None:
     except OSError as error:
         raise SealedFileError(f"{path}: cannot be written: {error.strerror}") from error
     finally:
-        if part.exists():
+        if part.exists():  # never so below a path that is no folder, where `unlink` would fail
             part.unlink()
 
 
@@ -108,20 +101,14 @@ def _mark(kind: str) -> bytes:
 
 def entries_of(name: str, group: Any) -> dict[str, np.ndarray]:
     """Return the entries of a dataclass or named tuple: `name.field`, and its `layers` one by one."""
-    entries: dict[str, Any] = {}
-    for item in _field_names(type(group)):
-        value = getattr(group, item)
-        if item == "layers":
-            entries |= layer_entries(name, value)
-        else:
-            entries[f"{name}.{item}"] = value
+    values = {item: getattr(group, item) for item in _field_names(type(group))}
+    entries = layer_entries(name, values.pop("layers")) if "layers" in values else {}
+    entries |= {f"{name}.{item}": value for item, value in values.items()}
     return {item: np.asarray(value) for item, value in entries.items()}
 
 
 def _field_names(kind: type) -> tuple[str, ...]:
-    """Return the names of the fields of a dataclass or named tuple, inherited ones too."""
-    fields = getattr(kind, "_fields", None)
-    return fields or tuple(item.name for item in dataclasses.fields(kind))
+    return getattr(kind, "_fields", None) or tuple(item.name for item in dataclasses.fields(kind))
 
 
 def layer_entries(name: str, layers: tuple[Layer, ...]) -> dict[str, Any]:
@@ -181,17 +168,16 @@ class Entries:
             n_inputs = width
         return tuple(layers)
 
-    def network(
-        self,
-        name: str,
-        kind: type,
-        shapes: Mapping[str, tuple[int | None, ...]],
-        n_inputs: int,
-        n_outputs: int,
-    ) -> Any:
-        """Return a named tuple of float32 arrays in the `shapes` of its fields, and of `layers`."""
-        values = {item: self.take(f"{name}.{item}", np.float32, shape) for item, shape in shapes.items()}
-        values = {item: np.asarray(value, np.float32) for item, value in values.items()}
+    def network(self, name: str, kind: type, shapes: Mapping, n_inputs: int, n_outputs: int) -> Any:
+        """Return a named tuple of float32 arrays in the `shapes` of its fields, and of `layers`.
+
+        Every field whose name has `_scale` in it must be greater than 0.
+        """
+        values = {}
+        for item, shape in shapes.items():
+            value = values[item] = np.asarray(self.take(f"{name}.{item}", np.float32, shape), np.float32)
+            if "_scale" in item and not (value > 0.0).all():
+                self.fail(f"{name}.{item}", f"got {value.tolist()}, expected numbers > 0")
         return kind(**values, layers=self.layers(name, n_inputs, n_outputs))
 
     def finish(self, schema: int) -> None:

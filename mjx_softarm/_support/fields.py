@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 import typing
-from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -13,15 +12,7 @@ from mjx_softarm._support.errors import InputError
 
 PerChamber = float | tuple[float, ...]
 MAX_COUNT = 100  # of sections, and of links in each; beyond it arrays of the mechanics do not fit a memory
-FLOAT32_MIN, FLOAT32_MAX = (
-    1.1754944e-38,
-    3.4028235e38,
-)  # sizes of a normal float32, in which arms are simulated
-
-
-def in_float32(value: float) -> bool:
-    """Return whether a number is zero or of a size that float32 holds."""
-    return value == 0.0 or FLOAT32_MIN <= abs(value) <= FLOAT32_MAX
+FLOAT32_MIN, FLOAT32_MAX = 1.1754944e-38, 3.4028235e38  # sizes of a normal float32, for the simulation
 
 
 class SpecError(InputError):
@@ -50,10 +41,8 @@ class Rule:
         """Return whether a value is of the kind and in the range."""
         if self.kind is str:
             return isinstance(value, str)
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
+        if isinstance(value, bool) or not isinstance(value, (int, self.kind)):
             return False
-        if self.kind is int:
-            return isinstance(value, int) and self.low <= value <= self.high
         try:
             value = float(value)
         except OverflowError:
@@ -62,14 +51,14 @@ class Rule:
         return math.isfinite(value) and above and value <= self.high
 
 
-def positive(per_chamber: bool = False, high: float = math.inf) -> Any:
+def positive(per_chamber: bool = False) -> Any:
     """Declare a number > 0."""
-    return field(metadata={"rule": Rule(low=0.0, low_open=True, per_chamber=per_chamber, high=high)})
+    return field(metadata={"rule": Rule(low=0.0, low_open=True, per_chamber=per_chamber)})
 
 
-def not_negative(per_chamber: bool = False) -> Any:
+def not_negative() -> Any:
     """Declare a number >= 0."""
-    return field(metadata={"rule": Rule(low=0.0, per_chamber=per_chamber)})
+    return field(metadata={"rule": Rule(low=0.0)})
 
 
 def anything(per_chamber: bool = False, low: float = -math.inf, high: float = math.inf) -> Any:
@@ -95,30 +84,25 @@ def read_fields(cls: type, data: Any, source: str, prefix: str) -> dict[str, Any
         if name not in known:
             raise SpecError(f"{source}: {prefix}{name}: unknown field, expected one of {', '.join(known)}")
     hints = typing.get_type_hints(cls)
-    groups: dict[str, Any] = {name: hint for name, hint in hints.items() if dataclasses.is_dataclass(hint)}
     values: dict[str, Any] = {}
     for item in fields(cls):
         path = prefix + item.name
+        group: Any = hints[item.name] if dataclasses.is_dataclass(hints[item.name]) else None
         if item.name not in data:
-            expected = "a table" if item.name in groups else rule_of(item).text
+            expected = "a table" if group else rule_of(item).text
             raise SpecError(f"{source}: {path}: missing, expected {expected}")
         value = data[item.name]
-        group = groups.get(item.name)
-        if "kinds" in item.metadata and isinstance(value, dict):
-            group, value = _choose(item.metadata["kinds"], value, source, path)
+        if (kinds := item.metadata.get("kinds")) and isinstance(value, dict):
+            value = dict(value)
+            kind = value.pop("kind", next(iter(kinds)))
+            if not isinstance(kind, str) or kind not in kinds:
+                raise SpecError(f"{source}: {path}.kind: got {kind!r}, expected {' or '.join(kinds)}")
+            group = kinds[kind]
         if group is not None:
             values[item.name] = group(**read_fields(group, value, source, path + "."))
         else:
             values[item.name] = _read_value(rule_of(item), value, source, path)
     return values
-
-
-def _choose(kinds: Mapping[str, type], data: dict, source: str, path: str) -> tuple[type, dict]:
-    """Return the class that an entry `kind` names, and the other entries."""
-    kind = data.get("kind", next(iter(kinds)))
-    if not isinstance(kind, str) or kind not in kinds:
-        raise SpecError(f"{source}: {path}.kind: got {kind!r}, expected {' or '.join(kinds)}")
-    return kinds[kind], {name: value for name, value in data.items() if name != "kind"}
 
 
 def rule_of(item: dataclasses.Field) -> Rule:
@@ -128,12 +112,11 @@ def rule_of(item: dataclasses.Field) -> Rule:
 
 def _read_value(rule: Rule, value: Any, source: str, path: str) -> Any:
     many = rule.per_chamber and isinstance(value, (list, tuple))
-    items = value if many else [value]
+    items: Any = value if many else [value]
     if not all(map(rule.accepts, items)):
         raise SpecError(f"{source}: {path}: got {value!r}, expected {rule.text}")
-    if rule.kind is float and not all(map(in_float32, items)):
+    if rule.kind is float and not all(x == 0.0 or FLOAT32_MIN <= abs(x) <= FLOAT32_MAX for x in items):
         sizes = f"sizes from {FLOAT32_MIN:.2g} to {FLOAT32_MAX:.2g}, which float32 holds"
         raise SpecError(f"{source}: {path}: got {value!r}, expected {sizes}")
-    if many:
-        return tuple(map(float, value))
-    return rule.kind(value)
+    numbers = tuple(map(rule.kind, items))
+    return numbers if many else numbers[0]

@@ -27,9 +27,8 @@ class Finding(NamedTuple):
         first, last = self.rows or (0, 0)
         rows = f"line {first}" if first == last else f"lines {first} to {last}"
         cost = f"; costs {self.n_dropped} rows" if self.n_dropped else ""
-        return ": ".join([self.file, *([rows] if self.rows else []), *filter(None, [self.column])]) + (
-            f": {self.problem}{cost}"
-        )
+        place = (self.file, self.rows and rows, self.column)
+        return ": ".join([*filter(None, place), f"{self.problem}{cost}"])
 
 
 class LogError(InputError):
@@ -132,7 +131,6 @@ def outlier_rows(values: np.ndarray, least: float) -> np.ndarray:
     high = np.minimum(np.maximum(a, b), np.maximum(c, d))
     off = np.abs(values[2:-2] - 0.5 * (low + high))  # low and high are the middle two, in either order
     sigma = 1.4826 * np.median(off)
-    outlier[2:-2] = off > np.maximum(
-        np.maximum(_SPIKE_SIGMA * sigma, least), _SPIKE_LOCAL * np.abs(high - low)
-    )
+    usual = np.maximum(_SPIKE_SIGMA * sigma, least)
+    outlier[2:-2] = off > np.maximum(usual, _SPIKE_LOCAL * np.abs(high - low))
     return outlier

@@ -16,7 +16,7 @@ import numpy as np
 
 from mjx_softarm.logs.checks import Finding, LogError
 from mjx_softarm.logs.schema import GROUPS, UNITS, Column, Log, log_columns
-from mjx_softarm.logs.tables import Table, read_table
+from mjx_softarm.logs.tables import read_table
 from mjx_softarm.sensing.sensors import SENSORS
 
 _CELL = re.compile(r"(\w+)\s*(?:\[(.*)\])?")
@@ -55,6 +55,7 @@ class LogMatrix(NamedTuple):
         return Log(source=self.file, row=self.row, **groups)
 
 
+@np.errstate(over="ignore", invalid="ignore")  # any number may stand in a file
 def read_matrix(
     path: str | Path,
     n_chambers: int,
@@ -74,25 +75,7 @@ def read_matrix(
     Raises:
         LogError: the file cannot be understood; the message has a line for each finding.
     """
-    table = read_table(path)
-    with np.errstate(over="ignore", invalid="ignore"):  # any number may stand in a file
-        return _matrix(str(path), table, n_chambers, ("time_s", *needed), one_of, reading_name)
-
-
-def refuse(findings: Sequence[Finding]) -> None:
-    """Raise a `LogError` with all findings, if there are any."""
-    if findings:
-        raise LogError(findings)
-
-
-def _matrix(
-    file: str,
-    table: Table,
-    n_chambers: int,
-    needed: Sequence[str],
-    one_of: Sequence[str],
-    reading_name: str | None,
-) -> tuple[LogMatrix, list[Finding]]:
+    file, table = str(path), read_table(path)
     matches = [_CELL.fullmatch(cell) for cell in table.names]
     names = [match[1] if match else cell for match, cell in zip(matches, table.names, strict=True)]
     units = {name: match[2] if match else None for name, match in zip(names, matches, strict=True)}
@@ -101,7 +84,12 @@ def _matrix(
     reading_name = reading_name or _reading_name(names)
     known = {column.name: column for column in log_columns(n_chambers, n_markers, reading_name)}
 
-    problems = [*_header_errors(names, units, known, reading_name), *_absent(names, known, needed, one_of)]
+    if any(name[:1].isalpha() for name in names):
+        problems = [*_header_errors(names, units, known, reading_name)]
+        problems += _absent(names, known, ("time_s", *needed), one_of)
+    else:
+        got = ", ".join(names)[:60]
+        problems = [("", f"expected a header such as `time [s],pressure0 [kPa],...`, got {got}")]
     refuse([Finding(file, (1, 1), name, problem) for name, problem in problems])
     present = [column for name, column in known.items() if name in names]
     columns = tuple(dataclasses.replace(column, unit=units[column.name]) for column in present)
@@ -109,6 +97,12 @@ def _matrix(
     values *= [UNITS[column.kind][column.unit] for column in columns]
     extra = [Finding(file, (1, 1), name, "unknown column, ignored") for name in names if name not in known]
     return LogMatrix(file, columns, values, table.row), extra
+
+
+def refuse(findings: Sequence[Finding]) -> None:
+    """Raise a `LogError` with all findings, if there are any."""
+    if findings:
+        raise LogError(findings)
 
 
 def _reading_name(names: list[str]) -> str:
@@ -120,9 +114,6 @@ def _reading_name(names: list[str]) -> str:
 def _header_errors(
     names: list[str], units: dict, known: dict, reading_name: str
 ) -> Iterator[tuple[str, str]]:
-    if not _is_header(names):
-        yield "", f"expected a header such as `time [s],pressure0 [kPa],...`, got {', '.join(names)[:60]}"
-        return
     for name, unit in units.items():
         if names.count(name) > 1:
             yield name, f"{names.count(name)} columns of this name, expected one"
@@ -143,8 +134,6 @@ def _absent(
     names: list[str], known: dict, needed: Sequence[str], one_of: Sequence[str]
 ) -> Iterator[tuple[str, str]]:
     """Yield the groups that have no column, with the problem."""
-    if not _is_header(names):
-        return
     groups = {known[name].group for name in names if name in known}
     for group in needed:
         if group not in groups:
@@ -155,7 +144,3 @@ def _absent(
         firsts = [next(column for column in known.values() if column.group == group) for group in one_of]
         *most, last = [f"{column.name}.." for column in firsts]
         yield "", f"expected {', '.join(most)} or {last}; got only {', '.join(names)[:60]}"
-
-
-def _is_header(names: list[str]) -> bool:
-    return any(name[:1].isalpha() for name in names)

@@ -34,10 +34,7 @@ UNITS: Mapping[str, Mapping[str, float]] = MappingProxyType(
     }
 )
 _XYZ = ("x", "y", "z")
-_POSE = {
-    **dict.fromkeys(_XYZ, ("pose_length", "mm")),
-    **dict.fromkeys(("yaw", "pitch", "roll"), ("angle", "deg")),
-}
+_POSE = dict.fromkeys(_XYZ, ("pose_length", "mm")) | dict.fromkeys(("yaw", "pitch", "roll"), ("angle", "deg"))
 
 
 @dataclass(frozen=True)
@@ -110,9 +107,8 @@ class Log:
             LogError: they are readings of another one.
         """
         if self.readings is not None and self.reading_name != sensor.reading_name:
-            problem = (
-                f"got readings of {self.reading_name}, expected {sensor.reading_name} of a {sensor.kind}"
-            )
+            expected = f"{sensor.reading_name} of a {sensor.kind}"
+            problem = f"got readings of {self.reading_name}, expected {expected}"
             raise LogError([Finding(self.source, None, f"{self.reading_name}0", problem)])
         return self.readings
 
@@ -123,9 +119,8 @@ class Log:
         return dataclasses.replace(self, row=self.row[rows], **kept)
 
 
-GROUPS = tuple(
-    item.name for item in dataclasses.fields(Log) if item.name not in ("source", "row", "reading_name")
-)
+_NO_GROUPS = ("source", "row", "reading_name")
+GROUPS = tuple(item.name for item in dataclasses.fields(Log) if item.name not in _NO_GROUPS)
 
 
 def log_table(log: Log) -> tuple[tuple[Column, ...], np.ndarray]:
@@ -133,9 +128,8 @@ def log_table(log: Log) -> tuple[tuple[Column, ...], np.ndarray]:
     per_chamber = [getattr(log, name) for name in ("readings", "spring_m", "pressure_kpa", "reference_m")]
     n_chambers = max((value.shape[1] for value in per_chamber if value is not None), default=0)
     n_markers = 0 if log.marker_m is None else log.marker_m.shape[1]
-    columns = tuple(
-        c for c in log_columns(n_chambers, n_markers, log.reading_name) if getattr(log, c.group) is not None
-    )
+    known = log_columns(n_chambers, n_markers, log.reading_name)
+    columns = tuple(column for column in known if getattr(log, column.group) is not None)
     present = [value for name in GROUPS if (value := getattr(log, name)) is not None]
     table = np.concatenate([np.reshape(value, (len(log), -1)) for value in present], axis=1)
     return columns, table / np.array([UNITS[c.kind][c.unit] for c in columns])

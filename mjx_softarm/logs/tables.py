@@ -9,7 +9,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -81,18 +81,14 @@ def _read_csv(path: Path, names: Sequence[str] | None) -> Table:
         found = [text for mark, text in _OTHER_DELIMITERS.items() if mark in first]
         got = f"{found[0]} between the columns" if found else f"one column, {first[:60]!r}"
         raise _error(path, f"expected columns parted by commas, and decimal points; got {got}", 1)
-    n_lines = _count_lines(path)
-    if n_lines <= n_header:
-        raise _error(path, "a header and no rows, expected at least 2 rows")
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "loadtxt: input contained no data")  # an error below
-            values = np.loadtxt(
-                path, delimiter=",", skiprows=n_header, ndmin=2, comments=None, encoding="utf-8-sig"
-            )
+            options: Any = {"delimiter": ",", "comments": None, "encoding": "utf-8-sig"}
+            values = np.loadtxt(path, skiprows=n_header, ndmin=2, **options)
     except ValueError:
         return _read_lines(path, names, n_header)
-    if values.shape != (n_lines - n_header, len(names)):  # blank lines, or a header of another length
+    if values.shape != (_count_lines(path) - n_header, len(names)):  # blank lines, or another header's length
         return _read_lines(path, names, n_header)
     return Table(names, values, np.arange(len(values)) + 1 + n_header)
 
@@ -132,12 +128,14 @@ def _read_lines(path: Path, names: tuple[str, ...], n_header: int) -> Table:
             cells = line.rstrip("\r\n").split(",")
             if len(cells) != len(names):
                 raise _error(path, _ragged(line, len(cells), len(names)), number)
-            try:
-                numbers = np.array([float(cell) if cell.strip() else np.nan for cell in cells])
-            except ValueError:
-                name, cell = next(pair for pair in zip(names, cells, strict=True) if not _is_number(pair[1]))
-                raise _error(path, f"got {cell.strip()[:40]!r}, expected a number", number, name) from None
-            values.append(numbers)
+            numbers = []
+            for name, cell in zip(names, cells, strict=True):
+                try:
+                    numbers.append(float(cell) if cell.strip() else np.nan)
+                except ValueError:
+                    problem = f"got {cell.strip()[:40]!r}, expected a number"
+                    raise _error(path, problem, number, name) from None
+            values.append(np.array(numbers))
             row.append(number)
     if not values:
         raise _error(path, "a header and no rows, expected at least 2 rows")
@@ -148,11 +146,3 @@ def _ragged(line: str, n_cells: int, n_names: int) -> str:
     found = [text for mark, text in _OTHER_DELIMITERS.items() if mark in line]
     hint = f", and {found[0]}" if found else "; decimal commas?" if n_cells >= 1.5 * n_names else ""
     return f"got {n_cells} cells{hint}; expected {n_names}, as in the header"
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return not cell.strip()
-    return True

@@ -40,14 +40,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjx_softarm._support.archive import (
-    Entries,
-    SealedFileError,
-    entries_of,
-    layer_entries,
-    read_sealed,
-    write_sealed,
-)
+from mjx_softarm._support import archive
+from mjx_softarm._support.archive import Entries, SealedFileError, entries_of
 from mjx_softarm._support.mlp import Layer
 from mjx_softarm.control import TOLERANCE_M, Gains
 from mjx_softarm.mdp.actions import N_ACTIONS, ActionMap
@@ -114,7 +108,9 @@ def policy_from_actor(
     """Make the policy of an actor that was trained on an arm.
 
     Args:
-        actor_params: nested mappings of arrays, as flax initialises the actor; see `layers_from_flax`.
+        actor_params: as flax initialises the actor, `{"params": {"hidden_0": {"kernel", "bias"}, ...,
+            "head": {"kernel", "bias"}}}`; the head's first n outputs are the mean, as many more the log
+            standard deviation.
         spec: the arm; scales, limits, calibration and gains are its own, as in the environment.
         reward: the environment's.
         model: networks and workspace of the arm.
@@ -127,7 +123,7 @@ def policy_from_actor(
             array has the wrong shape or is not finite.
     """
     policy = Policy(
-        layers=layers_from_flax(actor_params, spec.n_chambers),
+        layers=_layers_from_flax(actor_params, spec.n_chambers),
         obs_scale=ObsScale.from_spec(spec),
         reward=reward,
         actions=ActionMap.from_spec(spec),
@@ -142,17 +138,8 @@ def policy_from_actor(
     return _unpack(_pack(policy), "policy")
 
 
-def layers_from_flax(actor_params: Mapping[str, Any], n_actions: int) -> tuple[Layer, ...]:
-    """Return the actor's layers without its standard deviations; the one place that knows flax's names.
-
-    Args:
-        actor_params: `{"params": {"hidden_0": {"kernel", "bias"}, ..., "head": {"kernel", "bias"}}}`; the
-            head's first `n_actions` outputs are the mean, as many more the log standard deviation.
-        n_actions: number of actions.
-
-    Raises:
-        ValueError: the layers have other names.
-    """
+def _layers_from_flax(actor_params: Mapping[str, Any], n_actions: int) -> tuple[Layer, ...]:
+    """Return the actor's layers without its standard deviations; the one place that knows flax's names."""
     dense = actor_params.get("params", {})
     names = [*(f"hidden_{k}" for k in range(len(dense) - 1)), "head"]
     if set(dense) != set(names):
@@ -172,7 +159,7 @@ def save_policy(path: str | Path, policy: Policy) -> None:
     """
     arrays = _pack(policy)
     _unpack(arrays, str(path))
-    write_sealed(Path(path), arrays, KIND)
+    archive.write_sealed(Path(path), arrays, KIND)
 
 
 def load_policy(path: str | Path) -> Policy:
@@ -182,7 +169,7 @@ def load_policy(path: str | Path) -> Policy:
         SealedFileError: the file cannot be read, is incomplete, damaged, of another program or of another
             version, or an entry is missing, unknown, or of the wrong type, shape or range.
     """
-    return _unpack(read_sealed(Path(path), KIND, "python -m train export"), str(path))
+    return _unpack(archive.read_sealed(Path(path), KIND, "python -m train export"), str(path))
 
 
 def _pack(policy: Policy) -> dict[str, np.ndarray]:
@@ -198,7 +185,7 @@ def _pack(policy: Policy) -> dict[str, np.ndarray]:
         "workspace": policy.workspace,
         "provenance_json": json.dumps(policy.provenance),
     }
-    entries |= layer_entries("actor", policy.layers)
+    entries |= archive.layer_entries("actor", policy.layers)
     entries |= {f"action.{name}": getattr(policy.actions, name) for name in ("low", "high")}
     for name in ("obs_scale", "reward", "sensor", "gains"):
         numbers = entries_of(name, getattr(policy, name))

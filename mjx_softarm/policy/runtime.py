@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mjx_softarm._support.mlp import mlp
 from mjx_softarm.mdp.observation import ObsScale, observe
 from mjx_softarm.policy.file import Policy
 
@@ -56,11 +57,8 @@ class PolicyRunner:
                 asks for would be springs without a length.
         """
         pose, goal = np.broadcast_arrays(_six("pose", pose), _six("goal", goal))
-        x = observe(pose, goal, self._scale, self.policy.reward)  # (..., 18)
-        *hidden, (head_weight, head_bias) = self.policy.layers
-        for weight, bias in hidden:
-            x = np.maximum(x @ weight + bias, 0.0)  # (..., out)
-        action = np.tanh(x @ head_weight + head_bias)  # (..., n)
+        observation = observe(pose, goal, self._scale, self.policy.reward)  # (..., 18)
+        action = np.tanh(mlp(self.policy.layers, observation))  # (..., n)
         if not np.isfinite(action).all():
             raise ValueError("action: got nan, expected finite numbers; the actor overflows")
         return action

@@ -63,9 +63,7 @@ def estimate_frame(estimator: PoseEstimator, spring_m: Array) -> Frame:
     even = constant_curvature(estimator.spring_site_m, spring_m)  # (..., n_sections)
     normalised = (spring_m - estimator.spring_centre_m) / estimator.spring_scale_m
     changes = mlp(estimator.layers, xp.concat([normalised, *_downs(even.rotation)], axis=-1))
-    changes = (
-        changes.reshape(*changes.shape[:-1], -1, N_CHANGES) * estimator.change_scale
-    )  # (..., sections, 6)
+    changes = changes.reshape(*changes.shape[:-1], -1, N_CHANGES) * estimator.change_scale  # (..., n / 3, 6)
     quaternion = xp.concat([xp.ones_like(changes[..., :1]), changes[..., 3:]], axis=-1)
     turn = rotation_from_quaternion(quaternion / xp.sqrt(xp.sum(quaternion**2, axis=-1))[..., None])
     return chain(Frame(even.position_m + changes[..., :3], turn @ even.rotation))
@@ -136,16 +134,10 @@ def take_estimator(entries: Entries, name: str, n_springs: int) -> PoseEstimator
         SealedFileError: an entry is missing, or of the wrong type, shape or range.
     """
     n_sections = n_springs // N_CHAMBERS_PER_SECTION
-    shapes = {
-        "spring_site_m": (n_springs, 2),
-        "spring_centre_m": (n_springs,),
-        "spring_scale_m": (n_springs,),
-        "change_scale": (N_CHANGES,),
-    }
+    shapes: dict = dict.fromkeys(("spring_centre_m", "spring_scale_m"), (n_springs,))
+    shapes |= {"spring_site_m": (n_springs, 2), "change_scale": (N_CHANGES,)}
     n_in, n_out = n_springs + 3 * n_sections, N_CHANGES * n_sections
-    estimator = entries.network(name, PoseEstimator, shapes, n_in, n_out)
-    _check_scales(entries, name, estimator, "spring_scale_m", "change_scale")
-    return estimator
+    return entries.network(name, PoseEstimator, shapes, n_in, n_out)
 
 
 def take_spring_model(entries: Entries, name: str, n_springs: int) -> SpringModel:
@@ -155,12 +147,4 @@ def take_spring_model(entries: Entries, name: str, n_springs: int) -> SpringMode
         SealedFileError: an entry is missing, or of the wrong type, shape or range.
     """
     shapes = {item: (n_springs,) for item in SpringModel._fields if item != "layers"}
-    model = entries.network(name, SpringModel, shapes, n_springs, n_springs)
-    _check_scales(entries, name, model, "pressure_scale_kpa", "spring_scale_m")
-    return model
-
-
-def _check_scales(entries: Entries, name: str, network: NamedTuple, *items: str) -> None:
-    for item in items:
-        if not (getattr(network, item) > 0.0).all():
-            entries.fail(f"{name}.{item}", f"got {getattr(network, item).tolist()}, expected numbers > 0")
+    return entries.network(name, SpringModel, shapes, n_springs, n_springs)

@@ -73,13 +73,9 @@ def quaternion_from_pose(pose: Array) -> Array:
     xp = array_namespace(pose)
     half = xp.deg2rad(0.5 * pose[..., 3:])
     (cy, cp, cr), (sy, sp, sr) = ([f(half[..., k]) for k in range(3)] for f in (xp.cos, xp.sin))
-    parts = [
-        cy * cp * cr + sy * sp * sr,
-        cy * cp * sr - sy * sp * cr,
-        cy * sp * cr + sy * cp * sr,
-        sy * cp * cr - cy * sp * sr,
-    ]
-    return xp.stack(parts, axis=-1)
+    w, x = cy * cp * cr + sy * sp * sr, cy * cp * sr - sy * sp * cr
+    y, z = cy * sp * cr + sy * cp * sr, sy * cp * cr - cy * sp * sr
+    return xp.stack([w, x, y, z], axis=-1)
 
 
 def frame_from_pose(pose: Array) -> tuple[Array, Array]:

@@ -118,10 +118,9 @@ def correction_between(pose: Array, real_pose: Array) -> Array:
 def carry_body(plate_position: Array, plate_rotation: Array, real_pose: Array) -> tuple[Array, Array]:
     """Estimate the plates of the real arm from the correction of its tip.
 
-    An approximation: a tilted base, the main cause of the offset, moves a plate the more the further
-    down it is. So each plate moves by a share of the tip's offset, in proportion to its place along the arm,
-    and keeps its direction; the last plate is that of the real tip. A shifted base, which moves all plates, is
-    not corrected at the base.
+    An approximation: a tilted base, the main cause of the offset, moves a plate the more the further down it
+    is. So each plate moves by a share of the tip's offset, by its place along the arm, and keeps
+    its direction; the last plate is that of the real tip. A shift of the base itself is not corrected there.
 
     Args:
         plate_position (..., L + 1, 3) [m]: simulated, as in `mjx_softarm.mechanics.kinematics.Frames`.
@@ -174,14 +173,9 @@ def take_s2r(entries: Entries, name: str, n_springs: int | None = None) -> S2R:
     n_inputs = None if n_springs is None else N_POSE_INPUTS + n_springs
     low = entries.take(f"{name}.input_low", np.float32, (n_inputs,))
     n_in, n_out = len(low), N_POSE_OUTPUTS
-    shapes: dict[str, tuple[int | None, ...]] = {
-        "input_low": (n_in,),
-        "input_high": (n_in,),
-        "output_low": (n_out,),
-        "output_high": (n_out,),
-        "anchors": (None, n_in),
-        "limit": (),
-    }
+    shapes: dict = dict.fromkeys(("input_low", "input_high"), (n_in,))
+    shapes |= dict.fromkeys(("output_low", "output_high"), (n_out,))
+    shapes |= {"anchors": (None, n_in), "limit": ()}
     s2r = entries.network(name, S2R, shapes, n_in, n_out)
     for item, holds, expected in (
         ("input_high", s2r.input_low < s2r.input_high, "more than input_low"),

@@ -59,9 +59,7 @@ class Sensor:
 
     kind: ClassVar[str]  # `kind` in the specification
     reading_name: ClassVar[str]  # of the columns of a log, and of an action's entries
-    units: ClassVar[
-        Mapping[str, float]
-    ]  # that a log may use, with factors to the unit used inside, the first
+    units: ClassVar[Mapping[str, float]]  # of a log, with factors to the unit used inside, the first
     range_fields: ClassVar[tuple[str, str]]  # fields that hold the least and the greatest believed reading
     plausible: ClassVar[tuple[float, float]]  # a log's column with a median outside has another unit
     spike: ClassVar[float]  # a reading that is off its neighbours by less is no outlier
