@@ -2,7 +2,6 @@
 
 import contextlib
 import copy
-import dataclasses
 import math
 import re
 
@@ -13,11 +12,6 @@ from hypothesis import strategies as st
 
 from mjx_softarm import ArmSpec, SpecError
 from tests.properties import damaged, few
-
-
-@pytest.fixture
-def spec():
-    return ArmSpec.default()
 
 
 @pytest.fixture
@@ -68,12 +62,8 @@ def test_default_is_the_paper_s_arm(spec):
 
 
 def test_derived_counts_and_lengths(spec):
-    assert spec.n_chambers == 9
-    assert spec.n_links == 3 * spec.structure.links_per_section
+    assert (spec.n_chambers, spec.n_links) == (9, 3 * spec.structure.links_per_section)
     assert spec.n_links * spec.link_length_m == pytest.approx(3 * spec.geometry.section_length_m)
-
-
-def test_per_chamber_spreads_one_number_and_keeps_a_list(spec):
     assert spec.per_chamber(spec.sensor.beta) == (0.93,) * 9
     areas = tuple(1e-3 + 1e-5 * k for k in range(9))
     assert spec.per_chamber(spec.replace(chambers={"area_m2": areas}).chambers.area_m2) == areas
@@ -82,21 +72,9 @@ def test_per_chamber_spreads_one_number_and_keeps_a_list(spec):
 # --- round trips and replacement -------------------------------------------------------------------
 
 
-def test_toml_round_trip(tmp_path, spec):
-    beta = tuple(0.9 + 0.01 * k for k in range(9))
-    spec = spec.replace(name='mine: "ünï"', sensor={"beta": beta}, mass={"payload_kg": 0.1 + 0.2})
-    spec.to_toml(tmp_path / "arm.toml")
-    again = ArmSpec.from_toml(tmp_path / "arm.toml")
-    assert again == spec
-    assert again.sensor.beta == beta
-    assert ArmSpec.from_dict(spec.to_dict()) == spec
-
-
-def test_whole_numbers_are_read_as_floats(data):
-    spec = ArmSpec.from_dict(changed(data, "sensor.beta", [1] * 9))
-    assert isinstance(spec.sensor.beta[0], float)
-    spec = ArmSpec.from_dict(changed(data, "mass.arm_kg", 4))
-    assert isinstance(spec.mass.arm_kg, float)
+def test_whole_numbers_are_read_as_floats(spec):
+    spec = spec.replace(sensor={"beta": [1] * 9}, mass={"arm_kg": 4})
+    assert isinstance(spec.sensor.beta[0], float) and isinstance(spec.mass.arm_kg, float)
 
 
 def test_replace_changes_only_what_it_names_and_leaves_the_original(spec):
@@ -105,12 +83,6 @@ def test_replace_changes_only_what_it_names_and_leaves_the_original(spec):
     assert spec.to_dict() == before
     assert (new.name, new.mass.payload_kg, new.n_links) == ("heavy", 0.2, 18)
     assert new.replace(name=spec.name, mass={"payload_kg": 0.0}, structure={"links_per_section": 4}) == spec
-
-
-def test_a_spec_is_frozen_and_hashable(spec):
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        spec.mass.arm_kg = 1.0
-    assert hash(spec) == hash(ArmSpec.default())
 
 
 def test_another_number_of_sections_needs_no_new_scalars(spec):
@@ -126,15 +98,14 @@ REFUSED = [
     # field, value, what the message expects
     ("mass.arm_kg", "heavy", "a number > 0"),
     ("mass.arm_kg", True, "a number > 0"),
-    ("mass.arm_kg", None, "a number > 0"),
     ("mass.arm_kg", [4.25], "a number > 0"),
     ("mass.arm_kg", 0.0, "a number > 0"),
     ("mass.arm_kg", math.nan, "a number > 0"),
     ("mass.arm_kg", math.inf, "a number > 0"),
+    ("mass.arm_kg", 10**400, "a number > 0"),
     ("mass.payload_kg", -0.1, "a number >= 0"),
     ("sensor.compensation_h", math.nan, "a number"),
     ("structure.n_sections", 3.0, "a whole number >= 1 and <= 100"),
-    ("structure.n_sections", True, "a whole number >= 1 and <= 100"),
     ("structure.n_sections", 0, "a whole number >= 1 and <= 100"),
     ("structure.links_per_section", 10**40, "a whole number >= 1 and <= 100"),
     ("mass.arm_kg", 1e39, "sizes from 1.2e-38 to 3.4e+38, which float32 holds"),
@@ -145,10 +116,10 @@ REFUSED = [
     ("sensor.beta", -0.93, "a number > 0, or a list with one per chamber"),
     ("sensor.beta", [0.93] * 8 + [math.nan], "a number > 0, or a list with one per chamber"),
     ("sensor.beta", [0.93] * 8 + [True], "a number > 0, or a list with one per chamber"),
-    ("sensor.beta", [[0.93]] * 9, "a number > 0, or a list with one per chamber"),
     ("sensor.beta", [0.93] * 8, "one, or one for each of the 9 chambers"),
     ("sensor.beta", [], "one, or one for each of the 9 chambers"),
-    ("name", 3, "a text"),
+    ("sensor.kind", "laser", "coil or draw_wire"),
+    ("name", {"first": "arm"}, "a text"),
     ("mass", 4.7, "a table"),
 ]
 
@@ -178,47 +149,25 @@ def test_a_range_must_not_be_empty(data, low, high):
 @pytest.mark.parametrize("path", ["mass.arm_kg", "sensor", "name"])
 def test_a_missing_field_is_named(data, path):
     *groups, name = path.split(".")
-    part = data[groups[0]] if groups else data
-    del part[name]
+    del (data[groups[0]] if groups else data)[name]
     assert message_of(ArmSpec.from_dict, data, "my.toml").startswith(f"my.toml: {path}: missing")
 
 
-def test_an_unknown_field_is_named_with_the_known_ones(data):
-    text = message_of(ArmSpec.from_dict, changed(data, "control.kd", 1.0), "my.toml")
-    assert text == (
-        "my.toml: control.kd: unknown field, expected one of rate_hz, kp_kpa_per_m, ki_kpa_per_ms"
-    )
+def test_an_unknown_field_is_named_with_the_known_ones(spec, data):
     text = message_of(ArmSpec.from_dict, changed(data, "motors", {}), "my.toml")
     assert text.startswith("my.toml: motors: unknown field, expected one of name, structure,")
+    text = message_of(spec.replace, control={"kd": 1.0})
+    assert text == "replace: control.kd: unknown field, expected one of rate_hz, kp_kpa_per_m, ki_kpa_per_ms"
+    text = message_of(spec.replace, motors={})
+    assert text.startswith("replace: got unknown group 'motors', expected one of name,")
 
 
-def test_replace_refuses_like_a_file_does(spec):
-    text = message_of(spec.replace, mass={"payload_kg": -1.0})
-    assert text == "replace: mass.payload_kg: got -1.0, expected a number >= 0"
-    assert message_of(spec.replace, mass={"payload": 1.0}).startswith("replace: mass.payload: unknown field")
-    assert message_of(spec.replace, motors={}).startswith(
-        "replace: got unknown group 'motors', expected one of name,"
-    )
-
-
-def test_a_file_that_is_no_toml_is_named(tmp_path):
-    path = tmp_path / "broken.toml"
-    path.write_text("name = \nmass", "utf-8")
-    assert re.match(
-        rf"{re.escape(str(path))}: not a TOML file: .*line 1", message_of(ArmSpec.from_toml, path)
-    )
-    path.write_bytes(b"name = '\xff'")
-    assert message_of(ArmSpec.from_toml, path).startswith(f"{path}: not a TOML file: ")
-
-
-def test_a_file_that_cannot_be_read_is_named(tmp_path):
-    path = tmp_path / "absent.toml"
-    assert message_of(ArmSpec.from_toml, path) == f"{path}: cannot be read: No such file or directory"
-    assert message_of(ArmSpec.from_toml, tmp_path).startswith(f"{tmp_path}: cannot be read: ")
-
-
-def test_a_value_in_a_file_is_refused_with_the_file_s_name(tmp_path, spec):
+def test_files_that_cannot_be_used_are_named(tmp_path, spec):
     path = tmp_path / "arm.toml"
+    assert message_of(ArmSpec.from_toml, path) == f"{path}: cannot be read: No such file or directory"
+    for content in (b"name = \nmass", b"name = '\xff'"):
+        path.write_bytes(content)
+        assert message_of(ArmSpec.from_toml, path).startswith(f"{path}: not a TOML file: ")
     spec.to_toml(path)
     path.write_text(path.read_text("utf-8").replace("gripper_kg = 0.45", "gripper_kg = nan"), "utf-8")
     assert message_of(ArmSpec.from_toml, path) == f"{path}: mass.gripper_kg: got nan, expected a number >= 0"
@@ -235,16 +184,6 @@ def test_a_value_in_a_file_is_refused_with_the_file_s_name(tmp_path, spec):
 def test_lengths_that_the_sensor_cannot_read_are_refused(change, field):
     with pytest.raises(SpecError, match=rf"springs\.{field}: .* reads .* expected sensor\.frequency_min_hz"):
         ArmSpec.default().replace(**change)
-
-
-def test_a_number_too_large_for_a_float_is_refused():
-    with pytest.raises(SpecError, match=r"mass\.arm_kg: got 10+, expected a number > 0"):
-        ArmSpec.default().replace(mass={"arm_kg": 10**400})
-
-
-def test_a_table_in_the_place_of_a_text_is_refused():
-    with pytest.raises(SpecError, match="name: got .* expected a text"):
-        ArmSpec.default().replace(name={"first": "arm"})
 
 
 # --- all specifications ------------------------------------------------------------------------------------
@@ -279,13 +218,8 @@ def test_a_damaged_file_is_read_or_refused_as_a_specification(tmp_path, data):
         assert ArmSpec.from_toml(tmp_path / "arm.toml").n_chambers > 0
 
 
-NUMBERS = [
-    f"{group}.{name}"
-    for group, fields in ArmSpec.default().to_dict().items()
-    if isinstance(fields, dict)
-    for name in fields
-    if name != "kind"
-]
+GROUPS = {name: group for name, group in ArmSpec.default().to_dict().items() if isinstance(group, dict)}
+NUMBERS = [f"{group}.{name}" for group, fields in GROUPS.items() for name in fields if name != "kind"]
 
 
 @settings(few, max_examples=200)

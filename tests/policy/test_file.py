@@ -3,7 +3,9 @@
 import dataclasses
 import hashlib
 import os
+from functools import partial
 
+import jax
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -12,6 +14,7 @@ from hypothesis.extra import numpy as npst
 
 from mjx_softarm import ArmSpec
 from mjx_softarm._support.archive import SealedFileError, sealed
+from mjx_softarm.control import Gains
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.policy import file as export
 from mjx_softarm.policy.file import load_policy, policy_from_actor, save_policy
@@ -61,25 +64,12 @@ def arrays_of(path):
 def reseal(path, drop=(), **changes):
     """The file with other entries, under a checksum that fits them."""
     arrays = {name: value for name, value in arrays_of(path).items() if name not in drop}
-    path.write_bytes(
-        sealed(arrays | {name.replace("__", "."): v for name, v in changes.items()}, export.KIND)
-    )
+    arrays |= {name.replace("__", "."): value for name, value in changes.items()}
+    path.write_bytes(sealed(arrays, export.KIND))
 
 
 def assert_same(one, other):
-    for item in dataclasses.fields(export.Policy):
-        got, expected = getattr(one, item.name), getattr(other, item.name)
-        if isinstance(expected, (tuple, np.ndarray)):
-            for a, b in zip(flat(got), flat(expected), strict=True):
-                np.testing.assert_array_equal(a, b, strict=True)
-        else:
-            assert got == expected, item.name
-
-
-def flat(value):
-    if dataclasses.is_dataclass(value):
-        value = tuple(vars(value).values())
-    return [x for part in value for x in flat(part)] if isinstance(value, tuple) else [np.asarray(value)]
+    jax.tree.map(partial(np.testing.assert_array_equal, strict=True), vars(one), vars(other))
 
 
 def refusal(path):
@@ -91,15 +81,13 @@ def refusal(path):
     return message.removeprefix(f"{path}: ")
 
 
-def test_what_is_saved_is_loaded(file, make_policy):
+def test_what_is_saved_is_loaded_and_has_the_same_bytes(file, make_policy):
     assert_same(load_policy(file), make_policy())
-    assert load_policy(file).provenance == PROVENANCE
-
-
-def test_policy_without_a_sim_to_real_network(tmp_path, make_policy):
-    save_policy(tmp_path / "policy.npz", make_policy(s2r=None))
-    assert_same(load_policy(tmp_path / "policy.npz"), make_policy(s2r=None))
-    assert arrays_of(tmp_path / "policy.npz")["s2r_kind"] == "none"
+    before = file.read_bytes()
+    save_policy(file, load_policy(file))
+    assert file.read_bytes() == before
+    save_policy(file, make_policy(s2r=None))
+    assert_same(load_policy(file), make_policy(s2r=None))
 
 
 def test_parts_are_those_of_the_arm(file):
@@ -107,40 +95,18 @@ def test_parts_are_those_of_the_arm(file):
     assert [weight.shape for weight, _ in policy.layers] == [(18, 7), (7, 5), (5, 9)]
     np.testing.assert_array_equal(policy.obs_scale.centre, [0, 0, -600, 0, 0, 0])
     np.testing.assert_array_equal(policy.obs_scale.scale, [200, 200, 200, 90, 90, 90])
-    assert (policy.reward.threshold, policy.reward.weight_per_mm, policy.reward.weight_per_deg) == (
-        0.025,
-        0.0056,
-        0.001,
-    )
-    assert (policy.gains.pressure_min_kpa, policy.gains.pressure_max_kpa, policy.rate_hz) == (
-        -40.0,
-        20.0,
-        50.0,
-    )
-    np.testing.assert_array_equal(policy.sensor.beta, policy.spec.sensor.beta)
-    # Resonance of capacitor, coil and compensation, from the paper's equations.
-    for column, length_m in ((0, spec.springs.length_min_m), (1, spec.springs.length_max_m)):
-        wire_m = (length_m - spec.sensor.delta_m) / np.linspace(0.9, 0.98, 9)
-        coil_h = 1.26e-6 * spec.sensor.turns**2 * np.pi * spec.sensor.coil_radius_m**2 / wire_m
-        total_h = coil_h + spec.sensor.compensation_h
-        expected = 1.0 / (2.0 * np.pi * np.sqrt(spec.sensor.capacitance_f * total_h))
-        np.testing.assert_allclose(policy.actions[1 + column], expected, rtol=1e-12)
+    assert (policy.reward, policy.provenance) == (RewardConfig(threshold=0.025), PROVENANCE)
+    assert (policy.gains, policy.rate_hz) == (Gains.from_spec(spec), 50.0)
+    for readings, length_m in zip(policy.actions[1:], (0.085, 0.275), strict=True):
+        np.testing.assert_allclose(policy.sensor.lengths(readings).length_m, length_m, rtol=1e-12)
 
 
 def test_file_is_plain_npz_with_named_layouts(file):
     arrays = arrays_of(file)
     assert arrays["schema_version"] == 3 and arrays["s2r_kind"] == "mlp"
-    assert arrays["obs_layout"].tolist()[:7] == [
-        *("pose_x_mm", "pose_y_mm", "pose_z_mm", "pose_yaw_deg", "pose_pitch_deg", "pose_roll_deg"),
-        "goal_x_mm",
-    ]
-    assert arrays["obs_layout"].shape == (18,) and arrays["obs_layout"][17] == "error_roll_deg"
+    parts, axes = ("pose", "goal", "error"), ("x_mm", "y_mm", "z_mm", "yaw_deg", "pitch_deg", "roll_deg")
+    assert arrays["obs_layout"].tolist() == [f"{part}_{axis}" for part in parts for axis in axes]
     assert arrays["action_layout"].tolist() == [f"frequency{k}" for k in range(9)]
-
-
-def test_same_policy_gives_same_bytes(file, tmp_path):
-    save_policy(tmp_path / "again.npz", load_policy(file))
-    assert (tmp_path / "again.npz").read_bytes() == file.read_bytes()
 
 
 def test_actor_with_one_layer_and_arm_with_two_sections(tmp_path, make_arm_model):
@@ -153,10 +119,9 @@ def test_actor_with_one_layer_and_arm_with_two_sections(tmp_path, make_arm_model
 @pytest.mark.parametrize("names", [["hidden_0"], ["hidden_1", "head"], ["hidden_0", "head", "norm_0"], []])
 def test_parameters_of_another_network_are_refused(names, make_arm_model):
     dense, model = make_params()["params"]["hidden_0"], make_arm_model(9)
+    params = {"params": dict.fromkeys(names, dense)}
     with pytest.raises(ValueError, match=r"expected hidden_0, hidden_1, \.\.\. and head"):
-        policy_from_actor(
-            {"params": dict.fromkeys(names, dense)}, ArmSpec.default(), RewardConfig(), model, {}
-        )
+        policy_from_actor(params, ArmSpec.default(), RewardConfig(), model, {})
 
 
 def test_networks_of_another_arm_are_refused(make_arm_model):
@@ -164,12 +129,7 @@ def test_networks_of_another_arm_are_refused(make_arm_model):
         model = make_arm_model(9, s2r=True)._replace(**{part: getattr(make_arm_model(6, s2r=True), part)})
         with pytest.raises(SealedFileError, match=rf"policy: {part}\.\w+: got float32 \("):
             policy_from_actor(make_params(), ArmSpec.default(), RewardConfig(), model, {})
-
-
-def test_actor_of_another_arm_is_refused(make_arm_model):
-    with pytest.raises(
-        SealedFileError, match=r"policy: actor.2.bias: got float32 \(6,\), expected float32 \(9,\)"
-    ):
+    with pytest.raises(SealedFileError, match=r"actor.2.bias: got float32 \(6,\), expected float32 \(9,\)"):
         policy_from_actor(make_params(n_actions=3), ArmSpec.default(), RewardConfig(), make_arm_model(9), {})
 
 
@@ -193,52 +153,35 @@ def test_any_entry_in_the_place_of_another_is_read_or_refused(file, data):
 def test_files_that_are_no_policy(tmp_path):
     path = tmp_path / "other.npz"
     assert refusal(path) == "cannot be read: No such file or directory"
-    assert refusal(tmp_path) == "cannot be read: Is a directory"
+    expected = "expected an unchanged file of `python -m train export`"
     for content in (b"", b"name = 'paper'\n", b"PK\x03\x04", bytes(1000)):
         path.write_bytes(content)
-        assert refusal(path) == (
-            f"got no complete npz archive, {len(content)} bytes, "
-            "expected an unchanged file of `python -m train export`"
-        )
+        assert refusal(path) == f"got no complete npz archive, {len(content)} bytes, {expected}"
     np.savez(path, weight=np.zeros(3))
     assert refusal(path).startswith("got an archive without a policy's mark at its end")
 
 
-@pytest.mark.parametrize("version", [0, 1, 2])
-def test_another_schema_is_named_before_anything_else(file, version):
-    reseal(file, drop=["gains.kp_kpa_per_m"], schema_version=np.array(version), nose=np.zeros(3))
-    assert refusal(file) == (
-        f"schema_version: got {version}, expected 3; `python -m train export RUN` writes the policy anew"
-    )
+def test_another_schema_is_named_before_anything_else(file):
+    reseal(file, drop=["gains.kp_kpa_per_m"], schema_version=np.array(2), nose=np.zeros(3))
+    expected = "expected 3; `python -m train export RUN` writes the policy anew"
+    assert refusal(file) == f"schema_version: got 2, {expected}"
 
 
-def test_every_entry_is_required(file):
+def test_every_entry_is_required_and_its_type_shape_and_numbers_are_checked(file):
     data = file.read_bytes()
-    for name in arrays_of(file):
+    for name, array in arrays_of(file).items():
         reseal(file, drop=[name])
         assert refusal(file) == f"{name}: missing"
-        file.write_bytes(data)
-
-
-def test_every_number_must_be_finite(file):
-    data = file.read_bytes()
-    for name, array in arrays_of(file).items():
-        if array.dtype.kind == "f":
-            for bad in (np.nan, np.inf):
-                changed = array.copy()
-                changed.flat[-1] = bad
-                reseal(file, **{name: changed})
-                assert refusal(file) == f"{name}: got {bad}, expected finite numbers that float32 holds"
-                file.write_bytes(data)
-
-
-def test_every_type_and_shape_is_checked(file):
-    data = file.read_bytes()
-    for name, array in arrays_of(file).items():
-        for changed in (array.astype("S"), array[None]):
-            reseal(file, **{name: changed})
-            assert refusal(file).startswith(f"{name}: got {changed.dtype.name} {changed.shape}, expected ")
+        spoilt = [(x, f"{x.dtype.name} {x.shape}, expected ") for x in (array.astype("S"), array[None])]
+        for bad in (np.nan, np.inf) if array.dtype.kind == "f" else ():
+            changed = array.copy()
+            changed.flat[-1] = bad
+            spoilt.append((changed, f"{bad}, expected finite numbers that float32 holds"))
+        for changed, message in spoilt:
             file.write_bytes(data)
+            reseal(file, **{name: changed})
+            assert refusal(file).startswith(f"{name}: got {message}")
+        file.write_bytes(data)
 
 
 @pytest.mark.parametrize(
@@ -247,10 +190,6 @@ def test_every_type_and_shape_is_checked(file):
         ({"actor__n_layers": np.array(0)}, "actor.n_layers: got 0, expected at least 1"),
         ({"actor__n_layers": np.array(4)}, "actor.3.bias: missing"),
         ({"actor__n_layers": np.array(2)}, "actor.1.bias: got float32 (5,), expected float32 (9,)"),
-        (
-            {"actor__1__weight": np.zeros((8, 5), np.float32)},
-            "actor.1.weight: got float32 (8, 5), expected float32 (7, 5)",
-        ),
         ({"actor__0__bias": np.zeros(7)}, "actor.0.bias: got float64 (7,), expected float32 (7,)"),
         ({"obs_layout": np.array(export.OBS_LAYOUT[::-1])}, "obs_layout: got ['error_roll_deg', "),
         ({"action_layout": np.array(["voltage0"] * 9)}, "action_layout: got ['voltage0', 'voltage0', "),
@@ -258,10 +197,7 @@ def test_every_type_and_shape_is_checked(file):
         ({"action__low": np.full(9, 5e6)}, "action.low: got [5000000.0, "),
         ({"action__low": np.full(9, 1.0)}, "action.low: got [1.0, "),
         ({"sensor__delta_m": np.full(9, -1.0)}, "action.low: got "),
-        (
-            {"gains__pressure_min_kpa": np.array(20.0)},
-            "gains.pressure_min_kpa: got 20.0, expected less than gains.pressure_max_kpa",
-        ),
+        ({"gains__pressure_min_kpa": np.array(20.0)}, "gains.pressure_min_kpa: got 20.0, expected less than"),
         ({"rate_hz": np.array(0.0)}, "rate_hz: got 0.0, expected a number > 0"),
         ({"tolerance_m": np.array(-1e-3)}, "tolerance_m: got -0.001, expected a number > 0"),
         ({"n_actions": np.array(0)}, "n_actions: got 0, expected a whole number > 0"),
@@ -269,7 +205,6 @@ def test_every_type_and_shape_is_checked(file):
         ({"s2r_kind": np.array("none")}, "s2r.0.bias: unknown entry, schema 3 has none of this name"),
         ({"workspace": np.zeros((0, 6), np.float32)}, "workspace: got float32 (0, 6), expected "),
         ({"estimator__spring_scale_m": np.zeros(9, np.float32)}, "estimator.spring_scale_m: got [0.0, "),
-        ({"s2r__limit": np.float32(0.0)}, "s2r.limit: got 0.0, expected a number > 0"),
         ({"provenance_json": np.array("[1]")}, "provenance_json: got '[1]', expected a JSON object"),
         ({"spec_json": np.array("{")}, "spec_json: got '{', expected a JSON object"),
         ({"spec_json": np.array('{"nose": 1}')}, "spec_json: nose: unknown field, expected one of name, "),
@@ -286,9 +221,7 @@ def test_policy_that_is_not_finite_is_not_written(file, make_policy):
     before = file.read_bytes()
     layers = make_policy().layers
     layers[0][0][3, 2] = np.nan
-    with pytest.raises(
-        SealedFileError, match=r"actor\.0\.weight: got nan, expected finite numbers that float32 holds"
-    ):
+    with pytest.raises(SealedFileError, match=r"actor\.0\.weight: got nan, expected finite numbers"):
         save_policy(file, make_policy(layers=layers))
     assert file.read_bytes() == before
 

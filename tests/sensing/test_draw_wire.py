@@ -60,11 +60,8 @@ def test_specification_is_written_and_read(tmp_path):
 def test_actions_are_voltages_and_lead_where_they_say():
     env = ReachEnv(SPEC, EnvConfig(n_poses=16))
     shortest_v, middle_v, longest_v = 0.085 / 0.2, 0.18 / 0.2, 0.275 / 0.2  # beta is 1, delta 0
-    np.testing.assert_allclose(
-        env.action_map.readings(np.linspace(-1, 1, 3)[:, None]),
-        np.outer([shortest_v, middle_v, longest_v], np.ones(9)),
-        rtol=1e-6,
-    )
+    expected = np.outer([shortest_v, middle_v, longest_v], np.ones(9))
+    np.testing.assert_allclose(env.action_map.readings(np.linspace(-1, 1, 3)[:, None]), expected, rtol=1e-6)
     state = jax.jit(env.reset)(jax.random.key(0))
     goal_m = env.pool.spring_m[3]
     after = jax.jit(env.step)(state, env.action_of(goal_m))
@@ -76,9 +73,8 @@ def test_actions_are_voltages_and_lead_where_they_say():
 def test_recorded_voltages_calibrate_the_wires(tmp_path):
     targets_kpa = np.random.default_rng(0).uniform(-20.0, 10.0, (60, 9))
     log = record(WireArm(), SPEC.replace(springs={"length_min_m": 0.1}), targets_kpa).log
-    write_log(
-        tmp_path / "springs.csv", dataclasses.replace(log, tip_m=None, tip_quaternion=None, marker_m=None)
-    )
+    log = dataclasses.replace(log, tip_m=None, tip_quaternion=None, marker_m=None)
+    write_log(tmp_path / "springs.csv", log)
     assert "voltage0 [V]" in (tmp_path / "springs.csv").read_text().splitlines()[0]
     log, _ = read_log(tmp_path / "springs.csv")
     fit = fit_springs(log.readings_of(SPEC.sensor), log.spring_m, Sensor.from_spec(SPEC))

@@ -33,20 +33,6 @@ def angle_deg(a, b):
     return np.rad2deg(Rotation.from_matrix(np.swapaxes(a, -1, -2) @ b).magnitude())
 
 
-def test_straight_arm_has_no_angles():
-    tip = np.array([0.0, 0.0, -0.6])
-    np.testing.assert_array_equal(pose_from_frame(tip, np.eye(3)), [0, 0, -600, 0, 0, 0])
-
-
-@pytest.mark.parametrize(
-    "angles", [(90, 0, 0), (0, 45, 0), (0, 0, 90), (-120, 0, 0), (0, -60, 0), (0, 0, 170)]
-)
-def test_each_angle_turns_about_its_own_axis(angles):
-    axis = int(np.flatnonzero(angles)[0])
-    rotation = Rotation.from_rotvec(np.deg2rad(angles[axis]) * np.eye(3)[2 - axis]).as_matrix()
-    np.testing.assert_allclose(pose_from_frame(np.zeros(3), rotation)[3:], angles, atol=1e-12)
-
-
 def test_pose_from_frame_is_scipy_s_intrinsic_zyx():
     pose = pose_from_frame(POSITIONS_M, ROTATIONS.as_matrix())
     np.testing.assert_allclose(pose[:, :3], 1000.0 * POSITIONS_M)
@@ -107,11 +93,9 @@ def test_gradient_equals_the_difference_quotient():
     with jax.enable_x64(True):
         jacobian = jax.jacobian(pose_from_frame, argnums=1)(jnp.zeros(3), jnp.asarray(rotation))
     step = 1e-6
-    for row, column in np.ndindex(3, 3):
-        change = np.zeros((3, 3))
-        change[row, column] = step
-        ends = [pose_from_frame(np.zeros(3), rotation + sign * change) for sign in (-1, 1)]
-        np.testing.assert_allclose(jacobian[:, row, column], (ends[1] - ends[0]) / (2 * step), atol=1e-5)
+    changes = step * np.eye(9).reshape(3, 3, 3, 3)
+    back, ahead = (pose_from_frame(np.zeros((3, 3, 3)), rotation + sign * changes) for sign in (-1, 1))
+    np.testing.assert_allclose(np.moveaxis(jacobian, 0, 2), (ahead - back) / (2 * step), atol=1e-5)
 
 
 def test_pose_error_wraps_angles_only():
@@ -122,13 +106,9 @@ def test_pose_error_wraps_angles_only():
     np.testing.assert_array_equal(pose_error(pose, pose), 0.0)
 
 
-def test_pose_error_keeps_small_float32_differences():
-    goal = np.zeros(6, np.float32)
+def test_pose_error_keeps_small_float32_differences_and_their_slope():
     pose = np.full(6, 1e-4, np.float32)
-    np.testing.assert_array_equal(pose_error(pose, goal), pose)
-
-
-def test_pose_error_has_the_slope_of_a_difference():
+    np.testing.assert_array_equal(pose_error(pose, np.zeros(6, np.float32)), pose)
     slope = jax.grad(lambda p: pose_error(p, jnp.zeros(6)).sum())(jnp.full(6, 270.0))
     np.testing.assert_array_equal(slope, 1.0)
 

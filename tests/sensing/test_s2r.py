@@ -67,9 +67,8 @@ def test_correction_is_a_shift_and_a_turn_in_the_base_frame():
     change = np.concatenate([shift_mm, axis * np.tan(angle / 2)], axis=1)
     (start_m, start_axes), (end_m, end_axes) = frame_from_pose(start), frame_from_pose(moved(start, change))
     np.testing.assert_allclose(end_m, start_m + 1e-3 * shift_mm, atol=1e-12)
-    np.testing.assert_allclose(
-        end_axes, Rotation.from_rotvec(axis * angle).as_matrix() @ start_axes, atol=1e-12
-    )
+    turn = Rotation.from_rotvec(axis * angle).as_matrix()
+    np.testing.assert_allclose(end_axes, turn @ start_axes, atol=1e-12)
 
 
 def test_correction_between_two_poses_turns_one_into_the_other():
