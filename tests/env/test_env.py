@@ -418,9 +418,10 @@ def test_engine_mjx_steps_like_engine_chain(few):
 def test_mode_dynamic_comes_to_rest_at_the_quasi_static_equilibrium(few):
     env = ReachEnv(few.env.spec, dataclasses.replace(few.env.config, mode="dynamic", dynamic_step_s=1.0))
     fresh, step = compiled(env)
-    assert leaves_equal(fresh, few.fresh)
-    first = now = step(few.before, few.actions)
-    assert types(first) == types(few.before)
+    before = few.before.replace(metrics=fresh.metrics)  # reasons of failures are those of motion
+    assert leaves_equal(fresh.pipeline_state, few.fresh.pipeline_state)
+    first = now = step(before, few.actions)
+    assert types(first) == types(before)
     for _ in range(29):
         now = step(now, few.actions)
     moving, resting, truth = (
