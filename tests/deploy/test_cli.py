@@ -125,7 +125,9 @@ def test_recording_that_ends_early_vents_and_has_its_log(folder, fault, status, 
             {fault}
 """
     )
-    (folder / "driver.py").write_text("import os, signal\n" + driver)
+    (folder / "driver.py").write_text(
+        "import os, signal\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n" + driver
+    )
     done = command(folder, "record", "--arm", "driver:Arm", "--out", "a.csv", "--poses", "9", "--transients")
     assert done.stdout.endswith(f"{status} []\n") and message in done.stderr
     written = np.loadtxt(folder / "written.txt")

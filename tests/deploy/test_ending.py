@@ -144,9 +144,14 @@ def test_plan_that_is_not_finite_is_never_written():
 
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP", "SIGINT"])
 @pytest.mark.parametrize("command", ["run", "record"])
-def test_signals_vent_and_save(command, name):
+def test_signals_vent_and_save(command, name, request):
     """Sent in the drive, and again in the venting, where they change nothing."""
     number = getattr(signal, name)
+    # A program that was started in the background may have been told to ignore SIGINT.
+    request.addfinalizer(
+        lambda handler=signal.getsignal(signal.SIGINT): signal.signal(signal.SIGINT, handler)
+    )
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     before = signal.getsignal(number)
     calls = range(20, 21) if number == signal.SIGINT else (20, 25)
 

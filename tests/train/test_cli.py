@@ -149,7 +149,10 @@ def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path, environment):
     "arguments, message",
     [
         (["reach", "--tqc.gama", "1"], "Unrecognized options: --tqc.gama, 1; Perhaps you meant: --tqc.gamma"),
-        (["reach", "--preset", "slow"], "--preset: got 'slow', expected one of ('quick', 'paper')"),
+        (
+            ["reach", "--preset", "slow"],
+            "--preset: got 'slow', expected one of ('quick', 'paper', 'analytic')",
+        ),
         (["reach", "--n-arms", "1.5"], "--n-arms: got '1.5', expected a whole number"),
         (["imitate"], "FILE: got nothing, expected the demonstrations"),
         (["imitate", "absent.npz", "--stages", "0.5,1"], "--stages: "),

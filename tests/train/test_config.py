@@ -25,7 +25,7 @@ def test_overrides_reach_every_level_and_leave_the_preset_alone():
     "assignment, message",
     [
         ("seed", "seed: got 'seed', expected NAME=VALUE"),
-        ("sed=1", "sed: got 'sed=1', expected NAME=VALUE for one of seed, n_arms"),
+        ("sed=1", "sed: got 'sed=1', expected NAME=VALUE for one of learner, seed"),
         ("tqc.gama=1", "expected NAME=VALUE for one of hidden_actor"),
         ("tqc=1", "tqc: got 'tqc=1'"),
         ("seed.x=1", "seed.x: got 'seed.x=1'"),

@@ -133,8 +133,8 @@ def test_position_far_from_its_waypoint_is_not_logged(expert, waypoints, plan):
     result = Teleoperation(Misplaced(), expert).record(waypoints, plan)
     assert (
         len(result.log) == 0
-        and "home: 7" in result.ending.cause
-        and "mm off and not to be" in result.ending.cause
+        and "home: got 7" in result.ending.cause
+        and "mm off after corrections" in result.ending.cause
     )
 
 

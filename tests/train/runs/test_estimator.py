@@ -77,7 +77,7 @@ def test_same_seed_same_networks(monkeypatch):
 
 
 def test_held_out_seed_is_refused():
-    with pytest.raises(ValueError, match="seed: 20000 draws the held-out equilibria"):
+    with pytest.raises(ValueError, match="seed: got 20000, which draws the held-out equilibria"):
         distil(SPEC, HELD_OUT_SEED)
 
 
