@@ -16,7 +16,7 @@ from benchmarks.paper.kinds import EVALUATION_FILE, KINDS, POLICY_FILE, Trial, l
 from benchmarks.paper.measure import operate, save_outcome
 from mjx_softarm.mechanics.pipe import PIPES_MM
 
-LOG_FILE, CALIBRATION, CHECKPOINTS = "log.npz", "calibration", "checkpoints"
+CALIBRATION = "calibration"
 # Session of a twin in trials of demonstrated tasks; demonstrations are recorded in its evaluation session,
 # with other noise.
 TRIAL_SESSION = 2
@@ -41,13 +41,13 @@ def calibrate_twin(folder: Path, settings: Settings, twin: int) -> None:
 
     here, spec = folder / f"twin{twin}", ArmSpec.default()
     here.mkdir(parents=True, exist_ok=True)
-    if not (here / LOG_FILE).exists():
-        _record(here / LOG_FILE, spec, settings.n_poses, twin)
-    log, findings = read_log(here / LOG_FILE, spec.n_chambers)
+    file = here / "log.npz"
+    if not file.exists():
+        _record(file, spec, settings.n_poses, twin)
+    log, findings = read_log(file, spec.n_chambers)
     xla.enable_compilation_cache()
     calibration = calibrate([log], spec)
-    lines = [str(finding) for finding in findings]
-    write_calibration(here / CALIBRATION, calibration, lines, provenance("benchmarks"))
+    write_calibration(here / CALIBRATION, calibration, [*map(str, findings)], provenance("benchmarks"))
 
 
 def _record(path: Path, spec: Any, n_poses: int, twin: int) -> None:
@@ -80,14 +80,9 @@ def train_reach(folder: Path, settings: Settings, twin: int | None, seed: int) -
             options = ["--preset", settings.preset, "--seed", str(seed), "--out", str(run)]
             if twin is not None:
                 options += ["--calibration", str(folder / f"twin{twin}" / CALIBRATION)]
-            command(log, "reach", *options, *_set(settings.training))
+            command(log, "reach", *options, *(f"--{text}" for text in settings.training))
     if not (run / POLICY_FILE).exists():
         command(log, "export", str(run))
-
-
-def _set(settings: tuple[str, ...]) -> list[str]:
-    """Return the options of settings NAME=VALUE."""
-    return [f"--{text}" for text in settings]
 
 
 def demonstrate(folder: Path, settings: Settings, twin: int, task: str) -> None:
@@ -113,7 +108,7 @@ def learn(folder: Path, settings: Settings, name: str, twin: int, seed: int) -> 
     """
     run, kind = folder / learned_run(name, twin, seed), KINDS[name]
     log = run.with_suffix(".log")
-    saved = any(path.name.isdecimal() for path in (run / CHECKPOINTS).glob("*"))
+    saved = any(path.name.isdecimal() for path in (run / "checkpoints").glob("*"))
     if saved and (run / "config.json").exists():  # written last
         command(log, "imitate", "--resume", str(run))
         return
@@ -126,8 +121,8 @@ def learn(folder: Path, settings: Settings, name: str, twin: int, seed: int) -> 
         options += ["--reward", str(folder / learned_run(kind.reward_of, twin, seed))]
     if kind.from_reach:
         options += ["--agent", str(folder / reach_run(twin, seed))]
-    demonstrations = str(folder / demonstrations_path(twin, kind.task))
-    command(log, "imitate", demonstrations, *options, *_set((*kind.settings, *settings.imitation)))
+    options += [f"--{text}" for text in (*kind.settings, *settings.imitation)]
+    command(log, "imitate", str(folder / demonstrations_path(twin, kind.task)), *options)
 
 
 def export(folder: Path, settings: Settings, twin: int, runs: tuple[str, ...]) -> None:

@@ -59,17 +59,15 @@ def stages(experiment: str, settings: Settings) -> list[list[Stage]]:
         Stage(f"try {trial.name}", (trial.result,), jobs.try_out, (trial,))
         for trial in trials(experiment, settings)
     ]
-    film = Stage("film", (FILMS[experiment],), jobs.film, (filmed(experiment, settings), FILMS[experiment]))
+    kind, objects = ("with", "") if experiment == "open" else ("pipe", "as shown")
+    filmed = Trial(kind, settings.twins[0], settings.seeds[0], objects)
+    film = Stage("film", (FILMS[experiment],), jobs.film, (filmed, FILMS[experiment]))
     if experiment == "open":
         nominal = [_reach(None, seed) for seed in settings.seeds]
         return [[*calibrations, *nominal], on_twins, [*tried, film]]
+    path = jobs.demonstrations_path
     demonstrations = [
-        Stage(
-            f"demonstrate {task} on twin {twin}",
-            (jobs.demonstrations_path(twin, task),),
-            jobs.demonstrate,
-            (twin, task),
-        )
+        Stage(f"demonstrate {task} on twin {twin}", (path(twin, task),), jobs.demonstrate, (twin, task))
         for task in TASKS
         for twin in settings.twins
     ]
@@ -77,12 +75,6 @@ def stages(experiment: str, settings: Settings) -> list[list[Stage]]:
     with_their_reward = [_learn(*item) for item in trainings(settings) if KINDS[item[0]].reward_of]
     exports = [_export(settings, twin) for twin in settings.twins]
     return [calibrations, [*demonstrations, *on_twins], first, with_their_reward, exports, [*tried, film]]
-
-
-def filmed(experiment: str, settings: Settings) -> Trial:
-    """Return the trial that an experiment's film shows."""
-    kind, objects = ("with", "") if experiment == "open" else ("pipe", "as shown")
-    return Trial(kind, settings.twins[0], settings.seeds[0], objects)
 
 
 def _reach(twin: int | None, seed: int) -> Stage:

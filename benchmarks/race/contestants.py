@@ -214,12 +214,6 @@ CONTESTANTS = (  # the most telling first
 )
 
 
-def contestant_of(name: str, seed: int) -> Contestant:
-    """Return a contestant of CONTESTANTS, started."""
-    library, variant = name.rsplit("-", 1)
-    return ours(name, seed) if library == "ours" else peer(library, variant, seed)
-
-
 def prepare(
     contestant: Contestant, start_up_s: float, stretch_s: float, n_goals: int
 ) -> tuple[Facts, Callable[[], Facts]]:
@@ -254,7 +248,8 @@ def prepare(
 
 
 def _prepare(name: str, seed: str, stretch_s: str, n_goals: str) -> tuple[Facts, Callable[[], Facts]]:
-    contestant = contestant_of(name, int(seed))
+    library, variant = name.rsplit("-", 1)
+    contestant = ours(name, int(seed)) if library == "ours" else peer(library, variant, int(seed))
     start_up_s = time.perf_counter() - START - contestant.uncounted_s
     return prepare(contestant, start_up_s, float(stretch_s), int(n_goals))
 

@@ -15,8 +15,8 @@ from benchmarks.race.contestants import (
     CONTESTANTS,
     Contestant,
     HeldOut,
-    contestant_of,
     our_config,
+    ours,
     prepare,
     tuned_settings,
 )
@@ -125,7 +125,7 @@ def test_ours_without_hindsight_differs_in_nothing_else():
 
 @pytest.mark.slow
 def test_ours_trains_and_is_evaluated():
-    facts, work = prepare(contestant_of("ours-plain", 0), 1.0, 0.0, 64)
+    facts, work = prepare(ours("ours-plain", 0), 1.0, 0.0, 64)
     points = [work() for _ in range(3)]
     assert facts == {"start_up_s": 1.0}
     assert [point["env_steps"] for point in points] == [2048, 4096, 6144]
