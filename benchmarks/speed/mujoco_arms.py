@@ -11,6 +11,7 @@ is cheaper but ends further from the equilibrium, so each rate comes with the er
 
 from __future__ import annotations
 
+import copy
 import time
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,7 +25,7 @@ from mjx_softarm import control
 from mjx_softarm.mdp.actions import ActionMap
 from mjx_softarm.mdp.observation import OBS_SIZE, ObsScale, observe
 from mjx_softarm.mdp.rewards import RewardConfig, reward
-from mjx_softarm.sensing.pose import pose_from_quaternion
+from mjx_softarm.sensing.pose import pose_from_frame, pose_from_quaternion
 from mjx_softarm.spec import ARM_FILE, ArmSpec
 
 REST_S, REST_M = 0.5, 1e-4
@@ -49,6 +50,11 @@ def sensed_model(spec: ArmSpec) -> mujoco.MjModel:
     return mjspec.compile()
 
 
+def _springs(data: mujoco.MjData) -> np.ndarray:
+    """Return the spring lengths (n_chambers,) [m]; imports no JAX, as `mechanics.mjcf` does."""
+    return data.ten_length[1::2]
+
+
 class RestDetector:
     """Detector of settled arms (n), judged by their springs control period by control period.
 
@@ -64,7 +70,7 @@ class RestDetector:
         self._past_m = np.empty((round(REST_S * spec.control.rate_hz) + 1, n, spec.n_chambers))
         self._tick = 0
 
-    def after(self, length_m: np.ndarray, arms: slice | np.ndarray = slice(None)) -> np.ndarray:
+    def after(self, length_m: np.ndarray, arms: slice | np.ndarray) -> np.ndarray:
         """Take the springs (k, n_chambers) of some arms after a period; return which arms are done (k,)."""
         self._past_m[self._tick % len(self._past_m), arms] = length_m
         self._tick += 1
@@ -72,7 +78,11 @@ class RestDetector:
             return np.ones(len(length_m), bool)
         if self._tick < len(self._past_m):
             return np.zeros(len(length_m), bool)
-        return (np.ptp(self._past_m[:, arms], axis=0) <= self._rest_m).all(axis=-1)
+        oldest_m = self._past_m[self._tick % len(self._past_m), arms]
+        done = np.abs(length_m - oldest_m).max(axis=-1) <= self._rest_m
+        if done.any():  # only then is the whole past worth its time
+            done[done] = np.ptp(self._past_m[:, arms][:, done], axis=0).max(axis=-1) <= self._rest_m
+        return done
 
 
 class Settled(NamedTuple):
@@ -90,11 +100,13 @@ class SteppedArms:
         model: made by `sensed_model`.
         spec: the same arm.
         n: number of arms.
-        n_threads: threads of the rollout; 0 steps a single arm without one, which is faster for one.
+        n_threads: threads of the rollout; 0 steps a single arm without rollout and sensors, faster for one.
     """
 
     def __init__(self, model: mujoco.MjModel, spec: ArmSpec, n: int, n_threads: int):
-        self.n, self.spec, self.model = n, spec, model
+        self.n, self.spec, self.model = n, spec, copy.copy(model)
+        if not n_threads:
+            self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR
         self.gains, self.period_s = control.Gains.from_spec(spec), 1.0 / spec.control.rate_hz
         self._data = [mujoco.MjData(model) for _ in range(max(1, n_threads))]
         self._rollout, self.stepping_s = rollout.Rollout(nthread=n_threads) if n_threads else None, 0.0
@@ -102,6 +114,7 @@ class SteppedArms:
         size = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)  # time, qpos, qvel
         self._state = np.zeros((n, size))
         self._integral_kpa, self.length_m = np.zeros((2, n, spec.n_chambers))
+        self._tip = np.zeros((n, 7))  # position and quaternion
         self.place(np.ones(n, bool), np.zeros((n, model.nq)), np.zeros((n, model.nu)))
 
     def place(self, arms: np.ndarray, q: np.ndarray, pressure_kpa: np.ndarray) -> None:
@@ -114,8 +127,7 @@ class SteppedArms:
             mujoco.mj_resetData(self.model, data)
             data.qpos[:] = coordinates
             mujoco.mj_fwdPosition(self.model, data)
-            mujoco.mj_sensorPos(self.model, data)
-            self.length_m[index] = data.sensordata[: self.spec.n_chambers]
+            self.length_m[index] = _springs(data)
 
     def settle(self, reference_m: np.ndarray, rest_m: float = REST_M) -> Settled:
         """Hold references (n, n_chambers) until each arm rests.
@@ -123,35 +135,36 @@ class SteppedArms:
         Springs are read as a rollout leaves them, one time step old.
         """
         rest, moving, n_physics = RestDetector(self.n, self.spec, rest_m), np.arange(self.n), 0
-        pressure_kpa, tip = np.zeros_like(reference_m), np.zeros((self.n, 7))
+        pressure_kpa = np.zeros_like(reference_m)
         while len(moving):
-            pressure, self._integral_kpa[moving] = control.pressures(
-                reference_m[moving],
-                self.length_m[moving],
-                self._integral_kpa[moving],
-                self.gains,
-                self.period_s,
+            arms = moving if len(moving) < self.n else slice(None)  # a slice copies nothing
+            pressure_kpa[arms], self._integral_kpa[arms] = control.pressures(
+                reference_m[arms], self.length_m[arms], self._integral_kpa[arms], self.gains, self.period_s
             )
             start = time.perf_counter()
-            sensed = self._step(moving, pressure)
+            self._step(arms, pressure_kpa[arms])
             self.stepping_s += time.perf_counter() - start
-            pressure_kpa[moving] = pressure
-            self.length_m[moving], tip[moving] = np.split(sensed, [self.spec.n_chambers], axis=1)
             n_physics += len(moving) * self._n_steps
-            moving = moving[~rest.after(self.length_m[moving], moving)]
-        return Settled(pose_from_quaternion(tip[:, :3], tip[:, 3:]), pressure_kpa, n_physics)
+            moving = moving[~rest.after(self.length_m[arms], arms)]
+        if self._rollout is None:
+            tip = self._data[0].site("tip")
+            pose = pose_from_frame(tip.xpos, tip.xmat.reshape(3, 3))[None]
+        else:
+            pose = pose_from_quaternion(self._tip[:, :3], self._tip[:, 3:])
+        return Settled(pose, pressure_kpa, n_physics)
 
-    def _step(self, moving: np.ndarray, pressure_kpa: np.ndarray) -> np.ndarray:
-        """Hold pressures (k, n_chambers) for a control period; return what the sensors read (k, n_sensed)."""
+    def _step(self, arms: slice | np.ndarray, pressure_kpa: np.ndarray) -> None:
+        """Hold pressures (k, n_chambers) of some arms for a control period, and read springs and tips."""
         if self._rollout is None:
             self._data[0].ctrl[:] = pressure_kpa[0]
             mujoco.mj_step(self.model, self._data[0], self._n_steps)
-            return self._data[0].sensordata[None].copy()
-        state, sensed = self._rollout.rollout(
-            self.model, self._data, self._state[moving], pressure_kpa[:, None], nstep=self._n_steps
-        )
-        self._state[moving] = state[:, -1]
-        return sensed[:, -1]
+            self.length_m[0] = _springs(self._data[0])
+        else:
+            state, sensed = self._rollout.rollout(
+                self.model, self._data, self._state[arms], pressure_kpa[:, None], nstep=self._n_steps
+            )
+            self._state[arms] = state[:, -1]
+            self.length_m[arms], self._tip[arms] = np.split(sensed[:, -1], [self.spec.n_chambers], axis=1)
 
     def close(self) -> None:
         """End the rollout's threads."""

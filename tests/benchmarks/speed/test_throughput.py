@@ -81,7 +81,7 @@ def test_an_arm_rests_when_no_spring_has_moved_for_long_enough():
     still, ticks = np.zeros(9), []
     for tick in range(3 * n_quiet):
         moving = np.where(np.arange(9) == 4, 1.1e-3 * min(tick, 10), 0.0)  # the second arm stops later
-        ticks.append(rest.after(np.stack([still, moving])))
+        ticks.append(rest.after(np.stack([still, moving]), slice(None)))
     first = np.argmax(np.array(ticks), axis=0)
     assert first[0] == n_quiet and first[1] == n_quiet + 10
 
@@ -90,7 +90,7 @@ def test_a_spring_that_swings_back_to_where_it_was_does_not_rest():
     rest = RestDetector(1, SPEC, rest_m=1e-3)
     period = round(REST_S * SPEC.control.rate_hz)
     swing = 2e-3 * np.sin(2 * np.pi * np.arange(4 * period) / period)
-    assert not any(rest.after(np.full((1, 9), value))[0] for value in swing)
+    assert not any(rest.after(np.full((1, 9), value), slice(None))[0] for value in swing)
 
 
 def test_the_stepped_environment_is_the_project_s(folder):
