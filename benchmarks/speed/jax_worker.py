@@ -1,12 +1,12 @@
 """Worker: this project's arms, compiled, on all cores.
 
-    python -m benchmarks.speed.jax_worker steps ENGINE MODE N_ARMS LINKS CACHE   environment steps
-    python -m benchmarks.speed.jax_worker settle ENGINE REFERENCES LINKS CACHE   settling alone
-    python -m benchmarks.speed.jax_worker start CACHE                            start of a training
+    python -m benchmarks.speed.jax_worker steps ENGINE MODE N_ARMS LINKS     environment steps
+    python -m benchmarks.speed.jax_worker settle ENGINE REFERENCES LINKS     settling alone
+    python -m benchmarks.speed.jax_worker start CACHE                        start of a training
 
 LINKS is a number of links per section, REFERENCES an npz file with references (n, n_chambers) [m] by name.
-The first two tell seconds to trace and to compile with the empty cache folder CACHE, seconds for both from
-the cache that this filled, and where the arms settled.
+CACHE is the folder of the compilation cache. The first two tell seconds to trace and to compile without a
+cache, and where the arms settled.
 """
 
 from __future__ import annotations
@@ -28,7 +28,6 @@ from mjx_softarm._support import draws, xla
 from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.env.gym import EPISODE_LENGTH
 from mjx_softarm.env.vector import VectorEnv
-from mjx_softarm.mechanics.mjcf import steps_per_period
 from mjx_softarm.spec import ArmSpec
 from train.agent.hindsight_tqc import HindsightTQC
 from train.epoch.devices import split
@@ -41,22 +40,16 @@ N_TOLD = 256  # arms whose tips are told
 ROUND_S, SET_S = 1.0, 0.5  # least time of a round of steps, and of a round of each set of references
 
 
-def compile_twice(function: Callable, *arguments: Any) -> tuple[Callable, Facts]:
-    """Compile a jitted function with the empty cache that is enabled, and again with the cache now filled.
-
-    Returns:
-        The compiled function; seconds by name.
-    """
+def compile_timed(function: Callable, *arguments: Any) -> tuple[Callable, Facts]:
+    """Compile a jitted function without a cache; return the compiled function, and seconds by name."""
+    compilation_cache.reset_cache()
+    jax.config.update("jax_enable_compilation_cache", False)
     jax.clear_caches()  # a part may have been traced for something else
     start = time.perf_counter()
     lowered = function.lower(*arguments)
     traced = time.perf_counter()
-    lowered.compile()
-    cold = time.perf_counter()
-    jax.clear_caches()
-    compiled = function.lower(*arguments).compile()
-    again = time.perf_counter()
-    times = {"tracing_s": traced - start, "compiling_s": cold - traced, "both_from_cache_s": again - cold}
+    compiled = lowered.compile()
+    times = {"tracing_s": traced - start, "compiling_s": time.perf_counter() - traced}
     return compiled, {name: round(value, 2) for name, value in times.items()}
 
 
@@ -68,20 +61,12 @@ def repeats_for(call: Callable[[], Any], round_s: float) -> int:
     return max(1, round(round_s / (time.perf_counter() - start)))
 
 
-def enable_empty_cache(folder: str) -> None:
-    """Cache every compiled program in a folder from here on."""
-    compilation_cache.reset_cache()
-    xla.enable_compilation_cache(folder)
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-
-
-def steps(engine: Any, mode: Any, n_arms: str, links: str, cache: str) -> tuple[Facts, Callable[[], Facts]]:
+def steps(engine: Any, mode: Any, n_arms: str, links: str) -> tuple[Facts, Callable[[], Facts]]:
     """Prepare a rollout of n arms with random actions, which saturate about half of the chambers."""
     n, mesh = int(n_arms), mesh_of_cores(int(n_arms))
     spec = ArmSpec.default().replace(structure={"links_per_section": int(links)})
     xla.enable_compilation_cache()  # for the pool of poses, which is not measured
     env = ReachEnv(spec, EnvConfig(engine=engine, mode=mode, n_poses=N_POSES))
-    enable_empty_cache(cache)
     arms = VectorEnv(env, n, EPISODE_LENGTH, mesh)
 
     def rollout(state, key):
@@ -96,24 +81,21 @@ def steps(engine: Any, mode: Any, n_arms: str, links: str, cache: str) -> tuple[
             return jax.lax.scan(step, state, jax.random.split(key, N_STEPS[mode]))
 
     state, key = xla.jit(arms.reset, env.uses_mjx)(jax.random.PRNGKey(0)), jax.random.PRNGKey(1)
-    compiled, facts = compile_twice(xla.jit(rollout, env.uses_mjx), state, key)
+    compiled, facts = compile_timed(xla.jit(rollout, env.uses_mjx), state, key)
     repeats = repeats_for(lambda: compiled(state, key), ROUND_S)
     if mode == "quasistatic":
         _, (*_, ends) = compiled(state, key)
         rows = (np.asarray(x, float).reshape(-1, x.shape[-1])[:N_TOLD] for x in ends)  # first step first
         facts |= {name: x.tolist() for name, x in zip(TOLD, rows, strict=True)}
-    period_s = 1.0 / spec.control.rate_hz
-    physics = round(env.config.dynamic_step_s / period_s) * steps_per_period(period_s)
 
     def work() -> Facts:
         start = time.perf_counter()
         for _ in range(repeats):
             end = compiled(state, key)
         _, (unsettled, saturated, _) = jax.block_until_ready(end)
-        rate = repeats * N_STEPS[mode] * n / (time.perf_counter() - start)
+        spent = time.perf_counter() - start
         return {
-            "env_steps_per_s": rate,
-            **({"physics_steps_per_s": physics * rate} if mode == "dynamic" else {}),
+            "env_steps_per_s": repeats * N_STEPS[mode] * n / spent,
             "unsettled": int(unsettled.sum()),
             "saturated_chambers": round(float(np.mean(saturated)), 2),
             **peak_memory(),
@@ -122,16 +104,15 @@ def steps(engine: Any, mode: Any, n_arms: str, links: str, cache: str) -> tuple[
     return facts, work
 
 
-def settle(engine: str, references: str, links: str, cache: str) -> tuple[Facts, Callable[[], Facts]]:
+def settle(engine: str, references: str, links: str) -> tuple[Facts, Callable[[], Facts]]:
     """Prepare one compiled function that settles each set of references."""
     spec = ArmSpec.default().replace(structure={"links_per_section": int(links)})
     with np.load(references) as stored:
         sets = {name: stored[name].astype(np.float32) for name in stored.files}
     first = next(iter(sets))
     mesh = mesh_of_cores(len(sets[first]))
-    enable_empty_cache(cache)
     sets = jax.device_put(sets, split(mesh)) if mesh else jax.tree.map(jnp.asarray, sets)
-    function, facts = compile_twice(settle_function(spec, engine, mesh=mesh), sets[first])
+    function, facts = compile_timed(settle_function(spec, engine, mesh=mesh), sets[first])
     repeats = repeats_for(lambda: function(sets[first]), SET_S)
 
     def work() -> Facts:
@@ -145,8 +126,6 @@ def settle(engine: str, references: str, links: str, cache: str) -> tuple[Facts,
                 "solves_per_s": repeats * len(reference) / (time.perf_counter() - start),
                 "tip_mm": (1e3 * np.asarray(found.tip_position_m, float)).tolist(),
                 "unsettled": int(np.sum(~np.asarray(found.settled))),
-                "mean_iterations": round(float(np.mean(found.iterations)), 2),
-                "most_iterations": int(np.max(found.iterations)),
             }
         return told
 

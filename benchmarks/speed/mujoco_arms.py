@@ -12,7 +12,6 @@ is cheaper but ends further from the equilibrium, so each rate comes with the er
 from __future__ import annotations
 
 import copy
-import time
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -94,7 +93,7 @@ class Settled(NamedTuple):
 
 
 class SteppedArms:
-    """Arms side by side in a threaded rollout; `stepping_s` is the time spent in the rollout so far.
+    """Arms side by side in a threaded rollout.
 
     Args:
         model: made by `sensed_model`.
@@ -109,7 +108,7 @@ class SteppedArms:
             self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR
         self.gains, self.period_s = control.Gains.from_spec(spec), 1.0 / spec.control.rate_hz
         self._data = [mujoco.MjData(model) for _ in range(max(1, n_threads))]
-        self._rollout, self.stepping_s = rollout.Rollout(nthread=n_threads) if n_threads else None, 0.0
+        self._rollout = rollout.Rollout(nthread=n_threads) if n_threads else None
         self._n_steps = round(self.period_s / model.opt.timestep)
         size = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)  # time, qpos, qvel
         self._state = np.zeros((n, size))
@@ -141,9 +140,7 @@ class SteppedArms:
             pressure_kpa[arms], self._integral_kpa[arms] = control.pressures(
                 reference_m[arms], self.length_m[arms], self._integral_kpa[arms], self.gains, self.period_s
             )
-            start = time.perf_counter()
             self._step(arms, pressure_kpa[arms])
-            self.stepping_s += time.perf_counter() - start
             n_physics += len(moving) * self._n_steps
             moving = moving[~rest.after(self.length_m[arms], arms)]
         if self._rollout is None:
@@ -241,11 +238,9 @@ class SteppedReachGym(gymnasium.Env):
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
         """Hold the references of an action until the arm rests."""
-        before_s = self._reach.arms.stepping_s
         (obs,), (value,), (reached,), (over,), end = self._reach.step(action[None])
         info: dict[str, Any] = {
             "n_physics": end.physics_steps,
-            "stepping_s": self._reach.arms.stepping_s - before_s,
             "reference_m": self._reach.reference_m(action),
             "tip_mm": end.pose[0, :3],
         }

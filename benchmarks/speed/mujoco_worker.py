@@ -28,28 +28,24 @@ N_STEPPED = 64
 
 
 class Step(NamedTuple):
-    """Costs of a step of all environments, and where it led."""
+    """Cost of a step of all environments, and where it led."""
 
     n_physics: int  # time steps of all arms together
-    stepping_s: float  # wall time spent in time steps; the mean of several processes
     reference_m: np.ndarray  # (n_env, n_chambers)
     tip_mm: np.ndarray  # (n_env, 3)
 
 
 def timed(step: Callable[[], Step], timestep_s: float) -> Facts:
-    """Step for `ROUND_S`; return rates, and what an environment step consists of."""
+    """Step for `ROUND_S`; return the rate, the simulated time of an environment step, and where they led."""
     steps = []
     start = time.perf_counter()
     while (spent := time.perf_counter() - start) < ROUND_S:
         steps.append(step())
-    reference_m, tip_mm = (np.concatenate([getattr(one, x) for one in steps]) for x in Step._fields[2:])
-    n_env, n_physics = len(tip_mm), sum(one.n_physics for one in steps)
+    reference_m, tip_mm = (np.concatenate([getattr(one, x) for one in steps]) for x in Step._fields[1:])
+    simulated_s = timestep_s * sum(one.n_physics for one in steps)  # of all arms together
     return {
-        "env_steps_per_s": n_env / spent,
-        "physics_steps_per_s": n_physics / spent,
-        "physics_steps_per_env_step": round(n_physics / n_env),
-        "simulated_s_per_env_step": round(timestep_s * n_physics / n_env, 2),
-        "share_in_time_steps": round(sum(one.stepping_s for one in steps) / spent, 2),
+        "env_steps_per_s": len(tip_mm) / spent,
+        "simulated_s_per_env_step": round(simulated_s / len(tip_mm), 2),
         "reference_m": reference_m.tolist(),
         "tip_mm": tip_mm.tolist(),
     }
@@ -70,8 +66,7 @@ def subproc(folder: str, n: str) -> tuple[Facts, Callable[[], Facts]]:
     def step() -> Step:
         *_, infos = envs.step(rng.uniform(-1.0, 1.0, (int(n), *envs.action_space.shape)))
         told = {name: np.array([info[name] for info in infos]) for name in Step._fields}
-        costs = int(told["n_physics"].sum()), float(told["stepping_s"].mean())
-        return Step(*costs, told["reference_m"], told["tip_mm"])
+        return Step(int(told["n_physics"].sum()), told["reference_m"], told["tip_mm"])
 
     step()
     return {"stable_baselines3": __version__}, lambda: timed(step, timestep_s)
@@ -86,11 +81,10 @@ def rollout(folder: str, n_threads: str) -> tuple[Facts, Callable[[], Facts]]:
     envs.reset(np.ones(n, bool))
 
     def step() -> Step:
-        before_s, action = envs.arms.stepping_s, rng.uniform(-1.0, 1.0, (n, envs.arms.spec.n_chambers))
+        action = rng.uniform(-1.0, 1.0, (n, envs.arms.spec.n_chambers))
         _, _, reached, over, end = envs.step(action)
         envs.reset(reached | over)
-        stepping_s = envs.arms.stepping_s - before_s
-        return Step(end.physics_steps, stepping_s, envs.reference_m(action), end.pose[:, :3])
+        return Step(end.physics_steps, envs.reference_m(action), end.pose[:, :3])
 
     return {"arms": n}, lambda: timed(step, envs.arms.model.opt.timestep)
 

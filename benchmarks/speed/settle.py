@@ -71,14 +71,7 @@ def _ways(links: int, spreads: Sequence[float]) -> list[dict[str, Any]]:
         file = str(Path(folder, "references.npz"))
         np.savez(file, **references)
         for method in METHODS if links <= MOST_LINKS_MJX else ("chain", "stepping"):
-            program = [
-                "benchmarks.speed.jax_worker",
-                "settle",
-                method,
-                file,
-                str(links),
-                f"{folder}/{method}",
-            ]
+            program = ["benchmarks.speed.jax_worker", "settle", method, file, str(links)]
             if method == "stepping":
                 program = ["benchmarks.speed.mujoco_worker", "settle", file, str(links)]
             workers[method] = Worker(f"{method}, {links} links per section", program)

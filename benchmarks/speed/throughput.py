@@ -31,16 +31,14 @@ NO_MJX = f"compiles for minutes and in gigabytes at {MOST_LINKS_MJX} links, and 
 N_LINKS = ArmSpec.default().structure.links_per_section
 PAPER_WORKERS, PAPER_STEP_S = 14, 0.03  # the paper's cost of an environment step; the workers may share cores
 SUBPROC = "SubprocVecEnv"
-NOTES = {
-    "C MuJoCo": "a step is over when the slowest arm rests, once its own damping has stopped it",
-    "median, 95 %, max mm": "distance of the tip from the true equilibrium",
-    "the paper": f"it reports {PAPER_STEP_S} s for an environment step; how far from rest its arms are then "
-    "is not known",
-}
 COLUMNS = (
-    *("program", "env_steps_per_s", "times_subproc", "times_paper", "physics_steps_per_s"),
-    *("physics_steps_per_env_step", "simulated_s_per_env_step", "share_in_time_steps", *ERROR),
-    *("skipped", "failed"),
+    "program",
+    "env_steps_per_s",
+    "times_subproc",
+    "simulated_s_per_env_step",
+    *ERROR,
+    "skipped",
+    "failed",
 )
 
 Point = tuple[str, str, int, int]  # engine, mode, arms, links per section
@@ -73,7 +71,6 @@ def measure() -> dict[str, Any]:
         "over_links": over_links
         + [{**no_mjx, "links_per_section": links} for links in LINKS if links > MOST_LINKS_MJX],
         "side_by_side": _side_by_side(ArmSpec.default(), on_gpu),
-        "notes": NOTES,
         "start": _starts(),
         "goals": [*gpu.rate_goals(rows, on_gpu), gpu.training_goal(on_gpu)],
     }
@@ -81,9 +78,8 @@ def measure() -> dict[str, Any]:
 
 def turns(group: Sequence[Point], n_used: int | None = None) -> list[dict[str, Any]]:
     """Return a row for each point; the programs take turns on all cores, or on the first n."""
-    with tempfile.TemporaryDirectory() as folder:
-        workers = [_worker(point, folder, n_used) for point in group]
-        rounds, failed = take_turns(workers, N_ROUNDS)
+    workers = [_worker(point, n_used) for point in group]
+    rounds, failed = take_turns(workers, N_ROUNDS)
     rows = []
     for point, worker in zip(group, workers, strict=True):
         row: dict[str, Any] = dict(zip(("engine", "mode", "arms", "links_per_section"), point, strict=True))
@@ -97,11 +93,11 @@ def turns(group: Sequence[Point], n_used: int | None = None) -> list[dict[str, A
     return rows
 
 
-def _worker(point: Point, folder: str, n_used: int | None = None) -> Worker:
+def _worker(point: Point, n_used: int | None = None) -> Worker:
     engine, mode, n, links = point
     name = f"{engine}, {mode}, {n} arms, {links} links"
-    arguments = ["steps", engine, mode, str(n), str(links), f"{folder}/{name}"]
-    return Worker(name, ["benchmarks.speed.jax_worker", *arguments], n_cores=n_used)
+    program = ["benchmarks.speed.jax_worker", "steps", engine, mode, str(n), str(links)]
+    return Worker(name, program, n_cores=n_used)
 
 
 def over_rounds(rounds: Sequence[Facts]) -> dict[str, Any]:
@@ -127,8 +123,8 @@ def _side_by_side(spec: ArmSpec, on_gpu: bool) -> list[dict[str, Any]]:
     with tempfile.TemporaryDirectory() as folder:
         write_arm(Path(folder), spec)
         workers = [
-            _worker(("chain", "quasistatic", n_arms, N_LINKS), folder),
-            _worker(("mjx", "quasistatic", n_arms if on_gpu else 128, N_LINKS), folder),
+            _worker(("chain", "quasistatic", n_arms, N_LINKS)),
+            _worker(("mjx", "quasistatic", n_arms if on_gpu else 128, N_LINKS)),
             Worker(f"C MuJoCo, rollout, {n} threads", [module, "rollout", folder, n]),
         ]
         try:
@@ -146,21 +142,14 @@ def _side_by_side(spec: ArmSpec, on_gpu: bool) -> list[dict[str, Any]]:
 
 
 def side_by_side(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return rows with the paper's added, and each rate as a multiple of it and of SubprocVecEnv's."""
-    paper_rate = round(PAPER_WORKERS / PAPER_STEP_S)
-    paper = {
-        "program": f"the paper: {PAPER_WORKERS} workers, {PAPER_STEP_S} s a step, at most",
-        "env_steps_per_s": paper_rate,
-    }
+    """Return rows with the paper's added, and each rate as a multiple of SubprocVecEnv's."""
+    program = f"the paper: {PAPER_WORKERS} workers, {PAPER_STEP_S} s a step, at most"
+    paper = {"program": program, "env_steps_per_s": round(PAPER_WORKERS / PAPER_STEP_S)}
     base = next((row.get("env_steps_per_s") for row in rows if SUBPROC in row["program"]), None)
     full = []
     for row in rows:
         rate = row.get("env_steps_per_s")
-        times = {
-            "times_subproc": _digits(rate / base) if rate and base else None,
-            "times_paper": _digits(rate / paper_rate) if rate else None,
-        }
-        full.append({**row, **times})
+        full.append({**row, "times_subproc": _digits(rate / base) if rate and base else None})
     return [{name: row.get(name) for name in COLUMNS} for row in [*full, paper]]
 
 

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from importlib import metadata
+from unittest.mock import Mock
 
 import pytest
 
@@ -23,25 +24,16 @@ def made(monkeypatch):
     return made
 
 
-def test_every_requirement_is_pinned_and_the_simulator_s_are_those_that_run_here():
-    for name in PINS:
-        requirements = dict(requirement.split("==") for requirement in peer_packages(name))
-        assert all(requirements.values())
-        found = {
-            package: requirements.get(package, requirements.get(f"{package}[cuda12]")) for package in SHARED
-        }
-        assert found == {package: metadata.version(package) for package in SHARED}
-    assert "sbx-rl" in "".join(peer_packages("sbx")) and "sb3-contrib" in "".join(
-        peer_packages("sb3-contrib")
-    )
-
-
-def test_the_compiler_for_gpus_is_that_of_the_jax_which_runs_here_without_cuda():
-    plugin, *shared = peer_packages(COMPILER)
-    assert plugin == f"jax-cuda12-plugin=={metadata.version('jax')}" and "[cuda12]" not in "".join(shared)
-    assert dict(package.split("==") for package in shared) == {
-        package: metadata.version(package) for package in SHARED
-    }
+@pytest.mark.parametrize(
+    "name, package", [("sbx", "sbx-rl"), ("sb3-contrib", "sb3-contrib"), (COMPILER, "jax-cuda12-plugin")]
+)
+def test_every_requirement_is_pinned_and_the_simulator_s_are_those_that_run_here(name, package):
+    requirements = dict(requirement.split("==") for requirement in peer_packages(name))
+    assert all(requirements.values()) and package in requirements
+    found = {shared: requirements.get(shared, requirements.get(f"{shared}[cuda12]")) for shared in SHARED}
+    assert found == {shared: metadata.version(shared) for shared in SHARED}
+    if name == COMPILER:
+        assert requirements[package] == metadata.version("jax") and "jax[cuda12]" not in requirements
 
 
 def test_an_environment_is_made_once_and_each_peer_has_its_own(made, tmp_path):
@@ -69,7 +61,7 @@ def test_one_that_was_interrupted_is_made_anew(made, monkeypatch, tmp_path):
     peer_python("sbx", tmp_path)
     monkeypatch.setitem(PINS, "sbx", ("sbx-rl==0.0.1",))
     with monkeypatch.context() as patch:
-        patch.setattr(peers, "_make", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        patch.setattr(peers, "_make", Mock(side_effect=KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             peer_python("sbx", tmp_path)
     assert not (tmp_path / ".venv-sbx" / MARKER).exists()
@@ -78,10 +70,8 @@ def test_one_that_was_interrupted_is_made_anew(made, monkeypatch, tmp_path):
 
 
 def test_why_an_environment_cannot_be_made_is_told_in_one_line(monkeypatch, tmp_path):
-    def fail(*_):
-        raise subprocess.CalledProcessError(1, ["pip"], stderr="a\nERROR: No matching distribution\n")
-
-    monkeypatch.setattr(peers, "_make", fail)
+    failed = subprocess.CalledProcessError(1, ["pip"], stderr="a\nERROR: No matching distribution\n")
+    monkeypatch.setattr(peers, "_make", Mock(side_effect=failed))
     with pytest.raises(PeerError, match=r"^sbx: .*\.venv-sbx: ERROR: No matching distribution$"):
         peer_python("sbx", tmp_path)
     assert not (tmp_path / ".venv-sbx" / MARKER).exists()

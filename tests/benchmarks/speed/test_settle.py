@@ -149,13 +149,13 @@ def test_spread_arms_settle_as_on_one_device():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("way_to", ["chain", "stepping"])
-def test_a_worker_tells_where_the_arms_settle(tmp_path, monkeypatch, way_to):
+def test_a_worker_tells_where_the_arms_settle(tmp_path, way_to):
     reference = random_references(SMALL, 64)
     file = str(tmp_path / "references.npz")
     np.savez(file, **{"1.0": reference})
     program = ["benchmarks.speed.mujoco_worker", "settle", file, "2"]
     if way_to == "chain":
-        program = ["benchmarks.speed.jax_worker", "settle", "chain", file, "2", str(tmp_path / "cache")]
+        program = ["benchmarks.speed.jax_worker", "settle", "chain", file, "2"]
     worker = Worker(way_to, program)
     with working(worker):
         told = worker.round()["1.0"]

@@ -2,14 +2,15 @@
 
 import subprocess
 import sys
+from unittest.mock import Mock
 
 import jax
 import numpy as np
 import pytest
 
-from benchmarks.harness.rounds import WorkerError
+from benchmarks.harness.rounds import ROOT, WorkerError
 from benchmarks.speed import throughput
-from benchmarks.speed.jax_worker import compile_twice
+from benchmarks.speed.jax_worker import compile_timed
 from benchmarks.speed.mujoco_arms import (
     REST_S,
     RestDetector,
@@ -49,9 +50,6 @@ def reference():
 @pytest.fixture(scope="module")
 def truth(reference):
     return true_rest(SPEC, reference)
-
-
-# --- C MuJoCo in time steps --------------------------------------------------------------------------------
 
 
 def test_arms_stepped_in_time_rest_where_the_solver_says_alone_and_in_company(model, reference, truth):
@@ -112,7 +110,7 @@ def test_as_a_gymnasium_environment_it_tells_costs_and_where_it_stopped(folder):
     assert stepped.observation_space.contains(obs) and stepped.observation_space.contains(after)
     assert not terminated and not truncated and stepped.step(action)[3]
     assert info.keys() == set(Step._fields) and info["tip_mm"].shape == (3,)
-    assert info["n_physics"] > 100 and 0.0 < info["stepping_s"] < 60.0
+    assert info["n_physics"] > 100
 
 
 def test_arms_that_reach_their_goals_are_told_from_those_whose_time_is_over(folder):
@@ -132,15 +130,7 @@ def test_arms_that_reach_their_goals_are_told_from_those_whose_time_is_over(fold
 
 def test_the_stepped_arms_need_no_jax():
     check = "import sys, benchmarks.speed.mujoco_arms; sys.exit('jax' in sys.modules)"
-    assert (
-        subprocess.run(
-            [sys.executable, "-c", check], cwd=throughput.__file__.split("/benchmarks")[0]
-        ).returncode
-        == 0
-    )
-
-
-# --- programs side by side ---------------------------------------------------------------------------------
+    subprocess.run([sys.executable, "-c", check], cwd=ROOT, check=True)
 
 
 def test_a_point_that_fails_tells_why_and_costs_no_other(monkeypatch):
@@ -151,13 +141,7 @@ def test_a_point_that_fails_tells_why_and_costs_no_other(monkeypatch):
     monkeypatch.setattr(throughput, "take_turns", made_up)
     rows = throughput.turns([("chain", "quasistatic", 8, 4), ("mjx", "dynamic", 8, 4)])
     assert [row.get("env_steps_per_s") for row in rows] == [7.0, None]
-    assert rows[1] == {
-        "engine": "mjx",
-        "mode": "dynamic",
-        "arms": 8,
-        "links_per_section": 4,
-        "failed": "mjx, dynamic, 8 arms, 4 links: no memory",
-    }
+    assert rows[1]["engine"] == "mjx" and rows[1]["failed"] == "mjx, dynamic, 8 arms, 4 links: no memory"
 
 
 def test_side_by_side_a_program_that_fails_has_a_row_that_says_why(monkeypatch):
@@ -169,20 +153,15 @@ def test_side_by_side_a_program_that_fails_has_a_row_that_says_why(monkeypatch):
     monkeypatch.setattr(throughput, "write_arm", lambda folder, spec: None)
     monkeypatch.setattr(throughput, "peer_python", lambda name: sys.executable)
     rows = throughput._side_by_side(SPEC, on_gpu=False)
-    assert rows[0]["env_steps_per_s"] == 4670 and rows[0]["times_paper"] == 10.0
+    assert rows[0]["env_steps_per_s"] == 4670
     assert [row["failed"] for row in rows] == [None, "no memory", "no memory", "no memory", None]
 
 
 def test_a_start_that_fails_tells_why(monkeypatch):
-    def fail(worker):
-        raise WorkerError(f"{worker.name}: stopped with status 1, expected a result:\nno memory")
-
-    monkeypatch.setattr(throughput.Worker, "start", fail)
+    monkeypatch.setattr(throughput.Worker, "start", Mock(side_effect=WorkerError("stopped\nno memory")))
     starts = throughput._starts()
-    assert {state: row["failed"].endswith("no memory") for state, row in starts.items()} == {
-        "empty_cache": True,
-        "filled_cache": True,
-    }
+    assert starts.keys() == {"empty_cache", "filled_cache"}
+    assert all(row["failed"].endswith("no memory") for row in starts.values())
 
 
 def test_rates_are_medians_over_rounds_and_arrays_are_left_out():
@@ -194,10 +173,10 @@ def test_rates_are_medians_over_rounds_and_arrays_are_left_out():
     assert over_rounds([{"env_steps_per_s": 5.678}]) == {"env_steps_per_s": 5.68}
 
 
-def test_compiling_anew_and_from_the_cache_gives_a_function_that_computes():
-    compiled, facts = compile_twice(jax.jit(lambda x: 2 * x), 3.0)
-    assert compiled(4.0) == 8.0
-    assert facts.keys() == {"tracing_s", "compiling_s", "both_from_cache_s"}
+def test_a_timed_compilation_gives_a_function_that_computes(monkeypatch):
+    monkeypatch.setattr(jax.config, "update", Mock())  # other tests keep their cache
+    compiled, facts = compile_timed(jax.jit(lambda x: 2 * x), 3.0)
+    assert compiled(4.0) == 8.0 and facts.keys() == {"tracing_s", "compiling_s"}
 
 
 def test_everything_asked_for_is_measured():
@@ -211,7 +190,7 @@ def test_everything_asked_for_is_measured():
     assert {n for group in points(on_gpu=True) for *_, n, _ in group} >= {1, 8192, 32_768}
 
 
-def test_rates_are_told_as_multiples_of_the_processes_and_of_the_paper():
+def test_rates_are_told_as_multiples_of_the_processes_beside_the_paper_s():
     rows = side_by_side(
         [
             {"program": "chain", "env_steps_per_s": 5000},
@@ -220,18 +199,16 @@ def test_rates_are_told_as_multiples_of_the_processes_and_of_the_paper():
         ]
     )
     assert [row["times_subproc"] for row in rows] == [100, 1.0, None, None]
-    assert [row["times_paper"] for row in rows] == [10.71, 0.11, None, None]
     assert rows[2]["skipped"] == "no device" and rows[1]["p95_mm"] == 0.5
     assert rows[3]["env_steps_per_s"] == 467  # the paper's
     assert side_by_side([{"program": "chain", "env_steps_per_s": 5000}])[0]["times_subproc"] is None
 
 
-def test_an_environment_step_is_taken_apart(monkeypatch):
+def test_a_round_of_steps_has_its_rate_and_the_simulated_time_of_a_step(monkeypatch):
     clock = iter([0.0, 0.0, 0.5, 1.0])
     monkeypatch.setattr("benchmarks.speed.mujoco_worker.time.perf_counter", lambda: next(clock))
     monkeypatch.setattr("benchmarks.speed.mujoco_worker.ROUND_S", 1.0)
-    steps = iter(Step(n, s, np.zeros((2, 9)), np.ones((2, 3))) for n, s in ((400, 0.25), (200, 0.05)))
+    steps = iter(Step(n, np.zeros((2, 9)), np.ones((2, 3))) for n in (400, 200))
     told = timed(lambda: next(steps), timestep_s=0.002)
-    assert (told["env_steps_per_s"], told["physics_steps_per_s"]) == (4.0, 600.0)
-    assert (told["physics_steps_per_env_step"], told["simulated_s_per_env_step"]) == (150, 0.3)
-    assert told["share_in_time_steps"] == 0.3 and np.shape(told["tip_mm"]) == (4, 3)
+    assert (told["env_steps_per_s"], told["simulated_s_per_env_step"]) == (4.0, 0.3)
+    assert np.shape(told["tip_mm"]) == (4, 3)
