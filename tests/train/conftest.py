@@ -1,13 +1,13 @@
 """Learning from demonstrations on a short arm, which compiles in seconds."""
 
+import jax
 import numpy as np
 import pytest
 
-from mjx_softarm.env import EnvConfig, ReachEnv
-from mjx_softarm.spec import ArmSpec
+from mjx_softarm.env import ReachEnv
+from tests.train.small import CONFIG, SETTINGS, SHORT
 from train.agent.gail import GailConfig
 from train.agent.hindsight import HindsightConfig
-from train.agent.tqc import TQCConfig
 from train.config import ImitationConfig, Stage
 from train.demos.demonstrations import Demonstrations
 
@@ -18,15 +18,9 @@ N_POSITIONS = 6
 def imitation_config():
     """Eight epochs of two stages; goals are rebalanced after every third epoch."""
     return ImitationConfig(
-        n_arms=8,
-        total_env_steps=128,
-        updates_per_env_step=0.5,
-        warmup_env_steps=16,
-        batch_size=16,
-        replay_capacity=64,
-        vector_steps_per_epoch=2,
-        env=EnvConfig(n_poses=256),
-        tqc=TQCConfig(hidden_actor=(16, 16), hidden_critic=(16, 16), learning_rate_end=0.1),
+        **SETTINGS,
+        env=CONFIG.env,
+        tqc=CONFIG.tqc,
         hindsight=HindsightConfig(0.0, 0.0),
         gail=GailConfig(hidden=(16,)),
         stages=(Stage(share=0.5, every=2), Stage(share=0.5, kept=0.25)),
@@ -36,9 +30,7 @@ def imitation_config():
 
 @pytest.fixture(scope="session")
 def short_env(imitation_config):
-    """One section of two links."""
-    spec = ArmSpec.default().replace(structure={"n_sections": 1, "links_per_section": 2})
-    return ReachEnv(spec, imitation_config.env)
+    return ReachEnv(SHORT, imitation_config.env)
 
 
 @pytest.fixture(scope="session")
@@ -47,3 +39,11 @@ def shown(short_env):
     pool = short_env.pool
     positions, actions = pool.pose[:N_POSITIONS], short_env.action_of(pool.spring_m[:N_POSITIONS])
     return Demonstrations(positions, actions, np.zeros(N_POSITIONS, np.int32))
+
+
+@pytest.fixture(scope="module")
+def quick_compiler():
+    """Twice as fast to compile what runs for milliseconds."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)

@@ -1,4 +1,4 @@
-"""Learning from demonstrations: the expert's rows, the rewards, the discriminator, and parts of other runs."""
+"""Learning from demonstrations: the expert's rows, rewards, the discriminator, parts of other runs."""
 
 import dataclasses
 

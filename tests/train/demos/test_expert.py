@@ -109,10 +109,7 @@ def test_look_tells_what_is_not_in_the_pipe(expert, spec):
     ("finger_m", "message"),
     [
         ([0.4, 0.0, -0.6], r"waypoint 'far' at 400, 0, -600 mm .* mm off.* from the wall, chamber \d at"),
-        (
-            [0.0, 0.13, -0.4],
-            r"waypoint 'far' at 0, 130, -400 mm .* mm from the wall",
-        ),  # within reach, in the wall
+        ([0.0, 0.13, -0.4], r"waypoint 'far' at 0, 130, -400 mm .* mm from the wall"),  # in the wall
     ],
 )
 def test_waypoint_that_cannot_be_met_is_named(expert, finger_m, message):
@@ -135,11 +132,8 @@ def test_gripper_that_cannot_hang_as_asked_hangs_a_little_otherwise(expert, spec
 
 def test_tasks_have_the_papers_positions(spec):
     tasks = {name: task(name, spec) for name in TASKS}
-    assert {name: len(value.waypoints) for name, value in tasks.items()} == {
-        "circle16": 16,
-        "pipe300": 28,
-        "pipe250": 37,
-    }
+    n_waypoints = {name: len(value.waypoints) for name, value in tasks.items()}
+    assert n_waypoints == {"circle16": 16, "pipe300": 28, "pipe250": 37}
     for name, stops in {
         "pipe300": ["pick right", "place left", "pick bottom", "place right"],
         "pipe250": ["pick left", "place bottom", "pick right", "place left"],

@@ -16,9 +16,9 @@ from mjx_softarm.sensing.pose import pose_from_frame, quaternion_from_pose
 from mjx_softarm.sensing.s2r import S2R_FILE, save_s2r
 from mjx_softarm.sensing.sensors import Sensor
 from train.__main__ import main
-from train.demos.demonstrations import load_demonstrations
+from train.demos.demonstrations import read_demonstrations
 from train.demos.expert import Posture
-from train.demos.teleop import CLOSE_M, Teleoperation, read_keys
+from train.demos.teleop import CLOSE_M, Teleoperation
 from train.demos.waypoints import task
 
 SPEC = ArmSpec.default()
@@ -131,11 +131,7 @@ def test_position_far_from_its_waypoint_is_not_logged(expert, waypoints, plan):
             return Capture(np.array([0.05, 0.0, -0.5]), *others)
 
     result = Teleoperation(Misplaced(), expert).record(waypoints, plan)
-    assert (
-        len(result.log) == 0
-        and "home: got 7" in result.ending.cause
-        and "mm off after corrections" in result.ending.cause
-    )
+    assert len(result.log) == 0 and "home: got 7" in result.ending.cause
 
 
 def test_chamber_without_pressure_is_named(expert, waypoints, plan):
@@ -143,8 +139,7 @@ def test_chamber_without_pressure_is_named(expert, waypoints, plan):
         def write_pressures(self, pressure_kpa):
             super().write_pressures(np.where(np.arange(SPEC.n_chambers) == 4, 0.0, pressure_kpa))
 
-    told = []
-    result = Teleoperation(Leaking(), expert, told.append).record(waypoints, plan)
+    result = Teleoperation(Leaking(), expert).record(waypoints, plan)
     assert len(result.log) == 0
     assert "home: not at rest after 15 s: spring 4 is +" in result.ending.cause
     assert "chamber at -40.0 kPa" in result.ending.cause
@@ -171,52 +166,34 @@ def command(calibration, monkeypatch, capsys):
     return run
 
 
-def test_keys_move_the_finger_tips(expert, command, tmp_path):
+STEER = ("record", "--arm", "a:B", "--task", "pipe300", "--keyboard", "--out")
+
+
+def test_keys_move_the_finger_tips(command, tmp_path):
     out = tmp_path / "keys.csv"
-    keys = " x \nsXz \n ?\nlY q x"
-    status, told = command(
-        "record", "--arm", "fake:Arm", "--task", "pipe300", "--keyboard", "--out", out, keys=keys
-    )
+    status, told = command(*STEER, out, keys=" x \nsXz \n ?\nlY q x")
     assert status == 0, told
     assert "not moved since the start" in told and "was logged" in told and "got key '?'" in told
-    demos = load_demonstrations(out, SPEC)
-    assert demos.sequence.tolist() == [0, 0, 0]
+    log, _ = read_demonstrations(out, SPEC)
+    assert log.sequence.tolist() == [0, 0, 0]
     start_m = IdealArm().finger_m
     moved_mm = np.cumsum([[20.0, 0.0, 0.0], [-5.0, 0.0, 5.0], [0.0, -20.0, 0.0]], axis=0)
-    rows = np.loadtxt(out, delimiter=",", skiprows=1)
-    header = out.read_text().splitlines()[0].split(",")
-    tip = [header.index(f"tip_{axis} [mm]") for axis in "xyz"]
-    half = [header.index(f"tip_q{part} [1]") for part in "wxyz"]
-    w, x, y, z = rows[:, half].T
-    axis = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x**2 + y**2)], axis=-1)
-    np.testing.assert_allclose(rows[:, tip] - 100.0 * axis, 1e3 * start_m + moved_mm, atol=2.0)
+    np.testing.assert_allclose(1e3 * fingers_m(log), 1e3 * start_m + moved_mm, atol=2.0)
     status, told = command("check", out)
     assert status == 0 and "poses: 3" in told and "sequences: 1: 0 with 3" in told
 
 
 def test_move_into_the_wall_is_refused_and_the_arm_stays(command, tmp_path):
-    keys = "y" * 8 + "Y q"
-    status, told = command(
-        "record", "--arm", "a:B", "--task", "pipe300", "--keyboard", "--out", tmp_path / "k.npz", keys=keys
-    )
+    status, told = command(*STEER, tmp_path / "k.npz", keys="y" * 8 + "Y q")
     assert status == 0 and "cannot be met" in told and "pose 1 logged" in told
 
 
 def test_misuse_is_told_before_anything_moves(command, tmp_path):
+    record = ("record", "--arm", "a:B", "--out")
     for args, message in (
-        (
-            ("record", "--arm", "a:B", "--out", tmp_path / "x.csv"),
-            "--task: got nothing, expected one of circle16",
-        ),
-        (
-            ("record", "--arm", "a:B", "--task", "pipe300", "--out", tmp_path / "no" / "x.csv"),
-            "expected the name of a new file in a folder that exists",
-        ),
+        ((*record, tmp_path / "x.csv"), "--task: got nothing, expected one of circle16"),
+        ((*record, tmp_path / "no" / "x.csv", "--task", "pipe300"), "expected the name of a new file"),
         (("check", tmp_path / "none.csv"), "none.csv: No such file"),
     ):
         status, told = command(*args)
         assert status == 2 and message in told
-
-
-def test_keys_are_read_as_they_come():
-    assert list(read_keys(io.StringIO("x y\nq"))) == ["x", " ", "y", "\n", "q"]

@@ -14,30 +14,26 @@ import jax
 import numpy as np
 import pytest
 
-from mjx_softarm.env import EnvConfig, ReachEnv
-from mjx_softarm.spec import ArmSpec
+from mjx_softarm.env import ReachEnv
+from tests.train import small
+from tests.train.small import SHORT, new_job
 from train.__main__ import main
-from train.agent.hindsight_tqc import HindsightTQC
 from train.agent.tqc import TQCConfig
-from train.config import ConfigError, TrainConfig
+from train.config import ConfigError
 from train.epoch.devices import mesh_of, split
-from train.epoch.job import Job
 from train.runs.checkpoint import Run
 
 N_DEVICES = 8
 CAPACITY = 4096  # larger than all else that has an axis
-CONFIG = TrainConfig(
+CONFIG = dataclasses.replace(
+    small.CONFIG,
     n_arms=16,
     total_env_steps=256,
-    updates_per_env_step=0.5,
     warmup_env_steps=32,
     batch_size=32,
     replay_capacity=CAPACITY,
-    vector_steps_per_epoch=2,
-    env=EnvConfig(n_poses=256),
     tqc=TQCConfig(hidden_actor=(16, 16), hidden_critic=(16, 16)),
 )
-SHORT = ArmSpec.default().replace(structure={"n_sections": 1, "links_per_section": 2})
 
 pytestmark = pytest.mark.skipif(
     len(jax.local_devices()) < N_DEVICES, reason=f"needs {N_DEVICES} devices, which a CPU can simulate"
@@ -49,13 +45,9 @@ def env():
     return ReachEnv(SHORT, CONFIG.env)
 
 
-def new_job(config, env, devices):
-    return Job(config, env, HindsightTQC(config, env), mesh=mesh_of(devices))
-
-
 @pytest.fixture(scope="module")
 def jobs(env):
-    return {n: new_job(CONFIG, env, n) for n in ("1", str(N_DEVICES))}
+    return {n: new_job(CONFIG, env, mesh=mesh_of(n)) for n in ("1", str(N_DEVICES))}
 
 
 @pytest.fixture(scope="module")
@@ -157,7 +149,7 @@ def test_a_policy_of_many_devices_is_read_where_there_is_one(tmp_path, trained):
 def test_what_cannot_be_split_evenly_is_named(env, name):
     config = dataclasses.replace(CONFIG, **{name: getattr(CONFIG, name) + 4})
     with pytest.raises(ConfigError, match=f"^{name}: got .* expected a multiple of the {N_DEVICES}"):
-        new_job(config, env, str(N_DEVICES))
+        new_job(config, env, mesh=mesh_of(str(N_DEVICES)))
 
 
 @pytest.mark.parametrize("devices", ["0", "-1", "two", "1000000", "localhost:1/0"])
@@ -167,18 +159,14 @@ def test_devices_that_are_not_there_are_refused(devices, capsys):
 
 
 LONGEST_S = 900  # of a process, compilation included
-SETTINGS = [
-    "n_arms=16",
-    "total_env_steps=512",
-    "vector_steps_per_epoch=2",
-    "warmup_env_steps=32",
-    "batch_size=32",
-    "evaluation_epochs=2",
-    "replay_capacity=4096",
-    "env.n_poses=256",
-    "tqc.hidden_actor=16",
-    "tqc.hidden_critic=16",
-]
+SETTINGS = small.flags(
+    n_arms=16,
+    total_env_steps=512,
+    warmup_env_steps=32,
+    batch_size=32,
+    evaluation_epochs=2,
+    replay_capacity=4096,
+)
 
 
 def start(arguments, *devices):
@@ -212,7 +200,7 @@ def end(processes):
 @pytest.mark.slow
 def test_two_processes_train_as_one_and_go_on_after_one_was_killed(tmp_path):
     SHORT.to_toml(tmp_path / "arm.toml")
-    new = ["--spec", tmp_path / "arm.toml", *(f"--{text}" for text in SETTINGS)]
+    new = ["--spec", tmp_path / "arm.toml", *SETTINGS]
     printed = end(start([*new, "--out", tmp_path / "whole"], *pair()))
     for text in ("run: ", "circle.png"):  # one speaks for both
         assert text in printed[0] and text not in printed[1]

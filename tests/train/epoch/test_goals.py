@@ -1,7 +1,5 @@
 """Demonstrated goals: episodes, stages, balance, and a run that continues bit for bit."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +7,6 @@ import pytest
 
 from train.agent.hindsight_tqc import HindsightTQC
 from train.agent.imitation import Imitation
-from train.config import ConfigError, from_dict, override, to_dict
 from train.epoch.devices import mesh_of
 from train.epoch.goals import DemonstratedGoals, goal_weights
 from train.epoch.job import Job
@@ -95,33 +92,3 @@ def test_rebalanced_goals_are_drawn_by_their_weights(job):
     goals = arms(jax.random.split(jax.random.PRNGKey(5), 500)).pipeline_state.goal.reshape(-1, 6)
     share = np.mean(indices(job, goals) == 5)
     assert abs(share - (0.5 / 6 + 0.5)) < 4 * np.sqrt(0.25 / len(goals))
-
-
-def test_each_stages_end_is_evaluated(imitation_config):
-    config = dataclasses.replace(imitation_config, total_env_steps=160, evaluation_epochs=4)  # 10 epochs
-    assert [epoch for epoch in range(1, 11) if config.evaluates_after(epoch)] == [4, 5, 8, 10]
-
-
-def test_config_survives_json(imitation_config):
-    piped = dataclasses.replace(
-        imitation_config, env=dataclasses.replace(imitation_config.env, pipe_diameter_mm=300.0)
-    )
-    assert from_dict(to_dict(piped)) == piped
-
-
-@pytest.mark.parametrize(
-    ("assignment", "message"),
-    [
-        ("stages=[{}]", "settings"),
-        ('stages=[{"share": 0.5, "every": 1, "kept": 1.0}]', "add up to 0.5, expected 1"),
-        ('stages=[{"share": 1.0, "every": 0, "kept": 1.0}]', "every: got 0"),
-        ("expert_share=1.0", "expert_share: got 1.0"),
-        ("learned_weight=0", "expected some reward"),
-        ("learned_weight=-1", "expected numbers >= 0"),
-        ("rebalance_env_steps=-1", "rebalance_env_steps: got -1"),
-        ("env.mode=dynamic", "expected 'quasistatic'"),
-    ],
-)
-def test_a_bad_setting_is_told(imitation_config, assignment, message):
-    with pytest.raises(ConfigError, match=message):
-        override(imitation_config, [assignment])

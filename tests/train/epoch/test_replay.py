@@ -26,9 +26,7 @@ def strict():
         yield
 
 
-@pytest.fixture(scope="module")
-def add():
-    return jax.jit(replay.add)
+add = jax.jit(replay.add)
 
 
 def rows(tags):
@@ -44,13 +42,14 @@ def oldest_first(ring):
     return [int(ring.data.tag[(start + i) % CAPACITY]) for i in range(size)]
 
 
+@pytest.mark.parametrize("batch", [BATCH, CAPACITY])
 @pytest.mark.parametrize("seed", range(4))
-def test_ring_keeps_the_last_valid_items_in_order_over_many_wraps(add, seed):
+def test_ring_keeps_the_last_valid_items_in_order_over_many_wraps(seed, batch):
     rng = np.random.default_rng(seed)
     ring, model = replay.create(EXAMPLE, CAPACITY), []
     for step in range(25):
-        tags = np.arange(step * BATCH, (step + 1) * BATCH)
-        valid = rng.random(BATCH) < rng.choice([0.0, 0.3, 0.8, 1.0])
+        tags = np.arange(step * batch, (step + 1) * batch)
+        valid = rng.random(batch) < rng.choice([0.0, 0.3, 0.8, 1.0])
         ring = add(ring, rows(tags), jnp.asarray(valid))
         model = (model + tags[valid].tolist())[-CAPACITY:]
         assert oldest_first(ring) == model
@@ -59,13 +58,7 @@ def test_ring_keeps_the_last_valid_items_in_order_over_many_wraps(add, seed):
         np.testing.assert_array_equal(ring.data.vector[filled], expected)
 
 
-def test_batch_as_large_as_the_ring_replaces_all_of_it(add):
-    ring = add(replay.create(EXAMPLE, CAPACITY), rows(range(3)), jnp.ones(3, bool))
-    ring = add(ring, rows(range(10, 10 + CAPACITY)), jnp.ones(CAPACITY, bool))
-    assert oldest_first(ring) == list(range(10, 10 + CAPACITY))
-
-
-def test_nan_rows_marked_by_finite_rows_never_enter(add):
+def test_nan_rows_marked_by_finite_rows_never_enter():
     items = rows(range(BATCH))
     items = items._replace(vector=items.vector.at[1, 0].set(jnp.nan).at[3, 1].set(jnp.inf))
     finite = replay.finite_rows(items)
@@ -75,7 +68,7 @@ def test_nan_rows_marked_by_finite_rows_never_enter(add):
     assert np.all(np.isfinite(ring.data.vector))
 
 
-def test_sample_is_uniform_over_the_filled_slots_and_only_those(add):
+def test_sample_is_uniform_over_the_filled_slots_and_only_those():
     n_filled, n_draws = 4, 20_000
     ring = add(replay.create(EXAMPLE, CAPACITY), rows(range(1, 1 + n_filled)), jnp.ones(n_filled, bool))
     draw = jax.jit(functools.partial(replay.sample, batch_size=n_draws))
@@ -104,11 +97,6 @@ def test_items_of_any_pytree_structure_are_stored_with_their_dtypes():
         (rows(range(5)), np.ones(4, bool), r"items.*tag: got \(5,\)"),
         (rows(range(5)), np.ones(5, np.float32), r"valid: got \(5,\) float32"),
         (rows(range(5))._replace(tag=jnp.zeros(5)), np.ones(5, bool), r"tag: got .*float32"),
-        (
-            rows(range(5))._replace(vector=jnp.zeros((5, 3))),
-            np.ones(5, bool),
-            r"vector: .* expected \(5, 2\)",
-        ),
         ((jnp.zeros(5),), np.ones(5, bool), "got structure"),
     ],
 )
@@ -142,5 +130,5 @@ def test_thinning_draws_every_item_alike():
 def test_thinning_to_all_or_nothing():
     ring = replay.add(replay.create(jnp.zeros(()), 8), jnp.arange(8.0), jnp.ones(8, bool))
     whole, empty = (replay.thin(ring, jax.random.PRNGKey(0), share) for share in (1.0, 0.0))
-    np.testing.assert_array_equal(whole.data, ring.data)
-    assert int(whole.position) == 0 and int(whole.size) == 8 and int(empty.size) == 0
+    jax.tree.map(np.testing.assert_array_equal, whole, ring)
+    assert int(empty.size) == 0

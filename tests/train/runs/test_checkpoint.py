@@ -13,9 +13,9 @@ def test_a_folder_that_is_no_run_is_named(tmp_path):
     with pytest.raises(RunError, match="not the folder of a run: .*config.json: No such file"):
         Run.open(tmp_path)
     (tmp_path / "config.json").write_text("{")
-    with pytest.raises(RunError, match="config.json: not a run's config"):
+    with pytest.raises(RunError, match="config.json: got a config of another version"):
         Run.open(tmp_path)
-    with pytest.raises(RunError, match="already holds a run; continue it with --resume"):
+    with pytest.raises(RunError, match="got a folder with a run, .*--resume"):
         Run.create(tmp_path, CONFIG, ArmSpec.default())
 
 
