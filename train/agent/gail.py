@@ -12,6 +12,7 @@ Shapes: B batch, O observation (which holds the goal), A action.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -75,13 +76,9 @@ class Gail:
         params = self.network.init(key, jnp.zeros((1, self.obs_size)), jnp.zeros((1, self.action_size)))
         return DiscriminatorState(params, self.optimizer.init(params))
 
-    def logits(self, params: Any) -> Logits:
-        """Return the discriminator as a function of scaled observations and actions."""
-        return lambda obs, action: self.network.apply(params, obs, action)
-
     def reward(self, params: Any, obs: Array, action: Array) -> Array:
         """Return the learned reward (...) of actions (..., A) at observations (..., O)."""
-        return learned_reward(self.logits(params)(*self._scaled(obs, action)))
+        return learned_reward(self.network.apply(params, *self._scaled(obs, action)))
 
     def update(
         self,
@@ -106,7 +103,7 @@ class Gail:
         between = jax.tree.map(lambda e, a: mix * e + (1.0 - mix) * a, expert, agent)  # (B, O), (B, A)
 
         def loss(params: Any) -> tuple[Array, dict[str, Array]]:
-            logits = self.logits(params)
+            logits = functools.partial(self.network.apply, params)
             on_expert, on_agent = logits(*expert), logits(*agent)
             entropy = cross_entropy(on_expert, on_agent)
             penalty = gradient_penalty(logits, *between)

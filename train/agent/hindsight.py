@@ -99,11 +99,6 @@ def _near_offsets(distance: Array, direction: Array, config: HindsightConfig) ->
 
     A turn is a normal draw in proportion to the translation's length over its own norm, so it has a heavy
     tail: some goals are turned further than the arm can turn, as a user's goals may be.
-
-    Args:
-        distance (n,): uniform draws.
-        direction (n, 6): normal draws.
-        config: nearest, furthest, and how far the angles are turned.
     """
     low, high = jnp.log(config.near_min_mm), jnp.log(config.near_max_mm)
     length = jnp.exp(low + (high - low) * distance)[:, None]  # (n, 1) [mm]

@@ -111,26 +111,10 @@ def squash(mean: jax.Array, log_std: jax.Array, noise: jax.Array) -> tuple[jax.A
 
 
 def sample_action(mean: jax.Array, log_std: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Draw an action and its log-density; see `squash`.
-
-    Args:
-        mean (..., A): mean before squashing.
-        log_std (..., A): log standard deviation before squashing.
-        key: PRNG key.
-
-    Returns:
-        action (..., A) in (-1, 1) and log_prob (...).
-    """
+    """Draw an action (..., A) in (-1, 1) and its log-density (...); see `squash`."""
     return squash(mean, log_std, draws.normal(key, mean.shape))
 
 
 def mode(mean: jax.Array) -> jax.Array:
-    """Return the deterministic action: the squashed mean, which is also the median of each action.
-
-    Args:
-        mean (..., A): mean before squashing.
-
-    Returns:
-        action (..., A) in (-1, 1).
-    """
+    """Return the deterministic action (..., A): the squashed mean, which is also its median."""
     return jnp.tanh(mean)

@@ -85,10 +85,8 @@ def _out_of_range(matrix: LogMatrix, spec: ArmSpec) -> Iterator[Finding]:
         for row in np.flatnonzero((values < min(limits)) | (values > max(limits))):
             got = f"got {_shown(column, values[row])} {column.unit}"
             yield _finding(matrix, row, column.name, f"{got}, expected {low} to {high}, the arm's range")
-    tip_m, reach_m = (
-        matrix.values[:, matrix.indices("tip_m")],
-        spec.structure.n_sections * spec.springs.length_max_m,
-    )
+    tip_m = matrix.values[:, matrix.indices("tip_m")]
+    reach_m = spec.structure.n_sections * spec.springs.length_max_m
     for row in np.flatnonzero((np.linalg.norm(tip_m, axis=1) > reach_m) | (tip_m[:, 2] > 0.0)):
         got = ", ".join(f"{1e3 * value:.4g}" for value in tip_m[row])
         expected = f"a tip below the base and within {1e3 * reach_m:.4g} mm of it"
@@ -99,9 +97,8 @@ def _out_of_range(matrix: LogMatrix, spec: ArmSpec) -> Iterator[Finding]:
         yield _finding(matrix, row, "tip_qw..qz", f"{got}, expected unit quaternions")
     sequence = matrix.values[:, matrix.indices("sequence")[0]]
     for row in np.flatnonzero((sequence < 0.0) | (sequence > 1e6) | (sequence != np.round(sequence))):
-        yield _finding(
-            matrix, row, "sequence", f"got {sequence[row]:g}, expected a whole number from 0 to 1000000"
-        )
+        got = f"got {sequence[row]:g}"
+        yield _finding(matrix, row, "sequence", f"{got}, expected a whole number from 0 to 1000000")
 
 
 def _out_of_order(matrix: LogMatrix) -> Iterator[Finding]:

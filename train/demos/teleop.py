@@ -187,22 +187,17 @@ class Teleoperation:
         self._last = row
 
     def _seen(self, row: dict) -> tuple[np.ndarray, np.ndarray]:
-        """Return finger tips (3,) [m] and the gripper's rotation (3, 3), measured, or planned without a frame."""
+        """Return finger tips (3,) [m] and rotation (3, 3) of the gripper, measured if there is a frame."""
         if "tip_m" not in row:
             return self._now.finger_m, self._now.rotation
         rotation = rotation_from_quaternion(row["tip_quaternion"])
         return row["tip_m"] - self.expert.spec.mass.gripper_length_m * rotation[:, 2], rotation
 
     def _add(self, row: dict, sequence: int, off_m: float) -> None:
-        planned = (
-            {}
-            if self._sees
-            else {
-                "tip_m": 1e-3 * self._now.pose[:3].astype(float),
-                "tip_quaternion": quaternion_from_pose(self._now.pose.astype(float)),
-            }
-        )
-        self._rows.add((planned | row) | {"sequence": sequence})
+        if not self._sees:
+            pose = self._now.pose.astype(float)
+            row = {"tip_m": 1e-3 * pose[:3], "tip_quaternion": quaternion_from_pose(pose)} | row
+        self._rows.add(row | {"sequence": sequence})
         self._off_m.append(off_m)
 
 

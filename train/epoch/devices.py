@@ -44,7 +44,12 @@ def mesh_of(devices: str | None) -> Mesh | None:
     if devices is None or devices == "1":
         return None
     if devices.isdecimal() and int(devices):
-        return Mesh(np.array(_local(int(devices))), (AXIS,))
+        n, found = int(devices), jax.local_devices()
+        if len(found) < n:
+            on_cpu = jax.default_backend() == "cpu"
+            hint = "; the environment variable JAX_NUM_CPU_DEVICES makes more of a CPU" * on_cpu
+            raise ConfigError(f"--devices: got {n}, expected at most {len(found)}, which there are{hint}")
+        return Mesh(np.array(found[:n]), (AXIS,))
     meeting = _MEETING.fullmatch(devices)
     if not meeting and devices != CLUSTER:
         raise ConfigError(f"--devices: got {devices!r}, expected a number, {CLUSTER} or HOST:PORT/K/N")
@@ -57,16 +62,6 @@ def mesh_of(devices: str | None) -> Mesh | None:
     except (ValueError, RuntimeError) as error:
         raise ConfigError(f"--devices {devices}: {error}") from error
     return Mesh(np.array(jax.devices()), (AXIS,))
-
-
-def _local(n: int) -> list[jax.Device]:  # pyright: ignore[reportInvalidTypeForm]
-    found = jax.local_devices()
-    if len(found) < n:
-        hint = "; the environment variable JAX_NUM_CPU_DEVICES makes more of a CPU" * (
-            jax.default_backend() == "cpu"
-        )
-        raise ConfigError(f"--devices: got {n}, expected at most {len(found)}, which there are{hint}")
-    return found[:n]
 
 
 def split(mesh: Mesh) -> NamedSharding:

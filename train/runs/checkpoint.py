@@ -173,7 +173,12 @@ class Run:
         """Delete checkpoints and metrics later than an epoch, before the run continues from there."""
         for later in [saved for saved in self.epochs if saved > epoch]:
             self._manager.delete(later)
-        self.truncate_metrics(epoch)
+        if not is_first_process():
+            return
+        rows = [row for row in self.metrics() if row["epoch"] <= epoch]
+        temporary = self.path / "metrics.jsonl.part"
+        temporary.write_text("".join(json.dumps(row) + "\n" for row in rows), "utf-8")
+        os.replace(temporary, self.path / "metrics.jsonl")
 
     def save(self, epoch: int, state: TrainState) -> None:
         """Write a checkpoint; an interrupted write leaves the one before it in force."""
@@ -249,15 +254,6 @@ class Run:
             except json.JSONDecodeError:
                 break
         return rows
-
-    def truncate_metrics(self, epoch: int) -> None:
-        """Delete lines later than an epoch, before the run continues from there."""
-        if not is_first_process():
-            return
-        rows = [row for row in self.metrics() if row["epoch"] <= epoch]
-        temporary = self.path / "metrics.jsonl.part"
-        temporary.write_text("".join(json.dumps(row) + "\n" for row in rows), "utf-8")
-        os.replace(temporary, self.path / "metrics.jsonl")
 
 
 def _shape_somewhere(x: Any) -> jax.ShapeDtypeStruct:

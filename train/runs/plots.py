@@ -50,10 +50,12 @@ def dress(axes: Any, title: str, x: str, y: str) -> None:
         axes.xaxis.set_major_formatter(EngFormatter())
 
 
-def _axes(figure: Figure, position: Any, title: str, x: str, y: str) -> Any:
-    axes = figure.add_subplot(*position) if isinstance(position, tuple) else figure.add_subplot(position)
-    dress(axes, title, x, y)
-    return axes
+def _figure(width: float, *panels: tuple[str, str, str], height: float = 4.0) -> tuple[Figure, Any]:
+    """Return a figure of panels side by side, each with title and labels of x and y, and their axes."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    for k, panel in enumerate(panels):
+        dress(figure.add_subplot(1, len(panels), k + 1), *panel)
+    return figure, figure.axes
 
 
 def logarithmic(axes: Any) -> None:
@@ -63,45 +65,56 @@ def logarithmic(axes: Any) -> None:
     axes.yaxis.set_minor_formatter(LogFormatter())
 
 
-def learning_curve(rows: list[dict[str, Any]]) -> Figure:
-    """Draw held-out tip error and success over environment steps."""
-    figure = Figure(figsize=(10, 4), layout="constrained")
+def _evaluations(
+    axes: Any, rows: list[dict[str, Any]], factor: float, lines: dict[str, tuple[str, str]]
+) -> None:
+    """Draw figures of the evaluations over environment steps: name -> colour and label."""
     evaluated = [row for row in rows if "evaluation/median_mm" in row]
     steps = [row["env_steps"] for row in evaluated]
-    left = _axes(figure, 121, "tip error on held-out goals", STEPS, "mm")
-    left.plot(steps, [row["evaluation/median_mm"] for row in evaluated], color=BLUE, label="median")
-    left.plot(steps, [row["evaluation/p95_mm"] for row in evaluated], color=ORANGE, label="95 %")
-    left.plot(
-        steps, [row["evaluation/circle_mean_mm"] for row in evaluated], color=GREY, label="circle, mean"
+    for name, (colour, label) in lines.items():
+        values = [factor * row[f"evaluation/{name}"] for row in evaluated]
+        axes.plot(steps, values, color=colour, label=label)
+    axes.legend(frameon=False)
+
+
+def learning_curve(rows: list[dict[str, Any]]) -> Figure:
+    """Draw held-out tip error and success over environment steps."""
+    figure, (left, right) = _figure(
+        10,
+        ("tip error on held-out goals", STEPS, "mm"),
+        ("goals reached, chambers saturated", STEPS, "%"),
     )
+    errors = {
+        "median_mm": (BLUE, "median"),
+        "p95_mm": (ORANGE, "95 %"),
+        "circle_mean_mm": (GREY, "circle, mean"),
+    }
+    _evaluations(left, rows, 1, errors)
     logarithmic(left)
-    left.legend(frameon=False)
-    right = _axes(figure, 122, "goals reached, chambers saturated", STEPS, "%")
-    for name, colour, label in (
-        ("reached_share", BLUE, "goals reached"),
-        ("saturated_share", ORANGE, "goals with a saturated chamber"),
-    ):
-        right.plot(steps, [100 * row[f"evaluation/{name}"] for row in evaluated], color=colour, label=label)
+    shares = {
+        "reached_share": (BLUE, "goals reached"),
+        "saturated_share": (ORANGE, "goals with a saturated chamber"),
+    }
+    _evaluations(right, rows, 100, shares)
     right.set_ylim(0, 100)
-    right.legend(frameon=False)
     return figure
 
 
 def circle_figure(circle: Reached) -> Figure:
     """Draw the circle from above, and the error and the pressures along it."""
-    figure = Figure(figsize=(12, 4), layout="constrained")
     goal, pose = np.asarray(circle.goal), np.asarray(circle.pose)
-    error = circle.tip_error_mm
-    left = _axes(figure, 131, "circle from above", "x [mm]", "y [mm]")
+    error, n_saturated = circle.tip_error_mm, int(np.sum(circle.saturated_chambers))
+    figure, (left, middle, right) = _figure(
+        12,
+        ("circle from above", "x [mm]", "y [mm]"),
+        (f"tip error: mean {error.mean():.2f} mm, largest {error.max():.2f} mm", "point", "mm"),
+        (f"pressures; {n_saturated} saturated chambers", "point", "kPa"),
+    )
     left.plot(*np.vstack([goal, goal[:1]])[:, :2].T, color=GREY, label="goal")
     left.plot(pose[:, 0], pose[:, 1], "o", markersize=3.5, color=BLUE, label="reached")
     left.set_aspect("equal")
     left.legend(frameon=False, loc="center")
-    title = f"tip error: mean {error.mean():.2f} mm, largest {error.max():.2f} mm"
-    middle = _axes(figure, 132, title, "point", "mm")
     middle.bar(np.arange(len(error)), error, color=BLUE)
-    n_saturated = int(np.sum(circle.saturated_chambers))
-    right = _axes(figure, 133, f"pressures; {n_saturated} saturated chambers", "point", "kPa")
     for k, line in enumerate(np.asarray(circle.pressure_kpa).T):
         right.plot(line, color=colormaps["tab10"](k % 10), label=f"chamber {k}", linewidth=1.2)
     right.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
@@ -110,27 +123,20 @@ def circle_figure(circle: Reached) -> Figure:
 
 def workspace_figure(workspace: Reached) -> Figure:
     """Draw the tip error over the workspace, and its distribution."""
-    figure = Figure(figsize=(13, 4), layout="constrained")
     goal, error = np.asarray(workspace.goal), workspace.tip_error_mm
+    figure, (side, above, axes) = _figure(
+        13,
+        ("tip error at the goals, side view", "y [mm]", "z [mm]"),
+        ("tip error at the goals, from above", "x [mm]", "y [mm]"),
+        (f"distribution over {len(error)} held-out goals", "tip error [mm]", "share of goals [%]"),
+    )
     order = np.argsort(error)
     top = max(1.0, float(np.quantile(error, 0.98)))
-    for position, columns, title in ((131, (1, 2), "side view"), (132, (0, 1), "from above")):
-        names = [f"{'xyz'[k]} [mm]" for k in columns]
-        axes = _axes(figure, position, f"tip error at the goals, {title}", *names)
-        points = axes.scatter(
-            goal[order, columns[0]],
-            goal[order, columns[1]],
-            c=error[order],
-            s=5,
-            cmap="viridis",
-            vmin=0,
-            vmax=top,
-        )
-        axes.set_aspect("equal")
-    figure.colorbar(points, ax=axes, label="mm", extend="max")
-    axes = _axes(
-        figure, 133, f"distribution over {len(error)} held-out goals", "tip error [mm]", "share of goals [%]"
-    )
+    colours: dict[str, Any] = {"c": error[order], "s": 5, "cmap": "viridis", "vmin": 0, "vmax": top}
+    for panel, x, y in ((side, 1, 2), (above, 0, 1)):
+        points = panel.scatter(goal[order, x], goal[order, y], **colours)
+        panel.set_aspect("equal")
+    figure.colorbar(points, ax=above, label="mm", extend="max")
     axes.plot(np.sort(error), 100 * np.arange(1, len(error) + 1) / len(error), color=BLUE)
     for share, colour in ((50, GREY), (95, ORANGE)):
         at = float(np.quantile(error, share / 100))
@@ -145,50 +151,45 @@ def workspace_figure(workspace: Reached) -> Figure:
 
 def imitation_curve(rows: list[dict[str, Any]]) -> Figure:
     """Draw success and tip error at the demonstrated poses over environment steps."""
-    figure = Figure(figsize=(10, 4), layout="constrained")
-    evaluated = [row for row in rows if "evaluation/success_share" in row]
-    steps = [row["env_steps"] for row in evaluated]
-    left = _axes(figure, 121, "demonstrated poses reached", STEPS, "%")
-    for name, colour, label in (
-        ("success_share", BLUE, "unsaturated, inside the pipe"),
-        ("reached_share", GREY, "the pose alone"),
-    ):
-        left.plot(steps, [100 * row[f"evaluation/{name}"] for row in evaluated], color=colour, label=label)
+    figure, (left, right) = _figure(
+        10, ("demonstrated poses reached", STEPS, "%"), ("tip error at the poses", STEPS, "mm")
+    )
+    shares = {
+        "success_share": (BLUE, "unsaturated, inside the pipe"),
+        "reached_share": (GREY, "the pose alone"),
+    }
+    _evaluations(left, rows, 100, shares)
     left.set_ylim(0, 105)
-    left.legend(frameon=False)
-    right = _axes(figure, 122, "tip error at the poses", STEPS, "mm")
-    right.plot(steps, [row["evaluation/median_mm"] for row in evaluated], color=BLUE, label="median")
-    right.plot(steps, [row["evaluation/max_mm"] for row in evaluated], color=ORANGE, label="largest")
+    _evaluations(right, rows, 1, {"median_mm": (BLUE, "median"), "max_mm": (ORANGE, "largest")})
     logarithmic(right)
-    right.legend(frameon=False)
     return figure
 
 
 def losses(rows: list[dict[str, Any]]) -> Figure:
     """Draw all metrics of the learner that are losses over environment steps."""
     names = list(dict.fromkeys(name for row in rows for name in row if name.endswith("loss")))
-    figure = Figure(figsize=(4 * max(len(names), 1), 3.5), layout="constrained")
-    for k, name in enumerate(names):
-        title = name.split("/")[1].replace("_", " ")
-        axes = _axes(figure, (1, len(names), k + 1), title, STEPS, "")
-        learned = [row for row in rows if row["updates"] > 0]
+    learned = [row for row in rows if row["updates"] > 0]
+    panels = [(name.split("/")[1].replace("_", " "), STEPS, "") for name in names]
+    figure, panels = _figure(4 * max(len(names), 1), *panels, height=3.5)
+    for name, axes in zip(names, panels, strict=True):
         axes.plot([row["env_steps"] for row in learned], [row[name] for row in learned], color=BLUE)
     return figure
 
 
 def positions_figure(at: AtPositions) -> Figure:
     """Draw demonstrated and reached poses from the front, and errors and clearances along them."""
-    figure = Figure(figsize=(12, 4), layout="constrained")
-    goal, pose = np.asarray(at.reached.goal), np.asarray(at.reached.pose)
-    left = _axes(figure, 131, "poses from the front", "x [mm]", "z [mm]")
+    goal, pose, error = np.asarray(at.reached.goal), np.asarray(at.reached.pose), at.reached.tip_error_mm
+    figure, (left, middle, right) = _figure(
+        12,
+        ("poses from the front", "x [mm]", "z [mm]"),
+        (f"tip error: mean {error.mean():.2f} mm", "position", "mm"),
+        ("clearance of the body to the pipe", "position", "mm"),
+    )
     left.plot(goal[:, 0], goal[:, 2], color=GREY, marker="o", markerfacecolor="none", label="demonstrated")
     left.plot(pose[:, 0], pose[:, 2], "o", markersize=3.5, color=BLUE, label="reached")
     left.set_aspect("equal")
     left.legend(frameon=False)
-    error = at.reached.tip_error_mm
-    middle = _axes(figure, 132, f"tip error: mean {error.mean():.2f} mm", "position", "mm")
     middle.bar(np.arange(len(error)), error, color=np.where(at.success, BLUE, ORANGE))
-    right = _axes(figure, 133, "clearance of the body to the pipe", "position", "mm")
     if np.isfinite(at.reached.clearance_mm).all():
         right.bar(np.arange(len(error)), at.reached.clearance_mm, color=BLUE)
     else:

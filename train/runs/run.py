@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from mjx_softarm._support.provenance import write_json
 from mjx_softarm.env import ReachEnv
 from train.config import TrainConfig
 from train.epoch.devices import any_process, is_first_process
-from train.epoch.job import Job, TrainState
+from train.epoch.job import TrainState
 from train.runs import plots
 from train.runs.checkpoint import Run, RunError
 from train.runs.task import Task, task_of
@@ -44,26 +44,23 @@ def train(run: Run, task: Task, console: Console) -> Any:
     Raises:
         Interrupted: after Ctrl-C or a termination signal, once the state is saved.
     """
+    config = run.config
     with asked_to_stop() as asked:
         epoch, state = _begin(run, task, console)
-        run.truncate_metrics(epoch)
-        with open_board(run, state) as board, progress_bar(console) as progress:
-            bar = progress.add_task("training", total=run.config.n_epochs, completed=epoch, text="")
-            while epoch < run.config.n_epochs:
-                state, row = _timed_epoch(task.job, task.prepare(state, epoch))
+        run.rewind(epoch)
+        with open_board(run, state) as board, shown_progress(config, epoch, console) as show:
+            while epoch < config.n_epochs:
+                state, metrics = timed_epoch(task.job, task.prepare(state, epoch))
+                row = {name: float(value) for name, value in metrics.items()}
                 epoch += 1
-                stop, due = any_process(bool(asked)), run.config.evaluates_after(epoch)
+                stop, due = any_process(bool(asked)), config.evaluates_after(epoch)
                 if due:
                     row |= evaluation(task, task.job.policy(state))
                 record(run, board, epoch, counts(state), row)
                 if due or stop:
                     run.save(epoch, state)
-                progress.update(bar, completed=epoch, text=_line(task, row))
-                if due and not console.is_terminal:  # a log file gets lines instead of a bar
-                    console.print(
-                        f"epoch {epoch} of {run.config.n_epochs}: {_line(task, row)}", highlight=False
-                    )
-                if stop and epoch < run.config.n_epochs:
+                show(epoch, _line(task, row), due)
+                if stop and epoch < config.n_epochs:
                     raise Interrupted(f"stopped after epoch {epoch}; continue with --resume {run.path}")
     return finish(run, task, task.job.policy(state))
 
@@ -148,19 +145,16 @@ def open_board(run: Run, state: TrainState) -> SummaryWriter:
     return SummaryWriter(str(run.path), purge_step=purge_step, write_to_disk=is_first_process())
 
 
-def _timed_epoch(job: Job, state: TrainState) -> tuple[TrainState, dict[str, float]]:
-    start = time.perf_counter()
-    updates = int(state.n_updates)
+def timed_epoch(job: Any, state: TrainState) -> tuple[TrainState, dict[str, Any]]:
+    """Return the next state of a job, or of a sweep's, and its metrics with the speeds of one run."""
+    start, before = time.perf_counter(), counts(state)["updates"]
     state, metrics = job.epoch(state)
-    row = {name: float(value) for name, value in jax.device_get(metrics).items()}
+    metrics = jax.device_get(metrics)
     seconds = time.perf_counter() - start
-    return state, row | speeds(job.config, int(state.n_updates) - updates, seconds)
-
-
-def speeds(config: TrainConfig, n_updates: int, seconds: float) -> dict[str, float]:
-    """Return the speeds of an epoch with n updates, named as in a row of metrics."""
-    n_env_steps = config.n_arms * config.vector_steps_per_epoch
-    return {"speed/env_steps_per_s": n_env_steps / seconds, "speed/updates_per_s": n_updates / seconds}
+    n_env_steps = job.config.n_arms * job.config.vector_steps_per_epoch
+    n_updates = counts(state)["updates"] - before
+    speeds = {"env_steps_per_s": n_env_steps / seconds, "updates_per_s": n_updates / seconds}
+    return state, metrics | {f"speed/{name}": value for name, value in speeds.items()}
 
 
 def evaluation(task: Task, policy: Any) -> dict[str, float]:
@@ -170,8 +164,8 @@ def evaluation(task: Task, policy: Any) -> dict[str, float]:
 
 
 def counts(state: TrainState) -> dict[str, int]:
-    """Return the numbers of env steps and updates so far, named as in a row of metrics."""
-    return {"env_steps": int(state.n_env_steps), "updates": int(state.n_updates)}
+    """Return one run's numbers of env steps and updates so far, named as in a row of metrics."""
+    return {"env_steps": int(state.n_env_steps), "updates": int(np.max(state.n_updates))}
 
 
 def record(run: Run, board: SummaryWriter, epoch: int, done: dict[str, int], row: dict[str, float]) -> None:
@@ -189,11 +183,23 @@ def _line(task: Task, row: dict[str, float]) -> str:
     return f"{text}  {task.headline(row)}" if "evaluation/median_mm" in row else text
 
 
-def progress_bar(console: Console) -> Progress:
-    """Return a progress bar over epochs, hidden where the console is a file."""
+@contextmanager
+def shown_progress(
+    config: TrainConfig, epoch: int, console: Console
+) -> Iterator[Callable[[int, str, bool], None]]:
+    """Yield a function that shows an epoch with its text on a bar, or, if due, as a line of a file."""
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     columns += (TextColumn("{task.fields[text]}"),)
-    return Progress(*columns, console=console, speed_estimate_period=120, disable=not console.is_terminal)
+    hidden = not console.is_terminal
+    with Progress(*columns, console=console, speed_estimate_period=120, disable=hidden) as progress:
+        bar = progress.add_task("training", total=config.n_epochs, completed=epoch, text="")
+
+        def show(epoch: int, text: str, due: bool) -> None:
+            progress.update(bar, completed=epoch, text=text)
+            if due and hidden:
+                console.print(f"epoch {epoch} of {config.n_epochs}: {text}", highlight=False)
+
+        yield show
 
 
 @contextmanager

@@ -8,14 +8,12 @@ from __future__ import annotations
 
 import json
 import shutil
-import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 from rich.console import Console
 
@@ -29,12 +27,13 @@ from train.runs.checkpoint import Run, RunError
 from train.runs.run import (
     Interrupted,
     asked_to_stop,
+    counts,
     evaluation,
     finish,
     open_board,
-    progress_bar,
     record,
-    speeds,
+    shown_progress,
+    timed_epoch,
 )
 from train.runs.task import Task, learner_of, task_of
 from train.sweep.job import SweepJob, with_env_config
@@ -127,23 +126,26 @@ def train(sweep: Sweep, console: Console) -> None:
         console.print(f"continuing after epoch {epoch} of {config.n_epochs}")
     states = _start(sweep, job, epoch)
     console.print("compiling (cached for the next start) ...")
-    with asked_to_stop() as asked, ExitStack() as stack, progress_bar(console) as progress:
+    with (
+        asked_to_stop() as asked,
+        ExitStack() as stack,
+        shown_progress(config, epoch, console) as show,
+    ):
         boards = [stack.enter_context(open_board(run, states)) for run in sweep.runs]
-        bar = progress.add_task("training", total=config.n_epochs, completed=epoch, text="")
         while epoch < config.n_epochs:
-            states, rows = _timed_epoch(job, states)
+            states, metrics = timed_epoch(job, states)
+            rows = [
+                {name: float(x[k] if np.ndim(x) else x) for name, x in metrics.items()} for k in range(job.n)
+            ]
             epoch += 1
-            stop, due = bool(asked), config.evaluates_after(epoch)
-            done = {"env_steps": int(states.n_env_steps), "updates": int(states.n_updates[0])}
+            stop, due, done = bool(asked), config.evaluates_after(epoch), counts(states)
             for k, (run, board, row) in enumerate(zip(sweep.runs, boards, rows, strict=True)):
                 if due:
                     row |= evaluation(tasks[run.config.env], job.policy(states, k))
                 record(run, board, epoch, done, row)
                 if due or stop:
                     run.save(epoch, job.member(states, k))
-            progress.update(bar, completed=epoch, text=_line(rows))
-            if due and not console.is_terminal:  # a log file gets lines instead of a bar
-                console.print(f"epoch {epoch} of {config.n_epochs}: {_line(rows)}", highlight=False)
+            show(epoch, _line(rows), due)
             if stop and epoch < config.n_epochs:
                 raise Interrupted(f"stopped after epoch {epoch}; continue with --resume {sweep.path}")
     for k, run in enumerate(sweep.runs):
@@ -153,10 +155,7 @@ def train(sweep: Sweep, console: Console) -> None:
 def _tasks(sweep: Sweep, env: ReachEnv) -> dict[EnvConfig, Task]:
     """Return the tasks that evaluate the members, one for each environment."""
     configs = {run.config.env: run.config for run in sweep.runs}
-    return {
-        env_config: task_of(config, with_env_config(env, env_config))
-        for env_config, config in configs.items()
-    }
+    return {own: task_of(config, with_env_config(env, own)) for own, config in configs.items()}
 
 
 def _start(sweep: Sweep, job: SweepJob, epoch: int) -> TrainState:
@@ -167,17 +166,6 @@ def _start(sweep: Sweep, job: SweepJob, epoch: int) -> TrainState:
         return job.init()
     like = job.member_shapes()
     return job.together([run.restore(like)[1] for run in sweep.runs])
-
-
-def _timed_epoch(job: SweepJob, states: TrainState) -> tuple[TrainState, list[dict[str, float]]]:
-    """Return the next states, and a row of metrics for each member; speeds are those of one member."""
-    start = time.perf_counter()
-    updates = int(states.n_updates[0])
-    states, metrics = job.epoch(states)
-    metrics = jax.device_get(metrics)
-    seconds = time.perf_counter() - start
-    speed = speeds(job.config, int(states.n_updates[0]) - updates, seconds)
-    return states, [{name: float(x[k]) for name, x in metrics.items()} | speed for k in range(job.n)]
 
 
 def _line(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -25,5 +25,5 @@ def test_metrics_later_than_the_checkpoint_are_forgotten(tmp_path):
         run.log({"epoch": epoch})
     with (tmp_path / "metrics.jsonl").open("a") as file:
         file.write('{"epoch": 5, "cut')
-    run.truncate_metrics(2)
+    run.rewind(2)
     assert run.metrics() == [{"epoch": 1}, {"epoch": 2}]
