@@ -146,12 +146,6 @@ def loaded(*packages):
     return set(done.stdout.split())
 
 
-def test_importing_training_and_calibration_leaves_the_twin_out():
-    modules = loaded("train", "calib")
-    assert not {name for name in modules if name.startswith("mjx_softarm.twin")}
-    assert "train.agent.tqc" in modules
-
-
 def test_light_rooms_are_imported_without_jax_and_mujoco():
     modules = loaded(*(f"mjx_softarm.{room}" for room in LIGHT))
     assert not modules & {*HEAVY, *JOBS} and "mjx_softarm.deploy.session" in modules

@@ -20,6 +20,10 @@ ROOT = Path(__file__).resolve().parents[2]
     [
         ("twin", "got 'twin', expected twin:SEED or package.module:Class"),
         ("twin:-1", "got '-1', expected an integer >= 0"),
+        ("twin::pipe300", "got '', expected an integer >= 0"),
+        ("twin:0:pipe200", "twin:0:PIPE: got 'pipe200', expected pipe300 or pipe250"),
+        ("twin:0:", "twin:0:PIPE: got '', expected pipe300 or pipe250"),
+        ("twin:0:pipe300:x", "got 'pipe300:x', expected pipe300 or pipe250"),
         ("no_such_module:Arm", "no_such_module cannot be imported: No module named 'no_such_module'"),
         ("mjx_softarm.deploy.loop:Nothing", "module mjx_softarm.deploy.loop has no 'Nothing'"),
         ("mjx_softarm.deploy.session:Run", "has no method read_sensors or write_pressures"),
@@ -105,11 +109,7 @@ def test_command_line_tells_what_is_wrong(folder):
 @pytest.mark.parametrize(
     ("fault", "status", "message"),
     [
-        (
-            "raise RuntimeError('valve')",
-            3,
-            "write_pressures: RuntimeError: valve (driver.py, line ",
-        ),
+        ("raise RuntimeError('valve')", 3, "write_pressures: RuntimeError: valve (driver.py, line "),
         ("os.kill(os.getpid(), signal.SIGTERM)", 143, "ended early: ended by SIGTERM"),
         ("os.kill(os.getpid(), signal.SIGINT)", 130, "ended early: interrupted"),
     ],

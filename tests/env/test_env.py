@@ -114,10 +114,6 @@ def test_an_action_scales_the_frequency_linearly_between_those_of_the_shortest_a
     np.testing.assert_allclose(env.action_of(jnp.float32(lengths)), actions, atol=1e-5)
 
 
-def test_action_of_is_the_inverse_of_reference(env, random_actions):
-    np.testing.assert_allclose(env.action_of(env.reference_m(random_actions)), random_actions, atol=1e-5)
-
-
 def test_actions_beyond_one_and_lengths_beyond_the_limits_are_clipped(env, spec):
     shortest, longest = spec.springs.length_min_m, spec.springs.length_max_m
     np.testing.assert_allclose(env.reference_m(jnp.full(9, -3.0)), shortest, atol=1e-7)
@@ -150,14 +146,6 @@ def test_every_goal_is_reached_to_a_tenth_of_a_millimetre_with_no_chamber_satura
     np.testing.assert_array_equal(after.reward, 100.0)
     np.testing.assert_array_equal(after.done, 1)
     np.testing.assert_array_equal(after.metrics["reached"], 1)
-
-
-def test_goals_spread_over_the_workspace(env):
-    x, y, z = np.asarray(env.pool.pose[:, :3]).T
-    # The workspace is 400 mm wide (paper); 512 poses touch its rim in few places.
-    assert min(np.ptp(x), np.ptp(y), np.ptp(z)) > 0.65 * 400
-    voxels = np.unique(np.floor(np.asarray(env.pool.pose[:, :3]) / 25.0), axis=0)
-    assert len(voxels) > 350  # of about 1100 that can be reached
 
 
 def test_the_same_key_gives_the_same_episode_and_another_key_another_one(reset, step, random_actions):
@@ -223,24 +211,12 @@ def test_where_an_arm_goes_does_not_depend_on_where_it_was(reset, step, random_a
 
 
 FAILURES = {
-    "a NaN in the action": lambda arm, action: (arm, action.at[3].set(jnp.nan)),
-    "an infinity in the action": lambda arm, action: (arm, action.at[3].set(jnp.inf)),
-    "a payload of a thousand tonnes": lambda arm, action: (
-        arm._replace(payload_kg=jnp.array(1e6)),
-        action,
-    ),
-    "chambers that push apart": lambda arm, action: (
-        arm._replace(chamber_stiffness=jnp.full(9, -1e4)),
-        action,
-    ),
-    "a NaN among the numbers of the arm": lambda arm, action: (
-        arm._replace(payload_kg=jnp.array(jnp.nan)),
-        action,
-    ),
-    "a NaN in the calibration": lambda arm, action: (
-        arm._replace(sensor_offset_m=arm.sensor_offset_m.at[0].set(jnp.nan)),
-        action,
-    ),
+    "a NaN in the action": {"action": jnp.nan},
+    "an infinity in the action": {"action": jnp.inf},
+    "a payload of a thousand tonnes": {"payload_kg": 1e6},
+    "chambers that push apart": {"chamber_stiffness": jnp.full(9, -1e4)},
+    "a NaN among the numbers of the arm": {"payload_kg": jnp.nan},
+    "a NaN in the calibration": {"sensor_offset_m": jnp.zeros(9).at[0].set(jnp.nan)},
 }
 
 
@@ -250,10 +226,12 @@ def broken(env, reset, step):
     start = reset(0)
     start = with_arm(start, goal=start.pipeline_state.pose)
     arms, actions = start.pipeline_state, env.action_of(start.pipeline_state.spring_m)
-    for index, break_one in enumerate(FAILURES.values()):
-        arm, action = break_one(jax.tree.map(lambda x, i=index: x[i], arms), actions[index])
-        arms = jax.tree.map(lambda many, one, i=index: many.at[i].set(one), arms, arm)
-        actions = actions.at[index].set(action)
+    for index, changes in enumerate(FAILURES.values()):
+        for name, value in changes.items():
+            if name == "action":
+                actions = actions.at[index, 3].set(value)
+            else:
+                arms = arms._replace(**{name: getattr(arms, name).at[index].set(value)})
     before = start.replace(pipeline_state=arms)
     whole = step(start, env.action_of(start.pipeline_state.spring_m))
     return before, step(before, actions), whole

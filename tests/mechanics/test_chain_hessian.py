@@ -49,14 +49,6 @@ def test_a_system_with_the_hessian_is_that_with_the_dense_matrix(n_sections):
     np.testing.assert_allclose(found, wanted.reshape(found.shape), atol=1e-5 * np.abs(wanted).max())
 
 
-def test_one_alone_is_solved_as_in_a_batch():
-    hessian, columns = chain(3)
-    many = jax.jit(jax.vmap(ChainHessian.solve))(hessian, columns)
-    for k in range(N_ARMS):
-        one = jax.jit(ChainHessian.solve)(jax.tree.map(lambda x, k=k: x[k], hessian), columns[k])
-        np.testing.assert_allclose(one, many[k], atol=1e-6)
-
-
 def test_batches_of_batches_are_solved_as_one():
     hessian, columns = chain(2)
     twice = jax.tree.map(lambda x: np.stack([x, x[::-1]]), (hessian, columns))

@@ -10,7 +10,7 @@ from scipy import linalg
 
 from mjx_softarm import ArmSpec
 from mjx_softarm.mechanics.kinematics import chain_kinematics
-from mjx_softarm.mechanics.mjcf import build_model, spring_lengths
+from mjx_softarm.mechanics.mjcf import build_model
 from mjx_softarm.mechanics.settle import (
     ACTIVE_SET_GAIN_KPA_PER_M,
     MAX_ITERATIONS,
@@ -101,6 +101,9 @@ def test_c_mujoco_finds_the_settled_arm_in_balance(arm, solve, targets):
 
 def test_every_chamber_tracks_or_is_at_the_limit_that_stops_it():
     reference = references()
+    low, high = SPEC.springs.length_min_m, SPEC.springs.length_max_m
+    corner = reference[: N // 4]  # the shortest and the longest that may be commanded
+    reference[: N // 4] = np.where(corner < 0.5 * (low + high), low, high)
     found = settled(settle, reference)
     error = reference - found.spring_m
     at_high, at_low = found.pressure_kpa == HIGH_KPA, found.pressure_kpa == LOW_KPA
@@ -110,7 +113,7 @@ def test_every_chamber_tracks_or_is_at_the_limit_that_stops_it():
     assert np.abs(error[~found.at_limit]).max() < TRACKING_TOLERANCE_M
     assert error[at_high].min() > -TRACKING_TOLERANCE_M  # full pressure, and the spring still too short
     assert error[at_low].max() < TRACKING_TOLERANCE_M
-    assert (found.tracking_error_m < TRACKING_TOLERANCE_M).all()
+    assert (found.tracking_error_m < TRACKING_TOLERANCE_M).all() and found.settled.all()
 
 
 def test_half_the_chambers_at_a_limit_take_a_handful_of_steps():
@@ -149,18 +152,6 @@ def test_a_newton_step_is_that_of_the_dense_system():
             np.testing.assert_array_equal(after.at_limit, held)
 
 
-def test_the_report_is_the_pose_and_the_lengths_of_its_joint_coordinates():
-    found = settled(settle, references())
-    model = build_model(SPEC)
-    data = mujoco.MjData(model)
-    for k in range(0, N, 8):
-        data.qpos[:] = found.q[k]
-        mujoco.mj_forward(model, data)
-        np.testing.assert_allclose(found.tip_position_m[k], data.site("tip").xpos, atol=1e-6)
-        np.testing.assert_allclose(found.tip_rotation[k], data.site("tip").xmat.reshape(3, 3), atol=1e-6)
-        np.testing.assert_allclose(found.spring_m[k], spring_lengths(data), atol=1e-6)
-
-
 def test_the_springs_that_pressures_give_ask_for_these_pressures():
     pressure = 0.9 * pressures()  # within the limits
     there = settled(settle_pressures, pressure)
@@ -168,17 +159,6 @@ def test_the_springs_that_pressures_give_ask_for_these_pressures():
     assert back.settled.all() and not back.at_limit.any()
     np.testing.assert_allclose(back.pressure_kpa, pressure, atol=0.02)
     np.testing.assert_allclose(back.q, there.q, atol=1e-4)
-
-
-@pytest.mark.parametrize("solve, targets", [(settle, references), (settle_pressures, pressures)])
-def test_mirrored_targets_give_the_mirrored_arm(solve, targets):
-    target = targets()
-    mirrored = target.reshape(N, 3, 3)[:, :, [0, 2, 1]].reshape(N, 9)  # chamber 0 lies in the mirror, x = 0
-    plain, found = settled(solve, target), settled(solve, mirrored)
-    mirror = np.diag([-1.0, 1.0, 1.0])
-    assert np.abs(plain.tip_position_m[:, 0]).max() > 0.05
-    np.testing.assert_allclose(found.tip_position_m, plain.tip_position_m @ mirror, atol=2e-6)
-    np.testing.assert_allclose(found.tip_rotation, mirror @ plain.tip_rotation @ mirror, atol=2e-5)
 
 
 def test_a_single_arm_settles_as_in_a_batch():
@@ -233,21 +213,6 @@ def test_a_payload_pulls_the_arm_down_by_its_weight_over_the_stiffness():
     chambers, springs = SPEC.chambers.stiffness_n_per_m, SPEC.springs.stiffness_n_per_m
     section = 3 * (chambers + springs) + SPEC.backbone.axial_stiffness_n_per_m
     assert height[0] - height[1] == pytest.approx(3 * 0.5 * 9.81 / section, rel=1e-3)
-
-
-def test_a_payload_moves_a_bent_arm_unless_its_springs_are_held():
-    pressure = np.tile([10.0, -20.0, -10.0], (1, 3))
-    loaded = SPEC.replace(mass={"payload_kg": 0.5})
-    free = settled(settle_pressures, pressure)
-    sagged = settled(settle_pressures, pressure, loaded)
-    held = settled(settle, free.spring_m, loaded)
-
-    def shift_mm(other):
-        return 1e3 * np.linalg.norm(other.tip_position_m - free.tip_position_m)
-
-    assert held.settled.all() and not held.at_limit.any()
-    assert shift_mm(sagged) > 5.0
-    assert shift_mm(held) < 0.25 * shift_mm(sagged)  # what is left: the links bend unevenly
 
 
 def test_half_a_kilogram_moves_held_arms_by_as_much_as_the_readme_says():

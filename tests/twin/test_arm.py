@@ -27,11 +27,6 @@ PRESSURES_KPA = np.array(
 
 
 @pytest.fixture(scope="module")
-def spec():
-    return ArmSpec.default()
-
-
-@pytest.fixture(scope="module")
 def noiseless():
     """A twin with everything but noise, brought to rest at some pressures; tests only read it."""
     arm = Twin(3, build=Build(noise=0.0))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mjx_softarm.twin import pneumatics
-from mjx_softarm.twin.pneumatics import ATMOSPHERE_KPA, PUMP_M3_PER_S, VALVE_S, Pneumatics
+from mjx_softarm.twin.pneumatics import ATMOSPHERE_KPA, VALVE_S, Pneumatics
 
 AREA_M2, SLOPE_M, REST_M, DT_S = 1.62e-3, -4.06e-3, 0.2, 0.001
 
@@ -29,9 +29,8 @@ def test_valve_answers_after_its_dead_time():
     system = air()
     system.command(np.full(9, -5.0))
     track = np.array([system.step(np.full(9, 0.2)).copy() for _ in range(20)])
-    dead = round(VALVE_S / DT_S)
-    np.testing.assert_array_equal(track[:dead], 0.0)
-    assert (track[dead:] < 0.0).all()
+    np.testing.assert_array_equal(track[:10], 0.0)  # 10 ms, as in the paper
+    assert (track[10:] < 0.0).all()
 
 
 def test_pressures_arrive_and_stay():
@@ -57,8 +56,3 @@ def test_chamber_cut_off_from_the_pump_follows_boyle(monkeypatch):
     after = system.volume_m3(np.full(9, 0.17))
     pressure = ATMOSPHERE_KPA + system.step(np.full(9, 0.17))
     np.testing.assert_allclose(pressure * after, ATMOSPHERE_KPA * before)
-
-
-def test_paper_s_pump_and_valves():
-    assert pytest.approx(12.0) == PUMP_M3_PER_S * 60e3
-    assert VALVE_S == 0.01
