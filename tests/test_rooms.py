@@ -111,13 +111,6 @@ def test_training_and_calibration_never_import_the_twin(room):
     assert not [path for path, text in texts.items() if "softarm.twin" in text]  # importlib, by a string
 
 
-def test_the_import_check_sees_the_twin():
-    path = ROOT / "mjx_softarm/twin/arm.py"
-    found = set(imported(ast.parse(path.read_text("utf-8")), path))
-    assert {"mjx_softarm.twin.model", "mjx_softarm.twin.model.build_twin", "mujoco"} <= found
-    assert ("benchmarks", "twin") in {(room, other) for room, other, _ in ARROWS}
-
-
 @pytest.mark.parametrize("room", LIGHT)
 def test_light_rooms_name_no_simulator(room):
     paths = [path for top, path in files() if top == room]
@@ -137,15 +130,10 @@ print(*sorted(sys.modules))
 """
 
 
-def loaded(*packages):
-    """Modules in a fresh process after the import of all modules of some packages."""
-    done = subprocess.run(
-        [sys.executable, "-c", LOADED, *packages], cwd=ROOT, capture_output=True, text=True, timeout=120
-    )
-    assert done.returncode == 0, done.stderr
-    return set(done.stdout.split())
-
-
 def test_light_rooms_are_imported_without_jax_and_mujoco():
-    modules = loaded(*(f"mjx_softarm.{room}" for room in LIGHT))
+    """All of their modules, in a fresh process."""
+    command = [sys.executable, "-c", LOADED, *(f"mjx_softarm.{room}" for room in LIGHT)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    modules = set(done.stdout.split())
     assert not modules & {*HEAVY, *JOBS} and "mjx_softarm.deploy.session" in modules

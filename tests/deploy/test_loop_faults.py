@@ -29,8 +29,6 @@ from tests.linear_arm import (
     read_m,
 )
 
-# --- chambers --------------------------------------------------------------------------------------
-
 
 class Leaking(LinearArm):
     """A chamber falls to atmospheric pressure."""
@@ -71,9 +69,6 @@ def test_arm_that_never_rests_is_counted():
     assert run.log.time_s[run.arrivals[0].row] >= N_ACTIONS * faults.SETTLE_TIMEOUT_S - 1.0
 
 
-# --- goals -----------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("goal", [FAR, np.full(6, np.nan), np.zeros(6)])
 def test_goal_outside_is_skipped(goal):
     arm = LinearArm()
@@ -98,9 +93,6 @@ def test_distance_to_reachable_poses():
     assert distance == pytest.approx(1.0)
     _, turned = nearest(found, np.array([0, 0, -600, 0, 0, 90]), reward)
     assert turned == pytest.approx(90 * reward.weight_per_deg / found.limit)
-
-
-# --- time ------------------------------------------------------------------------------------------
 
 
 class Slow(LinearArm):
@@ -131,9 +123,6 @@ def test_missed_deadlines(refuse):
     assert run.status == 3 and "arm late" in run.ending.cause
     assert run.counts() == {Fault.MISSED_DEADLINE: faults.LATE_TICKS, Fault.ARM_LATE: 1}
     np.testing.assert_array_equal(arm.command_kpa, 0.0)
-
-
-# --- responses -------------------------------------------------------------------------------------
 
 
 def test_s2r_corrects_the_estimate_and_extrapolation_is_counted():

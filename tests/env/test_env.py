@@ -45,9 +45,6 @@ def types(state):
     return jax.tree.map(jax.typeof, state)
 
 
-# --- sim-to-real network -----------------------------------------------------------------------------------
-
-
 def test_with_a_network_every_pose_is_the_real_one_and_the_arm_underneath_the_same():
     """A network that looks at a spring: poses of reset, step, pool and reward are corrected, and the body."""
     config = EnvConfig(n_poses=64, randomisation=Randomisation(sensor_noise_mm=2.0), pipe_diameter_mm=300.0)
@@ -95,9 +92,6 @@ def test_with_a_network_every_pose_is_the_real_one_and_the_arm_underneath_the_sa
     np.testing.assert_allclose(ends[1].metrics["tip_error_mm"], tip_mm, rtol=1e-4)
 
 
-# --- action <-> frequency <-> length -----------------------------------------------------------------------
-
-
 def test_an_action_scales_the_frequency_linearly_between_those_of_the_shortest_and_longest_spring(env, spec):
     sensor = spec.sensor
     coil = 1.26e-6 * sensor.turns**2 * np.pi * sensor.coil_radius_m**2
@@ -120,9 +114,6 @@ def test_actions_beyond_one_and_lengths_beyond_the_limits_are_clipped(env, spec)
     np.testing.assert_allclose(env.reference_m(jnp.full(9, 3.0)), longest, atol=1e-7)
     np.testing.assert_array_equal(env.action_of(jnp.full(9, 0.5 * shortest)), -1.0)
     np.testing.assert_array_equal(env.action_of(jnp.full(9, 2.0 * longest)), 1.0)
-
-
-# --- reset -------------------------------------------------------------------------------------------------
 
 
 def test_starts_and_goals_are_drawn_from_the_pool_each_on_its_own(env, start):
@@ -153,9 +144,6 @@ def test_the_same_key_gives_the_same_episode_and_another_key_another_one(reset, 
     assert leaves_equal(first, again)
     assert not np.array_equal(first.pipeline_state.goal, other.pipeline_state.goal)
     assert not np.array_equal(first.obs, other.obs)
-
-
-# --- step --------------------------------------------------------------------------------------------------
 
 
 def test_step_returns_the_types_it_takes_so_that_it_is_compiled_once(start, step, random_actions):
@@ -260,9 +248,6 @@ def test_an_arm_that_cannot_settle_leaves_the_others_alone(broken):
     assert leaves_equal(after, whole)
 
 
-# --- randomisation -----------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def randomised(spec, env):
     """State of as many arms as the other fixtures', every kind of randomisation on."""
@@ -337,9 +322,6 @@ def test_a_payload_and_stiffer_chambers_ask_for_other_pressures_at_the_same_spri
     np.testing.assert_allclose(loaded - nominal, -0.3 * 9.81 / (3 * area), rtol=1e-3)
     stretch = 0.1 * np.asarray(arm.chamber_stiffness[0]) * (0.19 - 0.2)
     np.testing.assert_allclose(stiffened - nominal, stretch / area, rtol=1e-3)
-
-
-# --- one word changes engine or mode -----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("word", [{"engine": "mujoco"}, {"mode": "static"}])

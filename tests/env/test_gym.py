@@ -36,9 +36,6 @@ def still(envs):
     return np.array(envs.env.action_of(np.full((N_ARMS, 9), 0.17, np.float32)))
 
 
-# --- one arm -----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.filterwarnings("error::UserWarning")
 def test_gymnasium_s_checker_has_nothing_to_say(arm):
     check_env(arm)
@@ -89,9 +86,6 @@ def test_actions_of_another_shape_and_unknown_options_are_refused(arm, envs):
     for env in (arm, envs):
         with pytest.raises(ValueError, match="got options speed, expected none"):
             env.reset(options={"speed": 1})
-
-
-# --- many arms ---------------------------------------------------------------------------------------------
 
 
 def test_observations_stay_within_their_space(envs):
@@ -219,9 +213,6 @@ def test_make_vec_gives_the_vector_environment_with_the_registered_time_limit():
     envs = gymnasium.make_vec(ENV_ID, num_envs=2, config=CONFIG)
     assert type(envs) is SoftArmVectorEnv and envs.num_envs == 2
     assert envs._arms.episode_length == EPISODE_LENGTH
-
-
-# --- Stable-Baselines3 -------------------------------------------------------------------------------------
 
 
 @pytest.fixture

@@ -58,12 +58,6 @@ def play(*script):
     return start, history
 
 
-def test_arms_start_episodes_of_their_own():
-    start, _ = play([GO_ON] * 4)
-    assert len(set(np.asarray(start.obs[:, 0]))) == 4
-    np.testing.assert_array_equal(start.obs[:, 1], 0)
-
-
 def test_an_arm_that_goes_on_is_not_touched():
     start, [(state, after, outcome)] = play([GO_ON] * 3)
     np.testing.assert_array_equal(state.obs, np.stack([start.obs[:, 0], np.ones(3)], axis=1))

@@ -121,9 +121,6 @@ def angle_error_deg(a, b):
     return np.rad2deg(2.0 * np.arcsin(chord / np.sqrt(8.0)))
 
 
-# --- the truth -------------------------------------------------------------------------------------
-
-
 def test_the_truth_is_at_rest_and_a_good_part_of_its_chambers_saturated():
     reference, rest = references(N_MANY, seed=0), truth(N_MANY, seed=0)
     assert rest.residual.max() < 1e-6
@@ -142,9 +139,6 @@ def test_neither_time_step_nor_damping_nor_gains_move_the_rest():
         np.testing.assert_allclose(own.q, fast.q[k], atol=1e-5)
         np.testing.assert_allclose(own.tip_position_m, fast.tip_position_m[k], atol=2e-6)
         np.testing.assert_allclose(own.pressure_kpa, fast.pressure_kpa[k], atol=1e-2)
-
-
-# --- what is held against it -----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("engine", ["chain", "mjx"])

@@ -44,9 +44,6 @@ def names(count, name):
     return [name(k).name for k in range(count)]
 
 
-# --- the paper's figures ---------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("pressure_kpa, length_mm", [(LOW_KPA, 105.0), (FREE_KPA, 200.0), (HIGH_KPA, 235.0)])
 def test_one_section_has_the_paper_s_lengths(pressure_kpa, length_mm):
     length, angle = section_at_rest(pressure_kpa, pressure_kpa, pressure_kpa)
@@ -85,9 +82,6 @@ def test_springs_and_pressure_limits(model):
     np.testing.assert_array_equal(model.tendon_lengthspring[springs], 0.2)
     np.testing.assert_array_equal(model.actuator_ctrlrange, [[LOW_KPA, HIGH_KPA]] * 9)
     assert model.actuator_ctrllimited.all()
-
-
-# --- layout ----------------------------------------------------------------------------------------
 
 
 def test_every_object_has_its_name_and_place(model):
@@ -129,35 +123,6 @@ def test_the_free_arm_hangs_straight_with_its_chambers_around_it(spec, model):
                 )
 
 
-def test_a_tendon_feels_the_joints_of_its_own_section_alone(model):
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    straight = data.ten_length.copy()
-    data.qpos[12:24] = np.tile([0.01, 0.1, -0.2], 4)  # the four links of the middle section
-    mujoco.mj_forward(model, data)
-    moved = np.abs(data.ten_length - straight) > 1e-6
-    np.testing.assert_array_equal(moved, np.repeat([False, True, False], 6))
-
-
-def test_fields_with_one_number_per_chamber_reach_their_chamber(spec):
-    step = 1.0 + 0.01 * np.arange(9)
-    chambers = {
-        "stiffness_n_per_m": tuple(500.0 * step),
-        "length_offset_m": tuple(0.001 * step),
-        "area_m2": tuple(1.6e-3 * step),
-    }
-    model = build_model(spec.replace(chambers=chambers))
-    np.testing.assert_allclose(model.tendon_stiffness[0::2], 500.0 * step)
-    np.testing.assert_allclose(model.tendon_lengthspring[0::2, 0], 0.2 + 0.001 * step)
-    data = mujoco.MjData(model)
-    data.ctrl[:] = 10.0
-    mujoco.mj_forward(model, data)
-    np.testing.assert_allclose(data.actuator_force, 16.0 * step)  # 10 kPa on 16 cm2
-
-
-# --- forces ----------------------------------------------------------------------------------------
-
-
 def test_pressure_pushes_with_an_area_that_changes_with_length(spec, model):
     data = mujoco.MjData(model)
     data.ctrl[:] = HIGH_KPA
@@ -187,9 +152,6 @@ def test_a_section_is_as_stiff_as_its_backbone_chambers_and_springs_together(spe
 def test_stiffness_and_damping_are_linear_since_mjx_uses_no_higher_terms(model):
     for field in ("jnt_stiffnesspoly", "tendon_stiffnesspoly", "dof_dampingpoly", "tendon_dampingpoly"):
         assert not getattr(model, field).any(), field
-
-
-# --- pictures --------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

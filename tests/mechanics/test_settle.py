@@ -85,9 +85,6 @@ ARMS = {
 }
 
 
-# --- rest ------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("arm", ARMS)
 @pytest.mark.parametrize("solve, targets", [(settle, references), (settle_pressures, pressures)])
 def test_c_mujoco_finds_the_settled_arm_in_balance(arm, solve, targets):
@@ -173,9 +170,6 @@ def test_a_single_arm_settles_as_in_a_batch():
         assert {x.dtype for x in (alone.q, alone.residual, alone.tip_rotation)} == {np.dtype(np.float32)}
 
 
-# --- pressures -------------------------------------------------------------------------------------
-
-
 def test_pressures_beyond_the_limits_are_clipped_to_them():
     beyond = np.where(pressures() > -10.0, 60.0, -101.0)
     limit = np.clip(beyond, LOW_KPA, HIGH_KPA)
@@ -234,9 +228,6 @@ def test_half_a_kilogram_moves_held_arms_by_as_much_as_the_readme_says():
     assert anywhere.at_limit.any(axis=1).mean() > 0.5
 
 
-# --- failures --------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("solve, targets", [(settle, references), (settle_pressures, pressures)])
 def test_one_target_that_is_not_a_number_fails_alone(solve, targets):
     target = targets()
@@ -281,9 +272,6 @@ def test_an_impossible_arm_is_reported_not_raised(arm, solve, targets):
     assert (left[found.settled] < 2 * RESIDUAL_TOLERANCE).all()
     off = (left > RESIDUAL_TOLERANCE / 2) | (found.tracking_error_m > TRACKING_TOLERANCE_M / 2)
     assert off[~found.settled].all()
-
-
-# --- compilation -----------------------------------------------------------------------------------
 
 
 def test_new_numbers_need_no_new_compilation():

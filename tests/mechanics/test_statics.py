@@ -89,9 +89,6 @@ def pulled(data):
     return data.qfrc_passive + data.qfrc_actuator - data.qfrc_bias
 
 
-# --- against C MuJoCo ------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("structure", STRUCTURES, ids=str)
 def test_the_gradient_is_minus_c_mujoco_s_force(structure):
     spec = odd_arm(*structure)
@@ -140,9 +137,6 @@ def test_single_precision_is_far_finer_than_what_counts_as_settled():
         gradient = solved(spec, q, pressure, np.float32).gradient
         assert gradient.dtype == np.float32
         np.testing.assert_allclose(gradient, -force, atol=RESIDUAL_TOLERANCE / 5)
-
-
-# --- against the energy ----------------------------------------------------------------------------
 
 
 def energy(q, pressure_kpa, spec):
@@ -202,9 +196,6 @@ def test_gradient_and_hessian_are_the_energy_s_derivatives():
         found = solved(spec, q, pressure)
         np.testing.assert_allclose(found.gradient, gradient, atol=1e-11 * np.abs(gradient).max())
         np.testing.assert_allclose(found.hessian, hessian, atol=1e-11 * np.abs(hessian).max())
-
-
-# --- parameters ------------------------------------------------------------------------------------
 
 
 def test_parameters_are_the_specification_s_in_base_units():

@@ -41,9 +41,6 @@ def n_voxels(tip_mm):
     return len(np.unique(np.floor(tip_mm / VOXEL_MM), axis=0))
 
 
-# --- sampled poses ---------------------------------------------------------------------------------
-
-
 def test_every_sampled_pose_is_a_rest_of_c_mujoco():
     model = build_model(SPEC)
     data = mujoco.MjData(model)
@@ -84,9 +81,6 @@ def test_an_arm_that_never_settles_is_refused_with_the_count():
     spec = SPEC.replace(name="limp", chambers={"stiffness_n_per_m": 1.0}, backbone=limp)
     with pytest.raises(ValueError, match=r"the arm 'limp' settles at 0 of 128 .* expected at 64 or more"):
         sample_workspace(spec, 64, seed=0)
-
-
-# --- extremes --------------------------------------------------------------------------------------
 
 
 def test_many_pressures_are_settled_each_in_its_place():
@@ -137,9 +131,6 @@ def test_the_arm_covers_the_paper_s_workspace():
     assert found.spring_m.min() < shortest + 5e-3 and found.spring_m.max() > longest - 5e-3
 
 
-# --- outline ---------------------------------------------------------------------------------------
-
-
 def test_the_outline_of_a_notched_square_keeps_the_notch():
     x, y = np.meshgrid(np.arange(11.0), np.arange(11.0))
     points = np.stack([x, y], axis=-1)[~((x > 3) & (x < 7) & (y > 3))]  # a slot from the top, 3 to 7
@@ -154,9 +145,6 @@ def test_the_outline_of_a_notched_square_keeps_the_notch():
 @pytest.mark.parametrize("points", [np.zeros((2, 2)), np.stack([np.arange(5.0)] * 2, axis=1)])
 def test_points_on_a_line_have_no_outline(points):
     assert outline(points, gap=1.0).shape == (0, 2, 2)
-
-
-# --- command line ----------------------------------------------------------------------------------
 
 
 def run(*arguments):
