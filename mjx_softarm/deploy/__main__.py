@@ -19,7 +19,6 @@ from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.arms import open_arm
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.ending import FAULT, save_log
-from mjx_softarm.deploy.faults import RESPONSE
 from mjx_softarm.deploy.record import record
 from mjx_softarm.deploy.session import Run, follow
 from mjx_softarm.mechanics.excitation import random_pressures
@@ -84,7 +83,7 @@ def _run(
 
 def _summary(run: Run) -> None:
     for fault, count in run.counts().items():
-        print(f"fault: {fault.value}: {count} times, {RESPONSE[fault].value}")
+        print(f"fault: {fault.value}: {count} times, {fault.response.value}")
     if len(run.latency_s):
         median, high = 1e3 * np.quantile(run.latency_s, (0.5, 0.999))
         n = len(run.latency_s)
@@ -93,12 +92,7 @@ def _summary(run: Run) -> None:
 
 
 def _record(
-    arm: Arm,
-    out: Path,
-    spec: cli.SpecFile = None,
-    poses: int = 500,
-    seed: int = 0,
-    transients: bool = False,
+    arm: Arm, out: Path, spec: cli.SpecFile = None, poses: int = 500, seed: int = 0, transients: bool = False
 ) -> int:
     """Log static poses at random pressures, for calibration.
 
@@ -119,10 +113,11 @@ def _record(
     if not len(result.log):
         print(f"no pose was logged: {result.ending.cause or 'none came to rest'}", file=sys.stderr)
         return result.ending.status or FAULT
-    unseen = "; the arm has no motion capture, so tip and markers are missing"
-    unseen = unseen if result.log.tip_m is None else ""
+    unseen = "; the arm has no motion capture, so tip and markers are missing" * (result.log.tip_m is None)
     if result.ending.status != cli.ERROR:
-        print(f"log: {out}, {len(result.log)} rows, {result.n_poses} poses at rest{unseen}")
+        print(
+            f"log: {out}, {len(result.log)} rows, {result.n_poses} poses at rest{no_capture * (result.log.tip_m is None)}"
+        )
     if result.n_unsettled:
         print(f"{result.n_unsettled} poses did not come to rest in time")
     if result.ending.cause:

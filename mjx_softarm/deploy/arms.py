@@ -31,7 +31,13 @@ def open_arm(name: str) -> Any:
     if not module_name or not item:
         raise ArmError(f"--arm: got {name!r}, expected twin:SEED or package.module:Class")
     if module_name == "twin":
-        return _twin(item)
+        try:
+            return importlib.import_module(_TWIN).twin_of(item)
+        except ImportError as error:
+            text = f"the twin needs MuJoCo (pip install 'mjx-softarm[sim]'): {error}"
+            raise ArmError(f"--arm: {text}") from error
+        except ValueError as error:
+            raise ArmError(f"--arm: {error}") from error
     if (here := os.getcwd()) not in sys.path:
         sys.path.insert(0, here)
     try:
@@ -49,12 +55,3 @@ def open_arm(name: str) -> Any:
         return kind()
     except (OSError, TypeError, ValueError) as error:
         raise ArmError(f"--arm: {name} cannot be opened: {type(error).__name__}: {error}") from error
-
-
-def _twin(item: str) -> Any:
-    try:
-        return importlib.import_module(_TWIN).twin_of(item)
-    except ImportError as error:
-        raise ArmError(f"--arm: the twin needs MuJoCo (pip install 'mjx-softarm[sim]'): {error}") from error
-    except ValueError as error:
-        raise ArmError(f"--arm: {error}") from error

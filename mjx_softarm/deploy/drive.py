@@ -15,9 +15,9 @@ import numpy as np
 from mjx_softarm.control import Gains, pressures
 from mjx_softarm.deploy.arm_io import ArmIO
 from mjx_softarm.deploy.controller import WINDOW_S
-from mjx_softarm.deploy.faults import LOST_TICKS, SETTLE_TIMEOUT_S, still
+from mjx_softarm.deploy.faults import LOST_TICKS, SETTLE_TIMEOUT_S, read_lengths, still
 from mjx_softarm.deploy.link import VENT_KPA_PER_S, ArmFault, Link
-from mjx_softarm.sensing.sensors import Sensor, SensorFault
+from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.spec import ArmSpec
 
 RAMP_M_PER_S = 0.03  # of the reference that has furthest to go
@@ -111,18 +111,13 @@ class Drive:
     def _tick(self, law: Law) -> tuple[dict, np.ndarray | None, bool]:
         """Return the row, the spring lengths (n,) if none was lost, and whether the law has arrived."""
         begin_s = self.link.now()
-        n = len(self.link.pressure_kpa)
+        nothing = np.full(len(self.link.pressure_kpa), np.nan)
         readings = self.link.read()
         row = self.link.look(begin_s)
-        text = "no readings within the tick"
-        spring_m, lost = np.full(n, np.nan), True
-        if readings is not None:
-            reading = self.sensor.lengths(readings, np.nan)
-            spring_m, lost = reading.length_m, bool(np.any(reading.fault != SensorFault.OK.value))
-            text = self.sensor.describe_faults(readings, reading.fault).replace("\n", "; ")
-        row["readings"] = spring_m * np.nan if readings is None else readings
-        self.n_lost = self.n_lost + 1 if lost else 0
-        known_m = None if lost else spring_m
+        spring_m, lost, text = read_lengths(self.sensor, readings, nothing)
+        row["readings"] = nothing if readings is None else readings
+        self.n_lost = self.n_lost + 1 if lost.any() else 0
+        known_m = None if lost.any() else spring_m
         try:
             if self.n_lost >= LOST_TICKS:
                 raise ArmFault(f"readings lost in {self.n_lost} ticks in a row: {text}")

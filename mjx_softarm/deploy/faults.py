@@ -24,15 +24,14 @@ expected.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from enum import Enum
-from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 
 from mjx_softarm.control import Gains, saturated
 from mjx_softarm.sensing.estimator import SpringModel, expected_springs
+from mjx_softarm.sensing.sensors import Sensor, SensorFault
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION
 
 LOST_TICKS = 3
@@ -59,36 +58,26 @@ class Response(Enum):
 
 
 class Fault(Enum):
-    """Kinds of faults; the table stands in the module's docstring."""
+    """Kinds of faults and the response to each; the table stands in the module's docstring."""
 
-    LOST_READING = "lost reading"
-    SENSOR_LOST = "sensor lost"
-    SENSOR_STUCK = "sensor stuck"
-    CHAMBER_LOST = "chamber lost its pressure"
-    GOAL_OUTSIDE = "goal outside the workspace"
-    MISSED_DEADLINE = "missed deadline"
-    ARM_LATE = "arm late"
-    ARM_LOST = "arm lost"
-    NOT_SETTLED = "not settled"
-    SATURATED = "saturated"
-    EXTRAPOLATION = "extrapolation"
+    response: Response
 
+    LOST_READING = "lost reading", Response.GO_ON
+    SENSOR_LOST = "sensor lost", Response.VENT
+    SENSOR_STUCK = "sensor stuck", Response.VENT
+    CHAMBER_LOST = "chamber lost its pressure", Response.VENT
+    GOAL_OUTSIDE = "goal outside the workspace", Response.SKIP
+    MISSED_DEADLINE = "missed deadline", Response.GO_ON
+    ARM_LATE = "arm late", Response.VENT
+    ARM_LOST = "arm lost", Response.VENT
+    NOT_SETTLED = "not settled", Response.GO_ON
+    SATURATED = "saturated", Response.GO_ON
+    EXTRAPOLATION = "extrapolation", Response.GO_ON
 
-RESPONSE: Mapping[Fault, Response] = MappingProxyType(
-    {
-        Fault.LOST_READING: Response.GO_ON,
-        Fault.SENSOR_LOST: Response.VENT,
-        Fault.SENSOR_STUCK: Response.VENT,
-        Fault.CHAMBER_LOST: Response.VENT,
-        Fault.GOAL_OUTSIDE: Response.SKIP,
-        Fault.MISSED_DEADLINE: Response.GO_ON,
-        Fault.ARM_LATE: Response.VENT,
-        Fault.ARM_LOST: Response.VENT,
-        Fault.NOT_SETTLED: Response.GO_ON,
-        Fault.SATURATED: Response.GO_ON,
-        Fault.EXTRAPOLATION: Response.GO_ON,
-    }
-)
+    def __new__(cls, text: str, response: Response) -> Fault:
+        fault = object.__new__(cls)
+        fault._value_, fault.response = text, response
+        return fault
 
 
 class Event(NamedTuple):
@@ -99,10 +88,22 @@ class Event(NamedTuple):
 
     @property
     def response(self) -> Response:
-        return RESPONSE[self.fault]
+        return self.fault.response
 
     def __str__(self) -> str:
         return f"{self.fault.value}: {self.message} -> {self.response.value}"
+
+
+def read_lengths(
+    sensor: Sensor, readings: np.ndarray | None, last_m: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, str]:
+    """Return spring lengths (n,) [m], the last ones where a reading is lost; which are (n,); and why."""
+    if readings is None:
+        return last_m, np.ones(len(last_m), bool), "no readings within the tick"
+    reading = sensor.lengths(readings)
+    lost = reading.fault != SensorFault.OK.value
+    text = sensor.describe_faults(readings, reading.fault).replace("\n", "; ")
+    return np.where(lost, last_m, reading.length_m), lost, text
 
 
 def still(spring_m: np.ndarray) -> bool:

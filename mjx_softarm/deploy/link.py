@@ -45,11 +45,7 @@ class Link:
         self._simulated = hasattr(arm, "time_s")
         self._measures, self.sees = hasattr(arm, "pressures"), hasattr(arm, "motion_capture")
         # Shapes of what is logged; those of markers are the first frame's.
-        self._shapes: dict[str, tuple[int, ...]] = {
-            "pressure_kpa": (n,),
-            "tip_m": (3,),
-            "tip_quaternion": (4,),
-        }
+        self._shapes: dict[str, tuple[int, ...]] = {"tip_m": (3,), "tip_quaternion": (4,)}
         self._unsure = False  # whether the arm may have taken the last pressures, though it did not say so
         self.pressure_kpa = np.zeros(n)  # in force
 

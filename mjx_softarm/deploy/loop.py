@@ -25,7 +25,6 @@ from mjx_softarm.deploy.reachability import nearest
 from mjx_softarm.sensing.estimator import estimate_frame
 from mjx_softarm.sensing.pose import pose_from_frame
 from mjx_softarm.sensing.s2r import apply_correction, correction, distance, inputs
-from mjx_softarm.sensing.sensors import SensorFault
 
 _CHAMBER_WINDOWS = 2  # for so many a lost chamber must show without a break
 
@@ -39,11 +38,8 @@ def with_goal(controller: Controller, state: State, goal: np.ndarray) -> tuple[S
     pose, away = nearest(controller.reachable, goal, controller.policy.reward)
     if away > 1.0:
         near = ", ".join(f"{value:.0f}" for value in pose)
-        message = (
-            f"{text} is {away:.1f} times as far from the nearest reachable pose as a goal may be; "
-            f"that pose is {near} [mm, deg]"
-        )
-        return state, (Event(Fault.GOAL_OUTSIDE, message),)
+        far = f"{text} is {away:.1f} times as far from the nearest reachable pose as a goal may be"
+        return state, (Event(Fault.GOAL_OUTSIDE, f"{far}; that pose is {near} [mm, deg]"),)
     return state._replace(goal=goal, n_actions=0, n_ticks=0), ()
 
 
@@ -59,8 +55,8 @@ def step(controller: Controller, state: State, readings: np.ndarray | None, late
     Returns:
         The next state, whose pressures are to be written unless the tick says stop, and the tick.
     """
-    events = list(_deadline(controller, late, state.n_late + 1))
     state = state._replace(n_late=state.n_late + 1 if late else 0)
+    events = _deadline(controller, state.n_late)
     state, found = _sense(controller, state, readings)
     events += found
 
@@ -103,29 +99,18 @@ def _stops(events: list[Event]) -> bool:
     return any(event.response is Response.VENT for event in events)
 
 
-def _deadline(controller: Controller, late: bool, n_late: int) -> tuple[Event, ...]:
-    if not late:
-        return ()
-    limit = f"expected at most {1e3 * controller.dt_s:g} ms"
-    missed = Event(Fault.MISSED_DEADLINE, f"the last tick took too long, {limit}")
-    if n_late < faults.LATE_TICKS:
-        return (missed,)
-    return missed, Event(Fault.ARM_LATE, f"{n_late} ticks in a row took too long, {limit}")
+def _deadline(controller: Controller, n_late: int) -> list[Event]:
+    late = f"took too long, expected at most {1e3 * controller.dt_s:g} ms"
+    missed = [Event(Fault.MISSED_DEADLINE, f"the last tick {late}")] if n_late else []
+    if n_late >= faults.LATE_TICKS:
+        missed.append(Event(Fault.ARM_LATE, f"{n_late} ticks in a row {late}"))
+    return missed
 
 
 def _sense(controller: Controller, state: State, readings: np.ndarray | None) -> tuple[State, list[Event]]:
     """Return the state with new spring lengths, the last good one where there is none, and sensor faults."""
-    sensor = controller.policy.sensor
-    if readings is None:
-        lost, spring_m, events = np.ones(len(state.spring_m), bool), state.spring_m, []
-        events.append(Event(Fault.LOST_READING, "no readings within the tick"))
-    else:
-        reading = sensor.lengths(readings)
-        lost, events = reading.fault != SensorFault.OK.value, []
-        spring_m = np.where(lost, state.spring_m, reading.length_m)
-        if lost.any():
-            text = sensor.describe_faults(readings, reading.fault).replace("\n", "; ")
-            events.append(Event(Fault.LOST_READING, text))
+    spring_m, lost, text = faults.read_lengths(controller.policy.sensor, readings, state.spring_m)
+    events = [Event(Fault.LOST_READING, text)] if lost.any() else []
     window = controller.window
     state = state._replace(
         spring_m=spring_m,
@@ -159,14 +144,8 @@ def _check_chambers(controller: Controller, state: State, at_rest: bool) -> tupl
     if state.reference_m is None or not at_rest:
         return state._replace(n_suspect=np.zeros_like(state.n_suspect)), []
     policy = controller.policy
-    suspect = faults.lost_chambers(
-        policy.spring_model,
-        policy.gains,
-        state.pressure_kpa,
-        state.reference_m,
-        state.spring_m,
-        policy.tolerance_m,
-    )
+    seen = state.pressure_kpa, state.reference_m, state.spring_m
+    suspect = faults.lost_chambers(policy.spring_model, policy.gains, *seen, policy.tolerance_m)
     state = state._replace(n_suspect=np.where(suspect, state.n_suspect + 1, 0))
     lost = state.n_suspect >= _CHAMBER_WINDOWS * controller.window
     if not lost.any():
@@ -209,14 +188,9 @@ def _on_reference(controller: Controller, state: State) -> bool:
 
 def _unsettled(controller: Controller, state: State, settled: bool) -> list[Event]:
     """Return the faults of the springs as they stand before the next action."""
-    off_m = state.springs_m.mean(axis=0) - state.reference_m
-    mask = saturated(
-        state.pressure_kpa,
-        state.reference_m,
-        state.springs_m.mean(axis=0),
-        controller.policy.gains,
-        controller.policy.tolerance_m,
-    )
+    policy, mean_m = controller.policy, state.springs_m.mean(axis=0)
+    off_m = mean_m - state.reference_m
+    mask = saturated(state.pressure_kpa, state.reference_m, mean_m, policy.gains, policy.tolerance_m)
     events = []
     if not settled:
         worst = int(np.argmax(np.where(mask, 0.0, np.abs(off_m))))

@@ -16,7 +16,7 @@ import numpy as np
 from mjx_softarm.deploy.arm_io import ArmIO
 from mjx_softarm.deploy.controller import Controller, State, Tick, start
 from mjx_softarm.deploy.ending import DONE, FAULT, Ending, vent_at_end
-from mjx_softarm.deploy.faults import RESPONSE, Event, Fault, Response
+from mjx_softarm.deploy.faults import Event, Fault, Response
 from mjx_softarm.deploy.link import ArmFault, Link, Recorder
 from mjx_softarm.deploy.loop import believed, step, with_goal
 from mjx_softarm.logs.schema import Log
@@ -49,7 +49,7 @@ class Run(NamedTuple):
     @property
     def status(self) -> int:
         """Exit status: that of the ending, or of a fault if a goal was refused."""
-        refused = any(RESPONSE[fault] is not Response.GO_ON for fault in self.counts())
+        refused = any(event.response is not Response.GO_ON for event in self.events)
         return self.ending.status or (FAULT if refused else DONE)
 
 

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 from mjx_softarm.control import TOLERANCE_M
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.mechanics.pipe import CrossPipe
 from mjx_softarm.mechanics.workspace import HELD_OUT_SEED
+
+
+def _expect(config: Any, name: str, holds: bool, expected: str) -> None:
+    if not holds:
+        value = getattr(config, name)
+        raise ValueError(f"{type(config).__name__}.{name}: got {value!r}, expected {expected}")
 
 
 @dataclass(frozen=True)
@@ -20,12 +26,9 @@ class Randomisation:
     sensor_noise_mm: float = 0.0  # standard deviation of each spring's reading, fixed within an episode
 
     def __post_init__(self):
-        if self.payload_max_kg < 0:
-            raise ValueError(f"Randomisation.payload_max_kg: got {self.payload_max_kg}, expected >= 0")
-        if not 0 <= self.stiffness_spread < 1:
-            raise ValueError(f"Randomisation.stiffness_spread: got {self.stiffness_spread}, expected 0 to 1")
-        if self.sensor_noise_mm < 0:
-            raise ValueError(f"Randomisation.sensor_noise_mm: got {self.sensor_noise_mm}, expected >= 0")
+        _expect(self, "payload_max_kg", not self.payload_max_kg < 0, ">= 0")
+        _expect(self, "stiffness_spread", 0 <= self.stiffness_spread < 1, "0 to 1")
+        _expect(self, "sensor_noise_mm", not self.sensor_noise_mm < 0, ">= 0")
 
 
 @dataclass(frozen=True)
@@ -47,23 +50,13 @@ class EnvConfig:
 
     def __post_init__(self):
         for name, allowed in (("engine", ("chain", "mjx")), ("mode", ("quasistatic", "dynamic"))):
-            if getattr(self, name) not in allowed:
-                raise ValueError(f"EnvConfig.{name}: got {getattr(self, name)!r}, expected one of {allowed}")
+            _expect(self, name, getattr(self, name) in allowed, f"one of {allowed}")
+        cost, seed = "clearance_cost_per_mm", HELD_OUT_SEED
         if self.pipe_diameter_mm is not None:
             CrossPipe.of_mm(self.pipe_diameter_mm)  # raises
-        elif self.clearance_cost_per_mm:
-            raise ValueError(
-                f"EnvConfig.clearance_cost_per_mm: got {self.clearance_cost_per_mm}, expected 0 without a "
-                "pipe_diameter_mm"
-            )
-        if self.clearance_cost_per_mm < 0:
-            raise ValueError(
-                f"EnvConfig.clearance_cost_per_mm: got {self.clearance_cost_per_mm}, expected >= 0"
-            )
-        if self.n_poses < 1:
-            raise ValueError(f"EnvConfig.n_poses: got {self.n_poses}, expected at least 1")
-        if self.workspace_seed == HELD_OUT_SEED:
-            raise ValueError(
-                f"EnvConfig.workspace_seed: got {HELD_OUT_SEED}, expected another: "
-                f"{HELD_OUT_SEED} draws the goals of the evaluation"
-            )
+        else:
+            _expect(self, cost, not self.clearance_cost_per_mm, "0 without a pipe_diameter_mm")
+        _expect(self, cost, not self.clearance_cost_per_mm < 0, ">= 0")
+        _expect(self, "n_poses", self.n_poses >= 1, "at least 1")
+        other = f"another: {seed} draws the goals of the evaluation"
+        _expect(self, "workspace_seed", self.workspace_seed != seed, other)

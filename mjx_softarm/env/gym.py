@@ -100,16 +100,9 @@ class SoftArmVectorEnv(gymnasium.vector.VectorEnv):
 
     def _traced_step(self, state: State, actions: Array, key: Array) -> tuple[State, tuple]:
         following, after, outcome = self._arms.step(state, actions, key)
-        truncated = outcome.truncated | ~outcome.valid
+        ends = outcome.terminated, outcome.truncated | ~outcome.valid
         infos = _reset_info(following), _step_info(after)
-        return following, (
-            following.obs,
-            outcome.reward,
-            outcome.terminated,
-            truncated,
-            *infos,
-            outcome.final_obs,
-        )
+        return following, (following.obs, outcome.reward, *ends, *infos, outcome.final_obs)
 
 
 class SoftArmEnv(gymnasium.Env):
@@ -187,9 +180,8 @@ def as_sb3(envs: SoftArmVectorEnv) -> VecEnv:
             raise NotImplementedError(f"{attr_name}: the arms are one compiled program, set it on a new one")
 
         def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
-            raise NotImplementedError(
-                f"{method_name}: the arms are one compiled program, without methods each"
-            )
+            text = "the arms are one compiled program, without methods each"
+            raise NotImplementedError(f"{method_name}: {text}")
 
         def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
             return [False] * len(list(self._get_indices(indices)))
@@ -211,9 +203,7 @@ def spaces(env: ReachEnv) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
     return gymnasium.spaces.Box(low, high), gymnasium.spaces.Box(-1.0, 1.0, (env.action_size,), np.float32)
 
 
-@functools.lru_cache(maxsize=8)
-def _reach_env(arm: ArmSpec, config: EnvConfig) -> ReachEnv:
-    return ReachEnv(arm, config)
+_reach_env = functools.lru_cache(maxsize=8)(ReachEnv)
 
 
 @functools.lru_cache(maxsize=8)

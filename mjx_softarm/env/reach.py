@@ -211,15 +211,10 @@ class ReachEnv(Env):
         tolerance = 1e-3 * self.config.saturation_tolerance_mm
         reading = arm.spring_m + arm.sensor_offset_m
         saturated = control.saturated(arm.pressure_kpa, reference, reading, self.gains, tolerance) & valid
-        clearance_mm = self._clearance_mm(arm.motion.q, arm.pose)
+        blocked, clearance_mm = jnp.any(saturated), self._clearance_mm(arm.motion.q, arm.pose)
         terms: dict[str, Array]
         value, reached, terms = rewards.reward(
-            arm.pose,
-            arm.goal,
-            arm.n_steps,
-            jnp.any(saturated),
-            self.config.reward,
-            self.clearance_cost(clearance_mm),
+            arm.pose, arm.goal, arm.n_steps, blocked, self.config.reward, self.clearance_cost(clearance_mm)
         )
         metrics = {
             "tip_error_mm": jnp.linalg.norm(arm.pose[:3] - arm.goal[:3]),
@@ -235,26 +230,15 @@ class ReachEnv(Env):
             obs=self.observe(arm.pose, arm.goal),
             reward=jnp.where(valid, value, 0.0),
             done=(reached | ~valid).astype(jnp.float32),
-            metrics={**state.metrics, **metrics},
-            info={
-                **state.info,
-                "saturated": jnp.any(saturated),
-                "valid": valid,
-                "clearance_mm": clearance_mm,
-            },
+            metrics=state.metrics | metrics,
+            info=state.info | {"saturated": blocked, "valid": valid, "clearance_mm": clearance_mm},
         )
 
     def _move(self, arm: ArmState, reference_m: Array) -> tuple[Motion, Settled | Moved]:
         params = self.params_of(arm)
         if self.config.mode == "dynamic":
-            return advance(
-                with_params(self.model, params),
-                arm.motion,
-                reference_m,
-                self.gains,
-                self.config.dynamic_step_s,
-                1.0 / self.spec.control.rate_hz,
-            )
+            model, period_s = with_params(self.model, params), 1.0 / self.spec.control.rate_hz
+            return advance(model, arm.motion, reference_m, self.gains, self.config.dynamic_step_s, period_s)
         uses_mjx = self.config.engine == "mjx"
         kinematics = mjx_kinematics(self.model) if uses_mjx else chain_kinematics(params)
         end = settle(kinematics, params, reference_m)

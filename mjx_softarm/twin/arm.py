@@ -93,21 +93,18 @@ class Twin:
         self._base_m = self._parts.base_position_m
         self._base_rotation = rotation_matrix(self._parts.base_tilt_rad)
         self._steps = round(1.0 / (spec.control.rate_hz * self._model.opt.timestep))
-        self._gripper_length_m = spec.mass.gripper_length_m
         self.time_s = 0.0
         mujoco.mj_step1(self._model, self._data)
         self._start_losses()
-        chambers, n = self._parts.spec.chambers, spec.n_chambers
-        self._air = Pneumatics(
-            np.array(self._parts.spec.per_chamber(chambers.area_m2)),
-            np.array(self._parts.spec.per_chamber(chambers.area_slope_m)),
-            spec.geometry.section_length_m,
-            chamber_lengths(self._data),
-            self._model.opt.timestep,
+        chambers = self._parts.spec.chambers
+        area, slope = (
+            np.array(spec.per_chamber(value)) for value in (chambers.area_m2, chambers.area_slope_m)
         )
+        now_m, timestep_s = chamber_lengths(self._data), self._model.opt.timestep
+        self._air = Pneumatics(area, slope, spec.geometry.section_length_m, now_m, timestep_s)
         self.attach(payload_kg)
         for _ in range(round(REST_S * spec.control.rate_hz)):
-            self.write_pressures(np.zeros(n))
+            self.write_pressures(np.zeros(spec.n_chambers))
         self.time_s = 0.0
 
     def _start_losses(self) -> None:
@@ -133,15 +130,13 @@ class Twin:
         low, high = chambers.pressure_min_kpa, chambers.pressure_max_kpa
         command = np.asarray(pressure_kpa, float)
         if command.shape != self._air.pressure_kpa.shape:
-            raise ValueError(
-                f"pressure_kpa: got shape {command.shape}, expected {self._air.pressure_kpa.shape}"
-            )
+            expected = self._air.pressure_kpa.shape
+            raise ValueError(f"pressure_kpa: got shape {command.shape}, expected {expected}")
         within = (command >= low - PRESSURE_TOLERANCE_KPA) & (command <= high + PRESSURE_TOLERANCE_KPA)
         if not within.all():
             chamber = int(np.flatnonzero(~within)[0])
-            raise ValueError(
-                f"pressure_kpa[{chamber}]: got {command[chamber]:g}, expected {low:g} to {high:g} kPa"
-            )
+            text = f"got {command[chamber]:g}, expected {low:g} to {high:g} kPa"
+            raise ValueError(f"pressure_kpa[{chamber}]: {text}")
         self._air.command(np.clip(command, low, high))
         self._wall_force = WallForce(0.0, 0.0)
         for _ in range(self._steps):
@@ -181,7 +176,7 @@ class Twin:
             raise ValueError(f"payload_kg: got {payload_kg!r}, expected a number >= 0")
         body = self._model.body("payload").id
         self._model.body_mass[body] = payload_kg
-        self._model.body_inertia[body] = payload_kg * self._gripper_length_m**2 / 12
+        self._model.body_inertia[body] = payload_kg * self._parts.spec.mass.gripper_length_m**2 / 12
         mujoco.mj_setConst(self._model, mujoco.MjData(self._model))
         mujoco.mj_step1(self._model, self._data)
 
@@ -234,8 +229,7 @@ class Twin:
             f"{sensor.reading_name} noise [{sensor.unit}]": self._build.noise * sensor.noise,
             "pressure noise [kPa]": self._build.noise * PRESSURE_NOISE_KPA,
             "motion capture noise [mm, deg]": [
-                self._build.noise * 1e3 * CAPTURE_NOISE_M,
-                self._build.noise * CAPTURE_NOISE_DEG,
+                self._build.noise * value for value in (1e3 * CAPTURE_NOISE_M, CAPTURE_NOISE_DEG)
             ],
             "pump [L/min]": 6e4 * PUMP_M3_PER_S,
             "valve [ms]": 1e3 * VALVE_S,
