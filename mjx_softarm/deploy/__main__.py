@@ -115,9 +115,7 @@ def _record(
         return result.ending.status or FAULT
     unseen = "; the arm has no motion capture, so tip and markers are missing" * (result.log.tip_m is None)
     if result.ending.status != cli.ERROR:
-        print(
-            f"log: {out}, {len(result.log)} rows, {result.n_poses} poses at rest{no_capture * (result.log.tip_m is None)}"
-        )
+        print(f"log: {out}, {len(result.log)} rows, {result.n_poses} poses at rest{unseen}")
     if result.n_unsettled:
         print(f"{result.n_unsettled} poses did not come to rest in time")
     if result.ending.cause:
