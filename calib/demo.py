@@ -44,10 +44,9 @@ def planted_arm(spec: ArmSpec, seed: int) -> ArmSpec:
         return tuple(values * (1.0 + rng.uniform(-spread, spread, spec.n_chambers)))
 
     chambers, geometry, backbone = spec.chambers, spec.geometry, spec.backbone
-    offset_m = np.array(spec.per_chamber(chambers.length_offset_m)) + rng.uniform(
-        -4e-3, 4e-3, spec.n_chambers
-    )
-    delta_m = np.array(spec.per_chamber(spec.sensor.delta_m)) + rng.uniform(-5e-3, 5e-3, spec.n_chambers)
+    n = spec.n_chambers
+    offset_m = np.array(spec.per_chamber(chambers.length_offset_m)) + rng.uniform(-4e-3, 4e-3, n)
+    delta_m = np.array(spec.per_chamber(spec.sensor.delta_m)) + rng.uniform(-5e-3, 5e-3, n)
     return spec.replace(
         name=f"{spec.name} planted {seed}",
         structure={"links_per_section": spec.structure.links_per_section + 2},
@@ -86,14 +85,11 @@ def write_demo(folder: Path, spec: ArmSpec, seed: int) -> list[Path]:
     """
     folder.mkdir(parents=True, exist_ok=True)
     planted, rng = planted_arm(spec, seed), np.random.default_rng([seed, 1])
-    logs = {
-        "springs.csv": _springs(planted, rng),
-        "poses.csv": _poses(planted, rng),
-        "steps.csv": _steps(planted, rng),
-    }
-    for name, log in logs.items():
-        write_log(folder / name, log)
-    return [folder / name for name in logs]
+    files = []
+    for name, log in (("springs", _springs), ("poses", _poses), ("steps", _steps)):
+        files.append(folder / f"{name}.csv")
+        write_log(files[-1], log(planted, rng))
+    return files
 
 
 def _springs(arm: ArmSpec, rng: np.random.Generator) -> Log:
@@ -108,8 +104,8 @@ def _springs(arm: ArmSpec, rng: np.random.Generator) -> Log:
 
 def _poses(arm: ArmSpec, rng: np.random.Generator) -> Log:
     pressure_kpa = random_pressures(arm, N_POSES, rng)
-    model, data = _model(arm)
-    found = settle_many(arm, pressure_kpa)
+    model = build_model(arm)
+    data, found = mujoco.MjData(model), settle_many(arm, pressure_kpa)
     seen = [_look(arm, model, data, q) for q in found.q[found.settled]]
     pressure_kpa = np.asarray(found.pressure_kpa)[found.settled]
     return _measured(arm, POSE_S * np.arange(len(seen)), pressure_kpa, seen, rng)
@@ -118,8 +114,8 @@ def _poses(arm: ArmSpec, rng: np.random.Generator) -> Log:
 def _steps(arm: ArmSpec, rng: np.random.Generator) -> Log:
     """Simulate steps of the pressures with C MuJoCo."""
     low, high = arm.chambers.pressure_min_kpa, arm.chambers.pressure_max_kpa
-    model, data = _model(arm)
-    period_s = 1.0 / arm.control.rate_hz
+    model, period_s = build_model(arm), 1.0 / arm.control.rate_hz
+    data = mujoco.MjData(model)
     targets = rng.uniform(0.8 * low, 0.8 * high, (N_STEPS, arm.n_chambers))
     pressure_kpa, seen = np.repeat(targets, round(STEP_S / period_s), axis=0), []
     data.qpos[:] = settle_many(arm, targets[-1:]).q[0]
@@ -128,11 +124,6 @@ def _steps(arm: ArmSpec, rng: np.random.Generator) -> Log:
         data.ctrl[:] = row
         mujoco.mj_step(model, data, steps_per_period(period_s))
     return _measured(arm, period_s * np.arange(len(seen)), pressure_kpa, seen, rng)
-
-
-def _model(arm: ArmSpec) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    model = build_model(arm)
-    return model, mujoco.MjData(model)
 
 
 class _Seen(NamedTuple):

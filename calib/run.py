@@ -159,10 +159,8 @@ def _chambers(logs: Sequence[Log], spec: ArmSpec, seed: int) -> tuple[ArmSpec, S
 
 def _damping(logs: Sequence[Log], spec: ArmSpec, seed: int) -> tuple[ArmSpec, Section]:
     if not find_stretches(logs, spec):
-        needed = (
-            f"{NOT_FITTED} No log follows the moving arm; it decides how the arm swings, not where it rests."
-        )
-        return spec, Section("Damping", needed)
+        needed = "No log follows the moving arm; it decides how the arm swings, not where it rests."
+        return spec, Section("Damping", f"{NOT_FITTED} {needed}")
     fit = calibrate_damping(logs, spec, seed)
     return fit.spec, sections.damping(fit)
 
@@ -178,10 +176,8 @@ def _s2r(logs: Sequence[Log], spec: ArmSpec, seed: int) -> tuple[S2R | None, Sec
         what = f"pressures, spring lengths and tip poses, a payload of {spec.mass.payload_kg:g} kg"
         rows |= {"poses at which the simulated arm finds no rest": poses.n - n_settled}
         needed = f"Not fitted: {_few(MIN_S2R_POSES, what, n_settled, rows)}"
-        warnings = (
-            f"policies will be trained on simulated poses: log {MIN_S2R_POSES} poses at rest or more",
-        )
-        return None, Section("Sim-to-real network", needed, warnings=warnings)
+        remedy = f"policies will be trained on simulated poses: log {MIN_S2R_POSES} poses at rest or more"
+        return None, Section("Sim-to-real network", needed, warnings=(remedy,))
     real = pose_from_frame(poses.tip_m, poses.tip_rotation)
     pose, spring_m, real = (x[simulated.valid] for x in (simulated.pose, simulated.spring_m, real))
     fit = fit_s2r(pose, spring_m, real, seed)

@@ -21,7 +21,7 @@ import numpy as np
 from calib.errors import FitError
 from calib.fit.blocks import held_out_blocks
 from calib.fit.equilibrium import simulate
-from calib.fit.leastsquares import Problem, Solution, fit, principal
+from calib.fit.leastsquares import NOT_CONVERGED, Problem, Solution, fit, principal
 from calib.read.static_poses import HOLD_KPA, StaticPoses, find_static_poses
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.spec import ArmSpec
@@ -115,19 +115,20 @@ def calibrate_chambers(logs: Log | Sequence[Log], spec: ArmSpec, seed: int = 0) 
             f"chambers: got {poses.n} poses at rest, expected {MIN_POSES} or more; "
             f"rows of the logs: {row_uses}"
         )
-    poses = poses._replace(pressure_kpa=_held_or_changing(poses.pressure_kpa))
+    held = np.ptp(poses.pressure_kpa, axis=0) < HOLD_KPA  # their noise would pass for changes
+    poses = poses._replace(pressure_kpa=np.where(held, poses.pressure_kpa.mean(axis=0), poses.pressure_kpa))
     held_out = held_out_blocks(poses.n, HELD_OUT_SHARE, HELD_OUT_BLOCK, seed)
     fitted = poses.take(~held_out)
-    solution = fit(lambda x: simulate(spec, fitted, x)[:2], _problem(spec.n_chambers))
+    prior = np.append(np.repeat(PRIOR, spec.n_chambers), BENDING_PRIOR)
+    group = np.repeat([0, 1, 2], [3, 3, spec.n_chambers])
+    problem = Problem(prior, group, np.array(SCALE), np.array(MIN_SCALE))
+    solution = fit(lambda x: simulate(spec, fitted, x)[:2], problem)
     before, _, _ = simulate(spec, poses, np.zeros_like(solution.x))
     after, _, chamber_m = simulate(spec, poses, solution.x)
     calibrated = _calibrated(spec, solution.x, poses)
-    widths, directions = principal(
-        solution, np.append(np.repeat(TOLERANCE, spec.n_chambers), BENDING_TOLERANCE)
-    )
-    weak = tuple(
-        _describe(width, vector) for width, vector in zip(widths, directions.T, strict=True) if width > 1.0
-    )
+    tolerance = np.append(np.repeat(TOLERANCE, spec.n_chambers), BENDING_TOLERANCE)
+    widths, directions = principal(solution, tolerance)
+    weak = tuple(_describe(w, vector) for w, vector in zip(widths, directions.T, strict=True) if w > 1.0)
     found = ChamberFit(
         spec=calibrated,
         half_width_95=_half_widths(spec, solution),
@@ -146,21 +147,6 @@ def calibrate_chambers(logs: Log | Sequence[Log], spec: ArmSpec, seed: int = 0) 
         warnings=(),
     )
     return dataclasses.replace(found, warnings=_warnings(found, spec, solution))
-
-
-def _held_or_changing(pressure_kpa: np.ndarray) -> np.ndarray:
-    """Return pressures (n, n_chambers) without the noise of held ones, which would pass for changes."""
-    held = np.ptp(pressure_kpa, axis=0) < HOLD_KPA
-    return np.where(held, np.mean(pressure_kpa, axis=0), pressure_kpa)
-
-
-def _problem(n_chambers: int) -> Problem:
-    return Problem(
-        prior=np.append(np.repeat(PRIOR, n_chambers), BENDING_PRIOR),
-        group=np.repeat([0, 1, 2], [3, 3, n_chambers]),
-        scale=np.array(SCALE),
-        min_scale=np.array(MIN_SCALE),
-    )
 
 
 def _calibrated(spec: ArmSpec, x: np.ndarray, poses: StaticPoses) -> ArmSpec:
@@ -215,26 +201,19 @@ def _describe(width: float, vector: np.ndarray) -> str:
 def _errors(error: np.ndarray) -> Errors:
     settled = error[~np.isinf(error[:, 0])].reshape(-1, error.shape[1])
     if len(settled) == 0:
-        nan = float("nan")
-        return Errors(0, nan, nan, nan, nan, None)
+        return Errors(0, np.nan, np.nan, np.nan, np.nan, None)
     tip_mm = 1e3 * np.linalg.norm(settled[:, :3], axis=1)
     turn_deg = np.degrees(np.arcsin(np.minimum(np.linalg.norm(settled[:, 3:6], axis=1), 1.0)))
     spring = settled[:, 6:]
     measured = np.isfinite(spring).any()
-    return Errors(
-        len(settled),
-        float(tip_mm.mean()),
-        float(np.percentile(tip_mm, 95)),
-        float(turn_deg.mean()),
-        float(np.percentile(turn_deg, 95)),
-        1e3 * float(np.sqrt(np.nanmean(spring**2))) if measured else None,
-    )
+    tip_95_mm, turn_95_deg = float(np.percentile(tip_mm, 95)), float(np.percentile(turn_deg, 95))
+    spring_rms_mm = 1e3 * float(np.sqrt(np.nanmean(spring**2))) if measured else None
+    tip, turn = (float(tip_mm.mean()), tip_95_mm), (float(turn_deg.mean()), turn_95_deg)
+    return Errors(len(settled), *tip, *turn, spring_rms_mm)
 
 
 def _warnings(found: ChamberFit, spec: ArmSpec, solution: Solution) -> tuple[str, ...]:
-    said = []
-    if not solution.converged:
-        said.append("the fit did not converge: start from a specification closer to the arm (--spec)")
+    said = [] if solution.converged else [NOT_CONVERGED]
     if found.poses.n < ENOUGH_POSES:
         said.append(f"got {found.poses.n} poses at rest, expected {ENOUGH_POSES} or more: log more poses")
     if n_unsettled := np.count_nonzero(np.isnan(found.tip_error_mm)):

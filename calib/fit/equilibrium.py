@@ -67,7 +67,9 @@ def residuals(x: Array, params: ArmParams, measured: Measured) -> tuple[Array, A
     arm = with_numbers(x, params._replace(tool_mass_kg=masses))
     with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
         kinematics = chain_kinematics(arm)
-        found = settle_pressures(kinematics, arm.without_pressure_limits(), measured.pressure_kpa)
+        found = settle_pressures(
+            kinematics, arm.without_pressure_limits(), jnp.asarray(measured.pressure_kpa)
+        )
         chamber_m = tendons(kinematics(jax.lax.stop_gradient(found.q)), arm.chamber_site_m).length
         turn = measured.tip_rotation.T @ found.tip_rotation
     angle = 0.5 * jnp.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])

@@ -72,14 +72,11 @@ def fit_network(x: np.ndarray, y: np.ndarray, seed: int, config: NetworkConfig |
     config = config or NetworkConfig()
     _check(x, y)
     n = len(x)
-    stopping = [
-        held_out_blocks(n, config.stop_share, block_rows(n), 1_000 * seed + k)
-        for k in range(config.n_members)
-    ]
+    seeds = (1_000 * seed + k for k in range(config.n_members))
+    stopping = [held_out_blocks(n, config.stop_share, block_rows(n), of) for of in seeds]
     bounds = _bounds(x, y)
-    z = (2.0 * (x - bounds["input_low"]) / (bounds["input_high"] - bounds["input_low"]) - 1.0).astype(
-        np.float32
-    )
+    low, high = bounds["input_low"], bounds["input_high"]
+    z = (2.0 * (x - low) / (high - low) - 1.0).astype(np.float32)
     linear = _line(z, y)
     left = y - z @ linear
     centre, spread = left.mean(axis=0), left.std(axis=0)
@@ -108,16 +105,12 @@ def fit_network(x: np.ndarray, y: np.ndarray, seed: int, config: NetworkConfig |
 
 def _check(x: np.ndarray, y: np.ndarray) -> None:
     if x.ndim != 2 or y.ndim != 2 or len(x) != len(y) or len(x) < 2:
-        raise FitError(
-            f"network: got tables {x.shape} and {y.shape}, expected as many rows in both, 2 or more"
-        )
+        raise FitError(f"network: got tables {x.shape} and {y.shape}, expected as many rows, 2 or more")
     for name, table in (("inputs", x), ("outputs", y)):
         if not np.isfinite(table).all():
             row, column = np.argwhere(~np.isfinite(table))[0]
-            value = table[row, column]
-            raise FitError(
-                f"network: {name}, row {row}, column {column}: got {value}, expected a finite number"
-            )
+            where = f"{name}, row {row}, column {column}"
+            raise FitError(f"network: {where}: got {table[row, column]}, expected a finite number")
 
 
 def _bounds(x: np.ndarray, y: np.ndarray) -> dict[str, np.ndarray]:
@@ -125,14 +118,9 @@ def _bounds(x: np.ndarray, y: np.ndarray) -> dict[str, np.ndarray]:
     low, high = (f(x, axis=0).astype(np.float32) for f in (np.min, np.max))
     narrow = high - low <= 1e-5 * np.maximum(np.abs(low), np.abs(high))
     margin = np.where(narrow, np.maximum(1e-3 * np.abs(low), 1e-3), 0.0).astype(np.float32)
-    outputs = (f(y, axis=0).astype(np.float32) for f in (np.min, np.max))
-    return dict(
-        zip(
-            ("input_low", "input_high", "output_low", "output_high"),
-            (low - margin, high + margin, *outputs),
-            strict=True,
-        )
-    )
+    output_low, output_high = (f(y, axis=0).astype(np.float32) for f in (np.min, np.max))
+    inputs = {"input_low": low - margin, "input_high": high + margin}
+    return inputs | {"output_low": output_low, "output_high": output_high}
 
 
 def _equally_many(rows: list[np.ndarray]) -> np.ndarray:

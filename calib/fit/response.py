@@ -209,9 +209,8 @@ def _fit(starts: Array, steps: Array, drive: Array, target: Array, keep: Array):
 def _lines(pressure_kpa: np.ndarray, length_m: np.ndarray, keep: np.ndarray) -> np.ndarray:
     """Return predictions (m, n) of a straight line in all pressures, for each row of keep (m, n)."""
     features = np.column_stack([pressure_kpa, np.ones(len(length_m))])
-    return np.stack(
-        [features @ np.linalg.lstsq(features[kept], length_m[kept], rcond=None)[0] for kept in keep]
-    )
+    slopes = (np.linalg.lstsq(features[kept], length_m[kept], rcond=None)[0] for kept in keep)
+    return np.stack([features @ slope for slope in slopes])
 
 
 def _rms(error: np.ndarray) -> float:
@@ -225,17 +224,16 @@ def _check(time_s: np.ndarray, pressure_kpa: np.ndarray, length_m: np.ndarray) -
             f"response: got pressures {np.shape(pressure_kpa)} and lengths {np.shape(length_m)}, "
             f"expected ({n}, n_chambers) and ({n},) for {n} times"
         )
-    for name, bad, expected in (
-        ("time_s", np.flatnonzero(~(np.diff(time_s) > 0)) + 1, "a time after the row before"),
-        ("pressure_kpa", np.flatnonzero(~np.isfinite(pressure_kpa).all(axis=1)), "finite numbers"),
+    later = np.append(True, np.diff(time_s) > 0)
+    for name, values, good, expected in (
+        ("time_s", time_s, later, "a time after the row before"),
+        ("pressure_kpa", pressure_kpa, np.isfinite(pressure_kpa).all(axis=1), "finite numbers"),
     ):
-        if len(bad):
-            value = (time_s if name == "time_s" else pressure_kpa)[bad[0]]
-            raise ValueError(f"response: {name} row {bad[0]}: got {value}, expected {expected}")
-    if np.isfinite(length_m).sum() < 20:
-        raise ValueError(
-            f"response: length_m: got {np.isfinite(length_m).sum()} measured lengths, expected 20 or more"
-        )
+        if not good.all():
+            row = int(np.argmin(good))
+            raise ValueError(f"response: {name} row {row}: got {values[row]}, expected {expected}")
+    if (n_known := np.isfinite(length_m).sum()) < 20:
+        raise ValueError(f"response: length_m: got {n_known} measured lengths, expected 20 or more")
     if np.ptp(np.mean(pressure_kpa, axis=1)) == 0 or np.nanstd(length_m) == 0:
         raise ValueError("response: got pressures or lengths that never change, expected at least one step")
 
@@ -252,12 +250,9 @@ def _warnings(fit: ResponseFit, steps_s: np.ndarray) -> tuple[str, ...]:
             "the straight line predicts held-out rows better: use it, or log more steps of the pressures"
         )
     for name, tau in (("fill", fit.response.tau_fill_s), ("vent", fit.response.tau_vent_s)):
+        constant = f"time constant to {name}, {tau:.3g} s, is"
         if not 1.5 * TAU_RANGE_S[0] < tau < TAU_RANGE_S[1] / 1.5:
-            found.append(
-                f"time constant to {name}, {tau:.3g} s, is at the edge of what is tried: log longer steps"
-            )
+            found.append(f"{constant} at the edge of what is tried: log longer steps")
         elif tau < np.median(steps_s):
-            found.append(
-                f"time constant to {name}, {tau:.3g} s, is shorter than the time between rows: log faster"
-            )
+            found.append(f"{constant} shorter than the time between rows: log faster")
     return tuple(found)

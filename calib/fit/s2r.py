@@ -87,9 +87,10 @@ def simulate_poses(spec: ArmSpec, reference_m: np.ndarray) -> SimulatedPoses:
         expected = f"(n, {spec.n_chambers}) with n at least 1"
         raise FitError(f"spring lengths: got an array {reference.shape}, expected {expected}")
     if not np.isfinite(reference).all():
-        row, column = np.argwhere(~np.isfinite(reference))[0]
-        value = reference[row, column]
-        raise FitError(f"spring lengths: row {row}, spring {column}: got {value}, expected a finite number")
+        row, k = np.argwhere(~np.isfinite(reference))[0]
+        raise FitError(
+            f"spring lengths: row {row}, spring {k}: got {reference[row, k]}, expected a finite number"
+        )
     n, params = len(reference), ArmParams.from_spec(spec)
     limit = np.full(spec.n_chambers, PRESSURE_LIMIT_KPA, np.float32)
     params = params._replace(pressure_min_kpa=-limit, pressure_max_kpa=limit)
@@ -137,10 +138,9 @@ def fit_s2r(
     fit = fit_network(x[~held_out], y[~held_out], seed, config)
     corrected = correct(fit.network, pose_sim, spring_m)
     errors = {
-        "in_sample": pose_errors(corrected[~held_out], pose_real[~held_out]),
-        "test": pose_errors(corrected[held_out], pose_real[held_out]),
-        "in_sample_uncorrected": pose_errors(pose_sim[~held_out], pose_real[~held_out]),
-        "test_uncorrected": pose_errors(pose_sim[held_out], pose_real[held_out]),
+        name + which: pose_errors(pose[rows], pose_real[rows])
+        for which, pose in (("", corrected), ("_uncorrected", pose_sim))
+        for name, rows in (("in_sample", ~held_out), ("test", held_out))
     }
     flagged = extrapolation(fit.network, pose_sim[held_out], spring_m[held_out]) > 1.0
     turn_deg = 2.0 * np.rad2deg(np.arctan(np.linalg.norm(y[:, 3:], axis=1)))
@@ -151,7 +151,7 @@ def fit_s2r(
         stop_epoch=tuple(map(int, fit.stop_epoch)),
         n_epochs=fit.n_epochs,
         flagged_share=float(flagged.mean()),
-        warnings=tuple(_warnings(n, turn_deg, **errors)),
+        warnings=tuple(_warnings(n, turn_deg, errors)),
     )
 
 
@@ -164,14 +164,7 @@ def pose_errors(pose: np.ndarray, real: np.ndarray) -> PoseErrors:
     return PoseErrors(*(float(value) for pair in both for value in pair))
 
 
-def _warnings(
-    n: int,
-    turn_deg: np.ndarray,
-    in_sample: PoseErrors,
-    test: PoseErrors,
-    in_sample_uncorrected: PoseErrors,
-    test_uncorrected: PoseErrors,
-) -> list[str]:
+def _warnings(n: int, turn_deg: np.ndarray, errors: dict[str, PoseErrors]) -> list[str]:
     found = []
     if n < MIN_ROWS:
         found.append(f"got {n} rows, expected {MIN_ROWS} or more for a network: log more poses")
@@ -183,15 +176,13 @@ def _warnings(
         )
     for name, unit in (("translation_mean_mm", "mm"), ("rotation_mean_deg", "deg")):
         what = name.split("_")[0]
-        got, without, seen = (getattr(e, name) for e in (test, test_uncorrected, in_sample))
+        got, without, seen = (getattr(errors[e], name) for e in ("test", "test_uncorrected", "in_sample"))
         if got >= without:
             found.append(
                 f"{what}: {got:.3g} {unit} on held-out rows, no better than {without:.3g} without: "
                 "log more poses, or train without the network"
             )
         if got > MAX_HELD_OUT_RATIO * seen:
-            found.append(
-                f"{what}: {got:.3g} {unit} on held-out rows, far more than {seen:.3g} in training: "
-                "log more poses"
-            )
+            far = f"far more than {seen:.3g} in training"
+            found.append(f"{what}: {got:.3g} {unit} on held-out rows, {far}: log more poses")
     return found

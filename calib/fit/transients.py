@@ -22,7 +22,7 @@ import numpy as np
 
 from calib.errors import FitError
 from calib.fit.blocks import held_out_blocks
-from calib.fit.leastsquares import Problem, fit
+from calib.fit.leastsquares import NOT_CONVERGED, Problem, fit
 from calib.read.static_poses import HOLD_KPA
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mechanics.mjcf import build_model, steps_per_period
@@ -216,11 +216,7 @@ def _rms_mm(error: np.ndarray) -> float:
 
 
 def _warnings(done: DampingFit, widths: np.ndarray, converged: bool) -> tuple[str, ...]:
-    said = (
-        []
-        if converged
-        else ["the fit did not converge: start from a specification closer to the arm (--spec)"]
-    )
+    said = [] if converged else [NOT_CONVERGED]
     for name, width in zip(done.half_width_95, widths, strict=True):
         if width > KNOWN:
             said.append(f"{name} is known to {100 * width:.0f} % only: log larger steps of the pressures")

@@ -59,12 +59,10 @@ def read_asu(path: str | Path) -> tuple[AsuLog, list[Finding]]:
     Raises:
         LogError: the file is not such a log; the message names line and column.
     """
-    pressures = [
-        f"{kind}{k}" for half in (0, 3) for kind in ("desired", "measured") for k in range(half, half + 3)
-    ]
-    bodies = [
-        f"{body}_{axis}" for body in range(N_BODIES) for axis in ("x", "y", "z", "qx", "qy", "qz", "qw")
-    ]
+    kinds = ("desired", "measured")
+    pressures = [f"{kind}{k}" for half in (0, 3) for kind in kinds for k in range(half, half + 3)]
+    axes = ("x", "y", "z", "qx", "qy", "qz", "qw")
+    bodies = [f"{body}_{axis}" for body in range(N_BODIES) for axis in axes]
     names = ["time", *pressures, *(f"wire{k}" for k in range(4)), *bodies]
     table = _finite(str(path), read_table(path, names))
     pressure_kpa = UNITS["pressure"]["psi"] * table.values[:, 1:13].reshape(-1, 2, 2, 3)
@@ -74,9 +72,8 @@ def read_asu(path: str | Path) -> tuple[AsuLog, list[Finding]]:
     findings = _stale(str(path), table.row, stale, np.any(stale, axis=1)) + findings
     late = checks.late_rows(table.values[:, 0])
     if late.any():
-        findings.append(
-            _finding(str(path), table.row[late], "time", "repeated or going back, expected increasing")
-        )
+        problem = "repeated or going back, expected increasing"
+        findings.append(_finding(str(path), table.row[late], "time", problem))
     log = AsuLog(
         source=str(path),
         row=table.row,
@@ -106,12 +103,10 @@ def read_trunk(path: str | Path) -> tuple[TrunkLog, list[Finding]]:
     needed = [*positions, *motors, *(quaternions if turns else [])]
     missing = [name for name in needed if name not in table.names]
     if missing:
-        raise LogError(
-            [Finding(str(path), (1, 1), ", ".join(missing), "missing, expected a log of the trunk")]
-        )
-    table = _finite(
-        str(path), Table(tuple(needed), table.values[:, [table.names.index(n) for n in needed]], table.row)
-    )
+        problem = "missing, expected a log of the trunk"
+        raise LogError([Finding(str(path), (1, 1), ", ".join(missing), problem)])
+    values = table.values[:, [table.names.index(name) for name in needed]]
+    table = _finite(str(path), Table(tuple(needed), values, table.row))
     position_m = table.values[:, :9].reshape(-1, N_BODIES, 3)
     stale = np.stack([checks.stale_rows(position_m[:, k]) for k in range(N_BODIES)], axis=1)
     findings = _stale(str(path), table.row, stale, stale[:, -1])
@@ -119,9 +114,8 @@ def read_trunk(path: str | Path) -> tuple[TrunkLog, list[Finding]]:
     if turns:
         quaternion, found = _orientation(str(path), table.row, table.values[:, 15:].reshape(-1, N_BODIES, 4))
         findings += found
-    return TrunkLog(
-        str(path), table.row, table.values[:, 9:15], position_m, quaternion, ~stale[:, -1]
-    ), findings
+    log = TrunkLog(str(path), table.row, table.values[:, 9:15], position_m, quaternion, ~stale[:, -1])
+    return log, findings
 
 
 def _finding(file: str, rows: np.ndarray, column: str, problem: str, n_dropped: int = 0) -> Finding:
@@ -141,14 +135,9 @@ def _finite(file: str, table: Table) -> Table:
 
 
 def _stale(file: str, row: np.ndarray, stale: np.ndarray, dropped: np.ndarray) -> list[Finding]:
+    problem = "equal to the row before, expected motion capture renewed in each row"
     return [
-        _finding(
-            file,
-            row[stale[:, k]],
-            f"body {k}",
-            "equal to the row before, expected motion capture renewed in each row",
-            n_dropped=int(np.count_nonzero(stale[:, k] & dropped)),
-        )
+        _finding(file, row[stale[:, k]], f"body {k}", problem, int(np.count_nonzero(stale[:, k] & dropped)))
         for k in np.flatnonzero(stale.any(axis=0))
     ]
 

@@ -134,7 +134,6 @@ def schema_text(n_chambers: int = 9, n_markers: int = 3) -> str:
         units = list(UNITS[first.kind])
         bounds = PLAUSIBLE[quantity(first)]
         steps = " between rows" if first.kind == "time" else ""
-        lines.append(
-            f"{names:<30} {', '.join(units):<26} {bounds.low:g} to {bounds.high:g} {units[0]}{steps}"
-        )
+        plausible = f"{bounds.low:g} to {bounds.high:g} {units[0]}{steps}"
+        lines.append(f"{names:<30} {', '.join(units):<26} {plausible}")
     return "\n".join(lines)

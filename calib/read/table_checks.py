@@ -57,6 +57,7 @@ class Fault(NamedTuple):
     problem: str
     mask: np.ndarray  # (n,)
     drops: bool = True
+    counted: bool = True  # the finding begins with the number of rows
 
 
 def clean(matrix: LogMatrix) -> tuple[LogMatrix, list[Finding]]:
@@ -75,7 +76,7 @@ def clean(matrix: LogMatrix) -> tuple[LogMatrix, list[Finding]]:
     if quaternion := matrix.indices("tip_quaternion"):
         matrix.values[:, quaternion], flipped = checks.same_sign(matrix.values[:, quaternion])
         if flipped.any():
-            problem = f"{np.count_nonzero(flipped)} x sign flipped, repaired; expected neighbours of one sign"
+            problem = "sign flipped, repaired; expected neighbours of one sign"
             findings.append(_finding(matrix, Fault("tip_qw..qz", problem, flipped, drops=False)))
     return matrix, findings
 
@@ -89,14 +90,15 @@ def _gaps(matrix: LogMatrix) -> Iterator[Fault]:
     gap[ordered] = checks.gap_rows(time_s[ordered])
     if gap.any():
         steps_s = np.diff(time_s[ordered])
-        got = f"{np.count_nonzero(gap)} x gap, longest {steps_s.max():.4g} s"
-        yield Fault("time", f"{got}, expected steps near {np.median(steps_s):.4g} s", gap, drops=False)
+        expected = f"expected steps near {np.median(steps_s):.4g} s"
+        yield Fault("time", f"gap, longest {steps_s.max():.4g} s, {expected}", gap, drops=False)
 
 
 def _finding(matrix: LogMatrix, fault: Fault) -> Finding:
     rows = matrix.row[fault.mask]
+    problem = f"{len(rows)} x {fault.problem}" if fault.counted else fault.problem
     n_dropped = len(rows) if fault.drops else 0
-    return Finding(matrix.file, (int(rows[0]), int(rows[-1])), fault.column, fault.problem, n_dropped)
+    return Finding(matrix.file, (int(rows[0]), int(rows[-1])), fault.column, problem, n_dropped)
 
 
 def implausible(matrix: LogMatrix) -> list[Finding]:
@@ -127,7 +129,7 @@ def _implausible_column(column: Column, values: np.ndarray) -> str:
     if not np.isfinite(values).any():
         return "no number in the whole column"
     got = _typical(np.diff(values) if column.kind == "time" else values)
-    low, high = _bounds(column)
+    low, high, *_ = PLAUSIBLE[quantity(column)]
     by_hand = column.kind == "time" and len(values) < BY_HAND_ROWS and low <= got <= BY_HAND_S
     if low <= got <= high or by_hand:
         return ""
@@ -137,11 +139,6 @@ def _implausible_column(column: Column, values: np.ndarray) -> str:
     hint = f" (plausible in {' or '.join(fitting)})" if fitting else ""
     expected = f"{low / factor:.4g} to {high / factor:.4g} {column.unit}"
     return f"{what} {got / factor:.4g} {column.unit}{hint}, expected {expected}: wrong unit or column"
-
-
-def _bounds(column: Column) -> tuple[float, float]:
-    plausible = PLAUSIBLE[quantity(column)]
-    return plausible.low, plausible.high
 
 
 def quantity(column: Column) -> str:
@@ -173,50 +170,47 @@ def _single_rows(matrix: LogMatrix) -> Iterator[Fault]:
     for k, column in enumerate(matrix.columns):
         values = matrix.values[:, k]
         finite = np.isfinite(values)
-        if not finite.all():
-            got = f"{np.count_nonzero(~finite)} x NaN or inf"
-            yield Fault(column.name, f"{got}, expected numbers", ~finite)
+        yield Fault(column.name, "NaN or inf, expected numbers", ~finite)
         if column.kind == "time":
             late = np.zeros(len(values), bool)
             late[finite] = checks.late_rows(values[finite])
-            got = f"{np.count_nonzero(late)} x repeated or going back"
-            yield Fault("time", f"{got}, expected times that increase", late)
+            yield Fault("time", "repeated or going back, expected times that increase", late)
             continue
-        low, high = _bounds(column)
+        low, high, *_ = PLAUSIBLE[quantity(column)]
         outside = finite & ((values < low) | (values > high))
         if outside.any():
-            got = f"{np.count_nonzero(outside)} x out of range, first {_shown(column, values[outside][0])}"
-            expected = f"{_shown(column, low)} to {_shown(column, high)}"
-            yield Fault(column.name, f"{got}, expected {expected}", outside)
+            expected = f"expected {_shown(column, low)} to {_shown(column, high)}"
+            first = _shown(column, values[outside][0])
+            yield Fault(column.name, f"out of range, first {first}, {expected}", outside)
 
 
 def _renewal(matrix: LogMatrix) -> Iterator[Fault]:
     everywhere = np.ones(len(matrix.row), bool)
     for k in matrix.indices("readings", "spring_m", "pressure_kpa"):
         if np.ptp(matrix.values[:, k]) == 0.0:
-            problem = (
-                f"always {_shown(matrix.columns[k], matrix.values[0, k])}, expected a sensor that changes"
-            )
-            yield Fault(matrix.columns[k].name, problem, everywhere, drops=False)
+            always = _shown(matrix.columns[k], matrix.values[0, k])
+            problem = f"always {always}, expected a sensor that changes"
+            yield Fault(matrix.columns[k].name, problem, everywhere, drops=False, counted=False)
     for name, axes in matrix.bodies():
         body = matrix.values[:, axes]
         if checks.moves(body):
             # A quaternion that goes on shows that the tip was seen, though it is where it was.
             seen = matrix.indices("tip_quaternion") if name == "tip" else []
             stale = checks.stale_rows(matrix.values[:, [*axes, *seen]])
-            got = f"{np.count_nonzero(stale)} x equal to the row before"
-            yield Fault(f"{name}_x..z", f"{got}, expected motion capture renewed in each row", stale)
+            problem = "equal to the row before, expected motion capture renewed in each row"
+            yield Fault(f"{name}_x..z", problem, stale)
         elif name == "tip":
-            yield Fault("tip_x..z", "never moves by 1 mm, expected a tip that moves", everywhere, drops=False)
+            problem = "never moves by 1 mm, expected a tip that moves"
+            yield Fault("tip_x..z", problem, everywhere, drops=False, counted=False)
     if quaternion := matrix.indices("tip_quaternion"):
         values = matrix.values[:, quaternion]
         wrong = checks.not_unit_rows(values)
-        got = f"{np.count_nonzero(wrong)} x length not 1, first {np.linalg.norm(values[wrong][:1]):.4g}"
-        yield Fault("tip_qw..qz", f"{got}, expected unit quaternions", wrong)
+        first = f"{np.linalg.norm(values[wrong][:1]):.4g}"
+        yield Fault("tip_qw..qz", f"length not 1, first {first}, expected unit quaternions", wrong)
         turned = np.zeros(len(wrong), bool)
         turned[~wrong] = checks.turned_rows(values[~wrong])
-        got = f"{np.count_nonzero(turned)} x turned by 180 degrees between jumps"
-        yield Fault("tip_qw..qz", f"{got}, expected a continuous orientation", turned)
+        problem = "turned by 180 degrees between jumps, expected a continuous orientation"
+        yield Fault("tip_qw..qz", problem, turned)
 
 
 def _neighbours(matrix: LogMatrix) -> Iterator[Fault]:
@@ -224,7 +218,5 @@ def _neighbours(matrix: LogMatrix) -> Iterator[Fault]:
         column = matrix.columns[k]
         outlier = checks.outlier_rows(matrix.values[:, k], PLAUSIBLE[quantity(column)].spike)
         if outlier.any():
-            got = (
-                f"{np.count_nonzero(outlier)} x outlier, first {_shown(column, matrix.values[outlier, k][0])}"
-            )
-            yield Fault(column.name, f"{got}, expected a value like its neighbours", outlier)
+            first = _shown(column, matrix.values[outlier, k][0])
+            yield Fault(column.name, f"outlier, first {first}, expected a value like its neighbours", outlier)

@@ -10,9 +10,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from calib.fit.chambers import BENDING, ChamberFit
+from calib.fit.chambers import BENDING, ChamberFit, Errors
 from calib.fit.markers import MarkerLimits
-from calib.fit.s2r import S2RFit
+from calib.fit.s2r import PoseErrors, S2RFit
 from calib.fit.sensors import SpringFit
 from calib.fit.transients import DampingFit
 from calib.report.page import Section, Table
@@ -67,13 +67,10 @@ def chambers(fit: ChamberFit) -> Section:
     head = ("", *(text for _, title, _ in units for text in (title, "+-")))
     bending = spec.backbone.bending_stiffness_nm_per_rad
     backbone = Table(("", "value", "+-"), ((BENDING, bending, float(fit.half_width_95[BENDING])),))
-    errors = (
-        ("held-out poses, before", fit.held_out_before),
-        ("held-out poses, calibrated", fit.held_out),
-        ("poses of the fit, calibrated", fit.in_sample),
-    )
-    error_rows = tuple(
-        (name, e.n, e.translation_mean_mm, e.translation_95_mm, e.rotation_mean_deg) for name, e in errors
+    errors = _errors(
+        ("held-out poses, before", fit.held_out_before.n, fit.held_out_before),
+        ("held-out poses, calibrated", fit.held_out.n, fit.held_out),
+        ("poses of the fit, calibrated", fit.in_sample.n, fit.in_sample),
     )
     figure, axes = _figure()
     bins = np.linspace(0.0, np.nanquantile(fit.tip_error_mm, 0.99), _BINS).tolist()
@@ -86,7 +83,7 @@ def chambers(fit: ChamberFit) -> Section:
         f"{fit.poses.n} poses at rest: simulated at the measured pressures against the measured tip and "
         "springs. Rest lengths are relative to the section's. Intervals are 95 %. "
         f"Rows of the logs: {row_uses}.",
-        (Table(head, tuple(rows)), backbone, Table(_ERROR_HEAD, error_rows)),
+        (Table(head, tuple(rows)), backbone, errors),
         fit.warnings,
         _plain(fit, "spec", "poses", "is_held_out", "tip_error_mm", "chamber_m")
         | {"values": values | {BENDING: bending}},
@@ -101,11 +98,9 @@ def with_markers(section: Section, limits: MarkerLimits) -> Section:
     axes.plot(*2 * [1e3 * np.array([limits.length_min_m, limits.length_max_m])], "k:", lw=1)
     axes.set(xlabel="chambers, simulated [mm]", ylabel="from the curves through the markers [mm]")
     lengths = ("chambers at the most bent poses", 1e3 * limits.length_min_m, 1e3 * limits.length_max_m)
-    simulated = (
-        "simulated at the same poses",
-        *(float(1e3 * f(limits.simulated_m)) for f in (np.min, np.max)),
-    )
-    table = Table(("", "shortest [mm]", "longest [mm]"), (lengths, simulated))
+    simulated = (float(1e3 * f(limits.simulated_m)) for f in (np.min, np.max))
+    rows = (lengths, ("simulated at the same poses", *simulated))
+    table = Table(("", "shortest [mm]", "longest [mm]"), rows)
     title = f"chambers at the {len(limits.pose)} most bent poses"
     return dataclasses.replace(
         section,
@@ -142,13 +137,10 @@ def s2r(fit: S2RFit, pose: np.ndarray, spring_m: np.ndarray, real: np.ndarray, n
 
     `n_unsettled` other poses took no part, as the simulated arm did not settle at their spring lengths.
     """
-    errors = tuple(
-        (name, n, e.translation_mean_mm, e.translation_95_mm, e.rotation_mean_deg)
-        for name, n, e in (
-            ("held-out poses, simulated", int(fit.held_out.sum()), fit.test_uncorrected),
-            ("held-out poses, corrected", int(fit.held_out.sum()), fit.test),
-            ("poses of the fit, corrected", int((~fit.held_out).sum()), fit.in_sample),
-        )
+    errors = _errors(
+        ("held-out poses, simulated", int(fit.held_out.sum()), fit.test_uncorrected),
+        ("held-out poses, corrected", int(fit.held_out.sum()), fit.test),
+        ("poses of the fit, corrected", int((~fit.held_out).sum()), fit.in_sample),
     )
     corrected = correct(fit.s2r, pose, spring_m)
     figure, axes = _figure()
@@ -162,24 +154,25 @@ def s2r(fit: S2RFit, pose: np.ndarray, spring_m: np.ndarray, real: np.ndarray, n
         f"the network learns the error of its tip. It flags {100 * fit.flagged_share:.1f} % of the held-out "
         "poses as far from those it learned from. "
         f"At {n_unsettled} other poses the simulation found no rest; they took no part.",
-        (Table(_ERROR_HEAD, errors),),
+        (errors,),
         fit.warnings,
         _plain(fit, "s2r", "held_out") | {"n_unsettled": n_unsettled},
         (("held-out poses with and without the network", figure),),
     )
 
 
-_ERROR_HEAD = ("tip", "poses", "mean [mm]", "95 % [mm]", "mean turn [deg]")
+def _errors(*rows: tuple[str, int, Errors | PoseErrors]) -> Table:
+    head = ("tip", "poses", "mean [mm]", "95 % [mm]", "mean turn [deg]")
+    shown = (
+        (what, n, e.translation_mean_mm, e.translation_95_mm, e.rotation_mean_deg) for what, n, e in rows
+    )
+    return Table(head, tuple(shown))
 
 
 def _plain(fit: Any, *left_out: str) -> dict[str, Any]:
     """Return the fields of a fit as JSON has them."""
-    fields = fit._asdict() if hasattr(fit, "_asdict") else _fields(fit)
+    fields = fit._asdict() if hasattr(fit, "_asdict") else vars(fit)
     return {name: _json(value) for name, value in fields.items() if name not in (*left_out, "warnings")}
-
-
-def _fields(fit: Any) -> dict[str, Any]:
-    return {item.name: getattr(fit, item.name) for item in dataclasses.fields(fit)}
 
 
 def _json(value: Any) -> Any:
