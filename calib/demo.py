@@ -85,11 +85,11 @@ def write_demo(folder: Path, spec: ArmSpec, seed: int) -> list[Path]:
     """
     folder.mkdir(parents=True, exist_ok=True)
     planted, rng = planted_arm(spec, seed), np.random.default_rng([seed, 1])
-    files = []
-    for name, log in (("springs", _springs), ("poses", _poses), ("steps", _steps)):
-        files.append(folder / f"{name}.csv")
-        write_log(files[-1], log(planted, rng))
-    return files
+    makers = {"springs.csv": _springs, "poses.csv": _poses, "steps.csv": _steps}
+    logs = {name: make(planted, rng) for name, make in makers.items()}
+    for name, log in logs.items():
+        write_log(folder / name, log)
+    return [folder / name for name in logs]
 
 
 def _springs(arm: ArmSpec, rng: np.random.Generator) -> Log:

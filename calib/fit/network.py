@@ -105,7 +105,8 @@ def fit_network(x: np.ndarray, y: np.ndarray, seed: int, config: NetworkConfig |
 
 def _check(x: np.ndarray, y: np.ndarray) -> None:
     if x.ndim != 2 or y.ndim != 2 or len(x) != len(y) or len(x) < 2:
-        raise FitError(f"network: got tables {x.shape} and {y.shape}, expected as many rows, 2 or more")
+        tables = f"{x.shape} and {y.shape}"
+        raise FitError(f"network: got tables {tables}, expected as many rows in both, 2 or more")
     for name, table in (("inputs", x), ("outputs", y)):
         if not np.isfinite(table).all():
             row, column = np.argwhere(~np.isfinite(table))[0]
