@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.optimize import least_squares
 
+NOT_CONVERGED = "the fit did not converge: start from a specification closer to the arm (--spec)"
 ROUNDS = ("linear", "huber", "huber")  # losses: the first with the given scales, the others with those found
 # Of a round: evaluations of the model; relative changes of the loss and of x, of which single precision gives
 # no less; SciPy's third test depends on the units of x.

@@ -225,7 +225,8 @@ def _descend(x: Array, y: Array, share: Array, fit_share: bool) -> Array:
 
         start = (p, optimiser.init(p), 0, jnp.inf)
         goal = 1e-10 * jnp.min(scale)
-        return jax.lax.while_loop(lambda c: (c[2] < ITERATIONS) & (c[3] > goal), iterate, start)[0]
+        end = jax.lax.while_loop(lambda c: (c[2] < ITERATIONS) & (c[3] > goal), iterate, start)
+        return jnp.asarray(end[0])
 
     def next_round(count: Array, p: Array) -> Array:
         size = jnp.nanmedian(jnp.where(known, jnp.abs(residual(p)), jnp.nan), axis=0)

@@ -148,10 +148,8 @@ def test_signals_vent_and_save(command, name, request):
     """Sent in the drive, and again in the venting, where they change nothing."""
     number = getattr(signal, name)
     # A program that was started in the background may have been told to ignore SIGINT.
-    request.addfinalizer(
-        lambda handler=signal.getsignal(signal.SIGINT): signal.signal(signal.SIGINT, handler)
-    )
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+    ours = signal.signal(signal.SIGINT, signal.default_int_handler)
+    request.addfinalizer(lambda: signal.signal(signal.SIGINT, ours))
     before = signal.getsignal(number)
     calls = range(20, 21) if number == signal.SIGINT else (20, 25)
 

@@ -141,7 +141,7 @@ class Run:
             raise RunError(f"{path}: not the folder of a run: {file}: {error.strerror}") from error
         except (ValueError, KeyError, TypeError) as error:
             raise RunError(
-                f"{file}: got a config of another version: {error}; expected this version's"
+                f"{file}: got a damaged config or another version's: {error}; expected this version's"
             ) from error
         s2r = load_s2r(path / S2R_FILE, spec.n_chambers) if has_s2r else None
         return cls(path, config, spec, s2r)

@@ -13,7 +13,7 @@ def test_a_folder_that_is_no_run_is_named(tmp_path):
     with pytest.raises(RunError, match="not the folder of a run: .*config.json: No such file"):
         Run.open(tmp_path)
     (tmp_path / "config.json").write_text("{")
-    with pytest.raises(RunError, match="config.json: got a config of another version"):
+    with pytest.raises(RunError, match="config.json: got a damaged config or another version's"):
         Run.open(tmp_path)
     with pytest.raises(RunError, match="got a folder with a run, .*--resume"):
         Run.create(tmp_path, CONFIG, ArmSpec.default())
