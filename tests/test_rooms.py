@@ -17,6 +17,7 @@ LEVELS = (
     ("mdp",),
     ("env", "policy"),
     ("deploy", "twin"),
+    ("export",),
     ("__init__", "__main__"),
     ("calib",),
     ("train",),
@@ -27,7 +28,7 @@ LEVEL = {room: level for level, rooms in enumerate(LEVELS) for room in rooms}
 JOBS = ("calib", "train", "benchmarks")
 HEAVY = {"jax", "jaxlib", "mujoco"}
 # Functions that need JAX import it where they are called; the room itself is imported without.
-LIGHT = ("deploy", "policy", "sensing", "mdp", "logs")
+LIGHT = ("export", "deploy", "policy", "sensing", "mdp", "logs")
 
 
 def imported(tree, path):

@@ -29,6 +29,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mjx_softarm._support.xp import Array, array_namespace
 from mjx_softarm.control import Gains, saturated
 from mjx_softarm.sensing.estimator import SpringModel, expected_springs
 from mjx_softarm.sensing.sensors import Sensor, SensorFault
@@ -106,10 +107,29 @@ def read_lengths(
     return np.where(lost, last_m, reading.length_m), lost, text
 
 
-def still(spring_m: np.ndarray) -> bool:
+def still(spring_m: Array) -> Array:
     """Return whether springs came to rest over a window (ticks, n) [m]: its halves have the same mean."""
-    half = len(spring_m) // 2
-    return bool(np.all(np.abs(spring_m[-half:].mean(axis=0) - spring_m[:half].mean(axis=0)) < STILL_M))
+    xp, half = array_namespace(spring_m), len(spring_m) // 2
+    moved_m = xp.mean(spring_m[-half:], axis=0) - xp.mean(spring_m[:half], axis=0)  # (n,)
+    return xp.all(xp.abs(moved_m) < STILL_M)
+
+
+def on_reference(
+    springs_m: Array, reference_m: Array, pressure_kpa: Array, gains: Gains, tolerance_m: float
+) -> Array:
+    """Return whether each spring is on its reference, in the mean of a window, or its chamber at a limit.
+
+    Args:
+        springs_m (ticks, n) [m]: lengths over the window.
+        reference_m (n,) [m]: asked of the springs.
+        pressure_kpa (n,) [kPa]: commanded.
+        gains: with the limits.
+        tolerance_m: greatest error of a spring that counts as on its reference.
+    """
+    xp = array_namespace(springs_m, reference_m, pressure_kpa)
+    off_m = xp.abs(xp.mean(springs_m, axis=0) - reference_m)
+    at_limit = (pressure_kpa <= gains.pressure_min_kpa) | (pressure_kpa >= gains.pressure_max_kpa)
+    return xp.all((off_m < tolerance_m) | at_limit)
 
 
 def stuck_springs(spring_m: np.ndarray, pressure_kpa: np.ndarray) -> np.ndarray:
@@ -119,14 +139,27 @@ def stuck_springs(spring_m: np.ndarray, pressure_kpa: np.ndarray) -> np.ndarray:
         spring_m (ticks, n) [m]: readings of the last ticks.
         pressure_kpa (ticks, n) [kPa]: pressures commanded in them.
     """
-    moved_m = np.ptp(spring_m, axis=0)  # (n,)
-    suspects = moved_m < STUCK_RANGE_M
-    if not suspects.any():
-        return suspects
-    by_section = moved_m.reshape(-1, N_CHAMBERS_PER_SECTION)
-    near_m = np.repeat(by_section.max(axis=1), N_CHAMBERS_PER_SECTION)
-    asked = (np.ptp(pressure_kpa, axis=0) > STUCK_PRESSURE_KPA) | (near_m > STUCK_NEIGHBOUR_M)
-    return suspects & asked
+    suspects = stock_still(spring_m)
+    return suspects & asked_to_move(spring_m, pressure_kpa) if suspects.any() else suspects
+
+
+def stock_still(spring_m: Array) -> Array:
+    """Return which springs (n,) did not move, nor show any noise, over a window (ticks, n) [m]."""
+    return _range(spring_m) < STUCK_RANGE_M
+
+
+def asked_to_move(spring_m: Array, pressure_kpa: Array) -> Array:
+    """Return which springs (n,) should have moved: the chamber was driven or the section moved."""
+    xp, moved_m = array_namespace(spring_m), _range(spring_m)
+    section_m = xp.max(moved_m.reshape(-1, N_CHAMBERS_PER_SECTION), axis=1)[:, None]  # (n_sections, 1)
+    near_m = (section_m + np.zeros(N_CHAMBERS_PER_SECTION)).reshape(-1)  # (n,)
+    return (_range(pressure_kpa) > STUCK_PRESSURE_KPA) | (near_m > STUCK_NEIGHBOUR_M)
+
+
+def _range(values: Array) -> Array:
+    """Return how far values (ticks, n) went apart."""
+    xp = array_namespace(values)
+    return xp.max(values, axis=0) - xp.min(values, axis=0)
 
 
 def lost_chambers(
@@ -152,14 +185,18 @@ def lost_chambers(
         tolerance_m: greatest error of a spring that counts as on its reference.
     """
     suspects = saturated(pressure_kpa, reference_m, spring_m, gains, tolerance_m)
-    if not suspects.any():
-        return suspects
-    without = np.where(np.eye(len(pressure_kpa), dtype=bool), 0.0, pressure_kpa)  # (n, n)
-    expected_m, *absent_m = expected_springs(model, np.vstack([pressure_kpa, without]))
-    effect_m = np.array(absent_m) - expected_m  # (n chambers, n springs)
-    deviation_m = spring_m - expected_m  # (n,)
-    share = effect_m @ deviation_m / np.sum(effect_m**2, axis=1)  # (n,)
+    return suspects & as_without(model, pressure_kpa, spring_m) if suspects.any() else suspects
+
+
+def as_without(model: SpringModel, pressure_kpa: Array, spring_m: Array) -> Array:
+    """Return for which chambers (n,) the springs lie as they would without that chamber's pressure."""
+    xp, own = array_namespace(pressure_kpa, spring_m), np.eye(len(pressure_kpa), dtype=bool)
+    pressures_kpa = xp.concat([pressure_kpa[None], xp.where(own, 0.0, pressure_kpa)])  # (1 + n, n)
+    springs_m = expected_springs(model, pressures_kpa)
+    effect_m = springs_m[1:] - springs_m[0]  # (n chambers, n springs)
+    deviation_m = spring_m - springs_m[0]  # (n,)
+    share = effect_m @ deviation_m / xp.sum(effect_m**2, axis=1)  # (n,)
     left_m = deviation_m - share[:, None] * effect_m
-    explained = 1.0 - np.sum(left_m**2, axis=1) / np.sum(deviation_m**2)
-    own_m = np.abs(share * np.diagonal(effect_m))
-    return suspects & (share > LOST_SHARE) & (explained > EXPLAINED_SHARE) & (own_m > LOST_EFFECT_M)
+    explained = 1.0 - xp.sum(left_m**2, axis=1) / xp.sum(deviation_m**2)
+    own_m = xp.abs(share * xp.sum(xp.where(own, effect_m, 0.0), axis=1))
+    return (share > LOST_SHARE) & (explained > EXPLAINED_SHARE) & (own_m > LOST_EFFECT_M)

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from mjx_softarm._support.xp import Array, array_namespace
 from mjx_softarm.deploy.arm_io import ArmIO
 from mjx_softarm.deploy.faults import LATE_TICKS
 from mjx_softarm.logs.schema import Log
@@ -24,6 +25,12 @@ from mjx_softarm.sensing.sensors import Sensor
 
 VENT_KPA_PER_S = 20.0
 VENT_TRIES = 10  # failed writes in a row after which the arm counts as not vented
+
+
+def vented(pressure_kpa: Array, dt_s: float) -> Array:
+    """Return pressures (n,) [kPa] a tick further along the ramp to zero."""
+    step_kpa = VENT_KPA_PER_S * dt_s
+    return pressure_kpa - array_namespace(pressure_kpa).clip(pressure_kpa, -step_kpa, step_kpa)
 
 
 class ArmFault(Exception):
@@ -122,11 +129,11 @@ class Link:
         Raises:
             ArmFault: the pumps took no pressures for VENT_TRIES ticks.
         """
-        step_kpa, n_failed = VENT_KPA_PER_S * self._dt_s, 0
+        n_failed = 0
         while self._unsure or self.pressure_kpa.any():
             begin_s = time.monotonic()
             try:
-                in_time = self.write(self.pressure_kpa - np.clip(self.pressure_kpa, -step_kpa, step_kpa))
+                in_time = self.write(vented(self.pressure_kpa, self._dt_s))
                 why = "not in time"
             except ArmFault as error:
                 in_time, why = False, str(error)

@@ -22,11 +22,9 @@ from mjx_softarm.deploy import faults
 from mjx_softarm.deploy.controller import Controller, State, Tick
 from mjx_softarm.deploy.faults import Event, Fault, Response
 from mjx_softarm.deploy.reachability import nearest
-from mjx_softarm.sensing.estimator import estimate_frame
-from mjx_softarm.sensing.pose import pose_from_frame
-from mjx_softarm.sensing.s2r import apply_correction, correction, distance, inputs
+from mjx_softarm.policy.runtime import tip_pose
 
-_CHAMBER_WINDOWS = 2  # for so many a lost chamber must show without a break
+CHAMBER_WINDOWS = 2  # for so many a lost chamber must show without a break
 
 
 def with_goal(controller: Controller, state: State, goal: np.ndarray) -> tuple[State, tuple[Event, ...]]:
@@ -84,15 +82,10 @@ def believed(controller: Controller, spring_m: np.ndarray) -> tuple[np.ndarray, 
     Returns:
         Pose (6,) [mm, deg], NaN where a length is; `s2r.extrapolation` of it, 0 without a network.
     """
-    policy = controller.policy
     if np.isnan(spring_m).any():
         return np.full(6, np.nan), 0.0
-    frame, spring_m = estimate_frame(policy.estimator, spring_m), spring_m.astype(np.float32)
-    if policy.s2r is None:
-        return pose_from_frame(*frame), 0.0
-    x = inputs(frame, spring_m)
-    pose = pose_from_frame(*apply_correction(frame, correction(policy.s2r, x)))
-    return pose, float(distance(policy.s2r, x) / policy.s2r.limit)
+    pose, away = tip_pose(controller.policy, spring_m)
+    return pose, float(away)
 
 
 def _stops(events: list[Event]) -> bool:
@@ -137,7 +130,7 @@ def _sense(controller: Controller, state: State, readings: np.ndarray | None) ->
 def _at_rest(controller: Controller, state: State) -> bool:
     """Return whether nothing has moved for a window; one after the last action, at the earliest."""
     full = len(state.springs_m) == controller.window and state.n_ticks >= controller.window
-    return full and faults.still(state.springs_m)
+    return full and bool(faults.still(state.springs_m))
 
 
 def _check_chambers(controller: Controller, state: State, at_rest: bool) -> tuple[State, list[Event]]:
@@ -147,7 +140,7 @@ def _check_chambers(controller: Controller, state: State, at_rest: bool) -> tupl
     seen = state.pressure_kpa, state.reference_m, state.spring_m
     suspect = faults.lost_chambers(policy.spring_model, policy.gains, *seen, policy.tolerance_m)
     state = state._replace(n_suspect=np.where(suspect, state.n_suspect + 1, 0))
-    lost = state.n_suspect >= _CHAMBER_WINDOWS * controller.window
+    lost = state.n_suspect >= CHAMBER_WINDOWS * controller.window
     if not lost.any():
         return state, []
     kpa = ", ".join(f"{value:.1f}" for value in state.pressure_kpa[lost])
@@ -159,7 +152,8 @@ def _go(controller: Controller, state: State, at_rest: bool) -> tuple[State, lis
     """Act if the goal is new or the springs have settled; arrive when they have after the last action."""
     events: list[Event] = []
     if state.n_actions > 0:
-        settled = at_rest and _on_reference(controller, state)
+        policy, seen = controller.policy, (state.springs_m, state.reference_m, state.pressure_kpa)
+        settled = at_rest and bool(faults.on_reference(*seen, policy.gains, policy.tolerance_m))
         if not settled and state.n_ticks * controller.dt_s < faults.SETTLE_TIMEOUT_S:
             return state, [], False
         if state.n_suspect.any() and settled:  # whether a chamber is lost comes first
@@ -175,15 +169,6 @@ def _go(controller: Controller, state: State, at_rest: bool) -> tuple[State, lis
     reference_m = controller.plan(pose, state.goal, state.spring_m)
     state = state._replace(reference_m=reference_m, n_actions=state.n_actions + 1, n_ticks=0)
     return state, events, False
-
-
-def _on_reference(controller: Controller, state: State) -> bool:
-    """Return whether each spring is on its reference, in the window's mean, or its chamber at a limit."""
-    gains = controller.policy.gains
-    off_m = np.abs(state.springs_m.mean(axis=0) - state.reference_m)
-    kpa = state.pressure_kpa
-    at_limit = (kpa <= gains.pressure_min_kpa) | (kpa >= gains.pressure_max_kpa)
-    return bool(np.all((off_m < controller.policy.tolerance_m) | at_limit))
 
 
 def _unsettled(controller: Controller, state: State, settled: bool) -> list[Event]:

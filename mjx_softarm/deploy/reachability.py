@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mjx_softarm._support.xp import Array, array_namespace
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.sensing.pose import frame_from_pose
 
@@ -39,16 +40,22 @@ class Reachable(NamedTuple):
 
 def nearest(reachable: Reachable, goal: np.ndarray, reward: RewardConfig) -> tuple[np.ndarray, float]:
     """Return the reachable pose (6,) [mm, deg] nearest to a goal (6,), and its distance over the limit."""
-    position_m, rotation = frame_from_pose(np.asarray(goal, np.float64))
-    position = 1e3 * reward.weight_per_mm * position_m
-    distance = _distances(reachable, position[None], rotation.reshape(1, 9))[0]  # (m,)
+    distance = distances(reachable, np.asarray(goal, np.float64), reward)
     index = int(np.argmin(distance))
-    return reachable.pose[index], float(distance[index] / reachable.limit)
+    return reachable.pose[index], float(distance[index])
 
 
-def _distances(reachable: Reachable, position: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+def distances(reachable: Reachable, goal: Array, reward: RewardConfig) -> Array:
+    """Return the distances (m,) of a goal (6,) [mm, deg] to the reachable poses, over the limit."""
+    position_m, rotation = frame_from_pose(goal)
+    position = 1e3 * reward.weight_per_mm * position_m
+    return _distances(reachable, position[None], rotation.reshape(1, 9))[0] / reachable.limit
+
+
+def _distances(reachable: Reachable, position: Array, rotation: Array) -> Array:
     """Return distances (k, m) of positions (k, 3) and rotations (k, 9) to the poses, turns by their angle."""
-    squares = np.sum(position**2, axis=1)[:, None] + np.sum(reachable.position**2, axis=1)
-    away = np.maximum(squares - 2.0 * position @ reachable.position.T, 0.0)
-    cos = np.clip(0.5 * (rotation @ reachable.rotation.T - 1.0), -1.0, 1.0)
-    return np.sqrt(away + (reachable.weight_per_deg * np.degrees(np.arccos(cos))) ** 2)
+    xp = array_namespace(position, rotation)
+    squares = xp.sum(position**2, axis=1)[:, None] + np.sum(reachable.position**2, axis=1)
+    away = xp.maximum(squares - 2.0 * position @ reachable.position.T, 0.0)
+    cos = xp.clip(0.5 * (rotation @ reachable.rotation.T - 1.0), -1.0, 1.0)
+    return xp.sqrt(away + (reachable.weight_per_deg * xp.rad2deg(xp.acos(cos))) ** 2)

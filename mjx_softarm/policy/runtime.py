@@ -1,6 +1,7 @@
-"""The policy in NumPy: pose and goal -> spring lengths for the sensor-space law.
+"""The policy in NumPy: spring lengths -> pose of the tip; pose and goal -> references of the springs.
 
-Observation, sensors and law are the functions that training uses; only the actor's layers are evaluated here.
+Observation, sensors and networks are the functions that training uses. The functions here take JAX arrays
+and the symbols of `mjx_softarm.export` as well.
 """
 
 from __future__ import annotations
@@ -11,8 +12,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mjx_softarm._support.mlp import mlp
+from mjx_softarm._support.xp import Array, array_namespace
 from mjx_softarm.mdp.observation import ObsScale, observe
 from mjx_softarm.policy.file import Policy
+from mjx_softarm.sensing.estimator import estimate_frame
+from mjx_softarm.sensing.pose import pose_from_frame
+from mjx_softarm.sensing.s2r import apply_correction, correction, distance, inputs
 
 
 class Reference(NamedTuple):
@@ -20,6 +25,27 @@ class Reference(NamedTuple):
 
     readings: np.ndarray  # (..., n) of the sensors
     length_m: np.ndarray  # (..., n) the same, as calibrated lengths: the reference of `control.pressures`
+
+
+def tip_pose(policy: Policy, spring_m: Array) -> tuple[Array, Array]:
+    """Return the tip pose (6,) [mm, deg] that springs (n,) [m] tell; and `s2r.extrapolation` of it, or 0."""
+    frame = estimate_frame(policy.estimator, spring_m)
+    if policy.s2r is None:
+        return pose_from_frame(*frame), np.float32(0.0)
+    x = inputs(frame, array_namespace(spring_m).asarray(spring_m, dtype=np.float32))
+    pose = pose_from_frame(*apply_correction(frame, correction(policy.s2r, x)))
+    return pose, distance(policy.s2r, x) / policy.s2r.limit
+
+
+def actor_output(policy: Policy, observation: Array) -> Array:
+    """Return the action (..., n) in [-1, 1] of observations (..., 18)."""
+    return array_namespace(observation).tanh(mlp(policy.layers, observation))
+
+
+def action_towards(policy: Policy, pose: Array, goal: Array) -> Array:
+    """Return the action (..., n) in [-1, 1] from a pose towards a goal (..., 6) [mm, deg], all float32."""
+    scale = ObsScale(*(np.asarray(value, np.float32) for value in policy.obs_scale))
+    return actor_output(policy, observe(pose, goal, scale, policy.reward))
 
 
 class PolicyRunner:
@@ -30,7 +56,6 @@ class PolicyRunner:
 
     def __init__(self, policy: Policy):
         self.policy = policy
-        self._scale = ObsScale(*(np.asarray(value, np.float32) for value in policy.obs_scale))
 
     def act(self, pose: ArrayLike, goal: ArrayLike) -> Reference:
         """Return the spring references that bring the tip from a pose towards a goal.
@@ -57,8 +82,7 @@ class PolicyRunner:
                 asks for would be springs without a length.
         """
         pose, goal = np.broadcast_arrays(_six("pose", pose), _six("goal", goal))
-        observation = observe(pose, goal, self._scale, self.policy.reward)  # (..., 18)
-        action = np.tanh(mlp(self.policy.layers, observation))  # (..., n)
+        action = action_towards(self.policy, pose, goal)
         if not np.isfinite(action).all():
             raise ValueError("action: got nan, expected finite numbers; the actor overflows")
         return action

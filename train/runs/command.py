@@ -15,6 +15,7 @@ from rich.table import Table
 
 from mjx_softarm._support import cli
 from mjx_softarm.env import ReachEnv
+from mjx_softarm.export.write import export_onnx
 from train.config import ConfigError, ImitationConfig, TrainConfig
 from train.demos.demonstrations import from_log, read_demonstrations
 from train.epoch import devices
@@ -121,19 +122,25 @@ def evaluate(run: tyro.conf.Positional[Path]) -> int:
     return 0
 
 
-def export(folders: tyro.conf.Positional[tuple[Path, ...]], out: cli.MaybePath = None) -> int:
-    """Write policies, each as one npz file.
+def export(
+    folders: tyro.conf.Positional[tuple[Path, ...]], out: cli.MaybePath = None, onnx: bool = False
+) -> int:
+    """Write policies, each as one npz file, and for other runtimes.
 
     Args:
         folders: folders of runs
         out: file to write, for one run; None: policy.npz in its folder
+        onnx: write ONNX graphs and golden rows beside it
     """
     if not folders or (out and len(folders) > 1):
         expected = "one folder of a run" + ("" if out else " or more")
         raise RunError(f"RUN: got {len(folders)}, expected {expected}")
     console = start()
     for path in folders:
-        console.print(f"policy: {export_run(Run.open(path), out)}", highlight=False)
+        policy = export_run(Run.open(path), out)
+        console.print(f"policy: {policy}", highlight=False)
+        for file in export_onnx(policy) if onnx else ():
+            console.print(f"  {file}", highlight=False)
     return 0
 
 

@@ -1,0 +1,154 @@
+"""Golden rows answered by a policy file, an ONNX graph or a program, and how far the answers are off."""
+
+from __future__ import annotations
+
+import hashlib
+import subprocess
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mjx_softarm._support.errors import InputError
+from mjx_softarm.deploy.controller import Controller
+from mjx_softarm.deploy.faults import Fault
+from mjx_softarm.export.golden import BITS, Golden, Machine, output_columns
+from mjx_softarm.policy.file import load_policy
+
+TOLERANCE = 1e-5  # of the range of an output
+PROGRAM_VERSION = 1  # of the rows that a program reads and writes
+_TIMEOUT_S = 120.0
+
+
+class Agreement(NamedTuple):
+    """Comparison of answers with golden ones."""
+
+    n_rows: int
+    error: float  # greatest, as a share of the output's range; infinite where a fault differs
+    column: str  # output in which it is
+    row: int  # counted from 0
+
+    @property
+    def holds(self) -> bool:
+        return self.error <= TOLERANCE
+
+    def __str__(self) -> str:
+        verdict = "agree" if self.holds else "DO NOT AGREE"
+        where = f"({self.column}, row {self.row})"
+        return f"{self.n_rows} rows {verdict}, greatest difference {self.error:.1e} of the range {where}"
+
+
+def check(golden: Golden, path: Path) -> Agreement:
+    """Compare the answers of a runtime with golden ones.
+
+    Args:
+        golden: the rows.
+        path: policy file `.npz`, graph `.onnx`, or a program that reads rows and writes their outputs.
+
+    Raises:
+        InputError: the file is not what its name says, is of another policy, or the program failed.
+    """
+    answer = {".npz": _by_numpy, ".onnx": _by_onnx}.get(path.suffix, _by_program)
+    rows, outputs = answer(golden, path)
+    return compare(golden, rows, outputs)
+
+
+def compare(golden: Golden, rows: np.ndarray, outputs: dict[str, np.ndarray]) -> Agreement:
+    """Compare outputs, by the names of their columns, with those of some golden rows.
+
+    Args:
+        golden: the rows.
+        rows (k,): indices of the rows answered.
+        outputs: arrays (k,) by column.
+    """
+    names = output_columns(golden.about["n"])
+    worst = Agreement(len(rows), 0.0, "none", 0)
+    for name, got in outputs.items():
+        column = names.index(name)
+        expected, scale = golden.outputs[rows, column], golden.about["range"][column]
+        off = np.abs(got - expected)
+        if name in ("pose_yaw", "pose_pitch", "pose_roll"):
+            off = np.minimum(off, 360.0 - off)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = np.where(off == 0.0, 0.0, off / scale)
+        share = np.where(np.isnan(got) & np.isnan(expected), 0.0, np.where(np.isnan(off), np.inf, share))
+        if share.max() >= worst.error:
+            worst = Agreement(len(rows), float(share.max()), name, int(rows[share.argmax()]))
+    return worst
+
+
+def _same_policy(path: Path, sha256: Any, golden: Golden) -> None:
+    expected = golden.about["policy_sha256"]
+    if sha256 != expected:
+        raise InputError(f"{path}: got policy {str(sha256)[:12]}, expected {expected[:12]}, the golden rows'")
+
+
+def _by_numpy(golden: Golden, path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    policy = load_policy(path)
+    _same_policy(path, hashlib.sha256(path.read_bytes()).hexdigest(), golden)
+    machine = Machine(Controller.of(policy))
+    answers = np.array([machine.answer(row) for row in golden.inputs])
+    return np.arange(len(answers)), _columns(golden, answers)
+
+
+def _by_onnx(golden: Golden, path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    try:
+        import onnxruntime
+
+        from mjx_softarm.export.onnx_files import read_onnx
+    except ImportError as error:
+        expected = "the packages of pip install 'mjx-softarm[onnx]'"
+        raise InputError(f"{path}: got no {error.name}, expected {expected}") from error
+    data, about = read_onnx(path)
+    _same_policy(path, about["policy_sha256"], golden)
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 3
+    session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+    names, n = [item.name for item in session.get_outputs()], golden.about["n"]
+    if "goal_outside" not in names:
+        raise InputError(f"{path}: got {about['kind']}, expected the graph from readings to references")
+    rows = np.flatnonzero(golden.inputs[:, 0])  # a graph has no memory
+    answers = []
+    for row in golden.inputs[rows].astype(np.float32):
+        arrays: Any = session.run(None, {"readings": row[4:-6], "goal": row[-6:]})
+        result = dict(zip(names, arrays, strict=True))
+        acts = np.isfinite(result["reference_m"]).all()
+        found = {
+            Fault.LOST_READING: result["reading_lost"].any(),
+            Fault.GOAL_OUTSIDE: result["goal_outside"],
+            Fault.EXTRAPOLATION: acts and result["extrapolation"] > 1.0,
+        }
+        faults = sum(BITS[fault] for fault, there in found.items() if there)
+        nothing = np.full(n, np.nan)
+        springs = nothing, result["reference_m"], result["length_m"]
+        answers.append(np.concat([[faults, 0.0], *springs, result["pose"]]))
+    outputs = _columns(golden, np.array(answers))
+    return rows, {name: value for name, value in outputs.items() if not name.startswith("pressure")}
+
+
+def _by_program(golden: Golden, path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    lines = [" ".join(f"{value:.9g}" for value in row) for row in golden.inputs]
+    try:
+        command, text = [str(path.resolve())], "\n".join([*lines, ""])
+        done = subprocess.run(command, input=text, capture_output=True, text=True, timeout=_TIMEOUT_S)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise InputError(f"{path}: cannot be run: {error}") from error
+    first, *rest = done.stdout.splitlines() or [""]
+    words = [*first.split(), *("",) * 4]
+    if done.returncode or words[:2] != ["mjx_softarm", str(PROGRAM_VERSION)]:
+        got = done.stderr.strip() or f"exit status {done.returncode}, first line {first!r}"
+        raise InputError(
+            f"{path}: got {got}, expected a program that answers rows of version {PROGRAM_VERSION}"
+        )
+    _same_policy(path, words[2], golden)
+    try:
+        answers = np.array([line.split() for line in rest], float).reshape(golden.outputs.shape)
+    except ValueError as error:
+        got = f"{len(rest)} lines"
+        expected = "{} lines of {} numbers".format(*golden.outputs.shape)
+        raise InputError(f"{path}: got {got}, expected {expected}") from error
+    return np.arange(len(answers)), _columns(golden, answers)
+
+
+def _columns(golden: Golden, answers: np.ndarray) -> dict[str, np.ndarray]:
+    return dict(zip(output_columns(golden.about["n"]), answers.T, strict=True))

@@ -1,0 +1,230 @@
+"""Golden rows: what the control loop answers, row by row, to check it in any language.
+
+A row of inputs is one tick of the loop, and its answer the outputs:
+
+    restart      1: begin anew, with an arm without pressure
+    new_goal     1: take the goal of this row
+    late         1: the last tick missed its deadline
+    taken        0: the arm did not take the last pressures
+    reading<k>   of the sensors; nan where none came
+    goal_<axis>  [mm, deg]
+    faults       sum of 2**k over the faults of this tick, k counted in `mjx_softarm.deploy.faults.Fault`
+    arrived      1: the goal had all its actions and the springs have settled
+    pressure<k>  [kPa] to write; after a fault whose response is to vent, a ramp to zero
+    reference<k> [m]
+    length<k>    [m] believed in
+    pose_<axis>  [mm, deg] of the tip that these lengths tell
+
+The first `N_SINGLE` rows each begin anew, so that each is the policy's answer to readings and a goal. The
+others are runs of the loop, on an arm that follows the policy's own spring model, with faults.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Generator, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mjx_softarm._support.errors import InputError
+from mjx_softarm.deploy.controller import Controller, start
+from mjx_softarm.deploy.faults import Event, Fault, Response
+from mjx_softarm.deploy.link import vented
+from mjx_softarm.deploy.loop import believed, step, with_goal
+from mjx_softarm.deploy.reachability import nearest
+from mjx_softarm.sensing.estimator import expected_springs
+
+SCHEMA_VERSION = 1
+N_SINGLE = 1000
+AXES = ("x", "y", "z", "yaw", "pitch", "roll")
+FLAGS = ("restart", "new_goal", "late", "taken")
+BITS = {fault: 1 << k for k, fault in enumerate(Fault)}
+STOPS = sum(bit for fault, bit in BITS.items() if fault.response is Response.VENT)
+
+_SPREAD_M = 2e-3  # of the springs of single rows around the model's, as by payloads
+_OUTSIDE, _LOST = 0.1, 0.1  # shares of single rows
+_LAG, _NOISE_M = 0.15, 4e-5  # of the arm in the runs, per tick
+_RUN_TICKS = 400  # at most
+
+
+class Golden(NamedTuple):
+    """Rows and answers."""
+
+    about: dict[str, Any]  # schema_version, policy_sha256, n, and the range of each output column
+    inputs: np.ndarray  # (rows, 4 + n + 6)
+    outputs: np.ndarray  # (rows, 2 + 3 n + 6)
+
+
+def input_columns(n: int) -> list[str]:
+    """Return the names of a row's inputs."""
+    return [*FLAGS, *(f"reading{k}" for k in range(n)), *(f"goal_{axis}" for axis in AXES)]
+
+
+def output_columns(n: int) -> list[str]:
+    """Return the names of a row's outputs."""
+    springs = [f"{name}{k}" for name in ("pressure", "reference", "length") for k in range(n)]
+    return ["faults", "arrived", *springs, *(f"pose_{axis}" for axis in AXES)]
+
+
+class Machine:
+    """The control loop as a machine that answers rows."""
+
+    def __init__(self, controller: Controller):
+        self.controller = controller
+        self._restart()
+
+    def _restart(self) -> None:
+        self.state, self.stopped = start(self.controller), False
+        self._before_kpa = self.state.pressure_kpa
+
+    def answer(self, row: np.ndarray) -> np.ndarray:
+        """Return the outputs (2 + 3 n + 6,) of inputs (4 + n + 6,)."""
+        restart, new_goal, late, taken = row[:4] > 0.5
+        if restart:
+            self._restart()
+        if not taken:
+            self.state = self.state._replace(pressure_kpa=self._before_kpa)
+        self._before_kpa = self.state.pressure_kpa
+        events, arrived = (), False
+        if self.stopped:
+            self.state = self.state._replace(pressure_kpa=vented(self._before_kpa, self.controller.dt_s))
+        else:
+            events, arrived = self._tick(row[4:-6], row[-6:] if new_goal else None, bool(late))
+        state = self.state
+        reference_m = np.full_like(state.spring_m, np.nan) if state.reference_m is None else state.reference_m
+        faults = sum({BITS[event.fault] for event in events})
+        pose, _ = believed(self.controller, state.spring_m)
+        return np.concat([[faults, arrived], state.pressure_kpa, reference_m, state.spring_m, pose])
+
+    def _tick(
+        self, readings: np.ndarray, goal: np.ndarray | None, late: bool
+    ) -> tuple[tuple[Event, ...], bool]:
+        refused = ()
+        if goal is not None:
+            self.state, refused = with_goal(self.controller, self.state, goal)
+        self.state, tick = step(self.controller, self.state, readings, late)
+        self.stopped = tick.stop is not None
+        return refused + tick.events, tick.arrived
+
+
+def make_golden(controller: Controller, policy_sha256: str, seed: int = 0) -> Golden:
+    """Make rows that meet the faults of an arm, and let the loop answer them."""
+    rng, machine = np.random.default_rng(seed), Machine(controller)
+    inputs, outputs = [], []
+    for row in _single_rows(controller, rng):
+        inputs.append(row)
+        outputs.append(machine.answer(row))
+    for kind in ("calm", "lost", "stuck", "late", "leaking", "swinging"):
+        run = _rows_of_run(controller, kind, rng)
+        row = next(run)
+        for _ in range(_RUN_TICKS if kind != "swinging" else 2 * _RUN_TICKS):
+            inputs.append(row)
+            outputs.append(machine.answer(row))
+            if machine.state.goal is None or (machine.stopped and not machine.state.pressure_kpa.any()):
+                break
+            row = run.send(machine.state.pressure_kpa)
+    n = controller.policy.spec.n_chambers
+    about = {"schema_version": SCHEMA_VERSION, "policy_sha256": policy_sha256, "n": n}
+    about["range"] = _ranges(controller).tolist()
+    return Golden(about, np.array(inputs), np.array(outputs))
+
+
+def _ranges(controller: Controller) -> np.ndarray:
+    """Return the range (2 + 3 n + 6,) of each output, 0 where nothing but equality will do."""
+    policy = controller.policy
+    n, ones = policy.spec.n_chambers, np.ones(policy.spec.n_chambers)
+    pressure_kpa = ones * policy.gains.pressure_max_kpa - ones * policy.gains.pressure_min_kpa
+    length_m = policy.actions.lengths(ones) - policy.actions.lengths(-ones)
+    pose = np.concat([6.0 * policy.obs_scale.scale[:3], np.full(3, 360.0)])  # twice the arm's length
+    return np.concat([np.zeros(2), pressure_kpa, length_m, length_m, pose]).reshape(2 + 3 * n + 6)
+
+
+def _row(flags: tuple[int, ...], readings: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    """Return a row whose numbers survive nine digits of text."""
+    return np.array([float(f"{value:.9g}") for value in (*flags, *readings, *goal)])
+
+
+def _single_rows(controller: Controller, rng: np.random.Generator) -> Iterator[np.ndarray]:
+    policy, n = controller.policy, controller.policy.spec.n_chambers
+    low, high = policy.sensor.range
+    for _ in range(N_SINGLE):
+        kpa = rng.uniform(policy.gains.pressure_min_kpa, policy.gains.pressure_max_kpa, n)
+        spring_m = expected_springs(policy.spring_model, kpa) + rng.normal(0.0, _SPREAD_M, n)
+        readings = policy.sensor.readings(spring_m)
+        if rng.random() < _LOST:
+            readings[rng.integers(n)] = rng.choice([np.nan, np.min(low) - 1.0, 2.0 * np.max(high)])
+        yield _row((1, 1, 0, 1), readings, _goal(controller, rng, outside=rng.random() < _OUTSIDE))
+
+
+def _goal(controller: Controller, rng: np.random.Generator, outside: bool) -> np.ndarray:
+    """Return a pose close to a reachable one, or one that is clearly outside."""
+    policy = controller.policy
+    while True:
+        goal = rng.choice(policy.workspace) + rng.normal(0.0, [2.0] * 3 + [1.0] * 3)
+        goal = goal + outside * rng.normal(0.0, [300.0] * 3 + [0.0] * 3)
+        away = nearest(controller.reachable, goal, policy.reward)[1]
+        if away > 1.02 if outside else away < 0.98:
+            return goal
+
+
+def _rows_of_run(
+    controller: Controller, kind: str, rng: np.random.Generator
+) -> Generator[np.ndarray, np.ndarray, None]:
+    """Yield rows of a run with a fault; takes the pressures that were answered."""
+    policy, n = controller.policy, controller.policy.spec.n_chambers
+    actual_kpa, goal = np.zeros(n), _goal(controller, rng, outside=False)
+    leak, first = np.ones(n), None
+    for tick in range(10**6):
+        spring_m = expected_springs(policy.spring_model, actual_kpa) + rng.normal(0.0, _NOISE_M, n)
+        if kind == "swinging":
+            spring_m = spring_m + 5e-3 * np.sin(2 * np.pi * 0.7 * tick * controller.dt_s)
+        readings = policy.sensor.readings(spring_m)
+        first = readings if first is None else first
+        if kind == "lost" and (tick in (30, 40) or tick >= 60):
+            readings = np.where(np.arange(n) == tick % n, np.nan, readings)
+            readings = np.where((np.arange(n) == 4) & (tick >= 60), np.nan, readings)
+        if kind == "stuck":
+            readings[-1] = first[-1]
+        late = kind == "late" and (tick in (20, 22) or tick >= 60)
+        flags = (tick == 0, tick == 0, late, not (late and tick % 2 == 0))
+        pressure_kpa = yield _row(tuple(map(int, flags)), readings, goal)
+        if kind == "leaking" and tick == 60:
+            leak[np.argmax(np.abs(pressure_kpa))] = 0.0
+        actual_kpa = actual_kpa + _LAG * (leak * pressure_kpa - actual_kpa)
+
+
+def write_golden(path: Path, golden: Golden) -> None:
+    """Write rows as CSV, between a line of JSON and a checksum."""
+    n = golden.about["n"]
+    table = np.concat([golden.inputs, golden.outputs], axis=1)
+    lines = [",".join(f"{value:.9g}" for value in row) for row in table]
+    header = ",".join(input_columns(n) + output_columns(n))
+    text = "\n".join([f"# {json.dumps(golden.about)}", header, *lines, ""])
+    path.write_text(f"{text}# {hashlib.sha256(text.encode()).hexdigest()}\n", "utf-8")
+
+
+def read_golden(path: Path) -> Golden:
+    """Read rows.
+
+    Raises:
+        InputError: the file cannot be read, is incomplete, changed or of another version.
+    """
+    expected = "an unchanged file of golden rows of `python -m train export RUN --onnx`"
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    body, seal = data[:-67], data[-67:]
+    if seal != f"# {hashlib.sha256(body).hexdigest()}\n".encode():
+        raise InputError(f"{path}: got {len(data)} bytes without their checksum, expected {expected}")
+    first, _, *lines = body.decode().splitlines()
+    about = json.loads(first[1:])
+    if about.get("schema_version") != SCHEMA_VERSION:
+        got = f"schema_version: got {about.get('schema_version')}, expected {SCHEMA_VERSION}"
+        raise InputError(f"{path}: {got}; export the run again")
+    table = np.array([line.split(",") for line in lines], float)
+    n_inputs = len(input_columns(about["n"]))
+    return Golden(about, table[:, :n_inputs], table[:, n_inputs:])

@@ -1,0 +1,228 @@
+"""Recorded computations: NumPy functions called on symbols, kept as operations for other languages.
+
+Sensors, estimator, networks, maps, law and faults are written once, in the functions of whatever library
+their arrays bring along (`mjx_softarm._support.xp`). A `Symbol` is an array of known shape and type that
+brings this module along: such a function, called on symbols, returns the symbols of its results, and each
+symbol knows the operation and the operands that it comes from. Shapes and types are NumPy's own: every
+operation is tried on arrays of ones.
+
+The operations are NumPy's functions of the same name, elementwise but for
+
+    input, constant                  `option`: the name; nothing
+    cast, reshape                    nothing: type and shape are the symbol's
+    index                            `option`: places (shape) of the elements in the flat operand
+    concat, sum, min, max, all, any  `option`: the axis, or the axes as a tuple
+    matmul                           as NumPy's
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+REDUCTIONS = ("sum", "min", "max", "all", "any")
+
+
+@dataclass(frozen=True, eq=False)
+class Symbol:
+    """One array of a recorded computation."""
+
+    op: str
+    operands: tuple[Symbol, ...]
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    option: Any = None
+    value: np.ndarray | None = None  # of a constant
+
+    __array_ufunc__ = None  # lets NumPy arrays leave operators to this class
+
+    def __array_namespace__(self) -> Any:
+        return _NAMESPACE
+
+    @property
+    def ndim(self) -> int:
+        return len(self.shape)
+
+    @property
+    def size(self) -> int:
+        return math.prod(self.shape)
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, key: Any) -> Symbol:
+        places = np.arange(self.size).reshape(self.shape)[key]
+        return Symbol("index", (self,), np.shape(places), self.dtype, np.asarray(places))
+
+    def reshape(self, *shape: int) -> Symbol:
+        return Symbol("reshape", (self,), np.empty(self.shape).reshape(*shape).shape, self.dtype)
+
+    def __neg__(self) -> Symbol:
+        return elementwise("negative", self)
+
+    def __invert__(self) -> Symbol:
+        return elementwise("logical_not", self)
+
+    def __pow__(self, power: int) -> Symbol:
+        if power != 2:
+            raise NotImplementedError(f"power: got {power}, expected 2")
+        return elementwise("multiply", self, self)
+
+    def __eq__(self, other: Any) -> Any:
+        return elementwise("equal", self, other)
+
+    def __ne__(self, other: Any) -> Any:
+        return elementwise("logical_not", elementwise("equal", self, other))
+
+    def __bool__(self) -> bool:
+        raise TypeError(f"{self.op}: a symbol has no value to decide by")
+
+    __hash__ = object.__hash__
+
+
+def _operator(name: str, swapped: bool = False) -> Callable[[Symbol, Any], Symbol]:
+    def operate(self: Symbol, other: Any) -> Symbol:
+        return _NAMESPACE[name](*((other, self) if swapped else (self, other)))
+
+    return operate
+
+
+_OPERATORS = {"add": "add", "sub": "subtract", "mul": "multiply", "truediv": "divide", "matmul": "matmul"}
+_OPERATORS |= {"and": "logical_and", "or": "logical_or"}
+for _word, _name in _OPERATORS.items():
+    setattr(Symbol, f"__{_word}__", _operator(_name))
+    setattr(Symbol, f"__r{_word}__", _operator(_name, swapped=True))
+for _word, _name in {"lt": "less", "le": "less_equal", "gt": "greater", "ge": "greater_equal"}.items():
+    setattr(Symbol, f"__{_word}__", _operator(_name))
+
+
+def symbol(name: str, shape: tuple[int, ...], dtype: Any = np.float64) -> Symbol:
+    """Return an input of a computation."""
+    return Symbol("input", (), shape, np.dtype(dtype), name)
+
+
+def constant(value: Any, dtype: Any = None) -> Symbol:
+    """Return a number or an array as a symbol; a symbol as it is."""
+    if isinstance(value, Symbol):
+        return value
+    array = np.asarray(value, dtype)
+    return Symbol("constant", (), array.shape, array.dtype, value=array)
+
+
+def elementwise(name: str, *operands: Any) -> Symbol:
+    """Record an operation on elements; bare numbers take the type of the arrays, as in NumPy."""
+    like = _tried(name, *operands)
+    values = operands[1:] if name == "where" else operands
+    common = np.result_type(*(_one(value) for value in values))
+    taken = [value if hasattr(value, "dtype") else np.asarray(value, common) for value in operands]
+    return Symbol(name, tuple(map(constant, taken)), like.shape, like.dtype)
+
+
+def ordered(results: Iterable[Symbol]) -> list[Symbol]:
+    """Return all symbols that results come from, and these, each after its operands."""
+    found: dict[Symbol, None] = {}
+
+    def visit(item: Symbol) -> None:
+        if item not in found:
+            for operand in item.operands:
+                visit(operand)
+            found[item] = None
+
+    for result in results:
+        visit(result)
+    return list(found)
+
+
+def _one(value: Any) -> Any:
+    """Return an array of ones like a symbol."""
+    return np.ones(value.shape, value.dtype) if isinstance(value, Symbol) else value
+
+
+def _tried(name: str, *operands: Any, **options: Any) -> Any:
+    with np.errstate(all="ignore"):
+        return getattr(np, name)(*map(_one, operands), **options)
+
+
+def _reduced(name: str, x: Symbol, axis: Any = None) -> Symbol:
+    like = _tried(name, x, axis=axis)
+    axes = tuple(range(x.ndim)) if axis is None else (axis,) if isinstance(axis, int) else axis
+    return Symbol(name, (x,), like.shape, like.dtype, tuple(sorted(item % x.ndim for item in axes)))
+
+
+def _mean(x: Symbol, axis: Any = None) -> Symbol:
+    total = _reduced("sum", x, axis)
+    return elementwise("divide", total, x.size / total.size)
+
+
+def _concat(arrays: Iterable[Any], axis: int = 0) -> Symbol:
+    arrays = list(arrays)
+    like = np.concat([_one(array) for array in arrays], axis=axis)
+    parts = tuple(_cast(constant(array), like.dtype) for array in arrays)
+    return Symbol("concat", parts, like.shape, like.dtype, axis % like.ndim)
+
+
+def _stack(arrays: Iterable[Any], axis: int = -1) -> Symbol:
+    if axis != -1:
+        raise NotImplementedError(f"stack: got axis {axis}, expected -1")
+    return _concat([constant(array)[..., None] for array in arrays], axis=-1)
+
+
+def _cast(x: Symbol, dtype: Any) -> Symbol:
+    return x if x.dtype == dtype else Symbol("cast", (x,), x.shape, np.dtype(dtype))
+
+
+def _matmul(a: Any, b: Any) -> Symbol:
+    like = _tried("matmul", a, b)
+    operands = tuple(_cast(constant(value), like.dtype) for value in (a, b))
+    return Symbol("matmul", operands, like.shape, like.dtype)
+
+
+_OTHER_NAMES = {"abs": "absolute", "atan2": "arctan2", "acos": "arccos"}
+_OWN = {
+    "matmul": _matmul,
+    "mean": _mean,
+    "concat": _concat,
+    "stack": _stack,
+    "asarray": lambda x, dtype: _cast(x, dtype),
+    "clip": lambda x, low, high: _NAMESPACE.minimum(_NAMESPACE.maximum(x, low), high),
+    "rad2deg": lambda x: elementwise("multiply", x, 180.0 / math.pi),
+    "deg2rad": lambda x: elementwise("multiply", x, math.pi / 180.0),
+    "ones_like": lambda x: constant(np.ones(x.shape, x.dtype)),
+    "zeros_like": lambda x: constant(np.zeros(x.shape, x.dtype)),
+}
+
+
+class _Namespace:
+    """NumPy's functions, on symbols; on arrays and numbers alone they are NumPy's."""
+
+    def __getitem__(self, name: str) -> Callable[..., Any]:
+        return getattr(self, name)
+
+    def __getattr__(self, name: str) -> Any:
+        plain, known = getattr(np, name), _OTHER_NAMES.get(name, name)
+        if not callable(plain) or isinstance(plain, type):  # a number or a type
+            return plain
+
+        def function(*operands: Any, **options: Any) -> Any:
+            if not any(isinstance(value, Symbol) for value in _flat(operands)):
+                return plain(*operands, **options)
+            if known in _OWN:
+                return _OWN[known](*operands, **options)
+            if known in REDUCTIONS:
+                return _reduced(known, *operands, **options)
+            return elementwise(known, *operands, **options)
+
+        return function
+
+
+def _flat(operands: Iterable[Any]) -> Iterator[Any]:
+    """Yield operands, and those in lists of operands."""
+    for operand in operands:
+        yield from operand if isinstance(operand, list | tuple) else (operand,)
+
+
+_NAMESPACE = _Namespace()

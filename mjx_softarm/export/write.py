@@ -1,0 +1,81 @@
+"""A policy file's exports for other runtimes: ONNX graphs, C++ sources, golden rows."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mjx_softarm._support.errors import InputError
+from mjx_softarm.deploy.controller import Controller
+from mjx_softarm.export import computations
+from mjx_softarm.export.golden import make_golden, write_golden
+from mjx_softarm.mdp.observation import OBS_LAYOUT
+from mjx_softarm.policy.file import Policy, action_layout, load_policy
+
+_POSE = {"unit": ["mm"] * 3 + ["deg"] * 3, "names": ["x", "y", "z", "yaw", "pitch", "roll"]}
+FRAME = "base frame: z up, the arm hangs towards -z; angles intrinsic Z-Y-X, zero where it hangs straight"
+
+
+def export_onnx(policy_path: Path) -> list[Path]:
+    """Write the graphs of a policy beside it, with golden rows; return the files.
+
+    Raises:
+        InputError: the policy cannot be read, the package onnx is missing, or a file cannot be written.
+    """
+    try:
+        from mjx_softarm.export.onnx_files import write_onnx
+    except ImportError as error:
+        expected = "the packages of pip install 'mjx-softarm[onnx]'"
+        raise InputError(f"--onnx: got no {error.name}, expected {expected}") from error
+    controller, sha256 = _open(policy_path)
+    n = controller.policy.spec.n_chambers
+    about = describe(controller.policy, sha256)
+    whole, actor = (policy_path.with_name(f"{policy_path.stem}{end}.onnx") for end in ("", "_actor"))
+    never = {"last_length_m": np.full(n, np.nan)}
+    write_onnx(whole, computations.graph(controller), {"kind": "policy", **about}, never)
+    write_onnx(actor, computations.actor(controller), {"kind": "actor", **about}, {})
+    golden = policy_path.with_name(f"{policy_path.stem}_golden.csv")
+    write_golden(golden, make_golden(controller, sha256))
+    return [whole, actor, golden]
+
+
+def describe(policy: Policy, sha256: str) -> dict[str, Any]:
+    """Return what a user of a graph needs to know: units, frames, names, the arm and its numbers."""
+    sensor, n = policy.sensor, policy.spec.n_chambers
+    lengths = {"unit": "m", "names": [f"spring{k}" for k in range(n)]}
+    readings = {"unit": sensor.unit, "names": list(action_layout(policy.spec))}
+    return {
+        "policy_sha256": sha256,
+        "frame": FRAME,
+        "inputs": {
+            "readings": readings,
+            "goal": _POSE,
+            "last_length_m": lengths | {"default": "nan: none yet; a lost reading holds it"},
+            "observation": {"names": list(OBS_LAYOUT), "centre": policy.obs_scale.centre.tolist()}
+            | {"scale": policy.obs_scale.scale.tolist()},
+        },
+        "outputs": {
+            "reference_m": lengths | {"nan": "no length of a spring, or a goal outside the workspace"},
+            "reference_reading": readings,
+            "length_m": lengths,
+            "reading_lost": {"names": lengths["names"]},
+            "pose": _POSE,
+            "extrapolation": {"above 1": "the pose is further from the calibration than is believed"},
+            "goal_outside": {"true": "the goal is outside the workspace"},
+            "action": {"names": readings["names"], "range": [-1.0, 1.0]},
+        },
+        "rate_hz": policy.rate_hz,
+        "tolerance_m": policy.tolerance_m,
+        "n_actions": policy.n_actions,
+        "gains": {name: np.asarray(value).tolist() for name, value in policy.gains._asdict().items()},
+        "spec": policy.spec.to_dict(),
+        "provenance": dict(policy.provenance),
+    }
+
+
+def _open(policy_path: Path) -> tuple[Controller, str]:
+    sha256 = hashlib.sha256(policy_path.read_bytes()).hexdigest()
+    return Controller.of(load_policy(policy_path)), sha256

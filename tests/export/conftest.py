@@ -1,0 +1,56 @@
+"""Policies with every part at work, their files and their golden rows."""
+
+import dataclasses
+import hashlib
+import itertools
+
+import numpy as np
+import pytest
+
+from mjx_softarm.deploy.controller import Controller
+from mjx_softarm.export.golden import make_golden
+from mjx_softarm.policy.file import load_policy, save_policy
+from mjx_softarm.sensing.s2r import N_POSE_INPUTS, N_POSE_OUTPUTS, S2R
+from tests.linear_arm import SPEC, N, make_policy
+
+
+def layers(*sizes, scale):
+    rng = np.random.default_rng(5)
+    pairs = itertools.pairwise(sizes)
+    return tuple(
+        (np.float32(scale * rng.normal(size=(a, b))), np.float32(0.1 * rng.normal(size=b))) for a, b in pairs
+    )
+
+
+def busy_policy(spec=SPEC):
+    """The linear arm's policy with an actor, an estimator and a sim-to-real network that change much."""
+    policy, n_in = make_policy(spec), N_POSE_INPUTS + N
+    s2r = S2R(
+        layers(n_in, 8, N_POSE_OUTPUTS, scale=0.3),
+        *(np.full(n_in, value, np.float32) for value in (-1.0, 1.0)),
+        *(np.float32(sign * np.array([9.0] * 3 + [0.1] * 3)) for sign in (-1, 1)),
+        anchors=np.float32(np.random.default_rng(6).normal(0.0, 0.1, (5, n_in))),
+        limit=np.float32(0.335),
+    )
+    estimator = policy.estimator._replace(
+        layers=layers(2 * N, 6, 18, scale=0.2), change_scale=np.full(6, 0.01, np.float32)
+    )
+    return dataclasses.replace(policy, layers=layers(18, 12, N, scale=0.5), estimator=estimator, s2r=s2r)
+
+
+@pytest.fixture(scope="session")
+def policy_file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("export") / "policy.npz"
+    beta = tuple(np.linspace(0.9, 0.98, N))
+    save_policy(path, busy_policy(SPEC.replace(sensor={"beta": beta})))
+    return path
+
+
+@pytest.fixture(scope="session")
+def controller(policy_file):
+    return Controller.of(load_policy(policy_file))
+
+
+@pytest.fixture(scope="session")
+def golden(controller, policy_file):
+    return make_golden(controller, hashlib.sha256(policy_file.read_bytes()).hexdigest())

@@ -1,0 +1,86 @@
+"""Golden rows: what they meet, the file they stand in, and the agreement of NumPy and JAX."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjx_softarm._support.errors import InputError
+from mjx_softarm.deploy.faults import Fault, Response
+from mjx_softarm.export.__main__ import main
+from mjx_softarm.export.check import TOLERANCE, check, compare
+from mjx_softarm.export.golden import BITS, N_SINGLE, output_columns, read_golden, write_golden
+from mjx_softarm.policy.runtime import action_towards, tip_pose
+from tests.linear_arm import N
+
+
+def test_rows_meet_faults_and_vent(golden):
+    faults = golden.outputs[:, 0].astype(int)
+    met = {fault for fault, bit in BITS.items() if np.any(faults & bit)}
+    assert {fault for fault in Fault if fault.response is Response.VENT} - {Fault.ARM_LOST} <= met
+    assert {Fault.LOST_READING, Fault.GOAL_OUTSIDE, Fault.EXTRAPOLATION, Fault.SATURATED} <= met
+    assert len(golden.inputs) > N_SINGLE == np.count_nonzero(golden.inputs[:N_SINGLE, 0])
+    stopped = np.flatnonzero(faults & BITS[Fault.SENSOR_STUCK])[0]
+    pressure_kpa = golden.outputs[stopped:, 2 : 2 + N]
+    ramp = np.abs(pressure_kpa[: np.flatnonzero(golden.inputs[stopped + 1 :, 0])[0] + 1])
+    assert ramp[0].max() > 1.0 and not ramp[-1].any() and (np.diff(ramp, axis=0) <= 1e-9).all()
+
+
+def test_jax_agrees(golden, controller):
+    policy = controller.policy
+    good = np.flatnonzero(np.isfinite(golden.outputs[:N_SINGLE]).all(axis=1))
+    readings, goal = (
+        jnp.asarray(x[good], jnp.float32) for x in (golden.inputs[:, 4:-6], golden.inputs[:, -6:])
+    )
+
+    @jax.jit
+    def answer(readings, goal):
+        length_m = policy.sensor.lengths(readings).length_m
+        pose, _ = tip_pose(policy, length_m)
+        return policy.actions.lengths(action_towards(policy, pose, goal)), length_m, pose
+
+    table = np.concatenate(answer(readings, goal), axis=1)
+    columns = [name for name in output_columns(N) if not name.startswith(("faults", "arrived", "pressure"))]
+    agreement = compare(golden, good, dict(zip(columns, table.T, strict=True)))
+    assert len(good) > 700
+    assert agreement.error < TOLERANCE, agreement
+
+
+def test_command_checks_a_policy_file(golden, policy_file, tmp_path, capsys):
+    write_golden(tmp_path / "golden.csv", golden)
+    assert main(["check", str(tmp_path / "golden.csv"), str(policy_file)]) == 0
+    assert f"{len(golden.inputs)} rows agree" in capsys.readouterr().out
+    column = np.arange(golden.outputs.shape[1]) == output_columns(N).index("reference1")
+    other = golden._replace(inputs=golden.inputs[:20], outputs=golden.outputs[:20] + 1e-3 * column)
+    write_golden(tmp_path / "golden.csv", other)
+    assert main(["check", str(tmp_path / "golden.csv"), str(policy_file)]) == 1
+    assert "DO NOT AGREE" in (out := capsys.readouterr().out) and "reference1" in out
+
+
+def test_file_gives_rows_back_and_damaged_ones_are_refused(golden, policy_file, tmp_path):
+    path = tmp_path / "golden.csv"
+    write_golden(path, golden)
+    found = read_golden(path)
+    np.testing.assert_array_equal(found.inputs, golden.inputs)
+    np.testing.assert_allclose(found.outputs, golden.outputs, rtol=1e-8, atol=1e-12)
+    data = path.read_bytes()
+    for spoilt in (data[:-1000], data.replace(b"0.2", b"0.3", 1), b"", b"time [s],pressure0 [kPa]\n"):
+        path.write_bytes(spoilt)
+        with pytest.raises(InputError, match="without their checksum, expected an unchanged file"):
+            read_golden(path)
+    newer = golden._replace(about=golden.about | {"schema_version": 2})
+    write_golden(path, newer)
+    with pytest.raises(InputError, match="schema_version: got 2, expected 1; export the run again"):
+        read_golden(path)
+    other = golden._replace(about=golden.about | {"policy_sha256": "0" * 64})
+    with pytest.raises(InputError, match="got policy [0-9a-f]{12}, expected 000000000000"):
+        check(other, policy_file)
+
+
+def test_fault_that_differs_is_infinitely_off(golden):
+    faults = golden.outputs[:, 0].copy()
+    faults[7] += 1
+    agreement = compare(golden, np.arange(len(faults)), {"faults": faults})
+    assert (agreement.error, agreement.column, agreement.row) == (np.inf, "faults", 7)
+    turned = golden.outputs[:, -1] + 360.0
+    assert compare(golden, np.arange(len(faults)), {"pose_roll": turned}).error < TOLERANCE

@@ -1,0 +1,115 @@
+"""ONNX graphs in onnxruntime."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from mjx_softarm import ArmSpec
+from mjx_softarm._support.errors import InputError
+from mjx_softarm.deploy.controller import Controller, start
+from mjx_softarm.deploy.loop import step, with_goal
+from mjx_softarm.export import computations
+from mjx_softarm.export.check import TOLERANCE, check
+from mjx_softarm.export.golden import N_SINGLE
+from mjx_softarm.export.write import export_onnx
+from mjx_softarm.policy.runtime import actor_output
+from tests.export.conftest import busy_policy
+from tests.linear_arm import N
+
+onnx = pytest.importorskip("onnx", reason="the package onnx is not installed")
+onnx_files = pytest.importorskip("mjx_softarm.export.onnx_files")
+ort = pytest.importorskip("onnxruntime", reason="the package onnxruntime is not installed")
+
+
+@pytest.fixture(scope="module")
+def files(policy_file):
+    return export_onnx(policy_file)
+
+
+def test_graph_agrees_on_golden_rows(files, golden):
+    agreement = check(golden, files[0])
+    assert agreement.n_rows >= N_SINGLE and agreement.error < TOLERANCE, agreement
+
+
+def test_graphs_need_opset_17_and_say_what_they_are(files, controller):
+    model = onnx.load(files[0])
+    assert [(item.domain, item.version) for item in model.opset_import] == [("", 17)]
+    types = {item.type.tensor_type.elem_type for item in (*model.graph.input, *model.graph.output)}
+    assert types <= {onnx.TensorProto.FLOAT, onnx.TensorProto.BOOL}
+    about = json.loads({item.key: item.value for item in model.metadata_props}["mjx_softarm"])
+    assert ArmSpec.from_dict(about["spec"], "metadata") == controller.policy.spec  # to the last digit
+    assert about["inputs"]["readings"]["unit"] == "Hz" and about["rate_hz"] == controller.policy.rate_hz
+    assert {item.name for item in model.graph.output} <= about["outputs"].keys()
+
+
+def test_actor_alone(files, controller):
+    session = ort.InferenceSession(files[1])
+    observation = np.random.default_rng(0).normal(size=18).astype(np.float32)
+    [action] = session.run(None, {"observation": observation})
+    np.testing.assert_allclose(action, actor_output(controller.policy, observation), atol=1e-6)
+    assert np.ptp(action) > 0.1
+
+
+def test_lost_reading_holds_the_last_length(files, golden, controller):
+    session = ort.InferenceSession(files[0])
+    row = np.flatnonzero(np.isfinite(golden.outputs[:N_SINGLE]).all(axis=1))[0]
+    readings, goal = np.split(golden.inputs[row, 4:], [N])
+    last_m = np.linspace(0.15, 0.2, N)
+    readings[3] = np.nan
+    feed = {"readings": readings, "goal": goal, "last_length_m": last_m}
+    names = ["reference_m", "length_m", "reading_lost"]
+    got = session.run(names, {name: np.float32(value) for name, value in feed.items()})
+    assert got[1][3] == np.float32(0.15 + 3 * 0.05 / 8) and np.flatnonzero(got[2]).tolist() == [3]
+    # The loop does not act while a reading is lost; with the same lengths read, it asks for the same.
+    readings[3] = controller.policy.sensor.readings(last_m)[3]
+    state, _ = with_goal(controller, start(controller), goal)
+    np.testing.assert_allclose(got[0], step(controller, state, readings, False)[0].reference_m, atol=1e-6)
+
+
+def test_draw_wires_without_a_sim_to_real_network(tmp_path):
+    sensor = {"kind": "draw_wire", "m_per_v": 0.1, "voltage_min_v": 0.0, "voltage_max_v": 5.0}
+    spec = ArmSpec.default().to_dict()
+    spec["sensor"] = {**sensor, "beta": 1.0, "delta_m": 0.01}
+    policy = dataclasses.replace(busy_policy(ArmSpec.from_dict(spec, "test")), s2r=None)
+    controller = Controller.of(policy)
+    onnx_files.write_onnx(tmp_path / "wires.onnx", computations.graph(controller), {}, {})
+    session = ort.InferenceSession(tmp_path / "wires.onnx")
+    readings, goal = np.linspace(1.5, 2.0, N), policy.workspace[0].astype(float)
+    state, _ = with_goal(controller, start(controller), goal)
+    state, _ = step(controller, state, readings, False)
+    feed = {"readings": readings, "goal": goal, "last_length_m": readings}
+    [reference_m] = session.run(["reference_m"], {name: np.float32(value) for name, value in feed.items()})
+    np.testing.assert_allclose(reference_m, state.reference_m, atol=1e-6)
+
+
+def test_other_graphs_are_refused(files, golden, tmp_path):
+    data, path = files[0].read_bytes(), tmp_path / "policy.onnx"
+
+    def refusal(content):
+        path.write_bytes(content)
+        with pytest.raises(InputError) as caught:
+            check(golden, path)
+        assert str(caught.value).startswith(f"{path}: ") and "\n" not in str(caught.value)
+        return str(caught.value)
+
+    assert "got no ONNX graph" in refusal(data[: len(data) // 2]) or "damaged" in refusal(
+        data[: len(data) // 2]
+    )
+    assert "got no ONNX graph" in refusal(b"PK\x03\x04 something else")
+    model = onnx.load_from_string(data)
+    [weight] = [item for item in model.graph.initializer if tuple(item.dims) == (18, 12)]
+    weight.raw_data = weight.raw_data[:-1] + bytes([weight.raw_data[-1] ^ 1])
+    assert "damaged" in refusal(model.SerializeToString())
+    del model.metadata_props[:]
+    assert "of another program" in refusal(model.SerializeToString())
+    assert "got actor, expected the graph" in refusal(files[1].read_bytes())
+
+
+def test_newer_graph_is_refused(controller, golden, tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(onnx_files, "SCHEMA_VERSION", 2)
+        onnx_files.write_onnx(tmp_path / "a.onnx", computations.actor(controller), {}, {})
+    with pytest.raises(InputError, match="schema_version: got 2, expected 1; `python -m train export"):
+        check(golden, tmp_path / "a.onnx")
