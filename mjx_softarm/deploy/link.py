@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import time
 import traceback
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -175,17 +176,19 @@ def describe(error: BaseException) -> str:
 
 
 class Recorder:
-    """Rows of a log in the making."""
+    """Rows of a log in the making; with `kept`, only so many of the newest. Its length counts all."""
 
-    def __init__(self) -> None:
-        self._rows: list[dict[str, Any]] = []
+    def __init__(self, kept: int | None = None) -> None:
+        self._rows: deque[dict[str, Any]] = deque(maxlen=kept)
+        self._n_rows = 0
 
     def __len__(self) -> int:
-        return len(self._rows)
+        return self._n_rows
 
     def add(self, row: dict[str, Any]) -> None:
         """Keep a row."""
         self._rows.append(row)
+        self._n_rows += 1
 
     def log(self, source: str, sensor: Sensor) -> Log:
         """Return the log so far of an arm with this sensor; NaN where a row has no value.
@@ -198,5 +201,5 @@ class Recorder:
             for name, shape in (shapes or {"time_s": ()}).items()
         }
         arrays["time_s"] = arrays["time_s"] - arrays["time_s"][:1]
-        row = np.arange(2, len(self) + 2)
+        row = np.arange(2, len(self._rows) + 2)
         return Log(source=source, row=row, reading_name=sensor.reading_name, **arrays)

@@ -21,6 +21,7 @@ from mjx_softarm.control import pressures, saturated
 from mjx_softarm.deploy import faults
 from mjx_softarm.deploy.controller import Controller, State, Tick
 from mjx_softarm.deploy.faults import Event, Fault, Response
+from mjx_softarm.deploy.link import VENT_KPA_PER_S
 from mjx_softarm.deploy.reachability import nearest
 from mjx_softarm.policy.runtime import tip_pose
 
@@ -39,6 +40,18 @@ def with_goal(controller: Controller, state: State, goal: np.ndarray) -> tuple[S
         far = f"{text} is {away:.1f} times as far from the nearest reachable pose as a goal may be"
         return state, (Event(Fault.GOAL_OUTSIDE, f"{far}; that pose is {near} [mm, deg]"),)
     return state._replace(goal=goal, n_actions=0, n_ticks=0), ()
+
+
+def hold(state: State) -> State:
+    """Return the state without a goal, the springs held as they were read last."""
+    if np.isnan(state.spring_m).any():
+        return state._replace(goal=None)
+    return state._replace(goal=None, reference_m=state.spring_m, n_ticks=0)
+
+
+def release(state: State) -> State:
+    """Return the state without goal and references, in which the pressures go to zero along the ramp."""
+    return state._replace(goal=None, reference_m=None)
 
 
 def step(controller: Controller, state: State, readings: np.ndarray | None, late: bool) -> tuple[State, Tick]:
@@ -66,13 +79,8 @@ def step(controller: Controller, state: State, readings: np.ndarray | None, late
     if known and not _stops(events) and state.goal is not None and not state.n_lost.any():
         state, found, arrived = _go(controller, state, at_rest)
         events += found
-    if not _stops(events) and state.reference_m is not None:
-        pressure_kpa, integral_kpa = pressures(
-            state.reference_m, state.spring_m, state.integral_kpa, controller.policy.gains, controller.dt_s
-        )
-        state = state._replace(
-            pressure_kpa=pressure_kpa, integral_kpa=integral_kpa, n_ticks=state.n_ticks + 1
-        )
+    if not _stops(events):
+        state = _with_pressures(controller, state)
     return state, Tick(state.spring_m, tuple(events), arrived)
 
 
@@ -86,6 +94,18 @@ def believed(controller: Controller, spring_m: np.ndarray) -> tuple[np.ndarray, 
         return np.full(6, np.nan), 0.0
     pose, away = tip_pose(controller.policy, spring_m)
     return pose, float(away)
+
+
+def _with_pressures(controller: Controller, state: State) -> State:
+    """Return the state with the next pressures: the law's; nearer to zero where there are no references."""
+    if state.reference_m is None:
+        step_kpa = VENT_KPA_PER_S * controller.dt_s
+        lower_kpa = state.pressure_kpa - np.clip(state.pressure_kpa, -step_kpa, step_kpa)
+        return state._replace(pressure_kpa=lower_kpa, integral_kpa=lower_kpa)
+    pressure_kpa, integral_kpa = pressures(
+        state.reference_m, state.spring_m, state.integral_kpa, controller.policy.gains, controller.dt_s
+    )
+    return state._replace(pressure_kpa=pressure_kpa, integral_kpa=integral_kpa, n_ticks=state.n_ticks + 1)
 
 
 def _stops(events: list[Event]) -> bool:

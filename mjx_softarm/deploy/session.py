@@ -7,9 +7,9 @@ neither is used for control.
 from __future__ import annotations
 
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -18,11 +18,12 @@ from mjx_softarm.deploy.controller import Controller, State, Tick, start
 from mjx_softarm.deploy.ending import DONE, FAULT, Ending, vent_at_end
 from mjx_softarm.deploy.faults import Event, Fault, Response
 from mjx_softarm.deploy.link import ArmFault, Link, Recorder
-from mjx_softarm.deploy.loop import believed, step, with_goal
+from mjx_softarm.deploy.loop import believed, hold, release, step, with_goal
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.sensing.pose import pose_error
 
 _ROUNDING_S = 1e-6  # by which a simulated tick may be longer than the period
+_KEPT = 1000  # rows, arrivals and faults of a run without a log
 
 
 class Arrival(NamedTuple):
@@ -31,6 +32,26 @@ class Arrival(NamedTuple):
     goal: np.ndarray  # (6,) [mm, deg]
     estimate: np.ndarray  # (6,) [mm, deg] pose believed in
     row: int  # index of the log's row
+
+
+class Orders(NamedTuple):
+    """Wishes for the next tick; of several, the safest is done."""
+
+    vent: bool = False  # let the pressures go to zero; a later goal brings the arm up again
+    hold: bool = False  # give up the goals and hold the springs where they are
+    goals: Sequence[np.ndarray] | None = None  # poses (6,) [mm, deg] in place of those before; None: as before
+
+
+class Pilot(Protocol):
+    """Someone who steers an arm while the loop runs. Neither method may wait: both stand in the tick."""
+
+    def orders(self) -> Orders:
+        """Return what is wished since the last tick."""
+        ...
+
+    def look(self, state: State, tick: Tick, row: dict[str, Any]) -> None:
+        """Take a tick: the state after it, its results, and the row that it logged."""
+        ...
 
 
 class Run(NamedTuple):
@@ -73,31 +94,54 @@ def follow(
         arrived: takes the index of each goal arrived at, as the arm rests there; for what a gripper does.
         save: writes the log, once the arm is vented.
     """
-    session = _Session(arm, controller, goals, duration_s, tell, arrived)
-    ending = vent_at_end(session.run, session.link, tell, lambda: save(session.log()))
-    return Run(
-        log=session.log(),
-        arrivals=tuple(session.arrivals),
-        events=tuple(session.events),
-        latency_s=np.array(session.latency_s),
-        ending=ending,
-    )
+    return _Session(arm, controller, goals, duration_s, tell, arrived).to_end(save)
+
+
+def steer(
+    arm: ArmIO,
+    controller: Controller,
+    pilot: Pilot,
+    tell: Callable[[str], None] = lambda text: None,
+    save: Callable[[Log], None] | None = None,
+) -> Run:
+    """Do what a pilot orders until something ends the run, then vent; `follow` explains the arguments.
+
+    Without `save` the run may last for days: only the newest rows, arrivals and faults are kept.
+    """
+    kept = None if save else _KEPT
+    return _Session(arm, controller, (), None, tell, pilot=pilot, kept=kept).to_end(save or (lambda log: None))
 
 
 class _Session:
-    """Mutable state of `follow`."""
+    """Mutable state of `follow` and `steer`."""
 
-    def __init__(self, arm: ArmIO, controller: Controller, goals, duration_s: float | None, tell, arrived):
-        self.controller, self.tell, self.arrived = controller, tell, arrived
+    def __init__(
+        self,
+        arm: ArmIO,
+        controller: Controller,
+        goals: Iterable[np.ndarray],
+        duration_s: float | None,
+        tell: Callable[[str], None],
+        arrived: Callable[[int], None] = lambda goal: None,
+        pilot: Pilot | None = None,
+        kept: int | None = None,
+    ):
+        self.controller, self.tell, self.arrived, self.pilot = controller, tell, arrived, pilot
         self.goals, self.duration_s, self.n_taken = list(goals), duration_s, 0
         self.state: State = start(controller)
-        self.link, self.rows = Link(arm, len(self.state.pressure_kpa), controller.dt_s), Recorder()
+        self.link, self.rows = Link(arm, len(self.state.pressure_kpa), controller.dt_s), Recorder(kept)
         self.began_s = self.link.now()
-        self.arrivals: list[Arrival] = []
-        self.events: list[Event] = []
-        self.latency_s: list[float] = []
+        self.arrivals: deque[Arrival] = deque(maxlen=kept)
+        self.events: deque[Event] = deque(maxlen=kept)
+        self.latency_s: deque[float] = deque(maxlen=kept)
         self.last: set[Fault] = set()
         self.late = False
+
+    def to_end(self, save: Callable[[Log], None]) -> Run:
+        """Run, vent, save the log, and return what came of it."""
+        ending = vent_at_end(self.run, self.link, self.tell, lambda: save(self.log()))
+        events, latency_s = tuple(self.events), np.array(self.latency_s)
+        return Run(self.log(), tuple(self.arrivals), events, latency_s, ending)
 
     def run(self) -> None:
         """Go through the goals.
@@ -151,15 +195,27 @@ class _Session:
         self._note(tick.events)
         if tick.arrived:
             self._arrive(row["goal"], row["estimate"])
+        if self.pilot:
+            self.pilot.look(self.state, tick, row)
 
     def _next_goal(self, now_s: float) -> bool:
         """Take the next accepted goal once the last is done; return False when goals or time are over."""
+        if self.pilot:
+            self._obey(self.pilot.orders())
         while self.state.goal is None and self.n_taken < len(self.goals):
             self.state, events = with_goal(self.controller, self.state, self.goals[self.n_taken])
             self.n_taken += 1
             self._note(events)
         over = self.duration_s is not None and now_s - self.began_s >= self.duration_s
-        return not over and self.state.goal is not None
+        return not over and (self.state.goal is not None or self.pilot is not None)
+
+    def _obey(self, orders: Orders) -> None:
+        if orders.vent or orders.hold:
+            self.goals, self.n_taken = [], 0
+            self.state = release(self.state) if orders.vent else hold(self.state)
+        elif orders.goals is not None:
+            self.goals, self.n_taken = list(orders.goals), 0
+            self.state = self.state._replace(goal=None)
 
     def _note(self, events: Sequence[Event]) -> None:
         """Count events; tell each but those that repeat the tick before, and those told at the end."""

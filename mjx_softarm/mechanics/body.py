@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mjx_softarm.spec import ArmSpec
+from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
 
 SPRING_WIDTH_M = 0.002  # radius of a spring, outside the circle that the springs stand on
 
@@ -16,6 +16,13 @@ SPRING_WIDTH_M = 0.002  # radius of a spring, outside the circle that the spring
 def ring_radius_m(spec: ArmSpec) -> float:
     """Return the outer radius of a ring."""
     return spec.geometry.spring_radius_m + SPRING_WIDTH_M
+
+
+def hole_directions(spec: ArmSpec) -> np.ndarray:
+    """Return the direction (n, 2) of each chamber, and of its spring, from its section's axis: x and y."""
+    first = np.radians(spec.geometry.first_chamber_deg)
+    angle = first + 2 * np.pi * np.arange(spec.n_chambers) / N_CHAMBERS_PER_SECTION
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
 def rim_points(radius_m: float, n: int = 16) -> np.ndarray:

@@ -1,10 +1,12 @@
-"""Random pressures that take an arm all over its workspace. NumPy alone: they drive a real arm, too."""
+"""Pressures and poses that take an arm over its workspace. NumPy alone: they drive a real arm, too."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from mjx_softarm.spec import ArmSpec
+
+CIRCLE_HEIGHT_MM = -575.0
 
 
 def random_pressures(spec: ArmSpec, n_poses: int, seed: int | np.random.Generator) -> np.ndarray:
@@ -20,3 +22,15 @@ def random_pressures(spec: ArmSpec, n_poses: int, seed: int | np.random.Generato
     low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
     swing = np.cos(np.random.default_rng(seed).uniform(0.0, np.pi, (n_poses, spec.n_chambers)))
     return low + (high - low) * 0.5 * (1.0 + swing)
+
+
+def circle_poses(n: int = 40, diameter_mm: float = 160.0, height_mm: float = CIRCLE_HEIGHT_MM) -> np.ndarray:
+    """Return poses (n, 6) [mm, deg] along a horizontal circle below the base, the tip hanging straight down.
+
+    The paper gives diameter and number of points but no height; at the default one, the paper's arm reaches
+    every point with 2 kPa to spare in each chamber.
+    """
+    angle = 2 * np.pi * np.arange(n) / n
+    radius, zero = 0.5 * diameter_mm, np.zeros(n)
+    columns = [radius * np.cos(angle), radius * np.sin(angle), np.full(n, height_mm), zero, zero, zero]
+    return np.stack(columns, axis=-1).astype(np.float32)

@@ -19,6 +19,7 @@ import numpy as np
 from jax import Array
 
 from mjx_softarm._support.small_matrices import block_diagonal, product
+from mjx_softarm.mechanics.body import hole_directions
 from mjx_softarm.mechanics.chain_hessian import ChainHessian
 from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK, Frames
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
@@ -70,9 +71,7 @@ class ArmParams(NamedTuple):
     def from_spec(cls, spec: ArmSpec, dtype: np.typing.DTypeLike = np.float32) -> ArmParams:
         """Return the numbers of `spec`, in SI units but for the pressures [kPa]."""
         n, per_section = spec.n_chambers, spec.structure.links_per_section
-        first = np.radians(spec.geometry.first_chamber_deg)
-        angle = first + 2 * np.pi * np.arange(n) / N_CHAMBERS_PER_SECTION
-        on_circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        on_circle = hole_directions(spec)
         axial = spec.backbone.axial_stiffness_n_per_m * per_section
         bending = spec.backbone.bending_stiffness_nm_per_rad * per_section
         values: dict[str, Any] = {

@@ -91,18 +91,3 @@ def extreme_poses(spec: ArmSpec) -> Settled:
     """
     levels = (spec.chambers.pressure_min_kpa, 0.0, spec.chambers.pressure_max_kpa)
     return settle_many(spec, np.array(list(itertools.product(levels, repeat=spec.n_chambers))))
-
-
-CIRCLE_HEIGHT_MM = -575.0
-
-
-def circle_poses(n: int = 40, diameter_mm: float = 160.0, height_mm: float = CIRCLE_HEIGHT_MM) -> np.ndarray:
-    """Return poses (n, 6) [mm, deg] along a horizontal circle below the base, the tip hanging straight down.
-
-    The paper gives diameter and number of points but no height; at the default one, the paper's arm reaches
-    every point with 2 kPa to spare in each chamber.
-    """
-    angle = 2 * np.pi * np.arange(n) / n
-    radius, zero = 0.5 * diameter_mm, np.zeros(n)
-    columns = [radius * np.cos(angle), radius * np.sin(angle), np.full(n, height_mm), zero, zero, zero]
-    return np.stack(columns, axis=-1).astype(np.float32)

@@ -17,7 +17,8 @@ from mjx_softarm._support.mjx import State
 from mjx_softarm.env import Randomisation, ReachEnv
 from mjx_softarm.mdp import rewards
 from mjx_softarm.mdp.actions import N_ACTIONS
-from mjx_softarm.mechanics.workspace import HELD_OUT_SEED, circle_poses
+from mjx_softarm.mechanics.excitation import circle_poses
+from mjx_softarm.mechanics.workspace import HELD_OUT_SEED
 from train.agent.learner import Learner
 
 N_GOALS = 2_000

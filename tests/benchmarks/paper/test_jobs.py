@@ -12,7 +12,7 @@ from benchmarks.paper.engine import SMOKE
 from benchmarks.paper.kinds import KINDS, Trial, learned_run, reach_run
 from benchmarks.paper.measure import load_outcome
 from mjx_softarm._support import cli
-from mjx_softarm.mechanics.workspace import circle_poses
+from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.policy.file import save_policy
 from mjx_softarm.policy.runtime import PolicyRunner
 from mjx_softarm.sensing.sensors import Sensor

@@ -20,7 +20,7 @@ from benchmarks.paper.summary import (
 )
 from benchmarks.paper.trials import FILMS, trainings, trials
 from mjx_softarm.mechanics.pipe import CrossPipe, clearance
-from mjx_softarm.mechanics.workspace import circle_poses
+from mjx_softarm.mechanics.excitation import circle_poses
 from tests.benchmarks.paper.made_up import (
     SPEC,
     TINY,
