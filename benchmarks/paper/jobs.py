@@ -146,8 +146,8 @@ class Scene(NamedTuple):
 
 def scene_of(folder: Path, settings: Settings, trial: Trial) -> Scene:
     """Return a trial's twin, in its pipe if it has one, its controller and its goals."""
-    from mjx_softarm.mechanics.pipe import CrossPipe
     from mjx_softarm.mechanics.excitation import circle_poses
+    from mjx_softarm.mechanics.pipe import CrossPipe
     from mjx_softarm.twin.arm import EVALUATION_SESSION, Twin
     from train.demos.demonstrations import load_demonstrations
     from train.demos.waypoints import task as task_of

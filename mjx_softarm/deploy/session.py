@@ -39,7 +39,7 @@ class Orders(NamedTuple):
 
     vent: bool = False  # let the pressures go to zero; a later goal brings the arm up again
     hold: bool = False  # give up the goals and hold the springs where they are
-    goals: Sequence[np.ndarray] | None = None  # poses (6,) [mm, deg] in place of those before; None: as before
+    goals: Sequence[np.ndarray] | None = None  # poses (6,) [mm, deg] in place of all others; None: as before
 
 
 class Pilot(Protocol):
@@ -108,8 +108,8 @@ def steer(
 
     Without `save` the run may last for days: only the newest rows, arrivals and faults are kept.
     """
-    kept = None if save else _KEPT
-    return _Session(arm, controller, (), None, tell, pilot=pilot, kept=kept).to_end(save or (lambda log: None))
+    session = _Session(arm, controller, (), None, tell, pilot=pilot, kept=None if save else _KEPT)
+    return session.to_end(save or (lambda log: None))
 
 
 class _Session:

@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation
 
 from mjx_softarm import ArmSpec
 from mjx_softarm.control import Gains, pressures
-from mjx_softarm.mechanics.mjcf import chamber_lengths, spring_lengths
 from mjx_softarm.mechanics.excitation import circle_poses
+from mjx_softarm.mechanics.mjcf import chamber_lengths, spring_lengths
 from mjx_softarm.mechanics.workspace import settle_many
 from mjx_softarm.sensing.pose import pose_error, pose_from_frame
 from mjx_softarm.sensing.sensors import Sensor

@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mjx_softarm.mechanics.pipe import PIPES_MM, CrossPipe
 from mjx_softarm.mechanics.excitation import circle_poses
+from mjx_softarm.mechanics.pipe import PIPES_MM, CrossPipe
 from mjx_softarm.sensing.pose import frame_from_pose
 from mjx_softarm.spec import ArmSpec
 

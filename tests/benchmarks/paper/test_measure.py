@@ -21,8 +21,8 @@ from mjx_softarm.deploy.ending import Ending
 from mjx_softarm.deploy.faults import Event, Fault
 from mjx_softarm.deploy.session import Arrival, Run
 from mjx_softarm.logs.schema import Log
-from mjx_softarm.mechanics.pipe import APPLE_KG, BALL_KG
 from mjx_softarm.mechanics.excitation import circle_poses
+from mjx_softarm.mechanics.pipe import APPLE_KG, BALL_KG
 from mjx_softarm.twin.arm import Twin
 from tests.benchmarks.paper.made_up import GRIPPER_M, N, made_up, make_policy
 

@@ -19,8 +19,8 @@ from benchmarks.paper.summary import (
     trial_rows,
 )
 from benchmarks.paper.trials import FILMS, trainings, trials
-from mjx_softarm.mechanics.pipe import CrossPipe, clearance
 from mjx_softarm.mechanics.excitation import circle_poses
+from mjx_softarm.mechanics.pipe import CrossPipe, clearance
 from tests.benchmarks.paper.made_up import (
     SPEC,
     TINY,
