@@ -67,9 +67,18 @@ def main(
         lines = [f"  {name:{width}}  {_line(command)}" for name, command in commands.items()]
         print("\n".join([f"usage: {prog} COMMAND [--help] ...", "", about, "", *lines]))
         return 0
-    try:
+
+    def run() -> int:
         name, command = read(prog, commands, words)
         return finish(name, command())
+
+    return guarded(run)
+
+
+def guarded(run: Callable[[], int]) -> int:
+    """Run a command; return its exit status, 2 after an error that its user can put right, 130 on Ctrl-C."""
+    try:
+        return run()
     except InputError as error:
         text = str(error)
     except OSError as error:

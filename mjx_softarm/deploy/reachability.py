@@ -8,9 +8,10 @@ import numpy as np
 
 from mjx_softarm._support.xp import Array, array_namespace
 from mjx_softarm.mdp.rewards import RewardConfig
-from mjx_softarm.sensing.pose import frame_from_pose
+from mjx_softarm.sensing.pose import frame_from_pose, pose_from_frame, share_of_turn
 
 _CHUNK = 256  # poses whose distances to all others are computed at once
+_INSIDE = 0.99  # of the limit: of a goal that was brought back into the workspace
 
 
 class Reachable(NamedTuple):
@@ -50,6 +51,18 @@ def distances(reachable: Reachable, goal: Array, reward: RewardConfig) -> Array:
     position_m, rotation = frame_from_pose(goal)
     position = 1e3 * reward.weight_per_mm * position_m
     return _distances(reachable, position[None], rotation.reshape(1, 9))[0] / reachable.limit
+
+
+def clamped(reachable: Reachable, goal: np.ndarray, reward: RewardConfig) -> np.ndarray:
+    """Return a goal (6,) [mm, deg] within the limit: itself, or on the way to it from the nearest pose."""
+    goal = np.asarray(goal, np.float64)
+    pose, away = nearest(reachable, goal, reward)
+    if away <= 1.0:
+        return goal
+    share = _INSIDE / away
+    (from_m, from_rotation), (to_m, to_rotation) = frame_from_pose(pose), frame_from_pose(goal)
+    rotation = share_of_turn(to_rotation @ from_rotation.T, np.array(share)) @ from_rotation
+    return pose_from_frame(from_m + share * (to_m - from_m), rotation)
 
 
 def _distances(reachable: Reachable, position: Array, rotation: Array) -> Array:

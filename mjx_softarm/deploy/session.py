@@ -98,13 +98,13 @@ def follow(
 
 
 def steer(
-    arm: ArmIO,
+    arm: Any,
     controller: Controller,
     pilot: Pilot,
     tell: Callable[[str], None] = lambda text: None,
     save: Callable[[Log], None] | None = None,
 ) -> Run:
-    """Do what a pilot orders until something ends the run, then vent; `follow` explains the arguments.
+    """Do what a pilot orders to an `ArmIO` until something ends the run, then vent; arguments as of `follow`.
 
     Without `save` the run may last for days: only the newest rows, arrivals and faults are kept.
     """

@@ -91,6 +91,15 @@ def frame_from_pose(pose: Array) -> tuple[Array, Array]:
     return 0.001 * pose[..., :3], xp.stack(rows, axis=-1).reshape(*pose.shape[:-1], 3, 3)
 
 
+def share_of_turn(rotation: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """Return shares (...,) of a turn (3, 3), about its own axis: matrices (..., 3, 3). NumPy only."""
+    w, *axis = quaternion_from_pose(pose_from_frame(np.zeros(3), rotation))
+    sine = np.linalg.norm(axis)
+    half = np.asarray(share) * (np.arctan2(sine, abs(w)) * np.sign(w))  # the shorter way round
+    along = np.multiply.outer(np.sin(half), np.array(axis) / max(sine, np.finfo(float).tiny))
+    return rotation_from_quaternion(np.concatenate([np.cos(half)[..., None], along], axis=-1))
+
+
 def pose_error(pose: Array, goal: Array) -> Array:
     """Return pose - goal, both (..., 6) [mm, deg], with angle differences wrapped into [-180, 180)."""
     xp = array_namespace(pose, goal)

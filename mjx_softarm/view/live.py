@@ -1,0 +1,177 @@
+"""The loop's side of the live view: an arm that is steered from a page, and tells it of each tick.
+
+The page's server is a process of its own. Nothing that a browser does, or does not, takes time from the loop:
+a tick leaves its numbers in the channel and takes the orders that are there.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mjx_softarm._support.errors import InputError
+from mjx_softarm.deploy.controller import Controller, State, Tick
+from mjx_softarm.deploy.ending import FAULT
+from mjx_softarm.deploy.reachability import clamped
+from mjx_softarm.deploy.session import Orders, Run, steer
+from mjx_softarm.logs.schema import Log
+from mjx_softarm.mechanics.excitation import circle_poses
+from mjx_softarm.policy.file import Policy
+from mjx_softarm.view.channel import End
+from mjx_softarm.view.look import look_at
+
+READY_S = 60.0  # for the server to start
+N_LINES = 4  # of what the loop told last, on the page
+_ROUNDS = 100  # of the circle
+
+
+class Setup(NamedTuple):
+    """Settings of the page's server."""
+
+    policy: Policy
+    arm: str  # name
+    host: str
+    port: int
+    carries: bool = False  # a payload can be attached to the arm
+
+
+class Paced:
+    """A simulated arm that is no faster than a real one."""
+
+    def __init__(self, arm: Any):
+        self._arm, self._began_s = arm, time.monotonic() - arm.time_s
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._arm, name)
+
+    def write_pressures(self, pressure_kpa: np.ndarray) -> None:
+        """Let a control period pass, then wait until it has; time lost before is not made up for."""
+        self._arm.write_pressures(pressure_kpa)
+        left_s = self._began_s + self._arm.time_s - time.monotonic()
+        self._began_s -= min(left_s, 0.0)
+        time.sleep(max(left_s, 0.0))
+
+
+class PagePilot:
+    """Orders from a page.
+
+    After Stop or Vent goals are ignored until somebody asks for motion anew, so that a page that goes on
+    sending goals undoes neither.
+    """
+
+    def __init__(self, end: End, arm: Any, controller: Controller, tell: Callable[[str], None]):
+        self._end, self._arm, self._controller = end, arm, controller
+        self._tell, self._said = tell, deque(maxlen=N_LINES)
+        self._armed, self._payload_kg, self._n_pages, self._lost = False, 0.0, 0, False
+        self._doing, self._goal = "waits", np.full(6, np.nan)
+        # A simulated arm begins by itself: it hits nobody.
+        self._first: dict[str, Any] = {"circle": True} if hasattr(arm, "time_s") else {}
+
+    def tell(self, text: str) -> None:
+        """Print a line, and show it on the page."""
+        self._tell(text)
+        self._said.append(text)
+
+    def orders(self) -> Orders:
+        """Return what the page asked for since the last tick."""
+        asked = self._first | self._end.take()
+        self._first = {}
+        self._count_pages(asked.get("pages", self._n_pages))
+        if "payload_kg" in asked:
+            self._payload_kg = asked["payload_kg"]
+            self._arm.attach(self._payload_kg)
+        if self._end.closed.is_set() and not self._lost:
+            self._lost = asked["hold"] = True
+            self.tell("the page's server has ended; the arm holds, Ctrl-C vents it")
+        if "vent" in asked or "hold" in asked:
+            self._armed, self._goal = False, np.full(6, np.nan)
+            return Orders(vent="vent" in asked, hold=True)
+        self._armed |= "circle" in asked or "follow" in asked
+        if "circle" in asked:
+            return Orders(goals=_ROUNDS * [self._clamped(goal) for goal in circle_poses()])
+        if "goal" in asked and self._armed:
+            return Orders(goals=[self._clamped(asked["goal"])])
+        return Orders()
+
+    def look(self, state: State, tick: Tick, row: dict[str, Any]) -> None:
+        """Show a tick on the page."""
+        self._doing = _doing(state, self._controller.policy.n_actions)
+        self._goal = self._goal if state.goal is None else state.goal  # shown until the arm is sent elsewhere
+        look = look_at(row, tick.spring_m, self._payload_kg)._replace(goal=self._goal)
+        self._end.put(look=look, doing=self._doing, armed=self._armed, lines=tuple(self._said))
+
+    def _clamped(self, goal: np.ndarray) -> np.ndarray:
+        return clamped(self._controller.reachable, goal, self._controller.policy.reward)
+
+    def _count_pages(self, n_pages: int) -> None:
+        if n_pages == 0 < self._n_pages:
+            self.tell(f"no page is open; the arm {self._doing}, as it did; Ctrl-C vents it")
+        self._n_pages = n_pages
+
+
+def _doing(state: State, n_actions: int) -> str:
+    """Return what the arm does, as the predicate of a sentence."""
+    if state.goal is not None:
+        return f"moves to its goal, action {max(state.n_actions, 1)} of {n_actions}"
+    if state.reference_m is None:
+        return "is being vented" if state.pressure_kpa.any() else "has no pressure"
+    return "holds"
+
+
+def live(
+    setup: Setup,
+    arm: Any,
+    tell: Callable[[str], None],
+    ready: Callable[[str], None] = lambda url: None,
+    save: Callable[[Log], None] | None = None,
+) -> Run:
+    """Steer an arm from a page until something ends it; after a fault the page stays until Ctrl-C.
+
+    Args:
+        setup: of the page.
+        arm: an `ArmIO`.
+        tell: takes a line for each arrival and each fault.
+        ready: takes the page's address.
+        save: writes the run's log.
+
+    Raises:
+        InputError: the page cannot be served.
+    """
+    from mjx_softarm.view.page import serve
+
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe()
+    process = context.Process(target=serve, args=(theirs, setup), daemon=True)
+    process.start()
+    theirs.close()
+    end, controller = End(ours), Controller.of(setup.policy)
+    try:
+        ready(_address(end))
+        pilot = PagePilot(end, arm, controller, tell)
+        arm = Paced(arm) if hasattr(arm, "time_s") else arm
+        run = steer(arm, controller, pilot, pilot.tell, save)
+        end.put(ended=run.ending.cause, vented=run.ending.vented)
+        if run.ending.status == FAULT:
+            tell("the page stays; Ctrl-C ends it")
+            with contextlib.suppress(KeyboardInterrupt):
+                end.closed.wait()
+    finally:
+        process.terminate()
+    return run
+
+
+def _address(end: End) -> str:
+    """Return the page's address once it is served."""
+    deadline_s = time.monotonic() + READY_S
+    while time.monotonic() < deadline_s and not end.closed.wait(0.02):
+        if "failed" in (said := end.take()):
+            raise InputError(said["failed"])
+        if "url" in said:
+            return said["url"]
+    raise InputError(f"view: got no page within {READY_S:g} s, expected one")

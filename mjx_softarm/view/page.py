@@ -1,0 +1,153 @@
+"""The page of the live view, served by a process of its own."""
+
+from __future__ import annotations
+
+import signal
+import time
+from multiprocessing.connection import Connection
+from typing import Any
+
+import numpy as np
+import viser
+
+from mjx_softarm.sensing.pose import pose_from_quaternion, quaternion_from_pose
+from mjx_softarm.view.channel import End
+from mjx_softarm.view.live import Setup
+from mjx_softarm.view.look import Limits, Look
+from mjx_softarm.view.panel import Panel, css
+from mjx_softarm.view.stage import GOAL, SATURATED, Stage, add_workspace, open_server, set_the_scene
+
+FRAME_S, BARS, TRACES = 0.02, 5, 10  # between frames; frames between bars, and between traces
+SILENT_S = 1.0  # after which the page says that the loop is not heard
+DRAG_S = 0.5  # after its last move for which the gizmo is the user's
+_BLUE, _GREY = "#2463a8", "#868e96"
+_STOP, _VENT = (
+    "Give up the goals, hold the arm where it is",
+    "Let the pressures go to zero; what it carries sinks",
+)
+_CIRCLE, _GIZMO = (
+    "Go round the paper's circle, point by point",
+    "Follow the goal that is dragged in the picture",
+)
+
+
+def serve(connection: Connection, setup: Setup) -> None:
+    """Serve the page until the loop's process ends; Ctrl-C is the loop's."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end = End(connection)
+    try:
+        server = open_server(setup.host, setup.port, setup.arm)
+    except OSError as error:
+        end.put(failed=f"--host, --port: got {setup.host}, {setup.port}: {error.strerror or error}")
+        end.closed.wait()
+        return
+    page = Page(server, end, setup)
+    end.put(url=f"http://{setup.host}:{server.get_port()}")
+    while not end.closed.wait(FRAME_S):
+        page.refresh()
+
+
+class Page:
+    """One arm with its gizmo, buttons, bars and traces, the same for all who look."""
+
+    def __init__(self, server: viser.ViserServer, end: End, setup: Setup):
+        self._server, self._end = server, end
+        self._known: dict[str, Any] = {"doing": "is not heard yet", "armed": False, "lines": ()}
+        self._n_frames, self._heard_s, self._moved_s = 0, time.monotonic(), -DRAG_S
+        self._at = np.full(6, np.nan)  # pose that the gizmo shows
+        spec = setup.policy.spec
+        set_the_scene(server, spec)
+        self._stage = Stage(server.scene, spec)
+        self._workspace = add_workspace(server.scene, setup.policy.workspace)
+        look = {"scale": 0.15, "depth_test": False, "visible": False}
+        self._gizmo = server.scene.add_transform_controls("/gizmo", **look)
+        self._button("Stop", "hold", _STOP, "orange", viser.Icon.HAND_STOP)
+        self._button("Vent", "vent", _VENT, "red", viser.Icon.WIND)
+        self._panel = Panel(server.gui, Limits.of(spec), spec.n_chambers)
+        with server.gui.add_folder("Move", order=0.5):
+            self._button("Circle", "circle", _CIRCLE, None, viser.Icon.CIRCLE)
+            self._button("Drag the goal", "follow", _GIZMO, None, viser.Icon.ARROWS_MOVE)
+            if setup.carries:
+                self._add_payload()
+            self._add_workspace_box()
+        self._listen()
+
+    def _button(self, label: str, name: str, hint: str, colour: Any, icon: Any) -> None:
+        order = 0.0 if colour else None
+        button = self._server.gui.add_button(label, hint=hint, color=colour, icon=icon, order=order)
+
+        @button.on_click
+        async def _(_: Any) -> None:  # in the server's own thread: no queue of others stands before it
+            self._end.put(**{name: True})
+
+    def _add_payload(self) -> None:
+        slider = self._server.gui.add_slider("payload [g]", 0, 1000, 50, 0, hint="Hung to the finger tips")
+
+        @slider.on_update
+        async def _(_: Any) -> None:
+            self._end.put(payload_kg=1e-3 * slider.value)
+
+    def _add_workspace_box(self) -> None:
+        box = self._server.gui.add_checkbox("reachable poses", False, hint="Where goals are kept")
+
+        @box.on_update
+        async def _(_: Any) -> None:
+            self._workspace.visible = box.value
+
+    def _listen(self) -> None:
+        @self._gizmo.on_update
+        async def _(_: Any) -> None:
+            self._moved_s = time.monotonic()
+            self._end.put(goal=pose_from_quaternion(self._gizmo.position, self._gizmo.wxyz))
+
+        async def count(_: viser.ClientHandle) -> None:
+            self._end.put(pages=len(self._server.get_clients()))
+
+        self._server.on_client_connect(count)
+        self._server.on_client_disconnect(count)
+
+    def refresh(self) -> None:
+        """Show the newest tick, if there is one."""
+        news = self._end.take()
+        self._known |= news
+        if "look" in news:
+            self._heard_s = time.monotonic()
+            self._n_frames += 1
+            with self._server.atomic():
+                self._show(news["look"])
+        if self._n_frames % BARS == 0 or "look" not in news:
+            self._show_text(time.monotonic() - self._heard_s)
+
+    def _show(self, look: Look) -> None:
+        self._stage.show(look)
+        self._show_gizmo(look)
+        if self._n_frames % BARS == 0:
+            self._panel.show_bars(look)
+        if self._n_frames % TRACES == 0:
+            self._panel.show_traces(look)
+
+    def _show_gizmo(self, look: Look) -> None:
+        """Keep the gizmo, unless it is dragged, at the loop's goal, or where it was left, or at the tip."""
+        armed = self._known["armed"]
+        at = next((pose for pose in (look.goal, self._at) if armed and np.isfinite(pose).all()), look.tip)
+        dragged = time.monotonic() - self._moved_s < DRAG_S
+        self._gizmo.visible = armed
+        if not dragged and np.isfinite(at).all() and not np.array_equal(at, self._at):
+            self._at = at
+            self._gizmo.position, self._gizmo.wxyz = 1e-3 * at[:3], quaternion_from_pose(at)
+
+    def _show_text(self, silent_s: float) -> None:
+        doing, lines, red = self._known["doing"], self._known["lines"], css(SATURATED)
+        if "ended" in self._known:
+            vented = "vented" if self._known["vented"] else "NOT VENTED, it may be under pressure"
+            title, colour, lines = (
+                f"The run has ended; the arm is {vented}",
+                red,
+                [*lines, self._known["ended"]],
+            )
+        elif silent_s > SILENT_S:
+            title, colour = f"The loop was not heard for {silent_s:.0f} s", red
+        else:
+            colours = {"moves": _BLUE, "holds": css(GOAL)}
+            title, colour = f"The arm {doing}", colours.get(doing.split()[0], _GREY)
+        self._panel.show_text(title, colour, self._known.get("look"), lines[::-1])

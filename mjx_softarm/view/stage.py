@@ -1,0 +1,148 @@
+"""One arm on viser's scene: bellows, rings, springs, gripper and payload, its tip, its goal and its trail.
+
+All copies of a part are one batched mesh, so that a frame is a few messages.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections import deque
+from typing import Any
+
+import numpy as np
+import viser
+
+from mjx_softarm.mechanics.body import SPRING_WIDTH_M, payload_radius_m, ring_radius_m
+from mjx_softarm.sensing.pose import quaternion_from_pose
+from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
+from mjx_softarm.view import meshes
+from mjx_softarm.view.look import Limits, Look
+from mjx_softarm.view.shape import COILS, FOLDS, Copies, shape
+
+SECTION_COLOURS = ((214, 90, 66), (235, 172, 70), (70, 140, 200))  # as in MuJoCo's pictures
+SATURATED, GOAL, SEEN = (226, 38, 77), (40, 160, 96), (124, 77, 210)
+_RING, _SPRING, _GRIPPER, _MOUNT = (62, 66, 74), (176, 182, 190), (52, 55, 62), (142, 147, 155)
+_PAYLOAD, _TRAIL = (52, 150, 66), (245, 130, 32)
+_TRAIL_POINTS, _TRAIL_STEP_M = 300, 2e-3
+_RING_M, _WIRE_M, _MOUNT_M = 0.005, 7e-4, (0.095, 0.04)  # height; radius; radius and height
+
+
+class Stage:
+    """One arm; several may stand side by side.
+
+    Args:
+        scene: of the server.
+        spec: the arm.
+        name: of its node.
+        place_m: (3,) of its base.
+    """
+
+    def __init__(self, scene: viser.SceneApi, spec: ArmSpec, name: str = "/arm", place_m=(0.0, 0.0, 0.0)):
+        self._spec, self._limits = spec, Limits.of(spec)
+        self._trail: deque[np.ndarray] = deque(maxlen=_TRAIL_POINTS)
+        self._marked: np.ndarray | None = None  # (n,) chambers drawn as saturated
+        scene.add_frame(name, show_axes=False, position=place_m)
+
+        def solid(path: str, mesh: meshes.Mesh, colour, **options: Any):
+            vertices, faces = mesh.vertices, mesh.faces
+            return scene.add_mesh_simple(f"{name}/{path}", vertices, faces, color=colour, **options)
+
+        def copies(path: str, mesh: meshes.Mesh, at: Copies, colour):
+            batch = mesh.vertices, mesh.faces, at.quaternion, at.position_m
+            colours = np.tile(np.array(colour, np.uint8), (len(at.pitch_m), 1))
+            looks = {"batched_scales": at.scales, "batched_colors": colours, "lod": "off"}
+            return scene.add_batched_meshes_simple(f"{name}/{path}", *batch, **looks)
+
+        def points(path: str, colour, size_m: float):
+            looks = {"point_size": size_m, "point_shape": "circle", "visible": False}
+            return scene.add_point_cloud(f"{name}/{path}", np.zeros((1, 3)), colour, **looks)
+
+        rest = shape(spec, self._rest_m(), np.full(6, np.nan))
+        turn = meshes.coil(1.6 * SPRING_WIDTH_M, _WIRE_M, spec.geometry.section_length_m / COILS)
+        solid("mount", meshes.disc(*_MOUNT_M), _MOUNT, position=(0.0, 0.0, _MOUNT_M[1] / 2))
+        self._rings = copies("rings", meshes.disc(ring_radius_m(spec), _RING_M), rest.rings, _RING)
+        self._folds = copies("bellows", meshes.fold(spec.geometry.chamber_diameter_m / 2), rest.folds, _RING)
+        self._coils = copies("springs", turn, rest.coils, _SPRING)
+        self._tip = scene.add_frame(f"{name}/tip", show_axes=False)
+        self._seen = scene.add_frame(f"{name}/seen", show_axes=False)
+        self._goal = scene.add_frame(f"{name}/goal", show_axes=False)
+        solid("tip/gripper", meshes.gripper(spec), _GRIPPER, flat_shading=True)
+        for path, colour in (("seen", SEEN), ("goal", GOAL)):
+            solid(f"{path}/gripper", meshes.gripper(spec), colour, opacity=0.4, flat_shading=True)
+        self._payload = scene.add_icosphere(
+            f"{name}/tip/payload", 1.0, color=_PAYLOAD, position=(0.0, 0.0, -spec.mass.gripper_length_m)
+        )
+        self._markers, self._path = points("markers", SEEN, 0.008), points("trail", _TRAIL, 0.003)
+
+    def show(self, look: Look) -> None:
+        """Draw a moment."""
+        spring_m = np.where(np.isnan(look.spring_m), self._rest_m(), look.spring_m)
+        now = shape(self._spec, spring_m, look.tip)
+        for handle, copies in ((self._rings, now.rings), (self._folds, now.folds), (self._coils, now.coils)):
+            handle.batched_positions, handle.batched_wxyzs = copies.position_m, copies.quaternion
+            handle.batched_scales = copies.scales
+        self._mark(self._limits.saturated(look))
+        self._tip.position, self._tip.wxyz = now.rings.position_m[-1], now.rings.quaternion[-1]
+        self._payload.visible = look.payload_kg > 0.0
+        self._payload.scale = payload_radius_m(look.payload_kg)
+        for handle, pose in ((self._seen, look.seen), (self._goal, look.goal)):
+            handle.visible = bool(np.isfinite(pose).all())
+            if handle.visible:
+                handle.position, handle.wxyz = 1e-3 * pose[:3], quaternion_from_pose(pose)
+        if len(look.marker_m) and np.isfinite(look.marker_m).all():
+            self._markers.points, self._markers.visible = look.marker_m, True
+        self._follow(now.rings.position_m[-1])
+
+    def _follow(self, tip_m: np.ndarray) -> None:
+        if not self._trail or np.linalg.norm(tip_m - self._trail[-1]) > _TRAIL_STEP_M:
+            self._trail.append(tip_m)
+            self._path.points, self._path.visible = np.array(self._trail), True
+
+    def _rest_m(self) -> np.ndarray:
+        return np.full(self._spec.n_chambers, self._spec.geometry.section_length_m)
+
+    def _mark(self, saturated: np.ndarray) -> None:
+        """Colour the bellows; only when that changes is it sent."""
+        if self._marked is None or not np.array_equal(saturated, self._marked):
+            self._marked = saturated
+            own = np.array([section_colour(k) for k in range(len(saturated))])
+            colour = np.where(saturated[:, None], SATURATED, own).astype(np.uint8)
+            self._folds.batched_colors = np.repeat(colour, FOLDS, axis=0)
+
+
+def section_colour(chamber: int) -> tuple[int, int, int]:
+    """Return the colour of a chamber's section."""
+    return SECTION_COLOURS[chamber // N_CHAMBERS_PER_SECTION % len(SECTION_COLOURS)]
+
+
+def add_workspace(scene: viser.SceneApi, pose: np.ndarray) -> viser.PointCloudHandle:
+    """Add the reachable poses (m, 6) [mm, deg] as points, the deeper the darker; hidden at first."""
+    depth = (pose[:, 2:3].max() - pose[:, 2:3]) / max(float(np.ptp(pose[:, 2])), 1.0)
+    colours = (depth * (38, 84, 160) + (1 - depth) * (120, 200, 235)).astype(np.uint8)
+    looks = {"point_size": 0.004, "point_shape": "circle", "visible": False}
+    return scene.add_point_cloud("/workspace", 1e-3 * pose[:, :3], colours, **looks)
+
+
+def open_server(host: str, port: int, label: str) -> viser.ViserServer:
+    """Return a server that prints nothing.
+
+    Raises:
+        OSError: it cannot listen there.
+    """
+    with contextlib.redirect_stdout(None):
+        return viser.ViserServer(host, port, label=label, verbose=False)
+
+
+def set_the_scene(server: viser.ViserServer, spec: ArmSpec, width_m: float = 0.0) -> None:
+    """Set theme, floor and camera for arms side by side along y over a width [m]."""
+    length_m = spec.structure.n_sections * spec.geometry.section_length_m + spec.mass.gripper_length_m
+    server.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(36, 99, 168))
+    server.scene.set_up_direction("+z")
+    server.scene.configure_default_lights(cast_shadow=False)
+    server.scene.configure_environment_map("studio", environment_intensity=0.4)
+    middle, floor = (0.0, width_m / 2, -0.55 * length_m), (0.0, width_m / 2, -1.3 * length_m)
+    lines = {"cell_size": 0.1, "cell_color": (228, 231, 236), "section_color": (205, 210, 217)}
+    server.scene.add_grid("/floor", 1.6, 1.6 + width_m, position=floor, section_size=0.4, **lines)
+    away_m = 1.35 * length_m + 1.2 * width_m
+    server.initial_camera.position = (away_m, width_m / 2 - 0.5 * away_m, -0.3 * length_m)
+    server.initial_camera.look_at = middle

@@ -1,0 +1,79 @@
+"""An arm that a pilot steers: goals taken and given up, springs held, pressures let go, all ends vented."""
+
+import numpy as np
+import pytest
+
+from mjx_softarm.deploy.ending import FAULT
+from mjx_softarm.deploy.link import VENT_KPA_PER_S
+from mjx_softarm.deploy.session import Orders, steer
+from tests.linear_arm import CONTROLLER, DT_S, GOALS, SPRINGS_M, LinearArm, read_m
+
+
+class Stop(Exception):
+    """The pilot has had enough."""
+
+
+class Script:
+    """Orders by tick."""
+
+    def __init__(self, orders, n_ticks):
+        self.script, self.n_ticks, self.tick, self.states = orders, n_ticks, -1, []
+
+    def orders(self):
+        self.tick += 1
+        if self.tick == self.n_ticks:
+            raise Stop
+        return self.script.get(self.tick, Orders())
+
+    def look(self, state, tick, row):
+        self.states.append(state)
+
+
+def fly(orders, n_ticks, **kwargs):
+    arm, pilot = LinearArm(), Script(orders, n_ticks)
+    return arm, pilot, steer(arm, CONTROLLER, pilot, **kwargs)
+
+
+def test_goals_come_and_go():
+    _, _, run = fly({5: Orders(goals=GOALS[:1]), 20: Orders(goals=GOALS[1:])}, 700)
+    np.testing.assert_array_equal(run.log.goal[6], GOALS[0])
+    np.testing.assert_array_equal(run.log.goal[30], GOALS[1])
+    assert np.isnan(run.log.goal[:5]).all() and [a.goal.tolist() for a in run.arrivals] == [GOALS[1].tolist()]
+    np.testing.assert_allclose(read_m(run.log)[-1], SPRINGS_M[1], atol=5e-4)  # held after the arrival
+
+
+def test_hold_stops_the_arm_where_it_is():
+    arm, _, run = fly({0: Orders(goals=GOALS), 12: Orders(hold=True)}, 200)
+    spring_m = read_m(run.log)
+    assert np.isnan(run.log.goal[12:]).all() and run.arrivals == ()
+    np.testing.assert_allclose(spring_m[-50:].mean(axis=0), spring_m[11], atol=1e-3)
+    assert np.abs(run.log.pressure_kpa[-1]).max() > 1.0  # still under pressure
+    np.testing.assert_array_equal(arm.command_kpa, 0.0)  # at the end it is not
+
+
+def test_vent_lets_the_pressures_go_and_a_goal_brings_them_back():
+    _, _, run = fly({0: Orders(goals=GOALS), 60: Orders(vent=True), 250: Orders(goals=GOALS[:1])}, 600)
+    kpa = run.log.pressure_kpa
+    assert np.abs(np.diff(kpa[61:200], axis=0)).max() <= VENT_KPA_PER_S * DT_S + 1e-9
+    assert np.all(np.diff(np.abs(kpa[61:200]), axis=0) <= 0.0) and not kpa[200:250].any()
+    np.testing.assert_allclose(read_m(run.log)[-1], SPRINGS_M[0], atol=5e-4)
+
+
+@pytest.mark.parametrize("others", [{"hold": True}, {"goals": GOALS}])
+def test_the_safest_order_wins(others):
+    _, pilot, _ = fly({0: Orders(goals=GOALS), 60: Orders(vent=True, **others)}, 61)
+    assert pilot.states[-1].goal is None and pilot.states[-1].reference_m is None
+
+
+def test_a_pilot_that_fails_ends_the_run_vented():
+    arm, _, run = fly({0: Orders(goals=GOALS)}, 50)
+    assert run.status == FAULT and run.ending.vented and "Stop" in run.ending.cause
+    np.testing.assert_array_equal(arm.command_kpa, 0.0)
+
+
+def test_a_run_without_a_log_does_not_grow():
+    _, _, run = fly({0: Orders(goals=GOALS)}, 1200)
+    assert len(run.log) == 1000 and run.log.row[-1] == 1001
+    saved = []
+    _, _, run = fly({0: Orders(goals=GOALS)}, 1200, save=saved.append)
+    assert len(saved[0]) == 1200
