@@ -71,7 +71,7 @@ def _run(
     if not duration > 0.0:
         raise InputError(f"--duration: got {duration:g}, expected a number > 0")
     controller = Controller.of(load_policy(policy))
-    _check_file("--log", log)
+    check_file("--log", log)
     limit_s = None if np.isinf(duration) else duration
     save = partial(save_log, log) if log else lambda log: None
     run = follow(open_arm(arm), controller, list(map(np.array, goal)), limit_s, _tell, save=save)
@@ -105,7 +105,7 @@ def _record(
     if poses < 1:
         raise InputError(f"--poses: got {poses}, expected at least 1")
     arm_spec = cli.arm_of(spec)
-    _check_file("--out", out)
+    check_file("--out", out)
     if out.exists():
         raise InputError(f"--out: got {out}, which is there already, expected a new file")
     targets_kpa = random_pressures(arm_spec, poses, seed)
@@ -127,7 +127,7 @@ def _tell(text: str) -> None:
     print(text, flush=True)
 
 
-def _check_file(option: str, path: Path | None) -> None:
+def check_file(option: str, path: Path | None) -> None:
     """Refuse a log that could not be written before the arm moves."""
     if path is not None and not path.parent.is_dir():
         raise InputError(f"{option}: got {path}, expected a file in a folder that exists")

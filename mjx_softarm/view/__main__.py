@@ -8,10 +8,13 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from functools import partial
+from pathlib import Path
+
+import tyro
 
 from mjx_softarm._support import cli
 from mjx_softarm._support.errors import InputError
-from mjx_softarm.deploy.__main__ import Arm
+from mjx_softarm.deploy.__main__ import Arm, check_file
 from mjx_softarm.deploy.arms import open_arm
 from mjx_softarm.deploy.ending import save_log
 from mjx_softarm.policy.file import load_policy
@@ -26,32 +29,62 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _view(
+    logs: tyro.conf.Positional[tuple[Path, ...]] = (),
     policy: cli.MaybePath = None,
     arm: Arm = "twin:7",
     log: cli.MaybePath = None,
+    spec: cli.SpecFile = None,
+    html: cli.MaybePath = None,
     host: str = HERE,
     port: int = 8080,
 ) -> int:
-    """Show an arm in the browser and steer it there.
+    """Show an arm in the browser and steer it there; or, with logs, replay these side by side.
 
     Args:
-        policy: file that `python -m train export` wrote
-        log: file for the run's log, CSV or npz
-        host: address to listen on; another one lets everybody who reaches it move the arm
+        logs: of `deploy run` and `record`, CSV or npz
+        policy: file that `python -m train export` wrote, to steer with
+        log: file for the log of the steered run, CSV or npz
+        html: file to write the logs to, as a page that plays without a server
+        host: address to listen on; with another one everybody who reaches it can move the arm
         port: port to listen on; the next free one, if it is taken
     """
     try:
         import viser  # noqa: F401
     except ImportError as error:
         raise InputError(f"the view needs viser (pip install 'mjx-softarm[view]'): {error}") from error
+    for option, path in (("--log", log), ("--html", html)):
+        check_file(option, path)
+    if logs:
+        return _replay(logs, cli.arm_of(spec), html, host, port)
+    if html is not None:
+        raise InputError("--html: got no log, expected one or more, which are then written")
+    if policy is None:
+        made = "`make demo` trains one, `python -m train export RUN` writes its file"
+        raise InputError(f"--policy: got nothing, expected a policy; {made}")
+    return _live(load_policy(policy), arm, log, host, port)
+
+
+def _live(policy, arm: str, log: Path | None, host: str, port: int) -> int:
     from mjx_softarm.view.live import Setup, live
 
-    if policy is None:
-        made = "`make demo` trains one in two minutes and writes runs/quick/policy.npz"
-        raise InputError(f"--policy: got nothing, expected a policy; {made}")
     io, save = open_arm(arm), partial(save_log, log) if log else None
-    setup = Setup(load_policy(policy), arm, host, port, hasattr(io, "attach"))
+    setup = Setup(policy, arm, host, port, hasattr(io, "attach"))
     return live(setup, io, _tell, partial(_welcome, host), save).status
+
+
+def _replay(logs: tuple[Path, ...], spec, html: Path | None, host: str, port: int) -> int:
+    from mjx_softarm.view.replay import Track, replay, share
+    from mjx_softarm.view.stage import open_server
+
+    tracks = [Track(path, spec) for path in logs]
+    if html is not None:
+        speed = share(html, spec, tracks)
+        _tell(f"wrote {html}, {html.stat().st_size / 1e6:.1f} MB" + f", {speed} times as fast" * (speed > 1))
+        return 0
+    server = open_server(host, port, ", ".join(track.name for track in tracks))
+    _tell(f"open http://{host}:{server.get_port()}; Ctrl-C ends")
+    replay(server, spec, tracks)
+    return 0
 
 
 def _welcome(host: str, url: str) -> None:

@@ -138,8 +138,8 @@ def set_the_scene(server: viser.ViserServer, spec: ArmSpec, width_m: float = 0.0
     length_m = spec.structure.n_sections * spec.geometry.section_length_m + spec.mass.gripper_length_m
     server.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(36, 99, 168))
     server.scene.set_up_direction("+z")
-    server.scene.configure_default_lights(cast_shadow=False)
-    server.scene.configure_environment_map("studio", environment_intensity=0.4)
+    server.scene.configure_default_lights(False)
+    server.scene.configure_environment_map("studio", environment_intensity=0.9)
     middle, floor = (0.0, width_m / 2, -0.55 * length_m), (0.0, width_m / 2, -1.3 * length_m)
     lines = {"cell_size": 0.1, "cell_color": (228, 231, 236), "section_color": (205, 210, 217)}
     server.scene.add_grid("/floor", 1.6, 1.6 + width_m, position=floor, section_size=0.4, **lines)

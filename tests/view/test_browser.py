@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from calib.read.logs import read_log
+from mjx_softarm.logs.schema import write_log
 from mjx_softarm.policy.file import save_policy
-from tests.linear_arm import POLICY, SPEC
+from tests.linear_arm import GOALS, POLICY, SPEC, LinearArm, go
 
 ROOT = Path(__file__).resolve().parents[2]
 WIDTH, HEIGHT = 1000, 700
@@ -83,3 +84,19 @@ def test_goal_is_dragged_and_the_arm_stopped_and_vented(browser, live):
     goal = read_log(path)[0].goal
     dragged = goal[np.isfinite(goal[:, 0]) & (np.abs(goal[:, 0] - goal[0, 0]) > 1e-6)]
     assert dragged[-1, 2] > 1e3 * before_m[2] + 10.0  # [mm]
+
+
+def test_shared_file_plays_without_a_server(browser, tmp_path):
+    from mjx_softarm.view.replay import Track, share
+
+    write_log(tmp_path / "run.csv", go(LinearArm(), goals=GOALS[:1], duration_s=2.0).log)
+    share(tmp_path / "run.html", SPEC, [Track(tmp_path / "run.csv", SPEC)])
+    context = browser.new_context(offline=True, viewport={"width": 500, "height": 400})
+    page, errors = context.new_page(), []
+    page.on("pageerror", lambda error: errors.append(error))
+    page.goto((tmp_path / "run.html").as_uri())
+    page.wait_for_selector("canvas")
+    later = "Number(document.querySelector('input').value) > 0.3"  # of the time at the foot of the page
+    page.wait_for_function(later, timeout=30_000)
+    assert not errors
+    context.close()

@@ -1,0 +1,123 @@
+"""Logs in the browser: scrubbed at any speed, side by side, or as one file that plays without a server."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import viser
+
+from mjx_softarm._support.errors import InputError
+from mjx_softarm.logs.checks import late_rows
+from mjx_softarm.logs.files import read_matrix
+from mjx_softarm.sensing.sensors import Sensor
+from mjx_softarm.spec import ArmSpec
+from mjx_softarm.view.look import Limits, Look, looks
+from mjx_softarm.view.panel import Panel
+from mjx_softarm.view.stage import Stage, open_server, set_the_scene
+
+APART_M = 0.6  # bases of arms side by side
+FRAME_S, TRACES_S = 0.04, 0.2  # between frames, and between points of the traces
+SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4", "10", "30")
+SHARE_HZ, SHARE_FRAMES = 10.0, 600  # a longer log is shared faster than it was
+_BLUE = "#2463a8"
+
+
+class Track:
+    """One log on the common time line, which begins with its first row.
+
+    Raises:
+        LogError: the log cannot be understood, or has nothing to draw an arm by.
+        InputError: it has no rows.
+    """
+
+    def __init__(self, path: Path, spec: ArmSpec):
+        log = read_matrix(path, spec.n_chambers, one_of=("readings", "spring_m"))[0].log()
+        log = log.take(np.isfinite(log.time_s))
+        log = log.take(~late_rows(log.time_s))
+        if not len(log):
+            raise InputError(f"{path}: got no rows, expected some")
+        self.name, self._time_s = path.name, log.time_s - log.time_s[0]
+        self._look, self.end_s = looks(log, Sensor.from_spec(spec)), float(self._time_s[-1])
+
+    def at(self, time_s: float) -> Look:
+        """Return the last look up to a time."""
+        row = int(np.searchsorted(self._time_s, time_s, side="right")) - 1
+        return self._look(max(row, 0))._replace(time_s=float(self._time_s[max(row, 0)]))
+
+
+class Replay:
+    """Logs on a page, with a slider of time and a speed."""
+
+    def __init__(self, server: viser.ViserServer, spec: ArmSpec, tracks: Sequence[Track]):
+        self._server, self._tracks, self._traced_s = server, tracks, -np.inf
+        self._stages, end_s = _stages(server, spec, tracks), max(track.end_s for track in tracks)
+        gui = server.gui
+        self._play = gui.add_checkbox("play", True, order=0.0)
+        self._speed = gui.add_dropdown("speed", SPEEDS, initial_value="1", order=0.1)
+        self._time = gui.add_slider("time [s]", 0.0, max(end_s, FRAME_S), FRAME_S / 2, 0.0, order=0.1)
+        self._panels = []
+        for track in tracks:
+            with gui.add_folder(track.name):
+                self._panels.append(Panel(gui, Limits.of(spec), spec.n_chambers))
+        self._shown_s, self._end_s = -1.0, end_s
+
+    def refresh(self, passed_s: float) -> None:
+        """Go on by a time [s] of the clock, and show the moment if it is another."""
+        if self._play.value:
+            later_s = self._time.value + passed_s * float(self._speed.value)
+            self._time.value = later_s if later_s <= self._end_s else 0.0
+        if self._time.value != self._shown_s:
+            self._shown_s = self._time.value
+            traced = abs(self._shown_s - self._traced_s) >= TRACES_S
+            self._traced_s = self._shown_s if traced else self._traced_s
+            with self._server.atomic():
+                for track, stage, panel in zip(self._tracks, self._stages, self._panels, strict=True):
+                    look = track.at(self._shown_s)
+                    stage.show(look)
+                    if traced:
+                        panel.show_bars(look)
+                        panel.show_traces(look)
+                        panel.show_text(f"{look.time_s:.2f} s of {track.end_s:.1f} s", _BLUE, look)
+
+
+def replay(server: viser.ViserServer, spec: ArmSpec, tracks: Sequence[Track]) -> None:
+    """Serve logs until Ctrl-C."""
+    page, before_s = Replay(server, spec, tracks), time.monotonic()
+    while True:
+        now_s = time.monotonic()
+        page.refresh(now_s - before_s)
+        before_s = now_s
+        time.sleep(FRAME_S)
+
+
+def share(path: Path, spec: ArmSpec, tracks: Sequence[Track]) -> int:
+    """Write a page that plays logs without a server; return how many times as fast as they were."""
+    end_s = max(track.end_s for track in tracks)
+    speed = max(1, math.ceil(end_s * SHARE_HZ / SHARE_FRAMES))
+    server = open_server("127.0.0.1", 8080, "")
+    stages = _stages(server, spec, tracks)
+    times_s = np.arange(0.0, end_s + 1e-9, speed / SHARE_HZ)
+    recording = server.get_scene_serializer()
+    for time_s in times_s:
+        for track, stage in zip(tracks, stages, strict=True):
+            stage.show(track.at(time_s))
+        recording.insert_sleep(1.0 / SHARE_HZ)
+    path.write_text(recording.as_html(), "utf-8")
+    with contextlib.redirect_stdout(None):
+        server.stop()
+    return speed
+
+
+def _stages(server: viser.ViserServer, spec: ArmSpec, tracks: Sequence[Track]) -> list[Stage]:
+    """Set the scene, and return a stage for each log, named and side by side."""
+    set_the_scene(server, spec, APART_M * (len(tracks) - 1))
+    stages = []
+    for k, track in enumerate(tracks):
+        stages.append(Stage(server.scene, spec, f"/arm{k}", (0.0, k * APART_M, 0.0)))
+        server.scene.add_label(f"/arm{k}/name", track.name, position=(0.0, 0.0, 0.09))
+    return stages
