@@ -15,45 +15,22 @@ from mjx_softarm._support import cli
 
 # By name, the function that measures and what it measures. It returns figures, or an exit status.
 BENCHMARKS = {
-    "throughput": (
-        "benchmarks.speed.throughput:measure",
-        "env steps/s over arms and links, beside C MuJoCo in time steps; start-up times",
-    ),
-    "settle": (
-        "benchmarks.speed.settle:measure",
-        "error, speed and compile time of Newton against time stepping",
-    ),
-    "kernels": (
-        "benchmarks.speed.kernels:measure",
-        "kernels that a GPU is given, loop by loop; compiled for an H200 where there is none",
-    ),
-    "learner": (
-        "benchmarks.speed.learner:measure",
-        "gradient updates/s over batch sizes, against sb3-contrib, SBX and brax",
-    ),
+    "throughput": ("benchmarks.speed.throughput:measure", "env steps/s beside C MuJoCo's; start-up times"),
+    "settle": ("benchmarks.speed.settle:measure", "error and speed of Newton's method and of time stepping"),
+    "kernels": ("benchmarks.speed.kernels:measure", "kernels of a GPU loop by loop; of an H200 without one"),
+    "learner": ("benchmarks.speed.learner:measure", "gradient updates/s beside sb3-contrib, SBX and brax"),
     "guard": ("benchmarks.speed.guard:main", "speed against a stored baseline, in four minutes"),
-    "calibration": (
-        "benchmarks.accuracy.calibration:measure",
-        "errors of springs and chambers on a planted arm",
-    ),
+    "calibration": ("benchmarks.accuracy.calibration:measure", "errors of calibration on a planted arm"),
     "logs": ("benchmarks.accuracy.logs:measure", "errors of calibration on public logs of real arms"),
-    "learning": (
-        "benchmarks.accuracy.learning:measure",
-        "tip errors of finished runs, over the seeds of the same settings",
-    ),
-    "race": (
-        "benchmarks.race.race:race",
-        "time to a tip error against sb3-contrib and SBX, two hours a seed",
-    ),
+    "learning": ("benchmarks.accuracy.learning:measure", "tip errors of finished runs over their seeds"),
+    "race": ("benchmarks.race.race:race", "time to a tip error beside sb3-contrib and SBX, two hours a seed"),
     "paper": ("benchmarks.paper.experiments:paper", "the paper's experiments on twins, in hours"),
 }
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a benchmark; returns the exit status."""
-    about = (
-        "Benchmarks print tables and write JSON, with machine, versions and commit, to benchmarks/results."
-    )
+    about = "Print tables, and write JSON with machine, versions and commit to benchmarks/results."
     return cli.main("python -m benchmarks", about, BENCHMARKS, arguments, _finish)
 
 

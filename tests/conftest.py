@@ -1,4 +1,4 @@
-"""What tests share: the paper's arm and its environment, built and compiled once."""
+"""Fixtures that tests share: the paper's arm and its environment, built and compiled once."""
 
 import itertools
 
@@ -13,14 +13,29 @@ from mjx_softarm.policy.file import ArmModel
 from mjx_softarm.sensing.estimator import N_CHANGES, PoseEstimator, SpringModel
 from mjx_softarm.sensing.s2r import N_POSE_INPUTS, N_POSE_OUTPUTS, S2R
 
-jax.config.update("jax_num_cpu_devices", 8)  # of which most tests use one
-N_ARMS = 512  # of every call of `reset` and `step`: another number would compile anew
+jax.config.update("jax_num_cpu_devices", 8)  # most tests use one of them
+N_ARMS = 512  # in each call of `reset` and `step`: another number would compile anew
 
 
 @pytest.fixture(scope="session", autouse=True)
 def compilation_cache():
     """Compile once per machine rather than once per run."""
     xla.enable_compilation_cache()
+
+
+@pytest.fixture(scope="module")
+def quick_compiler():
+    """Twice as fast to compile what runs for milliseconds."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
+@pytest.fixture(scope="module")
+def strict():
+    """Neither dtypes nor ranks are promoted."""
+    with jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -36,9 +36,6 @@ def changed(data, path, value):
     return data
 
 
-# --- the packaged arm ------------------------------------------------------------------------------
-
-
 def test_default_is_the_paper_s_arm(spec):
     paper = {
         "structure.n_sections": 3,
@@ -69,30 +66,12 @@ def test_derived_counts_and_lengths(spec):
     assert spec.per_chamber(spec.replace(chambers={"area_m2": areas}).chambers.area_m2) == areas
 
 
-# --- round trips and replacement -------------------------------------------------------------------
-
-
-def test_whole_numbers_are_read_as_floats(spec):
-    spec = spec.replace(sensor={"beta": [1] * 9}, mass={"arm_kg": 4})
-    assert isinstance(spec.sensor.beta[0], float) and isinstance(spec.mass.arm_kg, float)
-
-
-def test_replace_changes_only_what_it_names_and_leaves_the_original(spec):
-    before = spec.to_dict()
-    new = spec.replace(name="heavy", mass={"payload_kg": 0.2}, structure={"links_per_section": 6})
-    assert spec.to_dict() == before
-    assert (new.name, new.mass.payload_kg, new.n_links) == ("heavy", 0.2, 18)
-    assert new.replace(name=spec.name, mass={"payload_kg": 0.0}, structure={"links_per_section": 4}) == spec
-
-
 def test_another_number_of_sections_needs_no_new_scalars(spec):
     assert spec.replace(structure={"n_sections": 2}).n_chambers == 6
     beta = {"beta": [0.93] * 9}
     text = message_of(spec.replace(sensor=beta).replace, structure={"n_sections": 2})
     assert text == "replace: sensor.beta: got 9 numbers, expected one, or one for each of the 6 chambers"
 
-
-# --- what is refused -------------------------------------------------------------------------------
 
 REFUSED = [
     # field, value, what the message expects
@@ -185,8 +164,6 @@ def test_lengths_that_the_sensor_cannot_read_are_refused(change, field):
     with pytest.raises(SpecError, match=rf"springs\.{field}: .* reads .* expected sensor\.frequency_min_hz"):
         ArmSpec.default().replace(**change)
 
-
-# --- all specifications ------------------------------------------------------------------------------------
 
 POSITIVE = st.floats(1e-6, 1e6)
 

@@ -78,11 +78,7 @@ def trunk_errors(
 ) -> dict[str, float]:
     """Return tip errors on fresh held-out rows; motor angles replace springs, a line the simulator.
 
-    Args:
-        data: folder of the real logs.
-        log: "1" or "11".
-        held_out: number of rows -> mask of held-out rows.
-        history: extrapolate the angles, see `motor_angles`.
+    The log is "1" or "11"; with `history`, its angles are extrapolated, see `motor_angles`.
     """
     trunk, _ = read_trunk(data / TRUNK_LOG.format(log))
     x = motor_angles(trunk.motor_deg) if history else trunk.motor_deg

@@ -27,12 +27,12 @@ def in_parallel(jobs: Sequence[Job]) -> dict[str, Any]:
         JobError: one failed; those under way are finished, the others are not begun.
     """
     context = multiprocessing.get_context("spawn")
-    cores = _shares(sorted(os.sched_getaffinity(0))) if hasattr(os, "sched_setaffinity") else [[]]
-    queue = context.Queue()
-    for share in cores:
-        queue.put(share)
+    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_setaffinity") else []
+    n, queue = min(N_WORKERS, len(cores) or 1), context.Queue()
+    for k in range(n):
+        queue.put(cores[k::n])
     given: dict[str, Any] = {}
-    pool = ProcessPoolExecutor(len(cores), context, _settle_worker, (queue,))
+    pool = ProcessPoolExecutor(n, context, _settle_worker, (queue,))
     try:
         waiting = {pool.submit(function, *arguments): name for name, function, arguments in jobs}
         for done in as_completed(waiting):
@@ -46,12 +46,6 @@ def in_parallel(jobs: Sequence[Job]) -> dict[str, Any]:
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
     return given
-
-
-def _shares(cores: Sequence[int]) -> list[list[int]]:
-    """Return the cores of each worker."""
-    n = min(N_WORKERS, len(cores))
-    return [list(cores[k::n]) for k in range(n)]
 
 
 def _settle_worker(queue: Any) -> None:

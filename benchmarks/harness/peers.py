@@ -14,7 +14,6 @@ from __future__ import annotations
 import subprocess
 import sys
 import venv
-from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
 
@@ -26,17 +25,8 @@ PINS = {"sbx": ("sbx-rl==0.28.0", *_SB3), "sb3-contrib": ("sb3-contrib==2.9.2", 
 COMPILER = "gpu-compiler"
 # Packages that mjx_softarm, train.runs.evaluate and train.epoch.job import.
 SHARED = (
-    "numpy",
-    "tomli_w",
-    "jax",
-    "jaxlib",
-    "mujoco",
-    "mujoco-mjx",
-    "brax",
-    "flax",
-    "optax",
-    "gymnasium",
-    "tyro",
+    *("numpy", "tomli_w", "jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax"),
+    *("gymnasium", "tyro"),
 )
 
 
@@ -45,11 +35,7 @@ class PeerError(RuntimeError):
 
 
 def peer_python(name: str, root: Path = ROOT) -> Path:
-    """Return the interpreter of a peer's virtual environment, which is made if there is none.
-
-    Args:
-        name: key of `PINS`, or `COMPILER`.
-        root: folder of the environment.
+    """Return the interpreter of the virtual environment of a key of `PINS` or of `COMPILER`, made if missing.
 
     Raises:
         PeerError: it could not be made.
@@ -73,15 +59,14 @@ def peer_python(name: str, root: Path = ROOT) -> Path:
 
 def peer_packages(name: str) -> tuple[str, ...]:
     """Return the packages of a peer's environment; its JAX is for CUDA if this one is."""
+    versions = {package: metadata.version(package) for package in SHARED}
     if name == COMPILER:
-        return (f"jax-cuda12-plugin=={metadata.version('jax')}", *_pinned({}))
-    cuda = any(distribution.name == "jax-cuda12-plugin" for distribution in metadata.distributions())
-    return (*PINS[name], *_pinned({"jax": "jax[cuda12]"} if cuda else {}))
-
-
-def _pinned(names: Mapping[str, str]) -> list[str]:
-    """Return the shared packages in the versions that run here, some under other names."""
-    return [f"{names.get(package, package)}=={metadata.version(package)}" for package in SHARED]
+        own = (f"jax-cuda12-plugin=={versions['jax']}",)
+    else:
+        own, installed = PINS[name], {distribution.name for distribution in metadata.distributions()}
+        if "jax-cuda12-plugin" in installed:
+            versions["jax[cuda12]"] = versions.pop("jax")
+    return (*own, *(f"{package}=={version}" for package, version in versions.items()))
 
 
 def _make(home: Path, python: Path, packages: tuple[str, ...]) -> None:

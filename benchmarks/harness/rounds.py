@@ -163,11 +163,7 @@ def take_turns(workers: Sequence[Worker], n_rounds: int) -> tuple[dict[str, list
 
 
 def serve(prepare: Callable[[], tuple[Facts, Callable[[], Facts]]]) -> None:
-    """Answer requests for rounds, in the worker's process.
-
-    Args:
-        prepare: returns the first answer, and the function that does a round.
-    """
+    """Answer requests in a worker; `prepare` returns the first answer, and the function that does a round."""
     channel = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)  # output of libraries is no answer
     facts, work = prepare()

@@ -48,11 +48,7 @@ class Camera:
 
 
 def film_scene(path: Path, scene: Scene, trial: Trial) -> None:
-    """Write the film of a trial: its pipe cut open from the front, or the circle from above.
-
-    Raises:
-        RenderError: there is no OpenGL.
-    """
+    """Write the film of a trial: its pipe cut open from the front, or the circle from above."""
     with scene.twin.renderer(WIDTH, HEIGHT) as renderer:
         camera = Camera(scene.twin, renderer)
         operate(WatchedTwin(scene.twin, camera.shoot), *scene[1:], trial.objects)

@@ -15,6 +15,7 @@ from benchmarks.paper.summary import HEAVY_G, LIGHT_G, SUCCESS, Row, all_done
 
 CALM_PERCENT = 99.0
 WIDE_RUNS, NARROW_RUNS, OF_RUNS = 8, 7, 9  # for other numbers of runs, the same share
+ANGLES = ("yaw", "pitch", "roll")
 
 
 class Check(NamedTuple):
@@ -26,13 +27,7 @@ class Check(NamedTuple):
 
 
 def check_goals(experiment: str, table: Sequence[Row], trainings: Sequence[Row]) -> list[Check]:
-    """Check the goals of an experiment.
-
-    Args:
-        experiment: "open" or "confined".
-        table: from `trial_rows`.
-        trainings: from `training_rows`.
-    """
+    """Check the goals of the experiment "open" or "confined", given `trial_rows` and `training_rows`."""
     return _open(table) if experiment == "open" else _confined(table, trainings)
 
 
@@ -47,31 +42,19 @@ def _open(table: Sequence[Row]) -> list[Check]:
     reports = (
         f"reported in {reported} of {len(heavy)} runs; in {silent}, a saturated chamber was not reported"
     )
+    better = "translation without S2R over that with it, at least 2"
+    free, n_saturated = "with S2R, unloaded: no saturated chamber at any point", np.sum(n_points)
     hits = f"{np.sum(at_points):g} points, in {np.count_nonzero(at_points)} of {len(gradient)} runs"
     n_missed, n_incomplete = _missed(table)
     missed = f"{n_missed} points missed, in {n_incomplete} of {len(table)} runs"
     return [
         _at_most("with S2R, mean translation", "mm", 5.0, unloaded, "translation_mm"),
-        *(
-            _at_most(f"with S2R, mean {name}", "deg", 3.0, unloaded, f"{name}_deg")
-            for name in ("yaw", "pitch", "roll")
-        ),
-        _reaching(
-            "translation without S2R over that with it, at least 2",
-            f"{ratio:.2f}",
-            ratio >= 2,
-            without,
-            unloaded,
-        ),
+        *(_at_most(f"with S2R, mean {x}", "deg", 3.0, unloaded, f"{x}_deg") for x in ANGLES),
+        _reaching(better, f"{ratio:.2f}", ratio >= 2, without, unloaded),
         _at_most(f"35 to {LIGHT_G} g, mean translation", "mm", 6.0, light, "translation_mm"),
         _at_most("1 kg, largest translation of all runs", "mm", 20.0, heavy, "max_mm", np.max),
         _check("1 kg, saturation detected and reported by the loop", reports, reported > 0 == silent, heavy),
-        _reaching(
-            "with S2R, unloaded: no saturated chamber at any point",
-            f"{np.sum(n_points):g} points of {len(unloaded)} runs",
-            not np.any(n_points),
-            unloaded,
-        ),
+        _reaching(free, f"{n_saturated:g} points of {len(unloaded)} runs", not n_saturated, unloaded),
         _check("gradient descent saturates at least one chamber", hits, np.any(at_points), gradient),
         _check("every point of every run is reached", missed, not n_missed, table),
     ]
@@ -82,30 +65,25 @@ def _confined(table: Sequence[Row], trainings: Sequence[Row]) -> list[Check]:
     narrow, circle = _select(table, "narrow", "as shown"), _select(table, "circle", "as shown")
     without = _select(table, "with", "0 g")
     mm, without_mm = _mean_mm(circle), _mean_mm(without)
+    both_mm = f"{mm:.2f} mm with, {without_mm:.2f} mm without"
     learned, hand_made, stages = (
         [row for row in trainings if row["kind"] == kind] for kind in ("pipe", "hand-made", "circle")
     )
     done = {(row["twin"], row["seed"]): all_done(row) for row in exchanged}
+    four = "300 mm pipe: all four operations done, as shown and exchanged"
+    better = "circle: mean translation with demonstrations not above that without"
     both = [all_done(row) and done.get((row["twin"], row["seed"]), False) for row in shown]
     return [
         *(
             _at_most(f"300 mm pipe: mean absolute error in {axis} at the goals", "mm", 5.0, shown, name)
             for axis, name in (("X", "x_mm"), ("Y", "y_mm"), ("Z", "z_mm"))
         ),
-        _share_done(
-            "300 mm pipe: all four operations done, as shown and exchanged", WIDE_RUNS, both, exchanged
-        ),
+        _share_done(four, WIDE_RUNS, both, exchanged),
         _share_done("250 mm pipe: both tasks done", NARROW_RUNS, [all_done(row) for row in narrow], narrow),
         _calm("300 mm pipe, as shown and exchanged", shown, exchanged),
         _calm("250 mm pipe", narrow),
         _fewer_steps(learned, hand_made),
-        _reaching(
-            "circle: mean translation with demonstrations not above that without",
-            f"{mm:.2f} mm with, {without_mm:.2f} mm without",
-            mm <= without_mm,
-            circle,
-            without,
-        ),
+        _reaching(better, both_mm, mm <= without_mm, circle, without),
         _kept([row["stages_first_success"] for row in stages]),
     ]
 

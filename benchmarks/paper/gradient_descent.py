@@ -62,13 +62,7 @@ def forward_kinematics(policy: Policy) -> Callable[[np.ndarray], np.ndarray]:
 
 
 def descend(residual: Residual, spring_m: np.ndarray, low_m: np.ndarray, high_m: np.ndarray) -> np.ndarray:
-    """Return springs (n,) [m] within limits that minimise the squared residual locally.
-
-    Args:
-        residual: function to minimise.
-        spring_m (n,) [m]: start, clipped to the limits.
-        low_m, high_m (n,) [m]: the limits.
-    """
+    """Return springs (n,) [m] within limits (n,) [m] that locally minimise the squared residual."""
     x = np.clip(np.asarray(spring_m, float), low_m, high_m)
     cost, step = _cost(residual, x), FIRST_STEP
     for _ in range(MAX_STEPS):

@@ -1,4 +1,7 @@
-"""The stages' functions. Each runs in a process of its own, so it imports what it needs by itself."""
+"""The stages' functions; one raises a `JobError` if a command or a recording fails.
+
+Each runs in a process of its own, so it imports what it needs by itself.
+"""
 
 from __future__ import annotations
 
@@ -28,49 +31,34 @@ def demonstrations_path(twin: int, task: str) -> str:
 
 
 def calibrate_twin(folder: Path, settings: Settings, twin: int) -> None:
-    """Record a twin's log, unless it exists, and calibrate the twin by it.
-
-    Raises:
-        JobError: the recording ended early.
-    """
+    """Record a twin's log, unless it exists, and calibrate the twin by it."""
     from calib.read.logs import read_log
     from calib.run import calibrate, write_calibration
     from mjx_softarm._support import xla
     from mjx_softarm._support.provenance import provenance
+    from mjx_softarm.deploy.record import record
+    from mjx_softarm.logs.schema import write_log
+    from mjx_softarm.mechanics.excitation import random_pressures
     from mjx_softarm.spec import ArmSpec
+    from mjx_softarm.twin.arm import S2R_SESSION, Twin
 
     here, spec = folder / f"twin{twin}", ArmSpec.default()
     here.mkdir(parents=True, exist_ok=True)
     file = here / "log.npz"
     if not file.exists():
-        _record(file, spec, settings.n_poses, twin)
+        pressures_kpa = random_pressures(spec, settings.n_poses, seed=twin)
+        recording = record(Twin(twin, spec, session=S2R_SESSION), spec, pressures_kpa)
+        if cause := recording.ending.cause:
+            raise JobError(f"{file}: got a recording that ended early ({cause}), expected all poses")
+        write_log(file, recording.log)
     log, findings = read_log(file, spec.n_chambers)
     xla.enable_compilation_cache()
     calibration = calibrate([log], spec)
     write_calibration(here / CALIBRATION, calibration, [*map(str, findings)], provenance("benchmarks"))
 
 
-def _record(path: Path, spec: Any, n_poses: int, twin: int) -> None:
-    from mjx_softarm.deploy.record import record
-    from mjx_softarm.logs.schema import write_log
-    from mjx_softarm.mechanics.excitation import random_pressures
-    from mjx_softarm.twin.arm import S2R_SESSION, Twin
-
-    arm = Twin(twin, spec, session=S2R_SESSION)
-    recording = record(arm, spec, random_pressures(spec, n_poses, seed=twin))
-    if recording.ending.cause:
-        raise JobError(
-            f"{path}: got a recording that ended early ({recording.ending.cause}), expected {n_poses} poses"
-        )
-    write_log(path, recording.log)
-
-
 def train_reach(folder: Path, settings: Settings, twin: int | None, seed: int) -> None:
-    """Train and export a policy of the nominal arm, or of a twin's calibration; resume what was interrupted.
-
-    Raises:
-        JobError: a command failed.
-    """
+    """Train and export a policy of the nominal arm or of a twin's calibration; resume an interrupted run."""
     run = folder / reach_run(twin, seed)
     log = run.with_suffix(".log")
     if not (run / EVALUATION_FILE).exists():
@@ -86,11 +74,7 @@ def train_reach(folder: Path, settings: Settings, twin: int | None, seed: int) -
 
 
 def demonstrate(folder: Path, settings: Settings, twin: int, task: str) -> None:
-    """Record a task's demonstrations on a twin.
-
-    Raises:
-        JobError: the command failed.
-    """
+    """Record a task's demonstrations on a twin."""
     file = folder / demonstrations_path(twin, task)
     part = file.with_name(f"part-{file.name}")  # a recording that ends early keeps what it has
     part.unlink(missing_ok=True)
@@ -101,11 +85,7 @@ def demonstrate(folder: Path, settings: Settings, twin: int, task: str) -> None:
 
 
 def learn(folder: Path, settings: Settings, name: str, twin: int, seed: int) -> None:
-    """Train a policy from demonstrations; resume what was interrupted.
-
-    Raises:
-        JobError: a command failed.
-    """
+    """Train a policy from demonstrations; resume what was interrupted."""
     run, kind = folder / learned_run(name, twin, seed), KINDS[name]
     log = run.with_suffix(".log")
     saved = any(path.name.isdecimal() for path in (run / "checkpoints").glob("*"))
@@ -126,11 +106,7 @@ def learn(folder: Path, settings: Settings, name: str, twin: int, seed: int) -> 
 
 
 def export(folder: Path, settings: Settings, twin: int, runs: tuple[str, ...]) -> None:
-    """Export a twin's policies at once: they share what is distilled for its arm.
-
-    Raises:
-        JobError: the command failed.
-    """
+    """Export a twin's policies at once: they share what is distilled for its arm."""
     pending = [str(folder / run) for run in runs if not (folder / run / POLICY_FILE).exists()]
     command(folder / f"export-twin{twin}.log", "export", *pending)
 

@@ -63,17 +63,13 @@ class Outcome(NamedTuple):
 
 
 class WatchedTwin:
-    """A twin that calls a function each time it has been driven."""
+    """A twin that calls a function each time it has been driven; all else is the twin's own."""
 
     def __init__(self, twin: Any, on_driven: Callable[[], None]):
         self._twin, self._on_driven = twin, on_driven
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._twin, name)
-
-    def read_sensors(self) -> np.ndarray:
-        """Read the twin; see `ArmIO`."""
-        return self._twin.read_sensors()
 
     def write_pressures(self, pressure_kpa: np.ndarray) -> None:
         """Drive the twin; see `ArmIO`."""
@@ -140,7 +136,7 @@ def operate(
     """Follow goals (p, 6) [mm, deg], picking and placing as their names say."""
     gripper_m = controller.policy.spec.mass.gripper_length_m
     forces: list[tuple[float, float]] = []
-    watched = WatchedTwin(twin, lambda: forces.append(twin.wall_force_n()))
+    watched: Any = WatchedTwin(twin, lambda: forces.append(twin.wall_force_n()))
     gripper = Gripper(watched, names, finger_tips(goals, gripper_m), objects, gripper_m)
     run = follow(watched, controller, goals, arrived=gripper.arrived)
     force_n = np.zeros((len(run.log), 2))

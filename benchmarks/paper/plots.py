@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -96,7 +96,7 @@ def success_figure(results: Results) -> Figure:
     panel = figure.subplots()
     dress(panel, "demonstrated poses with success, in simulation", STEPS, "%")
     for kind, colour in (("pipe", BLUE), ("hand-made", ORANGE)):
-        runs = _trainings(results, kind)
+        runs = [run for (of, *_), run in results.trainings.items() if of == kind]
         steps, share = _series(runs, "evaluation/success_share")
         panel.plot(steps, 100 * share.T, color=colour, linewidth=0.5, alpha=0.4)
         _band(panel, steps, 100 * share, (f"{KINDS[kind].title}: {len(runs)} runs", colour))
@@ -114,16 +114,10 @@ def losses_figure(results: Results) -> Figure:
     for panel, name in zip(panels, LOSSES, strict=True):
         dress(panel, name.split("/")[1].replace("_", " "), STEPS, "")
         for kind, style in (("pipe", ("with gradient penalty", BLUE)), ("no-penalty", ("without", ORANGE))):
-            steps, loss = _series(_trainings(results, kind, twins.__contains__), name)
-            _band(panel, steps, loss, style)
+            runs = [run for (of, twin, _), run in results.trainings.items() if of == kind and twin in twins]
+            _band(panel, *_series(runs, name), style)
     panels[-1].legend(frameon=False)
     return figure
-
-
-def _trainings(
-    results: Results, kind: str, on_twin: Callable[[int], bool] = lambda twin: True
-) -> list[Training]:
-    return [training for (of, twin, _), training in results.trainings.items() if of == kind and on_twin(twin)]
 
 
 def _series(runs: Sequence[Training], name: str) -> tuple[np.ndarray, np.ndarray]:

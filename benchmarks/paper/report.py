@@ -31,15 +31,7 @@ COLUMNS = {  # figures in the printed table
 def write_report(
     experiment: str, folder: Path, pictures: Path, settings: Settings, results: Results
 ) -> dict[str, Any]:
-    """Write JSON, pictures and film; returns the figures.
-
-    Args:
-        experiment: key of PREFIXES.
-        folder: of the benchmark, with policies, calibrations and film.
-        pictures: folder for JSON file, pictures and film.
-        settings: of the benchmark.
-        results: of all trials and trainings.
-    """
+    """Write JSON file, pictures and film of an experiment to the folder `pictures`; returns the figures."""
     data = figures_of(experiment, folder, settings, results)
     pictures.mkdir(parents=True, exist_ok=True)
     finite = json.loads(json.dumps(data), parse_constant=lambda _: None)  # JSON has no NaN

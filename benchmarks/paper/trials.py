@@ -89,9 +89,7 @@ def _learn(kind: str, twin: int, seed: int) -> Stage:
 
 
 def _export(settings: Settings, twin: int) -> Stage:
-    runs = tuple(
-        learned_run(*item) for item in trainings(settings) if item[0] != "no-penalty" and item[1] == twin
-    )
-    return Stage(
-        f"export for twin {twin}", tuple(f"{run}/{POLICY_FILE}" for run in runs), jobs.export, (twin, runs)
-    )
+    mine = [item for item in trainings(settings) if item[0] != "no-penalty" and item[1] == twin]
+    runs = tuple(learned_run(*item) for item in mine)
+    policies = tuple(f"{run}/{POLICY_FILE}" for run in runs)
+    return Stage(f"export for twin {twin}", policies, jobs.export, (twin, runs))

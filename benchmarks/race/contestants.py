@@ -116,10 +116,7 @@ def ours(name: str, seed: int) -> Contestant:
 def peer(library: str, variant: str, seed: int) -> Contestant:
     """Return TQC of SBX or Stable-Baselines3-contrib, after its first round of updates.
 
-    Args:
-        library: key of `benchmarks.harness.peers.PINS`.
-        variant: hindsight, plain (tuned, without hindsight) or defaults.
-        seed: of training.
+    Its variants: hindsight, plain (tuned, without hindsight) and defaults.
     """
     from stable_baselines3.common.logger import Logger  # pyright: ignore[reportMissingImports]
 
@@ -166,12 +163,7 @@ def peer(library: str, variant: str, seed: int) -> Contestant:
 
 
 def tuned_settings(config: Any, n_steps: Callable[[], int]) -> dict[str, Any]:
-    """Return our settings by the names that the TQC of Stable-Baselines3 and SBX has for them.
-
-    Args:
-        config: a `TrainConfig`.
-        n_steps: env steps so far.
-    """
+    """Return our settings by the names that TQC of Stable-Baselines3 and SBX has; `n_steps` counts ours."""
     tqc = config.tqc
     low = tqc.learning_rate_end
 

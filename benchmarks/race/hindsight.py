@@ -67,10 +67,6 @@ class HindsightBuffer(HerReplayBuffer):
 
     def __init__(self, *positional: Any, arm: ReachEnv, share: float, reward_scale: float, **settings: Any):
         super().__init__(*positional, **settings)
-        if arm.config.clearance_cost_per_mm:
-            raise ValueError(
-                "HindsightBuffer: got an arm that is charged for walls, expected one that is not"
-            )
         self.her_ratio = share
         self._scale, self._config, self._reward_scale = arm.scale, arm.config.reward, reward_scale
 
@@ -84,14 +80,9 @@ class HindsightBuffer(HerReplayBuffer):
     ) -> DictReplayBufferSamples:
         """Return transitions with goals that were reached later."""
         where = batch_indices, env_indices
-        before, after, goals = (
-            poses * self._scale.scale + self._scale.centre
-            for poses in (
-                self.observations["achieved_goal"][where],
-                self.next_observations["achieved_goal"][where],
-                self._sample_goals(*where),
-            )
-        )
+        reached = (poses["achieved_goal"][where] for poses in (self.observations, self.next_observations))
+        scaled = (*reached, self._sample_goals(*where))
+        before, after, goals = (poses * self._scale.scale + self._scale.centre for poses in scaled)
         cost = self._reward_scale * self._config.saturation_cost
         reward, reached, _ = rewards.reward(
             after,

@@ -23,19 +23,9 @@ from typing import Annotated, Any, NamedTuple
 
 from benchmarks.harness.common import machine_kind, save, show
 from benchmarks.harness.peers import PINS, PeerError, peer_python
-from benchmarks.harness.rounds import Worker, WorkerError
+from benchmarks.harness.rounds import Facts, Worker, WorkerError
 from benchmarks.race.contestants import CONTESTANTS
-from benchmarks.race.summary import (
-    FIRST,
-    GOAL_MM,
-    GOALS,
-    LEVELS_MM,
-    PEERS,
-    Point,
-    crossing,
-    median_mm,
-    summarise,
-)
+from benchmarks.race.summary import FIRST, GOAL_MM, GOALS, LEVELS_MM, PEERS, crossing, median_mm, summarise
 from mjx_softarm._support import cli
 from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.provenance import provenance, write_json
@@ -49,7 +39,6 @@ class Limits(NamedTuple):
     wall_s: float = math.inf  # start-up included, evaluations not
     target_mm: float = 0.0  # median tip error
     stretch_s: float = 0.0  # of training between evaluations, not a limit
-    n_points: int = 1_000_000  # evaluations
 
 
 class RaceError(InputError):
@@ -66,7 +55,6 @@ def _names(words: list[str]) -> tuple[str, ...]:
 def race(
     seeds: cli.Integers = (0,),
     only: Annotated[tuple[str, ...], cli.listed(_names, "NAME,NAME,...")] = CONTESTANTS,
-    smoke: bool = False,
     out: cli.MaybePath = None,
 ) -> int:
     """Measure time and env steps to a tip error against the peers, two hours for each seed.
@@ -74,26 +62,20 @@ def race(
     Args:
         seeds: of training
         only: contestants, beside ours-quick and what was measured before
-        smoke: run everything, but tiny; says nothing about speed
         out: working folder; None: runs/race
 
     Raises:
         RaceError: ours-quick failed, or the folder has results of other conditions.
     """
-    folder = out or Path("runs/race-smoke" if smoke else "runs/race")
-    n_goals, n_points = (64, 3) if smoke else (2_000, Limits().n_points)
-    figures = summarise(run(folder, seeds, only, n_goals, n_points))
+    figures = summarise(run(out or Path("runs/race"), seeds, only))
     show({name: value for name, value in figures.items() if name != "curves"}, "race")
     if any(row["contestant"] == FIRST for row in figures["failed"]):
         raise RaceError(f"{FIRST}: got a failure, expected a result, without which there is no race")
-    if not smoke:
-        print(f"written: {save('race', figures)}")
+    print(f"written: {save('race', figures)}")
     return 0
 
 
-def run(
-    folder: Path, seeds: Sequence[int], names: Sequence[str], n_goals: int, n_points: int
-) -> list[dict[str, Any]]:
+def run(folder: Path, seeds: Sequence[int], names: Sequence[str], n_goals: int = 2_000) -> list[Facts]:
     """Return the results of the contestants, and of others that the folder has; missing ones are measured.
 
     One that fails has `failed` in place of points. If it is the first of a seed, that seed has no others:
@@ -105,17 +87,16 @@ def run(
     folder.mkdir(parents=True, exist_ok=True)
     results = []
     for seed in seeds:
-        first = _result(folder, FIRST, seed, Limits(n_points=n_points), n_goals)
+        first = _result(folder, FIRST, seed, Limits(), n_goals)
         results.append(first)
         for name in CONTESTANTS:
             wanted = name in names or _file(folder, name, seed).exists()
             if name != FIRST and wanted and "failed" not in first:
-                limits = limits_of(name, first["points"])._replace(n_points=n_points)
-                results.append(_result(folder, name, seed, limits, n_goals))
+                results.append(_result(folder, name, seed, limits_of(name, first["points"]), n_goals))
     return results
 
 
-def limits_of(name: str, first: Sequence[Point]) -> Limits:
+def limits_of(name: str, first: Sequence[Facts]) -> Limits:
     """Return a contestant's limits, by the curve of the first."""
     reached_mm = [level for level in LEVELS_MM if crossing(first, level, "wall_s") is not None]
     time_s = crossing(first, GOAL_MM, "wall_s") or first[-1]["wall_s"]
@@ -135,7 +116,6 @@ def _result(folder: Path, name: str, seed: int, limits: Limits, n_goals: int) ->
     made = provenance("benchmarks")
     conditions: dict[str, Any] = {
         "n_goals": n_goals,
-        "n_points": limits.n_points,
         "peers": {library: list(packages) for library, packages in PINS.items()},
         "packages": made["packages"],
         "machine": machine_kind(),
@@ -164,21 +144,11 @@ def _result(folder: Path, name: str, seed: int, limits: Limits, n_goals: int) ->
 
 
 def train(worker: Worker, limits: Limits) -> dict[str, Any]:
-    """Let a contestant train until its end or a limit.
-
-    Args:
-        worker: the contestant, not started.
-        limits: of wall time, error and evaluations.
-
-    Returns:
-        Start-up time, limit of wall time (None without one) and the curve's points.
-    """
+    """Let a contestant train until its end or a limit; returns start-up time, time limit and curve."""
     limit_s = limits.wall_s if math.isfinite(limits.wall_s) else None
-    print(
-        f"{worker.name}:{f' up to {limit_s:.0f} s,' if limit_s else ''} evaluations not counted ...",
-        flush=True,
-    )
-    points: list[Point] = []
+    until = f" up to {limit_s:.0f} s," if limit_s else ""
+    print(f"{worker.name}:{until} evaluations not counted ...", flush=True)
+    points: list[Facts] = []
     ended = False
     try:
         worker.start()
@@ -187,13 +157,9 @@ def train(worker: Worker, limits: Limits) -> dict[str, Any]:
             ended = point.pop("ended")
             points.append(point)
             error_mm = median_mm(point)
-            print(
-                f"{worker.name}: {point['wall_s']:.0f} s, {point['env_steps']:,} env steps, "
-                f"{point['updates']:,} updates, median {error_mm:.2f} mm",
-                flush=True,
-            )
+            done = f"{point['env_steps']:,} env steps, {point['updates']:,} updates"
+            print(f"{worker.name}: {point['wall_s']:.0f} s, {done}, median {error_mm:.2f} mm", flush=True)
             ended |= point["wall_s"] >= limits.wall_s or error_mm <= limits.target_mm
-            ended |= len(points) >= limits.n_points
     finally:
         worker.close()
     return {"start_up_s": worker.facts["start_up_s"], "limit_s": limit_s, "points": points}

@@ -28,13 +28,7 @@ Point = Mapping[str, Any]  # of a curve: wall_s, trained_s, env_steps, updates, 
 
 
 def crossing(points: Sequence[Point], level_mm: float, axis: str) -> float | None:
-    """Return where a curve first comes down to a level, linearly between evaluations; None if it does not.
-
-    Args:
-        points: of the curve.
-        level_mm: median tip error.
-        axis: `wall_s`, `trained_s` or `env_steps`.
-    """
+    """Return where on an axis a curve first comes down to a level, linearly between evaluations, or None."""
     before = None
     for point in points:
         error_mm = median_mm(point)
@@ -61,9 +55,7 @@ def summarise(results: Sequence[Result]) -> dict[str, Any]:
         "wall_s_without_start_up": [_row(result, "trained_s") for result in ran],
         "env_steps": [_row(result, "env_steps") for result in ran],
         "goals": [judge(library, results) for library in GOALS],
-        "not_raced": sorted(
-            set(CONTESTANTS) - {result["contestant"] for result in results}, key=CONTESTANTS.index
-        ),
+        "not_raced": [name for name in CONTESTANTS if name not in {r["contestant"] for r in results}],
         "failed": [{key: r[key] for key in (*who, "failed")} for r in results if "failed" in r],
         "measured_at": [{key: r[key] for key in (*who, "commit", "uncommitted_changes")} for r in ran],
         "curves": results,

@@ -20,22 +20,13 @@ MEDIAN_MM, WITHIN_S = 3.0, 120.0
 LONGEST_S = 600.0
 # Many arms, few and large batches: what a GPU is good at. Run on a CPU alone so far, see docs/scaling.md.
 TRAINING = (
-    "n_arms=2048",
-    "vector_steps_per_epoch=4",
-    "updates_per_env_step=0.03125",
-    "batch_size=4096",
-    "total_env_steps=2000000",
-    "evaluation_epochs=5",
+    *("n_arms=2048", "vector_steps_per_epoch=4", "updates_per_env_step=0.03125"),
+    *("batch_size=4096", "total_env_steps=2000000", "evaluation_epochs=5"),
 )
 
 
 def rate_goals(rows: Sequence[Mapping[str, Any]], on_gpu: bool) -> list[dict[str, str]]:
-    """Return the goals for env steps/s of each engine, settling included, at the best number of arms.
-
-    Args:
-        rows: with `engine`, `mode`, `arms` and, where they did not fail, `env_steps_per_s`.
-        on_gpu: whether they were measured on a GPU; if not, the goals are skipped.
-    """
+    """Return the goals for env steps/s of each engine at the best number of arms; skipped without a GPU."""
     goals = []
     for engine, least in LEAST_RATE.items():
         text = f"{least:,} env steps/s on a GPU, {engine}"
@@ -53,9 +44,7 @@ def rate_goals(rows: Sequence[Mapping[str, Any]], on_gpu: bool) -> list[dict[str
 
 def training_goal(on_gpu: bool) -> dict[str, str]:
     """Return the goal for the wall time of a training process, imports and compilation included."""
-    text = (
-        f"{MEDIAN_MM:g} mm median over the workspace in under {WITHIN_S:g} s on a GPU, compilation included"
-    )
+    text = f"{MEDIAN_MM:g} mm median over the workspace in under {WITHIN_S:g} s on a GPU, with compilation"
     if not on_gpu:
         return goal(text, NO_DEVICE, None)
     with tempfile.TemporaryDirectory() as folder:
@@ -74,20 +63,9 @@ def training_goal(on_gpu: bool) -> dict[str, str]:
 
 
 def seconds_to(
-    median_mm: float,
-    command: Sequence[str],
-    metrics: Path,
-    longest_s: float,
-    environment: Mapping[str, str],
+    median_mm: float, command: Sequence[str], metrics: Path, longest_s: float, environment: Mapping[str, str]
 ) -> tuple[float | None, float]:
     """Start a training process, watch its metrics until the median is reached, and stop it.
-
-    Args:
-        median_mm: median to reach.
-        command: command of the process.
-        metrics: file that it writes.
-        longest_s: time limit.
-        environment: variables that it has besides this process's.
 
     Returns:
         Seconds since its start, None if it ended or `longest_s` went by before; the least median so far.
@@ -125,6 +103,4 @@ def least_median(metrics: Path) -> float:
         return float("inf")
     lines = metrics.read_text("utf-8").splitlines(keepends=True)
     rows = [json.loads(line) for line in lines if line.endswith("\n")]  # the last may be half written
-    return min(
-        (row["evaluation/median_mm"] for row in rows if "evaluation/median_mm" in row), default=float("inf")
-    )
+    return min(row.get("evaluation/median_mm", float("inf")) for row in [{}, *rows])

@@ -1,4 +1,4 @@
-"""Whether something got slower than a stored baseline of the same kind of machine; on one core of the CPU.
+"""Regression guard: costs on one core of the CPU beside a stored baseline of the same kind of machine.
 
     python -m benchmarks guard            compare, for use before a release, in about four minutes
     python -m benchmarks guard --store    make this the baseline of this kind of machine

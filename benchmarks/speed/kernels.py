@@ -121,8 +121,6 @@ def read(text: str) -> Loop:
             current = computations.setdefault(found[2], [])
             entry = found[2] if found[1] else entry
         current.append(line)
-    if not entry:
-        raise ValueError(f"HLO: got {text[:60]!r}, expected an ENTRY computation")
     return _loop(computations, [entry], 1)
 
 

@@ -16,12 +16,7 @@ import numpy as np
 from benchmarks.harness.peers import PINS, PeerError, peer_python
 from benchmarks.harness.rounds import Worker, take_turns
 
-CONTESTANTS = {
-    "ours": "ours",
-    "sb3-contrib": "sb3-contrib TQC",
-    "sbx": "SBX TQC",
-    "brax": "brax SAC",
-}
+CONTESTANTS = {"ours": "ours", "sb3-contrib": "sb3-contrib TQC", "sbx": "SBX TQC", "brax": "brax SAC"}
 BATCH_SIZES = (256, 1024, 4096, 16_384, 32_768)
 N_ROUNDS = 5
 N_FIRST = 256  # updates a round at the smallest batch
@@ -36,17 +31,19 @@ def measure() -> dict[str, Any]:
     rates: dict[int, dict[str, list[float]]] = {}
     rows_per_s = dict.fromkeys(pythons, BATCH_SIZES[0] * N_FIRST / ROUND_S)
     for batch_size in BATCH_SIZES:
-        workers = {}
+        workers, where = [], f"from batch {batch_size:,} on"
         for name in [name for name in pythons if name not in left_out]:
             update_s = batch_size / rows_per_s[name]
             if update_s > SLOW_S:
-                left_out[name] = (
-                    f"from batch {batch_size:,} on: an update is expected to take {update_s:.0f} s"
-                )
+                left_out[name] = f"{where}: an update is expected to take {update_s:.0f} s"
             else:
-                workers[name] = _worker(name, pythons[name], batch_size, updates_per_round(update_s))
-        print(f"batch {batch_size:,}: {', '.join(workers)} ...", flush=True)
-        rates[batch_size] = _alternate(workers, left_out, f"from batch {batch_size:,} on")
+                size = str(batch_size), str(updates_per_round(update_s))
+                program = ["benchmarks.speed.learner_contestants", name, *size]
+                workers.append(Worker(name, program, pythons[name]))
+        print(f"batch {batch_size:,}: {', '.join(worker.name for worker in workers)} ...", flush=True)
+        rounds, failed = take_turns(workers, N_ROUNDS)
+        left_out |= {name: f"{where}: {why}" for name, why in failed.items()}
+        rates[batch_size] = {name: [x["updates_per_s"] for x in told] for name, told in rounds.items()}
         rows_per_s |= {name: batch_size * float(np.median(x)) for name, x in rates[batch_size].items()}
     return {
         "updates_per_s": table(rates),
@@ -68,11 +65,8 @@ def table(rates: Mapping[int, Mapping[str, Sequence[float]]]) -> list[dict[str, 
         row: dict[str, Any] = {"batch": batch_size}
         row |= {CONTESTANTS[name]: _rounded(value) for name, value in medians.items()}
         if "ours" in medians:
-            row |= {
-                f"ours / {name}": _rounded(medians["ours"] / value)
-                for name, value in medians.items()
-                if name != "ours"
-            }
+            peers = {name: value for name, value in medians.items() if name != "ours"}
+            row |= {f"ours / {name}": _rounded(medians["ours"] / value) for name, value in peers.items()}
         rows.append(row)
     return rows
 
@@ -86,19 +80,6 @@ def _pythons(left_out: dict[str, str]) -> dict[str, Path | None]:
         except PeerError as error:
             left_out[name] = str(error)
     return pythons
-
-
-def _worker(name: str, python: Path | None, batch_size: int, n_updates: int) -> Worker:
-    return Worker(
-        name, ["benchmarks.speed.learner_contestants", name, str(batch_size), str(n_updates)], python
-    )
-
-
-def _alternate(workers: Mapping[str, Worker], left_out: dict[str, str], where: str) -> dict[str, list[float]]:
-    """Return the rates of the rounds by name; one that fails is left out from then on."""
-    rounds, failed = take_turns(list(workers.values()), N_ROUNDS)
-    left_out |= {name: f"{where}: {why}" for name, why in failed.items()}
-    return {name: [facts["updates_per_s"] for facts in told] for name, told in rounds.items()}
 
 
 def _rounded(value: float) -> float:

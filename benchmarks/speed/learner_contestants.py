@@ -28,11 +28,7 @@ N_STORED = 100_000
 def _timed(train: Callable[[], Any], n_updates: int) -> tuple[Facts, Callable[[], Facts]]:
     """Return rounds of `train`, which blocks until it is done; the first call does not count."""
     train()
-
-    def work() -> Facts:
-        return {"updates_per_s": n_updates / _seconds(train)}
-
-    return {}, work
+    return {}, lambda: {"updates_per_s": n_updates / _seconds(train)}
 
 
 def _ours(batch_size: int, n_updates: int) -> tuple[Facts, Callable[[], Facts]]:
@@ -50,11 +46,7 @@ def _ours(batch_size: int, n_updates: int) -> tuple[Facts, Callable[[], Facts]]:
     from train.epoch import replay
     from train.presets import PRESETS
 
-    hindsight, scale, reward = (
-        PRESETS["quick"].hindsight,
-        ObsScale.from_spec(ArmSpec.default()),
-        RewardConfig(),
-    )
+    hindsight, scale = PRESETS["quick"].hindsight, ObsScale.from_spec(ArmSpec.default())
     agent = TQC(OBS_SIZE, ACTION_SIZE, TQCConfig())
     rng = np.random.default_rng(0)
 
@@ -77,7 +69,7 @@ def _ours(batch_size: int, n_updates: int) -> tuple[Facts, Callable[[], Facts]]:
     def update(state, key):
         key_sample, key_relabel, key_update = jax.random.split(key, 3)
         batch = replay.sample(memory, key_sample, batch_size)
-        batch = relabel(batch, key_relabel, hindsight, scale, reward, exchange_actions=True)
+        batch = relabel(batch, key_relabel, hindsight, scale, RewardConfig(), exchange_actions=True)
         return agent.update(state, batch, key_update)
 
     def scan(state, key):
@@ -94,11 +86,7 @@ def _ours(batch_size: int, n_updates: int) -> tuple[Facts, Callable[[], Facts]]:
 
 
 def choose_threads(train: Callable[[], Any]) -> None:
-    """Let PyTorch use all its threads, or one where that trains faster, as waiting for each other costs.
-
-    Args:
-        train: some updates; the fastest of three calls counts.
-    """
+    """Let PyTorch use all its threads, or one where the fastest of three calls is faster with it."""
     import torch  # pyright: ignore[reportMissingImports]
 
     times = {}

@@ -39,11 +39,8 @@ def sensed_model(spec: ArmSpec) -> mujoco.MjModel:
 
     mjspec = build_spec(spec)
     for chamber in range(spec.n_chambers):
-        mjspec.add_sensor(
-            type=mujoco.mjtSensor.mjSENS_TENDONPOS,
-            objtype=mujoco.mjtObj.mjOBJ_TENDON,
-            objname=f"spring{chamber}",
-        )
+        kind, of = mujoco.mjtSensor.mjSENS_TENDONPOS, mujoco.mjtObj.mjOBJ_TENDON
+        mjspec.add_sensor(type=kind, objtype=of, objname=f"spring{chamber}")
     for kind in (mujoco.mjtSensor.mjSENS_FRAMEPOS, mujoco.mjtSensor.mjSENS_FRAMEQUAT):
         mjspec.add_sensor(type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname="tip")
     return mjspec.compile()
@@ -55,13 +52,7 @@ def _springs(data: mujoco.MjData) -> np.ndarray:
 
 
 class RestDetector:
-    """Detector of settled arms (n), judged by their springs control period by control period.
-
-    Args:
-        n: number of arms.
-        spec: the arm.
-        rest_m: largest movement of a spring within `REST_S` that counts as none.
-    """
+    """Detector of n settled arms: no spring has moved by more than `rest_m` within `REST_S`."""
 
     def __init__(self, n: int, spec: ArmSpec, rest_m: float = REST_M):
         self._rest_m = rest_m
@@ -93,13 +84,9 @@ class Settled(NamedTuple):
 
 
 class SteppedArms:
-    """Arms side by side in a threaded rollout.
+    """Arms side by side in a threaded rollout of a `sensed_model`.
 
-    Args:
-        model: made by `sensed_model`.
-        spec: the same arm.
-        n: number of arms.
-        n_threads: threads of the rollout; 0 steps a single arm without rollout and sensors, faster for one.
+    With 0 threads a single arm is stepped without rollout and sensors, which is faster for one.
     """
 
     def __init__(self, model: mujoco.MjModel, spec: ArmSpec, n: int, n_threads: int):
@@ -163,11 +150,6 @@ class SteppedArms:
             self._state[arms] = state[:, -1]
             self.length_m[arms], self._tip[arms] = np.split(sensed[:, -1], [self.spec.n_chambers], axis=1)
 
-    def close(self) -> None:
-        """End the rollout's threads."""
-        if self._rollout is not None:
-            self._rollout.close()
-
 
 def write_arm(folder: Path, spec: ArmSpec, n_poses: int = 1024) -> None:
     """Write what `SteppedReach` needs: specification, model, and poses to start at and to reach."""
@@ -183,12 +165,7 @@ def write_arm(folder: Path, spec: ArmSpec, n_poses: int = 1024) -> None:
 class SteppedReach:
     """Reaching for poses as `ReachEnv` defines it, with arms that are stepped in time.
 
-    Args:
-        folder: specification, model and pool of poses, as `write_arm` makes it.
-        n: number of arms.
-        n_threads: threads of the rollout; 0 for a single arm.
-        seed: of starts and goals.
-        episode_length: environment steps.
+    The folder has specification, model and pool of poses, as `write_arm` makes it.
     """
 
     def __init__(self, folder: str, n: int, n_threads: int, seed: int, episode_length: int):

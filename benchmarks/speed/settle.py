@@ -10,7 +10,6 @@ with C MuJoCo stepped to rest.
 from __future__ import annotations
 
 import os
-import sys
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -101,27 +100,14 @@ def way(rounds: Sequence[Facts], truth: Truth) -> dict[str, Any]:
 
 def _goal() -> dict[str, str]:
     """Return the goal for environment steps a second on two cores, and for the error of the same programs."""
-    if reason := no_goal(n_cores(), jax.default_backend()):
-        return goal(GOAL, reason, None)
+    if n_cores() < GOAL_CORES or jax.default_backend() != "cpu" or not hasattr(os, "sched_setaffinity"):
+        return goal(GOAL, f"got no CPU on Linux with {GOAL_CORES} cores or more", None)
     points = [("chain", "quasistatic", n, N_LINKS) for n in GOAL_ARMS]
     return speed_goal(turns(points, GOAL_CORES))
 
 
-def no_goal(n: int, backend: str) -> str:
-    """Return why the goal cannot be measured on n cores with a backend of JAX; empty where it can."""
-    if n < GOAL_CORES:
-        return f"{n} core here"
-    if not hasattr(os, "sched_setaffinity"):
-        return f"programs cannot be kept to {GOAL_CORES} cores on {sys.platform}"
-    return "" if backend == "cpu" else "jax does not run on the CPU here"
-
-
 def speed_goal(rows: Sequence[Mapping[str, Any]]) -> dict[str, str]:
-    """Return the goal, judged at the fastest number of arms.
-
-    Args:
-        rows: each with `failed`, or with `arms`, `env_steps_per_s` and the tip's error `p95_mm`.
-    """
+    """Return the goal, judged at the fastest number of arms."""
     measured = [row for row in rows if "failed" not in row]
     why = "; ".join(row["failed"] for row in rows if "failed" in row)
     if not measured:

@@ -31,15 +31,7 @@ NO_MJX = f"compiles for minutes and in gigabytes at {MOST_LINKS_MJX} links, and 
 N_LINKS = ArmSpec.default().structure.links_per_section
 PAPER_WORKERS, PAPER_STEP_S = 14, 0.03  # the paper's cost of an environment step; the workers may share cores
 SUBPROC = "SubprocVecEnv"
-COLUMNS = (
-    "program",
-    "env_steps_per_s",
-    "times_subproc",
-    "simulated_s_per_env_step",
-    *ERROR,
-    "skipped",
-    "failed",
-)
+COLUMNS = ("program", "env_steps_per_s", "times_subproc", "simulated_s_per_env_step", *ERROR)
 
 Point = tuple[str, str, int, int]  # engine, mode, arms, links per section
 
@@ -150,7 +142,7 @@ def side_by_side(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     for row in rows:
         rate = row.get("env_steps_per_s")
         full.append({**row, "times_subproc": _digits(rate / base) if rate and base else None})
-    return [{name: row.get(name) for name in COLUMNS} for row in [*full, paper]]
+    return [{name: row.get(name) for name in (*COLUMNS, "skipped", "failed")} for row in [*full, paper]]
 
 
 def _starts() -> dict[str, Any]:

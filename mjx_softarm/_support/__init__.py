@@ -1,1 +1,1 @@
-"""What several rooms need and no reader of one has to know: arrays, files, compilation."""
+"""Tools that several rooms share and no reader of one has to know: arrays, files, compilation."""

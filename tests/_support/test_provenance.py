@@ -1,4 +1,4 @@
-"""What a result says that it depends on."""
+"""Provenance of a result: its commit, and whether its code is committed."""
 
 import subprocess
 

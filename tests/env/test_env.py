@@ -146,10 +146,6 @@ def test_the_same_key_gives_the_same_episode_and_another_key_another_one(reset, 
     assert not np.array_equal(first.obs, other.obs)
 
 
-def test_step_returns_the_types_it_takes_so_that_it_is_compiled_once(start, step, random_actions):
-    assert types(step(start, random_actions)) == types(start)
-
-
 def test_observation_is_scaled_pose_scaled_goal_and_error(start, step, random_actions):
     for state in (start, step(start, random_actions)):
         pose, goal = (np.float64(x) for x in (state.pipeline_state.pose, state.pipeline_state.goal))
@@ -192,12 +188,6 @@ def test_reward_done_and_metrics_are_those_of_the_paper_s_three_cases(env, spec,
     np.testing.assert_allclose(after.reward, terms, rtol=1e-6)
 
 
-def test_where_an_arm_goes_does_not_depend_on_where_it_was(reset, step, random_actions):
-    """At rest the law has forgotten its past: the equilibrium is the references' alone."""
-    ends = [step(reset(seed), random_actions).pipeline_state for seed in (0, 1)]
-    np.testing.assert_array_equal(ends[0].pose, ends[1].pose)
-
-
 FAILURES = {
     "a NaN in the action": {"action": jnp.nan},
     "an infinity in the action": {"action": jnp.inf},
@@ -210,7 +200,7 @@ FAILURES = {
 
 @pytest.fixture(scope="module")
 def broken(env, reset, step):
-    """Of a batch, the first arms each broken in one way and all at their goal: before, after, names."""
+    """A batch at its goals, its first arms each broken in one way: before, after, and after when whole."""
     start = reset(0)
     start = with_arm(start, goal=start.pipeline_state.pose)
     arms, actions = start.pipeline_state, env.action_of(start.pipeline_state.spring_m)
@@ -346,7 +336,7 @@ class Few(NamedTuple):
     params=[SHORT_ARM, pytest.param(ArmSpec.default(), marks=pytest.mark.slow)],
     ids=["short", "paper"],
 )
-def few(request):
+def few(request, quick_compiler):
     env = ReachEnv(request.param, EnvConfig(n_poses=64, randomisation=SPREAD))
     fresh, step = compiled(env)
     before = with_arm(fresh, sensor_offset_m=fresh.pipeline_state.sensor_offset_m.at[3, 0].set(jnp.nan))

@@ -1,4 +1,4 @@
-"""How episodes end and begin anew, on arms that do as they are told."""
+"""Ends and new beginnings of episodes, on arms that do as they are told."""
 
 from typing import NamedTuple
 

@@ -11,7 +11,7 @@ from hypothesis.extra import numpy as npst
 
 from mjx_softarm.logs.checks import LogError
 from mjx_softarm.logs.files import read_matrix
-from mjx_softarm.logs.schema import Log, log_table, write_log
+from mjx_softarm.logs.schema import Log, write_log
 from tests.properties import damaged, few
 
 
@@ -44,24 +44,6 @@ def test_csv_is_what_a_plain_reader_expects(tmp_path):
         assert float(row["payload [g]"]) == pytest.approx(105.0)
         assert float(row["goal_x [mm]"]) == pytest.approx(log.goal[n, 0], rel=1e-8)
         assert float(row["goal_roll [deg]"]) == pytest.approx(log.goal[n, 5], rel=1e-8)
-
-
-def test_npz_holds_the_same_table(tmp_path):
-    log = small_log()
-    write_log(tmp_path / "log.npz", log)
-    columns, table = log_table(log)
-    with np.load(tmp_path / "log.npz", allow_pickle=False) as file:
-        assert file["columns"].tolist() == [column.header for column in columns]
-        np.testing.assert_array_equal(file["table"], table)
-
-
-def test_rows_are_taken_by_mask_or_index():
-    log = small_log()
-    for rows in (np.array([False, True, False, True]), np.array([1, 3])):
-        taken = log.take(rows)
-        assert len(taken) == 2 and taken.row.tolist() == [3, 5]
-        np.testing.assert_array_equal(taken.marker_m, log.marker_m[[1, 3]])
-        assert taken.pressure_kpa is None
 
 
 def test_failed_write_leaves_the_old_file_and_no_part(tmp_path, monkeypatch):

@@ -49,14 +49,6 @@ def test_a_system_with_the_hessian_is_that_with_the_dense_matrix(n_sections):
     np.testing.assert_allclose(found, wanted.reshape(found.shape), atol=1e-5 * np.abs(wanted).max())
 
 
-def test_batches_of_batches_are_solved_as_one():
-    hessian, columns = chain(2)
-    twice = jax.tree.map(lambda x: np.stack([x, x[::-1]]), (hessian, columns))
-    found = jax.jit(jax.vmap(jax.vmap(ChainHessian.solve)))(*twice)
-    once = jax.jit(jax.vmap(ChainHessian.solve))(hessian, columns)
-    np.testing.assert_allclose(found, np.stack([once, once[::-1]]), atol=1e-6)
-
-
 def test_a_matrix_that_is_not_positive_definite_gives_nan_and_its_neighbours_do_not():
     hessian, columns = chain(3)
     coupled = hessian.above.copy()
@@ -78,34 +70,18 @@ def test_the_diagonal_is_added_where_it_belongs():
     )
 
 
-def test_elimination_takes_a_matrix_that_all_share():
-    rng = np.random.default_rng(0)
-    matrix, columns = (
-        np.float32(np.eye(3) + 0.1 * rng.normal(size=(3, 3))),
-        np.float32(rng.normal(size=(4, 3, 2))),
-    )
-    found = jax.vmap(eliminate, in_axes=(None, 0))(matrix, columns)
-    np.testing.assert_allclose(found, np.linalg.solve(matrix, columns), atol=1e-5)
-
-
-def test_elimination_of_rows_of_which_some_are_the_identity_s():
-    rng = np.random.default_rng(1)
-    matrix = np.float32(2.0 * np.eye(6) + 0.3 * rng.normal(size=(8, 6, 6)))  # not symmetric
-    given = rng.uniform(size=(8, 6)) < 0.5
-    matrix = np.where(given[..., None], np.eye(6, dtype=np.float32), matrix)
-    columns = np.float32(rng.normal(size=(8, 6, 1)))
+@pytest.mark.parametrize("n", range(1, 8))
+def test_elimination_of_rows_of_which_some_are_the_identity_s(n):
+    rng = np.random.default_rng(n)
+    matrix = np.float32(2.0 * np.eye(n) + 0.3 * rng.normal(size=(8, n, n)))  # not symmetric
+    given = rng.uniform(size=(8, n)) < 0.5
+    matrix = np.where(given[..., None], np.eye(n, dtype=np.float32), matrix)
+    columns = np.float32(rng.normal(size=(8, n, 3)))
     found = np.asarray(jax.jit(jax.vmap(eliminate))(matrix, columns))
     np.testing.assert_allclose(found, np.linalg.solve(matrix, columns), atol=1e-5)
     np.testing.assert_array_equal(found[given], columns[given])
-
-
-@pytest.mark.parametrize("n", range(1, 8))
-def test_elimination_of_any_number_of_unknowns(n):
-    rng = np.random.default_rng(n)
-    root, columns = rng.normal(size=(4, n, n)), np.float32(rng.normal(size=(4, n, 3)))
-    matrix = np.float32(root @ root.swapaxes(1, 2) + np.eye(n))
-    found = jax.vmap(eliminate)(matrix, columns)
-    np.testing.assert_allclose(found, np.linalg.solve(matrix, columns), rtol=1e-3, atol=1e-4)
+    shared = jax.vmap(eliminate, in_axes=(None, 0))(matrix[0], columns)
+    np.testing.assert_allclose(shared, np.linalg.solve(matrix[0], columns), atol=1e-5)
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0])

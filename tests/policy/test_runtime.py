@@ -90,17 +90,6 @@ def test_equals_actor_and_environment_in_jax(spec, actor_params, runner, poses, 
     np.testing.assert_allclose(reference.readings, expected, rtol=1e-6)
 
 
-@pytest.mark.parametrize("sign", [-1.0, 1.0])
-def test_full_action_is_the_shortest_or_longest_spring(spec, actor_params, make_arm_model, poses, sign):
-    head = actor_params["params"]["head"]
-    saturating = {"kernel": 0.0 * head["kernel"], "bias": jnp.full(18, 20.0 * sign)}
-    params = {"params": {**actor_params["params"], "head": saturating}}
-    policy = policy_from_actor(params, spec, RewardConfig(), make_arm_model(9), {})
-    reference = PolicyRunner(policy).act(*poses)
-    limit = spec.springs.length_min_m if sign < 0 else spec.springs.length_max_m
-    np.testing.assert_allclose(reference.length_m, np.full((N, 9), limit), rtol=1e-7)
-
-
 def test_one_pose_and_a_batch_agree(runner, poses):
     batch = runner.act(*poses)
     one = runner.act(poses[0, 3].tolist(), poses[1, 3].tolist())

@@ -17,15 +17,11 @@ from mjx_softarm.sensing.pose import (
 )
 from tests.properties import few
 
+pytestmark = pytest.mark.usefixtures("strict")
+
 RNG = np.random.default_rng(0)
 ROTATIONS = Rotation.random(500, random_state=1)
 POSITIONS_M = RNG.uniform(-1.0, 1.0, (500, 3))
-
-
-@pytest.fixture(autouse=True)
-def _strict():
-    with jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
-        yield
 
 
 def angle_deg(a, b):
@@ -33,10 +29,13 @@ def angle_deg(a, b):
     return np.rad2deg(Rotation.from_matrix(np.swapaxes(a, -1, -2) @ b).magnitude())
 
 
-def test_pose_from_frame_is_scipy_s_intrinsic_zyx():
+def test_poses_of_frames_and_quaternions_are_scipy_s_intrinsic_zyx():
+    """A quaternion has its scalar first, and its length does not matter."""
+    expected = np.concatenate([1000.0 * POSITIONS_M, ROTATIONS.as_euler("ZYX", degrees=True)], axis=1)
     pose = pose_from_frame(POSITIONS_M, ROTATIONS.as_matrix())
-    np.testing.assert_allclose(pose[:, :3], 1000.0 * POSITIONS_M)
-    np.testing.assert_allclose(pose[:, 3:], ROTATIONS.as_euler("ZYX", degrees=True), atol=1e-9)
+    np.testing.assert_allclose(pose, expected, atol=1e-9)
+    quaternion = ROTATIONS.as_quat(scalar_first=True) * RNG.uniform(0.9, 1.1, (500, 1))
+    np.testing.assert_allclose(pose_from_quaternion(POSITIONS_M, quaternion), expected, atol=1e-9)
 
 
 def test_frame_from_pose_is_scipy_s_intrinsic_zyx():
@@ -52,12 +51,6 @@ def test_quaternion_from_pose_is_scipy_s():
     ours = quaternion_from_pose(np.concatenate([POSITIONS_M, angles], axis=1))
     theirs = ROTATIONS.as_quat(scalar_first=True)
     np.testing.assert_allclose(np.abs((ours * theirs).sum(axis=1)), 1.0, atol=1e-12)  # q and -q are one
-
-
-def test_pose_from_quaternion_is_scalar_first_and_ignores_the_length():
-    quaternion = ROTATIONS.as_quat(scalar_first=True) * RNG.uniform(0.9, 1.1, (500, 1))
-    expected = pose_from_frame(POSITIONS_M, ROTATIONS.as_matrix())
-    np.testing.assert_allclose(pose_from_quaternion(POSITIONS_M, quaternion), expected, atol=1e-9)
 
 
 @pytest.mark.parametrize("pitch", [90.0, -90.0, 90.0 - 1e-7, 90.0 - 1e-4, -90.0 + 1e-4, 89.9, -89.9])
@@ -125,8 +118,6 @@ def test_jax_gives_numpy_s_poses():
     difference = pose_error(jax.jit(jax.vmap(pose_from_quaternion))(position, quaternion), expected)
     np.testing.assert_allclose(difference[~steep], 0.0, atol=1e-3)
 
-
-# --- all poses ---------------------------------------------------------------------------------------------
 
 POSES = st.tuples(*[st.floats(-2e3, 2e3)] * 3, *[st.floats(-720.0, 720.0)] * 3).map(np.array)
 

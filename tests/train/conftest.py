@@ -1,6 +1,5 @@
 """Learning from demonstrations on a short arm, which compiles in seconds."""
 
-import jax
 import numpy as np
 import pytest
 
@@ -39,11 +38,3 @@ def shown(short_env):
     pool = short_env.pool
     positions, actions = pool.pose[:N_POSITIONS], short_env.action_of(pool.spring_m[:N_POSITIONS])
     return Demonstrations(positions, actions, np.zeros(N_POSITIONS, np.int32))
-
-
-@pytest.fixture(scope="module")
-def quick_compiler():
-    """Twice as fast to compile what runs for milliseconds."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)

@@ -6,7 +6,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import jax
@@ -24,52 +23,64 @@ from train.runs.checkpoint import Run, RunError, sole_trainer
 from train.runs.plots import IMITATION_PICTURES, REACH_PICTURES
 from train.runs.run import task_of_run
 
+ROOT = Path(__file__).resolve().parents[2]
+
+
+pytestmark = pytest.mark.usefixtures("quick_compiler")
+
 
 @pytest.fixture(scope="module")
-def environment(tmp_path_factory):
-    """One compilation cache for every process of this file."""
-    cache = tmp_path_factory.mktemp("cache")
-    return {**os.environ, "XDG_CACHE_HOME": str(cache)}
-
-
-def command(out):
-    return [sys.executable, "-m", "train", "reach", *flags(), "--out", str(out)]
-
-
-def resume(out):
-    return [sys.executable, "-m", "train", "reach", "--resume", str(out)]
+def arm(tmp_path_factory):
+    """File of the short arm."""
+    path = tmp_path_factory.mktemp("arm") / "arm.toml"
+    SHORT.to_toml(path)
+    return str(path)
 
 
 def final_state(out):
-    run = Run.open(Path(out))
+    run = Run.open(out)
     job = new_job(run.config, ReachEnv(run.spec, run.config.env))
     return run.restore(jax.eval_shape(job.init, jax.random.PRNGKey(0)))
 
 
-def interrupt_after_a_checkpoint(out, number, environment):
-    """Start a run, send a signal once a checkpoint stands; returns the process, which has ended."""
-    process = subprocess.Popen(command(out), env=environment, stdout=subprocess.PIPE, text=True)
-    deadline = time.monotonic() + 300
-    while not any(path.name.isdigit() for path in Path(out).glob("checkpoints/*")):  # whole ones
-        assert process.poll() is None and time.monotonic() < deadline, "no checkpoint before the run ended"
-        time.sleep(0.01)
-    process.send_signal(number)
-    process.communicate(timeout=120)
-    return process
+def send_in_epoch_6(number):
+    """Return `Run.log` that sends a signal to its own process after epoch 6; checkpoints are every fourth."""
+
+    def log_and_send(run, row, log=Run.log):
+        log(run, row)
+        if row["epoch"] == 6:
+            os.kill(os.getpid(), number)
+
+    return log_and_send
 
 
-def test_a_run_survives_kill_9_and_ends_with_the_same_bits(tmp_path, environment, monkeypatch):
+DIES = """
+import signal, sys
+from tests.train.test_cli import Run, main, send_in_epoch_6
+Run.log = send_in_epoch_6(signal.SIGKILL)
+main(sys.argv[1:])
+"""
+
+
+def test_a_run_survives_kill_9_and_ends_with_the_same_bits(arm, tmp_path, monkeypatch):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
-    process = interrupt_after_a_checkpoint(killed, signal.SIGKILL, environment)
+    command = ["reach", *flags(), "--spec", arm, "--out"]
+    assert main([*command, str(whole)]) == 0
+    like_here = {
+        "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
+        "JAX_NUM_CPU_DEVICES": "8",
+    }  # so little is compiled anew
+    process = subprocess.run(
+        [sys.executable, "-c", DIES, *command, str(killed)], env={**os.environ, **like_here}, cwd=ROOT
+    )
     assert process.returncode == -signal.SIGKILL and not (killed / "evaluation.json").exists()
-    subprocess.run(resume(killed), env=environment, check=True, capture_output=True)
-    subprocess.run(command(whole), env=environment, check=True, capture_output=True)
+    assert Run.open(killed).latest_epoch == 4 and len(Run.open(killed).metrics()) == 6
+    assert main(["reach", "--resume", str(killed)]) == 0
 
     (epoch, expected), (resumed_epoch, resumed) = final_state(whole), final_state(killed)
     assert epoch == resumed_epoch == 16
     jax.tree.map(np.testing.assert_array_equal, jax.device_get(expected), jax.device_get(resumed))
-    rows = [json.loads(line) for line in (killed / "metrics.jsonl").read_text().splitlines()]
-    assert [row["epoch"] for row in rows] == list(range(1, 17))
+    assert [row["epoch"] for row in Run.open(killed).metrics()] == list(range(1, 17))
 
     assert main(["evaluate", str(whole)]) == 0
     figures = json.loads((whole / "evaluation.json").read_text())
@@ -79,10 +90,19 @@ def test_a_run_survives_kill_9_and_ends_with_the_same_bits(tmp_path, environment
     config = json.loads((whole / "config.json").read_text())
     assert {"python", "packages", "commit"} <= config["provenance"].keys()
 
-    for name, smaller in (("N_TRAINING", 512), ("N_STEPS", 10)):  # how exact it is, test_estimator asks
+    smallest = {"N_TRAINING": 512, "N_HELD_OUT": 64, "N_STEPS": 10, "PAYLOADS_KG": (0.0,)}
+    for name, smaller in smallest.items():  # how exact it is, test_estimator asks
         monkeypatch.setattr(f"train.runs.estimator.{name}", smaller)
     assert main(["export", str(whole)]) == 0
     assert (whole / "policy.npz").exists()
+
+
+def test_ctrl_c_saves_and_says_how_to_go_on(arm, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "stopped"
+    monkeypatch.setattr(Run, "log", send_in_epoch_6(signal.SIGINT))
+    assert main(["reach", *flags(), "--spec", arm, "--out", str(out)]) == 130
+    assert "continue with" in " ".join(capsys.readouterr().out.split())
+    assert Run.open(out).latest_epoch == len(Run.open(out).metrics()) == 7
 
 
 @pytest.mark.parametrize("command", ["reach", "imitate", "sweep"])
@@ -95,33 +115,12 @@ def test_help_explains_every_setting(command, capsys):
     assert without_text == []
 
 
-HOLD = """
-import sys, time
-from pathlib import Path
-from train.runs.checkpoint import sole_trainer
-with sole_trainer(Path(sys.argv[1])):
-    print("held", flush=True)
-    time.sleep(600)
-"""
-
-
-def test_a_folder_has_one_trainer_at_a_time_and_is_free_once_that_was_killed(tmp_path):
-    holder = subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path)], stdout=subprocess.PIPE, text=True)
-    assert holder.stdout.readline() == "held\n"
-    with pytest.raises(RunError, match=f"{tmp_path}: another process is training in it"):
+def test_a_folder_has_one_trainer_at_a_time(tmp_path):
+    """One that was killed holds it no longer: such a run is resumed above."""
+    with sole_trainer(tmp_path), pytest.raises(RunError, match=f"{tmp_path}: another process is training"):
         sole_trainer(tmp_path).__enter__()
-    holder.kill()
-    holder.communicate()
     with sole_trainer(tmp_path):
         pass
-
-
-def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path, environment):
-    out = tmp_path / "stopped"
-    process = interrupt_after_a_checkpoint(out, signal.SIGINT, environment)
-    assert process.returncode == 130
-    rows = (out / "metrics.jsonl").read_text().splitlines()
-    assert Run.open(out).latest_epoch == json.loads(rows[-1])["epoch"] < 16
 
 
 @pytest.mark.parametrize(
@@ -159,9 +158,8 @@ def test_misuse_is_one_line_and_leaves_nothing_behind(arguments, message, tmp_pa
 
 @pytest.fixture(scope="module")
 def demonstrations(tmp_path_factory):
-    """A short arm's file, and a file of what it was shown."""
-    folder = tmp_path_factory.mktemp("demonstrations")
-    SHORT.to_toml(folder / "arm.toml")
+    """File of poses that the short arm was shown."""
+    path = tmp_path_factory.mktemp("demonstrations") / "demos.npz"
     pool = sample_workspace(SHORT, 6, seed=1)
     log = Log(
         source="demos",
@@ -172,24 +170,17 @@ def demonstrations(tmp_path_factory):
         tip_quaternion=quaternion_from_pose(np.asarray(pool.pose, float)),
         sequence=np.zeros(6),
     )
-    write_log(folder / "demos.npz", log)
-    return folder
+    write_log(path, log)
+    return str(path)
 
 
 def test_imitation_resumes_across_stages_and_hands_its_reward_on(
-    demonstrations, tmp_path, monkeypatch, capsys
+    arm, demonstrations, tmp_path, monkeypatch, capsys
 ):
     # 8 epochs, the second stage from the fourth
     changes = {"total_env_steps": 128, "evaluation_epochs": 2, "rebalance_env_steps": 48, "gail.hidden": 16}
-    settings = [
-        *flags(**changes),
-        "--stages",
-        "0.5,2,1",
-        "0.5,1,0.5",
-        "--spec",
-        str(demonstrations / "arm.toml"),
-    ]
-    imitate = ["imitate", str(demonstrations / "demos.npz"), *settings, "--out"]
+    stages = ["--stages", "0.5,2,1", "0.5,1,0.5"]
+    imitate = ["imitate", demonstrations, *flags(**changes), *stages, "--spec", arm, "--out"]
     whole, killed, narrow = (tmp_path / name for name in ("whole", "killed", "narrow"))
     assert main([*imitate, str(whole)]) == 0
     assert all((whole / name).exists() for name in IMITATION_PICTURES)

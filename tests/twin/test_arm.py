@@ -7,13 +7,11 @@ from scipy.spatial.transform import Rotation
 
 from mjx_softarm import ArmSpec
 from mjx_softarm.control import Gains, pressures
-from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.mechanics.mjcf import chamber_lengths, spring_lengths
 from mjx_softarm.mechanics.workspace import settle_many
-from mjx_softarm.sensing.pose import pose_error, pose_from_frame
 from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.twin import arm as twin
-from mjx_softarm.twin.arm import EVALUATION_SEEDS, Twin
+from mjx_softarm.twin.arm import Twin
 from mjx_softarm.twin.model import Build, build_twin, draw_parts
 
 IDEAL = Build(gap=0.0, losses=0.0, noise=0.0, links_per_section=4)  # training's model, moving
@@ -68,16 +66,6 @@ def test_ideal_twin_rests_where_settle_says(spec):
 def test_impossible_payload_is_refused(payload_kg):
     with pytest.raises(ValueError, match=r"payload_kg: got .*, expected a number >= 0"):
         Twin(0, payload_kg=payload_kg, build=IDEAL)
-
-
-def test_finer_twin_is_near_the_ideal_one():
-    """Ten links differ from four by the bending of a link, not by more."""
-    tips_m = []
-    for links in (4, 10):
-        arm = Twin(0, build=IDEAL._replace(links_per_section=links))
-        hold_pressures(arm, PRESSURES_KPA[1], 12.0)
-        tips_m.append(arm.motion_capture().tip_m)
-    assert 1e-4 < np.linalg.norm(tips_m[0] - tips_m[1]) < 0.015
 
 
 def test_twisted_mounting_turns_the_sections_and_stretches_nothing(spec):
@@ -205,17 +193,6 @@ def test_seed_chooses_the_twin_and_session_the_noise():
     assert twin.S2R_SESSION != twin.EVALUATION_SESSION
 
 
-def test_one_write_is_one_control_period():
-    arm = Twin(0, build=IDEAL)
-    assert arm.time_s == 0.0
-    hold_pressures(arm, np.zeros(9), 1.0)
-    arm.read_sensors(), arm.pressures(), arm.motion_capture()
-    assert arm.time_s == pytest.approx(1.0)
-    slower = Twin(0, ArmSpec.default().replace(control={"rate_hz": 30.0}), build=IDEAL)
-    slower.write_pressures(np.zeros(9))
-    assert slower.time_s == pytest.approx(1.0 / 30.0)
-
-
 @pytest.mark.parametrize(
     ("command", "message"),
     [
@@ -233,10 +210,6 @@ def test_impossible_command_is_refused_and_nothing_moves(command, message):
     arm.write_pressures(np.full(9, np.nextafter(np.float32(20.0), np.float32(21.0))))
 
 
-def test_describe_tells_distributions_not_draws():
-    assert Twin(1).describe() == Twin(2).describe()
-
-
 def test_springs_reach_their_references_from_any_side(spec):
     """The law at 50 Hz; what hysteresis leaves at the tip once the springs are where they should be."""
     gains, tips_m = Gains.from_spec(spec), []
@@ -250,52 +223,11 @@ def test_springs_reach_their_references_from_any_side(spec):
     assert np.linalg.norm(tips_m[0] - tips_m[1]) < 2e-3
 
 
-def bang_bang(seed, duration_s):
+def test_survives_random_extremes():
     """Every chamber at one of its limits, redrawn at random after 1 to 50 ticks; a payload comes and goes."""
-    arm, rng = Twin(seed), np.random.default_rng(seed)
-    while arm.time_s < duration_s:
+    arm, rng = Twin(0), np.random.default_rng(0)
+    while arm.time_s < 20.0:
         arm.attach(rng.choice([0.0, 1.0]))
         hold_pressures(arm, rng.choice([-40.0, 20.0], 9), rng.integers(1, 51) / 50)
         assert np.isfinite(arm.read_sensors()).all()
         assert np.linalg.norm(arm.motion_capture().tip_m) < 1.2
-
-
-def test_survives_random_extremes():
-    bang_bang(0, 20.0)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", EVALUATION_SEEDS[:2])
-def test_survives_ten_minutes_of_random_extremes(seed):
-    bang_bang(seed, 600.0)
-
-
-def references_for(spec, goal):
-    """Spring lengths (n, 9) that bring training's model to poses (n, 6): Gauss-Newton over the pressures."""
-    pressure, step_kpa, pull = np.full((len(goal), 9), -8.0), 0.5, 0.02
-    moves = step_kpa * np.concatenate([np.zeros((1, 9)), np.eye(9), -np.eye(9)])
-    for _ in range(8):
-        rest = settle_many(spec, (moves[:, None] + pressure).reshape(-1, 9))
-        pose = pose_from_frame(rest.tip_position_m, rest.tip_rotation).reshape(19, -1, 6)
-        slope = np.moveaxis(pose[1:10] - pose[10:], 0, -1) / (2 * step_kpa)  # (n, 6, 9)
-        for k, error in enumerate(pose_error(pose[0], goal)):
-            rows = np.concatenate([slope[k], pull * np.eye(9)])
-            wanted = np.concatenate([-error, pull * (-10.0 - pressure[k])])
-            move = np.linalg.lstsq(rows, wanted)[0]
-            pressure[k] += move * min(1.0, 8.0 / np.abs(move).max())
-    rest = settle_many(spec, pressure)
-    error = pose_error(pose_from_frame(rest.tip_position_m, rest.tip_rotation), goal)
-    assert np.linalg.norm(error[:, :3], axis=1).max() < 0.05
-    return rest.spring_m.astype(float)
-
-
-@pytest.mark.slow
-def test_without_s2r_the_twins_miss_the_circle_by_the_paper_s_error(spec):
-    goal = circle_poses(8)
-    references, gains, errors_mm = references_for(spec, goal), Gains.from_spec(spec), []
-    for seed in EVALUATION_SEEDS:
-        arm, integral_kpa = Twin(seed), np.zeros(9)
-        for reference_m, point in zip(references, goal, strict=True):
-            integral_kpa = hold_springs(arm, reference_m, integral_kpa, gains, 8.0, arm._parts.sensor)
-            errors_mm.append(np.linalg.norm(1e3 * arm.motion_capture().tip_m - point[:3]))
-    assert np.mean(errors_mm) == pytest.approx(21.0, abs=1.5)

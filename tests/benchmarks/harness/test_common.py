@@ -6,10 +6,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
 from rich.console import Console
 
-from benchmarks.harness.common import goal, show
+from benchmarks.harness.common import show
 
 
 def shown(figures, title=""):
@@ -50,13 +49,6 @@ def test_other_dictionaries_are_titled_by_their_path_and_what_is_loose_comes_fir
     deep = "settle, inner, deep down"
     titles = ["settle", deep, f"{deep}, groups, 1", f"{deep}, groups, 1, z"]
     assert [line for line in text.splitlines() if line.startswith("settle")] == titles
-
-
-@pytest.mark.parametrize("met, verdict", [(True, "met"), (False, "NOT MET"), (None, "skipped")])
-def test_a_goal_tells_what_was_measured_and_whether_it_is_met(met, verdict):
-    row = goal("fast", "7 /s", met)
-    assert row == {"goal": "fast", "measured": "7 /s", "verdict": verdict}
-    assert ["fast", "7 /s", verdict] in cells(shown({"goals": [row]}))
 
 
 MEMORY = """

@@ -57,18 +57,6 @@ def test_a_changed_pin_or_another_python_makes_it_anew(made, monkeypatch, tmp_pa
     assert len(made) == 3
 
 
-def test_one_that_was_interrupted_is_made_anew(made, monkeypatch, tmp_path):
-    peer_python("sbx", tmp_path)
-    monkeypatch.setitem(PINS, "sbx", ("sbx-rl==0.0.1",))
-    with monkeypatch.context() as patch:
-        patch.setattr(peers, "_make", Mock(side_effect=KeyboardInterrupt))
-        with pytest.raises(KeyboardInterrupt):
-            peer_python("sbx", tmp_path)
-    assert not (tmp_path / ".venv-sbx" / MARKER).exists()
-    peer_python("sbx", tmp_path)
-    assert len(made) == 2
-
-
 def test_why_an_environment_cannot_be_made_is_told_in_one_line(monkeypatch, tmp_path):
     failed = subprocess.CalledProcessError(1, ["pip"], stderr="a\nERROR: No matching distribution\n")
     monkeypatch.setattr(peers, "_make", Mock(side_effect=failed))

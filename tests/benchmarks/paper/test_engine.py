@@ -1,14 +1,13 @@
 """The engine: stages run once, in their order, elsewhere; the folder keeps its settings."""
 
 import dataclasses
-import json
 
 import pytest
 
 from benchmarks.harness import parallel
 from benchmarks.harness.parallel import JobError
 from benchmarks.paper import engine
-from benchmarks.paper.engine import Stage, claim, command, run_stages
+from benchmarks.paper.engine import Stage, claim, run_stages
 from tests.benchmarks.paper.made_up import TINY
 
 
@@ -38,22 +37,6 @@ def test_folder_of_other_settings_is_refused(tmp_path):
     claim(tmp_path, dataclasses.replace(TINY, twins=(0, 1, 2), seeds=(5,)))
     with pytest.raises(JobError, match=r"settings.json: got n_points 3, expected n_points 40;"):
         claim(tmp_path, dataclasses.replace(TINY, n_points=40))
-
-
-def test_folder_from_before_a_setting_existed_has_its_default(tmp_path):
-    claim(tmp_path, TINY)
-    file = tmp_path / "settings.json"
-    old = json.loads(file.read_text())
-    del old["imitation"]
-    file.write_text(json.dumps(old))
-    claim(tmp_path, TINY)
-    with pytest.raises(JobError, match=r"got imitation \[\], expected imitation \['frozen=true'\]"):
-        claim(tmp_path, dataclasses.replace(TINY, imitation=("frozen=true",)))
-
-
-def test_failed_command_says_how(tmp_path):
-    with pytest.raises(JobError, match=r"exit status 2; .*run.log ends with\n(.*\n)*error: "):
-        command(tmp_path / "run.log", "export", str(tmp_path / "nothing"))
 
 
 def test_jobs_run_elsewhere_and_a_failure_is_named():

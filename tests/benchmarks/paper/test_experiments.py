@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks.__main__ import main
 from benchmarks.paper import engine, experiments, report
-from benchmarks.paper.engine import SMOKE, claim
+from benchmarks.paper.engine import SMOKE
 from benchmarks.paper.measure import save_outcome
 from benchmarks.paper.trials import stages, trials
 from tests.benchmarks.paper.made_up import TINY, fill, good_results
@@ -57,12 +57,6 @@ def test_both_experiments_or_one(tmp_path, monkeypatch, capsys):
     assert main(["paper", "--only", "confined", "--twins", "1,2", *smoke]) == 0
     assert done == [("open", (0,)), ("confined", (0,)), ("confined", (1, 2))]
     assert f"written: {tmp_path / 'paper-confined.json'}" in capsys.readouterr().out
-
-
-def test_folder_of_other_settings_is_an_error(tmp_path, capsys):
-    claim(tmp_path, TINY)
-    assert main(["paper", "--smoke", "--out", str(tmp_path)]) == 2
-    assert "choose another --out" in capsys.readouterr().err
 
 
 @pytest.mark.slow

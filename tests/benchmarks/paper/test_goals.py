@@ -95,16 +95,6 @@ def test_confined_goals_that_are_missed_are_named(changed, goals):
     assert unmet("confined", changed) == goals
 
 
-def test_values_say_what_was_missed():
-    changed = {FIRST: made_up("pipe", missed=[2])}
-    assert checks("confined", changed)[0].value == "1.00 mm, 1 points missed in 1 of 9 runs"
-    never = {("hand-made", 0, 0): trained("hand-made", reaches_at=11)}
-    values = {check.text: check.value for check in checks("confined", never)}
-    # Eight runs with 8000 steps, and one that counts as 10 001.
-    told = "learned 4,000 in the mean; hand-made 8,222 in the mean or more: never in 1 of 9 runs"
-    assert values[STEPS] == told
-
-
 def test_what_was_not_measured_is_not_met():
     for experiment in ("open", "confined"):
         found = {(check.value, check.met) for check in check_goals(experiment, [], [])}

@@ -6,7 +6,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from benchmarks.harness.parallel import JobError
 from benchmarks.paper import jobs
 from benchmarks.paper.engine import SMOKE
 from benchmarks.paper.kinds import KINDS, Trial, learned_run, reach_run
@@ -89,29 +88,6 @@ def test_settings_of_each_kind_are_known(tmp_path, commands, kind):
     assert (config.gail.gradient_penalty == 0) == (kind == "no-penalty")
     assert (options.reward is not None) == (kind == "narrow")
     assert config.env.pipe_diameter_mm == {"narrow": 250, "circle": None}.get(kind, 300)
-
-
-def test_missing_policies_are_exported_in_one_go(tmp_path, commands):
-    (tmp_path / "a").mkdir()
-    (tmp_path / "a" / "policy.npz").touch()
-    (export,) = commands(jobs.export, tmp_path, TINY, 0, ("a", "b", "c"))
-    assert parsed(export).keywords["folders"] == (tmp_path / "b", tmp_path / "c")
-
-
-def test_recording_that_ends_early_is_no_demonstration(tmp_path, monkeypatch):
-    file = tmp_path / jobs.demonstrations_path(3, "pipe300")
-    file.parent.mkdir()
-
-    def ends_early(log, *arguments):
-        options = parsed(arguments)
-        assert (options.arm, options.task) == ("twin:3:pipe300", "pipe300")
-        options.out.write_text("half of it")
-        raise JobError("ended early")
-
-    monkeypatch.setattr(jobs, "command", ends_early)
-    with pytest.raises(JobError):
-        jobs.demonstrate(tmp_path, TINY, 3, "pipe300")
-    assert not file.exists()
 
 
 def test_scene_is_the_twin_in_its_pipe(tmp_path, make_arm_model, monkeypatch):

@@ -8,12 +8,10 @@ from benchmarks.paper.measure import (
     GRASP_M,
     PLACE_M,
     Gripper,
-    WatchedTwin,
     figures,
     finger_tips,
     load_outcome,
     measure,
-    operate,
     save_outcome,
 )
 from mjx_softarm.deploy.controller import Controller
@@ -23,7 +21,6 @@ from mjx_softarm.deploy.session import Arrival, Run
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.mechanics.pipe import APPLE_KG, BALL_KG
-from mjx_softarm.twin.arm import Twin
 from tests.benchmarks.paper.made_up import GRIPPER_M, N, made_up, make_policy
 
 DOWN = np.array([1.0, 0.0, 0.0, 0.0])  # quaternion of a gripper that hangs straight
@@ -97,29 +94,12 @@ def test_figures_of_a_task_by_hand():
     assert row["events"] == {Fault.SATURATED.value: 3}
 
 
-def test_trial_without_an_arrival_has_no_error():
-    row = figures(made_up("with", missed=range(6)))
-    assert np.isnan([row[name] for name in ("translation_mm", "x_mm", "max_mm", "believed_mm")]).all()
-    assert row["reached"] == 0
-
-
 def test_outcome_comes_back_from_its_file(tmp_path):
     outcome = made_up("pipe", saturated=[(0, 3)], fails=(1,), missed=(2,))
     save_outcome(tmp_path / "run.npz", outcome)
     for name, value in load_outcome(tmp_path / "run.npz")._asdict().items():
         expected = getattr(outcome, name)
         assert np.array_equal(value, expected, equal_nan=value.dtype.kind == "f"), name
-
-
-def test_watched_twin_is_driven_and_tells_each_time():
-    ticks = iter([(0.0, 1.0), (2.0, 0.0)])
-    twin = SimpleNamespace(write_pressures=lambda p: None, wall_force_n=lambda: next(ticks), time_s=3.0)
-    forces = []
-    watched = WatchedTwin(twin, lambda: forces.append(twin.wall_force_n()))
-    for _ in range(2):
-        watched.write_pressures(np.zeros(N))
-    assert forces == [(0.0, 1.0), (2.0, 0.0)]
-    assert watched.time_s == 3.0
 
 
 def test_finger_tips_are_below_the_tip():
@@ -180,17 +160,3 @@ def test_full_gripper_picks_nothing_else():
     success, did = gripped({}, skip=(3,))  # the ball comes to the bottom, and ends where the apple should
     assert success == [False, True, False, False, False, True]
     assert did == [BALL_KG, "release"]
-
-
-def test_object_lies_where_it_was_released(monkeypatch):
-    monkeypatch.setattr("tests.benchmarks.paper.test_measure.NAMES", (*NAMES, "pick left"))
-    monkeypatch.setattr("tests.benchmarks.paper.test_measure.GOALS_M", np.vstack([GOALS_M, GOALS_M[3]]))
-    assert gripped({1: 0.03}, order=(1, 3, 6)) == ([True, True, False], [BALL_KG, "release"])  # 30 mm away
-
-
-def test_policy_operates_a_twin(make_arm_model):
-    controller = Controller.of(make_policy(make_arm_model))
-    outcome = operate(Twin(0), controller, circle_poses(1).astype(float), ["pick right"], "as shown")
-    assert outcome.operation.tolist() == [True] and outcome.success.tolist() == [False]
-    assert len(outcome.wall_n) == len(outcome.container_n) == len(outcome.finger_m) == len(outcome.time_s)
-    assert not outcome.wall_n.any()

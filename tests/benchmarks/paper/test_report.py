@@ -13,14 +13,12 @@ from benchmarks.paper.measure import save_outcome
 from benchmarks.paper.summary import (
     first_stage_success,
     load_results,
-    spread,
     spreads,
     steps_to_success,
     trial_rows,
 )
 from benchmarks.paper.trials import FILMS, trainings, trials
 from mjx_softarm.mechanics.excitation import circle_poses
-from mjx_softarm.mechanics.pipe import CrossPipe, clearance
 from tests.benchmarks.paper.made_up import (
     SPEC,
     TINY,
@@ -34,12 +32,6 @@ from tests.benchmarks.paper.made_up import (
 )
 from train.config import to_dict
 from train.presets import IMITATION_PRESETS
-
-
-def test_spread_by_hand():
-    expected = {"mean": 3.0, "std": np.sqrt(14 / 3), "min": 1.0, "max": 6.0}
-    assert spread([1.0, 2.0, 6.0]) == pytest.approx(expected)
-    assert np.isnan(list(spread([1.0, np.nan]).values())).all()
 
 
 def test_spreads_group_kinds_and_variants():
@@ -132,13 +124,6 @@ def test_confined_results_are_written_and_nothing_is_hidden(tmp_path):
     assert [row["x_mm"] is None for row in figures["runs"]].count(True) == 3
 
 
-def test_printed_rows_have_the_paper_s_numbers_below():
-    table = spreads(trial_rows(good_results("open", TINY)))
-    rows = report.printed_rows("open", [item for item in table if item["kind"] == "without"])
-    assert [row["kind"] for row in rows] == ["without S2R", "the paper's arm"]
-    assert (rows[0]["translation_mm"], rows[1]["translation_mm"]) == ("10.00 ± 0.00", 21.01)
-
-
 @pytest.mark.parametrize("experiment", ["open", "confined"])
 def test_titles_and_labels_lie_within_the_pictures(experiment):
     results = good_results(experiment, TINY)
@@ -149,9 +134,6 @@ def test_titles_and_labels_lie_within_the_pictures(experiment):
             box = artist.get_tightbbox()
             inside = box.x0 >= -1 and box.y0 >= -1 and box.x1 <= width + 1 and box.y1 <= height + 1
             assert inside, (name, artist, box)
-
-
-# --- Film --------------------------------------------------------------------------------------------------
 
 
 class DrawnTwin:
@@ -171,30 +153,6 @@ class DrawnTwin:
 
     def renderer(self, width, height):
         return open("/dev/null")
-
-
-def test_twin_is_filmed_at_equal_times():
-    twin = DrawnTwin()
-    camera = film.Camera(twin, None)
-    for _ in range(round(200 / 0.02)):
-        twin.write_pressures(np.zeros(N))
-        camera.shoot()
-    taken = [picture[0, 0, 0] for picture in camera.pictures]
-    assert taken[:3] == [0, 1, 2]
-    assert len(taken) == len(camera.seen) == 201
-    path_mm = 1e3 * np.array([seen.tip_m for seen in camera.seen])
-    images = film.frames(camera.pictures, path_mm, film.SideView("", "", (0, 1), circle_poses(4)[:, :3]))
-    shown = [image.getpixel((0, 319))[0] for image in images]
-    assert len(images) == film.MAX_FRAMES
-    assert (shown[0], shown[-1]) == (0, 200)
-    assert shown == sorted(shown)
-
-
-def test_outline_is_the_wall():
-    pipe = CrossPipe.of_mm(300)
-    for line in film.outline_mm(pipe):
-        for x, z in 0.5e-3 * (line[:-1] + line[1:]):
-            assert abs(clearance(pipe, np.array([x, 0.0, z]))) < 1e-9
 
 
 def test_film_shows_the_pipe_and_the_path(tmp_path, monkeypatch):

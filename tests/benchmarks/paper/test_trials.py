@@ -41,20 +41,3 @@ def test_stages_leave_every_trial_s_result_and_come_after_what_they_need():
                 circle = at[f"circle-twin{twin}-seed0/evaluation.json"]
                 assert at[f"twin{twin}/demos-circle16.npz"] < circle
                 assert at[f"twin{twin}-seed0/policy.npz"] < circle
-
-
-def test_both_experiments_share_calibrations_and_policies():
-    shared = [
-        {path for group in stages(experiment, TINY) for stage in group for path in stage.results}
-        for experiment in ("open", "confined")
-    ]
-    assert shared[0] & shared[1] == {
-        path
-        for twin in TINY.twins
-        for path in (
-            f"twin{twin}/calibration",
-            f"twin{twin}-seed0/evaluation.json",
-            f"twin{twin}-seed0/policy.npz",
-            f"trials/with-twin{twin}-seed0-0-g.npz",
-        )
-    }

@@ -75,18 +75,6 @@ def played():
     return Played()
 
 
-def test_each_part_of_a_batch_has_exchanged_goals_and_others(played):
-    own = {tuple(goal) for goal in played.buffer.observations["desired_goal"].reshape(-1, 6)}
-    batch = played.buffer.sample(16 * 64)
-    exchanged = [tuple(goal) not in own for goal in batch.observations["desired_goal"].numpy()]
-    np.testing.assert_array_equal(
-        batch.observations["desired_goal"].numpy(), batch.next_observations["desired_goal"].numpy()
-    )
-    assert np.mean(exchanged) == SHARE
-    shares = np.reshape(exchanged, (16, 64)).mean(axis=1)  # SBX makes batches of consecutive rows
-    assert shares.min() > 0.5 and shares.max() < 1.0
-
-
 def test_goals_of_their_own_would_have_given_what_the_environment_gave(played, monkeypatch):
     buffer, where = played.buffer, played.where
     monkeypatch.setattr(buffer, "_sample_goals", lambda *where: buffer.observations["desired_goal"][where])
@@ -100,18 +88,6 @@ def test_goals_of_their_own_would_have_given_what_the_environment_gave(played, m
     np.testing.assert_array_equal(np.isclose(own.rewards[:, 0], -10.0), played.saturated[where])
     assert 0.1 < played.saturated[where].mean() < 0.9
     assert 0.1 < own.dones.numpy().mean() < 0.9
-
-
-def test_a_pose_that_was_reached_ends_the_episode_with_the_bonus_unless_it_saturated(played, monkeypatch):
-    buffer, where = played.buffer, played.where
-    monkeypatch.setattr(
-        buffer, "_sample_goals", lambda *where: buffer.next_observations["achieved_goal"][where]
-    )
-    batch = buffer._get_virtual_samples(*where)
-    saturated = played.saturated[where][:, None]
-    np.testing.assert_allclose(batch.rewards, np.where(saturated, -10.0, 10.0), rtol=1e-6)
-    np.testing.assert_array_equal(batch.dones, ~saturated)
-    np.testing.assert_allclose(batch.next_observations["observation"], 0.0, atol=1e-6)
 
 
 def test_a_goal_elsewhere_gives_the_reward_and_the_observations_of_the_way_to_it(played, monkeypatch):
@@ -138,13 +114,3 @@ def test_a_goal_elsewhere_gives_the_reward_and_the_observations_of_the_way_to_it
     wanted = np.where(played.saturated[where], -10.0, REWARD_SCALE * (-10 * error - 0.1 * n_steps))
     np.testing.assert_allclose(batch.rewards[:, 0], wanted, atol=1e-4)
     assert not batch.dones.any()
-
-
-def test_an_arm_that_is_charged_for_walls_is_refused(played):
-    from benchmarks.race.hindsight import HindsightBuffer
-
-    charged = EnvConfig(n_poses=8, pipe_diameter_mm=300.0, clearance_cost_per_mm=1.0)
-    arm = SoftArmVectorEnv(1, config=charged).env
-    spaces = played.buffer.observation_space, played.buffer.action_space
-    with pytest.raises(ValueError, match="not charged for walls"):
-        HindsightBuffer(8, *spaces, env=None, arm=arm, share=SHARE, reward_scale=1.0)

@@ -1,4 +1,4 @@
-"""What is asked of a GPU, judged on made-up figures and with a made-up training."""
+"""Goals for a GPU, judged on made-up figures and with a made-up training."""
 
 import json
 import sys
@@ -12,25 +12,17 @@ from train.presets import PRESETS
 
 def rates(**engines):
     mode = {"mode": "quasistatic"}
-    rows = [
-        {"engine": engine, **mode, "arms": n, "env_steps_per_s": rate}
-        for engine, measured in engines.items()
-        for n, rate in measured.items()
-    ]
+    points = [(engine, n, rate) for engine, measured in engines.items() for n, rate in measured.items()]
+    rows = [{"engine": engine, **mode, "arms": n, "env_steps_per_s": rate} for engine, n, rate in points]
     return [*rows, {"engine": "mjx", "mode": "dynamic", "arms": 1, "env_steps_per_s": 10**9}]
 
 
-def test_goals_of_a_gpu_are_met_at_the_best_number_of_arms_or_not():
+def test_goals_of_a_gpu_are_judged_at_the_best_number_of_arms_and_skipped_without_one():
     goals = gpu.rate_goals(rates(chain={1: 5, 8192: 300_000, 32_768: 7}, mjx={8192: 29_999}), on_gpu=True)
     assert [row["verdict"] for row in goals] == ["met", "NOT MET"]
     assert goals[0]["measured"] == "300,000 with 8,192 arms"
-
-
-def test_goals_of_a_gpu_are_skipped_without_one_and_say_why():
-    goals = [
-        *gpu.rate_goals(rates(chain={1: 10**6}, mjx={1: 10**6}), on_gpu=False),
-        gpu.training_goal(on_gpu=False),
-    ]
+    goals = gpu.rate_goals(rates(chain={1: 10**6}, mjx={1: 10**6}), on_gpu=False)
+    goals.append(gpu.training_goal(on_gpu=False))
     assert {row["verdict"] for row in goals} == {"skipped"}
     assert {row["measured"] for row in goals} == {gpu.NO_DEVICE}
 
@@ -49,7 +41,6 @@ with open(sys.argv[1], "w", buffering=1) as file:
     file.write('{"evaluation/median_mm": 1')
     file.flush()
     time.sleep(float(sys.argv[2]))
-sys.exit(int(sys.argv[3]))
 """
 
 
@@ -57,25 +48,7 @@ sys.exit(int(sys.argv[3]))
 def test_time_to_a_median_is_read_from_the_metrics_of_a_run(tmp_path, median_mm, reached):
     metrics = tmp_path / "metrics.jsonl"
     sleep = "60" if reached else "0"  # stopped as soon as it is there
-    command = [sys.executable, "-c", TRAINING, str(metrics), sleep, "0"]
+    command = [sys.executable, "-c", TRAINING, str(metrics), sleep]
     spent, best = gpu.seconds_to(median_mm, command, metrics, 30.0, {})
     assert (spent is not None) == reached and best == 2.5
     assert json.loads(metrics.read_text().splitlines()[0]) == {"evaluation/median_mm": 9.0}
-
-
-def test_a_training_that_fails_is_a_goal_that_is_not_met(tmp_path, monkeypatch):
-    metrics = tmp_path / "metrics.jsonl"
-    fails = [sys.executable, "-c", TRAINING, str(metrics), "0", "3"]
-    with pytest.raises(RuntimeError, match="status 3"):
-        gpu.seconds_to(1.0, fails, metrics, 30.0, {})
-    given = []
-
-    def fail(median_mm, command, metrics, longest_s, environment):
-        given.append((metrics, environment))
-        raise RuntimeError("train reach: status 1: a\nRESOURCE_EXHAUSTED: no memory")
-
-    monkeypatch.setattr(gpu, "seconds_to", fail)
-    row = gpu.training_goal(on_gpu=True)
-    assert (row["measured"], row["verdict"]) == ("RESOURCE_EXHAUSTED: no memory", "NOT MET")
-    ((metrics, environment),) = given
-    assert environment["XDG_CACHE_HOME"] in str(metrics)  # new and empty, so compilation is in the time

@@ -1,15 +1,12 @@
 """The learner's benchmark: rounds that take turns, contestants left out, ratios; with made-up programs."""
 
-import math
 import sys
 from types import SimpleNamespace
-from unittest.mock import Mock
 
 import pytest
 
-from benchmarks.harness.peers import PeerError
-from benchmarks.speed import learner, learner_contestants
-from benchmarks.speed.learner import BATCH_SIZES, CONTESTANTS, table, updates_per_round
+from benchmarks.speed import learner
+from benchmarks.speed.learner import BATCH_SIZES, CONTESTANTS, updates_per_round
 from benchmarks.speed.learner_contestants import choose_threads
 
 ROWS_PER_S = {"ours": 64_000.0, "sb3-contrib": 16_000.0, "sbx": 32_000.0, "brax": 128_000.0}
@@ -42,11 +39,6 @@ def test_contestants_take_turns_at_each_size_with_ratios_beside(asked):
     assert figures["updates_per_s"][0] == {"batch": 256, **rates, **ratios}
     assert [row["batch"] for row in figures["updates_per_s"]] == [256, 1024, 4096, 16_384, 32_768]
     assert figures["left_out"] == [] and figures["rounds"][0]["ours"] == [250.0] * learner.N_ROUNDS
-
-
-def test_a_median_does_not_see_one_slow_round():
-    (row,) = table({64: {"ours": [10.0, 1.0, 11.0], "sbx": [4.0, 5.0, 6.0]}})
-    assert row == {"batch": 64, "ours": 10.0, "SBX TQC": 5.0, "ours / sbx": 2.0}
 
 
 def test_updates_per_round_keep_a_round_at_about_its_time(asked):
@@ -83,13 +75,6 @@ def test_a_contestant_that_fails_is_left_out_from_there_and_the_others_go_on(ask
     assert figures["left_out"] == [{"contestant": CONTESTANTS[name], "why": why}]
 
 
-def test_a_peer_that_cannot_be_installed_is_left_out(asked, monkeypatch):
-    monkeypatch.setattr(learner, "peer_python", Mock(side_effect=PeerError("no network")))
-    figures = learner.measure()
-    assert set(figures["updates_per_s"][0]) == {"batch", "ours", "brax SAC", "ours / brax"}
-    assert [row["why"] for row in figures["left_out"]] == ["no network"] * 2
-
-
 @pytest.mark.parametrize(
     "times, chosen",
     [
@@ -108,20 +93,3 @@ def test_pytorch_gets_the_threads_it_trains_fastest_with(monkeypatch, times, cho
     left = {n: iter(own) for n, own in times.items()}
     choose_threads(lambda: clock.__setitem__(0, clock[0] + next(left[threads[0]])))
     assert threads == [chosen]
-
-
-@pytest.mark.slow
-def test_our_contestant_updates_its_networks_and_tells_how_fast(monkeypatch):
-    from train.epoch import replay
-
-    stored, add = [], replay.add
-
-    def seen(*given):
-        stored.append(add(*given))
-        return stored[-1]
-
-    monkeypatch.setattr(learner_contestants, "N_STORED", 256)
-    monkeypatch.setattr(replay, "add", seen)
-    facts, work = learner_contestants.CONTESTANTS["ours"](32, 2)
-    assert facts == {} and int(stored[0].size) == 256
-    assert 0.0 < work()["updates_per_s"] < math.inf

@@ -96,9 +96,6 @@ def fitted_without_springs():
     return calibrate_chambers(pose_log(planted(), 200, seed=0, spring_m=None), SPEC)
 
 
-# --- planted arms ----------------------------------------------------------------------------------
-
-
 def test_planted_numbers_come_back(fitted):
     stiffness, area, slope, offset_m = off_by(fitted.spec, planted())
     assert stiffness < 0.05
@@ -188,9 +185,6 @@ def test_an_arm_that_does_not_settle_is_masked_and_counted():
     assert np.isnan(fit.tip_error_mm).sum() == 3
     assert any("no rest at 3 of 100 poses" in warning for warning in fit.warnings)
     assert tip_error_mm(fit.spec, planted()).mean() < 0.5
-
-
-# --- what the poses do not tell --------------------------------------------------------------------
 
 
 def test_a_chamber_that_never_changes_is_named_and_its_area_left_alone():

@@ -84,13 +84,6 @@ def test_simulated_arms_are_met_as_coarsely_as_the_module_says(arm, kind, rms_m,
     assert limits.length_max_m == limits.length_m.max()
 
 
-def test_poses_without_markers_are_left_out(arm):
-    poses, length_m = poses_with_markers(arm, "chamber")
-    most = marker_limits(poses, length_m, SPEC).pose[0]
-    poses.marker_m[most, 3] = np.nan
-    assert most not in marker_limits(poses, length_m, SPEC).pose
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [

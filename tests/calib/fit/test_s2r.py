@@ -11,7 +11,6 @@ from benchmarks.accuracy.logs import trunk_errors
 from calib.fit.blocks import held_out_blocks
 from calib.fit.network import NetworkConfig, fit_network
 from calib.fit.s2r import fit_s2r, pose_errors, simulate_poses
-from mjx_softarm._support.mlp import mlp
 from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.settle import settle
 from mjx_softarm.mechanics.statics import ArmParams
@@ -140,30 +139,6 @@ def test_refuses_what_does_not_fit_together(spec, arms):
     with pytest.raises(ValueError, match="inputs, row 3, column 9: got nan, expected a finite number"):
         broken = np.where(np.arange(150)[:, None] == 3, np.nan, spring_m)
         fit_network(np.concatenate([np.zeros((150, 9)), broken], axis=1), true, seed=0)
-
-
-def test_one_network_says_the_mean_of_its_members():
-    rng = np.random.default_rng(0)
-    x = rng.uniform(-1.0, 1.0, (400, 2))
-    y = np.stack([np.sin(3.0 * x[:, 0]), 5.0 + x[:, 0] * x[:, 1]], axis=1)
-    config = NetworkConfig(hidden=(8, 4), n_members=3, n_updates=50)
-    network = fit_network(x, y, 0, config).network
-    shapes = [weight.shape for weight, _ in network.layers]  # three members and the line
-    assert shapes == [(2, 3 * 8 + 2), (3 * 8 + 2, 3 * 4 + 2), (3 * 4 + 2, 2)]
-    z = 2.0 * (x - network.input_low) / (network.input_high - network.input_low) - 1.0
-    (w0, b0), (w1, b1), (w2, b2) = network.layers
-    slices = [(slice(8 * k, 8 * k + 8), slice(4 * k, 4 * k + 4)) for k in range(3)]
-    members = [mlp(((w0[:, a], b0[a]), (w1[a, b], b1[b]), (3.0 * w2[b], 0.0)), z) for a, b in slices]
-    expected = np.mean(members, axis=0) + (z + 1.0) @ w2[-2:] + b2
-    np.testing.assert_allclose(mlp(network.layers, z), expected, rtol=1e-5, atol=1e-5)
-
-
-def test_a_straight_line_is_learned_exactly_enough():
-    """The line goes through the network's layers; what is left to the members is nothing."""
-    x = np.random.default_rng(0).uniform(-3.0, 5.0, (500, 3))
-    y = x @ [[2.0], [-1.0], [0.3]] + 7.0
-    fitted = correction(fit_network(x, y, 0, NetworkConfig(n_updates=50)).network, x)
-    assert np.abs(fitted - y).max() < 0.02 * np.ptp(y)
 
 
 def test_a_constant_input_and_a_constant_output_do_no_harm():

@@ -63,11 +63,11 @@ def test_an_update_descends_on_the_loss_and_its_penalty():
 
 
 @pytest.mark.parametrize(
-    "change", [{"learning_rate": -1.0}, {"gradient_penalty": -1.0}, {"input_scale": 0.0}]
+    ("name", "value"), [("learning_rate", -1.0), ("gradient_penalty", -1.0), ("input_scale", 0.0)]
 )
-def test_a_bad_setting_is_named(change):
-    with pytest.raises(ValueError, match=f"GailConfig.{next(iter(change))}: got"):
-        GailConfig(**change)
+def test_a_bad_setting_is_named(name, value):
+    with pytest.raises(ValueError, match=f"GailConfig.{name}: got"):
+        GailConfig(**{name: value})
 
 
 def test_an_expert_is_recovered_from_its_actions_alone():

@@ -14,6 +14,8 @@ from train.agent.tqc import TQCConfig, Transition
 
 B = 16
 
+pytestmark = pytest.mark.usefixtures("quick_compiler")
+
 
 @pytest.fixture
 def new(imitation_config, short_env, shown):

@@ -7,13 +7,9 @@ import pytest
 
 from train.agent.networks import Actor, Critics, squash
 
+pytestmark = pytest.mark.usefixtures("strict")
+
 OBS, ACTION = 3, 2
-
-
-@pytest.fixture(autouse=True, scope="module")
-def strict():
-    with jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
-        yield
 
 
 def numpy_dense(layer, x):

@@ -238,14 +238,8 @@ def test_a_batch_field_of_the_wrong_shape_is_named(agent, state, field):
         agent.update(state, wrong, jax.random.key(0))
 
 
-BAD = {
-    "hidden_critic": (),
-    "n_critics": 0,
-    "n_drop_per_critic": 25,
-    "gamma": 1.5,
-    "tau": 0.0,
-    "initial_alpha": 0.0,
-}
+BAD = {"hidden_critic": (), "n_critics": 0, "n_drop_per_critic": 25}
+BAD |= {"gamma": 1.5, "tau": 0.0, "initial_alpha": 0.0}
 
 
 @pytest.mark.parametrize(("field", "value"), BAD.items())

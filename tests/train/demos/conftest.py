@@ -1,4 +1,4 @@
-"""What tests of demonstrations share: one expert, compiled once."""
+"""Fixtures for tests of demonstrations: one expert, compiled once."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ SHIFT_MM = (4.0, -3.0, 2.0)
 
 @pytest.fixture(scope="session")
 def shift_mm():
-    """What the network of `expert` adds to every simulated tip."""
+    """Shift (3,) [mm] that the network of `expert` adds to every simulated tip."""
     return np.array(SHIFT_MM)
 
 

@@ -59,12 +59,6 @@ def test_rows_are_positions_and_the_actions_that_lead_there(file, env, name):
     np.testing.assert_allclose(rotation, np.tile(turn, (6, 1, 1)), atol=1e-6)
 
 
-def test_a_single_row_is_enough(tmp_path):
-    write_log(tmp_path / "one.csv", demonstration_log().take([3]))
-    demos = load_demonstrations(tmp_path / "one.csv", SPEC)
-    assert demos.positions.shape == (1, 6) and demos.sequence.tolist() == [5]
-
-
 LIMITS_M = np.array([[SPEC.springs.length_min_m], [SPEC.springs.length_max_m]])
 LOW, HIGH = Sensor.from_spec(SPEC).readings(LIMITS_M)[:, 0]
 MISTAKES = {

@@ -6,10 +6,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_softarm import control
-from mjx_softarm.mechanics.mjcf import build_model, spring_lengths
+from mjx_softarm.mechanics.mjcf import build_model
 from mjx_softarm.mechanics.pipe import CrossPipe, body_clearance
 from mjx_softarm.sensing.pose import pose_from_frame
+from tests.mechanics.test_fidelity import FAST_GAINS, fast_model, stepped_to_rest
 from train.demos.expert import (
     EASED,
     LIMIT_SHARE,
@@ -38,20 +38,12 @@ def plan(expert, waypoints):
 
 
 def hold(spec, reference_m):
-    """C MuJoCo under the sensor-space law, stepped until it rests; strong damping only shortens the way."""
-    model = build_model(spec)
-    model.opt.timestep = 1.0
-    model.dof_damping[:] = 4.0 * model.jnt_stiffness[model.dof_jntid]
-    model.tendon_damping[:] = 4.0 * model.tendon_stiffness
-    gains = control.Gains.from_spec(spec)._replace(ki_kpa_per_ms=200.0)
-    data, integral = mujoco.MjData(model), np.zeros(spec.n_chambers)
+    """C MuJoCo at rest under the sensor-space law."""
+    rest, model = stepped_to_rest(fast_model(), reference_m, FAST_GAINS), build_model(spec)
+    data = mujoco.MjData(model)
+    data.qpos[:], data.ctrl[:] = rest.q, rest.pressure_kpa
     mujoco.mj_forward(model, data)
-    for _ in range(3000):
-        data.ctrl[:], integral = control.pressures(reference_m, spring_lengths(data), integral, gains, 1.0)
-        mujoco.mj_step(model, data)
-        if max(np.abs(data.qvel).max(), np.abs(data.qacc).max()) < 1e-10:
-            return model, data
-    return pytest.fail("C MuJoCo did not come to rest")
+    return model, data
 
 
 def plates(model, data, spec):
@@ -118,7 +110,7 @@ def test_waypoint_that_cannot_be_met_is_named(expert, finger_m, message):
 
 
 def test_gripper_that_cannot_hang_as_asked_hangs_a_little_otherwise(expert, spec):
-    """Where square it could not keep off the wall and the limits, it is turned; the position is kept."""
+    """The gripper turns where square it would meet the wall or the limits; its position is kept."""
     finger_m = np.array([0.12, 0.02, -0.66])
     found = expert.reach("edge", expert.target(Waypoint("edge", finger_m, SQUARE)), np.zeros(spec.n_chambers))
     turn = found.rotation.T - found.rotation

@@ -58,7 +58,7 @@ class BlindArm:
 
 
 class IdealArm(BlindArm):
-    """The same, seen by motion capture."""
+    """The nominal arm, seen by motion capture."""
 
     def motion_capture(self):
         tip_m = np.asarray(self.now.tip_position_m, float)
@@ -77,7 +77,7 @@ def plan(expert, waypoints):
 
 
 def fingers_m(log):
-    """Where the log has the finger tips: 100 mm below the tip, along its axis."""
+    """Return the finger tips (rows, 3) [m] of a log: 100 mm below the tip, along its axis."""
     x, y, z, w = (log.tip_quaternion[:, k] for k in (1, 2, 3, 0))
     axis = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x**2 + y**2)], axis=-1)
     return log.tip_m - 0.1 * axis

@@ -187,7 +187,7 @@ def pair():
 
 
 def end(processes):
-    """What each printed; all must end well, and in time."""
+    """Return the texts that the processes printed; all must end well, and in time."""
     try:
         printed = [process.communicate(timeout=LONGEST_S)[0] for process in processes]
     finally:

@@ -11,6 +11,8 @@ from train.epoch.devices import mesh_of
 from train.epoch.goals import DemonstratedGoals, goal_weights
 from train.epoch.job import Job
 
+pytestmark = pytest.mark.usefixtures("quick_compiler")
+
 
 def new_job(config, env, shown, mesh=None):
     learner = Imitation(HindsightTQC(config, env), config, env, shown)

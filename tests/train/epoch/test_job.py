@@ -11,10 +11,12 @@ from mjx_softarm.env import ReachEnv
 from tests.train.small import CONFIG, SHORT, new_job
 from train.runs.checkpoint import Run, RunError
 
+pytestmark = pytest.mark.usefixtures("quick_compiler")
+
 
 @pytest.fixture(scope="module")
 def job():
-    return new_job(CONFIG, ReachEnv(config=CONFIG.env))
+    return new_job(CONFIG, ReachEnv(SHORT, CONFIG.env))
 
 
 def start(job):

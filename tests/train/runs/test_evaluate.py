@@ -6,6 +6,8 @@ import pytest
 
 from train.runs.evaluate import N_ACTIONS, Evaluator, Reached, summarise
 
+pytestmark = pytest.mark.usefixtures("quick_compiler")
+
 
 def reached(error_mm, scaled_error, saturated, settled):
     n = len(error_mm)
@@ -41,41 +43,40 @@ def test_figures_of_results_made_by_hand():
 
 
 class Scripted:
-    """An agent whose action is looked up by the goal in the observation."""
+    """An agent whose policy is an array of actions, looked up by the goal in the observation."""
 
-    def __init__(self, env, goals, actions):
+    def __init__(self, env, goals):
         self._goals = jnp.stack([env.observe(goal, goal) for goal in goals])[:, 6:12]
-        self._actions = actions
 
-    def mode(self, _, obs):
-        distance = jnp.sum((self._goals - obs[6:12]) ** 2, axis=-1)
-        return self._actions[jnp.argmin(distance)]
+    def mode(self, actions, obs):
+        return actions[jnp.argmin(jnp.sum((self._goals - obs[6:12]) ** 2, axis=-1))]
 
 
 @pytest.fixture(scope="module")
-def pool_goals(env):
-    return env.pool.pose[:64], env.action_of(env.pool.spring_m[:64])
-
-
-def evaluate(env, goals, actions):
-    evaluator = Evaluator(env, Scripted(env, goals, actions), n_goals=len(goals))
+def evaluator(short_env):
+    goals = short_env.pool.pose[:64]
+    evaluator = Evaluator(short_env, Scripted(short_env, goals), n_goals=len(goals))
     evaluator.goals = goals
-    return evaluator(None)
+    return evaluator
 
 
-def test_a_policy_that_never_moves_is_as_far_as_the_goals_are(env, pool_goals):
-    goals, actions = pool_goals
-    figures, workspace, circle = evaluate(env, goals, jnp.broadcast_to(actions[:1], actions.shape))
-    expected = np.linalg.norm(np.asarray(goals - goals[0])[:, :3], axis=-1)
+@pytest.fixture
+def actions(short_env):
+    """Actions (64, 3) that lead to the goals."""
+    return short_env.action_of(short_env.pool.spring_m[:64])
+
+
+def test_a_policy_that_never_moves_is_as_far_as_the_goals_are(evaluator, actions):
+    goals = np.asarray(evaluator.goals)
+    figures, workspace, circle = evaluator(jnp.broadcast_to(actions[:1], actions.shape))
+    expected = np.linalg.norm((goals - goals[0])[:, :3], axis=-1)
     np.testing.assert_allclose(workspace.tip_error_mm, expected, atol=0.1)
     assert figures.median_mm == pytest.approx(np.median(expected), abs=0.1)
-    around = np.linalg.norm(np.asarray(circle.goal - np.asarray(goals[0]))[:, :3], axis=-1)
+    around = np.linalg.norm((np.asarray(circle.goal) - goals[0])[:, :3], axis=-1)
     np.testing.assert_allclose(circle.tip_error_mm, around, atol=0.1)
 
 
-def test_an_arm_that_fails_on_the_way_counts_as_unsettled(env, pool_goals):
-    goals, actions = pool_goals
-    bad = actions.at[3].set(jnp.nan)
-    figures, workspace, _ = evaluate(env, goals, bad)
-    assert N_ACTIONS > 1 and not workspace.settled[3] and workspace.settled.sum() == len(goals) - 1
-    assert figures.unsettled == 1 and figures.reached_share == 1 - 1 / len(goals)
+def test_an_arm_that_fails_on_the_way_counts_as_unsettled(evaluator, actions):
+    figures, workspace, _ = evaluator(actions.at[3].set(jnp.nan))
+    assert N_ACTIONS > 1 and not workspace.settled[3] and workspace.settled.sum() == len(actions) - 1
+    assert figures.unsettled == 1 and figures.reached_share == 1 - 1 / len(actions)

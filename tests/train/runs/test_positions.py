@@ -10,6 +10,8 @@ from mjx_softarm.env import ReachEnv
 from train.runs.evaluate import Reached
 from train.runs.positions import PositionEvaluator, summarise
 
+pytestmark = pytest.mark.usefixtures("quick_compiler")
+
 
 @pytest.fixture
 def perfect(short_env, shown):
