@@ -135,8 +135,9 @@ def test_reverse_mode_is_the_transpose_of_forward_mode():
 
 
 def test_both_engines_have_the_same_derivative():
-    params = ArmParams.from_spec(SHORT)
-    reference, turn = np.float32(references()[:, :6]), np.float32(directions()[1][:, :6])
+    spec = SHORT.replace(structure={"n_sections": 1})
+    params = ArmParams.from_spec(spec)
+    reference, turn = np.float32(references()[:, :3]), np.float32(directions()[1][:, :3])
 
     def slopes(kinematics, uses_mjx=False):
         def one(reference, turn):
@@ -145,7 +146,7 @@ def test_both_engines_have_the_same_derivative():
         return xla.jit(jax.vmap(one), uses_mjx)(reference, turn)
 
     chain = slopes(chain_kinematics(params))
-    mjx_slope = slopes(mjx_kinematics(mjx.put_model(build_model(SHORT))), uses_mjx=True)
+    mjx_slope = slopes(mjx_kinematics(mjx.put_model(build_model(spec))), uses_mjx=True)
     for name in SEEN:
         assert np.abs(chain[name]).max() > 1e-2
         assert np.quantile(relative_error(mjx_slope[name], chain[name]), 0.99) < 1e-2, name
