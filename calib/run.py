@@ -27,10 +27,11 @@ from calib.fit.s2r import fit_s2r, simulate_poses
 from calib.fit.sensors import fit_springs
 from calib.fit.transients import calibrate_damping, find_stretches
 from calib.read.logs import same_arm
-from calib.read.static_poses import MIN_HOLD_S, find_static_poses
+from calib.read.static_poses import find_static_poses
 from calib.report import sections
 from calib.report.page import Section, to_html, to_json
 from mjx_softarm._support.provenance import write_json
+from mjx_softarm.logs.rest import MIN_HOLD_S
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.sensing.pose import pose_from_frame
 from mjx_softarm.sensing.s2r import S2R, S2R_FILE, save_s2r

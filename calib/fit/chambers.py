@@ -22,7 +22,8 @@ from calib.errors import FitError
 from calib.fit.blocks import held_out_blocks
 from calib.fit.equilibrium import simulate
 from calib.fit.leastsquares import NOT_CONVERGED, Problem, Solution, fit, principal
-from calib.read.static_poses import HOLD_KPA, StaticPoses, find_static_poses
+from calib.read.static_poses import StaticPoses, find_static_poses
+from mjx_softarm.logs.rest import HOLD_KPA
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.spec import ArmSpec
 

@@ -23,7 +23,7 @@ import numpy as np
 from calib.errors import FitError
 from calib.fit.blocks import held_out_blocks
 from calib.fit.leastsquares import NOT_CONVERGED, Problem, fit
-from calib.read.static_poses import HOLD_KPA
+from mjx_softarm.logs.rest import HOLD_KPA
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mechanics.mjcf import build_model, steps_per_period
 from mjx_softarm.mechanics.workspace import settle_many

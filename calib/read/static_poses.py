@@ -1,15 +1,4 @@
-"""Static poses of a log: poses of the arm at rest, to which equilibria are fitted.
-
-A log is cut into holds: stretches in which no pressure leaves 1 kPa around its first value, the payload
-stays, and no two rows are more than 3 s apart. The last second of a hold counts, provided that
-
-- the hold had lasted for 3 s by then, three times the slowest time constant of the paper's arm. Where rows
-  are missing before a hold, the pressures are assumed to have been held meanwhile, as when somebody records
-  one pose after the other;
-- the tip moves by less than 1 mm/s, or by no more than its own noise can explain, and stays within 2 mm.
-
-The rows that count are averaged to one pose, so that a long hold weighs no more than a short one.
-"""
+"""Static poses of logs: the arm at rest (`mjx_softarm.logs.rest`), to which equilibria are fitted."""
 
 from __future__ import annotations
 
@@ -19,18 +8,11 @@ from typing import NamedTuple
 import numpy as np
 
 from calib.errors import FitError
+from mjx_softarm.logs.rest import holds, last_second, moves
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.sensing.pose import rotation_from_quaternion
 from mjx_softarm.sensing.sensors import Sensor, SensorFault
 from mjx_softarm.spec import ArmSpec
-
-HOLD_KPA = 1.0  # a held pressure stays this close to its first value
-MIN_HOLD_S = 3.0  # before the rows that count
-WINDOW_S = 1.0  # end of a hold, whose rows count
-MAX_SPEED_M_S = 1e-3  # of a tip at rest
-MAX_SPREAD_M = 2e-3  # RMS distance to the mean position of a tip at rest
-SPEED_SIGMA = 3.0  # standard deviations by which noise may exceed the speed
-ROUNDING_S = 1e-6  # of logged times
 
 
 class StaticPoses(NamedTuple):
@@ -91,11 +73,11 @@ def _static_poses_of(log: Log, spec: ArmSpec, n_markers: int, row_uses: dict[str
     rotation = rotation_from_quaternion(log.tip_quaternion)
     found = []
     for start, stop in holds(log.time_s, log.pressure_kpa, payload):
-        rows = _last_second(log.time_s, start, stop)
+        rows = last_second(log.time_s, start, stop)
         row_uses["pressures not held long enough"] += stop - start - len(rows)
         if len(rows) == 0:
             continue
-        if _moves(log.time_s[rows], log.tip_m[rows]):
+        if moves(log.time_s[rows], log.tip_m[rows]):
             row_uses["tip still moving"] += len(rows)
             continue
         row_uses["used"] += len(rows)
@@ -104,26 +86,6 @@ def _static_poses_of(log: Log, spec: ArmSpec, n_markers: int, row_uses: dict[str
         )
         kept = payload[rows[0]]  # the same in all, which a mean would round
         found.append((pressure, kept, tip, nearest_rotation(turn), spring, marker, len(rows) == 1))
-    return found
-
-
-def holds(time_s: np.ndarray, pressure_kpa: np.ndarray, payload_kg: np.ndarray) -> list[tuple[int, int]]:
-    """Return first row, and row after the last, of each stretch at constant pressures and payload."""
-    n, start, found = len(time_s), 0, []
-    breaks = np.flatnonzero((np.diff(time_s) > MIN_HOLD_S) | (np.diff(payload_kg) != 0)) + 1
-    while start < n:
-        later = breaks[np.searchsorted(breaks, start, side="right") :]
-        end = int(later[0]) if len(later) else n
-        stop, width = start + 1, 64
-        while stop < end:  # look further and further ahead
-            ahead = pressure_kpa[stop : min(stop + width, end)]
-            left = (np.abs(ahead - pressure_kpa[start]) > HOLD_KPA).any(axis=1)
-            stop += int(np.argmax(left)) if left.any() else len(left)
-            if left.any():
-                break
-            width *= 2
-        found.append((start, stop))
-        start = stop
     return found
 
 
@@ -141,29 +103,6 @@ def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
     left, _, right = np.linalg.svd(matrix)
     left[..., :, 2] *= np.linalg.det(left @ right)[..., None]
     return left @ right
-
-
-def _last_second(time_s: np.ndarray, start: int, stop: int) -> np.ndarray:
-    """Return the rows of a hold that count, if any."""
-    gap = time_s[start] - time_s[start - 1] if start > 0 else 0.0
-    since = time_s[start - 1] if gap > MIN_HOLD_S else time_s[start]
-    rows = np.arange(start, stop)
-    window = time_s[rows] >= time_s[stop - 1] - WINDOW_S - ROUNDING_S
-    return rows[window & (time_s[rows] - since >= MIN_HOLD_S - ROUNDING_S)]
-
-
-def _moves(time_s: np.ndarray, tip_m: np.ndarray) -> bool:
-    """Return whether the tip moves over some rows of a hold; False for a single row."""
-    off = tip_m - np.mean(tip_m, axis=0)
-    if len(off) < 2:
-        return False
-    if np.sqrt(np.mean(np.sum(off**2, axis=1))) > MAX_SPREAD_M:
-        return True
-    time = time_s - np.mean(time_s)
-    slope = time @ off / (time @ time)  # (3,) [m/s]
-    left = off - time[:, None] * slope
-    noise = np.sqrt(np.sum(left**2) / max(len(off) - 2, 1) / (time @ time))
-    return bool(np.linalg.norm(slope) > MAX_SPEED_M_S + SPEED_SIGMA * noise)
 
 
 def _check(log: Log, spec: ArmSpec) -> None:

@@ -33,7 +33,7 @@ class Plausible(NamedTuple):
 # from kPa, rad from deg, or one chamber from another.
 PLAUSIBLE: Mapping[str, Plausible] = MappingProxyType(
     {
-        "time": Plausible(5e-4, 9.0),  # of the steps, in the median: 2 kHz down to a pose every 9 s
+        "time": Plausible(5e-4, 19.0),  # of the steps, in the median: 2 kHz down to a pose every 19 s
         "length": Plausible(0.03, 1.0, spike=1e-3),  # of a spring
         "position": Plausible(-3.0, 3.0, least=0.1, spike=2e-3),  # of tip and markers, from the base
         "pressure": Plausible(-105.0, 1000.0, least=0.5, spike=10.0),  # vacuum to ten bar

@@ -21,7 +21,7 @@ from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.ending import FAULT, save_log
 from mjx_softarm.deploy.record import record
 from mjx_softarm.deploy.session import Run, follow
-from mjx_softarm.mechanics.excitation import random_pressures
+from mjx_softarm.mechanics.excitation import growing, random_pressures
 from mjx_softarm.policy.file import load_policy
 
 _STATUS = """Exit status: 0 done; 2 it could not begin, or its log could not be written; 3 a fault ended it or
@@ -94,7 +94,7 @@ def _summary(run: Run) -> None:
 def _record(
     arm: Arm, out: Path, spec: cli.SpecFile = None, poses: int = 500, seed: int = 0, transients: bool = False
 ) -> int:
-    """Log static poses at random pressures, for calibration.
+    """Log static poses at random pressures, for calibration; the first ten grow from a tenth of the range.
 
     Args:
         out: log to write, CSV or npz
@@ -108,7 +108,7 @@ def _record(
     check_file("--out", out)
     if out.exists():
         raise InputError(f"--out: got {out}, which is there already, expected a new file")
-    targets_kpa = random_pressures(arm_spec, poses, seed)
+    targets_kpa = growing(random_pressures(arm_spec, poses, seed))
     result = record(open_arm(arm), arm_spec, targets_kpa, transients, _tell, partial(save_log, out))
     if not len(result.log):
         print(f"no pose was logged: {result.ending.cause or 'none came to rest'}", file=sys.stderr)
@@ -117,7 +117,7 @@ def _record(
     if result.ending.status != cli.ERROR:
         print(f"log: {out}, {len(result.log)} rows, {result.n_poses} poses at rest{unseen}")
     if result.n_unsettled:
-        print(f"{result.n_unsettled} poses did not come to rest in time")
+        print(f"{result.n_unsettled} poses were not seen at rest in time")
     if result.ending.cause:
         print(f"ended early: {result.ending.cause}", file=sys.stderr)
     return result.ending.status

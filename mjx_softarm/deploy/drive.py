@@ -83,26 +83,33 @@ class Drive:
         self.link = Link(arm, spec.n_chambers, self.dt_s)
         self.n_lost = 0
 
-    def to_rest(self, law: Law) -> dict | None:
+    def to_rest(
+        self, law: Law, held: Callable[[], bool] = lambda: True, timeout_s: float = SETTLE_TIMEOUT_S
+    ) -> dict | None:
         """Drive until the springs are at rest where the law wants them.
 
         Where the arm has motion capture, it is given another window to see the arm at rest.
 
+        Args:
+            law: takes the arm there.
+            held: returns whether the arm has been there for long enough.
+            timeout_s: longest time that this may take.
+
         Returns:
-            What there is to log of the last tick; None if that took more than `SETTLE_TIMEOUT_S`.
+            What there is to log of the last tick; None if it took longer.
 
         Raises:
             ArmFault: the arm cannot be reached, or too many readings were lost in a row.
         """
         n_unseen = 0
         springs_m = np.empty((0, len(self.link.pressure_kpa)))
-        for _ in range(round(SETTLE_TIMEOUT_S / self.dt_s)):
+        for _ in range(round(timeout_s / self.dt_s)):
             row, spring_m, arrived = self._tick(law)
             if spring_m is None or not arrived:
                 springs_m = springs_m[:0]
                 continue
             springs_m = np.vstack([springs_m, spring_m])[-self.window :]
-            if len(springs_m) == self.window and still(springs_m):
+            if len(springs_m) == self.window and still(springs_m) and held():
                 n_unseen += 1
                 if not self.link.sees or "tip_m" in row or n_unseen > self.window:
                     return row

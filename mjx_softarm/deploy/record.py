@@ -1,25 +1,30 @@
 """Record random safe poses of an arm for calibration. NumPy only: the arm need not be known yet.
 
 The pressures are drawn as those of the poses that policies are trained on; from one set to the next goes a
-ramp. A pose is logged when the springs have come to rest, or, with `transients`, every tick is. The columns
-are the control loop's without references, goals and estimates.
+ramp, and each is held until calibration takes the arm for at rest (`mjx_softarm.logs.rest`). A pose is
+logged as the mean over the last second of its hold, or, with `transients`, every tick is. The columns are the
+control loop's without references, goals and estimates.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from mjx_softarm.deploy.arm_io import ArmIO
 from mjx_softarm.deploy.drive import Drive, ramp
 from mjx_softarm.deploy.ending import Ending, vent_at_end
-from mjx_softarm.deploy.link import Recorder
+from mjx_softarm.deploy.faults import LOST_SHARE, SETTLE_TIMEOUT_S, STUCK_PRESSURE_KPA, stuck_springs
+from mjx_softarm.deploy.link import ArmFault, Recorder
+from mjx_softarm.logs.checks import same_sign
+from mjx_softarm.logs.rest import MIN_HOLD_S, ROUNDING_S, WINDOW_S, leaves, moves
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.spec import ArmSpec
 
+TIMEOUT_S = SETTLE_TIMEOUT_S + MIN_HOLD_S + WINDOW_S
 PROGRESS_S = 10.0  # between lines of progress
 
 
@@ -28,7 +33,7 @@ class Recording(NamedTuple):
 
     log: Log
     n_poses: int  # that came to rest
-    n_unsettled: int  # that did not within SETTLE_TIMEOUT_S; not logged, transients apart
+    n_unsettled: int  # that were not seen at rest within TIMEOUT_S; not logged, transients apart
     ending: Ending
 
 
@@ -50,17 +55,24 @@ def record(
         tell: takes a line of progress now and then.
         save: writes the log, if it has rows, once the arm is vented.
     """
-    rows, rest = Recorder(), []
-    drive = Drive(arm, spec, rows.add if transients else lambda row: None)
+    rows, hold, rest = Recorder(), _Hold(), []
+
+    def on_tick(row: dict) -> None:
+        hold.add(row, "tip_m" in row or not drive.link.sees)
+        if transients:
+            rows.add(row)
+
+    drive = Drive(arm, spec, on_tick)
     began_s = told_s = time.monotonic()
 
     def run() -> None:
         nonlocal told_s
         for k, target_kpa in enumerate(targets_kpa, 1):
-            row = drive.to_rest(ramp(target_kpa, drive.dt_s))
-            rest.append(row is not None)
-            if row is not None and not transients:
-                rows.add(row)
+            hold.ticks.clear()
+            rest.append(drive.to_rest(ramp(target_kpa, drive.dt_s), hold.is_long, TIMEOUT_S) is not None)
+            hold.check(drive, target_kpa if rest[-1] else None)
+            if rest[-1] and not transients:
+                rows.add(_mean(hold.last_second()))
             now_s = time.monotonic()
             if now_s - told_s >= PROGRESS_S or k == len(targets_kpa):
                 left_min = (now_s - began_s) / k * (len(targets_kpa) - k) / 60
@@ -72,3 +84,62 @@ def record(
 
     ending = vent_at_end(run, drive.link, tell, lambda: save(log()) if len(rows) else None)
     return Recording(log(), sum(rest), len(rest) - sum(rest), ending)
+
+
+class _Hold:
+    """Rows since the pressures were last elsewhere, as calibration cuts holds out of a log of all ticks."""
+
+    def __init__(self) -> None:
+        self.rows: list[dict[str, Any]] = []
+        self.ticks: list[dict[str, Any]] = []  # of this pose
+
+    def add(self, row: dict[str, Any], seen: bool) -> None:
+        """Take the row of a tick, and whether motion capture, if there is any, saw the tip."""
+        self.ticks.append(row)
+        if not seen or not all(np.isfinite(value).all() for value in row.values()):
+            return  # nor does calibration believe it
+        if self.rows and leaves(row["pressure_kpa"], self.rows[0]["pressure_kpa"]):
+            self.rows.clear()
+        self.rows.append(row)
+
+    def last_second(self) -> list[dict[str, Any]]:
+        """Return the rows that count."""
+        since_s = self.rows[-1]["time_s"] - WINDOW_S - ROUNDING_S
+        return [row for row in self.rows if row["time_s"] >= since_s]
+
+    def is_long(self) -> bool:
+        """Return whether the hold has been long enough and the tip is at rest."""
+        held_s = self.rows[-1]["time_s"] - self.rows[0]["time_s"] if self.rows else 0.0
+        if held_s < MIN_HOLD_S + WINDOW_S - ROUNDING_S:
+            return False
+        rows = self.last_second()
+        if "tip_m" not in rows[0]:
+            return True
+        return not moves(*(np.array([row[name] for row in rows]) for name in ("time_s", "tip_m")))
+
+    def check(self, drive: Drive, target_kpa: np.ndarray | None) -> None:
+        """Stop at what no pose of a sound arm shows.
+
+        Raises:
+            ArmFault: a sensor stood stock-still, or a chamber at rest does not have its pressure.
+        """
+        kpa = np.array([row["pressure_kpa"] for row in self.ticks])
+        readings = np.array([row["readings"] for row in self.ticks])
+        spring_m = drive.sensor.lengths(readings, np.nan).length_m
+        if (stuck := np.flatnonzero(stuck_springs(spring_m, kpa))).size:
+            raise ArmFault(f"spring{stuck[0]}: always the same reading, expected one that changes")
+        if target_kpa is None:
+            return
+        off = np.abs(kpa[-1] - target_kpa) > np.maximum(STUCK_PRESSURE_KPA, LOST_SHARE * np.abs(target_kpa))
+        if (k := np.flatnonzero(off)).size:
+            got, wanted = kpa[-1, k[0]], target_kpa[k[0]]
+            raise ArmFault(f"pressures: chamber{k[0]}: got {got:.1f} kPa at rest, expected {wanted:.1f} kPa")
+
+
+def _mean(rows: Sequence[dict[str, Any]]) -> dict[str, np.ndarray]:
+    """Return the mean of rows at rest."""
+    values = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    if "tip_quaternion" in values:
+        mean = same_sign(values["tip_quaternion"])[0].mean(axis=0)
+        values["tip_quaternion"] = mean[None] / np.linalg.norm(mean)
+    return {name: value.mean(axis=0) for name, value in values.items()}

@@ -7,6 +7,7 @@ import numpy as np
 from mjx_softarm.spec import ArmSpec
 
 CIRCLE_HEIGHT_MM = -575.0
+N_GROWING = 10  # poses from a first small motion to the full range
 
 
 def random_pressures(spec: ArmSpec, n_poses: int, seed: int | np.random.Generator) -> np.ndarray:
@@ -34,3 +35,9 @@ def circle_poses(n: int = 40, diameter_mm: float = 160.0, height_mm: float = CIR
     radius, zero = 0.5 * diameter_mm, np.zeros(n)
     columns = [radius * np.cos(angle), radius * np.sin(angle), np.full(n, height_mm), zero, zero, zero]
     return np.stack(columns, axis=-1).astype(np.float32)
+
+
+def growing(pressure_kpa: np.ndarray) -> np.ndarray:
+    """Scale the first of some sets of pressures (n_poses, n) [kPa], from a tenth to all of each."""
+    share = np.minimum(1.0, np.arange(1, len(pressure_kpa) + 1) / N_GROWING)
+    return share[:, None] * pressure_kpa

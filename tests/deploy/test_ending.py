@@ -15,7 +15,7 @@ from mjx_softarm.mechanics.excitation import random_pressures
 from tests.linear_arm import GOALS, POLICY, SPEC, LinearArm, N, go
 
 METHODS = ("time_s", "read_sensors", "write_pressures", "pressures", "motion_capture")
-TARGETS_KPA = random_pressures(SPEC, 3, 0)
+TARGETS_KPA = random_pressures(SPEC, 1, 0)
 
 
 class Faulty:

@@ -1,14 +1,22 @@
-"""Recording on a linear arm: random pressures, poses at rest, whole transients, an early end."""
+"""Recording on a linear arm: random pressures, poses at rest, whole transients, an early end.
+
+Poses at rest are those that calibration finds in the log.
+"""
+
+import dataclasses
+import re
 
 import numpy as np
 import pytest
 
 from calib.read.logs import read_log
+from calib.read.static_poses import find_static_poses
+from mjx_softarm.deploy.arm_io import Capture
 from mjx_softarm.deploy.ending import Ending
 from mjx_softarm.deploy.link import VENT_KPA_PER_S
 from mjx_softarm.deploy.record import record
 from mjx_softarm.logs.schema import write_log
-from mjx_softarm.mechanics.excitation import random_pressures
+from mjx_softarm.mechanics.excitation import growing, random_pressures
 from tests.linear_arm import (
     DT_S,
     GAIN_M_PER_KPA,
@@ -18,6 +26,7 @@ from tests.linear_arm import (
     SPEC,
     Blind,
     LinearArm,
+    N,
     nan,
     read_m,
 )
@@ -37,14 +46,81 @@ def test_recorded_poses_are_at_rest(tmp_path):
     result = record(arm, SPEC, targets_kpa, tell=lines.append)
     assert lines == ["5 of 5 poses, about 0.0 min left"]
     assert (result.n_poses, result.n_unsettled, result.ending) == (5, 0, Ending())
-    np.testing.assert_array_equal(result.log.pressure_kpa, targets_kpa)
-    np.testing.assert_allclose(read_m(result.log), REST_M + targets_kpa @ GAIN_M_PER_KPA.T, atol=5e-4)
+    np.testing.assert_allclose(result.log.pressure_kpa, targets_kpa, atol=1e-12)
+    np.testing.assert_allclose(read_m(result.log), REST_M + targets_kpa @ GAIN_M_PER_KPA.T, atol=3e-5)
     np.testing.assert_array_equal(arm.command_kpa, 0.0)
     steps = np.abs(np.diff(np.array(arm.written), axis=0))
     assert steps.max() <= VENT_KPA_PER_S * DT_S + 1e-9
     write_log(tmp_path / "log.npz", result.log)
     log, _ = read_log(tmp_path / "log.npz")
     np.testing.assert_allclose(log.pressure_kpa, targets_kpa)
+
+
+class Seen(LinearArm):
+    """A slow arm whose tip, seen but for some frames, follows its first springs; pressures are measured."""
+
+    def write_pressures(self, pressure_kpa):
+        before_kpa = self.actual_kpa
+        super().write_pressures(pressure_kpa)
+        self.actual_kpa = before_kpa + DT_S * (self.holds(self.command_kpa) - before_kpa)  # within 1 s
+
+    def pressures(self):
+        return self.actual_kpa + 0.05 * self._rng.standard_normal(N)
+
+    def motion_capture(self):
+        if self.tick % 7 == 0:
+            raise OSError("frame dropped")
+        tip_m = self.spring_m[:3] + 2e-4 * self._rng.standard_normal(3)
+        sign = (-1) ** self.tick  # both are the same rotation
+        return Capture(tip_m, sign * np.array([0.8, 0.6, 0.0, 0.0]), tip_m[None])
+
+
+@pytest.mark.parametrize("transients", [False, True])
+def test_calibration_finds_each_recorded_pose(tmp_path, transients):
+    targets_kpa = growing(random_pressures(SPEC, 6, 3))
+    result = record(Seen(), SPEC, targets_kpa, transients)
+    assert (result.n_poses, result.n_unsettled) == (6, 0)
+    write_log(tmp_path / "log.npz", dataclasses.replace(result.log, tip_m=result.log.tip_m - [0, 0, 0.6]))
+    log, _ = read_log(tmp_path / "log.npz")
+    poses, row_uses = find_static_poses([log], SPEC)
+    assert poses.n == 6 and row_uses["tip still moving"] == 0
+    assert transients or (len(log) == row_uses["used"] == 6)
+    spring_m = REST_M + poses.pressure_kpa @ GAIN_M_PER_KPA.T
+    np.testing.assert_allclose(poses.pressure_kpa, targets_kpa, atol=1.0)
+    np.testing.assert_allclose(poses.spring_m, spring_m, atol=4e-5)
+    off_m = poses.tip_m + [0, 0, 0.6] - spring_m[:, :3]
+    assert np.std(off_m) == pytest.approx(2e-4 / np.sqrt(43), rel=0.4)  # of 50 ticks, 43 seen
+    np.testing.assert_allclose(np.abs(poses.tip_rotation[:, 1, 2]), 0.96, atol=1e-6)
+
+
+def test_first_poses_grow_from_small_to_full():
+    targets_kpa = random_pressures(SPEC, 12, 3)
+    np.testing.assert_allclose((growing(targets_kpa) / targets_kpa)[:, 0], [*np.arange(0.1, 1.1, 0.1), 1, 1])
+
+
+class Leaking(Seen):
+    """Chamber 4 holds no pressure."""
+
+    def holds(self, pressure_kpa):
+        return np.where(np.arange(N) == 4, 0.0, pressure_kpa)
+
+
+def frozen(readings):
+    return np.where(np.arange(N) == 4, 5e6, readings)
+
+
+@pytest.mark.parametrize(
+    ("arm", "message"),
+    [
+        (Blind(range(10**6), frozen), "spring4: always the same reading"),
+        (Leaking(), "pressures: chamber4: got -?0.[01] kPa at rest, expected -?[0-9]"),
+    ],
+)
+def test_recording_stops_at_a_fault_while_poses_are_small(arm, message):
+    result = record(arm, SPEC, growing(random_pressures(SPEC, 50, 3)))
+    assert re.match(message, result.ending.cause) and result.ending.status == 3
+    assert len(result.log) < 3 and not arm.command_kpa.any()
+    assert np.abs(arm.written).max() < 0.31 * max(-LOW_KPA, HIGH_KPA)
 
 
 def test_recorded_transients_are_whole():
@@ -54,7 +130,7 @@ def test_recorded_transients_are_whole():
 
 
 def test_recording_stops_and_vents_when_readings_are_lost():
-    arm = Blind(range(150, 10**6), nan)
+    arm = Blind(range(450, 10**6), nan)
     result = record(arm, SPEC, random_pressures(SPEC, 50, 3))
     assert (
         "readings lost in 3 ticks in a row: spring4: read nan Hz" in result.ending.cause
