@@ -3,7 +3,8 @@
 The schema is that of `mjx_softarm.logs.schema`. A file that cannot be understood (a column missing, a wrong
 unit) is refused. Otherwise each row is believed whole or dropped whole: for a NaN, a reading out of range, a
 time that does not increase, motion capture that was not renewed or is turned, an outlier. So a log that was
-read has no holes in its columns, and its times show where rows are missing. Signs of quaternions are
+read has no holes but in the references, goals and estimates of the control loop, which may have none, and its
+times show where rows are missing. Signs of quaternions are
 repaired; columns that never change, time gaps and unknown columns are only reported. Each finding tells how
 many rows it dropped.
 """

@@ -47,6 +47,7 @@ PLAUSIBLE: Mapping[str, Plausible] = MappingProxyType(
 )
 BY_HAND_ROWS, BY_HAND_S = 300, 600.0  # so few rows may be poses recorded by hand, so far apart
 HANGS_BELOW_M = -0.05  # of the tip, in the median: the base frame's z is up and the arm hangs
+FROM_LOOP = ("reference_m", "goal", "estimate")  # logged by the control loop, which may have none
 SENSORS = ("readings", "spring_m", "pressure_kpa", "tip_m", "marker_m")
 
 
@@ -127,7 +128,7 @@ def _typical(values: np.ndarray) -> float:
 def _implausible_column(column: Column, values: np.ndarray) -> str:
     what = "median step" if column.kind == "time" else "median"
     if not np.isfinite(values).any():
-        return "no number in the whole column"
+        return "" if column.group in FROM_LOOP else "no number in the whole column"
     got = _typical(np.diff(values) if column.kind == "time" else values)
     low, high, *_ = PLAUSIBLE[quantity(column)]
     by_hand = column.kind == "time" and len(values) < BY_HAND_ROWS and low <= got <= BY_HAND_S
@@ -170,7 +171,8 @@ def _single_rows(matrix: LogMatrix) -> Iterator[Fault]:
     for k, column in enumerate(matrix.columns):
         values = matrix.values[:, k]
         finite = np.isfinite(values)
-        yield Fault(column.name, "NaN or inf, expected numbers", ~finite)
+        missing = np.isinf(values) if column.group in FROM_LOOP else ~finite
+        yield Fault(column.name, "NaN or inf, expected numbers", missing)
         if column.kind == "time":
             late = np.zeros(len(values), bool)
             late[finite] = checks.late_rows(values[finite])

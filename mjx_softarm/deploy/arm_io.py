@@ -1,5 +1,15 @@
 """Interface of an arm's driver, which a real arm and its twin both implement.
 
+A driver is a class without arguments. Of an arm with n springs and n chambers (9 of the paper's arm), it has
+
+    read_sensors() -> (n,)           needed    readings, in the unit of the specification's sensor
+    write_pressures((n,))            needed    pressures to regulate to [kPa]
+    pressures() -> (n,)              optional  pressures measured [kPa], logged in place of those commanded
+    motion_capture() -> Capture      optional  tip (3,), (4,), markers (m, 3), springs (n,); for calibration
+    time_s                           optional  clock [s] of a simulated arm, which nobody waits for
+
+`mjx_softarm.deploy.drivers` has drivers over serial and UDP that need only your numbers.
+
 Whatever else a driver raises ends the run as a fault: the arm is vented and the log is written.
 """
 
@@ -51,12 +61,37 @@ class ArmIO(Protocol):
 
 
 class Capture(NamedTuple):
-    """One frame of motion capture, in the base frame (see `mjx_softarm.sensing.pose`)."""
+    """One frame of motion capture, in the base frame (see `mjx_softarm.sensing.pose`).
 
-    tip_m: np.ndarray  # (3,) centre of the last plate
-    tip_quaternion: np.ndarray  # (4,) w, x, y, z
-    marker_m: np.ndarray  # (n_markers, 3) from the base to the tip
-    spring_m: np.ndarray | None = None  # (n,) spring lengths between markers at their ends, if there are any
+    Attributes:
+        tip_m (3,) [m]: centre of the last plate.
+        tip_quaternion (4,): w, x, y, z; 1, 0, 0, 0 where the arm hangs straight.
+        marker_m (n_markers, 3) [m]: from the base to the tip; (0, 3) without markers.
+        spring_m (n,) [m]: spring lengths between markers at their ends, if there are any.
+    """
+
+    tip_m: np.ndarray
+    tip_quaternion: np.ndarray
+    marker_m: np.ndarray
+    spring_m: np.ndarray | None = None
+
+
+class MeasuredPressures(Protocol):
+    """Pressure sensors of an arm, for its logs; no controller looks at them."""
+
+    def pressures(self) -> np.ndarray:
+        """Return the pressures (n,) [kPa] that the regulators measure now, relative to the atmosphere."""
+        ...
+
+
+class SimulatedClock(Protocol):
+    """Clock of a simulated arm, which stands still but in `write_pressures`.
+
+    Attributes:
+        time_s [s]: advances by one period of the control loop with each write.
+    """
+
+    time_s: float
 
 
 class MotionCapture(Protocol):

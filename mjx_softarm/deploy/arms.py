@@ -53,5 +53,5 @@ def open_arm(name: str) -> Any:
         raise ArmError(f"--arm: {name} has no method {' or '.join(missing)}; see mjx_softarm.deploy.ArmIO")
     try:
         return kind()
-    except (OSError, TypeError, ValueError) as error:
+    except (ImportError, OSError, TypeError, ValueError) as error:
         raise ArmError(f"--arm: {name} cannot be opened: {type(error).__name__}: {error}") from error

@@ -33,6 +33,17 @@ def test_clean_log_comes_back_without_findings(file, name, seed):
     assert log.goal is None and log.estimate is None and log.reference_m is None
 
 
+@pytest.mark.parametrize("rows", [slice(0, 30), slice(None)])
+def test_log_of_a_run_may_lack_references_goals_and_estimates(file, rows):
+    goal = np.tile([80.0, 0.0, -575.0, 0.0, 0.0, 0.0], (N, 1))
+    goal[rows], reference_m = np.nan, 0.2 * goal[:, [0] * 9] / 80.0
+    log, findings = read_log(file(goal=goal, reference_m=reference_m, estimate=goal))
+    assert findings == [] and len(log) == N
+    np.testing.assert_allclose(log.goal, goal)
+    goal[5] = np.inf
+    assert len(read_log(file(goal=goal))[0]) == N - 1
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_a_row_per_pose_comes_back_without_findings(file, seed):
     """Separate poses, seconds apart, some of them held: no motion, so no jump, turn or spike."""

@@ -1,0 +1,156 @@
+"""The example drivers with a microcontroller of the test's own at the other end of a real line."""
+
+import os
+import pty
+import socket
+import threading
+import tty
+
+import numpy as np
+import pytest
+
+from mjx_softarm.deploy.arms import ArmError, open_arm
+from mjx_softarm.deploy.drivers.serial_line import SerialArm
+from mjx_softarm.deploy.drivers.udp import UdpArm
+from mjx_softarm.deploy.record import record
+from tests.linear_arm import REST_M, SPEC, LinearArm, N, read_m
+
+TIMEOUT_S = 0.5  # this machine may be busy
+
+
+class Controller:
+    """A linear arm's microcontroller: answers lines by the table of `mjx_softarm.deploy.drivers`."""
+
+    def __init__(self):
+        self.arm, self.late, self.silent, self.garbage = LinearArm(), b"", 0, b""
+
+    def answers(self, line):
+        letter, count, *values = line.decode("ascii").split()
+        if self.silent:
+            self.silent -= 1
+            self.late = f"R {count} {' '.join(['1'] * 18)}\n".encode()
+            return []
+        late, self.late = self.late, b""
+        if self.garbage:
+            return [self.garbage.replace(b"K", count.encode())]
+        if letter == "R":
+            words = [f"{value:.9g}" for value in (*self.arm.read_sensors(), *self.arm.actual_kpa)]
+            return [late, f"R {count} {' '.join(words)}\n".encode()]
+        if max(map(float, values)) > 20.0:
+            return [f"E {count} chamber beyond 20 kPa\n".encode()]
+        self.arm.write_pressures(np.array(values, float))
+        return [late, f"P {count}\n".encode()]
+
+
+def serve_serial(controller):
+    """Return the driver's class and what ends the other end."""
+    ours, theirs = pty.openpty()
+    tty.setraw(theirs)
+
+    def loop():
+        pending = b""
+        while True:
+            try:
+                pending += os.read(ours, 4096)
+            except OSError:
+                return
+            *lines, pending = pending.split(b"\n")
+            for line in lines:
+                if line == b"end":
+                    return
+                for answer in controller.answers(line):
+                    os.write(ours, answer[: len(answer) // 2])  # in two parts, as they come over a wire
+                    os.write(ours, answer[len(answer) // 2 :])
+
+    name = os.ttyname(theirs)
+    thread = threading.Thread(target=loop)
+    thread.start()
+
+    def end():
+        os.write(theirs, b"end\n")
+        thread.join()
+        os.close(ours)
+        os.close(theirs)
+
+    return type("Arm", (SerialArm,), {"port": name, "n": N, "timeout_s": TIMEOUT_S}), end
+
+
+def serve_udp(controller):
+    ours = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    ours.bind(("127.0.0.1", 0))
+
+    def loop():
+        while True:
+            line, sender = ours.recvfrom(4096)
+            if line == b"end":
+                return
+            for answer in controller.answers(line):
+                ours.sendto(answer, sender)
+
+    thread = threading.Thread(target=loop)
+    thread.start()
+
+    def end():
+        ours.sendto(b"end", ours.getsockname())
+        thread.join()
+        ours.close()
+
+    return type("Arm", (UdpArm,), {"address": ours.getsockname(), "n": N, "timeout_s": TIMEOUT_S}), end
+
+
+@pytest.fixture(params=[serve_serial, serve_udp])
+def line(request):
+    controller = Controller()
+    kind, end = request.param(controller)
+    request.addfinalizer(end)
+    if request.param is serve_serial:
+        pytest.importorskip("serial")
+    return kind(), controller
+
+
+def test_values_go_over_the_line(line):
+    arm, controller = line
+    controller.arm.noise_m = 0.0
+    kpa = np.linspace(-40.0, 20.0, N)
+    for _ in range(3):
+        arm.write_pressures(kpa)
+        np.testing.assert_allclose(controller.arm.command_kpa, kpa, rtol=1e-5)
+        np.testing.assert_allclose(arm.read_sensors(), controller.arm.read_sensors(), rtol=1e-8)
+        np.testing.assert_allclose(arm.pressures(), controller.arm.actual_kpa, rtol=1e-8)
+
+
+def test_old_answers_are_passed_over(line):
+    arm, controller = line
+    arm.timeout_s, controller.silent = 0.05, 1
+    with pytest.raises(TimeoutError, match="R: no answer within 50 ms"):
+        arm.read_sensors()
+    arm.timeout_s = TIMEOUT_S
+    assert arm.read_sensors().min() > 1e6  # the late answer had ones
+
+
+def test_what_the_arm_refuses_and_what_it_garbles_is_an_error(line):
+    arm, controller = line
+    with pytest.raises(ValueError, match="P: refused: chamber beyond 20 kPa"):
+        arm.write_pressures(np.full(N, 21.0))
+    controller.garbage = b"R K 1 2 3\n"
+    with pytest.raises(OSError, match="got 3 numbers, expected 18"):
+        arm.read_sensors()
+    controller.garbage = b"R K 1 2 x3\n"
+    with pytest.raises(OSError, match="'1 2 x3.*expected numbers"):
+        arm.read_sensors()
+
+
+def test_recording_over_the_line(line, monkeypatch):
+    """The arm's time passes as pressures come, so the loop need not wait either."""
+    arm, controller = line
+    monkeypatch.setattr(type(arm), "time_s", property(lambda _: controller.arm.time_s), raising=False)
+    result = record(arm, SPEC, np.full((1, N), -5.0))
+    assert result.ending.cause == "" and len(result.log) == 1 and not controller.arm.command_kpa.any()
+    np.testing.assert_allclose(result.log.pressure_kpa, -5.0, atol=1e-4)
+    np.testing.assert_allclose(read_m(result.log), REST_M - 5.0 * 9e-4, atol=5e-5)
+
+
+def test_port_that_is_not_there_is_named():
+    pytest.importorskip("serial")
+    with pytest.raises(ArmError, match="SerialArm cannot be opened: SerialException: .*ttyACM0"):
+        open_arm("mjx_softarm.deploy.drivers.serial_line:SerialArm")
