@@ -1,7 +1,5 @@
 """A trial on a twin and its outcome: errors by motion capture, saturation, contact forces, objects moved.
 
-Motion capture is noisy: an error is the mean over the window in which the springs had settled.
-
 Whether an object is taken depends on where the finger tips are when the loop reports an arrival: near enough
 to the object, the twin gets its weight, else the object stays. An object released near enough to a
 container's place lies where the finger tips were; else it has fallen beside the container and is lost.
@@ -15,19 +13,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjx_softarm.control import saturated
 from mjx_softarm.deploy import faults
+from mjx_softarm.deploy import measure as accuracy
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.session import Run, follow
 from mjx_softarm.mechanics.pipe import APPLE_KG, BALL_KG
-from mjx_softarm.sensing.pose import (
-    frame_from_pose,
-    pose_error,
-    pose_from_quaternion,
-    rotation_from_quaternion,
-)
+from mjx_softarm.sensing.pose import frame_from_pose, rotation_from_quaternion
 
-AT_LIMIT_KPA = 0.1  # distance to a pressure limit that counts as at it, for a window's mean
 GRASP_M = 0.02  # finger tips to the object's middle: the jaws open 40 mm
 PLACE_M = 0.04  # finger tips to the middle of a container
 CALM_N = 1.0  # contact force that counts as none
@@ -152,45 +144,20 @@ def operate(
 
 def measure(run: Run, controller: Controller, goals: np.ndarray) -> Outcome:
     """Return the outcome of a run towards goals (p, 6) [mm, deg], without objects and contact forces."""
-    log, policy, window = run.log, controller.policy, controller.window
+    log, policy = run.log, controller.policy
     assert log.pressure_kpa is not None and log.reference_m is not None and log.goal is not None
     assert log.tip_m is not None and log.tip_quaternion is not None  # a twin has motion capture
     spring_m = policy.sensor.lengths(log.readings, np.nan).length_m
-    seen = pose_from_quaternion(log.tip_m, log.tip_quaternion)
-    error, believed = np.full((2, *goals.shape), np.nan)
-    mask, arrival_s = np.zeros((len(goals), policy.spec.n_chambers), bool), np.full(len(goals), np.nan)
-    gains = policy.gains._replace(
-        pressure_min_kpa=policy.gains.pressure_min_kpa + AT_LIMIT_KPA,
-        pressure_max_kpa=policy.gains.pressure_max_kpa - AT_LIMIT_KPA,
-    )
-    # Means over the window that ends with each arrival.
-    for arrival in run.arrivals:
-        point = _point_of(arrival.goal, goals)
-        rows = slice(max(0, arrival.row + 1 - window), arrival.row + 1)
-        error[point] = pose_error(seen[rows], arrival.goal).mean(axis=0)
-        believed[point] = pose_error(np.asarray(arrival.estimate, float), arrival.goal)
-        arrival_s[point] = log.time_s[arrival.row]
-        mask[point] = saturated(
-            log.pressure_kpa[rows].mean(axis=0),
-            log.reference_m[arrival.row],
-            spring_m[rows].mean(axis=0),
-            gains,
-            policy.tolerance_m,
-        )
     counts = run.counts()
     finger_m = captured_finger_tips(log.tip_m, log.tip_quaternion, policy.spec.mass.gripper_length_m)
     return Outcome(
-        goal=goals,
+        **accuracy.measure(run, controller, goals)._asdict(),
         name=np.full(len(goals), ""),
-        error=error,
-        believed=believed,
-        saturated=mask,
         success=np.zeros(len(goals), bool),
-        arrival_s=arrival_s,
         events=np.array([counts.get(fault, 0) for fault in faults.Fault]),
         latency_s=np.quantile(run.latency_s, (0.5, 0.999)),
         time_s=log.time_s,
-        point=np.array([_point_of(goal, goals) for goal in log.goal]),
+        point=np.array([accuracy.point_of(goal, goals) for goal in log.goal]),
         reference_m=log.reference_m.astype(np.float32),
         spring_m=spring_m.astype(np.float32),
         pressure_kpa=log.pressure_kpa.astype(np.float32),
@@ -198,11 +165,6 @@ def measure(run: Run, controller: Controller, goals: np.ndarray) -> Outcome:
         wall_n=np.zeros(len(log), np.float32),
         container_n=np.zeros(len(log), np.float32),
     )
-
-
-def _point_of(goal: np.ndarray, goals: np.ndarray) -> int:
-    """Return the index of a goal among goals (p, 6); -1 where there is none."""
-    return -1 if np.isnan(goal).any() else int(np.argmin(np.abs(goals - goal).sum(axis=1)))
 
 
 def save_outcome(path: Path, outcome: Outcome) -> None:
@@ -221,33 +183,14 @@ def load_outcome(path: Path) -> Outcome:
 
 def figures(outcome: Outcome) -> dict[str, Any]:
     """Return the figures of one trial; errors over the goals that were reached, NaN without any."""
-    reached = np.isfinite(outcome.error).all(axis=1)
-    n_reached = int(reached.sum())
-    error, believed = (
-        values[reached] if n_reached else np.full((1, 6), np.nan)
-        for values in (outcome.error, outcome.believed)
-    )
-    away = np.linalg.norm(error[:, :3], axis=1)
-    per_point = outcome.saturated.sum(axis=1)
-    events = {f.value: int(n) for f, n in zip(faults.Fault, outcome.events, strict=True) if n}
-    names = ("x_mm", "y_mm", "z_mm", "yaw_deg", "pitch_deg", "roll_deg")
+    reached = accuracy.Accuracy(*(getattr(outcome, name) for name in accuracy.Accuracy._fields))
     return {
-        "points": len(outcome.goal),
-        "reached": n_reached,
-        "translation_mm": float(away.mean()),
-        "rmse_mm": float(np.sqrt(np.mean(away**2))),
-        "max_mm": float(away.max()),
-        **dict(zip(names, np.abs(error).mean(axis=0).tolist(), strict=True)),
-        "believed_mm": float(np.linalg.norm(believed[:, :3], axis=1).mean()),
-        "saturated_points": int(np.count_nonzero(per_point)),
-        "saturated_chambers_max": int(per_point.max()),
-        "saturation_events": events.get(faults.Fault.SATURATED.value, 0),
+        **accuracy.figures(reached, dict(zip(faults.Fault, outcome.events, strict=True))),
         "operations": int(outcome.operation.sum()),
         "done": int(outcome.success.sum()),
         "calm_percent": 100 * float(np.mean(outcome.wall_n < CALM_N)),
         "wall_max_n": float(outcome.wall_n.max()),
         "container_max_n": float(outcome.container_n.max()),
-        "events": events,
         "seconds": float(outcome.time_s[-1]),
         "latency_ms": [round(1e3 * float(value), 3) for value in outcome.latency_s],
     }

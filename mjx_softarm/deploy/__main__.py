@@ -1,4 +1,4 @@
-"""Command line: `python -m mjx_softarm.deploy run | record`.
+"""Command line: `python -m mjx_softarm.deploy run | measure | record`.
 
 However a command ends, the arm is vented and what was logged is written.
 """
@@ -19,13 +19,15 @@ from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.arms import open_arm
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.ending import FAULT, save_log
+from mjx_softarm.deploy.measure import figures, measure, read_goals, write_accuracy
 from mjx_softarm.deploy.record import record
 from mjx_softarm.deploy.session import Run, follow
 from mjx_softarm.mechanics.excitation import growing, random_pressures
 from mjx_softarm.policy.file import load_policy
 
-_STATUS = """Exit status: 0 done; 2 it could not begin, or its log could not be written; 3 a fault ended it or
-refused a goal; 130 Ctrl-C; 143 SIGTERM. In all cases the arm is vented and what was logged is written."""
+_STATUS = """Exit status: 0 done; 1 done, but a goal was not reached; 2 it could not begin, or its log could
+not be written; 3 a fault ended it or refused a goal; 130 Ctrl-C; 143 SIGTERM. In all cases the arm is vented
+and what was logged is written."""
 _ABOUT = f"A policy on an arm.\n\n{_STATUS}"
 
 
@@ -47,7 +49,7 @@ Arm = Annotated[
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit status."""
-    commands = {"run": _run, "record": _record}
+    commands = {"run": _run, "measure": _measure, "record": _record}
     return cli.main("python -m mjx_softarm.deploy", _ABOUT, commands, arguments)
 
 
@@ -57,14 +59,16 @@ def _run(
     goal: tyro.conf.UseAppendAction[tuple[Goal, ...]],
     log: cli.MaybePath = None,
     duration: float = np.inf,
+    stay: bool = False,
 ) -> int:
-    """Bring the tip to goals.
+    """Bring the tip to goals; errors are by motion capture where there is any.
 
     Args:
         policy: file that `python -m train export` wrote
         goal: pose of the tip [mm, deg] in the base frame; again for a further one
         log: file for the run's log, CSV or npz
         duration: [s] of the arm after which the run ends
+        stay: hold the last goal, until Ctrl-C or the end of the duration
     """
     if not goal:
         raise InputError("--goal: missing, expected the pose of the tip, X,Y,Z,YAW,PITCH,ROLL")
@@ -74,7 +78,8 @@ def _run(
     check_file("--log", log)
     limit_s = None if np.isinf(duration) else duration
     save = partial(save_log, log) if log else lambda log: None
-    run = follow(open_arm(arm), controller, list(map(np.array, goal)), limit_s, _tell, save=save)
+    goals = list(map(np.array, goal))
+    run = follow(open_arm(arm), controller, goals, limit_s, _tell, save=save, stay=stay)
     if log and run.ending.status != cli.ERROR:
         print(f"log: {log}, {len(run.log)} rows")
     _summary(run)
@@ -88,7 +93,51 @@ def _summary(run: Run) -> None:
         median, high = 1e3 * np.quantile(run.latency_s, (0.5, 0.999))
         n = len(run.latency_s)
         print(f"from readings to pressures: median {median:.2f} ms, 99.9 % {high:.2f} ms of {n} ticks")
-    print(f"{len(run.arrivals)} goals done; the arm is {'' if run.ending.vented else 'NOT '}vented")
+    reached = f"{sum(arrival.reached for arrival in run.arrivals)} of {run.n_goals} goals reached"
+    print(f"{reached}; the arm is {'' if run.ending.vented else 'NOT '}vented")
+
+
+def _measure(
+    policy: tyro.conf.Positional[Path],
+    arm: Arm,
+    out: Path,
+    goals: Annotated[str, tyro.conf.arg(metavar="circle|grid|FILE")] = "circle",
+    points: int = 16,
+) -> int:
+    """Measure a policy's accuracy on an arm with motion capture.
+
+    Args:
+        policy: file that `python -m train export` wrote
+        out: folder to write: the figures, a picture, the log
+        goals: circle; grid, over the workspace; or a CSV file of poses
+        points: of the circle, or of the grid at most
+    """
+    if points < 1:
+        raise InputError(f"--points: got {points}, expected at least 1")
+    controller = Controller.of(load_policy(policy))
+    poses = read_goals(goals, controller.policy.workspace, points)
+    if out.exists():
+        raise InputError(f"--out: got {out}, which is there already, expected a new folder")
+    driver = open_arm(arm)
+    if not hasattr(driver, "motion_capture"):
+        raise InputError(f"--arm: got {arm}, which has no motion_capture, expected an arm that has")
+    out.mkdir(parents=True)
+    run = follow(driver, controller, poses, tell=_tell, save=partial(save_log, out / "log.npz"))
+    if not run.arrivals:
+        _summary(run)
+        return run.status
+    accuracy = measure(run, controller, poses)
+    found = figures(accuracy, run.counts()) | {"seconds": float(run.log.time_s[-1])}
+    if missing := write_accuracy(out, accuracy, found):
+        print(missing)
+    for name, unit, most in (("translation", "mm", "max_mm"), ("rotation", "deg", "rotation_max_deg")):
+        mean, high, most = found[f"{name}_{unit}"], found[f"{name}_95_{unit}"], found[most]
+        print(f"{name} [{unit}]: mean {mean:.2f}, 95 % below {high:.2f}, at most {most:.2f}")
+    n_saturated = found["saturated_points"]
+    print(f"{found['reached']} of {found['points']} points, {n_saturated} with a saturated chamber")
+    print(f"figures: {out / 'accuracy.json'}")
+    _summary(run)
+    return run.status
 
 
 def _record(

@@ -13,7 +13,13 @@ from typing import Any, NamedTuple
 from mjx_softarm.deploy.link import Link, describe
 from mjx_softarm.logs.schema import Log, write_log
 
-DONE, NOT_WRITTEN, FAULT, INTERRUPTED = 0, 2, 3, 130  # exit statuses; 128 and its number after a signal
+DONE, MISSED, NOT_WRITTEN, FAULT, INTERRUPTED = (
+    0,
+    1,
+    2,
+    3,
+    130,
+)  # exit statuses; 128 and its number after a signal
 _INTERRUPTS = {"drive": 0, "vent": 1, "save": 2}  # Ctrl-C so far that a step goes on after
 
 

@@ -7,8 +7,9 @@
                        chamber is driven or a spring of its section moves
     CHAMBER_LOST       a chamber at its limit, its spring off the reference, and the    vent
                        arm at rest in the shape of an arm without that pressure
-    GOAL_OUTSIDE       a goal further from all reachable poses than they are from       skip the goal
-                       each other, or not finite
+    GOAL_OUTSIDE       a goal that no pressures bring the tip to, by the policy's       skip the goal
+                       models and its threshold of a goal; a pilot's goal further
+                       from all reachable poses than they are from each other
     MISSED_DEADLINE    a tick longer than the period, or pressures not taken in time    go on
     ARM_LATE           LATE_TICKS of these in a row                                     vent
     ARM_LOST           the driver cannot reach sensors or pumps, or refuses pressures   vent

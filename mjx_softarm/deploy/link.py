@@ -190,6 +190,10 @@ class Recorder:
         self._rows.append(row)
         self._n_rows += 1
 
+    def last(self, n: int) -> list[dict[str, Any]]:
+        """Return the last n rows."""
+        return [self._rows[k] for k in range(-min(n, len(self._rows)), 0)]
+
     def log(self, source: str, sensor: Sensor) -> Log:
         """Return the log so far of an arm with this sensor; NaN where a row has no value.
 

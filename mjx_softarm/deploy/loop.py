@@ -15,6 +15,8 @@ Gains, limits, calibration, rate, tolerance and number of actions are the policy
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from mjx_softarm.control import pressures, saturated
@@ -23,6 +25,7 @@ from mjx_softarm.deploy.controller import Controller, State, Tick
 from mjx_softarm.deploy.faults import Event, Fault, Response
 from mjx_softarm.deploy.link import VENT_KPA_PER_S
 from mjx_softarm.deploy.reachability import nearest
+from mjx_softarm.policy.reach import nearest_poses
 from mjx_softarm.policy.runtime import tip_pose
 
 CHAMBER_WINDOWS = 2  # for so many a lost chamber must show without a break
@@ -40,6 +43,25 @@ def with_goal(controller: Controller, state: State, goal: np.ndarray) -> tuple[S
         far = f"{text} is {away:.1f} times as far from the nearest reachable pose as a goal may be"
         return state, (Event(Fault.GOAL_OUTSIDE, f"{far}; that pose is {near} [mm, deg]"),)
     return state._replace(goal=goal, n_actions=0, n_ticks=0), ()
+
+
+def refusals(controller: Controller, goals: Sequence[np.ndarray]) -> dict[int, Event]:
+    """Return which goals (6,) [mm, deg] are refused, since no pressures reach them; takes longer than a tick.
+
+    It is sharper than `with_goal`, whose poses lie some 15 mm apart.
+    """
+    finite = [k for k, goal in enumerate(goals) if np.shape(goal) == (6,) and np.isfinite(goal).all()]
+    if not finite:
+        return {}
+    policy = controller.policy
+    poses, errors = nearest_poses(policy, np.array([goals[k] for k in finite], float))
+    found = {}
+    for k, pose, error in zip(finite, poses, errors, strict=True):
+        if error > policy.reward.threshold:
+            got, near = (", ".join(f"{value:.0f}" for value in values) for values in (goals[k], pose))
+            message = f"got {got}, expected a pose that the arm reaches; the nearest is {near} [mm, deg]"
+            found[k] = Event(Fault.GOAL_OUTSIDE, message)
+    return found
 
 
 def hold(state: State) -> State:

@@ -15,12 +15,13 @@ import numpy as np
 
 from mjx_softarm.deploy.arm_io import ArmIO
 from mjx_softarm.deploy.controller import Controller, State, Tick, start
-from mjx_softarm.deploy.ending import DONE, FAULT, Ending, vent_at_end
+from mjx_softarm.deploy.ending import DONE, FAULT, MISSED, Ending, vent_at_end
 from mjx_softarm.deploy.faults import Event, Fault, Response
 from mjx_softarm.deploy.link import ArmFault, Link, Recorder
-from mjx_softarm.deploy.loop import believed, hold, release, step, with_goal
+from mjx_softarm.deploy.loop import believed, hold, refusals, release, step, with_goal
 from mjx_softarm.logs.schema import Log
-from mjx_softarm.sensing.pose import pose_error
+from mjx_softarm.mdp.rewards import scaled_error
+from mjx_softarm.sensing.pose import pose_error, pose_from_quaternion
 
 _ROUNDING_S = 1e-6  # by which a simulated tick may be longer than the period
 _KEPT = 1000  # rows, arrivals and faults of a run without a log
@@ -32,6 +33,7 @@ class Arrival(NamedTuple):
     goal: np.ndarray  # (6,) [mm, deg]
     estimate: np.ndarray  # (6,) [mm, deg] pose believed in
     row: int  # index of the log's row
+    reached: bool = True  # within the policy's threshold of a goal, by motion capture if there is any
 
 
 class Orders(NamedTuple):
@@ -62,6 +64,7 @@ class Run(NamedTuple):
     events: tuple[Event, ...]
     latency_s: np.ndarray  # (ticks,) from readings to pressures, without the arm's input and output
     ending: Ending
+    n_goals: int = 0  # that were asked for; 0 of a pilot's
 
     def counts(self) -> dict[Fault, int]:
         """Return how often each fault came."""
@@ -69,9 +72,10 @@ class Run(NamedTuple):
 
     @property
     def status(self) -> int:
-        """Exit status: that of the ending, or of a fault if a goal was refused."""
+        """Exit status: that of the ending, of a fault if a goal was refused, or of a goal not reached."""
         refused = any(event.response is not Response.GO_ON for event in self.events)
-        return self.ending.status or (FAULT if refused else DONE)
+        n_reached = sum(arrival.reached for arrival in self.arrivals)
+        return self.ending.status or (FAULT if refused else MISSED if n_reached < self.n_goals else DONE)
 
 
 def follow(
@@ -82,6 +86,7 @@ def follow(
     tell: Callable[[str], None] = lambda text: None,
     arrived: Callable[[int], None] = lambda goal: None,
     save: Callable[[Log], None] = lambda log: None,
+    stay: bool = False,
 ) -> Run:
     """Bring the tip to goals, one after the other, then vent; `vent_at_end` says what else ends a run.
 
@@ -93,8 +98,9 @@ def follow(
         tell: takes a line for each arrival and each fault.
         arrived: takes the index of each goal arrived at, as the arm rests there; for what a gripper does.
         save: writes the log, once the arm is vented.
+        stay: hold the last goal, for as long as `duration_s` or until something else ends the run.
     """
-    return _Session(arm, controller, goals, duration_s, tell, arrived).to_end(save)
+    return _Session(arm, controller, goals, duration_s, tell, arrived, stay).to_end(save)
 
 
 def steer(
@@ -112,6 +118,14 @@ def steer(
     return session.to_end(save or (lambda log: None))
 
 
+def seen_error(tip_m: np.ndarray, tip_quaternion: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    """Return the mean error (6,) [mm, deg] of tips (k, 3) [m] and (k, 4); NaN where none was seen."""
+    seen = np.isfinite(tip_m).all(axis=-1)
+    if not seen.any():
+        return np.full(6, np.nan)
+    return pose_error(pose_from_quaternion(tip_m[seen], tip_quaternion[seen]), goal).mean(axis=0)
+
+
 class _Session:
     """Mutable state of `follow` and `steer`."""
 
@@ -123,11 +137,13 @@ class _Session:
         duration_s: float | None,
         tell: Callable[[str], None],
         arrived: Callable[[int], None] = lambda goal: None,
+        stay: bool = False,
         pilot: Pilot | None = None,
         kept: int | None = None,
     ):
         self.controller, self.tell, self.arrived, self.pilot = controller, tell, arrived, pilot
-        self.goals, self.duration_s, self.n_taken = list(goals), duration_s, 0
+        self.goals, self.duration_s, self.n_taken, self.stay = list(goals), duration_s, 0, stay
+        self.refusals = refusals(controller, self.goals)  # before the arm moves: it takes longer than a tick
         self.state: State = start(controller)
         self.link, self.rows = Link(arm, len(self.state.pressure_kpa), controller.dt_s), Recorder(kept)
         self.began_s = self.link.now()
@@ -141,7 +157,8 @@ class _Session:
         """Run, vent, save the log, and return what came of it."""
         ending = vent_at_end(self.run, self.link, self.tell, lambda: save(self.log()))
         events, latency_s = tuple(self.events), np.array(self.latency_s)
-        return Run(self.log(), tuple(self.arrivals), events, latency_s, ending)
+        n_goals = 0 if self.pilot else len(self.goals)
+        return Run(self.log(), tuple(self.arrivals), events, latency_s, ending, n_goals)
 
     def run(self) -> None:
         """Go through the goals.
@@ -203,11 +220,15 @@ class _Session:
         if self.pilot:
             self._obey(self.pilot.orders())
         while self.state.goal is None and self.n_taken < len(self.goals):
-            self.state, events = with_goal(self.controller, self.state, self.goals[self.n_taken])
+            goal, refusal = self.goals[self.n_taken], self.refusals.get(self.n_taken)
             self.n_taken += 1
+            events = (refusal,) if refusal else ()
+            if not refusal:
+                self.state, events = with_goal(self.controller, self.state, goal)
             self._note(events)
         over = self.duration_s is not None and now_s - self.began_s >= self.duration_s
-        return not over and (self.state.goal is not None or self.pilot is not None)
+        stays = self.pilot is not None or (self.stay and len(self.arrivals) > 0)
+        return not over and (self.state.goal is not None or stays)
 
     def _obey(self, orders: Orders) -> None:
         if orders.vent or orders.hold:
@@ -226,12 +247,25 @@ class _Session:
         self.events.extend(events)
 
     def _arrive(self, goal: np.ndarray, estimate: np.ndarray) -> None:
-        error = pose_error(np.asarray(estimate, float), goal)
-        self.arrivals.append(Arrival(goal, estimate, len(self.rows) - 1))
+        error, how = self._seen_error(goal), "motion capture"
+        if np.isnan(error).any():
+            error, how = pose_error(np.asarray(estimate, float), goal), "the springs"
+        reward = self.controller.policy.reward
+        reached = bool(np.linalg.norm(scaled_error(goal + error, goal, reward)) < reward.threshold)
+        self.arrivals.append(Arrival(goal, estimate, len(self.rows) - 1, reached))
         angles = ", ".join(f"{value:+.1f}" for value in error[3:])
-        off = f"estimated {np.linalg.norm(error[:3]):.1f} mm off; yaw, pitch, roll {angles} deg off"
-        self.tell(self._at(f"goal {len(self.arrivals)}: {off}"))
+        off = f"{np.linalg.norm(error[:3]):.1f} mm off by {how}; yaw, pitch, roll {angles} deg off"
+        missed = "" if reached else "; NOT REACHED"
+        self.tell(self._at(f"goal {len(self.arrivals)}: {off}{missed}"))
         self.arrived(self.n_taken - 1)
+
+    def _seen_error(self, goal: np.ndarray) -> np.ndarray:
+        """Return the error (6,) [mm, deg] by motion capture over the window of rest, NaN without."""
+        rows = [row for row in self.rows.last(self.controller.window) if "tip_m" in row]
+        if not rows:
+            return np.full(6, np.nan)
+        tip_m, quaternion = (np.array([row[name] for row in rows]) for name in ("tip_m", "tip_quaternion"))
+        return seen_error(tip_m, quaternion, goal)
 
     def _at(self, text: object) -> str:
         return f"{len(self.rows) * self.controller.dt_s:.2f} s: {text}"

@@ -1,5 +1,6 @@
 """Arms by name, and the command line that drives them, without JAX in its process."""
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -78,7 +79,7 @@ def test_command_line_runs_without_jax(folder):
     done = command(
         folder, "run", "policy.npz", "--arm", "driver:Arm", goal, "--log", "a.csv", "--duration", "1"
     )
-    assert done.stderr == "" and done.stdout.endswith("0 []\n")
+    assert done.stderr == "" and done.stdout.endswith("1 []\n") and "0 of 1 goals reached" in done.stdout
     assert "from readings to pressures: median" in done.stdout and "the arm is vented" in done.stdout
     assert len(read_log(folder / "a.csv")[0]) > 0
     done = command(folder, "record", "--arm", "driver:Arm", "--out", "b.csv", "--poses", "2")
@@ -87,6 +88,31 @@ def test_command_line_runs_without_jax(folder):
     done = command(folder, "record", "--arm", "driver:Arm", "--out", "b.csv", "--poses", "3")
     assert done.stdout.startswith("2 ") and done.stderr.count("\n") == 1 and "--out: got b.csv" in done.stderr
     assert (folder / "b.csv").read_text().count("\n") == 3
+
+
+def test_accuracy_is_measured_without_jax(folder):
+    """The arm never leaves its place: the tip is where the springs say, and the policy where it asks."""
+    seen = """
+    def motion_capture(self):
+        from mjx_softarm.deploy.arm_io import Capture
+        return Capture(np.array([0.0, 0.0, -0.5]), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros((0, 3)))
+"""
+    measure = ("measure", "policy.npz", "--arm", "driver:Arm", "--out", "a", "--goals", "goals.csv")
+    goal = POLICY.workspace[0]
+    header = "x [mm],y [mm],z [mm],yaw [deg],pitch [deg],roll [deg]"
+    (folder / "goals.csv").write_text(f"{header}\n{','.join(map(str, goal))}\n")
+    done = command(folder, *measure)
+    assert done.stdout.startswith("2 ") and "has no motion_capture" in done.stderr
+    with (folder / "driver.py").open("a") as file:
+        file.write(seen)
+    done = command(folder, *measure)
+    assert done.stderr == "" and done.stdout.endswith("1 []\n") and "NOT REACHED" in done.stdout
+    found = json.loads((folder / "a" / "accuracy.json").read_text())
+    off_mm = np.linalg.norm(goal[:3] - [0.0, 0.0, -500.0])
+    assert found["translation_mm"] == found["max_mm"] == pytest.approx(off_mm)
+    assert found["saturated_points"] == 1 and len(read_log(folder / "a" / "log.npz")[0]) > 100
+    done = command(folder, *measure)
+    assert done.stdout.startswith("2 ") and "--out: got a, which is there already" in done.stderr
 
 
 def test_command_line_tells_what_is_wrong(folder):

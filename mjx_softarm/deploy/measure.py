@@ -1,0 +1,173 @@
+"""Accuracy of a policy on an arm: errors at goals, judged by motion capture. NumPy only.
+
+Motion capture is noisy: an error is the mean over the window in which the springs had settled.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mjx_softarm._support.errors import InputError
+from mjx_softarm.control import saturated
+from mjx_softarm.deploy.controller import Controller
+from mjx_softarm.deploy.faults import Fault
+from mjx_softarm.deploy.session import Run, seen_error
+from mjx_softarm.logs.tables import read_table
+from mjx_softarm.mechanics.excitation import circle_poses
+from mjx_softarm.sensing.pose import pose_error
+
+AT_LIMIT_KPA = 0.1  # distance to a pressure limit that counts as at it, for a window's mean
+POSE_NAMES = ("x_mm", "y_mm", "z_mm", "yaw_deg", "pitch_deg", "roll_deg")
+GOAL_COLUMNS = ("x [mm]", "y [mm]", "z [mm]", "yaw [deg]", "pitch [deg]", "roll [deg]")
+
+
+class Accuracy(NamedTuple):
+    """Outcome at p goals, of an arm with n chambers; NaN where a goal was missed."""
+
+    goal: np.ndarray  # (p, 6) [mm, deg]
+    error: np.ndarray  # (p, 6) [mm, deg] of the tip by motion capture
+    believed: np.ndarray  # (p, 6) [mm, deg] pose that the loop estimated, less the goal
+    saturated: np.ndarray  # (p, n) bool: chamber at a limit with its spring off the reference, on arrival
+    arrival_s: np.ndarray  # (p,)
+
+
+def read_goals(name: str, workspace: np.ndarray, n: int) -> np.ndarray:
+    """Return goals (p, 6) [mm, deg] by name: `circle` and `grid` of at most n poses, or a CSV file.
+
+    Raises:
+        InputError: there is no such file, or its columns are not `GOAL_COLUMNS`.
+    """
+    if name == "circle":
+        return circle_poses(n).astype(float)
+    if name == "grid":
+        return grid_poses(workspace, n)
+    table = read_table(name)
+    if table.names != GOAL_COLUMNS or not np.isfinite(table.values).all():
+        expected = f"numbers in the columns {','.join(GOAL_COLUMNS)}"
+        raise InputError(f"{name}: got {','.join(table.names)}, expected {expected}")
+    return table.values
+
+
+def grid_poses(workspace: np.ndarray, n: int) -> np.ndarray:
+    """Return up to n of the workspace's poses (m, 6) [mm, deg], one in each cell of a grid of positions.
+
+    The grid is cubic, the finest with at most n cells that hold a pose; the pose is that nearest the middle.
+    """
+    low, high = workspace[:, :3].min(axis=0), workspace[:, :3].max(axis=0)
+    chosen = np.zeros(1, int)
+    for n_cells in range(1, n + 1):  # along the longest side
+        size = (high - low).max() / n_cells + 1e-6
+        at = (workspace[:, :3] - low) / size
+        away = np.linalg.norm(at - np.floor(at) - 0.5, axis=1)
+        order = np.argsort(away)
+        _, first = np.unique(np.floor(at[order]), axis=0, return_index=True)
+        if len(first) > n:
+            break
+        chosen = order[first]
+    return np.asarray(workspace[chosen], float)
+
+
+def measure(run: Run, controller: Controller, goals: np.ndarray) -> Accuracy:
+    """Return the accuracy of a run towards goals (p, 6) [mm, deg], on an arm with motion capture."""
+    log, policy, window = run.log, controller.policy, controller.window
+    error, believed = np.full((2, *goals.shape), np.nan)
+    mask, arrival_s = np.zeros((len(goals), policy.spec.n_chambers), bool), np.full(len(goals), np.nan)
+    gains = policy.gains._replace(
+        pressure_min_kpa=policy.gains.pressure_min_kpa + AT_LIMIT_KPA,
+        pressure_max_kpa=policy.gains.pressure_max_kpa - AT_LIMIT_KPA,
+    )
+    # Means over the window that ends with each arrival.
+    for arrival in run.arrivals:
+        point = point_of(arrival.goal, goals)
+        assert log.pressure_kpa is not None and log.reference_m is not None and log.readings is not None
+        assert log.tip_m is not None and log.tip_quaternion is not None  # it has motion capture
+        rows = slice(max(0, arrival.row + 1 - window), arrival.row + 1)
+        error[point] = seen_error(log.tip_m[rows], log.tip_quaternion[rows], arrival.goal)
+        believed[point] = pose_error(np.asarray(arrival.estimate, float), arrival.goal)
+        arrival_s[point] = log.time_s[arrival.row]
+        mask[point] = saturated(
+            log.pressure_kpa[rows].mean(axis=0),
+            log.reference_m[arrival.row],
+            policy.sensor.lengths(log.readings[rows], np.nan).length_m.mean(axis=0),
+            gains,
+            policy.tolerance_m,
+        )
+    return Accuracy(goals, error, believed, mask, arrival_s)
+
+
+def point_of(goal: np.ndarray, goals: np.ndarray) -> int:
+    """Return the index of a goal among goals (p, 6); -1 where there is none."""
+    return -1 if np.isnan(goal).any() else int(np.argmin(np.abs(goals - goal).sum(axis=1)))
+
+
+def figures(accuracy: Accuracy, events: Mapping[Fault, int]) -> dict[str, Any]:
+    """Return the figures of an accuracy, errors over the goals that were reached, NaN without any.
+
+    Rotation is the norm of the errors of yaw, pitch and roll.
+
+    Args:
+        accuracy: errors and saturation.
+        events: how often each fault was reported.
+    """
+    reached = np.isfinite(accuracy.error).all(axis=1)
+    n_reached = int(reached.sum())
+    error, believed = (
+        values[reached] if n_reached else np.full((1, 6), np.nan)
+        for values in (accuracy.error, accuracy.believed)
+    )
+    away, turned = np.linalg.norm(error[:, :3], axis=1), np.linalg.norm(error[:, 3:], axis=1)
+    per_point = accuracy.saturated.sum(axis=1)
+    return {
+        "points": len(accuracy.goal),
+        "reached": n_reached,
+        "translation_mm": float(away.mean()),
+        "translation_95_mm": float(np.quantile(away, 0.95)),
+        "rmse_mm": float(np.sqrt(np.mean(away**2))),
+        "max_mm": float(away.max()),
+        "rotation_deg": float(turned.mean()),
+        "rotation_95_deg": float(np.quantile(turned, 0.95)),
+        "rotation_max_deg": float(turned.max()),
+        **dict(zip(POSE_NAMES, np.abs(error).mean(axis=0).tolist(), strict=True)),
+        "believed_mm": float(np.linalg.norm(believed[:, :3], axis=1).mean()),
+        "saturated_points": int(np.count_nonzero(per_point)),
+        "saturated_chambers_max": int(per_point.max()),
+        "saturation_events": events.get(Fault.SATURATED, 0),
+        "events": {fault.value: int(n) for fault, n in events.items() if n},
+    }
+
+
+def write_accuracy(folder: Path, accuracy: Accuracy, found: Mapping[str, Any]) -> str:
+    """Write `accuracy.json`, and `accuracy.png` where matplotlib is there; return what is missing, or "".
+
+    Raises:
+        OSError: they cannot be written.
+    """
+    points = [
+        {"goal": goal.tolist(), "error": error.tolist() if np.isfinite(error).all() else None}
+        for goal, error in zip(accuracy.goal, accuracy.error, strict=True)
+    ]
+    numbers = {name: None if value != value else value for name, value in found.items()}
+    text = json.dumps({**numbers, "at": points}, indent=2, allow_nan=False)
+    (folder / "accuracy.json").write_text(f"{text}\n", "utf-8")
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        return "no picture: matplotlib is not installed"
+    figure = Figure(figsize=(10, 4), layout="constrained")
+    above, side, shares = figure.subplots(1, 3)
+    seen = accuracy.goal[:, :3] + accuracy.error[:, :3]
+    for axes, (i, j) in ((above, (0, 1)), (side, (0, 2))):
+        axes.plot(accuracy.goal[:, i], accuracy.goal[:, j], "o", mfc="none", label="goal")
+        axes.plot(seen[:, i], seen[:, j], ".", label="measured")
+        axes.set(xlabel=f"{'xyz'[i]} [mm]", ylabel=f"{'xyz'[j]} [mm]", aspect="equal")
+    above.legend()
+    away = np.sort(np.linalg.norm(accuracy.error[np.isfinite(accuracy.error).all(axis=1), :3], axis=1))
+    shares.plot(away, np.arange(1, len(away) + 1) / max(len(away), 1), drawstyle="steps-post")
+    shares.set(xlabel="translation error [mm]", ylabel="share of the goals below", ylim=(0, 1), xlim=0)
+    figure.savefig(folder / "accuracy.png", dpi=150)
+    return ""

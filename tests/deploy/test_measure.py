@@ -1,0 +1,105 @@
+"""Accuracy on the linear arm, whose motion capture is off by what the test plants."""
+
+import json
+
+import numpy as np
+import pytest
+
+from mjx_softarm._support.errors import InputError
+from mjx_softarm.deploy.arm_io import Capture
+from mjx_softarm.deploy.ending import DONE, FAULT, MISSED
+from mjx_softarm.deploy.faults import Fault
+from mjx_softarm.deploy.measure import figures, grid_poses, measure, read_goals, write_accuracy
+from mjx_softarm.mechanics.excitation import circle_poses
+from mjx_softarm.sensing.estimator import estimate
+from mjx_softarm.sensing.pose import quaternion_from_pose
+from tests.linear_arm import CONTROLLER, FAR, GOALS, POLICY, LinearArm, go
+
+OFF_MM = np.array([1.0, -2.0, 2.0])
+
+
+class Seen(LinearArm):
+    """Motion capture that is off by OFF_MM, with noise, and misses frames."""
+
+    def __init__(self, off_mm=OFF_MM):
+        super().__init__()
+        self.off_mm = off_mm
+
+    def motion_capture(self):
+        if self.tick % 5 == 0:
+            raise OSError("frame dropped")
+        pose = estimate(POLICY.estimator, self.spring_m[None])[0].astype(float)
+        tip_m = 1e-3 * (pose[:3] + self.off_mm + 0.2 * self._rng.standard_normal(3))
+        return Capture(tip_m, quaternion_from_pose(pose), tip_m[None])
+
+
+def test_error_is_that_by_motion_capture(tmp_path):
+    lines = []
+    run = go(Seen(), tell=lines.append)
+    found = measure(run, CONTROLLER, GOALS)
+    np.testing.assert_allclose(found.error[:, :3], np.tile(OFF_MM, (2, 1)), atol=0.4)
+    assert np.abs(found.error[:, 3:]).max() < 0.5 and np.abs(found.believed[:, :3]).max() < 0.5
+    assert not found.saturated.any() and (np.diff(found.arrival_s) > 0.0).all()
+    assert len(lines) == 2 and all("mm off by motion capture" in line for line in lines)
+    numbers = figures(found, run.counts())
+    assert numbers["reached"] == numbers["points"] == 2
+    assert numbers["translation_mm"] == pytest.approx(3.0, abs=0.4) and run.status == DONE
+    pytest.importorskip("matplotlib")
+    assert write_accuracy(tmp_path, found, numbers) == "" and (tmp_path / "accuracy.png").stat().st_size > 0
+    assert json.loads((tmp_path / "accuracy.json").read_text())["at"][1]["goal"] == GOALS[1].tolist()
+
+
+def test_quantiles_and_rotation_by_hand():
+    found = measure(go(Seen(), goals=GOALS[:1]), CONTROLLER, np.tile(GOALS[0], (21, 1)))
+    found.error[:] = np.nan
+    found.error[:20, :3] = np.arange(1.0, 21.0)[:, None] * [0.6, 0.0, 0.8]
+    found.error[:20, 3:] = [2.0, -1.0, 2.0]
+    numbers = figures(found, {Fault.SATURATED: 2})
+    assert (numbers["points"], numbers["reached"], numbers["saturation_events"]) == (21, 20, 2)
+    assert (numbers["translation_mm"], numbers["max_mm"]) == pytest.approx((10.5, 20.0))
+    assert numbers["translation_95_mm"] == pytest.approx(19.05)
+    assert (numbers["rotation_deg"], numbers["rotation_max_deg"]) == pytest.approx((3.0, 3.0))
+
+
+@pytest.mark.parametrize(
+    ("off_mm", "goals", "status"),
+    [(0 * OFF_MM, GOALS[:1], DONE), (4 * OFF_MM, GOALS[:1], MISSED), (4 * OFF_MM, [FAR, GOALS[0]], FAULT)],
+)
+def test_goal_that_is_not_reached_has_an_exit_status(off_mm, goals, status):
+    run = go(Seen(off_mm), goals=goals)
+    assert run.status == status and [arrival.reached for arrival in run.arrivals] == [not off_mm.any()]
+
+
+def test_run_that_ends_before_its_goals_has_missed_them():
+    assert go(LinearArm(), duration_s=0.5).status == MISSED
+
+
+def test_stay_holds_the_last_goal_until_the_end():
+    arm = LinearArm()
+    run = go(arm, goals=GOALS[:1], stay=True, duration_s=30.0)
+    assert run.status == DONE and run.log.time_s[-1] == pytest.approx(30.0, abs=0.1)
+    held_kpa = np.asarray(run.log.pressure_kpa)[run.arrivals[0].row :]
+    assert np.ptp(held_kpa, axis=0).max() < 1.0 and np.abs(held_kpa).max() > 5.0
+    assert not arm.command_kpa.any()
+    refused = go(LinearArm(), goals=[FAR], stay=True)
+    assert len(refused.log) == 0 and refused.status == FAULT
+
+
+def test_goals_by_name(tmp_path):
+    np.testing.assert_array_equal(read_goals("circle", POLICY.workspace, 8), circle_poses(8))
+    np.testing.assert_array_equal(read_goals("grid", POLICY.workspace, 30), grid_poses(POLICY.workspace, 30))
+    file = tmp_path / "goals.csv"
+    file.write_text("x [mm],y [mm],z [mm],yaw [deg],pitch [deg],roll [deg]\n80,0,-575,0,0,0\n1,2,3,4,5,6\n")
+    np.testing.assert_array_equal(read_goals(str(file), POLICY.workspace, 1)[1], range(1, 7))
+    file.write_text("x,y,z\n1,2,3\n")
+    with pytest.raises(InputError, match=r"goals.csv: got x,y,z, expected numbers in the columns x \[mm\]"):
+        read_goals(str(file), POLICY.workspace, 1)
+
+
+def test_grid_is_spread_over_the_workspace():
+    cloud = np.random.default_rng(0).uniform(-100.0, 100.0, (5000, 6))
+    chosen = grid_poses(cloud, 64)
+    assert len(chosen) == 64 and all((cloud == pose).all(axis=1).any() for pose in chosen)
+    away = np.linalg.norm(chosen[:, None, :3] - chosen[None, :, :3], axis=2) + 1e9 * np.eye(64)
+    assert away.min() > 25.0  # cells are 50 mm wide
+    assert len(grid_poses(cloud, 1)) == 1
