@@ -76,24 +76,6 @@ class Capture(NamedTuple):
     spring_m: np.ndarray | None = None
 
 
-class MeasuredPressures(Protocol):
-    """Pressure sensors of an arm, for its logs; no controller looks at them."""
-
-    def pressures(self) -> np.ndarray:
-        """Return the pressures (n,) [kPa] that the regulators measure now, relative to the atmosphere."""
-        ...
-
-
-class SimulatedClock(Protocol):
-    """Clock of a simulated arm, which stands still but in `write_pressures`.
-
-    Attributes:
-        time_s [s]: advances by one period of the control loop with each write.
-    """
-
-    time_s: float
-
-
 class MotionCapture(Protocol):
     """Motion capture of an arm, for calibration logs and to verify; no controller may look at it."""
 
