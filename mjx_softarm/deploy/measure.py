@@ -164,7 +164,8 @@ def write_accuracy(folder: Path, accuracy: Accuracy, found: Mapping[str, Any]) -
     for axes, (i, j) in ((above, (0, 1)), (side, (0, 2))):
         axes.plot(accuracy.goal[:, i], accuracy.goal[:, j], "o", mfc="none", label="goal")
         axes.plot(seen[:, i], seen[:, j], ".", label="measured")
-        axes.set(xlabel=f"{'xyz'[i]} [mm]", ylabel=f"{'xyz'[j]} [mm]", aspect="equal")
+        axes.set(xlabel=f"{'xyz'[i]} [mm]", ylabel=f"{'xyz'[j]} [mm]")
+        axes.set_aspect("equal", adjustable="datalim")
     above.legend()
     away = np.sort(np.linalg.norm(accuracy.error[np.isfinite(accuracy.error).all(axis=1), :3], axis=1))
     shares.plot(away, np.arange(1, len(away) + 1) / max(len(away), 1), drawstyle="steps-post")
