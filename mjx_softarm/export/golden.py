@@ -47,6 +47,7 @@ STOPS = sum(bit for fault, bit in BITS.items() if fault.response is Response.VEN
 _SPREAD_M = 2e-3  # of the springs of single rows around the model's, as by payloads
 _OUTSIDE, _LOST = 0.1, 0.1  # shares of single rows
 _LAG, _NOISE_M = 0.15, 4e-5  # of the arm in the runs, per tick
+_SWING_M = 2e-3
 _RUN_TICKS = 400  # at most
 
 
@@ -176,11 +177,12 @@ def _rows_of_run(
     """Yield rows of a run with a fault; takes the pressures that were answered."""
     policy, n = controller.policy, controller.policy.spec.n_chambers
     actual_kpa, goal = np.zeros(n), _goal(controller, rng, outside=False)
-    leak, first = np.ones(n), None
+    leak, first, longest_m = np.ones(n), None, policy.actions.lengths(np.ones(n))
     for tick in range(10**6):
         spring_m = expected_springs(policy.spring_model, actual_kpa) + rng.normal(0.0, _NOISE_M, n)
-        if kind == "swinging":
-            spring_m = spring_m + 5e-3 * np.sin(2 * np.pi * 0.7 * tick * controller.dt_s)
+        if kind == "swinging":  # never all still, and so long that the law drives every chamber to its limit
+            phase = 2 * np.pi * 0.7 * tick * controller.dt_s + np.arange(n)
+            spring_m = longest_m - _SWING_M * (1.0 - np.sin(phase))
         readings = policy.sensor.readings(spring_m)
         first = readings if first is None else first
         if kind == "lost" and (tick in (30, 40) or tick >= 60):

@@ -11,6 +11,7 @@ import numpy as np
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.export import computations
+from mjx_softarm.export.cpp import sources
 from mjx_softarm.export.golden import make_golden, write_golden
 from mjx_softarm.mdp.observation import OBS_LAYOUT
 from mjx_softarm.policy.file import Policy, action_layout, load_policy
@@ -40,6 +41,23 @@ def export_onnx(policy_path: Path) -> list[Path]:
     golden = policy_path.with_name(f"{policy_path.stem}_golden.csv")
     write_golden(golden, make_golden(controller, sha256))
     return [whole, actor, golden]
+
+
+def export_cpp(policy_path: Path, folder: Path) -> list[Path]:
+    """Write a policy as C++ sources into a folder, with golden rows; return the files.
+
+    Raises:
+        InputError: the policy cannot be read.
+        OSError: a file cannot be written.
+    """
+    controller, sha256 = _open(policy_path)
+    folder.mkdir(parents=True, exist_ok=True)
+    files = []
+    for name, text in sources(controller, sha256).items():
+        files.append(folder / name)
+        files[-1].write_text(text, "utf-8")
+    write_golden(folder / "golden.csv", make_golden(controller, sha256))
+    return [*files, folder / "golden.csv"]
 
 
 def describe(policy: Policy, sha256: str) -> dict[str, Any]:

@@ -135,7 +135,7 @@ def policy_from_actor(
         tolerance_m=tolerance_m,
         n_actions=n_actions,
     )
-    return _unpack(_pack(policy), "policy")
+    return _unpack(file_entries(policy), "policy")
 
 
 def _layers_from_flax(actor_params: Mapping[str, Any], n_actions: int) -> tuple[Layer, ...]:
@@ -157,7 +157,7 @@ def save_policy(path: str | Path, policy: Policy) -> None:
             written. A file that was there before is then still there.
         TypeError: the provenance holds something that JSON has not.
     """
-    arrays = _pack(policy)
+    arrays = file_entries(policy)
     _unpack(arrays, str(path))
     archive.write_sealed(Path(path), arrays, KIND)
 
@@ -172,7 +172,8 @@ def load_policy(path: str | Path) -> Policy:
     return _unpack(archive.read_sealed(Path(path), KIND, "python -m train export"), str(path))
 
 
-def _pack(policy: Policy) -> dict[str, np.ndarray]:
+def file_entries(policy: Policy) -> dict[str, np.ndarray]:
+    """Return the entries of a policy's file by name."""
     entries: dict[str, Any] = {
         "schema_version": SCHEMA_VERSION,
         "spec_json": json.dumps(policy.spec.to_dict()),

@@ -15,7 +15,7 @@ from rich.table import Table
 
 from mjx_softarm._support import cli
 from mjx_softarm.env import ReachEnv
-from mjx_softarm.export.write import export_onnx
+from mjx_softarm.export.write import export_cpp, export_onnx
 from train.config import ConfigError, ImitationConfig, TrainConfig
 from train.demos.demonstrations import from_log, read_demonstrations
 from train.epoch import devices
@@ -123,7 +123,10 @@ def evaluate(run: tyro.conf.Positional[Path]) -> int:
 
 
 def export(
-    folders: tyro.conf.Positional[tuple[Path, ...]], out: cli.MaybePath = None, onnx: bool = False
+    folders: tyro.conf.Positional[tuple[Path, ...]],
+    out: cli.MaybePath = None,
+    onnx: bool = False,
+    cpp: cli.MaybePath = None,
 ) -> int:
     """Write policies, each as one npz file, and for other runtimes.
 
@@ -131,15 +134,17 @@ def export(
         folders: folders of runs
         out: file to write, for one run; None: policy.npz in its folder
         onnx: write ONNX graphs and golden rows beside it
+        cpp: folder for a C++ header, programs and golden rows, for one run
     """
-    if not folders or (out and len(folders) > 1):
-        expected = "one folder of a run" + ("" if out else " or more")
+    if not folders or ((out or cpp) and len(folders) > 1):
+        expected = "one folder of a run" + ("" if out or cpp else " or more")
         raise RunError(f"RUN: got {len(folders)}, expected {expected}")
     console = start()
     for path in folders:
         policy = export_run(Run.open(path), out)
         console.print(f"policy: {policy}", highlight=False)
-        for file in export_onnx(policy) if onnx else ():
+        files = export_onnx(policy) if onnx else []
+        for file in [*files, *(export_cpp(policy, cpp) if cpp else [])]:
             console.print(f"  {file}", highlight=False)
     return 0
 

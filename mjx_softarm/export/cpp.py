@@ -1,0 +1,51 @@
+"""A policy and its control loop as C++ sources: a header with all numbers, two programs, a CMake file."""
+
+from __future__ import annotations
+
+from importlib import resources
+
+from mjx_softarm.deploy.controller import Controller
+from mjx_softarm.deploy.faults import LATE_TICKS, LOST_TICKS, SETTLE_TIMEOUT_S, Fault, Response
+from mjx_softarm.deploy.loop import CHAMBER_WINDOWS
+from mjx_softarm.export.computations import parts
+from mjx_softarm.export.cpp_functions import Numbers, function
+from mjx_softarm.policy.file import file_entries
+
+_TEMPLATES = {"softarm.hpp": "softarm.hpp.in"} | {
+    name: name for name in ("rows.cpp", "example.cpp", "CMakeLists.txt")
+}
+
+
+def sources(controller: Controller, policy_sha256: str) -> dict[str, str]:
+    """Return the text of each file by its name."""
+    policy = controller.policy
+    numbers = Numbers(file_entries(policy))
+    functions = [function(name, part, numbers) for name, part in parts(controller).items()]
+    faults = [f"  {fault.name} = 1u << {k},  // {fault.response.value}" for k, fault in enumerate(Fault)]
+    vents = [fault.name for fault in Fault if fault.response is Response.VENT]
+    values = {
+        "SHA256": policy_sha256,
+        "N": policy.spec.n_chambers,
+        "RATE": f"{policy.rate_hz:g}",
+        "PERIOD": repr(controller.dt_s),
+        "UNIT": policy.sensor.unit,
+        "FAULTS": "\n".join(faults),
+        "N_FAULTS": len(Fault),
+        "VENTS": " | ".join([*vents, "NOT_FINITE"]),
+        "NUMBERS": numbers.text(),
+        "PARTS": "\n".join(functions),
+        "WINDOW": controller.window,
+        "N_ACTIONS": policy.n_actions,
+        "LOST_TICKS": LOST_TICKS,
+        "LATE_TICKS": LATE_TICKS,
+        "SUSPECT_TICKS": CHAMBER_WINDOWS * controller.window,
+        "TIMEOUT": repr(SETTLE_TIMEOUT_S),
+        "GOAL": ", ".join(f"{value:.1f}" for value in policy.workspace[0]),
+    }
+    texts = {}
+    for name, template in _TEMPLATES.items():
+        text = resources.files("mjx_softarm").joinpath(f"export/templates/{template}").read_text("utf-8")
+        for key, value in values.items():
+            text = text.replace(f"@{key}@", str(value))
+        texts[name] = text
+    return texts

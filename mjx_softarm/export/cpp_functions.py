@@ -1,0 +1,266 @@
+"""Recorded computations as C++ functions: loops over arrays of fixed size, without allocation.
+
+An operation whose elements are read once is written into the expression that reads it; all others have an
+array of their own. `_places` finds a formula for the place of an element in an operand that is broadcast or
+indexed; where there is none, a table holds the places.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Mapping
+
+import numpy as np
+
+from mjx_softarm.export.computations import Computation
+from mjx_softarm.export.symbols import REDUCTIONS, Symbol, ordered
+
+_TYPES = {"float64": "double", "float32": "float", "int32": "int", "int64": "int", "bool": "bool"}
+_VIEWS = ("reshape", "index")
+_EXPRESSIONS = {
+    "add": "({} + {})",
+    "subtract": "({} - {})",
+    "multiply": "({} * {})",
+    "divide": "({} / {})",
+    "negative": "(-{})",
+    "less": "({} < {})",
+    "less_equal": "({} <= {})",
+    "greater": "({} > {})",
+    "greater_equal": "({} >= {})",
+    "equal": "({} == {})",
+    "logical_and": "({} && {})",
+    "logical_or": "({} || {})",
+    "logical_not": "(!{})",
+    "where": "({} ? {} : {})",
+    "maximum": "most({}, {})",
+    "minimum": "least({}, {})",
+    "arctan2": "std::atan2({}, {})",
+    "arccos": "std::acos({})",
+    "absolute": "std::fabs({})",
+    "isfinite": "std::isfinite({})",
+    **{name: f"std::{name}({{}})" for name in ("sqrt", "sin", "cos", "tanh", "floor")},
+}
+# Before the first element, and after each one.
+_FOLDS = {
+    "sum": ("0", "{} += {};"),
+    "min": ("INFINITY", "{0} = least({0}, {1});"),
+    "max": ("-INFINITY", "{0} = most({0}, {1});"),
+    "all": ("true", "{0} = {0} && {1};"),
+    "any": ("false", "{0} = {0} || {1};"),
+}
+
+
+class Numbers:
+    """Constant arrays of all functions, each once.
+
+    Args:
+        names: names of arrays that have one; the others are numbered.
+    """
+
+    def __init__(self, names: Mapping[str, np.ndarray]):
+        self._known = {_key(array): name.replace(".", "_") for name, array in names.items()}
+        self._used: dict[str, np.ndarray] = {}
+
+    def name(self, array: np.ndarray) -> str:
+        """Return the name of an array."""
+        key = _key(array)
+        name = self._known.setdefault(key, f"numbers_{len(self._known)}")
+        self._used[name] = array
+        return name
+
+    def text(self) -> str:
+        """Return the definitions of all arrays that were named."""
+        return "\n".join(_definition(name, array) for name, array in self._used.items())
+
+
+def function(name: str, computation: Computation, numbers: Numbers) -> str:
+    """Return a computation as a function, its outputs after its inputs."""
+    takes = [f"const {_TYPES[item.dtype.name]}* {item.option}" for item in computation.inputs]
+    gives = [f"{_TYPES[item.dtype.name]}* {key}" for key, item in computation.outputs.items()]
+    body = "\n".join(f"  {line}" for line in _Body(computation, numbers).lines)
+    return f"inline void {name}({', '.join(takes + gives)}) noexcept {{\n{body}\n}}\n"
+
+
+class _Body:
+    """Statements of one function."""
+
+    def __init__(self, computation: Computation, numbers: Numbers):
+        self.lines: list[str] = []
+        self._numbers, self._names = numbers, {}
+        items = ordered(computation.outputs.values())
+        outputs = {item: name for name, item in computation.outputs.items()}
+        self._readers = defaultdict(list)
+        for item in items:
+            for operand in item.operands:
+                self._readers[operand].append(item)
+        for item in items:
+            if item in outputs:
+                self._store(item, outputs[item])
+            elif item.op not in ("input", "constant", *_VIEWS) and not self._read_once(item):
+                name = f"v{len(self._names)}"
+                self.lines.append(f"{_TYPES[item.dtype.name]} {name}[{item.size}];")
+                self._store(item, name)
+
+    def _read_once(self, item: Symbol) -> bool:
+        """Return whether an operation on elements can stand where its result is read."""
+        if item.op not in _EXPRESSIONS | {"cast": ""} and item.op not in _VIEWS:
+            return False
+        if len(self._readers[item]) != 1:
+            return False
+        [reader] = self._readers[item]
+        if reader.op == "matmul" or reader.size > item.size:
+            return False
+        return reader.op not in _VIEWS or self._read_once(reader)
+
+    def _store(self, item: Symbol, name: str) -> None:
+        """Write the loops that fill the array `name`."""
+        if item.op == "matmul":
+            self._matmul(item, name)
+        elif item.op in REDUCTIONS:
+            self._reduce(item, name)
+        elif item.op == "concat":
+            self._concat(item, name)
+        else:
+            self._loop(item.size, lambda i: f"{name}[{i}] = {self._formula(item, i)};")
+        self._names[item] = name
+
+    def _loop(self, size: int, statement) -> None:
+        line = statement("i") if size > 1 else statement("0")
+        self.lines.append(f"for (int i = 0; i < {size}; ++i) {line}" if size > 1 else line)
+
+    def _value(self, item: Symbol, i: str) -> str:
+        """Return the expression of element `i`, counted in flat order."""
+        return f"{self._names[item]}[{i}]" if item in self._names else self._formula(item, i)
+
+    def _formula(self, item: Symbol, i: str) -> str:
+        if item.op == "input":
+            return f"{item.option}[{i}]"
+        if item.op == "constant":
+            return self._constant(item.value, i)
+        if item.op == "reshape":
+            return self._value(item.operands[0], i)
+        if item.op == "index":
+            return self._value(item.operands[0], self._places(item.option, i))
+        if item.op == "cast":
+            return f"{_TYPES[item.dtype.name]}({self._value(item.operands[0], i)})"
+        values = item.operands[1:] if item.op == "where" else item.operands
+        common = np.result_type(*(value.dtype for value in values))
+        texts = []
+        for k, operand in enumerate(item.operands):
+            numbered = np.arange(operand.size).reshape(operand.shape)
+            text = self._value(operand, self._places(np.broadcast_to(numbered, item.shape), i))
+            is_common = operand.dtype == common or (item.op == "where" and k == 0)
+            texts.append(text if is_common else f"{_TYPES[common.name]}({text})")
+        return _EXPRESSIONS[item.op].format(*texts)
+
+    def _constant(self, value: np.ndarray, i: str) -> str:
+        first = value.reshape(-1)[0]
+        same = np.array_equal(value, np.full(value.shape, first), equal_nan=value.dtype.kind == "f")
+        return _literal(first) if same else f"{self._numbers.name(value)}[{i}]"
+
+    def _places(self, places: np.ndarray, i: str) -> str:
+        """Return the place of element `i` in an operand, given the places of all."""
+        flat = places.reshape(-1)
+        count, start = np.arange(flat.size), int(flat[0])
+        stride = int(flat[1]) - start if flat.size > 1 else 0
+        if np.array_equal(flat, start + stride * count):
+            term = {0: "", 1: i}.get(stride, f"{stride} * {_one(i)}")
+            return " + ".join(filter(None, [str(start) if start or not term else "", term]))
+        period = int(np.argmax(flat[1:] == start)) + 1
+        if np.array_equal(flat, count % period):
+            return f"{_one(i)} % {period}"
+        repeats = int(np.argmax(flat != start))
+        if np.array_equal(flat, count // repeats):
+            return f"{_one(i)} / {repeats}"
+        return f"{self._numbers.name(flat.astype(np.int32))}[{i}]"
+
+    def _matmul(self, item: Symbol, name: str) -> None:
+        a, b = item.operands
+        n_rows, n_inner = (1, *a.shape)[-2:]
+        n_columns = 1 if b.ndim == 1 else b.shape[-1]
+        n_batch = math.prod(a.shape[:-2])
+        if n_batch != math.prod(b.shape[:-2]):
+            raise NotImplementedError(f"matmul: got {a.shape} and {b.shape}, expected equal leading axes")
+        batch, row, inner, column = ("b", n_batch), ("r", n_rows), ("k", n_inner), ("c", n_columns)
+        x, weight = self._value(a, _flat(batch, row, inner)), self._value(b, _flat(batch, inner, column))
+        target = f"{name}[{_flat(batch, row, column)}]"
+        outside, columns = "".join(map(_for, (batch, row))), _for(column)
+        self.lines += [
+            f"{outside}{{" if outside else "{",
+            f"  {columns}{target} = 0;",
+            f"  for (int k = 0; k < {n_inner}; ++k) {{",
+            f"    const {_TYPES[item.dtype.name]} x = {x};",
+            f"    {columns}{target} += x * {weight};",
+            "  }",
+            "}",
+        ]
+
+    def _reduce(self, item: Symbol, name: str) -> None:
+        [x], axes = item.operands, item.option
+        n_reduced = math.prod(x.shape[axis] for axis in axes)
+        n_inner = math.prod(x.shape[axes[-1] + 1 :])
+        first, fold = _FOLDS[item.op]
+        places = {1: f"i * {n_reduced} + k", item.size: f"k * {n_inner} + i"}
+        between = f"((i / {n_inner}) * {n_reduced} + k) * {n_inner} + i % {n_inner}"
+        value = self._value(x, "k" if item.size == 1 else places.get(n_inner, between))
+        self.lines += [
+            f"for (int i = 0; i < {item.size}; ++i) {{",
+            f"  {_TYPES[item.dtype.name]} folded = {first};",
+            f"  for (int k = 0; k < {n_reduced}; ++k) {fold.format('folded', value)}",
+            f"  {name}[i] = folded;",
+            "}",
+        ]
+
+    def _concat(self, item: Symbol, name: str) -> None:
+        n_inner, start = math.prod(item.shape[item.option + 1 :]), 0
+        n_row = item.shape[item.option] * n_inner
+        for part in item.operands:
+            n = part.shape[item.option] * n_inner
+            place = f"{start} + i" if n == part.size else f"i / {n} * {n_row} + {start} + i % {n}"
+            place = f"i * {n_row} + {start}" if n == 1 else place
+            self.lines.append(
+                f"for (int i = 0; i < {part.size}; ++i) {name}[{place}] = {self._value(part, 'i')};"
+            )
+            start += n
+
+
+def _one(text: str) -> str:
+    """Return an expression that may stand beside any operator."""
+    return text if text.isalnum() else f"({text})"
+
+
+def _flat(*indices: tuple[str, int]) -> str:
+    """Return the place in flat order of indices, each with the size of its axis."""
+    text = ""
+    for name, size in indices:
+        if size > 1:
+            text = f"{_one(text)} * {size} + {name}" if text else name
+    return text or "0"
+
+
+def _for(index: tuple[str, int]) -> str:
+    name, size = index
+    return f"for (int {name} = 0; {name} < {size}; ++{name}) " if size > 1 else ""
+
+
+def _key(array: np.ndarray) -> tuple:
+    return array.dtype.str, array.size, np.ascontiguousarray(array).tobytes()
+
+
+def _literal(value: np.generic) -> str:
+    if value.dtype.kind == "b":
+        return "true" if value else "false"
+    if value.dtype.kind == "i":
+        return str(int(value))
+    if np.isnan(value):
+        return f"{_TYPES[value.dtype.name]}(NAN)"
+    text = np.format_float_scientific(value, trim="0") if value else "0.0"
+    return f"{text}f" if value.dtype == np.float32 else text
+
+
+def _definition(name: str, array: np.ndarray) -> str:
+    texts = [_literal(value) for value in array.reshape(-1)]
+    rows = [", ".join(texts[k : k + 8]) for k in range(0, len(texts), 8)]
+    body = ",\n  ".join(rows)
+    return f"inline constexpr {_TYPES[array.dtype.name]} {name}[{len(texts)}] = {{\n  {body}}};"

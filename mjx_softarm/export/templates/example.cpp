@@ -1,0 +1,43 @@
+// Brings the tip to a goal. Write the two functions below for your arm; all else is in softarm.hpp.
+#include <chrono>
+#include <cstdio>
+#include <thread>
+
+#include "softarm.hpp"
+
+using softarm::kN;
+using Clock = std::chrono::steady_clock;
+
+// Reads the springs' sensors; NaN for a reading that did not come within the tick.
+static void read_sensors(double* readings) {
+  for (int k = 0; k < kN; ++k) readings[k] = NAN;
+}
+
+// Sets what the chambers' pressures [kPa] are regulated to; false where the arm did not take them in time.
+static bool write_pressures(const double* pressure_kpa) {
+  for (int k = 0; k < kN; ++k) std::printf("%.1f%c", pressure_kpa[k], k + 1 < kN ? ' ' : '\n');
+  return true;
+}
+
+int main() {
+  const double goal[6] = {@GOAL@};  // x, y, z [mm], yaw, pitch, roll [deg]
+  softarm::Controller controller;
+  if (!controller.set_goal(goal)) {
+    std::puts("the goal is outside the workspace");
+    return 3;
+  }
+  const auto period = std::chrono::duration_cast<Clock::duration>(std::chrono::duration<double>(softarm::kPeriod));
+  softarm::Tick tick{};
+  bool late = false, taken = true;
+  for (auto next = Clock::now() + period; !tick.vented; next += period) {
+    double readings[kN];
+    read_sensors(readings);
+    tick = controller.tick(readings, late, taken);
+    taken = write_pressures(tick.pressure_kpa);
+    if (tick.faults) std::printf("faults: %#x%s\n", tick.faults, tick.stopped ? ", vents" : "");
+    if (tick.arrived) controller.vent();  // or set_goal() to the next one
+    late = Clock::now() > next;
+    if (late) next = Clock::now();
+    std::this_thread::sleep_until(next);
+  }
+}

@@ -1,0 +1,41 @@
+// Answers golden rows: reads rows of numbers, writes the outputs of each (python -m pydoc mjx_softarm.export.golden).
+#include <cstdio>
+
+#include "softarm.hpp"
+
+using softarm::kN;
+
+static void write(const double* values, int n) {
+  for (int k = 0; k < n; ++k) std::printf(" %.17g", values[k]);
+}
+
+int main() {
+  std::printf("mjx_softarm 1 %s\n", softarm::kPolicySha256);
+  std::fflush(stdout);
+  softarm::Controller controller;
+  constexpr int n_inputs = 4 + kN + 6;
+  double row[n_inputs];
+  for (long line = 1;; ++line) {
+    for (int k = 0; k < n_inputs; ++k) {
+      if (std::scanf("%lf", &row[k]) == 1) continue;
+      if (k == 0 && std::feof(stdin)) return 0;
+      std::fprintf(stderr, "row %ld: got %d numbers, expected %d\n", line, k, n_inputs);
+      return 2;
+    }
+    if (row[0] > 0.5) controller = softarm::Controller{};
+    const bool refused = row[1] > 0.5 && !controller.set_goal(row + 4 + kN);
+    const softarm::Tick tick = controller.tick(row + 4, row[2] > 0.5, row[3] > 0.5);
+    double reference[kN], length[kN];
+    float pose[6];
+    controller.references(reference);
+    controller.lengths(length);
+    controller.tip(pose);
+    std::printf("%u %d", tick.faults | (refused ? softarm::GOAL_OUTSIDE : 0u), tick.arrived);
+    write(tick.pressure_kpa, kN);
+    write(reference, kN);
+    write(length, kN);
+    for (const float value : pose) std::printf(" %.9g", value);
+    std::printf("\n");
+    std::fflush(stdout);
+  }
+}
