@@ -22,6 +22,7 @@ from mjx_softarm.deploy.ending import FAULT, save_log
 from mjx_softarm.deploy.measure import figures, measure, read_goals, write_accuracy
 from mjx_softarm.deploy.record import record
 from mjx_softarm.deploy.session import Run, follow
+from mjx_softarm.logs import mcap_file
 from mjx_softarm.mechanics.excitation import growing, random_pressures
 from mjx_softarm.policy.file import load_policy
 
@@ -66,7 +67,7 @@ def _run(
     Args:
         policy: file that `python -m train export` wrote
         goal: pose of the tip [mm, deg] in the base frame; again for a further one
-        log: file for the run's log, CSV or npz
+        log: file for the run's log, CSV, npz or MCAP, by the end of its name
         duration: [s] of the arm after which the run ends
         stay: hold the last goal, until Ctrl-C or the end of the duration
     """
@@ -182,6 +183,8 @@ def check_file(option: str, path: Path | None) -> None:
         raise InputError(f"{option}: got {path}, expected a file in a folder that exists")
     if path is not None and path.is_dir():
         raise InputError(f"{option}: got {path}, a folder, expected a file")
+    if path is not None and path.suffix == mcap_file.SUFFIX:
+        mcap_file.require_mcap(option)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 
@@ -125,9 +126,8 @@ class _Body:
             self._loop(item.size, lambda i: f"{name}[{i}] = {self._formula(item, i)};")
         self._names[item] = name
 
-    def _loop(self, size: int, statement) -> None:
-        line = statement("i") if size > 1 else statement("0")
-        self.lines.append(f"for (int i = 0; i < {size}; ++i) {line}" if size > 1 else line)
+    def _loop(self, size: int, statement: Callable[[str], str]) -> None:
+        self.lines.append(_for(("i", size)) + statement("i" if size > 1 else "0"))
 
     def _value(self, item: Symbol, i: str) -> str:
         """Return the expression of element `i`, counted in flat order."""
@@ -137,7 +137,7 @@ class _Body:
         if item.op == "input":
             return f"{item.option}[{i}]"
         if item.op == "constant":
-            return self._constant(item.value, i)
+            return self._constant(np.asarray(item.value), i)
         if item.op == "reshape":
             return self._value(item.operands[0], i)
         if item.op == "index":
@@ -248,7 +248,8 @@ def _key(array: np.ndarray) -> tuple:
     return array.dtype.str, array.size, np.ascontiguousarray(array).tobytes()
 
 
-def _literal(value: np.generic) -> str:
+def _literal(value: Any) -> str:
+    """Return a NumPy number in C++, all digits of it."""
     if value.dtype.kind == "b":
         return "true" if value else "false"
     if value.dtype.kind == "i":

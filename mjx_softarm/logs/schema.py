@@ -16,6 +16,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from mjx_softarm.logs import mcap_file
 from mjx_softarm.logs.checks import Finding, LogError
 from mjx_softarm.sensing.sensors import SENSORS, Coil, Sensor
 
@@ -136,7 +137,7 @@ def log_table(log: Log) -> tuple[tuple[Column, ...], np.ndarray]:
 
 
 def write_log(path: str | Path, log: Log) -> None:
-    """Write a log as CSV, or as npz where the name ends so; whole or not at all.
+    """Write a log as CSV, or as npz or MCAP where the name ends so; whole or not at all.
 
     Raises:
         OSError: the file cannot be written.
@@ -149,6 +150,8 @@ def write_log(path: str | Path, log: Log) -> None:
         with part.open("wb") as file:
             if path.suffix == ".npz":
                 np.savez(file, columns=np.array(headers), table=table)
+            elif path.suffix == mcap_file.SUFFIX:
+                mcap_file.write_mcap(file, columns, table)
             else:
                 np.savetxt(file, table, "%.9g", ",", header=",".join(headers), comments="")
         os.replace(part, path)

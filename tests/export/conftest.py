@@ -1,5 +1,6 @@
 """Policies with every part at work, their files and their golden rows."""
 
+import contextlib
 import dataclasses
 import hashlib
 import itertools
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 
 from mjx_softarm.deploy.controller import Controller
-from mjx_softarm.export.golden import make_golden
+from mjx_softarm.export import golden as golden_rows
 from mjx_softarm.policy.file import load_policy, save_policy
 from mjx_softarm.sensing.s2r import N_POSE_INPUTS, N_POSE_OUTPUTS, S2R
 from tests.linear_arm import SPEC, N, make_policy
@@ -38,6 +39,15 @@ def busy_policy(spec=SPEC):
     return dataclasses.replace(policy, layers=layers(18, 12, N, scale=0.5), estimator=estimator, s2r=s2r)
 
 
+@contextlib.contextmanager
+def few_golden_rows():
+    """Golden rows made in here are few."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(golden_rows, "N_SINGLE", 40)
+        patch.setattr(golden_rows, "_RUN_TICKS", 30)
+        yield
+
+
 @pytest.fixture(scope="session")
 def policy_file(tmp_path_factory):
     path = tmp_path_factory.mktemp("export") / "policy.npz"
@@ -53,4 +63,4 @@ def controller(policy_file):
 
 @pytest.fixture(scope="session")
 def golden(controller, policy_file):
-    return make_golden(controller, hashlib.sha256(policy_file.read_bytes()).hexdigest())
+    return golden_rows.make_golden(controller, hashlib.sha256(policy_file.read_bytes()).hexdigest())

@@ -15,7 +15,7 @@ from mjx_softarm.export.check import TOLERANCE, check
 from mjx_softarm.export.golden import N_SINGLE
 from mjx_softarm.export.write import export_onnx
 from mjx_softarm.policy.runtime import actor_output
-from tests.export.conftest import busy_policy
+from tests.export.conftest import busy_policy, few_golden_rows
 from tests.linear_arm import N
 
 onnx = pytest.importorskip("onnx", reason="the package onnx is not installed")
@@ -25,7 +25,8 @@ ort = pytest.importorskip("onnxruntime", reason="the package onnxruntime is not 
 
 @pytest.fixture(scope="module")
 def files(policy_file):
-    return export_onnx(policy_file)
+    with few_golden_rows():
+        return export_onnx(policy_file)
 
 
 def test_graph_agrees_on_golden_rows(files, golden):

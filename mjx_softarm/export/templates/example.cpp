@@ -22,13 +22,10 @@ static bool write_pressures(const double* pressure_kpa) {
 int main() {
   const double goal[6] = {@GOAL@};  // x, y, z [mm], yaw, pitch, roll [deg]
   softarm::Controller controller;
-  if (!controller.set_goal(goal)) {
-    std::puts("the goal is outside the workspace");
-    return 3;
-  }
-  const auto period = std::chrono::duration_cast<Clock::duration>(std::chrono::duration<double>(softarm::kPeriod));
-  softarm::Tick tick{};
+  if (!controller.set_goal(goal)) return 3;  // outside the workspace
+  const std::chrono::duration<double> period(softarm::kPeriod);
   bool late = false, taken = true;
+  softarm::Tick tick{};
   for (auto next = Clock::now() + period; !tick.vented; next += period) {
     double readings[kN];
     read_sensors(readings);
@@ -36,8 +33,7 @@ int main() {
     taken = write_pressures(tick.pressure_kpa);
     if (tick.faults) std::printf("faults: %#x%s\n", tick.faults, tick.stopped ? ", vents" : "");
     if (tick.arrived) controller.vent();  // or set_goal() to the next one
-    late = Clock::now() > next;
-    if (late) next = Clock::now();
+    if ((late = Clock::now() > next)) next = Clock::now();
     std::this_thread::sleep_until(next);
   }
 }

@@ -1,0 +1,30 @@
+"""`python -m train export RUN --onnx --cpp DIR`: which files it writes, and what it refuses."""
+
+import pytest
+
+from mjx_softarm.export.golden import read_golden
+from tests.export.conftest import few_golden_rows
+from train.runs import command
+from train.runs.checkpoint import RunError
+
+
+def test_files_of_an_export(policy_file, tmp_path, monkeypatch, capsys):
+    pytest.importorskip("onnx", reason="the package onnx is not installed")
+    policy = tmp_path / "policy.npz"
+    policy.write_bytes(policy_file.read_bytes())
+    monkeypatch.setattr(command, "export_run", lambda run, out: policy)
+    monkeypatch.setattr(command.Run, "open", lambda path: None)
+    with few_golden_rows():
+        assert command.export((tmp_path,), onnx=True, cpp=tmp_path / "cpp") == 0
+    beside = {path.name for path in tmp_path.iterdir()}
+    assert beside == {"policy.npz", "policy.onnx", "policy_actor.onnx", "policy_golden.csv", "cpp"}
+    names = {path.name for path in (tmp_path / "cpp").iterdir()}
+    assert names == {"softarm.hpp", "rows.cpp", "example.cpp", "CMakeLists.txt", "golden.csv"}
+    assert names | beside - {"cpp"} <= {line.split("/")[-1] for line in capsys.readouterr().out.splitlines()}
+    golden = read_golden(tmp_path / "cpp" / "golden.csv")
+    assert golden.about["policy_sha256"] in (tmp_path / "cpp" / "softarm.hpp").read_text()
+
+
+def test_one_folder_holds_one_policy(tmp_path):
+    with pytest.raises(RunError, match="RUN: got 2, expected one folder of a run"):
+        command.export((tmp_path, tmp_path), cpp=tmp_path / "cpp")

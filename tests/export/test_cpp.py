@@ -1,0 +1,159 @@
+"""The C++ header: compiled with warnings as errors and sanitizers, checked on golden rows."""
+
+import dataclasses
+import os
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+
+from mjx_softarm import ArmSpec
+from mjx_softarm._support.errors import InputError
+from mjx_softarm.deploy.controller import Controller
+from mjx_softarm.export import golden as golden_rows
+from mjx_softarm.export.check import TOLERANCE, check
+from mjx_softarm.export.cpp import sources
+from tests.export.conftest import busy_policy, few_golden_rows
+
+pytestmark = pytest.mark.skipif(not shutil.which("g++"), reason="there is no compiler g++ here")
+STRICT = ("-std=c++17", "-Wall", "-Wextra", "-Werror")
+SANITIZED = ("-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+MATH = {"sin", "cos", "tan", "tanh", "atan2", "acos", "floor", "sqrt"}
+
+
+def compile_(*arguments):
+    done = subprocess.run(["g++", *STRICT, *map(str, arguments)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[:3000]
+
+
+@pytest.fixture(scope="module")
+def folder(controller, golden, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("cpp")
+    for name, text in sources(controller, golden.about["policy_sha256"]).items():
+        (folder / name).write_text(text)
+    compile_(*SANITIZED, folder / "rows.cpp", "-o", folder / "rows")
+    return folder
+
+
+def test_rows_agree_under_sanitizers(folder, golden):
+    agreement = check(golden, folder / "rows")
+    assert agreement.n_rows == len(golden.inputs) and agreement.error < TOLERANCE, agreement
+
+
+def test_draw_wires_without_a_sim_to_real_network(tmp_path):
+    spec = ArmSpec.default().to_dict()
+    spec["sensor"] = {"kind": "draw_wire", "m_per_v": 0.1, "voltage_min_v": 0.0, "voltage_max_v": 5.0}
+    spec["sensor"] |= {"beta": 1.0, "delta_m": 0.01}
+    controller = Controller.of(dataclasses.replace(busy_policy(ArmSpec.from_dict(spec, "test")), s2r=None))
+    for name, text in sources(controller, "ab").items():
+        (tmp_path / name).write_text(text)
+    compile_("-O1", tmp_path / "rows.cpp", "-o", tmp_path / "rows")
+    with few_golden_rows():
+        agreement = check(golden_rows.make_golden(controller, "ab"), tmp_path / "rows")
+    assert agreement.n_rows > 100 and agreement.error < TOLERANCE, agreement
+
+
+def test_a_tick_neither_allocates_nor_throws(folder):
+    """All that its machine code calls are functions of <cmath> and of memory blocks."""
+    (folder / "tick.cpp").write_text(
+        '#include "softarm.hpp"\n'
+        "bool run(softarm::Controller& c, const double* goal, const double* readings, float* pose) {\n"
+        "  return c.set_goal(goal) && c.tip(pose) && c.tick(readings).vented;\n}\n"
+    )
+    compile_("-O2", "-fno-exceptions", "-fno-rtti", "-c", folder / "tick.cpp", "-o", folder / "tick.o")
+    listed = subprocess.run(["nm", "-u", folder / "tick.o"], capture_output=True, text=True, check=True)
+    called = {line.split()[-1] for line in listed.stdout.splitlines()}
+    assert "tanhf" in called and "acos" in called
+    allowed = MATH | {f"{name}f" for name in MATH} | {"sincos", "sincosf", "memcpy", "memmove", "memset"}
+    assert called <= allowed | {"__stack_chk_fail", "_GLOBAL_OFFSET_TABLE_"}
+
+
+def test_example_vents_an_arm_that_gives_no_readings(folder):
+    text = (folder / "example.cpp").read_text()
+    assert text.count("\n") <= 40 and "@" not in text + (folder / "softarm.hpp").read_text()
+    compile_(folder / "example.cpp", "-o", folder / "example")
+    done = subprocess.run([folder / "example"], capture_output=True, text=True, timeout=30)
+    assert done.returncode == 0 and done.stderr == ""
+    assert done.stdout.splitlines()[-2:] == ["0.0 " * 8 + "0.0", "faults: 0x3, vents"]
+
+
+@pytest.mark.skipif(not shutil.which("cmake"), reason="there is no cmake here")
+def test_cmake_builds_both_programs(folder, tmp_path):
+    for step in (["-S", folder, "-B", tmp_path, "-DCMAKE_BUILD_TYPE=Debug"], ["--build", tmp_path]):
+        done = subprocess.run(["cmake", *step], capture_output=True, text=True)
+        assert done.returncode == 0, done.stdout + done.stderr
+    assert os.access(tmp_path / "rows", os.X_OK) and os.access(tmp_path / "example", os.X_OK)
+
+
+def test_other_programs_and_rows_are_refused(folder, golden, tmp_path):
+    other = golden._replace(about=golden.about | {"policy_sha256": "0" * 64})
+    with pytest.raises(InputError, match="rows: got policy [0-9a-f]{12}, expected 000000000000"):
+        check(other, folder / "rows")
+    short = subprocess.run([folder / "rows"], input="1 1 0 1 0.2", capture_output=True, text=True)
+    assert (short.returncode, short.stderr) == (2, "row 1: got 5 numbers, expected 19\n")
+    program = tmp_path / "program"
+    sha256 = golden.about["policy_sha256"]
+    for script, message in (
+        ("echo hello", "expected a program that answers rows of version 1"),
+        (f"echo mjx_softarm 2 {sha256}", "expected a program that answers rows of version 1"),
+        (f"echo mjx_softarm 1 {sha256}; echo 1 2", r"got 1 lines, expected \d+ lines of 35 numbers"),
+    ):
+        program.write_text(f"#!/bin/sh\ncat > /dev/null\n{script}\n")
+        program.chmod(0o755)
+        with pytest.raises(InputError, match=message):
+            check(golden, program)
+    with pytest.raises(InputError, match="cannot be run"):
+        check(golden, tmp_path / "none")
+
+
+def test_truncated_header_does_not_compile(folder, tmp_path):
+    text = (folder / "softarm.hpp").read_text()
+    (tmp_path / "softarm.hpp").write_text(text[: len(text) * 2 // 3])
+    shutil.copy(folder / "rows.cpp", tmp_path)
+    with pytest.raises(AssertionError, match="error: "):
+        compile_("-fsyntax-only", tmp_path / "rows.cpp")
+
+
+TIMED = """
+#include <algorithm>
+#include <chrono>
+#include <cstdio>
+#include "softarm.hpp"
+int main() {
+  using Clock = std::chrono::steady_clock;
+  const double goal[6] = {GOAL}, readings[softarm::kN] = {READINGS};
+  double best_us = 1e9;
+  for (int k = 0; k < 300; ++k) {
+    softarm::Controller controller;
+    if (!controller.set_goal(goal)) return 1;
+    const auto begin = Clock::now();
+    const softarm::Tick tick = controller.tick(readings);
+    best_us = std::min(best_us, std::chrono::duration<double, std::micro>(Clock::now() - begin).count());
+    double reference[softarm::kN];
+    if (tick.stopped || !controller.references(reference)) return 2;
+  }
+  std::printf("%g", best_us);
+}
+"""
+
+
+def test_an_acting_tick_takes_less_than_50_us(tmp_path, controller, golden):
+    """With an actor of two layers of 256, the paper's; the best of many, since others use the machine."""
+    rng = np.random.default_rng(0)
+    sizes = [(18, 256), (256, 256), (256, 9)]
+    layers = tuple(
+        (np.float32(0.05 * rng.normal(size=size)), np.zeros(size[1], np.float32)) for size in sizes
+    )
+    policy = dataclasses.replace(controller.policy, layers=layers)
+    for name, text in sources(Controller.of(policy), "ab").items():
+        (tmp_path / name).write_text(text)
+    row = golden.inputs[np.flatnonzero(np.isfinite(golden.outputs).all(axis=1))[0], 4:]
+    numbers = {"GOAL": row[-6:], "READINGS": row[:-6]}
+    text = TIMED
+    for name, values in numbers.items():
+        text = text.replace(f"{{{name}}}", f"{{{', '.join(map(repr, values.tolist()))}}}")
+    (tmp_path / "timed.cpp").write_text(text)
+    compile_("-O2", tmp_path / "timed.cpp", "-o", tmp_path / "timed")
+    done = subprocess.run([tmp_path / "timed"], capture_output=True, text=True)
+    assert done.returncode == 0 and float(done.stdout) < 50.0, done.stdout
