@@ -1,6 +1,6 @@
 """Logs in Foxglove's format MCAP: one topic for each part of a log, its messages JSON with a schema.
 
-The topic `/pressure_kpa` has a message `{"pressure0": -12.5, ...}` for each row, in the units of the CSV file;
+The topic `/pressure_kpa` has a message `{"pressure0": -12.5, ...}` for each row, in units as in the CSV file;
 the schema names them. A missing value is null. Times count from the log's first row.
 """
 
