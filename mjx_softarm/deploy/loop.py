@@ -23,7 +23,7 @@ from mjx_softarm.control import pressures, saturated
 from mjx_softarm.deploy import faults
 from mjx_softarm.deploy.controller import Controller, State, Tick
 from mjx_softarm.deploy.faults import Event, Fault, Response
-from mjx_softarm.deploy.link import VENT_KPA_PER_S
+from mjx_softarm.deploy.link import vented
 from mjx_softarm.deploy.reachability import nearest
 from mjx_softarm.policy.reach import nearest_poses
 from mjx_softarm.policy.runtime import tip_pose
@@ -121,8 +121,7 @@ def believed(controller: Controller, spring_m: np.ndarray) -> tuple[np.ndarray, 
 def _with_pressures(controller: Controller, state: State) -> State:
     """Return the state with the next pressures: the law's; nearer to zero where there are no references."""
     if state.reference_m is None:
-        step_kpa = VENT_KPA_PER_S * controller.dt_s
-        lower_kpa = state.pressure_kpa - np.clip(state.pressure_kpa, -step_kpa, step_kpa)
+        lower_kpa = vented(state.pressure_kpa, controller.dt_s)
         return state._replace(pressure_kpa=lower_kpa, integral_kpa=lower_kpa)
     pressure_kpa, integral_kpa = pressures(
         state.reference_m, state.spring_m, state.integral_kpa, controller.policy.gains, controller.dt_s

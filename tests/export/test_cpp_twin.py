@@ -11,7 +11,7 @@ from mjx_softarm.deploy.arms import open_arm
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.session import follow
 from mjx_softarm.export.cpp import sources
-from mjx_softarm.mechanics.workspace import circle_poses
+from mjx_softarm.mechanics.excitation import circle_poses
 from tests.export.conftest import busy_policy
 from tests.linear_arm import N
 
