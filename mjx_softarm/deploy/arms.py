@@ -5,7 +5,10 @@ from __future__ import annotations
 import importlib
 import os
 import sys
+import time
 from typing import Any
+
+import numpy as np
 
 from mjx_softarm._support.errors import InputError
 
@@ -55,3 +58,20 @@ def open_arm(name: str) -> Any:
         return kind()
     except (ImportError, OSError, TypeError, ValueError) as error:
         raise ArmError(f"--arm: {name} cannot be opened: {type(error).__name__}: {error}") from error
+
+
+class Paced:
+    """A simulated arm that is no faster than a real one."""
+
+    def __init__(self, arm: Any):
+        self._arm, self._began_s = arm, time.monotonic() - arm.time_s
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._arm, name)
+
+    def write_pressures(self, pressure_kpa: np.ndarray) -> None:
+        """Let a control period pass, then wait until it has; time lost before is not made up for."""
+        self._arm.write_pressures(pressure_kpa)
+        left_s = self._began_s + self._arm.time_s - time.monotonic()
+        self._began_s -= min(left_s, 0.0)
+        time.sleep(max(left_s, 0.0))

@@ -6,10 +6,15 @@ and two fingers, all boxes.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
+from mjx_softarm.sensing.estimator import Frame, backbone
+from mjx_softarm.sensing.pose import pose_from_frame, quaternion_from_pose
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
 
+FOLDS, COILS = 12, 20  # of a bellows, and of a spring
 SPRING_WIDTH_M = 0.002  # radius of a spring, outside the circle that the springs stand on
 
 
@@ -44,3 +49,58 @@ def gripper_boxes(spec: ArmSpec) -> dict[str, tuple[np.ndarray, np.ndarray]]:
 def payload_radius_m(payload_kg: float) -> float:
     """Return the radius of the ball drawn for a payload; the ball collides with nothing."""
     return 0.03 * payload_kg ** (1 / 3) + 0.01
+
+
+class Copies(NamedTuple):
+    """Places of the copies of one mesh."""
+
+    position_m: np.ndarray  # (k, 3)
+    quaternion: np.ndarray  # (k, 4) w, x, y, z
+    pitch_m: np.ndarray  # (k,) length along its own z, in which a mesh that is to be stretched has 1
+
+    @property
+    def scales(self) -> np.ndarray:
+        """(k, 3) along the mesh's axes."""
+        return np.stack([np.ones_like(self.pitch_m)] * 2 + [self.pitch_m], axis=-1)
+
+
+class Shape(NamedTuple):
+    """Places of all parts. Bellows and springs are numbered as in the model, each from its upper end."""
+
+    rings: Copies  # links_per_section to a section, below the base's own
+    folds: Copies  # FOLDS to a bellows
+    coils: Copies  # COILS to a spring
+
+
+def shape(spec: ArmSpec, spring_m: np.ndarray, tip: np.ndarray) -> Shape:
+    """Return the shape of an arm with springs (n,) [m] and its tip at a pose (6,) [mm, deg]."""
+    geometry, directions = spec.geometry, hole_directions(spec)
+    n_rings = spec.structure.links_per_section
+    steps = [(np.arange(n) + 0.5) / n for n in (FOLDS, COILS)]
+    at = np.concatenate([(np.arange(n_rings) + 1.0) / n_rings, *steps])
+    sections = backbone(geometry.spring_radius_m * directions, spring_m, tip, at)
+    rings, folds, coils = (
+        Frame(*(part[:, rows] for part in sections))
+        for rows in np.split(np.arange(len(at)), [n_rings, n_rings + FOLDS])
+    )
+    centres = rings.position_m.reshape(-1, 3)
+    return Shape(
+        Copies(centres, _quaternions(rings.rotation.reshape(-1, 3, 3)), np.ones(len(centres))),
+        _beside(folds, geometry.chamber_radius_m * directions),
+        _beside(coils, geometry.spring_radius_m * directions),
+    )
+
+
+def _beside(line: Frame, hole_m: np.ndarray) -> Copies:
+    """Return copies beside each section's axis (n_sections, k), through its holes (n, 2)."""
+    hole = hole_m.reshape(-1, N_CHAMBERS_PER_SECTION, 2)
+    aside = np.einsum("skij,shj->shki", line.rotation[..., :2], hole)
+    position_m = line.position_m[:, None] + aside  # (n_sections, 3, k, 3)
+    pitch_m = np.linalg.norm(np.diff(position_m, axis=2), axis=-1).mean(axis=-1)
+    n_copies = position_m.shape[2]
+    quaternion = np.repeat(_quaternions(line.rotation)[:, None], N_CHAMBERS_PER_SECTION, axis=1)
+    return Copies(position_m.reshape(-1, 3), quaternion.reshape(-1, 4), np.repeat(pitch_m.ravel(), n_copies))
+
+
+def _quaternions(rotation: np.ndarray) -> np.ndarray:
+    return quaternion_from_pose(pose_from_frame(np.zeros(rotation.shape[:-1]), rotation))

@@ -14,10 +14,17 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
 from mjx_softarm._support.archive import Entries
 from mjx_softarm._support.mlp import Layer, mlp
 from mjx_softarm._support.xp import Array, array_namespace
-from mjx_softarm.sensing.pose import pose_from_frame, rotation_from_quaternion
+from mjx_softarm.sensing.pose import (
+    frame_from_pose,
+    pose_from_frame,
+    rotation_from_quaternion,
+    share_of_turn,
+)
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION
 
 N_CHANGES = 6  # of a section's end: position [m], Gibbs vector (axis times the tangent of half the angle)
@@ -117,6 +124,39 @@ def chain(sections: Frame) -> Frame:
         position_m = sections.position_m[..., section, :, None] + above @ position_m
         rotation = above @ rotation
     return Frame(position_m[..., 0], rotation)
+
+
+def backbone(spring_site_m: np.ndarray, spring_m: np.ndarray, tip: np.ndarray, at: np.ndarray) -> Frame:
+    """Return frames along the arm, which ends at the tip's pose. NumPy only.
+
+    Sections of constant curvature, as the springs tell, are in series. How far the tip is off their end is
+    spread over the arm, growing evenly from the base.
+
+    Args:
+        spring_site_m (n, 2) [m]: holes of the springs.
+        spring_m (n,) [m]: lengths.
+        tip (6,) [mm, deg]: pose; NaN leaves the end where the springs bring it.
+        at (k,): shares of each section's length, 1 among them.
+
+    Returns:
+        Positions (n_sections, k, 3) and rotations (n_sections, k, 3, 3) in the base frame.
+    """
+    # Length and bend of a part of a section are the same part of its springs' lengths.
+    inner = constant_curvature(spring_site_m, at[:, None] * spring_m)  # (k, n_sections)
+    end = int(np.argmax(at))
+    frames, above_m, above = [], np.zeros(3), np.eye(3)
+    for section in range(inner.position_m.shape[1]):
+        position_m = above_m + inner.position_m[:, section] @ above.T
+        rotation = above @ inner.rotation[:, section]
+        frames.append((position_m, rotation))
+        above_m, above = position_m[end], rotation[end]
+    position_m, rotation = (np.stack(part) for part in zip(*frames, strict=True))  # (n_sections, k)
+    if not np.isfinite(tip).all():
+        return Frame(position_m, rotation)
+    tip_m, tip_rotation = frame_from_pose(np.asarray(tip, float))
+    share = (np.arange(len(frames))[:, None] + at) / len(frames)  # of the way to the tip
+    turn = share_of_turn(tip_rotation @ above.T, share)
+    return Frame(position_m + share[..., None] * (tip_m - above_m), turn @ rotation)
 
 
 def expected_springs(model: SpringModel, pressure_kpa: Array) -> Array:

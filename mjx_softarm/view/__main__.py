@@ -18,6 +18,7 @@ from mjx_softarm.deploy.__main__ import Arm, check_file
 from mjx_softarm.deploy.arms import open_arm
 from mjx_softarm.deploy.ending import save_log
 from mjx_softarm.policy.file import load_policy
+from mjx_softarm.spec import ArmSpec
 
 PROGRAM, HERE = "python -m mjx_softarm.view", "127.0.0.1"
 
@@ -61,18 +62,14 @@ def _view(
     if policy is None:
         made = "`make demo` trains one, `python -m train export RUN` writes its file"
         raise InputError(f"--policy: got nothing, expected a policy; {made}")
-    return _live(load_policy(policy), arm, log, host, port)
-
-
-def _live(policy, arm: str, log: Path | None, host: str, port: int) -> int:
     from mjx_softarm.view.live import Setup, live
 
-    io, save = open_arm(arm), partial(save_log, log) if log else None
-    setup = Setup(policy, arm, host, port, hasattr(io, "attach"))
-    return live(setup, io, _tell, partial(_welcome, host), save).status
+    read, io = load_policy(policy), open_arm(arm)
+    setup = Setup(read, arm, host, port, hasattr(io, "attach"))
+    return live(setup, io, _tell, partial(_welcome, host), partial(save_log, log) if log else None).status
 
 
-def _replay(logs: tuple[Path, ...], spec, html: Path | None, host: str, port: int) -> int:
+def _replay(logs: tuple[Path, ...], spec: ArmSpec, html: Path | None, host: str, port: int) -> int:
     from mjx_softarm.view.replay import Track, replay, share
     from mjx_softarm.view.stage import open_server
 
@@ -83,8 +80,7 @@ def _replay(logs: tuple[Path, ...], spec, html: Path | None, host: str, port: in
         return 0
     server = open_server(host, port, ", ".join(track.name for track in tracks))
     _tell(f"open http://{host}:{server.get_port()}; Ctrl-C ends")
-    replay(server, spec, tracks)
-    return 0
+    return replay(server, spec, tracks)
 
 
 def _welcome(host: str, url: str) -> None:

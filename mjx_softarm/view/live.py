@@ -15,7 +15,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from mjx_softarm._support.channel import End
 from mjx_softarm._support.errors import InputError
+from mjx_softarm.deploy.arms import Paced
 from mjx_softarm.deploy.controller import Controller, State, Tick
 from mjx_softarm.deploy.ending import FAULT
 from mjx_softarm.deploy.reachability import clamped
@@ -23,7 +25,6 @@ from mjx_softarm.deploy.session import Orders, Run, steer
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.policy.file import Policy
-from mjx_softarm.view.channel import End
 from mjx_softarm.view.look import look_at
 
 READY_S = 60.0  # for the server to start
@@ -39,23 +40,6 @@ class Setup(NamedTuple):
     host: str
     port: int
     carries: bool = False  # a payload can be attached to the arm
-
-
-class Paced:
-    """A simulated arm that is no faster than a real one."""
-
-    def __init__(self, arm: Any):
-        self._arm, self._began_s = arm, time.monotonic() - arm.time_s
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._arm, name)
-
-    def write_pressures(self, pressure_kpa: np.ndarray) -> None:
-        """Let a control period pass, then wait until it has; time lost before is not made up for."""
-        self._arm.write_pressures(pressure_kpa)
-        left_s = self._began_s + self._arm.time_s - time.monotonic()
-        self._began_s -= min(left_s, 0.0)
-        time.sleep(max(left_s, 0.0))
 
 
 class PagePilot:
@@ -118,7 +102,7 @@ class PagePilot:
 def _doing(state: State, n_actions: int) -> str:
     """Return what the arm does, as the predicate of a sentence."""
     if state.goal is not None:
-        return f"moves to its goal, action {max(state.n_actions, 1)} of {n_actions}"
+        return f"moves (action {max(state.n_actions, 1)} of {n_actions})"
     if state.reference_m is None:
         return "is being vented" if state.pressure_kpa.any() else "has no pressure"
     return "holds"

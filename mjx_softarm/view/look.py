@@ -87,15 +87,7 @@ def looks(log: Log, sensor: Sensor) -> Callable[[int], Look]:
     if spring_m is None:
         problem = f"got neither {sensor.reading_name}0.. nor spring0.., expected springs to draw the arm by"
         raise LogError([Finding(log.source, None, "", problem)])
-    spring_m = _held(spring_m)
     groups = ("time_s", "pressure_kpa", "tip_m", "tip_quaternion", "marker_m")
     names = (*groups, "payload_kg", "reference_m", "goal", "estimate")
     present = {name: value for name in names if (value := getattr(log, name)) is not None}
     return lambda k: look_at({name: value[k] for name, value in present.items()}, spring_m[k])
-
-
-def _held(spring_m: np.ndarray) -> np.ndarray:
-    """Return lengths (rows, n) with each lost one replaced by the last before it, or the first after."""
-    known = np.isfinite(spring_m)
-    row = np.maximum.accumulate(np.where(known, np.arange(len(spring_m))[:, None], -1), axis=0)
-    return np.take_along_axis(spring_m, np.where(row < 0, known.argmax(axis=0), row), axis=0)

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import viser
 
+from mjx_softarm._support.channel import End
 from mjx_softarm.sensing.pose import pose_from_quaternion, quaternion_from_pose
-from mjx_softarm.view.channel import End
 from mjx_softarm.view.live import Setup
 from mjx_softarm.view.look import Limits, Look
 from mjx_softarm.view.panel import Panel, css
@@ -58,7 +58,7 @@ class Page:
         spec = setup.policy.spec
         set_the_scene(server, spec)
         self._stage = Stage(server.scene, spec)
-        self._workspace = add_workspace(server.scene, setup.policy.workspace)
+        workspace = add_workspace(server.scene, setup.policy.workspace)
         look = {"scale": 0.15, "depth_test": False, "visible": False}
         self._gizmo = server.scene.add_transform_controls("/gizmo", **look)
         self._button("Stop", "hold", _STOP, "orange", viser.Icon.HAND_STOP)
@@ -69,7 +69,8 @@ class Page:
             self._button("Drag the goal", "follow", _GIZMO, None, viser.Icon.ARROWS_MOVE)
             if setup.carries:
                 self._add_payload()
-            self._add_workspace_box()
+            box = server.gui.add_checkbox("reachable poses", False, hint="Where goals are kept")
+        box.on_update(lambda _: setattr(workspace, "visible", box.value))
         self._listen()
 
     def _button(self, label: str, name: str, hint: str, colour: Any, icon: Any) -> None:
@@ -86,13 +87,6 @@ class Page:
         @slider.on_update
         async def _(_: Any) -> None:
             self._end.put(payload_kg=1e-3 * slider.value)
-
-    def _add_workspace_box(self) -> None:
-        box = self._server.gui.add_checkbox("reachable poses", False, hint="Where goals are kept")
-
-        @box.on_update
-        async def _(_: Any) -> None:
-            self._workspace.visible = box.value
 
     def _listen(self) -> None:
         @self._gizmo.on_update

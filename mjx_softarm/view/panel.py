@@ -28,7 +28,7 @@ class Panel:
             self._bars = gui.add_html("")
         with gui.add_folder("Traces"):
             lines = ("believed", css(GOAL)), ("seen", css(SEEN))
-            self._errors = _plot(gui, "tip error [mm]: believed green, seen violet", lines)
+            self._errors = _plot(gui, "tip error [mm], violet: seen", lines)
             colours = [(f"chamber {k}", css(section_colour(k))) for k in range(n)]
             self._pressures = _plot(gui, "pressures [kPa]", colours)
         self._trace: deque[tuple] = deque(maxlen=TRACE_POINTS)

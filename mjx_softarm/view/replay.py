@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 import viser
@@ -85,7 +86,7 @@ class Replay:
                         panel.show_text(f"{look.time_s:.2f} s of {track.end_s:.1f} s", _BLUE, look)
 
 
-def replay(server: viser.ViserServer, spec: ArmSpec, tracks: Sequence[Track]) -> None:
+def replay(server: viser.ViserServer, spec: ArmSpec, tracks: Sequence[Track]) -> NoReturn:
     """Serve logs until Ctrl-C."""
     page, before_s = Replay(server, spec, tracks), time.monotonic()
     while True:

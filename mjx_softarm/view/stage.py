@@ -12,12 +12,19 @@ from typing import Any
 import numpy as np
 import viser
 
-from mjx_softarm.mechanics.body import SPRING_WIDTH_M, payload_radius_m, ring_radius_m
+from mjx_softarm.mechanics.body import (
+    COILS,
+    FOLDS,
+    SPRING_WIDTH_M,
+    Copies,
+    payload_radius_m,
+    ring_radius_m,
+    shape,
+)
 from mjx_softarm.sensing.pose import quaternion_from_pose
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
 from mjx_softarm.view import meshes
 from mjx_softarm.view.look import Limits, Look
-from mjx_softarm.view.shape import COILS, FOLDS, Copies, shape
 
 SECTION_COLOURS = ((214, 90, 66), (235, 172, 70), (70, 140, 200))  # as in MuJoCo's pictures
 SATURATED, GOAL, SEEN = (226, 38, 77), (40, 160, 96), (124, 77, 210)
@@ -57,7 +64,8 @@ class Stage:
             looks = {"point_size": size_m, "point_shape": "circle", "visible": False}
             return scene.add_point_cloud(f"{name}/{path}", np.zeros((1, 3)), colour, **looks)
 
-        rest = shape(spec, self._rest_m(), np.full(6, np.nan))
+        self._spring_m = np.full(spec.n_chambers, spec.geometry.section_length_m)  # as drawn last
+        rest = shape(spec, self._spring_m, np.full(6, np.nan))
         turn = meshes.coil(1.6 * SPRING_WIDTH_M, _WIRE_M, spec.geometry.section_length_m / COILS)
         solid("mount", meshes.disc(*_MOUNT_M), _MOUNT, position=(0.0, 0.0, _MOUNT_M[1] / 2))
         self._rings = copies("rings", meshes.disc(ring_radius_m(spec), _RING_M), rest.rings, _RING)
@@ -76,8 +84,8 @@ class Stage:
 
     def show(self, look: Look) -> None:
         """Draw a moment."""
-        spring_m = np.where(np.isnan(look.spring_m), self._rest_m(), look.spring_m)
-        now = shape(self._spec, spring_m, look.tip)
+        self._spring_m = np.where(np.isnan(look.spring_m), self._spring_m, look.spring_m)
+        now = shape(self._spec, self._spring_m, look.tip)
         for handle, copies in ((self._rings, now.rings), (self._folds, now.folds), (self._coils, now.coils)):
             handle.batched_positions, handle.batched_wxyzs = copies.position_m, copies.quaternion
             handle.batched_scales = copies.scales
@@ -97,9 +105,6 @@ class Stage:
         if not self._trail or np.linalg.norm(tip_m - self._trail[-1]) > _TRAIL_STEP_M:
             self._trail.append(tip_m)
             self._path.points, self._path.visible = np.array(self._trail), True
-
-    def _rest_m(self) -> np.ndarray:
-        return np.full(self._spec.n_chambers, self._spec.geometry.section_length_m)
 
     def _mark(self, saturated: np.ndarray) -> None:
         """Colour the bellows; only when that changes is it sent."""
@@ -138,8 +143,9 @@ def set_the_scene(server: viser.ViserServer, spec: ArmSpec, width_m: float = 0.0
     length_m = spec.structure.n_sections * spec.geometry.section_length_m + spec.mass.gripper_length_m
     server.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(36, 99, 168))
     server.scene.set_up_direction("+z")
-    server.scene.configure_default_lights(False)
-    server.scene.configure_environment_map("studio", environment_intensity=0.9)
+    server.scene.configure_default_lights(cast_shadow=False)
+    server.scene.configure_environment_map(None)  # it would bleach the colours
+    server.scene.add_light_ambient("/light", intensity=1.2)
     middle, floor = (0.0, width_m / 2, -0.55 * length_m), (0.0, width_m / 2, -1.3 * length_m)
     lines = {"cell_size": 0.1, "cell_color": (228, 231, 236), "section_color": (205, 210, 217)}
     server.scene.add_grid("/floor", 1.6, 1.6 + width_m, position=floor, section_size=0.4, **lines)

@@ -3,15 +3,16 @@
 import json
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from calib.read.logs import read_log
-from mjx_softarm.deploy.arms import ArmError, open_arm
+from mjx_softarm.deploy.arms import ArmError, Paced, open_arm
 from mjx_softarm.policy.file import save_policy
-from tests.linear_arm import FAR, POLICY, REST_M, SENSOR, N
+from tests.linear_arm import DT_S, FAR, POLICY, REST_M, SENSOR, LinearArm, N
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -33,6 +34,14 @@ ROOT = Path(__file__).resolve().parents[2]
 def test_arm_that_cannot_be_had(name, message):
     with pytest.raises(ArmError, match=message):
         open_arm(name)
+
+
+def test_paced_arm_keeps_real_time():
+    arm = Paced(LinearArm())
+    began_s = time.monotonic()
+    for _ in range(20):
+        arm.write_pressures(np.zeros(N))
+    assert time.monotonic() - began_s >= 20 * DT_S - 0.005 and arm.tick == 20
 
 
 DRIVER = """

@@ -14,6 +14,7 @@ from mjx_softarm.sensing.pose import (
     pose_from_frame,
     pose_from_quaternion,
     quaternion_from_pose,
+    share_of_turn,
 )
 from tests.properties import few
 
@@ -144,3 +145,11 @@ def test_pose_error_is_wrapped_and_does_not_depend_on_whole_turns(pose, goal, tu
     difference = (turned - error + [0, 0, 0, 180, 180, 180]) % 360.0 - [0, 0, 0, 180, 180, 180]
     np.testing.assert_allclose(difference[3:], 0.0, atol=1e-9)
     np.testing.assert_allclose(turned[:3], pose[:3] - goal[:3])
+
+
+@pytest.mark.parametrize("angle_deg", [0.0, 1e-6, 40.0, 179.0, -100.0])
+def test_share_of_a_turn_is_about_its_axis(angle_deg):
+    axis = np.array([0.36, -0.48, 0.8])
+    turn, third = (Rotation.from_rotvec(np.radians(part * angle_deg) * axis) for part in (1.0, 1 / 3))
+    shares = share_of_turn(turn.as_matrix(), np.array([0.0, 1 / 3, 1.0]))
+    np.testing.assert_allclose(shares, [np.eye(3), third.as_matrix(), turn.as_matrix()], atol=1e-9)

@@ -59,7 +59,7 @@ def test_goal_is_dragged_and_the_arm_stopped_and_vented(browser, live):
     process, address, path = live
     page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
     page.goto(address)
-    says(page, "The arm moves to its goal")  # a simulated arm begins by itself
+    says(page, "The arm moves")  # a simulated arm begins by itself
     press(page, "Stop")
     says(page, "The arm holds")
     press(page, "Drag the goal")

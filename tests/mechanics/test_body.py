@@ -1,15 +1,12 @@
-"""The drawn shape against closed forms and a twin, and the bars against what they show."""
+"""The drawn shape against closed forms and a twin."""
 
 import numpy as np
-import pytest
 
 from mjx_softarm import ArmSpec
-from mjx_softarm.logs.checks import LogError
-from mjx_softarm.logs.schema import Log
+from mjx_softarm.mechanics.body import COILS, FOLDS, shape
 from mjx_softarm.sensing.pose import frame_from_pose, pose_from_quaternion
-from mjx_softarm.view.look import Limits, look_at, looks
-from mjx_softarm.view.shape import COILS, FOLDS, shape
-from tests.linear_arm import HIGH_KPA, REST_M, SENSOR, SPEC, N
+from mjx_softarm.twin.arm import Twin
+from tests.linear_arm import REST_M, SPEC, N
 
 UNKNOWN = np.full(6, np.nan)
 
@@ -49,8 +46,6 @@ def test_arm_ends_at_the_tip_s_pose():
 
 
 def test_shape_is_near_a_twin_s_markers():
-    from mjx_softarm.twin.arm import Twin
-
     twin = Twin(7)
     for _ in range(250):
         twin.write_pressures(np.random.default_rng(1).uniform(-35, 18, N))
@@ -59,32 +54,3 @@ def test_shape_is_near_a_twin_s_markers():
     ends_m = rings.position_m.reshape(3, -1, 3)[:2, -1]
     off_m = np.linalg.norm(ends_m - seen.marker_m[[2, 5]], axis=1)
     assert off_m.max() < 0.02 and np.linalg.norm(np.diff(ends_m, axis=0)) > 0.1
-
-
-def test_saturated_chambers_are_found_and_marked():
-    panel = pytest.importorskip("mjx_softarm.view.panel", reason="needs viser", exc_type=ImportError)
-    kpa, reference_m = np.zeros(N), np.full(N, REST_M)
-    kpa[[2, 7]] = HIGH_KPA - 0.1  # as measured
-    reference_m[2] += 0.01  # chamber 7 is on its reference
-    row = {"time_s": 0.0, "pressure_kpa": kpa, "reference_m": reference_m}
-    look, limits = look_at(row, np.full(N, REST_M)), Limits.of(SPEC)
-    assert np.flatnonzero(limits.saturated(look)).tolist() == [2]
-    drawn = panel.bars(look, limits)
-    assert "saturated: chamber 2<" in drawn and drawn.count(panel.css((226, 38, 77))) == 3
-    assert "-10.0</text>" in drawn
-    nothing = look_at({"time_s": 0.0}, np.full(N, np.nan))
-    assert "nan" not in panel.bars(nothing, limits)
-
-
-def test_looks_of_a_log():
-    spring_m = np.linspace(0.18, 0.22, 4)[:, None] * np.ones(N)
-    readings = SENSOR.readings(spring_m)
-    readings[1, 3] = readings[0, 0] = np.nan
-    log = Log("x.csv", np.arange(2, 6), np.arange(4.0), readings=readings, goal=np.zeros((4, 6)))
-    at = looks(log, SENSOR)
-    assert at(1).spring_m[3] == pytest.approx(0.18) and at(0).spring_m[0] == pytest.approx(spring_m[1, 0])
-    assert at(2).time_s == 2.0 and np.isnan(at(2).estimate).all() and not at(2).goal.any()
-    with pytest.raises(
-        LogError, match=r"x\.csv: got neither frequency0\.\. nor spring0\.\., expected springs"
-    ):
-        looks(Log("x.csv", np.arange(2, 6), np.arange(4.0)), SENSOR)

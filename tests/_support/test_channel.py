@@ -1,0 +1,62 @@
+"""A channel of which neither end waits for the other."""
+
+import time
+from multiprocessing import Pipe
+
+import numpy as np
+import pytest
+
+from mjx_softarm._support.channel import End
+
+
+def wait_for(condition, seconds=10.0):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+def taken(end, name):
+    """All values that come until one of this name does."""
+    found = {}
+    wait_for(lambda: found.update(end.take()) or name in found)
+    return found
+
+
+@pytest.fixture
+def ends():
+    ours, theirs = Pipe()
+    return End(ours), theirs
+
+
+def test_channel_keeps_the_newest_of_each_name(ends):
+    end, other = ends
+    other.send({"goal": 1})
+    other.send({"vent": True, "goal": 2})
+    other.send({"goal": 3, "last": True})
+    assert taken(end, "last") == {"vent": True, "goal": 3, "last": True} and end.take() == {}
+    end.put(look=1, doing="x")
+    wait_for(other.poll)
+    assert other.recv() == {"look": 1, "doing": "x"}
+
+
+def test_other_end_that_reads_nothing_costs_no_time_and_no_memory(ends):
+    end, other = ends
+    longest = 0.0
+    for k in range(3000):  # far more than a pipe holds
+        began = time.perf_counter()
+        end.put(look=np.full(100, float(k)))
+        longest = max(longest, time.perf_counter() - began)
+    assert longest < 0.1  # a write that waited would never return
+    assert len(end._out) <= 1
+    seen = []
+    wait_for(lambda: seen.append(other.recv()["look"][0]) or seen[-1] == 2999.0)
+    assert len(seen) < 3000 and seen == sorted(seen)
+
+
+def test_lost_end_is_seen(ends):
+    end, other = ends
+    other.close()
+    assert end.closed.wait(5.0)
+    end.put(look=1)
+    assert end.take() == {}

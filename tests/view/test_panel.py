@@ -1,0 +1,39 @@
+"""Looks of a log, and the bars against what they show."""
+
+import numpy as np
+import pytest
+
+from mjx_softarm.logs.checks import LogError
+from mjx_softarm.logs.schema import Log
+from mjx_softarm.view.look import Limits, look_at, looks
+from tests.linear_arm import HIGH_KPA, REST_M, SENSOR, SPEC, N
+
+
+def test_saturated_chambers_are_found_and_marked():
+    panel = pytest.importorskip("mjx_softarm.view.panel", reason="needs viser", exc_type=ImportError)
+    kpa, reference_m = np.zeros(N), np.full(N, REST_M)
+    kpa[[2, 7]] = HIGH_KPA - 0.1  # as measured
+    reference_m[2] += 0.01  # chamber 7 is on its reference
+    row = {"time_s": 0.0, "pressure_kpa": kpa, "reference_m": reference_m}
+    look, limits = look_at(row, np.full(N, REST_M)), Limits.of(SPEC)
+    assert np.flatnonzero(limits.saturated(look)).tolist() == [2]
+    drawn = panel.bars(look, limits)
+    assert "saturated: chamber 2<" in drawn and drawn.count(panel.css((226, 38, 77))) == 3
+    assert "-10.0</text>" in drawn
+    nothing = look_at({"time_s": 0.0}, np.full(N, np.nan))
+    assert "nan" not in panel.bars(nothing, limits)
+
+
+def test_looks_of_a_log():
+    spring_m = np.linspace(0.18, 0.22, 4)[:, None] * np.ones(N)
+    readings = SENSOR.readings(spring_m)
+    readings[1, 3] = np.nan
+    log = Log("x.csv", np.arange(2, 6), np.arange(4.0), readings=readings, goal=np.zeros((4, 6)))
+    at = looks(log, SENSOR)
+    np.testing.assert_allclose(at(2).spring_m, spring_m[2])
+    assert np.flatnonzero(np.isnan(at(1).spring_m)).tolist() == [3]
+    assert at(2).time_s == 2.0 and np.isnan(at(2).estimate).all() and not at(2).goal.any()
+    with pytest.raises(
+        LogError, match=r"x\.csv: got neither frequency0\.\. nor spring0\.\., expected springs"
+    ):
+        looks(Log("x.csv", np.arange(2, 6), np.arange(4.0)), SENSOR)
