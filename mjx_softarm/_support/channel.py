@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import threading
 from multiprocessing.connection import Connection
+from queue import SimpleQueue
 from typing import Any
 
 
@@ -16,8 +17,8 @@ class End:
     """One end of the channel."""
 
     def __init__(self, connection: Connection):
-        self._connection, self._ready = connection, threading.Event()
-        # Each operation on these is atomic, so that no lock is needed that a thread could be found holding.
+        # Each operation on these is atomic: no lock is there that a thread, or a signal that raises, leaves shut.
+        self._connection, self._ready = connection, SimpleQueue[None]()
         self._out: dict[str, Any] = {}
         self._in: dict[str, Any] = {}
         self.closed = threading.Event()  # set when the other end is gone
@@ -27,15 +28,16 @@ class End:
     def put(self, **values: Any) -> None:
         """Hand values to the other end, by name."""
         self._out.update(values)
-        self._ready.set()
+        if self._ready.empty():
+            self._ready.put(None)
 
     def take(self) -> dict[str, Any]:
         """Return the newest values that came since the last call, by name."""
         return _emptied(self._in)
 
     def _send(self) -> None:
-        while self._ready.wait() and not self.closed.is_set():
-            self._ready.clear()
+        while not self.closed.is_set():
+            self._ready.get()
             try:
                 self._connection.send(_emptied(self._out))
             except OSError:

@@ -146,7 +146,7 @@ def live(
             with contextlib.suppress(KeyboardInterrupt):
                 end.closed.wait()
     finally:
-        process.terminate()
+        process.kill()
     return run
 
 

@@ -29,7 +29,7 @@ def pixel(point_m):
 
 
 def says(page, text):
-    page.wait_for_function(f"document.body.innerText.includes({text!r})", timeout=30_000)
+    page.wait_for_function(f"document.body.innerText.includes({text!r})", timeout=60_000)
 
 
 def press(page, name):
@@ -97,6 +97,6 @@ def test_shared_file_plays_without_a_server(browser, tmp_path):
     page.goto((tmp_path / "run.html").as_uri())
     page.wait_for_selector("canvas")
     later = "Number(document.querySelector('input').value) > 0.3"  # of the time at the foot of the page
-    page.wait_for_function(later, timeout=30_000)
+    page.wait_for_function(later, timeout=60_000)
     assert not errors
     context.close()
