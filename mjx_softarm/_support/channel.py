@@ -17,7 +17,7 @@ class End:
     """One end of the channel."""
 
     def __init__(self, connection: Connection):
-        # Each operation on these is atomic: no lock is there that a thread, or a signal that raises, leaves shut.
+        # Each operation on these is atomic: no lock that a thread, or a signal that raises, could leave shut.
         self._connection, self._ready = connection, SimpleQueue[None]()
         self._out: dict[str, Any] = {}
         self._in: dict[str, Any] = {}
