@@ -20,6 +20,10 @@ from train.agent.gail import GailConfig
 from train.agent.hindsight import HindsightConfig
 from train.agent.tqc import TQCConfig
 
+LEARNER_GROUPS = {"tqc": ("tqc", "hindsight"), "analytic": ("analytic",)}  # settings that a learner reads
+POLISH_EPOCH = 256  # gradient steps between two reports of polishing
+POLISH_EVALUATION_EPOCHS = 4  # of these between two evaluations and checkpoints
+
 
 class ConfigError(InputError):
     """A setting that cannot be used; the message names it, what it got and what was expected."""
@@ -59,6 +63,8 @@ class TrainConfig:
     """relabelled goals, as shares of a batch; the rest keeps its own goals"""
     analytic: AnalyticConfig = field(default_factory=AnalyticConfig)
     """policy and descent of the analytic learner"""
+    polish_updates: int = 0
+    """gradient steps of the analytic learner that follow TQC's, from its policy, for arms at rest"""
 
     def __post_init__(self) -> None:
         for name in (
@@ -75,6 +81,13 @@ class TrainConfig:
             raise ConfigError(
                 f"learner: got 'analytic' with env.mode {self.env.mode!r}, expected 'quasistatic'"
             )
+        if self.polish_updates < 0:
+            raise ConfigError(f"polish_updates: got {self.polish_updates}, expected at least 0")
+        if self.polish_updates and (self.learner, self.env.mode) != ("tqc", "quasistatic"):
+            raise ConfigError(
+                f"polish_updates: got {self.polish_updates} with learner {self.learner!r} and env.mode "
+                f"{self.env.mode!r}, expected 0, or 'tqc' and 'quasistatic'"
+            )
         if self.warmup_env_steps < 0:
             raise ConfigError(f"warmup_env_steps: got {self.warmup_env_steps}, expected at least 0")
         if self.replay_capacity < self.n_arms:
@@ -89,20 +102,43 @@ class TrainConfig:
 
     @property
     def n_updates_per_vector_step(self) -> int:
+        if self.learner == "analytic":  # it learns from the action itself
+            return 1
         return round(self.updates_per_env_step * self.n_arms)
 
     @property
-    def n_epochs(self) -> int:
+    def n_own_epochs(self) -> int:
+        """Number of epochs of the learner, without polishing."""
         return -(-self.total_env_steps // (self.n_arms * self.vector_steps_per_epoch))
 
     @property
+    def n_epochs(self) -> int:
+        """Number of epochs of the run."""
+        return self.n_own_epochs + (self.polish.n_epochs if self.polish_updates else 0)
+
+    @property
     def n_updates(self) -> int:
-        """Number of gradient steps of the run, warm-up epochs counted as if they had any."""
-        return self.n_epochs * self.vector_steps_per_epoch * self.n_updates_per_vector_step
+        """Number of the learner's gradient steps, warm-up epochs counted as if they had any."""
+        return self.n_own_epochs * self.vector_steps_per_epoch * self.n_updates_per_vector_step
+
+    @property
+    def polish(self) -> TrainConfig:
+        """Config of polishing, as a run of the analytic learner."""
+        return dataclasses.replace(
+            self,
+            learner="analytic",
+            total_env_steps=self.polish_updates * self.n_arms,
+            vector_steps_per_epoch=POLISH_EPOCH,
+            evaluation_epochs=POLISH_EVALUATION_EPOCHS,
+            analytic=dataclasses.replace(self.analytic, hidden=self.tqc.hidden_actor),
+            polish_updates=0,
+        )
 
     def evaluates_after(self, epoch: int) -> bool:
         """Return whether an evaluation and a checkpoint follow the n-th epoch."""
-        return epoch % self.evaluation_epochs == 0 or epoch == self.n_epochs
+        if epoch > self.n_own_epochs:
+            return self.polish.evaluates_after(epoch - self.n_own_epochs)
+        return epoch % self.evaluation_epochs == 0 or epoch == self.n_own_epochs
 
 
 @dataclass(frozen=True)
@@ -180,6 +216,9 @@ class ImitationConfig(TrainConfig):
             )
         if self.rebalance_env_steps < 0:
             raise ConfigError(f"rebalance_env_steps: got {self.rebalance_env_steps}, expected at least 0")
+        if self.polish_updates or self.learner != "tqc":
+            got = f"{self.learner!r}, {self.polish_updates}"
+            raise ConfigError(f"learner, polish_updates: got {got}, expected 'tqc', 0 for demonstrations")
         if self.env.mode != "quasistatic":
             raise ConfigError(f"env.mode: got {self.env.mode!r}, expected 'quasistatic' for demonstrations")
 
@@ -230,8 +269,10 @@ def to_dict(config: TrainConfig) -> dict[str, Any]:
 def from_dict(data: dict[str, Any]) -> TrainConfig:
     """Return the config that `to_dict` gave; an `ImitationConfig` where its settings are there.
 
+    A setting that is missing, as in a run of before it was added, has its default.
+
     Raises:
-        ConfigError: a setting is missing, unknown or of the wrong type.
+        ConfigError: a setting is unknown or of the wrong type.
     """
     return _read(ImitationConfig if "stages" in data else TrainConfig, data, "config")
 
@@ -240,11 +281,11 @@ def _read(kind: Any, value: Any, path: str) -> Any:
     """Return the value of a setting, or of a group of settings, whose type is `kind`, from what JSON gave."""
     if dataclasses.is_dataclass(kind) and isinstance(kind, type):
         hints = typing.get_type_hints(kind)
-        if not isinstance(value, dict) or value.keys() != hints.keys():
+        if not isinstance(value, dict) or not value.keys() <= hints.keys():
             got = sorted(value) if isinstance(value, dict) else value
             raise ConfigError(f"{path}: got {got}, expected the settings {sorted(hints)}")
         prefix = f"{path}." if path else ""
-        values = {name: _read(hint, value[name], prefix + name) for name, hint in hints.items()}
+        values = {name: _read(hints[name], item, prefix + name) for name, item in value.items()}
         try:
             return kind(**values)
         except ValueError as error:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+from train.agent.analytic import AnalyticConfig
 from train.agent.hindsight import HindsightConfig
 from train.agent.tqc import TQCConfig
 from train.config import ImitationConfig, Stage, TrainConfig
@@ -31,17 +32,16 @@ PRESETS: dict[str, TrainConfig] = {
         batch_size=128,
         replay_capacity=262_144,
         evaluation_epochs=30,
+        analytic=AnalyticConfig(learning_rate=5e-4),
+        polish_updates=2_048,
     ),
-    # The analytic learner needs neither replay nor warm-up. It has arms of its own, so few act beside them.
+    # A gradient step through the equilibrium takes one action of all arms.
     "analytic": TrainConfig(
         learner="analytic",
         n_arms=64,
-        total_env_steps=51_200,
-        updates_per_env_step=0.25,
-        warmup_env_steps=0,
-        batch_size=64,
-        replay_capacity=64,
-        evaluation_epochs=10,
+        total_env_steps=524_288,
+        vector_steps_per_epoch=256,
+        evaluation_epochs=4,
     ),
     "paper": dataclasses.replace(_TUNED, total_env_steps=300_000, updates_per_env_step=0.5),
 }

@@ -26,7 +26,7 @@ from mjx_softarm.mechanics.mjcf import build_model
 from mjx_softarm.mechanics.pipe import CrossPipe, body_clearance
 from mjx_softarm.mechanics.settle import Settled, SettleResult, settle
 from mjx_softarm.mechanics.statics import ArmParams
-from mjx_softarm.mechanics.workspace import Pool, sample_workspace
+from mjx_softarm.mechanics.workspace import Pool, sample_evenly, sample_workspace
 from mjx_softarm.sensing.pose import pose_from_frame
 from mjx_softarm.sensing.s2r import S2R, carry_body, correct
 from mjx_softarm.sensing.sensors import SENSORS
@@ -131,9 +131,9 @@ class ReachEnv(Env):
         """Simulation that runs: "chain" or "mjx" kinematics of the equilibrium, or "mjx dynamic" steps."""
         return "mjx dynamic" if self.config.mode == "dynamic" else self.config.engine
 
-    def sample_pool(self, n: int, seed: int) -> Pool:
-        """Draw n poses of the workspace as `sample_workspace` does, and correct them to those observed."""
-        pool = sample_workspace(self.spec, n, seed)
+    def sample_pool(self, n: int, seed: int, evenly: bool = False) -> Pool:
+        """Draw n poses with `sample_workspace` or `sample_evenly`, and correct them to those observed."""
+        pool = (sample_evenly if evenly else sample_workspace)(self.spec, n, seed)
         return pool._replace(pose=self._observed_pose(pool.pose, pool.spring_m))
 
     def _observed_pose(self, pose: Array, spring_m: Array) -> Array:

@@ -20,6 +20,7 @@ from mjx_softarm.spec import ArmSpec, SpecError
 
 BATCH = 1024
 CANDIDATES_PER_POSE = 2
+CANDIDATES_PER_EVEN_POSE = 10
 VOXEL_MM = 25.0
 HELD_OUT_SEED = 20_000  # seed of the goals that policies are evaluated on; training uses other seeds
 
@@ -67,7 +68,32 @@ def sample_workspace(spec: ArmSpec, n: int, seed: int) -> Pool:
         SpecError: the arm settles at fewer than `n` of the candidates.
     """
     rng = np.random.default_rng(seed)
-    found = settle_many(spec, random_pressures(spec, CANDIDATES_PER_POSE * n, rng))
+    return _draw(spec, n, random_pressures(spec, CANDIDATES_PER_POSE * n, rng), rng, replace=False)
+
+
+def sample_evenly(spec: ArmSpec, n: int, seed: int) -> Pool:
+    """Draw poses whose tips are uniform in volume over the reachable workspace, rim included.
+
+    Every voxel of 25 mm that a candidate reaches is equally likely, and every candidate within it. Of the ten
+    candidates per pose, half have random pressures and half lowest, zero or highest ones in random
+    combinations, which are the rim. A pose may come twice.
+
+    Args:
+        spec: the arm.
+        n: number of poses.
+        seed: of the draw; training and evaluation use different ones.
+
+    Raises:
+        SpecError: the arm settles at fewer than `n` of the candidates.
+    """
+    rng = np.random.default_rng(seed)
+    half = CANDIDATES_PER_EVEN_POSE * n // 2
+    extremes = rng.choice(_levels(spec), (half, spec.n_chambers))
+    return _draw(spec, n, np.concatenate([random_pressures(spec, half, rng), extremes]), rng, replace=True)
+
+
+def _draw(spec: ArmSpec, n: int, pressure_kpa: np.ndarray, rng: np.random.Generator, replace: bool) -> Pool:
+    found = settle_many(spec, pressure_kpa)
     tip_mm = np.where(found.settled[:, None], 1e3 * found.tip_position_m, 0.0)
     _, voxel, count = np.unique(
         np.floor(tip_mm / VOXEL_MM).astype(int), axis=0, return_inverse=True, return_counts=True
@@ -78,7 +104,7 @@ def sample_workspace(spec: ArmSpec, n: int, seed: int) -> Pool:
             f"the arm {spec.name!r} settles at {np.count_nonzero(weight)} of {len(weight)} random pressures, "
             f"expected at {n} or more; is it stiff enough?"
         )
-    chosen = rng.choice(len(weight), n, replace=False, p=weight / weight.sum())
+    chosen = rng.choice(len(weight), n, replace=replace, p=weight / weight.sum())
     pose = pose_from_frame(found.tip_position_m[chosen], found.tip_rotation[chosen])
     arrays = (found.q[chosen], found.pressure_kpa[chosen], found.spring_m[chosen], pose)
     return Pool(*map(jnp.asarray, arrays))
@@ -89,5 +115,8 @@ def extreme_poses(spec: ArmSpec) -> Settled:
 
     Source: the paper's workspace figure.
     """
-    levels = (spec.chambers.pressure_min_kpa, 0.0, spec.chambers.pressure_max_kpa)
-    return settle_many(spec, np.array(list(itertools.product(levels, repeat=spec.n_chambers))))
+    return settle_many(spec, np.array(list(itertools.product(_levels(spec), repeat=spec.n_chambers))))
+
+
+def _levels(spec: ArmSpec) -> tuple[float, float, float]:
+    return (spec.chambers.pressure_min_kpa, 0.0, spec.chambers.pressure_max_kpa)

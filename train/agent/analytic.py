@@ -42,7 +42,9 @@ Params = Any  # a flax parameter tree
 class AnalyticConfig:
     """Hyperparameters of learning through the equilibrium. Raises ValueError naming a bad field."""
 
-    n_arms: int = 64  # arms of a gradient step
+    # See TQCConfig.
+    NUMBERS = ("learning_rate", "max_gradient_norm", "tau", "new_share", "saturation_cost_per_mm")
+
     hidden: tuple[int, ...] = (256, 256, 256)  # width of each hidden layer of the policy
     learning_rate: float = 2e-3  # of Adam
     learning_rate_end: float = 0.01  # share of it left at the end; it falls along a half cosine
@@ -53,7 +55,6 @@ class AnalyticConfig:
 
     def __post_init__(self) -> None:
         required = {
-            "n_arms": (self.n_arms >= 1, "at least 1"),
             "learning_rate": (self.learning_rate >= 0.0, "a number >= 0"),
             "learning_rate_end": (0.0 <= self.learning_rate_end <= 1.0, "a number in [0, 1]"),
             "max_gradient_norm": (self.max_gradient_norm > 0.0, "a number > 0"),
@@ -81,14 +82,17 @@ class Analytic:
     Args:
         config: hyperparameters.
         env: the arm, at rest.
+        n_arms: arms of a gradient step.
         n_updates: gradient steps of the run, over which the learning rate falls.
-        mesh: devices over which the learner's arms are spread.
+        mesh: devices over which the arms are spread.
     """
 
-    def __init__(self, config: AnalyticConfig, env: ReachEnv, n_updates: int, mesh: Mesh | None = None):
-        self.config, self.env, self.mesh = config, env, mesh
+    def __init__(
+        self, config: AnalyticConfig, env: ReachEnv, n_arms: int, n_updates: int, mesh: Mesh | None = None
+    ):
+        self.config, self.env, self.mesh, self.own_arms = config, env, mesh, n_arms
         self.actor: Any = Actor(env.action_size, config.hidden)
-        self.arms = VectorEnv(env, config.n_arms, episode_length=1, mesh=mesh)
+        self.arms = VectorEnv(env, n_arms, episode_length=1, mesh=mesh)
         rate = optax.cosine_decay_schedule(config.learning_rate, n_updates, config.learning_rate_end)
         self.optimizer = optax.chain(optax.clip_by_global_norm(config.max_gradient_norm), optax.adam(rate))
 
@@ -118,7 +122,7 @@ class Analytic:
     def update(
         self, state: AnalyticState, sample: Sample, key: Array
     ) -> tuple[AnalyticState, dict[str, Array]]:
-        """Take one gradient step, and one action of the learner's own arms."""
+        """Take one gradient step, and one action of all arms."""
         # Act and settle; the gradient of each arm's loss with respect to its own action.
         action, pull_back = jax.vjp(lambda params: self.mode(params, state.arms.obs), state.actor_params)
         step = over_arms(jax.value_and_grad(self._loss, has_aux=True), self.mesh)
@@ -127,7 +131,7 @@ class Analytic:
 
         # Leave out arms that did not settle and gradients that are not finite, as at a pitch of 90 degrees.
         valid = after.info["valid"] & jnp.all(jnp.isfinite(d_action), axis=-1)  # (B,)
-        d_action = jnp.where(valid[:, None], d_action, jnp.zeros_like(d_action)) / self.config.n_arms
+        d_action = jnp.where(valid[:, None], d_action, jnp.zeros_like(d_action)) / self.own_arms
         (gradient,) = pull_back(d_action)
 
         # Descend.
@@ -143,10 +147,11 @@ class Analytic:
         )
         metrics = {
             "loss": jnp.sum(loss, where=valid) / jnp.maximum(jnp.sum(valid), 1),
-            "gradient_norm": optax.global_norm(gradient),
+            "gradient_norm": optax.tree.norm(gradient),
             "left_out": jnp.mean(~valid),
         }
-        return next_state, {f"analytic/{name}": x for name, x in metrics.items()}
+        env_metrics = {f"env/{name}": jnp.mean(x) for name, x in after.metrics.items()}
+        return next_state, env_metrics | {f"analytic/{name}": x for name, x in metrics.items()}
 
     def _loss(self, action: Array, arm: State) -> tuple[Array, State]:
         """Return the loss of an action (A,) of one arm, and the state that it leads to."""
@@ -162,7 +167,7 @@ class Analytic:
     def _go_on(self, after: State, key: Array) -> State:
         """Return the arms as they stand, some of them with a new start and goal."""
         key_new, key_reset = jax.random.split(key)
-        new = draws.uniform(key_new, (self.config.n_arms,)) < self.config.new_share
+        new = draws.uniform(key_new, (self.own_arms,)) < self.config.new_share
         new |= ~after.info["valid"]
         fresh = self.arms.reset(key_reset)
         return jax.tree.map(

@@ -27,6 +27,8 @@ from train.agent.tqc import Transition
 class HindsightConfig:
     """Shares of a batch that get another goal; the rest keeps its own."""
 
+    NUMBERS = ("reached_share", "near_share", "near_min_mm", "near_max_mm", "mm_per_deg")  # as in TQCConfig
+
     reached_share: float = 0.5  # share whose goal becomes the pose reached
     near_share: float = 0.0  # share whose goal becomes a pose near the one reached
     near_min_mm: float = 1.0  # smallest distance of a near goal

@@ -15,6 +15,8 @@ from train.config import TrainConfig
 class HindsightTQC:
     """`Learner` whose update has two parts, between which a wrapper can change the batch."""
 
+    own_arms = 0
+
     def __init__(self, config: TrainConfig, env: ReachEnv):
         self.config, self.env = config, env
         self.tqc = tqc = TQC(env.observation_size, env.action_size, config.tqc, config.n_updates)

@@ -43,6 +43,8 @@ class ImitationState(NamedTuple):
 class Imitation:
     """`Learner` that wraps another and replaces its rewards and some rows of its batches."""
 
+    own_arms = 0
+
     def __init__(
         self, learner: HindsightTQC, config: ImitationConfig, env: ReachEnv, demonstrations: Demonstrations
     ):
@@ -102,7 +104,7 @@ class Imitation:
             ValueError: a donor has no such part, or one of another size.
         """
         if agent is not None:
-            donor = agent.agent if isinstance(agent, ImitationState) else agent
+            donor = getattr(agent, "agent", agent)  # of a run that imitated or was polished
             state = state._replace(agent=self.learner.adopt(state.agent, donor))
         if reward is not None:
             if not isinstance(reward, ImitationState) or reward.discriminator is None:

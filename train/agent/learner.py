@@ -1,9 +1,11 @@
 """The interface of a learner: what the epoch, evaluation, sweeps, checkpoints and export need of it.
 
-An epoch steps the arms, stores their transitions and calls `update` some times after each action. The learner
-decides what to do with the replay: sample it as it is stored, relabel it, or leave it and learn from its own
-rollouts. Anything that has the methods of `Learner` can be handed to `train.epoch.job.Job`; nothing need
-inherit from it. On several devices, batches are spread over them and the learner's state is on all of them.
+An epoch steps the arms, stores their transitions and calls `update` some times after each action; the learner
+samples the replay as it is stored, or relabels it. A learner with `own_arms` steps these itself as it learns:
+an epoch of it is nothing but updates, without replay.
+
+Anything that has the methods of `Learner` can be handed to `train.epoch.job.Job`; nothing need inherit from
+it. On several devices, batches are spread over them and the learner's state is on all of them.
 
 Shapes: O observation, A action.
 """
@@ -36,6 +38,8 @@ Sample = Callable[[Array], Experience]  # key -> a batch of the replay, drawn un
 class Learner(Protocol):
     """Pure functions of a state, which is any pytree of arrays and all that an update changes."""
 
+    own_arms: int  # arms that an update steps, each once; 0 for a learner from the replay
+
     def init(self, key: Array) -> Any:
         """Return the first state; no two of its leaves share a buffer, since the state is donated."""
         ...
@@ -56,7 +60,11 @@ class Learner(Protocol):
         ...
 
     def update(self, state: Any, sample: Sample, key: Array) -> tuple[Any, dict[str, Array]]:
-        """Take one gradient step; return the next state and scalar metrics by name, such as "tqc/entropy"."""
+        """Take one gradient step; return the next state and scalar metrics by name, such as "tqc/entropy".
+
+        With arms of its own it must not call `sample`, and returns the means of the environment's metrics
+        too, by names such as "env/tip_error_mm".
+        """
         ...
 
 

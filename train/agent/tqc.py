@@ -30,6 +30,10 @@ Params = Any  # a flax parameter tree
 class TQCConfig:
     """Hyperparameters, by default stable-baselines3-contrib's. Raises ValueError naming a bad field."""
 
+    # Fields that may be traced numbers, so that members of a sweep may differ in them.
+    NUMBERS = ("learning_rate", "learning_rate_alpha", "gamma", "tau", "initial_alpha")
+    NUMBERS += ("target_entropy", "reward_scale")
+
     hidden_actor: tuple[int, ...] = (256, 256)  # widths of the actor's hidden layers
     hidden_critic: tuple[int, ...] = (256, 256)  # widths of each critic's hidden layers
     n_critics: int = 2  # number of critics
@@ -121,12 +125,14 @@ class TQC:
             alpha_opt_state=self.alpha_optimizer.init(log_alpha),
         )
 
-    def adopt(self, state: TQCState, donor: TQCState) -> TQCState:
+    def adopt(self, state: TQCState, donor: Any) -> TQCState:
         """Return the state with a donor's networks and temperature; the optimisers begin anew.
 
         Raises:
-            ValueError: the donor's networks are of another size.
+            ValueError: the donor has no critics, or networks of another size.
         """
+        if not isinstance(donor, TQCState):
+            raise ValueError("got a policy without critics, expected a run of TQC")
         names = ("actor_params", "mean_actor_params", "critic_params", "target_params", "log_alpha")
         given, own = ({name: getattr(each, name) for name in names} for each in (donor, state))
         check_same_shapes("networks", given, own)

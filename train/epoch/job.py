@@ -1,7 +1,8 @@
 """One epoch of training as one jitted, donated call: act, store, update.
 
 An epoch is composed of arms, a distribution of their goals, a replay and a learner; see
-`train.agent.learner`. It knows no learner by name.
+`train.agent.learner`. It knows no learner by name. Where the learner has arms of its own, the epoch has none,
+and no replay.
 """
 
 from __future__ import annotations
@@ -54,9 +55,9 @@ class WorkspaceGoals:
 class TrainState(NamedTuple):
     """All that a run consists of; with it, a run continues bit for bit."""
 
-    arms: State  # n_arms
+    arms: Any  # State of n_arms, None where the learner has its own
     learner: Any  # state of the learner
-    memory: replay.Replay  # of Experience
+    memory: Any  # Replay of Experience, None where the learner has its own arms
     goals: Any  # state of the goals' distribution
     key: Array
     n_env_steps: Array  # () int32 actions taken, invalid ones included
@@ -83,16 +84,21 @@ class Job:
         self.goals = goals or WorkspaceGoals()
         self.arms = VectorEnv(env, config.n_arms, config.episode_length, mesh)
         self.n_traces = 0
-        self.sharding = None if mesh is None else _sharding(config, mesh)
+        self.sharding = None if mesh is None else _sharding(config, mesh, bool(learner.own_arms))
         results = None if mesh is None else (self.sharding, everywhere(mesh))
         self.init = xla.jit(self.first, env.uses_mjx, out_shardings=self.sharding)
         self.epoch = xla.jit(self.advance, env.uses_mjx, donate_argnums=0, out_shardings=results)
         self._thin = xla.jit(replay.thin, env.uses_mjx, donate_argnums=0)
 
-    def start(self, first: Callable[[], T]) -> T:
+    def like(self, epoch: int) -> TrainState:
+        """Return a state structured as the run's after some epochs."""
+        return self.init(jax.random.PRNGKey(0))
+
+    def start(self, first: Callable[[], T], epoch: int = 0) -> T:
         """Return the result of `first`, such as a state, with the epoch compiled in another thread meanwhile.
 
-        With a mesh of devices the epoch is compiled when it is called first; a second call compiles nothing.
+        `epoch` is the number of epochs done; a job with several stages compiles those that are left. With a
+        mesh of devices the epoch is compiled when it is called first; a second call compiles nothing.
         """
         if self.mesh is not None or self.n_traces:
             return first()
@@ -119,16 +125,17 @@ class Job:
     def first(self, key: Array) -> TrainState:
         """Return the state that a run begins with; `init` is this, jitted."""
         key, key_arms, key_learner, key_goals = jax.random.split(key, 4)
-        goals = self.goals.init()
-        arms = self.goals.begin(goals, self.arms.reset(key_arms), key_goals)
-        experience = jax.eval_shape(
-            lambda: self._experience(arms, jnp.zeros((self.arms.n, self.env.action_size)), arms)
-        )
-        one = jax.tree.map(lambda x: jnp.zeros(x.shape[1:], x.dtype), experience)
+        goals, arms, memory = self.goals.init(), None, None
+        if not self.learner.own_arms:
+            arms = self.goals.begin(goals, self.arms.reset(key_arms), key_goals)
+            action = jnp.zeros((self.arms.n, self.env.action_size))
+            experience = jax.eval_shape(lambda: self._experience(arms, action, arms))
+            one = jax.tree.map(lambda x: jnp.zeros(x.shape[1:], x.dtype), experience)
+            memory = replay.create(one, self.config.replay_capacity)
         return TrainState(
             arms=arms,
             learner=self.learner.init(key_learner),
-            memory=replay.create(one, self.config.replay_capacity),
+            memory=memory,
             goals=goals,
             key=key,
             n_env_steps=jnp.zeros((), jnp.int32),
@@ -144,11 +151,25 @@ class Job:
         """
         self.n_traces += 1
         with draws.on(self.mesh):
-            state, metrics = jax.lax.scan(
-                self._vector_step, state, None, length=self.config.vector_steps_per_epoch
-            )
+            step = self._own_step if self.learner.own_arms else self._vector_step
+            state, metrics = jax.lax.scan(step, state, None, length=self.config.vector_steps_per_epoch)
         unsettled = jnp.sum(metrics.pop("env/unsettled")) * self.config.n_arms
         return state, {**jax.tree.map(jnp.mean, metrics), "env/unsettled": unsettled}
+
+    def _own_step(self, state: TrainState, _) -> tuple[TrainState, dict[str, Array]]:
+        """Take one update of a learner that steps arms of its own."""
+        key, key_update = jax.random.split(state.key)
+        learner, metrics = self.learner.update(state.learner, _no_replay, key_update)
+        n_arms = self.learner.own_arms
+        n_unsettled = jnp.round(n_arms * metrics["env/unsettled"]).astype(jnp.int32)
+        state = state._replace(
+            learner=learner,
+            key=key,
+            n_env_steps=state.n_env_steps + n_arms,
+            n_updates=state.n_updates + 1,
+            n_unsettled=state.n_unsettled + n_unsettled,
+        )
+        return state, metrics
 
     def _vector_step(self, state: TrainState, _) -> tuple[TrainState, dict[str, Array]]:
         """Take one action of every arm, and the updates that follow it."""
@@ -219,7 +240,11 @@ class Job:
         )
 
 
-def _sharding(config: TrainConfig, mesh: Mesh) -> TrainState:
+def _no_replay(key: Array) -> Experience:
+    raise TypeError("sample: got a call, expected none by a learner that steps arms of its own")
+
+
+def _sharding(config: TrainConfig, mesh: Mesh, own_arms: bool) -> TrainState:
     """Return where the parts of a state are, as a prefix of its tree."""
     for name in ("n_arms", "replay_capacity", "batch_size"):
         if getattr(config, name) % mesh.size:
@@ -227,6 +252,7 @@ def _sharding(config: TrainConfig, mesh: Mesh) -> TrainState:
                 f"{name}: got {getattr(config, name)}, expected a multiple of the {mesh.size} devices"
             )
     on_all, rows = cast(Any, everywhere(mesh)), split(mesh)  # in the places of arrays
-    everything = dict.fromkeys(TrainState._fields, on_all)
-    memory = replay.Replay(data=rows, position=on_all, size=on_all)
-    return TrainState(**{**everything, "arms": rows, "memory": memory})
+    everything: dict[str, Any] = dict.fromkeys(TrainState._fields, on_all)
+    everything["arms"] = None if own_arms else rows
+    everything["memory"] = None if own_arms else replay.Replay(data=rows, position=on_all, size=on_all)
+    return TrainState(**everything)

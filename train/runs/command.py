@@ -23,7 +23,7 @@ from train.options import NewRunOptions, named_preset, start
 from train.presets import IMITATION_PRESETS, PRESETS
 from train.runs import run as runs
 from train.runs.checkpoint import Run, RunError, sole_trainer
-from train.runs.evaluate import N_ACTIONS
+from train.runs.evaluate import N_ACTIONS, Summary
 from train.runs.export import export_run
 from train.runs.task import Task, task_of
 
@@ -174,11 +174,16 @@ def _train(run: Run, task: Task, console: Console) -> int:
 
 
 def _show(run: Run, task: Task, summary: Any, console: Console) -> None:
+    summaries = {"value": summary}
+    if run.config.polish_updates:
+        summaries = {"TQC alone": Summary(**runs.evaluation_after(run, run.config.n_own_epochs))}
+        summaries["polished"] = summary
     table = Table(title=f"{task.title}, {N_ACTIONS} actions each", title_justify="left")
     table.add_column("figure")
-    table.add_column("value", justify="right")
-    for name, value in summary.rows():
-        table.add_row(name, value)
+    for name in summaries:
+        table.add_column(name, justify="right")
+    for rows in zip(*(each.rows() for each in summaries.values()), strict=True):
+        table.add_row(rows[0][0], *(value for _, value in rows))
     console.print(table)
     for name in task.picture_names:
         console.print(f"picture: {run.path / name}", highlight=False, soft_wrap=True)

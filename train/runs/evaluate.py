@@ -1,4 +1,8 @@
-"""Evaluation of a policy on held-out goals over the whole workspace, and on the paper's circle."""
+"""Evaluation of a policy on two sets of held-out goals over the whole workspace, and on the paper's circle.
+
+The first set is drawn as goals of the training are, which is rarely near the rim; the second is uniform in
+volume, rim included.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +52,10 @@ class Summary:
     p95_mm: float
     reached_share: float  # goals with the norm of e below theta and no chamber saturated
     saturated_share: float  # goals at which a chamber is saturated
-    unsettled: int
+    even_median_mm: float  # of the goals that are uniform in volume, as the next two
+    even_p95_mm: float
+    even_reached_share: float
+    unsettled: int  # in all of the evaluation
     circle_mean_mm: float
     circle_max_mm: float
     circle_saturated_chambers: int  # summed over the circle's points
@@ -63,6 +70,9 @@ class Summary:
             ("tip error, 95 %", f"{self.p95_mm:.2f} mm"),
             ("goals reached", f"{100 * self.reached_share:.1f} %"),
             ("goals with a saturated chamber", f"{100 * self.saturated_share:.1f} %"),
+            ("uniform in volume: median", f"{self.even_median_mm:.2f} mm"),
+            ("uniform in volume: 95 %", f"{self.even_p95_mm:.2f} mm"),
+            ("uniform in volume: reached", f"{100 * self.even_reached_share:.1f} %"),
             ("arms that did not settle", f"{self.unsettled}"),
             ("circle, mean tip error", f"{self.circle_mean_mm:.2f} mm"),
             ("circle, largest tip error", f"{self.circle_max_mm:.2f} mm"),
@@ -87,15 +97,17 @@ class Evaluator:
 
     @functools.cached_property
     def goals(self) -> Array:
-        """Held-out poses (n_goals, 6) [mm, deg]; drawn when first needed, since an export does without."""
-        return self.env.sample_pool(self.n_goals, HELD_OUT_SEED).pose
+        """Both sets of held-out poses (2 n_goals, 6) [mm, deg]; an export does without and draws none."""
+        sets = (self.env.sample_pool(self.n_goals, HELD_OUT_SEED, evenly) for evenly in (False, True))
+        return jnp.concatenate([poses.pose for poses in sets])
 
     def __call__(self, policy: Any) -> tuple[Summary, Reached, Reached]:
-        """Return figures, and the results on the workspace and on the circle as NumPy arrays."""
+        """Return figures, and the results on the first set and on the circle as NumPy arrays."""
         policy = jax.device_get(policy)  # maybe on many devices; one is enough
-        workspace = jax.device_get(self._workspace(policy, self.goals))
+        both = jax.device_get(self._workspace(policy, self.goals))
+        workspace, even = (jax.tree.map(lambda x, k=k: np.split(x, 2)[k], both) for k in range(2))
         circle = jax.device_get(self._circle(policy, self.circle))
-        return summarise(workspace, circle, self.env.config.reward.threshold), workspace, circle
+        return summarise(workspace, even, circle, self.env.config.reward.threshold), workspace, circle
 
     def _reach_all(self, policy: Any, goals: Array) -> Reached:
         keys = jax.random.split(jax.random.PRNGKey(HELD_OUT_SEED), len(goals))
@@ -139,16 +151,23 @@ def follow(env: ReachEnv, learner: Learner, policy: Any, path: Array) -> Reached
     return jax.tree.map(lambda x: x[len(path) :], reached)
 
 
-def summarise(workspace: Reached, circle: Reached, threshold: float) -> Summary:
-    """Return the figures of results on the workspace and on the circle."""
-    error, around = workspace.tip_error_mm, circle.tip_error_mm
-    free = workspace.saturated_chambers == 0
+def summarise(workspace: Reached, even: Reached, circle: Reached, threshold: float) -> Summary:
+    """Return the figures of results on both sets of goals and on the circle."""
+    error, around, at_even = workspace.tip_error_mm, circle.tip_error_mm, even.tip_error_mm
+
+    def reached_share(at: Reached) -> float:
+        free = at.saturated_chambers == 0
+        return float(np.mean((at.scaled_error < threshold) & free & at.settled))
+
     return Summary(
         median_mm=float(np.median(error)),
         p95_mm=float(np.quantile(error, 0.95)),
-        reached_share=float(np.mean((workspace.scaled_error < threshold) & free & workspace.settled)),
-        saturated_share=float(np.mean(~free)),
-        unsettled=int(np.sum(~workspace.settled) + np.sum(~circle.settled)),
+        reached_share=reached_share(workspace),
+        saturated_share=float(np.mean(workspace.saturated_chambers > 0)),
+        even_median_mm=float(np.median(at_even)),
+        even_p95_mm=float(np.quantile(at_even, 0.95)),
+        even_reached_share=reached_share(even),
+        unsettled=sum(int(np.sum(~at.settled)) for at in (workspace, even, circle)),
         circle_mean_mm=float(np.mean(around)),
         circle_max_mm=float(np.max(around)),
         circle_saturated_chambers=int(np.sum(circle.saturated_chambers)),

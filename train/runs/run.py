@@ -70,10 +70,11 @@ def _begin(run: Run, task: Task, console: Console) -> tuple[int, TrainState]:
     console.print("compiling (cached for the next start) ...")
 
     def first() -> tuple[int, TrainState]:
-        state = task.job.init(jax.random.PRNGKey(run.config.seed))
-        return (0, state) if run.latest_epoch is None else run.restore(state)
+        if run.latest_epoch is None:
+            return 0, task.job.init(jax.random.PRNGKey(run.config.seed))
+        return run.restore(task.job.like(run.latest_epoch))
 
-    epoch, state = task.job.start(first)
+    epoch, state = task.job.start(first, run.latest_epoch or 0)
     if epoch:
         console.print(f"continuing after epoch {epoch} of {run.config.n_epochs}")
     return epoch, state
@@ -83,7 +84,10 @@ def finish(run: Run, task: Task, policy: Any) -> Any:
     """Evaluate a policy, write `evaluation.json` and the pictures; returns the figures."""
     summary, *reached = task.evaluate(policy)
     if is_first_process():
-        write_json(run.path / "evaluation.json", summary.to_dict())
+        figures = summary.to_dict()
+        if run.config.polish_updates:
+            figures["tqc_alone"] = evaluation_after(run, run.config.n_own_epochs)
+        write_json(run.path / "evaluation.json", figures)
         plots.save(run.path, task.pictures(run.metrics(), *reached))
     return summary
 
@@ -105,7 +109,7 @@ def restore_policy(run: Run, task: Task | None = None) -> tuple[Task, Any]:
         RunError: the run has no checkpoint, or one of another learner.
     """
     task = task or task_of_run(run)
-    return task, task.job.learner.policy(_restored_learner(run, task))
+    return task, task.job.policy(_restored(run, task))
 
 
 def begin_with(task: Task, seed: int, **donors: Run) -> TrainState:
@@ -124,7 +128,7 @@ def begin_with(task: Task, seed: int, **donors: Run) -> TrainState:
     for name, donor in donors.items():
         if adopt is None:
             raise RunError(f"{donor.path}: got a donor of {name}, expected none for this learner")
-        given = _restored_learner(donor, task_of_run(donor))
+        given = _restored(donor, task_of_run(donor)).learner
         try:
             state = state._replace(learner=adopt(state.learner, **{name: given}))
         except ValueError as error:
@@ -132,10 +136,10 @@ def begin_with(task: Task, seed: int, **donors: Run) -> TrainState:
     return task.job.place(state)
 
 
-def _restored_learner(run: Run, task: Task) -> Any:
-    """Return the learner's state of a run's newest checkpoint."""
-    shapes = jax.eval_shape(task.job.init, jax.random.PRNGKey(0))
-    return run.restore_part("learner", shapes.learner)
+def _restored(run: Run, task: Task) -> TrainState:
+    """Return the state of a run's newest checkpoint: learner in NumPy, shapes of the rest."""
+    shapes = jax.eval_shape(lambda: task.job.like(run.latest_epoch or 0))
+    return shapes._replace(learner=run.restore_part("learner", shapes.learner))
 
 
 def open_board(run: Run, state: TrainState) -> SummaryWriter:
@@ -147,20 +151,25 @@ def open_board(run: Run, state: TrainState) -> SummaryWriter:
 
 def timed_epoch(job: Any, state: TrainState) -> tuple[TrainState, dict[str, Any]]:
     """Return the next state of a job, or of a sweep's, and its metrics with the speeds of one run."""
-    start, before = time.perf_counter(), counts(state)["updates"]
+    start, before = time.perf_counter(), counts(state)
     state, metrics = job.epoch(state)
     metrics = jax.device_get(metrics)
     seconds = time.perf_counter() - start
-    n_env_steps = job.config.n_arms * job.config.vector_steps_per_epoch
-    n_updates = counts(state)["updates"] - before
-    speeds = {"env_steps_per_s": n_env_steps / seconds, "updates_per_s": n_updates / seconds}
-    return state, metrics | {f"speed/{name}": value for name, value in speeds.items()}
+    speeds = {f"speed/{name}_per_s": (n - before[name]) / seconds for name, n in counts(state).items()}
+    return state, metrics | speeds
 
 
 def evaluation(task: Task, policy: Any) -> dict[str, float]:
     """Return the figures of a policy, named as in a row of metrics."""
     figures = task.evaluate(policy)[0].to_dict()
     return {f"evaluation/{name}": x for name, x in figures.items() if not isinstance(x, tuple)}
+
+
+def evaluation_after(run: Run, epoch: int) -> dict[str, Any]:
+    """Return the figures of the evaluation that followed an epoch, by name."""
+    prefix = "evaluation/"
+    [row] = [row for row in run.metrics() if row["epoch"] == epoch]
+    return {name.removeprefix(prefix): value for name, value in row.items() if name.startswith(prefix)}
 
 
 def counts(state: TrainState) -> dict[str, int]:

@@ -21,6 +21,7 @@ from train.config import ImitationConfig, TrainConfig
 from train.demos.demonstrations import Demonstrations
 from train.epoch.goals import DemonstratedGoals
 from train.epoch.job import Job, TrainState
+from train.epoch.polish import PolishedJob
 from train.runs import plots
 from train.runs.evaluate import N_GOALS, Evaluator
 from train.runs.positions import PositionEvaluator
@@ -29,7 +30,7 @@ from train.runs.positions import PositionEvaluator
 class Task(NamedTuple):
     """A job with all that differs around it from task to task."""
 
-    job: Job
+    job: Job | PolishedJob
     title: str  # of the table of figures
     evaluate: Callable[[Any], tuple[Any, ...]]  # policy -> figures (`to_dict`), then results
     picture_names: tuple[str, ...]
@@ -40,9 +41,11 @@ class Task(NamedTuple):
 
 def learner_of(config: TrainConfig, env: ReachEnv, mesh: Mesh | None = None) -> Learner:
     """Return the learner that a config of a reach run names."""
-    if config.learner == "analytic":
-        return Analytic(config.analytic, env, config.n_updates, mesh)
-    return HindsightTQC(config, env)
+    return _analytic(config, env, mesh) if config.learner == "analytic" else HindsightTQC(config, env)
+
+
+def _analytic(config: TrainConfig, env: ReachEnv, mesh: Mesh | None) -> Analytic:
+    return Analytic(config.analytic, env, config.n_arms, config.n_updates, mesh)
 
 
 def task_of(
@@ -68,6 +71,8 @@ def task_of(
         assert demonstrations is not None
         return _imitation(config, env, demonstrations, mesh, learner)
     job = Job(config, env, learner or learner_of(config, env, mesh), mesh=mesh)
+    if config.polish_updates:
+        job = PolishedJob(job, _analytic(config.polish, env, mesh), mesh)
     return Task(
         job=job,
         title=f"{N_GOALS} held-out goals",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Sequence
@@ -18,7 +19,7 @@ from train.options import NewRunOptions, named_preset, start
 from train.presets import PRESETS
 from train.runs.checkpoint import sole_trainer
 from train.runs.run import Interrupted, free_path
-from train.sweep.job import VARIABLE, setting
+from train.sweep.job import setting, variable
 from train.sweep.report import CURVES_FILE, RESULTS_FILE, report
 from train.sweep.run import create, open_sweep, train
 
@@ -33,8 +34,8 @@ class SweepCommand(NewRunOptions):
     own values.
     """
 
-    preset: Literal["quick", "paper"] = "quick"
-    """settings to begin with; the defaults below are this preset's"""
+    preset: Literal["quick", "paper", "analytic"] = "quick"
+    """settings to begin with; the defaults below are this preset's, without polishing"""
     config: Annotated[TrainConfig, tyro.conf.arg(name="")]
     seeds: cli.Integers = (0,)
     """seeds of each setting"""
@@ -44,7 +45,7 @@ class SweepCommand(NewRunOptions):
     @classmethod
     def default(cls, arguments: Sequence[str]) -> Self:
         preset: Any = named_preset(arguments, PRESETS, "quick")
-        return cls(preset=preset, config=PRESETS[preset])
+        return cls(preset=preset, config=dataclasses.replace(PRESETS[preset], polish_updates=0))
 
     def __call__(self) -> int:
         console = start()
@@ -52,6 +53,8 @@ class SweepCommand(NewRunOptions):
             self.check_resume_alone(self.default([]))
             sweep = open_sweep(self.resume)
         else:
+            if self.config.polish_updates:
+                raise ConfigError(f"polish_updates: got {self.config.polish_updates}, expected 0 in a sweep")
             members, varied = members_of(self.config, self.seeds, self.vary)
             spec, s2r = self.read_arm(console)
             path = self.out or free_path(Path("runs") / f"sweep-{self.preset}")
@@ -90,10 +93,11 @@ def members_of(
     for assignment in vary:
         path, _, text = assignment.partition("=")
         path = path.replace("-", "_")
-        if path not in VARIABLE:
+        if path not in (numbers := variable(config)):
             raise ConfigError(
-                f"--vary {assignment}: got a setting that decides what is computed or on what shapes, "
-                f"expected NAME=VALUE,... for one of {', '.join(VARIABLE)}"
+                f"--vary {assignment}: got a setting that decides what is computed or on what shapes, or one "
+                f"that the learner {config.learner!r} does not read, expected NAME=VALUE,... for one of "
+                f"{', '.join(numbers)}"
             )
         if path in values:
             raise ConfigError(f"--vary {assignment}: got {path} again, expected all its values in one")

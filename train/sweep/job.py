@@ -22,9 +22,8 @@ from jax import Array
 from mjx_softarm._support import xla
 from mjx_softarm.env import Randomisation, ReachEnv
 from mjx_softarm.mdp.rewards import RewardConfig
-from train.agent.hindsight import HindsightConfig
 from train.agent.learner import Learner
-from train.config import TrainConfig
+from train.config import LEARNER_GROUPS, TrainConfig
 from train.epoch.job import Job, TrainState
 
 
@@ -32,22 +31,21 @@ def _numbers_of(group: str, config: Any) -> tuple[str, ...]:
     return tuple(f"{group}.{field.name}" for field in dataclasses.fields(config))
 
 
-# Settings that are numbers in what is computed; the others decide what is computed, and on what shapes.
-VARIABLE = (
-    "tqc.learning_rate",
-    "tqc.learning_rate_alpha",
-    "tqc.gamma",
-    "tqc.tau",
-    "tqc.initial_alpha",
-    "tqc.target_entropy",
-    "tqc.reward_scale",
-    *_numbers_of("hindsight", HindsightConfig),
-    *_numbers_of("env.reward", RewardConfig),
-    *_numbers_of("env.randomisation", Randomisation),
-    "env.saturation_tolerance_mm",
-    "env.clearance_cost_per_mm",
-    "env.clearance_margin_mm",
-)
+def variable(config: TrainConfig) -> tuple[str, ...]:
+    """Return the names of the settings that are numbers in what is computed, and that the learner reads.
+
+    The others decide what is computed, and on what shapes.
+    """
+    groups = LEARNER_GROUPS[config.learner]
+    return (
+        *(f"{group}.{name}" for group in groups for name in getattr(config, group).NUMBERS),
+        *_numbers_of("env.reward", RewardConfig),
+        *_numbers_of("env.randomisation", Randomisation),
+        "env.saturation_tolerance_mm",
+        "env.clearance_cost_per_mm",
+        "env.clearance_margin_mm",
+    )
+
 
 _AXES = TrainState(**{**dict.fromkeys(TrainState._fields, cast(Any, 0)), "n_env_steps": cast(Any, None)})
 
@@ -60,7 +58,7 @@ def setting(config: Any, path: str) -> Any:
 
 
 def with_env_config(env: ReachEnv, config: Any) -> ReachEnv:
-    """Return the environment with a config that differs in `VARIABLE` settings alone."""
+    """Return the environment with a config that differs in `variable` settings alone."""
     other = copy.copy(env)
     other.config = config
     return other

@@ -13,8 +13,10 @@ from train.agent.analytic import Analytic, AnalyticConfig
 from train.config import ConfigError, TrainConfig
 
 SHORT = ArmSpec.default().replace(structure={"n_sections": 1, "links_per_section": 2})
-CONFIG = AnalyticConfig(n_arms=32, hidden=(32, 32), tau=0.05)
-N_UPDATES = 150
+CONFIG = AnalyticConfig(hidden=(32, 32), tau=0.05)
+N_ARMS, N_UPDATES = 32, 150
+
+pytestmark = pytest.mark.usefixtures("quick_compiler")
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +24,7 @@ def learner():
     """Arms that differ in payload, stiffness and sensor bias."""
     randomisation = Randomisation(payload_max_kg=0.2, stiffness_spread=0.05, sensor_noise_mm=0.5)
     env = ReachEnv(SHORT, EnvConfig(n_poses=256, randomisation=randomisation))
-    return Analytic(CONFIG, env, N_UPDATES)
+    return Analytic(CONFIG, env, N_ARMS, N_UPDATES)
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +61,7 @@ def test_it_learns_to_reach(learner, update, start, tip_error_mm):
 def test_arms_go_on_from_where_their_actions_led_and_some_begin_anew(learner, update, start):
     after, _ = update(start, jax.random.key(2))
     begun = np.asarray(after.arms.pipeline_state.n_steps) == 0
-    assert 0 < begun.sum() < CONFIG.n_arms
+    assert 0 < begun.sum() < N_ARMS
     moved = jax.jit(jax.vmap(learner.env.step))(start.arms, learner.mode(start.actor_params, start.arms.obs))
     np.testing.assert_allclose(
         after.arms.pipeline_state.pose[~begun], moved.pipeline_state.pose[~begun], atol=1e-3
@@ -70,7 +72,7 @@ def test_an_arm_that_does_not_settle_is_left_out_and_begins_anew(update, start):
     arm = start.arms.pipeline_state
     broken = arm._replace(payload_kg=arm.payload_kg.at[0].set(jnp.nan))
     after, metrics = update(start._replace(arms=start.arms.replace(pipeline_state=broken)), jax.random.key(3))
-    assert metrics["analytic/left_out"] == pytest.approx(1 / CONFIG.n_arms)
+    assert metrics["analytic/left_out"] == pytest.approx(1 / N_ARMS)
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(after.actor_params))
     assert np.isfinite(after.arms.pipeline_state.payload_kg).all()
 
@@ -80,9 +82,7 @@ def test_motion_is_refused():
         TrainConfig(learner="analytic", env=EnvConfig(mode="dynamic"))
 
 
-@pytest.mark.parametrize(
-    ("name", "value"), [("n_arms", 0), ("tau", 0.0), ("learning_rate_end", 2.0), ("new_share", -0.1)]
-)
+@pytest.mark.parametrize(("name", "value"), [("tau", 0.0), ("learning_rate_end", 2.0), ("new_share", -0.1)])
 def test_a_setting_out_of_range_is_named(name, value):
     with pytest.raises(ValueError, match=f"AnalyticConfig.{name}: got {value}"):
         dataclasses.replace(CONFIG, **{name: value})

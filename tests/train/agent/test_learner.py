@@ -41,6 +41,8 @@ pytestmark = pytest.mark.usefixtures("quick_compiler")
 class Regression:
     """A network fitted to the actions that led to the poses reached."""
 
+    own_arms = 0
+
     def __init__(self, env):
         self.env, self.network, self.optimizer = env, Actor(env.action_size, (16,)), optax.adam(1e-2)
 

@@ -31,13 +31,16 @@ def test_figures_of_results_made_by_hand():
         saturated=[0, 0, 0, 2, 0],
         settled=[True, True, True, True, False],
     )
+    even = reached([6.0, 8.0], [0.01, 0.04], [0, 0], [True, True])
     circle = reached([1.0, 4.0], [0.01, 0.02], [1, 2], [True, False])
-    figures = summarise(workspace, circle, threshold=0.03)
+    figures = summarise(workspace, even, circle, threshold=0.03)
     assert figures.median_mm == pytest.approx(3.0)
     assert figures.p95_mm == pytest.approx(4.0 + 0.8 * 46.0)  # linear between the fourth and the fifth
     assert figures.reached_share == 2 / 5  # not at the threshold, not saturated, not unsettled
     assert figures.saturated_share == 1 / 5
     assert figures.unsettled == 2
+    assert (figures.even_median_mm, figures.even_p95_mm) == pytest.approx((7.0, 7.9))
+    assert figures.even_reached_share == 1 / 2
     assert (figures.circle_mean_mm, figures.circle_max_mm) == pytest.approx((2.5, 4.0))
     assert figures.circle_saturated_chambers == 3
 
@@ -56,7 +59,7 @@ class Scripted:
 def evaluator(short_env):
     goals = short_env.pool.pose[:64]
     evaluator = Evaluator(short_env, Scripted(short_env, goals), n_goals=len(goals))
-    evaluator.goals = goals
+    evaluator.goals = jnp.concatenate([goals, goals])  # both sets
     return evaluator
 
 
@@ -67,7 +70,7 @@ def actions(short_env):
 
 
 def test_a_policy_that_never_moves_is_as_far_as_the_goals_are(evaluator, actions):
-    goals = np.asarray(evaluator.goals)
+    goals = np.asarray(evaluator.goals)[:64]
     figures, workspace, circle = evaluator(jnp.broadcast_to(actions[:1], actions.shape))
     expected = np.linalg.norm((goals - goals[0])[:, :3], axis=-1)
     np.testing.assert_allclose(workspace.tip_error_mm, expected, atol=0.1)
@@ -79,4 +82,4 @@ def test_a_policy_that_never_moves_is_as_far_as_the_goals_are(evaluator, actions
 def test_an_arm_that_fails_on_the_way_counts_as_unsettled(evaluator, actions):
     figures, workspace, _ = evaluator(actions.at[3].set(jnp.nan))
     assert N_ACTIONS > 1 and not workspace.settled[3] and workspace.settled.sum() == len(actions) - 1
-    assert figures.unsettled == 1 and figures.reached_share == 1 - 1 / len(actions)
+    assert figures.unsettled == 2 and figures.reached_share == 1 - 1 / len(actions)

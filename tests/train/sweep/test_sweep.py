@@ -23,7 +23,7 @@ from train.runs.checkpoint import Run, RunError
 from train.runs.task import Task
 from train.sweep import run as sweep_run
 from train.sweep.command import members_of
-from train.sweep.job import VARIABLE, SweepJob, setting
+from train.sweep.job import SweepJob, setting, variable
 from train.sweep.report import CURVES_FILE, FIGURES, RESULTS_FILE, curves, report
 from train.sweep.run import create, open_sweep
 
@@ -51,6 +51,7 @@ OTHER_SETTINGS = """
     env.saturation_tolerance_mm=5.0 env.clearance_cost_per_mm=0.3 env.clearance_margin_mm=90.0
 """
 OTHER = OTHER_SETTINGS.split()
+VARIABLE = variable(CONFIG)
 N_EPOCHS = 5
 pytestmark = pytest.mark.usefixtures("quick_compiler")
 
