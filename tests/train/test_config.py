@@ -69,7 +69,7 @@ def test_each_stages_end_is_evaluated(imitation_config):
 @pytest.mark.parametrize(
     ("assignment", "message"),
     [
-        ("stages=[{}]", "settings"),
+        ('stages=[{"part": 1.0}]', "settings"),
         ('stages=[{"share": 0.5, "every": 1, "kept": 1.0}]', "add up to 0.5, expected 1"),
         ('stages=[{"share": 1.0, "every": 0, "kept": 1.0}]', "every: got 0"),
         ("expert_share=1.0", "expert_share: got 1.0"),

@@ -74,9 +74,9 @@ def _evaluations(
     for name, (colour, label) in lines.items():
         values = [factor * row[f"evaluation/{name}"] for row in evaluated]
         axes.plot(steps, values, color=colour, label=label)
-    polished = [row["env_steps"] for row in rows if "analytic/loss" in row and "tqc/entropy" in rows[0]]
-    if polished:
-        axes.axvline(polished[0], color=INK, linestyle=":", linewidth=1, label="polishing begins")
+    tqc = [row["env_steps"] for row in rows if "analytic/loss" not in row]
+    if 0 < len(tqc) < len(rows):
+        axes.axvline(tqc[-1], color=INK, linestyle=":", linewidth=1, label="polishing begins")
     axes.legend(frameon=False)
 
 
