@@ -13,18 +13,18 @@ from typing import Any
 
 from mjx_softarm._support import cli
 
-# By name, the function that measures and what it measures. It returns figures, or an exit status.
+# By name, the function that measures. It returns figures, or an exit status.
 BENCHMARKS = {
-    "throughput": ("benchmarks.speed.throughput:measure", "env steps/s beside C MuJoCo's; start-up times"),
-    "settle": ("benchmarks.speed.settle:measure", "error and speed of Newton's method and of time stepping"),
-    "kernels": ("benchmarks.speed.kernels:measure", "kernels of a GPU loop by loop; of an H200 without one"),
-    "learner": ("benchmarks.speed.learner:measure", "gradient updates/s beside sb3-contrib, SBX and brax"),
-    "guard": ("benchmarks.speed.guard:main", "speed against a stored baseline, in four minutes"),
-    "calibration": ("benchmarks.accuracy.calibration:measure", "errors of calibration on a planted arm"),
-    "logs": ("benchmarks.accuracy.logs:measure", "errors of calibration on public logs of real arms"),
-    "learning": ("benchmarks.accuracy.learning:measure", "tip errors of finished runs over their seeds"),
-    "race": ("benchmarks.race.race:race", "time to a tip error beside sb3-contrib and SBX, two hours a seed"),
-    "paper": ("benchmarks.paper.experiments:paper", "the paper's experiments on twins, in hours"),
+    "throughput": "benchmarks.speed.throughput:measure",
+    "settle": "benchmarks.speed.settle:measure",
+    "kernels": "benchmarks.speed.kernels:measure",
+    "learner": "benchmarks.speed.learner:measure",
+    "guard": "benchmarks.speed.guard:main",
+    "calibration": "benchmarks.accuracy.calibration:measure",
+    "logs": "benchmarks.accuracy.logs:measure",
+    "learning": "benchmarks.accuracy.learning:measure",
+    "race": "benchmarks.race.race:race",
+    "paper": "benchmarks.paper.experiments:paper",
 }
 
 

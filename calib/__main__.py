@@ -25,7 +25,11 @@ from mjx_softarm.spec import ArmSpec
 
 Logs = Annotated[
     tyro.conf.Positional[tuple[Path, ...]],
-    tyro.conf.arg(metavar="LOG [LOG ...]", help="logs, CSV or npz; see `template`"),
+    tyro.conf.arg(
+        metavar="LOG [LOG ...]",
+        help="logs, CSV or npz; see `template`",
+        help_behavior_hint="(required)",
+    ),
 ]
 Strict = Annotated[
     bool, tyro.conf.arg(help="refuse logs with any fault", help_behavior_hint="(default: drop rows)")
@@ -39,7 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _template(out: tyro.conf.Positional[Path] = Path("log.csv")) -> int:
-    """Write a small log to start from, and tell what is in it.
+    """Write a small log to start from, and print its columns.
 
     Args:
         out: file to write
@@ -51,8 +55,8 @@ def _template(out: tyro.conf.Positional[Path] = Path("log.csv")) -> int:
 
 
 def _check(logs: Logs, spec: cli.SpecFile = None, strict: Strict = False) -> int:
-    """Tell what is wrong with logs."""
-    read, findings = _read(logs, cli.arm_of(spec), strict)
+    """Print the faults of logs."""
+    read, findings = _read(logs, ArmSpec.of(spec), strict)
     for log in read:
         print(f"{log.source}: {len(log)} rows to use, {log.time_s[-1] - log.time_s[0]:.1f} s")
     return 1 if findings else 0
@@ -100,7 +104,7 @@ def _run(
 
     _check_seed(seed)
     refuse_existing(out)
-    arm = cli.arm_of(spec)
+    arm = ArmSpec.of(spec)
     read, findings = _read(logs, arm, strict)
     xla.enable_compilation_cache()
     springs = {"shared": shared_springs, "fit_compensation": fit_compensation}

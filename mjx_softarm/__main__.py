@@ -42,13 +42,15 @@ def _spec(out: Path = Path("arm.toml"), force: bool = False) -> int:
 def _picture(
     spec: cli.SpecFile = None, pressures: tuple[float, ...] = (0.0,), out: Path = Path("arm.png")
 ) -> int:
-    """Draw the arm in equilibrium at given pressures; without a display, MUJOCO_GL=egl or osmesa says how.
+    """Draw the arm in equilibrium at given pressures.
+
+    Without a display, set MUJOCO_GL to egl or osmesa.
 
     Args:
         pressures: [kPa] one for all chambers, or one for each, section by section from the base
         out: PNG file to write
     """
-    arm = cli.arm_of(spec)
+    arm = ArmSpec.of(spec)
     _check_pressures(arm, pressures)
     _import_mujoco()
     from mjx_softarm.mechanics.mjcf import build_model
@@ -79,7 +81,7 @@ def _workspace(spec: cli.SpecFile = None, out: Path = Path(".")) -> int:
     Args:
         out: folder for workspace.png
     """
-    arm = cli.arm_of(spec)
+    arm = ArmSpec.of(spec)
     if 3**arm.n_chambers > MAX_COMBINATIONS:
         raise InputError(
             f"{spec}: got 3^{arm.n_chambers} combinations of pressures, expected {MAX_COMBINATIONS:,} at most"
@@ -89,7 +91,7 @@ def _workspace(spec: cli.SpecFile = None, out: Path = Path(".")) -> int:
         from mjx_softarm.mechanics import workspace_plot as plot
     except ImportError as error:
         raise InputError(
-            f"drawing needs matplotlib and scipy (pip install matplotlib scipy): {error}"
+            f"drawing needs matplotlib and scipy (pip install 'mjx-softarm[sim]'): {error}"
         ) from error
     from mjx_softarm.mechanics.workspace import extreme_poses
 

@@ -18,6 +18,7 @@ import numpy as np
 import tomli_w
 
 from mjx_softarm._support.fields import (
+    N_CHAMBERS_PER_SECTION,
     PerChamber,
     SpecError,
     anything,
@@ -28,7 +29,6 @@ from mjx_softarm._support.fields import (
 )
 from mjx_softarm.sensing.sensors import SENSORS, Sensor
 
-N_CHAMBERS_PER_SECTION = 3
 ARM_FILE = "arm.toml"  # in the folder of a calibration
 
 
@@ -143,6 +143,11 @@ class ArmSpec:
         """Return the paper's arm."""
         text = resources.files("mjx_softarm").joinpath("arms/paper.toml").read_text("utf-8")
         return cls.from_dict(tomllib.loads(text), "arms/paper.toml")
+
+    @classmethod
+    def of(cls, path: Path | None) -> ArmSpec:
+        """Return the arm of a file, or the paper's arm where none is given; raises as `from_toml` does."""
+        return cls.default() if path is None else cls.from_toml(path)
 
     @classmethod
     def from_toml(cls, path: str | Path) -> ArmSpec:

@@ -15,6 +15,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.env import EnvConfig
+from mjx_softarm.mdp.actions import N_ACTIONS
 from train.agent.analytic import AnalyticConfig
 from train.agent.gail import GailConfig
 from train.agent.hindsight import HindsightConfig
@@ -39,7 +40,7 @@ class TrainConfig:
     """seed of networks, exploration, goals and batches; the pool of poses has env.workspace_seed"""
     n_arms: int = 128
     """arms simulated side by side"""
-    episode_length: int = 4
+    episode_length: int = N_ACTIONS
     """actions per episode at most"""
     total_env_steps: int = 300_000
     """actions of all arms together"""
@@ -67,37 +68,28 @@ class TrainConfig:
     """gradient steps of the analytic learner that follow TQC's, from its policy, for arms at rest"""
 
     def __post_init__(self) -> None:
-        for name in (
-            "n_arms",
-            "episode_length",
-            "total_env_steps",
-            "batch_size",
-            "vector_steps_per_epoch",
-            "evaluation_epochs",
-        ):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"{name}: got {getattr(self, name)}, expected at least 1")
+        counts = ("n_arms", "episode_length", "total_env_steps", "batch_size")
+        least = dict.fromkeys((*counts, "vector_steps_per_epoch", "evaluation_epochs"), 1)
+        for name, low in {**least, "seed": 0, "warmup_env_steps": 0, "polish_updates": 0}.items():
+            if getattr(self, name) < low:
+                raise ConfigError(f"{name}: got {getattr(self, name)}, expected at least {low}")
         if self.learner == "analytic" and self.env.mode != "quasistatic":
             raise ConfigError(
                 f"learner: got 'analytic' with env.mode {self.env.mode!r}, expected 'quasistatic'"
             )
-        if self.polish_updates < 0:
-            raise ConfigError(f"polish_updates: got {self.polish_updates}, expected at least 0")
         if self.polish_updates and (self.learner, self.env.mode) != ("tqc", "quasistatic"):
             raise ConfigError(
                 f"polish_updates: got {self.polish_updates} with learner {self.learner!r} and env.mode "
                 f"{self.env.mode!r}, expected 0, or 'tqc' and 'quasistatic'"
             )
-        if self.warmup_env_steps < 0:
-            raise ConfigError(f"warmup_env_steps: got {self.warmup_env_steps}, expected at least 0")
         if self.replay_capacity < self.n_arms:
             raise ConfigError(
                 f"replay_capacity: got {self.replay_capacity}, expected at least n_arms = {self.n_arms}"
             )
-        if self.n_updates_per_vector_step < 1:
+        if not math.isfinite(self.updates_per_env_step) or self.n_updates_per_vector_step < 1:
             raise ConfigError(
-                f"updates_per_env_step: got {self.updates_per_env_step}, expected at least one update per "
-                f"step of all {self.n_arms} arms, {1 / self.n_arms:.4g}"
+                f"updates_per_env_step: got {self.updates_per_env_step}, expected a finite number of at "
+                f"least one update per step of all {self.n_arms} arms, {1 / self.n_arms:.4g}"
             )
 
     @property
@@ -161,8 +153,10 @@ class Stage:
 def _stages(words: list[str]) -> tuple[Stage, ...]:
     stages = []
     for word in words:
-        share, every, kept = word.split(",")
-        stages.append(Stage(float(share), int(every), float(kept)))
+        numbers = word.split(",")
+        if len(numbers) != 3:
+            raise ValueError(f"got {word!r}, expected SHARE,EVERY,KEPT")
+        stages.append(Stage(float(numbers[0]), int(numbers[1]), float(numbers[2])))
     return tuple(stages)
 
 

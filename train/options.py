@@ -27,7 +27,7 @@ class ArmOptions:
     def read_arm(self, console: Console) -> tuple[ArmSpec, S2R | None]:
         """Return the arm, and the sim-to-real network of its calibration if there is one."""
         if self.calibration is None:
-            return cli.arm_of(self.spec), None
+            return ArmSpec.of(self.spec), None
         if self.spec:
             raise ConfigError(f"--spec {self.spec}: got --calibration {self.calibration} too, expected one")
         spec, file = ArmSpec.from_toml(self.calibration / ARM_FILE), self.calibration / S2R_FILE

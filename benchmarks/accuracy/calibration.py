@@ -20,7 +20,10 @@ from mjx_softarm.sensing.sensors import Sensor
 
 
 def measure() -> dict[str, Any]:
-    """Calibrate the demo's springs and chambers, whose geometry differs from the simulator's; tips in mm."""
+    """Measure errors of calibrated springs and chambers on a planted arm.
+
+    The arm is that of `python -m calib demo`, whose geometry differs from the simulator's; tips are in mm.
+    """
     spec = ArmSpec.default()
     planted = demo.planted_arm(spec, seed=0)
     with tempfile.TemporaryDirectory() as folder:

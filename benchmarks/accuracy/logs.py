@@ -28,7 +28,7 @@ SEEDS = (0, 1, 2)
 
 
 def measure(data: Path) -> dict[str, Any]:
-    """Return all figures, in mm.
+    """Measure errors [mm] of calibration on public logs of real arms.
 
     Args:
         data: folder with `asl_trunk` and `asu_softarm`.
@@ -108,7 +108,14 @@ def motor_angles(measured_deg: np.ndarray) -> np.ndarray:
 
 
 def polynomial(x: np.ndarray, y: np.ndarray, train: np.ndarray, degree: int) -> np.ndarray:
-    """Fit a polynomial in standardised inputs to `train` rows; returns predictions for all rows."""
+    """Fit a polynomial in standardised inputs to some rows; return predictions (n, n_out) for all rows.
+
+    Args:
+        x (n, n_in): inputs.
+        y (n, n_out): outputs.
+        train (n,) bool: rows of the fit.
+        degree: of the polynomial.
+    """
     z = (x - x[train].mean(axis=0)) / x[train].std(axis=0)
     powers = [
         list(chosen)

@@ -43,10 +43,12 @@ Costs = Mapping[str, float]  # of one process, by the name of the work
 
 
 def main(store: bool = False) -> int:
-    """Compare speed with the stored baseline; exit status 1 if something is slower, 2 without a result.
+    """Compare speed with a stored baseline, in four minutes.
+
+    Exit status: 1 if something is slower, 2 without a result.
 
     Args:
-        store: Make this the baseline of this kind of machine.
+        store: make this the baseline of this kind of machine.
     """
     kind, kinds = cpu_kind(), json.loads(FILE.read_text("utf-8"))["kinds"] if FILE.exists() else {}
     known = [name for name, stored in kinds.items() if stored["sizes"] == SIZES]

@@ -50,7 +50,10 @@ _SCRATCH = re.compile(r"[su]8\[\d*\]")  # working memory of a library's call, am
 
 
 def measure() -> dict[str, Any]:
-    """Return a row for each loop, and kernels and bytes of whole steps, until the slowest arm has settled."""
+    """Count the kernels and bytes that a GPU is given, loop by loop; for an H200 where there is no GPU.
+
+    A whole step lasts until the slowest arm has settled.
+    """
     import jax
 
     from benchmarks.speed import gpu

@@ -29,7 +29,6 @@ from mjx_softarm.spec import ARM_FILE, ArmSpec
 
 REST_S, REST_M = 0.5, 1e-4
 LONGEST_S = 12.0  # an arm that still moves after this is taken as it is
-SATURATION_TOLERANCE_M = 1e-3
 MODEL_FILE, POOL_FILE = "model.mjb", "pool.npz"
 
 
@@ -192,7 +191,7 @@ class SteppedReach:
         end = self.arms.settle(reference_m)
         self.n_taken += 1
         saturated = control.saturated(
-            end.pressure_kpa, reference_m, self.arms.length_m, self.arms.gains, SATURATION_TOLERANCE_M
+            end.pressure_kpa, reference_m, self.arms.length_m, self.arms.gains, control.TOLERANCE_M
         ).any(axis=-1)
         value, reached, *_ = reward(end.pose, self.goal, self.n_taken, saturated, self._reward)
         obs = observe(end.pose, self.goal, self._scale, self._reward)

@@ -51,7 +51,7 @@ def points(on_gpu: bool) -> list[list[Point]]:
 
 
 def measure() -> dict[str, Any]:
-    """Return rates over arms and over links, peers' rates, start-up times of training, goals for a GPU."""
+    """Measure env steps/s over arms and links, beside C MuJoCo in time steps, and start-up times."""
     on_gpu = jax.default_backend() == "gpu"
     rows = [row for group in points(on_gpu) for row in turns(group)]
     over_links = [row for row in rows if row["arms"] == (8192 if on_gpu else 128)]

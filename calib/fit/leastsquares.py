@@ -82,7 +82,13 @@ def fit(model: Model, problem: Problem) -> Solution:
 
 
 def solution_at(x: np.ndarray, error: np.ndarray, jacobian: np.ndarray, problem: Problem) -> Solution:
-    """Return scales and covariance of a fit that ended at x, with the errors and Jacobian there."""
+    """Return scales and covariance of a fit that ended at x.
+
+    Args:
+        x (p,): parameters at the end.
+        error (n, m), jacobian (n, m, p): errors at x, in m columns, and their derivatives.
+        problem: priors and scales of the fit.
+    """
     scale = _scales(error, problem)
     covariance, decrement = _covariance(error, jacobian, x, scale, problem)
     return Solution(x, covariance, scale, decrement < 0.5 * SMALL_STEP**2)

@@ -77,6 +77,7 @@ def fit_curved_line(
     """Fit lines in x / (1 - share x); arguments as in `fit_line`.
 
     Args:
+        x (n, k), y (n, k): predictors and targets.
         share: the curvature, or where its fit starts; x is 1 at most, share below 1.
         fit_share: fit the curvature, too, one for all columns.
 

@@ -49,7 +49,6 @@ class NetworkFit(NamedTuple):
     network: S2R
     stop_epoch: np.ndarray  # (n_members,) epoch whose weights were best on the member's own blocks
     n_epochs: int
-    stop_loss: np.ndarray  # (n_members,) mean squared error there; 1 is that of a constant
 
 
 def block_rows(n: int) -> int:
@@ -96,11 +95,10 @@ def fit_network(x: np.ndarray, y: np.ndarray, seed: int, config: NetworkConfig |
         learning_rate=config.learning_rate,
         weight_decay=config.weight_decay,
     )
-    losses = np.asarray(losses)  # (n_members, n_epochs)
     layers = _side_by_side(jax.device_get(members), spread, centre, linear)
     anchors, limit = _anchors(z, stopping[0])
     network = S2R(layers=layers, **bounds, anchors=anchors, limit=np.float32(limit))
-    return NetworkFit(network, losses.argmin(axis=1), n_epochs, losses.min(axis=1))
+    return NetworkFit(network, np.asarray(losses).argmin(axis=1), n_epochs)
 
 
 def _check(x: np.ndarray, y: np.ndarray) -> None:

@@ -61,7 +61,6 @@ class S2RFit:
     held_out: np.ndarray  # (n,) mask of rows that took no part
     in_sample: PoseErrors
     test: PoseErrors  # held-out rows
-    in_sample_uncorrected: PoseErrors
     test_uncorrected: PoseErrors
     stop_epoch: tuple[int, ...]  # epoch at which each member stopped
     n_epochs: int
@@ -138,9 +137,9 @@ def fit_s2r(
     fit = fit_network(x[~held_out], y[~held_out], seed, config)
     corrected = correct(fit.network, pose_sim, spring_m)
     errors = {
-        name + which: pose_errors(pose[rows], pose_real[rows])
-        for which, pose in (("", corrected), ("_uncorrected", pose_sim))
-        for name, rows in (("in_sample", ~held_out), ("test", held_out))
+        "in_sample": pose_errors(corrected[~held_out], pose_real[~held_out]),
+        "test": pose_errors(corrected[held_out], pose_real[held_out]),
+        "test_uncorrected": pose_errors(pose_sim[held_out], pose_real[held_out]),
     }
     flagged = extrapolation(fit.network, pose_sim[held_out], spring_m[held_out]) > 1.0
     turn_deg = 2.0 * np.rad2deg(np.arctan(np.linalg.norm(y[:, 3:], axis=1)))

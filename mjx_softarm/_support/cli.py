@@ -6,11 +6,14 @@ option may be, docstrings say what it means.
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import functools
 import importlib
+import importlib.util
 import inspect
 import io
+import itertools
 import os
 import re
 import sys
@@ -22,13 +25,15 @@ import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
 from mjx_softarm._support.errors import InputError
-from mjx_softarm.spec import ArmSpec
 
 ERROR, INTERRUPTED = 2, 130  # exit statuses
 
 # Parts of tyro's boxes: colours, sides, and the rules between parts, which are hyphens without UTF-8.
 _COLOUR, _SIDE, _RULE = re.compile(r"\x1b\[[0-9;]*m"), " |\u2502", re.compile(r"\W?[-\u2500]{3,}\W?")
 _PLAINER = (
+    (r"^Unrecognized options: (.*)", r"command line: got \1, expected options as --help tells"),
+    (r"^Missing value for argument '(\S+)'.*", r"\1: got nothing, expected a value"),
+    (r"no type matching (\S+) could be instantiated from \['(.*?)'\].*", r"got '\2', expected \1"),
     (r"^Error parsing (?:(-\S*: )|\S*: )", r"\1"),
     (r"invalid literal for int\(\) with base 10: (.*)", r"got \1, expected a whole number"),
     (r"could not convert string to float: (.*)", r"got \1, expected a number"),
@@ -38,7 +43,7 @@ _PLAINER = (
     (r"^invalid choice (\S+) for argument '(\S+)'. Expected", r"\2: got \1, expected"),
 )
 
-Command = Callable[..., Any] | tuple[str, str]
+Command = Callable[..., Any] | str
 
 
 def main(
@@ -48,13 +53,13 @@ def main(
     arguments: Sequence[str] | None = None,
     finish: Callable[[str, Any], int] = lambda name, status: status,
 ) -> int:
-    """Run the command that the arguments begin with; without any, list the commands.
+    """Run the command that the arguments begin with; list the commands where they stop short of one.
 
     Args:
         prog: the program as its user calls it.
         about: a sentence about the program.
-        commands: functions by name; or, instead of one, MODULE:NAME, imported only when it is run, and a line
-            of help.
+        commands: functions by name; or, instead of one, MODULE:NAME, which is imported only when it is run.
+            The first line of its docstring is its help.
         arguments: words of the command line, by default those of this process.
         finish: turns a command's name and what it returned into an exit status.
 
@@ -62,9 +67,11 @@ def main(
         The command's exit status; 2 after an error that its user can put right, 130 after Ctrl-C.
     """
     words = sys.argv[1:] if arguments is None else list(arguments)
-    if not words or words[0] in ("-h", "--help"):
-        width = max(map(len, commands))
-        lines = [f"  {name:{width}}  {_line(command)}" for name, command in commands.items()]
+    group = list(itertools.takewhile(lambda word: word not in ("-h", "--help"), words))
+    shown = [name for name in commands if (parts := name.split()) != group and parts[: len(group)] == group]
+    if shown:
+        width = max(map(len, shown))
+        lines = [f"  {name:{width}}  {_line(commands[name])}" for name in shown]
         print("\n".join([f"usage: {prog} COMMAND [--help] ...", "", about, "", *lines]))
         return 0
 
@@ -102,13 +109,22 @@ def read(prog: str, commands: Mapping[str, Command], words: Sequence[str]) -> tu
 
 
 def _line(command: Command) -> str:
-    return command[1] if isinstance(command, tuple) else (inspect.getdoc(command) or "").partition("\n")[0]
+    if isinstance(command, str):  # read from the file, as the import may take seconds
+        module, _, name = command.partition(":")
+        found = importlib.util.find_spec(module)
+        assert found and found.origin, module
+        body = ast.parse(Path(found.origin).read_text("utf-8")).body
+        defined = [node for node in body if isinstance(node, ast.FunctionDef | ast.ClassDef)]
+        text = next(ast.get_docstring(node) for node in defined if node.name == name)
+    else:
+        text = inspect.getdoc(command)
+    return (text or "").partition("\n")[0]
 
 
 def _load(command: Command) -> Callable[..., Any]:
-    if not isinstance(command, tuple):
+    if not isinstance(command, str):
         return command
-    module, _, name = command[0].partition(":")
+    module, _, name = command.partition(":")
     return getattr(importlib.import_module(module), name)
 
 
@@ -211,12 +227,3 @@ SpecFile = Annotated[
         metavar="ARM.toml", help="specification of the arm", help_behavior_hint="(default: the paper's arm)"
     ),
 ]
-
-
-def arm_of(spec: Path | None) -> ArmSpec:
-    """Return the arm of a specification file, or the paper's arm where none is given.
-
-    Raises:
-        SpecError: the file is no specification.
-    """
-    return ArmSpec.default() if spec is None else ArmSpec.from_toml(spec)

@@ -25,6 +25,7 @@ from mjx_softarm.deploy.session import Run, follow
 from mjx_softarm.logs import mcap_file
 from mjx_softarm.mechanics.excitation import growing, random_pressures
 from mjx_softarm.policy.file import load_policy
+from mjx_softarm.spec import ArmSpec
 
 _STATUS = """Exit status: 0 done; 1 done, but a goal was not reached; 2 it could not begin, or its log could
 not be written; 3 a fault ended it or refused a goal; 130 Ctrl-C; 143 SIGTERM. In all cases the arm is vented
@@ -154,7 +155,7 @@ def _record(
     """
     if poses < 1:
         raise InputError(f"--poses: got {poses}, expected at least 1")
-    arm_spec = cli.arm_of(spec)
+    arm_spec = ArmSpec.of(spec)
     check_file("--out", out)
     if out.exists():
         raise InputError(f"--out: got {out}, which is there already, expected a new file")

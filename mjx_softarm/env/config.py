@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any, Literal
+import math
+from dataclasses import dataclass, field, fields
+from typing import Annotated, Any, Literal
+
+from tyro.conf import arg
 
 from mjx_softarm.control import TOLERANCE_M
 from mjx_softarm.mdp.rewards import RewardConfig
@@ -26,17 +29,19 @@ class Randomisation:
     sensor_noise_mm: float = 0.0  # standard deviation of each spring's reading, fixed within an episode
 
     def __post_init__(self):
-        _expect(self, "payload_max_kg", not self.payload_max_kg < 0, ">= 0")
+        for name in ("payload_max_kg", "sensor_noise_mm"):
+            _expect(self, name, 0 <= getattr(self, name) < math.inf, "a finite number >= 0")
         _expect(self, "stiffness_spread", 0 <= self.stiffness_spread < 1, "0 to 1")
-        _expect(self, "sensor_noise_mm", not self.sensor_noise_mm < 0, ">= 0")
 
 
 @dataclass(frozen=True)
 class EnvConfig:
     """Simulation, reward and randomisation of `ReachEnv`."""
 
-    engine: Literal["chain", "mjx"] = "chain"  # kinematics of the quasi-static mode
-    mode: Literal["quasistatic", "dynamic"] = "quasistatic"  # equilibrium of each action, or its motion
+    engine: Annotated[Literal["chain", "mjx"], arg(aliases=["--engine"])] = "chain"
+    """kinematics of the quasi-static mode"""
+    mode: Annotated[Literal["quasistatic", "dynamic"], arg(aliases=["--mode"])] = "quasistatic"
+    """equilibrium of each action, or its motion"""
     reward: RewardConfig = field(default_factory=RewardConfig)
     randomisation: Randomisation = field(default_factory=Randomisation)
     saturation_tolerance_mm: float = 1e3 * TOLERANCE_M
@@ -44,19 +49,27 @@ class EnvConfig:
     n_poses: int = 8192  # poses of the reachable workspace that starts and goals are drawn from
     workspace_seed: int = 0  # seed of these poses
     dynamic_step_s: float = 0.5  # duration of one environment step in dynamic mode
-    pipe_diameter_mm: float | None = None  # cross-shaped pipe around the arm, without contact
+    pipe_diameter_mm: Annotated[float | None, arg(aliases=["--pipe"])] = None
+    """cross-shaped pipe around the arm, without contact"""
     clearance_cost_per_mm: float = 0.0  # reward lost per mm by which the clearance falls below the margin
     clearance_margin_mm: float = 10.0  # clearance of the body to the wall that costs nothing
 
     def __post_init__(self):
         for name, allowed in (("engine", ("chain", "mjx")), ("mode", ("quasistatic", "dynamic"))):
             _expect(self, name, getattr(self, name) in allowed, f"one of {allowed}")
+        _expect(self, "dynamic_step_s", 0 < self.dynamic_step_s < math.inf, "a finite number > 0")
+        for item in fields(self.reward):
+            value = getattr(self.reward, item.name)
+            _expect(self.reward, item.name, 0 <= value < math.inf, "a finite number >= 0")
         cost, seed = "clearance_cost_per_mm", HELD_OUT_SEED
         if self.pipe_diameter_mm is not None:
             CrossPipe.of_mm(self.pipe_diameter_mm)  # raises
         else:
             _expect(self, cost, not self.clearance_cost_per_mm, "0 without a pipe_diameter_mm")
-        _expect(self, cost, not self.clearance_cost_per_mm < 0, ">= 0")
+        _expect(self, cost, 0 <= self.clearance_cost_per_mm < math.inf, "a finite number >= 0")
+        _expect(self, "clearance_margin_mm", math.isfinite(self.clearance_margin_mm), "a finite number")
+        tolerance = "saturation_tolerance_mm"
+        _expect(self, tolerance, 0 <= self.saturation_tolerance_mm < math.inf, "a finite number >= 0")
         _expect(self, "n_poses", self.n_poses >= 1, "at least 1")
         other = f"another: {seed} draws the goals of the evaluation"
         _expect(self, "workspace_seed", self.workspace_seed != seed, other)

@@ -180,7 +180,8 @@ class ReachEnv(Env):
         zero = jnp.zeros(())
         names = ("tip_error_mm", "reached", "saturated_chambers", "unsettled", *self._failures)
         metrics = dict.fromkeys(names, zero)
-        metrics |= {f"reward_{name}": zero for name in ("goal", "error", "steps", "saturation", "clearance")}
+        terms = rewards.reward(arm.pose, goal, arm.n_steps, jnp.array(False), self.config.reward)[2]
+        metrics |= {f"reward_{name}": zero for name in terms}
         info = {
             "saturated": jnp.array(False),
             "valid": jnp.array(True),

@@ -25,7 +25,13 @@ ROUNDING_S = 1e-6  # of logged times
 
 
 def holds(time_s: np.ndarray, pressure_kpa: np.ndarray, payload_kg: np.ndarray) -> list[tuple[int, int]]:
-    """Return first row, and row after the last, of each stretch at constant pressures and payload."""
+    """Return first row, and row after the last, of each stretch at constant pressures and payload.
+
+    Args:
+        time_s (n,): times of the rows.
+        pressure_kpa (n, n_chambers): commanded pressures.
+        payload_kg (n,): payload.
+    """
     n, start, found = len(time_s), 0, []
     breaks = np.flatnonzero((np.diff(time_s) > MIN_HOLD_S) | (np.diff(payload_kg) != 0)) + 1
     while start < n:

@@ -34,10 +34,8 @@ from mjx_softarm.twin.model import (
 from mjx_softarm.twin.pipe import WallForce, contact_force, is_container
 from mjx_softarm.twin.pneumatics import PUMP_M3_PER_S, VALVE_S, Pneumatics
 
-# The twins that results are reported on; the size of the gap was set on these six, without S2R. An S2R
-# network belongs to one arm, so its data come from the same twin, but from another session, whose noise is
-# another, and from other motions than the evaluation's.
-EVALUATION_SEEDS = (0, 1, 2, 3, 4, 5)
+# An S2R network belongs to one arm, so its data come from the same twin as the evaluation, but from another
+# session, whose noise is another, and from other motions.
 S2R_SESSION, EVALUATION_SESSION = 0, 1
 
 # Chambers: four stops of equal force; 3 % of the elastic force of a chamber at its shortest.
@@ -181,7 +179,7 @@ class Twin:
         mujoco.mj_step1(self._model, self._data)
 
     def release(self) -> None:
-        """Let the payload go."""
+        """Remove the payload."""
         self.attach(0.0)
 
     def wall_force_n(self) -> WallForce:

@@ -56,7 +56,7 @@ def _view(
     for option, path in (("--log", log), ("--html", html)):
         check_file(option, path)
     if logs:
-        return _replay(logs, cli.arm_of(spec), html, host, port)
+        return _replay(logs, ArmSpec.of(spec), html, host, port)
     if html is not None:
         raise InputError("--html: got no log, expected one or more, which are then written")
     if policy is None:

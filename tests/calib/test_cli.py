@@ -60,7 +60,7 @@ def test_each_step_brings_the_simulated_tip_closer_to_held_out_poses(calibrated)
     assert chambers["held_out"][mean] < 0.5 * chambers["held_out_before"][mean]
     bending, found = "bending_stiffness_nm_per_rad", ArmSpec.from_toml(calibrated[1] / "arm.toml")
     assert chambers["values"][bending] == found.backbone.bending_stiffness_nm_per_rad
-    assert network["n_unsettled"] >= 0
+    assert network["n_unsettled"] == 0
     corrected, simulated = network["test"], network["test_uncorrected"]
     assert corrected[mean] < 0.8 * simulated[mean]
     assert corrected["rotation_mean_deg"] < 0.8 * simulated["rotation_mean_deg"]

@@ -1,6 +1,7 @@
 """The environment against NumPy, against known equilibria, and against itself where it must agree."""
 
 import dataclasses
+import math
 from typing import NamedTuple
 
 import jax
@@ -13,6 +14,7 @@ from mjx_softarm._support import xla
 from mjx_softarm._support.mjx import State
 from mjx_softarm.env import EnvConfig, Randomisation, ReachEnv
 from mjx_softarm.env.reach import PAYLOAD
+from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.mechanics.kinematics import chain_frames
 from mjx_softarm.mechanics.pipe import CrossPipe, body_clearance
 from mjx_softarm.mechanics.statics import ArmParams
@@ -319,6 +321,22 @@ def test_an_unknown_engine_or_mode_is_refused_by_name(word):
     (field, value), *_ = word.items()
     with pytest.raises(ValueError, match=rf"EnvConfig\.{field}: got '{value}', expected one of"):
         EnvConfig(**word)
+
+
+@pytest.mark.parametrize(
+    "kind, field",
+    [
+        (EnvConfig, "dynamic_step_s"),
+        (EnvConfig, "saturation_tolerance_mm"),
+        (Randomisation, "payload_max_kg"),
+        (Randomisation, "sensor_noise_mm"),
+        (lambda **weight: EnvConfig(reward=RewardConfig(**weight)), "threshold"),
+    ],
+)
+@pytest.mark.parametrize("value", [math.nan, math.inf, -1.0])
+def test_a_number_that_is_negative_or_not_finite_is_refused_by_name(kind, field, value):
+    with pytest.raises(ValueError, match=rf"\.{field}: got {value}, expected a finite number >"):
+        kind(**{field: value})
 
 
 class Few(NamedTuple):

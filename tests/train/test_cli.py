@@ -126,14 +126,21 @@ def test_a_folder_has_one_trainer_at_a_time(tmp_path):
 @pytest.mark.parametrize(
     "arguments, message",
     [
-        (["reach", "--tqc.gama", "1"], "Unrecognized options: --tqc.gama, 1; Perhaps you meant: --tqc.gamma"),
+        (["reach", "--tqc.gama", "1"], "expected options as --help tells; Perhaps you meant: --tqc.gamma"),
         (
             ["reach", "--preset", "slow"],
             "--preset: got 'slow', expected one of ('quick', 'paper', 'analytic')",
         ),
         (["reach", "--n-arms", "1.5"], "--n-arms: got '1.5', expected a whole number"),
         (["imitate"], "FILE: got nothing, expected the demonstrations"),
-        (["imitate", "absent.npz", "--stages", "0.5,1"], "--stages: "),
+        (["imitate", "absent.npz", "--stages", "0.5,1"], "--stages: got '0.5,1', expected SHARE,EVERY,KEPT"),
+        (["sweep", "--vary", "tqc.gamma"], "--vary: got 'tqc.gamma', expected NAME=VALUE,..."),
+        (["reach", "--engine=fast"], "--engine/--env.engine: got 'fast', expected one of ('chain', 'mjx')"),
+        (["reach", "--seed", "-1"], "seed: got -1, expected at least 0"),
+        (
+            ["reach", "--updates-per-env-step", "inf"],
+            "updates_per_env_step: got inf, expected a finite",
+        ),
         (["demos", "record", "--task", "circle16"], "train demos record: got nothing, expected --arm"),
         (["export"], "RUN: got 0, expected one folder of a run or more"),
         (["reach", "--spec", "absent.toml"], "absent.toml: cannot be read: No such file or directory"),

@@ -31,7 +31,10 @@ def test_overrides_reach_every_level_and_leave_the_preset_alone():
         ("env.engine=fast", "env.engine: got 'fast', expected"),
         ("tqc.gamma=2", "TQCConfig.gamma"),
         ("hindsight.reached_share=0.9", "reached_share"),
-        ("updates_per_env_step=0.001", "expected at least one update per step of all 128 arms"),
+        (
+            "updates_per_env_step=0.001",
+            "expected a finite number of at least one update per step of all",
+        ),
         ("replay_capacity=10", "replay_capacity: got 10, expected at least n_arms = 128"),
     ],
 )

@@ -67,7 +67,7 @@ class Record(ArmOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class Check(ArmOptions):
-    """Tell what a file of demonstrations has, and what is wrong with it."""
+    """Print the contents of a file of demonstrations, and its faults."""
 
     file: tyro.conf.Positional[Path]
     """CSV or npz"""

@@ -27,15 +27,16 @@ from train.runs.evaluate import N_ACTIONS, Summary
 from train.runs.export import export_run
 from train.runs.task import Task, task_of
 
+Runs = Annotated[
+    tyro.conf.Positional[tuple[Path, ...]],
+    tyro.conf.arg(metavar="RUN [RUN ...]", help="folders of runs", help_behavior_hint="(required)"),
+]
 Devices = Annotated[str | None, tyro.conf.DisallowNone, tyro.conf.arg(metavar="D", help=devices.HELP)]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Reach(NewRunOptions):
-    """Train a policy that reaches poses of the workspace.
-
-    --engine and --mode are short for --env.engine and --env.mode.
-    """
+    """Train a policy that reaches poses of the workspace."""
 
     preset: Literal["quick", "paper", "analytic"] = "quick"
     """settings to begin with; the defaults below are this preset's"""
@@ -62,10 +63,9 @@ class Reach(NewRunOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class Imitate(NewRunOptions):
-    """Train a policy that reaches poses as they were shown.
+    """Train a policy from demonstrated poses.
 
-    --pipe MM, --engine and --mode are short for --env.pipe-diameter-mm, --env.engine and --env.mode. With a
-    pipe, the evaluation counts poses whose body is not inside it.
+    With a pipe, the evaluation counts poses whose body is not inside it.
     """
 
     file: tyro.conf.Positional[cli.MaybePath] = None
@@ -122,16 +122,10 @@ def evaluate(run: tyro.conf.Positional[Path]) -> int:
     return 0
 
 
-def export(
-    folders: tyro.conf.Positional[tuple[Path, ...]],
-    out: cli.MaybePath = None,
-    onnx: bool = False,
-    cpp: cli.MaybePath = None,
-) -> int:
+def export(folders: Runs, out: cli.MaybePath = None, onnx: bool = False, cpp: cli.MaybePath = None) -> int:
     """Write policies, each as one npz file, and for other runtimes.
 
     Args:
-        folders: folders of runs
         out: file to write, for one run; None: policy.npz in its folder
         onnx: write ONNX graphs and golden rows beside it
         cpp: folder for a C++ header, programs and golden rows, for one run

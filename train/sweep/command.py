@@ -30,8 +30,7 @@ _WIDTH = 160  # of the table where it is printed elsewhere than to a terminal
 class SweepCommand(NewRunOptions):
     """Train `reach` with several seeds and settings, all at once.
 
-    --engine and --mode are short for --env.engine and --env.mode. --seeds and --vary replace the settings'
-    own values.
+    --seeds and --vary replace the settings' own values.
     """
 
     preset: Literal["quick", "paper", "analytic"] = "quick"
@@ -92,6 +91,8 @@ def members_of(
     values: dict[str, list[str]] = {}
     for assignment in vary:
         path, _, text = assignment.partition("=")
+        if not text:
+            raise ConfigError(f"--vary: got {assignment!r}, expected NAME=VALUE,...")
         path = path.replace("-", "_")
         if path not in (numbers := variable(config)):
             raise ConfigError(

@@ -16,7 +16,7 @@ from mjx_softarm.policy.file import save_policy
 from mjx_softarm.policy.runtime import PolicyRunner
 from mjx_softarm.sensing.sensors import Sensor
 from tests.benchmarks.paper.made_up import SPEC, TINY, N, goals_of, make_policy, pipe_trial
-from train.__main__ import COMMANDS, in_full
+from train.__main__ import COMMANDS
 
 
 @pytest.fixture
@@ -35,7 +35,7 @@ def commands(monkeypatch):
 
 def parsed(arguments):
     """Return the command with its options; an unknown one ends the test."""
-    return cli.read("train", COMMANDS, in_full(arguments))[1]
+    return cli.read("train", COMMANDS, arguments)[1]
 
 
 def test_training_starts_resumes_exports_or_does_nothing(tmp_path, commands):
