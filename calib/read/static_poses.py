@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from calib.errors import FitError
-from mjx_softarm.logs.rest import holds, last_second, moves
+from mjx_softarm.logs.rest import NEEDED, holds, last_second, moves
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.sensing.pose import rotation_from_quaternion
 from mjx_softarm.sensing.sensors import Sensor, SensorFault
@@ -61,8 +61,8 @@ def find_static_poses(logs: Sequence[Log], spec: ArmSpec) -> tuple[StaticPoses, 
 def _static_poses_of(log: Log, spec: ArmSpec, n_markers: int, row_uses: dict[str, int]) -> list[tuple]:
     _check(log, spec)
     payload = np.full(len(log), spec.mass.payload_kg) if log.payload_kg is None else log.payload_kg
-    columns = [log.time_s[:, None], payload[:, None], log.pressure_kpa, log.tip_m, log.tip_quaternion]
-    finite = np.all(np.isfinite(np.concatenate(columns, axis=1)), axis=1)
+    columns = [value for name in NEEDED if (value := getattr(log, name)) is not None]
+    finite = np.all(np.isfinite(np.column_stack(columns)), axis=1)
     row_uses["not finite"] += int(np.count_nonzero(~finite))
     log, payload = log.take(finite), payload[finite]
     assert log.pressure_kpa is not None and log.tip_m is not None  # else `_check` raises

@@ -20,7 +20,7 @@ from mjx_softarm.deploy.ending import Ending, vent_at_end
 from mjx_softarm.deploy.faults import LOST_SHARE, SETTLE_TIMEOUT_S, STUCK_PRESSURE_KPA, stuck_springs
 from mjx_softarm.deploy.link import ArmFault, Recorder
 from mjx_softarm.logs.checks import same_sign
-from mjx_softarm.logs.rest import MIN_HOLD_S, ROUNDING_S, WINDOW_S, leaves, moves
+from mjx_softarm.logs.rest import MIN_HOLD_S, NEEDED, ROUNDING_S, WINDOW_S, leaves, moves
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.spec import ArmSpec
 
@@ -96,7 +96,7 @@ class _Hold:
     def add(self, row: dict[str, Any], seen: bool) -> None:
         """Take the row of a tick, and whether motion capture, if there is any, saw the tip."""
         self.ticks.append(row)
-        if not seen or not all(np.isfinite(value).all() for value in row.values()):
+        if not seen or not all(np.isfinite(row[name]).all() for name in NEEDED if name in row):
             return  # nor does calibration believe it
         if self.rows and leaves(row["pressure_kpa"], self.rows[0]["pressure_kpa"]):
             self.rows.clear()
@@ -137,9 +137,17 @@ class _Hold:
 
 
 def _mean(rows: Sequence[dict[str, Any]]) -> dict[str, np.ndarray]:
-    """Return the mean of rows at rest."""
-    values = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    """Return the mean of rows at rest over the numbers that are there; NaN where there is none."""
+    shapes = {name: np.shape(value) for row in rows for name, value in row.items()}
+    values = {
+        name: np.array([row.get(name, np.full(shape, np.nan)) for row in rows])
+        for name, shape in shapes.items()
+    }
     if "tip_quaternion" in values:
         mean = same_sign(values["tip_quaternion"])[0].mean(axis=0)
         values["tip_quaternion"] = mean[None] / np.linalg.norm(mean)
-    return {name: value.mean(axis=0) for name, value in values.items()}
+    with np.errstate(invalid="ignore"):  # 0 / 0 is NaN
+        return {
+            name: np.where(np.isfinite(value), value, 0.0).sum(axis=0) / np.isfinite(value).sum(axis=0)
+            for name, value in values.items()
+        }

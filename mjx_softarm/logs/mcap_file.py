@@ -1,7 +1,7 @@
 """Logs in Foxglove's format MCAP: one topic for each part of a log, its messages JSON with a schema.
 
 The topic `/pressure_kpa` has a message `{"pressure0": -12.5, ...}` for each row, in units as in the CSV file;
-the schema names them. A missing value is null. Times count from the log's first row.
+the schema names them. A missing or infinite value is null. Times count from the log's first row.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def write_mcap(file: BinaryIO, columns: Sequence[Column], table: np.ndarray) -> 
     for sequence, row in enumerate(table):
         time_ns = round(1e9 * row[0])
         for channel_id, places in topics:
-            values = {columns[k].name: None if math.isnan(row[k]) else float(row[k]) for k in places}
+            values = {columns[k].name: float(row[k]) if math.isfinite(row[k]) else None for k in places}
             data = json.dumps(values).encode()
             writer.add_message(channel_id, time_ns, data, publish_time=time_ns, sequence=sequence)
     writer.finish()

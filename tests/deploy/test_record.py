@@ -93,6 +93,25 @@ def test_calibration_finds_each_recorded_pose(tmp_path, transients):
     np.testing.assert_allclose(np.abs(poses.tip_rotation[:, 1, 2]), 0.96, atol=1e-6)
 
 
+class Hidden(Seen):
+    """A second marker that is never seen, a third now and then, and springs in every third frame only."""
+
+    def motion_capture(self):
+        seen = super().motion_capture()
+        third_m = seen.tip_m if self.tick % 2 else np.full(3, np.inf)
+        spring_m = None if self.tick % 3 else self.spring_m
+        return seen._replace(marker_m=np.array([seen.tip_m, np.full(3, np.nan), third_m]), spring_m=spring_m)
+
+
+def test_hidden_markers_cost_no_pose():
+    result = record(Hidden(), SPEC, growing(random_pressures(SPEC, 2, 3)))
+    assert (result.n_poses, result.n_unsettled, result.ending) == (2, 0, Ending())
+    marker_m = result.log.marker_m
+    assert np.isnan(marker_m[:, 1]).all()
+    np.testing.assert_allclose(marker_m[:, [0, 2]], np.tile(result.log.tip_m[:, None], (1, 2, 1)), atol=3e-4)
+    np.testing.assert_allclose(result.log.spring_m[:, :3], result.log.tip_m, atol=3e-4)
+
+
 def test_first_poses_grow_from_small_to_full():
     targets_kpa = random_pressures(SPEC, 12, 3)
     np.testing.assert_allclose((growing(targets_kpa) / targets_kpa)[:, 0], [*np.arange(0.1, 1.1, 0.1), 1, 1])

@@ -16,6 +16,7 @@ reader = pytest.importorskip("mcap.reader", reason="the package mcap is not inst
 
 def test_reader_finds_every_number_with_its_unit(tmp_path):
     log = go(LinearArm(), goals=GOALS[:1], duration_s=0.5).log
+    log.readings[1, 4] = np.inf
     columns, table = log_table(log)
     write_log(tmp_path / "run.mcap", log)
     found = [{} for _ in table]
@@ -27,10 +28,12 @@ def test_reader_finds_every_number_with_its_unit(tmp_path):
             units |= {
                 name: item["description"] for name, item in json.loads(schema.data)["properties"].items()
             }
-            found[message.sequence] |= {"time": message.log_time * 1e-9} | json.loads(message.data)
+            found[message.sequence] |= {"time": message.log_time * 1e-9} | json.loads(
+                message.data, parse_constant=pytest.fail
+            )
     assert units == {column.name: f"[{column.unit}]" for column in columns[1:]}
     got = np.array([[row[column.name] for column in columns] for row in found], float)  # null is NaN
-    np.testing.assert_allclose(got, table, rtol=1e-12, atol=1e-9)
+    np.testing.assert_allclose(got, np.where(np.isinf(table), np.nan, table), rtol=1e-12, atol=1e-9)
 
 
 def test_missing_package_is_told_before_the_arm_moves(monkeypatch):
