@@ -3,6 +3,7 @@
 import dataclasses
 import os
 import shutil
+import signal
 import subprocess
 
 import numpy as np
@@ -71,11 +72,53 @@ def test_a_tick_neither_allocates_nor_throws(folder):
 
 def test_example_vents_an_arm_that_gives_no_readings(folder):
     text = (folder / "example.cpp").read_text()
-    assert text.count("\n") <= 40 and "@" not in text + (folder / "softarm.hpp").read_text()
+    assert text.count("\n") <= 52 and "@" not in text + (folder / "softarm.hpp").read_text()
     compile_(folder / "example.cpp", "-o", folder / "example")
     done = subprocess.run([folder / "example"], capture_output=True, text=True, timeout=30)
     assert done.returncode == 0 and done.stderr == ""
     assert done.stdout.splitlines()[-2:] == ["0.0 " * 8 + "0.0", "faults: 0x3, vents"]
+
+
+READS = """
+static void read_sensors(double* readings) {
+  static const double at_rest[kN] = {READINGS};
+  static int tick = 0;
+  for (int k = 0; k < kN; ++k) readings[k] = at_rest[k] * (1.0 + 1e-3 * (tick % 2));
+  ++tick;
+}
+static bool write_pressures(const double* pressure_kpa) {
+  static int refused = 0;
+  double most = 0.0;
+  for (int k = 0; k < kN; ++k) most = std::fmax(most, std::fabs(pressure_kpa[k]));
+  std::fprintf(stderr, "%.17g\\n", most);
+  return most > 0.0 || ++refused > 3;
+}
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_example_that_is_ended_vents_until_the_arm_has_taken_it(folder, golden, tmp_path, number):
+    row = golden.inputs[np.flatnonzero(np.isfinite(golden.outputs).all(axis=1))[0]]
+    text = (folder / "example.cpp").read_text()
+    first, last = text.index("// Reads the springs' sensors"), text.index("// Ctrl-C")
+    reads = READS.replace("READINGS", ", ".join(map(repr, row[4:-6].tolist())))
+    (tmp_path / "example.cpp").write_text(text[:first] + reads + text[last:])
+    compile_(f"-I{folder}", tmp_path / "example.cpp", "-o", tmp_path / "example")
+    with subprocess.Popen([tmp_path / "example"], stderr=subprocess.PIPE, text=True) as done:
+        assert done.stderr is not None
+        driven = [float(done.stderr.readline()) for _ in range(8)]
+        done.send_signal(number)
+        ramp = np.array([float(line) for line in done.stderr])
+    assert done.returncode == 0 and driven[-1] > 0.0
+    falls = -np.diff(ramp[np.argmax(ramp) :])
+    assert ((falls >= 0.0) & (falls < 0.4 + 1e-9)).all()  # 20 kPa/s
+    assert not ramp[-4:].any() and ramp[-5] > 0.0  # three times refused
+
+
+@pytest.mark.parametrize("option", ["-ffast-math", "-Ofast", "-ffinite-math-only"])
+def test_header_refuses_mathematics_without_nan(folder, option):
+    with pytest.raises(AssertionError, match="tells lost readings by NaN"):
+        compile_("-fsyntax-only", option, folder / "rows.cpp")
 
 
 @pytest.mark.skipif(not shutil.which("cmake"), reason="there is no cmake here")

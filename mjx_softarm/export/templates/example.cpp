@@ -1,5 +1,6 @@
 // Brings the tip to a goal. Write the two functions below for your arm; all else is in softarm.hpp.
 #include <chrono>
+#include <csignal>
 #include <cstdio>
 #include <thread>
 
@@ -19,14 +20,25 @@ static bool write_pressures(const double* pressure_kpa) {
   return true;
 }
 
+// Ctrl-C and SIGTERM vent the arm; a second one ends at once, with the arm under pressure.
+static volatile std::sig_atomic_t ends = 0;
+
+static void end(int signal) {
+  ends = 1;
+  std::signal(signal, SIG_DFL);
+}
+
 int main() {
+  std::signal(SIGINT, end);
+  std::signal(SIGTERM, end);
   const double goal[6] = {@GOAL@};  // x, y, z [mm], yaw, pitch, roll [deg]
   softarm::Controller controller;
   if (!controller.set_goal(goal)) return 3;  // outside the workspace
   const std::chrono::duration<double> period(softarm::kPeriod);
   bool late = false, taken = true;
   softarm::Tick tick{};
-  for (auto next = Clock::now() + period; !tick.vented; next += period) {
+  for (auto next = Clock::now() + period; !(tick.vented && taken); next += period) {
+    if (ends) controller.vent();
     double readings[kN];
     read_sensors(readings);
     tick = controller.tick(readings, late, taken);
