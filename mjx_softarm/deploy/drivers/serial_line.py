@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 from mjx_softarm.deploy.drivers import LineArm
+
+START_S = 5.0  # many boards begin anew when their port is opened, and take about 2 s
 
 
 class SerialArm(LineArm):
@@ -22,12 +25,35 @@ class SerialArm(LineArm):
         import serial
 
         super().__init__()
-        timeouts: dict[str, Any] = {"timeout": self.timeout_s, "write_timeout": self.timeout_s}
-        self._serial = serial.Serial(self.port, self.baud, **timeouts)
+        self._late: Any = serial.SerialTimeoutException
+        self._rest = b""
+        self._serial = serial.Serial(self.port, self.baud, write_timeout=self.timeout_s)
         self._serial.reset_input_buffer()
+        self._wait_for_answer()
+
+    def _wait_for_answer(self) -> None:
+        end_s = time.monotonic() + START_S
+        while True:
+            try:
+                self.read_sensors()
+                return
+            except TimeoutError as error:
+                if time.monotonic() > end_s:
+                    self._serial.close()
+                    raise OSError(f"{self.port}: no readings within {START_S:g} s: {error}") from error
 
     def send(self, line: bytes) -> None:
-        self._serial.write(line)
+        try:
+            self._serial.write(line)
+        except self._late as error:
+            raise TimeoutError(f"{self.port}: not sent within {1e3 * self.timeout_s:g} ms") from error
 
     def receive(self, timeout_s: float) -> bytes:
-        return self._serial.read_until(b"\n")
+        if b"\n" not in self._rest:
+            self._serial.timeout = timeout_s
+            self._rest += self._serial.read(max(1, self._serial.in_waiting))
+        line, end, rest = self._rest.partition(b"\n")
+        if not end:
+            return b""
+        self._rest = rest
+        return line + end

@@ -4,12 +4,14 @@ import os
 import pty
 import socket
 import threading
+import time
 import tty
 
 import numpy as np
 import pytest
 
 from mjx_softarm.deploy.arms import ArmError, open_arm
+from mjx_softarm.deploy.drivers import serial_line
 from mjx_softarm.deploy.drivers.serial_line import SerialArm
 from mjx_softarm.deploy.drivers.udp import UdpArm
 from mjx_softarm.deploy.record import record
@@ -124,20 +126,67 @@ def test_old_answers_are_passed_over(line):
     arm.timeout_s, controller.silent = 0.05, 1
     with pytest.raises(TimeoutError, match="R: no answer within 50 ms"):
         arm.read_sensors()
+    assert np.isnan(arm.pressures()).all()  # those measured before are old
     arm.timeout_s = TIMEOUT_S
     assert arm.read_sensors().min() > 1e6  # the late answer had ones
 
 
-def test_what_the_arm_refuses_and_what_it_garbles_is_an_error(line):
+def test_what_the_arm_refuses_is_an_error_and_what_it_garbles_is_lost(line):
     arm, controller = line
     with pytest.raises(ValueError, match="P: refused: chamber beyond 20 kPa"):
         arm.write_pressures(np.full(N, 21.0))
-    controller.garbage = b"R K 1 2 3\n"
-    with pytest.raises(OSError, match="got 3 numbers, expected 18"):
-        arm.read_sensors()
-    controller.garbage = b"R K 1 2 x3\n"
-    with pytest.raises(OSError, match="'1 2 x3.*expected numbers"):
-        arm.read_sensors()
+    arm.timeout_s = 0.05
+    nine = b" 1 2 3 4 5 6 7 8 9"
+    for garbage, message in (
+        (b"R K 1 2 3\n", "got 'R' and 3 numbers, expected 'R' and 18"),
+        (b"R K 1 2 x3\n", "'1 2 x3', expected numbers"),
+        (b"P K" + 2 * nine + b"\n", "got 'P' and 18 numbers, expected 'R' and 18"),
+        (b"\n\n\xff R\n", "no answer within 50 ms"),
+        (b"R K" + 2 * nine, "no answer within 50 ms"),  # its end is missing: the last may be 98.7
+    ):
+        controller.garbage = garbage
+        with pytest.raises(TimeoutError, match=message):
+            arm.read_sensors()
+    arm.timeout_s, controller.garbage = TIMEOUT_S, b""
+    if isinstance(arm, SerialArm):
+        with pytest.raises(TimeoutError):  # this answer hangs on to the one without an end
+            arm.read_sensors()
+    assert arm.read_sensors().min() > 1e6
+
+
+def test_two_requests_without_an_answer_take_their_timeouts(line):
+    arm, controller = line
+    arm.timeout_s, controller.silent = 0.1, 2
+    begin_s = time.monotonic()
+    for ask in (arm.read_sensors, lambda: arm.write_pressures(np.zeros(N))):
+        with pytest.raises(TimeoutError):
+            ask()
+    assert 0.2 <= time.monotonic() - begin_s < 0.4
+
+
+def test_board_that_begins_anew_is_waited_for(request, monkeypatch):
+    pytest.importorskip("serial")
+    controller = Controller()
+    kind, end = serve_serial(controller)
+    request.addfinalizer(end)
+    kind.timeout_s, controller.silent = 0.05, 4
+    assert kind().read_sensors().min() > 1e6 and controller.silent == 0
+    monkeypatch.setattr(serial_line, "START_S", 0.2)
+    controller.silent = 100
+    with pytest.raises(OSError, match=r"/dev/.*: no readings within 0.2 s: R: no answer within 50 ms"):
+        kind()
+
+
+def test_line_that_cannot_be_sent_in_time_is_lost(monkeypatch):
+    pytest.importorskip("serial")
+    ends = (_, theirs) = pty.openpty()  # nobody reads at the other
+    tty.setraw(theirs)
+    monkeypatch.setattr(SerialArm, "_wait_for_answer", lambda _: None)
+    arm = type("Arm", (SerialArm,), {"port": os.ttyname(theirs), "n": N, "timeout_s": 0.02})()
+    with pytest.raises(TimeoutError, match="not sent within 20 ms"):
+        arm.send(1_000_000 * b"?")
+    for end in ends:
+        os.close(end)
 
 
 def test_recording_over_the_line(line, monkeypatch):
