@@ -91,7 +91,7 @@ def _workspace(spec: cli.SpecFile = None, out: Path = Path(".")) -> int:
         from mjx_softarm.mechanics import workspace_plot as plot
     except ImportError as error:
         raise InputError(
-            f"drawing needs matplotlib and scipy (pip install 'mjx-softarm[sim]'): {error}"
+            f"drawing needs matplotlib and scipy (pip install -e '.[sim]' in the checkout): {error}"
         ) from error
     from mjx_softarm.mechanics.workspace import extreme_poses
 

@@ -37,7 +37,7 @@ def open_arm(name: str) -> Any:
         try:
             return importlib.import_module(_TWIN).twin_of(item)
         except ImportError as error:
-            text = f"the twin needs MuJoCo (pip install 'mjx-softarm[sim]'): {error}"
+            text = f"the twin needs MuJoCo (pip install -e '.[sim]' in the checkout): {error}"
             raise ArmError(f"--arm: {text}") from error
         except ValueError as error:
             raise ArmError(f"--arm: {error}") from error

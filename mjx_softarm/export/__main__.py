@@ -28,7 +28,7 @@ def _check(golden: tyro.conf.Positional[Path], runtimes: tyro.conf.Positional[tu
     """Compare what policy files, graphs and programs answer with golden rows.
 
     Args:
-        golden: the rows, policy_golden.csv
+        golden: the rows, policy_golden.csv of `--onnx` or golden.csv of `--cpp`
         runtimes: policy.npz, policy.onnx, or a program that reads rows from its input and writes the outputs
     """
     if not runtimes:

@@ -97,7 +97,7 @@ def _by_onnx(golden: Golden, path: Path) -> tuple[np.ndarray, dict[str, np.ndarr
 
         from mjx_softarm.export.onnx_files import read_onnx
     except ImportError as error:
-        expected = "the packages of pip install 'mjx-softarm[onnx]'"
+        expected = "pip install -e '.[onnx]' in the checkout"
         raise InputError(f"{path}: got no {error.name}, expected {expected}") from error
     data, about = read_onnx(path)
     _same_policy(path, about["policy_sha256"], golden)
@@ -131,7 +131,7 @@ def _by_program(golden: Golden, path: Path) -> tuple[np.ndarray, dict[str, np.nd
     try:
         command, text = [str(path.resolve())], "\n".join([*lines, ""])
         done = subprocess.run(command, input=text, capture_output=True, text=True, timeout=_TIMEOUT_S)
-    except (OSError, subprocess.TimeoutExpired) as error:
+    except (OSError, subprocess.TimeoutExpired, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be run: {error}") from error
     first, *rest = done.stdout.splitlines() or [""]
     words = [*first.split(), *("",) * 4]

@@ -214,7 +214,7 @@ def read_golden(path: Path) -> Golden:
     Raises:
         InputError: the file cannot be read, is incomplete, changed or of another version.
     """
-    expected = "an unchanged file of golden rows of `python -m train export RUN --onnx`"
+    expected = "an unchanged file of golden rows: policy_golden.csv of `--onnx`, golden.csv of `--cpp`"
     try:
         data = path.read_bytes()
     except OSError as error:

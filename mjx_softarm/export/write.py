@@ -29,7 +29,7 @@ def export_onnx(policy_path: Path) -> list[Path]:
     try:
         from mjx_softarm.export.onnx_files import write_onnx
     except ImportError as error:
-        expected = "the packages of pip install 'mjx-softarm[onnx]'"
+        expected = "pip install -e '.[onnx]' in the checkout"
         raise InputError(f"--onnx: got no {error.name}, expected {expected}") from error
     controller, sha256 = _open(policy_path)
     n = controller.policy.spec.n_chambers

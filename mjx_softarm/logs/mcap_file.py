@@ -32,7 +32,9 @@ def require_mcap(where: str) -> None:
     try:
         import mcap  # noqa: F401
     except ImportError as error:
-        raise InputError(f"{where}: got no {error.name}, expected pip install 'mjx-softarm[mcap]'") from error
+        raise InputError(
+            f"{where}: got no {error.name}, expected pip install -e '.[mcap]' in the checkout"
+        ) from error
 
 
 def write_mcap(file: BinaryIO, columns: Sequence[Column], table: np.ndarray) -> None:

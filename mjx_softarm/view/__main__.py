@@ -52,7 +52,9 @@ def _view(
     try:
         import viser  # noqa: F401
     except ImportError as error:
-        raise InputError(f"the view needs viser (pip install 'mjx-softarm[view]'): {error}") from error
+        raise InputError(
+            f"the view needs viser (pip install -e '.[view]' in the checkout): {error}"
+        ) from error
     for option, path in (("--log", log), ("--html", html)):
         check_file(option, path)
     if logs:

@@ -9,7 +9,7 @@ FLAGS = ("--no-sandbox", "--use-gl=swiftshader", "--enable-unsafe-swiftshader", 
 
 @pytest.fixture(scope="session")
 def browser():
-    pytest.importorskip("viser", reason="needs viser: pip install 'mjx-softarm[view]'")
+    pytest.importorskip("viser", reason="needs viser: pip install -e '.[view]'")
     api = pytest.importorskip("playwright.sync_api", reason="needs Playwright: pip install playwright")
     path = shutil.which("chromium") or shutil.which("google-chrome")
     if path is None:

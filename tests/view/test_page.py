@@ -12,7 +12,7 @@ from mjx_softarm.view.live import Setup
 from mjx_softarm.view.look import look_at
 from tests.linear_arm import GOALS, POLICY, REST_M, N
 
-pytest.importorskip("viser", reason="needs viser: pip install 'mjx-softarm[view]'")
+pytest.importorskip("viser", reason="needs viser: pip install -e '.[view]'")
 import msgspec
 import viser
 from viser import _messages

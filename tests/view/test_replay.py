@@ -11,7 +11,7 @@ from mjx_softarm._support.errors import InputError
 from mjx_softarm.logs.schema import write_log
 from tests.linear_arm import GOALS, SPEC, LinearArm, go
 
-pytest.importorskip("viser", reason="needs viser: pip install 'mjx-softarm[view]'")
+pytest.importorskip("viser", reason="needs viser: pip install -e '.[view]'")
 from mjx_softarm.view.replay import SHARE_HZ, Replay, Track, share
 from mjx_softarm.view.stage import open_server
 

@@ -1,4 +1,4 @@
-"""Example driver over a serial port; needs pyserial (`pip install 'mjx-softarm[serial]'`)."""
+"""Example driver over a serial port; needs pyserial (`pip install -e '.[serial]'` in the checkout)."""
 
 from __future__ import annotations
 
