@@ -30,6 +30,7 @@ from typing import NamedTuple
 from mjx_softarm._support.xp import Array, array_namespace
 from mjx_softarm.spec import ArmSpec
 
+AT_LIMIT_KPA = 0.2  # distance to a limit at which a measured, noisy pressure counts as at it
 TOLERANCE_M = 1e-3  # greatest error of a spring that counts as on its reference, unless a run says otherwise
 
 
@@ -45,6 +46,11 @@ class Gains(NamedTuple):
     def from_spec(cls, spec: ArmSpec) -> Gains:
         limits_kpa = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
         return cls(spec.control.kp_kpa_per_m, spec.control.ki_kpa_per_ms, *limits_kpa)
+
+    def measured(self) -> Gains:
+        """Return the gains with limits AT_LIMIT_KPA within their own, for `saturated` of measured pressures."""
+        low, high = self.pressure_min_kpa + AT_LIMIT_KPA, self.pressure_max_kpa - AT_LIMIT_KPA
+        return self._replace(pressure_min_kpa=low, pressure_max_kpa=high)
 
 
 def pressures(

@@ -103,7 +103,7 @@ def _reaching(text: str, value: str, met: Any, *groups: Sequence[Row]) -> Check:
 
 def _missed(rows: Sequence[Row]) -> tuple[int, int]:
     """Return the number of missed goal poses, and of the runs that missed any."""
-    missed = [row["points"] - row["reached"] for row in rows]
+    missed = [row["points"] - row["measured"] for row in rows]
     return sum(missed), sum(n > 0 for n in missed)
 
 

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy import faults
 from mjx_softarm.deploy import measure as accuracy
 from mjx_softarm.deploy.controller import Controller
@@ -125,16 +126,17 @@ def captured_finger_tips(tip_m: np.ndarray, quaternion: np.ndarray, gripper_m: f
 def operate(
     twin: Any, controller: Controller, goals: np.ndarray, names: Sequence[str], objects: str = ""
 ) -> Outcome:
-    """Follow goals (p, 6) [mm, deg], picking and placing as their names say."""
+    """Follow goals (p, 6) [mm, deg], picking and placing as their names say; raises as `measure`."""
     gripper_m = controller.policy.spec.mass.gripper_length_m
     forces: list[tuple[float, float]] = []
     watched: Any = WatchedTwin(twin, lambda: forces.append(twin.wall_force_n()))
     gripper = Gripper(watched, names, finger_tips(goals, gripper_m), objects, gripper_m)
     run = follow(watched, controller, goals, arrived=gripper.arrived)
+    outcome = measure(run, controller, goals)
     force_n = np.zeros((len(run.log), 2))
     n = min(len(forces), len(force_n))  # a lost arm takes no more pressures; venting is not logged
-    force_n[:n] = forces[:n]
-    return measure(run, controller, goals)._replace(
+    force_n[:n] = np.reshape(forces[:n], (n, 2))
+    return outcome._replace(
         name=np.array(names),
         success=gripper.success,
         wall_n=force_n[:, 0].astype(np.float32),
@@ -143,8 +145,15 @@ def operate(
 
 
 def measure(run: Run, controller: Controller, goals: np.ndarray) -> Outcome:
-    """Return the outcome of a run towards goals (p, 6) [mm, deg], without objects and contact forces."""
+    """Return the outcome of a run towards goals (p, 6) [mm, deg], without objects and contact forces.
+
+    Raises:
+        InputError: no tick was logged.
+    """
     log, policy = run.log, controller.policy
+    if not len(log):
+        cause = run.ending.cause or "all were refused"
+        raise InputError(f"goals: got {len(goals)} and no tick of the loop: {cause}, expected one to go to")
     assert log.pressure_kpa is not None and log.reference_m is not None and log.goal is not None
     assert log.tip_m is not None and log.tip_quaternion is not None  # a twin has motion capture
     spring_m = policy.sensor.lengths(log.readings, np.nan).length_m
@@ -157,7 +166,7 @@ def measure(run: Run, controller: Controller, goals: np.ndarray) -> Outcome:
         events=np.array([counts.get(fault, 0) for fault in faults.Fault]),
         latency_s=np.quantile(run.latency_s, (0.5, 0.999)),
         time_s=log.time_s,
-        point=np.array([accuracy.point_of(goal, goals) for goal in log.goal]),
+        point=_points(run, goals),
         reference_m=log.reference_m.astype(np.float32),
         spring_m=spring_m.astype(np.float32),
         pressure_kpa=log.pressure_kpa.astype(np.float32),
@@ -165,6 +174,19 @@ def measure(run: Run, controller: Controller, goals: np.ndarray) -> Outcome:
         wall_n=np.zeros(len(log), np.float32),
         container_n=np.zeros(len(log), np.float32),
     )
+
+
+def _points(run: Run, goals: np.ndarray) -> np.ndarray:
+    """Return the index among goals (p, 6) of each tick's goal (t,), -1 without one."""
+    point, begin, first = np.full(len(run.log), -1), 0, 0
+    assert run.log.goal is not None
+    for arrival in run.arrivals:
+        point[begin : arrival.row + 1] = arrival.index
+        begin, first = arrival.row + 1, arrival.index + 1
+    for k in range(begin, len(point)):  # on the way to the goal at which the run ended
+        if np.isfinite(run.log.goal[k]).all():
+            point[k] = first + np.argmin(np.abs(goals[first:] - run.log.goal[k]).sum(axis=1))
+    return point
 
 
 def save_outcome(path: Path, outcome: Outcome) -> None:
@@ -182,10 +204,10 @@ def load_outcome(path: Path) -> Outcome:
 
 
 def figures(outcome: Outcome) -> dict[str, Any]:
-    """Return the figures of one trial; errors over the goals that were reached, NaN without any."""
-    reached = accuracy.Accuracy(*(getattr(outcome, name) for name in accuracy.Accuracy._fields))
+    """Return the figures of one trial; errors over the goals that were measured, NaN without any."""
+    errors = accuracy.Accuracy(*(getattr(outcome, name) for name in accuracy.Accuracy._fields))
     return {
-        **accuracy.figures(reached, dict(zip(faults.Fault, outcome.events, strict=True))),
+        **accuracy.figures(errors, dict(zip(faults.Fault, outcome.events, strict=True))),
         "operations": int(outcome.operation.sum()),
         "done": int(outcome.success.sum()),
         "calm_percent": 100 * float(np.mean(outcome.wall_n < CALM_N)),

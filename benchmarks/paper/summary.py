@@ -144,7 +144,7 @@ def spreads(table: Sequence[Row]) -> list[dict[str, Any]]:
             "variant": variant,
             "load_g": load_g,
             "runs": len(rows),
-            "incomplete_runs": sum(row["reached"] < row["points"] for row in rows),
+            "incomplete_runs": sum(row["measured"] < row["points"] for row in rows),
             "all_done_runs": sum(map(all_done, rows)),
             **{name: spread([row[name] for row in rows]) for name in FIGURES},
             "paper": paper_numbers(kind, variant, load_g),

@@ -19,7 +19,7 @@ from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.arms import open_arm
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.ending import FAULT, save_log
-from mjx_softarm.deploy.measure import figures, measure, read_goals, write_accuracy
+from mjx_softarm.deploy.measure import figures, measure, read_goals, require_motion_capture, write_accuracy
 from mjx_softarm.deploy.record import record
 from mjx_softarm.deploy.session import Run, follow
 from mjx_softarm.logs import mcap_file
@@ -121,22 +121,24 @@ def _measure(
     if out.exists():
         raise InputError(f"--out: got {out}, which is there already, expected a new folder")
     driver = open_arm(arm)
-    if not hasattr(driver, "motion_capture"):
-        raise InputError(f"--arm: got {arm}, which has no motion_capture, expected an arm that has")
+    require_motion_capture(driver, f"--arm: {arm}")
     out.mkdir(parents=True)
     run = follow(driver, controller, poses, tell=_tell, save=partial(save_log, out / "log.npz"))
     if not run.arrivals:
         _summary(run)
         return run.status
     accuracy = measure(run, controller, poses)
-    found = figures(accuracy, run.counts()) | {"seconds": float(run.log.time_s[-1])}
+    found = figures(accuracy, run.counts()) | {
+        "reached": sum(arrival.reached for arrival in run.arrivals),
+        "seconds": float(run.log.time_s[-1]),
+    }
     if missing := write_accuracy(out, accuracy, found):
         print(missing)
     for name, unit, most in (("translation", "mm", "max_mm"), ("rotation", "deg", "rotation_max_deg")):
         mean, high, most = found[f"{name}_{unit}"], found[f"{name}_95_{unit}"], found[most]
         print(f"{name} [{unit}]: mean {mean:.2f}, 95 % below {high:.2f}, at most {most:.2f}")
     n_saturated = found["saturated_points"]
-    print(f"{found['reached']} of {found['points']} points, {n_saturated} with a saturated chamber")
+    print(f"{found['measured']} of {found['points']} goals measured, {n_saturated} with a saturated chamber")
     print(f"figures: {out / 'accuracy.json'}")
     _summary(run)
     return run.status

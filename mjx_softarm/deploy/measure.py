@@ -6,6 +6,7 @@ Motion capture is noisy: an error is the mean over the window in which the sprin
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,12 +17,16 @@ from mjx_softarm._support.errors import InputError
 from mjx_softarm.control import saturated
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.faults import Fault
+from mjx_softarm.deploy.link import describe
 from mjx_softarm.deploy.session import Run, seen_error
 from mjx_softarm.logs.tables import read_table
 from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.sensing.pose import pose_error
 
-AT_LIMIT_KPA = 0.1  # distance to a pressure limit that counts as at it, for a window's mean
+LOOKS, LOOK_S = (
+    50,
+    0.02,
+)  # frames of motion capture asked for before an arm moves, and the time between two [s]
 POSE_NAMES = ("x_mm", "y_mm", "z_mm", "yaw_deg", "pitch_deg", "roll_deg")
 GOAL_COLUMNS = ("x [mm]", "y [mm]", "z [mm]", "yaw [deg]", "pitch [deg]", "roll [deg]")
 
@@ -72,20 +77,39 @@ def grid_poses(workspace: np.ndarray, n: int) -> np.ndarray:
     return np.asarray(workspace[chosen], float)
 
 
+def require_motion_capture(arm: Any, where: str) -> None:
+    """Look, for a second at most, before an arm moves.
+
+    Raises:
+        InputError: motion capture does not see the tip; the message begins with `where`.
+    """
+    why = f"{where}: got an arm without the method motion_capture"
+    for _ in range(LOOKS if hasattr(arm, "motion_capture") else 0):
+        try:
+            if np.isfinite(arm.motion_capture().tip_m).all():
+                return
+            why = f"{where}: got motion capture that does not see the tip"
+        except Exception as error:  # a driver may raise anything
+            why = f"{where}: got no frame of motion capture: {describe(error)}"
+        time.sleep(LOOK_S)
+    raise InputError(f"{why}, expected a frame with the tip")
+
+
 def measure(run: Run, controller: Controller, goals: np.ndarray) -> Accuracy:
-    """Return the accuracy of a run towards goals (p, 6) [mm, deg], on an arm with motion capture."""
+    """Return the accuracy of a run towards goals (p, 6) [mm, deg], on an arm with motion capture.
+
+    Raises:
+        InputError: motion capture saw nothing, or no tick was logged.
+    """
     log, policy, window = run.log, controller.policy, controller.window
     error, believed = np.full((2, *goals.shape), np.nan)
     mask, arrival_s = np.zeros((len(goals), policy.spec.n_chambers), bool), np.full(len(goals), np.nan)
-    gains = policy.gains._replace(
-        pressure_min_kpa=policy.gains.pressure_min_kpa + AT_LIMIT_KPA,
-        pressure_max_kpa=policy.gains.pressure_max_kpa - AT_LIMIT_KPA,
-    )
+    if log.tip_m is None or log.tip_quaternion is None:
+        raise InputError(f"motion capture: got no frame in {len(log)} ticks, expected the tip")
     # Means over the window that ends with each arrival.
     for arrival in run.arrivals:
-        point = point_of(arrival.goal, goals)
+        point = arrival.index
         assert log.pressure_kpa is not None and log.reference_m is not None and log.readings is not None
-        assert log.tip_m is not None and log.tip_quaternion is not None  # it has motion capture
         rows = slice(max(0, arrival.row + 1 - window), arrival.row + 1)
         error[point] = seen_error(log.tip_m[rows], log.tip_quaternion[rows], arrival.goal)
         believed[point] = pose_error(np.asarray(arrival.estimate, float), arrival.goal)
@@ -94,37 +118,33 @@ def measure(run: Run, controller: Controller, goals: np.ndarray) -> Accuracy:
             log.pressure_kpa[rows].mean(axis=0),
             log.reference_m[arrival.row],
             policy.sensor.lengths(log.readings[rows], np.nan).length_m.mean(axis=0),
-            gains,
+            policy.gains.measured(),
             policy.tolerance_m,
         )
     return Accuracy(goals, error, believed, mask, arrival_s)
 
 
-def point_of(goal: np.ndarray, goals: np.ndarray) -> int:
-    """Return the index of a goal among goals (p, 6); -1 where there is none."""
-    return -1 if np.isnan(goal).any() else int(np.argmin(np.abs(goals - goal).sum(axis=1)))
-
-
 def figures(accuracy: Accuracy, events: Mapping[Fault, int]) -> dict[str, Any]:
-    """Return the figures of an accuracy, errors over the goals that were reached, NaN without any.
+    """Return the figures of an accuracy, errors over the goals that were measured, NaN without any.
 
+    A goal is measured if the tip arrived and was seen, however far off.
     Rotation is the norm of the errors of yaw, pitch and roll.
 
     Args:
         accuracy: errors and saturation.
         events: how often each fault was reported.
     """
-    reached = np.isfinite(accuracy.error).all(axis=1)
-    n_reached = int(reached.sum())
+    measured = np.isfinite(accuracy.error).all(axis=1)
+    n_measured = int(measured.sum())
     error, believed = (
-        values[reached] if n_reached else np.full((1, 6), np.nan)
+        values[measured] if n_measured else np.full((1, 6), np.nan)
         for values in (accuracy.error, accuracy.believed)
     )
     away, turned = np.linalg.norm(error[:, :3], axis=1), np.linalg.norm(error[:, 3:], axis=1)
     per_point = accuracy.saturated.sum(axis=1)
     return {
         "points": len(accuracy.goal),
-        "reached": n_reached,
+        "measured": n_measured,
         "translation_mm": float(away.mean()),
         "translation_95_mm": float(np.quantile(away, 0.95)),
         "rmse_mm": float(np.sqrt(np.mean(away**2))),

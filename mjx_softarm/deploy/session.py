@@ -33,6 +33,7 @@ class Arrival(NamedTuple):
     goal: np.ndarray  # (6,) [mm, deg]
     estimate: np.ndarray  # (6,) [mm, deg] pose believed in
     row: int  # index of the log's row
+    index: int  # of the goal among those asked for
     reached: bool = True  # within the policy's threshold of a goal, by motion capture if there is any
 
 
@@ -252,7 +253,7 @@ class _Session:
             error, how = pose_error(np.asarray(estimate, float), goal), "the springs"
         reward = self.controller.policy.reward
         reached = bool(np.linalg.norm(scaled_error(goal + error, goal, reward)) < reward.threshold)
-        self.arrivals.append(Arrival(goal, estimate, len(self.rows) - 1, reached))
+        self.arrivals.append(Arrival(goal, estimate, len(self.rows) - 1, self.n_taken - 1, reached))
         angles = ", ".join(f"{value:+.1f}" for value in error[3:])
         off = f"{np.linalg.norm(error[:3]):.1f} mm off by {how}; yaw, pitch, roll {angles} deg off"
         missed = "" if reached else "; NOT REACHED"

@@ -14,8 +14,6 @@ from mjx_softarm.sensing.pose import pose_error, pose_from_quaternion
 from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.spec import ArmSpec
 
-AT_LIMIT_KPA = 0.2  # of a limit: measured pressures are noisy
-
 
 class Look(NamedTuple):
     """Numbers to show; NaN where one is not known."""
@@ -52,8 +50,7 @@ class Limits(NamedTuple):
 
     def saturated(self, look: Look) -> np.ndarray:
         """Return which chambers (n,) are at a limit with their springs off the references."""
-        low, high = self.gains.pressure_min_kpa + AT_LIMIT_KPA, self.gains.pressure_max_kpa - AT_LIMIT_KPA
-        gains = self.gains._replace(pressure_min_kpa=low, pressure_max_kpa=high)
+        gains = self.gains.measured()
         return saturated(look.pressure_kpa, look.reference_m, look.spring_m, gains, TOLERANCE_M)
 
 

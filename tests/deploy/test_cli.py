@@ -111,12 +111,17 @@ def test_accuracy_is_measured_without_jax(folder):
     header = "x [mm],y [mm],z [mm],yaw [deg],pitch [deg],roll [deg]"
     (folder / "goals.csv").write_text(f"{header}\n{','.join(map(str, goal))}\n")
     done = command(folder, *measure)
-    assert done.stdout.startswith("2 ") and "has no motion_capture" in done.stderr
+    assert (
+        done.stdout.startswith("2 ")
+        and "driver:Arm: got an arm without the method motion_capture" in done.stderr
+    )
     with (folder / "driver.py").open("a") as file:
         file.write(seen)
     done = command(folder, *measure)
     assert done.stderr == "" and done.stdout.endswith("1 []\n") and "NOT REACHED" in done.stdout
     found = json.loads((folder / "a" / "accuracy.json").read_text())
+    assert (found["points"], found["measured"], found["reached"]) == (1, 1, 0)
+    assert "1 of 1 goals measured" in done.stdout and "0 of 1 goals reached" in done.stdout
     off_mm = np.linalg.norm(goal[:3] - [0.0, 0.0, -500.0])
     assert found["translation_mm"] == found["max_mm"] == pytest.approx(off_mm)
     assert found["saturated_points"] == 1 and len(read_log(folder / "a" / "log.npz")[0]) > 100

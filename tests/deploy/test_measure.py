@@ -9,11 +9,18 @@ from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.arm_io import Capture
 from mjx_softarm.deploy.ending import DONE, FAULT, MISSED
 from mjx_softarm.deploy.faults import Fault
-from mjx_softarm.deploy.measure import figures, grid_poses, measure, read_goals, write_accuracy
+from mjx_softarm.deploy.measure import (
+    figures,
+    grid_poses,
+    measure,
+    read_goals,
+    require_motion_capture,
+    write_accuracy,
+)
 from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.sensing.estimator import estimate
 from mjx_softarm.sensing.pose import quaternion_from_pose
-from tests.linear_arm import CONTROLLER, FAR, GOALS, POLICY, LinearArm, go
+from tests.linear_arm import CONTROLLER, FAR, GOALS, POLICY, LinearArm, N, go
 
 OFF_MM = np.array([1.0, -2.0, 2.0])
 
@@ -42,11 +49,51 @@ def test_error_is_that_by_motion_capture(tmp_path):
     assert not found.saturated.any() and (np.diff(found.arrival_s) > 0.0).all()
     assert len(lines) == 2 and all("mm off by motion capture" in line for line in lines)
     numbers = figures(found, run.counts())
-    assert numbers["reached"] == numbers["points"] == 2
+    assert numbers["measured"] == numbers["points"] == 2
     assert numbers["translation_mm"] == pytest.approx(3.0, abs=0.4) and run.status == DONE
     pytest.importorskip("matplotlib")
     assert write_accuracy(tmp_path, found, numbers) == "" and (tmp_path / "accuracy.png").stat().st_size > 0
     assert json.loads((tmp_path / "accuracy.json").read_text())["at"][1]["goal"] == GOALS[1].tolist()
+
+
+def test_goal_that_comes_again_is_a_goal_of_its_own():
+    goals = GOALS[[0, 1, 0]]
+    found = measure(go(Seen(), goals=[FAR, *goals]), CONTROLLER, np.array([FAR, *goals]))
+    assert np.isnan(found.error[0]).all() and np.isfinite(found.error[1:]).all()
+    assert (np.diff(found.arrival_s[1:]) > 0.0).all()
+
+
+class Dark(Seen):
+    """Motion capture that misses its first frames."""
+
+    def __init__(self, n_missed):
+        super().__init__()
+        self.n_missed = n_missed
+        self.write_pressures(np.zeros(N))  # past a frame that is dropped
+
+    def motion_capture(self):
+        self.n_missed -= 1
+        if self.n_missed >= 0:
+            raise OSError("no camera")
+        return super().motion_capture()
+
+
+def test_motion_capture_is_looked_at_before_the_arm_moves(monkeypatch):
+    monkeypatch.setattr("mjx_softarm.deploy.measure.LOOK_S", 0.0)
+    require_motion_capture(Dark(3), "--arm")
+    unseen = Dark(0)
+    unseen.off_mm = np.nan * OFF_MM
+    for arm, message in (
+        (LinearArm(), "--arm: got an arm without the method motion_capture, expected a frame"),
+        (Dark(10**6), "--arm: got no frame of motion capture: no camera, expected a frame"),
+        (unseen, "--arm: got motion capture that does not see the tip, expected a frame"),
+    ):
+        with pytest.raises(InputError, match=message):
+            require_motion_capture(arm, "--arm")
+    run = go(Dark(10**6), goals=GOALS[:1])
+    assert run.arrivals
+    with pytest.raises(InputError, match=r"motion capture: got no frame in [0-9]+ ticks"):
+        measure(run, CONTROLLER, GOALS[:1])
 
 
 def test_quantiles_and_rotation_by_hand():
@@ -55,7 +102,7 @@ def test_quantiles_and_rotation_by_hand():
     found.error[:20, :3] = np.arange(1.0, 21.0)[:, None] * [0.6, 0.0, 0.8]
     found.error[:20, 3:] = [2.0, -1.0, 2.0]
     numbers = figures(found, {Fault.SATURATED: 2})
-    assert (numbers["points"], numbers["reached"], numbers["saturation_events"]) == (21, 20, 2)
+    assert (numbers["points"], numbers["measured"], numbers["saturation_events"]) == (21, 20, 2)
     assert (numbers["translation_mm"], numbers["max_mm"]) == pytest.approx((10.5, 20.0))
     assert numbers["translation_95_mm"] == pytest.approx(19.05)
     assert (numbers["rotation_deg"], numbers["rotation_max_deg"]) == pytest.approx((3.0, 3.0))

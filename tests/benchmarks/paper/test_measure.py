@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
 from benchmarks.paper.measure import (
     GRASP_M,
@@ -12,8 +13,11 @@ from benchmarks.paper.measure import (
     finger_tips,
     load_outcome,
     measure,
+    operate,
     save_outcome,
 )
+from mjx_softarm._support.errors import InputError
+from mjx_softarm.deploy.arm_io import Capture
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.ending import Ending
 from mjx_softarm.deploy.faults import Event, Fault
@@ -22,6 +26,7 @@ from mjx_softarm.logs.schema import Log
 from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.mechanics.pipe import APPLE_KG, BALL_KG
 from tests.benchmarks.paper.made_up import GRIPPER_M, N, made_up, make_policy
+from tests.linear_arm import CONTROLLER, FAR, GOALS, LinearArm, go
 
 DOWN = np.array([1.0, 0.0, 0.0, 0.0])  # quaternion of a gripper that hangs straight
 NAMES = ("home", "pick right", "to place left 1", "place left", "pick bottom", "place right")
@@ -54,7 +59,7 @@ def test_errors_are_averaged_over_the_window_of_rest(make_arm_model):
         reference_m=reference_m,
         goal=np.tile(goals[1], (n_rows, 1)),
     )
-    arrival = Arrival(goals[1], goals[1] + [1.0, 0, 0, 0, 0, 0], n_rows - 1)
+    arrival = Arrival(goals[1], goals[1] + [1.0, 0, 0, 0, 0, 0], n_rows - 1, 1)
     events = (Event(Fault.SATURATED, ""), Event(Fault.SATURATED, ""))
     run = Run(log, (arrival,), events, np.array([1e-4] * 10), Ending())
     outcome = measure(run, controller, goals)
@@ -66,8 +71,30 @@ def test_errors_are_averaged_over_the_window_of_rest(make_arm_model):
     assert np.allclose(outcome.spring_m, 0.2)
     assert set(outcome.point) == {1}
     row = figures(outcome)
-    assert (row["reached"], row["points"], row["saturation_events"]) == (1, 2, 2)
+    assert (row["measured"], row["points"], row["saturation_events"]) == (1, 2, 2)
     assert np.isclose(row["believed_mm"], 1.0)
+
+
+class Still(LinearArm):
+    """An arm whose tip is always seen in one place."""
+
+    def motion_capture(self):
+        return Capture(np.zeros(3), DOWN, np.zeros((0, 3)))
+
+
+def test_each_tick_has_its_goal():
+    goals = GOALS[[0, 1, 0]]
+    run = go(Still(), goals=goals)
+    point = measure(run, CONTROLLER, goals).point
+    assert (np.diff(point) >= 0).all() and np.unique(point).tolist() == [0, 1, 2]
+    assert np.flatnonzero(np.diff(point)).tolist() == [arrival.row for arrival in run.arrivals[:2]]
+    cut = run._replace(arrivals=run.arrivals[:2])  # the last goal was never arrived at
+    assert measure(cut, CONTROLLER, goals).point.tolist() == point.tolist()
+
+
+def test_goals_that_are_all_refused_are_told():
+    with pytest.raises(InputError, match="goals: got 1 and no tick of the loop: all were refused"):
+        operate(Still(), CONTROLLER, np.array([FAR]), ["home"])
 
 
 def test_figures_of_a_circle_by_hand():
@@ -79,14 +106,14 @@ def test_figures_of_a_circle_by_hand():
     assert row["max_mm"] == 5.0
     assert (row["yaw_deg"], row["pitch_deg"], row["roll_deg"]) == (2.0, 1.0, 1.5)
     assert (row["saturated_points"], row["saturated_chambers_max"]) == (2, 2)
-    assert (row["reached"], row["points"], row["operations"]) == (2, 6, 0)
+    assert (row["measured"], row["points"], row["operations"]) == (2, 6, 0)
 
 
 def test_figures_of_a_task_by_hand():
     outcome = made_up("pipe", (1.0, -2.0, 2.0), reported=3, fails=(3,), pressed=0.03, missed=(1, 2, 3))
     outcome.error[0, :3] = 4.0, 0.0, 0.0
     row = figures(outcome)
-    assert (row["points"], row["reached"], row["operations"], row["done"]) == (28, 25, 4, 3)
+    assert (row["points"], row["measured"], row["operations"], row["done"]) == (28, 25, 4, 3)
     assert np.allclose([row["x_mm"], row["y_mm"], row["z_mm"]], [28 / 25, 48 / 25, 48 / 25])
     assert np.isclose(row["translation_mm"], (4 + 24 * 3) / 25)
     assert np.isclose(row["calm_percent"], 97.0)
