@@ -156,7 +156,7 @@ def figures(accuracy: Accuracy, events: Mapping[Fault, int]) -> dict[str, Any]:
         "believed_mm": float(np.linalg.norm(believed[:, :3], axis=1).mean()),
         "saturated_points": int(np.count_nonzero(per_point)),
         "saturated_chambers_max": int(per_point.max()),
-        "saturation_events": events.get(Fault.SATURATED, 0),
+        "saturation_events": int(events.get(Fault.SATURATED, 0)),
         "events": {fault.value: int(n) for fault, n in events.items() if n},
     }
 
