@@ -23,6 +23,9 @@ FIGURES = (
     "p95_mm",
     "reached_share",
     "saturated_share",
+    "even_median_mm",
+    "even_p95_mm",
+    "even_reached_share",
     "circle_mean_mm",
     "circle_max_mm",
     "circle_saturated_chambers",
@@ -35,6 +38,7 @@ _COLUMNS = (
     ("p95_mm", "95 % [mm]", 1, 2),
     ("reached_share", "goals\nreached [%]", 100, 1),
     ("saturated_share", "saturated [%]", 100, 1),
+    ("even_median_mm", "uniform in\nvolume [mm]", 1, 2),
     ("circle_mean_mm", "circle,\nmean [mm]", 1, 2),
 )
 
@@ -47,7 +51,8 @@ def by_settings(runs: Sequence[Run], settings_of: Callable[[Run], dict[str, Any]
         settings_of: settings that the runs of a group share.
 
     Returns:
-        For each group `settings`, `runs` with their figures, and `over_seeds`: mean, least and greatest.
+        For each group `settings`, `runs` with their figures, and `over_seeds`: mean, least and greatest; for
+        polished runs `tqc_alone_over_seeds` too.
 
     Raises:
         RunError: a run is not finished.
@@ -57,7 +62,11 @@ def by_settings(runs: Sequence[Run], settings_of: Callable[[Run], dict[str, Any]
         settings = settings_of(run)
         group = groups.setdefault(json.dumps(settings, sort_keys=True), {"settings": settings, "runs": []})
         group["runs"].append(_figures(run))
-    return [{**group, "over_seeds": _spread(group["runs"])} for group in groups.values()]
+    for group in groups.values():
+        group["over_seeds"] = _spread(group["runs"])
+        if all("tqc_alone" in row for row in group["runs"]):  # polished runs
+            group["tqc_alone_over_seeds"] = _spread([row["tqc_alone"] for row in group["runs"]])
+    return list(groups.values())
 
 
 def _figures(run: Run) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from train.runs.checkpoint import Run
 from train.runs.evaluate import Evaluator
 from train.runs.run import evaluation_after, restore_policy, train
 from train.runs.task import task_of
+from train.sweep.report import by_settings
 
 POLISHED = dataclasses.replace(CONFIG, polish_updates=512)
 N_TQC, N = POLISHED.n_own_epochs, POLISHED.n_epochs  # epochs
@@ -79,6 +80,9 @@ def test_both_parts_are_told_apart_and_the_polished_policy_is_exported(task, run
     assert rows[-1]["analytic/loss"] < rows[N_TQC]["analytic/loss"]
     assert rows[-1]["evaluation/median_mm"] < evaluation_after(run, N_TQC)["median_mm"]
     assert same(restore_policy(run, task)[1], task.job.policy(states[N]))
+    [group] = by_settings([run], lambda run: {})
+    for part, epoch in (("tqc_alone_over_seeds", N_TQC), ("over_seeds", N)):
+        assert group[part]["median_mm"]["mean"] == evaluation_after(run, epoch)["median_mm"]
 
 
 def test_another_run_may_begin_with_its_policy_and_critics(task, states):

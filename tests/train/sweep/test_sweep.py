@@ -281,6 +281,7 @@ def test_the_table_has_mean_least_and_greatest_over_the_seeds(finished):
         "95 % [mm]": ["10.50\n(10.00 to 11.00)"] * 2,
         "goals reached [%]": ["37.5\n(25.0 to 50.0)"] * 2,
         "saturated [%]": ["0.0\n(0.0 to 0.0)"] * 2,
+        "uniform in volume [mm]": ["0.00\n(0.00 to 0.00)"] * 2,
         "circle, mean [mm]": ["1.00\n(1.00 to 1.00)"] * 2,
     }
     written = json.loads((finished.path / RESULTS_FILE).read_text())
