@@ -13,21 +13,17 @@ from typing import Any, NamedTuple
 from mjx_softarm.deploy.link import Link, describe
 from mjx_softarm.logs.schema import Log, write_log
 
-DONE, MISSED, NOT_WRITTEN, FAULT, INTERRUPTED = (
-    0,
-    1,
-    2,
-    3,
-    130,
-)  # exit statuses; 128 and its number after a signal
+# Exit statuses; after a signal, 128 and its number.
+DONE, MISSED, NOT_WRITTEN, FAULT, INTERRUPTED = 0, 1, 2, 3, 130
 _INTERRUPTS = {"drive": 0, "vent": 1, "save": 2}  # Ctrl-C so far that a step goes on after
 
 
 class Terminated(BaseException):
-    """A signal that asks the process to end."""
+    """A signal that ends a step."""
 
     def __init__(self, number: int):
-        super().__init__(f"ended by {signal.Signals(number).name}")
+        by = f"ended by {signal.Signals(number).name}"
+        super().__init__("interrupted" if number == signal.SIGINT else by)
         self.number = number
 
 
@@ -45,51 +41,82 @@ def vent_at_end(
     """Run `body`, vent the arm and save the log, whatever happens on the way.
 
     Any exception, Ctrl-C, SIGTERM and SIGHUP end the body. While the arm is vented and the log written, they
-    are told and change nothing, but for a second Ctrl-C, which ends the venting.
+    are noted and change nothing, but for a second Ctrl-C, which ends the venting. Nothing is told before the
+    arm is vented and the log written, since a terminal may block.
 
     Args:
         body: drives the arm.
         link: the arm.
-        tell: takes a line for each thing that goes wrong; what it raises then is ignored.
+        tell: takes a line for each thing that went wrong; what it raises then is ignored.
         save: writes the log.
     """
-    finish = _Finish({"drive": body, "vent": link.vent, "save": save}, tell)
-    with _signals_raise():
+    finish = _Finish({"drive": body, "vent": link.vent, "save": save})
+    with _signals(finish.on_signal):
         finish.run()
+    for line in finish.lines:
+        with contextlib.suppress(Exception):
+            tell(line)
     return Ending("; ".join(finish.causes), finish.status, finish.vented)
 
 
 class _Finish:
     """Steps that follow one another, whatever each of them raises."""
 
-    def __init__(self, steps: dict[str, Callable[[], Any]], tell: Callable[[str], Any]):
-        self._steps, self._tell = steps, tell
-        self._left, self._untold, self._n_interrupts = list(steps), [], 0
+    def __init__(self, steps: dict[str, Callable[[], Any]]):
+        self._steps, self._running = steps, ""
+        self._signals: list[int] = []  # that ended no step
+        self._n_interrupts = 0
         self.causes: list[str] = []
+        self.lines: list[str] = []  # to be told
         self.status, self.vented = DONE, True
 
     def run(self) -> None:
-        while self._left or self._untold:
-            try:  # all that takes time stands in here: an interrupt may come anywhere
-                while self._untold:
-                    with contextlib.suppress(Exception):
-                        self._tell(self._untold.pop(0))
-                if self._left:
-                    self._steps[self._left[0]]()
-                    self._left.pop(0)
-            except BaseException as error:
-                self._note(error)
+        left = list(self._steps)
+        while left:
+            step = left[0]
+            error = self._attempt(step)
+            goes_on = error is not None and self._note(step, error)
+            if not goes_on:
+                left.pop(0)
+            while self._signals:
+                self._note(step, Terminated(self._signals.pop(0)), ended=False)
 
-    def _note(self, error: BaseException) -> None:
-        step = self._left[0] if self._left else ""
+    def on_signal(self, number: int, _frame: Any) -> None:
+        """Raise in the step that the signal ends, once; note it otherwise."""
+        self._n_interrupts += number == signal.SIGINT
+        ends = number == signal.SIGINT and self._n_interrupts > _INTERRUPTS.get(self._running, 2)
+        if self._running and (ends or self._running == "drive"):
+            self._running = ""
+            raise Terminated(number)
+        self._signals.append(number)
+
+    def _attempt(self, step: str) -> BaseException | None:
+        """Return what a step raised; a signal may come at any place in here, even as another error does."""
+        try:
+            try:
+                self._running = step
+                self._steps[step]()
+                self._running = ""
+            except BaseException as error:
+                self._running = ""
+                return error
+        except Terminated as error:
+            return error
+        return None
+
+    def _note(self, step: str, error: BaseException, ended: bool = True) -> bool:
+        """Note an error or a signal; return whether the step goes on after it."""
         signalled = isinstance(error, (KeyboardInterrupt, Terminated))
-        self._n_interrupts += isinstance(error, KeyboardInterrupt)
-        text = (str(error) or "interrupted") if signalled else describe(error)
-        goes_on = signalled and step != "drive" and self._n_interrupts <= _INTERRUPTS.get(step, 2)
+        self._n_interrupts += isinstance(error, KeyboardInterrupt)  # raised by the body itself
+        goes_on = not ended or (
+            signalled and step != "drive" and self._n_interrupts <= _INTERRUPTS.get(step, 2)
+        )
         if signalled:
+            text = str(error) or "interrupted"
             number = error.number if isinstance(error, Terminated) else signal.SIGINT
             self.status = self.status or 128 + number
         else:
+            text = describe(error)
             self.status = NOT_WRITTEN if step == "save" else FAULT
         if step == "vent" and not goes_on:
             self.vented = False
@@ -97,37 +124,38 @@ class _Finish:
         elif step == "save" and not goes_on:
             text = f"log not written: {text}"
         self.causes.append(text)
-        self._untold.append(f"{text} -> vent" if step == "drive" else text)
-        if step and not goes_on:
-            self._left.pop(0)
+        self.lines.append(f"{text} -> vented" if step == "drive" else text)
+        return goes_on
 
 
 @contextlib.contextmanager
-def _signals_raise() -> Iterator[None]:
-    """Let SIGTERM, and SIGHUP of a terminal that closes, raise `Terminated`, as SIGINT raises by itself."""
-
-    def end(number: int, _frame: Any) -> None:
-        raise Terminated(number)
-
-    names = ("SIGTERM", "SIGHUP") if threading.current_thread() is threading.main_thread() else ()
+def _signals(handler: Callable[[int, Any], None]) -> Iterator[None]:
+    """Hand SIGINT, SIGTERM, and SIGHUP of a terminal that closes, to a handler."""
+    names = ("SIGINT", "SIGTERM", "SIGHUP")
+    if threading.current_thread() is not threading.main_thread():
+        names = ()
     numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
-    before = {number: signal.signal(number, end) for number in numbers}
+    before = {number: signal.signal(number, handler) for number in numbers}
     try:
         yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        for number, former in before.items():
+            signal.signal(number, former)
 
 
 def save_log(path: Path, log: Log) -> None:
     """Write a log; where that fails, write it to the folder for temporary files, so that no row is lost.
+
+    There it has its own format, or npz where it was the format that failed.
 
     Raises:
         OSError: it could not be written to `path`; the message names the file that it is in.
     """
     try:
         write_log(path, log)
-    except OSError as error:
-        spare = Path(tempfile.mkdtemp()) / path.name
+    except Exception as error:
+        name = path.name if isinstance(error, OSError) else f"{path.stem}.npz"
+        spare = Path(tempfile.mkdtemp()) / name
         write_log(spare, log)
-        raise OSError(f"{path}: {error.strerror or error}; the log is in {spare}") from error
+        why = getattr(error, "strerror", None) or error
+        raise OSError(f"{path}: {why}; the log is in {spare}") from error

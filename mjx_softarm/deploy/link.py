@@ -25,7 +25,7 @@ from mjx_softarm.logs.schema import Log
 from mjx_softarm.sensing.sensors import Sensor
 
 VENT_KPA_PER_S = 20.0
-VENT_TRIES = 10  # failed writes in a row after which the arm counts as not vented
+VENT_TRIES = 250  # failed writes in a row, some 5 s of them, after which the arm counts as not vented
 
 
 def vented(pressure_kpa: Array, dt_s: float) -> Array:
@@ -168,11 +168,15 @@ class Link:
 
 def describe(error: BaseException) -> str:
     """Return an error's message, with its type and place where it is none of the documented ones."""
-    if isinstance(error, (ArmFault, OSError, ValueError)) and str(error):
-        return str(error)
+    try:
+        text = str(error)
+    except Exception:  # a driver's own, whose text cannot be made
+        text = ""
+    if isinstance(error, (ArmFault, OSError, ValueError)) and text:
+        return text
     place = traceback.extract_tb(error.__traceback__)[-1:]
     where = "".join(f" ({Path(frame.filename).name}, line {frame.lineno})" for frame in place)
-    return ": ".join(filter(None, [type(error).__name__, str(error)])) + where
+    return ": ".join(filter(None, [type(error).__name__, text])) + where
 
 
 class Recorder:

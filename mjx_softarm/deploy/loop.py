@@ -57,7 +57,7 @@ def refusals(controller: Controller, goals: Sequence[np.ndarray]) -> dict[int, E
     poses, errors = nearest_poses(policy, np.array([goals[k] for k in finite], float))
     found = {}
     for k, pose, error in zip(finite, poses, errors, strict=True):
-        if error > policy.reward.threshold:
+        if not error <= policy.reward.threshold:  # nor NaN
             got, near = (", ".join(f"{value:.0f}" for value in values) for values in (goals[k], pose))
             message = f"got {got}, expected a pose that the arm reaches; the nearest is {near} [mm, deg]"
             found[k] = Event(Fault.GOAL_OUTSIDE, message)
@@ -65,8 +65,11 @@ def refusals(controller: Controller, goals: Sequence[np.ndarray]) -> dict[int, E
 
 
 def hold(state: State) -> State:
-    """Return the state without a goal, the springs held as they were read last."""
-    if np.isnan(state.spring_m).any():
+    """Return the state without a goal, the springs held as they were read last.
+
+    An arm without references, which has no pressure or is being vented, stays so.
+    """
+    if state.reference_m is None or np.isnan(state.spring_m).any():
         return state._replace(goal=None)
     return state._replace(goal=None, reference_m=state.spring_m, n_ticks=0)
 

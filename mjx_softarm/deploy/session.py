@@ -191,7 +191,11 @@ class _Session:
         readings = self.link.read()
         row = self.link.look(begin_s)
         began = time.perf_counter()
-        self.state, tick = step(self.controller, self.state, readings, self.late)
+        try:
+            self.state, tick = step(self.controller, self.state, readings, self.late)
+        except Exception:  # the row that explains it is kept
+            self._log(row, readings, goal, self.state.spring_m)
+            raise
         self.latency_s.append(time.perf_counter() - began)
         try:
             in_time = tick.stop is not None or self.link.write(self.state.pressure_kpa)
@@ -204,17 +208,20 @@ class _Session:
 
     def _keep(self, row: dict[str, Any], readings: np.ndarray | None, goal: Any, tick: Tick) -> None:
         """Log a tick and tell of it."""
-        nothing = np.full(len(self.state.pressure_kpa), np.nan)
-        row["readings"] = nothing if readings is None else readings
-        row["estimate"], _ = believed(self.controller, tick.spring_m)
-        row["reference_m"] = nothing if self.state.reference_m is None else self.state.reference_m
-        row["goal"] = np.full(6, np.nan) if goal is None else goal
-        self.rows.add(row)
+        self._log(row, readings, goal, tick.spring_m)
         self._note(tick.events)
         if tick.arrived:
             self._arrive(row["goal"], row["estimate"])
         if self.pilot:
             self.pilot.look(self.state, tick, row)
+
+    def _log(self, row: dict[str, Any], readings: np.ndarray | None, goal: Any, spring_m: np.ndarray) -> None:
+        nothing = np.full(len(self.state.pressure_kpa), np.nan)
+        row["readings"] = nothing if readings is None else readings
+        row["estimate"], _ = believed(self.controller, spring_m)
+        row["reference_m"] = nothing if self.state.reference_m is None else self.state.reference_m
+        row["goal"] = np.full(6, np.nan) if goal is None else goal
+        self.rows.add(row)
 
     def _next_goal(self, now_s: float) -> bool:
         """Take the next accepted goal once the last is done; return False when goals or time are over."""

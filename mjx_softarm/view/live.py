@@ -54,6 +54,7 @@ class PagePilot:
         self._tell, self._said = tell, deque(maxlen=N_LINES)
         self._armed, self._payload_kg, self._n_pages, self._lost = False, 0.0, 0, False
         self._doing, self._goal = "waits", np.full(6, np.nan)
+        self._circle = _ROUNDS * [self._clamped(goal) for goal in circle_poses()]  # takes longer than a tick
         # A simulated arm begins by itself: it hits nobody.
         self._first: dict[str, Any] = {"circle": True} if hasattr(arm, "time_s") else {}
 
@@ -72,13 +73,13 @@ class PagePilot:
             self._arm.attach(self._payload_kg)
         if self._end.closed.is_set() and not self._lost:
             self._lost = asked["hold"] = True
-            self.tell("the page's server has ended; the arm holds, Ctrl-C vents it")
+            self.tell("the page's server has ended; an arm under pressure holds, Ctrl-C vents it")
         if "vent" in asked or "hold" in asked:
             self._armed, self._goal = False, np.full(6, np.nan)
             return Orders(vent="vent" in asked, hold=True)
         self._armed |= "circle" in asked or "follow" in asked
         if "circle" in asked:
-            return Orders(goals=_ROUNDS * [self._clamped(goal) for goal in circle_poses()])
+            return Orders(goals=self._circle)
         if "goal" in asked and self._armed:
             return Orders(goals=[self._clamped(asked["goal"])])
         return Orders()

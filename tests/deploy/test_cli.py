@@ -150,8 +150,8 @@ def test_command_line_tells_what_is_wrong(folder):
     ("fault", "status", "message"),
     [
         ("raise RuntimeError('valve')", 3, "write_pressures: RuntimeError: valve (driver.py, line "),
-        ("os.kill(os.getpid(), signal.SIGTERM)", 143, "ended early: ended by SIGTERM"),
-        ("os.kill(os.getpid(), signal.SIGINT)", 130, "ended early: interrupted"),
+        ("signal.raise_signal(signal.SIGTERM)", 143, "ended early: ended by SIGTERM"),
+        ("signal.raise_signal(signal.SIGINT)", 130, "ended early: interrupted"),
     ],
 )
 def test_recording_that_ends_early_vents_and_has_its_log(folder, fault, status, message):
@@ -166,7 +166,7 @@ def test_recording_that_ends_early_vents_and_has_its_log(folder, fault, status, 
 """
     )
     (folder / "driver.py").write_text(
-        "import os, signal\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n" + driver
+        "import signal\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n" + driver
     )
     done = command(folder, "record", "--arm", "driver:Arm", "--out", "a.csv", "--poses", "9", "--transients")
     assert done.stdout.endswith(f"{status} []\n") and message in done.stderr

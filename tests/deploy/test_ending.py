@@ -1,6 +1,5 @@
 """Faults injected at every call of a driver: the arm is vented, its rows are kept, the cause is named."""
 
-import os
 import signal
 
 import numpy as np
@@ -94,7 +93,7 @@ def test_fault_at_every_call_vents_and_keeps_the_rows(command):
             continue
         assert vented(arm) and ending.vented and ending.status == 3, call
         assert f"{arm.failed}: RuntimeError: valve driver" in ending.cause
-        assert any(arm.failed in line and "-> vent" in line for line in lines)
+        assert any(arm.failed in line and "-> vented" in line for line in lines)
         assert len(log) >= arm.n_rows and (not len(log) or len(saved[0]) == len(log))
 
 
@@ -154,7 +153,7 @@ def test_signals_vent_and_save(command, name, request):
     calls = range(20, 21) if number == signal.SIGINT else (20, 25)
 
     def send():
-        os.kill(os.getpid(), number)
+        signal.raise_signal(number)
         raise TimeoutError
 
     arm = Faulty(send, "write_pressures", calls)
@@ -162,6 +161,31 @@ def test_signals_vent_and_save(command, name, request):
     assert vented(arm) and ending.vented and ending.status == 128 + number
     assert len(saved[0]) == len(log) == 21
     assert signal.getsignal(number) == before
+
+
+def test_signals_that_come_together_vent_and_save():
+    both = {signal.SIGTERM, signal.SIGHUP}
+
+    def send():
+        signal.pthread_sigmask(signal.SIG_BLOCK, both)
+        for number in both:
+            signal.raise_signal(number)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, both)
+
+    arm = Faulty(send, "write_pressures", (20,))
+    ending, log, saved = drive("run", arm)
+    assert vented(arm) and ending.vented and ending.status - 128 in both
+    assert len(saved[0]) == len(log) == 21
+
+
+def test_error_without_a_text_vents_and_saves():
+    class Mute(Exception):
+        def __str__(self):
+            raise TypeError("no text")
+
+    arm = Faulty(raises(Mute()), "read_sensors", (20,))
+    ending, log, saved = drive("run", arm)
+    assert vented(arm) and ending.status == 3 and "Mute" in ending.cause and len(saved[0]) == len(log)
 
 
 def test_second_interrupt_ends_the_venting_at_once_and_says_so():

@@ -65,6 +65,14 @@ def test_the_safest_order_wins(others):
     assert pilot.states[-1].goal is None and pilot.states[-1].reference_m is None
 
 
+def test_to_hold_an_arm_without_references_changes_nothing():
+    """One that was never moved stays without pressure, and one that is being vented goes on."""
+    _, pilot, run = fly({5: Orders(hold=True)}, 50)
+    assert pilot.states[-1].reference_m is None and not run.log.pressure_kpa.any()
+    _, pilot, run = fly({0: Orders(goals=GOALS), 60: Orders(vent=True), 65: Orders(hold=True)}, 200)
+    assert run.log.pressure_kpa[64].any() and not run.log.pressure_kpa[-1].any()
+
+
 def test_a_pilot_that_fails_ends_the_run_vented():
     arm, _, run = fly({0: Orders(goals=GOALS)}, 50)
     assert run.status == FAULT and run.ending.vented and "Stop" in run.ending.cause
