@@ -136,10 +136,10 @@ def export(folders: Runs, out: cli.MaybePath = None, onnx: bool = False, cpp: cl
     console = start()
     for path in folders:
         policy = export_run(Run.open(path), out)
-        console.print(f"policy: {policy}", highlight=False)
+        console.print(f"policy: {policy}", highlight=False, soft_wrap=True)
         files = export_onnx(policy) if onnx else []
         for file in [*files, *(export_cpp(policy, cpp) if cpp else [])]:
-            console.print(f"  {file}", highlight=False)
+            console.print(f"  {file}", highlight=False, soft_wrap=True)
     return 0
 
 
@@ -156,7 +156,7 @@ def _resume(path: Path, mesh: Mesh | None, console: Console) -> int:
 
 
 def _train(run: Run, task: Task, console: Console) -> int:
-    console.print(f"run: {run.path}", highlight=False)
+    console.print(f"run: {run.path}", highlight=False, soft_wrap=True)
     try:
         with sole_trainer(run.path):
             summary = runs.train(run, task, console)

@@ -102,7 +102,7 @@ def test_held_out_goals_are_evaluated_as_the_trainer_does_it():
     reached = evaluator._workspace(params, evaluator.goals)
     found = HeldOut(env, 12).tip_error_mm(lambda obs: np.asarray(agent.mode(params, obs)))
     assert np.ptp(found) > 10.0
-    np.testing.assert_allclose(found, reached.tip_error_mm, atol=0.01)
+    np.testing.assert_allclose(found, reached.tip_error_mm[:12], atol=0.01)  # of the first set
 
 
 def test_ours_without_hindsight_differs_in_nothing_else():
