@@ -48,7 +48,7 @@ class Gains(NamedTuple):
         return cls(spec.control.kp_kpa_per_m, spec.control.ki_kpa_per_ms, *limits_kpa)
 
     def measured(self) -> Gains:
-        """Return the gains with limits AT_LIMIT_KPA within their own, for `saturated` of measured pressures."""
+        """Return the gains with limits AT_LIMIT_KPA within their own, for pressures that were measured."""
         low, high = self.pressure_min_kpa + AT_LIMIT_KPA, self.pressure_max_kpa - AT_LIMIT_KPA
         return self._replace(pressure_min_kpa=low, pressure_max_kpa=high)
 

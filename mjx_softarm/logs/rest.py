@@ -8,8 +8,8 @@ stays, and no two rows are more than 3 s apart. The last second of a hold counts
   recorded after the other; so is a first row that is followed by such a gap;
 - the tip moves by less than 1 mm/s, or by no more than its own noise can explain, and stays within 2 mm.
 
-Rows with a number missing in a column of NEEDED are left out. The rows that count are averaged to one pose, so
-that a long hold weighs no more than a short one.
+Rows with a number missing in a column of NEEDED are left out. The rows that count are averaged to one pose,
+so that a long hold weighs no more than a short one.
 """
 
 from __future__ import annotations
