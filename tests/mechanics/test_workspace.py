@@ -19,6 +19,7 @@ from mjx_softarm.mechanics.workspace import (
     VOXEL_MM,
     Pool,
     extreme_poses,
+    sample_evenly,
     sample_workspace,
     settle_many,
 )
@@ -53,6 +54,16 @@ def test_every_sampled_pose_is_a_rest_of_c_mujoco():
         np.testing.assert_allclose(pool().pose[k, :3], 1e3 * tip.xpos, atol=1e-3)
         np.testing.assert_allclose(pool().pose[k, 3:], angles, atol=1e-3)
         np.testing.assert_allclose(pool().spring_m[k], spring_lengths(data), atol=1e-6)
+
+
+def test_even_poses_fill_more_of_the_volume_and_its_rim_than_those_of_the_training():
+    even, trained = np.asarray(sample_evenly(SPEC, BATCH, 0).pose)[:, :3], pool().pose[:, :3]
+    assert even.shape == trained.shape and n_voxels(even) > 1.1 * n_voxels(trained)
+    _, counts = np.unique(np.floor(even / VOXEL_MM), axis=0, return_counts=True)
+    assert counts.max() <= 8  # where the mean is between one and two
+    for share in (1.0, 99.0):  # tips nearest to the base, and furthest from it
+        at = [np.percentile(np.linalg.norm(tip_mm, axis=1), share) for tip_mm in (even, trained)]
+        assert (at[0] < at[1]) == (share < 50.0)
 
 
 def test_sampled_poses_can_be_commanded():
