@@ -103,23 +103,23 @@ class PolishedJob:
 
     def epoch(self, state: TrainState) -> tuple[TrainState, dict[str, Array]]:
         """Run an epoch of the stage that the state is of; the state given is used up."""
-        if isinstance(state.learner, PolishState):
-            return self.polish.epoch(state)
-        state, metrics = self.tqc.epoch(state)
-        per_epoch = self.tqc.config.n_arms * self.tqc.config.vector_steps_per_epoch
-        if int(state.n_env_steps) == self._n_epochs * per_epoch:
+        stage = self._stage(state)
+        state, metrics = stage.epoch(state)
+        per_epoch = self.config.n_arms * self.config.vector_steps_per_epoch
+        if stage is self.tqc and int(state.n_env_steps) == self._n_epochs * per_epoch:
             state = self._hand_over(state)
         return state, metrics
 
     def policy(self, state: TrainState) -> Any:
         """Return the parameters of the policy that is evaluated and exported."""
-        job = self.polish if isinstance(state.learner, PolishState) else self.tqc
-        return job.policy(state)
+        return self._stage(state).policy(state)
 
     def place(self, state: TrainState) -> TrainState:
         """Return the state on the devices where its epoch expects it."""
-        job = self.polish if isinstance(state.learner, PolishState) else self.tqc
-        return job.place(state)
+        return self._stage(state).place(state)
+
+    def _stage(self, state: TrainState) -> Job:
+        return self.polish if isinstance(state.learner, PolishState) else self.tqc
 
     def _hand_over(self, state: TrainState) -> TrainState:
         if self._compiled is not None:
