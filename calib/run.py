@@ -92,7 +92,7 @@ def refuse_existing(folder: Path) -> None:
         FileExistsError: the folder exists and is not empty, or is the current one.
     """
     if not folder.name or (folder.exists() and (not folder.is_dir() or any(folder.iterdir()))):
-        raise FileExistsError(f"{folder}: is there already; choose another --out")
+        raise FileExistsError(f"--out: got {folder}, which is there already, expected a new folder")
 
 
 def write_calibration(

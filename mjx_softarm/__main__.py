@@ -91,7 +91,7 @@ def _workspace(spec: cli.SpecFile = None, out: Path = Path(".")) -> int:
         from mjx_softarm.mechanics import workspace_plot as plot
     except ImportError as error:
         raise InputError(
-            f"drawing needs matplotlib and scipy (pip install -e '.[sim]' in the checkout): {error}"
+            f"drawing: got {error}, expected matplotlib and scipy: pip install -e '.[sim]' in the checkout"
         ) from error
     from mjx_softarm.mechanics.workspace import extreme_poses
 
@@ -118,7 +118,7 @@ def _import_mujoco() -> None:
     except (ImportError, AttributeError, RuntimeError) as error:
         asked = os.environ.get("MUJOCO_GL", "")
         raise InputError(
-            f"MUJOCO_GL: got {asked!r}, with which MuJoCo cannot be imported: {error}"
+            f"MUJOCO_GL: got {asked!r} ({error}), expected a name with which MuJoCo can be imported"
         ) from error
 
 

@@ -159,9 +159,9 @@ class ArmSpec:
         try:
             data = tomllib.loads(Path(path).read_text("utf-8"))
         except OSError as error:
-            raise SpecError(f"{path}: cannot be read: {error.strerror}") from error
+            raise SpecError(f"{path}: got {error.strerror!r}, expected a specification") from error
         except (ValueError, RecursionError) as error:  # no TOML, no UTF-8, or nested too deeply
-            raise SpecError(f"{path}: not a TOML file: {error}") from error
+            raise SpecError(f"{path}: got {error}, expected TOML") from error
         return cls.from_dict(data, str(path))
 
     @classmethod

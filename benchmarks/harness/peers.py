@@ -52,7 +52,8 @@ def peer_python(name: str, root: Path = ROOT) -> Path:
         _make(home, python, packages)
     except (OSError, subprocess.CalledProcessError) as error:
         said = (getattr(error, "stderr", None) or str(error)).strip().splitlines()
-        raise PeerError(f"{name}: no virtual environment in {home}: {said[-1] if said else error}") from error
+        got = said[-1] if said else error
+        raise PeerError(f"{name}: got {got}, expected a virtual environment in {home}") from error
     marker.write_text(content, "utf-8")
     return python
 

@@ -104,7 +104,7 @@ class Worker:
             late = f" after {ANSWER_S:g} s in silence" if time.perf_counter() - start > ANSWER_S else ""
             self._said.seek(0)
             last = "\n".join(self._said.read().splitlines()[-15:])
-            raise WorkerError(f"{self.name}: stopped with status {status}{late}, expected a result:\n{last}")
+            raise WorkerError(f"{self.name}: got status {status}{late}, expected a result:\n{last}")
         return json.loads(line)
 
 
@@ -128,7 +128,7 @@ def _few_cores(n: int | None) -> Iterator[None]:
         yield
         return
     if not hasattr(os, "sched_setaffinity"):
-        raise WorkerError(f"programs cannot be kept to {n} cores on {sys.platform}")
+        raise WorkerError(f"cores: got {n} on {sys.platform}, expected Linux to keep programs to some")
     cores = os.sched_getaffinity(0)
     os.sched_setaffinity(0, sorted(cores)[:n])
     try:

@@ -112,5 +112,6 @@ def command(log: Path, *arguments: str) -> None:
     if done.returncode:
         last = "\n".join(log.read_text("utf-8").splitlines()[-5:])
         raise JobError(
-            f"python -m train {' '.join(arguments)}: exit status {done.returncode}; {log} ends with\n{last}"
+            f"python -m train {' '.join(arguments)}: got exit status {done.returncode}, expected 0; "
+            f"{log} ends with\n{last}"
         )

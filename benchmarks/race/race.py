@@ -125,8 +125,9 @@ def _result(folder: Path, name: str, seed: int, limits: Limits, n_goals: int) ->
         result = json.loads(file.read_text("utf-8"))
         found = result.get("conditions", {})
         if differing := [key for key in conditions if found.get(key) != conditions[key]]:
-            got = ", ".join(f"{key} {found.get(key)}, now {conditions[key]}" for key in differing)
-            raise RaceError(f"{file}: was made with {got}; choose another --out, or remove the file")
+            was = ", ".join(f"{key} {found.get(key)}" for key in differing)
+            now = ", ".join(f"{key} {conditions[key]}" for key in differing)
+            raise RaceError(f"{file}: got {was}, expected {now}; choose another --out, or remove the file")
         print(f"{who}: measured before, in {file}")
         return result
     program = ["benchmarks.race.contestants", name, str(seed), str(limits.stretch_s), str(n_goals)]

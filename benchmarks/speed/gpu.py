@@ -88,7 +88,9 @@ def seconds_to(
                 if ended and process.returncode:
                     said.seek(0)
                     last = "\n".join(said.read().splitlines()[-15:])
-                    raise RuntimeError(f"{' '.join(command)}: status {process.returncode}: {last}")
+                    raise RuntimeError(
+                        f"{' '.join(command)}: got status {process.returncode}, expected 0: {last}"
+                    )
                 if ended or spent > longest_s:
                     return None, best
                 time.sleep(0.1)

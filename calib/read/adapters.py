@@ -103,7 +103,7 @@ def read_trunk(path: str | Path) -> tuple[TrunkLog, list[Finding]]:
     needed = [*positions, *motors, *(quaternions if turns else [])]
     missing = [name for name in needed if name not in table.names]
     if missing:
-        problem = "missing, expected a log of the trunk"
+        problem = "got no such columns, expected a log of the trunk"
         raise LogError([Finding(str(path), (1, 1), ", ".join(missing), problem)])
     values = table.values[:, [table.names.index(name) for name in needed]]
     table = _finite(str(path), Table(tuple(needed), values, table.row))
@@ -126,7 +126,7 @@ def _finite(file: str, table: Table) -> Table:
     """Return the table, or raise an error that names each column with a NaN."""
     bad = ~np.isfinite(table.values)
     found = [
-        _finding(file, table.row[bad[:, k]], table.names[k], "NaN or inf, expected numbers")
+        _finding(file, table.row[bad[:, k]], table.names[k], "got NaN or inf, expected numbers")
         for k in np.flatnonzero(bad.any(axis=0))
     ]
     if found:

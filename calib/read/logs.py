@@ -79,13 +79,13 @@ def _differences(first: Log, other: Log) -> Iterator[tuple[str, str]]:
         if a is None or b is None:
             continue  # springs on a ruler need no motion capture, poses no ruler
         if a.shape[1:] != b.shape[1:]:
-            yield name, f"{a.shape[1]} and {b.shape[1]} in a row, expected logs of one arm"
+            yield name, f"got {a.shape[1]} and {b.shape[1]} in a row, expected logs of one arm"
         elif name in _FACTORS:
             sizes = [np.linalg.norm(value, axis=1) if name == "tip_m" else value for value in (a, b)]
             low, high = zip(*(np.percentile(size, [1, 99]) for size in sizes), strict=True)
             if max(low) > _FACTORS[name] * min(high):
                 ranges = " and ".join(f"{low[k]:.4g} to {high[k]:.4g}" for k in range(2))
-                yield name, f"{ranges}, expected ranges that meet in logs of one arm"
+                yield name, f"got {ranges}, expected ranges that meet in logs of one arm"
 
 
 def template(path: str | Path) -> str:
@@ -98,7 +98,7 @@ def template(path: str | Path) -> str:
         FileExistsError: the file exists already.
     """
     if Path(path).exists():
-        raise FileExistsError(f"{path}: exists already, expected the name of a new file")
+        raise FileExistsError(f"{path}: got a file that exists already, expected the name of a new one")
     spec = ArmSpec.default()
     n_sections = spec.structure.n_sections
     phase = 2.0 * np.pi * (np.arange(10)[:, None] / 10.0 + np.arange(spec.n_chambers) / spec.n_chambers)

@@ -72,7 +72,7 @@ def clean(matrix: LogMatrix) -> tuple[LogMatrix, list[Finding]]:
             keep = ~np.logical_or.reduce(dropped)
             matrix = matrix._replace(values=matrix.values[keep], row=matrix.row[keep])
         if len(matrix.row) < 2:
-            left = f"{len(matrix.row)} rows left, expected 2 at least"
+            left = f"got {len(matrix.row)} rows left, expected 2 at least"
             raise LogError([*findings, Finding(matrix.file, None, "", left)])
     if quaternion := matrix.indices("tip_quaternion"):
         matrix.values[:, quaternion], flipped = checks.same_sign(matrix.values[:, quaternion])
@@ -105,7 +105,7 @@ def _finding(matrix: LogMatrix, fault: Fault) -> Finding:
 def implausible(matrix: LogMatrix) -> list[Finding]:
     """Find reasons to refuse the log: columns without numbers, or that contradict their header."""
     if len(matrix.row) < 2:
-        return [Finding(matrix.file, None, "", f"{len(matrix.row)} row, expected 2 at least")]
+        return [Finding(matrix.file, None, "", f"got {len(matrix.row)} row, expected 2 at least")]
     problems = {}
     for k, column in enumerate(matrix.columns):
         problems[column.name] = _implausible_column(column, matrix.values[:, k])
@@ -115,7 +115,7 @@ def implausible(matrix: LogMatrix) -> list[Finding]:
         z_m = _typical(matrix.values[:, tip[2]])
         if z_m > HANGS_BELOW_M:
             expected = f"below {HANGS_BELOW_M} m, as z is up and the arm hangs from the base"
-            problems["tip_z"] = problems["tip_z"] or f"median {z_m:.3g} m, expected {expected}"
+            problems["tip_z"] = problems["tip_z"] or f"got a median of {z_m:.3g} m, expected {expected}"
     return [Finding(matrix.file, None, name, problem) for name, problem in problems.items() if problem]
 
 
@@ -191,7 +191,7 @@ def _renewal(matrix: LogMatrix) -> Iterator[Fault]:
     for k in matrix.indices("readings", "spring_m", "pressure_kpa"):
         if np.ptp(matrix.values[:, k]) == 0.0:
             always = _shown(matrix.columns[k], matrix.values[0, k])
-            problem = f"always {always}, expected a sensor that changes"
+            problem = f"got always {always}, expected a sensor that changes"
             yield Fault(matrix.columns[k].name, problem, everywhere, drops=False, counted=False)
     for name, axes in matrix.bodies():
         body = matrix.values[:, axes]
@@ -202,7 +202,7 @@ def _renewal(matrix: LogMatrix) -> Iterator[Fault]:
             problem = "equal to the row before, expected motion capture renewed in each row"
             yield Fault(f"{name}_x..z", problem, stale)
         elif name == "tip":
-            problem = "never moves by 1 mm, expected a tip that moves"
+            problem = "got a tip that never moves by 1 mm, expected one that moves"
             yield Fault("tip_x..z", problem, everywhere, drops=False, counted=False)
     if quaternion := matrix.indices("tip_quaternion"):
         values = matrix.values[:, quaternion]

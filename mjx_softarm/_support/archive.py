@@ -49,7 +49,7 @@ def write_sealed(path: Path, arrays: Mapping[str, Any], kind: str) -> None:
         part.write_bytes(sealed(arrays, kind))
         part.replace(path)
     except OSError as error:
-        raise SealedFileError(f"{path}: cannot be written: {error.strerror}") from error
+        raise SealedFileError(f"{path}: got {error.strerror!r}, expected to write a file") from error
     finally:
         if part.exists():  # never so below a path that is no folder, where `unlink` would fail
             part.unlink()
@@ -69,20 +69,20 @@ def read_sealed(path: Path, kind: str, made_by: str) -> dict[str, np.ndarray]:
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise SealedFileError(f"{path}: cannot be read: {error.strerror}") from error
+        raise SealedFileError(f"{path}: got {error.strerror!r}, expected a file of `{made_by}`") from error
+    expected = f"an unchanged file of `{made_by}`"
     content, digest = data[:-_N_DIGEST], data[-_N_DIGEST:]
     if not content.endswith(_mark(kind)):
         whole = zipfile.is_zipfile(io.BytesIO(data))
         got = f"an archive without a {kind}'s mark at its end" if whole else "no complete npz archive"
-        expected = f"an unchanged file of `{made_by}`"
         raise SealedFileError(f"{path}: got {got}, {len(data)} bytes, expected {expected}")
     if hashlib.sha256(content).hexdigest().encode() != digest:
-        raise SealedFileError(f"{path}: damaged: its {len(data)} bytes do not have the checksum at their end")
+        raise SealedFileError(f"{path}: got {len(data)} bytes without their checksum, expected {expected}")
     try:
         with np.load(io.BytesIO(data), allow_pickle=False) as npz:
             return {name: np.asarray(npz[name]) for name in npz.files}
     except (OSError, *ZIP_ERRORS) as error:
-        raise SealedFileError(f"{path}: holds an array that cannot be read: {error}") from error
+        raise SealedFileError(f"{path}: got a damaged array ({error}), expected {expected}") from error
 
 
 def sealed(arrays: Mapping[str, Any], kind: str) -> bytes:
@@ -134,7 +134,7 @@ class Entries:
         A dimension of None stands for any number from 1.
         """
         if name not in self._arrays:
-            self.fail(name, "missing")
+            self.fail(name, "got nothing, expected an entry")
         array = self._arrays[name]
         self._left.discard(name)
         expected = f"{kind.__name__.rstrip('_')} {' or '.join(map(_shape_text, shapes))}"
@@ -183,7 +183,7 @@ class Entries:
     def finish(self, schema: int) -> None:
         """Refuse entries that were not taken."""
         for name in sorted(self._left):
-            self.fail(name, f"unknown entry, schema {schema} has none of this name")
+            self.fail(name, f"got an unknown entry, expected those of schema {schema}")
 
 
 def _fits(shape: tuple[int, ...], expected: tuple[int | None, ...]) -> bool:

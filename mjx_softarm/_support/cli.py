@@ -89,7 +89,8 @@ def guarded(run: Callable[[], int]) -> int:
     except InputError as error:
         text = str(error)
     except OSError as error:
-        text = f"{error.filename}: {error.strerror}" if error.filename else str(error)
+        why = f"{error.filename}: got {error.strerror!r}, expected a file or folder that can be used"
+        text = why if error.filename else str(error)
     except KeyboardInterrupt:
         return INTERRUPTED
     print(f"error: {text}", file=sys.stderr)

@@ -83,7 +83,7 @@ def read_fields(cls: type, data: Any, source: str, prefix: str) -> dict[str, Any
     known = [item.name for item in fields(cls)]
     for name in data:
         if name not in known:
-            raise SpecError(f"{source}: {prefix}{name}: unknown field, expected one of {', '.join(known)}")
+            raise SpecError(f"{source}: {prefix}{name}: got an unknown field, expected {', '.join(known)}")
     hints = typing.get_type_hints(cls)
     values: dict[str, Any] = {}
     for item in fields(cls):
@@ -91,7 +91,7 @@ def read_fields(cls: type, data: Any, source: str, prefix: str) -> dict[str, Any
         group: Any = hints[item.name] if dataclasses.is_dataclass(hints[item.name]) else None
         if item.name not in data:
             expected = "a table" if group else rule_of(item).text
-            raise SpecError(f"{source}: {path}: missing, expected {expected}")
+            raise SpecError(f"{source}: {path}: got nothing, expected {expected}")
         value = data[item.name]
         if (kinds := item.metadata.get("kinds")) and isinstance(value, dict):
             value = dict(value)

@@ -73,7 +73,7 @@ def _run(
         stay: hold the last goal, until Ctrl-C or the end of the duration
     """
     if not goal:
-        raise InputError("--goal: missing, expected the pose of the tip, X,Y,Z,YAW,PITCH,ROLL")
+        raise InputError("--goal: got nothing, expected the pose of the tip, X,Y,Z,YAW,PITCH,ROLL")
     if not duration > 0.0:
         raise InputError(f"--duration: got {duration:g}, expected a number > 0")
     controller = Controller.of(load_policy(policy))

@@ -37,8 +37,8 @@ def open_arm(name: str) -> Any:
         try:
             return importlib.import_module(_TWIN).twin_of(item)
         except ImportError as error:
-            text = f"the twin needs MuJoCo (pip install -e '.[sim]' in the checkout): {error}"
-            raise ArmError(f"--arm: {text}") from error
+            expected = "MuJoCo for the twin: pip install -e '.[sim]' in the checkout"
+            raise ArmError(f"--arm: got {error}, expected {expected}") from error
         except ValueError as error:
             raise ArmError(f"--arm: {error}") from error
     if (here := os.getcwd()) not in sys.path:
@@ -46,18 +46,19 @@ def open_arm(name: str) -> Any:
     try:
         kind = getattr(importlib.import_module(module_name), item)
     except ImportError as error:
-        raise ArmError(f"--arm: {module_name} cannot be imported: {error}") from error
+        raise ArmError(f"--arm {name}: got {error}, expected a module that can be imported") from error
     except AttributeError as error:
-        raise ArmError(f"--arm: module {module_name} has no {item!r}") from error
+        raise ArmError(f"--arm {name}: got no {item!r} in {module_name}, expected an arm's class") from error
     missing = [method for method in _METHODS if not callable(getattr(kind, method, None))]
     if missing == ["read_sensors"] and hasattr(kind, "read_frequencies"):
-        raise ArmError(f"--arm: {name}: got a method read_frequencies, expected it to be named read_sensors")
+        raise ArmError(f"--arm {name}: got a method read_frequencies, expected it to be named read_sensors")
     if missing:
-        raise ArmError(f"--arm: {name} has no method {' or '.join(missing)}; see mjx_softarm.deploy.ArmIO")
+        raise ArmError(f"--arm {name}: got no method {' or '.join(missing)}, expected those of deploy.ArmIO")
     try:
         return kind()
     except (ImportError, OSError, TypeError, ValueError) as error:
-        raise ArmError(f"--arm: {name} cannot be opened: {type(error).__name__}: {error}") from error
+        got = f"{type(error).__name__}: {error}"
+        raise ArmError(f"--arm {name}: got {got}; expected an arm that opens") from error
 
 
 class Paced:

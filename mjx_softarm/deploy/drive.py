@@ -127,7 +127,9 @@ class Drive:
         known_m = None if lost.any() else spring_m
         try:
             if self.n_lost >= LOST_TICKS:
-                raise ArmFault(f"readings lost in {self.n_lost} ticks in a row: {text}")
+                raise ArmFault(
+                    f"sensors: got {self.n_lost} lost readings in a row, expected under {LOST_TICKS}: {text}"
+                )
             pressure_kpa, arrived = law(known_m, self.link.pressure_kpa)
             self.link.write(pressure_kpa)
         finally:

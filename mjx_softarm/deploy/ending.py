@@ -158,4 +158,4 @@ def save_log(path: Path, log: Log) -> None:
         spare = Path(tempfile.mkdtemp()) / name
         write_log(spare, log)
         why = getattr(error, "strerror", None) or error
-        raise OSError(f"{path}: {why}; the log is in {spare}") from error
+        raise OSError(f"{path}: got {why}, expected to write it; the log is in {spare}") from error

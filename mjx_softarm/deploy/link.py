@@ -101,7 +101,9 @@ class Link:
         except TimeoutError as error:
             self._n_late += 1
             if self._n_late > 2 * LATE_TICKS:
-                raise ArmFault(f"write_pressures: not in time {self._n_late} times in a row") from error
+                raise ArmFault(
+                    f"write_pressures: got {self._n_late} late in a row, expected {2 * LATE_TICKS} at most"
+                ) from error
             return False
         self._unsure, self._n_late, self.pressure_kpa = False, 0, pressure_kpa
         return True
@@ -140,7 +142,9 @@ class Link:
                 in_time, why = False, str(error)
             n_failed = 0 if in_time else n_failed + 1
             if n_failed == VENT_TRIES:
-                raise ArmFault(f"{n_failed} writes failed in a row, the last: {why}")
+                raise ArmFault(
+                    f"vent: got {n_failed} failed writes in a row, expected fewer; the last: {why}"
+                )
             self.wait_until(begin_s + self._dt_s)
 
     def _frame(self) -> dict[str, np.ndarray]:

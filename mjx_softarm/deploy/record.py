@@ -127,7 +127,7 @@ class _Hold:
         readings = np.array([row["readings"] for row in self.ticks])
         spring_m = drive.sensor.lengths(readings, np.nan).length_m
         if (stuck := np.flatnonzero(stuck_springs(spring_m, kpa))).size:
-            raise ArmFault(f"spring{stuck[0]}: always the same reading, expected one that changes")
+            raise ArmFault(f"spring{stuck[0]}: got the same reading always, expected one that changes")
         if target_kpa is None:
             return
         off = np.abs(kpa[-1] - target_kpa) > np.maximum(STUCK_PRESSURE_KPA, LOST_SHARE * np.abs(target_kpa))

@@ -84,7 +84,7 @@ class SoftArmVectorEnv(gymnasium.vector.VectorEnv):
         the episode are in `final_obs` and `final_info`.
         """
         if self._state is None:
-            raise gymnasium.error.ResetNeeded("SoftArmVectorEnv.step: call reset first")
+            raise gymnasium.error.ResetNeeded("SoftArmVectorEnv.step: got no episode, expected reset first")
         actions = _as_actions(actions, self.action_space.shape)
         self._state, results = self._step_arms(self._state, actions, _new_key(self.np_random))
         obs, reward, terminated, truncated, started, last, final_obs = _to_numpy(results)
@@ -132,7 +132,7 @@ class SoftArmEnv(gymnasium.Env):
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, Info]:
         """Act once, action (n_chambers,) in [-1, 1]."""
         if self._state is None:
-            raise gymnasium.error.ResetNeeded("SoftArmEnv.step: call reset first")
+            raise gymnasium.error.ResetNeeded("SoftArmEnv.step: got no episode, expected reset first")
         self._state = state = self._step_arm(self._state, _as_actions(action, self.action_space.shape))
         obs, reward, info = _to_numpy((state.obs, state.reward, _step_info(state)))
         info = {name: value if value.ndim else value.item() for name, value in info.items()}

@@ -132,7 +132,7 @@ def _by_program(golden: Golden, path: Path) -> tuple[np.ndarray, dict[str, np.nd
         command, text = [str(path.resolve())], "\n".join([*lines, ""])
         done = subprocess.run(command, input=text, capture_output=True, text=True, timeout=_TIMEOUT_S)
     except (OSError, subprocess.TimeoutExpired, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be run: {error}") from error
+        raise InputError(f"{path}: got {error}, expected a program that runs") from error
     first, *rest = done.stdout.splitlines() or [""]
     words = [*first.split(), *("",) * 4]
     if done.returncode or words[:2] != ["mjx_softarm", str(PROGRAM_VERSION)]:

@@ -218,7 +218,7 @@ def read_golden(path: Path) -> Golden:
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+        raise InputError(f"{path}: got {error.strerror!r}, expected {expected}") from error
     body, seal = data[:-67], data[-67:]
     if seal != f"# {hashlib.sha256(body).hexdigest()}\n".encode():
         raise InputError(f"{path}: got {len(data)} bytes without their checksum, expected {expected}")

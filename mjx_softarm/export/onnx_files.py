@@ -98,14 +98,14 @@ def read_onnx(path: Path) -> tuple[bytes, dict[str, Any]]:
         data = path.read_bytes()
         model = onnx.load_from_string(data)
     except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+        raise InputError(f"{path}: got {error.strerror!r}, expected {expected}") from error
     except Exception as error:  # protobuf's DecodeError is of the package that onnx happens to use
         raise InputError(f"{path}: got no ONNX graph, {len(data)} bytes, expected {expected}") from error
     entries = {item.key: item.value for item in model.metadata_props}
     if not entries.keys() >= {ABOUT, SEAL}:
         raise InputError(f"{path}: got an ONNX graph of another program, expected {expected}")
     if entries[SEAL] != _digest(model):
-        raise InputError(f"{path}: damaged: it does not have the checksum in its metadata")
+        raise InputError(f"{path}: got a graph without its checksum, expected {expected}")
     about = json.loads(entries[ABOUT])
     if about["schema_version"] != SCHEMA_VERSION:
         got = f"schema_version: got {about['schema_version']}, expected {SCHEMA_VERSION}"

@@ -89,7 +89,7 @@ def read_matrix(
         problems += _absent(names, known, ("time_s", *needed), one_of)
     else:
         got = ", ".join(names)[:60]
-        problems = [("", f"expected a header such as `time [s],pressure0 [kPa],...`, got {got}")]
+        problems = [("", f"got {got}, expected a header such as `time [s],pressure0 [kPa],...`")]
     refuse([Finding(file, (1, 1), name, problem) for name, problem in problems])
     present = [column for name, column in known.items() if name in names]
     columns = tuple(dataclasses.replace(column, unit=units[column.name]) for column in present)
@@ -116,13 +116,13 @@ def _header_errors(
 ) -> Iterator[tuple[str, str]]:
     for name, unit in units.items():
         if names.count(name) > 1:
-            yield name, f"{names.count(name)} columns of this name, expected one"
+            yield name, f"got {names.count(name)} columns of this name, expected one"
         if name in known and unit not in UNITS[known[name].kind]:
             expected = ", ".join(f"[{unit}]" for unit in UNITS[known[name].kind])
             yield name, f"got {'no unit' if unit is None else f'[{unit}]'}, expected one of {expected}"
         if name not in known and re.fullmatch(rf"({reading_name}|spring|pressure|reference)\d+", name):
             n_chambers = sum(column.group == "spring_m" for column in known.values())
-            yield name, f"expected a log of {n_chambers} chambers, numbered from 0"
+            yield name, f"got this column, expected those of {n_chambers} chambers, numbered from 0"
     for group in {known[name].group for name in names if name in known}:
         columns = [name for name, column in known.items() if column.group == group]
         if missing := [name for name in columns if name not in names]:
@@ -139,8 +139,8 @@ def _absent(
         if group not in groups:
             first, *others = [column for column in known.values() if column.group == group]
             expected = f"columns `{first.header}` to `{others[-1].name}`" if others else None
-            yield first.name, f"missing, expected {expected or f'a column `{first.header}`'}"
+            yield first.name, f"got nothing, expected {expected or f'a column `{first.header}`'}"
     if one_of and not groups & set(one_of):
         firsts = [next(column for column in known.values() if column.group == group) for group in one_of]
         *most, last = [f"{column.name}.." for column in firsts]
-        yield "", f"expected {', '.join(most)} or {last}; got only {', '.join(names)[:60]}"
+        yield "", f"got only {', '.join(names)[:60]}, expected {', '.join(most)} or {last}"

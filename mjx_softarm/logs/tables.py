@@ -45,7 +45,7 @@ def read_table(path: str | Path, names: Sequence[str] | None = None) -> Table:
     try:
         table = _read_npz(path) if path.suffix == ".npz" else _read_csv(path, names)
     except OSError as error:
-        raise _error(path, error.strerror or str(error)) from error
+        raise _error(path, f"got {error.strerror or str(error)!r}, expected a log") from error
     table.values[np.abs(table.values) > FLOAT32_MAX] = np.inf
     return table
 
@@ -55,18 +55,18 @@ def _error(path: Path, problem: str, line: int | None = None, column: str = "") 
 
 
 def _read_npz(path: Path) -> Table:
-    expected = "expected an npz file with `columns` (k,) of text and `table` (n, k) of numbers"
+    expected = "an npz file with `columns` (k,) of text and `table` (n, k) of numbers"
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             columns, values = arrays["columns"], arrays["table"]
     except (*ZIP_ERRORS, KeyError, AttributeError, TypeError) as error:
-        raise _error(path, f"{expected}, got: {error}") from error
+        raise _error(path, f"got {error}, expected {expected}") from error
     shapes = f"columns {columns.shape} of {columns.dtype}, table {values.shape} of {values.dtype}"
     fits = columns.dtype.kind == "U" and values.dtype.kind in "fiu" and values.ndim == 2
     if not fits or columns.shape != values.shape[1:]:
-        raise _error(path, f"{expected}, got {shapes}")
+        raise _error(path, f"got {shapes}, expected {expected}")
     if len(values) == 0:
-        raise _error(path, "no rows, expected at least 2")
+        raise _error(path, "got no rows, expected at least 2")
     return Table(tuple(map(str, columns)), values.astype(np.float64), np.arange(len(values)) + 2)
 
 
@@ -80,7 +80,7 @@ def _read_csv(path: Path, names: Sequence[str] | None) -> Table:
     if "," not in first:
         found = [text for mark, text in _OTHER_DELIMITERS.items() if mark in first]
         got = f"{found[0]} between the columns" if found else f"one column, {first[:60]!r}"
-        raise _error(path, f"expected columns parted by commas, and decimal points; got {got}", 1)
+        raise _error(path, f"got {got}, expected columns parted by commas, and decimal points", 1)
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "loadtxt: input contained no data")  # an error below
@@ -95,19 +95,19 @@ def _read_csv(path: Path, names: Sequence[str] | None) -> Table:
 
 def _check_text(path: Path, head: bytes) -> None:
     if not head.strip():
-        raise _error(path, "an empty file, expected a header and rows")
+        raise _error(path, "got an empty file, expected a header and rows")
     if head.startswith((b"\xff\xfe", b"\xfe\xff")) or (
         not head.startswith(b"PK") and 0.3 < head.count(0) / len(head) < 0.6 and head[:512].isascii()
     ):
-        raise _error(path, "UTF-16 text, expected UTF-8; save the file again with that encoding")
+        raise _error(path, "got UTF-16 text, expected UTF-8; save the file again with that encoding")
     if 0 in head:
-        raise _error(path, "a binary file, expected CSV text (or npz, by the end of its name)")
+        raise _error(path, "got a binary file, expected CSV text (or npz, by the end of its name)")
     try:
         head[: head.rfind(b"\n") + 1].decode("utf-8")
     except UnicodeDecodeError as error:
         got = f"byte 0x{head[error.start]:02x} at {error.start}"
         line = head.count(b"\n", 0, error.start) + 1
-        raise _error(path, f"neither UTF-8 text nor npz: {got}", line) from error
+        raise _error(path, f"got {got}, expected UTF-8 text or npz", line) from error
 
 
 def _count_lines(path: Path) -> int:
@@ -138,11 +138,11 @@ def _read_lines(path: Path, names: tuple[str, ...], n_header: int) -> Table:
             values.append(np.array(numbers))
             row.append(number)
     if not values:
-        raise _error(path, "a header and no rows, expected at least 2 rows")
+        raise _error(path, "got a header and no rows, expected at least 2 rows")
     return Table(names, np.stack(values), np.array(row))
 
 
 def _ragged(line: str, n_cells: int, n_names: int) -> str:
     found = [text for mark, text in _OTHER_DELIMITERS.items() if mark in line]
-    hint = f", and {found[0]}" if found else "; decimal commas?" if n_cells >= 1.5 * n_names else ""
-    return f"got {n_cells} cells{hint}; expected {n_names}, as in the header"
+    hint = f" and {found[0]}" if found else " (decimal commas?)" if n_cells >= 1.5 * n_names else ""
+    return f"got {n_cells} cells{hint}, expected {n_names} as in the header"

@@ -84,12 +84,12 @@ class Renderer:
             RenderError: the renderer is closed.
         """
         if self._renderer is None:
-            raise RenderError("the renderer is closed")
+            raise RenderError("renderer: got a closed one, expected it open")
         q = np.asarray(q, float)
         if q.shape != (self._model.nq,):
             raise ValueError(f"q: got shape {q.shape}, expected ({self._model.nq},)")
         if not np.isfinite(q).all():
-            raise ValueError("q: got numbers that are not finite; did the arm settle?")
+            raise ValueError("q: got numbers that are not finite, expected those of an arm that settled")
         self._data.qpos[:] = q
         mujoco.mj_forward(self._model, self._data)
         view = self._camera(camera or Camera())
@@ -145,7 +145,9 @@ def _open_renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Ren
         return mujoco.Renderer(model, height, width, _MAX_GEOMS)
     except Exception as error:  # each library has its own
         message = " ".join(f"{type(error).__name__}: {error}".split())
-        raise RenderError(f"no OpenGL to draw with (MUJOCO_GL={name}: {message}). {_ADVICE}") from error
+        raise RenderError(
+            f"MUJOCO_GL: got {name!r} ({message}), expected OpenGL to draw with. {_ADVICE}"
+        ) from error
 
 
 @functools.cache
@@ -168,7 +170,7 @@ def _working_library() -> str:
         if probe.returncode == 0:
             return name
         tried.append(f"{name}: {next(filter(_is_error, probe.stderr.splitlines()), 'failed')}")
-    raise RenderError(f"no OpenGL to draw with ({'; '.join(tried)}). {_ADVICE}")
+    raise RenderError(f"MUJOCO_GL: got {'; '.join(tried)}; expected OpenGL to draw with. {_ADVICE}")
 
 
 def _is_error(line: str) -> bool:

@@ -101,8 +101,8 @@ def _draw(spec: ArmSpec, n: int, pressure_kpa: np.ndarray, rng: np.random.Genera
     weight = found.settled / count[voxel.ravel()]
     if np.count_nonzero(weight) < n:
         raise SpecError(
-            f"the arm {spec.name!r} settles at {np.count_nonzero(weight)} of {len(weight)} random pressures, "
-            f"expected at {n} or more; is it stiff enough?"
+            f"{spec.name}: got an arm that settles at {np.count_nonzero(weight)} of {len(weight)} random "
+            f"pressures, expected at {n} or more; is it stiff enough?"
         )
     chosen = rng.choice(len(weight), n, replace=replace, p=weight / weight.sum())
     pose = pose_from_frame(found.tip_position_m[chosen], found.tip_rotation[chosen])

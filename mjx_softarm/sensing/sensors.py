@@ -150,7 +150,7 @@ class Sensor:
             values = {name: np.broadcast_to(value, np.shape(fault)) for name, value in vars(self).items()}
             one = dataclasses.replace(self, **{name: float(value[index]) for name, value in values.items()})
             expected = one.expected(SensorFault(int(fault[index])))
-            lines.append(f"spring{index}: read {float(readings[index]):.7g} {self.unit}, expected {expected}")
+            lines.append(f"spring{index}: got {float(readings[index]):.7g} {self.unit}, expected {expected}")
         return "\n".join(lines)
 
     def expected(self, fault: SensorFault) -> str:

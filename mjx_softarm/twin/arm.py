@@ -140,7 +140,9 @@ class Twin:
         for _ in range(self._steps):
             self._step()
         if self._data.warning.number.any():  # MuJoCo would start anew by itself
-            raise FloatingPointError(f"the twin's model became unstable before {self.time_s:g} s")
+            raise FloatingPointError(
+                f"twin: got an unstable state at {self.time_s:g} s, expected a stable one"
+            )
         self.time_s += self._steps * self._model.opt.timestep
 
     def pressures(self) -> np.ndarray:

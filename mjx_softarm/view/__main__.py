@@ -53,7 +53,7 @@ def _view(
         import viser  # noqa: F401
     except ImportError as error:
         raise InputError(
-            f"the view needs viser (pip install -e '.[view]' in the checkout): {error}"
+            f"view: got {error}, expected viser: pip install -e '.[view]' in the checkout"
         ) from error
     for option, path in (("--log", log), ("--html", html)):
         check_file(option, path)

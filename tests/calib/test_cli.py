@@ -69,11 +69,14 @@ def test_each_step_brings_the_simulated_tip_closer_to_held_out_poses(calibrated)
 def test_nothing_is_overwritten(demo, calibrated, capsys, tmp_path, monkeypatch):
     before = (calibrated[1] / "arm.toml").read_bytes()
     assert main(["run", *demo, "--out", str(calibrated[1])]) == 2
-    assert capsys.readouterr().err == f"error: {calibrated[1]}: is there already; choose another --out\n"
+    assert (
+        capsys.readouterr().err
+        == f"error: --out: got {calibrated[1]}, which is there already, expected a new folder\n"
+    )
     assert (calibrated[1] / "arm.toml").read_bytes() == before
     monkeypatch.chdir(tmp_path)
     assert main(["run", *demo, "--out", "."]) == 2
-    assert capsys.readouterr() == ("", "error: .: is there already; choose another --out\n")
+    assert capsys.readouterr() == ("", "error: --out: got ., which is there already, expected a new folder\n")
 
 
 @pytest.fixture

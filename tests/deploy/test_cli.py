@@ -26,9 +26,12 @@ ROOT = Path(__file__).resolve().parents[2]
         ("twin:0:pipe200", "twin:0:PIPE: got 'pipe200', expected pipe300 or pipe250"),
         ("twin:0:", "twin:0:PIPE: got '', expected pipe300 or pipe250"),
         ("twin:0:pipe300:x", "got 'pipe300:x', expected pipe300 or pipe250"),
-        ("no_such_module:Arm", "no_such_module cannot be imported: No module named 'no_such_module'"),
-        ("mjx_softarm.deploy.loop:Nothing", "module mjx_softarm.deploy.loop has no 'Nothing'"),
-        ("mjx_softarm.deploy.session:Run", "has no method read_sensors or write_pressures"),
+        ("no_such_module:Arm", "no_such_module:Arm: got No module named 'no_such_module', expected a module"),
+        (
+            "mjx_softarm.deploy.loop:Nothing",
+            "got no 'Nothing' in mjx_softarm.deploy.loop, expected an arm's class",
+        ),
+        ("mjx_softarm.deploy.session:Run", "got no method read_sensors or write_pressures, expected"),
     ],
 )
 def test_arm_that_cannot_be_had(name, message):
@@ -132,8 +135,11 @@ def test_accuracy_is_measured_without_jax(folder):
 def test_command_line_tells_what_is_wrong(folder):
     goal = ("--goal", "0,0,-600,0,0,0")
     for args, message in (
-        (("run", "no.npz", "--arm", "driver:Arm", *goal), "no.npz: cannot be read"),
-        (("run", "policy.npz", "--arm", "driver:Arms", *goal), "module driver has no 'Arms'"),
+        (
+            ("run", "no.npz", "--arm", "driver:Arm", *goal),
+            "no.npz: got 'No such file or directory', expected a file of",
+        ),
+        (("run", "policy.npz", "--arm", "driver:Arms", *goal), "got no 'Arms' in driver"),
         (
             ("run", "policy.npz", "--arm", "driver:Arm", *goal, "--log", "no/a.csv"),
             "--log: got no/a.csv, expected a file in a folder",

@@ -22,7 +22,7 @@ def test_one_lost_reading_holds_the_last_good_one(spoil):
     assert held_m[4] == before_m[4] != after_m[4]
     np.testing.assert_allclose(run.log.estimate[30], estimate(POLICY.estimator, held_m), atol=1e-3)
     assert np.isnan(run.log.readings[30, 4])
-    assert ("spring4: read nan Hz" in run.events[0].message) == (spoil is nan)
+    assert ("spring4: got nan Hz" in run.events[0].message) == (spoil is nan)
 
 
 @pytest.mark.parametrize("spoil", [nan, late])

@@ -147,7 +147,7 @@ def test_other_programs_and_rows_are_refused(folder, golden, tmp_path):
         program.chmod(0o755)
         with pytest.raises(InputError, match=message):
             check(golden, program)
-    with pytest.raises(InputError, match="cannot be run"):
+    with pytest.raises(InputError, match="expected a program that runs"):
         check(golden, tmp_path / "none")
 
 

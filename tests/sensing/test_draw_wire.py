@@ -46,7 +46,7 @@ def test_voltages_are_lengths_by_scale_and_calibration():
     good = fault == 0
     np.testing.assert_allclose(length_m[good], (BETA * volts / 5.0 * 1.0 + DELTA_M)[good])
     np.testing.assert_allclose(PLANTED.readings(length_m)[good], volts[good])
-    assert "spring4: read 0.04 V, expected 0.05 to 4.95 V" in PLANTED.describe_faults(volts, fault)
+    assert "spring4: got 0.04 V, expected 0.05 to 4.95 V" in PLANTED.describe_faults(volts, fault)
 
 
 def test_specification_is_written_and_read(tmp_path):
@@ -100,7 +100,7 @@ def test_policy_is_written_read_and_run(tmp_path):
 
     run = go(Unplugged(), GOALS[:1], Controller.of(policy, exact_plan))
     assert {Fault.LOST_READING, Fault.SENSOR_LOST} <= set(run.counts())
-    assert "spring2: read 0 V" in run.events[0].message
+    assert "spring2: got 0 V" in run.events[0].message
 
 
 def test_twin_reads_volts():

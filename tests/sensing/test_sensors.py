@@ -175,4 +175,4 @@ def test_gradient_of_an_impossible_length_is_finite():
 def test_faults_are_described_with_spring_reading_and_expectation():
     params, frequency = Sensor.from_spec(WIDE), np.where(np.arange(9) == 6, 9.0e6, 4.0e6)
     text = params.describe_faults(frequency, params.lengths(frequency).fault)
-    assert text.startswith("spring6: read 9000000 Hz, expected below 8761191 Hz, where the compensation")
+    assert text.startswith("spring6: got 9000000 Hz, expected below 8761191 Hz, where the compensation")

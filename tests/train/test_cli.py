@@ -117,7 +117,7 @@ def test_help_explains_every_setting(command, capsys):
 
 def test_a_folder_has_one_trainer_at_a_time(tmp_path):
     """One that was killed holds it no longer: such a run is resumed above."""
-    with sole_trainer(tmp_path), pytest.raises(RunError, match=f"{tmp_path}: another process is training"):
+    with sole_trainer(tmp_path), pytest.raises(RunError, match=f"{tmp_path}: got another process"):
         sole_trainer(tmp_path).__enter__()
     with sole_trainer(tmp_path):
         pass
@@ -143,7 +143,7 @@ def test_a_folder_has_one_trainer_at_a_time(tmp_path):
         ),
         (["demos", "record", "--task", "circle16"], "train demos record: got nothing, expected --arm"),
         (["export"], "RUN: got 0, expected one folder of a run or more"),
-        (["reach", "--spec", "absent.toml"], "absent.toml: cannot be read: No such file or directory"),
+        (["reach", "--spec", "absent.toml"], "absent.toml: got 'No such file or directory', expected a spec"),
         (["reach", "--resume", "absent"], "absent: not the folder of a run"),
         (
             ["reach", "--resume", "absent", "--seed", "1", "--tqc.gamma", "0.4", "--out", "run"],

@@ -108,7 +108,7 @@ class Imitation:
             state = state._replace(agent=self.learner.adopt(state.agent, donor))
         if reward is not None:
             if not isinstance(reward, ImitationState) or reward.discriminator is None:
-                raise ValueError("learned no reward; expected a run of `imitate` that did")
+                raise ValueError("reward: got none, expected a run of `imitate` that learned one")
             check_same_shapes("discriminator", reward.discriminator, state.discriminator)
             state = state._replace(discriminator=reward.discriminator)
         return state

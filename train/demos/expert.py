@@ -192,7 +192,7 @@ class Expert:
         expected = f", {np.degrees(TOLERANCE_RAD / EASED):.1f} deg" if target.turn.any() else ""
         expected += "" if self.pipe is None else f", {1e3 * MARGIN_M:g} mm from the wall"
         return (
-            f"waypoint {name!r} at {finger} mm cannot be met: got at best "
+            f"waypoint {name!r} at {finger} mm: got at best "
             f"{1e3 * off_m:.1f} mm off{turned}{wall}, chamber {chamber} at {kpa:.1f} kPa; expected "
             f"at most {1e3 * TOLERANCE_M:g} mm{expected}, {low + MARGIN_KPA:g} to {high - MARGIN_KPA:g} kPa"
         )

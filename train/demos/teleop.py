@@ -179,8 +179,8 @@ class Teleoperation:
         off_m = self._drive.sensor.lengths(readings, 0.0).length_m - self._now.spring_m
         worst = int(np.argmax(np.abs(off_m)))
         return ArmFault(
-            f"{name}: not at rest after {SETTLE_TIMEOUT_S:g} s: spring {worst} is {1e3 * off_m[worst]:+.1f} "
-            f"mm off, its chamber at {self._drive.link.pressure_kpa[worst]:.1f} kPa"
+            f"{name}: got no rest, expected it within {SETTLE_TIMEOUT_S:g} s; spring {worst} is "
+            f"{1e3 * off_m[worst]:+.1f} mm off, its chamber at {self._drive.link.pressure_kpa[worst]:.1f} kPa"
         )
 
     def _look(self, row: dict) -> None:

@@ -60,7 +60,7 @@ def mesh_of(devices: str | None) -> Mesh | None:
         else:
             jax.distributed.initialize()
     except (ValueError, RuntimeError) as error:
-        raise ConfigError(f"--devices {devices}: {error}") from error
+        raise ConfigError(f"--devices: got {devices} ({error}), expected processes that meet") from error
     return Mesh(np.array(jax.devices()), (AXIS,))
 
 

@@ -49,7 +49,9 @@ def sole_trainer(path: Path) -> Iterator[None]:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
-                raise RunError(f"{path}: another process is training in it; stop it, or wait") from error
+                raise RunError(
+                    f"{path}: got another process that trains in it, expected none; stop it, or wait"
+                ) from error
         yield
 
 
@@ -121,7 +123,7 @@ class Run:
             if is_first_process():
                 write_json(path / "config.json", data)
         except OSError as error:
-            raise RunError(f"{path}: cannot be written: {error.strerror}") from error
+            raise RunError(f"{path}: got {error.strerror!r}, expected to write a new folder") from error
         return run
 
     @classmethod
@@ -138,10 +140,10 @@ class Run:
             config, has_s2r = from_dict(data["train"]), data.get("s2r", False)
             spec = ArmSpec.from_dict(data["spec"], str(file))
         except OSError as error:
-            raise RunError(f"{path}: not the folder of a run: {file}: {error.strerror}") from error
+            raise RunError(f"{file}: got {error.strerror!r}, expected the folder of a run") from error
         except (ValueError, KeyError, TypeError) as error:
             raise RunError(
-                f"{file}: got a damaged config or another version's: {error}; expected this version's"
+                f"{file}: got a damaged config or another version's ({error}), expected this version's"
             ) from error
         s2r = load_s2r(path / S2R_FILE, spec.n_chambers) if has_s2r else None
         return cls(path, config, spec, s2r)
@@ -228,14 +230,14 @@ class Run:
 
     def _of_another_version(self) -> RunError:
         return RunError(
-            f"{self.path}: its checkpoint has other parts or sizes than the states of this version; "
+            f"{self.path}: got a checkpoint of other parts or sizes, expected this version's; "
             "continue it with the commit that its config.json names"
         )
 
     def _newest(self) -> int:
         epoch = self.latest_epoch
         if epoch is None:
-            raise RunError(f"{self.path}: holds no checkpoint; start it anew")
+            raise RunError(f"{self.path}: got no checkpoint, expected one; start the run anew")
         return epoch
 
     def log(self, row: dict[str, Any]) -> None:

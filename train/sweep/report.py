@@ -72,7 +72,7 @@ def by_settings(runs: Sequence[Run], settings_of: Callable[[Run], dict[str, Any]
 def _figures(run: Run) -> dict[str, Any]:
     file = run.path / "evaluation.json"
     if not file.exists():
-        raise RunError(f"{run.path}: not finished: no evaluation.json")
+        raise RunError(f"{run.path}: got no evaluation.json, expected a finished run")
     rows = run.metrics()
     return {
         "seed": run.config.seed,

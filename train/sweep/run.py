@@ -80,7 +80,8 @@ def create(
         RunError: there is such a folder already, or it cannot be made.
     """
     if path.exists():
-        raise RunError(f"{path}: is there already; continue it with --resume {path}, or choose another --out")
+        expected = f"a new folder; --resume {path} continues this one"
+        raise RunError(f"--out: got {path}, which is there already, expected {expected}")
     part = path.with_name(path.name + ".part")
     shutil.rmtree(part, ignore_errors=True)  # of a start that was interrupted
     for name, config in members.items():
@@ -90,7 +91,7 @@ def create(
         write_json(part / SWEEP_FILE, data)
         part.replace(path)
     except OSError as error:
-        raise RunError(f"{path}: cannot be written: {error.strerror}") from error
+        raise RunError(f"{path}: got {error.strerror!r}, expected to write a new folder") from error
     return open_sweep(path)
 
 
@@ -105,9 +106,9 @@ def open_sweep(path: Path) -> Sweep:
         data = json.loads(file.read_text("utf-8"))
         members, varied = data["members"], tuple(data["varied"])
     except OSError as error:
-        raise RunError(f"{path}: not the folder of a sweep: {file}: {error.strerror}") from error
+        raise RunError(f"{file}: got {error.strerror!r}, expected the folder of a sweep") from error
     except (ValueError, KeyError, TypeError) as error:
-        raise RunError(f"{file}: not what a sweep writes: {error!r}") from error
+        raise RunError(f"{file}: got {error!r}, expected what a sweep writes") from error
     return Sweep(path, tuple(Run.open(path / name) for name in members), varied)
 
 

@@ -91,7 +91,7 @@ class LineArm:
                 continue
             text = " ".join(words)
             if head == "E":
-                raise ValueError(f"{letter}: refused: {text}")
+                raise ValueError(f"{letter}: got the refusal {text!r}, expected an answer")
             try:
                 numbers = np.array([float(word) for word in words])
             except ValueError as error:
@@ -100,4 +100,4 @@ class LineArm:
                 got = f"{head!r} and {len(numbers)} numbers"
                 raise TimeoutError(f"{letter}: got {got}, expected {letter!r} and {size}")
             return numbers
-        raise TimeoutError(f"{letter}: no answer within {1e3 * self.timeout_s:g} ms")
+        raise TimeoutError(f"{letter}: got no answer, expected one within {1e3 * self.timeout_s:g} ms")

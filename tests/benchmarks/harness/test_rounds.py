@@ -59,4 +59,4 @@ def test_a_program_that_says_nothing_is_stopped(tmp_path, monkeypatch):
     monkeypatch.setattr(rounds, "ANSWER_S", 0.5)
     told, failed = take_turns([Worker("silent", ["silent"])], 1)
     assert told == {}
-    assert failed["silent"].startswith("silent: stopped with status -9 after 0.5 s in silence")
+    assert failed["silent"].startswith("silent: got status -9 after 0.5 s in silence")

@@ -139,7 +139,7 @@ def asked(monkeypatch):
     def made_up(worker, limits):
         asked[worker.name] = limits
         if worker.name in ("sbx-hindsight, seed 0", "ours-quick, seed 3"):
-            raise WorkerError(f"{worker.name}: stopped with status 1")
+            raise WorkerError(f"{worker.name}: got status 1")
         return {"start_up_s": 2.0, "limit_s": None, "points": POINTS}
 
     monkeypatch.setattr(race, "train", made_up)
@@ -193,7 +193,7 @@ def test_results_of_another_commit_size_or_machine_are_refused(asked, monkeypatc
         race_in(tmp_path, n_goals=9)
     made["commit"] = "b"
     with pytest.raises(
-        RaceError, match=r"ours-quick-seed0.json: was made with commit a, now b; choose another"
+        RaceError, match=r"ours-quick-seed0.json: got commit a, expected commit b; choose another"
     ):
         race_in(tmp_path)
     made["commit"] = "a"
@@ -207,6 +207,6 @@ def test_without_the_first_there_is_no_race_and_other_seeds_are_told(asked, monk
     assert main(["race", "--seeds", "1,3", "--out", str(tmp_path)]) == 2
     said = capsys.readouterr()
     assert "ours-quick" in said.err
-    assert "stopped with status 1" in said.out and "29.5" in said.out
+    assert "got status 1" in said.out and "29.5" in said.out
     assert not list(tmp_path.glob("*seed3.json"))
     assert len(list(tmp_path.glob("*seed1.json"))) == len(CONTESTANTS)

@@ -124,7 +124,7 @@ def test_values_go_over_the_line(line):
 def test_old_answers_are_passed_over(line):
     arm, controller = line
     arm.timeout_s, controller.silent = 0.05, 1
-    with pytest.raises(TimeoutError, match="R: no answer within 50 ms"):
+    with pytest.raises(TimeoutError, match="R: got no answer, expected one within 50 ms"):
         arm.read_sensors()
     assert np.isnan(arm.pressures()).all()  # those measured before are old
     arm.timeout_s = TIMEOUT_S
@@ -133,7 +133,7 @@ def test_old_answers_are_passed_over(line):
 
 def test_what_the_arm_refuses_is_an_error_and_what_it_garbles_is_lost(line):
     arm, controller = line
-    with pytest.raises(ValueError, match="P: refused: chamber beyond 20 kPa"):
+    with pytest.raises(ValueError, match="P: got the refusal 'chamber beyond 20 kPa'"):
         arm.write_pressures(np.full(N, 21.0))
     arm.timeout_s = 0.05
     nine = b" 1 2 3 4 5 6 7 8 9"
@@ -141,8 +141,11 @@ def test_what_the_arm_refuses_is_an_error_and_what_it_garbles_is_lost(line):
         (b"R K 1 2 3\n", "got 'R' and 3 numbers, expected 'R' and 18"),
         (b"R K 1 2 x3\n", "'1 2 x3', expected numbers"),
         (b"P K" + 2 * nine + b"\n", "got 'P' and 18 numbers, expected 'R' and 18"),
-        (b"\n\n\xff R\n", "no answer within 50 ms"),
-        (b"R K" + 2 * nine, "no answer within 50 ms"),  # its end is missing: the last may be 98.7
+        (b"\n\n\xff R\n", "got no answer, expected one within 50 ms"),
+        (
+            b"R K" + 2 * nine,
+            "got no answer, expected one within 50 ms",
+        ),  # its end is missing: the last may be 98.7
     ):
         controller.garbage = garbage
         with pytest.raises(TimeoutError, match=message):
@@ -173,7 +176,9 @@ def test_board_that_begins_anew_is_waited_for(request, monkeypatch):
     assert kind().read_sensors().min() > 1e6 and controller.silent == 0
     monkeypatch.setattr(serial_line, "START_S", 0.2)
     controller.silent = 100
-    with pytest.raises(OSError, match=r"/dev/.*: no readings within 0.2 s: R: no answer within 50 ms"):
+    with pytest.raises(
+        OSError, match=r"/dev/.*: got no readings, expected some within 0.2 s; R: got no answer"
+    ):
         kind()
 
 
@@ -183,7 +188,7 @@ def test_line_that_cannot_be_sent_in_time_is_lost(monkeypatch):
     tty.setraw(theirs)
     monkeypatch.setattr(SerialArm, "_wait_for_answer", lambda _: None)
     arm = type("Arm", (SerialArm,), {"port": os.ttyname(theirs), "n": N, "timeout_s": 0.02})()
-    with pytest.raises(TimeoutError, match="not sent within 20 ms"):
+    with pytest.raises(TimeoutError, match="got a line stuck, expected it sent within 20 ms"):
         arm.send(1_000_000 * b"?")
     for end in ends:
         os.close(end)
@@ -201,5 +206,7 @@ def test_recording_over_the_line(line, monkeypatch):
 
 def test_port_that_is_not_there_is_named():
     pytest.importorskip("serial")
-    with pytest.raises(ArmError, match="SerialArm cannot be opened: SerialException: .*ttyACM0"):
+    with pytest.raises(
+        ArmError, match="SerialArm: got SerialException: .*ttyACM0.*; expected an arm that opens"
+    ):
         open_arm("mjx_softarm.deploy.drivers.serial_line:SerialArm")

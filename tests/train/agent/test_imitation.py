@@ -102,5 +102,5 @@ def test_parts_that_do_not_fit_are_refused(new):
         learner.adopt(state, agent=other)
     without = new(learned_weight=0.0, hand_made_weight=1.0).init(jax.random.PRNGKey(0))
     for donor in (without, state.agent):
-        with pytest.raises(ValueError, match="learned no reward"):
+        with pytest.raises(ValueError, match="reward: got none"):
             learner.adopt(state, reward=donor)

@@ -115,5 +115,5 @@ def test_a_policy_that_the_file_cannot_hold_is_refused(run, task, tmp_path, quic
 
 
 def test_a_checkpoint_of_another_learner_is_refused(run, tmp_path):
-    with pytest.raises(RunError, match=f"{run.path}: its checkpoint has other parts or sizes"):
+    with pytest.raises(RunError, match=f"{run.path}: got a checkpoint of other parts or sizes"):
         export.export_run(run, tmp_path / "policy.npz")

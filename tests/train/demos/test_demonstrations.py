@@ -95,7 +95,7 @@ def test_planted_mistake_is_named(file, mistake, name):
 
 @pytest.mark.parametrize("group", NEEDED)
 def test_missing_columns(file, group):
-    with pytest.raises(LogError, match=r"demos.csv: line 1: .*: missing, expected"):
+    with pytest.raises(LogError, match=r"demos.csv: line 1: .*: got nothing, expected"):
         load_demonstrations(file(without=[group]), SPEC)
 
 

@@ -78,9 +78,9 @@ def test_an_arm_that_does_not_settle_is_reset_counted_and_never_stored(job):
 
 def test_a_checkpoint_that_is_missing_or_of_another_structure_is_refused(job, tmp_path):
     run, state = Run.create(tmp_path, CONFIG, job.env.spec), start(job)
-    with pytest.raises(RunError, match="holds no checkpoint"):
+    with pytest.raises(RunError, match="got no checkpoint"):
         run.restore(state)
     run.save(0, state)
     for other in ({**state._asdict(), "more": state.key}, state._replace(key=state.arms.obs)):
-        with pytest.raises(RunError, match=f"{tmp_path}: its checkpoint has other parts or sizes"):
+        with pytest.raises(RunError, match=f"{tmp_path}: got a checkpoint of other parts or sizes"):
             run.restore(other)

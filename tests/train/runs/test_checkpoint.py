@@ -10,7 +10,7 @@ CONFIG = TrainConfig()
 
 
 def test_a_folder_that_is_no_run_is_named(tmp_path):
-    with pytest.raises(RunError, match="not the folder of a run: .*config.json: No such file"):
+    with pytest.raises(RunError, match="config.json: got 'No such file.*expected the folder of a run"):
         Run.open(tmp_path)
     (tmp_path / "config.json").write_text("{")
     with pytest.raises(RunError, match="config.json: got a damaged config or another version's"):

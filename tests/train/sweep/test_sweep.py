@@ -206,7 +206,7 @@ def test_a_sweep_as_a_user_runs_it(tmp_path, capsys):
     assert (path / names[1] / "evaluation.json").read_text() == figures
     capsys.readouterr()
     assert main(command) == 2
-    assert "is there already; continue it with --resume" in capsys.readouterr().err
+    assert "which is there already, expected a new folder; --resume" in capsys.readouterr().err
 
 
 def test_members_are_the_product_of_seeds_and_values():
@@ -246,7 +246,7 @@ def test_resume_goes_alone(capsys):
 
 
 def test_a_folder_that_is_no_sweep_is_named(tmp_path):
-    with pytest.raises(RunError, match="not the folder of a sweep: .*sweep.json: No such file"):
+    with pytest.raises(RunError, match="sweep.json: got 'No such file.*expected the folder of a sweep"):
         open_sweep(tmp_path)
     (tmp_path / "sweep.json").write_text('{"members": 3}')
     with pytest.raises(RunError, match="sweep.json: not what a sweep writes"):
@@ -306,5 +306,5 @@ def test_the_plot_has_the_mean_and_the_spread(finished):
 
 def test_an_unfinished_member_is_named(finished):
     (finished.runs[2].path / "evaluation.json").unlink()
-    with pytest.raises(RunError, match=re.escape(f"{finished.runs[2].path}: not finished")):
+    with pytest.raises(RunError, match=re.escape(f"{finished.runs[2].path}: got no evaluation.json")):
         report(finished)
