@@ -126,7 +126,7 @@ def _finite(file: str, table: Table) -> Table:
     """Return the table, or raise an error that names each column with a NaN."""
     bad = ~np.isfinite(table.values)
     found = [
-        _finding(file, table.row[bad[:, k]], table.names[k], "got NaN or inf, expected numbers")
+        _finding(file, table.row[bad[:, k]], table.names[k], "NaN or inf, expected numbers")
         for k in np.flatnonzero(bad.any(axis=0))
     ]
     if found:

@@ -128,7 +128,7 @@ def _typical(values: np.ndarray) -> float:
 def _implausible_column(column: Column, values: np.ndarray) -> str:
     what = "median step" if column.kind == "time" else "median"
     if not np.isfinite(values).any():
-        return "" if column.group in FROM_LOOP else "no number in the whole column"
+        return "" if column.group in FROM_LOOP else "got no number in the whole column, expected some"
     got = _typical(np.diff(values) if column.kind == "time" else values)
     low, high, *_ = PLAUSIBLE[quantity(column)]
     by_hand = column.kind == "time" and len(values) < BY_HAND_ROWS and low <= got <= BY_HAND_S
@@ -139,7 +139,9 @@ def _implausible_column(column: Column, values: np.ndarray) -> str:
     fitting = [unit for unit, other in factors.items() if low <= got / factor * other <= high]
     hint = f" (plausible in {' or '.join(fitting)})" if fitting else ""
     expected = f"{low / factor:.4g} to {high / factor:.4g} {column.unit}"
-    return f"{what} {got / factor:.4g} {column.unit}{hint}, expected {expected}: wrong unit or column"
+    return (
+        f"got a {what} of {got / factor:.4g} {column.unit}{hint}, expected {expected}: wrong unit or column"
+    )
 
 
 def quantity(column: Column) -> str:
@@ -159,7 +161,7 @@ def _implausible_size(matrix: LogMatrix, group: str) -> str:
     if largest == 0.0 or largest >= least:
         return ""
     got, expected = f"{largest / factor:.4g} {column.unit}", f"{least / factor:.4g} {column.unit} at least"
-    return f"99 % of the values are below {got}, expected the largest to reach {expected}: wrong unit"
+    return f"got 99 % of the values below {got}, expected the largest to reach {expected}: wrong unit"
 
 
 def _shown(column: Column, value: float) -> str:

@@ -121,7 +121,7 @@ def test_functions_of_two_words_get_lists_and_flags():
         ("show files --seeds 0,a", "--seeds: got '0,a', expected whole numbers"),
         ("fail", "program fail: got nothing, expected --how {bug,input,file,interrupt}"),
         ("fail --how input", "x: got 1, expected 2"),
-        ("fail --how file", "absent/file: No such file or directory"),
+        ("fail --how file", "absent/file: got 'No such file or directory', expected a file"),
     ],
 )
 def test_a_mistake_is_one_line_and_status_2(words, message, capsys):

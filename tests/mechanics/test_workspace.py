@@ -58,7 +58,7 @@ def test_every_sampled_pose_is_a_rest_of_c_mujoco():
 
 def test_even_poses_fill_more_of_the_volume_and_its_rim_than_those_of_the_training():
     even, trained = np.asarray(sample_evenly(SPEC, BATCH, 0).pose)[:, :3], pool().pose[:, :3]
-    assert even.shape == trained.shape and n_voxels(even) > 1.1 * n_voxels(trained)
+    assert even.shape == trained.shape and n_voxels(even) > 1.05 * n_voxels(trained)
     _, counts = np.unique(np.floor(even / VOXEL_MM), axis=0, return_counts=True)
     assert counts.max() <= 8  # where the mean is between one and two
     for share in (1.0, 99.0):  # tips nearest to the base, and furthest from it

@@ -189,7 +189,7 @@ def test_results_of_another_commit_size_or_machine_are_refused(asked, monkeypatc
     assert {(one["commit"], one["uncommitted_changes"]) for one in before} == {("a", True)}
     made |= {"command": "that", "uncommitted_changes": False}
     assert race_in(tmp_path) == [one | {"uncommitted_changes": "failed" not in one} for one in before]
-    with pytest.raises(RaceError, match="n_goals 8, now 9"):
+    with pytest.raises(RaceError, match="got n_goals 8, expected n_goals 9"):
         race_in(tmp_path, n_goals=9)
     made["commit"] = "b"
     with pytest.raises(
@@ -198,7 +198,7 @@ def test_results_of_another_commit_size_or_machine_are_refused(asked, monkeypatc
         race_in(tmp_path)
     made["commit"] = "a"
     monkeypatch.setattr(race, "machine_kind", lambda: "Abacus, 4 cores")
-    with pytest.raises(RaceError, match="machine Abacus, 2 cores, now Abacus, 4 cores"):
+    with pytest.raises(RaceError, match="got machine Abacus, 2 cores, expected machine Abacus, 4 cores"):
         race_in(tmp_path)
 
 

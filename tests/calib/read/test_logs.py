@@ -101,11 +101,11 @@ def test_logs_of_one_arm_and_of_two():
     first = arm_log(source="a.csv")
     same_arm([first, arm_log(seed=1, source="b.csv"), arm_log(seed=2, source="c.csv")])
     for change, message in [
-        ({"spring_m": 3.0 * first.spring_m}, "spring_m: 0.1.* and 0.5"),
+        ({"spring_m": 3.0 * first.spring_m}, "spring_m: got 0.1.* and 0.5"),
         ({"readings": 0.5 * first.readings}, "readings: "),
         ({"tip_m": 2.0 * first.tip_m}, "tip_m: "),
-        ({"pressure_kpa": first.pressure_kpa[:, :6]}, "pressure_kpa: 9 and 6 in a row"),
-        ({"marker_m": first.marker_m[:, :2]}, "marker_m: 3 and 2 in a row"),
+        ({"pressure_kpa": first.pressure_kpa[:, :6]}, "pressure_kpa: got 9 and 6 in a row"),
+        ({"marker_m": first.marker_m[:, :2]}, "marker_m: got 3 and 2 in a row"),
     ]:
         other = dataclasses.replace(first, source="b.csv", **change)
         with pytest.raises(LogError, match="a.csv and b.csv: " + message):

@@ -193,7 +193,7 @@ def test_misuse_is_told_before_anything_moves(command, tmp_path):
     for args, message in (
         ((*record, tmp_path / "x.csv"), "--task: got nothing, expected one of circle16"),
         ((*record, tmp_path / "no" / "x.csv", "--task", "pipe300"), "expected the name of a new file"),
-        (("check", tmp_path / "none.csv"), "none.csv: No such file"),
+        (("check", tmp_path / "none.csv"), "none.csv: got 'No such file"),
     ):
         status, told = command(*args)
         assert status == 2 and message in told

@@ -249,7 +249,7 @@ def test_a_folder_that_is_no_sweep_is_named(tmp_path):
     with pytest.raises(RunError, match="sweep.json: got 'No such file.*expected the folder of a sweep"):
         open_sweep(tmp_path)
     (tmp_path / "sweep.json").write_text('{"members": 3}')
-    with pytest.raises(RunError, match="sweep.json: not what a sweep writes"):
+    with pytest.raises(RunError, match="sweep.json: got .*, expected what a sweep writes"):
         open_sweep(tmp_path)
 
 
