@@ -26,7 +26,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.custom_derivatives import SymbolicZero
 
-from mjx_softarm._support.small_matrices import eliminate, product
+from mjx_softarm._support.small_matrices import eliminate
 from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK, Frames
 from mjx_softarm.mechanics.statics import Statics, statics
 
@@ -41,42 +41,44 @@ class EquilibriumTangents(NamedTuple):
     tip_rotation: Array  # (3, 3)
 
 
+class Response(NamedTuple):
+    """Response of joints and springs to the chambers' pressures, at the balance of forces."""
+
+    dq_dp: Array  # (nv, n_chambers) [m/kPa, rad/kPa], K
+    dspring_dp: Array  # (n_chambers, n_chambers) [m/kPa], S K
+
+
+class Equilibrium(NamedTuple):
+    """An equilibrium, and what its derivative is made of."""
+
+    q: Array  # (nv,)
+    pressure_kpa: Array  # (n_chambers,)
+    at_limit: Array  # (n_chambers,) bool, the active set
+    frames: Frames
+    statics: Statics
+    response: Response
+
+
 def equilibrium_tangents(
-    primals: tuple,
-    tangents: tuple,
-    frames: Frames,
-    here: Statics,
-    q: Array,
-    pressure_kpa: Array,
-    at_limit: Array,
-    settled: Array,
+    primals: tuple, tangents: tuple, end: Equilibrium, settled: Array
 ) -> EquilibriumTangents:
     """Differentiate an equilibrium along a direction.
 
     Args:
         primals: kinematics, params (`ArmParams`) and reference_m (n_chambers,) of `settle`.
         tangents: the direction, of the same structure, with `SymbolicZero` where nothing changes.
-        frames: plates and joints at the equilibrium.
-        here: statics at the equilibrium.
-        q (nv,): joint coordinates of the equilibrium.
-        pressure_kpa (n_chambers,): its pressures.
-        at_limit (n_chambers,) bool: its active set.
+        end: the equilibrium.
         settled () bool: false for a zero derivative.
     """
     _, params, reference = primals
     _, params_dot, reference_dot = tangents
-    n_sections, n_chambers = params.n_sections, len(at_limit)
+    q, pressure_kpa, at_limit, frames, here, response = end
     explicit = _explicit_tangents(primals, tangents, q, pressure_kpa)
 
-    # Response matrices: K, and the inverse of H where the arm's numbers change
-    columns = [here.push_per_kpa]
-    if explicit is not None:
-        columns.append(jnp.eye(len(q), dtype=q.dtype).reshape(n_sections, -1, len(q)))
-    solved = _masked(here.hessian.solve(jnp.concatenate(columns, axis=-1)), settled)
-    dq_dp = solved[..., :n_chambers]
-    dspring_dp = product(here.springs.jacobian, dq_dp).reshape(n_chambers, n_chambers)
-    identity = jnp.eye(n_chambers, dtype=q.dtype)
-    rows = jnp.where(at_limit[:, None], identity, dspring_dp)
+    # Inverse of the chambers' equations
+    dq_dp = _masked(response.dq_dp, settled)
+    identity = jnp.eye(len(at_limit), dtype=q.dtype)
+    rows = jnp.where(at_limit[:, None], identity, _masked(response.dspring_dp, settled))
     inverse = _masked(eliminate(rows, identity), settled)
 
     # Right-hand side of each chamber's equation
@@ -86,14 +88,16 @@ def equilibrium_tangents(
     tracking_dot = _array(reference_dot, reference)
     dq_held = jnp.zeros_like(q)  # at held pressures
     if explicit is not None:
-        dq_held = -jnp.sum(solved[..., n_chambers:] * explicit.gradient, axis=-1).reshape(-1)
+        every = jnp.eye(len(q), dtype=q.dtype).reshape(params.n_sections, -1, len(q))
+        compliance = _masked(here.hessian.solve(every), settled).reshape(len(q), -1)  # H^-1
+        dq_held = -jnp.sum(compliance * explicit.gradient, axis=-1)
         tracking_dot = tracking_dot - explicit.spring_m - _along(here.springs.jacobian, dq_held)
     limit_dot = jax.lax.select(at_high, high_dot, low_dot)
     right = jax.lax.select(at_limit, limit_dot, tracking_dot)
 
     # Pressures, joints, and what follows from them
     dp = jnp.sum(inverse * right, axis=-1)
-    dq = jnp.sum(dq_dp * dp, axis=-1).reshape(-1) + dq_held
+    dq = jnp.sum(dq_dp * dp, axis=-1) + dq_held
     tip_dot, rotation_dot = _tip_tangents(frames, dq)
     spring_dot = _along(here.springs.jacobian, dq)
     if explicit is not None:

@@ -23,9 +23,9 @@ from jax import Array
 from jax.custom_derivatives import zero_from_primal
 
 from mjx_softarm._support.small_matrices import eliminate, product
-from mjx_softarm.mechanics.implicit import equilibrium_tangents
-from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK, Frames, Kinematics
-from mjx_softarm.mechanics.statics import ArmParams, Statics, statics
+from mjx_softarm.mechanics.implicit import Equilibrium, Response, equilibrium_tangents
+from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK, Kinematics
+from mjx_softarm.mechanics.statics import ArmParams, statics
 
 MAX_ITERATIONS = 12
 ACTIVE_SET_GAIN_KPA_PER_M = 1000.0
@@ -83,7 +83,8 @@ class _Iterate(NamedTuple):
     q: Array  # (nv,)
     pressure: Array  # (n_chambers,) [kPa]
     at_limit: Array  # (n_chambers,) bool, the active set of the last step
-    moving: Array  # () bool, the last step was large or changed the active set
+    response: Response  # before the last step
+    n_small: Array  # () int, small steps without a change of the active set, since the last other one
     stiffening: Array  # () joint stiffness added, in parts of it, where the energy is not convex
     iteration: Array  # ()
 
@@ -105,11 +106,9 @@ def settle(kinematics: Kinematics, params: ArmParams, reference_m: Array) -> Set
 
 
 def _settle_jvp(primals: tuple, tangents: tuple) -> tuple[Settled, Settled]:
-    found, frames, here = _solve(*primals)
+    found, end = _solve(*primals, n_small=2)  # the second small step only brings the response up to date
     with jax.default_matmul_precision("highest"):
-        change = equilibrium_tangents(
-            primals, tangents, frames, here, found.q, found.pressure_kpa, found.at_limit, found.settled
-        )
+        change = equilibrium_tangents(primals, tangents, end, found.settled)
     none = Settled(*(zero_from_primal(field, symbolic_zeros=True) for field in found))
     return found, none._replace(**change._asdict())
 
@@ -117,21 +116,24 @@ def _settle_jvp(primals: tuple, tangents: tuple) -> tuple[Settled, Settled]:
 settle.defjvp(_settle_jvp, symbolic_zeros=True)
 
 
-def _solve(kinematics: Kinematics, params: ArmParams, reference_m: Array) -> tuple[Settled, Frames, Statics]:
-    """Return the equilibrium, and frames and statics of its joint coordinates."""
+def _solve(
+    kinematics: Kinematics, params: ArmParams, reference_m: Array, n_small: int = 1
+) -> tuple[Settled, Equilibrium]:
+    """Return the equilibrium after `n_small` small steps, and all that its derivative needs."""
     dtype = params.link_length_m.dtype
-    n_links = params.link_mass_kg.shape[0]
+    nv, n_chambers = params.link_mass_kg.shape[0] * DOFS_PER_LINK, params.area.shape[0]
     start = _Iterate(
-        q=jnp.zeros(n_links * DOFS_PER_LINK, dtype),
+        q=jnp.zeros(nv, dtype),
         pressure=jnp.clip(jnp.zeros_like(params.area), params.pressure_min_kpa, params.pressure_max_kpa),
         at_limit=jnp.zeros(params.area.shape, bool),
-        moving=jnp.array(True),
+        response=Response(jnp.zeros((nv, n_chambers), dtype), jnp.zeros((n_chambers, n_chambers), dtype)),
+        n_small=jnp.array(0),
         stiffening=jnp.zeros((), dtype),
         iteration=jnp.array(0),
     )
     with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
         end = jax.lax.while_loop(
-            lambda it: it.moving & (it.iteration < MAX_ITERATIONS),
+            lambda it: (it.n_small < n_small) & (it.iteration < MAX_ITERATIONS + n_small - 1),
             lambda it: _newton_step(it, kinematics, params, reference_m),
             start,
         )
@@ -179,12 +181,13 @@ def _newton_step(it: _Iterate, kinematics: Kinematics, params: ArmParams, refere
     largest = jnp.max(jnp.abs(dq))
     scale = jnp.minimum(1.0, MAX_STEP / largest)
     convex = jnp.isfinite(largest)
-    same_set = jnp.all(at_limit == it.at_limit)
+    small = jnp.all(at_limit == it.at_limit) & (largest < SMALL_STEP) & (it.stiffening == 0)
     return _Iterate(
         q=jax.lax.select(convex, it.q + scale * dq, it.q),
         pressure=jax.lax.select(convex, it.pressure + scale * dp, it.pressure),
         at_limit=at_limit,
-        moving=~(same_set & (largest < SMALL_STEP) & (it.stiffening == 0)),
+        response=Response(dq_dp.reshape(-1, len(error)), dspring_dp),
+        n_small=jnp.where(small, it.n_small + 1, 0),
         stiffening=jnp.where(convex, 0.0, 4.0 * it.stiffening + 4.0),
         iteration=it.iteration + 1,
     )
@@ -192,7 +195,7 @@ def _newton_step(it: _Iterate, kinematics: Kinematics, params: ArmParams, refere
 
 def _report(
     it: _Iterate, kinematics: Kinematics, params: ArmParams, reference_m: Array
-) -> tuple[Settled, Frames, Statics]:
+) -> tuple[Settled, Equilibrium]:
     # Forces and springs at the end
     pressure = jnp.clip(it.pressure, params.pressure_min_kpa, params.pressure_max_kpa)
     frames = kinematics(it.q)
@@ -224,4 +227,4 @@ def _report(
         result=result.astype(jnp.int32),
         iterations=it.iteration,
     )
-    return found, frames, here
+    return found, Equilibrium(it.q, pressure, at_limit, frames, here, it.response)
