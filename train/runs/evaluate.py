@@ -83,17 +83,16 @@ class Summary:
 class Evaluator:
     """Evaluate policies of one learner on one arm without randomisation; compiled once.
 
-    Every goal gets `N_ACTIONS` actions of the deterministic policy, and the state after the last counts. On
-    the workspace each arm starts at a random pose. On the circle, a single arm goes from point to point in a
-    second lap, which is evaluated; the first brings it there.
+    Every goal gets `N_ACTIONS` actions of the deterministic policy, and the state after the last counts. Each
+    of many arms goes from goal to goal of its part of the workspace. One goes twice around the circle, and
+    its second lap counts.
     """
 
     def __init__(self, env: ReachEnv, learner: Learner, n_goals: int = N_GOALS):
-        self.env, self.learner = nominal(env), learner
-        self.n_goals = n_goals
-        self.circle = jnp.asarray(circle_poses())
-        self._workspace = xla.jit(self._reach_all, env.uses_mjx)
-        self._circle = xla.jit(functools.partial(follow, self.env, learner), env.uses_mjx)
+        self.env, self.n_goals = nominal(env), n_goals
+        self.circle = np.asarray(circle_poses())
+        one = functools.partial(follow, self.env, learner)
+        self._follow = xla.jit(jax.vmap(one, in_axes=(None, 0, 0)), env.uses_mjx)
 
     @functools.cached_property
     def goals(self) -> Array:
@@ -104,15 +103,16 @@ class Evaluator:
     def __call__(self, policy: Any) -> tuple[Summary, Reached, Reached]:
         """Return figures, and the results on the first set and on the circle as NumPy arrays."""
         policy = jax.device_get(policy)  # maybe on many devices; one is enough
-        both = jax.device_get(self._workspace(policy, self.goals))
-        workspace, even = (jax.tree.map(lambda x, k=k: np.split(x, 2)[k], both) for k in range(2))
-        circle = jax.device_get(self._circle(policy, self.circle))
+        lap, n_goals = len(self.circle), len(self.goals)
+        n_arms = -(-n_goals // (2 * lap))
+        paths = np.resize(self.goals, (n_arms + 1, 2 * lap, 6))  # the last goals are there twice
+        paths[-1] = np.tile(self.circle, (2, 1))
+        keys = jax.random.split(jax.random.PRNGKey(HELD_OUT_SEED), len(paths))
+        found = jax.device_get(self._follow(policy, paths, keys))
+        both = jax.tree.map(lambda x: np.split(x[:-1].reshape(-1, *x.shape[2:])[:n_goals], 2), found)
+        workspace, even = (Reached(*(field[k] for field in both)) for k in range(2))
+        circle = jax.tree.map(lambda x: x[-1, lap:], found)
         return summarise(workspace, even, circle, self.env.config.reward.threshold), workspace, circle
-
-    def _reach_all(self, policy: Any, goals: Array) -> Reached:
-        keys = jax.random.split(jax.random.PRNGKey(HELD_OUT_SEED), len(goals))
-        starts = jax.vmap(self.env.reset)(keys)
-        return jax.vmap(lambda *at: reach(self.env, self.learner, policy, *at)[1])(starts, goals)
 
 
 def nominal(env: ReachEnv) -> ReachEnv:
@@ -143,12 +143,12 @@ def reach(env: ReachEnv, learner: Learner, policy: Any, state: State, goal: Arra
     )
 
 
-def follow(env: ReachEnv, learner: Learner, policy: Any, path: Array) -> Reached:
-    """Return the results of one arm along a path (n, 6) of goals, in a second pass; the first leads there."""
-    start = env.reset(jax.random.PRNGKey(HELD_OUT_SEED))
-    twice = jnp.concatenate([path, path])
-    _, reached = jax.lax.scan(lambda state, goal: reach(env, learner, policy, state, goal), start, twice)
-    return jax.tree.map(lambda x: x[len(path) :], reached)
+def follow(env: ReachEnv, learner: Learner, policy: Any, path: Array, key: Array) -> Reached:
+    """Return the results of one arm, from a random start, along a path (n, 6) of goals."""
+    _, reached = jax.lax.scan(
+        lambda state, goal: reach(env, learner, policy, state, goal), env.reset(key), path
+    )
+    return reached
 
 
 def summarise(workspace: Reached, even: Reached, circle: Reached, threshold: float) -> Summary:
