@@ -43,6 +43,18 @@ PRESETS: dict[str, TrainConfig] = {
         vector_steps_per_epoch=256,
         evaluation_epochs=4,
     ),
+    # The paper's recipe: 14 workers, sb3-contrib's hyperparameters with its one gradient step for each step of
+    # the workers, and each transition stored again with the pose it achieved for its goal.
+    "as-printed": TrainConfig(
+        n_arms=14,
+        total_env_steps=300_000,
+        updates_per_env_step=1 / 14,
+        warmup_env_steps=100,
+        replay_capacity=600_000,
+        hindsight=HindsightConfig(exchange_actions=False),
+        vector_steps_per_epoch=256,
+        evaluation_epochs=20,
+    ),
     "paper": dataclasses.replace(_TUNED, total_env_steps=300_000, updates_per_env_step=0.5),
 }
 

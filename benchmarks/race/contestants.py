@@ -3,7 +3,7 @@
     python -m benchmarks.race.contestants NAME SEED STRETCH_S N_GOALS
 
 NAME is one of `CONTESTANTS`. Ours is the loop of `python -m train reach` without its files, with the preset
-quick or paper. The peers train on the project's Gymnasium environment through `learn`: with the defaults of
+analytic, quick (TQC, then polished) or paper. The peers train on the project's Gymnasium environment through `learn`: with the defaults of
 their algorithm and one arm, or with the settings of ours-quick wherever they have one. They have none for the
 temperature's own learning rate. Our learning rate falls along a half cosine over the preset's env steps, at
 which our training ends; theirs does so too, and begins anew.
@@ -18,6 +18,7 @@ are chosen. Start-up ends when a peer has done a first round of updates, and whe
 from __future__ import annotations
 
 import dataclasses
+import functools
 import importlib
 import math
 import sys
@@ -53,35 +54,34 @@ class HeldOut:
 
         from mjx_softarm._support import xla
         from mjx_softarm.mechanics.workspace import HELD_OUT_SEED
+        from train.runs.evaluate import paths_of, start_keys, towards
 
-        goals = env.sample_pool(n_goals, HELD_OUT_SEED).pose
-
-        def start(key, goal):
-            state = env.reset(key)
-            arm = state.pipeline_state._replace(goal=goal)
-            return state.replace(pipeline_state=arm, obs=env.observe(arm.pose, goal))
-
-        keys = jax.random.split(jax.random.PRNGKey(HELD_OUT_SEED), n_goals)
-        self._start = xla.jit(jax.vmap(start), env.uses_mjx)(keys, goals)
+        self.n_goals = n_goals
+        self._paths = paths_of(env.sample_pool(n_goals, HELD_OUT_SEED).pose)  # (n_arms, k, 6)
+        self._start = xla.jit(jax.vmap(env.reset), env.uses_mjx)(start_keys(len(self._paths)))
+        self._towards = xla.jit(jax.vmap(functools.partial(towards, env)), env.uses_mjx)
         self._step = xla.jit(jax.vmap(env.step), env.uses_mjx)
 
     def tip_error_mm(self, policy: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
         """Return the tip error at each goal (n_goals,), after the last action."""
         from train.runs.evaluate import N_ACTIONS
 
-        state = self._start
-        for _ in range(N_ACTIONS):
-            state = self._step(state, policy(np.array(state.obs)))
-        arm = state.pipeline_state
-        return np.linalg.norm(np.asarray(arm.pose - arm.goal)[:, :3], axis=-1)
+        state, errors = self._start, []
+        for goals in np.moveaxis(self._paths, 1, 0):
+            state = self._towards(state, goals)
+            for _ in range(N_ACTIONS):
+                state = self._step(state, policy(np.array(state.obs)))
+            errors.append(state.metrics["tip_error_mm"])
+        return np.stack(errors, axis=1).reshape(-1)[: self.n_goals]
 
 
 def our_config(name: str) -> Any:
-    """Return the `TrainConfig` of ours-quick, ours-plain or ours-paper."""
+    """Return the `TrainConfig` of one of ours; ours-plain is quick without hindsight."""
     from train.presets import PRESETS
 
-    config = PRESETS["paper" if name == "ours-paper" else "quick"]
-    if name == "ours-plain":
+    plain = name == "ours-plain"
+    config = PRESETS["quick" if plain else name.removeprefix("ours-")]
+    if plain:
         without = dataclasses.replace(config.hindsight, reached_share=0.0, near_share=0.0)
         config = dataclasses.replace(config, hindsight=without)
     return config
@@ -92,12 +92,11 @@ def ours(name: str, seed: int) -> Contestant:
     import jax
 
     from mjx_softarm.env import ReachEnv
-    from train.agent.hindsight_tqc import HindsightTQC
-    from train.epoch.job import Job
+    from train.runs.task import task_of
 
     config = dataclasses.replace(our_config(name), seed=seed)
-    env = ReachEnv(config=config.env)
-    job = Job(config, env, HindsightTQC(config, env))
+    job = task_of(config, ReachEnv(config=config.env)).job
+    n_env_steps = config.total_env_steps + config.polish_updates * config.n_arms
     state = job.start(lambda: job.init(jax.random.PRNGKey(seed)))
     act = jax.jit(job.learner.mode)
 
@@ -109,7 +108,7 @@ def ours(name: str, seed: int) -> Contestant:
         train,
         policy=lambda obs: np.asarray(act(job.policy(state), obs)),
         done=lambda: (int(state.n_env_steps), int(state.n_updates)),
-        limit=config.total_env_steps,
+        limit=n_env_steps,
     )
 
 
@@ -201,8 +200,8 @@ def scaled(envs: Any, factor: float) -> Any:
 
 
 CONTESTANTS = (  # the most telling first
-    *("ours-quick", "sbx-hindsight", "sb3-contrib-hindsight", "sbx-plain", "sb3-contrib-plain", "ours-plain"),
-    *("sbx-defaults", "sb3-contrib-defaults", "ours-paper"),
+    *("ours-quick", "ours-analytic", "sbx-hindsight", "sb3-contrib-hindsight", "sbx-plain"),
+    *("sb3-contrib-plain", "ours-plain", "sbx-defaults", "sb3-contrib-defaults", "ours-paper"),
 )
 
 

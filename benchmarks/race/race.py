@@ -5,9 +5,9 @@ TQC of SBX and of Stable-Baselines3-contrib on the same arms, goals and evaluati
 each trains. They run one after another, each in a process of its own with all cores. A level is reached
 where the line between two evaluations crosses it for the first time.
 
-Ours with the preset quick goes first. A peer is stopped when it has had as many times our time to 5 mm as the
-goal asks for, since the goal is met then, or when it has reached all levels that ours has; ours-plain has as
-long as SBX, or its preset's env steps. The preset paper, for the finer levels, trains to the finest or to its
+Ours with the presets quick and analytic go first. A peer is stopped when it has had as many times our time to
+5 mm as its goals ask for, since they are met then, or when it has reached all levels that quick has; ours-plain
+has as long as SBX, or its preset's env steps. The preset paper, for the finer levels, trains to the finest or to its
 end. Results stay in the working folder: the same command continues an interrupted race, and seeds may be
 added.
 """
@@ -88,20 +88,32 @@ def run(folder: Path, seeds: Sequence[int], names: Sequence[str], n_goals: int =
     results = []
     for seed in seeds:
         first = _result(folder, FIRST, seed, Limits(), n_goals)
+        ours = [first]
         results.append(first)
         for name in CONTESTANTS:
             wanted = name in names or _file(folder, name, seed).exists()
             if name != FIRST and wanted and "failed" not in first:
-                results.append(_result(folder, name, seed, limits_of(name, first["points"]), n_goals))
+                found = _result(folder, name, seed, limits_of(name, ours), n_goals)
+                results.append(found)
+                ours += [found] * name.startswith("ours")
     return results
 
 
-def limits_of(name: str, first: Sequence[Facts]) -> Limits:
-    """Return a contestant's limits, by the curve of the first."""
-    reached_mm = [level for level in LEVELS_MM if crossing(first, level, "wall_s") is not None]
-    time_s = crossing(first, GOAL_MM, "wall_s") or first[-1]["wall_s"]
-    wall_s = GOALS.get(name.rsplit("-", 1)[0], GOALS["sbx"]) * time_s
-    if name == "ours-paper":
+def limits_of(name: str, ours: Sequence[Facts]) -> Limits:
+    """Return a contestant's limits, by the curves of ours that raced before it, the first one's before all."""
+    reached_mm = [level for level in LEVELS_MM if crossing(ours[0]["points"], level, "wall_s") is not None]
+    times_s = {
+        raced["contestant"]: crossing(raced["points"], GOAL_MM, "wall_s") or raced["points"][-1]["wall_s"]
+        for raced in ours
+        if "points" in raced
+    }
+    library = name.rsplit("-", 1)[0].replace("ours", "sbx")
+    wall_s = max(
+        wanted.times * times_s[wanted.ours[0]]
+        for wanted in GOALS
+        if wanted.library == library and wanted.ours[0] in times_s
+    )
+    if name in ("ours-analytic", "ours-paper"):
         return Limits(target_mm=min(LEVELS_MM), stretch_s=wall_s / N_STRETCHES)
     return Limits(wall_s, min(reached_mm, default=0), wall_s / N_STRETCHES)
 

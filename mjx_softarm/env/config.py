@@ -70,6 +70,6 @@ class EnvConfig:
         _expect(self, "clearance_margin_mm", math.isfinite(self.clearance_margin_mm), "a finite number")
         tolerance = "saturation_tolerance_mm"
         _expect(self, tolerance, 0 <= self.saturation_tolerance_mm < math.inf, "a finite number >= 0")
-        _expect(self, "n_poses", self.n_poses >= 1, "at least 1")
+        _expect(self, "n_poses", self.n_poses >= 2, "at least 2")
         other = f"another: {seed} draws the goals of the evaluation"
         _expect(self, "workspace_seed", self.workspace_seed != seed, other)

@@ -116,7 +116,7 @@ class ReachEnv(Env):
         self.model = mjx.put_model(build_model(self.spec)) if self.uses_mjx else None
         self._results = MotionResult if self.config.mode == "dynamic" else SettleResult
         self._failures = {f"invalid_{r.name.lower()}": r.value for r in self._results if r.value != 0}
-        self.pool = self.sample_pool(self.config.n_poses, self.config.workspace_seed)
+        self.pool = self._training_pool(self.config.n_poses, self.config.workspace_seed)
 
     @property
     def observation_size(self) -> int:
@@ -135,6 +135,11 @@ class ReachEnv(Env):
         """Draw n poses with `sample_workspace` or `sample_evenly`, and correct them to those observed."""
         pool = (sample_evenly if evenly else sample_workspace)(self.spec, n, seed)
         return pool._replace(pose=self._observed_pose(pool.pose, pool.spring_m))
+
+    def _training_pool(self, n: int, seed: int) -> Pool:
+        """Draw starts and goals: half of them as `sample_workspace` does, half evenly, rim included."""
+        halves = self.sample_pool(n - n // 2, seed), self.sample_pool(n // 2, seed, evenly=True)
+        return jax.tree.map(lambda *parts: jnp.concatenate(parts), *halves)
 
     def _observed_pose(self, pose: Array, spring_m: Array) -> Array:
         if self.s2r is None:

@@ -57,7 +57,7 @@ def sample_workspace(spec: ArmSpec, n: int, seed: int) -> Pool:
 
     Pressures follow the arcsine law between their limits, which favours the extremes where the workspace
     ends; of twice as many candidates, `n` are drawn with weights that even out the number of tips per
-    voxel of 25 mm. Candidates that did not settle are left out.
+    voxel of 25 mm. Candidates that did not settle, or with a spring beyond its limits, are left out.
 
     Args:
         spec: the arm.
@@ -65,7 +65,7 @@ def sample_workspace(spec: ArmSpec, n: int, seed: int) -> Pool:
         seed: of the draw; training and evaluation use different ones.
 
     Raises:
-        SpecError: the arm settles at fewer than `n` of the candidates.
+        SpecError: the arm settles, its springs within their limits, at fewer than `n` of the candidates.
     """
     rng = np.random.default_rng(seed)
     return _draw(spec, n, random_pressures(spec, CANDIDATES_PER_POSE * n, rng), rng, replace=False)
@@ -84,7 +84,7 @@ def sample_evenly(spec: ArmSpec, n: int, seed: int) -> Pool:
         seed: of the draw; training and evaluation use different ones.
 
     Raises:
-        SpecError: the arm settles at fewer than `n` of the candidates.
+        SpecError: the arm settles, its springs within their limits, at fewer than `n` of the candidates.
     """
     rng = np.random.default_rng(seed)
     half = CANDIDATES_PER_EVEN_POSE * n // 2
@@ -94,15 +94,18 @@ def sample_evenly(spec: ArmSpec, n: int, seed: int) -> Pool:
 
 def _draw(spec: ArmSpec, n: int, pressure_kpa: np.ndarray, rng: np.random.Generator, replace: bool) -> Pool:
     found = settle_many(spec, pressure_kpa)
-    tip_mm = np.where(found.settled[:, None], 1e3 * found.tip_position_m, 0.0)
+    in_range = (spec.springs.length_min_m <= found.spring_m) & (found.spring_m <= spec.springs.length_max_m)
+    usable = found.settled & in_range.all(axis=-1)
+    tip_mm = np.where(usable[:, None], 1e3 * found.tip_position_m, 0.0)
     _, voxel, count = np.unique(
         np.floor(tip_mm / VOXEL_MM).astype(int), axis=0, return_inverse=True, return_counts=True
     )
-    weight = found.settled / count[voxel.ravel()]
+    weight = usable / count[voxel.ravel()]
     if np.count_nonzero(weight) < n:
         raise SpecError(
-            f"{spec.name}: got an arm that settles at {np.count_nonzero(weight)} of {len(weight)} random "
-            f"pressures, expected at {n} or more; is it stiff enough?"
+            f"{spec.name}: got an arm that settles, its springs within their limits, at "
+            f"{np.count_nonzero(weight)} of {len(weight)} random pressures, expected at {n} or more; is it "
+            "stiff enough?"
         )
     chosen = rng.choice(len(weight), n, replace=replace, p=weight / weight.sum())
     pose = pose_from_frame(found.tip_position_m[chosen], found.tip_rotation[chosen])

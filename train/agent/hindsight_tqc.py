@@ -36,7 +36,7 @@ class HindsightTQC:
             self.config.hindsight,
             self.env.scale,
             self.config.env.reward,
-            exchange_actions=self.config.env.mode == "quasistatic",
+            exchange_actions=self.config.hindsight.exchange_actions and self.config.env.mode == "quasistatic",
         )
 
     def learn(self, state: TQCState, batch: Transition, key: Array) -> tuple[TQCState, dict[str, Array]]:

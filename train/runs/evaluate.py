@@ -1,7 +1,7 @@
 """Evaluation of a policy on two sets of held-out goals over the whole workspace, and on the paper's circle.
 
-The first set is drawn as goals of the training are, which is rarely near the rim; the second is uniform in
-volume, rim included.
+The first set has random pressures and is rarely near the rim; the second is uniform in volume, rim included.
+Half of the training's goals are drawn as either set is.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from mjx_softarm.mechanics.workspace import HELD_OUT_SEED
 from train.agent.learner import Learner
 
 N_GOALS = 2_000
+PATH = 80  # goals that one arm goes to, one after another: as many as two laps of the circle
 
 
 class Reached(NamedTuple):
@@ -104,15 +105,22 @@ class Evaluator:
         """Return figures, and the results on the first set and on the circle as NumPy arrays."""
         policy = jax.device_get(policy)  # maybe on many devices; one is enough
         lap, n_goals = len(self.circle), len(self.goals)
-        n_arms = -(-n_goals // (2 * lap))
-        paths = np.resize(self.goals, (n_arms + 1, 2 * lap, 6))  # the last goals are there twice
-        paths[-1] = np.tile(self.circle, (2, 1))
-        keys = jax.random.split(jax.random.PRNGKey(HELD_OUT_SEED), len(paths))
-        found = jax.device_get(self._follow(policy, paths, keys))
+        paths = np.concatenate([paths_of(self.goals), np.tile(self.circle, (2, 1))[None]])
+        found = jax.device_get(self._follow(policy, paths, start_keys(len(paths))))
         both = jax.tree.map(lambda x: np.split(x[:-1].reshape(-1, *x.shape[2:])[:n_goals], 2), found)
         workspace, even = (Reached(*(field[k] for field in both)) for k in range(2))
         circle = jax.tree.map(lambda x: x[-1, lap:], found)
         return summarise(workspace, even, circle, self.env.config.reward.threshold), workspace, circle
+
+
+def paths_of(goals: Array) -> np.ndarray:
+    """Return goals (n, 6) as paths (n_arms, PATH, 6), in their order; the last one goes on with the first."""
+    return np.resize(goals, (-(-len(goals) // PATH), PATH, 6))
+
+
+def start_keys(n_arms: int) -> Array:
+    """Return keys of the arms' random starts."""
+    return jax.random.split(jax.random.PRNGKey(HELD_OUT_SEED), n_arms)
 
 
 def nominal(env: ReachEnv) -> ReachEnv:
@@ -121,16 +129,20 @@ def nominal(env: ReachEnv) -> ReachEnv:
     return env if config == env.config else ReachEnv(env.spec, config, env.s2r)
 
 
+def towards(env: ReachEnv, state: State, goal: Array) -> State:
+    """Return an arm's state with another goal (6,) [mm, deg]."""
+    arm = state.pipeline_state._replace(goal=goal)
+    return state.replace(pipeline_state=arm, obs=env.observe(arm.pose, goal))
+
+
 def reach(env: ReachEnv, learner: Learner, policy: Any, state: State, goal: Array) -> tuple[State, Reached]:
     """Take N_ACTIONS with one arm towards a goal (6,); return its state and the result."""
-    arm = state.pipeline_state._replace(goal=goal)
-    state = state.replace(pipeline_state=arm, obs=env.observe(arm.pose, goal))
 
     def act(state: State, _):
         after = env.step(state, learner.mode(policy, state.obs))
         return after, after.info["valid"]
 
-    state, settled = jax.lax.scan(act, state, None, length=N_ACTIONS)
+    state, settled = jax.lax.scan(act, towards(env, state, goal), None, length=N_ACTIONS)
     arm = state.pipeline_state
     return state, Reached(
         goal=goal,

@@ -13,10 +13,9 @@ from jax import Array
 
 from mjx_softarm._support import xla
 from mjx_softarm.env import ReachEnv
-from mjx_softarm.mechanics.workspace import HELD_OUT_SEED
 from mjx_softarm.sensing.pose import pose_error
 from train.agent.learner import Learner
-from train.runs.evaluate import Reached, follow, nominal
+from train.runs.evaluate import Reached, follow, nominal, start_keys
 
 
 class AtPositions(NamedTuple):
@@ -76,8 +75,7 @@ class PositionEvaluator:
     def __call__(self, policy: Any) -> tuple[PositionSummary, AtPositions]:
         """Return figures, and results as NumPy arrays."""
         policy = jax.device_get(policy)  # maybe on many devices; one is enough
-        twice, key = np.tile(self.positions, (2, 1)), jax.random.PRNGKey(HELD_OUT_SEED)
-        passes = jax.device_get(self._follow(policy, twice, key))
+        passes = jax.device_get(self._follow(policy, np.tile(self.positions, (2, 1)), start_keys(1)[0]))
         reached = jax.tree.map(lambda x: x[len(self.positions) :], passes)
         return summarise(reached, self.env.config.reward.threshold, self.first)
 

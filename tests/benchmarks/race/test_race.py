@@ -99,14 +99,17 @@ def test_held_out_goals_are_evaluated_as_the_trainer_does_it():
     agent = TQC(env.observation_size, env.action_size)
     params = agent.init(jax.random.PRNGKey(3)).actor_params
     evaluator = Evaluator(env, agent, n_goals=12)
-    reached = evaluator._workspace(params, evaluator.goals)
+    _, reached, _ = evaluator(params)
     found = HeldOut(env, 12).tip_error_mm(lambda obs: np.asarray(agent.mode(params, obs)))
     assert np.ptp(found) > 10.0
     np.testing.assert_allclose(found, reached.tip_error_mm[:12], atol=0.01)  # of the first set
 
 
 def test_ours_without_hindsight_differs_in_nothing_else():
-    quick, plain, paper = (our_config(f"ours-{name}") for name in ("quick", "plain", "paper"))
+    quick, plain, paper, analytic = (
+        our_config(f"ours-{name}") for name in ("quick", "plain", "paper", "analytic")
+    )
+    assert analytic == PRESETS["analytic"]
     assert (plain.hindsight.reached_share, plain.hindsight.near_share) == (0.0, 0.0)
     assert quick.hindsight == PRESETS["quick"].hindsight and quick.hindsight.near_share > 0
     assert dataclasses.replace(plain, hindsight=quick.hindsight) == quick
@@ -153,18 +156,20 @@ def race_in(folder, seeds=(0,), n_goals=8):
 
 def test_peers_get_our_time_to_5_mm_as_often_as_the_goal_asks_and_stop_where_ours_did(asked, tmp_path):
     results = race_in(tmp_path, (4,))
-    sbx, sb3 = (Limits(n * 29.5, 5, n * 29.5 / 40) for n in (5, 15))
+    sbx, sb3 = (Limits(n * 29.5, 5, n * 29.5 / 40) for n in (20, 15))  # SBX: 5 times quick, 20 analytic
     assert asked == {
         "ours-quick, seed 4": Limits(),
         **{f"sbx-{name}, seed 4": sbx for name in ("hindsight", "plain", "defaults")},
         **{f"sb3-contrib-{name}, seed 4": sb3 for name in ("hindsight", "plain", "defaults")},
         "ours-plain, seed 4": sbx,
+        "ours-analytic, seed 4": Limits(float("inf"), 2, 5 * 29.5 / 40),
         "ours-paper, seed 4": Limits(float("inf"), 2, sbx.stretch_s),
     }
     assert list(asked) == [f"{name}, seed 4" for name in CONTESTANTS]  # the most telling first
     assert all("points" in one for one in results)
     # One that does not reach 5 mm: multiples of all its time.
-    assert limits_of("sbx-plain", POINTS[:2]) == Limits(5 * 22.0, 10, 5 * 22.0 / 40)
+    quick = {"contestant": "ours-quick", "points": POINTS[:2]}
+    assert limits_of("sbx-plain", [quick]) == Limits(5 * 22.0, 10, 5 * 22.0 / 40)
 
 
 def test_some_may_race_alone_and_the_others_and_those_that_failed_follow(
@@ -174,10 +179,10 @@ def test_some_may_race_alone_and_the_others_and_those_that_failed_follow(
     some = [name for name in CONTESTANTS if "hindsight" in name or "plain" in name]
     assert main(["race", "--only", ",".join(some), "--out", str(tmp_path)]) == 0
     assert list(asked) == [f"{name}, seed 0" for name in ("ours-quick", *some)]
-    assert "['sbx-defaults', 'sb3-contrib-defaults', 'ours-paper']" in capsys.readouterr().out
+    assert "['ours-analytic', 'sbx-defaults', 'sb3-contrib-defaults', 'ours-paper']" in capsys.readouterr().out
     asked.clear()
     assert main(["race", "--out", str(tmp_path)]) == 0
-    rest = ("sbx-hindsight", "sbx-defaults", "sb3-contrib-defaults", "ours-paper")  # the first had failed
+    rest = ("ours-analytic", "sbx-hindsight", "sbx-defaults", "sb3-contrib-defaults", "ours-paper")  # the first had failed
     assert list(asked) == [f"{name}, seed 0" for name in rest]
 
 
