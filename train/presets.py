@@ -43,8 +43,8 @@ PRESETS: dict[str, TrainConfig] = {
         vector_steps_per_epoch=256,
         evaluation_epochs=4,
     ),
-    # The paper's recipe: 14 workers, sb3-contrib's hyperparameters with its one gradient step for each step of
-    # the workers, and each transition stored again with the pose it achieved for its goal.
+    # The paper's recipe: 14 workers, sb3-contrib's hyperparameters, of which one is a gradient step for each
+    # step of the workers, and each transition stored again with the pose it achieved for its goal.
     "as-printed": TrainConfig(
         n_arms=14,
         total_env_steps=300_000,

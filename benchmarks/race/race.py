@@ -6,10 +6,10 @@ each trains. They run one after another, each in a process of its own with all c
 where the line between two evaluations crosses it for the first time.
 
 Ours with the presets quick and analytic go first. A peer is stopped when it has had as many times our time to
-5 mm as its goals ask for, since they are met then, or when it has reached all levels that quick has; ours-plain
-has as long as SBX, or its preset's env steps. The preset paper, for the finer levels, trains to the finest or to its
-end. Results stay in the working folder: the same command continues an interrupted race, and seeds may be
-added.
+5 mm as its goals ask for, since they are met then, or when it has reached all levels that quick has;
+ours-plain has as long as SBX, or its preset's env steps. The preset paper, for the finer levels, trains to
+the finest or to its end. Results stay in the working folder: the same command continues an interrupted race,
+and seeds may be added.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ def run(folder: Path, seeds: Sequence[int], names: Sequence[str], n_goals: int =
 
 
 def limits_of(name: str, ours: Sequence[Facts]) -> Limits:
-    """Return a contestant's limits, by the curves of ours that raced before it, the first one's before all."""
+    """Return a contestant's limits, by the curves of ours that raced before it, the first one's first."""
     reached_mm = [level for level in LEVELS_MM if crossing(ours[0]["points"], level, "wall_s") is not None]
     times_s = {
         raced["contestant"]: crossing(raced["points"], GOAL_MM, "wall_s") or raced["points"][-1]["wall_s"]

@@ -34,7 +34,7 @@ class HindsightConfig:
     near_min_mm: float = 1.0  # smallest distance of a near goal
     near_max_mm: float = 100.0  # largest distance of a near goal
     mm_per_deg: float = 1.0  # distance that goes with a turn of one degree of a near goal
-    exchange_actions: bool = True  # saturated actions of relabelled transitions to rest become the sensed ones
+    exchange_actions: bool = True  # relabelled, a saturated action that led to rest becomes the sensed one
 
     def __post_init__(self):
         if min(self.reached_share, self.near_share) < 0 or self.reached_share + self.near_share > 1:
