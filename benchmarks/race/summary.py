@@ -15,7 +15,7 @@ import numpy as np
 from benchmarks.harness.common import goal
 from benchmarks.race.contestants import CONTESTANTS
 
-LEVELS_MM = (10, 5, 3, 2)
+LEVELS_MM = (10, 5, 3, 2, 1)
 GOAL_MM = 5
 FIRST, OUR_TQC = "ours-quick", ("ours-quick", "ours-paper")
 PEERS = {

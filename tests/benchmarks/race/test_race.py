@@ -162,8 +162,8 @@ def test_peers_get_our_time_to_5_mm_as_often_as_the_goal_asks_and_stop_where_our
         **{f"sbx-{name}, seed 4": sbx for name in ("hindsight", "plain", "defaults")},
         **{f"sb3-contrib-{name}, seed 4": sb3 for name in ("hindsight", "plain", "defaults")},
         "ours-plain, seed 4": sbx,
-        "ours-analytic, seed 4": Limits(float("inf"), 2, 5 * 29.5 / 40),
-        "ours-paper, seed 4": Limits(float("inf"), 2, sbx.stretch_s),
+        "ours-analytic, seed 4": Limits(float("inf"), 1, 5 * 29.5 / 40),
+        "ours-paper, seed 4": Limits(float("inf"), 1, sbx.stretch_s),
     }
     assert list(asked) == [f"{name}, seed 4" for name in CONTESTANTS]  # the most telling first
     assert all("points" in one for one in results)

@@ -154,6 +154,7 @@ def test_tables_have_a_row_for_each_contestant_with_start_up_and_without():
         "to_5_mm": 29.5,
         "to_3_mm": "not within 32",
         "to_2_mm": "not within 32",
+        "to_1_mm": "not within 32",
         "best_mm": 4.0,
         "in_all": 32,
     }
