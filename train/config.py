@@ -22,6 +22,7 @@ from train.agent.hindsight import HindsightConfig
 from train.agent.tqc import TQCConfig
 
 LEARNER_GROUPS = {"tqc": ("tqc", "hindsight"), "analytic": ("analytic",)}  # settings that a learner reads
+POLISH_ARMS = 64  # arms of a gradient step of polishing
 POLISH_EPOCH = 256  # gradient steps between two reports of polishing
 POLISH_EVALUATION_EPOCHS = 4  # of these between two evaluations and checkpoints
 
@@ -119,7 +120,9 @@ class TrainConfig:
         return dataclasses.replace(
             self,
             learner="analytic",
-            total_env_steps=self.polish_updates * self.n_arms,
+            n_arms=POLISH_ARMS,
+            total_env_steps=self.polish_updates * POLISH_ARMS,
+            env=dataclasses.replace(self.env, even_share=0.5),  # the rim, too
             vector_steps_per_epoch=POLISH_EPOCH,
             evaluation_epochs=POLISH_EVALUATION_EPOCHS,
             analytic=dataclasses.replace(self.analytic, hidden=self.tqc.hidden_actor),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from train.agent.analytic import AnalyticConfig
+from mjx_softarm.env import EnvConfig
 from train.agent.hindsight import HindsightConfig
 from train.agent.tqc import TQCConfig
 from train.config import ImitationConfig, Stage, TrainConfig
@@ -32,16 +32,16 @@ PRESETS: dict[str, TrainConfig] = {
         batch_size=128,
         replay_capacity=262_144,
         evaluation_epochs=30,
-        analytic=AnalyticConfig(learning_rate=5e-4),
-        polish_updates=2_048,
+        polish_updates=8_192,
     ),
     # A gradient step through the equilibrium takes one action of all arms.
     "analytic": TrainConfig(
         learner="analytic",
         n_arms=64,
-        total_env_steps=524_288,
+        total_env_steps=64 * 65_536,
         vector_steps_per_epoch=256,
-        evaluation_epochs=4,
+        evaluation_epochs=16,
+        env=EnvConfig(n_poses=16_384, even_share=0.5),
     ),
     # The paper's recipe: 14 workers, sb3-contrib's hyperparameters, of which one is a gradient step for each
     # step of the workers, and each transition stored again with the pose it achieved for its goal.

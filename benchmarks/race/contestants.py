@@ -96,7 +96,7 @@ def ours(name: str, seed: int) -> Contestant:
 
     config = dataclasses.replace(our_config(name), seed=seed)
     job = task_of(config, ReachEnv(config=config.env)).job
-    n_env_steps = config.total_env_steps + config.polish_updates * config.n_arms
+    n_env_steps = config.total_env_steps + (config.polish.total_env_steps if config.polish_updates else 0)
     state = job.start(lambda: job.init(jax.random.PRNGKey(seed)))
     act = jax.jit(job.learner.mode)
 

@@ -47,6 +47,7 @@ class EnvConfig:
     saturation_tolerance_mm: float = 1e3 * TOLERANCE_M
     """spring error at which a chamber at its limit counts as saturated"""
     n_poses: int = 8192  # poses of the reachable workspace that starts and goals are drawn from
+    even_share: float = 0.0  # share of these that are uniform in volume, rim included
     workspace_seed: int = 0  # seed of these poses
     dynamic_step_s: float = 0.5  # duration of one environment step in dynamic mode
     pipe_diameter_mm: Annotated[float | None, arg(aliases=["--pipe"])] = None
@@ -70,6 +71,7 @@ class EnvConfig:
         _expect(self, "clearance_margin_mm", math.isfinite(self.clearance_margin_mm), "a finite number")
         tolerance = "saturation_tolerance_mm"
         _expect(self, tolerance, 0 <= self.saturation_tolerance_mm < math.inf, "a finite number >= 0")
-        _expect(self, "n_poses", self.n_poses >= 2, "at least 2")
+        _expect(self, "n_poses", self.n_poses >= 1, "at least 1")
+        _expect(self, "even_share", 0 <= self.even_share <= 1, "0 to 1")
         other = f"another: {seed} draws the goals of the evaluation"
         _expect(self, "workspace_seed", self.workspace_seed != seed, other)

@@ -116,7 +116,7 @@ class ReachEnv(Env):
         self.model = mjx.put_model(build_model(self.spec)) if self.uses_mjx else None
         self._results = MotionResult if self.config.mode == "dynamic" else SettleResult
         self._failures = {f"invalid_{r.name.lower()}": r.value for r in self._results if r.value != 0}
-        self.pool = self._training_pool(self.config.n_poses, self.config.workspace_seed)
+        self.pool = self._training_pool()
 
     @property
     def observation_size(self) -> int:
@@ -136,10 +136,12 @@ class ReachEnv(Env):
         pool = (sample_evenly if evenly else sample_workspace)(self.spec, n, seed)
         return pool._replace(pose=self._observed_pose(pool.pose, pool.spring_m))
 
-    def _training_pool(self, n: int, seed: int) -> Pool:
-        """Draw starts and goals: half of them as `sample_workspace` does, half evenly, rim included."""
-        halves = self.sample_pool(n - n // 2, seed), self.sample_pool(n // 2, seed, evenly=True)
-        return jax.tree.map(lambda *parts: jnp.concatenate(parts), *halves)
+    def _training_pool(self) -> Pool:
+        """Draw the poses that starts and goals are drawn from."""
+        n_even = round(self.config.even_share * self.config.n_poses)
+        counts = (self.config.n_poses - n_even, False), (n_even, True)
+        parts = [self.sample_pool(n, self.config.workspace_seed, evenly) for n, evenly in counts if n]
+        return jax.tree.map(lambda *part: jnp.concatenate(part), *parts)
 
     def _observed_pose(self, pose: Array, spring_m: Array) -> Array:
         if self.s2r is None:

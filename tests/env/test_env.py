@@ -130,6 +130,17 @@ def test_starts_and_goals_are_drawn_from_the_pool_each_on_its_own(env, start):
     np.testing.assert_array_equal(start.pipeline_state.motion.q, env.pool.q[np.array(starts)])
 
 
+def test_a_share_of_the_poses_is_uniform_in_volume(spec):
+    config = EnvConfig(n_poses=48, even_share=0.25, workspace_seed=3)
+    env = ReachEnv(spec, config)
+    plain, even = env.sample_pool(36, 3), env.sample_pool(12, 3, evenly=True)
+    np.testing.assert_array_equal(env.pool.pose, np.concatenate([plain.pose, even.pose]))
+    assert len(np.unique(env.pool.pose, axis=0)) > 40
+    for share in (-0.1, 1.1):
+        with pytest.raises(ValueError, match=r"EnvConfig.even_share: got .*, expected 0 to 1"):
+            EnvConfig(even_share=share)
+
+
 def test_every_goal_is_reached_to_a_tenth_of_a_millimetre_with_no_chamber_saturated(env, start, step):
     after = step(with_arm(start, goal=env.pool.pose), env.action_of(env.pool.spring_m))
     assert float(after.metrics["tip_error_mm"].max()) < 0.1

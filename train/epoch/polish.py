@@ -79,7 +79,7 @@ class PolishedJob:
     def __init__(self, tqc: Job, analytic: Analytic, mesh: Mesh | None = None):
         shapes = jax.eval_shape(tqc.learner.init, jax.random.PRNGKey(0))
         self._learner = Polish(analytic, shapes)
-        self.tqc, self.polish = tqc, Job(tqc.config.polish, tqc.env, self._learner, mesh=mesh)
+        self.tqc, self.polish = tqc, Job(tqc.config.polish, analytic.env, self._learner, mesh=mesh)
         self.config, self.env, self.learner = tqc.config, tqc.env, tqc.learner
         self._n_epochs = tqc.config.n_own_epochs
         self._compiled: Future | None = None

@@ -1,7 +1,6 @@
 """Evaluation of a policy on two sets of held-out goals over the whole workspace, and on the paper's circle.
 
 The first set has random pressures and is rarely near the rim; the second is uniform in volume, rim included.
-Half of the training's goals are drawn as either set is.
 """
 
 from __future__ import annotations

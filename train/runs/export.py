@@ -67,8 +67,8 @@ def export_run(run: Run, path: Path | None = None, task: Task | None = None) -> 
 def arm_model(env: ReachEnv) -> tuple[ArmModel, Distilled]:
     """Return the deployed arm's model of an environment's arm, and its errors."""
     distilled = _distil(env.spec)
-    every = max(1, len(env.pool.pose) // N_WORKSPACE)
-    workspace = np.asarray(env.pool.pose[::every][:N_WORKSPACE], np.float32)
+    halves = [env.sample_pool(N_WORKSPACE // 2, SEED, evenly).pose for evenly in (False, True)]
+    workspace = np.concatenate(halves).astype(np.float32)
     return ArmModel(workspace, distilled.estimator, distilled.spring_model, env.s2r), distilled
 
 

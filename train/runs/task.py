@@ -72,7 +72,8 @@ def task_of(
         return _imitation(config, env, demonstrations, mesh, learner)
     job = Job(config, env, learner or learner_of(config, env, mesh), mesh=mesh)
     if config.polish_updates:
-        job = PolishedJob(job, _analytic(config.polish, env, mesh), mesh)
+        polished = ReachEnv(env.spec, config.polish.env, env.s2r)
+        job = PolishedJob(job, _analytic(config.polish, polished, mesh), mesh)
     return Task(
         job=job,
         title=f"{N_GOALS} held-out goals",

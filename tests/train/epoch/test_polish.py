@@ -60,7 +60,7 @@ def test_polishing_begins_with_tqc_s_policy_and_keeps_its_critics(task, states):
     assert same(end.learner.tqc, after.learner.tqc) and not same(task.job.policy(end), task.job.policy(after))
     n_tqc_steps = N_TQC * CONFIG.n_arms * CONFIG.vector_steps_per_epoch
     assert int(after.n_env_steps) == n_tqc_steps
-    assert int(end.n_env_steps) == n_tqc_steps + POLISHED.polish_updates * CONFIG.n_arms
+    assert int(end.n_env_steps) == n_tqc_steps + POLISHED.polish.total_env_steps
     assert int(end.n_updates) == int(after.n_updates) + POLISHED.polish_updates
 
 
