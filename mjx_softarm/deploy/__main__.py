@@ -44,7 +44,7 @@ Goal = Annotated[tuple[float, ...], cli.listed(_goal, "X,Y,Z,YAW,PITCH,ROLL")]
 Arm = Annotated[
     str,
     tyro.conf.arg(
-        help="twin:SEED, a simulated arm; twin:SEED:pipe300, in a pipe; package.module:Class, your driver"
+        help="twin:SEED, twin:rod:SEED, simulated; twin:SEED:pipe300, in a pipe; package.module:Class, yours"
     ),
 ]
 

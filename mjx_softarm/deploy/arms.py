@@ -1,4 +1,4 @@
-"""Arms by name: `twin:SEED`, `twin:SEED:PIPE`, or `package.module:Class`, a driver of one's own."""
+"""Arms by name: `twin:SEED`, `twin:SEED:PIPE`, `twin:rod:SEED`, or your driver, `package.module:Class`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from mjx_softarm._support.errors import InputError
 
-_TWIN = "mjx_softarm.twin.arm"  # imported by name and where it is asked for alone: it needs MuJoCo
+_TWIN = "mjx_softarm.twin.names"  # imported by name and where it is asked for alone: it needs MuJoCo
 _METHODS = ("read_sensors", "write_pressures")
 
 
@@ -24,8 +24,9 @@ def open_arm(name: str) -> Any:
     """Open an arm: an `ArmIO`, maybe with `pressures`, `motion_capture` or a clock of its own, `time_s`.
 
     Args:
-        name: `twin:SEED`, or in a pipe `twin:SEED:pipe300` or `twin:SEED:pipe250`; or `package.module:Class`,
-            whose class takes no arguments; modules in the working directory are found.
+        name: `twin:SEED`, or in a pipe `twin:SEED:pipe300` or `twin:SEED:pipe250`; `twin:rod:SEED`;
+            or `package.module:Class`, whose class takes no arguments; modules in the working directory
+            are found.
 
     Raises:
         ArmError: the name is malformed, nothing of this name can be imported, or it is no arm.

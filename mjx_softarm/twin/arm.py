@@ -19,12 +19,22 @@ import numpy as np
 from mjx_softarm.deploy.arm_io import Capture
 from mjx_softarm.mechanics.body import payload_radius_m
 from mjx_softarm.mechanics.mjcf import chamber_lengths, spring_lengths
-from mjx_softarm.mechanics.pipe import PIPES_MM, CrossPipe
+from mjx_softarm.mechanics.pipe import CrossPipe
 from mjx_softarm.spec import ArmSpec
 from mjx_softarm.twin.hysteresis import StopOperators
+from mjx_softarm.twin.instruments import (
+    CAPTURE_NOISE_DEG,
+    CAPTURE_NOISE_M,
+    EVALUATION_SESSION,
+    MARKERS_PER_SECTION,
+    PRESSURE_NOISE_KPA,
+    SPRING_NOISE_M,
+    WIDEST_DRAW,
+    checked_payload,
+    checked_pressures,
+)
 from mjx_softarm.twin.model import (
     AS_BUILT,
-    WIDEST_DRAW,
     Build,
     build_twin,
     draw_parts,
@@ -34,10 +44,6 @@ from mjx_softarm.twin.model import (
 from mjx_softarm.twin.pipe import WallForce, contact_force, is_container
 from mjx_softarm.twin.pneumatics import PUMP_M3_PER_S, VALVE_S, Pneumatics
 
-# An S2R network belongs to one arm, so its data come from the same twin as the evaluation, but from another
-# session, whose noise is another, and from other motions.
-S2R_SESSION, EVALUATION_SESSION = 0, 1
-
 # Chambers: four stops of equal force; 3 % of the elastic force of a chamber at its shortest.
 HYSTERESIS_LIMIT_N = 1.5
 HYSTERESIS_STROKES_M = (0.003, 0.006, 0.012, 0.024)
@@ -45,12 +51,6 @@ HYSTERESIS_STROKES_M = (0.003, 0.006, 0.012, 0.024)
 FRICTION_LIMIT = (0.3, 0.01, 0.01)  # [N, N m, N m]
 FRICTION_STROKE = (2e-4, 5e-3, 5e-3)  # [m, rad, rad]
 
-PRESSURE_NOISE_KPA = 0.05
-CAPTURE_NOISE_M = 2e-4
-CAPTURE_NOISE_DEG = 0.1
-SPRING_NOISE_M = 2**0.5 * CAPTURE_NOISE_M  # between two markers
-PRESSURE_TOLERANCE_KPA = 1e-3  # a float32 limit is not yet beyond the limit
-MARKERS_PER_SECTION = 3
 REST_S = 4.0  # hanging at atmospheric pressure before time starts
 
 
@@ -124,18 +124,7 @@ class Twin:
 
     def write_pressures(self, pressure_kpa: np.ndarray) -> None:
         """Command pressures (n,) [kPa], then let one control period pass; see `ArmIO`."""
-        chambers = self._parts.spec.chambers
-        low, high = chambers.pressure_min_kpa, chambers.pressure_max_kpa
-        command = np.asarray(pressure_kpa, float)
-        if command.shape != self._air.pressure_kpa.shape:
-            expected = self._air.pressure_kpa.shape
-            raise ValueError(f"pressure_kpa: got shape {command.shape}, expected {expected}")
-        within = (command >= low - PRESSURE_TOLERANCE_KPA) & (command <= high + PRESSURE_TOLERANCE_KPA)
-        if not within.all():
-            chamber = int(np.flatnonzero(~within)[0])
-            text = f"got {command[chamber]:g}, expected {low:g} to {high:g} kPa"
-            raise ValueError(f"pressure_kpa[{chamber}]: {text}")
-        self._air.command(np.clip(command, low, high))
+        self._air.command(checked_pressures(pressure_kpa, self._parts.spec))
         self._wall_force = WallForce(0.0, 0.0)
         for _ in range(self._steps):
             self._step()
@@ -172,8 +161,7 @@ class Twin:
         Raises:
             ValueError: a mass that is negative or not finite.
         """
-        if not (np.isfinite(payload_kg) and payload_kg >= 0.0):
-            raise ValueError(f"payload_kg: got {payload_kg!r}, expected a number >= 0")
+        payload_kg = checked_payload(payload_kg)
         body = self._model.body("payload").id
         self._model.body_mass[body] = payload_kg
         self._model.body_inertia[body] = payload_kg * self._parts.spec.mass.gripper_length_m**2 / 12
@@ -251,17 +239,3 @@ class Twin:
 
     def _draw(self, deviation: float, *shape: int) -> np.ndarray:
         return self._build.noise * deviation * self._noise.standard_normal(shape)
-
-
-def twin_of(name: str) -> Twin:
-    """Make the twin of a name, `SEED` or `SEED:PIPE`.
-
-    Raises:
-        ValueError: the name is malformed, or the arm of this seed does not fit into the pipe.
-    """
-    seed, colon, pipe = name.partition(":")
-    if not seed.isdecimal():
-        raise ValueError(f"twin:SEED: got {seed!r}, expected an integer >= 0")
-    if colon and pipe not in PIPES_MM:
-        raise ValueError(f"twin:{seed}:PIPE: got {pipe!r}, expected {' or '.join(PIPES_MM)}")
-    return Twin(int(seed), pipe=CrossPipe.of_mm(PIPES_MM[pipe]) if pipe else None)

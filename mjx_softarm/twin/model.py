@@ -24,12 +24,12 @@ from mjx_softarm.mechanics.pipe import CrossPipe
 from mjx_softarm.mechanics.statics import GRAVITY_M_S2
 from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
+from mjx_softarm.twin.instruments import WIDEST_DRAW
 from mjx_softarm.twin.pipe import add_pipe
 
 GAP = 1.9
 LINKS_PER_SECTION = 10
 MAX_TIMESTEP_S = 0.005  # the tip within 0.13 mm RMS of 0.00125 s, over 30 s of random commands
-WIDEST_DRAW = 2.0  # standard deviations; a part further off would not have been mounted
 
 
 @dataclass(frozen=True)

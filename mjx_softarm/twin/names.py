@@ -1,0 +1,30 @@
+"""Twins by name."""
+
+from __future__ import annotations
+
+from mjx_softarm.mechanics.pipe import PIPES_MM, CrossPipe
+from mjx_softarm.twin.arm import Twin
+from mjx_softarm.twin.rod_twin import RodTwin
+
+ROD = "rod"
+
+
+def twin_of(name: str) -> Twin | RodTwin:
+    """Make the twin of a name, `SEED`, `SEED:PIPE` or `rod:SEED`.
+
+    Raises:
+        ValueError: the name is malformed, or the arm of this seed does not fit into the pipe.
+    """
+    if name.startswith(f"{ROD}:"):
+        return RodTwin(_seed(name.removeprefix(f"{ROD}:"), f"twin:{ROD}:SEED"))
+    seed, colon, pipe = name.partition(":")
+    number = _seed(seed, "twin:SEED")
+    if colon and pipe not in PIPES_MM:
+        raise ValueError(f"twin:{seed}:PIPE: got {pipe!r}, expected {' or '.join(PIPES_MM)}")
+    return Twin(number, pipe=CrossPipe.of_mm(PIPES_MM[pipe]) if pipe else None)
+
+
+def _seed(text: str, form: str) -> int:
+    if not text.isdecimal():
+        raise ValueError(f"{form}: got {text!r}, expected an integer >= 0")
+    return int(text)

@@ -1,0 +1,249 @@
+"""A hanging arm as a geometrically exact rod: bending, torsion, shear and extension, with fibres along it.
+
+This is another mechanics than that of training, written without it: no links, hinges or tendons. The rod is
+cut into elements of constant strain: curvature and twist kappa, shear and extension nu, both in the element's
+own axes. With h an element's length, R_e the axes where it begins (turned by the joint, where a section
+begins) and exp the rotation by a vector,
+
+    R_{e+1} = R_e exp(h kappa),    x_{e+1} = x_e + h R_e exp(h kappa / 2) nu,
+
+where nu = (0, 0, -1) at rest, as the arm hangs towards -z. Chambers and springs are fibres that are glued to
+the cross-sections, so each piece of one stretches by itself: a piece at r is h |nu + kappa x r| long, and
+lambda is that over h, times the section's length L. A chamber pulls with
+
+    f = k d (1 + c (d / L)^2) - p (A + A' (lambda - L)),    d = lambda - rest length,
+
+so it hardens. The motion is overdamped, without inertia: C dq/dt = -dV/dq with the potential V and damping
+C in proportion to the stiffness of the straight rod. A step is linearly implicit Euler's; where the rod comes
+to rest, dV/dq is zero whatever the step.
+
+Source: Simo, "A finite strain beam formulation", Comput. Methods Appl. Mech. Eng. 49 (1985); elements of
+constant strain as in Renda et al., "Discrete Cosserat approach", IEEE T-RO 34 (2018).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
+
+GRAVITY_M_S2 = 9.81
+N_STRAINS = 6  # of an element: curvature x, y, twist [1/m], shear x, y, extension
+REST_STRAIN = np.array([0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
+CREEP_S = 0.25  # time constant of the damping
+LONGEST_S = 400.0  # steps on the way to rest
+REST_TOLERANCE = 1e-9  # largest entry of dV/dq [N m^2, N m]
+_CROSS = np.zeros((3, 9))  # from a vector to the matrix of its cross product
+_CROSS[0, [5, 7]] = _CROSS[1, [6, 2]] = _CROSS[2, [1, 3]] = -1.0, 1.0
+
+
+class RodParts(NamedTuple):
+    """Numbers of a rod of s sections with three chambers and three springs each."""
+
+    section_length_m: float
+    section_mass_kg: np.ndarray  # (s,)
+    bending: np.ndarray  # (s,) E I [N m^2]
+    torsion: np.ndarray  # (s,) G J [N m^2]
+    shear: np.ndarray  # (s,) G A [N]
+    extension: np.ndarray  # (s,) E A [N]
+    joint: np.ndarray  # (s, 3, 3) turn of each section against the end of the one above
+    chamber_hole_m: np.ndarray  # (s, 3, 2) x and y in the section's cross-sections
+    spring_hole_m: np.ndarray  # (s, 3, 2)
+    stiffness: np.ndarray  # (s, 3) k [N/m] of the chambers
+    hardening: np.ndarray  # (s, 3) c
+    rest_m: np.ndarray  # (s, 3) of the chambers
+    area: np.ndarray  # (s, 3) A [N/kPa] at the section's length
+    area_slope: np.ndarray  # (s, 3) A' [N/kPa/m]
+    spring_stiffness: float  # [N/m]
+    spring_rest_m: float
+    tool_mass_kg: np.ndarray  # (2,) gripper and payload
+    tool_offset_m: np.ndarray  # (2,) below the rod's end
+    up: np.ndarray  # (3,) against gravity, in the axes of the rod's base
+
+
+class Shape(NamedTuple):
+    """Places along the rod, in the axes of its base."""
+
+    node_m: np.ndarray  # (n + 1, 3) ends of the elements, the first the base
+    rotation: np.ndarray  # (n + 1, 3, 3) columns are the axes of the cross-sections there
+
+
+class Rod:
+    """A rod with its strains `q` (n, 6), its only state."""
+
+    def __init__(self, parts: RodParts, per_section: int):
+        """Lay out the rod, straight and without force.
+
+        Args:
+            parts: numbers of the rod.
+            per_section: elements in each section.
+        """
+        self.per_section = per_section
+        self.length_m = parts.section_length_m / per_section
+        n_sections = len(parts.bending)
+        self._joint = np.tile(np.eye(3), (n_sections * per_section, 1, 1))
+        self._joint[::per_section] = parts.joint
+        law = [parts.bending, parts.bending, parts.torsion, parts.shear, parts.shear, parts.extension]
+        self._elastic = np.repeat(np.stack(law, axis=1), per_section, axis=0)  # (n, 6)
+        hole = np.zeros((n_sections, 6, 3))
+        hole[:, :3, :2], hole[:, 3:, :2] = parts.chamber_hole_m, parts.spring_hole_m
+        hole = np.repeat(hole, per_section, axis=0)
+        # d(nu + kappa x r) / dq (n, 6 fibres, 3, 6 strains)
+        self._along = np.concatenate([-_cross_matrix(hole), np.broadcast_to(np.eye(3), (*hole.shape, 3))], -1)
+        self._square = np.swapaxes(self._along, -1, -2) @ self._along
+        self.replace(parts)
+        self.q = np.tile(REST_STRAIN, (n_sections * per_section, 1))
+        stiffness = self._local(self.q, np.zeros((n_sections, 3)))[1]
+        self._damping = CREEP_S * np.diagonal(stiffness, axis1=1, axis2=2).ravel()
+
+    def replace(self, parts: RodParts) -> None:
+        """Take other masses, areas or stiffnesses; the strains stay."""
+        self.parts = parts
+        mass = np.repeat(parts.section_mass_kg / self.per_section, self.per_section)
+        self._node_kg = 0.5 * (mass + np.append(mass[1:], 0.0))  # (n,) half of each element, at its lower end
+
+    def shape(self) -> Shape:
+        """Return the places of the rod's cross-sections."""
+        half, turn = (rotation_about(share * self.length_m * self.q[:, :3]) for share in (0.5, 1.0))
+        return self._shape(half, turn)[0]
+
+    def spring_lengths(self) -> np.ndarray:
+        """Return the lengths (3 s,) [m] of the springs."""
+        u = self._stretch(self.q)[:, 3:]
+        pieces = self.length_m * np.linalg.norm(u, axis=-1)
+        return pieces.reshape(-1, self.per_section, 3).sum(axis=1).ravel()
+
+    def step(self, pressure_kpa: np.ndarray, duration_s: float) -> float:
+        """Move for a while at pressures (3 s,) [kPa]; return the largest entry of dV/dq before."""
+        gradient, hessian = self._derivatives(pressure_kpa.reshape(-1, 3))
+        factor = None
+        while factor is None:
+            np.fill_diagonal(hessian, hessian.diagonal() + self._damping / duration_s)
+            try:
+                factor = cho_factor(hessian, check_finite=False)
+            except LinAlgError:  # not convex there: move less
+                duration_s *= 0.5
+        change = cho_solve(factor, gradient.ravel(), check_finite=False)
+        self.q = self.q - change.reshape(self.q.shape)
+        return float(np.abs(gradient).max())
+
+    def settle(self, pressure_kpa: np.ndarray) -> None:
+        """Move to rest at pressures (3 s,) [kPa], by way of a few seconds of motion.
+
+        Raises:
+            FloatingPointError: no rest is found.
+        """
+        for k in range(200):
+            if self.step(pressure_kpa, min(0.1 * 2.0**k, LONGEST_S)) < REST_TOLERANCE:
+                return
+        raise FloatingPointError("the rod finds no rest")
+
+    def _shape(self, half: np.ndarray, turn: np.ndarray) -> tuple[Shape, np.ndarray, np.ndarray]:
+        """Return the shape, and the axes (n, 3, 3) where each element begins, and in its middle."""
+        rotation = [np.eye(3)]
+        begin = []
+        for joint, own in zip(self._joint, turn, strict=True):
+            begin.append(rotation[-1] @ joint)
+            rotation.append(begin[-1] @ own)
+        begin = np.array(begin)
+        middle = begin @ half
+        reach = self.length_m * (middle @ self.q[:, 3:, None])[..., 0]
+        node = np.concatenate([np.zeros((1, 3)), np.cumsum(reach, axis=0)])
+        return Shape(node, np.array(rotation)), begin, middle
+
+    def _stretch(self, q: np.ndarray) -> np.ndarray:
+        """Return nu + kappa x r (n, 6 fibres, 3)."""
+        return (self._along @ q[:, None, :, None])[..., 0]
+
+    def _local(self, q: np.ndarray, pressure_kpa: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return derivatives of the energy of backbone, chambers and springs: (n, 6) and (n, 6, 6)."""
+        parts, h = self.parts, self.length_m
+        u = self._stretch(q)
+        size = np.sqrt(np.sum(u**2, axis=-1))  # (n, 6)
+        section_m = parts.section_length_m * size.reshape(-1, self.per_section, 6)
+        tension, slope = (x.reshape(size.shape) for x in self._fibres(section_m, pressure_kpa[:, None]))
+        lead = (np.swapaxes(self._along, -1, -2) @ (u / size[..., None])[..., None])[..., 0]  # (n, 6, 6)
+        gradient = h * np.sum(tension[..., None] * lead, axis=1)
+        gradient += h * self._elastic * (q - REST_STRAIN)
+        curve = h * tension / size
+        weight = h * parts.section_length_m * slope - curve
+        hessian = np.swapaxes(lead, 1, 2) @ (weight[..., None] * lead)
+        hessian += np.sum(curve[..., None, None] * self._square, axis=1)
+        hessian += h * self._elastic[..., None] * np.eye(N_STRAINS)
+        return gradient, hessian
+
+    def _fibres(self, length_m: np.ndarray, pressure_kpa: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return pulls (s, per_section, 6) [N] of chambers and springs so stretched, and their slopes."""
+        parts = self.parts
+        chamber, spring = length_m[..., :3], length_m[..., 3:]
+        stiffness, hardening, rest, area, area_slope = (
+            x[:, None] for x in (parts.stiffness, parts.hardening, parts.rest_m, parts.area, parts.area_slope)
+        )
+        off = chamber - rest
+        harder = hardening * (off / parts.section_length_m) ** 2
+        effective = area + area_slope * (chamber - parts.section_length_m)
+        pull = stiffness * off * (1.0 + harder) - pressure_kpa * effective
+        slope = stiffness * (1.0 + 3.0 * harder) - pressure_kpa * area_slope
+        drawn = parts.spring_stiffness * (spring - parts.spring_rest_m)
+        constant = np.full_like(spring, parts.spring_stiffness)
+        return np.concatenate([pull, drawn], -1), np.concatenate([slope, constant], -1)
+
+    def _derivatives(self, pressure_kpa: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return dV/dq (n, 6) and its derivative (6 n, 6 n) at pressures (s, 3)."""
+        gradient, local = self._local(self.q, pressure_kpa)
+        fall, turn = self._weights()
+        up = GRAVITY_M_S2 * self.parts.up
+        # Between two elements, d2V / dq_i dq_j = up . (turn_i x fall_j) with i nearer to the base
+        n = len(self.q)
+        lever = np.cross(up, turn).reshape(n * N_STRAINS, 3)
+        matrix = (lever @ fall.reshape(-1, 3).T).reshape(n, N_STRAINS, n, N_STRAINS)
+        matrix *= np.triu(np.ones((n, n)))[:, None, :, None]
+        own = np.arange(n)
+        matrix[own, :, own] *= 0.5
+        matrix = matrix.reshape(n * N_STRAINS, -1)
+        matrix = (matrix + matrix.T).reshape(n, N_STRAINS, n, N_STRAINS)
+        matrix[own, :, own] += local
+        return gradient + fall @ up, matrix.reshape(n * N_STRAINS, -1)
+
+    def _weights(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return, by each strain (n, 6, 3): what all masses move together [kg m], and what turns below it."""
+        h, parts = self.length_m, self.parts
+        bend = self.q[:, :3]
+        half, turn = rotation_about(0.5 * h * bend), rotation_about(h * bend)
+        (node, rotation), begin, middle = self._shape(half, turn)
+        tool = node[-1] - parts.tool_offset_m[:, None] * rotation[-1, :, 2]
+        below = self._node_kg[:, None] * node[1:]
+        moment = np.cumsum(below[::-1], axis=0)[::-1] + parts.tool_mass_kg @ tool
+        mass = np.cumsum(self._node_kg[::-1])[::-1] + parts.tool_mass_kg.sum()
+        hung = moment - mass[:, None] * node[1:]
+        whole = h * np.swapaxes(begin @ _left_jacobian(h * bend), 1, 2)  # (n, 3 strains, 3)
+        inner = 0.5 * h * np.swapaxes(begin @ _left_jacobian(0.5 * h * bend), 1, 2)
+        reach = np.diff(node, axis=0)
+        aside = np.concatenate([np.cross(inner, reach[:, None]), h * np.swapaxes(middle, 1, 2)], axis=1)
+        turns = np.concatenate([whole, np.zeros_like(whole)], axis=1)
+        return mass[:, None, None] * aside + np.cross(turns, hung[:, None]), turns
+
+
+def _cross_matrix(v: np.ndarray) -> np.ndarray:
+    """Return matrices (..., 3, 3) that multiply from the left as the cross product with v (..., 3)."""
+    return (v @ _CROSS).reshape(*v.shape, 3)
+
+
+def rotation_about(v: np.ndarray) -> np.ndarray:
+    """Return rotations (..., 3, 3) about vectors (..., 3) by their lengths [rad]."""
+    angle = np.linalg.norm(v, axis=-1)[..., None, None]
+    cross = _cross_matrix(v)
+    return (
+        np.eye(3) + np.sinc(angle / np.pi) * cross + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * cross @ cross
+    )
+
+
+def _left_jacobian(v: np.ndarray) -> np.ndarray:
+    """Return J (..., 3, 3) with exp(v + dv) = exp(J dv) exp(v), to first order."""
+    angle = np.linalg.norm(v, axis=-1)[..., None, None]
+    small = angle < 1e-3
+    safe = np.where(small, 1.0, angle)
+    third = np.where(small, 1.0 / 6.0, (safe - np.sin(safe)) / safe**3)
+    cross = _cross_matrix(v)
+    return np.eye(3) + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * cross + third * cross @ cross

@@ -1,0 +1,224 @@
+"""The rod twin: a stand-in of other physics than training's, behind the same `ArmIO` as `Twin`.
+
+An arm of `mjx_softarm.twin.rod`: it bends, shears, twists and extends without joints, its chambers harden,
+its base is tilted, its sections are rolled against each other, motion capture's frame of the tip is turned
+against the last plate and off its middle. Regulators follow their commands with a lag; there is no pump, no
+hysteresis and no inertia. Readings, noise and clock are those of `Twin`. Parts are drawn from the seed.
+
+How `ROD_GAP` was set: it is the gap of `Twin`, with the same tolerances for base, roll and springs. With
+spring lengths that bring training's model to the paper's circle, as there, the tips of rods 100 to 105, which
+no experiment uses, are 15.9 mm and 6.7 deg off at a gap of 1.8 and 17.9 mm and 7.7 deg at 2.1.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mjx_softarm.deploy.arm_io import Capture
+from mjx_softarm.sensing.pose import pose_from_frame, quaternion_from_pose
+from mjx_softarm.sensing.sensors import Sensor
+from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
+from mjx_softarm.twin.instruments import (
+    CAPTURE_NOISE_DEG,
+    CAPTURE_NOISE_M,
+    EVALUATION_SESSION,
+    MARKERS_PER_SECTION,
+    PRESSURE_NOISE_KPA,
+    SPRING_NOISE_M,
+    WIDEST_DRAW,
+    checked_payload,
+    checked_pressures,
+)
+from mjx_softarm.twin.rod import CREEP_S, Rod, RodParts, rotation_about
+
+ROD_GAP = 1.9
+ELEMENTS_PER_SECTION = 6  # the tip within 0.2 mm of twelve
+REGULATOR_S = 0.1  # lag of the pressures
+
+
+@dataclass(frozen=True)
+class RodTolerances:
+    """Distance from training's model at a gap of 1: standard deviations, and what all rods have."""
+
+    hardening: float = 0.5  # of all rods: half as stiff again, a section's length from rest
+    torsion_rad_per_nm: float = 0.08  # of all rods: of a section
+    shear_per_n: float = 6e-4  # of all rods
+    chamber_stiffness: float = 0.04  # relative, per chamber
+    chamber_area: float = 0.02  # relative, per chamber
+    chamber_length_m: float = 0.001  # per chamber
+    backbone_stiffness: float = 0.06  # relative, per section
+    section_mass: float = 0.03  # relative, per section
+    hole_radius_m: float = 0.001  # per chamber, and per spring
+    hole_angle_deg: float = 1.0  # per chamber, and per spring
+    section_roll_deg: float = 1.75  # per section, against the one above
+    base_tilt_deg: float = 0.9  # per axis
+    base_offset_m: float = 0.003  # per axis
+    tip_turn_deg: float = 1.0  # per axis: motion capture's frame against the last plate
+    tip_offset_m: float = 0.001  # per axis
+    spring_beta: float = 0.01  # relative, per spring
+    spring_delta_m: float = 0.00075  # per spring
+
+
+@dataclass(frozen=True)
+class RodBuild:
+    """Distance of the rod twin from training's model; tests set some of these to zero."""
+
+    gap: float = ROD_GAP  # scale of the tolerances
+    noise: float = 1.0  # scale of the noise of all sensors
+    per_section: int = ELEMENTS_PER_SECTION
+
+
+class RodTwin:
+    """One rod with regulators, sensors and cameras; an `ArmIO` and a `MotionCapture`."""
+
+    def __init__(
+        self,
+        seed: int,
+        spec: ArmSpec | None = None,
+        payload_kg: float = 0.0,
+        session: int = EVALUATION_SESSION,
+        build: RodBuild | None = None,
+    ):
+        """Hang the arm up, unpressurised and at rest; arguments as those of `Twin`."""
+        self._spec, self._build = spec or ArmSpec.default(), build or RodBuild()
+        self._noise = np.random.default_rng([session, seed])
+        rng = np.random.default_rng(seed)
+        std = _scaled(self._build.gap)
+        self._base_m = _off(rng, std.base_offset_m, 3)
+        self._base_rotation = rotation_about(np.radians(_off(rng, std.base_tilt_deg, 3)) * [1.0, 1.0, 0.0])
+        self._tip_m = _off(rng, std.tip_offset_m, 3)
+        self._tip_turn = rotation_about(np.radians(_off(rng, std.tip_turn_deg, 3)))
+        self._sensor = _sensor(rng, self._spec, std)
+        parts = draw_rod(rng, self._spec, std, self._base_rotation[2])
+        self._rod = Rod(parts, self._build.per_section)
+        self._pressure_kpa = np.zeros(self._spec.n_chambers)
+        self.time_s = 0.0
+        self.attach(payload_kg)
+        self._rod.settle(self._pressure_kpa)
+
+    def read_sensors(self) -> np.ndarray:
+        """Return what the springs' sensors read now (n,), noisy and in the converter's steps; see `ArmIO`."""
+        true = self._sensor.readings(self._rod.spring_lengths())
+        noisy = true + self._draw(self._sensor.noise, len(true))
+        return np.round(noisy / self._sensor.resolution) * self._sensor.resolution
+
+    def write_pressures(self, pressure_kpa: np.ndarray) -> None:
+        """Command pressures (n,) [kPa], then let one control period pass; see `ArmIO`."""
+        command = checked_pressures(pressure_kpa, self._spec)
+        period_s = 1.0 / self._spec.control.rate_hz
+        self._pressure_kpa += -np.expm1(-period_s / REGULATOR_S) * (command - self._pressure_kpa)
+        self._rod.step(self._pressure_kpa, period_s)
+        self.time_s += period_s
+
+    def pressures(self) -> np.ndarray:
+        """Return pressures (n,) [kPa] that the regulators' sensors measure in the chambers now."""
+        return self._pressure_kpa + self._draw(PRESSURE_NOISE_KPA, len(self._pressure_kpa))
+
+    def motion_capture(self) -> Capture:
+        """Return the tip, and the middle of the rod at each third of a section, from the first to the tip."""
+        n_markers = MARKERS_PER_SECTION * self._spec.structure.n_sections
+        thirds = np.arange(1, n_markers + 1) * self._build.per_section // MARKERS_PER_SECTION
+        node_m, rotation = self._rod.shape()
+        marker_m = self._base_m + node_m[thirds] @ self._base_rotation.T
+        tip_m = self._base_m + self._base_rotation @ (node_m[-1] + rotation[-1] @ self._tip_m)
+        turn = rotation_about(np.radians(self._draw(CAPTURE_NOISE_DEG, 3)))
+        tip = turn @ self._base_rotation @ rotation[-1] @ self._tip_turn
+        quaternion = quaternion_from_pose(pose_from_frame(np.zeros(3), tip))
+        noise_m = self._draw(CAPTURE_NOISE_M, n_markers + 1, 3)
+        spring_m = self._rod.spring_lengths() + self._draw(SPRING_NOISE_M, self._spec.n_chambers)
+        return Capture(tip_m + noise_m[0], quaternion, marker_m + noise_m[1:], spring_m)
+
+    def attach(self, payload_kg: float) -> None:
+        """Hang a payload to the finger tips, in place of what hung there.
+
+        Raises:
+            ValueError: a mass that is negative or not finite.
+        """
+        parts = self._rod.parts
+        masses = np.array([parts.tool_mass_kg[0], checked_payload(payload_kg)])
+        self._rod.replace(parts._replace(tool_mass_kg=masses))
+
+    def release(self) -> None:
+        """Remove the payload."""
+        self.attach(0.0)
+
+    def describe(self) -> dict[str, Any]:
+        """Return how the rods are distributed, for reports: nothing about the one that was drawn."""
+        return {
+            "gap": self._build.gap,
+            "distances": dataclasses.asdict(_scaled(self._build.gap)),
+            "widest draw [standard deviations]": WIDEST_DRAW,
+            "elements per section": self._build.per_section,
+            "creep, regulators [s]": [CREEP_S, REGULATOR_S],
+            "noise": f"{self._build.noise:g} times that of Twin",
+        }
+
+    def _draw(self, deviation: float, *shape: int) -> np.ndarray:
+        return self._build.noise * deviation * self._noise.standard_normal(shape)
+
+
+def draw_rod(rng: np.random.Generator, spec: ArmSpec, std: RodTolerances, up: np.ndarray) -> RodParts:
+    """Draw the numbers of a rod; `up` (3,) is against gravity in the axes of its base."""
+    s, length_m = spec.structure.n_sections, spec.geometry.section_length_m
+    chambers, backbone = spec.chambers, spec.backbone
+
+    def factors(deviation: float, *shape: int) -> np.ndarray:
+        return 1.0 + _off(rng, deviation, *shape)
+
+    def holes(radius_m: float) -> np.ndarray:
+        first = np.radians(spec.geometry.first_chamber_deg)
+        angle = first + 2 * np.pi * np.arange(N_CHAMBERS_PER_SECTION) / N_CHAMBERS_PER_SECTION
+        angle = angle + np.radians(_off(rng, std.hole_angle_deg, s, N_CHAMBERS_PER_SECTION))
+        radius = radius_m + _off(rng, std.hole_radius_m, s, N_CHAMBERS_PER_SECTION)
+        return radius[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+    def each(value: float | tuple[float, ...]) -> np.ndarray:
+        return np.reshape(spec.per_chamber(value), (s, -1))
+
+    roll_rad = np.radians(_off(rng, std.section_roll_deg, s))
+    area = factors(std.chamber_area, s, N_CHAMBERS_PER_SECTION)
+    stiff = factors(std.backbone_stiffness, s)
+    return RodParts(
+        section_length_m=length_m,
+        section_mass_kg=spec.mass.arm_kg / s * factors(std.section_mass, s),
+        bending=backbone.bending_stiffness_nm_per_rad * length_m * stiff,
+        torsion=length_m / max(std.torsion_rad_per_nm, 1e-4) * stiff,
+        shear=stiff / max(std.shear_per_n, 1e-6),
+        extension=backbone.axial_stiffness_n_per_m * length_m * stiff,
+        joint=np.stack([rotation_about(np.array([0.0, 0.0, roll])) for roll in roll_rad]),
+        chamber_hole_m=holes(spec.geometry.chamber_radius_m),
+        spring_hole_m=holes(spec.geometry.spring_radius_m),
+        stiffness=each(chambers.stiffness_n_per_m)
+        * factors(std.chamber_stiffness, s, N_CHAMBERS_PER_SECTION),
+        hardening=np.full((s, N_CHAMBERS_PER_SECTION), std.hardening),
+        rest_m=length_m
+        + each(chambers.length_offset_m)
+        + _off(rng, std.chamber_length_m, s, N_CHAMBERS_PER_SECTION),
+        area=1e3 * each(chambers.area_m2) * area,
+        area_slope=1e3 * each(chambers.area_slope_m) * area,
+        spring_stiffness=spec.springs.stiffness_n_per_m,
+        spring_rest_m=spec.springs.rest_length_m,
+        tool_mass_kg=np.array([spec.mass.gripper_kg, 0.0]),
+        tool_offset_m=spec.mass.gripper_length_m * np.array([0.5, 1.0]),
+        up=up,
+    )
+
+
+def _sensor(rng: np.random.Generator, spec: ArmSpec, std: RodTolerances) -> Sensor:
+    """Draw the sensors, with the springs' own beta and delta."""
+    sensor = Sensor.from_spec(spec)
+    beta = sensor.beta * (1.0 + _off(rng, std.spring_beta, spec.n_chambers))
+    delta_m = sensor.delta_m + _off(rng, std.spring_delta_m, spec.n_chambers)
+    return dataclasses.replace(sensor, beta=beta, delta_m=delta_m)
+
+
+def _off(rng: np.random.Generator, deviation: float, *shape: int) -> np.ndarray:
+    return deviation * np.clip(rng.standard_normal(shape), -WIDEST_DRAW, WIDEST_DRAW)
+
+
+def _scaled(gap: float) -> RodTolerances:
+    return RodTolerances(**{name: gap * x for name, x in dataclasses.asdict(RodTolerances()).items()})

@@ -1,0 +1,105 @@
+"""The rod twin behind `ArmIO`."""
+
+import ast
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from mjx_softarm.deploy.arms import ArmError, open_arm
+from mjx_softarm.deploy.record import record
+from mjx_softarm.sensing.sensors import Sensor
+from mjx_softarm.twin import rod_twin
+from mjx_softarm.twin.instruments import S2R_SESSION
+from mjx_softarm.twin.rod_twin import RodBuild, RodTwin
+
+KPA = np.array([-12.0, 3, -20, -5, -30, 4, 2, -9, -14])
+COARSE = RodBuild(per_section=3)
+
+
+def hold(arm, pressure_kpa, duration_s):
+    for _ in range(round(50 * duration_s)):
+        arm.write_pressures(pressure_kpa)
+    return arm
+
+
+def test_refinement_changes_little():
+    """Half as many elements again, a heavy payload, every part off."""
+    tips = []
+    for per_section in (6, 9):
+        arm = RodTwin(101, payload_kg=1.0, build=RodBuild(noise=0.0, per_section=per_section))
+        arm._rod.settle(KPA)
+        tips.append(arm.motion_capture().tip_m)
+    assert np.linalg.norm(tips[0] - tips[1]) < 2.5e-4
+
+
+def test_payload_pulls_and_is_released(spec):
+    arm = RodTwin(101, build=RodBuild(noise=0.0, per_section=3))
+    z = [arm.motion_capture().tip_m[2]]
+    for change in (lambda: arm.attach(1.0), arm.release):
+        change()
+        hold(arm, np.zeros(9), 5.0)
+        z.append(arm.motion_capture().tip_m[2])
+    assert z[1] < z[0] - 5e-3 and z[2] == pytest.approx(z[0], abs=1e-5)
+    with pytest.raises(ValueError, match=r"payload_kg: got nan, expected a number >= 0"):
+        arm.attach(np.nan)
+
+
+def test_mount_and_tilt_show_with_the_arm_hanging():
+    straight = RodTwin(101, build=RodBuild(gap=0.0, noise=0.0, per_section=3)).motion_capture()
+    np.testing.assert_allclose(straight.tip_quaternion, [1.0, 0.0, 0.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(straight.tip_m[:2], 0.0, atol=1e-9)
+    off = RodTwin(101, build=RodBuild(noise=0.0, per_section=3)).motion_capture()
+    turn = Rotation.from_quat(off.tip_quaternion, scalar_first=True)
+    assert 1.0 < np.degrees(turn.magnitude()) < 20.0
+    assert off.marker_m.shape == (9, 3)
+
+
+def test_pressures_and_tip_follow_with_a_lag():
+    arm = RodTwin(101, build=RodBuild(noise=0.0, per_section=3))
+    hold(arm, KPA, rod_twin.REGULATOR_S)
+    np.testing.assert_allclose(arm.pressures(), (1.0 - np.exp(-1.0)) * KPA, rtol=1e-6)
+    early = arm.motion_capture().tip_m
+    late, later = (hold(arm, KPA, 4.0).motion_capture().tip_m for _ in range(2))
+    assert np.linalg.norm(early - late) > 0.01 > 1e-5 > np.linalg.norm(later - late)
+    assert arm.time_s == pytest.approx(8.1)
+
+
+def test_seed_chooses_the_rod_and_session_the_noise(spec):
+    def seen(*args, **options):
+        arm = hold(RodTwin(*args, build=COARSE, **options), KPA, 0.1)
+        return np.concatenate([arm.read_sensors(), arm.pressures(), arm.motion_capture().tip_m])
+
+    first = seen(7)
+    np.testing.assert_array_equal(first, seen(7))
+    assert (first != seen(8)).all()
+    other_day = seen(7, session=S2R_SESSION)
+    assert (first != other_day).all()
+    np.testing.assert_allclose(first[:9], other_day[:9], atol=10 * Sensor.from_spec(spec).noise)
+
+
+def test_it_is_recorded_as_any_arm(spec):
+    found = record(RodTwin(101, build=COARSE), spec, KPA[None])
+    assert found.n_poses == 1 and found.ending.vented and not found.ending.cause
+    np.testing.assert_allclose(found.log.pressure_kpa[0], KPA, atol=0.1)
+
+
+def test_it_has_a_name():
+    assert isinstance(open_arm("twin:rod:3"), RodTwin)
+    for name in ("twin:rod:x", "twin:rod:", "twin:rod:3:pipe300"):
+        with pytest.raises(ArmError, match=r"--arm: twin:rod:SEED: got '.*', expected an integer >= 0"):
+            open_arm(name)
+
+
+def test_impossible_command_is_refused():
+    arm = RodTwin(101, build=COARSE)
+    with pytest.raises(ValueError, match=r"pressure_kpa\[2\]: got 20.1, expected -40 to 20 kPa"):
+        arm.write_pressures([0, 0, 20.1, 0, 0, 0, 0, 0, 0])
+    assert arm.time_s == 0.0
+
+
+def test_it_is_written_without_the_training_model():
+    tree = ast.parse(Path(rod_twin.__file__).read_text("utf-8"))
+    imported = " ".join(ast.unparse(n) for n in ast.walk(tree) if isinstance(n, ast.Import | ast.ImportFrom))
+    assert "mechanics" not in imported and "mujoco" not in imported
