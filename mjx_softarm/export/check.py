@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,11 +13,11 @@ import numpy as np
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.faults import Fault
-from mjx_softarm.export.golden import BITS, Golden, Machine, output_columns
+from mjx_softarm.export.golden import BITS, FLAGS, Golden, Machine, output_columns
 from mjx_softarm.policy.file import load_policy
 
 TOLERANCE = 1e-5  # of the range of an output
-PROGRAM_VERSION = 1  # of the rows that a program reads and writes
+PROGRAM_VERSION = 2  # of the rows that a program reads and writes
 _TIMEOUT_S = 120.0
 
 
@@ -104,14 +105,30 @@ def _by_onnx(golden: Golden, path: Path) -> tuple[np.ndarray, dict[str, np.ndarr
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3
     session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
-    names, n = [item.name for item in session.get_outputs()], golden.about["n"]
-    if "goal_outside" not in names:
+    names = [item.name for item in session.get_outputs()]
+
+    def answer(inputs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        arrays: Any = session.run(None, inputs)
+        return dict(zip(names, arrays, strict=True))
+
+    if about["kind"] == "check of goals":
+        return _checked(golden, lambda goal: bool(answer({"goal": goal})["goal_outside"]))
+    if about["kind"] != "policy":
         raise InputError(f"{path}: got {about['kind']}, expected the graph from readings to references")
-    rows = np.flatnonzero(golden.inputs[:, 0])  # a graph has no memory
+    return without_memory(golden, lambda readings, goal: answer({"readings": readings, "goal": goal}))
+
+
+def without_memory(golden: Golden, answer: Callable) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Return the golden rows that readings and goal decide, and their outputs by column.
+
+    Args:
+        golden: the rows.
+        answer: readings (n,) and goal (6,), float32 -> outputs of `computations.answer`.
+    """
+    rows = np.flatnonzero(golden.inputs[:, FLAGS.index("restart")] > golden.inputs[:, FLAGS.index("checked")])
     answers = []
     for row in golden.inputs[rows].astype(np.float32):
-        arrays: Any = session.run(None, {"readings": row[4:-6], "goal": row[-6:]})
-        result = dict(zip(names, arrays, strict=True))
+        result = answer(row[len(FLAGS) : -6], row[-6:])
         acts = np.isfinite(result["reference_m"]).all()
         found = {
             Fault.LOST_READING: result["reading_lost"].any(),
@@ -119,11 +136,20 @@ def _by_onnx(golden: Golden, path: Path) -> tuple[np.ndarray, dict[str, np.ndarr
             Fault.EXTRAPOLATION: acts and result["extrapolation"] > 1.0,
         }
         faults = sum(BITS[fault] for fault, there in found.items() if there)
-        nothing = np.full(n, np.nan)
+        nothing = np.full(golden.about["n"], np.nan)
         springs = nothing, result["reference_m"], result["length_m"]
         answers.append(np.concat([[faults, 0.0], *springs, result["pose"]]))
     outputs = _columns(golden, np.array(answers))
     return rows, {name: value for name, value in outputs.items() if not name.startswith("pressure")}
+
+
+def _checked(
+    golden: Golden, outside: Callable[[np.ndarray], bool]
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Return the golden rows whose goals are checked, and their faults, GOAL_OUTSIDE by `outside`."""
+    rows, bit = np.flatnonzero(golden.inputs[:, FLAGS.index("checked")]), BITS[Fault.GOAL_OUTSIDE]
+    found = np.array([bit * outside(goal) for goal in golden.inputs[rows, -6:].astype(np.float32)], int)
+    return rows, {"faults": golden.outputs[rows, 0].astype(int) & ~bit | found}
 
 
 def _by_program(golden: Golden, path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:

@@ -6,13 +6,15 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mjx_softarm._support.xp import Array, array_namespace
 from mjx_softarm.control import pressures, saturated
 from mjx_softarm.deploy import faults
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.link import vented
 from mjx_softarm.deploy.reachability import distances
-from mjx_softarm.export.symbols import Symbol, constant, symbol
+from mjx_softarm.export.symbols import Symbol, constant, repeat, symbol
 from mjx_softarm.mdp.observation import OBS_SIZE
+from mjx_softarm.policy import reach
 from mjx_softarm.policy.runtime import action_towards, actor_output, tip_pose
 from mjx_softarm.sensing.sensors import Reading, SensorFault
 
@@ -25,30 +27,50 @@ class Computation(NamedTuple):
 
 
 def graph(controller: Controller) -> Computation:
-    """Record readings, goal and last lengths -> references, as the loop takes them when it acts.
+    """Record `answer`."""
+    n = controller.policy.spec.n_chambers
+    inputs = symbol("readings", (n,)), symbol("goal", (6,)), symbol("last_length_m", (n,))
+    return Computation(inputs, {name: constant(value) for name, value in answer(controller, *inputs).items()})
 
-    A lost reading holds the last length of its spring. References are NaN where the loop would give none: a
-    spring has neither a reading nor a last length, or the goal is outside the workspace.
+
+def answer(controller: Controller, readings: Array, goal: Array, last_m: Array) -> dict[str, Array]:
+    """Return the references that the loop takes from readings (n,) and a goal (6,) when it acts, and more.
+
+    A lost reading holds the last length (n,) [m] of its spring. References are NaN where the loop would give
+    none: a spring has neither a reading nor a last length, or the goal is outside the workspace.
     """
-    policy, n = controller.policy, controller.policy.spec.n_chambers
-    readings, goal, last_m = symbol("readings", (n,)), symbol("goal", (6,)), symbol("last_length_m", (n,))
-    xp = readings.__array_namespace__()
+    policy, xp = controller.policy, array_namespace(readings)
     reading = policy.sensor.lengths(readings, last_m)
     pose, away = tip_pose(policy, reading.length_m)
     reference = policy.actions.readings(action_towards(policy, pose, xp.asarray(goal, dtype=np.float32)))
     # A distance that is NaN is not within the limit, nor is a length that is NaN finite.
-    inside = xp.min(distances(controller.reachable, goal, policy.reward)) <= 1.0
+    inside = _inside(controller, goal)
     acts = inside & xp.all(xp.isfinite(reading.length_m))
-    outputs = {
+    return {
         "reference_m": xp.where(acts, policy.sensor.lengths(reference).length_m, np.nan),
         "reference_reading": xp.where(acts, reference, np.nan),
         "length_m": reading.length_m,
         "reading_lost": _lost(reading),
         "pose": pose,
-        "extrapolation": constant(away),
+        "extrapolation": away,
         "goal_outside": ~inside,
     }
-    return Computation((readings, goal, last_m), outputs)
+
+
+def check(controller: Controller) -> Computation:
+    """Record goal -> whether the loop refuses it before a run, the nearest pose and its weighted error."""
+    policy, goal = controller.policy, symbol("goal", (6,))
+    start = constant(reach.begin(policy, 1))
+    search = repeat(lambda search: reach.improve(policy, goal[None], search), start, reach.N_STEPS)
+    pose, error = reach.nearest_of(policy, goal[None], search)
+    reached = _inside(controller, goal) & (error[0] <= policy.reward.threshold)
+    return Computation((goal,), {"goal_outside": ~reached, "nearest": pose[0], "error": error[0]})
+
+
+def _inside(controller: Controller, goal: Array) -> Array:
+    """Return whether the loop takes a goal (6,) that it is given in a run."""
+    xp = array_namespace(goal)
+    return xp.min(distances(controller.reachable, goal, controller.policy.reward)) <= 1.0
 
 
 def actor(controller: Controller) -> Computation:
@@ -75,7 +97,8 @@ def parts(controller: Controller) -> dict[str, Computation]:
     mask = saturated(pressure_kpa, reference_m, spring_m, gains, tolerance_m)
     settled = faults.on_reference(springs_m, reference_m, pressure_kpa, gains, tolerance_m)
     stuck = faults.stock_still(springs_m) & faults.asked_to_move(springs_m, pressures_kpa)
-    near = xp.min(distances(controller.reachable, goal, policy.reward))
+    search = symbol("search", reach.begin(policy, 1).shape)
+    found, error = reach.nearest_of(policy, goal[None], search)
 
     def of(*inputs: Symbol, **outputs: Symbol) -> Computation:
         return Computation(inputs, outputs)
@@ -86,7 +109,10 @@ def parts(controller: Controller) -> dict[str, Computation]:
         "references": of(pose, goal, asked_m=policy.actions.lengths(action)),
         "law": of(reference_m, spring_m, integral_kpa, **law),
         "vented": of(pressure_kpa, next_kpa=vented(pressure_kpa, controller.dt_s)),
-        "goal_distance": of(goal, distance=near),
+        "inside": of(goal, holds=_inside(controller, goal)),
+        "search_begin": of(search=constant(reach.begin(policy, 1))),
+        "search_step": of(goal, search, next=reach.improve(policy, goal[None], search)),
+        "search_end": of(search, goal, nearest=found[0], error=error[0]),
         "mean_length": of(springs_m, mean_m=xp.mean(springs_m, axis=0)),
         "still": of(springs_m, holds=faults.still(springs_m)),
         "on_reference": of(springs_m, reference_m, pressure_kpa, holds=settled),
@@ -98,6 +124,6 @@ def parts(controller: Controller) -> dict[str, Computation]:
     }
 
 
-def _lost(reading: Reading) -> Symbol:
+def _lost(reading: Reading) -> Array:
     """Return which readings (n,) gave no length."""
     return reading.fault != SensorFault.OK.value

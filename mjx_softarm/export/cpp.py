@@ -10,6 +10,7 @@ from mjx_softarm.deploy.loop import CHAMBER_WINDOWS
 from mjx_softarm.export.computations import parts
 from mjx_softarm.export.cpp_functions import Numbers, function
 from mjx_softarm.policy.file import file_entries
+from mjx_softarm.policy.reach import N_STEPS, begin
 
 _TEMPLATES = {"softarm.hpp": "softarm.hpp.in"} | {
     name: name for name in ("rows.cpp", "example.cpp", "CMakeLists.txt")
@@ -40,6 +41,9 @@ def sources(controller: Controller, policy_sha256: str) -> dict[str, str]:
         "LATE_TICKS": LATE_TICKS,
         "SUSPECT_TICKS": CHAMBER_WINDOWS * controller.window,
         "TIMEOUT": repr(SETTLE_TIMEOUT_S),
+        "SEARCH": begin(policy, 1).size,
+        "SEARCH_STEPS": N_STEPS,
+        "THRESHOLD": repr(policy.reward.threshold),
         "GOAL": ", ".join(f"{value:.1f}" for value in policy.workspace[0]),
     }
     texts = {}

@@ -177,9 +177,9 @@ class _Body:
 
     def _matmul(self, item: Symbol, name: str) -> None:
         a, b = item.operands
-        n_rows, n_inner = (1, *a.shape)[-2:]
+        n_rows, n_inner = (1, *a.shape)[-2:] if b.ndim > 2 else (a.size // a.shape[-1], a.shape[-1])
         n_columns = 1 if b.ndim == 1 else b.shape[-1]
-        n_batch = math.prod(a.shape[:-2])
+        n_batch = math.prod(a.shape[:-2]) if b.ndim > 2 else 1
         if n_batch != math.prod(b.shape[:-2]):
             raise NotImplementedError(f"matmul: got {a.shape} and {b.shape}, expected equal leading axes")
         batch, row, inner, column = ("b", n_batch), ("r", n_rows), ("k", n_inner), ("c", n_columns)

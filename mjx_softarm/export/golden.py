@@ -6,6 +6,8 @@ A row of inputs is one tick of the loop, and its answer the outputs:
     new_goal     1: take the goal of this row
     late         1: the last tick missed its deadline
     taken        0: the arm did not take the last pressures
+    lost         1: the driver cannot reach the arm
+    checked      1: refuse the goal if no pressures reach it, as before a run
     reading<k>   of the sensors; nan where none came
     goal_<axis>  [mm, deg]
     faults       sum of 2**k over the faults of this tick, k counted in `mjx_softarm.deploy.faults.Fault`
@@ -15,8 +17,9 @@ A row of inputs is one tick of the loop, and its answer the outputs:
     length<k>    [m] believed in
     pose_<axis>  [mm, deg] of the tip that these lengths tell
 
-The first `N_SINGLE` rows each begin anew, so that each is the policy's answer to readings and a goal. The
-others are runs of the loop, on an arm that follows the policy's own spring model, with faults.
+The first `N_SINGLE` rows each begin anew, so that each is the policy's answer to readings and a goal. At most
+`N_CHECKED` more have checked goals. The others are runs of the loop, on an arm that follows the policy's own
+spring model, with faults.
 """
 
 from __future__ import annotations
@@ -33,14 +36,15 @@ from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.controller import Controller, start
 from mjx_softarm.deploy.faults import Event, Fault, Response
 from mjx_softarm.deploy.link import vented
-from mjx_softarm.deploy.loop import believed, step, with_goal
+from mjx_softarm.deploy.loop import believed, refusals, step, with_goal
 from mjx_softarm.deploy.reachability import nearest
+from mjx_softarm.policy.reach import nearest_poses
 from mjx_softarm.sensing.estimator import expected_springs
 
-SCHEMA_VERSION = 1
-N_SINGLE = 1000
+SCHEMA_VERSION = 2
+N_SINGLE, N_CHECKED = 1000, 40
 AXES = ("x", "y", "z", "yaw", "pitch", "roll")
-FLAGS = ("restart", "new_goal", "late", "taken")
+FLAGS = ("restart", "new_goal", "late", "taken", "lost", "checked")
 BITS = {fault: 1 << k for k, fault in enumerate(Fault)}
 STOPS = sum(bit for fault, bit in BITS.items() if fault.response is Response.VENT)
 
@@ -48,6 +52,9 @@ _SPREAD_M = 2e-3  # of the springs of single rows around the model's, as by payl
 _OUTSIDE, _LOST = 0.1, 0.1  # shares of single rows
 _LAG, _NOISE_M = 0.15, 4e-5  # of the arm in the runs, per tick
 _SWING_M = 2e-3
+_CANDIDATES = 200  # goals to choose checked ones from,
+_REACHED, _MISSED = 0.8, 1.5  # whose errors over the threshold are this clear,
+_SHIFT = 0.01  # also of the goals that are so far off, since a search is only as exact as its numbers
 _RUN_TICKS = 400  # at most
 
 
@@ -55,7 +62,7 @@ class Golden(NamedTuple):
     """Rows and answers."""
 
     about: dict[str, Any]  # schema_version, policy_sha256, n, and the range of each output column
-    inputs: np.ndarray  # (rows, 4 + n + 6)
+    inputs: np.ndarray  # (rows, 6 + n + 6)
     outputs: np.ndarray  # (rows, 2 + 3 n + 6)
 
 
@@ -82,43 +89,45 @@ class Machine:
         self._before_kpa = self.state.pressure_kpa
 
     def answer(self, row: np.ndarray) -> np.ndarray:
-        """Return the outputs (2 + 3 n + 6,) of inputs (4 + n + 6,)."""
-        restart, new_goal, late, taken = row[:4] > 0.5
+        """Return the outputs (2 + 3 n + 6,) of inputs (6 + n + 6,)."""
+        restart, new_goal, late, taken, lost, checked = row[: len(FLAGS)] > 0.5
         if restart:
             self._restart()
         if not taken:
             self.state = self.state._replace(pressure_kpa=self._before_kpa)
         self._before_kpa = self.state.pressure_kpa
         events, arrived = (), False
+        if lost:
+            events, self.stopped = (Event(Fault.ARM_LOST, "the driver cannot reach it"),), True
         if self.stopped:
             self.state = self.state._replace(pressure_kpa=vented(self._before_kpa, self.controller.dt_s))
         else:
-            events, arrived = self._tick(row[4:-6], row[-6:] if new_goal else None, bool(late))
+            refused = self._take_goal(row[-6:], checked) if new_goal else ()
+            self.state, tick = step(self.controller, self.state, row[len(FLAGS) : -6], bool(late))
+            self.stopped = tick.stop is not None
+            events, arrived = refused + tick.events, tick.arrived
         state = self.state
         reference_m = np.full_like(state.spring_m, np.nan) if state.reference_m is None else state.reference_m
         faults = sum({BITS[event.fault] for event in events})
         pose, _ = believed(self.controller, state.spring_m)
         return np.concat([[faults, arrived], state.pressure_kpa, reference_m, state.spring_m, pose])
 
-    def _tick(
-        self, readings: np.ndarray, goal: np.ndarray | None, late: bool
-    ) -> tuple[tuple[Event, ...], bool]:
-        refused = ()
-        if goal is not None:
+    def _take_goal(self, goal: np.ndarray, checked: bool) -> tuple[Event, ...]:
+        """Take a goal; return why it was refused, if it was."""
+        refused = tuple(refusals(self.controller, [goal]).values()) if checked else ()
+        if not refused:
             self.state, refused = with_goal(self.controller, self.state, goal)
-        self.state, tick = step(self.controller, self.state, readings, late)
-        self.stopped = tick.stop is not None
-        return refused + tick.events, tick.arrived
+        return refused
 
 
 def make_golden(controller: Controller, policy_sha256: str, seed: int = 0) -> Golden:
     """Make rows that meet the faults of an arm, and let the loop answer them."""
     rng, machine = np.random.default_rng(seed), Machine(controller)
     inputs, outputs = [], []
-    for row in _single_rows(controller, rng):
+    for row in (*_single_rows(controller, rng), *_checked_rows(controller, rng)):
         inputs.append(row)
         outputs.append(machine.answer(row))
-    for kind in ("calm", "lost", "stuck", "late", "leaking", "swinging"):
+    for kind in ("calm", "lost", "stuck", "late", "leaking", "unplugged", "swinging"):
         run = _rows_of_run(controller, kind, rng)
         row = next(run)
         for _ in range(_RUN_TICKS if kind != "swinging" else 2 * _RUN_TICKS):
@@ -157,7 +166,22 @@ def _single_rows(controller: Controller, rng: np.random.Generator) -> Iterator[n
         readings = policy.sensor.readings(spring_m)
         if rng.random() < _LOST:
             readings[rng.integers(n)] = rng.choice([np.nan, np.min(low) - 1.0, 2.0 * np.max(high)])
-        yield _row((1, 1, 0, 1), readings, _goal(controller, rng, outside=rng.random() < _OUTSIDE))
+        yield _row((1, 1, 0, 1, 0, 0), readings, _goal(controller, rng, outside=rng.random() < _OUTSIDE))
+
+
+def _checked_rows(controller: Controller, rng: np.random.Generator) -> Iterator[np.ndarray]:
+    """Yield goals within the workspace that pressures reach, and as many that none reach, if there are."""
+    policy, n = controller.policy, controller.policy.spec.n_chambers
+    goals = rng.choice(policy.workspace, _CANDIDATES) + rng.normal(
+        0.0, [5.0] * 3 + [30.0] * 3, (_CANDIDATES, 6)
+    )
+    goals = goals[[nearest(controller.reachable, goal, policy.reward)[1] < 0.98 for goal in goals]]
+    errors = np.array([nearest_poses(policy, goals + shift)[1] for shift in (0.0, _SHIFT)])
+    least, most = errors.min(axis=0) / policy.reward.threshold, errors.max(axis=0) / policy.reward.threshold
+    readings = policy.sensor.readings(expected_springs(policy.spring_model, np.zeros(n)))
+    for chosen in (least > _MISSED, most < _REACHED):
+        for goal in goals[chosen][: N_CHECKED // 2]:
+            yield _row((1, 1, 0, 1, 0, 1), readings, goal)
 
 
 def _goal(controller: Controller, rng: np.random.Generator, outside: bool) -> np.ndarray:
@@ -191,7 +215,8 @@ def _rows_of_run(
         if kind == "stuck":
             readings[-1] = first[-1]
         late = kind == "late" and (tick in (20, 22) or tick >= 60)
-        flags = (tick == 0, tick == 0, late, not (late and tick % 2 == 0))
+        lost = kind == "unplugged" and tick == 60
+        flags = (tick == 0, tick == 0, late, not (late and tick % 2 == 0), lost, False)
         pressure_kpa = yield _row(tuple(map(int, flags)), readings, goal)
         if kind == "leaking" and tick == 60:
             leak[np.argmax(np.abs(pressure_kpa))] = 0.0

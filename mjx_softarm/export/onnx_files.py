@@ -126,10 +126,11 @@ def _digest(model: onnx.ModelProto) -> str:
 class _Writer:
     """Nodes and tensors of a graph in the making."""
 
-    def __init__(self) -> None:
+    def __init__(self, prefix: str = "v", tensors: dict[str, onnx.TensorProto] | None = None) -> None:
         self.nodes: list[onnx.NodeProto] = []
-        self.tensors: dict[str, onnx.TensorProto] = {}
+        self.tensors = {} if tensors is None else tensors  # shared with the graph around
         self._names: dict[Symbol, str] = {}
+        self._prefix = prefix
 
     def name(self, item: Symbol) -> str:
         """Return the name of a symbol's value, once all nodes that it needs are there."""
@@ -140,7 +141,7 @@ class _Writer:
 
     def node(self, operator: str, inputs: list[str], output: str | None = None, **attributes: Any) -> str:
         """Add a node; return the name of its output."""
-        output = output or f"v{len(self.nodes)}"
+        output = output or f"{self._prefix}{len(self.nodes)}"
         self.nodes.append(helper.make_node(operator, inputs, [output], **attributes))
         return output
 
@@ -190,6 +191,18 @@ class _Writer:
     def _all(self, item: Symbol, x: str) -> str:
         number = self.node("Cast", [x], to=TensorProto.INT32)
         return self.node("Cast", [self._min(item, number)], to=TensorProto.BOOL)
+
+    def _repeat(self, item: Symbol, start: str) -> str:
+        before, after, n = item.option
+        inside = _Writer(f"{before.option}_", self.tensors)
+        results = [inside.node("Identity", ["on"]), inside.name(after)]
+        like = {"elem_type": _TYPES[item.dtype.kind], "shape": item.shape}
+        flag = {"elem_type": TensorProto.BOOL, "shape": ()}
+        info = helper.make_tensor_value_info
+        takes = [info("step", TensorProto.INT64, ()), info("on", **flag), info(before.option, **like)]
+        gives = [info(results[0], **flag), info(results[1], **like)]
+        body = helper.make_graph(inside.nodes, "repeated", takes, gives)
+        return self.node("Loop", [self.tensor(np.int64(n)), self.tensor(np.bool_(True)), start], body=body)
 
     def _isfinite(self, item: Symbol, x: str) -> str:
         """x - x is NaN, unequal to itself, where x is not finite."""

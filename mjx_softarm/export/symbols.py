@@ -13,6 +13,7 @@ The operations are NumPy's functions of the same name, elementwise but for
     index                            `option`: places (shape) of the elements in the flat operand
     concat, sum, min, max, all, any  `option`: the axis, or the axes as a tuple
     matmul                           as NumPy's
+    repeat                           `option`: a `Repeat`; the operand is what it begins with
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -55,8 +56,7 @@ class Symbol:
         return self.shape[0]
 
     def __getitem__(self, key: Any) -> Symbol:
-        places = np.arange(self.size).reshape(self.shape)[key]
-        return Symbol("index", (self,), np.shape(places), self.dtype, np.asarray(places))
+        return _placed(self, np.arange(self.size).reshape(self.shape)[key])
 
     def reshape(self, *shape: int) -> Symbol:
         return Symbol("reshape", (self,), np.empty(self.shape).reshape(*shape).shape, self.dtype)
@@ -82,6 +82,14 @@ class Symbol:
         raise TypeError(f"{self.op}: a symbol has no value to decide by")
 
     __hash__ = object.__hash__
+
+
+class Repeat(NamedTuple):
+    """A computation of a symbol from one of its own kind, done n times over."""
+
+    before: Symbol
+    after: Symbol
+    n: int
 
 
 def _operator(name: str, swapped: bool = False) -> Callable[[Symbol, Any], Symbol]:
@@ -120,6 +128,17 @@ def elementwise(name: str, *operands: Any) -> Symbol:
     common = np.result_type(*(_one(value) for value in values))
     taken = [value if hasattr(value, "dtype") else np.asarray(value, common) for value in operands]
     return Symbol(name, tuple(map(constant, taken)), like.shape, like.dtype)
+
+
+def _placed(x: Symbol, places: Any) -> Symbol:
+    """Return the elements of a symbol at places in flat order."""
+    return Symbol("index", (x,), np.shape(places), x.dtype, np.asarray(places))
+
+
+def repeat(step: Callable[[Symbol], Symbol], start: Symbol, n: int) -> Symbol:
+    """Record n applications of a function."""
+    before = symbol("before", start.shape, start.dtype)
+    return Symbol("repeat", (start,), start.shape, start.dtype, Repeat(before, step(before), n))
 
 
 def ordered(results: Iterable[Symbol]) -> list[Symbol]:
@@ -187,6 +206,7 @@ _OWN = {
     "mean": _mean,
     "concat": _concat,
     "stack": _stack,
+    "swapaxes": lambda x, a, b: _placed(x, np.arange(x.size).reshape(x.shape).swapaxes(a, b)),
     "asarray": lambda x, dtype: _cast(x, dtype),
     "clip": lambda x, low, high: _NAMESPACE.minimum(_NAMESPACE.maximum(x, low), high),
     "rad2deg": lambda x: elementwise("multiply", x, 180.0 / math.pi),

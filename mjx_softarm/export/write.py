@@ -34,13 +34,16 @@ def export_onnx(policy_path: Path) -> list[Path]:
     controller, sha256 = _open(policy_path)
     n = controller.policy.spec.n_chambers
     about = describe(controller.policy, sha256)
-    whole, actor = (policy_path.with_name(f"{policy_path.stem}{end}.onnx") for end in ("", "_actor"))
+    whole, actor, check = (
+        policy_path.with_name(f"{policy_path.stem}{end}.onnx") for end in ("", "_actor", "_check")
+    )
     never = {"last_length_m": np.full(n, np.nan)}
     write_onnx(whole, computations.graph(controller), {"kind": "policy", **about}, never)
     write_onnx(actor, computations.actor(controller), {"kind": "actor", **about}, {})
+    write_onnx(check, computations.check(controller), {"kind": "check of goals", **about}, {})
     golden = policy_path.with_name(f"{policy_path.stem}_golden.csv")
     write_golden(golden, make_golden(controller, sha256))
-    return [whole, actor, golden]
+    return [whole, actor, check, golden]
 
 
 def export_cpp(policy_path: Path, folder: Path) -> list[Path]:
@@ -83,6 +86,8 @@ def describe(policy: Policy, sha256: str) -> dict[str, Any]:
             "pose": _POSE,
             "extrapolation": {"above 1": "the pose is further from the calibration than is believed"},
             "goal_outside": {"true": "the goal is outside the workspace"},
+            "nearest": _POSE,
+            "error": {"above": policy.reward.threshold, "means": "no pressures reach the goal"},
             "action": {"names": readings["names"], "range": [-1.0, 1.0]},
         },
         "rate_hz": policy.rate_hz,

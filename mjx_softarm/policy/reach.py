@@ -2,7 +2,8 @@
 
 The nearest pose to a goal is searched over the pressures between their limits: pressures give springs, these
 the tip. Levenberg-Marquardt steps, from several starts at once; pressures at a limit that would leave it are
-held there. Poses that the arm reaches in simulation are found to about 0.4 mm.
+held there. Poses that the arm reaches in simulation are found to about 0.4 mm. `begin`, `improve` and
+`nearest_of` take the symbols of `mjx_softarm.export` as well as NumPy's arrays.
 
 Source: Kanzow, Yamashita, Fukushima, "Levenberg-Marquardt methods with strong local convergence properties
 for solving nonlinear equations with convex constraints", J. Comput. Appl. Math. 172, 2004.
@@ -12,6 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from mjx_softarm._support.xp import Array, array_namespace
 from mjx_softarm.mdp.rewards import scaled_error
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.sensing.estimator import estimate_frame, expected_springs
@@ -21,49 +23,91 @@ from mjx_softarm.sensing.s2r import apply_correction, correction, inputs
 N_STARTS, N_STEPS = 4, 20
 _DIFFERENCE = 1e-3  # of the range of pressures
 _EASE, _STIFFEN = 0.2, 8.0  # factors of the damping after a step that helped, and after one that did not
+_LEAST_DAMPING, _MOST_DAMPING = 1e-6, 1e3
 
 
 def nearest_poses(policy: Policy, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the nearest poses (k, 6) [mm, deg] to goals (k, 6), and their weighted errors (k,)."""
-    k, n = len(goal), policy.spec.n_chambers
-    low, high = policy.gains.pressure_min_kpa, policy.gains.pressure_max_kpa
-    target = np.repeat(_features(policy, *frame_from_pose(goal)), N_STARTS, axis=0)  # (rows, 12)
-
-    def offset(x: np.ndarray) -> np.ndarray:
-        at = _features(policy, *_tip(policy, low + (high - low) * x))
-        return at - target.reshape(len(target), *[1] * (x.ndim - 2), 12)
-
-    start = np.random.default_rng(0).uniform(0.2, 0.8, (N_STARTS, n))
-    x = np.tile(start, (k, 1))  # (rows, n) pressures within their range
-    error, damping = offset(x), np.full(len(x), 1e-3)
+    goal = np.asarray(goal, float)
+    search = begin(policy, len(goal))
     for _ in range(N_STEPS):
-        slope = (offset(x[:, None] + _DIFFERENCE * np.eye(n)) - error[:, None]) / _DIFFERENCE  # (rows, n, 12)
-        gradient = np.einsum("rnm,rm->rn", slope, error)
-        free = ~(((x <= 0.0) & (gradient > 0.0)) | ((x >= 1.0) & (gradient < 0.0)))
-        slope, gradient = slope * free[..., None], gradient * free
-        curvature = slope @ np.swapaxes(slope, 1, 2) + damping[:, None, None] * np.eye(n)
-        tried = np.clip(x - np.linalg.solve(curvature, gradient[..., None])[..., 0], 0.0, 1.0)
-        left = offset(tried)
-        helped = np.sum(left**2, axis=1) < np.sum(error**2, axis=1)
-        x, error = np.where(helped[:, None], tried, x), np.where(helped[:, None], left, error)
-        damping = np.clip(damping * np.where(helped, _EASE, _STIFFEN), 1e-9, 1e3)
-    best = np.argmin(np.sum(error**2, axis=1).reshape(k, N_STARTS), axis=1) + N_STARTS * np.arange(k)
-    pose = pose_from_frame(*_tip(policy, low + (high - low) * x[best])).astype(float)
-    return pose, np.linalg.norm(scaled_error(pose, goal, policy.reward), axis=1)
+        search = improve(policy, goal, search)
+    return nearest_of(policy, goal, search)
 
 
-def _tip(policy: Policy, pressure_kpa: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the tip's position (..., 3) [m] and axes (..., 3, 3) at pressures (..., n) [kPa]."""
-    spring_m = expected_springs(policy.spring_model, pressure_kpa)
+def begin(policy: Policy, k: int) -> np.ndarray:
+    """Return the start of a search for k goals (k * N_STARTS, n + 1): shares of the pressures, damping."""
+    start = np.random.default_rng(0).uniform(0.2, 0.8, (N_STARTS, policy.spec.n_chambers))
+    return np.tile(np.concat([start, np.full((N_STARTS, 1), 1e-3)], axis=1), (k, 1))
+
+
+def improve(policy: Policy, goal: Array, search: Array) -> Array:
+    """Take one Levenberg-Marquardt step of a search (k * N_STARTS, n + 1) towards goals (k, 6) [mm, deg]."""
+    xp, n = array_namespace(goal, search), policy.spec.n_chambers
+    share, damping = search[:, :n], search[:, n]
+    target = _target(policy, goal, len(share))  # (rows, 12)
+    error = _at(policy, share) - target
+    beside = _at(policy, share[:, None] + _DIFFERENCE * np.eye(n)) - target[:, None]  # (rows, n, 12)
+    slope = (beside - error[:, None]) / _DIFFERENCE
+    gradient = xp.sum(slope * error[:, None], axis=-1)  # (rows, n)
+    free = ~(((share <= 0.0) & (gradient > 0.0)) | ((share >= 1.0) & (gradient < 0.0)))
+    slope, gradient = xp.where(free[..., None], slope, 0.0), xp.where(free, gradient, 0.0)
+    curvature = slope @ xp.swapaxes(slope, 1, 2) + damping[:, None, None] * np.eye(n)
+    tried = xp.clip(share - _solved(curvature, gradient), 0.0, 1.0)
+    helped = xp.sum((_at(policy, tried) - target) ** 2, axis=-1) < xp.sum(error**2, axis=-1)
+    damping = xp.clip(damping * xp.where(helped, _EASE, _STIFFEN), _LEAST_DAMPING, _MOST_DAMPING)
+    return xp.concat([xp.where(helped[:, None], tried, share), damping[:, None]], axis=1)
+
+
+def nearest_of(policy: Policy, goal: Array, search: Array) -> tuple[Array, Array]:
+    """Return a search's nearest poses (k, 6) [mm, deg] to goals (k, 6), and their weighted errors (k,)."""
+    xp, share = array_namespace(goal, search), search[:, : policy.spec.n_chambers]
+    error = _at(policy, share) - _target(policy, goal, len(share))
+    square = xp.sum(error**2, axis=-1).reshape(-1, N_STARTS)
+    pose = pose_from_frame(*_tip(policy, share)).reshape(-1, N_STARTS, 6)
+    best, least = pose[:, 0], square[:, 0]
+    for start in range(1, N_STARTS):
+        better = square[:, start] < least
+        best = xp.where(better[:, None], pose[:, start], best)
+        least = xp.where(better, square[:, start], least)
+    return best, xp.sqrt(xp.sum(scaled_error(best, goal, policy.reward) ** 2, axis=-1))
+
+
+def _tip(policy: Policy, share: Array) -> tuple[Array, Array]:
+    """Return the tip's position (..., 3) [m] and axes (..., 3, 3) at shares (..., n) of the pressures."""
+    low, high = policy.gains.pressure_min_kpa, policy.gains.pressure_max_kpa
+    spring_m = expected_springs(policy.spring_model, low + (high - low) * share)
     frame = estimate_frame(policy.estimator, spring_m)
     if policy.s2r is None:
         return frame
     return apply_correction(frame, correction(policy.s2r, inputs(frame, spring_m)))
 
 
-def _features(policy: Policy, position_m: np.ndarray, axes: np.ndarray) -> np.ndarray:
+def _at(policy: Policy, share: Array) -> Array:
+    """Return the `_features` (..., 12) of the tip at shares (..., n) of the range of pressures."""
+    return _features(policy, *_tip(policy, share))
+
+
+def _target(policy: Policy, goal: Array, n_rows: int) -> Array:
+    """Return the `_features` (n_rows, 12) of goals (k, 6), each for the same number of rows."""
+    return _features(policy, *frame_from_pose(goal))[np.arange(n_rows) * len(goal) // n_rows]
+
+
+def _features(policy: Policy, position_m: Array, axes: Array) -> Array:
     """Return 12 numbers (..., 12) whose differences are weighted errors, of a turn as its angle if small."""
-    axes = axes / np.linalg.norm(axes, axis=-2, keepdims=True)
+    xp = array_namespace(position_m, axes)
+    axes = axes / xp.sqrt(xp.sum(axes**2, axis=-2))[..., None, :]
     turn = policy.reward.weight_per_deg * np.degrees(1.0) / np.sqrt(2.0) * axes
     position = 1e3 * policy.reward.weight_per_mm * position_m
-    return np.concatenate([position, turn.reshape(*turn.shape[:-2], 9)], axis=-1, dtype=float)
+    return xp.concat([position, turn.reshape(*turn.shape[:-2], 9)], axis=-1)
+
+
+def _solved(matrix: Array, column: Array) -> Array:
+    """Solve positive definite systems (rows, n, n) for columns (rows, n), by Gauss-Jordan elimination."""
+    xp, n = array_namespace(matrix, column), matrix.shape[-1]
+    left = xp.concat([matrix, column[..., None]], axis=-1)  # (rows, n, n + 1 - k)
+    for k in range(n):
+        row = left[:, k, 1:] / left[:, k, :1]
+        cleared = left[..., 1:] - left[..., :1] * row[:, None]
+        left = xp.where(np.arange(n)[:, None] == k, row[:, None], cleared)
+    return left[..., 0]

@@ -15,6 +15,7 @@ from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.export import golden as golden_rows
 from mjx_softarm.export.check import TOLERANCE, check
 from mjx_softarm.export.cpp import sources
+from mjx_softarm.export.golden import FLAGS
 from tests.export.conftest import busy_policy, few_golden_rows
 
 pytestmark = pytest.mark.skipif(not shutil.which("g++"), reason="there is no compiler g++ here")
@@ -60,6 +61,7 @@ def test_a_tick_neither_allocates_nor_throws(folder):
     (folder / "tick.cpp").write_text(
         '#include "softarm.hpp"\n'
         "bool run(softarm::Controller& c, const double* goal, const double* readings, float* pose) {\n"
+        "  if (!softarm::reaches(goal, pose)) c.vent(softarm::ARM_LOST);\n"
         "  return c.set_goal(goal) && c.tip(pose) && c.tick(readings).vented;\n}\n"
     )
     compile_("-O2", "-fno-exceptions", "-fno-rtti", "-c", folder / "tick.cpp", "-o", folder / "tick.o")
@@ -80,11 +82,11 @@ def test_example_vents_an_arm_that_gives_no_readings(folder):
 
 
 READS = """
-static void read_sensors(double* readings) {
+static bool read_sensors(double* readings) {
   static const double at_rest[kN] = {READINGS};
   static int tick = 0;
   for (int k = 0; k < kN; ++k) readings[k] = at_rest[k] * (1.0 + 1e-3 * (tick % 2));
-  ++tick;
+  return ++tick > 0;
 }
 static bool write_pressures(const double* pressure_kpa) {
   static int refused = 0;
@@ -101,7 +103,7 @@ def test_example_that_is_ended_vents_until_the_arm_has_taken_it(folder, golden, 
     row = golden.inputs[np.flatnonzero(np.isfinite(golden.outputs).all(axis=1))[0]]
     text = (folder / "example.cpp").read_text()
     first, last = text.index("// Reads the springs' sensors"), text.index("// Ctrl-C")
-    reads = READS.replace("READINGS", ", ".join(map(repr, row[4:-6].tolist())))
+    reads = READS.replace("READINGS", ", ".join(map(repr, row[len(FLAGS) : -6].tolist())))
     (tmp_path / "example.cpp").write_text(text[:first] + reads + text[last:])
     compile_(f"-I{folder}", tmp_path / "example.cpp", "-o", tmp_path / "example")
     with subprocess.Popen([tmp_path / "example"], stderr=subprocess.PIPE, text=True) as done:
@@ -133,15 +135,15 @@ def test_other_programs_and_rows_are_refused(folder, golden, tmp_path):
     other = golden._replace(about=golden.about | {"policy_sha256": "0" * 64})
     with pytest.raises(InputError, match="rows: got policy [0-9a-f]{12}, expected 000000000000"):
         check(other, folder / "rows")
-    short = subprocess.run([folder / "rows"], input="1 1 0 1 0.2", capture_output=True, text=True)
-    assert (short.returncode, short.stderr) == (2, "row 1: got 5 numbers, expected 19\n")
+    short = subprocess.run([folder / "rows"], input="1 1 0 1 0 0 0.2", capture_output=True, text=True)
+    assert (short.returncode, short.stderr) == (2, "row 1: got 7 numbers, expected 21\n")
     program = tmp_path / "program"
     sha256 = golden.about["policy_sha256"]
     for script, message in (
-        ("echo hello", "expected a program that answers rows of version 1"),
-        (f"echo mjx_softarm 2 {sha256}", "expected a program that answers rows of version 1"),
+        ("echo hello", "expected a program that answers rows of version 2"),
+        (f"echo mjx_softarm 3 {sha256}", "expected a program that answers rows of version 2"),
         (r"printf '\377\n'", "can't decode byte 0xff.*, expected a program that runs"),
-        (f"echo mjx_softarm 1 {sha256}; echo 1 2", r"got 1 lines, expected \d+ lines of 35 numbers"),
+        (f"echo mjx_softarm 2 {sha256}; echo 1 2", r"got 1 lines, expected \d+ lines of 35 numbers"),
     ):
         program.write_text(f"#!/bin/sh\ncat > /dev/null\n{script}\n")
         program.chmod(0o755)
@@ -192,7 +194,7 @@ def test_an_acting_tick_takes_less_than_50_us(tmp_path, controller, golden):
     policy = dataclasses.replace(controller.policy, layers=layers)
     for name, text in sources(Controller.of(policy), "ab").items():
         (tmp_path / name).write_text(text)
-    row = golden.inputs[np.flatnonzero(np.isfinite(golden.outputs).all(axis=1))[0], 4:]
+    row = golden.inputs[np.flatnonzero(np.isfinite(golden.outputs).all(axis=1))[0], len(FLAGS) :]
     numbers = {"GOAL": row[-6:], "READINGS": row[:-6]}
     text = TIMED
     for name, values in numbers.items():

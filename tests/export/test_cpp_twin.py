@@ -32,12 +32,12 @@ def test_circle_ends_where_numpy_s_ends(tmp_path):
     arm, tips_m = open_arm("twin:0"), []
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "bufsize": 1}
     with subprocess.Popen([tmp_path / "rows"], **pipes) as program:
-        assert program.stdout.readline().split() == ["mjx_softarm", "1", "ab"]
+        assert program.stdout.readline().split() == ["mjx_softarm", "2", "ab"]
         for goal in goals:
             new, arrived = 1, False
             while not arrived:
                 readings, _, seen = arm.read_sensors(), arm.pressures(), arm.motion_capture()
-                row = (int(not tips_m and new), new, 0, 1, *readings, *goal)
+                row = (int(not tips_m and new), new, 0, 1, 0, 0, *readings, *goal)
                 print(*(f"{value:.17g}" for value in row), file=program.stdin)
                 _, arrived, *kpa = np.array(program.stdout.readline().split(), float)[: 2 + N]
                 arm.write_pressures(np.array(kpa))

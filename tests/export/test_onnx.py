@@ -12,7 +12,7 @@ from mjx_softarm.deploy.controller import Controller, start
 from mjx_softarm.deploy.loop import step, with_goal
 from mjx_softarm.export import computations
 from mjx_softarm.export.check import TOLERANCE, check
-from mjx_softarm.export.golden import N_SINGLE
+from mjx_softarm.export.golden import FLAGS, N_SINGLE
 from mjx_softarm.export.write import export_onnx
 from mjx_softarm.policy.runtime import actor_output
 from tests.export.conftest import busy_policy, few_golden_rows
@@ -32,6 +32,12 @@ def files(policy_file):
 def test_graph_agrees_on_golden_rows(files, golden):
     agreement = check(golden, files[0])
     assert agreement.n_rows >= N_SINGLE and agreement.error < TOLERANCE, agreement
+
+
+def test_graph_that_checks_goals_agrees(files, golden):
+    agreement = check(golden, files[2])
+    assert agreement.n_rows == np.count_nonzero(golden.inputs[:, FLAGS.index("checked")]) > 20
+    assert agreement.error == 0.0, agreement
 
 
 def test_graphs_need_opset_17_and_say_what_they_are(files, controller):
@@ -56,7 +62,7 @@ def test_actor_alone(files, controller):
 def test_lost_reading_holds_the_last_length(files, golden, controller):
     session = ort.InferenceSession(files[0])
     row = np.flatnonzero(np.isfinite(golden.outputs[:N_SINGLE]).all(axis=1))[0]
-    readings, goal = np.split(golden.inputs[row, 4:], [N])
+    readings, goal = np.split(golden.inputs[row, len(FLAGS) :], [N])
     last_m = np.linspace(0.15, 0.2, N)
     readings[3] = np.nan
     feed = {"readings": readings, "goal": goal, "last_length_m": last_m}

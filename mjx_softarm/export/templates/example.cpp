@@ -9,9 +9,10 @@
 using softarm::kN;
 using Clock = std::chrono::steady_clock;
 
-// Reads the springs' sensors; NaN for a reading that did not come within the tick.
-static void read_sensors(double* readings) {
+// Reads the springs' sensors, NaN for a reading that did not come in time; false where they cannot be reached.
+static bool read_sensors(double* readings) {
   for (int k = 0; k < kN; ++k) readings[k] = NAN;
+  return true;
 }
 
 // Sets what the chambers' pressures [kPa] are regulated to; false where the arm did not take them in time.
@@ -22,7 +23,6 @@ static bool write_pressures(const double* pressure_kpa) {
 
 // Ctrl-C and SIGTERM vent the arm; a second one ends at once, with the arm under pressure.
 static volatile std::sig_atomic_t ends = 0;
-
 static void end(int signal) {
   ends = 1;
   std::signal(signal, SIG_DFL);
@@ -32,15 +32,16 @@ int main() {
   std::signal(SIGINT, end);
   std::signal(SIGTERM, end);
   const double goal[6] = {@GOAL@};  // x, y, z [mm], yaw, pitch, roll [deg]
+  float nearest[6];
   softarm::Controller controller;
-  if (!controller.set_goal(goal)) return 3;  // outside the workspace
+  if (!softarm::reaches(goal, nearest) || !controller.set_goal(goal)) return 3;  // outside the workspace
   const std::chrono::duration<double> period(softarm::kPeriod);
   bool late = false, taken = true;
   softarm::Tick tick{};
   for (auto next = Clock::now() + period; !(tick.vented && taken); next += period) {
-    if (ends) controller.vent();
     double readings[kN];
-    read_sensors(readings);
+    if (!read_sensors(readings)) controller.vent(softarm::ARM_LOST);
+    if (ends) controller.vent();
     tick = controller.tick(readings, late, taken);
     taken = write_pressures(tick.pressure_kpa);
     if (tick.faults) std::printf("faults: %#x%s\n", tick.faults, tick.stopped ? ", vents" : "");

@@ -10,11 +10,13 @@ static void write(const double* values, int n) {
 }
 
 int main() {
-  std::printf("mjx_softarm 1 %s\n", softarm::kPolicySha256);
+  std::printf("mjx_softarm 2 %s\n", softarm::kPolicySha256);
   std::fflush(stdout);
   softarm::Controller controller;
-  constexpr int n_inputs = 4 + kN + 6;
+  constexpr int n_flags = 6, n_inputs = n_flags + kN + 6;
   double row[n_inputs];
+  float nearest[6];
+  const double *readings = row + n_flags, *goal = readings + kN;
   for (long line = 1;; ++line) {
     for (int k = 0; k < n_inputs; ++k) {
       if (std::scanf("%lf", &row[k]) == 1) continue;
@@ -23,8 +25,10 @@ int main() {
       return 2;
     }
     if (row[0] > 0.5) controller = softarm::Controller{};
-    const bool refused = row[1] > 0.5 && !controller.set_goal(row + 4 + kN);
-    const softarm::Tick tick = controller.tick(row + 4, row[2] > 0.5, row[3] > 0.5);
+    const bool no_way = row[5] > 0.5 && !softarm::reaches(goal, nearest);
+    const bool refused = row[1] > 0.5 && (no_way || !controller.set_goal(goal));
+    if (row[4] > 0.5) controller.vent(softarm::ARM_LOST);
+    const softarm::Tick tick = controller.tick(readings, row[2] > 0.5, row[3] > 0.5);
     double reference[kN], length[kN];
     float pose[6];
     controller.references(reference);
