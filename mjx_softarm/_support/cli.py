@@ -17,7 +17,7 @@ import itertools
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -39,8 +39,12 @@ _PLAINER = (
     (r"could not convert string to float: (.*)", r"got \1, expected a number"),
     (r"Could not find valid parse for arguments: (.*)", r"got \1, expected values as --help tells"),
     (r"^Missing from (.*?):", r"\1: got nothing, expected"),
+    (r" \(required\)(?= )", ";"),
     (r" \(required\)", ""),
-    (r"^invalid choice (\S+) for argument '(\S+)'. Expected", r"\2: got \1, expected"),
+    (
+        r"^invalid choice (\S+) for argument '(\S+)'. Expected one of \((.*)\).",
+        r"\2: got \1, expected one of \3",
+    ),
 )
 
 Command = Callable[..., Any] | str
@@ -105,7 +109,10 @@ def read(prog: str, commands: Mapping[str, Command], words: Sequence[str]) -> tu
     """
     name = next((name for name in commands if list(words[: len(name.split())]) == name.split()), None)
     if name is None:
-        raise InputError(f"{prog}: got {words[0]!r}, expected one of {', '.join(commands)}")
+        first, *rest = words
+        if group := [name.removeprefix(f"{first} ") for name in commands if name.startswith(f"{first} ")]:
+            prog, first, commands = f"{prog} {first}", rest[0], dict.fromkeys(group, "")
+        raise InputError(f"{prog}: got {first!r}, expected one of {', '.join(commands)}")
     return name, parse(_load(commands[name]), f"{prog} {name}", words[len(name.split()) :])
 
 
@@ -216,6 +223,19 @@ def listed(read: Callable[[list[str]], tuple], metavar: str) -> PrimitiveConstru
         instance_from_str=read,
         is_instance=lambda value: isinstance(value, tuple),
         str_from_instance=lambda value: [",".join(map(str, value))],
+    )
+
+
+def one_of(names: Iterable[str]) -> PrimitiveConstructorSpec:
+    """Return how an option is read whose value is one of some names."""
+    choices = tuple(names)
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=f"{{{','.join(choices)}}}",
+        instance_from_str=lambda words: words[0],
+        is_instance=lambda value: value in choices,
+        str_from_instance=lambda value: [value],
+        choices=choices,
     )
 
 

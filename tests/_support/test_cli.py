@@ -42,7 +42,7 @@ class Settings:
 class Make:
     """Make something."""
 
-    preset: Literal["small", "large"] = "small"
+    preset: Annotated[str, cli.one_of(PRESETS)] = "small"
     settings: Annotated[Settings, tyro.conf.arg(name="")] = field(default_factory=Settings)
     out: cli.MaybePath = None
     """file to write"""
@@ -105,6 +105,7 @@ def test_functions_of_two_words_get_lists_and_flags():
     "words, message",
     [
         ("dance", "program: got 'dance', expected one of make, show files, fail, late"),
+        ("show dance", "program show: got 'dance', expected one of files"),
         (
             "make --inner.gama 1",
             "command line: got --inner.gama, 1, expected options as --help tells; Perhaps you meant",
@@ -114,7 +115,7 @@ def test_functions_of_two_words_get_lists_and_flags():
         ("make --limit low", "--limit: got 'low', expected {None}|FLOAT"),
         ("make --size wide", "--size: got 'wide', expected a number"),
         ("make --inner.widths 1 x", "--inner.widths: got ['1', 'x'], expected"),
-        ("make --preset huge", "--preset: got 'huge', expected one of ('small', 'large')"),
+        ("make --preset huge", "--preset: got 'huge', expected one of 'small', 'large'\n"),
         ("make --n 0", "n: got 0, expected at least 1"),
         ("make --inner.gamma 2", "Inner.gamma: got 2.0, expected at most 1"),
         ("make more", "more"),

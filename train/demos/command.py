@@ -6,12 +6,13 @@ import sys
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Annotated
 
 import numpy as np
 import tyro
 from rich.console import Console
 
+from mjx_softarm._support import cli
 from mjx_softarm.deploy import arms
 from mjx_softarm.deploy.ending import DONE, FAULT, NOT_WRITTEN, save_log
 from mjx_softarm.logs.schema import Log
@@ -30,7 +31,7 @@ class Record(ArmOptions):
 
     arm: str
     """twin:SEED, twin:SEED:pipe300, or package.module:Class, a driver of your own"""
-    task: Literal["circle16", "pipe300", "pipe250"] | None = None
+    task: tyro.conf.DisallowNone[Annotated[str, cli.one_of(TASKS)] | None] = None
     """task with its waypoints and its pipe; --keyboard does without"""
     keyboard: bool = False
     """steer by keys, in the task's pipe if one is given"""

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Self
 
 import tyro
 from jax.sharding import Mesh
@@ -38,14 +38,14 @@ Devices = Annotated[str | None, tyro.conf.DisallowNone, tyro.conf.arg(metavar="D
 class Reach(NewRunOptions):
     """Train a policy that reaches poses of the workspace."""
 
-    preset: Literal["quick", "paper", "analytic"] = "quick"
+    preset: Annotated[str, cli.one_of(PRESETS)] = "quick"
     """settings to begin with; the defaults below are this preset's"""
     config: Annotated[TrainConfig, tyro.conf.arg(name="")]
     devices: Devices = None
 
     @classmethod
     def default(cls, arguments: Sequence[str]) -> Self:
-        preset: Any = named_preset(arguments, PRESETS, "quick")
+        preset = named_preset(arguments, PRESETS, "quick")
         return cls(preset=preset, config=PRESETS[preset])
 
     def __call__(self) -> int:
@@ -70,7 +70,7 @@ class Imitate(NewRunOptions):
 
     file: tyro.conf.Positional[cli.MaybePath] = None
     """demonstrations as `demos record` writes them"""
-    preset: Literal["pipe", "circle", "hand-made", "frozen"] = "pipe"
+    preset: Annotated[str, cli.one_of(IMITATION_PRESETS)] = "pipe"
     """settings to begin with. pipe: the learned reward; circle: both, in two stages; hand-made: the
     environment's reward at the same goals; frozen: that and another run's learned reward, with --reward"""
     config: Annotated[ImitationConfig, tyro.conf.arg(name="")]
@@ -82,7 +82,7 @@ class Imitate(NewRunOptions):
 
     @classmethod
     def default(cls, arguments: Sequence[str]) -> Self:
-        preset: Any = named_preset(arguments, IMITATION_PRESETS, "pipe")
+        preset = named_preset(arguments, IMITATION_PRESETS, "pipe")
         return cls(preset=preset, config=IMITATION_PRESETS[preset])
 
     def __call__(self) -> int:

@@ -8,7 +8,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Self
 
 import tyro
 from rich.console import Console
@@ -33,7 +33,7 @@ class SweepCommand(NewRunOptions):
     --seeds and --vary replace the settings' own values.
     """
 
-    preset: Literal["quick", "paper", "analytic"] = "quick"
+    preset: Annotated[str, cli.one_of(PRESETS)] = "quick"
     """settings to begin with; the defaults below are this preset's, without polishing"""
     config: Annotated[TrainConfig, tyro.conf.arg(name="")]
     seeds: cli.Integers = (0,)
@@ -43,7 +43,7 @@ class SweepCommand(NewRunOptions):
 
     @classmethod
     def default(cls, arguments: Sequence[str]) -> Self:
-        preset: Any = named_preset(arguments, PRESETS, "quick")
+        preset = named_preset(arguments, PRESETS, "quick")
         return cls(preset=preset, config=dataclasses.replace(PRESETS[preset], polish_updates=0))
 
     def __call__(self) -> int:
