@@ -13,6 +13,12 @@ their references. The learner has arms of its own that go on from where its acti
 states that the policy leads to, disturbances of the randomisation included. A part of them begins anew at
 each step. An environment's cost of clearance, where it has one, adds to the loss.
 
+Neither learning rate nor average depends on the length of the run, so that every policy on the way is as good
+as that of a shorter run: the rate falls as 1 / (1 + t / t_half) over the steps t, and the policy is an average
+of the newest ones, in which a share of all steps counts.
+
+Source of the average: Shamir, Zhang, "Stochastic Gradient Descent for Non-smooth Optimization", ICML 2013.
+
 Shapes: B arms, O observation, A action.
 """
 
@@ -43,22 +49,23 @@ class AnalyticConfig:
     """Hyperparameters of learning through the equilibrium. Raises ValueError naming a bad field."""
 
     # See TQCConfig.
-    NUMBERS = ("learning_rate", "max_gradient_norm", "tau", "new_share", "saturation_cost_per_mm")
+    NUMBERS = ("learning_rate", "learning_rate_half", "max_gradient_norm", "mean_share", "new_share")
+    NUMBERS += ("saturation_cost_per_mm",)
 
     hidden: tuple[int, ...] = (256, 256, 256)  # width of each hidden layer of the policy
     learning_rate: float = 2e-3  # of Adam
-    learning_rate_end: float = 0.01  # share of it left at the end; it falls along a half cosine
+    learning_rate_half: float = 5_000.0  # gradient steps after which half of it is left, after twice a third
     max_gradient_norm: float = 1.0  # a longer gradient is shortened to this
-    tau: float = 0.005  # Polyak rate of the mean policy, per gradient step
+    mean_share: float = 0.1  # share of the gradient steps so far over which the mean policy averages
     new_share: float = 0.33  # share of the arms that get a new start and goal after each step
     saturation_cost_per_mm: float = 0.1  # c of the loss
 
     def __post_init__(self) -> None:
         required = {
             "learning_rate": (self.learning_rate >= 0.0, "a number >= 0"),
-            "learning_rate_end": (0.0 <= self.learning_rate_end <= 1.0, "a number in [0, 1]"),
+            "learning_rate_half": (self.learning_rate_half > 0.0, "a number > 0"),
             "max_gradient_norm": (self.max_gradient_norm > 0.0, "a number > 0"),
-            "tau": (0.0 < self.tau <= 1.0, "a number in (0, 1]"),
+            "mean_share": (0.0 <= self.mean_share <= 1.0, "a number in [0, 1]"),
             "new_share": (0.0 <= self.new_share <= 1.0, "a number in [0, 1]"),
             "saturation_cost_per_mm": (self.saturation_cost_per_mm >= 0.0, "a number >= 0"),
         }
@@ -71,8 +78,9 @@ class AnalyticState(NamedTuple):
     """All that an update changes."""
 
     actor_params: Params
-    mean_actor_params: Params  # Polyak average of actor_params: the policy that comes of training
+    mean_actor_params: Params  # average of actor_params over the last steps: the policy that comes of training
     opt_state: optax.OptState
+    n_steps: Array  # () int32 gradient steps taken
     arms: State  # B
 
 
@@ -83,18 +91,19 @@ class Analytic:
         config: hyperparameters.
         env: the arm, at rest.
         n_arms: arms of a gradient step.
-        n_updates: gradient steps of the run, over which the learning rate falls.
         mesh: devices over which the arms are spread.
     """
 
     def __init__(
-        self, config: AnalyticConfig, env: ReachEnv, n_arms: int, n_updates: int, mesh: Mesh | None = None
+        self, config: AnalyticConfig, env: ReachEnv, n_arms: int, mesh: Mesh | None = None
     ):
         self.config, self.env, self.mesh, self.own_arms = config, env, mesh, n_arms
         self.actor: Any = Actor(env.action_size, config.hidden)
         self.arms = VectorEnv(env, n_arms, episode_length=1, mesh=mesh)
-        rate = optax.cosine_decay_schedule(config.learning_rate, n_updates, config.learning_rate_end)
-        self.optimizer = optax.chain(optax.clip_by_global_norm(config.max_gradient_norm), optax.adam(rate))
+        self.optimizer = optax.chain(
+            optax.clip_by_global_norm(config.max_gradient_norm),
+            optax.adam(lambda n_steps: config.learning_rate / (1.0 + n_steps / config.learning_rate_half)),
+        )
 
     def init(self, key: Array) -> AnalyticState:
         """Return a fresh policy, and arms at random poses."""
@@ -104,6 +113,7 @@ class Analytic:
             actor_params=params,
             mean_actor_params=jax.tree.map(jnp.copy, params),  # so that the state can be donated
             opt_state=self.optimizer.init(params),
+            n_steps=jnp.zeros((), jnp.int32),
             arms=self.arms.reset(key_arms),
         )
 
@@ -137,12 +147,12 @@ class Analytic:
         # Descend.
         change, opt_state = self.optimizer.update(gradient, state.opt_state, state.actor_params)
         actor_params = optax.apply_updates(state.actor_params, change)
+        newest = 1.0 / (1.0 + self.config.mean_share * state.n_steps)
         next_state = AnalyticState(
             actor_params=actor_params,
-            mean_actor_params=optax.incremental_update(
-                actor_params, state.mean_actor_params, self.config.tau
-            ),
+            mean_actor_params=optax.incremental_update(actor_params, state.mean_actor_params, newest),
             opt_state=opt_state,
+            n_steps=state.n_steps + 1,
             arms=self._go_on(after, key),
         )
         metrics = {

@@ -45,7 +45,7 @@ def learner_of(config: TrainConfig, env: ReachEnv, mesh: Mesh | None = None) -> 
 
 
 def _analytic(config: TrainConfig, env: ReachEnv, mesh: Mesh | None) -> Analytic:
-    return Analytic(config.analytic, env, config.n_arms, config.n_updates, mesh)
+    return Analytic(config.analytic, env, config.n_arms, mesh)
 
 
 def task_of(

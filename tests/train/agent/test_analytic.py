@@ -13,7 +13,7 @@ from train.agent.analytic import Analytic, AnalyticConfig
 from train.config import ConfigError, TrainConfig
 
 SHORT = ArmSpec.default().replace(structure={"n_sections": 1, "links_per_section": 2})
-CONFIG = AnalyticConfig(hidden=(32, 32), tau=0.05)
+CONFIG = AnalyticConfig(hidden=(32, 32))
 N_ARMS, N_UPDATES = 32, 150
 
 pytestmark = pytest.mark.usefixtures("quick_compiler")
@@ -24,7 +24,7 @@ def learner():
     """Arms that differ in payload, stiffness and sensor bias."""
     randomisation = Randomisation(payload_max_kg=0.2, stiffness_spread=0.05, sensor_noise_mm=0.5)
     env = ReachEnv(SHORT, EnvConfig(n_poses=256, randomisation=randomisation))
-    return Analytic(CONFIG, env, N_ARMS, N_UPDATES)
+    return Analytic(CONFIG, env, N_ARMS)
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +82,7 @@ def test_motion_is_refused():
         TrainConfig(learner="analytic", env=EnvConfig(mode="dynamic"))
 
 
-@pytest.mark.parametrize(("name", "value"), [("tau", 0.0), ("learning_rate_end", 2.0), ("new_share", -0.1)])
+@pytest.mark.parametrize(("name", "value"), [("mean_share", 2.0), ("learning_rate_half", 0.0), ("new_share", -0.1)])
 def test_a_setting_out_of_range_is_named(name, value):
     with pytest.raises(ValueError, match=f"AnalyticConfig.{name}: got {value}"):
         dataclasses.replace(CONFIG, **{name: value})
