@@ -52,9 +52,9 @@ class AnalyticConfig:
     NUMBERS = ("learning_rate", "learning_rate_half", "max_gradient_norm", "mean_share", "new_share")
     NUMBERS += ("saturation_cost_per_mm",)
 
-    hidden: tuple[int, ...] = (256, 256, 256)  # width of each hidden layer of the policy
+    hidden: tuple[int, ...] = (256, 256, 256, 256)  # width of each hidden layer of the policy
     learning_rate: float = 2e-3  # of Adam
-    learning_rate_half: float = 5_000.0  # gradient steps after which half of it is left, after twice a third
+    learning_rate_half: float = 3_000.0  # gradient steps after which half of it is left, after twice a third
     max_gradient_norm: float = 1.0  # a longer gradient is shortened to this
     mean_share: float = 0.1  # share of the gradient steps so far over which the mean policy averages
     new_share: float = 0.33  # share of the arms that get a new start and goal after each step

@@ -121,9 +121,9 @@ def test_tuned_peers_have_the_quick_preset_s_settings():
     settings = tuned_settings(PRESETS["quick"], lambda: n_steps[0])
     rate = settings.pop("learning_rate")
     names = ("buffer_size", "learning_starts", "batch_size", "tau", "gamma", "train_freq", "gradient_steps")
-    values = (262_144, 2048, 128, 0.005, 0.5, 1, 16, "auto_0.1", -30.0)
+    values = (262_144, 2048, 128, 0.005, 0.1, 1, 16, "auto_0.1", -30.0)
     assert settings == dict(zip((*names, "ent_coef", "target_entropy"), values, strict=True))
-    rates = {0: 1e-3, 120_000: 0.51e-3, 239_999: 0.02e-3, 240_000: 1e-3, 360_000: 0.51e-3}
+    rates = {0: 4e-3, 90_000: 2.04e-3, 179_999: 0.08e-3, 180_000: 4e-3, 270_000: 2.04e-3}
     for n_steps[0], expected in rates.items():
         assert rate(1.0) == pytest.approx(expected, rel=1e-3)
 
