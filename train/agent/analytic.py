@@ -14,8 +14,8 @@ states that the policy leads to, disturbances of the randomisation included. A p
 each step. An environment's cost of clearance, where it has one, adds to the loss.
 
 Neither learning rate nor average depends on the length of the run, so that every policy on the way is as good
-as that of a shorter run: the rate falls as 1 / (1 + t / t_half) over the steps t, and the policy is an average
-of the newest ones, in which a share of all steps counts.
+as that of a shorter run: the rate falls as 1 / (1 + t / t_half) over the steps t, and the policy is an
+average of the newest ones, in which a share of all steps counts.
 
 Source of the average: Shamir, Zhang, "Stochastic Gradient Descent for Non-smooth Optimization", ICML 2013.
 
@@ -78,7 +78,7 @@ class AnalyticState(NamedTuple):
     """All that an update changes."""
 
     actor_params: Params
-    mean_actor_params: Params  # average of actor_params over the last steps: the policy that comes of training
+    mean_actor_params: Params  # average of the newest actor_params: the policy that comes of training
     opt_state: optax.OptState
     n_steps: Array  # () int32 gradient steps taken
     arms: State  # B
@@ -94,9 +94,7 @@ class Analytic:
         mesh: devices over which the arms are spread.
     """
 
-    def __init__(
-        self, config: AnalyticConfig, env: ReachEnv, n_arms: int, mesh: Mesh | None = None
-    ):
+    def __init__(self, config: AnalyticConfig, env: ReachEnv, n_arms: int, mesh: Mesh | None = None):
         self.config, self.env, self.mesh, self.own_arms = config, env, mesh, n_arms
         self.actor: Any = Actor(env.action_size, config.hidden)
         self.arms = VectorEnv(env, n_arms, episode_length=1, mesh=mesh)

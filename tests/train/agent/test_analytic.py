@@ -82,7 +82,9 @@ def test_motion_is_refused():
         TrainConfig(learner="analytic", env=EnvConfig(mode="dynamic"))
 
 
-@pytest.mark.parametrize(("name", "value"), [("mean_share", 2.0), ("learning_rate_half", 0.0), ("new_share", -0.1)])
+@pytest.mark.parametrize(
+    ("name", "value"), [("mean_share", 2.0), ("learning_rate_half", 0.0), ("new_share", -0.1)]
+)
 def test_a_setting_out_of_range_is_named(name, value):
     with pytest.raises(ValueError, match=f"AnalyticConfig.{name}: got {value}"):
         dataclasses.replace(CONFIG, **{name: value})
