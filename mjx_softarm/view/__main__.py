@@ -8,6 +8,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from functools import partial
+from importlib import resources
 from pathlib import Path
 
 import tyro
@@ -43,7 +44,7 @@ def _view(
 
     Args:
         logs: of `deploy run` and `record`, CSV or npz
-        policy: file that `python -m train export` wrote, to steer with
+        policy: file that `python -m train export` wrote, to steer with; without it the package's own is used
         log: file for the log of the steered run, CSV or npz
         html: file to write the logs to, as a page that plays without a server
         host: address to listen on; with another one everybody who reaches it can move the arm
@@ -61,14 +62,21 @@ def _view(
         return _replay(logs, ArmSpec.of(spec), html, host, port)
     if html is not None:
         raise InputError("--html: got no log, expected one or more, which are then written")
-    if policy is None:
-        made = "`make demo` trains one, `python -m train export RUN` writes its file"
-        raise InputError(f"--policy: got nothing, expected a policy; {made}")
     from mjx_softarm.view.live import Setup, live
 
-    read, io = load_policy(policy), open_arm(arm)
+    read, io = load_policy(policy or _shipped()), open_arm(arm)
     setup = Setup(read, arm, host, port, hasattr(io, "attach"))
     return live(setup, io, _tell, partial(_welcome, host), partial(save_log, log) if log else None).status
+
+
+def _shipped() -> Path:
+    """Return the policy file that ships with the package."""
+    folder = resources.files("mjx_softarm").joinpath("policy/shipped")
+    names = [item for item in folder.iterdir() if item.name.endswith(".npz")] if folder.is_dir() else []
+    if not names:
+        made = "`make demo` trains one, `python -m train export RUN` writes its file"
+        raise InputError(f"--policy: got nothing, expected a policy; {made}")
+    return Path(str(names[0]))
 
 
 def _replay(logs: tuple[Path, ...], spec: ArmSpec, html: Path | None, host: str, port: int) -> int:

@@ -29,7 +29,8 @@ from mjx_softarm.view.look import look_at
 
 READY_S = 60.0  # for the server to start
 N_LINES = 4  # of what the loop told last, on the page
-_ROUNDS = 100  # of the circle
+_ROUNDS = 100  # of the circle, and of picking and placing
+_LIFT_MM, _OBJECT_KG = 25.0, 0.22  # an apple, as in the paper's pipe
 
 
 class Setup(NamedTuple):
@@ -55,6 +56,8 @@ class PagePilot:
         self._armed, self._payload_kg, self._n_pages, self._lost = False, 0.0, 0, False
         self._doing, self._goal = "waits", np.full(6, np.nan)
         self._circle = _ROUNDS * [self._clamped(goal) for goal in circle_poses()]  # takes longer than a tick
+        self._place = _ROUNDS * [self._clamped(goal) for goal in place_poses()]
+        self._loads: list[float | None] = []  # to hang to the gripper at the arrivals to come
         # A simulated arm begins by itself: it hits nobody.
         self._first: dict[str, Any] = {"circle": True} if hasattr(arm, "time_s") else {}
 
@@ -69,27 +72,39 @@ class PagePilot:
         self._first = {}
         self._count_pages(asked.get("pages", self._n_pages))
         if "payload_kg" in asked:
-            self._payload_kg = asked["payload_kg"]
-            self._arm.attach(self._payload_kg)
+            self._carry(asked["payload_kg"])
         if self._end.closed.is_set() and not self._lost:
             self._lost = asked["hold"] = True
             self.tell("the page's server has ended; an arm under pressure holds, Ctrl-C vents it")
         if "vent" in asked or "hold" in asked:
-            self._armed, self._goal = False, np.full(6, np.nan)
+            self._armed, self._goal, self._loads = False, np.full(6, np.nan), []
             return Orders(vent="vent" in asked, hold=True)
-        self._armed |= "circle" in asked or "follow" in asked
+        self._armed |= not asked.keys().isdisjoint(("circle", "follow", "place"))
+        if not asked.keys().isdisjoint(("circle", "follow", "goal")):
+            self._loads = []
         if "circle" in asked:
             return Orders(goals=self._circle)
+        if "place" in asked:
+            self._loads = _ROUNDS * [None, _OBJECT_KG, None, None, 0.0, None]
+            return Orders(goals=self._place)
         if "goal" in asked and self._armed:
             return Orders(goals=[self._clamped(asked["goal"])])
         return Orders()
 
     def look(self, state: State, tick: Tick, row: dict[str, Any]) -> None:
-        """Show a tick on the page."""
+        """Show a tick on the page; grip or let go where the arm has arrived."""
+        if tick.arrived and self._loads and (load_kg := self._loads.pop(0)) is not None:
+            self._carry(load_kg)
         self._doing = _doing(state, self._controller.policy.n_actions)
         self._goal = self._goal if state.goal is None else state.goal  # shown until the arm is sent elsewhere
         look = look_at(row, tick.spring_m, self._payload_kg)._replace(goal=self._goal)
         self._end.put(look=look, doing=self._doing, armed=self._armed, lines=tuple(self._said))
+
+    def _carry(self, payload_kg: float) -> None:
+        """Hang a mass to the gripper of an arm that can; another arm's gripper is its user's."""
+        if hasattr(self._arm, "attach"):
+            self._arm.attach(payload_kg)
+            self._payload_kg = payload_kg
 
     def _clamped(self, goal: np.ndarray) -> np.ndarray:
         return clamped(self._controller.reachable, goal, self._controller.policy.reward)
@@ -98,6 +113,13 @@ class PagePilot:
         if n_pages == 0 < self._n_pages:
             self.tell(f"no page is open; the arm {self._doing}, as it did; Ctrl-C vents it")
         self._n_pages = n_pages
+
+
+def place_poses() -> np.ndarray:
+    """Return goals (6, 6) [mm, deg]: above, at and above a place, then one across the circle."""
+    sides = circle_poses()[[0, 20]]
+    lift = np.array([0.0, 0.0, _LIFT_MM, 0.0, 0.0, 0.0])
+    return np.concatenate([[side + lift, side, side + lift] for side in sides])
 
 
 def _doing(state: State, n_actions: int) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import trimesh
+from scipy.spatial import Delaunay
 from trimesh import creation
 
 from mjx_softarm.mechanics.body import gripper_boxes
@@ -35,6 +36,24 @@ def coil(radius_m: float, wire_m: float, pitch_m: float, n: int = 13, n_wire: in
     b, d = (np.roll(side, -1, axis=0) for side in (a, c))
     faces = np.concatenate([np.stack([a, c, b], axis=-1), np.stack([b, c, d], axis=-1)])
     return Mesh(vertices.reshape(-1, 3), faces.reshape(-1, 3), process=False)
+
+
+def workspace_hull(point_m: np.ndarray) -> Mesh:
+    """Return the surface around points (m, 3) [m], which follows hollows wider than a tenth of its extent.
+
+    Source: Edelsbrunner, Muecke, "Three-dimensional alpha shapes", ACM Transactions on Graphics 13, 1994.
+    """
+    corners = Delaunay(point_m).simplices  # (tetrahedra, 4)
+    edge = point_m[corners[:, 1:]] - point_m[corners[:, :1]]
+    square, across = np.sum(edge**2, axis=-1), np.cross(edge[:, [1, 2, 0]], edge[:, [2, 0, 1]])
+    volume = np.abs(np.sum(edge[:, 0] * across[:, 0], axis=-1))
+    radius_m = np.linalg.norm(np.einsum("tk,tkx->tx", square, across), axis=-1) / np.maximum(
+        2 * volume, 1e-18
+    )
+    corners = corners[radius_m < np.ptp(point_m, axis=0).max() / 10.0]
+    faces = np.concatenate([np.delete(corners, k, axis=1) for k in range(4)])
+    _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
+    return Mesh(point_m, faces[first[count == 1]], process=False)  # the faces of one tetrahedron alone
 
 
 def gripper(spec: ArmSpec) -> Mesh:

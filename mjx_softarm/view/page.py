@@ -25,8 +25,9 @@ _STOP, _VENT = (
     "Give up the goals, hold the arm where it is",
     "Let the pressures go to zero; what it carries sinks",
 )
-_CIRCLE, _GIZMO = (
+_CIRCLE, _PLACE, _GIZMO = (
     "Go round the paper's circle, point by point",
+    "Fetch a mass on one side, put it down on the other, and back",
     "Follow the goal that is dragged in the picture",
 )
 
@@ -58,7 +59,7 @@ class Page:
         spec = setup.policy.spec
         set_the_scene(server, spec)
         self._stage = Stage(server.scene, spec)
-        workspace = add_workspace(server.scene, setup.policy.workspace)
+        points, hull = add_workspace(server.scene, setup.policy.workspace)
         look = {"scale": 0.15, "depth_test": False, "visible": False}
         self._gizmo = server.scene.add_transform_controls("/gizmo", **look)
         self._button("Stop", "hold", _STOP, "orange", viser.Icon.HAND_STOP)
@@ -66,11 +67,12 @@ class Page:
         self._panel = Panel(server.gui, Limits.of(spec), spec.n_chambers)
         with server.gui.add_folder("Move", order=0.5):
             self._button("Circle", "circle", _CIRCLE, None, viser.Icon.CIRCLE)
+            self._button("Pick and place", "place", _PLACE, None, viser.Icon.ARROWS_EXCHANGE)
             self._button("Drag the goal", "follow", _GIZMO, None, viser.Icon.ARROWS_MOVE)
             if setup.carries:
                 self._add_payload()
-            box = server.gui.add_checkbox("reachable poses", False, hint="Where goals are kept")
-        box.on_update(lambda _: setattr(workspace, "visible", box.value))
+            self._box("reachable poses", "Goals are kept near them", points)
+            self._box("reachable workspace", "The hull of the reachable poses", hull)
         self._listen()
 
     def _button(self, label: str, name: str, hint: str, colour: Any, icon: Any) -> None:
@@ -80,6 +82,11 @@ class Page:
         @button.on_click
         async def _(_: Any) -> None:  # in the server's own thread: no queue of others stands before it
             self._end.put(**{name: True})
+
+    def _box(self, label: str, hint: str, node: viser.SceneNodeHandle) -> None:
+        """Add a check box that shows a node of the scene."""
+        box = self._server.gui.add_checkbox(label, False, hint=hint)
+        box.on_update(lambda _: setattr(node, "visible", box.value))
 
     def _add_payload(self) -> None:
         slider = self._server.gui.add_slider("payload [g]", 0, 1000, 50, 0, hint="Hung to the finger tips")

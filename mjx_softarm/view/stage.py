@@ -29,6 +29,7 @@ from mjx_softarm.view.look import Limits, Look
 SECTION_COLOURS = ((214, 90, 66), (235, 172, 70), (70, 140, 200))  # as in MuJoCo's pictures
 SATURATED, GOAL, SEEN = (226, 38, 77), (40, 160, 96), (124, 77, 210)
 _RING, _SPRING, _GRIPPER, _MOUNT = (62, 66, 74), (176, 182, 190), (52, 55, 62), (142, 147, 155)
+_HULL = (70, 130, 200)
 _PAYLOAD, _TRAIL = (52, 150, 66), (245, 130, 32)
 _TRAIL_POINTS, _TRAIL_STEP_M = 300, 2e-3
 _RING_M, _WIRE_M, _MOUNT_M = 0.005, 7e-4, (0.095, 0.04)  # height; radius; radius and height
@@ -120,12 +121,20 @@ def section_colour(chamber: int) -> tuple[int, int, int]:
     return SECTION_COLOURS[chamber // N_CHAMBERS_PER_SECTION % len(SECTION_COLOURS)]
 
 
-def add_workspace(scene: viser.SceneApi, pose: np.ndarray) -> viser.PointCloudHandle:
-    """Add the reachable poses (m, 6) [mm, deg] as points, the deeper the darker; hidden at first."""
+def add_workspace(scene: viser.SceneApi, pose: np.ndarray) -> tuple[viser.SceneNodeHandle, ...]:
+    """Add the reachable poses (m, 6) [mm, deg], the deeper the darker, and their hull; both hidden."""
     depth = (pose[:, 2:3].max() - pose[:, 2:3]) / max(float(np.ptp(pose[:, 2])), 1.0)
     colours = (depth * (38, 84, 160) + (1 - depth) * (120, 200, 235)).astype(np.uint8)
     looks = {"point_size": 0.004, "point_shape": "circle", "visible": False}
-    return scene.add_point_cloud("/workspace", 1e-3 * pose[:, :3], colours, **looks)
+    points = scene.add_point_cloud("/workspace", 1e-3 * pose[:, :3], colours, **looks)
+    surface, looks = (
+        meshes.workspace_hull(1e-3 * pose[:, :3].astype(float)),
+        {"opacity": 0.2, "side": "double"},
+    )
+    hull = scene.add_mesh_simple(
+        "/hull", surface.vertices, surface.faces, color=_HULL, visible=False, cast_shadow=False, **looks
+    )
+    return points, hull
 
 
 def open_server(host: str, port: int, label: str) -> viser.ViserServer:

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from mjx_softarm._support.channel import End
-from mjx_softarm.deploy.controller import start
+from mjx_softarm.deploy.controller import Tick, start
 from mjx_softarm.deploy.loop import with_goal
 from mjx_softarm.deploy.session import Orders, steer
-from mjx_softarm.view.live import PagePilot
-from tests.linear_arm import CONTROLLER, FAR, GOALS, LinearArm
+from mjx_softarm.view.live import PagePilot, place_poses
+from tests.linear_arm import CONTROLLER, FAR, GOALS, REST_M, LinearArm, N
 
 
 @pytest.fixture
@@ -83,6 +83,24 @@ def test_closed_page_and_dead_server_are_told(inbox):
     inbox.closed = SimpleNamespace(is_set=lambda: True)
     assert ask(pilot, inbox) == Orders(hold=True) and "server has ended" in lines[-1]
     assert ask(pilot, inbox) == Orders() and len(lines) == 2
+
+
+def test_picking_and_placing_hangs_a_mass_to_the_gripper_and_takes_it_off(inbox):
+    arm, loads = SimpleNamespace(), []
+    arm.attach = loads.append
+    pilot = PagePilot(inbox, arm, CONTROLLER, lambda text: None)
+    goals = ask(pilot, inbox, place=True).goals[:6]
+    state, row, held = start(CONTROLLER), {"time_s": 0.0}, []
+    for goal in goals:
+        pilot.look(state._replace(goal=goal), Tick(np.full(N, REST_M), (), False), row)
+        pilot.look(state, Tick(np.full(N, REST_M), (), True), row)
+        held.append(inbox.shown[-1]["look"].payload_kg)
+    assert loads == [held[1], 0.0] and held == [0.0, held[1], held[1], held[1], 0.0, 0.0] and held[1] > 0.1
+    above, at, _, above_next, next_at, _ = place_poses()
+    assert above[2] > at[2] == next_at[2] < above_next[2] and at[0] > 50.0 > -50.0 > next_at[0]
+    ask(pilot, inbox, goal=GOALS[0])  # somebody drags the goal in between
+    pilot.look(state, Tick(np.full(N, REST_M), (), True), row)
+    assert len(loads) == 2
 
 
 def test_payload_is_attached(inbox):
