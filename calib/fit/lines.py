@@ -253,16 +253,6 @@ def _stretches(table: np.ndarray) -> np.ndarray:
     return np.stack([np.pad(p, ((0, longest - len(p)), (0, 0)), constant_values=np.nan) for p in pieces])
 
 
-def still_rows(time_s: np.ndarray, x: np.ndarray, tolerance: float, window_s: float = 0.5) -> np.ndarray:
-    """Mask (n,) of the rows around which x (n,) moves by less than the tolerance within the window.
-
-    Two instruments that are not triggered together differ by speed times delay while the arm moves; a static
-    calibration wants rows at which both were still. A fit's residuals have no say in it.
-    """
-    before, after = (np.interp(time_s + shift, time_s, x) for shift in (-window_s, window_s))
-    return (np.abs(x - before) < tolerance) & (np.abs(after - x) < tolerance)
-
-
 def _warnings(fit: LineFit, x: np.ndarray, name: str) -> tuple[str, ...]:
     found = []
     for k in range(len(fit.slope)):

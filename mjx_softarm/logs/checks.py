@@ -1,7 +1,7 @@
 """Checks of the rows of a log.
 
 Detectors take arrays and return a mask of the rows at fault; they know nothing of files. The logs of this
-project and the adapters of other people's logs share them.
+project and readers of other formats share them.
 """
 
 from __future__ import annotations
