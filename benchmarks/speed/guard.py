@@ -5,8 +5,8 @@
     python -m benchmarks.speed.guard      the worker: one process of a measurement
 
 A cost is the least time of some work over the least time of matrix products in the same process, because a
-disturbance only adds. A comparison takes the median of three processes. The tolerance is twice the largest
-distance of a median of three of the baseline's five processes from the median of all, and at least a tenth;
+disturbance only adds. A comparison takes the median of three processes. So does the tolerance: it is twice
+the largest distance of a median of three of the baseline's five from the median of all, and at least a tenth;
 a baseline with a tolerance above a quarter is refused. A loss of parallelism is not seen.
 """
 
@@ -25,6 +25,7 @@ import numpy as np
 from benchmarks.harness.common import RESULTS, cpu_kind, show
 from benchmarks.harness.rounds import Facts, Worker, WorkerError, serve, working
 from benchmarks.speed.truth import random_references, settle_function
+from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.provenance import provenance, write_json
 from mjx_softarm.env import EnvConfig, ReachEnv
 from train.agent.hindsight_tqc import HindsightTQC
@@ -34,7 +35,7 @@ from train.presets import PRESETS
 FILE = RESULTS / "guard.json"
 N_PROCESSES, N_STORED, N_ROUNDS = 3, 5, 12  # of a comparison, of a baseline; rounds of each
 MARGIN, LEAST_TOLERANCE, MOST_TOLERANCE = 2.0, 0.1, 0.25
-WORSE, NO_RESULT = 1, 2
+WORSE = 1  # exit status
 SIZES = {"n_arms": 128, "n_settles": 20, "n_env_steps": 16, "n_updates": 16, "batch_size": 256}
 SIZES |= {"n_rows": 1024, "n_products": 8, "n_compiles": 2}
 WORK = ("settle", "epoch", "compile")
@@ -49,29 +50,27 @@ def main(store: bool = False) -> int:
 
     Args:
         store: make this the baseline of this kind of machine.
+
+    Raises:
+        InputError: there is no baseline, a process failed, or the baseline is too uncertain to be stored.
     """
     kind, kinds = cpu_kind(), json.loads(FILE.read_text("utf-8"))["kinds"] if FILE.exists() else {}
-    known = [name for name, stored in kinds.items() if stored["sizes"] == SIZES]
-    if not store and kind not in known:
-        print(f"error: {FILE}: got baselines of this work for {known}, expected one for {kind}; store it on")
-        print("a state that is known to be good: python -m benchmarks guard --store")
-        return NO_RESULT
+    stored = kinds.get(kind, {})
+    if not store and stored.get("sizes") != SIZES:
+        raise InputError(f"{FILE}: got no baseline of this work on {kind}, expected one: guard --store")
     try:
         samples = [process_costs() for _ in range(N_STORED if store else N_PROCESSES)]
     except WorkerError as error:
-        print(f"error: {error}")
-        return NO_RESULT
+        raise InputError(error.reason) from error
     if not store:
-        rows = compare(kinds[kind]["costs"], samples)
-        show({"costs": rows}, f"guard, {kind}, baseline of commit {kinds[kind]['commit']}")
+        rows = compare(stored["costs"], samples)
+        show({"costs": rows}, f"guard, {kind}, baseline of commit {stored['commit']}")
         return WORSE if any(row["verdict"] == "WORSE" for row in rows) else 0
-    show({"costs": (costs := baseline_of(samples))}, f"baseline of {kind}")
-    if loose := [name for name, stored in costs.items() if stored["tolerance"] > MOST_TOLERANCE]:
-        print(
-            f"error: got a tolerance of {', '.join(loose)} above {MOST_TOLERANCE}, expected less; not stored;"
-        )
-        print("try again while nothing else runs on this machine")
-        return NO_RESULT
+    costs = baseline_of(samples)
+    show({"costs": costs}, f"baseline of {kind}")
+    if loose := [name for name, row in costs.items() if row["tolerance"] > MOST_TOLERANCE]:
+        expected = f"at most {MOST_TOLERANCE}; try again while nothing else runs here"
+        raise InputError(f"tolerance of {', '.join(loose)}: got more, expected {expected}")
     write_json(FILE, {"kinds": {**kinds, kind: {"costs": costs, "sizes": SIZES, **provenance("benchmarks")}}})
     print(f"written: {FILE}")
     return 0
@@ -79,8 +78,7 @@ def main(store: bool = False) -> int:
 
 def process_costs() -> dict[str, float]:
     """Return the costs that one process on one core measures, by the name of the work."""
-    worker = Worker("guard", ["benchmarks.speed.guard"], n_cores=1)
-    with working(worker):
+    with working(worker := Worker("guard", ["benchmarks.speed.guard"], n_cores=1)):
         rounds = [worker.facts | worker.round() for _ in range(N_ROUNDS)]
     least = {name: min(seconds[name] for seconds in rounds) for name in rounds[0]}
     return {name: least[name] / least["product"] for name in WORK}
@@ -91,10 +89,12 @@ def baseline_of(samples: Sequence[Costs]) -> dict[str, dict[str, Any]]:
     baseline = {}
     for name in WORK:
         costs = [sample[name] for sample in samples]
-        medians = np.median(list(itertools.combinations(costs, N_PROCESSES)), axis=1)
-        spread = float(np.max(np.abs(medians / np.median(costs) - 1.0)))
-        tolerance = max(LEAST_TOLERANCE, MARGIN * spread)
-        baseline[name] = {"cost": float(np.median(costs)), "tolerance": tolerance, "processes": costs}
+        cost, medians = (
+            float(np.median(costs)),
+            np.median([*itertools.combinations(costs, N_PROCESSES)], axis=1),
+        )
+        tolerance = max(LEAST_TOLERANCE, MARGIN * float(np.max(np.abs(medians / cost - 1.0))))
+        baseline[name] = {"cost": cost, "tolerance": tolerance, "processes": costs}
     return baseline
 
 
@@ -105,8 +105,8 @@ def compare(baseline: Mapping[str, Mapping[str, Any]], samples: Sequence[Costs])
         now, tolerance = float(np.median([sample[name] for sample in samples])), stored["tolerance"]
         change = now / stored["cost"] - 1.0
         verdict = "WORSE" if change > tolerance else "better" if change < -tolerance else "same"
-        row = {"work": name, "baseline": stored["cost"], "now": now, "verdict": verdict}
-        rows.append(row | {"change": f"{change:+.1%}", "tolerance": f"{tolerance:.1%}"})
+        told = {"verdict": verdict, "change": f"{change:+.1%}", "tolerance": f"{tolerance:.1%}"}
+        rows.append({"work": name, "baseline": stored["cost"], "now": now, **told})
     return rows
 
 
@@ -115,12 +115,9 @@ def prepare() -> tuple[Facts, Callable[[], Facts]]:
     jax.config.update("jax_platforms", "cpu")
     jax.config.update("jax_enable_compilation_cache", False)
     env, n_arms, n_steps = ReachEnv(config=EnvConfig(n_poses=1024)), SIZES["n_arms"], SIZES["n_env_steps"]
-    updates = {
-        "batch_size": SIZES["batch_size"],
-        "updates_per_env_step": SIZES["n_updates"] / n_steps / n_arms,
-    }
-    size = {"n_arms": n_arms, "vector_steps_per_epoch": n_steps, "warmup_env_steps": 0, "env": env.config}
-    config = dataclasses.replace(PRESETS["quick"], **updates, **size)
+    settings: Any = {"n_arms": n_arms, "vector_steps_per_epoch": n_steps, "batch_size": SIZES["batch_size"]}
+    settings |= {"updates_per_env_step": SIZES["n_updates"] / n_steps / n_arms, "warmup_env_steps": 0}
+    config = dataclasses.replace(PRESETS["quick"], env=env.config, **settings)
     job, epochs = Job(config, env, HindsightTQC(config, env)), []
     states = [job.init(jax.random.PRNGKey(0))]
 

@@ -5,9 +5,11 @@ from unittest.mock import Mock
 
 import pytest
 
+from benchmarks.__main__ import main
 from benchmarks.harness.rounds import WorkerError
 from benchmarks.speed import guard
 from benchmarks.speed.guard import baseline_of, compare
+from mjx_softarm._support.errors import InputError
 
 KIND = "Abacus, 2 cores"
 
@@ -80,8 +82,8 @@ def machine(tmp_path, monkeypatch):
 
 
 def test_status_tells_stored_same_worse_and_no_baseline(machine, monkeypatch, capsys):
-    assert guard.main() == guard.NO_RESULT  # before anything is measured
-    assert "guard --store" in capsys.readouterr().out
+    assert main(["guard"]) == 2  # before anything is measured
+    assert "guard.json: got no baseline of this work on Abacus, 2 cores, expected" in capsys.readouterr().err
     machine += STORED
     assert guard.main(store=True) == 0
     assert {"commit", "packages", "machine"} <= json.loads(guard.FILE.read_text())["kinds"][KIND].keys()
@@ -90,7 +92,7 @@ def test_status_tells_stored_same_worse_and_no_baseline(machine, monkeypatch, ca
     machine += samples(epoch=(2.0, 2.1, 2.0), compile=(1.0, 1.3, 1.4))
     assert guard.main() == guard.WORSE
     monkeypatch.setattr(guard, "process_costs", Mock(side_effect=WorkerError("guard: no memory")))
-    assert guard.main() == guard.NO_RESULT and "no memory" in capsys.readouterr().out
+    assert main(["guard"]) == 2 and capsys.readouterr().err == "error: guard: no memory\n"
 
 
 def test_baselines_of_other_machines_stay_and_those_of_other_work_are_not_compared(machine, monkeypatch):
@@ -103,4 +105,12 @@ def test_baselines_of_other_machines_stay_and_those_of_other_work_are_not_compar
     assert guard.main() == 0
     assert json.loads(guard.FILE.read_text())["kinds"].keys() == {KIND, "Slide rule, 4 cores"}
     monkeypatch.setattr(guard, "cpu_kind", lambda: KIND)
-    assert guard.main() == guard.NO_RESULT
+    with pytest.raises(InputError, match="got no baseline"):
+        guard.main()
+
+
+def test_an_uncertain_baseline_is_not_stored(machine):
+    machine += samples(epoch=(1.0, 1.0, 1.0, 1.1, 1.1), settle=(1.0, 1.0, 0.7, 1.3, 1.3))
+    with pytest.raises(InputError, match="tolerance of settle: got more, expected at most 0.25"):
+        guard.main(store=True)
+    assert not guard.FILE.exists()
