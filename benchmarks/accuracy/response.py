@@ -54,7 +54,8 @@ def fit_response(time_s: np.ndarray, pressure_kpa: np.ndarray, length_m: np.ndar
     drive = (drive - drive.min()) / span
 
     def predicted(log_p: np.ndarray, kept: np.ndarray) -> np.ndarray:
-        state = _states(*np.exp(log_p), steps_s, drive)
+        fill_s, vent_s, play = np.exp(log_p)
+        state = _states(fill_s, vent_s, play, steps_s, drive)
         return _linear(np.stack([state, state**2], axis=1), length_m, kept)
 
     def fit(kept: np.ndarray) -> np.ndarray:
