@@ -1,4 +1,4 @@
-"""What twins of all kinds share: sessions, noise, and the commands that they refuse."""
+"""Parts that twins of all kinds share: sessions, noise, and the commands that they refuse."""
 
 from __future__ import annotations
 

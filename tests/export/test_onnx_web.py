@@ -32,7 +32,7 @@ const numbers = (list) => new ort.Tensor("float32", list.map((x) => x ?? NaN), [
 
 
 def in_node(script, text=""):
-    """What a script writes, with packages from NODE_PATH or ./node_modules; None if it fails."""
+    """Output of a script, with packages from NODE_PATH or ./node_modules; None if it fails."""
     if not shutil.which("node"):
         return None
     paths = os.pathsep.join(filter(None, [os.environ.get("NODE_PATH"), os.path.abspath("node_modules")]))

@@ -18,7 +18,7 @@ WIDTH, HEIGHT = 1000, 700
 
 
 def pixel(point_m):
-    """Where a point is drawn by the first camera, of 75 degrees from top to bottom."""
+    """Pixel at which the first camera draws a point, with 75 degrees from top to bottom."""
     length_m = 3 * SPEC.geometry.section_length_m + SPEC.mass.gripper_length_m
     eye, at = length_m * np.array([1.35, -0.675, -0.3]), length_m * np.array([0, 0, -0.55])
     ahead = (at - eye) / np.linalg.norm(at - eye)
