@@ -57,10 +57,10 @@ def test_specification_is_written_and_read(tmp_path):
     assert ArmSpec.from_toml(tmp_path / "arm.toml") == spec
 
 
-def test_actions_are_voltages_and_lead_where_they_say():
-    env = ReachEnv(SPEC, EnvConfig(n_poses=16))
+def test_actions_are_voltages_and_lead_where_they_say(quick_compiler):
+    env = ReachEnv(SPEC.replace(structure={"n_sections": 1, "links_per_section": 2}), EnvConfig(n_poses=16))
     shortest_v, middle_v, longest_v = 0.085 / 0.2, 0.18 / 0.2, 0.275 / 0.2  # beta is 1, delta 0
-    expected = np.outer([shortest_v, middle_v, longest_v], np.ones(9))
+    expected = np.outer([shortest_v, middle_v, longest_v], np.ones(3))
     np.testing.assert_allclose(env.action_map.readings(np.linspace(-1, 1, 3)[:, None]), expected, rtol=1e-6)
     state = jax.jit(env.reset)(jax.random.key(0))
     goal_m = env.pool.spring_m[3]

@@ -21,6 +21,7 @@ from benchmarks.race.contestants import (
 )
 from benchmarks.race.race import Limits, RaceError, limits_of, run, train
 from mjx_softarm.env import EnvConfig, ReachEnv
+from tests.train.small import SHORT
 from train.agent.tqc import TQC
 from train.presets import PRESETS
 from train.runs.evaluate import Evaluator
@@ -94,8 +95,8 @@ def test_time_counts_in_training_and_stands_while_the_policy_is_evaluated(monkey
     assert (work()["wall_s"], work()["ended"]) == (13.0, True)
 
 
-def test_held_out_goals_are_evaluated_as_the_trainer_does_it():
-    env = ReachEnv(config=EnvConfig(n_poses=16))
+def test_held_out_goals_are_evaluated_as_the_trainer_does_it(quick_compiler):
+    env = ReachEnv(SHORT, EnvConfig(n_poses=16))
     agent = TQC(env.observation_size, env.action_size)
     params = agent.init(jax.random.PRNGKey(3)).actor_params
     evaluator = Evaluator(env, agent, n_goals=12)
