@@ -42,6 +42,7 @@ def measure(data: Path) -> dict[str, Any]:
         "trunk, 3D RMSE": {
             **{f"_1, seed {seed}": trunk_errors(data, "1", _blocks(seed)) for seed in SEEDS},
             "_11, last fifth": trunk_errors(data, "11", lambda n: np.arange(n) >= 0.8 * n),
+            "_1 asked for _11": trunk_across(data, "1", "11"),
         },
     }
 
@@ -86,10 +87,28 @@ def trunk_errors(
 
     The log is "1" or "11"; with `history`, its angles are extrapolated, see `motor_angles`.
     """
+    x, tip_mm, fresh = _trunk(data, log, history)
+    out = held_out(len(x))
+    return _trunk_errors(x, tip_mm, ~out & fresh, out & fresh)
+
+
+def trunk_across(data: Path, log: str, asked: str) -> dict[str, float]:
+    """Return tip errors on the fresh rows of a log, of fits to another log."""
+    parts = [_trunk(data, name, True) for name in (log, asked)]
+    x, tip_mm, fresh = (np.concatenate(column) for column in zip(*parts, strict=True))
+    train = np.arange(len(x)) < len(parts[0][0])
+    return _trunk_errors(x, tip_mm, train & fresh, ~train & fresh)
+
+
+def _trunk(data: Path, log: str, history: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return motor angles (n, 6) [deg], tips (n, 3) [mm], and whether they are fresh (n,)."""
     trunk = read_trunk(data / TRUNK_LOG.format(log))
     x = motor_angles(trunk.motor_deg) if history else trunk.motor_deg
-    tip_mm, out = 1e3 * trunk.position_m[:, -1], held_out(len(x))
-    train, test = ~out & trunk.fresh, out & trunk.fresh
+    return x, 1e3 * trunk.position_m[:, -1], trunk.fresh
+
+
+def _trunk_errors(x: np.ndarray, tip_mm: np.ndarray, train: np.ndarray, test: np.ndarray) -> dict[str, float]:
+    """Return errors on rows `test` (n,) of polynomials and the network, fitted to rows `train` (n,)."""
     linear, quadratic, cubic = (polynomial(x, tip_mm, train, degree) for degree in (1, 2, 3))
     network = linear + correction(fit_network(x[train], (tip_mm - linear)[train], seed=0).network, x)
     predictions = {"linear": linear, "quadratic": quadratic, "cubic": cubic, "network": network}

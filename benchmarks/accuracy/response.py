@@ -65,7 +65,7 @@ def fit_response(time_s: np.ndarray, pressure_kpa: np.ndarray, length_m: np.ndar
         start = min(np.log(STARTS), key=lambda log_p: np.sum(residual(log_p) ** 2))
         return least_squares(residual, start, bounds=(np.log(LOW), np.log(HIGH)), diff_step=1e-3).x
 
-    known, fold = np.isfinite(length_m), folds(len(time_s))
+    known, fold = np.isfinite(length_m), folds(len(time_s), by=np.mean(pressure_kpa, axis=1))
     held_out, line = np.empty_like(length_m), np.empty_like(length_m)
     for k in range(fold.max() + 1):
         out, kept = fold == k, known & (fold != k)

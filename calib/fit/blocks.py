@@ -32,10 +32,14 @@ def held_out_blocks(n: int, share: float = 0.2, block: int = 100, seed: int = 0)
     return np.isin(np.arange(n) // block, chosen)
 
 
-def folds(n: int, block: int = 100, n_folds: int = 5, seed: int = 0) -> np.ndarray:
+def folds(
+    n: int, block: int = 100, n_folds: int = 5, seed: int = 0, by: np.ndarray | None = None
+) -> np.ndarray:
     """Return the fold (n,) that holds out each row: every row once, in whole blocks, drawn at random.
 
-    Blocks are as in `held_out_blocks`. A log of fewer blocks than folds is cut into one block for each.
+    Blocks are as in `held_out_blocks`. A log of fewer blocks than folds is cut into one block for each. With
+    `by` (n,), each fold gets blocks from the whole range of that quantity: of as many blocks as there are
+    folds, neighbours in its order, each goes to another fold.
 
     Raises:
         ValueError: fewer than two folds, or fewer rows than folds.
@@ -43,5 +47,12 @@ def folds(n: int, block: int = 100, n_folds: int = 5, seed: int = 0) -> np.ndarr
     if not 2 <= n_folds <= n:
         raise ValueError(f"held-out rows: got {n_folds} folds, expected 2 to {n}, the number of rows")
     n_blocks = max(-(-n // block), n_folds)
-    fold_of_block = np.random.default_rng(seed).permutation(n_blocks) % n_folds
-    return fold_of_block[np.arange(n) * n_blocks // n]
+    rng, block_of_row = np.random.default_rng(seed), np.arange(n) * n_blocks // n
+    if by is None:
+        return (rng.permutation(n_blocks) % n_folds)[block_of_row]
+    mean = np.bincount(block_of_row, by) / np.bincount(block_of_row)
+    fold_of_block = np.empty(n_blocks, int)
+    for start in range(0, n_blocks, n_folds):
+        neighbours = np.argsort(mean)[start : start + n_folds]
+        fold_of_block[neighbours] = rng.permutation(n_folds)[: len(neighbours)]
+    return fold_of_block[block_of_row]

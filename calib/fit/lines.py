@@ -7,27 +7,24 @@ rows of a log err alike.
 
 from __future__ import annotations
 
-import functools
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-import optax
-from jax import Array
 
 from calib.errors import FitError
 from calib.fit.blocks import folds
-from calib.fit.leastsquares import SIGMA_PER_MEDIAN, Problem, solution_at
+from calib.fit.huber_line import HUBER, descend, wire_length
+from calib.fit.leastsquares import Problem, solution_at
 
-HUBER = 1.345  # in standard deviations of the noise: 95 % of the efficiency of least squares
 DOWN_WEIGHTED = 2 * HUBER  # beyond it a row counts less than half
 PRIOR = 10.0  # of the parameters of normalised columns: next to nothing
-ROUNDS = 5  # of scale and parameters in turn
-ITERATIONS = 40  # of L-BFGS in each round
 STRETCHES = 50  # of neighbouring rows, for the intervals
 STUDENT = 2.0096  # 97.5 % quantile for STRETCHES - 1 degrees of freedom
 MIN_ROWS = 50
+MIN_BLOCKS = 20  # of which folds are made: shorter blocks rather than fewer
+EDGE = 0.05  # of the range of the other rows, beyond which a held-out row is extrapolated to
+MAX_BEYOND = 0.02  # share of such rows that is worth a warning
 
 
 class LineFit(NamedTuple):
@@ -39,6 +36,7 @@ class LineFit(NamedTuple):
     offset_interval: np.ndarray  # (k, 2)
     rms: np.ndarray  # (k,) over all rows, outliers too
     held_out_rms: np.ndarray  # (k,) over all rows, each predicted by a fit without its block
+    beyond: np.ndarray  # (k,) share of rows that this fit had to extrapolate to
     noise: np.ndarray  # (k,) robust standard deviation of the residuals
     n_rows: np.ndarray  # (k,)
     n_outliers: np.ndarray  # (k,) rows that count less than half
@@ -99,13 +97,17 @@ def fit_curved_line(
     x, y = np.where(known, x, np.nan), np.where(known, y, np.nan)
     lines = _robust_lines(x, y, share, fit_share)
     # Predict each row by a fit that has not seen its block.
-    held_out, fold = np.full_like(y, np.nan), folds(len(x), block, min(5, len(x)), seed)
+    held_out, beyond, fold = np.full_like(y, np.nan), np.zeros(y.shape, bool), _folds(x, block, seed)
     for k in range(fold.max() + 1):
         out = fold == k
         if (known[~out].sum(axis=0) >= 2).all():  # else the warnings say that there are too few rows
             others = _robust_lines(x, np.where(out[:, None], np.nan, y), share, fit_share)
-            held_out[out] = others.slope * _wire(x[out], others.share) + others.offset
-    wire = _wire(x, lines.share)
+            held_out[out] = others.slope * wire_length(x[out], others.share) + others.offset
+            seen = np.where(known[~out], x[~out], np.nan)
+            low, high = np.nanmin(seen, axis=0), np.nanmax(seen, axis=0)
+            margin = EDGE * (high - low)
+            beyond[out] = (x[out] < low - margin) | (x[out] > high + margin)
+    wire = wire_length(x, lines.share)
     residual = y - lines.slope * wire - lines.offset
     fit = LineFit(
         slope=lines.slope,
@@ -114,6 +116,7 @@ def fit_curved_line(
         offset_interval=lines.offset[:, None] + lines.half_width[1][:, None] * [-1, 1],
         rms=np.sqrt(np.nanmean(residual**2, 0)),
         held_out_rms=np.sqrt(np.nanmean((y - held_out) ** 2, 0)),
+        beyond=beyond.sum(0) / known.sum(0),
         noise=lines.noise,
         n_rows=known.sum(0),
         n_outliers=(np.abs(residual) > DOWN_WEIGHTED * lines.noise).sum(0),
@@ -123,6 +126,15 @@ def fit_curved_line(
     if shared:
         fit = LineFit(*(np.repeat(value, n_columns, axis=0) for value in fit[:-1]), warnings=fit.warnings)
     return fit, lines.share, lines.share_half_width
+
+
+def _folds(x: np.ndarray, block: int, seed: int) -> np.ndarray:
+    """Return the fold (n,) of each row; all folds reach over the whole range of the columns (n, k)."""
+    n = len(x)
+    known = np.isfinite(x)
+    centred = np.where(known, x - np.nanmean(x, axis=0), 0.0) / np.maximum(np.nanstd(x, axis=0), 1e-300)
+    block = max(min(block, n // MIN_BLOCKS), 1)
+    return folds(n, block, min(5, n), seed, centred.sum(axis=1) / np.maximum(known.sum(axis=1), 1))
 
 
 class _Lines(NamedTuple):
@@ -145,14 +157,14 @@ def _robust_lines(x: np.ndarray, y: np.ndarray, share: float, fit_share: bool) -
         return _Lines(*joined, np.concatenate(noise), share, 0.0)
     k = x.shape[1]
     # Normalise the columns, and cut them into stretches: (n_stretches, n_rows, k).
-    wire = _wire(x, share)
+    wire = wire_length(x, share)
     centre, y_centre = np.nanmean(wire, axis=0), np.nanmean(y, axis=0)
     spread, y_spread = (np.maximum(np.nanstd(table, axis=0), 1e-300) for table in (wire, y))
     x, y = (_stretches(table) for table in (x, (y - y_centre) / y_spread))
 
     def model(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         slope, offset, now = p[:k], p[k : 2 * k], share + p[2 * k :].sum()
-        wire = _wire(x, now)
+        wire = wire_length(x, now)
         z = (wire - centre) / spread
         jacobian = np.zeros((*x.shape, len(p)))
         for j in range(k):
@@ -171,7 +183,7 @@ def _robust_lines(x: np.ndarray, y: np.ndarray, share: float, fit_share: bool) -
         huber=HUBER,
     )
     with jax.enable_x64(True):
-        start = np.asarray(_descend(x.reshape(-1, k), y.reshape(-1, k), share, fit_share))
+        start = np.asarray(descend(x.reshape(-1, k), y.reshape(-1, k), share, fit_share))
     slope, offset = start[:k], start[k : 2 * k]
     p = np.concatenate([slope * spread, offset + slope * centre, start[2 * k :]])
     found = solution_at(p, *model(p), problem)
@@ -187,63 +199,6 @@ def _robust_lines(x: np.ndarray, y: np.ndarray, share: float, fit_share: bool) -
         share + float(found.x[2 * k :].sum()),
         STUDENT * float(np.sqrt(variance[2 * k :].sum())),
     )
-
-
-@functools.partial(jax.jit, static_argnames="fit_share")
-def _descend(x: Array, y: Array, share: Array, fit_share: bool) -> Array:
-    """Return slopes (k,), offsets (k,) and, if fitted, the change of the share that minimise Huber's loss.
-
-    Args:
-        x, y (n, k): columns, NaN where missing; y has unit spread.
-        share (): start of the share.
-        fit_share: whether to fit the share.
-    """
-    known = jnp.isfinite(x) & jnp.isfinite(y)
-    n, k = known.sum(axis=0), x.shape[1]
-    x, y = jnp.where(known, x, 0.0), jnp.where(known, y, 0.0)
-
-    def features(p: Array) -> tuple[Array, Array, Array]:  # standardised, with mean and spread
-        wire = _wire(x, share + p[2 * k :].sum())
-        mean = jnp.sum(known * wire, axis=0) / n
-        spread = jnp.sqrt(jnp.maximum(jnp.sum(known * (wire - mean) ** 2, axis=0) / n, 1e-300))
-        return (wire - mean) / spread, mean, spread
-
-    def residual(p: Array) -> Array:
-        return jnp.where(known, p[:k] * features(p)[0] + p[k : 2 * k] - y, 0.0)
-
-    def descend(p: Array, scale: Array) -> Array:
-        def loss(p):
-            huber = jnp.where(known, optax.losses.huber_loss(residual(p) / scale, delta=HUBER), 0.0)
-            return jnp.min(scale) ** 2 * jnp.sum(huber) / jnp.sum(n)
-
-        optimiser = optax.lbfgs(linesearch=optax.scale_by_backtracking_linesearch(20, store_grad=True))
-
-        def iterate(carry):
-            p, state, count, _ = carry
-            value, slope = optax.value_and_grad_from_state(loss)(p, state=state)
-            step, state = optimiser.update(slope, state, p, value=value, grad=slope, value_fn=loss)
-            return optax.apply_updates(p, step), state, count + 1, optax.tree.norm(slope)
-
-        start = (p, optimiser.init(p), 0, jnp.inf)
-        goal = 1e-10 * jnp.min(scale)
-        end = jax.lax.while_loop(lambda c: (c[2] < ITERATIONS) & (c[3] > goal), iterate, start)
-        return jnp.asarray(end[0])
-
-    def next_round(count: Array, p: Array) -> Array:
-        size = jnp.nanmedian(jnp.where(known, jnp.abs(residual(p)), jnp.nan), axis=0)
-        return descend(p, jnp.where(count == 0, 1e3, jnp.maximum(SIGMA_PER_MEDIAN * size, 1e-9)))
-
-    start = jnp.concatenate([jnp.ones(k), jnp.zeros(k + fit_share)])
-    p = jax.lax.fori_loop(0, ROUNDS, next_round, start)  # least squares first, then Huber's loss
-    _, mean, spread = features(p)
-    slope = p[:k] / spread
-    return jnp.concatenate([slope, p[k : 2 * k] - slope * mean, p[2 * k :]])
-
-
-def _wire(x: Any, share: Any) -> Any:
-    """Return the wire length, but for a factor, from x = w / w_max and share = I_comp w_max."""
-    rest = 1.0 - share * x
-    return x / (jnp if isinstance(rest, Array) else np).maximum(rest, 1e-3)
 
 
 def _stretches(table: np.ndarray) -> np.ndarray:
@@ -267,6 +222,11 @@ def _warnings(fit: LineFit, x: np.ndarray, name: str) -> tuple[str, ...]:
                 range_y < 5 * fit.noise[k],
                 f"lengths spread by {range_y:.3g} only, noise being {fit.noise[k]:.3g}, so slope and offset "
                 "can hardly be told apart: measure over the whole range",
+            ),
+            (
+                fit.beyond[k] > MAX_BEYOND,
+                f"held-out error {fit.held_out_rms[k]:.3g} extrapolates in {100 * fit.beyond[k]:.0f} % of "
+                "rows: measure the shortest and the longest lengths more than once, at different times",
             ),
             (
                 not fit.held_out_rms[k] < 1.5 * fit.rms[k],

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from calib.fit.blocks import held_out_blocks
+from calib.fit.blocks import folds, held_out_blocks
 
 
 @pytest.mark.parametrize("n", [2, 3, 7, 99, 150, 201, 1_000, 4_338, 15_001])
@@ -23,3 +23,14 @@ def test_blocks_are_whole_as_many_as_asked_for_and_chosen_by_the_seed():
 def test_refuses(arguments):
     with pytest.raises(ValueError, match=r"held-out rows: got .* expected"):
         held_out_blocks(*arguments)
+
+
+def test_folds_reach_over_the_whole_range_of_a_quantity():
+    """A staircase of ten steps: without its order a fold may hold out both ends, or one step alone."""
+    by = np.repeat(np.arange(10.0), 100)
+    for seed in range(5):
+        fold = folds(1000, 50, 5, seed, by)
+        assert np.bincount(fold).tolist() == [200] * 5
+        for k in range(5):
+            assert by[fold != k].min() == 0.0 and by[fold != k].max() == 9.0
+            assert np.ptp(by[fold == k]) >= 5.0

@@ -40,3 +40,15 @@ def test_refuses():
         fit_line(np.zeros((5, 1)), np.zeros((4, 1)))
     with pytest.raises(ValueError, match="wire0: got 9 rows with a reading and a length, expected 3 or more"):
         fit_line(np.ones((9, 1)), np.arange(9.0)[:, None], "wire")
+
+
+def test_plateaus_are_held_out_across_the_range_and_extrapolation_is_said():
+    """Rows at rest at few lengths: a fold that sees one length only would be tens of millimetres off."""
+    rng = np.random.default_rng(0)
+    x = np.repeat([0.10, 0.13, 0.16, 0.19], 40)[:, None]
+    y = 1.1 * x + 0.002 + 2e-4 * rng.standard_normal(x.shape)
+    fit = fit_line(x, y)
+    assert fit.held_out_rms[0] < 1.2 * fit.rms[0] and fit.beyond[0] == 0.0
+    far = np.concatenate([x, np.full((8, 1), 0.5)])
+    said = fit_line(far, 1.1 * far + 2e-4 * rng.standard_normal(far.shape)).warnings
+    assert any("extrapolates in" in warning for warning in said)
