@@ -21,6 +21,7 @@ BENCHMARKS = {
     "learner": "benchmarks.speed.learner:measure",
     "guard": "benchmarks.speed.guard:main",
     "calibration": "benchmarks.accuracy.calibration:measure",
+    "planning": "benchmarks.accuracy.planning:measure",
     "logs": "benchmarks.accuracy.logs:measure",
     "learning": "benchmarks.accuracy.learning:measure",
     "race": "benchmarks.race.race:race",

@@ -1,4 +1,4 @@
-"""Command line: `python -m calib template | check | demo | run`.
+"""Command line: `python -m calib template | check | demo | run | plan`.
 
 Exit status: 0 done, 1 done but not to be trusted, 2 not done, 130 interrupted.
 """
@@ -21,7 +21,7 @@ from mjx_softarm._support import cli
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.logs.checks import Finding
 from mjx_softarm.logs.schema import Log
-from mjx_softarm.spec import ArmSpec
+from mjx_softarm.spec import ARM_FILE, ArmSpec
 
 Logs = Annotated[
     tyro.conf.Positional[tuple[Path, ...]],
@@ -38,7 +38,7 @@ Strict = Annotated[
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit status."""
-    commands = {"template": _template, "check": _check, "demo": _demo, "run": _run}
+    commands = {"template": _template, "check": _check, "demo": _demo, "run": _run, "plan": _plan}
     return cli.main("python -m calib", "Calibrate an arm from its logs.", commands, arguments)
 
 
@@ -113,9 +113,44 @@ def _run(
     for section in calibration.sections:
         for warning in section.warnings:
             print(f"warning: {section.title}: {warning}")
+        for note in section.notes:
+            print(f"note: {section.title}: {note}")
     print(f"report: {out / 'report.html'}")
     print(f"next: python -m train reach --calibration {out}")
     return 1 if any(section.warnings for section in calibration.sections) else 0
+
+
+def _plan(
+    calibration: tyro.conf.Positional[Path], poses: int = 100, out: Path = Path("next.csv"), seed: int = 0
+) -> int:
+    """Choose poses to record next, for `python -m mjx_softarm.deploy record --plan`.
+
+    Args:
+        calibration: folder that `run` wrote
+        poses: number of poses
+        out: table of pressures to write, CSV
+        seed: seed of the candidates
+    """
+    from calib.plan import RECORDED_FILE, load_recorded, plan
+    from mjx_softarm._support import xla
+    from mjx_softarm.logs.pressure_plan import write_plan
+
+    _check_seed(seed)
+    if poses < 1:
+        raise InputError(f"--poses: got {poses}, expected at least 1")
+    if out.exists():
+        raise InputError(f"--out: got {out}, which is there already, expected a new file")
+    arm = ArmSpec.from_toml(calibration / ARM_FILE)
+    recorded = load_recorded(calibration / RECORDED_FILE, arm.n_chambers)
+    xla.enable_compilation_cache()
+    found = plan(arm, recorded, poses, seed)
+    write_plan(out, found.pressure_kpa)
+    now, then = found.n_unknown
+    print(f"{found.n_informative} poses for the fit, {poses - found.n_informative} for the network")
+    print(f"unknown directions, as far as the fitted model tells: {now} now, {then} with these poses")
+    print(f"plan: {out}")
+    print(f"next: python -m mjx_softarm.deploy record --plan {out} --arm ARM --spec SPEC --out LOG")
+    return 0
 
 
 def _check_seed(seed: int) -> None:

@@ -1,10 +1,11 @@
 """Calibration of an arm from its logs: springs, then chambers, then damping, then the sim-to-real network.
 
-Each step uses the results of those before it. A step without data keeps the specification's values, and
-warns. The result is a folder that training takes:
+Each step uses the results of those before it. A step without data, or whose fit is worse on held-out data
+than its start, keeps the specification's values, and warns. The result is a folder that training takes:
 
     arm.toml      the calibrated specification
     s2r.npz       the sim-to-real network, if there were poses to fit it to
+    recorded.npz  the poses, for `python -m calib plan`
     report.html   results with pictures, and whether to trust them
     report.json   the same for programs
 """
@@ -21,11 +22,12 @@ from typing import Any
 import numpy as np
 
 from calib.errors import FitError
-from calib.fit.chambers import MIN_POSES, calibrate_chambers
+from calib.fit.chambers import MIN_POSES, ChamberFit, calibrate_chambers
 from calib.fit.markers import marker_limits
 from calib.fit.s2r import fit_s2r, simulate_poses
 from calib.fit.sensors import fit_springs
 from calib.fit.transients import calibrate_damping, find_stretches
+from calib.plan import RECORDED_FILE, Recorded, save_recorded
 from calib.read.logs import same_arm
 from calib.read.static_poses import find_static_poses
 from calib.report import sections
@@ -34,7 +36,7 @@ from mjx_softarm._support.provenance import write_json
 from mjx_softarm.logs.rest import MIN_HOLD_S
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.sensing.pose import pose_from_frame
-from mjx_softarm.sensing.s2r import S2R, S2R_FILE, save_s2r
+from mjx_softarm.sensing.s2r import S2R, S2R_FILE, correct, save_s2r
 from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.spec import ARM_FILE, ArmSpec
 
@@ -45,10 +47,11 @@ NOT_FITTED = "Not fitted: the specification's values stay."
 
 @dataclasses.dataclass(frozen=True)
 class Calibration:
-    """Calibrated arm, and the sections of its report."""
+    """Calibrated arm, the poses that it was fitted to, and the sections of its report."""
 
     spec: ArmSpec
     s2r: S2R | None
+    recorded: Recorded | None
     sections: tuple[Section, ...]
 
 
@@ -77,12 +80,14 @@ def calibrate(
     spec, springs = _springs(logs, spec, seed, spring_options)
     seen = [log for log in logs if not any(getattr(log, name) is None for name in POSE_COLUMNS)]
     progress("chambers ...")
-    spec, chambers = _chambers(seen, spec, seed)
+    spec, chambers, recorded = _chambers(seen, spec, seed)
     progress("damping ...")
     spec, damping = _damping(seen, spec, seed)
     progress("sim-to-real network ...")
-    s2r, network = _s2r(seen, spec, seed)
-    return Calibration(spec, s2r, (springs, chambers, damping, network))
+    s2r, network, error_mm = _s2r(seen, spec, seed)
+    if recorded is not None and error_mm is not None:
+        recorded = recorded._replace(error_mm=error_mm)
+    return Calibration(spec, s2r, recorded, (springs, chambers, damping, network))
 
 
 def refuse_existing(folder: Path) -> None:
@@ -112,6 +117,8 @@ def write_calibration(
         calibration.spec.to_toml(part / ARM_FILE)
         if calibration.s2r is not None:
             save_s2r(part / S2R_FILE, calibration.s2r)
+        if calibration.recorded is not None:
+            save_recorded(part / RECORDED_FILE, calibration.recorded)
         report = (calibration.sections, findings, provenance)
         write_json(part / "report.json", to_json(*report))
         (part / "report.html").write_text(to_html(calibration.spec.name, *report), "utf-8")
@@ -142,12 +149,12 @@ def _springs(
     return spec, sections.springs(fit, calibrated.length_m, length_m)
 
 
-def _chambers(logs: Sequence[Log], spec: ArmSpec, seed: int) -> tuple[ArmSpec, Section]:
+def _chambers(logs: Sequence[Log], spec: ArmSpec, seed: int) -> tuple[ArmSpec, Section, Recorded | None]:
     poses, rows = find_static_poses(logs, spec)
     if poses.n < MIN_POSES:
         needed = f"{NOT_FITTED} {_few(MIN_POSES, 'pressures and tip poses', poses.n, rows)}"
         remedy = f"stiffness, area and length are not this arm's: log {MIN_POSES} poses at rest or more"
-        return spec, Section("Chambers", needed, warnings=(remedy,))
+        return spec, Section("Chambers", needed, warnings=(remedy,)), None
     fit = calibrate_chambers(logs, spec, seed)
     section = sections.chambers(fit)
     if fit.poses.marker_m.shape[1]:
@@ -155,7 +162,13 @@ def _chambers(logs: Sequence[Log], spec: ArmSpec, seed: int) -> tuple[ArmSpec, S
             section = sections.with_markers(section, marker_limits(fit.poses, fit.chamber_m, fit.spec))
         except FitError as error:  # markers only check, so a calibration does not fail for them
             section = dataclasses.replace(section, warnings=(*section.warnings, str(error)))
-    return fit.spec, section
+    return fit.spec if fit.is_better else spec, section, _recorded(fit)
+
+
+def _recorded(fit: ChamberFit) -> Recorded:
+    known = np.isfinite(fit.tip_error_mm)
+    error_mm = np.where(known, fit.tip_error_mm, np.mean(fit.tip_error_mm[known]))
+    return Recorded(fit.poses.pressure_kpa, fit.poses.payload_kg, error_mm, fit.scale)
 
 
 def _damping(logs: Sequence[Log], spec: ArmSpec, seed: int) -> tuple[ArmSpec, Section]:
@@ -163,14 +176,20 @@ def _damping(logs: Sequence[Log], spec: ArmSpec, seed: int) -> tuple[ArmSpec, Se
         needed = "No log follows the moving arm; it decides how the arm swings, not where it rests."
         return spec, Section("Damping", f"{NOT_FITTED} {needed}")
     fit = calibrate_damping(logs, spec, seed)
-    return fit.spec, sections.damping(fit)
+    return fit.spec if fit.is_better else spec, sections.damping(fit)
 
 
-def _s2r(logs: Sequence[Log], spec: ArmSpec, seed: int) -> tuple[S2R | None, Section]:
-    """Fit the network of the unloaded arm: with a payload, the simulation differs."""
+def _s2r(logs: Sequence[Log], spec: ArmSpec, seed: int) -> tuple[S2R | None, Section, np.ndarray | None]:
+    """Fit the network of the unloaded arm: with a payload, the simulation differs.
+
+    Returns:
+        The network, its section, and its error [mm] at each pose of the logs, of which those that were not
+        held out get the mean.
+    """
     poses, rows = find_static_poses(logs, spec)
     unloaded = np.isclose(poses.payload_kg, spec.mass.payload_kg, rtol=0.0, atol=1e-6)
-    poses = poses.take(np.isfinite(poses.spring_m).all(axis=1) & unloaded)
+    used = np.flatnonzero(np.isfinite(poses.spring_m).all(axis=1) & unloaded)
+    n_poses, poses = poses.n, poses.take(used)
     simulated = simulate_poses(spec, poses.spring_m) if poses.n else None
     n_settled = 0 if simulated is None else int(np.count_nonzero(simulated.valid))
     if simulated is None or n_settled < MIN_S2R_POSES:
@@ -178,11 +197,15 @@ def _s2r(logs: Sequence[Log], spec: ArmSpec, seed: int) -> tuple[S2R | None, Sec
         rows |= {"poses at which the simulated arm finds no rest": poses.n - n_settled}
         needed = f"Not fitted: {_few(MIN_S2R_POSES, what, n_settled, rows)}"
         remedy = f"policies will be trained on simulated poses: log {MIN_S2R_POSES} poses at rest or more"
-        return None, Section("Sim-to-real network", needed, warnings=(remedy,))
+        return None, Section("Sim-to-real network", needed, warnings=(remedy,)), None
     real = pose_from_frame(poses.tip_m, poses.tip_rotation)
     pose, spring_m, real = (x[simulated.valid] for x in (simulated.pose, simulated.spring_m, real))
     fit = fit_s2r(pose, spring_m, real, seed)
-    return fit.s2r, sections.s2r(fit, pose, spring_m, real, poses.n - n_settled)
+    away_mm = np.linalg.norm((correct(fit.s2r, pose, spring_m) - real)[:, :3], axis=1)
+    error_mm = np.full(n_poses, fit.test.translation_mean_mm)
+    error_mm[used[simulated.valid][fit.held_out]] = away_mm[fit.held_out]
+    section = sections.s2r(fit, pose, spring_m, real, poses.n - n_settled)
+    return fit.s2r if fit.is_better else None, section, error_mm
 
 
 def _few(n: int, what: str, n_found: int, rows: Mapping[str, int]) -> str:

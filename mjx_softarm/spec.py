@@ -24,8 +24,10 @@ from mjx_softarm._support.fields import (
     anything,
     count,
     not_negative,
+    per_section,
     positive,
     read_fields,
+    vector,
 )
 from mjx_softarm.sensing.sensors import SENSORS, Sensor
 
@@ -105,6 +107,21 @@ class Control:
 
 
 @dataclass(frozen=True)
+class Mounting:
+    """How the arm hangs in the frame of motion capture, and how that frame's tip sits on the arm.
+
+    Turns are rotation vectors. All are zero in an arm that is built and measured perfectly, and where a file
+    has no such table.
+    """
+
+    base_turn_deg: tuple[float, ...] = vector()  # of the base, in the base frame
+    base_offset_m: tuple[float, ...] = vector()  # of the base, in the base frame
+    section_roll_deg: tuple[float, ...] = per_section()  # of a section's holes about its axis
+    tip_turn_deg: tuple[float, ...] = vector()  # of the measured tip's axes, in those of the last plate
+    tip_offset_m: tuple[float, ...] = vector()  # of the measured tip, in the axes of the last plate
+
+
+@dataclass(frozen=True)
 class ArmSpec:
     """A pneumatic soft arm: sections in series, three chambers and three springs in each.
 
@@ -121,6 +138,7 @@ class ArmSpec:
     springs: Springs
     sensor: Sensor = field(metadata={"kinds": SENSORS})  # without `kind` in a file: the first
     control: Control
+    mounting: Mounting = Mounting()
 
     @property
     def n_chambers(self) -> int:
@@ -137,6 +155,11 @@ class ArmSpec:
     def per_chamber(self, value: PerChamber) -> tuple[float, ...]:
         """Return one number per chamber, however the field was written."""
         return tuple(value) if isinstance(value, tuple) else (float(value),) * self.n_chambers
+
+    @property
+    def section_roll_deg(self) -> tuple[float, ...]:
+        """One number per section."""
+        return self.mounting.section_roll_deg or (0.0,) * self.structure.n_sections
 
     @classmethod
     def default(cls) -> ArmSpec:
@@ -203,8 +226,14 @@ class ArmSpec:
 
     def _check_together(self, source: str) -> None:
         """Refuse fields that contradict each other."""
+        roll = self.mounting.section_roll_deg
+        if roll and len(roll) != self.structure.n_sections:
+            raise SpecError(
+                f"{source}: mounting.section_roll_deg: got {len(roll)} numbers, "
+                f"expected {self.structure.n_sections}, one for each section"
+            )
         for group, values in self.to_dict().items():
-            for name, value in values.items() if isinstance(values, dict) else ():
+            for name, value in values.items() if isinstance(values, dict) and group != "mounting" else ():
                 if isinstance(value, tuple) and len(value) != self.n_chambers:
                     raise SpecError(
                         f"{source}: {group}.{name}: got {len(value)} numbers, "

@@ -1,4 +1,4 @@
-"""Stiffness, effective area and length of each chamber, fitted to poses of the arm at rest.
+"""Stiffness, area and length of each chamber, and the arm's mounting, fitted to poses of the arm at rest.
 
 The simulated arm settles at the logged pressures; its chambers are changed until tip poses agree, and spring
 lengths where they were measured. Robust least squares (`calib.fit.leastsquares`) take the Jacobian from the
@@ -22,6 +22,7 @@ from calib.errors import FitError
 from calib.fit.blocks import held_out_blocks
 from calib.fit.equilibrium import simulate
 from calib.fit.leastsquares import NOT_CONVERGED, Problem, Solution, fit, principal
+from calib.fit.parameters import half_widths, names, priors, spec_at, tolerances
 from calib.read.static_poses import StaticPoses, find_static_poses
 from mjx_softarm.logs.rest import HOLD_KPA
 from mjx_softarm.logs.schema import Log
@@ -33,14 +34,8 @@ HELD_OUT_SHARE = 0.2
 HELD_OUT_BLOCK = 5  # poses
 SCALE = (1e-3, 0.01, 1e-3)  # of tip [m], rotation [rad] and springs [m]
 MIN_SCALE = (1e-4, 1e-3, 1e-4)
-# The four parameters of a chamber, see `calib.fit.equilibrium.with_numbers`.
-FIELDS = ("stiffness_n_per_m", "area_m2", "area_slope_m", "length_offset_m")
-SHORT = dict(zip(FIELDS, ("stiffness", "area", "slope", "offset"), strict=True))
-PRIOR = (1.0, 1.0, 1.0, 0.25)  # a factor of e; an area per section length; a quarter of a section
-TOLERANCE = (0.05, 0.05, 0.05, 0.005)  # known to 5 %; 5 % of an area a section; 1 mm of 200 mm
-BENDING = "bending_stiffness_nm_per_rad"  # of the backbone, the last of the parameters
-BENDING_PRIOR, BENDING_TOLERANCE = 1.0, 0.05  # a factor of e; 5 %
 MAX_RATIO = 2.0  # calibrated to specified value, and held-out to other errors
+TOLD_TURN_DEG = 1.0
 MAX_PRESSURE_GAP = 0.1  # share of the range that may be missing at either end
 
 
@@ -61,15 +56,16 @@ class ChamberFit:
     """Calibrated chambers and whether to trust them.
 
     Attributes:
-        spec: calibrated arm: chambers, bending stiffness of the backbone, and the range of spring lengths
-            that may be commanded, which is the range measured at rest.
-        half_width_95: half-width of the 95 % interval of each fitted field of `spec.chambers` (n_chambers,)
-            and of `spec.backbone` ().
+        spec: calibrated arm: chambers, bending stiffness of the backbone, mounting, and the range of spring
+            lengths that may be commanded, which is the range measured at rest.
+        half_width_95: half-width of the 95 % interval of each fitted field of `spec.chambers` (n_chambers,),
+            of `spec.backbone` () and of `spec.mounting`.
         direction_widths: half-widths of the 95 % intervals along the principal directions of the fit, in
-            units of TOLERANCE, largest first (4 * n_chambers + 1,).
+            units of the tolerances of `calib.fit.parameters`, largest first (p,).
         weak: unknown directions, whose width is above 1, in words.
         in_sample, held_out: errors of the calibrated arm; held-out poses took no part in the fit.
         in_sample_before, held_out_before: errors of the specification that the fit started from.
+        scale: robust errors (3,) of tip [m], rotation [rad] and springs [m].
         rows: number of rows of the logs, by use.
         n_single: number of poses of one row, which cannot show whether the tip moved.
         poses: static poses of the logs, in their order.
@@ -87,6 +83,7 @@ class ChamberFit:
     held_out: Errors
     in_sample_before: Errors
     held_out_before: Errors
+    scale: np.ndarray
     rows: Mapping[str, int]
     n_single: int
     poses: StaticPoses
@@ -94,6 +91,22 @@ class ChamberFit:
     tip_error_mm: np.ndarray
     chamber_m: np.ndarray
     warnings: tuple[str, ...]
+
+    @property
+    def is_better(self) -> bool:
+        """Whether the fit is closer to held-out poses than the specification that it started from."""
+        return self.held_out.translation_mean_mm < self.held_out_before.translation_mean_mm
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Say whether motion capture's axes of the tip are off those of the last plate."""
+        turn_deg = np.linalg.norm(self.spec.mounting.tip_turn_deg)
+        if turn_deg < TOLD_TURN_DEG:
+            return ()
+        return (
+            f"the tip's measured quaternion is {turn_deg:.1f} deg off with the arm hanging straight. The "
+            "calibration accounts for it. Zero it there, and calibrate anew, if angles are to be the plate's",
+        )
 
 
 def calibrate_chambers(logs: Log | Sequence[Log], spec: ArmSpec, seed: int = 0) -> ChamberFit:
@@ -120,25 +133,25 @@ def calibrate_chambers(logs: Log | Sequence[Log], spec: ArmSpec, seed: int = 0) 
     poses = poses._replace(pressure_kpa=np.where(held, poses.pressure_kpa.mean(axis=0), poses.pressure_kpa))
     held_out = held_out_blocks(poses.n, HELD_OUT_SHARE, HELD_OUT_BLOCK, seed)
     fitted = poses.take(~held_out)
-    prior = np.append(np.repeat(PRIOR, spec.n_chambers), BENDING_PRIOR)
     group = np.repeat([0, 1, 2], [3, 3, spec.n_chambers])
-    problem = Problem(prior, group, np.array(SCALE), np.array(MIN_SCALE))
+    problem = Problem(priors(spec), group, np.array(SCALE), np.array(MIN_SCALE))
     solution = fit(lambda x: simulate(spec, fitted, x)[:2], problem)
     before, _, _ = simulate(spec, poses, np.zeros_like(solution.x))
     after, _, chamber_m = simulate(spec, poses, solution.x)
     calibrated = _calibrated(spec, solution.x, poses)
-    tolerance = np.append(np.repeat(TOLERANCE, spec.n_chambers), BENDING_TOLERANCE)
-    widths, directions = principal(solution, tolerance)
-    weak = tuple(_describe(w, vector) for w, vector in zip(widths, directions.T, strict=True) if w > 1.0)
+    widths, directions = principal(solution, tolerances(spec))
+    each = zip(widths, directions.T, strict=True)
+    weak = tuple(_describe(width, vector, names(spec)) for width, vector in each if width > 1.0)
     found = ChamberFit(
         spec=calibrated,
-        half_width_95=_half_widths(spec, solution),
+        half_width_95=half_widths(calibrated, solution.half_width),
         direction_widths=widths,
         weak=weak,
         in_sample=_errors(after[~held_out]),
         held_out=_errors(after[held_out]),
         in_sample_before=_errors(before[~held_out]),
         held_out_before=_errors(before[held_out]),
+        scale=solution.scale,
         rows=rows,
         n_single=int(np.count_nonzero(poses.single)),
         poses=poses,
@@ -152,47 +165,15 @@ def calibrate_chambers(logs: Log | Sequence[Log], spec: ArmSpec, seed: int = 0) 
 
 def _calibrated(spec: ArmSpec, x: np.ndarray, poses: StaticPoses) -> ArmSpec:
     """Return the specification with fitted chambers and the range of the measured spring lengths."""
-    values = _of_x(spec, x)
     springs = {}
     if np.isfinite(poses.spring_m).any():
         low, high = float(np.nanmin(poses.spring_m)), float(np.nanmax(poses.spring_m))
         springs = {"length_min_m": low, "length_max_m": high}
-    chambers = {name: tuple(map(float, values[name])) for name in FIELDS}
-    return spec.replace(chambers=chambers, backbone={BENDING: float(values[BENDING])}, springs=springs)
+    return spec_at(spec, x).replace(springs=springs)
 
 
-def _of_x(spec: ArmSpec, x: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the fields of the specification at x (4 * n_chambers + 1,), see `with_numbers`."""
-    stiffness, area, slope, offset = x[:-1].reshape(len(FIELDS), -1)
-    old = {name: np.array(spec.per_chamber(getattr(spec.chambers, name))) for name in FIELDS}
-    length_m = spec.geometry.section_length_m
-    return {
-        "stiffness_n_per_m": old["stiffness_n_per_m"] * np.exp(stiffness),
-        "area_m2": old["area_m2"] * np.exp(area),
-        "area_slope_m": old["area_slope_m"] + slope * old["area_m2"] / length_m,
-        "length_offset_m": old["length_offset_m"] + offset * length_m,
-        BENDING: spec.backbone.bending_stiffness_nm_per_rad * np.exp(x[-1]),
-    }
-
-
-def _half_widths(spec: ArmSpec, solution: Solution) -> dict[str, np.ndarray]:
-    *chambers, bending = solution.half_width
-    stiffness, area, slope, offset = np.reshape(chambers, (len(FIELDS), -1))
-    found = _of_x(spec, solution.x)
-    length_m = spec.geometry.section_length_m
-    return {
-        "stiffness_n_per_m": found["stiffness_n_per_m"] * stiffness,
-        "area_m2": found["area_m2"] * area,
-        "area_slope_m": np.array(spec.per_chamber(spec.chambers.area_m2)) / length_m * slope,
-        "length_offset_m": length_m * offset,
-        BENDING: found[BENDING] * bending,
-    }
-
-
-def _describe(width: float, vector: np.ndarray) -> str:
-    """Describe a principal direction by its largest components, in units of TOLERANCE."""
-    n_chambers = len(vector) // len(FIELDS)
-    names = [f"{SHORT[name]}{k}" for name in FIELDS for k in range(n_chambers)] + [BENDING]
+def _describe(width: float, vector: np.ndarray, names: Sequence[str]) -> str:
+    """Describe a principal direction by its largest components, in units of their tolerances."""
     largest = np.argsort(-np.abs(vector))[:4]
     sign = np.sign(vector[largest[0]])
     components = (f"{sign * vector[k]:+.2f} {names[k]}" for k in largest)
@@ -227,9 +208,9 @@ def _warnings(found: ChamberFit, spec: ArmSpec, solution: Solution) -> tuple[str
             f"held-out tip error {found.held_out.translation_mean_mm:.2f} mm is more than {MAX_RATIO:g} "
             f"times that of the other poses, {found.in_sample.translation_mean_mm:.2f} mm: log more poses"
         )
-    if not found.held_out.translation_mean_mm < found.held_out_before.translation_mean_mm:
-        said.append("the specification itself is better on held-out poses: keep it, or log more poses")
-    stiffness, area = (np.exp(np.abs(solution.x[:-1].reshape(len(FIELDS), -1)[k])) for k in (0, 1))
+    if not found.is_better:
+        said.append("the specification itself is better on held-out poses, so it stays: log more poses")
+    stiffness, area = np.exp(np.abs(solution.x[: 2 * spec.n_chambers])).reshape(2, -1)
     for name, ratio in (("stiffness", stiffness), ("area", area)):
         if (far := np.flatnonzero(ratio > MAX_RATIO)).size:
             said.append(
@@ -239,7 +220,8 @@ def _warnings(found: ChamberFit, spec: ArmSpec, solution: Solution) -> tuple[str
     if found.weak:
         n_weak = len(found.weak)
         springs = ", with spring lengths" if np.isnan(found.poses.spring_m).any() else ""
-        said.append(f"{n_weak} unknown directions, the first {found.weak[0]}: log more poses{springs}")
+        remedy = f"record those of `python -m calib plan`{springs}"
+        said.append(f"{n_weak} unknown directions, the first {found.weak[0]}: {remedy}")
     low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
     gap = MAX_PRESSURE_GAP * (high - low)
     lowest, highest = found.poses.pressure_kpa.min(0), found.poses.pressure_kpa.max(0)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from calib.fit.parameters import with_numbers
 from calib.read.static_poses import StaticPoses
 from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.settle import RESIDUAL_TOLERANCE, settle_pressures
@@ -29,32 +30,11 @@ class Measured(NamedTuple):
     spring_m: Array | np.ndarray  # (n_chambers,)
 
 
-def with_numbers(x: Array, params: ArmParams) -> ArmParams:
-    """Return an arm whose chambers and backbone differ from those of `params`.
-
-    Args:
-        x (4 * n_chambers + 1,): for each chamber the logarithm of the ratio of stiffness; that of area; the
-            change of the area's slope, in areas per section length; the change of the rest length, in section
-            lengths. Last, the logarithm of the ratio of the backbone's bending stiffness.
-        params: arm at x = 0.
-    """
-    stiffness, area, slope, offset = x[:-1].reshape(4, -1)
-    bend = jnp.exp(x[-1])
-    joints = params.joint_stiffness.reshape(-1, 3) * jnp.stack([jnp.ones_like(bend), bend, bend])
-    return params._replace(
-        joint_stiffness=joints.reshape(-1),
-        chamber_stiffness=params.chamber_stiffness * jnp.exp(stiffness),
-        area=params.area * jnp.exp(area),
-        area_slope=params.area_slope + slope * params.area / params.section_length_m,
-        chamber_rest_m=params.chamber_rest_m + offset * params.section_length_m,
-    )
-
-
 def residuals(x: Array, params: ArmParams, measured: Measured) -> tuple[Array, Array, Array]:
     """Return simulated minus measured pose of one arm at rest.
 
     Args:
-        x (4 * n_chambers + 1,): parameters, see `with_numbers`.
+        x (p,): see `calib.fit.parameters`.
         params: arm at x = 0, but for the payload.
         measured: measurements of one pose.
 
@@ -83,11 +63,11 @@ def simulate(spec: ArmSpec, poses: StaticPoses, x: np.ndarray) -> tuple[np.ndarr
     Args:
         spec: arm at x = 0.
         poses: n measured poses.
-        x (4 * n_chambers + 1,): parameters, see `with_numbers`.
+        x (p,): see `calib.fit.parameters`.
 
     Returns:
         Errors (n, 6 + n_chambers) of `residuals`, inf where the arm does not settle; their Jacobian
-        (n, 6 + n_chambers, 4 * n_chambers + 1); chamber lengths (n, n_chambers) [m].
+        (n, 6 + n_chambers, p); chamber lengths (n, n_chambers) [m].
     """
     params = ArmParams.from_spec(spec)
     fields = (poses.pressure_kpa, poses.payload_kg, poses.tip_m, poses.tip_rotation, poses.spring_m)

@@ -67,6 +67,11 @@ class S2RFit:
     flagged_share: float  # share of the held-out rows with extrapolation above 1
     warnings: tuple[str, ...]  # reasons not to trust it, each with its remedy
 
+    @property
+    def is_better(self) -> bool:
+        """Whether held-out tips are closer with the network than without."""
+        return self.test.translation_mean_mm < self.test_uncorrected.translation_mean_mm
+
 
 def simulate_poses(spec: ArmSpec, reference_m: np.ndarray) -> SimulatedPoses:
     """Settle the simulated arm at spring lengths under the sensor-space law, without pressure limits.
@@ -177,9 +182,10 @@ def _warnings(n: int, turn_deg: np.ndarray, errors: dict[str, PoseErrors]) -> li
         what = name.split("_")[0]
         got, without, seen = (getattr(errors[e], name) for e in ("test", "test_uncorrected", "in_sample"))
         if got >= without:
+            left_out = ", so it is left out" if name.startswith("translation") else ""
             found.append(
-                f"{what}: {got:.3g} {unit} on held-out rows, no better than {without:.3g} without: "
-                "log more poses, or train without the network"
+                f"{what}: {got:.3g} {unit} on held-out rows, no better than {without:.3g} without the network"
+                f"{left_out}: log more poses"
             )
         if got > MAX_HELD_OUT_RATIO * seen:
             far = f"far more than {seen:.3g} in training"

@@ -76,6 +76,11 @@ class DampingFit:
     time_s: float
     warnings: tuple[str, ...]
 
+    @property
+    def is_better(self) -> bool:
+        """Whether the fit is no worse on held-out seconds than the specification that it started from."""
+        return self.held_out_rms_mm <= MARGIN * self.held_out_before_rms_mm
+
 
 def calibrate_damping(logs: Log | Sequence[Log], spec: ArmSpec, seed: int = 0) -> DampingFit:
     """Fit the damping of chambers and backbone to the logs of a moving arm.
@@ -225,6 +230,6 @@ def _warnings(done: DampingFit, widths: np.ndarray, converged: bool) -> tuple[st
             f"held-out error {done.held_out_rms_mm:.1f} mm is more than {MAX_RATIO:g} times the error of the "
             f"other seconds, {done.in_sample_rms_mm:.1f} mm: log a longer motion"
         )
-    if done.held_out_rms_mm > MARGIN * done.held_out_before_rms_mm:
-        said.append("the specified damping is better on held-out seconds: keep it, or log a longer motion")
+    if not done.is_better:
+        said.append("the specified damping is better on held-out seconds, so it stays: log a longer motion")
     return tuple(said)

@@ -31,6 +31,7 @@ class Section:
         text: data and method of the fit, in a sentence or two.
         tables: numbers.
         warnings: reasons not to trust the step, each with its remedy; none is good.
+        notes: facts that are worth a look but no reason not to trust the step.
         data: the same numbers for JSON.
         figures: captions and drawings.
     """
@@ -41,6 +42,7 @@ class Section:
     warnings: tuple[str, ...] = ()
     data: Any = None
     figures: tuple[tuple[str, Figure], ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 def to_json(
@@ -50,7 +52,11 @@ def to_json(
     return {
         "trustworthy": not any(section.warnings for section in sections),
         "parts": {
-            section.title: {"figures": section.data, "warnings": list(section.warnings)}
+            section.title: {
+                "figures": section.data,
+                "warnings": list(section.warnings),
+                "notes": list(section.notes),
+            }
             for section in sections
         },
         "findings": list(findings),

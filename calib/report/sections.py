@@ -10,8 +10,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from calib.fit.chambers import BENDING, ChamberFit, Errors
+from calib.fit.chambers import ChamberFit, Errors
 from calib.fit.markers import MarkerLimits
+from calib.fit.parameters import BENDING
 from calib.fit.s2r import PoseErrors, S2RFit
 from calib.fit.sensors import SpringFit
 from calib.fit.transients import DampingFit
@@ -67,6 +68,7 @@ def chambers(fit: ChamberFit) -> Section:
     head = ("", *(text for _, title, _ in units for text in (title, "+-")))
     bending = spec.backbone.bending_stiffness_nm_per_rad
     backbone = Table(("", "value", "+-"), ((BENDING, bending, float(fit.half_width_95[BENDING])),))
+    mounting = _mounting(fit)
     errors = _errors(
         ("held-out poses, before", fit.held_out_before.n, fit.held_out_before),
         ("held-out poses, calibrated", fit.held_out.n, fit.held_out),
@@ -83,12 +85,27 @@ def chambers(fit: ChamberFit) -> Section:
         f"{fit.poses.n} poses at rest: simulated at the measured pressures against the measured tip and "
         "springs. Rest lengths are relative to the section's. Intervals are 95 %. "
         f"Rows of the logs: {row_uses}.",
-        (Table(head, tuple(rows)), backbone, errors),
+        (Table(head, tuple(rows)), backbone, mounting, errors),
         fit.warnings,
         _plain(fit, "spec", "poses", "is_held_out", "tip_error_mm", "chamber_m")
-        | {"values": values | {BENDING: bending}},
+        | {"values": values | {BENDING: bending} | dataclasses.asdict(spec.mounting)},
         (("simulated to measured tip", figure),),
+        fit.notes,
     )
+
+
+def _mounting(fit: ChamberFit) -> Table:
+    """Return the table of the arm's mounting, with intervals."""
+    rows = []
+    for name, values in dataclasses.asdict(fit.spec.mounting).items():
+        unit, factor = ("deg", 1.0) if name.endswith("_deg") else ("mm", 1e3)
+        what = name.removesuffix("_deg").removesuffix("_m").replace("_", " ")
+        labels = range(len(values)) if "section" in name else "xyz"
+        rows += [
+            (f"{what} {label} [{unit}]", factor * value, float(factor * width))
+            for label, value, width in zip(labels, values, fit.half_width_95[name], strict=True)
+        ]
+    return Table(("", "value", "+-"), tuple(rows))
 
 
 def with_markers(section: Section, limits: MarkerLimits) -> Section:

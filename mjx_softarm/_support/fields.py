@@ -29,6 +29,7 @@ class Rule:
     high: float = math.inf
     low_open: bool = False
     per_chamber: bool = False
+    length: int | None = None  # of a list; 0 for one number per section, or none
 
     @property
     def text(self) -> str:
@@ -36,6 +37,8 @@ class Rule:
         noun = {int: "a whole number", float: "a number", str: "a text"}[self.kind]
         low = "" if self.low == -math.inf else f" {'>' if self.low_open else '>='} {self.low:g}"
         high = "" if self.high == math.inf else f" and <= {self.high:g}" if low else f" <= {self.high:g}"
+        if self.length is not None:
+            return f"a list of {self.length} numbers" if self.length else "a list with one number per section"
         return noun + low + high + (", or a list with one per chamber" if self.per_chamber else "")
 
     def accepts(self, value: Any) -> bool:
@@ -67,6 +70,16 @@ def anything(per_chamber: bool = False, low: float = -math.inf, high: float = ma
     return field(metadata={"rule": Rule(low=low, high=high, per_chamber=per_chamber)})
 
 
+def vector() -> Any:
+    """Declare three numbers, by default zeros."""
+    return field(default=(0.0, 0.0, 0.0), metadata={"rule": Rule(length=3)})
+
+
+def per_section() -> Any:
+    """Declare a list with one number per section, by default empty, which stands for zeros."""
+    return field(default=(), metadata={"rule": Rule(length=0)})
+
+
 def count() -> Any:
     """Declare a count from 1."""
     return field(metadata={"rule": Rule(kind=int, low=1, high=MAX_COUNT)})
@@ -89,6 +102,8 @@ def read_fields(cls: type, data: Any, source: str, prefix: str) -> dict[str, Any
     for item in fields(cls):
         path = prefix + item.name
         group: Any = hints[item.name] if dataclasses.is_dataclass(hints[item.name]) else None
+        if item.name not in data and has_default(item):
+            continue
         if item.name not in data:
             expected = "a table" if group else rule_of(item).text
             raise SpecError(f"{source}: {path}: got nothing, expected {expected}")
@@ -111,9 +126,16 @@ def rule_of(item: dataclasses.Field) -> Rule:
     return item.metadata.get("rule", Rule(kind=str))
 
 
+def has_default(item: dataclasses.Field) -> bool:
+    """Return whether a field may be missing."""
+    return any(x is not dataclasses.MISSING for x in (item.default, item.default_factory))
+
+
 def _read_value(rule: Rule, value: Any, source: str, path: str) -> Any:
-    many = rule.per_chamber and isinstance(value, (list, tuple))
+    many = isinstance(value, (list, tuple)) and (rule.per_chamber or rule.length is not None)
     items: Any = value if many else [value]
+    if rule.length is not None and not (many and len(value) == (rule.length or len(value))):
+        raise SpecError(f"{source}: {path}: got {value!r}, expected {rule.text}")
     if not all(map(rule.accepts, items)):
         raise SpecError(f"{source}: {path}: got {value!r}, expected {rule.text}")
     if rule.kind is float and not all(x == 0.0 or FLOAT32_MIN <= abs(x) <= FLOAT32_MAX for x in items):

@@ -23,6 +23,7 @@ from mjx_softarm.deploy.measure import figures, measure, read_goals, require_mot
 from mjx_softarm.deploy.record import record
 from mjx_softarm.deploy.session import Run, follow
 from mjx_softarm.logs import mcap_file
+from mjx_softarm.logs.pressure_plan import read_plan
 from mjx_softarm.mechanics.excitation import growing, random_pressures
 from mjx_softarm.policy.file import load_policy
 from mjx_softarm.spec import ArmSpec
@@ -145,13 +146,20 @@ def _measure(
 
 
 def _record(
-    arm: Arm, out: Path, spec: cli.SpecFile = None, poses: int = 500, seed: int = 0, transients: bool = False
+    arm: Arm,
+    out: Path,
+    spec: cli.SpecFile = None,
+    poses: int = 500,
+    plan: cli.MaybePath = None,
+    seed: int = 0,
+    transients: bool = False,
 ) -> int:
     """Log static poses at random pressures, for calibration; the first ten grow from a tenth of the range.
 
     Args:
         out: log to write, CSV or npz
-        poses: number of poses
+        poses: number of random poses
+        plan: pressures in place of random ones, from `python -m calib plan`
         seed: seed of the poses
         transients: log every tick, not the static poses alone
     """
@@ -161,7 +169,7 @@ def _record(
     check_file("--out", out)
     if out.exists():
         raise InputError(f"--out: got {out}, which is there already, expected a new file")
-    targets_kpa = growing(random_pressures(arm_spec, poses, seed))
+    targets_kpa = read_plan(plan, arm_spec) if plan else growing(random_pressures(arm_spec, poses, seed))
     result = record(open_arm(arm), arm_spec, targets_kpa, transients, _tell, partial(save_log, out))
     if not len(result.log):
         print(f"no pose was logged: {result.ending.cause or 'none came to rest'}", file=sys.stderr)

@@ -21,7 +21,7 @@ from mjx_softarm.mdp import observation as obs
 from mjx_softarm.mdp import rewards
 from mjx_softarm.mdp.actions import ActionMap
 from mjx_softarm.mechanics.dynamics import Motion, MotionResult, Moved, advance, with_params
-from mjx_softarm.mechanics.kinematics import chain_frames, chain_kinematics, mjx_kinematics
+from mjx_softarm.mechanics.kinematics import chain_kinematics, mjx_kinematics
 from mjx_softarm.mechanics.mjcf import build_model
 from mjx_softarm.mechanics.pipe import CrossPipe, body_clearance
 from mjx_softarm.mechanics.settle import Settled, SettleResult, settle
@@ -261,7 +261,7 @@ class ReachEnv(Env):
         """Return the distance () of the body, whose tip has this pose, to the pipe's wall."""
         if self.pipe is None:
             return jnp.asarray(jnp.inf, q.dtype)
-        frames = chain_frames(q, self.params.link_length_m)
+        frames = chain_kinematics(self.params)(q)
         plates = frames.plate_position, frames.plate_rotation
         if self.s2r is not None:
             plates = carry_body(*plates, pose)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mjx_softarm.sensing.estimator import Frame, backbone
-from mjx_softarm.sensing.pose import pose_from_frame, quaternion_from_pose
+from mjx_softarm.sensing.pose import quaternion_from_rotation
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
 
 FOLDS, COILS = 12, 20  # of a bellows, and of a spring
@@ -25,7 +25,8 @@ def ring_radius_m(spec: ArmSpec) -> float:
 
 def hole_directions(spec: ArmSpec) -> np.ndarray:
     """Return the direction (n, 2) of each chamber, and of its spring, from its section's axis: x and y."""
-    first = np.radians(spec.geometry.first_chamber_deg)
+    roll_deg = np.repeat(spec.section_roll_deg, N_CHAMBERS_PER_SECTION)
+    first = np.radians(spec.geometry.first_chamber_deg + roll_deg)
     angle = first + 2 * np.pi * np.arange(spec.n_chambers) / N_CHAMBERS_PER_SECTION
     return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
@@ -85,7 +86,7 @@ def shape(spec: ArmSpec, spring_m: np.ndarray, tip: np.ndarray) -> Shape:
     )
     centres = rings.position_m.reshape(-1, 3)
     return Shape(
-        Copies(centres, _quaternions(rings.rotation.reshape(-1, 3, 3)), np.ones(len(centres))),
+        Copies(centres, quaternion_from_rotation(rings.rotation.reshape(-1, 3, 3)), np.ones(len(centres))),
         _beside(folds, geometry.chamber_radius_m * directions),
         _beside(coils, geometry.spring_radius_m * directions),
     )
@@ -98,9 +99,5 @@ def _beside(line: Frame, hole_m: np.ndarray) -> Copies:
     position_m = line.position_m[:, None] + aside  # (n_sections, 3, k, 3)
     pitch_m = np.linalg.norm(np.diff(position_m, axis=2), axis=-1).mean(axis=-1)
     n_copies = position_m.shape[2]
-    quaternion = np.repeat(_quaternions(line.rotation)[:, None], N_CHAMBERS_PER_SECTION, axis=1)
+    quaternion = np.repeat(quaternion_from_rotation(line.rotation)[:, None], N_CHAMBERS_PER_SECTION, axis=1)
     return Copies(position_m.reshape(-1, 3), quaternion.reshape(-1, 4), np.repeat(pitch_m.ravel(), n_copies))
-
-
-def _quaternions(rotation: np.ndarray) -> np.ndarray:
-    return quaternion_from_pose(pose_from_frame(np.zeros(rotation.shape[:-1]), rotation))

@@ -131,8 +131,7 @@ def _explicit_tangents(primals: tuple, tangents: tuple, q: Array, pressure_kpa: 
         kinematics, params = jax.tree.unflatten(structure, merged)
         frames = kinematics(q)
         here = statics(frames, q, pressure_kpa, params)
-        tip = frames.plate_position[-1], frames.plate_rotation[-1]
-        return _Explicit(here.gradient, here.springs.length, *tip)
+        return _Explicit(here.gradient, here.springs.length, frames.tip_position, frames.tip_rotation)
 
     return jax.jvp(observables, [numbers[k] for k in changing], [directions[k] for k in changing])[1]
 
@@ -159,7 +158,7 @@ def _tip_tangents(frames: Frames, dq: Array) -> tuple[Array, Array]:
     """Return the tip's velocity (3,) and its rotation's derivative (3, 3) for joint velocities (nv,)."""
     joint = frames.axis * dq.reshape(-1, DOFS_PER_LINK, 1)
     turn = joint[:, 1] + joint[:, 2]  # (n_links, 3)
-    tip = frames.plate_position[-1]
-    velocity = jnp.sum(joint[:, 0] + jnp.cross(turn, tip - frames.anchor), axis=0)
-    rotation = jnp.cross(jnp.sum(turn, axis=0)[:, None], frames.plate_rotation[-1], axis=0)
+    lever = frames.tip_position - frames.anchor
+    velocity = jnp.sum(joint[:, 0] + jnp.cross(turn, lever), axis=0)
+    rotation = jnp.cross(jnp.sum(turn, axis=0)[:, None], frames.tip_rotation, axis=0)
     return velocity, rotation

@@ -13,15 +13,31 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from mjx_softarm._support.mjx import mjx
 from mjx_softarm._support.small_matrices import product
+from mjx_softarm.sensing.pose import rotation_from_quaternion
 
 if TYPE_CHECKING:
     from mjx_softarm.mechanics.statics import ArmParams
 
 DOFS_PER_LINK = 3
+
+
+class Mount(NamedTuple):
+    """Where the base hangs in the base frame, and where the tip sits on the last plate."""
+
+    base_position_m: Array | np.ndarray  # (3,)
+    base_rotation: Array | np.ndarray  # (3, 3)
+    tip_offset_m: Array | np.ndarray  # (3,) in the axes of the last plate
+    tip_rotation: Array | np.ndarray  # (3, 3)
+
+
+LEVEL = Mount(
+    np.zeros(3, np.float32), np.eye(3, dtype=np.float32), np.zeros(3, np.float32), np.eye(3, dtype=np.float32)
+)
 
 
 class Frames(NamedTuple):
@@ -31,6 +47,8 @@ class Frames(NamedTuple):
     plate_rotation: Array  # (n_links + 1, 3, 3), columns are the plate's axes
     axis: Array  # (n_links, 3 dofs, 3), unit vectors: slide, hinge x, hinge y
     anchor: Array  # (n_links, 3) [m], the point both hinges turn about
+    tip_position: Array  # (3,) [m]
+    tip_rotation: Array  # (3, 3)
 
 
 Kinematics = Callable[[Array], Frames]  # joint coordinates (nv,) [m, rad, rad] -> Frames
@@ -38,7 +56,7 @@ Kinematics = Callable[[Array], Frames]  # joint coordinates (nv,) [m, rad, rad] 
 
 def chain_kinematics(params: ArmParams) -> Kinematics:
     """Return the closed-form kinematics of an arm, a pytree of the numbers that it depends on."""
-    return jax.tree_util.Partial(chain_frames, link_length_m=params.link_length_m)
+    return jax.tree_util.Partial(chain_frames, link_length_m=params.link_length_m, mount=params.mount)
 
 
 def mjx_kinematics(model: mjx.Model) -> Kinematics:
@@ -46,26 +64,37 @@ def mjx_kinematics(model: mjx.Model) -> Kinematics:
     return jax.tree_util.Partial(mjx_frames, model)
 
 
-def chain_frames(q: Array, link_length_m: Array | float) -> Frames:
+def chain_frames(q: Array, link_length_m: Array | float, mount: Mount = LEVEL) -> Frames:
     """Return the frames in closed form: products of the links' rotations, sums of the links' vectors.
 
     Args:
         q (3 * n_links,): joint coordinates [m, rad, rad].
         link_length_m: distance of two plates at rest.
+        mount: of base and tip.
     """
     slide, bend_x, bend_y = jnp.moveaxis(q.reshape(-1, DOFS_PER_LINK), -1, 0)  # (L,) each
+    base = jnp.asarray(mount.base_rotation, q.dtype)
     local = _rotation_xy(bend_x, bend_y)  # (L, 3, 3)
-    rotation = jax.lax.associative_scan(product, local)  # (L, 3, 3)
-    plate_rotation = jnp.concatenate([jnp.eye(3, dtype=q.dtype)[None], rotation])
+    rotation = product(base, jax.lax.associative_scan(product, local))  # (L, 3, 3)
+    plate_rotation = jnp.concatenate([base[None], rotation])
     parent, child = plate_rotation[:-1], plate_rotation[1:]
     half = 0.5 * link_length_m
     to_anchor = -(half + slide)[:, None] * parent[:, :, 2]
     to_plate = to_anchor - half * child[:, :, 2]
-    plate_position = jnp.concatenate([jnp.zeros((1, 3), q.dtype), jnp.cumsum(to_plate, axis=0)])
+    start = jnp.asarray(mount.base_position_m, q.dtype)
+    plate_position = jnp.concatenate([start[None], start + jnp.cumsum(to_plate, axis=0)])
     cos, sin = jnp.cos(bend_x)[:, None], jnp.sin(bend_x)[:, None]
     axis_y = cos * parent[:, :, 1] + sin * parent[:, :, 2]
     axis = jnp.stack([-parent[:, :, 2], parent[:, :, 0], axis_y], axis=1)
-    return Frames(plate_position, plate_rotation, axis, plate_position[:-1] + to_anchor)
+    last = plate_rotation[-1]
+    return Frames(
+        plate_position,
+        plate_rotation,
+        axis,
+        anchor=plate_position[:-1] + to_anchor,
+        tip_position=plate_position[-1] + jnp.sum(last * jnp.asarray(mount.tip_offset_m, q.dtype), axis=-1),
+        tip_rotation=product(last, jnp.asarray(mount.tip_rotation, q.dtype)),
+    )
 
 
 def _rotation_xy(x: Array, y: Array) -> Array:
@@ -80,7 +109,8 @@ def mjx_frames(model: mjx.Model, q: Array) -> Frames:
     """Return the frames of `mjx.kinematics`, for a model that `mjx_softarm.mechanics.mjcf` built.
 
     Args:
-        model: the compiled arm on the device; its first bodies are the world and the links in order.
+        model: the compiled arm on the device; its first bodies are the world and the links in order, its
+            first geometries the rings, its last site the tip.
         q (3 * n_links,): joint coordinates [m, rad, rad].
     """
     n_links = q.shape[-1] // DOFS_PER_LINK
@@ -88,11 +118,14 @@ def mjx_frames(model: mjx.Model, q: Array) -> Frames:
     links = slice(1, n_links + 1)
     rotation = data.xmat[links].reshape(n_links, 3, 3)
     anchor = data.xpos[links]
-    half = -model.body_pos[1, 2]
+    half = -model.geom_pos[1, 2]
     position = anchor - half * rotation[:, :, 2]
+    base = rotation_from_quaternion(model.body_quat[1])
     return Frames(
-        plate_position=jnp.concatenate([jnp.zeros((1, 3), q.dtype), position]),
-        plate_rotation=jnp.concatenate([jnp.eye(3, dtype=q.dtype)[None], rotation]),
+        plate_position=jnp.concatenate([model.geom_pos[:1], position]),
+        plate_rotation=jnp.concatenate([base[None], rotation]),
         axis=data.xaxis[: n_links * DOFS_PER_LINK].reshape(n_links, DOFS_PER_LINK, 3),
         anchor=anchor,
+        tip_position=data.site_xpos[-1],
+        tip_rotation=data.site_xmat[-1].reshape(3, 3),
     )

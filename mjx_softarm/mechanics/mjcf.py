@@ -14,6 +14,7 @@ import numpy as np
 
 from mjx_softarm.mechanics.body import SPRING_WIDTH_M, gripper_boxes, payload_radius_m, ring_radius_m
 from mjx_softarm.mechanics.statics import GRAVITY_M_S2, ArmParams
+from mjx_softarm.sensing.pose import quaternion_from_rotation
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
 
 MAX_TIMESTEP_S = 0.004
@@ -40,12 +41,16 @@ def build_spec(spec: ArmSpec) -> mujoco.MjSpec:
     mjspec.visual.headlight.diffuse = [0.55, 0.55, 0.55]
     sky = mjspec.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, width=64, height=384)
     sky.builtin, sky.rgb1, sky.rgb2 = mujoco.mjtBuiltin.mjBUILTIN_GRADIENT, [1.0] * 3, [0.82, 0.86, 0.9]
-    _add_ring(mjspec.worldbody, 0, [0.0, 0.0, 0.0], spec)
-    _add_holes(mjspec.worldbody, 0, 0, np.zeros(3), params, spec)
-    body = mjspec.worldbody
+    world = body = mjspec.worldbody
+    _add_ring(world, 0, [0.0, 0.0, 0.0], spec)
+    _add_holes(world, 0, 0, np.zeros(3), params, spec)
     for link in range(spec.n_links):
         body = _add_link(body, link, params, spec)
     _add_tools(body, params, spec)
+    turn = quaternion_from_rotation(params.mount.base_rotation)
+    base = world.add_frame(pos=params.mount.base_position_m, quat=turn)
+    for part in (*world.geoms, *world.sites, *world.bodies):
+        part.set_frame(base)
     for chamber in range(spec.n_chambers):
         _add_chamber(mjspec, chamber, params, spec)
     return mjspec
@@ -126,9 +131,11 @@ def _add_holes(body, plate: int, section: int, position, params: ArmParams, spec
 
 
 def _add_tools(last, params: ArmParams, spec: ArmSpec) -> None:
-    """Add gripper and payload below the last plate, whose centre is the tip."""
+    """Add gripper and payload below the last plate, and the tip where it is measured, at best the centre."""
     half, length = spec.link_length_m / 2, spec.mass.gripper_length_m
-    last.add_site(name="tip", pos=[0.0, 0.0, -half], size=[0.004] * 3, rgba=[0.9, 0.1, 0.1, 1.0])
+    tip = last.add_site(name="tip", size=[0.004] * 3, rgba=[0.9, 0.1, 0.1, 1.0])
+    tip.pos = params.mount.tip_offset_m - [0.0, 0.0, half]
+    tip.quat = quaternion_from_rotation(params.mount.tip_rotation)
     for k, name in enumerate(("gripper", "payload")):
         tool = last.add_body(name=name, pos=[0.0, 0.0, -half - float(params.tool_offset_m[k])])
         mass = float(params.tool_mass_kg[k])

@@ -21,7 +21,8 @@ from jax import Array
 from mjx_softarm._support.small_matrices import block_diagonal, product
 from mjx_softarm.mechanics.body import hole_directions
 from mjx_softarm.mechanics.chain_hessian import ChainHessian
-from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK, Frames
+from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK, Frames, Mount
+from mjx_softarm.sensing.pose import rotation_about
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
 
 GRAVITY_M_S2 = 9.81
@@ -48,6 +49,7 @@ class ArmParams(NamedTuple):
     spring_rest_m: Array  # (n_chambers,)
     pressure_min_kpa: Array  # (n_chambers,)
     pressure_max_kpa: Array  # (n_chambers,)
+    mount: Mount
 
     @property
     def section_length_m(self) -> Array:
@@ -92,7 +94,15 @@ class ArmParams(NamedTuple):
             "pressure_min_kpa": np.full(n, spec.chambers.pressure_min_kpa),
             "pressure_max_kpa": np.full(n, spec.chambers.pressure_max_kpa),
         }
-        return cls(**{name: np.asarray(value, dtype) for name, value in values.items()})  # type: ignore
+        numbers = {name: np.asarray(value, dtype) for name, value in values.items()}
+        return cls(**numbers, mount=_mount(spec, dtype))  # type: ignore
+
+
+def _mount(spec: ArmSpec, dtype: np.typing.DTypeLike) -> Mount:
+    mounting = spec.mounting
+    base, tip = (rotation_about(np.radians(turn)) for turn in (mounting.base_turn_deg, mounting.tip_turn_deg))
+    values = (mounting.base_offset_m, base, mounting.tip_offset_m, tip)
+    return Mount(*(np.asarray(value, dtype) for value in values))
 
 
 class Tendons(NamedTuple):

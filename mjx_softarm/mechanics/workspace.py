@@ -88,7 +88,7 @@ def sample_evenly(spec: ArmSpec, n: int, seed: int) -> Pool:
     """
     rng = np.random.default_rng(seed)
     half = CANDIDATES_PER_EVEN_POSE * n // 2
-    extremes = rng.choice(_levels(spec), (half, spec.n_chambers))
+    extremes = rng.choice(pressure_levels(spec), (half, spec.n_chambers))
     return _draw(spec, n, np.concatenate([random_pressures(spec, half, rng), extremes]), rng, replace=True)
 
 
@@ -118,8 +118,9 @@ def extreme_poses(spec: ArmSpec) -> Settled:
 
     Source: the paper's workspace figure.
     """
-    return settle_many(spec, np.array(list(itertools.product(_levels(spec), repeat=spec.n_chambers))))
+    return settle_many(spec, np.array(list(itertools.product(pressure_levels(spec), repeat=spec.n_chambers))))
 
 
-def _levels(spec: ArmSpec) -> tuple[float, float, float]:
+def pressure_levels(spec: ArmSpec) -> tuple[float, float, float]:
+    """Return lowest, zero and highest pressure [kPa]."""
     return (spec.chambers.pressure_min_kpa, 0.0, spec.chambers.pressure_max_kpa)

@@ -91,9 +91,29 @@ def frame_from_pose(pose: Array) -> tuple[Array, Array]:
     return 0.001 * pose[..., :3], xp.stack(rows, axis=-1).reshape(*pose.shape[:-1], 3, 3)
 
 
+def quaternion_from_rotation(rotation: Array) -> Array:
+    """Return the quaternions (..., 4) w, x, y, z of rotations (..., 3, 3). NumPy only."""
+    return quaternion_from_pose(pose_from_frame(np.zeros(rotation.shape[:-1]), rotation))
+
+
+def rotation_about(vector_rad: np.ndarray) -> np.ndarray:
+    """Return the rotation (3, 3) about a vector (3,) by its length [rad]. NumPy only."""
+    half = 0.5 * np.linalg.norm(vector_rad)
+    sine = 0.5 * np.sinc(half / np.pi) * np.asarray(vector_rad, float)
+    return rotation_from_quaternion(np.append(np.cos(half), sine))
+
+
+def rotation_vector(rotation: np.ndarray) -> np.ndarray:
+    """Return the rotation vector (3,) [rad] of a rotation (3, 3); inverse of `rotation_about`."""
+    w, *axis = quaternion_from_rotation(rotation)
+    sine = np.linalg.norm(axis)
+    angle = 2.0 * np.arctan2(sine, abs(w)) * np.sign(w)
+    return angle / max(sine, np.finfo(float).tiny) * np.array(axis)
+
+
 def share_of_turn(rotation: np.ndarray, share: np.ndarray) -> np.ndarray:
     """Return shares (...,) of a turn (3, 3), about its own axis: matrices (..., 3, 3). NumPy only."""
-    w, *axis = quaternion_from_pose(pose_from_frame(np.zeros(3), rotation))
+    w, *axis = quaternion_from_rotation(rotation)
     sine = np.linalg.norm(axis)
     half = np.asarray(share) * (np.arctan2(sine, abs(w)) * np.sign(w))  # the shorter way round
     along = np.multiply.outer(np.sin(half), np.array(axis) / max(sine, np.finfo(float).tiny))

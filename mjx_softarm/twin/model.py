@@ -103,6 +103,7 @@ def draw_parts(seed: int, spec: ArmSpec, build: Build) -> Parts:
             "area_slope_m": tuple(area_factor * spec.per_chamber(chambers.area_slope_m)),
             "length_offset_m": tuple(offset_m),
         },
+        mounting={"base_turn_deg": (0.0,) * 3, "base_offset_m": (0.0,) * 3, "section_roll_deg": ()},
         mass={"gripper_kg": spec.mass.gripper_kg * (1.0 + off(std.gripper_mass)), "payload_kg": 0.0},
     )
     beta = np.array(per_chamber(sensor.beta, std.spring_beta))

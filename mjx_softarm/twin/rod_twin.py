@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from mjx_softarm.deploy.arm_io import Capture
-from mjx_softarm.sensing.pose import pose_from_frame, quaternion_from_pose
+from mjx_softarm.sensing.pose import quaternion_from_rotation, rotation_about
 from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
 from mjx_softarm.twin.instruments import (
@@ -33,7 +33,7 @@ from mjx_softarm.twin.instruments import (
     checked_payload,
     checked_pressures,
 )
-from mjx_softarm.twin.rod import CREEP_S, Rod, RodParts, rotation_about
+from mjx_softarm.twin.rod import CREEP_S, Rod, RodParts
 
 ROD_GAP = 1.9
 ELEMENTS_PER_SECTION = 6  # the tip within 0.2 mm of twelve
@@ -114,6 +114,11 @@ class RodTwin:
         self._rod.step(self._pressure_kpa, period_s)
         self.time_s += period_s
 
+    def settle(self, pressure_kpa: np.ndarray) -> None:
+        """Go to rest at pressures (n,) [kPa] at once; the clock stands still."""
+        self._pressure_kpa = checked_pressures(pressure_kpa, self._spec)
+        self._rod.settle(self._pressure_kpa)
+
     def pressures(self) -> np.ndarray:
         """Return pressures (n,) [kPa] that the regulators' sensors measure in the chambers now."""
         return self._pressure_kpa + self._draw(PRESSURE_NOISE_KPA, len(self._pressure_kpa))
@@ -127,7 +132,7 @@ class RodTwin:
         tip_m = self._base_m + self._base_rotation @ (node_m[-1] + rotation[-1] @ self._tip_m)
         turn = rotation_about(np.radians(self._draw(CAPTURE_NOISE_DEG, 3)))
         tip = turn @ self._base_rotation @ rotation[-1] @ self._tip_turn
-        quaternion = quaternion_from_pose(pose_from_frame(np.zeros(3), tip))
+        quaternion = quaternion_from_rotation(tip)
         noise_m = self._draw(CAPTURE_NOISE_M, n_markers + 1, 3)
         spring_m = self._rod.spring_lengths() + self._draw(SPRING_NOISE_M, self._spec.n_chambers)
         return Capture(tip_m + noise_m[0], quaternion, marker_m + noise_m[1:], spring_m)

@@ -41,7 +41,8 @@ def test_demo_logs_have_no_fault(demo, capsys):
 def test_run_writes_the_whole_folder_and_nothing_beside_it(calibrated):
     status, folder = calibrated
     assert status in (0, 1)
-    assert sorted(p.name for p in folder.iterdir()) == ["arm.toml", "report.html", "report.json", "s2r.npz"]
+    files = ["arm.toml", "recorded.npz", "report.html", "report.json", "s2r.npz"]
+    assert sorted(p.name for p in folder.iterdir()) == files
     assert [p.name for p in folder.parent.iterdir()] == ["out"]
     report = json.loads((folder / "report.json").read_text())
     assert status == (0 if report["trustworthy"] else 1)

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 from calib.read.logs import read_log
+from mjx_softarm.deploy.__main__ import main
 from mjx_softarm.deploy.arms import ArmError, Paced, open_arm
+from mjx_softarm.logs.pressure_plan import write_plan
 from mjx_softarm.policy.file import save_policy
 from tests.linear_arm import DT_S, FAR, POLICY, REST_M, SENSOR, LinearArm, N
 
@@ -179,3 +181,11 @@ def test_recording_that_ends_early_vents_and_has_its_log(folder, fault, status, 
     written = np.loadtxt(folder / "written.txt")
     assert np.abs(written).max() > 3.0 and not written[-1].any()
     assert (folder / "a.csv").read_text().count("\n") == 1 + 25
+
+
+def test_a_plan_of_pressures_is_recorded(tmp_path):
+    plan, out = tmp_path / "next.csv", tmp_path / "log.npz"
+    write_plan(plan, np.array([[-5.0, 3, -10, -5, 2, 4, 2, -9, -4]]))
+    assert main(["record", "--arm", "twin:rod:101", "--plan", str(plan), "--out", str(out)]) == 0
+    found = read_log(out, 9)[0]
+    np.testing.assert_allclose(found.pressure_kpa, [[-5.0, 3, -10, -5, 2, 4, 2, -9, -4]], atol=0.1)

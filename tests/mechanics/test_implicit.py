@@ -54,7 +54,7 @@ def equilibrium_of_set(params, reference, q, pressure, at_limit, at_high):
         q, pressure = q - step[: len(q)], pressure - step[len(q) :]
     left, here = equations(q, pressure)
     frames = kinematics(q)
-    fields = q, pressure, here.springs.length, frames.plate_position[-1], frames.plate_rotation[-1]
+    fields = q, pressure, here.springs.length, frames.tip_position, frames.tip_rotation
     return dict(zip(SEEN, fields, strict=True)), jnp.max(jnp.abs(left))
 
 

@@ -7,12 +7,15 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from mjx_softarm import ArmSpec
 from mjx_softarm._support import xla
 from mjx_softarm._support.mjx import mjx
-from mjx_softarm.mechanics.kinematics import Frames, chain_frames, mjx_frames
+from mjx_softarm.mechanics.kinematics import Frames, chain_frames, chain_kinematics, mjx_frames
 from mjx_softarm.mechanics.mjcf import build_model
+from mjx_softarm.mechanics.statics import ArmParams
+from mjx_softarm.mechanics.workspace import settle_many
 
 STRUCTURES = [(3, 4), (2, 3), (1, 1)]
 TOLERANCE_M = 1e-6  # float32 at 0.7 m
@@ -50,6 +53,8 @@ def mujoco_frames(model, q):
         plate_rotation=np.array([ring.xmat.reshape(3, 3) for ring in rings]),
         axis=np.array([[joint.xaxis for joint in link] for link in joints]),
         anchor=np.array([link[1].xanchor for link in joints]),
+        tip_position=data.site("tip").xpos,
+        tip_rotation=data.site("tip").xmat.reshape(3, 3),
     )
 
 
@@ -113,3 +118,43 @@ def test_axes_and_anchors_give_c_mujoco_s_jacobian_of_the_tip():
         turns = axis * [[0.0], [1.0], [1.0]]
         np.testing.assert_allclose(moves.reshape(-1, 3).T, jacobian, atol=2e-6)
         np.testing.assert_allclose(turns.reshape(-1, 3).T, turning, atol=2e-6)
+
+
+MOUNTING = {
+    "base_turn_deg": (20.0, -10.0, 5.0),
+    "base_offset_m": (0.01, -0.02, 0.03),
+    "section_roll_deg": (3.0, -2.0, 4.0),
+    "tip_turn_deg": (-12.0, 15.0, 5.0),
+    "tip_offset_m": (0.001, -0.002, 0.004),
+}
+
+
+def test_both_engines_mount_base_and_tip_alike():
+    mounted = arm().replace(mounting=MOUNTING)
+    params = ArmParams.from_spec(mounted)
+    q = np.float32(random_q(mounted, 1)[0])
+    chain = jax.jit(chain_kinematics(params))(q)
+    other = xla.jit(lambda q: mjx_frames(mjx.put_model(build_model(mounted)), q), True)(q)
+    for name, a, b in zip(Frames._fields, chain, other, strict=True):
+        np.testing.assert_allclose(a, b, atol=2e-6, err_msg=name)
+    turned = Rotation.from_rotvec([20.0, -10.0, 5.0], degrees=True).as_matrix()
+    np.testing.assert_allclose(chain.plate_rotation[0], turned, atol=1e-6)
+    np.testing.assert_allclose(chain.plate_position[0], MOUNTING["base_offset_m"])
+    level = jax.jit(chain_kinematics(ArmParams.from_spec(arm())))(q)
+    expected = np.array(MOUNTING["base_offset_m"]) + level.plate_position @ turned.T
+    np.testing.assert_allclose(chain.plate_position, expected, atol=1e-6)
+
+
+def test_a_tilted_arm_at_rest_is_at_rest_in_mujoco():
+    """Gravity, holes and plates of both descriptions of a tilted, rolled arm: no force is left."""
+    mounted = arm().replace(mounting=MOUNTING)
+    pressure_kpa = np.array([[-12.0, 3, -20, -5, -30, 4, 2, -9, -14]])
+    found = settle_many(mounted, pressure_kpa)
+    model = build_model(mounted)
+    data = mujoco.MjData(model)
+    data.qpos[:], data.ctrl[:] = found.q[0], pressure_kpa[0]
+    mujoco.mj_forward(model, data)
+    left = data.qfrc_passive + data.qfrc_actuator - data.qfrc_bias
+    assert np.abs(left).max() < 5e-3
+    np.testing.assert_allclose(data.site("tip").xpos, found.tip_position_m[0], atol=1e-5)
+    np.testing.assert_allclose(data.site("tip").xmat.reshape(3, 3), found.tip_rotation[0], atol=1e-5)

@@ -145,7 +145,7 @@ def test_an_ideal_rod_agrees_with_the_training_model(spec):
     expected = settle_many(spec, pressures)
     for kpa, tip_m, spring_m in zip(pressures, expected.tip_position_m, expected.spring_m, strict=True):
         arm = RodTwin(0, build=RodBuild(gap=0.0, noise=0.0))
-        arm._rod.settle(kpa)
+        arm.settle(kpa)
         np.testing.assert_allclose(arm.motion_capture().tip_m, tip_m, atol=3e-3)
         np.testing.assert_allclose(arm._rod.spring_lengths(), spring_m, atol=2e-3)
 

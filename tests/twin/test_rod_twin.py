@@ -29,7 +29,7 @@ def test_refinement_changes_little():
     tips = []
     for per_section in (6, 9):
         arm = RodTwin(101, payload_kg=1.0, build=RodBuild(noise=0.0, per_section=per_section))
-        arm._rod.settle(KPA)
+        arm.settle(KPA)
         tips.append(arm.motion_capture().tip_m)
     assert np.linalg.norm(tips[0] - tips[1]) < 2.5e-4
 

@@ -219,7 +219,7 @@ def _posture(pressure_kpa: Array, params: ArmParams, s2r: S2R | None, spec: ArmS
         found = settle_pressures(kinematics, params.without_pressure_limits(), pressure_kpa)
         frames = kinematics(found.q)
         plates = frames.plate_position, frames.plate_rotation
-        pose = pose_from_frame(plates[0][-1], plates[1][-1])
+        pose = pose_from_frame(frames.tip_position, frames.tip_rotation)
         if s2r is not None:
             pose = correct(s2r, pose, found.spring_m)
             plates = carry_body(*plates, pose)

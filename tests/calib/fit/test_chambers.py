@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from calib.fit.blocks import held_out_blocks
-from calib.fit.chambers import BENDING, FIELDS, MIN_POSES, calibrate_chambers
+from calib.fit.chambers import MIN_POSES, calibrate_chambers
+from calib.fit.parameters import BENDING, FIELDS
 from mjx_softarm import ArmSpec
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mechanics.workspace import settle_many
@@ -207,3 +208,28 @@ def test_a_chamber_that_never_changes_is_named_and_its_area_left_alone():
 def test_refuses_a_log_that_cannot_be_used(changes, message):
     with pytest.raises(ValueError, match=message):
         calibrate_chambers(pose_log(SPEC, 9, 0, **changes), SPEC)
+
+
+MOUNTING = {
+    "base_turn_deg": (2.0, -1.5, 0.0),
+    "base_offset_m": (3e-3, -2e-3, 2e-3),
+    "section_roll_deg": (3.0, -2.0, 4.0),
+    "tip_turn_deg": (-2.0, 1.5, 5.0),
+    "tip_offset_m": (1e-3, -2e-3, 0.0),
+}
+
+
+def test_mounting_comes_back_with_intervals_and_a_turned_quaternion_is_told():
+    """Neither chambers nor S2R have to carry a tilted base, rolled sections or skew axes of the tip."""
+    arm = planted().replace(mounting=MOUNTING)
+    fit = calibrate_chambers(pose_log(arm, 200, seed=0), SPEC)
+    for name, planted_value in MOUNTING.items():
+        error = np.abs(np.array(getattr(fit.spec.mounting, name)) - planted_value)
+        assert (error < (0.25 if name.endswith("_deg") else 7e-4)).all(), name
+        assert (error < 2.0 * fit.half_width_95[name] + 1e-9).mean() > 0.6
+    assert fit.held_out_before.rotation_mean_deg > 4.0 > 1.0 > fit.held_out.rotation_mean_deg
+    assert "quaternion is 5." in fit.notes[0] and not fit.warnings
+
+
+def test_a_hanging_quaternion_that_is_right_is_not_told(fitted):
+    assert fitted.notes == ()

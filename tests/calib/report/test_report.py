@@ -72,6 +72,13 @@ def test_names_and_findings_are_text_not_markup():
 def test_json_has_the_same_figures_and_says_whether_to_trust_them():
     data = json.loads(json.dumps(to_json(make_parts(), ["a finding"], PROVENANCE)))
     assert data["trustworthy"] is True and data["findings"] == ["a finding"]
-    assert data["parts"]["Springs"] == {"figures": {"beta": [0.93]}, "warnings": []}
+    assert data["parts"]["Springs"] == {"figures": {"beta": [0.93]}, "warnings": [], "notes": []}
     assert data["provenance"] == PROVENANCE
     assert to_json(make_parts(("no",)), [], {})["trustworthy"] is False
+
+
+def test_a_note_is_shown_and_costs_no_trust():
+    part = Section("Chambers", "Fitted.", notes=("a quaternion is off",))
+    assert "a quaternion is off" in Page(to_html("x", (part,), [], {})).texts["p"]
+    data = to_json((part,), [], {})
+    assert data["trustworthy"] is True and data["parts"]["Chambers"]["notes"] == ["a quaternion is off"]

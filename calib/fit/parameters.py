@@ -1,0 +1,177 @@
+"""Parameters of the fit to poses at rest: chambers, backbone and mounting, in one vector that starts at zero.
+
+For each chamber, x holds the logarithm of the ratio of its stiffness; that of its area; the change of the
+area's slope, in areas per section length; the change of its rest length, in section lengths. Then come the
+logarithm of the ratio of the backbone's bending stiffness, and the mounting: the base's turn about x and y
+and its offset, the roll of each section's holes, the turn of the measured tip and its offset within the last
+plate. The base's turn about z is the roll of all sections; an offset of the tip along the arm is one of the
+base.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from mjx_softarm._support.small_matrices import product
+from mjx_softarm.mechanics.statics import ArmParams
+from mjx_softarm.sensing.pose import rotation_about, rotation_from_quaternion, rotation_vector
+from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
+
+# The four parameters of a chamber.
+FIELDS = ("stiffness_n_per_m", "area_m2", "area_slope_m", "length_offset_m")
+SHORT = dict(zip(FIELDS, ("stiffness", "area", "slope", "offset"), strict=True))
+BENDING = "bending_stiffness_nm_per_rad"  # of the backbone
+
+
+class Block(NamedTuple):
+    """Parameters of one kind."""
+
+    name: str
+    per: str  # "chamber", "section", or "" for `n` of them
+    n: int
+    prior: float  # standard deviation about the start
+    tolerance: float  # known within it
+
+
+BLOCKS = (
+    Block("stiffness", "chamber", 0, 1.0, 0.05),  # a factor of e; 5 %
+    Block("area", "chamber", 0, 1.0, 0.05),
+    Block("slope", "chamber", 0, 1.0, 0.05),  # an area per section length; 5 % of it
+    Block("offset", "chamber", 0, 0.25, 0.005),  # a quarter of a section; 1 mm of 200 mm
+    Block(BENDING, "", 1, 1.0, 0.05),
+    Block("base turn", "", 2, 0.1, 0.01),  # 6 deg; 0.6 deg
+    Block("base offset", "", 3, 0.01, 0.002),  # [m]
+    Block("roll", "section", 0, 0.2, 0.01),  # 11 deg
+    Block("tip turn", "", 3, 0.5, 0.01),  # 29 deg
+    Block("tip offset", "", 2, 0.01, 0.002),  # [m]
+)
+
+
+def size(block: Block, spec: ArmSpec) -> int:
+    """Return the number of parameters of a block."""
+    return {"chamber": spec.n_chambers, "section": spec.structure.n_sections, "": block.n}[block.per]
+
+
+def priors(spec: ArmSpec) -> np.ndarray:
+    """Return standard deviations (p,) about the start."""
+    return np.concatenate([np.full(size(block, spec), block.prior) for block in BLOCKS])
+
+
+def tolerances(spec: ArmSpec) -> np.ndarray:
+    """Return errors (p,) within which parameters count as known."""
+    return np.concatenate([np.full(size(block, spec), block.tolerance) for block in BLOCKS])
+
+
+def names(spec: ArmSpec) -> list[str]:
+    """Return the name of each parameter."""
+    return [name for block in BLOCKS for name in _names(block, size(block, spec))]
+
+
+def _names(block: Block, n: int) -> Iterator[str]:
+    if block.per:
+        return (f"{block.name}{k}" for k in range(n))
+    return iter([block.name] if n == 1 else (f"{block.name} {axis}" for axis in "xyz"[:n]))
+
+
+def _split(x: Array | np.ndarray, n_chambers: int) -> dict[str, Array | np.ndarray]:
+    """Return the blocks of x by name."""
+    sizes = {"chamber": n_chambers, "section": n_chambers // N_CHAMBERS_PER_SECTION}
+    found, start = {}, 0
+    for block in BLOCKS:
+        stop = start + sizes.get(block.per, block.n)
+        found[block.name], start = x[start:stop], stop
+    return found
+
+
+def with_numbers(x: Array, params: ArmParams) -> ArmParams:
+    """Return the arm at x (p,) where `params` is the arm at x = 0."""
+    by = _split(x, params.area.shape[0])
+    bend = jnp.exp(by[BENDING][0])
+    joints = params.joint_stiffness.reshape(-1, 3) * jnp.stack([jnp.ones_like(bend), bend, bend])
+    roll = jnp.repeat(by["roll"], N_CHAMBERS_PER_SECTION)
+    zero = jnp.zeros(1, x.dtype)
+    mount = params.mount
+    return params._replace(
+        chamber_site_m=_rolled(params.chamber_site_m, roll),
+        spring_site_m=_rolled(params.spring_site_m, roll),
+        joint_stiffness=joints.reshape(-1),
+        chamber_stiffness=params.chamber_stiffness * jnp.exp(by["stiffness"]),
+        area=params.area * jnp.exp(by["area"]),
+        area_slope=params.area_slope + by["slope"] * params.area / params.section_length_m,
+        chamber_rest_m=params.chamber_rest_m + by["offset"] * params.section_length_m,
+        mount=mount._replace(
+            base_position_m=mount.base_position_m + by["base offset"],
+            base_rotation=product(_turned(jnp.concatenate([by["base turn"], zero])), mount.base_rotation),
+            tip_offset_m=mount.tip_offset_m + jnp.concatenate([by["tip offset"], zero]),
+            tip_rotation=product(mount.tip_rotation, _turned(by["tip turn"])),
+        ),
+    )
+
+
+def _rolled(site_m: Array, roll: Array) -> Array:
+    cos, sin = jnp.cos(roll), jnp.sin(roll)
+    x, y = site_m[:, 0], site_m[:, 1]
+    return jnp.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
+
+
+def _turned(gibbs: Array) -> Array:
+    """Return the rotation (3, 3) about a vector (3,), smooth at zero; its angle [rad] to second order."""
+    quaternion = jnp.concatenate([jnp.ones(1, gibbs.dtype), 0.5 * gibbs])
+    return rotation_from_quaternion(quaternion) / jnp.sum(quaternion**2)
+
+
+def spec_at(spec: ArmSpec, x: np.ndarray) -> ArmSpec:
+    """Return the specification at x (p,) where `spec` is that at x = 0."""
+    by = _split(x, spec.n_chambers)
+    old = {name: np.array(spec.per_chamber(getattr(spec.chambers, name))) for name in FIELDS}
+    length_m, mounting = spec.geometry.section_length_m, spec.mounting
+    chambers = {
+        "stiffness_n_per_m": old["stiffness_n_per_m"] * np.exp(by["stiffness"]),
+        "area_m2": old["area_m2"] * np.exp(by["area"]),
+        "area_slope_m": old["area_slope_m"] + by["slope"] * old["area_m2"] / length_m,
+        "length_offset_m": old["length_offset_m"] + by["offset"] * length_m,
+    }
+    base, tip = (rotation_about(np.radians(v)) for v in (mounting.base_turn_deg, mounting.tip_turn_deg))
+    base = np.asarray(_turned(jnp.append(by["base turn"], 0.0)), float) @ base
+    tip = tip @ np.asarray(_turned(jnp.asarray(by["tip turn"])), float)
+    turned = {
+        "base_turn_deg": np.degrees(rotation_vector(base)),
+        "base_offset_m": mounting.base_offset_m + by["base offset"],
+        "section_roll_deg": spec.section_roll_deg + np.degrees(by["roll"]),
+        "tip_turn_deg": np.degrees(rotation_vector(tip)),
+        "tip_offset_m": mounting.tip_offset_m + np.append(by["tip offset"], 0.0),
+    }
+    bending = spec.backbone.bending_stiffness_nm_per_rad * float(np.exp(by[BENDING][0]))
+    return spec.replace(
+        chambers={name: tuple(map(float, value)) for name, value in chambers.items()},
+        backbone={BENDING: bending},
+        mounting={name: tuple(map(float, value)) for name, value in turned.items()},
+    )
+
+
+def half_widths(spec: ArmSpec, width: np.ndarray) -> dict[str, np.ndarray]:
+    """Return half-widths by field, in its unit, of parameters known within `width` (p,).
+
+    Args:
+        spec: the fitted arm.
+        width (p,): half-widths of the parameters.
+    """
+    by, length_m = _split(width, spec.n_chambers), spec.geometry.section_length_m
+    area = np.array(spec.per_chamber(spec.chambers.area_m2))
+    return {
+        "stiffness_n_per_m": spec.per_chamber(spec.chambers.stiffness_n_per_m) * by["stiffness"],
+        "area_m2": area * by["area"],
+        "area_slope_m": area / length_m * by["slope"],
+        "length_offset_m": length_m * by["offset"],
+        BENDING: np.array(spec.backbone.bending_stiffness_nm_per_rad * by[BENDING][0]),
+        "base_turn_deg": np.append(np.degrees(by["base turn"]), 0.0),
+        "base_offset_m": by["base offset"],
+        "section_roll_deg": np.degrees(by["roll"]),
+        "tip_turn_deg": np.degrees(by["tip turn"]),
+        "tip_offset_m": np.append(by["tip offset"], 0.0),
+    }

@@ -1,0 +1,183 @@
+"""Poses to record next: those that tell a calibration's unknown directions, then those far from any pose.
+
+The information of poses at rest on the parameters x of `calib.fit.parameters` is the sum over the poses of
+J^T J, with J the derivatives of tip, rotation and springs by x over their scales, and of the prior's. Its
+inverse is the covariance. Poses are chosen one by one among candidates at random and at the extremes of the
+pressures: the one that brings down the sum of the variances the most, each in units of its tolerance. Once no
+direction is expected to stay unknown, and for half of the poses in any case, they are drawn as for clustering
+(k-means++): by the square of the distance to the nearest pose, times the sim-to-real network's error there.
+
+Source: Fedorov, "Theory of Optimal Experiments", 1972 (A-optimal design); Arthur, Vassilvitskii, "k-means++",
+SODA 2007.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from calib.fit.equilibrium import simulate
+from calib.fit.leastsquares import QUANTILE
+from calib.fit.parameters import priors, tolerances
+from calib.read.static_poses import StaticPoses
+from mjx_softarm._support.archive import Entries, entries_of, read_sealed, write_sealed
+from mjx_softarm.mechanics.excitation import random_pressures
+from mjx_softarm.mechanics.workspace import pressure_levels, settle_many
+from mjx_softarm.spec import ArmSpec
+
+KIND, RECORDED_FILE = "recorded", "recorded.npz"  # in the folder of a calibration
+SHARE_FAR = 0.5  # of the poses, at least, that are drawn by their distance
+MAX_CANDIDATES = 1500
+MARGIN = 1.5  # by which fits know less than the information says
+N_NEAREST = 8  # poses whose errors are averaged
+MAX_ERROR_RATIO = 2.0  # of such a mean to that of all poses
+
+
+class Recorded(NamedTuple):
+    """Poses that a calibration knows, float64."""
+
+    pressure_kpa: np.ndarray  # (n, n_chambers)
+    payload_kg: np.ndarray  # (n,)
+    error_mm: np.ndarray  # (n,) of the tip, of the sim-to-real network where there is one
+    scale: np.ndarray  # (3,) robust errors of tip [m], rotation [rad] and springs [m]
+
+
+class Plan(NamedTuple):
+    """Poses to record, and what they are expected to tell."""
+
+    pressure_kpa: np.ndarray  # (n, n_chambers), those of the information first
+    n_informative: int
+    n_unknown: tuple[int, int]  # directions that are unknown now, and expected to be so with the plan
+
+
+def save_recorded(path: Path, recorded: Recorded) -> None:
+    """Write the poses of a calibration; raises as `write_sealed` does."""
+    write_sealed(path, entries_of(KIND, recorded), KIND)
+
+
+def load_recorded(path: Path, n_chambers: int) -> Recorded:
+    """Read the poses of a calibration.
+
+    Raises:
+        SealedFileError: the file is missing, damaged, or of another arm.
+    """
+    entries = Entries(read_sealed(path, KIND, "python -m calib run"), str(path))
+    shapes = {"pressure_kpa": (None, n_chambers), "payload_kg": (None,), "error_mm": (None,), "scale": (3,)}
+    found = Recorded(**{name: entries.take(f"{KIND}.{name}", np.float64, s) for name, s in shapes.items()})
+    entries.finish(1)
+    return found
+
+
+def plan(spec: ArmSpec, recorded: Recorded, n: int, seed: int) -> Plan:
+    """Choose poses to record.
+
+    Args:
+        spec: calibrated arm.
+        recorded: poses of its calibration.
+        n: number of poses to choose.
+        seed: of the candidates and of the draw.
+    """
+    rng = np.random.default_rng(seed)
+    candidates = _candidates(spec, min(20 * n, MAX_CANDIDATES), rng)
+    rows = _derivatives(spec, recorded.pressure_kpa, recorded.payload_kg, recorded.scale)
+    tolerance = tolerances(spec)
+    prior = np.diag((tolerance / priors(spec)) ** 2)
+    scaled = rows.reshape(-1, len(tolerance)) * tolerance
+    covariance = np.linalg.inv(prior + scaled.T @ scaled)
+    payload = np.full(len(candidates), spec.mass.payload_kg)
+    options = _derivatives(spec, candidates, payload, recorded.scale) * tolerance
+    before = n_unknown(covariance)
+    chosen, covariance = choose_informative(options, covariance, n - round(SHARE_FAR * n))
+    far = choose_far(spec, recorded, candidates, chosen, n - len(chosen), rng)
+    left = options[far].reshape(-1, len(tolerance))
+    covariance = np.linalg.inv(np.linalg.inv(covariance) + left.T @ left)
+    pressure_kpa = candidates[np.concatenate([chosen, far]).astype(int)]
+    return Plan(pressure_kpa, len(chosen), (before, n_unknown(covariance)))
+
+
+def n_unknown(covariance: np.ndarray) -> int:
+    """Return the number of directions known to less than the tolerance, 1 in the covariance's units."""
+    widths = MARGIN * QUANTILE * np.sqrt(np.linalg.eigvalsh(covariance))
+    return int(np.count_nonzero(widths > 1.0))
+
+
+def choose_informative(options: np.ndarray, covariance: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Choose up to n poses by A-optimality; fewer once no direction is unknown.
+
+    Args:
+        options (m, k, p): derivatives of each candidate's k measurements, in units of scales and tolerances.
+        covariance (p, p): of the parameters before, in units of their tolerances.
+        n: greatest number of poses.
+
+    Returns:
+        Indices of the chosen, and the covariance with them.
+    """
+    chosen: list[int] = []
+    left = np.ones(len(options), bool)
+    while len(chosen) < n and n_unknown(covariance) > 0:
+        spread = options @ covariance  # (m, k, p)
+        inner = np.eye(options.shape[1]) + spread @ np.swapaxes(options, 1, 2)
+        gain = np.trace(np.linalg.solve(inner, spread @ np.swapaxes(spread, 1, 2)), axis1=1, axis2=2)
+        best = int(np.argmax(np.where(left, gain, -np.inf)))
+        chosen.append(best)
+        left[best] = False
+        covariance = covariance - spread[best].T @ np.linalg.solve(inner[best], spread[best])
+    return np.array(chosen, int), covariance
+
+
+def choose_far(
+    spec: ArmSpec,
+    recorded: Recorded,
+    candidates: np.ndarray,
+    taken: np.ndarray,
+    n: int,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """Draw n candidates (m, n_chambers) far from poses, recorded or taken; return their indices."""
+    span = spec.chambers.pressure_max_kpa - spec.chambers.pressure_min_kpa
+    square = np.mean((candidates[:, None] - recorded.pressure_kpa) ** 2, axis=-1) / span**2
+    near = np.argsort(square, axis=1)[:, :N_NEAREST]
+    ratio = recorded.error_mm[near].mean(axis=1) / recorded.error_mm.mean()
+    weight = np.clip(ratio, 1.0 / MAX_ERROR_RATIO, MAX_ERROR_RATIO)
+    away = square.min(axis=1)
+
+    def keep_away(k: int) -> np.ndarray:
+        return np.minimum(away, np.mean((candidates - candidates[k]) ** 2, axis=1) / span**2)
+
+    for k in taken:
+        away = keep_away(k)
+    found: list[int] = []
+    for _ in range(n):
+        chance = weight * away
+        found.append(int(rng.choice(len(candidates), p=chance / chance.sum())))
+        away = keep_away(found[-1])
+    return np.array(found, int)
+
+
+def _candidates(spec: ArmSpec, n: int, rng: np.random.Generator) -> np.ndarray:
+    """Draw pressures (m, n_chambers), half of them at random, half at extremes, at which the arm settles."""
+    half = n // 2
+    extremes = rng.choice(pressure_levels(spec), (half, spec.n_chambers))
+    drawn = np.concatenate([random_pressures(spec, n - half, rng), extremes])
+    return drawn[settle_many(spec, drawn).settled]
+
+
+def _derivatives(
+    spec: ArmSpec, pressure_kpa: np.ndarray, payload_kg: np.ndarray, scale: np.ndarray
+) -> np.ndarray:
+    """Return derivatives (n, 6 + n_chambers, p) of measurements over their scales; zero without a rest."""
+    n, n_chambers = pressure_kpa.shape
+    guess = StaticPoses(
+        pressure_kpa=pressure_kpa,
+        payload_kg=payload_kg,
+        tip_m=np.zeros((n, 3)),
+        tip_rotation=settle_many(spec, pressure_kpa).tip_rotation,
+        spring_m=np.zeros((n, n_chambers)),
+        marker_m=np.zeros((n, 0, 3)),
+        single=np.zeros(n, bool),
+    )
+    error, slope, _ = simulate(spec, guess, np.zeros(len(priors(spec))))
+    settled = np.isfinite(error[:, 0]) & np.isfinite(slope).all(axis=(1, 2))
+    return np.where(settled[:, None, None], slope, 0.0) / np.repeat(scale, [3, 3, n_chambers])[:, None]

@@ -1,0 +1,91 @@
+"""Planned poses: their choice by hand on small problems, and the way from a calibration to a recording."""
+
+import numpy as np
+import pytest
+
+from calib.__main__ import main
+from calib.plan import (
+    RECORDED_FILE,
+    Recorded,
+    choose_far,
+    choose_informative,
+    load_recorded,
+    n_unknown,
+    plan,
+    save_recorded,
+)
+from mjx_softarm import ArmSpec
+from mjx_softarm._support.archive import SealedFileError
+from mjx_softarm._support.errors import InputError
+from mjx_softarm.logs.pressure_plan import read_plan, write_plan
+
+SMALL = ArmSpec.default().replace(structure={"n_sections": 1, "links_per_section": 2})
+
+
+def test_the_pose_that_tells_the_unknown_direction_is_chosen_first():
+    """Three candidates, each of which measures one of three parameters; the second is the unknown one."""
+    options = np.zeros((3, 1, 3))
+    options[[0, 1, 2], 0, [0, 1, 2]] = 4.0
+    covariance = np.diag([0.1, 50.0, 0.3])
+    chosen, after = choose_informative(options, covariance, 3)
+    assert chosen[0] == 1 and after[1, 1] == pytest.approx(1.0 / (1.0 / 50.0 + 16.0))
+    np.testing.assert_allclose(after, np.linalg.inv(np.linalg.inv(covariance) + 16.0 * np.diag([0, 1, 1])))
+
+
+def test_no_pose_is_spent_once_all_directions_are_known():
+    chosen, after = choose_informative(np.ones((4, 1, 2)), 1e-3 * np.eye(2), 3)
+    assert len(chosen) == 0 and n_unknown(after) == 0
+    assert n_unknown(np.diag([1.0, 1e-4])) == 1
+
+
+def test_far_poses_keep_away_from_those_recorded_and_go_where_the_error_is():
+    near, far = np.full((40, 3), -10.0), np.full((40, 3), 10.0)
+    candidates = np.concatenate([near, far]) + np.random.default_rng(0).normal(size=(80, 3))
+    recorded = Recorded(near[:10], np.zeros(10), np.ones(10), np.ones(3))
+    found = choose_far(SMALL, recorded, candidates, np.array([], int), 1, np.random.default_rng(1))
+    assert found[0] >= 40
+    both = np.concatenate([near[:10], far[:10]])
+    bad = Recorded(both, np.zeros(20), np.repeat([9.0, 1.0], 10), np.ones(3))
+    drawn = [
+        choose_far(SMALL, bad, candidates, np.array([], int), 1, np.random.default_rng(k))[0]
+        for k in range(60)
+    ]
+    assert np.mean(np.array(drawn) < 40) > 0.65
+
+
+@pytest.fixture(scope="module")
+def recorded():
+    rng = np.random.default_rng(0)
+    pressure_kpa = rng.uniform(-5.0, 5.0, (30, 3))
+    return Recorded(pressure_kpa, np.zeros(30), np.ones(30), np.array([1e-3, 0.01, 1e-3]))
+
+
+def test_a_plan_makes_directions_known(recorded):
+    """Poses of small pressures do not tell how areas change with length."""
+    found = plan(SMALL, recorded, 30, seed=0)
+    assert found.pressure_kpa.shape == (30, 3)
+    assert found.n_unknown[1] < found.n_unknown[0]
+    assert 1 <= found.n_informative <= 15
+    assert np.abs(found.pressure_kpa[: found.n_informative]).mean() > 10.0
+
+
+def test_from_a_calibration_to_a_file_that_record_reads(recorded, tmp_path, capsys):
+    SMALL.to_toml(tmp_path / "arm.toml")
+    save_recorded(tmp_path / RECORDED_FILE, recorded)
+    out = tmp_path / "next.csv"
+    assert main(["plan", str(tmp_path), "--poses", "30", "--out", str(out)]) == 0
+    assert "unknown directions" in capsys.readouterr().out
+    pressure_kpa = read_plan(out, SMALL)
+    assert pressure_kpa.shape == (30, 3)
+    assert main(["plan", str(tmp_path), "--out", str(out)]) == 2
+    assert "expected a new file" in capsys.readouterr().err
+    with pytest.raises(SealedFileError, match="recorded.pressure_kpa: got float64"):
+        load_recorded(tmp_path / RECORDED_FILE, 9)
+
+
+def test_pressures_beyond_the_limits_or_of_another_arm_are_refused(tmp_path):
+    write_plan(tmp_path / "a.csv", np.array([[0.0, 1.0, 2.0], [0.0, 30.0, 0.0]]))
+    with pytest.raises(InputError, match=r"a.csv: line 3: pressure1 \[kPa\]: got 30, expected -40 to 20"):
+        read_plan(tmp_path / "a.csv", SMALL)
+    with pytest.raises(InputError, match="expected pressure0"):
+        read_plan(tmp_path / "a.csv", ArmSpec.default())
