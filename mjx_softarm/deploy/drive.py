@@ -26,7 +26,7 @@ RAMP_M_PER_S = 0.03  # of the reference that has furthest to go
 HELD_M, MEAN_S = 1e-4, 0.2
 
 # Spring lengths (n,) [m], None where one was lost, and pressures in force (n,) [kPa] -> pressures to write,
-# and whether the arm is where it is to be, as far as the law can tell.
+# and whether the law has reached its target.
 Law = Callable[[np.ndarray | None, np.ndarray], tuple[np.ndarray, bool]]
 
 

@@ -47,7 +47,7 @@ def vent_at_end(
     Args:
         body: drives the arm.
         link: the arm.
-        tell: takes a line for each thing that went wrong; what it raises then is ignored.
+        tell: takes a line for each error; what it raises is ignored.
         save: writes the log.
     """
     finish = _Finish({"drive": body, "vent": link.vent, "save": save})
@@ -60,14 +60,14 @@ def vent_at_end(
 
 
 class _Finish:
-    """Steps that follow one another, whatever each of them raises."""
+    """Steps that run one after the other, whatever each of them raises."""
 
     def __init__(self, steps: dict[str, Callable[[], Any]]):
         self._steps, self._running = steps, ""
-        self._signals: list[int] = []  # that ended no step
+        self._signals: list[int] = []  # signals that ended no step
         self._n_interrupts = 0
         self.causes: list[str] = []
-        self.lines: list[str] = []  # to be told
+        self.lines: list[str] = []  # messages for `tell`
         self.status, self.vented = DONE, True
 
     def run(self) -> None:

@@ -41,14 +41,18 @@ LATE_TICKS = 5
 SETTLE_TIMEOUT_S = 15.0  # a pump of 12 L/min takes up to 10 s from one end of the workspace to the other
 STILL_M = 2e-4  # greatest difference between the means of a window's halves at rest; far above the noise
 
-# A live spring has noise of some 0.01 mm and more: over a window, this is none.
+# A spring is stuck if its readings range over less than the noise of a live one, some 0.01 mm, while in the
+# same window its own chamber is driven by this much, or a spring of its section moves by this much.
 STUCK_RANGE_M = 1e-5
-STUCK_PRESSURE_KPA = 2.0  # that its own chamber was driven by in the window,
-STUCK_NEIGHBOUR_M = 2e-3  # or a spring of its section moved
+STUCK_PRESSURE_KPA = 2.0
+STUCK_NEIGHBOUR_M = 2e-3
 
-LOST_SHARE = 0.5  # of a chamber's pressure, that the shape says is missing
-EXPLAINED_SHARE = 0.7  # of the springs' squared deviations, by that missing pressure
-LOST_EFFECT_M = 0.01  # on the chamber's own spring: less cannot be told from tolerances and payload
+# A chamber is lost if the shape lacks more than this share of its pressure, if that explains more than this
+# share of the springs' squared deviations, and if its own spring would move by more than this length: less
+# cannot be told from tolerances and payload.
+LOST_SHARE = 0.5
+EXPLAINED_SHARE = 0.7
+LOST_EFFECT_M = 0.01
 
 
 class Response(Enum):

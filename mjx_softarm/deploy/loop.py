@@ -28,7 +28,7 @@ from mjx_softarm.deploy.reachability import nearest
 from mjx_softarm.policy.reach import nearest_poses
 from mjx_softarm.policy.runtime import tip_pose
 
-CHAMBER_WINDOWS = 2  # for so many a lost chamber must show without a break
+CHAMBER_WINDOWS = 2  # a chamber counts as lost after so many windows in a row
 
 
 def with_goal(controller: Controller, state: State, goal: np.ndarray) -> tuple[State, tuple[Event, ...]]:

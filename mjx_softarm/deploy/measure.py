@@ -23,10 +23,7 @@ from mjx_softarm.logs.tables import read_table
 from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.sensing.pose import pose_error
 
-LOOKS, LOOK_S = (
-    50,
-    0.02,
-)  # frames of motion capture asked for before an arm moves, and the time between two [s]
+LOOKS, LOOK_S = 50, 0.02  # frames of motion capture tried before an arm moves, and the time between two
 POSE_NAMES = ("x_mm", "y_mm", "z_mm", "yaw_deg", "pitch_deg", "roll_deg")
 GOAL_COLUMNS = ("x [mm]", "y [mm]", "z [mm]", "yaw [deg]", "pitch [deg]", "roll [deg]")
 

@@ -97,13 +97,13 @@ class _Hold:
         """Take the row of a tick, and whether motion capture, if there is any, saw the tip."""
         self.ticks.append(row)
         if not seen or not all(np.isfinite(row[name]).all() for name in NEEDED if name in row):
-            return  # nor does calibration believe it
+            return  # calibration leaves such a row out, too
         if self.rows and leaves(row["pressure_kpa"], self.rows[0]["pressure_kpa"]):
             self.rows.clear()
         self.rows.append(row)
 
     def last_second(self) -> list[dict[str, Any]]:
-        """Return the rows that count."""
+        """Return the rows of the last second, which are averaged."""
         since_s = self.rows[-1]["time_s"] - WINDOW_S - ROUNDING_S
         return [row for row in self.rows if row["time_s"] >= since_s]
 
@@ -118,7 +118,7 @@ class _Hold:
         return not moves(*(np.array([row[name] for row in rows]) for name in ("time_s", "tip_m")))
 
     def check(self, drive: Drive, target_kpa: np.ndarray | None) -> None:
-        """Stop at what no pose of a sound arm shows.
+        """Stop where a pose shows that the arm is faulty.
 
         Raises:
             ArmFault: a sensor stood stock-still, or a chamber at rest does not have its pressure.

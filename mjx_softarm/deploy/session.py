@@ -38,7 +38,7 @@ class Arrival(NamedTuple):
 
 
 class Orders(NamedTuple):
-    """Wishes for the next tick; of several, the safest is done."""
+    """Orders for the next tick; where there are several, the safest one counts."""
 
     vent: bool = False  # let the pressures go to zero; a later goal brings the arm up again
     hold: bool = False  # give up the goals and hold the springs where they are
@@ -46,10 +46,10 @@ class Orders(NamedTuple):
 
 
 class Pilot(Protocol):
-    """Someone who steers an arm while the loop runs. Neither method may wait: both stand in the tick."""
+    """Someone who steers an arm while the loop runs. Neither method may wait: both run within a tick."""
 
     def orders(self) -> Orders:
-        """Return what is wished since the last tick."""
+        """Return the orders since the last tick."""
         ...
 
     def look(self, state: State, tick: Tick, row: dict[str, Any]) -> None:
@@ -65,7 +65,7 @@ class Run(NamedTuple):
     events: tuple[Event, ...]
     latency_s: np.ndarray  # (ticks,) from readings to pressures, without the arm's input and output
     ending: Ending
-    n_goals: int = 0  # that were asked for; 0 of a pilot's
+    n_goals: int = 0  # number of goals asked for; 0 with a pilot
 
     def counts(self) -> dict[Fault, int]:
         """Return how often each fault came."""
@@ -97,7 +97,7 @@ def follow(
         goals: poses (6,) [mm, deg].
         duration_s: vent after so long, wherever the arm is.
         tell: takes a line for each arrival and each fault.
-        arrived: takes the index of each goal arrived at, as the arm rests there; for what a gripper does.
+        arrived: takes the index of each goal arrived at, as the arm rests there; a gripper may act.
         save: writes the log, once the arm is vented.
         stay: hold the last goal, for as long as `duration_s` or until something else ends the run.
     """
@@ -111,7 +111,7 @@ def steer(
     tell: Callable[[str], None] = lambda text: None,
     save: Callable[[Log], None] | None = None,
 ) -> Run:
-    """Do what a pilot orders to an `ArmIO` until something ends the run, then vent; arguments as of `follow`.
+    """Steer an `ArmIO` by a pilot's orders until something ends the run, then vent; arguments as of `follow`.
 
     Without `save` the run may last for days: only the newest rows, arrivals and faults are kept.
     """
@@ -155,7 +155,7 @@ class _Session:
         self.late = False
 
     def to_end(self, save: Callable[[Log], None]) -> Run:
-        """Run, vent, save the log, and return what came of it."""
+        """Run, vent and save the log; return the results."""
         ending = vent_at_end(self.run, self.link, self.tell, lambda: save(self.log()))
         events, latency_s = tuple(self.events), np.array(self.latency_s)
         n_goals = 0 if self.pilot else len(self.goals)
@@ -200,7 +200,7 @@ class _Session:
         try:
             in_time = tick.stop is not None or self.link.write(self.state.pressure_kpa)
             self.state = self.state._replace(pressure_kpa=self.link.pressure_kpa)
-        finally:  # whatever became of the pressures, they did not wait for this
+        finally:  # the row is kept even if the pressures were refused; logging comes after them
             self._keep(row, readings, goal, tick)
         if tick.stop is not None:
             raise _Stopped(self._at(f"{tick.stop.fault.value}: {tick.stop.message}"))

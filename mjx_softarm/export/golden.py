@@ -34,7 +34,7 @@ import numpy as np
 
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.controller import Controller, start
-from mjx_softarm.deploy.faults import Event, Fault, Response
+from mjx_softarm.deploy.faults import Event, Fault
 from mjx_softarm.deploy.link import vented
 from mjx_softarm.deploy.loop import believed, refusals, step, with_goal
 from mjx_softarm.deploy.reachability import nearest
@@ -46,7 +46,6 @@ N_SINGLE, N_CHECKED = 1000, 40
 AXES = ("x", "y", "z", "yaw", "pitch", "roll")
 FLAGS = ("restart", "new_goal", "late", "taken", "lost", "checked")
 BITS = {fault: 1 << k for k, fault in enumerate(Fault)}
-STOPS = sum(bit for fault, bit in BITS.items() if fault.response is Response.VENT)
 
 _SPREAD_M = 2e-3  # of the springs of single rows around the model's, as by payloads
 _OUTSIDE, _LOST = 0.1, 0.1  # shares of single rows

@@ -4,7 +4,7 @@ A finer model than training's, with parts that are off, chambers with hysteresis
 that has to be pumped and sensors that are noisy. Training and calibration never import it. Its parameters
 are drawn from one integer seed and stay private; `describe` tells how they are distributed.
 
-Clock: simulated time stands still but in `write_pressures`, which advances it by one control period of the
+Clock: simulated time passes only in `write_pressures`, which advances it by one control period of the
 specification. So a loop that reads, computes and writes runs at that rate however fast the machine is.
 """
 

@@ -79,7 +79,7 @@ class Target(NamedTuple):
 
 
 class Expert:
-    """The solver for one arm in one pipe, or in the open."""
+    """Solver for one arm, in one pipe or in open space."""
 
     def __init__(self, spec: ArmSpec, s2r: S2R | None = None, pipe: CrossPipe | None = None, seed: int = 0):
         self.spec, self.s2r, self.pipe = spec, s2r, pipe

@@ -150,7 +150,7 @@ class Teleoperation:
 
     def _step(self, finger_m: np.ndarray) -> bool:
         """Bring the finger tips to a point (3,) [m]; False, with a message, where that cannot be done."""
-        waypoint = Waypoint("of the key", finger_m)
+        waypoint = Waypoint("keyboard", finger_m)
         try:
             posture = self.expert.reach(waypoint.name, self.expert.target(waypoint), self._now.pressure_kpa)
         except ExpertError as error:

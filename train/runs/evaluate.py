@@ -96,7 +96,7 @@ class Evaluator:
 
     @functools.cached_property
     def goals(self) -> Array:
-        """Both sets of held-out poses (2 n_goals, 6) [mm, deg]; an export does without and draws none."""
+        """Both sets of held-out poses (2 n_goals, 6) [mm, deg], drawn on first use: an export needs none."""
         sets = (self.env.sample_pool(self.n_goals, HELD_OUT_SEED, evenly) for evenly in (False, True))
         return jnp.concatenate([poses.pose for poses in sets])
 

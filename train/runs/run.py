@@ -113,7 +113,7 @@ def restore_policy(run: Run, task: Task | None = None) -> tuple[Task, Any]:
 
 
 def begin_with(task: Task, seed: int, **donors: Run) -> TrainState:
-    """Return the state that a new run begins with, where parts of its learner are other runs'.
+    """Return the state that a new run begins with, parts of its learner being taken from other runs.
 
     Args:
         task: task of the new run.

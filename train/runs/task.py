@@ -28,7 +28,7 @@ from train.runs.positions import PositionEvaluator
 
 
 class Task(NamedTuple):
-    """A job with all that differs around it from task to task."""
+    """Job of a run, and how the run is evaluated, shown, and prepared for an epoch."""
 
     job: Job | PolishedJob
     title: str  # of the table of figures
@@ -62,7 +62,7 @@ def task_of(
         env: of its arms.
         demonstrations: to learn from; needed where the config is an `ImitationConfig`.
         mesh: devices to train on; None is one device.
-        learner: a learner of one's own in the place of the config's.
+        learner: another learner in the place of the config's.
 
     Raises:
         ConfigError: the run cannot be split evenly over the devices of the mesh.

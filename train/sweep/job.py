@@ -78,7 +78,7 @@ class SweepJob:
         env: ReachEnv,
         learner_of: Callable[[TrainConfig, ReachEnv], Learner],
     ):
-        """Compile nothing yet.
+        """Prepare the functions; nothing is compiled yet.
 
         Args:
             configs: of the members, which differ in their seeds and in the settings `varied` alone.
