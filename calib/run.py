@@ -8,6 +8,7 @@ than its start, keeps the specification's values, and warns. The result is a fol
     recorded.npz  the poses, for `python -m calib plan`
     report.html   results with pictures, and whether to trust them
     report.json   the same for programs
+    poses.npz     measured and simulated poses that the network was fitted to, for the view
 """
 
 from __future__ import annotations
@@ -33,10 +34,11 @@ from calib.read.static_poses import find_static_poses
 from calib.report import sections
 from calib.report.page import Section, to_html, to_json
 from mjx_softarm._support.provenance import write_json
+from mjx_softarm.logs.pose_pairs import PosePairs, write_pose_pairs
 from mjx_softarm.logs.rest import MIN_HOLD_S
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.sensing.pose import pose_from_frame
-from mjx_softarm.sensing.s2r import S2R, S2R_FILE, correct, save_s2r
+from mjx_softarm.sensing.s2r import S2R, S2R_FILE, correct, extrapolation, save_s2r
 from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.spec import ARM_FILE, ArmSpec
 
@@ -53,6 +55,7 @@ class Calibration:
     s2r: S2R | None
     recorded: Recorded | None
     sections: tuple[Section, ...]
+    poses: Mapping[str, PosePairs]  # measured and simulated, without and with the network
 
 
 def calibrate(
@@ -84,10 +87,10 @@ def calibrate(
     progress("damping ...")
     spec, damping = _damping(seen, spec, seed)
     progress("sim-to-real network ...")
-    s2r, network, error_mm = _s2r(seen, spec, seed)
+    s2r, network, error_mm, poses = _s2r(seen, spec, seed)
     if recorded is not None and error_mm is not None:
         recorded = recorded._replace(error_mm=error_mm)
-    return Calibration(spec, s2r, recorded, (springs, chambers, damping, network))
+    return Calibration(spec, s2r, recorded, (springs, chambers, damping, network), poses)
 
 
 def refuse_existing(folder: Path) -> None:
@@ -119,6 +122,8 @@ def write_calibration(
             save_s2r(part / S2R_FILE, calibration.s2r)
         if calibration.recorded is not None:
             save_recorded(part / RECORDED_FILE, calibration.recorded)
+        if calibration.poses:
+            write_pose_pairs(part, calibration.poses)
         report = (calibration.sections, findings, provenance)
         write_json(part / "report.json", to_json(*report))
         (part / "report.html").write_text(to_html(calibration.spec.name, *report), "utf-8")
@@ -179,12 +184,14 @@ def _damping(logs: Sequence[Log], spec: ArmSpec, seed: int) -> tuple[ArmSpec, Se
     return fit.spec if fit.is_better else spec, sections.damping(fit)
 
 
-def _s2r(logs: Sequence[Log], spec: ArmSpec, seed: int) -> tuple[S2R | None, Section, np.ndarray | None]:
+def _s2r(
+    logs: Sequence[Log], spec: ArmSpec, seed: int
+) -> tuple[S2R | None, Section, np.ndarray | None, dict[str, PosePairs]]:
     """Fit the network of the unloaded arm: with a payload, the simulation differs.
 
     Returns:
-        The network, its section, and its error [mm] at each pose of the logs, of which those that were not
-        held out get the mean.
+        The network, its section, its error [mm] at each pose of the logs, of which those that were not held out
+        get the mean, and measured poses beside simulated ones, without and with it.
     """
     poses, rows = find_static_poses(logs, spec)
     unloaded = np.isclose(poses.payload_kg, spec.mass.payload_kg, rtol=0.0, atol=1e-6)
@@ -197,15 +204,17 @@ def _s2r(logs: Sequence[Log], spec: ArmSpec, seed: int) -> tuple[S2R | None, Sec
         rows |= {"poses at which the simulated arm finds no rest": poses.n - n_settled}
         needed = f"Not fitted: {_few(MIN_S2R_POSES, what, n_settled, rows)}"
         remedy = f"policies will be trained on simulated poses: log {MIN_S2R_POSES} poses at rest or more"
-        return None, Section("Sim-to-real network", needed, warnings=(remedy,)), None
+        return None, Section("Sim-to-real network", needed, warnings=(remedy,)), None, {}
     real = pose_from_frame(poses.tip_m, poses.tip_rotation)
     pose, spring_m, real = (x[simulated.valid] for x in (simulated.pose, simulated.spring_m, real))
     fit = fit_s2r(pose, spring_m, real, seed)
-    away_mm = np.linalg.norm((correct(fit.s2r, pose, spring_m) - real)[:, :3], axis=1)
+    away, never = extrapolation(fit.s2r, pose, spring_m), np.zeros(len(pose), bool)
+    corrected = PosePairs(real, correct(fit.s2r, pose, spring_m), away > 1.0)
+    pairs = {"simulated": PosePairs(real, pose, never), "with the network": corrected}
     error_mm = np.full(n_poses, fit.test.translation_mean_mm)
-    error_mm[used[simulated.valid][fit.held_out]] = away_mm[fit.held_out]
+    error_mm[used[simulated.valid][fit.held_out]] = corrected.error_mm[fit.held_out]
     section = sections.s2r(fit, pose, spring_m, real, poses.n - n_settled)
-    return fit.s2r if fit.is_better else None, section, error_mm
+    return fit.s2r if fit.is_better else None, section, error_mm, pairs
 
 
 def _few(n: int, what: str, n_found: int, rows: Mapping[str, int]) -> str:

@@ -35,17 +35,19 @@ def _view(
     policy: cli.MaybePath = None,
     arm: Arm = "twin:7",
     log: cli.MaybePath = None,
+    demos: cli.MaybePath = None,
     spec: cli.SpecFile = None,
     html: cli.MaybePath = None,
     host: str = HERE,
     port: int = 8080,
 ) -> int:
-    """Show an arm in the browser and steer it there; or, with logs, replay these side by side.
+    """Show an arm in the browser and steer it there; or replay logs; or follow a run, or show a calibration.
 
     Args:
-        logs: of `deploy run` and `record`, CSV or npz
+        logs: of `deploy run` and `record`, CSV or npz, side by side; or the folder of a run or a calibration
         policy: file that `python -m train export` wrote, to steer with; without it the package's own is used
         log: file for the log of the steered run, CSV or npz
+        demos: file for demonstrations, poses taken on the page for `train imitate`, CSV or npz
         html: file to write the logs to, as a page that plays without a server
         host: address to listen on; with another one everybody who reaches it can move the arm
         port: port to listen on; the next free one, if it is taken
@@ -56,8 +58,10 @@ def _view(
         raise InputError(
             f"view: got {error}, expected viser: pip install -e '.[view]' in the checkout"
         ) from error
-    for option, path in (("--log", log), ("--html", html)):
+    for option, path in (("--log", log), ("--demos", demos), ("--html", html)):
         check_file(option, path)
+    if any(path.is_dir() for path in logs):
+        return _errors(logs, html, host, port)
     if logs:
         return _replay(logs, ArmSpec.of(spec), html, host, port)
     if html is not None:
@@ -65,8 +69,9 @@ def _view(
     from mjx_softarm.view.live import Setup, live
 
     read, io = load_policy(policy or _shipped()), open_arm(arm)
-    setup = Setup(read, arm, host, port, hasattr(io, "attach"))
-    return live(setup, io, _tell, partial(_welcome, host), partial(save_log, log) if log else None).status
+    setup = Setup(read, arm, host, port, hasattr(io, "attach"), demos is not None)
+    saves = [partial(save_log, path) if path else None for path in (log, demos)]
+    return live(setup, io, _tell, partial(_welcome, host), *saves).status
 
 
 def _shipped() -> Path:
@@ -91,6 +96,19 @@ def _replay(logs: tuple[Path, ...], spec: ArmSpec, html: Path | None, host: str,
     server = open_server(host, port, ", ".join(track.name for track in tracks))
     _tell(f"open http://{host}:{server.get_port()}; Ctrl-C ends")
     return replay(server, spec, tracks)
+
+
+def _errors(folders: tuple[Path, ...], html: Path | None, host: str, port: int) -> int:
+    from mjx_softarm.view.errors import follow_errors, spec_of
+    from mjx_softarm.view.stage import open_server
+
+    folder, *others = folders
+    if others or html is not None:
+        raise InputError(f"LOGS: got {folder} and more, expected one folder without --html, or logs")
+    spec_of(folder)
+    server = open_server(host, port, folder.name)
+    _tell(f"open http://{host}:{server.get_port()}; Ctrl-C ends")
+    return follow_errors(server, folder)
 
 
 def _welcome(host: str, url: str) -> None:

@@ -25,6 +25,7 @@ from mjx_softarm.deploy.session import Orders, Run, steer
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.policy.file import Policy
+from mjx_softarm.view.demonstrations import Demonstrations
 from mjx_softarm.view.look import look_at
 
 READY_S = 60.0  # for the server to start
@@ -41,6 +42,7 @@ class Setup(NamedTuple):
     host: str
     port: int
     carries: bool = False  # a payload can be attached to the arm
+    records: bool = False  # poses can be taken as demonstrations
 
 
 class PagePilot:
@@ -55,6 +57,7 @@ class PagePilot:
         self._tell, self._said = tell, deque(maxlen=N_LINES)
         self._armed, self._payload_kg, self._n_pages, self._lost = False, 0.0, 0, False
         self._doing, self._goal = "waits", np.full(6, np.nan)
+        self.demonstrations, self._takes = Demonstrations(controller.policy), False
         self._circle = _ROUNDS * [self._clamped(goal) for goal in circle_poses()]  # takes longer than a tick
         self._place = _ROUNDS * [self._clamped(goal) for goal in place_poses()]
         self._loads: list[float | None] = []  # to hang to the gripper at the arrivals to come
@@ -71,6 +74,7 @@ class PagePilot:
         asked = self._first | self._end.take()
         self._first = {}
         self._count_pages(asked.get("pages", self._n_pages))
+        self._takes = "take" in asked
         if "payload_kg" in asked:
             self._carry(asked["payload_kg"])
         if self._end.closed.is_set() and not self._lost:
@@ -95,6 +99,8 @@ class PagePilot:
         """Show a tick on the page; grip or let go where the arm has arrived."""
         if tick.arrived and self._loads and (load_kg := self._loads.pop(0)) is not None:
             self._carry(load_kg)
+        if self._takes:
+            self.tell(self.demonstrations.take(state, row))
         self._doing = _doing(state, self._controller.policy.n_actions)
         self._goal = self._goal if state.goal is None else state.goal  # shown until the arm is sent elsewhere
         look = look_at(row, tick.spring_m, self._payload_kg)._replace(goal=self._goal)
@@ -137,6 +143,7 @@ def live(
     tell: Callable[[str], None],
     ready: Callable[[str], None] = lambda url: None,
     save: Callable[[Log], None] | None = None,
+    save_demonstrations: Callable[[Log], None] | None = None,
 ) -> Run:
     """Steer an arm from a page until something ends it; after a fault the page stays until Ctrl-C.
 
@@ -146,9 +153,11 @@ def live(
         tell: takes a line for each arrival and each fault.
         ready: takes the page's address.
         save: writes the run's log.
+        save_demonstrations: writes the poses that were taken, if there are any.
 
     Raises:
         InputError: the page cannot be served.
+        OSError: the demonstrations cannot be written.
     """
     from mjx_softarm.view.page import serve
 
@@ -163,6 +172,8 @@ def live(
         pilot = PagePilot(end, arm, controller, tell)
         arm = Paced(arm) if hasattr(arm, "time_s") else arm
         run = steer(arm, controller, pilot, pilot.tell, save)
+        if save_demonstrations and len(pilot.demonstrations):
+            save_demonstrations(pilot.demonstrations.log())
         end.put(ended=run.ending.cause, vented=run.ending.vented)
         if run.ending.status == FAULT:
             tell("the page stays; Ctrl-C ends it")

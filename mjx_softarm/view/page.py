@@ -25,10 +25,11 @@ _STOP, _VENT = (
     "Give up the goals, hold the arm where it is",
     "Let the pressures go to zero; what it carries sinks",
 )
-_CIRCLE, _PLACE, _GIZMO = (
+_CIRCLE, _PLACE, _GIZMO, _TAKE = (
     "Go round the paper's circle, point by point",
     "Fetch a mass on one side, put it down on the other, and back",
     "Follow the goal that is dragged in the picture",
+    "Take the pose at rest as a demonstration",
 )
 
 
@@ -69,6 +70,8 @@ class Page:
             self._button("Circle", "circle", _CIRCLE, None, viser.Icon.CIRCLE)
             self._button("Pick and place", "place", _PLACE, None, viser.Icon.ARROWS_EXCHANGE)
             self._button("Drag the goal", "follow", _GIZMO, None, viser.Icon.ARROWS_MOVE)
+            if setup.records:
+                self._button("Take the pose", "take", _TAKE, None, viser.Icon.CAMERA)
             if setup.carries:
                 self._add_payload()
             self._box("reachable poses", "Goals are kept near them", points)

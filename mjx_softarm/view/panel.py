@@ -28,9 +28,9 @@ class Panel:
             self._bars = gui.add_html("")
         with gui.add_folder("Traces"):
             lines = ("believed", css(GOAL)), ("seen", css(SEEN))
-            self._errors = _plot(gui, "tip error [mm], violet: seen", lines)
+            self._errors = plot(gui, "tip error [mm], violet: seen", lines)
             colours = [(f"chamber {k}", css(section_colour(k))) for k in range(n)]
-            self._pressures = _plot(gui, "pressures [kPa]", colours)
+            self._pressures = plot(gui, "pressures [kPa]", colours)
         self._trace: deque[tuple] = deque(maxlen=TRACE_POINTS)
 
     def show_bars(self, look: Look) -> None:
@@ -121,7 +121,8 @@ def css(colour: Sequence[int]) -> str:
     return "#" + "".join(f"{part:02x}" for part in colour)
 
 
-def _plot(gui: viser.GuiApi, title: str, lines: Sequence[tuple[str, str]]) -> viser.GuiUplotHandle:
+def plot(gui: viser.GuiApi, title: str, lines: Sequence[tuple[str, str]]) -> viser.GuiUplotHandle:
+    """Add an empty plot of lines, each with a label and a colour, over one axis."""
     series = [uplot.Series(label="s"), *(uplot.Series(label=a, stroke=b, width=1.5) for a, b in lines)]
     scales = {"x": uplot.Scale(time=False), "y": uplot.Scale(auto=True)}
     nothing, legend = tuple(np.zeros(1) for _ in series), uplot.Legend(show=False)

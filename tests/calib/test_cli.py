@@ -11,6 +11,7 @@ from calib.__main__ import main
 from calib.demo import planted_arm, write_demo
 from calib.read.logs import read_log
 from mjx_softarm import ArmSpec
+from mjx_softarm.logs.pose_pairs import read_pose_pairs
 from mjx_softarm.logs.schema import write_log
 from mjx_softarm.sensing.s2r import load_s2r
 
@@ -41,8 +42,11 @@ def test_demo_logs_have_no_fault(demo, capsys):
 def test_run_writes_the_whole_folder_and_nothing_beside_it(calibrated):
     status, folder = calibrated
     assert status in (0, 1)
-    files = ["arm.toml", "recorded.npz", "report.html", "report.json", "s2r.npz"]
-    assert sorted(p.name for p in folder.iterdir()) == files
+    names = ["arm.toml", "poses.npz", "recorded.npz", "report.html", "report.json", "s2r.npz"]
+    assert sorted(p.name for p in folder.iterdir()) == names
+    pairs = read_pose_pairs(folder)
+    network, alone = pairs["with the network"], pairs["simulated"]
+    assert np.median(network.error_mm) < np.median(alone.error_mm) and len(network.target) >= 60
     assert [p.name for p in folder.parent.iterdir()] == ["out"]
     report = json.loads((folder / "report.json").read_text())
     assert status == (0 if report["trustworthy"] else 1)

@@ -18,6 +18,7 @@ import orbax.checkpoint as ocp
 from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.provenance import provenance, write_json
 from mjx_softarm.logs.files import LogError
+from mjx_softarm.logs.pose_pairs import PosePairs, write_pose_pairs
 from mjx_softarm.logs.schema import Log, write_log
 from mjx_softarm.sensing.s2r import S2R, S2R_FILE, load_s2r, save_s2r
 from mjx_softarm.spec import ArmSpec
@@ -60,7 +61,8 @@ class Run:
 
     `config.json` (settings, arm, calibration, versions, commit), `s2r.npz` (the calibration's sim-to-real
     network, if it has one), `demonstrations.npz` (if it learns from them), `checkpoints/`, `metrics.jsonl`,
-    `evaluation.json`, pictures, TensorBoard's event files and, once exported, `policy.npz`.
+    `poses.npz` (of the newest evaluation), `evaluation.json`, pictures, TensorBoard's event files and, once
+    exported, `policy.npz`.
 
     Where several processes train together, all of them open the folder, which they share, and save
     checkpoints; the rest is written by the first alone.
@@ -245,6 +247,16 @@ class Run:
         if is_first_process():
             with (self.path / "metrics.jsonl").open("a", encoding="utf-8") as file:
                 file.write(json.dumps(row) + "\n")
+
+    def write_poses(self, *results: Any) -> None:
+        """Write poses at goals, and around the circle if an evaluation found them, for the view."""
+        if is_first_process():
+            found = [getattr(result, "reached", result) for result in results]
+            sets = {
+                name: PosePairs(at.goal, at.pose, (at.saturated_chambers > 0) | ~at.settled)
+                for name, at in zip(("goals", "circle"), found, strict=False)
+            }
+            write_pose_pairs(self.path, sets)
 
     def metrics(self) -> list[dict[str, Any]]:
         """Return the lines of `metrics.jsonl`, up to the first incomplete one."""

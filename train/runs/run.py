@@ -55,7 +55,7 @@ def train(run: Run, task: Task, console: Console) -> Any:
                 epoch += 1
                 stop, due = any_process(bool(asked)), config.evaluates_after(epoch)
                 if due:
-                    row |= evaluation(task, task.job.policy(state))
+                    row |= evaluation(run, task, task.job.policy(state))
                 record(run, board, epoch, counts(state), row)
                 if due or stop:
                     run.save(epoch, state)
@@ -84,6 +84,7 @@ def finish(run: Run, task: Task, policy: Any) -> Any:
     """Evaluate a policy, write `evaluation.json` and the pictures; returns the figures."""
     summary, *reached = task.evaluate(policy)
     if is_first_process():
+        run.write_poses(*reached)
         figures = summary.to_dict()
         if run.config.polish_updates:
             figures["tqc_alone"] = evaluation_after(run, run.config.n_own_epochs)
@@ -159,9 +160,11 @@ def timed_epoch(job: Any, state: TrainState) -> tuple[TrainState, dict[str, Any]
     return state, metrics | speeds
 
 
-def evaluation(task: Task, policy: Any) -> dict[str, float]:
-    """Return the figures of a policy, named as in a row of metrics."""
-    figures = task.evaluate(policy)[0].to_dict()
+def evaluation(run: Run, task: Task, policy: Any) -> dict[str, float]:
+    """Return the figures of a policy, named as in a row of metrics; its poses go into the run's folder."""
+    summary, *results = task.evaluate(policy)
+    run.write_poses(*results)
+    figures = summary.to_dict()
     return {f"evaluation/{name}": x for name, x in figures.items() if not isinstance(x, tuple)}
 
 

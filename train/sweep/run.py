@@ -142,7 +142,7 @@ def train(sweep: Sweep, console: Console) -> None:
             stop, due, done = bool(asked), config.evaluates_after(epoch), counts(states)
             for k, (run, board, row) in enumerate(zip(sweep.runs, boards, rows, strict=True)):
                 if due:
-                    row |= evaluation(tasks[run.config.env], job.policy(states, k))
+                    row |= evaluation(run, tasks[run.config.env], job.policy(states, k))
                 record(run, board, epoch, done, row)
                 if due or stop:
                     run.save(epoch, job.member(states, k))

@@ -1,0 +1,71 @@
+"""Pairs of poses that should be equal, as a training run or a calibration leaves them for the view.
+
+The npz file `POSES_FILE` of a folder holds named sets: `<set>.target` and `<set>.pose` (n, 6) [mm, deg], and
+`<set>.warned` (n,) bool.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from mjx_softarm._support.archive import ZIP_ERRORS
+from mjx_softarm._support.errors import InputError
+
+POSES_FILE = "poses.npz"
+
+
+class PosePairs(NamedTuple):
+    """n poses beside their targets."""
+
+    target: np.ndarray  # (n, 6) [mm, deg] goals of a run, measured tips of a calibration
+    pose: np.ndarray  # (n, 6) [mm, deg] reached, or simulated
+    warned: np.ndarray  # (n,) bool: a chamber saturated or the arm not settled; the network extrapolating
+
+    @property
+    def error_mm(self) -> np.ndarray:
+        """Distance (n,) of the positions."""
+        return np.linalg.norm((self.pose - self.target)[:, :3], axis=-1)
+
+
+def write_pose_pairs(folder: Path, sets: Mapping[str, PosePairs]) -> None:
+    """Write sets by their names into a folder, whole or not at all.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    arrays = {f"{name}.{field}": x for name, pairs in sets.items() for field, x in pairs._asdict().items()}
+    part = folder / f"{POSES_FILE}.part"
+    with part.open("wb") as file:
+        np.savez_compressed(file, **arrays)
+    os.replace(part, folder / POSES_FILE)
+
+
+def read_pose_pairs(folder: Path) -> dict[str, PosePairs]:
+    """Read the sets of a folder.
+
+    Raises:
+        InputError: there are none, or the file is of something else.
+    """
+    path = folder / POSES_FILE
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+            names = dict.fromkeys(key.rpartition(".")[0] for key in arrays.files)
+            sets = {
+                name: PosePairs(*(arrays[f"{name}.{field}"] for field in PosePairs._fields)) for name in names
+            }
+    except FileNotFoundError as error:
+        expected = f"{POSES_FILE} of a run that was evaluated, or of a calibration with a sim-to-real network"
+        raise InputError(f"{folder}: got no {POSES_FILE}, expected the {expected}") from error
+    except (*ZIP_ERRORS, OSError, KeyError, ValueError) as error:
+        raise InputError(f"{path}: got {error}, expected sets of poses") from error
+    for name, pairs in sets.items():
+        n = len(pairs.warned)
+        shapes = [x.shape for x in pairs]
+        if shapes != [(n, 6), (n, 6), (n,)]:
+            raise InputError(f"{path}: {name}: got shapes {shapes}, expected (n, 6), (n, 6) and (n,)")
+    return sets

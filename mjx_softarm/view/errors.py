@@ -1,0 +1,164 @@
+"""Errors of poses in space: those of a training run as it goes on, or of a calibration."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+import viser
+
+from mjx_softarm._support.errors import InputError
+from mjx_softarm.logs.pose_pairs import POSES_FILE, PosePairs, read_pose_pairs
+from mjx_softarm.spec import ARM_FILE, ArmSpec
+from mjx_softarm.view.panel import css, plot
+from mjx_softarm.view.stage import SATURATED, Stage, set_the_scene
+
+CONFIG_FILE, METRICS_FILE = "config.json", "metrics.jsonl"  # of a run
+CURVES = {"evaluation/median_mm": ("median", "#1f6fb4"), "evaluation/circle_mean_mm": ("circle", "#e07b28")}
+REFRESH_S = 1.0
+SCALE_MM = np.array([1.0, 2.0, 5.0, 10.0, 20.0])  # errors of these colours, those between in between
+SCALE = np.array([(33, 145, 80), (140, 190, 60), (240, 200, 60), (240, 130, 40), (200, 30, 60)])
+_POINT_M, _WARNED = 0.005, SATURATED
+
+
+def spec_of(folder: Path) -> ArmSpec:
+    """Return the arm of a run's or a calibration's folder.
+
+    Raises:
+        InputError: the folder is neither.
+        SpecError: its specification cannot be used.
+    """
+    if (folder / ARM_FILE).exists():
+        return ArmSpec.from_toml(folder / ARM_FILE)
+    try:
+        return ArmSpec.from_dict(json.loads((folder / CONFIG_FILE).read_text("utf-8"))["spec"], str(folder))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        expected = f"the folder of a run, with {CONFIG_FILE}, or of a calibration, with {ARM_FILE}"
+        raise InputError(f"{folder}: got {error}, expected {expected}") from error
+
+
+def colours(error_mm: np.ndarray) -> np.ndarray:
+    """Return colours (n, 3) of errors (n,) [mm], on a logarithmic scale."""
+    place = np.log(np.maximum(error_mm, SCALE_MM[0]))
+    return np.stack([np.interp(place, np.log(SCALE_MM), part) for part in SCALE.T], axis=-1).astype(np.uint8)
+
+
+class Errors:
+    """Poses at their targets, coloured by their errors, with lines to the targets; and learning curves.
+
+    Raises:
+        InputError: the folder is neither a run's nor a calibration's.
+    """
+
+    def __init__(self, server: viser.ViserServer, folder: Path):
+        self._server, self._folder, self._read = server, folder, {}
+        self._is_run = (folder / CONFIG_FILE).exists()
+        spec = spec_of(folder)
+        set_the_scene(server, spec)
+        Stage(server.scene, spec)
+        self._text = server.gui.add_html("", order=0.0)
+        self._sets = server.gui.add_folder("Poses", order=0.5)
+        self._boxes: dict[str, viser.GuiCheckboxHandle] = {}
+        if self._is_run:
+            self._curve = plot(server.gui, "tip error [mm] over env steps", list(CURVES.values()))
+
+    def refresh(self) -> None:
+        """Show what the folder holds now, if it is another than before."""
+        if self._changed(POSES_FILE):
+            sets = read_pose_pairs(self._folder)
+            with self._server.atomic():
+                for name, pairs in sets.items():
+                    self._show(name, pairs)
+            self._say("".join(_row(name, pairs) for name, pairs in sets.items()))
+        elif not self._boxes:
+            self._say("<div>waiting for the first evaluation ...</div>")
+        if self._is_run and self._changed(METRICS_FILE):
+            self._show_curves()
+
+    def _changed(self, name: str) -> bool:
+        """Return whether a file is there and was written since this was asked last."""
+        path = self._folder / name
+        written = path.stat().st_mtime_ns if path.exists() else None
+        before, self._read[name] = self._read.get(name), written
+        return written not in (None, before)
+
+    def _show(self, name: str, pairs: PosePairs) -> None:
+        target_m, pose_m = 1e-3 * pairs.target[:, :3], 1e-3 * pairs.pose[:, :3]
+        box = self._boxes.get(name) or self._add_box(name)
+        colour = colours(pairs.error_mm)
+        looks = {"point_size": _POINT_M, "point_shape": "circle", "visible": box.value}
+        scene = self._server.scene
+        scene.add_point_cloud(f"/{name}/points", target_m, colour, **looks)
+        lines = np.stack([target_m, pose_m], axis=1)  # (n, 2, 3)
+        scene.add_line_segments(
+            f"/{name}/lines",
+            lines,
+            np.repeat(colour[:, None], 2, axis=1),
+            thickness=2.0,
+            thickness_units="screen",
+        )
+        if pairs.warned.any():
+            looks |= {"point_size": 2 * _POINT_M, "point_shape": "diamond"}
+            scene.add_point_cloud(f"/{name}/warned", target_m[pairs.warned], _WARNED, **looks)
+        else:
+            scene.remove_by_name(f"/{name}/warned")
+
+    def _add_box(self, name: str) -> viser.GuiCheckboxHandle:
+        node = self._server.scene.add_frame(f"/{name}", show_axes=False)
+        with self._sets:
+            box = self._server.gui.add_checkbox(name, True)
+        box.on_update(lambda _: setattr(node, "visible", box.value))
+        self._boxes[name] = box
+        return box
+
+    def _show_curves(self) -> None:
+        rows = _rows(self._folder / METRICS_FILE)
+        evaluated = [row for row in rows if all(name in row for name in CURVES)]
+        if evaluated:
+            self._curve.data = tuple(
+                np.array([row[name] for row in evaluated], float) for name in ("env_steps", *CURVES)
+            )
+
+    def _say(self, rows: str) -> None:
+        stops = ", ".join(f"{css(c)} {100 * k / (len(SCALE) - 1):.0f}%" for k, c in enumerate(SCALE))
+        marks = "".join(f"<span>{mm:g}</span>" for mm in SCALE_MM)
+        bar = f"height:8px;border-radius:4px;background:linear-gradient(to right, {stops})"
+        about = "a chamber saturated, or not settled" if self._is_run else "the network extrapolates"
+        self._text.content = (
+            "<div style='padding:0.5em 0.8em;font-size:12px;line-height:1.5'>"
+            f"{rows}<div style='margin-top:0.5em;{bar}'></div>"
+            f"<div style='display:flex;justify-content:space-between;color:#868e96'>{marks}</div>"
+            f"<div style='color:#868e96'>error [mm]; diamonds: {about}</div></div>"
+        )
+
+
+def _row(name: str, pairs: PosePairs) -> str:
+    median, most = np.quantile(pairs.error_mm, (0.5, 0.95))
+    poses = f"{len(pairs.target)} poses, {pairs.warned.sum()} marked"
+    return f"<div><b>{name}</b>: median {median:.2f} mm, 95 % {most:.2f} mm; {poses}</div>"
+
+
+def _rows(path: Path) -> list[dict[str, Any]]:
+    """Return the lines of a file of metrics; the last may be half written."""
+    rows = []
+    for line in path.read_text("utf-8").splitlines():
+        try:
+            rows.append(json.loads(line))
+        except json.JSONDecodeError:
+            break
+    return rows
+
+
+def follow_errors(server: viser.ViserServer, folder: Path) -> NoReturn:
+    """Serve the errors of a folder until Ctrl-C.
+
+    Raises:
+        InputError: as of `Errors`, or its poses cannot be read.
+    """
+    page = Errors(server, folder)
+    while True:
+        page.refresh()
+        time.sleep(REFRESH_S)

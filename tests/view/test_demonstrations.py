@@ -1,0 +1,70 @@
+"""Demonstrations that are taken from a steered arm, checked as they are taken."""
+
+import re
+
+import numpy as np
+import pytest
+
+from mjx_softarm.deploy.controller import start
+from mjx_softarm.logs.schema import write_log
+from mjx_softarm.view.demonstrations import Demonstrations
+from tests.linear_arm import CONTROLLER, HIGH_KPA, POLICY, REST_M, SENSOR, SPEC, N
+from train.demos.demonstrations import load_demonstrations
+
+POSE = np.array([20.0, -10.0, -600.0, 0.0, 5.0, 0.0])
+HOLDS = start(CONTROLLER)._replace(
+    reference_m=np.full(N, REST_M),
+    spring_m=np.full(N, REST_M),
+    springs_m=np.full((CONTROLLER.window, N), REST_M),
+)
+READINGS = SENSOR.readings(np.full(N, REST_M))
+
+
+def row(time_s, pose=POSE, **others):
+    return {"time_s": time_s, "readings": READINGS, "estimate": pose} | others
+
+
+def test_poses_are_what_imitation_takes(tmp_path):
+    demos = Demonstrations(POLICY)
+    assert demos.take(HOLDS, row(1.0)) == "pose 1 taken: tip at 20, -10, -600 mm, believed"
+    assert "expected another" in demos.take(HOLDS, row(2.0, POSE + 0.5))
+    seen = {"tip_m": np.array([0.0, 0.03, -0.6]), "tip_quaternion": np.array([1.0, 0.0, 0.0, 0.0])}
+    assert demos.take(HOLDS, row(3.0, **seen)).endswith("tip at 0, 30, -600 mm, seen")
+    missed = {"tip_m": np.full(3, np.nan), "tip_quaternion": np.full(4, np.nan)}
+    assert demos.take(HOLDS, row(4.0, **missed)).endswith("believed")
+    write_log(tmp_path / "demos.csv", demos.log())
+    found = load_demonstrations(tmp_path / "demos.csv", SPEC)
+    np.testing.assert_allclose(found.positions, [POSE, [0, 30, -600, 0, 0, 0], POSE], atol=1e-3)
+    np.testing.assert_allclose(
+        found.actions, POLICY.actions.from_readings(np.tile(READINGS, (3, 1))), atol=1e-4
+    )
+    assert not found.sequence.any()
+
+
+@pytest.mark.parametrize(
+    ("state", "others", "message"),
+    [
+        (HOLDS._replace(reference_m=None), {}, "has no pressure, expected one at rest"),
+        (HOLDS._replace(goal=POSE), {}, "an arm that moves"),
+        (
+            HOLDS._replace(springs_m=np.linspace(0.2, 0.21, 25)[:, None] + np.zeros(N)),
+            {},
+            "an arm that moves",
+        ),
+        (HOLDS._replace(n_lost=np.eye(N, dtype=int)[4]), {}, "spring 4: got no reading"),
+        (
+            HOLDS._replace(pressure_kpa=HIGH_KPA * np.eye(N)[2], reference_m=REST_M + 0.01 * np.eye(N)[2]),
+            {},
+            "chamber 2: got its limit of pressure",
+        ),
+        (
+            HOLDS,
+            {"readings": SENSOR.readings(np.full(N, 0.3))},
+            "spring 0: got .* Hz, expected .* range of actions",
+        ),
+    ],
+)
+def test_poses_that_cannot_be_learned_from_are_refused(state, others, message):
+    demos = Demonstrations(POLICY)
+    assert re.search(f"pose not taken: .*{message}", demos.take(state, row(1.0, **others)))
+    assert len(demos) == 0
