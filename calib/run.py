@@ -190,7 +190,7 @@ def _s2r(
     """Fit the network of the unloaded arm: with a payload, the simulation differs.
 
     Returns:
-        The network, its section, its error [mm] at each pose of the logs, of which those that were not held out
+        The network, its section, its error [mm] at each pose of the logs, of which those not held out
         get the mean, and measured poses beside simulated ones, without and with it.
     """
     poses, rows = find_static_poses(logs, spec)
