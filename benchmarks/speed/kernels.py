@@ -26,10 +26,8 @@ from benchmarks.harness.rounds import Facts, Worker, WorkerError, serve, working
 from mjx_softarm.spec import ArmSpec
 
 N_ARMS = 8192
-OF_EIGHT = (
-    *("n_arms=65536", "vector_steps_per_epoch=4", "updates_per_env_step=0.0009765625"),
-    *("batch_size=32768", "replay_capacity=4194304"),
-)
+OF_EIGHT = ("n_arms=65536", "vector_steps_per_epoch=4", "updates_per_env_step=0.0009765625")
+OF_EIGHT += ("batch_size=32768", "replay_capacity=4194304")
 H200 = """gpu_device_info { core_count: 132 fpus_per_core: 128 memory_bandwidth: 4800000000000
 threads_per_block_limit: 1024 threads_per_warp: 32 threads_per_core_limit: 2048 clock_rate_ghz: 1.98
 shared_memory_per_block: 49152 shared_memory_per_core: 233472 shared_memory_per_block_optin: 232448
