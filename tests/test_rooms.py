@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[1]
 LEVELS = (
     ("_support",),
     ("sensing",),
-    ("spec",),
+    ("spec", "pneumatics"),
     ("mechanics", "control", "logs"),
     ("mdp",),
     ("env", "policy"),

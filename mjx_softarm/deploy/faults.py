@@ -38,7 +38,7 @@ from mjx_softarm.spec import N_CHAMBERS_PER_SECTION
 
 LOST_TICKS = 3
 LATE_TICKS = 5
-SETTLE_TIMEOUT_S = 15.0  # a pump of 12 L/min takes up to 10 s from one end of the workspace to the other
+SETTLE_TIMEOUT_S = 15.0  # a twin is within 2 mm of its rest after 4 s, and still after some more
 STILL_M = 2e-4  # greatest difference between the means of a window's halves at rest; far above the noise
 
 # A spring is stuck if its readings range over less than the noise of a live one, some 0.01 mm, while in the

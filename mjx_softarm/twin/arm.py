@@ -20,6 +20,7 @@ from mjx_softarm.deploy.arm_io import Capture
 from mjx_softarm.mechanics.body import payload_radius_m
 from mjx_softarm.mechanics.mjcf import chamber_lengths, spring_lengths
 from mjx_softarm.mechanics.pipe import CrossPipe
+from mjx_softarm.pneumatics import PUMP_M3_PER_S, VALVE_S
 from mjx_softarm.spec import ArmSpec
 from mjx_softarm.twin.hysteresis import StopOperators
 from mjx_softarm.twin.instruments import (
@@ -42,7 +43,7 @@ from mjx_softarm.twin.model import (
     scaled_tolerances,
 )
 from mjx_softarm.twin.pipe import WallForce, contact_force, is_container
-from mjx_softarm.twin.pneumatics import PUMP_M3_PER_S, VALVE_S, Pneumatics
+from mjx_softarm.twin.pneumatics import Pneumatics
 
 # Chambers: four stops of equal force; 3 % of the elastic force of a chamber at its shortest.
 HYSTERESIS_LIMIT_N = 1.5
