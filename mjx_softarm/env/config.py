@@ -27,11 +27,14 @@ class Randomisation:
     payload_max_kg: float = 0.0  # the payload is uniform from the spec's to this much more
     stiffness_spread: float = 0.0  # each chamber's stiffness is times 1 + uniform(-spread, spread)
     sensor_noise_mm: float = 0.0  # standard deviation of each spring's reading, fixed within an episode
+    damping_spread: float = 0.0  # in motion, all dampers are times 1 + uniform(-spread, spread)
+    delay_max_s: float = 0.0  # in motion, the valves' dead time is uniform from their own to this much more
 
     def __post_init__(self):
-        for name in ("payload_max_kg", "sensor_noise_mm"):
+        for name in ("payload_max_kg", "sensor_noise_mm", "delay_max_s"):
             _expect(self, name, 0 <= getattr(self, name) < math.inf, "a finite number >= 0")
-        _expect(self, "stiffness_spread", 0 <= self.stiffness_spread < 1, "0 to 1")
+        for name in ("stiffness_spread", "damping_spread"):
+            _expect(self, name, 0 <= getattr(self, name) < 1, "0 to 1")
 
 
 @dataclass(frozen=True)
@@ -39,9 +42,12 @@ class EnvConfig:
     """Simulation, reward and randomisation of `ReachEnv`."""
 
     engine: Annotated[Literal["chain", "mjx"], arg(aliases=["--engine"])] = "chain"
-    """kinematics of the quasi-static mode"""
+    """kinematics: in closed form, or MJX's; all else is shared, the inertia in motion being MJX's"""
     mode: Annotated[Literal["quasistatic", "dynamic"], arg(aliases=["--mode"])] = "quasistatic"
     """equilibrium of each action, or its motion"""
+    observation: Literal["pose", "motion"] = "pose"
+    """pose and goal, or also springs, their rates, the tip's velocity and the last action; in dynamic mode"""
+    goal_ends: bool = True  # a goal that is reached ends the episode; else it pays in every step
     reward: RewardConfig = field(default_factory=RewardConfig)
     randomisation: Randomisation = field(default_factory=Randomisation)
     saturation_tolerance_mm: float = 1e3 * TOLERANCE_M
@@ -50,15 +56,23 @@ class EnvConfig:
     even_share: float = 0.0  # share of these that are uniform in volume, rim included
     workspace_seed: int = 0  # seed of these poses
     dynamic_step_s: float = 0.5  # duration of one environment step in dynamic mode
+    simulation_step_s: float = 0.02  # time step in dynamic mode, at most; no longer than a control period
     pipe_diameter_mm: Annotated[float | None, arg(aliases=["--pipe"])] = None
     """cross-shaped pipe around the arm, without contact"""
     clearance_cost_per_mm: float = 0.0  # reward lost per mm by which the clearance falls below the margin
     clearance_margin_mm: float = 10.0  # clearance of the body to the wall that costs nothing
 
     def __post_init__(self):
-        for name, allowed in (("engine", ("chain", "mjx")), ("mode", ("quasistatic", "dynamic"))):
+        for name, allowed in (
+            ("engine", ("chain", "mjx")),
+            ("mode", ("quasistatic", "dynamic")),
+            ("observation", ("pose", "motion")),
+        ):
             _expect(self, name, getattr(self, name) in allowed, f"one of {allowed}")
-        _expect(self, "dynamic_step_s", 0 < self.dynamic_step_s < math.inf, "a finite number > 0")
+        known = self.observation == "pose" or self.mode == "dynamic"
+        _expect(self, "observation", known, "'pose' for arms at rest")
+        for name in ("dynamic_step_s", "simulation_step_s"):
+            _expect(self, name, 0 < getattr(self, name) < math.inf, "a finite number > 0")
         for item in fields(self.reward):
             value = getattr(self.reward, item.name)
             _expect(self.reward, item.name, 0 <= value < math.inf, "a finite number >= 0")

@@ -1,13 +1,11 @@
 """One arm that reaches for poses: a brax environment with the paper's state, action and reward.
 
 An action is nine sensor readings, scaled to [-1, 1]; the sensor-space law turns them into pressures.
-`mode="quasistatic"` goes straight to the equilibrium (kinematics from `engine`), `mode="dynamic"` steps
-`mjx.step` under the law at the control rate.
+`mode="quasistatic"` goes straight to the equilibrium; `mode="dynamic"` steps MJX's equation of motion, with
+chambers that fill, under the law at the control rate. Both have their kinematics from `engine`.
 """
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,16 +15,18 @@ from mjx_softarm import control
 from mjx_softarm._support import draws
 from mjx_softarm._support.mjx import Env, State, mjx
 from mjx_softarm.env.config import EnvConfig
+from mjx_softarm.env.state import ArmState, EpisodeNoise
 from mjx_softarm.mdp import observation as obs
 from mjx_softarm.mdp import rewards
 from mjx_softarm.mdp.actions import ActionMap
-from mjx_softarm.mechanics.dynamics import Motion, MotionResult, Moved, advance, with_params
+from mjx_softarm.mechanics.dynamics import Motion, MotionResult, Moved, MovingArm, advance
 from mjx_softarm.mechanics.kinematics import chain_kinematics, mjx_kinematics
 from mjx_softarm.mechanics.mjcf import build_model
 from mjx_softarm.mechanics.pipe import CrossPipe, body_clearance
 from mjx_softarm.mechanics.settle import Settled, SettleResult, settle
 from mjx_softarm.mechanics.statics import ArmParams
 from mjx_softarm.mechanics.workspace import Pool, sample_evenly, sample_workspace
+from mjx_softarm.pneumatics import VALVE_S
 from mjx_softarm.sensing.pose import pose_from_frame
 from mjx_softarm.sensing.s2r import S2R, carry_body, correct
 from mjx_softarm.sensing.sensors import SENSORS
@@ -36,27 +36,6 @@ PAYLOAD = 1  # index in ArmParams.tool_mass_kg
 
 for _sensor in SENSORS.values():
     jax.tree_util.register_dataclass(_sensor)  # numbers are traced, the kind is static
-
-
-class EpisodeNoise(NamedTuple):
-    """Random numbers that fix one episode: start, goal, payload, stiffness, sensor bias."""
-
-    uniform: Array  # (3 + n_chambers,) from 0 to 1: start, goal, payload, stiffness of each chamber
-    normal: Array  # (n_chambers,) standard normal: bias of each spring's reading
-
-
-class ArmState(NamedTuple):
-    """One arm between two actions."""
-
-    payload_kg: Array  # () payload of this episode
-    chamber_stiffness: Array  # (n_chambers,) [N/m] stiffnesses of this episode
-    sensor_offset_m: Array  # (n_chambers,) reading less true length, in this episode
-    motion: Motion  # joint coordinates, velocities, integral of the law
-    pose: Array  # (6,) [mm, deg] as observed: the real arm's where there is a sim-to-real network
-    spring_m: Array  # (n_chambers,) true lengths
-    pressure_kpa: Array  # (n_chambers,)
-    goal: Array  # (6,) [mm, deg]
-    n_steps: Array  # () actions taken in this episode
 
 
 class ReachEnv(Env):
@@ -69,6 +48,7 @@ class ReachEnv(Env):
                angles by 90 deg
         6-11   pose of the goal, scaled in this way, too
         12-17  error w (pose - goal), by the reward's weights per mm and per degree, angles wrapped
+        With `observation="motion"`, 30 more follow: see `mjx_softarm.mdp.observation.observe_motion`
 
     Action (n_chambers,), each in [-1, 1]: readings of the springs' sensors to be reached, from that of the
         shortest to that of the longest spring (`mjx_softarm.mdp.actions`). The sensor-space law then sets the
@@ -81,6 +61,7 @@ class ReachEnv(Env):
     Info:
         valid () bool            the simulation succeeded; learn from no other step
         saturated () bool        a chamber is at a pressure limit with its spring off its reference
+        blocked (n_chambers,)    which chambers are
         clearance_mm ()          distance of the body to the pipe's wall; infinite without a pipe
 
     Metrics, each () float32:
@@ -120,7 +101,11 @@ class ReachEnv(Env):
 
     @property
     def observation_size(self) -> int:
-        return obs.OBS_SIZE
+        return obs.OBS_SIZE + (obs.motion_size(self.action_size) if self.observes_motion else 0)
+
+    @property
+    def observes_motion(self) -> bool:
+        return self.config.observation == "motion"
 
     @property
     def action_size(self) -> int:
@@ -163,7 +148,9 @@ class ReachEnv(Env):
 
     def sample_noise(self, rng: Array, n: int) -> EpisodeNoise:
         """Draw the random numbers of n episodes: leaves (n, ...)."""
-        return EpisodeNoise(*draws.both(rng, (n, 3 + self.action_size), (n, self.action_size)))
+        moves = self.config.mode == "dynamic"
+        moving = draws.uniform(jax.random.fold_in(rng, 1), (n, 2)) if moves else None
+        return EpisodeNoise(*draws.both(rng, (n, 3 + self.action_size), (n, self.action_size)), moving)
 
     def reset_from(self, noise: EpisodeNoise) -> State:
         """Start the episode that `noise` fixes."""
@@ -172,18 +159,23 @@ class ReachEnv(Env):
         start = jax.tree.map(lambda x: x[start_row], self.pool)
         goal = self.pool.pose[goal_row]
         spread = self.config.randomisation
+        damping, delay = jnp.array([0.5, 0.0]) if noise.moving is None else noise.moving
         arm = ArmState(
             payload_kg=self.params.tool_mass_kg[PAYLOAD] + spread.payload_max_kg * share[2],
             chamber_stiffness=self.params.chamber_stiffness
             * (1.0 + spread.stiffness_spread * (2.0 * share[3:] - 1.0)),
             sensor_offset_m=1e-3 * spread.sensor_noise_mm * noise.normal,
-            motion=Motion(start.q, jnp.zeros_like(start.q), start.pressure_kpa),
+            damping=1.0 + spread.damping_spread * (2.0 * damping - 1.0),
+            delay_s=VALVE_S + spread.delay_max_s * delay,
+            motion=Motion.at_rest(start.q, start.pressure_kpa),
             pose=start.pose,
             spring_m=start.spring_m,
             pressure_kpa=start.pressure_kpa,
+            sensed=None,
             goal=goal,
             n_steps=jnp.zeros((), jnp.int32),
         )
+        arm = arm._replace(sensed=self._sensed(arm, arm, self.action_of(arm.spring_m + arm.sensor_offset_m)))
         zero = jnp.zeros(())
         names = ("tip_error_mm", "reached", "saturated_chambers", "unsettled", *self._failures)
         metrics = dict.fromkeys(names, zero)
@@ -191,10 +183,11 @@ class ReachEnv(Env):
         metrics |= {f"reward_{name}": zero for name in terms}
         info = {
             "saturated": jnp.array(False),
+            "blocked": jnp.zeros(self.action_size, bool),
             "valid": jnp.array(True),
             "clearance_mm": self._clearance_mm(start.q, start.pose),
         }
-        return State(arm, self.observe(arm.pose, goal), zero, zero, metrics, info)
+        return State(arm, self.observe(arm.pose, goal, arm.sensed), zero, zero, metrics, info)
 
     def step(self, state: State, action: Array) -> State:
         """Move to the references of `action` (n_chambers,) in [-1, 1]; `done` is 1 where the goal is reached.
@@ -215,10 +208,12 @@ class ReachEnv(Env):
             pressure_kpa=end.pressure_kpa,
             n_steps=arm.n_steps + 1,
         )
+        moved = moved._replace(sensed=self._sensed(moved, end, action))
         arm = jax.tree.map(lambda new, old: jnp.where(valid, new, old), moved, arm)
         tolerance = 1e-3 * self.config.saturation_tolerance_mm
         reading = arm.spring_m + arm.sensor_offset_m
-        saturated = control.saturated(arm.pressure_kpa, reference, reading, self.gains, tolerance) & valid
+        held_kpa = arm.motion.integral_kpa  # pressures of a rest; in motion a limit may pass
+        saturated = control.saturated(held_kpa, reference, reading, self.gains, tolerance) & valid
         blocked, clearance_mm = jnp.any(saturated), self._clearance_mm(arm.motion.q, arm.pose)
         terms: dict[str, Array]
         value, reached, terms = rewards.reward(
@@ -235,22 +230,23 @@ class ReachEnv(Env):
         }
         return state.replace(
             pipeline_state=arm,
-            obs=self.observe(arm.pose, arm.goal),
+            obs=self.observe(arm.pose, arm.goal, arm.sensed),
             reward=jnp.where(valid, value, 0.0),
-            done=(reached | ~valid).astype(jnp.float32),
+            done=((reached & self.config.goal_ends) | ~valid).astype(jnp.float32),
             metrics=state.metrics | metrics,
-            info=state.info | {"saturated": blocked, "valid": valid, "clearance_mm": clearance_mm},
+            info=state.info
+            | {"saturated": blocked, "blocked": saturated, "valid": valid, "clearance_mm": clearance_mm},
         )
 
     def _move(self, arm: ArmState, reference_m: Array) -> tuple[Motion, Settled | Moved]:
-        params = self.params_of(arm)
-        if self.config.mode == "dynamic":
-            model, period_s = with_params(self.model, params), 1.0 / self.spec.control.rate_hz
-            return advance(model, arm.motion, reference_m, self.gains, self.config.dynamic_step_s, period_s)
-        uses_mjx = self.config.engine == "mjx"
-        kinematics = mjx_kinematics(self.model) if uses_mjx else chain_kinematics(params)
+        params, config = self.params_of(arm), self.config
+        kinematics = mjx_kinematics(self.model) if config.engine == "mjx" else chain_kinematics(params)
+        if config.mode == "dynamic":
+            moving = MovingArm.of(self.model, kinematics, params, arm.damping, arm.delay_s)
+            times_s = config.dynamic_step_s, 1.0 / self.spec.control.rate_hz, config.simulation_step_s
+            return advance(moving, arm.motion, reference_m, self.gains, *times_s)
         end = settle(kinematics, params, reference_m)
-        return Motion(end.q, jnp.zeros_like(end.q), end.pressure_kpa), end
+        return Motion.at_rest(end.q, end.pressure_kpa), end
 
     def clearance_cost(self, clearance_mm: Array) -> Array:
         """Return the cost (...) of clearances (...) [mm] of the body to the pipe's wall."""
@@ -267,9 +263,21 @@ class ReachEnv(Env):
             plates = carry_body(*plates, pose)
         return 1e3 * body_clearance(self.pipe, *plates, self.spec)
 
-    def observe(self, pose: Array, goal: Array) -> Array:
-        """Return the observation (..., 18) of a pose and a goal (..., 6) [mm, deg]."""
-        return obs.observe(pose, goal, self.scale, self.config.reward)
+    def observe(self, pose: Array, goal: Array, sensed: Array | None = None) -> Array:
+        """Return the observation (..., O) of pose and goal (..., 6) [mm, deg], and of `ArmState.sensed`."""
+        observed = obs.observe(pose, goal, self.scale, self.config.reward)
+        return observed if sensed is None else jnp.concatenate([observed, sensed], axis=-1)
+
+    def _sensed(self, arm: ArmState, end: ArmState | Settled | Moved, action: Array) -> Array | None:
+        """Return `ArmState.sensed` of an arm, at rest where `end` is not the end of a motion."""
+        if not self.observes_motion:
+            return None
+        last_m, tip_mm, last_mm = end.spring_m, jnp.zeros(3), jnp.zeros(3)
+        if isinstance(end, Moved):
+            last_m, tip_mm = end.last_spring_m, 1e3 * end.tip_position_m
+            last_mm = 1e3 * end.last_tip_position_m
+        read_m, last_m = arm.spring_m + arm.sensor_offset_m, last_m + arm.sensor_offset_m
+        return obs.observe_motion(read_m, last_m, tip_mm, last_mm, action, self.spec)
 
     def params_of(self, arm: ArmState) -> ArmParams:
         """Return the numbers of an arm, with those of its episode in their places."""

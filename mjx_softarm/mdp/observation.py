@@ -1,5 +1,7 @@
 """The observation: pose, goal and scaled error, one function for training, twin and deployed arm.
 
+An arm in motion has more to tell: spring lengths and their rates, the tip's velocity, the last action.
+
 Source: the paper's state s = (P, g, e) in R^18. A fixed affine map brings pose and goal to
 the order of one; it changes only the numbers that a network sees.
 """
@@ -32,6 +34,39 @@ class ObsScale(NamedTuple):
         length_mm = 1e3 * spec.structure.n_sections * spec.geometry.section_length_m
         centre = np.array([0.0, 0.0, -length_mm, 0.0, 0.0, 0.0], np.float32)
         return cls(centre, np.array([length_mm / 3] * 3 + [90.0] * 3, np.float32))
+
+
+SPRING_M_PER_S, TIP_MM_PER_S = 0.1, 300.0  # speeds that are scaled to 1
+
+
+def motion_size(n_springs: int) -> int:
+    """Return the number of entries of `observe_motion`."""
+    return 3 * n_springs + 3
+
+
+def observe_motion(
+    spring_m: Array, last_spring_m: Array, tip_mm: Array, last_tip_mm: Array, action: Array, spec: ArmSpec
+) -> Array:
+    """Return what a moving arm has to tell besides pose and goal, scaled to the order of one: (..., 3 n + 3).
+
+    Args:
+        spring_m (..., n) [m]: lengths read.
+        last_spring_m (..., n) [m]: lengths read one control period before.
+        tip_mm (..., 3) [mm]: position of the tip.
+        last_tip_mm (..., 3) [mm]: position of the tip one control period before.
+        action (..., n): the last action, in [-1, 1].
+        spec: the arm, for its range of lengths and its control rate.
+
+    Returns:
+        Lengths, from -1 at the shortest to 1 at the longest; their rates; the tip's velocity; the action.
+    """
+    xp = array_namespace(spring_m, tip_mm, action)
+    low, high = spec.springs.length_min_m, spec.springs.length_max_m
+    rate_hz = spec.control.rate_hz
+    lengths = (2.0 * spring_m - low - high) / (high - low)
+    rates = (spring_m - last_spring_m) * (rate_hz / SPRING_M_PER_S)
+    velocity = (tip_mm - last_tip_mm) * (rate_hz / TIP_MM_PER_S)
+    return xp.concat([lengths, rates, velocity, action], axis=-1)
 
 
 def observe(pose: Array, goal: Array, scale: ObsScale, config: RewardConfig) -> Array:

@@ -1,18 +1,40 @@
-"""Transients: MJX stepped in time under the sensor-space law at the control rate."""
+"""Transients: MJX's equation of motion under the sensor-space law, stepped at the control rate.
+
+    M(q) dv/dt + c(q, v) + D v + dV/dq = 0,    dq/dt = v
+
+The mass matrix M and the bias c of the velocities are MJX's (`mjx.crb`, `mjx.rne`). The potential V at the
+chambers' pressures, with its gradient and Hessian K, and the dampers D have the closed form of
+`mjx_softarm.mechanics.statics`; the kinematics are those of either engine.
+
+A step of length h takes the implicit midpoint rule, linearised about its start. It is of second order, and
+stable however stiff a link is, so that a step may be as long as a control period:
+
+    (M + h/2 D + h^2/4 K) dv = -h (dV/dq + D v + c + h/2 K v),    q' = q + h (v + dv / 2)
+
+The chambers fill as `mjx_softarm.pneumatics` has it, in half steps: the pressure of a step is that of its
+middle, and K holds the stiffness of the gas.
+
+Source: Hairer, Wanner, "Solving Ordinary Differential Equations II", 1996, IV.7 (linearly implicit methods).
+"""
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-from mjx_softarm import control
+from mjx_softarm import control, pneumatics
 from mjx_softarm._support.mjx import mjx
-from mjx_softarm.mechanics.mjcf import spring_lengths, steps_per_period
+from mjx_softarm._support.small_matrices import block_diagonal, eliminate, product
+from mjx_softarm.mechanics.kinematics import Frames, Kinematics
 from mjx_softarm.mechanics.settle import Result
-from mjx_softarm.mechanics.statics import ArmParams
+from mjx_softarm.mechanics.statics import ArmParams, Tendons, all_tendons, statics_of
+
+N_PER_KPA_M2 = 1e3
+LONGEST_M = 1.0  # spring length that no arm reaches, before its numbers are no longer finite
 
 
 class MotionResult(Result):
@@ -20,82 +42,222 @@ class MotionResult(Result):
 
     FINITE = 0, "every joint coordinate and velocity is finite"
     NOT_FINITE = 1, "a joint coordinate or velocity is not a finite number"
+    DIVERGED = 2, f"a spring is longer than {LONGEST_M:g} m: the time step is too long for this arm"
 
 
 class Motion(NamedTuple):
-    """State of a moving arm between two instants."""
+    """State of a moving arm between two instants; at rest, integral, pressure and command are equal."""
 
     q: Array  # (nv,) [m, rad, rad]
     velocity: Array  # (nv,) [m/s, rad/s, rad/s]
     integral_kpa: Array  # (n_chambers,) integral part of the sensor-space law
+    pressure_kpa: Array  # (n_chambers,) in the chambers
+    command_kpa: Array  # (n_chambers,) that the valves act on
+
+    @classmethod
+    def at_rest(cls, q: Array, pressure_kpa: Array) -> Motion:
+        """Return the state of an arm at rest at joint coordinates (nv,) and pressures (n_chambers,)."""
+        return cls(q, jnp.zeros_like(q), pressure_kpa, pressure_kpa, pressure_kpa)
 
 
 class Moved(NamedTuple):
     """Observables of an arm at the end of a motion."""
 
-    pressure_kpa: Array  # (n_chambers,) at the end
+    pressure_kpa: Array  # (n_chambers,) in the chambers
     spring_m: Array  # (n_chambers,) spring lengths
+    last_spring_m: Array  # (n_chambers,) spring lengths one control period before
     tip_position_m: Array  # (3,)
+    last_tip_position_m: Array  # (3,) one control period before
     tip_rotation: Array  # (3, 3)
     result: Array  # () int32, a `MotionResult`
 
 
-def with_params(model: mjx.Model, params: ArmParams) -> mjx.Model:
-    """Return the model with the masses and stiffnesses of `params`; damping and geometry stay the model's."""
-    stiffness = jnp.stack([params.chamber_stiffness, params.spring_stiffness], axis=1).reshape(-1)
-    mass = jnp.concatenate([jnp.zeros(1), params.link_mass_kg, params.tool_mass_kg])
-    scale = jnp.where(model.body_mass > 0, mass / jnp.maximum(model.body_mass, 1e-9), 0.0)
-    return model.replace(
-        body_mass=mass,
-        body_inertia=model.body_inertia * scale[:, None],
-        jnt_stiffness=params.joint_stiffness,
-        tendon_stiffness=stiffness,
-    )
+class MovingArm(NamedTuple):
+    """Numbers of an arm in motion."""
+
+    model: mjx.Model
+    kinematics: Kinematics
+    params: ArmParams
+    damping: Array  # () factor of all dampers
+    delay_s: Array  # () dead time of the valves, at most a control period
+
+    @classmethod
+    def of(
+        cls,
+        model: mjx.Model,
+        kinematics: Kinematics,
+        params: ArmParams,
+        damping: Array | float = 1.0,
+        delay_s: Array | float = pneumatics.VALVE_S,
+    ) -> MovingArm:
+        """Return an arm with the masses and stiffnesses of `params`; all else is the model's.
+
+        Args:
+            model: the arm, from `mjx_softarm.mechanics.mjcf`.
+            kinematics: of either engine.
+            params: numbers of the arm.
+            damping: factor of all dampers.
+            delay_s: dead time of the valves, at most a control period.
+        """
+        mass = jnp.concatenate([jnp.zeros(1), params.link_mass_kg, params.tool_mass_kg])
+        scale = jnp.where(model.body_mass > 0, mass / jnp.maximum(model.body_mass, 1e-9), 0.0)
+        model = model.replace(
+            body_mass=mass,
+            body_inertia=model.body_inertia * scale[:, None],
+            opt=model.opt.replace(gravity=jnp.zeros(3)),  # V has the weights
+        )
+        return cls(model, kinematics, params, jnp.asarray(damping), jnp.asarray(delay_s))
+
+
+class _Instant(NamedTuple):
+    """Geometry of the arm at joint coordinates."""
+
+    frames: Frames
+    tendons: Tendons  # of chambers and springs, leaves (2, ...)
+
+    @property
+    def chamber_m(self) -> Array:
+        return self.tendons.length[0]
+
+    @property
+    def spring_m(self) -> Array:
+        return self.tendons.length[1]
 
 
 def advance(
-    model: mjx.Model,
+    arm: MovingArm,
     motion: Motion,
     reference_m: Array,
     gains: control.Gains,
     duration_s: float,
     period_s: float,
+    step_s: float,
 ) -> tuple[Motion, Moved]:
     """Run the arm for a while under the law.
 
     Args:
-        model: the arm, from `mjx_softarm.mechanics.mjcf`.
+        arm: numbers of the arm.
         motion: state at the start.
         reference_m (n_chambers,): spring lengths that the law tracks.
         gains: of the law.
         duration_s: a whole number of control periods.
         period_s: control period of the model's specification.
+        step_s: time step at most; a control period has a whole number of them.
 
     Returns:
         State and observables at the end.
     """
-    data = mjx.make_data(model).replace(qpos=motion.q, qvel=motion.velocity)
-    data = mjx.tendon(model, mjx.com_pos(model, mjx.kinematics(model, data)))
+    n_steps = math.ceil(period_s / step_s - 1e-9)
 
-    def tick(carry, _):
-        data, integral = carry
-        pressure, integral = control.pressures(reference_m, spring_lengths(data), integral, gains, period_s)
-        data = data.replace(ctrl=pressure)
-        data = jax.lax.fori_loop(0, steps_per_period(period_s), lambda _, d: mjx.step(model, d), data)
-        data = mjx.tendon(model, mjx.com_pos(model, mjx.kinematics(model, data)))
-        return (data, integral), None
+    def tick(carry: tuple[Motion, Array, Array], _):
+        motion, *_ = carry
+        now = _at(arm, motion.q)
+        told = now.spring_m, now.frames.plate_position[-1]
+        command, integral = control.pressures(reference_m, now.spring_m, motion.integral_kpa, gains, period_s)
+        motion = motion._replace(integral_kpa=integral)
+        for k in range(n_steps):
+            now = _at(arm, motion.q) if k else now
+            motion = _step(arm, motion, now, command, k, period_s / n_steps)
+        return (motion._replace(command_kpa=command), *told), None
 
     with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
-        (data, integral), _ = jax.lax.scan(
-            tick, (data, motion.integral_kpa), None, length=round(duration_s / period_s)
-        )
-    end = Motion(data.qpos, data.qvel, integral)
-    finite = jnp.all(jnp.isfinite(data.qpos)) & jnp.all(jnp.isfinite(data.qvel))
-    result = jnp.where(finite, MotionResult.FINITE.value, MotionResult.NOT_FINITE.value)
+        nothing = jnp.zeros_like(reference_m), jnp.zeros(3, motion.q.dtype)
+        n_ticks = round(duration_s / period_s)
+        (end, *last), _ = jax.lax.scan(tick, (motion, *nothing), None, length=n_ticks)
+        now = _at(arm, end.q)
+    finite = jnp.all(jnp.isfinite(end.q)) & jnp.all(jnp.isfinite(end.velocity))
+    finite &= jnp.all(jnp.isfinite(end.pressure_kpa))
+    result = jnp.where(
+        jnp.all(now.spring_m < LONGEST_M), MotionResult.FINITE.value, MotionResult.DIVERGED.value
+    )
+    result = jnp.where(finite, result, MotionResult.NOT_FINITE.value)
     return end, Moved(
-        pressure_kpa=data.ctrl,
-        spring_m=spring_lengths(data),
-        tip_position_m=data.site_xpos[-1],
-        tip_rotation=data.site_xmat[-1],
+        pressure_kpa=end.pressure_kpa,
+        spring_m=now.spring_m,
+        last_spring_m=last[0],
+        tip_position_m=now.frames.plate_position[-1],
+        last_tip_position_m=last[1],
+        tip_rotation=now.frames.plate_rotation[-1],
         result=result.astype(jnp.int32),
     )
+
+
+def _at(arm: MovingArm, q: Array) -> _Instant:
+    frames = arm.kinematics(q)
+    return _Instant(frames, all_tendons(frames, arm.params))
+
+
+def _step(arm: MovingArm, motion: Motion, now: _Instant, command_kpa: Array, k: int, h: float) -> Motion:
+    """Take the k-th time step of a control period, in which the law has commanded pressures (n_chambers,)."""
+    v, params = motion.velocity, arm.params
+    jacobian = now.tendons.jacobian  # (2, n_sections, 3, n)
+
+    def volume_m3(moved: Array) -> Array:
+        """Return the chambers' volumes (n_chambers,) after joint displacements (nv,)."""
+        along = product(jacobian[0], moved.reshape(params.n_sections, -1, 1)).reshape(-1)
+        area = params.area / N_PER_KPA_M2, params.area_slope / N_PER_KPA_M2
+        return pneumatics.volume_m3(now.chamber_m + along, *area, params.section_length_m)
+
+    def fill(gas_m3: Array, volume: Array, half: int) -> Array:
+        """Return the gas (n_chambers,) after the half step."""
+        new = jnp.clip(half + 1.0 - arm.delay_s / (0.5 * h), 0.0, 1.0)  # share of it with the new command
+        command = motion.command_kpa + new * (command_kpa - motion.command_kpa)
+        return pneumatics.regulated(gas_m3, volume, command, 0.5 * h)
+
+    # Pressures of the step's middle
+    gas_m3 = pneumatics.gas_at(motion.pressure_kpa, volume_m3(0.0 * v))
+    middle_m3 = volume_m3(0.5 * h * v)
+    gas_m3 = fill(gas_m3, middle_m3, 2 * k)
+    pressure_kpa = pneumatics.pressure_of(gas_m3, middle_m3)
+
+    # Forces and their derivatives at its start
+    mass, bias = _inertia(arm.model, now.frames, params, motion)
+    potential = statics_of(now.tendons, now.frames, motion.q, pressure_kpa, params)
+    damping, stiffness = _dampers(arm, jacobian), potential.hessian.dense()
+    gas = (
+        pneumatics.ATMOSPHERE_KPA / N_PER_KPA_M2 * gas_m3 * (potential.area / middle_m3) ** 2
+    )  # (n_chambers,) [N/m]
+    pushed = jacobian[0] * gas.reshape(params.n_sections, -1, 1)
+    stiffness_of_gas = block_diagonal(product(jnp.swapaxes(jacobian[0], 1, 2), pushed))
+
+    # The linearised midpoint rule
+    force = potential.gradient + bias + damping @ v + 0.5 * h * (stiffness @ v)
+    matrix = mass + 0.5 * h * damping + 0.25 * h**2 * (stiffness + stiffness_of_gas)
+    dv = eliminate(matrix, -h * force[:, None])[:, 0]
+    dq = h * (v + 0.5 * dv)
+
+    # Pressures of its end
+    end_m3 = volume_m3(dq)
+    gas_m3 = fill(gas_m3, end_m3, 2 * k + 1)
+    return motion._replace(
+        q=motion.q + dq, velocity=v + dv, pressure_kpa=pneumatics.pressure_of(gas_m3, end_m3)
+    )
+
+
+def _dampers(arm: MovingArm, jacobian: Array) -> Array:
+    """Return the matrix (nv, nv) of all dampers, with tendons of Jacobians (2, n_sections, 3, n)."""
+    tendon = arm.model.tendon_damping.reshape(jacobian.shape[1], -1, 2)  # (n_sections, 3, 2)
+    rows = jnp.concatenate(list(jacobian), axis=1)  # (n_sections, 6, n)
+    scaled = jnp.concatenate([tendon[..., :1] * jacobian[0], tendon[..., 1:] * jacobian[1]], axis=1)
+    own = block_diagonal(product(jnp.swapaxes(rows, 1, 2), scaled))
+    return arm.damping * (own + jnp.diag(arm.model.dof_damping))
+
+
+def _inertia(model: mjx.Model, frames: Frames, params: ArmParams, motion: Motion) -> tuple[Array, Array]:
+    """Return MJX's mass matrix (nv, nv), and its bias (nv,) of the velocities."""
+    last = frames.plate_rotation[-1]
+    tools = frames.plate_position[-1] - params.tool_offset_m[:, None] * last[:, 2]
+    position = jnp.concatenate([jnp.zeros((1, 3)), frames.anchor, tools])  # of the bodies, the world first
+    rotation = jnp.concatenate([frames.plate_rotation, last[None], last[None]])
+    data = mjx.make_data(model).replace(
+        qpos=motion.q,
+        qvel=motion.velocity,
+        xpos=position,
+        xmat=rotation,
+        xipos=position,
+        ximat=rotation,
+        xaxis=frames.axis.reshape(-1, 3),
+        xanchor=jnp.repeat(frames.anchor, frames.axis.shape[1], axis=0),
+    )
+    data = mjx.crb(model, mjx.com_pos(model, data))
+    return mjx.full_m(model, data), mjx.rne(model, mjx.com_vel(model, data)).qfrc_bias

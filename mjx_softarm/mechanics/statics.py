@@ -140,8 +140,17 @@ def statics(frames: Frames, q: Array, pressure_kpa: Array, params: ArmParams) ->
         pressure_kpa (n_chambers,): chamber pressures.
         params: numbers of the arm.
     """
+    return statics_of(all_tendons(frames, params), frames, q, pressure_kpa, params)
+
+
+def all_tendons(frames: Frames, params: ArmParams) -> Tendons:
+    """Return the chambers' tendons and the springs', stacked: leaves (2, ...)."""
     sites = jnp.stack([params.chamber_site_m, params.spring_site_m])
-    both = jax.vmap(tendons, in_axes=(None, 0))(frames, sites)  # in one piece: fewer and larger operations
+    return jax.vmap(tendons, in_axes=(None, 0))(frames, sites)  # in one piece: fewer and larger operations
+
+
+def statics_of(both: Tendons, frames: Frames, q: Array, pressure_kpa: Array, params: ArmParams) -> Statics:
+    """Return gradient and Hessian of V(q) as `statics`, with the tendons of `all_tendons` given."""
     chambers, springs = (jax.tree.map(lambda x, k=k: x[k], both) for k in range(2))
     area = params.area + params.area_slope * (chambers.length - params.section_length_m)
     tension = jnp.stack(

@@ -40,7 +40,7 @@ class DemonstratedGoals:
         goal = self.positions[jax.random.categorical(key_goal, jnp.log(state), shape=(n,))]  # (n, 6)
         new = (arm.n_steps == 0)[:, None]
         arm = arm._replace(pose=jnp.where(new, start, arm.pose), goal=jnp.where(new, goal, arm.goal))
-        return arms.replace(pipeline_state=arm, obs=self.env.observe(arm.pose, arm.goal))
+        return arms.replace(pipeline_state=arm, obs=self.env.observe(arm.pose, arm.goal, arm.sensed))
 
     def of_stage(self, epoch: int) -> np.ndarray:
         """Return which positions (m,) are goals in an epoch: bool."""

@@ -131,7 +131,7 @@ def nominal(env: ReachEnv) -> ReachEnv:
 def towards(env: ReachEnv, state: State, goal: Array) -> State:
     """Return an arm's state with another goal (6,) [mm, deg]."""
     arm = state.pipeline_state._replace(goal=goal)
-    return state.replace(pipeline_state=arm, obs=env.observe(arm.pose, goal))
+    return state.replace(pipeline_state=arm, obs=env.observe(arm.pose, goal, arm.sensed))
 
 
 def reach(env: ReachEnv, learner: Learner, policy: Any, state: State, goal: Array) -> tuple[State, Reached]:
