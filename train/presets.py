@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 
-from mjx_softarm.env import EnvConfig
+from mjx_softarm.env import EnvConfig, Randomisation
+from mjx_softarm.mdp.rewards import RewardConfig
 from train.agent.hindsight import HindsightConfig
 from train.agent.tqc import TQCConfig
 from train.config import ImitationConfig, Stage, TrainConfig
@@ -57,6 +58,24 @@ PRESETS: dict[str, TrainConfig] = {
         hindsight=HindsightConfig(exchange_actions=False),
         vector_steps_per_epoch=256,
         evaluation_epochs=20,
+    ),
+    # Half-second actions of arms in motion; with --agent, from a policy that was trained at rest. A goal that
+    # is reached pays for every action that the arm is there.
+    "motion": dataclasses.replace(
+        _TUNED,
+        total_env_steps=131_072,
+        episode_length=8,
+        updates_per_env_step=0.25,
+        replay_capacity=131_072,
+        evaluation_epochs=16,
+        env=EnvConfig(
+            mode="dynamic",
+            observation="motion",
+            goal_ends=False,
+            reward=RewardConfig(saturation_cost=10.0),
+            randomisation=Randomisation(damping_spread=0.2, delay_max_s=0.005),
+        ),
+        tqc=dataclasses.replace(_TUNED.tqc, learning_rate=5e-4, critics_first=4_096),
     ),
     "paper": dataclasses.replace(
         _AT_REST, total_env_steps=300_000, updates_per_env_step=0.5, polish_updates=32_768

@@ -4,9 +4,10 @@ Some transitions of a batch keep the goal they were made for. Some get the pose 
 goal, and with it the goal bonus (the paper's relabelling). Some get a goal near that pose, at a distance
 drawn log-uniformly, which shows the critic how the reward falls off around a pose.
 
-A relabelled transition to rest whose chambers had saturated also gets the action that asks for the spring
-lengths it ended at: they lead to the same equilibrium with no chamber off its reference
-(hindsight action transitions, Levy et al., ICLR 2019).
+A relabelled transition whose chambers had saturated also gets another action (hindsight action transitions,
+Levy et al., ICLR 2019). At rest it asks for the spring lengths that the arm ended at: they lead to the same
+equilibrium with no chamber off its reference. In motion only the references of the saturated chambers are
+exchanged for the lengths these ended at: the law holds such a chamber at its limit either way.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ class HindsightConfig:
     near_min_mm: float = 1.0  # smallest distance of a near goal
     near_max_mm: float = 100.0  # largest distance of a near goal
     mm_per_deg: float = 1.0  # distance that goes with a turn of one degree of a near goal
-    exchange_actions: bool = True  # relabelled, a saturated action that led to rest becomes the sensed one
+    exchange_actions: bool = True  # relabelled, a saturated action becomes the sensed one
 
     def __post_init__(self):
         if min(self.reached_share, self.near_share) < 0 or self.reached_share + self.near_share > 1:
@@ -58,7 +59,7 @@ def relabel(
     scale: obs.ObsScale,
     reward_config: rewards.RewardConfig,
     *,
-    exchange_actions: bool,
+    goal_ends: bool,
 ) -> Transition:
     """Return a batch to learn from; with both shares zero, its rewards are those the environment gave.
 
@@ -68,8 +69,7 @@ def relabel(
         config: shares.
         scale: of the observations.
         reward_config: weights of the reward.
-        exchange_actions: whether a saturated action is exchanged for the sensed one. Right only where an
-            action leads to rest: the lengths sensed in the middle of a motion lead elsewhere.
+        goal_ends: whether a goal that is reached ends an episode.
     """
     # Goals: own, reached, or near the pose reached.
     n = batch.saturated.shape[0]
@@ -80,7 +80,7 @@ def relabel(
     goal = jnp.where(reached[:, None], batch.next_pose, jnp.where(near[:, None], near_pose, batch.goal))
 
     # Actions: where a chamber saturated, the one that asks for the lengths it reached.
-    sensed = (reached | near) & batch.saturated & exchange_actions
+    sensed = (reached | near) & batch.saturated & config.exchange_actions
     action = jnp.where(sensed[:, None], batch.sensed_action, batch.action)
     saturated = batch.saturated & ~sensed
 
@@ -88,13 +88,20 @@ def relabel(
     reward, done, _ = rewards.reward(
         batch.next_pose, goal, batch.n_steps, saturated, reward_config, batch.clearance_cost
     )
+    before, after = batch.sensed, batch.next_sensed
+    if after is not None:
+        after = after.at[:, -action.shape[1] :].set(action)  # the last action, exchanged
     return Transition(
-        obs=obs.observe(batch.pose, goal, scale, reward_config),
+        obs=_joined(obs.observe(batch.pose, goal, scale, reward_config), before),
         action=action,
         reward=reward,
-        next_obs=obs.observe(batch.next_pose, goal, scale, reward_config),
-        terminated=done.astype(reward.dtype),
+        next_obs=_joined(obs.observe(batch.next_pose, goal, scale, reward_config), after),
+        terminated=(done & goal_ends).astype(reward.dtype),
     )
+
+
+def _joined(observation: Array, sensed: Array | None) -> Array:
+    return observation if sensed is None else jnp.concatenate([observation, sensed], axis=-1)
 
 
 def _near_offsets(distance: Array, direction: Array, config: HindsightConfig) -> Array:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 from jax import Array
 
@@ -21,7 +23,20 @@ class HindsightTQC:
         self.config, self.env = config, env
         self.tqc = tqc = TQC(env.observation_size, env.action_size, config.tqc, config.n_updates)
         self.init, self.act, self.policy, self.mode = tqc.init, tqc.act, tqc.policy, tqc.mode
-        self.adopt = tqc.adopt
+
+    def adopt(self, state: TQCState, agent: Any) -> TQCState:
+        """Return the state with a donor's networks and temperature.
+
+        A run in motion takes the policy alone, of a donor at rest or in motion and by whatever learner. What
+        it observes besides pose and goal has no weight at first, and its critics begin anew.
+
+        Raises:
+            ValueError: the donor has no such networks, or networks of another size.
+        """
+        donor = getattr(agent, "agent", agent)  # of a run that imitated or was polished
+        if self.config.env.mode == "dynamic":
+            return self.tqc.adopt_policy(state, donor.mean_actor_params)
+        return self.tqc.adopt(state, donor)
 
     def update(self, state: TQCState, sample: Sample, key: Array) -> tuple[TQCState, dict[str, Array]]:
         """Take one gradient step of all networks on one relabelled batch."""
@@ -36,7 +51,7 @@ class HindsightTQC:
             self.config.hindsight,
             self.env.scale,
             self.config.env.reward,
-            exchange_actions=self.config.hindsight.exchange_actions and self.config.env.mode == "quasistatic",
+            goal_ends=self.config.env.goal_ends,
         )
 
     def learn(self, state: TQCState, batch: Transition, key: Array) -> tuple[TQCState, dict[str, Array]]:

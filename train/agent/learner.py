@@ -26,10 +26,12 @@ class Experience(NamedTuple):
     goal: Array  # (..., 6) [mm, deg]
     action: Array  # (..., n_chambers) in [-1, 1]
     next_pose: Array  # (..., 6) [mm, deg]
-    sensed_action: Array  # (..., n_chambers) the action that asks for the spring lengths reached
+    sensed_action: Array  # (..., n_chambers) action for the spring lengths reached; see `hindsight`
     saturated: Array  # (...,) bool
     clearance_cost: Array  # (...,) for a body close to a wall
     n_steps: Array  # (...,) actions taken in the episode, this one included
+    sensed: Array | None = None  # (..., k) what the observation has besides pose and goal; None is nothing
+    next_sensed: Array | None = None  # (..., k) after the action
 
 
 Sample = Callable[[Array], Experience]  # key -> a batch of the replay, drawn uniformly with replacement

@@ -26,6 +26,9 @@ from train.agent.networks import Actor, Critics, mode, sample_action, squash
 Params = Any  # a flax parameter tree
 
 
+GIVEN_LOG_STD = -4.0  # of the noise before tanh with which an actor that is given begins to explore
+
+
 @dataclass(frozen=True)
 class TQCConfig:
     """Hyperparameters, by default stable-baselines3-contrib's. Raises ValueError naming a bad field."""
@@ -48,6 +51,9 @@ class TQCConfig:
     initial_alpha: float = 1.0  # initial temperature
     target_entropy: float | None = None  # target entropy [nat]; None is minus the number of actions
     reward_scale: float = 1.0  # factor on every reward in the critics' targets
+    critics_first: int = (
+        0  # gradient steps of the critics before the actor's first, for an actor that is given
+    )
 
     def __post_init__(self) -> None:
         required = {
@@ -58,6 +64,7 @@ class TQCConfig:
             "learning_rate_end": (0.0 <= self.learning_rate_end <= 1.0, "a number in [0, 1]"),
             "gamma": (0.0 <= self.gamma <= 1.0, "a number in [0, 1]"),
             "tau": (0.0 < self.tau <= 1.0, "a number in (0, 1]"),
+            "critics_first": (self.critics_first >= 0, "a number >= 0"),
             "initial_alpha": (self.initial_alpha > 0.0, "a positive number"),
         }
         for name, (holds, expected) in required.items():
@@ -102,7 +109,12 @@ class TQC:
         self.critics: Any = Critics(
             config.n_critics, config.n_quantiles, config.hidden_critic, config.layer_norm
         )
-        self.optimizer = optax.adam(_learning_rate(config, n_updates))
+        rate = _learning_rate(config, n_updates)
+        self.optimizer = self.actor_optimizer = optax.adam(rate)
+        if config.critics_first:
+            later = rate if callable(rate) else optax.constant_schedule(rate)
+            held = optax.join_schedules([optax.constant_schedule(0.0), later], [config.critics_first])
+            self.actor_optimizer = optax.adam(held)
         self.alpha_optimizer = optax.adam(config.learning_rate_alpha)
         self.target_entropy = -float(action_size) if config.target_entropy is None else config.target_entropy
 
@@ -120,7 +132,7 @@ class TQC:
             critic_params=critic_params,
             target_params=own_buffers(critic_params),
             log_alpha=log_alpha,
-            actor_opt_state=self.optimizer.init(actor_params),
+            actor_opt_state=self.actor_optimizer.init(actor_params),
             critic_opt_state=self.optimizer.init(critic_params),
             alpha_opt_state=self.alpha_optimizer.init(log_alpha),
         )
@@ -137,6 +149,22 @@ class TQC:
         given, own = ({name: getattr(each, name) for name in names} for each in (donor, state))
         check_same_shapes("networks", given, own)
         return state._replace(**given)
+
+    def adopt_policy(self, state: TQCState, given: Params) -> TQCState:
+        """Return the state with a given actor's means, which may observe less; it explores little at first.
+
+        Raises:
+            ValueError: the actor has layers of another size.
+        """
+        actor = jax.tree.map(jnp.asarray, given)
+        first, head = (actor["params"][name] for name in ("hidden_0", "head"))
+        unseen = self.obs_size - first["kernel"].shape[0]
+        if unseen > 0:
+            first["kernel"] = jnp.pad(first["kernel"], ((0, unseen), (0, 0)))
+        head["kernel"] = head["kernel"].at[:, self.action_size :].set(0.0)
+        head["bias"] = head["bias"].at[self.action_size :].set(GIVEN_LOG_STD)
+        check_same_shapes("actor", actor, state.actor_params)
+        return state._replace(actor_params=actor, mean_actor_params=jax.tree.map(jnp.copy, actor))
 
     def act(self, state: TQCState, obs: Array, key: Array) -> Array:
         """Sample an action (..., A) in (-1, 1) at obs (..., O)."""
@@ -175,7 +203,7 @@ class TQC:
 
         # Optimiser steps, and Polyak averages of their results.
         critic = _descend(self.optimizer, d_critic, state.critic_opt_state, state.critic_params)
-        actor = _descend(self.optimizer, d_actor, state.actor_opt_state, state.actor_params)
+        actor = _descend(self.actor_optimizer, d_actor, state.actor_opt_state, state.actor_params)
         temperature = _descend(self.alpha_optimizer, d_alpha, state.alpha_opt_state, state.log_alpha)
         next_state = TQCState(
             actor_params=actor[0],

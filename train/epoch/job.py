@@ -228,15 +228,20 @@ class Job:
     def _experience(self, before: State, action: Array, after: State) -> Experience:
         """Return the transitions of n arms as they are stored."""
         start, end = before.pipeline_state, after.pipeline_state
+        sensed_action = self.env.action_of(end.spring_m + end.sensor_offset_m)
+        if self.config.env.mode == "dynamic":  # the arm moves on: the other references still count
+            sensed_action = jnp.where(after.info["blocked"], sensed_action, action)
         return Experience(
             pose=start.pose,
             goal=start.goal,
             action=action,
             next_pose=end.pose,
-            sensed_action=self.env.action_of(end.spring_m + end.sensor_offset_m),
+            sensed_action=sensed_action,
             saturated=after.info["saturated"],
             clearance_cost=self.env.clearance_cost(after.info["clearance_mm"]),
             n_steps=end.n_steps,
+            sensed=start.sensed,
+            next_sensed=end.sensed,
         )
 
 

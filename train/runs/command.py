@@ -41,6 +41,8 @@ class Reach(NewRunOptions):
     preset: Annotated[str, cli.one_of(PRESETS)] = "quick"
     """settings to begin with; the defaults below are this preset's"""
     config: Annotated[TrainConfig, tyro.conf.arg(name="")]
+    agent: cli.MaybePath = None
+    """run whose actor and critics this one begins with; in motion, whose policy"""
     devices: Devices = None
 
     @classmethod
@@ -58,7 +60,11 @@ class Reach(NewRunOptions):
         console.print("drawing goals from the reachable workspace ...")
         task = task_of(self.config, ReachEnv(spec, self.config.env, s2r), mesh=mesh)
         path = self.out or runs.default_path("reach", self.preset, self.config.seed)
-        return _train(Run.create(path, self.config, spec, s2r), task, console)
+        if self.agent is None:
+            return _train(Run.create(path, self.config, spec, s2r), task, console)
+        donors = {"agent": self.agent}
+        state = runs.begin_with(task, self.config.seed, agent=Run.open(self.agent))
+        return _train(Run.create(path, self.config, spec, s2r, None, donors, state), task, console)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -43,6 +43,7 @@ def train(run: Run, task: Task, console: Console) -> Any:
 
     Raises:
         Interrupted: after Ctrl-C or a termination signal, once the state is saved.
+        RunError: arms in motion diverge.
     """
     config = run.config
     with asked_to_stop() as asked:
@@ -53,6 +54,7 @@ def train(run: Run, task: Task, console: Console) -> Any:
                 state, metrics = timed_epoch(task.job, task.prepare(state, epoch))
                 row = {name: float(value) for name, value in metrics.items()}
                 epoch += 1
+                refuse_divergence(config, row["env/unsettled"])
                 stop, due = any_process(bool(asked)), config.evaluates_after(epoch)
                 if due:
                     row |= evaluation(run, task, task.job.policy(state))
@@ -63,6 +65,16 @@ def train(run: Run, task: Task, console: Console) -> Any:
                 if stop and epoch < config.n_epochs:
                     raise Interrupted(f"stopped after epoch {epoch}; continue with --resume {run.path}")
     return finish(run, task, task.job.policy(state))
+
+
+def refuse_divergence(config: TrainConfig, n_unsettled: float) -> None:
+    """Raise RunError where most of an epoch's actions of arms in motion led to no finite state."""
+    n_actions = config.n_arms * config.vector_steps_per_epoch
+    if config.env.mode == "dynamic" and n_unsettled > n_actions / 2:
+        raise RunError(
+            f"env.simulation_step_s: got {config.env.simulation_step_s:g}, with which {n_unsettled:.0f} of "
+            f"{n_actions} actions diverged, expected a shorter time step for this arm"
+        )
 
 
 def _begin(run: Run, task: Task, console: Console) -> tuple[int, TrainState]:

@@ -50,9 +50,7 @@ def relabelled(env, stored):
 
     def of(key=0, **shares):
         config = HindsightConfig(**shares)
-        return many, relabel(
-            many, jax.random.key(key), config, env.scale, env.config.reward, exchange_actions=True
-        )
+        return many, relabel(many, jax.random.key(key), config, env.scale, env.config.reward, goal_ends=True)
 
     return of
 
