@@ -35,6 +35,9 @@ def export_run(run: Run, path: Path | None = None, task: Task | None = None) -> 
         RunError: the run has no checkpoint, or its learner's policy is not a network that the file can hold.
         SealedFileError: the file cannot be written.
     """
+    if run.config.env.observation != "pose":
+        got = run.config.env.observation
+        raise RunError(f"{run.path}: env.observation: got {got!r}, expected 'pose' for a policy to export")
     task, params = restore_policy(run, task)
     model, distilled = arm_model(task.job.env)
     errors = {name: getattr(distilled, name) for name in ("tip_mm", "turn_deg", "spring_mm")}

@@ -157,3 +157,17 @@ def test_shares_are_kept_and_the_rest_is_as_it_was(env, transition, relabelled):
 def test_shares_that_are_none_are_refused(shares):
     with pytest.raises(ValueError, match="got reached_share .* expected numbers >= 0 that add up to 1"):
         HindsightConfig(*shares)
+
+
+def test_what_is_sensed_follows_pose_and_goal_and_knows_the_action_exchanged(env, stored):
+    n = len(stored.n_steps)
+    before, after = jnp.full((n, 12), 2.0), jnp.full((n, 12), 3.0)
+    moving = stored._replace(sensed=before, next_sensed=after)
+    config = HindsightConfig(reached_share=1.0)
+    batch = relabel(moving, jax.random.key(0), config, env.scale, env.config.reward, goal_ends=False)
+    np.testing.assert_array_equal(batch.obs[:, 18:], before)
+    n_springs = batch.action.shape[1]
+    np.testing.assert_array_equal(batch.next_obs[:, 18:-n_springs], after[:, :-n_springs])
+    np.testing.assert_array_equal(batch.next_obs[:, -n_springs:], batch.action)
+    assert (batch.action != stored.action).any()
+    assert batch.reward.max() > 50.0 and not batch.terminated.any()  # reached, and it goes on

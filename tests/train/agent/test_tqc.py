@@ -246,3 +246,31 @@ BAD |= {"gamma": 1.5, "tau": 0.0, "initial_alpha": 0.0}
 def test_config_names_the_field_out_of_range(field, value):
     with pytest.raises(ValueError, match=rf"TQCConfig\.{field}: got .* expected"):
         TQCConfig(**{field: value})
+
+
+def test_a_given_policy_acts_as_before_whatever_it_did_not_observe():
+    """Two more entries of the observation have no weight; the noise is small; the critics stay."""
+    settings = TQCConfig(hidden_actor=(8,), hidden_critic=(8,))
+    donor, wider = (TQC(n, 2, settings) for n in (3, 5))
+    given, own = (each.init(jax.random.key(k)) for k, each in enumerate((donor, wider)))
+    adopted = wider.adopt_policy(own, given.mean_actor_params)
+    obs = jax.random.normal(jax.random.key(2), (4, 5))
+    expected = donor.mode(given.mean_actor_params, obs[:, :3])
+    np.testing.assert_allclose(wider.mode(adopted.mean_actor_params, obs), expected, atol=1e-6)
+    assert np.abs(wider.act(adopted, obs, jax.random.key(3)) - expected).max() < 0.1
+    assert equal(adopted.critic_params, own.critic_params)
+    with pytest.raises(ValueError, match="actor: got layers of"):
+        donor.adopt_policy(given, own.mean_actor_params)
+
+
+def test_the_critics_learn_first():
+    """While they do, the actor stays as it was given; then it moves, too."""
+    agent = TQC(3, 2, TQCConfig(hidden_actor=(8,), hidden_critic=(8,), critics_first=2))
+    row = jnp.ones((4, 3), jnp.float32)
+    batch = Transition(row, jnp.zeros((4, 2)), jnp.ones(4), row, jnp.zeros(4))
+    states = [agent.init(jax.random.key(0))]
+    for k in range(3):
+        states.append(jax.jit(agent.update)(states[-1], batch, jax.random.key(k))[0])
+    assert equal(states[0].actor_params, states[2].actor_params)
+    assert not equal(states[0].critic_params, states[1].critic_params)
+    assert not equal(states[2].actor_params, states[3].actor_params)
