@@ -40,7 +40,8 @@ def calibrate_twin(folder: Path, settings: Settings, twin: int) -> None:
     from mjx_softarm.logs.schema import write_log
     from mjx_softarm.mechanics.excitation import random_pressures
     from mjx_softarm.spec import ArmSpec
-    from mjx_softarm.twin.arm import S2R_SESSION, Twin
+    from mjx_softarm.twin.arm import Twin
+    from mjx_softarm.twin.instruments import S2R_SESSION
 
     here, spec = folder / f"twin{twin}", ArmSpec.default()
     here.mkdir(parents=True, exist_ok=True)

@@ -12,6 +12,7 @@ from mjx_softarm.mechanics.workspace import settle_many
 from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.twin import arm as twin
 from mjx_softarm.twin.arm import Twin
+from mjx_softarm.twin.instruments import EVALUATION_SESSION, S2R_SESSION
 from mjx_softarm.twin.model import Build, build_twin, draw_parts
 
 IDEAL = Build(gap=0.0, losses=0.0, noise=0.0, links_per_section=4)  # training's model, moving
@@ -185,12 +186,12 @@ def test_seed_chooses_the_twin_and_session_the_noise():
     first = records(7)
     np.testing.assert_array_equal(first, records(7))
     assert (first != records(8)).all()
-    other_day = records(7, session=twin.S2R_SESSION)
+    other_day = records(7, session=S2R_SESSION)
     assert (first != other_day).all()
     np.testing.assert_allclose(first[:9], other_day[:9], atol=10 * ArmSpec.default().sensor.noise)
     silent = [records(7, session=session, build=Build(noise=0.0)) for session in (0, 1)]
     np.testing.assert_array_equal(*silent)
-    assert twin.S2R_SESSION != twin.EVALUATION_SESSION
+    assert S2R_SESSION != EVALUATION_SESSION
 
 
 @pytest.mark.parametrize(
