@@ -14,9 +14,7 @@ N_ACTIONS = MOVING.n_arms * MOVING.vector_steps_per_epoch
 
 
 def test_an_epoch_in_which_most_arms_diverge_ends_the_run_and_names_the_step():
-    with pytest.raises(
-        RunError, match=rf"env\.simulation_step_s: got 0\.02, with which 9 of {N_ACTIONS} act"
-    ):
+    with pytest.raises(RunError, match=rf"env\.simulation_step_s: got 0\.02, with which 9 of {N_ACTIONS}"):
         refuse_divergence(MOVING, 9.0)
 
 
