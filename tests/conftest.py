@@ -11,6 +11,7 @@ from mjx_softarm._support import xla
 from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.policy.file import ArmModel
 from mjx_softarm.sensing.estimator import N_CHANGES, PoseEstimator, SpringModel
+from mjx_softarm.sensing.load import LoadEstimator
 from mjx_softarm.sensing.s2r import N_POSE_INPUTS, N_POSE_OUTPUTS, S2R
 
 jax.config.update("jax_num_cpu_devices", 8)  # most tests use one of them
@@ -93,8 +94,11 @@ def make_arm_model():
 
         angle = np.pi / 2 + 2 * np.pi * np.arange(n) / 3
         site_m = np.float32(0.067 * np.stack([np.cos(angle), np.sin(angle)], -1))
-        estimator = PoseEstimator(
-            layers(2 * n, 4, N_CHANGES * n // 3), site_m, row(0.18), row(0.05), row(1e-3, 6)
+        n_changes, kg = N_CHANGES * n // 3, np.float32([0.0, 1.0])
+        networks = layers(2 * n, 4, n_changes), layers(2 * n + 1, 4, n_changes)
+        estimator = PoseEstimator(*networks, site_m, row(0.18), row(0.05), *kg, row(1e-3, 6))
+        load = LoadEstimator(
+            layers(2 * n, 4, 1), row(0.18), row(0.05), row(-10.0), row(30.0), np.float32(1.0)
         )
         springs = SpringModel(layers(n, 5, n), row(-10.0), row(30.0), row(0.18), row(0.05))
         poses = np.float32([[0, 0, -600, 0, 0, 0], [80, 0, -575, 0, 0, 0], [0, 100, -500, 10, 40, -30]])
@@ -105,6 +109,6 @@ def make_arm_model():
             np.float32(rng.normal(size=(4, n_in))),
             np.float32(0.3),
         )
-        return ArmModel(poses, estimator, springs, s2r_network if s2r else None)
+        return ArmModel(poses, estimator, load, springs, s2r_network if s2r else None)
 
     return make

@@ -11,6 +11,7 @@ from mjx_softarm.mdp.observation import ObsScale
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.sensing.estimator import PoseEstimator, SpringModel, estimate
+from mjx_softarm.sensing.load import LoadEstimator
 from mjx_softarm.sensing.sensors import Sensor
 
 SPEC = ArmSpec.default()
@@ -77,10 +78,21 @@ def make_policy(spec=SPEC):
     site = SPEC.geometry.spring_radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     network = PoseEstimator(
         layers=((np.zeros((2 * N, 18), np.float32), np.zeros(18, np.float32)),),
+        load_layers=((np.zeros((2 * N + 1, 18), np.float32), np.zeros(18, np.float32)),),
         spring_site_m=site.astype(np.float32),
         spring_centre_m=centre,
         spring_scale_m=centre + 1,
+        load_centre_kg=np.float32(0.0),
+        load_scale_kg=np.float32(1.0),
         change_scale=np.ones(6, np.float32),
+    )
+    load = LoadEstimator(
+        layers=((np.zeros((2 * N, 1), np.float32), np.zeros(1, np.float32)),),
+        spring_centre_m=centre,
+        spring_scale_m=centre + 1,
+        pressure_centre_kpa=centre,
+        pressure_scale_kpa=centre + 1,
+        load_scale_kg=np.float32(1.0),
     )
     model = SpringModel(
         layers=((GAIN_M_PER_KPA.astype(np.float32), np.zeros(N, np.float32)),),
@@ -98,8 +110,9 @@ def make_policy(spec=SPEC):
         gains=Gains.from_spec(SPEC),
         rate_hz=SPEC.control.rate_hz,
         spec=spec,
-        workspace=estimate(network, REST_M + rng.uniform(-30, 15, (2000, N)) @ GAIN_M_PER_KPA.T),
+        workspace=estimate(network, REST_M + rng.uniform(-30, 15, (2000, N)) @ GAIN_M_PER_KPA.T, 0.0),
         estimator=network,
+        load_estimator=load,
         spring_model=model,
         s2r=None,
         provenance={},
@@ -109,7 +122,7 @@ def make_policy(spec=SPEC):
 POLICY = make_policy()
 PRESSURES_KPA = np.random.default_rng(2).uniform(-20, 10, (2, N))
 SPRINGS_M = REST_M + PRESSURES_KPA @ GAIN_M_PER_KPA.T
-GOALS = estimate(POLICY.estimator, SPRINGS_M).astype(float)
+GOALS = estimate(POLICY.estimator, SPRINGS_M, 0.0).astype(float)
 FAR = GOALS[0] + [0.0, 0.0, -400.0, 0.0, 0.0, 0.0]
 
 

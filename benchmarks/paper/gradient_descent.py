@@ -51,11 +51,11 @@ def gradient_descent(policy: Policy) -> Plan:
 
 
 def forward_kinematics(policy: Policy) -> Callable[[np.ndarray], np.ndarray]:
-    """Return the map of springs (..., n) [m] to the loop's pose estimate (..., 6) [mm, deg], in float64."""
+    """Return the map of springs (..., n) [m] to poses (..., 6) [mm, deg] of the specified arm, in float64."""
     estimator, s2r = _double(policy.estimator), _double(policy.s2r)
 
     def pose_of(spring_m: np.ndarray) -> np.ndarray:
-        pose = estimate(estimator, spring_m)
+        pose = estimate(estimator, spring_m, policy.spec.mass.payload_kg)
         return pose if s2r is None else correct(s2r, pose, spring_m)
 
     return pose_of

@@ -47,7 +47,7 @@ PLAUSIBLE: Mapping[str, Plausible] = MappingProxyType(
 )
 BY_HAND_ROWS, BY_HAND_S = 300, 600.0  # so few rows may be poses recorded by hand, so far apart
 HANGS_BELOW_M = -0.05  # of the tip, in the median: the base frame's z is up and the arm hangs
-FROM_LOOP = ("reference_m", "goal", "estimate")  # logged by the control loop, which may have none
+FROM_LOOP = ("reference_m", "goal", "estimate", "load_kg")  # logged by the control loop, which may have none
 SENSORS = ("readings", "spring_m", "pressure_kpa", "tip_m", "marker_m")
 
 

@@ -13,7 +13,7 @@ import json
 import struct
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -100,10 +100,17 @@ def _mark(kind: str) -> bytes:
 
 
 def entries_of(name: str, group: Any) -> dict[str, np.ndarray]:
-    """Return the entries of a dataclass or named tuple: `name.field`, and its `layers` one by one."""
-    values = {item: getattr(group, item) for item in _field_names(type(group))}
-    entries = layer_entries(name, values.pop("layers")) if "layers" in values else {}
-    entries |= {f"{name}.{item}": value for item, value in values.items()}
+    """Return the entries of a dataclass or named tuple: `name.field`.
+
+    Layers stand one by one: those of `layers` as of `name`, those of `x_layers` as of `name.x`.
+    """
+    entries: dict[str, Any] = {}
+    for item in _field_names(type(group)):
+        value, whose = getattr(group, item), item.removesuffix("layers")
+        if whose != item:
+            entries |= layer_entries(f"{name}.{whose}".rstrip("._"), value)
+        else:
+            entries[f"{name}.{item}"] = value
     return {item: np.asarray(value) for item, value in entries.items()}
 
 
@@ -168,7 +175,9 @@ class Entries:
             n_inputs = width
         return tuple(layers)
 
-    def network(self, name: str, kind: type, shapes: Mapping, n_inputs: int, n_outputs: int) -> Any:
+    def network(
+        self, name: str, kind: Callable[..., Any], shapes: Mapping, n_inputs: int, n_outputs: int
+    ) -> Any:
         """Return a named tuple of float32 arrays in the `shapes` of its fields, and of `layers`.
 
         Every field whose name has `_scale` in it must be greater than 0.

@@ -12,6 +12,7 @@ from mjx_softarm.deploy.faults import Event, Response
 from mjx_softarm.deploy.reachability import Reachable
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.policy.runtime import PolicyRunner
+from mjx_softarm.sensing.load import Load
 
 WINDOW_S = 0.5
 
@@ -56,6 +57,10 @@ class State(NamedTuple):
     pressure_kpa: np.ndarray  # (n,) in force
     springs_m: np.ndarray  # (ticks, n) readings of the last window, the newest last
     pressures_kpa: np.ndarray  # (ticks, n) in force at these
+    chambers_kpa: np.ndarray  # (ticks, n) measured at these, or in force where none was measured
+    load: Load  # payload that windows at rest told
+    n_unweighed: int  # ticks since the last of these
+    shift: np.ndarray  # (6,) [mm, deg] of the goal that the policy is given
 
 
 class Tick(NamedTuple):
@@ -87,4 +92,8 @@ def start(controller: Controller) -> State:
         pressure_kpa=np.zeros(n),
         springs_m=np.empty((0, n)),
         pressures_kpa=np.empty((0, n)),
+        chambers_kpa=np.empty((0, n)),
+        load=Load(controller.policy.spec.mass.payload_kg),
+        n_unweighed=0,
+        shift=np.zeros(6),
     )

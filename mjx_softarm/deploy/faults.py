@@ -17,6 +17,10 @@
                        within SETTLE_TIMEOUT_S
     SATURATED          a chamber at its limit with its spring off the reference         go on
     EXTRAPOLATION      the sim-to-real network asked far from its training rows         go on
+    LOAD_LOST          the payload fell from one rest to the next: an object dropped    go on
+    OVERLOADED         a payload beyond the largest that the estimator was made for     go on
+    LOAD_UNKNOWN       springs and pressures that no payload explains: the pose is      go on
+                       estimated from the springs alone, with the specified payload
 
 To vent is to end the run and bring all pressures to zero along a ramp, as at every end of a run
 (`mjx_softarm.deploy.ending`). Every fault is counted; `Event.message` says what was seen and what was
@@ -79,6 +83,9 @@ class Fault(Enum):
     NOT_SETTLED = "not settled", Response.GO_ON
     SATURATED = "saturated", Response.GO_ON
     EXTRAPOLATION = "extrapolation", Response.GO_ON
+    LOAD_LOST = "load lost", Response.GO_ON
+    OVERLOADED = "overloaded", Response.GO_ON
+    LOAD_UNKNOWN = "load unknown", Response.GO_ON
 
     def __new__(cls, text: str, response: Response) -> Fault:
         fault = object.__new__(cls)

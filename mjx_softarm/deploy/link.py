@@ -51,7 +51,7 @@ class Link:
         self._arm: Any = arm
         self._n, self._dt_s, self._n_late = n, dt_s, 0
         self._simulated = hasattr(arm, "time_s")
-        self._measures, self.sees = hasattr(arm, "pressures"), hasattr(arm, "motion_capture")
+        self.measures, self.sees = hasattr(arm, "pressures"), hasattr(arm, "motion_capture")
         # Shapes of what is logged; those of markers are the first frame's.
         self._shapes: dict[str, tuple[int, ...]] = {"tip_m": (3,), "tip_quaternion": (4,)}
         self._unsure = False  # whether the arm may have taken the last pressures, though it did not say so
@@ -117,7 +117,7 @@ class Link:
             ArmFault: a method failed, or gave arrays of another shape than before.
         """
         row: dict[str, Any] = {"time_s": time_s, "pressure_kpa": self.pressure_kpa}
-        if self._measures:
+        if self.measures:
             kpa = self._call("pressures", lambda: np.array(self._arm.pressures(), float), timeouts=False)
             row["pressure_kpa"] = self._shaped("pressures", kpa, (self._n,))
         if self.sees:

@@ -1,6 +1,7 @@
 """One tick of the control loop: readings in, pressures and faults out. Pure; NumPy only.
 
-    readings -> spring lengths -> pose of the tip (estimator, then sim-to-real network)
+    readings -> spring lengths; at rest: spring lengths, pressures -> payload
+    spring lengths, payload -> pose of the tip (estimator, then sim-to-real network)
     at rest: pose, goal -> policy -> references;    every tick: references -> sensor-space law -> pressures
 
 The policy was trained on arms at rest, so it acts on arms at rest: at once when a goal is new, and again
@@ -9,13 +10,15 @@ settled when, for a window of half a second, each one is on its reference or its
 moves. Where that takes longer than `faults.SETTLE_TIMEOUT_S`, it is counted and the policy acts all the same.
 What stands when the springs have settled for the last time is the arrival.
 
+The policy takes an arm as specified to a goal. What a payload, or its own error, leaves of the way shows in
+the pose at rest: the next action is towards a goal that is shifted by as much. Springs that have not settled
+and chambers at their limit shift nothing, since they do not show where the policy brings the arm.
+
 Gains, limits, calibration, rate, tolerance and number of actions are the policy file's.
 `mjx_softarm.deploy.faults` says what can go wrong.
 """
 
 from __future__ import annotations
-
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -25,10 +28,13 @@ from mjx_softarm.deploy.controller import Controller, State, Tick
 from mjx_softarm.deploy.faults import Event, Fault, Response
 from mjx_softarm.deploy.link import vented
 from mjx_softarm.deploy.reachability import nearest
-from mjx_softarm.policy.reach import nearest_poses
 from mjx_softarm.policy.runtime import tip_pose
+from mjx_softarm.sensing.load import HIGHEST, LOWEST, Load, averaged, tell_load
+from mjx_softarm.sensing.pose import pose_error
 
 CHAMBER_WINDOWS = 2  # a chamber counts as lost after so many windows in a row
+OVERLOAD_KG = 0.1  # beyond the largest payload, since none is told exactly
+MAX_SHIFT = np.repeat([25.0, 5.0], 3)  # [mm, deg] of a goal
 
 
 def with_goal(controller: Controller, state: State, goal: np.ndarray) -> tuple[State, tuple[Event, ...]]:
@@ -43,25 +49,6 @@ def with_goal(controller: Controller, state: State, goal: np.ndarray) -> tuple[S
         far = f"{text} is {away:.1f} times as far from the nearest reachable pose as a goal may be"
         return state, (Event(Fault.GOAL_OUTSIDE, f"{far}; that pose is {near} [mm, deg]"),)
     return state._replace(goal=goal, n_actions=0, n_ticks=0), ()
-
-
-def refusals(controller: Controller, goals: Sequence[np.ndarray]) -> dict[int, Event]:
-    """Return which goals (6,) [mm, deg] are refused, since no pressures reach them; takes longer than a tick.
-
-    It is sharper than `with_goal`, whose poses lie some 15 mm apart.
-    """
-    finite = [k for k, goal in enumerate(goals) if np.shape(goal) == (6,) and np.isfinite(goal).all()]
-    if not finite:
-        return {}
-    policy = controller.policy
-    poses, errors = nearest_poses(policy, np.array([goals[k] for k in finite], float))
-    found = {}
-    for k, pose, error in zip(finite, poses, errors, strict=True):
-        if not error <= policy.reward.threshold:  # nor NaN
-            got, near = (", ".join(f"{value:.0f}" for value in values) for values in (goals[k], pose))
-            message = f"got {got}, expected a pose that the arm reaches; the nearest is {near} [mm, deg]"
-            found[k] = Event(Fault.GOAL_OUTSIDE, message)
-    return found
 
 
 def hold(state: State) -> State:
@@ -79,7 +66,13 @@ def release(state: State) -> State:
     return state._replace(goal=None, reference_m=None)
 
 
-def step(controller: Controller, state: State, readings: np.ndarray | None, late: bool) -> tuple[State, Tick]:
+def step(
+    controller: Controller,
+    state: State,
+    readings: np.ndarray | None,
+    late: bool,
+    measured_kpa: np.ndarray | None = None,
+) -> tuple[State, Tick]:
     """Take one tick.
 
     Args:
@@ -87,19 +80,22 @@ def step(controller: Controller, state: State, readings: np.ndarray | None, late
         state: after the last tick; its pressures are in force.
         readings (n,): of the sensors, or None where none came in time.
         late: the last tick missed its deadline.
+        measured_kpa (n,) [kPa]: of the chambers; NaN, or None for all, where only those in force are known.
 
     Returns:
         The next state, whose pressures are to be written unless the tick says stop, and the tick.
     """
     state = state._replace(n_late=state.n_late + 1 if late else 0)
     events = _deadline(controller, state.n_late)
-    state, found = _sense(controller, state, readings)
+    state, found = _sense(controller, state, readings, measured_kpa)
     events += found
 
     arrived = False
     known, at_rest = not np.isnan(state.spring_m).any(), _at_rest(controller, state)
     if known and not _stops(events):
         state, found = _check_chambers(controller, state, at_rest)
+        events += found
+        state, found = _weigh(controller, state, at_rest)
         events += found
     if known and not _stops(events) and state.goal is not None and not state.n_lost.any():
         state, found, arrived = _go(controller, state, at_rest)
@@ -109,15 +105,15 @@ def step(controller: Controller, state: State, readings: np.ndarray | None, late
     return state, Tick(state.spring_m, tuple(events), arrived)
 
 
-def believed(controller: Controller, spring_m: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the tip pose that springs (n,) [m] tell.
+def believed(controller: Controller, spring_m: np.ndarray, load: Load) -> tuple[np.ndarray, float]:
+    """Return the tip pose that springs (n,) [m] tell with a payload.
 
     Returns:
         Pose (6,) [mm, deg], NaN where a length is; `s2r.extrapolation` of it, 0 without a network.
     """
     if np.isnan(spring_m).any():
         return np.full(6, np.nan), 0.0
-    pose, away = tip_pose(controller.policy, spring_m)
+    pose, away = tip_pose(controller.policy, spring_m, load.believed_kg)
     return pose, float(away)
 
 
@@ -144,16 +140,21 @@ def _deadline(controller: Controller, n_late: int) -> list[Event]:
     return missed
 
 
-def _sense(controller: Controller, state: State, readings: np.ndarray | None) -> tuple[State, list[Event]]:
+def _sense(
+    controller: Controller, state: State, readings: np.ndarray | None, measured_kpa: np.ndarray | None
+) -> tuple[State, list[Event]]:
     """Return the state with new spring lengths, the last good one where there is none, and sensor faults."""
     spring_m, lost, text = faults.read_lengths(controller.policy.sensor, readings, state.spring_m)
     events = [Event(Fault.LOST_READING, text)] if lost.any() else []
-    window = controller.window
+    window, kpa = controller.window, state.pressure_kpa
+    if measured_kpa is not None:
+        kpa = np.where(np.isfinite(measured_kpa), measured_kpa, kpa)
     state = state._replace(
         spring_m=spring_m,
         n_lost=np.where(lost, state.n_lost + 1, 0),
         springs_m=np.concat([state.springs_m[1 - window :], spring_m[None]]),
         pressures_kpa=np.concat([state.pressures_kpa[1 - window :], state.pressure_kpa[None]]),
+        chambers_kpa=np.concat([state.chambers_kpa[1 - window :], kpa[None]]),
     )
     gone = state.n_lost >= faults.LOST_TICKS
     if gone.any():
@@ -192,6 +193,33 @@ def _check_chambers(controller: Controller, state: State, at_rest: bool) -> tupl
     return state, [Event(Fault.CHAMBER_LOST, message)]
 
 
+def _weigh(controller: Controller, state: State, at_rest: bool) -> tuple[State, list[Event]]:
+    """Return the state with the payload that a window at rest tells; windows do not overlap."""
+    state = state._replace(n_unweighed=state.n_unweighed + 1)
+    unsure = state.n_suspect.any() or state.n_lost.any()
+    if not at_rest or unsure or state.n_unweighed < controller.window:
+        return state, []
+    policy, before = controller.policy, state.load
+    own_kg, most_kg = policy.spec.mass.payload_kg, float(policy.load_estimator.load_scale_kg)
+    told_kg = float(
+        tell_load(policy.load_estimator, state.springs_m.mean(axis=0), state.chambers_kpa.mean(axis=0))
+    )
+    events = []
+    if LOWEST * most_kg <= told_kg <= HIGHEST * most_kg:
+        load = averaged(before, told_kg)
+    else:
+        load, got = Load(own_kg), f"springs and pressures tell {1e3 * told_kg:.0f} g"
+        message = f"{got}, the pose is estimated from the springs alone, with {1e3 * own_kg:.0f} g"
+        events.append(Event(Fault.LOAD_UNKNOWN, message))
+    if load.began and load.kg < before.kg:
+        message = f"{1e3 * load.kg:.0f} g, from {1e3 * before.kg:.0f} g at the rests before"
+        events.append(Event(Fault.LOAD_LOST, message))
+    if load.kg > most_kg + OVERLOAD_KG:
+        message = f"{1e3 * load.kg:.0f} g, expected at most {1e3 * most_kg:.0f} g"
+        events.append(Event(Fault.OVERLOADED, message))
+    return state._replace(load=load, n_unweighed=0), events
+
+
 def _go(controller: Controller, state: State, at_rest: bool) -> tuple[State, list[Event], bool]:
     """Act if the goal is new or the springs have settled; arrive when they have after the last action."""
     events: list[Event] = []
@@ -206,13 +234,24 @@ def _go(controller: Controller, state: State, at_rest: bool) -> tuple[State, lis
         if state.n_actions == controller.policy.n_actions:
             return state._replace(goal=None), events, True
     assert state.goal is not None  # `step` asks
-    pose, away = believed(controller, state.spring_m)
+    shift = state.shift if events else _shifted(controller, state)
+    pose, away = believed(controller, state.spring_m, state.load)
     if away > 1.0:
         message = f"{away:.1f} times as far from the training rows as the network is believed"
         events.append(Event(Fault.EXTRAPOLATION, message))
-    reference_m = controller.plan(pose, state.goal, state.spring_m)
-    state = state._replace(reference_m=reference_m, n_actions=state.n_actions + 1, n_ticks=0)
+    reference_m = controller.plan(pose, state.goal + shift, state.spring_m)
+    state = state._replace(reference_m=reference_m, n_actions=state.n_actions + 1, n_ticks=0, shift=shift)
     return state, events, False
+
+
+def _shifted(controller: Controller, state: State) -> np.ndarray:
+    """Return the shift (6,) [mm, deg] of the goal for the next action, less what the last one left."""
+    if state.n_actions == 0:
+        return np.zeros(6)
+    assert state.goal is not None
+    pose, _ = believed(controller, state.springs_m.mean(axis=0), state.load)
+    left = pose_error(np.asarray(pose, float), state.goal)
+    return np.clip(state.shift - left, -MAX_SHIFT, MAX_SHIFT)
 
 
 def _unsettled(controller: Controller, state: State, settled: bool) -> list[Event]:

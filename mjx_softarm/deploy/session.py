@@ -1,7 +1,7 @@
 """The control loop on an arm: input, output and time around the pure `mjx_softarm.deploy.loop`.
 
 An arm that offers `pressures()`, what its regulators measure, or `motion_capture()` has both logged;
-neither is used for control.
+motion capture is not used for control, pressures to tell the payload alone.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from mjx_softarm.deploy.controller import Controller, State, Tick, start
 from mjx_softarm.deploy.ending import DONE, FAULT, MISSED, Ending, vent_at_end
 from mjx_softarm.deploy.faults import Event, Fault, Response
 from mjx_softarm.deploy.link import ArmFault, Link, Recorder
-from mjx_softarm.deploy.loop import believed, hold, refusals, release, step, with_goal
+from mjx_softarm.deploy.loop import believed, hold, release, step, with_goal
+from mjx_softarm.deploy.reachability import refusals
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mdp.rewards import scaled_error
 from mjx_softarm.sensing.pose import pose_error, pose_from_quaternion
@@ -144,7 +145,8 @@ class _Session:
     ):
         self.controller, self.tell, self.arrived, self.pilot = controller, tell, arrived, pilot
         self.goals, self.duration_s, self.n_taken, self.stay = list(goals), duration_s, 0, stay
-        self.refusals = refusals(controller, self.goals)  # before the arm moves: it takes longer than a tick
+        # Before the arm moves: it takes longer than a tick.
+        self.refusals = refusals(controller.policy, self.goals)
         self.state: State = start(controller)
         self.link, self.rows = Link(arm, len(self.state.pressure_kpa), controller.dt_s), Recorder(kept)
         self.began_s = self.link.now()
@@ -167,6 +169,8 @@ class _Session:
         Raises:
             ArmFault: a fault whose response is to vent.
         """
+        if not self.link.measures:
+            self.tell("payload: told from the commanded pressures, since the arm measures none")
         try:
             while True:
                 begin_s = self.link.now()
@@ -192,7 +196,7 @@ class _Session:
         row = self.link.look(begin_s)
         began = time.perf_counter()
         try:
-            self.state, tick = step(self.controller, self.state, readings, self.late)
+            self.state, tick = step(self.controller, self.state, readings, self.late, row["pressure_kpa"])
         except Exception:  # the row that explains it is kept
             self._log(row, readings, goal, self.state.spring_m)
             raise
@@ -218,7 +222,8 @@ class _Session:
     def _log(self, row: dict[str, Any], readings: np.ndarray | None, goal: Any, spring_m: np.ndarray) -> None:
         nothing = np.full(len(self.state.pressure_kpa), np.nan)
         row["readings"] = nothing if readings is None else readings
-        row["estimate"], _ = believed(self.controller, spring_m)
+        row["estimate"], _ = believed(self.controller, spring_m, self.state.load)
+        row["load_kg"] = self.state.load.believed_kg
         row["reference_m"] = nothing if self.state.reference_m is None else self.state.reference_m
         row["goal"] = np.full(6, np.nan) if goal is None else goal
         self.rows.add(row)

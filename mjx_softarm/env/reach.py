@@ -24,15 +24,13 @@ from mjx_softarm.mechanics.kinematics import chain_kinematics, mjx_kinematics
 from mjx_softarm.mechanics.mjcf import build_model
 from mjx_softarm.mechanics.pipe import CrossPipe, body_clearance
 from mjx_softarm.mechanics.settle import Settled, SettleResult, settle
-from mjx_softarm.mechanics.statics import ArmParams
+from mjx_softarm.mechanics.statics import PAYLOAD, ArmParams
 from mjx_softarm.mechanics.workspace import Pool, sample_evenly, sample_workspace
 from mjx_softarm.pneumatics import VALVE_S
 from mjx_softarm.sensing.pose import pose_from_frame
 from mjx_softarm.sensing.s2r import S2R, carry_body, correct
 from mjx_softarm.sensing.sensors import SENSORS
 from mjx_softarm.spec import ArmSpec
-
-PAYLOAD = 1  # index in ArmParams.tool_mass_kg
 
 for _sensor in SENSORS.values():
     jax.tree_util.register_dataclass(_sensor)  # numbers are traced, the kind is static

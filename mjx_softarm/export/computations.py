@@ -16,6 +16,8 @@ from mjx_softarm.export.symbols import Symbol, constant, repeat, symbol
 from mjx_softarm.mdp.observation import OBS_SIZE
 from mjx_softarm.policy import reach
 from mjx_softarm.policy.runtime import action_towards, actor_output, tip_pose
+from mjx_softarm.sensing.load import tell_load
+from mjx_softarm.sensing.pose import pose_error
 from mjx_softarm.sensing.sensors import Reading, SensorFault
 
 
@@ -30,18 +32,22 @@ def graph(controller: Controller) -> Computation:
     """Record `answer`."""
     n = controller.policy.spec.n_chambers
     inputs = symbol("readings", (n,)), symbol("goal", (6,)), symbol("last_length_m", (n,))
+    inputs = *inputs, symbol("load_kg", ()), symbol("pressure_kpa", (n,))
     return Computation(inputs, {name: constant(value) for name, value in answer(controller, *inputs).items()})
 
 
-def answer(controller: Controller, readings: Array, goal: Array, last_m: Array) -> dict[str, Array]:
+def answer(
+    controller: Controller, readings: Array, goal: Array, last_m: Array, load_kg: Array, pressure_kpa: Array
+) -> dict[str, Array]:
     """Return the references that the loop takes from readings (n,) and a goal (6,) when it acts, and more.
 
     A lost reading holds the last length (n,) [m] of its spring. References are NaN where the loop would give
-    none: a spring has neither a reading nor a last length, or the goal is outside the workspace.
+    none: a spring has neither a reading nor a last length, or the goal is outside the workspace. The payload
+    () [kg] is the caller's average of what rests told, each at its pressures (n,) [kPa].
     """
     policy, xp = controller.policy, array_namespace(readings)
     reading = policy.sensor.lengths(readings, last_m)
-    pose, away = tip_pose(policy, reading.length_m)
+    pose, away = tip_pose(policy, reading.length_m, load_kg)
     reference = policy.actions.readings(action_towards(policy, pose, xp.asarray(goal, dtype=np.float32)))
     # A distance that is NaN is not within the limit, nor is a length that is NaN finite.
     inside = _inside(controller, goal)
@@ -54,6 +60,7 @@ def answer(controller: Controller, readings: Array, goal: Array, last_m: Array) 
         "pose": pose,
         "extrapolation": away,
         "goal_outside": ~inside,
+        "load_told_kg": tell_load(policy.load_estimator, reading.length_m, pressure_kpa),
     }
 
 
@@ -86,11 +93,12 @@ def parts(controller: Controller) -> dict[str, Computation]:
     names = ("readings", "reference_m", "spring_m", "integral_kpa", "pressure_kpa")
     readings, reference_m, spring_m, integral_kpa, pressure_kpa = (symbol(name, (n,)) for name in names)
     springs_m, pressures_kpa = (symbol(name, (window, n)) for name in ("springs_m", "pressures_kpa"))
-    goal, pose = symbol("goal", (6,)), symbol("pose", (6,), np.float32)
+    goal, pose, load_kg = symbol("goal", (6,)), symbol("pose", (6,), np.float32), symbol("load_kg", ())
     xp = readings.__array_namespace__()
 
     reading = policy.sensor.lengths(readings, spring_m)
-    tip, away = tip_pose(policy, spring_m)
+    tip, away = tip_pose(policy, spring_m, load_kg)
+    told_kg = tell_load(policy.load_estimator, xp.mean(springs_m, axis=0), xp.mean(pressures_kpa, axis=0))
     action = action_towards(policy, pose, xp.asarray(goal, dtype=np.float32))
     written_kpa, next_kpa = pressures(reference_m, spring_m, integral_kpa, gains, controller.dt_s)
     law = {"pressure_kpa": written_kpa, "next_integral_kpa": next_kpa}
@@ -105,7 +113,9 @@ def parts(controller: Controller) -> dict[str, Computation]:
 
     return {
         "lengths": of(readings, spring_m, length_m=reading.length_m, lost=_lost(reading)),
-        "tip": of(spring_m, tip=tip, away=constant(away)),
+        "told_load": of(springs_m, pressures_kpa, kg=told_kg),
+        "left": of(pose, goal, off=pose_error(xp.asarray(pose, dtype=np.float64), goal)),
+        "tip": of(spring_m, load_kg, tip=tip, away=constant(away)),
         "references": of(pose, goal, asked_m=policy.actions.lengths(action)),
         "law": of(reference_m, spring_m, integral_kpa, **law),
         "vented": of(pressure_kpa, next_kpa=vented(pressure_kpa, controller.dt_s)),

@@ -6,11 +6,12 @@ from importlib import resources
 
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.faults import LATE_TICKS, LOST_TICKS, SETTLE_TIMEOUT_S, Fault, Response
-from mjx_softarm.deploy.loop import CHAMBER_WINDOWS
+from mjx_softarm.deploy.loop import CHAMBER_WINDOWS, MAX_SHIFT, OVERLOAD_KG
 from mjx_softarm.export.computations import parts
 from mjx_softarm.export.cpp_functions import Numbers, function
 from mjx_softarm.policy.file import file_entries
 from mjx_softarm.policy.reach import N_STEPS, begin
+from mjx_softarm.sensing.load import HIGHEST, JUMP_KG, LOWEST, N_AVERAGED, N_JUMPS
 
 _TEMPLATES = {"softarm.hpp": "softarm.hpp.in"} | {
     name: name for name in ("rows.cpp", "example.cpp", "CMakeLists.txt")
@@ -24,6 +25,7 @@ def sources(controller: Controller, policy_sha256: str) -> dict[str, str]:
     functions = [function(name, part, numbers) for name, part in parts(controller).items()]
     faults = [f"  {fault.name} = 1u << {k},  // {fault.response.value}" for k, fault in enumerate(Fault)]
     vents = [fault.name for fault in Fault if fault.response is Response.VENT]
+    most_kg = float(policy.load_estimator.load_scale_kg)
     values = {
         "SHA256": policy_sha256,
         "N": policy.spec.n_chambers,
@@ -44,6 +46,14 @@ def sources(controller: Controller, policy_sha256: str) -> dict[str, str]:
         "SEARCH": begin(policy, 1).size,
         "SEARCH_STEPS": N_STEPS,
         "THRESHOLD": repr(policy.reward.threshold),
+        "OWN_LOAD": repr(policy.spec.mass.payload_kg),
+        "LEAST_LOAD": repr(LOWEST * most_kg),
+        "GREATEST_LOAD": repr(HIGHEST * most_kg),
+        "OVERLOAD": repr(most_kg + OVERLOAD_KG),
+        "JUMP": repr(JUMP_KG),
+        "N_JUMPS": N_JUMPS,
+        "N_AVERAGED": N_AVERAGED,
+        "MAX_SHIFT": ", ".join(map(repr, MAX_SHIFT.tolist())),
         "GOAL": ", ".join(f"{value:.1f}" for value in policy.workspace[0]),
     }
     texts = {}

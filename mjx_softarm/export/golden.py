@@ -36,8 +36,8 @@ from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.controller import Controller, start
 from mjx_softarm.deploy.faults import Event, Fault
 from mjx_softarm.deploy.link import vented
-from mjx_softarm.deploy.loop import believed, refusals, step, with_goal
-from mjx_softarm.deploy.reachability import nearest
+from mjx_softarm.deploy.loop import believed, step, with_goal
+from mjx_softarm.deploy.reachability import nearest, refusals
 from mjx_softarm.policy.reach import nearest_poses
 from mjx_softarm.sensing.estimator import expected_springs
 
@@ -108,12 +108,12 @@ class Machine:
         state = self.state
         reference_m = np.full_like(state.spring_m, np.nan) if state.reference_m is None else state.reference_m
         faults = sum({BITS[event.fault] for event in events})
-        pose, _ = believed(self.controller, state.spring_m)
+        pose, _ = believed(self.controller, state.spring_m, state.load)
         return np.concat([[faults, arrived], state.pressure_kpa, reference_m, state.spring_m, pose])
 
     def _take_goal(self, goal: np.ndarray, checked: bool) -> tuple[Event, ...]:
         """Take a goal; return why it was refused, if it was."""
-        refused = tuple(refusals(self.controller, [goal]).values()) if checked else ()
+        refused = tuple(refusals(self.controller.policy, [goal]).values()) if checked else ()
         if not refused:
             self.state, refused = with_goal(self.controller, self.state, goal)
         return refused

@@ -37,7 +37,11 @@ def export_onnx(policy_path: Path) -> list[Path]:
     whole, actor, check = (
         policy_path.with_name(f"{policy_path.stem}{end}.onnx") for end in ("", "_actor", "_check")
     )
-    never = {"last_length_m": np.full(n, np.nan)}
+    never = {
+        "last_length_m": np.full(n, np.nan),
+        "load_kg": controller.policy.spec.mass.payload_kg,
+        "pressure_kpa": np.full(n, np.nan),
+    }
     write_onnx(whole, computations.graph(controller), {"kind": "policy", **about}, never)
     write_onnx(actor, computations.actor(controller), {"kind": "actor", **about}, {})
     write_onnx(check, computations.check(controller), {"kind": "check of goals", **about}, {})
@@ -75,6 +79,8 @@ def describe(policy: Policy, sha256: str) -> dict[str, Any]:
             "readings": readings,
             "goal": _POSE,
             "last_length_m": lengths | {"default": "nan: none yet; a lost reading holds it"},
+            "load_kg": {"unit": "kg", "default": "the specification's: load_told_kg, averaged over rests"},
+            "pressure_kpa": {"unit": "kPa", "default": "nan: not known; of the arm at rest"},
             "observation": {"names": list(OBS_LAYOUT), "centre": policy.obs_scale.centre.tolist()}
             | {"scale": policy.obs_scale.scale.tolist()},
         },
@@ -88,6 +94,7 @@ def describe(policy: Policy, sha256: str) -> dict[str, Any]:
             "goal_outside": {"true": "the goal is outside the workspace"},
             "nearest": _POSE,
             "error": {"above": policy.reward.threshold, "means": "no pressures reach the goal"},
+            "load_told_kg": {"unit": "kg", "nan": "without pressures"},
             "action": {"names": readings["names"], "range": [-1.0, 1.0]},
         },
         "rate_hz": policy.rate_hz,

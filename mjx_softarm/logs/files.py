@@ -45,7 +45,7 @@ class LogMatrix(NamedTuple):
         groups: dict[str, Any] = {
             name: self.values[:, chosen] for name in GROUPS if (chosen := self.indices(name))
         }
-        for name in ("time_s", "payload_kg", "sequence"):
+        for name in ("time_s", "payload_kg", "load_kg", "sequence"):
             if name in groups:
                 groups[name] = groups[name][:, 0]
         if "marker_m" in groups:

@@ -70,6 +70,7 @@ def log_columns(
         *(Column("reference_m", f"reference{k}", "length", "mm") for k in chambers),
         *(Column("goal", f"goal_{axis}", *_POSE[axis]) for axis in _POSE),
         *(Column("estimate", f"estimate_{axis}", *_POSE[axis]) for axis in _POSE),
+        Column("load_kg", "load", "mass", "g"),
         Column("sequence", "sequence", "id", "1"),
     )
 
@@ -95,6 +96,7 @@ class Log:
     reference_m: np.ndarray | None = None  # (n, n_chambers) spring lengths that were asked for
     goal: np.ndarray | None = None  # (n, 6) [mm, deg]
     estimate: np.ndarray | None = None  # (n, 6) [mm, deg] tip pose that the controller believed in
+    load_kg: np.ndarray | None = None  # (n,) payload that the controller believed in
     sequence: np.ndarray | None = None  # (n,) which demonstration a row is part of, counted from 0
     reading_name: str = Coil.reading_name  # of what the readings are, as in the names of their columns
 

@@ -26,6 +26,7 @@ from mjx_softarm.sensing.pose import rotation_about
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
 
 GRAVITY_M_S2 = 9.81
+PAYLOAD = 1  # index in ArmParams.tool_mass_kg
 
 
 class ArmParams(NamedTuple):

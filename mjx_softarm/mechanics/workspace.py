@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -14,7 +15,7 @@ from jax import Array
 from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.settle import Settled, settle_pressures
-from mjx_softarm.mechanics.statics import ArmParams
+from mjx_softarm.mechanics.statics import PAYLOAD, ArmParams
 from mjx_softarm.sensing.pose import pose_from_frame
 from mjx_softarm.spec import ArmSpec, SpecError
 
@@ -34,6 +35,15 @@ class Pool(NamedTuple):
     pose: Array  # (n, 6) [mm, deg]
 
 
+class LoadedPool(NamedTuple):
+    """Equilibria of arms with payloads, whose chambers are not quite the nominal arm's."""
+
+    load_kg: Array  # (n,) payload
+    pressure_kpa: Array  # (n, n_chambers)
+    spring_m: Array  # (n, n_chambers)
+    pose: Array  # (n, 6) [mm, deg]
+
+
 @functools.cache
 def _solver():
     def solve(params: ArmParams, pressure_kpa: Array) -> Settled:
@@ -43,12 +53,33 @@ def _solver():
     return jax.jit(jax.vmap(solve, in_axes=(None, 0)))
 
 
+@functools.cache
+def _loaded_solver():
+    def solve(
+        params: ArmParams, pressure_kpa: Array, load_kg: Array, stiffness: Array, area: Array
+    ) -> Settled:
+        params = params._replace(
+            tool_mass_kg=jnp.asarray(params.tool_mass_kg).at[PAYLOAD].set(load_kg),
+            chamber_stiffness=params.chamber_stiffness * stiffness,
+            area=params.area * area,
+        )
+        return settle_pressures(chain_kinematics(params), params, pressure_kpa)
+
+    return jax.jit(jax.vmap(solve, in_axes=(None, 0, 0, 0, 0)))
+
+
 def settle_many(spec: ArmSpec, pressure_kpa: np.ndarray) -> Settled:
     """Return equilibria at many pressures (n, n_chambers) [kPa], as NumPy arrays with a leading axis n."""
-    params = ArmParams.from_spec(spec)
-    n = len(pressure_kpa)
-    padded = np.resize(np.asarray(pressure_kpa, np.float32), (-(-n // BATCH) * BATCH, spec.n_chambers))
-    parts = [jax.device_get(_solver()(params, part)) for part in np.split(padded, len(padded) // BATCH)]
+    return _in_batches(_solver(), spec, pressure_kpa)
+
+
+def _in_batches(solver: Callable[..., Settled], spec: ArmSpec, *columns: np.ndarray) -> Settled:
+    """Return equilibria of rows of columns (n, ...), as NumPy arrays with a leading axis n."""
+    params, n = ArmParams.from_spec(spec), len(columns[0])
+    n_batches = -(-n // BATCH)
+    padded = [np.resize(np.asarray(x, np.float32), (n_batches * BATCH, *x.shape[1:])) for x in columns]
+    batches = zip(*(np.split(x, n_batches) for x in padded), strict=True)
+    parts = [jax.device_get(solver(params, *batch)) for batch in batches]
     return jax.tree.map(lambda *x: np.concatenate(x)[:n], *parts)
 
 
@@ -68,7 +99,30 @@ def sample_workspace(spec: ArmSpec, n: int, seed: int) -> Pool:
         SpecError: the arm settles, its springs within their limits, at fewer than `n` of the candidates.
     """
     rng = np.random.default_rng(seed)
-    return _draw(spec, n, random_pressures(spec, CANDIDATES_PER_POSE * n, rng), rng, replace=False)
+    found = settle_many(spec, random_pressures(spec, CANDIDATES_PER_POSE * n, rng))
+    return _pool(found, _chosen(spec, found, n, rng, replace=False))
+
+
+def sample_loaded(spec: ArmSpec, load_kg: np.ndarray, spread: float, seed: int) -> LoadedPool:
+    """Draw poses as `sample_workspace` does, of arms with payloads and chambers that are off.
+
+    Args:
+        spec: the arm; its payload is not looked at.
+        load_kg (m,) [kg]: payloads of the candidates, of which half are drawn.
+        spread: by which chambers' stiffness and area are off at most, as a share of the arm's.
+        seed: of the draw; training and evaluation use different ones.
+
+    Raises:
+        SpecError: the arm settles at fewer than half of the candidates.
+    """
+    rng = np.random.default_rng(seed)
+    shape = len(load_kg), spec.n_chambers
+    pressure_kpa = random_pressures(spec, shape[0], rng)
+    factors = (rng.uniform(1.0 - spread, 1.0 + spread, shape) for _ in range(2))
+    found = _in_batches(_loaded_solver(), spec, pressure_kpa, load_kg, *factors)
+    rows = _chosen(spec, found, shape[0] // CANDIDATES_PER_POSE, rng, replace=False)
+    pool = _pool(found, rows)
+    return LoadedPool(jnp.asarray(load_kg[rows], jnp.float32), pool.pressure_kpa, pool.spring_m, pool.pose)
 
 
 def sample_evenly(spec: ArmSpec, n: int, seed: int) -> Pool:
@@ -89,11 +143,12 @@ def sample_evenly(spec: ArmSpec, n: int, seed: int) -> Pool:
     rng = np.random.default_rng(seed)
     half = CANDIDATES_PER_EVEN_POSE * n // 2
     extremes = rng.choice(pressure_levels(spec), (half, spec.n_chambers))
-    return _draw(spec, n, np.concatenate([random_pressures(spec, half, rng), extremes]), rng, replace=True)
+    found = settle_many(spec, np.concatenate([random_pressures(spec, half, rng), extremes]))
+    return _pool(found, _chosen(spec, found, n, rng, replace=True))
 
 
-def _draw(spec: ArmSpec, n: int, pressure_kpa: np.ndarray, rng: np.random.Generator, replace: bool) -> Pool:
-    found = settle_many(spec, pressure_kpa)
+def _chosen(spec: ArmSpec, found: Settled, n: int, rng: np.random.Generator, replace: bool) -> np.ndarray:
+    """Draw rows (n,) of equilibria with weights that even out the number of tips per voxel."""
     in_range = (spec.springs.length_min_m <= found.spring_m) & (found.spring_m <= spec.springs.length_max_m)
     usable = found.settled & in_range.all(axis=-1)
     tip_mm = np.where(usable[:, None], 1e3 * found.tip_position_m, 0.0)
@@ -107,7 +162,10 @@ def _draw(spec: ArmSpec, n: int, pressure_kpa: np.ndarray, rng: np.random.Genera
             f"{np.count_nonzero(weight)} of {len(weight)} random pressures, expected at {n} or more; is it "
             "stiff enough?"
         )
-    chosen = rng.choice(len(weight), n, replace=replace, p=weight / weight.sum())
+    return rng.choice(len(weight), n, replace=replace, p=weight / weight.sum())
+
+
+def _pool(found: Settled, chosen: np.ndarray) -> Pool:
     pose = pose_from_frame(found.tip_position_m[chosen], found.tip_rotation[chosen])
     arrays = (found.q[chosen], found.pressure_kpa[chosen], found.spring_m[chosen], pose)
     return Pool(*map(jnp.asarray, arrays))

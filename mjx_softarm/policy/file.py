@@ -19,7 +19,8 @@ networks and the workspace float32.
     n_actions            () int       towards each goal, as in the evaluation of the run
     tolerance_m          ()           greatest error of a spring that counts as on its reference
     workspace            (m, 6)       poses [mm, deg] that the arm reaches, spread over its workspace
-    estimator.<field>                 `PoseEstimator`: spring lengths to the simulated pose
+    estimator.<field>                 `PoseEstimator`: spring lengths and payload to the simulated pose
+    load_estimator.<field>            `LoadEstimator`: spring lengths and pressures to the payload
     spring_model.<field>              `SpringModel`: pressures to spring lengths, to find chambers that fail
     s2r_kind             ()           "mlp", or "none": the policy was trained on simulated poses
     s2r.<field>                       `S2R`, if there is one: simulated pose to the real one
@@ -48,11 +49,12 @@ from mjx_softarm.mdp.actions import N_ACTIONS, ActionMap
 from mjx_softarm.mdp.observation import OBS_LAYOUT, OBS_SIZE, ObsScale
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.sensing.estimator import PoseEstimator, SpringModel, take_estimator, take_spring_model
+from mjx_softarm.sensing.load import LoadEstimator, take_load_estimator
 from mjx_softarm.sensing.s2r import S2R, take_s2r
 from mjx_softarm.sensing.sensors import Sensor, SensorFault
 from mjx_softarm.spec import ArmSpec, SpecError
 
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 
 KIND = "policy"
 
@@ -69,6 +71,7 @@ class Policy:
     rate_hz: float
     workspace: np.ndarray  # (m, 6)
     estimator: PoseEstimator
+    load_estimator: LoadEstimator
     spring_model: SpringModel
     s2r: S2R | None
     spec: ArmSpec
@@ -87,6 +90,7 @@ class ArmModel(NamedTuple):
 
     workspace: np.ndarray  # (m, 6) poses [mm, deg]
     estimator: PoseEstimator
+    load_estimator: LoadEstimator
     spring_model: SpringModel
     s2r: S2R | None
 
@@ -191,7 +195,9 @@ def file_entries(policy: Policy) -> dict[str, np.ndarray]:
     for name in ("obs_scale", "reward", "sensor", "gains"):
         numbers = entries_of(name, getattr(policy, name))
         entries |= {item: value.astype(np.float64) for item, value in numbers.items()}
-    for name in ("estimator", "spring_model") + (("s2r",) if policy.s2r is not None else ()):
+    for name in ("estimator", "load_estimator", "spring_model") + (
+        ("s2r",) if policy.s2r is not None else ()
+    ):
         entries |= entries_of(name, getattr(policy, name))
     return {name: np.asarray(value) for name, value in entries.items()}
 
@@ -224,6 +230,7 @@ def _unpack(arrays: Mapping[str, np.ndarray], source: str) -> Policy:
         rate_hz=entries.take("rate_hz", np.float64, ()),
         workspace=entries.take("workspace", np.float32, (None, 6)),
         estimator=take_estimator(entries, "estimator", n),
+        load_estimator=take_load_estimator(entries, "load_estimator", n),
         spring_model=take_spring_model(entries, "spring_model", n),
         s2r=take_s2r(entries, "s2r", n) if s2r_kind == "mlp" else None,
         spec=spec,

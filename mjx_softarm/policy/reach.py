@@ -1,4 +1,4 @@
-"""Nearest poses that an arm can take to goals, by the policy file's models of the arm.
+"""Nearest poses that an arm can take to goals, by the policy file's models of the arm as specified.
 
 The nearest pose to a goal is searched over the pressures between their limits: pressures give springs, these
 the tip. Levenberg-Marquardt steps, from several starts at once; pressures at a limit that would leave it are
@@ -77,7 +77,7 @@ def _tip(policy: Policy, share: Array) -> tuple[Array, Array]:
     """Return the tip's position (..., 3) [m] and axes (..., 3, 3) at shares (..., n) of the pressures."""
     low, high = policy.gains.pressure_min_kpa, policy.gains.pressure_max_kpa
     spring_m = expected_springs(policy.spring_model, low + (high - low) * share)
-    frame = estimate_frame(policy.estimator, spring_m)
+    frame = estimate_frame(policy.estimator, spring_m, policy.spec.mass.payload_kg)
     if policy.s2r is None:
         return frame
     return apply_correction(frame, correction(policy.s2r, inputs(frame, spring_m)))

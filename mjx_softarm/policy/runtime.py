@@ -1,4 +1,4 @@
-"""The policy in NumPy: spring lengths -> pose of the tip; pose and goal -> references of the springs.
+"""The policy in NumPy: spring lengths, payload -> pose of the tip; pose, goal -> references of the springs.
 
 Observation, sensors and networks are the functions that training uses. The functions here take JAX arrays
 and the symbols of `mjx_softarm.export` as well.
@@ -27,9 +27,18 @@ class Reference(NamedTuple):
     length_m: np.ndarray  # (..., n) the same, as calibrated lengths: the reference of `control.pressures`
 
 
-def tip_pose(policy: Policy, spring_m: Array) -> tuple[Array, Array]:
-    """Return the tip pose (6,) [mm, deg] that springs (n,) [m] tell; and `s2r.extrapolation` of it, or 0."""
-    frame = estimate_frame(policy.estimator, spring_m)
+def tip_pose(policy: Policy, spring_m: Array, load_kg: Array | float) -> tuple[Array, Array]:
+    """Return the tip pose that springs and a payload tell.
+
+    Args:
+        policy: with the networks.
+        spring_m (n,) [m]: lengths.
+        load_kg () [kg]: payload.
+
+    Returns:
+        Pose (6,) [mm, deg], and `s2r.extrapolation` of it, or 0.
+    """
+    frame = estimate_frame(policy.estimator, spring_m, load_kg)
     if policy.s2r is None:
         return pose_from_frame(*frame), np.float32(0.0)
     x = inputs(frame, array_namespace(spring_m).asarray(spring_m, dtype=np.float32))

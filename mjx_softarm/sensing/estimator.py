@@ -4,7 +4,9 @@ No sensor of the arm sees the tip. Its pose is estimated from the spring lengths
 section's length and bend, a section of constant curvature has a closed form, and the sections are in series.
 Real sections do not bend evenly, since the weight below pulls at them. A small network, distilled from the
 simulator, corrects each section's end. Its inputs are the springs and the direction of gravity at each
-section's end; its outputs are changes, which stay continuous where yaw and roll do not.
+section's end; its outputs are changes, which stay continuous where yaw and roll do not. A second one has the
+payload as an input, too (`mjx_softarm.sensing.load`), and gives changes per payload: without one, the first
+network is all there is.
 
 In the other direction, `expected_springs` predicts the spring lengths at given pressures without a payload.
 The control loop compares them with the readings to find a chamber that has lost its pressure.
@@ -12,6 +14,7 @@ The control loop compares them with the readings to find a chamber that has lost
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -32,12 +35,15 @@ _SMALL_BEND = 1e-8  # square [rad^2] below which a section counts as straight
 
 
 class PoseEstimator(NamedTuple):
-    """Spring lengths to tip pose, for n springs in n / 3 sections. All float32."""
+    """Spring lengths and payload to tip pose, for n springs in n / 3 sections. All float32."""
 
     layers: tuple[Layer, ...]  # normalised springs (n,) and downs (n,) -> changes (n_sections * N_CHANGES,)
+    load_layers: tuple[Layer, ...]  # the same and the normalised payload (1,) -> changes, per this payload
     spring_site_m: Array  # (n, 2) holes of the springs in their rings, x and y
     spring_centre_m: Array  # (n,) lengths that are normalised to 0,
     spring_scale_m: Array  # (n,) and what is added to them for 1
+    load_centre_kg: Array  # () payload that is normalised to 0
+    load_scale_kg: Array  # () and what is added to it for 1
     change_scale: Array  # (N_CHANGES,) [m, 1] of the network's outputs
 
 
@@ -58,18 +64,22 @@ class Frame(NamedTuple):
     rotation: Array  # (..., 3, 3), columns are the plate's axes
 
 
-def estimate(estimator: PoseEstimator, spring_m: Array) -> Array:
-    """Return the tip pose (..., 6) [mm, deg] of an arm at rest with springs (..., n) [m]."""
-    return pose_from_frame(*estimate_frame(estimator, spring_m))
+def estimate(estimator: PoseEstimator, spring_m: Array, load_kg: Array | float) -> Array:
+    """Return the tip pose (..., 6) [mm, deg] of an arm at rest; arguments as of `estimate_frame`."""
+    return pose_from_frame(*estimate_frame(estimator, spring_m, load_kg))
 
 
-def estimate_frame(estimator: PoseEstimator, spring_m: Array) -> Frame:
-    """Return the tip frame of an arm at rest with springs (..., n) [m]."""
+def estimate_frame(estimator: PoseEstimator, spring_m: Array, load_kg: Array | float) -> Frame:
+    """Return the tip frame of an arm at rest with springs (..., n) [m] and a payload (...) or () [kg]."""
     xp = array_namespace(spring_m, estimator.spring_site_m)
     spring_m = xp.asarray(spring_m, dtype=estimator.spring_site_m.dtype)
     even = constant_curvature(estimator.spring_site_m, spring_m)  # (..., n_sections)
     normalised = (spring_m - estimator.spring_centre_m) / estimator.spring_scale_m
-    changes = mlp(estimator.layers, xp.concat([normalised, *_downs(even.rotation)], axis=-1))
+    load = (xp.asarray(load_kg, dtype=spring_m.dtype) - estimator.load_centre_kg) / estimator.load_scale_kg
+    load = (xp.zeros_like(normalised[..., 0]) + load)[..., None]  # (..., 1)
+    shape = xp.concat([normalised, *_downs(even.rotation)], axis=-1)
+    changes = mlp(estimator.layers, shape)
+    changes = changes + load * mlp(estimator.load_layers, xp.concat([shape, load], axis=-1))
     changes = changes.reshape(*changes.shape[:-1], -1, N_CHANGES) * estimator.change_scale  # (..., n / 3, 6)
     quaternion = xp.concat([xp.ones_like(changes[..., :1]), changes[..., 3:]], axis=-1)
     turn = rotation_from_quaternion(quaternion / xp.sqrt(xp.sum(quaternion**2, axis=-1))[..., None])
@@ -176,8 +186,10 @@ def take_estimator(entries: Entries, name: str, n_springs: int) -> PoseEstimator
     n_sections = n_springs // N_CHAMBERS_PER_SECTION
     shapes: dict = dict.fromkeys(("spring_centre_m", "spring_scale_m"), (n_springs,))
     shapes |= {"spring_site_m": (n_springs, 2), "change_scale": (N_CHANGES,)}
+    shapes |= dict.fromkeys(("load_centre_kg", "load_scale_kg"), ())
     n_in, n_out = n_springs + 3 * n_sections, N_CHANGES * n_sections
-    return entries.network(name, PoseEstimator, shapes, n_in, n_out)
+    load_layers = entries.layers(f"{name}.load", n_in + 1, n_out)
+    return entries.network(name, partial(PoseEstimator, load_layers=load_layers), shapes, n_in, n_out)
 
 
 def take_spring_model(entries: Entries, name: str, n_springs: int) -> SpringModel:

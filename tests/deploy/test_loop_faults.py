@@ -151,7 +151,7 @@ def test_s2r_corrects_the_estimate_and_extrapolation_is_counted():
     run = go(LinearArm(), goals=GOALS[:1], controller=controller)
     assert run.counts() == {Fault.EXTRAPOLATION: N_ACTIONS}
     spring_m = read_m(run.log).astype(np.float32)
-    simulated = estimate(POLICY.estimator, spring_m)
+    simulated = estimate(POLICY.estimator, spring_m, 0.0)
     corrected = correct(network, simulated, spring_m)
     assert np.abs(corrected - simulated).max() > 0.5
     np.testing.assert_allclose(run.log.estimate, corrected, atol=2e-3)

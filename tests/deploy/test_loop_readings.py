@@ -20,7 +20,7 @@ def test_one_lost_reading_holds_the_last_good_one(spoil):
     before_m, now_m, after_m = read_m(run.log)[29:32]
     held_m = np.where(np.isnan(now_m), before_m, now_m)
     assert held_m[4] == before_m[4] != after_m[4]
-    np.testing.assert_allclose(run.log.estimate[30], estimate(POLICY.estimator, held_m), atol=1e-3)
+    np.testing.assert_allclose(run.log.estimate[30], estimate(POLICY.estimator, held_m, 0.0), atol=1e-3)
     assert np.isnan(run.log.readings[30, 4])
     assert ("spring4: got nan Hz" in run.events[0].message) == (spoil is nan)
 

@@ -35,7 +35,7 @@ class Seen(LinearArm):
     def motion_capture(self):
         if self.tick % 5 == 0:
             raise OSError("frame dropped")
-        pose = estimate(POLICY.estimator, self.spring_m[None])[0].astype(float)
+        pose = estimate(POLICY.estimator, self.spring_m[None], 0.0)[0].astype(float)
         tip_m = 1e-3 * (pose[:3] + self.off_mm + 0.2 * self._rng.standard_normal(3))
         return Capture(tip_m, quaternion_from_pose(pose), tip_m[None])
 

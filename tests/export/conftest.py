@@ -34,9 +34,13 @@ def busy_policy(spec=SPEC):
         limit=np.float32(0.335),
     )
     estimator = policy.estimator._replace(
-        layers=layers(2 * N, 6, 18, scale=0.2), change_scale=np.full(6, 0.01, np.float32)
+        layers=layers(2 * N, 6, 18, scale=0.2),
+        load_layers=layers(2 * N + 1, 6, 18, scale=0.2),
+        change_scale=np.full(6, 0.01, np.float32),
     )
-    return dataclasses.replace(policy, layers=layers(18, 12, N, scale=0.5), estimator=estimator, s2r=s2r)
+    load = policy.load_estimator._replace(layers=layers(2 * N, 6, 1, scale=0.3))
+    networks = {"estimator": estimator, "load_estimator": load, "s2r": s2r}
+    return dataclasses.replace(policy, layers=layers(18, 12, N, scale=0.5), **networks)
 
 
 @contextlib.contextmanager

@@ -86,7 +86,8 @@ def test_draw_wires_without_a_sim_to_real_network(tmp_path):
     readings, goal = np.linspace(1.5, 2.0, N), policy.workspace[0].astype(float)
     state, _ = with_goal(controller, start(controller), goal)
     state, _ = step(controller, state, readings, False)
-    feed = {"readings": readings, "goal": goal, "last_length_m": readings}
+    more = {"load_kg": np.float32(0.0), "pressure_kpa": readings}
+    feed = {"readings": readings, "goal": goal, "last_length_m": readings, **more}
     [reference_m] = session.run(["reference_m"], {name: np.float32(value) for name, value in feed.items()})
     np.testing.assert_allclose(reference_m, state.reference_m, atol=1e-6)
 

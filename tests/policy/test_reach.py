@@ -9,7 +9,7 @@ from tests.linear_arm import GAIN_M_PER_KPA, HIGH_KPA, LOW_KPA, POLICY, REST_M, 
 
 
 def poses(pressure_kpa):
-    return estimate(POLICY.estimator, REST_M + np.asarray(pressure_kpa) @ GAIN_M_PER_KPA.T).astype(float)
+    return estimate(POLICY.estimator, REST_M + np.asarray(pressure_kpa) @ GAIN_M_PER_KPA.T, 0.0).astype(float)
 
 
 def test_poses_between_the_limits_are_reached():

@@ -41,11 +41,15 @@ def integrated(length_m, towards_rad, bend_rad, n=20_000):
 def network(seed, size=1.0, dtype=np.float32):
     """An estimator with random layers."""
     rng = np.random.default_rng(seed)
-    layers = tuple(
-        (size * rng.normal(size=(n_in, n_out)) / np.sqrt(n_in), size * 0.1 * rng.normal(size=n_out))
-        for n_in, n_out in ((2 * N, 32), (32, 3 * N_CHANGES))
-    )
-    arrays = (layers, SITE_M, STRAIGHT_M, np.full(N, 0.03), np.repeat([0.003, 0.015], 3))
+    networks = [
+        tuple(
+            (size * rng.normal(size=(n_in, n_out)) / np.sqrt(n_in), size * 0.1 * rng.normal(size=n_out))
+            for n_in, n_out in ((n_inputs, 32), (32, 3 * N_CHANGES))
+        )
+        for n_inputs in (2 * N, 2 * N + 1)
+    ]
+    numbers = np.full(N, 0.03), 0.2, 0.8, np.repeat([0.003, 0.015], 3)
+    arrays = (*networks, SITE_M, STRAIGHT_M, *numbers)
     return PoseEstimator(*jax.tree.map(lambda x: np.asarray(x, dtype), arrays))
 
 
@@ -77,7 +81,9 @@ def test_changes_move_and_turn_the_section_ends():
     rng = np.random.default_rng(0)
     changes = rng.normal(size=(3, N_CHANGES)) * np.repeat([0.01, 0.2], 3)
     estimator = network(0, dtype=np.float64)._replace(
-        layers=((np.zeros((2 * N, 18)), changes.ravel()),), change_scale=np.ones(6)
+        layers=((np.zeros((2 * N, 18)), 0.7 * changes.ravel()),),
+        load_layers=((np.zeros((2 * N + 1, 18)), 0.2 * changes.ravel()),),
+        change_scale=np.ones(6),
     )
     spring_m = 0.2 + 0.03 * rng.normal(size=N)
     even = constant_curvature(SITE_M, spring_m)
@@ -85,7 +91,7 @@ def test_changes_move_and_turn_the_section_ends():
     axis = changes[:, 3:] / np.linalg.norm(changes[:, 3:], axis=1, keepdims=True)
     turn = Rotation.from_rotvec(angle[:, None] * axis).as_matrix()
     expected = chain(Frame(even.position_m + changes[:, :3], turn @ even.rotation))
-    got = estimate_frame(estimator, spring_m)
+    got = estimate_frame(estimator, spring_m, 1.4)  # 1.5 times the scale above the centre
     np.testing.assert_allclose(got.position_m, expected.position_m, atol=1e-12)
     np.testing.assert_allclose(got.rotation, expected.rotation, atol=1e-12)
     np.testing.assert_allclose(got.rotation @ got.rotation.T, np.eye(3), atol=1e-12)
@@ -94,23 +100,26 @@ def test_changes_move_and_turn_the_section_ends():
 def test_numpy_and_jax_agree_and_batches_are_rows():
     estimator, rng = network(1), np.random.default_rng(1)
     spring_m = (0.2 + 0.03 * rng.normal(size=(2, 50, N))).astype(np.float32)
-    pose = estimate(estimator, spring_m)
+    load_kg = np.float32([[0.0], [1.0]])
+    pose = estimate(estimator, spring_m, load_kg)
     assert pose.shape == (2, 50, 6) and pose.dtype == np.float32
-    in_jax = jax.jit(estimate)(jax.tree.map(jnp.asarray, estimator), jnp.asarray(spring_m))
+    in_jax = jax.jit(estimate)(jax.tree.map(jnp.asarray, estimator), jnp.asarray(spring_m), load_kg)
     same = [frame_from_pose(np.asarray(x, float)) for x in (pose, in_jax)]  # angles may differ in gimbal lock
     for one, other in zip(*same, strict=True):
         np.testing.assert_allclose(one, other, atol=2e-5)
-    np.testing.assert_allclose(estimate(estimator, spring_m[1, 7]), pose[1, 7], atol=2e-2)
-    one = estimate_frame(estimator, spring_m[1, 7])
+    np.testing.assert_allclose(estimate(estimator, spring_m[1, 7], 1.0), pose[1, 7], atol=2e-2)
+    one = estimate_frame(estimator, spring_m[1, 7], 1.0)
     np.testing.assert_allclose(one.rotation, same[0][1][1, 7], atol=1e-5)
-    assert estimate(estimator, spring_m.astype(np.float64)).dtype == np.float32
+    assert estimate(estimator, spring_m.astype(np.float64), 0.5).dtype == np.float32
 
 
 def test_straight_arm_has_a_slope():
-    slope = jax.jit(jax.jacobian(lambda s: estimate_frame(network(2), s).position_m))(jnp.asarray(STRAIGHT_M))
+    slope = jax.jit(jax.jacobian(lambda s: estimate_frame(network(2), s, 0.0).position_m))(
+        jnp.asarray(STRAIGHT_M)
+    )
     step = 1e-4 * np.eye(N)
     double = network(2, dtype=np.float64)
-    ahead, back = (estimate_frame(double, STRAIGHT_M + sign * step).position_m for sign in (1, -1))
+    ahead, back = (estimate_frame(double, STRAIGHT_M + sign * step, 0.0).position_m for sign in (1, -1))
     np.testing.assert_allclose(slope, (ahead - back).T / 2e-4, atol=2e-2)
     assert np.abs(slope).max() > 0.5
 
@@ -121,8 +130,8 @@ def test_nothing_jumps_through_gimbal_lock():
     bent = np.concatenate([springs_of(0.2, 0.0, np.pi / 6)] * 3)
     spring_m = (0.2 + share * (bent - 0.2)).astype(np.float32)
     estimator = network(3, size=0.1)
-    assert np.abs(estimate(estimator, spring_m)[:, 4]).max() > 85.0
-    frame = estimate_frame(estimator, spring_m)
+    assert np.abs(estimate(estimator, spring_m, 0.0)[:, 4]).max() > 85.0
+    frame = estimate_frame(estimator, spring_m, 0.0)
     assert np.abs(np.diff(frame.rotation, axis=0)).max() < 2e-3
     assert np.abs(np.diff(frame.position_m, axis=0)).max() < 1e-3
 

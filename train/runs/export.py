@@ -40,7 +40,7 @@ def export_run(run: Run, path: Path | None = None, task: Task | None = None) -> 
         raise RunError(f"{run.path}: env.observation: got {got!r}, expected 'pose' for a policy to export")
     task, params = restore_policy(run, task)
     model, distilled = arm_model(task.job.env)
-    errors = {name: getattr(distilled, name) for name in ("tip_mm", "turn_deg", "spring_mm")}
+    errors = {name: getattr(distilled, name) for name in ("tip_mm", "turn_deg", "load_kg", "spring_mm")}
     provenance = {
         **json.loads((run.path / "config.json").read_text("utf-8")),
         "epoch": run.latest_epoch,
@@ -72,7 +72,8 @@ def arm_model(env: ReachEnv) -> tuple[ArmModel, Distilled]:
     distilled = _distil(env.spec)
     halves = [env.sample_pool(N_WORKSPACE // 2, SEED, evenly).pose for evenly in (False, True)]
     workspace = np.concatenate(halves).astype(np.float32)
-    return ArmModel(workspace, distilled.estimator, distilled.spring_model, env.s2r), distilled
+    networks = distilled.estimator, distilled.load_estimator, distilled.spring_model
+    return ArmModel(workspace, *networks, env.s2r), distilled
 
 
 @functools.cache

@@ -27,7 +27,7 @@ def random_springs(n, seed=0):
 
 def forward(policy, spring_m):
     """The loop's estimate, in float32 as the loop has it."""
-    pose = estimate(policy.estimator, spring_m)
+    pose = estimate(policy.estimator, spring_m, 0.0)
     return pose if policy.s2r is None else correct(policy.s2r, pose, spring_m)
 
 

@@ -126,7 +126,7 @@ def test_without_s2r_the_nominal_policy_plans_and_the_springs_are_calibrated(tmp
 
 def test_policy_goes_to_a_point_on_a_twin(tmp_path, make_arm_model, monkeypatch):
     # The made-up networks' arm reaches no point of the circle.
-    monkeypatch.setattr("mjx_softarm.deploy.session.refusals", lambda controller, goals: {})
+    monkeypatch.setattr("mjx_softarm.deploy.session.refusals", lambda policy, goals: {})
     settings, trial = dataclasses.replace(TINY, n_points=1), Trial("with", 0, 0)
     (tmp_path / reach_run(0, 0)).mkdir()
     save_policy(tmp_path / reach_run(0, 0) / "policy.npz", make_policy(make_arm_model))

@@ -94,7 +94,7 @@ def test_it_learns_in_the_epoch_and_is_evaluated(run):
 @pytest.fixture
 def quick_export(make_arm_model, monkeypatch):
     model = make_arm_model(SHORT.n_chambers)
-    nothing = Distilled(model.estimator, model.spring_model, {}, {}, {})
+    nothing = Distilled(*model[1:4], {}, {}, {}, {})
     monkeypatch.setattr(export, "arm_model", lambda env: (model, nothing))
 
 

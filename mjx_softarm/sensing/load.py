@@ -1,0 +1,84 @@
+"""The payload of an arm at rest, told by springs and pressures, and averaged over rests. NumPy and JAX.
+
+A payload bends and stretches the arm, and the sensor-space law holds its springs where they were: the springs
+alone do not show it, but the pressures that hold them do. A small network, distilled from simulated rests of
+arms whose chambers differ from the specification's by a few per cent, tells the payload. A payload changes
+rarely, so what rests tell is averaged, until two of them in a row disagree.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from mjx_softarm._support.archive import Entries
+from mjx_softarm._support.mlp import Layer, mlp
+from mjx_softarm._support.xp import Array, array_namespace
+
+N_AVERAGED = 8  # rests that the average is about
+JUMP_KG = 0.25  # by which a rest disagrees with the average,
+N_JUMPS = 2  # so many of them in a row begin a new one
+# Payloads in the network's data, as shares of the largest one: what is told outside is no payload.
+LOWEST, HIGHEST = -0.5, 1.5
+
+
+class LoadEstimator(NamedTuple):
+    """Springs and pressures at rest to the payload. All float32."""
+
+    layers: tuple[Layer, ...]  # normalised springs (n,) and pressures (n,) -> payload (1,), normalised
+    spring_centre_m: Array  # (n,)
+    spring_scale_m: Array  # (n,)
+    pressure_centre_kpa: Array  # (n,)
+    pressure_scale_kpa: Array  # (n,)
+    load_scale_kg: Array  # () the arm's largest payload, normalised to 1
+
+
+class Load(NamedTuple):
+    """A payload, averaged over rests."""
+
+    kg: float
+    n_rests: int = 0  # in the average, at most N_AVERAGED; 0: nothing was told yet, the payload is assumed
+    n_jumps: int = 0  # rests in a row that disagreed with the average
+    began: bool = False  # the last rest replaced another average
+
+    @property
+    def believed_kg(self) -> float:
+        """Payload [kg] to reckon with."""
+        return max(self.kg, 0.0)
+
+
+def tell_load(estimator: LoadEstimator, spring_m: Array, pressure_kpa: Array) -> Array:
+    """Return the payload (...) [kg] of an arm at rest with springs (..., n) [m] at pressures (..., n) [kPa].
+
+    It may be below 0 or above `load_scale_kg`, which is for the caller to judge.
+    """
+    xp, dtype = (
+        array_namespace(spring_m, pressure_kpa, estimator.load_scale_kg),
+        estimator.spring_scale_m.dtype,
+    )
+    springs = (xp.asarray(spring_m, dtype=dtype) - estimator.spring_centre_m) / estimator.spring_scale_m
+    pressures = xp.asarray(pressure_kpa, dtype=dtype) - estimator.pressure_centre_kpa
+    x = xp.concat([springs, pressures / estimator.pressure_scale_kpa], axis=-1)
+    return estimator.load_scale_kg * mlp(estimator.layers, x)[..., 0]
+
+
+def averaged(load: Load, told_kg: float) -> Load:
+    """Return the average with what another rest told."""
+    disagrees = load.n_rests > 0 and abs(told_kg - load.kg) > JUMP_KG
+    if disagrees and load.n_jumps + 1 < N_JUMPS:
+        return load._replace(n_jumps=load.n_jumps + 1)
+    if disagrees or load.n_rests == 0:
+        return Load(told_kg, 1, began=disagrees)
+    n = min(load.n_rests + 1, N_AVERAGED)
+    return Load(load.kg + (told_kg - load.kg) / n, n)
+
+
+def take_load_estimator(entries: Entries, name: str, n_springs: int) -> LoadEstimator:
+    """Take the estimator `name` from the entries of a file, checked.
+
+    Raises:
+        SealedFileError: an entry is missing, or of the wrong type, shape or range.
+    """
+    shapes = {item: (n_springs,) for item in LoadEstimator._fields if item != "layers"} | {
+        "load_scale_kg": ()
+    }
+    return entries.network(name, LoadEstimator, shapes, 2 * n_springs, 1)

@@ -1,0 +1,150 @@
+"""The payload in the loop: told at rest, believed in the pose, made up for at the goal; its faults."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from mjx_softarm.deploy.controller import Controller
+from mjx_softarm.deploy.faults import Fault
+from mjx_softarm.sensing.estimator import estimate
+from tests.linear_arm import GAIN_M_PER_KPA, POLICY, REST_M, LinearArm, N, go, read_m
+
+STRETCH_M_PER_KG = 0.004  # of each spring, at held pressures
+SINK_M_PER_KG = 0.005  # of each section's end, at held springs
+GOAL = np.array([0.0, 0.0, -585.0, 0.0, 0.0, 0.0])
+
+
+def loaded_policy():
+    """The linear arm's policy, whose estimators are exact for payloads on it."""
+    slope = -GAIN_M_PER_KPA.sum(axis=0) / (N * STRETCH_M_PER_KG)  # (n,) [kg / kPa]
+    weight = np.concatenate([np.full(N, 1.0 / (N * STRETCH_M_PER_KG)), slope])[:, None]
+    layer = np.float32(weight), np.full(1, -REST_M / STRETCH_M_PER_KG, np.float32)
+    sink = np.tile([0.0, 0.0, -SINK_M_PER_KG, 0.0, 0.0, 0.0], 3).astype(np.float32)
+    per_load = np.zeros((2 * N + 1, 18), np.float32), sink
+    return dataclasses.replace(
+        POLICY,
+        load_estimator=POLICY.load_estimator._replace(layers=(layer,)),
+        estimator=POLICY.estimator._replace(load_layers=(per_load,)),
+    )
+
+
+def plan_unloaded(pose, goal, spring_m):
+    """Springs of the straight arm at the goal's height, without a payload."""
+    return np.full(N, -1e-3 * goal[2] / 3)
+
+
+LOADED = loaded_policy()
+CONTROLLER = Controller.of(LOADED, plan_unloaded)
+
+
+class LoadedArm(LinearArm):
+    """A linear arm that carries a payload until a tick."""
+
+    def __init__(self, payload_kg, until=10**6):
+        super().__init__()
+        self._payload_kg, self._until = payload_kg, until
+
+    @property
+    def payload_kg(self):
+        return self._payload_kg if self.tick < self._until else 0.0
+
+    @property
+    def spring_m(self):
+        return super().spring_m + STRETCH_M_PER_KG * self.payload_kg
+
+
+class Weak(LoadedArm):
+    """Regulators that hold 1 kPa too little."""
+
+    def holds(self, pressure_kpa):
+        return pressure_kpa - 1.0
+
+
+class Honest(Weak):
+    def pressures(self):
+        return self.actual_kpa
+
+
+def follow(arm, goals=(GOAL,), **kwargs):
+    return go(arm, list(goals), CONTROLLER, **kwargs)
+
+
+@pytest.mark.parametrize("payload_kg", [0.0, 0.6])
+def test_payload_is_told_at_rest_and_believed_in_the_pose(payload_kg):
+    run = follow(LoadedArm(payload_kg))
+    assert run.log.load_kg[0] == 0.0 and run.log.load_kg[-1] == pytest.approx(payload_kg, abs=0.03)
+    pose = estimate(LOADED.estimator, read_m(run.log)[-1], run.log.load_kg[-1])
+    np.testing.assert_allclose(run.log.estimate[-1], pose, atol=1e-3)
+    assert run.counts() == {}
+
+
+def test_goal_is_shifted_by_what_the_payload_bends():
+    run = follow(LoadedArm(0.8))
+    [arrival] = run.arrivals
+    tip_mm = -1e3 * (read_m(run.log)[arrival.row].mean() * 3 + 3 * SINK_M_PER_KG * 0.8)
+    assert tip_mm == pytest.approx(GOAL[2], abs=0.7)  # 12 mm off without
+    assert arrival.reached and arrival.estimate[2] == pytest.approx(GOAL[2], abs=0.7)
+
+
+def test_shift_begins_anew_with_each_goal_and_ends_somewhere():
+    asked = []
+
+    def plan(pose, goal, spring_m):
+        asked.append(goal.copy())
+        return np.full(N, REST_M)  # never there
+
+    far = GOAL + [0.0, 0.0, 40.0, 0.0, 0.0, 0.0]
+    go(LinearArm(), [far, GOAL], Controller.of(LOADED, plan))
+    assert [goal[2] for goal in asked[::4]] == [far[2], GOAL[2]]
+    assert max(abs(goal[2] - far[2]) for goal in asked[:4]) == 25.0
+
+
+def test_saturated_arm_shifts_nothing():
+    asked = []
+
+    def plan(pose, goal, spring_m):
+        asked.append(goal.copy())
+        return np.full(N, REST_M + 0.06)
+
+    run = go(LinearArm(), [GOAL], Controller.of(LOADED, plan))
+    assert run.counts()[Fault.SATURATED] and len(asked) == 4
+    np.testing.assert_array_equal(asked, np.tile(GOAL, (4, 1)))
+
+
+def test_object_that_drops_is_told():
+    lines = []
+    goals = [GOAL, GOAL + [0.0, 0.0, 10.0, 0.0, 0.0, 0.0]]
+    run = follow(LoadedArm(0.6, until=250), goals, tell=lines.append)
+    assert run.counts() == {Fault.LOAD_LOST: 1} and len(run.arrivals) == 2
+    assert run.log.load_kg[240] == pytest.approx(0.6, abs=0.03)
+    assert run.log.load_kg[-1] == pytest.approx(0.0, abs=0.03)
+    [line] = [line for line in lines if "load lost" in line]
+    assert "from 60" in line or "from 59" in line
+
+
+def test_overload_is_told():
+    run = follow(LoadedArm(1.3))
+    assert set(run.counts()) == {Fault.OVERLOADED} and run.log.load_kg[-1] == pytest.approx(1.3, abs=0.03)
+
+
+def test_what_no_payload_explains_leaves_the_springs_alone():
+    run = follow(LoadedArm(2.5))
+    assert set(run.counts()) == {Fault.LOAD_UNKNOWN} and not run.log.load_kg.any()
+    assert "from the springs alone, with 0 g" in run.events[0].message
+
+
+def test_measured_pressures_tell_more_than_those_in_force():
+    lines, blind = [], []
+    seen, unseen = follow(Honest(0.5), tell=lines.append), follow(Weak(0.5), tell=blind.append)
+    assert seen.log.load_kg[-1] == pytest.approx(0.5, abs=0.03)
+    assert unseen.log.load_kg[-1] < 0.35
+    assert "commanded pressures" in blind[0] and not any("commanded" in line for line in lines)
+
+
+def test_pressure_that_is_not_measured_is_the_one_in_force():
+    class Gaps(LoadedArm):
+        def pressures(self):
+            return np.where(np.arange(N) == self.tick % N, np.nan, self.actual_kpa)
+
+    assert follow(Gaps(0.5)).log.load_kg[-1] == pytest.approx(0.5, abs=0.05)

@@ -1,0 +1,67 @@
+"""The payload of an arm at rest: the network by hand, NumPy against JAX, and the average over rests."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjx_softarm.sensing.load import JUMP_KG, N_AVERAGED, Load, LoadEstimator, averaged, tell_load
+
+N = 9
+
+
+def linear(of_springs, of_pressures, dtype=np.float32):
+    """An estimator without hidden layers: weights of the normalised springs and pressures, and 0.1."""
+    layer = np.concatenate([np.full(N, of_springs), np.full(N, of_pressures)])[:, None], np.full(1, 0.1)
+    numbers = np.full(N, 0.2), np.full(N, 0.05), np.full(N, -10.0), np.full(N, 20.0), 0.8
+    return LoadEstimator(*jax.tree.map(lambda x: np.asarray(x, dtype), ((layer,), *numbers)))
+
+
+def after(*told_kg):
+    load = Load(0.0)
+    for kg in told_kg:
+        load = averaged(load, kg)
+    return load
+
+
+def test_network_by_hand():
+    told_kg = tell_load(linear(0.5, -0.25), np.full((4, N), 0.21), np.full((4, N), 10.0))
+    np.testing.assert_allclose(told_kg, np.full(4, 0.8 * (9 * (0.5 * 0.2 - 0.25 * 1.0) + 0.1)), rtol=1e-5)
+    assert told_kg.dtype == np.float32
+
+
+def test_numpy_and_jax_agree():
+    estimator, rng = linear(0.3, 0.2), np.random.default_rng(0)
+    rows = rng.uniform(0.1, 0.25, (5, N)), rng.uniform(-40.0, 20.0, (5, N))
+    in_jax = jax.jit(tell_load)(estimator, *(jnp.asarray(x, jnp.float32) for x in rows))
+    np.testing.assert_allclose(tell_load(estimator, *rows), in_jax, rtol=1e-5, atol=1e-6)
+
+
+def test_first_rest_replaces_what_was_assumed():
+    assert after(0.7) == Load(0.7, 1)
+
+
+def test_rests_are_averaged():
+    told_kg = 0.5 + 0.05 * np.random.default_rng(1).standard_normal(N_AVERAGED)
+    assert after(*told_kg).kg == pytest.approx(told_kg.mean())
+    late = after(*[0.5] * 100, 0.6)
+    assert late.kg == pytest.approx(0.5 + 0.1 / N_AVERAGED) and late.n_rests == N_AVERAGED
+
+
+@pytest.mark.parametrize("change_kg", [-2 * JUMP_KG, 2 * JUMP_KG])
+def test_two_rests_that_disagree_begin_a_new_average(change_kg):
+    held = after(0.6, 0.6, 0.6)
+    once = averaged(held, 0.6 + change_kg)
+    assert once.kg == held.kg and not once.began
+    again = averaged(once, 0.65 + change_kg)
+    assert again == Load(0.65 + change_kg, 1, began=True)
+    assert not averaged(again, 0.65 + change_kg).began
+
+
+def test_one_odd_rest_is_forgotten():
+    load = after(0.6, 0.6, 0.0, 0.6, 0.0)
+    assert load.kg == pytest.approx(0.6) and not load.began
+
+
+def test_less_than_nothing_is_reckoned_as_nothing():
+    assert after(-0.1).believed_kg == 0.0 and after(-0.1, 0.1, 0.15).believed_kg == pytest.approx(0.05)
