@@ -67,7 +67,7 @@ def test_lost_reading_holds_the_last_length(files, golden, controller):
     readings[3] = np.nan
     feed = {"readings": readings, "goal": goal, "last_length_m": last_m}
     names = ["reference_m", "length_m", "reading_lost"]
-    got = session.run(names, {name: np.float32(value) for name, value in feed.items()})
+    got = session.run(names, {name: np.asarray(value, np.float32) for name, value in feed.items()})
     assert got[1][3] == np.float32(0.15 + 3 * 0.05 / 8) and np.flatnonzero(got[2]).tolist() == [3]
     # The loop does not act while a reading is lost; with the same lengths read, it asks for the same.
     readings[3] = controller.policy.sensor.readings(last_m)[3]
@@ -86,9 +86,9 @@ def test_draw_wires_without_a_sim_to_real_network(tmp_path):
     readings, goal = np.linspace(1.5, 2.0, N), policy.workspace[0].astype(float)
     state, _ = with_goal(controller, start(controller), goal)
     state, _ = step(controller, state, readings, False)
-    more = {"load_kg": np.float32(0.0), "pressure_kpa": readings}
+    more = {"load_kg": np.zeros(()), "pressure_kpa": readings}
     feed = {"readings": readings, "goal": goal, "last_length_m": readings, **more}
-    [reference_m] = session.run(["reference_m"], {name: np.float32(value) for name, value in feed.items()})
+    [reference_m] = session.run(["reference_m"], {name: np.asarray(value, np.float32) for name, value in feed.items()})
     np.testing.assert_allclose(reference_m, state.reference_m, atol=1e-6)
 
 
