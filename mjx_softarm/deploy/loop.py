@@ -212,7 +212,7 @@ def _weigh(controller: Controller, state: State, at_rest: bool) -> tuple[State, 
         message = f"{got}, the pose is estimated from the springs alone, with {1e3 * own_kg:.0f} g"
         events.append(Event(Fault.LOAD_UNKNOWN, message))
     if load.began and load.kg < before.kg:
-        message = f"{1e3 * load.kg:.0f} g, from {1e3 * before.kg:.0f} g at the rests before"
+        message = f"{1e3 * load.believed_kg:.0f} g, from {1e3 * before.kg:.0f} g at the rests before"
         events.append(Event(Fault.LOAD_LOST, message))
     if load.kg > most_kg + OVERLOAD_KG:
         message = f"{1e3 * load.kg:.0f} g, expected at most {1e3 * most_kg:.0f} g"

@@ -88,7 +88,8 @@ def test_draw_wires_without_a_sim_to_real_network(tmp_path):
     state, _ = step(controller, state, readings, False)
     more = {"load_kg": np.zeros(()), "pressure_kpa": readings}
     feed = {"readings": readings, "goal": goal, "last_length_m": readings, **more}
-    [reference_m] = session.run(["reference_m"], {name: np.asarray(value, np.float32) for name, value in feed.items()})
+    feed = {name: np.asarray(value, np.float32) for name, value in feed.items()}
+    [reference_m] = session.run(["reference_m"], feed)
     np.testing.assert_allclose(reference_m, state.reference_m, atol=1e-6)
 
 
