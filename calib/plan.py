@@ -173,7 +173,7 @@ def _derivatives(
         pressure_kpa=pressure_kpa,
         payload_kg=payload_kg,
         tip_m=np.zeros((n, 3)),
-        tip_rotation=settle_many(spec, pressure_kpa).tip_rotation,
+        tip_rotation=np.asarray(settle_many(spec, pressure_kpa).tip_rotation),
         spring_m=np.zeros((n, n_chambers)),
         marker_m=np.zeros((n, 0, 3)),
         single=np.zeros(n, bool),

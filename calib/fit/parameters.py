@@ -11,7 +11,7 @@ base.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -78,7 +78,7 @@ def _names(block: Block, n: int) -> Iterator[str]:
     return iter([block.name] if n == 1 else (f"{block.name} {axis}" for axis in "xyz"[:n]))
 
 
-def _split(x: Array | np.ndarray, n_chambers: int) -> dict[str, Array | np.ndarray]:
+def _split(x: Array | np.ndarray, n_chambers: int) -> dict[str, Any]:
     """Return the blocks of x by name."""
     sizes = {"chamber": n_chambers, "section": n_chambers // N_CHAMBERS_PER_SECTION}
     found, start = {}, 0
@@ -106,9 +106,11 @@ def with_numbers(x: Array, params: ArmParams) -> ArmParams:
         chamber_rest_m=params.chamber_rest_m + by["offset"] * params.section_length_m,
         mount=mount._replace(
             base_position_m=mount.base_position_m + by["base offset"],
-            base_rotation=product(_turned(jnp.concatenate([by["base turn"], zero])), mount.base_rotation),
+            base_rotation=product(
+                _turned(jnp.concatenate([by["base turn"], zero])), jnp.asarray(mount.base_rotation)
+            ),
             tip_offset_m=mount.tip_offset_m + jnp.concatenate([by["tip offset"], zero]),
-            tip_rotation=product(mount.tip_rotation, _turned(by["tip turn"])),
+            tip_rotation=product(jnp.asarray(mount.tip_rotation), _turned(by["tip turn"])),
         ),
     )
 
@@ -164,7 +166,7 @@ def half_widths(spec: ArmSpec, width: np.ndarray) -> dict[str, np.ndarray]:
     by, length_m = _split(width, spec.n_chambers), spec.geometry.section_length_m
     area = np.array(spec.per_chamber(spec.chambers.area_m2))
     return {
-        "stiffness_n_per_m": spec.per_chamber(spec.chambers.stiffness_n_per_m) * by["stiffness"],
+        "stiffness_n_per_m": np.array(spec.per_chamber(spec.chambers.stiffness_n_per_m)) * by["stiffness"],
         "area_m2": area * by["area"],
         "area_slope_m": area / length_m * by["slope"],
         "length_offset_m": length_m * by["offset"],

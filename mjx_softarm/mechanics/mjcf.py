@@ -134,7 +134,7 @@ def _add_tools(last, params: ArmParams, spec: ArmSpec) -> None:
     """Add gripper and payload below the last plate, and the tip where it is measured, at best the centre."""
     half, length = spec.link_length_m / 2, spec.mass.gripper_length_m
     tip = last.add_site(name="tip", size=[0.004] * 3, rgba=[0.9, 0.1, 0.1, 1.0])
-    tip.pos = params.mount.tip_offset_m - [0.0, 0.0, half]
+    tip.pos = np.asarray(params.mount.tip_offset_m) - [0.0, 0.0, half]
     tip.quat = quaternion_from_rotation(params.mount.tip_rotation)
     for k, name in enumerate(("gripper", "payload")):
         tool = last.add_body(name=name, pos=[0.0, 0.0, -half - float(params.tool_offset_m[k])])
