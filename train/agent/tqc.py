@@ -51,9 +51,7 @@ class TQCConfig:
     initial_alpha: float = 1.0  # initial temperature
     target_entropy: float | None = None  # target entropy [nat]; None is minus the number of actions
     reward_scale: float = 1.0  # factor on every reward in the critics' targets
-    critics_first: int = (
-        0  # gradient steps of the critics before the actor's first, for an actor that is given
-    )
+    critics_first: int = 0  # gradient steps of the critics before the first of a given actor
 
     def __post_init__(self) -> None:
         required = {
