@@ -73,7 +73,7 @@ def log_at_rest(arm: RodTwin, pressure_kpa: np.ndarray) -> Log:
             "pressure_kpa": np.mean([arm.pressures() for _ in frames], axis=0),
             "tip_m": np.mean([frame.tip_m for frame in frames], axis=0),
             "tip_quaternion": quaternion / np.linalg.norm(quaternion),
-            "spring_m": np.mean([frame.spring_m for frame in frames], axis=0),
+            "spring_m": np.mean(np.array([frame.spring_m for frame in frames], float), axis=0),
         }
         for name, value in seen.items():
             rows.setdefault(name, []).append(value)

@@ -95,8 +95,10 @@ def distil(spec: ArmSpec, seed: int) -> Distilled:
     load_estimator = _fit(_first_load_estimator(spec, loaded, key_load), _load_loss, loaded, key_load)
     unloaded = sample_workspace(spec, N_TRAINING, seed)
     springs = _fit(_first_spring_model(unloaded, key_springs), _spring_loss, unloaded, key_springs)
-    networks = jax.tree.map(lambda x: np.asarray(x, np.float32), (estimator, load_estimator, springs))
-    return Distilled(*networks, *_errors(*networks, spec))
+    pose, load, springs = jax.tree.map(
+        lambda x: np.asarray(x, np.float32), (estimator, load_estimator, springs)
+    )
+    return Distilled(pose, load, springs, *_errors(pose, load, springs, spec))
 
 
 def _with_load(pool: Pool, load_kg: float) -> LoadedPool:
