@@ -88,7 +88,7 @@ def sample_workspace(spec: ArmSpec, n: int, seed: int) -> Pool:
 
     Pressures follow the arcsine law between their limits, which favours the extremes where the workspace
     ends; of twice as many candidates, `n` are drawn with weights that even out the number of tips per
-    voxel of 25 mm. Candidates that did not settle, or with a spring beyond its limits, are left out.
+    voxel of 25 mm. Candidates that did not settle are left out.
 
     Args:
         spec: the arm.
@@ -96,11 +96,11 @@ def sample_workspace(spec: ArmSpec, n: int, seed: int) -> Pool:
         seed: of the draw; training and evaluation use different ones.
 
     Raises:
-        SpecError: the arm settles, its springs within their limits, at fewer than `n` of the candidates.
+        SpecError: the arm settles at fewer than `n` of the candidates.
     """
     rng = np.random.default_rng(seed)
     found = settle_many(spec, random_pressures(spec, CANDIDATES_PER_POSE * n, rng))
-    return _pool(found, _chosen(spec, found, n, rng, replace=False))
+    return _pool(found, _chosen(spec, found, found.settled, n, rng, replace=False))
 
 
 def sample_loaded(spec: ArmSpec, load_kg: np.ndarray, spread: float, seed: int) -> LoadedPool:
@@ -120,7 +120,7 @@ def sample_loaded(spec: ArmSpec, load_kg: np.ndarray, spread: float, seed: int) 
     pressure_kpa = random_pressures(spec, shape[0], rng)
     factors = (rng.uniform(1.0 - spread, 1.0 + spread, shape) for _ in range(2))
     found = _in_batches(_loaded_solver(), spec, pressure_kpa, load_kg, *factors)
-    rows = _chosen(spec, found, shape[0] // CANDIDATES_PER_POSE, rng, replace=False)
+    rows = _chosen(spec, found, found.settled, shape[0] // CANDIDATES_PER_POSE, rng, replace=False)
     pool = _pool(found, rows)
     return LoadedPool(jnp.asarray(load_kg[rows], jnp.float32), pool.pressure_kpa, pool.spring_m, pool.pose)
 
@@ -130,7 +130,8 @@ def sample_evenly(spec: ArmSpec, n: int, seed: int) -> Pool:
 
     Every voxel of 25 mm that a candidate reaches is equally likely, and every candidate within it. Of the ten
     candidates per pose, half have random pressures and half lowest, zero or highest ones in random
-    combinations, which are the rim. A pose may come twice.
+    combinations, which are the rim. Candidates that did not settle are left out, and those with a spring beyond
+    its limits, which no policy can ask for. A pose may come twice.
 
     Args:
         spec: the arm.
@@ -144,13 +145,15 @@ def sample_evenly(spec: ArmSpec, n: int, seed: int) -> Pool:
     half = CANDIDATES_PER_EVEN_POSE * n // 2
     extremes = rng.choice(pressure_levels(spec), (half, spec.n_chambers))
     found = settle_many(spec, np.concatenate([random_pressures(spec, half, rng), extremes]))
-    return _pool(found, _chosen(spec, found, n, rng, replace=True))
-
-
-def _chosen(spec: ArmSpec, found: Settled, n: int, rng: np.random.Generator, replace: bool) -> np.ndarray:
-    """Draw rows (n,) of equilibria with weights that even out the number of tips per voxel."""
     in_range = (spec.springs.length_min_m <= found.spring_m) & (found.spring_m <= spec.springs.length_max_m)
     usable = found.settled & in_range.all(axis=-1)
+    return _pool(found, _chosen(spec, found, usable, n, rng, replace=True))
+
+
+def _chosen(
+    spec: ArmSpec, found: Settled, usable: np.ndarray, n: int, rng: np.random.Generator, replace: bool
+) -> np.ndarray:
+    """Draw rows (n,) of usable equilibria with weights that even out the number of tips per voxel."""
     tip_mm = np.where(usable[:, None], 1e3 * found.tip_position_m, 0.0)
     _, voxel, count = np.unique(
         np.floor(tip_mm / VOXEL_MM).astype(int), axis=0, return_inverse=True, return_counts=True
@@ -158,9 +161,8 @@ def _chosen(spec: ArmSpec, found: Settled, n: int, rng: np.random.Generator, rep
     weight = usable / count[voxel.ravel()]
     if np.count_nonzero(weight) < n:
         raise SpecError(
-            f"{spec.name}: got an arm that settles, its springs within their limits, at "
-            f"{np.count_nonzero(weight)} of {len(weight)} random pressures, expected at {n} or more; is it "
-            "stiff enough?"
+            f"{spec.name}: got an arm that settles at {np.count_nonzero(weight)} of {len(weight)} random "
+            f"pressures, expected at {n} or more; is it stiff enough?"
         )
     return rng.choice(len(weight), n, replace=replace, p=weight / weight.sum())
 

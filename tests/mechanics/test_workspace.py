@@ -72,6 +72,14 @@ def test_sampled_poses_can_be_commanded():
     assert pool().spring_m.max() < SPEC.springs.length_max_m + 1e-3
 
 
+def test_an_arm_stronger_than_its_springs_has_poses_of_which_even_ones_can_be_commanded():
+    low_m, high_m = SPEC.springs.length_min_m, SPEC.springs.length_max_m
+    stronger = SPEC.replace(chambers={"pressure_min_kpa": 2 * LOW_KPA, "pressure_max_kpa": 2 * HIGH_KPA})
+    plain, even = (np.asarray(draw(stronger, 64, 0).spring_m) for draw in (sample_workspace, sample_evenly))
+    assert plain.min() < low_m or plain.max() > high_m
+    assert even.min() >= low_m and even.max() <= high_m
+
+
 def test_sampled_poses_spread_further_and_more_evenly_than_uniform_pressures():
     uniform = np.random.default_rng(0).uniform(LOW_KPA, HIGH_KPA, (BATCH, 9))
     tip_mm = 1e3 * settle_many(SPEC, uniform).tip_position_m
@@ -89,7 +97,7 @@ def test_an_arm_that_never_settles_is_refused_with_the_count():
     limp = {"axial_stiffness_n_per_m": 1.0, "bending_stiffness_nm_per_rad": 0.01}
     spec = SPEC.replace(name="limp", chambers={"stiffness_n_per_m": 1.0}, backbone=limp)
     with pytest.raises(
-        ValueError, match=r"limp: got an arm that settles, .* at 0 of 128 .* expected at 64 or more"
+        ValueError, match=r"limp: got an arm that settles at 0 of 128 .* expected at 64 or more"
     ):
         sample_workspace(spec, 64, seed=0)
 
