@@ -130,8 +130,8 @@ def sample_evenly(spec: ArmSpec, n: int, seed: int) -> Pool:
 
     Every voxel of 25 mm that a candidate reaches is equally likely, and every candidate within it. Of the ten
     candidates per pose, half have random pressures and half lowest, zero or highest ones in random
-    combinations, which are the rim. Candidates that did not settle are left out, and those with a spring beyond
-    its limits, which no policy can ask for. A pose may come twice.
+    combinations, which are the rim. Left out are candidates that did not settle, and those with a spring
+    beyond its limits, which no policy can ask for. A pose may come twice.
 
     Args:
         spec: the arm.

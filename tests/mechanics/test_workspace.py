@@ -74,7 +74,7 @@ def test_sampled_poses_can_be_commanded():
 
 def test_an_arm_stronger_than_its_springs_has_poses_of_which_even_ones_can_be_commanded():
     low_m, high_m = SPEC.springs.length_min_m, SPEC.springs.length_max_m
-    stronger = SPEC.replace(chambers={"pressure_min_kpa": 2 * LOW_KPA, "pressure_max_kpa": 2 * HIGH_KPA})
+    stronger = SPEC.replace(chambers={"pressure_min_kpa": 1.4 * LOW_KPA, "pressure_max_kpa": 1.4 * HIGH_KPA})
     plain, even = (np.asarray(draw(stronger, 64, 0).spring_m) for draw in (sample_workspace, sample_evenly))
     assert plain.min() < low_m or plain.max() > high_m
     assert even.min() >= low_m and even.max() <= high_m
