@@ -21,7 +21,7 @@ CURVES = {"evaluation/median_mm": ("median", "#1f6fb4"), "evaluation/circle_mean
 REFRESH_S = 1.0
 SCALE_MM = np.array([1.0, 2.0, 5.0, 10.0, 20.0])  # errors of these colours, those between in between
 SCALE = np.array([(33, 145, 80), (140, 190, 60), (240, 200, 60), (240, 130, 40), (200, 30, 60)])
-_POINT_M, _WARNED = 0.005, SATURATED
+_POINT_M, _LINE_M, _WARNED = 0.005, 0.0015, SATURATED
 
 
 def spec_of(folder: Path) -> ArmSpec:
@@ -93,13 +93,8 @@ class Errors:
         scene = self._server.scene
         scene.add_point_cloud(f"/{name}/points", target_m, colour, **looks)
         lines = np.stack([target_m, pose_m], axis=1)  # (n, 2, 3)
-        scene.add_line_segments(
-            f"/{name}/lines",
-            lines,
-            np.repeat(colour[:, None], 2, axis=1),
-            thickness=2.0,
-            thickness_units="screen",
-        )
+        ends = np.repeat(colour[:, None], 2, axis=1)
+        scene.add_line_segments(f"/{name}/lines", lines, ends, thickness=_LINE_M)
         if pairs.warned.any():
             looks |= {"point_size": 2 * _POINT_M, "point_shape": "diamond"}
             scene.add_point_cloud(f"/{name}/warned", target_m[pairs.warned], _WARNED, **looks)
