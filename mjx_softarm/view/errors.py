@@ -87,9 +87,10 @@ class Errors:
 
     def _show(self, name: str, pairs: PosePairs) -> None:
         target_m, pose_m = 1e-3 * pairs.target[:, :3], 1e-3 * pairs.pose[:, :3]
-        box = self._boxes.get(name) or self._add_box(name)
+        if name not in self._boxes:
+            self._add_box(name)
         colour = colours(pairs.error_mm)
-        looks = {"point_size": _POINT_M, "point_shape": "circle", "visible": box.value}
+        looks = {"point_size": _POINT_M, "point_shape": "circle"}
         scene = self._server.scene
         scene.add_point_cloud(f"/{name}/points", target_m, colour, **looks)
         lines = np.stack([target_m, pose_m], axis=1)  # (n, 2, 3)
@@ -101,13 +102,13 @@ class Errors:
         else:
             scene.remove_by_name(f"/{name}/warned")
 
-    def _add_box(self, name: str) -> viser.GuiCheckboxHandle:
+    def _add_box(self, name: str) -> None:
+        """Add a check box that shows a set; the nodes below its frame are as visible as that is."""
         node = self._server.scene.add_frame(f"/{name}", show_axes=False)
         with self._sets:
             box = self._server.gui.add_checkbox(name, True)
         box.on_update(lambda _: setattr(node, "visible", box.value))
         self._boxes[name] = box
-        return box
 
     def _show_curves(self) -> None:
         rows = _rows(self._folder / METRICS_FILE)
