@@ -13,6 +13,7 @@ import viser
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.logs.pose_pairs import POSES_FILE, PosePairs, read_pose_pairs
 from mjx_softarm.spec import ARM_FILE, ArmSpec
+from mjx_softarm.view.look import look_at
 from mjx_softarm.view.panel import css, plot
 from mjx_softarm.view.stage import SATURATED, Stage, set_the_scene
 
@@ -58,7 +59,8 @@ class Errors:
         self._is_run = (folder / CONFIG_FILE).exists()
         spec = spec_of(folder)
         set_the_scene(server, spec)
-        Stage(server.scene, spec)
+        straight_m = np.full(spec.n_chambers, spec.geometry.section_length_m)
+        Stage(server.scene, spec).show(look_at({"time_s": 0.0}, straight_m))
         self._text = server.gui.add_html("", order=0.0)
         self._sets = server.gui.add_folder("Poses", order=0.5)
         self._boxes: dict[str, viser.GuiCheckboxHandle] = {}

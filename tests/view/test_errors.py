@@ -83,6 +83,8 @@ def test_calibration_is_shown(server, tmp_path):
     page = Errors(server, tmp_path)
     page.refresh()
     assert "the network extrapolates" in page._text.content and not hasattr(page, "_curve")
+    hidden = [name for name, node in server.scene._handle_from_node_name.items() if not node.visible]
+    assert {"/arm/tip/payload", "/arm/goal", "/arm/seen"} <= set(hidden)
 
 
 def test_folders_of_something_else_are_refused(run, tmp_path, capsys):
