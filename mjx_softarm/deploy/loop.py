@@ -11,8 +11,8 @@ moves. Where that takes longer than `faults.SETTLE_TIMEOUT_S`, it is counted and
 What stands when the springs have settled for the last time is the arrival.
 
 The policy takes an arm as specified to a goal. What a payload, or its own error, leaves of the way shows in
-the pose at rest: the next action is towards a goal that is shifted by as much. Springs that have not settled
-and chambers at their limit shift nothing, since they do not show where the policy brings the arm.
+the pose that its references make: the next action is towards a goal that is shifted by as much. Springs that
+have not settled and chambers at their limit shift nothing: the arm does not follow such references.
 
 Gains, limits, calibration, rate, tolerance and number of actions are the policy file's.
 `mjx_softarm.deploy.faults` says what can go wrong.
@@ -245,11 +245,14 @@ def _go(controller: Controller, state: State, at_rest: bool) -> tuple[State, lis
 
 
 def _shifted(controller: Controller, state: State) -> np.ndarray:
-    """Return the shift (6,) [mm, deg] of the goal for the next action, less what the last one left."""
+    """Return the shift (6,) [mm, deg] of the goal for the next action, less what the last references leave.
+
+    References, not springs, since these may creep by some tenths of a millimetre in an arm at rest.
+    """
     if state.n_actions == 0:
         return np.zeros(6)
-    assert state.goal is not None
-    pose, _ = believed(controller, state.springs_m.mean(axis=0), state.load)
+    assert state.goal is not None and state.reference_m is not None
+    pose, _ = believed(controller, state.reference_m, state.load)
     left = pose_error(np.asarray(pose, float), state.goal)
     return np.clip(state.shift - left, -MAX_SHIFT, MAX_SHIFT)
 
