@@ -11,8 +11,8 @@ moves. Where that takes longer than `faults.SETTLE_TIMEOUT_S`, it is counted and
 What stands when the springs have settled for the last time is the arrival.
 
 The policy takes an arm as specified to a goal. What a payload, or its own error, leaves of the way shows in
-the pose that its references make: the next action is towards a goal that is shifted by as much. Springs that
-have not settled and chambers at their limit shift nothing: the arm does not follow such references.
+the pose that its references make: the next action is towards a goal that is shifted by as much, unless the
+springs have not settled.
 
 Gains, limits, calibration, rate, tolerance and number of actions are the policy file's.
 `mjx_softarm.deploy.faults` says what can go wrong.
@@ -33,7 +33,7 @@ from mjx_softarm.sensing.load import HIGHEST, LOWEST, Load, averaged, tell_load
 from mjx_softarm.sensing.pose import pose_error
 
 CHAMBER_WINDOWS = 2  # a chamber counts as lost after so many windows in a row
-OVERLOAD_KG = 0.1  # beyond the largest payload, since none is told exactly
+OVERLOAD_KG = 0.25  # beyond the largest payload, since none is told exactly
 MAX_SHIFT = np.repeat([25.0, 5.0], 3)  # [mm, deg] of a goal
 
 
@@ -223,6 +223,7 @@ def _weigh(controller: Controller, state: State, at_rest: bool) -> tuple[State, 
 def _go(controller: Controller, state: State, at_rest: bool) -> tuple[State, list[Event], bool]:
     """Act if the goal is new or the springs have settled; arrive when they have after the last action."""
     events: list[Event] = []
+    settled = False
     if state.n_actions > 0:
         policy, seen = controller.policy, (state.springs_m, state.reference_m, state.pressure_kpa)
         settled = at_rest and bool(faults.on_reference(*seen, policy.gains, policy.tolerance_m))
@@ -234,7 +235,7 @@ def _go(controller: Controller, state: State, at_rest: bool) -> tuple[State, lis
         if state.n_actions == controller.policy.n_actions:
             return state._replace(goal=None), events, True
     assert state.goal is not None  # `step` asks
-    shift = state.shift if events else _shifted(controller, state)
+    shift = state.shift if state.n_actions and not settled else _shifted(controller, state)
     pose, away = believed(controller, state.spring_m, state.load)
     if away > 1.0:
         message = f"{away:.1f} times as far from the training rows as the network is believed"
@@ -247,12 +248,15 @@ def _go(controller: Controller, state: State, at_rest: bool) -> tuple[State, lis
 def _shifted(controller: Controller, state: State) -> np.ndarray:
     """Return the shift (6,) [mm, deg] of the goal for the next action, less what the last references leave.
 
-    References, not springs, since these may creep by some tenths of a millimetre in an arm at rest.
+    References, not springs, since these may creep by some tenths of a millimetre in an arm at rest; but the
+    springs of saturated chambers, which do not follow their references.
     """
     if state.n_actions == 0:
         return np.zeros(6)
     assert state.goal is not None and state.reference_m is not None
-    pose, _ = believed(controller, state.reference_m, state.load)
+    policy, mean_m = controller.policy, state.springs_m.mean(axis=0)
+    mask = saturated(state.pressure_kpa, state.reference_m, mean_m, policy.gains, policy.tolerance_m)
+    pose, _ = believed(controller, np.where(mask, mean_m, state.reference_m), state.load)
     left = pose_error(np.asarray(pose, float), state.goal)
     return np.clip(state.shift - left, -MAX_SHIFT, MAX_SHIFT)
 

@@ -100,16 +100,18 @@ def test_shift_begins_anew_with_each_goal_and_ends_somewhere():
     assert max(abs(goal[2] - far[2]) for goal in asked[:4]) == 25.0
 
 
-def test_saturated_arm_shifts_nothing():
+def test_saturated_chambers_shift_by_where_their_springs_are():
     asked = []
 
     def plan(pose, goal, spring_m):
         asked.append(goal.copy())
-        return np.full(N, REST_M + 0.06)
+        return np.full(N, REST_M + 0.06)  # beyond what 20 kPa make
 
-    run = go(LinearArm(), [GOAL], Controller.of(LOADED, plan))
+    longest_m = REST_M + GAIN_M_PER_KPA[0].sum() * POLICY.gains.pressure_max_kpa
+    goal = np.array([0.0, 0.0, 10.0 - 3e3 * longest_m, 0.0, 0.0, 0.0])
+    run = go(LinearArm(), [goal], Controller.of(LOADED, plan))
     assert run.counts()[Fault.SATURATED] and len(asked) == 4
-    np.testing.assert_array_equal(asked, np.tile(GOAL, (4, 1)))
+    assert asked[1][2] - goal[2] == pytest.approx(10.0, abs=1.0)
 
 
 def test_object_that_drops_is_told():

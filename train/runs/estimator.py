@@ -119,9 +119,8 @@ def _stronger(spec: ArmSpec) -> ArmSpec:
     """Return the arm with more pressure: a real one reaches spring lengths just beyond the simulated."""
     low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
     more = MORE_PRESSURE * (high - low)
-    return spec.replace(
-        chambers={"pressure_min_kpa": max(low - more, -100.0), "pressure_max_kpa": high + more}
-    )
+    chambers = {"pressure_min_kpa": max(low - more, -100.0), "pressure_max_kpa": high + more}
+    return spec.replace(chambers=chambers)
 
 
 def _first_estimator(spec: ArmSpec, pool: LoadedPool, key: Array) -> PoseEstimator:
@@ -233,7 +232,7 @@ def _errors(
         turn_deg[payload_kg] = _error(np.degrees(2.0 * np.arcsin(np.minimum(chord, 1.0))))
         spring_mm[payload_kg] = _error(1e3 * springs.max(axis=-1))
         many_kg = np.full(CANDIDATES_PER_POSE * N_HELD_OUT, load_kg)
-        off = jax.tree.map(np.asarray, sample_loaded(spec, many_kg, CHAMBERS_OFF, HELD_OUT_SEED))
+        off = jax.tree.map(np.asarray, sample_loaded(loaded, many_kg, CHAMBERS_OFF, HELD_OUT_SEED))
         told_kg = tell_load(load_estimator, off.spring_m, off.pressure_kpa)
         load_off_kg[payload_kg] = _error(np.abs(told_kg - load_kg))
     return tip_mm, turn_deg, load_off_kg, spring_mm
