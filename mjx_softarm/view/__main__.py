@@ -8,7 +8,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from functools import partial
-from importlib import resources
 from pathlib import Path
 
 import tyro
@@ -18,7 +17,7 @@ from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.__main__ import Arm, check_file
 from mjx_softarm.deploy.arms import open_arm
 from mjx_softarm.deploy.ending import save_log
-from mjx_softarm.policy.file import load_policy
+from mjx_softarm.policy.file import SHIPPED, load_policy
 from mjx_softarm.spec import ArmSpec
 
 PROGRAM, HERE = "python -m mjx_softarm.view", "127.0.0.1"
@@ -68,20 +67,10 @@ def _view(
         raise InputError("--html: got no log, expected one or more, which are then written")
     from mjx_softarm.view.live import Setup, live
 
-    read, io = load_policy(policy or _shipped()), open_arm(arm)
+    read, io = load_policy(policy or SHIPPED), open_arm(arm)
     setup = Setup(read, arm, host, port, hasattr(io, "attach"), demos is not None)
     saves = [partial(save_log, path) if path else None for path in (log, demos)]
     return live(setup, io, _tell, partial(_welcome, host), *saves).status
-
-
-def _shipped() -> Path:
-    """Return the policy file that ships with the package."""
-    folder = resources.files("mjx_softarm").joinpath("policy/shipped")
-    names = [item for item in folder.iterdir() if item.name.endswith(".npz")] if folder.is_dir() else []
-    if not names:
-        made = "`make demo` trains one, `python -m train export RUN` writes its file"
-        raise InputError(f"--policy: got nothing, expected a policy; {made}")
-    return Path(str(names[0]))
 
 
 def _replay(logs: tuple[Path, ...], spec: ArmSpec, html: Path | None, host: str, port: int) -> int:

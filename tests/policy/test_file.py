@@ -249,3 +249,9 @@ def test_schema_4_stays_as_it_is(file, make_policy):
     names = "\n".join(sorted([*arrays_of(file), *fields]))
     digest = hashlib.sha256(names.encode()).hexdigest()[:8]
     assert digest == SCHEMA_4, "other entries, or other fields of ArmSpec: raise export.SCHEMA_VERSION"
+
+
+def test_the_policy_that_ships_is_one_of_this_version_for_the_paper_s_arm():
+    policy = load_policy(export.SHIPPED)
+    assert policy.spec == ArmSpec.default() and policy.s2r is None
+    assert export.SHIPPED.stat().st_size < 1e6

@@ -77,7 +77,6 @@ def test_command_line(path, tmp_path):
         return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
 
     for words, message in (
-        ((), "--policy: got nothing, expected a policy; `make demo` trains one"),
         (("--html", tmp_path / "a.html"), "--html: got no log, expected one or more"),
         ((path, "--html", tmp_path / "no" / "a.html"), "expected a file in a folder that exists"),
         ((tmp_path / "no.csv",), "no.csv"),
