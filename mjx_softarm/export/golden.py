@@ -38,8 +38,10 @@ from mjx_softarm.deploy.faults import Event, Fault
 from mjx_softarm.deploy.link import vented
 from mjx_softarm.deploy.loop import believed, step, with_goal
 from mjx_softarm.deploy.reachability import nearest, refusals
+from mjx_softarm.policy.file import Policy
 from mjx_softarm.policy.reach import nearest_poses
 from mjx_softarm.sensing.estimator import expected_springs
+from mjx_softarm.sensing.load import tell_load
 
 SCHEMA_VERSION = 2
 N_SINGLE, N_CHECKED = 1000, 40
@@ -54,7 +56,11 @@ _SWING_M = 2e-3
 _CANDIDATES = 200  # goals to choose checked ones from,
 _REACHED, _MISSED = 0.8, 1.5  # whose errors over the threshold are this clear,
 _SHIFT = 0.01  # also of the goals that are so far off, since a search is only as exact as its numbers
+_RUNS = ("calm", "lost", "stuck", "late", "leaking", "unplugged", "swinging", "heavy", "pressed", "dropping")
 _RUN_TICKS = 400  # at most
+_HEAVY, _PRESSED, _CARRIED = 1.4, 1.8, 0.8  # payloads of runs, as shares of the largest,
+_DROP_TICK = 200  # and when the last one falls, and the goal is given again
+_WEIGHT_MAX_KPA = 8.0
 
 
 class Golden(NamedTuple):
@@ -126,13 +132,14 @@ def make_golden(controller: Controller, policy_sha256: str, seed: int = 0) -> Go
     for row in (*_single_rows(controller, rng), *_checked_rows(controller, rng)):
         inputs.append(row)
         outputs.append(machine.answer(row))
-    for kind in ("calm", "lost", "stuck", "late", "leaking", "unplugged", "swinging"):
+    for kind in _RUNS:
         run = _rows_of_run(controller, kind, rng)
         row = next(run)
-        for _ in range(_RUN_TICKS if kind != "swinging" else 2 * _RUN_TICKS):
+        for tick in range(_RUN_TICKS * (2 if kind in ("swinging", "dropping") else 1)):
             inputs.append(row)
             outputs.append(machine.answer(row))
-            if machine.state.goal is None or (machine.stopped and not machine.state.pressure_kpa.any()):
+            arrived = machine.state.goal is None and not (kind == "dropping" and tick < _DROP_TICK)
+            if arrived or (machine.stopped and not machine.state.pressure_kpa.any()):
                 break
             row = run.send(machine.state.pressure_kpa)
     n = controller.policy.spec.n_chambers
@@ -201,8 +208,13 @@ def _rows_of_run(
     policy, n = controller.policy, controller.policy.spec.n_chambers
     actual_kpa, goal = np.zeros(n), _goal(controller, rng, outside=False)
     leak, first, longest_m = np.ones(n), None, policy.actions.lengths(np.ones(n))
+    carried = {"heavy": _HEAVY, "pressed": _PRESSED, "dropping": _CARRIED}.get(kind, 0.0)
     for tick in range(10**6):
-        spring_m = expected_springs(policy.spring_model, actual_kpa) + rng.normal(0.0, _NOISE_M, n)
+        if kind == "dropping" and tick == _DROP_TICK:
+            carried = 0.0
+        weight_kpa = _weight_kpa(policy, actual_kpa, carried) if carried else 0.0
+        spring_m = expected_springs(policy.spring_model, actual_kpa - weight_kpa)
+        spring_m = spring_m + rng.normal(0.0, _NOISE_M, n)
         if kind == "swinging":  # never all still, and so long that the law drives every chamber to its limit
             phase = 2 * np.pi * 0.7 * tick * controller.dt_s + np.arange(n)
             spring_m = longest_m - _SWING_M * (1.0 - np.sin(phase))
@@ -215,11 +227,23 @@ def _rows_of_run(
             readings[-1] = first[-1]
         late = kind == "late" and (tick in (20, 22) or tick >= 60)
         lost = kind == "unplugged" and tick == 60
-        flags = (tick == 0, tick == 0, late, not (late and tick % 2 == 0), lost, False)
+        new_goal = tick == 0 or (kind == "dropping" and tick == _DROP_TICK)
+        flags = (tick == 0, new_goal, late, not (late and tick % 2 == 0), lost, False)
         pressure_kpa = yield _row(tuple(map(int, flags)), readings, goal)
         if kind == "leaking" and tick == 60:
             leak[np.argmax(np.abs(pressure_kpa))] = 0.0
         actual_kpa = actual_kpa + _LAG * (leak * pressure_kpa - actual_kpa)
+
+
+def _weight_kpa(policy: Policy, pressure_kpa: np.ndarray, share: float) -> float:
+    """Return the pressure [kPa] that a share of the largest payload stands for, by the load's network.
+
+    An arm with so much more pressure in every chamber than its springs show seems to carry this payload.
+    """
+    model, less_kpa = policy.load_estimator, np.linspace(-_WEIGHT_MAX_KPA, _WEIGHT_MAX_KPA, 201)
+    spring_m = expected_springs(policy.spring_model, pressure_kpa - less_kpa[:, None])
+    told_kg = tell_load(model, spring_m, np.broadcast_to(pressure_kpa, spring_m.shape))
+    return float(less_kpa[np.argmin(np.abs(told_kg - share * model.load_scale_kg))])
 
 
 def write_golden(path: Path, golden: Golden) -> None:

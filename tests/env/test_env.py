@@ -259,12 +259,16 @@ def randomised(spec, env):
     return xla.jit(jax.vmap(spread.reset), spread.uses_mjx)(keys)
 
 
+def assert_all_arms_have(drawn, nominal, name):
+    for own, value in zip(jax.tree.leaves(drawn), jax.tree.leaves(nominal), strict=True):
+        np.testing.assert_array_equal(own, np.broadcast_to(value, own.shape), err_msg=name)
+
+
 def test_without_randomisation_every_arm_is_the_nominal_one(spec, env, start):
     nominal = ArmParams.from_spec(spec)
     drawn = jax.vmap(env.params_of)(start.pipeline_state)
-    for name, value in nominal._asdict().items():
-        own = np.asarray(getattr(drawn, name))
-        np.testing.assert_array_equal(own, np.broadcast_to(value, own.shape), err_msg=name)
+    for name in nominal._fields:
+        assert_all_arms_have(getattr(drawn, name), getattr(nominal, name), name)
     np.testing.assert_array_equal(start.pipeline_state.sensor_offset_m, 0.0)
 
 
@@ -280,10 +284,7 @@ def test_randomised_numbers_fill_their_bounds_and_no_other_number_changes(spec, 
     assert np.ptp(factor, axis=1).min() > 0.02  # each chamber for itself
     unchanged = {"tool_mass_kg", "chamber_stiffness"} ^ set(ArmParams._fields)
     for name in unchanged:
-        value = np.asarray(getattr(drawn, name))
-        np.testing.assert_array_equal(
-            value, np.broadcast_to(getattr(nominal, name), value.shape), err_msg=name
-        )
+        assert_all_arms_have(getattr(drawn, name), getattr(nominal, name), name)
     np.testing.assert_array_equal(drawn.tool_mass_kg[:, 0], np.float32(spec.mass.gripper_kg))
 
 

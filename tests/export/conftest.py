@@ -12,7 +12,7 @@ from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.export import golden as golden_rows
 from mjx_softarm.policy.file import load_policy, save_policy
 from mjx_softarm.sensing.s2r import N_POSE_INPUTS, N_POSE_OUTPUTS, S2R
-from tests.linear_arm import SPEC, N, make_policy
+from tests.linear_arm import GAIN_M_PER_KPA, REST_M, SPEC, N, make_policy
 
 
 def layers(*sizes, scale):
@@ -38,7 +38,11 @@ def busy_policy(spec=SPEC):
         load_layers=layers(2 * N + 1, 6, 18, scale=0.2),
         change_scale=np.full(6, 0.01, np.float32),
     )
-    load = policy.load_estimator._replace(layers=layers(2 * N, 6, 1, scale=0.3))
+    # 1 kPa less in every chamber than its springs show is half a kilogram
+    own = np.linalg.inv(GAIN_M_PER_KPA).mean(axis=0)
+    weight = 0.5 * np.concat([own, np.full(N, -1.0 / N)])[:, None]
+    bias = -0.5 * np.array([own.sum() * REST_M])
+    load = policy.load_estimator._replace(layers=((np.float32(weight), np.float32(bias)),))
     networks = {"estimator": estimator, "load_estimator": load, "s2r": s2r}
     return dataclasses.replace(policy, layers=layers(18, 12, N, scale=0.5), **networks)
 

@@ -184,6 +184,7 @@ int main() {
 """
 
 
+@pytest.mark.slow  # a busy machine may miss it
 def test_an_acting_tick_takes_less_than_50_us(tmp_path, controller, golden):
     """With an actor of two layers of 256, the paper's; the best of many, since others use the machine."""
     rng = np.random.default_rng(0)

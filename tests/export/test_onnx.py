@@ -62,7 +62,7 @@ def test_actor_alone(files, controller):
 def test_lost_reading_holds_the_last_length(files, golden, controller):
     session = ort.InferenceSession(files[0])
     row = np.flatnonzero(np.isfinite(golden.outputs[:N_SINGLE]).all(axis=1))[0]
-    readings, goal = np.split(golden.inputs[row, len(FLAGS) :], [N])
+    readings, goal = np.split(golden.inputs[row, len(FLAGS) :].copy(), [N])
     last_m = np.linspace(0.15, 0.2, N)
     readings[3] = np.nan
     feed = {"readings": readings, "goal": goal, "last_length_m": last_m}

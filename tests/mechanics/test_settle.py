@@ -194,7 +194,8 @@ def test_one_target_that_is_not_a_number_fails_alone(solve, targets):
 @pytest.mark.parametrize("name", ArmParams._fields)
 def test_parameters_that_are_not_numbers_settle_nothing(name):
     params = ArmParams.from_spec(SPEC)
-    broken = params._replace(**{name: np.full_like(getattr(params, name), np.nan)})
+    nothing = jax.tree.map(lambda x: np.full_like(x, np.nan), getattr(params, name))
+    broken = params._replace(**{name: nothing})
     found = settled(settle, references(), params=broken)
     assert not found.settled.any()
     assert (found.iterations <= MAX_ITERATIONS).all()

@@ -208,4 +208,4 @@ def test_parameters_are_the_specification_s_in_base_units():
     assert params.link_mass_kg.sum() == pytest.approx(4.25)
     assert params.section_length_m == pytest.approx(0.2)
     assert params.n_sections == 3
-    assert {np.asarray(x).dtype for x in ArmParams.from_spec(spec)} == {np.dtype(np.float32)}
+    assert {np.asarray(x).dtype for x in jax.tree.leaves(ArmParams.from_spec(spec))} == {np.dtype(np.float32)}

@@ -135,7 +135,7 @@ def test_a_folder_has_one_trainer_at_a_time(tmp_path):
         (["imitate"], "FILE: got nothing, expected the demonstrations"),
         (["imitate", "absent.npz", "--stages", "0.5,1"], "--stages: got '0.5,1', expected SHARE,EVERY,KEPT"),
         (["sweep", "--vary", "tqc.gamma"], "--vary: got 'tqc.gamma', expected NAME=VALUE,..."),
-        (["reach", "--engine=fast"], "--engine/--env.engine: got 'fast', expected one of ('chain', 'mjx')"),
+        (["reach", "--engine=fast"], "--engine/--env.engine: got 'fast', expected one of 'chain', 'mjx'"),
         (["reach", "--seed", "-1"], "seed: got -1, expected at least 0"),
         (
             ["reach", "--updates-per-env-step", "inf"],
@@ -144,15 +144,24 @@ def test_a_folder_has_one_trainer_at_a_time(tmp_path):
         (["demos", "record", "--task", "circle16"], "train demos record: got nothing, expected --arm"),
         (["export"], "RUN: got 0, expected one folder of a run or more"),
         (["reach", "--spec", "absent.toml"], "absent.toml: got 'No such file or directory', expected a spec"),
-        (["reach", "--resume", "absent"], "absent: not the folder of a run"),
+        (
+            ["reach", "--resume", "absent"],
+            "absent/config.json: got 'No such file or directory', expected the folder of a run",
+        ),
         (
             ["reach", "--resume", "absent", "--seed", "1", "--tqc.gamma", "0.4", "--out", "run"],
             "--resume absent: got --out, --seed, --tqc too, expected none: its own settings hold",
         ),
         (["reach", "--env.workspace-seed", "20000"], "20000 draws the goals of the evaluation"),
         (["reach", "--hindsight.near-min-mm", "0"], "near_min_mm"),
-        (["evaluate", "absent"], "absent: not the folder of a run"),
-        (["export", "absent"], "absent: not the folder of a run"),
+        (
+            ["evaluate", "absent"],
+            "absent/config.json: got 'No such file or directory', expected the folder of a run",
+        ),
+        (
+            ["export", "absent"],
+            "absent/config.json: got 'No such file or directory', expected the folder of a run",
+        ),
     ],
 )
 def test_misuse_is_one_line_and_leaves_nothing_behind(arguments, message, tmp_path, monkeypatch, capsys):

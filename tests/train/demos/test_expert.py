@@ -100,8 +100,14 @@ def test_look_tells_what_is_not_in_the_pipe(expert, spec):
 @pytest.mark.parametrize(
     ("finger_m", "message"),
     [
-        ([0.4, 0.0, -0.6], r"waypoint 'far' at 400, 0, -600 mm .* mm off.* from the wall, chamber \d at"),
-        ([0.0, 0.13, -0.4], r"waypoint 'far' at 0, 130, -400 mm .* mm from the wall"),  # in the wall
+        (
+            [0.4, 0.0, -0.6],
+            r"waypoint 'far' at 400, 0, -600 mm: got at best .* mm off.* from the wall, chamber \d at",
+        ),
+        (
+            [0.0, 0.13, -0.4],
+            r"waypoint 'far' at 0, 130, -400 mm: got at best .* mm from the wall",
+        ),  # in the wall
     ],
 )
 def test_waypoint_that_cannot_be_met_is_named(expert, finger_m, message):

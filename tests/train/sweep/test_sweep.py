@@ -45,6 +45,7 @@ OTHER_SETTINGS = """
     env.reward.saturation_cost=20.0 env.reward.threshold=0.2 env.reward.weight_per_mm=0.003
     env.reward.weight_per_deg=0.004 env.randomisation.payload_max_kg=0.3
     env.randomisation.stiffness_spread=0.2 env.randomisation.sensor_noise_mm=0.5
+    env.randomisation.damping_spread=0.2 env.randomisation.delay_max_s=0.05
     env.saturation_tolerance_mm=5.0 env.clearance_cost_per_mm=0.3 env.clearance_margin_mm=90.0
 """
 OTHER = OTHER_SETTINGS.split()
