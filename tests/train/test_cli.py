@@ -14,6 +14,7 @@ import pytest
 
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.logs.schema import Log, write_log
+from mjx_softarm.mechanics import workspace
 from mjx_softarm.mechanics.workspace import sample_workspace
 from mjx_softarm.sensing.pose import frame_from_pose, quaternion_from_pose
 from mjx_softarm.sensing.sensors import Sensor
@@ -63,6 +64,7 @@ main(sys.argv[1:])
 
 
 def test_a_run_survives_kill_9_and_ends_with_the_same_bits(arm, tmp_path, monkeypatch):
+    workspace._solver.cache_clear()  # others may have compiled it with other options than the process below
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     command = ["reach", *flags(), "--spec", arm, "--out"]
     assert main([*command, str(whole)]) == 0
