@@ -76,7 +76,8 @@ class Errors:
                     self._show(name, pairs)
             self._say("".join(_row(name, pairs) for name, pairs in sets.items()))
         elif not self._boxes:
-            self._say("<div>waiting for the first evaluation ...</div>")
+            missing = f"no {POSES_FILE} here: the logs had no poses, or an older version wrote this folder"
+            self._say(f"<div>{'waiting for the first evaluation ...' if self._is_run else missing}</div>")
         if self._is_run and self._changed(METRICS_FILE):
             self._show_curves()
 

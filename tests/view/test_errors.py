@@ -93,3 +93,10 @@ def test_folders_of_something_else_are_refused(run, tmp_path, capsys):
     assert "expected the folder of a run, with config.json, or of a calibration" in capsys.readouterr().err
     assert main([str(run), str(run)]) == 2
     assert "and more, expected one folder" in capsys.readouterr().err
+
+
+def test_a_calibration_without_poses_says_so(server, tmp_path):
+    SPEC.to_toml(tmp_path / "arm.toml")
+    page = Errors(server, tmp_path)
+    page.refresh()
+    assert f"no {POSES_FILE} here: the logs had no poses" in page._text.content
