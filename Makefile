@@ -9,7 +9,7 @@ BIN := .venv/bin
 INSTALLED := .venv/.installed-$(EXTRAS)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow lint bench clean .venv
+.PHONY: help demo test test-slow lint docs bench clean .venv
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z.-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -26,6 +26,9 @@ test-slow: $(INSTALLED)  ## the tests that take minutes
 
 lint: $(INSTALLED) .venv/.installed-dev  ## ruff, which corrects what it can, and pyright, on all files that git knows
 	$(BIN)/pre-commit run --all-files
+
+docs: $(INSTALLED) .venv/.installed-docs  ## the site, links checked, into build/site
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 bench: $(INSTALLED)  ## the benchmarks
 	$(BIN)/python -m benchmarks throughput

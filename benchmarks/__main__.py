@@ -31,7 +31,7 @@ BENCHMARKS = {
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a benchmark; returns the exit status."""
-    about = "Print tables, and write JSON with machine, versions and commit to benchmarks/results."
+    about = "Print tables, and write JSON with machine, versions and commit to docs/results."
     return cli.main("python -m benchmarks", about, BENCHMARKS, arguments, _finish)
 
 

@@ -24,7 +24,7 @@ from rich.text import Text
 from mjx_softarm._support.provenance import provenance, write_json
 from train.epoch.devices import mesh_of
 
-RESULTS = Path(__file__).parents[1] / "results"
+RESULTS = Path(__file__).parents[2] / "docs/results"
 WIDTH = 160  # of tables, where they are not printed to a terminal
 VERDICT = {True: "met", False: "NOT MET", None: "skipped"}
 
@@ -138,7 +138,7 @@ def _cell(value: Any) -> str:
 
 
 def save(name: str, figures: dict[str, Any]) -> Path:
-    """Write figures with what they depend on to `benchmarks/results/NAME.json`."""
+    """Write figures with what they depend on to `docs/results/NAME.json`."""
     RESULTS.mkdir(exist_ok=True)
     path = RESULTS / f"{name}.json"
     write_json(path, {"figures": figures, **provenance("benchmarks")})

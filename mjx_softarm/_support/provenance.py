@@ -18,7 +18,7 @@ PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "o
 
 def provenance(program: str) -> dict[str, Any]:
     """Return versions, machine and commit; changes of other benchmarks' results do not count."""
-    versions, status = {}, _git("status", "--porcelain", "--", ":/", ":(top,exclude)benchmarks/results")
+    versions, status = {}, _git("status", "--porcelain", "--", ":/", ":(top,exclude)docs/results")
     for name in PACKAGES:
         try:
             versions[name] = metadata.version(name)

@@ -58,7 +58,7 @@ class VectorEnv:
 
         Args:
             state: of n arms.
-            action (n, action_size) in [-1, 1].
+            action (n, action_size): in [-1, 1].
             key: for the new episodes.
 
         Returns:

@@ -11,7 +11,7 @@ from mjx_softarm._support.provenance import provenance
 @pytest.fixture
 def checkout(tmp_path, monkeypatch):
     """A commit of a package and of a result, in which this package seems to lie."""
-    for name in ("package/code.py", "benchmarks/results/a.json"):
+    for name in ("package/code.py", "docs/results/a.json"):
         (tmp_path / name).parent.mkdir(parents=True)
         (tmp_path / name).write_text("1")
     who = ("-c", "user.name=a", "-c", "user.email=a@b")
@@ -23,8 +23,8 @@ def checkout(tmp_path, monkeypatch):
 
 def test_code_that_is_not_committed_is_told_and_other_results_are_not(checkout):
     assert provenance("a")["uncommitted_changes"] is False
-    (checkout / "benchmarks/results/a.json").write_text("2")
-    (checkout / "benchmarks/results/b.json").write_text("2")
+    (checkout / "docs/results/a.json").write_text("2")
+    (checkout / "docs/results/b.json").write_text("2")
     assert provenance("a")["uncommitted_changes"] is False
     (checkout / "package/code.py").write_text("2")
     assert provenance("a")["uncommitted_changes"] is True

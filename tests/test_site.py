@@ -1,0 +1,27 @@
+"""The site builds without a warning, and links between files lead somewhere."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def test_the_site_builds_without_a_warning(tmp_path):
+    pytest.importorskip("mkdocs", reason="pip install -e '.[docs]'")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
+    quiet = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
+    done = subprocess.run(command, cwd=ROOT, env=quiet, capture_output=True, text=True)
+    assert done.returncode == 0 and "WARNING" not in done.stderr, done.stderr
+    assert "equilibrium" in (tmp_path / "api/index.html").read_text("utf-8")  # docstrings are read
+
+
+def test_the_readme_s_links_lead_to_files():
+    text = (ROOT / "README.md").read_text("utf-8")
+    links = re.findall(r"\]\(([^)#]+)|src=\"([^\"]+)", text)
+    targets = [target for pair in links for target in pair if target and "://" not in target]
+    assert targets and not [target for target in targets if not (ROOT / target).is_file()]
