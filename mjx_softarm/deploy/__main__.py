@@ -25,7 +25,7 @@ from mjx_softarm.deploy.session import Run, follow
 from mjx_softarm.logs import mcap_file
 from mjx_softarm.logs.pressure_plan import read_plan
 from mjx_softarm.mechanics.excitation import growing, random_pressures
-from mjx_softarm.policy.file import load_policy
+from mjx_softarm.policy.file import SHIPPED, load_policy
 from mjx_softarm.spec import ArmSpec
 
 _STATUS = """Exit status: 0 done; 1 done, but a goal was not reached; 2 it could not begin, or its log could
@@ -42,6 +42,13 @@ def _goal(words: list[str]) -> tuple[float, ...]:
 
 
 Goal = Annotated[tuple[float, ...], cli.listed(_goal, "X,Y,Z,YAW,PITCH,ROLL")]
+PolicyFile = Annotated[
+    Path,
+    tyro.conf.arg(
+        help="file that `python -m train export` wrote",
+        help_behavior_hint="(default: the package's own, for the paper's arm)",
+    ),
+]
 Arm = Annotated[
     str,
     tyro.conf.arg(
@@ -57,9 +64,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(
-    policy: tyro.conf.Positional[Path],
     arm: Arm,
     goal: tyro.conf.UseAppendAction[tuple[Goal, ...]],
+    policy: tyro.conf.Positional[PolicyFile] = SHIPPED,
     log: cli.MaybePath = None,
     duration: float = np.inf,
     stay: bool = False,
@@ -67,7 +74,6 @@ def _run(
     """Bring the tip to goals; errors are by motion capture where there is any.
 
     Args:
-        policy: file that `python -m train export` wrote
         goal: pose of the tip [mm, deg] in the base frame; again for a further one
         log: file for the run's log, CSV, npz or MCAP, by the end of its name
         duration: [s] of the arm after which the run ends
@@ -77,7 +83,7 @@ def _run(
         raise InputError("--goal: got nothing, expected the pose of the tip, X,Y,Z,YAW,PITCH,ROLL")
     if not duration > 0.0:
         raise InputError(f"--duration: got {duration:g}, expected a number > 0")
-    controller = Controller.of(load_policy(policy))
+    controller = _controller(policy)
     check_file("--log", log)
     limit_s = None if np.isinf(duration) else duration
     save = partial(save_log, log) if log else lambda log: None
@@ -87,6 +93,12 @@ def _run(
         print(f"log: {log}, {len(run.log)} rows")
     _summary(run)
     return run.status
+
+
+def _controller(policy: Path) -> Controller:
+    if policy == SHIPPED:
+        _tell("policy: the package's own, for the paper's arm as specified; for an arm of yours train one")
+    return Controller.of(load_policy(policy))
 
 
 def _summary(run: Run) -> None:
@@ -101,23 +113,22 @@ def _summary(run: Run) -> None:
 
 
 def _measure(
-    policy: tyro.conf.Positional[Path],
     arm: Arm,
     out: Path,
+    policy: tyro.conf.Positional[PolicyFile] = SHIPPED,
     goals: Annotated[str, tyro.conf.arg(metavar="circle|grid|FILE")] = "circle",
     points: int = 16,
 ) -> int:
     """Measure a policy's accuracy on an arm with motion capture.
 
     Args:
-        policy: file that `python -m train export` wrote
         out: folder to write: the figures, a picture, the log
         goals: circle; grid, over the workspace; or a CSV file of poses
         points: of the circle, or of the grid at most
     """
     if points < 1:
         raise InputError(f"--points: got {points}, expected at least 1")
-    controller = Controller.of(load_policy(policy))
+    controller = _controller(policy)
     poses = read_goals(goals, controller.policy.workspace, points)
     if out.exists():
         raise InputError(f"--out: got {out}, which is there already, expected a new folder")

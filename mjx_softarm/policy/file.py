@@ -57,9 +57,7 @@ from mjx_softarm.spec import ArmSpec, SpecError
 SCHEMA_VERSION = 4
 
 KIND = "policy"
-SHIPPED = (
-    Path(__file__).parent / "shipped" / "paper.npz"
-)  # a policy for the paper's arm; its card is beside it
+SHIPPED = Path(__file__).parent / "shipped/paper.npz"  # for the paper's arm; its card is beside it
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ import tyro
 
 from mjx_softarm._support import cli
 from mjx_softarm._support.errors import InputError
-from mjx_softarm.deploy.__main__ import Arm, check_file
+from mjx_softarm.deploy.__main__ import Arm, PolicyFile, check_file
 from mjx_softarm.deploy.arms import open_arm
 from mjx_softarm.deploy.ending import save_log
 from mjx_softarm.policy.file import SHIPPED, load_policy
@@ -31,7 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _view(
     logs: tyro.conf.Positional[tuple[Path, ...]] = (),
-    policy: cli.MaybePath = None,
+    policy: PolicyFile = SHIPPED,
     arm: Arm = "twin:7",
     log: cli.MaybePath = None,
     demos: cli.MaybePath = None,
@@ -44,7 +44,6 @@ def _view(
 
     Args:
         logs: of `deploy run` and `record`, CSV or npz, side by side; or the folder of a run or a calibration
-        policy: file that `python -m train export` wrote, to steer with; without it the package's own is used
         log: file for the log of the steered run, CSV or npz
         demos: file for demonstrations, poses taken on the page for `train imitate`, CSV or npz
         html: file to write the logs to, as a page that plays without a server
@@ -67,7 +66,7 @@ def _view(
         raise InputError("--html: got no log, expected one or more, which are then written")
     from mjx_softarm.view.live import Setup, live
 
-    read, io = load_policy(policy or SHIPPED), open_arm(arm)
+    read, io = load_policy(policy), open_arm(arm)
     setup = Setup(read, arm, host, port, hasattr(io, "attach"), demos is not None)
     saves = [partial(save_log, path) if path else None for path in (log, demos)]
     return live(setup, io, _tell, partial(_welcome, host), *saves).status

@@ -13,7 +13,7 @@ from calib.read.logs import read_log
 from mjx_softarm.deploy.__main__ import main
 from mjx_softarm.deploy.arms import ArmError, Paced, open_arm
 from mjx_softarm.logs.pressure_plan import write_plan
-from mjx_softarm.policy.file import save_policy
+from mjx_softarm.policy.file import SHIPPED, load_policy, save_policy
 from tests.linear_arm import DT_S, FAR, POLICY, REST_M, SENSOR, LinearArm, N
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -102,6 +102,13 @@ def test_command_line_runs_without_jax(folder):
     done = command(folder, "record", "--arm", "driver:Arm", "--out", "b.csv", "--poses", "3")
     assert done.stdout.startswith("2 ") and done.stderr.count("\n") == 1 and "--out: got b.csv" in done.stderr
     assert (folder / "b.csv").read_text().count("\n") == 3
+
+
+def test_the_shipped_policy_runs_where_none_is_named(folder):
+    goal = "--goal=" + ",".join(map(str, load_policy(SHIPPED).workspace[0]))
+    done = command(folder, "run", "--arm", "driver:Arm", goal, "--duration", "1")
+    assert done.stderr == "" and done.stdout.endswith("1 []\n") and "0 of 1 goals reached" in done.stdout
+    assert done.stdout.startswith("policy: the package's own")
 
 
 def test_accuracy_is_measured_without_jax(folder):
