@@ -180,7 +180,7 @@ def _newton_step(it: _Iterate, kinematics: Kinematics, params: ArmParams, refere
     # Step length; where the energy is not convex, or springs do not follow chambers: no step, stiffer joints
     largest = jnp.max(jnp.abs(dq))
     scale = jnp.minimum(1.0, MAX_STEP / largest)
-    convex = jnp.isfinite(largest)
+    convex = jnp.all(jnp.isfinite(dq))  # XLA's maximum passes over some NaN, with jax 0.12 on a CPU
     small = jnp.all(at_limit == it.at_limit) & (largest < SMALL_STEP) & (it.stiffening == 0)
     return _Iterate(
         q=jax.lax.select(convex, it.q + scale * dq, it.q),
@@ -210,8 +210,9 @@ def _report(
     tracking = jnp.max(jnp.where(params.pinned, 0.0, off))
 
     good = (residual < RESIDUAL_TOLERANCE) & (tracking < TRACKING_TOLERANCE_M)
+    finite = jnp.all(jnp.isfinite(here.gradient)) & jnp.all(jnp.isfinite(error))
     result = jnp.select(
-        [~(jnp.isfinite(residual) & jnp.isfinite(tracking)), good, it.stiffening > 0],
+        [~finite, good, it.stiffening > 0],
         [SettleResult.NOT_FINITE.value, SettleResult.CONVERGED.value, SettleResult.NOT_CONVEX.value],
         SettleResult.OUT_OF_ITERATIONS.value,
     )

@@ -1,0 +1,96 @@
+"""Each change that the page "Extend" prints, applied to a copy and used."""
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from mjx_softarm import ArmSpec
+from tests.train.small import CONFIG, SHORT
+from train import presets
+from train.runs.checkpoint import Run
+
+ROOT = Path(__file__).resolve().parents[2]
+PARTS = dict(
+    re.findall(r"^## (.+?)\n(.+?)(?=^## |\Z)", (ROOT / "docs/extend.md").read_text("utf-8"), re.M | re.S)
+)
+
+
+def block(part, language):
+    return re.search(rf"```{language}\n(.+?)```", PARTS[part], re.S)[1]
+
+
+@pytest.fixture
+def changed(tmp_path):
+    """Make a copy of the code with the part's diff applied."""
+
+    def make(part):
+        for room in ("mjx_softarm", "train", "calib", "benchmarks"):
+            shutil.copytree(ROOT / room, tmp_path / room, ignore=shutil.ignore_patterns("__pycache__"))
+        subprocess.run(["git", "apply", "-"], cwd=tmp_path, input=block(part, "diff"), text=True, check=True)
+        return tmp_path
+
+    return make
+
+
+def output(folder, *arguments):
+    command = [sys.executable, *arguments]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True).stdout
+
+
+def test_a_reward_term(changed):
+    program = """
+import numpy as np
+from mjx_softarm.mdp.rewards import RewardConfig, reward
+goal = np.array([0.0, 0.0, -600.0, 0.0, 0.0, 0.0])
+pose = goal + [30.0, 0.0, 0.0, 0.0, 20.0, 0.0]
+both = [reward(at, goal, 0, np.array(False), RewardConfig())[2]["pitch"].item() for at in (pose, goal)]
+print(*both)
+"""
+    away, there = map(float, output(changed("A reward term"), "-c", program).split())
+    assert (away, there) == (pytest.approx(-2.0), 0.0)
+
+
+def test_a_sensor(changed):
+    folder = changed("A sensor")
+    (folder / "sensor.toml").write_text(block("A sensor", "toml"))
+    program = """
+import tomllib
+import numpy as np
+from mjx_softarm import ArmSpec
+from mjx_softarm.mdp.actions import ActionMap
+from mjx_softarm.sensing.sensors import Sensor
+from mjx_softarm.twin.arm import Twin
+data = ArmSpec.default().to_dict() | tomllib.load(open("sensor.toml", "rb"))
+spec = ArmSpec.from_dict(data)
+sensor, twin = Sensor.from_spec(spec), Twin(0, spec)
+readings = twin.read_sensors()
+length_m, fault = sensor.lengths(readings)
+actions = ActionMap.from_spec(spec)
+back_m = actions.lengths(actions.from_lengths(length_m))
+print(sensor.unit, readings.mean(), fault.any(), np.abs(back_m - length_m).max() < 1e-5)
+"""
+    unit, ohm, faulty, same = output(folder, "-c", program).split()
+    assert (unit, faulty, same) == ("ohm", "False", "True") and 3e3 < float(ohm) < 6e3  # 1e5 * 0.2**2 = 4000
+
+
+@pytest.mark.slow
+def test_a_learner(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(ArmSpec, "default", lambda: SHORT)
+    monkeypatch.setitem(presets.PRESETS, "quick", CONFIG)
+    exec(compile(block("A learner", "python"), "my_learner.py", "exec"), {})
+    rows = Run.open(tmp_path / "runs/restless").metrics()
+    assert rows[-1]["env_steps"] == CONFIG.total_env_steps and "evaluation/median_mm" in rows[-1]
+
+
+def test_a_benchmark(changed):
+    folder = changed("A benchmark")
+    (folder / "docs").mkdir()
+    assert "act us" in output(folder, *block("A benchmark", "sh").replace("2000", "10").split()[1:])
+    figures = json.loads((folder / "docs/results/act.json").read_text())["figures"]
+    assert 0.0 < figures["act_us"] < 1e4
