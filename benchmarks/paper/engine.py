@@ -14,7 +14,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from benchmarks.harness.parallel import JobError, in_parallel
 from mjx_softarm._support.provenance import write_json
@@ -26,7 +26,8 @@ SETTINGS_FILE = "settings.json"
 class Settings:
     """Size of the experiments, and how policies are trained."""
 
-    twins: tuple[int, ...] = (0, 1, 2)
+    arm: Literal["twin", "rod"] = "twin"  # stand-in for an arm; a rod in open space alone
+    twins: tuple[int, ...] = (0, 1, 2)  # their seeds
     seeds: tuple[int, ...] = (0, 1, 2)
     preset: str = "paper"
     training: tuple[str, ...] = ()  # further settings of `train reach`, NAME=VALUE
@@ -37,9 +38,9 @@ class Settings:
     loads_g: tuple[int, ...] = (35, 105, 220, 330, 500, 1000)
 
     def shared(self) -> dict[str, Any]:
-        """Return the settings that all results in a folder share; twins and seeds may be added later."""
+        """Return the settings that all results in a folder share; the others may be added to later."""
         data = json.loads(json.dumps(dataclasses.asdict(self)))
-        return {name: value for name, value in data.items() if name not in ("twins", "seeds")}
+        return {name: value for name, value in data.items() if name not in ("twins", "seeds", "loads_g")}
 
 
 SMOKE = Settings(

@@ -8,10 +8,11 @@ from typing import Any, Literal
 
 from benchmarks.harness.common import RESULTS, show
 from benchmarks.paper.engine import SMOKE, Settings, claim, run_stages
-from benchmarks.paper.report import printed_rows, write_report
+from benchmarks.paper.report import json_name, printed_rows, write_report
 from benchmarks.paper.summary import load_results
 from benchmarks.paper.trials import FILMS, stages
 from mjx_softarm._support import cli
+from mjx_softarm._support.errors import InputError
 
 
 def paper(
@@ -19,7 +20,10 @@ def paper(
     only: Literal["open", "confined"] | None = None,
     twins: cli.Integers | None = None,
     seeds: cli.Integers | None = None,
-    preset: Literal["quick", "paper"] | None = None,
+    loads: cli.Integers | None = None,
+    arm: Literal["twin", "rod"] = "twin",
+    preset: Literal["quick", "paper", "analytic"] | None = None,
+    env_steps: int | None = None,
     out: cli.MaybePath = None,
 ) -> int:
     """Run the paper's experiments on twins, beside its numbers, in hours.
@@ -32,12 +36,18 @@ def paper(
         only: one experiment; None: both
         twins: which twins; None: 0,1,2
         seeds: of training; None: 0,1,2
-        preset: of training in open space; None: paper
+        loads: payloads in open space [g]; None: 35,105,220,330,500,1000
+        arm: twin, or a rod, of other physics, in open space alone
+        preset: of training in open space; None: paper; analytic leaves no critics for the confined circle
+        env_steps: of training in open space; None: the preset's
         out: working folder; None: runs/paper
     """
-    given = {"twins": twins, "seeds": seeds, "preset": preset}
+    if only != "open" and (arm == "rod" or preset == "analytic"):
+        raise InputError(f"--only: got {only}, expected open with --arm rod or --preset analytic")
+    training = (f"total_env_steps={env_steps}",) if env_steps else None
+    given = {"twins": twins, "seeds": seeds, "loads_g": loads, "preset": preset, "training": training}
     chosen = {name: value for name, value in given.items() if value is not None}
-    settings = dataclasses.replace(SMOKE if smoke else Settings(), **chosen)
+    settings = dataclasses.replace(SMOKE if smoke else Settings(), arm=arm, **chosen)
     folder = out or Path("runs/paper-smoke" if smoke else "runs/paper")
     pictures = folder if smoke else RESULTS
     for experiment in [only] if only else FILMS:
@@ -45,7 +55,7 @@ def paper(
         show({"mean and deviation over runs": printed_rows(experiment, data["spreads"])}, experiment)
         for check in data["goals"]:
             print(f"{'met    ' if check['met'] else 'NOT MET'}  {check['text']}: {check['value']}")
-        print(f"written: {pictures / f'paper-{experiment}.json'}")
+        print(f"written: {pictures / json_name(experiment, settings)}")
     return 0
 
 

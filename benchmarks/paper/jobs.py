@@ -15,7 +15,14 @@ import numpy as np
 
 from benchmarks.harness.parallel import JobError
 from benchmarks.paper.engine import Settings, command
-from benchmarks.paper.kinds import EVALUATION_FILE, KINDS, POLICY_FILE, Trial, learned_run, reach_run
+from benchmarks.paper.kinds import (
+    KINDS,
+    POLICY_FILE,
+    Trial,
+    arm_name,
+    learned_run,
+    reach_run,
+)
 from benchmarks.paper.measure import operate, save_outcome
 from mjx_softarm.mechanics.pipe import PIPES_MM
 
@@ -30,6 +37,14 @@ def demonstrations_path(twin: int, task: str) -> str:
     return f"twin{twin}/demos-{task}.npz"
 
 
+def stand_in(settings: Settings) -> Any:
+    """Return the class of the stand-ins for an arm."""
+    from mjx_softarm.twin.arm import Twin
+    from mjx_softarm.twin.rod_twin import RodTwin
+
+    return RodTwin if settings.arm == "rod" else Twin
+
+
 def calibrate_twin(folder: Path, settings: Settings, twin: int) -> None:
     """Record a twin's log, unless it exists, and calibrate the twin by it."""
     from calib.read.logs import read_log
@@ -40,7 +55,6 @@ def calibrate_twin(folder: Path, settings: Settings, twin: int) -> None:
     from mjx_softarm.logs.schema import write_log
     from mjx_softarm.mechanics.excitation import random_pressures
     from mjx_softarm.spec import ArmSpec
-    from mjx_softarm.twin.arm import Twin
     from mjx_softarm.twin.instruments import S2R_SESSION
 
     here, spec = folder / f"twin{twin}", ArmSpec.default()
@@ -48,7 +62,7 @@ def calibrate_twin(folder: Path, settings: Settings, twin: int) -> None:
     file = here / "log.npz"
     if not file.exists():
         pressures_kpa = random_pressures(spec, settings.n_poses, seed=twin)
-        recording = record(Twin(twin, spec, session=S2R_SESSION), spec, pressures_kpa)
+        recording = record(stand_in(settings)(twin, spec, session=S2R_SESSION), spec, pressures_kpa)
         if cause := recording.ending.cause:
             raise JobError(f"{file}: got a recording that ended early ({cause}), expected all poses")
         write_log(file, recording.log)
@@ -59,19 +73,16 @@ def calibrate_twin(folder: Path, settings: Settings, twin: int) -> None:
 
 
 def train_reach(folder: Path, settings: Settings, twin: int | None, seed: int) -> None:
-    """Train and export a policy of the nominal arm or of a twin's calibration; resume an interrupted run."""
+    """Train a policy of the nominal arm or of a twin's calibration; resume an interrupted run."""
     run = folder / reach_run(twin, seed)
     log = run.with_suffix(".log")
-    if not (run / EVALUATION_FILE).exists():
-        if (run / "config.json").exists():
-            command(log, "reach", "--resume", str(run))
-        else:
-            options = ["--preset", settings.preset, "--seed", str(seed), "--out", str(run)]
-            if twin is not None:
-                options += ["--calibration", str(folder / f"twin{twin}" / CALIBRATION)]
-            command(log, "reach", *options, *(f"--{text}" for text in settings.training))
-    if not (run / POLICY_FILE).exists():
-        command(log, "export", str(run))
+    if (run / "config.json").exists():
+        command(log, "reach", "--resume", str(run))
+        return
+    options = ["--preset", settings.preset, "--seed", str(seed), "--out", str(run)]
+    if twin is not None:
+        options += ["--calibration", str(folder / f"twin{twin}" / CALIBRATION)]
+    command(log, "reach", *options, *(f"--{text}" for text in settings.training))
 
 
 def demonstrate(folder: Path, settings: Settings, twin: int, task: str) -> None:
@@ -106,10 +117,10 @@ def learn(folder: Path, settings: Settings, name: str, twin: int, seed: int) -> 
     command(log, "imitate", str(folder / demonstrations_path(twin, kind.task)), *options)
 
 
-def export(folder: Path, settings: Settings, twin: int, runs: tuple[str, ...]) -> None:
-    """Export a twin's policies at once: they share what is distilled for its arm."""
+def export(folder: Path, settings: Settings, twin: int | None, runs: tuple[str, ...]) -> None:
+    """Export an arm's policies at once: they share what is distilled for it."""
     pending = [str(folder / run) for run in runs if not (folder / run / POLICY_FILE).exists()]
-    command(folder / f"export-twin{twin}.log", "export", *pending)
+    command(folder / f"export-{arm_name(twin)}.log", "export", *pending)
 
 
 class Scene(NamedTuple):
@@ -125,21 +136,21 @@ def scene_of(folder: Path, settings: Settings, trial: Trial) -> Scene:
     """Return a trial's twin, in its pipe if it has one, its controller and its goals."""
     from mjx_softarm.mechanics.excitation import circle_poses
     from mjx_softarm.mechanics.pipe import CrossPipe
-    from mjx_softarm.twin.arm import EVALUATION_SESSION, Twin
+    from mjx_softarm.twin.instruments import EVALUATION_SESSION
     from train.demos.demonstrations import load_demonstrations
     from train.demos.waypoints import task as task_of
 
     controller, task = controller_of(folder, trial), KINDS[trial.kind].task
-    pipe = None
+    inside: dict[str, Any] = {}
     if task in PIPES_MM:
-        spec, pipe = controller.policy.spec, CrossPipe.of_mm(PIPES_MM[task])
+        spec, inside = controller.policy.spec, {"pipe": CrossPipe.of_mm(PIPES_MM[task])}
         demonstrations = load_demonstrations(folder / demonstrations_path(trial.twin, task), spec)
         goals = demonstrations.positions[: settings.n_positions].astype(float)
         names = [waypoint.name for waypoint in task_of(task, spec).waypoints[: settings.n_positions]]
     else:
         goals, names = circle_poses(settings.n_points).astype(float), [""] * settings.n_points
     session = TRIAL_SESSION if task else EVALUATION_SESSION
-    twin = Twin(trial.twin, payload_kg=1e-3 * trial.load_g, session=session, pipe=pipe)
+    twin = stand_in(settings)(trial.twin, payload_kg=1e-3 * trial.load_g, session=session, **inside)
     return Scene(twin, controller, goals, names)
 
 

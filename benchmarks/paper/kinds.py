@@ -53,9 +53,14 @@ class Trial(NamedTuple):
         return f"trials/{self.name}.npz"
 
 
+def arm_name(twin: int | None) -> str:
+    """Return the name of a twin, or of the nominal arm, in paths."""
+    return "nominal" if twin is None else f"twin{twin}"
+
+
 def reach_run(twin: int | None, seed: int) -> str:
     """Return the run folder of a policy without demonstrations; None is the nominal arm."""
-    return f"{'nominal' if twin is None else f'twin{twin}'}-seed{seed}"
+    return f"{arm_name(twin)}-seed{seed}"
 
 
 def learned_run(kind: str, twin: int, seed: int) -> str:

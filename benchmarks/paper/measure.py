@@ -38,6 +38,7 @@ class Outcome(NamedTuple):
     saturated: np.ndarray  # (p, n) bool: chamber at a limit with its spring off the reference, on arrival
     success: np.ndarray  # (p,) bool: an object was picked or placed
     arrival_s: np.ndarray  # (p,)
+    told_g: np.ndarray  # (p,) payload that the loop believed in, on arrival
     events: np.ndarray  # (faults,) how often the loop reported each of `faults.Fault`
     latency_s: np.ndarray  # (2,) median and 99.9 % of a tick's computing time
     time_s: np.ndarray  # (t,)
@@ -129,7 +130,8 @@ def operate(
     """Follow goals (p, 6) [mm, deg], picking and placing as their names say; raises as `measure`."""
     gripper_m = controller.policy.spec.mass.gripper_length_m
     forces: list[tuple[float, float]] = []
-    watched: Any = WatchedTwin(twin, lambda: forces.append(twin.wall_force_n()))
+    force = getattr(twin, "wall_force_n", lambda: (0.0, 0.0))  # a rod touches nothing
+    watched: Any = WatchedTwin(twin, lambda: forces.append(force()))
     gripper = Gripper(watched, names, finger_tips(goals, gripper_m), objects, gripper_m)
     run = follow(watched, controller, goals, arrived=gripper.arrived)
     outcome = measure(run, controller, goals)

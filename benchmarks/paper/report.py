@@ -21,11 +21,28 @@ from benchmarks.paper.trials import FILMS
 from mjx_softarm._support.provenance import provenance, write_json
 
 DPI, N_COLOURS = 110, 64
-PREFIXES = {"open": "paper", "confined": "paper-confined"}  # of files beside the JSON
+PREFIXES = {"open": "paper", "confined": "paper-confined", "rod": "paper-rod"}  # of files beside the JSON
 COLUMNS = {  # figures in the printed table
-    "open": ("translation_mm", "max_mm", "yaw_deg", "pitch_deg", "roll_deg", "saturated_points"),
+    "open": (
+        "translation_mm",
+        "max_mm",
+        "yaw_deg",
+        "pitch_deg",
+        "roll_deg",
+        "saturated_points",
+        "load_off_g",
+    ),
     "confined": ("x_mm", "y_mm", "z_mm", "translation_mm", "max_mm", "done", "calm_percent", "wall_max_n"),
 }
+
+
+def json_name(experiment: str, settings: Settings) -> str:
+    """Return the name of an experiment's JSON file."""
+    return f"paper-{_label(experiment, settings)}.json"
+
+
+def _label(experiment: str, settings: Settings) -> str:
+    return experiment if settings.arm == "twin" else settings.arm
 
 
 def write_report(
@@ -35,8 +52,8 @@ def write_report(
     data = figures_of(experiment, folder, settings, results)
     pictures.mkdir(parents=True, exist_ok=True)
     finite = json.loads(json.dumps(data), parse_constant=lambda _: None)  # JSON has no NaN
-    write_json(pictures / f"paper-{experiment}.json", {"figures": finite, **provenance("benchmarks")})
-    prefix, film = PREFIXES[experiment], folder / FILMS[experiment]
+    write_json(pictures / json_name(experiment, settings), {"figures": finite, **provenance("benchmarks")})
+    prefix, film = PREFIXES[_label(experiment, settings)], folder / FILMS[experiment]
     for name, figure in draw(experiment, results, data["runs"]).items():
         _save_picture(pictures / f"{prefix}-{name}.png", figure)
     if film.exists():
@@ -47,21 +64,22 @@ def write_report(
 def figures_of(experiment: str, folder: Path, settings: Settings, results: Results) -> dict[str, Any]:
     """Return all figures: goals, spreads, trainings or simulated errors, calibrations, every run."""
     table, trainings = trial_rows(results), training_rows(results)
-    shared = {**settings.shared(), "twins": list(settings.twins), "seeds": list(settings.seeds)}
+    more = {"twins": settings.twins, "seeds": settings.seeds, "loads_g": settings.loads_g}
+    shared = settings.shared() | {name: list(values) for name, values in more.items()}
     calibrations = {}
     for twin in settings.twins:
         report = json.loads((folder / f"twin{twin}" / CALIBRATION / "report.json").read_text("utf-8"))
         calibrations[f"twin {twin}"] = {title: part["warnings"] for title, part in report["parts"].items()}
-    more = {"simulated": simulated_rows(folder, settings, table)} if experiment == "open" else {}
+    simulated = {"simulated": simulated_rows(folder, settings, table)} if experiment == "open" else {}
     return {
-        "arm": "twin",
+        "arm": settings.arm,
         "settings": shared,
         "goals": [check._asdict() for check in check_goals(experiment, table, trainings)],
         "spreads": spreads(table),
         "calibrations": calibrations,
         "runs": table,
         "trainings": trainings,
-        **more,
+        **simulated,
     }
 
 

@@ -19,7 +19,7 @@ Row = Mapping[str, Any]
 FIGURES = (  # with a spread over runs
     *("translation_mm", "rmse_mm", "max_mm", "x_mm", "y_mm", "z_mm", "yaw_deg", "pitch_deg", "roll_deg"),
     *("believed_mm", "saturated_points", "saturated_chambers_max", "saturation_events", "done"),
-    *("calm_percent", "wall_max_n", "container_max_n"),
+    *("calm_percent", "wall_max_n", "container_max_n", "load_off_g"),
 )
 LIGHT_G, HEAVY_G = 500, 1000  # the paper's "about 9 mm" is for loads up to LIGHT_G
 N_OPERATIONS = 4
@@ -72,9 +72,20 @@ def _load_training(run: Path) -> Training:
 def trial_rows(results: Results) -> list[dict[str, Any]]:
     """Return a row of figures for each trial."""
     return [
-        {**trial._asdict(), "variant": trial.variant, **figures(outcome)}
+        {
+            **trial._asdict(),
+            "variant": trial.variant,
+            **figures(outcome),
+            "load_off_g": load_off_g(trial, outcome),
+        }
         for trial, outcome in results.outcomes.items()
     ]
+
+
+def load_off_g(trial: Trial, outcome: Outcome) -> float:
+    """Return by how much the loop was wrong about the payload, in the mean over the goals; NaN in a pipe."""
+    told_g = outcome.told_g[np.isfinite(outcome.told_g)]
+    return float(np.abs(told_g - trial.load_g).mean()) if len(told_g) and not trial.objects else np.nan
 
 
 def training_rows(results: Results) -> list[dict[str, Any]]:

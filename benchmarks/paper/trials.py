@@ -11,9 +11,20 @@ The folder of a benchmark, which both experiments share:
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from benchmarks.paper import jobs
 from benchmarks.paper.engine import Settings, Stage
-from benchmarks.paper.kinds import EVALUATION_FILE, KINDS, POLICY_FILE, TASKS, Trial, learned_run, reach_run
+from benchmarks.paper.kinds import (
+    EVALUATION_FILE,
+    KINDS,
+    POLICY_FILE,
+    TASKS,
+    Trial,
+    arm_name,
+    learned_run,
+    reach_run,
+)
 
 FILMS = {"open": "circle.gif", "confined": "pipe.gif"}
 
@@ -62,9 +73,11 @@ def stages(experiment: str, settings: Settings) -> list[list[Stage]]:
     kind, objects = ("with", "") if experiment == "open" else ("pipe", "as shown")
     filmed = Trial(kind, settings.twins[0], settings.seeds[0], objects)
     film = Stage("film", (FILMS[experiment],), jobs.film, (filmed, FILMS[experiment]))
+    films = [film] * (settings.arm == "twin")  # a rod cannot be drawn
     if experiment == "open":
         nominal = [_reach(None, seed) for seed in settings.seeds]
-        return [[*calibrations, *nominal], on_twins, [*tried, film]]
+        exports = [_export(twin, settings.seeds) for twin in (None, *settings.twins)]
+        return [[*calibrations, *nominal], on_twins, exports, [*tried, *films]]
     path = jobs.demonstrations_path
     demonstrations = [
         Stage(f"demonstrate {task} on twin {twin}", (path(twin, task),), jobs.demonstrate, (twin, task))
@@ -73,14 +86,13 @@ def stages(experiment: str, settings: Settings) -> list[list[Stage]]:
     ]
     first = [_learn(*item) for item in trainings(settings) if not KINDS[item[0]].reward_of]
     with_their_reward = [_learn(*item) for item in trainings(settings) if KINDS[item[0]].reward_of]
-    exports = [_export(settings, twin) for twin in settings.twins]
-    return [calibrations, [*demonstrations, *on_twins], first, with_their_reward, exports, [*tried, film]]
+    exports = [_export(twin, settings.seeds, trainings(settings)) for twin in settings.twins]
+    return [calibrations, [*demonstrations, *on_twins], first, with_their_reward, exports, [*tried, *films]]
 
 
 def _reach(twin: int | None, seed: int) -> Stage:
     name = f"train {'nominal arm' if twin is None else f'for twin {twin}'}, seed {seed}"
-    results = tuple(f"{reach_run(twin, seed)}/{file}" for file in (EVALUATION_FILE, POLICY_FILE))
-    return Stage(name, results, jobs.train_reach, (twin, seed))
+    return Stage(name, (f"{reach_run(twin, seed)}/{EVALUATION_FILE}",), jobs.train_reach, (twin, seed))
 
 
 def _learn(kind: str, twin: int, seed: int) -> Stage:
@@ -88,8 +100,9 @@ def _learn(kind: str, twin: int, seed: int) -> Stage:
     return Stage(f"learn {kind} for twin {twin}, seed {seed}", (result,), jobs.learn, (kind, twin, seed))
 
 
-def _export(settings: Settings, twin: int) -> Stage:
-    mine = [item for item in trainings(settings) if item[0] != "no-penalty" and item[1] == twin]
-    runs = tuple(learned_run(*item) for item in mine)
+def _export(twin: int | None, seeds: Iterable[int], learned: Iterable[tuple[str, int, int]] = ()) -> Stage:
+    """Return the stage that exports an arm's policies: without demonstrations, and learned from them."""
+    mine = [item for item in learned if item[0] != "no-penalty" and item[1] == twin]
+    runs = (*(reach_run(twin, seed) for seed in seeds), *(learned_run(*item) for item in mine))
     policies = tuple(f"{run}/{POLICY_FILE}" for run in runs)
-    return Stage(f"export for twin {twin}", policies, jobs.export, (twin, runs))
+    return Stage(f"export for {arm_name(twin)}", policies, jobs.export, (twin, runs))

@@ -52,7 +52,8 @@ PolicyFile = Annotated[
 Arm = Annotated[
     str,
     tyro.conf.arg(
-        help="twin:SEED, twin:rod:SEED, simulated; twin:SEED:pipe300, in a pipe; package.module:Class, yours"
+        help="twin:SEED, twin:rod:SEED, simulated; twin:SEED:pipe300, in a pipe; twin:SEED:500g, "
+        "with a payload; package.module:Class, yours"
     ),
 ]
 

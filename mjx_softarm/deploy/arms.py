@@ -1,4 +1,7 @@
-"""Arms by name: `twin:SEED`, `twin:SEED:PIPE`, `twin:rod:SEED`, or your driver, `package.module:Class`."""
+"""Arms by name: `twin:SEED`, `twin:SEED:PIPE`, `twin:rod:SEED`, or your driver, `package.module:Class`.
+
+A twin's name that ends in `:500g` has a payload of 500 g.
+"""
 
 from __future__ import annotations
 
@@ -25,8 +28,8 @@ def open_arm(name: str) -> Any:
 
     Args:
         name: `twin:SEED`, or in a pipe `twin:SEED:pipe300` or `twin:SEED:pipe250`; `twin:rod:SEED`;
-            or `package.module:Class`, whose class takes no arguments; modules in the working directory
-            are found.
+            each with a payload as `twin:SEED:500g`; or `package.module:Class`, whose class takes no
+            arguments; modules in the working directory are found.
 
     Raises:
         ArmError: the name is malformed, nothing of this name can be imported, or it is no arm.
@@ -40,7 +43,7 @@ def open_arm(name: str) -> Any:
         except ImportError as error:
             expected = "MuJoCo for the twin: pip install -e '.[sim]' in the checkout"
             raise ArmError(f"--arm: got {error}, expected {expected}") from error
-        except ValueError as error:
+        except (ValueError, FloatingPointError) as error:
             raise ArmError(f"--arm: {error}") from error
     if (here := os.getcwd()) not in sys.path:
         sys.path.insert(0, here)

@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from mjx_softarm import ArmSpec
 from mjx_softarm.control import Gains, pressures
+from mjx_softarm.deploy.arms import ArmError, open_arm
 from mjx_softarm.mechanics.mjcf import chamber_lengths, spring_lengths
 from mjx_softarm.mechanics.workspace import settle_many
 from mjx_softarm.sensing.sensors import Sensor
@@ -14,6 +15,7 @@ from mjx_softarm.twin import arm as twin
 from mjx_softarm.twin.arm import Twin
 from mjx_softarm.twin.instruments import EVALUATION_SESSION, S2R_SESSION
 from mjx_softarm.twin.model import Build, build_twin, draw_parts
+from mjx_softarm.twin.rod_twin import RodTwin
 
 IDEAL = Build(gap=0.0, losses=0.0, noise=0.0, links_per_section=4)  # training's model, moving
 PRESSURES_KPA = np.array(
@@ -232,3 +234,14 @@ def test_survives_random_extremes():
         hold_pressures(arm, rng.choice([-40.0, 20.0], 9), rng.integers(1, 51) / 50)
         assert np.isfinite(arm.read_sensors()).all()
         assert np.linalg.norm(arm.motion_capture().tip_m) < 1.2
+
+
+def test_payload_in_a_name():
+    named = [open_arm(f"twin:{name}:500g").motion_capture().tip_m for name in ("3", "rod:3")]
+    loaded = [kind(3, payload_kg=0.5).motion_capture().tip_m for kind in (Twin, RodTwin)]
+    np.testing.assert_array_equal(named, loaded)
+    in_pipe = open_arm("twin:7:pipe300:220g")
+    lower_m = open_arm("twin:7:pipe300").motion_capture().tip_m - in_pipe.motion_capture().tip_m
+    assert lower_m[2] > 1e-3 and "pipe" in in_pipe.describe()
+    with pytest.raises(ArmError, match="twin: got an unstable state"):
+        open_arm("twin:3:99999999g")

@@ -30,7 +30,7 @@ class Record(ArmOptions):
     """Bring an arm's finger tips to waypoints, and log the static poses there."""
 
     arm: str
-    """twin:SEED, twin:SEED:pipe300, or package.module:Class, a driver of your own"""
+    """twin:SEED, twin:SEED:pipe300, twin:SEED:500g, or package.module:Class, a driver of your own"""
     task: tyro.conf.DisallowNone[Annotated[str, cli.one_of(TASKS)] | None] = None
     """task with its waypoints and its pipe; --keyboard does without"""
     keyboard: bool = False

@@ -32,7 +32,9 @@ def goals_of(kind, n_points=6):
     return [point.name for point in waypoints], goal
 
 
-def made_up(kind, error=(1.0, -2.0, 3.0), saturated=(), reported=0, fails=(), pressed=0.0, missed=()):
+def made_up(
+    kind, error=(1.0, -2.0, 3.0), saturated=(), reported=0, fails=(), pressed=0.0, missed=(), told_g=0
+):
     """An outcome with one error (up to 6,) at every goal; `pressed`: share of time with 2 N on the wall."""
     names, goal = goals_of(kind)
     ticks = 100
@@ -44,6 +46,7 @@ def made_up(kind, error=(1.0, -2.0, 3.0), saturated=(), reported=0, fails=(), pr
         saturated=np.zeros((len(goal), N), bool),
         success=np.array([name.startswith(("pick", "place")) for name in names]),
         arrival_s=np.linspace(1.0, 0.25 * ticks, len(goal)),
+        told_g=np.full(len(goal), float(told_g)),
         events=np.array([reported if fault is Fault.SATURATED else 0 for fault in Fault]),
         latency_s=np.array([1e-4, 3e-4]),
         time_s=0.25 * np.arange(ticks),
@@ -58,7 +61,7 @@ def made_up(kind, error=(1.0, -2.0, 3.0), saturated=(), reported=0, fails=(), pr
     for point, chamber in saturated:
         outcome.saturated[point, chamber] = True
     outcome.success[np.flatnonzero(outcome.operation)[list(fails)]] = False
-    outcome.error[list(missed)] = np.nan
+    outcome.error[list(missed)], outcome.told_g[list(missed)] = np.nan, np.nan
     return outcome
 
 
@@ -79,12 +82,14 @@ def good_results(experiment, settings=FULL, changed=None):
     """Results that meet every goal, but for what is changed: trial or training -> outcome or course."""
     outcomes = {}
     for trial in trials(experiment, settings):
-        error_mm = {"without": 10.0, "gradient": 5.0, "with": 4.0}.get(trial.kind)
+        error_mm = {"without": 4.0, "gradient": 2.0, "with": 1.25, "circle": 1.0}.get(trial.kind)
         hit = trial.kind == "gradient" or trial.load_g == 1000
         outcomes[trial] = (
             made_up(trial.kind)
             if error_mm is None
-            else made_up(trial.kind, (error_mm, 0, 0, -0.5), [(1, 2)] if hit else [], 2 * hit)
+            else made_up(
+                trial.kind, (error_mm, 0, 0, -0.5), [(1, 2)] if hit else [], 2 * hit, told_g=trial.load_g
+            )
         )
     items = trainings(settings) if experiment == "confined" else []
     found = {item: trained(item[0], reaches_at=8 if item[0] == "hand-made" else 4) for item in items}

@@ -34,7 +34,7 @@ def test_stages_run_group_by_group_and_only_where_a_result_is_missing(tmp_path, 
 
 def test_folder_of_other_settings_is_refused(tmp_path):
     claim(tmp_path, TINY)
-    claim(tmp_path, dataclasses.replace(TINY, twins=(0, 1, 2), seeds=(5,)))
+    claim(tmp_path, dataclasses.replace(TINY, twins=(0, 1, 2), seeds=(5,), loads_g=(35,)))
     with pytest.raises(JobError, match=r"settings.json: got n_points 3, expected n_points 40;"):
         claim(tmp_path, dataclasses.replace(TINY, n_points=40))
 

@@ -45,10 +45,11 @@ def test_interrupted_benchmark_runs_only_what_is_missing(tmp_path, monkeypatch, 
 
 
 def test_both_experiments_or_one(tmp_path, monkeypatch, capsys):
-    done = []
+    done, chosen = [], []
 
     def run(experiment, folder, pictures, settings):
         done.append((experiment, settings.twins))
+        chosen.append((settings.arm, settings.loads_g, settings.preset, settings.training))
         return {"goals": [{"text": experiment, "value": "1", "met": True}], "spreads": []}
 
     monkeypatch.setattr(experiments, "run", run)
@@ -57,10 +58,17 @@ def test_both_experiments_or_one(tmp_path, monkeypatch, capsys):
     assert main(["paper", "--only", "confined", "--twins", "1,2", *smoke]) == 0
     assert done == [("open", (0,)), ("confined", (0,)), ("confined", (1, 2))]
     assert f"written: {tmp_path / 'paper-confined.json'}" in capsys.readouterr().out
+    rods = ["--arm", "rod", "--loads", "500", "--preset", "analytic", "--env-steps", "64"]
+    assert main(["paper", "--only", "open", *rods, *smoke]) == 0
+    assert chosen[-1] == ("rod", (500,), "analytic", ("total_env_steps=64",))
+    assert f"written: {tmp_path / 'paper-rod.json'}" in capsys.readouterr().out
+    for option in (["--arm", "rod"], ["--preset", "analytic"]):
+        assert main(["paper", *option, *smoke]) == 2
+        assert "--only: got None, expected open with" in capsys.readouterr().err
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("experiment", "n_goals"), [("open", 11), ("confined", 10)])
+@pytest.mark.parametrize(("experiment", "n_goals"), [("open", 13), ("confined", 10)])
 def test_smoke(tmp_path, capsys, experiment, n_goals):
     assert main(["paper", "--smoke", "--only", experiment, "--out", str(tmp_path)]) == 0
     assert "goals" in json.loads((tmp_path / f"paper-{experiment}.json").read_text("utf-8"))["figures"]

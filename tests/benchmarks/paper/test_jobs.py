@@ -15,6 +15,7 @@ from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.policy.file import save_policy
 from mjx_softarm.policy.runtime import PolicyRunner
 from mjx_softarm.sensing.sensors import Sensor
+from mjx_softarm.twin.rod_twin import RodTwin
 from tests.benchmarks.paper.made_up import SPEC, TINY, N, goals_of, make_policy, pipe_trial
 from train.__main__ import COMMANDS
 
@@ -38,23 +39,22 @@ def parsed(arguments):
     return cli.read("train", COMMANDS, arguments)[1]
 
 
-def test_training_starts_resumes_exports_or_does_nothing(tmp_path, commands):
+def test_training_starts_or_resumes_and_an_arm_s_policies_are_exported_at_once(tmp_path, commands):
     settings = dataclasses.replace(TINY, preset="quick", training=("tqc.gamma=0.9",))
     run, work = tmp_path / reach_run(1, 2), (jobs.train_reach, tmp_path, settings, 1, 2)
-    start, export = commands(*work)
+    (start,) = commands(*work)
     options = parsed(start)
     assert (options.preset, options.config.seed, options.out) == ("quick", 2, run)
     assert options.calibration == tmp_path / "twin1" / "calibration"
     assert options.config.tqc.gamma == 0.9
-    assert parsed(export).keywords["folders"] == (run,)
     run.mkdir()
     (run / "config.json").touch()
-    resume, export = commands(*work)
-    assert parsed(resume).resume == run and parsed(export).keywords["folders"] == (run,)
-    (run / "evaluation.json").touch()
-    assert commands(*work) == [export]
+    (resume,) = commands(*work)
+    assert parsed(resume).resume == run
+    exports = jobs.export, tmp_path, settings, 1, (reach_run(1, 2), reach_run(1, 3))
+    assert parsed(commands(*exports)[0]).keywords["folders"] == (run, tmp_path / reach_run(1, 3))
     (run / "policy.npz").touch()
-    assert commands(*work) == []
+    assert parsed(commands(*exports)[0]).keywords["folders"] == (tmp_path / reach_run(1, 3),)
 
 
 def test_learning_starts_with_what_it_builds_on_resumes_or_starts_anew(tmp_path, commands):
@@ -107,6 +107,8 @@ def test_scene_is_the_twin_in_its_pipe(tmp_path, make_arm_model, monkeypatch):
     scene = jobs.scene_of(tmp_path, TINY, pipe_trial(kind="circle"))
     assert "pipe" not in scene.twin.describe()
     assert np.array_equal(scene.goals, circle_poses(TINY.n_points).astype(float))
+    rods = dataclasses.replace(TINY, arm="rod")
+    assert isinstance(jobs.scene_of(tmp_path, rods, pipe_trial(kind="circle")).twin, RodTwin)
 
 
 def test_without_s2r_the_nominal_policy_plans_and_the_springs_are_calibrated(tmp_path, make_arm_model):

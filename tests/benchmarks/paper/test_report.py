@@ -12,6 +12,7 @@ from benchmarks.paper.kinds import KINDS, Trial, learned_run
 from benchmarks.paper.measure import save_outcome
 from benchmarks.paper.summary import (
     first_stage_success,
+    load_off_g,
     load_results,
     spreads,
     steps_to_success,
@@ -35,14 +36,14 @@ from train.presets import IMITATION_PRESETS
 
 
 def test_spreads_group_kinds_and_variants():
-    changed = {Trial("with", 1, 0): made_up("with", (6.0,), missed=[0])}
+    changed = {Trial("with", 1, 0): made_up("with", (3.25,), missed=[0])}
     table = trial_rows(good_results("open", TINY, changed))
     found = {(item["kind"], item["variant"]): item for item in spreads(table)}
     loads = [("with", "0 g"), ("with", "500 g"), ("with", "1000 g")]
     assert set(found) == {("without", "0 g"), ("gradient", "0 g"), *loads}
     unloaded = found["with", "0 g"]
     assert (unloaded["runs"], unloaded["incomplete_runs"]) == (2, 1)
-    assert unloaded["translation_mm"] == pytest.approx({"mean": 5.0, "std": 1.0, "min": 4.0, "max": 6.0})
+    assert unloaded["translation_mm"] == pytest.approx({"mean": 2.25, "std": 1.0, "min": 1.25, "max": 3.25})
     assert unloaded["paper"]["translation_mm"] == 11.59
     assert found["without", "0 g"]["paper"]["yaw_deg"] == 13.72
     assert found["with", "1000 g"]["paper"] == {"max_mm": 23.76}
@@ -57,6 +58,14 @@ def test_spreads_group_kinds_and_variants():
     assert (shown["runs"], shown["all_done_runs"], shown["incomplete_runs"]) == (9, 8, 0)
     assert shown["paper"]["x_mm"] == 8.93
     assert found["circle", "as shown"]["paper"] == {"translation_mm": 11.29}
+
+
+def test_load_s_error_is_the_mean_over_the_goals_that_were_arrived_at():
+    outcome = made_up("with", missed=[0], told_g=470)
+    outcome.told_g[1] = 530
+    assert load_off_g(Trial("with", 0, 0, load_g=500), outcome) == 30.0
+    assert np.isnan(load_off_g(pipe_trial(), outcome))
+    assert np.isnan(load_off_g(Trial("with", 0, 0), made_up("with", missed=range(6))))
 
 
 def test_steps_and_stages_of_a_training_by_hand():
@@ -110,7 +119,7 @@ def test_open_results_are_written_and_nothing_is_hidden(tmp_path):
     assert [row["translation_mm"] is None for row in figures["runs"]].count(True) == 1
     simulated = figures["simulated"]
     assert {item["simulated_mm"] for item in simulated} == {1.25}
-    assert (simulated[0]["on_twin_mm"]["min"], simulated[0]["on_twin_mm"]["max"]) == (10.0, 10.0)
+    assert (simulated[0]["on_twin_mm"]["min"], simulated[0]["on_twin_mm"]["max"]) == (4.0, 4.0)
 
 
 def test_confined_results_are_written_and_nothing_is_hidden(tmp_path):

@@ -1,5 +1,7 @@
 """The lists of trials, trainings and stages of both experiments."""
 
+import dataclasses
+
 from benchmarks.paper.engine import Settings
 from benchmarks.paper.trials import stages, trainings, trials
 from tests.benchmarks.paper.made_up import TINY
@@ -14,6 +16,12 @@ def test_three_twins_and_three_seeds():
     learned = trainings(Settings())
     assert len(learned) == len(set(learned)) == 4 * 9 + 3
     assert sum(kind == "no-penalty" for kind, _, _ in learned) == 3
+
+
+def test_rods_are_not_filmed():
+    rods = dataclasses.replace(TINY, arm="rod")
+    names = [[stage.name for group in stages("open", x) for stage in group] for x in (TINY, rods)]
+    assert set(names[0]) - set(names[1]) == {"film"}
 
 
 def test_stages_leave_every_trial_s_result_and_come_after_what_they_need():
@@ -40,4 +48,4 @@ def test_stages_leave_every_trial_s_result_and_come_after_what_they_need():
                 assert at[f"twin{twin}/demos-pipe300.npz"] < learned["pipe"] < learned["narrow"]
                 circle = at[f"circle-twin{twin}-seed0/evaluation.json"]
                 assert at[f"twin{twin}/demos-circle16.npz"] < circle
-                assert at[f"twin{twin}-seed0/policy.npz"] < circle
+                assert at[f"twin{twin}-seed0/evaluation.json"] < circle
