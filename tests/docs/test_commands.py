@@ -16,6 +16,7 @@ import pytest
 from calib import demo
 from mjx_softarm import ArmSpec
 from mjx_softarm._support import cli
+from mjx_softarm.policy.file import SHIPPED, load_policy
 from train.runs import estimator
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -105,6 +106,26 @@ def test_commands_of_other_programs_name_what_there_is(call):
 @pytest.mark.parametrize("module", PYDOC)
 def test_modules_to_read_about_exist(module):
     assert find_spec(module)
+
+
+def python_blocks(page):
+    return re.findall(r"^```python\n(.+?)^```", (ROOT / page).read_text("utf-8"), re.M | re.S)
+
+
+@pytest.mark.slow
+def test_the_readme_s_environment_steps(capsys):
+    exec(python_blocks("README.md")[0], {})
+    tip_error_mm, saturated = map(float, capsys.readouterr().out.split())
+    assert 0.0 < tip_error_mm < 1e3 and 0.0 < saturated < 9.0
+
+
+def test_the_readme_s_policy_acts(tmp_path, monkeypatch):
+    shutil.copy(SHIPPED, tmp_path / "policy.npz")
+    monkeypatch.chdir(tmp_path)
+    pose, goal = load_policy(SHIPPED).workspace[:2]
+    found = {"pose": pose, "goal": goal}
+    exec(python_blocks("README.md")[1], found)
+    assert found["reference"].length_m.shape == (9,)
 
 
 # Journeys: the commands of the pages in the order of the site, with fewer poses and steps.
