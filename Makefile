@@ -27,7 +27,7 @@ test-slow: $(INSTALLED)  ## the tests that take minutes
 lint: $(INSTALLED) .venv/.installed-dev  ## ruff, which corrects what it can, and pyright, on all files that git knows
 	$(BIN)/pre-commit run --all-files
 
-docs: $(INSTALLED) .venv/.installed-docs  ## the site, links checked, into build/site
+docs: .venv/.installed-docs  ## the site, links checked, into build/site
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 bench: $(INSTALLED)  ## the benchmarks
