@@ -126,16 +126,17 @@ def test_without_s2r_the_nominal_policy_plans_and_the_springs_are_calibrated(tmp
     assert not np.allclose(with_s2r, expected)
 
 
-def test_policy_goes_to_a_point_on_a_twin(tmp_path, make_arm_model, monkeypatch):
+@pytest.mark.parametrize("arm", ["twin", "rod"])
+def test_policy_goes_to_a_point_on_a_twin(tmp_path, make_arm_model, monkeypatch, arm):
     # The made-up networks' arm reaches no point of the circle.
     monkeypatch.setattr("mjx_softarm.deploy.session.refusals", lambda policy, goals: {})
-    settings, trial = dataclasses.replace(TINY, n_points=1), Trial("with", 0, 0)
+    settings, trial = dataclasses.replace(TINY, n_points=1, arm=arm), Trial("with", 0, 0, load_g=300)
     (tmp_path / reach_run(0, 0)).mkdir()
     save_policy(tmp_path / reach_run(0, 0) / "policy.npz", make_policy(make_arm_model))
     jobs.try_out(tmp_path, settings, trial)
     outcome = load_outcome(tmp_path / trial.result)
     assert np.isfinite(outcome.error).all() and not outcome.operation.any()
-    # The actor asks for the same springs wherever the goal is, and these the twin holds.
+    # The actor asks for the same springs wherever the goal is, and these the arm holds, loaded as it is.
     last = np.flatnonzero(outcome.point == 0)[-1]
     assert np.abs(outcome.spring_m[last] - outcome.reference_m[last]).max() < 2e-3
     assert np.linalg.norm(outcome.error[0, :3]) > 10.0
