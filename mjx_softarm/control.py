@@ -1,26 +1,29 @@
 """The sensor-space law: spring lengths and their references -> chamber pressures.
 
-One law for training, twin and deployed arm. Each chamber has a PI law on its own spring. A spring shorter
-than its reference asks for more pressure:
+One law for training, twin and deployed arm. Each chamber has a law on its own spring. A spring shorter than
+its reference asks for more pressure:
 
-    e   = reference - length
-    i'  = clip(i + ki e dt, p_min, p_max)        integral, in kPa
-    p   = clip(i' + kp e, p_min, p_max)
+    r'  = r + (reference - r) dt / (reference_s + dt)     reference on its way
+    l'  = l + (length - l) / 2                            smoothed length
+    e   = r' - length
+    i'  = clip(i + ki e dt, p_min, p_max)                 integral, in kPa
+    p   = clip(i' + kp e - kd (l' - l) / dt, p_min, p_max)
+
+A new reference is approached in some `reference_s` seconds, about as fast as the pump can fill the chambers:
+a jump would wind up the integral while they fill. The rate of the length damps the arm's swing. Lengths are
+read at 50 Hz, so their rate is smoothed over two ticks or so.
 
 The integral is clamped to the pressures there are, so it never winds up: however long a chamber has
 been at its limit, it leaves it in the very tick in which the error changes sign.
 
-At rest (i' = i, constant e) each chamber is in one of three states, in each of which p = i:
+At rest (r' = reference, l' = length, i' = i) each chamber is in one of three states, in each of which p = i:
 
     p_min <= p <= p_max and e = 0    it tracks its reference
     p = p_max           and e > 0    it can push no further
     p = p_min           and e < 0    it can pull no further
 
-Neither kp nor ki nor dt is in there: they say how the arm comes to rest, not where.
+No gain and no time is in there: they say how the arm comes to rest, not where.
 `mjx_softarm.mechanics.settle` solves for exactly this rest.
-
-There is no derivative term: a rate from readings at 50 Hz is mostly noise, and the arm's own damping
-already slows it.
 """
 
 from __future__ import annotations
@@ -39,13 +42,16 @@ class Gains(NamedTuple):
 
     kp_kpa_per_m: Array
     ki_kpa_per_ms: Array  # kPa per metre and second
+    kd_kpa_s_per_m: Array  # kPa per metre per second
+    reference_s: Array  # time constant with which a new reference is approached
     pressure_min_kpa: Array
     pressure_max_kpa: Array
 
     @classmethod
     def from_spec(cls, spec: ArmSpec) -> Gains:
         limits_kpa = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
-        return cls(spec.control.kp_kpa_per_m, spec.control.ki_kpa_per_ms, *limits_kpa)
+        law = spec.control
+        return cls(law.kp_kpa_per_m, law.ki_kpa_per_ms, law.kd_kpa_s_per_m, law.reference_s, *limits_kpa)
 
     def measured(self) -> Gains:
         """Return the gains with limits AT_LIMIT_KPA within their own, for pressures that were measured."""
@@ -53,26 +59,43 @@ class Gains(NamedTuple):
         return self._replace(pressure_min_kpa=low, pressure_max_kpa=high)
 
 
+class LawState(NamedTuple):
+    """Memory of the law between two ticks."""
+
+    integral_kpa: Array  # (..., n) at rest, the pressures
+    reference_m: Array  # (..., n) on its way to the reference
+    length_m: Array  # (..., n) smoothed
+
+    @classmethod
+    def at_rest(cls, pressure_kpa: Array, length_m: Array) -> LawState:
+        """Return the memory of a law that holds spring lengths (..., n) [m] at pressures (..., n) [kPa]."""
+        return cls(pressure_kpa, length_m, length_m)
+
+
 def pressures(
-    reference_m: Array, length_m: Array, integral_kpa: Array, gains: Gains, dt_s: float
-) -> tuple[Array, Array]:
+    reference_m: Array, length_m: Array, state: LawState, gains: Gains, dt_s: float
+) -> tuple[Array, LawState]:
     """Compute one tick of the law.
 
     Args:
         reference_m (..., n) [m]: spring lengths to reach.
         length_m (..., n) [m]: spring lengths read, finite.
-        integral_kpa (..., n) [kPa]: the law's state; the pressures at which it starts, or zeros.
+        state: after the last tick.
         gains: numbers of the law.
         dt_s: time since the last tick.
 
     Returns:
-        Pressures (..., n) [kPa] within the limits, and the next integral (..., n) [kPa].
+        Pressures (..., n) [kPa] within the limits, and the next state.
     """
-    xp = array_namespace(reference_m, length_m, integral_kpa, *gains)
+    xp = array_namespace(reference_m, length_m, *state, *gains)
     low, high = gains.pressure_min_kpa, gains.pressure_max_kpa
-    error_m = reference_m - length_m
-    next_integral_kpa = xp.clip(integral_kpa + gains.ki_kpa_per_ms * dt_s * error_m, low, high)
-    return xp.clip(next_integral_kpa + gains.kp_kpa_per_m * error_m, low, high), next_integral_kpa
+    on_its_way_m = state.reference_m + (reference_m - state.reference_m) * (dt_s / (gains.reference_s + dt_s))
+    smooth_m = 0.5 * (state.length_m + length_m)
+    error_m = on_its_way_m - length_m
+    integral_kpa = xp.clip(state.integral_kpa + gains.ki_kpa_per_ms * dt_s * error_m, low, high)
+    damping_kpa = gains.kd_kpa_s_per_m / dt_s * (smooth_m - state.length_m)
+    pressure_kpa = xp.clip(integral_kpa + gains.kp_kpa_per_m * error_m - damping_kpa, low, high)
+    return pressure_kpa, LawState(integral_kpa, on_its_way_m, smooth_m)
 
 
 def saturated(

@@ -104,6 +104,8 @@ class Control:
     rate_hz: float = positive()
     kp_kpa_per_m: float = not_negative()
     ki_kpa_per_ms: float = positive()
+    kd_kpa_s_per_m: float = not_negative()
+    reference_s: float = not_negative()
 
 
 @dataclass(frozen=True)

@@ -126,7 +126,7 @@ GOALS = estimate(POLICY.estimator, SPRINGS_M, 0.0).astype(float)
 FAR = GOALS[0] + [0.0, 0.0, -400.0, 0.0, 0.0, 0.0]
 
 
-def exact_plan(pose, goal, spring_m):
+def exact_plan(pose, goal, spring_m, sensed):
     """The springs of the goal."""
     return SPRINGS_M[int(np.argmin(np.abs(GOALS - goal).sum(axis=1)))]
 

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from mjx_softarm import ArmSpec
-from mjx_softarm.control import Gains, pressures, saturated
+from mjx_softarm.control import Gains, LawState, pressures, saturated
 
 pytestmark = pytest.mark.usefixtures("strict")
 
 DT_S = 0.02
 GAINS = Gains.from_spec(ArmSpec.default())
+SLOW = GAINS._replace(kp_kpa_per_m=0.0, ki_kpa_per_ms=100.0, kd_kpa_s_per_m=0.0)
 LOW, HIGH = GAINS.pressure_min_kpa, GAINS.pressure_max_kpa
 FREE_M = 0.200
 M_PER_KPA = 2.0e-3
@@ -27,20 +28,33 @@ def plant(length_m, pressure_kpa, compliance):
 
 def run(reference_m, gains, n_ticks, compliance=UNCOUPLED):
     """Lengths, pressures and integral after so many ticks from the free length."""
-    length, integral = np.full(9, FREE_M), np.zeros(9)
+    length = np.full(9, FREE_M)
+    state = LawState.at_rest(np.zeros(9), length)
     for _ in range(n_ticks):
-        pressure, integral = pressures(reference_m, length, integral, gains, DT_S)
+        pressure, state = pressures(reference_m, length, state, gains, DT_S)
         length = plant(length, pressure, compliance)
-    return length, pressure, integral
+    return length, pressure, state.integral_kpa
 
 
 def test_one_tick_by_hand():
-    gains = Gains(kp_kpa_per_m=100.0, ki_kpa_per_ms=500.0, pressure_min_kpa=-40.0, pressure_max_kpa=20.0)
+    gains = Gains(100.0, 500.0, 0.0, 0.0, -40.0, 20.0)
     reference, length = np.array([0.21, 0.20, 0.60, 0.10]), np.array([0.20, 0.21, 0.20, 0.20])
-    pressure, integral = pressures(reference, length, np.array([1.0, 1.0, 19.0, -39.5]), gains, 0.02)
+    start = LawState.at_rest(np.array([1.0, 1.0, 19.0, -39.5]), length)
+    pressure, state = pressures(reference, length, start, gains, 0.02)
     # integral + 10 e, then + 100 e, each within the limits
-    np.testing.assert_allclose(integral, [1.1, 0.9, 20.0, -40.0])
+    np.testing.assert_allclose(state.integral_kpa, [1.1, 0.9, 20.0, -40.0])
     np.testing.assert_allclose(pressure, [2.1, -0.1, 20.0, -40.0])
+
+
+def test_one_tick_of_a_reference_on_its_way_and_a_moving_spring_by_hand():
+    gains = Gains(100.0, 500.0, 10.0, 0.08, -40.0, 20.0)
+    start = LawState(np.zeros(1), np.array([0.20]), np.array([0.198]))
+    pressure, state = pressures(np.array([0.21]), np.array([0.20]), start, gains, 0.02)
+    # A fifth of the way to the reference; half of the way to the length read
+    np.testing.assert_allclose(state.reference_m, 0.202)
+    np.testing.assert_allclose(state.length_m, 0.199)
+    np.testing.assert_allclose(state.integral_kpa, 0.02)
+    np.testing.assert_allclose(pressure, 0.02 + 0.2 - 10.0 * 0.001 / 0.02)
 
 
 def test_rest_is_tracking_or_a_limit():
@@ -52,7 +66,7 @@ def test_rest_is_tracking_or_a_limit():
     np.testing.assert_allclose(length, FREE_M + M_PER_KPA * expected, atol=1e-8)
 
 
-@pytest.mark.parametrize("gains", [GAINS, GAINS._replace(kp_kpa_per_m=0.0, ki_kpa_per_ms=100.0)])
+@pytest.mark.parametrize("gains", [GAINS, SLOW])
 def test_rest_of_coupled_springs_is_complementary_whatever_the_gains(gains):
     rng = np.random.default_rng(3)
     mix = rng.normal(size=(9, 9))
@@ -72,13 +86,14 @@ def test_rest_of_coupled_springs_is_complementary_whatever_the_gains(gains):
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_long_saturation_is_left_at_once(sign):
-    unlimited = GAINS._replace(pressure_min_kpa=-np.inf, pressure_max_kpa=np.inf)
+    gains = GAINS._replace(reference_s=0.0)
+    unlimited = gains._replace(pressure_min_kpa=-np.inf, pressure_max_kpa=np.inf)
     limit = HIGH if sign > 0 else LOW
     length = np.full(9, FREE_M + M_PER_KPA * limit)  # as far as the limit takes it
     out_of_reach, back = np.full(9, FREE_M + sign * 0.2), length - sign * 0.005
-    integral = wound_up = np.zeros(9)
+    clamped = wound_up = LawState.at_rest(np.zeros(9), length)
     for _ in range(round(30.0 / DT_S)):
-        pressure, integral = pressures(out_of_reach, length, integral, GAINS, DT_S)
+        pressure, clamped = pressures(out_of_reach, length, clamped, gains, DT_S)
         _, wound_up = pressures(out_of_reach, length, wound_up, unlimited, DT_S)
     np.testing.assert_array_equal(pressure, limit)
 
@@ -89,7 +104,7 @@ def test_a_long_saturation_is_left_at_once(sign):
                 return tick
         return None
 
-    assert ticks_at_the_limit(integral, GAINS) == 0
+    assert ticks_at_the_limit(clamped, gains) == 0
     assert ticks_at_the_limit(wound_up, unlimited) > 1000
 
 
@@ -105,7 +120,7 @@ def test_saturated_needs_the_limit_and_the_error_it_blocks():
 def test_limits_that_float32_rounds_are_still_limits(to_library):
     gains = GAINS._replace(pressure_min_kpa=-40.1, pressure_max_kpa=20.1)
     reference, length, integral = map(to_library, np.float32([[0.4, 0.0], [0.2, 0.2], [20.0, -40.0]]))
-    pressure, _ = pressures(reference, length, integral, gains, DT_S)
+    pressure, _ = pressures(reference, length, LawState.at_rest(integral, length), gains, DT_S)
     assert pressure.dtype == np.float32
     assert saturated(pressure, reference, length, gains, 1e-3).all()
 
@@ -115,15 +130,16 @@ def test_jax_vmapped_and_scanned_gives_numpy_s_pressures():
     reference = np.float32(rng.uniform(0.10, 0.26, (50, 6, 9)))  # ticks, arms, springs
     length = np.float32(rng.uniform(0.10, 0.26, (50, 6, 9)))
 
-    def tick(integral, now):
-        pressure, integral = jax.vmap(lambda r, x, i: pressures(r, x, i, GAINS, DT_S))(*now, integral)
+    def tick(state, now):
+        pressure, state = jax.vmap(lambda r, x, s: pressures(r, x, s, GAINS, DT_S))(*now, state)
         flags = jax.vmap(lambda p, r, x: saturated(p, r, x, GAINS, 1e-3))(pressure, *now)
-        return integral, (pressure, flags)
+        return state, (pressure, flags)
 
-    _, (got, flags) = jax.jit(lambda *now: jax.lax.scan(tick, jnp.zeros((6, 9)), now))(reference, length)
-    integral = np.zeros((6, 9), np.float32)
+    start = LawState.at_rest(jnp.zeros((6, 9)), jnp.asarray(length[0]))
+    _, (got, flags) = jax.jit(lambda *now: jax.lax.scan(tick, start, now))(reference, length)
+    state = LawState.at_rest(np.zeros((6, 9), np.float32), length[0])
     for k in range(50):
-        expected, integral = pressures(reference[k], length[k], integral, GAINS, DT_S)
+        expected, state = pressures(reference[k], length[k], state, GAINS, DT_S)
         np.testing.assert_allclose(got[k], expected, rtol=1e-6, atol=1e-6 * HIGH)
         np.testing.assert_array_equal(flags[k], saturated(expected, reference[k], length[k], GAINS, 1e-3))
     assert got.dtype == expected.dtype == np.float32

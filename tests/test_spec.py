@@ -136,7 +136,7 @@ def test_an_unknown_field_is_named_with_the_known_ones(spec, data):
     text = message_of(ArmSpec.from_dict, changed(data, "motors", {}), "my.toml")
     assert text.startswith("my.toml: motors: got an unknown field, expected name, structure,")
     text = message_of(spec.replace, control={"kd": 1.0})
-    assert text == "replace: control.kd: got an unknown field, expected rate_hz, kp_kpa_per_m, ki_kpa_per_ms"
+    assert text.startswith("replace: control.kd: got an unknown field, expected rate_hz, kp_kpa_per_m,")
     text = message_of(spec.replace, motors={})
     assert text.startswith("replace: got unknown group 'motors', expected one of name,")
 

@@ -36,7 +36,7 @@ class TrainConfig:
     """A training run that reaches poses."""
 
     learner: Literal["tqc", "analytic"] = "tqc"
-    """tqc: from transitions, by critics; analytic: by the gradient of the equilibrium, for arms at rest"""
+    """tqc: from transitions, by critics; analytic: by the gradient of the simulation"""
     seed: int = 0
     """seed of networks, exploration, goals and batches; the pool of poses has env.workspace_seed"""
     n_arms: int = 128
@@ -74,10 +74,6 @@ class TrainConfig:
         for name, low in {**least, "seed": 0, "warmup_env_steps": 0, "polish_updates": 0}.items():
             if getattr(self, name) < low:
                 raise ConfigError(f"{name}: got {getattr(self, name)}, expected at least {low}")
-        if self.learner == "analytic" and self.env.mode != "quasistatic":
-            raise ConfigError(
-                f"learner: got 'analytic' with env.mode {self.env.mode!r}, expected 'quasistatic'"
-            )
         if self.polish_updates and (self.learner, self.env.mode) != ("tqc", "quasistatic"):
             raise ConfigError(
                 f"polish_updates: got {self.polish_updates} with learner {self.learner!r} and env.mode "

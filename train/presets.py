@@ -6,6 +6,7 @@ import dataclasses
 
 from mjx_softarm.env import EnvConfig, Randomisation
 from mjx_softarm.mdp.rewards import RewardConfig
+from train.agent.analytic import AnalyticConfig
 from train.agent.hindsight import HindsightConfig
 from train.agent.tqc import TQCConfig
 from train.config import ImitationConfig, Stage, TrainConfig
@@ -25,6 +26,14 @@ _TUNED = TrainConfig(
 
 # At rest one action is enough, so the value of later ones hardly matters.
 _AT_REST = dataclasses.replace(_TUNED, tqc=dataclasses.replace(_TUNED.tqc, gamma=0.1, learning_rate=4e-3))
+
+_MOVING = EnvConfig(
+    mode="dynamic",
+    observation="motion",
+    goal_ends=False,
+    reward=RewardConfig(saturation_cost=10.0),
+    randomisation=Randomisation(damping_spread=0.2, delay_max_s=0.005),
+)
 
 PRESETS: dict[str, TrainConfig] = {
     # On a CPU a gradient step costs as much as many env steps, so there are eight of these to one of those,
@@ -59,23 +68,34 @@ PRESETS: dict[str, TrainConfig] = {
         vector_steps_per_epoch=256,
         evaluation_epochs=20,
     ),
-    # Half-second actions of arms in motion; with --agent, from a policy that was trained at rest. A goal that
-    # is reached pays for every action that the arm is there.
+    # Half-second actions of arms in motion. A goal that is reached pays for every action that the arm is
+    # there.
     "motion": dataclasses.replace(
         _TUNED,
         total_env_steps=131_072,
         episode_length=8,
         updates_per_env_step=0.25,
+        batch_size=128,
         replay_capacity=131_072,
         evaluation_epochs=16,
-        env=EnvConfig(
-            mode="dynamic",
-            observation="motion",
-            goal_ends=False,
-            reward=RewardConfig(saturation_cost=10.0),
-            randomisation=Randomisation(damping_spread=0.2, delay_max_s=0.005),
+        env=_MOVING,
+        tqc=dataclasses.replace(_TUNED.tqc, learning_rate=2e-3),
+    ),
+    # The same task through the gradient of the motion, from the policy of a run of `quick` (--agent).
+    "motion-analytic": TrainConfig(
+        learner="analytic",
+        n_arms=64,
+        total_env_steps=64 * 640,
+        vector_steps_per_epoch=32,
+        evaluation_epochs=5,
+        env=dataclasses.replace(_MOVING, n_poses=16_384, randomisation=Randomisation()),
+        analytic=AnalyticConfig(
+            hidden=_TUNED.tqc.hidden_actor,
+            horizon=4,
+            learning_rate=1e-4,
+            learning_rate_half=200.0,
+            mean_share=0.3,
         ),
-        tqc=dataclasses.replace(_TUNED.tqc, learning_rate=5e-4, critics_first=4_096),
     ),
     "paper": dataclasses.replace(
         _AT_REST, total_env_steps=300_000, updates_per_env_step=0.5, polish_updates=32_768

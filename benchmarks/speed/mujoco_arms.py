@@ -98,7 +98,8 @@ class SteppedArms:
         self._n_steps = round(self.period_s / model.opt.timestep)
         size = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)  # time, qpos, qvel
         self._state = np.zeros((n, size))
-        self._integral_kpa, self.length_m = np.zeros((2, n, spec.n_chambers))
+        self.length_m = np.zeros((n, spec.n_chambers))
+        self._law = np.zeros((3, n, spec.n_chambers))  # a `control.LawState`
         self._tip = np.zeros((n, 7))  # position and quaternion
         self.place(np.ones(n, bool), np.zeros((n, model.nq)), np.zeros((n, model.nu)))
 
@@ -106,13 +107,13 @@ class SteppedArms:
         """Put the arms of a mask (n,) to rest at joint coordinates (k, nq) that balance pressures [kPa]."""
         self._state[arms] = 0.0
         self._state[arms, 1 : self.model.nq + 1] = q
-        self._integral_kpa[arms] = pressure_kpa
         data = self._data[0]
         for index, coordinates in zip(np.flatnonzero(arms), q, strict=True):
             mujoco.mj_resetData(self.model, data)
             data.qpos[:] = coordinates
             mujoco.mj_fwdPosition(self.model, data)
             self.length_m[index] = _springs(data)
+        self._law[:, arms] = control.LawState.at_rest(pressure_kpa, self.length_m[arms])
 
     def settle(self, reference_m: np.ndarray, rest_m: float = REST_M) -> Settled:
         """Hold references (n, n_chambers) until each arm rests.
@@ -123,8 +124,9 @@ class SteppedArms:
         pressure_kpa = np.zeros_like(reference_m)
         while len(moving):
             arms = moving if len(moving) < self.n else slice(None)  # a slice copies nothing
-            pressure_kpa[arms], self._integral_kpa[arms] = control.pressures(
-                reference_m[arms], self.length_m[arms], self._integral_kpa[arms], self.gains, self.period_s
+            law = control.LawState(*self._law[:, arms])
+            pressure_kpa[arms], self._law[:, arms] = control.pressures(
+                reference_m[arms], self.length_m[arms], law, self.gains, self.period_s
             )
             self._step(arms, pressure_kpa[arms])
             n_physics += len(moving) * self._n_steps

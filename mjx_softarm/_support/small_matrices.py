@@ -49,6 +49,26 @@ def _eliminate_many(n: int, batched: list[bool], matrix: Array, columns: Array) 
     return jnp.moveaxis(_eliminate_last(jnp.concatenate(parts, axis=1)), -1, 0), True
 
 
+@jax.custom_vjp
+def solve(matrix: Array, columns: Array) -> Array:
+    """Multiply the inverse of a symmetric matrix (n, n) by columns (n, k), by `eliminate`; has a gradient."""
+    return eliminate(matrix, columns)
+
+
+def _solve_forward(matrix: Array, columns: Array) -> tuple[Array, tuple[Array, Array]]:
+    found = eliminate(matrix, columns)
+    return found, (matrix, found)
+
+
+def _solve_backward(kept: tuple[Array, Array], d_found: Array) -> tuple[Array, Array]:
+    matrix, found = kept
+    d_columns = eliminate(matrix, d_found)
+    return -d_columns @ found.T, d_columns
+
+
+solve.defvjp(_solve_forward, _solve_backward)
+
+
 def _eliminate_last(augmented: Array) -> Array:
     """Eliminate in matrices beside columns (n, n + k, batch); with the batch last, one instruction serves it.
 

@@ -19,9 +19,16 @@ from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.arms import open_arm
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.ending import FAULT, save_log
-from mjx_softarm.deploy.measure import figures, measure, read_goals, require_motion_capture, write_accuracy
+from mjx_softarm.deploy.measure import (
+    along,
+    figures,
+    measure,
+    read_goals,
+    require_motion_capture,
+    write_accuracy,
+)
 from mjx_softarm.deploy.record import record
-from mjx_softarm.deploy.session import Run, follow
+from mjx_softarm.deploy.session import Run, follow, trace
 from mjx_softarm.logs import mcap_file
 from mjx_softarm.logs.pressure_plan import read_plan
 from mjx_softarm.mechanics.excitation import growing, random_pressures
@@ -119,6 +126,7 @@ def _measure(
     policy: tyro.conf.Positional[PolicyFile] = SHIPPED,
     goals: Annotated[str, tyro.conf.arg(metavar="circle|grid|FILE")] = "circle",
     points: int = 16,
+    seconds: float | None = None,
 ) -> int:
     """Measure a policy's accuracy on an arm with motion capture.
 
@@ -126,7 +134,10 @@ def _measure(
         out: folder to write: the figures, a picture, the log
         goals: circle; grid, over the workspace; or a CSV file of poses
         points: of the circle, or of the grid at most
+        seconds: pass all goals without a stop in so long [s], from the first and, on a circle, back to it
     """
+    if seconds is not None and not (0.0 < seconds < np.inf and goals != "grid"):
+        raise InputError(f"--seconds: got {seconds:g} with --goals {goals}, expected > 0, and not a grid")
     if points < 1:
         raise InputError(f"--points: got {points}, expected at least 1")
     controller = _controller(policy)
@@ -136,7 +147,12 @@ def _measure(
     driver = open_arm(arm)
     require_motion_capture(driver, f"--arm: {arm}")
     out.mkdir(parents=True)
-    run = follow(driver, controller, poses, tell=_tell, save=partial(save_log, out / "log.npz"))
+    save = partial(save_log, out / "log.npz")
+    if seconds is None:
+        run = follow(driver, controller, poses, tell=_tell, save=save)
+    else:
+        poses = np.concatenate([poses, poses[:1]]) if goals == "circle" else poses
+        run = trace(driver, controller, poses, seconds, _tell, save)
     if not run.arrivals:
         _summary(run)
         return run.status
@@ -144,12 +160,19 @@ def _measure(
     found = figures(accuracy, run.counts()) | {
         "reached": sum(arrival.reached for arrival in run.arrivals),
         "seconds": float(run.log.time_s[-1]),
+        **({} if run.way is None else along(run, controller.dt_s)),
     }
     if missing := write_accuracy(out, accuracy, found):
         print(missing)
     for name, unit, most in (("translation", "mm", "max_mm"), ("rotation", "deg", "rotation_max_deg")):
         mean, high, most = found[f"{name}_{unit}"], found[f"{name}_95_{unit}"], found[most]
         print(f"{name} [{unit}]: mean {mean:.2f}, 95 % below {high:.2f}, at most {most:.2f}")
+    if run.way is not None:
+        print(
+            f"on the way, {found['way_s']:.0f} s [mm]: mean {found['way_mm']:.2f}, 95 % below "
+            f"{found['way_95_mm']:.2f}, at most {found['way_max_mm']:.2f}; {found['lag_s']:.2f} s behind, "
+            f"without that {found['way_without_lag_mm']:.2f}"
+        )
     n_saturated = found["saturated_points"]
     print(f"{found['measured']} of {found['points']} goals measured, {n_saturated} with a saturated chamber")
     print(f"figures: {out / 'accuracy.json'}")

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mjx_softarm.control import LawState
 from mjx_softarm.deploy.faults import Event, Response
 from mjx_softarm.deploy.reachability import Reachable
 from mjx_softarm.policy.file import Policy
@@ -16,7 +17,7 @@ from mjx_softarm.sensing.load import Load
 
 WINDOW_S = 0.5
 
-Plan = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+Plan = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None], np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +26,7 @@ class Controller:
 
     policy: Policy
     reachable: Reachable
-    plan: Plan  # pose and goal (6,), springs (n,) [m] -> references (n,) [m]
+    plan: Plan  # pose and goal (6,), springs (n,) [m], `observe_motion` or None -> references (n,) [m]
     dt_s: float
     window: int  # ticks
 
@@ -36,7 +37,7 @@ class Controller:
         return cls(
             policy=policy,
             reachable=Reachable.from_poses(policy.workspace, policy.reward),
-            plan=plan or (lambda pose, goal, _: runner.act(pose, goal).length_m),
+            plan=plan or (lambda pose, goal, _, sensed: runner.act(pose, goal, sensed).length_m),
             dt_s=1.0 / policy.rate_hz,
             window=max(2, round(WINDOW_S * policy.rate_hz)),
         )
@@ -46,6 +47,7 @@ class State(NamedTuple):
     """Memory of the loop from tick to tick, for n springs and chambers."""
 
     goal: np.ndarray | None  # (6,) [mm, deg]
+    moves: bool  # the goal is another one in every tick
     n_actions: int  # for this goal
     n_ticks: int  # since the last action
     n_late: int  # missed deadlines in a row
@@ -53,7 +55,7 @@ class State(NamedTuple):
     n_lost: np.ndarray  # (n,) lost readings in a row
     n_suspect: np.ndarray  # (n,) ticks in a row in which a chamber seemed to have lost its pressure
     reference_m: np.ndarray | None  # (n,)
-    integral_kpa: np.ndarray  # (n,) integral part of the sensor-space law
+    law: LawState  # (n,) each; NaN lengths before the first reading
     pressure_kpa: np.ndarray  # (n,) in force
     springs_m: np.ndarray  # (ticks, n) readings of the last window, the newest last
     pressures_kpa: np.ndarray  # (ticks, n) in force at these
@@ -81,6 +83,7 @@ def start(controller: Controller) -> State:
     n = controller.policy.spec.n_chambers
     return State(
         goal=None,
+        moves=False,
         n_actions=0,
         n_ticks=0,
         n_late=0,
@@ -88,7 +91,7 @@ def start(controller: Controller) -> State:
         n_lost=np.zeros(n, int),
         n_suspect=np.zeros(n, int),
         reference_m=None,
-        integral_kpa=np.zeros(n),
+        law=LawState.at_rest(np.zeros(n), np.full(n, np.nan)),
         pressure_kpa=np.zeros(n),
         springs_m=np.empty((0, n)),
         pressures_kpa=np.empty((0, n)),

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from mjx_softarm.control import Gains, pressures
+from mjx_softarm.control import Gains, LawState, pressures
 from mjx_softarm.deploy.arm_io import ArmIO
 from mjx_softarm.deploy.controller import WINDOW_S
 from mjx_softarm.deploy.faults import LOST_TICKS, SETTLE_TIMEOUT_S, read_lengths, still
@@ -47,20 +47,20 @@ class Hold:
     def __init__(self, gains: Gains, reference_m: np.ndarray, dt_s: float):
         self._gains, self._goal_m, self._dt_s = gains, np.asarray(reference_m, float), dt_s
         self.reference_m: np.ndarray | None = None  # on its way; None before the first reading
-        self._integral_kpa: Any = None
+        self._state: Any = None
         self._off_m: Any = np.inf  # running mean
 
     def __call__(self, spring_m: np.ndarray | None, in_force_kpa: np.ndarray) -> tuple[np.ndarray, bool]:
         if spring_m is None:
             return in_force_kpa, False
         if self.reference_m is None:
-            self.reference_m, self._integral_kpa = spring_m, in_force_kpa
+            self.reference_m, self._state = spring_m, LawState.at_rest(in_force_kpa, spring_m)
             self._off_m = spring_m - self._goal_m
         left_m = self._goal_m - self.reference_m
         steps = np.abs(left_m).max() / (RAMP_M_PER_S * self._dt_s)
         self.reference_m = self.reference_m + left_m / max(1.0, steps)
-        pressure_kpa, self._integral_kpa = pressures(
-            self.reference_m, spring_m, self._integral_kpa, self._gains, self._dt_s
+        pressure_kpa, self._state = pressures(
+            self.reference_m, spring_m, self._state, self._gains, self._dt_s
         )
         self._off_m = self._off_m + self._dt_s / MEAN_S * (spring_m - self._goal_m - self._off_m)
         return pressure_kpa, steps <= 1.0 and bool(np.all(np.abs(self._off_m) < HELD_M))

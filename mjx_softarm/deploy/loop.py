@@ -4,11 +4,16 @@
     spring lengths, payload -> pose of the tip (estimator, then sim-to-real network)
     at rest: pose, goal -> policy -> references;    every tick: references -> sensor-space law -> pressures
 
-The policy was trained on arms at rest, so it acts on arms at rest: at once when a goal is new, and again
+A policy that was trained on arms at rest acts on arms at rest: at once when a goal is new, and again
 whenever the springs have settled, `Policy.n_actions` times for a goal, as in its evaluation. Springs have
 settled when, for a window of half a second, each one is on its reference or its chamber at a limit, and none
 moves. Where that takes longer than `faults.SETTLE_TIMEOUT_S`, it is counted and the policy acts all the same.
-What stands when the springs have settled for the last time is the arrival.
+What stands when the springs have settled for the last time is the arrival. A policy that was trained in
+motion acts every `Policy.action_s` seconds, as often, and arrives when the springs have settled after that.
+
+A goal may also move, from tick to tick. Towards it, a policy that was trained on arms at rest takes all its
+actions at once, in the mind: each leads on from the pose that the references of the one before make. One that
+was trained in motion acts as ever. Where the goal stops moving, it becomes an ordinary one.
 
 The policy takes an arm as specified to a goal. What a payload, or its own error, leaves of the way shows in
 the pose that its references make: the next action is towards a goal that is shifted by as much, unless the
@@ -22,12 +27,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from mjx_softarm.control import pressures, saturated
+from mjx_softarm.control import LawState, pressures, saturated
 from mjx_softarm.deploy import faults
 from mjx_softarm.deploy.controller import Controller, State, Tick
 from mjx_softarm.deploy.faults import Event, Fault, Response
 from mjx_softarm.deploy.link import vented
 from mjx_softarm.deploy.reachability import nearest
+from mjx_softarm.mdp.observation import observe_motion, rate_ticks
+from mjx_softarm.policy.file import Policy
 from mjx_softarm.policy.runtime import tip_pose
 from mjx_softarm.sensing.load import HIGHEST, LOWEST, Load, averaged, tell_load
 from mjx_softarm.sensing.pose import pose_error
@@ -48,7 +55,12 @@ def with_goal(controller: Controller, state: State, goal: np.ndarray) -> tuple[S
         near = ", ".join(f"{value:.0f}" for value in pose)
         far = f"{text} is {away:.1f} times as far from the nearest reachable pose as a goal may be"
         return state, (Event(Fault.GOAL_OUTSIDE, f"{far}; that pose is {near} [mm, deg]"),)
-    return state._replace(goal=goal, n_actions=0, n_ticks=0), ()
+    return state._replace(goal=goal, moves=False, n_actions=0, n_ticks=0), ()
+
+
+def with_moving_goal(state: State, goal: np.ndarray) -> State:
+    """Return the state with where a moving goal (6,) [mm, deg], all of whose way is reachable, is now."""
+    return state._replace(goal=goal, moves=True)
 
 
 def hold(state: State) -> State:
@@ -98,8 +110,11 @@ def step(
         state, found = _weigh(controller, state, at_rest)
         events += found
     if known and not _stops(events) and state.goal is not None and not state.n_lost.any():
-        state, found, arrived = _go(controller, state, at_rest)
-        events += found
+        if state.moves:
+            state = _chase(controller, state)
+        else:
+            state, found, arrived = _go(controller, state, at_rest)
+            events += found
     if not _stops(events):
         state = _with_pressures(controller, state)
     return state, Tick(state.spring_m, tuple(events), arrived)
@@ -121,11 +136,14 @@ def _with_pressures(controller: Controller, state: State) -> State:
     """Return the state with the next pressures: the law's; nearer to zero where there are no references."""
     if state.reference_m is None:
         lower_kpa = vented(state.pressure_kpa, controller.dt_s)
-        return state._replace(pressure_kpa=lower_kpa, integral_kpa=lower_kpa)
-    pressure_kpa, integral_kpa = pressures(
-        state.reference_m, state.spring_m, state.integral_kpa, controller.policy.gains, controller.dt_s
+        return state._replace(pressure_kpa=lower_kpa, law=LawState.at_rest(lower_kpa, state.spring_m))
+    law = state.law
+    if np.isnan(law.length_m).any():  # these are the first lengths that were read
+        law = LawState.at_rest(state.pressure_kpa, state.spring_m)
+    pressure_kpa, law = pressures(
+        state.reference_m, state.spring_m, law, controller.policy.gains, controller.dt_s
     )
-    return state._replace(pressure_kpa=pressure_kpa, integral_kpa=integral_kpa, n_ticks=state.n_ticks + 1)
+    return state._replace(pressure_kpa=pressure_kpa, law=law, n_ticks=state.n_ticks + 1)
 
 
 def _stops(events: list[Event]) -> bool:
@@ -227,11 +245,12 @@ def _go(controller: Controller, state: State, at_rest: bool) -> tuple[State, lis
     if state.n_actions > 0:
         policy, seen = controller.policy, (state.springs_m, state.reference_m, state.pressure_kpa)
         settled = at_rest and bool(faults.on_reference(*seen, policy.gains, policy.tolerance_m))
-        if not settled and state.n_ticks * controller.dt_s < faults.SETTLE_TIMEOUT_S:
+        if not settled and state.n_ticks * controller.dt_s < _patience_s(policy, state.n_actions):
             return state, [], False
         if state.n_suspect.any() and settled:  # whether a chamber is lost comes first
             return state, [], False
-        events += _unsettled(controller, state, settled)
+        if not policy.action_s or state.n_actions == policy.n_actions:
+            events += _unsettled(controller, state, settled)
         if state.n_actions == controller.policy.n_actions:
             return state._replace(goal=None), events, True
     assert state.goal is not None  # `step` asks
@@ -240,9 +259,54 @@ def _go(controller: Controller, state: State, at_rest: bool) -> tuple[State, lis
     if away > 1.0:
         message = f"{away:.1f} times as far from the training rows as the network is believed"
         events.append(Event(Fault.EXTRAPOLATION, message))
-    reference_m = controller.plan(pose, state.goal + shift, state.spring_m)
+    sensed = _sensed(controller, state, pose)
+    reference_m = controller.plan(pose, state.goal + shift, state.spring_m, sensed)
     state = state._replace(reference_m=reference_m, n_actions=state.n_actions + 1, n_ticks=0, shift=shift)
     return state, events, False
+
+
+def _chase(controller: Controller, state: State) -> State:
+    """Return the state with the references towards a moving goal, if an action is due."""
+    policy = controller.policy
+    assert state.goal is not None  # `step` asks
+    pose, _ = believed(controller, state.spring_m, state.load)
+    if policy.action_s:
+        if state.n_actions and state.n_ticks * controller.dt_s < policy.action_s:
+            return state
+        reference_m = controller.plan(pose, state.goal, state.spring_m, _sensed(controller, state, pose))
+        return state._replace(reference_m=reference_m, n_actions=state.n_actions + 1, n_ticks=0)
+    shift, reference_m = state.shift, state.spring_m
+    for _ in range(policy.n_actions):
+        reference_m = controller.plan(pose, state.goal + shift, state.spring_m, None)
+        pose, _ = believed(controller, reference_m, state.load)
+        left = pose_error(np.asarray(pose, float), state.goal)
+        shift = np.clip(shift - left, -MAX_SHIFT, MAX_SHIFT)
+    return state._replace(reference_m=reference_m, n_actions=state.n_actions + 1, n_ticks=0, shift=shift)
+
+
+def _patience_s(policy: Policy, n_actions: int) -> float:
+    """Return for how long [s] the springs may move until the next action comes, or the arrival."""
+    more = policy.action_s and n_actions < policy.n_actions
+    return policy.action_s if more else faults.SETTLE_TIMEOUT_S
+
+
+def _sensed(controller: Controller, state: State, pose: np.ndarray) -> np.ndarray | None:
+    """Return `observe_motion` of the arm, which is believed at a pose (6,), for a policy that observes it."""
+    policy = controller.policy
+    if not policy.observes_motion:
+        return None
+    n_before = min(rate_ticks(policy.rate_hz), len(state.springs_m) - 1)
+    last_m = state.springs_m[-1 - n_before]
+    reference_m = state.spring_m if state.reference_m is None else state.reference_m
+    return observe_motion(
+        state.spring_m,
+        last_m,
+        pose[:3],
+        believed(controller, last_m, state.load)[0][:3],
+        state.law.integral_kpa,
+        policy.actions.from_lengths(reference_m),
+        policy.spec,
+    )
 
 
 def _shifted(controller: Controller, state: State) -> np.ndarray:

@@ -24,6 +24,7 @@ from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.sensing.pose import pose_error
 
 LOOKS, LOOK_S = 50, 0.02  # frames of motion capture tried before an arm moves, and the time between two
+MOST_LAG_S = 3.0  # of a tip behind a moving goal
 POSE_NAMES = ("x_mm", "y_mm", "z_mm", "yaw_deg", "pitch_deg", "roll_deg")
 GOAL_COLUMNS = ("x [mm]", "y [mm]", "z [mm]", "yaw [deg]", "pitch [deg]", "roll [deg]")
 
@@ -159,6 +160,38 @@ def figures(accuracy: Accuracy, events: Mapping[Fault, int]) -> dict[str, Any]:
         "saturated_chambers_max": int(per_point.max()),
         "saturation_events": int(events.get(Fault.SATURATED, 0)),
         "events": {fault.value: int(n) for fault, n in events.items() if n},
+    }
+
+
+def along(run: Run, dt_s: float) -> dict[str, float]:
+    """Return the tip's distances from a moving goal by motion capture, NaN where it was not seen.
+
+    Returns:
+        Mean, 95 % and largest distance [mm] at the same time; the lag [s] for which the mean is least, of
+        those up to `MOST_LAG_S`, and the mean with this lag.
+
+    Raises:
+        InputError: motion capture saw nothing.
+    """
+    assert run.way is not None and run.log.goal is not None
+    if run.log.tip_m is None:
+        raise InputError(f"motion capture: got no frame in {len(run.log)} ticks, expected the tip")
+    goal, tip = run.log.goal[run.way, :3], 1e3 * run.log.tip_m[run.way]
+    n = len(goal)
+
+    def away_mm(lag: int) -> np.ndarray:
+        return np.linalg.norm(tip[lag:] - goal[: n - lag], axis=1)
+
+    lags = range(min(round(MOST_LAG_S / dt_s), n - 1) + 1)
+    means = [float(np.nanmean(away_mm(lag))) for lag in lags]
+    best, now = int(np.argmin(means)), away_mm(0)
+    return {
+        "way_mm": means[0],
+        "way_95_mm": float(np.nanquantile(now, 0.95)),
+        "way_max_mm": float(np.nanmax(now)),
+        "lag_s": best * dt_s,
+        "way_without_lag_mm": means[best],
+        "way_s": n * dt_s,
     }
 
 

@@ -18,13 +18,14 @@ from mjx_softarm.deploy.controller import Controller, State, Tick, start
 from mjx_softarm.deploy.ending import DONE, FAULT, MISSED, Ending, vent_at_end
 from mjx_softarm.deploy.faults import Event, Fault, Response
 from mjx_softarm.deploy.link import ArmFault, Link, Recorder
-from mjx_softarm.deploy.loop import believed, hold, release, step, with_goal
+from mjx_softarm.deploy.loop import believed, hold, release, step, with_goal, with_moving_goal
 from mjx_softarm.deploy.reachability import refusals
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mdp.rewards import scaled_error
 from mjx_softarm.sensing.pose import pose_error, pose_from_quaternion
 
 _ROUNDING_S = 1e-6  # by which a simulated tick may be longer than the period
+LEAD_S = 0.85  # of the goal of a policy trained at rest before the tip; by so much the law lags, on twins
 _KEPT = 1000  # rows, arrivals and faults of a run without a log
 
 
@@ -67,6 +68,7 @@ class Run(NamedTuple):
     latency_s: np.ndarray  # (ticks,) from readings to pressures, without the arm's input and output
     ending: Ending
     n_goals: int = 0  # number of goals asked for; 0 with a pilot
+    way: slice | None = None  # rows of the log in which the goal moved
 
     def counts(self) -> dict[Fault, int]:
         """Return how often each fault came."""
@@ -103,6 +105,34 @@ def follow(
         stay: hold the last goal, for as long as `duration_s` or until something else ends the run.
     """
     return _Session(arm, controller, goals, duration_s, tell, arrived, stay).to_end(save)
+
+
+def trace(
+    arm: ArmIO,
+    controller: Controller,
+    goals: np.ndarray,
+    way_s: float,
+    tell: Callable[[str], None] = lambda text: None,
+    save: Callable[[Log], None] = lambda log: None,
+) -> Run:
+    """Bring the tip to the first goal, then past all others to the last one without a stop, then vent.
+
+    Args:
+        arm: without pressure, as its driver gives it.
+        controller: the policy.
+        goals (p, 6) [mm, deg]: poses, at equal times; in between the goal moves on straight lines.
+        way_s: time from the first to the last.
+        tell: takes a line for each arrival and each fault.
+        save: writes the log, once the arm is vented.
+    """
+    return _Session(arm, controller, goals, None, tell, way_s=way_s).to_end(save)
+
+
+def on_the_way(goals: np.ndarray, share: float) -> np.ndarray:
+    """Return the pose (6,) [mm, deg] after a share of the way past goals (p, 6); its end for more than 1."""
+    at = min(share, 1.0) * (len(goals) - 1)
+    k = min(int(at), len(goals) - 2)
+    return goals[k] + (at - k) * pose_error(goals[k + 1], goals[k])
 
 
 def steer(
@@ -142,7 +172,9 @@ class _Session:
         stay: bool = False,
         pilot: Pilot | None = None,
         kept: int | None = None,
+        way_s: float | None = None,
     ):
+        self.way_s, self.way_began_s, self.way = way_s, np.nan, slice(0)
         self.controller, self.tell, self.arrived, self.pilot = controller, tell, arrived, pilot
         self.goals, self.duration_s, self.n_taken, self.stay = list(goals), duration_s, 0, stay
         # Before the arm moves: it takes longer than a tick.
@@ -161,7 +193,9 @@ class _Session:
         ending = vent_at_end(self.run, self.link, self.tell, lambda: save(self.log()))
         events, latency_s = tuple(self.events), np.array(self.latency_s)
         n_goals = 0 if self.pilot else len(self.goals)
-        return Run(self.log(), tuple(self.arrivals), events, latency_s, ending, n_goals)
+        way = None if self.way_s is None else self.way
+        n_goals = n_goals if way is None else 2
+        return Run(self.log(), tuple(self.arrivals), events, latency_s, ending, n_goals, way)
 
     def run(self) -> None:
         """Go through the goals.
@@ -191,7 +225,7 @@ class _Session:
 
     def _tick(self, begin_s: float) -> bool:
         """Return whether the arm took the pressures in time."""
-        goal = self.state.goal
+        goal = self._goal_on_the_way(begin_s) if self.state.moves else self.state.goal
         readings = self.link.read()
         row = self.link.look(begin_s)
         began = time.perf_counter()
@@ -232,6 +266,11 @@ class _Session:
         """Take the next accepted goal once the last is done; return False when goals or time are over."""
         if self.pilot:
             self._obey(self.pilot.orders())
+        if self.way_s is not None and self.n_taken == 1 and self.state.goal is None:
+            self.way_began_s, self.n_taken = now_s, len(self.goals)
+            self.way = slice(len(self.rows), len(self.rows))
+        if np.isfinite(self.way_began_s):
+            self._move_goal(now_s)
         while self.state.goal is None and self.n_taken < len(self.goals):
             goal, refusal = self.goals[self.n_taken], self.refusals.get(self.n_taken)
             self.n_taken += 1
@@ -242,6 +281,22 @@ class _Session:
         over = self.duration_s is not None and now_s - self.began_s >= self.duration_s
         stays = self.pilot is not None or (self.stay and len(self.arrivals) > 0)
         return not over and (self.state.goal is not None or stays)
+
+    def _move_goal(self, now_s: float) -> None:
+        """Set the moving goal, or where it has come to its end the last one, once."""
+        assert self.way_s is not None  # as it began
+        self.way = slice(self.way.start, len(self.rows))
+        if now_s - self.way_began_s < self.way_s:
+            lead_s = self.controller.policy.action_s or LEAD_S
+            self.state = with_moving_goal(self.state, self._goal_on_the_way(now_s + lead_s))
+        else:
+            self.way_began_s = np.nan
+            self.state, events = with_goal(self.controller, self.state, self.goals[-1])
+            self._note(events)
+
+    def _goal_on_the_way(self, now_s: float) -> np.ndarray:
+        assert self.way_s is not None
+        return on_the_way(np.array(self.goals), (now_s - self.way_began_s) / self.way_s)
 
     def _obey(self, orders: Orders) -> None:
         if orders.vent or orders.hold:

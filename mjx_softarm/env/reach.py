@@ -46,7 +46,7 @@ class ReachEnv(Env):
                angles by 90 deg
         6-11   pose of the goal, scaled in this way, too
         12-17  error w (pose - goal), by the reward's weights per mm and per degree, angles wrapped
-        With `observation="motion"`, 30 more follow: see `mjx_softarm.mdp.observation.observe_motion`
+        With `observation="motion"`, 39 more follow: see `mjx_softarm.mdp.observation.observe_motion`
 
     Action (n_chambers,), each in [-1, 1]: readings of the springs' sensors to be reached, from that of the
         shortest to that of the longest spring (`mjx_softarm.mdp.actions`). The sensor-space law then sets the
@@ -99,7 +99,7 @@ class ReachEnv(Env):
 
     @property
     def observation_size(self) -> int:
-        return obs.OBS_SIZE + (obs.motion_size(self.action_size) if self.observes_motion else 0)
+        return obs.OBS_SIZE + (len(obs.motion_layout(self.action_size)) if self.observes_motion else 0)
 
     @property
     def observes_motion(self) -> bool:
@@ -165,7 +165,7 @@ class ReachEnv(Env):
             sensor_offset_m=1e-3 * spread.sensor_noise_mm * noise.normal,
             damping=1.0 + spread.damping_spread * (2.0 * damping - 1.0),
             delay_s=VALVE_S + spread.delay_max_s * delay,
-            motion=Motion.at_rest(start.q, start.pressure_kpa),
+            motion=Motion.at_rest(start.q, start.pressure_kpa, start.spring_m),
             pose=start.pose,
             spring_m=start.spring_m,
             pressure_kpa=start.pressure_kpa,
@@ -210,7 +210,7 @@ class ReachEnv(Env):
         arm = jax.tree.map(lambda new, old: jnp.where(valid, new, old), moved, arm)
         tolerance = 1e-3 * self.config.saturation_tolerance_mm
         reading = arm.spring_m + arm.sensor_offset_m
-        held_kpa = arm.motion.integral_kpa  # pressures of a rest; in motion a limit may pass
+        held_kpa = arm.motion.law.integral_kpa  # pressures of a rest; in motion a limit may pass
         saturated = control.saturated(held_kpa, reference, reading, self.gains, tolerance) & valid
         blocked, clearance_mm = jnp.any(saturated), self._clearance_mm(arm.motion.q, arm.pose)
         terms: dict[str, Array]
@@ -241,10 +241,13 @@ class ReachEnv(Env):
         kinematics = mjx_kinematics(self.model) if config.engine == "mjx" else chain_kinematics(params)
         if config.mode == "dynamic":
             moving = MovingArm.of(self.model, kinematics, params, arm.damping, arm.delay_s)
-            times_s = config.dynamic_step_s, 1.0 / self.spec.control.rate_hz, config.simulation_step_s
-            return advance(moving, arm.motion, reference_m, self.gains, *times_s)
+            rate_hz = self.spec.control.rate_hz
+            times_s = config.dynamic_step_s, 1.0 / rate_hz, config.simulation_step_s
+            return advance(
+                moving, arm.motion, reference_m, self.gains, *times_s, n_before=obs.rate_ticks(rate_hz)
+            )
         end = settle(kinematics, params, reference_m)
-        return Motion.at_rest(end.q, end.pressure_kpa), end
+        return Motion.at_rest(end.q, end.pressure_kpa, end.spring_m), end
 
     def clearance_cost(self, clearance_mm: Array) -> Array:
         """Return the cost (...) of clearances (...) [mm] of the body to the pipe's wall."""
@@ -275,7 +278,8 @@ class ReachEnv(Env):
             last_m, tip_mm = end.last_spring_m, 1e3 * end.tip_position_m
             last_mm = 1e3 * end.last_tip_position_m
         read_m, last_m = arm.spring_m + arm.sensor_offset_m, last_m + arm.sensor_offset_m
-        return obs.observe_motion(read_m, last_m, tip_mm, last_mm, action, self.spec)
+        integral_kpa = arm.motion.law.integral_kpa
+        return obs.observe_motion(read_m, last_m, tip_mm, last_mm, integral_kpa, action, self.spec)
 
     def params_of(self, arm: ArmState) -> ArmParams:
         """Return the numbers of an arm, with those of its episode in their places."""

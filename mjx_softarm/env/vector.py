@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,17 +15,23 @@ from mjx_softarm._support.mjx import State
 from mjx_softarm.env import ReachEnv
 
 
-def over_arms(function: Callable, mesh: Mesh | None = None) -> Callable:
+def over_arms(function: Callable, mesh: Mesh | None = None, n_shared: int = 0) -> Callable:
     """Return the function of many arms, by their first axis, that a function of one arm makes.
 
-    With a mesh of devices, each does its share of the arms, which must be equal ones, and does not wait for
-    the slowest arm of another.
+    Its last `n_shared` arguments are the same for all arms. With a mesh of devices, each does its share of
+    the arms, which must be equal ones, and does not wait for the slowest arm of another.
     """
-    all_arms = jax.vmap(function)
-    if mesh is None:
-        return all_arms
-    spec = PartitionSpec(mesh.axis_names)
-    return jax.shard_map(all_arms, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
+
+    def of_all(*arguments: Any) -> Any:
+        n_own = len(arguments) - n_shared
+        all_arms = jax.vmap(function, in_axes=(0,) * n_own + (None,) * n_shared)
+        if mesh is None:
+            return all_arms(*arguments)
+        own, shared = PartitionSpec(mesh.axis_names), PartitionSpec()
+        specs = (own,) * n_own + (shared,) * n_shared
+        return jax.shard_map(all_arms, mesh=mesh, in_specs=specs, out_specs=own, check_vma=False)(*arguments)
+
+    return of_all
 
 
 class Outcome(NamedTuple):

@@ -16,7 +16,7 @@ from mjx_softarm.deploy.faults import Fault
 from mjx_softarm.export.golden import BITS, FLAGS, Golden, Machine, output_columns
 from mjx_softarm.policy.file import load_policy
 
-TOLERANCE = 1e-5  # of the range of an output
+TOLERANCE = 1e-4  # of the range of an output; the law adds up the rounding of float32 references over time
 PROGRAM_VERSION = 2  # of the rows that a program reads and writes
 _TIMEOUT_S = 120.0
 

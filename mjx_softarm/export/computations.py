@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mjx_softarm._support.xp import Array, array_namespace
-from mjx_softarm.control import pressures, saturated
+from mjx_softarm.control import LawState, pressures, saturated
 from mjx_softarm.deploy import faults
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.link import vented
@@ -90,8 +90,9 @@ def parts(controller: Controller) -> dict[str, Computation]:
     """Record the functions that `mjx_softarm.deploy.loop` is made of, each by its name in C++."""
     policy, n, window = controller.policy, controller.policy.spec.n_chambers, controller.window
     gains, tolerance_m = policy.gains, policy.tolerance_m
-    names = ("readings", "reference_m", "spring_m", "integral_kpa", "pressure_kpa")
-    readings, reference_m, spring_m, integral_kpa, pressure_kpa = (symbol(name, (n,)) for name in names)
+    names = ("readings", "reference_m", "spring_m", "pressure_kpa")
+    readings, reference_m, spring_m, pressure_kpa = (symbol(name, (n,)) for name in names)
+    state = LawState(*(symbol(f"last_{name}", (n,)) for name in LawState._fields))
     springs_m, pressures_kpa = (symbol(name, (window, n)) for name in ("springs_m", "pressures_kpa"))
     goal, pose, load_kg = symbol("goal", (6,)), symbol("pose", (6,), np.float32), symbol("load_kg", ())
     xp = readings.__array_namespace__()
@@ -100,8 +101,8 @@ def parts(controller: Controller) -> dict[str, Computation]:
     tip, away = tip_pose(policy, spring_m, load_kg)
     told_kg = tell_load(policy.load_estimator, xp.mean(springs_m, axis=0), xp.mean(pressures_kpa, axis=0))
     action = action_towards(policy, pose, xp.asarray(goal, dtype=np.float32))
-    written_kpa, next_kpa = pressures(reference_m, spring_m, integral_kpa, gains, controller.dt_s)
-    law = {"pressure_kpa": written_kpa, "next_integral_kpa": next_kpa}
+    written_kpa, after = pressures(reference_m, spring_m, state, gains, controller.dt_s)
+    law = {"written_kpa": written_kpa} | {f"next_{name}": value for name, value in after._asdict().items()}
     mask = saturated(pressure_kpa, reference_m, spring_m, gains, tolerance_m)
     settled = faults.on_reference(springs_m, reference_m, pressure_kpa, gains, tolerance_m)
     stuck = faults.stock_still(springs_m) & faults.asked_to_move(springs_m, pressures_kpa)
@@ -117,7 +118,7 @@ def parts(controller: Controller) -> dict[str, Computation]:
         "left": of(pose, goal, off=pose_error(xp.asarray(pose, dtype=np.float64), goal)),
         "tip": of(spring_m, load_kg, tip=tip, away=constant(away)),
         "references": of(pose, goal, asked_m=policy.actions.lengths(action)),
-        "law": of(reference_m, spring_m, integral_kpa, **law),
+        "law": of(reference_m, spring_m, *state, **law),
         "vented": of(pressure_kpa, next_kpa=vented(pressure_kpa, controller.dt_s)),
         "inside": of(goal, holds=_inside(controller, goal)),
         "search_begin": of(search=constant(reach.begin(policy, 1))),

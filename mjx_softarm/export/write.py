@@ -108,4 +108,8 @@ def describe(policy: Policy, sha256: str) -> dict[str, Any]:
 
 def _open(policy_path: Path) -> tuple[Controller, str]:
     sha256 = hashlib.sha256(policy_path.read_bytes()).hexdigest()
-    return Controller.of(load_policy(policy_path)), sha256
+    policy = load_policy(policy_path)
+    if policy.action_s:
+        expected = "0: a policy that was trained on arms at rest"
+        raise InputError(f"{policy_path}: action_s: got {policy.action_s:g}, expected {expected}")
+    return Controller.of(policy), sha256

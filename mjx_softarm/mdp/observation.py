@@ -1,6 +1,7 @@
 """The observation: pose, goal and scaled error, one function for training, twin and deployed arm.
 
-An arm in motion has more to tell: spring lengths and their rates, the tip's velocity, the last action.
+An arm in motion has more to tell: spring lengths and their rates, the tip's velocity, the law's integral,
+the last action.
 
 Source: the paper's state s = (P, g, e) in R^18. A fixed affine map brings pose and goal to
 the order of one; it changes only the numbers that a network sees.
@@ -20,6 +21,8 @@ from mjx_softarm.spec import ArmSpec
 _AXES = ("x_mm", "y_mm", "z_mm", "yaw_deg", "pitch_deg", "roll_deg")
 OBS_LAYOUT = tuple(f"{part}_{axis}" for part in ("pose", "goal", "error") for axis in _AXES)
 OBS_SIZE = len(OBS_LAYOUT)
+RATE_S = 0.1  # time over which lengths and positions give rates
+SPRING_M_PER_S, TIP_MM_PER_S = 0.1, 300.0  # speeds that are scaled to 1
 
 
 class ObsScale(NamedTuple):
@@ -36,37 +39,52 @@ class ObsScale(NamedTuple):
         return cls(centre, np.array([length_mm / 3] * 3 + [90.0] * 3, np.float32))
 
 
-SPRING_M_PER_S, TIP_MM_PER_S = 0.1, 300.0  # speeds that are scaled to 1
+def motion_layout(n_springs: int) -> tuple[str, ...]:
+    """Return the names of the entries of `observe_motion`."""
+    springs, rates, integrals, actions = (
+        [f"{name}_{k}" for k in range(n_springs)] for name in ("spring", "spring_rate", "integral", "action")
+    )
+    return (*springs, *rates, *(f"velocity_{axis}" for axis in "xyz"), *integrals, *actions)
 
 
-def motion_size(n_springs: int) -> int:
-    """Return the number of entries of `observe_motion`."""
-    return 3 * n_springs + 3
+def rate_ticks(rate_hz: float) -> int:
+    """Return the number of control periods over which rates are taken."""
+    return max(1, round(RATE_S * rate_hz))
 
 
 def observe_motion(
-    spring_m: Array, last_spring_m: Array, tip_mm: Array, last_tip_mm: Array, action: Array, spec: ArmSpec
+    spring_m: Array,
+    last_spring_m: Array,
+    tip_mm: Array,
+    last_tip_mm: Array,
+    integral_kpa: Array,
+    action: Array,
+    spec: ArmSpec,
 ) -> Array:
-    """Return what a moving arm has to tell besides pose and goal, scaled to the order of one: (..., 3 n + 3).
+    """Return what a moving arm has to tell besides pose and goal, scaled to the order of one: (..., 4 n + 3).
 
     Args:
         spring_m (..., n) [m]: lengths read.
-        last_spring_m (..., n) [m]: lengths read one control period before.
+        last_spring_m (..., n) [m]: lengths read `rate_ticks` before.
         tip_mm (..., 3) [mm]: position of the tip.
-        last_tip_mm (..., 3) [mm]: position of the tip one control period before.
+        last_tip_mm (..., 3) [mm]: position of the tip `rate_ticks` before.
+        integral_kpa (..., n) [kPa]: of the sensor-space law.
         action (..., n): the last action, in [-1, 1].
-        spec: the arm, for its range of lengths and its control rate.
+        spec: the arm, for its ranges of lengths and pressures and its control rate.
 
     Returns:
-        Lengths, from -1 at the shortest to 1 at the longest; their rates; the tip's velocity; the action.
+        Lengths, from -1 at the shortest to 1 at the longest; their rates; the tip's velocity; the integral,
+        from -1 at the least to 1 at the greatest pressure; the action.
     """
     xp = array_namespace(spring_m, tip_mm, action)
     low, high = spec.springs.length_min_m, spec.springs.length_max_m
-    rate_hz = spec.control.rate_hz
+    least, greatest = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
+    over_s = rate_ticks(spec.control.rate_hz) / spec.control.rate_hz
     lengths = (2.0 * spring_m - low - high) / (high - low)
-    rates = (spring_m - last_spring_m) * (rate_hz / SPRING_M_PER_S)
-    velocity = (tip_mm - last_tip_mm) * (rate_hz / TIP_MM_PER_S)
-    return xp.concat([lengths, rates, velocity, action], axis=-1)
+    rates = (spring_m - last_spring_m) / (over_s * SPRING_M_PER_S)
+    velocity = (tip_mm - last_tip_mm) / (over_s * TIP_MM_PER_S)
+    integral = (2.0 * integral_kpa - least - greatest) / (greatest - least)
+    return xp.concat([lengths, rates, velocity, integral, action], axis=-1)
 
 
 def observe(pose: Array, goal: Array, scale: ObsScale, config: RewardConfig) -> Array:

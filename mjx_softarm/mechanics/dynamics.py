@@ -6,10 +6,11 @@ The mass matrix M and the bias c of the velocities are MJX's (`mjx.crb`, `mjx.rn
 chambers' pressures, with its gradient and Hessian K, and the dampers D have the closed form of
 `mjx_softarm.mechanics.statics`; the kinematics are those of either engine.
 
-A step of length h takes the implicit midpoint rule, linearised about its start. It is of second order, and
-stable however stiff a link is, so that a step may be as long as a control period:
+A step of length h takes the implicit midpoint rule, linearised about the middle as the velocity at the start
+predicts it, q + h/2 v. It is of second order, and stable however stiff a link is, so that a step may be as
+long as a control period. With all functions of q taken there,
 
-    (M + h/2 D + h^2/4 K) dv = -h (dV/dq + D v + c + h/2 K v),    q' = q + h (v + dv / 2)
+    (M + h/2 D + h^2/4 K) dv = -h (dV/dq + D v + c),    q' = q + h (v + dv / 2)
 
 The chambers fill as `mjx_softarm.pneumatics` has it, in half steps: the pressure of a step is that of its
 middle, and K holds the stiffness of the gas.
@@ -28,7 +29,7 @@ from jax import Array
 
 from mjx_softarm import control, pneumatics
 from mjx_softarm._support.mjx import mjx
-from mjx_softarm._support.small_matrices import block_diagonal, eliminate, product
+from mjx_softarm._support.small_matrices import block_diagonal, product, solve
 from mjx_softarm.mechanics.kinematics import Frames, Kinematics
 from mjx_softarm.mechanics.settle import Result
 from mjx_softarm.mechanics.statics import ArmParams, Tendons, all_tendons, statics_of
@@ -46,18 +47,19 @@ class MotionResult(Result):
 
 
 class Motion(NamedTuple):
-    """State of a moving arm between two instants; at rest, integral, pressure and command are equal."""
+    """State of a moving arm between two instants."""
 
     q: Array  # (nv,) [m, rad, rad]
     velocity: Array  # (nv,) [m/s, rad/s, rad/s]
-    integral_kpa: Array  # (n_chambers,) integral part of the sensor-space law
+    law: control.LawState  # (n_chambers,) each
     pressure_kpa: Array  # (n_chambers,) in the chambers
     command_kpa: Array  # (n_chambers,) that the valves act on
 
     @classmethod
-    def at_rest(cls, q: Array, pressure_kpa: Array) -> Motion:
-        """Return the state of an arm at rest at joint coordinates (nv,) and pressures (n_chambers,)."""
-        return cls(q, jnp.zeros_like(q), pressure_kpa, pressure_kpa, pressure_kpa)
+    def at_rest(cls, q: Array, pressure_kpa: Array, spring_m: Array) -> Motion:
+        """Return the state of an arm at rest at joint coordinates (nv,), with its pressures and springs."""
+        law = control.LawState.at_rest(pressure_kpa, spring_m)
+        return cls(q, jnp.zeros_like(q), law, pressure_kpa, pressure_kpa)
 
 
 class Moved(NamedTuple):
@@ -65,9 +67,9 @@ class Moved(NamedTuple):
 
     pressure_kpa: Array  # (n_chambers,) in the chambers
     spring_m: Array  # (n_chambers,) spring lengths
-    last_spring_m: Array  # (n_chambers,) spring lengths one control period before
+    last_spring_m: Array  # (n_chambers,) spring lengths some control periods before
     tip_position_m: Array  # (3,)
-    last_tip_position_m: Array  # (3,) one control period before
+    last_tip_position_m: Array  # (3,) as long before
     tip_rotation: Array  # (3, 3)
     result: Array  # () int32, a `MotionResult`
 
@@ -132,6 +134,7 @@ def advance(
     duration_s: float,
     period_s: float,
     step_s: float,
+    n_before: int = 1,
 ) -> tuple[Motion, Moved]:
     """Run the arm for a while under the law.
 
@@ -143,27 +146,26 @@ def advance(
         duration_s: a whole number of control periods.
         period_s: control period of the model's specification.
         step_s: time step at most; a control period has a whole number of them.
+        n_before: control periods before the end at which the last lengths and positions are told.
 
     Returns:
         State and observables at the end.
     """
     n_steps = math.ceil(period_s / step_s - 1e-9)
 
-    def tick(carry: tuple[Motion, Array, Array], _):
-        motion, *_ = carry
+    def tick(motion: Motion, _):
         now = _at(arm, motion.q)
         told = now.spring_m, now.frames.plate_position[-1]
-        command, integral = control.pressures(reference_m, now.spring_m, motion.integral_kpa, gains, period_s)
-        motion = motion._replace(integral_kpa=integral)
+        command, law = control.pressures(reference_m, now.spring_m, motion.law, gains, period_s)
+        motion = motion._replace(law=law)
         for k in range(n_steps):
-            now = _at(arm, motion.q) if k else now
-            motion = _step(arm, motion, now, command, k, period_s / n_steps)
-        return (motion._replace(command_kpa=command), *told), None
+            motion = _step(arm, motion, command, k, period_s / n_steps)
+        return motion._replace(command_kpa=command), told
 
     with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
-        nothing = jnp.zeros_like(reference_m), jnp.zeros(3, motion.q.dtype)
         n_ticks = round(duration_s / period_s)
-        (end, *last), _ = jax.lax.scan(tick, (motion, *nothing), None, length=n_ticks)
+        tick = jax.checkpoint(tick, prevent_cse=False)  # a gradient computes each tick again
+        end, told = jax.lax.scan(tick, motion, None, length=n_ticks)
         now = _at(arm, end.q)
     finite = jnp.all(jnp.isfinite(end.q)) & jnp.all(jnp.isfinite(end.velocity))
     finite &= jnp.all(jnp.isfinite(end.pressure_kpa))
@@ -171,12 +173,13 @@ def advance(
         jnp.all(now.spring_m < LONGEST_M), MotionResult.FINITE.value, MotionResult.DIVERGED.value
     )
     result = jnp.where(finite, result, MotionResult.NOT_FINITE.value)
+    last_spring_m, last_tip_m = (each[max(n_ticks - n_before, 0)] for each in told)
     return end, Moved(
         pressure_kpa=end.pressure_kpa,
         spring_m=now.spring_m,
-        last_spring_m=last[0],
+        last_spring_m=last_spring_m,
         tip_position_m=now.frames.plate_position[-1],
-        last_tip_position_m=last[1],
+        last_tip_position_m=last_tip_m,
         tip_rotation=now.frames.plate_rotation[-1],
         result=result.astype(jnp.int32),
     )
@@ -187,13 +190,16 @@ def _at(arm: MovingArm, q: Array) -> _Instant:
     return _Instant(frames, all_tendons(frames, arm.params))
 
 
-def _step(arm: MovingArm, motion: Motion, now: _Instant, command_kpa: Array, k: int, h: float) -> Motion:
+def _step(arm: MovingArm, motion: Motion, command_kpa: Array, k: int, h: float) -> Motion:
     """Take the k-th time step of a control period, in which the law has commanded pressures (n_chambers,)."""
     v, params = motion.velocity, arm.params
+    half_way = 0.5 * h * v  # (nv,)
+    middle = motion._replace(q=motion.q + half_way)
+    now = _at(arm, middle.q)
     jacobian = now.tendons.jacobian  # (2, n_sections, 3, n)
 
     def volume_m3(moved: Array) -> Array:
-        """Return the chambers' volumes (n_chambers,) after joint displacements (nv,)."""
+        """Return the chambers' volumes (n_chambers,) at joint displacements (nv,) from the middle."""
         along = product(jacobian[0], moved.reshape(params.n_sections, -1, 1)).reshape(-1)
         area = params.area / N_PER_KPA_M2, params.area_slope / N_PER_KPA_M2
         return pneumatics.volume_m3(now.chamber_m + along, *area, params.section_length_m)
@@ -205,14 +211,14 @@ def _step(arm: MovingArm, motion: Motion, now: _Instant, command_kpa: Array, k: 
         return pneumatics.regulated(gas_m3, volume, command, 0.5 * h)
 
     # Pressures of the step's middle
-    gas_m3 = pneumatics.gas_at(motion.pressure_kpa, volume_m3(0.0 * v))
-    middle_m3 = volume_m3(0.5 * h * v)
+    gas_m3 = pneumatics.gas_at(motion.pressure_kpa, volume_m3(-half_way))
+    middle_m3 = volume_m3(0.0 * v)
     gas_m3 = fill(gas_m3, middle_m3, 2 * k)
     pressure_kpa = pneumatics.pressure_of(gas_m3, middle_m3)
 
-    # Forces and their derivatives at its start
-    mass, bias = _inertia(arm.model, now.frames, params, motion)
-    potential = statics_of(now.tendons, now.frames, motion.q, pressure_kpa, params)
+    # Forces and their derivatives there
+    mass, bias = _inertia(arm.model, now.frames, params, middle)
+    potential = statics_of(now.tendons, now.frames, middle.q, pressure_kpa, params)
     damping, stiffness = _dampers(arm, jacobian), potential.hessian.dense()
     gas = (
         pneumatics.ATMOSPHERE_KPA / N_PER_KPA_M2 * gas_m3 * (potential.area / middle_m3) ** 2
@@ -221,13 +227,13 @@ def _step(arm: MovingArm, motion: Motion, now: _Instant, command_kpa: Array, k: 
     stiffness_of_gas = block_diagonal(product(jnp.swapaxes(jacobian[0], 1, 2), pushed))
 
     # The linearised midpoint rule
-    force = potential.gradient + bias + damping @ v + 0.5 * h * (stiffness @ v)
+    force = potential.gradient + bias + damping @ v
     matrix = mass + 0.5 * h * damping + 0.25 * h**2 * (stiffness + stiffness_of_gas)
-    dv = eliminate(matrix, -h * force[:, None])[:, 0]
+    dv = solve(matrix, -h * force[:, None])[:, 0]
     dq = h * (v + 0.5 * dv)
 
     # Pressures of its end
-    end_m3 = volume_m3(dq)
+    end_m3 = volume_m3(dq - half_way)
     gas_m3 = fill(gas_m3, end_m3, 2 * k + 1)
     return motion._replace(
         q=motion.q + dq, velocity=v + dv, pressure_kpa=pneumatics.pressure_of(gas_m3, end_m3)

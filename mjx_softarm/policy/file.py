@@ -5,7 +5,8 @@ networks and the workspace float32.
 
     schema_version       () int
     spec_json            ()           the arm trained for, as `ArmSpec.to_dict` gives it
-    obs_layout           (18,) text   names of the observation's entries, `OBS_LAYOUT`
+    obs_layout           (O,) text    names of the observation's entries: `OBS_LAYOUT`, and in motion
+                                      `motion_layout`
     action_layout        (n,) text    names of the action's entries, `action_layout`
     actor.n_layers       () int
     actor.<k>.weight     (in, out)    layer k = 0, 1, ...; ReLU after each but the last,
@@ -17,6 +18,7 @@ networks and the workspace float32.
     gains.<field>        () or (n,)   `Gains`: the sensor-space law and the pressure limits
     rate_hz              ()           of the sensor-space law
     n_actions            () int       towards each goal, as in the evaluation of the run
+    action_s             ()           time between two actions in motion; 0: the policy acts on arms at rest
     tolerance_m          ()           greatest error of a spring that counts as on its reference
     workspace            (m, 6)       poses [mm, deg] that the arm reaches, spread over its workspace
     estimator.<field>                 `PoseEstimator`: spring lengths and payload to the simulated pose
@@ -46,7 +48,7 @@ from mjx_softarm._support.archive import Entries, SealedFileError, entries_of
 from mjx_softarm._support.mlp import Layer
 from mjx_softarm.control import TOLERANCE_M, Gains
 from mjx_softarm.mdp.actions import N_ACTIONS, ActionMap
-from mjx_softarm.mdp.observation import OBS_LAYOUT, OBS_SIZE, ObsScale
+from mjx_softarm.mdp.observation import OBS_LAYOUT, ObsScale, motion_layout
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.sensing.estimator import PoseEstimator, SpringModel, take_estimator, take_spring_model
 from mjx_softarm.sensing.load import LoadEstimator, take_load_estimator
@@ -54,7 +56,7 @@ from mjx_softarm.sensing.s2r import S2R, take_s2r
 from mjx_softarm.sensing.sensors import Sensor, SensorFault
 from mjx_softarm.spec import ArmSpec, SpecError
 
-SCHEMA_VERSION = 4
+SCHEMA_VERSION = 5
 
 KIND = "policy"
 SHIPPED = Path(__file__).parent / "shipped/paper.npz"  # for the paper's arm; its card is beside it
@@ -79,6 +81,12 @@ class Policy:
     provenance: Mapping[str, Any]
     tolerance_m: float = TOLERANCE_M
     n_actions: int = N_ACTIONS
+    action_s: float = 0.0
+
+    @property
+    def observes_motion(self) -> bool:
+        """Whether the policy observes `observe_motion` besides pose and goal."""
+        return len(self.layers[0][0]) > len(OBS_LAYOUT)
 
     @property
     def sensor(self) -> Sensor:
@@ -109,6 +117,7 @@ def policy_from_actor(
     provenance: Mapping[str, Any],
     tolerance_m: float = TOLERANCE_M,
     n_actions: int = N_ACTIONS,
+    action_s: float = 0.0,
 ) -> Policy:
     """Make the policy of an actor that was trained on an arm.
 
@@ -122,6 +131,7 @@ def policy_from_actor(
         provenance: how the policy came about, in types that JSON has.
         tolerance_m: greatest error of a spring that counts as on its reference; the environment's.
         n_actions: towards each goal; the evaluation's.
+        action_s: time between two actions in motion; 0 for a policy that was trained on arms at rest.
 
     Raises:
         ValueError: the parameters are not those of an actor for this arm; as a SealedFileError where an
@@ -139,6 +149,7 @@ def policy_from_actor(
         provenance=provenance,
         tolerance_m=tolerance_m,
         n_actions=n_actions,
+        action_s=action_s,
     )
     return _unpack(file_entries(policy), "policy")
 
@@ -182,11 +193,12 @@ def file_entries(policy: Policy) -> dict[str, np.ndarray]:
     entries: dict[str, Any] = {
         "schema_version": SCHEMA_VERSION,
         "spec_json": json.dumps(policy.spec.to_dict()),
-        "obs_layout": OBS_LAYOUT,
+        "obs_layout": _obs_layout(policy.spec, policy.observes_motion),
         "action_layout": action_layout(policy.spec),
         "rate_hz": policy.rate_hz,
         "tolerance_m": policy.tolerance_m,
         "n_actions": policy.n_actions,
+        "action_s": policy.action_s,
         "s2r_kind": "none" if policy.s2r is None else "mlp",
         "workspace": policy.workspace,
         "provenance_json": json.dumps(policy.provenance),
@@ -203,6 +215,10 @@ def file_entries(policy: Policy) -> dict[str, np.ndarray]:
     return {name: np.asarray(value) for name, value in entries.items()}
 
 
+def _obs_layout(spec: ArmSpec, observes_motion: bool) -> tuple[str, ...]:
+    return OBS_LAYOUT + (motion_layout(spec.n_chambers) if observes_motion else ())
+
+
 def _unpack(arrays: Mapping[str, np.ndarray], source: str) -> Policy:
     entries = Entries(arrays, source)
     version = entries.take("schema_version", np.integer, ())
@@ -216,11 +232,11 @@ def _unpack(arrays: Mapping[str, np.ndarray], source: str) -> Policy:
     except SpecError as error:
         raise SealedFileError(str(error)) from error
     n = spec.n_chambers
-    obs_layout = entries.take("obs_layout", np.str_, (OBS_SIZE,))
+    obs_layout = entries.take("obs_layout", np.str_, (None,))
     names = entries.take("action_layout", np.str_, (n,))
     s2r_kind = entries.take("s2r_kind", np.str_, ())
     policy = Policy(
-        layers=entries.layers("actor", OBS_SIZE, n),
+        layers=entries.layers("actor", len(obs_layout), n),
         obs_scale=entries.group("obs_scale", ObsScale, (6,)),
         reward=entries.group("reward", RewardConfig, ()),
         actions=ActionMap(
@@ -238,12 +254,14 @@ def _unpack(arrays: Mapping[str, np.ndarray], source: str) -> Policy:
         provenance=entries.table("provenance_json"),
         tolerance_m=entries.take("tolerance_m", np.float64, ()),
         n_actions=entries.take("n_actions", np.integer, ()),
+        action_s=entries.take("action_s", np.float64, ()),
     )
+    layout = _obs_layout(spec, policy.observes_motion)
     limits = policy.sensor.lengths(np.stack(policy.actions[1:]))  # (2, n)
     readable = (limits.fault == SensorFault.OK.value) & (limits.length_m[0] < limits.length_m[1])
     low_kpa, high_kpa = policy.gains.pressure_min_kpa, policy.gains.pressure_max_kpa
     for name, holds, expected in (
-        ("obs_layout", obs_layout == np.array(OBS_LAYOUT), list(OBS_LAYOUT)),
+        ("obs_layout", np.array_equal(obs_layout, layout), list(layout)),
         ("action_layout", names == np.array(action_layout(spec)), list(action_layout(spec))),
         ("obs_scale.scale", policy.obs_scale.scale > 0.0, "numbers > 0"),
         ("action.low", readable, "readings that have a length, less than that of action.high"),
@@ -251,6 +269,7 @@ def _unpack(arrays: Mapping[str, np.ndarray], source: str) -> Policy:
         ("rate_hz", policy.rate_hz > 0.0, "a number > 0"),
         ("tolerance_m", policy.tolerance_m > 0.0, "a number > 0"),
         ("n_actions", policy.n_actions > 0, "a whole number > 0"),
+        ("action_s", 0.0 <= policy.action_s < np.inf, "a finite number >= 0"),
         ("s2r_kind", s2r_kind in ("mlp", "none"), "mlp or none"),
     ):
         if not np.all(holds):

@@ -47,14 +47,20 @@ def tip_pose(policy: Policy, spring_m: Array, load_kg: Array | float) -> tuple[A
 
 
 def actor_output(policy: Policy, observation: Array) -> Array:
-    """Return the action (..., n) in [-1, 1] of observations (..., 18)."""
+    """Return the action (..., n) in [-1, 1] of observations (..., O)."""
     return array_namespace(observation).tanh(mlp(policy.layers, observation))
 
 
-def action_towards(policy: Policy, pose: Array, goal: Array) -> Array:
-    """Return the action (..., n) in [-1, 1] from a pose towards a goal (..., 6) [mm, deg], all float32."""
+def action_towards(policy: Policy, pose: Array, goal: Array, sensed: Array | None = None) -> Array:
+    """Return the action (..., n) in [-1, 1] from a pose towards a goal (..., 6) [mm, deg], all float32.
+
+    `sensed` (..., k) is `observe_motion`, where the policy observes it.
+    """
     scale = ObsScale(*(np.asarray(value, np.float32) for value in policy.obs_scale))
-    return actor_output(policy, observe(pose, goal, scale, policy.reward))
+    observation = observe(pose, goal, scale, policy.reward)
+    if sensed is not None:
+        observation = array_namespace(pose).concat([observation, sensed], axis=-1)
+    return actor_output(policy, observation)
 
 
 class PolicyRunner:
@@ -66,12 +72,13 @@ class PolicyRunner:
     def __init__(self, policy: Policy):
         self.policy = policy
 
-    def act(self, pose: ArrayLike, goal: ArrayLike) -> Reference:
+    def act(self, pose: ArrayLike, goal: ArrayLike, sensed: ArrayLike | None = None) -> Reference:
         """Return the spring references that bring the tip from a pose towards a goal.
 
         Args:
             pose (..., 6) [mm, deg]: of the tip; see `mjx_softarm.sensing.pose`.
             goal (..., 6) [mm, deg]: target of the tip; the leading axes broadcast against the pose's.
+            sensed (..., k): `mjx_softarm.mdp.observation.observe_motion`, for a policy that observes it.
 
         Returns:
             Readings (..., n) and lengths (..., n) [m], both within the policy's limits.
@@ -80,18 +87,24 @@ class PolicyRunner:
             ValueError: as `action` does.
         """
         actions = self.policy.actions
-        readings = actions.readings(self.action(pose, goal))  # (..., n)
+        readings = actions.readings(self.action(pose, goal, sensed))  # (..., n)
         return Reference(readings, actions.sensor.lengths(readings).length_m)
 
-    def action(self, pose: ArrayLike, goal: ArrayLike) -> np.ndarray:
+    def action(self, pose: ArrayLike, goal: ArrayLike, sensed: ArrayLike | None = None) -> np.ndarray:
         """Return the action (..., n) in [-1, 1], float32, that `act` maps to readings; arguments as there.
 
         Raises:
             ValueError: pose or goal has the wrong shape or is not finite, or the actor overflows; what it
-                asks for would be springs without a length.
+                asks for would be springs without a length. `sensed` is missing, or is not observed.
         """
         pose, goal = np.broadcast_arrays(_six("pose", pose), _six("goal", goal))
-        action = action_towards(self.policy, pose, goal)
+        if self.policy.observes_motion != (sensed is not None):
+            came, expected = "an array", "None: the policy does not observe motion"
+            if sensed is None:
+                came, expected = "None", "`observe_motion` of the arm: the policy observes motion"
+            raise ValueError(f"sensed: got {came}, expected {expected}")
+        sensed = None if sensed is None else np.asarray(sensed, np.float32)
+        action = action_towards(self.policy, pose, goal, sensed)
         if not np.isfinite(action).all():
             raise ValueError("action: got nan, expected finite numbers; the actor overflows")
         return action

@@ -1,5 +1,7 @@
 """The control loop on a linear arm whose every answer is known: what it does when all is well."""
 
+import dataclasses
+
 import numpy as np
 
 from calib.read.logs import read_log
@@ -8,8 +10,10 @@ from mjx_softarm.deploy.arm_io import Capture
 from mjx_softarm.deploy.controller import Controller, start
 from mjx_softarm.deploy.ending import Ending
 from mjx_softarm.deploy.loop import step, with_goal
+from mjx_softarm.deploy.session import LEAD_S, on_the_way, trace
 from mjx_softarm.logs.schema import write_log
 from mjx_softarm.mdp.actions import N_ACTIONS
+from mjx_softarm.mdp.observation import OBS_SIZE, motion_layout
 from mjx_softarm.sensing.estimator import estimate
 from tests.linear_arm import (
     CONTROLLER,
@@ -18,6 +22,7 @@ from tests.linear_arm import (
     NOISE_M,
     POLICY,
     SENSOR,
+    SPEC,
     SPRINGS_M,
     LinearArm,
     exact_plan,
@@ -43,16 +48,58 @@ def test_reaches_goals_and_vents():
 def test_acts_at_once_and_then_at_rest():
     arm, asked = LinearArm(), []
 
-    def plan(pose, goal, spring_m):
+    def plan(pose, goal, spring_m, sensed):
         asked.append((arm.tick, np.abs(arm.command_kpa - arm.actual_kpa).max()))
         np.testing.assert_allclose(pose, estimate(POLICY.estimator, spring_m, 0.0), atol=1e-3)
         np.testing.assert_allclose(spring_m, arm.spring_m, atol=5 * NOISE_M)
-        return exact_plan(pose, goal, spring_m)
+        assert sensed is None
+        return exact_plan(pose, goal, spring_m, sensed)
 
     go(arm, controller=Controller.of(POLICY, plan))
     assert len(asked) == N_ACTIONS * len(GOALS) and asked[0][0] == 0
-    assert max(lag_kpa for _, lag_kpa in asked) < 0.2  # the arm has followed the command
+    assert max(lag_kpa for _, lag_kpa in asked) < 0.3  # followed, but for what the readings' noise makes
     assert np.diff([tick for tick, _ in asked]).min() >= CONTROLLER.window or len(GOALS) > 1
+
+
+def test_a_policy_of_motion_acts_in_time_and_is_told_of_motion():
+    arm, asked = LinearArm(), []
+    wide = (np.zeros((OBS_SIZE + len(motion_layout(9)), 9), np.float32), np.zeros(9, np.float32))
+    policy = dataclasses.replace(POLICY, layers=(wide,), action_s=0.3)
+
+    def plan(pose, goal, spring_m, sensed):
+        asked.append((arm.tick, sensed))
+        return exact_plan(pose, goal, spring_m, sensed)
+
+    run = go(arm, goals=GOALS[:1], controller=Controller.of(policy, plan))
+    assert len(run.arrivals) == 1 and not run.events
+    np.testing.assert_array_equal([tick for tick, _ in asked], [0, 15, 30, 45])
+    first, second = asked[0][1], asked[1][1]
+    np.testing.assert_array_equal(first[9:21], 0.0)  # no rate of the springs, nor of the tip
+    middle = 0.5 * (SPEC.springs.length_min_m + SPEC.springs.length_max_m)
+    half = 0.5 * (SPEC.springs.length_max_m - SPEC.springs.length_min_m)
+    rows = read_m(run.log)
+    np.testing.assert_allclose(middle + half * second[:9], rows[15], atol=1e-6)
+    np.testing.assert_allclose(second[9:18] * 0.1 * 0.1, rows[15] - rows[10], atol=1e-6)  # 100 mm/s, 0.1 s
+    asked_m = POLICY.actions.lengths(second[-9:])
+    np.testing.assert_allclose(asked_m, SPRINGS_M[0], atol=1e-5)
+
+
+def test_a_moving_goal_is_followed_and_its_end_is_an_arrival():
+    arm, goals = LinearArm(), np.array([GOALS[0], GOALS[1]])
+
+    def plan(pose, goal, spring_m, sensed):  # springs in between for goals in between
+        share = np.linalg.norm(goal - goals[0]) / np.linalg.norm(goals[1] - goals[0])
+        return SPRINGS_M[0] + share * (SPRINGS_M[1] - SPRINGS_M[0])
+
+    run = trace(arm, Controller.of(POLICY, plan), goals, way_s=10.0)
+    assert run.status == 0 and [arrival.goal.tolist() for arrival in run.arrivals] == goals.tolist()
+    goal = run.log.goal[run.way]
+    assert len(goal) in (500, 501)
+    np.testing.assert_allclose(goal[250], on_the_way(goals, 0.5), atol=1e-6)
+    ahead = on_the_way(goals, 0.5 + LEAD_S / 10.0)
+    share = np.linalg.norm(ahead - goals[0]) / np.linalg.norm(goals[1] - goals[0])
+    expected_m = SPRINGS_M[0] + share * (SPRINGS_M[1] - SPRINGS_M[0])
+    np.testing.assert_allclose(run.log.reference_m[run.way][250], expected_m, atol=1e-3)  # a tick apart
 
 
 def test_policy_itself_plans_by_default():
@@ -64,12 +111,12 @@ def test_policy_itself_plans_by_default():
 
 def test_state_is_not_changed_in_place():
     state, _ = with_goal(CONTROLLER, start(CONTROLLER), GOALS[0])
-    arrays = [np.array(value, copy=True) for value in (state.integral_kpa, state.n_lost, state.springs_m)]
+    arrays = [np.array(value, copy=True) for value in (state.law.integral_kpa, state.n_lost, state.springs_m)]
     readings = LinearArm().read_sensors()
     first = step(CONTROLLER, state, readings, False)[0]
     second = step(CONTROLLER, state, readings, False)[0]
     np.testing.assert_array_equal(first.pressure_kpa, second.pressure_kpa)
-    for before, after in zip(arrays, (state.integral_kpa, state.n_lost, state.springs_m), strict=True):
+    for before, after in zip(arrays, (state.law.integral_kpa, state.n_lost, state.springs_m), strict=True):
         np.testing.assert_array_equal(before, after)
 
 

@@ -29,7 +29,7 @@ def loaded_policy():
     )
 
 
-def plan_unloaded(pose, goal, spring_m):
+def plan_unloaded(pose, goal, spring_m, sensed):
     """Springs of the straight arm at the goal's height, without a payload."""
     return np.full(N, -1e-3 * goal[2] / 3)
 
@@ -90,7 +90,7 @@ def test_goal_is_shifted_by_what_the_payload_bends():
 def test_shift_begins_anew_with_each_goal_and_ends_somewhere():
     asked = []
 
-    def plan(pose, goal, spring_m):
+    def plan(pose, goal, spring_m, sensed):
         asked.append(goal.copy())
         return np.full(N, REST_M)  # never there
 
@@ -103,7 +103,7 @@ def test_shift_begins_anew_with_each_goal_and_ends_somewhere():
 def test_saturated_chambers_shift_by_where_their_springs_are():
     asked = []
 
-    def plan(pose, goal, spring_m):
+    def plan(pose, goal, spring_m, sensed):
         asked.append(goal.copy())
         return np.full(N, REST_M + 0.06)  # beyond what 20 kPa make
 

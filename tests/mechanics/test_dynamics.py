@@ -1,4 +1,4 @@
-"""The arm in motion against C MuJoCo at 1 ms, whose chambers are filled by the twin's pneumatics."""
+"""The arm in motion against C MuJoCo at 0.25 ms, whose chambers are filled by the twin's pneumatics."""
 
 from typing import NamedTuple
 
@@ -15,14 +15,14 @@ from mjx_softarm.mechanics.dynamics import Motion, MotionResult, MovingArm, adva
 from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.mjcf import build_model, chamber_lengths, spring_lengths
 from mjx_softarm.mechanics.settle import settle_pressures
-from mjx_softarm.mechanics.statics import ArmParams
+from mjx_softarm.mechanics.statics import ArmParams, all_tendons
 from mjx_softarm.twin.pneumatics import Pneumatics
 
 SPEC = ArmSpec.default()
 SHORT_ARM = SPEC.replace(structure={"n_sections": 1, "links_per_section": 2})
 GAINS, PERIOD_S = control.Gains.from_spec(SPEC), 0.02
-TRUE_STEP_S = 1e-3
-N_ARMS, N_HOLDS, HOLD_TICKS = 16, 4, 25  # a new reference each half second, for 2 s
+TRUE_STEP_S = 2.5e-4  # at 1 ms MuJoCo itself is 0.4 mm (95 %) from this
+N_ARMS, N_HOLDS, HOLD_TICKS = 8, 4, 25  # a new reference each half second, for 2 s
 
 
 class Start(NamedTuple):
@@ -60,9 +60,9 @@ def true_tips(spec, q, pressure_kpa, reference_m):
     air.command(pressure_kpa)
     for _ in range(2000):  # held until the chambers are full
         air.step(chamber_lengths(data))
-    integral, tips = pressure_kpa, []
+    law, tips = control.LawState.at_rest(pressure_kpa, spring_lengths(data)), []
     for reference in reference_m:
-        command, integral = control.pressures(reference, spring_lengths(data), integral, GAINS, PERIOD_S)
+        command, law = control.pressures(reference, spring_lengths(data), law, GAINS, PERIOD_S)
         air.command(command)
         for _ in range(round(PERIOD_S / TRUE_STEP_S)):
             data.ctrl[:] = air.step(chamber_lengths(data))
@@ -77,17 +77,19 @@ def mover(spec):
     model, params = mjx.put_model(build_model(spec)), jax.tree.map(jnp.asarray, ArmParams.from_spec(spec))
 
     def move(q, pressure_kpa, reference_m, delay_s):
-        arm = MovingArm.of(model, chain_kinematics(params), params, delay_s=delay_s)
+        kinematics = chain_kinematics(params)
+        arm = MovingArm.of(model, kinematics, params, delay_s=delay_s)
+        start = Motion.at_rest(q, pressure_kpa, all_tendons(kinematics(q), params).length[1])
 
         def tick(motion, reference):
             return advance(arm, motion, reference, GAINS, PERIOD_S, PERIOD_S, PERIOD_S)
 
-        return jax.lax.scan(tick, Motion.at_rest(q, pressure_kpa), reference_m)[1]
+        return jax.lax.scan(tick, start, reference_m)[1]
 
     return xla.jit(jax.vmap(move, in_axes=(0, 0, 0, None)))
 
 
-def test_transients_are_those_of_c_mujoco_at_1_ms():
+def test_transients_are_those_of_c_mujoco():
     """Within 1 mm at 95 % over 2 s, with a random reference each half second."""
     start, asked = starts(SPEC, N_ARMS), references(SPEC, N_ARMS)
     moved = mover(SPEC)(*start, np.float32(asked), pneumatics.VALVE_S)

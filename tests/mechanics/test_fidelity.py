@@ -30,7 +30,7 @@ POSITION_MM, ANGLE_DEG = 0.1, 0.1
 
 # Soonest at rest: one second a step, every damper worth four seconds of its spring, and strong gains.
 FAST_STEP_S, FAST_DAMPING_S = 1.0, 4.0
-FAST_GAINS = GAINS._replace(kp_kpa_per_m=600.0, ki_kpa_per_ms=200.0)
+FAST_GAINS = GAINS._replace(kp_kpa_per_m=600.0, ki_kpa_per_ms=200.0, kd_kpa_s_per_m=0.0, reference_s=0.0)
 
 
 class Rest(NamedTuple):
@@ -63,13 +63,12 @@ def stepped_to_rest(model, reference_m, gains, steps_per_tick=1, tolerance=1e-11
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     period_s = steps_per_tick * model.opt.timestep
-    integral = np.zeros(9)
+    law = control.LawState.at_rest(np.zeros(9), spring_lengths(data))
     for _ in range(max_ticks):
-        before = integral
-        spring = spring_lengths(data)
-        data.ctrl[:], integral = control.pressures(reference_m, spring, integral, gains, period_s)
+        before = law.integral_kpa
+        data.ctrl[:], law = control.pressures(reference_m, spring_lengths(data), law, gains, period_s)
         mujoco.mj_step(model, data, steps_per_tick)
-        drift = np.abs(integral - before).max() / period_s
+        drift = np.abs(law.integral_kpa - before).max() / period_s
         # An acceleration settles long before a velocity; both are asked for.
         if max(np.abs(data.qvel).max(), np.abs(data.qacc).max(), 1e-3 * drift) < tolerance:
             break
@@ -158,15 +157,14 @@ def test_stepped_mjx_comes_to_rest_where_c_mujoco_does():
 
     def rest_of(reference):
         def tick(carry, _):
-            data, integral = carry
-            pressure, integral = control.pressures(
-                reference, spring_lengths(data), integral, FAST_GAINS, FAST_STEP_S
-            )
-            return (mjx.step(model, data.replace(ctrl=pressure)), integral), None
+            data, law = carry
+            pressure, law = control.pressures(reference, spring_lengths(data), law, FAST_GAINS, FAST_STEP_S)
+            return (mjx.step(model, data.replace(ctrl=pressure)), law), None
 
         start = mjx.make_data(model).replace(ten_length=jnp.full(18, SPEC.geometry.section_length_m))
-        (data, integral), _ = jax.lax.scan(tick, (start, jnp.zeros(9)), None, length=n_ticks)
-        return data.qpos, data.qvel, integral
+        law = control.LawState.at_rest(jnp.zeros(9), spring_lengths(start))
+        (data, law), _ = jax.lax.scan(tick, (start, law), None, length=n_ticks)
+        return data.qpos, data.qvel, law.integral_kpa
 
     q, velocity, pressure = xla.jit(jax.vmap(rest_of))(np.float32(references(N_COMMANDS, seed=0)))
     assert np.abs(velocity).max() < 1e-6

@@ -6,7 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mjx_softarm import ArmSpec
-from mjx_softarm.control import Gains, pressures
+from mjx_softarm.control import Gains, LawState, pressures
 from mjx_softarm.deploy.arms import ArmError, open_arm
 from mjx_softarm.mechanics.mjcf import chamber_lengths, spring_lengths
 from mjx_softarm.mechanics.workspace import settle_many
@@ -41,13 +41,13 @@ def hold_pressures(arm, pressure_kpa, duration_s):
         arm.write_pressures(pressure_kpa)
 
 
-def hold_springs(arm, reference_m, integral_kpa, gains, duration_s, params):
-    """Run the sensor-space law; returns its integral."""
+def hold_springs(arm, reference_m, pressure_kpa, gains, duration_s, sensor):
+    """Run the sensor-space law on an arm at rest at pressures (n,)."""
+    law = LawState.at_rest(pressure_kpa, sensor.lengths(arm.read_sensors()).length_m)
     for _ in range(round(50 * duration_s)):
-        length_m = params.lengths(arm.read_sensors()).length_m
-        command, integral_kpa = pressures(reference_m, length_m, integral_kpa, gains, 0.02)
+        length_m = sensor.lengths(arm.read_sensors()).length_m
+        command, law = pressures(reference_m, length_m, law, gains, 0.02)
         arm.write_pressures(command)
-    return integral_kpa
 
 
 def test_ideal_twin_rests_where_settle_says(spec):

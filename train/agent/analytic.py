@@ -1,17 +1,21 @@
-"""Learning through the equilibrium: the simulator's own gradient teaches the policy.
+"""Learning through the simulation: its own gradient teaches the policy.
 
-The pose at rest is a differentiable function of the spring references (`mjx_softarm.mechanics.implicit`), so
-the policy's parameters descend the error of the pose itself: no critic, no replay, no exploration. With
-a = pi(s) the action in state s, e(a) the scaled pose error after it, theta the tolerance of the goal and
-d_t(a) the distance of spring t from its reference [mm],
+The pose at rest is a differentiable function of the spring references (`mjx_softarm.mechanics.implicit`), and
+so is the pose in motion, through all time steps. So the policy's parameters descend the error of the pose
+itself: no critic, no replay, no exploration. With a = pi(s) the action in state s, e(a) the scaled pose error
+after it, theta the tolerance of the goal and d_t(a) the distance of spring t from its reference [mm],
 
     loss = E[ ||e(a)|| / theta + c sum_t d_t(a) ].
 
 A chamber at a pressure limit does not follow its reference, so the first term has no gradient with respect
-to it; the second pulls the reference back to what the chamber can reach. The law holds all other springs on
-their references. The learner has arms of its own that go on from where its actions led them, so it sees the
-states that the policy leads to, disturbances of the randomisation included. A part of them begins anew at
-each step. An environment's cost of clearance, where it has one, adds to the loss.
+to it; the second pulls the reference back to what the chamber can reach. At rest the law holds all other
+springs on their references; in motion, where it does not yet, springs of chambers at a limit count alone.
+There the loss is that after the last of the next `horizon` actions, and a fifth of the mean over all of them:
+the tip shall be there, and rather soon than late.
+
+The learner has arms of its own that go on from where its actions led them, so it sees the states that the
+policy leads to, disturbances of the randomisation included. A part of them begins anew at each step. An
+environment's cost of clearance, where it has one, adds to the loss.
 
 Neither learning rate nor average depends on the length of the run, so that every policy on the way is as good
 as that of a shorter run: the rate falls as 1 / (1 + t / t_half) over the steps t, and the policy is an
@@ -38,15 +42,18 @@ from mjx_softarm._support.mjx import State
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.env.vector import VectorEnv, over_arms
 from mjx_softarm.mdp import rewards
-from train.agent.learner import Sample
-from train.agent.networks import Actor, mode
+from train.agent.learner import Sample, check_same_shapes
+from train.agent.networks import Actor, mode, widened
 
 Params = Any  # a flax parameter tree
+EARLY = (
+    0.2  # weight of the mean loss of all actions that a gradient step looks ahead, beside that of the last
+)
 
 
 @dataclass(frozen=True)
 class AnalyticConfig:
-    """Hyperparameters of learning through the equilibrium. Raises ValueError naming a bad field."""
+    """Hyperparameters of learning through the simulation. Raises ValueError naming a bad field."""
 
     # See TQCConfig.
     NUMBERS = ("learning_rate", "learning_rate_half", "max_gradient_norm", "mean_share", "new_share")
@@ -59,6 +66,7 @@ class AnalyticConfig:
     mean_share: float = 0.1  # share of the gradient steps so far over which the mean policy averages
     new_share: float = 0.33  # share of the arms that get a new start and goal after each step
     saturation_cost_per_mm: float = 0.1  # c of the loss
+    horizon: int = 1  # actions that a gradient step looks ahead; more than one for arms in motion
 
     def __post_init__(self) -> None:
         required = {
@@ -68,6 +76,7 @@ class AnalyticConfig:
             "mean_share": (0.0 <= self.mean_share <= 1.0, "a number in [0, 1]"),
             "new_share": (0.0 <= self.new_share <= 1.0, "a number in [0, 1]"),
             "saturation_cost_per_mm": (self.saturation_cost_per_mm >= 0.0, "a number >= 0"),
+            "horizon": (self.horizon >= 1, "a whole number >= 1"),
         }
         for name, (holds, expected) in required.items():
             if not holds:
@@ -84,12 +93,20 @@ class AnalyticState(NamedTuple):
     arms: State  # B
 
 
+class _Ahead(NamedTuple):
+    """Arms as they look ahead, for H actions."""
+
+    after: State  # after the first of these
+    obs: Array  # (H, O) before each
+    valid: Array  # () bool: the arm settled after each
+
+
 class Analytic:
-    """`Learner` by the gradient of the equilibrium; it uses no replay.
+    """`Learner` by the gradient of the simulation; it uses no replay.
 
     Args:
         config: hyperparameters.
-        env: the arm, at rest.
+        env: the arm.
         n_arms: arms of a gradient step.
         mesh: devices over which the arms are spread.
     """
@@ -115,6 +132,17 @@ class Analytic:
             arms=self.arms.reset(key_arms),
         )
 
+    def adopt(self, state: AnalyticState, agent: Any) -> AnalyticState:
+        """Return the state with a donor's policy, of whatever learner; it may observe less.
+
+        Raises:
+            ValueError: the donor's networks have another size.
+        """
+        donor = getattr(agent, "agent", agent)  # of a run that imitated or was polished
+        params = widened(donor.mean_actor_params, self.env.observation_size)
+        check_same_shapes("actor", params, state.actor_params)
+        return state._replace(actor_params=params, mean_actor_params=jax.tree.map(jnp.copy, params))
+
     def act(self, state: AnalyticState, obs: Array, key: Array) -> Array:
         """Return the policy's actions (..., A) at obs (..., O): nothing needs to be explored."""
         return self.mode(state.actor_params, obs)
@@ -131,16 +159,18 @@ class Analytic:
         self, state: AnalyticState, sample: Sample, key: Array
     ) -> tuple[AnalyticState, dict[str, Array]]:
         """Take one gradient step, and one action of all arms."""
-        # Act and settle; the gradient of each arm's loss with respect to its own action.
-        action, pull_back = jax.vjp(lambda params: self.mode(params, state.arms.obs), state.actor_params)
-        step = over_arms(jax.value_and_grad(self._loss, has_aux=True), self.mesh)
-        d_action: Array
-        (loss, after), d_action = step(action, state.arms)  # (B,), state, (B, A)
+        # Act H times; the gradient of each arm's loss with respect to each of its actions.
+        look_ahead = jax.value_and_grad(self._loss, has_aux=True)
+        changes = jnp.zeros((self.own_arms, self.config.horizon, self.env.action_size))
+        ahead: _Ahead
+        (loss, ahead), d_action = over_arms(look_ahead, self.mesh, 1)(changes, state.arms, state.actor_params)
 
         # Leave out arms that did not settle and gradients that are not finite, as at a pitch of 90 degrees.
-        valid = after.info["valid"] & jnp.all(jnp.isfinite(d_action), axis=-1)  # (B,)
-        d_action = jnp.where(valid[:, None], d_action, jnp.zeros_like(d_action)) / self.own_arms
+        valid = ahead.valid & jnp.all(jnp.isfinite(d_action), axis=(1, 2))  # (B,)
+        d_action = jnp.where(valid[:, None, None], d_action, jnp.zeros_like(d_action)) / self.own_arms
+        _, pull_back = jax.vjp(lambda params: self.mode(params, ahead.obs), state.actor_params)
         (gradient,) = pull_back(d_action)
+        after = ahead.after
 
         # Descend.
         change, opt_state = self.optimizer.update(gradient, state.opt_state, state.actor_params)
@@ -161,16 +191,30 @@ class Analytic:
         env_metrics = {f"env/{name}": jnp.mean(x) for name, x in after.metrics.items()}
         return next_state, env_metrics | {f"analytic/{name}": x for name, x in metrics.items()}
 
-    def _loss(self, action: Array, arm: State) -> tuple[Array, State]:
-        """Return the loss of an action (A,) of one arm, and the state that it leads to."""
-        after = self.env.step(arm, action)
-        end = after.pipeline_state
-        error = rewards.scaled_error(end.pose, end.goal, self.env.config.reward)  # (6,)
-        norm = jnp.sqrt(jnp.sum(error**2) + 1e-12)
+    def _loss(self, changes: Array, arm: State, params: Params) -> tuple[Array, _Ahead]:
+        """Return the loss of one arm that takes H actions of the policy, each changed a little: (H, A)."""
+
+        def act(arm: State, change: Array) -> tuple[State, tuple[Array, State, Array]]:
+            action = self.mode(params, arm.obs) + change
+            after = self.env.step(arm, action)
+            return after, (self._cost(action, after), after, arm.obs)
+
+        horizon = self.config.horizon
+        _, (cost, after, obs) = jax.lax.scan(act, arm, changes, length=horizon, unroll=horizon == 1)
+        first = jax.tree.map(lambda x: x[0], after)
+        loss = cost[0] if horizon == 1 else cost[-1] + EARLY * jnp.mean(cost)
+        return loss, _Ahead(first, obs, jnp.all(after.info["valid"]))
+
+    def _cost(self, action: Array, after: State) -> Array:
+        """Return the cost of an action (A,) of one arm, and of the state that it leads to."""
+        end, config = after.pipeline_state, self.env.config
+        error = rewards.scaled_error(end.pose, end.goal, config.reward)  # (6,)
+        off = jnp.sqrt(jnp.sum(error**2) + 1e-12) / config.reward.threshold
         off_m = self.env.reference_m(action) - (end.spring_m + end.sensor_offset_m)  # (A,)
+        if config.mode == "dynamic":  # most of them are on their way
+            off_m = jnp.where(after.info["blocked"], off_m, 0.0)
         cost = self.config.saturation_cost_per_mm * 1e3 * jnp.sum(jnp.abs(off_m))
-        cost += self.env.clearance_cost(after.info["clearance_mm"])
-        return norm / self.env.config.reward.threshold + cost, after
+        return off + cost + self.env.clearance_cost(after.info["clearance_mm"])
 
     def _go_on(self, after: State, key: Array) -> State:
         """Return the arms as they stand, some of them with a new start and goal."""

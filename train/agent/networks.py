@@ -1,5 +1,7 @@
 """Actor and critic networks, and the tanh-squashed Gaussian that the actor parametrises."""
 
+from typing import Any
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -40,6 +42,15 @@ class Actor(nn.Module):
         head = nn.Dense(2 * self.action_size, name="head")(x)  # (..., 2A)
         mean, log_std = jnp.split(head, 2, axis=-1)  # (..., A) each
         return mean, jnp.clip(log_std, LOG_STD_MIN, LOG_STD_MAX)
+
+
+def widened(params: Any, obs_size: int) -> Any:
+    """Return an actor's parameters for longer observations (..., O), whose new entries count nothing."""
+    params = jax.tree.map(jnp.asarray, params)
+    first = params["params"]["hidden_0"]
+    unseen = max(0, obs_size - first["kernel"].shape[0])
+    first["kernel"] = jnp.pad(first["kernel"], ((0, unseen), (0, 0)))
+    return params
 
 
 class Critics(nn.Module):

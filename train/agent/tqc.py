@@ -21,7 +21,7 @@ from jax import Array
 from mjx_softarm._support import draws
 from train.agent.learner import check_same_shapes
 from train.agent.losses import actor_loss, alpha_loss, quantile_huber_loss, truncated_targets
-from train.agent.networks import Actor, Critics, mode, sample_action, squash
+from train.agent.networks import Actor, Critics, mode, sample_action, squash, widened
 
 Params = Any  # a flax parameter tree
 
@@ -51,7 +51,6 @@ class TQCConfig:
     initial_alpha: float = 1.0  # initial temperature
     target_entropy: float | None = None  # target entropy [nat]; None is minus the number of actions
     reward_scale: float = 1.0  # factor on every reward in the critics' targets
-    critics_first: int = 0  # gradient steps of the critics before the first of a given actor
 
     def __post_init__(self) -> None:
         required = {
@@ -62,7 +61,6 @@ class TQCConfig:
             "learning_rate_end": (0.0 <= self.learning_rate_end <= 1.0, "a number in [0, 1]"),
             "gamma": (0.0 <= self.gamma <= 1.0, "a number in [0, 1]"),
             "tau": (0.0 < self.tau <= 1.0, "a number in (0, 1]"),
-            "critics_first": (self.critics_first >= 0, "a number >= 0"),
             "initial_alpha": (self.initial_alpha > 0.0, "a positive number"),
         }
         for name, (holds, expected) in required.items():
@@ -108,11 +106,7 @@ class TQC:
             config.n_critics, config.n_quantiles, config.hidden_critic, config.layer_norm
         )
         rate = _learning_rate(config, n_updates)
-        self.optimizer = self.actor_optimizer = optax.adam(rate)
-        if config.critics_first:
-            later = rate if callable(rate) else optax.constant_schedule(rate)
-            held = optax.join_schedules([optax.constant_schedule(0.0), later], [config.critics_first])
-            self.actor_optimizer = optax.adam(held)
+        self.optimizer = optax.adam(rate)
         self.alpha_optimizer = optax.adam(config.learning_rate_alpha)
         self.target_entropy = -float(action_size) if config.target_entropy is None else config.target_entropy
 
@@ -130,7 +124,7 @@ class TQC:
             critic_params=critic_params,
             target_params=own_buffers(critic_params),
             log_alpha=log_alpha,
-            actor_opt_state=self.actor_optimizer.init(actor_params),
+            actor_opt_state=self.optimizer.init(actor_params),
             critic_opt_state=self.optimizer.init(critic_params),
             alpha_opt_state=self.alpha_optimizer.init(log_alpha),
         )
@@ -154,11 +148,8 @@ class TQC:
         Raises:
             ValueError: the actor has layers of another size.
         """
-        actor = jax.tree.map(jnp.asarray, given)
-        first, head = (actor["params"][name] for name in ("hidden_0", "head"))
-        unseen = self.obs_size - first["kernel"].shape[0]
-        if unseen > 0:
-            first["kernel"] = jnp.pad(first["kernel"], ((0, unseen), (0, 0)))
+        actor = widened(given, self.obs_size)
+        head = actor["params"]["head"]
         head["kernel"] = head["kernel"].at[:, self.action_size :].set(0.0)
         head["bias"] = head["bias"].at[self.action_size :].set(GIVEN_LOG_STD)
         check_same_shapes("actor", actor, state.actor_params)
@@ -201,7 +192,7 @@ class TQC:
 
         # Optimiser steps, and Polyak averages of their results.
         critic = _descend(self.optimizer, d_critic, state.critic_opt_state, state.critic_params)
-        actor = _descend(self.actor_optimizer, d_actor, state.actor_opt_state, state.actor_params)
+        actor = _descend(self.optimizer, d_actor, state.actor_opt_state, state.actor_params)
         temperature = _descend(self.alpha_optimizer, d_alpha, state.alpha_opt_state, state.log_alpha)
         next_state = TQCState(
             actor_params=actor[0],

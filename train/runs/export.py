@@ -35,9 +35,6 @@ def export_run(run: Run, path: Path | None = None, task: Task | None = None) -> 
         RunError: the run has no checkpoint, or its learner's policy is not a network that the file can hold.
         SealedFileError: the file cannot be written.
     """
-    if run.config.env.observation != "pose":
-        got = run.config.env.observation
-        raise RunError(f"{run.path}: env.observation: got {got!r}, expected 'pose' for a policy to export")
     task, params = restore_policy(run, task)
     model, distilled = arm_model(task.job.env)
     errors = {name: getattr(distilled, name) for name in ("tip_mm", "turn_deg", "load_kg", "spring_mm")}
@@ -59,6 +56,7 @@ def export_run(run: Run, path: Path | None = None, task: Task | None = None) -> 
             provenance,
             tolerance_m=1e-3 * run.config.env.saturation_tolerance_mm,
             n_actions=N_ACTIONS,
+            action_s=run.config.env.dynamic_step_s if run.config.env.mode == "dynamic" else 0.0,
         )
     except (ValueError, AttributeError) as error:
         raise RunError(f"{run.path}: {error}") from error

@@ -121,8 +121,8 @@ def test_without_s2r_the_nominal_policy_plans_and_the_springs_are_calibrated(tmp
     assert chosen.policy.spec == SPEC
     pose, goal = circle_poses(2).astype(float)
     expected = PolicyRunner(make_policy(make_arm_model)).act(pose, goal).length_m
-    assert np.allclose(chosen.plan(pose, goal, np.full(N, 0.2)), expected)
-    with_s2r = jobs.controller_of(tmp_path, Trial("with", 0, 0)).plan(pose, goal, 0)
+    assert np.allclose(chosen.plan(pose, goal, np.full(N, 0.2), None), expected)
+    with_s2r = jobs.controller_of(tmp_path, Trial("with", 0, 0)).plan(pose, goal, 0, None)
     assert not np.allclose(with_s2r, expected)
 
 

@@ -10,7 +10,6 @@ import pytest
 from mjx_softarm.env import EnvConfig, Randomisation, ReachEnv
 from mjx_softarm.spec import ArmSpec
 from train.agent.analytic import Analytic, AnalyticConfig
-from train.config import ConfigError, TrainConfig
 
 SHORT = ArmSpec.default().replace(structure={"n_sections": 1, "links_per_section": 2})
 CONFIG = AnalyticConfig(hidden=(32, 32))
@@ -77,9 +76,35 @@ def test_an_arm_that_does_not_settle_is_left_out_and_begins_anew(update, start):
     assert np.isfinite(after.arms.pipeline_state.payload_kg).all()
 
 
-def test_motion_is_refused():
-    with pytest.raises(ConfigError, match="learner: got 'analytic' with env.mode 'dynamic'"):
-        TrainConfig(learner="analytic", env=EnvConfig(mode="dynamic"))
+def test_the_gradient_of_moving_arms_looks_several_actions_ahead():
+    """Against differences of the loss, for changes of the first and of the last of three actions."""
+    env = ReachEnv(SHORT, EnvConfig(n_poses=64, mode="dynamic", dynamic_step_s=0.1, goal_ends=False))
+    learner = Analytic(dataclasses.replace(CONFIG, horizon=3), env, 4)
+    state = jax.jit(learner.init)(jax.random.key(0))
+    loss = jax.vmap(jax.value_and_grad(learner._loss, has_aux=True), in_axes=(0, 0, None))
+    at = jax.jit(lambda changes: loss(changes, state.arms, state.actor_params))
+    changes = jnp.zeros((4, 3, env.action_size))
+    (_, ahead), slope = at(changes)
+    assert np.asarray(ahead.valid).all() and ahead.obs.shape == (4, 3, env.observation_size)
+    np.testing.assert_array_equal(ahead.obs[:, 0], state.arms.obs)
+    for k in (0, 2):
+        way = jax.random.normal(jax.random.key(k), (env.action_size,))
+        (above, _), _ = at(changes.at[:, k].set(3e-3 * way))
+        (below, _), _ = at(changes.at[:, k].set(-3e-3 * way))
+        np.testing.assert_allclose(slope[:, k] @ way, (above - below) / 6e-3, rtol=0.05, atol=2e-3)
+    assert np.abs(slope[:, 0]).max() > 0.01  # what is done first counts later
+
+
+def test_a_policy_is_adopted_and_may_observe_less(learner, start):
+    env = ReachEnv(SHORT, EnvConfig(n_poses=64, mode="dynamic", observation="motion"))
+    wider = Analytic(CONFIG, env, 4)
+    own = jax.jit(wider.init)(jax.random.key(1))
+    obs = np.random.default_rng(0).normal(size=(5, env.observation_size)).astype(np.float32)
+    expected = learner.mode(learner.policy(start), obs[:, : learner.env.observation_size])
+    np.testing.assert_allclose(wider.mode(wider.policy(wider.adopt(own, start)), obs), expected, atol=1e-6)
+    smaller = Analytic(dataclasses.replace(CONFIG, hidden=(8,)), env, 4)
+    with pytest.raises(ValueError, match="actor: got layers of"):
+        smaller.adopt(jax.eval_shape(smaller.init, jax.random.key(2)), start)
 
 
 @pytest.mark.parametrize(

@@ -261,16 +261,3 @@ def test_a_given_policy_acts_as_before_whatever_it_did_not_observe():
     assert equal(adopted.critic_params, own.critic_params)
     with pytest.raises(ValueError, match="actor: got layers of"):
         donor.adopt_policy(given, own.mean_actor_params)
-
-
-def test_the_critics_learn_first():
-    """While they do, the actor stays as it was given; then it moves, too."""
-    agent = TQC(3, 2, TQCConfig(hidden_actor=(8,), hidden_critic=(8,), critics_first=2))
-    row = jnp.ones((4, 3), jnp.float32)
-    batch = Transition(row, jnp.zeros((4, 2)), jnp.ones(4), row, jnp.zeros(4))
-    states = [agent.init(jax.random.key(0))]
-    for k in range(3):
-        states.append(jax.jit(agent.update)(states[-1], batch, jax.random.key(k))[0])
-    assert equal(states[0].actor_params, states[2].actor_params)
-    assert not equal(states[0].critic_params, states[1].critic_params)
-    assert not equal(states[2].actor_params, states[3].actor_params)
