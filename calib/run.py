@@ -206,8 +206,9 @@ def _s2r(
         remedy = f"policies will be trained on simulated poses: log {MIN_S2R_POSES} poses at rest or more"
         return None, Section("Sim-to-real network", needed, warnings=(remedy,)), None, {}
     real = pose_from_frame(poses.tip_m, poses.tip_rotation)
-    pose, spring_m, real = (x[simulated.valid] for x in (simulated.pose, simulated.spring_m, real))
-    fit = fit_s2r(pose, spring_m, real, seed)
+    settled, real = simulated.take(simulated.valid), real[simulated.valid]
+    pose, spring_m = settled.pose, settled.spring_m
+    fit = fit_s2r(spec, settled, real, seed)
     away, never = extrapolation(fit.s2r, pose, spring_m), np.zeros(len(pose), bool)
     corrected = PosePairs(real, correct(fit.s2r, pose, spring_m), away > 1.0)
     pairs = {"simulated": PosePairs(real, pose, never), "with the network": corrected}

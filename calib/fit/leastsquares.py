@@ -24,6 +24,7 @@ ROUNDS = ("linear", "huber", "huber")  # losses: the first with the given scales
 # Of a round: evaluations of the model; relative changes of the loss and of x, of which single precision gives
 # no less; SciPy's third test depends on the units of x.
 TOLERANCES: dict[str, Any] = {"max_nfev": 15, "ftol": 1e-6, "xtol": 1e-4, "gtol": None}
+NEWTON_STEPS = 5  # at most, after the rounds: each round's scales are those of the round before
 SMALL_STEP = 0.1  # standard deviations that a converged fit is from its minimum, at most
 NO_ANSWER = 30.0  # error, in scales, of a row for which the model has no answer
 SIGMA_PER_MEDIAN = 1.4826  # of the absolute value of a normal variable
@@ -50,7 +51,13 @@ class Solution(NamedTuple):
     x: np.ndarray  # (p,)
     covariance: np.ndarray  # (p, p)
     scale: np.ndarray  # (n_groups,) standard deviations of the errors
-    converged: bool
+    newton_step: np.ndarray  # (p,) by which x is still off the minimum
+    decrement: float  # by which that step would bring the loss down
+
+    @property
+    def converged(self) -> bool:
+        """Whether x is as good as at the minimum."""
+        return self.decrement < 0.5 * SMALL_STEP**2
 
     @property
     def half_width(self) -> np.ndarray:
@@ -78,7 +85,16 @@ def fit(model: Model, problem: Problem) -> Solution:
     for loss in ROUNDS:
         x = least_squares(errors, x, loss=loss, **options, **TOLERANCES).x
         scale = _scales(evaluate(x.tobytes())[0], problem)
-    return solution_at(x, *evaluate(x.tobytes()), problem)
+    solution = solution_at(x, *evaluate(x.tobytes()), problem)
+    for _ in range(NEWTON_STEPS):
+        if solution.converged:
+            break
+        x, scale = solution.x + solution.newton_step, solution.scale
+        before, after = (_loss(*evaluate(at.tobytes()), at, scale, problem) for at in (solution.x, x))
+        if not after < before:
+            break
+        solution = solution_at(x, *evaluate(x.tobytes()), problem)
+    return solution
 
 
 def solution_at(x: np.ndarray, error: np.ndarray, jacobian: np.ndarray, problem: Problem) -> Solution:
@@ -90,8 +106,8 @@ def solution_at(x: np.ndarray, error: np.ndarray, jacobian: np.ndarray, problem:
         problem: priors and scales of the fit.
     """
     scale = _scales(error, problem)
-    covariance, decrement = _covariance(error, jacobian, x, scale, problem)
-    return Solution(x, covariance, scale, decrement < 0.5 * SMALL_STEP**2)
+    covariance, newton_step, decrement = _covariance(error, jacobian, x, scale, problem)
+    return Solution(x, covariance, scale, newton_step, decrement)
 
 
 def principal(solution: Solution, tolerance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -121,8 +137,8 @@ def _scaled(
 
 def _covariance(
     error: np.ndarray, jacobian: np.ndarray, x: np.ndarray, scale: np.ndarray, problem: Problem
-) -> tuple[np.ndarray, float]:
-    """Return the covariance (p, p), and how far a Newton step would still bring the loss down."""
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return the covariance (p, p), the Newton step (p,) and how far it would bring the loss down."""
     error, slope = _scaled(error, jacobian, scale, problem)
     precision = np.diag(problem.prior**-2.0)
     inside = np.where(np.abs(error)[..., None] <= problem.huber, slope, 0.0)
@@ -132,8 +148,18 @@ def _covariance(
     change = np.linalg.solve(hessian - curvature, score[..., None])[..., 0]  # (n, p) without each row
     inverse = np.linalg.inv(hessian)
     gradient = score.sum(axis=0) + precision @ x
-    decrement = 0.5 * float(gradient @ inverse @ gradient)
-    return change.T @ change + inverse @ precision @ inverse, decrement
+    newton_step = -inverse @ gradient
+    covariance = change.T @ change + inverse @ precision @ inverse
+    return covariance, newton_step, -0.5 * float(gradient @ newton_step)
+
+
+def _loss(
+    error: np.ndarray, jacobian: np.ndarray, x: np.ndarray, scale: np.ndarray, problem: Problem
+) -> float:
+    """Return Huber's loss with the prior's."""
+    size = np.abs(_scaled(error, jacobian, scale, problem)[0])
+    each = np.where(size <= problem.huber, 0.5 * size**2, problem.huber * (size - 0.5 * problem.huber))
+    return float(each.sum() + 0.5 * np.sum((x / problem.prior) ** 2))
 
 
 def _scales(error: np.ndarray, problem: Problem) -> np.ndarray:

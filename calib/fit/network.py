@@ -5,8 +5,8 @@ networks with weight decay learn its residual, each stopped early on blocks of r
 their outputs are averaged. The linear map and the members are joined to one network, layers side by side,
 which is stored and run as one.
 
-Up to `MAX_PROCESS_ROWS` rows, a Gaussian process is fitted first, which is closer to rows not seen
-than networks are. One network then learns the process, at the rows and at many points around them.
+Where a process was fitted to the rows (`calib.fit.section_process`), one network learns its mean instead, at
+many points.
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ from jax import Array
 
 from calib.errors import FitError
 from calib.fit.blocks import held_out_blocks
-from calib.fit.gaussian_process import fit_process, predict
 from mjx_softarm._support.mlp import Layer, mlp
 from mjx_softarm.sensing.s2r import S2R
 
@@ -33,10 +32,6 @@ LIMIT_PERCENTILE = 99.0
 ROWS_PER_BLOCK = 100
 MIN_BLOCKS = 20  # shorter blocks rather than fewer
 
-
-MAX_PROCESS_ROWS = 2_000
-N_AROUND = 16_000  # points around the rows, at which a network learns a process
-REACH = 0.5  # of such a point, in parts of the difference of two rows
 STOP_EVERY = 10  # of the points one stops the training early
 
 
@@ -53,7 +48,7 @@ class NetworkConfig:
     stop_share: float = 0.2  # of the rows, which stop a member early
 
 
-# Of a network that learns a process: without noise there is nothing to average, and nothing to hold back.
+# For a network that learns a process: without noise there is nothing to average, and nothing to hold back.
 OF_PROCESS = NetworkConfig((128, 128), 1, 6_000, 5e-3, 256, 0.0)
 
 
@@ -70,30 +65,40 @@ def block_rows(n: int) -> int:
     return max(min(ROWS_PER_BLOCK, n // MIN_BLOCKS), 1)
 
 
-def fit_network(x: np.ndarray, y: np.ndarray, seed: int, config: NetworkConfig | None = None) -> NetworkFit:
+def fit_network(
+    x: np.ndarray,
+    y: np.ndarray,
+    seed: int,
+    config: NetworkConfig | None = None,
+    points: tuple[np.ndarray, np.ndarray] | None = None,
+) -> NetworkFit:
     """Fit a network from inputs to outputs by mean squared error.
 
     Args:
         x (n, n_in): inputs in order of time, without the rows that will test the network.
         y (n, n_out): outputs.
         seed: seed of weights, batches and blocks.
-        config: training settings; by default those for so many rows.
+        config: training settings.
+        points: inputs (m, n_in) and outputs (m, n_out) without noise that it learns in place of the rows.
 
     Raises:
         FitError: fewer than two rows, arrays that do not fit together, or a number that is not finite.
     """
     _check(x, y)
     n = len(x)
-    few = n <= MAX_PROCESS_ROWS
-    config = config or (OF_PROCESS if few else NetworkConfig())
+    config = config or (NetworkConfig() if points is None else OF_PROCESS)
     seeds = (1_000 * seed + k for k in range(config.n_members))
     stopping = [held_out_blocks(n, config.stop_share, block_rows(n), of) for of in seeds]
     bounds = _bounds(x, y)
     low, high = bounds["input_low"], bounds["input_high"]
-    z = (2.0 * (x - low) / (high - low) - 1.0).astype(np.float32)
+
+    def normalised(x: np.ndarray) -> np.ndarray:
+        return (2.0 * (x - low) / (high - low) - 1.0).astype(np.float32)
+
+    z = normalised(x)
     anchors, limit = _anchors(z, stopping[0])
-    if few:
-        z, y = _points_of_process(z, y, seed)
+    if points is not None:
+        z, y = np.clip(normalised(points[0]), -1.0, 1.0), points[1]
         stopping = [np.arange(len(z)) % STOP_EVERY == 0] * config.n_members
     linear = _line(z, y)
     left = y - z @ linear
@@ -117,18 +122,6 @@ def fit_network(x: np.ndarray, y: np.ndarray, seed: int, config: NetworkConfig |
     layers = _side_by_side(jax.device_get(members), spread, centre, linear)
     network = S2R(layers=layers, **bounds, anchors=anchors, limit=np.float32(limit))
     return NetworkFit(network, np.asarray(losses).argmin(axis=1), n_epochs)
-
-
-def _points_of_process(z: np.ndarray, y: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rows and points around them (m, n_in), with the mean there of a process fitted to the rows.
-
-    A point is off its row by a share of the difference of two others, so that the points fill the same space.
-    """
-    first, one, other = np.random.default_rng(seed).integers(0, len(z), (3, N_AROUND))
-    share = REACH * np.random.default_rng([seed, 1]).uniform(size=(N_AROUND, 1))
-    around = np.clip(z[first] + share * (z[one] - z[other]), -1.0, 1.0)
-    points = np.concatenate([z, around]).astype(np.float64)
-    return points, predict(fit_process(z.astype(np.float64), y), points)
 
 
 def _check(x: np.ndarray, y: np.ndarray) -> None:

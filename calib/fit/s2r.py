@@ -2,8 +2,9 @@
 
 As in the paper, the log gives spring lengths and real tip poses, the calibrated simulation gives its own
 poses at the same spring lengths, and a network learns the difference, which takes fewer rows than learning
-the real pose itself. Contiguous blocks of rows take no part in the fit or its early stopping, and measure its
-error.
+the real pose itself. It does not learn from the rows, which are few, but from a Gaussian process that was
+fitted to them and knows of sections (`calib.fit.section_process`): at the rows, and at many simulated arms
+around them. Contiguous blocks of rows take no part in either, and measure the error.
 
 Source: Sim-to-Real Transfer in Meng et al.
 """
@@ -20,6 +21,7 @@ import numpy as np
 from calib.errors import FitError
 from calib.fit.blocks import held_out_blocks
 from calib.fit.network import NetworkConfig, block_rows, fit_network
+from calib.fit.section_process import SectionProcess, Sections, fit_process, predict, sections
 from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.settle import Settled, settle
 from mjx_softarm.mechanics.statics import ArmParams
@@ -33,6 +35,8 @@ PRESSURE_LIMIT_KPA = 200.0  # limit of the simulated arm, beyond what any length
 MAX_TURN_DEG = 90.0
 MAX_HELD_OUT_RATIO = 3.0
 BATCH = 512
+N_AROUND = 16_000  # simulated arms around the rows, at which the network learns the process
+REACH = 0.5  # of such an arm, in parts of the difference of two rows
 
 
 class SimulatedPoses(NamedTuple):
@@ -41,6 +45,11 @@ class SimulatedPoses(NamedTuple):
     pose: np.ndarray  # (n, 6) [mm, deg]
     spring_m: np.ndarray  # (n, n_chambers) lengths reached
     valid: np.ndarray  # (n,) bool, whether the arm settled
+    sections: Sections
+
+    def take(self, rows: np.ndarray) -> SimulatedPoses:
+        """Return some of the poses, chosen by indices or a mask (n,)."""
+        return jax.tree.map(lambda values: values[rows], self)
 
 
 @dataclass(frozen=True)
@@ -100,22 +109,25 @@ def simulate_poses(spec: ArmSpec, reference_m: np.ndarray) -> SimulatedPoses:
     params = params._replace(pressure_min_kpa=-limit, pressure_max_kpa=limit)
     padded = np.resize(reference, (-(-n // BATCH) * BATCH, spec.n_chambers))
     found = [jax.device_get(_settle()(params, batch)) for batch in np.split(padded, len(padded) // BATCH)]
-    return SimulatedPoses(*(np.concatenate(column)[:n] for column in zip(*found, strict=True)))
+    return jax.tree.map(lambda *columns: np.concatenate(columns)[:n], *found)
 
 
 @functools.cache
 def _settle():
-    def one(params: ArmParams, reference: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def one(params: ArmParams, reference: jax.Array) -> SimulatedPoses:
         kinematics = chain_kinematics(params)
         end: Settled = settle(kinematics, params, reference)
-        return pose_from_frame(end.tip_position_m, end.tip_rotation), end.spring_m, end.settled
+        pose = pose_from_frame(end.tip_position_m, end.tip_rotation)
+        return SimulatedPoses(
+            pose, end.spring_m, end.settled, sections(kinematics(end.q), params, end.spring_m)
+        )
 
     return jax.jit(jax.vmap(one, in_axes=(None, 0)))
 
 
 def fit_s2r(
-    pose_sim: np.ndarray,
-    spring_m: np.ndarray,
+    spec: ArmSpec,
+    simulated: SimulatedPoses,
     pose_real: np.ndarray,
     seed: int = 0,
     config: NetworkConfig | None = None,
@@ -123,23 +135,27 @@ def fit_s2r(
     """Fit a network from simulated poses and spring lengths to real poses.
 
     Args:
-        pose_sim (n, 6) [mm, deg]: poses from `simulate_poses`, settled rows only, in order of time.
-        spring_m (n, n_chambers) [m]: their spring lengths.
+        spec: calibrated arm.
+        simulated: its n poses from `simulate_poses`, settled ones only, in order of time.
         pose_real (n, 6) [mm, deg]: measured poses in the base frame.
         seed: seed of all random draws.
         config: training settings.
 
     Raises:
-        FitError: arrays that do not fit together, too few rows to hold some out, or numbers not finite.
+        FitError: another number of measured poses, too few to hold some out, or one that is not finite.
     """
-    n = len(pose_sim)
-    if np.shape(pose_sim) != (n, 6) or np.shape(pose_real) != (n, 6) or np.shape(spring_m)[:1] != (n,):
-        shapes = f"{np.shape(pose_sim)}, {np.shape(spring_m)}, {np.shape(pose_real)}"
-        raise FitError(f"sim-to-real: got {shapes}, expected (n, 6), (n, n_springs), (n, 6)")
-    pose_sim, spring_m, pose_real = (np.asarray(a, np.float64) for a in (pose_sim, spring_m, pose_real))
+    n = len(simulated.pose)
+    if np.shape(pose_real) != (n, 6):
+        raise FitError(f"sim-to-real: got {np.shape(pose_real)} measured poses, expected {(n, 6)}")
+    arrays = (simulated.pose, simulated.spring_m, pose_real)
+    pose_sim, spring_m, pose_real = (np.asarray(a, np.float64) for a in arrays)
     held_out = held_out_blocks(n, HELD_OUT_SHARE, block_rows(n), seed)
     x, y = inputs(frame_from_pose(pose_sim), spring_m), correction_between(pose_sim, pose_real)
-    fit = fit_network(x[~held_out], y[~held_out], seed, config)
+    if (missing := np.flatnonzero(~np.isfinite(pose_real).all(axis=1))).size:
+        raise FitError(f"sim-to-real: measured pose {missing[0]}: got nan, expected finite numbers")
+    process = fit_process(simulated.sections.take(~held_out), y[~held_out])
+    points = _points_around(spec, process, spring_m[~held_out], seed)
+    fit = fit_network(x[~held_out], y[~held_out], seed, config, points)
     corrected = correct(fit.network, pose_sim, spring_m)
     errors = {
         "in_sample": pose_errors(corrected[~held_out], pose_real[~held_out]),
@@ -157,6 +173,22 @@ def fit_s2r(
         flagged_share=float(flagged.mean()),
         warnings=tuple(_warnings(n, turn_deg, errors)),
     )
+
+
+def _points_around(
+    spec: ArmSpec, process: SectionProcess, spring_m: np.ndarray, seed: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return inputs of the network and means of a process at simulated arms, at and around rows of springs.
+
+    An arm is off its row by a share of the difference of two others, so that the arms fill the same space.
+    """
+    first, one, other = np.random.default_rng(seed).integers(0, len(spring_m), (3, N_AROUND))
+    share = REACH * np.random.default_rng([seed, 1]).uniform(size=(N_AROUND, 1))
+    around = spring_m[first] + share * (spring_m[one] - spring_m[other])
+    around = np.clip(around, spring_m.min(axis=0), spring_m.max(axis=0))
+    found = simulate_poses(spec, np.concatenate([spring_m, around]))
+    found = found.take(found.valid)
+    return inputs(frame_from_pose(found.pose), found.spring_m), predict(process, found.sections)
 
 
 def pose_errors(pose: np.ndarray, real: np.ndarray) -> PoseErrors:

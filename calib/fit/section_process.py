@@ -1,0 +1,161 @@
+"""Gaussian process of an arm's sections: from the simulated tip to the real one, learned from few poses.
+
+A real section twists, shears and hardens as its simulation does not. How much depends on that section's own
+shape and load. So each section s has an unknown correction g_s, a small shift and turn at its middle in its
+own axes. It depends on the section's state u_s alone: its spring lengths, the direction of gravity in its
+axes, and the moment of all weights below. With E_s, the lever by which the middle of section s moves the
+tip, the correction of the tip is
+
+    y = sum_s E_s g_s(u_s) + noise.
+
+Each g_s is a Gaussian process with the covariance v (1 + exp(-|u - u'|^2 / (2 l^2))), so y is one, too. Of a
+grid, the length l and the noise are taken that make the rows most likely; the variance v has a closed form.
+
+Source: Rasmussen, Williams, "Gaussian Processes for Machine Learning", MIT Press 2006, sections 2.2 and 5.4.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from scipy.linalg import cho_solve, cholesky
+
+from mjx_softarm.mechanics.kinematics import Frames
+from mjx_softarm.mechanics.statics import ArmParams
+from mjx_softarm.spec import N_CHAMBERS_PER_SECTION
+
+LENGTHS = (2.0, 3.0, 4.5, 7.0)  # of states; see `sections`
+NOISES = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1, 1.0)  # variances, in parts of those of a section
+MAX_GRID_ROWS = 200  # from which length and noise are chosen
+MAX_ROWS = 1_000
+N_OUTPUTS = 6  # shift [mm], Gibbs vector
+
+
+class Sections(NamedTuple):
+    """States of the s sections of simulated arms at rest, and what their middles do to the tip."""
+
+    state: np.ndarray | Array  # (n, s, 9)
+    effect: (
+        np.ndarray | Array
+    )  # (n, s, 6, 6) shift [mm] and Gibbs vector times `lever_mm` to those of the tip
+    lever_mm: np.ndarray | Array  # (n,) half of a section's length: a turn by as many radians counts as 1 mm
+
+    def take(self, rows: np.ndarray) -> Sections:
+        """Return some of the arms, chosen by indices or a mask (n,)."""
+        return Sections(*(values[rows] for values in self))
+
+
+class SectionProcess(NamedTuple):
+    """Mean of a process given n rows."""
+
+    rows: Sections
+    length: float
+    weight: np.ndarray  # (n, s, 6) of the rows, at their sections
+
+
+def sections(frames: Frames, params: ArmParams, spring_m: Array) -> Sections:
+    """Return states and effects (s, ...) of the sections of one arm.
+
+    A state holds spring lengths in quarters of a section's length, the vertical in the section's axes, and
+    the moment of the weights below, in units of the whole arm's weight half a section's length aside.
+
+    Args:
+        frames: of the arm at rest.
+        params: its numbers.
+        spring_m (n_chambers,): its spring lengths.
+    """
+    n_sections, length_m = params.n_sections, params.section_length_m
+    per_section = params.link_mass_kg.shape[0] // n_sections
+    middle = per_section * np.arange(n_sections) + per_section // 2
+    position, rotation = frames.plate_position[middle], frames.plate_rotation[middle]
+    last_m, down = frames.plate_position[-1], -frames.plate_rotation[-1, :, 2]
+    body_m = jnp.concatenate([frames.anchor, last_m + params.tool_offset_m[:, None] * down])
+    body_kg = jnp.concatenate([params.link_mass_kg, params.tool_mass_kg])
+    below = np.arange(len(body_m)) >= middle[:, None]  # (s, bodies)
+    lever_kgm = jnp.sum((below * body_kg)[..., None] * (body_m - position[:, None]), axis=1)
+    moment = jnp.cross(lever_kgm, jnp.array([0.0, 0.0, 1.0])) / (0.5 * length_m * body_kg.sum())
+    local = jnp.einsum("sij,si->sj", rotation, moment)
+    own = spring_m.reshape(n_sections, N_CHAMBERS_PER_SECTION) / (0.25 * length_m)
+    lever_mm = 500.0 * length_m
+    aside = 1000.0 * (frames.tip_position - position)[:, None, :]
+    turned = jnp.cross(jnp.swapaxes(rotation, 1, 2), aside) * 2.0 / lever_mm  # (s, axis of the turn, shift)
+    effect = jnp.concatenate(
+        [
+            jnp.concatenate([rotation, jnp.swapaxes(turned, 1, 2)], axis=2),
+            jnp.concatenate([jnp.zeros_like(rotation), rotation], axis=2),
+        ],
+        axis=1,
+    )
+    return Sections(jnp.concatenate([own, rotation[:, 2, :], local], axis=1), effect, lever_mm)
+
+
+def fit_process(rows: Sections, y: np.ndarray) -> SectionProcess:
+    """Fit a process to the corrections y (n, 6) [mm, Gibbs vector] of n simulated tips.
+
+    Of more rows than `MAX_ROWS`, as many take part, evenly spread.
+    """
+    rows, y = _some(Sections(*(np.asarray(values, float) for values in rows)), y, MAX_ROWS)
+    length, noise = _most_likely(*_some(rows, y, MAX_GRID_ROWS))
+    weight = _solve(_covariance(rows, rows, length), noise, _levelled(rows, y).ravel())[0]
+    at_sections = np.einsum("nsji,nj->nsi", rows.effect, weight.reshape(len(y), N_OUTPUTS))
+    return SectionProcess(rows, length, at_sections)
+
+
+def predict(process: SectionProcess, at: Sections) -> np.ndarray:
+    """Return the mean (m, 6) [mm, Gibbs vector] for m simulated arms."""
+    found = np.zeros((len(at.state), N_OUTPUTS))
+    for s in range(at.state.shape[1]):
+        likeness = _likeness(at.state[:, s], process.rows.state[:, s], process.length)
+        found += np.einsum("nij,nj->ni", at.effect[:, s], likeness @ process.weight[:, s])
+    return found / _units(at)
+
+
+def _some(rows: Sections, y: np.ndarray, n: int) -> tuple[Sections, np.ndarray]:
+    chosen = np.linspace(0, len(y) - 1, min(n, len(y))).round().astype(int)
+    return rows.take(chosen), y[chosen]
+
+
+def _most_likely(rows: Sections, y: np.ndarray) -> tuple[float, float]:
+    """Return length and noise."""
+    off, best = _levelled(rows, y).ravel(), (np.inf, 0.0, 0.0)
+    for length in LENGTHS:
+        covariance = _covariance(rows, rows, length)
+        for noise in NOISES:
+            weight, half_log_determinant = _solve(covariance, noise, off)
+            variance = max(float(off @ weight) / len(off), 1e-12)
+            unlikely = 0.5 * len(off) * np.log(variance) + half_log_determinant
+            best = min(best, (unlikely, length, noise))
+    return best[1:]
+
+
+def _solve(covariance: np.ndarray, noise: float, y: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the solution for y of the covariance with noise, and half the logarithm of the determinant."""
+    factor = cholesky(covariance + noise * np.eye(len(y)), lower=True, check_finite=False)
+    return cho_solve((factor, True), y, check_finite=False), float(np.log(np.diag(factor)).sum())
+
+
+def _covariance(a: Sections, b: Sections, length: float) -> np.ndarray:
+    """Return the covariance (6 n, 6 m) of two sets of tips, over the sections' variance."""
+    total = np.zeros((len(a.state), N_OUTPUTS, len(b.state), N_OUTPUTS))
+    for s in range(a.state.shape[1]):
+        likeness = _likeness(a.state[:, s], b.state[:, s], length)
+        total += likeness[:, None, :, None] * np.einsum("nik,mjk->nimj", a.effect[:, s], b.effect[:, s])
+    return total.reshape(N_OUTPUTS * len(a.state), -1)
+
+
+def _likeness(a: np.ndarray, b: np.ndarray, length: float) -> np.ndarray:
+    square = np.maximum((a**2).sum(axis=1)[:, None] + (b**2).sum(axis=1) - 2.0 * a @ b.T, 0.0)
+    return 1.0 + np.exp(-square / (2.0 * length**2))
+
+
+def _levelled(rows: Sections, y: np.ndarray) -> np.ndarray:
+    return y * _units(rows)
+
+
+def _units(at: Sections) -> np.ndarray:
+    """Return factors (n, 6) that bring the Gibbs vector to millimetres."""
+    lever_mm = np.asarray(at.lever_mm)[:, None]
+    return np.concatenate([np.ones((len(lever_mm), 3)), np.repeat(lever_mm, 3, axis=1)], axis=1)
