@@ -2,8 +2,9 @@
 
 The information of poses at rest on the parameters x of `calib.fit.parameters` is the sum over the poses of
 J^T J, with J the derivatives of tip, rotation and springs by x over their scales, and of the prior's. Its
-inverse is the covariance. Poses are chosen one by one among candidates at random and at the extremes of the
-pressures: the one that brings down the sum of the variances the most, each in units of its tolerance. Once no
+inverse is the covariance. Poses are chosen one by one among candidates, the one that brings down the sum of
+the variances the most, each in units of its tolerance. Candidates have pressures at random, at the extremes,
+or alike within each section: a long straight arm and a short one tell a shift of the base from its tilt. Once no
 direction is expected to stay unknown, and for half of the poses in any case, they are drawn as for clustering
 (k-means++): by the square of the distance to the nearest pose, times the sim-to-real network's error there.
 
@@ -25,7 +26,7 @@ from calib.read.static_poses import StaticPoses
 from mjx_softarm._support.archive import Entries, entries_of, read_sealed, write_sealed
 from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.mechanics.workspace import pressure_levels, settle_many
-from mjx_softarm.spec import ArmSpec
+from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
 
 KIND, RECORDED_FILE = "recorded", "recorded.npz"  # in the folder of a calibration
 SHARE_FAR = 0.5  # of the poses, at least, that are drawn by their distance
@@ -157,10 +158,12 @@ def choose_far(
 
 
 def _candidates(spec: ArmSpec, n: int, rng: np.random.Generator) -> np.ndarray:
-    """Draw pressures (m, n_chambers), half of them at random, half at extremes, at which the arm settles."""
-    half = n // 2
-    extremes = rng.choice(pressure_levels(spec), (half, spec.n_chambers))
-    drawn = np.concatenate([random_pressures(spec, n - half, rng), extremes])
+    """Draw pressures (m, n_chambers) at which the arm settles: random, extreme, alike within sections."""
+    third = -(-n // 3)
+    extremes = rng.choice(pressure_levels(spec), (third, spec.n_chambers))
+    of_section = random_pressures(spec, third, rng)[:, ::N_CHAMBERS_PER_SECTION]
+    alike = np.repeat(of_section, N_CHAMBERS_PER_SECTION, axis=1)
+    drawn = np.concatenate([random_pressures(spec, third, rng), extremes, alike])
     return drawn[settle_many(spec, drawn).settled]
 
 

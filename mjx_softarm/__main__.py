@@ -5,14 +5,13 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
-from importlib import resources
 from pathlib import Path
 
 import numpy as np
 
 from mjx_softarm._support import cli
 from mjx_softarm._support.errors import InputError
-from mjx_softarm.spec import ArmSpec
+from mjx_softarm.spec import ArmSpec, shipped_arm
 
 MAX_COMBINATIONS = 1_000_000  # of pressures
 
@@ -24,17 +23,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return cli.main("python -m mjx_softarm", about, commands, arguments)
 
 
-def _spec(out: Path = Path("arm.toml"), force: bool = False) -> int:
-    """Write the paper's arm, every number with its unit and its source, to start your own from.
+def _spec(arm: str = "paper", out: Path = Path("arm.toml"), force: bool = False) -> int:
+    """Write an arm's specification, every number with its unit and its source, to start your own from.
 
     Args:
+        arm: paper, sopra or stiff-flop
         out: file to write
         force: replace the file if there is one
     """
     if out.exists() and not force:
         raise InputError(f"--out: got {out}, which exists already, expected a new file, or --force")
-    text = resources.files("mjx_softarm").joinpath("arms/paper.toml").read_text("utf-8")
-    out.write_text(text, "utf-8")
+    out.write_text(shipped_arm(arm), "utf-8")
     print(f"wrote {out}; edit it and use it with --spec {out}")
     return 0
 

@@ -166,13 +166,20 @@ class ArmSpec:
     @classmethod
     def default(cls) -> ArmSpec:
         """Return the paper's arm."""
-        text = resources.files("mjx_softarm").joinpath("arms/paper.toml").read_text("utf-8")
-        return cls.from_dict(tomllib.loads(text), "arms/paper.toml")
+        return cls.from_dict(tomllib.loads(shipped_arm("paper")), "arms/paper.toml")
 
     @classmethod
     def of(cls, path: Path | None) -> ArmSpec:
-        """Return the arm of a file, or the paper's arm where none is given; raises as `from_toml` does."""
-        return cls.default() if path is None else cls.from_toml(path)
+        """Return the arm of a file or of the package's name for it, or the paper's arm where none is given.
+
+        Raises:
+            SpecError: there is no such arm, or as `from_toml` does.
+        """
+        if path is None:
+            return cls.default()
+        if path.suffix or path.exists():
+            return cls.from_toml(path)
+        return cls.from_dict(tomllib.loads(shipped_arm(str(path))), f"arms/{path}.toml")
 
     @classmethod
     def from_toml(cls, path: str | Path) -> ArmSpec:
@@ -262,3 +269,17 @@ class ArmSpec:
                     f"{source}: springs.{name}: got {length_m!r}, which reads {readings[~readable][0]:.6g} "
                     f"{unit}, expected sensor.{' to '.join(sensor.range_fields)}, {low:g} to {high:g} {unit}"
                 )
+
+
+def shipped_arm(name: str) -> str:
+    """Return the TOML of an arm that the package describes.
+
+    Raises:
+        SpecError: there is none of this name; the message says which there are.
+    """
+    arms = {
+        file.name.removesuffix(".toml"): file for file in resources.files(f"{__package__}.arms").iterdir()
+    }
+    if name not in arms:
+        raise SpecError(f"{name}: got no such arm, expected a file, or {', '.join(sorted(arms))}")
+    return arms[name].read_text("utf-8")

@@ -245,6 +245,8 @@ Integers = Annotated[tuple[int, ...], listed(_integers, "N,N,...")]  # different
 SpecFile = Annotated[
     MaybePath,
     tyro.conf.arg(
-        metavar="ARM.toml", help="specification of the arm", help_behavior_hint="(default: the paper's arm)"
+        metavar="ARM.toml|NAME",
+        help="specification of the arm, or the package's name for one: paper, sopra, stiff-flop",
+        help_behavior_hint="(default: the paper's arm)",
     ),
 ]

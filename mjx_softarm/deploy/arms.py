@@ -27,8 +27,9 @@ def open_arm(name: str) -> Any:
     """Open an arm: an `ArmIO`, maybe with `pressures`, `motion_capture` or a clock of its own, `time_s`.
 
     Args:
-        name: `twin:SEED`, or in a pipe `twin:SEED:pipe300` or `twin:SEED:pipe250`; `twin:rod:SEED`;
-            each with a payload as `twin:SEED:500g`; or `package.module:Class`, whose class takes no
+        name: `twin:SEED`, or in a pipe `twin:SEED:pipe300` or `twin:SEED:pipe250`; `twin:rod:SEED`, or of
+            another arm `twin:rod:SEED@ARM`; each with a payload as `twin:SEED:500g`; or
+            `package.module:Class`, whose class takes no
             arguments; modules in the working directory are found.
 
     Raises:

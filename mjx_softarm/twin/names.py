@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from mjx_softarm.mechanics.pipe import PIPES_MM, CrossPipe
+from mjx_softarm.spec import ArmSpec
 from mjx_softarm.twin.arm import Twin
 from mjx_softarm.twin.rod_twin import RodTwin
 
@@ -10,14 +13,18 @@ ROD = "rod"
 
 
 def twin_of(name: str) -> Twin | RodTwin:
-    """Make the twin of a name, `SEED`, `SEED:PIPE` or `rod:SEED`, each with a payload as `SEED:500g`.
+    """Make the twin of a name, `SEED`, `SEED:PIPE`, `rod:SEED` or `rod:SEED@ARM`, with a payload as `SEED:500g`.
+
+    Rods are of any arm, as `--spec` names it; the others have the losses of the paper's arm.
 
     Raises:
-        ValueError: the name is malformed, or the arm of this seed does not fit into the pipe.
+        ValueError: the name is malformed, there is no such arm, or the arm does not fit into the pipe.
     """
     name, payload_kg = _without_payload(name)
     if name.startswith(f"{ROD}:"):
-        return RodTwin(_seed(name.removeprefix(f"{ROD}:"), f"twin:{ROD}:SEED"), payload_kg=payload_kg)
+        seed, at, arm = name.removeprefix(f"{ROD}:").partition("@")
+        number = _seed(seed, f"twin:{ROD}:SEED")
+        return RodTwin(number, ArmSpec.of(Path(arm)) if at else None, payload_kg)
     seed, colon, pipe = name.partition(":")
     number = _seed(seed, "twin:SEED")
     if colon and pipe not in PIPES_MM:

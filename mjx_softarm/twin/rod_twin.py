@@ -87,7 +87,7 @@ class RodTwin:
         self._spec, self._build = spec or ArmSpec.default(), build or RodBuild()
         self._noise = np.random.default_rng([session, seed])
         rng = np.random.default_rng(seed)
-        std = _scaled(self._build.gap)
+        std = _scaled(self._build.gap, self._spec)
         self._base_m = _off(rng, std.base_offset_m, 3)
         self._base_rotation = rotation_about(np.radians(_off(rng, std.base_tilt_deg, 3)) * [1.0, 1.0, 0.0])
         self._tip_m = _off(rng, std.tip_offset_m, 3)
@@ -155,7 +155,7 @@ class RodTwin:
         """Return how the rods are distributed, for reports: nothing about the one that was drawn."""
         return {
             "gap": self._build.gap,
-            "distances": dataclasses.asdict(_scaled(self._build.gap)),
+            "distances": dataclasses.asdict(_scaled(self._build.gap, self._spec)),
             "widest draw [standard deviations]": WIDEST_DRAW,
             "elements per section": self._build.per_section,
             "creep, regulators [s]": [CREEP_S, REGULATOR_S],
@@ -225,5 +225,16 @@ def _off(rng: np.random.Generator, deviation: float, *shape: int) -> np.ndarray:
     return deviation * np.clip(rng.standard_normal(shape), -WIDEST_DRAW, WIDEST_DRAW)
 
 
-def _scaled(gap: float) -> RodTolerances:
-    return RodTolerances(**{name: gap * x for name, x in dataclasses.asdict(RodTolerances()).items()})
+def _scaled(gap: float, spec: ArmSpec) -> RodTolerances:
+    """Return the tolerances of an arm: lengths and compliances are in proportion to the paper's arm's."""
+    paper = ArmSpec.default()
+    length = spec.geometry.section_length_m / paper.geometry.section_length_m
+    bending = paper.backbone.bending_stiffness_nm_per_rad / spec.backbone.bending_stiffness_nm_per_rad
+    axial = paper.backbone.axial_stiffness_n_per_m / spec.backbone.axial_stiffness_n_per_m
+    factors = {"torsion_rad_per_nm": bending, "shear_per_n": axial / length}
+    return RodTolerances(
+        **{
+            name: gap * x * (length if name.endswith("_m") else factors.get(name, 1.0))
+            for name, x in dataclasses.asdict(RodTolerances()).items()
+        }
+    )
