@@ -4,9 +4,10 @@ The information of poses at rest on the parameters x of `calib.fit.parameters` i
 J^T J, with J the derivatives of tip, rotation and springs by x over their scales, and of the prior's. Its
 inverse is the covariance. Poses are chosen one by one among candidates, the one that brings down the sum of
 the variances the most, each in units of its tolerance. Candidates have pressures at random, at the extremes,
-or alike within each section: a long straight arm and a short one tell a shift of the base from its tilt. Once no
-direction is expected to stay unknown, and for half of the poses in any case, they are drawn as for clustering
-(k-means++): by the square of the distance to the nearest pose, times the sim-to-real network's error there.
+or alike within each section: a long straight arm and a short one tell a shift of the base from its tilt.
+Once no direction is expected to stay unknown, and for half of the poses in any case, they are drawn as for
+clustering (k-means++): by the square of the distance to the nearest pose, times the sim-to-real network's
+error there.
 
 Source: Fedorov, "Theory of Optimal Experiments", 1972 (A-optimal design); Arthur, Vassilvitskii, "k-means++",
 SODA 2007.
