@@ -22,6 +22,7 @@ BENCHMARKS = {
     "guard": "benchmarks.speed.guard:main",
     "calibration": "benchmarks.accuracy.calibration:measure",
     "planning": "benchmarks.accuracy.planning:measure",
+    "arms": "benchmarks.accuracy.arms:measure",
     "logs": "benchmarks.accuracy.logs:measure",
     "learning": "benchmarks.accuracy.learning:measure",
     "race": "benchmarks.race.race:race",

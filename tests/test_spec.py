@@ -4,6 +4,7 @@ import contextlib
 import copy
 import math
 import re
+from pathlib import Path
 
 import pytest
 import tomli_w
@@ -212,3 +213,20 @@ def test_any_value_of_a_field_is_taken_or_refused_by_the_field_s_name(path, valu
         ArmSpec.default().replace(**{group: {name: value}})
     except SpecError as error:
         assert re.match(rf"replace: ({re.escape(path)}|springs\.|chambers\.|sensor\.)", str(error))
+
+
+@pytest.mark.parametrize("name", ["paper", "sopra", "stiff-flop"])
+def test_arms_that_ship_have_names(name, tmp_path, monkeypatch):
+    """A file of the same name comes first."""
+    monkeypatch.chdir(tmp_path)
+    assert ArmSpec.of(Path(name)).name == name
+    ArmSpec.default().replace(name="mine").to_toml(name)
+    assert ArmSpec.of(Path(name)).name == "mine"
+
+
+def test_an_arm_of_no_such_name_is_told_with_those_that_there_are(tmp_path):
+    expected = r"nobody: got no such arm, expected a file, or paper, sopra, stiff-flop"
+    with pytest.raises(SpecError, match=expected):
+        ArmSpec.of(Path("nobody"))
+    with pytest.raises(SpecError, match="expected a specification"):
+        ArmSpec.of(tmp_path / "nobody.toml")

@@ -22,3 +22,14 @@ def test_steps_that_damping_alone_has_made_small_are_no_end():
     solution = fit(lambda x: (SLOPE @ (x - TRUE), -SLOPE), PROBLEM)
     np.testing.assert_array_equal(solution.x, 0.0)
     assert not solution.converged
+
+
+def test_newton_steps_end_a_fit_whose_scales_still_changed():
+    """Outliers leave the scale of a round behind, and so the minimum for the one that is told."""
+    rng = np.random.default_rng(1)
+    slope = rng.normal(size=(400, 2, 3))
+    noise = 0.2 * rng.normal(size=(400, 2)) + np.where(rng.uniform(size=(400, 1)) < 0.2, 3.0, 0.0)
+    solution = fit(lambda x: (slope @ (x - TRUE) + noise, slope), PROBLEM)
+    assert solution.converged
+    assert np.linalg.norm(solution.newton_step) < 0.1 * np.linalg.norm(solution.half_width)
+    np.testing.assert_allclose(solution.x, TRUE, atol=0.05)

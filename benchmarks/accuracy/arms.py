@@ -1,0 +1,105 @@
+"""Arms that ship, by the same commands: recorded and calibrated from their own rod twins, trained, measured.
+
+The commands are those of `docs/your-arm.md`. Each arm is measured at a grid of goals over its workspace, the
+paper's around its circle, too.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Annotated, Any
+
+from mjx_softarm._support import cli
+from mjx_softarm._support.errors import InputError
+from mjx_softarm.spec import ArmSpec
+
+FAILED = 2  # exit status from which on a command has left nothing to go on with
+
+
+def _names(words: list[str]) -> tuple[str, ...]:
+    return tuple(words[0].split(","))
+
+
+def measure(
+    arms: Annotated[tuple[str, ...], cli.listed(_names, "NAME,NAME,...")] = ("paper", "sopra", "stiff-flop"),
+    poses: int = 300,
+    steps: int = 64 * 65_536,
+    points: int = 40,
+    keep: cli.MaybePath = None,
+) -> dict[str, Any]:
+    """Calibrate, train and measure arms on rod twins with seed 0.
+
+    Args:
+        arms: the package's names of arms
+        poses: random poses of each calibration
+        steps: environment steps of each training
+        points: goals of the grid, at most
+        keep: folder for logs, calibrations and runs; without one they are deleted
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        return {arm: _measure(arm, (keep or Path(folder)) / arm, poses, steps, points) for arm in arms}
+
+
+def _measure(arm: str, folder: Path, poses: int, steps: int, points: int) -> dict[str, Any]:
+    folder.mkdir(parents=True)
+    twin, log, calibration = f"twin:rod:0@{arm}", folder / "poses.csv", folder / "calibration"
+    run, policy = folder / "run", folder / "run/policy.npz"
+    record = ["mjx_softarm.deploy", "record", "--arm", twin, "--spec", arm, "--poses", poses, "--out", log]
+    train = ["train", "reach", "--preset", "analytic", "--calibration", calibration, "--out", run]
+    by_policy = ["mjx_softarm.deploy", "measure", policy, "--arm", twin]
+    _command(*record)
+    distrusted = _command("calib", "run", log, "--spec", arm, "--out", calibration)
+    _command(*train, "--total-env-steps", steps)
+    _command("train", "export", run)
+    measured = {"grid": ["--goals", "grid", "--points", points]}
+    if arm == "paper":
+        measured["circle"] = ["--goals", "circle"]
+    for goals, options in measured.items():
+        _command(*by_policy, *options, "--out", folder / goals)
+    return _figures(arm, folder, distrusted) | {
+        f"{goals}, {what}": json.loads((folder / goals / "accuracy.json").read_text())[key]
+        for goals in measured
+        for what, key in FIGURES.items()
+    }
+
+
+FIGURES = {
+    "goals": "measured",
+    "mean [mm]": "translation_mm",
+    "95 % [mm]": "translation_95_mm",
+    "mean [deg]": "rotation_deg",
+    "saturated": "saturated_points",
+}
+
+
+def _figures(arm: str, folder: Path, distrusted: int) -> dict[str, Any]:
+    """Return what the arm is, and what its calibration says of itself."""
+    spec = ArmSpec.of(Path(arm))
+    parts = json.loads((folder / "calibration/report.json").read_text())["parts"]
+    chambers, network = (parts[title]["figures"] for title in ("Chambers", "Sim-to-real network"))
+    return {
+        "length [mm]": 1e3 * spec.structure.n_sections * spec.geometry.section_length_m,
+        "sections": spec.structure.n_sections,
+        "pressures [kPa]": f"{spec.chambers.pressure_min_kpa:g} to {spec.chambers.pressure_max_kpa:g}",
+        "calibration's exit status": distrusted,
+        "unknown directions": len(chambers["weak"]),
+        "tip without S2R, held out [mm]": network["test_uncorrected"]["translation_mean_mm"],
+        "tip with S2R, held out [mm]": network["test"]["translation_mean_mm"],
+    }
+
+
+def _command(*words: Any) -> int:
+    """Run a command of this project, its output shown; return its exit status.
+
+    Raises:
+        InputError: the command ended with `FAILED` or more.
+    """
+    command = [str(word) for word in words]
+    status = subprocess.run([sys.executable, "-m", *command], check=False).returncode
+    if status >= FAILED or status < 0:
+        raise InputError(f"python -m {' '.join(command)}: got exit status {status}, expected 0 or 1")
+    return status
