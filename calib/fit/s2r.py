@@ -34,6 +34,7 @@ MIN_ROWS = 200
 PRESSURE_LIMIT_KPA = 200.0  # limit of the simulated arm, beyond what any length of a real one needs
 MAX_TURN_DEG = 90.0
 MAX_HELD_OUT_RATIO = 3.0
+GOOD_SHARE = 0.1  # of the error without the network: less is good whatever the rows of the fit have
 BATCH = 512
 N_AROUND = 16_000  # simulated arms around the rows, at which the network learns the process
 REACH = 0.5  # of such an arm, in parts of the difference of two rows
@@ -219,7 +220,7 @@ def _warnings(n: int, turn_deg: np.ndarray, errors: dict[str, PoseErrors]) -> li
                 f"{what}: {got:.3g} {unit} on held-out rows, no better than {without:.3g} without the network"
                 f"{left_out}: log more poses"
             )
-        if got > MAX_HELD_OUT_RATIO * seen:
+        if got > max(MAX_HELD_OUT_RATIO * seen, GOOD_SHARE * without):
             far = f"far more than {seen:.3g} in training"
             found.append(f"{what}: {got:.3g} {unit} on held-out rows, {far}: log more poses")
     return found
