@@ -13,7 +13,7 @@ ROD = "rod"
 
 
 def twin_of(name: str) -> Twin | RodTwin:
-    """Make the twin of a name, `SEED`, `SEED:PIPE`, `rod:SEED` or `rod:SEED@ARM`, with a payload as `SEED:500g`.
+    """Make the twin of a name: `SEED`, `SEED:PIPE`, `rod:SEED`, `rod:SEED@ARM`; with a payload `SEED:500g`.
 
     Rods are of any arm, as `--spec` names it; the others have the losses of the paper's arm.
 
