@@ -49,7 +49,7 @@ class NetworkConfig:
 
 
 # For a network that learns a process: without noise there is nothing to average, and nothing to hold back.
-OF_PROCESS = NetworkConfig((128, 128), 1, 6_000, 5e-3, 256, 0.0)
+OF_PROCESS = NetworkConfig((192, 192), 1, 12_000, 4e-3, 512, 0.0)
 
 
 class NetworkFit(NamedTuple):

@@ -4,7 +4,7 @@ As in the paper, the log gives spring lengths and real tip poses, the calibrated
 poses at the same spring lengths, and a network learns the difference, which takes fewer rows than learning
 the real pose itself. It does not learn from the rows, which are few, but from a Gaussian process that was
 fitted to them and knows of sections (`calib.fit.section_process`): at the rows, and at many simulated arms
-around them. Contiguous blocks of rows take no part in either, and measure the error.
+all over the workspace. Contiguous blocks of rows take no part in either, and measure the error.
 
 Source: Sim-to-Real Transfer in Meng et al.
 """
@@ -22,9 +22,11 @@ from calib.errors import FitError
 from calib.fit.blocks import held_out_blocks
 from calib.fit.network import NetworkConfig, block_rows, fit_network
 from calib.fit.section_process import SectionProcess, Sections, fit_process, predict, sections
+from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.settle import Settled, settle
 from mjx_softarm.mechanics.statics import ArmParams
+from mjx_softarm.mechanics.workspace import settle_many
 from mjx_softarm.sensing.pose import frame_from_pose, pose_from_frame
 from mjx_softarm.sensing.s2r import S2R, correct, correction_between, extrapolation, inputs
 from mjx_softarm.spec import ArmSpec
@@ -36,8 +38,7 @@ MAX_TURN_DEG = 90.0
 MAX_HELD_OUT_RATIO = 3.0
 GOOD_SHARE = 0.1  # of the error without the network: less is good whatever the rows of the fit have
 BATCH = 512
-N_AROUND = 16_000  # simulated arms around the rows, at which the network learns the process
-REACH = 0.5  # of such an arm, in parts of the difference of two rows
+N_POINTS = 24_000  # simulated arms at random pressures, at which the network learns the process
 
 
 class SimulatedPoses(NamedTuple):
@@ -155,7 +156,7 @@ def fit_s2r(
     if (missing := np.flatnonzero(~np.isfinite(pose_real).all(axis=1))).size:
         raise FitError(f"sim-to-real: measured pose {missing[0]}: got nan, expected finite numbers")
     process = fit_process(simulated.sections.take(~held_out), y[~held_out])
-    points = _points_around(spec, process, spring_m[~held_out], seed)
+    points = _points(spec, process, spring_m[~held_out], seed)
     fit = fit_network(x[~held_out], y[~held_out], seed, config, points)
     corrected = correct(fit.network, pose_sim, spring_m)
     errors = {
@@ -176,20 +177,15 @@ def fit_s2r(
     )
 
 
-def _points_around(
+def _points(
     spec: ArmSpec, process: SectionProcess, spring_m: np.ndarray, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return inputs of the network and means of a process at simulated arms, at and around rows of springs.
-
-    An arm is off its row by a share of the difference of two others, so that the arms fill the same space.
-    """
-    first, one, other = np.random.default_rng(seed).integers(0, len(spring_m), (3, N_AROUND))
-    share = REACH * np.random.default_rng([seed, 1]).uniform(size=(N_AROUND, 1))
-    around = spring_m[first] + share * (spring_m[one] - spring_m[other])
-    around = np.clip(around, spring_m.min(axis=0), spring_m.max(axis=0))
-    found = simulate_poses(spec, np.concatenate([spring_m, around]))
-    found = found.take(found.valid)
-    return inputs(frame_from_pose(found.pose), found.spring_m), predict(process, found.sections)
+    """Return inputs of the network and means of a process at rows of springs, and all over the workspace."""
+    found = settle_many(spec, random_pressures(spec, N_POINTS, seed))
+    over = np.clip(found.spring_m[found.settled], spring_m.min(axis=0), spring_m.max(axis=0))
+    simulated = simulate_poses(spec, np.concatenate([spring_m, over]))
+    settled = simulated.take(simulated.valid)
+    return inputs(frame_from_pose(settled.pose), settled.spring_m), predict(process, settled.sections)
 
 
 def pose_errors(pose: np.ndarray, real: np.ndarray) -> PoseErrors:

@@ -141,7 +141,7 @@ def _measure(
     if points < 1:
         raise InputError(f"--points: got {points}, expected at least 1")
     controller = _controller(policy)
-    poses = read_goals(goals, controller.policy.workspace, points)
+    poses = read_goals(goals, controller.policy, points)
     if out.exists():
         raise InputError(f"--out: got {out}, which is there already, expected a new folder")
     driver = open_arm(arm)

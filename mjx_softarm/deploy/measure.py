@@ -21,7 +21,8 @@ from mjx_softarm.deploy.link import describe
 from mjx_softarm.deploy.session import Run, seen_error
 from mjx_softarm.logs.tables import read_table
 from mjx_softarm.mechanics.excitation import circle_poses
-from mjx_softarm.sensing.pose import pose_error
+from mjx_softarm.policy.file import Policy
+from mjx_softarm.sensing.pose import frame_from_pose, pose_error, pose_from_frame, rotation_about
 
 LOOKS, LOOK_S = 50, 0.02  # frames of motion capture tried before an arm moves, and the time between two
 MOST_LAG_S = 3.0  # of a tip behind a moving goal
@@ -40,16 +41,20 @@ class Accuracy(NamedTuple):
     told_g: np.ndarray  # (p,) payload that the loop believed in, on arrival
 
 
-def read_goals(name: str, workspace: np.ndarray, n: int) -> np.ndarray:
+def read_goals(name: str, policy: Policy, n: int) -> np.ndarray:
     """Return goals (p, 6) [mm, deg] by name: `circle` and `grid` of at most n poses, or a CSV file.
+
+    Around the circle the last plate hangs straight down, with motion capture's frame on it as calibrated.
 
     Raises:
         InputError: there is no such file, or its columns are not `GOAL_COLUMNS`.
     """
     if name == "circle":
-        return circle_poses(n).astype(float)
+        position_m, _ = frame_from_pose(circle_poses(n).astype(float))
+        turn = rotation_about(np.radians(policy.spec.mounting.tip_turn_deg))
+        return np.asarray(pose_from_frame(position_m, np.broadcast_to(turn, (n, 3, 3))))
     if name == "grid":
-        return grid_poses(workspace, n)
+        return grid_poses(policy.workspace, n)
     table = read_table(name)
     if table.names != GOAL_COLUMNS or not np.isfinite(table.values).all():
         expected = f"numbers in the columns {','.join(GOAL_COLUMNS)}"
