@@ -174,7 +174,7 @@ def controller_of(folder: Path, trial: Trial) -> Any:
     nominal = load_policy(folder / reach_run(None, seed) / POLICY_FILE)
     runner = PolicyRunner(nominal)
     calibrated_springs = dataclasses.replace(nominal, actions=nominal.actions._replace(sensor=policy.sensor))
-    return Controller.of(calibrated_springs, lambda pose, goal, _: runner.act(pose, goal).length_m)
+    return Controller.of(calibrated_springs, lambda pose, goal, *_: runner.act(pose, goal).length_m)
 
 
 def try_out(folder: Path, settings: Settings, trial: Trial) -> None:

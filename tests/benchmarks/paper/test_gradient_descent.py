@@ -61,7 +61,7 @@ def test_goals_of_the_own_forward_kinematics_are_reached(policy):
     for goal in goals:
         spring_m = np.full(N, 0.19)
         for _ in range(N_ACTIONS):  # as the loop asks for them
-            spring_m = plan(np.zeros(6), goal, spring_m)
+            spring_m = plan(np.zeros(6), goal, spring_m, None)
         pose = pose_of(spring_m)
         assert np.linalg.norm(pose[:3] - goal[:3]) < 0.2
         # Yaw, which springs along the arm hardly turn, comes last; the paper's goal counts as reached at 1.
