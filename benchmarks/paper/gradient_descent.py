@@ -41,7 +41,9 @@ def gradient_descent(policy: Policy) -> Plan:
     low_m, high_m = policy.sensor.lengths(np.stack(policy.actions[1:])).length_m  # (n,) each
     pose_of = forward_kinematics(policy)
 
-    def plan(_pose: np.ndarray, goal: np.ndarray, spring_m: np.ndarray, _sensed: None) -> np.ndarray:
+    def plan(
+        _pose: np.ndarray, goal: np.ndarray, spring_m: np.ndarray, _sensed: np.ndarray | None
+    ) -> np.ndarray:
         def residual(x: np.ndarray) -> np.ndarray:
             return pose_error(pose_of(x), goal)
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -24,7 +24,7 @@ from calib.fit.network import NetworkConfig, block_rows, fit_network
 from calib.fit.section_process import SectionProcess, Sections, fit_process, predict, sections
 from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.mechanics.kinematics import chain_kinematics
-from mjx_softarm.mechanics.settle import Settled, settle
+from mjx_softarm.mechanics.settle import settle
 from mjx_softarm.mechanics.statics import ArmParams
 from mjx_softarm.mechanics.workspace import settle_many
 from mjx_softarm.sensing.pose import frame_from_pose, pose_from_frame
@@ -118,7 +118,7 @@ def simulate_poses(spec: ArmSpec, reference_m: np.ndarray) -> SimulatedPoses:
 def _settle():
     def one(params: ArmParams, reference: jax.Array) -> SimulatedPoses:
         kinematics = chain_kinematics(params)
-        end: Settled = settle(kinematics, params, reference)
+        end: Any = settle(kinematics, params, reference)
         pose = pose_from_frame(end.tip_position_m, end.tip_rotation)
         return SimulatedPoses(
             pose, end.spring_m, end.settled, sections(kinematics(end.q), params, end.spring_m)

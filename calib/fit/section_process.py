@@ -146,7 +146,7 @@ def _covariance(a: Sections, b: Sections, length: float) -> np.ndarray:
     return total.reshape(N_OUTPUTS * len(a.state), -1)
 
 
-def _likeness(a: np.ndarray, b: np.ndarray, length: float) -> np.ndarray:
+def _likeness(a: np.ndarray | Array, b: np.ndarray | Array, length: float) -> np.ndarray:
     square = np.maximum((a**2).sum(axis=1)[:, None] + (b**2).sum(axis=1) - 2.0 * a @ b.T, 0.0)
     return 1.0 + np.exp(-square / (2.0 * length**2))
 

@@ -151,7 +151,7 @@ def sample_evenly(spec: ArmSpec, n: int, seed: int) -> Pool:
 
 
 def _chosen(
-    spec: ArmSpec, found: Settled, usable: np.ndarray, n: int, rng: np.random.Generator, replace: bool
+    spec: ArmSpec, found: Settled, usable: np.ndarray | Array, n: int, rng: np.random.Generator, replace: bool
 ) -> np.ndarray:
     """Draw rows (n,) of usable equilibria with weights that even out the number of tips per voxel."""
     tip_mm = np.where(usable[:, None], 1e3 * found.tip_position_m, 0.0)

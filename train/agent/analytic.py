@@ -163,6 +163,7 @@ class Analytic:
         look_ahead = jax.value_and_grad(self._loss, has_aux=True)
         changes = jnp.zeros((self.own_arms, self.config.horizon, self.env.action_size))
         ahead: _Ahead
+        d_action: Array  # (B, H, A)
         (loss, ahead), d_action = over_arms(look_ahead, self.mesh, 1)(changes, state.arms, state.actor_params)
 
         # Leave out arms that did not settle and gradients that are not finite, as at a pitch of 90 degrees.
@@ -212,7 +213,7 @@ class Analytic:
         off = jnp.sqrt(jnp.sum(error**2) + 1e-12) / config.reward.threshold
         off_m = self.env.reference_m(action) - (end.spring_m + end.sensor_offset_m)  # (A,)
         if config.mode == "dynamic":  # most of them are on their way
-            off_m = jnp.where(after.info["blocked"], off_m, 0.0)
+            off_m = after.info["blocked"] * off_m
         cost = self.config.saturation_cost_per_mm * 1e3 * jnp.sum(jnp.abs(off_m))
         return off + cost + self.env.clearance_cost(after.info["clearance_mm"])
 
