@@ -151,7 +151,6 @@ def _measure(
     if seconds is None:
         run = follow(driver, controller, poses, tell=_tell, save=save)
     else:
-        poses = np.concatenate([poses, poses[:1]]) if goals == "circle" else poses
         run = trace(driver, controller, poses, seconds, _tell, save)
     if not run.arrivals:
         _summary(run)

@@ -13,12 +13,13 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from mjx_softarm.deploy.acting import believed
 from mjx_softarm.deploy.arm_io import ArmIO
 from mjx_softarm.deploy.controller import Controller, State, Tick, start
 from mjx_softarm.deploy.ending import DONE, FAULT, MISSED, Ending, vent_at_end
 from mjx_softarm.deploy.faults import Event, Fault, Response
 from mjx_softarm.deploy.link import ArmFault, Link, Recorder
-from mjx_softarm.deploy.loop import believed, hold, release, step, with_goal, with_moving_goal
+from mjx_softarm.deploy.loop import hold, release, step, with_goal, with_moving_goal
 from mjx_softarm.deploy.reachability import refusals
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mdp.rewards import scaled_error
@@ -266,6 +267,9 @@ class _Session:
         """Take the next accepted goal once the last is done; return False when goals or time are over."""
         if self.pilot:
             self._obey(self.pilot.orders())
+        if self.way_s is not None and self.refusals and not self.n_taken:  # no part of the way is gone
+            self._note(tuple(self.refusals.values()))
+            self.n_taken = len(self.goals)
         if self.way_s is not None and self.n_taken == 1 and self.state.goal is None:
             self.way_began_s, self.n_taken = now_s, len(self.goals)
             self.way = slice(len(self.rows), len(self.rows))

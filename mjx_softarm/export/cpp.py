@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from importlib import resources
 
+from mjx_softarm.deploy.acting import MAX_SHIFT
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.faults import LATE_TICKS, LOST_TICKS, SETTLE_TIMEOUT_S, Fault, Response
-from mjx_softarm.deploy.loop import CHAMBER_WINDOWS, MAX_SHIFT, OVERLOAD_KG
+from mjx_softarm.deploy.loop import CHAMBER_WINDOWS, OVERLOAD_KG
 from mjx_softarm.export.computations import parts
 from mjx_softarm.export.cpp_functions import Numbers, function
 from mjx_softarm.policy.file import file_entries

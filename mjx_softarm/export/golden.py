@@ -33,10 +33,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjx_softarm._support.errors import InputError
+from mjx_softarm.deploy.acting import believed
 from mjx_softarm.deploy.controller import Controller, start
 from mjx_softarm.deploy.faults import Event, Fault
 from mjx_softarm.deploy.link import vented
-from mjx_softarm.deploy.loop import believed, step, with_goal
+from mjx_softarm.deploy.loop import step, with_goal
 from mjx_softarm.deploy.reachability import nearest, refusals
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.policy.reach import nearest_poses

@@ -8,7 +8,8 @@ from calib.read.logs import read_log
 from mjx_softarm.deploy import link
 from mjx_softarm.deploy.arm_io import Capture
 from mjx_softarm.deploy.controller import Controller, start
-from mjx_softarm.deploy.ending import Ending
+from mjx_softarm.deploy.ending import FAULT, Ending
+from mjx_softarm.deploy.faults import Fault
 from mjx_softarm.deploy.loop import step, with_goal
 from mjx_softarm.deploy.session import LEAD_S, on_the_way, trace
 from mjx_softarm.logs.schema import write_log
@@ -18,6 +19,7 @@ from mjx_softarm.sensing.estimator import estimate
 from tests.linear_arm import (
     CONTROLLER,
     DT_S,
+    FAR,
     GOALS,
     NOISE_M,
     POLICY,
@@ -82,6 +84,20 @@ def test_a_policy_of_motion_acts_in_time_and_is_told_of_motion():
     np.testing.assert_allclose(second[9:18] * 0.1 * 0.1, rows[15] - rows[10], atol=1e-6)  # 100 mm/s, 0.1 s
     asked_m = POLICY.actions.lengths(second[-9:])
     np.testing.assert_allclose(asked_m, SPRINGS_M[0], atol=1e-5)
+
+
+def test_a_goal_half_way_is_half_way_and_angles_take_the_short_way():
+    goals = np.array([[0.0, 0, -600, 170, 0, 0], [10.0, 0, -580, -170, 0, 4], [30.0, 0, -580, -170, 0, 4]])
+    np.testing.assert_allclose(on_the_way(goals, 0.25), [5.0, 0, -590, 180, 0, 2])
+    np.testing.assert_allclose(on_the_way(goals, 0.75), [20.0, 0, -580, -170, 0, 4])
+    np.testing.assert_allclose(on_the_way(goals, 1.2), goals[2])
+
+
+def test_a_way_with_a_goal_out_of_reach_is_not_begun():
+    arm = LinearArm()
+    run = trace(arm, CONTROLLER, np.array([GOALS[0], FAR, GOALS[1]]), way_s=5.0)
+    assert run.status == FAULT and not run.arrivals and run.counts() == {Fault.GOAL_OUTSIDE: 1}
+    np.testing.assert_array_equal(arm.written, 0.0)
 
 
 def test_a_moving_goal_is_followed_and_its_end_is_an_arrival():

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from mjx_softarm.deploy.arm_io import Capture
 from mjx_softarm.deploy.ending import DONE, FAULT, MISSED
 from mjx_softarm.deploy.faults import Fault
 from mjx_softarm.deploy.measure import (
+    along,
     figures,
     grid_poses,
     measure,
@@ -159,3 +161,16 @@ def test_grid_is_spread_over_the_workspace():
     away = np.linalg.norm(chosen[:, None, :3] - chosen[None, :, :3], axis=2) + 1e9 * np.eye(64)
     assert away.min() > 25.0  # cells are 50 mm wide
     assert len(grid_poses(cloud, 1)) == 1
+
+
+def test_distance_and_lag_along_a_way():
+    """A tip that does in each tick what the goal did 0.4 s before, 3 mm beside it; one frame is lost."""
+    n, lag = 500, 20
+    goal = np.tile([0.0, 0.0, -600.0, 0.0, 0.0, 0.0], (n + lag, 1))
+    goal[:, 0] = np.arange(n + lag)
+    tip_mm = goal[:n, :3] + [0.0, 3.0, 0.0]
+    tip_mm[7] = np.nan
+    run = SimpleNamespace(log=SimpleNamespace(goal=goal[lag:], tip_m=1e-3 * tip_mm), way=slice(0, n))
+    found = along(run, 0.02)
+    assert found["lag_s"] == pytest.approx(0.4) and found["way_without_lag_mm"] == pytest.approx(3.0)
+    assert found["way_mm"] == pytest.approx(np.hypot(lag, 3.0)) and found["way_s"] == pytest.approx(10.0)

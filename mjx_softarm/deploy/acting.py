@@ -1,0 +1,142 @@
+"""Actions of the loop: when the policy acts, on which belief, and towards which goal. Pure; NumPy only.
+
+`mjx_softarm.deploy.loop` says how these follow one another.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mjx_softarm.control import saturated
+from mjx_softarm.deploy import faults
+from mjx_softarm.deploy.controller import Controller, State
+from mjx_softarm.deploy.faults import Event, Fault
+from mjx_softarm.mdp.observation import observe_motion, rate_ticks
+from mjx_softarm.policy.file import Policy
+from mjx_softarm.policy.runtime import tip_pose
+from mjx_softarm.sensing.load import Load
+from mjx_softarm.sensing.pose import pose_error
+
+MAX_SHIFT = np.repeat([25.0, 5.0], 3)  # [mm, deg] of a goal
+
+
+def believed(controller: Controller, spring_m: np.ndarray, load: Load) -> tuple[np.ndarray, float]:
+    """Return the tip pose that springs (n,) [m] tell with a payload.
+
+    Returns:
+        Pose (6,) [mm, deg], NaN where a length is; `s2r.extrapolation` of it, 0 without a network.
+    """
+    if np.isnan(spring_m).any():
+        return np.full(6, np.nan), 0.0
+    pose, away = tip_pose(controller.policy, spring_m, load.believed_kg)
+    return pose, float(away)
+
+
+def go(controller: Controller, state: State, at_rest: bool) -> tuple[State, list[Event], bool]:
+    """Act if the goal is new or the springs have settled; arrive when they have after the last action."""
+    events: list[Event] = []
+    settled = False
+    if state.n_actions > 0:
+        policy, seen = controller.policy, (state.springs_m, state.reference_m, state.pressure_kpa)
+        settled = at_rest and bool(faults.on_reference(*seen, policy.gains, policy.tolerance_m))
+        if not settled and state.n_ticks * controller.dt_s < _patience_s(policy, state.n_actions):
+            return state, [], False
+        if state.n_suspect.any() and settled:  # whether a chamber is lost comes first
+            return state, [], False
+        if not policy.action_s or state.n_actions == policy.n_actions:
+            events += _unsettled(controller, state, settled)
+        if state.n_actions == controller.policy.n_actions:
+            return state._replace(goal=None), events, True
+    assert state.goal is not None  # `step` asks
+    shift = state.shift if state.n_actions and not settled else _shifted(controller, state)
+    pose, away = believed(controller, state.spring_m, state.load)
+    if away > 1.0:
+        message = f"{away:.1f} times as far from the training rows as the network is believed"
+        events.append(Event(Fault.EXTRAPOLATION, message))
+    sensed = _sensed(controller, state, pose)
+    reference_m = controller.plan(pose, state.goal + shift, state.spring_m, sensed)
+    state = state._replace(reference_m=reference_m, n_actions=state.n_actions + 1, n_ticks=0, shift=shift)
+    return state, events, False
+
+
+def chase(controller: Controller, state: State) -> State:
+    """Return the state with the references towards a moving goal, if an action is due."""
+    policy = controller.policy
+    assert state.goal is not None  # `step` asks
+    pose, _ = believed(controller, state.spring_m, state.load)
+    if policy.action_s:
+        if state.n_actions and state.n_ticks * controller.dt_s < policy.action_s:
+            return state
+        reference_m = controller.plan(pose, state.goal, state.spring_m, _sensed(controller, state, pose))
+        return state._replace(reference_m=reference_m, n_actions=state.n_actions + 1, n_ticks=0)
+    shift, reference_m = state.shift, state.spring_m
+    for _ in range(policy.n_actions):
+        reference_m = controller.plan(pose, state.goal + shift, state.spring_m, None)
+        pose, _ = believed(controller, reference_m, state.load)
+        left = pose_error(np.asarray(pose, float), state.goal)
+        shift = np.clip(shift - left, -MAX_SHIFT, MAX_SHIFT)
+    return state._replace(reference_m=reference_m, n_actions=state.n_actions + 1, n_ticks=0, shift=shift)
+
+
+def _patience_s(policy: Policy, n_actions: int) -> float:
+    """Return for how long [s] the springs may move until the next action comes, or the arrival."""
+    more = policy.action_s and n_actions < policy.n_actions
+    return policy.action_s if more else faults.SETTLE_TIMEOUT_S
+
+
+def _sensed(controller: Controller, state: State, pose: np.ndarray) -> np.ndarray | None:
+    """Return `observe_motion` of the arm, which is believed at a pose (6,), for a policy that observes it."""
+    policy = controller.policy
+    if not policy.observes_motion:
+        return None
+    n_before = min(rate_ticks(policy.rate_hz), len(state.springs_m) - 1)
+    last_m = state.springs_m[-1 - n_before]
+    reference_m = state.spring_m if state.reference_m is None else state.reference_m
+    return observe_motion(
+        state.spring_m,
+        last_m,
+        pose[:3],
+        believed(controller, last_m, state.load)[0][:3],
+        state.law.integral_kpa,
+        policy.actions.from_lengths(reference_m),
+        policy.spec,
+    )
+
+
+def _shifted(controller: Controller, state: State) -> np.ndarray:
+    """Return the shift (6,) [mm, deg] of the goal for the next action, less what the last references leave.
+
+    References, not springs, since these may creep by some tenths of a millimetre in an arm at rest; but the
+    springs of saturated chambers, which do not follow their references.
+    """
+    if state.n_actions == 0:
+        return np.zeros(6)
+    assert state.goal is not None and state.reference_m is not None
+    policy, mean_m = controller.policy, state.springs_m.mean(axis=0)
+    mask = saturated(state.pressure_kpa, state.reference_m, mean_m, policy.gains, policy.tolerance_m)
+    pose, _ = believed(controller, np.where(mask, mean_m, state.reference_m), state.load)
+    left = pose_error(np.asarray(pose, float), state.goal)
+    return np.clip(state.shift - left, -MAX_SHIFT, MAX_SHIFT)
+
+
+def _unsettled(controller: Controller, state: State, settled: bool) -> list[Event]:
+    """Return the faults of the springs as they stand before the next action."""
+    policy, mean_m = controller.policy, state.springs_m.mean(axis=0)
+    off_m = mean_m - state.reference_m
+    mask = saturated(state.pressure_kpa, state.reference_m, mean_m, policy.gains, policy.tolerance_m)
+    events = []
+    if not settled:
+        worst = int(np.argmax(np.where(mask, 0.0, np.abs(off_m))))
+        off = f"{1e3 * off_m[worst]:+.1f} mm"
+        message = f"after {faults.SETTLE_TIMEOUT_S:g} s, spring{worst} is {off} off its reference"
+        events.append(Event(Fault.NOT_SETTLED, message))
+    if mask.any():
+        off = ", ".join(f"{1e3 * value:+.1f}" for value in off_m[mask])
+        message = f"{names('chamber', mask)}: at the limit, spring {off} mm off its reference"
+        events.append(Event(Fault.SATURATED, message))
+    return events
+
+
+def names(kind: str, mask: np.ndarray) -> str:
+    """Return the names of springs or chambers of a mask (n,)."""
+    return ", ".join(f"{kind}{k}" for k in np.flatnonzero(mask))
