@@ -1,7 +1,8 @@
 """Poses to record next: those that tell a calibration's unknown directions, then those far from any pose.
 
 The information of poses at rest on the parameters x of `calib.fit.parameters` is the sum over the poses of
-J^T J, with J the derivatives of tip, rotation and springs by x over their scales, and of the prior's. Its
+J^T J, with J the derivatives of tip, rotation, springs and, if the calibration had them, of markers at the
+sections' ends by x over their scales, and of the prior's. Its
 inverse is the covariance. Poses are chosen one by one among candidates, the one that brings down the sum of
 the variances the most, each in units of its tolerance. Candidates have pressures at random, at the extremes,
 or alike within each section: a long straight arm and a short one tell a shift of the base from its tilt.
@@ -20,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calib.fit.equilibrium import simulate
+from calib.fit.equilibrium import error_groups, simulate
 from calib.fit.leastsquares import QUANTILE
 from calib.fit.parameters import priors, tolerances
 from calib.read.static_poses import StaticPoses
@@ -43,7 +44,7 @@ class Recorded(NamedTuple):
     pressure_kpa: np.ndarray  # (n, n_chambers)
     payload_kg: np.ndarray  # (n,)
     error_mm: np.ndarray  # (n,) of the tip, of the sim-to-real network where there is one
-    scale: np.ndarray  # (3,) robust errors of tip [m], rotation [rad] and springs [m]
+    scale: np.ndarray  # (3,) robust errors of tip [m], rotation [rad] and springs [m]; (4,) with markers [m]
 
 
 class Plan(NamedTuple):
@@ -66,8 +67,13 @@ def load_recorded(path: Path, n_chambers: int) -> Recorded:
         SealedFileError: the file is missing, damaged, or of another arm.
     """
     entries = Entries(read_sealed(path, KIND, "python -m calib run"), str(path))
-    shapes = {"pressure_kpa": (None, n_chambers), "payload_kg": (None,), "error_mm": (None,), "scale": (3,)}
-    found = Recorded(**{name: entries.take(f"{KIND}.{name}", np.float64, s) for name, s in shapes.items()})
+    shapes = {
+        "pressure_kpa": ((None, n_chambers),),
+        "payload_kg": ((None,),),
+        "error_mm": ((None,),),
+        "scale": ((3,), (4,)),
+    }
+    found = Recorded(**{name: entries.take(f"{KIND}.{name}", np.float64, *s) for name, s in shapes.items()})
     entries.finish(1)
     return found
 
@@ -171,7 +177,7 @@ def _candidates(spec: ArmSpec, n: int, rng: np.random.Generator) -> np.ndarray:
 def _derivatives(
     spec: ArmSpec, pressure_kpa: np.ndarray, payload_kg: np.ndarray, scale: np.ndarray
 ) -> np.ndarray:
-    """Return derivatives (n, 6 + n_chambers, p) of measurements over their scales; zero without a rest."""
+    """Return derivatives (n, m, p) of measurements over their scales (3,) or (4,); zero without a rest."""
     n, n_chambers = pressure_kpa.shape
     guess = StaticPoses(
         pressure_kpa=pressure_kpa,
@@ -182,6 +188,9 @@ def _derivatives(
         marker_m=np.zeros((n, 0, 3)),
         single=np.zeros(n, bool),
     )
-    error, slope, _ = simulate(spec, guess, np.zeros(len(priors(spec))))
+    end_m = np.zeros((n, spec.structure.n_sections, 3))
+    error, slope, _ = simulate(spec, guess, end_m, np.zeros(len(priors(spec))))
+    group = error_groups(spec)
+    seen = group < len(scale)
     settled = np.isfinite(error[:, 0]) & np.isfinite(slope).all(axis=(1, 2))
-    return np.where(settled[:, None, None], slope, 0.0) / np.repeat(scale, [3, 3, n_chambers])[:, None]
+    return np.where(settled[:, None, None], slope[:, seen], 0.0) / scale[group[seen]][:, None]

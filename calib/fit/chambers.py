@@ -1,8 +1,8 @@
 """Stiffness, area and length of each chamber, and the arm's mounting, fitted to poses of the arm at rest.
 
 The simulated arm settles at the logged pressures; its chambers are changed until tip poses agree, and spring
-lengths where they were measured. Robust least squares (`calib.fit.leastsquares`) take the Jacobian from the
-implicit function theorem, see `calib.fit.equilibrium`.
+lengths and markers at the sections' ends where they were measured. Robust least squares
+(`calib.fit.leastsquares`) take the Jacobian from the implicit function theorem, see `calib.fit.equilibrium`.
 
 Masses are known and set the scale of all forces. The bending stiffness of the backbone is fitted too, as area
 and stiffness would otherwise absorb its error. Its axial stiffness and that of the springs cannot be fitted:
@@ -20,8 +20,9 @@ import numpy as np
 
 from calib.errors import FitError
 from calib.fit.blocks import held_out_blocks
-from calib.fit.equilibrium import simulate
+from calib.fit.equilibrium import error_groups, simulate
 from calib.fit.leastsquares import NOT_CONVERGED, Problem, Solution, fit, principal
+from calib.fit.markers import section_ends
 from calib.fit.parameters import half_widths, names, priors, spec_at, tolerances
 from calib.read.static_poses import StaticPoses, find_static_poses
 from mjx_softarm.logs.rest import HOLD_KPA
@@ -32,8 +33,8 @@ MIN_POSES = 20
 ENOUGH_POSES = 100
 HELD_OUT_SHARE = 0.2
 HELD_OUT_BLOCK = 5  # poses
-SCALE = (1e-3, 0.01, 1e-3)  # of tip [m], rotation [rad] and springs [m]
-MIN_SCALE = (1e-4, 1e-3, 1e-4)
+SCALE = (1e-3, 0.01, 1e-3, 1e-3)  # of tip [m], rotation [rad], springs [m] and markers [m]
+MIN_SCALE = (1e-4, 1e-3, 1e-4, 1e-4)
 MAX_RATIO = 2.0  # calibrated to specified value, and held-out to other errors
 TOLD_TURN_DEG = 1.0
 MAX_PRESSURE_GAP = 0.1  # share of the range that may be missing at either end
@@ -65,7 +66,8 @@ class ChamberFit:
         weak: unknown directions, whose width is above 1, in words.
         in_sample, held_out: errors of the calibrated arm; held-out poses took no part in the fit.
         in_sample_before, held_out_before: errors of the specification that the fit started from.
-        scale: robust errors (3,) of tip [m], rotation [rad] and springs [m].
+        scale: robust errors (3,) of tip [m], rotation [rad] and springs [m], then of markers [m] if there
+            are any.
         rows: number of rows of the logs, by use.
         n_single: number of poses of one row, which cannot show whether the tip moved.
         poses: static poses of the logs, in their order.
@@ -91,6 +93,11 @@ class ChamberFit:
     tip_error_mm: np.ndarray
     chamber_m: np.ndarray
     warnings: tuple[str, ...]
+
+    @property
+    def has_markers(self) -> bool:
+        """Whether markers at the sections' ends took part."""
+        return len(self.scale) == len(SCALE)
 
     @property
     def is_better(self) -> bool:
@@ -133,11 +140,11 @@ def calibrate_chambers(logs: Log | Sequence[Log], spec: ArmSpec, seed: int = 0) 
     poses = poses._replace(pressure_kpa=np.where(held, poses.pressure_kpa.mean(axis=0), poses.pressure_kpa))
     held_out = held_out_blocks(poses.n, HELD_OUT_SHARE, HELD_OUT_BLOCK, seed)
     fitted = poses.take(~held_out)
-    group = np.repeat([0, 1, 2], [3, 3, spec.n_chambers])
-    problem = Problem(priors(spec), group, np.array(SCALE), np.array(MIN_SCALE))
-    solution = fit(lambda x: simulate(spec, fitted, x)[:2], problem)
-    before, _, _ = simulate(spec, poses, np.zeros_like(solution.x))
-    after, _, chamber_m = simulate(spec, poses, solution.x)
+    end_m, complaints = _section_ends(poses, spec)
+    problem = Problem(priors(spec), error_groups(spec), np.array(SCALE), np.array(MIN_SCALE))
+    solution = fit(lambda x: simulate(spec, fitted, end_m[~held_out], x)[:2], problem)
+    before, _, _ = simulate(spec, poses, end_m, np.zeros_like(solution.x))
+    after, _, chamber_m = simulate(spec, poses, end_m, solution.x)
     calibrated = _calibrated(spec, solution.x, poses)
     widths, directions = principal(solution, tolerances(spec))
     each = zip(widths, directions.T, strict=True)
@@ -147,20 +154,28 @@ def calibrate_chambers(logs: Log | Sequence[Log], spec: ArmSpec, seed: int = 0) 
         half_width_95=half_widths(calibrated, solution.half_width),
         direction_widths=widths,
         weak=weak,
-        in_sample=_errors(after[~held_out]),
-        held_out=_errors(after[held_out]),
-        in_sample_before=_errors(before[~held_out]),
-        held_out_before=_errors(before[held_out]),
-        scale=solution.scale,
+        in_sample=_errors(after[~held_out], spec),
+        held_out=_errors(after[held_out], spec),
+        in_sample_before=_errors(before[~held_out], spec),
+        held_out_before=_errors(before[held_out], spec),
+        scale=solution.scale[: 4 if np.isfinite(end_m).any() else 3],
         rows=rows,
         n_single=int(np.count_nonzero(poses.single)),
         poses=poses,
         is_held_out=held_out,
         tip_error_mm=np.where(np.isinf(after[:, 0]), np.nan, 1e3 * np.linalg.norm(after[:, :3], axis=1)),
         chamber_m=chamber_m,
-        warnings=(),
+        warnings=complaints,
     )
-    return dataclasses.replace(found, warnings=_warnings(found, spec, solution))
+    return dataclasses.replace(found, warnings=complaints + _warnings(found, spec, solution))
+
+
+def _section_ends(poses: StaticPoses, spec: ArmSpec) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return the markers at the sections' ends, NaN where they are not to be used, and why not."""
+    try:
+        return section_ends(poses, spec), ()
+    except FitError as error:  # the fit goes without them
+        return np.full((poses.n, spec.structure.n_sections, 3), np.nan), (str(error),)
 
 
 def _calibrated(spec: ArmSpec, x: np.ndarray, poses: StaticPoses) -> ArmSpec:
@@ -180,13 +195,13 @@ def _describe(width: float, vector: np.ndarray, names: Sequence[str]) -> str:
     return f"known to {width:.1f} times the tolerance: {' '.join(components)}"
 
 
-def _errors(error: np.ndarray) -> Errors:
+def _errors(error: np.ndarray, spec: ArmSpec) -> Errors:
     settled = error[~np.isinf(error[:, 0])].reshape(-1, error.shape[1])
     if len(settled) == 0:
         return Errors(0, np.nan, np.nan, np.nan, np.nan, None)
     tip_mm = 1e3 * np.linalg.norm(settled[:, :3], axis=1)
     turn_deg = np.degrees(np.arcsin(np.minimum(np.linalg.norm(settled[:, 3:6], axis=1), 1.0)))
-    spring = settled[:, 6:]
+    spring = settled[:, 6 : 6 + spec.n_chambers]
     measured = np.isfinite(spring).any()
     tip_95_mm, turn_95_deg = float(np.percentile(tip_mm, 95)), float(np.percentile(turn_deg, 95))
     spring_rms_mm = 1e3 * float(np.sqrt(np.nanmean(spring**2))) if measured else None

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from calib.fit.parameters import with_numbers
+from calib.fit.parameters import marker_sites, with_numbers
 from calib.read.static_poses import StaticPoses
-from mjx_softarm.mechanics.kinematics import chain_kinematics
+from mjx_softarm.mechanics.kinematics import Frames, chain_kinematics
 from mjx_softarm.mechanics.settle import RESIDUAL_TOLERANCE, settle_pressures
 from mjx_softarm.mechanics.statics import ArmParams, tendons
 from mjx_softarm.spec import ArmSpec
@@ -28,6 +28,7 @@ class Measured(NamedTuple):
     tip_m: Array | np.ndarray  # (3,)
     tip_rotation: Array | np.ndarray  # (3, 3)
     spring_m: Array | np.ndarray  # (n_chambers,)
+    end_m: Array | np.ndarray  # (n_sections, 3) markers on the sections' last plates
 
 
 def residuals(x: Array, params: ArmParams, measured: Measured) -> tuple[Array, Array, Array]:
@@ -39,7 +40,8 @@ def residuals(x: Array, params: ArmParams, measured: Measured) -> tuple[Array, A
         measured: measurements of one pose.
 
     Returns:
-        (6 + n_chambers,): tip [m]; rotation [rad], the axis times the sine of the angle; springs [m].
+        (6 + n_chambers + 3 n_sections,): tip [m]; rotation [rad], the axis times the sine of the angle;
+            springs [m]; markers at the sections' ends [m].
         (): largest residual force [N, N m].
         (n_chambers,) [m]: chamber lengths.
     """
@@ -50,27 +52,49 @@ def residuals(x: Array, params: ArmParams, measured: Measured) -> tuple[Array, A
         found = settle_pressures(
             kinematics, arm.without_pressure_limits(), jnp.asarray(measured.pressure_kpa)
         )
-        chamber_m = tendons(kinematics(jax.lax.stop_gradient(found.q)), arm.chamber_site_m).length
+        frames = kinematics(found.q)
+        chamber_m = tendons(jax.lax.stop_gradient(frames), arm.chamber_site_m).length
         turn = measured.tip_rotation.T @ found.tip_rotation
+        end_m = _section_ends(frames, marker_sites(x, len(found.spring_m)))
     angle = 0.5 * jnp.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
-    error = [found.tip_position_m - measured.tip_m, angle, found.spring_m - measured.spring_m]
+    error = [
+        found.tip_position_m - measured.tip_m,
+        angle,
+        found.spring_m - measured.spring_m,
+        (end_m - measured.end_m).reshape(-1),
+    ]
     return jnp.concatenate(error), found.residual, jax.lax.stop_gradient(chamber_m)
 
 
-def simulate(spec: ArmSpec, poses: StaticPoses, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def error_groups(spec: ArmSpec) -> np.ndarray:
+    """Return the kind (m,) of each of the `residuals`: tip 0, rotation 1, springs 2, markers 3."""
+    return np.repeat([0, 1, 2, 3], [3, 3, spec.n_chambers, 3 * spec.structure.n_sections])
+
+
+def _section_ends(frames: Frames, site_m: Array) -> Array:
+    """Return the places (n_sections, 3) [m] of sites (n_sections, 3) [m] on the sections' last plates."""
+    step = (len(frames.plate_position) - 1) // len(site_m)
+    position, rotation = frames.plate_position[step::step], frames.plate_rotation[step::step]
+    return position + jnp.sum(rotation * site_m[:, None], axis=-1)
+
+
+def simulate(
+    spec: ArmSpec, poses: StaticPoses, end_m: np.ndarray, x: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Simulate all poses at x.
 
     Args:
         spec: arm at x = 0.
         poses: n measured poses.
+        end_m (n, n_sections, 3) [m]: markers at the sections' ends, NaN where not measured.
         x (p,): see `calib.fit.parameters`.
 
     Returns:
-        Errors (n, 6 + n_chambers) of `residuals`, inf where the arm does not settle; their Jacobian
-        (n, 6 + n_chambers, p); chamber lengths (n, n_chambers) [m].
+        Errors (n, m) of `residuals`, inf where the arm does not settle; their Jacobian (n, m, p); chamber
+        lengths (n, n_chambers) [m].
     """
     params = ArmParams.from_spec(spec)
-    fields = (poses.pressure_kpa, poses.payload_kg, poses.tip_m, poses.tip_rotation, poses.spring_m)
+    fields = (poses.pressure_kpa, poses.payload_kg, poses.tip_m, poses.tip_rotation, poses.spring_m, end_m)
     padded = -(-poses.n // BATCH) * BATCH
     measured = Measured(*(np.resize(np.float32(f), (padded, *f.shape[1:])) for f in fields))
     batches = [Measured(*(f[k : k + BATCH] for f in measured)) for k in range(0, padded, BATCH)]

@@ -1,13 +1,16 @@
-"""Length limits of the chambers from markers along the arm, at its most bent poses.
+"""Markers along the arm: the sections' ends, which the fit uses, and length limits of the chambers.
 
-The markers sit at one site of every ring, evenly spaced from the base to the tip, the last on the tip's
-plate. Three polynomials of fourth order X(s), Y(s), Z(s) run through them and through that site of the base.
-The rings turn with the curve without twisting about it, so any other site of the rings, such as that of a
-chamber, has a parallel curve. The length of a chamber is the length of its curve within its section.
+The markers sit on rings, evenly spaced from the base to the tip, as many in each section, the last on the
+tip's plate. So one of them is on the last plate of each section, wherever on it.
+
+For lengths, at the most bent poses, they are taken to sit at one site of every ring. Three polynomials of
+fourth order X(s), Y(s), Z(s) run through them and through that site of the base. The rings turn with the
+curve without twisting about it, so any other site of the rings, such as that of a chamber, has a parallel
+curve. The length of a chamber is the length of its curve within its section.
 
 A polynomial of fourth order is too smooth for three sections that bend independently, so the lengths are
 coarse: on simulated arms without noise they are off by 5 mm RMS with markers in the middle of the rings, by
-6 mm at the chambers and by 11 mm at the springs, and by tens of mm at worst. So they only check the fit. The
+6 mm at the chambers and by 11 mm at the springs, and by tens of mm at worst. So these only check the fit. The
 range of a chamber follows from its pressure limits, stiffness and area; that of a spring, from measurements.
 
 Source: Simulation Calibration and Validation in Meng et al.
@@ -44,6 +47,25 @@ class MarkerLimits(NamedTuple):
     length_max_m: float
 
 
+def section_ends(poses: StaticPoses, spec: ArmSpec) -> np.ndarray:
+    """Return the markers on the sections' last plates (n, n_sections, 3) [m], NaN where not measured.
+
+    Raises:
+        FitError: the sections do not have equally many, no pose has them, or the last is off the tip's plate.
+    """
+    n_markers, n_sections = poses.marker_m.shape[1], spec.structure.n_sections
+    if n_markers == 0:
+        return np.full((poses.n, n_sections, 3), np.nan)
+    if n_markers % n_sections:
+        raise FitError(f"markers: got {n_markers}, expected as many in each of {n_sections} sections")
+    seen = np.flatnonzero(np.isfinite(poses.marker_m).all(axis=(1, 2)))
+    if len(seen) == 0:
+        raise FitError("markers: got no pose at rest that has them, expected one or more")
+    _marker_site(poses.take(seen))
+    step = n_markers // n_sections
+    return poses.marker_m[:, step - 1 :: step]
+
+
 def marker_limits(poses: StaticPoses, simulated_m: np.ndarray, spec: ArmSpec) -> MarkerLimits:
     """Compute length limits from the most bent poses.
 
@@ -53,17 +75,12 @@ def marker_limits(poses: StaticPoses, simulated_m: np.ndarray, spec: ArmSpec) ->
         spec: the arm.
 
     Raises:
-        FitError: there are fewer than five markers, no pose has them, or the last is off the tip's plate.
+        FitError: there are fewer than `MIN_MARKERS`, or as in `section_ends`.
     """
-    n_markers = poses.marker_m.shape[1]
-    if n_markers < MIN_MARKERS or n_markers % spec.structure.n_sections:
-        raise FitError(
-            f"markers: got {n_markers}, expected {MIN_MARKERS} or more, as many in each of "
-            f"{spec.structure.n_sections} sections"
-        )
+    if poses.marker_m.shape[1] < MIN_MARKERS:
+        raise FitError(f"markers: got {poses.marker_m.shape[1]}, expected {MIN_MARKERS} or more")
+    section_ends(poses, spec)
     seen = np.flatnonzero(np.isfinite(poses.marker_m).all(axis=(1, 2)))
-    if len(seen) == 0:
-        raise FitError("markers: got no pose at rest that has them, expected one or more")
     site_m = _marker_site(poses.take(seen))
     bending_deg = np.degrees(np.arccos(np.clip(poses.tip_rotation[seen, 2, 2], -1.0, 1.0)))
     order = np.argsort(-bending_deg)[:N_POSES]

@@ -5,7 +5,8 @@ area's slope, in areas per section length; the change of its rest length, in sec
 logarithm of the ratio of the backbone's bending stiffness, and the mounting: the base's turn about x and y
 and its offset, the roll of each section's holes, the turn of the measured tip and its offset within the last
 plate. The base's turn about z is the roll of all sections; an offset of the tip along the arm is one of the
-base.
+base. Last come the sites of the markers at the sections' ends within their plates, one by one, as a marker is
+stuck on by hand: nobody needs them, so any error of them is tolerated.
 """
 
 from __future__ import annotations
@@ -49,6 +50,8 @@ BLOCKS = (
     Block("roll", "section", 0, 0.2, 0.01),  # 11 deg
     Block("tip turn", "", 3, 0.5, 0.01),  # 29 deg
     Block("tip offset", "", 2, 0.01, 0.002),  # [m]
+    Block("marker x", "section", 0, 0.05, 1.0),  # [m]
+    Block("marker y", "section", 0, 0.05, 1.0),
 )
 
 
@@ -113,6 +116,12 @@ def with_numbers(x: Array, params: ArmParams) -> ArmParams:
             tip_rotation=product(jnp.asarray(mount.tip_rotation), _turned(by["tip turn"])),
         ),
     )
+
+
+def marker_sites(x: Array, n_chambers: int) -> Array:
+    """Return where the sections' end markers sit in their plates (n_sections, 3) [m] at x (p,)."""
+    by = _split(x, n_chambers)
+    return jnp.stack([by["marker x"], by["marker y"], jnp.zeros_like(by["marker x"])], axis=-1)
 
 
 def _rolled(site_m: Array, roll: Array) -> Array:

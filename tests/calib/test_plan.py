@@ -69,6 +69,15 @@ def test_a_plan_makes_directions_known(recorded):
     assert np.abs(found.pressure_kpa[: found.n_informative]).mean() > 10.0
 
 
+def test_markers_of_the_calibration_count_for_the_plan_too(recorded, tmp_path):
+    with_markers = recorded._replace(scale=np.append(recorded.scale, 1e-3))
+    save_recorded(tmp_path / RECORDED_FILE, with_markers)
+    loaded = load_recorded(tmp_path / RECORDED_FILE, 3)
+    np.testing.assert_array_equal(loaded.scale, with_markers.scale)
+    unknown = [plan(SMALL, known, 30, seed=0).n_unknown for known in (recorded, loaded)]
+    assert unknown[1][0] <= unknown[0][0] and unknown[1] != unknown[0]
+
+
 def test_from_a_calibration_to_a_file_that_record_reads(recorded, tmp_path, capsys):
     SMALL.to_toml(tmp_path / "arm.toml")
     save_recorded(tmp_path / RECORDED_FILE, recorded)

@@ -1,7 +1,9 @@
 """Chambers of planted arms come back from noisy poses; what poses do not tell is said."""
 
 import dataclasses
+from pathlib import Path
 
+import jax
 import mujoco
 import numpy as np
 import pytest
@@ -11,6 +13,8 @@ from calib.fit.chambers import MIN_POSES, calibrate_chambers
 from calib.fit.parameters import BENDING, FIELDS
 from mjx_softarm import ArmSpec
 from mjx_softarm.logs.schema import Log
+from mjx_softarm.mechanics import excitation
+from mjx_softarm.mechanics.kinematics import chain_frames
 from mjx_softarm.mechanics.workspace import settle_many
 
 SPEC = ArmSpec.default()
@@ -65,8 +69,8 @@ def pose_log(arm, n, seed, pressure_kpa=None, **changes):
         source="poses.csv",
         row=np.arange(n) + 2,
         time_s=5.0 * np.arange(n),
-        spring_m=found.spring_m + noise(SPRING_NOISE_M, 9),
-        pressure_kpa=pressure_kpa + noise(PRESSURE_NOISE_KPA, 9),
+        spring_m=found.spring_m + noise(SPRING_NOISE_M, arm.n_chambers),
+        pressure_kpa=pressure_kpa + noise(PRESSURE_NOISE_KPA, arm.n_chambers),
         tip_m=found.tip_position_m + noise(TIP_NOISE_M, 3),
         tip_quaternion=quaternions(found.tip_rotation, noise(TURN_NOISE_RAD, 3)),
         payload_kg=np.full(n, arm.mass.payload_kg),
@@ -117,6 +121,37 @@ def test_without_springs_stiffness_and_area_come_back_and_the_offsets_are_said_t
     assert "offset" in fitted_without_springs.weak[0]
     assert fitted_without_springs.direction_widths[0] > 3.0
     assert any("directions" in warning for warning in fitted_without_springs.warnings)
+
+
+def end_markers(arm, n, seed, site_m):
+    """Markers (n, n_sections, 3) of the poses of `pose_log` at sites of the sections' last plates."""
+    found = settle_many(arm, random_pressures(n, seed))
+    frames = jax.vmap(lambda q: chain_frames(q, arm.link_length_m))(found.q)
+    step = arm.structure.links_per_section
+    place, turn = frames.plate_position[:, step::step], frames.plate_rotation[:, step::step]
+    marker_m = place + np.einsum("nsij,sj->nsi", turn, site_m)
+    return marker_m + np.random.default_rng([seed, 2]).normal(scale=TIP_NOISE_M, size=marker_m.shape)
+
+
+def test_markers_at_the_sections_ends_tell_the_offsets_wherever_they_are_stuck(fitted_without_springs):
+    site_m = np.array([[0.03, 0.0, 0.0], [0.0, 0.04, 0.0], [-0.02, 0.01, 0.0]])
+    marker_m = end_markers(planted(), 200, 0, site_m)
+    fit = calibrate_chambers(pose_log(planted(), 200, seed=0, spring_m=None, marker_m=marker_m), SPEC)
+    assert fit.has_markers and not fitted_without_springs.has_markers
+    assert fit.direction_widths[0] < 0.5 * fitted_without_springs.direction_widths[0]
+    assert len(fit.weak) < len(fitted_without_springs.weak)
+    assert off_by(fit.spec, planted())[3] < 1.5e-3
+    assert fit.scale[3] == pytest.approx(TIP_NOISE_M, rel=0.2)
+
+
+def test_an_arm_of_two_sections_is_calibrated():
+    spec = ArmSpec.of(Path("sopra"))
+    arm = spec.replace(chambers={"stiffness_n_per_m": 1.2 * spec.chambers.stiffness_n_per_m})
+    pressure_kpa = excitation.random_pressures(arm, 60, np.random.default_rng(0))
+    log = pose_log(arm, 60, 0, pressure_kpa, marker_m=np.zeros((60, 5, 3)))
+    fit = calibrate_chambers(log, spec)
+    assert fit.is_better and fit.held_out.translation_mean_mm < 1.5
+    assert any("markers: got 5, expected as many in each of 2 sections" in w for w in fit.warnings)
 
 
 def test_the_calibrated_tip_is_the_planted_arm_s(fitted, fitted_without_springs):
