@@ -22,9 +22,9 @@ from typing import Any
 
 import numpy as np
 
-from calib.errors import FitError
 from calib.fit.chambers import MIN_POSES, ChamberFit, calibrate_chambers
-from calib.fit.markers import marker_limits
+from calib.fit.held_pressures import HeldPressures, fit_held_pressures
+from calib.fit.markers import MIN_MARKERS, marker_limits
 from calib.fit.s2r import fit_s2r, simulate_poses
 from calib.fit.sensors import fit_springs
 from calib.fit.transients import calibrate_damping, find_stretches
@@ -87,7 +87,9 @@ def calibrate(
     progress("damping ...")
     spec, damping = _damping(seen, spec, seed)
     progress("sim-to-real network ...")
-    s2r, network, error_mm, poses = _s2r(seen, spec, seed)
+    s2r, network, error_mm, poses, held = _s2r(seen, spec, seed)
+    if held is not None and held.is_better:
+        spec = spec.replace(unmodelled=dataclasses.asdict(held.unmodelled))
     if recorded is not None and error_mm is not None:
         recorded = recorded._replace(error_mm=error_mm)
     return Calibration(spec, s2r, recorded, (springs, chambers, damping, network), poses)
@@ -162,11 +164,8 @@ def _chambers(logs: Sequence[Log], spec: ArmSpec, seed: int) -> tuple[ArmSpec, S
         return spec, Section("Chambers", needed, warnings=(remedy,)), None
     fit = calibrate_chambers(logs, spec, seed)
     section = sections.chambers(fit)
-    if fit.poses.marker_m.shape[1]:
-        try:
-            section = sections.with_markers(section, marker_limits(fit.poses, fit.chamber_m, fit.spec))
-        except FitError as error:  # markers only check, so a calibration does not fail for them
-            section = dataclasses.replace(section, warnings=(*section.warnings, str(error)))
+    if fit.has_markers and fit.poses.marker_m.shape[1] >= MIN_MARKERS:
+        section = sections.with_markers(section, marker_limits(fit.poses, fit.chamber_m, fit.spec))
     return fit.spec if fit.is_better else spec, section, _recorded(fit)
 
 
@@ -186,12 +185,13 @@ def _damping(logs: Sequence[Log], spec: ArmSpec, seed: int) -> tuple[ArmSpec, Se
 
 def _s2r(
     logs: Sequence[Log], spec: ArmSpec, seed: int
-) -> tuple[S2R | None, Section, np.ndarray | None, dict[str, PosePairs]]:
+) -> tuple[S2R | None, Section, np.ndarray | None, dict[str, PosePairs], HeldPressures | None]:
     """Fit the network of the unloaded arm: with a payload, the simulation differs.
 
     Returns:
         The network, its section, its error [mm] at each pose of the logs, of which those not held out
-        get the mean, and measured poses beside simulated ones, without and with it.
+        get the mean, measured poses beside simulated ones, without and with it, and the pressures that hold
+        the arm at these poses.
     """
     poses, rows = find_static_poses(logs, spec)
     unloaded = np.isclose(poses.payload_kg, spec.mass.payload_kg, rtol=0.0, atol=1e-6)
@@ -204,7 +204,7 @@ def _s2r(
         rows |= {"poses at which the simulated arm finds no rest": poses.n - n_settled}
         needed = f"Not fitted: {_few(MIN_S2R_POSES, what, n_settled, rows)}"
         remedy = f"policies will be trained on simulated poses: log {MIN_S2R_POSES} poses at rest or more"
-        return None, Section("Sim-to-real network", needed, warnings=(remedy,)), None, {}
+        return None, Section("Sim-to-real network", needed, warnings=(remedy,)), None, {}, None
     real = pose_from_frame(poses.tip_m, poses.tip_rotation)
     settled, real = simulated.take(simulated.valid), real[simulated.valid]
     pose, spring_m = settled.pose, settled.spring_m
@@ -214,8 +214,9 @@ def _s2r(
     pairs = {"simulated": PosePairs(real, pose, never), "with the network": corrected}
     error_mm = np.full(n_poses, fit.test.translation_mean_mm)
     error_mm[used[simulated.valid][fit.held_out]] = corrected.error_mm[fit.held_out]
-    section = sections.s2r(fit, pose, spring_m, real, poses.n - n_settled)
-    return fit.s2r if fit.is_better else None, section, error_mm, pairs
+    held = fit_held_pressures(spec, spring_m, poses.pressure_kpa[simulated.valid], settled.pressure_kpa, seed)
+    section = sections.with_pressures(sections.s2r(fit, pose, spring_m, real, poses.n - n_settled), held)
+    return fit.s2r if fit.is_better else None, section, error_mm, pairs, held
 
 
 def _few(n: int, what: str, n_found: int, rows: Mapping[str, int]) -> str:

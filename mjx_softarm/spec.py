@@ -24,7 +24,7 @@ from mjx_softarm._support.fields import (
     anything,
     count,
     not_negative,
-    per_section,
+    numbers,
     positive,
     read_fields,
     vector,
@@ -118,9 +118,21 @@ class Mounting:
 
     base_turn_deg: tuple[float, ...] = vector()  # of the base, in the base frame
     base_offset_m: tuple[float, ...] = vector()  # of the base, in the base frame
-    section_roll_deg: tuple[float, ...] = per_section()  # of a section's holes about its axis
+    section_roll_deg: tuple[float, ...] = numbers()  # of each section's holes about its axis
     tip_turn_deg: tuple[float, ...] = vector()  # of the measured tip's axes, in those of the last plate
     tip_offset_m: tuple[float, ...] = vector()  # of the measured tip, in the axes of the last plate
+
+
+@dataclass(frozen=True)
+class Unmodelled:
+    """Pressures that hold the unloaded arm, measured less simulated: what the model of the chambers leaves.
+
+    Linear in the springs' lengths; nothing where a file has no such table. The simulation goes without, but a
+    payload is told by pressures, with this taken into account.
+    """
+
+    pressure_kpa: tuple[float, ...] = numbers()  # of each chamber, where springs have their sections' length
+    slope_kpa_per_m: tuple[float, ...] = numbers()  # a row for each chamber, a column for each spring
 
 
 @dataclass(frozen=True)
@@ -141,6 +153,7 @@ class ArmSpec:
     sensor: Sensor = field(metadata={"kinds": SENSORS})  # without `kind` in a file: the first
     control: Control
     mounting: Mounting = Mounting()
+    unmodelled: Unmodelled = Unmodelled()
 
     @property
     def n_chambers(self) -> int:
@@ -162,6 +175,14 @@ class ArmSpec:
     def section_roll_deg(self) -> tuple[float, ...]:
         """One number per section."""
         return self.mounting.section_roll_deg or (0.0,) * self.structure.n_sections
+
+    def unmodelled_kpa(self, spring_m: np.ndarray) -> np.ndarray:
+        """Return measured less simulated pressures (..., n) [kPa] at springs (..., n) [m], unloaded."""
+        if not self.unmodelled.pressure_kpa:
+            return np.zeros_like(spring_m)
+        slope = np.reshape(self.unmodelled.slope_kpa_per_m, (self.n_chambers, self.n_chambers))
+        stretched_m = spring_m - self.geometry.section_length_m
+        return np.asarray(self.unmodelled.pressure_kpa) + stretched_m @ slope.T
 
     @classmethod
     def default(cls) -> ArmSpec:
@@ -235,14 +256,19 @@ class ArmSpec:
 
     def _check_together(self, source: str) -> None:
         """Refuse fields that contradict each other."""
-        roll = self.mounting.section_roll_deg
-        if roll and len(roll) != self.structure.n_sections:
-            raise SpecError(
-                f"{source}: mounting.section_roll_deg: got {len(roll)} numbers, "
-                f"expected {self.structure.n_sections}, one for each section"
-            )
+        n, counted = self.n_chambers, ("mounting", "unmodelled")
+        for path, wanted, what in (
+            ("mounting.section_roll_deg", self.structure.n_sections, "one for each section"),
+            ("unmodelled.pressure_kpa", n, "one for each chamber"),
+            ("unmodelled.slope_kpa_per_m", n * n, "a row for each chamber"),
+        ):
+            group, name = path.split(".")
+            got = len(getattr(getattr(self, group), name))
+            needed = group == "unmodelled" and self.unmodelled != Unmodelled()
+            if (got or needed) and got != wanted:
+                raise SpecError(f"{source}: {path}: got {got} numbers, expected {wanted}, {what}")
         for group, values in self.to_dict().items():
-            for name, value in values.items() if isinstance(values, dict) and group != "mounting" else ():
+            for name, value in values.items() if isinstance(values, dict) and group not in counted else ():
                 if isinstance(value, tuple) and len(value) != self.n_chambers:
                     raise SpecError(
                         f"{source}: {group}.{name}: got {len(value)} numbers, "

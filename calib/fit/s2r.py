@@ -46,6 +46,7 @@ class SimulatedPoses(NamedTuple):
 
     pose: np.ndarray  # (n, 6) [mm, deg]
     spring_m: np.ndarray  # (n, n_chambers) lengths reached
+    pressure_kpa: np.ndarray  # (n, n_chambers) that hold them
     valid: np.ndarray  # (n,) bool, whether the arm settled
     sections: Sections
 
@@ -121,7 +122,11 @@ def _settle():
         end: Any = settle(kinematics, params, reference)
         pose = pose_from_frame(end.tip_position_m, end.tip_rotation)
         return SimulatedPoses(
-            pose, end.spring_m, end.settled, sections(kinematics(end.q), params, end.spring_m)
+            pose,
+            end.spring_m,
+            end.pressure_kpa,
+            end.settled,
+            sections(kinematics(end.q), params, end.spring_m),
         )
 
     return jax.jit(jax.vmap(one, in_axes=(None, 0)))

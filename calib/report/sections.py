@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from calib.fit.chambers import ChamberFit, Errors
+from calib.fit.held_pressures import HeldPressures
 from calib.fit.markers import MarkerLimits
 from calib.fit.parameters import BENDING
 from calib.fit.s2r import PoseErrors, S2RFit
@@ -178,6 +179,17 @@ def s2r(fit: S2RFit, pose: np.ndarray, spring_m: np.ndarray, real: np.ndarray, n
     )
 
 
+def with_pressures(section: Section, held: HeldPressures) -> Section:
+    """Say in the network's section how far simulated pressures are off, before and after their fit."""
+    text = (
+        f" The pressures that hold these poses are {held.before_kpa:.2f} kPa off the simulated ones (RMS, "
+        f"held-out poses), and {held.after_kpa:.2f} kPa after a straight line in the springs' lengths, by "
+        "which payloads are told."
+    )
+    data = {"held_pressures_rms_kpa": {"simulated": held.before_kpa, "fitted": held.after_kpa}}
+    return dataclasses.replace(section, text=section.text + text, data=section.data | data)
+
+
 def _errors(*rows: tuple[str, int, Errors | PoseErrors]) -> Table:
     head = ("tip", "poses", "mean [mm]", "95 % [mm]", "mean turn [deg]")
     shown = (
@@ -207,5 +219,5 @@ def _figure() -> tuple[Figure, Axes]:
 
 def _label(axes: Axes, x: str, y: str) -> None:
     axes.set(xlabel=x, ylabel=y)
-    axes.legend(fontsize="small", ncols=3)
+    axes.legend(fontsize="small", ncols=3, loc="upper left")
     axes.grid(alpha=0.3)

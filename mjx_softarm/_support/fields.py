@@ -29,7 +29,7 @@ class Rule:
     high: float = math.inf
     low_open: bool = False
     per_chamber: bool = False
-    length: int | None = None  # of a list; 0 for one number per section, or none
+    length: int | None = None  # of a list; 0 for any
 
     @property
     def text(self) -> str:
@@ -38,7 +38,7 @@ class Rule:
         low = "" if self.low == -math.inf else f" {'>' if self.low_open else '>='} {self.low:g}"
         high = "" if self.high == math.inf else f" and <= {self.high:g}" if low else f" <= {self.high:g}"
         if self.length is not None:
-            return f"a list of {self.length} numbers" if self.length else "a list with one number per section"
+            return f"a list of {self.length} numbers" if self.length else "a list of numbers"
         return noun + low + high + (", or a list with one per chamber" if self.per_chamber else "")
 
     def accepts(self, value: Any) -> bool:
@@ -75,8 +75,8 @@ def vector() -> Any:
     return field(default=(0.0, 0.0, 0.0), metadata={"rule": Rule(length=3)})
 
 
-def per_section() -> Any:
-    """Declare a list with one number per section, by default empty, which stands for zeros."""
+def numbers() -> Any:
+    """Declare a list of numbers, by default empty, which stands for zeros."""
     return field(default=(), metadata={"rule": Rule(length=0)})
 
 

@@ -56,7 +56,7 @@ from mjx_softarm.sensing.s2r import S2R, take_s2r
 from mjx_softarm.sensing.sensors import Sensor, SensorFault
 from mjx_softarm.spec import ArmSpec, SpecError
 
-SCHEMA_VERSION = 5
+SCHEMA_VERSION = 6
 
 KIND = "policy"
 SHIPPED = Path(__file__).parent / "shipped/paper.npz"  # for the paper's arm; its card is beside it

@@ -21,8 +21,8 @@ from mjx_softarm.policy.file import load_policy, policy_from_actor, save_policy
 from tests.properties import few
 
 PROVENANCE = {"commit": "0123abc", "created": "2025-01-31", "packages": {"numpy": "2.0"}, "seed": 7}
-# Digest of the names that schema 5 stores and of the fields of its specification.
-SCHEMA_5 = "9add86bc"
+# Digest of the names that schema 6 stores and of the fields of its specification.
+SCHEMA_6 = "1868266f"
 
 
 def make_params(hidden=(7, 5), n_actions=9):
@@ -103,7 +103,7 @@ def test_parts_are_those_of_the_arm(file):
 
 def test_file_is_plain_npz_with_named_layouts(file):
     arrays = arrays_of(file)
-    assert arrays["schema_version"] == 5 and arrays["s2r_kind"] == "mlp"
+    assert arrays["schema_version"] == 6 and arrays["s2r_kind"] == "mlp"
     parts, axes = ("pose", "goal", "error"), ("x_mm", "y_mm", "z_mm", "yaw_deg", "pitch_deg", "roll_deg")
     assert arrays["obs_layout"].tolist() == [f"{part}_{axis}" for part in parts for axis in axes]
     assert arrays["action_layout"].tolist() == [f"frequency{k}" for k in range(9)]
@@ -163,7 +163,7 @@ def test_files_that_are_no_policy(tmp_path):
 
 def test_another_schema_is_named_before_anything_else(file):
     reseal(file, drop=["gains.kp_kpa_per_m"], schema_version=np.array(3), nose=np.zeros(3))
-    expected = "expected 5; `python -m train export RUN` writes the policy anew"
+    expected = "expected 6; `python -m train export RUN` writes the policy anew"
     assert refusal(file) == f"schema_version: got 3, {expected}"
 
 
@@ -202,7 +202,7 @@ def test_every_entry_is_required_and_its_type_shape_and_numbers_are_checked(file
         ({"tolerance_m": np.array(-1e-3)}, "tolerance_m: got -0.001, expected a number > 0"),
         ({"n_actions": np.array(0)}, "n_actions: got 0, expected a whole number > 0"),
         ({"s2r_kind": np.array("tree")}, "s2r_kind: got tree, expected mlp or none"),
-        ({"s2r_kind": np.array("none")}, "s2r.0.bias: got an unknown entry, expected those of schema 5"),
+        ({"s2r_kind": np.array("none")}, "s2r.0.bias: got an unknown entry, expected those of schema 6"),
         ({"workspace": np.zeros((0, 6), np.float32)}, "workspace: got float32 (0, 6), expected "),
         ({"estimator__spring_scale_m": np.zeros(9, np.float32)}, "estimator.spring_scale_m: got [0.0, "),
         ({"provenance_json": np.array("[1]")}, "provenance_json: got '[1]', expected a JSON object"),
@@ -243,12 +243,12 @@ def test_failed_write_keeps_the_old_file_and_leaves_nothing(file, make_policy, m
     assert file.read_bytes() == before
 
 
-def test_schema_5_stays_as_it_is(file, make_policy):
+def test_schema_6_stays_as_it_is(file, make_policy):
     groups = make_policy().spec.to_dict().items()
     fields = [f"{name}.{item}" for name, group in groups if isinstance(group, dict) for item in group]
     names = "\n".join(sorted([*arrays_of(file), *fields]))
     digest = hashlib.sha256(names.encode()).hexdigest()[:8]
-    assert digest == SCHEMA_5, "other entries, or other fields of ArmSpec: raise export.SCHEMA_VERSION"
+    assert digest == SCHEMA_6, "other entries, or other fields of ArmSpec: raise export.SCHEMA_VERSION"
 
 
 def test_the_policy_that_ships_is_one_of_this_version_for_the_paper_s_arm():

@@ -89,11 +89,11 @@ def distil(spec: ArmSpec, seed: int) -> Distilled:
     key_pose, key_springs = jax.random.split(key)
     key_bend, key_load = (jax.random.fold_in(key, k) for k in (2, 3))
     poses = _with_load(sample_workspace(_stronger(spec), N_TRAINING, seed), spec.mass.payload_kg)
-    loaded = sample_loaded(spec, _loads(spec, seed), CHAMBERS_OFF, seed)
+    loaded = _as_measured(spec, sample_loaded(spec, _loads(spec, seed), CHAMBERS_OFF, seed))
     estimator = _fit(_first_estimator(spec, poses, key_pose), _pose_loss, poses, key_pose)
     estimator = _fit(estimator, _pose_loss, loaded, key_bend, "load_layers")
     load_estimator = _fit(_first_load_estimator(spec, loaded, key_load), _load_loss, loaded, key_load)
-    unloaded = sample_workspace(spec, N_TRAINING, seed)
+    unloaded = _as_measured(spec, sample_workspace(spec, N_TRAINING, seed))
     springs = _fit(_first_spring_model(unloaded, key_springs), _spring_loss, unloaded, key_springs)
     pose, load, springs = jax.tree.map(
         lambda x: np.asarray(x, np.float32), (estimator, load_estimator, springs)
@@ -103,6 +103,12 @@ def distil(spec: ArmSpec, seed: int) -> Distilled:
 
 def _with_load(pool: Pool, load_kg: float) -> LoadedPool:
     return LoadedPool(jnp.full(len(pool.pose), load_kg), pool.pressure_kpa, pool.spring_m, pool.pose)
+
+
+def _as_measured(spec: ArmSpec, pool: Any) -> Any:
+    """Return poses with the pressures that hold the real arm there, as far as its calibration knows them."""
+    real_kpa = pool.pressure_kpa + spec.unmodelled_kpa(np.asarray(pool.spring_m))
+    return pool._replace(pressure_kpa=jnp.asarray(real_kpa, jnp.float32))
 
 
 def _loads(spec: ArmSpec, seed: int) -> np.ndarray:
@@ -223,7 +229,9 @@ def _errors(
     for payload_kg in PAYLOADS_KG:
         load_kg = spec.mass.payload_kg + payload_kg
         loaded = spec.replace(mass={"payload_kg": load_kg})
-        pool = jax.tree.map(np.asarray, sample_workspace(loaded, N_HELD_OUT, HELD_OUT_SEED))
+        pool = jax.tree.map(
+            np.asarray, _as_measured(spec, sample_workspace(loaded, N_HELD_OUT, HELD_OUT_SEED))
+        )
         position_m, rotation = frame_from_pose(pool.pose)
         guess = estimate_frame(estimator, pool.spring_m, load_kg)
         chord = np.sqrt(np.sum((guess.rotation - rotation) ** 2, axis=(-2, -1)) / 8)  # sin of half the angle
@@ -232,8 +240,8 @@ def _errors(
         turn_deg[payload_kg] = _error(np.degrees(2.0 * np.arcsin(np.minimum(chord, 1.0))))
         spring_mm[payload_kg] = _error(1e3 * springs.max(axis=-1))
         many_kg = np.full(CANDIDATES_PER_POSE * N_HELD_OUT, load_kg)
-        off = jax.tree.map(np.asarray, sample_loaded(loaded, many_kg, CHAMBERS_OFF, HELD_OUT_SEED))
-        told_kg = tell_load(load_estimator, off.spring_m, off.pressure_kpa)
+        off = _as_measured(spec, sample_loaded(loaded, many_kg, CHAMBERS_OFF, HELD_OUT_SEED))
+        told_kg = np.asarray(tell_load(load_estimator, off.spring_m, off.pressure_kpa))
         load_off_kg[payload_kg] = _error(np.abs(told_kg - load_kg))
     return tip_mm, turn_deg, load_off_kg, spring_mm
 

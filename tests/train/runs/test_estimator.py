@@ -154,3 +154,16 @@ def test_all_of_the_training_is_worth_it():
     errors = distil(SPEC, 0).tip_mm
     assert errors[0.0].median < 0.8 and errors[0.0].p95 < 1.6  # 0.5 and 1.0 without the pressure beyond
     assert errors[0.5].median < 0.7 and errors[1.0].median < 0.7
+
+
+def test_a_payload_is_told_with_what_the_calibration_found_of_the_pressures(monkeypatch, distilled, pool):
+    small(monkeypatch, 1000)
+    rng = np.random.default_rng(5)
+    table = {"pressure_kpa": tuple(rng.normal(0, 2, N)), "slope_kpa_per_m": tuple(rng.normal(0, 100, N * N))}
+    spec = SPEC.replace(unmodelled=table)
+    held_kpa = pool.pressure_kpa + spec.unmodelled_kpa(pool.spring_m)
+    found = distil(spec, 0).load_estimator
+    told_kg = np.abs(
+        [tell_load(estimator, pool.spring_m, held_kpa) for estimator in (distilled.load_estimator, found)]
+    )
+    assert np.median(told_kg[1]) < 0.08 < 0.15 < np.median(told_kg[0])

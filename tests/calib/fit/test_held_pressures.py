@@ -1,0 +1,43 @@
+"""Pressures that hold the unloaded arm: a planted straight line comes back, and only where it helps."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from calib.fit.held_pressures import fit_held_pressures
+from mjx_softarm.spec import ArmSpec, SpecError
+
+SPEC = ArmSpec.default()
+N = SPEC.n_chambers
+
+
+def poses(n=200, noise_kpa=0.3):
+    rng = np.random.default_rng(3)
+    spring_m = SPEC.geometry.section_length_m + rng.uniform(-0.02, 0.04, (n, N))
+    simulated_kpa = rng.uniform(-20.0, 20.0, (n, N))
+    return spring_m, simulated_kpa, noise_kpa * rng.standard_normal((n, N))
+
+
+def test_a_planted_line_comes_back_through_the_specification():
+    spring_m, simulated_kpa, noise_kpa = poses()
+    slope = np.random.default_rng(4).normal(0.0, 60.0, (N, N))
+    planted_kpa = 0.5 + (spring_m - SPEC.geometry.section_length_m) @ slope.T
+    fit = fit_held_pressures(SPEC, spring_m, simulated_kpa + planted_kpa + noise_kpa, simulated_kpa)
+    assert fit.is_better and fit.after_kpa < 0.4 < 2.0 < fit.before_kpa
+    spec = SPEC.replace(unmodelled=dataclasses.asdict(fit.unmodelled))
+    assert np.abs(spec.unmodelled_kpa(spring_m) - planted_kpa).max() < 0.5
+
+
+def test_noise_alone_is_told_by_the_rows_held_out():
+    spring_m, simulated_kpa, noise_kpa = poses()
+    fit = fit_held_pressures(SPEC, spring_m, simulated_kpa + noise_kpa, simulated_kpa)
+    assert not fit.is_better
+
+
+def test_a_specification_has_none_or_all_of_its_numbers():
+    assert not SPEC.unmodelled_kpa(np.full(N, 0.1)).any()
+    with pytest.raises(SpecError, match="unmodelled.slope_kpa_per_m: got 0 numbers, expected 81"):
+        SPEC.replace(unmodelled={"pressure_kpa": (1.0,) * N})
+    with pytest.raises(SpecError, match="unmodelled.pressure_kpa: got 2 numbers, expected 9"):
+        SPEC.replace(unmodelled={"pressure_kpa": (1.0, 2.0)})
