@@ -61,6 +61,7 @@ class ReachEnv(Env):
         saturated () bool        a chamber is at a pressure limit with its spring off its reference
         blocked (n_chambers,)    which chambers are
         clearance_mm ()          distance of the body to the pipe's wall; infinite without a pipe
+        path_mm (n_ticks, 3)     in motion: position of the tip at the start of each control period
 
     Metrics, each () float32:
         tip_error_mm             distance of the tip to the goal
@@ -91,9 +92,9 @@ class ReachEnv(Env):
         self.action_map = ActionMap(sensor, *(jnp.asarray(limit, jnp.float32) for limit in limits))
         diameter_mm = self.config.pipe_diameter_mm
         self.pipe = None if diameter_mm is None else CrossPipe.of_mm(diameter_mm)
-        self.uses_mjx = self.config.engine == "mjx" or self.config.mode == "dynamic"
+        self.uses_mjx = self.config.engine == "mjx" or self.moves
         self.model = mjx.put_model(build_model(self.spec)) if self.uses_mjx else None
-        self._results = MotionResult if self.config.mode == "dynamic" else SettleResult
+        self._results = MotionResult if self.moves else SettleResult
         self._failures = {f"invalid_{r.name.lower()}": r.value for r in self._results if r.value != 0}
         self.pool = self._training_pool()
 
@@ -106,13 +107,22 @@ class ReachEnv(Env):
         return self.config.observation == "motion"
 
     @property
+    def moves(self) -> bool:
+        return self.config.mode == "dynamic"
+
+    @property
+    def n_ticks(self) -> int:
+        """Control periods of an action in motion."""
+        return round(self.config.dynamic_step_s * self.spec.control.rate_hz)
+
+    @property
     def action_size(self) -> int:
         return self.spec.n_chambers
 
     @property
     def backend(self) -> str:
         """Simulation that runs: "chain" or "mjx" kinematics of the equilibrium, or "mjx dynamic" steps."""
-        return "mjx dynamic" if self.config.mode == "dynamic" else self.config.engine
+        return "mjx dynamic" if self.moves else self.config.engine
 
     def sample_pool(self, n: int, seed: int, evenly: bool = False) -> Pool:
         """Draw n poses with `sample_workspace` or `sample_evenly`, and correct them to those observed."""
@@ -146,8 +156,7 @@ class ReachEnv(Env):
 
     def sample_noise(self, rng: Array, n: int) -> EpisodeNoise:
         """Draw the random numbers of n episodes: leaves (n, ...)."""
-        moves = self.config.mode == "dynamic"
-        moving = draws.uniform(jax.random.fold_in(rng, 1), (n, 2)) if moves else None
+        moving = draws.uniform(jax.random.fold_in(rng, 1), (n, 2)) if self.moves else None
         return EpisodeNoise(*draws.both(rng, (n, 3 + self.action_size), (n, self.action_size)), moving)
 
     def reset_from(self, noise: EpisodeNoise) -> State:
@@ -185,6 +194,8 @@ class ReachEnv(Env):
             "valid": jnp.array(True),
             "clearance_mm": self._clearance_mm(start.q, start.pose),
         }
+        if self.moves:
+            info["path_mm"] = jnp.zeros((self.n_ticks, 3))
         return State(arm, self.observe(arm.pose, goal, arm.sensed), zero, zero, metrics, info)
 
     def step(self, state: State, action: Array) -> State:
@@ -226,28 +237,39 @@ class ReachEnv(Env):
         } | {
             f"reward_{name}": jnp.where(valid, term, 0.0).astype(jnp.float32) for name, term in terms.items()
         }
+        info = {
+            "saturated": blocked,
+            "blocked": saturated,
+            "valid": valid,
+            "clearance_mm": clearance_mm,
+            **self._path_mm(end),
+        }
         return state.replace(
             pipeline_state=arm,
             obs=self.observe(arm.pose, arm.goal, arm.sensed),
             reward=jnp.where(valid, value, 0.0),
             done=((reached & self.config.goal_ends) | ~valid).astype(jnp.float32),
             metrics=state.metrics | metrics,
-            info=state.info
-            | {"saturated": blocked, "blocked": saturated, "valid": valid, "clearance_mm": clearance_mm},
+            info=state.info | info,
         )
 
     def _move(self, arm: ArmState, reference_m: Array) -> tuple[Motion, Settled | Moved]:
         params, config = self.params_of(arm), self.config
         kinematics = mjx_kinematics(self.model) if config.engine == "mjx" else chain_kinematics(params)
-        if config.mode == "dynamic":
+        if self.moves:
             moving = MovingArm.of(self.model, kinematics, params, arm.damping, arm.delay_s)
             rate_hz = self.spec.control.rate_hz
             times_s = config.dynamic_step_s, 1.0 / rate_hz, config.simulation_step_s
-            return advance(
-                moving, arm.motion, reference_m, self.gains, *times_s, n_before=obs.rate_ticks(rate_hz)
-            )
+            return advance(moving, arm.motion, reference_m, self.gains, *times_s)
         end = settle(kinematics, params, reference_m)
         return Motion.at_rest(end.q, end.pressure_kpa, end.spring_m), end
+
+    def _path_mm(self, end: Settled | Moved) -> dict[str, Array]:
+        """Return `info["path_mm"]` of an arm that moved."""
+        if not isinstance(end, Moved):
+            return {}
+        frames = pose_from_frame(end.path.tip_position_m, end.path.tip_rotation)
+        return {"path_mm": self._observed_pose(frames, end.path.spring_m)[:, :3]}
 
     def clearance_cost(self, clearance_mm: Array) -> Array:
         """Return the cost (...) of clearances (...) [mm] of the body to the pipe's wall."""
@@ -275,8 +297,9 @@ class ReachEnv(Env):
             return None
         last_m, tip_mm, last_mm = end.spring_m, jnp.zeros(3), jnp.zeros(3)
         if isinstance(end, Moved):
-            last_m, tip_mm = end.last_spring_m, 1e3 * end.tip_position_m
-            last_mm = 1e3 * end.last_tip_position_m
+            before = max(self.n_ticks - obs.rate_ticks(self.spec.control.rate_hz), 0)
+            last_m, tip_mm = end.path.spring_m[before], 1e3 * end.tip_position_m
+            last_mm = 1e3 * end.path.tip_position_m[before]
         read_m, last_m = arm.spring_m + arm.sensor_offset_m, last_m + arm.sensor_offset_m
         integral_kpa = arm.motion.law.integral_kpa
         return obs.observe_motion(read_m, last_m, tip_mm, last_mm, integral_kpa, action, self.spec)

@@ -62,15 +62,22 @@ class Motion(NamedTuple):
         return cls(q, jnp.zeros_like(q), law, pressure_kpa, pressure_kpa)
 
 
+class Path(NamedTuple):
+    """Observables of an arm at the start of each of t control periods."""
+
+    spring_m: Array  # (t, n_chambers) spring lengths
+    tip_position_m: Array  # (t, 3)
+    tip_rotation: Array  # (t, 3, 3)
+
+
 class Moved(NamedTuple):
-    """Observables of an arm at the end of a motion."""
+    """Observables of an arm at the end of a motion, and on the way."""
 
     pressure_kpa: Array  # (n_chambers,) in the chambers
     spring_m: Array  # (n_chambers,) spring lengths
-    last_spring_m: Array  # (n_chambers,) spring lengths some control periods before
     tip_position_m: Array  # (3,)
-    last_tip_position_m: Array  # (3,) as long before
     tip_rotation: Array  # (3, 3)
+    path: Path
     result: Array  # () int32, a `MotionResult`
 
 
@@ -134,7 +141,6 @@ def advance(
     duration_s: float,
     period_s: float,
     step_s: float,
-    n_before: int = 1,
 ) -> tuple[Motion, Moved]:
     """Run the arm for a while under the law.
 
@@ -146,7 +152,6 @@ def advance(
         duration_s: a whole number of control periods.
         period_s: control period of the model's specification.
         step_s: time step at most; a control period has a whole number of them.
-        n_before: control periods before the end at which the last lengths and positions are told.
 
     Returns:
         State and observables at the end.
@@ -155,7 +160,7 @@ def advance(
 
     def tick(motion: Motion, _):
         now = _at(arm, motion.q)
-        told = now.spring_m, now.frames.plate_position[-1]
+        told = Path(now.spring_m, now.frames.plate_position[-1], now.frames.plate_rotation[-1])
         command, law = control.pressures(reference_m, now.spring_m, motion.law, gains, period_s)
         motion = motion._replace(law=law)
         for k in range(n_steps):
@@ -163,9 +168,8 @@ def advance(
         return motion._replace(command_kpa=command), told
 
     with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
-        n_ticks = round(duration_s / period_s)
         tick = jax.checkpoint(tick, prevent_cse=False)  # a gradient computes each tick again
-        end, told = jax.lax.scan(tick, motion, None, length=n_ticks)
+        end, path = jax.lax.scan(tick, motion, None, length=round(duration_s / period_s))
         now = _at(arm, end.q)
     finite = jnp.all(jnp.isfinite(end.q)) & jnp.all(jnp.isfinite(end.velocity))
     finite &= jnp.all(jnp.isfinite(end.pressure_kpa))
@@ -173,14 +177,12 @@ def advance(
         jnp.all(now.spring_m < LONGEST_M), MotionResult.FINITE.value, MotionResult.DIVERGED.value
     )
     result = jnp.where(finite, result, MotionResult.NOT_FINITE.value)
-    last_spring_m, last_tip_m = (each[max(n_ticks - n_before, 0)] for each in told)
     return end, Moved(
         pressure_kpa=end.pressure_kpa,
         spring_m=now.spring_m,
-        last_spring_m=last_spring_m,
         tip_position_m=now.frames.plate_position[-1],
-        last_tip_position_m=last_tip_m,
         tip_rotation=now.frames.plate_rotation[-1],
+        path=path,
         result=result.astype(jnp.int32),
     )
 

@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mjx_softarm._support import cli
+from mjx_softarm._support.provenance import write_json
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.export.write import export_cpp, export_onnx
 from train.config import ConfigError, ImitationConfig, TrainConfig
@@ -23,7 +24,7 @@ from train.options import NewRunOptions, named_preset, start
 from train.presets import IMITATION_PRESETS, PRESETS
 from train.runs import run as runs
 from train.runs.checkpoint import Run, RunError, sole_trainer
-from train.runs.evaluate import N_ACTIONS, Summary
+from train.runs.evaluate import N_ACTIONS, Evaluator, Summary
 from train.runs.export import export_run
 from train.runs.task import Task, task_of
 
@@ -115,16 +116,30 @@ class Imitate(NewRunOptions):
         return _train(Run.create(path, config, spec, s2r, log, donors, state), task, console)
 
 
-def evaluate(run: tyro.conf.Positional[Path]) -> int:
+def evaluate(run: tyro.conf.Positional[Path], in_motion: float | None = None) -> int:
     """Evaluate a run's newest policy, with figures and pictures.
 
     Args:
         run: folder of the run
+        in_motion: evaluate it on arms in motion, with actions of so many seconds, without pictures [s]
     """
     console = start()
     opened = Run.open(run)
     task, policy = runs.restore_policy(opened)
-    _show(opened, task, runs.finish(opened, task, policy), console)
+    if in_motion is None:
+        _show(opened, task, runs.finish(opened, task, policy), console)
+        return 0
+    if isinstance(opened.config, ImitationConfig):
+        raise RunError(
+            f"--in-motion: got {run}, learned from demonstrations, expected a run of `train reach`"
+        )
+    moving = dataclasses.replace(opened.config.env, mode="dynamic", dynamic_step_s=in_motion)
+    summary, *_ = Evaluator(ReachEnv(opened.spec, moving, opened.s2r), task.job.learner)(policy)
+    title = f"{task.title}, {N_ACTIONS} actions of {in_motion:g} s each, in motion"
+    _table(title, {"value": summary}, console)
+    file = opened.path / f"evaluation-in-motion-{in_motion:g}s.json"
+    write_json(file, summary.to_dict())
+    console.print(f"written: {file}", highlight=False, soft_wrap=True)
     return 0
 
 
@@ -178,12 +193,16 @@ def _show(run: Run, task: Task, summary: Any, console: Console) -> None:
     if run.config.polish_updates:
         summaries = {"TQC alone": Summary(**runs.evaluation_after(run, run.config.n_own_epochs))}
         summaries["polished"] = summary
-    table = Table(title=f"{task.title}, {N_ACTIONS} actions each", title_justify="left")
+    _table(f"{task.title}, {N_ACTIONS} actions each", summaries, console)
+    for name in task.picture_names:
+        console.print(f"picture: {run.path / name}", highlight=False, soft_wrap=True)
+
+
+def _table(title: str, summaries: dict[str, Any], console: Console) -> None:
+    table = Table(title=title, title_justify="left")
     table.add_column("figure")
     for name in summaries:
         table.add_column(name, justify="right")
     for rows in zip(*(each.rows() for each in summaries.values()), strict=True):
         table.add_row(rows[0][0], *(value for _, value in rows))
     console.print(table)
-    for name in task.picture_names:
-        console.print(f"picture: {run.path / name}", highlight=False, soft_wrap=True)

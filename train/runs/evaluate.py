@@ -25,6 +25,7 @@ from mjx_softarm.mechanics.workspace import HELD_OUT_SEED
 from train.agent.learner import Learner
 
 N_GOALS = 2_000
+NEAR_MM = 5.0  # tip error of an arm that has arrived, in motion
 PATH = 80  # goals that one arm goes to, one after another: as many as two laps of the circle
 
 
@@ -38,6 +39,9 @@ class Reached(NamedTuple):
     settled: Array  # (n,) bool, after every action
     pressure_kpa: Array  # (n, n_chambers)
     clearance_mm: Array  # (n,) of the body to the pipe's wall; infinite without a pipe
+    # In motion, else NaN:
+    near_s: Array  # (n,) time until the tip is within NEAR_MM for good; infinite if never
+    overshoot_mm: Array  # (n,) how far the tip went beyond the goal, along the way from its start
 
     @property
     def tip_error_mm(self) -> Array:
@@ -59,9 +63,15 @@ class Summary:
     circle_mean_mm: float
     circle_max_mm: float
     circle_saturated_chambers: int  # summed over the circle's points
+    # In motion:
+    near_share: float | None = None  # goals within NEAR_MM of which the tip comes for good
+    near_median_s: float | None = None  # time until then, of those goals
+    overshoot_median_mm: float | None = None
+    overshoot_p95_mm: float | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        return dataclasses.asdict(self)
+        """Return the figures that there are."""
+        return {name: value for name, value in dataclasses.asdict(self).items() if value is not None}
 
     def rows(self) -> list[tuple[str, str]]:
         """Return the rows of a table: name, and value with its unit."""
@@ -77,6 +87,18 @@ class Summary:
             ("circle, mean tip error", f"{self.circle_mean_mm:.2f} mm"),
             ("circle, largest tip error", f"{self.circle_max_mm:.2f} mm"),
             ("circle, saturated chambers", f"{self.circle_saturated_chambers}"),
+            *self._rows_of_motion(),
+        ]
+
+    def _rows_of_motion(self) -> list[tuple[str, str]]:
+        if self.near_share is None:
+            return []
+        after = "-" if self.near_median_s is None else f"{self.near_median_s:.2f} s"
+        return [
+            (f"within {NEAR_MM:g} mm for good", f"{100 * self.near_share:.1f} %"),
+            ("  after, in the median of these", after),
+            ("overshoot, median", f"{self.overshoot_median_mm:.1f} mm"),
+            ("overshoot, 95 %", f"{self.overshoot_p95_mm:.1f} mm"),
         ]
 
 
@@ -139,10 +161,14 @@ def reach(env: ReachEnv, learner: Learner, policy: Any, state: State, goal: Arra
 
     def act(state: State, _):
         after = env.step(state, learner.mode(policy, state.obs))
-        return after, after.info["valid"]
+        return after, (after.info["valid"], after.info.get("path_mm", ()))
 
-    state, settled = jax.lax.scan(act, towards(env, state, goal), None, length=N_ACTIONS)
+    state, (settled, path_mm) = jax.lax.scan(act, towards(env, state, goal), None, length=N_ACTIONS)
     arm = state.pipeline_state
+    near_s = overshoot_mm = jnp.asarray(jnp.nan)
+    if env.moves:
+        way_mm = jnp.concatenate([path_mm.reshape(-1, 3), arm.pose[None, :3]])
+        near_s, overshoot_mm = way_figures(way_mm, goal[:3], 1.0 / env.spec.control.rate_hz)
     return state, Reached(
         goal=goal,
         pose=arm.pose,
@@ -151,7 +177,26 @@ def reach(env: ReachEnv, learner: Learner, policy: Any, state: State, goal: Arra
         settled=jnp.all(settled),
         pressure_kpa=arm.pressure_kpa,
         clearance_mm=state.info["clearance_mm"],
+        near_s=near_s,
+        overshoot_mm=overshoot_mm,
     )
+
+
+def way_figures(way_mm: Array, goal_mm: Array, period_s: float) -> tuple[Array, Array]:
+    """Return when a tip came near its goal for good [s], and how far it went beyond it [mm], both ().
+
+    Args:
+        way_mm (t, 3): positions of the tip, a control period apart, the first where it began.
+        goal_mm (3,): the goal.
+        period_s: control period.
+    """
+    off_mm = way_mm - goal_mm
+    far = jnp.linalg.norm(off_mm, axis=-1) > NEAR_MM
+    last_far = jnp.max(jnp.where(far, jnp.arange(1, len(way_mm) + 1), 0))
+    near_s = jnp.where(far[-1], jnp.inf, period_s * last_far)
+    begin_mm = jnp.linalg.norm(off_mm[0])
+    along_mm = off_mm @ (-off_mm[0] / jnp.maximum(begin_mm, 1e-6))
+    return near_s, jnp.maximum(jnp.max(along_mm), 0.0)
 
 
 def follow(env: ReachEnv, learner: Learner, policy: Any, path: Array, key: Array) -> Reached:
@@ -170,6 +215,15 @@ def summarise(workspace: Reached, even: Reached, circle: Reached, threshold: flo
         free = at.saturated_chambers == 0
         return float(np.mean((at.scaled_error < threshold) & free & at.settled))
 
+    motion = {}
+    if np.isfinite(workspace.overshoot_mm).all():
+        near_s = workspace.near_s[np.isfinite(workspace.near_s)]
+        motion = {
+            "near_share": len(near_s) / len(error),
+            "near_median_s": float(np.median(near_s)) if len(near_s) else None,
+            "overshoot_median_mm": float(np.median(workspace.overshoot_mm)),
+            "overshoot_p95_mm": float(np.quantile(workspace.overshoot_mm, 0.95)),
+        }
     return Summary(
         median_mm=float(np.median(error)),
         p95_mm=float(np.quantile(error, 0.95)),
@@ -182,4 +236,5 @@ def summarise(workspace: Reached, even: Reached, circle: Reached, threshold: flo
         circle_mean_mm=float(np.mean(around)),
         circle_max_mm=float(np.max(around)),
         circle_saturated_chambers=int(np.sum(circle.saturated_chambers)),
+        **motion,
     )

@@ -77,7 +77,7 @@ def _evaluations(
     tqc = [row["env_steps"] for row in rows if "analytic/loss" not in row]
     if 0 < len(tqc) < len(rows):
         axes.axvline(tqc[-1], color=INK, linestyle=":", linewidth=1, label="polishing begins")
-    axes.legend(frameon=False)
+    axes.legend(frameon=False, loc="upper right")
 
 
 def learning_curve(rows: list[dict[str, Any]]) -> Figure:
@@ -191,7 +191,7 @@ def positions_figure(at: AtPositions) -> Figure:
     left.plot(goal[:, 0], goal[:, 2], color=GREY, marker="o", markerfacecolor="none", label="demonstrated")
     left.plot(pose[:, 0], pose[:, 2], "o", markersize=3.5, color=BLUE, label="reached")
     left.set_aspect("equal")
-    left.legend(frameon=False)
+    left.legend(frameon=False, loc="upper right")
     middle.bar(np.arange(len(error)), error, color=np.where(at.success, BLUE, ORANGE))
     if np.isfinite(at.reached.clearance_mm).all():
         right.bar(np.arange(len(error)), at.reached.clearance_mm, color=BLUE)

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from train.runs.evaluate import N_ACTIONS, Evaluator, Reached, summarise
+from train.runs.evaluate import N_ACTIONS, Evaluator, Reached, summarise, way_figures
 
 pytestmark = pytest.mark.usefixtures("quick_compiler")
 
@@ -21,6 +21,8 @@ def reached(error_mm, scaled_error, saturated, settled):
         settled=np.array(settled),
         pressure_kpa=np.zeros((n, 9)),
         clearance_mm=np.full(n, np.inf),
+        near_s=np.full(n, np.nan),
+        overshoot_mm=np.full(n, np.nan),
     )
 
 
@@ -83,3 +85,24 @@ def test_an_arm_that_fails_on_the_way_counts_as_unsettled(evaluator, actions):
     figures, workspace, _ = evaluator(actions.at[3].set(jnp.nan))
     assert N_ACTIONS > 1 and not workspace.settled[3] and workspace.settled.sum() == len(actions) - 1
     assert figures.unsettled == 2 and figures.reached_share == 1 - 1 / len(actions)
+
+
+def test_when_a_tip_is_near_for_good_and_how_far_it_went_beyond():
+    x = np.array([40.0, 20.0, 4.0, -8.0, -3.0, 1.0])  # near, beyond by 8 mm, near again
+    way = jnp.asarray(np.stack([x, 0.0 * x, 0.0 * x], axis=-1))
+    near_s, overshoot_mm = way_figures(way, jnp.zeros(3), 0.02)
+    assert near_s == pytest.approx(0.08) and overshoot_mm == pytest.approx(8.0)
+    assert np.isinf(way_figures(way[:4], jnp.zeros(3), 0.02)[0])
+    assert way_figures(way[4:], jnp.zeros(3), 0.02)[0] == 0.0
+
+
+def test_figures_of_a_motion():
+    still = reached([1.0, 9.0, 2.0], [0.01] * 3, [0] * 3, [True] * 3)
+    moving = still._replace(near_s=np.array([0.4, np.inf, 0.8]), overshoot_mm=np.array([0.0, 1.0, 2.0]))
+    at_rest = summarise(still, still, still, 0.03)
+    assert at_rest.near_share is None and "near_share" not in at_rest.to_dict()
+    figures = summarise(moving, moving, moving, 0.03)
+    assert (figures.near_share, figures.near_median_s) == (pytest.approx(2 / 3), pytest.approx(0.6))
+    assert figures.overshoot_median_mm == 1.0 and len(figures.rows()) == 4 + len(
+        summarise(still, still, still, 0.03).rows()
+    )

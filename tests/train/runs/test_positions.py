@@ -40,7 +40,7 @@ def test_positions_are_evaluated_with_body_and_pressures(short_env, perfect, sho
 
 def test_success_at_the_first_stages_positions_is_told_apart():
     zero, poses = np.zeros(3), np.zeros((3, 6))
-    reached = Reached(poses, poses, zero, zero, zero == 0, zero, np.array([5.0, -1, -1]))
+    reached = Reached(poses, poses, zero, zero, zero == 0, zero, np.array([5.0, -1, -1]), zero, zero)
     figures, _ = summarise(reached, 0.03, np.array([True, True, False]))
     assert (figures.success_share, figures.success_first_share) == (pytest.approx(1 / 3), 0.5)
     assert figures.outside_positions == 2
