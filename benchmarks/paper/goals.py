@@ -33,9 +33,8 @@ def check_goals(experiment: str, table: Sequence[Row], trainings: Sequence[Row])
 
 def _open(table: Sequence[Row]) -> list[Check]:
     unloaded, without, gradient = (_select(table, kind, "0 g") for kind in ("with", "without", "gradient"))
-    light = [row for row in table if row["load_g"] == LIGHT_G]
     told = [row for row in table if row["kind"] == "with"]
-    heavy = [row for row in table if row["load_g"] == HEAVY_G]
+    light, heavy = ([row for row in told if row["load_g"] == load_g] for load_g in (LIGHT_G, HEAVY_G))
     ratio = _mean_mm(without) / _mean_mm(unloaded)
     n_points, at_points = (_values(rows, "saturated_points") for rows in (unloaded, gradient))
     silent = sum(row["saturated_points"] > 0 and not row["saturation_events"] for row in heavy)

@@ -157,7 +157,8 @@ def scene_of(folder: Path, settings: Settings, trial: Trial) -> Scene:
 def controller_of(folder: Path, trial: Trial) -> Any:
     """Return a trial's controller: its way to find references, in the same loop.
 
-    Without S2R, the policy of the nominal arm plans spring lengths, and only the springs are calibrated.
+    Without S2R, the policy of the nominal arm plans spring lengths, and only the springs are calibrated; as
+    specified, not even these.
     """
     from benchmarks.paper.gradient_descent import gradient_descent
     from mjx_softarm.deploy.controller import Controller
@@ -165,6 +166,8 @@ def controller_of(folder: Path, trial: Trial) -> Any:
     from mjx_softarm.policy.runtime import PolicyRunner
 
     kind, twin, seed = trial.kind, trial.twin, trial.seed
+    if kind == "specified":
+        return Controller.of(load_policy(folder / reach_run(None, seed) / POLICY_FILE))
     run = learned_run(kind, twin, seed) if KINDS[kind].task else reach_run(twin, seed)
     policy = load_policy(folder / run / POLICY_FILE)
     if kind == "gradient":

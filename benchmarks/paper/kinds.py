@@ -19,6 +19,7 @@ class Kind(NamedTuple):
 
 
 KINDS = {
+    "specified": Kind("specification alone"),
     "without": Kind("without S2R"),
     "with": Kind("with S2R"),
     "gradient": Kind("gradient descent"),

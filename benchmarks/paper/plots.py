@@ -34,7 +34,7 @@ def circle_figure(outcomes: Mapping[Trial, Outcome]) -> Figure:
 
     Points at which a chamber is saturated are ringed.
     """
-    chosen = {t: outcome for t, outcome in outcomes.items() if not t.load_g}
+    chosen = {t: outcome for t, outcome in outcomes.items() if not t.load_g and t.kind in COLOURS}
     twins, seed = sorted({trial.twin for trial in chosen}), min(trial.seed for trial in chosen)
     figure = Figure(figsize=(4.0 * len(twins) + 0.4, 4.7), layout="compressed")
     panels = figure.subplots(1, len(twins), squeeze=False, sharex=True, sharey=True)[0]
@@ -76,7 +76,7 @@ def loads_figure(table: Sequence[Row]) -> Figure:
         panel.set_xticks(sorted({row["load_g"] for row in rows}))
         panel.tick_params("x", rotation=60)
         panel.set_ylim(bottom=0)
-        panel.legend(frameon=False, fontsize=8)
+        panel.legend(frameon=False, fontsize=8, loc="upper right")
     return figure
 
 
@@ -116,7 +116,7 @@ def losses_figure(results: Results) -> Figure:
         for kind, style in (("pipe", ("with gradient penalty", BLUE)), ("no-penalty", ("without", ORANGE))):
             runs = [run for (of, twin, _), run in results.trainings.items() if of == kind and twin in twins]
             _band(panel, *_series(runs, name), style)
-    panels[-1].legend(frameon=False)
+    panels[-1].legend(frameon=False, loc="upper right")
     return figure
 
 

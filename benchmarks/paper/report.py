@@ -25,6 +25,7 @@ PREFIXES = {"open": "paper", "confined": "paper-confined", "rod": "paper-rod"}  
 COLUMNS = {  # figures in the printed table
     "open": (
         "translation_mm",
+        "rmse_mm",
         "max_mm",
         "yaw_deg",
         "pitch_deg",

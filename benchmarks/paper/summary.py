@@ -171,6 +171,6 @@ def all_done(row: Row) -> bool:
 
 def paper_numbers(kind: str, variant: str, load_g: int = 0) -> dict[str, float]:
     """Return what the paper prints for its physical arm; it has no number for gradient descent."""
-    if load_g:
+    if load_g and kind == "with":
         return {"translation_mm": PAPER_LOADS_MM} if load_g <= LIGHT_G else {"max_mm": PAPER_HEAVY_MAX_MM}
     return dict(PAPER.get((kind, variant), {}))

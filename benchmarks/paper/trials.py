@@ -39,17 +39,18 @@ def trainings(settings: Settings) -> list[tuple[str, int, int]]:
 def trials(experiment: str, settings: Settings) -> list[Trial]:
     """Return the trials of an experiment, a key of `FILMS`.
 
-    In open space, gradient descent has no training seed, so it runs once for each twin. In confined spaces
-    the policy without gradient penalty is judged by its training alone, and the circle without demonstrations
-    is a trial of the open-space experiment.
+    In open space, gradient descent has no training seed, so it runs once for each twin and load. In confined
+    spaces the policy without gradient penalty is judged by its training alone, and the circle without
+    demonstrations is a trial of the open-space experiment.
     """
     found = []
     if experiment == "open":
         for twin in settings.twins:
             for seed in settings.seeds:
-                found += [Trial("without", twin, seed), Trial("with", twin, seed)]
+                found += [Trial(kind, twin, seed) for kind in ("specified", "without", "with")]
                 found += [Trial("with", twin, seed, load_g=load_g) for load_g in settings.loads_g]
-            found.append(Trial("gradient", twin, settings.seeds[0]))
+            loads_g = (0, *settings.loads_g)
+            found += [Trial("gradient", twin, settings.seeds[0], load_g=load_g) for load_g in loads_g]
         return found
     for kind, twin, seed in trainings(settings):
         if kind != "no-penalty":

@@ -122,6 +122,9 @@ def test_without_s2r_the_nominal_policy_plans_and_the_springs_are_calibrated(tmp
     pose, goal = circle_poses(2).astype(float)
     expected = PolicyRunner(make_policy(make_arm_model)).act(pose, goal).length_m
     assert np.allclose(chosen.plan(pose, goal, np.full(N, 0.2), None), expected)
+    specified = jobs.controller_of(tmp_path, Trial("specified", 0, 0))
+    assert np.allclose(specified.plan(pose, goal, np.full(N, 0.2), None), expected)
+    assert np.array_equal(specified.policy.sensor.beta, Sensor.from_spec(SPEC).beta)
     with_s2r = jobs.controller_of(tmp_path, Trial("with", 0, 0)).plan(pose, goal, 0, None)
     assert not np.allclose(with_s2r, expected)
 

@@ -40,14 +40,15 @@ def test_spreads_group_kinds_and_variants():
     table = trial_rows(good_results("open", TINY, changed))
     found = {(item["kind"], item["variant"]): item for item in spreads(table)}
     loads = [("with", "0 g"), ("with", "500 g"), ("with", "1000 g")]
-    assert set(found) == {("without", "0 g"), ("gradient", "0 g"), *loads}
+    loads += [("gradient", variant) for _, variant in loads]
+    assert set(found) == {("specified", "0 g"), ("without", "0 g"), *loads}
     unloaded = found["with", "0 g"]
     assert (unloaded["runs"], unloaded["incomplete_runs"]) == (2, 1)
     assert unloaded["translation_mm"] == pytest.approx({"mean": 2.25, "std": 1.0, "min": 1.25, "max": 3.25})
     assert unloaded["paper"]["translation_mm"] == 11.59
     assert found["without", "0 g"]["paper"]["yaw_deg"] == 13.72
     assert found["with", "1000 g"]["paper"] == {"max_mm": 23.76}
-    assert found["gradient", "0 g"]["paper"] == {}
+    assert found["gradient", "0 g"]["paper"] == found["gradient", "500 g"]["paper"] == {}
     table = trial_rows(good_results("confined", changed={pipe_trial(): made_up("pipe", fails=(0,))}))
     found = {(item["kind"], item["variant"]): item for item in spreads(table)}
     assert set(found) == {

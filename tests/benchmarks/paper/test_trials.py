@@ -9,8 +9,8 @@ from tests.benchmarks.paper.made_up import TINY
 
 def test_three_twins_and_three_seeds():
     found = trials("open", Settings())
-    assert len(found) == len(set(found)) == 3 * 3 * (2 + 6) + 3
-    assert sum(trial.kind == "gradient" for trial in found) == 3
+    assert len(found) == len(set(found)) == 3 * 3 * (3 + 6) + 3 * 7
+    assert sum(trial.kind == "gradient" for trial in found) == 3 * 7
     found = trials("confined", Settings())
     assert len(found) == len(set(found)) == 9 * 5 + 9
     learned = trainings(Settings())
@@ -35,6 +35,7 @@ def test_stages_leave_every_trial_s_result_and_come_after_what_they_need():
             policies = {
                 "with": ["twin{}-seed0"],
                 "gradient": ["twin{}-seed0"],
+                "specified": ["nominal-seed0"],
                 "without": ["twin{}-seed0", "nominal-seed0"],
             }.get(trial.kind, [run])
             for folder in policies:
