@@ -225,7 +225,7 @@ def write_accuracy(folder: Path, accuracy: Accuracy, found: Mapping[str, Any]) -
         axes.plot(seen[:, i], seen[:, j], ".", label="measured")
         axes.set(xlabel=f"{'xyz'[i]} [mm]", ylabel=f"{'xyz'[j]} [mm]")
         axes.set_aspect("equal", adjustable="datalim")
-    above.legend()
+    above.legend(loc="upper right")
     away = np.sort(np.linalg.norm(accuracy.error[np.isfinite(accuracy.error).all(axis=1), :3], axis=1))
     shares.plot(away, np.arange(1, len(away) + 1) / max(len(away), 1), drawstyle="steps-post")
     shares.set(xlabel="translation error [mm]", ylabel="share of the goals below", ylim=(0, 1), xlim=0)

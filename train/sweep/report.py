@@ -156,5 +156,5 @@ def curves(sweep: Sweep) -> Figure:
         )
     plots.logarithmic(axes)
     if sweep.varied:
-        axes.legend(frameon=False)
+        axes.legend(frameon=False, loc="upper right")
     return figure
