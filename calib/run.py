@@ -18,7 +18,7 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -87,12 +87,12 @@ def calibrate(
     progress("damping ...")
     spec, damping = _damping(seen, spec, seed)
     progress("sim-to-real network ...")
-    s2r, network, error_mm, poses, held = _s2r(seen, spec, seed)
-    if held is not None and held.is_better:
-        spec = spec.replace(unmodelled=dataclasses.asdict(held.unmodelled))
-    if recorded is not None and error_mm is not None:
-        recorded = recorded._replace(error_mm=error_mm)
-    return Calibration(spec, s2r, recorded, (springs, chambers, damping, network), poses)
+    last = _s2r(seen, spec, seed)
+    if last.held is not None and last.held.is_better:
+        spec = spec.replace(unmodelled=dataclasses.asdict(last.held.unmodelled))
+    if recorded is not None and last.error_mm is not None:
+        recorded = recorded._replace(error_mm=last.error_mm)
+    return Calibration(spec, last.s2r, recorded, (springs, chambers, damping, last.section), last.pairs)
 
 
 def refuse_existing(folder: Path) -> None:
@@ -183,16 +183,20 @@ def _damping(logs: Sequence[Log], spec: ArmSpec, seed: int) -> tuple[ArmSpec, Se
     return fit.spec if fit.is_better else spec, sections.damping(fit)
 
 
-def _s2r(
-    logs: Sequence[Log], spec: ArmSpec, seed: int
-) -> tuple[S2R | None, Section, np.ndarray | None, dict[str, PosePairs], HeldPressures | None]:
-    """Fit the network of the unloaded arm: with a payload, the simulation differs.
+class _Unloaded(NamedTuple):
+    """Fits to the poses of the unloaded arm."""
 
-    Returns:
-        The network, its section, its error [mm] at each pose of the logs, of which those not held out
-        get the mean, measured poses beside simulated ones, without and with it, and the pressures that hold
-        the arm at these poses.
-    """
+    s2r: S2R | None
+    section: Section
+    error_mm: np.ndarray | None = None  # of the network at each pose of the logs; not held out: the mean
+    pairs: Mapping[str, PosePairs] = MappingProxyType(
+        {}
+    )  # measured poses beside simulated ones, without and with the network
+    held: HeldPressures | None = None
+
+
+def _s2r(logs: Sequence[Log], spec: ArmSpec, seed: int) -> _Unloaded:
+    """Fit the network, and the pressures, of the unloaded arm: with a payload, the simulation differs."""
     poses, rows = find_static_poses(logs, spec)
     unloaded = np.isclose(poses.payload_kg, spec.mass.payload_kg, rtol=0.0, atol=1e-6)
     used = np.flatnonzero(np.isfinite(poses.spring_m).all(axis=1) & unloaded)
@@ -204,7 +208,7 @@ def _s2r(
         rows |= {"poses at which the simulated arm finds no rest": poses.n - n_settled}
         needed = f"Not fitted: {_few(MIN_S2R_POSES, what, n_settled, rows)}"
         remedy = f"policies will be trained on simulated poses: log {MIN_S2R_POSES} poses at rest or more"
-        return None, Section("Sim-to-real network", needed, warnings=(remedy,)), None, {}, None
+        return _Unloaded(None, Section("Sim-to-real network", needed, warnings=(remedy,)))
     real = pose_from_frame(poses.tip_m, poses.tip_rotation)
     settled, real = simulated.take(simulated.valid), real[simulated.valid]
     pose, spring_m = settled.pose, settled.spring_m
@@ -216,7 +220,7 @@ def _s2r(
     error_mm[used[simulated.valid][fit.held_out]] = corrected.error_mm[fit.held_out]
     held = fit_held_pressures(spec, spring_m, poses.pressure_kpa[simulated.valid], settled.pressure_kpa, seed)
     section = sections.with_pressures(sections.s2r(fit, pose, spring_m, real, poses.n - n_settled), held)
-    return fit.s2r if fit.is_better else None, section, error_mm, pairs, held
+    return _Unloaded(fit.s2r if fit.is_better else None, section, error_mm, pairs, held)
 
 
 def _few(n: int, what: str, n_found: int, rows: Mapping[str, int]) -> str:

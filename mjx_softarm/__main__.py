@@ -11,7 +11,8 @@ import numpy as np
 
 from mjx_softarm._support import cli
 from mjx_softarm._support.errors import InputError
-from mjx_softarm.spec import ArmSpec, shipped_arm
+from mjx_softarm.arms import shipped_arm
+from mjx_softarm.spec import ArmSpec
 
 MAX_COMBINATIONS = 1_000_000  # of pressures
 

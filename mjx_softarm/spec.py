@@ -10,7 +10,6 @@ from __future__ import annotations
 import dataclasses
 import tomllib
 from dataclasses import dataclass, field
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -27,11 +26,14 @@ from mjx_softarm._support.fields import (
     numbers,
     positive,
     read_fields,
+    rule_of,
     vector,
 )
+from mjx_softarm.arms import shipped_arm
 from mjx_softarm.sensing.sensors import SENSORS, Sensor
 
 ARM_FILE = "arm.toml"  # in the folder of a calibration
+PAIRS = "pairs of chamber and spring"
 
 
 @dataclass(frozen=True)
@@ -67,11 +69,11 @@ class Mass:
 class Chambers:
     """Bellows: force = pressure * (area_m2 + area_slope_m * (length - section length))."""
 
-    area_m2: PerChamber = positive(per_chamber=True)
-    area_slope_m: PerChamber = anything(per_chamber=True)
-    stiffness_n_per_m: PerChamber = positive(per_chamber=True)
+    area_m2: PerChamber = positive(per="chambers")
+    area_slope_m: PerChamber = anything(per="chambers")
+    stiffness_n_per_m: PerChamber = positive(per="chambers")
     damping_ns_per_m: float = not_negative()
-    length_offset_m: PerChamber = anything(per_chamber=True, low=-0.1, high=0.1)
+    length_offset_m: PerChamber = anything(per="chambers", low=-0.1, high=0.1)
     pressure_min_kpa: float = anything(low=-101.325)
     pressure_max_kpa: float = anything(low=-101.325)
 
@@ -118,7 +120,7 @@ class Mounting:
 
     base_turn_deg: tuple[float, ...] = vector()  # of the base, in the base frame
     base_offset_m: tuple[float, ...] = vector()  # of the base, in the base frame
-    section_roll_deg: tuple[float, ...] = numbers()  # of each section's holes about its axis
+    section_roll_deg: tuple[float, ...] = numbers("sections")  # of its holes about its axis
     tip_turn_deg: tuple[float, ...] = vector()  # of the measured tip's axes, in those of the last plate
     tip_offset_m: tuple[float, ...] = vector()  # of the measured tip, in the axes of the last plate
 
@@ -131,8 +133,8 @@ class Unmodelled:
     payload is told by pressures, with this taken into account.
     """
 
-    pressure_kpa: tuple[float, ...] = numbers()  # of each chamber, where springs have their sections' length
-    slope_kpa_per_m: tuple[float, ...] = numbers()  # a row for each chamber, a column for each spring
+    pressure_kpa: tuple[float, ...] = numbers("chambers")  # where springs have their sections' length
+    slope_kpa_per_m: tuple[float, ...] = numbers(PAIRS)  # a row for each chamber, a column for each spring
 
 
 @dataclass(frozen=True)
@@ -178,11 +180,10 @@ class ArmSpec:
 
     def unmodelled_kpa(self, spring_m: np.ndarray) -> np.ndarray:
         """Return measured less simulated pressures (..., n) [kPa] at springs (..., n) [m], unloaded."""
-        if not self.unmodelled.pressure_kpa:
-            return np.zeros_like(spring_m)
-        slope = np.reshape(self.unmodelled.slope_kpa_per_m, (self.n_chambers, self.n_chambers))
+        n, table = self.n_chambers, self.unmodelled
+        slope = np.reshape(table.slope_kpa_per_m or np.zeros(n * n), (n, n))
         stretched_m = spring_m - self.geometry.section_length_m
-        return np.asarray(self.unmodelled.pressure_kpa) + stretched_m @ slope.T
+        return np.asarray(table.pressure_kpa or np.zeros(n)) + stretched_m @ slope.T
 
     @classmethod
     def default(cls) -> ArmSpec:
@@ -256,23 +257,22 @@ class ArmSpec:
 
     def _check_together(self, source: str) -> None:
         """Refuse fields that contradict each other."""
-        n, counted = self.n_chambers, ("mounting", "unmodelled")
-        for path, wanted, what in (
-            ("mounting.section_roll_deg", self.structure.n_sections, "one for each section"),
-            ("unmodelled.pressure_kpa", n, "one for each chamber"),
-            ("unmodelled.slope_kpa_per_m", n * n, "a row for each chamber"),
-        ):
-            group, name = path.split(".")
-            got = len(getattr(getattr(self, group), name))
-            needed = group == "unmodelled" and self.unmodelled != Unmodelled()
-            if (got or needed) and got != wanted:
-                raise SpecError(f"{source}: {path}: got {got} numbers, expected {wanted}, {what}")
-        for group, values in self.to_dict().items():
-            for name, value in values.items() if isinstance(values, dict) and group not in counted else ():
-                if isinstance(value, tuple) and len(value) != self.n_chambers:
+        counts = {
+            "sections": self.structure.n_sections,
+            "chambers": self.n_chambers,
+            PAIRS: self.n_chambers**2,
+        }
+        for group in dataclasses.fields(self):
+            table = getattr(self, group.name)
+            for item in dataclasses.fields(table) if dataclasses.is_dataclass(table) else ():
+                value, rule = getattr(table, item.name), rule_of(item)
+                if not (rule.per and isinstance(value, tuple)) or value == item.default:
+                    continue
+                if len(value) != counts[rule.per]:
+                    instead = "one, or " if rule.length is None else ""
                     raise SpecError(
-                        f"{source}: {group}.{name}: got {len(value)} numbers, "
-                        f"expected one, or one for each of the {self.n_chambers} chambers"
+                        f"{source}: {group.name}.{item.name}: got {len(value)} numbers, "
+                        f"expected {instead}one for each of the {counts[rule.per]} {rule.per}"
                     )
         for group, low, high in (
             ("chambers", "pressure_min_kpa", "pressure_max_kpa"),
@@ -295,17 +295,3 @@ class ArmSpec:
                     f"{source}: springs.{name}: got {length_m!r}, which reads {readings[~readable][0]:.6g} "
                     f"{unit}, expected sensor.{' to '.join(sensor.range_fields)}, {low:g} to {high:g} {unit}"
                 )
-
-
-def shipped_arm(name: str) -> str:
-    """Return the TOML of an arm that the package describes.
-
-    Raises:
-        SpecError: there is none of this name; the message says which there are.
-    """
-    arms = {
-        file.name.removesuffix(".toml"): file for file in resources.files(f"{__package__}.arms").iterdir()
-    }
-    if name not in arms:
-        raise SpecError(f"{name}: got no such arm, expected a file, or {', '.join(sorted(arms))}")
-    return arms[name].read_text("utf-8")

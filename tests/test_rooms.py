@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[1]
 # Imports for types alone do not count: a sensor is made from a specification, which holds one.
 LEVELS = (
     ("_support",),
-    ("sensing",),
+    ("sensing", "arms"),
     ("spec", "pneumatics"),
     ("mechanics", "control", "logs"),
     ("mdp",),

@@ -1,4 +1,4 @@
-"""What the model of the chambers leaves of the pressures that hold the unloaded arm: measured less simulated.
+"""Pressures that hold the unloaded arm, measured less simulated: what the model of the chambers leaves.
 
 Holes, rings and bellows are not where the specification has them, so a chamber's pressure depends a little on
 the springs beside it. A straight line in all springs' lengths, fitted by least squares, takes that up. It

@@ -22,14 +22,14 @@ class SpecError(InputError):
 
 @dataclass(frozen=True)
 class Rule:
-    """Values that a field accepts: a kind of number, its range, and whether one per chamber is allowed."""
+    """Values that a field accepts: a kind of number, its range, and how many."""
 
     kind: type = float
     low: float = -math.inf
     high: float = math.inf
     low_open: bool = False
-    per_chamber: bool = False
-    length: int | None = None  # of a list; 0 for any
+    per: str = ""  # a list has one for each of these; without a length it may be a single number, too
+    length: int | None = None  # of what has to be a list; 0 if it depends on the arm
 
     @property
     def text(self) -> str:
@@ -39,7 +39,7 @@ class Rule:
         high = "" if self.high == math.inf else f" and <= {self.high:g}" if low else f" <= {self.high:g}"
         if self.length is not None:
             return f"a list of {self.length} numbers" if self.length else "a list of numbers"
-        return noun + low + high + (", or a list with one per chamber" if self.per_chamber else "")
+        return noun + low + high + (", or a list with one per chamber" if self.per else "")
 
     def accepts(self, value: Any) -> bool:
         """Return whether a value is of the kind and in the range."""
@@ -55,9 +55,9 @@ class Rule:
         return math.isfinite(value) and above and value <= self.high
 
 
-def positive(per_chamber: bool = False) -> Any:
+def positive(per: str = "") -> Any:
     """Declare a number > 0."""
-    return field(metadata={"rule": Rule(low=0.0, low_open=True, per_chamber=per_chamber)})
+    return field(metadata={"rule": Rule(low=0.0, low_open=True, per=per)})
 
 
 def not_negative() -> Any:
@@ -65,9 +65,9 @@ def not_negative() -> Any:
     return field(metadata={"rule": Rule(low=0.0)})
 
 
-def anything(per_chamber: bool = False, low: float = -math.inf, high: float = math.inf) -> Any:
+def anything(per: str = "", low: float = -math.inf, high: float = math.inf) -> Any:
     """Declare a number in a range, by default any."""
-    return field(metadata={"rule": Rule(low=low, high=high, per_chamber=per_chamber)})
+    return field(metadata={"rule": Rule(low=low, high=high, per=per)})
 
 
 def vector() -> Any:
@@ -75,9 +75,9 @@ def vector() -> Any:
     return field(default=(0.0, 0.0, 0.0), metadata={"rule": Rule(length=3)})
 
 
-def numbers() -> Any:
-    """Declare a list of numbers, by default empty, which stands for zeros."""
-    return field(default=(), metadata={"rule": Rule(length=0)})
+def numbers(per: str) -> Any:
+    """Declare a list with one number for each of these, by default empty, which stands for zeros."""
+    return field(default=(), metadata={"rule": Rule(per=per, length=0)})
 
 
 def count() -> Any:
@@ -132,7 +132,7 @@ def has_default(item: dataclasses.Field) -> bool:
 
 
 def _read_value(rule: Rule, value: Any, source: str, path: str) -> Any:
-    many = isinstance(value, (list, tuple)) and (rule.per_chamber or rule.length is not None)
+    many = isinstance(value, (list, tuple)) and (rule.per or rule.length is not None)
     items: Any = value if many else [value]
     if rule.length is not None and not (many and len(value) == (rule.length or len(value))):
         raise SpecError(f"{source}: {path}: got {value!r}, expected {rule.text}")

@@ -28,7 +28,8 @@ from mjx_softarm.deploy.measure import (
     write_accuracy,
 )
 from mjx_softarm.deploy.record import record
-from mjx_softarm.deploy.session import Run, follow, trace
+from mjx_softarm.deploy.run import Run
+from mjx_softarm.deploy.session import follow, trace
 from mjx_softarm.logs import mcap_file
 from mjx_softarm.logs.pressure_plan import read_plan
 from mjx_softarm.mechanics.excitation import growing, random_pressures

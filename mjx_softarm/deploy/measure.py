@@ -18,11 +18,11 @@ from mjx_softarm.control import saturated
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.faults import Fault
 from mjx_softarm.deploy.link import describe
-from mjx_softarm.deploy.session import Run, seen_error
+from mjx_softarm.deploy.run import Run
 from mjx_softarm.logs.tables import read_table
 from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.policy.file import Policy
-from mjx_softarm.sensing.pose import frame_from_pose, pose_error, pose_from_frame, rotation_about
+from mjx_softarm.sensing.pose import frame_from_pose, pose_error, pose_from_frame, rotation_about, seen_error
 
 LOOKS, LOOK_S = 50, 0.02  # frames of motion capture tried before an arm moves, and the time between two
 MOST_LAG_S = 3.0  # of a tip behind a moving goal

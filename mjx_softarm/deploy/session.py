@@ -7,7 +7,7 @@ motion capture is not used for control, pressures to tell the payload alone.
 from __future__ import annotations
 
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple, Protocol
 
@@ -16,28 +16,20 @@ import numpy as np
 from mjx_softarm.deploy.acting import believed
 from mjx_softarm.deploy.arm_io import ArmIO
 from mjx_softarm.deploy.controller import Controller, State, Tick, start
-from mjx_softarm.deploy.ending import DONE, FAULT, MISSED, Ending, vent_at_end
+from mjx_softarm.deploy.ending import vent_at_end
 from mjx_softarm.deploy.faults import Event, Fault, Response
 from mjx_softarm.deploy.link import ArmFault, Link, Recorder
 from mjx_softarm.deploy.loop import hold, release, step, with_goal, with_moving_goal
 from mjx_softarm.deploy.reachability import refusals
+from mjx_softarm.deploy.run import Arrival, Run
+from mjx_softarm.deploy.way import Way
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mdp.rewards import scaled_error
-from mjx_softarm.sensing.pose import pose_error, pose_from_quaternion
+from mjx_softarm.sensing.pose import pose_error, seen_error
 
 _ROUNDING_S = 1e-6  # by which a simulated tick may be longer than the period
 LEAD_S = 0.85  # of the goal of a policy trained at rest before the tip; by so much the law lags, on twins
 _KEPT = 1000  # rows, arrivals and faults of a run without a log
-
-
-class Arrival(NamedTuple):
-    """A goal that had all its actions."""
-
-    goal: np.ndarray  # (6,) [mm, deg]
-    estimate: np.ndarray  # (6,) [mm, deg] pose believed in
-    row: int  # index of the log's row
-    index: int  # of the goal among those asked for
-    reached: bool = True  # within the policy's threshold of a goal, by motion capture if there is any
 
 
 class Orders(NamedTuple):
@@ -58,29 +50,6 @@ class Pilot(Protocol):
     def look(self, state: State, tick: Tick, row: dict[str, Any]) -> None:
         """Take a tick: the state after it, its results, and the row that it logged."""
         ...
-
-
-class Run(NamedTuple):
-    """Results of a run."""
-
-    log: Log
-    arrivals: tuple[Arrival, ...]
-    events: tuple[Event, ...]
-    latency_s: np.ndarray  # (ticks,) from readings to pressures, without the arm's input and output
-    ending: Ending
-    n_goals: int = 0  # number of goals asked for; 0 with a pilot
-    way: slice | None = None  # rows of the log in which the goal moved
-
-    def counts(self) -> dict[Fault, int]:
-        """Return how often each fault came."""
-        return dict(Counter(event.fault for event in self.events))
-
-    @property
-    def status(self) -> int:
-        """Exit status: that of the ending, of a fault if a goal was refused, or of a goal not reached."""
-        refused = any(event.response is not Response.GO_ON for event in self.events)
-        n_reached = sum(arrival.reached for arrival in self.arrivals)
-        return self.ending.status or (FAULT if refused else MISSED if n_reached < self.n_goals else DONE)
 
 
 def follow(
@@ -126,14 +95,8 @@ def trace(
         tell: takes a line for each arrival and each fault.
         save: writes the log, once the arm is vented.
     """
-    return _Session(arm, controller, goals, None, tell, way_s=way_s).to_end(save)
-
-
-def on_the_way(goals: np.ndarray, share: float) -> np.ndarray:
-    """Return the pose (6,) [mm, deg] after a share of the way past goals (p, 6); its end for more than 1."""
-    at = min(share, 1.0) * (len(goals) - 1)
-    k = min(int(at), len(goals) - 2)
-    return goals[k] + (at - k) * pose_error(goals[k + 1], goals[k])
+    way = Way(goals, way_s, controller.policy.action_s or LEAD_S)
+    return _Session(arm, controller, goals, None, tell, way=way).to_end(save)
 
 
 def steer(
@@ -151,14 +114,6 @@ def steer(
     return session.to_end(save or (lambda log: None))
 
 
-def seen_error(tip_m: np.ndarray, tip_quaternion: np.ndarray, goal: np.ndarray) -> np.ndarray:
-    """Return the mean error (6,) [mm, deg] of tips (k, 3) [m] and (k, 4); NaN where none was seen."""
-    seen = np.isfinite(tip_m).all(axis=-1)
-    if not seen.any():
-        return np.full(6, np.nan)
-    return pose_error(pose_from_quaternion(tip_m[seen], tip_quaternion[seen]), goal).mean(axis=0)
-
-
 class _Session:
     """Mutable state of `follow` and `steer`."""
 
@@ -173,10 +128,10 @@ class _Session:
         stay: bool = False,
         pilot: Pilot | None = None,
         kept: int | None = None,
-        way_s: float | None = None,
+        way: Way | None = None,
     ):
-        self.way_s, self.way_began_s, self.way = way_s, np.nan, slice(0)
-        self.controller, self.tell, self.arrived, self.pilot = controller, tell, arrived, pilot
+        self.controller, self.tell, self.arrived = controller, tell, arrived
+        self.pilot, self.way = pilot, way
         self.goals, self.duration_s, self.n_taken, self.stay = list(goals), duration_s, 0, stay
         # Before the arm moves: it takes longer than a tick.
         self.refusals = refusals(controller.policy, self.goals)
@@ -193,10 +148,9 @@ class _Session:
         """Run, vent and save the log; return the results."""
         ending = vent_at_end(self.run, self.link, self.tell, lambda: save(self.log()))
         events, latency_s = tuple(self.events), np.array(self.latency_s)
-        n_goals = 0 if self.pilot else len(self.goals)
-        way = None if self.way_s is None else self.way
-        n_goals = n_goals if way is None else 2
-        return Run(self.log(), tuple(self.arrivals), events, latency_s, ending, n_goals, way)
+        n_goals = 0 if self.pilot else 2 if self.way else len(self.goals)  # a way's first and last
+        rows = self.way.rows if self.way else None
+        return Run(self.log(), tuple(self.arrivals), events, latency_s, ending, n_goals, rows)
 
     def run(self) -> None:
         """Go through the goals.
@@ -226,7 +180,7 @@ class _Session:
 
     def _tick(self, begin_s: float) -> bool:
         """Return whether the arm took the pressures in time."""
-        goal = self._goal_on_the_way(begin_s) if self.state.moves else self.state.goal
+        goal = self.way.goal(begin_s) if self.way and self.state.moves else self.state.goal
         readings = self.link.read()
         row = self.link.look(begin_s)
         began = time.perf_counter()
@@ -267,14 +221,8 @@ class _Session:
         """Take the next accepted goal once the last is done; return False when goals or time are over."""
         if self.pilot:
             self._obey(self.pilot.orders())
-        if self.way_s is not None and self.refusals and not self.n_taken:  # no part of the way is gone
-            self._note(tuple(self.refusals.values()))
-            self.n_taken = len(self.goals)
-        if self.way_s is not None and self.n_taken == 1 and self.state.goal is None:
-            self.way_began_s, self.n_taken = now_s, len(self.goals)
-            self.way = slice(len(self.rows), len(self.rows))
-        if np.isfinite(self.way_began_s):
-            self._move_goal(now_s)
+        if self.way:
+            self._go_along(self.way, now_s)
         while self.state.goal is None and self.n_taken < len(self.goals):
             goal, refusal = self.goals[self.n_taken], self.refusals.get(self.n_taken)
             self.n_taken += 1
@@ -286,21 +234,22 @@ class _Session:
         stays = self.pilot is not None or (self.stay and len(self.arrivals) > 0)
         return not over and (self.state.goal is not None or stays)
 
-    def _move_goal(self, now_s: float) -> None:
-        """Set the moving goal, or where it has come to its end the last one, once."""
-        assert self.way_s is not None  # as it began
-        self.way = slice(self.way.start, len(self.rows))
-        if now_s - self.way_began_s < self.way_s:
-            lead_s = self.controller.policy.action_s or LEAD_S
-            self.state = with_moving_goal(self.state, self._goal_on_the_way(now_s + lead_s))
+    def _go_along(self, way: Way, now_s: float) -> None:
+        """Move the goal along a way, from an arrival at its first pose until the goal is at the last."""
+        if self.refusals and not self.n_taken:  # no part of the way is gone
+            self._note(tuple(self.refusals.values()))
+            self.n_taken = len(self.goals)
+        begins = self.n_taken == 1 and self.state.goal is None
+        if begins:
+            way.begin(now_s, len(self.rows))
+            self.n_taken = len(self.goals)
+        if not (begins or self.state.moves):
+            return
+        if way.go_on(now_s, len(self.rows)):
+            self.state = with_moving_goal(self.state, way.goal_ahead(now_s))
         else:
-            self.way_began_s = np.nan
             self.state, events = with_goal(self.controller, self.state, self.goals[-1])
             self._note(events)
-
-    def _goal_on_the_way(self, now_s: float) -> np.ndarray:
-        assert self.way_s is not None
-        return on_the_way(np.array(self.goals), (now_s - self.way_began_s) / self.way_s)
 
     def _obey(self, orders: Orders) -> None:
         if orders.vent or orders.hold:

@@ -62,6 +62,16 @@ class EnvConfig:
     clearance_cost_per_mm: float = 0.0  # reward lost per mm by which the clearance falls below the margin
     clearance_margin_mm: float = 10.0  # clearance of the body to the wall that costs nothing
 
+    @property
+    def moves(self) -> bool:
+        """Whether the arm is in motion."""
+        return self.mode == "dynamic"
+
+    @property
+    def observes_motion(self) -> bool:
+        """Whether more than pose and goal is observed."""
+        return self.observation == "motion"
+
     def __post_init__(self):
         for name, allowed in (
             ("engine", ("chain", "mjx")),
@@ -69,7 +79,7 @@ class EnvConfig:
             ("observation", ("pose", "motion")),
         ):
             _expect(self, name, getattr(self, name) in allowed, f"one of {allowed}")
-        known = self.observation == "pose" or self.mode == "dynamic"
+        known = self.moves or not self.observes_motion
         _expect(self, "observation", known, "'pose' for arms at rest")
         for name in ("dynamic_step_s", "simulation_step_s"):
             _expect(self, name, 0 < getattr(self, name) < math.inf, "a finite number > 0")

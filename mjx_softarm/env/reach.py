@@ -29,11 +29,7 @@ from mjx_softarm.mechanics.workspace import Pool, sample_evenly, sample_workspac
 from mjx_softarm.pneumatics import VALVE_S
 from mjx_softarm.sensing.pose import pose_from_frame
 from mjx_softarm.sensing.s2r import S2R, carry_body, correct
-from mjx_softarm.sensing.sensors import SENSORS
 from mjx_softarm.spec import ArmSpec
-
-for _sensor in SENSORS.values():
-    jax.tree_util.register_dataclass(_sensor)  # numbers are traced, the kind is static
 
 
 class ReachEnv(Env):
@@ -92,23 +88,15 @@ class ReachEnv(Env):
         self.action_map = ActionMap(sensor, *(jnp.asarray(limit, jnp.float32) for limit in limits))
         diameter_mm = self.config.pipe_diameter_mm
         self.pipe = None if diameter_mm is None else CrossPipe.of_mm(diameter_mm)
-        self.uses_mjx = self.config.engine == "mjx" or self.moves
+        self.uses_mjx = self.config.engine == "mjx" or self.config.moves
         self.model = mjx.put_model(build_model(self.spec)) if self.uses_mjx else None
-        self._results = MotionResult if self.moves else SettleResult
+        self._results = MotionResult if self.config.moves else SettleResult
         self._failures = {f"invalid_{r.name.lower()}": r.value for r in self._results if r.value != 0}
         self.pool = self._training_pool()
 
     @property
     def observation_size(self) -> int:
-        return obs.OBS_SIZE + (len(obs.motion_layout(self.action_size)) if self.observes_motion else 0)
-
-    @property
-    def observes_motion(self) -> bool:
-        return self.config.observation == "motion"
-
-    @property
-    def moves(self) -> bool:
-        return self.config.mode == "dynamic"
+        return obs.OBS_SIZE + (len(obs.motion_layout(self.action_size)) if self.config.observes_motion else 0)
 
     @property
     def n_ticks(self) -> int:
@@ -122,7 +110,7 @@ class ReachEnv(Env):
     @property
     def backend(self) -> str:
         """Simulation that runs: "chain" or "mjx" kinematics of the equilibrium, or "mjx dynamic" steps."""
-        return "mjx dynamic" if self.moves else self.config.engine
+        return "mjx dynamic" if self.config.moves else self.config.engine
 
     def sample_pool(self, n: int, seed: int, evenly: bool = False) -> Pool:
         """Draw n poses with `sample_workspace` or `sample_evenly`, and correct them to those observed."""
@@ -156,7 +144,7 @@ class ReachEnv(Env):
 
     def sample_noise(self, rng: Array, n: int) -> EpisodeNoise:
         """Draw the random numbers of n episodes: leaves (n, ...)."""
-        moving = draws.uniform(jax.random.fold_in(rng, 1), (n, 2)) if self.moves else None
+        moving = draws.uniform(jax.random.fold_in(rng, 1), (n, 2)) if self.config.moves else None
         return EpisodeNoise(*draws.both(rng, (n, 3 + self.action_size), (n, self.action_size)), moving)
 
     def reset_from(self, noise: EpisodeNoise) -> State:
@@ -194,7 +182,7 @@ class ReachEnv(Env):
             "valid": jnp.array(True),
             "clearance_mm": self._clearance_mm(start.q, start.pose),
         }
-        if self.moves:
+        if self.config.moves:
             info["path_mm"] = jnp.zeros((self.n_ticks, 3))
         return State(arm, self.observe(arm.pose, goal, arm.sensed), zero, zero, metrics, info)
 
@@ -256,7 +244,7 @@ class ReachEnv(Env):
     def _move(self, arm: ArmState, reference_m: Array) -> tuple[Motion, Settled | Moved]:
         params, config = self.params_of(arm), self.config
         kinematics = mjx_kinematics(self.model) if config.engine == "mjx" else chain_kinematics(params)
-        if self.moves:
+        if self.config.moves:
             moving = MovingArm.of(self.model, kinematics, params, arm.damping, arm.delay_s)
             rate_hz = self.spec.control.rate_hz
             times_s = config.dynamic_step_s, 1.0 / rate_hz, config.simulation_step_s
@@ -293,7 +281,7 @@ class ReachEnv(Env):
 
     def _sensed(self, arm: ArmState, end: ArmState | Settled | Moved, action: Array) -> Array | None:
         """Return `ArmState.sensed` of an arm, at rest where `end` is not the end of a motion."""
-        if not self.observes_motion:
+        if not self.config.observes_motion:
             return None
         last_m, tip_mm, last_mm = end.spring_m, jnp.zeros(3), jnp.zeros(3)
         if isinstance(end, Moved):

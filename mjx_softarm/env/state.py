@@ -4,9 +4,14 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
 from jax import Array
 
 from mjx_softarm.mechanics.dynamics import Motion
+from mjx_softarm.sensing.sensors import SENSORS
+
+for _sensor in SENSORS.values():
+    jax.tree_util.register_dataclass(_sensor)  # numbers are traced, the kind is static
 
 
 class EpisodeNoise(NamedTuple):

@@ -127,3 +127,11 @@ def pose_error(pose: Array, goal: Array) -> Array:
     angles = error[..., 3:]
     wrapped = angles - 360.0 * xp.floor((angles + 180.0) / 360.0)
     return xp.concat([error[..., :3], wrapped], axis=-1)
+
+
+def seen_error(tip_m: np.ndarray, tip_quaternion: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    """Return the mean error (6,) [mm, deg] of tips (k, 3) [m] and (k, 4); NaN where none was seen."""
+    seen = np.isfinite(tip_m).all(axis=-1)
+    if not seen.any():
+        return np.full(6, np.nan)
+    return pose_error(pose_from_quaternion(tip_m[seen], tip_quaternion[seen]), goal).mean(axis=0)

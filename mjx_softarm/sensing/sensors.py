@@ -66,8 +66,8 @@ class Sensor:
     noise: ClassVar[float]  # standard deviation of a twin's readings
     resolution: ClassVar[float]  # step of a twin's converter
 
-    beta: PerChamber | Array = positive(per_chamber=True)
-    delta_m: PerChamber | Array = anything(per_chamber=True)
+    beta: PerChamber | Array = positive(per="chambers")
+    delta_m: PerChamber | Array = anything(per="chambers")
 
     @staticmethod
     def from_spec(spec: ArmSpec) -> Sensor:
@@ -75,7 +75,7 @@ class Sensor:
 
         The arrays are float64; JAX narrows them where they meet its own.
         """
-        names = [item.name for item in dataclasses.fields(spec.sensor) if rule_of(item).per_chamber]
+        names = [item.name for item in dataclasses.fields(spec.sensor) if rule_of(item).per]
         arrays = {name: np.array(spec.per_chamber(getattr(spec.sensor, name))) for name in names}
         return dataclasses.replace(spec.sensor, **arrays)
 

@@ -21,7 +21,8 @@ from mjx_softarm.deploy.arms import Paced
 from mjx_softarm.deploy.controller import Controller, State, Tick
 from mjx_softarm.deploy.ending import FAULT
 from mjx_softarm.deploy.reachability import clamped
-from mjx_softarm.deploy.session import Orders, Run, steer
+from mjx_softarm.deploy.run import Run
+from mjx_softarm.deploy.session import Orders, steer
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.policy.file import Policy

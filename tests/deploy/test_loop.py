@@ -11,7 +11,8 @@ from mjx_softarm.deploy.controller import Controller, start
 from mjx_softarm.deploy.ending import FAULT, Ending
 from mjx_softarm.deploy.faults import Fault
 from mjx_softarm.deploy.loop import step, with_goal
-from mjx_softarm.deploy.session import LEAD_S, on_the_way, trace
+from mjx_softarm.deploy.session import LEAD_S, trace
+from mjx_softarm.deploy.way import on_the_way
 from mjx_softarm.logs.schema import write_log
 from mjx_softarm.mdp.actions import N_ACTIONS
 from mjx_softarm.mdp.observation import OBS_SIZE, motion_layout

@@ -212,7 +212,7 @@ class Analytic:
         error = rewards.scaled_error(end.pose, end.goal, config.reward)  # (6,)
         off = jnp.sqrt(jnp.sum(error**2) + 1e-12) / config.reward.threshold
         off_m = self.env.reference_m(action) - (end.spring_m + end.sensor_offset_m)  # (A,)
-        if config.mode == "dynamic":  # most of them are on their way
+        if config.moves:  # most of them are on their way
             off_m = after.info["blocked"] * off_m
         cost = self.config.saturation_cost_per_mm * 1e3 * jnp.sum(jnp.abs(off_m))
         return off + cost + self.env.clearance_cost(after.info["clearance_mm"])

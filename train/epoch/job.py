@@ -229,7 +229,7 @@ class Job:
         """Return the transitions of n arms as they are stored."""
         start, end = before.pipeline_state, after.pipeline_state
         sensed_action = self.env.action_of(end.spring_m + end.sensor_offset_m)
-        if self.config.env.mode == "dynamic":  # the arm moves on: the other references still count
+        if self.config.env.moves:  # the arm moves on: the other references still count
             sensed_action = jnp.where(after.info["blocked"], sensed_action, action)
         return Experience(
             pose=start.pose,

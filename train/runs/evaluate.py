@@ -166,7 +166,7 @@ def reach(env: ReachEnv, learner: Learner, policy: Any, state: State, goal: Arra
     state, (settled, path_mm) = jax.lax.scan(act, towards(env, state, goal), None, length=N_ACTIONS)
     arm = state.pipeline_state
     near_s = overshoot_mm = jnp.asarray(jnp.nan)
-    if env.moves:
+    if env.config.moves:
         way_mm = jnp.concatenate([path_mm.reshape(-1, 3), arm.pose[None, :3]])
         near_s, overshoot_mm = way_figures(way_mm, goal[:3], 1.0 / env.spec.control.rate_hz)
     return state, Reached(

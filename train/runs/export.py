@@ -56,7 +56,7 @@ def export_run(run: Run, path: Path | None = None, task: Task | None = None) -> 
             provenance,
             tolerance_m=1e-3 * run.config.env.saturation_tolerance_mm,
             n_actions=N_ACTIONS,
-            action_s=run.config.env.dynamic_step_s if run.config.env.mode == "dynamic" else 0.0,
+            action_s=run.config.env.dynamic_step_s if run.config.env.moves else 0.0,
         )
     except (ValueError, AttributeError) as error:
         raise RunError(f"{run.path}: {error}") from error

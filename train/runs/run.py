@@ -70,7 +70,7 @@ def train(run: Run, task: Task, console: Console) -> Any:
 def refuse_divergence(config: TrainConfig, n_unsettled: float) -> None:
     """Raise RunError where most of an epoch's actions of arms in motion led to no finite state."""
     n_actions = config.n_arms * config.vector_steps_per_epoch
-    if config.env.mode == "dynamic" and n_unsettled > n_actions / 2:
+    if config.env.moves and n_unsettled > n_actions / 2:
         raise RunError(
             f"env.simulation_step_s: got {config.env.simulation_step_s:g}, with which {n_unsettled:.0f} of "
             f"{n_actions} actions diverged, expected a shorter time step for this arm"

@@ -35,9 +35,19 @@ def test_noise_alone_is_told_by_the_rows_held_out():
     assert not fit.is_better
 
 
-def test_a_specification_has_none_or_all_of_its_numbers():
-    assert not SPEC.unmodelled_kpa(np.full(N, 0.1)).any()
-    with pytest.raises(SpecError, match="unmodelled.slope_kpa_per_m: got 0 numbers, expected 81"):
-        SPEC.replace(unmodelled={"pressure_kpa": (1.0,) * N})
-    with pytest.raises(SpecError, match="unmodelled.pressure_kpa: got 2 numbers, expected 9"):
-        SPEC.replace(unmodelled={"pressure_kpa": (1.0, 2.0)})
+def test_numbers_that_a_specification_lacks_are_zeros():
+    spring_m = np.full(N, 0.1)
+    assert not SPEC.unmodelled_kpa(spring_m).any()
+    assert (SPEC.replace(unmodelled={"pressure_kpa": (1.0,) * N}).unmodelled_kpa(spring_m) == 1.0).all()
+
+
+REFUSED = (
+    ("pressure_kpa", 2, "one for each of the 9 chambers"),
+    ("slope_kpa_per_m", N, "one for each of the 81 pairs of chamber and spring"),
+)
+
+
+@pytest.mark.parametrize(("name", "n", "expected"), REFUSED)
+def test_a_specification_says_how_many_numbers_it_needs(name, n, expected):
+    with pytest.raises(SpecError, match=f"unmodelled.{name}: got {n} numbers, expected {expected}"):
+        SPEC.replace(unmodelled={name: (1.0,) * n})

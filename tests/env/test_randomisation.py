@@ -1,0 +1,98 @@
+"""Differences from episode to episode: what is drawn, within which bounds, and what it does to an arm."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjx_softarm._support import xla
+from mjx_softarm.env import Randomisation, ReachEnv
+from mjx_softarm.env.reach import PAYLOAD
+from mjx_softarm.mechanics.statics import ArmParams
+
+MM = 1e-3
+SPREAD = Randomisation(payload_max_kg=0.5, stiffness_spread=0.2, sensor_noise_mm=2.0)
+
+
+def with_arm(state, **changes):
+    """The state with parts of its arms exchanged."""
+    return state.replace(pipeline_state=state.pipeline_state._replace(**changes))
+
+
+@pytest.fixture(scope="module")
+def randomised(spec, env):
+    """State of as many arms as the other fixtures', every kind of randomisation on."""
+    spread = ReachEnv(spec, dataclasses.replace(env.config, randomisation=SPREAD))
+    keys = jax.random.split(jax.random.key(0), env.config.n_poses)
+    return xla.jit(jax.vmap(spread.reset), spread.uses_mjx)(keys)
+
+
+def assert_all_arms_have(drawn, nominal, name):
+    for own, value in zip(jax.tree.leaves(drawn), jax.tree.leaves(nominal), strict=True):
+        np.testing.assert_array_equal(own, np.broadcast_to(value, own.shape), err_msg=name)
+
+
+def test_without_randomisation_every_arm_is_the_nominal_one(spec, env, start):
+    nominal = ArmParams.from_spec(spec)
+    drawn = jax.vmap(env.params_of)(start.pipeline_state)
+    for name in nominal._fields:
+        assert_all_arms_have(getattr(drawn, name), getattr(nominal, name), name)
+    np.testing.assert_array_equal(start.pipeline_state.sensor_offset_m, 0.0)
+
+
+def test_randomised_numbers_fill_their_bounds_and_no_other_number_changes(spec, env, randomised):
+    nominal, drawn = ArmParams.from_spec(spec), jax.vmap(env.params_of)(randomised.pipeline_state)
+    payload = np.asarray(drawn.tool_mass_kg[:, PAYLOAD]) - spec.mass.payload_kg
+    assert payload.min() >= 0.0 and payload.max() <= SPREAD.payload_max_kg
+    factor = np.asarray(drawn.chamber_stiffness) / nominal.chamber_stiffness
+    assert abs(factor - 1).max() <= SPREAD.stiffness_spread * (1 + 1e-6)
+    # 512 uniform draws leave less than one of 100 equal parts empty on average.
+    for value, low, high in ((payload, 0.0, 0.5), (factor, 0.8, 1.2)):
+        assert np.count_nonzero(np.histogram(value, 100, (low, high))[0]) > 90
+    assert np.ptp(factor, axis=1).min() > 0.02  # each chamber for itself
+    unchanged = {"tool_mass_kg", "chamber_stiffness"} ^ set(ArmParams._fields)
+    for name in unchanged:
+        assert_all_arms_have(getattr(drawn, name), getattr(nominal, name), name)
+    np.testing.assert_array_equal(drawn.tool_mass_kg[:, 0], np.float32(spec.mass.gripper_kg))
+
+
+def test_sensor_noise_has_its_standard_deviation_and_no_mean(randomised):
+    offset_mm = 1e3 * np.asarray(randomised.pipeline_state.sensor_offset_m)
+    n = offset_mm.size  # the bounds are five standard errors
+    assert abs(offset_mm.mean()) < 5 * 2.0 / np.sqrt(n)
+    assert abs(offset_mm.std() - 2.0) < 5 * 2.0 / np.sqrt(2 * n)
+    assert abs(np.corrcoef(offset_mm.T) - np.eye(9)).max() < 0.25  # springs for themselves
+
+
+def test_the_law_holds_readings_on_their_references_so_that_noise_shifts_the_true_lengths(
+    env, randomised, step, random_actions
+):
+    wanted = 0.175 + 0.005 * random_actions  # well within reach
+    arm = step(randomised, env.action_of(wanted)).pipeline_state
+    reading = arm.spring_m + randomised.pipeline_state.sensor_offset_m
+    np.testing.assert_allclose(reading, wanted, atol=0.11 * MM)
+    assert float(jnp.abs(arm.spring_m - wanted).max()) > 5 * MM
+
+
+def test_an_arm_keeps_its_own_numbers_for_the_whole_episode(env, randomised, step, random_actions):
+    after = step(step(randomised, env.action_of(env.pool.spring_m)), random_actions)
+    for name in ("payload_kg", "chamber_stiffness", "sensor_offset_m"):
+        assert np.array_equal(getattr(after.pipeline_state, name), getattr(randomised.pipeline_state, name))
+
+
+def test_a_payload_and_stiffer_chambers_ask_for_other_pressures_at_the_same_spring_lengths(env, start, step):
+    """By the balance of forces along a straight arm: 3 chambers carry the payload and their own stretch."""
+    action = jnp.broadcast_to(env.action_of(jnp.full(9, 0.19)), (len(start.obs), 9))
+    arm = start.pipeline_state
+    heavy = {"payload_kg": jnp.full_like(arm.payload_kg, 0.3)}
+    stiff = {"chamber_stiffness": 1.1 * arm.chamber_stiffness}
+    nominal, loaded, stiffened = (
+        step(with_arm(start, **changes), action).pipeline_state.pressure_kpa[0]
+        for changes in ({}, heavy, stiff)
+    )
+    area = np.asarray(env.params.area + env.params.area_slope * (0.19 - 0.2))  # N/kPa at this length
+    np.testing.assert_allclose(loaded - nominal, -0.3 * 9.81 / (3 * area), rtol=1e-3)
+    stretch = 0.1 * np.asarray(arm.chamber_stiffness[0]) * (0.19 - 0.2)
+    np.testing.assert_allclose(stiffened - nominal, stretch / area, rtol=1e-3)
