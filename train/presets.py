@@ -32,7 +32,7 @@ _MOVING = EnvConfig(
     observation="motion",
     goal_ends=False,
     reward=RewardConfig(saturation_cost=10.0),
-    randomisation=Randomisation(damping_spread=0.2, delay_max_s=0.005),
+    randomisation=Randomisation(damping_spread=0.2, delay_max_s=0.005, friction_max_n=1.5),
 )
 
 PRESETS: dict[str, TrainConfig] = {

@@ -29,9 +29,10 @@ class Randomisation:
     sensor_noise_mm: float = 0.0  # standard deviation of each spring's reading, fixed within an episode
     damping_spread: float = 0.0  # in motion, all dampers are times 1 + uniform(-spread, spread)
     delay_max_s: float = 0.0  # in motion, the valves' dead time is uniform from their own to this much more
+    friction_max_n: float = 0.0  # in motion, each chamber's dry friction is uniform from none to this
 
     def __post_init__(self):
-        for name in ("payload_max_kg", "sensor_noise_mm", "delay_max_s"):
+        for name in ("payload_max_kg", "sensor_noise_mm", "delay_max_s", "friction_max_n"):
             _expect(self, name, 0 <= getattr(self, name) < math.inf, "a finite number >= 0")
         for name in ("stiffness_spread", "damping_spread"):
             _expect(self, name, 0 <= getattr(self, name) < 1, "0 to 1")

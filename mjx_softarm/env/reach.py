@@ -15,7 +15,7 @@ from mjx_softarm import control
 from mjx_softarm._support import draws
 from mjx_softarm._support.mjx import Env, State, mjx
 from mjx_softarm.env.config import EnvConfig
-from mjx_softarm.env.state import ArmState, EpisodeNoise
+from mjx_softarm.env.state import ArmState, EpisodeNoise, motion_params
 from mjx_softarm.mdp import observation as obs
 from mjx_softarm.mdp import rewards
 from mjx_softarm.mdp.actions import ActionMap
@@ -26,7 +26,6 @@ from mjx_softarm.mechanics.pipe import CrossPipe, body_clearance
 from mjx_softarm.mechanics.settle import Settled, SettleResult, settle
 from mjx_softarm.mechanics.statics import PAYLOAD, ArmParams
 from mjx_softarm.mechanics.workspace import Pool, sample_evenly, sample_workspace
-from mjx_softarm.pneumatics import VALVE_S
 from mjx_softarm.sensing.pose import pose_from_frame
 from mjx_softarm.sensing.s2r import S2R, carry_body, correct
 from mjx_softarm.spec import ArmSpec
@@ -144,7 +143,7 @@ class ReachEnv(Env):
 
     def sample_noise(self, rng: Array, n: int) -> EpisodeNoise:
         """Draw the random numbers of n episodes: leaves (n, ...)."""
-        moving = draws.uniform(jax.random.fold_in(rng, 1), (n, 2)) if self.config.moves else None
+        moving = draws.uniform(jax.random.fold_in(rng, 1), (n, 3)) if self.config.moves else None
         return EpisodeNoise(*draws.both(rng, (n, 3 + self.action_size), (n, self.action_size)), moving)
 
     def reset_from(self, noise: EpisodeNoise) -> State:
@@ -154,14 +153,12 @@ class ReachEnv(Env):
         start = jax.tree.map(lambda x: x[start_row], self.pool)
         goal = self.pool.pose[goal_row]
         spread = self.config.randomisation
-        damping, delay = jnp.array([0.5, 0.0]) if noise.moving is None else noise.moving
         arm = ArmState(
             payload_kg=self.params.tool_mass_kg[PAYLOAD] + spread.payload_max_kg * share[2],
             chamber_stiffness=self.params.chamber_stiffness
             * (1.0 + spread.stiffness_spread * (2.0 * share[3:] - 1.0)),
             sensor_offset_m=1e-3 * spread.sensor_noise_mm * noise.normal,
-            damping=1.0 + spread.damping_spread * (2.0 * damping - 1.0),
-            delay_s=VALVE_S + spread.delay_max_s * delay,
+            moving=motion_params(spread, noise.moving),
             motion=Motion.at_rest(start.q, start.pressure_kpa, start.spring_m),
             pose=start.pose,
             spring_m=start.spring_m,
@@ -245,7 +242,7 @@ class ReachEnv(Env):
         params, config = self.params_of(arm), self.config
         kinematics = mjx_kinematics(self.model) if config.engine == "mjx" else chain_kinematics(params)
         if self.config.moves:
-            moving = MovingArm.of(self.model, kinematics, params, arm.damping, arm.delay_s)
+            moving = MovingArm.of(self.model, kinematics, params, arm.moving)
             rate_hz = self.spec.control.rate_hz
             times_s = config.dynamic_step_s, 1.0 / rate_hz, config.simulation_step_s
             return advance(moving, arm.motion, reference_m, self.gains, *times_s)

@@ -5,9 +5,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 from jax import Array
 
-from mjx_softarm.mechanics.dynamics import Motion
+from mjx_softarm.env.config import Randomisation
+from mjx_softarm.mechanics.dynamics import Motion, MotionParams
+from mjx_softarm.pneumatics import VALVE_S
 from mjx_softarm.sensing.sensors import SENSORS
 
 for _sensor in SENSORS.values():
@@ -15,11 +18,11 @@ for _sensor in SENSORS.values():
 
 
 class EpisodeNoise(NamedTuple):
-    """Random numbers that fix one episode: start, goal, payload, stiffness, sensor bias, damping, delay."""
+    """Random numbers that fix one episode."""
 
     uniform: Array  # (3 + n_chambers,) from 0 to 1: start, goal, payload, stiffness of each chamber
     normal: Array  # (n_chambers,) standard normal: bias of each spring's reading
-    moving: Array | None  # (2,) from 0 to 1: damping, delay; None for arms at rest
+    moving: Array | None  # (3,) from 0 to 1: damping, delay, friction; None for arms at rest
 
 
 class ArmState(NamedTuple):
@@ -28,8 +31,7 @@ class ArmState(NamedTuple):
     payload_kg: Array  # () payload of this episode
     chamber_stiffness: Array  # (n_chambers,) [N/m] stiffnesses of this episode
     sensor_offset_m: Array  # (n_chambers,) reading less true length, in this episode
-    damping: Array  # () factor of all dampers in this episode
-    delay_s: Array  # () dead time of the valves in this episode
+    moving: MotionParams  # of this episode
     motion: Motion  # joint coordinates, velocities, pressures
     pose: Array  # (6,) [mm, deg] as observed: the real arm's where there is a sim-to-real network
     spring_m: Array  # (n_chambers,) true lengths
@@ -37,3 +39,13 @@ class ArmState(NamedTuple):
     sensed: Array | None  # (k,) `observe_motion`; None where pose and goal are all that is observed
     goal: Array  # (6,) [mm, deg]
     n_steps: Array  # () actions taken in this episode
+
+
+def motion_params(spread: Randomisation, share: Array | None) -> MotionParams:
+    """Return the numbers that `EpisodeNoise.moving` fixes; the nominal ones for None."""
+    damping, delay, friction = jnp.array([0.5, 0.0, 0.0]) if share is None else share
+    return MotionParams(
+        damping=1.0 + spread.damping_spread * (2.0 * damping - 1.0),
+        delay_s=VALVE_S + spread.delay_max_s * delay,
+        friction_n=spread.friction_max_n * friction,
+    )

@@ -12,6 +12,9 @@ long as a control period. With all functions of q taken there,
 
     (M + h/2 D + h^2/4 K) dv = -h (dV/dq + D v + c),    q' = q + h (v + dv / 2)
 
+A chamber's dry friction F at the rate l' of its length is a damper too, of F / sqrt(l'^2 + w^2) with a small
+w: it is F where the arm moves, but does not hold an arm at rest.
+
 The chambers fill as `mjx_softarm.pneumatics` has it, in half steps: the pressure of a step is that of its
 middle, and K holds the stiffness of the gas.
 
@@ -35,6 +38,7 @@ from mjx_softarm.mechanics.settle import Result
 from mjx_softarm.mechanics.statics import ArmParams, Tendons, all_tendons, statics_of
 
 N_PER_KPA_M2 = 1e3
+CREEP_M_PER_S = 0.005  # rate of a chamber's length below which its dry friction fades
 LONGEST_M = 1.0  # spring length that no arm reaches, before its numbers are no longer finite
 
 
@@ -81,14 +85,21 @@ class Moved(NamedTuple):
     result: Array  # () int32, a `MotionResult`
 
 
+class MotionParams(NamedTuple):
+    """Numbers of an arm that show in motion alone."""
+
+    damping: Array | float = 1.0  # () factor of all dampers
+    delay_s: Array | float = pneumatics.VALVE_S  # () dead time of the valves, at most a control period
+    friction_n: Array | float = 0.0  # () dry friction of each chamber
+
+
 class MovingArm(NamedTuple):
     """Numbers of an arm in motion."""
 
     model: mjx.Model
     kinematics: Kinematics
     params: ArmParams
-    damping: Array  # () factor of all dampers
-    delay_s: Array  # () dead time of the valves, at most a control period
+    own: MotionParams
 
     @classmethod
     def of(
@@ -96,8 +107,7 @@ class MovingArm(NamedTuple):
         model: mjx.Model,
         kinematics: Kinematics,
         params: ArmParams,
-        damping: Array | float = 1.0,
-        delay_s: Array | float = pneumatics.VALVE_S,
+        own: MotionParams,
     ) -> MovingArm:
         """Return an arm with the masses and stiffnesses of `params`; all else is the model's.
 
@@ -105,8 +115,7 @@ class MovingArm(NamedTuple):
             model: the arm, from `mjx_softarm.mechanics.mjcf`.
             kinematics: of either engine.
             params: numbers of the arm.
-            damping: factor of all dampers.
-            delay_s: dead time of the valves, at most a control period.
+            own: its numbers that show in motion alone.
         """
         mass = jnp.concatenate([jnp.zeros(1), params.link_mass_kg, params.tool_mass_kg])
         scale = jnp.where(model.body_mass > 0, mass / jnp.maximum(model.body_mass, 1e-9), 0.0)
@@ -115,7 +124,7 @@ class MovingArm(NamedTuple):
             body_inertia=model.body_inertia * scale[:, None],
             opt=model.opt.replace(gravity=jnp.zeros(3)),  # V has the weights
         )
-        return cls(model, kinematics, params, jnp.asarray(damping), jnp.asarray(delay_s))
+        return cls(model, kinematics, params, own)
 
 
 class _Instant(NamedTuple):
@@ -208,7 +217,7 @@ def _step(arm: MovingArm, motion: Motion, command_kpa: Array, k: int, h: float) 
 
     def fill(gas_m3: Array, volume: Array, half: int) -> Array:
         """Return the gas (n_chambers,) after the half step."""
-        new = jnp.clip(half + 1.0 - arm.delay_s / (0.5 * h), 0.0, 1.0)  # share of it with the new command
+        new = jnp.clip(half + 1.0 - arm.own.delay_s / (0.5 * h), 0.0, 1.0)  # share of it with the new command
         command = motion.command_kpa + new * (command_kpa - motion.command_kpa)
         return pneumatics.regulated(gas_m3, volume, command, 0.5 * h)
 
@@ -221,7 +230,7 @@ def _step(arm: MovingArm, motion: Motion, command_kpa: Array, k: int, h: float) 
     # Forces and their derivatives there
     mass, bias = _inertia(arm.model, now.frames, params, middle)
     potential = statics_of(now.tendons, now.frames, middle.q, pressure_kpa, params)
-    damping, stiffness = _dampers(arm, jacobian), potential.hessian.dense()
+    damping, stiffness = _dampers(arm, jacobian, v), potential.hessian.dense()
     gas = (
         pneumatics.ATMOSPHERE_KPA / N_PER_KPA_M2 * gas_m3 * (potential.area / middle_m3) ** 2
     )  # (n_chambers,) [N/m]
@@ -242,13 +251,16 @@ def _step(arm: MovingArm, motion: Motion, command_kpa: Array, k: int, h: float) 
     )
 
 
-def _dampers(arm: MovingArm, jacobian: Array) -> Array:
-    """Return the matrix (nv, nv) of all dampers, with tendons of Jacobians (2, n_sections, 3, n)."""
+def _dampers(arm: MovingArm, jacobian: Array, v: Array) -> Array:
+    """Return the matrix (nv, nv) of all dampers and of friction, with Jacobians (2, n_sections, 3, n)."""
     tendon = arm.model.tendon_damping.reshape(jacobian.shape[1], -1, 2)  # (n_sections, 3, 2)
     rows = jnp.concatenate(list(jacobian), axis=1)  # (n_sections, 6, n)
     scaled = jnp.concatenate([tendon[..., :1] * jacobian[0], tendon[..., 1:] * jacobian[1]], axis=1)
     own = block_diagonal(product(jnp.swapaxes(rows, 1, 2), scaled))
-    return arm.damping * (own + jnp.diag(arm.model.dof_damping))
+    rate = product(jacobian[0], v.reshape(len(tendon), -1, 1))  # (n_sections, 3, 1) [m/s] of the chambers
+    secant = arm.own.friction_n / jnp.sqrt(rate**2 + CREEP_M_PER_S**2)
+    friction = block_diagonal(product(jnp.swapaxes(jacobian[0], 1, 2), secant * jacobian[0]))
+    return arm.own.damping * (own + jnp.diag(arm.model.dof_damping)) + friction
 
 
 def _inertia(model: mjx.Model, frames: Frames, params: ArmParams, motion: Motion) -> tuple[Array, Array]:

@@ -10,6 +10,8 @@ import pytest
 from mjx_softarm._support import xla
 from mjx_softarm.env import Randomisation, ReachEnv
 from mjx_softarm.env.reach import PAYLOAD
+from mjx_softarm.env.state import motion_params
+from mjx_softarm.mechanics.dynamics import MotionParams
 from mjx_softarm.mechanics.statics import ArmParams
 
 MM = 1e-3
@@ -96,3 +98,10 @@ def test_a_payload_and_stiffer_chambers_ask_for_other_pressures_at_the_same_spri
     np.testing.assert_allclose(loaded - nominal, -0.3 * 9.81 / (3 * area), rtol=1e-3)
     stretch = 0.1 * np.asarray(arm.chamber_stiffness[0]) * (0.19 - 0.2)
     np.testing.assert_allclose(stiffened - nominal, stretch / area, rtol=1e-3)
+
+
+def test_numbers_of_motion_fill_their_bounds():
+    spread = Randomisation(damping_spread=0.2, delay_max_s=0.005, friction_max_n=1.5)
+    np.testing.assert_allclose(motion_params(spread, jnp.zeros(3)), [0.8, 0.01, 0.0], rtol=1e-6)
+    np.testing.assert_allclose(motion_params(spread, jnp.ones(3)), [1.2, 0.015, 1.5], rtol=1e-6)
+    np.testing.assert_allclose(motion_params(spread, None), MotionParams())

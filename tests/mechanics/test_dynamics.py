@@ -8,10 +8,17 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_softarm import ArmSpec, control, pneumatics
+from mjx_softarm import ArmSpec, control
 from mjx_softarm._support import xla
 from mjx_softarm._support.mjx import mjx
-from mjx_softarm.mechanics.dynamics import Motion, MotionResult, MovingArm, advance
+from mjx_softarm.mechanics.dynamics import (
+    CREEP_M_PER_S,
+    Motion,
+    MotionParams,
+    MotionResult,
+    MovingArm,
+    advance,
+)
 from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.mjcf import build_model, chamber_lengths, spring_lengths
 from mjx_softarm.mechanics.settle import settle_pressures
@@ -48,8 +55,11 @@ def references(spec, n):
     return np.repeat(asked, HOLD_TICKS, axis=1)
 
 
-def true_tips(spec, q, pressure_kpa, reference_m):
-    """Tips (ticks, 3) [m] of C MuJoCo after each tick, with references (ticks, chambers)."""
+def true_tips(spec, q, pressure_kpa, reference_m, friction_n=0.0):
+    """Tips (ticks, 3) [m] of C MuJoCo after each tick, with references (ticks, chambers).
+
+    With friction each chamber is pushed against the rate of its length, at each time step anew.
+    """
     model = build_model(spec)
     model.opt.timestep, model.actuator_ctrllimited[:] = TRUE_STEP_S, 0
     data = mujoco.MjData(model)
@@ -66,19 +76,27 @@ def true_tips(spec, q, pressure_kpa, reference_m):
         air.command(command)
         for _ in range(round(PERIOD_S / TRUE_STEP_S)):
             data.ctrl[:] = air.step(chamber_lengths(data))
+            data.qfrc_applied[:] = dry_friction(data, friction_n) if friction_n else 0.0
             mujoco.mj_step2(model, data)
             mujoco.mj_step1(model, data)
         tips.append(data.site("tip").xpos.copy())
     return np.array(tips)
 
 
+def dry_friction(data, friction_n):
+    """Forces (nv,) of chambers that are pushed against the rate of their length."""
+    jacobian = data.ten_J.reshape(-1, data.qpos.size)[0::2]  # dense: each tendon crosses all links
+    rate = data.ten_velocity[0::2]
+    return -jacobian.T @ (friction_n * rate / np.sqrt(rate**2 + CREEP_M_PER_S**2))
+
+
 def mover(spec):
-    """Function of joint coordinates, pressures, references (ticks, chambers), delay: results of each tick."""
+    """Function of joint coordinates, pressures, references (ticks, chambers), own numbers: the results."""
     model, params = mjx.put_model(build_model(spec)), jax.tree.map(jnp.asarray, ArmParams.from_spec(spec))
 
-    def move(q, pressure_kpa, reference_m, delay_s):
+    def move(q, pressure_kpa, reference_m, own):
         kinematics = chain_kinematics(params)
-        arm = MovingArm.of(model, kinematics, params, delay_s=delay_s)
+        arm = MovingArm.of(model, kinematics, params, own)
         start = Motion.at_rest(q, pressure_kpa, all_tendons(kinematics(q), params).length[1])
 
         def tick(motion, reference):
@@ -92,7 +110,7 @@ def mover(spec):
 def test_transients_are_those_of_c_mujoco():
     """Within 1 mm at 95 % over 2 s, with a random reference each half second."""
     start, asked = starts(SPEC, N_ARMS), references(SPEC, N_ARMS)
-    moved = mover(SPEC)(*start, np.float32(asked), pneumatics.VALVE_S)
+    moved = mover(SPEC)(*start, np.float32(asked), MotionParams())
     true = np.array([true_tips(SPEC, *each) for each in zip(*start, asked, strict=True)])
     error_mm = 1e3 * np.linalg.norm(moved.tip_position_m - true, axis=-1)
     assert (moved.result == MotionResult.FINITE.value).all()
@@ -108,16 +126,31 @@ def short():
 
 def test_a_command_waits_for_the_valves(short):
     start, asked, move = short
-    late, soon = (move(*start, asked, delay_s).pressure_kpa for delay_s in (PERIOD_S, pneumatics.VALVE_S))
+    delays = MotionParams(delay_s=PERIOD_S), MotionParams()
+    late, soon = (move(*start, asked, own).pressure_kpa for own in delays)
     np.testing.assert_allclose(late[:, 0], start.pressure_kpa, atol=1e-2)
     assert np.abs(soon[:, 0] - start.pressure_kpa).max() > 0.3
     assert np.abs(late[:, 1] - start.pressure_kpa).max() > 0.3
 
 
+def test_dry_friction_is_that_of_c_mujoco(short):
+    """Pushed back along its path by up to 8 N in each chamber, which changes the path by millimetres."""
+    friction_n, asked = 8.0, references(SHORT_ARM, 4)
+    start, _, move = short
+    moved, free = (
+        np.asarray(move(*start, np.float32(asked), MotionParams(friction_n=f)).tip_position_m)
+        for f in (friction_n, 0.0)
+    )
+    true = np.array([true_tips(SHORT_ARM, *each, friction_n) for each in zip(*start, asked, strict=True)])
+    off_mm, change_mm = (1e3 * np.linalg.norm(moved - x, axis=-1) for x in (true, free))
+    assert np.percentile(change_mm, 95) > 3.0
+    assert np.percentile(off_mm, 95) < 0.1 * np.percentile(change_mm, 95)
+
+
 def test_a_nan_in_one_world_stays_there(short):
     (q, pressure), asked, move = short
-    clean = move(q, pressure, asked, pneumatics.VALVE_S)
-    moved = move(np.where(np.arange(4)[:, None] == 2, np.nan, q), pressure, asked, pneumatics.VALVE_S)
+    clean = move(q, pressure, asked, MotionParams())
+    moved = move(np.where(np.arange(4)[:, None] == 2, np.nan, q), pressure, asked, MotionParams())
     assert (moved.result[2] == MotionResult.NOT_FINITE.value).all()
     for name in ("tip_position_m", "pressure_kpa", "result"):
         for arm in (0, 1, 3):
@@ -128,6 +161,6 @@ def test_a_step_that_is_too_long_is_told(short):
     """Lengths that no arm has: the result says that the time step is to blame."""
     (q, pressure), asked, move = short
     torn = np.where(np.arange(4)[:, None] == 1, np.eye(q.shape[1])[0] * 2.0, q)
-    result = move(torn, pressure, asked, pneumatics.VALVE_S).result[:, 0]
+    result = move(torn, pressure, asked, MotionParams()).result[:, 0]
     np.testing.assert_array_equal(result, [0, MotionResult.DIVERGED.value, 0, 0])
     assert "time step is too long" in MotionResult(int(result[1])).text
