@@ -11,9 +11,9 @@ from mjx_softarm.control import saturated
 from mjx_softarm.deploy import faults
 from mjx_softarm.deploy.controller import Controller, State
 from mjx_softarm.deploy.faults import Event, Fault
-from mjx_softarm.mdp.observation import observe_motion, rate_ticks
+from mjx_softarm.mdp.observation import rate_ticks
 from mjx_softarm.policy.file import Policy
-from mjx_softarm.policy.runtime import tip_pose
+from mjx_softarm.policy.runtime import sensed_motion, tip_pose
 from mjx_softarm.sensing.load import Load
 from mjx_softarm.sensing.pose import pose_error
 
@@ -89,18 +89,10 @@ def _sensed(controller: Controller, state: State, pose: np.ndarray) -> np.ndarra
     policy = controller.policy
     if not policy.observes_motion:
         return None
-    n_before = min(rate_ticks(policy.rate_hz), len(state.springs_m) - 1)
-    last_m = state.springs_m[-1 - n_before]
-    reference_m = state.spring_m if state.reference_m is None else state.reference_m
-    return observe_motion(
-        state.spring_m,
-        last_m,
-        pose[:3],
-        believed(controller, last_m, state.load)[0][:3],
-        state.law.integral_kpa,
-        policy.actions.from_lengths(reference_m),
-        policy.spec,
-    )
+    before_m = state.springs_m[-1 - min(rate_ticks(policy.rate_hz), len(state.springs_m) - 1)]
+    reference_m = np.full_like(before_m, np.nan) if state.reference_m is None else state.reference_m
+    motion = state.spring_m, before_m, reference_m, state.law.integral_kpa
+    return sensed_motion(policy, pose, *motion, state.load.believed_kg)
 
 
 def _shifted(controller: Controller, state: State) -> np.ndarray:

@@ -13,12 +13,20 @@ from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.link import vented
 from mjx_softarm.deploy.reachability import distances
 from mjx_softarm.export.symbols import Symbol, constant, repeat, symbol
-from mjx_softarm.mdp.observation import OBS_SIZE
 from mjx_softarm.policy import reach
-from mjx_softarm.policy.runtime import action_towards, actor_output, tip_pose
+from mjx_softarm.policy.file import Policy, observation_names
+from mjx_softarm.policy.runtime import action_towards, actor_output, sensed_motion, tip_pose
 from mjx_softarm.sensing.load import tell_load
 from mjx_softarm.sensing.pose import pose_error
 from mjx_softarm.sensing.sensors import Reading, SensorFault
+
+
+class InMotion(NamedTuple):
+    """What a policy of motion takes besides readings and goal."""
+
+    before_m: Array  # (n,) lengths `rate_ticks` before; NaN if not known
+    last_reference_m: Array  # (n,) references of the last action; NaN before the first
+    integral_kpa: Array  # (n,) of the law
 
 
 class Computation(NamedTuple):
@@ -33,22 +41,34 @@ def graph(controller: Controller) -> Computation:
     n = controller.policy.spec.n_chambers
     inputs = symbol("readings", (n,)), symbol("goal", (6,)), symbol("last_length_m", (n,))
     inputs = *inputs, symbol("load_kg", ()), symbol("pressure_kpa", (n,))
-    return Computation(inputs, {name: constant(value) for name, value in answer(controller, *inputs).items()})
+    motion = _in_motion(n)
+    found = answer(controller, *inputs, motion)
+    inputs += tuple(motion) if controller.policy.observes_motion else ()
+    return Computation(inputs, {name: constant(value) for name, value in found.items()})
 
 
 def answer(
-    controller: Controller, readings: Array, goal: Array, last_m: Array, load_kg: Array, pressure_kpa: Array
+    controller: Controller,
+    readings: Array,
+    goal: Array,
+    last_m: Array,
+    load_kg: Array,
+    pressure_kpa: Array,
+    motion: InMotion | None = None,
 ) -> dict[str, Array]:
     """Return the references that the loop takes from readings (n,) and a goal (6,) when it acts, and more.
 
     A lost reading holds the last length (n,) [m] of its spring. References are NaN where the loop would give
     none: a spring has neither a reading nor a last length, or the goal is outside the workspace. The payload
-    () [kg] is the caller's average of what rests told, each at its pressures (n,) [kPa].
+    () [kg] is the caller's average of what rests told, each at its pressures (n,) [kPa]. `motion` is for
+    a policy that observes it.
     """
     policy, xp = controller.policy, array_namespace(readings)
     reading = policy.sensor.lengths(readings, last_m)
     pose, away = tip_pose(policy, reading.length_m, load_kg)
-    reference = policy.actions.readings(action_towards(policy, pose, xp.asarray(goal, dtype=np.float32)))
+    sensed = _sensed(policy, pose, reading.length_m, motion, load_kg)
+    action = action_towards(policy, pose, xp.asarray(goal, dtype=np.float32), sensed)
+    reference = policy.actions.readings(action)
     # A distance that is NaN is not within the limit, nor is a length that is NaN finite.
     inside = _inside(controller, goal)
     acts = inside & xp.all(xp.isfinite(reading.length_m))
@@ -81,9 +101,12 @@ def _inside(controller: Controller, goal: Array) -> Array:
 
 
 def actor(controller: Controller) -> Computation:
-    """Record the bare actor: observation (18,) -> action (n,) in [-1, 1]."""
-    observation = symbol("observation", (OBS_SIZE,), np.float32)
-    return Computation((observation,), {"action": actor_output(controller.policy, observation)})
+    """Record the bare actor: observation (O,) -> action (n,) in [-1, 1]."""
+    policy = controller.policy
+    observation = symbol(
+        "observation", (len(observation_names(policy.spec, policy.observes_motion)),), np.float32
+    )
+    return Computation((observation,), {"action": actor_output(policy, observation)})
 
 
 def parts(controller: Controller) -> dict[str, Computation]:
@@ -100,7 +123,9 @@ def parts(controller: Controller) -> dict[str, Computation]:
     reading = policy.sensor.lengths(readings, spring_m)
     tip, away = tip_pose(policy, spring_m, load_kg)
     told_kg = tell_load(policy.load_estimator, xp.mean(springs_m, axis=0), xp.mean(pressures_kpa, axis=0))
-    action = action_towards(policy, pose, xp.asarray(goal, dtype=np.float32))
+    motion = _in_motion(n)
+    sensed = _sensed(policy, pose, spring_m, motion, load_kg)
+    action = action_towards(policy, pose, xp.asarray(goal, dtype=np.float32), sensed)
     written_kpa, after = pressures(reference_m, spring_m, state, gains, controller.dt_s)
     law = {"written_kpa": written_kpa} | {f"next_{name}": value for name, value in after._asdict().items()}
     mask = saturated(pressure_kpa, reference_m, spring_m, gains, tolerance_m)
@@ -117,7 +142,7 @@ def parts(controller: Controller) -> dict[str, Computation]:
         "told_load": of(springs_m, pressures_kpa, kg=told_kg),
         "left": of(pose, goal, off=pose_error(xp.asarray(pose, dtype=np.float64), goal)),
         "tip": of(spring_m, load_kg, tip=tip, away=constant(away)),
-        "references": of(pose, goal, asked_m=policy.actions.lengths(action)),
+        "references": of(pose, goal, spring_m, *motion, load_kg, asked_m=policy.actions.lengths(action)),
         "law": of(reference_m, spring_m, *state, **law),
         "vented": of(pressure_kpa, next_kpa=vented(pressure_kpa, controller.dt_s)),
         "inside": of(goal, holds=_inside(controller, goal)),
@@ -133,6 +158,19 @@ def parts(controller: Controller) -> dict[str, Computation]:
             pressure_kpa, spring_m, mask=faults.as_without(policy.spring_model, pressure_kpa, spring_m)
         ),
     }
+
+
+def _in_motion(n: int) -> InMotion:
+    return InMotion(*(symbol(name, (n,)) for name in InMotion._fields))
+
+
+def _sensed(
+    policy: Policy, pose: Array, spring_m: Array, motion: InMotion | None, load_kg: Array
+) -> Array | None:
+    """Return what the policy observes besides pose and goal."""
+    if not policy.observes_motion or motion is None:
+        return None
+    return sensed_motion(policy, pose, spring_m, *motion, load_kg)
 
 
 def _lost(reading: Reading) -> Array:

@@ -10,6 +10,7 @@ from mjx_softarm.deploy.faults import LATE_TICKS, LOST_TICKS, SETTLE_TIMEOUT_S, 
 from mjx_softarm.deploy.loop import CHAMBER_WINDOWS, OVERLOAD_KG
 from mjx_softarm.export.computations import parts
 from mjx_softarm.export.cpp_functions import Numbers, function
+from mjx_softarm.mdp.observation import rate_ticks
 from mjx_softarm.policy.file import file_entries
 from mjx_softarm.policy.reach import N_STEPS, begin
 from mjx_softarm.sensing.load import HIGHEST, JUMP_KG, LOWEST, N_AVERAGED, N_JUMPS
@@ -40,6 +41,8 @@ def sources(controller: Controller, policy_sha256: str) -> dict[str, str]:
         "PARTS": "\n".join(functions),
         "WINDOW": controller.window,
         "N_ACTIONS": policy.n_actions,
+        "ACTION": repr(float(policy.action_s)),
+        "RATE_TICKS": rate_ticks(policy.rate_hz),
         "LOST_TICKS": LOST_TICKS,
         "LATE_TICKS": LATE_TICKS,
         "SUSPECT_TICKS": CHAMBER_WINDOWS * controller.window,

@@ -76,8 +76,12 @@ class Numbers:
 
 
 def function(name: str, computation: Computation, numbers: Numbers) -> str:
-    """Return a computation as a function, its outputs after its inputs."""
-    takes = [f"const {_TYPES[item.dtype.name]}* {item.option}" for item in computation.inputs]
+    """Return a computation as a function, its outputs after its inputs; those not looked at have no name."""
+    read = set(ordered(computation.outputs.values()))
+    takes = [
+        f"const {_TYPES[item.dtype.name]}*" + (f" {item.option}" if item in read else "")
+        for item in computation.inputs
+    ]
     gives = [f"{_TYPES[item.dtype.name]}* {key}" for key, item in computation.outputs.items()]
     body = "\n".join(f"  {line}" for line in _Body(computation, numbers).lines)
     return f"inline void {name}({', '.join(takes + gives)}) noexcept {{\n{body}\n}}\n"

@@ -13,8 +13,8 @@ from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.export import computations
 from mjx_softarm.export.cpp import sources
 from mjx_softarm.export.golden import make_golden, write_golden
-from mjx_softarm.mdp.observation import OBS_LAYOUT
-from mjx_softarm.policy.file import Policy, action_layout, load_policy
+from mjx_softarm.mdp.observation import RATE_S
+from mjx_softarm.policy.file import Policy, action_layout, load_policy, observation_names
 
 _POSE = {"unit": ["mm"] * 3 + ["deg"] * 3, "names": ["x", "y", "z", "yaw", "pitch", "roll"]}
 FRAME = "base frame: z up, the arm hangs towards -z; angles intrinsic Z-Y-X, zero where it hangs straight"
@@ -42,6 +42,9 @@ def export_onnx(policy_path: Path) -> list[Path]:
         "load_kg": controller.policy.spec.mass.payload_kg,
         "pressure_kpa": np.full(n, np.nan),
     }
+    if controller.policy.observes_motion:
+        unknown = np.full(n, np.nan)
+        never |= computations.InMotion(unknown, unknown, np.zeros(n))._asdict()
     write_onnx(whole, computations.graph(controller), {"kind": "policy", **about}, never)
     write_onnx(actor, computations.actor(controller), {"kind": "actor", **about}, {})
     write_onnx(check, computations.check(controller), {"kind": "check of goals", **about}, {})
@@ -81,8 +84,11 @@ def describe(policy: Policy, sha256: str) -> dict[str, Any]:
             "last_length_m": lengths | {"default": "nan: none yet; a lost reading holds it"},
             "load_kg": {"unit": "kg", "default": "the specification's: load_told_kg, averaged over rests"},
             "pressure_kpa": {"unit": "kPa", "default": "nan: not known; of the arm at rest"},
-            "observation": {"names": list(OBS_LAYOUT), "centre": policy.obs_scale.centre.tolist()}
-            | {"scale": policy.obs_scale.scale.tolist()},
+            "before_m": lengths | {"default": f"nan: not known; {RATE_S:g} s before"},
+            "last_reference_m": lengths | {"default": "nan: none yet; of the last action"},
+            "integral_kpa": {"unit": "kPa", "default": "0; of the law"},
+            "observation": {"names": list(observation_names(policy.spec, policy.observes_motion))}
+            | {name: value.tolist() for name, value in policy.obs_scale._asdict().items()},
         },
         "outputs": {
             "reference_m": lengths | {"nan": "no length of a spring, or a goal outside the workspace"},
@@ -100,6 +106,7 @@ def describe(policy: Policy, sha256: str) -> dict[str, Any]:
         "rate_hz": policy.rate_hz,
         "tolerance_m": policy.tolerance_m,
         "n_actions": policy.n_actions,
+        "action_s": policy.action_s,
         "gains": {name: np.asarray(value).tolist() for name, value in policy.gains._asdict().items()},
         "spec": policy.spec.to_dict(),
         "provenance": dict(policy.provenance),
@@ -108,8 +115,4 @@ def describe(policy: Policy, sha256: str) -> dict[str, Any]:
 
 def _open(policy_path: Path) -> tuple[Controller, str]:
     sha256 = hashlib.sha256(policy_path.read_bytes()).hexdigest()
-    policy = load_policy(policy_path)
-    if policy.action_s:
-        expected = "0: a policy that was trained on arms at rest"
-        raise InputError(f"{policy_path}: action_s: got {policy.action_s:g}, expected {expected}")
-    return Controller.of(policy), sha256
+    return Controller.of(load_policy(policy_path)), sha256

@@ -193,7 +193,7 @@ def file_entries(policy: Policy) -> dict[str, np.ndarray]:
     entries: dict[str, Any] = {
         "schema_version": SCHEMA_VERSION,
         "spec_json": json.dumps(policy.spec.to_dict()),
-        "obs_layout": _obs_layout(policy.spec, policy.observes_motion),
+        "obs_layout": observation_names(policy.spec, policy.observes_motion),
         "action_layout": action_layout(policy.spec),
         "rate_hz": policy.rate_hz,
         "tolerance_m": policy.tolerance_m,
@@ -215,7 +215,8 @@ def file_entries(policy: Policy) -> dict[str, np.ndarray]:
     return {name: np.asarray(value) for name, value in entries.items()}
 
 
-def _obs_layout(spec: ArmSpec, observes_motion: bool) -> tuple[str, ...]:
+def observation_names(spec: ArmSpec, observes_motion: bool) -> tuple[str, ...]:
+    """Return the names of an observation's entries."""
     return OBS_LAYOUT + (motion_layout(spec.n_chambers) if observes_motion else ())
 
 
@@ -256,7 +257,7 @@ def _unpack(arrays: Mapping[str, np.ndarray], source: str) -> Policy:
         n_actions=entries.take("n_actions", np.integer, ()),
         action_s=entries.take("action_s", np.float64, ()),
     )
-    layout = _obs_layout(spec, policy.observes_motion)
+    layout = observation_names(spec, policy.observes_motion)
     limits = policy.sensor.lengths(np.stack(policy.actions[1:]))  # (2, n)
     readable = (limits.fault == SensorFault.OK.value) & (limits.length_m[0] < limits.length_m[1])
     low_kpa, high_kpa = policy.gains.pressure_min_kpa, policy.gains.pressure_max_kpa

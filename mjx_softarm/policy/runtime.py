@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from mjx_softarm._support.mlp import mlp
 from mjx_softarm._support.xp import Array, array_namespace
-from mjx_softarm.mdp.observation import ObsScale, observe
+from mjx_softarm.mdp.observation import ObsScale, observe, observe_motion
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.sensing.estimator import estimate_frame
 from mjx_softarm.sensing.pose import pose_from_frame
@@ -44,6 +44,34 @@ def tip_pose(policy: Policy, spring_m: Array, load_kg: Array | float) -> tuple[A
     x = inputs(frame, array_namespace(spring_m).asarray(spring_m, dtype=np.float32))
     pose = pose_from_frame(*apply_correction(frame, correction(policy.s2r, x)))
     return pose, distance(policy.s2r, x) / policy.s2r.limit
+
+
+def sensed_motion(
+    policy: Policy,
+    pose: Array,
+    spring_m: Array,
+    before_m: Array,
+    reference_m: Array,
+    integral_kpa: Array,
+    load_kg: Array | float,
+) -> Array:
+    """Return `observe_motion` of an arm as its springs tell it, float32.
+
+    Args:
+        policy: that observes motion.
+        pose (6,) [mm, deg]: of the tip, as `tip_pose` of the springs.
+        spring_m (n,) [m]: lengths.
+        before_m (n,) [m]: lengths `rate_ticks` before; NaN if not known, as of an arm at rest.
+        reference_m (n,) [m]: references of the last action; NaN before the first.
+        integral_kpa (n,) [kPa]: of the sensor-space law.
+        load_kg () [kg]: payload.
+    """
+    xp = array_namespace(spring_m)
+    before_m, reference_m = (xp.where(xp.isfinite(x), x, spring_m) for x in (before_m, reference_m))
+    before_mm = tip_pose(policy, before_m, load_kg)[0][:3]
+    action = policy.actions.from_lengths(reference_m)
+    motion = spring_m, before_m, pose[:3], before_mm, integral_kpa, action
+    return xp.asarray(observe_motion(*motion, policy.spec), dtype=np.float32)
 
 
 def actor_output(policy: Policy, observation: Array) -> Array:

@@ -10,6 +10,7 @@ import pytest
 
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.export import golden as golden_rows
+from mjx_softarm.mdp.observation import OBS_SIZE, motion_layout
 from mjx_softarm.policy.file import load_policy, save_policy
 from mjx_softarm.sensing.s2r import N_POSE_INPUTS, N_POSE_OUTPUTS, S2R
 from tests.linear_arm import GAIN_M_PER_KPA, REST_M, SPEC, N, make_policy
@@ -45,6 +46,12 @@ def busy_policy(spec=SPEC):
     load = policy.load_estimator._replace(layers=((np.float32(weight), np.float32(bias)),))
     networks = {"estimator": estimator, "load_estimator": load, "s2r": s2r}
     return dataclasses.replace(policy, layers=layers(18, 12, N, scale=0.5), **networks)
+
+
+def moving_policy(spec=SPEC):
+    """The same, acting each 0.3 s on what it sees of the motion."""
+    n_in = OBS_SIZE + len(motion_layout(N))
+    return dataclasses.replace(busy_policy(spec), layers=layers(n_in, 12, N, scale=0.3), action_s=0.3)
 
 
 @contextlib.contextmanager

@@ -16,7 +16,7 @@ from mjx_softarm.export import golden as golden_rows
 from mjx_softarm.export.check import TOLERANCE, check
 from mjx_softarm.export.cpp import sources
 from mjx_softarm.export.golden import FLAGS
-from tests.export.conftest import busy_policy, few_golden_rows
+from tests.export.conftest import busy_policy, few_golden_rows, moving_policy
 
 pytestmark = pytest.mark.skipif(not shutil.which("g++"), reason="there is no compiler g++ here")
 STRICT = ("-std=c++17", "-Wall", "-Wextra", "-Werror")
@@ -43,11 +43,17 @@ def test_rows_agree_under_sanitizers(folder, golden):
     assert agreement.n_rows == len(golden.inputs) and agreement.error < TOLERANCE, agreement
 
 
-def test_draw_wires_without_a_sim_to_real_network(tmp_path):
+def draw_wires():
+    """A policy of an arm with draw wires, without a sim-to-real network."""
     spec = ArmSpec.default().to_dict()
     spec["sensor"] = {"kind": "draw_wire", "m_per_v": 0.1, "voltage_min_v": 0.0, "voltage_max_v": 5.0}
     spec["sensor"] |= {"beta": 1.0, "delta_m": 0.01}
-    controller = Controller.of(dataclasses.replace(busy_policy(ArmSpec.from_dict(spec, "test")), s2r=None))
+    return dataclasses.replace(busy_policy(ArmSpec.from_dict(spec, "test")), s2r=None)
+
+
+@pytest.mark.parametrize("make", [draw_wires, moving_policy])
+def test_rows_of_other_policies_agree(make, tmp_path):
+    controller = Controller.of(make())
     for name, text in sources(controller, "ab").items():
         (tmp_path / name).write_text(text)
     compile_("-O1", tmp_path / "rows.cpp", "-o", tmp_path / "rows")

@@ -12,10 +12,11 @@ from mjx_softarm.deploy.controller import Controller, start
 from mjx_softarm.deploy.loop import step, with_goal
 from mjx_softarm.export import computations
 from mjx_softarm.export.check import TOLERANCE, check
-from mjx_softarm.export.golden import FLAGS, N_SINGLE
+from mjx_softarm.export.golden import FLAGS, N_SINGLE, read_golden
 from mjx_softarm.export.write import export_onnx
+from mjx_softarm.policy.file import load_policy, save_policy
 from mjx_softarm.policy.runtime import actor_output
-from tests.export.conftest import busy_policy, few_golden_rows
+from tests.export.conftest import busy_policy, few_golden_rows, moving_policy
 from tests.linear_arm import N
 
 onnx = pytest.importorskip("onnx", reason="the package onnx is not installed")
@@ -91,6 +92,38 @@ def test_draw_wires_without_a_sim_to_real_network(tmp_path):
     feed = {name: np.asarray(value, np.float32) for name, value in feed.items()}
     [reference_m] = session.run(["reference_m"], feed)
     np.testing.assert_allclose(reference_m, state.reference_m, atol=1e-6)
+
+
+def test_a_policy_of_motion_is_told_of_the_motion(tmp_path):
+    """Without what it saw before, it answers as at its first action; with it, as the loop at its second."""
+    path = tmp_path / "moving.npz"
+    save_policy(path, moving_policy())
+    controller = Controller.of(load_policy(path))
+    with few_golden_rows():
+        whole, *_, golden = export_onnx(path)
+    agreement = check(read_golden(golden), whole)
+    assert agreement.n_rows >= 40 and agreement.error < TOLERANCE, agreement
+
+    goal = controller.policy.workspace[0].astype(float)
+    state, _ = with_goal(controller, start(controller), goal)
+    swing_m = 0.18 + 0.01 * np.sin(0.3 * np.arange(20))[:, None] * np.linspace(0.5, 1.0, N)
+    for spring_m in swing_m:
+        before, readings = state, controller.policy.sensor.readings(spring_m)
+        state, _ = step(controller, before, readings, False)
+        if state.n_actions == 2:
+            break
+    assert before.n_actions == 1 and state.n_actions == 2
+    seen_m = controller.policy.sensor.lengths(controller.policy.sensor.readings(swing_m)).length_m
+    at = len(before.springs_m)
+    motion = {"before_m": seen_m[at - 5], "last_reference_m": before.reference_m}
+    feed = {"readings": readings, "goal": goal, "integral_kpa": before.law.integral_kpa} | motion
+    feed = {name: np.asarray(value, np.float32) for name, value in feed.items()}
+    [reference_m] = ort.InferenceSession(whole).run(["reference_m"], feed)
+    np.testing.assert_allclose(reference_m, state.reference_m, atol=2e-6)
+    [blind_m] = ort.InferenceSession(whole).run(
+        ["reference_m"], {name: feed[name] for name in ("readings", "goal")}
+    )
+    assert np.abs(blind_m - state.reference_m).max() > 1e-4
 
 
 def test_other_graphs_are_refused(files, golden, tmp_path):
