@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from typing import Any
@@ -49,7 +50,18 @@ def in_parallel(jobs: Sequence[Job]) -> dict[str, Any]:
 
 
 def _settle_worker(queue: Any) -> None:
-    """Keep a worker and its children to its cores; Ctrl-C ends it, as training saves by itself."""
+    """Keep a worker and its children to its cores; Ctrl-C ends it, as training saves by itself.
+
+    The end of the benchmark, however it comes, ends it too.
+    """
     signal.signal(signal.SIGINT, signal.SIG_DFL)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     if share := queue.get():
         os.sched_setaffinity(0, share)
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None  # of a worker
+    parent.join()
+    os._exit(1)

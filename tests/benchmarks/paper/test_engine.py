@@ -1,6 +1,12 @@
 """The engine: stages run once, in their order, elsewhere; the folder keeps its settings."""
 
 import dataclasses
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
 
 import pytest
 
@@ -43,3 +49,34 @@ def test_jobs_run_elsewhere_and_a_failure_is_named():
     assert parallel.in_parallel([("a", pow, (2, 3)), ("b", divmod, (7, 2))]) == {"a": 8, "b": (3, 1)}
     with pytest.raises(JobError, match="bad: ValueError: invalid literal"):
         parallel.in_parallel([("bad", int, ("x",))])
+
+
+SLEEPY = """
+import os, time
+from benchmarks.harness.parallel import in_parallel
+from tests.benchmarks.paper.test_engine import sleep_long
+if __name__ == "__main__":
+    in_parallel([("long", sleep_long, ())])
+"""
+
+
+def sleep_long():
+    """A job that tells its process, and does not end by itself."""
+    print(os.getpid(), flush=True)
+    time.sleep(600.0)
+
+
+@pytest.mark.skipif(not Path("/proc").exists(), reason="there is no /proc to see processes in")
+def test_workers_end_with_a_benchmark_that_is_killed(tmp_path):
+    (tmp_path / "sleepy.py").write_text(SLEEPY)
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[3])}
+    command = [sys.executable, str(tmp_path / "sleepy.py")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as benchmark:
+        assert benchmark.stdout is not None
+        worker = int(benchmark.stdout.readline())
+        os.kill(worker, 0)  # it is there
+        benchmark.send_signal(signal.SIGKILL)
+        until = time.monotonic() + 60.0
+        while Path(f"/proc/{worker}").exists() and time.monotonic() < until:
+            time.sleep(0.05)
+        assert not Path(f"/proc/{worker}").exists()
