@@ -158,6 +158,11 @@ class ArmSpec:
     unmodelled: Unmodelled = Unmodelled()
 
     @property
+    def length_m(self) -> float:
+        """Length of the unloaded arm at rest."""
+        return self.structure.n_sections * self.geometry.section_length_m
+
+    @property
     def n_chambers(self) -> int:
         return N_CHAMBERS_PER_SECTION * self.structure.n_sections
 

@@ -82,7 +82,7 @@ def _figures(arm: str, folder: Path, distrusted: int) -> dict[str, Any]:
     parts = json.loads((folder / "calibration/report.json").read_text())["parts"]
     chambers, network = (parts[title]["figures"] for title in ("Chambers", "Sim-to-real network"))
     return {
-        "length [mm]": 1e3 * spec.structure.n_sections * spec.geometry.section_length_m,
+        "length [mm]": 1e3 * spec.length_m,
         "sections": spec.structure.n_sections,
         "pressures [kPa]": f"{spec.chambers.pressure_min_kpa:g} to {spec.chambers.pressure_max_kpa:g}",
         "calibration's exit status": distrusted,

@@ -148,7 +148,10 @@ def scene_of(folder: Path, settings: Settings, trial: Trial) -> Scene:
         goals = demonstrations.positions[: settings.n_positions].astype(float)
         names = [waypoint.name for waypoint in task_of(task, spec).waypoints[: settings.n_positions]]
     else:
-        goals, names = circle_poses(settings.n_points).astype(float), [""] * settings.n_points
+        goals, names = (
+            circle_poses(controller.policy.spec, settings.n_points).astype(float),
+            [""] * settings.n_points,
+        )
     session = TRIAL_SESSION if task else EVALUATION_SESSION
     twin = stand_in(settings)(trial.twin, payload_kg=1e-3 * trial.load_g, session=session, **inside)
     return Scene(twin, controller, goals, names)

@@ -104,7 +104,7 @@ def template(path: str | Path) -> str:
     phase = 2.0 * np.pi * (np.arange(10)[:, None] / 10.0 + np.arange(spec.n_chambers) / spec.n_chambers)
     length_m = spec.geometry.section_length_m + 0.01 * np.sin(phase)
     bend = np.stack([np.zeros(10), np.sin(phase[:, 0]), np.cos(phase[:, 0])], axis=1)
-    tip_m = [0.0, 0.0, -n_sections * spec.geometry.section_length_m] + bend * [0.0, 0.03, 0.01]
+    tip_m = [0.0, 0.0, -spec.length_m] + bend * [0.0, 0.03, 0.01]
     half = 0.1 * bend[:, 1]
     share = np.arange(1, n_sections + 1)[:, None] / n_sections
     log = Log(

@@ -50,7 +50,7 @@ def read_goals(name: str, policy: Policy, n: int) -> np.ndarray:
         InputError: there is no such file, or its columns are not `GOAL_COLUMNS`.
     """
     if name == "circle":
-        position_m, _ = frame_from_pose(circle_poses(n).astype(float))
+        position_m, _ = frame_from_pose(circle_poses(policy.spec, n).astype(float))
         turn = rotation_about(np.radians(policy.spec.mounting.tip_turn_deg))
         return np.asarray(pose_from_frame(position_m, np.broadcast_to(turn, (n, 3, 3))))
     if name == "grid":

@@ -191,7 +191,7 @@ def as_sb3(envs: SoftArmVectorEnv) -> VecEnv:
 
 def spaces(env: ReachEnv) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
     """Return the spaces of observations and actions; no section stretches to twice its length at rest."""
-    rest_mm = 1e3 * env.spec.structure.n_sections * env.spec.geometry.section_length_m
+    rest_mm = 1e3 * env.spec.length_m
     limit = 1.01 * np.array([2 * rest_mm] * 3 + [180.0] * 3)  # of a pose
     reward = env.config.reward
     weight = np.array([reward.weight_per_mm] * 3 + [reward.weight_per_deg] * 3)

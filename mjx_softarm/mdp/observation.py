@@ -34,7 +34,7 @@ class ObsScale(NamedTuple):
     @classmethod
     def from_spec(cls, spec: ArmSpec) -> ObsScale:
         """Return the map that centres on the unloaded tip and scales a third of the arm, or 90 deg, to 1."""
-        length_mm = 1e3 * spec.structure.n_sections * spec.geometry.section_length_m
+        length_mm = 1e3 * spec.length_m
         centre = np.array([0.0, 0.0, -length_mm, 0.0, 0.0, 0.0], np.float32)
         return cls(centre, np.array([length_mm / 3] * 3 + [90.0] * 3, np.float32))
 

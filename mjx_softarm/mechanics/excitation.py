@@ -6,7 +6,7 @@ import numpy as np
 
 from mjx_softarm.spec import ArmSpec
 
-CIRCLE_HEIGHT_MM = -575.0
+CIRCLE_DIAMETER_MM, CIRCLE_HEIGHT_MM = 160.0, -575.0  # of an arm of 600 mm, the paper's
 N_GROWING = 10  # poses from a first small motion to the full range
 
 
@@ -25,15 +25,15 @@ def random_pressures(spec: ArmSpec, n_poses: int, seed: int | np.random.Generato
     return low + (high - low) * 0.5 * (1.0 + swing)
 
 
-def circle_poses(n: int = 40, diameter_mm: float = 160.0, height_mm: float = CIRCLE_HEIGHT_MM) -> np.ndarray:
+def circle_poses(spec: ArmSpec, n: int = 40) -> np.ndarray:
     """Return poses (n, 6) [mm, deg] along a horizontal circle below the base, the tip hanging straight down.
 
-    The paper gives diameter and number of points but no height; at the default one, the paper's arm reaches
-    every point with 2 kPa to spare in each chamber.
+    It is the paper's, as many times as large as the arm is longer. The paper gives diameter and number of
+    points but no height; at ours, its arm reaches every point with 2 kPa to spare in each chamber.
     """
-    angle = 2 * np.pi * np.arange(n) / n
-    radius, zero = 0.5 * diameter_mm, np.zeros(n)
-    columns = [radius * np.cos(angle), radius * np.sin(angle), np.full(n, height_mm), zero, zero, zero]
+    angle, zero, size = 2 * np.pi * np.arange(n) / n, np.zeros(n), spec.length_m / 0.6
+    radius, height = 0.5 * CIRCLE_DIAMETER_MM * size, np.full(n, CIRCLE_HEIGHT_MM * size)
+    columns = [radius * np.cos(angle), radius * np.sin(angle), height, zero, zero, zero]
     return np.stack(columns, axis=-1).astype(np.float32)
 
 

@@ -26,6 +26,7 @@ from mjx_softarm.deploy.session import Orders, steer
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.policy.file import Policy
+from mjx_softarm.spec import ArmSpec
 from mjx_softarm.view.demonstrations import Demonstrations
 from mjx_softarm.view.look import look_at
 
@@ -59,8 +60,10 @@ class PagePilot:
         self._armed, self._payload_kg, self._n_pages, self._lost = False, 0.0, 0, False
         self._doing, self._goal = "waits", np.full(6, np.nan)
         self.demonstrations, self._takes = Demonstrations(controller.policy), False
-        self._circle = _ROUNDS * [self._clamped(goal) for goal in circle_poses()]  # takes longer than a tick
-        self._place = _ROUNDS * [self._clamped(goal) for goal in place_poses()]
+        spec = controller.policy.spec
+        # Before the first tick, since it takes longer than one
+        self._circle = _ROUNDS * [self._clamped(goal) for goal in circle_poses(spec)]
+        self._place = _ROUNDS * [self._clamped(goal) for goal in place_poses(spec)]
         self._loads: list[float | None] = []  # to hang to the gripper at the arrivals to come
         # A simulated arm begins by itself: it hits nobody.
         self._first: dict[str, Any] = {"circle": True} if hasattr(arm, "time_s") else {}
@@ -122,9 +125,9 @@ class PagePilot:
         self._n_pages = n_pages
 
 
-def place_poses() -> np.ndarray:
+def place_poses(spec: ArmSpec) -> np.ndarray:
     """Return goals (6, 6) [mm, deg]: above, at and above a place, then one across the circle."""
-    sides = circle_poses()[[0, 20]]
+    sides = circle_poses(spec)[[0, 20]]
     lift = np.array([0.0, 0.0, _LIFT_MM, 0.0, 0.0, 0.0])
     return np.concatenate([[side + lift, side, side + lift] for side in sides])
 

@@ -149,7 +149,7 @@ def open_server(host: str, port: int, label: str) -> viser.ViserServer:
 
 def set_the_scene(server: viser.ViserServer, spec: ArmSpec, width_m: float = 0.0) -> None:
     """Set theme, floor and camera for arms side by side along y over a width [m]."""
-    length_m = spec.structure.n_sections * spec.geometry.section_length_m + spec.mass.gripper_length_m
+    length_m = spec.length_m + spec.mass.gripper_length_m
     server.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(36, 99, 168))
     server.scene.set_up_direction("+z")
     server.scene.configure_default_lights(cast_shadow=False)

@@ -137,7 +137,7 @@ def test_stay_holds_the_last_goal_until_the_end():
 
 
 def test_goals_by_name(tmp_path):
-    np.testing.assert_allclose(read_goals("circle", POLICY, 8), circle_poses(8), atol=1e-4)
+    np.testing.assert_allclose(read_goals("circle", POLICY, 8), circle_poses(POLICY.spec, 8), atol=1e-4)
     np.testing.assert_array_equal(read_goals("grid", POLICY, 30), grid_poses(POLICY.workspace, 30))
     file = tmp_path / "goals.csv"
     file.write_text("x [mm],y [mm],z [mm],yaw [deg],pitch [deg],roll [deg]\n80,0,-575,0,0,0\n1,2,3,4,5,6\n")
@@ -151,7 +151,8 @@ def test_around_the_circle_the_plate_hangs_straight_not_the_frame_on_it():
     """An arm cannot twist itself by the turn of motion capture's frame."""
     turned = POLICY.spec.replace(mounting={"tip_turn_deg": (0.0, 0.0, 5.0)})
     goals = read_goals("circle", dataclasses.replace(POLICY, spec=turned), 8)
-    np.testing.assert_allclose(goals - circle_poses(8), [[0.0, 0.0, 0.0, 5.0, 0.0, 0.0]] * 8, atol=1e-4)
+    turn = goals - circle_poses(POLICY.spec, 8)
+    np.testing.assert_allclose(turn, [[0.0, 0.0, 0.0, 5.0, 0.0, 0.0]] * 8, atol=1e-4)
 
 
 def test_grid_is_spread_over_the_workspace():

@@ -7,6 +7,7 @@ import subprocess
 import numpy as np
 import pytest
 
+from mjx_softarm import ArmSpec
 from mjx_softarm.deploy.arms import open_arm
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.session import follow
@@ -19,7 +20,7 @@ from tests.linear_arm import N
 @pytest.mark.slow  # a minute of an arm, twice
 @pytest.mark.skipif(not shutil.which("g++"), reason="there is no compiler g++ here")
 def test_circle_ends_where_numpy_s_ends(tmp_path):
-    around = circle_poses(2000)
+    around = circle_poses(ArmSpec.default(), 2000)
     policy = dataclasses.replace(busy_policy(), workspace=around, n_actions=2, s2r=None)
     controller, goals = Controller.of(policy), around[::500].astype(float)
     run = follow(open_arm("twin:0"), controller, goals)

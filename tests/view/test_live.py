@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from mjx_softarm import ArmSpec
 from mjx_softarm._support.channel import End
 from mjx_softarm.deploy.controller import Tick, start
 from mjx_softarm.deploy.loop import with_goal
@@ -96,7 +97,7 @@ def test_picking_and_placing_hangs_a_mass_to_the_gripper_and_takes_it_off(inbox)
         pilot.look(state, Tick(np.full(N, REST_M), (), True), row)
         held.append(inbox.shown[-1]["look"].payload_kg)
     assert loads == [held[1], 0.0] and held == [0.0, held[1], held[1], held[1], 0.0, 0.0] and held[1] > 0.1
-    above, at, _, above_next, next_at, _ = place_poses()
+    above, at, _, above_next, next_at, _ = place_poses(ArmSpec.default())
     assert above[2] > at[2] == next_at[2] < above_next[2] and at[0] > 50.0 > -50.0 > next_at[0]
     ask(pilot, inbox, goal=GOALS[0])  # somebody drags the goal in between
     pilot.look(state, Tick(np.full(N, REST_M), (), True), row)

@@ -63,7 +63,7 @@ def task(name: str, spec: ArmSpec) -> Task:
 
 def circle(n: int, spec: ArmSpec) -> tuple[Waypoint, ...]:
     """Return n waypoints on the circle, with the gripper as in the circle's poses."""
-    position_m, _ = frame_from_pose(circle_poses(n).astype(float))
+    position_m, _ = frame_from_pose(circle_poses(spec, n).astype(float))
     finger_m = position_m - [0.0, 0.0, spec.mass.gripper_length_m]
     return tuple(Waypoint(f"circle {k}", point, SQUARE) for k, point in enumerate(finger_m))
 

@@ -112,7 +112,7 @@ class Evaluator:
 
     def __init__(self, env: ReachEnv, learner: Learner, n_goals: int = N_GOALS):
         self.env, self.n_goals = nominal(env), n_goals
-        self.circle = np.asarray(circle_poses())
+        self.circle = np.asarray(circle_poses(env.spec))
         one = functools.partial(follow, self.env, learner)
         self._follow = xla.jit(jax.vmap(one, in_axes=(None, 0, 0)), env.uses_mjx)
 

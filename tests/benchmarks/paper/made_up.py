@@ -25,7 +25,7 @@ TINY = Settings(twins=(0, 1), seeds=(0,), n_points=3, loads_g=(500, 1000))
 def goals_of(kind, n_points=6):
     """Names, and poses whose finger tips are at the waypoints, the gripper straight down."""
     if KINDS[kind].task in ("", "circle16"):
-        return [""] * n_points, circle_poses(n_points).astype(float)
+        return [""] * n_points, circle_poses(SPEC, n_points).astype(float)
     waypoints = task(KINDS[kind].task, SPEC).waypoints
     goal = np.zeros((len(waypoints), 6))
     goal[:, :3] = 1e3 * (np.array([point.finger_m for point in waypoints]) + [0.0, 0.0, GRIPPER_M])

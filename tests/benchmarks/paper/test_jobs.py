@@ -106,7 +106,7 @@ def test_scene_is_the_twin_in_its_pipe(tmp_path, make_arm_model, monkeypatch):
     assert len(scene.goals) == 7 and scene.names[-1] == "pick left"
     scene = jobs.scene_of(tmp_path, TINY, pipe_trial(kind="circle"))
     assert "pipe" not in scene.twin.describe()
-    assert np.array_equal(scene.goals, circle_poses(TINY.n_points).astype(float))
+    assert np.array_equal(scene.goals, circle_poses(SPEC, TINY.n_points).astype(float))
     rods = dataclasses.replace(TINY, arm="rod")
     assert isinstance(jobs.scene_of(tmp_path, rods, pipe_trial(kind="circle")).twin, RodTwin)
 
@@ -119,7 +119,7 @@ def test_without_s2r_the_nominal_policy_plans_and_the_springs_are_calibrated(tmp
     chosen = jobs.controller_of(tmp_path, Trial("without", 0, 0))
     assert np.array_equal(chosen.policy.sensor.beta, Sensor.from_spec(calibrated).beta)
     assert chosen.policy.spec == SPEC
-    pose, goal = circle_poses(2).astype(float)
+    pose, goal = circle_poses(SPEC, 2).astype(float)
     expected = PolicyRunner(make_policy(make_arm_model)).act(pose, goal).length_m
     assert np.allclose(chosen.plan(pose, goal, np.full(N, 0.2), None), expected)
     specified = jobs.controller_of(tmp_path, Trial("specified", 0, 0))

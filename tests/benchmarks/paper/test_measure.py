@@ -25,7 +25,7 @@ from mjx_softarm.deploy.run import Arrival, Run
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.mechanics.pipe import APPLE_KG, BALL_KG
-from tests.benchmarks.paper.made_up import GRIPPER_M, N, made_up, make_policy
+from tests.benchmarks.paper.made_up import GRIPPER_M, SPEC, N, made_up, make_policy
 from tests.linear_arm import CONTROLLER, FAR, GOALS, LinearArm, go
 
 DOWN = np.array([1.0, 0.0, 0.0, 0.0])  # quaternion of a gripper that hangs straight
@@ -37,7 +37,7 @@ def test_errors_are_averaged_over_the_window_of_rest(make_arm_model):
     policy = make_policy(make_arm_model)
     controller = Controller.of(policy)
     window, n_rows = controller.window, 3 * controller.window
-    goals = circle_poses(2).astype(float)
+    goals = circle_poses(SPEC, 2).astype(float)
     tip_mm = np.tile(goals[1, :3] + [3.0, 4.0, 0.0], (n_rows, 1))
     tip_mm[:-window] += 500.0  # on its way: does not count
     noise = np.where(np.arange(window) % 2, 1.0, -1.0)

@@ -98,7 +98,7 @@ def write(experiment, folder, results, filmed=False):
     """Write a report; returns its figures by the JSON file, and the names of all its files."""
     fill(folder, TINY)
     if filmed:
-        side = film.SideView("", "", (0, 1), circle_poses(3)[:, :3])
+        side = film.SideView("", "", (0, 1), circle_poses(SPEC, 3)[:, :3])
         images = film.frames([np.zeros((20, 15, 3), np.uint8)] * 3, np.zeros((3, 3)), side)
         film.write_gif(folder / FILMS[experiment], images)
     report.write_report(experiment, folder, folder / "out", TINY, results)
