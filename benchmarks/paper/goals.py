@@ -65,13 +65,15 @@ def _open(table: Sequence[Row]) -> list[Check]:
 def _confined(table: Sequence[Row], trainings: Sequence[Row]) -> list[Check]:
     shown, exchanged = _select(table, "pipe", "as shown"), _select(table, "pipe", "exchanged")
     narrow, circle = _select(table, "narrow", "as shown"), _select(table, "circle", "as shown")
-    without = _select(table, "with", "0 g")
+    moving, without = _select(table, "pipe", "as shown in motion"), _select(table, "with", "0 g")
+    time = np.mean(_values(moving, "seconds")) / np.mean(_values(shown, "seconds"))
     mm, without_mm = _mean_mm(circle), _mean_mm(without)
     both_mm = f"{mm:.2f} mm with, {without_mm:.2f} mm without"
     learned, hand_made, stages = (
         [row for row in trainings if row["kind"] == kind] for kind in ("pipe", "hand-made", "circle")
     )
     done = {(row["twin"], row["seed"]): all_done(row) for row in exchanged}
+    motion = "300 mm pipe, in motion"
     four = "300 mm pipe: all four operations done, as shown and exchanged"
     better = "circle: mean translation with demonstrations not above that without"
     both = [all_done(row) and done.get((row["twin"], row["seed"]), False) for row in shown]
@@ -82,7 +84,10 @@ def _confined(table: Sequence[Row], trainings: Sequence[Row]) -> list[Check]:
         ),
         _share_done(four, WIDE_RUNS, both, exchanged),
         _share_done("250 mm pipe: both tasks done", NARROW_RUNS, [all_done(row) for row in narrow], narrow),
+        _share_done(f"{motion}: all four operations done", WIDE_RUNS, list(map(all_done, moving)), moving),
+        _reaching(f"{motion}: time over that with stops, at most 0.5", f"{time:.2f}", time <= 0.5, moving),
         _calm("300 mm pipe, as shown and exchanged", shown, exchanged),
+        _calm(motion, moving),
         _calm("250 mm pipe", narrow),
         _fewer_steps(learned, hand_made),
         _reaching(better, both_mm, mm <= without_mm, circle, without),

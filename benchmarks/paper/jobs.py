@@ -187,7 +187,7 @@ def try_out(folder: Path, settings: Settings, trial: Trial) -> None:
     """Run a trial and save its outcome."""
     path = folder / trial.result
     path.parent.mkdir(exist_ok=True)
-    save_outcome(path, operate(*scene_of(folder, settings, trial), trial.objects))
+    save_outcome(path, operate(*scene_of(folder, settings, trial), trial.objects, trial.moves))
 
 
 def film(folder: Path, settings: Settings, trial: Trial, file: str) -> str:

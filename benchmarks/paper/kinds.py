@@ -40,10 +40,11 @@ class Trial(NamedTuple):
     seed: int  # of training
     objects: str = ""  # in the containers: key of `measure.OBJECTS_KG`, "" without demonstrations
     load_g: int = 0  # payload that the policy does not know
+    moves: bool = False  # past the positions between the objects, without a stop
 
     @property
     def variant(self) -> str:
-        return self.objects or f"{self.load_g} g"
+        return (self.objects or f"{self.load_g} g") + " in motion" * self.moves
 
     @property
     def name(self) -> str:

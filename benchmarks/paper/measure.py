@@ -18,12 +18,13 @@ from mjx_softarm.deploy import faults
 from mjx_softarm.deploy import measure as accuracy
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.run import Run
-from mjx_softarm.deploy.session import follow
+from mjx_softarm.deploy.session import follow, trace
 from mjx_softarm.mechanics.pipe import APPLE_KG, BALL_KG
 from mjx_softarm.sensing.pose import frame_from_pose, rotation_from_quaternion
 
 GRASP_M = 0.02  # finger tips to the object's middle: the jaws open 40 mm
 PLACE_M = 0.04  # finger tips to the middle of a container
+PACE_S = 1.0  # from a position to the next, where the arm does not stop
 CALM_N = 1.0  # contact force that counts as none
 # Masses in the containers when a task begins: the one picked first, then the one picked second.
 OBJECTS_KG = {"as shown": (BALL_KG, APPLE_KG), "exchanged": (APPLE_KG, BALL_KG)}
@@ -126,22 +127,38 @@ def captured_finger_tips(tip_m: np.ndarray, quaternion: np.ndarray, gripper_m: f
 
 
 def operate(
-    twin: Any, controller: Controller, goals: np.ndarray, names: Sequence[str], objects: str = ""
+    twin: Any,
+    controller: Controller,
+    goals: np.ndarray,
+    names: Sequence[str],
+    objects: str = "",
+    moves: bool = False,
 ) -> Outcome:
-    """Follow goals (p, 6) [mm, deg], picking and placing as their names say; raises as `measure`."""
+    """Follow goals (p, 6) [mm, deg], picking and placing as their names say; raises as `measure`.
+
+    If it moves, the arm passes those named "to ..." without a stop, and the outcome is of the others alone.
+    """
     gripper_m = controller.policy.spec.mass.gripper_length_m
     forces: list[tuple[float, float]] = []
     force = getattr(twin, "wall_force_n", lambda: (0.0, 0.0))  # a rod touches nothing
     watched: Any = WatchedTwin(twin, lambda: forces.append(force()))
     gripper = Gripper(watched, names, finger_tips(goals, gripper_m), objects, gripper_m)
-    run = follow(watched, controller, goals, arrived=gripper.arrived)
-    outcome = measure(run, controller, goals)
+    stops = np.flatnonzero(~(moves & np.char.startswith(names, "to ")))
+    if moves:
+        stopped = np.isin(np.arange(len(goals)), stops)
+        run = trace(watched, controller, goals, PACE_S, stopped, arrived=gripper.arrived)
+        indices = (int(np.searchsorted(stops, arrival.index)) for arrival in run.arrivals)
+        at = tuple(a._replace(index=k) for a, k in zip(run.arrivals, indices, strict=True))
+        run = run._replace(arrivals=at)
+    else:
+        run = follow(watched, controller, goals, arrived=gripper.arrived)
+    outcome = measure(run, controller, goals[stops])
     force_n = np.zeros((len(run.log), 2))
     n = min(len(forces), len(force_n))  # a lost arm takes no more pressures; venting is not logged
     force_n[:n] = np.reshape(forces[:n], (n, 2))
     return outcome._replace(
-        name=np.array(names),
-        success=gripper.success,
+        name=np.array(names)[stops],
+        success=gripper.success[stops],
         wall_n=force_n[:, 0].astype(np.float32),
         container_n=force_n[:, 1].astype(np.float32),
     )

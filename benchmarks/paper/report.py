@@ -33,7 +33,10 @@ COLUMNS = {  # figures in the printed table
         "saturated_points",
         "load_off_g",
     ),
-    "confined": ("x_mm", "y_mm", "z_mm", "translation_mm", "max_mm", "done", "calm_percent", "wall_max_n"),
+    "confined": (
+        *("x_mm", "y_mm", "z_mm", "translation_mm", "max_mm"),
+        *("done", "calm_percent", "wall_max_n", "seconds"),
+    ),
 }
 
 

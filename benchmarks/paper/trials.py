@@ -57,6 +57,7 @@ def trials(experiment: str, settings: Settings) -> list[Trial]:
             found.append(Trial(kind, twin, seed, "as shown"))
         if kind == "pipe":
             found.append(Trial(kind, twin, seed, "exchanged"))
+            found.append(Trial(kind, twin, seed, "as shown", moves=True))
     return found + [Trial("with", twin, seed) for twin in settings.twins for seed in settings.seeds]
 
 

@@ -152,7 +152,8 @@ def _measure(
     if seconds is None:
         run = follow(driver, controller, poses, tell=_tell, save=save)
     else:
-        run = trace(driver, controller, poses, seconds, _tell, save)
+        pace_s = seconds / max(len(poses) - 1, 1)
+        run = trace(driver, controller, poses, pace_s, tell=_tell, save=save)
     if not run.arrivals:
         _summary(run)
         return run.status
@@ -160,14 +161,14 @@ def _measure(
     found = figures(accuracy, run.counts()) | {
         "reached": sum(arrival.reached for arrival in run.arrivals),
         "seconds": float(run.log.time_s[-1]),
-        **({} if run.way is None else along(run, controller.dt_s)),
+        **(along(run, controller.dt_s) if run.ways else {}),
     }
     if missing := write_accuracy(out, accuracy, found):
         print(missing)
     for name, unit, most in (("translation", "mm", "max_mm"), ("rotation", "deg", "rotation_max_deg")):
         mean, high, most = found[f"{name}_{unit}"], found[f"{name}_95_{unit}"], found[most]
         print(f"{name} [{unit}]: mean {mean:.2f}, 95 % below {high:.2f}, at most {most:.2f}")
-    if run.way is not None:
+    if run.ways:
         print(
             f"on the way, {found['way_s']:.0f} s [mm]: mean {found['way_mm']:.2f}, 95 % below "
             f"{found['way_95_mm']:.2f}, at most {found['way_max_mm']:.2f}; {found['lag_s']:.2f} s behind, "

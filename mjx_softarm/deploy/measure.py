@@ -178,16 +178,17 @@ def along(run: Run, dt_s: float) -> dict[str, float]:
     Raises:
         InputError: motion capture saw nothing.
     """
-    assert run.way is not None and run.log.goal is not None
+    assert run.ways and run.log.goal is not None
     if run.log.tip_m is None:
         raise InputError(f"motion capture: got no frame in {len(run.log)} ticks, expected the tip")
-    goal, tip = run.log.goal[run.way, :3], 1e3 * run.log.tip_m[run.way]
-    n = len(goal)
+    ways = [(1e3 * run.log.tip_m[rows], run.log.goal[rows, :3]) for rows in run.ways]
+    n = sum(len(goal) for _, goal in ways)
 
     def away_mm(lag: int) -> np.ndarray:
-        return np.linalg.norm(tip[lag:] - goal[: n - lag], axis=1)
+        each = [np.linalg.norm(tip[lag:] - goal[: len(goal) - lag], axis=1) for tip, goal in ways]
+        return np.concatenate(each)
 
-    lags = range(min(round(MOST_LAG_S / dt_s), n - 1) + 1)
+    lags = range(min(round(MOST_LAG_S / dt_s), max(len(goal) for _, goal in ways) - 1) + 1)
     means = [float(np.nanmean(away_mm(lag))) for lag in lags]
     best, now = int(np.argmin(means)), away_mm(0)
     return {

@@ -31,7 +31,7 @@ class Run(NamedTuple):
     latency_s: np.ndarray  # (ticks,) from readings to pressures, without the arm's input and output
     ending: Ending
     n_goals: int = 0  # number of goals asked for; 0 with a pilot
-    way: slice | None = None  # rows of the log in which the goal moved
+    ways: tuple[slice, ...] = ()  # rows of the log in which the goal moved
 
     def counts(self) -> dict[Fault, int]:
         """Return how often each fault came."""

@@ -81,22 +81,26 @@ def trace(
     arm: ArmIO,
     controller: Controller,
     goals: np.ndarray,
-    way_s: float,
+    pace_s: float,
+    stops: np.ndarray | bool = False,
     tell: Callable[[str], None] = lambda text: None,
+    arrived: Callable[[int], None] = lambda goal: None,
     save: Callable[[Log], None] = lambda log: None,
 ) -> Run:
-    """Bring the tip to the first goal, then past all others to the last one without a stop, then vent.
+    """Bring the tip from stop to stop, past the goals in between, then vent.
 
     Args:
         arm: without pressure, as its driver gives it.
         controller: the policy.
-        goals (p, 6) [mm, deg]: poses, at equal times; in between the goal moves on straight lines.
-        way_s: time from the first to the last.
+        goals (p, 6) [mm, deg]: poses; between two of them the goal moves on a straight line.
+        pace_s: time from a goal to the next.
+        stops (p,): bool; the first and the last goal are stops in any case.
         tell: takes a line for each arrival and each fault.
+        arrived: takes the index of each stop arrived at, as the arm rests there; a gripper may act.
         save: writes the log, once the arm is vented.
     """
-    way = Way(goals, way_s, controller.policy.action_s or LEAD_S)
-    return _Session(arm, controller, goals, None, tell, way=way).to_end(save)
+    way = Way(goals, np.broadcast_to(stops, len(goals)), pace_s, controller.policy.action_s or LEAD_S)
+    return _Session(arm, controller, goals, None, tell, arrived, way=way).to_end(save)
 
 
 def steer(
@@ -148,8 +152,8 @@ class _Session:
         """Run, vent and save the log; return the results."""
         ending = vent_at_end(self.run, self.link, self.tell, lambda: save(self.log()))
         events, latency_s = tuple(self.events), np.array(self.latency_s)
-        n_goals = 0 if self.pilot else 2 if self.way else len(self.goals)  # a way's first and last
-        rows = self.way.rows if self.way else None
+        n_goals = 0 if self.pilot else len(self.way.stops if self.way else self.goals)
+        rows = tuple(self.way.rows) if self.way else ()
         return Run(self.log(), tuple(self.arrivals), events, latency_s, ending, n_goals, rows)
 
     def run(self) -> None:
@@ -235,20 +239,19 @@ class _Session:
         return not over and (self.state.goal is not None or stays)
 
     def _go_along(self, way: Way, now_s: float) -> None:
-        """Move the goal along a way, from an arrival at its first pose until the goal is at the last."""
+        """Move the goal along a way, from an arrival at a stop until the goal is at the next."""
         if self.refusals and not self.n_taken:  # no part of the way is gone
             self._note(tuple(self.refusals.values()))
             self.n_taken = len(self.goals)
-        begins = self.n_taken == 1 and self.state.goal is None
+        begins = self.state.goal is None and 0 < self.n_taken < len(self.goals)
         if begins:
-            way.begin(now_s, len(self.rows))
-            self.n_taken = len(self.goals)
+            self.n_taken = 1 + way.begin(self.n_taken - 1, now_s, len(self.rows))
         if not (begins or self.state.moves):
             return
         if way.go_on(now_s, len(self.rows)):
             self.state = with_moving_goal(self.state, way.goal_ahead(now_s))
         else:
-            self.state, events = with_goal(self.controller, self.state, self.goals[-1])
+            self.state, events = with_goal(self.controller, self.state, self.goals[self.n_taken - 1])
             self._note(events)
 
     def _obey(self, orders: Orders) -> None:

@@ -1,4 +1,4 @@
-"""A goal that moves past poses in a given time."""
+"""A goal that moves past poses, from one stop to the next."""
 
 from __future__ import annotations
 
@@ -8,33 +8,37 @@ from mjx_softarm.sensing.pose import pose_error
 
 
 class Way:
-    """Poses that a goal passes at equal times, on straight lines in between."""
+    """Poses on straight lines, all as far apart in time, some of which are stops."""
 
-    def __init__(self, goals: np.ndarray, seconds: float, lead_s: float):
+    def __init__(self, goals: np.ndarray, stops: np.ndarray, pace_s: float, lead_s: float):
         """Take a way.
 
         Args:
             goals (p, 6) [mm, deg]: poses, two or more.
-            seconds: time from the first to the last.
+            stops (p,): bool; the first and the last are stops in any case.
+            pace_s: time from a pose to the next.
             lead_s: by so much the goal that a controller is given is ahead.
         """
-        self.goals, self.seconds, self.lead_s = np.asarray(goals, float), seconds, lead_s
-        self.began_s: float | None = None
-        self.rows = slice(0)  # of the log, while the goal moves
+        self.goals, self.pace_s, self.lead_s = np.asarray(goals, float), pace_s, lead_s
+        self.stops = np.union1d(np.flatnonzero(stops), [0, len(goals) - 1])
+        self.began_s, self._leg = 0.0, self.goals
+        self.rows: list[slice] = []  # of the log, while the goal moves
 
-    def begin(self, now_s: float, row: int) -> None:
-        """Let the goal leave its first pose; the log has so many rows."""
-        self.began_s, self.rows = now_s, slice(row, row)
+    def begin(self, k: int, now_s: float, row: int) -> int:
+        """Let the goal leave the k-th pose, at a row of the log; return the index of the next stop."""
+        stop = int(self.stops[self.stops > k][0])
+        self.began_s, self._leg = now_s, self.goals[k : stop + 1]
+        self.rows.append(slice(row, row))
+        return stop
 
     def go_on(self, now_s: float, row: int) -> bool:
-        """Return whether the goal still moves; the log has so many rows."""
-        self.rows = slice(self.rows.start, row)
-        return self.began_s is not None and now_s - self.began_s < self.seconds
+        """Return whether the goal still moves, at a row of the log."""
+        self.rows[-1] = slice(self.rows[-1].start, row)
+        return now_s - self.began_s < self.pace_s * (len(self._leg) - 1)
 
     def goal(self, now_s: float) -> np.ndarray:
         """Return where the goal is (6,) [mm, deg]."""
-        assert self.began_s is not None
-        return on_the_way(self.goals, (now_s - self.began_s) / self.seconds)
+        return on_the_way(self._leg, (now_s - self.began_s) / (self.pace_s * (len(self._leg) - 1)))
 
     def goal_ahead(self, now_s: float) -> np.ndarray:
         """Return the goal (6,) [mm, deg] that a controller is given."""

@@ -17,6 +17,7 @@ from mjx_softarm.logs.schema import write_log
 from mjx_softarm.mdp.actions import N_ACTIONS
 from mjx_softarm.mdp.observation import OBS_SIZE, motion_layout
 from mjx_softarm.sensing.estimator import estimate
+from mjx_softarm.sensing.pose import pose_error
 from tests.linear_arm import (
     CONTROLLER,
     DT_S,
@@ -96,7 +97,7 @@ def test_a_goal_half_way_is_half_way_and_angles_take_the_short_way():
 
 def test_a_way_with_a_goal_out_of_reach_is_not_begun():
     arm = LinearArm()
-    run = trace(arm, CONTROLLER, np.array([GOALS[0], FAR, GOALS[1]]), way_s=5.0)
+    run = trace(arm, CONTROLLER, np.array([GOALS[0], FAR, GOALS[1]]), pace_s=5.0)
     assert run.status == FAULT and not run.arrivals and run.counts() == {Fault.GOAL_OUTSIDE: 1}
     np.testing.assert_array_equal(arm.written, 0.0)
 
@@ -108,15 +109,32 @@ def test_a_moving_goal_is_followed_and_its_end_is_an_arrival():
         share = np.linalg.norm(goal - goals[0]) / np.linalg.norm(goals[1] - goals[0])
         return SPRINGS_M[0] + share * (SPRINGS_M[1] - SPRINGS_M[0])
 
-    run = trace(arm, Controller.of(POLICY, plan), goals, way_s=10.0)
+    run = trace(arm, Controller.of(POLICY, plan), goals, pace_s=10.0)
     assert run.status == 0 and [arrival.goal.tolist() for arrival in run.arrivals] == goals.tolist()
-    goal = run.log.goal[run.way]
+    goal = run.log.goal[run.ways[0]]
     assert len(goal) in (500, 501)
     np.testing.assert_allclose(goal[250], on_the_way(goals, 0.5), atol=1e-6)
     ahead = on_the_way(goals, 0.5 + LEAD_S / 10.0)
     share = np.linalg.norm(ahead - goals[0]) / np.linalg.norm(goals[1] - goals[0])
     expected_m = SPRINGS_M[0] + share * (SPRINGS_M[1] - SPRINGS_M[0])
-    np.testing.assert_allclose(run.log.reference_m[run.way][250], expected_m, atol=1e-3)  # a tick apart
+    np.testing.assert_allclose(run.log.reference_m[run.ways[0]][250], expected_m, atol=1e-3)  # a tick apart
+
+
+def test_stops_on_a_way_are_arrivals_and_other_goals_are_passed():
+    arm, there = LinearArm(), []
+    goals = on_the_way(GOALS[:2], 0.0) + np.linspace(0.0, 1.0, 6)[:, None] * pose_error(GOALS[1], GOALS[0])
+
+    def plan(pose, goal, spring_m, sensed):
+        share = np.linalg.norm(goal - GOALS[0]) / np.linalg.norm(pose_error(GOALS[1], GOALS[0]))
+        return SPRINGS_M[0] + share * (SPRINGS_M[1] - SPRINGS_M[0])
+
+    controller = Controller.of(POLICY, plan)
+    run = trace(arm, controller, goals, pace_s=1.0, stops=np.arange(6) == 3, arrived=there.append)
+    assert there == [0, 3, 5] == [arrival.index for arrival in run.arrivals]
+    assert run.ending.status == 0 and run.n_goals == 3
+    lasted = [rows.stop - rows.start for rows in run.ways]
+    np.testing.assert_allclose(lasted, [150, 100], atol=1)
+    np.testing.assert_allclose(run.log.goal[run.ways[1]][50], goals[4], atol=1e-6)
 
 
 def test_policy_itself_plans_by_default():

@@ -171,7 +171,7 @@ def test_distance_and_lag_along_a_way():
     goal[:, 0] = np.arange(n + lag)
     tip_mm = goal[:n, :3] + [0.0, 3.0, 0.0]
     tip_mm[7] = np.nan
-    run = SimpleNamespace(log=SimpleNamespace(goal=goal[lag:], tip_m=1e-3 * tip_mm), way=slice(0, n))
+    run = SimpleNamespace(log=SimpleNamespace(goal=goal[lag:], tip_m=1e-3 * tip_mm), ways=(slice(0, n),))
     found = along(run, 0.02)
     assert found["lag_s"] == pytest.approx(0.4) and found["way_without_lag_mm"] == pytest.approx(3.0)
     assert found["way_mm"] == pytest.approx(np.hypot(lag, 3.0)) and found["way_s"] == pytest.approx(10.0)

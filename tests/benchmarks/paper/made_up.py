@@ -33,7 +33,15 @@ def goals_of(kind, n_points=6):
 
 
 def made_up(
-    kind, error=(1.0, -2.0, 3.0), saturated=(), reported=0, fails=(), pressed=0.0, missed=(), told_g=0
+    kind,
+    error=(1.0, -2.0, 3.0),
+    saturated=(),
+    reported=0,
+    fails=(),
+    pressed=0.0,
+    missed=(),
+    told_g=0,
+    tick_s=0.25,
 ):
     """An outcome with one error (up to 6,) at every goal; `pressed`: share of time with 2 N on the wall."""
     names, goal = goals_of(kind)
@@ -49,7 +57,7 @@ def made_up(
         told_g=np.full(len(goal), float(told_g)),
         events=np.array([reported if fault is Fault.SATURATED else 0 for fault in Fault]),
         latency_s=np.array([1e-4, 3e-4]),
-        time_s=0.25 * np.arange(ticks),
+        time_s=tick_s * np.arange(ticks),
         point=np.arange(ticks) * len(goal) // ticks,
         reference_m=np.full((ticks, N), 0.2),
         spring_m=np.full((ticks, N), 0.201),
@@ -87,7 +95,7 @@ def good_results(experiment, settings=FULL, changed=None):
         )
         hit = trial.kind == "gradient" or trial.load_g == 1000
         outcomes[trial] = (
-            made_up(trial.kind)
+            made_up(trial.kind, tick_s=0.1 if trial.moves else 0.25)
             if error_mm is None
             else made_up(
                 trial.kind, (error_mm, 0, 0, -0.5), [(1, 2)] if hit else [], 2 * hit, told_g=trial.load_g
@@ -128,5 +136,5 @@ def make_policy(make_arm_model, spec=SPEC, s2r=False):
     return policy_from_actor({"params": dense}, spec, RewardConfig(), model, {})
 
 
-def pipe_trial(twin=0, seed=0, objects="as shown", kind="pipe"):
-    return Trial(kind, twin, seed, objects)
+def pipe_trial(twin=0, seed=0, objects="as shown", kind="pipe", moves=False):
+    return Trial(kind, twin, seed, objects, moves=moves)

@@ -12,13 +12,17 @@ BOTH = "300 mm pipe: all four operations done, as shown and exchanged, in at lea
 TASKS = "250 mm pipe: both tasks done, in at least 7 of 9 runs"
 CALM = "300 mm pipe, as shown and exchanged: wall force below 1 N for 99 % of the time of every run"
 CALM_NARROW = "250 mm pipe: wall force below 1 N for 99 % of the time of every run"
+IN_MOTION = "300 mm pipe, in motion"
+MOVING = f"{IN_MOTION}: all four operations done, in at least 8 of 9 runs"
+TIME = f"{IN_MOTION}: time over that with stops, at most 0.5"
+CALM_MOVING = f"{IN_MOTION}: wall force below 1 N for 99 % of the time of every run"
 STEPS = "learned reward: 90 % success in fewer environment steps than the hand-made one"
 CIRCLE = "circle: mean translation with demonstrations not above that without"
 KEPT = "circle: success at the first stage's points after stage two not lower than before, in every run"
 TRANSLATION = "with S2R, mean translation at most 1.5 mm"
 REACHED = "every point of every run is reached"
 EXCHANGED = pipe_trial(2, 1, "exchanged")
-FIRST = pipe_trial()
+FIRST, MOVED = pipe_trial(), pipe_trial(moves=True)
 
 
 def checks(experiment, changed=None):
@@ -30,7 +34,7 @@ def unmet(experiment, changed=None):
     return [check.text for check in checks(experiment, changed) if not check.met]
 
 
-@pytest.mark.parametrize(("experiment", "n"), [("open", 13), ("confined", 10)])
+@pytest.mark.parametrize(("experiment", "n"), [("open", 13), ("confined", 13)])
 def test_goals_that_are_met(experiment, n):
     assert unmet(experiment) == []
     assert len(checks(experiment)) == n
@@ -84,6 +88,9 @@ def test_gradient_descent_without_saturation_misses_its_goal():
         ({FIRST: made_up("pipe", fails=(0,)), EXCHANGED: made_up("pipe", fails=(3,))}, [BOTH]),
         ({pipe_trial(t, kind="narrow"): made_up("narrow", fails=(2,)) for t in range(3)}, [TASKS]),
         ({EXCHANGED: made_up("pipe", pressed=0.02)}, [CALM]),
+        ({pipe_trial(t, moves=True): made_up("pipe", fails=(2,), tick_s=0.1) for t in range(2)}, [MOVING]),
+        ({MOVED: made_up("pipe", tick_s=0.4)}, [TIME]),  # (8 * 0.1 + 0.4) / 9 = 0.13
+        ({MOVED: made_up("pipe", pressed=0.02, tick_s=0.1)}, [CALM_MOVING]),
         ({pipe_trial(1, 1, kind="narrow"): made_up("narrow", pressed=0.02)}, [CALM_NARROW]),
         ({pipe_trial(kind="circle"): made_up("circle", (9.0, 0, 0))}, [CIRCLE]),  # 8 * 1 + 9 > 9 * 1.25
         ({("pipe", 0, 0): trained("pipe", reaches_at=11)}, [STEPS]),  # in one run, never
@@ -91,6 +98,7 @@ def test_gradient_descent_without_saturation_misses_its_goal():
         ({("circle", 1, 2): trained("circle", after_one=0.5, after_two=0.375)}, [KEPT]),
         ({("circle", t, s): trained("circle", 4, 10, 0.0, 0.0) for t in range(3) for s in range(3)}, [KEPT]),
         ({FIRST: made_up("pipe", (0.1, 0.1, 0.1), missed=[2])}, [X, Y, Z, CALM]),
+        ({MOVED: made_up("pipe", missed=[2], tick_s=0.1)}, [TIME, CALM_MOVING]),
         ({pipe_trial(kind="circle"): made_up("circle", (0.1, 0.1, 0.1), missed=[2])}, [CIRCLE]),
         ({Trial("with", 1, 1): made_up("with", (8.0, 0, 0), missed=[3])}, [CIRCLE]),
         # Just met:
@@ -116,6 +124,7 @@ def test_what_was_not_measured_is_not_met():
         return [check.text for check in check_goals("confined", rows, trainings) if not check.met]
 
     assert left(lambda row: row["objects"] != "exchanged") == [BOTH, CALM]
+    assert left(lambda row: not row["moves"]) == [MOVING, TIME, CALM_MOVING]
     assert left(lambda row: row["kind"] != "with") == [CIRCLE]
     one_stage = {("circle", t, s): trained("pipe") for t in range(3) for s in range(3)}
     assert unmet("confined", one_stage) == [KEPT]

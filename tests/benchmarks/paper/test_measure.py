@@ -7,6 +7,7 @@ import pytest
 
 from benchmarks.paper.measure import (
     GRASP_M,
+    PACE_S,
     PLACE_M,
     Gripper,
     figures,
@@ -92,6 +93,15 @@ def test_each_tick_has_its_goal():
     assert np.flatnonzero(np.diff(point)).tolist() == [arrival.row for arrival in run.arrivals[:2]]
     cut = run._replace(arrivals=run.arrivals[:2])  # the last goal was never arrived at
     assert measure(cut, CONTROLLER, goals).point.tolist() == point.tolist()
+
+
+def test_an_arm_in_motion_passes_what_is_on_its_way():
+    names, goals = ["home", "to pick right 1", "to pick right 2", "pick right"], GOALS[[0, 1, 1, 0]]
+    stopping, moving = (operate(Still(), CONTROLLER, goals, names, moves=moves) for moves in (False, True))
+    assert stopping.name.tolist() == names and moving.name.tolist() == ["home", "pick right"]
+    assert np.isfinite(moving.arrival_s).all() and set(moving.point) == {0, 1}
+    assert moving.arrival_s[1] - moving.arrival_s[0] > 3 * PACE_S
+    assert moving.time_s[-1] < stopping.time_s[-1]
 
 
 def test_goals_that_are_all_refused_are_told():
