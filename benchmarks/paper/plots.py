@@ -76,7 +76,7 @@ def loads_figure(table: Sequence[Row]) -> Figure:
         panel.set_xticks(sorted({row["load_g"] for row in rows}))
         panel.tick_params("x", rotation=60)
         panel.set_ylim(bottom=0)
-        panel.legend(frameon=False, fontsize=8, loc="upper right")
+        panel.legend(frameon=False, fontsize=8, loc="upper left")
     return figure
 
 
