@@ -21,10 +21,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calib.fit.equilibrium import error_groups, simulate
+from calib.fit.equilibrium import N_KINDS, error_groups, simulate, unmeasured
 from calib.fit.leastsquares import QUANTILE
 from calib.fit.parameters import priors, tolerances
-from calib.read.static_poses import StaticPoses
 from mjx_softarm._support.archive import Entries, entries_of, read_sealed, write_sealed
 from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.mechanics.workspace import pressure_levels, settle_many
@@ -44,7 +43,7 @@ class Recorded(NamedTuple):
     pressure_kpa: np.ndarray  # (n, n_chambers)
     payload_kg: np.ndarray  # (n,)
     error_mm: np.ndarray  # (n,) of the tip, of the sim-to-real network where there is one
-    scale: np.ndarray  # (3,) robust errors of tip [m], rotation [rad] and springs [m]; (4,) with markers [m]
+    scale: np.ndarray  # (2, 3) robust errors, see `ChamberFit`; (2, 4) with markers
 
 
 class Plan(NamedTuple):
@@ -71,7 +70,7 @@ def load_recorded(path: Path, n_chambers: int) -> Recorded:
         "pressure_kpa": ((None, n_chambers),),
         "payload_kg": ((None,),),
         "error_mm": ((None,),),
-        "scale": ((3,), (4,)),
+        "scale": ((2, 3), (2, 4)),
     }
     found = Recorded(**{name: entries.take(f"{KIND}.{name}", np.float64, *s) for name, s in shapes.items()})
     entries.finish(1)
@@ -177,20 +176,12 @@ def _candidates(spec: ArmSpec, n: int, rng: np.random.Generator) -> np.ndarray:
 def _derivatives(
     spec: ArmSpec, pressure_kpa: np.ndarray, payload_kg: np.ndarray, scale: np.ndarray
 ) -> np.ndarray:
-    """Return derivatives (n, m, p) of measurements over their scales (3,) or (4,); zero without a rest."""
-    n, n_chambers = pressure_kpa.shape
-    guess = StaticPoses(
-        pressure_kpa=pressure_kpa,
-        payload_kg=payload_kg,
-        tip_m=np.zeros((n, 3)),
-        tip_rotation=np.asarray(settle_many(spec, pressure_kpa).tip_rotation),
-        spring_m=np.zeros((n, n_chambers)),
-        marker_m=np.zeros((n, 0, 3)),
-        single=np.zeros(n, bool),
-    )
-    end_m = np.zeros((n, spec.structure.n_sections, 3))
+    """Return derivatives (n, m, p) of measurements over their scales; zero without a rest."""
+    rotation = np.asarray(settle_many(spec, pressure_kpa).tip_rotation)
+    guess, end_m = unmeasured(spec, pressure_kpa, payload_kg, rotation)
     error, slope, _ = simulate(spec, guess, end_m, np.zeros(len(priors(spec))))
-    group = error_groups(spec)
-    seen = group < len(scale)
+    straight, kind = np.divmod(error_groups(spec, pressure_kpa), N_KINDS)
+    seen = kind[0] < scale.shape[1]
     settled = np.isfinite(error[:, 0]) & np.isfinite(slope).all(axis=(1, 2))
-    return np.where(settled[:, None, None], slope[:, seen], 0.0) / scale[group[seen]][:, None]
+    sigma = scale[straight[:, seen], kind[:, seen]]
+    return np.where(settled[:, None, None], slope[:, seen], 0.0) / sigma[..., None]

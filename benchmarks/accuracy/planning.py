@@ -74,6 +74,7 @@ def log_at_rest(arm: RodTwin, pressure_kpa: np.ndarray) -> Log:
             "tip_m": np.mean([frame.tip_m for frame in frames], axis=0),
             "tip_quaternion": quaternion / np.linalg.norm(quaternion),
             "spring_m": np.mean(np.array([frame.spring_m for frame in frames], float), axis=0),
+            "marker_m": np.mean(np.array([frame.marker_m for frame in frames], float), axis=0),
         }
         for name, value in seen.items():
             rows.setdefault(name, []).append(value)
@@ -97,6 +98,8 @@ def _figures(calibration: Calibration, judge: Log) -> dict[str, Any]:
     before, after = pose_errors(pose, real), pose_errors(corrected, real)
     return {
         "unknown directions": len(chambers["weak"]),
+        "least known direction [tolerances]": float(np.max(chambers["direction_widths"])),
+        "unknown directions, tip [mm]": float(np.max(chambers["weak_tip_mm"], initial=0.0)),
         "calibrated tip, held out [mm]": chambers["held_out"]["translation_mean_mm"],
         "calibrated tip, held out [deg]": chambers["held_out"]["rotation_mean_deg"],
         "S2R, its training [mm]": network["in_sample"]["translation_mean_mm"],

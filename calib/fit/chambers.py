@@ -3,6 +3,7 @@
 The simulated arm settles at the logged pressures; its chambers are changed until tip poses agree, and spring
 lengths and markers at the sections' ends where they were measured. Robust least squares
 (`calib.fit.leastsquares`) take the Jacobian from the implicit function theorem, see `calib.fit.equilibrium`.
+Straight arms, if there are enough of them, have errors of their own scale: the model fits them better.
 
 Masses are known and set the scale of all forces. The bending stiffness of the backbone is fitted too, as area
 and stiffness would otherwise absorb its error. Its axial stiffness and that of the springs cannot be fitted:
@@ -20,10 +21,11 @@ import numpy as np
 
 from calib.errors import FitError
 from calib.fit.blocks import held_out_blocks
-from calib.fit.equilibrium import error_groups, simulate
+from calib.fit.equilibrium import N_KINDS, error_groups, simulate
 from calib.fit.leastsquares import NOT_CONVERGED, Problem, Solution, fit, principal
 from calib.fit.markers import section_ends
 from calib.fit.parameters import half_widths, names, priors, spec_at, tolerances
+from calib.fit.predictions import tip_changes
 from calib.read.static_poses import StaticPoses, find_static_poses
 from mjx_softarm.logs.rest import HOLD_KPA
 from mjx_softarm.logs.schema import Log
@@ -31,6 +33,7 @@ from mjx_softarm.spec import ArmSpec
 
 MIN_POSES = 20
 ENOUGH_POSES = 100
+MIN_STRAIGHT = 20  # poses of straight arms whose errors have scales of their own
 HELD_OUT_SHARE = 0.2
 HELD_OUT_BLOCK = 5  # poses
 SCALE = (1e-3, 0.01, 1e-3, 1e-3)  # of tip [m], rotation [rad], springs [m] and markers [m]
@@ -64,10 +67,12 @@ class ChamberFit:
         direction_widths: half-widths of the 95 % intervals along the principal directions of the fit, in
             units of the tolerances of `calib.fit.parameters`, largest first (p,).
         weak: unknown directions, whose width is above 1, in words.
+        weak_tip_mm: how far each of these moves the simulated tip within its interval, at the pressures and
+            with the payload where it does so the most (`calib.fit.predictions`).
         in_sample, held_out: errors of the calibrated arm; held-out poses took no part in the fit.
         in_sample_before, held_out_before: errors of the specification that the fit started from.
-        scale: robust errors (3,) of tip [m], rotation [rad] and springs [m], then of markers [m] if there
-            are any.
+        scale: robust errors of arms that bend and of straight ones (2, 3): tip [m], rotation [rad] and
+            springs [m], then (2, 4) markers [m] if there are any; a guess if too few arms are straight.
         rows: number of rows of the logs, by use.
         n_single: number of poses of one row, which cannot show whether the tip moved.
         poses: static poses of the logs, in their order.
@@ -81,6 +86,7 @@ class ChamberFit:
     half_width_95: Mapping[str, np.ndarray]
     direction_widths: np.ndarray
     weak: tuple[str, ...]
+    weak_tip_mm: np.ndarray
     in_sample: Errors
     held_out: Errors
     in_sample_before: Errors
@@ -97,7 +103,7 @@ class ChamberFit:
     @property
     def has_markers(self) -> bool:
         """Whether markers at the sections' ends took part."""
-        return len(self.scale) == len(SCALE)
+        return self.scale.shape[1] == len(SCALE)
 
     @property
     def is_better(self) -> bool:
@@ -141,24 +147,32 @@ def calibrate_chambers(logs: Log | Sequence[Log], spec: ArmSpec, seed: int = 0) 
     held_out = held_out_blocks(poses.n, HELD_OUT_SHARE, HELD_OUT_BLOCK, seed)
     fitted = poses.take(~held_out)
     end_m, complaints = _section_ends(poses, spec)
-    problem = Problem(priors(spec), error_groups(spec), np.array(SCALE), np.array(MIN_SCALE))
+    group = error_groups(spec, fitted.pressure_kpa)
+    if np.count_nonzero(group[:, 0] >= N_KINDS) < MIN_STRAIGHT:
+        group %= N_KINDS
+    problem = Problem(priors(spec), group, np.tile(SCALE, 2), np.tile(MIN_SCALE, 2))
     solution = fit(lambda x: simulate(spec, fitted, end_m[~held_out], x)[:2], problem)
     before, _, _ = simulate(spec, poses, end_m, np.zeros_like(solution.x))
     after, _, chamber_m = simulate(spec, poses, end_m, solution.x)
     calibrated = _calibrated(spec, solution.x, poses)
+    bent, straight = solution.scale.reshape(2, -1)
     widths, directions = principal(solution, tolerances(spec))
-    each = zip(widths, directions.T, strict=True)
-    weak = tuple(_describe(width, vector, names(spec)) for width, vector in each if width > 1.0)
+    unknown = widths > 1.0
+    change = (tolerances(spec)[:, None] * widths * directions)[:, unknown]
+    weak_tip_mm = 1e3 * tip_changes(spec, solution.x, change)
+    each = zip(widths[unknown], weak_tip_mm, directions.T[unknown], strict=True)
+    weak = tuple(_describe(*numbers, names(spec)) for numbers in each)
     found = ChamberFit(
         spec=calibrated,
         half_width_95=half_widths(calibrated, solution.half_width),
         direction_widths=widths,
         weak=weak,
+        weak_tip_mm=weak_tip_mm,
         in_sample=_errors(after[~held_out], spec),
         held_out=_errors(after[held_out], spec),
         in_sample_before=_errors(before[~held_out], spec),
         held_out_before=_errors(before[held_out], spec),
-        scale=solution.scale[: 4 if np.isfinite(end_m).any() else 3],
+        scale=np.stack([bent, np.minimum(bent, straight)])[:, : 4 if np.isfinite(end_m).any() else 3],
         rows=rows,
         n_single=int(np.count_nonzero(poses.single)),
         poses=poses,
@@ -187,12 +201,12 @@ def _calibrated(spec: ArmSpec, x: np.ndarray, poses: StaticPoses) -> ArmSpec:
     return spec_at(spec, x).replace(springs=springs)
 
 
-def _describe(width: float, vector: np.ndarray, names: Sequence[str]) -> str:
+def _describe(width: float, tip_mm: float, vector: np.ndarray, names: Sequence[str]) -> str:
     """Describe a principal direction by its largest components, in units of their tolerances."""
     largest = np.argsort(-np.abs(vector))[:4]
     sign = np.sign(vector[largest[0]])
     components = (f"{sign * vector[k]:+.2f} {names[k]}" for k in largest)
-    return f"known to {width:.1f} times the tolerance: {' '.join(components)}"
+    return f"known to {width:.2f} times the tolerance, the tip to {tip_mm:.1f} mm: {' '.join(components)}"
 
 
 def _errors(error: np.ndarray, spec: ArmSpec) -> Errors:
@@ -236,7 +250,7 @@ def _warnings(found: ChamberFit, spec: ArmSpec, solution: Solution) -> tuple[str
         n_weak = len(found.weak)
         springs = ", with spring lengths" if np.isnan(found.poses.spring_m).any() else ""
         remedy = f"record those of `python -m calib plan`{springs}"
-        said.append(f"{n_weak} unknown directions, the first {found.weak[0]}: {remedy}")
+        said.append("\n  ".join([f"{n_weak} unknown directions: {remedy}", *found.weak]))
     low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
     gap = MAX_PRESSURE_GAP * (high - low)
     lowest, highest = found.poses.pressure_kpa.min(0), found.poses.pressure_kpa.max(0)

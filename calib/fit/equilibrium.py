@@ -15,9 +15,11 @@ from calib.read.static_poses import StaticPoses
 from mjx_softarm.mechanics.kinematics import Frames, chain_kinematics
 from mjx_softarm.mechanics.settle import RESIDUAL_TOLERANCE, settle_pressures
 from mjx_softarm.mechanics.statics import ArmParams, tendons
-from mjx_softarm.spec import ArmSpec
+from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
 
 BATCH = 128  # poses simulated together
+N_KINDS = 4  # of errors: tip, rotation, springs, markers
+STRAIGHT = 0.2  # one chamber's excess over the section's others, as a share of the range, at most
 
 
 class Measured(NamedTuple):
@@ -66,9 +68,18 @@ def residuals(x: Array, params: ArmParams, measured: Measured) -> tuple[Array, A
     return jnp.concatenate(error), found.residual, jax.lax.stop_gradient(chamber_m)
 
 
-def error_groups(spec: ArmSpec) -> np.ndarray:
-    """Return the kind (m,) of each of the `residuals`: tip 0, rotation 1, springs 2, markers 3."""
-    return np.repeat([0, 1, 2, 3], [3, 3, spec.n_chambers, 3 * spec.structure.n_sections])
+def error_groups(spec: ArmSpec, pressure_kpa: np.ndarray) -> np.ndarray:
+    """Return the kind (n, m) of each of the `residuals` at pressures (n, n_chambers).
+
+    Tip 0, rotation 1, springs 2, markers 3, and 4 more for straight arms, whose sections each have nearly one
+    pressure: what the simulated arm lacks, such as torsion and shear, shows where the arm bends.
+    """
+    kind = np.repeat(range(N_KINDS), [3, 3, spec.n_chambers, 3 * spec.structure.n_sections])
+    circle = np.exp(2j * np.pi * np.arange(N_CHAMBERS_PER_SECTION) / N_CHAMBERS_PER_SECTION)
+    off_centre = np.abs(pressure_kpa.reshape(len(pressure_kpa), -1, N_CHAMBERS_PER_SECTION) @ circle)
+    span = spec.chambers.pressure_max_kpa - spec.chambers.pressure_min_kpa
+    straight = (off_centre < STRAIGHT * span).all(axis=1)
+    return kind + N_KINDS * straight[:, None]
 
 
 def _section_ends(frames: Frames, site_m: Array) -> Array:
@@ -76,6 +87,23 @@ def _section_ends(frames: Frames, site_m: Array) -> Array:
     step = (len(frames.plate_position) - 1) // len(site_m)
     position, rotation = frames.plate_position[step::step], frames.plate_rotation[step::step]
     return position + jnp.sum(rotation * site_m[:, None], axis=-1)
+
+
+def unmeasured(
+    spec: ArmSpec, pressure_kpa: np.ndarray, payload_kg: np.ndarray, tip_rotation: np.ndarray
+) -> tuple[StaticPoses, np.ndarray]:
+    """Return n poses to simulate that nobody measured, and their markers: zero but for the tip's axes."""
+    n = len(payload_kg)
+    poses = StaticPoses(
+        pressure_kpa=pressure_kpa,
+        payload_kg=payload_kg,
+        tip_m=np.zeros((n, 3)),
+        tip_rotation=tip_rotation,
+        spring_m=np.zeros((n, spec.n_chambers)),
+        marker_m=np.zeros((n, 0, 3)),
+        single=np.zeros(n, bool),
+    )
+    return poses, np.zeros((n, spec.structure.n_sections, 3))
 
 
 def simulate(

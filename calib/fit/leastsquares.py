@@ -1,7 +1,7 @@
 """Robust least squares with intervals, on `scipy.optimize.least_squares` with Huber's loss.
 
 The model returns errors and their Jacobian. The scales of the errors are estimated between rounds of the fit,
-one for each group of columns, so that what fits worse weighs less. A weak prior keeps parameters at the start
+one for each group of them, so that what fits worse weighs less. A weak prior keeps parameters at the start
 where the data do not determine them. The covariance is a sandwich whose clusters are the rows of errors: it
 adds up how the parameters change when one row is left out (jackknife, one Newton step).
 
@@ -39,7 +39,7 @@ class Problem:
     """Scales and prior of a fit that starts at x = 0."""
 
     prior: np.ndarray  # (p,) standard deviations about the start
-    group: np.ndarray  # (m,) group of each column of errors, counted from 0
+    group: np.ndarray  # (m,) or (n, m) group of each column, or of each of the errors, counted from 0
     scale: np.ndarray  # (n_groups,) first guess of the errors' standard deviations
     min_scale: np.ndarray  # (n_groups,)
     huber: float = 2.0  # scales at which Huber's loss becomes linear
@@ -132,7 +132,7 @@ def _scaled(
     answered = ~np.any(np.isinf(error), axis=1, keepdims=True)
     known = np.isfinite(error) & answered
     scaled = np.where(answered, np.where(known, error, 0.0) / sigma, NO_ANSWER)
-    return scaled, np.where(known[..., None], jacobian, 0.0) / sigma[:, None]
+    return scaled, np.where(known[..., None], jacobian, 0.0) / sigma[..., None]
 
 
 def _covariance(
@@ -166,7 +166,7 @@ def _scales(error: np.ndarray, problem: Problem) -> np.ndarray:
     """Return the robust standard deviation of each group (n_groups,)."""
     found = problem.scale.copy()
     for k in range(len(found)):
-        of_group = error[:, problem.group == k]
+        of_group = error[np.broadcast_to(problem.group == k, error.shape)]
         of_group = of_group[np.isfinite(of_group)]
         if len(of_group):
             found[k] = max(SIGMA_PER_MEDIAN * np.median(np.abs(of_group)), problem.min_scale[k])

@@ -57,7 +57,7 @@ def test_far_poses_keep_away_from_those_recorded_and_go_where_the_error_is():
 def recorded():
     rng = np.random.default_rng(0)
     pressure_kpa = rng.uniform(-5.0, 5.0, (30, 3))
-    return Recorded(pressure_kpa, np.zeros(30), np.ones(30), np.array([1e-3, 0.01, 1e-3]))
+    return Recorded(pressure_kpa, np.zeros(30), np.ones(30), np.tile([1e-3, 0.01, 1e-3], (2, 1)))
 
 
 def test_a_plan_makes_directions_known(recorded):
@@ -70,12 +70,19 @@ def test_a_plan_makes_directions_known(recorded):
 
 
 def test_markers_of_the_calibration_count_for_the_plan_too(recorded, tmp_path):
-    with_markers = recorded._replace(scale=np.append(recorded.scale, 1e-3))
+    with_markers = recorded._replace(scale=np.tile([1e-3, 0.01, 1e-3, 1e-3], (2, 1)))
     save_recorded(tmp_path / RECORDED_FILE, with_markers)
     loaded = load_recorded(tmp_path / RECORDED_FILE, 3)
     np.testing.assert_array_equal(loaded.scale, with_markers.scale)
     unknown = [plan(SMALL, known, 30, seed=0).n_unknown for known in (recorded, loaded)]
     assert unknown[1][0] <= unknown[0][0] and unknown[1] != unknown[0]
+
+
+def test_straight_poses_are_worth_more_where_the_model_fits_them_better(recorded):
+    """The recorded pressures are so small that the arm hardly bends."""
+    better = recorded._replace(scale=recorded.scale * [[1.0], [0.1]])
+    unknown = [plan(SMALL, known, 30, 0).n_unknown[0] for known in (recorded, better)]
+    assert unknown[1] < unknown[0]
 
 
 def test_from_a_calibration_to_a_file_that_record_reads(recorded, tmp_path, capsys):

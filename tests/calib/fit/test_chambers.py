@@ -141,7 +141,28 @@ def test_markers_at_the_sections_ends_tell_the_offsets_wherever_they_are_stuck(f
     assert fit.direction_widths[0] < 0.5 * fitted_without_springs.direction_widths[0]
     assert len(fit.weak) < len(fitted_without_springs.weak)
     assert off_by(fit.spec, planted())[3] < 1.5e-3
-    assert fit.scale[3] == pytest.approx(TIP_NOISE_M, rel=0.2)
+    assert fit.scale[0, 3] == pytest.approx(TIP_NOISE_M, rel=0.2)
+
+
+def test_what_bending_alone_does_to_an_arm_leaves_straight_poses_their_weight():
+    """The tip turns about the arm by up to 10 deg where it bends, which the simulated arm does not know."""
+    spec = SPEC.replace(structure={"n_sections": 1, "links_per_section": 2})
+    rng = np.random.default_rng(0)
+    straight = np.repeat(rng.uniform(-15.0, 8.0, (60, 1)), 3, axis=1)
+    pressure_kpa = np.concatenate([0.5 * excitation.random_pressures(spec, 140, rng), straight])
+    log = pose_log(spec, 200, 0, pressure_kpa)
+    twist = np.zeros((200, 3))
+    twist[:140, 2] = rng.uniform(-0.17, 0.17, 140)
+    found = settle_many(spec, pressure_kpa)
+    fits = [
+        calibrate_chambers(
+            dataclasses.replace(log, tip_quaternion=quaternions(found.tip_rotation, turn)), spec
+        )
+        for turn in (twist, twist[np.roll(np.arange(200), 60)])  # of bent poses, of as many at random
+    ]
+    assert fits[0].scale[0, 1] > 5.0 * fits[0].scale[1, 1]
+    width = [fit.half_width_95["tip_turn_deg"][2] for fit in fits]
+    assert width[0] < 0.5 * width[1]
 
 
 def test_an_arm_of_two_sections_is_calibrated():

@@ -1,0 +1,41 @@
+"""What changes of the parameters do to the tip: by hand, and beside arms that have them."""
+
+import numpy as np
+import pytest
+
+from calib.fit.parameters import names, spec_at
+from calib.fit.predictions import PAYLOAD_SHARE, tip_changes
+from mjx_softarm import ArmSpec
+from mjx_softarm.mechanics.excitation import random_pressures
+from mjx_softarm.mechanics.workspace import settle_many
+
+SPEC = ArmSpec.default().replace(structure={"n_sections": 1, "links_per_section": 2})
+NAMES = names(SPEC)
+
+
+def change(**values):
+    """A change of x by names, whose spaces are underscores."""
+    x = np.zeros(len(NAMES))
+    for name, value in values.items():
+        x[NAMES.index(name.replace("_", " "))] = value
+    return x
+
+
+def test_a_shifted_base_shifts_the_tip_as_far_and_a_marker_s_site_does_nothing():
+    both = np.stack([change(base_offset_x=2e-3), change(marker_x0=0.02)], axis=1)
+    np.testing.assert_allclose(tip_changes(SPEC, np.zeros(len(NAMES)), both), [2e-3, 0.0], atol=1e-6)
+    assert tip_changes(SPEC, np.zeros(len(NAMES)), both[:, :0]).shape == (0,)
+
+
+@pytest.mark.parametrize("what", [{"stiffness0": 0.02}, {"offset1": 5e-3, "offset2": -5e-3}])
+def test_chambers_that_are_off_move_the_tip_as_those_of_such_an_arm(what):
+    x, far = change(area0=0.1), change(**what)
+    heaviest_kg = PAYLOAD_SHARE * (SPEC.mass.arm_kg + SPEC.mass.gripper_kg)
+    pressure_kpa, moved_m = random_pressures(SPEC, 1000, 5), []
+    for payload_kg in (0.0, heaviest_kg):
+        arms = [spec_at(SPEC.replace(mass={"payload_kg": payload_kg}), at) for at in (x - far, x + far)]
+        low, high = (settle_many(arm, pressure_kpa) for arm in arms)
+        away_m = 0.5 * np.linalg.norm(high.tip_position_m - low.tip_position_m, axis=1)
+        moved_m.append(away_m[low.settled & high.settled])
+    expected = np.max(np.concatenate(moved_m))
+    assert tip_changes(SPEC, x, far[:, None])[0] == pytest.approx(expected, rel=0.1)
