@@ -78,8 +78,8 @@ def error_groups(spec: ArmSpec, pressure_kpa: np.ndarray) -> np.ndarray:
     circle = np.exp(2j * np.pi * np.arange(N_CHAMBERS_PER_SECTION) / N_CHAMBERS_PER_SECTION)
     off_centre = np.abs(pressure_kpa.reshape(len(pressure_kpa), -1, N_CHAMBERS_PER_SECTION) @ circle)
     span = spec.chambers.pressure_max_kpa - spec.chambers.pressure_min_kpa
-    straight = (off_centre < STRAIGHT * span).all(axis=1)
-    return kind + N_KINDS * straight[:, None]
+    straight = np.all(off_centre < STRAIGHT * span, axis=1, keepdims=True)
+    return kind + N_KINDS * straight
 
 
 def _section_ends(frames: Frames, site_m: Array) -> Array:
