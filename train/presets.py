@@ -97,13 +97,8 @@ PRESETS: dict[str, TrainConfig] = {
             mean_share=0.3,
         ),
     ),
-    # As accurate as TQC's critics with a good policy get: most of the time is polishing.
     "paper": dataclasses.replace(
-        _AT_REST,
-        tqc=dataclasses.replace(_AT_REST.tqc, hidden_actor=AnalyticConfig().hidden),
-        total_env_steps=300_000,
-        updates_per_env_step=0.125,
-        polish_updates=131_072,
+        _AT_REST, total_env_steps=300_000, updates_per_env_step=0.5, polish_updates=32_768
     ),
 }
 
