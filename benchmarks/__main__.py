@@ -24,7 +24,6 @@ BENCHMARKS = {
     "planning": "benchmarks.accuracy.planning:measure",
     "arms": "benchmarks.accuracy.arms:measure",
     "logs": "benchmarks.accuracy.logs:measure",
-    "load": "benchmarks.accuracy.load:measure",
     "learning": "benchmarks.accuracy.learning:measure",
     "race": "benchmarks.race.race:race",
     "paper": "benchmarks.paper.experiments:paper",
