@@ -148,10 +148,8 @@ def scene_of(folder: Path, settings: Settings, trial: Trial) -> Scene:
         goals = demonstrations.positions[: settings.n_positions].astype(float)
         names = [waypoint.name for waypoint in task_of(task, spec).waypoints[: settings.n_positions]]
     else:
-        goals, names = (
-            circle_poses(controller.policy.spec, settings.n_points).astype(float),
-            [""] * settings.n_points,
-        )
+        goals = circle_poses(controller.policy.spec, settings.n_points).astype(float)
+        names = [""] * len(goals)
     session = TRIAL_SESSION if task else EVALUATION_SESSION
     twin = stand_in(settings)(trial.twin, payload_kg=1e-3 * trial.load_g, session=session, **inside)
     return Scene(twin, controller, goals, names)

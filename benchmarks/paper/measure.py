@@ -143,9 +143,10 @@ def operate(
     force = getattr(twin, "wall_force_n", lambda: (0.0, 0.0))  # a rod touches nothing
     watched: Any = WatchedTwin(twin, lambda: forces.append(force()))
     gripper = Gripper(watched, names, finger_tips(goals, gripper_m), objects, gripper_m)
-    stops = np.flatnonzero(~(moves & np.char.startswith(names, "to ")))
+    stopped = ~(moves & np.char.startswith(names, "to "))
+    stopped[[0, -1]] = True
+    stops = np.flatnonzero(stopped)
     if moves:
-        stopped = np.isin(np.arange(len(goals)), stops)
         run = trace(watched, controller, goals, PACE_S, stopped, arrived=gripper.arrived)
         indices = (int(np.searchsorted(stops, arrival.index)) for arrival in run.arrivals)
         at = tuple(a._replace(index=k) for a, k in zip(run.arrivals, indices, strict=True))

@@ -179,7 +179,7 @@ def calibrate_chambers(logs: Log | Sequence[Log], spec: ArmSpec, seed: int = 0) 
         is_held_out=held_out,
         tip_error_mm=np.where(np.isinf(after[:, 0]), np.nan, 1e3 * np.linalg.norm(after[:, :3], axis=1)),
         chamber_m=chamber_m,
-        warnings=complaints,
+        warnings=(),
     )
     return dataclasses.replace(found, warnings=complaints + _warnings(found, spec, solution))
 

@@ -1,4 +1,4 @@
-"""What an error of the parameters means to the tip: by how much it moves over the workspace."""
+"""Errors of the parameters in millimetres of the tip, over the workspace."""
 
 from __future__ import annotations
 

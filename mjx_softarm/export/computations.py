@@ -22,7 +22,7 @@ from mjx_softarm.sensing.sensors import Reading, SensorFault
 
 
 class InMotion(NamedTuple):
-    """What a policy of motion takes besides readings and goal."""
+    """Inputs of a policy of motion besides readings and goal."""
 
     before_m: Array  # (n,) lengths `rate_ticks` before; NaN if not known
     last_reference_m: Array  # (n,) references of the last action; NaN before the first
@@ -103,9 +103,8 @@ def _inside(controller: Controller, goal: Array) -> Array:
 def actor(controller: Controller) -> Computation:
     """Record the bare actor: observation (O,) -> action (n,) in [-1, 1]."""
     policy = controller.policy
-    observation = symbol(
-        "observation", (len(observation_names(policy.spec, policy.observes_motion)),), np.float32
-    )
+    size = len(observation_names(policy.spec, policy.observes_motion))
+    observation = symbol("observation", (size,), np.float32)
     return Computation((observation,), {"action": actor_output(policy, observation)})
 
 

@@ -49,7 +49,7 @@ def busy_policy(spec=SPEC):
 
 
 def moving_policy(spec=SPEC):
-    """The same, acting each 0.3 s on what it sees of the motion."""
+    """A busy policy that acts each 0.3 s on what it sees of the motion."""
     n_in = OBS_SIZE + len(motion_layout(N))
     return dataclasses.replace(busy_policy(spec), layers=layers(n_in, 12, N, scale=0.3), action_s=0.3)
 

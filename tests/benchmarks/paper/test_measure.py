@@ -102,6 +102,10 @@ def test_an_arm_in_motion_passes_what_is_on_its_way():
     assert np.isfinite(moving.arrival_s).all() and set(moving.point) == {0, 1}
     assert moving.arrival_s[1] - moving.arrival_s[0] > 3 * PACE_S
     assert moving.time_s[-1] < stopping.time_s[-1]
+    cut = operate(
+        Still(), CONTROLLER, goals[:3], names[:3], moves=True
+    )  # the last goal is a stop whatever its name
+    assert cut.name.tolist() == [names[0], names[2]] and np.isfinite(cut.arrival_s).all()
 
 
 def test_goals_that_are_all_refused_are_told():

@@ -1,4 +1,4 @@
-"""What changes of the parameters do to the tip: by hand, and beside arms that have them."""
+"""Changes of the parameters in millimetres of the tip: by hand, and beside arms that have them."""
 
 import numpy as np
 import pytest
