@@ -11,6 +11,7 @@ three joints alone, and its length on those of its section; only gravity couples
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -111,7 +112,7 @@ class Tendons(NamedTuple):
 
     length: Array  # (n_chambers,) [m]
     jacobian: Array  # (n_sections, 3 tendons, n) by the n joints of the tendons' section
-    link_hessian: Array  # (n_links, 3 tendons, 3 dofs, 3 dofs) by the joints of a link
+    link_hessian: Array  # (3 dofs, 3 dofs, 3 tendons, n_links) by the joints of a link
 
 
 class Statics(NamedTuple):
@@ -174,10 +175,11 @@ def statics_of(both: Tendons, frames: Frames, q: Array, pressure_kpa: Array, par
 def _bending(tension: Array, link_hessian: Array) -> Array:
     """Sum tensions (2, n_sections, 3) times second derivatives of the lengths: (n_sections, n, n)."""
     n_sections = tension.shape[1]
-    per_section = link_hessian.shape[1] // n_sections
-    per_link = jnp.repeat(tension, per_section, axis=1)
-    links = jnp.sum(per_link[..., None, None] * link_hessian, axis=(0, 2))
-    return jax.vmap(block_diagonal)(links.reshape(n_sections, per_section, *links.shape[1:]))
+    per_section = link_hessian.shape[-1] // n_sections
+    per_link = jnp.repeat(jnp.swapaxes(tension, 1, 2), per_section, axis=-1)  # (2, 3 tendons, n_links)
+    links = jnp.sum(per_link[:, None, None] * link_hessian, axis=(0, 3))  # (3 dofs, 3 dofs, n_links)
+    blocks = jnp.moveaxis(links, -1, 0).reshape(n_sections, per_section, DOFS_PER_LINK, DOFS_PER_LINK)
+    return jax.vmap(block_diagonal)(blocks)
 
 
 def _stretching(slope: Array, jacobian: Array) -> Array:
@@ -194,42 +196,51 @@ def _stretching(slope: Array, jacobian: Array) -> Array:
 def tendons(frames: Frames, site_m: Array) -> Tendons:
     """Return lengths of tendons through holes in the rings, with derivatives.
 
+    Vectors are lists of three components (3 tendons, n_links), so that one instruction serves many links.
+
     Args:
         frames: plates and joints.
         site_m (n_chambers, 2): x and y of each tendon's hole in every ring of its section.
     """
-    n_links = frames.axis.shape[0]
-    n_sections = site_m.shape[0] // N_CHAMBERS_PER_SECTION
+    n_links, n_sections = frames.axis.shape[0], site_m.shape[0] // N_CHAMBERS_PER_SECTION
     per_section = n_links // n_sections
-    site = jnp.repeat(site_m.reshape(n_sections, N_CHAMBERS_PER_SECTION, 2), per_section, axis=0)  # (L, 3, 2)
-    arm = _dot(frames.plate_rotation[1:, None, :, :2], site[:, :, None])
-    above = _dot(frames.plate_rotation[:-1, None, :, :2], site[:, :, None])
-    lower = frames.plate_position[1:, None] + arm  # (L, 3, 3)
-    segment = lower - (frames.plate_position[:-1, None] + above)
-    length = jnp.sqrt(jnp.sum(segment**2, axis=-1))  # (L, 3)
-    unit = segment / length[..., None]
+    site = jnp.repeat(site_m.reshape(n_sections, N_CHAMBERS_PER_SECTION, 2), per_section, axis=0)
+    x, y = jnp.moveaxis(site, 0, -1)[:, 0], jnp.moveaxis(site, 0, -1)[:, 1]  # (3 tendons, n_links)
+    plate, ring = jnp.moveaxis(frames.plate_position, 0, -1), jnp.moveaxis(frames.plate_rotation, 0, -1)
+    upper = [plate[i, :-1] + ring[i, 0, :-1] * x + ring[i, 1, :-1] * y for i in range(3)]
+    lower = [plate[i, 1:] + ring[i, 0, 1:] * x + ring[i, 1, 1:] * y for i in range(3)]
+    segment = [low - up for low, up in zip(lower, upper, strict=True)]
+    length = jnp.sqrt(_dot(segment, segment))
+    unit = [component / length for component in segment]
 
-    lever = lower - frames.anchor[:, None]
-    slide, hinge = frames.axis[:, :1], frames.axis[:, 1:]  # (L, 1, 3), (L, 2, 3)
-    turn = jnp.cross(hinge[:, None], lever[:, :, None])  # (L, 3, 2, 3)
-    motion = jnp.concatenate([jnp.broadcast_to(slide[:, None], (n_links, 3, 1, 3)), turn], axis=2)
-    along = _dot(unit[:, :, None], motion)  # d length / d q, (L, 3, 3)
-    twist = jnp.cross(hinge[:, None, :, None], turn[:, :, None, :])  # a_i x J_j, (L, 3, 2, 2, 3)
-    second = _dot(unit[:, :, None, None], twist)
-    upper = jnp.triu(second)
-    second = upper + jnp.swapaxes(jnp.triu(second, 1), -1, -2)
-    curve = _dot(motion[..., :, None, :], motion[..., None, :, :]) - along[..., :, None] * along[..., None, :]
-    link_hessian = (curve / length[..., None, None]).at[..., 1:, 1:].add(second)
+    anchor, axes = frames.anchor.T, jnp.moveaxis(frames.axis, 0, -1)  # (3, n_links), (3 dofs, 3, n_links)
+    lever = [low - at for low, at in zip(lower, anchor, strict=True)]
+    motion = [list(axes[0]), *(_cross(hinge, lever) for hinge in axes[1:])]  # of the hole, by each joint
+    along = [_dot(unit, moved) for moved in motion]  # d length / d q
 
-    own = along.reshape(n_sections, per_section, N_CHAMBERS_PER_SECTION, DOFS_PER_LINK)
-    rows = jnp.moveaxis(own, 2, 1).reshape(n_sections, N_CHAMBERS_PER_SECTION, -1)
-    total = length.reshape(n_sections, per_section, -1).sum(1).reshape(-1)
-    return Tendons(total, rows, link_hessian)
+    def second(i: int, j: int) -> Array:
+        """Return the second derivative of the length by the i-th joint of a link and one not before it."""
+        curve = (_dot(motion[i], motion[j]) - along[i] * along[j]) / length
+        return curve if i == 0 else curve + _dot(unit, _cross(axes[i], motion[j]))
+
+    upper_half = {(i, j): second(i, j) for i in range(DOFS_PER_LINK) for j in range(i, DOFS_PER_LINK)}
+    dofs = range(DOFS_PER_LINK)
+    own = jnp.stack(along).reshape(DOFS_PER_LINK, N_CHAMBERS_PER_SECTION, n_sections, per_section)
+    return Tendons(
+        length=length.reshape(N_CHAMBERS_PER_SECTION, n_sections, -1).sum(-1).T.reshape(-1),
+        jacobian=own.transpose(2, 1, 3, 0).reshape(n_sections, N_CHAMBERS_PER_SECTION, -1),
+        link_hessian=jnp.stack([jnp.stack([upper_half[min(i, j), max(i, j)] for j in dofs]) for i in dofs]),
+    )
 
 
-def _dot(a: Array, b: Array) -> Array:
-    """Return inner products over the last axis as sums, since tiny matrix products are slow."""
-    return jnp.sum(a * b, axis=-1)
+def _dot(a: Sequence[Array] | Array, b: Sequence[Array] | Array) -> Array:
+    """Return the inner products of vectors whose components come first."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _cross(a: Sequence[Array] | Array, b: Sequence[Array] | Array) -> list[Array]:
+    """Return the components of the cross products of vectors whose components come first."""
+    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 
 
 def _gravity(frames: Frames, params: ArmParams) -> tuple[Array, ChainHessian]:
