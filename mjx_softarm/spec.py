@@ -21,12 +21,12 @@ from mjx_softarm._support.fields import (
     PerChamber,
     SpecError,
     anything,
+    check_counts,
     count,
     not_negative,
     numbers,
     positive,
     read_fields,
-    rule_of,
     vector,
 )
 from mjx_softarm.arms import shipped_arm
@@ -267,18 +267,7 @@ class ArmSpec:
             "chambers": self.n_chambers,
             PAIRS: self.n_chambers**2,
         }
-        for group in dataclasses.fields(self):
-            table = getattr(self, group.name)
-            for item in dataclasses.fields(table) if dataclasses.is_dataclass(table) else ():
-                value, rule = getattr(table, item.name), rule_of(item)
-                if not (rule.per and isinstance(value, tuple)) or value == item.default:
-                    continue
-                if len(value) != counts[rule.per]:
-                    instead = "one, or " if rule.length is None else ""
-                    raise SpecError(
-                        f"{source}: {group.name}.{item.name}: got {len(value)} numbers, "
-                        f"expected {instead}one for each of the {counts[rule.per]} {rule.per}"
-                    )
+        check_counts(self, counts, source, "")
         for group, low, high in (
             ("chambers", "pressure_min_kpa", "pressure_max_kpa"),
             ("springs", "length_min_m", "length_max_m"),

@@ -121,6 +121,25 @@ def read_fields(cls: type, data: Any, source: str, prefix: str) -> dict[str, Any
     return values
 
 
+def check_counts(table: Any, counts: dict[str, int], source: str, prefix: str) -> None:
+    """Refuse lists of an arm that do not have as many numbers as the arm has of what they are for.
+
+    Raises:
+        SpecError: a list is too short or too long.
+    """
+    for item in fields(table):
+        value, rule = getattr(table, item.name), rule_of(item)
+        if dataclasses.is_dataclass(value):
+            check_counts(value, counts, source, f"{prefix}{item.name}.")
+        is_list = rule.per and isinstance(value, tuple) and value != item.default
+        if is_list and len(value) != (n := counts[rule.per]):
+            instead = "one, or " if rule.length is None else ""
+            raise SpecError(
+                f"{source}: {prefix}{item.name}: got {len(value)} numbers, "
+                f"expected {instead}one for each of the {n} {rule.per}"
+            )
+
+
 def rule_of(item: dataclasses.Field) -> Rule:
     """Return the rule of a field; one without is a text."""
     return item.metadata.get("rule", Rule(kind=str))
