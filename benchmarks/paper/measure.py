@@ -17,7 +17,7 @@ from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy import faults
 from mjx_softarm.deploy import measure as accuracy
 from mjx_softarm.deploy.controller import Controller
-from mjx_softarm.deploy.run import Run
+from mjx_softarm.deploy.ending import Run
 from mjx_softarm.deploy.session import follow, trace
 from mjx_softarm.mechanics.pipe import APPLE_KG, BALL_KG
 from mjx_softarm.sensing.pose import frame_from_pose, rotation_from_quaternion

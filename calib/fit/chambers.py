@@ -21,11 +21,10 @@ import numpy as np
 
 from calib.errors import FitError
 from calib.fit.blocks import held_out_blocks
-from calib.fit.equilibrium import N_KINDS, error_groups, simulate
+from calib.fit.equilibrium import N_KINDS, error_groups, simulate, tip_changes
 from calib.fit.leastsquares import NOT_CONVERGED, Problem, Solution, fit, principal
 from calib.fit.markers import section_ends
 from calib.fit.parameters import half_widths, names, priors, spec_at, tolerances
-from calib.fit.predictions import tip_changes
 from calib.read.static_poses import StaticPoses, find_static_poses
 from mjx_softarm.logs.rest import HOLD_KPA
 from mjx_softarm.logs.schema import Log
@@ -68,7 +67,7 @@ class ChamberFit:
             units of the tolerances of `calib.fit.parameters`, largest first (p,).
         weak: unknown directions, whose width is above 1, in words.
         weak_tip_mm: how far each of these moves the simulated tip within its interval, at the pressures and
-            with the payload where it does so the most (`calib.fit.predictions`).
+            with the payload where it does so the most (`calib.fit.equilibrium`).
         in_sample, held_out: errors of the calibrated arm; held-out poses took no part in the fit.
         in_sample_before, held_out_before: errors of the specification that the fit started from.
         scale: robust errors of arms that bend and of straight ones (2, 3): tip [m], rotation [rad] and

@@ -1,4 +1,7 @@
-"""Static equilibrium of the arm as a differentiable function of its parameters, beside measured poses."""
+"""Static equilibrium of the arm as a differentiable function of its parameters, beside measured poses.
+
+Errors of the parameters are told by it in millimetres of the tip, too, over the workspace.
+"""
 
 from __future__ import annotations
 
@@ -12,13 +15,17 @@ from jax import Array
 
 from calib.fit.parameters import marker_sites, with_numbers
 from calib.read.static_poses import StaticPoses
+from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.mechanics.kinematics import Frames, chain_kinematics
 from mjx_softarm.mechanics.settle import RESIDUAL_TOLERANCE, settle_pressures
 from mjx_softarm.mechanics.statics import ArmParams, tendons
+from mjx_softarm.mechanics.workspace import pressure_levels
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
 
 BATCH = 128  # poses simulated together
 N_KINDS = 4  # of errors: tip, rotation, springs, markers
+N_WORKSPACE = 256  # poses over the workspace
+PAYLOAD_SHARE = 1.0 / 4.7  # of the arm's mass, the heaviest: 1 kg of the paper's arm
 STRAIGHT = 0.2  # one chamber's excess over the section's others, as a share of the range, at most
 
 
@@ -129,6 +136,31 @@ def simulate(
     found = [jax.device_get(_jacobian()(np.float32(x), params, batch)) for batch in batches]
     error, slope, settled, chamber_m = (np.concatenate(a)[: poses.n] for a in zip(*found, strict=True))
     return np.where(settled[:, None], error.astype(float), np.inf), slope.astype(float), chamber_m
+
+
+def tip_changes(spec: ArmSpec, x: np.ndarray, change: np.ndarray) -> np.ndarray:
+    """Return how far changes of x move the tip at given pressures, to first order, where they do the most.
+
+    Half of the poses have pressures at random and half at the extremes; every second one has the heaviest
+    payload.
+
+    Args:
+        spec: arm at x = 0.
+        x (p,): see `calib.fit.parameters`.
+        change (p, k): changes of x.
+
+    Returns:
+        Lengths (k,) [m].
+    """
+    rng = np.random.default_rng(0)
+    extremes = rng.choice(pressure_levels(spec), (N_WORKSPACE // 2, spec.n_chambers))
+    pressure_kpa = np.concatenate([random_pressures(spec, N_WORKSPACE - len(extremes), rng), extremes])
+    heaviest_kg = PAYLOAD_SHARE * (spec.mass.arm_kg + spec.mass.gripper_kg)
+    payload_kg = np.where(np.arange(N_WORKSPACE) % 2, heaviest_kg, 0.0)
+    rotation = np.broadcast_to(np.eye(3), (N_WORKSPACE, 3, 3))
+    error, slope, _ = simulate(spec, *unmeasured(spec, pressure_kpa, payload_kg, rotation), x)
+    settled = np.isfinite(error[:, 0]) & np.isfinite(slope).all(axis=(1, 2))
+    return np.linalg.norm(slope[settled, :3] @ change, axis=1).max(axis=0, initial=0.0)
 
 
 @functools.cache

@@ -131,6 +131,7 @@ def check_counts(table: Any, counts: dict[str, int], source: str, prefix: str) -
         value, rule = getattr(table, item.name), rule_of(item)
         if dataclasses.is_dataclass(value):
             check_counts(value, counts, source, f"{prefix}{item.name}.")
+            continue
         is_list = rule.per and isinstance(value, tuple) and value != item.default
         if is_list and len(value) != (n := counts[rule.per]):
             instead = "one, or " if rule.length is None else ""

@@ -16,9 +16,9 @@ import tyro
 
 from mjx_softarm._support import cli
 from mjx_softarm._support.errors import InputError
-from mjx_softarm.deploy.arms import open_arm
 from mjx_softarm.deploy.controller import Controller
-from mjx_softarm.deploy.ending import FAULT, save_log
+from mjx_softarm.deploy.drivers.names import open_arm
+from mjx_softarm.deploy.ending import FAULT, Run, save_log
 from mjx_softarm.deploy.measure import (
     along,
     figures,
@@ -28,7 +28,6 @@ from mjx_softarm.deploy.measure import (
     write_accuracy,
 )
 from mjx_softarm.deploy.record import record
-from mjx_softarm.deploy.run import Run
 from mjx_softarm.deploy.session import follow, trace
 from mjx_softarm.logs import mcap_file
 from mjx_softarm.logs.pressure_plan import read_plan

@@ -16,9 +16,9 @@ import numpy as np
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.control import saturated
 from mjx_softarm.deploy.controller import Controller
+from mjx_softarm.deploy.ending import Run
 from mjx_softarm.deploy.faults import Fault
 from mjx_softarm.deploy.link import describe
-from mjx_softarm.deploy.run import Run
 from mjx_softarm.logs.tables import read_table
 from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.policy.file import Policy

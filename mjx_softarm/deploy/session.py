@@ -16,12 +16,11 @@ import numpy as np
 from mjx_softarm.deploy.acting import believed
 from mjx_softarm.deploy.arm_io import ArmIO
 from mjx_softarm.deploy.controller import Controller, State, Tick, start
-from mjx_softarm.deploy.ending import vent_at_end
+from mjx_softarm.deploy.ending import Arrival, Run, vent_at_end
 from mjx_softarm.deploy.faults import Event, Fault, Response
 from mjx_softarm.deploy.link import ArmFault, Link, Recorder
 from mjx_softarm.deploy.loop import hold, release, step, with_goal, with_moving_goal
 from mjx_softarm.deploy.reachability import refusals
-from mjx_softarm.deploy.run import Arrival, Run
 from mjx_softarm.deploy.way import Way
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mdp.rewards import scaled_error

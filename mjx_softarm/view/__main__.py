@@ -15,7 +15,7 @@ import tyro
 from mjx_softarm._support import cli
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.__main__ import Arm, PolicyFile, check_file
-from mjx_softarm.deploy.arms import open_arm
+from mjx_softarm.deploy.drivers.names import open_arm
 from mjx_softarm.deploy.ending import save_log
 from mjx_softarm.policy.file import SHIPPED, load_policy
 from mjx_softarm.spec import ArmSpec

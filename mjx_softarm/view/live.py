@@ -17,11 +17,10 @@ import numpy as np
 
 from mjx_softarm._support.channel import End
 from mjx_softarm._support.errors import InputError
-from mjx_softarm.deploy.arms import Paced
 from mjx_softarm.deploy.controller import Controller, State, Tick
-from mjx_softarm.deploy.ending import FAULT
+from mjx_softarm.deploy.drivers.names import Paced
+from mjx_softarm.deploy.ending import FAULT, Run
 from mjx_softarm.deploy.reachability import clamped
-from mjx_softarm.deploy.run import Run
 from mjx_softarm.deploy.session import Orders, steer
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mechanics.excitation import circle_poses

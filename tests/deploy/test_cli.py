@@ -11,7 +11,7 @@ import pytest
 
 from calib.read.logs import read_log
 from mjx_softarm.deploy.__main__ import main
-from mjx_softarm.deploy.arms import ArmError, Paced, open_arm
+from mjx_softarm.deploy.drivers.names import ArmError, Paced, open_arm
 from mjx_softarm.logs.pressure_plan import write_plan
 from mjx_softarm.policy.file import SHIPPED, load_policy, save_policy
 from tests.linear_arm import DT_S, FAR, POLICY, REST_M, SENSOR, LinearArm, N

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from mjx_softarm import ArmSpec
-from mjx_softarm.deploy.arms import open_arm
 from mjx_softarm.deploy.controller import Controller
+from mjx_softarm.deploy.drivers.names import open_arm
 from mjx_softarm.deploy.session import follow
 from mjx_softarm.export.cpp import sources
 from mjx_softarm.mechanics.excitation import circle_poses

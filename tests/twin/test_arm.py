@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from mjx_softarm import ArmSpec
 from mjx_softarm.control import Gains, LawState, pressures
-from mjx_softarm.deploy.arms import ArmError, open_arm
+from mjx_softarm.deploy.drivers.names import ArmError, open_arm
 from mjx_softarm.mechanics.mjcf import chamber_lengths, spring_lengths
 from mjx_softarm.mechanics.workspace import settle_many
 from mjx_softarm.sensing.sensors import Sensor

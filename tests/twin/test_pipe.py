@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial import ConvexHull
 
 from mjx_softarm import ArmSpec
-from mjx_softarm.deploy.arms import open_arm
+from mjx_softarm.deploy.drivers.names import open_arm
 from mjx_softarm.mechanics.kinematics import chain_frames
 from mjx_softarm.mechanics.mjcf import build_spec
 from mjx_softarm.mechanics.pipe import CrossPipe, body_clearance, clearance

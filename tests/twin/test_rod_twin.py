@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mjx_softarm.deploy.arms import ArmError, open_arm
+from mjx_softarm.deploy.drivers.names import ArmError, open_arm
 from mjx_softarm.deploy.record import record
 from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.twin import rod_twin

@@ -13,7 +13,7 @@ import tyro
 from rich.console import Console
 
 from mjx_softarm._support import cli
-from mjx_softarm.deploy import arms
+from mjx_softarm.deploy.drivers import names
 from mjx_softarm.deploy.ending import DONE, FAULT, NOT_WRITTEN, save_log
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.spec import ArmSpec
@@ -47,7 +47,7 @@ class Record(ArmOptions):
                 f"--out: got {self.out}, expected the name of a new file in a folder that exists"
             )
         spec, s2r = self.read_arm(console)
-        arm = arms.open_arm(self.arm)
+        arm = names.open_arm(self.arm)
         waypoints, pipe = task(self.task, spec) if self.task else ((), None)
         expert = Expert(spec, s2r, pipe)
         plan = None if self.keyboard else expert.plan(waypoints)  # before the arm moves

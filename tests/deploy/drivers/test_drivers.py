@@ -10,8 +10,8 @@ import tty
 import numpy as np
 import pytest
 
-from mjx_softarm.deploy.arms import ArmError, open_arm
 from mjx_softarm.deploy.drivers import serial_line
+from mjx_softarm.deploy.drivers.names import ArmError, open_arm
 from mjx_softarm.deploy.drivers.serial_line import SerialArm
 from mjx_softarm.deploy.drivers.udp import UdpArm
 from mjx_softarm.deploy.record import record

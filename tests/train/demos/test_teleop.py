@@ -157,7 +157,7 @@ def command(calibration, monkeypatch, capsys):
     """Runs `python -m train demos` on the ideal arm with keys on its standard input."""
 
     def run(*args, keys=""):
-        monkeypatch.setattr("mjx_softarm.deploy.arms.open_arm", lambda name: IdealArm())
+        monkeypatch.setattr("mjx_softarm.deploy.drivers.names.open_arm", lambda name: IdealArm())
         monkeypatch.setattr("sys.stdin", io.StringIO(keys))
         status = main(["demos", *map(str, args), "--calibration", str(calibration)])
         captured = capsys.readouterr()

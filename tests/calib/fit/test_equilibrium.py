@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from calib.fit.equilibrium import PAYLOAD_SHARE, tip_changes
 from calib.fit.parameters import names, spec_at
-from calib.fit.predictions import PAYLOAD_SHARE, tip_changes
 from mjx_softarm import ArmSpec
 from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.mechanics.workspace import settle_many
