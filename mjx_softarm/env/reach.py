@@ -55,7 +55,6 @@ class ReachEnv(Env):
         valid () bool            the simulation succeeded; learn from no other step
         saturated () bool        a chamber is at a pressure limit with its spring off its reference
         blocked (n_chambers,)    which chambers are
-        off_m (n_chambers,)      references of the springs less their readings
         clearance_mm ()          distance of the body to the pipe's wall; infinite without a pipe
         path_mm (n_ticks, 3)     in motion: position of the tip at the start of each control period
 
@@ -177,7 +176,6 @@ class ReachEnv(Env):
         info = {
             "saturated": jnp.array(False),
             "blocked": jnp.zeros(self.action_size, bool),
-            "off_m": jnp.zeros(self.action_size),
             "valid": jnp.array(True),
             "clearance_mm": self._clearance_mm(start.q, start.pose),
         }
@@ -192,7 +190,8 @@ class ReachEnv(Env):
         `info["valid"]` is then false, and the transition must not be learned from.
         """
         arm: ArmState = state.pipeline_state
-        motion, end, reference = self.move(arm, action)
+        reference = self.reference_m(action)
+        motion, end = self._move(arm, reference - arm.sensor_offset_m)
         finite = jnp.all(jnp.isfinite(action))  # a NaN would ask for a length of 0
         result = jnp.where(finite, end.result, self._results.NOT_FINITE.value)
         valid = result == 0
@@ -226,7 +225,6 @@ class ReachEnv(Env):
         info = {
             "saturated": blocked,
             "blocked": saturated,
-            "off_m": reference - reading,
             "valid": valid,
             "clearance_mm": clearance_mm,
             **self._path_mm(end),
@@ -240,17 +238,16 @@ class ReachEnv(Env):
             info=state.info | info,
         )
 
-    def move(self, arm: ArmState, action: Array) -> tuple[Motion, Settled | Moved, Array]:
-        """Return the arm's motion after an action, what came of it, and the readings asked for [m]."""
-        params, config, reference_m = self.params_of(arm), self.config, self.reference_m(action)
+    def _move(self, arm: ArmState, reference_m: Array) -> tuple[Motion, Settled | Moved]:
+        params, config = self.params_of(arm), self.config
         kinematics = mjx_kinematics(self.model) if config.engine == "mjx" else chain_kinematics(params)
-        true_m = reference_m - arm.sensor_offset_m
-        if config.moves:
+        if self.config.moves:
             moving = MovingArm.of(self.model, kinematics, params, arm.moving)
-            times_s = config.dynamic_step_s, 1.0 / self.spec.control.rate_hz, config.simulation_step_s
-            return *advance(moving, arm.motion, true_m, self.gains, *times_s), reference_m
-        end = settle(kinematics, params, true_m)
-        return Motion.at_rest(end.q, end.pressure_kpa, end.spring_m), end, reference_m
+            rate_hz = self.spec.control.rate_hz
+            times_s = config.dynamic_step_s, 1.0 / rate_hz, config.simulation_step_s
+            return advance(moving, arm.motion, reference_m, self.gains, *times_s)
+        end = settle(kinematics, params, reference_m)
+        return Motion.at_rest(end.q, end.pressure_kpa, end.spring_m), end
 
     def _path_mm(self, end: Settled | Moved) -> dict[str, Array]:
         """Return `info["path_mm"]` of an arm that moved."""

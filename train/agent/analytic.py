@@ -198,7 +198,7 @@ class Analytic:
         def act(arm: State, change: Array) -> tuple[State, tuple[Array, State, Array]]:
             action = self.mode(params, arm.obs) + change
             after = self.env.step(arm, action)
-            return after, (self._cost(after), after, arm.obs)
+            return after, (self._cost(action, after), after, arm.obs)
 
         horizon = self.config.horizon
         _, (cost, after, obs) = jax.lax.scan(act, arm, changes, length=horizon, unroll=horizon == 1)
@@ -206,12 +206,12 @@ class Analytic:
         loss = cost[0] if horizon == 1 else cost[-1] + EARLY * jnp.mean(cost)
         return loss, _Ahead(first, obs, jnp.all(after.info["valid"]))
 
-    def _cost(self, after: State) -> Array:
-        """Return the cost of the state that an action of one arm leads to."""
+    def _cost(self, action: Array, after: State) -> Array:
+        """Return the cost of an action (A,) of one arm, and of the state that it leads to."""
         end, config = after.pipeline_state, self.env.config
         error = rewards.scaled_error(end.pose, end.goal, config.reward)  # (6,)
         off = jnp.sqrt(jnp.sum(error**2) + 1e-12) / config.reward.threshold
-        off_m = after.info["off_m"]  # (A,)
+        off_m = self.env.reference_m(action) - (end.spring_m + end.sensor_offset_m)  # (A,)
         if config.moves:  # most of them are on their way
             off_m = after.info["blocked"] * off_m
         cost = self.config.saturation_cost_per_mm * 1e3 * jnp.sum(jnp.abs(off_m))
