@@ -70,16 +70,15 @@ def marker_limits(poses: StaticPoses, simulated_m: np.ndarray, spec: ArmSpec) ->
     """Compute length limits from the most bent poses.
 
     Args:
-        poses: static poses with markers.
+        poses: static poses with markers, those of `section_ends`.
         simulated_m (n, n_chambers) [m]: chamber lengths of the calibrated arm at all poses.
         spec: the arm.
 
     Raises:
-        FitError: there are fewer than `MIN_MARKERS`, or as in `section_ends`.
+        FitError: there are fewer than `MIN_MARKERS`, or the last is off the tip's plate.
     """
     if poses.marker_m.shape[1] < MIN_MARKERS:
         raise FitError(f"markers: got {poses.marker_m.shape[1]}, expected {MIN_MARKERS} or more")
-    section_ends(poses, spec)
     seen = np.flatnonzero(np.isfinite(poses.marker_m).all(axis=(1, 2)))
     site_m = _marker_site(poses.take(seen))
     bending_deg = np.degrees(np.arccos(np.clip(poses.tip_rotation[seen, 2, 2], -1.0, 1.0)))

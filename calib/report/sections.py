@@ -86,7 +86,7 @@ def chambers(fit: ChamberFit) -> Section:
         f"{fit.poses.n} poses at rest: simulated at the measured pressures against the measured tip and "
         "springs. Rest lengths are relative to the section's. Intervals are 95 %. "
         f"Rows of the logs: {row_uses}.",
-        (Table(head, tuple(rows)), backbone, mounting, *_unknown(fit), errors),
+        (Table(head, tuple(rows)), backbone, mounting, errors),
         fit.warnings,
         _plain(fit, "spec", "poses", "is_held_out", "tip_error_mm", "chamber_m")
         | {"values": values | {BENDING: bending} | dataclasses.asdict(spec.mounting)},
@@ -107,12 +107,6 @@ def _mounting(fit: ChamberFit) -> Table:
             for label, value, width in zip(labels, values, fit.half_width_95[name], strict=True)
         ]
     return Table(("", "value", "+-"), tuple(rows))
-
-
-def _unknown(fit: ChamberFit) -> tuple[Table, ...]:
-    """Return the table of the unknown directions, if there are any, and what each is worth to the tip."""
-    rows = tuple(zip(fit.weak, map(float, fit.weak_tip_mm), strict=True))
-    return (Table(("unknown direction", "tip, at most [mm]"), rows),) if rows else ()
 
 
 def with_markers(section: Section, limits: MarkerLimits) -> Section:

@@ -147,7 +147,7 @@ def start_keys(n_arms: int) -> Array:
 def nominal(env: ReachEnv) -> ReachEnv:
     """Return the environment without randomisation."""
     config = dataclasses.replace(env.config, randomisation=Randomisation())
-    return env if config == env.config else type(env)(env.spec, config, env.s2r)
+    return env if config == env.config else ReachEnv(env.spec, config, env.s2r)
 
 
 def towards(env: ReachEnv, state: State, goal: Array) -> State:

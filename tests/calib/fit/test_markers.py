@@ -93,13 +93,18 @@ def test_every_third_of_nine_markers_is_at_a_section_s_end(arm):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda m: m[:, :4], "got 4, expected 5 or more"),
         (lambda m: m[:, :8], "got 8, expected as many in each of 3 sections"),
         (lambda m: m + np.nan, "got no pose at rest that has them"),
         (lambda m: m + [0.0, 0.0, 0.3], "mm above the tip's plate, expected it in the"),
     ],
 )
-def test_refuses(arm, change, message):
-    poses, length_m = poses_with_markers(arm, "chamber")
+def test_refuses_markers_that_are_not_at_the_sections_ends(arm, change, message):
+    poses, _ = poses_with_markers(arm, "chamber")
     with pytest.raises(ValueError, match=message):
-        marker_limits(poses._replace(marker_m=change(poses.marker_m)), length_m, SPEC)
+        section_ends(poses._replace(marker_m=change(poses.marker_m)), SPEC)
+
+
+def test_refuses_too_few_markers_for_curves(arm):
+    poses, length_m = poses_with_markers(arm, "chamber")
+    with pytest.raises(ValueError, match="got 4, expected 5 or more"):
+        marker_limits(poses._replace(marker_m=poses.marker_m[:, :4]), length_m, SPEC)
