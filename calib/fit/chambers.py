@@ -3,7 +3,8 @@
 The simulated arm settles at the logged pressures; its chambers are changed until tip poses agree, and spring
 lengths and markers at the sections' ends where they were measured. Robust least squares
 (`calib.fit.leastsquares`) take the Jacobian from the implicit function theorem, see `calib.fit.equilibrium`.
-Straight arms, if there are enough of them, have errors of their own scale: the model fits them better.
+Straight arms, if there are enough of them, have errors of their own scale: the model fits them better. A fit
+without some of the poses is judged by these; from there the last fit takes all.
 
 Masses are known and set the scale of all forces. The bending stiffness of the backbone is fitted too, as area
 and stiffness would otherwise absorb its error. Its axial stiffness and that of the springs cannot be fitted:
@@ -22,7 +23,7 @@ import numpy as np
 from calib.errors import FitError
 from calib.fit.blocks import held_out_blocks
 from calib.fit.equilibrium import N_KINDS, error_groups, simulate, tip_changes
-from calib.fit.leastsquares import NOT_CONVERGED, Problem, Solution, fit, principal
+from calib.fit.leastsquares import NOT_CONVERGED, Problem, Solution, fit, principal, refine
 from calib.fit.markers import section_ends
 from calib.fit.parameters import half_widths, names, priors, spec_at, tolerances
 from calib.read.static_poses import StaticPoses, find_static_poses
@@ -68,15 +69,16 @@ class ChamberFit:
         weak: unknown directions, whose width is above 1, in words.
         weak_tip_mm: how far each of these moves the simulated tip within its interval, at the pressures and
             with the payload where it does so the most (`calib.fit.equilibrium`).
-        in_sample, held_out: errors of the calibrated arm; held-out poses took no part in the fit.
+        in_sample, held_out: errors of a fit in which the held-out poses took no part; `spec` is that to all
+            poses, from there.
         in_sample_before, held_out_before: errors of the specification that the fit started from.
         scale: robust errors of arms that bend and of straight ones (2, 3): tip [m], rotation [rad] and
             springs [m], then (2, 4) markers [m] if there are any; a guess if too few arms are straight.
         rows: number of rows of the logs, by use.
         n_single: number of poses of one row, which cannot show whether the tip moved.
         poses: static poses of the logs, in their order.
-        is_held_out: mask (n,) of the poses that took no part.
-        tip_error_mm: tip error (n,) of the calibrated arm at each pose; NaN where it did not settle.
+        is_held_out: mask (n,) of the poses that judge.
+        tip_error_mm: tip error (n,) of the fit without the held-out poses; NaN where it did not settle.
         chamber_m: chamber lengths (n, n_chambers) of the calibrated arm at each pose.
         warnings: reasons not to trust the fit, each with its remedy; none is good.
     """
@@ -144,15 +146,11 @@ def calibrate_chambers(logs: Log | Sequence[Log], spec: ArmSpec, seed: int = 0) 
     held = np.ptp(poses.pressure_kpa, axis=0) < HOLD_KPA  # their noise would pass for changes
     poses = poses._replace(pressure_kpa=np.where(held, poses.pressure_kpa.mean(axis=0), poses.pressure_kpa))
     held_out = held_out_blocks(poses.n, HELD_OUT_SHARE, HELD_OUT_BLOCK, seed)
-    fitted = poses.take(~held_out)
     end_m, complaints = _section_ends(poses, spec)
-    group = error_groups(spec, fitted.pressure_kpa)
-    if np.count_nonzero(group[:, 0] >= N_KINDS) < MIN_STRAIGHT:
-        group %= N_KINDS
-    problem = Problem(priors(spec), group, np.tile(SCALE, 2), np.tile(MIN_SCALE, 2))
-    solution = fit(lambda x: simulate(spec, fitted, end_m[~held_out], x)[:2], problem)
+    judged, solution = _solutions(spec, poses, end_m, held_out)
     before, _, _ = simulate(spec, poses, end_m, np.zeros_like(solution.x))
-    after, _, chamber_m = simulate(spec, poses, end_m, solution.x)
+    after, _, _ = simulate(spec, poses, end_m, judged.x)
+    _, _, chamber_m = simulate(spec, poses, end_m, solution.x)
     calibrated = _calibrated(spec, solution.x, poses)
     bent, straight = solution.scale.reshape(2, -1)
     widths, directions = principal(solution, tolerances(spec))
@@ -181,6 +179,20 @@ def calibrate_chambers(logs: Log | Sequence[Log], spec: ArmSpec, seed: int = 0) 
         warnings=(),
     )
     return dataclasses.replace(found, warnings=complaints + _warnings(found, spec, solution))
+
+
+def _solutions(
+    spec: ArmSpec, poses: StaticPoses, end_m: np.ndarray, held_out: np.ndarray
+) -> tuple[Solution, Solution]:
+    """Return the fit without the held-out poses, by which these judge, and from there that to all poses."""
+    group = error_groups(spec, poses.pressure_kpa)
+    if np.count_nonzero(group[~held_out, 0] >= N_KINDS) < MIN_STRAIGHT:
+        group %= N_KINDS
+    all_of_them = Problem(priors(spec), group, np.tile(SCALE, 2), np.tile(MIN_SCALE, 2))
+    part = dataclasses.replace(all_of_them, group=group[~held_out])
+    some, some_end_m = poses.take(~held_out), end_m[~held_out]
+    judged = fit(lambda x: simulate(spec, some, some_end_m, x)[:2], part)
+    return judged, refine(lambda x: simulate(spec, poses, end_m, x)[:2], judged.x, all_of_them)
 
 
 def _section_ends(poses: StaticPoses, spec: ArmSpec) -> tuple[np.ndarray, tuple[str, ...]]:

@@ -85,15 +85,21 @@ def fit(model: Model, problem: Problem) -> Solution:
     for loss in ROUNDS:
         x = least_squares(errors, x, loss=loss, **options, **TOLERANCES).x
         scale = _scales(evaluate(x.tobytes())[0], problem)
-    solution = solution_at(x, *evaluate(x.tobytes()), problem)
+    return refine(lambda x: evaluate(x.tobytes()), x, problem)
+
+
+def refine(model: Model, x: np.ndarray, problem: Problem) -> Solution:
+    """Take Newton steps to the minimum from an x (p,) that is close to it, as that of a part of the rows."""
+    found = model(x)
+    solution = solution_at(x, *found, problem)
     for _ in range(NEWTON_STEPS):
         if solution.converged:
             break
         x, scale = solution.x + solution.newton_step, solution.scale
-        before, after = (_loss(*evaluate(at.tobytes()), at, scale, problem) for at in (solution.x, x))
-        if not after < before:
+        before, found = _loss(*found, solution.x, scale, problem), model(x)
+        if not _loss(*found, x, scale, problem) < before:
             break
-        solution = solution_at(x, *evaluate(x.tobytes()), problem)
+        solution = solution_at(x, *found, problem)
     return solution
 
 

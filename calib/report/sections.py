@@ -85,6 +85,7 @@ def chambers(fit: ChamberFit) -> Section:
         "Chambers",
         f"{fit.poses.n} poses at rest: simulated at the measured pressures against the measured tip and "
         "springs. Rest lengths are relative to the section's. Intervals are 95 %. "
+        "The fit is to all poses, the errors are those of a fit without the held-out ones. "
         f"Rows of the logs: {row_uses}.",
         (Table(head, tuple(rows)), backbone, mounting, errors),
         fit.warnings,

@@ -3,7 +3,7 @@
 import numpy as np
 
 from calib.fit import leastsquares
-from calib.fit.leastsquares import Problem, fit
+from calib.fit.leastsquares import Problem, fit, refine
 
 TRUE = np.array([0.3, -0.2, 0.1])
 PROBLEM = Problem(
@@ -23,6 +23,24 @@ def test_steps_that_damping_alone_has_made_small_are_no_end():
     solution = fit(lambda x: (SLOPE @ (x - TRUE), -SLOPE), PROBLEM)
     np.testing.assert_array_equal(solution.x, 0.0)
     assert not solution.converged
+
+
+def test_a_fit_to_a_part_of_the_rows_goes_on_to_all():
+    """The last rows have other errors, so the minimum moves; the intervals become those of all rows."""
+    rng = np.random.default_rng(1)
+    slope = rng.normal(size=(400, 2, 3))
+    error = 0.02 * rng.normal(size=(400, 2)) + np.where(np.arange(400) < 200, 0.01, -0.01)[:, None]
+
+    def model(x, rows=slice(None)):
+        return (slope @ (x - TRUE) + error)[rows], slope[rows]
+
+    part, whole = fit(lambda x: model(x, slice(200)), PROBLEM), fit(model, PROBLEM)
+    after = refine(model, part.x, PROBLEM)
+    assert after.converged
+    assert np.abs(part.x - whole.x).max() > 0.5 * whole.half_width.min()
+    np.testing.assert_allclose(after.x, whole.x, atol=0.1 * whole.half_width.min())
+    np.testing.assert_allclose(after.half_width, whole.half_width, rtol=0.02)
+    np.testing.assert_allclose(after.half_width, part.half_width / np.sqrt(2), rtol=0.15)
 
 
 def test_newton_steps_end_a_fit_whose_scales_still_changed(monkeypatch):
