@@ -181,7 +181,8 @@ class ImitationConfig(TrainConfig):
     frozen: bool = False
     """keep the discriminator of another run as it is; only the poses of the demonstrations are used"""
     expert_share: float = 0.25
-    """share of the critics' batches that is the expert's while the discriminator learns"""
+    """share of the critics' batches that is the expert's while the discriminator learns; in motion, share of
+    the arms' actions"""
     stages: Annotated[tuple[Stage, ...], _STAGES_OPTION] = (Stage(),)
     """stages in order: share of the env steps (all add up to 1), every n-th pose is a goal, share of the
     replay that is kept as the stage begins"""
@@ -212,8 +213,6 @@ class ImitationConfig(TrainConfig):
         if self.polish_updates or self.learner != "tqc":
             got = f"{self.learner!r}, {self.polish_updates}"
             raise ConfigError(f"learner, polish_updates: got {got}, expected 'tqc', 0 for demonstrations")
-        if self.env.mode != "quasistatic":
-            raise ConfigError(f"env.mode: got {self.env.mode!r}, expected 'quasistatic' for demonstrations")
 
     @property
     def stage_epochs(self) -> tuple[int, ...]:

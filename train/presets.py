@@ -131,6 +131,13 @@ IMITATION_PRESETS: dict[str, ImitationConfig] = {
         stages=(Stage(share=1 / 3, every=2), Stage(share=2 / 3, kept=0.2)),
     ),
     "pipe": _PIPE,
+    # Half-second actions in motion. Payloads as they are carried, since the springs tell them.
+    "pipe-moving": dataclasses.replace(
+        _PIPE,
+        env=dataclasses.replace(
+            _MOVING, randomisation=dataclasses.replace(_MOVING.randomisation, payload_max_kg=0.25)
+        ),
+    ),
     "hand-made": _HAND_MADE,
     "frozen": dataclasses.replace(_HAND_MADE, learned_weight=5.0, frozen=True),
 }

@@ -41,7 +41,8 @@ def trials(experiment: str, settings: Settings) -> list[Trial]:
 
     In open space, gradient descent has no training seed, so it runs once for each twin and load. In confined
     spaces the policy without gradient penalty is judged by its training alone, and the circle without
-    demonstrations is a trial of the open-space experiment.
+    demonstrations is a trial of the open-space experiment. In motion both are tried, the policy learned at
+    rest and that learned in motion, and the latter is judged.
     """
     found = []
     if experiment == "open":
@@ -53,10 +54,11 @@ def trials(experiment: str, settings: Settings) -> list[Trial]:
             found += [Trial("gradient", twin, settings.seeds[0], load_g=load_g) for load_g in loads_g]
         return found
     for kind, twin, seed in trainings(settings):
-        if kind != "no-penalty":
+        if kind not in ("no-penalty", "moving"):
             found.append(Trial(kind, twin, seed, "as shown"))
         if kind == "pipe":
             found.append(Trial(kind, twin, seed, "exchanged"))
+        if kind in ("pipe", "moving"):
             found.append(Trial(kind, twin, seed, "as shown", moves=True))
     return found + [Trial("with", twin, seed) for twin in settings.twins for seed in settings.seeds]
 

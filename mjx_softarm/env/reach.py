@@ -14,20 +14,20 @@ from jax import Array
 from mjx_softarm import control
 from mjx_softarm._support import draws
 from mjx_softarm._support.mjx import Env, State, mjx
+from mjx_softarm.env.clearance import Walls
 from mjx_softarm.env.config import EnvConfig
-from mjx_softarm.env.state import ArmState, EpisodeNoise, motion_params
+from mjx_softarm.env.state import ArmState, EpisodeNoise, at_rest, motion_params
 from mjx_softarm.mdp import observation as obs
 from mjx_softarm.mdp import rewards
 from mjx_softarm.mdp.actions import ActionMap
 from mjx_softarm.mechanics.dynamics import Motion, MotionResult, Moved, MovingArm, advance
 from mjx_softarm.mechanics.kinematics import chain_kinematics, mjx_kinematics
 from mjx_softarm.mechanics.mjcf import build_model
-from mjx_softarm.mechanics.pipe import CrossPipe, body_clearance
 from mjx_softarm.mechanics.settle import Settled, SettleResult, settle
 from mjx_softarm.mechanics.statics import PAYLOAD, ArmParams
 from mjx_softarm.mechanics.workspace import Pool, sample_evenly, sample_workspace
 from mjx_softarm.sensing.pose import pose_from_frame
-from mjx_softarm.sensing.s2r import S2R, carry_body, correct
+from mjx_softarm.sensing.s2r import S2R, correct
 from mjx_softarm.spec import ArmSpec
 
 
@@ -55,7 +55,8 @@ class ReachEnv(Env):
         valid () bool            the simulation succeeded; learn from no other step
         saturated () bool        a chamber is at a pressure limit with its spring off its reference
         blocked (n_chambers,)    which chambers are
-        clearance_mm ()          distance of the body to the pipe's wall; infinite without a pipe
+        clearance_mm ()          distance of the body to the pipe's wall, in motion the least in the control
+                                 periods of the action; infinite without a pipe
         path_mm (n_ticks, 3)     in motion: position of the tip at the start of each control period
 
     Metrics, each () float32:
@@ -85,8 +86,7 @@ class ReachEnv(Env):
         self.gains = control.Gains.from_spec(self.spec)
         sensor, *limits = ActionMap.from_spec(self.spec)
         self.action_map = ActionMap(sensor, *(jnp.asarray(limit, jnp.float32) for limit in limits))
-        diameter_mm = self.config.pipe_diameter_mm
-        self.pipe = None if diameter_mm is None else CrossPipe.of_mm(diameter_mm)
+        self.walls = Walls(self.config.pipe_diameter_mm, self.spec, self.params, s2r)
         self.uses_mjx = self.config.engine == "mjx" or self.config.moves
         self.model = mjx.put_model(build_model(self.spec)) if self.uses_mjx else None
         self._results = MotionResult if self.config.moves else SettleResult
@@ -159,15 +159,12 @@ class ReachEnv(Env):
             * (1.0 + spread.stiffness_spread * (2.0 * share[3:] - 1.0)),
             sensor_offset_m=1e-3 * spread.sensor_noise_mm * noise.normal,
             moving=motion_params(spread, noise.moving),
-            motion=Motion.at_rest(start.q, start.pressure_kpa, start.spring_m),
-            pose=start.pose,
-            spring_m=start.spring_m,
-            pressure_kpa=start.pressure_kpa,
+            **at_rest(start),
             sensed=None,
             goal=goal,
             n_steps=jnp.zeros((), jnp.int32),
         )
-        arm = arm._replace(sensed=self._sensed(arm, arm, self.action_of(arm.spring_m + arm.sensor_offset_m)))
+        arm = self.put(arm, start)
         zero = jnp.zeros(())
         names = ("tip_error_mm", "reached", "saturated_chambers", "unsettled", *self._failures)
         metrics = dict.fromkeys(names, zero)
@@ -177,11 +174,16 @@ class ReachEnv(Env):
             "saturated": jnp.array(False),
             "blocked": jnp.zeros(self.action_size, bool),
             "valid": jnp.array(True),
-            "clearance_mm": self._clearance_mm(start.q, start.pose),
+            "clearance_mm": self.walls.clearance_mm(start.q, start.pose),
         }
         if self.config.moves:
             info["path_mm"] = jnp.zeros((self.n_ticks, 3))
         return State(arm, self.observe(arm.pose, goal, arm.sensed), zero, zero, metrics, info)
+
+    def put(self, arm: ArmState, rest: Pool) -> ArmState:
+        """Return an arm at rest at an equilibrium, a row of a pool."""
+        arm = arm._replace(**at_rest(rest))
+        return arm._replace(sensed=self._sensed(arm, arm, self.action_of(arm.spring_m + arm.sensor_offset_m)))
 
     def step(self, state: State, action: Array) -> State:
         """Move to the references of `action` (n_chambers,) in [-1, 1]; `done` is 1 where the goal is reached.
@@ -208,10 +210,11 @@ class ReachEnv(Env):
         reading = arm.spring_m + arm.sensor_offset_m
         held_kpa = arm.motion.law.integral_kpa  # pressures of a rest; in motion a limit may pass
         saturated = control.saturated(held_kpa, reference, reading, self.gains, tolerance) & valid
-        blocked, clearance_mm = jnp.any(saturated), self._clearance_mm(arm.motion.q, arm.pose)
+        blocked, way = jnp.any(saturated), self._way(arm, end, valid)
+        cost = self.clearance_cost(way["clearance_mm"])
         terms: dict[str, Array]
         value, reached, terms = rewards.reward(
-            arm.pose, arm.goal, arm.n_steps, blocked, self.config.reward, self.clearance_cost(clearance_mm)
+            arm.pose, arm.goal, arm.n_steps, blocked, self.config.reward, cost
         )
         metrics = {
             "tip_error_mm": jnp.linalg.norm(arm.pose[:3] - arm.goal[:3]),
@@ -226,8 +229,7 @@ class ReachEnv(Env):
             "saturated": blocked,
             "blocked": saturated,
             "valid": valid,
-            "clearance_mm": clearance_mm,
-            **self._path_mm(end),
+            **way,
         }
         return state.replace(
             pipeline_state=arm,
@@ -249,27 +251,20 @@ class ReachEnv(Env):
         end = settle(kinematics, params, reference_m)
         return Motion.at_rest(end.q, end.pressure_kpa, end.spring_m), end
 
-    def _path_mm(self, end: Settled | Moved) -> dict[str, Array]:
-        """Return `info["path_mm"]` of an arm that moved."""
+    def _way(self, arm: ArmState, end: Settled | Moved, valid: Array) -> dict[str, Array]:
+        """Return the clearance of `info` after an action, and the path of an arm that moved."""
+        clearance_mm = self.walls.clearance_mm(arm.motion.q, arm.pose)
         if not isinstance(end, Moved):
-            return {}
-        frames = pose_from_frame(end.path.tip_position_m, end.path.tip_rotation)
-        return {"path_mm": self._observed_pose(frames, end.path.spring_m)[:, :3]}
+            return {"clearance_mm": clearance_mm}
+        tips = pose_from_frame(end.path.tip_position_m, end.path.tip_rotation)
+        pose = self._observed_pose(tips, end.path.spring_m)  # (n_ticks, 6)
+        least_mm = jnp.minimum(clearance_mm, self.walls.least_mm(end.path, pose))
+        return {"path_mm": pose[:, :3], "clearance_mm": jnp.where(valid, least_mm, clearance_mm)}
 
     def clearance_cost(self, clearance_mm: Array) -> Array:
         """Return the cost (...) of clearances (...) [mm] of the body to the pipe's wall."""
         within_mm = jnp.maximum(self.config.clearance_margin_mm - clearance_mm, 0.0)
         return self.config.clearance_cost_per_mm * within_mm
-
-    def _clearance_mm(self, q: Array, pose: Array) -> Array:
-        """Return the distance () of the body, whose tip has this pose, to the pipe's wall."""
-        if self.pipe is None:
-            return jnp.asarray(jnp.inf, q.dtype)
-        frames = chain_kinematics(self.params)(q)
-        plates = frames.plate_position, frames.plate_rotation
-        if self.s2r is not None:
-            plates = carry_body(*plates, pose)
-        return 1e3 * body_clearance(self.pipe, *plates, self.spec)
 
     def observe(self, pose: Array, goal: Array, sensed: Array | None = None) -> Array:
         """Return the observation (..., O) of pose and goal (..., 6) [mm, deg], and of `ArmState.sensed`."""

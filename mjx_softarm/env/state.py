@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +10,7 @@ from jax import Array
 
 from mjx_softarm.env.config import Randomisation
 from mjx_softarm.mechanics.dynamics import Motion, MotionParams
+from mjx_softarm.mechanics.workspace import Pool
 from mjx_softarm.pneumatics import VALVE_S
 from mjx_softarm.sensing.sensors import SENSORS
 
@@ -39,6 +40,16 @@ class ArmState(NamedTuple):
     sensed: Array | None  # (k,) `observe_motion`; None where pose and goal are all that is observed
     goal: Array  # (6,) [mm, deg]
     n_steps: Array  # () actions taken in this episode
+
+
+def at_rest(rest: Pool) -> dict[str, Any]:
+    """Return the fields of `ArmState` that tell where an arm at rest at a row of a pool is."""
+    return {
+        "motion": Motion.at_rest(rest.q, rest.pressure_kpa, rest.spring_m),
+        "pose": rest.pose,
+        "spring_m": rest.spring_m,
+        "pressure_kpa": rest.pressure_kpa,
+    }
 
 
 def motion_params(spread: Randomisation, share: Array | None) -> MotionParams:

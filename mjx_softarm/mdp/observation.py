@@ -21,6 +21,7 @@ from mjx_softarm.spec import ArmSpec
 _AXES = ("x_mm", "y_mm", "z_mm", "yaw_deg", "pitch_deg", "roll_deg")
 OBS_LAYOUT = tuple(f"{part}_{axis}" for part in ("pose", "goal", "error") for axis in _AXES)
 OBS_SIZE = len(OBS_LAYOUT)
+GOAL = slice(6, 12)  # of the observation
 RATE_S = 0.1  # time over which lengths and positions give rates
 SPRING_M_PER_S, TIP_MM_PER_S = 0.1, 300.0  # speeds that are scaled to 1
 

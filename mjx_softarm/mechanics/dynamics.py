@@ -70,8 +70,16 @@ class Path(NamedTuple):
     """Observables of an arm at the start of each of t control periods."""
 
     spring_m: Array  # (t, n_chambers) spring lengths
-    tip_position_m: Array  # (t, 3)
-    tip_rotation: Array  # (t, 3, 3)
+    plate_position_m: Array  # (t, L + 1, 3), as in `kinematics.Frames`
+    plate_rotation: Array  # (t, L + 1, 3, 3)
+
+    @property
+    def tip_position_m(self) -> Array:
+        return self.plate_position_m[..., -1, :]
+
+    @property
+    def tip_rotation(self) -> Array:
+        return self.plate_rotation[..., -1, :, :]
 
 
 class Moved(NamedTuple):
@@ -169,7 +177,7 @@ def advance(
 
     def tick(motion: Motion, _):
         now = _at(arm, motion.q)
-        told = Path(now.spring_m, now.frames.plate_position[-1], now.frames.plate_rotation[-1])
+        told = Path(now.spring_m, now.frames.plate_position, now.frames.plate_rotation)
         command, law = control.pressures(reference_m, now.spring_m, motion.law, gains, period_s)
         motion = motion._replace(law=law)
         for k in range(n_steps):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mjx_softarm.env import ReachEnv
+from mjx_softarm.env import EnvConfig, ReachEnv
 from tests.train.small import CONFIG, SETTINGS, SHORT
 from train.agent.gail import GailConfig
 from train.agent.hindsight import HindsightConfig
@@ -30,6 +30,15 @@ def imitation_config():
 @pytest.fixture(scope="session")
 def short_env(imitation_config):
     return ReachEnv(SHORT, imitation_config.env)
+
+
+@pytest.fixture(scope="session")
+def moving_env():
+    """The same arm in motion, two control periods an action."""
+    motion = EnvConfig(
+        mode="dynamic", observation="motion", goal_ends=False, dynamic_step_s=0.04, n_poses=256
+    )
+    return ReachEnv(SHORT, motion)
 
 
 @pytest.fixture(scope="session")

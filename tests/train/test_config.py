@@ -79,7 +79,6 @@ def test_each_stages_end_is_evaluated(imitation_config):
         ("learned_weight=0", "expected some reward"),
         ("learned_weight=-1", "expected numbers >= 0"),
         ("rebalance_env_steps=-1", "rebalance_env_steps: got -1"),
-        ("env.mode=dynamic", "expected 'quasistatic'"),
     ],
 )
 def test_a_bad_setting_of_imitation_is_named(imitation_config, assignment, message):

@@ -5,6 +5,10 @@ expert's answer to its goal from any start, and the expert is put where the agen
 compares two actions for one observation, and nothing but the action can tell them apart. The expert's answers
 also take a share of each batch of the critics, with the learned reward like all others.
 
+An arm in motion is still on its way when the next action comes. There the expert acts itself: a share of the
+arms' actions are the expert's answers to their goals, and the critics see what these led to. Where the expert
+acted, the discriminator compares it with what the agent would do there now.
+
 The learned reward is for goals that were asked for, not for those of hindsight, which the discriminator does
 not know. Episodes end with the goal reached or by the clock, so a reward that is never positive rewards no
 delay.
@@ -20,8 +24,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from mjx_softarm._support import draws
 from mjx_softarm.env import ReachEnv
-from mjx_softarm.mdp import rewards
+from mjx_softarm.mdp import observation, rewards
 from train.agent.gail import DiscriminatorState, Gail
 from train.agent.hindsight_tqc import HindsightTQC
 from train.agent.learner import Experience, Sample, check_same_shapes
@@ -52,8 +57,9 @@ class Imitation:
         self.positions = jnp.asarray(demonstrations.positions)  # (m, 6) [mm, deg]
         self.actions = jnp.asarray(demonstrations.actions)  # (m, A)
         self.gail = Gail(env.observation_size, env.action_size, config.gail)
-        expert_share = config.expert_share if config.learned_weight and not config.frozen else 0.0
-        self.n_expert = round(expert_share * config.batch_size)  # rows of a batch
+        self.expert_share = config.expert_share if config.learned_weight and not config.frozen else 0.0
+        at_rest = not env.config.moves
+        self.n_expert = round(at_rest * self.expert_share * config.batch_size)  # rows of a batch
 
     def init(self, key: Array) -> ImitationState:
         """Return fresh networks."""
@@ -62,8 +68,14 @@ class Imitation:
         return ImitationState(self.learner.init(key_agent), discriminator)
 
     def act(self, state: ImitationState, obs: Array, key: Array) -> Array:
-        """Return the wrapped learner's exploring actions."""
-        return self.learner.act(state.agent, obs, key)
+        """Return the wrapped learner's exploring actions; in motion, some are the expert's."""
+        action = self.learner.act(state.agent, obs, key)
+        if not self.env.config.moves:
+            return action
+        scale = self.env.scale
+        goal = obs[..., observation.GOAL] * scale.scale + scale.centre
+        by_expert = draws.uniform(jax.random.fold_in(key, 1), obs.shape[:-1]) < self.expert_share
+        return jnp.where(by_expert[..., None], self.actions[self._index_of(goal)], action)
 
     def policy(self, state: ImitationState) -> Any:
         """Return the wrapped learner's policy."""
@@ -80,16 +92,20 @@ class Imitation:
         key_sample, key_between, key_relabel, key_update = jax.random.split(key, 4)
         discriminator, metrics = state.discriminator, {}
 
-        # Batch: stored transitions, relabelled, the first rows exchanged for the expert's.
+        # Batch: stored transitions, relabelled, at rest the first rows exchanged for the expert's.
         stored = sample(key_sample)
         index = self._index_of(stored.goal)  # (B,)
-        batch = self.with_expert(self.learner.transitions(stored, key_relabel), stored, index)
+        batch = self.learner.transitions(stored, key_relabel)
+        if not self.env.config.moves:
+            batch = self.with_expert(batch, stored, index)
 
         # Discriminator: the expert's actions against the agent's, at the same observations.
-        start = self.env.observe(stored.pose, stored.goal)  # (B, O)
+        start = self.env.observe(stored.pose, stored.goal, stored.sensed)  # (B, O)
         if discriminator is not None and not self.config.frozen:
-            expert, agent = (start, self.actions[index]), (start, stored.action)
-            discriminator, metrics = self.gail.update(discriminator, expert, agent, key_between)
+            expert = self.actions[index]  # (B, A)
+            agent = self.of_agent(state, stored, start, expert, key_between)
+            pairs = (start, expert), (start, agent)
+            discriminator, metrics = self.gail.update(discriminator, *pairs, key_between)
 
         # Agent: the batch with rewards of the updated discriminator.
         reward, of_reward = self.rewards(batch, stored, start, discriminator)
@@ -136,6 +152,24 @@ class Imitation:
         mean = jnp.sum(learned) / jnp.maximum(jnp.sum(asked), 1)
         return reward + self.config.learned_weight * learned, {"reward": mean}
 
+    def of_agent(
+        self, state: ImitationState, stored: Experience, start: Array, expert: Array, key: Array
+    ) -> Array:
+        """Return the actions (B, A) of B transitions, the agent's present ones where the expert acted.
+
+        Args:
+            state: of this learner.
+            stored: B transitions.
+            start (B, O): their observations.
+            expert (B, A): the expert's answers to their goals.
+            key: draws the agent's present actions.
+        """
+        if not self.env.config.moves:
+            return stored.action
+        of_expert = jnp.all(stored.action == expert, axis=-1)  # (B,)
+        own = self.learner.act(state.agent, start, jax.random.fold_in(key, 1))  # (B, A)
+        return jnp.where(of_expert[:, None], own, stored.action)
+
     def with_expert(self, batch: Transition, stored: Experience, index: Array) -> Transition:
         """Return a batch whose first rows are the expert's answers, from the same starts to the same goals.
 
@@ -156,5 +190,5 @@ class Imitation:
         return jax.tree.map(lambda e, b: jnp.concatenate([e, b[n:]]), expert, batch)
 
     def _index_of(self, goal: Array) -> Array:
-        """Return the indices (B,) of the demonstrated positions that are the goals (B, 6)."""
-        return jnp.argmin(jnp.sum((goal[:, None] - self.positions) ** 2, axis=-1), axis=-1)
+        """Return the indices (...) of the demonstrated positions that are the goals (..., 6)."""
+        return jnp.argmin(jnp.sum((goal[..., None, :] - self.positions) ** 2, axis=-1), axis=-1)

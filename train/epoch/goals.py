@@ -2,10 +2,14 @@
 
 An episode goes from one position to another. Starts are all of them; goals of the first stage are some of
 them, those of later stages more. Between epochs, goals shift to the positions with the largest errors.
+
+An arm in motion needs more than a pose to begin with: it starts at rest under a demonstrated action. Half of
+the episodes start at the position that was shown before their goal, as the arm will go.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 import jax
@@ -13,20 +17,26 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from mjx_softarm._support import draws, xla
 from mjx_softarm._support.mjx import State
-from mjx_softarm.env import ReachEnv
-from train.config import ImitationConfig
+from mjx_softarm.env import Randomisation, ReachEnv
+from mjx_softarm.mechanics.workspace import Pool
+from train.config import ConfigError, ImitationConfig
+from train.demos.demonstrations import Demonstrations
 from train.epoch.job import Job, TrainState
 
 EVEN_SHARE = 0.5  # of the goals that are drawn evenly, however well they are reached
+NEXT_SHARE = 0.5  # of the episodes in motion that start at the position shown before their goal
 
 
 class DemonstratedGoals:
     """`Goals` among m demonstrated positions; the state is their weights (m,), relative to each other."""
 
-    def __init__(self, config: ImitationConfig, env: ReachEnv, positions: np.ndarray):
+    def __init__(self, config: ImitationConfig, env: ReachEnv, demonstrations: Demonstrations):
         self.config, self.env = config, env
-        self.positions = jnp.asarray(positions)  # (m, 6) [mm, deg]
+        self.positions = jnp.asarray(demonstrations.positions)  # (m, 6) [mm, deg]
+        self.before = jnp.asarray(shown_before(demonstrations.sequence))  # (m,)
+        self.rests = rests(env, demonstrations.actions) if env.config.moves else None
 
     def init(self) -> Array:
         """Return the weights of the first stage."""
@@ -36,10 +46,17 @@ class DemonstratedGoals:
         """Return n arms; a new episode begins at one demonstrated position, with another for its goal."""
         key_start, key_goal = jax.random.split(key)
         arm, n = arms.pipeline_state, len(arms.obs)
-        start = self.positions[jax.random.randint(key_start, (n,), 0, len(self.positions))]  # (n, 6)
-        goal = self.positions[jax.random.categorical(key_goal, jnp.log(state), shape=(n,))]  # (n, 6)
-        new = (arm.n_steps == 0)[:, None]
-        arm = arm._replace(pose=jnp.where(new, start, arm.pose), goal=jnp.where(new, goal, arm.goal))
+        start = jax.random.randint(key_start, (n,), 0, len(self.positions))
+        goal = jax.random.categorical(key_goal, jnp.log(state), shape=(n,))
+        if self.rests is None:
+            fresh = arm._replace(pose=self.positions[start], goal=self.positions[goal])
+        else:
+            follows = draws.uniform(jax.random.fold_in(key_start, 1), (n,)) < NEXT_SHARE
+            start = jnp.where(follows, self.before[goal], start)
+            at_start = jax.tree.map(lambda x: x[start], self.rests)
+            fresh = jax.vmap(self.env.put)(arm, at_start)._replace(goal=self.positions[goal])
+        new = arm.n_steps == 0
+        arm = jax.tree.map(lambda x, y: jnp.where(new.reshape((-1,) + (1,) * (x.ndim - 1)), x, y), fresh, arm)
         return arms.replace(pipeline_state=arm, obs=self.env.observe(arm.pose, arm.goal, arm.sensed))
 
     def of_stage(self, epoch: int) -> np.ndarray:
@@ -62,6 +79,30 @@ class DemonstratedGoals:
     def rebalance(self, state: TrainState, epoch: int, error_mm: Sequence[float] | np.ndarray) -> TrainState:
         """Return the state with goals shifted to the positions (m,) with the largest errors [mm]."""
         return state._replace(goals=jnp.asarray(goal_weights(error_mm, self.of_stage(epoch))))
+
+
+def rests(env: ReachEnv, actions: np.ndarray) -> Pool:
+    """Return the rests of the nominal arm under actions (m, n_chambers) in [-1, 1].
+
+    Raises:
+        ConfigError: the arm does not come to rest under one of them.
+    """
+    config = dataclasses.replace(
+        env.config, mode="quasistatic", observation="pose", n_poses=1, randomisation=Randomisation()
+    )
+    still = ReachEnv(env.spec, config, env.s2r)
+    begin = still.reset(jax.random.PRNGKey(0))
+    after = xla.jit(jax.vmap(still.step, in_axes=(None, 0)), still.uses_mjx)(begin, jnp.asarray(actions))
+    if not after.info["valid"].all():
+        lost = ", ".join(map(str, np.flatnonzero(~after.info["valid"])))
+        raise ConfigError(f"demonstrations: got rows {lost}, at which the arm does not settle, expected none")
+    arm = after.pipeline_state
+    return Pool(arm.motion.q, arm.pressure_kpa, arm.spring_m, arm.pose)
+
+
+def shown_before(sequence: np.ndarray) -> np.ndarray:
+    """Return which position (m,) was shown before each; the first of a sequence stands for itself."""
+    return np.arange(len(sequence)) - (np.diff(sequence, prepend=-1) == 0)
 
 
 def goal_weights(error_mm: Sequence[float] | np.ndarray, goals: np.ndarray) -> np.ndarray:

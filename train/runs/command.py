@@ -24,7 +24,7 @@ from train.options import NewRunOptions, named_preset, start
 from train.presets import IMITATION_PRESETS, PRESETS
 from train.runs import run as runs
 from train.runs.checkpoint import Run, RunError, sole_trainer
-from train.runs.evaluate import N_ACTIONS, Evaluator, Summary
+from train.runs.evaluate import N_ACTIONS, Summary
 from train.runs.export import export_run
 from train.runs.task import Task, task_of
 
@@ -78,8 +78,9 @@ class Imitate(NewRunOptions):
     file: tyro.conf.Positional[cli.MaybePath] = None
     """demonstrations as `demos record` writes them"""
     preset: Annotated[str, cli.one_of(IMITATION_PRESETS)] = "pipe"
-    """settings to begin with. pipe: the learned reward; circle: both, in two stages; hand-made: the
-    environment's reward at the same goals; frozen: that and another run's learned reward, with --reward"""
+    """settings to begin with. pipe: the learned reward; pipe-moving: likewise, on arms in motion; circle:
+    both, in two stages; hand-made: the environment's reward at the same goals; frozen: that and another run's
+    learned reward, with --reward"""
     config: Annotated[ImitationConfig, tyro.conf.arg(name="")]
     agent: cli.MaybePath = None
     """run whose actor and critics this one begins with"""
@@ -129,12 +130,8 @@ def evaluate(run: tyro.conf.Positional[Path], in_motion: float | None = None) ->
     if in_motion is None:
         _show(opened, task, runs.finish(opened, task, policy), console)
         return 0
-    if isinstance(opened.config, ImitationConfig):
-        raise RunError(
-            f"--in-motion: got {run}, learned from demonstrations, expected a run of `train reach`"
-        )
     moving = dataclasses.replace(opened.config.env, mode="dynamic", dynamic_step_s=in_motion)
-    summary, *_ = Evaluator(ReachEnv(opened.spec, moving, opened.s2r), task.job.learner)(policy)
+    summary, *_ = task.evaluate.on(ReachEnv(opened.spec, moving, opened.s2r))(policy)
     title = f"{task.title}, {N_ACTIONS} actions of {in_motion:g} s each, in motion"
     _table(title, {"value": summary}, console)
     file = opened.path / f"evaluation-in-motion-{in_motion:g}s.json"

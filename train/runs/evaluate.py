@@ -38,7 +38,8 @@ class Reached(NamedTuple):
     saturated_chambers: Array  # (n,)
     settled: Array  # (n,) bool, after every action
     pressure_kpa: Array  # (n, n_chambers)
-    clearance_mm: Array  # (n,) of the body to the pipe's wall; infinite without a pipe
+    # (n,) of the body to the pipe's wall, in motion the least on the way; infinite without a pipe
+    clearance_mm: Array
     # In motion, else NaN:
     near_s: Array  # (n,) time until the tip is within NEAR_MM for good; infinite if never
     overshoot_mm: Array  # (n,) how far the tip went beyond the goal, along the way from its start
@@ -111,7 +112,7 @@ class Evaluator:
     """
 
     def __init__(self, env: ReachEnv, learner: Learner, n_goals: int = N_GOALS):
-        self.env, self.n_goals = nominal(env), n_goals
+        self.env, self.learner, self.n_goals = nominal(env), learner, n_goals
         self.circle = np.asarray(circle_poses(env.spec))
         one = functools.partial(follow, self.env, learner)
         self._follow = xla.jit(jax.vmap(one, in_axes=(None, 0, 0)), env.uses_mjx)
@@ -121,6 +122,10 @@ class Evaluator:
         """Both sets of held-out poses (2 n_goals, 6) [mm, deg], drawn on first use: an export needs none."""
         sets = (self.env.sample_pool(self.n_goals, HELD_OUT_SEED, evenly) for evenly in (False, True))
         return jnp.concatenate([poses.pose for poses in sets])
+
+    def on(self, env: ReachEnv) -> Evaluator:
+        """Return the same evaluation on another environment."""
+        return Evaluator(env, self.learner, self.n_goals)
 
     def __call__(self, policy: Any) -> tuple[Summary, Reached, Reached]:
         """Return figures, and the results on the first set and on the circle as NumPy arrays."""
@@ -161,22 +166,22 @@ def reach(env: ReachEnv, learner: Learner, policy: Any, state: State, goal: Arra
 
     def act(state: State, _):
         after = env.step(state, learner.mode(policy, state.obs))
-        return after, (after.info["valid"], after.info.get("path_mm", ()))
+        return after, {name: after.info.get(name, ()) for name in ("valid", "clearance_mm", "path_mm")}
 
-    state, (settled, path_mm) = jax.lax.scan(act, towards(env, state, goal), None, length=N_ACTIONS)
+    state, way = jax.lax.scan(act, towards(env, state, goal), None, length=N_ACTIONS)
     arm = state.pipeline_state
     near_s = overshoot_mm = jnp.asarray(jnp.nan)
     if env.config.moves:
-        way_mm = jnp.concatenate([path_mm.reshape(-1, 3), arm.pose[None, :3]])
+        way_mm = jnp.concatenate([way["path_mm"].reshape(-1, 3), arm.pose[None, :3]])
         near_s, overshoot_mm = way_figures(way_mm, goal[:3], 1.0 / env.spec.control.rate_hz)
     return state, Reached(
         goal=goal,
         pose=arm.pose,
         scaled_error=jnp.linalg.norm(rewards.scaled_error(arm.pose, goal, env.config.reward)),
         saturated_chambers=state.metrics["saturated_chambers"],
-        settled=jnp.all(settled),
+        settled=jnp.all(way["valid"]),
         pressure_kpa=arm.pressure_kpa,
-        clearance_mm=state.info["clearance_mm"],
+        clearance_mm=jnp.min(way["clearance_mm"]) if env.config.moves else state.info["clearance_mm"],
         near_s=near_s,
         overshoot_mm=overshoot_mm,
     )

@@ -1,4 +1,4 @@
-"""Evaluation of a policy on demonstrated positions, with the body inside the pipe."""
+"""Evaluation of a policy on demonstrated positions, with the body inside the pipe, in motion all the way."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class PositionSummary:
     y_mm: float
     z_mm: float
     saturated_positions: int
-    outside_positions: int  # with part of the body beyond the pipe's wall
+    outside_positions: int  # with part of the body beyond the pipe's wall, in motion on the way there
     unsettled: int
     error_mm: tuple[float, ...]  # tip error at each position
 
@@ -68,9 +68,13 @@ class PositionEvaluator:
     """
 
     def __init__(self, env: ReachEnv, learner: Learner, positions: np.ndarray, first: np.ndarray):
-        self.env, self.first = nominal(env), first
+        self.env, self.learner, self.first = nominal(env), learner, first
         self.positions = np.asarray(positions, np.float32)
         self._follow = xla.jit(functools.partial(follow, self.env, learner), env.uses_mjx)
+
+    def on(self, env: ReachEnv) -> PositionEvaluator:
+        """Return the same evaluation on another environment."""
+        return PositionEvaluator(env, self.learner, self.positions, self.first)
 
     def __call__(self, policy: Any) -> tuple[PositionSummary, AtPositions]:
         """Return figures, and results as NumPy arrays."""

@@ -7,7 +7,7 @@ epoch.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from jax.sharding import Mesh
 from matplotlib.figure import Figure
@@ -32,7 +32,7 @@ class Task(NamedTuple):
 
     job: Job | PolishedJob
     title: str  # of the table of figures
-    evaluate: Callable[[Any], tuple[Any, ...]]  # policy -> figures (`to_dict`), then results
+    evaluate: Evaluator | PositionEvaluator  # policy -> figures (`to_dict`), then results
     picture_names: tuple[str, ...]
     pictures: Callable[..., dict[str, Figure]]  # rows of metrics, results -> figures by name
     headline: Callable[[dict[str, float]], str]  # row of metrics with an evaluation -> a short text
@@ -93,7 +93,7 @@ def _imitation(
     learner: Learner | None,
 ) -> Task:
     learner = learner or Imitation(HindsightTQC(config, env), config, env, demonstrations)
-    goals = DemonstratedGoals(config, env, demonstrations.positions)
+    goals = DemonstratedGoals(config, env, demonstrations)
     job = Job(config, env, learner, goals, mesh)
     evaluate = PositionEvaluator(env, learner, demonstrations.positions, goals.of_stage(0))
 

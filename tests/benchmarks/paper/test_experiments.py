@@ -68,7 +68,7 @@ def test_both_experiments_or_one(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("experiment", "n_goals"), [("open", 13), ("confined", 10)])
+@pytest.mark.parametrize(("experiment", "n_goals"), [("open", 13), ("confined", 13)])
 def test_smoke(tmp_path, capsys, experiment, n_goals):
     assert main(["paper", "--smoke", "--only", experiment, "--out", str(tmp_path)]) == 0
     assert "goals" in json.loads((tmp_path / f"paper-{experiment}.json").read_text("utf-8"))["figures"]

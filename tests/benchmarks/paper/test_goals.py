@@ -22,7 +22,7 @@ KEPT = "circle: success at the first stage's points after stage two not lower th
 TRANSLATION = "with S2R, mean translation at most 1.5 mm"
 REACHED = "every point of every run is reached"
 EXCHANGED = pipe_trial(2, 1, "exchanged")
-FIRST, MOVED = pipe_trial(), pipe_trial(moves=True)
+FIRST, MOVED = pipe_trial(), pipe_trial(kind="moving", moves=True)
 
 
 def checks(experiment, changed=None):
@@ -88,7 +88,7 @@ def test_gradient_descent_without_saturation_misses_its_goal():
         ({FIRST: made_up("pipe", fails=(0,)), EXCHANGED: made_up("pipe", fails=(3,))}, [BOTH]),
         ({pipe_trial(t, kind="narrow"): made_up("narrow", fails=(2,)) for t in range(3)}, [TASKS]),
         ({EXCHANGED: made_up("pipe", pressed=0.02)}, [CALM]),
-        ({pipe_trial(t, moves=True): made_up("pipe", fails=(2,), tick_s=0.1) for t in range(2)}, [MOVING]),
+        ({MOVED._replace(twin=t): made_up("pipe", fails=(2,), tick_s=0.1) for t in range(2)}, [MOVING]),
         ({MOVED: made_up("pipe", tick_s=0.4)}, [TIME]),  # (8 * 0.1 + 0.4) / 9 = 0.13
         ({MOVED: made_up("pipe", pressed=0.02, tick_s=0.1)}, [CALM_MOVING]),
         ({pipe_trial(1, 1, kind="narrow"): made_up("narrow", pressed=0.02)}, [CALM_NARROW]),
@@ -101,7 +101,8 @@ def test_gradient_descent_without_saturation_misses_its_goal():
         ({MOVED: made_up("pipe", missed=[2], tick_s=0.1)}, [TIME, CALM_MOVING]),
         ({pipe_trial(kind="circle"): made_up("circle", (0.1, 0.1, 0.1), missed=[2])}, [CIRCLE]),
         ({Trial("with", 1, 1): made_up("with", (8.0, 0, 0), missed=[3])}, [CIRCLE]),
-        # Just met:
+        # Just met, or not judged:
+        ({pipe_trial(moves=True): made_up("pipe", fails=(0, 1), pressed=0.5, tick_s=9.0)}, []),
         ({FIRST: made_up("pipe", fails=(0,))}, []),  # 8 of 9
         ({pipe_trial(t, kind="narrow"): made_up("narrow", fails=(0, 1)) for t in (0, 1)}, []),  # 7 of 9
         ({EXCHANGED: made_up("pipe", pressed=0.01)}, []),

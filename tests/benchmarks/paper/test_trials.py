@@ -12,9 +12,9 @@ def test_three_twins_and_three_seeds():
     assert len(found) == len(set(found)) == 3 * 3 * (3 + 6) + 3 * 7
     assert sum(trial.kind == "gradient" for trial in found) == 3 * 7
     found = trials("confined", Settings())
-    assert len(found) == len(set(found)) == 9 * 6 + 9
+    assert len(found) == len(set(found)) == 9 * 7 + 9
     learned = trainings(Settings())
-    assert len(learned) == len(set(learned)) == 4 * 9 + 3
+    assert len(learned) == len(set(learned)) == 5 * 9 + 3
     assert sum(kind == "no-penalty" for kind, _, _ in learned) == 3
 
 

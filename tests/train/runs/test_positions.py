@@ -38,6 +38,19 @@ def test_positions_are_evaluated_with_body_and_pressures(short_env, perfect, sho
     assert (np.isinf(at.reached.clearance_mm) if pipe_mm is None else at.reached.clearance_mm < 0.0).all()
 
 
+def test_in_motion_the_body_has_to_be_inside_all_the_way(short_env, moving_env, perfect, shown):
+    """A policy that knows the answers, in actions of a second, in a pipe that the arm just fits."""
+    envs = [
+        ReachEnv(env.spec, dataclasses.replace(env.config, pipe_diameter_mm=300.0, dynamic_step_s=1.0))
+        for env in (short_env, moving_env)
+    ]
+    at_rest = PositionEvaluator(envs[0], perfect, shown.positions, np.arange(len(shown.positions)) < 1)
+    (_, rest), (figures, motion) = at_rest({}), at_rest.on(envs[1])({})
+    assert figures.median_mm < 2.0 and figures.unsettled == 0
+    less_mm = rest.reached.clearance_mm - motion.reached.clearance_mm
+    assert less_mm.min() > -2.0 and less_mm.max() > 10.0
+
+
 def test_success_at_the_first_stages_positions_is_told_apart():
     zero, poses = np.zeros(3), np.zeros((3, 6))
     reached = Reached(poses, poses, zero, zero, zero == 0, zero, np.array([5.0, -1, -1]), zero, zero)

@@ -1,0 +1,40 @@
+"""Clearance of the arm's body to the pipe around it: at an instant, and on the way of an action."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jax import Array
+
+from mjx_softarm.mechanics.dynamics import Path
+from mjx_softarm.mechanics.kinematics import chain_kinematics
+from mjx_softarm.mechanics.pipe import CrossPipe, body_clearance
+from mjx_softarm.mechanics.statics import ArmParams
+from mjx_softarm.sensing.s2r import S2R, carry_body
+from mjx_softarm.spec import ArmSpec
+
+
+class Walls:
+    """The pipe around an arm. Without one, distances to its wall are infinite."""
+
+    def __init__(self, diameter_mm: float | None, spec: ArmSpec, params: ArmParams, s2r: S2R | None):
+        self.pipe = None if diameter_mm is None else CrossPipe.of_mm(diameter_mm)
+        self.spec, self.params, self.s2r = spec, params, s2r
+
+    def clearance_mm(self, q: Array, pose: Array) -> Array:
+        """Return the distance () of the body at joint coordinates (nv,), whose tip has a pose (6,)."""
+        if self.pipe is None:
+            return jnp.asarray(jnp.inf, q.dtype)
+        frames = chain_kinematics(self.params)(q)
+        return self._of_plates(self.pipe, frames.plate_position, frames.plate_rotation, pose)
+
+    def least_mm(self, path: Path, pose: Array) -> Array:
+        """Return the least distance () on a path, its start left out, whose tips have poses (t, 6)."""
+        if self.pipe is None or len(pose) == 1:  # nothing between start and end
+            return jnp.asarray(jnp.inf, pose.dtype)
+        plates = path.plate_position_m[1:], path.plate_rotation[1:]
+        return jnp.min(self._of_plates(self.pipe, *plates, pose[1:]))
+
+    def _of_plates(self, pipe: CrossPipe, position_m: Array, rotation: Array, pose: Array) -> Array:
+        if self.s2r is not None:
+            position_m, rotation = carry_body(position_m, rotation, pose)
+        return 1e3 * body_clearance(pipe, position_m, rotation, self.spec)

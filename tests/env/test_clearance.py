@@ -1,0 +1,42 @@
+"""Clearance of the body on the way of an action in motion."""
+
+import dataclasses
+
+import jax
+import numpy as np
+
+from mjx_softarm import ArmSpec
+from mjx_softarm._support import xla
+from mjx_softarm.env import EnvConfig, ReachEnv
+from mjx_softarm.mechanics.kinematics import chain_frames
+from mjx_softarm.mechanics.pipe import CrossPipe, body_clearance
+
+MM = 1e-3
+SHORT_ARM = ArmSpec.default().replace(structure={"n_sections": 1, "links_per_section": 2})
+
+
+def test_in_motion_the_clearance_is_the_least_of_the_way():
+    """That of an action of six control periods against six actions of one, and the arm in the end."""
+    config = EnvConfig(n_poses=64, mode="dynamic", dynamic_step_s=0.12, pipe_diameter_mm=300.0)
+    long, short = (
+        ReachEnv(SHORT_ARM, dataclasses.replace(config, dynamic_step_s=step_s)) for step_s in (0.12, 0.02)
+    )
+    keys = jax.random.split(jax.random.PRNGKey(0), 16)
+    actions = jax.random.uniform(jax.random.PRNGKey(1), (16, long.action_size), minval=-0.5, maxval=0.5)
+    start = xla.jit(jax.vmap(long.reset))(keys)
+    end = xla.jit(jax.vmap(long.step), long.uses_mjx)(start, actions)
+    now, step = start.replace(info=jax.vmap(short.reset)(keys).info), xla.jit(jax.vmap(short.step), True)
+    way = [(now := step(now, actions)).info["clearance_mm"] for _ in range(6)]
+    np.testing.assert_allclose(end.pipeline_state.pose, now.pipeline_state.pose, atol=0.01)
+    least_mm = np.min(way, axis=0)
+    np.testing.assert_allclose(end.info["clearance_mm"], least_mm, atol=0.01)
+    assert (least_mm < way[-1] - 0.1).any() and (least_mm == way[-1]).any()
+    wall_m = plain_clearance_m(end.pipeline_state.motion.q)
+    np.testing.assert_allclose(way[-1], wall_m / MM, atol=0.02)
+
+
+def plain_clearance_m(q):
+    """The distance of the bodies of arms (n, nv) to the wall, from kinematics in closed form."""
+    frames = jax.vmap(lambda q: chain_frames(q, SHORT_ARM.link_length_m))(q)
+    plates = frames.plate_position, frames.plate_rotation
+    return body_clearance(CrossPipe.of_mm(300.0), *plates, SHORT_ARM)
