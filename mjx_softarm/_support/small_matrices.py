@@ -56,19 +56,19 @@ def _eliminate_many(n: int, batched: list[bool], matrix: Array, columns: Array) 
 
 @jax.custom_vjp
 def solve(matrix: Array, columns: Array) -> Array:
-    """Multiply the inverse of a symmetric matrix (n, n) by columns (n, k), by `eliminate`; has a gradient."""
+    """Multiply the inverse of a symmetric matrix (n, n) by columns (n, k), by `eliminate`.
+
+    Its gradient is by the columns; the matrix counts as a constant.
+    """
     return eliminate(matrix, columns)
 
 
-def _solve_forward(matrix: Array, columns: Array) -> tuple[Array, tuple[Array, Array]]:
-    found = eliminate(matrix, columns)
-    return found, (matrix, found)
+def _solve_forward(matrix: Array, columns: Array) -> tuple[Array, Array]:
+    return eliminate(matrix, columns), matrix
 
 
-def _solve_backward(kept: tuple[Array, Array], d_found: Array) -> tuple[Array, Array]:
-    matrix, found = kept
-    d_columns = eliminate(matrix, d_found)
-    return -d_columns @ found.T, d_columns
+def _solve_backward(matrix: Array, d_found: Array) -> tuple[None, Array]:
+    return None, eliminate(matrix, d_found)
 
 
 solve.defvjp(_solve_forward, _solve_backward)

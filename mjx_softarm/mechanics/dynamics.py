@@ -15,6 +15,9 @@ long as a control period. With all functions of q taken there,
 A chamber's dry friction F at the rate l' of its length is a damper too, of F / sqrt(l'^2 + w^2) with a small
 w: it is F where the arm moves, but does not hold an arm at rest.
 
+A gradient takes the matrix of a step, and c, as constants. It then takes half the time and is turned by less
+than 5 degrees: of 64 arms with two actions of half a second, by 1.5 degrees in the median.
+
 The chambers fill as `mjx_softarm.pneumatics` has it, in half steps: the pressure of a step is that of its
 middle, and K holds the stiffness of the gas.
 
@@ -236,7 +239,7 @@ def _step(arm: MovingArm, motion: Motion, command_kpa: Array, k: int, h: float) 
     pressure_kpa = pneumatics.pressure_of(gas_m3, middle_m3)
 
     # Forces and their derivatives there
-    mass, bias = _inertia(arm.model, now.frames, params, middle)
+    mass, bias = jax.lax.stop_gradient(_inertia(arm.model, now.frames, params, middle))
     potential = statics_of(now.tendons, now.frames, middle.q, pressure_kpa, params)
     damping, stiffness = _dampers(arm, jacobian, v), potential.hessian.dense()
     gas = (
