@@ -24,6 +24,7 @@ BENCHMARKS = {
     "planning": "benchmarks.accuracy.planning:measure",
     "arms": "benchmarks.accuracy.arms:measure",
     "logs": "benchmarks.accuracy.logs:measure",
+    "claims": "benchmarks.accuracy.claims:measure",
     "learning": "benchmarks.accuracy.learning:measure",
     "race": "benchmarks.race.race:race",
     "paper": "benchmarks.paper.experiments:paper",

@@ -1,0 +1,231 @@
+"""The paper's claims of load-independence and of no saturation, in simulation, one cause changed at a time.
+
+All policies learn alike, through the gradient of the simulated equilibrium, on arms without a payload. One of
+`KINDS` changes what an action asks for: nine pressures in place of nine spring lengths, which the
+sensor-space law holds with whatever pressures it takes. Another leaves out the loss's term that pulls
+references of saturated chambers back. The learning rate is each kind's own best of `RATES`, by the held-out
+median of a shorter run with a seed that is not used again.
+
+Then the arm carries payloads that the policy does not know. It sees the true pose of the tip after each of
+four actions, so that no estimate of pose or payload stands between the two. Circles of `SIZES` times the
+paper's are gone around twice, the second lap counts. Gradient descent on the springs, which solves for
+lengths and knows no pressures, goes around the same circles from other random poses for each seed.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from benchmarks.paper.gradient_descent import gradient_descent
+from mjx_softarm import ArmSpec
+from mjx_softarm._support import cli, xla
+from mjx_softarm.env import EnvConfig, ReachEnv
+from mjx_softarm.env.state import ArmState
+from mjx_softarm.mdp.actions import N_ACTIONS
+from mjx_softarm.mechanics.dynamics import Motion
+from mjx_softarm.mechanics.excitation import CIRCLE_DIAMETER_MM, circle_poses
+from mjx_softarm.mechanics.kinematics import chain_kinematics
+from mjx_softarm.mechanics.settle import Settled, settle_pressures
+from mjx_softarm.mechanics.workspace import HELD_OUT_SEED
+from mjx_softarm.policy.file import SHIPPED, load_policy
+from train.config import TrainConfig, override
+from train.presets import PRESETS
+from train.runs.evaluate import N_GOALS, PATH, Reached, paths_of, reach, start_keys, towards
+from train.runs.task import learner_of, task_of
+
+LOADS_G = (0, 250, 500, 1000)
+SIZES = (0.75, 1.0, 1.25, 1.5)  # of the paper's circle: 120 to 240 mm
+N_CIRCLE = PATH // 2  # points of a lap
+RATES = (2e-3, 5e-4, 1e-4)
+TUNING_SEED, TUNING_SHARE = 100, 0.25  # share of a run's steps
+SOLVER = "gradient descent"
+
+
+class PressureEnv(ReachEnv):
+    """The arm at rest, with actions that are pressures: -1 is the least, 1 the greatest."""
+
+    def move(self, arm: ArmState, action: Array) -> tuple[Motion, Settled, Array]:
+        """Return the arm at rest at the pressures; its readings are not asked to be anything else."""
+        params = self.params_of(arm)
+        low, high = params.pressure_min_kpa, params.pressure_max_kpa
+        pressure_kpa = low + 0.5 * (jnp.clip(action, -1.0, 1.0) + 1.0) * (high - low)
+        end = settle_pressures(chain_kinematics(params), params, pressure_kpa)
+        reading_m = jax.lax.stop_gradient(end.spring_m) + arm.sensor_offset_m
+        return Motion.at_rest(end.q, end.pressure_kpa, end.spring_m), end, reading_m
+
+
+class Kind(NamedTuple):
+    """What one kind of policy has that differs."""
+
+    env: Callable[..., ReachEnv] = ReachEnv
+    settings: tuple[str, ...] = ()  # NAME=VALUE
+
+
+KINDS = {
+    "spring lengths": Kind(),
+    "no saturation term": Kind(settings=("analytic.saturation_cost_per_mm=0",)),
+    "pressures": Kind(PressureEnv),
+}
+
+
+def measure(
+    seeds: cli.Integers = (0, 1, 2), steps: int = 1_048_576, goals: int = N_GOALS, arms: int = 64
+) -> dict[str, Any]:
+    """Compare what actions ask for under payloads, and learning with and without a saturation term.
+
+    Args:
+        seeds: of training
+        steps: environment steps of training
+        goals: held-out goals of each of the two sets
+        arms: of a gradient step
+    """
+    spec = ArmSpec.default()
+    base = override(PRESETS["analytic"], [f"total_env_steps={steps}", f"n_arms={arms}"])
+    loads, circles, rates = [], [], {}
+    for name, kind in KINDS.items():
+        config = override(base, kind.settings)
+        trial = Trial(kind, config, spec, goals)
+        rates[name] = trial.best_rate()
+        for seed in seeds:
+            at_goals, around = trial.run(seed, rates[name])
+            loads += [{"commands": name, "seed": seed, **row} for row in at_goals]
+            circles += [{"way": name, "seed": seed, **row} for row in around]
+    for seed in seeds:
+        circles += [{"way": SOLVER, "seed": seed, **row} for row in descended(spec, seed)]
+    return {
+        "settings": {"seeds": list(seeds), "env_steps": steps, "goals": goals, "learning_rates": rates},
+        "under loads": means(loads, ("commands", "load_g")),
+        "circles": means(circles, ("way", "diameter_mm")),
+        "loads of all runs": loads,
+        "circles of all runs": circles,
+    }
+
+
+class Trial:
+    """Training and evaluation of one kind of policy, each compiled once for a learning rate."""
+
+    def __init__(self, kind: Kind, config: TrainConfig, spec: ArmSpec, n_goals: int):
+        self.kind, self.config, self.spec, self.n_goals = kind, config, spec, n_goals
+        self.env = kind.env(spec, EnvConfig())
+        sets = (self.env.sample_pool(n_goals, HELD_OUT_SEED, evenly).pose for evenly in (False, True))
+        self.paths = np.concatenate([paths_of(jnp.concatenate(list(sets))), laps(spec)])
+        self.keys = start_keys(len(self.paths))
+        one = functools.partial(follow, self.env, learner_of(config, self.env))
+        self._follow = xla.jit(jax.vmap(one, in_axes=(None, None, 0, 0)))
+
+    def best_rate(self) -> float:
+        """Return the learning rate with the least held-out median of a short run."""
+        steps = round(TUNING_SHARE * self.config.total_env_steps)
+        off_mm = {}
+        for rate in RATES:
+            policy = self.policy(TUNING_SEED, rate, steps)
+            workspace, _ = self.reached(policy, 0)
+            off_mm[rate] = float(np.median(workspace.tip_error_mm))
+        return min(off_mm, key=off_mm.__getitem__)
+
+    def run(self, seed: int, rate: float) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+        """Train one policy; return its figures under each payload, and around each circle without one."""
+        policy, at_goals, around = self.policy(seed, rate, self.config.total_env_steps), [], []
+        for load_g in LOADS_G:
+            workspace, circles = self.reached(policy, load_g)
+            around = around or circle_rows(circles)
+            at_goals.append({"load_g": load_g, **figures(workspace)})
+        return at_goals, around
+
+    def policy(self, seed: int, rate: float, steps: int) -> Any:
+        """Return the parameters of a policy after training."""
+        changes = [f"analytic.learning_rate={rate}", f"total_env_steps={steps}", f"seed={seed}"]
+        config = override(self.config, changes)
+        job = task_of(config, self.kind.env(self.spec, config.env)).job
+        state = job.start(lambda: job.init(jax.random.PRNGKey(seed)))
+        for _ in range(config.n_epochs):
+            state, _ = job.epoch(state)
+        return jax.device_get(job.policy(state))
+
+    def reached(self, policy: Any, load_g: int) -> tuple[Reached, Reached]:
+        """Return the results at the goals of both sets (2 n_goals,), and around circles (SIZES, N_CIRCLE)."""
+        found = jax.device_get(self._follow(policy, 1e-3 * load_g, self.paths, self.keys))
+        n = len(SIZES)
+        workspace = jax.tree.map(lambda x: x[:-n].reshape(-1, *x.shape[2:])[: 2 * self.n_goals], found)
+        return workspace, jax.tree.map(lambda x: x[-n:, -N_CIRCLE:], found)
+
+
+def laps(spec: ArmSpec) -> np.ndarray:
+    """Return two laps (SIZES, PATH, 6) [mm, deg] of each circle."""
+    sizes = np.array([[size, size, 1.0, 1.0, 1.0, 1.0] for size in SIZES], np.float32)  # wider, not lower
+    return np.tile(sizes[:, None] * circle_poses(spec, N_CIRCLE), (1, 2, 1))
+
+
+def follow(env: ReachEnv, learner: Any, policy: Any, load_kg: Array, path: Array, key: Array) -> Reached:
+    """Return the results of one arm with a payload, from a random start, along a path (n, 6) of goals."""
+    state = env.reset(key)
+    arm = state.pipeline_state
+    state = state.replace(pipeline_state=arm._replace(payload_kg=arm.payload_kg + load_kg))
+    return jax.lax.scan(lambda state, goal: reach(env, learner, policy, state, goal), state, path)[1]
+
+
+def figures(reached: Reached) -> dict[str, float]:
+    """Return errors, and the share of goals with a saturated chamber."""
+    off_mm = reached.tip_error_mm
+    return {
+        "median_mm": float(np.median(off_mm)),
+        "mean_mm": float(np.mean(off_mm)),
+        "p95_mm": float(np.quantile(off_mm, 0.95)),
+        "saturated_percent": 100 * float(np.mean(reached.saturated_chambers > 0)),
+    }
+
+
+def circle_rows(reached: Reached) -> list[dict[str, Any]]:
+    """Return a row of figures for each circle of results (SIZES, N_CIRCLE)."""
+    off_mm = np.linalg.norm((reached.pose - reached.goal)[..., :3], axis=-1)
+    return [
+        {
+            "diameter_mm": CIRCLE_DIAMETER_MM * size,
+            "mean_mm": float(np.mean(off)),
+            "max_mm": float(np.max(off)),
+            "saturated_points": int(np.sum(saturated > 0)),
+        }
+        for size, off, saturated in zip(SIZES, off_mm, reached.saturated_chambers, strict=True)
+    ]
+
+
+def descended(spec: ArmSpec, seed: int) -> list[dict[str, Any]]:
+    """Return the rows of the solver, by the estimator of the policy that ships; it knows of no payload."""
+    env, solve = ReachEnv(spec, EnvConfig()), gradient_descent(load_policy(SHIPPED))
+    step, reset = xla.jit(env.step), xla.jit(env.reset)
+    keys = jax.random.split(jax.random.PRNGKey(seed), len(SIZES))
+
+    def along(path: np.ndarray, key: Array) -> Iterator[tuple[np.ndarray, np.ndarray, Array]]:
+        state = reset(key)
+        for goal in path:
+            for _ in range(N_ACTIONS):
+                arm = state.pipeline_state
+                spring_m = solve(np.asarray(arm.pose), goal, np.asarray(arm.spring_m, float), None)
+                state = step(towards(env, state, goal), env.action_of(jnp.asarray(spring_m)))
+            yield goal, np.asarray(state.pipeline_state.pose), state.metrics["saturated_chambers"]
+
+    rows = [list(along(path, key))[-N_CIRCLE:] for path, key in zip(laps(spec), keys, strict=True)]
+    goal, pose, saturated = (np.array([[at[k] for at in row] for row in rows]) for k in range(3))
+    nothing = dict.fromkeys(Reached._fields)
+    return circle_rows(Reached(**nothing | {"goal": goal, "pose": pose, "saturated_chambers": saturated}))
+
+
+def means(rows: list[dict[str, Any]], by: tuple[str, ...]) -> list[dict[str, Any]]:
+    """Return the mean and the standard deviation over seeds of all figures, for each value of `by`."""
+    groups: dict[tuple, list[dict[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault(tuple(row[name] for name in by), []).append(row)
+    found = []
+    for group in groups.values():
+        names = [name for name in group[0] if name not in (*by, "seed")]
+        values = np.array([[row[name] for name in names] for row in group])
+        told = (f"{mean:.2f} ± {off:.2f}" for mean, off in zip(values.mean(0), values.std(0), strict=True))
+        found.append({name: group[0][name] for name in by} | dict(zip(names, told, strict=True)))
+    return found

@@ -1,0 +1,53 @@
+"""Arms whose actions are pressures, and what the comparison of claims makes of results."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks.accuracy.claims import SIZES, PressureEnv, laps, means
+from mjx_softarm import ArmSpec
+from mjx_softarm._support import xla
+from mjx_softarm.env import EnvConfig
+from tests.train.small import SHORT
+
+
+def test_an_action_is_a_pressure_whatever_the_payload():
+    env, chambers = PressureEnv(SHORT, EnvConfig(n_poses=16)), SHORT.chambers
+    action = jnp.array([[-1.0, 0.0, 0.5], [0.2, 0.2, 0.2]])
+    start = xla.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 2))
+    arm = start.pipeline_state
+    heavy = start.replace(pipeline_state=arm._replace(payload_kg=arm.payload_kg + 0.5))
+    step = xla.jit(jax.vmap(env.step))
+    free, loaded = step(start, action), step(heavy, action)
+    low, high = chambers.pressure_min_kpa, chambers.pressure_max_kpa
+    for after in (free, loaded):
+        asked = low + 0.5 * (action + 1.0) * (high - low)
+        np.testing.assert_allclose(after.pipeline_state.pressure_kpa, asked, atol=1e-4)
+        assert after.info["valid"].all() and not after.info["blocked"].any()
+        np.testing.assert_array_equal(after.info["off_m"], 0.0)
+    sunk_mm = free.pipeline_state.pose[:, 2] - loaded.pipeline_state.pose[:, 2]
+    assert (sunk_mm > 1.0).all()
+
+
+def test_the_pose_has_a_gradient_by_the_pressures():
+    env = PressureEnv(SHORT, EnvConfig(n_poses=16))
+    state = env.reset(jax.random.key(0))
+    height = xla.jit(jax.grad(lambda action: env.step(state, action).pipeline_state.pose[2]))
+    slope, more = height(jnp.zeros(3)), 1e-2 * jnp.ones(3)
+    z = xla.jit(lambda action: env.step(state, action).pipeline_state.pose[2])
+    change = float(z(more) - z(-more))
+    assert abs(change) > 0.05
+    np.testing.assert_allclose(float(slope @ (2.0 * more)), change, rtol=0.02)
+
+
+def test_circles_differ_in_size_and_not_in_height():
+    around = laps(ArmSpec.default())
+    radius_mm = np.linalg.norm(around[:, :, :2], axis=-1)
+    np.testing.assert_allclose(radius_mm, 80.0 * np.array(SIZES)[:, None] * np.ones(80), rtol=1e-5)
+    np.testing.assert_array_equal(around[:, :40], around[:, 40:])
+    assert np.ptp(around[..., 2]) == 0.0
+
+
+def test_figures_are_told_over_the_seeds_of_a_group():
+    rows = [{"way": w, "seed": s, "mm": mm} for w, s, mm in (("a", 0, 1.0), ("b", 0, 5.0), ("a", 1, 2.0))]
+    assert means(rows, ("way",)) == [{"way": "a", "mm": "1.50 ± 0.50"}, {"way": "b", "mm": "5.00 ± 0.00"}]
