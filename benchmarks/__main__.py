@@ -25,6 +25,7 @@ BENCHMARKS = {
     "arms": "benchmarks.accuracy.arms:measure",
     "logs": "benchmarks.accuracy.logs:measure",
     "claims": "benchmarks.accuracy.claims:measure",
+    "rewards": "benchmarks.accuracy.rewards:measure",
     "learning": "benchmarks.accuracy.learning:measure",
     "race": "benchmarks.race.race:race",
     "paper": "benchmarks.paper.experiments:paper",

@@ -181,8 +181,7 @@ class ImitationConfig(TrainConfig):
     frozen: bool = False
     """keep the discriminator of another run as it is; only the poses of the demonstrations are used"""
     expert_share: float = 0.25
-    """share of the critics' batches that is the expert's while the discriminator learns; in motion, share of
-    the arms' actions"""
+    """share of the critics' batches that is the expert's; in motion, share of the arms' actions"""
     stages: Annotated[tuple[Stage, ...], _STAGES_OPTION] = (Stage(),)
     """stages in order: share of the env steps (all add up to 1), every n-th pose is a goal, share of the
     replay that is kept as the stage begins"""

@@ -119,6 +119,7 @@ _HAND_MADE = dataclasses.replace(
     _PIPE,
     learned_weight=0.0,
     hand_made_weight=1.0,
+    expert_share=0.0,
     tqc=dataclasses.replace(_TUNED.tqc, learning_rate_alpha=1e-3),
     hindsight=_TUNED.hindsight,
 )
@@ -127,6 +128,7 @@ IMITATION_PRESETS: dict[str, ImitationConfig] = {
         _HAND_MADE,
         tqc=dataclasses.replace(_HAND_MADE.tqc, learning_rate=3e-4),
         learned_weight=5.0,
+        expert_share=_PIPE.expert_share,
         rebalance_env_steps=0,
         stages=(Stage(share=1 / 3, every=2), Stage(share=2 / 3, kept=0.2)),
     ),

@@ -117,6 +117,7 @@ class Trial:
         sets = (self.env.sample_pool(n_goals, HELD_OUT_SEED, evenly).pose for evenly in (False, True))
         self.paths = np.concatenate([paths_of(jnp.concatenate(list(sets))), laps(spec)])
         self.keys = start_keys(len(self.paths))
+        self._jobs: dict[float, Any] = {}  # by learning rate
         one = functools.partial(follow, self.env, learner_of(config, self.env))
         self._follow = xla.jit(jax.vmap(one, in_axes=(None, None, 0, 0)))
 
@@ -132,20 +133,21 @@ class Trial:
 
     def run(self, seed: int, rate: float) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
         """Train one policy; return its figures under each payload, and around each circle without one."""
-        policy, at_goals, around = self.policy(seed, rate, self.config.total_env_steps), [], []
-        for load_g in LOADS_G:
-            workspace, circles = self.reached(policy, load_g)
-            around = around or circle_rows(circles)
-            at_goals.append({"load_g": load_g, **figures(workspace)})
-        return at_goals, around
+        policy = self.policy(seed, rate, self.config.total_env_steps)
+        found = {load_g: self.reached(policy, load_g) for load_g in LOADS_G}
+        at_goals = [{"load_g": load_g, **figures(workspace)} for load_g, (workspace, _) in found.items()]
+        _, circles = found[0]
+        off_mm = np.linalg.norm((circles.pose - circles.goal)[..., :3], axis=-1)
+        return at_goals, circle_rows(off_mm, np.asarray(circles.saturated_chambers))
 
     def policy(self, seed: int, rate: float, steps: int) -> Any:
-        """Return the parameters of a policy after training."""
-        changes = [f"analytic.learning_rate={rate}", f"total_env_steps={steps}", f"seed={seed}"]
-        config = override(self.config, changes)
-        job = task_of(config, self.kind.env(self.spec, config.env)).job
+        """Return the parameters of a policy after so many env steps."""
+        if rate not in self._jobs:
+            config = override(self.config, [f"analytic.learning_rate={rate}"])
+            self._jobs[rate] = task_of(config, self.kind.env(self.spec, config.env)).job
+        job = self._jobs[rate]
         state = job.start(lambda: job.init(jax.random.PRNGKey(seed)))
-        for _ in range(config.n_epochs):
+        while int(state.n_env_steps) < steps:
             state, _ = job.epoch(state)
         return jax.device_get(job.policy(state))
 
@@ -182,9 +184,8 @@ def figures(reached: Reached) -> dict[str, float]:
     }
 
 
-def circle_rows(reached: Reached) -> list[dict[str, Any]]:
-    """Return a row of figures for each circle of results (SIZES, N_CIRCLE)."""
-    off_mm = np.linalg.norm((reached.pose - reached.goal)[..., :3], axis=-1)
+def circle_rows(off_mm: np.ndarray, n_saturated: np.ndarray) -> list[dict[str, Any]]:
+    """Return a row for each circle, by tip errors [mm] and saturated chambers (SIZES, N_CIRCLE)."""
     return [
         {
             "diameter_mm": CIRCLE_DIAMETER_MM * size,
@@ -192,7 +193,7 @@ def circle_rows(reached: Reached) -> list[dict[str, Any]]:
             "max_mm": float(np.max(off)),
             "saturated_points": int(np.sum(saturated > 0)),
         }
-        for size, off, saturated in zip(SIZES, off_mm, reached.saturated_chambers, strict=True)
+        for size, off, saturated in zip(SIZES, off_mm, n_saturated, strict=True)
     ]
 
 
@@ -202,19 +203,17 @@ def descended(spec: ArmSpec, seed: int) -> list[dict[str, Any]]:
     step, reset = xla.jit(env.step), xla.jit(env.reset)
     keys = jax.random.split(jax.random.PRNGKey(seed), len(SIZES))
 
-    def along(path: np.ndarray, key: Array) -> Iterator[tuple[np.ndarray, np.ndarray, Array]]:
+    def along(path: np.ndarray, key: Array) -> Iterator[tuple[float, float]]:
         state = reset(key)
         for goal in path:
             for _ in range(N_ACTIONS):
                 arm = state.pipeline_state
                 spring_m = solve(np.asarray(arm.pose), goal, np.asarray(arm.spring_m, float), None)
                 state = step(towards(env, state, goal), env.action_of(jnp.asarray(spring_m)))
-            yield goal, np.asarray(state.pipeline_state.pose), state.metrics["saturated_chambers"]
+            yield float(state.metrics["tip_error_mm"]), float(state.metrics["saturated_chambers"])
 
-    rows = [list(along(path, key))[-N_CIRCLE:] for path, key in zip(laps(spec), keys, strict=True)]
-    goal, pose, saturated = (np.array([[at[k] for at in row] for row in rows]) for k in range(3))
-    nothing = dict.fromkeys(Reached._fields)
-    return circle_rows(Reached(**nothing | {"goal": goal, "pose": pose, "saturated_chambers": saturated}))
+    found = [list(along(path, key))[-N_CIRCLE:] for path, key in zip(laps(spec), keys, strict=True)]
+    return circle_rows(*np.moveaxis(np.array(found), -1, 0))
 
 
 def means(rows: list[dict[str, Any]], by: tuple[str, ...]) -> list[dict[str, Any]]:

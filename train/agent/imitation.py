@@ -3,7 +3,7 @@
 An action of an arm at rest leads to the same pose from wherever it begins. So each demonstrated action is the
 expert's answer to its goal from any start, and the expert is put where the agent stood: the discriminator
 compares two actions for one observation, and nothing but the action can tell them apart. The expert's answers
-also take a share of each batch of the critics, with the learned reward like all others.
+also take a share of each batch of the critics, with the same reward as all others.
 
 An arm in motion is still on its way when the next action comes. There the expert acts itself: a share of the
 arms' actions are the expert's answers to their goals, and the critics see what these led to. Where the expert
@@ -57,9 +57,8 @@ class Imitation:
         self.positions = jnp.asarray(demonstrations.positions)  # (m, 6) [mm, deg]
         self.actions = jnp.asarray(demonstrations.actions)  # (m, A)
         self.gail = Gail(env.observation_size, env.action_size, config.gail)
-        self.expert_share = config.expert_share if config.learned_weight and not config.frozen else 0.0
         at_rest = not env.config.moves
-        self.n_expert = round(at_rest * self.expert_share * config.batch_size)  # rows of a batch
+        self.n_expert = round(at_rest * config.expert_share * config.batch_size)  # rows of a batch
 
     def init(self, key: Array) -> ImitationState:
         """Return fresh networks."""
@@ -74,7 +73,7 @@ class Imitation:
             return action
         scale = self.env.scale
         goal = obs[..., observation.GOAL] * scale.scale + scale.centre
-        by_expert = draws.uniform(jax.random.fold_in(key, 1), obs.shape[:-1]) < self.expert_share
+        by_expert = draws.uniform(jax.random.fold_in(key, 1), obs.shape[:-1]) < self.config.expert_share
         return jnp.where(by_expert[..., None], self.actions[self._index_of(goal)], action)
 
     def policy(self, state: ImitationState) -> Any:

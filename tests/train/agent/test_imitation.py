@@ -78,7 +78,7 @@ def test_an_update_moves_the_discriminator_unless_it_is_frozen(new, stored, froz
     )
     heads = [state.discriminator.params["params"]["head"]["kernel"] for state in (before, after)]
     assert np.array_equal(*heads) == frozen and ("gail/accuracy" in metrics) != frozen
-    assert float(metrics["gail/reward"]) < 0.0 and learner.n_expert == (0 if frozen else 4)
+    assert float(metrics["gail/reward"]) < 0.0
     policies = [jax.tree.leaves(learner.policy(state)) for state in (before, after)]
     assert not np.array_equal(policies[0][-1], policies[1][-1])
 
