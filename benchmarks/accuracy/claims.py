@@ -9,7 +9,7 @@ median of a shorter run with a seed that is not used again.
 Then the arm carries payloads that the policy does not know. It sees the true pose of the tip after each of
 four actions, so that no estimate of pose or payload stands between the two. Circles of `SIZES` times the
 paper's are gone around twice, the second lap counts. Gradient descent on the springs, which solves for
-lengths and knows no pressures, goes around the same circles from other random poses for each seed.
+lengths and knows no pressures, goes once around the same circles, from other random poses for each seed.
 """
 
 from __future__ import annotations
@@ -28,7 +28,6 @@ from mjx_softarm import ArmSpec
 from mjx_softarm._support import cli, xla
 from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.env.state import ArmState
-from mjx_softarm.mdp.actions import N_ACTIONS
 from mjx_softarm.mechanics.dynamics import Motion
 from mjx_softarm.mechanics.excitation import CIRCLE_DIAMETER_MM, circle_poses
 from mjx_softarm.mechanics.kinematics import chain_kinematics
@@ -45,7 +44,7 @@ SIZES = (0.75, 1.0, 1.25, 1.5)  # of the paper's circle: 120 to 240 mm
 N_CIRCLE = PATH // 2  # points of a lap
 RATES = (2e-3, 5e-4, 1e-4)
 TUNING_SEED, TUNING_SHARE = 100, 0.25  # share of a run's steps
-SOLVER = "gradient descent"
+SOLVER, N_SEARCHES = "gradient descent", 2  # for each point, the second from where the first has led
 
 
 class PressureEnv(ReachEnv):
@@ -206,13 +205,14 @@ def descended(spec: ArmSpec, seed: int) -> list[dict[str, Any]]:
     def along(path: np.ndarray, key: Array) -> Iterator[tuple[float, float]]:
         state = reset(key)
         for goal in path:
-            for _ in range(N_ACTIONS):
+            for _ in range(N_SEARCHES):
                 arm = state.pipeline_state
                 spring_m = solve(np.asarray(arm.pose), goal, np.asarray(arm.spring_m, float), None)
                 state = step(towards(env, state, goal), env.action_of(jnp.asarray(spring_m)))
             yield float(state.metrics["tip_error_mm"]), float(state.metrics["saturated_chambers"])
 
-    found = [list(along(path, key))[-N_CIRCLE:] for path, key in zip(laps(spec), keys, strict=True)]
+    laps_once = laps(spec)[:, :N_CIRCLE]
+    found = [list(along(path, key)) for path, key in zip(laps_once, keys, strict=True)]
     return circle_rows(*np.moveaxis(np.array(found), -1, 0))
 
 
