@@ -26,12 +26,11 @@ from jax import Array
 from benchmarks.paper.gradient_descent import gradient_descent
 from mjx_softarm import ArmSpec
 from mjx_softarm._support import cli, xla
+from mjx_softarm._support.mjx import State
 from mjx_softarm.env import EnvConfig, ReachEnv
-from mjx_softarm.env.state import ArmState
-from mjx_softarm.mechanics.dynamics import Motion
 from mjx_softarm.mechanics.excitation import CIRCLE_DIAMETER_MM, circle_poses
 from mjx_softarm.mechanics.kinematics import chain_kinematics
-from mjx_softarm.mechanics.settle import Settled, settle_pressures
+from mjx_softarm.mechanics.settle import settle_pressures
 from mjx_softarm.mechanics.workspace import HELD_OUT_SEED
 from mjx_softarm.policy.file import SHIPPED, load_policy
 from train.config import TrainConfig, override
@@ -50,14 +49,14 @@ SOLVER, N_SEARCHES = "gradient descent", 2  # for each point, the second from wh
 class PressureEnv(ReachEnv):
     """The arm at rest, with actions that are pressures: -1 is the least, 1 the greatest."""
 
-    def move(self, arm: ArmState, action: Array) -> tuple[Motion, Settled, Array]:
-        """Return the arm at rest at the pressures; its readings are not asked to be anything else."""
+    def step(self, state: State, action: Array) -> State:
+        """Go to the lengths at which these pressures hold the arm with its payload; see `ReachEnv.step`."""
+        arm = state.pipeline_state
         params = self.params_of(arm)
         low, high = params.pressure_min_kpa, params.pressure_max_kpa
         pressure_kpa = low + 0.5 * (jnp.clip(action, -1.0, 1.0) + 1.0) * (high - low)
-        end = settle_pressures(chain_kinematics(params), params, pressure_kpa)
-        reading_m = jax.lax.stop_gradient(end.spring_m) + arm.sensor_offset_m
-        return Motion.at_rest(end.q, end.pressure_kpa, end.spring_m), end, reading_m
+        held = settle_pressures(chain_kinematics(params), params, pressure_kpa)
+        return super().step(state, self.action_of(held.spring_m + arm.sensor_offset_m))
 
 
 class Kind(NamedTuple):
