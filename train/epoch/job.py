@@ -94,6 +94,10 @@ class Job:
         """Return a state structured as the run's after some epochs."""
         return self.init(jax.random.PRNGKey(0))
 
+    def shapes(self, epoch: int) -> TrainState:
+        """Return the shapes of what `like` returns; a jitted function within a traced one has no options."""
+        return jax.eval_shape(self.init, jax.random.PRNGKey(0))
+
     def start(self, first: Callable[[], T], epoch: int = 0) -> T:
         """Return the result of `first`, such as a state, with the epoch compiled in another thread meanwhile.
 
@@ -102,7 +106,7 @@ class Job:
         """
         if self.mesh is not None or self.n_traces:
             return first()
-        shapes = jax.eval_shape(self.init, jax.random.PRNGKey(0))
+        shapes = self.shapes(epoch)
         with ThreadPoolExecutor(1) as beside:
             result = beside.submit(first)
             self.epoch = self.epoch.lower(shapes).compile()

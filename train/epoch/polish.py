@@ -92,6 +92,10 @@ class PolishedJob:
         """Return a state structured as the run's after some epochs."""
         return (self.polish if epoch >= self._n_epochs else self.tqc).like(epoch)
 
+    def shapes(self, epoch: int) -> TrainState:
+        """Return the shapes of what `like` returns."""
+        return (self.polish if epoch >= self._n_epochs else self.tqc).shapes(epoch)
+
     def start(self, first: Callable[[], T], epoch: int = 0) -> T:
         """Return the result of `first`, with the epochs compiled in other threads; see `Job.start`."""
         if epoch >= self._n_epochs:

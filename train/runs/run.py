@@ -151,7 +151,7 @@ def begin_with(task: Task, seed: int, **donors: Run) -> TrainState:
 
 def _restored(run: Run, task: Task) -> TrainState:
     """Return the state of a run's newest checkpoint: learner in NumPy, shapes of the rest."""
-    shapes = jax.eval_shape(lambda: task.job.like(run.latest_epoch or 0))
+    shapes = task.job.shapes(run.latest_epoch or 0)
     return shapes._replace(learner=run.restore_part("learner", shapes.learner))
 
 
