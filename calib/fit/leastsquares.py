@@ -90,14 +90,14 @@ def fit(model: Model, problem: Problem) -> Solution:
 
 def refine(model: Model, x: np.ndarray, problem: Problem) -> Solution:
     """Take Newton steps to the minimum from an x (p,) that is close to it, as that of a part of the rows."""
-    found = model(x)
-    solution = solution_at(x, *found, problem)
+    solution = solution_at(x, *model(x), problem)
     for _ in range(NEWTON_STEPS):
         if solution.converged:
             break
-        x, scale = solution.x + solution.newton_step, solution.scale
-        before, found = _loss(*found, solution.x, scale, problem), model(x)
-        if not _loss(*found, x, scale, problem) < before:
+        x = solution.x + solution.newton_step
+        found = model(x)
+        # Single precision hides how little the loss comes down close to the minimum; the gradient tells.
+        if not _covariance(*found, x, solution.scale, problem)[2] < solution.decrement:
             break
         solution = solution_at(x, *found, problem)
     return solution
@@ -157,15 +157,6 @@ def _covariance(
     newton_step = -inverse @ gradient
     covariance = change.T @ change + inverse @ precision @ inverse
     return covariance, newton_step, -0.5 * float(gradient @ newton_step)
-
-
-def _loss(
-    error: np.ndarray, jacobian: np.ndarray, x: np.ndarray, scale: np.ndarray, problem: Problem
-) -> float:
-    """Return Huber's loss with the prior's."""
-    size = np.abs(_scaled(error, jacobian, scale, problem)[0])
-    each = np.where(size <= problem.huber, 0.5 * size**2, problem.huber * (size - 0.5 * problem.huber))
-    return float(each.sum() + 0.5 * np.sum((x / problem.prior) ** 2))
 
 
 def _scales(error: np.ndarray, problem: Problem) -> np.ndarray:

@@ -43,6 +43,20 @@ def test_a_fit_to_a_part_of_the_rows_goes_on_to_all():
     np.testing.assert_allclose(after.half_width, part.half_width / np.sqrt(2), rtol=0.15)
 
 
+def test_a_fit_ends_where_rounding_hides_how_the_loss_comes_down():
+    """Errors come in steps of a thousandth of their scale, as in single precision."""
+    rng = np.random.default_rng(1)
+    slope, noise = rng.normal(size=(400, 2, 3)), 0.2 * rng.normal(size=(400, 2))
+
+    def model(x):
+        return np.round(slope @ (x - TRUE) + noise, 3), slope
+
+    near = fit(model, PROBLEM)
+    for seed in range(20):
+        away = np.random.default_rng(seed).normal(size=3) * 0.08 * near.half_width
+        assert refine(model, near.x + away, PROBLEM).converged
+
+
 def test_newton_steps_end_a_fit_whose_scales_still_changed(monkeypatch):
     """Outliers on one side: the minimum moves with the scale, which each round leaves behind."""
     rng = np.random.default_rng(1)
