@@ -7,7 +7,7 @@ epoch.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 from jax.sharding import Mesh
 from matplotlib.figure import Figure
@@ -27,12 +27,24 @@ from train.runs.evaluate import N_GOALS, Evaluator
 from train.runs.positions import PositionEvaluator
 
 
+class Evaluation(Protocol):
+    """An evaluation of policies on arms of one environment."""
+
+    def __call__(self, policy: Any) -> tuple[Any, ...]:
+        """Return figures, which have `to_dict` and `rows`, then results."""
+        ...
+
+    def on(self, env: ReachEnv) -> Evaluation:
+        """Return the same evaluation on another environment."""
+        ...
+
+
 class Task(NamedTuple):
     """Job of a run, and how the run is evaluated, shown, and prepared for an epoch."""
 
     job: Job | PolishedJob
     title: str  # of the table of figures
-    evaluate: Evaluator | PositionEvaluator  # policy -> figures (`to_dict`), then results
+    evaluate: Evaluation
     picture_names: tuple[str, ...]
     pictures: Callable[..., dict[str, Figure]]  # rows of metrics, results -> figures by name
     headline: Callable[[dict[str, float]], str]  # row of metrics with an evaluation -> a short text
