@@ -81,21 +81,15 @@ PRESETS: dict[str, TrainConfig] = {
         env=_MOVING,
         tqc=dataclasses.replace(_TUNED.tqc, learning_rate=2e-3),
     ),
-    # The same task through the gradient of the motion, from the policy of a run of `quick` (--agent).
+    # The same task through the gradient of the motion, from the policy of a run of `analytic` (--agent).
     "motion-analytic": TrainConfig(
         learner="analytic",
         n_arms=64,
-        total_env_steps=64 * 640,
+        total_env_steps=64 * 1_024,
         vector_steps_per_epoch=32,
-        evaluation_epochs=5,
+        evaluation_epochs=8,
         env=dataclasses.replace(_MOVING, n_poses=16_384, randomisation=Randomisation()),
-        analytic=AnalyticConfig(
-            hidden=_TUNED.tqc.hidden_actor,
-            horizon=4,
-            learning_rate=1e-4,
-            learning_rate_half=200.0,
-            mean_share=0.3,
-        ),
+        analytic=AnalyticConfig(horizon=4, learning_rate=3e-4, learning_rate_half=400.0, mean_share=0.3),
     ),
     "paper": dataclasses.replace(
         _AT_REST, total_env_steps=300_000, updates_per_env_step=0.5, polish_updates=32_768

@@ -132,24 +132,27 @@ def learn(
     if reward == PRINTED:
         learner.gail = PrintedGail(env.observation_size, env.action_size, config.gail)
     todo = task_of(config, env, shown, learner=learner)
-    held_out = PositionEvaluator(env, learner, between, np.ones(len(between), bool))
+    at_shown, held_out = (
+        PositionEvaluator(env, learner, positions, np.ones(len(positions), bool))
+        for positions in (shown.positions, between)
+    )
     rows = []
     for seed in seeds:
         state, curve = todo.job.start(lambda seed=seed: todo.job.init(jax.random.PRNGKey(seed))), []
         for epoch in range(config.n_epochs):
             state, _ = todo.job.epoch(todo.prepare(state, epoch))
-            curve.append((int(state.n_env_steps), todo.evaluate(todo.job.policy(state))[0].success_share))
+            curve.append((int(state.n_env_steps), at_shown(todo.job.policy(state))[0].success_share))
         policy = todo.job.policy(state)
-        (at_shown, _), (at_held_out, _) = todo.evaluate(policy), held_out(policy)
+        (end, _), (between_them, _) = at_shown(policy), held_out(policy)
         first = next((n for n, share in curve if share >= SUCCESS), None)
         rows.append(
             {
                 "seed": seed,
                 "steps_to_success": first,
-                "success": at_shown.success_share,
-                "median_mm": at_shown.median_mm,
-                "held_out_success": at_held_out.success_share,
-                "held_out_median_mm": at_held_out.median_mm,
+                "success": end.success_share,
+                "median_mm": end.median_mm,
+                "held_out_success": between_them.success_share,
+                "held_out_median_mm": between_them.median_mm,
                 "curve": curve,
             }
         )
