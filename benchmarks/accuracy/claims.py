@@ -3,12 +3,13 @@
 All policies learn alike, through the gradient of the simulated equilibrium, on arms without a payload. One of
 `KINDS` changes what an action asks for: nine pressures in place of nine spring lengths, which the
 sensor-space law holds with whatever pressures it takes. Another leaves out the loss's term that pulls
-references of saturated chambers back. The learning rate is each kind's own best of `RATES`, by the held-out
-median of a shorter run with a seed that is not used again.
+references of saturated chambers back; pressures have no references, so they go without it, too. The learning
+rate is each kind's own best of `RATES`, by the held-out median of a shorter run with a seed that is not used
+again.
 
 Then the arm carries payloads that the policy does not know. It sees the true pose of the tip after each of
-four actions, so that no estimate of pose or payload stands between the two. Circles of `SIZES` times the
-paper's are gone around twice, the second lap counts. Gradient descent on the springs, which solves for
+four actions, so no estimate of pose or payload adds an error of its own. It goes twice around circles of
+`SIZES` times the paper's, and the second lap counts. Gradient descent on the springs, which solves for
 lengths and knows no pressures, goes once around the same circles, from other random poses for each seed.
 """
 
@@ -66,10 +67,11 @@ class Kind(NamedTuple):
     settings: tuple[str, ...] = ()  # NAME=VALUE
 
 
+NO_TERM = ("analytic.saturation_cost_per_mm=0",)
 KINDS = {
     "spring lengths": Kind(),
-    "no saturation term": Kind(settings=("analytic.saturation_cost_per_mm=0",)),
-    "pressures": Kind(PressureEnv),
+    "no saturation term": Kind(settings=NO_TERM),
+    "pressures": Kind(PressureEnv, NO_TERM),  # the term would read these actions as spring lengths
 }
 
 
