@@ -32,7 +32,8 @@ from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
 KIND, RECORDED_FILE = "recorded", "recorded.npz"  # in the folder of a calibration
 SHARE_FAR = 0.5  # of the poses, at least, that are drawn by their distance
 MAX_CANDIDATES = 1500
-MARGIN = 2.0  # by which fits know less: errors of a pose hang together, and are large where they tell much
+# Fits' intervals over those of the information, which takes errors for independent and as large everywhere
+MARGIN = 2.0
 N_NEAREST = 8  # poses whose errors are averaged
 MAX_ERROR_RATIO = 2.0  # of such a mean to that of all poses
 

@@ -3,8 +3,8 @@
 The simulated arm settles at the logged pressures; its chambers are changed until tip poses agree, and spring
 lengths and markers at the sections' ends where they were measured. Robust least squares
 (`calib.fit.leastsquares`) take the Jacobian from the implicit function theorem, see `calib.fit.equilibrium`.
-Straight arms, if there are enough of them, have errors of their own scale: the model fits them better. A fit
-without some of the poses is judged by these; from there the last fit takes all.
+Straight arms, if there are enough of them, have errors of their own scale: the model fits them better. A
+first fit leaves out some poses, which judge it. The last fit begins where that one ended, and takes all.
 
 Masses are known and set the scale of all forces. The bending stiffness of the backbone is fitted too, as area
 and stiffness would otherwise absorb its error. Its axial stiffness and that of the springs cannot be fitted:
@@ -69,8 +69,8 @@ class ChamberFit:
         weak: unknown directions, whose width is above 1, in words.
         weak_tip_mm: how far each of these moves the simulated tip within its interval, at the pressures and
             with the payload where it does so the most (`calib.fit.equilibrium`).
-        in_sample, held_out: errors of a fit in which the held-out poses took no part; `spec` is that to all
-            poses, from there.
+        in_sample, held_out: errors of the first fit, in which the held-out poses took no part; `spec` is from
+            the last fit, to all poses.
         in_sample_before, held_out_before: errors of the specification that the fit started from.
         scale: robust errors of arms that bend and of straight ones (2, 3): tip [m], rotation [rad] and
             springs [m], then (2, 4) markers [m] if there are any; a guess if too few arms are straight.
@@ -184,7 +184,7 @@ def calibrate_chambers(logs: Log | Sequence[Log], spec: ArmSpec, seed: int = 0) 
 def _solutions(
     spec: ArmSpec, poses: StaticPoses, end_m: np.ndarray, held_out: np.ndarray
 ) -> tuple[Solution, Solution]:
-    """Return the fit without the held-out poses, by which these judge, and from there that to all poses."""
+    """Return the fit without the held-out poses, which judge it, and the fit to all poses, begun from it."""
     group = error_groups(spec, poses.pressure_kpa)
     if np.count_nonzero(group[~held_out, 0] >= N_KINDS) < MIN_STRAIGHT:
         group %= N_KINDS

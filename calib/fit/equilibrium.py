@@ -1,6 +1,6 @@
 """Static equilibrium of the arm as a differentiable function of its parameters, beside measured poses.
 
-Errors of the parameters are told by it in millimetres of the tip, too, over the workspace.
+It also gives errors of the parameters in millimetres of the tip, over the workspace.
 """
 
 from __future__ import annotations

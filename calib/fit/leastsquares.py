@@ -89,7 +89,7 @@ def fit(model: Model, problem: Problem) -> Solution:
 
 
 def refine(model: Model, x: np.ndarray, problem: Problem) -> Solution:
-    """Take Newton steps to the minimum from an x (p,) that is close to it, as that of a part of the rows."""
+    """Take Newton steps to the minimum from an x (p,) close to it, such as that of a part of the rows."""
     solution = solution_at(x, *model(x), problem)
     for _ in range(NEWTON_STEPS):
         if solution.converged:

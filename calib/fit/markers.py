@@ -70,7 +70,7 @@ def marker_limits(poses: StaticPoses, simulated_m: np.ndarray, spec: ArmSpec) ->
     """Compute length limits from the most bent poses.
 
     Args:
-        poses: static poses with markers, those of `section_ends`.
+        poses: static poses with markers that `section_ends` has accepted.
         simulated_m (n, n_chambers) [m]: chamber lengths of the calibrated arm at all poses.
         spec: the arm.
 

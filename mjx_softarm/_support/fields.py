@@ -122,7 +122,13 @@ def read_fields(cls: type, data: Any, source: str, prefix: str) -> dict[str, Any
 
 
 def check_counts(table: Any, counts: dict[str, int], source: str, prefix: str) -> None:
-    """Refuse lists of an arm that do not have as many numbers as the arm has of what they are for.
+    """Refuse a list that does not have one number for each part of the arm that it describes.
+
+    Args:
+        table: a dataclass whose fields have rules, or are such dataclasses.
+        counts: number of the arm's parts, such as chambers, by the names that rules give them.
+        source: file or code that the numbers came from, for the message.
+        prefix: name of the table in its source, with a dot at its end, or empty.
 
     Raises:
         SpecError: a list is too short or too long.

@@ -241,9 +241,10 @@ class ReachEnv(Env):
         )
 
     def _move(self, arm: ArmState, reference_m: Array) -> tuple[Motion, Settled | Moved]:
+        """Return the motion after an action that asks for true lengths, and the observables at its end."""
         params, config = self.params_of(arm), self.config
         kinematics = mjx_kinematics(self.model) if config.engine == "mjx" else chain_kinematics(params)
-        if self.config.moves:
+        if config.moves:
             moving = MovingArm.of(self.model, kinematics, params, arm.moving)
             rate_hz = self.spec.control.rate_hz
             times_s = config.dynamic_step_s, 1.0 / rate_hz, config.simulation_step_s

@@ -95,7 +95,10 @@ class Job:
         return self.init(jax.random.PRNGKey(0))
 
     def shapes(self, epoch: int) -> TrainState:
-        """Return the shapes of what `like` returns; a jitted function within a traced one has no options."""
+        """Return the shapes of what `like` returns.
+
+        `init` stands at the top level here, since jax takes compiler options nowhere else.
+        """
         return jax.eval_shape(self.init, jax.random.PRNGKey(0))
 
     def start(self, first: Callable[[], T], epoch: int = 0) -> T:
