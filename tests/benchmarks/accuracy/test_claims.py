@@ -4,11 +4,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.accuracy.claims import SIZES, PressureEnv, laps, means
+from benchmarks.accuracy.claims import KINDS, SIZES, PressureEnv, laps, means
 from mjx_softarm import ArmSpec
 from mjx_softarm._support import xla
 from mjx_softarm.env import EnvConfig
+from mjx_softarm.mdp import rewards
 from tests.train.small import SHORT
+from train.agent.analytic import Analytic
+from train.config import override
+from train.presets import PRESETS
 
 
 def test_an_action_is_a_pressure_whatever_the_payload():
@@ -26,6 +30,17 @@ def test_an_action_is_a_pressure_whatever_the_payload():
         assert after.info["valid"].all() and not after.info["blocked"].any()
     sunk_mm = free.pipeline_state.pose[:, 2] - loaded.pipeline_state.pose[:, 2]
     assert (sunk_mm > 1.0).all()
+
+
+def test_pressures_cost_the_error_of_the_pose_alone():
+    env = PressureEnv(SHORT, EnvConfig(n_poses=16))
+    config = override(PRESETS["analytic"], KINDS["pressures"].settings)
+    action = jnp.array([-0.9, 0.0, 0.5])
+    after = xla.jit(env.step)(env.reset(jax.random.key(0)), action)
+    arm, reward = after.pipeline_state, env.config.reward
+    error = rewards.scaled_error(arm.pose, arm.goal, reward)
+    cost = Analytic(config.analytic, env, 1)._cost(action, after)
+    np.testing.assert_allclose(cost, jnp.linalg.norm(error) / reward.threshold, rtol=1e-5)
 
 
 def test_the_pose_has_a_gradient_by_the_pressures():
