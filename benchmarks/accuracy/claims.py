@@ -36,7 +36,7 @@ from mjx_softarm.mechanics.workspace import HELD_OUT_SEED
 from mjx_softarm.policy.file import SHIPPED, load_policy
 from train.config import TrainConfig, override
 from train.presets import PRESETS
-from train.runs.evaluate import N_GOALS, PATH, Reached, paths_of, reach, start_keys, towards
+from train.runs.evaluate import N_GOALS, PATH, Reached, follow_from, paths_of, start_keys, towards
 from train.runs.task import learner_of, task_of
 
 LOADS_G = (0, 250, 500, 1000)
@@ -61,7 +61,7 @@ class PressureEnv(ReachEnv):
 
 
 class Kind(NamedTuple):
-    """What one kind of policy has that differs."""
+    """Environment and settings of a kind of policy, where they differ from the first."""
 
     env: Callable[..., ReachEnv] = ReachEnv
     settings: tuple[str, ...] = ()  # NAME=VALUE
@@ -170,7 +170,7 @@ def follow(env: ReachEnv, learner: Any, policy: Any, load_kg: Array, path: Array
     state = env.reset(key)
     arm = state.pipeline_state
     state = state.replace(pipeline_state=arm._replace(payload_kg=arm.payload_kg + load_kg))
-    return jax.lax.scan(lambda state, goal: reach(env, learner, policy, state, goal), state, path)[1]
+    return follow_from(env, learner, policy, path, state)
 
 
 def figures(reached: Reached) -> dict[str, float]:

@@ -64,22 +64,16 @@ def measure(
     """
     spec = ArmSpec.default()
     shown, between = demonstrated(spec)
-    runs = []
-    for reward, settings in [(r, s) for s in PRESETS for r in (LEARNED, HAND_MADE)] + [(PRINTED, "pipe")]:
-        config = config_of(reward, settings, steps, arms)
-        runs += [
-            {"reward": reward, "settings": settings, **row}
-            for row in learn(reward, config, spec, shown, between, seeds)
-        ]
-    names = "reward", "settings"
-    groups = list(dict.fromkeys(tuple(run[name] for name in names) for run in runs))
+    kinds = [(reward, settings) for settings in PRESETS for reward in (LEARNED, HAND_MADE)]
+    means, runs = [], []
+    for reward, settings in (*kinds, (PRINTED, "pipe")):
+        kind = {"reward": reward, "settings": settings}
+        rows = learn(reward, config_of(reward, settings, steps, arms), spec, shown, between, seeds)
+        means.append(kind | summary(rows))
+        runs += [kind | row for row in rows]
     return {
         "positions": {"shown": len(shown.positions), "held out": len(between)},
-        "means": [
-            dict(zip(names, group, strict=True))
-            | summary([run for run in runs if tuple(run[name] for name in names) == group])
-            for group in groups
-        ],
+        "means": means,
         "runs": runs,
     }
 

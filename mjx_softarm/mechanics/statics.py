@@ -205,7 +205,7 @@ def tendons(frames: Frames, site_m: Array) -> Tendons:
     n_links, n_sections = frames.axis.shape[0], site_m.shape[0] // N_CHAMBERS_PER_SECTION
     per_section = n_links // n_sections
     site = jnp.repeat(site_m.reshape(n_sections, N_CHAMBERS_PER_SECTION, 2), per_section, axis=0)
-    x, y = jnp.moveaxis(site, 0, -1)[:, 0], jnp.moveaxis(site, 0, -1)[:, 1]  # (3 tendons, n_links)
+    x, y = site.T  # (3 tendons, n_links) each
     plate, ring = jnp.moveaxis(frames.plate_position, 0, -1), jnp.moveaxis(frames.plate_rotation, 0, -1)
     upper = [plate[i, :-1] + ring[i, 0, :-1] * x + ring[i, 1, :-1] * y for i in range(3)]
     lower = [plate[i, 1:] + ring[i, 0, 1:] * x + ring[i, 1, 1:] * y for i in range(3)]
@@ -223,8 +223,8 @@ def tendons(frames: Frames, site_m: Array) -> Tendons:
         curve = (_dot(motion[i], motion[j]) - along[i] * along[j]) / length
         return curve if i == 0 else curve + _dot(unit, _cross(axes[i], motion[j]))
 
-    upper_half = {(i, j): second(i, j) for i in range(DOFS_PER_LINK) for j in range(i, DOFS_PER_LINK)}
     dofs = range(DOFS_PER_LINK)
+    upper_half = {(i, j): second(i, j) for i in dofs for j in dofs[i:]}
     own = jnp.stack(along).reshape(DOFS_PER_LINK, N_CHAMBERS_PER_SECTION, n_sections, per_section)
     return Tendons(
         length=length.reshape(N_CHAMBERS_PER_SECTION, n_sections, -1).sum(-1).T.reshape(-1),

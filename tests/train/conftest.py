@@ -34,7 +34,7 @@ def short_env(imitation_config):
 
 @pytest.fixture(scope="session")
 def moving_env():
-    """The same arm in motion, two control periods an action."""
+    """The short arm in motion, two control periods an action."""
     motion = EnvConfig(
         mode="dynamic", observation="motion", goal_ends=False, dynamic_step_s=0.04, n_poses=256
     )

@@ -206,10 +206,12 @@ def way_figures(way_mm: Array, goal_mm: Array, period_s: float) -> tuple[Array, 
 
 def follow(env: ReachEnv, learner: Learner, policy: Any, path: Array, key: Array) -> Reached:
     """Return the results of one arm, from a random start, along a path (n, 6) of goals."""
-    _, reached = jax.lax.scan(
-        lambda state, goal: reach(env, learner, policy, state, goal), env.reset(key), path
-    )
-    return reached
+    return follow_from(env, learner, policy, path, env.reset(key))
+
+
+def follow_from(env: ReachEnv, learner: Learner, policy: Any, path: Array, state: State) -> Reached:
+    """Return the results of one arm, from a state, along a path (n, 6) of goals."""
+    return jax.lax.scan(lambda state, goal: reach(env, learner, policy, state, goal), state, path)[1]
 
 
 def summarise(workspace: Reached, even: Reached, circle: Reached, threshold: float) -> Summary:

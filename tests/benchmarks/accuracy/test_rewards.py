@@ -1,4 +1,4 @@
-"""What differs between kinds of reward, and how their runs are summarised."""
+"""Differences between kinds of reward, and the summary of their runs."""
 
 from benchmarks.accuracy.rewards import HAND_MADE, LEARNED, config_of, summary
 from train.config import to_dict

@@ -46,6 +46,17 @@ def indices(job, poses, off_mm=0.0):
     return distance.argmin(axis=1)
 
 
+def continued_bit_for_bit(job):
+    """Compare a run of six epochs with one that goes on after four; returns its state."""
+    whole, metrics = run(job, job.init(jax.random.PRNGKey(2)), 0, 6)
+    part, _ = run(job, job.init(jax.random.PRNGKey(2)), 0, 4)
+    part = jax.tree.map(jnp.asarray, jax.device_get(part))
+    resumed, _ = run(job, part, 4, 6)
+    assert job.n_traces == 1 and all(np.isfinite(value) for value in metrics.values())
+    jax.tree.map(np.testing.assert_array_equal, jax.device_get(whole), jax.device_get(resumed))
+    return whole
+
+
 def test_an_episode_goes_from_one_demonstrated_position_to_another(job):
     state = job.init(jax.random.PRNGKey(0))
     arm = state.arms.pipeline_state
@@ -75,13 +86,7 @@ def test_an_episode_in_motion_starts_at_rest_where_the_expert_held_the_arm(movin
 
 
 def test_a_run_in_motion_is_traced_once_and_continues_bit_for_bit(moving_job):
-    job = moving_job
-    whole, metrics = run(job, job.init(jax.random.PRNGKey(2)), 0, 6)
-    part, _ = run(job, job.init(jax.random.PRNGKey(2)), 0, 4)
-    part = jax.tree.map(jnp.asarray, jax.device_get(part))
-    resumed, _ = run(job, part, 4, 6)
-    assert job.n_traces == 1 and all(np.isfinite(value) for value in metrics.values())
-    jax.tree.map(np.testing.assert_array_equal, jax.device_get(whole), jax.device_get(resumed))
+    job, whole = moving_job, continued_bit_for_bit(moving_job)
     # A quarter of the actions were the expert's.
     stored = whole.memory.data
     expert = stored.action == np.asarray(job.learner.actions)[indices(job, stored.goal)]
@@ -109,12 +114,7 @@ def test_stages_change_the_goals_and_thin_the_replay(job):
 
 
 def test_a_run_is_traced_once_and_continues_bit_for_bit_across_a_stage(job):
-    whole, metrics = run(job, job.init(jax.random.PRNGKey(2)), 0, 6)
-    part, _ = run(job, job.init(jax.random.PRNGKey(2)), 0, 4)
-    part = jax.tree.map(jnp.asarray, jax.device_get(part))
-    resumed, _ = run(job, part, 4, 6)
-    assert job.n_traces == 1 and all(np.isfinite(value) for value in metrics.values())
-    jax.tree.map(np.testing.assert_array_equal, jax.device_get(whole), jax.device_get(resumed))
+    continued_bit_for_bit(job)
 
 
 def test_many_devices_learn_as_one_does_across_a_stage_and_a_balance(imitation_config, short_env, shown, job):
