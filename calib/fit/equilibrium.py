@@ -15,6 +15,7 @@ from jax import Array
 
 from calib.fit.parameters import marker_sites, with_numbers
 from calib.read.static_poses import StaticPoses
+from mjx_softarm._support import xla
 from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.mechanics.kinematics import Frames, chain_kinematics
 from mjx_softarm.mechanics.settle import RESIDUAL_TOLERANCE, settle_pressures
@@ -175,4 +176,4 @@ def _jacobian():
         slope, (error, left, chamber_m) = jax.jacfwd(errors, has_aux=True)(x)
         return error, slope, left < RESIDUAL_TOLERANCE, chamber_m
 
-    return jax.jit(jax.vmap(one, in_axes=(None, None, 0)))
+    return xla.jit(jax.vmap(one, in_axes=(None, None, 0)), uses_mjx=False)

@@ -22,6 +22,7 @@ from calib.errors import FitError
 from calib.fit.blocks import held_out_blocks
 from calib.fit.network import NetworkConfig, block_rows, fit_network
 from calib.fit.section_process import SectionProcess, Sections, fit_process, predict, sections
+from mjx_softarm._support import xla
 from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.settle import settle
@@ -129,7 +130,7 @@ def _settle():
             sections(kinematics(end.q), params, end.spring_m),
         )
 
-    return jax.jit(jax.vmap(one, in_axes=(None, 0)))
+    return xla.jit(jax.vmap(one, in_axes=(None, 0)), uses_mjx=False)
 
 
 def fit_s2r(

@@ -10,21 +10,24 @@ from typing import Any
 
 import jax
 
+# jaxlib 0.10 hands products to a library (YNNPACK) that makes learning on two cores a third slower.
+_CPU_OPTIONS = {"xla_cpu_experimental_ynn_fusion_type": ""}
+
 # Serial chains such as mjx.kinematics fall into a fusion trap of XLA's CPU emitters (jax >= 0.7), and
 # jaxlib 0.10 deadlocks on two cores with the concurrency-optimised scheduler.
-_CPU_OPTIONS = {
+_CPU_MJX_OPTIONS = {
     "xla_cpu_use_fusion_emitters": False,
     "xla_cpu_enable_concurrency_optimized_scheduler": False,
 }
 
 
 @functools.cache
-def compiler_options() -> dict[str, Any]:
+def compiler_options(uses_mjx: bool = True) -> dict[str, Any]:
     """Return the options for `jax.jit` that the installed jaxlib accepts; none on other devices than CPUs."""
     if jax.default_backend() != "cpu":
         return {}
     accepted = {}
-    for name, value in _CPU_OPTIONS.items():
+    for name, value in {**_CPU_OPTIONS, **(_CPU_MJX_OPTIONS if uses_mjx else {})}.items():
         try:
             jax.jit(lambda x: x + 1, compiler_options={name: value})(0)
         except (jax.errors.JaxRuntimeError, ValueError):  # an option that this jaxlib does not know
@@ -36,10 +39,10 @@ def compiler_options() -> dict[str, Any]:
 def jit(function: Callable, uses_mjx: bool = True, **kwargs: Any) -> Callable:
     """Compile with `jax.jit`, with this platform's options where the function uses MJX.
 
-    Without MJX the options do not help: the closed-form chain compiles well, and networks train about a tenth
-    slower with them.
+    Without MJX, its options do not help: the closed-form chain compiles well, and networks train about a
+    tenth slower with them.
     """
-    return jax.jit(function, compiler_options=compiler_options() if uses_mjx else None, **kwargs)
+    return jax.jit(function, compiler_options=compiler_options(uses_mjx), **kwargs)
 
 
 def enable_compilation_cache(directory: str | Path | None = None) -> Path:

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from mjx_softarm._support import xla
 from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.settle import Settled, settle_pressures
@@ -50,7 +51,7 @@ def _solver():
         kinematics = chain_kinematics(params)
         return settle_pressures(kinematics, params, pressure_kpa)
 
-    return jax.jit(jax.vmap(solve, in_axes=(None, 0)))
+    return xla.jit(jax.vmap(solve, in_axes=(None, 0)), uses_mjx=False)
 
 
 @functools.cache
@@ -65,7 +66,7 @@ def _loaded_solver():
         )
         return settle_pressures(chain_kinematics(params), params, pressure_kpa)
 
-    return jax.jit(jax.vmap(solve, in_axes=(None, 0, 0, 0, 0)))
+    return xla.jit(jax.vmap(solve, in_axes=(None, 0, 0, 0, 0)), uses_mjx=False)
 
 
 def settle_many(spec: ArmSpec, pressure_kpa: np.ndarray) -> Settled:

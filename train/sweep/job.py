@@ -119,7 +119,8 @@ class SweepJob:
 
     def member_shapes(self) -> TrainState:
         """Return the shapes of a member's state."""
-        return jax.eval_shape(self.member, jax.eval_shape(self.init), 0)
+        states = jax.eval_shape(self._init_all, self.keys, self.numbers)
+        return jax.eval_shape(self.member, states, 0)
 
     def together(self, members: Sequence[TrainState]) -> TrainState:
         """Return the state of all members from the states of each."""
