@@ -1,6 +1,7 @@
 """Many small matrices at once: products, block diagonals, elimination.
 
-Libraries are called once for each matrix, which costs more than the arithmetic of a small one.
+Libraries are called once for each matrix, which costs more than the arithmetic of a small one. Matrices of
+many arms have the arms last, (n, m, *arms), so that one instruction serves several arms; *arms may be empty.
 """
 
 from __future__ import annotations
@@ -16,36 +17,48 @@ WRITTEN_OUT = 4  # terms of an inner product that are added one by one, which is
 
 
 def product(a: Array, b: Array) -> Array:
-    """Multiply small matrices (..., n, m) and (..., m, k), as sums: faster than products when tiny."""
-    if a.shape[-1] <= WRITTEN_OUT:
-        return functools.reduce(
-            jnp.add, [a[..., :, k, None] * b[..., k, None, :] for k in range(a.shape[-1])]
-        )
-    return jnp.sum(a[..., :, :, None] * b[..., None, :, :], axis=-2)
+    """Multiply small matrices (n, m, *arms) and (m, k, *arms), as sums: faster than products when tiny."""
+    if len(b) <= WRITTEN_OUT:
+        return functools.reduce(jnp.add, [a[:, j, None] * b[j] for j in range(len(b))])
+    return jnp.sum(a[:, :, None] * b, axis=1)
+
+
+products = jax.vmap(product)  # of matrices (k, n, m, *arms) and (k, m, l, *arms)
+
+
+def identity(n: int, like: Array) -> Array:
+    """Return the identity (n, n, 1, ..., 1), with a 1 for each axis of arms of a matrix like these."""
+    return jnp.eye(n, dtype=like.dtype).reshape(n, n, *[1] * (like.ndim - 2))
 
 
 def block_diagonal(blocks: Array) -> Array:
-    """Return the block-diagonal matrix (n rows, n columns) of blocks (n, rows, columns)."""
-    n, rows, columns = blocks.shape
-    apart = jnp.eye(n, dtype=blocks.dtype)[:, None, :, None] * blocks[:, :, None]
-    return apart.reshape(n * rows, n * columns)
+    """Return the block-diagonal matrix (n rows, n columns, *arms) of blocks (n, rows, columns, *arms)."""
+    n, rows, columns, *arms = blocks.shape
+    apart = identity(n, blocks[0])[:, None, :, None] * blocks[:, :, None]
+    return apart.reshape(n * rows, n * columns, *arms)
 
 
-@jax.custom_batching.custom_vmap
 def eliminate(matrix: Array, columns: Array) -> Array:
-    """Multiply the inverse of a matrix (n, n) by columns (n, k): Gauss-Jordan, without pivoting.
+    """Multiply the inverse of a matrix (n, n, *arms) by columns (n, k, *arms): Gauss-Jordan, no pivoting.
 
     It is meant for symmetric positive definite matrices and for nearly such ones: the response of a settling
     arm's springs to their chambers, with rows of the identity for chambers at a limit.
 
     Returns:
-        (n, k), all NaN if a pivot is not positive, which is so where a symmetric matrix is not positive
-        definite.
+        (n, k, *arms), all NaN if a pivot is not positive, which is so where a symmetric matrix is not
+        positive definite.
     """
+    if matrix.ndim == 2:
+        return _eliminate_one(matrix, columns)
+    return _eliminate_last(jnp.concatenate([matrix, columns], axis=1))
+
+
+@jax.custom_batching.custom_vmap
+def _eliminate_one(matrix: Array, columns: Array) -> Array:
     return _eliminate_last(jnp.concatenate([matrix, columns], axis=1)[..., None])[..., 0]
 
 
-@eliminate.def_vmap
+@_eliminate_one.def_vmap
 def _eliminate_many(n: int, batched: list[bool], matrix: Array, columns: Array) -> tuple[Array, bool]:
     parts = [
         jnp.moveaxis(part, 0, -1) if own else jnp.broadcast_to(part[..., None], (*part.shape, n))
@@ -84,23 +97,18 @@ def _eliminate_last(augmented: Array) -> Array:
     augmented = jax.lax.optimization_barrier(augmented)
     for first in range(0, n, BLOCK):
         block = slice(first, min(first + BLOCK, n))
-        rows = _product_last(_inverse_last(augmented[block, block]), augmented[block])
+        rows = product(_inverse_last(augmented[block, block]), augmented[block])
         rows = jax.lax.optimization_barrier(rows)
-        augmented = (augmented - _product_last(augmented[:, block], rows)).at[block].set(rows)
+        augmented = (augmented - product(augmented[:, block], rows)).at[block].set(rows)
     return augmented[:, n:]
 
 
 def _inverse_last(matrix: Array) -> Array:
     """Invert matrices (n, n, batch) with positive pivots; n is small, since all is written out."""
     n = matrix.shape[0]
-    identity = jnp.broadcast_to(jnp.eye(n, dtype=matrix.dtype)[..., None], matrix.shape)
-    rows = list(jnp.concatenate([matrix, identity], axis=1))
+    beside = jnp.broadcast_to(identity(n, matrix), matrix.shape)
+    rows = list(jnp.concatenate([matrix, beside], axis=1))
     for k in range(n):
         row = rows[k] / jnp.where(rows[k][k] > 0, rows[k][k], jnp.nan)
         rows = [row if other == k else rows[other] - rows[other][k] * row for other in range(n)]
     return jnp.stack(rows)[:, n:]
-
-
-def _product_last(a: Array, b: Array) -> Array:
-    """Multiply matrices (n, m, batch) and (m, k, batch); m is small, since all is written out."""
-    return functools.reduce(jnp.add, [a[:, j, None] * b[j] for j in range(len(b))])

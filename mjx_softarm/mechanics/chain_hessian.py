@@ -16,20 +16,23 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from mjx_softarm._support.small_matrices import block_diagonal, eliminate, product
+from mjx_softarm._support.small_matrices import block_diagonal, eliminate, identity, product
 
 RANK = 2  # of what couples two sections
 
 
 class ChainHessian(NamedTuple):
-    """A symmetric matrix in blocks; the block of sections s < t is `above[s] @ below[t].T`."""
+    """A symmetric matrix in blocks; the block of sections s < t is `above[s] @ below[t].T`.
 
-    own: Array  # (n_sections, n, n) blocks of each section's n joints
-    above: Array  # (n_sections, n, 2)
-    below: Array  # (n_sections, n, 2)
+    Matrices of many arms have the arms last; *arms may be empty.
+    """
+
+    own: Array  # (n_sections, n, n, *arms) blocks of each section's n joints
+    above: Array  # (n_sections, n, 2, *arms)
+    below: Array  # (n_sections, n, 2, *arms)
 
     def dense(self) -> Array:
-        """Return the whole matrix (nv, nv)."""
+        """Return the whole matrix (nv, nv) of one arm."""
         n_sections, n, _ = self.own.shape
         section = jnp.repeat(jnp.arange(n_sections), n)
         above, below = (x.reshape(-1, RANK) for x in (self.above, self.below))
@@ -38,21 +41,23 @@ class ChainHessian(NamedTuple):
         return block_diagonal(self.own) + far + far.T
 
     def plus_diagonal(self, added: Array) -> ChainHessian:
-        """Return the matrix with `added` (nv,) on its diagonal."""
-        n_sections, n, _ = self.own.shape
-        return self._replace(own=self.own + added.reshape(n_sections, n, 1) * jnp.eye(n, dtype=added.dtype))
+        """Return the matrix with `added` (nv, *arms) on its diagonal."""
+        n_sections, n = self.own.shape[:2]
+        diagonal = added.reshape(n_sections, n, 1, *added.shape[1:]) * identity(n, self.own[0])
+        return self._replace(own=self.own + diagonal)
 
     def solve(self, columns: Array) -> Array:
-        """Return the inverse times columns (n_sections, n, k), in that form; NaN if not positive definite."""
+        """Return the inverse times columns (n_sections, n, k, *arms); NaN if not positive definite."""
         # From the tip to the base: eliminate each section, and add its reaction to those above
-        reaction = jnp.zeros((RANK, RANK), columns.dtype)  # of all sections further down
-        pull = jnp.zeros((RANK, columns.shape[-1]), columns.dtype)  # of their columns
+        k, *arms = columns.shape[2:]
+        reaction = jnp.zeros((RANK, RANK, *arms), columns.dtype)  # of all sections further down
+        pull = jnp.zeros((RANK, k, *arms), columns.dtype)  # of their columns
         reduced = []
         for own, above, below, column in reversed(list(zip(*self, columns, strict=True))):
             acted = product(above, reaction)
             right = jnp.concatenate([below - acted, column - product(above, pull)], axis=1)
-            solved = eliminate(own - product(acted, above.T), right)
-            passed_on = product((below - acted).T, solved)
+            solved = eliminate(own - product(acted, jnp.swapaxes(above, 0, 1)), right)
+            passed_on = product(jnp.swapaxes(below - acted, 0, 1), solved)
             reaction, pull = reaction + passed_on[:, :RANK], pull + passed_on[:, RANK:]
             reduced.append(solved)
         # From the base to the tip: substitute
@@ -60,5 +65,5 @@ class ChainHessian(NamedTuple):
         found = []
         for above, solved in zip(self.above, reversed(reduced), strict=True):
             found.append(solved[:, RANK:] - product(solved[:, :RANK], motion))
-            motion = motion + product(above.T, found[-1])
+            motion = motion + product(jnp.swapaxes(above, 0, 1), found[-1])
         return jnp.stack(found)

@@ -35,7 +35,7 @@ from jax import Array
 
 from mjx_softarm import control, pneumatics
 from mjx_softarm._support.mjx import mjx
-from mjx_softarm._support.small_matrices import block_diagonal, product, solve
+from mjx_softarm._support.small_matrices import block_diagonal, products, solve
 from mjx_softarm.mechanics.kinematics import Frames, Kinematics
 from mjx_softarm.mechanics.settle import Result
 from mjx_softarm.mechanics.statics import ArmParams, Tendons, all_tendons, statics_of
@@ -222,7 +222,7 @@ def _step(arm: MovingArm, motion: Motion, command_kpa: Array, k: int, h: float) 
 
     def volume_m3(moved: Array) -> Array:
         """Return the chambers' volumes (n_chambers,) at joint displacements (nv,) from the middle."""
-        along = product(jacobian[0], moved.reshape(params.n_sections, -1, 1)).reshape(-1)
+        along = products(jacobian[0], moved.reshape(params.n_sections, -1, 1)).reshape(-1)
         area = params.area / N_PER_KPA_M2, params.area_slope / N_PER_KPA_M2
         return pneumatics.volume_m3(now.chamber_m + along, *area, params.section_length_m)
 
@@ -246,7 +246,7 @@ def _step(arm: MovingArm, motion: Motion, command_kpa: Array, k: int, h: float) 
         pneumatics.ATMOSPHERE_KPA / N_PER_KPA_M2 * gas_m3 * (potential.area / middle_m3) ** 2
     )  # (n_chambers,) [N/m]
     pushed = jacobian[0] * gas.reshape(params.n_sections, -1, 1)
-    stiffness_of_gas = block_diagonal(product(jnp.swapaxes(jacobian[0], 1, 2), pushed))
+    stiffness_of_gas = block_diagonal(products(jnp.swapaxes(jacobian[0], 1, 2), pushed))
 
     # The linearised midpoint rule
     force = potential.gradient + bias + damping @ v
@@ -267,10 +267,10 @@ def _dampers(arm: MovingArm, jacobian: Array, v: Array) -> Array:
     tendon = arm.model.tendon_damping.reshape(jacobian.shape[1], -1, 2)  # (n_sections, 3, 2)
     rows = jnp.concatenate(list(jacobian), axis=1)  # (n_sections, 6, n)
     scaled = jnp.concatenate([tendon[..., :1] * jacobian[0], tendon[..., 1:] * jacobian[1]], axis=1)
-    own = block_diagonal(product(jnp.swapaxes(rows, 1, 2), scaled))
-    rate = product(jacobian[0], v.reshape(len(tendon), -1, 1))  # (n_sections, 3, 1) [m/s] of the chambers
+    own = block_diagonal(products(jnp.swapaxes(rows, 1, 2), scaled))
+    rate = products(jacobian[0], v.reshape(len(tendon), -1, 1))  # (n_sections, 3, 1) [m/s] of the chambers
     secant = arm.own.friction_n / jnp.sqrt(rate**2 + CREEP_M_PER_S**2)
-    friction = block_diagonal(product(jnp.swapaxes(jacobian[0], 1, 2), secant * jacobian[0]))
+    friction = block_diagonal(products(jnp.swapaxes(jacobian[0], 1, 2), secant * jacobian[0]))
     return arm.own.damping * (own + jnp.diag(arm.model.dof_damping)) + friction
 
 

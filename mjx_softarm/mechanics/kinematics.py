@@ -4,10 +4,14 @@ The arm is a chain of links. Each link joins a plate to the next one by a slide 
 parent plate's -z (positive = extension) and two perpendicular hinges, x then y, half a link below;
 joint coordinates are `q (3 * n_links,)`, ordered (slide [m], hinge x [rad], hinge y [rad]) link by link.
 Both functions of this module return the same `Frames`; everything downstream is shared.
+
+Many arms at once come last in every shape, (..., *arms), where one instruction serves several of them;
+*arms is empty for one arm.
 """
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -17,7 +21,7 @@ import numpy as np
 from jax import Array
 
 from mjx_softarm._support.mjx import mjx
-from mjx_softarm._support.small_matrices import product
+from mjx_softarm._support.small_matrices import product, products
 from mjx_softarm.sensing.pose import rotation_from_quaternion
 
 if TYPE_CHECKING:
@@ -43,15 +47,15 @@ LEVEL = Mount(
 class Frames(NamedTuple):
     """Poses of the arm's plates and joints in the base frame (z up)."""
 
-    plate_position: Array  # (n_links + 1, 3) [m], the first is the base
-    plate_rotation: Array  # (n_links + 1, 3, 3), columns are the plate's axes
-    axis: Array  # (n_links, 3 dofs, 3), unit vectors: slide, hinge x, hinge y
-    anchor: Array  # (n_links, 3) [m], the point both hinges turn about
-    tip_position: Array  # (3,) [m]
-    tip_rotation: Array  # (3, 3)
+    plate_position: Array  # (n_links + 1, 3, *arms) [m], the first is the base
+    plate_rotation: Array  # (n_links + 1, 3, 3, *arms), columns are the plate's axes
+    axis: Array  # (n_links, 3 dofs, 3, *arms), unit vectors: slide, hinge x, hinge y
+    anchor: Array  # (n_links, 3, *arms) [m], the point both hinges turn about
+    tip_position: Array  # (3, *arms) [m]
+    tip_rotation: Array  # (3, 3, *arms)
 
 
-Kinematics = Callable[[Array], Frames]  # joint coordinates (nv,) [m, rad, rad] -> Frames
+Kinematics = Callable[[Array], Frames]  # joint coordinates (nv, *arms) [m, rad, rad] -> Frames
 
 
 def chain_kinematics(params: ArmParams) -> Kinematics:
@@ -68,20 +72,22 @@ def chain_frames(q: Array, link_length_m: Array | float, mount: Mount = LEVEL) -
     """Return the frames in closed form: products of the links' rotations, sums of the links' vectors.
 
     Args:
-        q (3 * n_links,): joint coordinates [m, rad, rad].
+        q (3 * n_links, *arms): joint coordinates [m, rad, rad].
         link_length_m: distance of two plates at rest.
         mount: of base and tip.
     """
-    slide, bend_x, bend_y = jnp.moveaxis(q.reshape(-1, DOFS_PER_LINK), -1, 0)  # (L,) each
-    base = jnp.asarray(mount.base_rotation, q.dtype)
-    local = _rotation_xy(bend_x, bend_y)  # (L, 3, 3)
-    rotation = product(base, jax.lax.associative_scan(product, local))  # (L, 3, 3)
+    arms = q.shape[1:]
+    slide, bend_x, bend_y = jnp.moveaxis(q.reshape(-1, DOFS_PER_LINK, *arms), 1, 0)  # (L, *arms) each
+    base = jnp.broadcast_to(jnp.asarray(mount.base_rotation, q.dtype), (3, 3, *arms))
+    local = _rotation_xy(bend_x, bend_y)  # (L, 3, 3, *arms)
+    chained = jax.lax.associative_scan(products, local)
+    rotation = jax.vmap(product, in_axes=(None, 0))(base, chained)
     plate_rotation = jnp.concatenate([base[None], rotation])
     parent, child = plate_rotation[:-1], plate_rotation[1:]
     half = 0.5 * link_length_m
     to_anchor = -(half + slide)[:, None] * parent[:, :, 2]
     to_plate = to_anchor - half * child[:, :, 2]
-    start = jnp.asarray(mount.base_position_m, q.dtype)
+    start = jnp.broadcast_to(jnp.asarray(mount.base_position_m, q.dtype), (3, *arms))
     plate_position = jnp.concatenate([start[None], start + jnp.cumsum(to_plate, axis=0)])
     cos, sin = jnp.cos(bend_x)[:, None], jnp.sin(bend_x)[:, None]
     axis_y = cos * parent[:, :, 1] + sin * parent[:, :, 2]
@@ -92,17 +98,17 @@ def chain_frames(q: Array, link_length_m: Array | float, mount: Mount = LEVEL) -
         plate_rotation,
         axis,
         anchor=plate_position[:-1] + to_anchor,
-        tip_position=plate_position[-1] + jnp.sum(last * jnp.asarray(mount.tip_offset_m, q.dtype), axis=-1),
+        tip_position=plate_position[-1] + jnp.sum(last * jnp.asarray(mount.tip_offset_m, q.dtype), axis=1),
         tip_rotation=product(last, jnp.asarray(mount.tip_rotation, q.dtype)),
     )
 
 
 def _rotation_xy(x: Array, y: Array) -> Array:
-    """Return Rx(x) Ry(y), (..., 3, 3)."""
+    """Return Rx(x) Ry(y), (L, 3, 3, *arms)."""
     cx, sx, cy, sy = jnp.cos(x), jnp.sin(x), jnp.cos(y), jnp.sin(y)
     zero = jnp.zeros_like(x)
     rows = [[cy, zero, sy], [sx * sy, cx, -sx * cy], [-cx * sy, sx, cx * cy]]
-    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+    return jnp.stack([jnp.stack(row, axis=1) for row in rows], axis=1)
 
 
 def mjx_frames(model: mjx.Model, q: Array) -> Frames:
@@ -111,9 +117,11 @@ def mjx_frames(model: mjx.Model, q: Array) -> Frames:
     Args:
         model: the compiled arm on the device; its first bodies are the world and the links in order, its
             first geometries the rings, its last site the tip.
-        q (3 * n_links,): joint coordinates [m, rad, rad].
+        q (3 * n_links, *arms): joint coordinates [m, rad, rad].
     """
-    n_links = q.shape[-1] // DOFS_PER_LINK
+    if q.ndim > 1:
+        return jax.vmap(functools.partial(mjx_frames, model), in_axes=-1, out_axes=-1)(q)
+    n_links = len(q) // DOFS_PER_LINK
     data = mjx.kinematics(model, mjx.make_data(model).replace(qpos=q))
     links = slice(1, n_links + 1)
     rotation = data.xmat[links].reshape(n_links, 3, 3)

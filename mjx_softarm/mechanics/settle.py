@@ -15,16 +15,18 @@ Source: primal-dual active set as semismooth Newton, Hintermueller, Ito, Kunisch
 from __future__ import annotations
 
 import enum
-from typing import NamedTuple
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 from jax.custom_derivatives import zero_from_primal
 
-from mjx_softarm._support.small_matrices import eliminate, product
+from mjx_softarm._support.small_matrices import eliminate, identity, products
 from mjx_softarm.mechanics.implicit import Equilibrium, Response, equilibrium_tangents
-from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK, Kinematics
+from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK, Kinematics, mjx_frames
 from mjx_softarm.mechanics.statics import ArmParams, statics
 
 MAX_ITERATIONS = 12
@@ -80,13 +82,17 @@ class Settled(NamedTuple):
 
 
 class _Iterate(NamedTuple):
-    q: Array  # (nv,)
-    pressure: Array  # (n_chambers,) [kPa]
-    at_limit: Array  # (n_chambers,) bool, the active set of the last step
+    q: Array  # (nv, *arms)
+    pressure: Array  # (n_chambers, *arms) [kPa]
+    at_limit: Array  # (n_chambers, *arms) bool, the active set of the last step
     response: Response  # before the last step
-    n_small: Array  # () int, small steps without a change of the active set, since the last other one
-    stiffening: Array  # () joint stiffness added, in parts of it, where the energy is not convex
-    iteration: Array  # ()
+    n_small: Array  # arms, int: small steps without a change of the active set, since the last other one
+    stiffening: Array  # arms: joint stiffness added, in parts of it, where the energy is not convex
+    iteration: Array  # arms, int
+
+    def goes_on(self, n_small: int) -> Array:
+        """Return which arms need another step to have `n_small` small ones: arms, bool."""
+        return (self.n_small < n_small) & (self.iteration < MAX_ITERATIONS + n_small - 1)
 
 
 @jax.custom_jvp
@@ -102,11 +108,11 @@ def settle(kinematics: Kinematics, params: ArmParams, reference_m: Array) -> Set
         params: numbers of the arm.
         reference_m (n_chambers,): spring lengths that the law tracks.
     """
-    return _solve(kinematics, params, reference_m)[0]
+    return _solver(n_small=1)(kinematics, params, reference_m)[0]
 
 
 def _settle_jvp(primals: tuple, tangents: tuple) -> tuple[Settled, Settled]:
-    found, end = _solve(*primals, n_small=2)  # the second small step only brings the response up to date
+    found, end = _solver(n_small=2)(*primals)  # the second small step only brings the response up to date
     with jax.default_matmul_precision("highest"):
         change = equilibrium_tangents(primals, tangents, end, found.settled)
     none = Settled(*(zero_from_primal(field, symbolic_zeros=True) for field in found))
@@ -116,27 +122,53 @@ def _settle_jvp(primals: tuple, tangents: tuple) -> tuple[Settled, Settled]:
 settle.defjvp(_settle_jvp, symbolic_zeros=True)
 
 
+@functools.cache
+def _solver(n_small: int) -> Callable[[Kinematics, ArmParams, Array], tuple[Settled, Equilibrium]]:
+    """Return `_solve`, which with `jax.vmap` solves many arms at once, the arms last."""
+    solve = jax.custom_batching.custom_vmap(functools.partial(_solve, n_small))
+
+    def many(n: int, batched: list[Any], kinematics: Kinematics, params: ArmParams, reference_m: Array):
+        def arms_last(x: Any, own: bool) -> Array:
+            return jnp.moveaxis(x, 0, -1) if own else jnp.asarray(x)[..., None]
+
+        kinematics_own, params_own, reference_own = batched
+        if kinematics.func is not mjx_frames:  # which has no numbers that differ from arm to arm
+            kinematics = jax.tree.map(arms_last, kinematics, kinematics_own)
+        reference_m = arms_last(reference_m, reference_own)
+        reference_m = jnp.broadcast_to(reference_m, (*reference_m.shape[:-1], n))
+        found = _solve(n_small, kinematics, jax.tree.map(arms_last, params, params_own), reference_m)
+        return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), found), jax.tree.map(lambda _: True, found)
+
+    solve.def_vmap(many)
+    return solve
+
+
 def _solve(
-    kinematics: Kinematics, params: ArmParams, reference_m: Array, n_small: int = 1
+    n_small: int, kinematics: Kinematics, params: ArmParams, reference_m: Array
 ) -> tuple[Settled, Equilibrium]:
     """Return the equilibrium after `n_small` small steps, and all that its derivative needs."""
-    dtype = params.link_length_m.dtype
+    dtype, arms = params.link_length_m.dtype, reference_m.shape[1:]
     nv, n_chambers = params.link_mass_kg.shape[0] * DOFS_PER_LINK, params.area.shape[0]
+    none = jnp.zeros((n_chambers, *arms), dtype)
     start = _Iterate(
-        q=jnp.zeros(nv, dtype),
-        pressure=jnp.clip(jnp.zeros_like(params.area), params.pressure_min_kpa, params.pressure_max_kpa),
-        at_limit=jnp.zeros(params.area.shape, bool),
-        response=Response(jnp.zeros((nv, n_chambers), dtype), jnp.zeros((n_chambers, n_chambers), dtype)),
-        n_small=jnp.array(0),
-        stiffening=jnp.zeros((), dtype),
-        iteration=jnp.array(0),
+        q=jnp.zeros((nv, *arms), dtype),
+        pressure=jnp.clip(none, params.pressure_min_kpa, params.pressure_max_kpa),
+        at_limit=none.astype(bool),
+        response=Response(
+            jnp.zeros((nv, n_chambers, *arms), dtype), jnp.zeros((n_chambers, n_chambers, *arms), dtype)
+        ),
+        n_small=jnp.zeros(arms, int),
+        stiffening=jnp.zeros(arms, dtype),
+        iteration=jnp.zeros(arms, int),
     )
+
+    def go_on(it: _Iterate) -> _Iterate:
+        new = _newton_step(it, kinematics, params, reference_m)
+        goes_on = it.goes_on(n_small)
+        return jax.tree.map(lambda x, old: jnp.where(goes_on, x, old), new, it)
+
     with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
-        end = jax.lax.while_loop(
-            lambda it: (it.n_small < n_small) & (it.iteration < MAX_ITERATIONS + n_small - 1),
-            lambda it: _newton_step(it, kinematics, params, reference_m),
-            start,
-        )
+        end = jax.lax.while_loop(lambda it: jnp.any(it.goes_on(n_small)), go_on, start)
         return _report(end, kinematics, params, reference_m)
 
 
@@ -165,28 +197,29 @@ def _newton_step(it: _Iterate, kinematics: Kinematics, params: ArmParams, refere
 
     # Joints: H dq = B dp - grad V, so that dq = newton_step + dq_dp dp
     hessian = here.hessian.plus_diagonal(it.stiffening * params.joint_stiffness)
-    gradient = here.gradient.reshape(params.n_sections, -1, 1)
-    solved = hessian.solve(jnp.concatenate([-gradient, here.push_per_kpa], axis=-1))
-    newton_step, dq_dp = solved[..., 0], solved[..., 1:]
+    push, arms = here.push_per_kpa, error.shape[1:]
+    gradient = here.gradient.reshape(*push.shape[:2], 1, *arms)
+    solved = hessian.solve(jnp.concatenate([-gradient, push], axis=2))
+    newton_step, dq_dp = solved[:, :, 0], solved[:, :, 1:]
 
     # Pressures: each chamber closes its spring's error or goes to its limit
-    spring_response = product(here.springs.jacobian, solved).reshape(len(error), -1)
+    spring_response = products(here.springs.jacobian, solved).reshape(len(error), -1, *arms)
     newton_spring, dspring_dp = spring_response[:, 0], spring_response[:, 1:]
-    rows = jnp.where(at_limit[:, None], jnp.eye(len(error), dtype=dspring_dp.dtype), dspring_dp)
+    rows = jnp.where(at_limit[:, None], identity(len(error), dspring_dp), dspring_dp)
     residual = jax.lax.select(at_limit, limit - it.pressure, error - newton_spring)
     dp = eliminate(rows, residual[:, None])[:, 0]
-    dq = (newton_step + jnp.sum(dq_dp * dp, axis=-1)).reshape(-1)
+    dq = (newton_step + jnp.sum(dq_dp * dp, axis=2)).reshape(it.q.shape)
 
     # Step length; where the energy is not convex, or springs do not follow chambers: no step, stiffer joints
-    largest = jnp.max(jnp.abs(dq))
+    largest = jnp.max(jnp.abs(dq), axis=0)
     scale = jnp.minimum(1.0, MAX_STEP / largest)
-    convex = jnp.all(jnp.isfinite(dq))  # XLA's maximum passes over some NaN, with jax 0.12 on a CPU
-    small = jnp.all(at_limit == it.at_limit) & (largest < SMALL_STEP) & (it.stiffening == 0)
+    convex = jnp.all(jnp.isfinite(dq), axis=0)  # XLA's maximum passes over some NaN, with jax 0.12 on a CPU
+    small = jnp.all(at_limit == it.at_limit, axis=0) & (largest < SMALL_STEP) & (it.stiffening == 0)
     return _Iterate(
-        q=jax.lax.select(convex, it.q + scale * dq, it.q),
-        pressure=jax.lax.select(convex, it.pressure + scale * dp, it.pressure),
+        q=jnp.where(convex, it.q + scale * dq, it.q),
+        pressure=jnp.where(convex, it.pressure + scale * dp, it.pressure),
         at_limit=at_limit,
-        response=Response(dq_dp.reshape(-1, len(error)), dspring_dp),
+        response=Response(dq_dp.reshape(it.response.dq_dp.shape), dspring_dp),
         n_small=jnp.where(small, it.n_small + 1, 0),
         stiffening=jnp.where(convex, 0.0, 4.0 * it.stiffening + 4.0),
         iteration=it.iteration + 1,
@@ -200,17 +233,17 @@ def _report(
     pressure = jnp.clip(it.pressure, params.pressure_min_kpa, params.pressure_max_kpa)
     frames = kinematics(it.q)
     here = statics(frames, it.q, pressure, params)
-    residual = jnp.max(jnp.abs(here.gradient))
+    residual = jnp.max(jnp.abs(here.gradient), axis=0)
 
     # Errors of the law: of a chamber at a limit only those that would take it away from the limit
     error = reference_m - here.springs.length
     at_limit = (pressure <= params.pressure_min_kpa) | (pressure >= params.pressure_max_kpa)
     outward = jnp.where(pressure >= params.pressure_max_kpa, error, -error)
     off = jnp.where(at_limit, jnp.maximum(-outward, 0.0), jnp.abs(error))
-    tracking = jnp.max(jnp.where(params.pinned, 0.0, off))
+    tracking = jnp.max(jnp.where(params.pinned, 0.0, off), axis=0)
 
     good = (residual < RESIDUAL_TOLERANCE) & (tracking < TRACKING_TOLERANCE_M)
-    finite = jnp.all(jnp.isfinite(here.gradient)) & jnp.all(jnp.isfinite(error))
+    finite = jnp.all(jnp.isfinite(here.gradient), axis=0) & jnp.all(jnp.isfinite(error), axis=0)
     result = jnp.select(
         [~finite, good, it.stiffening > 0],
         [SettleResult.NOT_FINITE.value, SettleResult.CONVERGED.value, SettleResult.NOT_CONVEX.value],

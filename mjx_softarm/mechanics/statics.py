@@ -7,6 +7,9 @@ At given pressures p the arm is conservative. With l the chamber lengths and s t
 where W' = area_m2 + area_slope_m (l - l_rest) is a chamber's effective area, so that p W is the work of
 its air. A tendon runs from ring to ring, so the piece of it inside a link depends on that link's
 three joints alone, and its length on those of its section; only gravity couples different sections.
+
+Many arms at once come last in every shape, (..., *arms), as in `mjx_softarm.mechanics.kinematics`; a number
+that all of them share has a 1 in their place.
 """
 
 from __future__ import annotations
@@ -19,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from mjx_softarm._support.small_matrices import block_diagonal, product
+from mjx_softarm._support.small_matrices import block_diagonal, products
 from mjx_softarm.mechanics.body import hole_directions
 from mjx_softarm.mechanics.chain_hessian import ChainHessian
 from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK, Frames, Mount
@@ -110,26 +113,26 @@ def _mount(spec: ArmSpec, dtype: np.typing.DTypeLike) -> Mount:
 class Tendons(NamedTuple):
     """Lengths of a set of tendons with their first and second derivatives, by the joints they depend on."""
 
-    length: Array  # (n_chambers,) [m]
-    jacobian: Array  # (n_sections, 3 tendons, n) by the n joints of the tendons' section
-    link_hessian: Array  # (3 dofs, 3 dofs, 3 tendons, n_links) by the joints of a link
+    length: Array  # (n_chambers, *arms) [m]
+    jacobian: Array  # (n_sections, 3 tendons, n, *arms) by the n joints of the tendons' section
+    link_hessian: Array  # (3 dofs, 3 dofs, 3 tendons, n_links, *arms) by the joints of a link
 
 
 class Statics(NamedTuple):
     """Derivatives of the potential at given joint coordinates and pressures."""
 
-    gradient: Array  # (nv,) [N, N m]
+    gradient: Array  # (nv, *arms) [N, N m]
     hessian: ChainHessian
     chambers: Tendons
     springs: Tendons
-    area: Array  # (n_chambers,) [N/kPa] effective areas at these lengths
+    area: Array  # (n_chambers, *arms) [N/kPa] effective areas at these lengths
 
     @property
     def push_per_kpa(self) -> Array:
-        """(n_sections, n, n_chambers) generalised force of each chamber on the joints of each section."""
-        n_sections, n_chambers = self.area.shape[0] // N_CHAMBERS_PER_SECTION, self.area.shape[0]
-        push = self.chambers.jacobian * self.area.reshape(n_sections, -1, 1)
-        return block_diagonal(jnp.swapaxes(push, 1, 2)).reshape(n_sections, -1, n_chambers)
+        """(n_sections, n, n_chambers, *arms) generalised force of each chamber on each section's joints."""
+        n_sections, _, n, *arms = self.chambers.jacobian.shape
+        push = self.chambers.jacobian * self.area.reshape(n_sections, -1, 1, *arms)
+        return block_diagonal(jnp.swapaxes(push, 1, 2)).reshape(n_sections, n, -1, *arms)
 
 
 @jax.jit  # inlined where it is compiled; traced once for all of its callers
@@ -138,8 +141,8 @@ def statics(frames: Frames, q: Array, pressure_kpa: Array, params: ArmParams) ->
 
     Args:
         frames: of `q`, from either engine.
-        q (nv,): joint coordinates [m, rad, rad].
-        pressure_kpa (n_chambers,): chamber pressures.
+        q (nv, *arms): joint coordinates [m, rad, rad].
+        pressure_kpa (n_chambers, *arms): chamber pressures.
         params: numbers of the arm.
     """
     return statics_of(all_tendons(frames, params), frames, q, pressure_kpa, params)
@@ -160,60 +163,64 @@ def statics_of(both: Tendons, frames: Frames, q: Array, pressure_kpa: Array, par
             params.chamber_stiffness * (chambers.length - params.chamber_rest_m) - area * pressure_kpa,
             params.spring_stiffness * (springs.length - params.spring_rest_m),
         ]
-    ).reshape(2, params.n_sections, N_CHAMBERS_PER_SECTION)
-    slope = jnp.stack(
-        [params.chamber_stiffness - params.area_slope * pressure_kpa, params.spring_stiffness]
-    ).reshape(tension.shape)
+    ).reshape(2, params.n_sections, N_CHAMBERS_PER_SECTION, *q.shape[1:])
+    of_chambers = params.chamber_stiffness - params.area_slope * pressure_kpa
+    slope = jnp.stack([of_chambers, jnp.broadcast_to(params.spring_stiffness, of_chambers.shape)])
+    slope = slope.reshape(tension.shape)
     weight, hessian = _gravity(frames, params)
-    pull = jnp.sum(tension[..., None] * both.jacobian, axis=(0, 2))  # (n_sections, n)
-    gradient = weight + params.joint_stiffness * q + pull.reshape(-1)
+    pull = jnp.sum(tension[:, :, :, None] * both.jacobian, axis=(0, 2))  # (n_sections, n, *arms)
+    gradient = weight + params.joint_stiffness * q + pull.reshape(q.shape)
     own = hessian.own + _bending(tension, both.link_hessian) + _stretching(slope, both.jacobian)
     hessian = hessian._replace(own=own).plus_diagonal(params.joint_stiffness)
     return Statics(gradient, hessian, chambers, springs, area)
 
 
 def _bending(tension: Array, link_hessian: Array) -> Array:
-    """Sum tensions (2, n_sections, 3) times second derivatives of the lengths: (n_sections, n, n)."""
-    n_sections = tension.shape[1]
-    per_section = link_hessian.shape[-1] // n_sections
-    per_link = jnp.repeat(jnp.swapaxes(tension, 1, 2), per_section, axis=-1)  # (2, 3 tendons, n_links)
-    links = jnp.sum(per_link[:, None, None] * link_hessian, axis=(0, 3))  # (3 dofs, 3 dofs, n_links)
-    blocks = jnp.moveaxis(links, -1, 0).reshape(n_sections, per_section, DOFS_PER_LINK, DOFS_PER_LINK)
+    """Sum tensions (2, n_sections, 3, *arms) times second derivatives of the lengths.
+
+    Returns:
+        (n_sections, n, n, *arms).
+    """
+    n_sections, _, *arms = tension.shape[1:]
+    per_section = link_hessian.shape[4] // n_sections
+    per_link = jnp.repeat(jnp.swapaxes(tension, 1, 2), per_section, axis=2)  # (2, 3 tendons, n_links, *arms)
+    links = jnp.sum(per_link[:, None, None] * link_hessian, axis=(0, 3))  # (3 dofs, 3 dofs, n_links, *arms)
+    blocks = jnp.moveaxis(links, 2, 0).reshape(n_sections, per_section, *links.shape[:2], *arms)
     return jax.vmap(block_diagonal)(blocks)
 
 
 def _stretching(slope: Array, jacobian: Array) -> Array:
-    """Return sum_t slope_t dl_t dl_t^T over the tendons of each section: (n_sections, n, n).
+    """Return sum_t slope_t dl_t dl_t^T over the tendons of each section: (n_sections, n, n, *arms).
 
     Args:
-        slope (2, n_sections, 3): of the tensions by the lengths.
-        jacobian (2, n_sections, 3, n): of the lengths.
+        slope (2, n_sections, 3, *arms): of the tensions by the lengths.
+        jacobian (2, n_sections, 3, n, *arms): of the lengths.
     """
-    rows, scaled = (jnp.concatenate(list(x), axis=1) for x in (jacobian, slope[..., None] * jacobian))
-    return product(jnp.swapaxes(rows, 1, 2), scaled)
+    rows, scaled = (jnp.concatenate(list(x), axis=1) for x in (jacobian, slope[:, :, :, None] * jacobian))
+    return products(jnp.swapaxes(rows, 1, 2), scaled)
 
 
 def tendons(frames: Frames, site_m: Array) -> Tendons:
     """Return lengths of tendons through holes in the rings, with derivatives.
 
-    Vectors are lists of three components (3 tendons, n_links), so that one instruction serves many links.
+    Vectors are lists of three components (3 tendons, n_links, *arms): one instruction serves many links.
 
     Args:
         frames: plates and joints.
-        site_m (n_chambers, 2): x and y of each tendon's hole in every ring of its section.
+        site_m (n_chambers, 2, *arms): x and y of each tendon's hole in every ring of its section.
     """
     n_links, n_sections = frames.axis.shape[0], site_m.shape[0] // N_CHAMBERS_PER_SECTION
-    per_section = n_links // n_sections
-    site = jnp.repeat(site_m.reshape(n_sections, N_CHAMBERS_PER_SECTION, 2), per_section, axis=0)
-    x, y = site.T  # (3 tendons, n_links) each
-    plate, ring = jnp.moveaxis(frames.plate_position, 0, -1), jnp.moveaxis(frames.plate_rotation, 0, -1)
+    per_section, arms = n_links // n_sections, frames.axis.shape[3:]
+    site = site_m.reshape(n_sections, N_CHAMBERS_PER_SECTION, *site_m.shape[1:])
+    x, y = jnp.moveaxis(jnp.repeat(site, per_section, axis=0), (2, 1), (0, 1))  # (3 tendons, n_links) each
+    plate, ring = jnp.moveaxis(frames.plate_position, 0, 1), jnp.moveaxis(frames.plate_rotation, 0, 2)
     upper = [plate[i, :-1] + ring[i, 0, :-1] * x + ring[i, 1, :-1] * y for i in range(3)]
     lower = [plate[i, 1:] + ring[i, 0, 1:] * x + ring[i, 1, 1:] * y for i in range(3)]
     segment = [low - up for low, up in zip(lower, upper, strict=True)]
     length = jnp.sqrt(_dot(segment, segment))
     unit = [component / length for component in segment]
 
-    anchor, axes = frames.anchor.T, jnp.moveaxis(frames.axis, 0, -1)  # (3, n_links), (3 dofs, 3, n_links)
+    anchor, axes = jnp.swapaxes(frames.anchor, 0, 1), jnp.moveaxis(frames.axis, 0, 2)  # (3 dofs, 3, n_links)
     lever = [low - at for low, at in zip(lower, anchor, strict=True)]
     motion = [list(axes[0]), *(_cross(hinge, lever) for hinge in axes[1:])]  # of the hole, by each joint
     along = [_dot(unit, moved) for moved in motion]  # d length / d q
@@ -225,10 +232,13 @@ def tendons(frames: Frames, site_m: Array) -> Tendons:
 
     dofs = range(DOFS_PER_LINK)
     upper_half = {(i, j): second(i, j) for i in dofs for j in dofs[i:]}
-    own = jnp.stack(along).reshape(DOFS_PER_LINK, N_CHAMBERS_PER_SECTION, n_sections, per_section)
+    own = jnp.stack(along).reshape(DOFS_PER_LINK, N_CHAMBERS_PER_SECTION, n_sections, per_section, *arms)
+    whole = length.reshape(N_CHAMBERS_PER_SECTION, n_sections, per_section, *arms).sum(2)
     return Tendons(
-        length=length.reshape(N_CHAMBERS_PER_SECTION, n_sections, -1).sum(-1).T.reshape(-1),
-        jacobian=own.transpose(2, 1, 3, 0).reshape(n_sections, N_CHAMBERS_PER_SECTION, -1),
+        length=jnp.swapaxes(whole, 0, 1).reshape(-1, *arms),
+        jacobian=jnp.moveaxis(own, (2, 1, 3, 0), (0, 1, 2, 3)).reshape(
+            n_sections, N_CHAMBERS_PER_SECTION, -1, *arms
+        ),
         link_hessian=jnp.stack([jnp.stack([upper_half[min(i, j), max(i, j)] for j in dofs]) for i in dofs]),
     )
 
@@ -244,23 +254,31 @@ def _cross(a: Sequence[Array] | Array, b: Sequence[Array] | Array) -> list[Array
 
 
 def _gravity(frames: Frames, params: ArmParams) -> tuple[Array, ChainHessian]:
-    """Return gradient (nv,) and Hessian of the weights' potential.
+    """Return gradient (nv, *arms) and Hessian of the weights' potential.
 
     With M and c the mass and the centre of mass of all that hangs on a joint, and w = M a for a slide,
     w = M a x (c - o) for a hinge: the gradient is g w_z; the second derivative by an earlier hinge i and
     a joint j is g (a_i x w_j)_z, and none by an earlier slide.
     """
-    tool = frames.plate_position[-1] - params.tool_offset_m[:, None] * frames.plate_rotation[-1, :, 2]
-    own = params.link_mass_kg[:, None] * frames.anchor
-    moment = jnp.flip(jnp.cumsum(jnp.flip(own, 0), 0), 0) + params.tool_mass_kg @ tool  # (L, 3)
-    mass = jnp.flip(jnp.cumsum(jnp.flip(params.link_mass_kg))) + jnp.sum(params.tool_mass_kg)  # (L,)
+    arms, n_sections = frames.axis.shape[3:], params.n_sections
+    last = frames.plate_rotation[-1]
+    tool = frames.plate_position[-1] - params.tool_offset_m[:, None] * last[:, 2]  # (2, 3, *arms)
+    below_it = jax.lax.cumsum(params.link_mass_kg[:, None] * frames.anchor, reverse=True)  # (L, 3, *arms)
+    moment = below_it + jnp.sum(params.tool_mass_kg[:, None] * tool, axis=0)
+    mass = jax.lax.cumsum(params.link_mass_kg, reverse=True) + jnp.sum(params.tool_mass_kg, axis=0)
     hung = moment - mass[:, None] * frames.anchor
-    turn = jnp.cross(frames.axis[:, 1:], hung[:, None])
-    w = jnp.concatenate([mass[:, None, None] * frames.axis[:, :1], turn], axis=1)  # (L, 3 dofs, 3)
-    w = GRAVITY_M_S2 * w.reshape(params.n_sections, -1, 3)
-    axis = frames.axis.at[:, 0].set(0.0).reshape(w.shape)  # a slide turns nothing
-    above = jnp.stack([axis[..., 0], -axis[..., 1]], axis=-1)
-    below = jnp.stack([w[..., 1], w[..., 0]], axis=-1)
-    upper = jnp.triu(product(above, jnp.swapaxes(below, 1, 2)))
-    within = upper + jnp.swapaxes(jnp.triu(upper, 1), 1, 2)
-    return w[..., 2].reshape(-1), ChainHessian(within, above, below)
+    slide, hinges = (jnp.moveaxis(axes, 2, 0) for axes in (frames.axis[:, :1], frames.axis[:, 1:]))
+    turn = _cross(hinges, jnp.moveaxis(hung[:, None], 2, 0))  # (L, 2 hinges, *arms) each
+
+    def by_section(of_slides: Array, of_hinges: Array) -> Array:
+        """Join numbers of the joints of each link (L, 1, *arms), (L, 2, *arms): (n_sections, n, *arms)."""
+        return jnp.concatenate([of_slides, of_hinges], axis=1).reshape(n_sections, -1, *arms)
+
+    w = [GRAVITY_M_S2 * by_section(mass[:, None] * slide[i], turn[i]) for i in range(3)]
+    axis = [by_section(jnp.zeros_like(slide[i]), hinges[i]) for i in range(2)]  # a slide turns nothing
+    above, below = jnp.stack([axis[0], -axis[1]], axis=2), jnp.stack([w[1], w[0]], axis=2)
+    earlier_first = products(above, jnp.swapaxes(below, 1, 2))
+    n = earlier_first.shape[1]
+    upper = jnp.tri(n, dtype=bool).T.reshape(n, n, *[1] * len(arms))
+    within = jnp.where(upper, earlier_first, jnp.swapaxes(earlier_first, 1, 2))
+    return w[2].reshape(-1, *arms), ChainHessian(within, above, below)

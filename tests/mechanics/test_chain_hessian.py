@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_softarm._support.small_matrices import block_diagonal, eliminate, product
+from mjx_softarm._support.small_matrices import block_diagonal, eliminate, product, products
 from mjx_softarm.mechanics.chain_hessian import ChainHessian
 
 N_ARMS, N, K = 5, 6, 4
@@ -25,6 +25,10 @@ def chain(n_sections, seed=0, coupling=0.3):
     above, below = coupling * rng.normal(size=(2, N_ARMS, n_sections, N, 2))
     columns = rng.normal(size=(N_ARMS, n_sections, N, K))
     return ChainHessian(*map(np.float32, (own, above, below))), np.float32(columns)
+
+
+def arms_last(tree):
+    return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), tree)
 
 
 def dense(hessian):
@@ -47,6 +51,8 @@ def test_a_system_with_the_hessian_is_that_with_the_dense_matrix(n_sections):
     found = jax.jit(jax.vmap(ChainHessian.solve))(hessian, columns)
     wanted = np.linalg.solve(dense(hessian), columns.reshape(N_ARMS, -1, K).astype(float))
     np.testing.assert_allclose(found, wanted.reshape(found.shape), atol=1e-5 * np.abs(wanted).max())
+    at_once = jax.jit(ChainHessian.solve)(arms_last(hessian), arms_last(columns))
+    np.testing.assert_allclose(at_once, arms_last(found), atol=1e-6 * np.abs(wanted).max())
 
 
 def test_a_matrix_that_is_not_positive_definite_gives_nan_and_its_neighbours_do_not():
@@ -80,6 +86,8 @@ def test_elimination_of_rows_of_which_some_are_the_identity_s(n):
     found = np.asarray(jax.jit(jax.vmap(eliminate))(matrix, columns))
     np.testing.assert_allclose(found, np.linalg.solve(matrix, columns), atol=1e-5)
     np.testing.assert_array_equal(found[given], columns[given])
+    at_once = jax.jit(eliminate)(arms_last(matrix), arms_last(columns))
+    np.testing.assert_allclose(at_once, arms_last(found), atol=1e-6)
     shared = jax.vmap(eliminate, in_axes=(None, 0))(matrix[0], columns)
     np.testing.assert_allclose(shared, np.linalg.solve(matrix[0], columns), atol=1e-5)
 
@@ -96,6 +104,13 @@ def test_a_pivot_that_is_not_positive_gives_nan_and_its_neighbours_do_not(n, whi
 
 def test_small_products_and_block_diagonals():
     a, b = np.arange(12.0, dtype=np.float32).reshape(2, 2, 3), np.ones((2, 3, 4), np.float32)
-    np.testing.assert_allclose(product(a, b), a @ b)
+    np.testing.assert_allclose(products(a, b), a @ b)
+    np.testing.assert_allclose(product(arms_last(a), arms_last(b)), arms_last(a @ b))
+    long = np.arange(20.0, dtype=np.float32).reshape(2, 2, 5)
+    np.testing.assert_allclose(
+        product(arms_last(long), arms_last(long.swapaxes(1, 2)))[..., 1], long[1] @ long[1].T
+    )
     expected = np.array([[0, 1, 2, 0, 0, 0], [3, 4, 5, 0, 0, 0], [0, 0, 0, 6, 7, 8], [0, 0, 0, 9, 10, 11]])
     np.testing.assert_array_equal(block_diagonal(a), expected)
+    many = block_diagonal(np.stack([a, 2.0 * a], axis=-1))
+    np.testing.assert_array_equal(many, np.stack([expected, 2.0 * expected], axis=-1))

@@ -227,6 +227,24 @@ def test_an_impossible_arm_is_reported_not_raised(arm, solve, targets):
     assert off[~found.settled].all()
 
 
+def test_many_arms_at_once_settle_as_each_does_alone_whatever_numbers_they_share():
+    def one(softer, reference_m):
+        params = ArmParams.from_spec(SPEC)
+        params = params._replace(
+            chamber_stiffness=params.chamber_stiffness / softer,
+            mount=params.mount._replace(tip_offset_m=params.mount.tip_offset_m + 0.01 * softer),
+        )
+        return settle(chain_kinematics(params), params, reference_m)
+
+    softer, target = np.float32([1.0, 1.3]), np.float32(references()[:3])
+    alone = jax.jit(one)
+    expected = np.array([[alone(x, y).tip_position_m for y in target] for x in softer])
+    own = jax.jit(jax.vmap(one))(softer, target[[0, 2]])
+    np.testing.assert_allclose(own.tip_position_m, expected[[0, 1], [0, 2]], atol=1e-6)
+    shared = jax.jit(jax.vmap(jax.vmap(one, (None, 0)), (0, None)))(softer, target)
+    np.testing.assert_allclose(shared.tip_position_m, expected, atol=1e-6)
+
+
 def test_new_numbers_need_no_new_compilation():
     settled(settle, references())
     n_compiled = solver(settle)._cache_size()
