@@ -88,7 +88,7 @@ solve.defvjp(_solve_forward, _solve_backward)
 
 
 def _eliminate_last(augmented: Array) -> Array:
-    """Eliminate in matrices beside columns (n, n + k, batch); with the batch last, one instruction serves it.
+    """Eliminate in matrices beside columns (n, n + k, *arms).
 
     A block of columns is cleared at once, so that each number is read and written a third as often. Barriers
     keep the compiler from working out the pivots' rows again for each of the others.
@@ -104,7 +104,7 @@ def _eliminate_last(augmented: Array) -> Array:
 
 
 def _inverse_last(matrix: Array) -> Array:
-    """Invert matrices (n, n, batch) with positive pivots; n is small, since all is written out."""
+    """Invert matrices (n, n, *arms) with positive pivots; n is small, since all is written out."""
     n = matrix.shape[0]
     beside = jnp.broadcast_to(identity(n, matrix), matrix.shape)
     rows = list(jnp.concatenate([matrix, beside], axis=1))

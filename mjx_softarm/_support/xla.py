@@ -29,7 +29,8 @@ def compiler_options(uses_mjx: bool = True) -> dict[str, Any]:
     accepted = {}
     for name, value in {**_CPU_OPTIONS, **(_CPU_MJX_OPTIONS if uses_mjx else {})}.items():
         try:
-            jax.jit(lambda x: x + 1, compiler_options={name: value})(0)
+            with jax.ensure_compile_time_eval():  # also where a function is being traced
+                jax.jit(lambda x: x + 1, compiler_options={name: value})(0)
         except (jax.errors.JaxRuntimeError, ValueError):  # an option that this jaxlib does not know
             continue
         accepted[name] = value
@@ -37,7 +38,7 @@ def compiler_options(uses_mjx: bool = True) -> dict[str, Any]:
 
 
 def jit(function: Callable, uses_mjx: bool = True, **kwargs: Any) -> Callable:
-    """Compile with `jax.jit`, with this platform's options where the function uses MJX.
+    """Compile with `jax.jit` and this platform's options; not inside a function that is compiled.
 
     Without MJX, its options do not help: the closed-form chain compiles well, and networks train about a
     tenth slower with them.

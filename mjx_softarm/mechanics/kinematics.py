@@ -6,12 +6,11 @@ joint coordinates are `q (3 * n_links,)`, ordered (slide [m], hinge x [rad], hin
 Both functions of this module return the same `Frames`; everything downstream is shared.
 
 Many arms at once come last in every shape, (..., *arms), where one instruction serves several of them;
-*arms is empty for one arm.
+*arms is empty for one arm. A number that all of them share may have a 1 in their place.
 """
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -77,8 +76,16 @@ def chain_frames(q: Array, link_length_m: Array | float, mount: Mount = LEVEL) -
         mount: of base and tip.
     """
     arms = q.shape[1:]
+
+    def of_arms(x: Array | np.ndarray, *shape: int) -> Array:
+        """Return a number of the mount (*shape, *arms), from one that may be without arms."""
+        x = jnp.asarray(x, q.dtype)
+        if x.ndim == len(shape):
+            x = x.reshape(*shape, *[1] * len(arms))
+        return jnp.broadcast_to(x, (*shape, *arms))
+
     slide, bend_x, bend_y = jnp.moveaxis(q.reshape(-1, DOFS_PER_LINK, *arms), 1, 0)  # (L, *arms) each
-    base = jnp.broadcast_to(jnp.asarray(mount.base_rotation, q.dtype), (3, 3, *arms))
+    base = of_arms(mount.base_rotation, 3, 3)
     local = _rotation_xy(bend_x, bend_y)  # (L, 3, 3, *arms)
     chained = jax.lax.associative_scan(products, local)
     rotation = jax.vmap(product, in_axes=(None, 0))(base, chained)
@@ -87,7 +94,7 @@ def chain_frames(q: Array, link_length_m: Array | float, mount: Mount = LEVEL) -
     half = 0.5 * link_length_m
     to_anchor = -(half + slide)[:, None] * parent[:, :, 2]
     to_plate = to_anchor - half * child[:, :, 2]
-    start = jnp.broadcast_to(jnp.asarray(mount.base_position_m, q.dtype), (3, *arms))
+    start = of_arms(mount.base_position_m, 3)
     plate_position = jnp.concatenate([start[None], start + jnp.cumsum(to_plate, axis=0)])
     cos, sin = jnp.cos(bend_x)[:, None], jnp.sin(bend_x)[:, None]
     axis_y = cos * parent[:, :, 1] + sin * parent[:, :, 2]
@@ -98,8 +105,8 @@ def chain_frames(q: Array, link_length_m: Array | float, mount: Mount = LEVEL) -
         plate_rotation,
         axis,
         anchor=plate_position[:-1] + to_anchor,
-        tip_position=plate_position[-1] + jnp.sum(last * jnp.asarray(mount.tip_offset_m, q.dtype), axis=1),
-        tip_rotation=product(last, jnp.asarray(mount.tip_rotation, q.dtype)),
+        tip_position=plate_position[-1] + jnp.sum(last * of_arms(mount.tip_offset_m, 3), axis=1),
+        tip_rotation=product(last, of_arms(mount.tip_rotation, 3, 3)),
     )
 
 
@@ -117,10 +124,8 @@ def mjx_frames(model: mjx.Model, q: Array) -> Frames:
     Args:
         model: the compiled arm on the device; its first bodies are the world and the links in order, its
             first geometries the rings, its last site the tip.
-        q (3 * n_links, *arms): joint coordinates [m, rad, rad].
+        q (3 * n_links,): joint coordinates [m, rad, rad].
     """
-    if q.ndim > 1:
-        return jax.vmap(functools.partial(mjx_frames, model), in_axes=-1, out_axes=-1)(q)
     n_links = len(q) // DOFS_PER_LINK
     data = mjx.kinematics(model, mjx.make_data(model).replace(qpos=q))
     links = slice(1, n_links + 1)

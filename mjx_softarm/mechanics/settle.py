@@ -26,7 +26,7 @@ from jax.custom_derivatives import zero_from_primal
 
 from mjx_softarm._support.small_matrices import eliminate, identity, products
 from mjx_softarm.mechanics.implicit import Equilibrium, Response, equilibrium_tangents
-from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK, Kinematics, mjx_frames
+from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK, Kinematics, chain_frames
 from mjx_softarm.mechanics.statics import ArmParams, statics
 
 MAX_ITERATIONS = 12
@@ -86,12 +86,12 @@ class _Iterate(NamedTuple):
     pressure: Array  # (n_chambers, *arms) [kPa]
     at_limit: Array  # (n_chambers, *arms) bool, the active set of the last step
     response: Response  # before the last step
-    n_small: Array  # arms, int: small steps without a change of the active set, since the last other one
-    stiffening: Array  # arms: joint stiffness added, in parts of it, where the energy is not convex
-    iteration: Array  # arms, int
+    n_small: Array  # (*arms,) int, small steps without a change of the active set, since the last other one
+    stiffening: Array  # (*arms,) joint stiffness added, in parts of it, where the energy is not convex
+    iteration: Array  # (*arms,) int
 
     def goes_on(self, n_small: int) -> Array:
-        """Return which arms need another step to have `n_small` small ones: arms, bool."""
+        """Return which arms need another step to have `n_small` small ones: (*arms,) bool."""
         return (self.n_small < n_small) & (self.iteration < MAX_ITERATIONS + n_small - 1)
 
 
@@ -124,7 +124,7 @@ settle.defjvp(_settle_jvp, symbolic_zeros=True)
 
 @functools.cache
 def _solver(n_small: int) -> Callable[[Kinematics, ArmParams, Array], tuple[Settled, Equilibrium]]:
-    """Return `_solve`, which with `jax.vmap` solves many arms at once, the arms last."""
+    """Return `_solve` for one arm; inside of it, `jax.vmap` puts the arms last."""
     solve = jax.custom_batching.custom_vmap(functools.partial(_solve, n_small))
 
     def many(n: int, batched: list[Any], kinematics: Kinematics, params: ArmParams, reference_m: Array):
@@ -132,8 +132,12 @@ def _solver(n_small: int) -> Callable[[Kinematics, ArmParams, Array], tuple[Sett
             return jnp.moveaxis(x, 0, -1) if own else jnp.asarray(x)[..., None]
 
         kinematics_own, params_own, reference_own = batched
-        if kinematics.func is not mjx_frames:  # which has no numbers that differ from arm to arm
+        if getattr(kinematics, "func", None) is chain_frames:
             kinematics = jax.tree.map(arms_last, kinematics, kinematics_own)
+        else:  # it takes one arm
+            axes = jax.tree.map(lambda own: 0 if own else None, kinematics_own)
+            each = jax.vmap(lambda engine, q: engine(q), in_axes=(axes, -1), out_axes=-1)
+            kinematics = functools.partial(each, kinematics)
         reference_m = arms_last(reference_m, reference_own)
         reference_m = jnp.broadcast_to(reference_m, (*reference_m.shape[:-1], n))
         found = _solve(n_small, kinematics, jax.tree.map(arms_last, params, params_own), reference_m)
@@ -146,7 +150,10 @@ def _solver(n_small: int) -> Callable[[Kinematics, ArmParams, Array], tuple[Sett
 def _solve(
     n_small: int, kinematics: Kinematics, params: ArmParams, reference_m: Array
 ) -> tuple[Settled, Equilibrium]:
-    """Return the equilibrium after `n_small` small steps, and all that its derivative needs."""
+    """Return the equilibrium after `n_small` small steps, and all that its derivative needs.
+
+    With references (n_chambers, *arms) all results have the arms last, and so have numbers of the arms.
+    """
     dtype, arms = params.link_length_m.dtype, reference_m.shape[1:]
     nv, n_chambers = params.link_mass_kg.shape[0] * DOFS_PER_LINK, params.area.shape[0]
     none = jnp.zeros((n_chambers, *arms), dtype)

@@ -150,7 +150,7 @@ def statics(frames: Frames, q: Array, pressure_kpa: Array, params: ArmParams) ->
 
 def all_tendons(frames: Frames, params: ArmParams) -> Tendons:
     """Return the chambers' tendons and the springs', stacked: leaves (2, ...)."""
-    sites = jnp.stack([params.chamber_site_m, params.spring_site_m])
+    sites = jnp.stack(jnp.broadcast_arrays(params.chamber_site_m, params.spring_site_m))
     return jax.vmap(tendons, in_axes=(None, 0))(frames, sites)  # in one piece: fewer and larger operations
 
 
@@ -212,7 +212,7 @@ def tendons(frames: Frames, site_m: Array) -> Tendons:
     n_links, n_sections = frames.axis.shape[0], site_m.shape[0] // N_CHAMBERS_PER_SECTION
     per_section, arms = n_links // n_sections, frames.axis.shape[3:]
     site = site_m.reshape(n_sections, N_CHAMBERS_PER_SECTION, *site_m.shape[1:])
-    x, y = jnp.moveaxis(jnp.repeat(site, per_section, axis=0), (2, 1), (0, 1))  # (3 tendons, n_links) each
+    x, y = jnp.swapaxes(jnp.repeat(site, per_section, axis=0), 0, 2)  # (3 tendons, n_links) each
     plate, ring = jnp.moveaxis(frames.plate_position, 0, 1), jnp.moveaxis(frames.plate_rotation, 0, 2)
     upper = [plate[i, :-1] + ring[i, 0, :-1] * x + ring[i, 1, :-1] * y for i in range(3)]
     lower = [plate[i, 1:] + ring[i, 0, 1:] * x + ring[i, 1, 1:] * y for i in range(3)]
@@ -236,7 +236,7 @@ def tendons(frames: Frames, site_m: Array) -> Tendons:
     whole = length.reshape(N_CHAMBERS_PER_SECTION, n_sections, per_section, *arms).sum(2)
     return Tendons(
         length=jnp.swapaxes(whole, 0, 1).reshape(-1, *arms),
-        jacobian=jnp.moveaxis(own, (2, 1, 3, 0), (0, 1, 2, 3)).reshape(
+        jacobian=jnp.swapaxes(jnp.moveaxis(own, 0, 3), 0, 1).reshape(
             n_sections, N_CHAMBERS_PER_SECTION, -1, *arms
         ),
         link_hessian=jnp.stack([jnp.stack([upper_half[min(i, j), max(i, j)] for j in dofs]) for i in dofs]),

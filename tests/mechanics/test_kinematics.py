@@ -80,6 +80,12 @@ def test_the_chain_is_where_c_mujoco_puts_it(structure):
         assert_same_frames([field[k] for field in frames], mujoco_frames(model, q[k]), f"arm {k}")
 
 
+def test_arms_that_come_last_are_those_that_come_first():
+    length, q = arm(1, 2).link_length_m, random_q(arm(1, 2), 3)  # as many arms as a vector has components
+    last = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), jax.jit(chain_frames)(q.T, length))
+    assert_same_frames(last, jax.vmap(lambda q: chain_frames(q, length))(q), "3 arms")
+
+
 @pytest.mark.parametrize("structure", [(3, 4), (1, 1)], ids=str)  # the compiler takes long over more
 def test_mjx_and_the_chain_agree(structure):
     model = mjx.put_model(compiled(*structure))
