@@ -13,14 +13,15 @@ import jax.numpy as jnp
 from jax import Array
 
 BLOCK = 3  # pivots that are eliminated at once
-WRITTEN_OUT = 4  # terms of an inner product that are added one by one, which is four times as fast
 
 
 def product(a: Array, b: Array) -> Array:
-    """Multiply small matrices (n, m, *arms) and (m, k, *arms), as sums: faster than products when tiny."""
-    if len(b) <= WRITTEN_OUT:
-        return functools.reduce(jnp.add, [a[:, j, None] * b[j] for j in range(len(b))])
-    return jnp.sum(a[:, :, None] * b, axis=1)
+    """Multiply small matrices (n, m, *arms) and (m, k, *arms), term by term: faster than a product when small.
+
+    A sum over an axis would be shorter. jaxlib 0.10.2 hands it to a library on CPUs, and then some settled arms
+    are wrong, unless `mjx_softarm._support.xla.jit` compiles.
+    """
+    return functools.reduce(jnp.add, [a[:, j, None] * b[j] for j in range(len(b))])
 
 
 products = jax.vmap(product)  # of matrices (k, n, m, *arms) and (k, m, l, *arms)

@@ -22,7 +22,7 @@ def test_in_motion_the_clearance_is_the_least_of_the_way():
         ReachEnv(SHORT_ARM, dataclasses.replace(config, dynamic_step_s=step_s)) for step_s in (0.12, 0.02)
     )
     keys = jax.random.split(jax.random.PRNGKey(0), 16)
-    actions = jax.random.uniform(jax.random.PRNGKey(1), (16, long.action_size), minval=-0.5, maxval=0.5)
+    actions = jax.random.uniform(jax.random.PRNGKey(1), (16, long.action_size), minval=-1.0, maxval=1.0)
     start = xla.jit(jax.vmap(long.reset))(keys)
     end = xla.jit(jax.vmap(long.step), long.uses_mjx)(start, actions)
     now, step = start.replace(info=jax.vmap(short.reset)(keys).info), xla.jit(jax.vmap(short.step), True)
