@@ -16,10 +16,10 @@ BLOCK = 3  # pivots that are eliminated at once
 
 
 def product(a: Array, b: Array) -> Array:
-    """Multiply small matrices (n, m, *arms) and (m, k, *arms), term by term: faster than a product when small.
+    """Multiply small matrices (n, m, *arms) and (m, k, *arms), term by term, which is faster than a product.
 
-    A sum over an axis would be shorter. jaxlib 0.10.2 hands it to a library on CPUs, and then some settled arms
-    are wrong, unless `mjx_softarm._support.xla.jit` compiles.
+    A sum over an axis would be shorter. jaxlib 0.10.2 hands it to a library on CPUs, and then some settled
+    arms are wrong, unless `mjx_softarm._support.xla.jit` compiles.
     """
     return functools.reduce(jnp.add, [a[:, j, None] * b[j] for j in range(len(b))])
 

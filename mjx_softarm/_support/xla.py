@@ -10,7 +10,8 @@ from typing import Any
 
 import jax
 
-# jaxlib 0.10 hands products to a library (YNNPACK) that makes learning on two cores a third slower.
+# jaxlib 0.10 hands products and sums to a library (YNNPACK): learning is a third slower with it, and some
+# sums are wrong (see `small_matrices.product`).
 _CPU_OPTIONS = {"xla_cpu_experimental_ynn_fusion_type": ""}
 
 # Serial chains such as mjx.kinematics fall into a fusion trap of XLA's CPU emitters (jax >= 0.7), and
