@@ -13,15 +13,18 @@ import jax.numpy as jnp
 from jax import Array
 
 BLOCK = 3  # pivots that are eliminated at once
+WRITTEN_OUT = 4  # terms of an inner product without arms that are added one by one, which is faster
 
 
 def product(a: Array, b: Array) -> Array:
-    """Multiply small matrices (n, m, *arms) and (m, k, *arms), term by term, which is faster than a product.
+    """Multiply small matrices (n, m, *arms) and (m, k, *arms).
 
-    A sum over an axis would be shorter. jaxlib 0.10.2 hands it to a library on CPUs, and then some settled
-    arms are wrong, unless `mjx_softarm._support.xla.jit` compiles.
+    With arms, or a few terms, it is written out term by term: jaxlib 0.10.2 hands a sum over an axis in between
+    to a library on CPUs, and then some settled arms are wrong, unless `mjx_softarm._support.xla.jit` compiles.
     """
-    return functools.reduce(jnp.add, [a[:, j, None] * b[j] for j in range(len(b))])
+    if a.ndim > 2 or len(b) <= WRITTEN_OUT:
+        return functools.reduce(jnp.add, [a[:, j, None] * b[j] for j in range(len(b))])
+    return jnp.sum(a[:, :, None] * b, axis=1)
 
 
 products = jax.vmap(product)  # of matrices (k, n, m, *arms) and (k, m, l, *arms)
