@@ -19,8 +19,9 @@ WRITTEN_OUT = 4  # terms of an inner product without arms that are added one by 
 def product(a: Array, b: Array) -> Array:
     """Multiply small matrices (n, m, *arms) and (m, k, *arms).
 
-    With arms, or a few terms, it is written out term by term: jaxlib 0.10.2 hands a sum over an axis in between
-    to a library on CPUs, and then some settled arms are wrong, unless `mjx_softarm._support.xla.jit` compiles.
+    With arms, or a few terms, it is written out term by term. jaxlib 0.10.2 hands a sum over an axis in
+    between to a library on CPUs, and then some settled arms are wrong, unless
+    `mjx_softarm._support.xla.jit` compiles.
     """
     if a.ndim > 2 or len(b) <= WRITTEN_OUT:
         return functools.reduce(jnp.add, [a[:, j, None] * b[j] for j in range(len(b))])

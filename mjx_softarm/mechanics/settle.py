@@ -35,6 +35,7 @@ MAX_STEP = 0.5  # largest entry of a Newton step [m, rad]
 SMALL_STEP = 3e-4  # [m, rad]; the next error is of its square
 RESIDUAL_TOLERANCE = 2e-3  # [N, N m], against stiffnesses of 2 N m/rad and more
 TRACKING_TOLERANCE_M = 1e-4
+MAX_ARMS_ON_CPU = 128  # at once; the numbers of more do not stay in its cache
 
 
 class Result(enum.IntEnum):
@@ -127,24 +128,52 @@ def _solver(n_small: int) -> Callable[[Kinematics, ArmParams, Array], tuple[Sett
     """Return `_solve` for one arm; inside of it, `jax.vmap` puts the arms last."""
     solve = jax.custom_batching.custom_vmap(functools.partial(_solve, n_small))
 
-    def many(n: int, batched: list[Any], kinematics: Kinematics, params: ArmParams, reference_m: Array):
-        def arms_last(x: Any, own: bool) -> Array:
-            return jnp.moveaxis(x, 0, -1) if own else jnp.asarray(x)[..., None]
-
-        kinematics_own, params_own, reference_own = batched
-        if getattr(kinematics, "func", None) is chain_frames:
-            kinematics = jax.tree.map(arms_last, kinematics, kinematics_own)
-        else:  # it takes one arm
-            axes = jax.tree.map(lambda own: 0 if own else None, kinematics_own)
-            each = jax.vmap(lambda engine, q: engine(q), in_axes=(axes, -1), out_axes=-1)
-            kinematics = functools.partial(each, kinematics)
-        reference_m = arms_last(reference_m, reference_own)
-        reference_m = jnp.broadcast_to(reference_m, (*reference_m.shape[:-1], n))
-        found = _solve(n_small, kinematics, jax.tree.map(arms_last, params, params_own), reference_m)
-        return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), found), jax.tree.map(lambda _: True, found)
+    def many(n: int, batched: list[Any], *arguments: Any) -> tuple[Any, Any]:
+        if n > MAX_ARMS_ON_CPU and jax.default_backend() == "cpu":
+            found = _solve_in_chunks(solve, n, batched, arguments)
+        else:
+            found = _solve_arms_last(n_small, n, batched, *arguments)
+        return found, jax.tree.map(lambda _: True, found)
 
     solve.def_vmap(many)
     return solve
+
+
+def _solve_arms_last(
+    n_small: int, n: int, batched: list[Any], kinematics: Kinematics, params: ArmParams, reference_m: Array
+) -> tuple[Settled, Equilibrium]:
+    """Return what `_solve` finds of n arms; `batched` is true of arrays whose first axis is that of arms."""
+
+    def arms_last(x: Any, own: bool) -> Array:
+        return jnp.moveaxis(x, 0, -1) if own else jnp.asarray(x)[..., None]
+
+    kinematics_own, params_own, reference_own = batched
+    if getattr(kinematics, "func", None) is chain_frames:
+        kinematics = jax.tree.map(arms_last, kinematics, kinematics_own)
+    else:  # it takes one arm
+        axes = jax.tree.map(lambda own: 0 if own else None, kinematics_own)
+        each = jax.vmap(lambda engine, q: engine(q), in_axes=(axes, -1), out_axes=-1)
+        kinematics = functools.partial(each, kinematics)
+    reference_m = arms_last(reference_m, reference_own)
+    reference_m = jnp.broadcast_to(reference_m, (*reference_m.shape[:-1], n))
+    found = _solve(n_small, kinematics, jax.tree.map(arms_last, params, params_own), reference_m)
+    return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), found)
+
+
+def _solve_in_chunks(
+    solve: Callable, n: int, batched: list[Any], arguments: tuple
+) -> tuple[Settled, Equilibrium]:
+    """Return what `solve` finds of n arms, chunk after chunk; the last one repeats an arm to be as large."""
+    n_chunks = -(-n // MAX_ARMS_ON_CPU)
+    arm = jnp.minimum(jnp.arange(n_chunks * -(-n // n_chunks)), n - 1).reshape(n_chunks, -1)
+    own = tuple(batched)
+
+    def chunk(arm: Array) -> tuple[Settled, Equilibrium]:
+        theirs = jax.tree.map(lambda x, own: x[arm] if own else x, arguments, own)
+        return jax.vmap(solve, in_axes=jax.tree.map(lambda own: 0 if own else None, own))(*theirs)
+
+    found = jax.lax.map(chunk, arm)
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:n], found)
 
 
 def _solve(

@@ -227,25 +227,43 @@ def test_an_impossible_arm_is_reported_not_raised(arm, solve, targets):
     assert off[~found.settled].all()
 
 
+def softened(softer, reference_m):
+    """Settle an arm that has springs, holes and a mount of its own."""
+    params = ArmParams.from_spec(SPEC.replace(**ARMS["one section of two links"]))
+    params = params._replace(
+        chamber_stiffness=params.chamber_stiffness / softer,
+        chamber_site_m=params.chamber_site_m * softer**0.1,
+        mount=params.mount._replace(tip_offset_m=params.mount.tip_offset_m + 0.01 * softer),
+    )
+    return settle(chain_kinematics(params), params, reference_m)
+
+
 def test_many_arms_at_once_settle_as_each_does_alone_whatever_numbers_they_share():
-    spec = SPEC.replace(**ARMS["one section of two links"])
-
-    def one(softer, reference_m):
-        params = ArmParams.from_spec(spec)
-        params = params._replace(
-            chamber_stiffness=params.chamber_stiffness / softer,
-            chamber_site_m=params.chamber_site_m * softer**0.1,
-            mount=params.mount._replace(tip_offset_m=params.mount.tip_offset_m + 0.01 * softer),
-        )
-        return settle(chain_kinematics(params), params, reference_m)
-
     softer, target = np.float32([1.0, 1.3]), np.float32(references(3)[:3])
-    alone = jax.jit(one)
+    alone = jax.jit(softened)
     expected = np.array([[alone(x, y).tip_position_m for y in target] for x in softer])
-    own = jax.jit(jax.vmap(one))(softer, target[[0, 2]])
+    own = jax.jit(jax.vmap(softened))(softer, target[[0, 2]])
     np.testing.assert_allclose(own.tip_position_m, expected[[0, 1], [0, 2]], atol=1e-6)
-    shared = jax.jit(jax.vmap(jax.vmap(one, (None, 0)), (0, None)))(softer, target)
+    shared = jax.jit(jax.vmap(jax.vmap(softened, (None, 0)), (0, None)))(softer, target)
     np.testing.assert_allclose(shared.tip_position_m, expected, atol=1e-6)
+
+
+def test_more_arms_than_a_cpu_takes_at_once_settle_chunk_after_chunk(monkeypatch):
+    softer, target = np.float32([1.0, 1.1, 1.2, 1.3, 1.4]), np.float32(references(3)[:3])
+
+    def tips(softer, target):
+        found, change = jax.jvp(lambda x: softened(softer, x), (target,), (0.1 * target,))
+        return found.tip_position_m, change.tip_position_m
+
+    def of_all():
+        own = jax.jit(jax.vmap(tips))(softer, np.tile(target, (2, 1))[:5])
+        return own, jax.jit(jax.vmap(lambda x: tips(x, target[0])))(softer)
+
+    expected = of_all()
+    monkeypatch.setattr("mjx_softarm.mechanics.settle.MAX_ARMS_ON_CPU", 2)
+    chunks = of_all()
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-6), chunks, expected)
+    assert "scan" in str(jax.make_jaxpr(jax.vmap(softened, (0, None)))(softer, target[0]))
 
 
 def test_new_numbers_need_no_new_compilation():

@@ -1,0 +1,52 @@
+"""Options of the compiler: those that the installed jaxlib accepts, wherever they are asked for."""
+
+import jax
+import numpy as np
+import pytest
+
+from mjx_softarm._support import xla
+
+pytestmark = pytest.mark.skipif(jax.default_backend() != "cpu", reason="options are set on CPUs alone")
+
+
+def accepts(name, value):
+    try:
+        jax.jit(lambda x: x + 2, compiler_options={name: value})(0)
+    except (jax.errors.JaxRuntimeError, ValueError):
+        return False
+    return True
+
+
+@pytest.mark.parametrize("uses_mjx", [False, True])
+def test_options_are_those_that_jaxlib_accepts(uses_mjx):
+    wanted = {**xla._CPU_OPTIONS, **(xla._CPU_MJX_OPTIONS if uses_mjx else {})}
+    assert xla.compiler_options(uses_mjx) == {k: v for k, v in wanted.items() if accepts(k, v)}
+
+
+@pytest.mark.skipif(
+    not jax.lib.__version__.startswith("0.10."), reason="it is of this version that it is known"
+)
+def test_the_library_of_jaxlib_0_10_is_off():
+    assert xla.compiler_options(uses_mjx=False)["xla_cpu_experimental_ynn_fusion_type"] == ""
+
+
+def test_unknown_options_are_left_out(monkeypatch):
+    monkeypatch.setattr(xla, "_CPU_OPTIONS", {"xla_no_such_option": True})
+    xla.compiler_options.cache_clear()
+    try:
+        assert xla.compiler_options(False) == {}
+    finally:
+        xla.compiler_options.cache_clear()
+
+
+def test_options_can_be_asked_for_while_a_function_is_traced():
+    outside = xla.compiler_options()
+    inside = []
+
+    def traced(x):
+        xla.compiler_options.cache_clear()
+        inside.append(xla.compiler_options())
+        return 2 * x
+
+    assert jax.jit(traced)(np.float32(3.0)) == 6.0
+    assert inside == [outside]
