@@ -131,6 +131,12 @@ def exact_plan(pose, goal, spring_m, sensed):
     return SPRINGS_M[int(np.argmin(np.abs(GOALS - goal).sum(axis=1)))]
 
 
+def between(pose, goal, spring_m, sensed):
+    """The springs in between the goals' for a goal in between."""
+    share = np.linalg.norm(goal - GOALS[0]) / np.linalg.norm(GOALS[1] - GOALS[0])
+    return SPRINGS_M[0] + share * (SPRINGS_M[1] - SPRINGS_M[0])
+
+
 CONTROLLER = Controller.of(POLICY, exact_plan)
 
 

@@ -6,7 +6,8 @@
     SENSOR_STUCK       a spring that stands still, without its noise even, while its    vent
                        chamber is driven or a spring of its section moves
     CHAMBER_LOST       a chamber at its limit, its spring off the reference, and the    vent
-                       arm at rest in the shape of an arm without that pressure
+                       arm in the shape of one without that pressure: for a second of
+                       rest, or for three while the goal moves
     GOAL_OUTSIDE       a goal that no pressures bring the tip to, by the policy's       skip the goal
                        models and its threshold of a goal; a pilot's goal further
                        from all reachable poses than they are from each other
@@ -182,7 +183,7 @@ def lost_chambers(
     spring_m: np.ndarray,
     tolerance_m: float,
 ) -> np.ndarray:
-    """Return which chambers (n,) of an arm at rest have lost their pressure.
+    """Return which chambers (n,) of an arm at rest, or nearly so, have lost their pressure.
 
     A chamber at its limit with its spring off the reference is saturated, or it no longer holds pressure.
     Then the arm has the shape that it would have without that pressure: the springs' deviations from the

@@ -29,6 +29,7 @@ from tests.linear_arm import (
     SPEC,
     SPRINGS_M,
     LinearArm,
+    between,
     exact_plan,
     go,
     read_m,
@@ -104,19 +105,13 @@ def test_a_way_with_a_goal_out_of_reach_is_not_begun():
 
 def test_a_moving_goal_is_followed_and_its_end_is_an_arrival():
     arm, goals = LinearArm(), np.array([GOALS[0], GOALS[1]])
-
-    def plan(pose, goal, spring_m, sensed):  # springs in between for goals in between
-        share = np.linalg.norm(goal - goals[0]) / np.linalg.norm(goals[1] - goals[0])
-        return SPRINGS_M[0] + share * (SPRINGS_M[1] - SPRINGS_M[0])
-
-    run = trace(arm, Controller.of(POLICY, plan), goals, pace_s=10.0)
+    run = trace(arm, Controller.of(POLICY, between), goals, pace_s=10.0)
     assert run.status == 0 and [arrival.goal.tolist() for arrival in run.arrivals] == goals.tolist()
     goal = run.log.goal[run.ways[0]]
     assert len(goal) in (500, 501)
     np.testing.assert_allclose(goal[250], on_the_way(goals, 0.5), atol=1e-6)
     ahead = on_the_way(goals, 0.5 + LEAD_S / 10.0)
-    share = np.linalg.norm(ahead - goals[0]) / np.linalg.norm(goals[1] - goals[0])
-    expected_m = SPRINGS_M[0] + share * (SPRINGS_M[1] - SPRINGS_M[0])
+    expected_m = between(None, ahead, None, None)
     np.testing.assert_allclose(run.log.reference_m[run.ways[0]][250], expected_m, atol=1e-3)  # a tick apart
 
 
@@ -124,12 +119,9 @@ def test_stops_on_a_way_are_arrivals_and_other_goals_are_passed():
     arm, there = LinearArm(), []
     goals = on_the_way(GOALS[:2], 0.0) + np.linspace(0.0, 1.0, 6)[:, None] * pose_error(GOALS[1], GOALS[0])
 
-    def plan(pose, goal, spring_m, sensed):
-        share = np.linalg.norm(goal - GOALS[0]) / np.linalg.norm(pose_error(GOALS[1], GOALS[0]))
-        return SPRINGS_M[0] + share * (SPRINGS_M[1] - SPRINGS_M[0])
-
-    controller = Controller.of(POLICY, plan)
-    run = trace(arm, controller, goals, pace_s=1.0, stops=np.arange(6) == 3, arrived=there.append)
+    run = trace(
+        arm, Controller.of(POLICY, between), goals, pace_s=1.0, stops=np.arange(6) == 3, arrived=there.append
+    )
     assert there == [0, 3, 5] == [arrival.index for arrival in run.arrivals]
     assert run.ending.status == 0 and run.n_goals == 3
     lasted = [rows.stop - rows.start for rows in run.ways]

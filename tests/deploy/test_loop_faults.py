@@ -9,12 +9,15 @@ from mjx_softarm.deploy import faults
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.faults import Fault, Response
 from mjx_softarm.deploy.link import VENT_KPA_PER_S
+from mjx_softarm.deploy.loop import MOVING_WINDOWS
 from mjx_softarm.deploy.reachability import Reachable, nearest
+from mjx_softarm.deploy.session import trace
 from mjx_softarm.mdp.actions import N_ACTIONS
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.sensing.estimator import estimate
 from mjx_softarm.sensing.s2r import N_POSE_INPUTS, N_POSE_OUTPUTS, S2R, correct, extrapolation
 from tests.linear_arm import (
+    CONTROLLER,
     DT_S,
     FAR,
     GOALS,
@@ -24,6 +27,7 @@ from tests.linear_arm import (
     SPRINGS_M,
     LinearArm,
     N,
+    between,
     exact_plan,
     go,
     read_m,
@@ -33,12 +37,16 @@ from tests.linear_arm import (
 class Leaking(LinearArm):
     """A chamber falls to atmospheric pressure."""
 
+    def __init__(self, tick):
+        super().__init__()
+        self.leaks_from = tick
+
     def holds(self, pressure_kpa):
-        return np.where((np.arange(N) == 3) & (self.tick >= 150), 0.0, pressure_kpa)
+        return np.where((np.arange(N) == 3) & (self.tick >= self.leaks_from), 0.0, pressure_kpa)
 
 
 def test_lost_chamber_vents():
-    arm = Leaking()
+    arm = Leaking(150)
     run = go(arm)
     assert abs(PRESSURES_KPA[0, 3]) > 5.0  # it matters
     assert run.status == 3 and run.counts()[Fault.CHAMBER_LOST] == 1
@@ -47,6 +55,14 @@ def test_lost_chamber_vents():
     np.testing.assert_array_equal(arm.command_kpa, 0.0)
     vented = np.abs(np.diff(np.array(arm.written)[-20:], axis=0))
     assert 0.0 < vented.max() <= VENT_KPA_PER_S * DT_S + 1e-9
+
+
+def test_chamber_lost_while_the_goal_moves_vents():
+    arm = Leaking(500)
+    run = trace(arm, Controller.of(POLICY, between), GOALS[:2], pace_s=30.0)
+    assert run.status == 3 and run.counts()[Fault.CHAMBER_LOST] == 1 and len(run.arrivals) == 1
+    assert 500 + MOVING_WINDOWS * CONTROLLER.window < len(run.log.goal) < 1000
+    np.testing.assert_array_equal(arm.command_kpa, 0.0)
 
 
 def test_saturated_chamber_is_not_lost():
