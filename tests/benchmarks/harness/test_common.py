@@ -51,6 +51,12 @@ def test_other_dictionaries_are_titled_by_their_path_and_what_is_loose_comes_fir
     assert [line for line in text.splitlines() if line.startswith("settle")] == titles
 
 
+def test_curves_are_for_the_file_alone():
+    assert cells(shown({"runs": [{"seed": 0, "curve": [(512, 0.5), (1024, 0.7)], "few": [1, 2]}]})) == [
+        ["0", "[1, 2]"]
+    ]
+
+
 MEMORY = """
 import numpy as np
 from benchmarks.harness.common import peak_memory
