@@ -55,6 +55,17 @@ class LinearArm:
         return pressure_kpa
 
 
+class Leaking(LinearArm):
+    """A chamber falls to atmospheric pressure."""
+
+    def __init__(self, tick):
+        super().__init__()
+        self.leaks_from = tick
+
+    def holds(self, pressure_kpa):
+        return np.where((np.arange(N) == 3) & (self.tick >= self.leaks_from), 0.0, pressure_kpa)
+
+
 class Blind(LinearArm):
     """Readings go wrong in some ticks."""
 

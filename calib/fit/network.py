@@ -11,8 +11,9 @@ many points.
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -23,6 +24,7 @@ from jax import Array
 
 from calib.errors import FitError
 from calib.fit.blocks import held_out_blocks
+from mjx_softarm._support import xla
 from mjx_softarm._support.mlp import Layer, mlp
 from mjx_softarm.sensing.s2r import S2R
 
@@ -107,7 +109,7 @@ def fit_network(
     rows = _equally_many([np.flatnonzero(~stop) for stop in stopping])
     n_batches = max(rows.shape[1] // config.batch_size, 1)
     n_epochs = -(-config.n_updates // n_batches)
-    members, losses = _train(
+    members, losses = _trainer()(
         jax.random.key(seed),
         jnp.asarray(z, jnp.float32),
         jnp.asarray((left - centre) / spread, jnp.float32),
@@ -150,7 +152,11 @@ def _equally_many(rows: list[np.ndarray]) -> np.ndarray:
     return np.stack([np.resize(row, max(map(len, rows))) for row in rows])
 
 
-@partial(jax.jit, static_argnames=("hidden", "batch_size", "n_epochs"))
+@functools.cache
+def _trainer() -> Callable:
+    return xla.jit(_train, uses_mjx=False, static_argnames=("hidden", "batch_size", "n_epochs"))
+
+
 def _train(
     key: Array,
     x: Array,

@@ -39,7 +39,7 @@ def compiler_options(uses_mjx: bool = True) -> dict[str, Any]:
 
 
 def jit(function: Callable, uses_mjx: bool = True, **kwargs: Any) -> Callable:
-    """Compile with `jax.jit` and this platform's options; not inside a function that is compiled.
+    """Compile with `jax.jit` and this platform's options; JAX raises inside a function that it traces.
 
     Without MJX, its options do not help: the closed-form chain compiles well, and networks train about a
     tenth slower with them.

@@ -6,8 +6,8 @@
     SENSOR_STUCK       a spring that stands still, without its noise even, while its    vent
                        chamber is driven or a spring of its section moves
     CHAMBER_LOST       a chamber at its limit, its spring off the reference, and the    vent
-                       arm in the shape of one without that pressure: for a second of
-                       rest, or for three while the goal moves
+                       arm in the shape of one without that pressure: for a second, or
+                       for three while it moves
     GOAL_OUTSIDE       a goal that no pressures bring the tip to, by the policy's       skip the goal
                        models and its threshold of a goal; a pilot's goal further
                        from all reachable poses than they are from each other

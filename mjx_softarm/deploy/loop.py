@@ -36,8 +36,9 @@ from mjx_softarm.deploy.link import vented
 from mjx_softarm.deploy.reachability import nearest
 from mjx_softarm.sensing.load import HIGHEST, LOWEST, Load, averaged, tell_load
 
-CHAMBER_WINDOWS = 2  # a chamber of an arm at rest counts as lost after so many windows in a row
-MOVING_WINDOWS = 6  # the same while the goal moves: springs and pressures come after their references
+# A chamber counts as lost after so many windows in a row: of an arm at rest, and of one that moves, whose
+# springs and pressures come after their references.
+REST_WINDOWS, MOVING_WINDOWS = 2, 6
 OVERLOAD_KG = 0.25  # beyond the largest payload, since none is told exactly
 
 
@@ -182,13 +183,13 @@ def _at_rest(controller: Controller, state: State) -> bool:
 
 
 def _check_chambers(controller: Controller, state: State, at_rest: bool) -> tuple[State, list[Event]]:
-    if state.reference_m is None or not (at_rest or state.moves):
+    if state.reference_m is None:
         return state._replace(n_suspect=np.zeros_like(state.n_suspect)), []
     policy = controller.policy
     seen = state.pressure_kpa, state.reference_m, state.spring_m
     suspect = faults.lost_chambers(policy.spring_model, policy.gains, *seen, policy.tolerance_m)
     state = state._replace(n_suspect=np.where(suspect, state.n_suspect + 1, 0))
-    lost = state.n_suspect >= (MOVING_WINDOWS if state.moves else CHAMBER_WINDOWS) * controller.window
+    lost = state.n_suspect >= (REST_WINDOWS if at_rest else MOVING_WINDOWS) * controller.window
     if not lost.any():
         return state, []
     kpa = ", ".join(f"{value:.1f}" for value in state.pressure_kpa[lost])

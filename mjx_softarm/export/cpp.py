@@ -7,7 +7,7 @@ from importlib import resources
 from mjx_softarm.deploy.acting import MAX_SHIFT
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.faults import LATE_TICKS, LOST_TICKS, SETTLE_TIMEOUT_S, Fault, Response
-from mjx_softarm.deploy.loop import CHAMBER_WINDOWS, OVERLOAD_KG
+from mjx_softarm.deploy.loop import MOVING_WINDOWS, OVERLOAD_KG, REST_WINDOWS
 from mjx_softarm.export.computations import parts
 from mjx_softarm.export.cpp_functions import Numbers, function
 from mjx_softarm.mdp.observation import rate_ticks
@@ -45,7 +45,8 @@ def sources(controller: Controller, policy_sha256: str) -> dict[str, str]:
         "RATE_TICKS": rate_ticks(policy.rate_hz),
         "LOST_TICKS": LOST_TICKS,
         "LATE_TICKS": LATE_TICKS,
-        "SUSPECT_TICKS": CHAMBER_WINDOWS * controller.window,
+        "REST_TICKS": REST_WINDOWS * controller.window,
+        "MOVING_TICKS": MOVING_WINDOWS * controller.window,
         "TIMEOUT": repr(SETTLE_TIMEOUT_S),
         "SEARCH": begin(policy, 1).size,
         "SEARCH_STEPS": N_STEPS,

@@ -35,7 +35,7 @@ MAX_STEP = 0.5  # largest entry of a Newton step [m, rad]
 SMALL_STEP = 3e-4  # [m, rad]; the next error is of its square
 RESIDUAL_TOLERANCE = 2e-3  # [N, N m], against stiffnesses of 2 N m/rad and more
 TRACKING_TOLERANCE_M = 1e-4
-MAX_ARMS_ON_CPU = 128  # at once; the numbers of more do not stay in its cache
+MAX_ARMS_ON_CPU = 128  # at once, of one `jax.vmap`; the numbers of more do not stay in its cache
 
 
 class Result(enum.IntEnum):
@@ -125,7 +125,7 @@ settle.defjvp(_settle_jvp, symbolic_zeros=True)
 
 @functools.cache
 def _solver(n_small: int) -> Callable[[Kinematics, ArmParams, Array], tuple[Settled, Equilibrium]]:
-    """Return `_solve` for one arm; inside of it, `jax.vmap` puts the arms last."""
+    """Return `_solve` for one arm; inside of it, `jax.vmap` puts the arms last, many of them in chunks."""
     solve = jax.custom_batching.custom_vmap(functools.partial(_solve, n_small))
 
     def many(n: int, batched: list[Any], *arguments: Any) -> tuple[Any, Any]:
@@ -169,7 +169,7 @@ def _solve_in_chunks(
     own = tuple(batched)
 
     def chunk(arm: Array) -> tuple[Settled, Equilibrium]:
-        theirs = jax.tree.map(lambda x, own: x[arm] if own else x, arguments, own)
+        theirs = jax.tree.map(lambda x, own: jnp.asarray(x)[arm] if own else x, arguments, own)
         return jax.vmap(solve, in_axes=jax.tree.map(lambda own: 0 if own else None, own))(*theirs)
 
     found = jax.lax.map(chunk, arm)
@@ -219,7 +219,7 @@ def settle_pressures(kinematics: Kinematics, params: ArmParams, pressure_kpa: Ar
 
 
 def _active_set(pressure: Array, error_m: Array, params: ArmParams) -> tuple[Array, Array]:
-    """Return the chambers to be held at a limit (n,) bool, and each one's limit (n,) [kPa]."""
+    """Return the chambers to be held at a limit (n, *arms) bool, and each one's limit (n, *arms) [kPa]."""
     trial = pressure + ACTIVE_SET_GAIN_KPA_PER_M * error_m
     limit = jnp.clip(trial, params.pressure_min_kpa, params.pressure_max_kpa)
     return (trial != limit) | params.pinned, limit  # pinned ones even where the error happens to be zero

@@ -25,6 +25,7 @@ from tests.linear_arm import (
     POLICY,
     PRESSURES_KPA,
     SPRINGS_M,
+    Leaking,
     LinearArm,
     N,
     between,
@@ -32,17 +33,6 @@ from tests.linear_arm import (
     go,
     read_m,
 )
-
-
-class Leaking(LinearArm):
-    """A chamber falls to atmospheric pressure."""
-
-    def __init__(self, tick):
-        super().__init__()
-        self.leaks_from = tick
-
-    def holds(self, pressure_kpa):
-        return np.where((np.arange(N) == 3) & (self.tick >= self.leaks_from), 0.0, pressure_kpa)
 
 
 def test_lost_chamber_vents():
@@ -63,6 +53,15 @@ def test_chamber_lost_while_the_goal_moves_vents():
     assert run.status == 3 and run.counts()[Fault.CHAMBER_LOST] == 1 and len(run.arrivals) == 1
     assert 500 + MOVING_WINDOWS * CONTROLLER.window < len(run.log.goal) < 1000
     np.testing.assert_array_equal(arm.command_kpa, 0.0)
+
+
+def test_saturated_chamber_is_not_lost_while_the_goal_moves():
+    def beyond(*at):
+        return between(*at) + np.where(np.arange(N) == 3, 0.08, 0.0)
+
+    run = trace(LinearArm(), Controller.of(POLICY, beyond), GOALS[:2], pace_s=5.0)
+    assert set(run.counts()) == {Fault.SATURATED} and len(run.arrivals) == 2
+    assert (run.log.pressure_kpa[run.ways[0], 3] == HIGH_KPA).mean() > 0.9
 
 
 def test_saturated_chamber_is_not_lost():

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from mjx_softarm.deploy.ending import FAULT
+from mjx_softarm.deploy.faults import Fault
 from mjx_softarm.deploy.link import VENT_KPA_PER_S
 from mjx_softarm.deploy.session import Orders, steer
-from tests.linear_arm import CONTROLLER, DT_S, GOALS, SPRINGS_M, LinearArm, read_m
+from tests.linear_arm import CONTROLLER, DT_S, GOALS, SPRINGS_M, Leaking, LinearArm, read_m
 
 
 class Stop(Exception):
@@ -29,8 +30,8 @@ class Script:
         self.states.append(state)
 
 
-def fly(orders, n_ticks, **kwargs):
-    arm, pilot = LinearArm(), Script(orders, n_ticks)
+def fly(orders, n_ticks, arm=None, **kwargs):
+    arm, pilot = arm or LinearArm(), Script(orders, n_ticks)
     return arm, pilot, steer(arm, CONTROLLER, pilot, **kwargs)
 
 
@@ -40,6 +41,14 @@ def test_goals_come_and_go():
     np.testing.assert_array_equal(run.log.goal[30], GOALS[1])
     assert np.isnan(run.log.goal[:5]).all() and [a.goal.tolist() for a in run.arrivals] == [GOALS[1].tolist()]
     np.testing.assert_allclose(read_m(run.log)[-1], SPRINGS_M[1], atol=5e-4)  # held after the arrival
+
+
+def test_a_chamber_that_is_lost_while_a_goal_is_dragged_vents():
+    """Each goal is new, so the arm neither rests nor goes along a way."""
+    dragged = {tick: Orders(goals=GOALS[:1]) for tick in range(0, 1500, 20)}
+    arm, _, run = fly(dragged, 1500, Leaking(200))
+    assert run.counts()[Fault.CHAMBER_LOST] == 1 and len(run.log.row) < 600
+    np.testing.assert_array_equal(arm.command_kpa, 0.0)
 
 
 def test_hold_stops_the_arm_where_it_is():

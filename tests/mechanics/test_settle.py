@@ -263,7 +263,9 @@ def test_more_arms_than_a_cpu_takes_at_once_settle_chunk_after_chunk(monkeypatch
     monkeypatch.setattr("mjx_softarm.mechanics.settle.MAX_ARMS_ON_CPU", 2)
     chunks = of_all()
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-6), chunks, expected)
-    assert "scan" in str(jax.make_jaxpr(jax.vmap(softened, (0, None)))(softer, target[0]))
+    assert "scan" in str(jax.make_jaxpr(jax.vmap(tips, (0, None)))(softer, target[0]))
+    eager = jax.vmap(softened, (0, None))(softer, target[0])  # whose numbers are NumPy's
+    np.testing.assert_allclose(eager.tip_position_m, expected[1][0], atol=1e-6)
 
 
 def test_new_numbers_need_no_new_compilation():

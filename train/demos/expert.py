@@ -14,7 +14,7 @@ With a sim-to-real network, poses and body are the real arm's, P_S2R; see `carry
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from mjx_softarm._support import xla
 from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.xp import array_namespace
 from mjx_softarm.mechanics.excitation import random_pressures
@@ -93,7 +94,7 @@ class Expert:
         n, n_batches = len(pressure_kpa), -(-len(pressure_kpa) // _BATCH)
         padded = np.resize(np.float32(pressure_kpa), (n_batches * _BATCH, self.spec.n_chambers))
         parts = [
-            jax.device_get(_look_many(part, self._params, self.s2r, self.spec, self.pipe))
+            jax.device_get(_compiled(_look_many)(part, self._params, self.s2r, self.spec, self.pipe))
             for part in np.split(padded, n_batches)
         ]
         return jax.tree.map(lambda *x: np.concatenate(x)[:n], *parts)
@@ -126,7 +127,7 @@ class Expert:
         # Solve from all starts; with the orientation eased if nothing meets it.
         for weight in (1.0, EASED) if target.turn.any() else (1.0,):
             eased = target._replace(turn=np.float32(weight) * target.turn)
-            ends = _solve_many(starts, eased, self._params, self.s2r, self.spec, self.pipe)
+            ends = _compiled(_solve_many)(starts, eased, self._params, self.s2r, self.spec, self.pipe)
             found = self.look(np.asarray(ends))
             slack = self._slack(found, eased)
             met = np.flatnonzero((slack >= 0.0).all(axis=-1))
@@ -237,12 +238,15 @@ def _posture(pressure_kpa: Array, params: ArmParams, s2r: S2R | None, spec: ArmS
     ), wall_m
 
 
-@functools.partial(jax.jit, static_argnames=("spec", "pipe"))
+@functools.cache
+def _compiled(function: Callable) -> Callable:
+    return xla.jit(function, uses_mjx=False, static_argnames=("spec", "pipe"))
+
+
 def _look_many(pressure_kpa: Array, params: ArmParams, s2r, spec: ArmSpec, pipe: CrossPipe | None):
     return jax.vmap(lambda p: _posture(p, params, s2r, spec, pipe)[0])(pressure_kpa)
 
 
-@functools.partial(jax.jit, static_argnames=("spec", "pipe"))
 def _solve_many(starts_kpa, target: Target, params: ArmParams, s2r, spec: ArmSpec, pipe: CrossPipe | None):
     """Return pressures (N_STARTS, n_chambers) after damped Gauss-Newton steps from each start."""
     low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa

@@ -18,6 +18,7 @@ import numpy as np
 import optax
 from jax import Array
 
+from mjx_softarm._support import xla
 from mjx_softarm._support.mlp import Layer
 from mjx_softarm.mechanics.statics import ArmParams
 from mjx_softarm.mechanics.workspace import (
@@ -213,12 +214,12 @@ def _fit(
         updates, state = optimiser.update(gradient, state)
         return (optax.apply_updates(weights, updates), state), None
 
-    @jax.jit
     def run(weights: Any) -> Any:
         keys = jax.random.split(key, N_STEPS)
         return jax.lax.scan(step, (weights, optimiser.init(weights)), keys)[0][0]
 
-    return network._replace(**{layers: run(getattr(network, layers))})
+    weights = xla.jit(run, uses_mjx=False)(getattr(network, layers))
+    return network._replace(**{layers: weights})
 
 
 def _errors(
