@@ -116,7 +116,7 @@ def losses_figure(results: Results) -> Figure:
         for kind, style in (("pipe", ("with gradient penalty", BLUE)), ("no-penalty", ("without", ORANGE))):
             runs = [run for (of, twin, _), run in results.trainings.items() if of == kind and twin in twins]
             _band(panel, *_series(runs, name), style)
-    panels[-1].legend(frameon=False, loc="upper right")
+    panels[0].legend(frameon=False, loc="upper left")
     return figure
 
 
