@@ -11,8 +11,6 @@ many points.
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -109,7 +107,7 @@ def fit_network(
     rows = _equally_many([np.flatnonzero(~stop) for stop in stopping])
     n_batches = max(rows.shape[1] // config.batch_size, 1)
     n_epochs = -(-config.n_updates // n_batches)
-    members, losses = _trainer()(
+    members, losses = _train(
         jax.random.key(seed),
         jnp.asarray(z, jnp.float32),
         jnp.asarray((left - centre) / spread, jnp.float32),
@@ -152,11 +150,7 @@ def _equally_many(rows: list[np.ndarray]) -> np.ndarray:
     return np.stack([np.resize(row, max(map(len, rows))) for row in rows])
 
 
-@functools.cache
-def _trainer() -> Callable:
-    return xla.jit(_train, uses_mjx=False, static_argnames=("hidden", "batch_size", "n_epochs"))
-
-
+@xla.jit_at_first_call(uses_mjx=False, static_argnames=("hidden", "batch_size", "n_epochs"))
 def _train(
     key: Array,
     x: Array,

@@ -47,6 +47,19 @@ def jit(function: Callable, uses_mjx: bool = True, **kwargs: Any) -> Callable:
     return jax.jit(function, compiler_options=compiler_options(uses_mjx), **kwargs)
 
 
+def jit_at_first_call(uses_mjx: bool = True, **kwargs: Any) -> Callable[[Callable], Callable]:
+    """Return a decorator that compiles as `jit` does, for functions of a module.
+
+    Options are looked up at the first call: at import, that would start JAX on a device.
+    """
+
+    def decorate(function: Callable) -> Callable:
+        compiled = functools.cache(lambda: jit(function, uses_mjx, **kwargs))
+        return functools.wraps(function)(lambda *args, **keywords: compiled()(*args, **keywords))
+
+    return decorate
+
+
 def enable_compilation_cache(directory: str | Path | None = None) -> Path:
     """Keep compiled programs on disk, so that a second start is fast.
 

@@ -50,3 +50,16 @@ def test_options_can_be_asked_for_while_a_function_is_traced():
 
     assert jax.jit(traced)(np.float32(3.0)) == 6.0
     assert inside == [outside]
+
+
+def test_a_function_of_a_module_is_compiled_with_the_options_at_its_first_call(monkeypatch):
+    asked = []
+    monkeypatch.setattr(xla, "compiler_options", lambda uses_mjx: asked.append(uses_mjx) or {})
+
+    @xla.jit_at_first_call(uses_mjx=False, static_argnames="n")
+    def power(x, n):
+        return x ** len(range(n))  # which a traced n has not
+
+    assert asked == []
+    assert power(np.float32(3.0), n=2) == 9.0 and power(np.float32(2.0), n=3) == 8.0
+    assert asked == [False]

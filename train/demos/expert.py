@@ -13,8 +13,7 @@ With a sim-to-real network, poses and body are the real arm's, P_S2R; see `carry
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -94,7 +93,7 @@ class Expert:
         n, n_batches = len(pressure_kpa), -(-len(pressure_kpa) // _BATCH)
         padded = np.resize(np.float32(pressure_kpa), (n_batches * _BATCH, self.spec.n_chambers))
         parts = [
-            jax.device_get(_compiled(_look_many)(part, self._params, self.s2r, self.spec, self.pipe))
+            jax.device_get(_look_many(part, self._params, self.s2r, self.spec, self.pipe))
             for part in np.split(padded, n_batches)
         ]
         return jax.tree.map(lambda *x: np.concatenate(x)[:n], *parts)
@@ -127,7 +126,7 @@ class Expert:
         # Solve from all starts; with the orientation eased if nothing meets it.
         for weight in (1.0, EASED) if target.turn.any() else (1.0,):
             eased = target._replace(turn=np.float32(weight) * target.turn)
-            ends = _compiled(_solve_many)(starts, eased, self._params, self.s2r, self.spec, self.pipe)
+            ends = _solve_many(starts, eased, self._params, self.s2r, self.spec, self.pipe)
             found = self.look(np.asarray(ends))
             slack = self._slack(found, eased)
             met = np.flatnonzero((slack >= 0.0).all(axis=-1))
@@ -238,15 +237,12 @@ def _posture(pressure_kpa: Array, params: ArmParams, s2r: S2R | None, spec: ArmS
     ), wall_m
 
 
-@functools.cache
-def _compiled(function: Callable) -> Callable:
-    return xla.jit(function, uses_mjx=False, static_argnames=("spec", "pipe"))
-
-
+@xla.jit_at_first_call(uses_mjx=False, static_argnames=("spec", "pipe"))
 def _look_many(pressure_kpa: Array, params: ArmParams, s2r, spec: ArmSpec, pipe: CrossPipe | None):
     return jax.vmap(lambda p: _posture(p, params, s2r, spec, pipe)[0])(pressure_kpa)
 
 
+@xla.jit_at_first_call(uses_mjx=False, static_argnames=("spec", "pipe"))
 def _solve_many(starts_kpa, target: Target, params: ArmParams, s2r, spec: ArmSpec, pipe: CrossPipe | None):
     """Return pressures (N_STARTS, n_chambers) after damped Gauss-Newton steps from each start."""
     low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
