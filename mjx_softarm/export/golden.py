@@ -53,11 +53,12 @@ BITS = {fault: 1 << k for k, fault in enumerate(Fault)}
 _SPREAD_M = 2e-3  # of the springs of single rows around the model's, as by payloads
 _OUTSIDE, _LOST = 0.1, 0.1  # shares of single rows
 _LAG, _NOISE_M = 0.15, 4e-5  # of the arm in the runs, per tick
-_SWING_M = 2e-3
+_SWING_M, _SHAKE_M = 2e-3, 1e-3
 _CANDIDATES = 200  # goals to choose checked ones from,
 _REACHED, _MISSED = 0.8, 1.5  # whose errors over the threshold are this clear,
 _SHIFT = 0.01  # also of the goals that are so far off, since a search is only as exact as its numbers
 _RUNS = ("calm", "lost", "stuck", "late", "leaking", "unplugged", "swinging", "heavy", "pressed", "dropping")
+_RUNS += ("shaken",)  # and leaking: a chamber is lost in motion
 _RUN_TICKS = 400  # at most
 _HEAVY, _PRESSED, _CARRIED = 1.4, 1.8, 0.8  # payloads of runs, as shares of the largest,
 _DROP_TICK = 200  # and when the last one falls, and the goal is given again
@@ -216,8 +217,10 @@ def _rows_of_run(
         weight_kpa = _weight_kpa(policy, actual_kpa, carried) if carried else 0.0
         spring_m = expected_springs(policy.spring_model, actual_kpa - weight_kpa)
         spring_m = spring_m + rng.normal(0.0, _NOISE_M, n)
-        if kind == "swinging":  # never all still, and so long that the law drives every chamber to its limit
-            phase = 2 * np.pi * 0.7 * tick * controller.dt_s + np.arange(n)
+        phase = 2 * np.pi * 0.7 * tick * controller.dt_s + np.arange(n)  # of springs that are never all still
+        if kind == "shaken":
+            spring_m = spring_m + _SHAKE_M * np.sin(phase)
+        if kind == "swinging":  # so long that the law drives every chamber to its limit
             spring_m = longest_m - _SWING_M * (1.0 - np.sin(phase))
         readings = policy.sensor.readings(spring_m)
         first = readings if first is None else first
@@ -231,7 +234,7 @@ def _rows_of_run(
         new_goal = tick == 0 or (kind == "dropping" and tick == _DROP_TICK)
         flags = (tick == 0, new_goal, late, not (late and tick % 2 == 0), lost, False)
         pressure_kpa = yield _row(tuple(map(int, flags)), readings, goal)
-        if kind == "leaking" and tick == 60:
+        if kind in ("leaking", "shaken") and tick == 60:
             leak[np.argmax(np.abs(pressure_kpa))] = 0.0
         actual_kpa = actual_kpa + _LAG * (leak * pressure_kpa - actual_kpa)
 

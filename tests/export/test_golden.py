@@ -7,6 +7,7 @@ import pytest
 
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.faults import Fault
+from mjx_softarm.deploy.loop import MOVING_WINDOWS, REST_WINDOWS
 from mjx_softarm.export import computations
 from mjx_softarm.export.__main__ import main
 from mjx_softarm.export.check import TOLERANCE, check, compare, without_memory
@@ -15,11 +16,17 @@ from mjx_softarm.policy import reach
 from tests.linear_arm import N
 
 
-def test_rows_meet_faults_and_vent(golden):
+def test_rows_meet_faults_and_vent(golden, controller):
     faults = golden.outputs[:, 0].astype(int)
     met = {fault for fault, bit in BITS.items() if np.any(faults & bit)}
     assert met == set(Fault)
     assert len(golden.inputs) > N_SINGLE == np.count_nonzero(golden.inputs[:N_SINGLE, 0])
+    begins = np.flatnonzero(golden.inputs[:, 0])
+    lost = np.flatnonzero(faults & BITS[Fault.CHAMBER_LOST])
+    at_rest, in_motion = (
+        lost - begins[np.searchsorted(begins, lost, "right") - 1] - 60
+    )  # ticks after the leak
+    assert REST_WINDOWS * controller.window <= at_rest < MOVING_WINDOWS * controller.window <= in_motion
     stopped = np.flatnonzero(faults & BITS[Fault.SENSOR_STUCK])[0]
     pressure_kpa = golden.outputs[stopped:, 2 : 2 + N]
     ramp = np.abs(pressure_kpa[: np.flatnonzero(golden.inputs[stopped + 1 :, 0])[0] + 1])
