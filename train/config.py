@@ -9,7 +9,7 @@ import math
 import typing
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 from tyro.constructors import PrimitiveConstructorSpec
 
@@ -111,6 +111,19 @@ class TrainConfig:
         return self.n_own_epochs * self.vector_steps_per_epoch * self.n_updates_per_vector_step
 
     @property
+    def policy_hidden(self) -> tuple[int, ...]:
+        """Width of each hidden layer of the learner's policy."""
+        return self.analytic.hidden if self.learner == "analytic" else self.tqc.hidden_actor
+
+    def with_policy_of(self, donor: TrainConfig) -> Self:
+        """Return these settings with hidden layers of the policy as in a run that it is taken from."""
+        return dataclasses.replace(
+            self,
+            tqc=dataclasses.replace(self.tqc, hidden_actor=donor.policy_hidden),
+            analytic=dataclasses.replace(self.analytic, hidden=donor.policy_hidden),
+        )
+
+    @property
     def polish(self) -> TrainConfig:
         """Config of polishing, as a run of the analytic learner."""
         return dataclasses.replace(
@@ -121,7 +134,7 @@ class TrainConfig:
             env=dataclasses.replace(self.env, even_share=0.5),  # the rim, too
             vector_steps_per_epoch=POLISH_EPOCH,
             evaluation_epochs=POLISH_EVALUATION_EPOCHS,
-            analytic=dataclasses.replace(self.analytic, hidden=self.tqc.hidden_actor),
+            analytic=dataclasses.replace(self.analytic, hidden=self.policy_hidden),
             polish_updates=0,
         )
 

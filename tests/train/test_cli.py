@@ -221,10 +221,15 @@ def test_imitation_resumes_across_stages_and_hands_its_reward_on(
     assert main([*imitate, str(narrow), "--preset", "frozen"]) == 2
     assert "frozen: got true, expected --reward RUN" in capsys.readouterr().err
     assert not narrow.exists()
-    assert main([*imitate, str(narrow), "--preset", "frozen", "--reward", str(whole)]) == 0
+    other = flags(**changes, **{"tqc.hidden_actor": 8})  # the agent's layers are taken all the same
+    frozen = ["imitate", demonstrations, *other, *stages, "--spec", arm, "--preset", "frozen"]
+    donors = ["--agent", str(whole), "--reward", str(whole)]
+    assert main([*frozen, *donors, "--out", str(narrow)]) == 0
     kept = [discriminator_of(run) for run in (whole, narrow)]
     jax.tree.map(np.testing.assert_array_equal, *kept)
-    assert json.loads((narrow / "config.json").read_text())["begins_with"] == {"reward": str(whole)}
+    begun = json.loads((narrow / "config.json").read_text())["begins_with"]
+    assert begun == {"agent": str(whole), "reward": str(whole)}
+    assert [Run.open(run).config.tqc.hidden_actor for run in (whole, narrow)] == [(16,), (16,)]
 
 
 def discriminator_of(path):

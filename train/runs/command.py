@@ -43,7 +43,7 @@ class Reach(NewRunOptions):
     """settings to begin with; the defaults below are this preset's"""
     config: Annotated[TrainConfig, tyro.conf.arg(name="")]
     agent: cli.MaybePath = None
-    """run whose actor and critics this one begins with; in motion, whose policy"""
+    """run whose actor and critics this one begins with; in motion, whose policy. Its layers are taken, too"""
     devices: Devices = None
 
     @classmethod
@@ -57,15 +57,16 @@ class Reach(NewRunOptions):
         if self.resume:
             self.check_resume_alone(self.default([]))
             return _resume(self.resume, mesh, console)
+        agent = Run.open(self.agent) if self.agent else None
+        config = self.config.with_policy_of(agent.config) if agent else self.config
         spec, s2r = self.read_arm(console)
         console.print("drawing goals from the reachable workspace ...")
-        task = task_of(self.config, ReachEnv(spec, self.config.env, s2r), mesh=mesh)
-        path = self.out or runs.default_path("reach", self.preset, self.config.seed)
-        if self.agent is None:
-            return _train(Run.create(path, self.config, spec, s2r), task, console)
-        donors = {"agent": self.agent}
-        state = runs.begin_with(task, self.config.seed, agent=Run.open(self.agent))
-        return _train(Run.create(path, self.config, spec, s2r, None, donors, state), task, console)
+        task = task_of(config, ReachEnv(spec, config.env, s2r), mesh=mesh)
+        path = self.out or runs.default_path("reach", self.preset, config.seed)
+        if agent is None:
+            return _train(Run.create(path, config, spec, s2r), task, console)
+        state = runs.begin_with(task, config.seed, agent=agent)
+        return _train(Run.create(path, config, spec, s2r, None, {"agent": agent.path}, state), task, console)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,7 +84,7 @@ class Imitate(NewRunOptions):
     learned reward, with --reward"""
     config: Annotated[ImitationConfig, tyro.conf.arg(name="")]
     agent: cli.MaybePath = None
-    """run whose actor and critics this one begins with"""
+    """run whose actor and critics this one begins with. The actor's layers are taken, too"""
     reward: cli.MaybePath = None
     """run whose learned reward this one takes, and leaves as it is"""
     devices: Devices = None
@@ -111,8 +112,11 @@ class Imitate(NewRunOptions):
         spec, s2r = self.read_arm(console)
         log, _ = read_demonstrations(self.file, spec)
         donors = {name: path for name in ("agent", "reward") if (path := getattr(self, name))}
+        opened = {name: Run.open(path) for name, path in donors.items()}
+        if "agent" in opened:
+            config = config.with_policy_of(opened["agent"].config)
         task = task_of(config, ReachEnv(spec, config.env, s2r), from_log(log, spec), mesh)
-        state = runs.begin_with(task, config.seed, **{name: Run.open(path) for name, path in donors.items()})
+        state = runs.begin_with(task, config.seed, **opened)
         path = self.out or runs.default_path("imitate", self.preset, config.seed)
         return _train(Run.create(path, config, spec, s2r, log, donors, state), task, console)
 
