@@ -28,6 +28,7 @@ BENCHMARKS = {
     "rewards": "benchmarks.accuracy.rewards:measure",
     "learning": "benchmarks.accuracy.learning:measure",
     "race": "benchmarks.race.race:race",
+    "path": "benchmarks.accuracy.path:measure",
     "paper": "benchmarks.paper.experiments:paper",
 }
 

@@ -51,15 +51,15 @@ def _measure(arm: str, folder: Path, poses: int, steps: int, points: int) -> dic
     record = ["mjx_softarm.deploy", "record", "--arm", twin, "--spec", arm, "--poses", poses, "--out", log]
     train = ["train", "reach", "--preset", "analytic", "--calibration", calibration, "--out", run]
     by_policy = ["mjx_softarm.deploy", "measure", policy, "--arm", twin]
-    _command(*record)
-    distrusted = _command("calib", "run", log, "--spec", arm, "--out", calibration)
-    _command(*train, "--total-env-steps", steps)
-    _command("train", "export", run)
+    run_command(*record)
+    distrusted = run_command("calib", "run", log, "--spec", arm, "--out", calibration)
+    run_command(*train, "--total-env-steps", steps)
+    run_command("train", "export", run)
     measured = {"grid": ["--goals", "grid", "--points", points]}
     if arm == "paper":
         measured["circle"] = ["--goals", "circle"]
     for goals, options in measured.items():
-        _command(*by_policy, *options, "--out", folder / goals)
+        run_command(*by_policy, *options, "--out", folder / goals)
     return _figures(arm, folder, distrusted) | {
         f"{goals}, {what}": json.loads((folder / goals / "accuracy.json").read_text())[key]
         for goals in measured
@@ -92,7 +92,7 @@ def _figures(arm: str, folder: Path, distrusted: int) -> dict[str, Any]:
     }
 
 
-def _command(*words: Any) -> int:
+def run_command(*words: Any) -> int:
     """Run a command of this project, its output shown; return its exit status.
 
     Raises:

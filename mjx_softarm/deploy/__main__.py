@@ -59,8 +59,8 @@ PolicyFile = Annotated[
 Arm = Annotated[
     str,
     tyro.conf.arg(
-        help="twin:SEED, twin:rod:SEED, simulated; twin:rod:SEED@ARM, of another arm; twin:SEED:pipe300, "
-        "in a pipe; twin:SEED:500g, with a payload; package.module:Class, yours"
+        help="yours: package.module:Class; simulated: twin:SEED, or twin:rod:SEED; twin:rod:SEED@ARM, of "
+        "another arm; twin:SEED:pipe300, in a pipe; twin:SEED:500g, with a payload"
     ),
 ]
 

@@ -27,7 +27,10 @@ from mjx_softarm.mdp.rewards import scaled_error
 from mjx_softarm.sensing.pose import pose_error, seen_error
 
 _ROUNDING_S = 1e-6  # by which a simulated tick may be longer than the period
-LEAD_S = 0.85  # of the goal of a policy trained at rest before the tip; by so much the law lags, on twins
+LEAD_S, LEAD_ACTIONS = (
+    0.85,
+    2,
+)  # of a goal before the tip, by policies of rest, of motion: they lag so on twins
 _KEPT = 1000  # rows, arrivals and faults of a run without a log
 
 
@@ -98,7 +101,8 @@ def trace(
         arrived: takes the index of each stop arrived at, as the arm rests there; a gripper may act.
         save: writes the log, once the arm is vented.
     """
-    way = Way(goals, np.broadcast_to(stops, len(goals)), pace_s, controller.policy.action_s or LEAD_S)
+    lead_s = LEAD_ACTIONS * controller.policy.action_s or LEAD_S
+    way = Way(goals, np.broadcast_to(stops, len(goals)), pace_s, lead_s)
     return _Session(arm, controller, goals, None, tell, arrived, way=way).to_end(save)
 
 

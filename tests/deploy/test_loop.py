@@ -66,16 +66,18 @@ def test_acts_at_once_and_then_at_rest():
     assert np.diff([tick for tick, _ in asked]).min() >= CONTROLLER.window or len(GOALS) > 1
 
 
+_WIDE = (np.zeros((OBS_SIZE + len(motion_layout(9)), 9), np.float32), np.zeros(9, np.float32))
+OF_MOTION = dataclasses.replace(POLICY, layers=(_WIDE,), action_s=0.3)
+
+
 def test_a_policy_of_motion_acts_in_time_and_is_told_of_motion():
     arm, asked = LinearArm(), []
-    wide = (np.zeros((OBS_SIZE + len(motion_layout(9)), 9), np.float32), np.zeros(9, np.float32))
-    policy = dataclasses.replace(POLICY, layers=(wide,), action_s=0.3)
 
     def plan(pose, goal, spring_m, sensed):
         asked.append((arm.tick, sensed))
         return exact_plan(pose, goal, spring_m, sensed)
 
-    run = go(arm, goals=GOALS[:1], controller=Controller.of(policy, plan))
+    run = go(arm, goals=GOALS[:1], controller=Controller.of(OF_MOTION, plan))
     assert len(run.arrivals) == 1 and not run.events
     np.testing.assert_array_equal([tick for tick, _ in asked], [0, 15, 30, 45])
     first, second = asked[0][1], asked[1][1]
@@ -113,6 +115,20 @@ def test_a_moving_goal_is_followed_and_its_end_is_an_arrival():
     ahead = on_the_way(goals, 0.5 + LEAD_S / 10.0)
     expected_m = between(None, ahead, None, None)
     np.testing.assert_allclose(run.log.reference_m[run.ways[0]][250], expected_m, atol=1e-3)  # a tick apart
+
+
+def test_a_policy_of_motion_is_given_a_goal_two_actions_ahead():
+    arm, goals, asked = LinearArm(), np.array([GOALS[0], GOALS[1]]), []
+
+    def plan(pose, goal, spring_m, sensed):
+        asked.append((arm.tick, goal))
+        return between(pose, goal, spring_m, sensed)
+
+    run = trace(arm, Controller.of(OF_MOTION, plan), goals, pace_s=10.0)
+    begun = run.ways[0].start
+    tick, goal = next(each for each in asked if each[0] > begun + 200)
+    ahead = on_the_way(goals, ((tick - begun) * CONTROLLER.dt_s + 0.6) / 10.0)
+    np.testing.assert_allclose(goal, ahead, atol=0.003 * np.max(np.abs(goals[1] - goals[0])))  # a tick apart
 
 
 def test_stops_on_a_way_are_arrivals_and_other_goals_are_passed():
