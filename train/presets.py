@@ -45,7 +45,7 @@ PRESETS: dict[str, TrainConfig] = {
         batch_size=128,
         replay_capacity=262_144,
         evaluation_epochs=30,
-        polish_updates=16_384,
+        polish_updates=20_480,
     ),
     # A gradient step through the equilibrium takes one action of all arms.
     "analytic": TrainConfig(
