@@ -35,6 +35,10 @@ KINDS = {
     "hand-made": Kind("hand-made reward", "pipe300", "hand-made"),
     "no-penalty": Kind("no gradient penalty", "pipe300", "pipe", ("gail.gradient_penalty=0",)),
     "narrow": Kind("hand-made, and learned in the wide pipe", "pipe250", "frozen", reward_of="pipe"),
+    "narrow-learned": Kind(
+        "learned in the wide pipe", "pipe250", "frozen", ("hand_made_weight=0",), reward_of="pipe"
+    ),
+    "narrow-hand-made": Kind("hand-made reward", "pipe250", "hand-made"),
     "circle": Kind("with demonstrations", "circle16", "circle", from_reach=True),
 }
 TASKS = ("pipe300", "pipe250", "circle16")

@@ -109,8 +109,9 @@ def test_settings_of_each_kind_are_known(tmp_path, commands, kind):
     assert config.n_epochs == 2
     assert config.stage_epochs == ((0, 1) if kind == "circle" else (0,))
     assert (config.gail.gradient_penalty == 0) == (kind == "no-penalty")
-    assert (options.reward is not None) == (kind == "narrow")
-    assert config.env.pipe_diameter_mm == {"narrow": 250, "circle": None}.get(kind, 300)
+    assert (options.reward is not None) == (kind in ("narrow", "narrow-learned"))
+    assert (config.hand_made_weight > 0) == (kind in ("hand-made", "narrow", "narrow-hand-made", "circle"))
+    assert config.env.pipe_diameter_mm == {"pipe300": 300, "pipe250": 250, "circle16": None}[KINDS[kind].task]
 
 
 def test_scene_is_the_twin_in_its_pipe(tmp_path, make_arm_model, monkeypatch):

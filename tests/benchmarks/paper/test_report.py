@@ -53,6 +53,7 @@ def test_spreads_group_kinds_and_variants():
     found = {(item["kind"], item["variant"]): item for item in spreads(table)}
     assert set(found) == {
         *(("pipe", "as shown"), ("pipe", "exchanged"), ("hand-made", "as shown"), ("narrow", "as shown")),
+        *(("narrow-learned", "as shown"), ("narrow-hand-made", "as shown")),
         *(("circle", "as shown"), ("with", "0 g")),
         *(("pipe", "as shown in motion"), ("moving", "as shown in motion")),
     }

@@ -14,9 +14,9 @@ def test_three_twins_and_three_seeds():
     beside = trials("open", dataclasses.replace(Settings(), beside=("quick", "paper")))
     assert len(beside) == len(set(beside)) == len(found) + 2 * 9 * 7
     found = trials("confined", Settings())
-    assert len(found) == len(set(found)) == 9 * 7 + 9
+    assert len(found) == len(set(found)) == 9 * 9 + 9
     learned = trainings(Settings())
-    assert len(learned) == len(set(learned)) == 5 * 9 + 3
+    assert len(learned) == len(set(learned)) == 7 * 9 + 3
     assert sum(kind == "no-penalty" for kind, _, _ in learned) == 3
 
 
