@@ -13,6 +13,7 @@ from typing import Any
 
 import gymnasium
 import jax
+import jax.numpy as jnp
 import numpy as np
 import torch  # pyright: ignore[reportMissingImports]
 from stable_baselines3 import HerReplayBuffer  # pyright: ignore[reportMissingImports]
@@ -96,8 +97,8 @@ class HindsightBuffer(HerReplayBuffer):
         draws = self._rng.random((2, len(after)), np.float32)
         near = draws[0] < self._hindsight.near_share / self.her_ratio
         direction = self._rng.standard_normal((len(after), 6), np.float32)
-        offsets = np.asarray(near_offsets(draws[1], direction, self._hindsight))
-        goals = np.where(near[:, None], after + offsets, goals)
+        offsets = near_offsets(jnp.asarray(draws[1]), jnp.asarray(direction), self._hindsight)
+        goals = np.where(near[:, None], after + np.asarray(offsets), goals)
         cost = self._reward_scale * self._config.saturation_cost
         reward, reached, _ = rewards.reward(
             after,
