@@ -49,7 +49,7 @@ def paper(
         arm: twin, or a rod, of other physics, in open space alone
         preset: of training in open space; None: paper; analytic leaves no critics for the confined circle
         env_steps: of training in open space; None: the preset's
-        beside: further policies in open space with S2R: payloads (in training), or presets at their full length
+        beside: more policies in open space with S2R: payloads (in training), or presets at their full length
         out: working folder; None: runs/paper
     """
     if only != "open" and (arm == "rod" or preset == "analytic"):
