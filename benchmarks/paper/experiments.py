@@ -16,7 +16,7 @@ from mjx_softarm._support import cli
 from mjx_softarm._support.errors import InputError
 
 
-def _kinds(words: list[str]) -> tuple[str, ...]:
+def _presets(words: list[str]) -> tuple[str, ...]:
     names = tuple(words[0].split(","))
     if unknown := [name for name in names if name not in BESIDE]:
         raise ValueError(f"got {', '.join(unknown)}, expected some of {', '.join(BESIDE)}")
@@ -32,7 +32,7 @@ def paper(
     arm: Literal["twin", "rod"] = "twin",
     preset: Literal["quick", "paper", "analytic"] | None = None,
     env_steps: int | None = None,
-    beside: Annotated[tuple[str, ...], cli.listed(_kinds, "NAME,NAME,...")] = (),
+    beside: Annotated[tuple[str, ...], cli.listed(_presets, "NAME,NAME,...")] = (),
     out: cli.MaybePath = None,
 ) -> int:
     """Run the paper's experiments on twins, beside its numbers, in hours; exit status 1 if a goal is missed.
@@ -49,7 +49,7 @@ def paper(
         arm: twin, or a rod, of other physics, in open space alone
         preset: of training in open space; None: paper; analytic leaves no critics for the confined circle
         env_steps: of training in open space; None: the preset's
-        beside: more policies in open space with S2R: payloads (in training), or presets at their full length
+        beside: further presets in open space with S2R, as long as they are
         out: working folder; None: runs/paper
     """
     if only != "open" and (arm == "rod" or preset == "analytic"):

@@ -82,12 +82,13 @@ def train_reach(folder: Path, settings: Settings, twin: int | None, seed: int) -
 
 
 def train_other(folder: Path, settings: Settings, name: str, twin: int, seed: int) -> None:
-    """Train a policy of another preset, with payloads, or of a calibration without its S2R network."""
-    kind, calibration = KINDS[name], folder / f"twin{twin}" / CALIBRATION
-    arm = ["--spec", calibration / ARM_FILE] if name == "chambers" else ["--calibration", calibration]
-    preset, training = (kind.reach, ()) if kind.reach else (settings.preset, settings.training)
-    more = (f"--{text}" for text in (*training, *kind.settings))
-    _reach(folder / learned_run(name, twin, seed), seed, "--preset", preset, *more, *map(str, arm))
+    """Train a policy of another preset, or of a twin's calibration without its S2R network."""
+    run, calibration = folder / learned_run(name, twin, seed), folder / f"twin{twin}" / CALIBRATION
+    if preset := KINDS[name].reach:
+        _reach(run, seed, "--preset", preset, "--calibration", str(calibration))
+        return
+    chosen = ["--preset", settings.preset, *(f"--{text}" for text in settings.training)]
+    _reach(run, seed, *chosen, "--spec", str(calibration / ARM_FILE))
 
 
 def _reach(run: Path, seed: int, *options: str) -> None:

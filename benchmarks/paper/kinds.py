@@ -14,10 +14,10 @@ class Kind(NamedTuple):
     title: str
     task: str = ""  # of `train.demos.waypoints.TASKS`, whose demonstrations it learns from
     preset: str = ""  # of `python -m train imitate`
-    settings: tuple[str, ...] = ()  # NAME=VALUE, added to those of the preset
+    settings: tuple[str, ...] = ()  # NAME=VALUE
     reward_of: str = ""  # kind whose learned reward it takes, unchanged
     from_reach: bool = False  # begins with the policy that was trained without demonstrations
-    reach: str = ""  # preset of `python -m train reach`, in the place of the experiment's
+    reach: str = ""  # preset of `python -m train reach`, beside that of the experiment
 
 
 KINDS = {
@@ -25,7 +25,6 @@ KINDS = {
     "without": Kind("calibrated springs"),
     "chambers": Kind("calibrated springs and chambers"),
     "with": Kind("with S2R"),
-    "payloads": Kind("with S2R, trained with payloads", settings=("env.randomisation.payload_max_kg=1",)),
     "as-printed": Kind("with S2R, the paper's recipe", reach="as-printed"),
     "quick": Kind("with S2R, quick", reach="quick"),
     "paper": Kind("with S2R, paper", reach="paper"),
@@ -43,7 +42,7 @@ KINDS = {
     "circle": Kind("with demonstrations", "circle16", "circle", from_reach=True),
 }
 TASKS = ("pipe300", "pipe250", "circle16")
-BESIDE = ("payloads", *(name for name, kind in KINDS.items() if kind.reach))
+BESIDE = tuple(name for name, kind in KINDS.items() if kind.reach)
 
 
 class Trial(NamedTuple):

@@ -66,10 +66,6 @@ def test_further_policies_have_a_preset_of_their_own_or_no_network(tmp_path, com
     options = parsed(start)
     assert (options.preset, options.config.seed, options.calibration) == ("quick", 2, calibration)
     assert options.config == dataclasses.replace(PRESETS["quick"], seed=2)  # not the settings of the others
-    (start,) = commands(jobs.train_other, tmp_path, settings, "payloads", 1, 2)
-    options = parsed(start)
-    assert (options.preset, options.calibration, options.config.env.n_poses) == ("analytic", calibration, 64)
-    assert options.config.env.randomisation.payload_max_kg == 1.0
     (start,) = commands(jobs.train_other, tmp_path, settings, "chambers", 1, 2)
     options = parsed(start)
     assert (options.preset, options.spec, options.calibration) == (
