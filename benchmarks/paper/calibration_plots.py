@@ -45,13 +45,14 @@ def calibration_figures(folder: Path, settings: Settings) -> dict[str, Figure]:
 def configurations_figure(found: Comparison, twin: int) -> Figure:
     """Draw arms from two sides at poses far apart, and how far all simulated tips are from the measured."""
     figure = Figure(figsize=(10.5, 6.2), layout="constrained")
-    left, right = np.ravel(figure.subfigures(1, 2, width_ratios=(N_SHOWN, 1.55)))
+    left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(N_SHOWN, 1.55))[0]
     panels = left.subplots(len(VIEWS), N_SHOWN, sharex=True, sharey=True)
     for column, pose in enumerate(spread_poses(found)):
         for row, (axis, label) in enumerate(VIEWS):
             panel = panels[row, column]
             dress(panel, f"pose {column + 1}" if row == 0 else "", label, "" if column else "z [mm]")
             panel.set_aspect("equal", adjustable="box")
+            panel.margins(x=0.25)
             _draw_arm(panel, found, pose, [axis, 2])
     _draw_errors(right.subplots(), found)
     figure.legend(
@@ -161,9 +162,10 @@ def sensor_figure(found: Comparison, twin: int, specified: Sensor, calibrated: S
         label = f"{np.sqrt(np.mean(off**2)):.2f} mm RMS"
         errors.plot(at.ravel(), (read - ruler_mm).ravel(), "_", color=colour, markersize=7.0, label=label)
     errors.set_xticks(np.arange(found.reading.shape[1]))
-    errors.margins(y=0.2)
-    for panel, place in ((curve, "lower right"), (line, "lower right"), (errors, "upper right")):
-        panel.legend(frameon=False, fontsize=8.5, loc=place)
+    for panel in (curve, line, errors):
+        low, high = panel.get_ylim()
+        panel.set_ylim(low, high + 0.3 * (high - low))  # room for the legend
+        panel.legend(frameon=False, fontsize=8.5, loc="upper left")
     figure.suptitle(f"sensors of twin {twin} {UNSEEN}", **_LEFT)
     return figure
 

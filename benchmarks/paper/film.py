@@ -15,6 +15,7 @@ from benchmarks.paper.measure import WatchedTwin, captured_finger_tips, finger_t
 from mjx_softarm.mechanics.pipe import PIPES_MM, CrossPipe
 
 WIDTH, HEIGHT = 240, 320  # of each half [px]
+LABEL_HEIGHT = 32  # of the text above a square side view [px]
 PERIOD_S = 1.0  # simulated time between two pictures
 MAX_FRAMES = 120
 FRAME_MS = 80
@@ -118,10 +119,11 @@ def side_by_side(
     images = []
     for k in _spread(max(len(pictures) for pictures, _, _ in columns), N_LOAD_FRAMES):
         height, width, _ = columns[0][0][0].shape
-        images.append(Image.new("RGB", (width * len(columns), height + width)))
+        size = (width, width + LABEL_HEIGHT)
+        images.append(Image.new("RGB", (width * len(columns), height + size[1])))
         for left, (pictures, path_mm, side) in zip(range(0, images[-1].width, width), columns, strict=True):
             images[-1].paste(Image.fromarray(pictures[min(k, len(pictures) - 1)]), (left, 0))
-            images[-1].paste(_side_view((width, width), path_mm[: k + 1], side), (left, height))
+            images[-1].paste(_side_view(size, path_mm[: k + 1], side), (left, height))
     return images
 
 
