@@ -78,6 +78,8 @@ def run(experiment: str, folder: Path, pictures: Path, settings: Settings) -> di
         JobError: a stage failed, or the folder has other settings.
     """
     claim(folder, settings)
-    if no_film := run_stages(folder, settings, stages(experiment, settings)).get("film"):
-        print(f"no film: {no_film}")
+    returned = run_stages(folder, settings, stages(experiment, settings))
+    for name in ("film", "film of loads"):
+        if no_film := returned.get(name):
+            print(f"no {name}: {no_film}")
     return write_report(experiment, folder, pictures, settings, load_results(folder, experiment, settings))

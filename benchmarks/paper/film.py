@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,9 +15,11 @@ from benchmarks.paper.measure import WatchedTwin, captured_finger_tips, finger_t
 from mjx_softarm.mechanics.pipe import PIPES_MM, CrossPipe
 
 WIDTH, HEIGHT = 240, 320  # of each half [px]
+LABEL_HEIGHT = 32  # of the text above a square side view [px]
 PERIOD_S = 1.0  # simulated time between two pictures
 MAX_FRAMES = 120
 FRAME_MS = 80
+N_LOAD_FRAMES, LOAD_FRAME_MS = 70, 110  # of the film that has a column for each load
 N_COLOURS = 128
 INK, GREY, BLUE, ORANGE = (34, 34, 34), (154, 160, 166), (31, 111, 180), (224, 123, 40)
 
@@ -49,9 +52,7 @@ class Camera:
 
 def film_scene(path: Path, scene: Scene, trial: Trial) -> None:
     """Write the film of a trial: its pipe cut open from the front, or the circle from above."""
-    with scene.twin.renderer(WIDTH, HEIGHT) as renderer:
-        camera = Camera(scene.twin, renderer)
-        operate(WatchedTwin(scene.twin, camera.shoot), *scene[1:], trial.objects)
+    camera = _filmed(scene, trial)
     diameter_mm = PIPES_MM.get(KINDS[trial.kind].task)
     gripper_m = scene.controller.policy.spec.mass.gripper_length_m if diameter_mm else 0.0
     path_mm = 1e3 * np.array(
@@ -67,6 +68,26 @@ def film_scene(path: Path, scene: Scene, trial: Trial) -> None:
     write_gif(path, frames(camera.pictures, path_mm, side))
 
 
+def film_side_by_side(path: Path, scenes: Sequence[tuple[Scene, Trial]]) -> None:
+    """Write the film of trials on the circle, at equal times: one column for each, titled by its load."""
+    columns = []
+    for scene, trial in scenes:
+        camera = _filmed(scene, trial)
+        path_mm = 1e3 * np.array([seen.tip_m for seen in camera.seen])
+        title = f"{trial.load_g:,} g" if trial.load_g else "no load"
+        side = SideView(title, "reference (grey) and tip, from above", (0, 1), scene.goals[:, :3])
+        columns.append((camera.pictures, path_mm, side))
+    write_gif(path, side_by_side(columns), LOAD_FRAME_MS)
+
+
+def _filmed(scene: Scene, trial: Trial) -> Camera:
+    """Run a trial; returns the camera that filmed it."""
+    with scene.twin.renderer(WIDTH, HEIGHT) as renderer:
+        camera = Camera(scene.twin, renderer)
+        operate(WatchedTwin(scene.twin, camera.shoot), *scene[1:], trial.objects)
+    return camera
+
+
 def outline_mm(pipe: CrossPipe) -> list[np.ndarray]:
     """Return the cross from the front: lines (k, 2) of x and z [mm]."""
     r, far, z = pipe.radius_m, pipe.branch_m, pipe.centre_z_m
@@ -79,42 +100,70 @@ def outline_mm(pipe: CrossPipe) -> list[np.ndarray]:
 
 def frames(pictures: list[np.ndarray], path_mm: np.ndarray, side: SideView) -> list[Image.Image]:
     """Return at most `MAX_FRAMES` pictures, evenly spread, each beside the path (n, 3) up to its time."""
-    chosen = np.unique(np.linspace(0, len(pictures) - 1, min(MAX_FRAMES, len(pictures))).round().astype(int))
-    return [_frame(pictures[k], path_mm[: k + 1], side) for k in chosen]
+    images = []
+    for k in _spread(len(pictures), MAX_FRAMES):
+        height, width, _ = pictures[k].shape
+        images.append(Image.new("RGB", (2 * width, height)))
+        images[-1].paste(Image.fromarray(pictures[k]), (0, 0))
+        images[-1].paste(_side_view((width, height), path_mm[: k + 1], side), (width, 0))
+    return images
 
 
-def _frame(picture: np.ndarray, path_mm: np.ndarray, side: SideView) -> Image.Image:
-    height, width, _ = picture.shape
-    frame = Image.new("RGB", (2 * width, height), (255, 255, 255))
-    frame.paste(Image.fromarray(picture), (0, 0))
-    pen = ImageDraw.Draw(frame)
-    # Scale so that goals and lines fill 80 % of the right half.
+def side_by_side(
+    columns: Sequence[tuple[list[np.ndarray], np.ndarray, SideView]],
+) -> list[Image.Image]:
+    """Return frames with a column for each trial: its picture above its path (n, 3) up to the same time.
+
+    A trial that ended before the others shows its last picture from then on.
+    """
+    images = []
+    for k in _spread(max(len(pictures) for pictures, _, _ in columns), N_LOAD_FRAMES):
+        height, width, _ = columns[0][0][0].shape
+        size = (width, width + LABEL_HEIGHT)
+        images.append(Image.new("RGB", (width * len(columns), height + size[1])))
+        for left, (pictures, path_mm, side) in zip(range(0, images[-1].width, width), columns, strict=True):
+            images[-1].paste(Image.fromarray(pictures[min(k, len(pictures) - 1)]), (left, 0))
+            images[-1].paste(_side_view(size, path_mm[: k + 1], side), (left, height))
+    return images
+
+
+def _spread(n: int, n_most: int) -> list[int]:
+    """Return at most `n_most` of n indices, evenly spread, the first and the last among them."""
+    return np.unique(np.linspace(0, n - 1, min(n_most, n)).round().astype(int)).tolist()
+
+
+def _side_view(size: tuple[int, int], path_mm: np.ndarray, side: SideView) -> Image.Image:
+    """Draw a path (k, 3) from one side into a picture of some width and height [px]."""
+    width, height = size
+    image = Image.new("RGB", size, (255, 255, 255))
+    pen = ImageDraw.Draw(image)
+    # Scale so that goals and lines fill 80 % of the picture.
     axes = list(side.axes)
     shown = np.concatenate([side.goals_mm[:, axes], *side.lines_mm])
     low, high = shown.min(axis=0), shown.max(axis=0)
-    scale = 0.8 * min(np.array([width, height]) / np.maximum(high - low, 1.0))
+    scale = 0.8 * min(np.array(size) / np.maximum(high - low, 1.0))
 
     def at(point_mm: np.ndarray) -> tuple[float, float]:
         right, up = scale * (point_mm - 0.5 * (low + high))
-        return 1.5 * width + right, 0.53 * height - up
+        return 0.5 * width + right, 0.53 * height - up
 
     for line in side.lines_mm:
         pen.line([at(point) for point in line], fill=GREY, width=2)
-    pen.text((width + 8, 8), side.title, fill=INK)
-    pen.text((width + 8, 22), side.text, fill=GREY)
+    pen.text((8, 8), side.title, fill=INK)
+    pen.text((8, 22), side.text, fill=GREY)
     for goal in side.goals_mm[:, axes]:
         pen.circle(at(goal), 2, fill=GREY)
     pen.line([at(point) for point in path_mm[:, axes]], fill=BLUE, width=1)
     pen.circle(at(path_mm[-1, axes]), 4, fill=ORANGE)
-    return frame
+    return image
 
 
-def write_gif(path: Path, images: list[Image.Image]) -> None:
+def write_gif(path: Path, images: list[Image.Image], frame_ms: int = FRAME_MS) -> None:
     """Write a film that repeats, with one palette for all its frames."""
     palette = images[len(images) // 2].quantize(N_COLOURS, Image.Quantize.MAXCOVERAGE)
     first, *others = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images)
     part = path.with_name(path.name + ".part")
     first.save(
-        part, format="GIF", save_all=True, append_images=others, duration=FRAME_MS, loop=0, optimize=True
+        part, format="GIF", save_all=True, append_images=others, duration=frame_ms, loop=0, optimize=True
     )
     part.replace(path)

@@ -28,7 +28,9 @@ from benchmarks.paper.measure import operate, save_outcome
 from mjx_softarm.mechanics.pipe import PIPES_MM
 from mjx_softarm.spec import ARM_FILE
 
-CALIBRATION = "calibration"
+CALIBRATION, COMPARISON_FILE = "calibration", "comparison.npz"
+N_COMPARED = 40  # poses that a calibrated twin is compared at
+COMPARED_SEED = 1000  # and up: other poses than the logs', whose seeds are the twins'
 # Session of a twin in trials of demonstrated tasks; demonstrations are recorded in its evaluation session,
 # with other noise.
 TRIAL_SESSION = 2
@@ -53,9 +55,7 @@ def calibrate_twin(folder: Path, settings: Settings, twin: int) -> None:
     from calib.run import calibrate, write_calibration
     from mjx_softarm._support import xla
     from mjx_softarm._support.provenance import provenance
-    from mjx_softarm.deploy.record import record
     from mjx_softarm.logs.schema import write_log
-    from mjx_softarm.mechanics.excitation import random_pressures
     from mjx_softarm.spec import ArmSpec
     from mjx_softarm.twin.instruments import S2R_SESSION
 
@@ -63,15 +63,48 @@ def calibrate_twin(folder: Path, settings: Settings, twin: int) -> None:
     here.mkdir(parents=True, exist_ok=True)
     file = here / "log.npz"
     if not file.exists():
-        pressures_kpa = random_pressures(spec, settings.n_poses, seed=twin)
-        recording = record(stand_in(settings)(twin, spec, session=S2R_SESSION), spec, pressures_kpa)
-        if cause := recording.ending.cause:
-            raise JobError(f"{file}: got a recording that ended early ({cause}), expected all poses")
-        write_log(file, recording.log)
+        write_log(
+            file, _recorded(stand_in(settings)(twin, spec, session=S2R_SESSION), settings.n_poses, twin)
+        )
     log, findings = read_log(file, spec.n_chambers)
     xla.enable_compilation_cache()
     calibration = calibrate([log], spec)
     write_calibration(here / CALIBRATION, calibration, [*map(str, findings)], provenance("benchmarks"))
+
+
+def _recorded(arm: Any, n_poses: int, seed: int) -> Any:
+    """Return the log of random poses of a stand-in.
+
+    Raises:
+        JobError: the recording ended early.
+    """
+    from mjx_softarm.deploy.record import record
+    from mjx_softarm.mechanics.excitation import random_pressures
+    from mjx_softarm.spec import ArmSpec
+
+    spec = ArmSpec.default()
+    recording = record(arm, spec, random_pressures(spec, n_poses, seed=seed))
+    if cause := recording.ending.cause:
+        raise JobError(f"log of {n_poses} poses: got a recording that ended early ({cause}), expected all")
+    return recording.log
+
+
+def compare_twin(folder: Path, settings: Settings, twin: int) -> None:
+    """Compare a twin with its simulation, as specified and as calibrated, at poses of another session."""
+    from benchmarks.paper.comparison import compare, save_comparison
+    from mjx_softarm._support import xla
+    from mjx_softarm.sensing.s2r import S2R_FILE, load_s2r
+    from mjx_softarm.spec import ARM_FILE, ArmSpec
+    from mjx_softarm.twin.instruments import EVALUATION_SESSION
+
+    here = folder / f"twin{twin}"
+    specified, calibrated = ArmSpec.default(), ArmSpec.from_toml(here / CALIBRATION / ARM_FILE)
+    network = here / CALIBRATION / S2R_FILE  # absent where it would not help
+    s2r = load_s2r(network, calibrated.n_chambers) if network.exists() else None
+    arm = stand_in(settings)(twin, specified, session=EVALUATION_SESSION)
+    xla.enable_compilation_cache()
+    log = _recorded(arm, N_COMPARED, COMPARED_SEED + twin)
+    save_comparison(here / COMPARISON_FILE, compare(log, specified, calibrated, s2r))
 
 
 def train_reach(folder: Path, settings: Settings, twin: int | None, seed: int) -> None:
@@ -205,6 +238,18 @@ def film(folder: Path, settings: Settings, trial: Trial, file: str) -> str:
 
     try:
         film_scene(folder / file, scene_of(folder, settings, trial), trial)
+    except RenderError as error:
+        return str(error)
+    return ""
+
+
+def film_loads(folder: Path, settings: Settings, trials: tuple[Trial, ...], file: str) -> str:
+    """Film trials with different loads side by side; returns why they cannot be drawn, or ""."""
+    from benchmarks.paper.film import film_side_by_side
+    from mjx_softarm.mechanics.render import RenderError
+
+    try:
+        film_side_by_side(folder / file, [(scene_of(folder, settings, trial), trial) for trial in trials])
     except RenderError as error:
         return str(error)
     return ""

@@ -36,7 +36,8 @@ def circle_figure(outcomes: Mapping[Trial, Outcome]) -> Figure:
     """
     chosen = {t: outcome for t, outcome in outcomes.items() if not t.load_g and t.kind in COLOURS}
     twins, seed = sorted({trial.twin for trial in chosen}), min(trial.seed for trial in chosen)
-    figure = Figure(figsize=(4.0 * len(twins) + 0.4, 4.7), layout="compressed")
+    n_legend_columns, height = (2, 5.8) if len(twins) == 1 else (5, 5.1)
+    figure = Figure(figsize=(4.0 * len(twins) + 0.6, height), layout="constrained")
     panels = figure.subplots(1, len(twins), squeeze=False, sharex=True, sharey=True)[0]
     for panel, twin in zip(panels, twins, strict=True):
         dress(panel, f"twin {twin}, from above", "x [mm]", "y [mm]")
@@ -50,9 +51,18 @@ def circle_figure(outcomes: Mapping[Trial, Outcome]) -> Figure:
         hit = np.concatenate([(run.goal + run.error)[run.saturated.any(axis=1)] for run in here.values()])
         ring = {"color": RED, "markersize": 7.0, "fillstyle": "none", "linestyle": "none"}
         panel.plot(hit[:, 0], hit[:, 1], "o", label="a chamber saturated", **ring)
+    _make_square(panels[0])  # whatever the paths, the layout is the same
     handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, frameon=False, loc="outside lower center", ncols=2 * len(panels))
+    figure.legend(handles, labels, frameon=False, loc="outside lower center", ncols=n_legend_columns)
     return figure
+
+
+def _make_square(panel: Any) -> None:
+    """Give x and y of a panel, and of those that share them, ranges of one length about their middles."""
+    limits = np.array([panel.get_xlim(), panel.get_ylim()])
+    half = 0.5 * np.ptp(limits, axis=1).max() * np.array([-1.0, 1.0])
+    x, y = limits.mean(axis=1, keepdims=True) + half
+    panel.set(xlim=x, ylim=y)
 
 
 def _closed(pose: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Report of an experiment: JSON, pictures, film, and a table to print."""
+"""Report of an experiment: JSON, pictures, films, and a table to print."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from benchmarks.paper import plots
+from benchmarks.paper.calibration_plots import calibration_figures
 from benchmarks.paper.engine import MORE, Settings
 from benchmarks.paper.goals import check_goals
 from benchmarks.paper.jobs import CALIBRATION
 from benchmarks.paper.kinds import KINDS
 from benchmarks.paper.summary import Results, Row, simulated_rows, spreads, training_rows, trial_rows
-from benchmarks.paper.trials import FILMS
+from benchmarks.paper.trials import FILMS, LOADS_FILM
 from mjx_softarm._support.provenance import provenance, write_json
 
 DPI, N_COLOURS = 110, 64
@@ -52,16 +53,19 @@ def _label(experiment: str, settings: Settings) -> str:
 def write_report(
     experiment: str, folder: Path, pictures: Path, settings: Settings, results: Results
 ) -> dict[str, Any]:
-    """Write JSON file, pictures and film of an experiment to the folder `pictures`; returns the figures."""
+    """Write JSON file, pictures and films of an experiment to the folder `pictures`; returns the figures."""
     data = figures_of(experiment, folder, settings, results)
     pictures.mkdir(parents=True, exist_ok=True)
     finite = json.loads(json.dumps(data), parse_constant=lambda _: None)  # JSON has no NaN
     write_json(pictures / json_name(experiment, settings), {"figures": finite, **provenance("benchmarks")})
-    prefix, film = PREFIXES[_label(experiment, settings)], folder / FILMS[experiment]
-    for name, figure in draw(experiment, results, data["runs"]).items():
+    prefix, is_open = PREFIXES[_label(experiment, settings)], experiment == "open"
+    drawn = draw(experiment, results, data["runs"])
+    drawn |= calibration_figures(folder, settings) if is_open else {}
+    for name, figure in drawn.items():
         _save_picture(pictures / f"{prefix}-{name}.png", figure)
-    if film.exists():
-        shutil.copyfile(film, pictures / f"{prefix}-{film.name}")
+    for film in (FILMS[experiment], *[LOADS_FILM] * is_open):
+        if (folder / film).exists():
+            shutil.copyfile(folder / film, pictures / f"{prefix}-{film}")
     return data
 
 

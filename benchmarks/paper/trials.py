@@ -3,6 +3,7 @@
 The folder of a benchmark, which both experiments share:
 
     twinT/log.npz, twinT/calibration/      recorded and calibrated through `ArmIO` and logs alone
+    twinT/comparison.npz                   the first twin beside its simulation, before and after calibration
     twinT/demos-TASK.npz                   demonstrations of the scripted expert on the twin
     nominal-seedS/, twinT-seedS/           policies without demonstrations; the nominal ones know no twin
     KIND-twinT-seedS/                      policies without S2R, of other presets, or learned from
@@ -28,6 +29,7 @@ from benchmarks.paper.kinds import (
 )
 
 FILMS = {"open": "circle.gif", "confined": "pipe.gif"}
+LOADS_FILM, FILMED_LOADS_G = "loads.gif", (500, 1000)  # in open space; the loads are shown beside none
 
 
 def trainings(settings: Settings) -> list[tuple[str, int, int]]:
@@ -86,7 +88,9 @@ def stages(experiment: str, settings: Settings) -> list[list[Stage]]:
         others = [(kind, *run) for kind in ("chambers", *settings.beside) for run in runs]
         on_twins += [_learn(*item, jobs.train_other) for item in others]
         exports = [_export(twin, settings.seeds, others) for twin in (None, *settings.twins)]
-        return [[*calibrations, *nominal], on_twins, exports, [*tried, *films]]
+        loads = _film_loads(filmed, settings) * (settings.arm == "twin")
+        compared = _compare(settings.twins[0])
+        return [[*calibrations, *nominal], [*on_twins, compared], exports, [*tried, *films, *loads]]
     path = jobs.demonstrations_path
     demonstrations = [
         Stage(f"demonstrate {task} on twin {twin}", (path(twin, task),), jobs.demonstrate, (twin, task))
@@ -97,6 +101,19 @@ def stages(experiment: str, settings: Settings) -> list[list[Stage]]:
     with_their_reward = [_learn(*item) for item in trainings(settings) if KINDS[item[0]].reward_of]
     exports = [_export(twin, settings.seeds, trainings(settings)) for twin in settings.twins]
     return [calibrations, [*demonstrations, *on_twins], first, with_their_reward, exports, [*tried, *films]]
+
+
+def _compare(twin: int) -> Stage:
+    result = f"twin{twin}/{jobs.COMPARISON_FILE}"
+    return Stage(f"compare twin {twin} with its simulation", (result,), jobs.compare_twin, (twin,))
+
+
+def _film_loads(unloaded: Trial, settings: Settings) -> list[Stage]:
+    """Return the stage that films a trial beside the same with loads, if the experiment has such loads."""
+    loads_g = [load_g for load_g in settings.loads_g if load_g in FILMED_LOADS_G]
+    shown = (unloaded, *(unloaded._replace(load_g=load_g) for load_g in loads_g))
+    stage = Stage("film of loads", (LOADS_FILM,), jobs.film_loads, (shown, LOADS_FILM))
+    return [stage] * bool(loads_g)
 
 
 def _reach(twin: int | None, seed: int) -> Stage:

@@ -4,7 +4,9 @@ import json
 
 import numpy as np
 
+from benchmarks.paper.comparison import Comparison, save_comparison
 from benchmarks.paper.engine import Settings
+from benchmarks.paper.jobs import CALIBRATION, COMPARISON_FILE
 from benchmarks.paper.kinds import KINDS, Trial, reach_run
 from benchmarks.paper.measure import Outcome, finger_tips
 from benchmarks.paper.summary import Results, Training, training_rows, trial_rows
@@ -14,6 +16,8 @@ from mjx_softarm.deploy.faults import Fault
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.policy.file import policy_from_actor
+from mjx_softarm.sensing.sensors import Sensor
+from mjx_softarm.spec import ARM_FILE
 from train.demos.waypoints import task
 
 SPEC = ArmSpec.default()
@@ -114,6 +118,26 @@ def tables(results):
     return trial_rows(results), training_rows(results)
 
 
+def compared(n=6, specified_mm=20.0, calibrated_mm=2.0, corrected_mm=1.0):
+    """A comparison whose simulated arms are off by these distances along y; straight arms to one side."""
+    down = np.linspace(0.0, 1.0, SPEC.n_links + 1)[:, None] * [0.0, 0.0, -0.6]
+    plate_m = down + np.linspace(-0.1, 0.1, n)[:, None, None] * down[:, 2:] * [1.0, 0.0, 0.0]
+    off_m = 1e-3 * np.array([specified_mm, calibrated_mm])[:, None, None] * [0.0, 1.0, 0.0]
+    spring_m = np.linspace(0.15, 0.25, n * N).reshape(n, N)
+    return Comparison(
+        marker_m=plate_m[:, 1:],
+        tip_m=plate_m[:, -1],
+        spring_m=spring_m,
+        chamber_m=spring_m,
+        plate_pair_m=plate_m + off_m[:, None],
+        tip_pair_m=plate_m[:, -1] + off_m,
+        chamber_pair_m=spring_m + off_m[..., 1:2],
+        corrected_tip_m=plate_m[:, -1] + [0.0, 1e-3 * corrected_mm, 0.0],
+        reading=Sensor.from_spec(SPEC).readings(spring_m),
+        ruler_m=spring_m,
+    )
+
+
 def fill(folder, settings):
     """Leave in a folder what training and calibration would; the second twin's calibration warns."""
     for twin in (None, *settings.twins):
@@ -122,10 +146,12 @@ def fill(folder, settings):
             run.mkdir(parents=True)
             (run / "evaluation.json").write_text(json.dumps({"circle_mean_mm": 1.25}))
     for twin in settings.twins:
-        here = folder / f"twin{twin}" / "calibration"
+        here = folder / f"twin{twin}" / CALIBRATION
         here.mkdir(parents=True)
         parts = {"Springs": {"warnings": ["off <by> much"] if twin else []}}
         (here / "report.json").write_text(json.dumps({"parts": parts}))
+        SPEC.to_toml(here / ARM_FILE)
+        save_comparison(here.parent / COMPARISON_FILE, compared())
 
 
 def make_policy(make_arm_model, spec=SPEC, s2r=False):

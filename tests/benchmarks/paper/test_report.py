@@ -1,12 +1,16 @@
 """Summary, report, pictures and film: nothing of made-up results is hidden."""
 
+import dataclasses
+import io
 import json
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from PIL import Image
 
-from benchmarks.paper import film, report
+from benchmarks.paper import film, plots, report
+from benchmarks.paper.calibration_plots import calibration_figures
 from benchmarks.paper.jobs import Scene
 from benchmarks.paper.kinds import KINDS, Trial, learned_run
 from benchmarks.paper.measure import save_outcome
@@ -18,7 +22,7 @@ from benchmarks.paper.summary import (
     steps_to_success,
     trial_rows,
 )
-from benchmarks.paper.trials import FILMS, trainings, trials
+from benchmarks.paper.trials import FILMS, LOADS_FILM, trainings, trials
 from mjx_softarm.mechanics.excitation import circle_poses
 from tests.benchmarks.paper.made_up import (
     SPEC,
@@ -103,6 +107,7 @@ def write(experiment, folder, results, filmed=False):
         side = film.SideView("", "", (0, 1), circle_poses(SPEC, 3)[:, :3])
         images = film.frames([np.zeros((20, 15, 3), np.uint8)] * 3, np.zeros((3, 3)), side)
         film.write_gif(folder / FILMS[experiment], images)
+        film.write_gif(folder / LOADS_FILM, images)
     report.write_report(experiment, folder, folder / "out", TINY, results)
     written = json.loads((folder / "out" / f"paper-{experiment}.json").read_text("utf-8"))
     assert "commit" in written
@@ -113,7 +118,8 @@ def write(experiment, folder, results, filmed=False):
 def test_open_results_are_written_and_nothing_is_hidden(tmp_path):
     results = good_results("open", TINY, {Trial("with", 0, 0): made_up("with", missed=range(6))})
     figures, files = write("open", tmp_path, results, filmed=True)
-    assert files == {"paper-open.json", "paper-circle.gif", "paper-circle.png", "paper-loads.png"}
+    pictures = {f"paper-{name}.png" for name in ("circle", "loads", "configurations", "lengths", "sensor")}
+    assert files == {"paper-open.json", "paper-circle.gif", "paper-loads.gif", *pictures}
     assert (tmp_path / "out" / "paper-circle.gif").read_bytes()[:6] == b"GIF89a"
     assert figures["goals"][0]["value"] == "nan mm, 6 points missed in 1 of 2 runs"
     assert not figures["goals"][0]["met"]
@@ -128,8 +134,13 @@ def test_open_results_are_written_and_nothing_is_hidden(tmp_path):
 def test_confined_results_are_written_and_nothing_is_hidden(tmp_path):
     lost = [pipe_trial(1), pipe_trial(0, kind="narrow"), pipe_trial(1, kind="narrow")]
     changed = {t: made_up(t.kind, fails=range(4), missed=range(len(goals_of(t.kind)[1]))) for t in lost}
-    figures, files = write("confined", tmp_path, good_results("confined", TINY, changed))
-    assert files == {"paper-confined.json", "paper-confined-success.png", "paper-confined-losses.png"}
+    figures, files = write("confined", tmp_path, good_results("confined", TINY, changed), filmed=True)
+    assert files == {
+        "paper-confined.json",
+        "paper-confined-pipe.gif",
+        "paper-confined-success.png",
+        "paper-confined-losses.png",
+    }
     assert figures["goals"][0]["value"] == "nan mm, 28 points missed in 1 of 2 runs"
     assert [goal["met"] for goal in figures["goals"]].count(False) == 7
     assert len(figures["trainings"]) == len(trainings(TINY))
@@ -137,15 +148,32 @@ def test_confined_results_are_written_and_nothing_is_hidden(tmp_path):
 
 
 @pytest.mark.parametrize("experiment", ["open", "confined"])
-def test_titles_and_labels_lie_within_the_pictures(experiment):
-    results = good_results(experiment, TINY)
-    for name, figure in report.draw(experiment, results, trial_rows(results)).items():
-        figure.draw_without_rendering()
-        width, height = figure.bbox.size
-        for artist in (*figure.axes, *figure.legends):
-            box = artist.get_tightbbox()
-            inside = box.x0 >= -1 and box.y0 >= -1 and box.x1 <= width + 1 and box.y1 <= height + 1
-            assert inside, (name, artist, box)
+@pytest.mark.parametrize("twins", [(0,), (0, 1), (0, 1, 2)])
+def test_titles_and_labels_lie_within_the_pictures(experiment, twins, tmp_path):
+    settings = dataclasses.replace(TINY, twins=twins)
+    fill(tmp_path, settings)
+    results = good_results(experiment, settings)
+    drawn = report.draw(experiment, results, trial_rows(results))
+    for name, figure in (drawn | calibration_figures(tmp_path, settings)).items():
+        check_nothing_is_cut_off(name, figure)
+
+
+@pytest.mark.parametrize("n_twins", [1, 2, 3])
+@pytest.mark.parametrize("height", [0.5, 1.0, 1.1, 1.2, 1.3, 2.0])
+def test_circle_s_titles_are_whole_whatever_its_shape(n_twins, height):
+    results = good_results("open", dataclasses.replace(TINY, twins=tuple(range(n_twins))))
+    for outcome in results.outcomes.values():
+        outcome.goal[:, 1] *= height
+    check_nothing_is_cut_off("circle", plots.circle_figure(results.outcomes))
+
+
+def check_nothing_is_cut_off(name, figure):
+    """Fail if anything but white is at a border of the picture as it is saved."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=report.DPI)
+    shade = np.asarray(Image.open(buffer).convert("L"))
+    for border in (shade[0], shade[-1], shade[:, 0], shade[:, -1]):
+        assert border.min() == 255, name
 
 
 class DrawnTwin:
@@ -187,3 +215,31 @@ def test_film_shows_the_pipe_and_the_path(tmp_path, monkeypatch):
     grey = (np.asarray(images[0])[:, 240:] == (154, 160, 166)).all(axis=-1)
     assert grey[:, :120].sum() == pytest.approx(grey[:, 120:].sum(), rel=0.2)
     assert grey.sum() > 28 * 21 + 500  # more than the goals' dots cover
+
+
+def test_film_of_loads_has_a_column_for_each_and_one_that_ended_waits(tmp_path, monkeypatch):
+    seconds = {0: 30, 500: 60, 1000: 60}
+
+    def operate(twin, controller, goals, names, objects):
+        for _ in range(50 * seconds[twin.load_g]):
+            twin.write_pressures(np.zeros(N))
+
+    written = {}
+    monkeypatch.setattr(film, "operate", operate)
+    monkeypatch.setattr(film, "write_gif", lambda path, images, frame_ms: written.update({path: images}))
+    names, goals = goals_of("with")
+    scenes = []
+    for load_g in seconds:
+        twin = DrawnTwin()
+        twin.load_g = load_g
+        scenes.append((Scene(twin, None, goals, names), Trial("with", 0, 0, load_g=load_g)))
+    film.film_side_by_side(tmp_path / "loads.gif", scenes)
+    images = written[tmp_path / "loads.gif"]
+    assert len(images) <= film.N_LOAD_FRAMES
+    assert {image.size for image in images} == {
+        (3 * film.WIDTH, film.HEIGHT + film.WIDTH + film.LABEL_HEIGHT)
+    }
+    times = np.array([[image.getpixel((240 * k, 0))[0] for k in range(3)] for image in images])
+    assert np.all(np.diff(times[:, 1]) > 0) and np.array_equal(times[:, 1], times[:, 2])
+    assert np.array_equal(times[:, 0], np.minimum(times[:, 1], times[:, 0].max()))
+    assert times[:, 0].max() == pytest.approx(30, abs=1)
