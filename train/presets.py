@@ -45,15 +45,15 @@ PRESETS: dict[str, TrainConfig] = {
         batch_size=128,
         replay_capacity=262_144,
         evaluation_epochs=30,
-        polish_updates=12_288,
+        polish_updates=20_480,
     ),
     # A gradient step through the equilibrium takes one action of all arms.
     "analytic": TrainConfig(
         learner="analytic",
         n_arms=64,
-        total_env_steps=64 * 65_536,
+        total_env_steps=64 * 98_304,
         vector_steps_per_epoch=256,
-        evaluation_epochs=16,
+        evaluation_epochs=24,
         env=EnvConfig(n_poses=16_384, even_share=0.5),
     ),
     # The paper's recipe: 14 workers, sb3-contrib's hyperparameters, of which one is a gradient step for each

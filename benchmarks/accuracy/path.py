@@ -1,14 +1,18 @@
-"""The paper's circle on a twin, in time and stop by stop, by policies trained at rest and in motion."""
+"""The paper's circle on twins, in time and stop by stop, by policies trained at rest and in motion."""
 
 from __future__ import annotations
 
 import json
 import tempfile
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from benchmarks.accuracy.arms import run_command
 from mjx_softarm._support.errors import InputError
+from mjx_softarm.policy.file import load_policy
 
 IN_TIME = {
     "mean [mm]": "way_mm",
@@ -21,17 +25,15 @@ STOPPING = {"mean [mm]": "translation_mm", "largest [mm]": "max_mm", "seconds": 
 
 
 def measure(
-    policies: tuple[Path, ...],
-    arm: str = "twin:0",
+    policies: tuple[str, ...],
     seconds: tuple[float, ...] = (10.0, 20.0, 40.0),
     points: int = 80,
     stops: int = 40,
 ) -> dict[str, Any]:
-    """Follow a circle in time, and stop by stop, with policies for a twin.
+    """Follow a circle in time, and stop by stop, with policies for twins.
 
     Args:
-        policies: files that `python -m train export` wrote, for the arm
-        arm: the twin
+        policies: ARM=FILE of each, such as twin:0=runs/mine/policy.npz, as `python -m train export` wrote it
         seconds: once around in so long [s]
         points: of the circle, passed without a stop
         stops: points at which the arm comes to rest, and its time is taken
@@ -40,16 +42,44 @@ def measure(
         InputError: there are no policies, or one cannot be measured.
     """
     if not policies:
-        raise InputError("--policies: got none, expected files that `python -m train export` wrote")
+        raise InputError("--policies: got none, expected ARM=FILE of each policy")
     in_time, stopping = [], []
     with tempfile.TemporaryDirectory() as folder:
-        for policy in policies:
+        for arm, policy in map(_arm_and_file, policies):
+            trained = "in motion" if load_policy(policy).action_s else "at rest"
+            told = {"trained": trained, "arm": arm, "policy": policy.parent.name}
             for duration in seconds:
                 found = _measured(Path(folder), policy, arm, "--points", points, "--seconds", duration)
-                in_time.append({"policy": policy.stem, "once around [s]": duration, **_named(IN_TIME, found)})
+                in_time.append({**told, "once around [s]": duration, **_named(IN_TIME, found)})
             found = _measured(Path(folder), policy, arm, "--points", stops)
-            stopping.append({"policy": policy.stem, **_named(STOPPING, found)})
-    return {"arm": arm, "in time": in_time, "stop by stop": stopping}
+            stopping.append({**told, **_named(STOPPING, found)})
+    means = {
+        "means in time": means_over(in_time, ("trained", "once around [s]"), IN_TIME),
+        "means stop by stop": means_over(stopping, ("trained",), STOPPING),
+    }
+    return {**means, "in time": in_time, "stop by stop": stopping}
+
+
+def means_over(
+    rows: Sequence[dict[str, Any]], keys: Sequence[str], names: Iterable[str]
+) -> list[dict[str, Any]]:
+    """Return a row of means for each combination of the keys' values, in the order of their first rows."""
+    groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault(tuple(row[key] for key in keys), []).append(row)
+    return [
+        dict(zip(keys, values, strict=True))
+        | {"policies": len(group)}
+        | {name: float(np.mean([row[name] for row in group])) for name in names}
+        for values, group in groups.items()
+    ]
+
+
+def _arm_and_file(text: str) -> tuple[str, Path]:
+    arm, separator, file = text.partition("=")
+    if not separator:
+        raise InputError(f"--policies: got {text}, expected ARM=FILE, such as twin:0=policy.npz")
+    return arm, Path(file)
 
 
 def _measured(folder: Path, policy: Path, arm: str, *options: Any) -> dict[str, Any]:

@@ -7,8 +7,12 @@ suits one reward may not suit the other: both are tried with the other settings 
 further kind has the gradient penalty on the discriminator's probability, as the paper prints it, in place
 of its logit.
 
-Success at the shown positions is looked at every `LOOK` env steps, and that at held-out positions, half-way
-between the shown ones, at the end.
+Nor does a person show positions exactly. With the settings of `pipe` both rewards also learn from
+demonstrations with a hand's noise and detours, of another hand for each training seed; goals and rows of the
+expert are then the hand's.
+
+All kinds are judged alike: success at the scripted expert's positions is looked at every `LOOK` env steps,
+and that at held-out positions, half-way between these, at the end.
 """
 
 from __future__ import annotations
@@ -33,6 +37,7 @@ from train.agent.imitation import Imitation
 from train.config import ImitationConfig, override
 from train.demos.demonstrations import Demonstrations
 from train.demos.expert import Expert, ExpertError, Posture
+from train.demos.hand import by_hand
 from train.demos.waypoints import Waypoint, task
 from train.presets import IMITATION_PRESETS
 from train.runs.positions import PositionEvaluator
@@ -42,6 +47,12 @@ TASK = "pipe300"
 LOOK = 512  # env steps between two evaluations
 PRESETS = ("pipe", "hand-made")  # whose settings are tried
 LEARNED, HAND_MADE, PRINTED = "learned", "hand-made", "learned, penalty as printed"
+SCRIPTED, BY_HAND = "scripted", "by hand"  # who shows the positions
+KINDS = (  # reward, settings, who shows
+    *((reward, settings, SCRIPTED) for settings in PRESETS for reward in (LEARNED, HAND_MADE)),
+    (PRINTED, "pipe", SCRIPTED),
+    *((reward, "pipe", BY_HAND) for reward in (LEARNED, HAND_MADE)),
+)
 
 
 class PrintedGail(Gail):
@@ -64,15 +75,23 @@ def measure(
     """
     spec = ArmSpec.default()
     shown, between = demonstrated(spec)
-    kinds = [(reward, settings) for settings in PRESETS for reward in (LEARNED, HAND_MADE)]
+    hands = {seed: shown_by_hand(spec, seed) for seed in seeds}
     means, runs = [], []
-    for reward, settings in (*kinds, (PRINTED, "pipe")):
-        kind = {"reward": reward, "settings": settings}
-        rows = learn(reward, config_of(reward, settings, steps, arms), spec, shown, between, seeds)
+    for reward, settings, shown_by in KINDS:
+        kind = {"reward": reward, "settings": settings, "shown": shown_by}
+        config = config_of(reward, settings, steps, arms)
+        # Whatever is shown to all seeds is compiled once.
+        lessons = [(shown, seeds)] if shown_by == SCRIPTED else [(hands[seed], (seed,)) for seed in seeds]
+        rows = [
+            row
+            for lesson, of_seeds in lessons
+            for row in learn(reward, config, spec, lesson, (shown.positions, between), of_seeds)
+        ]
         means.append(kind | summary(rows))
         runs += [kind | row for row in rows]
+    n_by_hand = [len(hands[seed].positions) for seed in seeds]
     return {
-        "positions": {"shown": len(shown.positions), "held out": len(between)},
+        "positions": {"shown": len(shown.positions), "shown by hand": n_by_hand, "held out": len(between)},
         "means": means,
         "runs": runs,
     }
@@ -106,10 +125,19 @@ def demonstrated(spec: ArmSpec) -> tuple[Demonstrations, np.ndarray]:
             between.append(expert.reach(half.name, expert.target(half), found.pressure_kpa[k]).pose)
         except ExpertError:
             continue  # around a corner of the pipe
+    return _demonstrations(found, spec), np.array(between, np.float32)
+
+
+def shown_by_hand(spec: ArmSpec, seed: int) -> Demonstrations:
+    """Return what a hand shows; the seed is that of its noise and detours."""
+    waypoints, pipe = task(TASK, spec)
+    return _demonstrations(by_hand(Expert(spec, pipe=pipe), waypoints, seed)[1], spec)
+
+
+def _demonstrations(found: Posture, spec: ArmSpec) -> Demonstrations:
     actions = ActionMap.from_spec(spec).from_lengths(found.spring_m)
     sequence = np.zeros(len(actions), np.int32)
-    shown = Demonstrations(found.pose.astype(np.float32), actions.astype(np.float32), sequence)
-    return shown, np.array(between, np.float32)
+    return Demonstrations(found.pose.astype(np.float32), actions.astype(np.float32), sequence)
 
 
 def learn(
@@ -117,18 +145,26 @@ def learn(
     config: ImitationConfig,
     spec: ArmSpec,
     shown: Demonstrations,
-    between: np.ndarray,
+    judged: tuple[np.ndarray, np.ndarray],
     seeds: Sequence[int],
 ) -> list[dict[str, Any]]:
-    """Return a row for each seed: env steps to success, success in the end, and the curve of success."""
+    """Return a row for each seed: env steps to success, success in the end, and the curve of success.
+
+    Args:
+        reward: `LEARNED`, `HAND_MADE` or `PRINTED`.
+        config: of that kind.
+        spec: the arm.
+        shown: demonstrations to learn from.
+        judged: the scripted expert's positions (m, 6) and the held-out ones (k, 6) [mm, deg].
+        seeds: of training.
+    """
     env = ReachEnv(spec, config.env)
     learner = Imitation(HindsightTQC(config, env), config, env, shown)
     if reward == PRINTED:
         learner.gail = PrintedGail(env.observation_size, env.action_size, config.gail)
     todo = task_of(config, env, shown, learner=learner)
     at_shown, held_out = (
-        PositionEvaluator(env, learner, positions, np.ones(len(positions), bool))
-        for positions in (shown.positions, between)
+        PositionEvaluator(env, learner, positions, np.ones(len(positions), bool)) for positions in judged
     )
     rows = []
     for seed in seeds:

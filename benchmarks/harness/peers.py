@@ -1,9 +1,9 @@
 """Virtual environments of the libraries that this project is compared with, made on first use.
 
 Each has the peer and the simulator's packages in the versions that run here, so that all contestants train
-on the same environment. One more has JAX's compiler for GPUs, for machines without a GPU. They lie beside the
-checkout's own `.venv`, as `.venv-PEER`. A file in each lists its packages: an incomplete environment, or one
-of other packages, is made anew.
+on the same environment, and other simulators read the same arm. One more has JAX's compiler for GPUs, for
+machines without a GPU. They lie beside the checkout's own `.venv`, as `.venv-PEER`. A file in each lists its
+packages: an incomplete environment, or one of other packages, is made anew.
 
 On Linux, PyTorch comes with gigabytes of CUDA. To do without them, set
 `PIP_EXTRA_INDEX_URL=https://download.pytorch.org/whl/cpu`.
@@ -21,7 +21,11 @@ ROOT = Path(__file__).resolve().parents[2]
 MARKER = "complete"
 
 _SB3 = ("stable-baselines3==2.9.2", "torch==2.13.0")
-PINS = {"sbx": ("sbx-rl==0.28.0", *_SB3), "sb3-contrib": ("sb3-contrib==2.9.2", *_SB3)}
+PINS = {
+    "sbx": ("sbx-rl==0.28.0", *_SB3),
+    "sb3-contrib": ("sb3-contrib==2.9.2", *_SB3),
+    "soromox": ("soromox==0.5.0", "diffrax==0.7.2", "equinox==0.13.8"),
+}
 COMPILER = "gpu-compiler"
 # Packages that mjx_softarm, train.runs.evaluate and train.epoch.job import.
 SHARED = (
@@ -45,7 +49,7 @@ def peer_python(name: str, root: Path = ROOT) -> Path:
     content = "\n".join([f"python {sys.version_info.major}.{sys.version_info.minor}", *packages]) + "\n"
     if marker.exists() and marker.read_text("utf-8") == content:
         return python
-    large = "" if name == COMPILER else " and PyTorch"
+    large = " and PyTorch" if any(package.startswith("torch=") for package in packages) else ""
     print(f"making {home} with {packages[0]}{large}; the first time this takes minutes ...", flush=True)
     marker.unlink(missing_ok=True)
     try:

@@ -20,6 +20,7 @@ from benchmarks.harness.parallel import JobError, in_parallel
 from mjx_softarm._support.provenance import write_json
 
 SETTINGS_FILE = "settings.json"
+MORE = ("twins", "seeds", "loads_g", "beside")  # settings that results in a folder may differ in
 
 
 @dataclass(frozen=True)
@@ -36,11 +37,12 @@ class Settings:
     n_points: int = 40  # of the circle
     n_positions: int | None = None  # of a pipe's task, from the first; None is all
     loads_g: tuple[int, ...] = (35, 105, 220, 330, 500, 1000)
+    beside: tuple[str, ...] = ()  # further presets in open space, with their own settings
 
     def shared(self) -> dict[str, Any]:
         """Return the settings that all results in a folder share; the others may be added to later."""
         data = json.loads(json.dumps(dataclasses.asdict(self)))
-        return {name: value for name, value in data.items() if name not in ("twins", "seeds", "loads_g")}
+        return {name: value for name, value in data.items() if name not in MORE}
 
 
 SMOKE = Settings(

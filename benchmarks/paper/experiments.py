@@ -4,15 +4,23 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from benchmarks.harness.common import RESULTS, show
 from benchmarks.paper.engine import SMOKE, Settings, claim, run_stages
+from benchmarks.paper.kinds import BESIDE
 from benchmarks.paper.report import json_name, printed_rows, write_report
 from benchmarks.paper.summary import load_results
 from benchmarks.paper.trials import FILMS, stages
 from mjx_softarm._support import cli
 from mjx_softarm._support.errors import InputError
+
+
+def _presets(words: list[str]) -> tuple[str, ...]:
+    names = tuple(words[0].split(","))
+    if unknown := [name for name in names if name not in BESIDE]:
+        raise ValueError(f"got {', '.join(unknown)}, expected some of {', '.join(BESIDE)}")
+    return names
 
 
 def paper(
@@ -24,6 +32,7 @@ def paper(
     arm: Literal["twin", "rod"] = "twin",
     preset: Literal["quick", "paper", "analytic"] | None = None,
     env_steps: int | None = None,
+    beside: Annotated[tuple[str, ...], cli.listed(_presets, "NAME,NAME,...")] = (),
     out: cli.MaybePath = None,
 ) -> int:
     """Run the paper's experiments on twins, beside its numbers, in hours; exit status 1 if a goal is missed.
@@ -40,6 +49,7 @@ def paper(
         arm: twin, or a rod, of other physics, in open space alone
         preset: of training in open space; None: paper; analytic leaves no critics for the confined circle
         env_steps: of training in open space; None: the preset's
+        beside: further presets in open space with S2R, as long as they are
         out: working folder; None: runs/paper
     """
     if only != "open" and (arm == "rod" or preset == "analytic"):
@@ -47,7 +57,7 @@ def paper(
     training = (f"total_env_steps={env_steps}",) if env_steps else None
     given = {"twins": twins, "seeds": seeds, "loads_g": loads, "preset": preset, "training": training}
     chosen = {name: value for name, value in given.items() if value is not None}
-    settings = dataclasses.replace(SMOKE if smoke else Settings(), arm=arm, **chosen)
+    settings = dataclasses.replace(SMOKE if smoke else Settings(), arm=arm, beside=beside, **chosen)
     folder = out or Path("runs/paper-smoke" if smoke else "runs/paper")
     pictures = folder if smoke else RESULTS
     missed = 0

@@ -42,7 +42,7 @@ def _open(table: Sequence[Row]) -> list[Check]:
     reports = (
         f"reported in {reported} of {len(heavy)} runs; in {silent}, a saturated chamber was not reported"
     )
-    better = "translation without S2R over that with it, at least 2"
+    better = "translation with calibrated springs over that with S2R, at least 2"
     free, n_saturated = "with S2R, unloaded: no saturated chamber at any point", np.sum(n_points)
     hits = f"{np.sum(at_points):g} points, in {np.count_nonzero(at_points)} of {len(gradient)} runs"
     n_missed, n_incomplete = _missed(table)

@@ -22,9 +22,11 @@ from benchmarks.paper.kinds import (
     arm_name,
     learned_run,
     reach_run,
+    run_of,
 )
 from benchmarks.paper.measure import operate, save_outcome
 from mjx_softarm.mechanics.pipe import PIPES_MM
+from mjx_softarm.spec import ARM_FILE
 
 CALIBRATION, COMPARISON_FILE = "calibration", "comparison.npz"
 N_COMPARED = 40  # poses that a calibrated twin is compared at
@@ -107,15 +109,27 @@ def compare_twin(folder: Path, settings: Settings, twin: int) -> None:
 
 def train_reach(folder: Path, settings: Settings, twin: int | None, seed: int) -> None:
     """Train a policy of the nominal arm or of a twin's calibration; resume an interrupted run."""
-    run = folder / reach_run(twin, seed)
+    arm = [] if twin is None else ["--calibration", str(folder / f"twin{twin}" / CALIBRATION)]
+    chosen = ["--preset", settings.preset, *(f"--{text}" for text in settings.training)]
+    _reach(folder / reach_run(twin, seed), seed, *chosen, *arm)
+
+
+def train_other(folder: Path, settings: Settings, name: str, twin: int, seed: int) -> None:
+    """Train a policy of another preset, or of a twin's calibration without its S2R network."""
+    run, calibration = folder / learned_run(name, twin, seed), folder / f"twin{twin}" / CALIBRATION
+    if preset := KINDS[name].reach:
+        _reach(run, seed, "--preset", preset, "--calibration", str(calibration))
+        return
+    chosen = ["--preset", settings.preset, *(f"--{text}" for text in settings.training)]
+    _reach(run, seed, *chosen, "--spec", str(calibration / ARM_FILE))
+
+
+def _reach(run: Path, seed: int, *options: str) -> None:
     log = run.with_suffix(".log")
     if (run / "config.json").exists():
         command(log, "reach", "--resume", str(run))
-        return
-    options = ["--preset", settings.preset, "--seed", str(seed), "--out", str(run)]
-    if twin is not None:
-        options += ["--calibration", str(folder / f"twin{twin}" / CALIBRATION)]
-    command(log, "reach", *options, *(f"--{text}" for text in settings.training))
+    else:
+        command(log, "reach", *options, "--seed", str(seed), "--out", str(run))
 
 
 def demonstrate(folder: Path, settings: Settings, twin: int, task: str) -> None:
@@ -191,24 +205,20 @@ def scene_of(folder: Path, settings: Settings, trial: Trial) -> Scene:
 def controller_of(folder: Path, trial: Trial) -> Any:
     """Return a trial's controller: its way to find references, in the same loop.
 
-    Without S2R, the policy of the nominal arm plans spring lengths, and only the springs are calibrated; as
-    specified, not even these.
+    With calibrated springs alone, the policy of the nominal arm plans spring lengths; as specified, not even
+    the springs are calibrated.
     """
     from benchmarks.paper.gradient_descent import gradient_descent
     from mjx_softarm.deploy.controller import Controller
     from mjx_softarm.policy.file import load_policy
     from mjx_softarm.policy.runtime import PolicyRunner
 
-    kind, twin, seed = trial.kind, trial.twin, trial.seed
-    if kind == "specified":
-        return Controller.of(load_policy(folder / reach_run(None, seed) / POLICY_FILE))
-    run = learned_run(kind, twin, seed) if KINDS[kind].task else reach_run(twin, seed)
-    policy = load_policy(folder / run / POLICY_FILE)
-    if kind == "gradient":
+    policy = load_policy(folder / run_of(trial) / POLICY_FILE)
+    if trial.kind == "gradient":
         return Controller.of(policy, gradient_descent(policy))
-    if kind != "without":
+    if trial.kind != "without":
         return Controller.of(policy)
-    nominal = load_policy(folder / reach_run(None, seed) / POLICY_FILE)
+    nominal = load_policy(folder / reach_run(None, trial.seed) / POLICY_FILE)
     runner = PolicyRunner(nominal)
     calibrated_springs = dataclasses.replace(nominal, actions=nominal.actions._replace(sensor=policy.sensor))
     return Controller.of(calibrated_springs, lambda pose, goal, *_: runner.act(pose, goal).length_m)

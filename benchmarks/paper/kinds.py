@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 EVALUATION_FILE, POLICY_FILE = "evaluation.json", "policy.npz"
@@ -16,21 +17,32 @@ class Kind(NamedTuple):
     settings: tuple[str, ...] = ()  # NAME=VALUE
     reward_of: str = ""  # kind whose learned reward it takes, unchanged
     from_reach: bool = False  # begins with the policy that was trained without demonstrations
+    reach: str = ""  # preset of `python -m train reach`, beside that of the experiment
 
 
 KINDS = {
     "specified": Kind("specification alone"),
-    "without": Kind("without S2R"),
+    "without": Kind("calibrated springs"),
+    "chambers": Kind("calibrated springs and chambers"),
     "with": Kind("with S2R"),
+    "as-printed": Kind("with S2R, the paper's recipe", reach="as-printed"),
+    "quick": Kind("with S2R, quick", reach="quick"),
+    "paper": Kind("with S2R, paper", reach="paper"),
+    "analytic": Kind("with S2R, analytic", reach="analytic"),
     "gradient": Kind("gradient descent"),
     "pipe": Kind("learned reward", "pipe300", "pipe"),
     "moving": Kind("learned reward, in motion", "pipe300", "pipe-moving"),
     "hand-made": Kind("hand-made reward", "pipe300", "hand-made"),
     "no-penalty": Kind("no gradient penalty", "pipe300", "pipe", ("gail.gradient_penalty=0",)),
     "narrow": Kind("hand-made, and learned in the wide pipe", "pipe250", "frozen", reward_of="pipe"),
+    "narrow-learned": Kind(
+        "learned in the wide pipe", "pipe250", "frozen", ("hand_made_weight=0",), reward_of="pipe"
+    ),
+    "narrow-hand-made": Kind("hand-made reward", "pipe250", "hand-made"),
     "circle": Kind("with demonstrations", "circle16", "circle", from_reach=True),
 }
 TASKS = ("pipe300", "pipe250", "circle16")
+BESIDE = tuple(name for name, kind in KINDS.items() if kind.reach)
 
 
 class Trial(NamedTuple):
@@ -67,5 +79,13 @@ def reach_run(twin: int | None, seed: int) -> str:
 
 
 def learned_run(kind: str, twin: int, seed: int) -> str:
-    """Return the run folder of a policy learned from demonstrations."""
+    """Return the run folder of a policy of a kind's own: of another preset, or from demonstrations."""
     return f"{kind}-twin{twin}-seed{seed}"
+
+
+def run_of(trial: Trial) -> str:
+    """Return the run folder of a trial's policy, or of the one that its solver takes the arm from."""
+    if trial.kind == "specified":
+        return reach_run(None, trial.seed)
+    shared = trial.kind in ("without", "with", "gradient")
+    return (reach_run if shared else partial(learned_run, trial.kind))(trial.twin, trial.seed)

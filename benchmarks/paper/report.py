@@ -13,7 +13,7 @@ from PIL import Image
 
 from benchmarks.paper import plots
 from benchmarks.paper.calibration_plots import calibration_figures
-from benchmarks.paper.engine import Settings
+from benchmarks.paper.engine import MORE, Settings
 from benchmarks.paper.goals import check_goals
 from benchmarks.paper.jobs import CALIBRATION
 from benchmarks.paper.kinds import KINDS
@@ -72,8 +72,7 @@ def write_report(
 def figures_of(experiment: str, folder: Path, settings: Settings, results: Results) -> dict[str, Any]:
     """Return all figures: goals, spreads, trainings or simulated errors, calibrations, every run."""
     table, trainings = trial_rows(results), training_rows(results)
-    more = {"twins": settings.twins, "seeds": settings.seeds, "loads_g": settings.loads_g}
-    shared = settings.shared() | {name: list(values) for name, values in more.items()}
+    shared = settings.shared() | {name: list(getattr(settings, name)) for name in MORE}
     calibrations = {}
     for twin in settings.twins:
         report = json.loads((folder / f"twin{twin}" / CALIBRATION / "report.json").read_text("utf-8"))

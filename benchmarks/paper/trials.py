@@ -6,13 +6,14 @@ The folder of a benchmark, which both experiments share:
     twinT/comparison.npz                   the first twin beside its simulation, before and after calibration
     twinT/demos-TASK.npz                   demonstrations of the scripted expert on the twin
     nominal-seedS/, twinT-seedS/           policies without demonstrations; the nominal ones know no twin
-    KIND-twinT-seedS/                      policies learned from demonstrations; see `KINDS`
+    KIND-twinT-seedS/                      policies without S2R, of other presets, or learned from
+                                           demonstrations; see `KINDS`
     trials/TRIAL.npz                       what a trial on a twin measured
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 from benchmarks.paper import jobs
 from benchmarks.paper.engine import Settings, Stage
@@ -49,10 +50,11 @@ def trials(experiment: str, settings: Settings) -> list[Trial]:
     found = []
     if experiment == "open":
         for twin in settings.twins:
-            for seed in settings.seeds:
-                found += [Trial(kind, twin, seed) for kind in ("specified", "without", "with")]
-                found += [Trial("with", twin, seed, load_g=load_g) for load_g in settings.loads_g]
             loads_g = (0, *settings.loads_g)
+            for seed in settings.seeds:
+                found += [Trial(kind, twin, seed) for kind in ("specified", "without", "chambers")]
+                told = ("with", *settings.beside)
+                found += [Trial(kind, twin, seed, load_g=load_g) for kind in told for load_g in loads_g]
             found += [Trial("gradient", twin, settings.seeds[0], load_g=load_g) for load_g in loads_g]
         return found
     for kind, twin, seed in trainings(settings):
@@ -71,7 +73,8 @@ def stages(experiment: str, settings: Settings) -> list[list[Stage]]:
         Stage(f"log and calibrate twin {t}", (f"twin{t}/{jobs.CALIBRATION}",), jobs.calibrate_twin, (t,))
         for t in settings.twins
     ]
-    on_twins = [_reach(twin, seed) for twin in settings.twins for seed in settings.seeds]
+    runs = [(twin, seed) for twin in settings.twins for seed in settings.seeds]
+    on_twins = [_reach(*run) for run in runs]
     tried = [
         Stage(f"try {trial.name}", (trial.result,), jobs.try_out, (trial,))
         for trial in trials(experiment, settings)
@@ -82,7 +85,9 @@ def stages(experiment: str, settings: Settings) -> list[list[Stage]]:
     films = [film] * (settings.arm == "twin")  # a rod cannot be drawn
     if experiment == "open":
         nominal = [_reach(None, seed) for seed in settings.seeds]
-        exports = [_export(twin, settings.seeds) for twin in (None, *settings.twins)]
+        others = [(kind, *run) for kind in ("chambers", *settings.beside) for run in runs]
+        on_twins += [_learn(*item, jobs.train_other) for item in others]
+        exports = [_export(twin, settings.seeds, others) for twin in (None, *settings.twins)]
         loads = _film_loads(filmed, settings) * (settings.arm == "twin")
         compared = _compare(settings.twins[0])
         return [[*calibrations, *nominal], [*on_twins, compared], exports, [*tried, *films, *loads]]
@@ -116,13 +121,13 @@ def _reach(twin: int | None, seed: int) -> Stage:
     return Stage(name, (f"{reach_run(twin, seed)}/{EVALUATION_FILE}",), jobs.train_reach, (twin, seed))
 
 
-def _learn(kind: str, twin: int, seed: int) -> Stage:
+def _learn(kind: str, twin: int, seed: int, job: Callable[..., None] = jobs.learn) -> Stage:
     result = f"{learned_run(kind, twin, seed)}/{EVALUATION_FILE}"
-    return Stage(f"learn {kind} for twin {twin}, seed {seed}", (result,), jobs.learn, (kind, twin, seed))
+    return Stage(f"learn {kind} for twin {twin}, seed {seed}", (result,), job, (kind, twin, seed))
 
 
 def _export(twin: int | None, seeds: Iterable[int], learned: Iterable[tuple[str, int, int]] = ()) -> Stage:
-    """Return the stage that exports an arm's policies: without demonstrations, and learned from them."""
+    """Return the stage that exports an arm's policies: the experiment's own, and those of other kinds."""
     mine = [item for item in learned if item[0] != "no-penalty" and item[1] == twin]
     runs = (*(reach_run(twin, seed) for seed in seeds), *(learned_run(*item) for item in mine))
     policies = tuple(f"{run}/{POLICY_FILE}" for run in runs)

@@ -141,7 +141,7 @@ def peer(library: str, variant: str, seed: int) -> Contestant:
         settings["replay_buffer_class"] = HindsightBuffer
         settings["replay_buffer_kwargs"] = {
             "arm": arms.env,
-            "share": config.hindsight.reached_share + config.hindsight.near_share,
+            "hindsight": config.hindsight,
             "reward_scale": config.tqc.reward_scale,
         }
     model = algorithm(kind, envs, seed=seed, **settings)

@@ -2,8 +2,9 @@
 
 Stable-Baselines3's `HerReplayBuffer` needs observations as a dictionary, and chooses which transitions get a
 goal that was reached later in their episode. It recomputes only the reward for the new goal. Here observed
-error, reward and termination are recomputed. It cannot exchange actions: a transition that saturated, as
-nearly all random ones do, costs as much with its new goal as with its own.
+error, reward and termination are recomputed, and as many goals as in ours are near the pose that was reached.
+It cannot exchange actions: a transition that saturated, as nearly all random ones do, costs as much with its
+new goal as with its own.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from typing import Any
 
 import gymnasium
 import jax
+import jax.numpy as jnp
 import numpy as np
 import torch  # pyright: ignore[reportMissingImports]
 from stable_baselines3 import HerReplayBuffer  # pyright: ignore[reportMissingImports]
@@ -23,6 +25,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper  # pyright: i
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.mdp import observation as obs
 from mjx_softarm.mdp import rewards
+from train.agent.hindsight import HindsightConfig, near_offsets
 
 SLICES = {"achieved_goal": slice(0, 6), "desired_goal": slice(6, 12), "observation": slice(12, 18)}
 
@@ -60,14 +63,22 @@ class HindsightBuffer(HerReplayBuffer):
 
     Args:
         arm: environment that gives scales and rewards.
-        share: of a batch that gets another goal.
+        hindsight: shares of a batch that get another goal: reached later, or near the pose reached.
         reward_scale: factor of every stored reward.
         settings: those of `HerReplayBuffer`.
     """
 
-    def __init__(self, *positional: Any, arm: ReachEnv, share: float, reward_scale: float, **settings: Any):
+    def __init__(
+        self,
+        *positional: Any,
+        arm: ReachEnv,
+        hindsight: HindsightConfig,
+        reward_scale: float,
+        **settings: Any,
+    ):
         super().__init__(*positional, **settings)
-        self.her_ratio = share
+        self.her_ratio = hindsight.reached_share + hindsight.near_share
+        self._hindsight, self._rng = hindsight, np.random.default_rng(0)
         self._scale, self._config, self._reward_scale = arm.scale, arm.config.reward, reward_scale
 
     def sample(self, batch_size: int, env: Any = None) -> DictReplayBufferSamples:
@@ -78,11 +89,16 @@ class HindsightBuffer(HerReplayBuffer):
     def _get_virtual_samples(
         self, batch_indices: np.ndarray, env_indices: np.ndarray, env: Any = None
     ) -> DictReplayBufferSamples:
-        """Return transitions with goals that were reached later."""
+        """Return transitions with goals that were reached later, or near the pose reached."""
         where = batch_indices, env_indices
         reached = (poses["achieved_goal"][where] for poses in (self.observations, self.next_observations))
         scaled = (*reached, self._sample_goals(*where))
         before, after, goals = (poses * self._scale.scale + self._scale.centre for poses in scaled)
+        draws = self._rng.random((2, len(after)), np.float32)
+        near = draws[0] < self._hindsight.near_share / self.her_ratio
+        direction = self._rng.standard_normal((len(after), 6), np.float32)
+        offsets = near_offsets(jnp.asarray(draws[1]), jnp.asarray(direction), self._hindsight)
+        goals = np.where(near[:, None], after + np.asarray(offsets), goals)
         cost = self._reward_scale * self._config.saturation_cost
         reward, reached, _ = rewards.reward(
             after,

@@ -36,7 +36,7 @@ class Step(NamedTuple):
 
 
 def timed(step: Callable[[], Step], timestep_s: float) -> Facts:
-    """Step for `ROUND_S`; return the rate, the simulated time of an environment step, and where they led."""
+    """Step for `ROUND_S`; return rates, the simulated time of an environment step, and where they led."""
     steps = []
     start = time.perf_counter()
     while (spent := time.perf_counter() - start) < ROUND_S:
@@ -45,6 +45,7 @@ def timed(step: Callable[[], Step], timestep_s: float) -> Facts:
     simulated_s = timestep_s * sum(one.n_physics for one in steps)  # of all arms together
     return {
         "env_steps_per_s": len(tip_mm) / spent,
+        "simulated_s_per_s": simulated_s / spent,
         "simulated_s_per_env_step": round(simulated_s / len(tip_mm), 2),
         "reference_m": reference_m.tolist(),
         "tip_mm": tip_mm.tolist(),
@@ -86,7 +87,8 @@ def rollout(folder: str, n_threads: str) -> tuple[Facts, Callable[[], Facts]]:
         envs.reset(reached | over)
         return Step(end.physics_steps, envs.reference_m(action), end.pose[:, :3])
 
-    return {"arms": n}, lambda: timed(step, envs.arms.model.opt.timestep)
+    timestep_s = envs.arms.model.opt.timestep
+    return {"arms": n, "step_ms": 1e3 * timestep_s}, lambda: timed(step, timestep_s)
 
 
 def settle(references: str, links: str) -> tuple[Facts, Callable[[], Facts]]:

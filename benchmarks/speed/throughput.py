@@ -3,6 +3,9 @@
 Each program is a process of its own, and they take turns round by round; one that fails has a row that says
 why. Random actions saturate about half of the chambers. C MuJoCo's arms are stepped in time until they rest,
 see `benchmarks.speed.mujoco_arms`; their distance from the true equilibrium stands beside their rate.
+
+A table of its own compares programs that step in time, SoRoMoX among them, by simulated seconds of all arms
+together. Arms that are solved at rest simulate no time, so they are not in it.
 """
 
 from __future__ import annotations
@@ -22,6 +25,7 @@ from benchmarks.harness.rounds import Facts, Worker, WorkerError, take_turns, wo
 from benchmarks.speed import gpu
 from benchmarks.speed.mujoco_arms import write_arm
 from benchmarks.speed.truth import ERROR, TOLD, told_error
+from mjx_softarm.env import EnvConfig
 from mjx_softarm.spec import ArmSpec
 
 N_ROUNDS = 3
@@ -31,6 +35,9 @@ NO_MJX = f"compiles for minutes and in gigabytes at {MOST_LINKS_MJX} links, and 
 N_LINKS = ArmSpec.default().structure.links_per_section
 PAPER_WORKERS, PAPER_STEP_S = 14, 0.03  # the paper's cost of an environment step; the workers may share cores
 SUBPROC = "SubprocVecEnv"
+N_MOVING = 128  # arms in motion
+SOROMOX = {"explicit": "SoRoMoX, explicit", "implicit": "SoRoMoX, this project's implicit step"}
+MOVING_COLUMNS = ("program", "step_ms", "arms", "simulated_s_per_s")
 COLUMNS = ("program", "env_steps_per_s", "times_subproc", "simulated_s_per_env_step", *ERROR)
 
 Point = tuple[str, str, int, int]  # engine, mode, arms, links per section
@@ -63,6 +70,7 @@ def measure() -> dict[str, Any]:
         "over_links": over_links
         + [{**no_mjx, "links_per_section": links} for links in LINKS if links > MOST_LINKS_MJX],
         "side_by_side": _side_by_side(ArmSpec.default(), on_gpu),
+        "simulated_time": simulated_time(),
         "start": _starts(),
         "goals": [*gpu.rate_goals(rows, on_gpu), gpu.training_goal(on_gpu)],
     }
@@ -143,6 +151,43 @@ def side_by_side(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         rate = row.get("env_steps_per_s")
         full.append({**row, "times_subproc": _digits(rate / base) if rate and base else None})
     return [{name: row.get(name) for name in (*COLUMNS, "skipped", "failed")} for row in [*full, paper]]
+
+
+def simulated_time() -> list[dict[str, Any]]:
+    """Return the simulated seconds of an arm a second, of programs that step in time and take turns."""
+    n, skipped = str(n_cores()), []
+    with tempfile.TemporaryDirectory() as folder:
+        write_arm(Path(folder), ArmSpec.default())
+        workers = [
+            _worker(("mjx", "dynamic", N_MOVING, N_LINKS)),
+            Worker(
+                f"C MuJoCo, rollout, {n} threads", ["benchmarks.speed.mujoco_worker", "rollout", folder, n]
+            ),
+        ]
+        try:
+            python = peer_python("soromox")
+            for method, name in SOROMOX.items():
+                program = ["benchmarks.speed.soromox_worker", method, str(N_MOVING)]
+                workers.append(Worker(name, program, python))
+        except PeerError as error:
+            skipped += [{"program": name, "skipped": str(error)} for name in SOROMOX.values()]
+        rounds, failed = take_turns(workers, N_ROUNDS)
+    rows = []
+    for worker in workers:
+        row: dict[str, Any] = {"program": worker.name, "failed": failed.get(worker.name)}
+        if told := rounds.get(worker.name):
+            row |= worker.facts | over_rounds(told)
+        rows.append(row)
+    return [moving_row(row) for row in [*rows, *skipped]]
+
+
+def moving_row(row: dict[str, Any]) -> dict[str, Any]:
+    """Return a row of `simulated_time`; of environment steps a second, the duration of one is known."""
+    config = EnvConfig()
+    if "env_steps_per_s" in row and "simulated_s_per_s" not in row:
+        rate = _digits(row["env_steps_per_s"] * config.dynamic_step_s)
+        row = {"arms": N_MOVING, "step_ms": 1e3 * config.simulation_step_s, **row, "simulated_s_per_s": rate}
+    return {name: row.get(name) for name in (*MOVING_COLUMNS, "skipped", "failed")}
 
 
 def _starts() -> dict[str, Any]:

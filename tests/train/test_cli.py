@@ -156,6 +156,7 @@ def test_a_folder_has_one_trainer_at_a_time(tmp_path):
         ),
         (["reach", "--env.workspace-seed", "20000"], "20000 draws the goals of the evaluation"),
         (["reach", "--hindsight.near-min-mm", "0"], "near_min_mm"),
+        (["evaluate", "absent", "--actions", "3"], "--actions: got 3 without --in-motion, expected"),
         (
             ["evaluate", "absent"],
             "absent/config.json: got 'No such file or directory', expected the folder of a run",

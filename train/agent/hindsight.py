@@ -76,7 +76,7 @@ def relabel(
     (kind, distance), direction = draws.both(key, (2, n), (n, 6))
     reached = kind < config.reached_share
     near = ~reached & (kind < config.reached_share + config.near_share)
-    near_pose = batch.next_pose + _near_offsets(distance, direction, config).astype(batch.next_pose.dtype)
+    near_pose = batch.next_pose + near_offsets(distance, direction, config).astype(batch.next_pose.dtype)
     goal = jnp.where(reached[:, None], batch.next_pose, jnp.where(near[:, None], near_pose, batch.goal))
 
     # Actions: where a chamber saturated, the one that asks for the lengths it reached.
@@ -104,8 +104,13 @@ def _joined(observation: Array, sensed: Array | None) -> Array:
     return observation if sensed is None else jnp.concatenate([observation, sensed], axis=-1)
 
 
-def _near_offsets(distance: Array, direction: Array, config: HindsightConfig) -> Array:
+def near_offsets(distance: Array, direction: Array, config: HindsightConfig) -> Array:
     """Return offsets (n, 6) [mm, deg]: random directions, log-uniform lengths, and turns.
+
+    Args:
+        distance (n,): uniform draws in [0, 1).
+        direction (n, 6): normal draws.
+        config: the least and the largest length.
 
     A turn is a normal draw in proportion to the translation's length over its own norm, so it has a heavy
     tail: some goals are turned further than the arm can turn, as a user's goals may be.

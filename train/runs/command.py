@@ -121,13 +121,23 @@ class Imitate(NewRunOptions):
         return _train(Run.create(path, config, spec, s2r, log, donors, state), task, console)
 
 
-def evaluate(run: tyro.conf.Positional[Path], in_motion: float | None = None) -> int:
+def evaluate(
+    run: tyro.conf.Positional[Path], in_motion: float | None = None, actions: int | None = None
+) -> int:
     """Evaluate a run's newest policy, with figures and pictures.
 
     Args:
         run: folder of the run
         in_motion: evaluate it on arms in motion, with actions of so many seconds, without pictures [s]
+        actions: towards each goal, in motion; None: 4
+
+    Raises:
+        ConfigError: a number of actions that cannot be taken.
     """
+    if actions is not None and (actions < 1 or in_motion is None):
+        where = "" if in_motion else " without --in-motion"
+        raise ConfigError(f"--actions: got {actions}{where}, expected a positive number with --in-motion")
+    n_actions = actions or N_ACTIONS
     console = start()
     opened = Run.open(run)
     task, policy = runs.restore_policy(opened)
@@ -135,10 +145,10 @@ def evaluate(run: tyro.conf.Positional[Path], in_motion: float | None = None) ->
         _show(opened, task, runs.finish(opened, task, policy), console)
         return 0
     moving = dataclasses.replace(opened.config.env, mode="dynamic", dynamic_step_s=in_motion)
-    summary, *_ = task.evaluate.on(ReachEnv(opened.spec, moving, opened.s2r))(policy)
-    title = f"{task.title}, {N_ACTIONS} actions of {in_motion:g} s each, in motion"
+    summary, *_ = task.evaluate.on(ReachEnv(opened.spec, moving, opened.s2r), n_actions)(policy)
+    title = f"{task.title}, {n_actions} actions of {in_motion:g} s each, in motion"
     _table(title, {"value": summary}, console)
-    file = opened.path / f"evaluation-in-motion-{in_motion:g}s.json"
+    file = opened.path / f"evaluation-in-motion-{n_actions}x{in_motion:g}s.json"
     write_json(file, summary.to_dict())
     console.print(f"written: {file}", highlight=False, soft_wrap=True)
     return 0

@@ -15,7 +15,7 @@ from mjx_softarm._support import xla
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.sensing.pose import pose_error
 from train.agent.learner import Learner
-from train.runs.evaluate import Reached, follow, nominal, start_keys
+from train.runs.evaluate import N_ACTIONS, Reached, follow, nominal, start_keys
 
 
 class AtPositions(NamedTuple):
@@ -67,14 +67,23 @@ class PositionEvaluator:
     `first` (m,) bool tells the positions that are goals from the start.
     """
 
-    def __init__(self, env: ReachEnv, learner: Learner, positions: np.ndarray, first: np.ndarray):
+    def __init__(
+        self,
+        env: ReachEnv,
+        learner: Learner,
+        positions: np.ndarray,
+        first: np.ndarray,
+        n_actions: int = N_ACTIONS,
+    ):
         self.env, self.learner, self.first = nominal(env), learner, first
         self.positions = np.asarray(positions, np.float32)
-        self._follow = xla.jit(functools.partial(follow, self.env, learner), env.uses_mjx)
+        self._follow = xla.jit(
+            functools.partial(follow, self.env, learner, n_actions=n_actions), env.uses_mjx
+        )
 
-    def on(self, env: ReachEnv) -> PositionEvaluator:
+    def on(self, env: ReachEnv, n_actions: int = N_ACTIONS) -> PositionEvaluator:
         """Return the same evaluation on another environment."""
-        return PositionEvaluator(env, self.learner, self.positions, self.first)
+        return PositionEvaluator(env, self.learner, self.positions, self.first, n_actions)
 
     def __call__(self, policy: Any) -> tuple[PositionSummary, AtPositions]:
         """Return figures, and results as NumPy arrays."""

@@ -23,7 +23,7 @@ from train.epoch.goals import DemonstratedGoals
 from train.epoch.job import Job, TrainState
 from train.epoch.polish import PolishedJob
 from train.runs import plots
-from train.runs.evaluate import N_GOALS, Evaluator
+from train.runs.evaluate import N_ACTIONS, N_GOALS, Evaluator
 from train.runs.positions import PositionEvaluator
 
 
@@ -34,7 +34,7 @@ class Evaluation(Protocol):
         """Return figures, which have `to_dict` and `rows`, then results."""
         ...
 
-    def on(self, env: ReachEnv) -> Evaluation:
+    def on(self, env: ReachEnv, n_actions: int = N_ACTIONS) -> Evaluation:
         """Return the same evaluation on another environment."""
         ...
 

@@ -1,6 +1,12 @@
-"""Differences between kinds of reward, and the summary of their runs."""
+"""Differences between kinds of reward, what they learn from and are judged at, the summary of their runs."""
 
-from benchmarks.accuracy.rewards import HAND_MADE, LEARNED, config_of, summary
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from benchmarks.accuracy import rewards
+from benchmarks.accuracy.rewards import BY_HAND, HAND_MADE, LEARNED, SCRIPTED, config_of, measure, summary
 from train.config import to_dict
 
 
@@ -18,3 +24,37 @@ def test_a_run_without_success_counts_as_never():
     found = summary([{"steps_to_success": n, **rest} for n in (1024, None, 512)])
     assert found.pop("steps to 90 %: least, median, most") == "512, 1,024, never"
     assert found == rest
+
+
+@pytest.fixture
+def lessons(monkeypatch):
+    """Keeps what `learn` is given in the place of learning; a hand shows 10 positions more than its seed."""
+    given = []
+    rest = {"steps_to_success": 512, "success": 1.0, "median_mm": 1.0}
+    rest |= {"held_out_success": 1.0, "held_out_median_mm": 1.0}
+
+    def learn(reward, config, spec, shown, judged, seeds):
+        given.append((reward, len(shown.positions), [len(positions) for positions in judged], list(seeds)))
+        return [{"seed": seed, **rest} for seed in seeds]
+
+    shows = {"demonstrated": lambda spec: (showing(4), np.zeros((3, 6), np.float32))}
+    shows["shown_by_hand"] = lambda spec, seed: showing(10 + seed)
+    for name, value in (shows | {"learn": learn}).items():
+        monkeypatch.setattr(rewards, name, value)
+    return given
+
+
+def showing(n):
+    return SimpleNamespace(positions=np.zeros((n, 6), np.float32))
+
+
+def test_a_hand_shows_each_seed_other_positions_and_all_are_judged_at_the_scripted_ones(lessons):
+    found = measure(seeds=(0, 2))
+    scripted, by_hand = lessons[:5], lessons[5:]
+    assert {(n, tuple(seeds)) for _, n, _, seeds in scripted} == {(4, (0, 2))}
+    one, two = (10, [4, 3], [0]), (12, [4, 3], [2])
+    assert by_hand == [(LEARNED, *one), (LEARNED, *two), (HAND_MADE, *one), (HAND_MADE, *two)]
+    assert all(judged == [4, 3] for _, _, judged, _ in lessons)
+    assert found["positions"] == {"shown": 4, "shown by hand": [10, 12], "held out": 3}
+    assert [row["shown"] for row in found["means"]] == 5 * [SCRIPTED] + 2 * [BY_HAND]
+    assert [row["seed"] for row in found["runs"]] == 7 * [0, 2]

@@ -49,7 +49,7 @@ def test_both_experiments_or_one(tmp_path, monkeypatch, capsys):
 
     def run(experiment, folder, pictures, settings):
         done.append((experiment, settings.twins))
-        chosen.append((settings.arm, settings.loads_g, settings.preset, settings.training))
+        chosen.append((settings.arm, settings.loads_g, settings.preset, settings.training, settings.beside))
         return {"goals": [{"text": experiment, "value": "1", "met": True}], "spreads": []}
 
     monkeypatch.setattr(experiments, "run", run)
@@ -59,8 +59,8 @@ def test_both_experiments_or_one(tmp_path, monkeypatch, capsys):
     assert done == [("open", (0,)), ("confined", (0,)), ("confined", (1, 2))]
     assert f"written: {tmp_path / 'paper-confined.json'}" in capsys.readouterr().out
     rods = ["--arm", "rod", "--loads", "500", "--preset", "analytic", "--env-steps", "64"]
-    assert main(["paper", "--only", "open", *rods, *smoke]) == 0
-    assert chosen[-1] == ("rod", (500,), "analytic", ("total_env_steps=64",))
+    assert main(["paper", "--only", "open", *rods, "--beside", "quick", *smoke]) == 0
+    assert chosen[-1] == ("rod", (500,), "analytic", ("total_env_steps=64",), ("quick",))
     assert f"written: {tmp_path / 'paper-rod.json'}" in capsys.readouterr().out
     for option in (["--arm", "rod"], ["--preset", "analytic"]):
         assert main(["paper", *option, *smoke]) == 2

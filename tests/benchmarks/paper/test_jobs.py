@@ -15,9 +15,11 @@ from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.policy.file import save_policy
 from mjx_softarm.policy.runtime import PolicyRunner
 from mjx_softarm.sensing.sensors import Sensor
+from mjx_softarm.spec import ARM_FILE
 from mjx_softarm.twin.rod_twin import RodTwin
 from tests.benchmarks.paper.made_up import SPEC, TINY, N, goals_of, make_policy, pipe_trial
 from train.__main__ import COMMANDS
+from train.presets import PRESETS
 
 
 @pytest.fixture
@@ -57,6 +59,27 @@ def test_training_starts_or_resumes_and_an_arm_s_policies_are_exported_at_once(t
     assert parsed(commands(*exports)[0]).keywords["folders"] == (tmp_path / reach_run(1, 3),)
 
 
+def test_further_policies_have_a_preset_of_their_own_or_no_network(tmp_path, commands):
+    settings = dataclasses.replace(TINY, preset="analytic", training=("env.n_poses=64",))
+    calibration = tmp_path / "twin1" / "calibration"
+    (start,) = commands(jobs.train_other, tmp_path, settings, "quick", 1, 2)
+    options = parsed(start)
+    assert (options.preset, options.config.seed, options.calibration) == ("quick", 2, calibration)
+    assert options.config == dataclasses.replace(PRESETS["quick"], seed=2)  # not the settings of the others
+    (start,) = commands(jobs.train_other, tmp_path, settings, "chambers", 1, 2)
+    options = parsed(start)
+    assert (options.preset, options.spec, options.calibration) == (
+        "analytic",
+        calibration / ARM_FILE,
+        None,
+    )
+    assert options.config.env.n_poses == 64 and options.out == tmp_path / learned_run("chambers", 1, 2)
+    (options.out).mkdir()
+    (options.out / "config.json").touch()
+    (resume,) = commands(jobs.train_other, tmp_path, settings, "chambers", 1, 2)
+    assert parsed(resume).resume == options.out
+
+
 def test_learning_starts_with_what_it_builds_on_resumes_or_starts_anew(tmp_path, commands):
     run, work = tmp_path / learned_run("narrow", 1, 2), (jobs.learn, tmp_path, TINY, "narrow", 1, 2)
     (start,) = commands(*work)
@@ -86,8 +109,9 @@ def test_settings_of_each_kind_are_known(tmp_path, commands, kind):
     assert config.n_epochs == 2
     assert config.stage_epochs == ((0, 1) if kind == "circle" else (0,))
     assert (config.gail.gradient_penalty == 0) == (kind == "no-penalty")
-    assert (options.reward is not None) == (kind == "narrow")
-    assert config.env.pipe_diameter_mm == {"narrow": 250, "circle": None}.get(kind, 300)
+    assert (options.reward is not None) == (kind in ("narrow", "narrow-learned"))
+    assert (config.hand_made_weight > 0) == (kind in ("hand-made", "narrow", "narrow-hand-made", "circle"))
+    assert config.env.pipe_diameter_mm == {"pipe300": 300, "pipe250": 250, "circle16": None}[KINDS[kind].task]
 
 
 def test_scene_is_the_twin_in_its_pipe(tmp_path, make_arm_model, monkeypatch):

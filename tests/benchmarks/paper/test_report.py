@@ -45,7 +45,7 @@ def test_spreads_group_kinds_and_variants():
     found = {(item["kind"], item["variant"]): item for item in spreads(table)}
     loads = [("with", "0 g"), ("with", "500 g"), ("with", "1000 g")]
     loads += [("gradient", variant) for _, variant in loads]
-    assert set(found) == {("specified", "0 g"), ("without", "0 g"), *loads}
+    assert set(found) == {("specified", "0 g"), ("without", "0 g"), ("chambers", "0 g"), *loads}
     unloaded = found["with", "0 g"]
     assert (unloaded["runs"], unloaded["incomplete_runs"]) == (2, 1)
     assert unloaded["translation_mm"] == pytest.approx({"mean": 2.25, "std": 1.0, "min": 1.25, "max": 3.25})
@@ -57,6 +57,7 @@ def test_spreads_group_kinds_and_variants():
     found = {(item["kind"], item["variant"]): item for item in spreads(table)}
     assert set(found) == {
         *(("pipe", "as shown"), ("pipe", "exchanged"), ("hand-made", "as shown"), ("narrow", "as shown")),
+        *(("narrow-learned", "as shown"), ("narrow-hand-made", "as shown")),
         *(("circle", "as shown"), ("with", "0 g")),
         *(("pipe", "as shown in motion"), ("moving", "as shown in motion")),
     }

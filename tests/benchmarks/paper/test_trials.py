@@ -9,12 +9,14 @@ from tests.benchmarks.paper.made_up import TINY
 
 def test_three_twins_and_three_seeds():
     found = trials("open", Settings())
-    assert len(found) == len(set(found)) == 3 * 3 * (3 + 6) + 3 * 7
+    assert len(found) == len(set(found)) == 3 * 3 * (4 + 6) + 3 * 7
     assert sum(trial.kind == "gradient" for trial in found) == 3 * 7
+    beside = trials("open", dataclasses.replace(Settings(), beside=("quick", "paper")))
+    assert len(beside) == len(set(beside)) == len(found) + 2 * 9 * 7
     found = trials("confined", Settings())
-    assert len(found) == len(set(found)) == 9 * 7 + 9
+    assert len(found) == len(set(found)) == 9 * 9 + 9
     learned = trainings(Settings())
-    assert len(learned) == len(set(learned)) == 5 * 9 + 3
+    assert len(learned) == len(set(learned)) == 7 * 9 + 3
     assert sum(kind == "no-penalty" for kind, _, _ in learned) == 3
 
 
@@ -32,12 +34,13 @@ def test_loads_are_filmed_beside_none_if_they_are_tried():
 
 
 def test_stages_leave_every_trial_s_result_and_come_after_what_they_need():
+    settings = dataclasses.replace(TINY, beside=("quick",))
     for experiment in ("open", "confined"):
-        groups = stages(experiment, TINY)
+        groups = stages(experiment, settings)
         at = {path: k for k, group in enumerate(groups) for stage in group for path in stage.results}
         names = [stage.name for group in groups for stage in group]
         assert len(names) == len(set(names)) and len(at) == sum(len(s.results) for g in groups for s in g)
-        for trial in trials(experiment, TINY):
+        for trial in trials(experiment, settings):
             run = f"{trial.kind}-twin{trial.twin}-seed0"
             policies = {
                 "with": ["twin{}-seed0"],

@@ -7,6 +7,7 @@ from mjx_softarm.env import EnvConfig
 from mjx_softarm.env.gym import SoftArmVectorEnv, as_sb3
 from mjx_softarm.mdp import observation as obs
 from mjx_softarm.mdp import rewards
+from train.agent.hindsight import HindsightConfig
 
 pytest.importorskip("stable_baselines3", reason="Stable-Baselines3 is not installed")
 N_ARMS, LIMIT, N_STEPS, N_ROWS = 6, 3, 20, 8  # the ring is written over, and episodes cross its end
@@ -33,7 +34,7 @@ class Played:
             env=envs,
             n_envs=N_ARMS,
             arm=arms.env,
-            share=SHARE,
+            hindsight=HindsightConfig(reached_share=SHARE),
             reward_scale=REWARD_SCALE,
         )
         self.saturated = np.zeros((N_ROWS, N_ARMS), bool)
@@ -88,6 +89,27 @@ def test_goals_of_their_own_would_have_given_what_the_environment_gave(played, m
     np.testing.assert_array_equal(np.isclose(own.rewards[:, 0], -10.0), played.saturated[where])
     assert 0.1 < played.saturated[where].mean() < 0.9
     assert 0.1 < own.dones.numpy().mean() < 0.9
+
+
+def test_goals_near_the_pose_reached_are_as_many_and_as_far_as_asked_for(played, monkeypatch):
+    buffer, where = played.buffer, [np.tile(index, 50) for index in played.where]
+    near = HindsightConfig(reached_share=0.25, near_share=0.5, near_min_mm=2.0, near_max_mm=20.0)
+    monkeypatch.setattr(buffer, "_hindsight", near)
+    monkeypatch.setattr(
+        buffer, "_sample_goals", lambda *where: buffer.next_observations["achieved_goal"][where]
+    )
+    batch = buffer._get_virtual_samples(*where)
+    goal, after = (
+        played.pose(batch.next_observations[f"{of}_goal"].numpy()) for of in ("desired", "achieved")
+    )
+    off_mm = np.linalg.norm((goal - after)[:, :3], axis=1)
+    assert np.mean(off_mm > 1.0) == pytest.approx(0.5 / 0.75, abs=0.05)
+    assert off_mm.max() == pytest.approx(20.0, abs=1.0) and off_mm[off_mm > 1.0].min() == pytest.approx(
+        2.0, abs=0.1
+    )
+    free = ~played.saturated[tuple(where)]
+    reached = np.linalg.norm(rewards.scaled_error(after, goal, played.arm.config.reward), axis=1) < 0.03
+    np.testing.assert_array_equal(batch.rewards.numpy()[free, 0] == 10.0, reached[free])
 
 
 def test_a_goal_elsewhere_gives_the_reward_and_the_observations_of_the_way_to_it(played, monkeypatch):

@@ -17,7 +17,7 @@ from benchmarks.speed.mujoco_arms import (
     write_arm,
 )
 from benchmarks.speed.mujoco_worker import Step, timed
-from benchmarks.speed.throughput import over_rounds, points, side_by_side
+from benchmarks.speed.throughput import MOVING_COLUMNS, moving_row, over_rounds, points, side_by_side
 from benchmarks.speed.truth import error_figures, random_references, true_rest
 from mjx_softarm import ArmSpec
 from mjx_softarm.env import EnvConfig, ReachEnv
@@ -153,4 +153,18 @@ def test_a_round_of_steps_has_its_rate_and_the_simulated_time_of_a_step(monkeypa
     steps = iter(Step(n, np.zeros((2, 9)), np.ones((2, 3))) for n in (400, 200))
     told = timed(lambda: next(steps), timestep_s=0.002)
     assert (told["env_steps_per_s"], told["simulated_s_per_env_step"]) == (4.0, 0.3)
+    assert told["simulated_s_per_s"] == pytest.approx(1.2)
     assert np.shape(told["tip_mm"]) == (4, 3)
+
+
+def test_programs_in_motion_are_told_by_simulated_seconds_and_this_project_s_by_the_time_of_a_step():
+    ours = moving_row({"program": "mjx", "env_steps_per_s": 1000, "compiling_s": 3.0, "failed": None})
+    peer = moving_row({"program": "peer", "step_ms": 0.75, "arms": 8, "simulated_s_per_s": 20.5})
+    c = moving_row(
+        {"program": "C", "step_ms": 5.0, "arms": 64, "env_steps_per_s": 40, "simulated_s_per_s": 160}
+    )
+    missing = moving_row({"program": "absent", "skipped": "no network"})
+    assert [row["simulated_s_per_s"] for row in (ours, peer, c, missing)] == [500, 20.5, 160, None]
+    assert (ours["step_ms"], ours["arms"]) == (20.0, 128) and (c["step_ms"], c["arms"]) == (5.0, 64)
+    assert missing["skipped"] == "no network"
+    assert set(ours) == {*MOVING_COLUMNS, "skipped", "failed"}

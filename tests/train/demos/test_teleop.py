@@ -18,6 +18,7 @@ from mjx_softarm.sensing.sensors import Sensor
 from train.__main__ import main
 from train.demos.demonstrations import read_demonstrations
 from train.demos.expert import Posture
+from train.demos.hand import by_hand
 from train.demos.teleop import CLOSE_M, Teleoperation
 from train.demos.waypoints import task
 
@@ -188,11 +189,40 @@ def test_move_into_the_wall_is_refused_and_the_arm_stays(command, tmp_path):
     assert status == 0 and "mm: got at best" in told and "pose 1 logged" in told
 
 
+def test_a_hand_s_positions_are_recorded_and_corrected_towards(command, tmp_path, monkeypatch):
+    """The command takes the plan of `by_hand` with this seed; the arm ends at its positions."""
+    taken, whole = [], functools.partial(task, "pipe300")
+    monkeypatch.setattr("train.demos.command.task", lambda _, spec: cut(whole(spec), 4))
+    monkeypatch.setattr(
+        "train.demos.command.by_hand", lambda *given: taken.append(by_hand(*given)) or taken[0]
+    )
+    out = tmp_path / "hand.npz"
+    status, told = command("record", "--arm", "a:B", "--task", "pipe300", "--hand", "3", "--out", out)
+    assert status == 0, told
+    log, _ = read_demonstrations(out, SPEC)
+    wanted_m = np.stack([waypoint.finger_m for waypoint in taken[0][0]])
+    assert len(log) == 5  # a detour in one of three moves
+    assert np.linalg.norm(fingers_m(log) - wanted_m, axis=1).max() < CLOSE_M
+    assert "detour to pick right" in told
+
+
+def cut(whole, n):
+    return whole._replace(waypoints=whole.waypoints[:n])
+
+
 def test_misuse_is_told_before_anything_moves(command, tmp_path):
     record = ("record", "--arm", "a:B", "--out")
     for args, message in (
         ((*record, tmp_path / "x.csv"), "--task: got nothing, expected one of circle16"),
         ((*record, tmp_path / "no" / "x.csv", "--task", "pipe300"), "expected the name of a new file"),
+        (
+            (*record, tmp_path / "x.csv", "--task", "pipe300", "--hand", "-1"),
+            "--hand: got -1, expected a seed",
+        ),
+        (
+            (*record, tmp_path / "x.csv", "--keyboard", "--hand", "1"),
+            "--hand: got 1 with --keyboard, expected",
+        ),
         (("check", tmp_path / "none.csv"), "none.csv: got 'No such file"),
     ):
         status, told = command(*args)

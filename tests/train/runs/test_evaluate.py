@@ -102,7 +102,9 @@ def test_figures_of_a_motion():
     at_rest = summarise(still, still, still, 0.03)
     assert at_rest.near_share is None and "near_share" not in at_rest.to_dict()
     figures = summarise(moving, moving, moving, 0.03)
-    assert (figures.near_share, figures.near_median_s) == (pytest.approx(2 / 3), pytest.approx(0.6))
+    assert (figures.near_share, figures.near_median_s) == (pytest.approx(2 / 3), pytest.approx(0.8))
+    never = moving._replace(near_s=np.array([0.4, np.inf, np.inf]))
+    assert summarise(never, moving, moving, 0.03).near_median_s is None  # at one of three alone
     assert figures.overshoot_median_mm == 1.0 and len(figures.rows()) == 4 + len(
         summarise(still, still, still, 0.03).rows()
     )

@@ -47,6 +47,7 @@ def test_in_motion_the_body_has_to_be_inside_all_the_way(short_env, moving_env, 
     at_rest = PositionEvaluator(envs[0], perfect, shown.positions, np.arange(len(shown.positions)) < 1)
     (_, rest), (figures, motion) = at_rest({}), at_rest.on(envs[1])({})
     assert figures.median_mm < 2.0 and figures.unsettled == 0
+    assert at_rest.on(envs[1], n_actions=1)({})[0].median_mm > 2.0 * figures.median_mm
     less_mm = rest.reached.clearance_mm - motion.reached.clearance_mm
     assert less_mm.min() > -2.0 and less_mm.max() > 10.0
 

@@ -1,0 +1,150 @@
+"""Worker: arms that SoRoMoX moves in time, compiled, on all cores.
+
+    python -m benchmarks.speed.soromox_worker METHOD N_ARMS
+
+The arm is this project's as a piecewise-constant-strain robot: its lengths, masses, stiffnesses and dampers,
+one segment for each section. It bends and stretches; without torsion and shear, the stiffest motions, an
+explicit step may be three times as long. Two Gauss points in place of five take less time. Each round holds
+random pressures, as forces on the segments, and has neither a control law nor valves. METHOD is
+
+    explicit    Euler's step on SoRoMoX's accelerations, the longest that is stable. Its limit is 0.85 ms at
+                the fastest decay seen, 2,340 per second. Runge-Kutta methods allow 1.0 to 1.8 times that, at
+                two to six times the cost.
+    implicit    the linearised midpoint rule of `mjx_softarm.mechanics.dynamics` on SoRoMoX's inertia and
+                forces. It is not SoRoMoX's own. Longer steps are stable too, but pressures change once in a
+                control period.
+
+Source: SoRoMoX, https://github.com/tud-phi/soromox.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from benchmarks.harness.rounds import Facts, serve
+from mjx_softarm.spec import ArmSpec
+
+HELD_S = 0.5  # duration of a set of pressures, as of an environment step in motion
+N_STEPS = {"explicit": 667, "implicit": 25}  # in it; with 625 explicit ones, one arm in 128 diverged
+ROUND_S = 1.0  # least time of a round
+CHECKED_S = 2.0  # of random motion before the first round; every arm must stay finite
+N_GAUSS_POINTS = 2
+BENDS_AND_STRETCHES = (False, True, True, True, False, False)  # torsion, bending, stretch, shear
+
+
+def section_matrix(spec: ArmSpec, kind: str) -> np.ndarray:
+    """Return the matrix (6, 6) of a section's "stiffness" or "damping": torsion, bending, stretch, shear.
+
+    Torsion and shear, which the arm does not do, get the values of bending and stretch.
+    """
+    radii = spec.geometry.chamber_radius_m, spec.geometry.spring_radius_m
+    per_m, per_rad = ("n_per_m", "nm_per_rad") if kind == "stiffness" else ("ns_per_m", "nms_per_rad")
+    rods = [np.mean(getattr(group, f"{kind}_{per_m}")) for group in (spec.chambers, spec.springs)]
+    axial = 3.0 * sum(rods) + getattr(spec.backbone, f"axial_{kind}_{per_m}")
+    bending = 1.5 * np.dot(rods, np.square(radii)) + getattr(spec.backbone, f"bending_{kind}_{per_rad}")
+    return spec.geometry.section_length_m**2 * np.diag([bending] * 3 + [axial] * 3)  # per strain
+
+
+def random_forces(spec: ArmSpec, n: int, rng: np.random.Generator) -> np.ndarray:
+    """Return the generalised forces (n, 3 * n_sections) of random pressures in the arm's range."""
+    low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
+    force_n = 1e3 * np.mean(spec.chambers.area_m2) * rng.uniform(low, high, (n, spec.structure.n_sections, 3))
+    angle = np.deg2rad(spec.geometry.first_chamber_deg + 120.0 * np.arange(3))
+    radius_m = spec.geometry.chamber_radius_m
+    arms = np.stack([radius_m * np.sin(angle), -radius_m * np.cos(angle), np.ones(3)], axis=1)
+    return (spec.geometry.section_length_m * force_n @ arms).reshape(n, -1)
+
+
+def build_robot(spec: ArmSpec) -> Any:
+    """Return the arm as a hanging robot of SoRoMoX; the gripper's mass is spread over the last section."""
+    from soromox.systems import PCS, PCSStructure  # pyright: ignore[reportMissingImports]
+    from soromox.systems.components import LinkSpec  # pyright: ignore[reportMissingImports]
+
+    geometry, n = spec.geometry, spec.structure.n_sections
+    radius_m = geometry.chamber_radius_m + 0.5 * geometry.chamber_diameter_m
+    mass_kg = np.full(n, spec.mass.arm_kg / n)
+    mass_kg[-1] += spec.mass.gripper_kg + spec.mass.payload_kg
+    links = [
+        LinkSpec.circular(
+            length=geometry.section_length_m,
+            density=float(mass) / (math.pi * radius_m**2 * geometry.section_length_m),
+            radius=radius_m,
+            reference_strain=[0.0, 0.0, 0.0, 1.0, 0.0, 0.0],
+            stiffness=section_matrix(spec, "stiffness"),
+            damping=section_matrix(spec, "damping"),
+        )
+        for mass in mass_kg
+    ]
+    structure = PCSStructure(N_GAUSS_POINTS, list(BENDS_AND_STRETCHES) * n)
+    return PCS.from_links(links, structure=structure, gravity=np.array([9.81, 0.0, 0.0]))
+
+
+def stepper(robot: Any, method: str, step_s: float) -> Callable[[Any, Any], Any]:
+    """Return a function (state, forces) -> next state, of strains and rates (2 n,) and forces (n,)."""
+    import jax.numpy as jnp
+    from jax.scipy.linalg import solve
+
+    def explicit(state, force):
+        return state + step_s * robot.forward_dynamics(0.0, state, (force,))
+
+    def implicit(state, force):
+        q, v = jnp.split(state, 2)
+        middle = q + 0.5 * step_s * v
+        inertia, bias, weight = robot.dynamics_terms(middle, v)
+        stiffness, damping = robot.stiffness_matrix(), robot.damping_matrix(middle)
+        force = force - bias - weight - stiffness @ middle - damping @ v
+        matrix = inertia + 0.5 * step_s * damping + 0.25 * step_s**2 * stiffness
+        dv = solve(matrix, step_s * force, assume_a="pos")
+        return jnp.concatenate([q + step_s * (v + 0.5 * dv), v + dv])
+
+    return {"explicit": explicit, "implicit": implicit}[method]
+
+
+def move(method: str, n_arms: str) -> tuple[Facts, Callable[[], Facts]]:
+    """Prepare n arms, and check that they stay finite for `CHECKED_S`."""
+    import jax
+
+    n_cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    jax.config.update("jax_num_cpu_devices", n_cores)  # XLA runs most of this on one core of a device
+    from jax.sharding import Mesh, PartitionSpec
+
+    spec, n, rng = ArmSpec.default(), int(n_arms), np.random.default_rng(0)
+    step_s = HELD_S / N_STEPS[method]
+    step = stepper(build_robot(spec), method, step_s)
+
+    def held(state, force):
+        return jax.lax.fori_loop(0, N_STEPS[method], lambda _, state: step(state, force), state)
+
+    mesh = Mesh(np.array(jax.devices()[: math.gcd(n, len(jax.devices()))]), ("arms",))
+    split, many = PartitionSpec("arms"), jax.vmap(held)
+    run = jax.jit(jax.shard_map(many, mesh=mesh, in_specs=split, out_specs=split, check_vma=False))
+    state = np.zeros((n, 6 * spec.structure.n_sections), np.float32)  # strains and their rates
+    calls = 1
+
+    def work() -> Facts:
+        nonlocal state
+        forces = [random_forces(spec, n, rng).astype(np.float32) for _ in range(calls)]
+        start = time.perf_counter()
+        for force in forces:
+            state = run(state, force)
+        state = jax.block_until_ready(state)
+        rate = calls * n * HELD_S / (time.perf_counter() - start)
+        if not np.isfinite(state).all():
+            raise FloatingPointError(f"step: got {step_s:.2g} s, which diverges, expected a stable one")
+        return {"simulated_s_per_s": rate}
+
+    for _ in range(round(CHECKED_S / HELD_S)):  # the first compiles
+        rate = work()["simulated_s_per_s"]
+    calls = max(1, round(ROUND_S * rate / (n * HELD_S)))
+    return {"arms": n, "step_ms": round(1e3 * step_s, 2)}, work
+
+
+if __name__ == "__main__":
+    serve(lambda: move(*sys.argv[1:]))

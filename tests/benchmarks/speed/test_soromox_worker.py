@@ -1,0 +1,92 @@
+"""The worker of SoRoMoX: the same arm as the project's, forces of pressures, steps of a known robot."""
+
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from benchmarks.harness.peers import ROOT
+from benchmarks.harness.rounds import Worker, working
+from benchmarks.speed.soromox_worker import HELD_S, N_STEPS, random_forces, section_matrix, stepper
+from benchmarks.speed.throughput import SOROMOX
+from mjx_softarm import ArmSpec
+from mjx_softarm.env import EnvConfig
+
+SPEC = ArmSpec.default()
+PYTHON = ROOT / ".venv-soromox" / "bin" / "python"
+
+
+def test_a_section_has_the_stiffness_that_the_specification_gives_by_hand():
+    strains = np.diag(section_matrix(SPEC, "stiffness")) / 0.2**2
+    np.testing.assert_allclose(strains[3], 3 * (506.7 + 54.0) + 851.4)  # stretch
+    np.testing.assert_allclose(strains[1], 1.5 * (506.7 * 0.035**2 + 54.0 * 0.067**2) + 1.0814)  # bending
+    damping = np.diag(section_matrix(SPEC, "damping")) / 0.2**2
+    np.testing.assert_allclose(damping[3], 3 * (20.0 + 30.0) + 20.0)
+    np.testing.assert_allclose(damping[1], 1.5 * (20.0 * 0.035**2 + 30.0 * 0.067**2) + 1.0)
+
+
+def test_equal_pressures_stretch_and_one_chamber_bends_away_from_its_side():
+    class Fixed:
+        def uniform(self, low, high, shape):
+            pressure = np.full(shape, high)
+            pressure[:, 1, 1:] = 0.0  # only the first chamber of the second section
+            return pressure
+
+    (force,) = random_forces(SPEC, 1, Fixed())
+    sections = force.reshape(3, 3) / 0.2
+    push_n = 20e3 * 1.62e-3
+    np.testing.assert_allclose(sections[0], [0.0, 0.0, 3 * push_n], atol=1e-12)
+    np.testing.assert_allclose(sections[1], [0.035 * push_n, 0.0, push_n], atol=1e-12)  # at 90 deg
+
+
+def pendulum(inertia, damping, stiffness):
+    """A robot of one linear strain, with a weight of 1."""
+    matrices = [jnp.array([[x]]) for x in (inertia, damping, stiffness)]
+
+    def forward_dynamics(t, state, actuation):
+        q, v = state[:1], state[1:]
+        force = actuation[0] - 1.0 - matrices[2] @ q - matrices[1] @ v
+        return jnp.concatenate([v, force / inertia])
+
+    return SimpleNamespace(
+        forward_dynamics=forward_dynamics,
+        dynamics_terms=lambda q, v: (matrices[0], jnp.zeros(1), jnp.ones(1)),
+        damping_matrix=lambda q: matrices[1],
+        stiffness_matrix=lambda: matrices[2],
+    )
+
+
+@pytest.mark.parametrize("method, tolerance", [("explicit", 0.03), ("implicit", 1e-3)])
+def test_a_step_follows_an_oscillator(method, tolerance):
+    robot, state, n = pendulum(2.0, 0.0, 8.0), jnp.array([0.5, 0.0]), 200
+    step = stepper(robot, method, 0.5 / n)
+    for _ in range(n):
+        state = step(state, jnp.array([1.0]))  # it balances the weight
+    exact = np.array([0.5 * np.cos(1.0), -1.0 * np.sin(1.0)])  # angular rate 2 over 0.5 s
+    np.testing.assert_allclose(state, exact, atol=tolerance)
+
+
+def test_the_implicit_step_rests_where_an_explicit_one_diverges():
+    robot = pendulum(1e-3, 2.0, 10.0)  # decays 2,000 times a second
+    ends = {}
+    for method in N_STEPS:
+        step, state = stepper(robot, method, 0.02), jnp.zeros(2)
+        for _ in range(1000):
+            state = step(state, jnp.array([6.0]))
+        ends[method] = np.asarray(state)
+    np.testing.assert_allclose(ends["implicit"][0], 0.5, atol=1e-3)
+    assert not np.isfinite(ends["explicit"]).all()
+
+
+def test_the_implicit_step_is_as_long_as_mjx_s_and_every_method_has_a_row():
+    assert HELD_S / N_STEPS["implicit"] == pytest.approx(EnvConfig().simulation_step_s)
+    assert EnvConfig().dynamic_step_s == HELD_S and SOROMOX.keys() == N_STEPS.keys()
+
+
+@pytest.mark.skipif(not PYTHON.exists(), reason="the environment of SoRoMoX is not made")
+def test_arms_of_soromox_move_and_stay_finite():
+    program = ["benchmarks.speed.soromox_worker", "implicit", "4"]
+    with working(worker := Worker("SoRoMoX", program, PYTHON)):
+        assert worker.facts == {"arms": 4, "step_ms": 20.0}
+        assert worker.round()["simulated_s_per_s"] > 0.0
