@@ -27,7 +27,7 @@ def _names(words: list[str]) -> tuple[str, ...]:
 def measure(
     arms: Annotated[tuple[str, ...], cli.listed(_names, "NAME,NAME,...")] = ("paper", "sopra", "stiff-flop"),
     poses: int = 300,
-    steps: int = 64 * 65_536,
+    steps: int | None = None,
     points: int = 40,
     keep: cli.MaybePath = None,
 ) -> dict[str, Any]:
@@ -36,7 +36,7 @@ def measure(
     Args:
         arms: the package's names of arms
         poses: random poses of each calibration
-        steps: environment steps of each training
+        steps: environment steps of each training; None: the preset's
         points: goals of the grid, at most
         keep: folder for logs, calibrations and runs; without one they are deleted
     """
@@ -44,7 +44,7 @@ def measure(
         return {arm: _measure(arm, (keep or Path(folder)) / arm, poses, steps, points) for arm in arms}
 
 
-def _measure(arm: str, folder: Path, poses: int, steps: int, points: int) -> dict[str, Any]:
+def _measure(arm: str, folder: Path, poses: int, steps: int | None, points: int) -> dict[str, Any]:
     folder.mkdir(parents=True)
     twin, log, calibration = f"twin:rod:0@{arm}", folder / "poses.csv", folder / "calibration"
     run, policy = folder / "run", folder / "run/policy.npz"
@@ -53,7 +53,7 @@ def _measure(arm: str, folder: Path, poses: int, steps: int, points: int) -> dic
     by_policy = ["mjx_softarm.deploy", "measure", policy, "--arm", twin]
     run_command(*record)
     distrusted = run_command("calib", "run", log, "--spec", arm, "--out", calibration)
-    run_command(*train, "--total-env-steps", steps)
+    run_command(*train, *(("--total-env-steps", steps) if steps else ()))
     run_command("train", "export", run)
     measured = {"grid": ["--goals", "grid", "--points", points]}
     if arm == "paper":

@@ -6,7 +6,7 @@ import json
 import tempfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
@@ -24,6 +24,22 @@ IN_TIME = {
 STOPPING = {"mean [mm]": "translation_mm", "largest [mm]": "max_mm", "seconds": "seconds"}
 
 
+class _Chosen(NamedTuple):
+    """A policy and its arm."""
+
+    trained: str  # "at rest" or "in motion"
+    arm: str
+    file: Path
+
+    @classmethod
+    def of(cls, text: str) -> Self:
+        """Read ARM=FILE."""
+        arm, separator, file = text.partition("=")
+        if not separator:
+            raise InputError(f"--policies: got {text}, expected ARM=FILE, such as twin:0=policy.npz")
+        return cls("in motion" if load_policy(file).action_s else "at rest", arm, Path(file))
+
+
 def measure(
     policies: tuple[str, ...],
     seconds: tuple[float, ...] = (10.0, 20.0, 40.0),
@@ -39,15 +55,19 @@ def measure(
         stops: points at which the arm comes to rest, and its time is taken
 
     Raises:
-        InputError: there are no policies, or one cannot be measured.
+        InputError: there are no policies, one cannot be measured, or means would be of different arms.
     """
     if not policies:
         raise InputError("--policies: got none, expected ARM=FILE of each policy")
+    chosen = [_Chosen.of(text) for text in policies]
+    arms = {of: sorted(each.arm for each in chosen if each.trained == of) for of in ("at rest", "in motion")}
+    if all(arms.values()) and arms["at rest"] != arms["in motion"]:
+        got = "; ".join(f"{of} {', '.join(names)}" for of, names in arms.items())
+        raise InputError(f"--policies: got {got}, expected the same arms of both, since means are compared")
     in_time, stopping = [], []
     with tempfile.TemporaryDirectory() as folder:
-        for arm, policy in map(_arm_and_file, policies):
-            trained = "in motion" if load_policy(policy).action_s else "at rest"
-            told = {"trained": trained, "arm": arm, "policy": policy.parent.name}
+        for trained, arm, policy in chosen:
+            told = {"trained": trained, "arm": arm, "policy": str(policy)}
             for duration in seconds:
                 found = _measured(Path(folder), policy, arm, "--points", points, "--seconds", duration)
                 in_time.append({**told, "once around [s]": duration, **_named(IN_TIME, found)})
@@ -73,13 +93,6 @@ def means_over(
         | {name: float(np.mean([row[name] for row in group])) for name in names}
         for values, group in groups.items()
     ]
-
-
-def _arm_and_file(text: str) -> tuple[str, Path]:
-    arm, separator, file = text.partition("=")
-    if not separator:
-        raise InputError(f"--policies: got {text}, expected ARM=FILE, such as twin:0=policy.npz")
-    return arm, Path(file)
 
 
 def _measured(folder: Path, policy: Path, arm: str, *options: Any) -> dict[str, Any]:

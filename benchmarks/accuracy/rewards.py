@@ -8,8 +8,8 @@ further kind has the gradient penalty on the discriminator's probability, as the
 of its logit.
 
 Nor does a person show positions exactly. With the settings of `pipe` both rewards also learn from
-demonstrations with a hand's noise and detours, of another hand for each training seed; goals and rows of the
-expert are then the hand's.
+demonstrations with a hand's noise and detours: another hand for each training seed, and as many more goals as
+there are detours. Goals and rows of the expert are then the hand's.
 
 All kinds are judged alike: success at the scripted expert's positions is looked at every `LOOK` env steps,
 and that at held-out positions, half-way between these, at the end.

@@ -11,16 +11,17 @@ from matplotlib.figure import Figure
 from benchmarks.paper.comparison import Comparison, load_comparison
 from benchmarks.paper.engine import Settings
 from benchmarks.paper.jobs import CALIBRATION, COMPARISON_FILE
+from benchmarks.paper.plots import GREEN, RED
 from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.spec import ARM_FILE, N_CHAMBERS_PER_SECTION, ArmSpec
 from train.runs.plots import BLUE, GREY, INK, ORANGE, dress
 
-GREEN = "#2a9d6f"
 N_SHOWN = 4  # configurations
-STYLES = {  # of each simulation: label, colour, name below an axis
+STYLES = {  # of `SIMULATIONS`: label, colour, name below an axis
     "specified": ("simulated, as specified", ORANGE, "as\nspecified"),
     "calibrated": ("simulated, calibrated", BLUE, "calibrated"),
-    "S2R": ("tip with S2R", GREEN, "with\nS2R"),
+    "lengths": ("at lengths", RED, "calibr.,\nlengths"),
+    "S2R": ("tip with S2R", GREEN, "lengths,\nS2R"),
 }
 PAIR = (STYLES["specified"], STYLES["calibrated"])
 _LEFT: dict[str, Any] = {"x": 0.01, "ha": "left", "fontsize": 11}  # of a figure's title
@@ -31,10 +32,7 @@ VIEWS = ((0, "x [mm]"), (1, "y [mm]"))
 def calibration_figures(folder: Path, settings: Settings) -> dict[str, Figure]:
     """Return the drawings of the first twin's calibration by name."""
     twin = settings.twins[0]
-    here = folder / f"twin{twin}"
-    comparison, specified = load_comparison(here / COMPARISON_FILE), ArmSpec.default()
-    calibrated = ArmSpec.from_toml(here / CALIBRATION / ARM_FILE)
-    sensors = Sensor.from_spec(specified), Sensor.from_spec(calibrated)
+    comparison, sensors = _found(folder, twin)
     return {
         "configurations": configurations_figure(comparison, twin),
         "lengths": lengths_figure(comparison, twin),
@@ -42,10 +40,33 @@ def calibration_figures(folder: Path, settings: Settings) -> dict[str, Figure]:
     }
 
 
+def calibration_numbers(folder: Path, settings: Settings) -> dict[str, Any]:
+    """Return the numbers of the first twin's calibration that the drawings show."""
+    comparison, sensors = _found(folder, settings.twins[0])
+    off_mm = [_spring_rms_mm(comparison, sensor) for sensor in sensors]
+    rms_mm = (float(np.sqrt(np.mean(off**2))) for off in off_mm)
+    springs = dict(zip(("specified", "calibrated"), rms_mm, strict=True))
+    return {**comparison.figures(), "spring_rms_mm": springs}
+
+
+def _found(folder: Path, twin: int) -> tuple[Comparison, tuple[Sensor, Sensor]]:
+    """Return a twin's comparison, and its sensors as specified and as calibrated."""
+    here = folder / f"twin{twin}"
+    calibrated = ArmSpec.from_toml(here / CALIBRATION / ARM_FILE)
+    sensors = Sensor.from_spec(ArmSpec.default()), Sensor.from_spec(calibrated)
+    return load_comparison(here / COMPARISON_FILE), sensors
+
+
+def _spring_rms_mm(found: Comparison, sensor: Sensor) -> np.ndarray:
+    """Return how far the lengths that a sensor reads are off, for each spring (n_chambers,) [mm]."""
+    off_m = sensor.lengths(found.reading, np.nan).length_m - found.ruler_m
+    return 1e3 * np.sqrt(np.nanmean(off_m**2, axis=0))
+
+
 def configurations_figure(found: Comparison, twin: int) -> Figure:
     """Draw arms from two sides at poses far apart, and how far all simulated tips are from the measured."""
     figure = Figure(figsize=(10.5, 6.2), layout="constrained")
-    left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(N_SHOWN, 1.55))[0]
+    left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(N_SHOWN, 1.9))[0]
     panels = left.subplots(len(VIEWS), N_SHOWN, sharex=True, sharey=True)
     for column, pose in enumerate(spread_poses(found)):
         for row, (axis, label) in enumerate(VIEWS):
@@ -80,7 +101,7 @@ def _draw_arm(panel: Any, found: Comparison, pose: int, axes: list[int]) -> None
 
 def _draw_errors(panel: Any, found: Comparison) -> None:
     """Draw every pose's distance of the simulated to the measured tip, and the mean, of each simulation."""
-    dress(panel, f"tips, {len(found.tip_m)} poses", "", "simulated to measured [mm]")
+    dress(panel, f"tips, {len(found.tip_m)} poses", "at pressures; at lengths", "simulated to measured [mm]")
     errors_mm = {name: error[np.isfinite(error)] for name, error in found.errors_mm.items()}
     shown = {name: error for name, error in errors_mm.items() if len(error)}
     for at, (name, error_mm) in enumerate(shown.items()):
@@ -115,14 +136,15 @@ def lengths_figure(found: Comparison, twin: int) -> Figure:
     ends = 1e3 * np.array([np.nanmin(found.chamber_m), np.nanmax(found.chamber_m)])
     for section, (upper, lower) in enumerate(panels.T):
         dress(upper, f"section {section + 1}, from the base", "", "" if section else "simulated [mm]")
-        dress(lower, "", "measured [mm]", "" if section else "simulated - measured [mm]")
+        dress(lower, "", "from measured springs [mm]", "" if section else "simulated - measured [mm]")
         upper.plot(ends, ends, "--", color=INK, linewidth=1.0)
         lower.axhline(0.0, color=INK, linestyle="--", linewidth=1.0)
         chambers = slice(N_CHAMBERS_PER_SECTION * section, N_CHAMBERS_PER_SECTION * (section + 1))
         measured_mm = 1e3 * found.chamber_m[:, chambers].ravel()
-        for (_, colour, name), simulated_m in zip(PAIR, found.chamber_pair_m, strict=True):
+        rms_mm = found.chamber_rms_mm[:, section]
+        for (_, colour, name), simulated_m, rms in zip(PAIR, found.chamber_pair_m, rms_mm, strict=True):
             error_mm = 1e3 * simulated_m[:, chambers].ravel() - measured_mm
-            label = f"{name}: {np.sqrt(np.nanmean(error_mm**2)):.1f} mm RMS".replace("\n", " ")
+            label = f"{name}: {rms:.1f} mm RMS".replace("\n", " ")
             dots = {"color": colour, "markersize": 3.0, "alpha": 0.65, "linestyle": "none"}
             upper.plot(measured_mm, measured_mm + error_mm, "o", label=label, **dots)
             lower.plot(measured_mm, error_mm, "o", **dots)
@@ -137,7 +159,7 @@ def sensor_figure(found: Comparison, twin: int, specified: Sensor, calibrated: S
     curve, line, errors = figure.subplots(1, 3)
     read_mm = [1e3 * sensor.lengths(found.reading, np.nan).length_m for sensor in (specified, calibrated)]
     ruler_mm = 1e3 * found.ruler_m
-    off_mm = [np.sqrt(np.nanmean((read - ruler_mm) ** 2, axis=0)) for read in read_mm]
+    off_mm = [_spring_rms_mm(found, sensor) for sensor in (specified, calibrated)]
     k = int(np.nanargmax(off_mm[0]))
     unit, factor = _largest_unit(calibrated)
     dress(curve, f"spring {k}", f"{calibrated.reading_name} [{unit}]", "spring length L [mm]")

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
+from calib.errors import FitError
 from calib.fit.s2r import simulate_poses
 from calib.read.static_poses import find_static_poses
 from mjx_softarm.logs.schema import Log
@@ -21,6 +22,9 @@ from mjx_softarm.mechanics.statics import ArmParams, tendons
 from mjx_softarm.mechanics.workspace import settle_many
 from mjx_softarm.sensing.s2r import S2R, correct
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
+
+# Simulations of a tip: at the measured pressures, twice, and at the spring lengths read, twice.
+SIMULATIONS = ("specified", "calibrated", "lengths", "S2R")
 
 
 class Shapes(NamedTuple):
@@ -36,23 +40,39 @@ class Comparison(NamedTuple):
 
     marker_m: np.ndarray  # (n, n_markers, 3) measured, from the base to the tip
     tip_m: np.ndarray  # (n, 3) measured
-    spring_m: np.ndarray  # (n, n_chambers) measured
     chamber_m: np.ndarray  # (n, n_chambers) by `chambers_beside` the measured springs
     plate_pair_m: np.ndarray  # (2, n, n_links + 1, 3) simulated at the measured pressures
     tip_pair_m: np.ndarray  # (2, n, 3)
     chamber_pair_m: np.ndarray  # (2, n, n_chambers)
-    corrected_tip_m: np.ndarray  # (n, 3) simulated at the lengths read, and corrected by the S2R network
+    read_tip_m: np.ndarray  # (n, 3) simulated at the spring lengths read, as calibrated
+    corrected_tip_m: np.ndarray  # (n, 3) the same, corrected by the S2R network
     reading: np.ndarray  # (rows, n_chambers) of the springs' sensors
     ruler_m: np.ndarray  # (rows, n_chambers) spring lengths measured at these readings
 
     @property
     def errors_mm(self) -> dict[str, np.ndarray]:
-        """Distances (n,) of simulated to measured tips: as specified, as calibrated, with S2R."""
-        tips = (*self.tip_pair_m, self.corrected_tip_m)
-        names = ("specified", "calibrated", "S2R")
+        """Distances (n,) of simulated to measured tips, by keys of `SIMULATIONS`."""
+        tips = (*self.tip_pair_m, self.read_tip_m, self.corrected_tip_m)
         return {
             name: 1e3 * np.linalg.norm(tip - self.tip_m, axis=-1)
-            for name, tip in zip(names, tips, strict=True)
+            for name, tip in zip(SIMULATIONS, tips, strict=True)
+        }
+
+    @property
+    def chamber_rms_mm(self) -> np.ndarray:
+        """RMS differences (2, n_sections) of simulated to measured lengths of chambers, at the pressures."""
+        by_section = (self.chamber_pair_m - self.chamber_m).reshape(
+            2, len(self.tip_m), -1, N_CHAMBERS_PER_SECTION
+        )
+        return 1e3 * np.sqrt(np.nanmean(by_section**2, axis=(1, 3)))
+
+    def figures(self) -> dict[str, Any]:
+        """Return the means of what the pictures show, in mm; NaN where there is no network."""
+        specified, calibrated = self.chamber_rms_mm.tolist()
+        return {
+            "poses": len(self.tip_m),
+            "tip_mean_mm": {name: float(np.mean(error)) for name, error in self.errors_mm.items()},
+            "chamber_rms_mm": {"specified": specified, "calibrated": calibrated},
         }
 
 
@@ -94,23 +114,25 @@ def compare(log: Log, specified: ArmSpec, calibrated: ArmSpec, s2r: S2R | None) 
     Raises:
         FitError: the log lacks a column.
     """
-    assert log.readings is not None and log.spring_m is not None  # a twin has both
+    for name in ("readings", "spring_m"):
+        if getattr(log, name) is None:
+            raise FitError(f"{log.source}: {name}: got no such columns, expected those of a twin's log")
+    assert log.readings is not None and log.spring_m is not None
     poses, _ = find_static_poses([dataclasses.replace(log, readings=None)], calibrated)
     read, _ = find_static_poses([log], calibrated)
     pair = [simulate(spec, poses.pressure_kpa) for spec in (specified, calibrated)]
+    settled = simulate_poses(calibrated, read.spring_m)
     corrected_m = np.full_like(poses.tip_m, np.nan)
     if s2r is not None:
-        settled = simulate_poses(calibrated, read.spring_m)
-        tip_m = 1e-3 * correct(s2r, settled.pose, settled.spring_m)[:, :3]
-        corrected_m = _known(settled.valid, tip_m)
+        corrected_m = _known(settled.valid, 1e-3 * correct(s2r, settled.pose, settled.spring_m)[:, :3])
     return Comparison(
         marker_m=poses.marker_m,
         tip_m=poses.tip_m,
-        spring_m=poses.spring_m,
         chamber_m=chambers_beside(specified, poses.spring_m),
         plate_pair_m=np.stack([arm.plate_m for arm in pair]),
         tip_pair_m=np.stack([arm.tip_m for arm in pair]),
         chamber_pair_m=np.stack([arm.chamber_m for arm in pair]),
+        read_tip_m=_known(settled.valid, 1e-3 * settled.pose[:, :3]),
         corrected_tip_m=corrected_m,
         reading=log.readings,
         ruler_m=log.spring_m,
@@ -118,7 +140,7 @@ def compare(log: Log, specified: ArmSpec, calibrated: ArmSpec, s2r: S2R | None) 
 
 
 def _known(mask: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return values (n, ...), NaN where the mask (n,) is not."""
+    """Return values (n, ...), NaN where the mask (n,) is False."""
     return np.where(mask.reshape(-1, *[1] * (values.ndim - 1)), values, np.nan)
 
 

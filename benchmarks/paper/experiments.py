@@ -17,7 +17,7 @@ from mjx_softarm._support.errors import InputError
 
 
 def _presets(words: list[str]) -> tuple[str, ...]:
-    names = tuple(words[0].split(","))
+    names = tuple(dict.fromkeys(words[0].split(",")))
     if unknown := [name for name in names if name not in BESIDE]:
         raise ValueError(f"got {', '.join(unknown)}, expected some of {', '.join(BESIDE)}")
     return names
@@ -54,6 +54,8 @@ def paper(
     """
     if only != "open" and (arm == "rod" or preset == "analytic"):
         raise InputError(f"--only: got {only}, expected open with --arm rod or --preset analytic")
+    if beside and (smoke or only == "confined"):
+        raise InputError(f"--beside: got {','.join(beside)}, expected none with --smoke or --only confined")
     training = (f"total_env_steps={env_steps}",) if env_steps else None
     given = {"twins": twins, "seeds": seeds, "loads_g": loads, "preset": preset, "training": training}
     chosen = {name: value for name, value in given.items() if value is not None}

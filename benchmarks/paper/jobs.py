@@ -94,7 +94,7 @@ def compare_twin(folder: Path, settings: Settings, twin: int) -> None:
     from benchmarks.paper.comparison import compare, save_comparison
     from mjx_softarm._support import xla
     from mjx_softarm.sensing.s2r import S2R_FILE, load_s2r
-    from mjx_softarm.spec import ARM_FILE, ArmSpec
+    from mjx_softarm.spec import ArmSpec
     from mjx_softarm.twin.instruments import EVALUATION_SESSION
 
     here = folder / f"twin{twin}"

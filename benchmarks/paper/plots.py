@@ -16,7 +16,7 @@ from train.runs.plots import BLUE, GREY, INK, ORANGE, STEPS, dress
 GREEN, RED = "#2a9d6f", "#c43333"
 LOSSES = ("tqc/critic_loss", "tqc/actor_loss", "gail/discriminator_loss")
 
-COLOURS = {"without": ORANGE, "with": BLUE, "gradient": GREEN}  # of the kinds that follow the circle
+COLOURS = {"without": ORANGE, "with": BLUE, "gradient": GREEN}  # of the kinds that are drawn
 
 Style = tuple[str, str]  # label and colour
 

@@ -12,13 +12,13 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from benchmarks.paper import plots
-from benchmarks.paper.calibration_plots import calibration_figures
+from benchmarks.paper.calibration_plots import calibration_figures, calibration_numbers
 from benchmarks.paper.engine import MORE, Settings
 from benchmarks.paper.goals import check_goals
 from benchmarks.paper.jobs import CALIBRATION
 from benchmarks.paper.kinds import KINDS
 from benchmarks.paper.summary import Results, Row, simulated_rows, spreads, training_rows, trial_rows
-from benchmarks.paper.trials import FILMS, LOADS_FILM
+from benchmarks.paper.trials import FILMS, loads_film
 from mjx_softarm._support.provenance import provenance, write_json
 
 DPI, N_COLOURS = 110, 64
@@ -63,9 +63,10 @@ def write_report(
     drawn |= calibration_figures(folder, settings) if is_open else {}
     for name, figure in drawn.items():
         _save_picture(pictures / f"{prefix}-{name}.png", figure)
-    for film in (FILMS[experiment], *[LOADS_FILM] * is_open):
+    films = {FILMS[experiment]: FILMS[experiment]} | ({loads_film(settings): "loads.gif"} if is_open else {})
+    for film, name in films.items():
         if (folder / film).exists():
-            shutil.copyfile(folder / film, pictures / f"{prefix}-{film}")
+            shutil.copyfile(folder / film, pictures / f"{prefix}-{name}")
     return data
 
 
@@ -77,7 +78,10 @@ def figures_of(experiment: str, folder: Path, settings: Settings, results: Resul
     for twin in settings.twins:
         report = json.loads((folder / f"twin{twin}" / CALIBRATION / "report.json").read_text("utf-8"))
         calibrations[f"twin {twin}"] = {title: part["warnings"] for title, part in report["parts"].items()}
-    simulated = {"simulated": simulated_rows(folder, settings, table)} if experiment == "open" else {}
+    more = {}
+    if experiment == "open":
+        more["simulated"] = simulated_rows(folder, settings, table)
+        more[f"twin {settings.twins[0]} beside its simulation"] = calibration_numbers(folder, settings)
     return {
         "arm": settings.arm,
         "settings": shared,
@@ -86,7 +90,7 @@ def figures_of(experiment: str, folder: Path, settings: Settings, results: Resul
         "calibrations": calibrations,
         "runs": table,
         "trainings": trainings,
-        **simulated,
+        **more,
     }
 
 

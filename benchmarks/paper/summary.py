@@ -120,7 +120,10 @@ def first_stage_success(training: Training) -> list[float] | None:
 
 
 def simulated_rows(folder: Path, settings: Settings, table: Sequence[Row]) -> list[dict[str, Any]]:
-    """Return each policy's mean error on the circle in its own simulation, beside that on the twins."""
+    """Return mean errors on the circle of the policies with S2R and of those that know no twin.
+
+    Each has that in its own simulation beside that on the twins.
+    """
     rows = []
     for twin in (None, *settings.twins):
         kind = "without" if twin is None else "with"

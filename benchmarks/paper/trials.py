@@ -29,7 +29,7 @@ from benchmarks.paper.kinds import (
 )
 
 FILMS = {"open": "circle.gif", "confined": "pipe.gif"}
-LOADS_FILM, FILMED_LOADS_G = "loads.gif", (500, 1000)  # in open space; the loads are shown beside none
+FILMED_LOADS_G = (500, 1000)  # in open space, beside the unloaded arm
 
 
 def trainings(settings: Settings) -> list[tuple[str, int, int]]:
@@ -110,10 +110,19 @@ def _compare(twin: int) -> Stage:
 
 def _film_loads(unloaded: Trial, settings: Settings) -> list[Stage]:
     """Return the stage that films a trial beside the same with loads, if the experiment has such loads."""
-    loads_g = [load_g for load_g in settings.loads_g if load_g in FILMED_LOADS_G]
+    loads_g, file = _filmed_loads_g(settings), loads_film(settings)
     shown = (unloaded, *(unloaded._replace(load_g=load_g) for load_g in loads_g))
-    stage = Stage("film of loads", (LOADS_FILM,), jobs.film_loads, (shown, LOADS_FILM))
+    stage = Stage("film of loads", (file,), jobs.film_loads, (shown, file))
     return [stage] * bool(loads_g)
+
+
+def loads_film(settings: Settings) -> str:
+    """Return the name of the film of loads in the folder; it names them, since loads may be added."""
+    return "-".join(["loads", *map(str, _filmed_loads_g(settings))]) + ".gif"
+
+
+def _filmed_loads_g(settings: Settings) -> list[int]:
+    return [load_g for load_g in settings.loads_g if load_g in FILMED_LOADS_G]
 
 
 def _reach(twin: int | None, seed: int) -> Stage:

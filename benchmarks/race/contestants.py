@@ -143,6 +143,7 @@ def peer(library: str, variant: str, seed: int) -> Contestant:
             "arm": arms.env,
             "hindsight": config.hindsight,
             "reward_scale": config.tqc.reward_scale,
+            "seed": seed,
         }
     model = algorithm(kind, envs, seed=seed, **settings)
     model.set_logger(Logger(None, []))  # or each call of `learn` would make a folder

@@ -63,7 +63,8 @@ class HindsightBuffer(HerReplayBuffer):
 
     Args:
         arm: environment that gives scales and rewards.
-        hindsight: shares of a batch that get another goal: reached later, or near the pose reached.
+        hindsight: shares of a batch that get another goal: reached later, or near the pose reached; above 0.
+        seed: of the goals near a pose.
         reward_scale: factor of every stored reward.
         settings: those of `HerReplayBuffer`.
     """
@@ -74,11 +75,12 @@ class HindsightBuffer(HerReplayBuffer):
         arm: ReachEnv,
         hindsight: HindsightConfig,
         reward_scale: float,
+        seed: int,
         **settings: Any,
     ):
         super().__init__(*positional, **settings)
         self.her_ratio = hindsight.reached_share + hindsight.near_share
-        self._hindsight, self._rng = hindsight, np.random.default_rng(0)
+        self._hindsight, self._rng = hindsight, np.random.default_rng(seed)
         self._scale, self._config, self._reward_scale = arm.scale, arm.config.reward, reward_scale
 
     def sample(self, batch_size: int, env: Any = None) -> DictReplayBufferSamples:

@@ -4,8 +4,8 @@
 
 The arm is this project's as a piecewise-constant-strain robot: its lengths, masses, stiffnesses and dampers,
 one segment for each section. It bends and stretches; without torsion and shear, the stiffest motions, an
-explicit step may be three times as long. Two Gauss points in place of five take less time. Each round holds
-random pressures, as forces on the segments, and has neither a control law nor valves. METHOD is
+explicit step may be three times as long. It has two Gauss points, for speed; the default is five. Each round
+holds random pressures, as forces on the segments, and has neither a control law nor valves. METHOD is
 
     explicit    Euler's step on SoRoMoX's accelerations, the longest that is stable. Its limit is 0.85 ms at
                 the fastest decay seen, 2,340 per second. Runge-Kutta methods allow 1.0 to 1.8 times that, at

@@ -135,7 +135,7 @@ def evaluate(
         ConfigError: a number of actions that cannot be taken.
     """
     if actions is not None and (actions < 1 or in_motion is None):
-        where = "" if in_motion else " without --in-motion"
+        where = " without --in-motion" if in_motion is None else ""
         raise ConfigError(f"--actions: got {actions}{where}, expected a positive number with --in-motion")
     n_actions = actions or N_ACTIONS
     console = start()

@@ -1,19 +1,21 @@
 """The circle in time and stop by stop, as `python -m benchmarks path` measures it."""
 
+import dataclasses
 import json
 
 import pytest
 
+from benchmarks.accuracy import path
 from benchmarks.accuracy.path import means_over, measure
 from mjx_softarm._support.errors import InputError
-from mjx_softarm.policy.file import SHIPPED
+from mjx_softarm.policy.file import SHIPPED, load_policy
 
 
 def test_a_policy_is_measured_in_time_and_at_stops():
     figures = measure((f"twin:0={SHIPPED}",), seconds=(4.0,), points=4, stops=2)
     [in_time], [stopping] = figures["in time"], figures["stop by stop"]
     assert json.dumps(figures) and in_time["trained"] == stopping["trained"] == "at rest"
-    assert in_time["arm"] == "twin:0" and in_time["policy"] == "shipped"
+    assert in_time["arm"] == "twin:0" and in_time["policy"] == str(SHIPPED)
     assert in_time["once around [s]"] == 4.0 < stopping["seconds"] and stopping["mean [mm]"] > 0.0
     assert in_time["mean without that [mm]"] <= in_time["mean [mm]"] < in_time["largest [mm]"] < 200.0
     assert figures["means in time"][0]["mean [mm]"] == in_time["mean [mm]"]
@@ -32,5 +34,14 @@ def test_no_policies_and_one_that_cannot_be_measured_are_named(tmp_path):
         measure(())
     with pytest.raises(InputError, match="--policies: got policy.npz, expected ARM=FILE, such as"):
         measure(("policy.npz",))
-    with pytest.raises(InputError, match="absent.npz: got 'No such file"):
-        measure(("twin:0=absent.npz",))
+    with pytest.raises(InputError, match="absent.npz: got 'No such file"):  # before any is measured
+        measure((f"twin:0={SHIPPED}", "twin:0=absent.npz"))
+
+
+def test_means_of_different_arms_are_refused(monkeypatch):
+    moving = dataclasses.replace(load_policy(SHIPPED), action_s=0.5)
+    monkeypatch.setattr(
+        path, "load_policy", lambda file: moving if file == "moving" else load_policy(SHIPPED)
+    )
+    with pytest.raises(InputError, match="got at rest twin:0; in motion twin:1, expected the same arms"):
+        measure(("twin:0=still", "twin:1=moving"))

@@ -118,7 +118,7 @@ def tables(results):
     return trial_rows(results), training_rows(results)
 
 
-def compared(n=6, specified_mm=20.0, calibrated_mm=2.0, corrected_mm=1.0):
+def compared(n=6, specified_mm=20.0, calibrated_mm=2.0, read_mm=9.0, corrected_mm=1.0):
     """A comparison whose simulated arms are off by these distances along y; straight arms to one side."""
     down = np.linspace(0.0, 1.0, SPEC.n_links + 1)[:, None] * [0.0, 0.0, -0.6]
     plate_m = down + np.linspace(-0.1, 0.1, n)[:, None, None] * down[:, 2:] * [1.0, 0.0, 0.0]
@@ -127,11 +127,11 @@ def compared(n=6, specified_mm=20.0, calibrated_mm=2.0, corrected_mm=1.0):
     return Comparison(
         marker_m=plate_m[:, 1:],
         tip_m=plate_m[:, -1],
-        spring_m=spring_m,
         chamber_m=spring_m,
         plate_pair_m=plate_m + off_m[:, None],
         tip_pair_m=plate_m[:, -1] + off_m,
         chamber_pair_m=spring_m + off_m[..., 1:2],
+        read_tip_m=plate_m[:, -1] + [0.0, 1e-3 * read_mm, 0.0],
         corrected_tip_m=plate_m[:, -1] + [0.0, 1e-3 * corrected_mm, 0.0],
         reading=Sensor.from_spec(SPEC).readings(spring_m),
         ruler_m=spring_m,

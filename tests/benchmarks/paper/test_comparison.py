@@ -4,15 +4,20 @@ import numpy as np
 import pytest
 
 from benchmarks.paper import comparison, jobs
-from benchmarks.paper.calibration_plots import calibration_figures, configurations_figure, spread_poses
+from benchmarks.paper.calibration_plots import (
+    calibration_figures,
+    calibration_numbers,
+    configurations_figure,
+    spread_poses,
+)
 from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.spec import ARM_FILE
 from tests.benchmarks.paper.made_up import SPEC, TINY, N, compared
 
 
 def test_errors_are_distances_of_the_tips():
-    found = compared(specified_mm=20.0, calibrated_mm=2.0, corrected_mm=1.0).errors_mm
-    expected = {"specified": 20.0, "calibrated": 2.0, "S2R": 1.0}
+    found = compared(specified_mm=20.0, calibrated_mm=2.0, read_mm=9.0, corrected_mm=1.0).errors_mm
+    expected = {"specified": 20.0, "calibrated": 2.0, "lengths": 9.0, "S2R": 1.0}
     assert {name: float(error.mean()) for name, error in found.items()} == pytest.approx(expected)
 
 
@@ -39,7 +44,10 @@ def test_twin_is_compared_at_poses_that_its_calibration_has_not_seen(tmp_path, m
     assert np.isnan(found.corrected_tip_m).all()  # without a network
     assert 1.0 < found.errors_mm["specified"].mean() < 100.0
     assert not np.allclose(*found.tip_pair_m)
-    assert np.abs(found.ruler_m - found.spring_m).max() < 2e-3
+    assert np.abs(found.read_tip_m - found.tip_pair_m[1]).max() < 0.1
+    told = calibration_numbers(tmp_path, TINY)
+    assert told["poses"] == n and told["tip_mean_mm"]["specified"] == found.errors_mm["specified"].mean()
+    assert np.isfinite([*told["chamber_rms_mm"]["calibrated"], *told["spring_rms_mm"].values()]).all()
     assert set(calibration_figures(tmp_path, TINY)) == {"configurations", "lengths", "sensor"}
 
 

@@ -59,9 +59,15 @@ def test_both_experiments_or_one(tmp_path, monkeypatch, capsys):
     assert done == [("open", (0,)), ("confined", (0,)), ("confined", (1, 2))]
     assert f"written: {tmp_path / 'paper-confined.json'}" in capsys.readouterr().out
     rods = ["--arm", "rod", "--loads", "500", "--preset", "analytic", "--env-steps", "64"]
-    assert main(["paper", "--only", "open", *rods, "--beside", "quick", *smoke]) == 0
-    assert chosen[-1] == ("rod", (500,), "analytic", ("total_env_steps=64",), ("quick",))
+    assert main(["paper", "--only", "open", *rods, *smoke]) == 0
+    assert chosen[-1] == ("rod", (500,), "analytic", ("total_env_steps=64",), ())
     assert f"written: {tmp_path / 'paper-rod.json'}" in capsys.readouterr().out
+    beside = ["--beside", "quick,quick", "--out", str(tmp_path)]
+    assert main(["paper", "--only", "open", *beside]) == 0
+    assert chosen[-1][-1] == ("quick",)
+    for option in (["--smoke"], ["--only", "confined"]):
+        assert main(["paper", *option, *beside]) == 2
+        assert "--beside: got quick, expected none with --smoke or" in capsys.readouterr().err
     for option in (["--arm", "rod"], ["--preset", "analytic"]):
         assert main(["paper", *option, *smoke]) == 2
         assert "--only: got None, expected open with" in capsys.readouterr().err

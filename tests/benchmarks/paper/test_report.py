@@ -22,7 +22,7 @@ from benchmarks.paper.summary import (
     steps_to_success,
     trial_rows,
 )
-from benchmarks.paper.trials import FILMS, LOADS_FILM, trainings, trials
+from benchmarks.paper.trials import FILMS, loads_film, trainings, trials
 from mjx_softarm.mechanics.excitation import circle_poses
 from tests.benchmarks.paper.made_up import (
     SPEC,
@@ -107,7 +107,7 @@ def write(experiment, folder, results, filmed=False):
         side = film.SideView("", "", (0, 1), circle_poses(SPEC, 3)[:, :3])
         images = film.frames([np.zeros((20, 15, 3), np.uint8)] * 3, np.zeros((3, 3)), side)
         film.write_gif(folder / FILMS[experiment], images)
-        film.write_gif(folder / LOADS_FILM, images)
+        film.write_gif(folder / loads_film(TINY), images)
     report.write_report(experiment, folder, folder / "out", TINY, results)
     written = json.loads((folder / "out" / f"paper-{experiment}.json").read_text("utf-8"))
     assert "commit" in written
@@ -126,6 +126,7 @@ def test_open_results_are_written_and_nothing_is_hidden(tmp_path):
     assert figures["calibrations"] == {"twin 0": {"Springs": []}, "twin 1": {"Springs": ["off <by> much"]}}
     assert len(figures["runs"]) == len(trials("open", TINY))
     assert [row["translation_mm"] is None for row in figures["runs"]].count(True) == 1
+    assert figures["twin 0 beside its simulation"]["tip_mean_mm"]["S2R"] == pytest.approx(1.0)
     simulated = figures["simulated"]
     assert {item["simulated_mm"] for item in simulated} == {1.25}
     assert (simulated[0]["on_twin_mm"]["min"], simulated[0]["on_twin_mm"]["max"]) == (4.0, 4.0)

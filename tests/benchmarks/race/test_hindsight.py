@@ -36,6 +36,7 @@ class Played:
             arm=arms.env,
             hindsight=HindsightConfig(reached_share=SHARE),
             reward_scale=REWARD_SCALE,
+            seed=0,
         )
         self.saturated = np.zeros((N_ROWS, N_ARMS), bool)
         envs.seed(0)
