@@ -18,10 +18,10 @@ from train.runs.plots import BLUE, GREY, INK, ORANGE, dress
 
 N_SHOWN = 4  # configurations
 STYLES = {  # of `SIMULATIONS`: label, colour, name below an axis
-    "specified": ("simulated, as specified", ORANGE, "as\nspecified"),
-    "calibrated": ("simulated, calibrated", BLUE, "calibrated"),
-    "lengths": ("at lengths", RED, "calibr.,\nlengths"),
-    "S2R": ("tip with S2R", GREEN, "lengths,\nS2R"),
+    "specified": ("simulated, as specified", ORANGE, "specified,\npressures"),
+    "calibrated": ("simulated, calibrated", BLUE, "calibrated,\npressures"),
+    "lengths": ("at lengths", RED, "calibrated,\nlengths"),
+    "S2R": ("tip with S2R", GREEN, "S2R,\nlengths"),
 }
 PAIR = (STYLES["specified"], STYLES["calibrated"])
 _LEFT: dict[str, Any] = {"x": 0.01, "ha": "left", "fontsize": 11}  # of a figure's title
@@ -101,7 +101,8 @@ def _draw_arm(panel: Any, found: Comparison, pose: int, axes: list[int]) -> None
 
 def _draw_errors(panel: Any, found: Comparison) -> None:
     """Draw every pose's distance of the simulated to the measured tip, and the mean, of each simulation."""
-    dress(panel, f"tips, {len(found.tip_m)} poses", "at pressures; at lengths", "simulated to measured [mm]")
+    labels = "arm, and what it is simulated at", "simulated to measured [mm]"
+    dress(panel, f"tips, {len(found.tip_m)} poses", *labels)
     errors_mm = {name: error[np.isfinite(error)] for name, error in found.errors_mm.items()}
     shown = {name: error for name, error in errors_mm.items() if len(error)}
     for at, (name, error_mm) in enumerate(shown.items()):
@@ -114,7 +115,7 @@ def _draw_errors(panel: Any, found: Comparison) -> None:
     panel.set_yscale("log")
     panel.yaxis.set_major_formatter("{x:g}")
     panel.set_ylim(top=2.5 * max(error.max() for error in shown.values()))
-    panel.set_xticks(range(len(shown)), [STYLES[name][2] for name in shown])
+    panel.set_xticks(range(len(shown)), [STYLES[name][2] for name in shown], fontsize=8)
 
 
 def spread_poses(found: Comparison, n: int = N_SHOWN) -> list[int]:
@@ -142,9 +143,9 @@ def lengths_figure(found: Comparison, twin: int) -> Figure:
         chambers = slice(N_CHAMBERS_PER_SECTION * section, N_CHAMBERS_PER_SECTION * (section + 1))
         measured_mm = 1e3 * found.chamber_m[:, chambers].ravel()
         rms_mm = found.chamber_rms_mm[:, section]
-        for (_, colour, name), simulated_m, rms in zip(PAIR, found.chamber_pair_m, rms_mm, strict=True):
+        for (name, colour, _), simulated_m, rms in zip(PAIR, found.chamber_pair_m, rms_mm, strict=True):
             error_mm = 1e3 * simulated_m[:, chambers].ravel() - measured_mm
-            label = f"{name}: {rms:.1f} mm RMS".replace("\n", " ")
+            label = f"{name.removeprefix('simulated, ')}: {rms:.1f} mm RMS"
             dots = {"color": colour, "markersize": 3.0, "alpha": 0.65, "linestyle": "none"}
             upper.plot(measured_mm, measured_mm + error_mm, "o", label=label, **dots)
             lower.plot(measured_mm, error_mm, "o", **dots)
