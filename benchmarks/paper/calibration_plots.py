@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from benchmarks.paper.comparison import Comparison, load_comparison
-from benchmarks.paper.engine import Settings
+from benchmarks.paper.comparison import Comparison
+from benchmarks.paper.engine import Settings, load_arrays
 from benchmarks.paper.jobs import CALIBRATION, COMPARISON_FILE
 from benchmarks.paper.plots import GREEN, RED
 from mjx_softarm.sensing.sensors import Sensor
@@ -54,7 +54,7 @@ def _found(folder: Path, twin: int) -> tuple[Comparison, tuple[Sensor, Sensor]]:
     here = folder / f"twin{twin}"
     calibrated = ArmSpec.from_toml(here / CALIBRATION / ARM_FILE)
     sensors = Sensor.from_spec(ArmSpec.default()), Sensor.from_spec(calibrated)
-    return load_comparison(here / COMPARISON_FILE), sensors
+    return load_arrays(Comparison, here / COMPARISON_FILE), sensors
 
 
 def _spring_rms_mm(found: Comparison, sensor: Sensor) -> np.ndarray:

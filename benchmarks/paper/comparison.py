@@ -7,7 +7,6 @@ alone: motion capture of the tip, of the rings and of the springs, readings, pre
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -142,17 +141,3 @@ def compare(log: Log, specified: ArmSpec, calibrated: ArmSpec, s2r: S2R | None) 
 def _known(mask: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return values (n, ...), NaN where the mask (n,) is False."""
     return np.where(mask.reshape(-1, *[1] * (values.ndim - 1)), values, np.nan)
-
-
-def save_comparison(path: Path, comparison: Comparison) -> None:
-    """Write a comparison whole or not at all."""
-    part = path.with_name(path.name + ".part")
-    with part.open("wb") as file:
-        np.savez_compressed(file, **comparison._asdict())
-    part.replace(path)
-
-
-def load_comparison(path: Path) -> Comparison:
-    """Read the comparison that `save_comparison` wrote."""
-    with np.load(path) as file:
-        return Comparison(**{name: file[name] for name in Comparison._fields})

@@ -16,6 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+import numpy as np
+
 from benchmarks.harness.parallel import JobError, in_parallel
 from mjx_softarm._support.provenance import write_json
 
@@ -100,6 +102,20 @@ def run_stages(folder: Path, settings: Settings, groups: Sequence[Sequence[Stage
             jobs = [(stage.name, stage.function, (folder, settings, *stage.inputs)) for stage in pending]
             returned |= in_parallel(jobs)
     return returned
+
+
+def save_arrays(path: Path, arrays: Any) -> None:
+    """Write a named tuple of arrays whole or not at all."""
+    part = path.with_name(path.name + ".part")
+    with part.open("wb") as file:
+        np.savez_compressed(file, **arrays._asdict())
+    part.replace(path)
+
+
+def load_arrays(kind: Any, path: Path) -> Any:
+    """Read the named tuple, of the class `kind`, that `save_arrays` wrote."""
+    with np.load(path) as file:
+        return kind(**{name: file[name] for name in kind._fields})
 
 
 def command(log: Path, *arguments: str) -> None:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks.harness.parallel import JobError
-from benchmarks.paper.engine import Settings, command
+from benchmarks.paper.engine import Settings, command, save_arrays
 from benchmarks.paper.kinds import (
     KINDS,
     POLICY_FILE,
@@ -24,7 +24,7 @@ from benchmarks.paper.kinds import (
     reach_run,
     run_of,
 )
-from benchmarks.paper.measure import operate, save_outcome
+from benchmarks.paper.measure import operate
 from mjx_softarm.mechanics.pipe import PIPES_MM
 from mjx_softarm.spec import ARM_FILE
 
@@ -63,9 +63,8 @@ def calibrate_twin(folder: Path, settings: Settings, twin: int) -> None:
     here.mkdir(parents=True, exist_ok=True)
     file = here / "log.npz"
     if not file.exists():
-        write_log(
-            file, _recorded(stand_in(settings)(twin, spec, session=S2R_SESSION), settings.n_poses, twin)
-        )
+        arm = stand_in(settings)(twin, spec, session=S2R_SESSION)
+        write_log(file, _recorded(arm, settings.n_poses, twin))
     log, findings = read_log(file, spec.n_chambers)
     xla.enable_compilation_cache()
     calibration = calibrate([log], spec)
@@ -91,7 +90,7 @@ def _recorded(arm: Any, n_poses: int, seed: int) -> Any:
 
 def compare_twin(folder: Path, settings: Settings, twin: int) -> None:
     """Compare a twin with its simulation, as specified and as calibrated, at poses of another session."""
-    from benchmarks.paper.comparison import compare, save_comparison
+    from benchmarks.paper.comparison import compare
     from mjx_softarm._support import xla
     from mjx_softarm.sensing.s2r import S2R_FILE, load_s2r
     from mjx_softarm.spec import ArmSpec
@@ -104,32 +103,37 @@ def compare_twin(folder: Path, settings: Settings, twin: int) -> None:
     arm = stand_in(settings)(twin, specified, session=EVALUATION_SESSION)
     xla.enable_compilation_cache()
     log = _recorded(arm, N_COMPARED, COMPARED_SEED + twin)
-    save_comparison(here / COMPARISON_FILE, compare(log, specified, calibrated, s2r))
+    save_arrays(here / COMPARISON_FILE, compare(log, specified, calibrated, s2r))
 
 
 def train_reach(folder: Path, settings: Settings, twin: int | None, seed: int) -> None:
-    """Train a policy of the nominal arm or of a twin's calibration; resume an interrupted run."""
-    arm = [] if twin is None else ["--calibration", str(folder / f"twin{twin}" / CALIBRATION)]
-    chosen = ["--preset", settings.preset, *(f"--{text}" for text in settings.training)]
-    _reach(folder / reach_run(twin, seed), seed, *chosen, *arm)
+    """Train a policy of the nominal arm or of a twin's calibration."""
+    arm = [] if twin is None else ["--calibration", folder / f"twin{twin}" / CALIBRATION]
+    _reach(folder / reach_run(twin, seed), seed, *_chosen(settings), *arm)
 
 
 def train_other(folder: Path, settings: Settings, name: str, twin: int, seed: int) -> None:
     """Train a policy of another preset, or of a twin's calibration without its S2R network."""
-    run, calibration = folder / learned_run(name, twin, seed), folder / f"twin{twin}" / CALIBRATION
-    if preset := KINDS[name].reach:
-        _reach(run, seed, "--preset", preset, "--calibration", str(calibration))
-        return
-    chosen = ["--preset", settings.preset, *(f"--{text}" for text in settings.training)]
-    _reach(run, seed, *chosen, "--spec", str(calibration / ARM_FILE))
+    calibration, preset = folder / f"twin{twin}" / CALIBRATION, KINDS[name].reach
+    if preset:
+        options = ["--preset", preset, "--calibration", calibration]
+    else:
+        options = [*_chosen(settings), "--spec", calibration / ARM_FILE]
+    _reach(folder / learned_run(name, twin, seed), seed, *options)
 
 
-def _reach(run: Path, seed: int, *options: str) -> None:
+def _chosen(settings: Settings) -> list[str]:
+    """Return the options of the experiment's own policies."""
+    return ["--preset", settings.preset, *(f"--{text}" for text in settings.training)]
+
+
+def _reach(run: Path, seed: int, *options: Any) -> None:
+    """Train a policy with these options, or resume an interrupted run."""
     log = run.with_suffix(".log")
     if (run / "config.json").exists():
         command(log, "reach", "--resume", str(run))
     else:
-        command(log, "reach", *options, "--seed", str(seed), "--out", str(run))
+        command(log, "reach", *map(str, options), "--seed", str(seed), "--out", str(run))
 
 
 def demonstrate(folder: Path, settings: Settings, twin: int, task: str) -> None:
@@ -228,28 +232,20 @@ def try_out(folder: Path, settings: Settings, trial: Trial) -> None:
     """Run a trial and save its outcome."""
     path = folder / trial.result
     path.parent.mkdir(exist_ok=True)
-    save_outcome(path, operate(*scene_of(folder, settings, trial), trial.objects, trial.moves))
+    save_arrays(path, operate(*scene_of(folder, settings, trial), trial.objects, trial.moves))
 
 
-def film(folder: Path, settings: Settings, trial: Trial, file: str) -> str:
-    """Film a trial; returns why it cannot be drawn, or ""."""
-    from benchmarks.paper.film import film_scene
+def film(folder: Path, settings: Settings, trials: tuple[Trial, ...], file: str) -> str:
+    """Film a trial, or several side by side; returns why they cannot be drawn, or ""."""
+    from benchmarks.paper.film import film_scene, film_side_by_side
     from mjx_softarm.mechanics.render import RenderError
 
+    scenes = [(scene_of(folder, settings, trial), trial) for trial in trials]
     try:
-        film_scene(folder / file, scene_of(folder, settings, trial), trial)
-    except RenderError as error:
-        return str(error)
-    return ""
-
-
-def film_loads(folder: Path, settings: Settings, trials: tuple[Trial, ...], file: str) -> str:
-    """Film trials with different loads side by side; returns why they cannot be drawn, or ""."""
-    from benchmarks.paper.film import film_side_by_side
-    from mjx_softarm.mechanics.render import RenderError
-
-    try:
-        film_side_by_side(folder / file, [(scene_of(folder, settings, trial), trial) for trial in trials])
+        if len(scenes) == 1:
+            film_scene(folder / file, *scenes[0])
+        else:
+            film_side_by_side(folder / file, scenes)
     except RenderError as error:
         return str(error)
     return ""

@@ -8,7 +8,6 @@ container's place lies where the finger tips were; else it has fallen beside the
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -208,20 +207,6 @@ def _points(run: Run, goals: np.ndarray) -> np.ndarray:
         if np.isfinite(run.log.goal[k]).all():
             point[k] = first + np.argmin(np.abs(goals[first:] - run.log.goal[k]).sum(axis=1))
     return point
-
-
-def save_outcome(path: Path, outcome: Outcome) -> None:
-    """Write an outcome whole or not at all."""
-    part = path.with_name(path.name + ".part")
-    with part.open("wb") as file:
-        np.savez_compressed(file, **outcome._asdict())
-    part.replace(path)
-
-
-def load_outcome(path: Path) -> Outcome:
-    """Read the outcome that `save_outcome` wrote."""
-    with np.load(path) as file:
-        return Outcome(**{name: file[name] for name in Outcome._fields})
 
 
 def figures(outcome: Outcome) -> dict[str, Any]:

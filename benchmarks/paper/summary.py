@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.paper.engine import Settings
+from benchmarks.paper.engine import Settings, load_arrays
 from benchmarks.paper.kinds import EVALUATION_FILE, Trial, learned_run, reach_run
-from benchmarks.paper.measure import Outcome, figures, load_outcome
+from benchmarks.paper.measure import Outcome, figures
 from benchmarks.paper.trials import trainings, trials
 
 Row = Mapping[str, Any]
@@ -55,7 +55,9 @@ def load_results(folder: Path, experiment: str, settings: Settings) -> Results:
     """Read what an experiment's stages left in the folder."""
     items = trainings(settings) if experiment == "confined" else []
     return Results(
-        outcomes={trial: load_outcome(folder / trial.result) for trial in trials(experiment, settings)},
+        outcomes={
+            trial: load_arrays(Outcome, folder / trial.result) for trial in trials(experiment, settings)
+        },
         trainings={item: _load_training(folder / learned_run(*item)) for item in items},
     )
 

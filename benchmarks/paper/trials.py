@@ -81,7 +81,7 @@ def stages(experiment: str, settings: Settings) -> list[list[Stage]]:
     ]
     kind, objects = ("with", "") if experiment == "open" else ("pipe", "as shown")
     filmed = Trial(kind, settings.twins[0], settings.seeds[0], objects)
-    film = Stage("film", (FILMS[experiment],), jobs.film, (filmed, FILMS[experiment]))
+    film = Stage("film", (FILMS[experiment],), jobs.film, ((filmed,), FILMS[experiment]))
     films = [film] * (settings.arm == "twin")  # a rod cannot be drawn
     if experiment == "open":
         nominal = [_reach(None, seed) for seed in settings.seeds]
@@ -112,7 +112,7 @@ def _film_loads(unloaded: Trial, settings: Settings) -> list[Stage]:
     """Return the stage that films a trial beside the same with loads, if the experiment has such loads."""
     loads_g, file = _filmed_loads_g(settings), loads_film(settings)
     shown = (unloaded, *(unloaded._replace(load_g=load_g) for load_g in loads_g))
-    stage = Stage("film of loads", (file,), jobs.film_loads, (shown, file))
+    stage = Stage("film of loads", (file,), jobs.film, (shown, file))
     return [stage] * bool(loads_g)
 
 

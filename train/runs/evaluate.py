@@ -66,9 +66,7 @@ class Summary:
     circle_saturated_chambers: int  # summed over the circle's points
     # In motion:
     near_share: float | None = None  # goals within NEAR_MM of which the tip comes for good
-    near_median_s: float | None = (
-        None  # median time until then, of all goals; None if fewer than half come near
-    )
+    near_median_s: float | None = None  # median time until then, of all goals; None if most never come near
     overshoot_median_mm: float | None = None
     overshoot_p95_mm: float | None = None
 

@@ -4,8 +4,8 @@ import json
 
 import numpy as np
 
-from benchmarks.paper.comparison import Comparison, save_comparison
-from benchmarks.paper.engine import Settings
+from benchmarks.paper.comparison import Comparison
+from benchmarks.paper.engine import Settings, save_arrays
 from benchmarks.paper.jobs import CALIBRATION, COMPARISON_FILE
 from benchmarks.paper.kinds import KINDS, Trial, reach_run
 from benchmarks.paper.measure import Outcome, finger_tips
@@ -151,7 +151,7 @@ def fill(folder, settings):
         parts = {"Springs": {"warnings": ["off <by> much"] if twin else []}}
         (here / "report.json").write_text(json.dumps({"parts": parts}))
         SPEC.to_toml(here / ARM_FILE)
-        save_comparison(here.parent / COMPARISON_FILE, compared())
+        save_arrays(here.parent / COMPARISON_FILE, compared())
 
 
 def make_policy(make_arm_model, spec=SPEC, s2r=False):

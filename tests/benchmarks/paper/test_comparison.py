@@ -10,6 +10,7 @@ from benchmarks.paper.calibration_plots import (
     configurations_figure,
     spread_poses,
 )
+from benchmarks.paper.engine import load_arrays
 from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.spec import ARM_FILE
 from tests.benchmarks.paper.made_up import SPEC, TINY, N, compared
@@ -37,7 +38,7 @@ def test_twin_is_compared_at_poses_that_its_calibration_has_not_seen(tmp_path, m
     SPEC.replace(mass={"arm_kg": 4.0}).to_toml(here / jobs.CALIBRATION / ARM_FILE)
     monkeypatch.setattr(jobs, "N_COMPARED", 3)
     jobs.compare_twin(tmp_path, TINY, 0)
-    found = comparison.load_comparison(here / jobs.COMPARISON_FILE)
+    found = load_arrays(comparison.Comparison, here / jobs.COMPARISON_FILE)
     n = len(found.tip_m)
     assert 1 <= n <= 3
     assert found.chamber_pair_m.shape == (2, n, N) and found.plate_pair_m.shape == (2, n, SPEC.n_links + 1, 3)

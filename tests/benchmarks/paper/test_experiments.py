@@ -8,7 +8,6 @@ import pytest
 from benchmarks.__main__ import main
 from benchmarks.paper import engine, experiments, report
 from benchmarks.paper.engine import SMOKE
-from benchmarks.paper.measure import save_outcome
 from benchmarks.paper.trials import stages, trials
 from tests.benchmarks.paper.made_up import TINY, fill, good_results
 
@@ -26,7 +25,7 @@ def test_interrupted_benchmark_runs_only_what_is_missing(tmp_path, monkeypatch, 
                 (tmp_path / path).touch()
             if name.startswith("try "):
                 trial = named[name].inputs[0]
-                save_outcome(tmp_path / trial.result, results.outcomes[trial])
+                engine.save_arrays(tmp_path / trial.result, results.outcomes[trial])
         return {name: "not here" if name == "film" else None for name, _, _ in jobs}
 
     fill(tmp_path, TINY)

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from benchmarks.paper import jobs
-from benchmarks.paper.engine import SMOKE
+from benchmarks.paper.engine import SMOKE, load_arrays
 from benchmarks.paper.kinds import KINDS, Trial, learned_run, reach_run
-from benchmarks.paper.measure import load_outcome
+from benchmarks.paper.measure import Outcome
 from mjx_softarm._support import cli
 from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.policy.file import save_policy
@@ -161,7 +161,7 @@ def test_policy_goes_to_a_point_on_a_twin(tmp_path, make_arm_model, monkeypatch,
     (tmp_path / reach_run(0, 0)).mkdir()
     save_policy(tmp_path / reach_run(0, 0) / "policy.npz", make_policy(make_arm_model))
     jobs.try_out(tmp_path, settings, trial)
-    outcome = load_outcome(tmp_path / trial.result)
+    outcome = load_arrays(Outcome, tmp_path / trial.result)
     assert np.isfinite(outcome.error).all() and not outcome.operation.any()
     # The actor asks for the same springs wherever the goal is, and these the arm holds, loaded as it is.
     last = np.flatnonzero(outcome.point == 0)[-1]

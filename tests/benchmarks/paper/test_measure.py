@@ -5,17 +5,17 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from benchmarks.paper.engine import load_arrays, save_arrays
 from benchmarks.paper.measure import (
     GRASP_M,
     PACE_S,
     PLACE_M,
     Gripper,
+    Outcome,
     figures,
     finger_tips,
-    load_outcome,
     measure,
     operate,
-    save_outcome,
 )
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.arm_io import Capture
@@ -138,8 +138,8 @@ def test_figures_of_a_task_by_hand():
 
 def test_outcome_comes_back_from_its_file(tmp_path):
     outcome = made_up("pipe", saturated=[(0, 3)], fails=(1,), missed=(2,))
-    save_outcome(tmp_path / "run.npz", outcome)
-    for name, value in load_outcome(tmp_path / "run.npz")._asdict().items():
+    save_arrays(tmp_path / "run.npz", outcome)
+    for name, value in load_arrays(Outcome, tmp_path / "run.npz")._asdict().items():
         expected = getattr(outcome, name)
         assert np.array_equal(value, expected, equal_nan=value.dtype.kind == "f"), name
 

@@ -11,9 +11,9 @@ from PIL import Image
 
 from benchmarks.paper import film, plots, report
 from benchmarks.paper.calibration_plots import calibration_figures
+from benchmarks.paper.engine import save_arrays
 from benchmarks.paper.jobs import Scene
 from benchmarks.paper.kinds import KINDS, Trial, learned_run
-from benchmarks.paper.measure import save_outcome
 from benchmarks.paper.summary import (
     first_stage_success,
     load_off_g,
@@ -86,7 +86,7 @@ def test_steps_and_stages_of_a_training_by_hand():
 def test_stage_ends_come_from_the_runs_config(tmp_path):
     (tmp_path / "trials").mkdir()
     for trial in trials("confined", TINY):
-        save_outcome(tmp_path / trial.result, made_up(trial.kind))
+        save_arrays(tmp_path / trial.result, made_up(trial.kind))
     for item in trainings(TINY):
         run = tmp_path / learned_run(*item)
         run.mkdir()

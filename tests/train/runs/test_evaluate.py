@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from train.runs import evaluate
 from train.runs.evaluate import N_ACTIONS, Evaluator, Reached, summarise, way_figures
 
 pytestmark = pytest.mark.usefixtures("quick_compiler")
@@ -85,6 +86,20 @@ def test_an_arm_that_fails_on_the_way_counts_as_unsettled(evaluator, actions):
     figures, workspace, _ = evaluator(actions.at[3].set(jnp.nan))
     assert N_ACTIONS > 1 and not workspace.settled[3] and workspace.settled.sum() == len(actions) - 1
     assert figures.unsettled == 2 and figures.reached_share == 1 - 1 / len(actions)
+
+
+def test_as_many_actions_are_taken_as_asked_for(short_env, evaluator, actions, monkeypatch):
+    take = evaluate.reach
+
+    def counted(env, learner, policy, state, goal, n_actions):
+        after, result = take(env, learner, policy, state, goal, n_actions)
+        return after, result._replace(near_s=after.pipeline_state.n_steps - state.pipeline_state.n_steps)
+
+    monkeypatch.setattr(evaluate, "reach", counted)
+    few = evaluator.on(short_env, 2)
+    few.goals = evaluator.goals
+    _, workspace, circle = few(actions)
+    assert (workspace.near_s == 2).all() and (circle.near_s == 2).all()
 
 
 def test_when_a_tip_is_near_for_good_and_how_far_it_went_beyond():
