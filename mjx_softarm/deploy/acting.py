@@ -18,6 +18,7 @@ from mjx_softarm.sensing.load import Load
 from mjx_softarm.sensing.pose import pose_error
 
 MAX_SHIFT = np.repeat([25.0, 5.0], 3)  # [mm, deg] of a goal
+MOVING_SHARE = 0.05  # of what is left of the way to a moving goal, by which an action shifts it
 
 
 def believed(controller: Controller, spring_m: np.ndarray, load: Load) -> tuple[np.ndarray, float]:
@@ -35,7 +36,6 @@ def believed(controller: Controller, spring_m: np.ndarray, load: Load) -> tuple[
 def go(controller: Controller, state: State, at_rest: bool) -> tuple[State, list[Event], bool]:
     """Act if the goal is new or the springs have settled; arrive when they have after the last action."""
     events: list[Event] = []
-    settled = False
     if state.n_actions > 0:
         policy, seen = controller.policy, (state.springs_m, state.reference_m, state.pressure_kpa)
         settled = at_rest and bool(faults.on_reference(*seen, policy.gains, policy.tolerance_m))
@@ -45,17 +45,18 @@ def go(controller: Controller, state: State, at_rest: bool) -> tuple[State, list
             return state, [], False
         if not policy.action_s or state.n_actions == policy.n_actions:
             events += _unsettled(controller, state, settled)
+        if settled:
+            state = state._replace(shift=_shifted(controller, state))
         if state.n_actions == controller.policy.n_actions:
             return state._replace(goal=None), events, True
     assert state.goal is not None  # `step` asks
-    shift = state.shift if state.n_actions and not settled else _shifted(controller, state)
     pose, away = believed(controller, state.spring_m, state.load)
     if away > 1.0:
         message = f"{away:.1f} times as far from the training rows as the network is believed"
         events.append(Event(Fault.EXTRAPOLATION, message))
     sensed = _sensed(controller, state, pose)
-    reference_m = controller.plan(pose, state.goal + shift, state.spring_m, sensed)
-    state = state._replace(reference_m=reference_m, n_actions=state.n_actions + 1, n_ticks=0, shift=shift)
+    reference_m = controller.plan(pose, state.goal + state.shift, state.spring_m, sensed)
+    state = state._replace(reference_m=reference_m, n_actions=state.n_actions + 1, n_ticks=0)
     return state, events, False
 
 
@@ -67,14 +68,20 @@ def chase(controller: Controller, state: State) -> State:
     if policy.action_s:
         if state.n_actions and state.n_ticks * controller.dt_s < policy.action_s:
             return state
-        reference_m = controller.plan(pose, state.goal, state.spring_m, _sensed(controller, state, pose))
-        return state._replace(reference_m=reference_m, n_actions=state.n_actions + 1, n_ticks=0)
+        left = np.nan_to_num(pose_error(np.asarray(pose, float), state.due[0]))
+        shift = _clipped(state.shift - MOVING_SHARE * left)
+        reference_m = controller.plan(
+            pose, state.goal + shift, state.spring_m, _sensed(controller, state, pose)
+        )
+        due = np.concat([state.due[1:], state.goal[None]])
+        n_actions = state.n_actions + 1
+        return state._replace(reference_m=reference_m, n_actions=n_actions, n_ticks=0, shift=shift, due=due)
     shift, reference_m = state.shift, state.spring_m
     for _ in range(policy.n_actions):
         reference_m = controller.plan(pose, state.goal + shift, state.spring_m, None)
         pose, _ = believed(controller, reference_m, state.load)
         left = pose_error(np.asarray(pose, float), state.goal)
-        shift = np.clip(shift - left, -MAX_SHIFT, MAX_SHIFT)
+        shift = _clipped(shift - left)
     return state._replace(reference_m=reference_m, n_actions=state.n_actions + 1, n_ticks=0, shift=shift)
 
 
@@ -96,19 +103,21 @@ def _sensed(controller: Controller, state: State, pose: np.ndarray) -> np.ndarra
 
 
 def _shifted(controller: Controller, state: State) -> np.ndarray:
-    """Return the shift (6,) [mm, deg] of the goal for the next action, less what the last references leave.
+    """Return the shift (6,) [mm, deg] of goals from now on, less what the last references leave.
 
     References, not springs, since these may creep by some tenths of a millimetre in an arm at rest; but the
     springs of saturated chambers, which do not follow their references.
     """
-    if state.n_actions == 0:
-        return np.zeros(6)
     assert state.goal is not None and state.reference_m is not None
     policy, mean_m = controller.policy, state.springs_m.mean(axis=0)
     mask = saturated(state.pressure_kpa, state.reference_m, mean_m, policy.gains, policy.tolerance_m)
     pose, _ = believed(controller, np.where(mask, mean_m, state.reference_m), state.load)
     left = pose_error(np.asarray(pose, float), state.goal)
-    return np.clip(state.shift - left, -MAX_SHIFT, MAX_SHIFT)
+    return _clipped(state.shift - left)
+
+
+def _clipped(shift: np.ndarray) -> np.ndarray:
+    return np.clip(shift, -MAX_SHIFT, MAX_SHIFT)
 
 
 def _unsettled(controller: Controller, state: State, settled: bool) -> list[Event]:

@@ -19,6 +19,9 @@ WINDOW_S = 0.5
 
 Plan = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None], np.ndarray]
 
+LEAD_ACTIONS = 2  # of a moving goal before the tip, by policies of motion: they lag so on twins
+NONE_DUE = np.full((LEAD_ACTIONS, 6), np.nan)
+
 
 @dataclass(frozen=True, eq=False)
 class Controller:
@@ -62,7 +65,8 @@ class State(NamedTuple):
     chambers_kpa: np.ndarray  # (ticks, n) measured at these, or in force where none was measured
     load: Load  # payload that windows at rest told
     n_unweighed: int  # ticks since the last of these
-    shift: np.ndarray  # (6,) [mm, deg] of the goal that the policy is given
+    shift: np.ndarray  # (6,) [mm, deg] of the goals that the policy is given
+    due: np.ndarray  # (LEAD_ACTIONS, 6) [mm, deg] moving goal at the last actions, oldest first; NaN: none
 
 
 class Tick(NamedTuple):
@@ -99,4 +103,5 @@ def start(controller: Controller) -> State:
         load=Load(controller.policy.spec.mass.payload_kg),
         n_unweighed=0,
         shift=np.zeros(6),
+        due=NONE_DUE,
     )

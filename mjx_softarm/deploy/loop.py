@@ -15,9 +15,10 @@ A goal may also move, from tick to tick. Towards it, a policy that was trained o
 actions at once, in the mind: each leads on from the pose that the references of the one before make. One that
 was trained in motion acts as ever. Where the goal stops moving, it becomes an ordinary one.
 
-The policy takes an arm as specified to a goal. What a payload, or its own error, leaves of the way shows in
-the pose that its references make: the next action is towards a goal that is shifted by as much, unless the
-springs have not settled.
+The policy takes an arm as specified to a goal. What a payload, or its own error, leaves of the way shows,
+when the springs have settled, in the pose that its references make: goals are shifted by as much from then
+on. A policy of motion that follows a moving goal shifts it with each action by a small share of what is left
+to where the tip should be by now, the goal of some actions ago.
 
 Gains, limits, calibration, rate, tolerance and number of actions are the policy file's.
 `mjx_softarm.deploy.faults` says what can go wrong.
@@ -30,7 +31,7 @@ import numpy as np
 from mjx_softarm.control import LawState, pressures
 from mjx_softarm.deploy import faults
 from mjx_softarm.deploy.acting import chase, go, names
-from mjx_softarm.deploy.controller import Controller, State, Tick
+from mjx_softarm.deploy.controller import NONE_DUE, Controller, State, Tick
 from mjx_softarm.deploy.faults import Event, Fault, Response
 from mjx_softarm.deploy.link import vented
 from mjx_softarm.deploy.reachability import nearest
@@ -58,7 +59,8 @@ def with_goal(controller: Controller, state: State, goal: np.ndarray) -> tuple[S
 
 def with_moving_goal(state: State, goal: np.ndarray) -> State:
     """Return the state with where a moving goal (6,) [mm, deg], all of whose way is reachable, is now."""
-    return state._replace(goal=goal, moves=True)
+    follows = state.moves and state.goal is not None
+    return state._replace(goal=goal, moves=True, due=state.due if follows else NONE_DUE)
 
 
 def hold(state: State) -> State:

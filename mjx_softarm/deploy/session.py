@@ -15,7 +15,7 @@ import numpy as np
 
 from mjx_softarm.deploy.acting import believed
 from mjx_softarm.deploy.arm_io import ArmIO
-from mjx_softarm.deploy.controller import Controller, State, Tick, start
+from mjx_softarm.deploy.controller import LEAD_ACTIONS, Controller, State, Tick, start
 from mjx_softarm.deploy.ending import Arrival, Run, vent_at_end
 from mjx_softarm.deploy.faults import Event, Fault, Response
 from mjx_softarm.deploy.link import ArmFault, Link, Recorder
@@ -27,10 +27,7 @@ from mjx_softarm.mdp.rewards import scaled_error
 from mjx_softarm.sensing.pose import pose_error, seen_error
 
 _ROUNDING_S = 1e-6  # by which a simulated tick may be longer than the period
-LEAD_S, LEAD_ACTIONS = (
-    0.85,
-    2,
-)  # of a goal before the tip, by policies of rest, of motion: they lag so on twins
+LEAD_S = 0.85  # of a moving goal before the tip, by policies of rest: they lag so on twins
 _KEPT = 1000  # rows, arrivals and faults of a run without a log
 
 

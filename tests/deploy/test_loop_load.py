@@ -7,6 +7,7 @@ import pytest
 
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.faults import Fault
+from mjx_softarm.deploy.session import trace
 from mjx_softarm.sensing.estimator import estimate
 from tests.linear_arm import GAIN_M_PER_KPA, POLICY, REST_M, LinearArm, N, go, read_m
 
@@ -87,7 +88,7 @@ def test_goal_is_shifted_by_what_the_payload_bends():
     assert arrival.reached and arrival.estimate[2] == pytest.approx(GOAL[2], abs=2.0)
 
 
-def test_shift_begins_anew_with_each_goal_and_ends_somewhere():
+def test_shift_is_kept_from_goal_to_goal_and_ends_somewhere():
     asked = []
 
     def plan(pose, goal, spring_m, sensed):
@@ -96,8 +97,22 @@ def test_shift_begins_anew_with_each_goal_and_ends_somewhere():
 
     far = GOAL + [0.0, 0.0, 40.0, 0.0, 0.0, 0.0]
     go(LinearArm(), [far, GOAL], Controller.of(LOADED, plan))
-    assert [goal[2] for goal in asked[::4]] == [far[2], GOAL[2]]
+    assert [goal[2] for goal in asked[::4]] == [far[2], GOAL[2] + 25.0]
     assert max(abs(goal[2] - far[2]) for goal in asked[:4]) == 25.0
+
+
+def test_a_policy_of_motion_makes_up_for_its_offset_along_the_way():
+    def plan(pose, goal, spring_m, sensed):
+        off_mm = np.clip(0.8 * (goal - GOAL), 0.0, 8.0)  # from the first stop on
+        return plan_unloaded(pose, goal + off_mm, spring_m, sensed)
+
+    high = GOAL + [0.0, 0.0, 30.0, 0.0, 0.0, 0.0]
+    of_motion = dataclasses.replace(LOADED, action_s=0.1)
+    run = trace(LinearArm(), Controller.of(of_motion, plan), np.array([GOAL, high]), pace_s=20.0)
+    rows = run.ways[0]
+    off_mm = run.log.estimate[rows, 2] - run.log.goal[rows, 2]
+    [_, arrival] = run.arrivals
+    assert abs(off_mm[-300:]).max() < 1.0 and abs(arrival.estimate[2] - high[2]) < 1.0
 
 
 def test_saturated_chambers_shift_by_where_their_springs_are():
