@@ -18,7 +18,8 @@ from mjx_softarm.sensing.load import Load
 from mjx_softarm.sensing.pose import pose_error
 
 MAX_SHIFT = np.repeat([25.0, 5.0], 3)  # [mm, deg] of a goal
-MOVING_SHARE = 0.05  # of what is left of the way to a moving goal, by which an action shifts it
+MAX_KEPT = np.repeat([10.0, 2.0], 3)  # of the next one; what goes beyond is of a goal that is out of reach
+MOVING_SHARE = 0.05  # of what is left to where the tip should be, by which an action shifts a moving goal
 
 
 def believed(controller: Controller, spring_m: np.ndarray, load: Load) -> tuple[np.ndarray, float]:
@@ -48,7 +49,7 @@ def go(controller: Controller, state: State, at_rest: bool) -> tuple[State, list
         if settled:
             state = state._replace(shift=_shifted(controller, state))
         if state.n_actions == controller.policy.n_actions:
-            return state._replace(goal=None), events, True
+            return state._replace(goal=None, shift=_clipped(state.shift, MAX_KEPT)), events, True
     assert state.goal is not None  # `step` asks
     pose, away = believed(controller, state.spring_m, state.load)
     if away > 1.0:
@@ -68,8 +69,7 @@ def chase(controller: Controller, state: State) -> State:
     if policy.action_s:
         if state.n_actions and state.n_ticks * controller.dt_s < policy.action_s:
             return state
-        left = np.nan_to_num(pose_error(np.asarray(pose, float), state.due[0]))
-        shift = _clipped(state.shift - MOVING_SHARE * left)
+        shift = _clipped(state.shift - MOVING_SHARE * _beside(np.asarray(pose, float), state.due))
         reference_m = controller.plan(
             pose, state.goal + shift, state.spring_m, _sensed(controller, state, pose)
         )
@@ -116,8 +116,20 @@ def _shifted(controller: Controller, state: State) -> np.ndarray:
     return _clipped(state.shift - left)
 
 
-def _clipped(shift: np.ndarray) -> np.ndarray:
-    return np.clip(shift, -MAX_SHIFT, MAX_SHIFT)
+def _beside(pose: np.ndarray, due: np.ndarray) -> np.ndarray:
+    """Return how far a pose (6,) is beside the way of a goal (k, 6), from where that was first; 0 without.
+
+    Along the way it may lag, or be ahead, which is no offset.
+    """
+    if np.isnan(due).any():
+        return np.zeros(6)
+    left, along = pose_error(pose, due[0]), pose_error(due[-1], due[0])[:3]
+    left[:3] -= along * (left[:3] @ along) / max(along @ along, 1e-12)
+    return left
+
+
+def _clipped(shift: np.ndarray, limit: np.ndarray = MAX_SHIFT) -> np.ndarray:
+    return np.clip(shift, -limit, limit)
 
 
 def _unsettled(controller: Controller, state: State, settled: bool) -> list[Event]:

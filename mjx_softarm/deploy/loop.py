@@ -16,9 +16,9 @@ actions at once, in the mind: each leads on from the pose that the references of
 was trained in motion acts as ever. Where the goal stops moving, it becomes an ordinary one.
 
 The policy takes an arm as specified to a goal. What a payload, or its own error, leaves of the way shows,
-when the springs have settled, in the pose that its references make: goals are shifted by as much from then
-on. A policy of motion that follows a moving goal shifts it with each action by a small share of what is left
-to where the tip should be by now, the goal of some actions ago.
+when the springs have settled, in the pose that its references make: the goal is shifted by as much from then
+on, and the next ones, too, at most by `acting.MAX_KEPT`. A policy of motion that follows a moving goal shifts
+it with each action by a small share of how far the tip is beside the goal's way.
 
 Gains, limits, calibration, rate, tolerance and number of actions are the policy file's.
 `mjx_softarm.deploy.faults` says what can go wrong.
@@ -54,13 +54,12 @@ def with_goal(controller: Controller, state: State, goal: np.ndarray) -> tuple[S
         near = ", ".join(f"{value:.0f}" for value in pose)
         far = f"{text} is {away:.1f} times as far from the nearest reachable pose as a goal may be"
         return state, (Event(Fault.GOAL_OUTSIDE, f"{far}; that pose is {near} [mm, deg]"),)
-    return state._replace(goal=goal, moves=False, n_actions=0, n_ticks=0), ()
+    return state._replace(goal=goal, moves=False, n_actions=0, n_ticks=0, due=NONE_DUE), ()
 
 
 def with_moving_goal(state: State, goal: np.ndarray) -> State:
     """Return the state with where a moving goal (6,) [mm, deg], all of whose way is reachable, is now."""
-    follows = state.moves and state.goal is not None
-    return state._replace(goal=goal, moves=True, due=state.due if follows else NONE_DUE)
+    return state._replace(goal=goal, moves=True)
 
 
 def hold(state: State) -> State:
