@@ -50,6 +50,8 @@ def go(controller: Controller, state: State, at_rest: bool) -> tuple[State, list
             state = state._replace(shift=_shifted(controller, state))
         if state.n_actions == controller.policy.n_actions:
             return state._replace(goal=None, shift=_clipped(state.shift, MAX_KEPT)), events, True
+    elif not controller.policy.action_s:  # it makes up for what is left with its next actions
+        state = state._replace(shift=np.zeros(6))
     assert state.goal is not None  # `step` asks
     pose, away = believed(controller, state.spring_m, state.load)
     if away > 1.0:

@@ -17,8 +17,8 @@ was trained in motion acts as ever. Where the goal stops moving, it becomes an o
 
 The policy takes an arm as specified to a goal. What a payload, or its own error, leaves of the way shows,
 when the springs have settled, in the pose that its references make: the goal is shifted by as much from then
-on, and the next ones, too, at most by `acting.MAX_KEPT`. A policy of motion that follows a moving goal shifts
-it with each action by a small share of how far the tip is beside the goal's way.
+on. A policy of motion seldom settles between its actions, so its next goals are shifted too, at most by
+`acting.MAX_KEPT`; a moving one with each action by a small share of how far the tip is beside the goal's way.
 
 Gains, limits, calibration, rate, tolerance and number of actions are the policy file's.
 `mjx_softarm.deploy.faults` says what can go wrong.

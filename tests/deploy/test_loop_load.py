@@ -88,7 +88,8 @@ def test_goal_is_shifted_by_what_the_payload_bends():
     assert arrival.reached and arrival.estimate[2] == pytest.approx(GOAL[2], abs=2.0)
 
 
-def test_shift_ends_somewhere_and_the_next_goal_has_a_part_of_it():
+@pytest.mark.parametrize(("action_s", "kept_mm"), [(0.0, 0.0), (1.0, 10.0)])
+def test_shift_ends_somewhere_and_the_next_goal_of_a_policy_of_motion_has_a_part_of_it(action_s, kept_mm):
     asked = []
 
     def plan(pose, goal, spring_m, sensed):
@@ -96,8 +97,8 @@ def test_shift_ends_somewhere_and_the_next_goal_has_a_part_of_it():
         return np.full(N, REST_M)  # never there
 
     far = GOAL + [0.0, 0.0, 40.0, 0.0, 0.0, 0.0]
-    go(LinearArm(), [far, GOAL], Controller.of(LOADED, plan))
-    assert [goal[2] for goal in asked[::4]] == [far[2], GOAL[2] + 10.0]
+    go(LinearArm(), [far, GOAL], Controller.of(dataclasses.replace(LOADED, action_s=action_s), plan))
+    assert [goal[2] for goal in asked[::4]] == [far[2], GOAL[2] + kept_mm]
     assert max(abs(goal[2] - far[2]) for goal in asked[:4]) == 25.0
 
 
