@@ -68,23 +68,23 @@ def chase(controller: Controller, state: State) -> State:
     policy = controller.policy
     assert state.goal is not None  # `step` asks
     pose, _ = believed(controller, state.spring_m, state.load)
+    shift, due = state.shift, state.due
     if policy.action_s:
         if state.n_actions and state.n_ticks * controller.dt_s < policy.action_s:
             return state
-        shift = _clipped(state.shift - MOVING_SHARE * _beside(np.asarray(pose, float), state.due))
-        reference_m = controller.plan(
-            pose, state.goal + shift, state.spring_m, _sensed(controller, state, pose)
-        )
-        due = np.concat([state.due[1:], state.goal[None]])
-        n_actions = state.n_actions + 1
-        return state._replace(reference_m=reference_m, n_actions=n_actions, n_ticks=0, shift=shift, due=due)
-    shift, reference_m = state.shift, state.spring_m
-    for _ in range(policy.n_actions):
-        reference_m = controller.plan(pose, state.goal + shift, state.spring_m, None)
-        pose, _ = believed(controller, reference_m, state.load)
-        left = pose_error(np.asarray(pose, float), state.goal)
-        shift = _clipped(shift - left)
-    return state._replace(reference_m=reference_m, n_actions=state.n_actions + 1, n_ticks=0, shift=shift)
+        shift = _clipped(shift - MOVING_SHARE * _beside(np.asarray(pose, float), due))
+        sensed = _sensed(controller, state, pose)
+        reference_m = controller.plan(pose, state.goal + shift, state.spring_m, sensed)
+        due = np.concat([due[1:], state.goal[None]])
+    else:
+        reference_m = state.spring_m
+        for _ in range(policy.n_actions):
+            reference_m = controller.plan(pose, state.goal + shift, state.spring_m, None)
+            pose, _ = believed(controller, reference_m, state.load)
+            left = pose_error(np.asarray(pose, float), state.goal)
+            shift = _clipped(shift - left)
+    n_actions = state.n_actions + 1
+    return state._replace(reference_m=reference_m, n_actions=n_actions, n_ticks=0, shift=shift, due=due)
 
 
 def _patience_s(policy: Policy, n_actions: int) -> float:

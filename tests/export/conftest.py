@@ -55,11 +55,11 @@ def moving_policy(spec=SPEC):
 
 
 @contextlib.contextmanager
-def few_golden_rows():
-    """Golden rows made in here are few."""
+def few_golden_rows(run_ticks=30):
+    """Golden rows made in here are few; runs end after so many ticks."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(golden_rows, "N_SINGLE", 40)
-        patch.setattr(golden_rows, "_RUN_TICKS", 30)
+        patch.setattr(golden_rows, "_RUN_TICKS", run_ticks)
         yield
 
 

@@ -51,15 +51,29 @@ def draw_wires():
     return dataclasses.replace(busy_policy(ArmSpec.from_dict(spec, "test")), s2r=None)
 
 
-@pytest.mark.parametrize("make", [draw_wires, moving_policy])
-def test_rows_of_other_policies_agree(make, tmp_path):
-    controller = Controller.of(make())
+def agreeing_rows(policy, folder, run_ticks):
+    """Rows of a policy, on which its C++ agrees; a run that is given its goal again is twice as long."""
+    controller = Controller.of(policy)
     for name, text in sources(controller, "ab").items():
-        (tmp_path / name).write_text(text)
-    compile_("-O1", tmp_path / "rows.cpp", "-o", tmp_path / "rows")
-    with few_golden_rows():
-        agreement = check(golden_rows.make_golden(controller, "ab"), tmp_path / "rows")
+        (folder / name).write_text(text)
+    compile_("-O1", folder / "rows.cpp", "-o", folder / "rows")
+    with few_golden_rows(run_ticks):
+        golden = golden_rows.make_golden(controller, "ab")
+    agreement = check(golden, folder / "rows")
     assert agreement.n_rows > 100 and agreement.error < TOLERANCE, agreement
+    return golden
+
+
+def test_rows_of_draw_wires_agree(tmp_path):
+    agreeing_rows(draw_wires(), tmp_path, run_ticks=30)
+
+
+def test_rows_of_a_policy_of_motion_agree_and_it_keeps_a_part_of_its_shift(tmp_path):
+    golden = agreeing_rows(moving_policy(), tmp_path, run_ticks=110)
+    begins, given = (np.flatnonzero(golden.inputs[:, FLAGS.index(name)]) for name in ("restart", "new_goal"))
+    [again] = np.setdiff1d(given, begins)
+    began = begins[begins < again].max()
+    assert golden.outputs[began:again, 1].any()  # it had arrived
 
 
 def test_a_tick_neither_allocates_nor_throws(folder):
