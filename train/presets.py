@@ -6,6 +6,7 @@ import dataclasses
 
 from mjx_softarm.env import EnvConfig, Randomisation
 from mjx_softarm.mdp.rewards import RewardConfig
+from mjx_softarm.sensing.load import LARGEST_KG
 from train.agent.analytic import AnalyticConfig
 from train.agent.hindsight import HindsightConfig
 from train.agent.tqc import TQCConfig
@@ -22,6 +23,16 @@ _TUNED = TrainConfig(
         initial_alpha=0.1,
     ),
     hindsight=HindsightConfig(reached_share=0.25, near_share=0.5),
+)
+
+# A gradient step through the equilibrium takes one action of all arms.
+_ANALYTIC = TrainConfig(
+    learner="analytic",
+    n_arms=64,
+    total_env_steps=64 * 98_304,
+    vector_steps_per_epoch=256,
+    evaluation_epochs=24,
+    env=EnvConfig(n_poses=16_384, even_share=0.5),
 )
 
 # At rest one action is enough, so the value of later ones hardly matters.
@@ -47,14 +58,13 @@ PRESETS: dict[str, TrainConfig] = {
         evaluation_epochs=30,
         polish_updates=20_480,
     ),
-    # A gradient step through the equilibrium takes one action of all arms.
-    "analytic": TrainConfig(
-        learner="analytic",
-        n_arms=64,
-        total_env_steps=64 * 98_304,
-        vector_steps_per_epoch=256,
-        evaluation_epochs=24,
-        env=EnvConfig(n_poses=16_384, even_share=0.5),
+    "analytic": _ANALYTIC,
+    # The same for an arm that carries: the policy observes the payload, which the loop tells from pressures.
+    "payload": dataclasses.replace(
+        _ANALYTIC,
+        env=dataclasses.replace(
+            _ANALYTIC.env, observation="payload", randomisation=Randomisation(payload_max_kg=LARGEST_KG)
+        ),
     ),
     # The paper's recipe: 14 workers, sb3-contrib's hyperparameters, of which one is a gradient step for each
     # step of the workers, and each transition stored again with the pose it achieved for its goal.
@@ -97,7 +107,7 @@ PRESETS: dict[str, TrainConfig] = {
         total_env_steps=300_000,
         updates_per_env_step=0.25,
         polish_updates=131_072,
-        env=EnvConfig(n_poses=16_384, even_share=0.5),
+        env=_ANALYTIC.env,
         tqc=dataclasses.replace(_AT_REST.tqc, hidden_actor=AnalyticConfig().hidden),
     ),
 }

@@ -30,7 +30,7 @@ def paper(
     seeds: cli.Integers | None = None,
     loads: cli.Integers | None = None,
     arm: Literal["twin", "rod"] = "twin",
-    preset: Literal["quick", "paper", "analytic"] | None = None,
+    preset: Literal["quick", "paper", "analytic", "payload"] | None = None,
     env_steps: int | None = None,
     beside: Annotated[tuple[str, ...], cli.listed(_presets, "NAME,NAME,...")] = (),
     out: cli.MaybePath = None,
@@ -47,13 +47,14 @@ def paper(
         seeds: of training; None: 0,1,2
         loads: payloads in open space [g]; None: 35,105,220,330,500,1000
         arm: twin, or a rod, of other physics, in open space alone
-        preset: of training in open space; None: paper; analytic leaves no critics for the confined circle
+        preset: of training in open space; None: paper; analytic and payload leave no critics for the confined
+            circle
         env_steps: of training in open space; None: the preset's
-        beside: further presets in open space with S2R, as long as they are
+        beside: further presets in open space with S2R, as long as they are; payload as long as analytic
         out: working folder; None: runs/paper
     """
-    if only != "open" and (arm == "rod" or preset == "analytic"):
-        raise InputError(f"--only: got {only}, expected open with --arm rod or --preset analytic")
+    if only != "open" and (arm == "rod" or preset in ("analytic", "payload")):
+        raise InputError(f"--only: got {only}, expected open with --arm rod or --preset analytic or payload")
     if beside and (smoke or only == "confined"):
         raise InputError(f"--beside: got {','.join(beside)}, expected none with --smoke or --only confined")
     training = (f"total_env_steps={env_steps}",) if env_steps else None

@@ -29,6 +29,7 @@ from mjx_softarm.mechanics.pipe import PIPES_MM
 from mjx_softarm.spec import ARM_FILE
 
 CALIBRATION, COMPARISON_FILE = "calibration", "comparison.npz"
+ALIKE = {"analytic", "payload"}  # presets that differ in the payload alone, so they get the same env steps
 N_COMPARED = 40  # poses that a calibrated twin is compared at
 COMPARED_SEED = 1000  # and up: other poses than the logs', whose seeds are the twins'
 # Session of a twin in trials of demonstrated tasks; demonstrations are recorded in its evaluation session,
@@ -117,6 +118,8 @@ def train_other(folder: Path, settings: Settings, name: str, twin: int, seed: in
     calibration, preset = folder / f"twin{twin}" / CALIBRATION, KINDS[name].reach
     if preset:
         options = ["--preset", preset, "--calibration", calibration]
+        if {preset, settings.preset} == ALIKE:
+            options += _length(settings)
     else:
         options = [*_chosen(settings), "--spec", calibration / ARM_FILE]
     _reach(folder / learned_run(name, twin, seed), seed, *options)
@@ -124,7 +127,12 @@ def train_other(folder: Path, settings: Settings, name: str, twin: int, seed: in
 
 def _chosen(settings: Settings) -> list[str]:
     """Return the options of the experiment's own policies."""
-    return ["--preset", settings.preset, *(f"--{text}" for text in settings.training)]
+    return ["--preset", settings.preset, *_length(settings)]
+
+
+def _length(settings: Settings) -> list[str]:
+    """Return the options of how long they are trained."""
+    return [f"--{text}" for text in settings.training]
 
 
 def _reach(run: Path, seed: int, *options: Any) -> None:

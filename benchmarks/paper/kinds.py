@@ -29,6 +29,7 @@ KINDS = {
     "quick": Kind("with S2R, quick", reach="quick"),
     "paper": Kind("with S2R, paper", reach="paper"),
     "analytic": Kind("with S2R, analytic", reach="analytic"),
+    "payload": Kind("with S2R, payload", reach="payload"),
     "gradient": Kind("gradient descent"),
     "pipe": Kind("learned reward", "pipe300", "pipe"),
     "moving": Kind("learned reward, in motion", "pipe300", "pipe-moving"),

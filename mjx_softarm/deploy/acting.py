@@ -13,7 +13,7 @@ from mjx_softarm.deploy.controller import Controller, State
 from mjx_softarm.deploy.faults import Event, Fault
 from mjx_softarm.mdp.observation import rate_ticks
 from mjx_softarm.policy.file import Policy
-from mjx_softarm.policy.runtime import sensed_motion, tip_pose
+from mjx_softarm.policy.runtime import sensed_motion, sensed_payload, tip_pose
 from mjx_softarm.sensing.load import Load
 from mjx_softarm.sensing.pose import pose_error
 
@@ -79,7 +79,8 @@ def chase(controller: Controller, state: State) -> State:
     else:
         reference_m = state.spring_m
         for _ in range(policy.n_actions):
-            reference_m = controller.plan(pose, state.goal + shift, state.spring_m, None)
+            sensed = _sensed(controller, state, pose)
+            reference_m = controller.plan(pose, state.goal + shift, state.spring_m, sensed)
             pose, _ = believed(controller, reference_m, state.load)
             left = pose_error(np.asarray(pose, float), state.goal)
             shift = _clipped(shift - left)
@@ -94,10 +95,12 @@ def _patience_s(policy: Policy, n_actions: int) -> float:
 
 
 def _sensed(controller: Controller, state: State, pose: np.ndarray) -> np.ndarray | None:
-    """Return `observe_motion` of the arm, which is believed at a pose (6,), for a policy that observes it."""
+    """Return what the policy observes besides pose and goal of the arm, which is believed at a pose (6,)."""
     policy = controller.policy
-    if not policy.observes_motion:
+    if policy.observation == "pose":
         return None
+    if policy.observation == "payload":
+        return sensed_payload(policy, state.load.believed_kg)
     before_m = state.springs_m[-1 - min(rate_ticks(policy.rate_hz), len(state.springs_m) - 1)]
     reference_m = np.full_like(before_m, np.nan) if state.reference_m is None else state.reference_m
     motion = state.spring_m, before_m, reference_m, state.law.integral_kpa

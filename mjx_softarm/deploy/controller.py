@@ -29,7 +29,7 @@ class Controller:
 
     policy: Policy
     reachable: Reachable
-    plan: Plan  # pose and goal (6,), springs (n,) [m], `observe_motion` or None -> references (n,) [m]
+    plan: Plan  # pose and goal (6,), springs (n,) [m], `sensed` of `PolicyRunner.act` -> references (n,) [m]
     dt_s: float
     window: int  # ticks
 

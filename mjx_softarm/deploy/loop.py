@@ -15,10 +15,11 @@ A goal may also move, from tick to tick. Towards it, a policy that was trained o
 actions at once, in the mind: each leads on from the pose that the references of the one before make. One that
 was trained in motion acts as ever. Where the goal stops moving, it becomes an ordinary one.
 
-The policy takes an arm as specified to a goal. What a payload, or its own error, leaves of the way shows,
-when the springs have settled, in the pose that its references make: the goal is shifted by as much from then
-on. A policy of motion seldom settles between its actions, so its next goals are shifted too, at most by
-`acting.MAX_KEPT`; a moving one with each action by a small share of how far the tip is beside the goal's way.
+The policy takes an arm as specified to a goal; one that observes the payload, an arm that carries what rests
+told. What is left of the way shows, when the springs have settled, in the pose that its references make: the
+goal is shifted by as much from then on. A policy of motion seldom settles between its actions, so its next
+goals are shifted too, at most by `acting.MAX_KEPT`; a moving one with each action by a small share of how far
+the tip is beside the goal's way.
 
 Gains, limits, calibration, rate, tolerance and number of actions are the policy file's.
 `mjx_softarm.deploy.faults` says what can go wrong.

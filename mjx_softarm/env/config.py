@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, fields
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from tyro.conf import arg
 
 from mjx_softarm.control import TOLERANCE_M
+from mjx_softarm.mdp.observation import Observation
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.mechanics.pipe import CrossPipe
 from mjx_softarm.mechanics.workspace import HELD_OUT_SEED
@@ -46,8 +47,9 @@ class EnvConfig:
     """kinematics: in closed form, or MJX's; all else is shared, the inertia in motion being MJX's"""
     mode: Annotated[Literal["quasistatic", "dynamic"], arg(aliases=["--mode"])] = "quasistatic"
     """equilibrium of each action, or its motion"""
-    observation: Literal["pose", "motion"] = "pose"
-    """pose and goal, or also springs, their rates, the tip's velocity and the last action; in dynamic mode"""
+    observation: Observation = "pose"
+    """pose and goal; payload: also the payload; motion: also springs, their rates, the tip's velocity and the
+    last action, in dynamic mode"""
     goal_ends: bool = True  # a goal that is reached ends the episode; else it pays in every step
     reward: RewardConfig = field(default_factory=RewardConfig)
     randomisation: Randomisation = field(default_factory=Randomisation)
@@ -68,20 +70,15 @@ class EnvConfig:
         """Whether the arm is in motion."""
         return self.mode == "dynamic"
 
-    @property
-    def observes_motion(self) -> bool:
-        """Whether more than pose and goal is observed."""
-        return self.observation == "motion"
-
     def __post_init__(self):
         for name, allowed in (
             ("engine", ("chain", "mjx")),
             ("mode", ("quasistatic", "dynamic")),
-            ("observation", ("pose", "motion")),
+            ("observation", get_args(Observation)),
         ):
             _expect(self, name, getattr(self, name) in allowed, f"one of {allowed}")
-        known = self.moves or not self.observes_motion
-        _expect(self, "observation", known, "'pose' for arms at rest")
+        known = self.moves or self.observation != "motion"
+        _expect(self, "observation", known, "'pose' or 'payload' for arms at rest")
         for name in ("dynamic_step_s", "simulation_step_s"):
             _expect(self, name, 0 < getattr(self, name) < math.inf, "a finite number > 0")
         for item in fields(self.reward):

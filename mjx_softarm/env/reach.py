@@ -41,7 +41,8 @@ class ReachEnv(Env):
                angles by 90 deg
         6-11   pose of the goal, scaled in this way, too
         12-17  error w (pose - goal), by the reward's weights per mm and per degree, angles wrapped
-        With `observation="motion"`, 39 more follow: see `mjx_softarm.mdp.observation.observe_motion`
+        With `observation="payload"` the payload [kg] follows; with "motion" 39 more, see
+        `mjx_softarm.mdp.observation.observe_motion`
 
     Action (n_chambers,), each in [-1, 1]: readings of the springs' sensors to be reached, from that of the
         shortest to that of the longest spring (`mjx_softarm.mdp.actions`). The sensor-space law then sets the
@@ -95,7 +96,7 @@ class ReachEnv(Env):
 
     @property
     def observation_size(self) -> int:
-        return obs.OBS_SIZE + (len(obs.motion_layout(self.action_size)) if self.config.observes_motion else 0)
+        return len(obs.layouts(self.action_size)[self.config.observation])
 
     @property
     def n_ticks(self) -> int:
@@ -274,8 +275,10 @@ class ReachEnv(Env):
 
     def _sensed(self, arm: ArmState, end: ArmState | Settled | Moved, action: Array) -> Array | None:
         """Return `ArmState.sensed` of an arm, at rest where `end` is not the end of a motion."""
-        if not self.config.observes_motion:
+        if self.config.observation == "pose":
             return None
+        if self.config.observation == "payload":
+            return obs.observe_payload(arm.payload_kg)
         last_m, tip_mm, last_mm = end.spring_m, jnp.zeros(3), jnp.zeros(3)
         if isinstance(end, Moved):
             before = max(self.n_ticks - obs.rate_ticks(self.spec.control.rate_hz), 0)

@@ -37,7 +37,7 @@ class ArmState(NamedTuple):
     pose: Array  # (6,) [mm, deg] as observed: the real arm's where there is a sim-to-real network
     spring_m: Array  # (n_chambers,) true lengths
     pressure_kpa: Array  # (n_chambers,)
-    sensed: Array | None  # (k,) `observe_motion`; None where pose and goal are all that is observed
+    sensed: Array | None  # (k,) what is observed besides pose and goal; None is nothing
     goal: Array  # (6,) [mm, deg]
     n_steps: Array  # () actions taken in this episode
 

@@ -14,8 +14,8 @@ from mjx_softarm.deploy.link import vented
 from mjx_softarm.deploy.reachability import distances
 from mjx_softarm.export.symbols import Symbol, constant, repeat, symbol
 from mjx_softarm.policy import reach
-from mjx_softarm.policy.file import Policy, observation_names
-from mjx_softarm.policy.runtime import action_towards, actor_output, sensed_motion, tip_pose
+from mjx_softarm.policy.file import Policy
+from mjx_softarm.policy.runtime import action_towards, actor_output, sensed_motion, sensed_payload, tip_pose
 from mjx_softarm.sensing.load import tell_load
 from mjx_softarm.sensing.pose import pose_error
 from mjx_softarm.sensing.sensors import Reading, SensorFault
@@ -43,7 +43,7 @@ def graph(controller: Controller) -> Computation:
     inputs = *inputs, symbol("load_kg", ()), symbol("pressure_kpa", (n,))
     motion = _in_motion(n)
     found = answer(controller, *inputs, motion)
-    inputs += tuple(motion) if controller.policy.observes_motion else ()
+    inputs += tuple(motion) if controller.policy.observation == "motion" else ()
     return Computation(inputs, {name: constant(value) for name, value in found.items()})
 
 
@@ -103,8 +103,7 @@ def _inside(controller: Controller, goal: Array) -> Array:
 def actor(controller: Controller) -> Computation:
     """Record the bare actor: observation (O,) -> action (n,) in [-1, 1]."""
     policy = controller.policy
-    size = len(observation_names(policy.spec, policy.observes_motion))
-    observation = symbol("observation", (size,), np.float32)
+    observation = symbol("observation", (len(policy.obs_layout),), np.float32)
     return Computation((observation,), {"action": actor_output(policy, observation)})
 
 
@@ -167,7 +166,9 @@ def _sensed(
     policy: Policy, pose: Array, spring_m: Array, motion: InMotion | None, load_kg: Array
 ) -> Array | None:
     """Return what the policy observes besides pose and goal."""
-    if not policy.observes_motion or motion is None:
+    if policy.observation == "payload":
+        return sensed_payload(policy, load_kg)
+    if policy.observation == "pose" or motion is None:
         return None
     return sensed_motion(policy, pose, spring_m, *motion, load_kg)
 

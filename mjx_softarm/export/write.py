@@ -14,7 +14,7 @@ from mjx_softarm.export import computations
 from mjx_softarm.export.cpp import sources
 from mjx_softarm.export.golden import make_golden, write_golden
 from mjx_softarm.mdp.observation import RATE_S
-from mjx_softarm.policy.file import Policy, action_layout, load_policy, observation_names
+from mjx_softarm.policy.file import Policy, action_layout, load_policy
 
 _POSE = {"unit": ["mm"] * 3 + ["deg"] * 3, "names": ["x", "y", "z", "yaw", "pitch", "roll"]}
 FRAME = "base frame: z up, the arm hangs towards -z; angles intrinsic Z-Y-X, zero where it hangs straight"
@@ -42,7 +42,7 @@ def export_onnx(policy_path: Path) -> list[Path]:
         "load_kg": controller.policy.spec.mass.payload_kg,
         "pressure_kpa": np.full(n, np.nan),
     }
-    if controller.policy.observes_motion:
+    if controller.policy.observation == "motion":
         unknown = np.full(n, np.nan)
         never |= computations.InMotion(unknown, unknown, np.zeros(n))._asdict()
     write_onnx(whole, computations.graph(controller), {"kind": "policy", **about}, never)
@@ -87,7 +87,7 @@ def describe(policy: Policy, sha256: str) -> dict[str, Any]:
             "before_m": lengths | {"default": f"nan: not known; {RATE_S:g} s before"},
             "last_reference_m": lengths | {"default": "nan: none yet; of the last action"},
             "integral_kpa": {"unit": "kPa", "default": "0; of the law"},
-            "observation": {"names": list(observation_names(policy.spec, policy.observes_motion))}
+            "observation": {"names": list(policy.obs_layout)}
             | {name: value.tolist() for name, value in policy.obs_scale._asdict().items()},
         },
         "outputs": {

@@ -1,7 +1,7 @@
 """The observation: pose, goal and scaled error, one function for training, twin and deployed arm.
 
-An arm in motion has more to tell: spring lengths and their rates, the tip's velocity, the law's integral,
-the last action.
+A policy may observe more: the payload; or of an arm in motion the spring lengths and their rates, the tip's
+velocity, the law's integral, the last action.
 
 Source: the paper's state s = (P, g, e) in R^18. A fixed affine map brings pose and goal to
 the order of one; it changes only the numbers that a network sees.
@@ -9,13 +9,15 @@ the order of one; it changes only the numbers that a network sees.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from mjx_softarm._support.xp import Array, array_namespace
 from mjx_softarm.mdp.rewards import RewardConfig, scaled_error
 from mjx_softarm.spec import ArmSpec
+
+Observation = Literal["pose", "payload", "motion"]
 
 # Units are those before scaling: of pose and goal by `ObsScale`, of the error by the reward's weights.
 _AXES = ("x_mm", "y_mm", "z_mm", "yaw_deg", "pitch_deg", "roll_deg")
@@ -40,17 +42,28 @@ class ObsScale(NamedTuple):
         return cls(centre, np.array([length_mm / 3] * 3 + [90.0] * 3, np.float32))
 
 
-def motion_layout(n_springs: int) -> tuple[str, ...]:
-    """Return the names of the entries of `observe_motion`."""
+def layouts(n_springs: int) -> dict[Observation, tuple[str, ...]]:
+    """Return the names of the entries of each kind of observation: pose, goal and what else is observed."""
     springs, rates, integrals, actions = (
         [f"{name}_{k}" for k in range(n_springs)] for name in ("spring", "spring_rate", "integral", "action")
     )
-    return (*springs, *rates, *(f"velocity_{axis}" for axis in "xyz"), *integrals, *actions)
+    motion = *springs, *rates, *(f"velocity_{axis}" for axis in "xyz"), *integrals, *actions
+    return {
+        "pose": OBS_LAYOUT,
+        "payload": (*OBS_LAYOUT, "payload_kg"),
+        "motion": (*OBS_LAYOUT, *motion),
+    }
 
 
 def rate_ticks(rate_hz: float) -> int:
     """Return the number of control periods over which rates are taken."""
     return max(1, round(RATE_S * rate_hz))
+
+
+def observe_payload(payload_kg: Array) -> Array:
+    """Return what a policy that knows the payload () [kg] observes of it besides pose and goal: (1,)."""
+    xp = array_namespace(payload_kg)
+    return xp.asarray(payload_kg, dtype=np.float32)[None]
 
 
 def observe_motion(

@@ -5,8 +5,7 @@ networks and the workspace float32.
 
     schema_version       () int
     spec_json            ()           the arm trained for, as `ArmSpec.to_dict` gives it
-    obs_layout           (O,) text    names of the observation's entries: `OBS_LAYOUT`, and in motion
-                                      `motion_layout`
+    obs_layout           (O,) text    names of the observation's entries: one of `layouts`
     action_layout        (n,) text    names of the action's entries, `action_layout`
     actor.n_layers       () int
     actor.<k>.weight     (in, out)    layer k = 0, 1, ...; ReLU after each but the last,
@@ -48,7 +47,7 @@ from mjx_softarm._support.archive import Entries, SealedFileError, entries_of
 from mjx_softarm._support.mlp import Layer
 from mjx_softarm.control import TOLERANCE_M, Gains
 from mjx_softarm.mdp.actions import N_ACTIONS, ActionMap
-from mjx_softarm.mdp.observation import OBS_LAYOUT, ObsScale, motion_layout
+from mjx_softarm.mdp.observation import OBS_LAYOUT, Observation, ObsScale, layouts
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.sensing.estimator import PoseEstimator, SpringModel, take_estimator, take_spring_model
 from mjx_softarm.sensing.load import LoadEstimator, take_load_estimator
@@ -84,9 +83,15 @@ class Policy:
     action_s: float = 0.0
 
     @property
-    def observes_motion(self) -> bool:
-        """Whether the policy observes `observe_motion` besides pose and goal."""
-        return len(self.layers[0][0]) > len(OBS_LAYOUT)
+    def observation(self) -> Observation:
+        """What the policy observes, as the number of its entries tells."""
+        size, named = len(self.layers[0][0]), layouts(self.spec.n_chambers)
+        return next(observation for observation, names in named.items() if len(names) == size)
+
+    @property
+    def obs_layout(self) -> tuple[str, ...]:
+        """Names of the observation's entries."""
+        return layouts(self.spec.n_chambers)[self.observation]
 
     @property
     def sensor(self) -> Sensor:
@@ -193,7 +198,7 @@ def file_entries(policy: Policy) -> dict[str, np.ndarray]:
     entries: dict[str, Any] = {
         "schema_version": SCHEMA_VERSION,
         "spec_json": json.dumps(policy.spec.to_dict()),
-        "obs_layout": observation_names(policy.spec, policy.observes_motion),
+        "obs_layout": policy.obs_layout,
         "action_layout": action_layout(policy.spec),
         "rate_hz": policy.rate_hz,
         "tolerance_m": policy.tolerance_m,
@@ -213,11 +218,6 @@ def file_entries(policy: Policy) -> dict[str, np.ndarray]:
     ):
         entries |= entries_of(name, getattr(policy, name))
     return {name: np.asarray(value) for name, value in entries.items()}
-
-
-def observation_names(spec: ArmSpec, observes_motion: bool) -> tuple[str, ...]:
-    """Return the names of an observation's entries."""
-    return OBS_LAYOUT + (motion_layout(spec.n_chambers) if observes_motion else ())
 
 
 def _unpack(arrays: Mapping[str, np.ndarray], source: str) -> Policy:
@@ -257,7 +257,7 @@ def _unpack(arrays: Mapping[str, np.ndarray], source: str) -> Policy:
         n_actions=entries.take("n_actions", np.integer, ()),
         action_s=entries.take("action_s", np.float64, ()),
     )
-    layout = observation_names(spec, policy.observes_motion)
+    layout = {len(names): names for names in layouts(n).values()}.get(len(obs_layout), OBS_LAYOUT)
     limits = policy.sensor.lengths(np.stack(policy.actions[1:]))  # (2, n)
     readable = (limits.fault == SensorFault.OK.value) & (limits.length_m[0] < limits.length_m[1])
     low_kpa, high_kpa = policy.gains.pressure_min_kpa, policy.gains.pressure_max_kpa

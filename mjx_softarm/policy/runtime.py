@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from mjx_softarm._support.mlp import mlp
 from mjx_softarm._support.xp import Array, array_namespace
-from mjx_softarm.mdp.observation import ObsScale, observe, observe_motion
+from mjx_softarm.mdp.observation import OBS_SIZE, ObsScale, observe, observe_motion, observe_payload
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.sensing.estimator import estimate_frame
 from mjx_softarm.sensing.pose import pose_from_frame
@@ -44,6 +44,13 @@ def tip_pose(policy: Policy, spring_m: Array, load_kg: Array | float) -> tuple[A
     x = inputs(frame, array_namespace(spring_m).asarray(spring_m, dtype=np.float32))
     pose = pose_from_frame(*apply_correction(frame, correction(policy.s2r, x)))
     return pose, distance(policy.s2r, x) / policy.s2r.limit
+
+
+def sensed_payload(policy: Policy, load_kg: Array | float) -> Array:
+    """Return `observe_payload` of a payload () [kg] as told, brought to those that the policy knows."""
+    xp = array_namespace(load_kg)
+    least, most = policy.spec.mass.payload_kg, float(policy.load_estimator.load_scale_kg)
+    return observe_payload(xp.clip(load_kg, least, most))
 
 
 def sensed_motion(
@@ -82,7 +89,7 @@ def actor_output(policy: Policy, observation: Array) -> Array:
 def action_towards(policy: Policy, pose: Array, goal: Array, sensed: Array | None = None) -> Array:
     """Return the action (..., n) in [-1, 1] from a pose towards a goal (..., 6) [mm, deg], all float32.
 
-    `sensed` (..., k) is `observe_motion`, where the policy observes it.
+    `sensed` (..., k) is what the policy observes besides pose and goal, if it does.
     """
     scale = ObsScale(*(np.asarray(value, np.float32) for value in policy.obs_scale))
     observation = observe(pose, goal, scale, policy.reward)
@@ -106,7 +113,8 @@ class PolicyRunner:
         Args:
             pose (..., 6) [mm, deg]: of the tip; see `mjx_softarm.sensing.pose`.
             goal (..., 6) [mm, deg]: target of the tip; the leading axes broadcast against the pose's.
-            sensed (..., k): `mjx_softarm.mdp.observation.observe_motion`, for a policy that observes it.
+            sensed (..., k): `observe_payload` or `observe_motion` of `mjx_softarm.mdp.observation`, for a
+                policy that observes it.
 
         Returns:
             Readings (..., n) and lengths (..., n) [m], both within the policy's limits.
@@ -123,15 +131,17 @@ class PolicyRunner:
 
         Raises:
             ValueError: pose or goal has the wrong shape or is not finite, or the actor overflows; what it
-                asks for would be springs without a length. `sensed` is missing, or is not observed.
+                asks for would be springs without a length. `sensed` is missing, or is not observed, or has
+                the wrong shape.
         """
         pose, goal = np.broadcast_arrays(_six("pose", pose), _six("goal", goal))
-        if self.policy.observes_motion != (sensed is not None):
-            came, expected = "an array", "None: the policy does not observe motion"
-            if sensed is None:
-                came, expected = "None", "`observe_motion` of the arm: the policy observes motion"
-            raise ValueError(f"sensed: got {came}, expected {expected}")
+        observation, n_more = self.policy.observation, len(self.policy.obs_layout) - OBS_SIZE
         sensed = None if sensed is None else np.asarray(sensed, np.float32)
+        shape = None if sensed is None else sensed.shape[-1:]
+        if shape != ((n_more,) if n_more else None):
+            came = "None" if sensed is None else f"shape {sensed.shape}"
+            shapes = f"(..., {n_more})" if n_more else "None"
+            raise ValueError(f"sensed: got {came}, expected {shapes}: the policy observes the {observation}")
         action = action_towards(self.policy, pose, goal, sensed)
         if not np.isfinite(action).all():
             raise ValueError("action: got nan, expected finite numbers; the actor overflows")

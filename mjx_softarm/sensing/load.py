@@ -14,6 +14,7 @@ from mjx_softarm._support.archive import Entries
 from mjx_softarm._support.mlp import Layer, mlp
 from mjx_softarm._support.xp import Array, array_namespace
 
+LARGEST_KG = 1.0  # payload, on top of the specification's, that networks are made for: the paper's largest
 N_AVERAGED = 8  # rests that the average is about
 JUMP_KG = 0.25  # by which a rest disagrees with the average,
 N_JUMPS = 2  # so many of them in a row begin a new one

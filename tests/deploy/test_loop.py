@@ -15,7 +15,7 @@ from mjx_softarm.deploy.session import LEAD_S, trace
 from mjx_softarm.deploy.way import on_the_way
 from mjx_softarm.logs.schema import write_log
 from mjx_softarm.mdp.actions import N_ACTIONS
-from mjx_softarm.mdp.observation import OBS_SIZE, motion_layout
+from mjx_softarm.mdp.observation import layouts
 from mjx_softarm.sensing.estimator import estimate
 from mjx_softarm.sensing.pose import pose_error
 from tests.linear_arm import (
@@ -66,7 +66,7 @@ def test_acts_at_once_and_then_at_rest():
     assert np.diff([tick for tick, _ in asked]).min() >= CONTROLLER.window or len(GOALS) > 1
 
 
-_WIDE = (np.zeros((OBS_SIZE + len(motion_layout(9)), 9), np.float32), np.zeros(9, np.float32))
+_WIDE = (np.zeros((len(layouts(9)["motion"]), 9), np.float32), np.zeros(9, np.float32))
 OF_MOTION = dataclasses.replace(POLICY, layers=(_WIDE,), action_s=0.3)
 
 

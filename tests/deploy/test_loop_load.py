@@ -8,6 +8,7 @@ import pytest
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.faults import Fault
 from mjx_softarm.deploy.session import trace
+from mjx_softarm.mdp.observation import layouts
 from mjx_softarm.sensing.estimator import estimate
 from tests.linear_arm import GAIN_M_PER_KPA, POLICY, REST_M, LinearArm, N, go, read_m
 
@@ -78,6 +79,28 @@ def test_payload_is_told_at_rest_and_believed_in_the_pose(payload_kg):
     pose = estimate(LOADED.estimator, read_m(run.log)[-1], run.log.load_kg[-1])
     np.testing.assert_allclose(run.log.estimate[-1], pose, atol=1e-3)
     assert run.counts() == {}
+
+
+_WIDE = (np.zeros((len(layouts(N)["payload"]), N), np.float32), np.zeros(N, np.float32))
+CARRYING = dataclasses.replace(LOADED, layers=(_WIDE,))
+
+
+@pytest.mark.parametrize("payload_kg", [0.6, 1.4])
+@pytest.mark.parametrize("moves", [False, True])
+def test_a_policy_that_observes_the_payload_is_given_what_was_told_of_it_up_to_the_largest(payload_kg, moves):
+    given = []
+
+    def plan(pose, goal, spring_m, sensed):
+        given.append(float(sensed[0]))
+        return plan_unloaded(pose, goal, spring_m, sensed)
+
+    goals, controller = [GOAL, GOAL + [0.0, 0.0, 5.0, 0.0, 0.0, 0.0]], Controller.of(CARRYING, plan)
+    arm = LoadedArm(payload_kg)
+    if moves:
+        trace(arm, controller, np.array(goals), pace_s=3.0)
+    else:
+        go(arm, goals, controller)
+    assert given[0] == 0.0 and given[-1] == pytest.approx(min(payload_kg, 1.0), abs=0.03)
 
 
 def test_goal_is_shifted_by_what_the_payload_bends():

@@ -15,6 +15,12 @@ def test_an_unknown_engine_or_mode_is_refused_by_name(word):
         EnvConfig(**word)
 
 
+def test_an_arm_at_rest_observes_no_motion():
+    with pytest.raises(ValueError, match="got 'motion', expected 'pose' or 'payload' for arms at rest"):
+        EnvConfig(observation="motion")
+    assert EnvConfig(observation="motion", mode="dynamic").moves
+
+
 @pytest.mark.parametrize(
     "kind, field",
     [

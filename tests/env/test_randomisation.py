@@ -60,6 +60,19 @@ def test_randomised_numbers_fill_their_bounds_and_no_other_number_changes(spec, 
     np.testing.assert_array_equal(drawn.tool_mass_kg[:, 0], np.float32(spec.mass.gripper_kg))
 
 
+def test_a_payload_is_observed_as_it_is_from_start_to_end(spec, env, random_actions):
+    config = dataclasses.replace(env.config, observation="payload", randomisation=SPREAD)
+    carrying = ReachEnv(spec, config)
+    start = xla.jit(jax.vmap(carrying.reset), carrying.uses_mjx)(
+        jax.random.split(jax.random.key(0), len(random_actions))
+    )
+    after = xla.jit(jax.vmap(carrying.step), carrying.uses_mjx)(start, random_actions)
+    for state in (start, after):
+        assert state.obs.shape == (len(random_actions), carrying.observation_size)
+        np.testing.assert_array_equal(state.obs[:, -1], start.pipeline_state.payload_kg)
+    assert np.ptp(start.obs[:, -1]) > 0.4
+
+
 def test_sensor_noise_has_its_standard_deviation_and_no_mean(randomised):
     offset_mm = 1e3 * np.asarray(randomised.pipeline_state.sensor_offset_m)
     n = offset_mm.size  # the bounds are five standard errors

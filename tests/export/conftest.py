@@ -10,7 +10,7 @@ import pytest
 
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.export import golden as golden_rows
-from mjx_softarm.mdp.observation import OBS_SIZE, motion_layout
+from mjx_softarm.mdp.observation import layouts
 from mjx_softarm.policy.file import load_policy, save_policy
 from mjx_softarm.sensing.s2r import N_POSE_INPUTS, N_POSE_OUTPUTS, S2R
 from tests.linear_arm import GAIN_M_PER_KPA, REST_M, SPEC, N, make_policy
@@ -50,8 +50,13 @@ def busy_policy(spec=SPEC):
 
 def moving_policy(spec=SPEC):
     """A busy policy that acts each 0.3 s on what it sees of the motion."""
-    n_in = OBS_SIZE + len(motion_layout(N))
+    n_in = len(layouts(N)["motion"])
     return dataclasses.replace(busy_policy(spec), layers=layers(n_in, 12, N, scale=0.3), action_s=0.3)
+
+
+def carrying_policy(spec=SPEC):
+    """A busy policy that observes the payload."""
+    return dataclasses.replace(busy_policy(spec), layers=layers(len(layouts(N)["payload"]), 12, N, scale=0.5))
 
 
 @contextlib.contextmanager

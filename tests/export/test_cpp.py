@@ -16,7 +16,9 @@ from mjx_softarm.export import golden as golden_rows
 from mjx_softarm.export.check import TOLERANCE, check
 from mjx_softarm.export.cpp import sources
 from mjx_softarm.export.golden import FLAGS
-from tests.export.conftest import busy_policy, few_golden_rows, moving_policy
+from mjx_softarm.mdp.observation import OBS_SIZE
+from tests.export.conftest import busy_policy, carrying_policy, few_golden_rows, moving_policy
+from tests.linear_arm import N
 
 pytestmark = pytest.mark.skipif(not shutil.which("g++"), reason="there is no compiler g++ here")
 STRICT = ("-std=c++17", "-Wall", "-Wextra", "-Werror")
@@ -66,6 +68,18 @@ def agreeing_rows(policy, folder, run_ticks):
 
 def test_rows_of_draw_wires_agree(tmp_path):
     agreeing_rows(draw_wires(), tmp_path, run_ticks=30)
+
+
+def test_rows_of_a_policy_that_observes_the_payload_agree(tmp_path):
+    policy = carrying_policy()
+    golden = agreeing_rows(policy, tmp_path, run_ticks=110)
+    (weight, bias), *others = policy.layers
+    blind = dataclasses.replace(
+        policy, layers=((weight * (np.arange(len(weight)) < OBS_SIZE)[:, None], bias), *others)
+    )
+    machine = golden_rows.Machine(Controller.of(blind))
+    off_m = np.array([machine.answer(row) for row in golden.inputs]) - golden.outputs
+    assert np.nanmax(np.abs(off_m[:, 2 + N : 2 + 2 * N])) > 1e-3  # so a payload was told, and counts
 
 
 def test_rows_of_a_policy_of_motion_agree_and_it_keeps_a_part_of_its_shift(tmp_path):

@@ -15,8 +15,8 @@ from mjx_softarm.export.check import TOLERANCE, check
 from mjx_softarm.export.golden import FLAGS, N_SINGLE, read_golden
 from mjx_softarm.export.write import export_onnx
 from mjx_softarm.policy.file import load_policy, save_policy
-from mjx_softarm.policy.runtime import actor_output
-from tests.export.conftest import busy_policy, few_golden_rows, moving_policy
+from mjx_softarm.policy.runtime import PolicyRunner, actor_output
+from tests.export.conftest import busy_policy, carrying_policy, few_golden_rows, moving_policy
 from tests.linear_arm import N
 
 onnx = pytest.importorskip("onnx", reason="the package onnx is not installed")
@@ -124,6 +124,28 @@ def test_a_policy_of_motion_is_told_of_the_motion(tmp_path):
         ["reference_m"], {name: feed[name] for name in ("readings", "goal")}
     )
     assert np.abs(blind_m - state.reference_m).max() > 1e-4
+
+
+def test_a_policy_that_observes_the_payload_is_given_it_within_what_it_knows(tmp_path):
+    path = tmp_path / "carrying.npz"
+    save_policy(path, carrying_policy())
+    controller = Controller.of(load_policy(path))
+    with few_golden_rows():
+        whole, *_, golden = export_onnx(path)
+    agreement = check(read_golden(golden), whole)
+    assert agreement.n_rows >= 40 and agreement.error < TOLERANCE, agreement
+    goal = controller.policy.workspace[0].astype(float)
+    readings = controller.policy.sensor.readings(np.linspace(0.17, 0.19, N))
+    given = {}
+    for load_kg in (0.0, 0.5, 1.0, 1.4):
+        feed = {"readings": readings, "goal": goal, "load_kg": np.asarray(load_kg)}
+        feed = {name: np.asarray(value, np.float32) for name, value in feed.items()}
+        pose, reference_m = ort.InferenceSession(whole).run(["pose", "reference_m"], feed)
+        told = np.float32([min(load_kg, 1.0)])
+        expected_m = PolicyRunner(controller.policy).act(pose, goal, told).length_m
+        np.testing.assert_allclose(reference_m, expected_m, atol=1e-6)
+        given[load_kg] = reference_m
+    assert np.abs(given[0.5] - given[0.0]).max() > 1e-3
 
 
 def test_other_graphs_are_refused(files, golden, tmp_path):

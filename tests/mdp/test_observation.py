@@ -1,11 +1,11 @@
-"""The observation of a moving arm against hand calculations."""
+"""What is observed besides pose and goal, against hand calculations."""
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from mjx_softarm import ArmSpec
-from mjx_softarm.mdp.observation import motion_layout, observe_motion
+from mjx_softarm.mdp.observation import OBS_SIZE, layouts, observe_motion, observe_payload
 
 SPEC = ArmSpec.default()
 LOW_M, HIGH_M = SPEC.springs.length_min_m, SPEC.springs.length_max_m
@@ -22,9 +22,17 @@ def test_a_moving_arm_by_hand(to_library):
     integral = np.r_[LEAST_KPA, GREATEST_KPA, np.full(7, 0.5 * (LEAST_KPA + GREATEST_KPA))]
     given = (to_library(np.float32(x)) for x in (spring, last, tip, last_tip, integral, action))
     observed = np.asarray(observe_motion(*given, SPEC))
-    assert observed.shape == (len(motion_layout(9)),)
+    assert observed.shape == (len(layouts(9)["motion"]) - OBS_SIZE,)
     np.testing.assert_allclose(observed[:9], [-1.0, 1.0, *np.zeros(7)], atol=1e-5)
     np.testing.assert_allclose(observed[9:18], [0.2, *np.zeros(8)], atol=1e-4)  # of 100 mm/s
     np.testing.assert_allclose(observed[18:21], [0.0, 0.2, 0.0], atol=1e-4)  # of 300 mm/s
     np.testing.assert_allclose(observed[21:30], [-1.0, 1.0, *np.zeros(7)], atol=1e-6)
     np.testing.assert_array_equal(observed[30:], np.float32(action))
+
+
+@pytest.mark.parametrize("to_library", [float, jnp.asarray])
+def test_a_payload_is_observed_in_kilograms(to_library):
+    observed = observe_payload(to_library(0.35))
+    assert observed.dtype == np.float32
+    np.testing.assert_allclose(observed, [0.35], rtol=1e-6)
+    assert layouts(9)["payload"][OBS_SIZE:] == ("payload_kg",)

@@ -35,6 +35,10 @@ def test_overrides_reach_every_level_and_leave_the_preset_alone():
             "updates_per_env_step=0.001",
             "expected a finite number of at least one update per step of all",
         ),
+        (
+            "env.observation=payload",
+            "env.randomisation.payload_max_kg: got 0 with env.observation 'payload', expected at least 1",
+        ),
         ("replay_capacity=10", "replay_capacity: got 10, expected at least n_arms = 128"),
     ],
 )

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from mjx_softarm._support import draws
+from mjx_softarm.mdp.observation import OBS_SIZE
 
 LOG_STD_MIN = -20.0
 LOG_STD_MAX = 2.0
@@ -45,10 +46,13 @@ class Actor(nn.Module):
 
 
 def widened(params: Any, obs_size: int) -> Any:
-    """Return an actor's parameters for longer observations (..., O), whose new entries count nothing."""
+    """Return an actor's parameters for observations (..., O).
+
+    One of pose and goal alone is widened by entries that count nothing; any other stays as it is.
+    """
     params = jax.tree.map(jnp.asarray, params)
     first = params["params"]["hidden_0"]
-    unseen = max(0, obs_size - first["kernel"].shape[0])
+    unseen = max(0, obs_size - OBS_SIZE) if len(first["kernel"]) == OBS_SIZE else 0
     first["kernel"] = jnp.pad(first["kernel"], ((0, unseen), (0, 0)))
     return params
 

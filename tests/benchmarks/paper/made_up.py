@@ -94,9 +94,14 @@ def good_results(experiment, settings=FULL, changed=None):
     """Results that meet every goal, but for what is changed: trial or training -> outcome or course."""
     outcomes = {}
     for trial in trials(experiment, settings):
-        error_mm = {"specified": 5.0, "without": 4.0, "gradient": 2.0, "with": 1.25, "circle": 1.0}.get(
-            trial.kind
-        )
+        error_mm = {
+            "specified": 5.0,
+            "without": 4.0,
+            "gradient": 2.0,
+            "with": 1.25,
+            "payload": 1.0,
+            "circle": 1.0,
+        }.get(trial.kind)
         hit = trial.kind == "gradient" or trial.load_g == 1000
         outcomes[trial] = (
             made_up(trial.kind, tick_s=0.1 if trial.moves else 0.25)

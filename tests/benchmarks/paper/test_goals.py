@@ -1,5 +1,7 @@
 """Goals that are met, just met and missed, on made-up results."""
 
+import dataclasses
+
 import pytest
 
 from benchmarks.paper.goals import check_goals
@@ -73,6 +75,17 @@ def test_open_goals_that_are_missed_are_named(trial, outcome, goals):
     found = unmet("open", {trial: outcome})
     assert len(found) == len(goals)
     assert all(text.startswith(goal) for text, goal in zip(found, goals, strict=True))
+
+
+def test_goals_for_payloads_are_those_of_a_policy_that_observes_it_too():
+    settings = dataclasses.replace(TINY, beside=("payload",))
+    worst = {Trial("payload", 1, 0, load_g=1000): made_up("payload", (12.1,), told_g=1000)}
+    for changed, missed in ((None, []), (worst, ["1 kg, payload observed, m", "1 kg, payload observed, l"])):
+        found = check_goals("open", *tables(good_results("open", settings, changed)))
+        assert len(found) == 13 + 5
+        texts = [check.text for check in found if not check.met]
+        assert len(texts) == len(missed)
+        assert all(text.startswith(goal) for text, goal in zip(texts, missed, strict=True))
 
 
 def test_gradient_descent_without_saturation_misses_its_goal():

@@ -66,6 +66,8 @@ def test_further_policies_have_a_preset_of_their_own_or_no_network(tmp_path, com
     options = parsed(start)
     assert (options.preset, options.config.seed, options.calibration) == ("quick", 2, calibration)
     assert options.config == dataclasses.replace(PRESETS["quick"], seed=2)  # not the settings of the others
+    (start,) = commands(jobs.train_other, tmp_path, settings, "payload", 1, 2)
+    assert parsed(start).config.env == dataclasses.replace(PRESETS["payload"].env, n_poses=64)  # alike
     (start,) = commands(jobs.train_other, tmp_path, settings, "chambers", 1, 2)
     options = parsed(start)
     assert (options.preset, options.spec, options.calibration) == (

@@ -105,6 +105,9 @@ def test_a_policy_is_adopted_and_may_observe_less(learner, start):
     smaller = Analytic(dataclasses.replace(CONFIG, hidden=(8,)), env, 4)
     with pytest.raises(ValueError, match="actor: got layers of"):
         smaller.adopt(jax.eval_shape(smaller.init, jax.random.key(2)), start)
+    carrying = Analytic(CONFIG, ReachEnv(SHORT, EnvConfig(n_poses=64, observation="payload")), 4)
+    with pytest.raises(ValueError, match="actor: got layers of"):  # it observes other things, not less
+        wider.adopt(own, jax.jit(carrying.init)(jax.random.key(2)))
 
 
 @pytest.mark.parametrize(

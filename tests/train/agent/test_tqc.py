@@ -6,6 +6,7 @@ import numpy as np
 import optax
 import pytest
 
+from mjx_softarm.mdp.observation import OBS_SIZE
 from train.agent import losses
 from train.agent.networks import squash
 from train.agent.tqc import TQC, TQCConfig, Transition
@@ -251,11 +252,11 @@ def test_config_names_the_field_out_of_range(field, value):
 def test_a_given_policy_acts_as_before_whatever_it_did_not_observe():
     """Two more entries of the observation have no weight; the noise is small; the critics stay."""
     settings = TQCConfig(hidden_actor=(8,), hidden_critic=(8,))
-    donor, wider = (TQC(n, 2, settings) for n in (3, 5))
+    donor, wider = (TQC(n, 2, settings) for n in (OBS_SIZE, OBS_SIZE + 2))
     given, own = (each.init(jax.random.key(k)) for k, each in enumerate((donor, wider)))
     adopted = wider.adopt_policy(own, given.mean_actor_params)
-    obs = jax.random.normal(jax.random.key(2), (4, 5))
-    expected = donor.mode(given.mean_actor_params, obs[:, :3])
+    obs = jax.random.normal(jax.random.key(2), (4, OBS_SIZE + 2))
+    expected = donor.mode(given.mean_actor_params, obs[:, :OBS_SIZE])
     np.testing.assert_allclose(wider.mode(adopted.mean_actor_params, obs), expected, atol=1e-6)
     assert np.abs(wider.act(adopted, obs, jax.random.key(3)) - expected).max() < 0.1
     assert equal(adopted.critic_params, own.critic_params)
