@@ -1,16 +1,18 @@
 """The paper's claims of load-independence and of no saturation, in simulation, one cause changed at a time.
 
-All policies learn alike, through the gradient of the simulated equilibrium, on arms without a payload. One of
-`KINDS` changes what an action asks for: nine pressures in place of nine spring lengths, which the
-sensor-space law holds with whatever pressures it takes. Another leaves out the loss's term that pulls
-references of saturated chambers back; pressures have no references, so they go without it, too. The learning
-rate is each kind's own best of `RATES`, by the held-out median of a shorter run with a seed that is not used
-again.
+All policies learn alike, through the gradient of the simulated equilibrium, the first three of `KINDS` on
+arms without a payload. One changes what an action asks for: nine pressures in place of nine spring lengths,
+which the sensor-space law holds with whatever pressures it takes. Another leaves out the loss's term that
+pulls references of saturated chambers back; pressures have no references, so they go without it, too. Three
+more learn with payloads: spring lengths without and with the payload observed, and pressures with it. The
+learning rate is each kind's own best of `RATES`, by the held-out median without a payload of a shorter run
+with a seed that is not used again.
 
-Then the arm carries payloads that the policy does not know. It sees the true pose of the tip after each of
-four actions, so no estimate of pose or payload adds an error of its own. It goes twice around circles of
-`SIZES` times the paper's, and the second lap counts. Gradient descent on the springs, which solves for
-lengths and knows no pressures, goes once around the same circles, from other random poses for each seed.
+Then the arm carries payloads. The policy sees the true pose of the tip after each of four actions, and the
+true payload if it observes it, so no estimate adds an error of its own. Without a payload it goes twice
+around circles of `SIZES` times the paper's, and the second lap counts. Gradient descent on the springs, which
+solves for lengths and knows no pressures, goes once around the same circles, from other random poses for each
+seed.
 """
 
 from __future__ import annotations
@@ -28,12 +30,14 @@ from benchmarks.paper.gradient_descent import gradient_descent
 from mjx_softarm import ArmSpec
 from mjx_softarm._support import cli, xla
 from mjx_softarm._support.mjx import State
-from mjx_softarm.env import EnvConfig, ReachEnv
+from mjx_softarm.env import EnvConfig, Randomisation, ReachEnv
+from mjx_softarm.env.state import PAYLOAD_SHARE
 from mjx_softarm.mechanics.excitation import CIRCLE_DIAMETER_MM, circle_poses
 from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.settle import settle_pressures
 from mjx_softarm.mechanics.workspace import HELD_OUT_SEED
 from mjx_softarm.policy.file import SHIPPED, load_policy
+from mjx_softarm.sensing.load import LARGEST_KG
 from train.config import TrainConfig, override
 from train.presets import PRESETS
 from train.runs.evaluate import N_GOALS, PATH, Reached, follow_from, paths_of, start_keys, towards
@@ -67,11 +71,16 @@ class Kind(NamedTuple):
     settings: tuple[str, ...] = ()  # NAME=VALUE
 
 
+LOADED = (f"env.randomisation.payload_max_kg={LARGEST_KG}",)
+OBSERVED = (*LOADED, "env.observation=payload")
 NO_TERM = ("analytic.saturation_cost_per_mm=0",)
 KINDS = {
     "spring lengths": Kind(),
     "no saturation term": Kind(settings=NO_TERM),
     "pressures": Kind(PressureEnv, NO_TERM),  # the term would read these actions as spring lengths
+    "spring lengths, learned with payloads": Kind(settings=LOADED),
+    "spring lengths, payload observed": Kind(settings=OBSERVED),
+    "pressures, payload observed": Kind(PressureEnv, (*OBSERVED, *NO_TERM)),
 }
 
 
@@ -113,7 +122,8 @@ class Trial:
 
     def __init__(self, kind: Kind, config: TrainConfig, spec: ArmSpec, n_goals: int):
         self.kind, self.config, self.spec, self.n_goals = kind, config, spec, n_goals
-        self.env = kind.env(spec, EnvConfig())
+        loaded = Randomisation(payload_max_kg=LARGEST_KG)
+        self.env = kind.env(spec, EnvConfig(observation=config.env.observation, randomisation=loaded))
         sets = (self.env.sample_pool(n_goals, HELD_OUT_SEED, evenly).pose for evenly in (False, True))
         self.paths = np.concatenate([paths_of(jnp.concatenate(list(sets))), laps(spec)])
         self.keys = start_keys(len(self.paths))
@@ -167,10 +177,9 @@ def laps(spec: ArmSpec) -> np.ndarray:
 
 def follow(env: ReachEnv, learner: Any, policy: Any, load_kg: Array, path: Array, key: Array) -> Reached:
     """Return the results of one arm with a payload, from a random start, along a path (n, 6) of goals."""
-    state = env.reset(key)
-    arm = state.pipeline_state
-    state = state.replace(pipeline_state=arm._replace(payload_kg=arm.payload_kg + load_kg))
-    return follow_from(env, learner, policy, path, state)
+    noise = jax.tree.map(lambda x: x[0], env.sample_noise(key, 1))
+    share = noise.uniform.at[PAYLOAD_SHARE].set(load_kg / env.config.randomisation.payload_max_kg)
+    return follow_from(env, learner, policy, path, env.reset_from(noise._replace(uniform=share)))
 
 
 def figures(reached: Reached) -> dict[str, float]:

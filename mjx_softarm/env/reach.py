@@ -16,7 +16,7 @@ from mjx_softarm._support import draws
 from mjx_softarm._support.mjx import Env, State, mjx
 from mjx_softarm.env.clearance import Walls
 from mjx_softarm.env.config import EnvConfig
-from mjx_softarm.env.state import ArmState, EpisodeNoise, at_rest, motion_params
+from mjx_softarm.env.state import PAYLOAD_SHARE, ArmState, EpisodeNoise, at_rest, motion_params
 from mjx_softarm.mdp import observation as obs
 from mjx_softarm.mdp import rewards
 from mjx_softarm.mdp.actions import ActionMap
@@ -155,7 +155,7 @@ class ReachEnv(Env):
         goal = self.pool.pose[goal_row]
         spread = self.config.randomisation
         arm = ArmState(
-            payload_kg=self.params.tool_mass_kg[PAYLOAD] + spread.payload_max_kg * share[2],
+            payload_kg=self.params.tool_mass_kg[PAYLOAD] + spread.payload_max_kg * share[PAYLOAD_SHARE],
             chamber_stiffness=self.params.chamber_stiffness
             * (1.0 + spread.stiffness_spread * (2.0 * share[3:] - 1.0)),
             sensor_offset_m=1e-3 * spread.sensor_noise_mm * noise.normal,

@@ -18,6 +18,9 @@ for _sensor in SENSORS.values():
     jax.tree_util.register_dataclass(_sensor)  # numbers are traced, the kind is static
 
 
+PAYLOAD_SHARE = 2  # index in `EpisodeNoise.uniform`
+
+
 class EpisodeNoise(NamedTuple):
     """Random numbers that fix one episode."""
 

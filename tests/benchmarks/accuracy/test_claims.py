@@ -1,13 +1,15 @@
 """Arms whose actions are pressures, and what the comparison of claims makes of results."""
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.accuracy.claims import KINDS, SIZES, PressureEnv, laps, means
+from benchmarks.accuracy.claims import KINDS, SIZES, PressureEnv, follow, laps, means
 from mjx_softarm import ArmSpec
 from mjx_softarm._support import xla
-from mjx_softarm.env import EnvConfig
+from mjx_softarm.env import EnvConfig, Randomisation
 from mjx_softarm.mdp import rewards
 from tests.train.small import SHORT
 from train.agent.analytic import Analytic
@@ -30,6 +32,20 @@ def test_an_action_is_a_pressure_whatever_the_payload():
         assert after.info["valid"].all() and not after.info["blocked"].any()
     sunk_mm = free.pipeline_state.pose[:, 2] - loaded.pipeline_state.pose[:, 2]
     assert (sunk_mm > 1.0).all()
+
+
+def test_a_payload_is_carried_and_observed_from_the_first_action_on():
+    config = EnvConfig(n_poses=16, observation="payload", randomisation=Randomisation(payload_max_kg=1.0))
+    env, chambers = PressureEnv(SHORT, config), SHORT.chambers
+    as_heavy = SimpleNamespace(mode=lambda policy, obs: jnp.full(3, obs[-1]))
+    path, low, high = env.pool.pose[:2], chambers.pressure_min_kpa, chambers.pressure_max_kpa
+    one = xla.jit(lambda load_kg: follow(env, as_heavy, None, load_kg, path, jax.random.key(0)))
+    light, heavy = one(0.25), one(0.75)
+    for reached, load_kg in ((light, 0.25), (heavy, 0.75)):
+        np.testing.assert_allclose(
+            reached.pressure_kpa, low + 0.5 * (load_kg + 1.0) * (high - low), atol=0.02
+        )
+    assert not np.allclose(light.pose, heavy.pose, atol=1.0)
 
 
 def test_pressures_cost_the_error_of_the_pose_alone():
