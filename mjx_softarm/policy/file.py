@@ -85,8 +85,9 @@ class Policy:
     @property
     def observation(self) -> Observation:
         """What the policy observes, as the number of its entries tells."""
-        size, named = len(self.layers[0][0]), layouts(self.spec.n_chambers)
-        return next(observation for observation, names in named.items() if len(names) == size)
+        named = layouts(self.spec.n_chambers)
+        sizes: dict[int, Observation] = {len(names): observation for observation, names in named.items()}
+        return sizes.get(len(self.layers[0][0]), "pose")  # a policy of another number is refused by its shape
 
     @property
     def obs_layout(self) -> tuple[str, ...]:

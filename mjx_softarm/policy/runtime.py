@@ -114,7 +114,7 @@ class PolicyRunner:
             pose (..., 6) [mm, deg]: of the tip; see `mjx_softarm.sensing.pose`.
             goal (..., 6) [mm, deg]: target of the tip; the leading axes broadcast against the pose's.
             sensed (..., k): `observe_payload` or `observe_motion` of `mjx_softarm.mdp.observation`, for a
-                policy that observes it.
+                policy that observes it; its leading axes are broadcast to those of the poses.
 
         Returns:
             Readings (..., n) and lengths (..., n) [m], both within the policy's limits.
@@ -135,13 +135,14 @@ class PolicyRunner:
                 the wrong shape.
         """
         pose, goal = np.broadcast_arrays(_six("pose", pose), _six("goal", goal))
-        observation, n_more = self.policy.observation, len(self.policy.obs_layout) - OBS_SIZE
-        sensed = None if sensed is None else np.asarray(sensed, np.float32)
-        shape = None if sensed is None else sensed.shape[-1:]
-        if shape != ((n_more,) if n_more else None):
-            came = "None" if sensed is None else f"shape {sensed.shape}"
-            shapes = f"(..., {n_more})" if n_more else "None"
-            raise ValueError(f"sensed: got {came}, expected {shapes}: the policy observes the {observation}")
+        n_more = len(self.policy.obs_layout) - OBS_SIZE
+        if (None if sensed is None else np.shape(sensed)[-1:]) != ((n_more,) if n_more else None):
+            came = "None" if sensed is None else f"shape {np.shape(sensed)}"
+            expected = f"(..., {n_more})" if n_more else "None"
+            what = self.policy.observation
+            raise ValueError(f"sensed: got {came}, expected {expected}: the policy observes the {what}")
+        if sensed is not None:
+            sensed = np.broadcast_to(np.asarray(sensed, np.float32), (*pose.shape[:-1], n_more))
         action = action_towards(self.policy, pose, goal, sensed)
         if not np.isfinite(action).all():
             raise ValueError("action: got nan, expected finite numbers; the actor overflows")

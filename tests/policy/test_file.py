@@ -15,6 +15,7 @@ from hypothesis.extra import numpy as npst
 from mjx_softarm import ArmSpec
 from mjx_softarm._support.archive import SealedFileError, sealed
 from mjx_softarm.control import Gains
+from mjx_softarm.mdp.observation import layouts
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.policy import file as export
 from mjx_softarm.policy.file import load_policy, policy_from_actor, save_policy
@@ -25,9 +26,9 @@ PROVENANCE = {"commit": "0123abc", "created": "2025-01-31", "packages": {"numpy"
 SCHEMA_6 = "1868266f"
 
 
-def make_params(hidden=(7, 5), n_actions=9):
+def make_params(hidden=(7, 5), n_actions=9, n_obs=18):
     rng = np.random.default_rng(0)
-    sizes = [18, *hidden, 2 * n_actions]
+    sizes = [n_obs, *hidden, 2 * n_actions]
     names = [*(f"hidden_{k}" for k in range(len(hidden))), "head"]
     dense = {
         name: {"kernel": rng.normal(size=(n_in, n_out)), "bias": rng.normal(size=n_out)}
@@ -116,6 +117,15 @@ def test_actor_with_one_layer_and_arm_with_two_sections(tmp_path, make_arm_model
     assert_same(load_policy(tmp_path / "policy.npz"), policy)
 
 
+@pytest.mark.parametrize("observation", ["payload", "motion"])
+def test_what_a_policy_observes_is_kept(tmp_path, make_arm_model, observation):
+    names = layouts(9)[observation]
+    params, path = make_params(n_obs=len(names)), tmp_path / "policy.npz"
+    save_policy(path, policy_from_actor(params, ArmSpec.default(), RewardConfig(), make_arm_model(9), {}))
+    assert load_policy(path).observation == observation
+    assert tuple(arrays_of(path)["obs_layout"]) == load_policy(path).obs_layout == names
+
+
 @pytest.mark.parametrize("names", [["hidden_0"], ["hidden_1", "head"], ["hidden_0", "head", "norm_0"], []])
 def test_parameters_of_another_network_are_refused(names, make_arm_model):
     dense, model = make_params()["params"]["hidden_0"], make_arm_model(9)
@@ -131,6 +141,10 @@ def test_networks_of_another_arm_are_refused(make_arm_model):
             policy_from_actor(make_params(), ArmSpec.default(), RewardConfig(), model, {})
     with pytest.raises(SealedFileError, match=r"actor.2.bias: got float32 \(6,\), expected float32 \(9,\)"):
         policy_from_actor(make_params(n_actions=3), ArmSpec.default(), RewardConfig(), make_arm_model(9), {})
+    with pytest.raises(
+        SealedFileError, match=r"actor.0.weight: got float32 \(20, 7\), expected float32 \(18,"
+    ):
+        policy_from_actor(make_params(n_obs=20), ArmSpec.default(), RewardConfig(), make_arm_model(9), {})
 
 
 @settings(few, max_examples=150)

@@ -130,6 +130,9 @@ def test_what_is_sensed_must_be_what_the_policy_observes(runner, n_more, sensed,
     policy = dataclasses.replace(runner.policy, layers=(wider, *others))
     with pytest.raises(ValueError, match=f"sensed: {message}"):
         PolicyRunner(policy).act(np.zeros(6), np.zeros(6), sensed)
+    if n_more:
+        many = PolicyRunner(policy).act(np.zeros((4, 6)), np.zeros(6), np.zeros(n_more))
+        assert many.length_m.shape == (4, 9)
 
 
 @pytest.mark.filterwarnings("ignore:overflow", "ignore:invalid value")
