@@ -229,6 +229,9 @@ class ImitationConfig(TrainConfig):
             )
         if self.rebalance_env_steps < 0:
             raise ConfigError(f"rebalance_env_steps: got {self.rebalance_env_steps}, expected at least 0")
+        if self.env.observation == "payload":  # an action that was shown is right for one payload
+            expected = "'pose' or 'motion' for demonstrations"
+            raise ConfigError(f"env.observation: got 'payload', expected {expected}")
         if self.polish_updates or self.learner != "tqc":
             got = f"{self.learner!r}, {self.polish_updates}"
             raise ConfigError(f"learner, polish_updates: got {got}, expected 'tqc', 0 for demonstrations")

@@ -5,8 +5,8 @@ arms without a payload. One changes what an action asks for: nine pressures in p
 which the sensor-space law holds with whatever pressures it takes. Another leaves out the loss's term that
 pulls references of saturated chambers back; pressures have no references, so they go without it, too. Three
 more learn with payloads: spring lengths without and with the payload observed, and pressures with it. The
-learning rate is each kind's own best of `RATES`, by the held-out median without a payload of a shorter run
-with a seed that is not used again.
+learning rate is each kind's own best of `RATES`, by the held-out medians, in the mean over the payloads, of a
+shorter run with a seed that is not used again.
 
 Then the arm carries payloads. The policy sees the true pose of the tip after each of four actions, and the
 true payload if it observes it, so no estimate adds an error of its own. Without a payload it goes twice
@@ -132,13 +132,13 @@ class Trial:
         self._follow = xla.jit(jax.vmap(one, in_axes=(None, None, 0, 0)))
 
     def best_rate(self) -> float:
-        """Return the learning rate with the least held-out median of a short run."""
+        """Return the learning rate with the least held-out medians, in the mean over payloads."""
         steps = round(TUNING_SHARE * self.config.total_env_steps)
         off_mm = {}
         for rate in RATES:
             policy = self.policy(TUNING_SEED, rate, steps)
-            workspace, _ = self.reached(policy, 0)
-            off_mm[rate] = float(np.median(workspace.tip_error_mm))
+            found = (self.reached(policy, load_g)[0] for load_g in LOADS_G)
+            off_mm[rate] = float(np.mean([np.median(workspace.tip_error_mm) for workspace in found]))
         return min(off_mm, key=off_mm.__getitem__)
 
     def run(self, seed: int, rate: float) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:

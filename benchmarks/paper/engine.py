@@ -39,7 +39,7 @@ class Settings:
     n_points: int = 40  # of the circle
     n_positions: int | None = None  # of a pipe's task, from the first; None is all
     loads_g: tuple[int, ...] = (35, 105, 220, 330, 500, 1000)
-    beside: tuple[str, ...] = ()  # further presets in open space, with their own settings
+    beside: tuple[str, ...] = ()  # further presets in open space; see `jobs.ALIKE`
 
     def shared(self) -> dict[str, Any]:
         """Return the settings that all results in a folder share; the others may be added to later."""

@@ -50,7 +50,8 @@ def paper(
         preset: of training in open space; None: paper; analytic and payload leave no critics for the confined
             circle
         env_steps: of training in open space; None: the preset's
-        beside: further presets in open space with S2R, as long as they are; payload as long as analytic
+        beside: further presets in open space with S2R, as long as they are; payload beside analytic
+            as long as that
         out: working folder; None: runs/paper
     """
     if only != "open" and (arm == "rod" or preset in ("analytic", "payload")):

@@ -29,7 +29,10 @@ from mjx_softarm.mechanics.pipe import PIPES_MM
 from mjx_softarm.spec import ARM_FILE
 
 CALIBRATION, COMPARISON_FILE = "calibration", "comparison.npz"
-ALIKE = {"analytic", "payload"}  # presets that differ in the payload alone, so they get the same env steps
+ALIKE = {
+    "analytic",
+    "payload",
+}  # presets that differ in the payload alone, as do their runs
 N_COMPARED = 40  # poses that a calibrated twin is compared at
 COMPARED_SEED = 1000  # and up: other poses than the logs', whose seeds are the twins'
 # Session of a twin in trials of demonstrated tasks; demonstrations are recorded in its evaluation session,
@@ -119,7 +122,7 @@ def train_other(folder: Path, settings: Settings, name: str, twin: int, seed: in
     if preset:
         options = ["--preset", preset, "--calibration", calibration]
         if {preset, settings.preset} == ALIKE:
-            options += _length(settings)
+            options += _further(settings)
     else:
         options = [*_chosen(settings), "--spec", calibration / ARM_FILE]
     _reach(folder / learned_run(name, twin, seed), seed, *options)
@@ -127,11 +130,11 @@ def train_other(folder: Path, settings: Settings, name: str, twin: int, seed: in
 
 def _chosen(settings: Settings) -> list[str]:
     """Return the options of the experiment's own policies."""
-    return ["--preset", settings.preset, *_length(settings)]
+    return ["--preset", settings.preset, *_further(settings)]
 
 
-def _length(settings: Settings) -> list[str]:
-    """Return the options of how long they are trained."""
+def _further(settings: Settings) -> list[str]:
+    """Return the options of their further settings."""
     return [f"--{text}" for text in settings.training]
 
 
@@ -233,7 +236,9 @@ def controller_of(folder: Path, trial: Trial) -> Any:
     nominal = load_policy(folder / reach_run(None, trial.seed) / POLICY_FILE)
     runner = PolicyRunner(nominal)
     calibrated_springs = dataclasses.replace(nominal, actions=nominal.actions._replace(sensor=policy.sensor))
-    return Controller.of(calibrated_springs, lambda pose, goal, *_: runner.act(pose, goal).length_m)
+    return Controller.of(
+        calibrated_springs, lambda pose, goal, _, sensed: runner.act(pose, goal, sensed).length_m
+    )
 
 
 def try_out(folder: Path, settings: Settings, trial: Trial) -> None:

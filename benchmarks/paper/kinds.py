@@ -53,7 +53,7 @@ class Trial(NamedTuple):
     twin: int
     seed: int  # of training
     objects: str = ""  # in the containers: key of `measure.OBJECTS_KG`, "" without demonstrations
-    load_g: int = 0  # payload that the policy does not know
+    load_g: int = 0  # payload
     moves: bool = False  # past the positions between the objects, without a stop
 
     @property

@@ -69,7 +69,8 @@ def _ours(batch_size: int, n_updates: int) -> tuple[Facts, Callable[[], Facts]]:
     def update(state, key):
         key_sample, key_relabel, key_update = jax.random.split(key, 3)
         batch = replay.sample(memory, key_sample, batch_size)
-        batch = relabel(batch, key_relabel, hindsight, scale, RewardConfig(), goal_ends=True)
+        ends = {"goal_ends": True, "senses_action": False}
+        batch = relabel(batch, key_relabel, hindsight, scale, RewardConfig(), **ends)
         return agent.update(state, batch, key_update)
 
     def scan(state, key):

@@ -59,7 +59,8 @@ def go(controller: Controller, state: State, at_rest: bool) -> tuple[State, list
         events.append(Event(Fault.EXTRAPOLATION, message))
     sensed = _sensed(controller, state, pose)
     reference_m = controller.plan(pose, state.goal + state.shift, state.spring_m, sensed)
-    state = state._replace(reference_m=reference_m, n_actions=state.n_actions + 1, n_ticks=0)
+    n_actions = state.n_actions + 1
+    state = state._replace(reference_m=reference_m, acted_load=state.load, n_actions=n_actions, n_ticks=0)
     return state, events, False
 
 
@@ -111,12 +112,14 @@ def _shifted(controller: Controller, state: State) -> np.ndarray:
     """Return the shift (6,) [mm, deg] of goals from now on, less what the last references leave.
 
     References, not springs, since these may creep by some tenths of a millimetre in an arm at rest; but the
-    springs of saturated chambers, which do not follow their references.
+    springs of saturated chambers, which do not follow their references. What a payload bends is made up for
+    once: where the policy observes it, by its next action, so here it is the one that it was given.
     """
     assert state.goal is not None and state.reference_m is not None
     policy, mean_m = controller.policy, state.springs_m.mean(axis=0)
     mask = saturated(state.pressure_kpa, state.reference_m, mean_m, policy.gains, policy.tolerance_m)
-    pose, _ = believed(controller, np.where(mask, mean_m, state.reference_m), state.load)
+    load = state.acted_load if policy.observation == "payload" else state.load
+    pose, _ = believed(controller, np.where(mask, mean_m, state.reference_m), load)
     left = pose_error(np.asarray(pose, float), state.goal)
     return _clipped(state.shift - left)
 

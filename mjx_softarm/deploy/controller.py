@@ -64,6 +64,7 @@ class State(NamedTuple):
     pressures_kpa: np.ndarray  # (ticks, n) in force at these
     chambers_kpa: np.ndarray  # (ticks, n) measured at these, or in force where none was measured
     load: Load  # payload that windows at rest told
+    acted_load: Load  # the same at the last action
     n_unweighed: int  # ticks since the last of these
     shift: np.ndarray  # (6,) [mm, deg] of the goals that the policy is given
     due: np.ndarray  # (LEAD_ACTIONS, 6) [mm, deg] moving goal at the last actions, oldest first; NaN: none
@@ -101,6 +102,7 @@ def start(controller: Controller) -> State:
         pressures_kpa=np.empty((0, n)),
         chambers_kpa=np.empty((0, n)),
         load=Load(controller.policy.spec.mass.payload_kg),
+        acted_load=Load(controller.policy.spec.mass.payload_kg),
         n_unweighed=0,
         shift=np.zeros(6),
         due=NONE_DUE,

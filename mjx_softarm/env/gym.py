@@ -29,6 +29,7 @@ from mjx_softarm._support import xla
 from mjx_softarm._support.mjx import State
 from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.env.vector import VectorEnv
+from mjx_softarm.mdp.observation import OBS_SIZE
 from mjx_softarm.spec import ArmSpec
 
 if TYPE_CHECKING:
@@ -197,8 +198,10 @@ def spaces(env: ReachEnv) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
     weight = np.array([reward.weight_per_mm] * 3 + [reward.weight_per_deg] * 3)
     error = weight * np.array([2.0] * 3 + [1.0] * 3) * limit  # positions differ by twice as much, angles wrap
     low, high = ((limit_ - env.scale.centre) / env.scale.scale for limit_ in (-limit, limit))
+    more = np.full(env.observation_size - OBS_SIZE, np.inf)  # payload, or speeds: no bounds are known
     low, high = (
-        np.concatenate(part).astype(np.float32) for part in ([low, low, -error], [high, high, error])
+        np.concatenate(part).astype(np.float32)
+        for part in ([low, low, -error, -more], [high, high, error, more])
     )
     return gymnasium.spaces.Box(low, high), gymnasium.spaces.Box(-1.0, 1.0, (env.action_size,), np.float32)
 

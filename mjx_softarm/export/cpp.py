@@ -51,6 +51,7 @@ def sources(controller: Controller, policy_sha256: str) -> dict[str, str]:
         "SEARCH": begin(policy, 1).size,
         "SEARCH_STEPS": N_STEPS,
         "THRESHOLD": repr(policy.reward.threshold),
+        "OBSERVES_LOAD": str(policy.observation == "payload").lower(),
         "OWN_LOAD": repr(policy.spec.mass.payload_kg),
         "LEAST_LOAD": repr(LOWEST * most_kg),
         "GREATEST_LOAD": repr(HIGHEST * most_kg),

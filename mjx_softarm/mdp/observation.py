@@ -61,9 +61,9 @@ def rate_ticks(rate_hz: float) -> int:
 
 
 def observe_payload(payload_kg: Array) -> Array:
-    """Return what a policy that knows the payload () [kg] observes of it besides pose and goal: (1,)."""
+    """Return what a policy that knows the payload (...) [kg] observes of it: (..., 1)."""
     xp = array_namespace(payload_kg)
-    return xp.asarray(payload_kg, dtype=np.float32)[None]
+    return xp.asarray(payload_kg, dtype=np.float32)[..., None]
 
 
 def observe_motion(

@@ -47,7 +47,7 @@ def tip_pose(policy: Policy, spring_m: Array, load_kg: Array | float) -> tuple[A
 
 
 def sensed_payload(policy: Policy, load_kg: Array | float) -> Array:
-    """Return `observe_payload` of a payload () [kg] as told, brought to those that the policy knows."""
+    """Return `observe_payload` of a payload (...) [kg] as told, brought to those that the policy knows."""
     xp = array_namespace(load_kg)
     least, most = policy.spec.mass.payload_kg, float(policy.load_estimator.load_scale_kg)
     return observe_payload(xp.clip(load_kg, least, most))
@@ -113,8 +113,8 @@ class PolicyRunner:
         Args:
             pose (..., 6) [mm, deg]: of the tip; see `mjx_softarm.sensing.pose`.
             goal (..., 6) [mm, deg]: target of the tip; the leading axes broadcast against the pose's.
-            sensed (..., k): `observe_payload` or `observe_motion` of `mjx_softarm.mdp.observation`, for a
-                policy that observes it; its leading axes are broadcast to those of the poses.
+            sensed (..., k): `sensed_payload` or `sensed_motion`, for a policy that observes it; its leading
+                axes are broadcast to those of the poses.
 
         Returns:
             Readings (..., n) and lengths (..., n) [m], both within the policy's limits.

@@ -41,15 +41,15 @@ CONTROLLER = Controller.of(LOADED, plan_unloaded)
 
 
 class LoadedArm(LinearArm):
-    """A linear arm that carries a payload until a tick."""
+    """A linear arm that carries a payload from a tick until another."""
 
-    def __init__(self, payload_kg, until=10**6):
+    def __init__(self, payload_kg, until=10**6, since=0):
         super().__init__()
-        self._payload_kg, self._until = payload_kg, until
+        self._payload_kg, self._when = payload_kg, range(since, until)
 
     @property
     def payload_kg(self):
-        return self._payload_kg if self.tick < self._until else 0.0
+        return self._payload_kg if self.tick in self._when else 0.0
 
     @property
     def spring_m(self):
@@ -101,6 +101,23 @@ def test_a_policy_that_observes_the_payload_is_given_what_was_told_of_it_up_to_t
     else:
         go(arm, goals, controller)
     assert given[0] == 0.0 and given[-1] == pytest.approx(min(payload_kg, 1.0), abs=0.03)
+
+
+@pytest.mark.parametrize("since", [0, 90, 120])
+def test_a_payload_that_the_policy_observes_is_made_up_for_once(since):
+    """The plan is exact, so no goal is to be shifted, whenever the payload comes to be known."""
+    asked = []
+
+    def plan(pose, goal, spring_m, sensed):
+        asked.append(goal)
+        return plan_unloaded(pose, goal, spring_m, None) - SINK_M_PER_KG * float(sensed[0])
+
+    policy = dataclasses.replace(CARRYING, n_actions=6)
+    arm = LoadedArm(0.8, since=since)
+    run = go(arm, [GOAL], Controller.of(policy, plan))
+    np.testing.assert_allclose(np.array(asked), np.tile(GOAL, (6, 1)), atol=1.0)
+    [arrival] = run.arrivals
+    assert arrival.estimate[2] == pytest.approx(GOAL[2], abs=2.0) and arrival.reached
 
 
 def test_goal_is_shifted_by_what_the_payload_bends():

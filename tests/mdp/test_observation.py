@@ -35,4 +35,5 @@ def test_a_payload_is_observed_in_kilograms(to_library):
     observed = observe_payload(to_library(0.35))
     assert observed.dtype == np.float32
     np.testing.assert_allclose(observed, [0.35], rtol=1e-6)
+    assert observe_payload(np.zeros(3)).shape == (3, 1)
     assert layouts(9)["payload"][OBS_SIZE:] == ("payload_kg",)

@@ -48,6 +48,13 @@ def test_a_setting_that_cannot_be_is_named(assignment, message):
     assert message in str(error.value)
 
 
+def test_demonstrations_know_no_payload():
+    payloads = ["env.observation=payload", "env.randomisation.payload_max_kg=1"]
+    assert override(PRESETS["quick"], payloads).env.observation == "payload"
+    with pytest.raises(ConfigError, match="env.observation: got 'payload', expected 'pose' or 'motion'"):
+        override(IMITATION_PRESETS["pipe"], payloads)
+
+
 @pytest.mark.parametrize("config", [*PRESETS.values(), *IMITATION_PRESETS.values()])
 def test_presets_survive_json(config):
     assert from_dict(json.loads(json.dumps(to_dict(config)))) == config

@@ -60,6 +60,7 @@ def relabel(
     reward_config: rewards.RewardConfig,
     *,
     goal_ends: bool,
+    senses_action: bool,
 ) -> Transition:
     """Return a batch to learn from; with both shares zero, its rewards are those the environment gave.
 
@@ -70,6 +71,7 @@ def relabel(
         scale: of the observations.
         reward_config: weights of the reward.
         goal_ends: whether a goal that is reached ends an episode.
+        senses_action: whether what is sensed ends with the last action.
     """
     # Goals: own, reached, or near the pose reached.
     n = batch.saturated.shape[0]
@@ -89,7 +91,7 @@ def relabel(
         batch.next_pose, goal, batch.n_steps, saturated, reward_config, batch.clearance_cost
     )
     before, after = batch.sensed, batch.next_sensed
-    if after is not None:
+    if senses_action and after is not None:
         after = after.at[:, -action.shape[1] :].set(action)  # the last action, exchanged
     return Transition(
         obs=_joined(obs.observe(batch.pose, goal, scale, reward_config), before),

@@ -52,6 +52,7 @@ class HindsightTQC:
             self.env.scale,
             self.config.env.reward,
             goal_ends=self.config.env.goal_ends,
+            senses_action=self.config.env.observation == "motion",
         )
 
     def learn(self, state: TQCState, batch: Transition, key: Array) -> tuple[TQCState, dict[str, Array]]:

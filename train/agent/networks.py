@@ -46,9 +46,9 @@ class Actor(nn.Module):
 
 
 def widened(params: Any, obs_size: int) -> Any:
-    """Return an actor's parameters for observations (..., O).
+    """Return an actor's parameters; one that observes pose and goal alone is made to take (..., O).
 
-    One of pose and goal alone is widened by entries that count nothing; any other stays as it is.
+    New entries count nothing. An actor that observes more stays as it is.
     """
     params = jax.tree.map(jnp.asarray, params)
     first = params["params"]["hidden_0"]

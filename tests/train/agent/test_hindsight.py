@@ -50,7 +50,8 @@ def relabelled(env, stored):
 
     def of(key=0, **shares):
         config = HindsightConfig(**shares)
-        return many, relabel(many, jax.random.key(key), config, env.scale, env.config.reward, goal_ends=True)
+        kept = {"goal_ends": True, "senses_action": False}
+        return many, relabel(many, jax.random.key(key), config, env.scale, env.config.reward, **kept)
 
     return of
 
@@ -164,10 +165,16 @@ def test_what_is_sensed_follows_pose_and_goal_and_knows_the_action_exchanged(env
     before, after = jnp.full((n, 12), 2.0), jnp.full((n, 12), 3.0)
     moving = stored._replace(sensed=before, next_sensed=after)
     config = HindsightConfig(reached_share=1.0)
-    batch = relabel(moving, jax.random.key(0), config, env.scale, env.config.reward, goal_ends=False)
+    kept = {"goal_ends": False, "senses_action": True}
+    batch = relabel(moving, jax.random.key(0), config, env.scale, env.config.reward, **kept)
     np.testing.assert_array_equal(batch.obs[:, 18:], before)
     n_springs = batch.action.shape[1]
     np.testing.assert_array_equal(batch.next_obs[:, 18:-n_springs], after[:, :-n_springs])
     np.testing.assert_array_equal(batch.next_obs[:, -n_springs:], batch.action)
     assert (batch.action != stored.action).any()
     assert batch.reward.max() > 50.0 and not batch.terminated.any()  # reached, and it goes on
+    carrying = stored._replace(sensed=before[:, :1], next_sensed=after[:, :1])
+    kept["senses_action"] = False
+    batch = relabel(carrying, jax.random.key(0), config, env.scale, env.config.reward, **kept)
+    np.testing.assert_array_equal(batch.obs[:, 18:], before[:, :1])
+    np.testing.assert_array_equal(batch.next_obs[:, 18:], after[:, :1])
