@@ -87,6 +87,9 @@ def test_a_run_survives_kill_9_and_ends_with_the_same_bits(arm, tmp_path, monkey
     assert main(["evaluate", str(whole)]) == 0
     figures = json.loads((whole / "evaluation.json").read_text())
     assert figures == json.loads((killed / "evaluation.json").read_text())
+    assert main(["evaluate", str(whole), "--payload", "50"]) == 0
+    loaded = json.loads((whole / "evaluation-50g.json").read_text())
+    assert loaded.keys() == figures.keys() and loaded["median_mm"] != figures["median_mm"]
     assert all((whole / name).stat().st_size > 10_000 for name in REACH_PICTURES)
     assert list(whole.glob("events.out.tfevents.*"))
     config = json.loads((whole / "config.json").read_text())
@@ -156,6 +159,7 @@ def test_a_folder_has_one_trainer_at_a_time(tmp_path):
         ),
         (["reach", "--env.workspace-seed", "20000"], "20000 draws the goals of the evaluation"),
         (["reach", "--hindsight.near-min-mm", "0"], "near_min_mm"),
+        (["evaluate", "absent", "--payload", "-1"], "--payload: got -1, expected a finite number >= 0"),
         (["evaluate", "absent", "--actions", "3"], "--actions: got 3 without --in-motion, expected"),
         (
             ["evaluate", "absent"],

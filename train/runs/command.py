@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -122,18 +123,25 @@ class Imitate(NewRunOptions):
 
 
 def evaluate(
-    run: tyro.conf.Positional[Path], in_motion: float | None = None, actions: int | None = None
+    run: tyro.conf.Positional[Path],
+    payload: float = 0.0,
+    in_motion: float | None = None,
+    actions: int | None = None,
 ) -> int:
     """Evaluate a run's newest policy, with figures and pictures.
 
     Args:
         run: folder of the run
+        payload: evaluate it with so much more than the specification's payload, at goals that the arm reaches
+            with it, without pictures [g]
         in_motion: evaluate it on arms in motion, with actions of so many seconds, without pictures [s]
         actions: towards each goal, in motion; None: 4
 
     Raises:
-        ConfigError: a number of actions that cannot be taken.
+        ConfigError: a payload, or a number of actions, that cannot be.
     """
+    if not 0.0 <= payload < math.inf:
+        raise ConfigError(f"--payload: got {payload:g}, expected a finite number >= 0")
     if actions is not None and (actions < 1 or in_motion is None):
         where = " without --in-motion" if in_motion is None else ""
         raise ConfigError(f"--actions: got {actions}{where}, expected a positive number with --in-motion")
@@ -141,14 +149,22 @@ def evaluate(
     console = start()
     opened = Run.open(run)
     task, policy = runs.restore_policy(opened)
-    if in_motion is None:
+    if in_motion is None and not payload:
         _show(opened, task, runs.finish(opened, task, policy), console)
         return 0
-    moving = dataclasses.replace(opened.config.env, mode="dynamic", dynamic_step_s=in_motion)
-    summary, *_ = task.evaluate.on(ReachEnv(opened.spec, moving, opened.s2r), n_actions)(policy)
-    title = f"{task.title}, {n_actions} actions of {in_motion:g} s each, in motion"
-    _table(title, {"value": summary}, console)
-    file = opened.path / f"evaluation-in-motion-{n_actions}x{in_motion:g}s.json"
+    config, how, name = opened.config.env, f"{n_actions} actions each", "evaluation"
+    if payload:
+        how, name = f"{how}, {payload:g} g", f"{name}-{payload:g}g"
+    if in_motion is not None:
+        config = dataclasses.replace(config, mode="dynamic", dynamic_step_s=in_motion)
+        how, name = (
+            f"{how}, {in_motion:g} s an action, in motion",
+            f"{name}-in-motion-{n_actions}x{in_motion:g}s",
+        )
+    spec = opened.spec.replace(mass={"payload_kg": opened.spec.mass.payload_kg + 1e-3 * payload})
+    summary, *_ = task.evaluate.on(ReachEnv(spec, config, opened.s2r), n_actions)(policy)
+    _table(f"{task.title}, {how}", {"value": summary}, console)
+    file = opened.path / f"{name}.json"
     write_json(file, summary.to_dict())
     console.print(f"written: {file}", highlight=False, soft_wrap=True)
     return 0
