@@ -71,33 +71,37 @@ def _closed(pose: np.ndarray) -> np.ndarray:
 
 
 def loads_figure(table: Sequence[Row]) -> Figure:
-    """Draw each run's mean and largest translation error over the load, with S2R, and saturated points."""
-    rows = [row for row in table if row["kind"] == "with"]
+    """Draw each run's mean and largest translation error over the load, with S2R, and saturated points.
+
+    Policies that observe the payload are beside those that do not, if there are any.
+    """
     figure = Figure(figsize=(9, 3.8), layout="constrained")
     left, right = figure.subplots(1, 2)
     dress(left, "translation error with S2R", "load [g]", "mm")
     dress(right, "saturated chambers", "load [g]", "points of the circle")
-    _dots(left, rows, "translation_mm", ("mean of the circle", BLUE))
-    _dots(left, rows, "max_mm", ("largest", GREY))
-    _dots(right, rows, "saturated_points", ("a chamber saturated", RED))
+    for kind, how, line in (("with", "", "-"), ("payload", ", payload observed", "--")):
+        if rows := [row for row in table if row["kind"] == kind]:
+            _dots(left, rows, "translation_mm", (f"mean of the circle{how}", BLUE), line)
+            _dots(left, rows, "max_mm", (f"largest{how}", GREY), line)
+            _dots(right, rows, "saturated_points", (f"a chamber saturated{how}", RED), line)
     left.axhline(PAPER_LOADS_MM, color=INK, linestyle=":", linewidth=1, label="paper's arm, 35 to 500 g")
     right.yaxis.get_major_locator().set_params(integer=True)
     for panel in (left, right):
-        panel.set_xticks(sorted({row["load_g"] for row in rows}))
+        panel.set_xticks(sorted({row["load_g"] for row in table if row["kind"] == "with"}))
         panel.tick_params("x", rotation=60)
         panel.set_ylim(bottom=0)
         panel.legend(frameon=False, fontsize=8, loc="upper left")
     return figure
 
 
-def _dots(panel: Any, rows: Sequence[Row], name: str, style: Style) -> None:
+def _dots(panel: Any, rows: Sequence[Row], name: str, style: Style, line: str) -> None:
     """Draw every run as a dot at its load, and a line through the means."""
     label, colour = style
     loads = sorted({row["load_g"] for row in rows})
     means = [np.mean([row[name] for row in rows if row["load_g"] == load]) for load in loads]
     at, values = [row["load_g"] for row in rows], [row[name] for row in rows]
     panel.plot(at, values, "o", color=colour, markersize=3, alpha=0.5)
-    panel.plot(loads, means, color=colour, label=label)
+    panel.plot(loads, means, line, color=colour, label=label)
 
 
 def success_figure(results: Results) -> Figure:
