@@ -33,10 +33,11 @@ def calibration_figures(folder: Path, settings: Settings) -> dict[str, Figure]:
     """Return the drawings of the first twin's calibration by name."""
     twin = settings.twins[0]
     comparison, sensors = _found(folder, twin)
+    name = f"{settings.arm} {twin}"
     return {
-        "configurations": configurations_figure(comparison, twin),
-        "lengths": lengths_figure(comparison, twin),
-        "sensor": sensor_figure(comparison, twin, *sensors),
+        "configurations": configurations_figure(comparison, name),
+        "lengths": lengths_figure(comparison, name),
+        "sensor": sensor_figure(comparison, name, *sensors),
     }
 
 
@@ -63,7 +64,7 @@ def _spring_rms_mm(found: Comparison, sensor: Sensor) -> np.ndarray:
     return 1e3 * np.sqrt(np.nanmean(off_m**2, axis=0))
 
 
-def configurations_figure(found: Comparison, twin: int) -> Figure:
+def configurations_figure(found: Comparison, name: str) -> Figure:
     """Draw arms from two sides at poses far apart, and how far all simulated tips are from the measured."""
     figure = Figure(figsize=(10.5, 6.2), layout="constrained")
     left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(N_SHOWN, 1.9))[0]
@@ -82,7 +83,7 @@ def configurations_figure(found: Comparison, twin: int) -> Figure:
         loc="outside lower center",
         ncols=4,
     )
-    figure.suptitle(f"twin {twin} {UNSEEN}", **_LEFT)
+    figure.suptitle(f"{name} {UNSEEN}", **_LEFT)
     return figure
 
 
@@ -129,7 +130,7 @@ def spread_poses(found: Comparison, n: int = N_SHOWN) -> list[int]:
     return known[chosen].tolist()
 
 
-def lengths_figure(found: Comparison, twin: int) -> Figure:
+def lengths_figure(found: Comparison, name: str) -> Figure:
     """Draw simulated over measured lengths of the chambers, and their differences: a column per section."""
     n_sections = found.chamber_m.shape[1] // N_CHAMBERS_PER_SECTION
     figure = Figure(figsize=(9.5, 6.0), layout="constrained")
@@ -150,11 +151,11 @@ def lengths_figure(found: Comparison, twin: int) -> Figure:
             upper.plot(measured_mm, measured_mm + error_mm, "o", label=label, **dots)
             lower.plot(measured_mm, error_mm, "o", **dots)
         upper.legend(frameon=False, fontsize=8.5, loc="upper left", handletextpad=0.2)
-    figure.suptitle(f"chambers of twin {twin} at the measured pressures, {UNSEEN}", **_LEFT)
+    figure.suptitle(f"chambers of {name} at the measured pressures, {UNSEEN}", **_LEFT)
     return figure
 
 
-def sensor_figure(found: Comparison, twin: int, specified: Sensor, calibrated: Sensor) -> Figure:
+def sensor_figure(found: Comparison, name: str, specified: Sensor, calibrated: Sensor) -> Figure:
     """Draw one spring's curve from frequency to length, its line from raw length, and all springs' errors."""
     figure = Figure(figsize=(10.5, 4.0), layout="constrained")
     curve, line, errors = figure.subplots(1, 3)
@@ -189,7 +190,7 @@ def sensor_figure(found: Comparison, twin: int, specified: Sensor, calibrated: S
         low, high = panel.get_ylim()
         panel.set_ylim(low, high + 0.3 * (high - low))  # room for the legend
         panel.legend(frameon=False, fontsize=8.5, loc="upper left")
-    figure.suptitle(f"sensors of twin {twin} {UNSEEN}", **_LEFT)
+    figure.suptitle(f"sensors of {name} {UNSEEN}", **_LEFT)
     return figure
 
 

@@ -29,8 +29,8 @@ def _band(panel: Any, steps: np.ndarray, lines: np.ndarray, style: Style) -> Non
     panel.plot(steps, mean, color=colour, label=label, linewidth=1.5)
 
 
-def circle_figure(outcomes: Mapping[Trial, Outcome]) -> Figure:
-    """Draw the circle from above, reference and path of each kind: a panel for each twin, its first seed.
+def circle_figure(outcomes: Mapping[Trial, Outcome], arm: str) -> Figure:
+    """Draw the circle from above, reference and path of each kind: a panel for each arm, its first seed.
 
     Points at which a chamber is saturated are ringed.
     """
@@ -40,7 +40,7 @@ def circle_figure(outcomes: Mapping[Trial, Outcome]) -> Figure:
     figure = Figure(figsize=(4.0 * len(twins) + 0.6, height), layout="constrained")
     panels = figure.subplots(1, len(twins), squeeze=False, sharex=True, sharey=True)[0]
     for panel, twin in zip(panels, twins, strict=True):
-        dress(panel, f"twin {twin}, from above", "x [mm]", "y [mm]")
+        dress(panel, f"{arm} {twin}, from above", "x [mm]", "y [mm]")
         panel.set_aspect("equal")
         here = {trial.kind: outcome for trial, outcome in chosen.items() if trial[1:3] == (twin, seed)}
         goal = next(iter(here.values())).goal

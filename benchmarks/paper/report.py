@@ -59,7 +59,7 @@ def write_report(
     finite = json.loads(json.dumps(data), parse_constant=lambda _: None)  # JSON has no NaN
     write_json(pictures / json_name(experiment, settings), {"figures": finite, **provenance("benchmarks")})
     prefix, is_open = PREFIXES[_label(experiment, settings)], experiment == "open"
-    drawn = draw(experiment, results, data["runs"])
+    drawn = draw(experiment, results, data["runs"], settings.arm)
     drawn |= calibration_figures(folder, settings) if is_open else {}
     for name, figure in drawn.items():
         _save_picture(pictures / f"{prefix}-{name}.png", figure)
@@ -81,7 +81,9 @@ def figures_of(experiment: str, folder: Path, settings: Settings, results: Resul
     more = {}
     if experiment == "open":
         more["simulated"] = simulated_rows(folder, settings, table)
-        more[f"twin {settings.twins[0]} beside its simulation"] = calibration_numbers(folder, settings)
+        more[f"{settings.arm} {settings.twins[0]} beside its simulation"] = calibration_numbers(
+            folder, settings
+        )
     return {
         "arm": settings.arm,
         "settings": shared,
@@ -94,10 +96,10 @@ def figures_of(experiment: str, folder: Path, settings: Settings, results: Resul
     }
 
 
-def draw(experiment: str, results: Results, table: list[dict[str, Any]]) -> dict[str, Figure]:
+def draw(experiment: str, results: Results, table: list[dict[str, Any]], arm: str) -> dict[str, Figure]:
     """Return the drawings of an experiment by name."""
     if experiment == "open":
-        return {"circle": plots.circle_figure(results.outcomes), "loads": plots.loads_figure(table)}
+        return {"circle": plots.circle_figure(results.outcomes, arm), "loads": plots.loads_figure(table)}
     return {"success": plots.success_figure(results), "losses": plots.losses_figure(results)}
 
 

@@ -61,5 +61,5 @@ def test_drawn_poses_are_far_apart_and_known():
 
 def test_without_a_network_two_simulations_are_drawn():
     found = compared()._replace(corrected_tip_m=np.full((6, 3), np.nan))
-    texts = [text.get_text() for text in configurations_figure(found, 0).legends[0].get_texts()]
+    texts = [text.get_text() for text in configurations_figure(found, "twin 0").legends[0].get_texts()]
     assert texts == ["simulated, as specified", "simulated, calibrated", "measured markers and tip"]

@@ -154,7 +154,7 @@ def test_titles_and_labels_lie_within_the_pictures(experiment, twins, tmp_path):
     settings = dataclasses.replace(TINY, twins=twins)
     fill(tmp_path, settings)
     results = good_results(experiment, settings)
-    drawn = report.draw(experiment, results, trial_rows(results))
+    drawn = report.draw(experiment, results, trial_rows(results), "twin")
     for name, figure in (drawn | calibration_figures(tmp_path, settings)).items():
         check_nothing_is_cut_off(name, figure)
 
@@ -165,7 +165,7 @@ def test_circle_s_titles_are_whole_whatever_its_shape(n_twins, height):
     results = good_results("open", dataclasses.replace(TINY, twins=tuple(range(n_twins))))
     for outcome in results.outcomes.values():
         outcome.goal[:, 1] *= height
-    check_nothing_is_cut_off("circle", plots.circle_figure(results.outcomes))
+    check_nothing_is_cut_off("circle", plots.circle_figure(results.outcomes, "rod"))
 
 
 def check_nothing_is_cut_off(name, figure):
