@@ -24,6 +24,7 @@ spring model, with faults.
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 from collections.abc import Generator, Iterator
@@ -50,6 +51,7 @@ AXES = ("x", "y", "z", "yaw", "pitch", "roll")
 FLAGS = ("restart", "new_goal", "late", "taken", "lost", "checked")
 BITS = {fault: 1 << k for k, fault in enumerate(Fault)}
 
+_ROUNDED = 1e-5  # share of the pressures' range; other runtimes may be some ten times as far off
 _SPREAD_M = 2e-3  # of the springs of single rows around the model's, as by payloads
 _OUTSIDE, _LOST = 0.1, 0.1  # shares of single rows
 _LAG, _NOISE_M = 0.15, 4e-5  # of the arm in the runs, per tick
@@ -128,8 +130,13 @@ class Machine:
 
 
 def make_golden(controller: Controller, policy_sha256: str, seed: int = 0) -> Golden:
-    """Make rows that meet the faults of an arm, and let the loop answer them."""
+    """Make rows that meet the faults of an arm, and let the loop answer them.
+
+    Rows replay readings, which do not answer to the pressures, so rounding adds up. A run ends where the
+    pressures of a policy with rounded weights have become too different.
+    """
     rng, machine = np.random.default_rng(seed), Machine(controller)
+    rounded, most_kpa = Machine(_rounded(controller)), _ROUNDED * _ranges(controller)[2]
     inputs, outputs = [], []
     for row in (*_single_rows(controller, rng), *_checked_rows(controller, rng)):
         inputs.append(row)
@@ -140,6 +147,9 @@ def make_golden(controller: Controller, policy_sha256: str, seed: int = 0) -> Go
         for tick in range(_RUN_TICKS * (2 if kind in ("swinging", "dropping") else 1)):
             inputs.append(row)
             outputs.append(machine.answer(row))
+            rounded.answer(row)
+            if np.abs(machine.state.pressure_kpa - rounded.state.pressure_kpa).max() > most_kpa:
+                break
             arrived = machine.state.goal is None and not (kind == "dropping" and tick < _DROP_TICK)
             if arrived or (machine.stopped and not machine.state.pressure_kpa.any()):
                 break
@@ -148,6 +158,13 @@ def make_golden(controller: Controller, policy_sha256: str, seed: int = 0) -> Go
     about = {"schema_version": SCHEMA_VERSION, "policy_sha256": policy_sha256, "n": n}
     about["range"] = _ranges(controller).tolist()
     return Golden(about, np.array(inputs), np.array(outputs))
+
+
+def _rounded(controller: Controller) -> Controller:
+    """Return a controller whose policy has weights that differ in about their last bit."""
+    rng, policy = np.random.default_rng(1), controller.policy
+    layers = [(np.float32(w * (1.0 + 1e-7 * rng.normal(size=w.shape))), bias) for w, bias in policy.layers]
+    return Controller.of(dataclasses.replace(policy, layers=tuple(layers)))
 
 
 def _ranges(controller: Controller) -> np.ndarray:

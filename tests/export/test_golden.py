@@ -9,10 +9,12 @@ from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.faults import Fault
 from mjx_softarm.deploy.loop import MOVING_WINDOWS, REST_WINDOWS
 from mjx_softarm.export import computations
+from mjx_softarm.export import golden as golden_rows
 from mjx_softarm.export.__main__ import main
 from mjx_softarm.export.check import TOLERANCE, check, compare, without_memory
 from mjx_softarm.export.golden import BITS, FLAGS, N_SINGLE, output_columns, read_golden, write_golden
 from mjx_softarm.policy import reach
+from tests.export.conftest import few_golden_rows
 from tests.linear_arm import N
 
 
@@ -98,3 +100,11 @@ def test_fault_that_differs_is_infinitely_off(golden):
     assert (agreement.error, agreement.column, agreement.row) == (np.inf, "faults", 7)
     turned = golden.outputs[:, -1] + 360.0
     assert compare(golden, np.arange(len(faults)), {"pose_roll": turned}).error < TOLERANCE
+
+
+def test_a_run_ends_where_rounding_has_added_up(controller, monkeypatch):
+    with few_golden_rows():
+        whole = golden_rows.make_golden(controller, "ab")
+        monkeypatch.setattr(golden_rows, "_ROUNDED", 1e-8)
+        cut = golden_rows.make_golden(controller, "ab")
+    assert golden_rows.N_CHECKED < len(cut.inputs) < len(whole.inputs)
