@@ -84,7 +84,7 @@ class Policy:
 
     @property
     def observation(self) -> Observation:
-        """What the policy observes, as the number of its entries tells."""
+        """Kind of observation, as the number of its entries tells."""
         named = layouts(self.spec.n_chambers)
         sizes: dict[int, Observation] = {len(names): observation for observation, names in named.items()}
         return sizes.get(len(self.layers[0][0]), "pose")  # a policy of another number is refused by its shape

@@ -94,15 +94,20 @@ def test_draw_wires_without_a_sim_to_real_network(tmp_path):
     np.testing.assert_allclose(reference_m, state.reference_m, atol=1e-6)
 
 
-def test_a_policy_of_motion_is_told_of_the_motion(tmp_path):
-    """Without what it saw before, it answers as at its first action; with it, as the loop at its second."""
-    path = tmp_path / "moving.npz"
-    save_policy(path, moving_policy())
+def agreeing_graph(policy, path):
+    """Controller and whole graph of a policy that is saved there; the graph agrees on golden rows."""
+    save_policy(path, policy)
     controller = Controller.of(load_policy(path))
     with few_golden_rows():
         whole, *_, golden = export_onnx(path)
     agreement = check(read_golden(golden), whole)
     assert agreement.n_rows >= 40 and agreement.error < TOLERANCE, agreement
+    return controller, whole
+
+
+def test_a_policy_of_motion_is_told_of_the_motion(tmp_path):
+    """Without what it saw before, it answers as at its first action; with it, as the loop at its second."""
+    controller, whole = agreeing_graph(moving_policy(), tmp_path / "moving.npz")
 
     goal = controller.policy.workspace[0].astype(float)
     state, _ = with_goal(controller, start(controller), goal)
@@ -127,13 +132,7 @@ def test_a_policy_of_motion_is_told_of_the_motion(tmp_path):
 
 
 def test_a_policy_that_observes_the_payload_is_given_it_within_what_it_knows(tmp_path):
-    path = tmp_path / "carrying.npz"
-    save_policy(path, carrying_policy())
-    controller = Controller.of(load_policy(path))
-    with few_golden_rows():
-        whole, *_, golden = export_onnx(path)
-    agreement = check(read_golden(golden), whole)
-    assert agreement.n_rows >= 40 and agreement.error < TOLERANCE, agreement
+    controller, whole = agreeing_graph(carrying_policy(), tmp_path / "carrying.npz")
     goal = controller.policy.workspace[0].astype(float)
     readings = controller.policy.sensor.readings(np.linspace(0.17, 0.19, N))
     given = {}

@@ -1,4 +1,4 @@
-"""What is observed besides pose and goal, against hand calculations."""
+"""Observations of payload and motion against hand calculations."""
 
 import jax.numpy as jnp
 import numpy as np
