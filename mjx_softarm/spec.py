@@ -34,6 +34,7 @@ from mjx_softarm.sensing.sensors import SENSORS, Sensor
 
 ARM_FILE = "arm.toml"  # in the folder of a calibration
 PAIRS = "pairs of chamber and spring"
+PAPER_S_ARM_KG = 4.7  # which carries up to 1 kg
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,11 @@ class Mass:
     gripper_kg: float = not_negative()
     gripper_length_m: float = positive()
     payload_kg: float = not_negative()
+
+    @property
+    def largest_payload_kg(self) -> float:
+        """Payload on top of `payload_kg` to reckon with: 1 kg of the paper's arm, others in proportion."""
+        return (self.arm_kg + self.gripper_kg) / PAPER_S_ARM_KG
 
 
 @dataclass(frozen=True)

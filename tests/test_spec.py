@@ -67,6 +67,13 @@ def test_derived_counts_and_lengths(spec):
     assert spec.per_chamber(spec.replace(chambers={"area_m2": areas}).chambers.area_m2) == areas
 
 
+def test_the_largest_payload_is_a_kilogram_of_the_paper_s_arm_and_in_proportion_to_others(spec):
+    assert spec.mass.largest_payload_kg == 1.0
+    small = ArmSpec.of(Path("sopra")).mass
+    weight = (small.arm_kg + small.gripper_kg) / (spec.mass.arm_kg + spec.mass.gripper_kg)
+    assert small.largest_payload_kg == pytest.approx(weight)
+
+
 def test_another_number_of_sections_needs_no_new_scalars(spec):
     assert spec.replace(structure={"n_sections": 2}).n_chambers == 6
     beta = {"beta": [0.93] * 9}

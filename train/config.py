@@ -16,7 +16,6 @@ from tyro.constructors import PrimitiveConstructorSpec
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.env import EnvConfig
 from mjx_softarm.mdp.actions import N_ACTIONS
-from mjx_softarm.sensing.load import LARGEST_KG
 from train.agent.analytic import AnalyticConfig
 from train.agent.gail import GailConfig
 from train.agent.hindsight import HindsightConfig
@@ -80,11 +79,11 @@ class TrainConfig:
                 f"polish_updates: got {self.polish_updates} with learner {self.learner!r} and env.mode "
                 f"{self.env.mode!r}, expected 0, or 'tqc' and 'quasistatic'"
             )
-        most_kg = self.env.randomisation.payload_max_kg
-        if self.env.observation == "payload" and most_kg < LARGEST_KG:
+        given_kg = self.env.randomisation.payload_max_kg
+        if self.env.observation == "payload" and given_kg is not None:
             raise ConfigError(
-                f"env.randomisation.payload_max_kg: got {most_kg:g} with env.observation 'payload', expected "
-                f"at least {LARGEST_KG:g}, since so much may be told"
+                f"env.randomisation.payload_max_kg: got {given_kg:g} with env.observation 'payload', "
+                "expected none: it is the arm's largest, since so much may be told"
             )
         if self.replay_capacity < self.n_arms:
             raise ConfigError(

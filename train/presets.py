@@ -6,7 +6,6 @@ import dataclasses
 
 from mjx_softarm.env import EnvConfig, Randomisation
 from mjx_softarm.mdp.rewards import RewardConfig
-from mjx_softarm.sensing.load import LARGEST_KG
 from train.agent.analytic import AnalyticConfig
 from train.agent.hindsight import HindsightConfig
 from train.agent.tqc import TQCConfig
@@ -60,12 +59,7 @@ PRESETS: dict[str, TrainConfig] = {
     ),
     "analytic": _ANALYTIC,
     # The same for an arm that carries: the policy observes the payload, which the loop tells from pressures.
-    "payload": dataclasses.replace(
-        _ANALYTIC,
-        env=dataclasses.replace(
-            _ANALYTIC.env, observation="payload", randomisation=Randomisation(payload_max_kg=LARGEST_KG)
-        ),
-    ),
+    "payload": dataclasses.replace(_ANALYTIC, env=dataclasses.replace(_ANALYTIC.env, observation="payload")),
     # The paper's recipe: 14 workers, sb3-contrib's hyperparameters, of which one is a gradient step for each
     # step of the workers, and each transition stored again with the pose it achieved for its goal.
     "as-printed": TrainConfig(

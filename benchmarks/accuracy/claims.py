@@ -37,7 +37,6 @@ from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.settle import settle_pressures
 from mjx_softarm.mechanics.workspace import HELD_OUT_SEED
 from mjx_softarm.policy.file import SHIPPED, load_policy
-from mjx_softarm.sensing.load import LARGEST_KG
 from train.config import TrainConfig, override
 from train.presets import PRESETS
 from train.runs.evaluate import N_GOALS, PATH, Reached, follow_from, paths_of, start_keys, towards
@@ -71,8 +70,9 @@ class Kind(NamedTuple):
     settings: tuple[str, ...] = ()  # NAME=VALUE
 
 
+LARGEST_KG = ArmSpec.default().mass.largest_payload_kg
 LOADED = (f"env.randomisation.payload_max_kg={LARGEST_KG}",)
-OBSERVED = (*LOADED, "env.observation=payload")
+OBSERVED = ("env.observation=payload",)
 NO_TERM = ("analytic.saturation_cost_per_mm=0",)
 KINDS = {
     "spring lengths": Kind(),
@@ -178,7 +178,7 @@ def laps(spec: ArmSpec) -> np.ndarray:
 def follow(env: ReachEnv, learner: Any, policy: Any, load_kg: Array, path: Array, key: Array) -> Reached:
     """Return the results of one arm with a payload, from a random start, along a path (n, 6) of goals."""
     noise = jax.tree.map(lambda x: x[0], env.sample_noise(key, 1))
-    share = noise.uniform.at[PAYLOAD_SHARE].set(load_kg / env.config.randomisation.payload_max_kg)
+    share = noise.uniform.at[PAYLOAD_SHARE].set(load_kg / env.payload_max_kg)
     return follow_from(env, learner, policy, path, env.reset_from(noise._replace(uniform=share)))
 
 

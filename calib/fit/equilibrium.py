@@ -26,7 +26,6 @@ from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
 BATCH = 128  # poses simulated together
 N_KINDS = 4  # of errors: tip, rotation, springs, markers
 N_WORKSPACE = 256  # poses over the workspace
-PAYLOAD_SHARE = 1.0 / 4.7  # of the arm's mass, the heaviest: 1 kg of the paper's arm
 STRAIGHT = 0.2  # one chamber's excess over the section's others, as a share of the range, at most
 
 
@@ -156,8 +155,7 @@ def tip_changes(spec: ArmSpec, x: np.ndarray, change: np.ndarray) -> np.ndarray:
     rng = np.random.default_rng(0)
     extremes = rng.choice(pressure_levels(spec), (N_WORKSPACE // 2, spec.n_chambers))
     pressure_kpa = np.concatenate([random_pressures(spec, N_WORKSPACE - len(extremes), rng), extremes])
-    heaviest_kg = PAYLOAD_SHARE * (spec.mass.arm_kg + spec.mass.gripper_kg)
-    payload_kg = np.where(np.arange(N_WORKSPACE) % 2, heaviest_kg, 0.0)
+    payload_kg = np.where(np.arange(N_WORKSPACE) % 2, spec.mass.largest_payload_kg, 0.0)
     rotation = np.broadcast_to(np.eye(3), (N_WORKSPACE, 3, 3))
     error, slope, _ = simulate(spec, *unmeasured(spec, pressure_kpa, payload_kg, rotation), x)
     settled = np.isfinite(error[:, 0]) & np.isfinite(slope).all(axis=(1, 2))

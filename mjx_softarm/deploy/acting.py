@@ -13,7 +13,7 @@ from mjx_softarm.deploy.controller import Controller, State
 from mjx_softarm.deploy.faults import Event, Fault
 from mjx_softarm.mdp.observation import rate_ticks
 from mjx_softarm.policy.file import Policy
-from mjx_softarm.policy.runtime import sensed_motion, sensed_payload, tip_pose
+from mjx_softarm.policy.runtime import InMotion, sensed, tip_pose
 from mjx_softarm.sensing.load import Load
 from mjx_softarm.sensing.pose import pose_error
 
@@ -57,8 +57,7 @@ def go(controller: Controller, state: State, at_rest: bool) -> tuple[State, list
     if away > 1.0:
         message = f"{away:.1f} times as far from the training rows as the network is believed"
         events.append(Event(Fault.EXTRAPOLATION, message))
-    sensed = _sensed(controller, state, pose)
-    reference_m = controller.plan(pose, state.goal + state.shift, state.spring_m, sensed)
+    reference_m = _planned(controller, state, pose, state.shift)
     n_actions = state.n_actions + 1
     state = state._replace(reference_m=reference_m, acted_load=state.load, n_actions=n_actions, n_ticks=0)
     return state, events, False
@@ -74,14 +73,12 @@ def chase(controller: Controller, state: State) -> State:
         if state.n_actions and state.n_ticks * controller.dt_s < policy.action_s:
             return state
         shift = _clipped(shift - MOVING_SHARE * _beside(np.asarray(pose, float), due))
-        sensed = _sensed(controller, state, pose)
-        reference_m = controller.plan(pose, state.goal + shift, state.spring_m, sensed)
+        reference_m = _planned(controller, state, pose, shift)
         due = np.concat([due[1:], state.goal[None]])
     else:
         reference_m = state.spring_m
         for _ in range(policy.n_actions):
-            sensed = _sensed(controller, state, pose)
-            reference_m = controller.plan(pose, state.goal + shift, state.spring_m, sensed)
+            reference_m = _planned(controller, state, pose, shift)
             pose, _ = believed(controller, reference_m, state.load)
             left = pose_error(np.asarray(pose, float), state.goal)
             shift = _clipped(shift - left)
@@ -95,17 +92,15 @@ def _patience_s(policy: Policy, n_actions: int) -> float:
     return policy.action_s if more else faults.SETTLE_TIMEOUT_S
 
 
-def _sensed(controller: Controller, state: State, pose: np.ndarray) -> np.ndarray | None:
-    """Return what the policy observes besides pose and goal of the arm, which is believed at a pose (6,)."""
+def _planned(controller: Controller, state: State, pose: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """Return references (n,) [m] from a believed pose (6,) towards the goal with a shift (6,)."""
     policy = controller.policy
-    if policy.observation == "pose":
-        return None
-    if policy.observation == "payload":
-        return sensed_payload(policy, state.load.believed_kg)
+    assert state.goal is not None
     before_m = state.springs_m[-1 - min(rate_ticks(policy.rate_hz), len(state.springs_m) - 1)]
-    reference_m = np.full_like(before_m, np.nan) if state.reference_m is None else state.reference_m
-    motion = state.spring_m, before_m, reference_m, state.law.integral_kpa
-    return sensed_motion(policy, pose, *motion, state.load.believed_kg)
+    last_m = np.full_like(before_m, np.nan) if state.reference_m is None else state.reference_m
+    motion = InMotion(before_m, last_m, state.law.integral_kpa)
+    observed = sensed(policy, pose, state.spring_m, motion, state.load.believed_kg)
+    return controller.plan(pose, state.goal + shift, state.spring_m, observed)
 
 
 def _shifted(controller: Controller, state: State) -> np.ndarray:

@@ -41,7 +41,7 @@ from mjx_softarm.sensing.load import HIGHEST, LOWEST, Load, averaged, tell_load
 # A chamber counts as lost after so many windows in a row: of an arm at rest, and of one that moves, whose
 # springs and pressures come after their references.
 REST_WINDOWS, MOVING_WINDOWS = 2, 6
-OVERLOAD_KG = 0.25  # beyond the largest payload, since none is told exactly
+OVERLOAD = 1.25  # share of the largest payload, since none is told exactly
 
 
 def with_goal(controller: Controller, state: State, goal: np.ndarray) -> tuple[State, tuple[Event, ...]]:
@@ -212,7 +212,7 @@ def _weigh(controller: Controller, state: State, at_rest: bool) -> tuple[State, 
     )
     events = []
     if LOWEST * most_kg <= told_kg <= HIGHEST * most_kg:
-        load = averaged(before, told_kg)
+        load = averaged(before, told_kg, most_kg)
     else:
         load, got = Load(own_kg), f"springs and pressures tell {1e3 * told_kg:.0f} g"
         message = f"{got}, the pose is estimated from the springs alone, with {1e3 * own_kg:.0f} g"
@@ -220,7 +220,7 @@ def _weigh(controller: Controller, state: State, at_rest: bool) -> tuple[State, 
     if load.began and load.kg < before.kg:
         message = f"{1e3 * load.believed_kg:.0f} g, from {1e3 * before.kg:.0f} g at the rests before"
         events.append(Event(Fault.LOAD_LOST, message))
-    if load.kg > most_kg + OVERLOAD_KG:
+    if load.kg > OVERLOAD * most_kg:
         message = f"{1e3 * load.kg:.0f} g, expected at most {1e3 * most_kg:.0f} g"
         events.append(Event(Fault.OVERLOADED, message))
     return state._replace(load=load, n_unweighed=0), events

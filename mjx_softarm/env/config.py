@@ -25,7 +25,9 @@ def _expect(config: Any, name: str, holds: bool, expected: str) -> None:
 class Randomisation:
     """Differences from episode to episode; with all at zero every arm is the nominal one."""
 
-    payload_max_kg: float = 0.0  # the payload is uniform from the spec's to this much more
+    payload_max_kg: float | None = None
+    """the payload is uniform from the spec's to this much more; None: the arm's largest for a policy that
+    observes the payload, else none"""
     stiffness_spread: float = 0.0  # each chamber's stiffness is times 1 + uniform(-spread, spread)
     sensor_noise_mm: float = 0.0  # standard deviation of each spring's reading, fixed within an episode
     damping_spread: float = 0.0  # in motion, all dampers are times 1 + uniform(-spread, spread)
@@ -34,7 +36,7 @@ class Randomisation:
 
     def __post_init__(self):
         for name in ("payload_max_kg", "sensor_noise_mm", "delay_max_s", "friction_max_n"):
-            _expect(self, name, 0 <= getattr(self, name) < math.inf, "a finite number >= 0")
+            _expect(self, name, 0 <= (getattr(self, name) or 0.0) < math.inf, "a finite number >= 0")
         for name in ("stiffness_spread", "damping_spread"):
             _expect(self, name, 0 <= getattr(self, name) < 1, "0 to 1")
 

@@ -41,8 +41,8 @@ class ReachEnv(Env):
                angles by 90 deg
         6-11   pose of the goal, scaled in this way, too
         12-17  error w (pose - goal), by the reward's weights per mm and per degree, angles wrapped
-        With `observation="payload"` the payload [kg] follows; with "motion" 39 more, see
-        `mjx_softarm.mdp.observation.observe_motion`
+        With `observation="payload"` the payload follows, as a share of the largest; with "motion" 39 more,
+        see `mjx_softarm.mdp.observation.observe_motion`
 
     Action (n_chambers,), each in [-1, 1]: readings of the springs' sensors to be reached, from that of the
         shortest to that of the longest spring (`mjx_softarm.mdp.actions`). The sensor-space law then sets the
@@ -97,6 +97,14 @@ class ReachEnv(Env):
     @property
     def observation_size(self) -> int:
         return len(obs.layouts(self.action_size)[self.config.observation])
+
+    @property
+    def payload_max_kg(self) -> float:
+        """Largest payload of an episode on top of the specification's."""
+        given_kg = self.config.randomisation.payload_max_kg
+        if given_kg is not None:
+            return given_kg
+        return self.spec.mass.largest_payload_kg if self.config.observation == "payload" else 0.0
 
     @property
     def n_ticks(self) -> int:
@@ -155,7 +163,7 @@ class ReachEnv(Env):
         goal = self.pool.pose[goal_row]
         spread = self.config.randomisation
         arm = ArmState(
-            payload_kg=self.params.tool_mass_kg[PAYLOAD] + spread.payload_max_kg * share[PAYLOAD_SHARE],
+            payload_kg=self.params.tool_mass_kg[PAYLOAD] + self.payload_max_kg * share[PAYLOAD_SHARE],
             chamber_stiffness=self.params.chamber_stiffness
             * (1.0 + spread.stiffness_spread * (2.0 * share[3:] - 1.0)),
             sensor_offset_m=1e-3 * spread.sensor_noise_mm * noise.normal,
@@ -278,7 +286,7 @@ class ReachEnv(Env):
         if self.config.observation == "pose":
             return None
         if self.config.observation == "payload":
-            return obs.observe_payload(arm.payload_kg)
+            return obs.observe_payload(arm.payload_kg, self.spec)
         last_m, tip_mm, last_mm = end.spring_m, jnp.zeros(3), jnp.zeros(3)
         if isinstance(end, Moved):
             before = max(self.n_ticks - obs.rate_ticks(self.spec.control.rate_hz), 0)

@@ -14,19 +14,10 @@ from mjx_softarm.deploy.link import vented
 from mjx_softarm.deploy.reachability import distances
 from mjx_softarm.export.symbols import Symbol, constant, repeat, symbol
 from mjx_softarm.policy import reach
-from mjx_softarm.policy.file import Policy
-from mjx_softarm.policy.runtime import action_towards, actor_output, sensed_motion, sensed_payload, tip_pose
+from mjx_softarm.policy.runtime import InMotion, action_towards, actor_output, sensed, tip_pose
 from mjx_softarm.sensing.load import tell_load
 from mjx_softarm.sensing.pose import pose_error
 from mjx_softarm.sensing.sensors import Reading, SensorFault
-
-
-class InMotion(NamedTuple):
-    """Inputs of a policy of motion besides readings and goal."""
-
-    before_m: Array  # (n,) lengths `rate_ticks` before; NaN if not known
-    last_reference_m: Array  # (n,) references of the last action; NaN before the first
-    integral_kpa: Array  # (n,) of the law
 
 
 class Computation(NamedTuple):
@@ -54,20 +45,20 @@ def answer(
     last_m: Array,
     load_kg: Array,
     pressure_kpa: Array,
-    motion: InMotion | None = None,
+    motion: InMotion,
 ) -> dict[str, Array]:
     """Return the references that the loop takes from readings (n,) and a goal (6,) when it acts, and more.
 
     A lost reading holds the last length (n,) [m] of its spring. References are NaN where the loop would give
     none: a spring has neither a reading nor a last length, or the goal is outside the workspace. The payload
-    () [kg] is the caller's average of what rests told, each at its pressures (n,) [kPa]. `motion` is for
+    () [kg] is the caller's average of what rests told, each at its pressures (n,) [kPa]. `motion` matters to
     a policy that observes it.
     """
     policy, xp = controller.policy, array_namespace(readings)
     reading = policy.sensor.lengths(readings, last_m)
     pose, away = tip_pose(policy, reading.length_m, load_kg)
-    sensed = _sensed(policy, pose, reading.length_m, motion, load_kg)
-    action = action_towards(policy, pose, xp.asarray(goal, dtype=np.float32), sensed)
+    observed = sensed(policy, pose, reading.length_m, motion, load_kg)
+    action = action_towards(policy, pose, xp.asarray(goal, dtype=np.float32), observed)
     reference = policy.actions.readings(action)
     # A distance that is NaN is not within the limit, nor is a length that is NaN finite.
     inside = _inside(controller, goal)
@@ -122,8 +113,8 @@ def parts(controller: Controller) -> dict[str, Computation]:
     tip, away = tip_pose(policy, spring_m, load_kg)
     told_kg = tell_load(policy.load_estimator, xp.mean(springs_m, axis=0), xp.mean(pressures_kpa, axis=0))
     motion = _in_motion(n)
-    sensed = _sensed(policy, pose, spring_m, motion, load_kg)
-    action = action_towards(policy, pose, xp.asarray(goal, dtype=np.float32), sensed)
+    observed = sensed(policy, pose, spring_m, motion, load_kg)
+    action = action_towards(policy, pose, xp.asarray(goal, dtype=np.float32), observed)
     written_kpa, after = pressures(reference_m, spring_m, state, gains, controller.dt_s)
     law = {"written_kpa": written_kpa} | {f"next_{name}": value for name, value in after._asdict().items()}
     mask = saturated(pressure_kpa, reference_m, spring_m, gains, tolerance_m)
@@ -160,17 +151,6 @@ def parts(controller: Controller) -> dict[str, Computation]:
 
 def _in_motion(n: int) -> InMotion:
     return InMotion(*(symbol(name, (n,)) for name in InMotion._fields))
-
-
-def _sensed(
-    policy: Policy, pose: Array, spring_m: Array, motion: InMotion | None, load_kg: Array
-) -> Array | None:
-    """Return what the policy observes besides pose and goal."""
-    if policy.observation == "payload":
-        return sensed_payload(policy, load_kg)
-    if policy.observation == "pose" or motion is None:
-        return None
-    return sensed_motion(policy, pose, spring_m, *motion, load_kg)
 
 
 def _lost(reading: Reading) -> Array:

@@ -7,13 +7,13 @@ from importlib import resources
 from mjx_softarm.deploy.acting import MAX_KEPT, MAX_SHIFT
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.faults import LATE_TICKS, LOST_TICKS, SETTLE_TIMEOUT_S, Fault, Response
-from mjx_softarm.deploy.loop import MOVING_WINDOWS, OVERLOAD_KG, REST_WINDOWS
+from mjx_softarm.deploy.loop import MOVING_WINDOWS, OVERLOAD, REST_WINDOWS
 from mjx_softarm.export.computations import parts
 from mjx_softarm.export.cpp_functions import Numbers, function
 from mjx_softarm.mdp.observation import rate_ticks
 from mjx_softarm.policy.file import file_entries
 from mjx_softarm.policy.reach import N_STEPS, begin
-from mjx_softarm.sensing.load import HIGHEST, JUMP_KG, LOWEST, N_AVERAGED, N_JUMPS
+from mjx_softarm.sensing.load import HIGHEST, JUMP, LOWEST, N_AVERAGED, N_JUMPS
 
 _TEMPLATES = {"softarm.hpp": "softarm.hpp.in"} | {
     name: name for name in ("rows.cpp", "example.cpp", "CMakeLists.txt")
@@ -55,8 +55,8 @@ def sources(controller: Controller, policy_sha256: str) -> dict[str, str]:
         "OWN_LOAD": repr(policy.spec.mass.payload_kg),
         "LEAST_LOAD": repr(LOWEST * most_kg),
         "GREATEST_LOAD": repr(HIGHEST * most_kg),
-        "OVERLOAD": repr(most_kg + OVERLOAD_KG),
-        "JUMP": repr(JUMP_KG),
+        "OVERLOAD": repr(OVERLOAD * most_kg),
+        "JUMP": repr(JUMP * most_kg),
         "N_JUMPS": N_JUMPS,
         "N_AVERAGED": N_AVERAGED,
         "MAX_SHIFT": ", ".join(map(repr, MAX_SHIFT.tolist())),

@@ -60,10 +60,10 @@ def rate_ticks(rate_hz: float) -> int:
     return max(1, round(RATE_S * rate_hz))
 
 
-def observe_payload(payload_kg: Array) -> Array:
-    """Return what a policy that knows the payload (...) [kg] observes of it: (..., 1)."""
+def observe_payload(payload_kg: Array, spec: ArmSpec) -> Array:
+    """Return what a policy that knows the payload (...) [kg] observes of it: (..., 1), the largest is 1."""
     xp = array_namespace(payload_kg)
-    return xp.asarray(payload_kg, dtype=np.float32)[..., None]
+    return xp.asarray(payload_kg / spec.mass.largest_payload_kg, dtype=np.float32)[..., None]
 
 
 def observe_motion(

@@ -27,6 +27,14 @@ class Reference(NamedTuple):
     length_m: np.ndarray  # (..., n) the same, as calibrated lengths: the reference of `control.pressures`
 
 
+class InMotion(NamedTuple):
+    """What the loop knows of an arm in motion besides springs and payload."""
+
+    before_m: Array  # (n,) lengths `rate_ticks` before; NaN if not known, as of an arm at rest
+    last_reference_m: Array  # (n,) references of the last action; NaN before the first
+    integral_kpa: Array  # (n,) of the sensor-space law
+
+
 def tip_pose(policy: Policy, spring_m: Array, load_kg: Array | float) -> tuple[Array, Array]:
     """Return the tip pose that springs and a payload tell.
 
@@ -46,39 +54,30 @@ def tip_pose(policy: Policy, spring_m: Array, load_kg: Array | float) -> tuple[A
     return pose, distance(policy.s2r, x) / policy.s2r.limit
 
 
-def sensed_payload(policy: Policy, load_kg: Array | float) -> Array:
-    """Return `observe_payload` of a payload (...) [kg] as told, brought to those that the policy knows."""
-    xp = array_namespace(load_kg)
-    least, most = policy.spec.mass.payload_kg, float(policy.load_estimator.load_scale_kg)
-    return observe_payload(xp.clip(load_kg, least, most))
-
-
-def sensed_motion(
-    policy: Policy,
-    pose: Array,
-    spring_m: Array,
-    before_m: Array,
-    reference_m: Array,
-    integral_kpa: Array,
-    load_kg: Array | float,
-) -> Array:
-    """Return `observe_motion` of an arm as its springs tell it, float32.
+def sensed(
+    policy: Policy, pose: Array, spring_m: Array, motion: InMotion, load_kg: Array | float
+) -> Array | None:
+    """Return what a policy observes besides pose and goal: (k,) float32, or nothing.
 
     Args:
-        policy: that observes motion.
+        policy: one of any kind of observation.
         pose (6,) [mm, deg]: of the tip, as `tip_pose` of the springs.
         spring_m (n,) [m]: lengths.
-        before_m (n,) [m]: lengths `rate_ticks` before; NaN if not known, as of an arm at rest.
-        reference_m (n,) [m]: references of the last action; NaN before the first.
-        integral_kpa (n,) [kPa]: of the sensor-space law.
-        load_kg () [kg]: payload.
+        motion: of the arm; a policy that does not observe it ignores it.
+        load_kg () [kg]: payload as told, brought to those that the policy knows if it observes it.
     """
     xp = array_namespace(spring_m)
-    before_m, reference_m = (xp.where(xp.isfinite(x), x, spring_m) for x in (before_m, reference_m))
+    if policy.observation == "pose":
+        return None
+    if policy.observation == "payload":
+        least, most = policy.spec.mass.payload_kg, float(policy.load_estimator.load_scale_kg)
+        return observe_payload(xp.clip(load_kg, least, most), policy.spec)
+    known = motion.before_m, motion.last_reference_m
+    before_m, last_m = (xp.where(xp.isfinite(x), x, spring_m) for x in known)
     before_mm = tip_pose(policy, before_m, load_kg)[0][:3]
-    action = policy.actions.from_lengths(reference_m)
-    motion = spring_m, before_m, pose[:3], before_mm, integral_kpa, action
-    return xp.asarray(observe_motion(*motion, policy.spec), dtype=np.float32)
+    action = policy.actions.from_lengths(last_m)
+    observed = spring_m, before_m, pose[:3], before_mm, motion.integral_kpa, action
+    return xp.asarray(observe_motion(*observed, policy.spec), dtype=np.float32)
 
 
 def actor_output(policy: Policy, observation: Array) -> Array:
@@ -113,7 +112,7 @@ class PolicyRunner:
         Args:
             pose (..., 6) [mm, deg]: of the tip; see `mjx_softarm.sensing.pose`.
             goal (..., 6) [mm, deg]: target of the tip; the leading axes broadcast against the pose's.
-            sensed (..., k): `sensed_payload` or `sensed_motion`, for a policy that observes it; its leading
+            sensed (..., k): of the function `sensed`, for a policy that observes more; its leading
                 axes are broadcast to those of the poses.
 
         Returns:

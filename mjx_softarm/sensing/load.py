@@ -14,9 +14,8 @@ from mjx_softarm._support.archive import Entries
 from mjx_softarm._support.mlp import Layer, mlp
 from mjx_softarm._support.xp import Array, array_namespace
 
-LARGEST_KG = 1.0  # payload, on top of the specification's, that networks are made for: the paper's largest
 N_AVERAGED = 8  # rests that the average is about
-JUMP_KG = 0.25  # by which a rest disagrees with the average,
+JUMP = 0.25  # share of the largest payload by which a rest disagrees with the average,
 N_JUMPS = 2  # so many of them in a row begin a new one
 # Payloads in the network's data, as shares of the largest one: what is told outside is no payload.
 LOWEST, HIGHEST = -0.5, 1.5
@@ -62,9 +61,9 @@ def tell_load(estimator: LoadEstimator, spring_m: Array, pressure_kpa: Array) ->
     return estimator.load_scale_kg * mlp(estimator.layers, x)[..., 0]
 
 
-def averaged(load: Load, told_kg: float) -> Load:
-    """Return the average with what another rest told."""
-    disagrees = load.n_rests > 0 and abs(told_kg - load.kg) > JUMP_KG
+def averaged(load: Load, told_kg: float, largest_kg: float) -> Load:
+    """Return the average with what another rest of an arm with this largest payload told."""
+    disagrees = load.n_rests > 0 and abs(told_kg - load.kg) > JUMP * largest_kg
     if disagrees and load.n_jumps + 1 < N_JUMPS:
         return load._replace(n_jumps=load.n_jumps + 1)
     if disagrees or load.n_rests == 0:

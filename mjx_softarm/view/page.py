@@ -73,7 +73,7 @@ class Page:
             if setup.records:
                 self._button("Take the pose", "take", _TAKE, None, viser.Icon.CAMERA)
             if setup.carries:
-                self._add_payload()
+                self._add_payload(round(1e3 * spec.mass.largest_payload_kg))
             self._box("reachable poses", "Goals are kept near them", points)
             self._box("reachable workspace", "The hull of the reachable poses", hull)
         self._listen()
@@ -91,8 +91,9 @@ class Page:
         box = self._server.gui.add_checkbox(label, False, hint=hint)
         box.on_update(lambda _: setattr(node, "visible", box.value))
 
-    def _add_payload(self) -> None:
-        slider = self._server.gui.add_slider("payload [g]", 0, 1000, 50, 0, hint="Hung to the finger tips")
+    def _add_payload(self, largest_g: int) -> None:
+        hint, step_g = "Hung to the finger tips", max(largest_g // 20, 1)
+        slider = self._server.gui.add_slider("payload [g]", 0, largest_g, step_g, 0, hint=hint)
 
         @slider.on_update
         async def _(_: Any) -> None:

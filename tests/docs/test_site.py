@@ -1,4 +1,4 @@
-"""The site builds without a warning, and links between files lead somewhere."""
+"""The site builds without a warning, links lead somewhere, and results keep no path of a machine."""
 
 import os
 import re
@@ -25,3 +25,8 @@ def test_the_readme_s_links_lead_to_files():
     links = re.findall(r"\]\(([^)#]+)|src=\"([^\"]+)", text)
     targets = [target for pair in links for target in pair if target and "://" not in target]
     assert targets and not [target for target in targets if not (ROOT / target).is_file()]
+
+
+@pytest.mark.parametrize("file", sorted((ROOT / "docs/results").glob("*.json")), ids=lambda file: file.stem)
+def test_results_keep_no_path_of_a_machine(file):
+    assert not re.findall(r'(?:^|["\s=:])(?:/|~/|[A-Z]:\\)\w[^"\s]*', file.read_text("utf-8"))

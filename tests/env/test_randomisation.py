@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mjx_softarm._support import xla
-from mjx_softarm.env import Randomisation, ReachEnv
+from mjx_softarm.env import EnvConfig, Randomisation, ReachEnv
 from mjx_softarm.env.reach import PAYLOAD
 from mjx_softarm.env.state import motion_params
 from mjx_softarm.mechanics.dynamics import MotionParams
@@ -58,6 +58,18 @@ def test_randomised_numbers_fill_their_bounds_and_no_other_number_changes(spec, 
     for name in unchanged:
         assert_all_arms_have(getattr(drawn, name), getattr(nominal, name), name)
     np.testing.assert_array_equal(drawn.tool_mass_kg[:, 0], np.float32(spec.mass.gripper_kg))
+
+
+def test_payloads_go_up_to_the_arm_s_largest_where_they_are_observed(spec):
+    light = spec.replace(mass={"arm_kg": 1.0, "gripper_kg": 0.175})  # a quarter of the paper's arm
+    for observation, given_kg, expected_kg in (
+        ("payload", None, 0.25),
+        ("payload", 0.1, 0.1),
+        ("pose", None, 0),
+    ):
+        spread = Randomisation(payload_max_kg=given_kg)
+        env = ReachEnv(light, EnvConfig(n_poses=4, observation=observation, randomisation=spread))
+        assert env.payload_max_kg == pytest.approx(expected_kg)
 
 
 def test_a_payload_is_observed_as_it_is_from_start_to_end(spec, env, random_actions):

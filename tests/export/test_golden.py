@@ -14,6 +14,7 @@ from mjx_softarm.export.__main__ import main
 from mjx_softarm.export.check import TOLERANCE, check, compare, without_memory
 from mjx_softarm.export.golden import BITS, FLAGS, N_SINGLE, output_columns, read_golden, write_golden
 from mjx_softarm.policy import reach
+from mjx_softarm.policy.runtime import InMotion
 from tests.export.conftest import few_golden_rows
 from tests.linear_arm import N
 
@@ -36,9 +37,12 @@ def test_rows_meet_faults_and_vent(golden, controller):
 
 
 def test_jax_agrees_on_all_single_rows(golden, controller):
+    unknown, zeros = jnp.full(N, jnp.nan), jnp.zeros(N)
+    motion = InMotion(unknown, unknown, zeros)
+
     @jax.jit
     def answer(readings, goal):
-        return computations.answer(controller, readings, goal, jnp.full(N, jnp.nan), 0.0, jnp.zeros(N))
+        return computations.answer(controller, readings, goal, unknown, 0.0, zeros, motion)
 
     rows, outputs = without_memory(golden, answer)
     agreement = compare(golden, rows, outputs)

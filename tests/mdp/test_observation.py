@@ -31,9 +31,11 @@ def test_a_moving_arm_by_hand(to_library):
 
 
 @pytest.mark.parametrize("to_library", [float, jnp.asarray])
-def test_a_payload_is_observed_in_kilograms(to_library):
-    observed = observe_payload(to_library(0.35))
+def test_a_payload_is_observed_as_a_share_of_the_arm_s_largest(to_library):
+    observed = observe_payload(to_library(0.35), SPEC)
     assert observed.dtype == np.float32
     np.testing.assert_allclose(observed, [0.35], rtol=1e-6)
-    assert observe_payload(np.zeros(3)).shape == (3, 1)
+    half = SPEC.replace(mass={"arm_kg": SPEC.mass.arm_kg / 2, "gripper_kg": SPEC.mass.gripper_kg / 2})
+    np.testing.assert_allclose(observe_payload(to_library(0.35), half), [0.7], rtol=1e-6)
+    assert observe_payload(np.zeros(3), SPEC).shape == (3, 1)
     assert layouts(9)["payload"][OBS_SIZE:] == ("payload_kg",)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_softarm.sensing.load import JUMP_KG, N_AVERAGED, Load, LoadEstimator, averaged, tell_load
+from mjx_softarm.sensing.load import JUMP, N_AVERAGED, Load, LoadEstimator, averaged, tell_load
 
 N = 9
 
@@ -20,7 +20,7 @@ def linear(of_springs, of_pressures, dtype=np.float32):
 def after(*told_kg):
     load = Load(0.0)
     for kg in told_kg:
-        load = averaged(load, kg)
+        load = averaged(load, kg, 1.0)
     return load
 
 
@@ -48,14 +48,20 @@ def test_rests_are_averaged():
     assert late.kg == pytest.approx(0.5 + 0.1 / N_AVERAGED) and late.n_rests == N_AVERAGED
 
 
-@pytest.mark.parametrize("change_kg", [-2 * JUMP_KG, 2 * JUMP_KG])
+@pytest.mark.parametrize("change_kg", [-2 * JUMP, 2 * JUMP])
 def test_two_rests_that_disagree_begin_a_new_average(change_kg):
     held = after(0.6, 0.6, 0.6)
-    once = averaged(held, 0.6 + change_kg)
+    once = averaged(held, 0.6 + change_kg, 1.0)
     assert once.kg == held.kg and not once.began
-    again = averaged(once, 0.65 + change_kg)
+    again = averaged(once, 0.65 + change_kg, 1.0)
     assert again == Load(0.65 + change_kg, 1, began=True)
-    assert not averaged(again, 0.65 + change_kg).began
+    assert not averaged(again, 0.65 + change_kg, 1.0).began
+
+
+def test_a_lighter_arm_s_average_begins_anew_sooner():
+    load = averaged(averaged(Load(0.1, 3), 0.15, 0.1), 0.15, 0.1)
+    assert load == Load(0.15, 1, began=True)
+    assert not averaged(averaged(Load(0.1, 3), 0.15, 1.0), 0.15, 1.0).began
 
 
 def test_one_odd_rest_is_forgotten():

@@ -87,7 +87,10 @@ def test_a_run_survives_kill_9_and_ends_with_the_same_bits(arm, tmp_path, monkey
     assert main(["evaluate", str(whole)]) == 0
     figures = json.loads((whole / "evaluation.json").read_text())
     assert figures == json.loads((killed / "evaluation.json").read_text())
-    assert main(["evaluate", str(whole), "--payload", "50"]) == 0
+    carried_kg = []
+    carrying = lambda spec, *rest: carried_kg.append(spec.mass.payload_kg) or ReachEnv(spec, *rest)  # noqa: E731
+    monkeypatch.setattr("train.runs.command.ReachEnv", carrying)
+    assert main(["evaluate", str(whole), "--payload", "50"]) == 0 and carried_kg == [0.05]
     loaded = json.loads((whole / "evaluation-50g.json").read_text())
     assert loaded.keys() == figures.keys() and loaded["median_mm"] != figures["median_mm"]
     assert all((whole / name).stat().st_size > 10_000 for name in REACH_PICTURES)
@@ -95,7 +98,7 @@ def test_a_run_survives_kill_9_and_ends_with_the_same_bits(arm, tmp_path, monkey
     config = json.loads((whole / "config.json").read_text())
     assert {"python", "packages", "commit"} <= config["provenance"].keys()
 
-    smallest = {"N_TRAINING": 512, "N_HELD_OUT": 64, "N_STEPS": 10, "PAYLOADS_KG": (0.0,)}
+    smallest = {"N_TRAINING": 512, "N_HELD_OUT": 64, "N_STEPS": 10, "PAYLOADS": (0.0,)}
     for name, smaller in smallest.items():  # how exact it is, test_estimator asks
         monkeypatch.setattr(f"train.runs.estimator.{name}", smaller)
     assert main(["export", str(whole)]) == 0

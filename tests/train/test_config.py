@@ -35,10 +35,6 @@ def test_overrides_reach_every_level_and_leave_the_preset_alone():
             "updates_per_env_step=0.001",
             "expected a finite number of at least one update per step of all",
         ),
-        (
-            "env.observation=payload",
-            "env.randomisation.payload_max_kg: got 0 with env.observation 'payload', expected at least 1",
-        ),
         ("replay_capacity=10", "replay_capacity: got 10, expected at least n_arms = 128"),
     ],
 )
@@ -48,11 +44,16 @@ def test_a_setting_that_cannot_be_is_named(assignment, message):
     assert message in str(error.value)
 
 
+def test_a_payload_that_is_observed_is_up_to_the_arm_s_largest():
+    for given in (0.0, 0.5):
+        with pytest.raises(ConfigError, match=f"payload_max_kg: got {given:g} .*, expected none"):
+            override(PRESETS["payload"], [f"env.randomisation.payload_max_kg={given}"])
+
+
 def test_demonstrations_know_no_payload():
-    payloads = ["env.observation=payload", "env.randomisation.payload_max_kg=1"]
-    assert override(PRESETS["quick"], payloads).env.observation == "payload"
+    assert override(PRESETS["quick"], ["env.observation=payload"]).env.observation == "payload"
     with pytest.raises(ConfigError, match="env.observation: got 'payload', expected 'pose' or 'motion'"):
-        override(IMITATION_PRESETS["pipe"], payloads)
+        override(IMITATION_PRESETS["pipe"], ["env.observation=payload"])
 
 
 @pytest.mark.parametrize("config", [*PRESETS.values(), *IMITATION_PRESETS.values()])

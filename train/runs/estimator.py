@@ -36,7 +36,7 @@ from mjx_softarm.sensing.estimator import (
     estimate_frame,
     expected_springs,
 )
-from mjx_softarm.sensing.load import HIGHEST, LARGEST_KG, LOWEST, LoadEstimator, tell_load
+from mjx_softarm.sensing.load import HIGHEST, LOWEST, LoadEstimator, tell_load
 from mjx_softarm.sensing.pose import frame_from_pose
 from mjx_softarm.spec import ArmSpec
 
@@ -46,7 +46,7 @@ N_STEPS = 8_000
 BATCH = 256
 WIDTH = 128
 LEARNING_RATE = 4e-3  # at the start, with a cosine decay to zero
-PAYLOADS_KG = (0.0, 0.25, 0.5, LARGEST_KG)  # added to the specification's, at which errors are given
+PAYLOADS = (0.0, 0.25, 0.5, 1.0)  # at which errors are given, as shares of the largest
 CHAMBERS_OFF = 0.03  # share by which stiffness and area of a chamber may be off
 TURN_MM = 50.0  # tip distance that costs as much as a turn by one radian
 CHANGE_SCALE = 0.015  # scale of the network's outputs, in section lengths and half radians
@@ -118,7 +118,7 @@ def _loads(spec: ArmSpec, seed: int) -> np.ndarray:
 
 
 def _load_max_kg(spec: ArmSpec) -> float:
-    return spec.mass.payload_kg + LARGEST_KG
+    return spec.mass.payload_kg + spec.mass.largest_payload_kg
 
 
 def _stronger(spec: ArmSpec) -> ArmSpec:
@@ -142,7 +142,7 @@ def _first_estimator(spec: ArmSpec, pool: LoadedPool, key: Array) -> PoseEstimat
         spring_centre_m=jnp.mean(pool.spring_m, axis=0),
         spring_scale_m=jnp.std(pool.spring_m, axis=0),
         load_centre_kg=jnp.asarray(spec.mass.payload_kg),
-        load_scale_kg=jnp.asarray(LARGEST_KG),
+        load_scale_kg=jnp.asarray(spec.mass.largest_payload_kg),
         change_scale=jnp.asarray(scale),
     )
 
@@ -226,7 +226,8 @@ def _errors(
 ) -> tuple[dict[float, Error], ...]:
     """Return errors of tip [mm], axes [deg], load [kg] and springs [mm], by payload."""
     tip_mm, turn_deg, load_off_kg, spring_mm = {}, {}, {}, {}
-    for payload_kg in PAYLOADS_KG:
+    for share in PAYLOADS:
+        payload_kg = share * spec.mass.largest_payload_kg
         load_kg = spec.mass.payload_kg + payload_kg
         loaded = spec.replace(mass={"payload_kg": load_kg})
         pool = jax.tree.map(

@@ -151,7 +151,7 @@ def start_keys(n_arms: int) -> Array:
 
 def nominal(env: ReachEnv) -> ReachEnv:
     """Return the environment without randomisation."""
-    config = dataclasses.replace(env.config, randomisation=Randomisation())
+    config = dataclasses.replace(env.config, randomisation=Randomisation(payload_max_kg=0.0))
     return env if config == env.config else ReachEnv(env.spec, config, env.s2r)
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from calib.fit.equilibrium import PAYLOAD_SHARE, tip_changes
+from calib.fit.equilibrium import tip_changes
 from calib.fit.parameters import names, spec_at
 from mjx_softarm import ArmSpec
 from mjx_softarm.mechanics.excitation import random_pressures
@@ -30,9 +30,8 @@ def test_a_shifted_base_shifts_the_tip_as_far_and_a_marker_s_site_does_nothing()
 @pytest.mark.parametrize("what", [{"stiffness0": 0.02}, {"offset1": 5e-3, "offset2": -5e-3}])
 def test_chambers_that_are_off_move_the_tip_as_those_of_such_an_arm(what):
     x, far = change(area0=0.1), change(**what)
-    heaviest_kg = PAYLOAD_SHARE * (SPEC.mass.arm_kg + SPEC.mass.gripper_kg)
     pressure_kpa, moved_m = random_pressures(SPEC, 1000, 5), []
-    for payload_kg in (0.0, heaviest_kg):
+    for payload_kg in (0.0, SPEC.mass.largest_payload_kg):
         arms = [spec_at(SPEC.replace(mass={"payload_kg": payload_kg}), at) for at in (x - far, x + far)]
         low, high = (settle_many(arm, pressure_kpa) for arm in arms)
         away_m = 0.5 * np.linalg.norm(high.tip_position_m - low.tip_position_m, axis=1)

@@ -19,7 +19,7 @@ from mjx_softarm.sensing.estimator import estimate_frame, expected_springs
 from mjx_softarm.sensing.load import tell_load
 from mjx_softarm.sensing.pose import frame_from_pose
 from train.runs import estimator as module
-from train.runs.estimator import PAYLOADS_KG, distil
+from train.runs.estimator import PAYLOADS, distil
 
 SPEC = ArmSpec.default()
 N, N_ARMS = SPEC.n_chambers, 512
@@ -64,9 +64,9 @@ def test_springs_of_known_pressures(distilled, pool):
 
 def test_errors_are_told_by_payload(distilled):
     for errors in (distilled.tip_mm, distilled.turn_deg, distilled.load_kg, distilled.spring_mm):
-        assert tuple(errors) == PAYLOADS_KG
+        assert tuple(errors) == PAYLOADS
         assert all(0.0 < error.median < error.p95 < error.largest for error in errors.values())
-    medians = [distilled.spring_mm[payload_kg].median for payload_kg in PAYLOADS_KG]
+    medians = [distilled.spring_mm[payload_kg].median for payload_kg in PAYLOADS]
     assert medians == sorted(medians)
 
 
@@ -89,7 +89,7 @@ def test_payload_is_told_and_then_the_pose(distilled, payload_kg):
 
 def test_same_seed_same_networks(monkeypatch):
     small(monkeypatch, 20)
-    monkeypatch.setattr(module, "PAYLOADS_KG", (0.0,))
+    monkeypatch.setattr(module, "PAYLOADS", (0.0,))
     one, same = (jax.tree.leaves(distil(SPEC, 3)[:3]) for _ in range(2))
     assert all(x.dtype == np.float32 for x in one)
     assert all(np.array_equal(x, y) for x, y in zip(one, same, strict=True))
