@@ -62,7 +62,7 @@ _SHIFT = 0.01  # also of the goals that are so far off, since a search is only a
 _RUNS = ("calm", "lost", "stuck", "late", "leaking", "unplugged", "swinging", "heavy", "pressed", "dropping")
 _RUNS += ("shaken",)  # and leaking: a chamber is lost in motion
 _RUN_TICKS = 400  # at most
-_HEAVY, _PRESSED, _CARRIED = 1.4, 1.8, 0.8  # payloads of runs, as shares of the largest,
+_HEAVY, _PRESSED, _CARRIED = 1.45, 1.8, 0.8  # payloads of runs, as shares of the largest,
 _DROP_TICK = 200  # and when the last one falls, and the goal is given again
 _WEIGHT_MAX_KPA = 8.0
 

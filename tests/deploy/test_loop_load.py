@@ -192,8 +192,8 @@ def test_object_that_drops_is_told():
 
 
 def test_overload_is_told():
-    run = follow(LoadedArm(1.3))
-    assert set(run.counts()) == {Fault.OVERLOADED} and run.log.load_kg[-1] == pytest.approx(1.3, abs=0.03)
+    run = follow(LoadedArm(1.45))
+    assert set(run.counts()) == {Fault.OVERLOADED} and run.log.load_kg[-1] == pytest.approx(1.45, abs=0.03)
 
 
 def test_what_no_payload_explains_leaves_the_springs_alone():
