@@ -32,7 +32,7 @@ class Settings:
     arm: Literal["twin", "rod"] = "twin"  # stand-in for an arm; a rod in open space alone
     twins: tuple[int, ...] = (0, 1, 2)  # their seeds
     seeds: tuple[int, ...] = (0, 1, 2)
-    preset: str = "paper"
+    preset: str = "analytic"  # in open space
     training: tuple[str, ...] = ()  # further settings of `train reach`, NAME=VALUE
     imitation: tuple[str, ...] = ()  # further settings of `train imitate`, NAME=VALUE
     n_poses: int = 500  # of a calibration's log

@@ -47,15 +47,14 @@ def paper(
         seeds: of training; None: 0,1,2
         loads: payloads in open space [g]; None: 35,105,220,330,500,1000
         arm: twin, or a rod, of other physics, in open space alone
-        preset: of training in open space; None: paper; analytic and payload leave no critics for the confined
-            circle
+        preset: of training in open space; None: analytic; in confined spaces it is quick
         env_steps: of training in open space; None: the preset's
         beside: further presets in open space with S2R, as long as they are; payload beside analytic
             as long as that
         out: working folder; None: runs/paper
     """
-    if only != "open" and (arm == "rod" or preset in ("analytic", "payload")):
-        raise InputError(f"--only: got {only}, expected open with --arm rod or --preset analytic or payload")
+    if only != "open" and arm == "rod":
+        raise InputError(f"--only: got {only}, expected open with --arm rod")
     if beside and (smoke or only == "confined"):
         raise InputError(f"--beside: got {','.join(beside)}, expected none with --smoke or --only confined")
     training = (f"total_env_steps={env_steps}",) if env_steps else None

@@ -75,7 +75,7 @@ def _loaded(how: str, rows: Sequence[Row]) -> list[Check]:
 def _confined(table: Sequence[Row], trainings: Sequence[Row]) -> list[Check]:
     shown, exchanged = _select(table, "pipe", "as shown"), _select(table, "pipe", "exchanged")
     narrow, circle = _select(table, "narrow", "as shown"), _select(table, "circle", "as shown")
-    moving, without = _select(table, "moving", "as shown in motion"), _select(table, "with", "0 g")
+    moving, without = _select(table, "moving", "as shown in motion"), _select(table, "quick", "0 g")
     time = np.mean(_values(moving, "seconds")) / np.mean(_values(shown, "seconds"))
     mm, without_mm = _mean_mm(circle), _mean_mm(without)
     both_mm = f"{mm:.2f} mm with, {without_mm:.2f} mm without"

@@ -121,7 +121,7 @@ def train_other(folder: Path, settings: Settings, name: str, twin: int, seed: in
     calibration, preset = folder / f"twin{twin}" / CALIBRATION, KINDS[name].reach
     if preset:
         options = ["--preset", preset, "--calibration", calibration]
-        if {preset, settings.preset} == ALIKE:
+        if {preset, settings.preset} == ALIKE or preset == settings.preset:
             options += _further(settings)
     else:
         options = [*_chosen(settings), "--spec", calibration / ARM_FILE]
@@ -173,8 +173,8 @@ def learn(folder: Path, settings: Settings, name: str, twin: int, seed: int) -> 
         options += ["--pipe", str(diameter_mm)]
     if kind.reward_of:
         options += ["--reward", str(folder / learned_run(kind.reward_of, twin, seed))]
-    if kind.from_reach:
-        options += ["--agent", str(folder / reach_run(twin, seed))]
+    if kind.begins_with:
+        options += ["--agent", str(folder / learned_run(kind.begins_with, twin, seed))]
     options += [f"--{text}" for text in (*kind.settings, *settings.imitation)]
     command(log, "imitate", str(folder / demonstrations_path(twin, kind.task)), *options)
 

@@ -16,7 +16,7 @@ class Kind(NamedTuple):
     preset: str = ""  # of `python -m train imitate`
     settings: tuple[str, ...] = ()  # NAME=VALUE
     reward_of: str = ""  # kind whose learned reward it takes, unchanged
-    from_reach: bool = False  # begins with the policy that was trained without demonstrations
+    begins_with: str = ""  # kind whose policy it begins with
     reach: str = ""  # preset of `python -m train reach`, beside that of the experiment
 
 
@@ -40,7 +40,7 @@ KINDS = {
         "learned in the wide pipe", "pipe250", "frozen", ("hand_made_weight=0",), reward_of="pipe"
     ),
     "narrow-hand-made": Kind("hand-made reward", "pipe250", "hand-made"),
-    "circle": Kind("with demonstrations", "circle16", "circle", from_reach=True),
+    "circle": Kind("with demonstrations", "circle16", "circle", begins_with="quick"),
 }
 TASKS = ("pipe300", "pipe250", "circle16")
 BESIDE = tuple(name for name, kind in KINDS.items() if kind.reach)

@@ -44,8 +44,8 @@ def trials(experiment: str, settings: Settings) -> list[Trial]:
 
     In open space, gradient descent has no training seed, so it runs once for each twin and load. In confined
     spaces the policy without gradient penalty is judged by its training alone, and the circle without
-    demonstrations is a trial of the open-space experiment. In motion both are tried, the policy learned at
-    rest and that learned in motion, and the latter is judged.
+    demonstrations is a trial of the policy that those with them begin with. In motion both are tried, the
+    policy learned at rest and that learned in motion, and the latter is judged.
     """
     found = []
     if experiment == "open":
@@ -64,7 +64,7 @@ def trials(experiment: str, settings: Settings) -> list[Trial]:
             found.append(Trial(kind, twin, seed, "exchanged"))
         if kind in ("pipe", "moving"):
             found.append(Trial(kind, twin, seed, "as shown", moves=True))
-    return found + [Trial("with", twin, seed) for twin in settings.twins for seed in settings.seeds]
+    return found + [Trial("quick", twin, seed) for twin in settings.twins for seed in settings.seeds]
 
 
 def stages(experiment: str, settings: Settings) -> list[list[Stage]]:
@@ -74,7 +74,6 @@ def stages(experiment: str, settings: Settings) -> list[list[Stage]]:
         for t in settings.twins
     ]
     runs = [(twin, seed) for twin in settings.twins for seed in settings.seeds]
-    on_twins = [_reach(*run) for run in runs]
     tried = [
         Stage(f"try {trial.name}", (trial.result,), jobs.try_out, (trial,))
         for trial in trials(experiment, settings)
@@ -86,8 +85,8 @@ def stages(experiment: str, settings: Settings) -> list[list[Stage]]:
     if experiment == "open":
         nominal = [_reach(None, seed) for seed in settings.seeds]
         others = [(kind, *run) for kind in ("chambers", *settings.beside) for run in runs]
-        on_twins += [_learn(*item, jobs.train_other) for item in others]
-        exports = [_export(twin, settings.seeds, others) for twin in (None, *settings.twins)]
+        on_twins = [_reach(*run) for run in runs] + [_learn(*item, jobs.train_other) for item in others]
+        exports = [_export(twin, others, settings.seeds) for twin in (None, *settings.twins)]
         loads = _film_loads(filmed, settings) * (settings.arm == "twin")
         compared = _compare(settings.twins[0])
         return [[*calibrations, *nominal], [*on_twins, compared], exports, [*tried, *films, *loads]]
@@ -97,9 +96,11 @@ def stages(experiment: str, settings: Settings) -> list[list[Stage]]:
         for task in TASKS
         for twin in settings.twins
     ]
+    quick = [("quick", *run) for run in runs]
+    on_twins = [_learn(*item, jobs.train_other) for item in quick]
     first = [_learn(*item) for item in trainings(settings) if not KINDS[item[0]].reward_of]
     with_their_reward = [_learn(*item) for item in trainings(settings) if KINDS[item[0]].reward_of]
-    exports = [_export(twin, settings.seeds, trainings(settings)) for twin in settings.twins]
+    exports = [_export(twin, [*quick, *trainings(settings)]) for twin in settings.twins]
     return [calibrations, [*demonstrations, *on_twins], first, with_their_reward, exports, [*tried, *films]]
 
 
@@ -135,8 +136,8 @@ def _learn(kind: str, twin: int, seed: int, job: Callable[..., None] = jobs.lear
     return Stage(f"learn {kind} for twin {twin}, seed {seed}", (result,), job, (kind, twin, seed))
 
 
-def _export(twin: int | None, seeds: Iterable[int], learned: Iterable[tuple[str, int, int]] = ()) -> Stage:
-    """Return the stage that exports an arm's policies: the experiment's own, and those of other kinds."""
+def _export(twin: int | None, learned: Iterable[tuple[str, int, int]], seeds: Iterable[int] = ()) -> Stage:
+    """Return the stage that exports an arm's policies of other kinds, and the experiment's own of `seeds`."""
     mine = [item for item in learned if item[0] != "no-penalty" and item[1] == twin]
     runs = (*(reach_run(twin, seed) for seed in seeds), *(learned_run(*item) for item in mine))
     policies = tuple(f"{run}/{POLICY_FILE}" for run in runs)

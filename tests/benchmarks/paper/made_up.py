@@ -100,6 +100,7 @@ def good_results(experiment, settings=FULL, changed=None):
             "gradient": 2.0,
             "with": 1.25,
             "payload": 1.0,
+            "quick": 1.25,
             "circle": 1.0,
         }.get(trial.kind)
         hit = trial.kind == "gradient" or trial.load_g == 1000

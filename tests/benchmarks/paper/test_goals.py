@@ -114,7 +114,7 @@ def test_gradient_descent_without_saturation_misses_its_goal():
         ({FIRST: made_up("pipe", (0.1, 0.1, 0.1), missed=[2])}, [X, Y, Z, CALM]),
         ({MOVED: made_up("pipe", missed=[2], tick_s=0.1)}, [TIME, CALM_MOVING]),
         ({pipe_trial(kind="circle"): made_up("circle", (0.1, 0.1, 0.1), missed=[2])}, [CIRCLE]),
-        ({Trial("with", 1, 1): made_up("with", (8.0, 0, 0), missed=[3])}, [CIRCLE]),
+        ({Trial("quick", 1, 1): made_up("quick", (8.0, 0, 0), missed=[3])}, [CIRCLE]),
         # Just met, or not judged:
         ({pipe_trial(moves=True): made_up("pipe", fails=(0, 1), pressed=0.5, tick_s=9.0)}, []),
         ({FIRST: made_up("pipe", fails=(0,))}, []),  # 8 of 9
@@ -140,6 +140,6 @@ def test_what_was_not_measured_is_not_met():
 
     assert left(lambda row: row["objects"] != "exchanged") == [BOTH, CALM]
     assert left(lambda row: not row["moves"]) == [MOVING, TIME, CALM_MOVING]
-    assert left(lambda row: row["kind"] != "with") == [CIRCLE]
+    assert left(lambda row: row["kind"] != "quick") == [CIRCLE]
     one_stage = {("circle", t, s): trained("pipe") for t in range(3) for s in range(3)}
     assert unmet("confined", one_stage) == [KEPT]

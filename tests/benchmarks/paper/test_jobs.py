@@ -100,7 +100,7 @@ def test_learning_starts_with_what_it_builds_on_resumes_or_starts_anew(tmp_path,
     (run / "config.json").touch()
     assert parsed(commands(*work)[0]).resume == run
     (agent,) = commands(jobs.learn, tmp_path, TINY, "circle", 1, 2)
-    assert parsed(agent).agent == tmp_path / reach_run(1, 2)
+    assert parsed(agent).agent == tmp_path / learned_run("quick", 1, 2)
 
 
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if KINDS[kind].task])

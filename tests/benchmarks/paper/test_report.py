@@ -58,7 +58,7 @@ def test_spreads_group_kinds_and_variants():
     assert set(found) == {
         *(("pipe", "as shown"), ("pipe", "exchanged"), ("hand-made", "as shown"), ("narrow", "as shown")),
         *(("narrow-learned", "as shown"), ("narrow-hand-made", "as shown")),
-        *(("circle", "as shown"), ("with", "0 g")),
+        *(("circle", "as shown"), ("quick", "0 g")),
         *(("pipe", "as shown in motion"), ("moving", "as shown in motion")),
     }
     shown = found["pipe", "as shown"]
