@@ -12,6 +12,7 @@ from mjx_softarm.deploy import faults
 from mjx_softarm.deploy.controller import Controller, State
 from mjx_softarm.deploy.faults import Event, Fault
 from mjx_softarm.mdp.observation import rate_ticks
+from mjx_softarm.mdp.rewards import scaled_error
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.policy.runtime import InMotion, sensed, tip_pose
 from mjx_softarm.sensing.load import Load
@@ -19,6 +20,7 @@ from mjx_softarm.sensing.pose import pose_error
 
 MAX_SHIFT = np.repeat([25.0, 5.0], 3)  # [mm, deg] of a goal
 MAX_KEPT = np.repeat([10.0, 2.0], 3)  # of the next one; what goes beyond is of a goal that is out of reach
+SHARES = (1.0, 0.5, 0.25)  # of what is left, by which an action may shift the goal: the first that will do
 MOVING_SHARE = 0.05  # of what is left to where the tip should be, by which an action shifts a moving goal
 
 
@@ -35,10 +37,15 @@ def believed(controller: Controller, spring_m: np.ndarray, load: Load) -> tuple[
 
 
 def go(controller: Controller, state: State, at_rest: bool) -> tuple[State, list[Event], bool]:
-    """Act if the goal is new or the springs have settled; arrive when they have after the last action."""
-    events: list[Event] = []
+    """Act if the goal is new or the springs have settled; arrive when they have after the last action.
+
+    An action at rest that would lead away from the goal is not taken: the arm has arrived.
+    """
+    policy, events = controller.policy, list[Event]()
+    shifts, again = [state.shift], False
+    assert state.goal is not None  # `step` asks
     if state.n_actions > 0:
-        policy, seen = controller.policy, (state.springs_m, state.reference_m, state.pressure_kpa)
+        seen = state.springs_m, state.reference_m, state.pressure_kpa
         settled = at_rest and bool(faults.on_reference(*seen, policy.gains, policy.tolerance_m))
         if not settled and state.n_ticks * controller.dt_s < _patience_s(policy, state.n_actions):
             return state, [], False
@@ -47,20 +54,25 @@ def go(controller: Controller, state: State, at_rest: bool) -> tuple[State, list
         if not policy.action_s or state.n_actions == policy.n_actions:
             events += _unsettled(controller, state, settled)
         if settled:
-            state = state._replace(shift=_shifted(controller, state))
-        if state.n_actions == controller.policy.n_actions:
-            return state._replace(goal=None, shift=_clipped(state.shift, MAX_KEPT)), events, True
-    elif not controller.policy.action_s:  # it makes up for what is left with its next actions
-        state = state._replace(shift=np.zeros(6))
-    assert state.goal is not None  # `step` asks
+            left = _left(controller, state)
+            shifts = [_clipped(state.shift - share * left) for share in SHARES]
+            again = not policy.action_s
+        if state.n_actions == policy.n_actions:
+            return state._replace(goal=None, shift=_clipped(shifts[0], MAX_KEPT)), events, True
+    elif not policy.action_s:  # it makes up for what is left with its next actions
+        shifts = [np.zeros(6)]
     pose, away = believed(controller, state.spring_m, state.load)
     if away > 1.0:
         message = f"{away:.1f} times as far from the training rows as the network is believed"
         events.append(Event(Fault.EXTRAPOLATION, message))
-    reference_m = _planned(controller, state, pose, state.shift)
-    n_actions = state.n_actions + 1
-    state = state._replace(reference_m=reference_m, acted_load=state.load, n_actions=n_actions, n_ticks=0)
-    return state, events, False
+    for shift in shifts:
+        reference_m = _planned(controller, state, pose, shift)
+        if not (again and _leads_away(controller, state, reference_m)):
+            break
+    else:
+        return state._replace(goal=None), events, True
+    acted = {"reference_m": reference_m, "shift": shift, "acted_load": state.load}
+    return state._replace(**acted, n_actions=state.n_actions + 1, n_ticks=0), events, False
 
 
 def chase(controller: Controller, state: State) -> State:
@@ -103,20 +115,37 @@ def _planned(controller: Controller, state: State, pose: np.ndarray, shift: np.n
     return controller.plan(pose, state.goal + shift, state.spring_m, observed)
 
 
-def _shifted(controller: Controller, state: State) -> np.ndarray:
-    """Return the shift (6,) [mm, deg] of goals from now on, less what the last references leave.
+def _left(controller: Controller, state: State) -> np.ndarray:
+    """Return what the last references leave of the way to the goal (6,) [mm, deg].
 
-    References, not springs, since these may creep by some tenths of a millimetre in an arm at rest; but the
-    springs of saturated chambers, which do not follow their references. What a payload bends is made up for
-    once: where the policy observes it, by its next action, so here it is the one that it was given.
+    What a payload bends is made up for once: where the policy observes it, by its next action, so here it is
+    the one that it was given.
     """
     assert state.goal is not None and state.reference_m is not None
+    load = state.acted_load if controller.policy.observation == "payload" else state.load
+    return pose_error(_made(controller, state, state.reference_m, load), state.goal)
+
+
+def _leads_away(controller: Controller, state: State, reference_m: np.ndarray) -> bool:
+    """Return whether references (n,) [m] leave more than the last ones, and more than a goal allows."""
+    assert state.goal is not None and state.reference_m is not None
+    goal, reward = state.goal, controller.policy.reward
+    made = (_made(controller, state, x, state.load) for x in (state.reference_m, reference_m))
+    now, then = (np.linalg.norm(scaled_error(pose, goal, reward)) for pose in made)
+    return bool(then > max(now, reward.threshold))
+
+
+def _made(controller: Controller, state: State, reference_m: np.ndarray, load: Load) -> np.ndarray:
+    """Return the pose (6,) [mm, deg] that references (n,) [m] make of an arm that rests on the last ones.
+
+    References, not springs, since these may creep by some tenths of a millimetre in an arm at rest; but the
+    springs of saturated chambers that are asked for more, which do not follow.
+    """
+    assert state.reference_m is not None
     policy, mean_m = controller.policy, state.springs_m.mean(axis=0)
     mask = saturated(state.pressure_kpa, state.reference_m, mean_m, policy.gains, policy.tolerance_m)
-    load = state.acted_load if policy.observation == "payload" else state.load
-    pose, _ = believed(controller, np.where(mask, mean_m, state.reference_m), load)
-    left = pose_error(np.asarray(pose, float), state.goal)
-    return _clipped(state.shift - left)
+    stays = mask & ((reference_m - mean_m) * (state.reference_m - mean_m) > 0.0)
+    return np.asarray(believed(controller, np.where(stays, mean_m, reference_m), load)[0], float)
 
 
 def _beside(pose: np.ndarray, due: np.ndarray) -> np.ndarray:

@@ -17,9 +17,11 @@ was trained in motion acts as ever. Where the goal stops moving, it becomes an o
 
 The policy takes an arm as specified to a goal; one that observes the payload, an arm that carries what rests
 told. What is left of the way shows, when the springs have settled, in the pose that its references make: the
-goal is shifted by as much from then on. A policy of motion seldom settles between its actions, so its next
-goals are shifted too, at most by `acting.MAX_KEPT`; a moving one with each action by a small share of how far
-the tip is beside the goal's way.
+goal is shifted by as much from then on. A policy that learned few goals may answer a shifted one wrongly. So
+where its references would leave more than the last ones, and more than a goal allows, the goal is shifted by
+less; if a quarter is no better, the arm has arrived. A policy of motion seldom settles between its actions,
+so its next goals are shifted too, at most by `acting.MAX_KEPT`; a moving one with each action by a small
+share of how far the tip is beside the goal's way.
 
 Gains, limits, calibration, rate, tolerance and number of actions are the policy file's.
 `mjx_softarm.deploy.faults` says what can go wrong.

@@ -13,6 +13,7 @@ from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.link import vented
 from mjx_softarm.deploy.reachability import distances
 from mjx_softarm.export.symbols import Symbol, constant, repeat, symbol
+from mjx_softarm.mdp.rewards import scaled_error
 from mjx_softarm.policy import reach
 from mjx_softarm.policy.runtime import InMotion, action_towards, actor_output, sensed, tip_pose
 from mjx_softarm.sensing.load import tell_load
@@ -119,6 +120,8 @@ def parts(controller: Controller) -> dict[str, Computation]:
     law = {"written_kpa": written_kpa} | {f"next_{name}": value for name, value in after._asdict().items()}
     mask = saturated(pressure_kpa, reference_m, spring_m, gains, tolerance_m)
     settled = faults.on_reference(springs_m, reference_m, pressure_kpa, gains, tolerance_m)
+    scaled = scaled_error(xp.asarray(pose, dtype=np.float64), goal, policy.reward)
+    weighted = xp.sqrt(xp.sum(scaled * scaled))
     stuck = faults.stock_still(springs_m) & faults.asked_to_move(springs_m, pressures_kpa)
     search = symbol("search", reach.begin(policy, 1).shape)
     found, error = reach.nearest_of(policy, goal[None], search)
@@ -129,7 +132,7 @@ def parts(controller: Controller) -> dict[str, Computation]:
     return {
         "lengths": of(readings, spring_m, length_m=reading.length_m, lost=_lost(reading)),
         "told_load": of(springs_m, pressures_kpa, kg=told_kg),
-        "left": of(pose, goal, off=pose_error(xp.asarray(pose, dtype=np.float64), goal)),
+        "left": of(pose, goal, off=pose_error(xp.asarray(pose, dtype=np.float64), goal), error=weighted),
         "tip": of(spring_m, load_kg, tip=tip, away=constant(away)),
         "references": of(pose, goal, spring_m, *motion, load_kg, asked_m=policy.actions.lengths(action)),
         "law": of(reference_m, spring_m, *state, **law),

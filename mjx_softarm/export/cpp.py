@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from importlib import resources
 
-from mjx_softarm.deploy.acting import MAX_KEPT, MAX_SHIFT
+from mjx_softarm.deploy.acting import MAX_KEPT, MAX_SHIFT, SHARES
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.faults import LATE_TICKS, LOST_TICKS, SETTLE_TIMEOUT_S, Fault, Response
 from mjx_softarm.deploy.loop import MOVING_WINDOWS, OVERLOAD, REST_WINDOWS
@@ -59,6 +59,7 @@ def sources(controller: Controller, policy_sha256: str) -> dict[str, str]:
         "JUMP": repr(JUMP * most_kg),
         "N_JUMPS": N_JUMPS,
         "N_AVERAGED": N_AVERAGED,
+        "LEAST_SHARE": repr(min(SHARES)),
         "MAX_SHIFT": ", ".join(map(repr, MAX_SHIFT.tolist())),
         "MAX_KEPT": ", ".join(map(repr, MAX_KEPT.tolist())),
         "GOAL": ", ".join(f"{value:.1f}" for value in policy.workspace[0]),

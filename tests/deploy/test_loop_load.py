@@ -128,6 +128,26 @@ def test_goal_is_shifted_by_what_the_payload_bends():
     assert arrival.reached and arrival.estimate[2] == pytest.approx(GOAL[2], abs=2.0)
 
 
+@pytest.mark.parametrize(("wrong", "n_asked", "taken"), [(10.0, 4, 0), (2.5, 7, 3)])
+def test_a_shift_that_leads_away_is_made_smaller_or_ends_the_goal(wrong, n_asked, taken):
+    """The plan is 3 mm off, and answers a shift the other way: it leaves 33, 18, 10.5 mm, or 10.5, 6.8, 4.9.
+
+    A goal allows 5.4 mm.
+    """
+    asked_mm, references_m = [], []
+
+    def plan(pose, goal, spring_m, sensed):
+        asked_mm.append(goal[2] - GOAL[2])
+        answer = GOAL + [0.0, 0.0, 3.0 - wrong * asked_mm[-1], 0.0, 0.0, 0.0]
+        references_m.append(plan_unloaded(pose, answer, spring_m, sensed))
+        return references_m[-1]
+
+    run = go(LinearArm(), [GOAL], Controller.of(LOADED, plan))
+    assert len(asked_mm) == n_asked and [arrival.reached for arrival in run.arrivals] == [True]
+    np.testing.assert_allclose(asked_mm[1:4], asked_mm[1] * np.array([1.0, 0.5, 0.25]))
+    np.testing.assert_array_equal(run.log.reference_m[-1], references_m[taken])
+
+
 @pytest.mark.parametrize(("action_s", "kept_mm"), [(0.0, 0.0), (1.0, 10.0)])
 def test_shift_ends_somewhere_and_the_next_goal_of_a_policy_of_motion_has_a_part_of_it(action_s, kept_mm):
     asked = []
