@@ -150,7 +150,7 @@ def make_golden(controller: Controller, policy_sha256: str, seed: int = 0) -> Go
             rounded.answer(row)
             if np.abs(machine.state.pressure_kpa - rounded.state.pressure_kpa).max() > most_kpa:
                 break
-            arrived = machine.state.goal is None and not (kind == "dropping" and tick < _DROP_TICK)
+            arrived = machine.state.goal is None and not (kind == "dropping" and tick < 2 * _DROP_TICK)
             if arrived or (machine.stopped and not machine.state.pressure_kpa.any()):
                 break
             row = run.send(machine.state.pressure_kpa)
