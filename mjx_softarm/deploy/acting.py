@@ -39,12 +39,14 @@ def believed(controller: Controller, spring_m: np.ndarray, load: Load) -> tuple[
 def go(controller: Controller, state: State, at_rest: bool) -> tuple[State, list[Event], bool]:
     """Act if the goal is new or the springs have settled; arrive when they have after the last action.
 
-    An action at rest that would lead away from the goal is not taken: the arm has arrived.
+    A further action at rest that would lead away from the goal is tried with smaller shifts; where none will
+    do, the arm has arrived.
     """
     policy, events = controller.policy, list[Event]()
-    shifts, again = [state.shift], False
+    shifts, most = [state.shift], None  # to try in turn; weighted error that an action may leave
     assert state.goal is not None  # `step` asks
     if state.n_actions > 0:
+        assert state.reference_m is not None
         seen = state.springs_m, state.reference_m, state.pressure_kpa
         settled = at_rest and bool(faults.on_reference(*seen, policy.gains, policy.tolerance_m))
         if not settled and state.n_ticks * controller.dt_s < _patience_s(policy, state.n_actions):
@@ -54,11 +56,14 @@ def go(controller: Controller, state: State, at_rest: bool) -> tuple[State, list
         if not policy.action_s or state.n_actions == policy.n_actions:
             events += _unsettled(controller, state, settled)
         if settled:
-            left = _left(controller, state)
+            # What a payload bends is made up for once: where the policy observes it, by its next action.
+            load = state.acted_load if policy.observation == "payload" else state.load
+            left = pose_error(_made(controller, state, state.reference_m, load), state.goal)
             shifts = [_clipped(state.shift - share * left) for share in SHARES]
-            again = not policy.action_s
+            if not policy.action_s:
+                most = max(_error(controller, state, state.reference_m), policy.reward.threshold)
         if state.n_actions == policy.n_actions:
-            return state._replace(goal=None, shift=_clipped(shifts[0], MAX_KEPT)), events, True
+            return _arrived(state, shifts[0]), events, True
     elif not policy.action_s:  # it makes up for what is left with its next actions
         shifts = [np.zeros(6)]
     pose, away = believed(controller, state.spring_m, state.load)
@@ -67,10 +72,10 @@ def go(controller: Controller, state: State, at_rest: bool) -> tuple[State, list
         events.append(Event(Fault.EXTRAPOLATION, message))
     for shift in shifts:
         reference_m = _planned(controller, state, pose, shift)
-        if not (again and _leads_away(controller, state, reference_m)):
+        if most is None or not _error(controller, state, reference_m) > most:
             break
     else:
-        return state._replace(goal=None), events, True
+        return _arrived(state, state.shift), events, True
     acted = {"reference_m": reference_m, "shift": shift, "acted_load": state.load}
     return state._replace(**acted, n_actions=state.n_actions + 1, n_ticks=0), events, False
 
@@ -115,24 +120,16 @@ def _planned(controller: Controller, state: State, pose: np.ndarray, shift: np.n
     return controller.plan(pose, state.goal + shift, state.spring_m, observed)
 
 
-def _left(controller: Controller, state: State) -> np.ndarray:
-    """Return what the last references leave of the way to the goal (6,) [mm, deg].
-
-    What a payload bends is made up for once: where the policy observes it, by its next action, so here it is
-    the one that it was given.
-    """
-    assert state.goal is not None and state.reference_m is not None
-    load = state.acted_load if controller.policy.observation == "payload" else state.load
-    return pose_error(_made(controller, state, state.reference_m, load), state.goal)
+def _arrived(state: State, shift: np.ndarray) -> State:
+    """Return the state without its goal, with what the next goal keeps of a shift (6,) [mm, deg]."""
+    return state._replace(goal=None, shift=_clipped(shift, MAX_KEPT))
 
 
-def _leads_away(controller: Controller, state: State, reference_m: np.ndarray) -> bool:
-    """Return whether references (n,) [m] leave more than the last ones, and more than a goal allows."""
-    assert state.goal is not None and state.reference_m is not None
-    goal, reward = state.goal, controller.policy.reward
-    made = (_made(controller, state, x, state.load) for x in (state.reference_m, reference_m))
-    now, then = (np.linalg.norm(scaled_error(pose, goal, reward)) for pose in made)
-    return bool(then > max(now, reward.threshold))
+def _error(controller: Controller, state: State, reference_m: np.ndarray) -> float:
+    """Return the weighted error at the goal that references (n,) [m] leave with the payload that was told."""
+    assert state.goal is not None
+    pose = _made(controller, state, reference_m, state.load)
+    return float(np.linalg.norm(scaled_error(pose, state.goal, controller.policy.reward)))
 
 
 def _made(controller: Controller, state: State, reference_m: np.ndarray, load: Load) -> np.ndarray:

@@ -75,7 +75,7 @@ class Tick(NamedTuple):
 
     spring_m: np.ndarray  # (n,) lengths believed in; NaN before the first reading
     events: tuple[Event, ...]
-    arrived: bool  # the goal had all its actions and the springs have settled
+    arrived: bool  # the springs have settled, and no further action is due
 
     @property
     def stop(self) -> Event | None:

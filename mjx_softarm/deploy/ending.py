@@ -43,7 +43,7 @@ class Ending(NamedTuple):
 
 
 class Arrival(NamedTuple):
-    """A goal that had all its actions."""
+    """A goal towards which no further action was due."""
 
     goal: np.ndarray  # (6,) [mm, deg]
     estimate: np.ndarray  # (6,) [mm, deg] pose believed in

@@ -43,7 +43,7 @@ from mjx_softarm.sensing.load import HIGHEST, LOWEST, Load, averaged, tell_load
 # A chamber counts as lost after so many windows in a row: of an arm at rest, and of one that moves, whose
 # springs and pressures come after their references.
 REST_WINDOWS, MOVING_WINDOWS = 2, 6
-OVERLOAD = 1.4  # times the largest payload; 1 kg on twins was told as up to 1.36 kg
+OVERLOAD = 1.4  # times the largest payload; 1 kg was told as up to 1.4 kg at the goals of twins
 
 
 def with_goal(controller: Controller, state: State, goal: np.ndarray) -> tuple[State, tuple[Event, ...]]:

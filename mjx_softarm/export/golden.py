@@ -11,7 +11,7 @@ A row of inputs is one tick of the loop, and its answer the outputs:
     reading<k>   of the sensors; nan where none came
     goal_<axis>  [mm, deg]
     faults       sum of 2**k over the faults of this tick, k counted in `mjx_softarm.deploy.faults.Fault`
-    arrived      1: the goal had all its actions and the springs have settled
+    arrived      1: the springs have settled, and no further action is due
     pressure<k>  [kPa] to write; after a fault whose response is to vent, a ramp to zero
     reference<k> [m]
     length<k>    [m] believed in

@@ -28,7 +28,7 @@ class Reference(NamedTuple):
 
 
 class InMotion(NamedTuple):
-    """What the loop knows of an arm in motion besides springs and payload."""
+    """Earlier lengths, references and integral of an arm in motion."""
 
     before_m: Array  # (n,) lengths `rate_ticks` before; NaN if not known, as of an arm at rest
     last_reference_m: Array  # (n,) references of the last action; NaN before the first

@@ -36,6 +36,15 @@ def test_rows_meet_faults_and_vent(golden, controller):
     assert ramp[0].max() > 1.0 and not ramp[-1].any() and (np.diff(ramp, axis=0) <= 1e-9).all()
 
 
+def test_rows_meet_an_arrival_before_the_last_action(golden, controller):
+    """The weights are random, so an answer to a shifted goal often leads away from the goal."""
+    begins, n_taken = np.flatnonzero(golden.inputs[:, FLAGS.index("new_goal")]), []
+    for arrival in np.flatnonzero(golden.outputs[:, 1]):
+        first = begins[np.searchsorted(begins, arrival, "right") - 1]
+        n_taken.append(len(np.unique(golden.outputs[first : arrival + 1, 2 + N : 2 + 2 * N], axis=0)))
+    assert 1 <= min(n_taken) < controller.policy.n_actions
+
+
 def test_jax_agrees_on_all_single_rows(golden, controller):
     unknown, zeros = jnp.full(N, jnp.nan), jnp.zeros(N)
     motion = InMotion(unknown, unknown, zeros)
