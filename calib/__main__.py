@@ -116,7 +116,7 @@ def _run(
         for note in section.notes:
             print(f"note: {section.title}: {note}")
     print(f"report: {out / 'report.html'}")
-    print(f"next: python -m train reach --calibration {out}")
+    print(f"next: python -m train reach --preset analytic --calibration {out}")
     return 1 if any(section.warnings for section in calibration.sections) else 0
 
 

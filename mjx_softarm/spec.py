@@ -136,7 +136,7 @@ class Unmodelled:
     """Pressures that hold the unloaded arm, measured less simulated: what the model of the chambers leaves.
 
     Linear in the springs' lengths; nothing where a file has no such table. The simulation goes without, but a
-    payload is told by pressures, with this taken into account.
+    payload is estimated from pressures, with this taken into account.
     """
 
     pressure_kpa: tuple[float, ...] = numbers("chambers")  # where springs have their sections' length

@@ -83,7 +83,7 @@ class TrainConfig:
         if self.env.observation == "payload" and given_kg is not None:
             raise ConfigError(
                 f"env.randomisation.payload_max_kg: got {given_kg:g} with env.observation 'payload', "
-                "expected none: it is the arm's largest, since so much may be told"
+                "expected none: it is the arm's largest, since the loop may estimate so much"
             )
         if self.replay_capacity < self.n_arms:
             raise ConfigError(

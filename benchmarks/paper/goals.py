@@ -68,7 +68,7 @@ def _loaded(how: str, rows: Sequence[Row]) -> list[Check]:
         _at_most(f"{LIGHT_G} g{how}, mean translation", "mm", 2.5, light, "translation_mm"),
         _at_most(f"1 kg{how}, mean translation", "mm", 4.0, heavy, "translation_mm"),
         _at_most(f"1 kg{how}, largest translation of all runs", "mm", 12.0, heavy, "max_mm", np.max),
-        _at_most(f"payload{how}, as told, mean error at all loads", "g", 100.0, rows, "load_off_g"),
+        _at_most(f"payload{how}, estimated, mean error at all loads", "g", 100.0, rows, "load_off_g"),
     ]
 
 

@@ -2,7 +2,7 @@
 
 Holes, rings and bellows are not where the specification has them, so a chamber's pressure depends a little on
 the springs beside it. A straight line in all springs' lengths, fitted by least squares, takes that up. It
-matters to the payload, which is told by pressures: a kilogram is some 3 kPa in each chamber.
+matters to the payload, which is estimated from pressures: a kilogram is some 3 kPa in each chamber.
 """
 
 from __future__ import annotations

@@ -185,7 +185,7 @@ def with_pressures(section: Section, held: HeldPressures) -> Section:
     text = (
         f" The pressures that hold these poses are {held.before_kpa:.2f} kPa off the simulated ones (RMS, "
         f"held-out poses), and {held.after_kpa:.2f} kPa after a straight line in the springs' lengths, by "
-        "which payloads are told."
+        "which payloads are estimated."
     )
     data = {"held_pressures_rms_kpa": {"simulated": held.before_kpa, "fitted": held.after_kpa}}
     return dataclasses.replace(section, text=section.text + text, data=section.data | data)

@@ -25,7 +25,7 @@ MOVING_SHARE = 0.05  # of what is left to where the tip should be, by which an a
 
 
 def believed(controller: Controller, spring_m: np.ndarray, load: Load) -> tuple[np.ndarray, float]:
-    """Return the tip pose that springs (n,) [m] tell with a payload.
+    """Return the tip pose of springs (n,) [m] with a payload.
 
     Returns:
         Pose (6,) [mm, deg], NaN where a length is; `s2r.extrapolation` of it, 0 without a network.
@@ -126,7 +126,7 @@ def _arrived(state: State, shift: np.ndarray) -> State:
 
 
 def _error(controller: Controller, state: State, reference_m: np.ndarray) -> float:
-    """Return the weighted error at the goal that references (n,) [m] leave with the payload that was told."""
+    """Return the weighted error at the goal that references (n,) [m] leave with the estimated payload."""
     assert state.goal is not None
     pose = _made(controller, state, reference_m, state.load)
     return float(np.linalg.norm(scaled_error(pose, state.goal, controller.policy.reward)))

@@ -63,7 +63,7 @@ class State(NamedTuple):
     springs_m: np.ndarray  # (ticks, n) readings of the last window, the newest last
     pressures_kpa: np.ndarray  # (ticks, n) in force at these
     chambers_kpa: np.ndarray  # (ticks, n) measured at these, or in force where none was measured
-    load: Load  # payload that windows at rest told
+    load: Load  # payload, estimated at rest
     acted_load: Load  # the same at the last action
     n_unweighed: int  # ticks since the last of these
     shift: np.ndarray  # (6,) [mm, deg] of the goals that the policy is given

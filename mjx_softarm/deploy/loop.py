@@ -15,13 +15,13 @@ A goal may also move, from tick to tick. Towards it, a policy that was trained o
 actions at once, in the mind: each leads on from the pose that the references of the one before make. One that
 was trained in motion acts as ever. Where the goal stops moving, it becomes an ordinary one.
 
-The policy takes an arm as specified to a goal; one that observes the payload, an arm that carries what rests
-told. What is left of the way shows, when the springs have settled, in the pose that its references make: the
-goal is shifted by as much from then on. A policy that learned few goals may answer a shifted one wrongly. So
-where its references would leave more than the last ones, and more than a goal allows, the goal is shifted by
-less; if a quarter is no better, the arm has arrived. A policy of motion seldom settles between its actions,
-so its next goals are shifted too, at most by `acting.MAX_KEPT`; a moving one with each action by a small
-share of how far the tip is beside the goal's way.
+The policy takes an arm as specified to a goal; one that observes the payload, an arm with the estimated
+payload. What is left of the way shows, when the springs have settled, in the pose that its references make:
+the goal is shifted by as much from then on. A policy that learned few goals may answer a shifted one wrongly.
+So where its references would leave more than the last ones, and more than a goal allows, the goal is shifted
+by less; if a quarter is no better, the arm has arrived. A policy of motion seldom settles between its
+actions, so its next goals are shifted too, at most by `acting.MAX_KEPT`; a moving one with each action by a
+small share of how far the tip is beside the goal's way.
 
 Gains, limits, calibration, rate, tolerance and number of actions are the policy file's.
 `mjx_softarm.deploy.faults` says what can go wrong.
@@ -38,12 +38,12 @@ from mjx_softarm.deploy.controller import NONE_DUE, Controller, State, Tick
 from mjx_softarm.deploy.faults import Event, Fault, Response
 from mjx_softarm.deploy.link import vented
 from mjx_softarm.deploy.reachability import nearest
-from mjx_softarm.sensing.load import HIGHEST, LOWEST, Load, averaged, tell_load
+from mjx_softarm.sensing.load import HIGHEST, LOWEST, Load, averaged, estimate_load
 
 # A chamber counts as lost after so many windows in a row: of an arm at rest, and of one that moves, whose
 # springs and pressures come after their references.
 REST_WINDOWS, MOVING_WINDOWS = 2, 6
-OVERLOAD = 1.4  # times the largest payload; 1 kg was told as up to 1.4 kg at the goals of twins
+OVERLOAD = 1.4  # times the largest payload; 1 kg was estimated as up to 1.4 kg at the goals of twins
 
 
 def with_goal(controller: Controller, state: State, goal: np.ndarray) -> tuple[State, tuple[Event, ...]]:
@@ -202,25 +202,25 @@ def _check_chambers(controller: Controller, state: State, at_rest: bool) -> tupl
 
 
 def _weigh(controller: Controller, state: State, at_rest: bool) -> tuple[State, list[Event]]:
-    """Return the state with the payload that a window at rest tells; windows do not overlap."""
+    """Return the state with the payload estimated from a window at rest; windows do not overlap."""
     state = state._replace(n_unweighed=state.n_unweighed + 1)
     unsure = state.n_suspect.any() or state.n_lost.any()
     if not at_rest or unsure or state.n_unweighed < controller.window:
         return state, []
     policy, before = controller.policy, state.load
     own_kg, most_kg = policy.spec.mass.payload_kg, float(policy.load_estimator.load_scale_kg)
-    told_kg = float(
-        tell_load(policy.load_estimator, state.springs_m.mean(axis=0), state.chambers_kpa.mean(axis=0))
+    estimate_kg = float(
+        estimate_load(policy.load_estimator, state.springs_m.mean(axis=0), state.chambers_kpa.mean(axis=0))
     )
     events = []
-    if LOWEST * most_kg <= told_kg <= HIGHEST * most_kg:
-        load = averaged(before, told_kg, most_kg)
+    if LOWEST * most_kg <= estimate_kg <= HIGHEST * most_kg:
+        load = averaged(before, estimate_kg, most_kg)
     else:
-        load, got = Load(own_kg), f"springs and pressures tell {1e3 * told_kg:.0f} g"
+        load, got = Load(own_kg), f"springs and pressures give {1e3 * estimate_kg:.0f} g"
         message = f"{got}, the pose is estimated from the springs alone, with {1e3 * own_kg:.0f} g"
         events.append(Event(Fault.LOAD_UNKNOWN, message))
     if load.began and load.kg < before.kg:
-        message = f"{1e3 * load.believed_kg:.0f} g, from {1e3 * before.kg:.0f} g at the rests before"
+        message = f"{1e3 * load.believed_kg:.0f} g, from {1e3 * before.kg:.0f} g before"
         events.append(Event(Fault.LOAD_LOST, message))
     if load.kg > OVERLOAD * most_kg:
         message = f"{1e3 * load.kg:.0f} g, expected at most {1e3 * most_kg:.0f} g"

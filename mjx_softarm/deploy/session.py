@@ -1,7 +1,7 @@
 """The control loop on an arm: input, output and time around the pure `mjx_softarm.deploy.loop`.
 
 An arm that offers `pressures()`, what its regulators measure, or `motion_capture()` has both logged;
-motion capture is not used for control, pressures to tell the payload alone.
+motion capture is not used for control, pressures only to estimate the payload.
 """
 
 from __future__ import annotations
@@ -163,7 +163,7 @@ class _Session:
             ArmFault: a fault whose response is to vent.
         """
         if not self.link.measures:
-            self.tell("payload: told from the commanded pressures, since the arm measures none")
+            self.tell("payload: estimated from the commanded pressures, since the arm measures none")
         try:
             while True:
                 begin_s = self.link.now()

@@ -16,7 +16,7 @@ from mjx_softarm.export.symbols import Symbol, constant, repeat, symbol
 from mjx_softarm.mdp.rewards import scaled_error
 from mjx_softarm.policy import reach
 from mjx_softarm.policy.runtime import InMotion, action_towards, actor_output, sensed, tip_pose
-from mjx_softarm.sensing.load import tell_load
+from mjx_softarm.sensing.load import estimate_load
 from mjx_softarm.sensing.pose import pose_error
 from mjx_softarm.sensing.sensors import Reading, SensorFault
 
@@ -52,8 +52,8 @@ def answer(
 
     A lost reading holds the last length (n,) [m] of its spring. References are NaN where the loop would give
     none: a spring has neither a reading nor a last length, or the goal is outside the workspace. The payload
-    () [kg] is the caller's average of what rests told, each at its pressures (n,) [kPa]. `motion` matters to
-    a policy that observes it.
+    () [kg] is the caller's average of estimates at rest, each at its pressures (n,) [kPa]. `motion` matters
+    to a policy that observes it.
     """
     policy, xp = controller.policy, array_namespace(readings)
     reading = policy.sensor.lengths(readings, last_m)
@@ -72,7 +72,7 @@ def answer(
         "pose": pose,
         "extrapolation": away,
         "goal_outside": ~inside,
-        "load_told_kg": tell_load(policy.load_estimator, reading.length_m, pressure_kpa),
+        "load_estimate_kg": estimate_load(policy.load_estimator, reading.length_m, pressure_kpa),
     }
 
 
@@ -112,7 +112,9 @@ def parts(controller: Controller) -> dict[str, Computation]:
 
     reading = policy.sensor.lengths(readings, spring_m)
     tip, away = tip_pose(policy, spring_m, load_kg)
-    told_kg = tell_load(policy.load_estimator, xp.mean(springs_m, axis=0), xp.mean(pressures_kpa, axis=0))
+    estimate_kg = estimate_load(
+        policy.load_estimator, xp.mean(springs_m, axis=0), xp.mean(pressures_kpa, axis=0)
+    )
     motion = _in_motion(n)
     observed = sensed(policy, pose, spring_m, motion, load_kg)
     action = action_towards(policy, pose, xp.asarray(goal, dtype=np.float32), observed)
@@ -131,7 +133,7 @@ def parts(controller: Controller) -> dict[str, Computation]:
 
     return {
         "lengths": of(readings, spring_m, length_m=reading.length_m, lost=_lost(reading)),
-        "told_load": of(springs_m, pressures_kpa, kg=told_kg),
+        "estimated_load": of(springs_m, pressures_kpa, kg=estimate_kg),
         "left": of(pose, goal, off=pose_error(xp.asarray(pose, dtype=np.float64), goal), error=weighted),
         "tip": of(spring_m, load_kg, tip=tip, away=constant(away)),
         "references": of(pose, goal, spring_m, *motion, load_kg, asked_m=policy.actions.lengths(action)),

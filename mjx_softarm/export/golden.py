@@ -15,7 +15,7 @@ A row of inputs is one tick of the loop, and its answer the outputs:
     pressure<k>  [kPa] to write; after a fault whose response is to vent, a ramp to zero
     reference<k> [m]
     length<k>    [m] believed in
-    pose_<axis>  [mm, deg] of the tip that these lengths tell
+    pose_<axis>  [mm, deg] of the tip, estimated from these lengths
 
 The first `N_SINGLE` rows each begin anew, so that each is the policy's answer to readings and a goal. At most
 `N_CHECKED` more have checked goals. The others are runs of the loop, on an arm that follows the policy's own
@@ -43,7 +43,7 @@ from mjx_softarm.deploy.reachability import nearest, refusals
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.policy.reach import nearest_poses
 from mjx_softarm.sensing.estimator import expected_springs
-from mjx_softarm.sensing.load import tell_load
+from mjx_softarm.sensing.load import estimate_load
 
 SCHEMA_VERSION = 2
 N_SINGLE, N_CHECKED = 1000, 40
@@ -263,8 +263,8 @@ def _weight_kpa(policy: Policy, pressure_kpa: np.ndarray, share: float) -> float
     """
     model, less_kpa = policy.load_estimator, np.linspace(-_WEIGHT_MAX_KPA, _WEIGHT_MAX_KPA, 201)
     spring_m = expected_springs(policy.spring_model, pressure_kpa - less_kpa[:, None])
-    told_kg = tell_load(model, spring_m, np.broadcast_to(pressure_kpa, spring_m.shape))
-    return float(less_kpa[np.argmin(np.abs(told_kg - share * model.load_scale_kg))])
+    estimate_kg = estimate_load(model, spring_m, np.broadcast_to(pressure_kpa, spring_m.shape))
+    return float(less_kpa[np.argmin(np.abs(estimate_kg - share * model.load_scale_kg))])
 
 
 def write_golden(path: Path, golden: Golden) -> None:

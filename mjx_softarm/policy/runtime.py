@@ -36,7 +36,7 @@ class InMotion(NamedTuple):
 
 
 def tip_pose(policy: Policy, spring_m: Array, load_kg: Array | float) -> tuple[Array, Array]:
-    """Return the tip pose that springs and a payload tell.
+    """Return the tip pose of springs and a payload.
 
     Args:
         policy: with the networks.
@@ -64,7 +64,7 @@ def sensed(
         pose (6,) [mm, deg]: of the tip, as `tip_pose` of the springs.
         spring_m (n,) [m]: lengths.
         motion: of the arm; a policy that does not observe it ignores it.
-        load_kg () [kg]: payload as told, brought to those that the policy knows if it observes it.
+        load_kg () [kg]: estimated payload, brought to those that the policy knows if it observes it.
     """
     xp = array_namespace(spring_m)
     if policy.observation == "pose":

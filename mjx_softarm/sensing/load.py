@@ -1,9 +1,9 @@
-"""The payload of an arm at rest, told by springs and pressures, and averaged over rests. NumPy and JAX.
+"""Payload of an arm at rest, estimated from springs and pressures, and averaged. NumPy and JAX.
 
 A payload bends and stretches the arm, and the sensor-space law holds its springs where they were: the springs
-alone do not show it, but the pressures that hold them do. A small network, distilled from simulated rests of
-arms whose chambers differ from the specification's by a few per cent, tells the payload. A payload changes
-rarely, so what rests tell is averaged, until two of them in a row disagree.
+alone do not show it, but the pressures that hold them do. A small network, distilled from equilibria of
+simulated arms whose chambers differ from the specification's by a few per cent, estimates the payload. A
+payload changes rarely, so estimates are averaged, until two in a row disagree with the average.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from mjx_softarm._support.archive import Entries
 from mjx_softarm._support.mlp import Layer, mlp
 from mjx_softarm._support.xp import Array, array_namespace
 
-N_AVERAGED = 8  # rests that the average is about
-JUMP = 0.25  # share of the largest payload by which a rest disagrees with the average,
+N_AVERAGED = 8  # estimates that the average is about
+JUMP = 0.25  # share of the largest payload by which an estimate disagrees with the average,
 N_JUMPS = 2  # so many of them in a row begin a new one
-# Payloads in the network's data, as shares of the largest one: what is told outside is no payload.
+# Payloads in the network's data, as shares of the largest one: an estimate outside is no payload.
 LOWEST, HIGHEST = -0.5, 1.5
 
 
@@ -33,12 +33,12 @@ class LoadEstimator(NamedTuple):
 
 
 class Load(NamedTuple):
-    """A payload, averaged over rests."""
+    """A payload, averaged over estimates."""
 
     kg: float
-    n_rests: int = 0  # in the average, at most N_AVERAGED; 0: nothing was told yet, the payload is assumed
-    n_jumps: int = 0  # rests in a row that disagreed with the average
-    began: bool = False  # the last rest replaced another average
+    n_estimates: int = 0  # in the average, at most N_AVERAGED; 0: none yet, the payload is assumed
+    n_jumps: int = 0  # estimates in a row that disagreed with the average
+    began: bool = False  # the last estimate replaced another average
 
     @property
     def believed_kg(self) -> float:
@@ -46,7 +46,7 @@ class Load(NamedTuple):
         return max(self.kg, 0.0)
 
 
-def tell_load(estimator: LoadEstimator, spring_m: Array, pressure_kpa: Array) -> Array:
+def estimate_load(estimator: LoadEstimator, spring_m: Array, pressure_kpa: Array) -> Array:
     """Return the payload (...) [kg] of an arm at rest with springs (..., n) [m] at pressures (..., n) [kPa].
 
     It may be below 0 or above `load_scale_kg`, which is for the caller to judge.
@@ -61,15 +61,15 @@ def tell_load(estimator: LoadEstimator, spring_m: Array, pressure_kpa: Array) ->
     return estimator.load_scale_kg * mlp(estimator.layers, x)[..., 0]
 
 
-def averaged(load: Load, told_kg: float, largest_kg: float) -> Load:
-    """Return the average with what another rest of an arm with this largest payload told."""
-    disagrees = load.n_rests > 0 and abs(told_kg - load.kg) > JUMP * largest_kg
+def averaged(load: Load, estimate_kg: float, largest_kg: float) -> Load:
+    """Return the average with another estimate, of an arm with this largest payload."""
+    disagrees = load.n_estimates > 0 and abs(estimate_kg - load.kg) > JUMP * largest_kg
     if disagrees and load.n_jumps + 1 < N_JUMPS:
         return load._replace(n_jumps=load.n_jumps + 1)
-    if disagrees or load.n_rests == 0:
-        return Load(told_kg, 1, began=disagrees)
-    n = min(load.n_rests + 1, N_AVERAGED)
-    return Load(load.kg + (told_kg - load.kg) / n, n)
+    if disagrees or load.n_estimates == 0:
+        return Load(estimate_kg, 1, began=disagrees)
+    n = min(load.n_estimates + 1, N_AVERAGED)
+    return Load(load.kg + (estimate_kg - load.kg) / n, n)
 
 
 def take_load_estimator(entries: Entries, name: str, n_springs: int) -> LoadEstimator:

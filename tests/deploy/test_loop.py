@@ -46,7 +46,7 @@ def test_reaches_goals_and_vents():
         assert np.linalg.norm(arrival.estimate[:3] - arrival.goal[:3]) < 1.0
     np.testing.assert_array_equal(arm.command_kpa, 0.0)
     assert len(run.latency_s) == len(run.log) < len(arm.written)
-    assert lines[0].startswith("payload: told from the commanded pressures")
+    assert lines[0].startswith("payload: estimated from the commanded pressures")
     assert len(lines) == 1 + len(GOALS)
 
 

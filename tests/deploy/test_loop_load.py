@@ -1,4 +1,4 @@
-"""The payload in the loop: told at rest, believed in the pose, made up for at the goal; its faults."""
+"""The payload in the loop: estimated at rest, believed in the pose, made up for at the goal; its faults."""
 
 import dataclasses
 
@@ -73,7 +73,7 @@ def follow(arm, goals=(GOAL,), **kwargs):
 
 
 @pytest.mark.parametrize("payload_kg", [0.0, 0.6])
-def test_payload_is_told_at_rest_and_believed_in_the_pose(payload_kg):
+def test_payload_is_estimated_at_rest_and_believed_in_the_pose(payload_kg):
     run = follow(LoadedArm(payload_kg))
     assert run.log.load_kg[0] == 0.0 and run.log.load_kg[-1] == pytest.approx(payload_kg, abs=0.03)
     pose = estimate(LOADED.estimator, read_m(run.log)[-1], run.log.load_kg[-1])
@@ -87,7 +87,7 @@ CARRYING = dataclasses.replace(LOADED, layers=(_WIDE,))
 
 @pytest.mark.parametrize("payload_kg", [0.6, 1.4])
 @pytest.mark.parametrize("moves", [False, True])
-def test_a_policy_that_observes_the_payload_is_given_what_was_told_of_it_up_to_the_largest(payload_kg, moves):
+def test_a_policy_that_observes_the_payload_is_given_its_estimate_up_to_the_largest(payload_kg, moves):
     given = []
 
     def plan(pose, goal, spring_m, sensed):
@@ -200,7 +200,7 @@ def test_saturated_chambers_shift_by_where_their_springs_are():
     assert asked[1][2] - goal[2] == pytest.approx(10.0, abs=1.0)
 
 
-def test_object_that_drops_is_told():
+def test_object_that_drops_is_reported():
     lines = []
     goals = [GOAL, GOAL + [0.0, 0.0, 10.0, 0.0, 0.0, 0.0]]
     run = follow(LoadedArm(0.6, until=250), goals, tell=lines.append)
@@ -211,7 +211,7 @@ def test_object_that_drops_is_told():
     assert 550.0 < float(line.split("from ")[1].split(" g")[0]) < 650.0
 
 
-def test_overload_is_told():
+def test_overload_is_reported():
     run = follow(LoadedArm(1.45))
     assert set(run.counts()) == {Fault.OVERLOADED} and run.log.load_kg[-1] == pytest.approx(1.45, abs=0.03)
 

@@ -79,7 +79,7 @@ def test_rows_of_a_policy_that_observes_the_payload_agree(tmp_path):
     )
     machine = golden_rows.Machine(Controller.of(blind))
     off_m = np.array([machine.answer(row) for row in golden.inputs]) - golden.outputs
-    assert np.nanmax(np.abs(off_m[:, 2 + N : 2 + 2 * N])) > 1e-3  # so a payload was told, and counts
+    assert np.nanmax(np.abs(off_m[:, 2 + N : 2 + 2 * N])) > 1e-3  # so a payload was estimated, and counts
 
 
 def test_rows_of_a_policy_of_motion_agree_and_it_keeps_a_part_of_its_shift(tmp_path):

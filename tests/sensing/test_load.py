@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_softarm.sensing.load import JUMP, N_AVERAGED, Load, LoadEstimator, averaged, tell_load
+from mjx_softarm.sensing.load import JUMP, N_AVERAGED, Load, LoadEstimator, averaged, estimate_load
 
 N = 9
 
@@ -17,24 +17,24 @@ def linear(of_springs, of_pressures, dtype=np.float32):
     return LoadEstimator(*jax.tree.map(lambda x: np.asarray(x, dtype), ((layer,), *numbers)))
 
 
-def after(*told_kg):
+def after(*estimate_kg):
     load = Load(0.0)
-    for kg in told_kg:
+    for kg in estimate_kg:
         load = averaged(load, kg, 1.0)
     return load
 
 
 def test_network_by_hand():
-    told_kg = tell_load(linear(0.5, -0.25), np.full((4, N), 0.21), np.full((4, N), 10.0))
-    np.testing.assert_allclose(told_kg, np.full(4, 0.8 * (9 * (0.5 * 0.2 - 0.25 * 1.0) + 0.1)), rtol=1e-5)
-    assert told_kg.dtype == np.float32
+    estimate_kg = estimate_load(linear(0.5, -0.25), np.full((4, N), 0.21), np.full((4, N), 10.0))
+    np.testing.assert_allclose(estimate_kg, np.full(4, 0.8 * (9 * (0.5 * 0.2 - 0.25 * 1.0) + 0.1)), rtol=1e-5)
+    assert estimate_kg.dtype == np.float32
 
 
 def test_numpy_and_jax_agree():
     estimator, rng = linear(0.3, 0.2), np.random.default_rng(0)
     rows = rng.uniform(0.1, 0.25, (5, N)), rng.uniform(-40.0, 20.0, (5, N))
-    in_jax = jax.jit(tell_load)(estimator, *(jnp.asarray(x, jnp.float32) for x in rows))
-    np.testing.assert_allclose(tell_load(estimator, *rows), in_jax, rtol=1e-5, atol=1e-6)
+    in_jax = jax.jit(estimate_load)(estimator, *(jnp.asarray(x, jnp.float32) for x in rows))
+    np.testing.assert_allclose(estimate_load(estimator, *rows), in_jax, rtol=1e-5, atol=1e-6)
 
 
 def test_first_rest_replaces_what_was_assumed():
@@ -42,10 +42,10 @@ def test_first_rest_replaces_what_was_assumed():
 
 
 def test_rests_are_averaged():
-    told_kg = 0.5 + 0.05 * np.random.default_rng(1).standard_normal(N_AVERAGED)
-    assert after(*told_kg).kg == pytest.approx(told_kg.mean())
+    estimate_kg = 0.5 + 0.05 * np.random.default_rng(1).standard_normal(N_AVERAGED)
+    assert after(*estimate_kg).kg == pytest.approx(estimate_kg.mean())
     late = after(*[0.5] * 100, 0.6)
-    assert late.kg == pytest.approx(0.5 + 0.1 / N_AVERAGED) and late.n_rests == N_AVERAGED
+    assert late.kg == pytest.approx(0.5 + 0.1 / N_AVERAGED) and late.n_estimates == N_AVERAGED
 
 
 @pytest.mark.parametrize("change_kg", [-2 * JUMP, 2 * JUMP])

@@ -1,9 +1,9 @@
 """Small networks for the arm's computer, distilled from the simulator: of load, pose and springs.
 
 Equilibria over the whole workspace are the data, held-out ones the test. `mjx_softarm.sensing.estimator` and
-`mjx_softarm.sensing.load` describe the networks. The load is told from springs and pressures of arms whose
-chambers are off, since a calibration is not perfect either; the pose from springs and the load, for arms as
-specified. Told from pressures directly, the pose would take a chamber that is off for a shape.
+`mjx_softarm.sensing.load` describe the networks. The load is estimated from springs and pressures, for arms
+whose chambers are off, since a calibration is not perfect either; the pose from springs and the load, for
+arms as specified. A pose from pressures would take a chamber that is off for a shape.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from mjx_softarm.sensing.estimator import (
     estimate_frame,
     expected_springs,
 )
-from mjx_softarm.sensing.load import HIGHEST, LOWEST, LoadEstimator, tell_load
+from mjx_softarm.sensing.load import HIGHEST, LOWEST, LoadEstimator, estimate_load
 from mjx_softarm.sensing.pose import frame_from_pose
 from mjx_softarm.spec import ArmSpec
 
@@ -190,7 +190,7 @@ def _pose_loss(estimator: PoseEstimator, pool: LoadedPool) -> Array:
 
 def _load_loss(estimator: LoadEstimator, pool: LoadedPool) -> Array:
     """Return the mean square of the payload's error, as a share of the largest payload."""
-    off_kg = tell_load(estimator, pool.spring_m, pool.pressure_kpa) - pool.load_kg
+    off_kg = estimate_load(estimator, pool.spring_m, pool.pressure_kpa) - pool.load_kg
     return jnp.mean((off_kg / estimator.load_scale_kg) ** 2)
 
 
@@ -242,8 +242,8 @@ def _errors(
         spring_mm[payload_kg] = _error(1e3 * springs.max(axis=-1))
         many_kg = np.full(CANDIDATES_PER_POSE * N_HELD_OUT, load_kg)
         off = _as_measured(spec, sample_loaded(loaded, many_kg, CHAMBERS_OFF, HELD_OUT_SEED))
-        told_kg = np.asarray(tell_load(load_estimator, off.spring_m, off.pressure_kpa))
-        load_off_kg[payload_kg] = _error(np.abs(told_kg - load_kg))
+        estimate_kg = np.asarray(estimate_load(load_estimator, off.spring_m, off.pressure_kpa))
+        load_off_kg[payload_kg] = _error(np.abs(estimate_kg - load_kg))
     return tip_mm, turn_deg, load_off_kg, spring_mm
 
 

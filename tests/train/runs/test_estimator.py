@@ -16,7 +16,7 @@ from mjx_softarm.mechanics.settle import settle
 from mjx_softarm.mechanics.statics import ArmParams
 from mjx_softarm.mechanics.workspace import HELD_OUT_SEED, sample_workspace
 from mjx_softarm.sensing.estimator import estimate_frame, expected_springs
-from mjx_softarm.sensing.load import tell_load
+from mjx_softarm.sensing.load import estimate_load
 from mjx_softarm.sensing.pose import frame_from_pose
 from train.runs import estimator as module
 from train.runs.estimator import PAYLOADS, distil
@@ -75,16 +75,16 @@ def test_payload_is_told_and_then_the_pose(distilled, payload_kg):
     """Rests that C MuJoCo confirms elsewhere; the springs alone leave the tip some millimetres off."""
     spec = SPEC.replace(mass={"payload_kg": payload_kg})
     pool = jax.device_get(sample_workspace(spec, N_ARMS, 78))
-    told_kg = tell_load(distilled.load_estimator, pool.spring_m, pool.pressure_kpa)
-    assert np.mean(np.abs(told_kg - payload_kg)) < 0.08
+    estimate_kg = estimate_load(distilled.load_estimator, pool.spring_m, pool.pressure_kpa)
+    assert np.mean(np.abs(estimate_kg - payload_kg)) < 0.08
     tip_m, _ = frame_from_pose(pool.pose)
 
     def off_mm(load_kg):
         frame = estimate_frame(distilled.estimator, pool.spring_m, load_kg)
         return 1e3 * np.median(np.linalg.norm(frame.position_m - tip_m, axis=1))
 
-    assert off_mm(payload_kg) < 1.2 and off_mm(told_kg) < 1.5
-    assert off_mm(0.0) > 1.5 * off_mm(told_kg)
+    assert off_mm(payload_kg) < 1.2 and off_mm(estimate_kg) < 1.5
+    assert off_mm(0.0) > 1.5 * off_mm(estimate_kg)
 
 
 def test_same_seed_same_networks(monkeypatch):
@@ -163,7 +163,7 @@ def test_a_payload_is_told_with_what_the_calibration_found_of_the_pressures(monk
     spec = SPEC.replace(unmodelled=table)
     held_kpa = pool.pressure_kpa + spec.unmodelled_kpa(pool.spring_m)
     found = distil(spec, 0).load_estimator
-    told_kg = np.abs(
-        [tell_load(estimator, pool.spring_m, held_kpa) for estimator in (distilled.load_estimator, found)]
+    estimate_kg = np.abs(
+        [estimate_load(estimator, pool.spring_m, held_kpa) for estimator in (distilled.load_estimator, found)]
     )
-    assert np.median(told_kg[1]) < 0.08 < 0.15 < np.median(told_kg[0])
+    assert np.median(estimate_kg[1]) < 0.08 < 0.15 < np.median(estimate_kg[0])
