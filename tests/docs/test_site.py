@@ -1,5 +1,6 @@
 """The site builds without a warning, links lead somewhere, and results keep no path of a machine."""
 
+import json
 import os
 import re
 import subprocess
@@ -30,3 +31,15 @@ def test_the_readme_s_links_lead_to_files():
 @pytest.mark.parametrize("file", sorted((ROOT / "docs/results").glob("*.json")), ids=lambda file: file.stem)
 def test_results_keep_no_path_of_a_machine(file):
     assert not re.findall(r'(?:^|["\s=:])(?:/|~/|[A-Z]:\\)\w[^"\s]*', file.read_text("utf-8"))
+
+
+def test_the_table_of_files_has_each_result_with_its_command_and_commit():
+    page = (ROOT / "docs/results.md").read_text("utf-8")
+    rows = re.findall(r"^\| \[(\S+)\]\(results/\1\) \| (.*) \| (\w{7}) \|", page, re.MULTILINE)
+    assert sorted(name for name, *_ in rows) == sorted(f.name for f in (ROOT / "docs/results").glob("*.json"))
+    for name, command, commit in rows:
+        made = json.loads((ROOT / "docs/results" / name).read_text("utf-8"))
+        for source in made.get("kinds", {"": made}).values():  # `guard.json` has one for each kind of machine
+            assert source["commit"].startswith(commit), name
+            if command.startswith("`"):
+                assert re.sub(r" --out \S+", "", source["command"]) == command.strip("`"), name
