@@ -58,7 +58,7 @@ PRESETS: dict[str, TrainConfig] = {
         polish_updates=20_480,
     ),
     "analytic": _ANALYTIC,
-    # The same for an arm that carries: the policy observes the payload, which the loop tells from pressures.
+    # The same for an arm that carries: the policy observes the payload, which the loop estimates.
     "payload": dataclasses.replace(_ANALYTIC, env=dataclasses.replace(_ANALYTIC.env, observation="payload")),
     # The paper's recipe: 14 workers, sb3-contrib's hyperparameters, of which one is a gradient step for each
     # step of the workers, and each transition stored again with the pose it achieved for its goal.
@@ -137,7 +137,7 @@ IMITATION_PRESETS: dict[str, ImitationConfig] = {
         stages=(Stage(share=1 / 3, every=2), Stage(share=2 / 3, kept=0.2)),
     ),
     "pipe": _PIPE,
-    # Half-second actions in motion. Payloads as they are carried, since the springs tell them.
+    # Half-second actions in motion. Payloads as they are carried: they change how the arm moves.
     "pipe-moving": dataclasses.replace(
         _PIPE,
         env=dataclasses.replace(

@@ -39,7 +39,7 @@ class Outcome(NamedTuple):
     saturated: np.ndarray  # (p, n) bool: chamber at a limit with its spring off the reference, on arrival
     success: np.ndarray  # (p,) bool: an object was picked or placed
     arrival_s: np.ndarray  # (p,)
-    told_g: np.ndarray  # (p,) payload that the loop believed in, on arrival
+    load_estimate_g: np.ndarray  # (p,) payload that the loop believed in, on arrival
     events: np.ndarray  # (faults,) how often the loop reported each of `faults.Fault`
     latency_s: np.ndarray  # (2,) median and 99.9 % of a tick's computing time
     time_s: np.ndarray  # (t,)

@@ -134,7 +134,7 @@ def _measure(
         out: folder to write: the figures, a picture, the log
         goals: circle; grid, over the workspace; or a CSV file of poses
         points: of the circle, or of the grid at most
-        seconds: pass all goals without a stop in so long [s]; a circle once around
+        seconds: pass all goals without a stop in so long [s], from the first to the last
     """
     if seconds is not None and not (0.0 < seconds < np.inf and goals != "grid"):
         raise InputError(f"--seconds: got {seconds:g} with --goals {goals}, expected > 0, and not a grid")

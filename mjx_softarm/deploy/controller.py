@@ -65,7 +65,7 @@ class State(NamedTuple):
     chambers_kpa: np.ndarray  # (ticks, n) measured at these, or in force where none was measured
     load: Load  # payload, estimated at rest
     acted_load: Load  # the same at the last action
-    n_unweighed: int  # ticks since the last of these
+    n_unweighed: int  # ticks since the payload was last estimated
     shift: np.ndarray  # (6,) [mm, deg] of the goals that the policy is given
     due: np.ndarray  # (LEAD_ACTIONS, 6) [mm, deg] moving goal at the last actions, oldest first; NaN: none
 

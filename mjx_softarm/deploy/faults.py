@@ -18,7 +18,7 @@
                        within SETTLE_TIMEOUT_S
     SATURATED          a chamber at its limit with its spring off the reference         go on
     EXTRAPOLATION      the sim-to-real network asked far from its training rows         go on
-    LOAD_LOST          the estimated payload fell: an object dropped                    go on
+    LOAD_LOST          a new average of the payload begins lower: an object dropped     go on
     OVERLOADED         a payload of more than `loop.OVERLOAD` times the largest         go on
     LOAD_UNKNOWN       springs and pressures that no payload explains: the pose is      go on
                        estimated from the springs alone, with the specified payload

@@ -38,7 +38,7 @@ class Accuracy(NamedTuple):
     believed: np.ndarray  # (p, 6) [mm, deg] pose that the loop estimated, less the goal
     saturated: np.ndarray  # (p, n) bool: chamber at a limit with its spring off the reference, on arrival
     arrival_s: np.ndarray  # (p,)
-    told_g: np.ndarray  # (p,) payload that the loop believed in, on arrival
+    load_estimate_g: np.ndarray  # (p,) payload that the loop believed in, on arrival
 
 
 def read_goals(name: str, policy: Policy, n: int) -> np.ndarray:
@@ -108,7 +108,7 @@ def measure(run: Run, controller: Controller, goals: np.ndarray) -> Accuracy:
     log, policy, window = run.log, controller.policy, controller.window
     error, believed = np.full((2, *goals.shape), np.nan)
     mask = np.zeros((len(goals), policy.spec.n_chambers), bool)
-    arrival_s, told_g = np.full((2, len(goals)), np.nan)
+    arrival_s, load_estimate_g = np.full((2, len(goals)), np.nan)
     if log.tip_m is None or log.tip_quaternion is None:
         raise InputError(f"motion capture: got no frame in {len(log)} ticks, expected the tip")
     # Means over the window that ends with each arrival.
@@ -119,7 +119,7 @@ def measure(run: Run, controller: Controller, goals: np.ndarray) -> Accuracy:
         rows = slice(max(0, arrival.row + 1 - window), arrival.row + 1)
         error[point] = seen_error(log.tip_m[rows], log.tip_quaternion[rows], arrival.goal)
         believed[point] = pose_error(np.asarray(arrival.estimate, float), arrival.goal)
-        arrival_s[point], told_g[point] = log.time_s[arrival.row], 1e3 * log.load_kg[arrival.row]
+        arrival_s[point], load_estimate_g[point] = log.time_s[arrival.row], 1e3 * log.load_kg[arrival.row]
         mask[point] = saturated(
             log.pressure_kpa[rows].mean(axis=0),
             log.reference_m[arrival.row],
@@ -127,7 +127,7 @@ def measure(run: Run, controller: Controller, goals: np.ndarray) -> Accuracy:
             policy.gains.measured(),
             policy.tolerance_m,
         )
-    return Accuracy(goals, error, believed, mask, arrival_s, told_g)
+    return Accuracy(goals, error, believed, mask, arrival_s, load_estimate_g)
 
 
 def figures(accuracy: Accuracy, events: Mapping[Fault, int]) -> dict[str, Any]:
@@ -160,7 +160,7 @@ def figures(accuracy: Accuracy, events: Mapping[Fault, int]) -> dict[str, Any]:
         "rotation_max_deg": float(turned.max()),
         **dict(zip(POSE_NAMES, np.abs(error).mean(axis=0).tolist(), strict=True)),
         "believed_mm": float(np.linalg.norm(believed[:, :3], axis=1).mean()),
-        "told_g": float(accuracy.told_g[measured].mean()) if n_measured else np.nan,
+        "load_estimate_g": float(accuracy.load_estimate_g[measured].mean()) if n_measured else np.nan,
         "saturated_points": int(np.count_nonzero(per_point)),
         "saturated_chambers_max": int(per_point.max()),
         "saturation_events": int(events.get(Fault.SATURATED, 0)),

@@ -4,9 +4,9 @@ At given pressures p the arm is conservative. With l the chamber lengths and s t
 
     V(q) = gravity + backbone + sum k (l - l0)^2 / 2 + sum k_s (s - s0)^2 / 2 - sum p W(l),
 
-where W' = area_m2 + area_slope_m (l - l_rest) is a chamber's effective area, so that p W is the work of
-its air. A tendon runs from ring to ring, so the piece of it inside a link depends on that link's
-three joints alone, and its length on those of its section; only gravity couples different sections.
+where W' = area_m2 + area_slope_m (l - L) is a chamber's effective area, L the section's length, so that p W
+is the work of its air. A tendon runs from ring to ring, so the piece of it inside a link depends on that
+link's three joints alone, and its length on those of its section; only gravity couples different sections.
 
 Many arms at once come last in every shape, (..., *arms), as in `mjx_softarm.mechanics.kinematics`; a number
 that all of them share has a 1 in their place.

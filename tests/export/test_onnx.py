@@ -140,8 +140,8 @@ def test_a_policy_that_observes_the_payload_is_given_it_within_what_it_knows(tmp
         feed = {"readings": readings, "goal": goal, "load_kg": np.asarray(load_kg)}
         feed = {name: np.asarray(value, np.float32) for name, value in feed.items()}
         pose, reference_m = ort.InferenceSession(whole).run(["pose", "reference_m"], feed)
-        told = np.float32([min(load_kg, 1.0)])
-        expected_m = PolicyRunner(controller.policy).act(pose, goal, told).length_m
+        carried_kg = np.float32([min(load_kg, 1.0)])
+        expected_m = PolicyRunner(controller.policy).act(pose, goal, carried_kg).length_m
         np.testing.assert_allclose(reference_m, expected_m, atol=1e-6)
         given[load_kg] = reference_m
     assert np.abs(given[0.5] - given[0.0]).max() > 1e-3

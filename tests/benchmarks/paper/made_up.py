@@ -44,7 +44,7 @@ def made_up(
     fails=(),
     pressed=0.0,
     missed=(),
-    told_g=0,
+    estimate_g=0,
     tick_s=0.25,
 ):
     """An outcome with one error (up to 6,) at every goal; `pressed`: share of time with 2 N on the wall."""
@@ -58,7 +58,7 @@ def made_up(
         saturated=np.zeros((len(goal), N), bool),
         success=np.array([name.startswith(("pick", "place")) for name in names]),
         arrival_s=np.linspace(1.0, 0.25 * ticks, len(goal)),
-        told_g=np.full(len(goal), float(told_g)),
+        load_estimate_g=np.full(len(goal), float(estimate_g)),
         events=np.array([reported if fault is Fault.SATURATED else 0 for fault in Fault]),
         latency_s=np.array([1e-4, 3e-4]),
         time_s=tick_s * np.arange(ticks),
@@ -73,7 +73,7 @@ def made_up(
     for point, chamber in saturated:
         outcome.saturated[point, chamber] = True
     outcome.success[np.flatnonzero(outcome.operation)[list(fails)]] = False
-    outcome.error[list(missed)], outcome.told_g[list(missed)] = np.nan, np.nan
+    outcome.error[list(missed)], outcome.load_estimate_g[list(missed)] = np.nan, np.nan
     return outcome
 
 
@@ -108,7 +108,11 @@ def good_results(experiment, settings=FULL, changed=None):
             made_up(trial.kind, tick_s=0.1 if trial.moves else 0.25)
             if error_mm is None
             else made_up(
-                trial.kind, (error_mm, 0, 0, -0.5), [(1, 2)] if hit else [], 2 * hit, told_g=trial.load_g
+                trial.kind,
+                (error_mm, 0, 0, -0.5),
+                [(1, 2)] if hit else [],
+                2 * hit,
+                estimate_g=trial.load_g,
             )
         )
     items = trainings(settings) if experiment == "confined" else []

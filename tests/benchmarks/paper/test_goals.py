@@ -53,17 +53,21 @@ ANGLES = [f"with S2R, mean {angle} at most 3 deg" for angle in ("yaw", "pitch", 
     [
         (UNLOADED, made_up("with", (7.0,)), [TRANSLATION, RATIO]),
         (Trial("without", 0, 0), made_up("without", (0.9,)), [RATIO]),
-        (UNLOADED._replace(load_g=500), made_up("with", (4.0,), told_g=500), ["500 g, mean translation at"]),
-        (AT_1_KG, made_up("with", (7.0,), told_g=1000), ["1 kg, mean translation at most 4 mm"]),
+        (
+            UNLOADED._replace(load_g=500),
+            made_up("with", (4.0,), estimate_g=500),
+            ["500 g, mean translation at"],
+        ),
+        (AT_1_KG, made_up("with", (7.0,), estimate_g=1000), ["1 kg, mean translation at most 4 mm"]),
         (
             AT_1_KG,
-            made_up("with", (1.0,), told_g=300),
+            made_up("with", (1.0,), estimate_g=300),
             ["payload, estimated, mean error at all loads at most"],
         ),
         (AT_1_KG, made_up("with", (12.1,)), ["1 kg, mean", "1 kg, largest", "payload, estimated, mean"]),
         (
             AT_1_KG,
-            made_up("with", (1.0,), [(0, 0)], told_g=1000),
+            made_up("with", (1.0,), [(0, 0)], estimate_g=1000),
             ["1 kg, saturation detected and reported"],
         ),
         (Trial("with", 1, 0), made_up("with", (1.0,), [(2, 8)]), [FREE]),
@@ -83,7 +87,7 @@ def test_open_goals_that_are_missed_are_named(trial, outcome, goals):
 
 def test_goals_for_payloads_are_those_of_a_policy_that_observes_it_too():
     settings = dataclasses.replace(TINY, beside=("payload",))
-    worst = {Trial("payload", 1, 0, load_g=1000): made_up("payload", (12.1,), told_g=1000)}
+    worst = {Trial("payload", 1, 0, load_g=1000): made_up("payload", (12.1,), estimate_g=1000)}
     for changed, missed in ((None, []), (worst, ["1 kg observed, m", "1 kg observed, l"])):
         found = check_goals("open", *tables(good_results("open", settings, changed)))
         assert len(found) == 13 + 4

@@ -67,14 +67,14 @@ def test_errors_are_averaged_over_the_window_of_rest(make_arm_model):
     assert np.allclose(outcome.error[1], [3, 4, 0, 10, 0, 0], atol=1e-6)
     assert np.isnan(outcome.error[0]).all() and np.isnan(outcome.arrival_s[0])
     assert np.isclose(outcome.arrival_s[1], 0.02 * (n_rows - 1))
-    assert np.isnan(outcome.told_g[0]) and outcome.told_g[1] == 500.0
+    assert np.isnan(outcome.load_estimate_g[0]) and outcome.load_estimate_g[1] == 500.0
     assert np.flatnonzero(outcome.saturated[1]).tolist() == [4]
     assert not outcome.saturated[0].any()
     assert np.allclose(outcome.spring_m, 0.2)
     assert set(outcome.point) == {1}
     row = figures(outcome)
     assert (row["measured"], row["points"], row["saturation_events"]) == (1, 2, 2)
-    assert np.isclose(row["believed_mm"], 1.0) and row["told_g"] == 500.0
+    assert np.isclose(row["believed_mm"], 1.0) and row["load_estimate_g"] == 500.0
 
 
 class Still(LinearArm):

@@ -68,8 +68,8 @@ def test_spreads_group_kinds_and_variants():
 
 
 def test_load_s_error_is_the_mean_over_the_goals_that_were_arrived_at():
-    outcome = made_up("with", missed=[0], told_g=470)
-    outcome.told_g[1] = 530
+    outcome = made_up("with", missed=[0], estimate_g=470)
+    outcome.load_estimate_g[1] = 530
     assert load_off_g(Trial("with", 0, 0, load_g=500), outcome) == 30.0
     assert np.isnan(load_off_g(pipe_trial(), outcome))
     assert np.isnan(load_off_g(Trial("with", 0, 0), made_up("with", missed=range(6))))

@@ -62,7 +62,7 @@ def test_springs_of_known_pressures(distilled, pool):
     assert np.median(off_mm) == pytest.approx(distilled.spring_mm[0.0].median, rel=0.25)
 
 
-def test_errors_are_told_by_payload(distilled):
+def test_errors_are_given_by_payload(distilled):
     for errors in (distilled.tip_mm, distilled.turn_deg, distilled.load_kg, distilled.spring_mm):
         assert tuple(errors) == PAYLOADS
         assert all(0.0 < error.median < error.p95 < error.largest for error in errors.values())
@@ -71,7 +71,7 @@ def test_errors_are_told_by_payload(distilled):
 
 
 @pytest.mark.parametrize("payload_kg", [0.3, 1.0])
-def test_payload_is_told_and_then_the_pose(distilled, payload_kg):
+def test_payload_is_estimated_and_then_the_pose(distilled, payload_kg):
     """Rests that C MuJoCo confirms elsewhere; the springs alone leave the tip some millimetres off."""
     spec = SPEC.replace(mass={"payload_kg": payload_kg})
     pool = jax.device_get(sample_workspace(spec, N_ARMS, 78))
@@ -156,7 +156,7 @@ def test_all_of_the_training_is_worth_it():
     assert errors[0.5].median < 0.7 and errors[1.0].median < 0.7
 
 
-def test_a_payload_is_told_with_what_the_calibration_found_of_the_pressures(monkeypatch, distilled, pool):
+def test_a_payload_is_estimated_with_the_pressures_that_calibration_found(monkeypatch, distilled, pool):
     small(monkeypatch, 1000)
     rng = np.random.default_rng(5)
     table = {"pressure_kpa": tuple(rng.normal(0, 2, N)), "slope_kpa_per_m": tuple(rng.normal(0, 100, N * N))}
