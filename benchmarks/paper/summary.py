@@ -86,12 +86,8 @@ def trial_rows(results: Results) -> list[dict[str, Any]]:
 
 def load_off_g(trial: Trial, outcome: Outcome) -> float:
     """Return by how much the loop was wrong about the payload, in the mean over the goals; NaN in a pipe."""
-    load_estimate_g = outcome.load_estimate_g[np.isfinite(outcome.load_estimate_g)]
-    return (
-        float(np.abs(load_estimate_g - trial.load_g).mean())
-        if len(load_estimate_g) and not trial.objects
-        else np.nan
-    )
+    seen_g = outcome.load_estimate_g[np.isfinite(outcome.load_estimate_g)]
+    return float(np.abs(seen_g - trial.load_g).mean()) if len(seen_g) and not trial.objects else np.nan
 
 
 def training_rows(results: Results) -> list[dict[str, Any]]:

@@ -43,7 +43,7 @@ def go(controller: Controller, state: State, at_rest: bool) -> tuple[State, list
     do, the arm has arrived.
     """
     policy, events = controller.policy, list[Event]()
-    shifts, most = [state.shift], None  # to try in turn; weighted error that an action may leave
+    shifts, allowed = [state.shift], None  # to try in turn; weighted error that an action may leave
     assert state.goal is not None  # `step` asks
     if state.n_actions > 0:
         assert state.reference_m is not None
@@ -60,10 +60,10 @@ def go(controller: Controller, state: State, at_rest: bool) -> tuple[State, list
             load = state.acted_load if policy.observation == "payload" else state.load
             left = pose_error(_made(controller, state, state.reference_m, load), state.goal)
             shifts = [_clipped(state.shift - share * left) for share in SHARES]
-            if not policy.action_s:
-                most = max(_error(controller, state, state.reference_m), policy.reward.threshold)
         if state.n_actions == policy.n_actions:
             return _arrived(state, shifts[0]), events, True
+        if settled and not policy.action_s:
+            allowed = max(_error(controller, state, state.reference_m), policy.reward.threshold)
     elif not policy.action_s:  # it makes up for what is left with its next actions
         shifts = [np.zeros(6)]
     pose, away = believed(controller, state.spring_m, state.load)
@@ -72,7 +72,7 @@ def go(controller: Controller, state: State, at_rest: bool) -> tuple[State, list
         events.append(Event(Fault.EXTRAPOLATION, message))
     for shift in shifts:
         reference_m = _planned(controller, state, pose, shift)
-        if most is None or not _error(controller, state, reference_m) > most:
+        if allowed is None or not _error(controller, state, reference_m) > allowed:
             break
     else:
         return _arrived(state, state.shift), events, True
