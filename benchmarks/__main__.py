@@ -42,11 +42,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _finish(name: str, figures: dict[str, Any] | int) -> int:
     if isinstance(figures, int):
         return figures
-    from benchmarks.harness.common import save, show
+    from benchmarks.harness.common import save, show, status_of
 
     show(figures, name)
     print(f"written: {save(name, figures)}")
-    return 0
+    return status_of(figures)
 
 
 if __name__ == "__main__":

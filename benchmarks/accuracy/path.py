@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from benchmarks.accuracy.arms import run_command
+from benchmarks.harness.common import target
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.policy.file import load_policy
 
@@ -21,6 +22,7 @@ IN_TIME = {
     "behind [s]": "lag_s",
     "mean without that [mm]": "way_without_lag_mm",
 }
+WITHIN_MM, AROUND_S = 4.0, 20.0  # the target: a mean, once around in so long
 STOPPING = {"mean [mm]": "translation_mm", "largest [mm]": "max_mm", "seconds": "seconds"}
 
 
@@ -77,7 +79,25 @@ def measure(
         "means in time": means_over(in_time, ("trained", "once around [s]"), IN_TIME),
         "means stop by stop": means_over(stopping, ("trained",), STOPPING),
     }
-    return {**means, "in time": in_time, "stop by stop": stopping}
+    return {
+        "targets": targets(means["means in time"]),
+        **means,
+        "in time": in_time,
+        "stop by stop": stopping,
+    }
+
+
+def targets(means: Sequence[dict[str, Any]]) -> list[dict[str, str]]:
+    """Return the targets: a mean of policies trained at rest, one of those in motion."""
+    return [
+        target(
+            f"trained {row['trained']}, once around in {AROUND_S:g} s: mean at most {WITHIN_MM:g} mm",
+            f"{row['mean [mm]']:.2f} mm",
+            row["mean [mm]"] <= WITHIN_MM,
+        )
+        for row in means
+        if row["once around [s]"] == AROUND_S
+    ]
 
 
 def means_over(

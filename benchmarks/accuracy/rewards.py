@@ -25,6 +25,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from benchmarks.harness.common import target
 from benchmarks.paper.summary import SUCCESS
 from mjx_softarm import ArmSpec
 from mjx_softarm._support import cli
@@ -92,6 +93,7 @@ def measure(
     n_by_hand = [len(hands[seed].positions) for seed in seeds]
     return {
         "positions": {"shown": len(shown.positions), "shown by hand": n_by_hand, "held out": len(between)},
+        "targets": targets(runs),
         "means": means,
         "runs": runs,
     }
@@ -187,6 +189,21 @@ def learn(
             }
         )
     return rows
+
+
+def targets(runs: Sequence[dict[str, Any]]) -> list[dict[str, str]]:
+    """Return, for each settings and demonstrations, the target that the learned reward takes fewer steps."""
+    steps: dict[tuple[str, str], dict[str, list[float]]] = {}
+    for run in runs:
+        of = steps.setdefault((run["settings"], run["shown"]), {})
+        of.setdefault(run["reward"], []).append(run["steps_to_success"] or np.inf)
+    found = []
+    for (settings, shown), of in steps.items():
+        learned, hand_made = np.median(of[LEARNED]), np.median(of[HAND_MADE])
+        text = f"{settings}, {shown}: {100 * SUCCESS:g} % success in fewer env steps with the learned reward"
+        measured = f"{learned:,.0f} learned, {hand_made:,.0f} hand-made, medians"
+        found.append(target(text, measured, bool(learned < hand_made)))
+    return found
 
 
 def summary(runs: Sequence[dict[str, Any]]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Shared parts of the benchmarks: the machine, memory, goals, tables, and where results go.
+"""Shared parts of the benchmarks: the machine, memory, targets, tables, and where results go.
 
 Figures are nested dictionaries of plain values, made for JSON. `show` prints any of them: a list of flat
 dictionaries becomes a table with their keys as its head, other values become a table of names and values.
@@ -71,9 +71,14 @@ def peak_memory() -> dict[str, int]:
     return {"peak_rss_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6)}  # bytes on macOS
 
 
-def goal(text: str, measured: str, met: bool | None) -> dict[str, str]:
-    """Return a row for a goal; if `met` is None it could not be measured, and `measured` says why."""
-    return {"goal": text, "measured": measured, "verdict": VERDICT[met]}
+def target(text: str, measured: str, met: bool | None) -> dict[str, str]:
+    """Return a row for a target; if `met` is None it could not be measured, and `measured` says why."""
+    return {"target": text, "measured": measured, "verdict": VERDICT[met]}
+
+
+def status_of(figures: Mapping[str, Any]) -> int:
+    """Return the exit status: 1 where one of `targets` is not met, else 0."""
+    return int(any(row["verdict"] == VERDICT[False] for row in figures.get("targets", ())))
 
 
 def show(figures: Mapping[str, Any], title: str = "", console: Console | None = None) -> None:

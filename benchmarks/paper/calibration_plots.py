@@ -144,9 +144,9 @@ def lengths_figure(found: Comparison, name: str) -> Figure:
         chambers = slice(N_CHAMBERS_PER_SECTION * section, N_CHAMBERS_PER_SECTION * (section + 1))
         measured_mm = 1e3 * found.chamber_m[:, chambers].ravel()
         rms_mm = found.chamber_rms_mm[:, section]
-        for (name, colour, _), simulated_m, rms in zip(PAIR, found.chamber_pair_m, rms_mm, strict=True):
+        for (title, colour, _), simulated_m, rms in zip(PAIR, found.chamber_pair_m, rms_mm, strict=True):
             error_mm = 1e3 * simulated_m[:, chambers].ravel() - measured_mm
-            label = f"{name.removeprefix('simulated, ')}: {rms:.1f} mm RMS"
+            label = f"{title.removeprefix('simulated, ')}: {rms:.1f} mm RMS"
             dots = {"color": colour, "markersize": 3.0, "alpha": 0.65, "linestyle": "none"}
             upper.plot(measured_mm, measured_mm + error_mm, "o", label=label, **dots)
             lower.plot(measured_mm, error_mm, "o", **dots)
@@ -172,9 +172,9 @@ def sensor_figure(found: Comparison, name: str, specified: Sensor, calibrated: S
     for sensor, style, (_, colour, _) in zip((specified, calibrated), ("--", "-"), PAIR, strict=True):
         length_mm = 1e3 * sensor.lengths(reading, np.nan).length_m[:, k]
         beta, delta_mm = np.asarray(sensor.beta)[k], 1e3 * np.asarray(sensor.delta_m)[k]
-        name = "as specified" if sensor is specified else "calibrated"
-        curve.plot(reading[:, k] / factor, length_mm, style, color=colour, label=name)
-        text = f"{name}: beta {beta:.3f}, delta {delta_mm:.2f} mm"
+        which = "as specified" if sensor is specified else "calibrated"
+        curve.plot(reading[:, k] / factor, length_mm, style, color=colour, label=which)
+        text = f"{which}: beta {beta:.3f}, delta {delta_mm:.2f} mm"
         line.plot(raw_mm, length_mm, style, color=colour, label=text)
     dots = {"color": INK, "markersize": 3.0, "linestyle": "none", "label": "measured"}
     curve.plot(found.reading[:, k] / factor, ruler_mm[:, k], "o", **dots)

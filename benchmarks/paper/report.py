@@ -14,10 +14,10 @@ from PIL import Image
 from benchmarks.paper import plots
 from benchmarks.paper.calibration_plots import calibration_figures, calibration_numbers
 from benchmarks.paper.engine import MORE, Settings
-from benchmarks.paper.goals import check_goals
 from benchmarks.paper.jobs import CALIBRATION
 from benchmarks.paper.kinds import KINDS
 from benchmarks.paper.summary import Results, Row, simulated_rows, spreads, training_rows, trial_rows
+from benchmarks.paper.targets import check_targets
 from benchmarks.paper.trials import FILMS, loads_film
 from mjx_softarm._support.provenance import provenance, write_json
 
@@ -71,7 +71,7 @@ def write_report(
 
 
 def figures_of(experiment: str, folder: Path, settings: Settings, results: Results) -> dict[str, Any]:
-    """Return all figures: goals, spreads, trainings or simulated errors, calibrations, every run."""
+    """Return all figures: targets, spreads, trainings or simulated errors, calibrations, every run."""
     table, trainings = trial_rows(results), training_rows(results)
     shared = settings.shared() | {name: list(getattr(settings, name)) for name in MORE}
     calibrations = {}
@@ -87,7 +87,7 @@ def figures_of(experiment: str, folder: Path, settings: Settings, results: Resul
     return {
         "arm": settings.arm,
         "settings": shared,
-        "goals": [check._asdict() for check in check_goals(experiment, table, trainings)],
+        "targets": check_targets(experiment, table, trainings),
         "spreads": spreads(table),
         "calibrations": calibrations,
         "runs": table,

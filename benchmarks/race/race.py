@@ -6,7 +6,7 @@ each trains. They run one after another, each in a process of its own with all c
 where the line between two evaluations crosses it for the first time.
 
 Ours with the presets quick and analytic go first. A peer is stopped when it has had as many times our time to
-5 mm as its goals ask for, since they are met then, or when it has reached all levels that quick has;
+5 mm as its targets ask for, since they are met then, or when it has reached all levels that quick has;
 ours-plain has as long as SBX, or its preset's env steps. The preset paper, for the finer levels, trains to
 the finest or to its end. Results stay in the working folder: the same command continues an interrupted race,
 and seeds may be added.
@@ -21,11 +21,20 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
-from benchmarks.harness.common import machine_kind, save, show
+from benchmarks.harness.common import machine_kind, save, show, status_of
 from benchmarks.harness.peers import PINS, PeerError, peer_python
 from benchmarks.harness.rounds import Facts, Worker, WorkerError
 from benchmarks.race.contestants import CONTESTANTS
-from benchmarks.race.summary import FIRST, GOAL_MM, GOALS, LEVELS_MM, PEERS, crossing, median_mm, summarise
+from benchmarks.race.summary import (
+    FIRST,
+    LEVELS_MM,
+    PEERS,
+    TARGET_MM,
+    TARGETS,
+    crossing,
+    median_mm,
+    summarise,
+)
 from mjx_softarm._support import cli
 from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.provenance import provenance, write_json
@@ -72,7 +81,7 @@ def race(
     if any(row["contestant"] == FIRST for row in figures["failed"]):
         raise RaceError(f"{FIRST}: got a failure, expected a result, without which there is no race")
     print(f"written: {save('race', figures)}")
-    return 0
+    return status_of(figures)
 
 
 def run(folder: Path, seeds: Sequence[int], names: Sequence[str], n_goals: int = 2_000) -> list[Facts]:
@@ -103,14 +112,14 @@ def limits_of(name: str, ours: Sequence[Facts]) -> Limits:
     """Return a contestant's limits, by the curves of ours that raced before it, the first one's first."""
     reached_mm = [level for level in LEVELS_MM if crossing(ours[0]["points"], level, "wall_s") is not None]
     times_s = {
-        raced["contestant"]: crossing(raced["points"], GOAL_MM, "wall_s") or raced["points"][-1]["wall_s"]
+        raced["contestant"]: crossing(raced["points"], TARGET_MM, "wall_s") or raced["points"][-1]["wall_s"]
         for raced in ours
         if "points" in raced
     }
     library = name.rsplit("-", 1)[0].replace("ours", "sbx")
     wall_s = max(
         wanted.times * times_s[wanted.ours[0]]
-        for wanted in GOALS
+        for wanted in TARGETS
         if wanted.library == library and wanted.ours[0] in times_s
     )
     if name in ("ours-analytic", "ours-paper"):

@@ -1,6 +1,6 @@
-"""Results of a race: times to each level, and the goals.
+"""Results of a race: times to each level, and the targets.
 
-A goal compares the faster of some of our presets with the fastest variant of a peer: TQC with TQC, and
+A target compares the faster of some of our presets with the fastest variant of a peer: TQC with TQC, and
 learning through the equilibrium with SBX.
 """
 
@@ -12,11 +12,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.harness.common import goal
+from benchmarks.harness.common import target
 from benchmarks.race.contestants import CONTESTANTS
 
 LEVELS_MM = (10, 5, 3, 2, 1)
-GOAL_MM = 5
+TARGET_MM = 5
 FIRST, OUR_TQC = "ours-quick", ("ours-quick", "ours-paper")
 PEERS = {
     library: tuple(f"{library}-{variant}" for variant in ("hindsight", "plain", "defaults"))
@@ -24,15 +24,15 @@ PEERS = {
 }
 
 
-class Goal(NamedTuple):
-    """A library's wall time to GOAL_MM, as a multiple of that of some of ours."""
+class Target(NamedTuple):
+    """A library's wall time to TARGET_MM, as a multiple of that of some of ours."""
 
     library: str
     times: float
     ours: tuple[str, ...] = OUR_TQC
 
 
-GOALS = (Goal("sbx", 5.0), Goal("sb3-contrib", 15.0), Goal("sbx", 20.0, ("ours-analytic",)))
+TARGETS = (Target("sbx", 5.0), Target("sb3-contrib", 15.0), Target("sbx", 20.0, ("ours-analytic",)))
 
 Result = Mapping[str, Any]  # of a contestant with a seed
 Point = Mapping[str, Any]  # of a curve: wall_s, trained_s, env_steps, updates, median_mm (None if not finite)
@@ -58,14 +58,14 @@ def median_mm(point: Point) -> float:
 
 
 def summarise(results: Sequence[Result]) -> dict[str, Any]:
-    """Return times to each level with start-up and without, env steps, goals, failures and the curves."""
+    """Return times to each level with start-up and without, env steps, targets, failures and the curves."""
     ran = [result for result in results if "points" in result]
     who = ("contestant", "seed")
     return {
         "wall_s": [_row(result, "wall_s") for result in ran],
         "wall_s_without_start_up": [_row(result, "trained_s") for result in ran],
         "env_steps": [_row(result, "env_steps") for result in ran],
-        "goals": [judge(wanted, results) for wanted in GOALS],
+        "targets": [judge(wanted, results) for wanted in TARGETS],
         "not_raced": [name for name in CONTESTANTS if name not in {r["contestant"] for r in results}],
         "failed": [{key: r[key] for key in (*who, "failed")} for r in results if "failed" in r],
         "measured_at": [{key: r[key] for key in (*who, "commit", "uncommitted_changes")} for r in ran],
@@ -87,25 +87,25 @@ def _row(result: Result, axis: str) -> dict[str, Any]:
 
 
 def _time(result: Result) -> tuple[bool, float]:
-    """Return whether a contestant missed the goal's level, and its wall time there, or in all."""
-    found = crossing(result["points"], GOAL_MM, "wall_s")
+    """Return whether a contestant missed the target's level, and its wall time there, or in all."""
+    found = crossing(result["points"], TARGET_MM, "wall_s")
     return found is None, result["points"][-1]["wall_s"] if found is None else found
 
 
-def judge(wanted: Goal, results: Sequence[Result]) -> dict[str, str]:
-    """Judge a goal: how many times our wall time a library takes, median over seeds.
+def judge(wanted: Target, results: Sequence[Result]) -> dict[str, str]:
+    """Judge a target: how many times our wall time a library takes, median over seeds.
 
-    A peer that was stopped before the level counts with the time that it had. The goal is judged once all
+    A peer that was stopped before the level counts with the time that it had. The target is judged once all
     variants of the library, any of which might be the fastest, have raced with one seed, and the one that did
     best there with all seeds; with several such seeds, the best of each.
     """
     library, times, names = wanted
     whose = f"that of {', '.join(names)}"
-    text = f"{library}: wall time to {GOAL_MM} mm, start-up included, at least {times:g} times {whose}"
+    text = f"{library}: wall time to {TARGET_MM} mm, start-up included, at least {times:g} times {whose}"
     for result in results:
         if "failed" in result and result["contestant"] in (names[0], *PEERS[library]):
             told = f"{result['contestant']}, seed {result['seed']}: {result['failed']}"
-            return goal(text, told, False if result["contestant"] == names[0] else None)
+            return target(text, told, False if result["contestant"] == names[0] else None)
     raced = {(result["contestant"], result["seed"]): result for result in results if "points" in result}
     missing, ratios, all_reached = _missing(PEERS[library], raced), [], True
     for seed in sorted({seed for _, seed in raced}):
@@ -114,20 +114,20 @@ def judge(wanted: Goal, results: Sequence[Result]) -> dict[str, str]:
             for side in (names, PEERS[library])
         )
         if not ours:
-            return goal(text, f"not raced: {names[0]}, seed {seed}", None)
+            return target(text, f"not raced: {names[0]}, seed {seed}", None)
         ours_missed, ours_s = min(ours)
         if ours_missed:
-            return goal(text, f"ours did not reach it with seed {seed}", False)
+            return target(text, f"ours did not reach it with seed {seed}", False)
         if not theirs:
-            return goal(text, f"not raced: {missing}", None)
+            return target(text, f"not raced: {missing}", None)
         they_missed, their_s = min(theirs, key=lambda time: time[1])
         ratios.append(their_s / ours_s)
         all_reached &= not they_missed
     ratio = float(np.median(ratios))
     measured = f"{ratio:.2f} times" if all_reached else f"not within {ratio:.2f} times"
     if ratio >= times and missing:
-        return goal(text, f"{measured}; not raced: {missing}", None)
-    return goal(text, measured, ratio >= times)
+        return target(text, f"{measured}; not raced: {missing}", None)
+    return target(text, measured, ratio >= times)
 
 
 def _missing(variants: Sequence[str], raced: Mapping[tuple[str, int], Result]) -> str:

@@ -1,4 +1,4 @@
-"""Goals for a GPU: rates, and the time to a trained policy; skipped where there is none."""
+"""Targets for a GPU: rates, and the time to a trained policy; skipped where there is none."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.harness.common import goal
+from benchmarks.harness.common import target
 
 NO_DEVICE = "no CUDA device here: jax runs on the CPU"
 LEAST_RATE = {"chain": 300_000, "mjx": 30_000}  # env steps/s at the best number of arms
@@ -25,28 +25,28 @@ TRAINING = (
 )
 
 
-def rate_goals(rows: Sequence[Mapping[str, Any]], on_gpu: bool) -> list[dict[str, str]]:
-    """Return the goals for env steps/s of each engine at the best number of arms; skipped without a GPU."""
-    goals = []
+def rate_targets(rows: Sequence[Mapping[str, Any]], on_gpu: bool) -> list[dict[str, str]]:
+    """Return the targets for env steps/s of each engine at the best number of arms; skipped without a GPU."""
+    targets = []
     for engine, least in LEAST_RATE.items():
         text = f"{least:,} env steps/s on a GPU, {engine}"
         mine = [row for row in rows if (row["engine"], row["mode"]) == (engine, "quasistatic")]
         best = max(mine, key=lambda row: row.get("env_steps_per_s", 0.0))
         rate = best.get("env_steps_per_s")
         if not on_gpu:
-            goals.append(goal(text, NO_DEVICE, None))
+            targets.append(target(text, NO_DEVICE, None))
         elif rate is None:
-            goals.append(goal(text, "every run failed", False))
+            targets.append(target(text, "every run failed", False))
         else:
-            goals.append(goal(text, f"{rate:,} with {best['arms']:,} arms", rate >= least))
-    return goals
+            targets.append(target(text, f"{rate:,} with {best['arms']:,} arms", rate >= least))
+    return targets
 
 
-def training_goal(on_gpu: bool) -> dict[str, str]:
-    """Return the goal for the wall time of a training process, imports and compilation included."""
+def training_target(on_gpu: bool) -> dict[str, str]:
+    """Return the target for the wall time of a training process, imports and compilation included."""
     text = f"{MEDIAN_MM:g} mm median over the workspace in under {WITHIN_S:g} s on a GPU, with compilation"
     if not on_gpu:
-        return goal(text, NO_DEVICE, None)
+        return target(text, NO_DEVICE, None)
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "run"
         settings = [f"--{setting}" for setting in TRAINING]
@@ -56,10 +56,12 @@ def training_goal(on_gpu: bool) -> dict[str, str]:
             spent, best = seconds_to(MEDIAN_MM, command, run / "metrics.jsonl", LONGEST_S, cache)
         except RuntimeError as error:
             print(error, flush=True)
-            return goal(text, str(error).splitlines()[-1], False)
+            return target(text, str(error).splitlines()[-1], False)
     if spent is None:
-        return goal(text, f"{best:.3g} mm at best, when it ended or was stopped after {LONGEST_S:g} s", False)
-    return goal(text, f"{spent:.1f} s", spent < WITHIN_S)
+        return target(
+            text, f"{best:.3g} mm at best, when it ended or was stopped after {LONGEST_S:g} s", False
+        )
+    return target(text, f"{spent:.1f} s", spent < WITHIN_S)
 
 
 def seconds_to(

@@ -19,7 +19,7 @@ from unittest import mock
 import jax
 import numpy as np
 
-from benchmarks.harness.common import goal, n_cores
+from benchmarks.harness.common import n_cores, target
 from benchmarks.harness.rounds import Facts, Worker, take_turns
 from benchmarks.speed.throughput import LINKS, MOST_LINKS_MJX, N_LINKS, N_ROUNDS, NO_MJX, over_rounds, turns
 from benchmarks.speed.truth import Truth, error_figures, random_references, settle_function, true_rest
@@ -30,9 +30,11 @@ ITERATIONS = (2, 3, 4, 5, 6, 8, 12)
 N_ARMS = 512
 METHODS = ("chain", "mjx", "stepping")
 SPREADS = (0.1, 0.3, 0.42, 0.65, 0.85, 1.0, 1.4)  # of `random_references`; saturate from about 0 to 60 %
-GOAL_RATE, GOAL_P95_MM, GOAL_CORES = 10_000, 0.5, 2
-GOAL_ARMS = (128, 512, 1024)
-GOAL = f"{GOAL_RATE:,} env steps/s on {GOAL_CORES} CPU cores, chain, tip within {GOAL_P95_MM} mm (95 %)"
+TARGET_RATE, TARGET_P95_MM, TARGET_CORES = 10_000, 0.5, 2
+TARGET_ARMS = (128, 512, 1024)
+TARGET = (
+    f"{TARGET_RATE:,} env steps/s on {TARGET_CORES} CPU cores, chain, tip within {TARGET_P95_MM} mm (95 %)"
+)
 
 
 def measure() -> dict[str, Any]:
@@ -46,7 +48,7 @@ def measure() -> dict[str, Any]:
         "fixed": over_iterations(spec, reference, truth),
         "over_links": [row for row in rows if row["spread"] == 1.0],
         "over_saturation": [row for row in rows if row["links_per_section"] == N_LINKS],
-        "goals": [_goal()],
+        "targets": [_target()],
     }
 
 
@@ -98,21 +100,23 @@ def way(rounds: Sequence[Facts], truth: Truth) -> dict[str, Any]:
     return {**error_figures(tip_mm, first), **over_rounds(rounds)}
 
 
-def _goal() -> dict[str, str]:
-    """Return the goal for environment steps a second on two cores, and for the error of the same programs."""
-    if n_cores() < GOAL_CORES or jax.default_backend() != "cpu" or not hasattr(os, "sched_setaffinity"):
-        return goal(GOAL, f"got no CPU on Linux with {GOAL_CORES} cores or more", None)
-    points = [("chain", "quasistatic", n, N_LINKS) for n in GOAL_ARMS]
-    return speed_goal(turns(points, GOAL_CORES))
+def _target() -> dict[str, str]:
+    """Return the target for env steps a second on two cores, and for the error of the same programs."""
+    if n_cores() < TARGET_CORES or jax.default_backend() != "cpu" or not hasattr(os, "sched_setaffinity"):
+        return target(TARGET, f"got no CPU on Linux with {TARGET_CORES} cores or more", None)
+    points = [("chain", "quasistatic", n, N_LINKS) for n in TARGET_ARMS]
+    return speed_target(turns(points, TARGET_CORES))
 
 
-def speed_goal(rows: Sequence[Mapping[str, Any]]) -> dict[str, str]:
-    """Return the goal, judged at the fastest number of arms."""
+def speed_target(rows: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+    """Return the target, judged at the fastest number of arms."""
     measured = [row for row in rows if "failed" not in row]
     why = "; ".join(row["failed"] for row in rows if "failed" in row)
     if not measured:
-        return goal(GOAL, why, False)
+        return target(TARGET, why, False)
     best = max(measured, key=lambda row: row["env_steps_per_s"])
     rate, p95_mm = best["env_steps_per_s"], best["p95_mm"]
     text = f"{rate:,} with {best['arms']:,} arms, {p95_mm:g} mm"
-    return goal(GOAL, "; ".join(filter(None, [text, why])), rate >= GOAL_RATE and p95_mm <= GOAL_P95_MM)
+    return target(
+        TARGET, "; ".join(filter(None, [text, why])), rate >= TARGET_RATE and p95_mm <= TARGET_P95_MM
+    )

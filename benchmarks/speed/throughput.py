@@ -72,7 +72,7 @@ def measure() -> dict[str, Any]:
         "side_by_side": _side_by_side(ArmSpec.default(), on_gpu),
         "simulated_time": simulated_time(),
         "start": _starts(),
-        "goals": [*gpu.rate_goals(rows, on_gpu), gpu.training_goal(on_gpu)],
+        "targets": [*gpu.rate_targets(rows, on_gpu), gpu.training_target(on_gpu)],
     }
 
 

@@ -6,7 +6,7 @@ import json
 import pytest
 
 from benchmarks.accuracy import path
-from benchmarks.accuracy.path import means_over, measure
+from benchmarks.accuracy.path import means_over, measure, targets
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.policy.file import SHIPPED, load_policy
 
@@ -27,6 +27,13 @@ def test_means_are_those_of_equal_keys():
         {"trained": "at rest", "policies": 2, "mm": 2.0},
         {"trained": "in motion", "policies": 1, "mm": 4.0},
     ]
+
+
+def test_the_target_is_for_one_pace_however_trained():
+    rows = [("at rest", 20.0, 4.01), ("in motion", 20.0, 4.0), ("in motion", 10.0, 9.0)]
+    found = targets([{"trained": t, "once around [s]": s, "mean [mm]": mm} for t, s, mm in rows])
+    assert [row["verdict"] for row in found] == ["NOT MET", "met"]
+    assert found[0]["target"] == "trained at rest, once around in 20 s: mean at most 4 mm"
 
 
 def test_no_policies_and_one_that_cannot_be_measured_are_named(tmp_path):

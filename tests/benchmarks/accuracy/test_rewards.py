@@ -6,7 +6,16 @@ import numpy as np
 import pytest
 
 from benchmarks.accuracy import rewards
-from benchmarks.accuracy.rewards import BY_HAND, HAND_MADE, LEARNED, SCRIPTED, config_of, measure, summary
+from benchmarks.accuracy.rewards import (
+    BY_HAND,
+    HAND_MADE,
+    LEARNED,
+    SCRIPTED,
+    config_of,
+    measure,
+    summary,
+    targets,
+)
 from train.config import to_dict
 
 
@@ -24,6 +33,27 @@ def test_a_run_without_success_counts_as_never():
     found = summary([{"steps_to_success": n, **rest} for n in (1024, None, 512)])
     assert found.pop("steps to 90 %: least, median, most") == "512, 1,024, never"
     assert found == rest
+
+
+def test_a_learned_reward_is_to_need_fewer_steps_with_the_same_settings_and_demonstrations():
+    steps = {
+        ("pipe", SCRIPTED): {LEARNED: [512, 2048, None], HAND_MADE: [1024, 1024, 4096]},
+        ("hand-made", SCRIPTED): {LEARNED: [512, 512], HAND_MADE: [None, None]},
+    }
+    found = targets(
+        [
+            {"settings": settings, "shown": shown, "reward": reward, "steps_to_success": n}
+            for (settings, shown), of in steps.items()
+            for reward, taken in of.items()
+            for n in taken
+        ]
+    )
+    text = "90 % success in fewer env steps with the learned reward"
+    assert [(row["target"], row["verdict"]) for row in found] == [
+        (f"pipe, scripted: {text}", "NOT MET"),
+        (f"hand-made, scripted: {text}", "met"),
+    ]
+    assert found[0]["measured"] == "2,048 learned, 1,024 hand-made, medians"
 
 
 @pytest.fixture

@@ -1,14 +1,18 @@
-"""Tables of figures, goals, memory."""
+"""Tables of figures, targets, memory."""
 
 import io
+import json
 import os
 import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from rich.console import Console
 
-from benchmarks.harness.common import show
+from benchmarks import __main__ as benchmarks
+from benchmarks.harness import common
+from benchmarks.harness.common import show, target
 
 
 def shown(figures, title=""):
@@ -57,6 +61,22 @@ def test_curves_are_for_the_file_alone():
     ]
 
 
+@pytest.mark.parametrize(("met", "status"), [(True, 0), (None, 0), (False, 1)])
+def test_a_missed_target_ends_with_status_1_and_its_file_is_there(met, status, monkeypatch, tmp_path):
+    monkeypatch.setattr(common, "RESULTS", tmp_path)
+    figures = {"mm": 2.0, "targets": [target("1 mm", "0.5 mm", True), target("less", "2 mm", met)]}
+    monkeypatch.setitem(benchmarks.BENCHMARKS, "settle", f"{__name__}:measured")
+    monkeypatch.setitem(globals(), "FIGURES", figures)
+    assert benchmarks.main(["settle"]) == status
+    assert json.loads((tmp_path / "settle.json").read_text())["figures"] == figures
+
+
+def measured():
+    """Return what a benchmark measured."""
+    return FIGURES
+
+
+FIGURES: dict = {}
 MEMORY = """
 import numpy as np
 from benchmarks.harness.common import peak_memory

@@ -121,8 +121,8 @@ def test_open_results_are_written_and_nothing_is_hidden(tmp_path):
     pictures = {f"paper-{name}.png" for name in ("circle", "loads", "configurations", "lengths", "sensor")}
     assert files == {"paper-open.json", "paper-circle.gif", "paper-loads.gif", *pictures}
     assert (tmp_path / "out" / "paper-circle.gif").read_bytes()[:6] == b"GIF89a"
-    assert figures["goals"][0]["value"] == "nan mm, 6 points missed in 1 of 2 runs"
-    assert not figures["goals"][0]["met"]
+    assert figures["targets"][0]["measured"] == "nan mm, 6 points missed in 1 of 2 runs"
+    assert figures["targets"][0]["verdict"] == "NOT MET"
     assert figures["calibrations"] == {"twin 0": {"Springs": []}, "twin 1": {"Springs": ["off <by> much"]}}
     assert len(figures["runs"]) == len(trials("open", TINY))
     assert [row["translation_mm"] is None for row in figures["runs"]].count(True) == 1
@@ -142,8 +142,8 @@ def test_confined_results_are_written_and_nothing_is_hidden(tmp_path):
         "paper-confined-success.png",
         "paper-confined-losses.png",
     }
-    assert figures["goals"][0]["value"] == "nan mm, 28 points missed in 1 of 2 runs"
-    assert [goal["met"] for goal in figures["goals"]].count(False) == 7
+    assert figures["targets"][0]["measured"] == "nan mm, 28 points missed in 1 of 2 runs"
+    assert [row["verdict"] for row in figures["targets"]].count("NOT MET") == 7
     assert len(figures["trainings"]) == len(trainings(TINY))
     assert [row["x_mm"] is None for row in figures["runs"]].count(True) == 3
 
@@ -155,8 +155,10 @@ def test_titles_and_labels_lie_within_the_pictures(experiment, twins, tmp_path):
     fill(tmp_path, settings)
     results = good_results(experiment, settings)
     drawn = report.draw(experiment, results, trial_rows(results), "twin")
-    for name, figure in (drawn | calibration_figures(tmp_path, settings)).items():
+    calibrations = calibration_figures(tmp_path, settings)
+    for name, figure in (drawn | calibrations).items():
         check_nothing_is_cut_off(name, figure)
+    assert all("twin 0" in figure.get_suptitle() for figure in calibrations.values())
 
 
 @pytest.mark.parametrize("n_twins", [1, 2, 3])

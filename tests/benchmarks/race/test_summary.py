@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from benchmarks.race.summary import PEERS, Goal, crossing, judge, summarise
+from benchmarks.race.summary import PEERS, Target, crossing, judge, summarise
 
 
 def result(name, *errors_mm, seed=0):
@@ -32,7 +32,7 @@ def others(*errors_mm, libraries=tuple(PEERS), seed=0):
     return [result(name, *errors_mm, seed=seed) for library in libraries for name in PEERS[library]]
 
 
-TQC = {"sbx": Goal("sbx", 5.0), "sb3-contrib": Goal("sb3-contrib", 15.0)}
+TQC = {"sbx": Target("sbx", 5.0), "sb3-contrib": Target("sb3-contrib", 15.0)}
 
 
 def judged(library, *results):
@@ -118,7 +118,7 @@ def test_ours_is_the_better_of_two_presets_and_never_the_one_without_hindsight()
 
 
 def test_a_goal_of_another_learner_looks_at_that_learner_alone():
-    wanted = Goal("sbx", 10.0, ("ours-analytic",))
+    wanted = Target("sbx", 10.0, ("ours-analytic",))
     results = [result("ours-quick", 9.0, 4.0), *others(*[9.0] * 14, 4.0)]
     assert judge(wanted, results)["measured"] == "not raced: ours-analytic, seed 0"
     row = judge(wanted, [*results, result("ours-analytic", 4.0)])

@@ -1,4 +1,4 @@
-"""Goals for a GPU, judged on made-up figures and with a made-up training."""
+"""Targets for a GPU, judged on made-up figures and with a made-up training."""
 
 import json
 import sys
@@ -17,14 +17,14 @@ def rates(**engines):
     return [*rows, {"engine": "mjx", "mode": "dynamic", "arms": 1, "env_steps_per_s": 10**9}]
 
 
-def test_goals_of_a_gpu_are_judged_at_the_best_number_of_arms_and_skipped_without_one():
-    goals = gpu.rate_goals(rates(chain={1: 5, 8192: 300_000, 32_768: 7}, mjx={8192: 29_999}), on_gpu=True)
-    assert [row["verdict"] for row in goals] == ["met", "NOT MET"]
-    assert goals[0]["measured"] == "300,000 with 8,192 arms"
-    goals = gpu.rate_goals(rates(chain={1: 10**6}, mjx={1: 10**6}), on_gpu=False)
-    goals.append(gpu.training_goal(on_gpu=False))
-    assert {row["verdict"] for row in goals} == {"skipped"}
-    assert {row["measured"] for row in goals} == {gpu.NO_DEVICE}
+def test_targets_of_a_gpu_are_judged_at_the_best_number_of_arms_and_skipped_without_one():
+    targets = gpu.rate_targets(rates(chain={1: 5, 8192: 300_000, 32_768: 7}, mjx={8192: 29_999}), on_gpu=True)
+    assert [row["verdict"] for row in targets] == ["met", "NOT MET"]
+    assert targets[0]["measured"] == "300,000 with 8,192 arms"
+    targets = gpu.rate_targets(rates(chain={1: 10**6}, mjx={1: 10**6}), on_gpu=False)
+    targets.append(gpu.training_target(on_gpu=False))
+    assert {row["verdict"] for row in targets} == {"skipped"}
+    assert {row["measured"] for row in targets} == {gpu.NO_DEVICE}
 
 
 def test_the_training_for_a_gpu_has_settings_that_there_are():

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from benchmarks.speed import settle
-from benchmarks.speed.settle import GOAL_ARMS, SPREADS, speed_goal
+from benchmarks.speed.settle import SPREADS, TARGET_ARMS, speed_target
 from benchmarks.speed.truth import (
     Truth,
     error_figures,
@@ -61,11 +61,11 @@ def test_the_error_of_what_a_program_told_is_that_of_its_tips():
         ({}, ["a: no memory", "b: gone"], "NOT MET", "a: no memory; b: gone"),
     ],
 )
-def test_the_goal_asks_for_speed_and_precision_at_once(measured, failed, verdict, told):
+def test_the_target_asks_for_speed_and_precision_at_once(measured, failed, verdict, told):
     rows = [{"arms": n, "env_steps_per_s": rate, "p95_mm": mm} for n, (rate, mm) in measured.items()]
-    row = speed_goal([*rows, *({"failed": why} for why in failed)])
+    row = speed_target([*rows, *({"failed": why} for why in failed)])
     assert row["verdict"] == verdict and row["measured"] == told
-    assert 1024 in GOAL_ARMS
+    assert 1024 in TARGET_ARMS
 
 
 def test_more_iterations_come_closer(monkeypatch):

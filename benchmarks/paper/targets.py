@@ -1,33 +1,29 @@
-"""Goals of the experiments, set before anything was measured, and whether they are met.
+"""Targets of the experiments, set before anything was measured, and whether they are met.
 
-A trial that missed a goal pose meets none, however small its error.
+A trial that missed a goal meets none, however small its error.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
+from benchmarks.harness.common import target
 from benchmarks.paper.measure import CALM_N
-from benchmarks.paper.summary import HEAVY_G, LIGHT_G, SUCCESS, Row, all_done
+from benchmarks.paper.summary import HEAVY_G, LIGHT_G, Row, all_done
 
 CALM_PERCENT = 99.0
 WIDE_RUNS, NARROW_RUNS, OF_RUNS = 8, 7, 9  # for other numbers of runs, the same share
 ANGLES = ("yaw", "pitch", "roll")
 
 
-class Check(NamedTuple):
-    """A goal beside what was measured."""
-
-    text: str
-    value: str
-    met: bool
+Check = dict[str, str]  # a row of `target`
 
 
-def check_goals(experiment: str, table: Sequence[Row], trainings: Sequence[Row]) -> list[Check]:
-    """Check the goals of the experiment "open" or "confined", given `trial_rows` and `training_rows`."""
+def check_targets(experiment: str, table: Sequence[Row], trainings: Sequence[Row]) -> list[Check]:
+    """Check the targets of the experiment "open" or "confined", given `trial_rows` and `training_rows`."""
     return _open(table) if experiment == "open" else _confined(table, trainings)
 
 
@@ -62,7 +58,7 @@ def _open(table: Sequence[Row]) -> list[Check]:
 
 
 def _loaded(how: str, rows: Sequence[Row]) -> list[Check]:
-    """Check the goals for payloads; the policies are those of `rows`."""
+    """Check the targets for payloads; the policies are those of `rows`."""
     light, heavy = ([row for row in rows if row["load_g"] == load_g] for load_g in (LIGHT_G, HEAVY_G))
     return [
         _at_most(f"{LIGHT_G} g{how}, mean translation", "mm", 2.5, light, "translation_mm"),
@@ -79,9 +75,6 @@ def _confined(table: Sequence[Row], trainings: Sequence[Row]) -> list[Check]:
     time = np.mean(_values(moving, "seconds")) / np.mean(_values(shown, "seconds"))
     mm, without_mm = _mean_mm(circle), _mean_mm(without)
     both_mm = f"{mm:.2f} mm with, {without_mm:.2f} mm without"
-    learned, hand_made, stages = (
-        [row for row in trainings if row["kind"] == kind] for kind in ("pipe", "hand-made", "circle")
-    )
     done = {(row["twin"], row["seed"]): all_done(row) for row in exchanged}
     motion = "300 mm pipe, in motion"
     four = "300 mm pipe: all four operations done, as shown and exchanged"
@@ -99,19 +92,18 @@ def _confined(table: Sequence[Row], trainings: Sequence[Row]) -> list[Check]:
         _calm("300 mm pipe, as shown and exchanged", shown, exchanged),
         _calm(motion, moving),
         _calm("250 mm pipe", narrow),
-        _fewer_steps(learned, hand_made),
         _reaching(better, both_mm, mm <= without_mm, circle, without),
-        _kept([row["stages_first_success"] for row in stages]),
+        _kept([row["stages_first_success"] for row in trainings if row["kind"] == "circle"]),
     ]
 
 
 def _check(text: str, value: str, met: Any, *groups: Sequence[Any]) -> Check:
     """Return a check of groups of rows; not measured where one is empty."""
-    return Check(text, value, bool(met)) if all(groups) else Check(text, "not measured", False)
+    return target(text, value, bool(met)) if all(groups) else target(text, "not measured", False)
 
 
 def _reaching(text: str, value: str, met: Any, *groups: Sequence[Row]) -> Check:
-    """Return a check that is not met where a goal pose was missed."""
+    """Return a check that is not met where a goal was missed."""
     rows = [row for group in groups for row in group]
     n, n_runs = _missed(rows)
     missed = f", {n} points missed in {n_runs} of {len(rows)} runs" if n else ""
@@ -119,7 +111,7 @@ def _reaching(text: str, value: str, met: Any, *groups: Sequence[Row]) -> Check:
 
 
 def _missed(rows: Sequence[Row]) -> tuple[int, int]:
-    """Return the number of missed goal poses, and of the runs that missed any."""
+    """Return the number of missed goals, and of the runs that missed any."""
     missed = [row["points"] - row["measured"] for row in rows]
     return sum(missed), sum(n > 0 for n in missed)
 
@@ -154,22 +146,6 @@ def _calm(where: str, *groups: Sequence[Row]) -> Check:
     shares = _values([row for rows in groups for row in rows], "calm_percent")
     value = f"{min(shares):.2f} % in the worst run, {np.mean(shares):.2f} % in the mean"
     return _reaching(text, value, min(shares) >= CALM_PERCENT, *groups)
-
-
-def _fewer_steps(learned: Sequence[Row], hand_made: Sequence[Row]) -> Check:
-    """Compare environment steps to success.
-
-    A run without success counts as one step more than it had, the least possible. That favours the hand-made
-    reward, so every run with the learned one must succeed.
-    """
-    means, parts, never = [], [], []
-    for name, rows in (("learned", learned), ("hand-made", hand_made)):
-        means.append(np.mean([row["steps_to_success"] or row["env_steps"] + 1 for row in rows] or [np.nan]))
-        never.append(sum(row["steps_to_success"] is None for row in rows))
-        more = f" or more: never in {never[-1]} of {len(rows)} runs" if never[-1] else ""
-        parts.append(f"{name} {means[-1]:,.0f} in the mean{more}")
-    text = f"learned reward: {100 * SUCCESS:g} % success in fewer environment steps than the hand-made one"
-    return _check(text, "; ".join(parts), not never[0] and means[0] < means[1], learned, hand_made)
 
 
 def _kept(success: Sequence[Sequence[float] | None]) -> Check:
