@@ -11,14 +11,14 @@ shorter run with a seed that is not used again.
 Then the arm carries payloads. The policy sees the true pose of the tip after each of four actions, and the
 true payload if it observes it, so no estimate adds an error of its own. Without a payload it goes twice
 around circles of `SIZES` times the paper's, and the second lap counts. Gradient descent on the springs, which
-solves for lengths and knows no pressures, goes once around the same circles, from other random poses for each
-seed.
+solves for lengths and knows no pressures, goes without a payload to some of the goals, others for each seed,
+with as many searches as a policy has actions, and once around the same circles.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -32,6 +32,7 @@ from mjx_softarm._support import cli, xla
 from mjx_softarm._support.mjx import State
 from mjx_softarm.env import EnvConfig, Randomisation, ReachEnv
 from mjx_softarm.env.state import PAYLOAD_SHARE
+from mjx_softarm.mdp.actions import N_ACTIONS
 from mjx_softarm.mechanics.excitation import CIRCLE_DIAMETER_MM, circle_poses
 from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.settle import settle_pressures
@@ -47,7 +48,8 @@ SIZES = (0.75, 1.0, 1.25, 1.5)  # of the paper's circle: 120 to 240 mm
 N_CIRCLE = PATH // 2  # points of a lap
 RATES = (2e-3, 5e-4, 1e-4)
 TUNING_SEED, TUNING_SHARE = 100, 0.25  # share of a run's steps
-SOLVER, N_SEARCHES = "gradient descent", 2  # for each point, the second from where the first has led
+SOLVER, N_SOLVED = "gradient descent", 50  # goals of each set, for each seed
+N_SEARCHES = 2  # for each point of a circle, the second from where the first has led
 
 
 class PressureEnv(ReachEnv):
@@ -106,8 +108,11 @@ def measure(
             at_goals, around = trial.run(seed, rates[name])
             loads += [{"commands": name, "seed": seed, **row} for row in at_goals]
             circles += [{"way": name, "seed": seed, **row} for row in around]
+    descent = Descent(spec, goals)
     for seed in seeds:
-        circles += [{"way": SOLVER, "seed": seed, **row} for row in descended(spec, seed)]
+        at_goals, around = descent.run(seed)
+        loads.append({"commands": SOLVER, "seed": seed, "load_g": 0, **at_goals})
+        circles += [{"way": SOLVER, "seed": seed, **row} for row in around]
     return {
         "settings": {"seeds": list(seeds), "env_steps": steps, "goals": goals, "learning_rates": rates},
         "under loads": means(loads, ("commands", "load_g")),
@@ -124,8 +129,7 @@ class Trial:
         self.kind, self.config, self.spec, self.n_goals = kind, config, spec, n_goals
         loaded = Randomisation(payload_max_kg=LARGEST_KG)
         self.env = kind.env(spec, EnvConfig(observation=config.env.observation, randomisation=loaded))
-        sets = (self.env.sample_pool(n_goals, HELD_OUT_SEED, evenly).pose for evenly in (False, True))
-        self.paths = np.concatenate([paths_of(jnp.concatenate(list(sets))), laps(spec)])
+        self.paths = np.concatenate([paths_of(jnp.concatenate(goals_of(self.env, n_goals))), laps(spec)])
         self.keys = start_keys(len(self.paths))
         self._jobs: dict[float, Any] = {}  # by learning rate
         one = functools.partial(follow, self.env, learner_of(config, self.env))
@@ -145,7 +149,13 @@ class Trial:
         """Train one policy; return its figures under each payload, and around each circle without one."""
         policy = self.policy(seed, rate, self.config.total_env_steps)
         found = {load_g: self.reached(policy, load_g) for load_g in LOADS_G}
-        at_goals = [{"load_g": load_g, **figures(workspace)} for load_g, (workspace, _) in found.items()]
+        at_goals = [
+            {
+                "load_g": load_g,
+                **figures(np.asarray(workspace.tip_error_mm), np.asarray(workspace.saturated_chambers)),
+            }
+            for load_g, (workspace, _) in found.items()
+        ]
         _, circles = found[0]
         off_mm = np.linalg.norm((circles.pose - circles.goal)[..., :3], axis=-1)
         return at_goals, circle_rows(off_mm, np.asarray(circles.saturated_chambers))
@@ -169,6 +179,11 @@ class Trial:
         return workspace, jax.tree.map(lambda x: x[-n:, -N_CIRCLE:], found)
 
 
+def goals_of(env: ReachEnv, n_goals: int) -> list[Array]:
+    """Return n held-out goals (n_goals, 6) [mm, deg] of each of the two sets."""
+    return [env.sample_pool(n_goals, HELD_OUT_SEED, evenly).pose for evenly in (False, True)]
+
+
 def laps(spec: ArmSpec) -> np.ndarray:
     """Return two laps (SIZES, PATH, 6) [mm, deg] of each circle."""
     sizes = np.array([[size, size, 1.0, 1.0, 1.0, 1.0] for size in SIZES], np.float32)  # wider, not lower
@@ -182,14 +197,13 @@ def follow(env: ReachEnv, learner: Any, policy: Any, load_kg: Array, path: Array
     return follow_from(env, learner, policy, path, env.reset_from(noise._replace(uniform=share)))
 
 
-def figures(reached: Reached) -> dict[str, float]:
-    """Return errors, and the share of goals with a saturated chamber."""
-    off_mm = reached.tip_error_mm
+def figures(off_mm: np.ndarray, n_saturated: np.ndarray) -> dict[str, float]:
+    """Return errors, and the share of goals with a saturated chamber, by what each goal (n,) has."""
     return {
         "median_mm": float(np.median(off_mm)),
         "mean_mm": float(np.mean(off_mm)),
         "p95_mm": float(np.quantile(off_mm, 0.95)),
-        "saturated_percent": 100 * float(np.mean(reached.saturated_chambers > 0)),
+        "saturated_percent": 100 * float(np.mean(n_saturated > 0)),
     }
 
 
@@ -206,24 +220,35 @@ def circle_rows(off_mm: np.ndarray, n_saturated: np.ndarray) -> list[dict[str, A
     ]
 
 
-def descended(spec: ArmSpec, seed: int) -> list[dict[str, Any]]:
-    """Return the rows of the solver, by the estimator of the policy that ships; it knows of no payload."""
-    env, solve = ReachEnv(spec, EnvConfig()), gradient_descent(load_policy(SHIPPED))
-    step, reset = xla.jit(env.step), xla.jit(env.reset)
-    keys = jax.random.split(jax.random.PRNGKey(seed), len(SIZES))
+class Descent:
+    """Gradient descent by the estimator of the policy that ships; it knows of no payload."""
 
-    def along(path: np.ndarray, key: Array) -> Iterator[tuple[float, float]]:
-        state = reset(key)
+    def __init__(self, spec: ArmSpec, n_goals: int):
+        self.env, self.spec = ReachEnv(spec, EnvConfig()), spec
+        self.solve = gradient_descent(load_policy(SHIPPED))
+        self.step, self.reset = xla.jit(self.env.step), xla.jit(self.env.reset)
+        self.sets = [np.asarray(poses) for poses in goals_of(self.env, n_goals)]
+
+    def run(self, seed: int) -> tuple[dict[str, float], list[dict[str, Any]]]:
+        """Return its figures at some goals of both sets, and around each circle, from random poses."""
+        rng, keys = np.random.default_rng(seed), jax.random.split(jax.random.PRNGKey(seed), len(SIZES) + 1)
+        some = [rng.choice(poses, min(N_SOLVED, len(poses)), replace=False) for poses in self.sets]
+        at_goals = figures(*self.along(np.concatenate(some), keys[-1], N_ACTIONS))
+        laps_once = laps(self.spec)[:, :N_CIRCLE]
+        around = [self.along(path, key, N_SEARCHES) for path, key in zip(laps_once, keys, strict=False)]
+        return at_goals, circle_rows(*np.stack(around, axis=1))
+
+    def along(self, path: np.ndarray, key: Array, n_searches: int) -> np.ndarray:
+        """Return tip errors [mm] and saturated chambers (2, n) at the goals of a path (n, 6)."""
+        state, found = self.reset(key), []
         for goal in path:
-            for _ in range(N_SEARCHES):
+            for _ in range(n_searches):
                 arm = state.pipeline_state
-                spring_m = solve(np.asarray(arm.pose), goal, np.asarray(arm.spring_m, float), None)
-                state = step(towards(env, state, goal), env.action_of(jnp.asarray(spring_m)))
-            yield float(state.metrics["tip_error_mm"]), float(state.metrics["saturated_chambers"])
-
-    laps_once = laps(spec)[:, :N_CIRCLE]
-    found = [list(along(path, key)) for path, key in zip(laps_once, keys, strict=True)]
-    return circle_rows(*np.moveaxis(np.array(found), -1, 0))
+                spring_m = self.solve(np.asarray(arm.pose), goal, np.asarray(arm.spring_m, float), None)
+                action = self.env.action_of(jnp.asarray(spring_m))
+                state = self.step(towards(self.env, state, goal), action)
+            found.append([float(state.metrics[name]) for name in ("tip_error_mm", "saturated_chambers")])
+        return np.array(found).T
 
 
 def means(rows: list[dict[str, Any]], by: tuple[str, ...]) -> list[dict[str, Any]]:
