@@ -89,7 +89,7 @@ def loads_figure(table: Sequence[Row]) -> Figure:
     for panel in (left, right):
         panel.set_xticks(sorted({row["load_g"] for row in table if row["kind"] == "with"}))
         panel.tick_params("x", rotation=60)
-        panel.set_ylim(bottom=0)
+        panel.set_ylim(0, 1.45 * panel.get_ylim()[1])  # room for the legend
         panel.legend(frameon=False, fontsize=8, loc="upper left")
     return figure
 
