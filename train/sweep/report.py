@@ -30,6 +30,7 @@ FIGURES = (
     "circle_max_mm",
     "circle_saturated_chambers",
 )
+IN_MOTION = ("near_share", "near_median_s", "overshoot_median_mm", "overshoot_p95_mm")
 RESULTS_FILE, CURVES_FILE = "results.json", "learning_curves.png"
 
 # Columns of the table: figure, its heading, factor to the unit there, decimals.
@@ -51,8 +52,9 @@ def by_settings(runs: Sequence[Run], settings_of: Callable[[Run], dict[str, Any]
         settings_of: settings that the runs of a group share.
 
     Returns:
-        For each group `settings`, `runs` with their figures, and `over_seeds`: mean, least and greatest; for
-        polished runs `tqc_alone_over_seeds` too.
+        For each group `settings`, `runs` with their figures, and `over_seeds`: mean, least and greatest. What
+        all runs have beside these, in place of `NAME`, follows as `NAME_over_seeds`: `tqc_alone` of polished
+        runs, and further evaluations, by the names of their files.
 
     Raises:
         RunError: a run is not finished.
@@ -63,9 +65,11 @@ def by_settings(runs: Sequence[Run], settings_of: Callable[[Run], dict[str, Any]
         group = groups.setdefault(json.dumps(settings, sort_keys=True), {"settings": settings, "runs": []})
         group["runs"].append(_figures(run))
     for group in groups.values():
-        group["over_seeds"] = _spread(group["runs"])
-        if all("tqc_alone" in row for row in group["runs"]):  # polished runs
-            group["tqc_alone_over_seeds"] = _spread([row["tqc_alone"] for row in group["runs"]])
+        rows = group["runs"]
+        group["over_seeds"] = _spread(rows)
+        for name in (name for name, value in rows[0].items() if isinstance(value, dict)):
+            if all(name in row for row in rows):
+                group[f"{name}_over_seeds"] = _spread([row[name] for row in rows])
     return list(groups.values())
 
 
@@ -74,16 +78,19 @@ def _figures(run: Run) -> dict[str, Any]:
     if not file.exists():
         raise RunError(f"{run.path}: got no evaluation.json, expected a finished run")
     rows = run.metrics()
+    further = sorted(run.path.glob("evaluation-*.json"))
     return {
         "seed": run.config.seed,
         "env_steps": rows[-1]["env_steps"],
         "updates": rows[-1]["updates"],
         **json.loads(file.read_text("utf-8")),
+        **{file.stem: json.loads(file.read_text("utf-8")) for file in further},
     }
 
 
 def _spread(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
-    values = {name: [row[name] for row in rows] for name in FIGURES}
+    names = (*FIGURES, *(name for name in IN_MOTION if all(row.get(name) is not None for row in rows)))
+    values = {name: [row[name] for row in rows] for name in names}
     return {
         name: {"mean": float(np.mean(x)), "min": float(np.min(x)), "max": float(np.max(x))}
         for name, x in values.items()

@@ -33,7 +33,11 @@ def test_targets_are_those_of_the_groups_presets_for_means_over_seeds():
     names = ("median_mm", "p95_mm", "circle_mean_mm", "even_median_mm", "even_p95_mm")
     analytic = spread(**dict.fromkeys(names, 0.6), reached_share=0.97)
     groups = [{"preset": "quick", **quick}, {"preset": None}, {"preset": "as-printed"}]
-    found = targets([*groups, {"preset": "analytic", "over_seeds": analytic}])
+    moving = {"preset": "motion-analytic", "over_seeds": spread(median_mm=3.0)}
+    found = targets([*groups, {"preset": "analytic", "over_seeds": analytic}, moving])
+    *found, met, not_evaluated = found
+    assert (met["verdict"], not_evaluated["verdict"]) == ("met", "skipped")
+    assert not_evaluated["measured"] == "not evaluated"
     assert [row["verdict"] == "met" for row in found] == [False, True, False, True, False, False, True, True]
     assert found[0]["target"] == "quick, tqc alone over seeds, median mm: at most 2"
     assert found[4] == {

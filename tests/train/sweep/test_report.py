@@ -10,7 +10,7 @@ from mjx_softarm._support.provenance import write_json
 from tests.train.small import CONFIG, SHORT
 from train.runs.checkpoint import RunError
 from train.sweep.command import members_of
-from train.sweep.report import FIGURES, RESULTS_FILE, curves, report
+from train.sweep.report import FIGURES, RESULTS_FILE, by_settings, curves, report
 from train.sweep.run import create
 
 MEDIANS = {(0, 0.5): [9.0, 2.0], (1, 0.5): [7.0, 5.0], (0, 0.9): [8.0, 6.0], (1, 0.9): [6.0, 8.0]}
@@ -53,6 +53,21 @@ def test_the_table_has_mean_least_and_greatest_over_the_seeds(finished):
     groups = learning.measure(tuple(run.path for run in finished.runs))["groups"]
     assert [group["over_seeds"] for group in groups] == [first["over_seeds"], second["over_seeds"]]
     assert groups[1]["settings"]["tqc"]["gamma"] == 0.9 and "seed" not in groups[1]["settings"]
+
+
+def test_further_evaluations_are_told_where_all_seeds_have_them(finished):
+    figures = dict.fromkeys(FIGURES, 0.0) | {"near_share": 1.0, "near_median_s": None, "median_mm": 4.0}
+    names = ["evaluation-500g", "evaluation-in-motion-4x0.5s"]
+    for run in finished.runs[:3]:
+        for name in names[run.config.seed :]:
+            write_json(run.path / f"{name}.json", figures)
+    first, second = by_settings(finished.runs, lambda run: {"gamma": run.config.tqc.gamma})
+    assert first.keys() == {"settings", "runs", "over_seeds", f"{names[1]}_over_seeds"}
+    spread = first[f"{names[1]}_over_seeds"]
+    assert spread["median_mm"]["mean"] == 4.0 and spread["near_share"]["min"] == 1.0
+    assert "near_median_s" not in spread and "near_share" not in first["over_seeds"]
+    assert second.keys() == {"settings", "runs", "over_seeds"}
+    assert second["runs"][0]["evaluation-500g"]["median_mm"] == 4.0
 
 
 def test_the_plot_has_the_mean_and_the_spread(finished):
