@@ -18,6 +18,7 @@ import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
+from unittest import mock
 
 import numpy as np
 
@@ -171,6 +172,7 @@ def compiled(where: str, program: str, *settings: str) -> Facts:
     from jax.experimental import topologies
 
     from mjx_softarm.env import ReachEnv
+    from mjx_softarm.mechanics import settle
     from train.agent.hindsight_tqc import HindsightTQC
     from train.config import override
     from train.epoch.devices import AXIS, everywhere
@@ -191,7 +193,9 @@ def compiled(where: str, program: str, *settings: str) -> Facts:
         function, shapes = jax.jit(job.arms.step), (jax.eval_shape(job.arms.reset, key), action, key)
     each = jax.tree.broadcast((job.sharding,) if job.sharding else everywhere(mesh), shapes)
     placed = jax.tree.map(lambda x, on: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=on), shapes, each)
-    loop = read(str(function.lower(*placed).compile().as_text()))
+    with mock.patch.object(settle, "MAX_ARMS_ON_CPU", math.inf):  # this host is a CPU, the program's is not
+        lowered = function.lower(*placed)
+    loop = read(str(lowered.compile().as_text()))
     return {"loops": list(loop.rows()), "totals": [loop.over_turns(n).tolist() for n in (0, 1)]}
 
 
