@@ -231,11 +231,12 @@ class Descent:
 
     def run(self, seed: int) -> tuple[dict[str, float], list[dict[str, Any]]]:
         """Return its figures at some goals of both sets, and around each circle, from random poses."""
-        rng, keys = np.random.default_rng(seed), jax.random.split(jax.random.PRNGKey(seed), len(SIZES) + 1)
+        rng = np.random.default_rng(seed)
+        *keys, key_goals = jax.random.split(jax.random.PRNGKey(seed), len(SIZES) + 1)
         some = [rng.choice(poses, min(N_SOLVED, len(poses)), replace=False) for poses in self.sets]
-        at_goals = figures(*self.along(np.concatenate(some), keys[-1], N_ACTIONS))
+        at_goals = figures(*self.along(np.concatenate(some), key_goals, N_ACTIONS))
         laps_once = laps(self.spec)[:, :N_CIRCLE]
-        around = [self.along(path, key, N_SEARCHES) for path, key in zip(laps_once, keys, strict=False)]
+        around = [self.along(path, key, N_SEARCHES) for path, key in zip(laps_once, keys, strict=True)]
         return at_goals, circle_rows(*np.stack(around, axis=1))
 
     def along(self, path: np.ndarray, key: Array, n_searches: int) -> np.ndarray:

@@ -22,7 +22,7 @@ IN_TIME = {
     "behind [s]": "lag_s",
     "mean without that [mm]": "way_without_lag_mm",
 }
-WITHIN_MM, AROUND_S = 4.0, 20.0  # the target: a mean, once around in so long
+WITHIN_MM, AROUND_S = 4.0, 20.0  # target: mean error [mm] on a circle that takes so long [s]
 STOPPING = {"mean [mm]": "translation_mm", "largest [mm]": "max_mm", "seconds": "seconds"}
 
 
@@ -88,7 +88,7 @@ def measure(
 
 
 def targets(means: Sequence[dict[str, Any]]) -> list[dict[str, str]]:
-    """Return the targets: a mean of policies trained at rest, one of those in motion."""
+    """Return the target at `AROUND_S` for policies trained at rest, and for those trained in motion."""
     return [
         target(
             f"trained {row['trained']}, once around in {AROUND_S:g} s: mean at most {WITHIN_MM:g} mm",

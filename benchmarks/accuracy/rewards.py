@@ -192,16 +192,17 @@ def learn(
 
 
 def targets(runs: Sequence[dict[str, Any]]) -> list[dict[str, str]]:
-    """Return, for each settings and demonstrations, the target that the learned reward takes fewer steps."""
-    steps: dict[tuple[str, str], dict[str, list[float]]] = {}
-    for run in runs:
-        of = steps.setdefault((run["settings"], run["shown"]), {})
-        of.setdefault(run["reward"], []).append(run["steps_to_success"] or np.inf)
+    """Return the target of each settings and demonstrations: fewer env steps with the learned reward."""
     found = []
-    for (settings, shown), of in steps.items():
-        learned, hand_made = np.median(of[LEARNED]), np.median(of[HAND_MADE])
-        text = f"{settings}, {shown}: {100 * SUCCESS:g} % success in fewer env steps with the learned reward"
-        measured = f"{learned:,.0f} learned, {hand_made:,.0f} hand-made, medians"
+    for kind in dict.fromkeys((run["settings"], run["shown"]) for run in runs):
+        steps: dict[str, list[float]] = {LEARNED: [], HAND_MADE: [], PRINTED: []}
+        for run in runs:
+            if (run["settings"], run["shown"]) == kind:
+                steps[run["reward"]].append(run["steps_to_success"] or np.inf)
+        learned, hand_made = np.median(steps[LEARNED]), np.median(steps[HAND_MADE])
+        text = f"{', '.join(kind)}: {100 * SUCCESS:g} % success in fewer env steps with the learned reward"
+        told = [f"{n:,.0f}" if np.isfinite(n) else "never" for n in (learned, hand_made)]
+        measured = "{} learned, {} hand-made, medians".format(*told)
         found.append(target(text, measured, bool(learned < hand_made)))
     return found
 

@@ -77,7 +77,7 @@ def target(text: str, measured: str, met: bool | None) -> dict[str, str]:
 
 
 def status_of(figures: Mapping[str, Any]) -> int:
-    """Return the exit status: 1 where one of `targets` is not met, else 0."""
+    """Return the exit status: 1 where a target is missed, else 0."""
     return int(any(row["verdict"] == VERDICT[False] for row in figures.get("targets", ())))
 
 

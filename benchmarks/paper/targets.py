@@ -1,6 +1,6 @@
 """Targets of the experiments, set before anything was measured, and whether they are met.
 
-A trial that missed a goal meets none, however small its error.
+A trial that missed a goal meets no target, however small its error.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from benchmarks.paper.summary import HEAVY_G, LIGHT_G, Row, all_done
 CALM_PERCENT = 99.0
 WIDE_RUNS, NARROW_RUNS, OF_RUNS = 8, 7, 9  # for other numbers of runs, the same share
 ANGLES = ("yaw", "pitch", "roll")
-
 
 Check = dict[str, str]  # a row of `target`
 
@@ -98,7 +97,7 @@ def _confined(table: Sequence[Row], trainings: Sequence[Row]) -> list[Check]:
 
 
 def _check(text: str, value: str, met: Any, *groups: Sequence[Any]) -> Check:
-    """Return a check of groups of rows; not measured where one is empty."""
+    """Return a check of groups of rows; not measured, and so not met, where one is empty."""
     return target(text, value, bool(met)) if all(groups) else target(text, "not measured", False)
 
 

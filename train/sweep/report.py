@@ -67,8 +67,8 @@ def by_settings(runs: Sequence[Run], settings_of: Callable[[Run], dict[str, Any]
     for group in groups.values():
         rows = group["runs"]
         group["over_seeds"] = _spread(rows)
-        for name in (name for name, value in rows[0].items() if isinstance(value, dict)):
-            if all(name in row for row in rows):
+        for name, value in rows[0].items():
+            if isinstance(value, dict) and all(name in row for row in rows):
                 group[f"{name}_over_seeds"] = _spread([row[name] for row in rows])
     return list(groups.values())
 

@@ -22,6 +22,8 @@ def settings(name, *changes):
 def test_settings_are_those_of_a_preset_whatever_the_seed_or_of_none():
     assert all(preset_of(settings(name, "seed=3")) == name for name in PRESETS)
     assert preset_of(settings("quick", "n_arms=64")) is None
+    assert preset_of(settings("motion-analytic", "tqc.hidden_actor=[8]")) == "motion-analytic"  # not read
+    assert preset_of(settings("quick", "analytic.hidden=[8]")) is None  # polishing reads it
 
 
 def spread(**means):
@@ -38,6 +40,8 @@ def test_targets_are_those_of_the_groups_presets_for_means_over_seeds():
     *found, met, not_evaluated = found
     assert (met["verdict"], not_evaluated["verdict"]) == ("met", "skipped")
     assert not_evaluated["measured"] == "not evaluated"
+    never = moving | {"evaluation-in-motion-12x0.5s_over_seeds": spread(median_mm=1.0)}
+    assert targets([never])[1]["verdict"] == "NOT MET"
     assert [row["verdict"] == "met" for row in found] == [False, True, False, True, False, False, True, True]
     assert found[0]["target"] == "quick, tqc alone over seeds, median mm: at most 2"
     assert found[4] == {

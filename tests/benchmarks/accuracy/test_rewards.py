@@ -54,6 +54,7 @@ def test_a_learned_reward_is_to_need_fewer_steps_with_the_same_settings_and_demo
         (f"hand-made, scripted: {text}", "met"),
     ]
     assert found[0]["measured"] == "2,048 learned, 1,024 hand-made, medians"
+    assert found[1]["measured"] == "512 learned, never hand-made, medians"
 
 
 @pytest.fixture

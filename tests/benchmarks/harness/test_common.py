@@ -65,18 +65,10 @@ def test_curves_are_for_the_file_alone():
 def test_a_missed_target_ends_with_status_1_and_its_file_is_there(met, status, monkeypatch, tmp_path):
     monkeypatch.setattr(common, "RESULTS", tmp_path)
     figures = {"mm": 2.0, "targets": [target("1 mm", "0.5 mm", True), target("less", "2 mm", met)]}
-    monkeypatch.setitem(benchmarks.BENCHMARKS, "settle", f"{__name__}:measured")
-    monkeypatch.setitem(globals(), "FIGURES", figures)
-    assert benchmarks.main(["settle"]) == status
+    assert benchmarks._finish("settle", figures) == status
     assert json.loads((tmp_path / "settle.json").read_text())["figures"] == figures
 
 
-def measured():
-    """Return what a benchmark measured."""
-    return FIGURES
-
-
-FIGURES: dict = {}
 MEMORY = """
 import numpy as np
 from benchmarks.harness.common import peak_memory

@@ -91,7 +91,7 @@ def trained(kind, reaches_at=4, n=10, after_one=0.5, after_two=0.75):
 
 
 def good_results(experiment, settings=FULL, changed=None):
-    """Results that meet every goal, but for what is changed: trial or training -> outcome or course."""
+    """Results that meet every target, but for what is changed: trial or training -> outcome or course."""
     outcomes = {}
     for trial in trials(experiment, settings):
         error_mm = {

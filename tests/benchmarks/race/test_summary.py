@@ -1,4 +1,4 @@
-"""Summary of a race: curves with known crossings, the best of ours and of the peers, goals, tables."""
+"""Summary of a race: curves with known crossings, the best of ours and of the peers, targets, tables."""
 
 import json
 
@@ -63,7 +63,7 @@ def test_a_level_is_reached_where_the_line_between_two_evaluations_crosses_it_fi
     assert found is None if expected is None else found == pytest.approx(expected)
 
 
-def test_a_goal_is_met_only_once_all_variants_have_raced():
+def test_a_target_is_met_only_once_all_variants_have_raced():
     results = [OURS_FAST, *others(*SLOW)]
     assert judged("sbx", *results) == ("not within 25.17 times", "met")
     assert summarise(results)["not_raced"] == ["ours-analytic", "ours-plain", "ours-paper"]
@@ -95,7 +95,7 @@ def test_the_variant_that_does_best_where_all_race_must_race_with_all_seeds(best
     assert measured.endswith(f"raced: {other}, seed 2")
 
 
-def test_a_goal_is_met_by_the_better_variant_s_time_over_ours():
+def test_a_target_is_met_by_the_better_variant_s_time_over_ours():
     ours, later = result("ours-quick", 6.0, 4.0), [9.0] * 11  # 5 mm at 17 s
     first = result("sbx-hindsight", *later[:8], 6.0, 4.0)  # 97 s
     plain, defaults = (result(f"sbx-{name}", *later) for name in ("plain", "defaults"))
@@ -117,7 +117,7 @@ def test_ours_is_the_better_of_two_presets_and_never_the_one_without_hindsight()
     assert judged("sbx", result("ours-quick", 6.0), *others(*SLOW)) == (told, "NOT MET")
 
 
-def test_a_goal_of_another_learner_looks_at_that_learner_alone():
+def test_a_target_of_another_learner_looks_at_that_learner_alone():
     wanted = Target("sbx", 10.0, ("ours-analytic",))
     results = [result("ours-quick", 9.0, 4.0), *others(*[9.0] * 14, 4.0)]
     assert judge(wanted, results)["measured"] == "not raced: ours-analytic, seed 0"
@@ -125,7 +125,7 @@ def test_a_goal_of_another_learner_looks_at_that_learner_alone():
     assert (row["measured"], row["verdict"]) == ("12.50 times", "met")  # 150 s and 12 s
 
 
-def test_failures_are_told_and_only_that_of_ours_is_a_goal_not_met():
+def test_failures_are_told_and_only_that_of_ours_is_a_target_not_met():
     assert judged("sbx", failed("ours-quick")) == ("ours-quick, seed 0: no network", "NOT MET")
     results = [OURS_FAST, *others(*SLOW), failed("ours-paper"), failed("ours-plain")]
     assert judged("sbx", *results)[1] == "met"
