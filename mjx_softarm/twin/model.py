@@ -6,7 +6,8 @@ standard deviations are multiplied by one number, `GAP`.
 
 How `GAP` was set: spring lengths that bring the tip of training's model to the 40 points of the paper's
 circle within 0.01 mm were given to the sensor-space law on the twins 0 to 5, springs calibrated, no S2R.
-Their mean tip error is 21 mm, as is the paper's, a root mean square. It is not touched again. The experiments use three of these twins.
+Their mean tip error is 21 mm; so large is the paper's root mean square. It is not touched again. The
+experiments use three of these twins.
 """
 
 from __future__ import annotations
