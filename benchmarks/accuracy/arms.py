@@ -72,6 +72,7 @@ def _measure(arm: str, folder: Path, poses: int, steps: int | None, points: int)
 FIGURES = {
     "goals": "points",
     "measured": "measured",
+    "reached": "reached",
     "mean [mm]": "translation_mm",
     "95 % [mm]": "translation_95_mm",
     "mean [deg]": "rotation_deg",
