@@ -105,5 +105,6 @@ def run_command(*words: Any, also: Collection[int] = ()) -> int:
     command = [str(word) for word in words]
     status = subprocess.run([sys.executable, "-m", *command], check=False).returncode
     if not 0 <= status < FAILED and status not in also:
-        raise InputError(f"python -m {' '.join(command)}: got exit status {status}, expected 0 or 1")
+        expected = " or ".join(map(str, (*range(FAILED), *also)))
+        raise InputError(f"python -m {' '.join(command)}: got exit status {status}, expected {expected}")
     return status
