@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import json
 import shutil
@@ -11,13 +12,14 @@ from typing import Any
 from matplotlib.figure import Figure
 from PIL import Image
 
+from benchmarks.harness.common import target
 from benchmarks.paper import plots
 from benchmarks.paper.calibration_plots import calibration_figures, calibration_numbers
 from benchmarks.paper.engine import MORE, Settings
 from benchmarks.paper.jobs import CALIBRATION
 from benchmarks.paper.kinds import KINDS
 from benchmarks.paper.summary import Results, Row, simulated_rows, spreads, training_rows, trial_rows
-from benchmarks.paper.targets import check_targets
+from benchmarks.paper.targets import check_both_arms, check_targets
 from benchmarks.paper.trials import FILMS, loads_film
 from mjx_softarm._support.provenance import provenance, write_json
 
@@ -55,6 +57,8 @@ def write_report(
 ) -> dict[str, Any]:
     """Write JSON file, pictures and films of an experiment to the folder `pictures`; returns the figures."""
     data = figures_of(experiment, folder, settings, results)
+    if experiment == "open":
+        data["targets"] += _targets_of_both(pictures, settings, data["runs"])
     pictures.mkdir(parents=True, exist_ok=True)
     finite = json.loads(json.dumps(data), parse_constant=lambda _: None)  # JSON has no NaN
     write_json(pictures / json_name(experiment, settings), {"figures": finite, **provenance("benchmarks")})
@@ -94,6 +98,15 @@ def figures_of(experiment: str, folder: Path, settings: Settings, results: Resul
         "trainings": trainings,
         **more,
     }
+
+
+def _targets_of_both(pictures: Path, settings: Settings, table: list[Row]) -> list[dict[str, str]]:
+    """Return the targets of twins and rods together; the other arm's results are in a file, if anywhere."""
+    other = dataclasses.replace(settings, arm="rod" if settings.arm == "twin" else "twin")
+    file = pictures / json_name("open", other)
+    if not file.exists():
+        return [target("twins and rods together", f"not measured: {file.name} is missing", None)]
+    return check_both_arms([table, json.loads(file.read_text("utf-8"))["figures"]["runs"]])
 
 
 def draw(experiment: str, results: Results, table: list[dict[str, Any]], arm: str) -> dict[str, Figure]:

@@ -122,24 +122,25 @@ def first_stage_success(training: Training) -> list[float] | None:
 
 
 def simulated_rows(folder: Path, settings: Settings, table: Sequence[Row]) -> list[dict[str, Any]]:
-    """Return mean errors on the circle of the policies with S2R and of those that know no twin.
+    """Return mean errors on the circle of the policies with S2R, and of those that know no twin ("without").
 
     Each has that in its own simulation beside that on the twins.
     """
     rows = []
-    for twin in (None, *settings.twins):
-        kind = "without" if twin is None else "with"
-        for seed in settings.seeds:
-            file = folder / reach_run(twin, seed) / EVALUATION_FILE
-            on_twins = [
-                row["translation_mm"]
-                for row in table
-                if (row["kind"], row["seed"], row["load_g"]) == (kind, seed, 0)
-                and twin in (None, row["twin"])
-            ]
-            simulated_mm = json.loads(file.read_text("utf-8"))["circle_mean_mm"]
-            row = {"kind": kind, "twin": twin, "seed": seed, "simulated_mm": simulated_mm}
-            rows.append(row | {"on_twin_mm": spread(on_twins)})
+    for kind in ("without", "with", *settings.beside):
+        for twin in (None,) if kind == "without" else settings.twins:
+            for seed in settings.seeds:
+                run = learned_run(kind, twin, seed) if kind in settings.beside else reach_run(twin, seed)
+                evaluation = json.loads((folder / run / EVALUATION_FILE).read_text("utf-8"))
+                on_twins = [
+                    row["translation_mm"]
+                    for row in table
+                    if (row["kind"], row["seed"], row["load_g"]) == (kind, seed, 0)
+                    and twin in (None, row["twin"])
+                ]
+                row = {"kind": kind, "twin": twin, "seed": seed}
+                row["simulated_mm"] = evaluation["circle_mean_mm"]
+                rows.append(row | {"on_twin_mm": spread(on_twins)})
     return rows
 
 

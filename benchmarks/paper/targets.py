@@ -56,6 +56,22 @@ def _open(table: Sequence[Row]) -> list[Check]:
     ]
 
 
+def check_both_arms(tables: Sequence[Sequence[Row]]) -> list[Check]:
+    """Check the targets of twins and rods together, given the `trial_rows` of each in open space."""
+    checks = []
+    for kind, how in (("with", ""), ("payload", " observed")):
+        for load, limit_mm in (("0 g", 1.8), (f"{LIGHT_G} g", 3.0)):
+            groups = [_select(table, kind, load) for table in tables]
+            mean_mm = float(np.mean([_mean_mm(rows) for rows in groups]))
+            text = f"twins and rods, {load}{how}, mean of both mean translations at most {limit_mm:g} mm"
+            checks.append(_reaching(text, f"{mean_mm:.2f} mm", mean_mm <= limit_mm, *groups))
+        heavy = [_select(table, kind, f"{HEAVY_G} g") for table in tables]
+        largest_mm = float(np.max(_values([row for rows in heavy for row in rows], "max_mm")))
+        text = f"twins and rods, 1 kg{how}, largest translation of all runs at most 13 mm"
+        checks.append(_reaching(text, f"{largest_mm:.2f} mm", largest_mm <= 13, *heavy))
+    return checks
+
+
 def _loaded(how: str, rows: Sequence[Row]) -> list[Check]:
     """Check the targets for payloads; the policies are those of `rows`."""
     light, heavy = ([row for row in rows if row["load_g"] == load_g] for load_g in (LIGHT_G, HEAVY_G))
@@ -119,9 +135,9 @@ def _select(table: Sequence[Row], kind: str, variant: str) -> list[Row]:
     return [row for row in table if (row["kind"], row["variant"]) == (kind, variant)]
 
 
-def _values(rows: Sequence[Row], name: str) -> list[float]:
-    """Return a figure of each row; NaN without any, for a value that is not shown."""
-    return [row[name] for row in rows] or [np.nan]
+def _values(rows: Sequence[Row], name: str) -> np.ndarray:
+    """Return a figure (n,) of each row, NaN for None; one NaN without any, for a value that is not shown."""
+    return np.array([row[name] for row in rows] or [np.nan], float)
 
 
 def _mean_mm(rows: Sequence[Row]) -> float:

@@ -7,7 +7,7 @@ import numpy as np
 from benchmarks.paper.comparison import Comparison
 from benchmarks.paper.engine import Settings, save_arrays
 from benchmarks.paper.jobs import CALIBRATION, COMPARISON_FILE
-from benchmarks.paper.kinds import KINDS, Trial, reach_run
+from benchmarks.paper.kinds import KINDS, Trial, learned_run, reach_run
 from benchmarks.paper.measure import Outcome, finger_tips
 from benchmarks.paper.summary import Results, Training, training_rows, trial_rows
 from benchmarks.paper.trials import trainings, trials
@@ -150,11 +150,12 @@ def compared(n=6, specified_mm=20.0, calibrated_mm=2.0, read_mm=9.0, corrected_m
 
 def fill(folder, settings):
     """Leave in a folder what training and calibration would; the second twin's calibration warns."""
-    for twin in (None, *settings.twins):
-        for seed in settings.seeds:
-            run = folder / reach_run(twin, seed)
-            run.mkdir(parents=True)
-            (run / "evaluation.json").write_text(json.dumps({"circle_mean_mm": 1.25}))
+    for seed in settings.seeds:
+        runs = {reach_run(twin, seed): 1.25 for twin in (None, *settings.twins)}
+        runs |= {learned_run(kind, twin, seed): 2.5 for kind in settings.beside for twin in settings.twins}
+        for run, circle_mm in runs.items():
+            (folder / run).mkdir(parents=True)
+            (folder / run / "evaluation.json").write_text(json.dumps({"circle_mean_mm": circle_mm}))
     for twin in settings.twins:
         here = folder / f"twin{twin}" / CALIBRATION
         here.mkdir(parents=True)

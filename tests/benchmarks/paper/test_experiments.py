@@ -33,7 +33,7 @@ def test_interrupted_benchmark_runs_only_what_is_missing(tmp_path, monkeypatch, 
     monkeypatch.setattr(experiments, "load_results", lambda *_: results)
     monkeypatch.setattr(report, "draw", lambda *_: {})
     data = experiments.run(experiment, tmp_path, tmp_path / "out", TINY)
-    assert [row["target"] for row in data["targets"] if row["verdict"] != "met"] == []
+    assert [row["target"] for row in data["targets"] if row["verdict"] == "NOT MET"] == []
     assert {f"try {trial.name}" for trial in trials(experiment, TINY)} | {"film"} <= set(done)
     assert not any(name.startswith("log and calibrate") for name in done)  # `fill` left them
     gone = trials(experiment, TINY)[3]

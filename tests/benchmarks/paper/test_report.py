@@ -18,6 +18,7 @@ from benchmarks.paper.summary import (
     first_stage_success,
     load_off_g,
     load_results,
+    simulated_rows,
     spreads,
     steps_to_success,
     trial_rows,
@@ -123,6 +124,7 @@ def test_open_results_are_written_and_nothing_is_hidden(tmp_path):
     assert (tmp_path / "out" / "paper-circle.gif").read_bytes()[:6] == b"GIF89a"
     assert figures["targets"][0]["measured"] == "nan mm, 6 points missed in 1 of 2 runs"
     assert figures["targets"][0]["verdict"] == "NOT MET"
+    assert figures["targets"][-1]["measured"] == "not measured: paper-rod.json is missing"
     assert figures["calibrations"] == {"twin 0": {"Springs": []}, "twin 1": {"Springs": ["off <by> much"]}}
     assert len(figures["runs"]) == len(trials("open", TINY))
     assert [row["translation_mm"] is None for row in figures["runs"]].count(True) == 1
@@ -130,6 +132,29 @@ def test_open_results_are_written_and_nothing_is_hidden(tmp_path):
     simulated = figures["simulated"]
     assert {item["simulated_mm"] for item in simulated} == {1.25}
     assert (simulated[0]["on_twin_mm"]["min"], simulated[0]["on_twin_mm"]["max"]) == (4.0, 4.0)
+
+
+def test_presets_beside_have_simulated_errors_of_their_own(tmp_path):
+    settings = dataclasses.replace(TINY, beside=("quick",))
+    fill(tmp_path, settings)
+    rows = simulated_rows(tmp_path, settings, trial_rows(good_results("open", settings)))
+    found = {(row["kind"], row["twin"]): row["simulated_mm"] for row in rows}
+    expected = {("without", None): 1.25} | {("with", twin): 1.25 for twin in TINY.twins}
+    assert found == expected | {("quick", twin): 2.5 for twin in TINY.twins}
+
+
+def test_twins_and_rods_are_judged_together_where_both_were_measured(tmp_path):
+    write("open", tmp_path / "twins", good_results("open", TINY))
+    rods = dataclasses.replace(TINY, arm="rod")
+    fill(tmp_path / "rods", rods)
+    results = good_results("open", rods, {Trial("with", 1, 0, load_g=1000): made_up("with", missed=range(6))})
+    data = report.write_report("open", tmp_path / "rods", tmp_path / "twins" / "out", rods, results)
+    targets = {row["target"]: row["measured"] for row in data["targets"] if "rods" in row["target"]}
+    assert len(targets) == 6
+    assert targets["twins and rods, 0 g, mean of both mean translations at most 1.8 mm"] == "1.25 mm"
+    assert targets["twins and rods, 1 kg, largest translation of all runs at most 13 mm"].endswith(
+        "6 points missed in 1 of 4 runs"
+    )
 
 
 def test_confined_results_are_written_and_nothing_is_hidden(tmp_path):
