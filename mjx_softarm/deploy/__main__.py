@@ -35,8 +35,8 @@ from mjx_softarm.mechanics.excitation import growing, random_pressures
 from mjx_softarm.policy.file import SHIPPED, load_policy
 from mjx_softarm.spec import ArmSpec
 
-_STATUS = """Exit status: 0 done; 1 done, but a goal was not reached; 2 it could not begin, or its log could
-not be written; 3 a fault ended it or refused a goal; 130 Ctrl-C; 143 SIGTERM. In all cases the arm is vented
+_STATUS = """Exit status: 0 done; 1 done, but a goal was not reached, or was refused; 2 it could not begin,
+or its log could not be written; 3 a fault ended it; 130 Ctrl-C; 143 SIGTERM. In all cases the arm is vented
 and what was logged is written."""
 _ABOUT = f"A policy on an arm.\n\n{_STATUS}"
 

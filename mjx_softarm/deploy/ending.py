@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjx_softarm.deploy.faults import Event, Fault, Response
+from mjx_softarm.deploy.faults import Event, Fault
 from mjx_softarm.deploy.link import Link, describe
 from mjx_softarm.logs.schema import Log, write_log
 
@@ -69,10 +69,9 @@ class Run(NamedTuple):
 
     @property
     def status(self) -> int:
-        """Exit status: that of the ending, of a fault if a goal was refused, or of a goal not reached."""
-        refused = any(event.response is not Response.GO_ON for event in self.events)
+        """Exit status: that of the ending, or of a goal that was not reached, or was refused."""
         n_reached = sum(arrival.reached for arrival in self.arrivals)
-        return self.ending.status or (FAULT if refused else MISSED if n_reached < self.n_goals else DONE)
+        return self.ending.status or (MISSED if n_reached < self.n_goals else DONE)
 
 
 def vent_at_end(

@@ -8,7 +8,7 @@ from calib.read.logs import read_log
 from mjx_softarm.deploy import acting, link
 from mjx_softarm.deploy.arm_io import Capture
 from mjx_softarm.deploy.controller import Controller, start
-from mjx_softarm.deploy.ending import FAULT, Ending
+from mjx_softarm.deploy.ending import MISSED, Ending
 from mjx_softarm.deploy.faults import Fault
 from mjx_softarm.deploy.loop import step, with_goal
 from mjx_softarm.deploy.session import LEAD_S, trace
@@ -101,7 +101,7 @@ def test_a_goal_half_way_is_half_way_and_angles_take_the_short_way():
 def test_a_way_with_a_goal_out_of_reach_is_not_begun():
     arm = LinearArm()
     run = trace(arm, CONTROLLER, np.array([GOALS[0], FAR, GOALS[1]]), pace_s=5.0)
-    assert run.status == FAULT and not run.arrivals and run.counts() == {Fault.GOAL_OUTSIDE: 1}
+    assert run.status == MISSED and not run.arrivals and run.counts() == {Fault.GOAL_OUTSIDE: 1}
     np.testing.assert_array_equal(arm.written, 0.0)
 
 
