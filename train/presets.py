@@ -95,15 +95,6 @@ PRESETS: dict[str, TrainConfig] = {
         env=dataclasses.replace(_MOVING, n_poses=16_384, randomisation=Randomisation()),
         analytic=AnalyticConfig(horizon=4, learning_rate=3e-4, learning_rate_half=400.0, mean_share=0.3),
     ),
-    # The longest, with the goals and the policy of `analytic`.
-    "paper": dataclasses.replace(
-        _AT_REST,
-        total_env_steps=300_000,
-        updates_per_env_step=0.25,
-        polish_updates=131_072,
-        env=_ANALYTIC.env,
-        tqc=dataclasses.replace(_AT_REST.tqc, hidden_actor=AnalyticConfig().hidden),
-    ),
 }
 
 # The paper's schedules with a fifteenth or an eighth of its steps, which is enough. In the pipe, goals shift

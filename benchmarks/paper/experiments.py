@@ -30,7 +30,7 @@ def paper(
     seeds: cli.Integers | None = None,
     loads: cli.Integers | None = None,
     arm: Literal["twin", "rod"] = "twin",
-    preset: Literal["quick", "paper", "analytic", "payload"] | None = None,
+    preset: Literal["quick", "analytic", "payload"] | None = None,
     env_steps: int | None = None,
     beside: Annotated[tuple[str, ...], cli.listed(_presets, "NAME,NAME,...")] = (),
     out: cli.MaybePath = None,

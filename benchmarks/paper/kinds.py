@@ -27,7 +27,6 @@ KINDS = {
     "with": Kind("with S2R"),
     "as-printed": Kind("with S2R, the paper's recipe", reach="as-printed"),
     "quick": Kind("with S2R, quick", reach="quick"),
-    "paper": Kind("with S2R, paper", reach="paper"),
     "analytic": Kind("with S2R, analytic", reach="analytic"),
     "payload": Kind("with S2R, payload", reach="payload"),
     "gradient": Kind("gradient descent"),

@@ -202,7 +202,7 @@ def scaled(envs: Any, factor: float) -> Any:
 
 CONTESTANTS = (  # the most telling first
     *("ours-quick", "ours-analytic", "sbx-hindsight", "sb3-contrib-hindsight", "sbx-plain"),
-    *("sb3-contrib-plain", "ours-plain", "sbx-defaults", "sb3-contrib-defaults", "ours-paper"),
+    *("sb3-contrib-plain", "ours-plain", "sbx-defaults", "sb3-contrib-defaults"),
 )
 
 

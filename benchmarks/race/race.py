@@ -7,9 +7,8 @@ where the line between two evaluations crosses it for the first time.
 
 Ours with the presets quick and analytic go first. A peer is stopped when it has had as many times our time to
 5 mm as its targets ask for, since they are met then, or when it has reached all levels that quick has;
-ours-plain has as long as SBX, or its preset's env steps. The preset paper, for the finer levels, trains to
-the finest or to its end. Results stay in the working folder: the same command continues an interrupted race,
-and seeds may be added.
+ours-plain has as long as SBX, or its preset's env steps. Results stay in the working folder: the same command
+continues an interrupted race, and seeds may be added.
 """
 
 from __future__ import annotations
@@ -118,11 +117,11 @@ def limits_of(name: str, ours: Sequence[Facts]) -> Limits:
     }
     library = name.rsplit("-", 1)[0].replace("ours", "sbx")
     wall_s = max(
-        wanted.times * times_s[wanted.ours[0]]
+        wanted.times * times_s[wanted.ours]
         for wanted in TARGETS
-        if wanted.library == library and wanted.ours[0] in times_s
+        if wanted.library == library and wanted.ours in times_s
     )
-    if name in ("ours-analytic", "ours-paper"):
+    if name == "ours-analytic":
         return Limits(target_mm=min(LEVELS_MM), stretch_s=wall_s / N_STRETCHES)
     return Limits(wall_s, min(reached_mm, default=0), wall_s / N_STRETCHES)
 

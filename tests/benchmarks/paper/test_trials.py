@@ -11,7 +11,7 @@ def test_three_twins_and_three_seeds():
     found = trials("open", Settings())
     assert len(found) == len(set(found)) == 3 * 3 * (4 + 6) + 3 * 7
     assert sum(trial.kind == "gradient" for trial in found) == 3 * 7
-    beside = trials("open", dataclasses.replace(Settings(), beside=("quick", "paper")))
+    beside = trials("open", dataclasses.replace(Settings(), beside=("quick", "payload")))
     assert len(beside) == len(set(beside)) == len(found) + 2 * 9 * 7
     found = trials("confined", Settings())
     assert len(found) == len(set(found)) == 9 * 9 + 9
