@@ -17,7 +17,7 @@ from mjx_softarm._support import cli
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.spec import ArmSpec
 
-FAILED = 2  # exit status from which on a command has left nothing to go on with
+FAILED = 2  # exit status from which on a command failed
 
 
 def _names(words: list[str]) -> tuple[str, ...]:

@@ -116,9 +116,21 @@ def means_over(
 
 
 def _measured(folder: Path, policy: Path, arm: str, *options: Any) -> dict[str, Any]:
+    """Return the figures of one measurement.
+
+    Raises:
+        InputError: a goal of it was refused or not measured.
+    """
     out = Path(tempfile.mkdtemp(dir=folder)) / "measured"
     run_command("mjx_softarm.deploy", "measure", policy, "--arm", arm, *options, "--out", out)
-    return json.loads((out / "accuracy.json").read_text("utf-8"))
+    file = out / "accuracy.json"
+    if not file.exists():  # no goal was arrived at
+        raise InputError(f"--policies: {arm}={policy}: got no measured goal, expected all")
+    found = json.loads(file.read_text("utf-8"))
+    n_measured, n_goals = found["measured"], found["points"]
+    if "way_mm" not in found and n_measured < n_goals:
+        raise InputError(f"--policies: {arm}={policy}: got {n_measured} of {n_goals} goals, expected all")
+    return found
 
 
 def _named(names: dict[str, str], found: dict[str, Any]) -> dict[str, Any]:

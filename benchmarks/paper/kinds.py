@@ -78,7 +78,7 @@ def reach_run(twin: int | None, seed: int) -> str:
     return f"{arm_name(twin)}-seed{seed}"
 
 
-def learned_run(kind: str, twin: int | None, seed: int) -> str:
+def learned_run(kind: str, twin: int, seed: int) -> str:
     """Return the run folder of a policy of a kind's own: of another preset, or from demonstrations."""
     return f"{kind}-{reach_run(twin, seed)}"
 

@@ -77,7 +77,6 @@ def write_report(
 def figures_of(experiment: str, folder: Path, settings: Settings, results: Results) -> dict[str, Any]:
     """Return all figures: targets, spreads, trainings or simulated errors, calibrations, every run."""
     table, trainings = trial_rows(results), training_rows(results)
-    shared = settings.shared() | {name: list(getattr(settings, name)) for name in MORE}
     calibrations = {}
     for twin in settings.twins:
         report = json.loads((folder / f"twin{twin}" / CALIBRATION / "report.json").read_text("utf-8"))
@@ -90,7 +89,7 @@ def figures_of(experiment: str, folder: Path, settings: Settings, results: Resul
         )
     return {
         "arm": settings.arm,
-        "settings": shared,
+        "settings": _told(settings),
         "targets": check_targets(experiment, table, trainings),
         "spreads": spreads(table),
         "calibrations": calibrations,
@@ -101,12 +100,27 @@ def figures_of(experiment: str, folder: Path, settings: Settings, results: Resul
 
 
 def _targets_of_both(pictures: Path, settings: Settings, table: list[Row]) -> list[dict[str, str]]:
-    """Return the targets of twins and rods together; the other arm's results are in a file, if anywhere."""
+    """Return the targets of twins and rods together; the other arm's runs are read from its file.
+
+    Without a file, or with other settings than presets beside, they are not measured.
+    """
     other = dataclasses.replace(settings, arm="rod" if settings.arm == "twin" else "twin")
     file = pictures / json_name("open", other)
     if not file.exists():
         return [target("twins and rods together", f"not measured: {file.name} is missing", None)]
-    return check_both_arms([table, json.loads(file.read_text("utf-8"))["figures"]["runs"]])
+    figures, expected = json.loads(file.read_text("utf-8"))["figures"], _told(other)
+    found = figures["settings"] | {"beside": expected["beside"]}
+    if differing := [name for name in expected if found.get(name) != expected[name]]:
+        got = ", ".join(f"{name} {found.get(name)}" for name in differing)
+        asked = ", ".join(f"{name} {expected[name]}" for name in differing)
+        text = f"not measured: {file.name}: got {got}, expected {asked}"
+        return [target("twins and rods together", text, None)]
+    return check_both_arms([table, figures["runs"]])
+
+
+def _told(settings: Settings) -> dict[str, Any]:
+    """Return all settings as JSON has them."""
+    return settings.shared() | {name: list(getattr(settings, name)) for name in MORE}
 
 
 def draw(experiment: str, results: Results, table: list[dict[str, Any]], arm: str) -> dict[str, Figure]:

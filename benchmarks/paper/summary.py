@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -124,23 +125,22 @@ def first_stage_success(training: Training) -> list[float] | None:
 def simulated_rows(folder: Path, settings: Settings, table: Sequence[Row]) -> list[dict[str, Any]]:
     """Return mean errors on the circle of the policies with S2R, and of those that know no twin ("without").
 
-    Each has that in its own simulation beside that on the twins.
+    Each row has the error in the policy's own simulation, and that on its twin, or on all twins.
     """
+    runs = [("without", None, seed, reach_run(None, seed)) for seed in settings.seeds]
+    for twin, seed in itertools.product(settings.twins, settings.seeds):
+        runs.append(("with", twin, seed, reach_run(twin, seed)))
+        runs += [(kind, twin, seed, learned_run(kind, twin, seed)) for kind in settings.beside]
     rows = []
-    for kind in ("without", "with", *settings.beside):
-        for twin in (None,) if kind == "without" else settings.twins:
-            for seed in settings.seeds:
-                run = learned_run(kind, twin, seed) if kind in settings.beside else reach_run(twin, seed)
-                evaluation = json.loads((folder / run / EVALUATION_FILE).read_text("utf-8"))
-                on_twins = [
-                    row["translation_mm"]
-                    for row in table
-                    if (row["kind"], row["seed"], row["load_g"]) == (kind, seed, 0)
-                    and twin in (None, row["twin"])
-                ]
-                row = {"kind": kind, "twin": twin, "seed": seed}
-                row["simulated_mm"] = evaluation["circle_mean_mm"]
-                rows.append(row | {"on_twin_mm": spread(on_twins)})
+    for kind, twin, seed, run in runs:
+        evaluation = json.loads((folder / run / EVALUATION_FILE).read_text("utf-8"))
+        on_twins = [
+            row["translation_mm"]
+            for row in table
+            if (row["kind"], row["seed"], row["load_g"]) == (kind, seed, 0) and twin in (None, row["twin"])
+        ]
+        row = {"kind": kind, "twin": twin, "seed": seed, "simulated_mm": evaluation["circle_mean_mm"]}
+        rows.append(row | {"on_twin_mm": spread(on_twins)})
     return rows
 
 

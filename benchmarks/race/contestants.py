@@ -3,7 +3,7 @@
     python -m benchmarks.race.contestants NAME SEED STRETCH_S N_GOALS
 
 NAME is one of `CONTESTANTS`. Ours is the loop of `python -m train reach` without its files, with the preset
-analytic, quick (TQC, then polished) or paper. The peers train on the project's Gymnasium environment through
+analytic, or quick (TQC, then polished). The peers train on the project's Gymnasium environment through
 `learn`: with the defaults of their algorithm and one arm, or with the settings of ours-quick wherever they
 have one. They have none for the temperature's own learning rate. Our learning rate falls along a half cosine
 over the preset's env steps, at which our training ends; theirs does so too, and begins anew.

@@ -7,7 +7,8 @@ where the line between two evaluations crosses it for the first time.
 
 Ours with the presets quick and analytic go first. A peer is stopped when it has had as many times our time to
 5 mm as its targets ask for, since they are met then, or when it has reached all levels that quick has;
-ours-plain has as long as SBX, or its preset's env steps. Results stay in the working folder: the same command
+ours-plain has as long as SBX, or its preset's env steps. Analytic trains to the finest level, or to its end.
+Results stay in the working folder: the same command
 continues an interrupted race, and seeds may be added.
 """
 

@@ -106,6 +106,8 @@ def judge(wanted: Target, results: Sequence[Result]) -> dict[str, str]:
             told = f"{result['contestant']}, seed {result['seed']}: {result['failed']}"
             return target(text, told, False if result["contestant"] == ours else None)
     raced = {(result["contestant"], result["seed"]): result for result in results if "points" in result}
+    if not raced:
+        return target(text, f"not raced: {ours}", None)
     missing, ratios, all_reached = _missing(PEERS[library], raced), [], True
     for seed in sorted({seed for _, seed in raced}):
         theirs = [_time(raced[name, seed]) for name in PEERS[library] if (name, seed) in raced]

@@ -18,7 +18,7 @@ from mjx_softarm._support import cli
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.drivers.names import open_arm
-from mjx_softarm.deploy.ending import FAULT, Run, save_log
+from mjx_softarm.deploy.ending import MISSED, Run, save_log
 from mjx_softarm.deploy.measure import (
     along,
     figures,
@@ -35,9 +35,9 @@ from mjx_softarm.mechanics.excitation import growing, random_pressures
 from mjx_softarm.policy.file import SHIPPED, load_policy
 from mjx_softarm.spec import ArmSpec
 
-_STATUS = """Exit status: 0 done; 1 done, but a goal was not reached, or was refused; 2 it could not begin,
-or its log could not be written; 3 a fault ended it; 130 Ctrl-C; 143 SIGTERM. In all cases the arm is vented
-and what was logged is written."""
+_STATUS = """Exit status: 0 done; 1 done, but a goal was not reached, or was refused, or no pose was logged;
+2 it could not begin, or its log could not be written; 3 a fault ended it; 130 Ctrl-C; 143 SIGTERM. In all
+cases the arm is vented and what was logged is written."""
 _ABOUT = f"A policy on an arm.\n\n{_STATUS}"
 
 
@@ -208,7 +208,7 @@ def _record(
     result = record(open_arm(arm), arm_spec, targets_kpa, transients, _tell, partial(save_log, out))
     if not len(result.log):
         print(f"no pose was logged: {result.ending.cause or 'none came to rest'}", file=sys.stderr)
-        return result.ending.status or FAULT
+        return result.ending.status or MISSED
     unseen = "; the arm has no motion capture, so tip and markers are missing" * (result.log.tip_m is None)
     if result.ending.status != cli.ERROR:
         print(f"log: {out}, {len(result.log)} rows, {result.n_poses} poses at rest{unseen}")

@@ -69,7 +69,10 @@ class Run(NamedTuple):
 
     @property
     def status(self) -> int:
-        """Exit status: that of the ending, or of a goal that was not reached, or was refused."""
+        """Exit status: that of the ending, or of a goal that was not reached, or was refused.
+
+        Goals of a pilot do not count.
+        """
         n_reached = sum(arrival.reached for arrival in self.arrivals)
         return self.ending.status or (MISSED if n_reached < self.n_goals else DONE)
 

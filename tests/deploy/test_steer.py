@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from mjx_softarm.deploy.ending import FAULT
+from mjx_softarm.deploy.ending import DONE, FAULT, Ending
 from mjx_softarm.deploy.faults import Fault
 from mjx_softarm.deploy.link import VENT_KPA_PER_S
 from mjx_softarm.deploy.session import Orders, steer
-from tests.linear_arm import CONTROLLER, DT_S, GOALS, SPRINGS_M, Leaking, LinearArm, read_m
+from tests.linear_arm import CONTROLLER, DT_S, FAR, GOALS, SPRINGS_M, Leaking, LinearArm, read_m
 
 
 class Stop(Exception):
@@ -49,6 +49,13 @@ def test_a_chamber_that_is_lost_while_a_goal_is_dragged_vents():
     arm, _, run = fly(dragged, 1500, Leaking(200))
     assert run.counts()[Fault.CHAMBER_LOST] == 1 and len(run.log.row) < 600
     np.testing.assert_array_equal(arm.command_kpa, 0.0)
+
+
+def test_a_goal_that_is_refused_is_told_and_ends_nothing():
+    """Goals of a pilot are not counted, so none is missed."""
+    _, _, run = fly({0: Orders(goals=np.array([FAR])), 50: Orders(goals=GOALS[:1])}, 700)
+    assert run.counts()[Fault.GOAL_OUTSIDE] == 1 and run._replace(ending=Ending()).status == DONE
+    np.testing.assert_allclose(read_m(run.log)[-1], SPRINGS_M[0], atol=5e-4)
 
 
 def test_hold_stops_the_arm_where_it_is():

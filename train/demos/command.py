@@ -15,7 +15,7 @@ from rich.console import Console
 
 from mjx_softarm._support import cli
 from mjx_softarm.deploy.drivers import names
-from mjx_softarm.deploy.ending import DONE, FAULT, NOT_WRITTEN, save_log
+from mjx_softarm.deploy.ending import DONE, MISSED, NOT_WRITTEN, save_log
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.spec import ArmSpec
 from train.config import ConfigError
@@ -72,7 +72,7 @@ class Record(ArmOptions):
                 _tell(console, f"furthest from its waypoint: {1e3 * np.nanmax(result.off_m):.1f} mm")
         if result.ending.cause:
             _tell(console, f"ended early: {result.ending.cause}")
-        return result.ending.status or (DONE if len(result.log) else FAULT)
+        return result.ending.status or (DONE if len(result.log) else MISSED)
 
     def _plan(self, expert: Expert, waypoints: Sequence[Waypoint]) -> tuple[Sequence[Waypoint], Posture]:
         if self.hand is None:

@@ -45,6 +45,17 @@ def test_no_policies_and_one_that_cannot_be_measured_are_named(tmp_path):
         measure((f"twin:0={SHIPPED}", "twin:0=absent.npz"))
 
 
+def test_a_measurement_that_lacks_a_goal_is_an_error(monkeypatch):
+    def two_of_three(*words):
+        words[-1].mkdir()
+        (words[-1] / "accuracy.json").write_text('{"measured": 2, "points": 3}')
+
+    for run_command, got in ((two_of_three, "2 of 3 goals"), (lambda *words: None, "no measured goal")):
+        monkeypatch.setattr(path, "run_command", run_command)
+        with pytest.raises(InputError, match=f"twin:0=.*: got {got}, expected all"):
+            measure((f"twin:0={SHIPPED}",))
+
+
 def test_means_of_different_arms_are_refused(monkeypatch):
     moving = dataclasses.replace(load_policy(SHIPPED), action_s=0.5)
     monkeypatch.setattr(

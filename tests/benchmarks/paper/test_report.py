@@ -135,26 +135,33 @@ def test_open_results_are_written_and_nothing_is_hidden(tmp_path):
 
 
 def test_presets_beside_have_simulated_errors_of_their_own(tmp_path):
-    settings = dataclasses.replace(TINY, beside=("quick",))
+    settings = dataclasses.replace(TINY, beside=("payload",))
     fill(tmp_path, settings)
     rows = simulated_rows(tmp_path, settings, trial_rows(good_results("open", settings)))
-    found = {(row["kind"], row["twin"]): row["simulated_mm"] for row in rows}
-    expected = {("without", None): 1.25} | {("with", twin): 1.25 for twin in TINY.twins}
-    assert found == expected | {("quick", twin): 2.5 for twin in TINY.twins}
+    found = {(row["kind"], row["twin"]): (row["simulated_mm"], row["on_twin_mm"]["mean"]) for row in rows}
+    expected = {("without", None): (1.25, 4.0)} | {("with", twin): (1.25, 1.25) for twin in TINY.twins}
+    assert found == expected | {("payload", twin): (2.5, 1.0) for twin in TINY.twins}
 
 
-def test_twins_and_rods_are_judged_together_where_both_were_measured(tmp_path):
-    write("open", tmp_path / "twins", good_results("open", TINY))
+def test_twins_and_rods_are_judged_together_where_both_were_measured_alike(tmp_path):
+    lost = {Trial("with", 1, 0, load_g=1000): made_up("with", missed=range(6))}
+    write("open", tmp_path / "twins", good_results("open", TINY, lost))
     rods = dataclasses.replace(TINY, arm="rod")
     fill(tmp_path / "rods", rods)
-    results = good_results("open", rods, {Trial("with", 1, 0, load_g=1000): made_up("with", missed=range(6))})
-    data = report.write_report("open", tmp_path / "rods", tmp_path / "twins" / "out", rods, results)
-    targets = {row["target"]: row["measured"] for row in data["targets"] if "rods" in row["target"]}
-    assert len(targets) == 6
-    assert targets["twins and rods, 0 g, mean of both mean translations at most 1.8 mm"] == "1.25 mm"
-    assert targets["twins and rods, 1 kg, largest translation of all runs at most 13 mm"].endswith(
-        "6 points missed in 1 of 4 runs"
-    )
+
+    def judged(settings):
+        results, out = good_results("open", settings), tmp_path / "twins" / "out"
+        data = report.write_report("open", tmp_path / "rods", out, settings, results)
+        return {row["target"]: row["measured"] for row in data["targets"] if "rods" in row["target"]}
+
+    targets = judged(rods)
+    assert len(targets) == 3
+    assert targets["twins and rods, 0 g, mean of the two mean translations at most 1.8 mm"] == "1.25 mm"
+    largest = targets["twins and rods, 1 kg, largest translation of all runs at most 13 mm"]
+    assert largest == "nan mm, 6 points missed in 1 of 4 runs"
+    other = judged(dataclasses.replace(rods, preset="payload"))
+    told = "not measured: paper-open.json: got preset analytic, expected preset payload"
+    assert other == {"twins and rods together": told}
 
 
 def test_confined_results_are_written_and_nothing_is_hidden(tmp_path):

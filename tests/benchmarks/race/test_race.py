@@ -167,6 +167,10 @@ def test_peers_get_our_time_to_5_mm_as_often_as_the_target_asks_and_stop_where_o
     # One that does not reach 5 mm: multiples of all its time.
     quick = {"contestant": "ours-quick", "points": POINTS[:2]}
     assert limits_of("sbx-plain", [quick]) == Limits(5 * 22.0, 10, 5 * 22.0 / 40)
+    # Each target has the time of its own preset.
+    quick, analytic = ({"contestant": f"ours-{name}", "points": POINTS} for name in ("quick", "analytic"))
+    analytic["points"] = [POINTS[2] | {"wall_s": 5.0}]
+    assert limits_of("sbx-plain", [quick, analytic]).wall_s == 5 * 29.5  # 20 times 5 s are less
 
 
 def test_some_may_race_alone_and_the_others_and_those_that_failed_follow(

@@ -104,9 +104,9 @@ def test_a_target_is_met_by_the_better_variant_s_time_over_ours():
     assert judged("sbx", ours, first, plain, defaults) == ("2.18 times", "NOT MET")
 
 
-def test_ours_is_never_the_one_without_hindsight():
+def test_ours_is_the_preset_that_the_target_names():
     results = [result("ours-quick", 9.0, 9.0, 4.0), *others(*[9.0] * 14, 4.0)]
-    for more in ([], [result("ours-plain", 4.0)]):
+    for more in ([], [result("ours-plain", 4.0)], [result("ours-analytic", 4.0)]):
         assert judged("sbx", *results, *more)[0] == "5.00 times"  # 150 s and 30 s
     told = "ours did not reach it with seed 0"
     assert judged("sbx", result("ours-quick", 6.0), *others(*SLOW)) == (told, "NOT MET")
@@ -122,6 +122,8 @@ def test_a_target_of_another_learner_looks_at_that_learner_alone():
 
 def test_failures_are_told_and_only_that_of_ours_is_a_target_not_met():
     assert judged("sbx", failed("ours-quick")) == ("ours-quick, seed 0: no network", "NOT MET")
+    verdicts = [row["verdict"] for row in summarise([failed("ours-quick")])["targets"]]
+    assert verdicts == ["NOT MET", "NOT MET", "skipped"]
     results = [OURS_FAST, *others(*SLOW), failed("ours-analytic"), failed("ours-plain")]
     assert judged("sbx", *results)[1] == "met"
     assert summarise(results)["failed"] == results[-2:]
