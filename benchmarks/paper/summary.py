@@ -127,6 +127,7 @@ def simulated_rows(folder: Path, settings: Settings, table: Sequence[Row]) -> li
 
     Each row has the error in the policy's own simulation, and that on its twin, or on all twins.
     """
+    runs: list[tuple[str, int | None, int, str]]
     runs = [("without", None, seed, reach_run(None, seed)) for seed in settings.seeds]
     for twin, seed in itertools.product(settings.twins, settings.seeds):
         runs.append(("with", twin, seed, reach_run(twin, seed)))
