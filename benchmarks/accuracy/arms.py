@@ -17,7 +17,7 @@ from mjx_softarm._support import cli
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.spec import ArmSpec
 
-FAILED = 2  # exit status from which on a command failed
+DONE = (0, 1)  # exit statuses after which there are results
 
 
 def _names(words: list[str]) -> tuple[str, ...]:
@@ -50,21 +50,18 @@ def _measure(arm: str, folder: Path, poses: int, steps: int | None, points: int)
     run, policy = folder / "run", folder / "run/policy.npz"
     record = ["mjx_softarm.deploy", "record", "--arm", twin, "--spec", arm, "--poses", poses, "--out", log]
     train = ["train", "reach", "--preset", "analytic", "--calibration", calibration, "--out", run]
-    by_policy = ["mjx_softarm.deploy", "measure", policy, "--arm", twin]
     run_command(*record)
     distrusted = run_command("calib", "run", log, "--spec", arm, "--out", calibration)
     run_command(*train, *(("--total-env-steps", steps) if steps else ()))
     run_command("train", "export", run)
-    measured = {"grid": ["--goals", "grid", "--points", points]}
+    options = {"grid": ["--goals", "grid", "--points", points]}
     if arm == "paper":
-        measured["circle"] = ["--goals", "circle"]
-    for goals, options in measured.items():
-        run_command(*by_policy, *options, "--out", folder / goals)
-    return _figures(arm, folder, distrusted) | {
-        f"{goals}, {what}": json.loads((folder / goals / "accuracy.json").read_text())[key]
-        for goals in measured
-        for what, key in FIGURES.items()
-    }
+        options["circle"] = ["--goals", "circle"]
+    figures = _figures(arm, folder, distrusted)
+    for goals, given in options.items():
+        accuracy = accuracy_of(policy, twin, folder / goals, *given)
+        figures |= {f"{goals}, {what}": accuracy[key] for what, key in FIGURES.items()}
+    return figures
 
 
 FIGURES = {
@@ -94,15 +91,28 @@ def _figures(arm: str, folder: Path, distrusted: int) -> dict[str, Any]:
     }
 
 
+def accuracy_of(policy: Path, arm: str, out: Path, *options: Any) -> dict[str, Any]:
+    """Measure a policy on an arm by `deploy measure`; return the figures, which stay in the new folder `out`.
+
+    Raises:
+        InputError: the command failed, or no goal was arrived at.
+    """
+    run_command("mjx_softarm.deploy", "measure", policy, "--arm", arm, *options, "--out", out)
+    file = out / "accuracy.json"
+    if not file.exists():
+        raise InputError(f"{arm}={policy}: got no measured goal, expected all")
+    return json.loads(file.read_text("utf-8"))
+
+
 def run_command(*words: Any) -> int:
     """Run a command of this project, its output shown; return its exit status.
 
     Raises:
-        InputError: the command ended with `FAILED` or more.
+        InputError: the command ended with none of `DONE`.
     """
     command = [str(word) for word in words]
     status = subprocess.run([sys.executable, "-m", *command], check=False).returncode
-    if not 0 <= status < FAILED:
-        expected = " or ".join(map(str, range(FAILED)))
+    if status not in DONE:
+        expected = " or ".join(map(str, DONE))
         raise InputError(f"python -m {' '.join(command)}: got exit status {status}, expected {expected}")
     return status

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from benchmarks.accuracy.arms import run_command
+from benchmarks.accuracy.arms import accuracy_of
 from benchmarks.harness.common import target
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.policy.file import load_policy
@@ -122,11 +121,7 @@ def _measured(folder: Path, policy: Path, arm: str, *options: Any) -> dict[str, 
         InputError: a goal of it was refused or not measured.
     """
     out = Path(tempfile.mkdtemp(dir=folder)) / "measured"
-    run_command("mjx_softarm.deploy", "measure", policy, "--arm", arm, *options, "--out", out)
-    file = out / "accuracy.json"
-    if not file.exists():  # no goal was arrived at
-        raise InputError(f"--policies: {arm}={policy}: got no measured goal, expected all")
-    found = json.loads(file.read_text("utf-8"))
+    found = accuracy_of(policy, arm, out, *options)
     n_measured, n_goals = found["measured"], found["points"]
     if "way_mm" not in found and n_measured < n_goals:
         raise InputError(f"--policies: {arm}={policy}: got {n_measured} of {n_goals} goals, expected all")

@@ -76,6 +76,13 @@ def target(text: str, measured: str, met: bool | None) -> dict[str, str]:
     return {"target": text, "measured": measured, "verdict": VERDICT[met]}
 
 
+def difference(found: Mapping[str, Any], expected: Mapping[str, Any]) -> str:
+    """Return "got ..., expected ..." of the settings that differ from those expected, or "" if none does."""
+    names = [name for name in expected if found.get(name) != expected[name]]
+    got, asked = (", ".join(f"{name} {values.get(name)}" for name in names) for values in (found, expected))
+    return f"got {got}, expected {asked}" if names else ""
+
+
 def status_of(figures: Mapping[str, Any]) -> int:
     """Return the exit status: 1 where a target is missed, else 0."""
     return int(any(row["verdict"] == VERDICT[False] for row in figures.get("targets", ())))

@@ -18,6 +18,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from benchmarks.harness.common import difference
 from benchmarks.harness.parallel import JobError, in_parallel
 from mjx_softarm._support.provenance import write_json
 
@@ -41,10 +42,13 @@ class Settings:
     loads_g: tuple[int, ...] = (35, 105, 220, 330, 500, 1000)
     beside: tuple[str, ...] = ()  # further presets in open space; see `jobs.ALIKE`
 
+    def as_json(self) -> dict[str, Any]:
+        """Return all settings as JSON has them."""
+        return json.loads(json.dumps(dataclasses.asdict(self)))
+
     def shared(self) -> dict[str, Any]:
         """Return the settings that all results in a folder share; the others may be added to later."""
-        data = json.loads(json.dumps(dataclasses.asdict(self)))
-        return {name: value for name, value in data.items() if name not in MORE}
+        return {name: value for name, value in self.as_json().items() if name not in MORE}
 
 
 SMOKE = Settings(
@@ -80,10 +84,8 @@ def claim(folder: Path, settings: Settings) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         write_json(file, expected)
     found = {**Settings().shared(), **json.loads(file.read_text("utf-8"))}
-    if differing := [name for name in expected if found[name] != expected[name]]:
-        got = ", ".join(f"{name} {found[name]}" for name in differing)
-        asked = ", ".join(f"{name} {expected[name]}" for name in differing)
-        raise JobError(f"{file}: got {got}, expected {asked}; choose another --out")
+    if differing := difference(found, expected):
+        raise JobError(f"{file}: {differing}; choose another --out")
 
 
 def run_stages(folder: Path, settings: Settings, groups: Sequence[Sequence[Stage]]) -> dict[str, Any]:

@@ -12,10 +12,10 @@ from typing import Any
 from matplotlib.figure import Figure
 from PIL import Image
 
-from benchmarks.harness.common import target
+from benchmarks.harness.common import difference, target
 from benchmarks.paper import plots
 from benchmarks.paper.calibration_plots import calibration_figures, calibration_numbers
-from benchmarks.paper.engine import MORE, Settings
+from benchmarks.paper.engine import Settings
 from benchmarks.paper.jobs import CALIBRATION
 from benchmarks.paper.kinds import KINDS
 from benchmarks.paper.summary import Results, Row, simulated_rows, spreads, training_rows, trial_rows
@@ -89,7 +89,7 @@ def figures_of(experiment: str, folder: Path, settings: Settings, results: Resul
         )
     return {
         "arm": settings.arm,
-        "settings": _told(settings),
+        "settings": settings.as_json(),
         "targets": check_targets(experiment, table, trainings),
         "spreads": spreads(table),
         "calibrations": calibrations,
@@ -108,19 +108,10 @@ def _targets_of_both(pictures: Path, settings: Settings, table: list[Row]) -> li
     file = pictures / json_name("open", other)
     if not file.exists():
         return [target("twins and rods together", f"not measured: {file.name} is missing", None)]
-    figures, expected = json.loads(file.read_text("utf-8"))["figures"], _told(other)
-    found = figures["settings"] | {"beside": expected["beside"]}
-    if differing := [name for name in expected if found.get(name) != expected[name]]:
-        got = ", ".join(f"{name} {found.get(name)}" for name in differing)
-        asked = ", ".join(f"{name} {expected[name]}" for name in differing)
-        text = f"not measured: {file.name}: got {got}, expected {asked}"
-        return [target("twins and rods together", text, None)]
+    figures, expected = json.loads(file.read_text("utf-8"))["figures"], other.as_json()
+    if differing := difference(figures["settings"] | {"beside": expected["beside"]}, expected):
+        return [target("twins and rods together", f"not measured: {file.name}: {differing}", None)]
     return check_both_arms([table, figures["runs"]])
-
-
-def _told(settings: Settings) -> dict[str, Any]:
-    """Return all settings as JSON has them."""
-    return settings.shared() | {name: list(getattr(settings, name)) for name in MORE}
 
 
 def draw(experiment: str, results: Results, table: list[dict[str, Any]], arm: str) -> dict[str, Figure]:

@@ -59,20 +59,19 @@ def _open(table: Sequence[Row]) -> list[Check]:
 def check_both_arms(tables: Sequence[Sequence[Row]]) -> list[Check]:
     """Check the targets of twins and rods together, given the `trial_rows` of each in open space.
 
-    Those of a policy that observes the payload are checked where each arm has one.
+    Both have as many runs. Targets of a policy that observes the payload are checked where each arm has one.
     """
     observed = all(any(row["kind"] == "payload" for row in table) for table in tables)
-    checks = []
-    for kind, how in (("with", ""), *([("payload", " observed")] * observed)):
-        for load, limit_mm in (("0 g", 1.8), (f"{LIGHT_G} g", 3.0)):
-            groups = [_select(table, kind, load) for table in tables]
-            mean_mm = float(np.mean([_mean_mm(rows) for rows in groups]))
-            text = f"twins and rods, {load}{how}, mean of the two mean translations at most {limit_mm:g} mm"
-            checks.append(_reaching(text, f"{mean_mm:.2f} mm", mean_mm <= limit_mm, *groups))
-        heavy = [_select(table, kind, f"{HEAVY_G} g") for table in tables]
-        largest_mm = float(np.max(_values([row for rows in heavy for row in rows], "max_mm")))
-        text = f"twins and rods, 1 kg{how}, largest translation of all runs at most 13 mm"
-        checks.append(_reaching(text, f"{largest_mm:.2f} mm", largest_mm <= 13, *heavy))
+    together, checks = [row for table in tables for row in table], []
+    for kind, how in (("with", ""), ("payload", " observed"))[: 1 + observed]:
+        unloaded, light, heavy = (_select(together, kind, f"{load_g} g") for load_g in (0, LIGHT_G, HEAVY_G))
+        mean = f"{how}, mean of the two mean translations"
+        largest = f"twins and rods, 1 kg{how}, largest translation of all runs"
+        checks += [
+            _at_most(f"twins and rods, 0 g{mean}", "mm", 1.8, unloaded, "translation_mm"),
+            _at_most(f"twins and rods, {LIGHT_G} g{mean}", "mm", 3.0, light, "translation_mm"),
+            _at_most(largest, "mm", 13.0, heavy, "max_mm", np.max),
+        ]
     return checks
 
 

@@ -8,8 +8,7 @@ where the line between two evaluations crosses it for the first time.
 Ours with the presets quick and analytic go first. A peer is stopped when it has had as many times our time to
 5 mm as its targets ask for, since they are met then, or when it has reached all levels that quick has;
 ours-plain has as long as SBX, or its preset's env steps. Analytic trains to the finest level, or to its end.
-Results stay in the working folder: the same command
-continues an interrupted race, and seeds may be added.
+Results stay in the working folder: the same command continues an interrupted race, and seeds may be added.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
-from benchmarks.harness.common import machine_kind, save, show, status_of
+from benchmarks.harness.common import difference, machine_kind, save, show, status_of
 from benchmarks.harness.peers import PINS, PeerError, peer_python
 from benchmarks.harness.rounds import Facts, Worker, WorkerError
 from benchmarks.race.contestants import CONTESTANTS
@@ -144,11 +143,8 @@ def _result(folder: Path, name: str, seed: int, limits: Limits, n_goals: int) ->
     }
     if file.exists():
         result = json.loads(file.read_text("utf-8"))
-        found = result.get("conditions", {})
-        if differing := [key for key in conditions if found.get(key) != conditions[key]]:
-            was = ", ".join(f"{key} {found.get(key)}" for key in differing)
-            now = ", ".join(f"{key} {conditions[key]}" for key in differing)
-            raise RaceError(f"{file}: got {was}, expected {now}; choose another --out, or remove the file")
+        if differing := difference(result.get("conditions", {}), conditions):
+            raise RaceError(f"{file}: {differing}; choose another --out, or remove the file")
         print(f"{who}: measured before, in {file}")
         return result
     program = ["benchmarks.race.contestants", name, str(seed), str(limits.stretch_s), str(n_goals)]

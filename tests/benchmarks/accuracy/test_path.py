@@ -5,7 +5,7 @@ import json
 
 import pytest
 
-from benchmarks.accuracy import path
+from benchmarks.accuracy import arms, path
 from benchmarks.accuracy.path import means_over, measure, targets
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.policy.file import SHIPPED, load_policy
@@ -51,7 +51,7 @@ def test_a_measurement_that_lacks_a_goal_is_an_error(monkeypatch):
         (words[-1] / "accuracy.json").write_text('{"measured": 2, "points": 3}')
 
     for run_command, got in ((two_of_three, "2 of 3 goals"), (lambda *words: None, "no measured goal")):
-        monkeypatch.setattr(path, "run_command", run_command)
+        monkeypatch.setattr(arms, "run_command", run_command)
         with pytest.raises(InputError, match=f"twin:0=.*: got {got}, expected all"):
             measure((f"twin:0={SHIPPED}",))
 
