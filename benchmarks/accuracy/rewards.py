@@ -26,6 +26,7 @@ import jax
 import numpy as np
 
 from benchmarks.harness.common import target
+from benchmarks.harness.parallel import Job, in_parallel
 from benchmarks.paper.summary import SUCCESS
 from mjx_softarm import ArmSpec
 from mjx_softarm._support import cli
@@ -77,19 +78,23 @@ def measure(
     spec = ArmSpec.default()
     shown, between = demonstrated(spec)
     hands = {seed: shown_by_hand(spec, seed) for seed in seeds}
-    means, runs = [], []
-    for reward, settings, shown_by in KINDS:
-        kind = {"reward": reward, "settings": settings, "shown": shown_by}
+    jobs: dict[tuple[str, ...], list[Job]] = {kind: [] for kind in KINDS}
+    for kind in KINDS:
+        reward, settings, shown_by = kind
         config = config_of(reward, settings, steps, arms)
         # Whatever is shown to all seeds is compiled once.
         lessons = [(shown, seeds)] if shown_by == SCRIPTED else [(hands[seed], (seed,)) for seed in seeds]
-        rows = [
-            row
-            for lesson, of_seeds in lessons
-            for row in learn(reward, config, spec, lesson, (shown.positions, between), of_seeds)
-        ]
-        means.append(kind | summary(rows))
-        runs += [kind | row for row in rows]
+        for lesson, of_seeds in lessons:
+            name = f"{', '.join(kind)}, seeds {', '.join(map(str, of_seeds))}"
+            inputs = reward, config, spec, lesson, (shown.positions, between), of_seeds
+            jobs[kind].append((name, learn, inputs))
+    rows = in_parallel([job for of_kind in jobs.values() for job in of_kind])
+    means, runs = [], []
+    for kind, of_kind in jobs.items():
+        told = dict(zip(("reward", "settings", "shown"), kind, strict=True))
+        found = [row for name, *_ in of_kind for row in rows[name]]
+        means.append(told | summary(found))
+        runs += [told | row for row in found]
     n_by_hand = [len(hands[seed].positions) for seed in seeds]
     return {
         "positions": {"shown": len(shown.positions), "shown by hand": n_by_hand, "held out": len(between)},

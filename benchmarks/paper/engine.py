@@ -115,8 +115,15 @@ def save_arrays(path: Path, arrays: Any) -> None:
 
 
 def load_arrays(kind: Any, path: Path) -> Any:
-    """Read the named tuple, of the class `kind`, that `save_arrays` wrote."""
+    """Read the named tuple, of the class `kind`, that `save_arrays` wrote.
+
+    Raises:
+        JobError: it lacks an array.
+    """
     with np.load(path) as file:
+        if missing := [name for name in kind._fields if name not in file]:
+            why = f"got no {', '.join(missing)}, expected what this version writes"
+            raise JobError(f"{path}: {why}; remove the file, or choose another --out")
         return kind(**{name: file[name] for name in kind._fields})
 
 

@@ -79,7 +79,7 @@ def run(experiment: str, folder: Path, pictures: Path, settings: Settings) -> di
     """Run the stages of an experiment that are not done and write its report; returns the figures.
 
     Raises:
-        JobError: a stage failed, or the folder has other settings.
+        JobError: a stage failed, or the folder has other settings or files of an older version.
     """
     claim(folder, settings)
     returned = run_stages(folder, settings, stages(experiment, settings))

@@ -4,12 +4,12 @@
 
 NAME is one of `CONTESTANTS`. Ours is the loop of `python -m train reach` without its files, with the preset
 analytic, or quick (TQC, then polished). The peers train on the project's Gymnasium environment through
-`learn`: with the defaults of their algorithm and one arm, or with the settings of ours-quick wherever they
-have one. They have none for the temperature's own learning rate. Our learning rate falls along a half cosine
-over the preset's env steps, at which our training ends; theirs does so too, and begins anew.
+`learn`, with the settings of ours-quick wherever they have one. They have none for the temperature's own
+learning rate. Our learning rate falls along a half cosine over the preset's env steps, at which our training
+ends; theirs does so too, and begins anew.
 
 Hindsight: ours exchanges goals for the pose reached and for poses near it, and actions for the sensed ones;
-`benchmarks.race.hindsight` has the peers' own, for as large a share of a batch. Plain is without hindsight.
+`benchmarks.race.hindsight` has the peers' own, for as large a share of a batch.
 
 The clock counts from the program's start. It stands while the policy is evaluated and while PyTorch's threads
 are chosen. Start-up ends when a peer has done a first round of updates, and when ours has compiled.
@@ -75,26 +75,15 @@ class HeldOut:
         return np.stack(errors, axis=1).reshape(-1)[: self.n_goals]
 
 
-def our_config(name: str) -> Any:
-    """Return the `TrainConfig` of one of ours; ours-plain is quick without hindsight."""
-    from train.presets import PRESETS
-
-    plain = name == "ours-plain"
-    config = PRESETS["quick" if plain else name.removeprefix("ours-")]
-    if plain:
-        without = dataclasses.replace(config.hindsight, reached_share=0.0, near_share=0.0)
-        config = dataclasses.replace(config, hindsight=without)
-    return config
-
-
 def ours(name: str, seed: int) -> Contestant:
     """Return one of ours, compiled."""
     import jax
 
     from mjx_softarm.env import ReachEnv
+    from train.presets import PRESETS
     from train.runs.task import task_of
 
-    config = dataclasses.replace(our_config(name), seed=seed)
+    config = dataclasses.replace(PRESETS[name.removeprefix("ours-")], seed=seed)
     job = task_of(config, ReachEnv(config=config.env)).job
     n_env_steps = config.total_env_steps + (config.polish.total_env_steps if config.polish_updates else 0)
     state = job.start(lambda: job.init(jax.random.PRNGKey(seed)))
@@ -112,40 +101,35 @@ def ours(name: str, seed: int) -> Contestant:
     )
 
 
-def peer(library: str, variant: str, seed: int) -> Contestant:
-    """Return TQC of SBX or Stable-Baselines3-contrib, after its first round of updates.
-
-    Its variants: hindsight, plain (tuned, without hindsight) and defaults.
-    """
+def peer(name: str, seed: int) -> Contestant:
+    """Return TQC of SBX or Stable-Baselines3-contrib with hindsight, after its first round of updates."""
     from stable_baselines3.common.logger import Logger  # pyright: ignore[reportMissingImports]
 
+    from benchmarks.race.hindsight import GoalEnvs, HindsightBuffer, with_goals
     from mjx_softarm.env.gym import SoftArmVectorEnv, as_sb3
     from train.presets import PRESETS
 
-    config, algorithm = PRESETS["quick"], importlib.import_module(library.replace("-", "_")).TQC
+    config, library = PRESETS["quick"], library_of(name)
+    algorithm = importlib.import_module(library.replace("-", "_")).TQC
     start = time.perf_counter()
     if library == "sb3-contrib":
         throwaway = filled_model(algorithm)
-        batch_size = throwaway.batch_size if variant == "defaults" else config.batch_size
-        choose_threads(lambda: throwaway.train(gradient_steps=32, batch_size=batch_size))
+        choose_threads(lambda: throwaway.train(gradient_steps=32, batch_size=config.batch_size))
     uncounted_s = time.perf_counter() - start
-    n_arms = 1 if variant == "defaults" else config.n_arms
-    arms = SoftArmVectorEnv(n_arms, config.episode_length, config=config.env)
-    envs, settings, kind, seen, n_steps = as_sb3(arms), {}, "MlpPolicy", lambda obs: obs, 0
-    if variant != "defaults":
-        envs, settings = scaled(envs, config.tqc.reward_scale), tuned_settings(config, lambda: n_steps)
-    if variant == "hindsight":
-        from benchmarks.race.hindsight import GoalEnvs, HindsightBuffer, with_goals
-
-        envs, kind, seen = GoalEnvs(envs), "MultiInputPolicy", with_goals
-        settings["replay_buffer_class"] = HindsightBuffer
-        settings["replay_buffer_kwargs"] = {
+    arms, n_steps = SoftArmVectorEnv(config.n_arms, config.episode_length, config=config.env), 0
+    model = algorithm(
+        "MultiInputPolicy",
+        GoalEnvs(scaled(as_sb3(arms), config.tqc.reward_scale)),
+        seed=seed,
+        replay_buffer_class=HindsightBuffer,
+        replay_buffer_kwargs={
             "arm": arms.env,
             "hindsight": config.hindsight,
             "reward_scale": config.tqc.reward_scale,
             "seed": seed,
-        }
-    model = algorithm(kind, envs, seed=seed, **settings)
+        },
+        **settings_of(config, lambda: n_steps),
+    )
     model.set_logger(Logger(None, []))  # or each call of `learn` would make a folder
 
     def learn(n: int, **more: Any) -> None:
@@ -153,17 +137,17 @@ def peer(library: str, variant: str, seed: int) -> Contestant:
         model.learn(n, **more)
         n_steps = model.num_timesteps
 
-    learn(model.learning_starts + n_arms)
+    learn(model.learning_starts + config.n_arms)
     return Contestant(
         train=lambda: learn(CHUNK, reset_num_timesteps=False),
-        policy=lambda obs: model.predict(seen(obs), deterministic=True)[0],
+        policy=lambda obs: model.predict(with_goals(obs), deterministic=True)[0],
         done=lambda: (n_steps, model._n_updates),
         uncounted_s=uncounted_s,
     )
 
 
-def tuned_settings(config: Any, n_steps: Callable[[], int]) -> dict[str, Any]:
-    """Return our settings by the names that TQC of Stable-Baselines3 and SBX has; `n_steps` counts ours."""
+def settings_of(config: Any, n_steps: Callable[[], int]) -> dict[str, Any]:
+    """Return our settings by the names that TQC of Stable-Baselines3 and SBX has; `n_steps` counts theirs."""
     tqc = config.tqc
     low = tqc.learning_rate_end
 
@@ -200,10 +184,12 @@ def scaled(envs: Any, factor: float) -> Any:
     return Scaled(envs)
 
 
-CONTESTANTS = (  # the most telling first
-    *("ours-quick", "ours-analytic", "sbx-hindsight", "sb3-contrib-hindsight", "sbx-plain"),
-    *("sb3-contrib-plain", "ours-plain", "sbx-defaults", "sb3-contrib-defaults"),
-)
+CONTESTANTS = ("ours-quick", "ours-analytic", "sbx-hindsight", "sb3-contrib-hindsight")
+
+
+def library_of(name: str) -> str:
+    """Return the library of a peer, a key of `benchmarks.harness.peers.PINS`."""
+    return name.removesuffix("-hindsight")
 
 
 def prepare(
@@ -240,8 +226,7 @@ def prepare(
 
 
 def _prepare(name: str, seed: str, stretch_s: str, n_goals: str) -> tuple[Facts, Callable[[], Facts]]:
-    library, variant = name.rsplit("-", 1)
-    contestant = ours(name, int(seed)) if library == "ours" else peer(library, variant, int(seed))
+    contestant = (ours if name.startswith("ours") else peer)(name, int(seed))
     start_up_s = time.perf_counter() - START - contestant.uncounted_s
     return prepare(contestant, start_up_s, float(stretch_s), int(n_goals))
 

@@ -35,7 +35,7 @@ MAX_STEP = 0.5  # largest entry of a Newton step [m, rad]
 SMALL_STEP = 3e-4  # [m, rad]; the next error is of its square
 RESIDUAL_TOLERANCE = 2e-3  # [N, N m], against stiffnesses of 2 N m/rad and more
 TRACKING_TOLERANCE_M = 1e-4
-MAX_ARMS_ON_CPU = 128  # at once, of one `jax.vmap`; the numbers of more do not stay in its cache
+MAX_ARMS_ON_CPU = 128  # at once, of 36 joint coordinates; the numbers of more do not stay in its cache
 
 
 class Result(enum.IntEnum):
@@ -129,14 +129,23 @@ def _solver(n_small: int) -> Callable[[Kinematics, ArmParams, Array], tuple[Sett
     solve = jax.custom_batching.custom_vmap(functools.partial(_solve, n_small))
 
     def many(n: int, batched: list[Any], *arguments: Any) -> tuple[Any, Any]:
-        if n > MAX_ARMS_ON_CPU and jax.default_backend() == "cpu":
-            found = _solve_in_chunks(solve, n, batched, arguments)
+        if (at_once := _arms_at_once(n, arguments[1])) < n:
+            found = _solve_in_chunks(solve, n, -(-n // at_once), batched, arguments)
         else:
             found = _solve_arms_last(n_small, n, batched, *arguments)
         return found, jax.tree.map(lambda _: True, found)
 
     solve.def_vmap(many)
     return solve
+
+
+def _arms_at_once(n: int, params: ArmParams) -> int:
+    """Return how many of n arms settle at once: on a CPU sixteens, which fill its vectors, as its cache holds."""
+    if jax.default_backend() != "cpu":
+        return n
+    nv = params.link_mass_kg.shape[-1] * DOFS_PER_LINK
+    fit = MAX_ARMS_ON_CPU * min(1.0, (36 / nv) ** 2)
+    return 16 * max(1, round(fit / 16))
 
 
 def _solve_arms_last(
@@ -161,10 +170,9 @@ def _solve_arms_last(
 
 
 def _solve_in_chunks(
-    solve: Callable, n: int, batched: list[Any], arguments: tuple
+    solve: Callable, n: int, n_chunks: int, batched: list[Any], arguments: tuple
 ) -> tuple[Settled, Equilibrium]:
     """Return what `solve` finds of n arms, chunk after chunk; the last one repeats an arm to be as large."""
-    n_chunks = -(-n // MAX_ARMS_ON_CPU)
     arm = jnp.minimum(jnp.arange(n_chunks * -(-n // n_chunks)), n - 1).reshape(n_chunks, -1)
     own = tuple(batched)
 

@@ -15,6 +15,7 @@ from mjx_softarm.mechanics.settle import (
     RESIDUAL_TOLERANCE,
     TRACKING_TOLERANCE_M,
     SettleResult,
+    _arms_at_once,
     settle,
     settle_pressures,
 )
@@ -260,12 +261,18 @@ def test_more_arms_than_a_cpu_takes_at_once_settle_chunk_after_chunk(monkeypatch
         return own, jax.jit(jax.vmap(lambda x: tips(x, target[0])))(softer)
 
     expected = of_all()
-    monkeypatch.setattr("mjx_softarm.mechanics.settle.MAX_ARMS_ON_CPU", 2)
+    monkeypatch.setattr("mjx_softarm.mechanics.settle._arms_at_once", lambda n, _: 2)
     chunks = of_all()
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-6), chunks, expected)
     assert "scan" in str(jax.make_jaxpr(jax.vmap(tips, (0, None)))(softer, target[0]))
     eager = jax.vmap(softened, (0, None))(softer, target[0])  # whose numbers are NumPy's
     np.testing.assert_allclose(eager.tip_position_m, expected[1][0], atol=1e-6)
+
+
+@pytest.mark.parametrize("links, n", [(2, 128), (4, 128), (6, 64), (8, 32), (10, 16), (40, 16)])
+def test_a_cpu_settles_fewer_arms_at_once_the_more_links_they_have(links, n):
+    params = ArmParams.from_spec(SPEC.replace(structure={"links_per_section": links}))
+    assert _arms_at_once(1024, params) == n
 
 
 def test_new_numbers_need_no_new_compilation():

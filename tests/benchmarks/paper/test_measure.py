@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from benchmarks.harness.parallel import JobError
 from benchmarks.paper.engine import load_arrays, save_arrays
 from benchmarks.paper.measure import (
     GRASP_M,
@@ -142,6 +143,12 @@ def test_outcome_comes_back_from_its_file(tmp_path):
     for name, value in load_arrays(Outcome, tmp_path / "run.npz")._asdict().items():
         expected = getattr(outcome, name)
         assert np.array_equal(value, expected, equal_nan=value.dtype.kind == "f"), name
+
+
+def test_an_outcome_of_an_older_version_is_named(tmp_path):
+    np.savez(tmp_path / "run.npz", told_g=0.0)
+    with pytest.raises(JobError, match=r"run.npz: got no .*load_estimate_g.*, expected what this version"):
+        load_arrays(Outcome, tmp_path / "run.npz")
 
 
 def test_finger_tips_are_below_the_tip():

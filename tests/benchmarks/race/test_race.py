@@ -1,6 +1,5 @@
 """The race: contestants and their processes, what each is given, what is kept; with a made-up program."""
 
-import dataclasses
 import json
 import sys
 
@@ -9,15 +8,15 @@ import numpy as np
 import pytest
 
 from benchmarks.__main__ import main
+from benchmarks.harness.peers import PINS
 from benchmarks.harness.rounds import Worker, WorkerError
 from benchmarks.race import race
 from benchmarks.race.contestants import (
     CONTESTANTS,
     Contestant,
     HeldOut,
-    our_config,
     prepare,
-    tuned_settings,
+    settings_of,
 )
 from benchmarks.race.race import Limits, RaceError, limits_of, run, train
 from mjx_softarm.env import EnvConfig, ReachEnv
@@ -30,6 +29,7 @@ FAKE = '''
 """A contestant whose curve is known: 100 mm / round, 10 s and 1,000 env steps each; or it stops by itself."""
 import sys
 from benchmarks.__main__ import main
+from benchmarks.harness.peers import PINS
 from benchmarks.harness.rounds import serve
 name, seed, stretch_s, n_goals = sys.argv[1:]
 k = 0
@@ -106,17 +106,9 @@ def test_held_out_goals_are_evaluated_as_the_trainer_does_it(quick_compiler):
     np.testing.assert_allclose(found, reached.tip_error_mm[:12], atol=0.01)  # of the first set
 
 
-def test_ours_without_hindsight_differs_in_nothing_else():
-    quick, plain, analytic = (our_config(f"ours-{name}") for name in ("quick", "plain", "analytic"))
-    assert analytic == PRESETS["analytic"]
-    assert (plain.hindsight.reached_share, plain.hindsight.near_share) == (0.0, 0.0)
-    assert quick.hindsight == PRESETS["quick"].hindsight and quick.hindsight.near_share > 0
-    assert dataclasses.replace(plain, hindsight=quick.hindsight) == quick
-
-
-def test_tuned_peers_have_the_quick_preset_s_settings():
+def test_peers_have_the_quick_preset_s_settings():
     n_steps = [0]
-    settings = tuned_settings(PRESETS["quick"], lambda: n_steps[0])
+    settings = settings_of(PRESETS["quick"], lambda: n_steps[0])
     rate = settings.pop("learning_rate")
     names = ("buffer_size", "learning_starts", "batch_size", "tau", "gamma", "train_freq", "gradient_steps")
     values = (262_144, 2048, 128, 0.005, 0.1, 1, 16, "auto_0.1", -30.0)
@@ -144,7 +136,7 @@ def asked(monkeypatch):
         return {"start_up_s": 2.0, "limit_s": None, "points": POINTS}
 
     monkeypatch.setattr(race, "train", made_up)
-    monkeypatch.setattr(race, "peer_python", lambda name: sys.executable)
+    monkeypatch.setattr(race, "peer_python", lambda name: PINS[name] and sys.executable)
     return asked
 
 
@@ -157,36 +149,33 @@ def test_peers_get_our_time_to_5_mm_as_often_as_the_target_asks_and_stop_where_o
     sbx, sb3 = (Limits(n * 29.5, 5, n * 29.5 / 40) for n in (20, 15))  # SBX: 5 times quick, 20 analytic
     assert asked == {
         "ours-quick, seed 4": Limits(),
-        **{f"sbx-{name}, seed 4": sbx for name in ("hindsight", "plain", "defaults")},
-        **{f"sb3-contrib-{name}, seed 4": sb3 for name in ("hindsight", "plain", "defaults")},
-        "ours-plain, seed 4": sbx,
         "ours-analytic, seed 4": Limits(float("inf"), 1, 5 * 29.5 / 40),
+        "sbx-hindsight, seed 4": sbx,
+        "sb3-contrib-hindsight, seed 4": sb3,
     }
-    assert list(asked) == [f"{name}, seed 4" for name in CONTESTANTS]  # the most telling first
+    assert list(asked) == [f"{name}, seed 4" for name in CONTESTANTS]
     assert all("points" in one for one in results)
     # One that does not reach 5 mm: multiples of all its time.
     quick = {"contestant": "ours-quick", "points": POINTS[:2]}
-    assert limits_of("sbx-plain", [quick]) == Limits(5 * 22.0, 10, 5 * 22.0 / 40)
+    assert limits_of("sbx-hindsight", [quick]) == Limits(5 * 22.0, 10, 5 * 22.0 / 40)
     # Each target has the time of its own preset.
     quick, analytic = ({"contestant": f"ours-{name}", "points": POINTS} for name in ("quick", "analytic"))
     analytic["points"] = [POINTS[2] | {"wall_s": 5.0}]
-    assert limits_of("sbx-plain", [quick, analytic]).wall_s == 5 * 29.5  # 20 times 5 s are less
+    assert limits_of("sbx-hindsight", [quick, analytic]).wall_s == 5 * 29.5  # 20 times 5 s are less
 
 
 def test_some_may_race_alone_and_the_others_and_those_that_failed_follow(
     asked, monkeypatch, tmp_path, capsys
 ):
     monkeypatch.setattr(race, "save", lambda *_: tmp_path / "race.json")
-    some = [name for name in CONTESTANTS if "hindsight" in name or "plain" in name]
-    assert main(["race", "--only", ",".join(some), "--out", str(tmp_path)]) == 1  # as fast as ours
-    assert list(asked) == [f"{name}, seed 0" for name in ("ours-quick", *some)]
-    left = "['ours-analytic', 'sbx-defaults', 'sb3-contrib-defaults']"
-    assert left in capsys.readouterr().out
+    assert (
+        main(["race", "--only", "sbx-hindsight", "--out", str(tmp_path)]) == 0
+    )  # it fails, so no target is judged
+    assert list(asked) == ["ours-quick, seed 0", "sbx-hindsight, seed 0"]
+    assert "['ours-analytic', 'sb3-contrib-hindsight']" in capsys.readouterr().out
     asked.clear()
-    assert main(["race", "--out", str(tmp_path)]) == 1
-    failed = "sbx-hindsight"
-    rest = ("ours-analytic", failed, "sbx-defaults", "sb3-contrib-defaults")
-    assert list(asked) == [f"{name}, seed 0" for name in rest]
+    assert main(["race", "--out", str(tmp_path)]) == 1  # as fast as ours
+    assert list(asked) == [f"{name}, seed 0" for name in CONTESTANTS if name != "ours-quick"]
 
 
 def test_results_of_another_commit_size_or_machine_are_refused(asked, monkeypatch, tmp_path):
