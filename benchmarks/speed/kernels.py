@@ -193,9 +193,7 @@ def compiled(where: str, program: str, *settings: str) -> Facts:
         function, shapes = jax.jit(job.arms.step), (jax.eval_shape(job.arms.reset, key), action, key)
     each = jax.tree.broadcast((job.sharding,) if job.sharding else everywhere(mesh), shapes)
     placed = jax.tree.map(lambda x, on: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=on), shapes, each)
-    with mock.patch.object(
-        settle, "_arms_at_once", lambda n, _: n
-    ):  # this host is a CPU, the program's is not
+    with mock.patch.object(settle, "_arms_at_once", lambda n, _: n):  # as on a GPU; this host is a CPU
         lowered = function.lower(*placed)
     loop = read(str(lowered.compile().as_text()))
     return {"loops": list(loop.rows()), "totals": [loop.over_turns(n).tolist() for n in (0, 1)]}

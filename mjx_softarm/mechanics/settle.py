@@ -140,7 +140,7 @@ def _solver(n_small: int) -> Callable[[Kinematics, ArmParams, Array], tuple[Sett
 
 
 def _arms_at_once(n: int, params: ArmParams) -> int:
-    """Return how many of n arms settle at once: on a CPU sixteens, which fill its vectors, as its cache holds."""
+    """Return how many of n arms settle at once: on a CPU as many vectors of sixteen as its cache holds."""
     if jax.default_backend() != "cpu":
         return n
     nv = params.link_mass_kg.shape[-1] * DOFS_PER_LINK
