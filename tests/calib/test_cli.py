@@ -1,5 +1,6 @@
 """`python -m calib` as a user runs it: the demo calibrated and taken by training; bad input refused."""
 
+import dataclasses
 import json
 import shutil
 
@@ -9,6 +10,7 @@ import pytest
 import calib.demo
 from calib.__main__ import main
 from calib.demo import planted_arm, write_demo
+from calib.fit import network
 from calib.read.logs import read_log
 from mjx_softarm import ArmSpec
 from mjx_softarm.logs.pose_pairs import read_pose_pairs
@@ -30,7 +32,9 @@ def demo(tmp_path_factory):
 @pytest.fixture(scope="module")
 def calibrated(demo, tmp_path_factory):
     folder = tmp_path_factory.mktemp("calibrated") / "out"
-    status = main(["run", *demo, "--out", str(folder)])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(network, "OF_PROCESS", dataclasses.replace(network.OF_PROCESS, n_updates=2_000))
+        status = main(["run", *demo, "--out", str(folder)])
     return status, folder
 
 

@@ -111,7 +111,7 @@ def test_states_far_from_the_log_are_flagged_and_stay_bounded(spec, arms, fit):
 
 
 def test_held_out_rows_take_no_part_and_the_seed_decides(spec, arms):
-    simulated, true = first(arms, N_ROWS), arms[1][:N_ROWS]
+    simulated, true = first(arms, 300), arms[1][:300]
     once = fit_s2r(spec, simulated, true, seed=7, config=BRIEF)
     shifted, stretched = true + 0.0, simulated.spring_m + 0.0
     shifted[once.held_out, :3] += 50.0
