@@ -1,9 +1,10 @@
 """Virtual environments of the libraries that this project is compared with, made on first use.
 
 Each has the peer and the simulator's packages in the versions that run here, so that all contestants train
-on the same environment, and other simulators read the same arm. One more has JAX's compiler for GPUs, for
-machines without a GPU. They lie beside the checkout's own `.venv`, as `.venv-PEER`. A file in each lists its
-packages: an incomplete environment, or one of other packages, is made anew.
+on the same environment, and other simulators read the same arm; brax's learner has the older jax that it
+needs. One more has JAX's compiler for GPUs, for machines without a GPU. They lie beside the checkout's own
+`.venv`, as `.venv-PEER`. A file in each lists its packages: an incomplete environment, or one of other
+packages, is made anew.
 
 On Linux, PyTorch comes with gigabytes of CUDA. To do without them, set
 `PIP_EXTRA_INDEX_URL=https://download.pytorch.org/whl/cpu`.
@@ -24,6 +25,7 @@ _SB3 = ("stable-baselines3==2.9.2", "torch==2.13.0")
 PINS = {
     "sbx": ("sbx-rl==0.28.0", *_SB3),
     "sb3-contrib": ("sb3-contrib==2.9.2", *_SB3),
+    "brax": ("brax==0.14.2", "jax==0.9.2", "jaxlib==0.9.2", "flax==0.12.6"),
     "soromox": ("soromox==0.5.0", "diffrax==0.7.2", "equinox==0.13.8"),
 }
 COMPILER = "gpu-compiler"
@@ -64,14 +66,15 @@ def peer_python(name: str, root: Path = ROOT) -> Path:
 
 def peer_packages(name: str) -> tuple[str, ...]:
     """Return the packages of a peer's environment; its JAX is for CUDA if this one is."""
-    versions = {package: metadata.version(package) for package in SHARED}
+    shared = {package: metadata.version(package) for package in SHARED}
     if name == COMPILER:
-        own = (f"jax-cuda12-plugin=={versions['jax']}",)
+        versions = {"jax-cuda12-plugin": shared["jax"]} | shared
     else:
-        own, installed = PINS[name], {distribution.name for distribution in metadata.distributions()}
-        if "jax-cuda12-plugin" in installed:
+        own = dict(pin.split("==") for pin in PINS[name])
+        versions = own | shared | own  # its own first, in its own versions
+        if "jax-cuda12-plugin" in {distribution.name for distribution in metadata.distributions()}:
             versions["jax[cuda12]"] = versions.pop("jax")
-    return (*own, *(f"{package}=={version}" for package, version in versions.items()))
+    return tuple(f"{package}=={version}" for package, version in versions.items())
 
 
 def _make(home: Path, python: Path, packages: tuple[str, ...]) -> None:

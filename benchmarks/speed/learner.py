@@ -1,8 +1,9 @@
 """Gradient updates a second over batch sizes, against the peers' learners in one run on the same machine.
 
-The TQC of Stable-Baselines3-contrib and of SBX (Stable-Baselines Jax) run in virtual environments of their
-own, brax's SAC in this one; `benchmarks.speed.learner_contestants` describes each. At every size each has a
-process of its own; all prepare themselves, then they take turns. A rate is the median of the rounds.
+The TQC of Stable-Baselines3-contrib and of SBX (Stable-Baselines Jax), and brax's SAC, run in virtual
+environments of their own, brax's with the older jax that it needs; `benchmarks.speed.learner_contestants`
+describes each. At every size each has a process of its own; all prepare themselves, then they take turns. A
+rate is the median of the rounds.
 """
 
 from __future__ import annotations

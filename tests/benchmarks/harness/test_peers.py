@@ -29,6 +29,7 @@ def made(monkeypatch):
     [
         ("sbx", "sbx-rl"),
         ("sb3-contrib", "sb3-contrib"),
+        ("brax", "brax"),
         ("soromox", "soromox"),
         (COMPILER, "jax-cuda12-plugin"),
     ],
@@ -37,7 +38,10 @@ def test_every_requirement_is_pinned_and_the_simulator_s_are_those_that_run_here
     requirements = dict(requirement.split("==") for requirement in peer_packages(name))
     assert all(requirements.values()) and package in requirements
     found = {shared: requirements.get(shared, requirements.get(f"{shared}[cuda12]")) for shared in SHARED}
-    assert found == {shared: metadata.version(shared) for shared in SHARED}
+    own = {pin.split("==")[0] for pin in PINS.get(name, ())}
+    assert own.isdisjoint(SHARED) or name == "brax"
+    assert all(found[shared] == metadata.version(shared) for shared in SHARED if shared not in own)
+    assert requirements == requirements | dict(pin.split("==") for pin in PINS.get(name, ()))
     if name == COMPILER:
         assert requirements[package] == metadata.version("jax") and "jax[cuda12]" not in requirements
 

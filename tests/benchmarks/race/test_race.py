@@ -29,7 +29,6 @@ FAKE = '''
 """A contestant whose curve is known: 100 mm / round, 10 s and 1,000 env steps each; or it stops by itself."""
 import sys
 from benchmarks.__main__ import main
-from benchmarks.harness.peers import PINS
 from benchmarks.harness.rounds import serve
 name, seed, stretch_s, n_goals = sys.argv[1:]
 k = 0
