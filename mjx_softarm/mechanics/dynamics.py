@@ -37,7 +37,7 @@ from mjx_softarm import control, pneumatics
 from mjx_softarm._support.mjx import mjx
 from mjx_softarm._support.small_matrices import block_diagonal, products, solve
 from mjx_softarm.mechanics.kinematics import Frames, Kinematics
-from mjx_softarm.mechanics.settle import Result
+from mjx_softarm.mechanics.result import Result
 from mjx_softarm.mechanics.statics import ArmParams, Tendons, all_tendons, statics_of
 
 N_PER_KPA_M2 = 1e3

@@ -14,7 +14,6 @@ Source: primal-dual active set as semismooth Newton, Hintermueller, Ito, Kunisch
 
 from __future__ import annotations
 
-import enum
 import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -27,6 +26,7 @@ from jax.custom_derivatives import zero_from_primal
 from mjx_softarm._support.small_matrices import eliminate, identity, products
 from mjx_softarm.mechanics.implicit import Equilibrium, Response, equilibrium_tangents
 from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK, Kinematics, chain_frames
+from mjx_softarm.mechanics.result import Result
 from mjx_softarm.mechanics.statics import ArmParams, statics
 
 MAX_ITERATIONS = 12
@@ -36,18 +36,6 @@ SMALL_STEP = 3e-4  # [m, rad]; the next error is of its square
 RESIDUAL_TOLERANCE = 2e-3  # [N, N m], against stiffnesses of 2 N m/rad and more
 TRACKING_TOLERANCE_M = 1e-4
 MAX_ARMS_ON_CPU = 128  # at once, of 36 joint coordinates; the numbers of more do not stay in its cache
-
-
-class Result(enum.IntEnum):
-    """A code of how a simulation ended, an int32 in arrays, with a text for messages."""
-
-    text: str
-
-    def __new__(cls, code: int, text: str) -> Result:
-        member = int.__new__(cls, code)
-        member._value_ = code
-        member.text = text
-        return member
 
 
 class SettleResult(Result):

@@ -1,4 +1,4 @@
-"""What the benchmark of other arms takes from the commands that it runs."""
+"""Commands that the benchmark of other arms runs: which exit statuses end it."""
 
 import subprocess
 import sys

@@ -62,12 +62,11 @@ def test_a_learned_reward_is_to_need_fewer_steps_with_the_same_settings_and_demo
 def lessons(monkeypatch):
     """Keeps what `learn` is given in the place of learning; a hand shows 10 positions more than its seed."""
     given = []
-    rest = {"steps_to_success": 512, "success": 1.0, "median_mm": 1.0}
-    rest |= {"held_out_success": 1.0, "held_out_median_mm": 1.0}
+    rest = {"steps_to_success": 512, "success": 1.0, "held_out_success": 1.0, "held_out_median_mm": 1.0}
 
     def learn(reward, config, spec, shown, judged, seeds):
         given.append((reward, len(shown.positions), [len(positions) for positions in judged], list(seeds)))
-        return [{"seed": seed, **rest} for seed in seeds]
+        return [{"seed": seed, **rest, "median_mm": len(given)} for seed in seeds]
 
     shows = {"demonstrated": lambda spec: (showing(4), np.zeros((3, 6), np.float32))}
     shows["shown_by_hand"] = lambda spec, seed: showing(10 + seed)
@@ -96,3 +95,6 @@ def test_a_hand_shows_each_seed_other_positions_and_all_are_judged_at_the_script
     assert found["positions"] == {"shown": 4, "shown by hand": [10, 12], "held out": 3}
     assert [row["shown"] for row in found["means"]] == 5 * [SCRIPTED] + 2 * [BY_HAND]
     assert [row["seed"] for row in found["runs"]] == 7 * [0, 2]
+    whose = [row["median_mm"] for row in found["runs"]]  # the lesson, of which scripted ones have both seeds
+    assert whose == [1, 1, 2, 2, 3, 3, 4, 4, 5, 5, 6, 7, 8, 9]
+    assert [row["median_mm"] for row in found["means"]] == [1, 2, 3, 4, 5, 6.5, 8.5]
