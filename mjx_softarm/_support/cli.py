@@ -1,23 +1,19 @@
-"""Command lines: tyro reads the options of a command; an error is one line on stderr and exit status 2.
+"""Command lines: tyro reads the options of a command; an error is told on stderr, with exit status 2.
 
-A command is a function, or a dataclass that is called once its options are read. Type annotations say what an
-option may be, docstrings say what it means.
+A command is a function, or a dataclass that is called once its options are read. Type annotations say which
+values an option may have, docstrings say what it means.
 """
 
 from __future__ import annotations
 
 import ast
-import contextlib
 import functools
 import importlib
 import importlib.util
 import inspect
-import io
 import itertools
-import os
-import re
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -27,25 +23,6 @@ from tyro.constructors import PrimitiveConstructorSpec
 from mjx_softarm._support.errors import InputError
 
 ERROR, INTERRUPTED = 2, 130  # exit statuses
-
-# Parts of tyro's boxes: colours, sides, and the rules between parts, which are hyphens without UTF-8.
-_COLOUR, _SIDE, _RULE = re.compile(r"\x1b\[[0-9;]*m"), " |\u2502", re.compile(r"\W?[-\u2500]{3,}\W?")
-_PLAINER = (
-    (r"^Unrecognized options: (.*)", r"command line: got \1, expected options as --help tells"),
-    (r"^Missing value for argument '(\S+)'.*", r"\1: got nothing, expected a value"),
-    (r"no type matching (\S+) could be instantiated from \['(.*?)'\].*", r"got '\2', expected \1"),
-    (r"^Error parsing (?:(-\S*: )|\S*: )", r"\1"),
-    (r"invalid literal for int\(\) with base 10: (.*)", r"got \1, expected a whole number"),
-    (r"could not convert string to float: (.*)", r"got \1, expected a number"),
-    (r"Could not find valid parse for arguments: (.*)", r"got \1, expected values as --help tells"),
-    (r"^Missing from (.*?):", r"\1: got nothing, expected"),
-    (r" \(required\)(?= )", ";"),
-    (r" \(required\)", ""),
-    (
-        r"^invalid choice (\S+) for argument '(\S+)'. Expected one of \((.*)\).",
-        r"\2: got \1, expected one of \3",
-    ),
-)
 
 Command = Callable[..., Any] | str
 
@@ -90,6 +67,8 @@ def guarded(run: Callable[[], int]) -> int:
     """Run a command; return its exit status, 2 after an error that its user can put right, 130 on Ctrl-C."""
     try:
         return run()
+    except SystemExit as stop:  # tyro has printed help, or which option is wrong
+        return int(stop.code or 0)
     except InputError as error:
         text = str(error)
     except OSError as error:
@@ -105,7 +84,8 @@ def read(prog: str, commands: Mapping[str, Command], words: Sequence[str]) -> tu
     """Return the name of the command that the words begin with, and the command with its options.
 
     Raises:
-        InputError: there is no such command, or one of its options cannot be used.
+        InputError: there is no such command, or its options do not go together.
+        SystemExit: tyro has printed help, or which option is wrong.
     """
     name = next((name for name in commands if list(words[: len(name.split())]) == name.split()), None)
     if name is None:
@@ -149,21 +129,16 @@ def parse(command: Any, prog: str, arguments: Sequence[str]) -> Callable[[], Any
         The command with its options, to be called.
 
     Raises:
-        InputError: an option is unknown or missing, or has a value that it cannot have.
+        InputError: a dataclass refuses its values.
+        SystemExit: tyro has printed help, or which option is wrong.
     """
     begin_with = {"default": command.default(arguments)} if hasattr(command, "default") else {}
     kind = command if inspect.isclass(command) else _later(command)
-    boxes = io.StringIO()
     try:
-        with _lines_unbroken(arguments), contextlib.redirect_stderr(boxes):
-            return tyro.cli(  # pyright: ignore[reportReturnType, reportCallIssue]
-                kind, prog=prog, args=arguments, config=(tyro.conf.FlagCreatePairsOff,), **begin_with
-            )
-    except SystemExit as stop:
-        if not stop.code:
-            raise
-        raise InputError(_sentence(boxes.getvalue())) from None
-    except ValueError as error:  # a dataclass refuses its values
+        return tyro.cli(  # pyright: ignore[reportReturnType, reportCallIssue]
+            kind, prog=prog, args=arguments, config=(tyro.conf.FlagCreatePairsOff,), **begin_with
+        )
+    except ValueError as error:
         raise InputError(str(error)) from error
 
 
@@ -175,37 +150,6 @@ def _later(function: Callable[..., Any]) -> Callable[..., Callable[[], Any]]:
         return functools.partial(function, *args, **options)
 
     return bind
-
-
-@contextlib.contextmanager
-def _lines_unbroken(arguments: Sequence[str]) -> Iterator[None]:
-    """Let tyro print messages as wide as they are; help stays as wide as the terminal."""
-    before = os.environ.get("COLUMNS")
-    if not {"-h", "--help"} & set(arguments):
-        os.environ["COLUMNS"] = "100000"
-    try:
-        yield
-    finally:
-        os.environ.pop("COLUMNS", None)
-        if before is not None:
-            os.environ["COLUMNS"] = before
-
-
-def _sentence(boxes: str) -> str:
-    """Return what stands in tyro's box as one line: what is wrong and, in short, what was expected."""
-    parts: list[list[str]] = [[]]
-    for line in boxes.splitlines()[1:]:  # below the title
-        text = _COLOUR.sub("", line).strip(_SIDE)
-        if _RULE.fullmatch(text):
-            parts.append([])
-        elif text:
-            parts[-1].append(text)
-    told = [part for part in parts if part]
-    message = " ".join(told[0])
-    for pattern, plainer in _PLAINER:
-        message = re.sub(pattern, plainer, message)
-    hints = [" ".join(part[:2]) for part in told[1:] if part[0].startswith("Perhaps")]
-    return "; ".join([message, *hints])
 
 
 def _integers(words: list[str]) -> tuple[int, ...]:
