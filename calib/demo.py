@@ -19,7 +19,6 @@ from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.mechanics.mjcf import build_model, spring_lengths, steps_per_period
 from mjx_softarm.mechanics.workspace import settle_many
 from mjx_softarm.sensing.pose import rotation_from_quaternion
-from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
 
 N_LENGTHS = 60  # of each spring on the ruler
@@ -182,4 +181,4 @@ def _rows(time_s: np.ndarray) -> dict[str, Any]:
 
 def _readings(arm: ArmSpec, length_m: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     noisy_m = length_m + rng.normal(scale=READING_NOISE_M, size=length_m.shape)
-    return Sensor.from_spec(arm).readings(noisy_m)
+    return arm.spring_sensor.readings(noisy_m)

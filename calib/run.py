@@ -39,7 +39,6 @@ from mjx_softarm.logs.rest import MIN_HOLD_S
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.sensing.pose import pose_from_frame
 from mjx_softarm.sensing.s2r import S2R, S2R_FILE, correct, extrapolation, save_s2r
-from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.spec import ARM_FILE, ArmSpec
 
 POSE_COLUMNS = ("pressure_kpa", "tip_m", "tip_quaternion")  # needed in a log of poses
@@ -147,12 +146,12 @@ def _springs(
         remedy = "beta and delta are not this arm's: log readings beside spring lengths on a ruler"
         return spec, Section("Springs", needed, warnings=(remedy,))
     readings, length_m = (np.concatenate(x) for x in zip(*pairs, strict=True))
-    fit = fit_springs(readings, length_m, Sensor.from_spec(spec), seed=seed, **how)
+    fit = fit_springs(readings, length_m, spec.spring_sensor, seed=seed, **how)
     sensor: dict[str, Any] = {"beta": tuple(map(float, fit.beta)), "delta_m": tuple(map(float, fit.delta_m))}
     if fit.compensation_h is not None:
         sensor["compensation_h"] = fit.compensation_h
     spec = spec.replace(sensor=sensor)
-    calibrated = Sensor.from_spec(spec).lengths(readings, np.nan)
+    calibrated = spec.spring_sensor.lengths(readings, np.nan)
     return spec, sections.springs(fit, calibrated.length_m, length_m)
 
 

@@ -17,7 +17,6 @@ import numpy as np
 import tomli_w
 
 from mjx_softarm._support.fields import (
-    N_CHAMBERS_PER_SECTION,
     PerChamber,
     SpecError,
     anything,
@@ -30,7 +29,7 @@ from mjx_softarm._support.fields import (
     vector,
 )
 from mjx_softarm.arms import shipped_arm
-from mjx_softarm.sensing.sensors import SENSORS, Sensor
+from mjx_softarm.sensing.sensors import N_CHAMBERS_PER_SECTION, SENSORS, Sensor
 
 ARM_FILE = "arm.toml"  # in the folder of a calibration
 PAIRS = "pairs of chamber and spring"
@@ -180,6 +179,11 @@ class ArmSpec:
     def link_length_m(self) -> float:
         return self.geometry.section_length_m / self.structure.links_per_section
 
+    @property
+    def spring_sensor(self) -> Sensor:
+        """The sensor with one calibration per spring."""
+        return self.sensor.per_spring(self.n_chambers)
+
     def per_chamber(self, value: PerChamber) -> tuple[float, ...]:
         """Return one number per chamber, however the field was written."""
         return tuple(value) if isinstance(value, tuple) else (float(value),) * self.n_chambers
@@ -285,7 +289,7 @@ class ArmSpec:
                     f"{source}: {group}.{low}: got {least!r}, expected less than {high} ({greatest!r})"
                 )
         # Lengths that may be commanded must be lengths that the sensor can read.
-        sensor = Sensor.from_spec(self)
+        sensor = self.spring_sensor
         (low, high), unit = sensor.range, sensor.unit
         for name in ("length_min_m", "length_max_m"):
             length_m = getattr(self.springs, name)

@@ -12,11 +12,10 @@ from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.sensing.estimator import PoseEstimator, SpringModel, estimate
 from mjx_softarm.sensing.load import LoadEstimator
-from mjx_softarm.sensing.sensors import Sensor
 
 SPEC = ArmSpec.default()
 N, DT_S = SPEC.n_chambers, 1.0 / SPEC.control.rate_hz
-SENSOR = Sensor.from_spec(SPEC)
+SENSOR = SPEC.spring_sensor
 LOW_KPA, HIGH_KPA = SPEC.chambers.pressure_min_kpa, SPEC.chambers.pressure_max_kpa
 REST_M = 0.2
 # A chamber lengthens its own spring and, by bending, shortens its section's others.

@@ -16,7 +16,6 @@ from calib.fit.chambers import calibrate_chambers
 from calib.fit.sensors import fit_springs
 from calib.read.logs import read_log
 from mjx_softarm import ArmSpec
-from mjx_softarm.sensing.sensors import Sensor
 
 
 def measure() -> dict[str, Any]:
@@ -30,7 +29,7 @@ def measure() -> dict[str, Any]:
         files = demo.write_demo(Path(folder), spec, seed=0)
         springs, poses = (read_log(file)[0] for file in files[:2])
     assert springs.readings is not None and springs.spring_m is not None  # as the demo writes them
-    lines = fit_springs(springs.readings, springs.spring_m, Sensor.from_spec(spec))
+    lines = fit_springs(springs.readings, springs.spring_m, spec.spring_sensor)
     sensor = {"beta": tuple(map(float, lines.beta)), "delta_m": tuple(map(float, lines.delta_m))}
     fit = calibrate_chambers(poses, spec.replace(sensor=sensor))
     return {

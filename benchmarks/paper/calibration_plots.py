@@ -54,7 +54,7 @@ def _found(folder: Path, twin: int) -> tuple[Comparison, tuple[Sensor, Sensor]]:
     """Return a twin's comparison, and its sensors as specified and as calibrated."""
     here = folder / f"twin{twin}"
     calibrated = ArmSpec.from_toml(here / CALIBRATION / ARM_FILE)
-    sensors = Sensor.from_spec(ArmSpec.default()), Sensor.from_spec(calibrated)
+    sensors = ArmSpec.default().spring_sensor, calibrated.spring_sensor
     return load_arrays(Comparison, here / COMPARISON_FILE), sensors
 
 

@@ -17,7 +17,8 @@ from calib.fit.s2r import simulate_poses
 from calib.read.static_poses import find_static_poses
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mechanics.kinematics import chain_kinematics
-from mjx_softarm.mechanics.statics import ArmParams, tendons
+from mjx_softarm.mechanics.params import ArmParams
+from mjx_softarm.mechanics.statics import tendons
 from mjx_softarm.mechanics.workspace import settle_many
 from mjx_softarm.sensing.s2r import S2R, correct
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec

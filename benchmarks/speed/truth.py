@@ -20,7 +20,7 @@ from mjx_softarm.env.vector import over_arms
 from mjx_softarm.mechanics import settle as solver
 from mjx_softarm.mechanics.kinematics import chain_kinematics, mjx_kinematics
 from mjx_softarm.mechanics.mjcf import build_model
-from mjx_softarm.mechanics.statics import ArmParams
+from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.spec import ArmSpec
 
 QUANTILES = {"median_mm": 0.5, "p95_mm": 0.95, "max_mm": 1.0}

@@ -18,8 +18,9 @@ from calib.read.static_poses import StaticPoses
 from mjx_softarm._support import xla
 from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.mechanics.kinematics import Frames, chain_kinematics
+from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.settle import RESIDUAL_TOLERANCE, settle_pressures
-from mjx_softarm.mechanics.statics import ArmParams, tendons
+from mjx_softarm.mechanics.statics import tendons
 from mjx_softarm.mechanics.workspace import pressure_levels
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
 

@@ -24,7 +24,7 @@ import numpy as np
 
 from calib.errors import FitError
 from calib.read.static_poses import StaticPoses
-from mjx_softarm.mechanics.statics import ArmParams
+from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
 
 ORDER = 4

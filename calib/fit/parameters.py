@@ -19,7 +19,7 @@ import numpy as np
 from jax import Array
 
 from mjx_softarm._support.small_matrices import product
-from mjx_softarm.mechanics.statics import ArmParams
+from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.sensing.pose import rotation_about, rotation_from_quaternion, rotation_vector
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
 

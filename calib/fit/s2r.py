@@ -25,8 +25,8 @@ from calib.fit.section_process import SectionProcess, Sections, fit_process, pre
 from mjx_softarm._support import xla
 from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.mechanics.kinematics import chain_kinematics
+from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.settle import settle
-from mjx_softarm.mechanics.statics import ArmParams
 from mjx_softarm.mechanics.workspace import settle_many
 from mjx_softarm.sensing.pose import frame_from_pose, pose_from_frame
 from mjx_softarm.sensing.s2r import S2R, correct, correction_between, extrapolation, inputs

@@ -24,7 +24,7 @@ from jax import Array
 from scipy.linalg import cho_solve, cholesky
 
 from mjx_softarm.mechanics.kinematics import Frames
-from mjx_softarm.mechanics.statics import ArmParams
+from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION
 
 LENGTHS = (2.0, 3.0, 4.5, 7.0)  # of states; see `sections`

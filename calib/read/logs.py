@@ -21,7 +21,7 @@ from calib.read.table_checks import PLAUSIBLE, clean, implausible, quantity
 from mjx_softarm.logs.checks import Finding
 from mjx_softarm.logs.files import read_matrix, refuse
 from mjx_softarm.logs.schema import UNITS, Column, Log, log_columns, write_log
-from mjx_softarm.sensing.sensors import SENSORS, Sensor
+from mjx_softarm.sensing.sensors import SENSORS
 from mjx_softarm.spec import ArmSpec
 
 _HELP = """\
@@ -111,7 +111,7 @@ def template(path: str | Path) -> str:
         source=str(path),
         row=np.arange(10) + 2,
         time_s=np.arange(10) / spec.control.rate_hz,
-        readings=np.round(Sensor.from_spec(spec).readings(length_m)),
+        readings=np.round(spec.spring_sensor.readings(length_m)),
         pressure_kpa=np.round(5.0 * np.sin(phase + 1.0), 2),
         tip_m=np.round(tip_m, 5),
         tip_quaternion=np.stack([np.cos(half), np.sin(half), 0.0 * half, 0.0 * half], axis=1).round(6),

@@ -11,7 +11,7 @@ from calib.errors import FitError
 from mjx_softarm.logs.rest import NEEDED, holds, last_second, moves
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.sensing.pose import rotation_from_quaternion
-from mjx_softarm.sensing.sensors import Sensor, SensorFault
+from mjx_softarm.sensing.sensors import SensorFault
 from mjx_softarm.spec import ArmSpec
 
 
@@ -94,7 +94,7 @@ def spring_lengths(log: Log, spec: ArmSpec) -> np.ndarray:
     readings = log.readings_of(spec.sensor)
     if readings is None:
         return np.full((len(log), spec.n_chambers), np.nan) if log.spring_m is None else log.spring_m
-    reading = Sensor.from_spec(spec).lengths(readings)
+    reading = spec.spring_sensor.lengths(readings)
     return np.where(reading.fault == SensorFault.OK, reading.length_m, np.nan)
 
 

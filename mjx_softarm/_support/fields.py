@@ -10,7 +10,6 @@ from typing import Any
 
 from mjx_softarm._support.errors import InputError
 
-N_CHAMBERS_PER_SECTION = 3
 PerChamber = float | tuple[float, ...]
 MAX_COUNT = 100  # of sections, and of links in each; beyond it arrays of the mechanics do not fit a memory
 FLOAT32_MIN, FLOAT32_MAX = 1.1754944e-38, 3.4028235e38  # sizes of a normal float32, for the simulation

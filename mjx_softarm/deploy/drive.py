@@ -17,7 +17,6 @@ from mjx_softarm.deploy.arm_io import ArmIO
 from mjx_softarm.deploy.controller import WINDOW_S
 from mjx_softarm.deploy.faults import LOST_TICKS, SETTLE_TIMEOUT_S, read_lengths, still
 from mjx_softarm.deploy.link import VENT_KPA_PER_S, ArmFault, Link
-from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.spec import ArmSpec
 
 RAMP_M_PER_S = 0.03  # of the reference that has furthest to go
@@ -77,7 +76,7 @@ class Drive:
 
     def __init__(self, arm: ArmIO, spec: ArmSpec, on_tick: Callable[[dict], None] = lambda row: None):
         self.on_tick = on_tick
-        self.sensor, self.gains = Sensor.from_spec(spec), Gains.from_spec(spec)
+        self.sensor, self.gains = spec.spring_sensor, Gains.from_spec(spec)
         self.dt_s = 1.0 / spec.control.rate_hz
         self.window = max(2, round(WINDOW_S * spec.control.rate_hz))
         self.link = Link(arm, spec.n_chambers, self.dt_s)

@@ -7,8 +7,8 @@ from jax import Array
 
 from mjx_softarm.mechanics.dynamics import Path
 from mjx_softarm.mechanics.kinematics import chain_kinematics
+from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.pipe import CrossPipe, body_clearance
-from mjx_softarm.mechanics.statics import ArmParams
 from mjx_softarm.sensing.s2r import S2R, carry_body
 from mjx_softarm.spec import ArmSpec
 

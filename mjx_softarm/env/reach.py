@@ -23,8 +23,8 @@ from mjx_softarm.mdp.actions import ActionMap
 from mjx_softarm.mechanics.dynamics import Motion, MotionResult, Moved, MovingArm, advance
 from mjx_softarm.mechanics.kinematics import chain_kinematics, mjx_kinematics
 from mjx_softarm.mechanics.mjcf import build_model
+from mjx_softarm.mechanics.params import PAYLOAD, ArmParams
 from mjx_softarm.mechanics.settle import Settled, SettleResult, settle
-from mjx_softarm.mechanics.statics import PAYLOAD, ArmParams
 from mjx_softarm.mechanics.workspace import Pool, sample_evenly, sample_workspace
 from mjx_softarm.sensing.pose import pose_from_frame
 from mjx_softarm.sensing.s2r import S2R, correct

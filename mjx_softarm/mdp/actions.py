@@ -30,7 +30,7 @@ class ActionMap(NamedTuple):
     @classmethod
     def from_spec(cls, spec: ArmSpec) -> ActionMap:
         """Return the map of an arm, in float64."""
-        sensor = Sensor.from_spec(spec)
+        sensor = spec.spring_sensor
         limits_m = spec.springs.length_min_m, spec.springs.length_max_m
         return cls(sensor, *(sensor.readings(np.full(spec.n_chambers, limit_m)) for limit_m in limits_m))
 

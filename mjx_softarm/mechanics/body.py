@@ -65,7 +65,7 @@ class Copies(NamedTuple):
         return np.stack([np.ones_like(self.pitch_m)] * 2 + [self.pitch_m], axis=-1)
 
 
-class Shape(NamedTuple):
+class ArmShape(NamedTuple):
     """Places of all parts. Bellows and springs are numbered as in the model, each from its upper end."""
 
     rings: Copies  # links_per_section to a section, below the base's own
@@ -73,7 +73,7 @@ class Shape(NamedTuple):
     coils: Copies  # COILS to a spring
 
 
-def shape(spec: ArmSpec, spring_m: np.ndarray, tip: np.ndarray) -> Shape:
+def shape(spec: ArmSpec, spring_m: np.ndarray, tip: np.ndarray) -> ArmShape:
     """Return the shape of an arm with springs (n,) [m] and its tip at a pose (6,) [mm, deg]."""
     geometry, directions = spec.geometry, hole_directions(spec)
     n_rings = spec.structure.links_per_section
@@ -85,7 +85,7 @@ def shape(spec: ArmSpec, spring_m: np.ndarray, tip: np.ndarray) -> Shape:
         for rows in np.split(np.arange(len(at)), [n_rings, n_rings + FOLDS])
     )
     centres = rings.position_m.reshape(-1, 3)
-    return Shape(
+    return ArmShape(
         Copies(centres, quaternion_from_rotation(rings.rotation.reshape(-1, 3, 3)), np.ones(len(centres))),
         _beside(folds, geometry.chamber_radius_m * directions),
         _beside(coils, geometry.spring_radius_m * directions),

@@ -37,8 +37,9 @@ from mjx_softarm import control, pneumatics
 from mjx_softarm._support.mjx import mjx
 from mjx_softarm._support.small_matrices import block_diagonal, products, solve
 from mjx_softarm.mechanics.kinematics import Frames, Kinematics
+from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.result import Result
-from mjx_softarm.mechanics.statics import ArmParams, Tendons, all_tendons, statics_of
+from mjx_softarm.mechanics.statics import Tendons, all_tendons, statics_of
 
 N_PER_KPA_M2 = 1e3
 CREEP_M_PER_S = 0.005  # rate of a chamber's length below which its dry friction fades

@@ -41,8 +41,8 @@ class EquilibriumTangents(NamedTuple):
     tip_rotation: Array  # (3, 3)
 
 
-class Response(NamedTuple):
-    """Response of joints and springs to the chambers' pressures, at the balance of forces."""
+class PressureResponse(NamedTuple):
+    """PressureResponse of joints and springs to the chambers' pressures, at the balance of forces."""
 
     dq_dp: Array  # (nv, n_chambers) [m/kPa, rad/kPa], K
     dspring_dp: Array  # (n_chambers, n_chambers) [m/kPa], S K
@@ -56,7 +56,7 @@ class Equilibrium(NamedTuple):
     at_limit: Array  # (n_chambers,) bool, the active set
     frames: Frames
     statics: Statics
-    response: Response
+    response: PressureResponse
 
 
 def equilibrium_tangents(

@@ -12,7 +12,7 @@ Many arms at once come last in every shape, (..., *arms), where one instruction 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,26 +21,10 @@ from jax import Array
 
 from mjx_softarm._support.mjx import mjx
 from mjx_softarm._support.small_matrices import product, products
+from mjx_softarm.mechanics.params import LEVEL, ArmParams, Mount
 from mjx_softarm.sensing.pose import rotation_from_quaternion
 
-if TYPE_CHECKING:
-    from mjx_softarm.mechanics.statics import ArmParams
-
 DOFS_PER_LINK = 3
-
-
-class Mount(NamedTuple):
-    """Where the base hangs in the base frame, and where the tip sits on the last plate."""
-
-    base_position_m: Array | np.ndarray  # (3,)
-    base_rotation: Array | np.ndarray  # (3, 3)
-    tip_offset_m: Array | np.ndarray  # (3,) in the axes of the last plate
-    tip_rotation: Array | np.ndarray  # (3, 3)
-
-
-LEVEL = Mount(
-    np.zeros(3, np.float32), np.eye(3, dtype=np.float32), np.zeros(3, np.float32), np.eye(3, dtype=np.float32)
-)
 
 
 class Frames(NamedTuple):

@@ -13,7 +13,8 @@ import mujoco
 import numpy as np
 
 from mjx_softarm.mechanics.body import SPRING_WIDTH_M, gripper_boxes, payload_radius_m, ring_radius_m
-from mjx_softarm.mechanics.statics import GRAVITY_M_S2, ArmParams
+from mjx_softarm.mechanics.params import ArmParams
+from mjx_softarm.mechanics.statics import GRAVITY_M_S2
 from mjx_softarm.sensing.pose import quaternion_from_rotation
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
 

@@ -24,10 +24,11 @@ from jax import Array
 from jax.custom_derivatives import zero_from_primal
 
 from mjx_softarm._support.small_matrices import eliminate, identity, products
-from mjx_softarm.mechanics.implicit import Equilibrium, Response, equilibrium_tangents
+from mjx_softarm.mechanics.implicit import Equilibrium, PressureResponse, equilibrium_tangents
 from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK, Kinematics, chain_frames
+from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.result import Result
-from mjx_softarm.mechanics.statics import ArmParams, statics
+from mjx_softarm.mechanics.statics import statics
 
 MAX_ITERATIONS = 12
 ACTIVE_SET_GAIN_KPA_PER_M = 1000.0
@@ -74,7 +75,7 @@ class _Iterate(NamedTuple):
     q: Array  # (nv, *arms)
     pressure: Array  # (n_chambers, *arms) [kPa]
     at_limit: Array  # (n_chambers, *arms) bool, the active set of the last step
-    response: Response  # before the last step
+    response: PressureResponse  # before the last step
     n_small: Array  # (*arms,) int, small steps without a change of the active set, since the last other one
     stiffening: Array  # (*arms,) joint stiffness added, in parts of it, where the energy is not convex
     iteration: Array  # (*arms,) int
@@ -186,7 +187,7 @@ def _solve(
         q=jnp.zeros((nv, *arms), dtype),
         pressure=jnp.clip(none, params.pressure_min_kpa, params.pressure_max_kpa),
         at_limit=none.astype(bool),
-        response=Response(
+        response=PressureResponse(
             jnp.zeros((nv, n_chambers, *arms), dtype), jnp.zeros((n_chambers, n_chambers, *arms), dtype)
         ),
         n_small=jnp.zeros(arms, int),
@@ -251,7 +252,7 @@ def _newton_step(it: _Iterate, kinematics: Kinematics, params: ArmParams, refere
         q=jnp.where(convex, it.q + scale * dq, it.q),
         pressure=jnp.where(convex, it.pressure + scale * dp, it.pressure),
         at_limit=at_limit,
-        response=Response(dq_dp.reshape(it.response.dq_dp.shape), dspring_dp),
+        response=PressureResponse(dq_dp.reshape(it.response.dq_dp.shape), dspring_dp),
         n_small=jnp.where(small, it.n_small + 1, 0),
         stiffening=jnp.where(convex, 0.0, 4.0 * it.stiffening + 4.0),
         iteration=it.iteration + 1,

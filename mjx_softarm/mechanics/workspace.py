@@ -15,8 +15,8 @@ from jax import Array
 from mjx_softarm._support import xla
 from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.mechanics.kinematics import chain_kinematics
+from mjx_softarm.mechanics.params import PAYLOAD, ArmParams
 from mjx_softarm.mechanics.settle import Settled, settle_pressures
-from mjx_softarm.mechanics.statics import PAYLOAD, ArmParams
 from mjx_softarm.sensing.pose import pose_from_frame
 from mjx_softarm.spec import ArmSpec, SpecError
 

@@ -20,7 +20,6 @@ from typing import NamedTuple
 import numpy as np
 
 from mjx_softarm._support.archive import Entries
-from mjx_softarm._support.fields import N_CHAMBERS_PER_SECTION
 from mjx_softarm._support.mlp import Layer, mlp
 from mjx_softarm._support.xp import Array, array_namespace
 from mjx_softarm.sensing.pose import (
@@ -29,6 +28,7 @@ from mjx_softarm.sensing.pose import (
     rotation_from_quaternion,
     share_of_turn,
 )
+from mjx_softarm.sensing.sensors import N_CHAMBERS_PER_SECTION
 
 N_CHANGES = 6  # of a section's end: position [m], Gibbs vector (axis times the tangent of half the angle)
 _SMALL_BEND = 1e-8  # square [rad^2] below which a section counts as straight

@@ -18,16 +18,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from types import MappingProxyType
-from typing import TYPE_CHECKING, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
 from mjx_softarm._support.fields import PerChamber, anything, not_negative, positive, rule_of
 from mjx_softarm._support.xp import Array, array_namespace
 
-if TYPE_CHECKING:
-    from mjx_softarm.spec import ArmSpec
-
+N_CHAMBERS_PER_SECTION = 3  # each chamber has one spring beside it
 MU_0_H_PER_M = 1.26e-6  # the paper's value of the vacuum permeability; beta absorbs the last digit
 
 
@@ -53,7 +51,7 @@ class Reading(NamedTuple):
 class Sensor:
     """One kind of length sensor, calibrated for each of n springs.
 
-    In a specification, beta and delta are one number or one per chamber; `from_spec` spreads them to arrays
+    In a specification, beta and delta are one number or one per chamber; `per_spring` spreads them to arrays
     (n,). NumPy and JAX take it alike; `mjx_softarm.env` registers it as a pytree whose leaves are the fields.
     """
 
@@ -69,15 +67,11 @@ class Sensor:
     beta: PerChamber | Array = positive(per="chambers")
     delta_m: PerChamber | Array = anything(per="chambers")
 
-    @staticmethod
-    def from_spec(spec: ArmSpec) -> Sensor:
-        """Return the specification's sensor with an array (n,) for each field that may be per chamber.
-
-        The arrays are float64; JAX narrows them where they meet its own.
-        """
-        names = [item.name for item in dataclasses.fields(spec.sensor) if rule_of(item).per]
-        arrays = {name: np.array(spec.per_chamber(getattr(spec.sensor, name))) for name in names}
-        return dataclasses.replace(spec.sensor, **arrays)
+    def per_spring(self, n: int) -> Sensor:
+        """Return the sensor with an array (n,), float64, for each field that has a number per spring."""
+        names = [item.name for item in dataclasses.fields(self) if rule_of(item).per]
+        arrays = {name: np.full(n, getattr(self, name), float) for name in names}
+        return dataclasses.replace(self, **arrays)
 
     @property
     def unit(self) -> str:

@@ -121,7 +121,7 @@ def draw_parts(seed: int, spec: ArmSpec, build: Build) -> Parts:
     tilt_rad = np.radians(off(std.base_tilt_deg, 3)) * [1.0, 1.0, 0.0]  # about z: the first section's twist
     return Parts(
         spec=perturbed,
-        sensor=dataclasses.replace(Sensor.from_spec(spec), beta=beta, delta_m=delta_m),
+        sensor=dataclasses.replace(spec.spring_sensor, beta=beta, delta_m=delta_m),
         hole_m=hole_m,
         twist_rad=np.radians(off(std.section_twist_deg, n_sections)),
         backbone=1.0 + off(std.backbone_stiffness, n_sections),

@@ -215,7 +215,7 @@ def draw_rod(rng: np.random.Generator, spec: ArmSpec, std: RodTolerances, up: np
 
 def _sensor(rng: np.random.Generator, spec: ArmSpec, std: RodTolerances) -> Sensor:
     """Draw the sensors, with the springs' own beta and delta."""
-    sensor = Sensor.from_spec(spec)
+    sensor = spec.spring_sensor
     beta = sensor.beta * (1.0 + _off(rng, std.spring_beta, spec.n_chambers))
     delta_m = sensor.delta_m + _off(rng, std.spring_delta_m, spec.n_chambers)
     return dataclasses.replace(sensor, beta=beta, delta_m=delta_m)

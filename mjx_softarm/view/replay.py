@@ -15,7 +15,6 @@ import viser
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.logs.checks import late_rows
 from mjx_softarm.logs.files import read_matrix
-from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.spec import ArmSpec
 from mjx_softarm.view.look import Limits, Look, looks
 from mjx_softarm.view.panel import Panel
@@ -43,7 +42,7 @@ class Track:
         if not len(log):
             raise InputError(f"{path}: got no rows, expected some")
         self.name, self._time_s = path.name, log.time_s - log.time_s[0]
-        self._look, self.end_s = looks(log, Sensor.from_spec(spec)), float(self._time_s[-1])
+        self._look, self.end_s = looks(log, spec.spring_sensor), float(self._time_s[-1])
 
     def at(self, time_s: float) -> Look:
         """Return the last look up to a time."""

@@ -67,7 +67,7 @@ from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.twin.arm import Twin
 data = ArmSpec.default().to_dict() | tomllib.load(open("sensor.toml", "rb"))
 spec = ArmSpec.from_dict(data)
-sensor, twin = Sensor.from_spec(spec), Twin(0, spec)
+sensor, twin = spec.spring_sensor, Twin(0, spec)
 readings = twin.read_sensors()
 length_m, fault = sensor.lengths(readings)
 actions = ActionMap.from_spec(spec)

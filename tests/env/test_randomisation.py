@@ -12,7 +12,7 @@ from mjx_softarm.env import EnvConfig, Randomisation, ReachEnv
 from mjx_softarm.env.reach import PAYLOAD
 from mjx_softarm.env.state import motion_params
 from mjx_softarm.mechanics.dynamics import MotionParams
-from mjx_softarm.mechanics.statics import ArmParams
+from mjx_softarm.mechanics.params import ArmParams
 
 MM = 1e-3
 SPREAD = Randomisation(payload_max_kg=0.5, stiffness_spread=0.2, sensor_noise_mm=2.0)

@@ -21,8 +21,9 @@ from mjx_softarm.mechanics.dynamics import (
 )
 from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.mjcf import build_model, chamber_lengths, spring_lengths
+from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.settle import settle_pressures
-from mjx_softarm.mechanics.statics import ArmParams, all_tendons
+from mjx_softarm.mechanics.statics import all_tendons
 from mjx_softarm.twin.pneumatics import Pneumatics
 
 SPEC = ArmSpec.default()

@@ -19,8 +19,8 @@ from mjx_softarm._support import xla
 from mjx_softarm._support.mjx import mjx
 from mjx_softarm.mechanics.kinematics import chain_kinematics, mjx_kinematics
 from mjx_softarm.mechanics.mjcf import build_model, spring_lengths
+from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.settle import settle
-from mjx_softarm.mechanics.statics import ArmParams
 
 SPEC = ArmSpec.default()
 COARSE = SPEC.replace(structure={"links_per_section": 2})  # for MJX, which compiles for long with more

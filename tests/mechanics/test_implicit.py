@@ -12,8 +12,9 @@ from mjx_softarm._support import xla
 from mjx_softarm._support.mjx import mjx
 from mjx_softarm.mechanics.kinematics import chain_kinematics, mjx_kinematics
 from mjx_softarm.mechanics.mjcf import build_model
+from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.settle import settle, settle_pressures
-from mjx_softarm.mechanics.statics import ArmParams, statics
+from mjx_softarm.mechanics.statics import statics
 
 SPEC = ArmSpec.default()
 SHORT = SPEC.replace(structure={"n_sections": 2, "links_per_section": 2})

@@ -14,7 +14,7 @@ from mjx_softarm._support import xla
 from mjx_softarm._support.mjx import mjx
 from mjx_softarm.mechanics.kinematics import Frames, chain_frames, chain_kinematics, mjx_frames
 from mjx_softarm.mechanics.mjcf import build_model
-from mjx_softarm.mechanics.statics import ArmParams
+from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.workspace import settle_many
 
 STRUCTURES = [(3, 4), (2, 3), (1, 1)]

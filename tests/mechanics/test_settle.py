@@ -10,6 +10,7 @@ import pytest
 from mjx_softarm import ArmSpec
 from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.mjcf import build_model
+from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.settle import (
     MAX_ITERATIONS,
     RESIDUAL_TOLERANCE,
@@ -19,7 +20,6 @@ from mjx_softarm.mechanics.settle import (
     settle,
     settle_pressures,
 )
-from mjx_softarm.mechanics.statics import ArmParams
 
 SPEC = ArmSpec.default()
 LOW_KPA, HIGH_KPA = SPEC.chambers.pressure_min_kpa, SPEC.chambers.pressure_max_kpa

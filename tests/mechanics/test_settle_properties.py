@@ -8,8 +8,8 @@ from hypothesis.extra import numpy as npst
 
 from mjx_softarm import ArmSpec
 from mjx_softarm.mechanics.kinematics import chain_kinematics
+from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.settle import RESIDUAL_TOLERANCE, TRACKING_TOLERANCE_M, settle
-from mjx_softarm.mechanics.statics import ArmParams
 from tests.properties import few
 
 SPEC = ArmSpec.default()

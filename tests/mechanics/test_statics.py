@@ -13,8 +13,9 @@ from mjx_softarm import ArmSpec
 from mjx_softarm._support import xla
 from mjx_softarm.mechanics.kinematics import chain_frames
 from mjx_softarm.mechanics.mjcf import build_model
+from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.settle import RESIDUAL_TOLERANCE
-from mjx_softarm.mechanics.statics import ArmParams, statics
+from mjx_softarm.mechanics.statics import statics
 
 STRUCTURES = [(3, 4), (2, 3), (1, 1)]
 

@@ -17,14 +17,14 @@ from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.logs.checks import LogError
 from mjx_softarm.logs.schema import write_log
 from mjx_softarm.policy.file import load_policy, save_policy
-from mjx_softarm.sensing.sensors import DrawWire, Sensor, SensorFault
+from mjx_softarm.sensing.sensors import DrawWire, SensorFault
 from mjx_softarm.twin.arm import Twin
 from tests.linear_arm import GOALS, LinearArm, exact_plan, go, make_policy
 
 WIRE = {"kind": "draw_wire", "m_per_v": 0.2, "voltage_min_v": 0.05, "voltage_max_v": 4.95}
 SPEC = ArmSpec.default().replace(sensor=WIRE | {"beta": 1.0, "delta_m": 0.0})
 BETA, DELTA_M = np.linspace(0.94, 1.03, 9), np.linspace(-0.13, 0.02, 9)
-PLANTED = dataclasses.replace(Sensor.from_spec(SPEC), beta=BETA, delta_m=DELTA_M)
+PLANTED = dataclasses.replace(SPEC.spring_sensor, beta=BETA, delta_m=DELTA_M)
 
 
 class WireArm(LinearArm):
@@ -77,7 +77,7 @@ def test_recorded_voltages_calibrate_the_wires(tmp_path):
     write_log(tmp_path / "springs.csv", log)
     assert "voltage0 [V]" in (tmp_path / "springs.csv").read_text().splitlines()[0]
     log, _ = read_log(tmp_path / "springs.csv")
-    fit = fit_springs(log.readings_of(SPEC.sensor), log.spring_m, Sensor.from_spec(SPEC))
+    fit = fit_springs(log.readings_of(SPEC.sensor), log.spring_m, SPEC.spring_sensor)
     np.testing.assert_allclose(fit.beta, BETA, rtol=5e-3)
     np.testing.assert_allclose(fit.delta_m, DELTA_M, atol=1e-3)
     with pytest.raises(LogError, match="voltage0: got readings of voltage, expected frequency"):

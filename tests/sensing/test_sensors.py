@@ -43,7 +43,7 @@ def relative_error(got, expected):
 
 
 def test_default_sensor_at_the_free_length():
-    params = Sensor.from_spec(WIDE)
+    params = WIDE.spring_sensor
     # wire (200 - 2.45) / 0.93 = 212.4 mm; coil 3.774 uH; with 1 uH and 330 pF: 4.010 MHz
     np.testing.assert_allclose(params.readings(np.full(9, 0.200)), np.full(9, 4.010e6), rtol=1e-4)
 
@@ -55,13 +55,13 @@ def test_printed_formula_with_the_derivation_s_factor():
     numerator *= 1.26e-6 * sensor.coil_radius_m**2
     denominator = 1 - 4 * math.pi**2 * sensor.capacitance_f * sensor.compensation_h * f**2
     expected = numerator / denominator + np.array(sensor.delta_m)
-    np.testing.assert_allclose(Sensor.from_spec(spec).lengths(f).length_m, expected)
+    np.testing.assert_allclose(spec.spring_sensor.lengths(f).length_m, expected)
 
 
 @pytest.mark.parametrize("compensation_h", COMPENSATIONS_H)
 def test_float64_follows_the_equations_both_ways(compensation_h):
     spec = make_spec(compensation_h)
-    params = Sensor.from_spec(spec)
+    params = spec.spring_sensor
     frequency = frequency_by_the_book(LENGTHS_M, spec)
     assert relative_error(params.readings(LENGTHS_M), frequency) < 1e-14
     reading = params.lengths(frequency)
@@ -73,7 +73,7 @@ def test_float64_follows_the_equations_both_ways(compensation_h):
 @pytest.mark.parametrize("library", ["numpy", "jax"])
 def test_float32_keeps_its_precision(compensation_h, library):
     spec = make_spec(compensation_h)
-    params = narrow(Sensor.from_spec(spec))
+    params = narrow(spec.spring_sensor)
     batched = {"numpy": lambda f: f, "jax": lambda f: jax.jit(jax.vmap(f))}[library]
     to_frequency = batched(lambda x: params.readings(x))
     to_length = batched(lambda x: params.lengths(x).length_m)
@@ -102,7 +102,7 @@ BAD = {
 @pytest.mark.parametrize("value, fault", BAD.values(), ids=BAD.keys())
 @pytest.mark.filterwarnings("error")
 def test_a_bad_reading_is_reported_and_holds_its_fallback(library, value, fault):
-    params = Sensor.from_spec(make_spec())
+    params = make_spec().spring_sensor
     good = np.float32(params.readings(np.full(9, 0.180)))
     bad = good.copy()
     bad[4] = value
@@ -117,7 +117,7 @@ def test_a_bad_reading_is_reported_and_holds_its_fallback(library, value, fault)
 
 
 def test_a_calibration_without_positive_length_is_reported():
-    params = Sensor.from_spec(WIDE.replace(sensor={"delta_m": -0.05}))
+    params = WIDE.replace(sensor={"delta_m": -0.05}).spring_sensor
     reading = params.lengths(np.full(9, 1.0e6))
     assert set(reading.fault) == {SensorFault.NO_LENGTH} and not reading.length_m.any()
     assert "beta = 0.93 and delta = -0.05 m" in params.describe_faults(np.full(9, 1.0e6), reading.fault)
@@ -126,7 +126,7 @@ def test_a_calibration_without_positive_length_is_reported():
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("compensation_h, length_m", [(1e-6, 0.0), (1e-6, -0.9), (-1e-5, 0.2)])
 def test_a_length_no_coil_has_reads_nan_and_is_reported(compensation_h, length_m):
-    params = dataclasses.replace(Sensor.from_spec(WIDE), compensation_h=compensation_h, delta_m=np.zeros(9))
+    params = dataclasses.replace(WIDE.spring_sensor, compensation_h=compensation_h, delta_m=np.zeros(9))
     frequency = params.readings(np.full(9, length_m))
     assert np.isnan(frequency).all()
     assert set(params.lengths(frequency).fault) == {SensorFault.NOT_FINITE}
@@ -144,7 +144,7 @@ def test_a_reading_exactly_at_the_compensation_s_resonance_divides_by_nothing():
 
 
 def test_a_bad_reading_leaks_no_gradient():
-    params = Sensor.from_spec(make_spec())
+    params = make_spec().spring_sensor
     values = np.float32([4.0e6, math.nan, math.inf, -math.inf, 0.0, -4.0e6, 9.9e4, 2.0e7, 9.0e6])
 
     def total(frequency, delta_m, fallback_m):
@@ -165,7 +165,7 @@ def test_a_bad_reading_leaks_no_gradient():
 
 
 def test_gradient_of_an_impossible_length_is_finite():
-    params = Sensor.from_spec(make_spec())
+    params = make_spec().spring_sensor
     lengths = jnp.array([0.2, -0.1, -0.2, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1])
     slope = jax.grad(lambda x: jnp.nansum(params.readings(x)))(lengths)
     assert np.isfinite(slope).all()
@@ -173,6 +173,6 @@ def test_gradient_of_an_impossible_length_is_finite():
 
 
 def test_faults_are_described_with_spring_reading_and_expectation():
-    params, frequency = Sensor.from_spec(WIDE), np.where(np.arange(9) == 6, 9.0e6, 4.0e6)
+    params, frequency = WIDE.spring_sensor, np.where(np.arange(9) == 6, 9.0e6, 4.0e6)
     text = params.describe_faults(frequency, params.lengths(frequency).fault)
     assert text.startswith("spring6: got 9000000 Hz, expected below 8761191 Hz, where the compensation")

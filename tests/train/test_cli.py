@@ -17,7 +17,6 @@ from mjx_softarm.logs.schema import Log, write_log
 from mjx_softarm.mechanics import workspace
 from mjx_softarm.mechanics.workspace import sample_workspace
 from mjx_softarm.sensing.pose import frame_from_pose, quaternion_from_pose
-from mjx_softarm.sensing.sensors import Sensor
 from tests.train.small import SHORT, flags, new_job
 from train.__main__ import main
 from train.runs.checkpoint import Run, RunError, sole_trainer
@@ -191,7 +190,7 @@ def demonstrations(tmp_path_factory):
         source="demos",
         row=np.arange(6) + 2,
         time_s=np.arange(6.0),
-        readings=Sensor.from_spec(SHORT).readings(np.asarray(pool.spring_m, float)),
+        readings=SHORT.spring_sensor.readings(np.asarray(pool.spring_m, float)),
         tip_m=frame_from_pose(np.asarray(pool.pose, float))[0],
         tip_quaternion=quaternion_from_pose(np.asarray(pool.pose, float)),
         sequence=np.zeros(6),

@@ -10,7 +10,6 @@ from mjx_softarm.control import Gains, LawState, pressures
 from mjx_softarm.deploy.drivers.names import ArmError, open_arm
 from mjx_softarm.mechanics.mjcf import chamber_lengths, spring_lengths
 from mjx_softarm.mechanics.workspace import settle_many
-from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.twin import arm as twin
 from mjx_softarm.twin.arm import Twin
 from mjx_softarm.twin.instruments import EVALUATION_SESSION, S2R_SESSION
@@ -59,7 +58,7 @@ def test_ideal_twin_rests_where_settle_says(spec):
         assert expected.settled.all()
         for k, pressure in enumerate(PRESSURES_KPA):
             hold_pressures(arm, pressure, 12.0)
-            read_m = Sensor.from_spec(spec).lengths(arm.read_sensors()).length_m
+            read_m = spec.spring_sensor.lengths(arm.read_sensors()).length_m
             np.testing.assert_allclose(arm.motion_capture().tip_m, expected.tip_position_m[k], atol=2e-5)
             np.testing.assert_allclose(read_m, expected.spring_m[k], atol=2e-5)
             np.testing.assert_allclose(arm.pressures(), pressure, atol=1e-3)
@@ -159,7 +158,7 @@ def test_springs_have_their_own_calibration(spec, noiseless):
     """The true beta and delta give the spring's length; the nominal ones are millimetres off."""
     readings, true_m = noiseless.read_sensors(), spring_lengths(noiseless._data)
     calibrated = noiseless._parts.sensor.lengths(readings).length_m
-    nominal = Sensor.from_spec(spec).lengths(readings).length_m
+    nominal = spec.spring_sensor.lengths(readings).length_m
     np.testing.assert_allclose(calibrated, true_m, atol=3e-8)  # half a count is 1e-8 m
     assert np.abs(nominal - true_m).max() > 1e-3
 

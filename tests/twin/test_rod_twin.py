@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 
 from mjx_softarm.deploy.drivers.names import ArmError, open_arm
 from mjx_softarm.deploy.record import record
-from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.twin import rod_twin
 from mjx_softarm.twin.instruments import S2R_SESSION
 from mjx_softarm.twin.rod_twin import RodBuild, RodTwin
@@ -76,7 +75,7 @@ def test_seed_chooses_the_rod_and_session_the_noise(spec):
     assert (first != seen(8)).all()
     other_day = seen(7, session=S2R_SESSION)
     assert (first != other_day).all()
-    np.testing.assert_allclose(first[:9], other_day[:9], atol=10 * Sensor.from_spec(spec).noise)
+    np.testing.assert_allclose(first[:9], other_day[:9], atol=10 * spec.spring_sensor.noise)
 
 
 def test_it_is_recorded_as_any_arm(spec):

@@ -26,9 +26,9 @@ from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.xp import array_namespace
 from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.mechanics.kinematics import chain_kinematics
+from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.pipe import CrossPipe, body_points, clearance
 from mjx_softarm.mechanics.settle import RESIDUAL_TOLERANCE, settle_pressures
-from mjx_softarm.mechanics.statics import ArmParams
 from mjx_softarm.sensing.pose import frame_from_pose, pose_from_frame
 from mjx_softarm.sensing.s2r import S2R, carry_body, correct
 from mjx_softarm.spec import ArmSpec

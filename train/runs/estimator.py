@@ -20,7 +20,7 @@ from jax import Array
 
 from mjx_softarm._support import xla
 from mjx_softarm._support.mlp import Layer
-from mjx_softarm.mechanics.statics import ArmParams
+from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.workspace import (
     CANDIDATES_PER_POSE,
     HELD_OUT_SEED,

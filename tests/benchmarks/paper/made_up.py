@@ -16,7 +16,6 @@ from mjx_softarm.deploy.faults import Fault
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.policy.file import policy_from_actor
-from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.spec import ARM_FILE
 from train.demos.waypoints import task
 
@@ -143,7 +142,7 @@ def compared(n=6, specified_mm=20.0, calibrated_mm=2.0, read_mm=9.0, corrected_m
         chamber_pair_m=spring_m + off_m[..., 1:2],
         read_tip_m=plate_m[:, -1] + [0.0, 1e-3 * read_mm, 0.0],
         corrected_tip_m=plate_m[:, -1] + [0.0, 1e-3 * corrected_mm, 0.0],
-        reading=Sensor.from_spec(SPEC).readings(spring_m),
+        reading=SPEC.spring_sensor.readings(spring_m),
         ruler_m=spring_m,
     )
 

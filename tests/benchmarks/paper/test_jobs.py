@@ -14,7 +14,6 @@ from mjx_softarm._support import cli
 from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.policy.file import save_policy
 from mjx_softarm.policy.runtime import PolicyRunner
-from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.spec import ARM_FILE
 from mjx_softarm.twin.rod_twin import RodTwin
 from tests.benchmarks.paper.made_up import SPEC, TINY, N, goals_of, make_policy, pipe_trial
@@ -143,14 +142,14 @@ def test_without_s2r_the_nominal_policy_plans_and_the_springs_are_calibrated(tmp
         (tmp_path / reach_run(twin, 0)).mkdir()
         save_policy(tmp_path / reach_run(twin, 0) / "policy.npz", make_policy(make_arm_model, spec))
     chosen = jobs.controller_of(tmp_path, Trial("without", 0, 0))
-    assert np.array_equal(chosen.policy.sensor.beta, Sensor.from_spec(calibrated).beta)
+    assert np.array_equal(chosen.policy.sensor.beta, calibrated.spring_sensor.beta)
     assert chosen.policy.spec == SPEC
     pose, goal = circle_poses(SPEC, 2).astype(float)
     expected = PolicyRunner(make_policy(make_arm_model)).act(pose, goal).length_m
     assert np.allclose(chosen.plan(pose, goal, np.full(N, 0.2), None), expected)
     specified = jobs.controller_of(tmp_path, Trial("specified", 0, 0))
     assert np.allclose(specified.plan(pose, goal, np.full(N, 0.2), None), expected)
-    assert np.array_equal(specified.policy.sensor.beta, Sensor.from_spec(SPEC).beta)
+    assert np.array_equal(specified.policy.sensor.beta, SPEC.spring_sensor.beta)
     with_s2r = jobs.controller_of(tmp_path, Trial("with", 0, 0)).plan(pose, goal, 0, None)
     assert not np.allclose(with_s2r, expected)
 

@@ -8,7 +8,7 @@ from calib.fit.markers import N_POSES, chamber_lengths, fit_curve, marker_limits
 from calib.read.static_poses import StaticPoses
 from mjx_softarm import ArmSpec
 from mjx_softarm.mechanics.mjcf import build_model
-from mjx_softarm.mechanics.statics import ArmParams
+from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.workspace import settle_many
 
 SPEC = ArmSpec.default().replace(structure={"links_per_section": 6})  # markers are at thirds of a section

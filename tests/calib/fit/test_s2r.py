@@ -12,8 +12,8 @@ from calib.fit.blocks import held_out_blocks
 from calib.fit.network import NetworkConfig, fit_network
 from calib.fit.s2r import fit_s2r, pose_errors, simulate_poses
 from mjx_softarm.mechanics.kinematics import chain_kinematics
+from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.settle import settle
-from mjx_softarm.mechanics.statics import ArmParams
 from mjx_softarm.mechanics.workspace import sample_workspace
 from mjx_softarm.sensing.pose import frame_from_pose, pose_from_frame
 from mjx_softarm.sensing.s2r import apply_correction, correct, correction, extrapolation

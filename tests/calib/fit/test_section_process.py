@@ -7,7 +7,7 @@ import numpy as np
 from calib.fit import section_process
 from calib.fit.section_process import NOISES, Sections, fit_process, predict, sections
 from mjx_softarm.mechanics.kinematics import chain_kinematics
-from mjx_softarm.mechanics.statics import ArmParams
+from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.sensing.pose import frame_from_pose, pose_from_frame
 from mjx_softarm.sensing.s2r import apply_correction
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from calib.fit.sensors import fit_springs
-from mjx_softarm.sensing.sensors import Sensor
 
 N_ROWS = 2_000
 
@@ -15,7 +14,7 @@ def springs(spec, seed=0):
     """Planted calibration, readings without noise, true lengths, and lengths with 1 % of noise."""
     rng = np.random.default_rng(seed)
     planted = dataclasses.replace(
-        Sensor.from_spec(spec), beta=rng.uniform(0.85, 1.0, 9), delta_m=rng.uniform(-5e-3, 5e-3, 9)
+        spec.spring_sensor, beta=rng.uniform(0.85, 1.0, 9), delta_m=rng.uniform(-5e-3, 5e-3, 9)
     )
     length = rng.uniform(0.1, 0.26, (N_ROWS, 9))
     noisy = length * (1 + 0.01 * rng.standard_normal(length.shape))

@@ -9,7 +9,6 @@ from calib.read.static_poses import find_static_poses, nearest_rotation
 from mjx_softarm import ArmSpec
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.sensing.pose import rotation_from_quaternion
-from mjx_softarm.sensing.sensors import Sensor
 
 SPEC = ArmSpec.default()
 
@@ -94,7 +93,7 @@ def test_rows_that_are_not_finite_are_left_out_and_counted():
 
 def test_springs_are_read_from_frequencies_by_the_sensors_of_the_spec():
     length_m = np.full((750, 9), 0.18)
-    hz = Sensor.from_spec(SPEC).readings(length_m)
+    hz = SPEC.spring_sensor.readings(length_m)
     poses, _ = find_static_poses([steps(readings=hz)], SPEC)
     np.testing.assert_allclose(poses.spring_m, 0.18, rtol=1e-6)
     assert np.isnan(find_static_poses([steps()], SPEC)[0].spring_m).all()

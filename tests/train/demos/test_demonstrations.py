@@ -9,7 +9,6 @@ from mjx_softarm import ArmSpec
 from mjx_softarm.logs.checks import LogError
 from mjx_softarm.logs.schema import Log, log_table, write_log
 from mjx_softarm.sensing.pose import frame_from_pose
-from mjx_softarm.sensing.sensors import Sensor
 from train.demos.demonstrations import NEEDED, load_demonstrations, read_demonstrations
 
 SPEC = ArmSpec.default()
@@ -21,7 +20,7 @@ def demonstration_log(**changes):
     spring_m = rng.uniform(0.12, 0.22, (6, 9))
     values = {
         "time_s": np.array([0.0, 3.0, 8.0, 2.0, 9.0, 9.5]),  # the fourth row was another recording
-        "readings": Sensor.from_spec(SPEC).readings(spring_m),
+        "readings": SPEC.spring_sensor.readings(spring_m),
         "spring_m": spring_m,
         "tip_m": rng.uniform([-0.1, -0.1, -0.6], [0.1, 0.1, -0.5], (6, 3)),
         "tip_quaternion": np.tile([np.cos(0.1), 0.0, np.sin(0.1), 0.0], (6, 1)),
@@ -60,7 +59,7 @@ def test_rows_are_positions_and_the_actions_that_lead_there(file, env, name):
 
 
 LIMITS_M = np.array([[SPEC.springs.length_min_m], [SPEC.springs.length_max_m]])
-LOW, HIGH = Sensor.from_spec(SPEC).readings(LIMITS_M)[:, 0]
+LOW, HIGH = SPEC.spring_sensor.readings(LIMITS_M)[:, 0]
 MISTAKES = {
     "NaN": ("readings", (4, 3, np.nan), "line 6: frequency3: got nan, expected a number"),
     "no orientation": ("tip_quaternion", (1, 2, np.nan), "line 3: tip_qy: got nan, expected a number"),

@@ -10,11 +10,10 @@ import pytest
 from mjx_softarm import ArmSpec
 from mjx_softarm.deploy.arm_io import Capture
 from mjx_softarm.mechanics.kinematics import chain_kinematics
+from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.settle import settle_pressures
-from mjx_softarm.mechanics.statics import ArmParams
 from mjx_softarm.sensing.pose import pose_from_frame, quaternion_from_pose
 from mjx_softarm.sensing.s2r import S2R_FILE, save_s2r
-from mjx_softarm.sensing.sensors import Sensor
 from train.__main__ import main
 from train.demos.demonstrations import read_demonstrations
 from train.demos.expert import Posture
@@ -23,7 +22,7 @@ from train.demos.teleop import CLOSE_M, Teleoperation
 from train.demos.waypoints import task
 
 SPEC = ArmSpec.default()
-SENSOR = Sensor.from_spec(SPEC)
+SENSOR = SPEC.spring_sensor
 DT_S, LAG = 1.0 / SPEC.control.rate_hz, 0.15  # of the way to the commanded pressure, per tick
 
 

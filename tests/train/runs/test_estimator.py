@@ -12,8 +12,8 @@ from mjx_softarm.control import TOLERANCE_M, Gains, saturated
 from mjx_softarm.deploy.faults import lost_chambers
 from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.mjcf import build_model, spring_lengths
+from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.settle import settle
-from mjx_softarm.mechanics.statics import ArmParams
 from mjx_softarm.mechanics.workspace import HELD_OUT_SEED, sample_workspace
 from mjx_softarm.sensing.estimator import estimate_frame, expected_springs
 from mjx_softarm.sensing.load import estimate_load

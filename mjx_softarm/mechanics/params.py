@@ -1,0 +1,106 @@
+"""Numbers of an arm as arrays, from its specification."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from mjx_softarm.mechanics.body import hole_directions
+from mjx_softarm.sensing.pose import rotation_about
+from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
+
+PAYLOAD = 1  # index in ArmParams.tool_mass_kg
+
+
+class Mount(NamedTuple):
+    """Where the base hangs in the base frame, and where the tip sits on the last plate."""
+
+    base_position_m: Array | np.ndarray  # (3,)
+    base_rotation: Array | np.ndarray  # (3, 3)
+    tip_offset_m: Array | np.ndarray  # (3,) in the axes of the last plate
+    tip_rotation: Array | np.ndarray  # (3, 3)
+
+
+LEVEL = Mount(
+    np.zeros(3, np.float32), np.eye(3, dtype=np.float32), np.zeros(3, np.float32), np.eye(3, dtype=np.float32)
+)
+
+
+class ArmParams(NamedTuple):
+    """Numbers of an arm as arrays, so that a new value needs no new compilation.
+
+    Chambers and springs are ordered section by section, counter-clockwise within a section.
+    """
+
+    link_length_m: Array  # ()
+    chamber_site_m: Array  # (n_chambers, 2) holes of the chambers in their rings, x and y
+    spring_site_m: Array  # (n_chambers, 2)
+    link_mass_kg: Array  # (n_links,) at the hinges' anchor
+    tool_mass_kg: Array  # (2,) gripper and payload, below the last plate
+    tool_offset_m: Array  # (2,)
+    joint_stiffness: Array  # (3 * n_links,) [N/m, N m/rad, N m/rad]
+    chamber_stiffness: Array  # (n_chambers,) [N/m]
+    chamber_rest_m: Array  # (n_chambers,)
+    area: Array  # (n_chambers,) [N/kPa]
+    area_slope: Array  # (n_chambers,) [N/kPa/m]
+    spring_stiffness: Array  # (n_chambers,) [N/m]
+    spring_rest_m: Array  # (n_chambers,)
+    pressure_min_kpa: Array  # (n_chambers,)
+    pressure_max_kpa: Array  # (n_chambers,)
+    mount: Mount
+
+    @property
+    def section_length_m(self) -> Array:
+        return self.link_length_m * (self.link_mass_kg.shape[0] // self.n_sections)
+
+    @property
+    def n_sections(self) -> int:
+        return self.area.shape[0] // N_CHAMBERS_PER_SECTION
+
+    @property
+    def pinned(self) -> Array:
+        """(n_chambers,) bool, chambers whose limits leave one pressure."""
+        return self.pressure_min_kpa == self.pressure_max_kpa
+
+    def without_pressure_limits(self) -> ArmParams:
+        """Return the arm with limits that no pressure meets."""
+        limit = jnp.full_like(self.area, jnp.inf)
+        return self._replace(pressure_min_kpa=-limit, pressure_max_kpa=limit)
+
+    @classmethod
+    def from_spec(cls, spec: ArmSpec, dtype: np.typing.DTypeLike = np.float32) -> ArmParams:
+        """Return the numbers of `spec`, in SI units but for the pressures [kPa]."""
+        n, per_section = spec.n_chambers, spec.structure.links_per_section
+        on_circle = hole_directions(spec)
+        axial = spec.backbone.axial_stiffness_n_per_m * per_section
+        bending = spec.backbone.bending_stiffness_nm_per_rad * per_section
+        values: dict[str, Any] = {
+            "link_length_m": spec.link_length_m,
+            "chamber_site_m": spec.geometry.chamber_radius_m * on_circle,
+            "spring_site_m": spec.geometry.spring_radius_m * on_circle,
+            "link_mass_kg": np.full(spec.n_links, spec.mass.arm_kg / spec.n_links),
+            "tool_mass_kg": [spec.mass.gripper_kg, spec.mass.payload_kg],
+            "tool_offset_m": [spec.mass.gripper_length_m / 2, spec.mass.gripper_length_m],
+            "joint_stiffness": np.tile([axial, bending, bending], spec.n_links),
+            "chamber_stiffness": spec.per_chamber(spec.chambers.stiffness_n_per_m),
+            "chamber_rest_m": spec.geometry.section_length_m
+            + np.array(spec.per_chamber(spec.chambers.length_offset_m)),
+            "area": 1e3 * np.array(spec.per_chamber(spec.chambers.area_m2)),
+            "area_slope": 1e3 * np.array(spec.per_chamber(spec.chambers.area_slope_m)),
+            "spring_stiffness": np.full(n, spec.springs.stiffness_n_per_m),
+            "spring_rest_m": np.full(n, spec.springs.rest_length_m),
+            "pressure_min_kpa": np.full(n, spec.chambers.pressure_min_kpa),
+            "pressure_max_kpa": np.full(n, spec.chambers.pressure_max_kpa),
+        }
+        numbers = {name: np.asarray(value, dtype) for name, value in values.items()}
+        return cls(**numbers, mount=_mount(spec, dtype))  # type: ignore
+
+
+def _mount(spec: ArmSpec, dtype: np.typing.DTypeLike) -> Mount:
+    mounting = spec.mounting
+    base, tip = (rotation_about(np.radians(turn)) for turn in (mounting.base_turn_deg, mounting.tip_turn_deg))
+    values = (mounting.base_offset_m, base, mounting.tip_offset_m, tip)
+    return Mount(*(np.asarray(value, dtype) for value in values))
