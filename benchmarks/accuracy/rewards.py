@@ -7,12 +7,8 @@ suits one reward may not suit the other: both are tried with the other settings 
 further kind has the gradient penalty on the discriminator's probability, as the paper prints it, in place
 of its logit.
 
-Nor does a person show positions exactly. With the settings of `pipe` both rewards also learn from
-demonstrations with a hand's noise and detours: another hand for each training seed, and as many more goals as
-there are detours. Goals and rows of the expert are then the hand's.
-
-All kinds are judged alike: success at the scripted expert's positions is looked at every `LOOK` env steps,
-and that at held-out positions, half-way between these, at the end.
+All kinds are judged alike: success at the shown positions is looked at every `LOOK` env steps, and that at
+held-out positions, half-way between these, at the end.
 """
 
 from __future__ import annotations
@@ -39,7 +35,6 @@ from train.agent.imitation import Imitation
 from train.config import ImitationConfig, override
 from train.demos.demonstrations import Demonstrations
 from train.demos.expert import Expert, ExpertError, Posture
-from train.demos.hand import by_hand
 from train.demos.waypoints import Waypoint, task
 from train.presets import IMITATION_PRESETS
 from train.runs.positions import PositionEvaluator
@@ -49,11 +44,9 @@ TASK = "pipe300"
 LOOK = 512  # env steps between two evaluations
 PRESETS = ("pipe", "hand-made")  # whose settings are tried
 LEARNED, HAND_MADE, PRINTED = "learned", "hand-made", "learned, penalty as printed"
-SCRIPTED, BY_HAND = "scripted", "by hand"  # who shows the positions
-KINDS = (  # reward, settings, who shows
-    *((reward, settings, SCRIPTED) for settings in PRESETS for reward in (LEARNED, HAND_MADE)),
-    (PRINTED, "pipe", SCRIPTED),
-    *((reward, "pipe", BY_HAND) for reward in (LEARNED, HAND_MADE)),
+KINDS = (  # reward, settings
+    *((reward, settings) for settings in PRESETS for reward in (LEARNED, HAND_MADE)),
+    (PRINTED, "pipe"),
 )
 
 
@@ -77,27 +70,22 @@ def measure(
     """
     spec = ArmSpec.default()
     shown, between = demonstrated(spec)
-    hands = {seed: shown_by_hand(spec, seed) for seed in seeds}
-    jobs: dict[tuple[str, ...], list[Job]] = {kind: [] for kind in KINDS}
-    for kind in KINDS:
-        reward, settings, shown_by = kind
-        config = config_of(reward, settings, steps, arms)
-        # Whatever is shown to all seeds is compiled once.
-        lessons = [(shown, seeds)] if shown_by == SCRIPTED else [(hands[seed], (seed,)) for seed in seeds]
-        for lesson, of_seeds in lessons:
-            name = f"{', '.join(kind)}, seeds {', '.join(map(str, of_seeds))}"
-            inputs = reward, config, spec, lesson, (shown.positions, between), of_seeds
-            jobs[kind].append((name, learn, inputs))
-    rows = in_parallel([job for of_kind in jobs.values() for job in of_kind])
+    jobs: list[Job] = [
+        (
+            ", ".join(kind),
+            learn,
+            (kind[0], config_of(*kind, steps, arms), spec, shown, (shown.positions, between), seeds),
+        )
+        for kind in KINDS
+    ]
+    rows = in_parallel(jobs)
     means, runs = [], []
-    for kind, of_kind in jobs.items():
-        told = dict(zip(("reward", "settings", "shown"), kind, strict=True))
-        found = [row for name, *_ in of_kind for row in rows[name]]
-        means.append(told | summary(found))
-        runs += [told | row for row in found]
-    n_by_hand = [len(hands[seed].positions) for seed in seeds]
+    for kind, (name, *_) in zip(KINDS, jobs, strict=True):
+        told = dict(zip(("reward", "settings"), kind, strict=True))
+        means.append(told | summary(rows[name]))
+        runs += [told | row for row in rows[name]]
     return {
-        "positions": {"shown": len(shown.positions), "shown by hand": n_by_hand, "held out": len(between)},
+        "positions": {"shown": len(shown.positions), "held out": len(between)},
         "targets": targets(runs),
         "means": means,
         "runs": runs,
@@ -133,12 +121,6 @@ def demonstrated(spec: ArmSpec) -> tuple[Demonstrations, np.ndarray]:
         except ExpertError:
             continue  # around a corner of the pipe
     return _demonstrations(found, spec), np.array(between, np.float32)
-
-
-def shown_by_hand(spec: ArmSpec, seed: int) -> Demonstrations:
-    """Return what a hand shows; the seed is that of its noise and detours."""
-    waypoints, pipe = task(TASK, spec)
-    return _demonstrations(by_hand(Expert(spec, pipe=pipe), waypoints, seed)[1], spec)
 
 
 def _demonstrations(found: Posture, spec: ArmSpec) -> Demonstrations:
@@ -197,15 +179,15 @@ def learn(
 
 
 def targets(runs: Sequence[dict[str, Any]]) -> list[dict[str, str]]:
-    """Return the target of each settings and demonstrations: fewer env steps with the learned reward."""
+    """Return the target of each settings: fewer env steps with the learned reward."""
     found = []
-    for kind in dict.fromkeys((run["settings"], run["shown"]) for run in runs):
+    for settings in dict.fromkeys(run["settings"] for run in runs):
         steps: dict[str, list[float]] = {LEARNED: [], HAND_MADE: [], PRINTED: []}
         for run in runs:
-            if (run["settings"], run["shown"]) == kind:
+            if run["settings"] == settings:
                 steps[run["reward"]].append(run["steps_to_success"] or np.inf)
         learned, hand_made = np.median(steps[LEARNED]), np.median(steps[HAND_MADE])
-        text = f"{', '.join(kind)}: {100 * SUCCESS:g} % success in fewer env steps with the learned reward"
+        text = f"{settings}: {100 * SUCCESS:g} % success in fewer env steps with the learned reward"
         told = [f"{n:,.0f}" if np.isfinite(n) else "never" for n in (learned, hand_made)]
         measured = "{} learned, {} hand-made, medians".format(*told)
         found.append(target(text, measured, bool(learned < hand_made)))

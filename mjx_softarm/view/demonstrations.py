@@ -18,7 +18,7 @@ from mjx_softarm.sensing.pose import pose_error, pose_from_quaternion, quaternio
 APART = np.repeat([1.0, 1.0], 3)  # [mm, deg] from the pose that was taken last, in any of them
 
 
-class Demonstrations:
+class TakenPoses:
     """Poses of one sequence, in the order in which they were taken."""
 
     def __init__(self, policy: Policy):

@@ -26,7 +26,7 @@ from mjx_softarm.logs.schema import Log
 from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.spec import ArmSpec
-from mjx_softarm.view.demonstrations import Demonstrations
+from mjx_softarm.view.demonstrations import TakenPoses
 from mjx_softarm.view.look import look_at
 
 READY_S = 60.0  # for the server to start
@@ -58,7 +58,7 @@ class PagePilot:
         self._tell, self._said = tell, deque(maxlen=N_LINES)
         self._armed, self._payload_kg, self._n_pages, self._lost = False, 0.0, 0, False
         self._doing, self._goal = "waits", np.full(6, np.nan)
-        self.demonstrations, self._takes = Demonstrations(controller.policy), False
+        self.demonstrations, self._takes = TakenPoses(controller.policy), False
         spec = controller.policy.spec
         # Before the first tick, since it takes longer than one
         self._circle = _ROUNDS * [self._clamped(goal) for goal in circle_poses(spec)]

@@ -7,7 +7,7 @@ import pytest
 
 from mjx_softarm.deploy.controller import start
 from mjx_softarm.logs.schema import write_log
-from mjx_softarm.view.demonstrations import Demonstrations
+from mjx_softarm.view.demonstrations import TakenPoses
 from tests.linear_arm import CONTROLLER, HIGH_KPA, POLICY, REST_M, SENSOR, SPEC, N
 from train.demos.demonstrations import load_demonstrations
 
@@ -25,7 +25,7 @@ def row(time_s, pose=POSE, **others):
 
 
 def test_poses_are_what_imitation_takes(tmp_path):
-    demos = Demonstrations(POLICY)
+    demos = TakenPoses(POLICY)
     assert demos.take(HOLDS, row(1.0)) == "pose 1 taken: tip at 20, -10, -600 mm, believed"
     assert "expected another" in demos.take(HOLDS, row(2.0, POSE + 0.5))
     seen = {"tip_m": np.array([0.0, 0.03, -0.6]), "tip_quaternion": np.array([1.0, 0.0, 0.0, 0.0])}
@@ -65,6 +65,6 @@ def test_poses_are_what_imitation_takes(tmp_path):
     ],
 )
 def test_poses_that_cannot_be_learned_from_are_refused(state, others, message):
-    demos = Demonstrations(POLICY)
+    demos = TakenPoses(POLICY)
     assert re.search(f"pose not taken: .*{message}", demos.take(state, row(1.0, **others)))
     assert len(demos) == 0

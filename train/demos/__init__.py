@@ -1,1 +1,1 @@
-"""Demonstrations: recorded by a scripted expert or by hand."""
+"""Demonstrations of a scripted expert: planned, recorded on an arm, read and checked."""

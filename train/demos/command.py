@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -20,10 +18,9 @@ from mjx_softarm.logs.schema import Log
 from mjx_softarm.spec import ArmSpec
 from train.config import ConfigError
 from train.demos.demonstrations import from_log, read_demonstrations
-from train.demos.expert import Expert, Posture
-from train.demos.hand import by_hand
-from train.demos.teleop import KEYS, Teleoperation, read_keys
-from train.demos.waypoints import TASKS, Waypoint, task
+from train.demos.expert import Expert
+from train.demos.record import WaypointRecorder
+from train.demos.waypoints import TASKS, task
 from train.options import ArmOptions, start
 
 
@@ -33,39 +30,27 @@ class Record(ArmOptions):
 
     arm: str
     """twin:SEED, twin:SEED:pipe300, twin:SEED:500g, or package.module:Class, a driver of your own"""
-    task: tyro.conf.DisallowNone[Annotated[str, cli.one_of(TASKS)] | None] = None
-    """task with its waypoints and its pipe; --keyboard does without"""
-    keyboard: bool = False
-    """steer by keys, in the task's pipe if one is given"""
-    hand: tyro.conf.DisallowNone[int | None] = None
-    """seed of a hand's noise and detours; None: the expert's own positions"""
+    task: Annotated[str, cli.one_of(TASKS)]
+    """task with its waypoints and its pipe"""
     out: Path
     """file to write, CSV or npz"""
 
     def __call__(self) -> int:
         console = start()
-        if not (self.task or self.keyboard):
-            raise ConfigError(f"--task: got nothing, expected one of {', '.join(TASKS)}, or --keyboard")
-        if self.hand is not None and (self.hand < 0 or self.keyboard):
-            where = " with --keyboard" if self.keyboard else ""
-            raise ConfigError(f"--hand: got {self.hand}{where}, expected a seed of at least 0, no --keyboard")
         if not self.out.parent.is_dir() or self.out.exists():
             raise ConfigError(
                 f"--out: got {self.out}, expected the name of a new file in a folder that exists"
             )
+        # Plan all postures before the arm moves.
         spec, s2r = self.read_arm(console)
         arm = names.open_arm(self.arm)
-        waypoints, pipe = task(self.task, spec) if self.task else ((), None)
+        waypoints, pipe = task(self.task, spec)
         expert = Expert(spec, s2r, pipe)
-        plan = None
-        if not self.keyboard:  # before the arm moves
-            waypoints, plan = self._plan(expert, waypoints)
-        teleop = Teleoperation(arm, expert, lambda text: _tell(console, text), partial(save_log, self.out))
-        if plan is None:
-            _tell(console, KEYS)
-            result = teleop.steer(read_keys(sys.stdin))
-        else:
-            result = teleop.record(waypoints, plan)
+        plan = expert.plan(waypoints)
+        # Record, and tell what came of it.
+        tell, save = partial(_tell, console), partial(save_log, self.out)
+        recorder = WaypointRecorder(arm, expert, tell, save)
+        result = recorder.record(waypoints, plan)
         if len(result.log) and result.ending.status != NOT_WRITTEN:
             _tell(console, f"demonstrations: {self.out}, {len(result.log)} poses")
             if np.isfinite(result.off_m).any():
@@ -73,11 +58,6 @@ class Record(ArmOptions):
         if result.ending.cause:
             _tell(console, f"ended early: {result.ending.cause}")
         return result.ending.status or (DONE if len(result.log) else MISSED)
-
-    def _plan(self, expert: Expert, waypoints: Sequence[Waypoint]) -> tuple[Sequence[Waypoint], Posture]:
-        if self.hand is None:
-            return waypoints, expert.plan(waypoints)
-        return by_hand(expert, waypoints, self.hand)
 
 
 @dataclass(frozen=True, kw_only=True)

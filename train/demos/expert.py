@@ -68,7 +68,7 @@ class Posture(NamedTuple):
     residual: Any  # () residual of the equilibrium [N, N m]
 
 
-class Target(NamedTuple):
+class PostureTarget(NamedTuple):
     """A problem to solve."""
 
     finger_m: Any  # (3,)
@@ -110,12 +110,12 @@ class Expert:
             before = found[-1].pressure_kpa
         return jax.tree.map(lambda *x: np.stack(x), *found)
 
-    def target(self, waypoint: Waypoint) -> Target:
+    def target(self, waypoint: Waypoint) -> PostureTarget:
         """Return the problem of a waypoint."""
         zero = np.zeros(self.spec.n_chambers)
-        return Target(np.asarray(waypoint.finger_m), np.eye(3), np.array(waypoint.turn), zero, zero)
+        return PostureTarget(np.asarray(waypoint.finger_m), np.eye(3), np.array(waypoint.turn), zero, zero)
 
-    def reach(self, name: str, target: Target, before_kpa: np.ndarray) -> Posture:
+    def reach(self, name: str, target: PostureTarget, before_kpa: np.ndarray) -> Posture:
         """Return the posture that meets a target, near the one at `before_kpa` (n_chambers,).
 
         Raises:
@@ -141,7 +141,7 @@ class Expert:
         best = met[np.lexsort([far_kpa, -np.minimum(clear_m, WAY_CLEAR_M)])[0]]
         return jax.tree.map(lambda x: x[best], found)
 
-    def _starts(self, target: Target) -> np.ndarray:
+    def _starts(self, target: PostureTarget) -> np.ndarray:
         """Return pressures (N_STARTS, n_chambers): around the posture before, and from the pool."""
         low, high = self._limits_kpa()
         jitter = JITTER_KPA * self._rng.standard_normal((N_JITTERED, len(target.near_kpa)))
@@ -156,12 +156,12 @@ class Expert:
         chambers = self.spec.chambers
         return chambers.pressure_min_kpa, chambers.pressure_max_kpa
 
-    def _room_kpa(self, found: Posture, target: Target) -> np.ndarray:
+    def _room_kpa(self, found: Posture, target: PostureTarget) -> np.ndarray:
         """Return the distance (n, n_chambers) of the real arm's pressures to the nearest limit."""
         (low, high), real_kpa = self._limits_kpa(), found.pressure_kpa + target.bias_kpa
         return np.minimum(real_kpa - low, high - real_kpa)
 
-    def _slack(self, found: Posture, target: Target | None = None) -> np.ndarray:
+    def _slack(self, found: Posture, target: PostureTarget | None = None) -> np.ndarray:
         """Return the slack (n, demands) of each demand, in units of its tolerance.
 
         Demands are equilibrium and clearance and, with a target, pressures, springs, position, orientation.
@@ -179,7 +179,7 @@ class Expert:
             ]
         return np.nan_to_num(np.stack(demands, axis=-1), nan=-np.inf)
 
-    def _why(self, name: str, target: Target, found: Posture, slack: np.ndarray) -> str:
+    def _why(self, name: str, target: PostureTarget, found: Posture, slack: np.ndarray) -> str:
         """Return errors, clearance and tightest chamber of the best solution."""
         best = int(np.argmax(np.minimum(slack, 0.0).sum(axis=-1)))
         off_m, turn_rad = (value[best] for value in _off(found, target))
@@ -198,7 +198,7 @@ class Expert:
         )
 
 
-def _off(found: Posture, target: Target) -> tuple[np.ndarray, np.ndarray]:
+def _off(found: Posture, target: PostureTarget) -> tuple[np.ndarray, np.ndarray]:
     """Return the errors of the finger tips (n,) [m] and of the gripper's orientation (n,) [rad]."""
     angle = target.turn * _angle(found.rotation, target.rotation)
     return np.linalg.norm(found.finger_m - target.finger_m, axis=-1), np.linalg.norm(angle, axis=-1)
@@ -243,7 +243,9 @@ def _look_many(pressure_kpa: Array, params: ArmParams, s2r, spec: ArmSpec, pipe:
 
 
 @xla.jit_at_first_call(uses_mjx=False, static_argnames=("spec", "pipe"))
-def _solve_many(starts_kpa, target: Target, params: ArmParams, s2r, spec: ArmSpec, pipe: CrossPipe | None):
+def _solve_many(
+    starts_kpa, target: PostureTarget, params: ArmParams, s2r, spec: ArmSpec, pipe: CrossPipe | None
+):
     """Return pressures (N_STARTS, n_chambers) after damped Gauss-Newton steps from each start."""
     low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
 
@@ -274,7 +276,7 @@ def _solve_many(starts_kpa, target: Target, params: ArmParams, s2r, spec: ArmSpe
     return jax.vmap(solve)(starts_kpa)
 
 
-def _errors(posture: tuple[Posture, Array], target: Target, spec: ArmSpec) -> Array:
+def _errors(posture: tuple[Posture, Array], target: PostureTarget, spec: ArmSpec) -> Array:
     """Return the errors of a posture, each in its unit; limits count where they are violated."""
     now, wall_m = posture
     chambers, springs = spec.chambers, spec.springs

@@ -18,7 +18,6 @@ from mjx_softarm.spec import ArmSpec
 
 HOME_BELOW_M = 0.1  # finger tips below the crossing's centre, where the pipe's tasks begin and end
 
-
 # Orientation of the gripper.
 FREE = (0.0, 0.0, 0.0)
 STRAIGHT = (1.0, 1.0, 0.0)  # straight down
@@ -32,14 +31,8 @@ class Waypoint(NamedTuple):
     finger_m: np.ndarray  # (3,) in the base frame
     turn: tuple[float, float, float] = FREE  # 1 for each axis of the gripper whose rotation is fixed
 
-    @property
-    def operation(self) -> str:
-        """Operation on an object there: "pick", "place" or ""."""
-        first = self.name.split(" ")[0]
-        return first if first in ("pick", "place") else ""
 
-
-class Task(NamedTuple):
+class WaypointTask(NamedTuple):
     """Waypoints of one demonstration, and the pipe around the arm."""
 
     waypoints: tuple[Waypoint, ...]
@@ -53,12 +46,12 @@ _STOPS = {"pipe300": _PIPE300, "pipe250": _PIPE250}
 TASKS = ("circle16", *_STOPS)
 
 
-def task(name: str, spec: ArmSpec) -> Task:
+def task(name: str, spec: ArmSpec) -> WaypointTask:
     """Return the task of this name, one of `TASKS`, for an arm with the gripper of `spec`."""
     if name == "circle16":
-        return Task(circle(16, spec))
+        return WaypointTask(circle(16, spec))
     pipe = CrossPipe.of_mm(PIPES_MM[name])
-    return Task(pick_and_place(pipe, _STOPS[name]), pipe)
+    return WaypointTask(pick_and_place(pipe, _STOPS[name]), pipe)
 
 
 def circle(n: int, spec: ArmSpec) -> tuple[Waypoint, ...]:

@@ -7,16 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.accuracy import rewards
-from benchmarks.accuracy.rewards import (
-    BY_HAND,
-    HAND_MADE,
-    LEARNED,
-    SCRIPTED,
-    config_of,
-    measure,
-    summary,
-    targets,
-)
+from benchmarks.accuracy.rewards import HAND_MADE, LEARNED, PRINTED, config_of, measure, summary, targets
 from train.config import to_dict
 
 
@@ -36,23 +27,23 @@ def test_a_run_without_success_counts_as_never():
     assert found == rest
 
 
-def test_a_learned_reward_is_to_need_fewer_steps_with_the_same_settings_and_demonstrations():
+def test_a_learned_reward_is_to_need_fewer_steps_with_the_same_settings():
     steps = {
-        ("pipe", SCRIPTED): {LEARNED: [512, 2048, None], HAND_MADE: [1024, 1024, 4096]},
-        ("hand-made", SCRIPTED): {LEARNED: [512, 512], HAND_MADE: [None, None]},
+        "pipe": {LEARNED: [512, 2048, None], HAND_MADE: [1024, 1024, 4096]},
+        "hand-made": {LEARNED: [512, 512], HAND_MADE: [None, None]},
     }
     found = targets(
         [
-            {"settings": settings, "shown": shown, "reward": reward, "steps_to_success": n}
-            for (settings, shown), of in steps.items()
+            {"settings": settings, "reward": reward, "steps_to_success": n}
+            for settings, of in steps.items()
             for reward, taken in of.items()
             for n in taken
         ]
     )
     text = "90 % success in fewer env steps with the learned reward"
     assert [(row["target"], row["verdict"]) for row in found] == [
-        (f"pipe, scripted: {text}", "NOT MET"),
-        (f"hand-made, scripted: {text}", "met"),
+        (f"pipe: {text}", "NOT MET"),
+        (f"hand-made: {text}", "met"),
     ]
     assert found[0]["measured"] == "2,048 learned, 1,024 hand-made, medians"
     assert found[1]["measured"] == "512 learned, never hand-made, medians"
@@ -60,7 +51,7 @@ def test_a_learned_reward_is_to_need_fewer_steps_with_the_same_settings_and_demo
 
 @pytest.fixture
 def lessons(monkeypatch):
-    """Keeps what `learn` is given in the place of learning; a hand shows 10 positions more than its seed."""
+    """Keeps what `learn` is given in the place of learning."""
     given = []
     rest = {"steps_to_success": 512, "success": 1.0, "held_out_success": 1.0, "held_out_median_mm": 1.0}
 
@@ -69,7 +60,6 @@ def lessons(monkeypatch):
         return [{"seed": seed, **rest, "median_mm": len(given)} for seed in seeds]
 
     shows = {"demonstrated": lambda spec: (showing(4), np.zeros((3, 6), np.float32))}
-    shows["shown_by_hand"] = lambda spec, seed: showing(10 + seed)
     at_once = {"in_parallel": lambda jobs: {name: f(*sent(inputs)) for name, f, inputs in jobs}}
     for name, value in (shows | {"learn": learn} | at_once).items():
         monkeypatch.setattr(rewards, name, value)
@@ -85,16 +75,13 @@ def showing(n):
     return SimpleNamespace(positions=np.zeros((n, 6), np.float32))
 
 
-def test_a_hand_shows_each_seed_other_positions_and_all_are_judged_at_the_scripted_ones(lessons):
+def test_every_kind_learns_from_the_same_positions_with_all_seeds(lessons):
     found = measure(seeds=(0, 2))
-    scripted, by_hand = lessons[:5], lessons[5:]
-    assert {(n, tuple(seeds)) for _, n, _, seeds in scripted} == {(4, (0, 2))}
-    one, two = (10, [4, 3], [0]), (12, [4, 3], [2])
-    assert by_hand == [(LEARNED, *one), (LEARNED, *two), (HAND_MADE, *one), (HAND_MADE, *two)]
-    assert all(judged == [4, 3] for _, _, judged, _ in lessons)
-    assert found["positions"] == {"shown": 4, "shown by hand": [10, 12], "held out": 3}
-    assert [row["shown"] for row in found["means"]] == 5 * [SCRIPTED] + 2 * [BY_HAND]
-    assert [row["seed"] for row in found["runs"]] == 7 * [0, 2]
-    whose = [row["median_mm"] for row in found["runs"]]  # the lesson, of which scripted ones have both seeds
-    assert whose == [1, 1, 2, 2, 3, 3, 4, 4, 5, 5, 6, 7, 8, 9]
-    assert [row["median_mm"] for row in found["means"]] == [1, 2, 3, 4, 5, 6.5, 8.5]
+    rewards_told = [LEARNED, HAND_MADE, LEARNED, HAND_MADE, PRINTED]
+    assert lessons == [(reward, 4, [4, 3], [0, 2]) for reward in rewards_told]
+    assert found["positions"] == {"shown": 4, "held out": 3}
+    assert [row["reward"] for row in found["means"]] == rewards_told
+    assert [row["settings"] for row in found["means"]] == 2 * ["pipe"] + 2 * ["hand-made"] + ["pipe"]
+    assert [row["seed"] for row in found["runs"]] == 5 * [0, 2]
+    assert [row["median_mm"] for row in found["runs"]] == [1, 1, 2, 2, 3, 3, 4, 4, 5, 5]
+    assert [row["median_mm"] for row in found["means"]] == [1, 2, 3, 4, 5]

@@ -1,7 +1,6 @@
-"""Demonstrations recorded on an arm that is not where its expert believes it to be, by plan and by keys."""
+"""Demonstrations recorded on an arm that is not where its expert believes it to be."""
 
 import functools
-import io
 
 import jax
 import numpy as np
@@ -17,8 +16,7 @@ from mjx_softarm.sensing.s2r import S2R_FILE, save_s2r
 from train.__main__ import main
 from train.demos.demonstrations import read_demonstrations
 from train.demos.expert import Posture
-from train.demos.hand import by_hand
-from train.demos.teleop import CLOSE_M, Teleoperation
+from train.demos.record import CLOSE_M, WaypointRecorder
 from train.demos.waypoints import task
 
 SPEC = ArmSpec.default()
@@ -86,7 +84,7 @@ def fingers_m(log):
 def test_recorded_positions_are_the_waypoints(expert, waypoints, plan, shift_mm):
     told = []
     arm = IdealArm()
-    result = Teleoperation(arm, expert, told.append).record(waypoints, plan, sequence=3)
+    result = WaypointRecorder(arm, expert, told.append).record(waypoints, plan, sequence=3)
     assert result.ending.status == 0 and len(result.log) == len(told) == 4
     wanted_m = np.stack([waypoint.finger_m for waypoint in waypoints])
     off_m = np.linalg.norm(fingers_m(result.log) - wanted_m, axis=1)
@@ -99,7 +97,7 @@ def test_recorded_positions_are_the_waypoints(expert, waypoints, plan, shift_mm)
 def test_blind_arm_is_logged_where_it_was_planned(expert, waypoints, plan, shift_mm):
     arm = BlindArm()
     seen = []
-    result = Teleoperation(arm, expert, lambda _: seen.append(arm.finger_m)).record(waypoints[:2], plan)
+    result = WaypointRecorder(arm, expert, lambda _: seen.append(arm.finger_m)).record(waypoints[:2], plan)
     assert result.ending.status == 0 and np.isnan(result.off_m).all()
     wanted_m = np.stack([waypoint.finger_m for waypoint in waypoints[:2]])
     np.testing.assert_allclose(fingers_m(result.log), wanted_m, atol=1e-4)
@@ -108,8 +106,8 @@ def test_blind_arm_is_logged_where_it_was_planned(expert, waypoints, plan, shift
 
 def test_what_was_logged_before_readings_are_lost_stays(expert, waypoints, plan):
     arm = IdealArm()
-    teleoperation = Teleoperation(arm, expert, lambda _: setattr(arm, "n_ticks_left", 20))
-    result = teleoperation.record(waypoints, plan)
+    recorder = WaypointRecorder(arm, expert, lambda _: setattr(arm, "n_ticks_left", 20))
+    result = recorder.record(waypoints, plan)
     assert len(result.log) == 1 and "got 3 lost readings in a row" in result.ending.cause
 
 
@@ -118,7 +116,7 @@ def test_posture_that_saturates_the_arm_gives_way_to_another(expert, waypoints, 
     spring_m = plan.spring_m.copy()
     spring_m[1, 4] += 0.06
     broken = Posture(**{**plan._asdict(), "spring_m": spring_m})
-    result = Teleoperation(IdealArm(), expert).record(waypoints[:2], broken)
+    result = WaypointRecorder(IdealArm(), expert).record(waypoints[:2], broken)
     assert result.ending.status == 0 and result.off_m.max() < CLOSE_M
 
 
@@ -130,7 +128,7 @@ def test_position_far_from_its_waypoint_is_not_logged(expert, waypoints, plan):
             _, *others = super().motion_capture()
             return Capture(np.array([0.05, 0.0, -0.5]), *others)
 
-    result = Teleoperation(Misplaced(), expert).record(waypoints, plan)
+    result = WaypointRecorder(Misplaced(), expert).record(waypoints, plan)
     assert len(result.log) == 0 and "home: got 7" in result.ending.cause
 
 
@@ -139,89 +137,50 @@ def test_chamber_without_pressure_is_named(expert, waypoints, plan):
         def write_pressures(self, pressure_kpa):
             super().write_pressures(np.where(np.arange(SPEC.n_chambers) == 4, 0.0, pressure_kpa))
 
-    result = Teleoperation(Leaking(), expert).record(waypoints, plan)
+    result = WaypointRecorder(Leaking(), expert).record(waypoints, plan)
     assert len(result.log) == 0
     assert "home: got no rest, expected it within 15 s; spring 4 is +" in result.ending.cause
     assert "chamber at -40.0 kPa" in result.ending.cause
 
 
 @pytest.fixture
-def calibration(tmp_path, shifting_s2r):
+def command(tmp_path, shifting_s2r, monkeypatch, capsys):
+    """Runs `python -m train demos` on the ideal arm, with the calibration that believes it to be off."""
     SPEC.to_toml(tmp_path / "arm.toml")
     save_s2r(tmp_path / S2R_FILE, shifting_s2r)
-    return tmp_path
+    monkeypatch.setattr("mjx_softarm.deploy.drivers.names.open_arm", lambda name: IdealArm())
 
-
-@pytest.fixture
-def command(calibration, monkeypatch, capsys):
-    """Runs `python -m train demos` on the ideal arm with keys on its standard input."""
-
-    def run(*args, keys=""):
-        monkeypatch.setattr("mjx_softarm.deploy.drivers.names.open_arm", lambda name: IdealArm())
-        monkeypatch.setattr("sys.stdin", io.StringIO(keys))
-        status = main(["demos", *map(str, args), "--calibration", str(calibration)])
+    def run(*args):
+        status = main(["demos", *map(str, args), "--calibration", str(tmp_path)])
         captured = capsys.readouterr()
         return status, captured.out + captured.err
 
     return run
 
 
-STEER = ("record", "--arm", "a:B", "--task", "pipe300", "--keyboard", "--out")
+RECORD = ("record", "--arm", "a:B", "--out")
 
 
-def test_keys_move_the_finger_tips(command, tmp_path):
-    out = tmp_path / "keys.csv"
-    status, told = command(*STEER, out, keys=" x \nsXz \n ?\nlY q x")
-    assert status == 0, told
-    assert "not moved since the start" in told and "was logged" in told and "got key '?'" in told
-    log, _ = read_demonstrations(out, SPEC)
-    assert log.sequence.tolist() == [0, 0, 0]
-    start_m = IdealArm().finger_m
-    moved_mm = np.cumsum([[20.0, 0.0, 0.0], [-5.0, 0.0, 5.0], [0.0, -20.0, 0.0]], axis=0)
-    np.testing.assert_allclose(1e3 * fingers_m(log), 1e3 * start_m + moved_mm, atol=2.0)
-    status, told = command("check", out)
-    assert status == 0 and "poses: 3" in told and "sequences: 1: 0 with 3" in told
-
-
-def test_move_into_the_wall_is_refused_and_the_arm_stays(command, tmp_path):
-    status, told = command(*STEER, tmp_path / "k.npz", keys="y" * 8 + "Y q")
-    assert status == 0 and "mm: got at best" in told and "pose 1 logged" in told
-
-
-def test_a_hand_s_positions_are_recorded_and_corrected_towards(command, tmp_path, monkeypatch):
-    """The command takes the plan of `by_hand` with this seed; the arm ends at its positions."""
-    taken, whole = [], functools.partial(task, "pipe300")
-    monkeypatch.setattr("train.demos.command.task", lambda _, spec: cut(whole(spec), 4))
+def test_the_command_records_a_task_and_checks_its_file(command, tmp_path, monkeypatch, waypoints):
+    whole = functools.partial(task, "pipe300")
     monkeypatch.setattr(
-        "train.demos.command.by_hand", lambda *given: taken.append(by_hand(*given)) or taken[0]
+        "train.demos.command.task", lambda name, spec: whole(spec)._replace(waypoints=waypoints)
     )
-    out = tmp_path / "hand.npz"
-    status, told = command("record", "--arm", "a:B", "--task", "pipe300", "--hand", "3", "--out", out)
+    out = tmp_path / "demos.csv"
+    status, told = command(*RECORD, out, "--task", "pipe300")
     assert status == 0, told
+    assert f"demonstrations: {out}, 4 poses" in told and "furthest from its waypoint: " in told
     log, _ = read_demonstrations(out, SPEC)
-    wanted_m = np.stack([waypoint.finger_m for waypoint in taken[0][0]])
-    assert len(log) == 5  # a detour in one of three moves
+    wanted_m = np.stack([waypoint.finger_m for waypoint in waypoints])
     assert np.linalg.norm(fingers_m(log) - wanted_m, axis=1).max() < CLOSE_M
-    assert "detour to pick right" in told
-
-
-def cut(whole, n):
-    return whole._replace(waypoints=whole.waypoints[:n])
+    status, told = command("check", out)
+    assert status == 0 and "poses: 4" in told and "sequences: 1: 0 with 4" in told
 
 
 def test_misuse_is_told_before_anything_moves(command, tmp_path):
-    record = ("record", "--arm", "a:B", "--out")
     for args, message in (
-        ((*record, tmp_path / "x.csv"), "--task: got nothing, expected one of circle16"),
-        ((*record, tmp_path / "no" / "x.csv", "--task", "pipe300"), "expected the name of a new file"),
-        (
-            (*record, tmp_path / "x.csv", "--task", "pipe300", "--hand", "-1"),
-            "--hand: got -1, expected a seed",
-        ),
-        (
-            (*record, tmp_path / "x.csv", "--keyboard", "--hand", "1"),
-            "--hand: got 1 with --keyboard, expected",
-        ),
+        ((*RECORD, tmp_path / "x.csv"), "got nothing, expected --task"),
+        ((*RECORD, tmp_path / "no" / "x.csv", "--task", "pipe300"), "expected the name of a new file"),
         (("check", tmp_path / "none.csv"), "none.csv: got 'No such file"),
     ):
         status, told = command(*args)

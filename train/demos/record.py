@@ -1,0 +1,153 @@
+"""Demonstrations recorded on an arm, through its springs, pumps and motion capture alone.
+
+The sensor-space law holds the expert's references until the arm is at rest. Then motion capture gives the
+error of the finger tips, and the expert is asked for a pose that is shifted by this error. Without motion
+capture the error stays unknown, and the planned pose is logged. Between moves the pumps keep their pressures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from mjx_softarm.deploy.arm_io import ArmIO
+from mjx_softarm.deploy.drive import Drive, Hold
+from mjx_softarm.deploy.ending import Ending, vent_at_end
+from mjx_softarm.deploy.faults import SETTLE_TIMEOUT_S
+from mjx_softarm.deploy.link import ArmFault, Recorder
+from mjx_softarm.logs.schema import Log
+from mjx_softarm.sensing.pose import quaternion_from_pose, rotation_from_quaternion
+from train.demos.expert import Expert, ExpertError, Posture, PostureTarget
+from train.demos.waypoints import Waypoint
+
+CLOSE_M = 1.5e-3  # error of the finger tips below which nothing is corrected
+FAR_M = 0.01  # error of the finger tips above which a pose is not worth learning from
+N_CORRECTIONS = 3
+BEYOND_KPA = 3.0  # pressure that a chamber at its limit is assumed to lack
+
+
+class RecordedPoses(NamedTuple):
+    """Logged poses, with their errors."""
+
+    log: Log
+    off_m: np.ndarray  # (n,) error of the finger tips by motion capture; NaN without it
+    ending: Ending
+
+
+class WaypointRecorder:
+    """One arm, without pressure at first, with its expert.
+
+    Args:
+        arm: the arm, with or without motion capture.
+        expert: expert for the arm.
+        tell: takes a line for each pose.
+        save: writes the log, if it has rows, once the arm is vented.
+    """
+
+    def __init__(
+        self,
+        arm: ArmIO,
+        expert: Expert,
+        tell: Callable[[str], None] = lambda text: None,
+        save: Callable[[Log], None] = lambda log: None,
+    ):
+        self.expert, self.tell, self._save = expert, tell, save
+        self._drive = Drive(arm, expert.spec, self._tick)
+        self._rows, self._off_m = Recorder(), []
+        self._readings = np.empty(0)  # (n_chambers,) of the newest tick
+
+    def record(self, waypoints: Sequence[Waypoint], plan: Posture, sequence: int = 0) -> RecordedPoses:
+        """Bring the finger tips to waypoints, log each, and vent; see `vent_at_end`.
+
+        Args:
+            waypoints: one after the other.
+            plan: postures (n,) at the waypoints, by `Expert.plan`.
+            sequence: id of the demonstration.
+        """
+
+        def run() -> None:
+            for k, waypoint in enumerate(waypoints):
+                row, off_m = self._reach(waypoint, jax.tree.map(lambda x, k=k: x[k], plan))
+                self._rows.add(row | {"sequence": sequence})
+                self._off_m.append(off_m)
+                seen = f"{1e3 * off_m:.1f} mm off" if np.isfinite(off_m) else "not seen"
+                self.tell(f"{len(self._rows)} of {len(waypoints)}: {waypoint.name}: {seen}")
+
+        ending = vent_at_end(
+            run, self._drive.link, self.tell, lambda: self._save(self._log()) if self._rows else None
+        )
+        return RecordedPoses(self._log(), np.array(self._off_m), ending)
+
+    def _log(self) -> Log:
+        return self._rows.log("demonstrations", self._drive.sensor)
+
+    def _reach(self, waypoint: Waypoint, posture: Posture) -> tuple[dict, float]:
+        """Return the row at rest and the error [m] of the finger tips, after at most `N_CORRECTIONS`."""
+        target = asked = self.expert.target(waypoint)
+        row, off_m = None, np.nan
+        for n_left in range(N_CORRECTIONS, -1, -1):
+            # Hold the posture until rest. Where the tip is seen, move the target by its error.
+            row = self._drive.to_rest(Hold(self._drive.gains, posture.spring_m, self._drive.dt_s))
+            if row is not None:
+                off_m, asked = self._corrected(row, target, asked)
+                if not off_m >= CLOSE_M:  # close, or not seen
+                    break
+            if not n_left:
+                break
+            # Find another posture for the new target and the pressures that the arm had.
+            asked = asked._replace(bias_kpa=self._bias_kpa(posture))
+            try:
+                posture = self.expert.reach(waypoint.name, asked, posture.pressure_kpa)
+            except ExpertError as error:
+                self.tell(f"not corrected: {error}")
+                break
+        # Refuse a pose without rest, or far from its waypoint.
+        if row is None:
+            raise self._not_at_rest(waypoint.name, posture)
+        if off_m > FAR_M:
+            off = f"got {1e3 * off_m:.1f} mm off after corrections, expected at most {1e3 * FAR_M:g} mm"
+            raise ArmFault(f"{waypoint.name}: {off}; is the arm calibrated?")
+        if not self._drive.link.sees:
+            pose = posture.pose.astype(float)
+            row = {"tip_m": 1e-3 * pose[:3], "tip_quaternion": quaternion_from_pose(pose)} | row
+        return row, off_m
+
+    def _corrected(
+        self, row: dict, target: PostureTarget, asked: PostureTarget
+    ) -> tuple[float, PostureTarget]:
+        """Return the error [m] of the finger tips, NaN if not seen, and the target to ask the expert for.
+
+        Args:
+            row: row at rest.
+            target: target of the waypoint.
+            asked: target for which the expert found the present posture.
+        """
+        if "tip_m" not in row:
+            return np.nan, asked
+        rotation = rotation_from_quaternion(row["tip_quaternion"])
+        finger_m = row["tip_m"] - self.expert.spec.mass.gripper_length_m * rotation[:, 2]
+        return float(np.linalg.norm(finger_m - target.finger_m)), asked._replace(
+            finger_m=asked.finger_m + target.finger_m - finger_m,
+            rotation=target.rotation @ rotation.T @ asked.rotation,
+        )
+
+    def _bias_kpa(self, posture: Posture) -> np.ndarray:
+        """Return the arm's pressures less the posture's; guessed where a limit cuts them off."""
+        low, high = self._drive.gains.pressure_min_kpa, self._drive.gains.pressure_max_kpa
+        kpa = self._drive.link.pressure_kpa
+        beyond = np.where(kpa >= high, BEYOND_KPA, 0.0) - np.where(kpa <= low, BEYOND_KPA, 0.0)
+        return kpa + beyond - posture.pressure_kpa
+
+    def _not_at_rest(self, name: str, posture: Posture) -> ArmFault:
+        off_m = self._drive.sensor.lengths(self._readings, 0.0).length_m - posture.spring_m
+        worst = int(np.argmax(np.abs(off_m)))
+        return ArmFault(
+            f"{name}: got no rest, expected it within {SETTLE_TIMEOUT_S:g} s; spring {worst} is "
+            f"{1e3 * off_m[worst]:+.1f} mm off, its chamber at {self._drive.link.pressure_kpa[worst]:.1f} kPa"
+        )
+
+    def _tick(self, row: dict) -> None:
+        self._readings = row["readings"]
