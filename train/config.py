@@ -22,9 +22,6 @@ from train.agent.hindsight import HindsightConfig
 from train.agent.tqc import TQCConfig
 
 LEARNER_GROUPS = {"tqc": ("tqc", "hindsight"), "analytic": ("analytic",)}  # settings that a learner reads
-POLISH_ARMS = 64  # arms of a gradient step of polishing
-POLISH_EPOCH = 256  # gradient steps between two reports of polishing
-POLISH_EVALUATION_EPOCHS = 4  # of these between two evaluations and checkpoints
 
 
 class ConfigError(InputError):
@@ -65,20 +62,13 @@ class TrainConfig:
     """relabelled goals, as shares of a batch; the rest keeps its own goals"""
     analytic: AnalyticConfig = field(default_factory=AnalyticConfig)
     """policy and descent of the analytic learner"""
-    polish_updates: int = 0
-    """gradient steps of the analytic learner that follow TQC's, from its policy, for arms at rest"""
 
     def __post_init__(self) -> None:
         counts = ("n_arms", "episode_length", "total_env_steps", "batch_size")
         least = dict.fromkeys((*counts, "vector_steps_per_epoch", "evaluation_epochs"), 1)
-        for name, low in {**least, "seed": 0, "warmup_env_steps": 0, "polish_updates": 0}.items():
+        for name, low in {**least, "seed": 0, "warmup_env_steps": 0}.items():
             if getattr(self, name) < low:
                 raise ConfigError(f"{name}: got {getattr(self, name)}, expected at least {low}")
-        if self.polish_updates and (self.learner, self.env.mode) != ("tqc", "quasistatic"):
-            raise ConfigError(
-                f"polish_updates: got {self.polish_updates} with learner {self.learner!r} and env.mode "
-                f"{self.env.mode!r}, expected 0, or 'tqc' and 'quasistatic'"
-            )
         given_kg = self.env.randomisation.payload_max_kg
         if self.env.observation == "payload" and given_kg is not None:
             raise ConfigError(
@@ -102,19 +92,14 @@ class TrainConfig:
         return round(self.updates_per_env_step * self.n_arms)
 
     @property
-    def n_own_epochs(self) -> int:
-        """Number of epochs of the learner, without polishing."""
-        return -(-self.total_env_steps // (self.n_arms * self.vector_steps_per_epoch))
-
-    @property
     def n_epochs(self) -> int:
         """Number of epochs of the run."""
-        return self.n_own_epochs + (self.polish.n_epochs if self.polish_updates else 0)
+        return -(-self.total_env_steps // (self.n_arms * self.vector_steps_per_epoch))
 
     @property
     def n_updates(self) -> int:
         """Number of the learner's gradient steps, warm-up epochs counted as if they had any."""
-        return self.n_own_epochs * self.vector_steps_per_epoch * self.n_updates_per_vector_step
+        return self.n_epochs * self.vector_steps_per_epoch * self.n_updates_per_vector_step
 
     @property
     def policy_hidden(self) -> tuple[int, ...]:
@@ -129,26 +114,9 @@ class TrainConfig:
             analytic=dataclasses.replace(self.analytic, hidden=donor.policy_hidden),
         )
 
-    @property
-    def polish(self) -> TrainConfig:
-        """Config of polishing, as a run of the analytic learner."""
-        return dataclasses.replace(
-            self,
-            learner="analytic",
-            n_arms=POLISH_ARMS,
-            total_env_steps=self.polish_updates * POLISH_ARMS,
-            env=dataclasses.replace(self.env, even_share=0.5),  # the rim, too
-            vector_steps_per_epoch=POLISH_EPOCH,
-            evaluation_epochs=POLISH_EVALUATION_EPOCHS,
-            analytic=dataclasses.replace(self.analytic, hidden=self.policy_hidden),
-            polish_updates=0,
-        )
-
     def evaluates_after(self, epoch: int) -> bool:
         """Return whether an evaluation and a checkpoint follow the n-th epoch."""
-        if epoch > self.n_own_epochs:
-            return self.polish.evaluates_after(epoch - self.n_own_epochs)
-        return epoch % self.evaluation_epochs == 0 or epoch == self.n_own_epochs
+        return epoch % self.evaluation_epochs == 0 or epoch == self.n_epochs
 
 
 @dataclass(frozen=True)
@@ -231,9 +199,8 @@ class ImitationConfig(TrainConfig):
         if self.env.observation == "payload":  # an action that was shown is right for one payload
             expected = "'pose' or 'motion' for demonstrations"
             raise ConfigError(f"env.observation: got 'payload', expected {expected}")
-        if self.polish_updates or self.learner != "tqc":
-            got = f"{self.learner!r}, {self.polish_updates}"
-            raise ConfigError(f"learner, polish_updates: got {got}, expected 'tqc', 0 for demonstrations")
+        if self.learner != "tqc":
+            raise ConfigError(f"learner: got {self.learner!r}, expected 'tqc' for demonstrations")
 
     @property
     def stage_epochs(self) -> tuple[int, ...]:

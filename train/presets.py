@@ -55,7 +55,6 @@ PRESETS: dict[str, TrainConfig] = {
         batch_size=128,
         replay_capacity=262_144,
         evaluation_epochs=30,
-        polish_updates=20_480,
     ),
     "analytic": _ANALYTIC,
     # The same for an arm that carries: the policy observes the payload, which the loop estimates.

@@ -36,7 +36,7 @@ TARGETS = {  # of presets
         Target("even_median_mm", 0.8),
         Target("even_p95_mm", 4.0),
     ),
-    "quick": (Target("median_mm", 2.0, spread="tqc_alone_over_seeds"), Target("median_mm", 1.0)),
+    "quick": (Target("median_mm", 2.0),),
     "motion-analytic": (
         Target("median_mm", 3.0),
         Target("near_median_s", 1.2, spread="evaluation-in-motion-12x0.5s_over_seeds"),
@@ -76,9 +76,8 @@ def preset_of(settings: Mapping[str, Any]) -> str | None:
 
 def _read(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings without the seed and without groups that the learner does not read."""
-    learners = [settings["learner"], *(["analytic"] if settings["polish_updates"] else [])]
-    read = {group for name in learners for group in LEARNER_GROUPS[name]}
-    unread = {group for groups in LEARNER_GROUPS.values() for group in groups} - read
+    read = LEARNER_GROUPS[settings["learner"]]
+    unread = {group for groups in LEARNER_GROUPS.values() for group in groups if group not in read}
     return {name: value for name, value in settings.items() if name not in {"seed", *unread}}
 
 

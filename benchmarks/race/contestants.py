@@ -3,7 +3,7 @@
     python -m benchmarks.race.contestants NAME SEED STRETCH_S N_GOALS
 
 NAME is one of `CONTESTANTS`. Ours is the loop of `python -m train reach` without its files, with the preset
-analytic, or quick (TQC, then polished). The peers train on the project's Gymnasium environment through
+analytic, or quick (TQC). The peers train on the project's Gymnasium environment through
 `learn`, with the settings of ours-quick wherever they have one. They have none for the temperature's own
 learning rate. Our learning rate falls along a half cosine over the preset's env steps, at which our training
 ends; theirs does so too, and begins anew.
@@ -85,7 +85,6 @@ def ours(name: str, seed: int) -> Contestant:
 
     config = dataclasses.replace(PRESETS[name.removeprefix("ours-")], seed=seed)
     job = task_of(config, ReachEnv(config=config.env)).job
-    n_env_steps = config.total_env_steps + (config.polish.total_env_steps if config.polish_updates else 0)
     state = job.start(lambda: job.init(jax.random.PRNGKey(seed)))
     act = jax.jit(job.learner.mode)
 
@@ -97,7 +96,7 @@ def ours(name: str, seed: int) -> Contestant:
         train,
         policy=lambda obs: np.asarray(act(job.policy(state), obs)),
         done=lambda: (int(state.n_env_steps), int(state.n_updates)),
-        limit=n_env_steps,
+        limit=config.total_env_steps,
     )
 
 

@@ -136,7 +136,6 @@ FEWER = (
         r"(train (reach|imitate|sweep) .*--(preset|calibration).*)",
         r"\1 --total-env-steps 2048 --env.n-poses 256",
     ),
-    (r"(train (reach|sweep) .*--(preset quick|calibration).*)", r"\1 --polish-updates 0"),
 )
 LEFT_OUT = (
     "python -m benchmarks",  # hours, or a machine of their own; tests/benchmarks

@@ -36,6 +36,5 @@ def flags(**changes):
         "updates_per_env_step": 1,
         "replay_capacity": 128,
         "evaluation_epochs": 4,
-        "polish_updates": 0,
     }
     return [f"--{name}={value}" for name, value in {**SETTINGS, **networks, **short, **changes}.items()]

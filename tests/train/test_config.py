@@ -65,8 +65,8 @@ def test_json_with_a_setting_too_many_is_refused_and_a_missing_one_has_its_defau
     data = to_dict(TrainConfig())
     with pytest.raises(ConfigError, match="config.tqc: got .* expected the settings"):
         from_dict({**data, "tqc": {**data["tqc"], "extra": 1}})
-    older = {name: value for name, value in data.items() if name != "polish_updates"}
-    assert from_dict(older) == TrainConfig(polish_updates=0)
+    older = {name: value for name, value in data.items() if name != "episode_length"}
+    assert from_dict(older) == TrainConfig()
 
 
 def test_an_epoch_count_covers_the_steps_asked_for():

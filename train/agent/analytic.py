@@ -138,7 +138,7 @@ class Analytic:
         Raises:
             ValueError: the donor's networks have another size.
         """
-        donor = getattr(agent, "agent", agent)  # of a run that imitated or was polished
+        donor = getattr(agent, "agent", agent)  # of a run that imitated
         params = widened(donor.mean_actor_params, self.env.observation_size)
         check_same_shapes("actor", params, state.actor_params)
         return state._replace(actor_params=params, mean_actor_params=jax.tree.map(jnp.copy, params))

@@ -33,7 +33,7 @@ class HindsightTQC:
         Raises:
             ValueError: the donor has no such networks, or networks of another size.
         """
-        donor = getattr(agent, "agent", agent)  # of a run that imitated or was polished
+        donor = getattr(agent, "agent", agent)  # of a run that imitated
         if self.config.env.moves:
             return self.tqc.adopt_policy(state, donor.mean_actor_params)
         return self.tqc.adopt(state, donor)

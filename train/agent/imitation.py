@@ -119,7 +119,7 @@ class Imitation:
             ValueError: a donor has no such part, or one of another size.
         """
         if agent is not None:
-            donor = getattr(agent, "agent", agent)  # of a run that imitated or was polished
+            donor = getattr(agent, "agent", agent)  # of a run that imitated
             state = state._replace(agent=self.learner.adopt(state.agent, donor))
         if reward is not None:
             if not isinstance(reward, ImitationState) or reward.discriminator is None:

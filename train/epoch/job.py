@@ -90,26 +90,25 @@ class Job:
         self.epoch = xla.jit(self.advance, env.uses_mjx, donate_argnums=0, out_shardings=results)
         self._thin = xla.jit(replay.thin, env.uses_mjx, donate_argnums=0)
 
-    def like(self, epoch: int) -> TrainState:
-        """Return a state structured as the run's after some epochs."""
+    def like(self) -> TrainState:
+        """Return a state structured as the run's."""
         return self.init(jax.random.PRNGKey(0))
 
-    def shapes(self, epoch: int) -> TrainState:
+    def shapes(self) -> TrainState:
         """Return the shapes of what `like` returns.
 
         `init` stands at the top level here, since jax takes compiler options nowhere else.
         """
         return jax.eval_shape(self.init, jax.random.PRNGKey(0))
 
-    def start(self, first: Callable[[], T], epoch: int = 0) -> T:
+    def start(self, first: Callable[[], T]) -> T:
         """Return the result of `first`, such as a state, with the epoch compiled in another thread meanwhile.
 
-        `epoch` is the number of epochs done; a job with several stages compiles those that are left. With a
-        mesh of devices the epoch is compiled when it is called first; a second call compiles nothing.
+        With a mesh of devices the epoch is compiled when it is called first; a second call compiles nothing.
         """
         if self.mesh is not None or self.n_traces:
             return first()
-        shapes = self.shapes(epoch)
+        shapes = self.shapes()
         with ThreadPoolExecutor(1) as beside:
             result = beside.submit(first)
             self.epoch = self.epoch.lower(shapes).compile()

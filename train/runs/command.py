@@ -25,7 +25,7 @@ from train.options import NewRunOptions, named_preset, start
 from train.presets import IMITATION_PRESETS, PRESETS
 from train.runs import run as runs
 from train.runs.checkpoint import Run, RunError, sole_trainer
-from train.runs.evaluate import N_ACTIONS, Summary
+from train.runs.evaluate import N_ACTIONS
 from train.runs.export import export_run
 from train.runs.task import Task, task_of
 
@@ -163,7 +163,7 @@ def evaluate(
         )
     spec = opened.spec.replace(mass={"payload_kg": opened.spec.mass.payload_kg + 1e-3 * payload})
     summary, *_ = task.evaluate.on(ReachEnv(spec, config, opened.s2r), n_actions)(policy)
-    _table(f"{task.title}, {how}", {"value": summary}, console)
+    _table(f"{task.title}, {how}", summary, console)
     file = opened.path / f"{name}.json"
     write_json(file, summary.to_dict())
     console.print(f"written: {file}", highlight=False, soft_wrap=True)
@@ -216,20 +216,14 @@ def _train(run: Run, task: Task, console: Console) -> int:
 
 
 def _show(run: Run, task: Task, summary: Any, console: Console) -> None:
-    summaries = {"value": summary}
-    if run.config.polish_updates:
-        summaries = {"TQC alone": Summary(**runs.evaluation_after(run, run.config.n_own_epochs))}
-        summaries["polished"] = summary
-    _table(f"{task.title}, {N_ACTIONS} actions each", summaries, console)
+    _table(f"{task.title}, {N_ACTIONS} actions each", summary, console)
     for name in task.picture_names:
         console.print(f"picture: {run.path / name}", highlight=False, soft_wrap=True)
 
 
-def _table(title: str, summaries: dict[str, Any], console: Console) -> None:
-    table = Table(title=title, title_justify="left")
-    table.add_column("figure")
-    for name in summaries:
-        table.add_column(name, justify="right")
-    for rows in zip(*(each.rows() for each in summaries.values()), strict=True):
-        table.add_row(rows[0][0], *(value for _, value in rows))
+def _table(title: str, summary: Any, console: Console) -> None:
+    table = Table("figure", title=title, title_justify="left")
+    table.add_column("value", justify="right")
+    for row in summary.rows():
+        table.add_row(*row)
     console.print(table)

@@ -74,9 +74,6 @@ def _evaluations(
     for name, (colour, label) in lines.items():
         values = [factor * row[f"evaluation/{name}"] for row in evaluated]
         axes.plot(steps, values, color=colour, label=label)
-    tqc = [row["env_steps"] for row in rows if "analytic/loss" not in row]
-    if 0 < len(tqc) < len(rows):
-        axes.axvline(tqc[-1], color=INK, linestyle=":", linewidth=1, label="polishing begins")
     axes.legend(frameon=False, loc="upper right")
 
 

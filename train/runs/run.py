@@ -84,9 +84,9 @@ def _begin(run: Run, task: Task, console: Console) -> tuple[int, TrainState]:
     def first() -> tuple[int, TrainState]:
         if run.latest_epoch is None:
             return 0, task.job.init(jax.random.PRNGKey(run.config.seed))
-        return run.restore(task.job.like(run.latest_epoch))
+        return run.restore(task.job.like())
 
-    epoch, state = task.job.start(first, run.latest_epoch or 0)
+    epoch, state = task.job.start(first)
     if epoch:
         console.print(f"continuing after epoch {epoch} of {run.config.n_epochs}")
     return epoch, state
@@ -97,10 +97,7 @@ def finish(run: Run, task: Task, policy: Any) -> Any:
     summary, *reached = task.evaluate(policy)
     if is_first_process():
         run.write_poses(*reached)
-        figures = summary.to_dict()
-        if run.config.polish_updates:
-            figures["tqc_alone"] = evaluation_after(run, run.config.n_own_epochs)
-        write_json(run.path / "evaluation.json", figures)
+        write_json(run.path / "evaluation.json", summary.to_dict())
         plots.save(run.path, task.pictures(run.metrics(), *reached))
     return summary
 
@@ -151,7 +148,7 @@ def begin_with(task: Task, seed: int, **donors: Run) -> TrainState:
 
 def _restored(run: Run, task: Task) -> TrainState:
     """Return the state of a run's newest checkpoint: learner in NumPy, shapes of the rest."""
-    shapes = task.job.shapes(run.latest_epoch or 0)
+    shapes = task.job.shapes()
     return shapes._replace(learner=run.restore_part("learner", shapes.learner))
 
 
@@ -178,13 +175,6 @@ def evaluation(run: Run, task: Task, policy: Any) -> dict[str, float]:
     run.write_poses(*results)
     figures = summary.to_dict()
     return {f"evaluation/{name}": x for name, x in figures.items() if not isinstance(x, tuple)}
-
-
-def evaluation_after(run: Run, epoch: int) -> dict[str, Any]:
-    """Return the figures of the evaluation that followed an epoch, by name."""
-    prefix = "evaluation/"
-    [row] = [row for row in run.metrics() if row["epoch"] == epoch]
-    return {name.removeprefix(prefix): value for name, value in row.items() if name.startswith(prefix)}
 
 
 def counts(state: TrainState) -> dict[str, int]:

@@ -21,7 +21,6 @@ from train.config import ImitationConfig, TrainConfig
 from train.demos.demonstrations import Demonstrations
 from train.epoch.goals import DemonstratedGoals
 from train.epoch.job import Job, TrainState
-from train.epoch.polish import PolishedJob
 from train.runs import plots
 from train.runs.evaluate import N_ACTIONS, N_GOALS, Evaluator
 from train.runs.positions import PositionEvaluator
@@ -42,7 +41,7 @@ class Evaluation(Protocol):
 class Task(NamedTuple):
     """Job of a run, and how the run is evaluated, shown, and prepared for an epoch."""
 
-    job: Job | PolishedJob
+    job: Job
     title: str  # of the table of figures
     evaluate: Evaluation
     picture_names: tuple[str, ...]
@@ -53,11 +52,9 @@ class Task(NamedTuple):
 
 def learner_of(config: TrainConfig, env: ReachEnv, mesh: Mesh | None = None) -> Learner:
     """Return the learner that a config of a reach run names."""
-    return _analytic(config, env, mesh) if config.learner == "analytic" else HindsightTQC(config, env)
-
-
-def _analytic(config: TrainConfig, env: ReachEnv, mesh: Mesh | None) -> Analytic:
-    return Analytic(config.analytic, env, config.n_arms, mesh)
+    if config.learner == "analytic":
+        return Analytic(config.analytic, env, config.n_arms, mesh)
+    return HindsightTQC(config, env)
 
 
 def task_of(
@@ -83,9 +80,6 @@ def task_of(
         assert demonstrations is not None
         return _imitation(config, env, demonstrations, mesh, learner)
     job = Job(config, env, learner or learner_of(config, env, mesh), mesh=mesh)
-    if config.polish_updates:
-        polished = ReachEnv(env.spec, config.polish.env, env.s2r)
-        job = PolishedJob(job, _analytic(config.polish, polished, mesh), mesh)
     return Task(
         job=job,
         title=f"{N_GOALS} held-out goals",

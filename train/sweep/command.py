@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import math
 from collections.abc import Sequence
@@ -34,7 +33,7 @@ class SweepCommand(NewRunOptions):
     """
 
     preset: Annotated[str, cli.one_of(PRESETS)] = "quick"
-    """settings to begin with; the defaults below are this preset's, without polishing"""
+    """settings to begin with; the defaults below are this preset's"""
     config: Annotated[TrainConfig, tyro.conf.arg(name="")]
     seeds: cli.Integers = (0,)
     """seeds of each setting"""
@@ -44,7 +43,7 @@ class SweepCommand(NewRunOptions):
     @classmethod
     def default(cls, arguments: Sequence[str]) -> Self:
         preset = named_preset(arguments, PRESETS, "quick")
-        return cls(preset=preset, config=dataclasses.replace(PRESETS[preset], polish_updates=0))
+        return cls(preset=preset, config=PRESETS[preset])
 
     def __call__(self) -> int:
         console = start()
@@ -52,8 +51,6 @@ class SweepCommand(NewRunOptions):
             self.check_resume_alone(self.default([]))
             sweep = open_sweep(self.resume)
         else:
-            if self.config.polish_updates:
-                raise ConfigError(f"polish_updates: got {self.config.polish_updates}, expected 0 in a sweep")
             members, varied = members_of(self.config, self.seeds, self.vary)
             spec, s2r = self.read_arm(console)
             path = self.out or free_path(Path("runs") / f"sweep-{self.preset}")

@@ -52,9 +52,9 @@ def by_settings(runs: Sequence[Run], settings_of: Callable[[Run], dict[str, Any]
         settings_of: settings that the runs of a group share.
 
     Returns:
-        For each group `settings`, `runs` with their figures, and `over_seeds`: mean, least and greatest. What
-        all runs have beside these, in place of `NAME`, follows as `NAME_over_seeds`: `tqc_alone` of polished
-        runs, and further evaluations, by the names of their files.
+        For each group `settings`, `runs` with their figures, and `over_seeds`: mean, least and greatest.
+        Further evaluations that all runs of a group have follow as `NAME_over_seeds`, by the names of their
+        files.
 
     Raises:
         RunError: a run is not finished.
