@@ -33,7 +33,6 @@ docs: .venv/.installed-docs  ## the site, links checked, into build/site
 bench: $(INSTALLED)  ## the benchmarks
 	$(BIN)/python -m benchmarks throughput
 	$(BIN)/python -m benchmarks settle
-	$(BIN)/python -m benchmarks learner
 
 clean:  ## remove virtual environments, build outputs and caches; runs/ stays
 	rm -rf .venv .venv-* build dist *.egg-info .pytest_cache .ruff_cache

@@ -1,10 +1,9 @@
 """Virtual environments of the libraries that this project is compared with, made on first use.
 
 Each has the peer and the simulator's packages in the versions that run here, so that all contestants train
-on the same environment, and other simulators read the same arm; brax's learner has the older jax that it
-needs. One more has JAX's compiler for GPUs, for machines without a GPU. They lie beside the checkout's own
-`.venv`, as `.venv-PEER`. A file in each lists its packages: an incomplete environment, or one of other
-packages, is made anew.
+on the same environment, and other simulators read the same arm. They lie beside the checkout's own `.venv`,
+as `.venv-PEER`. A file in each lists its packages: an incomplete environment, or one of other packages, is
+made anew.
 
 On Linux, PyTorch comes with gigabytes of CUDA. To do without them, set
 `PIP_EXTRA_INDEX_URL=https://download.pytorch.org/whl/cpu`.
@@ -25,10 +24,8 @@ _SB3 = ("stable-baselines3==2.9.2", "torch==2.13.0")
 PINS = {
     "sbx": ("sbx-rl==0.28.0", *_SB3),
     "sb3-contrib": ("sb3-contrib==2.9.2", *_SB3),
-    "brax": ("brax==0.14.2", "jax==0.9.2", "jaxlib==0.9.2", "flax==0.12.6"),
     "soromox": ("soromox==0.5.0", "diffrax==0.7.2", "equinox==0.13.8"),
 }
-COMPILER = "gpu-compiler"
 # Packages that mjx_softarm, train.runs.evaluate and train.epoch.job import.
 SHARED = (
     *("numpy", "tomli_w", "jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax"),
@@ -41,7 +38,7 @@ class PeerError(RuntimeError):
 
 
 def peer_python(name: str, root: Path = ROOT) -> Path:
-    """Return the interpreter of the virtual environment of a key of `PINS` or of `COMPILER`, made if missing.
+    """Return the interpreter of the virtual environment of a peer, a key of `PINS`; make it if it is missing.
 
     Raises:
         PeerError: it could not be made.
@@ -66,14 +63,10 @@ def peer_python(name: str, root: Path = ROOT) -> Path:
 
 def peer_packages(name: str) -> tuple[str, ...]:
     """Return the packages of a peer's environment; its JAX is for CUDA if this one is."""
-    shared = {package: metadata.version(package) for package in SHARED}
-    if name == COMPILER:
-        versions = {"jax-cuda12-plugin": shared["jax"]} | shared
-    else:
-        own = dict(pin.split("==") for pin in PINS[name])
-        versions = own | shared | own  # its own first, in its own versions
-        if "jax-cuda12-plugin" in {distribution.name for distribution in metadata.distributions()}:
-            versions["jax[cuda12]"] = versions.pop("jax")
+    versions = dict(pin.split("==") for pin in PINS[name])
+    versions |= {package: metadata.version(package) for package in SHARED}
+    if "jax-cuda12-plugin" in {distribution.name for distribution in metadata.distributions()}:
+        versions["jax[cuda12]"] = versions.pop("jax")
     return tuple(f"{package}=={version}" for package, version in versions.items())
 
 

@@ -29,7 +29,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks.harness.rounds import Facts, serve
-from benchmarks.speed.learner_contestants import choose_threads, filled_model
 
 START = time.perf_counter()
 
@@ -105,6 +104,7 @@ def peer(name: str, seed: int) -> Contestant:
     from stable_baselines3.common.logger import Logger  # pyright: ignore[reportMissingImports]
 
     from benchmarks.race.hindsight import GoalEnvs, HindsightBuffer, with_goals
+    from benchmarks.race.threads import choose_threads, filled_model
     from mjx_softarm.env.gym import SoftArmVectorEnv, as_sb3
     from train.presets import PRESETS
 

@@ -1,1 +1,1 @@
-"""Speed: settling, throughput, learner, kernels."""
+"""Speed of settling and of environment steps."""

@@ -22,7 +22,6 @@ import numpy as np
 from benchmarks.harness.common import n_cores
 from benchmarks.harness.peers import PeerError, peer_python
 from benchmarks.harness.rounds import Facts, Worker, WorkerError, take_turns, working
-from benchmarks.speed import gpu
 from benchmarks.speed.mujoco_arms import write_arm
 from benchmarks.speed.truth import ERROR, TOLD, told_error
 from mjx_softarm.env import EnvConfig
@@ -72,7 +71,6 @@ def measure() -> dict[str, Any]:
         "side_by_side": _side_by_side(ArmSpec.default(), on_gpu),
         "simulated_time": simulated_time(),
         "start": _starts(),
-        "targets": [*gpu.rate_targets(rows, on_gpu), gpu.training_target(on_gpu)],
     }
 
 

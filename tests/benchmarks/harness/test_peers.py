@@ -8,7 +8,7 @@ from unittest.mock import Mock
 import pytest
 
 from benchmarks.harness import peers
-from benchmarks.harness.peers import COMPILER, MARKER, PINS, SHARED, PeerError, peer_packages, peer_python
+from benchmarks.harness.peers import MARKER, PINS, SHARED, PeerError, peer_packages, peer_python
 
 
 @pytest.fixture
@@ -29,21 +29,16 @@ def made(monkeypatch):
     [
         ("sbx", "sbx-rl"),
         ("sb3-contrib", "sb3-contrib"),
-        ("brax", "brax"),
         ("soromox", "soromox"),
-        (COMPILER, "jax-cuda12-plugin"),
     ],
 )
 def test_every_requirement_is_pinned_and_the_simulator_s_are_those_that_run_here(name, package):
     requirements = dict(requirement.split("==") for requirement in peer_packages(name))
     assert all(requirements.values()) and package in requirements
     found = {shared: requirements.get(shared, requirements.get(f"{shared}[cuda12]")) for shared in SHARED}
-    own = {pin.split("==")[0] for pin in PINS.get(name, ())}
-    assert own.isdisjoint(SHARED) or name == "brax"
-    assert all(found[shared] == metadata.version(shared) for shared in SHARED if shared not in own)
-    assert requirements == requirements | dict(pin.split("==") for pin in PINS.get(name, ()))
-    if name == COMPILER:
-        assert requirements[package] == metadata.version("jax") and "jax[cuda12]" not in requirements
+    own = dict(pin.split("==") for pin in PINS[name])
+    assert own.keys().isdisjoint(SHARED) and requirements == requirements | own
+    assert all(found[shared] == metadata.version(shared) for shared in SHARED)
 
 
 def test_an_environment_is_made_once_and_each_peer_has_its_own(made, tmp_path):

@@ -2,6 +2,7 @@
 
 import json
 import sys
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -19,6 +20,7 @@ from benchmarks.race.contestants import (
     settings_of,
 )
 from benchmarks.race.race import Limits, RaceError, limits_of, run, train
+from benchmarks.race.threads import choose_threads
 from mjx_softarm.env import EnvConfig, ReachEnv
 from tests.train.small import SHORT
 from train.agent.tqc import TQC
@@ -204,3 +206,23 @@ def test_without_the_first_there_is_no_race_and_other_seeds_are_told(asked, monk
     assert "got status 1" in said.out and "29.5" in said.out
     assert not list(tmp_path.glob("*seed3.json"))
     assert len(list(tmp_path.glob("*seed1.json"))) == len(CONTESTANTS)
+
+
+@pytest.mark.parametrize(
+    "times, chosen",
+    [
+        ({4: [9.0, 1.0, 1.0, 1.0], 1: [3.0] * 4}, 4),
+        ({4: [50.0] * 4, 1: [9.0, 60.0, 3.0, 70.0]}, 1),  # the best of three, after one that does not count
+        ({4: [50.0] * 4, 1: [3.0, 60.0, 60.0, 60.0]}, 4),
+    ],
+)
+def test_pytorch_gets_the_threads_it_trains_fastest_with(monkeypatch, times, chosen):
+    threads, clock = [4], [0.0]
+    torch = SimpleNamespace(
+        get_num_threads=lambda: threads[0], set_num_threads=lambda n: threads.__setitem__(0, n)
+    )
+    monkeypatch.setitem(sys.modules, "torch", torch)
+    monkeypatch.setattr("benchmarks.race.threads.time.perf_counter", lambda: clock[0])
+    left = {n: iter(own) for n, own in times.items()}
+    choose_threads(lambda: clock.__setitem__(0, clock[0] + next(left[threads[0]])))
+    assert threads == [chosen]
