@@ -19,7 +19,8 @@ from mjx_softarm.mechanics.workspace import sample_workspace
 from mjx_softarm.sensing.pose import frame_from_pose, quaternion_from_pose
 from tests.train.small import SHORT, flags, new_job
 from train.__main__ import main
-from train.runs.checkpoint import Run, RunError, sole_trainer
+from train.runs.checkpoint import Run, RunError
+from train.runs.lock import sole_trainer
 from train.runs.plots import IMITATION_PICTURES, REACH_PICTURES
 from train.runs.run import task_of_run
 

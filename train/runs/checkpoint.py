@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
-import fcntl
+import functools
 import json
+import operator
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -28,32 +28,12 @@ from train.epoch.devices import is_first_process, wait_for_all
 from train.epoch.job import TrainState
 
 N_KEPT = 2
-CHECKPOINTS, DEMONSTRATIONS_FILE, LOCK_FILE = "checkpoints", "demonstrations.npz", "training.lock"
+POLICY = "mean_actor_params"  # field of a learner's state that is evaluated and exported
+CHECKPOINTS, DEMONSTRATIONS_FILE = "checkpoints", "demonstrations.npz"
 
 
 class RunError(InputError):
     """A folder without a usable run; the message names the folder and the fault."""
-
-
-@contextlib.contextmanager
-def sole_trainer(path: Path) -> Iterator[None]:
-    """Lock the folder of a run or a sweep while training in it; a killed process releases the lock.
-
-    Where several processes train together, the first one holds it.
-
-    Raises:
-        RunError: another process holds it.
-    """
-    with contextlib.ExitStack() as stack:
-        if is_first_process():
-            file = stack.enter_context(open(path / LOCK_FILE, "w"))
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                raise RunError(
-                    f"{path}: got another process that trains in it, expected none; stop it, or wait"
-                ) from error
-        yield
 
 
 class Run:
@@ -72,6 +52,7 @@ class Run:
         self.path, self.config, self.spec, self.s2r = path, config, spec, s2r
         options = ocp.CheckpointManagerOptions(max_to_keep=N_KEPT, enable_async_checkpointing=False)
         self._manager = ocp.CheckpointManager((path / CHECKPOINTS).resolve(), options=options)
+        self._reader = ocp.PyTreeCheckpointHandler()  # of single fields, which the manager cannot read
 
     @classmethod
     def create(
@@ -209,32 +190,57 @@ class Run:
         """Return one field of the newest checkpoint's state as NumPy arrays, without reading the others.
 
         Args:
-            name: of the field.
+            name: name of the field.
             like: its value, or shapes, structured as the run's.
 
         Raises:
             RunError: there is no checkpoint, or it is not structured so.
         """
-        shapes = {name: jax.tree.map(ocp.utils.to_shape_dtype_struct, like)}
-        as_numpy = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), shapes)
-        arguments = ocp.args.PyTreeRestore(shapes, as_numpy, partial_restore=True)
-        # Not by the manager, which reads a checkpoint in no other way than it has saved one.
-        path = self._manager.directory / str(self._newest()) / "default"
         try:
-            part = ocp.Checkpointer(ocp.PyTreeCheckpointHandler()).restore(path, args=arguments)[name]
+            part = self._read([name], like)
         except (ValueError, KeyError, TypeError) as error:
             raise self._of_another_version() from error
-        # What the checkpoint lacks comes back as it was asked for, and arrays with the shapes that they have.
+        # orbax returns a leaf that the checkpoint lacks as it was asked for, and others in their own shapes.
         for got, expected in zip(jax.tree.leaves(part), jax.tree.leaves(like), strict=True):
             if isinstance(got, jax.ShapeDtypeStruct) or got.shape != expected.shape:
                 raise self._of_another_version()
         return part
+
+    def policy(self) -> Any:
+        """Return the parameters of the newest checkpoint's policy as NumPy arrays; nothing else is read.
+
+        They are the field `POLICY` of the learner's state, or of the state that it wraps as `agent`.
+
+        Raises:
+            RunError: there is no checkpoint, or no such field in it.
+        """
+        learner = self._reader.metadata(self._newest_path)["learner"]
+        fields = ["agent", POLICY] if "agent" in learner else [POLICY]
+        try:
+            saved = functools.reduce(operator.getitem, fields, learner)
+        except (KeyError, TypeError) as error:
+            raise self._of_another_version() from error
+        return self._read(["learner", *fields], saved)
+
+    def _read(self, fields: Sequence[str], like: Any) -> Any:
+        """Return the value of nested fields of the newest checkpoint; `like` has its structure and shapes."""
+        shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), like)
+        wanted: Any = functools.reduce(lambda value, name: {name: value}, reversed(fields), shapes)
+        as_numpy = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), wanted)
+        arguments = ocp.args.PyTreeRestore(wanted, as_numpy, partial_restore=True)
+        return functools.reduce(
+            operator.getitem, fields, self._reader.restore(self._newest_path, args=arguments)
+        )
 
     def _of_another_version(self) -> RunError:
         return RunError(
             f"{self.path}: got a checkpoint of other parts or sizes, expected this version's; "
             "continue it with the commit that its config.json names"
         )
+
+    @property
+    def _newest_path(self) -> Any:
+        return self._manager.directory / str(self._newest()) / "default"
 
     def _newest(self) -> int:
         epoch = self.latest_epoch

@@ -24,9 +24,10 @@ from train.epoch import devices
 from train.options import NewRunOptions, named_preset, start
 from train.presets import IMITATION_PRESETS, PRESETS
 from train.runs import run as runs
-from train.runs.checkpoint import Run, RunError, sole_trainer
+from train.runs.checkpoint import Run, RunError
 from train.runs.evaluate import N_ACTIONS
 from train.runs.export import export_run
+from train.runs.lock import sole_trainer
 from train.runs.task import Task, task_of
 
 Runs = Annotated[
@@ -148,7 +149,7 @@ def evaluate(
     n_actions = actions or N_ACTIONS
     console = start()
     opened = Run.open(run)
-    task, policy = runs.restore_policy(opened)
+    task, policy = runs.task_of_run(opened), opened.policy()
     if in_motion is None and not payload:
         _show(opened, task, runs.finish(opened, task, policy), console)
         return 0

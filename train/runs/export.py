@@ -6,57 +6,50 @@ import datetime
 import functools
 import json
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 
-from mjx_softarm.env import ReachEnv
 from mjx_softarm.mdp.actions import N_ACTIONS
+from mjx_softarm.mechanics.workspace import sample_evenly, sample_workspace
 from mjx_softarm.policy.file import ArmModel, policy_from_actor, save_policy
+from mjx_softarm.sensing.s2r import S2R, correct
 from mjx_softarm.spec import ArmSpec
 from train.runs.checkpoint import Run, RunError
 from train.runs.estimator import Distilled, distil
-from train.runs.run import restore_policy
-from train.runs.task import Task
 
 N_WORKSPACE = 2048  # poses that stand for the workspace
-SEED = 0  # seed of the estimator
+SEED = 0  # seed of the networks and of the workspace
+ERRORS = ("tip_mm", "turn_deg", "load_kg", "spring_mm")  # fields of `Distilled` that provenance keeps
 
 
-def export_run(run: Run, path: Path | None = None, task: Task | None = None) -> Path:
+def export_run(run: Run, path: Path | None = None, params: Any = None) -> Path:
     """Write the policy of a run's newest checkpoint; return the file.
 
     Args:
         run: folder with config and checkpoint.
         path: file to write; `policy.npz` in the run by default.
-        task: task of the run, where its learner is not the one that its config names.
+        params: parameters of the policy; by default those in the checkpoint.
 
     Raises:
         RunError: the run has no checkpoint, or its learner's policy is not a network that the file can hold.
         SealedFileError: the file cannot be written.
     """
-    task, params = restore_policy(run, task)
-    model, distilled = arm_model(task.job.env)
-    errors = {name: getattr(distilled, name) for name in ("tip_mm", "turn_deg", "load_kg", "spring_mm")}
-    provenance = {
-        **json.loads((run.path / "config.json").read_text("utf-8")),
-        "epoch": run.latest_epoch,
-        "estimator_errors": {
-            name: {f"{payload_kg:g} kg": error._asdict() for payload_kg, error in by_payload.items()}
-            for name, by_payload in errors.items()
-        },
-        "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-    }
+    if params is None:
+        params = run.policy()
+    model, distilled = arm_model(run.spec, run.s2r)
+    env = run.config.env
     try:
         policy = policy_from_actor(
             jax.device_get(params),
             run.spec,
-            run.config.env.reward,
+            env.reward,
             model,
-            provenance,
-            tolerance_m=1e-3 * run.config.env.saturation_tolerance_mm,
+            _provenance(run, distilled),
+            tolerance_m=1e-3 * env.saturation_tolerance_mm,
             n_actions=N_ACTIONS,
-            action_s=run.config.env.dynamic_step_s if run.config.env.moves else 0.0,
+            action_s=env.dynamic_step_s if env.moves else 0.0,
         )
     except (ValueError, AttributeError) as error:
         raise RunError(f"{run.path}: {error}") from error
@@ -65,16 +58,36 @@ def export_run(run: Run, path: Path | None = None, task: Task | None = None) -> 
     return path
 
 
-def arm_model(env: ReachEnv) -> tuple[ArmModel, Distilled]:
-    """Return the deployed arm's model of an environment's arm, and its errors."""
-    distilled = _distil(env.spec)
-    halves = [env.sample_pool(N_WORKSPACE // 2, SEED, evenly).pose for evenly in (False, True)]
-    workspace = np.concatenate(halves).astype(np.float32)
+def arm_model(spec: ArmSpec, s2r: S2R | None) -> tuple[ArmModel, Distilled]:
+    """Return an arm's networks and workspace, as the arm's computer needs them, and the networks' errors."""
+    distilled = _distil(spec)
     networks = distilled.estimator, distilled.load_estimator, distilled.spring_model
-    return ArmModel(workspace, *networks, env.s2r), distilled
+    return ArmModel(_workspace(spec, s2r), *networks, s2r), distilled
+
+
+def _workspace(spec: ArmSpec, s2r: S2R | None) -> np.ndarray:
+    """Return poses (N_WORKSPACE, 6) of the real arm: half at random pressures, half uniform in volume."""
+    halves = [sample(spec, N_WORKSPACE // 2, SEED) for sample in (sample_workspace, sample_evenly)]
+    with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
+        poses = [p.pose if s2r is None else correct(s2r, p.pose, p.spring_m) for p in halves]
+    return np.concatenate(poses).astype(np.float32)
 
 
 @functools.cache
 def _distil(spec: ArmSpec) -> Distilled:
     """Return the arm's networks, distilled once for all policies that a process exports."""
     return distil(spec, SEED)
+
+
+def _provenance(run: Run, distilled: Distilled) -> dict[str, Any]:
+    """Return the run's config with versions and commit, its epoch, the networks' errors, and the date."""
+    errors = {
+        name: {f"{kg:g} kg": error._asdict() for kg, error in getattr(distilled, name).items()}
+        for name in ERRORS
+    }
+    return {
+        **json.loads((run.path / "config.json").read_text("utf-8")),
+        "epoch": run.latest_epoch,
+        "estimator_errors": errors,
+        "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+    }

@@ -112,16 +112,6 @@ def task_of_run(run: Run, mesh: Mesh | None = None) -> Task:
     return task_of(run.config, ReachEnv(run.spec, run.config.env, run.s2r), run.demonstrations(), mesh)
 
 
-def restore_policy(run: Run, task: Task | None = None) -> tuple[Task, Any]:
-    """Return the task of a run, or that given, and the policy of the run's newest checkpoint.
-
-    Raises:
-        RunError: the run has no checkpoint, or one of another learner.
-    """
-    task = task or task_of_run(run)
-    return task, task.job.policy(_restored(run, task))
-
-
 def begin_with(task: Task, seed: int, **donors: Run) -> TrainState:
     """Return the state that a new run begins with, parts of its learner being taken from other runs.
 
@@ -138,18 +128,12 @@ def begin_with(task: Task, seed: int, **donors: Run) -> TrainState:
     for name, donor in donors.items():
         if adopt is None:
             raise RunError(f"{donor.path}: got a donor of {name}, expected none for this learner")
-        given = _restored(donor, task_of_run(donor)).learner
+        given = donor.restore_part("learner", task_of_run(donor).job.shapes().learner)
         try:
             state = state._replace(learner=adopt(state.learner, **{name: given}))
         except ValueError as error:
             raise RunError(f"{donor.path}: {error}") from error
     return task.job.place(state)
-
-
-def _restored(run: Run, task: Task) -> TrainState:
-    """Return the state of a run's newest checkpoint: learner in NumPy, shapes of the rest."""
-    shapes = task.job.shapes()
-    return shapes._replace(learner=run.restore_part("learner", shapes.learner))
 
 
 def open_board(run: Run, state: TrainState) -> SummaryWriter:

@@ -16,7 +16,7 @@ from mjx_softarm._support import cli
 from train.config import ConfigError, TrainConfig, override
 from train.options import NewRunOptions, named_preset, start
 from train.presets import PRESETS
-from train.runs.checkpoint import sole_trainer
+from train.runs.lock import sole_trainer
 from train.runs.run import Interrupted, free_path
 from train.sweep.job import setting, variable
 from train.sweep.report import CURVES_FILE, RESULTS_FILE, report

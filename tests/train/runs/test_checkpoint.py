@@ -1,12 +1,21 @@
-"""The folder of a run: refused in words, and its metrics forgotten with the epochs."""
+"""The folder of a run: refused in words, its metrics forgotten with the epochs, its policy read alone."""
 
+import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from mjx_softarm.spec import ArmSpec
+from train.agent.analytic import Analytic, AnalyticConfig
+from train.agent.hindsight_tqc import HindsightTQC
+from train.agent.imitation import Imitation
 from train.config import TrainConfig
+from train.epoch.job import TrainState
 from train.runs.checkpoint import Run, RunError
 
 CONFIG = TrainConfig()
+
+pytestmark = pytest.mark.usefixtures("quick_compiler")
 
 
 def test_a_folder_that_is_no_run_is_named(tmp_path):
@@ -27,3 +36,20 @@ def test_metrics_later_than_the_checkpoint_are_forgotten(tmp_path):
         file.write('{"epoch": 5, "cut')
     run.rewind(2)
     assert run.metrics() == [{"epoch": 1}, {"epoch": 2}]
+
+
+def test_the_policy_is_read_from_the_state_of_every_learner(tmp_path, short_env, imitation_config, shown):
+    config, zero = imitation_config, jnp.zeros((), jnp.int32)
+    tqc = HindsightTQC(config, short_env)
+    learners = {
+        "tqc": tqc,
+        "analytic": Analytic(AnalyticConfig(hidden=(16,)), short_env, config.n_arms),
+        "imitation": Imitation(tqc, config, short_env, shown),
+    }
+    for name, learner in learners.items():
+        run = Run.create(tmp_path / name, config, short_env.spec)
+        with pytest.raises(RunError, match="got no checkpoint, expected one"):
+            run.policy()
+        own = jax.jit(learner.init)(jax.random.PRNGKey(0))
+        run.save(1, TrainState(None, own, None, (), zero, zero, zero, zero))
+        jax.tree.map(np.testing.assert_array_equal, run.policy(), jax.device_get(learner.policy(own)))
