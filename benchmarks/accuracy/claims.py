@@ -40,7 +40,8 @@ from mjx_softarm.mechanics.workspace import HELD_OUT_SEED
 from mjx_softarm.policy.file import SHIPPED, load_policy
 from train.config import TrainConfig, override
 from train.presets import PRESETS
-from train.runs.evaluate import N_GOALS, PATH, Reached, follow_from, paths_of, start_keys, towards
+from train.runs import evaluate
+from train.runs.evaluate import N_GOALS, PATH, Reached, paths_of, start_keys, towards
 from train.runs.task import learner_of, task_of
 
 LOADS_G = (0, 250, 500, 1000)
@@ -194,7 +195,7 @@ def follow(env: ReachEnv, learner: Any, policy: Any, load_kg: Array, path: Array
     """Return the results of one arm with a payload, from a random start, along a path (n, 6) of goals."""
     noise = jax.tree.map(lambda x: x[0], env.sample_noise(key, 1))
     share = noise.uniform.at[PAYLOAD_SHARE].set(load_kg / env.payload_max_kg)
-    return follow_from(env, learner, policy, path, env.reset_from(noise._replace(uniform=share)))
+    return evaluate.follow(env, learner, policy, path, env.reset_from(noise._replace(uniform=share)))
 
 
 def figures(off_mm: np.ndarray, n_saturated: np.ndarray) -> dict[str, float]:

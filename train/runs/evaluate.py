@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -36,16 +37,15 @@ class Reached(NamedTuple):
     pose: Array  # (n, 6) [mm, deg]
     scaled_error: Array  # (n,) norm of e
     saturated_chambers: Array  # (n,)
-    settled: Array  # (n,) bool, after every action
+    settled: Array  # (n,) bool, whether the arm settled after every action
     pressure_kpa: Array  # (n, n_chambers)
-    # (n,) of the body to the pipe's wall, in motion the least on the way; infinite without a pipe
-    clearance_mm: Array
-    # In motion, else NaN:
-    near_s: Array  # (n,) time until the tip is within NEAR_MM for good; infinite if never
-    overshoot_mm: Array  # (n,) how far the tip went beyond the goal, along the way from its start
+    clearance_mm: Array  # (n,) body to the wall, in motion the least on the way; infinite without a pipe
+    near_s: Array  # (n,) time until the tip is within NEAR_MM for good; infinite if never, NaN at rest
+    overshoot_mm: Array  # (n,) distance of the tip beyond the goal, along its way; NaN at rest
 
     @property
-    def tip_error_mm(self) -> Array:
+    def tip_error_mm(self) -> np.ndarray:
+        """Distances (n,) of the tips to their goals."""
         return np.linalg.norm(np.asarray(self.pose - self.goal)[:, :3], axis=-1)
 
 
@@ -57,21 +57,20 @@ class Summary:
     p95_mm: float
     reached_share: float  # goals with the norm of e below theta and no chamber saturated
     saturated_share: float  # goals at which a chamber is saturated
-    even_median_mm: float  # of the goals that are uniform in volume, as the next two
-    even_p95_mm: float
-    even_reached_share: float
-    unsettled: int  # in all of the evaluation
+    even_median_mm: float  # median at the goals that are uniform in volume
+    even_p95_mm: float  # 95 % at these goals
+    even_reached_share: float  # reached share of these goals
+    unsettled: int  # arms that did not settle, at all goals and on the circle
     circle_mean_mm: float
     circle_max_mm: float
     circle_saturated_chambers: int  # summed over the circle's points
-    # In motion:
-    near_share: float | None = None  # goals within NEAR_MM of which the tip comes for good
-    near_median_s: float | None = None  # median time until then, of all goals; None if most never come near
-    overshoot_median_mm: float | None = None
-    overshoot_p95_mm: float | None = None
+    near_share: float | None = None  # in motion: goals with the tip within NEAR_MM for good
+    near_median_s: float | None = None  # in motion: median of `near_s`; None if it is infinite
+    overshoot_median_mm: float | None = None  # in motion
+    overshoot_p95_mm: float | None = None  # in motion
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the figures that there are."""
+        """Return the figures that are not None."""
         return {name: value for name, value in dataclasses.asdict(self).items() if value is not None}
 
     def rows(self) -> list[tuple[str, str]]:
@@ -114,12 +113,13 @@ class Evaluator:
     def __init__(self, env: ReachEnv, learner: Learner, n_goals: int = N_GOALS, n_actions: int = N_ACTIONS):
         self.env, self.learner, self.n_goals = nominal(env), learner, n_goals
         self.circle = np.asarray(circle_poses(env.spec))
-        one = functools.partial(follow, self.env, learner, n_actions=n_actions)
-        self._follow = xla.jit(jax.vmap(one, in_axes=(None, 0, 0)), env.uses_mjx)
+        self._follow = xla.jit(
+            jax.vmap(follower(self.env, learner, n_actions), in_axes=(None, 0, 0)), env.uses_mjx
+        )
 
     @functools.cached_property
     def goals(self) -> Array:
-        """Both sets of held-out poses (2 n_goals, 6) [mm, deg], drawn on first use: an export needs none."""
+        """Both sets of held-out poses (2 n_goals, 6) [mm, deg], drawn on first use."""
         sets = (self.env.sample_pool(self.n_goals, HELD_OUT_SEED, evenly) for evenly in (False, True))
         return jnp.concatenate([poses.pose for poses in sets])
 
@@ -129,10 +129,12 @@ class Evaluator:
 
     def __call__(self, policy: Any) -> tuple[Summary, Reached, Reached]:
         """Return figures, and the results on the first set and on the circle as NumPy arrays."""
-        policy = jax.device_get(policy)  # maybe on many devices; one is enough
+        # Follow all paths; the policy may be on many devices, and one is enough.
+        policy = jax.device_get(policy)
         lap, n_goals = len(self.circle), len(self.goals)
         paths = np.concatenate([paths_of(self.goals), np.tile(self.circle, (2, 1))[None]])
         found = jax.device_get(self._follow(policy, paths, start_keys(len(paths))))
+        # Split the results into the sets of goals and the circle.
         both = jax.tree.map(lambda x: np.split(x[:-1].reshape(-1, *x.shape[2:])[:n_goals], 2), found)
         workspace, even = (Reached(*(field[k] for field in both)) for k in range(2))
         circle = jax.tree.map(lambda x: x[-1, lap:], found)
@@ -170,6 +172,7 @@ def reach(
         after = env.step(state, learner.mode(policy, state.obs))
         return after, {name: after.info.get(name, ()) for name in ("valid", "clearance_mm", "path_mm")}
 
+    # Act, and find what the whole way tells.
     state, way = jax.lax.scan(act, towards(env, state, goal), None, length=n_actions)
     arm = state.pipeline_state
     near_s = overshoot_mm = jnp.asarray(jnp.nan)
@@ -207,13 +210,6 @@ def way_figures(way_mm: Array, goal_mm: Array, period_s: float) -> tuple[Array, 
 
 
 def follow(
-    env: ReachEnv, learner: Learner, policy: Any, path: Array, key: Array, n_actions: int = N_ACTIONS
-) -> Reached:
-    """Return the results of one arm, from a random start, along a path (n, 6) of goals."""
-    return follow_from(env, learner, policy, path, env.reset(key), n_actions)
-
-
-def follow_from(
     env: ReachEnv, learner: Learner, policy: Any, path: Array, state: State, n_actions: int = N_ACTIONS
 ) -> Reached:
     """Return the results of one arm, from a state, along a path (n, 6) of goals."""
@@ -224,6 +220,11 @@ def follow_from(
     return jax.lax.scan(go_on, state, path)[1]
 
 
+def follower(env: ReachEnv, learner: Learner, n_actions: int) -> Callable[[Any, Array, Array], Reached]:
+    """Return the function of policy, path and key that follows a path from a random start."""
+    return lambda policy, path, key: follow(env, learner, policy, path, env.reset(key), n_actions)
+
+
 def summarise(workspace: Reached, even: Reached, circle: Reached, threshold: float) -> Summary:
     """Return the figures of results on both sets of goals and on the circle."""
     error, around, at_even = workspace.tip_error_mm, circle.tip_error_mm, even.tip_error_mm
@@ -232,9 +233,10 @@ def summarise(workspace: Reached, even: Reached, circle: Reached, threshold: flo
         free = at.saturated_chambers == 0
         return float(np.mean((at.scaled_error < threshold) & free & at.settled))
 
+    # Figures of motion, where the arms moved.
     motion = {}
     if np.isfinite(workspace.overshoot_mm).all():
-        median_s = float(np.quantile(workspace.near_s, 0.5, method="higher"))  # of infinite ones, too
+        median_s = float(np.quantile(workspace.near_s, 0.5, method="higher"))  # some are infinite
         motion = {
             "near_share": float(np.mean(np.isfinite(workspace.near_s))),
             "near_median_s": median_s if np.isfinite(median_s) else None,

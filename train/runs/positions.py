@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -15,7 +14,7 @@ from mjx_softarm._support import xla
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.sensing.pose import pose_error
 from train.agent.learner import Learner
-from train.runs.evaluate import N_ACTIONS, Reached, follow, nominal, start_keys
+from train.runs.evaluate import N_ACTIONS, Reached, follower, nominal, start_keys
 
 
 class AtPositions(NamedTuple):
@@ -30,26 +29,27 @@ class PositionSummary:
     """Figures of an evaluation, as tables show them."""
 
     success_share: float
-    success_first_share: float  # of the positions that are goals from the start
-    reached_share: float  # close enough, whatever the chambers and the wall say
-    median_mm: float
-    max_mm: float
-    x_mm: float  # mean absolute errors
-    y_mm: float
-    z_mm: float
+    success_first_share: float  # share of success at the goals of the first stage
+    reached_share: float  # positions with the tip close enough, whatever chambers and wall say
+    median_mm: float  # tip error
+    max_mm: float  # largest tip error
+    x_mm: float  # mean absolute error along x
+    y_mm: float  # mean absolute error along y
+    z_mm: float  # mean absolute error along z
     saturated_positions: int
     outside_positions: int  # with part of the body beyond the pipe's wall, in motion on the way there
     unsettled: int
     error_mm: tuple[float, ...]  # tip error at each position
 
     def to_dict(self) -> dict[str, Any]:
+        """Return the figures by name."""
         return dataclasses.asdict(self)
 
     def rows(self) -> list[tuple[str, str]]:
         """Return the rows of a table: name, and value with its unit."""
         return [
             ("positions with success", f"{100 * self.success_share:.1f} %"),
-            ("of those of the first stage", f"{100 * self.success_first_share:.1f} %"),
+            ("positions of the first stage with success", f"{100 * self.success_first_share:.1f} %"),
             ("positions reached", f"{100 * self.reached_share:.1f} %"),
             ("tip error, median", f"{self.median_mm:.2f} mm"),
             ("tip error, largest", f"{self.max_mm:.2f} mm"),
@@ -77,9 +77,7 @@ class PositionEvaluator:
     ):
         self.env, self.learner, self.first = nominal(env), learner, first
         self.positions = np.asarray(positions, np.float32)
-        self._follow = xla.jit(
-            functools.partial(follow, self.env, learner, n_actions=n_actions), env.uses_mjx
-        )
+        self._follow = xla.jit(follower(self.env, learner, n_actions), env.uses_mjx)
 
     def on(self, env: ReachEnv, n_actions: int = N_ACTIONS) -> PositionEvaluator:
         """Return the same evaluation on another environment."""
@@ -87,14 +85,14 @@ class PositionEvaluator:
 
     def __call__(self, policy: Any) -> tuple[PositionSummary, AtPositions]:
         """Return figures, and results as NumPy arrays."""
-        policy = jax.device_get(policy)  # maybe on many devices; one is enough
+        policy = jax.device_get(policy)  # it may be on many devices
         passes = jax.device_get(self._follow(policy, np.tile(self.positions, (2, 1)), start_keys(1)[0]))
         reached = jax.tree.map(lambda x: x[len(self.positions) :], passes)
         return summarise(reached, self.env.config.reward.threshold, self.first)
 
 
 def summarise(reached: Reached, threshold: float, first: np.ndarray) -> tuple[PositionSummary, AtPositions]:
-    """Return the figures of results; a scaled error below the threshold is close enough."""
+    """Return the figures of results; a tip is close enough with its scaled error below the threshold."""
     error_mm = reached.tip_error_mm
     close = reached.scaled_error < threshold
     success = close & (reached.saturated_chambers == 0) & (reached.clearance_mm > 0.0) & reached.settled
