@@ -26,7 +26,7 @@ BENCHMARKS = {
     "learning": "benchmarks.accuracy.learning:measure",
     "race": "benchmarks.race.race:race",
     "path": "benchmarks.accuracy.path:measure",
-    "paper": "benchmarks.paper.experiments:paper",
+    "paper": "benchmarks.paper.experiments:Paper",
 }
 
 

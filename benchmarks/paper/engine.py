@@ -64,7 +64,7 @@ SMOKE = Settings(
 )
 
 
-class Stage(NamedTuple):
+class WorkStage(NamedTuple):
     """A job, called with the folder, the settings and its inputs; it is done once its results exist."""
 
     name: str
@@ -88,7 +88,7 @@ def claim(folder: Path, settings: Settings) -> None:
         raise JobError(f"{file}: {differing}; choose another --out")
 
 
-def run_stages(folder: Path, settings: Settings, groups: Sequence[Sequence[Stage]]) -> dict[str, Any]:
+def run_stages(folder: Path, settings: Settings, groups: Sequence[Sequence[WorkStage]]) -> dict[str, Any]:
     """Run the stages that are not done, group by group.
 
     Returns:

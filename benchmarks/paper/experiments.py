@@ -1,8 +1,12 @@
-"""The paper's experiments on twins, in open space and in confined spaces: `python -m benchmarks paper`."""
+"""How close does the paper's method come on simulated stand-ins for an arm?
+
+The paper's experiments, in open space and in confined spaces: `python -m benchmarks paper`.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -23,19 +27,9 @@ def _presets(words: list[str]) -> tuple[str, ...]:
     return names
 
 
-def paper(
-    smoke: bool = False,
-    only: Literal["open", "confined"] | None = None,
-    twins: cli.Integers | None = None,
-    seeds: cli.Integers | None = None,
-    loads: cli.Integers | None = None,
-    arm: Literal["twin", "rod"] = "twin",
-    preset: Literal["quick", "analytic", "payload"] | None = None,
-    env_steps: int | None = None,
-    beside: Annotated[tuple[str, ...], cli.listed(_presets, "NAME,NAME,...")] = (),
-    out: cli.MaybePath = None,
-) -> int:
-    """Run the paper's experiments on twins, beside its numbers, in hours.
+@dataclass(frozen=True)
+class Paper:
+    """How close does the paper's method come on simulated stand-ins for an arm? Takes hours.
 
     The exit status is 1 if a target is missed.
 
@@ -55,28 +49,54 @@ def paper(
             as long as that
         out: working folder; None: runs/paper
     """
-    if only != "open" and arm == "rod":
-        raise InputError(f"--only: got {only}, expected open with --arm rod")
-    if beside and (smoke or only == "confined"):
-        raise InputError(f"--beside: got {','.join(beside)}, expected none with --smoke or --only confined")
-    training = (f"total_env_steps={env_steps}",) if env_steps else None
-    given = {"twins": twins, "seeds": seeds, "loads_g": loads, "preset": preset, "training": training}
-    chosen = {name: value for name, value in given.items() if value is not None}
-    settings = dataclasses.replace(SMOKE if smoke else Settings(), arm=arm, beside=beside, **chosen)
-    folder = out or Path("runs/paper-smoke" if smoke else "runs/paper")
-    pictures = folder if smoke else RESULTS
-    status = 0
-    for experiment in [only] if only else FILMS:
-        data = run(experiment, folder, pictures, settings)
-        means = {"mean and deviation over runs": printed_rows(experiment, data["spreads"])}
-        show(means | {"targets": data["targets"]}, experiment)
-        status |= status_of(data)
-        print(f"written: {pictures / json_name(experiment, settings)}")
-    return 0 if smoke else status
+
+    smoke: bool = False
+    only: Literal["open", "confined"] | None = None
+    twins: cli.Integers | None = None
+    seeds: cli.Integers | None = None
+    loads: cli.Integers | None = None
+    arm: Literal["twin", "rod"] = "twin"
+    preset: Literal["quick", "analytic", "payload"] | None = None
+    env_steps: int | None = None
+    beside: Annotated[tuple[str, ...], cli.listed(_presets, "NAME,NAME,...")] = ()
+    out: cli.MaybePath = None
+
+    def __call__(self) -> int:
+        """Run the experiments, print and write their figures; return the exit status."""
+        settings = self.settings()
+        folder = self.out or Path("runs/paper-smoke" if self.smoke else "runs/paper")
+        pictures = folder if self.smoke else RESULTS
+        status = 0
+        for experiment in [self.only] if self.only else FILMS:
+            data = run(experiment, folder, pictures, settings)
+            means = {"mean and deviation over runs": printed_rows(experiment, data["spreads"])}
+            show(means | {"targets": data["targets"]}, experiment)
+            status |= status_of(data)
+            print(f"written: {pictures / json_name(experiment, settings)}")
+        return 0 if self.smoke else status
+
+    def settings(self) -> Settings:
+        """Return the settings that these options choose.
+
+        Raises:
+            InputError: the options do not go together.
+        """
+        if self.only != "open" and self.arm == "rod":
+            raise InputError(f"--only: got {self.only}, expected open with --arm rod")
+        if self.beside and (self.smoke or self.only == "confined"):
+            got = ",".join(self.beside)
+            raise InputError(f"--beside: got {got}, expected none with --smoke or --only confined")
+        training = (f"total_env_steps={self.env_steps}",) if self.env_steps else None
+        given = {"twins": self.twins, "seeds": self.seeds, "loads_g": self.loads}
+        given |= {"preset": self.preset, "training": training}
+        chosen = {name: value for name, value in given.items() if value is not None}
+        return dataclasses.replace(
+            SMOKE if self.smoke else Settings(), arm=self.arm, beside=self.beside, **chosen
+        )
 
 
 def run(experiment: str, folder: Path, pictures: Path, settings: Settings) -> dict[str, Any]:
-    """Run the stages of an experiment that are not done and write its report; returns the figures.
+    """Run the stages of an experiment that are not done and write its report; return the figures.
 
     Raises:
         JobError: a stage failed, or the folder has other settings or files of an older version.

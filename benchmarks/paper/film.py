@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from PIL import Image, ImageDraw
 
-from benchmarks.paper.jobs import Scene
 from benchmarks.paper.kinds import KINDS, Trial
 from benchmarks.paper.measure import WatchedTwin, captured_finger_tips, finger_tips, operate
+from benchmarks.paper.scene import Scene
 from mjx_softarm.mechanics.pipe import PIPES_MM, CrossPipe
 
 WIDTH, HEIGHT = 240, 320  # of each half [px]
@@ -34,7 +34,7 @@ class SideView(NamedTuple):
     lines_mm: tuple[np.ndarray, ...] = ()  # (k, 2) each, along these axes
 
 
-class Camera:
+class TwinCamera:
     """Pictures of a twin at equal times as it is driven, with what motion capture saw then."""
 
     def __init__(self, twin: Any, renderer: Any):
@@ -80,10 +80,10 @@ def film_side_by_side(path: Path, scenes: Sequence[tuple[Scene, Trial]]) -> None
     write_gif(path, side_by_side(columns), LOAD_FRAME_MS)
 
 
-def _filmed(scene: Scene, trial: Trial) -> Camera:
+def _filmed(scene: Scene, trial: Trial) -> TwinCamera:
     """Run a trial; returns the camera that filmed it."""
     with scene.twin.renderer(WIDTH, HEIGHT) as renderer:
-        camera = Camera(scene.twin, renderer)
+        camera = TwinCamera(scene.twin, renderer)
         operate(WatchedTwin(scene.twin, camera.shoot), *scene[1:], trial.objects)
     return camera
 

@@ -33,7 +33,6 @@ KINDS = {
     "pipe": Kind("learned reward", "pipe300", "pipe"),
     "moving": Kind("learned reward, in motion", "pipe300", "pipe-moving"),
     "hand-made": Kind("hand-made reward", "pipe300", "hand-made"),
-    "no-penalty": Kind("no gradient penalty", "pipe300", "pipe", ("gail.gradient_penalty=0",)),
     "narrow": Kind("hand-made, and learned in the wide pipe", "pipe250", "frozen", reward_of="pipe"),
     "narrow-learned": Kind(
         "learned in the wide pipe", "pipe250", "frozen", ("hand_made_weight=0",), reward_of="pipe"

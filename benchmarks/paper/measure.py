@@ -1,8 +1,7 @@
 """A trial on a twin and its outcome: errors by motion capture, saturation, contact forces, objects moved.
 
-Whether an object is taken depends on where the finger tips are when the loop reports an arrival: near enough
-to the object, the twin gets its weight, else the object stays. An object released near enough to a
-container's place lies where the finger tips were; else it has fallen beside the container and is lost.
+An object is taken if the finger tips are near it when the loop reports an arrival: the twin then gets its
+weight. An object that is released near its container lies where the finger tips were; elsewhere it is lost.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ CALM_N = 1.0  # contact force that counts as none
 OBJECTS_KG = {"as shown": (BALL_KG, APPLE_KG), "exchanged": (APPLE_KG, BALL_KG)}
 
 
-class Outcome(NamedTuple):
+class TrialOutcome(NamedTuple):
     """Outcome of a trial with p goals and t ticks, on an arm with n springs; NaN where a goal was missed."""
 
     goal: np.ndarray  # (p, 6) [mm, deg]
@@ -43,11 +42,6 @@ class Outcome(NamedTuple):
     events: np.ndarray  # (faults,) how often the loop reported each of `faults.Fault`
     latency_s: np.ndarray  # (2,) median and 99.9 % of a tick's computing time
     time_s: np.ndarray  # (t,)
-    point: np.ndarray  # (t,) index of the goal, -1 without one
-    reference_m: np.ndarray  # (t, n)
-    spring_m: np.ndarray  # (t, n) as read
-    pressure_kpa: np.ndarray  # (t, n) as measured
-    finger_m: np.ndarray  # (t, 3) finger tips by motion capture
     wall_n: np.ndarray  # (t,) contact force of the walls, the largest within each tick
     container_n: np.ndarray  # (t,) contact force of the containers
 
@@ -75,7 +69,7 @@ class WatchedTwin:
 class Gripper:
     """The gripper of a twin, and the objects in the containers.
 
-    Objects lie where the demonstrations have the finger tips as they pick them, `goals_m` (p, 3).
+    An object lies where the demonstrated finger tips pick it, in `goals_m` (p, 3).
     """
 
     def __init__(self, arm: Any, names: Sequence[str], goals_m: np.ndarray, objects: str, gripper_m: float):
@@ -89,7 +83,7 @@ class Gripper:
         self.success = np.zeros(len(names), bool)
 
     def arrived(self, k: int) -> None:
-        """Pick or place, if that is what goal k is for."""
+        """Pick or place at goal k, if its name says so."""
         operation, container = self._names[k].split(" ")[0], _container(self._names[k])
         if operation == "pick" and self._held_kg is None and container in self._lying:
             object_m, kg = self._lying[container]
@@ -132,16 +126,18 @@ def operate(
     names: Sequence[str],
     objects: str = "",
     moves: bool = False,
-) -> Outcome:
+) -> TrialOutcome:
     """Follow goals (p, 6) [mm, deg], picking and placing as their names say; raises as `measure`.
 
-    If it moves, the arm passes those named "to ..." without a stop, and the outcome is of the others alone.
+    If `moves`, the arm passes goals named "to ..." without a stop, and the outcome leaves them out.
     """
+    # Watch the twin's contact forces and its gripper.
     gripper_m = controller.policy.spec.mass.gripper_length_m
     forces: list[tuple[float, float]] = []
     force = getattr(twin, "wall_force_n", lambda: (0.0, 0.0))  # a rod touches nothing
     watched: Any = WatchedTwin(twin, lambda: forces.append(force()))
     gripper = Gripper(watched, names, finger_tips(goals, gripper_m), objects, gripper_m)
+    # Run the loop, with or without stops.
     stopped = ~(moves & np.char.startswith(names, "to "))
     stopped[[0, -1]] = True
     stops = np.flatnonzero(stopped)
@@ -152,6 +148,7 @@ def operate(
         run = run._replace(arrivals=at)
     else:
         run = follow(watched, controller, goals, arrived=gripper.arrived)
+    # Measure the run, and add the objects and the forces of each tick.
     outcome = measure(run, controller, goals[stops])
     force_n = np.zeros((len(run.log), 2))
     n = min(len(forces), len(force_n))  # a lost arm takes no more pressures; venting is not logged
@@ -164,52 +161,30 @@ def operate(
     )
 
 
-def measure(run: Run, controller: Controller, goals: np.ndarray) -> Outcome:
+def measure(run: Run, controller: Controller, goals: np.ndarray) -> TrialOutcome:
     """Return the outcome of a run towards goals (p, 6) [mm, deg], without objects and contact forces.
 
     Raises:
         InputError: no tick was logged.
     """
-    log, policy = run.log, controller.policy
+    log = run.log
     if not len(log):
         cause = run.ending.cause or "all were refused"
         raise InputError(f"goals: got {len(goals)} and no tick of the loop: {cause}, expected one to go to")
-    assert log.pressure_kpa is not None and log.reference_m is not None and log.goal is not None
-    assert log.tip_m is not None and log.tip_quaternion is not None  # a twin has motion capture
-    spring_m = policy.sensor.lengths(log.readings, np.nan).length_m
     counts = run.counts()
-    finger_m = captured_finger_tips(log.tip_m, log.tip_quaternion, policy.spec.mass.gripper_length_m)
-    return Outcome(
+    return TrialOutcome(
         **accuracy.measure(run, controller, goals)._asdict(),
         name=np.full(len(goals), ""),
         success=np.zeros(len(goals), bool),
         events=np.array([counts.get(fault, 0) for fault in faults.Fault]),
         latency_s=np.quantile(run.latency_s, (0.5, 0.999)),
         time_s=log.time_s,
-        point=_points(run, goals),
-        reference_m=log.reference_m.astype(np.float32),
-        spring_m=spring_m.astype(np.float32),
-        pressure_kpa=log.pressure_kpa.astype(np.float32),
-        finger_m=finger_m.astype(np.float32),
         wall_n=np.zeros(len(log), np.float32),
         container_n=np.zeros(len(log), np.float32),
     )
 
 
-def _points(run: Run, goals: np.ndarray) -> np.ndarray:
-    """Return the index among goals (p, 6) of each tick's goal (t,), -1 without one."""
-    point, begin, first = np.full(len(run.log), -1), 0, 0
-    assert run.log.goal is not None
-    for arrival in run.arrivals:
-        point[begin : arrival.row + 1] = arrival.index
-        begin, first = arrival.row + 1, arrival.index + 1
-    for k in range(begin, len(point)):  # on the way to the goal at which the run ended
-        if np.isfinite(run.log.goal[k]).all():
-            point[k] = first + np.argmin(np.abs(goals[first:] - run.log.goal[k]).sum(axis=1))
-    return point
-
-
-def figures(outcome: Outcome) -> dict[str, Any]:
+def figures(outcome: TrialOutcome) -> dict[str, Any]:
     """Return the figures of one trial; errors over the goals that were measured, NaN without any."""
     errors = accuracy.Accuracy(*(getattr(outcome, name) for name in accuracy.Accuracy._fields))
     return {

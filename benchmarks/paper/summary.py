@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks.paper.engine import Settings, load_arrays
-from benchmarks.paper.kinds import EVALUATION_FILE, Trial, learned_run, reach_run
-from benchmarks.paper.measure import Outcome, figures
+from benchmarks.paper.kinds import Trial, learned_run
+from benchmarks.paper.measure import TrialOutcome, figures
 from benchmarks.paper.trials import trainings, trials
 
 Row = Mapping[str, Any]
@@ -22,10 +21,10 @@ FIGURES = (  # with a spread over runs
     *("believed_mm", "saturated_points", "saturated_chambers_max", "saturation_events", "done"),
     *("calm_percent", "wall_max_n", "container_max_n", "load_off_g", "seconds"),
 )
-LIGHT_G, HEAVY_G = 500, 1000  # the paper's "about 9 mm" is for loads up to LIGHT_G
+LIGHT_G, HEAVY_G = 500, 1000
 N_OPERATIONS = 4
-# Numbers of the paper's physical arm by kind and variant; of the narrow pipe it says only that both tasks
-# were completed. Translation at each load, largest error at the heavy load, error in simulation.
+# Numbers of the paper's physical arm by kind and variant. About the narrow pipe the paper says only that both
+# tasks were completed.
 PAPER: Mapping[tuple[str, str], Mapping[str, float]] = {
     ("without", "0 g"): {"translation_mm": 21.01, "yaw_deg": 13.72, "pitch_deg": 2.82, "roll_deg": 6.98},
     ("with", "0 g"): {"translation_mm": 11.59, "yaw_deg": 9.54, "pitch_deg": 2.44, "roll_deg": 2.99},
@@ -34,7 +33,7 @@ PAPER: Mapping[tuple[str, str], Mapping[str, float]] = {
     ("narrow", "as shown"): {"done": N_OPERATIONS},
     ("circle", "as shown"): {"translation_mm": 11.29},
 }
-PAPER_LOADS_MM, PAPER_HEAVY_MAX_MM, PAPER_SIMULATED_MM = 9.0, 23.76, 3.89
+PAPER_LOADS_MM, PAPER_HEAVY_MAX_MM = 9.0, 23.76  # mean translation up to LIGHT_G, largest at HEAVY_G
 SUCCESS = 0.9  # share of the demonstrated poses that counts as learned
 
 
@@ -48,7 +47,7 @@ class Training(NamedTuple):
 class Results(NamedTuple):
     """All that an experiment measured."""
 
-    outcomes: dict[Trial, Outcome]
+    outcomes: dict[Trial, TrialOutcome]
     trainings: dict[tuple[str, int, int], Training]  # by kind, twin, seed; none in open space
 
 
@@ -57,7 +56,7 @@ def load_results(folder: Path, experiment: str, settings: Settings) -> Results:
     items = trainings(settings) if experiment == "confined" else []
     return Results(
         outcomes={
-            trial: load_arrays(Outcome, folder / trial.result) for trial in trials(experiment, settings)
+            trial: load_arrays(TrialOutcome, folder / trial.result) for trial in trials(experiment, settings)
         },
         trainings={item: _load_training(folder / learned_run(*item)) for item in items},
     )
@@ -85,14 +84,17 @@ def trial_rows(results: Results) -> list[dict[str, Any]]:
     ]
 
 
-def load_off_g(trial: Trial, outcome: Outcome) -> float:
-    """Return by how much the loop was wrong about the payload, in the mean over the goals; NaN in a pipe."""
+def load_off_g(trial: Trial, outcome: TrialOutcome) -> float:
+    """Return the mean error of the loop's payload estimate over the goals; NaN in a pipe."""
     seen_g = outcome.load_estimate_g[np.isfinite(outcome.load_estimate_g)]
     return float(np.abs(seen_g - trial.load_g).mean()) if len(seen_g) and not trial.objects else np.nan
 
 
 def training_rows(results: Results) -> list[dict[str, Any]]:
-    """Return a row for each training, by its own simulation; None is never, or no second stage."""
+    """Return a row of figures for each training, evaluated in its own simulation.
+
+    `steps_to_success` is None if the training never succeeded, `stages_first_success` without a second stage.
+    """
     return [
         {
             "kind": kind,
@@ -108,41 +110,18 @@ def training_rows(results: Results) -> list[dict[str, Any]]:
 
 
 def steps_to_success(training: Training) -> int | None:
-    """Return the environment steps to the first evaluation with enough success; None is never."""
+    """Return the environment steps to the first evaluation with enough success; None without one."""
     name = "evaluation/success_share"
     return next((row["env_steps"] for row in training.rows if row.get(name, 0.0) >= SUCCESS), None)
 
 
 def first_stage_success(training: Training) -> list[float] | None:
-    """Return success at the first stage's poses as it ends and at the end; None without a second stage."""
+    """Return success at the first stage's poses, after that stage and at the end; None for one stage."""
     if not training.stage_ends:
         return None
     name = "evaluation/success_first_share"
     as_it_ends = next(row for row in training.rows if row["epoch"] == training.stage_ends[0])
     return [float(as_it_ends[name]), float(training.rows[-1][name])]
-
-
-def simulated_rows(folder: Path, settings: Settings, table: Sequence[Row]) -> list[dict[str, Any]]:
-    """Return mean errors on the circle of the policies with S2R, and of those that know no twin ("without").
-
-    Each row has the error in the policy's own simulation, and that on its twin, or on all twins.
-    """
-    runs: list[tuple[str, int | None, int, str]]
-    runs = [("without", None, seed, reach_run(None, seed)) for seed in settings.seeds]
-    for twin, seed in itertools.product(settings.twins, settings.seeds):
-        runs.append(("with", twin, seed, reach_run(twin, seed)))
-        runs += [(kind, twin, seed, learned_run(kind, twin, seed)) for kind in settings.beside]
-    rows = []
-    for kind, twin, seed, run in runs:
-        evaluation = json.loads((folder / run / EVALUATION_FILE).read_text("utf-8"))
-        on_twins = [
-            row["translation_mm"]
-            for row in table
-            if (row["kind"], row["seed"], row["load_g"]) == (kind, seed, 0) and twin in (None, row["twin"])
-        ]
-        row = {"kind": kind, "twin": twin, "seed": seed, "simulated_mm": evaluation["circle_mean_mm"]}
-        rows.append(row | {"on_twin_mm": spread(on_twins)})
-    return rows
 
 
 def spread(values: Sequence[float]) -> dict[str, float]:
@@ -177,7 +156,7 @@ def all_done(row: Row) -> bool:
 
 
 def paper_numbers(kind: str, variant: str, load_g: int = 0) -> dict[str, float]:
-    """Return what the paper prints for its physical arm; it has no number for gradient descent."""
+    """Return the paper's numbers for its physical arm; none for gradient descent."""
     if load_g and kind == "with":
         return {"translation_mm": PAPER_LOADS_MM} if load_g <= LIGHT_G else {"max_mm": PAPER_HEAVY_MAX_MM}
     return dict(PAPER.get((kind, variant), {}))

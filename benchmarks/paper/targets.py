@@ -56,25 +56,6 @@ def _open(table: Sequence[Row]) -> list[Check]:
     ]
 
 
-def check_both_arms(tables: Sequence[Sequence[Row]]) -> list[Check]:
-    """Check the targets of twins and rods together, given the `trial_rows` of each in open space.
-
-    Both have as many runs. Targets of a policy that observes the payload are checked where each arm has one.
-    """
-    observed = all(any(row["kind"] == "payload" for row in table) for table in tables)
-    together, checks = [row for table in tables for row in table], []
-    for kind, how in (("with", ""), ("payload", " observed"))[: 1 + observed]:
-        unloaded, light, heavy = (_select(together, kind, f"{load_g} g") for load_g in (0, LIGHT_G, HEAVY_G))
-        mean = f"{how}, mean of the two mean translations"
-        largest = f"twins and rods, 1 kg{how}, largest translation of all runs"
-        checks += [
-            _at_most(f"twins and rods, 0 g{mean}", "mm", 1.8, unloaded, "translation_mm"),
-            _at_most(f"twins and rods, {LIGHT_G} g{mean}", "mm", 3.0, light, "translation_mm"),
-            _at_most(largest, "mm", 13.0, heavy, "max_mm", np.max),
-        ]
-    return checks
-
-
 def _loaded(how: str, rows: Sequence[Row]) -> list[Check]:
     """Check the targets for payloads; the policies are those of `rows`."""
     light, heavy = ([row for row in rows if row["load_g"] == load_g] for load_g in (LIGHT_G, HEAVY_G))

@@ -1,14 +1,13 @@
-"""The experiments as data: ways to find references, trials on twins, and the stages of each experiment.
+"""Trials on twins, and the stages of each experiment.
 
-The folder of a benchmark, which both experiments share:
+Both experiments share the folder of a benchmark:
 
     twinT/log.npz, twinT/calibration/      recorded and calibrated through `ArmIO` and logs alone
-    twinT/comparison.npz                   the first twin beside its simulation, before and after calibration
     twinT/demos-TASK.npz                   demonstrations of the scripted expert on the twin
     nominal-seedS/, twinT-seedS/           policies without demonstrations; the nominal ones know no twin
     KIND-twinT-seedS/                      policies without S2R, of other presets, or learned from
                                            demonstrations; see `KINDS`
-    trials/TRIAL.npz                       what a trial on a twin measured
+    trials/TRIAL.npz                       outcome of a trial on a twin
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 
 from benchmarks.paper import jobs
-from benchmarks.paper.engine import Settings, Stage
+from benchmarks.paper.engine import Settings, WorkStage
 from benchmarks.paper.kinds import (
     EVALUATION_FILE,
     KINDS,
@@ -27,94 +26,114 @@ from benchmarks.paper.kinds import (
     learned_run,
     reach_run,
 )
+from benchmarks.paper.scene import CALIBRATION, demonstrations_path
 
 FILMS = {"open": "circle.gif", "confined": "pipe.gif"}
 FILMED_LOADS_G = (500, 1000)  # in open space, beside the unloaded arm
 
+PolicyKey = tuple[str, int, int]  # kind, twin, seed
 
-def trainings(settings: Settings) -> list[tuple[str, int, int]]:
-    """Return all (kind, twin, seed) learned from demonstrations; without penalty on the first twin alone."""
+
+def trainings(settings: Settings) -> list[PolicyKey]:
+    """Return all policies that are learned from demonstrations."""
     learned = [kind for kind in KINDS if KINDS[kind].task]
-    found = [(kind, twin, seed) for kind in learned for twin in settings.twins for seed in settings.seeds]
-    return [item for item in found if item[0] != "no-penalty" or item[1] == settings.twins[0]]
+    return [(kind, *run) for kind in learned for run in _runs(settings)]
+
+
+def _runs(settings: Settings) -> list[tuple[int, int]]:
+    """Return all pairs of a twin and a training seed."""
+    return [(twin, seed) for twin in settings.twins for seed in settings.seeds]
 
 
 def trials(experiment: str, settings: Settings) -> list[Trial]:
-    """Return the trials of an experiment, a key of `FILMS`.
+    """Return the trials of an experiment, a key of `FILMS`."""
+    return _open_trials(settings) if experiment == "open" else _confined_trials(settings)
 
-    In open space, gradient descent has no training seed, so it runs once for each twin and load. In confined
-    spaces the policy without gradient penalty is judged by its training alone, and the circle without
-    demonstrations is a trial of the policy that those with them begin with. In motion both are tried, the
-    policy learned at rest and that learned in motion, and the latter is judged.
-    """
+
+def _open_trials(settings: Settings) -> list[Trial]:
+    loads_g, found = (0, *settings.loads_g), []
+    for twin in settings.twins:
+        for seed in settings.seeds:
+            found += [Trial(kind, twin, seed) for kind in ("specified", "without", "chambers")]
+            told = ("with", *settings.beside)
+            found += [Trial(kind, twin, seed, load_g=load_g) for kind in told for load_g in loads_g]
+        # Gradient descent is not trained, so it runs once for each twin and load.
+        found += [Trial("gradient", twin, settings.seeds[0], load_g=load_g) for load_g in loads_g]
+    return found
+
+
+def _confined_trials(settings: Settings) -> list[Trial]:
     found = []
-    if experiment == "open":
-        for twin in settings.twins:
-            loads_g = (0, *settings.loads_g)
-            for seed in settings.seeds:
-                found += [Trial(kind, twin, seed) for kind in ("specified", "without", "chambers")]
-                told = ("with", *settings.beside)
-                found += [Trial(kind, twin, seed, load_g=load_g) for kind in told for load_g in loads_g]
-            found += [Trial("gradient", twin, settings.seeds[0], load_g=load_g) for load_g in loads_g]
-        return found
     for kind, twin, seed in trainings(settings):
-        if kind not in ("no-penalty", "moving"):
+        if kind != "moving":
             found.append(Trial(kind, twin, seed, "as shown"))
         if kind == "pipe":
             found.append(Trial(kind, twin, seed, "exchanged"))
+        # Both policies go without stops: the one trained at rest and the one trained in motion.
         if kind in ("pipe", "moving"):
             found.append(Trial(kind, twin, seed, "as shown", moves=True))
-    return found + [Trial("quick", twin, seed) for twin in settings.twins for seed in settings.seeds]
+    # The policy that the circle's demonstrations begin with is tried without them.
+    return found + [Trial("quick", *run) for run in _runs(settings)]
 
 
-def stages(experiment: str, settings: Settings) -> list[list[Stage]]:
+def stages(experiment: str, settings: Settings) -> list[list[WorkStage]]:
     """Return the stages of an experiment, group by group."""
     calibrations = [
-        Stage(f"log and calibrate twin {t}", (f"twin{t}/{jobs.CALIBRATION}",), jobs.calibrate_twin, (t,))
+        WorkStage(f"log and calibrate twin {t}", (f"twin{t}/{CALIBRATION}",), jobs.calibrate_twin, (t,))
         for t in settings.twins
     ]
-    runs = [(twin, seed) for twin in settings.twins for seed in settings.seeds]
     tried = [
-        Stage(f"try {trial.name}", (trial.result,), jobs.try_out, (trial,))
+        WorkStage(f"try {trial.name}", (trial.result,), jobs.try_out, (trial,))
         for trial in trials(experiment, settings)
     ]
-    kind, objects = ("with", "") if experiment == "open" else ("pipe", "as shown")
-    filmed = Trial(kind, settings.twins[0], settings.seeds[0], objects)
-    film = Stage("film", (FILMS[experiment],), jobs.film, ((filmed,), FILMS[experiment]))
-    films = [film] * (settings.arm == "twin")  # a rod cannot be drawn
-    if experiment == "open":
-        nominal = [_reach(None, seed) for seed in settings.seeds]
-        others = [(kind, *run) for kind in ("chambers", *settings.beside) for run in runs]
-        on_twins = [_reach(*run) for run in runs] + [_learn(*item, jobs.train_other) for item in others]
-        exports = [_export(twin, others, settings.seeds) for twin in (None, *settings.twins)]
-        loads = _film_loads(filmed, settings) * (settings.arm == "twin")
-        compared = _compare(settings.twins[0])
-        return [[*calibrations, *nominal], [*on_twins, compared], exports, [*tried, *films, *loads]]
-    path = jobs.demonstrations_path
+    learning = _open_learning if experiment == "open" else _confined_learning
+    return [calibrations, *learning(settings), [*tried, *_films(experiment, settings)]]
+
+
+def _open_learning(settings: Settings) -> list[list[WorkStage]]:
+    """Return the stages that train and export the policies of open space."""
+    others = [(kind, *run) for kind in ("chambers", *settings.beside) for run in _runs(settings)]
+    nominal = [_reach(None, seed) for seed in settings.seeds]
+    on_twins = [_reach(*run) for run in _runs(settings)]
+    return [
+        [*nominal, *on_twins, *(_learn(*item, jobs.train_other) for item in others)],
+        [_export(twin, others, settings.seeds) for twin in (None, *settings.twins)],
+    ]
+
+
+def _confined_learning(settings: Settings) -> list[list[WorkStage]]:
+    """Return the stages that demonstrate, train and export the policies of confined spaces."""
     demonstrations = [
-        Stage(f"demonstrate {task} on twin {twin}", (path(twin, task),), jobs.demonstrate, (twin, task))
+        WorkStage(
+            f"demonstrate {task} on twin {twin}",
+            (demonstrations_path(twin, task),),
+            jobs.demonstrate,
+            (twin, task),
+        )
         for task in TASKS
         for twin in settings.twins
     ]
-    quick = [("quick", *run) for run in runs]
-    on_twins = [_learn(*item, jobs.train_other) for item in quick]
-    first = [_learn(*item) for item in trainings(settings) if not KINDS[item[0]].reward_of]
-    with_their_reward = [_learn(*item) for item in trainings(settings) if KINDS[item[0]].reward_of]
-    exports = [_export(twin, [*quick, *trainings(settings)]) for twin in settings.twins]
-    return [calibrations, [*demonstrations, *on_twins], first, with_their_reward, exports, [*tried, *films]]
+    quick, learned = [("quick", *run) for run in _runs(settings)], trainings(settings)
+    return [
+        [*demonstrations, *(_learn(*item, jobs.train_other) for item in quick)],
+        [_learn(*item) for item in learned if not KINDS[item[0]].reward_of],
+        [_learn(*item) for item in learned if KINDS[item[0]].reward_of],
+        [_export(twin, [*quick, *learned]) for twin in settings.twins],
+    ]
 
 
-def _compare(twin: int) -> Stage:
-    result = f"twin{twin}/{jobs.COMPARISON_FILE}"
-    return Stage(f"compare twin {twin} with its simulation", (result,), jobs.compare_twin, (twin,))
-
-
-def _film_loads(unloaded: Trial, settings: Settings) -> list[Stage]:
-    """Return the stage that films a trial beside the same with loads, if the experiment has such loads."""
-    loads_g, file = _filmed_loads_g(settings), loads_film(settings)
-    shown = (unloaded, *(unloaded._replace(load_g=load_g) for load_g in loads_g))
-    stage = Stage("film of loads", (file,), jobs.film, (shown, file))
-    return [stage] * bool(loads_g)
+def _films(experiment: str, settings: Settings) -> list[WorkStage]:
+    """Return the stages that film the first twin: one trial, and in open space one beside loads."""
+    if settings.arm == "rod":  # a rod cannot be drawn
+        return []
+    kind, objects = ("with", "") if experiment == "open" else ("pipe", "as shown")
+    shown, file = Trial(kind, settings.twins[0], settings.seeds[0], objects), FILMS[experiment]
+    films = [WorkStage("film", (file,), jobs.film, ((shown,), file))]
+    if experiment == "open" and (loads_g := _filmed_loads_g(settings)):
+        loaded = (shown, *(shown._replace(load_g=load_g) for load_g in loads_g))
+        file = loads_film(settings)
+        films.append(WorkStage("film of loads", (file,), jobs.film, (loaded, file)))
+    return films
 
 
 def loads_film(settings: Settings) -> str:
@@ -126,19 +145,19 @@ def _filmed_loads_g(settings: Settings) -> list[int]:
     return [load_g for load_g in settings.loads_g if load_g in FILMED_LOADS_G]
 
 
-def _reach(twin: int | None, seed: int) -> Stage:
+def _reach(twin: int | None, seed: int) -> WorkStage:
     name = f"train {'nominal arm' if twin is None else f'for twin {twin}'}, seed {seed}"
-    return Stage(name, (f"{reach_run(twin, seed)}/{EVALUATION_FILE}",), jobs.train_reach, (twin, seed))
+    return WorkStage(name, (f"{reach_run(twin, seed)}/{EVALUATION_FILE}",), jobs.train_reach, (twin, seed))
 
 
-def _learn(kind: str, twin: int, seed: int, job: Callable[..., None] = jobs.learn) -> Stage:
+def _learn(kind: str, twin: int, seed: int, job: Callable[..., None] = jobs.learn) -> WorkStage:
     result = f"{learned_run(kind, twin, seed)}/{EVALUATION_FILE}"
-    return Stage(f"learn {kind} for twin {twin}, seed {seed}", (result,), job, (kind, twin, seed))
+    return WorkStage(f"learn {kind} for twin {twin}, seed {seed}", (result,), job, (kind, twin, seed))
 
 
-def _export(twin: int | None, learned: Iterable[tuple[str, int, int]], seeds: Iterable[int] = ()) -> Stage:
+def _export(twin: int | None, learned: Iterable[PolicyKey], seeds: Iterable[int] = ()) -> WorkStage:
     """Return the stage that exports an arm's policies of other kinds, and the experiment's own of `seeds`."""
-    mine = [item for item in learned if item[0] != "no-penalty" and item[1] == twin]
-    runs = (*(reach_run(twin, seed) for seed in seeds), *(learned_run(*item) for item in mine))
+    mine = [learned_run(*item) for item in learned if item[1] == twin]
+    runs = (*(reach_run(twin, seed) for seed in seeds), *mine)
     policies = tuple(f"{run}/{POLICY_FILE}" for run in runs)
-    return Stage(f"export for {arm_name(twin)}", policies, jobs.export, (twin, runs))
+    return WorkStage(f"export for {arm_name(twin)}", policies, jobs.export, (twin, runs))

@@ -4,11 +4,10 @@ import json
 
 import numpy as np
 
-from benchmarks.paper.comparison import Comparison
-from benchmarks.paper.engine import Settings, save_arrays
-from benchmarks.paper.jobs import CALIBRATION, COMPARISON_FILE
-from benchmarks.paper.kinds import KINDS, Trial, learned_run, reach_run
-from benchmarks.paper.measure import Outcome, finger_tips
+from benchmarks.paper.engine import Settings
+from benchmarks.paper.kinds import KINDS, Trial
+from benchmarks.paper.measure import TrialOutcome
+from benchmarks.paper.scene import CALIBRATION
 from benchmarks.paper.summary import Results, Training, training_rows, trial_rows
 from benchmarks.paper.trials import trainings, trials
 from mjx_softarm import ArmSpec
@@ -16,7 +15,6 @@ from mjx_softarm.deploy.faults import Fault
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.policy.file import policy_from_actor
-from mjx_softarm.spec import ARM_FILE
 from train.demos.waypoints import task
 
 SPEC = ArmSpec.default()
@@ -49,7 +47,7 @@ def made_up(
     """An outcome with one error (up to 6,) at every goal; `pressed`: share of time with 2 N on the wall."""
     names, goal = goals_of(kind)
     ticks = 100
-    outcome = Outcome(
+    outcome = TrialOutcome(
         goal=goal,
         name=np.array(names),
         error=np.tile([*error, *[0.0] * (6 - len(error))], (len(goal), 1)),
@@ -61,11 +59,6 @@ def made_up(
         events=np.array([reported if fault is Fault.SATURATED else 0 for fault in Fault]),
         latency_s=np.array([1e-4, 3e-4]),
         time_s=tick_s * np.arange(ticks),
-        point=np.arange(ticks) * len(goal) // ticks,
-        reference_m=np.full((ticks, N), 0.2),
-        spring_m=np.full((ticks, N), 0.201),
-        pressure_kpa=np.full((ticks, N), 10.0),
-        finger_m=np.tile(finger_tips(goal[:1], GRIPPER_M), (ticks, 1)),
         wall_n=np.where(np.arange(ticks) < pressed * ticks, 2.0, 0.0),
         container_n=np.full(ticks, 5.0),
     )
@@ -81,7 +74,6 @@ def trained(kind, reaches_at=4, n=10, after_one=0.5, after_two=0.75):
     rows = []
     for epoch in range(1, n + 1):
         row = {"epoch": epoch, "env_steps": 1000 * epoch, "updates": 10 * epoch}
-        row |= {"tqc/critic_loss": 1.0 / epoch, "tqc/actor_loss": -epoch, "gail/discriminator_loss": 0.7}
         if epoch % 2 == 0:
             row["evaluation/success_share"] = 0.95 if epoch >= reaches_at else 0.2
             row["evaluation/success_first_share"] = after_one if epoch <= 4 else after_two
@@ -127,41 +119,13 @@ def tables(results):
     return trial_rows(results), training_rows(results)
 
 
-def compared(n=6, specified_mm=20.0, calibrated_mm=2.0, read_mm=9.0, corrected_mm=1.0):
-    """A comparison whose simulated arms are off by these distances along y; straight arms to one side."""
-    down = np.linspace(0.0, 1.0, SPEC.n_links + 1)[:, None] * [0.0, 0.0, -0.6]
-    plate_m = down + np.linspace(-0.1, 0.1, n)[:, None, None] * down[:, 2:] * [1.0, 0.0, 0.0]
-    off_m = 1e-3 * np.array([specified_mm, calibrated_mm])[:, None, None] * [0.0, 1.0, 0.0]
-    spring_m = np.linspace(0.15, 0.25, n * N).reshape(n, N)
-    return Comparison(
-        marker_m=plate_m[:, 1:],
-        tip_m=plate_m[:, -1],
-        chamber_m=spring_m,
-        plate_pair_m=plate_m + off_m[:, None],
-        tip_pair_m=plate_m[:, -1] + off_m,
-        chamber_pair_m=spring_m + off_m[..., 1:2],
-        read_tip_m=plate_m[:, -1] + [0.0, 1e-3 * read_mm, 0.0],
-        corrected_tip_m=plate_m[:, -1] + [0.0, 1e-3 * corrected_mm, 0.0],
-        reading=SPEC.spring_sensor.readings(spring_m),
-        ruler_m=spring_m,
-    )
-
-
 def fill(folder, settings):
-    """Leave in a folder what training and calibration would; the second twin's calibration warns."""
-    for seed in settings.seeds:
-        runs = {reach_run(twin, seed): 1.25 for twin in (None, *settings.twins)}
-        runs |= {learned_run(kind, twin, seed): 2.5 for kind in settings.beside for twin in settings.twins}
-        for run, circle_mm in runs.items():
-            (folder / run).mkdir(parents=True)
-            (folder / run / "evaluation.json").write_text(json.dumps({"circle_mean_mm": circle_mm}))
+    """Leave in a folder what calibration would; the second twin's calibration warns."""
     for twin in settings.twins:
         here = folder / f"twin{twin}" / CALIBRATION
         here.mkdir(parents=True)
         parts = {"Springs": {"warnings": ["off <by> much"] if twin else []}}
         (here / "report.json").write_text(json.dumps({"parts": parts}))
-        SPEC.to_toml(here / ARM_FILE)
-        save_arrays(here.parent / COMPARISON_FILE, compared())
 
 
 def make_policy(make_arm_model, spec=SPEC, s2r=False):

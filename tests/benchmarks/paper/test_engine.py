@@ -13,7 +13,7 @@ import pytest
 from benchmarks.harness import parallel
 from benchmarks.harness.parallel import JobError
 from benchmarks.paper import engine
-from benchmarks.paper.engine import Stage, claim, run_stages
+from benchmarks.paper.engine import WorkStage, claim, run_stages
 from tests.benchmarks.paper.made_up import TINY
 
 
@@ -28,13 +28,13 @@ def test_stages_run_group_by_group_and_only_where_a_result_is_missing(tmp_path, 
     done = []
     monkeypatch.setattr(engine, "in_parallel", lambda jobs: {name: f(*inputs) for name, f, inputs in jobs})
     groups = [
-        [Stage(f"stage {name}", (name,), leave, (name, done)) for name in group] for group in ("ab", "c")
+        [WorkStage(f"stage {name}", (name,), leave, (name, done)) for name in group] for group in ("ab", "c")
     ]
     assert run_stages(tmp_path, TINY, groups) == {"stage a": "A", "stage b": "B", "stage c": "C"}
     assert done == ["a", "b", "c"]
     (tmp_path / "b").unlink()
     assert run_stages(tmp_path, TINY, groups) == {"stage b": "B"}
-    two = [[Stage("both", ("a", "d"), leave, ("d", done))]]
+    two = [[WorkStage("both", ("a", "d"), leave, ("d", done))]]
     assert run_stages(tmp_path, TINY, two) == {"both": "D"}  # one of its results is missing
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from benchmarks.__main__ import main
 from benchmarks.harness.common import target
-from benchmarks.paper import engine, experiments, report
+from benchmarks.paper import engine, experiments
 from benchmarks.paper.engine import SMOKE
 from benchmarks.paper.trials import stages, trials
 from tests.benchmarks.paper.made_up import TINY, fill, good_results
@@ -31,10 +31,8 @@ def test_interrupted_benchmark_runs_only_what_is_missing(tmp_path, monkeypatch, 
     fill(tmp_path, TINY)
     monkeypatch.setattr(engine, "in_parallel", leave_results)
     monkeypatch.setattr(experiments, "load_results", lambda *_: results)
-    monkeypatch.setattr(report, "draw", lambda *_: {})
     data = experiments.run(experiment, tmp_path, tmp_path / "out", TINY)
-    alone = ["twins and rods together"] if experiment == "open" else []
-    assert [row["target"] for row in data["targets"] if row["verdict"] != "met"] == alone
+    assert {row["verdict"] for row in data["targets"]} == {"met"}
     assert {f"try {trial.name}" for trial in trials(experiment, TINY)} | {"film"} <= set(done)
     assert not any(name.startswith("log and calibrate") for name in done)  # `fill` left them
     gone = trials(experiment, TINY)[3]
@@ -76,7 +74,7 @@ def test_both_experiments_or_one(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("experiment", "n_targets"), [("open", 13 + 1), ("confined", 12)])
+@pytest.mark.parametrize(("experiment", "n_targets"), [("open", 13), ("confined", 12)])
 def test_smoke(tmp_path, experiment, n_targets):
     assert main(["paper", "--smoke", "--only", experiment, "--out", str(tmp_path)]) == 0
     made = json.loads((tmp_path / f"paper-{experiment}.json").read_text("utf-8"))

@@ -10,15 +10,13 @@ import pytest
 from PIL import Image
 
 from benchmarks.paper import film, plots, report
-from benchmarks.paper.calibration_plots import calibration_figures
 from benchmarks.paper.engine import save_arrays
-from benchmarks.paper.jobs import Scene
 from benchmarks.paper.kinds import KINDS, Trial, learned_run
+from benchmarks.paper.scene import Scene
 from benchmarks.paper.summary import (
     first_stage_success,
     load_off_g,
     load_results,
-    simulated_rows,
     spreads,
     steps_to_success,
     trial_rows,
@@ -119,96 +117,37 @@ def write(experiment, folder, results, filmed=False):
 def test_open_results_are_written_and_nothing_is_hidden(tmp_path):
     results = good_results("open", TINY, {Trial("with", 0, 0): made_up("with", missed=range(6))})
     figures, files = write("open", tmp_path, results, filmed=True)
-    pictures = {f"paper-{name}.png" for name in ("circle", "loads", "configurations", "lengths", "sensor")}
-    assert files == {"paper-open.json", "paper-circle.gif", "paper-loads.gif", *pictures}
+    assert files == {"paper-open.json", "paper-circle.gif", "paper-circle.png", "paper-loads.gif"}
     assert (tmp_path / "out" / "paper-circle.gif").read_bytes()[:6] == b"GIF89a"
     assert figures["targets"][0]["measured"] == "nan mm, 6 points missed in 1 of 2 runs"
     assert figures["targets"][0]["verdict"] == "NOT MET"
-    assert figures["targets"][-1]["measured"] == "not measured: paper-rod.json is missing"
     assert figures["calibrations"] == {"twin 0": {"Springs": []}, "twin 1": {"Springs": ["off <by> much"]}}
     assert len(figures["runs"]) == len(trials("open", TINY))
     assert [row["translation_mm"] is None for row in figures["runs"]].count(True) == 1
-    assert figures["twin 0 beside its simulation"]["tip_mean_mm"]["S2R"] == pytest.approx(1.0)
-    simulated = figures["simulated"]
-    assert {item["simulated_mm"] for item in simulated} == {1.25}
-    assert (simulated[0]["on_twin_mm"]["min"], simulated[0]["on_twin_mm"]["max"]) == (4.0, 4.0)
-
-
-def test_presets_beside_have_simulated_errors_of_their_own(tmp_path):
-    settings = dataclasses.replace(TINY, beside=("payload",))
-    fill(tmp_path, settings)
-    rows = simulated_rows(tmp_path, settings, trial_rows(good_results("open", settings)))
-    found = {(row["kind"], row["twin"]): (row["simulated_mm"], row["on_twin_mm"]["mean"]) for row in rows}
-    expected = {("without", None): (1.25, 4.0)} | {("with", twin): (1.25, 1.25) for twin in TINY.twins}
-    assert found == expected | {("payload", twin): (2.5, 1.0) for twin in TINY.twins}
-
-
-def test_twins_and_rods_are_judged_together_where_both_were_measured_alike(tmp_path):
-    lost = {Trial("with", 1, 0, load_g=1000): made_up("with", missed=range(6))}
-    write("open", tmp_path / "twins", good_results("open", TINY, lost))
-    rods = dataclasses.replace(TINY, arm="rod")
-    fill(tmp_path / "rods", rods)
-
-    def judged(settings):
-        results, out = good_results("open", settings), tmp_path / "twins" / "out"
-        data = report.write_report("open", tmp_path / "rods", out, settings, results)
-        return {row["target"]: row["measured"] for row in data["targets"] if "rods" in row["target"]}
-
-    targets = judged(rods)
-    assert len(targets) == 3
-    assert targets["twins and rods, 0 g, mean of the two mean translations at most 1.8 mm"] == "1.25 mm"
-    largest = targets["twins and rods, 1 kg, largest translation of all runs at most 13 mm"]
-    assert largest == "nan mm, 6 points missed in 1 of 4 runs"
-    other = judged(dataclasses.replace(rods, preset="payload"))
-    told = "not measured: paper-open.json: got preset analytic, expected preset payload"
-    assert other == {"twins and rods together": told}
 
 
 def test_confined_results_are_written_and_nothing_is_hidden(tmp_path):
     lost = [pipe_trial(1), pipe_trial(0, kind="narrow"), pipe_trial(1, kind="narrow")]
     changed = {t: made_up(t.kind, fails=range(4), missed=range(len(goals_of(t.kind)[1]))) for t in lost}
     figures, files = write("confined", tmp_path, good_results("confined", TINY, changed), filmed=True)
-    assert files == {
-        "paper-confined.json",
-        "paper-confined-pipe.gif",
-        "paper-confined-success.png",
-        "paper-confined-losses.png",
-    }
+    assert files == {"paper-confined.json", "paper-confined-pipe.gif"}
     assert figures["targets"][0]["measured"] == "nan mm, 28 points missed in 1 of 2 runs"
     assert [row["verdict"] for row in figures["targets"]].count("NOT MET") == 7
     assert len(figures["trainings"]) == len(trainings(TINY))
     assert [row["x_mm"] is None for row in figures["runs"]].count(True) == 3
 
 
-@pytest.mark.parametrize("experiment", ["open", "confined"])
-@pytest.mark.parametrize("twins", [(0,), (0, 1), (0, 1, 2)])
-def test_titles_and_labels_lie_within_the_pictures(experiment, twins, tmp_path):
-    settings = dataclasses.replace(TINY, twins=twins)
-    fill(tmp_path, settings)
-    results = good_results(experiment, settings)
-    drawn = report.draw(experiment, results, trial_rows(results), "twin")
-    calibrations = calibration_figures(tmp_path, settings)
-    for name, figure in (drawn | calibrations).items():
-        check_nothing_is_cut_off(name, figure)
-    assert all("twin 0" in figure.get_suptitle() for figure in calibrations.values())
-
-
 @pytest.mark.parametrize("n_twins", [1, 2, 3])
-@pytest.mark.parametrize("height", [0.5, 1.0, 1.1, 1.2, 1.3, 2.0])
+@pytest.mark.parametrize("height", [0.5, 1.0, 1.2, 2.0])
 def test_circle_s_titles_are_whole_whatever_its_shape(n_twins, height):
     results = good_results("open", dataclasses.replace(TINY, twins=tuple(range(n_twins))))
     for outcome in results.outcomes.values():
         outcome.goal[:, 1] *= height
-    check_nothing_is_cut_off("circle", plots.circle_figure(results.outcomes, "rod"))
-
-
-def check_nothing_is_cut_off(name, figure):
-    """Fail if anything but white is at a border of the picture as it is saved."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=report.DPI)
+    plots.circle_figure(results.outcomes, "rod").savefig(buffer, format="png", dpi=report.DPI)
     shade = np.asarray(Image.open(buffer).convert("L"))
     for border in (shade[0], shade[-1], shade[:, 0], shade[:, -1]):
-        assert border.min() == 255, name
+        assert border.min() == 255  # white
 
 
 class DrawnTwin:
