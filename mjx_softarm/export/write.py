@@ -90,7 +90,7 @@ def describe(policy: Policy, sha256: str) -> dict[str, Any]:
             "before_m": lengths | {"default": f"nan: not known; {RATE_S:g} s before"},
             "last_reference_m": lengths | {"default": "nan: none yet; of the last action"},
             "integral_kpa": {"unit": "kPa", "default": "0; of the law"},
-            "observation": {"names": list(policy.obs_layout)}
+            "observation": {"kind": policy.observation, "names": list(policy.obs_layout)}
             | {name: value.tolist() for name, value in policy.obs_scale._asdict().items()},
         },
         "outputs": {

@@ -5,18 +5,19 @@ networks and the workspace float32.
 
     schema_version       () int
     spec_json            ()           the arm trained for, as `ArmSpec.to_dict` gives it
-    obs_layout           (O,) text    names of the observation's entries: one of `layouts`
+    observation          ()           kind of observation: "pose", "payload" or "motion"
+    obs_layout           (O,) text    names of the observation's entries, `layouts` of that kind
     action_layout        (n,) text    names of the action's entries, `action_layout`
     actor.n_layers       () int
-    actor.<k>.weight     (in, out)    layer k = 0, 1, ...; ReLU after each but the last,
-    actor.<k>.bias       (out,)       whose outputs (n,) are the actions before tanh
+    actor.<k>.weight     (in, out)    layer k = 0, 1, ...; ReLU after each but the last
+    actor.<k>.bias       (out,)       the last layer's outputs (n,) are the actions before tanh
     obs_scale.<field>    (6,)         `ObsScale`: centre and scale of poses and goals
     reward.<field>       ()           `RewardConfig`: weights of the error, threshold of a goal
     action.low, .high    (n,)         readings that the actions -1 and 1 stand for, linear in between
     sensor.<field>       () or (n,)   the arm's `Sensor`: readings to lengths, and back
     gains.<field>        () or (n,)   `Gains`: the sensor-space law and the pressure limits
-    rate_hz              ()           of the sensor-space law
-    n_actions            () int       towards each goal, as in the evaluation of the run
+    rate_hz              ()           rate of the sensor-space law
+    n_actions            () int       actions towards each goal, as in the evaluation of the run
     action_s             ()           time between two actions in motion; 0: the policy acts on arms at rest
     tolerance_m          ()           greatest error of a spring that counts as on its reference
     workspace            (m, 6)       poses [mm, deg] that the arm reaches, spread over its workspace
@@ -27,9 +28,9 @@ networks and the workspace float32.
     s2r.<field>                       `S2R`, if there is one: simulated pose to the real one
     provenance_json      ()           how the policy came about: config, versions, commit, date
 
-The arm's numbers stand next to `spec_json` because the actor was trained with these, whatever a later version
-derives from a specification. A new entry, or a new field of a class named here (`ArmSpec` included), makes
-a new schema: raise `SCHEMA_VERSION`. A file of another schema is refused; its run can be exported again.
+The arm's numbers stand beside `spec_json` because the actor was trained with them: a later version may derive
+others from the same specification. A new entry, or a new field of a class named here (`ArmSpec` included),
+makes a new schema: raise `SCHEMA_VERSION`. A file of another schema is refused; its run can be exported again.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ from mjx_softarm._support.archive import Entries, SealedFileError, entries_of
 from mjx_softarm._support.mlp import Layer
 from mjx_softarm.control import TOLERANCE_M, Gains
 from mjx_softarm.mdp.actions import N_ACTIONS, ActionMap
-from mjx_softarm.mdp.observation import OBS_LAYOUT, Observation, ObsScale, layouts
+from mjx_softarm.mdp.observation import Observation, ObsScale, layouts
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.sensing.estimator import PoseEstimator, SpringModel, take_estimator, take_spring_model
 from mjx_softarm.sensing.load import LoadEstimator, take_load_estimator
@@ -55,7 +56,7 @@ from mjx_softarm.sensing.s2r import S2R, take_s2r
 from mjx_softarm.sensing.sensors import Sensor, SensorFault
 from mjx_softarm.spec import ArmSpec, SpecError
 
-SCHEMA_VERSION = 6
+SCHEMA_VERSION = 7
 
 KIND = "policy"
 SHIPPED = Path(__file__).parent / "shipped/paper.npz"  # for the paper's arm; its card is beside it
@@ -65,10 +66,10 @@ SHIPPED = Path(__file__).parent / "shipped/paper.npz"  # for the paper's arm; it
 class Policy:
     """A trained policy and all that its actions depend on; the module's docstring lists the entries."""
 
-    layers: tuple[Layer, ...]  # from the observation to the actions before tanh
+    layers: tuple[Layer, ...]  # actor: observation to actions before tanh
     obs_scale: ObsScale
     reward: RewardConfig
-    actions: ActionMap  # with the sensor
+    actions: ActionMap  # actions to readings, with the arm's sensor
     gains: Gains
     rate_hz: float
     workspace: np.ndarray  # (m, 6)
@@ -78,16 +79,10 @@ class Policy:
     s2r: S2R | None
     spec: ArmSpec
     provenance: Mapping[str, Any]
+    observation: Observation = "pose"
     tolerance_m: float = TOLERANCE_M
     n_actions: int = N_ACTIONS
     action_s: float = 0.0
-
-    @property
-    def observation(self) -> Observation:
-        """Kind of observation, as the number of its entries tells."""
-        named = layouts(self.spec.n_chambers)
-        sizes: dict[int, Observation] = {len(names): observation for observation, names in named.items()}
-        return sizes.get(len(self.layers[0][0]), "pose")  # a policy of another number is refused by its shape
 
     @property
     def obs_layout(self) -> tuple[str, ...]:
@@ -121,9 +116,7 @@ def policy_from_actor(
     reward: RewardConfig,
     model: ArmModel,
     provenance: Mapping[str, Any],
-    tolerance_m: float = TOLERANCE_M,
-    n_actions: int = N_ACTIONS,
-    action_s: float = 0.0,
+    **settings: Any,
 ) -> Policy:
     """Make the policy of an actor that was trained on an arm.
 
@@ -135,12 +128,11 @@ def policy_from_actor(
         reward: the environment's.
         model: networks and workspace of the arm.
         provenance: how the policy came about, in types that JSON has.
-        tolerance_m: greatest error of a spring that counts as on its reference; the environment's.
-        n_actions: towards each goal; the evaluation's.
-        action_s: time between two actions in motion; 0 for a policy that was trained on arms at rest.
+        settings: fields of `Policy` that have defaults, from the environment and the evaluation:
+            `observation`, `tolerance_m`, `n_actions`, `action_s`.
 
     Raises:
-        ValueError: the parameters are not those of an actor for this arm; as a SealedFileError where an
+        ValueError: the parameters are not those of an actor for this arm. It is a SealedFileError if an
             array has the wrong shape or is not finite.
     """
     policy = Policy(
@@ -153,9 +145,7 @@ def policy_from_actor(
         **model._asdict(),
         spec=spec,
         provenance=provenance,
-        tolerance_m=tolerance_m,
-        n_actions=n_actions,
-        action_s=action_s,
+        **settings,
     )
     return _unpack(file_entries(policy), "policy")
 
@@ -199,6 +189,7 @@ def file_entries(policy: Policy) -> dict[str, np.ndarray]:
     entries: dict[str, Any] = {
         "schema_version": SCHEMA_VERSION,
         "spec_json": json.dumps(policy.spec.to_dict()),
+        "observation": policy.observation,
         "obs_layout": policy.obs_layout,
         "action_layout": action_layout(policy.spec),
         "rate_hz": policy.rate_hz,
@@ -214,10 +205,9 @@ def file_entries(policy: Policy) -> dict[str, np.ndarray]:
     for name in ("obs_scale", "reward", "sensor", "gains"):
         numbers = entries_of(name, getattr(policy, name))
         entries |= {item: value.astype(np.float64) for item, value in numbers.items()}
-    for name in ("estimator", "load_estimator", "spring_model") + (
-        ("s2r",) if policy.s2r is not None else ()
-    ):
-        entries |= entries_of(name, getattr(policy, name))
+    for name in ("estimator", "load_estimator", "spring_model", "s2r"):
+        if getattr(policy, name) is not None:
+            entries |= entries_of(name, getattr(policy, name))
     return {name: np.asarray(value) for name, value in entries.items()}
 
 
@@ -234,6 +224,7 @@ def _unpack(arrays: Mapping[str, np.ndarray], source: str) -> Policy:
     except SpecError as error:
         raise SealedFileError(str(error)) from error
     n = spec.n_chambers
+    observation = entries.take("observation", np.str_, ())
     obs_layout = entries.take("obs_layout", np.str_, (None,))
     names = entries.take("action_layout", np.str_, (n,))
     s2r_kind = entries.take("s2r_kind", np.str_, ())
@@ -254,15 +245,17 @@ def _unpack(arrays: Mapping[str, np.ndarray], source: str) -> Policy:
         s2r=take_s2r(entries, "s2r", n) if s2r_kind == "mlp" else None,
         spec=spec,
         provenance=entries.table("provenance_json"),
+        observation=observation,
         tolerance_m=entries.take("tolerance_m", np.float64, ()),
         n_actions=entries.take("n_actions", np.integer, ()),
         action_s=entries.take("action_s", np.float64, ()),
     )
-    layout = {len(names): names for names in layouts(n).values()}.get(len(obs_layout), OBS_LAYOUT)
+    layout = layouts(n).get(observation, ())
     limits = policy.sensor.lengths(np.stack(policy.actions[1:]))  # (2, n)
     readable = (limits.fault == SensorFault.OK.value) & (limits.length_m[0] < limits.length_m[1])
     low_kpa, high_kpa = policy.gains.pressure_min_kpa, policy.gains.pressure_max_kpa
     for name, holds, expected in (
+        ("observation", bool(layout), " or ".join(layouts(n))),
         ("obs_layout", np.array_equal(obs_layout, layout), list(layout)),
         ("action_layout", names == np.array(action_layout(spec)), list(action_layout(spec))),
         ("obs_scale.scale", policy.obs_scale.scale > 0.0, "numbers > 0"),

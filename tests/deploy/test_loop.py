@@ -67,7 +67,7 @@ def test_acts_at_once_and_then_at_rest():
 
 
 _WIDE = (np.zeros((len(layouts(9)["motion"]), 9), np.float32), np.zeros(9, np.float32))
-OF_MOTION = dataclasses.replace(POLICY, layers=(_WIDE,), action_s=0.3)
+OF_MOTION = dataclasses.replace(POLICY, layers=(_WIDE,), observation="motion", action_s=0.3)
 
 
 def test_a_policy_of_motion_acts_in_time_and_is_told_of_motion():

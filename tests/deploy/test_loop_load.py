@@ -82,7 +82,7 @@ def test_payload_is_estimated_at_rest_and_believed_in_the_pose(payload_kg):
 
 
 _WIDE = (np.zeros((len(layouts(N)["payload"]), N), np.float32), np.zeros(N, np.float32))
-CARRYING = dataclasses.replace(LOADED, layers=(_WIDE,))
+CARRYING = dataclasses.replace(LOADED, layers=(_WIDE,), observation="payload")
 
 
 @pytest.mark.parametrize("payload_kg", [0.6, 1.4])

@@ -50,13 +50,14 @@ def busy_policy(spec=SPEC):
 
 def moving_policy(spec=SPEC):
     """A busy policy that acts each 0.3 s on what it sees of the motion."""
-    n_in = len(layouts(N)["motion"])
-    return dataclasses.replace(busy_policy(spec), layers=layers(n_in, 12, N, scale=0.3), action_s=0.3)
+    actor = layers(len(layouts(N)["motion"]), 12, N, scale=0.3)
+    return dataclasses.replace(busy_policy(spec), layers=actor, observation="motion", action_s=0.3)
 
 
 def carrying_policy(spec=SPEC):
     """A busy policy that observes the payload."""
-    return dataclasses.replace(busy_policy(spec), layers=layers(len(layouts(N)["payload"]), 12, N, scale=0.5))
+    actor = layers(len(layouts(N)["payload"]), 12, N, scale=0.5)
+    return dataclasses.replace(busy_policy(spec), layers=actor, observation="payload")
 
 
 @contextlib.contextmanager

@@ -15,15 +15,15 @@ from hypothesis.extra import numpy as npst
 from mjx_softarm import ArmSpec
 from mjx_softarm._support.archive import SealedFileError, sealed
 from mjx_softarm.control import Gains
-from mjx_softarm.mdp.observation import layouts
+from mjx_softarm.mdp.observation import OBS_LAYOUT, layouts
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.policy import file as export
 from mjx_softarm.policy.file import load_policy, policy_from_actor, save_policy
 from tests.properties import few
 
 PROVENANCE = {"commit": "0123abc", "created": "2025-01-31", "packages": {"numpy": "2.0"}, "seed": 7}
-# Digest of the names that schema 6 stores and of the fields of its specification.
-SCHEMA_6 = "1868266f"
+# Digest of the names that schema 7 stores and of the fields of its specification.
+SCHEMA_7 = "0503bedb"
 
 
 def make_params(hidden=(7, 5), n_actions=9, n_obs=18):
@@ -104,7 +104,7 @@ def test_parts_are_those_of_the_arm(file):
 
 def test_file_is_plain_npz_with_named_layouts(file):
     arrays = arrays_of(file)
-    assert arrays["schema_version"] == 6 and arrays["s2r_kind"] == "mlp"
+    assert arrays["schema_version"] == 7 and arrays["s2r_kind"] == "mlp"
     parts, axes = ("pose", "goal", "error"), ("x_mm", "y_mm", "z_mm", "yaw_deg", "pitch_deg", "roll_deg")
     assert arrays["obs_layout"].tolist() == [f"{part}_{axis}" for part in parts for axis in axes]
     assert arrays["action_layout"].tolist() == [f"frequency{k}" for k in range(9)]
@@ -121,7 +121,8 @@ def test_actor_with_one_layer_and_arm_with_two_sections(tmp_path, make_arm_model
 def test_what_a_policy_observes_is_kept(tmp_path, make_arm_model, observation):
     names = layouts(9)[observation]
     params, path = make_params(n_obs=len(names)), tmp_path / "policy.npz"
-    save_policy(path, policy_from_actor(params, ArmSpec.default(), RewardConfig(), make_arm_model(9), {}))
+    spec, model = ArmSpec.default(), make_arm_model(9)
+    save_policy(path, policy_from_actor(params, spec, RewardConfig(), model, {}, observation=observation))
     assert load_policy(path).observation == observation
     assert tuple(arrays_of(path)["obs_layout"]) == load_policy(path).obs_layout == names
 
@@ -176,9 +177,9 @@ def test_files_that_are_no_policy(tmp_path):
 
 
 def test_another_schema_is_named_before_anything_else(file):
-    reseal(file, drop=["gains.kp_kpa_per_m"], schema_version=np.array(3), nose=np.zeros(3))
-    expected = "expected 6; `python -m train export RUN` writes the policy anew"
-    assert refusal(file) == f"schema_version: got 3, {expected}"
+    reseal(file, drop=["gains.kp_kpa_per_m", "observation"], schema_version=np.array(6))
+    expected = "expected 7; `python -m train export RUN` writes the policy anew"
+    assert refusal(file) == f"schema_version: got 6, {expected}"
 
 
 def test_every_entry_is_required_and_its_type_shape_and_numbers_are_checked(file):
@@ -205,7 +206,9 @@ def test_every_entry_is_required_and_its_type_shape_and_numbers_are_checked(file
         ({"actor__n_layers": np.array(4)}, "actor.3.bias: got nothing"),
         ({"actor__n_layers": np.array(2)}, "actor.1.bias: got float32 (5,), expected float32 (9,)"),
         ({"actor__0__bias": np.zeros(7)}, "actor.0.bias: got float64 (7,), expected float32 (7,)"),
-        ({"obs_layout": np.array(export.OBS_LAYOUT[::-1])}, "obs_layout: got ['error_roll_deg', "),
+        ({"observation": np.array("force")}, "observation: got force, expected pose or payload or motion"),
+        ({"observation": np.array("payload")}, "obs_layout: got ['pose_x_mm', "),
+        ({"obs_layout": np.array(OBS_LAYOUT[::-1])}, "obs_layout: got ['error_roll_deg', "),
         ({"action_layout": np.array(["voltage0"] * 9)}, "action_layout: got ['voltage0', 'voltage0', "),
         ({"obs_scale__scale": np.zeros(6)}, "obs_scale.scale: got [0.0, "),
         ({"action__low": np.full(9, 5e6)}, "action.low: got [5000000.0, "),
@@ -216,7 +219,7 @@ def test_every_entry_is_required_and_its_type_shape_and_numbers_are_checked(file
         ({"tolerance_m": np.array(-1e-3)}, "tolerance_m: got -0.001, expected a number > 0"),
         ({"n_actions": np.array(0)}, "n_actions: got 0, expected a whole number > 0"),
         ({"s2r_kind": np.array("tree")}, "s2r_kind: got tree, expected mlp or none"),
-        ({"s2r_kind": np.array("none")}, "s2r.0.bias: got an unknown entry, expected those of schema 6"),
+        ({"s2r_kind": np.array("none")}, "s2r.0.bias: got an unknown entry, expected those of schema 7"),
         ({"workspace": np.zeros((0, 6), np.float32)}, "workspace: got float32 (0, 6), expected "),
         ({"estimator__spring_scale_m": np.zeros(9, np.float32)}, "estimator.spring_scale_m: got [0.0, "),
         ({"provenance_json": np.array("[1]")}, "provenance_json: got '[1]', expected a JSON object"),
@@ -257,12 +260,12 @@ def test_failed_write_keeps_the_old_file_and_leaves_nothing(file, make_policy, m
     assert file.read_bytes() == before
 
 
-def test_schema_6_stays_as_it_is(file, make_policy):
+def test_schema_7_stays_as_it_is(file, make_policy):
     groups = make_policy().spec.to_dict().items()
     fields = [f"{name}.{item}" for name, group in groups if isinstance(group, dict) for item in group]
     names = "\n".join(sorted([*arrays_of(file), *fields]))
     digest = hashlib.sha256(names.encode()).hexdigest()[:8]
-    assert digest == SCHEMA_6, "other entries, or other fields of ArmSpec: raise export.SCHEMA_VERSION"
+    assert digest == SCHEMA_7, "other entries, or other fields of ArmSpec: raise export.SCHEMA_VERSION"
 
 
 def test_the_policy_that_ships_is_one_of_this_version_for_the_paper_s_arm():

@@ -116,18 +116,18 @@ def test_malformed_pose_or_goal_is_refused(runner, name, value, message):
 
 
 @pytest.mark.parametrize(
-    ("n_more", "sensed", "message"),
+    ("observation", "n_more", "sensed", "message"),
     [
-        (0, [0.5], r"got shape \(1,\), expected None: the policy observes the pose"),
-        (1, None, r"got None, expected \(\.\.\., 1\): the policy observes the payload"),
-        (1, np.zeros(39), r"got shape \(39,\), expected \(\.\.\., 1\): the policy observes the payload"),
-        (39, None, r"got None, expected \(\.\.\., 39\): the policy observes the motion"),
+        ("pose", 0, [0.5], r"got shape \(1,\), expected None: the policy observes the pose"),
+        ("payload", 1, None, r"got None, expected \(\.\.\., 1\): the policy observes the payload"),
+        ("payload", 1, np.zeros(39), r"got shape \(39,\), expected \(\.\.\., 1\): the policy obs"),
+        ("motion", 39, None, r"got None, expected \(\.\.\., 39\): the policy observes the motion"),
     ],
 )
-def test_what_is_sensed_must_be_what_the_policy_observes(runner, n_more, sensed, message):
+def test_what_is_sensed_must_be_what_the_policy_observes(runner, observation, n_more, sensed, message):
     first, *others = runner.policy.layers
     wider = np.zeros((18 + n_more, first[0].shape[1]), np.float32), first[1]
-    policy = dataclasses.replace(runner.policy, layers=(wider, *others))
+    policy = dataclasses.replace(runner.policy, layers=(wider, *others), observation=observation)
     with pytest.raises(ValueError, match=f"sensed: {message}"):
         PolicyRunner(policy).act(np.zeros(6), np.zeros(6), sensed)
     if n_more:

@@ -47,6 +47,7 @@ def export_run(run: Run, path: Path | None = None, params: Any = None) -> Path:
             env.reward,
             model,
             _provenance(run, distilled),
+            observation=env.observation,
             tolerance_m=1e-3 * env.saturation_tolerance_mm,
             n_actions=N_ACTIONS,
             action_s=env.dynamic_step_s if env.moves else 0.0,
