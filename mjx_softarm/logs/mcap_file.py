@@ -10,14 +10,11 @@ import json
 import math
 from collections.abc import Sequence
 from itertools import groupby
-from typing import TYPE_CHECKING, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 
 from mjx_softarm._support.errors import InputError
-
-if TYPE_CHECKING:
-    from mjx_softarm.logs.schema import Column
 
 SUFFIX = ".mcap"
 _PROFILE, _ENCODING, _LIBRARY = "", "json", "mjx_softarm"
@@ -37,29 +34,35 @@ def require_mcap(where: str) -> None:
         ) from error
 
 
-def write_mcap(file: BinaryIO, columns: Sequence[Column], table: np.ndarray) -> None:
-    """Write a log's columns (k,), time first, and numbers (rows, k) in their units."""
+def write_mcap(file: BinaryIO, columns: Sequence[tuple[str, str, str]], table: np.ndarray) -> None:
+    """Write a log.
+
+    Args:
+        file: opened for writing.
+        columns (k,): topic, name and unit of each column; the first is the time.
+        table (rows, k): numbers in these units.
+    """
     from mcap.writer import Writer
 
     writer = Writer(file)
     writer.start(_PROFILE, _LIBRARY)
+    # Register each topic, with the places of its columns.
     topics = []
-    for group, members in groupby(range(1, len(columns)), lambda k: columns[k].group):
+    for topic, members in groupby(range(1, len(columns)), lambda k: columns[k][0]):
         places = list(members)
-        schema_id = writer.register_schema(group, "jsonschema", _schema([columns[k] for k in places]))
-        topics.append((writer.register_channel(f"/{group}", _ENCODING, schema_id), places))
+        schema_id = writer.register_schema(topic, "jsonschema", _schema([columns[k] for k in places]))
+        topics.append((writer.register_channel(f"/{topic}", _ENCODING, schema_id), places))
+    # Write one message a row into each topic.
     for sequence, row in enumerate(table):
         time_ns = round(1e9 * row[0])
         for channel_id, places in topics:
-            values = {columns[k].name: float(row[k]) if math.isfinite(row[k]) else None for k in places}
+            values = {columns[k][1]: float(row[k]) if math.isfinite(row[k]) else None for k in places}
             data = json.dumps(values).encode()
             writer.add_message(channel_id, time_ns, data, publish_time=time_ns, sequence=sequence)
     writer.finish()
 
 
-def _schema(columns: Sequence[Column]) -> bytes:
+def _schema(columns: Sequence[tuple[str, str, str]]) -> bytes:
     """Return the JSON schema of a topic's messages."""
-    numbers = {
-        column.name: {"type": ["number", "null"], "description": f"[{column.unit}]"} for column in columns
-    }
+    numbers = {name: {"type": ["number", "null"], "description": f"[{unit}]"} for _, name, unit in columns}
     return json.dumps({"type": "object", "properties": numbers}).encode()

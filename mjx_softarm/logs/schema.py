@@ -153,7 +153,7 @@ def write_log(path: str | Path, log: Log) -> None:
             if path.suffix == ".npz":
                 np.savez(file, columns=np.array(headers), table=table)
             elif path.suffix == mcap_file.SUFFIX:
-                mcap_file.write_mcap(file, columns, table)
+                mcap_file.write_mcap(file, [(c.group, c.name, c.unit) for c in columns], table)
             else:
                 np.savetxt(file, table, "%.9g", ",", header=",".join(headers), comments="")
         os.replace(part, path)

@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
@@ -21,6 +23,16 @@ from mjx_softarm.policy.file import SHIPPED, load_policy
 from mjx_softarm.spec import ArmSpec
 
 PROGRAM, HERE = "python -m mjx_softarm.view", "127.0.0.1"
+
+
+@dataclass(frozen=True)
+class Address:
+    """Address of the page."""
+
+    host: str = HERE
+    """address to listen on; with another one everybody who reaches it can move the arm"""
+    port: int = 8080
+    """port to listen on; the next free one, if it is taken"""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -37,8 +49,7 @@ def _view(
     demos: cli.MaybePath = None,
     spec: cli.SpecFile = None,
     html: cli.MaybePath = None,
-    host: str = HERE,
-    port: int = 8080,
+    at: Annotated[Address, tyro.conf.arg(name="")] = Address(),
 ) -> int:
     """Show an arm in the browser and steer it there; or replay logs; or follow a run, or show a calibration.
 
@@ -47,8 +58,6 @@ def _view(
         log: file for the log of the steered run, CSV or npz
         demos: file for demonstrations, poses taken on the page for `train imitate`, CSV or npz
         html: file to write the logs to, as a page that plays without a server
-        host: address to listen on; with another one everybody who reaches it can move the arm
-        port: port to listen on; the next free one, if it is taken
     """
     try:
         import viser  # noqa: F401
@@ -59,20 +68,21 @@ def _view(
     for option, path in (("--log", log), ("--demos", demos), ("--html", html)):
         check_file(option, path)
     if any(path.is_dir() for path in logs):
-        return _errors(logs, html, host, port)
+        return _errors(logs, html, at)
     if logs:
-        return _replay(logs, ArmSpec.of(spec), html, host, port)
+        return _replay(logs, ArmSpec.of(spec), html, at)
     if html is not None:
         raise InputError("--html: got no log, expected one or more, which are then written")
-    from mjx_softarm.view.live import Setup, live
+    from mjx_softarm.view.live import live
+    from mjx_softarm.view.page import Setup
 
     read, io = load_policy(policy), open_arm(arm)
-    setup = Setup(read, arm, host, port, hasattr(io, "attach"), demos is not None)
+    setup = Setup(read, arm, at.host, at.port, hasattr(io, "attach"), demos is not None)
     saves = [partial(save_log, path) if path else None for path in (log, demos)]
-    return live(setup, io, _tell, partial(_welcome, host), *saves).status
+    return live(setup, io, _tell, partial(_welcome, at.host), *saves).status
 
 
-def _replay(logs: tuple[Path, ...], spec: ArmSpec, html: Path | None, host: str, port: int) -> int:
+def _replay(logs: tuple[Path, ...], spec: ArmSpec, html: Path | None, at: Address) -> int:
     from mjx_softarm.view.replay import Track, replay, share
     from mjx_softarm.view.stage import open_server
 
@@ -81,12 +91,12 @@ def _replay(logs: tuple[Path, ...], spec: ArmSpec, html: Path | None, host: str,
         speed = share(html, spec, tracks)
         _tell(f"wrote {html}, {html.stat().st_size / 1e6:.1f} MB" + f", {speed} times as fast" * (speed > 1))
         return 0
-    server = open_server(host, port, ", ".join(track.name for track in tracks))
-    _tell(f"open http://{host}:{server.get_port()}; Ctrl-C ends")
+    server = open_server(at.host, at.port, ", ".join(track.name for track in tracks))
+    _tell(f"open http://{at.host}:{server.get_port()}; Ctrl-C ends")
     return replay(server, spec, tracks)
 
 
-def _errors(folders: tuple[Path, ...], html: Path | None, host: str, port: int) -> int:
+def _errors(folders: tuple[Path, ...], html: Path | None, at: Address) -> int:
     from mjx_softarm.view.errors import follow_errors, spec_of
     from mjx_softarm.view.stage import open_server
 
@@ -94,8 +104,8 @@ def _errors(folders: tuple[Path, ...], html: Path | None, host: str, port: int) 
     if others or html is not None:
         raise InputError(f"LOGS: got {folder} and more, expected one folder without --html, or logs")
     spec_of(folder)
-    server = open_server(host, port, folder.name)
-    _tell(f"open http://{host}:{server.get_port()}; Ctrl-C ends")
+    server = open_server(at.host, at.port, folder.name)
+    _tell(f"open http://{at.host}:{server.get_port()}; Ctrl-C ends")
     return follow_errors(server, folder)
 
 

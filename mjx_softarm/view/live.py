@@ -11,7 +11,7 @@ import multiprocessing
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,26 +24,17 @@ from mjx_softarm.deploy.reachability import clamped
 from mjx_softarm.deploy.session import Orders, steer
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mechanics.excitation import circle_poses
-from mjx_softarm.policy.file import Policy
 from mjx_softarm.spec import ArmSpec
-from mjx_softarm.view.demonstrations import TakenPoses
 from mjx_softarm.view.look import look_at
+from mjx_softarm.view.taken_poses import TakenPoses
+
+if TYPE_CHECKING:
+    from mjx_softarm.view.page import Setup
 
 READY_S = 60.0  # for the server to start
 N_LINES = 4  # of what the loop told last, on the page
 _ROUNDS = 100  # of the circle, and of picking and placing
 _LIFT_MM, _OBJECT_KG = 25.0, 0.22  # an apple, as in the paper's pipe
-
-
-class Setup(NamedTuple):
-    """Settings of the page's server."""
-
-    policy: Policy
-    arm: str  # name
-    host: str
-    port: int
-    carries: bool = False  # a payload can be attached to the arm
-    records: bool = False  # poses can be taken as demonstrations
 
 
 class PagePilot:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import signal
 import time
 from multiprocessing.connection import Connection
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import viser
 
 from mjx_softarm._support.channel import End
+from mjx_softarm.policy.file import Policy
 from mjx_softarm.sensing.pose import pose_from_quaternion, quaternion_from_pose
-from mjx_softarm.view.live import Setup
 from mjx_softarm.view.look import Limits, Look
 from mjx_softarm.view.panel import Panel, css
 from mjx_softarm.view.stage import GOAL, SATURATED, Stage, add_workspace, open_server, set_the_scene
@@ -31,6 +31,17 @@ _CIRCLE, _PLACE, _GIZMO, _TAKE = (
     "Follow the goal that is dragged in the picture",
     "Take the pose at rest as a demonstration",
 )
+
+
+class Setup(NamedTuple):
+    """Settings of the page's server."""
+
+    policy: Policy
+    arm: str  # name of the arm
+    host: str
+    port: int
+    carries: bool = False  # a payload can be attached to the arm
+    records: bool = False  # poses can be taken as demonstrations
 
 
 def serve(connection: Connection, setup: Setup) -> None:

@@ -50,7 +50,7 @@ class Track:
         return self._look(max(row, 0))._replace(time_s=float(self._time_s[max(row, 0)]))
 
 
-class Replay:
+class ReplayPage:
     """Logs on a page, with a slider of time and a speed."""
 
     def __init__(self, server: viser.ViserServer, spec: ArmSpec, tracks: Sequence[Track]):
@@ -87,7 +87,7 @@ class Replay:
 
 def replay(server: viser.ViserServer, spec: ArmSpec, tracks: Sequence[Track]) -> NoReturn:
     """Serve logs until Ctrl-C."""
-    page, before_s = Replay(server, spec, tracks), time.monotonic()
+    page, before_s = ReplayPage(server, spec, tracks), time.monotonic()
     while True:
         now_s = time.monotonic()
         page.refresh(now_s - before_s)

@@ -1,10 +1,20 @@
-"""A headless browser; tests that need one are skipped where there is none."""
+"""A server of pages, and a headless browser; tests that need one are skipped where there is none."""
 
 import shutil
 
 import pytest
 
 FLAGS = ("--no-sandbox", "--use-gl=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
+
+
+@pytest.fixture
+def server():
+    """A server without a page, on some free port."""
+    from mjx_softarm.view.stage import open_server
+
+    server = open_server("127.0.0.1", 8310, "")
+    yield server
+    server.stop()
 
 
 @pytest.fixture(scope="session")

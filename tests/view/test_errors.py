@@ -12,7 +12,6 @@ from mjx_softarm.logs.pose_pairs import POSES_FILE, PosePairs, read_pose_pairs, 
 pytest.importorskip("viser", reason="needs viser: pip install -e '.[view]'")
 from mjx_softarm.view.__main__ import main
 from mjx_softarm.view.errors import SCALE, SCALE_MM, Errors, colours
-from mjx_softarm.view.stage import open_server
 
 SPEC = ArmSpec.default()
 
@@ -20,13 +19,6 @@ SPEC = ArmSpec.default()
 def pairs(off_mm, n=20):
     target = np.random.default_rng(0).normal([0.0, 0.0, -500.0, 0.0, 0.0, 0.0], 50.0, (n, 6))
     return PosePairs(target, target + [off_mm, 0.0, 0.0, 0.0, 0.0, 9.0], np.arange(n) < 3)
-
-
-@pytest.fixture
-def server():
-    server = open_server("127.0.0.1", 8510, "")
-    yield server
-    server.stop()
 
 
 @pytest.fixture

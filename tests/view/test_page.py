@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from mjx_softarm._support.channel import End
-from mjx_softarm.view.live import Setup
 from mjx_softarm.view.look import look_at
 from tests.linear_arm import GOALS, POLICY, REST_M, N
 
@@ -18,8 +17,7 @@ import viser
 from viser import _messages
 from websockets.sync.client import connect
 
-from mjx_softarm.view.page import Page
-from mjx_softarm.view.stage import open_server
+from mjx_softarm.view.page import Page, Setup
 
 FLOOD_HZ = 500  # a browser sends a drag 60 times a second
 
@@ -43,13 +41,6 @@ class Client:
     def drag(self, x):
         pose = (1.0, 0.0, 0.0, 0.0), (x, 0.0, -0.5)
         self.send(_messages.TransformControlsUpdateMessage("/gizmo", *pose))
-
-
-@pytest.fixture
-def server():
-    server = open_server("127.0.0.1", 8420, "")
-    yield server
-    server.stop()
 
 
 @pytest.fixture

@@ -12,8 +12,7 @@ from mjx_softarm.logs.schema import write_log
 from tests.linear_arm import GOALS, SPEC, LinearArm, go
 
 pytest.importorskip("viser", reason="needs viser: pip install -e '.[view]'")
-from mjx_softarm.view.replay import SHARE_HZ, Replay, Track, share
-from mjx_softarm.view.stage import open_server
+from mjx_softarm.view.replay import SHARE_HZ, ReplayPage, Track, share
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -23,13 +22,6 @@ def path(tmp_path_factory):
     path = tmp_path_factory.mktemp("logs") / "run.csv"
     write_log(path, go(LinearArm(), goals=GOALS[:1], duration_s=2.0).log)
     return path
-
-
-@pytest.fixture
-def server():
-    server = open_server("127.0.0.1", 8310, "")
-    yield server
-    server.stop()
 
 
 def test_track_shows_the_row_of_a_time(path):
@@ -51,7 +43,7 @@ def test_track_goes_without_rows_out_of_order(path, tmp_path):
 
 
 def test_replay_plays_at_its_speed_pauses_and_begins_anew(path, server):
-    page = Replay(server, SPEC, [Track(path, SPEC), Track(path, SPEC)])
+    page = ReplayPage(server, SPEC, [Track(path, SPEC), Track(path, SPEC)])
     page.refresh(0.5)
     page._speed.value = "2"
     page.refresh(0.5)

@@ -7,7 +7,7 @@ import pytest
 
 from mjx_softarm.deploy.controller import start
 from mjx_softarm.logs.schema import write_log
-from mjx_softarm.view.demonstrations import TakenPoses
+from mjx_softarm.view.taken_poses import TakenPoses
 from tests.linear_arm import CONTROLLER, HIGH_KPA, POLICY, REST_M, SENSOR, SPEC, N
 from train.demos.demonstrations import load_demonstrations
 
