@@ -1,1 +1,1 @@
-"""Tools that several rooms share and no reader of one has to know: arrays, files, compilation."""
+"""Tools that several packages share: arrays, sealed files, compilation, command lines."""

@@ -1,7 +1,7 @@
 """Sealed files: named arrays in an npz archive with a checksum and the name of its kind. NumPy only.
 
-The archive's comment, its last bytes, is a mark that says what the file is and the SHA-256 of every byte
-before, so that a file that is incomplete, changed or of another kind is refused; any npz reader takes it.
+The archive ends with a comment: a mark that names the file's kind, then the SHA-256 of all bytes before it.
+An incomplete or changed file is refused, and a file of another kind. Any npz reader can open a sealed file.
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.fields import FLOAT32_MAX
 from mjx_softarm._support.mlp import Layer
 
-# Raised by NumPy and zipfile on archives that are damaged or of a kind that they do not read.
+# Exceptions of NumPy and zipfile on archives that are damaged or that they do not read.
 ZIP_ERRORS = (ValueError, EOFError, MemoryError, NotImplementedError)
 ZIP_ERRORS += (struct.error, zipfile.BadZipFile, zlib.error)
 _N_DIGEST = 64  # hexadecimal digits, the last bytes of the file
 
 
 class SealedFileError(InputError):
-    """A sealed file that cannot be used; the message names file, entry, what it got and what it expected."""
+    """A sealed file that cannot be used; the message names file and entry, what was got and expected."""
 
 
 def write_sealed(path: Path, arrays: Mapping[str, Any], kind: str) -> None:
     """Write arrays whole or not at all; the same arrays give the same bytes.
 
     Args:
-        path: the file; one that was there before stays until the new one is complete.
-        arrays: by name.
-        kind: what the file is, in a word.
+        path: the file; an older file of this name stays until the new one is complete.
+        arrays: arrays by name.
+        kind: kind of file, one word.
 
     Raises:
         SealedFileError: the file cannot be written.
@@ -51,7 +51,7 @@ def write_sealed(path: Path, arrays: Mapping[str, Any], kind: str) -> None:
     except OSError as error:
         raise SealedFileError(f"{path}: got {error.strerror!r}, expected to write a file") from error
     finally:
-        if part.exists():  # never so below a path that is no folder, where `unlink` would fail
+        if part.exists():  # `unlink(missing_ok=True)` fails where the parent is no folder
             part.unlink()
 
 
@@ -60,7 +60,7 @@ def read_sealed(path: Path, kind: str, made_by: str) -> dict[str, np.ndarray]:
 
     Args:
         path: the file.
-        kind: what it must be.
+        kind: kind that the file must have.
         made_by: the command that makes such files, for messages.
 
     Raises:
@@ -71,6 +71,7 @@ def read_sealed(path: Path, kind: str, made_by: str) -> dict[str, np.ndarray]:
     except OSError as error:
         raise SealedFileError(f"{path}: got {error.strerror!r}, expected a file of `{made_by}`") from error
     expected = f"an unchanged file of `{made_by}`"
+    # Check the mark and the checksum before anything is unpacked.
     content, digest = data[:-_N_DIGEST], data[-_N_DIGEST:]
     if not content.endswith(_mark(kind)):
         whole = zipfile.is_zipfile(io.BytesIO(data))
@@ -78,6 +79,7 @@ def read_sealed(path: Path, kind: str, made_by: str) -> dict[str, np.ndarray]:
         raise SealedFileError(f"{path}: got {got}, {len(data)} bytes, expected {expected}")
     if hashlib.sha256(content).hexdigest().encode() != digest:
         raise SealedFileError(f"{path}: got {len(data)} bytes without their checksum, expected {expected}")
+    # Unpack the arrays.
     try:
         with np.load(io.BytesIO(data), allow_pickle=False) as npz:
             return {name: np.asarray(npz[name]) for name in npz.files}
@@ -102,13 +104,13 @@ def _mark(kind: str) -> bytes:
 def entries_of(name: str, group: Any) -> dict[str, np.ndarray]:
     """Return the entries of a dataclass or named tuple: `name.field`.
 
-    Layers stand one by one: those of `layers` as of `name`, those of `x_layers` as of `name.x`.
+    Each layer of the field `layers` has entries `name.<k>...`, each layer of `x_layers` has `name.x.<k>...`.
     """
     entries: dict[str, Any] = {}
     for item in _field_names(type(group)):
-        value, whose = getattr(group, item), item.removesuffix("layers")
-        if whose != item:
-            entries |= layer_entries(f"{name}.{whose}".rstrip("._"), value)
+        value, network = getattr(group, item), item.removesuffix("layers")
+        if network != item:
+            entries |= layer_entries(f"{name}.{network}".rstrip("._"), value)
         else:
             entries[f"{name}.{item}"] = value
     return {item: np.asarray(value) for item, value in entries.items()}
@@ -127,7 +129,7 @@ def layer_entries(name: str, layers: tuple[Layer, ...]) -> dict[str, Any]:
 
 
 class Entries:
-    """Arrays of a file, each checked as it is taken."""
+    """Arrays of a file, each checked when it is taken."""
 
     def __init__(self, arrays: Mapping[str, np.ndarray], source: str):
         self._source, self._arrays, self._left = source, arrays, set(arrays)
@@ -136,9 +138,9 @@ class Entries:
         raise SealedFileError(f"{self._source}: {name}: {problem}")
 
     def take(self, name: str, kind: type, *shapes: tuple[int | None, ...]) -> Any:
-        """Return an array of `kind` in one of the `shapes`, finite; a single value as Python's own type.
+        """Return a finite array of `kind` in one of the `shapes`; a single value as Python's own type.
 
-        A dimension of None stands for any number from 1.
+        A dimension of None stands for any size from 1.
         """
         if name not in self._arrays:
             self.fail(name, "got nothing, expected an entry")
@@ -164,7 +166,7 @@ class Entries:
             self.fail(name, f"got {text[:60]!r}, expected a JSON object")
 
     def layers(self, name: str, n_inputs: int, n_outputs: int) -> tuple[Layer, ...]:
-        """Return the layers, at least one, of a network with so many inputs and outputs."""
+        """Return the layers, one or more, of a network with n_inputs and n_outputs."""
         layers, n_layers = [], self.take(f"{name}.n_layers", np.integer, ())
         if n_layers < 1:
             self.fail(f"{name}.n_layers", f"got {n_layers}, expected at least 1")
@@ -178,9 +180,9 @@ class Entries:
     def network(
         self, name: str, kind: Callable[..., Any], shapes: Mapping, n_inputs: int, n_outputs: int
     ) -> Any:
-        """Return a named tuple of float32 arrays in the `shapes` of its fields, and of `layers`.
+        """Return a named tuple with float32 arrays in the `shapes` of its fields, and with `layers`.
 
-        Every field whose name has `_scale` in it must be greater than 0.
+        A field with `_scale` in its name must be greater than 0.
         """
         values = {}
         for item, shape in shapes.items():
@@ -190,7 +192,7 @@ class Entries:
         return kind(**values, layers=self.layers(name, n_inputs, n_outputs))
 
     def finish(self, schema: int) -> None:
-        """Refuse entries that were not taken."""
+        """Refuse entries that nobody took."""
         for name in sorted(self._left):
             self.fail(name, f"got an unknown entry, expected those of schema {schema}")
 

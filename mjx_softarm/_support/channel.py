@@ -1,8 +1,8 @@
-"""A connection of two processes in which nobody ever waits for the other.
+"""A channel between two processes in which neither end waits for the other.
 
-The loop and the page's server each hold one end. What is put replaces what the other has not taken yet, name
-by name: a slow reader misses what is old, and a flood of messages is one message. Two threads of each end do
-the waiting.
+The control loop and the page's server hold one end each. A new value replaces the value of the same name that
+the other end has not taken yet: a slow reader misses old values, and a flood of messages becomes one message.
+Each end has two threads that wait on the connection.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ class End:
     """One end of the channel."""
 
     def __init__(self, connection: Connection):
-        # Each operation on these is atomic: no lock that a thread, or a signal that raises, could leave shut.
+        # Operations on these dictionaries are atomic, so no lock can stay closed after a signal that raises.
         self._connection, self._ready = connection, SimpleQueue[None]()
         self._out: dict[str, Any] = {}
         self._in: dict[str, Any] = {}
-        self.closed = threading.Event()  # set when the other end is gone
+        self.closed = threading.Event()  # set once the other end is gone
         for pump in (self._send, self._receive):
             threading.Thread(target=pump, daemon=True).start()
 
     def put(self, **values: Any) -> None:
-        """Hand values to the other end, by name."""
+        """Send values by name to the other end."""
         self._out.update(values)
         if self._ready.empty():
             self._ready.put(None)
 
     def take(self) -> dict[str, Any]:
-        """Return the newest values that came since the last call, by name."""
+        """Return the newest values by name that came since the last call."""
         return _emptied(self._in)
 
     def _send(self) -> None:

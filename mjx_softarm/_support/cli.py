@@ -39,14 +39,15 @@ def main(
     Args:
         prog: the program as its user calls it.
         about: a sentence about the program.
-        commands: functions by name; or, instead of one, MODULE:NAME, which is imported only when it is run.
-            The first line of its docstring is its help.
+        commands: functions by name, or texts MODULE:NAME, which are imported only when they run. The first
+            line of the docstring is the command's help.
         arguments: words of the command line, by default those of this process.
-        finish: turns a command's name and what it returned into an exit status.
+        finish: turns a command's name and its result into an exit status.
 
     Returns:
         The command's exit status; 2 after an error that its user can put right, 130 after Ctrl-C.
     """
+    # List the commands where the words name none, or a group such as `demos`.
     words = sys.argv[1:] if arguments is None else list(arguments)
     group = list(itertools.takewhile(lambda word: word not in ("-h", "--help"), words))
     shown = [name for name in commands if (parts := name.split()) != group and parts[: len(group)] == group]
@@ -56,6 +57,7 @@ def main(
         print("\n".join([f"usage: {prog} COMMAND [--help] ...", "", about, "", *lines]))
         return 0
 
+    # Run the command.
     def run() -> int:
         name, command = read(prog, commands, words)
         return finish(name, command())
@@ -97,7 +99,8 @@ def read(prog: str, commands: Mapping[str, Command], words: Sequence[str]) -> tu
 
 
 def _line(command: Command) -> str:
-    if isinstance(command, str):  # read from the file, as the import may take seconds
+    """Return the first line of a command's docstring."""
+    if isinstance(command, str):  # read from the file, because an import may take seconds
         module, _, name = command.partition(":")
         found = importlib.util.find_spec(module)
         assert found and found.origin, module
@@ -120,8 +123,8 @@ def parse(command: Any, prog: str, arguments: Sequence[str]) -> Callable[[], Any
     """Read the options of a command.
 
     Args:
-        command: a function or a dataclass. The classmethod `default` of a dataclass, if it has one, makes the
-            options to begin with from the words of the command line.
+        command: a function or a dataclass. A dataclass may have a classmethod `default`, which makes the
+            default options from the words of the command line.
         prog: the command as its user calls it.
         arguments: words of the command line after the command.
 
@@ -143,7 +146,7 @@ def parse(command: Any, prog: str, arguments: Sequence[str]) -> Callable[[], Any
 
 
 def _later(function: Callable[..., Any]) -> Callable[..., Callable[[], Any]]:
-    """Return a function that binds options without the call, whose errors are not those of the options."""
+    """Return a function that binds options without a call, so that a bug is not taken for a bad option."""
 
     @functools.wraps(function)
     def bind(*args: Any, **options: Any) -> Callable[[], Any]:
@@ -160,7 +163,7 @@ def _integers(words: list[str]) -> tuple[int, ...]:
 
 
 def listed(read: Callable[[list[str]], tuple], metavar: str) -> PrimitiveConstructorSpec:
-    """Return how an option is read whose value is one word with commas."""
+    """Return the reader of an option whose value is one word with commas."""
     return PrimitiveConstructorSpec(
         nargs=1,
         metavar=metavar,
@@ -171,7 +174,7 @@ def listed(read: Callable[[list[str]], tuple], metavar: str) -> PrimitiveConstru
 
 
 def one_of(names: Iterable[str]) -> PrimitiveConstructorSpec:
-    """Return how an option is read whose value is one of some names."""
+    """Return the reader of an option whose value is one of some names."""
     choices = tuple(names)
     return PrimitiveConstructorSpec(
         nargs=1,
@@ -185,7 +188,7 @@ def one_of(names: Iterable[str]) -> PrimitiveConstructorSpec:
 
 # Types of options.
 MaybePath = tyro.conf.DisallowNone[Path | None]
-Integers = Annotated[tuple[int, ...], listed(_integers, "N,N,...")]  # different ones, in rising order
+Integers = Annotated[tuple[int, ...], listed(_integers, "N,N,...")]  # in rising order, each once
 SpecFile = Annotated[
     MaybePath,
     tyro.conf.arg(

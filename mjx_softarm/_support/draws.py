@@ -1,7 +1,8 @@
-"""Random numbers in any shape, drawn as one row, and on several devices by each of them.
+"""Random numbers of any shape, drawn as one row; with several devices, each device draws all numbers.
 
-For a shape with a short last axis XLA unrolls the generator on a CPU, and compiles it three times as long.
-For numbers split over devices it lets devices draw for each other, and exchange the numbers.
+One row, because on a CPU XLA unrolls the generator for a shape with a short last axis and then compiles three
+times as long. All numbers on each device, because XLA otherwise lets devices draw for each other and exchange
+the numbers.
 """
 
 from __future__ import annotations
@@ -16,9 +17,9 @@ from jax.sharding import Mesh, PartitionSpec
 
 
 def on(mesh: Mesh | None) -> contextlib.AbstractContextManager:
-    """Return a context in which, in a traced function, each device of the mesh draws all numbers.
+    """Return a context in which each device of a mesh draws all numbers of a traced function.
 
-    None is one device.
+    A mesh of None stands for one device.
     """
     if mesh is None:
         return contextlib.nullcontext()
@@ -38,8 +39,8 @@ def normal(key: Array, shape: tuple[int, ...]) -> Array:
 def integers(key: Array, n: int, below: Array) -> Array:
     """Return integers (n,) from 0 to below `below` (), uint32.
 
-    They are the remainders of random bits, which favours some by less than one in a thousand where `below` is
-    at most four million, and compiles faster than `jax.random.randint`.
+    They are remainders of random bits, which compile faster than `jax.random.randint`. Some integers are
+    more likely than others, by less than one in a thousand for `below` up to four million.
     """
     return _everywhere(jax.random.bits(key, (n,), jnp.uint32) % below.astype(jnp.uint32))
 
@@ -54,7 +55,7 @@ def both(key: Array, shape_uniform: tuple[int, ...], shape_normal: tuple[int, ..
     """
     n_uniform = math.prod(shape_uniform)
     share = uniform(key, (n_uniform + math.prod(shape_normal),))
-    centred = jnp.maximum(2.0 * share[n_uniform:] - 1.0, jnp.nextafter(-1.0, 0.0))  # -1 is at minus infinity
+    centred = jnp.maximum(2.0 * share[n_uniform:] - 1.0, jnp.nextafter(-1.0, 0.0))  # -1 would give -infinity
     drawn = math.sqrt(2.0) * jax.lax.erf_inv(centred)
     uniform_part = _everywhere(share[:n_uniform].reshape(shape_uniform))
     return uniform_part, _everywhere(drawn.reshape(shape_normal))
@@ -62,6 +63,6 @@ def both(key: Array, shape_uniform: tuple[int, ...], shape_normal: tuple[int, ..
 
 def _everywhere(numbers: Array) -> Array:
     mesh = jax.sharding.get_abstract_mesh()
-    if mesh.empty or set(mesh.axis_types) != {jax.sharding.AxisType.Auto}:  # as within `jax.pmap`
+    if mesh.empty or set(mesh.axis_types) != {jax.sharding.AxisType.Auto}:  # inside `jax.pmap`
         return numbers
     return jax.lax.with_sharding_constraint(numbers, PartitionSpec())

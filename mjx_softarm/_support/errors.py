@@ -2,4 +2,4 @@
 
 
 class InputError(ValueError):
-    """An input that cannot be used; the message names it, what was got and what was expected."""
+    """An input that cannot be used; the message names the input, what was got and what was expected."""

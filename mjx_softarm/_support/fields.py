@@ -11,8 +11,8 @@ from typing import Any
 from mjx_softarm._support.errors import InputError
 
 PerChamber = float | tuple[float, ...]
-MAX_COUNT = 100  # of sections, and of links in each; beyond it arrays of the mechanics do not fit a memory
-FLOAT32_MIN, FLOAT32_MAX = 1.1754944e-38, 3.4028235e38  # sizes of a normal float32, for the simulation
+MAX_COUNT = 100  # largest number of sections, and of links per section; more would not fit into memory
+FLOAT32_MIN, FLOAT32_MAX = 1.1754944e-38, 3.4028235e38  # smallest and largest normal float32
 
 
 class SpecError(InputError):
@@ -27,8 +27,10 @@ class Rule:
     low: float = -math.inf
     high: float = math.inf
     low_open: bool = False
-    per: str = ""  # a list has one for each of these; without a length it may be a single number, too
-    length: int | None = None  # of what has to be a list; 0 if it depends on the arm
+    per: str = (
+        ""  # parts of the arm with a number each, such as "chambers"; without `length`, one for all may do
+    )
+    length: int | None = None  # length of a field that must be a list; 0: it depends on the arm
 
     @property
     def text(self) -> str:
@@ -75,7 +77,7 @@ def vector() -> Any:
 
 
 def numbers(per: str) -> Any:
-    """Declare a list with one number for each of these, by default empty, which stands for zeros."""
+    """Declare a list with one number for each part, such as a section; empty, the default, means zeros."""
     return field(default=(), metadata={"rule": Rule(per=per, length=0)})
 
 
@@ -92,10 +94,12 @@ def read_fields(cls: type, data: Any, source: str, prefix: str) -> dict[str, Any
     """
     if not isinstance(data, dict):
         raise SpecError(f"{source}: {prefix.rstrip('.') or 'specification'}: got {data!r}, expected a table")
+    # Refuse unknown fields.
     known = [item.name for item in fields(cls)]
     for name in data:
         if name not in known:
             raise SpecError(f"{source}: {prefix}{name}: got an unknown field, expected {', '.join(known)}")
+    # Read each field: a default, a table of its own, or numbers.
     hints = typing.get_type_hints(cls)
     values: dict[str, Any] = {}
     for item in fields(cls):
@@ -121,12 +125,12 @@ def read_fields(cls: type, data: Any, source: str, prefix: str) -> dict[str, Any
 
 
 def check_counts(table: Any, counts: dict[str, int], source: str, prefix: str) -> None:
-    """Refuse a list that does not have one number for each part of the arm that it describes.
+    """Refuse a list whose length is not the number of the arm's parts that it describes.
 
     Args:
         table: a dataclass whose fields have rules, or are such dataclasses.
-        counts: number of the arm's parts, such as chambers, by the names that rules give them.
-        source: file or code that the numbers came from, for the message.
+        counts: numbers of the arm's parts, such as chambers, by their names in rules.
+        source: file or code of the numbers, for the message.
         prefix: name of the table in its source, with a dot at its end, or empty.
 
     Raises:
@@ -147,7 +151,7 @@ def check_counts(table: Any, counts: dict[str, int], source: str, prefix: str) -
 
 
 def rule_of(item: dataclasses.Field) -> Rule:
-    """Return the rule of a field; one without is a text."""
+    """Return the rule of a field; a field without a rule is a text."""
     return item.metadata.get("rule", Rule(kind=str))
 
 

@@ -1,7 +1,7 @@
 """MJX and brax, imported in one place.
 
-Without warp, which nothing here uses, `mujoco.mjx` prints two lines whenever it is imported; they are held
-back. Neither package is typed well enough to be checked, so type checkers see `Any`.
+`mujoco.mjx` prints two lines at import if warp is not installed. Nothing here uses warp, so these lines are
+held back. Neither package has enough types to be checked, so type checkers see `Any`.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "o
 
 
 def provenance(program: str) -> dict[str, Any]:
-    """Return versions, machine and commit; changes of other benchmarks' results do not count."""
+    """Return versions, machine and commit; changed files in docs/results do not count as uncommitted."""
     versions, status = {}, _git("status", "--porcelain", "--", ":/", ":(top,exclude)docs/results")
     for name in PACKAGES:
         try:

@@ -1,7 +1,7 @@
 """Many small matrices at once: products, block diagonals, elimination.
 
-Libraries are called once for each matrix, which costs more than the arithmetic of a small one. Matrices of
-many arms have the arms last, (n, m, *arms), so that one instruction serves several arms; *arms may be empty.
+A library is called once per matrix, which costs more than the arithmetic of a small matrix. Matrices of many
+arms have the arms last, (n, m, *arms), so that one instruction works on several arms; *arms may be empty.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ import jax.numpy as jnp
 from jax import Array
 
 BLOCK = 3  # pivots that are eliminated at once
-WRITTEN_OUT = 4  # terms of an inner product without arms that are added one by one, which is faster
+WRITTEN_OUT = 4  # largest number of terms that a product without arms adds one by one, which is faster
 
 
 def product(a: Array, b: Array) -> Array:
     """Multiply small matrices (n, m, *arms) and (m, k, *arms).
 
-    With arms, or a few terms, it is written out term by term. jaxlib 0.10.2 hands a sum over an axis in
-    between to a library on CPUs, and then some settled arms are wrong, unless
-    `mjx_softarm._support.xla.jit` compiles.
+    A product with arms, or with few terms, is written out term by term. On CPUs jaxlib 0.10.2 hands a sum
+    over a middle axis to a library, and then some settled arms are wrong; the options of
+    `mjx_softarm._support.xla.jit` prevent this.
     """
     if a.ndim > 2 or len(b) <= WRITTEN_OUT:
         return functools.reduce(jnp.add, [a[:, j, None] * b[j] for j in range(len(b))])
@@ -32,7 +32,7 @@ products = jax.vmap(product)  # of matrices (k, n, m, *arms) and (k, m, l, *arms
 
 
 def identity(n: int, like: Array) -> Array:
-    """Return the identity (n, n, 1, ..., 1), with a 1 for each axis of arms of a matrix like these."""
+    """Return the identity (n, n, 1, ..., 1) with a 1 for each axis of arms that `like` has."""
     return jnp.eye(n, dtype=like.dtype).reshape(n, n, *[1] * (like.ndim - 2))
 
 
@@ -46,12 +46,12 @@ def block_diagonal(blocks: Array) -> Array:
 def eliminate(matrix: Array, columns: Array) -> Array:
     """Multiply the inverse of a matrix (n, n, *arms) by columns (n, k, *arms): Gauss-Jordan, no pivoting.
 
-    It is meant for symmetric positive definite matrices and for nearly such ones: the response of a settling
-    arm's springs to their chambers, with rows of the identity for chambers at a limit.
+    It is meant for matrices that are symmetric positive definite, or nearly: the response of a settling arm's
+    springs to its chambers, with rows of the identity for chambers at a limit.
 
     Returns:
-        (n, k, *arms), all NaN if a pivot is not positive, which is so where a symmetric matrix is not
-        positive definite.
+        (n, k, *arms), all NaN if a pivot is not positive. A symmetric matrix that is not positive definite
+        has such a pivot.
     """
     if matrix.ndim == 2:
         return _eliminate_one(matrix, columns)
@@ -95,8 +95,8 @@ solve.defvjp(_solve_forward, _solve_backward)
 def _eliminate_last(augmented: Array) -> Array:
     """Eliminate in matrices beside columns (n, n + k, *arms).
 
-    A block of columns is cleared at once, so that each number is read and written a third as often. Barriers
-    keep the compiler from working out the pivots' rows again for each of the others.
+    Each step clears a block of columns, so that each number is read and written a third as often. Barriers
+    keep the compiler from computing the pivots' rows again for every other row.
     """
     n = augmented.shape[0]
     augmented = jax.lax.optimization_barrier(augmented)
@@ -109,7 +109,7 @@ def _eliminate_last(augmented: Array) -> Array:
 
 
 def _inverse_last(matrix: Array) -> Array:
-    """Invert matrices (n, n, *arms) with positive pivots; n is small, since all is written out."""
+    """Invert matrices (n, n, *arms) with positive pivots; n must be small, since every row is written out."""
     n = matrix.shape[0]
     beside = jnp.broadcast_to(identity(n, matrix), matrix.shape)
     rows = list(jnp.concatenate([matrix, beside], axis=1))

@@ -10,7 +10,7 @@ from typing import Any
 
 import jax
 
-# jaxlib 0.10 hands products and sums to a library (YNNPACK): learning is a third slower with it, and some
+# jaxlib 0.10 hands products and sums to the library YNNPACK. Learning is a third slower with it, and some
 # sums are wrong (see `small_matrices.product`).
 _CPU_OPTIONS = {"xla_cpu_experimental_ynn_fusion_type": ""}
 
@@ -30,9 +30,9 @@ def compiler_options(uses_mjx: bool = True) -> dict[str, Any]:
     accepted = {}
     for name, value in {**_CPU_OPTIONS, **(_CPU_MJX_OPTIONS if uses_mjx else {})}.items():
         try:
-            with jax.ensure_compile_time_eval():  # also where a function is being traced
+            with jax.ensure_compile_time_eval():  # works while a function is traced, too
                 jax.jit(lambda x: x + 1, compiler_options={name: value})(0)
-        except (jax.errors.JaxRuntimeError, ValueError):  # an option that this jaxlib does not know
+        except (jax.errors.JaxRuntimeError, ValueError):  # this jaxlib does not know the option
             continue
         accepted[name] = value
     return accepted
@@ -41,8 +41,7 @@ def compiler_options(uses_mjx: bool = True) -> dict[str, Any]:
 def jit(function: Callable, uses_mjx: bool = True, **kwargs: Any) -> Callable:
     """Compile with `jax.jit` and this platform's options; JAX raises inside a function that it traces.
 
-    Without MJX, its options do not help: the closed-form chain compiles well, and networks train about a
-    tenth slower with them.
+    MJX's options are for programs with MJX alone: networks train about a tenth slower with them.
     """
     return jax.jit(function, compiler_options=compiler_options(uses_mjx), **kwargs)
 
@@ -50,7 +49,7 @@ def jit(function: Callable, uses_mjx: bool = True, **kwargs: Any) -> Callable:
 def jit_at_first_call(uses_mjx: bool = True, **kwargs: Any) -> Callable[[Callable], Callable]:
     """Return a decorator that compiles as `jit` does, for functions of a module.
 
-    Options are looked up at the first call: at import, that would start JAX on a device.
+    Options are looked up at the first call, because a look-up at import would start JAX on a device.
     """
 
     def decorate(function: Callable) -> Callable:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-Array = Any  # a NumPy or a JAX array; JAX itself is never imported here
+Array = Any  # a NumPy or a JAX array; this module never imports JAX
 
 
 def array_namespace(*arrays: Array) -> ModuleType:

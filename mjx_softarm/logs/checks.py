@@ -1,7 +1,6 @@
 """Checks of the rows of a log.
 
-Detectors take arrays and return a mask of the rows at fault; they know nothing of files. The logs of this
-project and readers of other formats share them.
+Detectors take arrays and return a mask of the faulty rows; they know nothing about files.
 """
 
 from __future__ import annotations
@@ -18,10 +17,10 @@ class Finding(NamedTuple):
     """A fault of a log."""
 
     file: str
-    rows: tuple[int, int] | None  # first and last line at fault, counted from 1; None: the whole file
-    column: str  # "" where it is not about columns
-    problem: str  # what was got, and what was expected
-    n_dropped: int = 0  # rows that it cost; a row with two faults counts in both findings
+    rows: tuple[int, int] | None  # first and last faulty line, counted from 1; None: the whole file
+    column: str  # name of the faulty column, or ""
+    problem: str  # "got X, expected Y"
+    n_dropped: int = 0  # number of dropped rows; a row with two faults counts in both findings
 
     def __str__(self) -> str:
         first, last = self.rows or (0, 0)
@@ -39,17 +38,17 @@ class LogError(InputError):
         self.findings = tuple(findings)
 
 
-_UNIT_TOLERANCE = 0.01  # of a quaternion's length
-_MOVES_M = 1e-3  # a body that stays within this cannot be told from a frozen one
-_TURN_DEG = 150.0  # a step of orientation that is a jump by 180 degrees
-_MOTION_DEG = 15.0  # larger typical steps are other poses, not motion, and may be turns
-_SPIKE_SIGMA = 20.0
-_SPIKE_LOCAL = 10.0
-_GAP_STEPS = 10.0
+_UNIT_TOLERANCE = 0.01  # error of a quaternion's length
+_MOVES_M = 1e-3  # range of positions up to which a body may be frozen
+_TURN_DEG = 150.0  # smallest step of orientation that counts as a jump by 180 degrees
+_MOTION_DEG = 15.0  # largest median step of one motion; with larger steps, rows are separate poses
+_SPIKE_SIGMA = 20.0  # smallest deviation of a spike, in standard deviations of the column
+_SPIKE_LOCAL = 10.0  # smallest deviation of a spike, in spreads of its neighbours
+_GAP_STEPS = 10.0  # smallest gap, in median time steps
 
 
 def stale_rows(values: np.ndarray) -> np.ndarray:
-    """Mask (n,) the rows of (n, k) that are equal to the row before: a reading that was not renewed."""
+    """Mask (n,) the rows of (n, k) that equal the row before: readings that were not renewed."""
     return np.concatenate([[False], (values[1:] == values[:-1]).all(axis=1)])
 
 
@@ -59,16 +58,16 @@ def moves(position_m: np.ndarray) -> bool:
 
 
 def not_unit_rows(quaternion: np.ndarray) -> np.ndarray:
-    """Mask (n,) the quaternions (n, 4) that are no rotation."""
+    """Mask (n,) the quaternions (n, 4) whose length is not 1."""
     return np.abs(np.linalg.norm(quaternion, axis=1) - 1.0) > _UNIT_TOLERANCE
 
 
 def turned_rows(quaternion: np.ndarray) -> np.ndarray:
     """Mask (n,) the rows where motion capture has a body turned by 180 degrees.
 
-    It confuses the markers of a symmetric body for some rows, then jumps back. Of the two orientations, the
-    one with fewer rows counts as turned. Where successive rows are other poses and not one motion there is no
-    telling, and none is.
+    Motion capture confuses the markers of a symmetric body for some rows, then jumps back. Of the two
+    orientations, the one with fewer rows counts as turned. Rows that are separate poses, not one motion,
+    cannot be checked: none counts as turned.
 
     Args:
         quaternion (n, 4): unit, scalar first or last.
@@ -83,10 +82,10 @@ def turned_rows(quaternion: np.ndarray) -> np.ndarray:
 
 
 def same_sign(quaternion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Choose the signs of quaternions (n, 4) so that successive ones are alike; q and -q are one rotation.
+    """Choose the signs of quaternions (n, 4) so that neighbours are alike; q and -q are one rotation.
 
     Returns:
-        The quaternions, and a mask (n,) of the rows where the sign flipped alone: q was about -q.
+        The quaternions, and a mask (n,) of the rows where only the sign jumped: q followed about -q.
     """
     cos_half = (quaternion[1:] * quaternion[:-1]).sum(axis=1)
     sign = np.cumprod(np.where(cos_half < 0.0, -1.0, 1.0))
@@ -97,8 +96,8 @@ def same_sign(quaternion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def late_rows(time_s: np.ndarray) -> np.ndarray:
     """Mask (n,) the rows whose time does not increase: repeated or backwards.
 
-    A row that is alone out of order, early or late, is at fault itself; otherwise the rows up to where the
-    time exceeds again all that came before.
+    A single row out of order, early or late, is faulty itself. Otherwise all rows are faulty up to the row
+    whose time exceeds all times before.
     """
     alone = np.zeros(len(time_s), bool)
     before, here, after = time_s[:-2], time_s[1:-1], time_s[2:]
@@ -119,9 +118,10 @@ def gap_rows(time_s: np.ndarray) -> np.ndarray:
 def outlier_rows(values: np.ndarray, least: float) -> np.ndarray:
     """Mask (n,) the spikes in a column (n,), one or two rows long.
 
-    A value is compared to the two before and the two after it. A spike is off their median by 20 times the
-    usual (by the median of absolute deviations), by 10 times the spread of the middle two, and by `least`. A
-    step or a fast swing moves the middle two apart, and constant or quantised columns stay below `least`.
+    A value is compared with the two values before and the two after it. A spike deviates from their median by
+    20 standard deviations of the column (from the median absolute deviation), by 10 times the spread of the
+    middle two of the four, and by `least`. A step or a fast swing spreads the middle two; constant or
+    quantised columns stay below `least`.
     """
     outlier = np.zeros(len(values), bool)
     if len(values) < 5:

@@ -1,7 +1,7 @@
-"""Log files as matrices: the columns that the schema knows, in the units used inside, rows not yet checked.
+"""Log files as matrices: the columns that the schema knows, in internal units; rows are not checked yet.
 
-All readers of logs use it. A file that cannot be understood is refused here, with a line for each column that
-is missing, has a wrong unit or stands there twice; which rows to believe is for the readers to say.
+All readers of logs use this module. It refuses a file that cannot be understood, with a line for each column
+that is missing, repeated or has a wrong unit. Each reader decides which rows to believe.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ class LogMatrix(NamedTuple):
 
     file: str
     columns: tuple[Column, ...]  # (k,) with the file's units, in the order of `log_columns`: time first
-    values: np.ndarray  # (n, k) in the units used inside
+    values: np.ndarray  # (n, k) in internal units
     row: np.ndarray  # (n,) line of the file
 
     def indices(self, *groups: str) -> list[int]:
-        """Return the indices of the columns that are part of these fields of `Log`."""
+        """Return the indices of the columns of these fields of `Log`."""
         return [k for k, column in enumerate(self.columns) if column.group in groups]
 
     def bodies(self) -> Iterator[tuple[str, list[int]]]:
-        """Yield tip and markers, each with the indices of its coordinates."""
+        """Yield the names of tip and markers, each with the indices of its coordinates."""
         columns = self.indices("tip_m", "marker_m")
         for start in range(0, len(columns), 3):
             yield self.columns[columns[start]].name[:-2], columns[start : start + 3]
@@ -55,7 +55,7 @@ class LogMatrix(NamedTuple):
         return Log(source=self.file, row=self.row, **groups)
 
 
-@np.errstate(over="ignore", invalid="ignore")  # any number may stand in a file
+@np.errstate(over="ignore", invalid="ignore")  # a file may hold any number
 def read_matrix(
     path: str | Path,
     n_chambers: int,
@@ -63,18 +63,19 @@ def read_matrix(
     one_of: Sequence[str] = (),
     reading_name: str | None = None,
 ) -> tuple[LogMatrix, list[Finding]]:
-    """Read the known columns of a file; unknown ones are findings.
+    """Read the known columns of a file; unknown columns are findings.
 
     Args:
-        path: CSV, or npz by the end of its name.
-        n_chambers: of the arm; a log of another number is refused.
-        needed: fields of `Log` whose columns must be there, besides time.
-        one_of: fields of `Log` of which one at least must be there.
-        reading_name: of the arm's sensors; by default the first that the file has columns of.
+        path: CSV file, or an npz file with the suffix `.npz`.
+        n_chambers: number of the arm's chambers; a log of another arm is refused.
+        needed: fields of `Log` whose columns are required, besides time.
+        one_of: fields of `Log`; the columns of at least one are required.
+        reading_name: name of the readings of the arm's sensors; by default the first name in the file.
 
     Raises:
         LogError: the file cannot be understood; the message has a line for each finding.
     """
+    # Split the header into names and units.
     file, table = str(path), read_table(path)
     matches = [_CELL.fullmatch(cell) for cell in table.names]
     names = [match[1] if match else cell for match, cell in zip(matches, table.names, strict=True)]
@@ -84,6 +85,7 @@ def read_matrix(
     reading_name = reading_name or _reading_name(names)
     known = {column.name: column for column in log_columns(n_chambers, n_markers, reading_name)}
 
+    # Refuse headers that do not fit the arm.
     if any(name[:1].isalpha() for name in names):
         problems = [*_header_errors(names, units, known, reading_name)]
         problems += _absent(names, known, ("time_s", *needed), one_of)
@@ -91,6 +93,7 @@ def read_matrix(
         got = ", ".join(names)[:60]
         problems = [("", f"got {got}, expected a header such as `time [s],pressure0 [kPa],...`")]
     refuse([Finding(file, (1, 1), name, problem) for name, problem in problems])
+    # Bring the known columns to internal units.
     present = [column for name, column in known.items() if name in names]
     columns = tuple(dataclasses.replace(column, unit=units[column.name]) for column in present)
     values = table.values[:, [names.index(column.name) for column in columns]]
@@ -100,13 +103,13 @@ def read_matrix(
 
 
 def refuse(findings: Sequence[Finding]) -> None:
-    """Raise a `LogError` with all findings, if there are any."""
+    """Raise a `LogError` with the findings, if there are any."""
     if findings:
         raise LogError(findings)
 
 
 def _reading_name(names: list[str]) -> str:
-    """Return the name of a file's readings; the default arm's where it has none."""
+    """Return the name of a file's readings, or that of the default arm if the file has no readings."""
     found = [sensor.reading_name for sensor in SENSORS.values()]
     return next((x for x in found if any(re.fullmatch(rf"{x}\d+", name) for name in names)), found[0])
 
@@ -114,6 +117,7 @@ def _reading_name(names: list[str]) -> str:
 def _header_errors(
     names: list[str], units: dict, known: dict, reading_name: str
 ) -> Iterator[tuple[str, str]]:
+    """Yield the columns that do not fit the schema, each with its problem."""
     for name, unit in units.items():
         if names.count(name) > 1:
             yield name, f"got {names.count(name)} columns of this name, expected one"
@@ -133,7 +137,7 @@ def _header_errors(
 def _absent(
     names: list[str], known: dict, needed: Sequence[str], one_of: Sequence[str]
 ) -> Iterator[tuple[str, str]]:
-    """Yield the groups that have no column, with the problem."""
+    """Yield the required groups without a column, each with its problem."""
     groups = {known[name].group for name in names if name in known}
     for group in needed:
         if group not in groups:

@@ -1,7 +1,7 @@
 """Logs in Foxglove's format MCAP: one topic for each part of a log, its messages JSON with a schema.
 
-The topic `/pressure_kpa` has a message `{"pressure0": -12.5, ...}` for each row, in units as in the CSV file;
-the schema names them. A missing or infinite value is null. Times count from the log's first row.
+The topic `/pressure_kpa` has a message `{"pressure0": -12.5, ...}` for each row. Units are those of the CSV
+file, and the schema names them. A missing or infinite value is null.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def require_mcap(where: str) -> None:
     """Refuse a log of this format where the package that writes it is missing.
 
     Raises:
-        InputError: it is; the message begins with `where`.
+        InputError: the package is missing; the message begins with `where`.
     """
     try:
         import mcap  # noqa: F401

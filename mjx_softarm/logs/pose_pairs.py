@@ -22,18 +22,18 @@ POSES_FILE = "poses.npz"
 class PosePairs(NamedTuple):
     """n poses beside their targets."""
 
-    target: np.ndarray  # (n, 6) [mm, deg] goals of a run, measured tips of a calibration
-    pose: np.ndarray  # (n, 6) [mm, deg] reached, or simulated
-    warned: np.ndarray  # (n,) bool: a chamber saturated or the arm not settled; the network extrapolating
+    target: np.ndarray  # (n, 6) [mm, deg] goals of a run, or measured tips of a calibration
+    pose: np.ndarray  # (n, 6) [mm, deg] reached poses of a run, or simulated tips of a calibration
+    warned: np.ndarray  # (n,) bool: saturated or not settled in a run, extrapolated in a calibration
 
     @property
     def error_mm(self) -> np.ndarray:
-        """Distance (n,) of the positions."""
+        """Distances (n,) between the positions."""
         return np.linalg.norm((self.pose - self.target)[:, :3], axis=-1)
 
 
 def write_pose_pairs(folder: Path, sets: Mapping[str, PosePairs]) -> None:
-    """Write sets by their names into a folder, whole or not at all.
+    """Write named sets into a folder, whole or not at all.
 
     Raises:
         OSError: the file cannot be written.
@@ -46,10 +46,10 @@ def write_pose_pairs(folder: Path, sets: Mapping[str, PosePairs]) -> None:
 
 
 def read_pose_pairs(folder: Path) -> dict[str, PosePairs]:
-    """Read the sets of a folder.
+    """Read the named sets of a folder.
 
     Raises:
-        InputError: there are none, or the file is of something else.
+        InputError: there is no file of sets, or it cannot be read as such.
     """
     path = folder / POSES_FILE
     try:

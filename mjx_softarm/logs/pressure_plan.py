@@ -1,4 +1,4 @@
-"""Tables of pressures to record, one pose a row, with columns as a log's: `pressure0 [kPa]` and so on."""
+"""Tables of pressures to record, one pose per row, with the columns of a log: `pressure0 [kPa]`, ..."""
 
 from __future__ import annotations
 
@@ -16,7 +16,11 @@ def _columns(n_chambers: int) -> tuple[str, ...]:
 
 
 def write_plan(path: Path, pressure_kpa: np.ndarray) -> None:
-    """Write pressures (n, n_chambers) [kPa]; raises OSError if that fails."""
+    """Write pressures (n, n_chambers) [kPa].
+
+    Raises:
+        OSError: the file cannot be written.
+    """
     header = ",".join(_columns(pressure_kpa.shape[1]))
     np.savetxt(path, pressure_kpa, fmt="%.3f", delimiter=",", header=header, comments="")
 

@@ -1,8 +1,8 @@
 """Logs of an arm: one table of columns with units, written by the control loop and read by `calib`.
 
-A log is a CSV file whose header names each column with its unit, `pressure0 [kPa]`, or an npz file with the
-same: `columns` (k,) of text and `table` (n, k) of float64. This module alone says which columns there are and
-which units a file may use; `mjx_softarm.logs.files` reads files from elsewhere.
+A log is a CSV file whose header names each column with its unit, `pressure0 [kPa]`, or an npz file with
+`columns` (k,) of text and `table` (n, k) of float64. Only this module defines the columns and the units that
+a file may use. `mjx_softarm.logs.files` reads logs.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from mjx_softarm.logs import mcap_file
 from mjx_softarm.logs.checks import Finding, LogError
 from mjx_softarm.sensing.sensors import SENSORS, Coil, Sensor
 
-# Kind of quantity -> units a file may use, each with its factor to the unit used inside, which comes first.
+# Kind of quantity -> units of a file, each with its factor to the internal unit, which comes first.
 UNITS: Mapping[str, Mapping[str, float]] = MappingProxyType(
     {
         "time": {"s": 1.0, "ms": 1e-3},
@@ -42,10 +42,10 @@ _POSE = dict.fromkeys(_XYZ, ("pose_length", "mm")) | dict.fromkeys(("yaw", "pitc
 class Column:
     """One column of a log file."""
 
-    group: str  # the field of `Log` that it is part of
-    name: str  # as in the header, without the unit
-    kind: str  # key of UNITS
-    unit: str  # that `write_log` uses
+    group: str  # field of `Log` with this column
+    name: str  # name in the header, without the unit
+    kind: str  # kind of quantity, a key of UNITS
+    unit: str  # unit that `write_log` uses
 
     @property
     def header(self) -> str:
@@ -55,7 +55,7 @@ class Column:
 def log_columns(
     n_chambers: int, n_markers: int = 0, reading_name: str = Coil.reading_name
 ) -> tuple[Column, ...]:
-    """Return all columns that a log of such an arm may have, in the order in which they are written."""
+    """Return all columns that a log of an arm may have, in the order of the file."""
     chambers, markers = range(n_chambers), range(n_markers)
     reading_unit = next(iter(UNITS[reading_name]))
     return (
@@ -80,34 +80,34 @@ class Log:
     """Rows of one log, ordered by time; a quantity that was not logged is None.
 
     Chambers and springs are numbered as in the model. Positions and orientation are in the base frame (see
-    `mjx_softarm.sensing.pose`), the tip being the centre of the last plate.
+    `mjx_softarm.sensing.pose`). The tip is the centre of the last plate.
     """
 
-    source: str  # the file, for messages
-    row: np.ndarray  # (n,) line of the file that a row came from, the header being line 1
+    source: str  # file name, for messages
+    row: np.ndarray  # (n,) line of the file for each row; the header is line 1
     time_s: np.ndarray  # (n,)
-    readings: np.ndarray | None = None  # (n, n_chambers) of the springs' sensors
-    spring_m: np.ndarray | None = None  # (n, n_chambers) measured otherwise than by these
+    readings: np.ndarray | None = None  # (n, n_chambers) readings of the springs' sensors
+    spring_m: np.ndarray | None = None  # (n, n_chambers) spring lengths from another instrument
     pressure_kpa: np.ndarray | None = None  # (n, n_chambers) relative to the atmosphere
     tip_m: np.ndarray | None = None  # (n, 3)
     tip_quaternion: np.ndarray | None = None  # (n, 4) w, x, y, z
     marker_m: np.ndarray | None = None  # (n, n_markers, 3) from the base to the tip
     payload_kg: np.ndarray | None = None  # (n,)
-    reference_m: np.ndarray | None = None  # (n, n_chambers) spring lengths that were asked for
+    reference_m: np.ndarray | None = None  # (n, n_chambers) references of the springs
     goal: np.ndarray | None = None  # (n, 6) [mm, deg]
-    estimate: np.ndarray | None = None  # (n, 6) [mm, deg] tip pose that the controller believed in
-    load_kg: np.ndarray | None = None  # (n,) payload that the controller believed in
-    sequence: np.ndarray | None = None  # (n,) which demonstration a row is part of, counted from 0
-    reading_name: str = Coil.reading_name  # of what the readings are, as in the names of their columns
+    estimate: np.ndarray | None = None  # (n, 6) [mm, deg] tip pose that the controller estimated
+    load_kg: np.ndarray | None = None  # (n,) payload that the controller estimated
+    sequence: np.ndarray | None = None  # (n,) index of the demonstration that a row belongs to, from 0
+    reading_name: str = Coil.reading_name  # quantity of the readings, as their columns are named
 
     def __len__(self) -> int:
         return len(self.time_s)
 
     def readings_of(self, sensor: Sensor) -> np.ndarray | None:
-        """Return the readings, if there are any, of an arm with this sensor.
+        """Return the readings of an arm with this sensor, or None without readings.
 
         Raises:
-            LogError: they are readings of another one.
+            LogError: the readings are of another kind of sensor.
         """
         if self.readings is not None and self.reading_name != sensor.reading_name:
             expected = f"{sensor.reading_name} of a {sensor.kind}"
@@ -116,7 +116,7 @@ class Log:
         return self.readings
 
     def take(self, rows: np.ndarray) -> Log:
-        """Return a log of some of the rows, given by their indices or a mask (n,)."""
+        """Return a log of some rows, given by indices or a mask (n,)."""
         values = {name: getattr(self, name) for name in GROUPS}
         kept = {name: None if value is None else value[rows] for name, value in values.items()}
         return dataclasses.replace(self, row=self.row[rows], **kept)
@@ -127,7 +127,7 @@ GROUPS = tuple(item.name for item in dataclasses.fields(Log) if item.name not in
 
 
 def log_table(log: Log) -> tuple[tuple[Column, ...], np.ndarray]:
-    """Return the columns (k,) that a log has, and its numbers (n, k) in the units of the columns."""
+    """Return the columns (k,) of a log, and its numbers (n, k) in the units of the columns."""
     per_chamber = [getattr(log, name) for name in ("readings", "spring_m", "pressure_kpa", "reference_m")]
     n_chambers = max((value.shape[1] for value in per_chamber if value is not None), default=0)
     n_markers = 0 if log.marker_m is None else log.marker_m.shape[1]
@@ -139,7 +139,7 @@ def log_table(log: Log) -> tuple[tuple[Column, ...], np.ndarray]:
 
 
 def write_log(path: str | Path, log: Log) -> None:
-    """Write a log as CSV, or as npz or MCAP where the name ends so; whole or not at all.
+    """Write a log as CSV, or as npz or MCAP by the suffix of the name; whole or not at all.
 
     Raises:
         OSError: the file cannot be written.

@@ -1,7 +1,7 @@
 """Tables of numbers from CSV and npz files, or an error that names the line and the column.
 
-Well-formed text goes through NumPy's fast reader. Only where that fails, or where line numbers are in doubt,
-is the file read again line by line, to say what is wrong with it.
+NumPy's fast reader reads well-formed text. If it fails, or if line numbers are in doubt, the file is read
+again line by line to find the error.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ _OTHER_DELIMITERS = {";": "semicolons", "\t": "tabs", "|": "bars"}
 class Table(NamedTuple):
     """Numbers of a file."""
 
-    names: tuple[str, ...]  # (k,) as in the header
+    names: tuple[str, ...]  # (k,) names in the header
     values: np.ndarray  # (n, k)
-    row: np.ndarray  # (n,) line of the file, counted from 1; an npz file counts as if it had a header
+    row: np.ndarray  # (n,) line of the file, counted from 1; the first row of an npz file is line 2
 
 
 def read_table(path: str | Path, names: Sequence[str] | None = None) -> Table:
-    """Read a CSV file, or an npz file as `mjx_softarm.logs.schema` has it.
+    """Read a CSV file, or an npz file as `mjx_softarm.logs.schema` describes it.
 
     A number that float32 cannot hold becomes infinite, which the readers of logs refuse.
 
     Args:
-        path: the file; npz where its name ends so.
-        names: the columns of a CSV file without a header.
+        path: CSV file, or an npz file with the suffix `.npz`.
+        names: names of the columns of a CSV file without a header.
 
     Raises:
-        LogError: the file cannot be read as such.
+        LogError: the file cannot be read.
     """
     path = Path(path)
     try:
@@ -83,12 +83,15 @@ def _read_csv(path: Path, names: Sequence[str] | None) -> Table:
         raise _error(path, f"got {got}, expected columns parted by commas, and decimal points", 1)
     try:
         with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "loadtxt: input contained no data")  # an error below
+            warnings.filterwarnings("ignore", "loadtxt: input contained no data")  # `_read_lines` refuses it
             options: Any = {"delimiter": ",", "comments": None, "encoding": "utf-8-sig"}
             values = np.loadtxt(path, skiprows=n_header, ndmin=2, **options)
     except ValueError:
         return _read_lines(path, names, n_header)
-    if values.shape != (_count_lines(path) - n_header, len(names)):  # blank lines, or another header's length
+    if values.shape != (
+        _count_lines(path) - n_header,
+        len(names),
+    ):  # blank lines, or a short header
         return _read_lines(path, names, n_header)
     return Table(names, values, np.arange(len(values)) + 1 + n_header)
 
@@ -119,7 +122,7 @@ def _count_lines(path: Path) -> int:
 
 
 def _read_lines(path: Path, names: tuple[str, ...], n_header: int) -> Table:
-    """Read line by line: blank lines are passed over, empty cells are NaN, anything else is an error."""
+    """Read line by line: blank lines are skipped, empty cells are NaN, any other text is an error."""
     values, row = [], []
     with path.open(encoding="utf-8-sig", errors="replace") as file:
         for number, line in enumerate(file, 1):
