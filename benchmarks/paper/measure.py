@@ -12,10 +12,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjx_softarm._support.errors import InputError
-from mjx_softarm.deploy import faults
 from mjx_softarm.deploy import measure as accuracy
 from mjx_softarm.deploy.controller import Controller
-from mjx_softarm.deploy.ending import Run
+from mjx_softarm.deploy.ending import LoopRun
+from mjx_softarm.deploy.safety import Fault
 from mjx_softarm.deploy.session import follow, trace
 from mjx_softarm.mechanics.pipe import APPLE_KG, BALL_KG
 from mjx_softarm.sensing.pose import frame_from_pose, rotation_from_quaternion
@@ -39,7 +39,7 @@ class TrialOutcome(NamedTuple):
     success: np.ndarray  # (p,) bool: an object was picked or placed
     arrival_s: np.ndarray  # (p,)
     load_estimate_g: np.ndarray  # (p,) payload that the loop believed in, on arrival
-    events: np.ndarray  # (faults,) how often the loop reported each of `faults.Fault`
+    events: np.ndarray  # (faults,) how often the loop reported each of `Fault`
     latency_s: np.ndarray  # (2,) median and 99.9 % of a tick's computing time
     time_s: np.ndarray  # (t,)
     wall_n: np.ndarray  # (t,) contact force of the walls, the largest within each tick
@@ -161,7 +161,7 @@ def operate(
     )
 
 
-def measure(run: Run, controller: Controller, goals: np.ndarray) -> TrialOutcome:
+def measure(run: LoopRun, controller: Controller, goals: np.ndarray) -> TrialOutcome:
     """Return the outcome of a run towards goals (p, 6) [mm, deg], without objects and contact forces.
 
     Raises:
@@ -176,7 +176,7 @@ def measure(run: Run, controller: Controller, goals: np.ndarray) -> TrialOutcome
         **accuracy.measure(run, controller, goals)._asdict(),
         name=np.full(len(goals), ""),
         success=np.zeros(len(goals), bool),
-        events=np.array([counts.get(fault, 0) for fault in faults.Fault]),
+        events=np.array([counts.get(fault, 0) for fault in Fault]),
         latency_s=np.quantile(run.latency_s, (0.5, 0.999)),
         time_s=log.time_s,
         wall_n=np.zeros(len(log), np.float32),
@@ -188,7 +188,7 @@ def figures(outcome: TrialOutcome) -> dict[str, Any]:
     """Return the figures of one trial; errors over the goals that were measured, NaN without any."""
     errors = accuracy.Accuracy(*(getattr(outcome, name) for name in accuracy.Accuracy._fields))
     return {
-        **accuracy.figures(errors, dict(zip(faults.Fault, outcome.events, strict=True))),
+        **accuracy.figures(errors, dict(zip(Fault, outcome.events, strict=True))),
         "operations": int(outcome.operation.sum()),
         "done": int(outcome.success.sum()),
         "calm_percent": 100 * float(np.mean(outcome.wall_n < CALM_N)),

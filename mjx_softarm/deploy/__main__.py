@@ -18,7 +18,7 @@ from mjx_softarm._support import cli
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.drivers.names import open_arm
-from mjx_softarm.deploy.ending import MISSED, Run, save_log
+from mjx_softarm.deploy.ending import MISSED, LoopRun, save_log
 from mjx_softarm.deploy.measure import (
     along,
     figures,
@@ -109,7 +109,7 @@ def _controller(policy: Path) -> Controller:
     return Controller.of(load_policy(policy))
 
 
-def _summary(run: Run) -> None:
+def _summary(run: LoopRun) -> None:
     for fault, count in run.counts().items():
         print(f"fault: {fault.value}: {count} times, {fault.response.value}")
     if len(run.latency_s):

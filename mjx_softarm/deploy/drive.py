@@ -14,8 +14,8 @@ import numpy as np
 
 from mjx_softarm.control import Gains, LawState, pressures
 from mjx_softarm.deploy.arm_io import ArmIO
-from mjx_softarm.deploy.controller import WINDOW_S
-from mjx_softarm.deploy.faults import LOST_TICKS, SETTLE_TIMEOUT_S, read_lengths, still
+from mjx_softarm.deploy.belief import read_lengths, still
+from mjx_softarm.deploy.controller import LOOP
 from mjx_softarm.deploy.link import VENT_KPA_PER_S, ArmFault, Link
 from mjx_softarm.spec import ArmSpec
 
@@ -78,12 +78,12 @@ class Drive:
         self.on_tick = on_tick
         self.sensor, self.gains = spec.spring_sensor, Gains.from_spec(spec)
         self.dt_s = 1.0 / spec.control.rate_hz
-        self.window = max(2, round(WINDOW_S * spec.control.rate_hz))
+        self.window = max(2, round(LOOP.window_s * spec.control.rate_hz))
         self.link = Link(arm, spec.n_chambers, self.dt_s)
         self.n_lost = 0
 
     def to_rest(
-        self, law: Law, held: Callable[[], bool] = lambda: True, timeout_s: float = SETTLE_TIMEOUT_S
+        self, law: Law, held: Callable[[], bool] = lambda: True, timeout_s: float = LOOP.settle_timeout_s
     ) -> dict | None:
         """Drive until the springs are at rest where the law wants them.
 
@@ -125,9 +125,10 @@ class Drive:
         self.n_lost = self.n_lost + 1 if lost.any() else 0
         known_m = None if lost.any() else spring_m
         try:
-            if self.n_lost >= LOST_TICKS:
+            most = LOOP.lost_ticks
+            if self.n_lost >= most:
                 raise ArmFault(
-                    f"sensors: got {self.n_lost} lost readings in a row, expected under {LOST_TICKS}: {text}"
+                    f"sensors: got {self.n_lost} lost readings in a row, expected under {most}: {text}"
                 )
             pressure_kpa, arrived = law(known_m, self.link.pressure_kpa)
             self.link.write(pressure_kpa)

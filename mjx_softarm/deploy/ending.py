@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjx_softarm.deploy.faults import Event, Fault
 from mjx_softarm.deploy.link import Link, describe
+from mjx_softarm.deploy.safety import Event, Fault
 from mjx_softarm.logs.schema import Log, write_log
 
 # Exit statuses; after a signal, 128 and its number.
@@ -52,8 +52,8 @@ class Arrival(NamedTuple):
     reached: bool = True  # within the policy's threshold of a goal, by motion capture if there is any
 
 
-class Run(NamedTuple):
-    """Results of a run."""
+class LoopRun(NamedTuple):
+    """Results of a run of the control loop."""
 
     log: Log
     arrivals: tuple[Arrival, ...]

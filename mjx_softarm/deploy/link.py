@@ -20,7 +20,7 @@ import numpy as np
 
 from mjx_softarm._support.xp import Array, array_namespace
 from mjx_softarm.deploy.arm_io import ArmIO
-from mjx_softarm.deploy.faults import LATE_TICKS
+from mjx_softarm.deploy.controller import LOOP
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.sensing.sensors import Sensor
 
@@ -100,9 +100,10 @@ class Link:
             self._call("write_pressures", lambda: self._arm.write_pressures(pressure_kpa))
         except TimeoutError as error:
             self._n_late += 1
-            if self._n_late > 2 * LATE_TICKS:
+            most = 2 * LOOP.late_ticks
+            if self._n_late > most:
                 raise ArmFault(
-                    f"write_pressures: got {self._n_late} late in a row, expected {2 * LATE_TICKS} at most"
+                    f"write_pressures: got {self._n_late} late in a row, expected {most} at most"
                 ) from error
             return False
         self._unsure, self._n_late, self.pressure_kpa = False, 0, pressure_kpa

@@ -16,9 +16,9 @@ import numpy as np
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.control import saturated
 from mjx_softarm.deploy.controller import Controller
-from mjx_softarm.deploy.ending import Run
-from mjx_softarm.deploy.faults import Fault
+from mjx_softarm.deploy.ending import LoopRun
 from mjx_softarm.deploy.link import describe
+from mjx_softarm.deploy.safety import Fault
 from mjx_softarm.logs.tables import read_table
 from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.policy.file import Policy
@@ -99,7 +99,7 @@ def require_motion_capture(arm: Any, where: str) -> None:
     raise InputError(f"{why}, expected a frame with the tip")
 
 
-def measure(run: Run, controller: Controller, goals: np.ndarray) -> Accuracy:
+def measure(run: LoopRun, controller: Controller, goals: np.ndarray) -> Accuracy:
     """Return the accuracy of a run towards goals (p, 6) [mm, deg], on an arm with motion capture.
 
     Raises:
@@ -168,7 +168,7 @@ def figures(accuracy: Accuracy, events: Mapping[Fault, int]) -> dict[str, Any]:
     }
 
 
-def along(run: Run, dt_s: float) -> dict[str, float]:
+def along(run: LoopRun, dt_s: float) -> dict[str, float]:
     """Return the tip's distances from a moving goal by motion capture, NaN where it was not seen.
 
     Returns:

@@ -1,7 +1,7 @@
 """The control loop on an arm: input, output and time around the pure `mjx_softarm.deploy.loop`.
 
-An arm that offers `pressures()`, what its regulators measure, or `motion_capture()` has both logged;
-motion capture is not used for control, pressures only to estimate the payload.
+Measured pressures and motion capture are logged where the arm offers them. Control does not use motion
+capture, and uses measured pressures only to estimate the payload.
 """
 
 from __future__ import annotations
@@ -9,46 +9,23 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any
 
 import numpy as np
 
-from mjx_softarm.deploy.acting import believed
 from mjx_softarm.deploy.arm_io import ArmIO
-from mjx_softarm.deploy.controller import LEAD_ACTIONS, Controller, State, Tick, start
-from mjx_softarm.deploy.ending import Arrival, Run, vent_at_end
-from mjx_softarm.deploy.faults import Event, Fault, Response
+from mjx_softarm.deploy.controller import Controller
+from mjx_softarm.deploy.ending import Arrival, LoopRun, vent_at_end
+from mjx_softarm.deploy.goals import Goals, ListedGoals, OrderedGoals, Pilot, Way
 from mjx_softarm.deploy.link import ArmFault, Link, Recorder
-from mjx_softarm.deploy.loop import hold, release, step, with_goal, with_moving_goal
-from mjx_softarm.deploy.reachability import refusals
-from mjx_softarm.deploy.way import Way
+from mjx_softarm.deploy.loop import LoopState, Tick, in_force, refusals, start, step
+from mjx_softarm.deploy.safety import Event, Fault, Response
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mdp.rewards import scaled_error
 from mjx_softarm.sensing.pose import pose_error, seen_error
 
 _ROUNDING_S = 1e-6  # by which a simulated tick may be longer than the period
-LEAD_S = 0.85  # of a moving goal before the tip, by policies of rest: they lag so on twins
 _KEPT = 1000  # rows, arrivals and faults of a run without a log
-
-
-class Orders(NamedTuple):
-    """Orders for the next tick; where there are several, the safest one counts."""
-
-    vent: bool = False  # let the pressures go to zero; a later goal brings the arm up again
-    hold: bool = False  # give up the goals and hold the springs where they are
-    goals: Sequence[np.ndarray] | None = None  # poses (6,) [mm, deg] in place of all others; None: as before
-
-
-class Pilot(Protocol):
-    """Someone who steers an arm while the loop runs. Neither method may wait: both run within a tick."""
-
-    def orders(self) -> Orders:
-        """Return the orders since the last tick."""
-        ...
-
-    def look(self, state: State, tick: Tick, row: dict[str, Any]) -> None:
-        """Take a tick: the state after it, its results, and the row that it logged."""
-        ...
 
 
 def follow(
@@ -60,7 +37,7 @@ def follow(
     arrived: Callable[[int], None] = lambda goal: None,
     save: Callable[[Log], None] = lambda log: None,
     stay: bool = False,
-) -> Run:
+) -> LoopRun:
     """Bring the tip to goals, one after the other, then vent; `vent_at_end` says what else ends a run.
 
     Args:
@@ -73,7 +50,10 @@ def follow(
         save: writes the log, once the arm is vented.
         stay: hold the last goal, for as long as `duration_s` or until something else ends the run.
     """
-    return _Session(arm, controller, goals, duration_s, tell, arrived, stay).to_end(save)
+    goals = list(goals)
+    refused = refusals(controller.policy, goals)  # before the arm moves: it takes longer than a tick
+    source = ListedGoals(controller, goals, refused, duration_s, stay)
+    return _Session(arm, controller, source, tell, arrived).to_end(save)
 
 
 def trace(
@@ -85,7 +65,7 @@ def trace(
     tell: Callable[[str], None] = lambda text: None,
     arrived: Callable[[int], None] = lambda goal: None,
     save: Callable[[Log], None] = lambda log: None,
-) -> Run:
+) -> LoopRun:
     """Bring the tip from stop to stop, past the goals in between, then vent.
 
     Args:
@@ -98,9 +78,9 @@ def trace(
         arrived: takes the index of each stop arrived at, as the arm rests there; a gripper may act.
         save: writes the log, once the arm is vented.
     """
-    lead_s = LEAD_ACTIONS * controller.policy.action_s or LEAD_S
-    way = Way(goals, np.broadcast_to(stops, len(goals)), pace_s, lead_s)
-    return _Session(arm, controller, goals, None, tell, arrived, way=way).to_end(save)
+    refused = refusals(controller.policy, list(goals))
+    way = Way(controller, goals, np.broadcast_to(stops, len(goals)), pace_s, refused)
+    return _Session(arm, controller, way, tell, arrived).to_end(save)
 
 
 def steer(
@@ -109,52 +89,48 @@ def steer(
     pilot: Pilot,
     tell: Callable[[str], None] = lambda text: None,
     save: Callable[[Log], None] | None = None,
-) -> Run:
+) -> LoopRun:
     """Steer an `ArmIO` by a pilot's orders until something ends the run, then vent; arguments as of `follow`.
 
     Without `save` the run may last for days: only the newest rows, arrivals and faults are kept.
     """
-    session = _Session(arm, controller, (), None, tell, pilot=pilot, kept=None if save else _KEPT)
-    return session.to_end(save or (lambda log: None))
+    source, kept = OrderedGoals(controller, pilot), None if save else _KEPT
+    return _Session(arm, controller, source, tell, look=pilot.look, kept=kept).to_end(
+        save or (lambda log: None)
+    )
 
 
 class _Session:
-    """Mutable state of `follow` and `steer`."""
+    """A run: moves data between the arm, the loop, the goals and the log."""
 
     def __init__(
         self,
         arm: ArmIO,
         controller: Controller,
-        goals: Iterable[np.ndarray],
-        duration_s: float | None,
+        goals: Goals,
         tell: Callable[[str], None],
         arrived: Callable[[int], None] = lambda goal: None,
-        stay: bool = False,
-        pilot: Pilot | None = None,
+        look: Callable[[LoopState, Tick, dict[str, Any]], None] = lambda state, tick, row: None,
         kept: int | None = None,
-        way: Way | None = None,
     ):
-        self.controller, self.tell, self.arrived = controller, tell, arrived
-        self.pilot, self.way = pilot, way
-        self.goals, self.duration_s, self.n_taken, self.stay = list(goals), duration_s, 0, stay
-        # Before the arm moves: it takes longer than a tick.
-        self.refusals = refusals(controller.policy, self.goals)
-        self.state: State = start(controller)
-        self.link, self.rows = Link(arm, len(self.state.pressure_kpa), controller.dt_s), Recorder(kept)
-        self.began_s = self.link.now()
+        self.controller, self.goals = controller, goals
+        self.tell, self.arrived, self.look = tell, arrived, look
+        self.state = start(controller)
+        self.nothing = np.full(controller.policy.spec.n_chambers, np.nan)
+        self.link, self.rows = Link(arm, len(self.nothing), controller.dt_s), Recorder(kept)
         self.arrivals: deque[Arrival] = deque(maxlen=kept)
         self.events: deque[Event] = deque(maxlen=kept)
         self.latency_s: deque[float] = deque(maxlen=kept)
         self.last: set[Fault] = set()
         self.late = False
 
-    def to_end(self, save: Callable[[Log], None]) -> Run:
+    def to_end(self, save: Callable[[Log], None]) -> LoopRun:
         """Run, vent and save the log; return the results."""
         ending = vent_at_end(self.run, self.link, self.tell, lambda: save(self.log()))
-        events, latency_s = tuple(self.events), np.array(self.latency_s)
-        n_goals = 0 if self.pilot else len(self.way.stops if self.way else self.goals)
-        rows = tuple(self.way.rows) if self.way else ()
-        return Run(self.log(), tuple(self.arrivals), events, latency_s, ending, n_goals, rows)
+        arrivals, events, latency_s = tuple(self.arrivals), tuple(self.events), np.array(self.latency_s)
+        return LoopRun(
+            self.log(), arrivals, events, latency_s, ending, self.goals.n_goals, tuple(self.goals.ways)
+        )
 
     def run(self) -> None:
         """Go through the goals.
@@ -167,8 +143,10 @@ class _Session:
         try:
             while True:
                 begin_s = self.link.now()
-                if not self._next_goal(begin_s):
+                state = self.goals.advance(self.state, begin_s, len(self.rows), self._note)
+                if state is None:
                     return
+                self.state = state
                 in_time = self._tick(begin_s)
                 self.late = not in_time or self.link.now() - begin_s > self.controller.dt_s + _ROUNDING_S
                 self.link.wait_until(begin_s + self.controller.dt_s)
@@ -184,83 +162,41 @@ class _Session:
 
     def _tick(self, begin_s: float) -> bool:
         """Return whether the arm took the pressures in time."""
-        goal = self.way.goal(begin_s) if self.way and self.state.moves else self.state.goal
+        # Read the arm.
+        goal = self.goals.shown(self.state, begin_s)
         readings = self.link.read()
         row = self.link.look(begin_s)
+        row["readings"] = self.nothing if readings is None else readings
+        row["goal"] = np.full(6, np.nan) if goal is None else goal
+
+        # Take a tick of the loop.
         began = time.perf_counter()
         try:
             self.state, tick = step(self.controller, self.state, readings, self.late, row["pressure_kpa"])
         except Exception:  # the row that explains it is kept
-            self._log(row, readings, goal, self.state.spring_m)
+            self._log(row)
             raise
         self.latency_s.append(time.perf_counter() - began)
+
+        # Write the pressures.
         try:
-            in_time = tick.stop is not None or self.link.write(self.state.pressure_kpa)
-            self.state = self.state._replace(pressure_kpa=self.link.pressure_kpa)
+            in_time = tick.stop is not None or self.link.write(self.state.command.pressure_kpa)
+            self.state = in_force(self.state, self.link.pressure_kpa)
         finally:  # the row is kept even if the pressures were refused; logging comes after them
-            self._keep(row, readings, goal, tick)
+            self._log(row)
+            self._note(tick.events)
+            if tick.arrived:
+                self._arrive(row["goal"], row["estimate"])
+            self.look(self.state, tick, row)
         if tick.stop is not None:
             raise _Stopped(self._at(f"{tick.stop.fault.value}: {tick.stop.message}"))
         return in_time
 
-    def _keep(self, row: dict[str, Any], readings: np.ndarray | None, goal: Any, tick: Tick) -> None:
-        """Log a tick and tell of it."""
-        self._log(row, readings, goal, tick.spring_m)
-        self._note(tick.events)
-        if tick.arrived:
-            self._arrive(row["goal"], row["estimate"])
-        if self.pilot:
-            self.pilot.look(self.state, tick, row)
-
-    def _log(self, row: dict[str, Any], readings: np.ndarray | None, goal: Any, spring_m: np.ndarray) -> None:
-        nothing = np.full(len(self.state.pressure_kpa), np.nan)
-        row["readings"] = nothing if readings is None else readings
-        row["estimate"], _ = believed(self.controller, spring_m, self.state.load)
-        row["load_kg"] = self.state.load.believed_kg
-        row["reference_m"] = nothing if self.state.reference_m is None else self.state.reference_m
-        row["goal"] = np.full(6, np.nan) if goal is None else goal
+    def _log(self, row: dict[str, Any]) -> None:
+        belief, reference_m = self.state.belief, self.state.command.reference_m
+        row["estimate"], row["load_kg"] = belief.pose, belief.load.believed_kg
+        row["reference_m"] = self.nothing if reference_m is None else reference_m
         self.rows.add(row)
-
-    def _next_goal(self, now_s: float) -> bool:
-        """Take the next accepted goal once the last is done; return False when goals or time are over."""
-        if self.pilot:
-            self._obey(self.pilot.orders())
-        if self.way:
-            self._go_along(self.way, now_s)
-        while self.state.goal is None and self.n_taken < len(self.goals):
-            goal, refusal = self.goals[self.n_taken], self.refusals.get(self.n_taken)
-            self.n_taken += 1
-            events = (refusal,) if refusal else ()
-            if not refusal:
-                self.state, events = with_goal(self.controller, self.state, goal)
-            self._note(events)
-        over = self.duration_s is not None and now_s - self.began_s >= self.duration_s
-        stays = self.pilot is not None or (self.stay and len(self.arrivals) > 0)
-        return not over and (self.state.goal is not None or stays)
-
-    def _go_along(self, way: Way, now_s: float) -> None:
-        """Move the goal along a way, from an arrival at a stop until the goal is at the next."""
-        if self.refusals and not self.n_taken:  # no part of the way is gone
-            self._note(tuple(self.refusals.values()))
-            self.n_taken = len(self.goals)
-        begins = self.state.goal is None and 0 < self.n_taken < len(self.goals)
-        if begins:
-            self.n_taken = 1 + way.begin(self.n_taken - 1, now_s, len(self.rows))
-        if not (begins or self.state.moves):
-            return
-        if way.go_on(now_s, len(self.rows)):
-            self.state = with_moving_goal(self.state, way.goal_ahead(now_s))
-        else:
-            self.state, events = with_goal(self.controller, self.state, self.goals[self.n_taken - 1])
-            self._note(events)
-
-    def _obey(self, orders: Orders) -> None:
-        if orders.vent or orders.hold:
-            self.goals, self.n_taken = [], 0
-            self.state = release(self.state) if orders.vent else hold(self.state)
-        elif orders.goals is not None:
-            self.goals, self.n_taken = list(orders.goals), 0
-            self.state = self.state._replace(goal=None)
 
     def _note(self, events: Sequence[Event]) -> None:
         """Count events; tell each but those that repeat the tick before, and those told at the end."""
@@ -276,12 +212,12 @@ class _Session:
             error, how = pose_error(np.asarray(estimate, float), goal), "the springs"
         reward = self.controller.policy.reward
         reached = bool(np.linalg.norm(scaled_error(goal + error, goal, reward)) < reward.threshold)
-        self.arrivals.append(Arrival(goal, estimate, len(self.rows) - 1, self.n_taken - 1, reached))
+        self.arrivals.append(Arrival(goal, estimate, len(self.rows) - 1, self.goals.n_taken - 1, reached))
         angles = ", ".join(f"{value:+.1f}" for value in error[3:])
         off = f"{np.linalg.norm(error[:3]):.1f} mm off by {how}; yaw, pitch, roll {angles} deg off"
         missed = "" if reached else "; NOT REACHED"
         self.tell(self._at(f"goal {len(self.arrivals)}: {off}{missed}"))
-        self.arrived(self.n_taken - 1)
+        self.arrived(self.goals.n_taken - 1)
 
     def _seen_error(self, goal: np.ndarray) -> np.ndarray:
         """Return the error (6,) [mm, deg] by motion capture over the window of rest, NaN without."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.controller import Controller
-from mjx_softarm.deploy.faults import Fault
+from mjx_softarm.deploy.safety import Fault
 from mjx_softarm.export.golden import BITS, FLAGS, Golden, Machine, output_columns
 from mjx_softarm.policy.file import load_policy
 

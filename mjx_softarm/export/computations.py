@@ -8,13 +8,13 @@ import numpy as np
 
 from mjx_softarm._support.xp import Array, array_namespace
 from mjx_softarm.control import LawState, pressures, saturated
-from mjx_softarm.deploy import faults
+from mjx_softarm.deploy.belief import as_without, asked_to_move, on_reference, still, stock_still
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.link import vented
-from mjx_softarm.deploy.reachability import distances
 from mjx_softarm.export.symbols import Symbol, constant, repeat, symbol
 from mjx_softarm.mdp.rewards import scaled_error
 from mjx_softarm.policy import reach
+from mjx_softarm.policy.reachable import distances
 from mjx_softarm.policy.runtime import InMotion, action_towards, actor_output, sensed, tip_pose
 from mjx_softarm.sensing.load import estimate_load
 from mjx_softarm.sensing.pose import pose_error
@@ -102,7 +102,7 @@ def actor(controller: Controller) -> Computation:
 def parts(controller: Controller) -> dict[str, Computation]:
     """Record the functions that `mjx_softarm.deploy.loop` is made of, each by its name in C++."""
     policy, n, window = controller.policy, controller.policy.spec.n_chambers, controller.window
-    gains, tolerance_m = policy.gains, policy.tolerance_m
+    gains, tolerance_m, config = policy.gains, policy.tolerance_m, controller.config
     names = ("readings", "reference_m", "spring_m", "pressure_kpa")
     readings, reference_m, spring_m, pressure_kpa = (symbol(name, (n,)) for name in names)
     state = LawState(*(symbol(f"last_{name}", (n,)) for name in LawState._fields))
@@ -121,10 +121,11 @@ def parts(controller: Controller) -> dict[str, Computation]:
     written_kpa, after = pressures(reference_m, spring_m, state, gains, controller.dt_s)
     law = {"written_kpa": written_kpa} | {f"next_{name}": value for name, value in after._asdict().items()}
     mask = saturated(pressure_kpa, reference_m, spring_m, gains, tolerance_m)
-    settled = faults.on_reference(springs_m, reference_m, pressure_kpa, gains, tolerance_m)
+    settled = on_reference(springs_m, reference_m, pressure_kpa, gains, tolerance_m)
     scaled = scaled_error(xp.asarray(pose, dtype=np.float64), goal, policy.reward)
     weighted = xp.sqrt(xp.sum(scaled * scaled))
-    stuck = faults.stock_still(springs_m) & faults.asked_to_move(springs_m, pressures_kpa)
+    stuck = stock_still(springs_m, config) & asked_to_move(springs_m, pressures_kpa, config)
+    without = as_without(policy.spring_model, pressure_kpa, spring_m, config)
     search = symbol("search", reach.begin(policy, 1).shape)
     found, error = reach.nearest_of(policy, goal[None], search)
 
@@ -144,13 +145,11 @@ def parts(controller: Controller) -> dict[str, Computation]:
         "search_step": of(goal, search, next=reach.improve(policy, goal[None], search)),
         "search_end": of(search, goal, nearest=found[0], error=error[0]),
         "mean_length": of(springs_m, mean_m=xp.mean(springs_m, axis=0)),
-        "still": of(springs_m, holds=faults.still(springs_m)),
+        "still": of(springs_m, holds=still(springs_m, config)),
         "on_reference": of(springs_m, reference_m, pressure_kpa, holds=settled),
         "saturated": of(pressure_kpa, reference_m, spring_m, mask=mask),
         "stuck": of(springs_m, pressures_kpa, mask=stuck),
-        "as_without": of(
-            pressure_kpa, spring_m, mask=faults.as_without(policy.spring_model, pressure_kpa, spring_m)
-        ),
+        "as_without": of(pressure_kpa, spring_m, mask=without),
     }
 
 

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from importlib import resources
 
-from mjx_softarm.deploy.acting import MAX_KEPT, MAX_SHIFT, SHARES
 from mjx_softarm.deploy.controller import Controller
-from mjx_softarm.deploy.faults import LATE_TICKS, LOST_TICKS, SETTLE_TIMEOUT_S, Fault, Response
-from mjx_softarm.deploy.loop import MOVING_WINDOWS, OVERLOAD, REST_WINDOWS
+from mjx_softarm.deploy.safety import Fault, Response
 from mjx_softarm.export.computations import parts
 from mjx_softarm.export.cpp_functions import Numbers, function
 from mjx_softarm.mdp.observation import rate_ticks
@@ -22,7 +20,7 @@ _TEMPLATES = {"softarm.hpp": "softarm.hpp.in"} | {
 
 def sources(controller: Controller, policy_sha256: str) -> dict[str, str]:
     """Return the text of each file by its name."""
-    policy = controller.policy
+    policy, config = controller.policy, controller.config
     numbers = Numbers(file_entries(policy))
     functions = [function(name, part, numbers) for name, part in parts(controller).items()]
     faults = [f"  {fault.name} = 1u << {k},  // {fault.response.value}" for k, fault in enumerate(Fault)]
@@ -43,25 +41,25 @@ def sources(controller: Controller, policy_sha256: str) -> dict[str, str]:
         "N_ACTIONS": policy.n_actions,
         "ACTION": repr(float(policy.action_s)),
         "RATE_TICKS": rate_ticks(policy.rate_hz),
-        "LOST_TICKS": LOST_TICKS,
-        "LATE_TICKS": LATE_TICKS,
-        "REST_TICKS": REST_WINDOWS * controller.window,
-        "MOVING_TICKS": MOVING_WINDOWS * controller.window,
-        "TIMEOUT": repr(SETTLE_TIMEOUT_S),
+        "LOST_TICKS": config.lost_ticks,
+        "LATE_TICKS": config.late_ticks,
+        "REST_TICKS": config.rest_windows * controller.window,
+        "MOVING_TICKS": config.moving_windows * controller.window,
+        "TIMEOUT": repr(config.settle_timeout_s),
         "SEARCH": begin(policy, 1).size,
         "SEARCH_STEPS": N_STEPS,
         "THRESHOLD": repr(policy.reward.threshold),
-        "OBSERVES_LOAD": str(policy.observation == "payload").lower(),
+        "OBSERVES_LOAD": str(controller.observes_payload).lower(),
         "OWN_LOAD": repr(policy.spec.mass.payload_kg),
         "LEAST_LOAD": repr(LOWEST * most_kg),
         "GREATEST_LOAD": repr(HIGHEST * most_kg),
-        "OVERLOAD": repr(OVERLOAD * most_kg),
+        "OVERLOAD": repr(config.overload * most_kg),
         "JUMP": repr(JUMP * most_kg),
         "N_JUMPS": N_JUMPS,
         "N_AVERAGED": N_AVERAGED,
-        "LEAST_SHARE": repr(min(SHARES)),
-        "MAX_SHIFT": ", ".join(map(repr, MAX_SHIFT.tolist())),
-        "MAX_KEPT": ", ".join(map(repr, MAX_KEPT.tolist())),
+        "LEAST_SHARE": repr(min(config.shares)),
+        "MAX_SHIFT": ", ".join(map(repr, config.shift_limit.tolist())),
+        "MAX_KEPT": ", ".join(map(repr, config.kept_limit.tolist())),
         "GOAL": ", ".join(f"{value:.1f}" for value in policy.workspace[0]),
     }
     texts = {}

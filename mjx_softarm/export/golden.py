@@ -10,7 +10,7 @@ A row of inputs is one tick of the loop, and its answer the outputs:
     checked      1: refuse the goal if no pressures reach it, as before a run
     reading<k>   of the sensors; nan where none came
     goal_<axis>  [mm, deg]
-    faults       sum of 2**k over the faults of this tick, k counted in `mjx_softarm.deploy.faults.Fault`
+    faults       sum of 2**k over the faults of this tick, k counted in `mjx_softarm.deploy.safety.Fault`
     arrived      1: the springs have settled, and no further action is due
     pressure<k>  [kPa] to write; after a fault whose response is to vent, a ramp to zero
     reference<k> [m]
@@ -34,14 +34,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjx_softarm._support.errors import InputError
-from mjx_softarm.deploy.acting import believed
-from mjx_softarm.deploy.controller import Controller, start
-from mjx_softarm.deploy.faults import Event, Fault
+from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.link import vented
-from mjx_softarm.deploy.loop import step, with_goal
-from mjx_softarm.deploy.reachability import nearest, refusals
+from mjx_softarm.deploy.loop import in_force, refusals, start, step, with_goal
+from mjx_softarm.deploy.safety import Event, Fault
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.policy.reach import nearest_poses
+from mjx_softarm.policy.reachable import nearest
 from mjx_softarm.sensing.estimator import expected_springs
 from mjx_softarm.sensing.load import estimate_load
 
@@ -95,7 +94,7 @@ class Machine:
 
     def _restart(self) -> None:
         self.state, self.stopped = start(self.controller), False
-        self._before_kpa = self.state.pressure_kpa
+        self._before_kpa = self.state.command.pressure_kpa
 
     def answer(self, row: np.ndarray) -> np.ndarray:
         """Return the outputs (2 + 3 n + 6,) of inputs (6 + n + 6,)."""
@@ -103,23 +102,23 @@ class Machine:
         if restart:
             self._restart()
         if not taken:
-            self.state = self.state._replace(pressure_kpa=self._before_kpa)
-        self._before_kpa = self.state.pressure_kpa
+            self.state = in_force(self.state, self._before_kpa)
+        self._before_kpa = self.state.command.pressure_kpa
         events, arrived = (), False
         if lost:
             events, self.stopped = (Event(Fault.ARM_LOST, "the driver cannot reach it"),), True
         if self.stopped:
-            self.state = self.state._replace(pressure_kpa=vented(self._before_kpa, self.controller.dt_s))
+            self.state = in_force(self.state, vented(self._before_kpa, self.controller.dt_s))
         else:
             refused = self._take_goal(row[-6:], checked) if new_goal else ()
             self.state, tick = step(self.controller, self.state, row[len(FLAGS) : -6], bool(late))
             self.stopped = tick.stop is not None
             events, arrived = refused + tick.events, tick.arrived
-        state = self.state
-        reference_m = np.full_like(state.spring_m, np.nan) if state.reference_m is None else state.reference_m
+        belief, command = self.state.belief, self.state.command
+        spring_m, nothing = belief.spring_m, np.full_like(belief.spring_m, np.nan)
+        reference_m = nothing if command.reference_m is None else command.reference_m
         faults = sum({BITS[event.fault] for event in events})
-        pose, _ = believed(self.controller, state.spring_m, state.load)
-        return np.concat([[faults, arrived], state.pressure_kpa, reference_m, state.spring_m, pose])
+        return np.concat([[faults, arrived], command.pressure_kpa, reference_m, spring_m, belief.pose])
 
     def _take_goal(self, goal: np.ndarray, checked: bool) -> tuple[Event, ...]:
         """Take a goal; return why it was refused, if it was."""
@@ -148,12 +147,13 @@ def make_golden(controller: Controller, policy_sha256: str, seed: int = 0) -> Go
             inputs.append(row)
             outputs.append(machine.answer(row))
             rounded.answer(row)
-            if np.abs(machine.state.pressure_kpa - rounded.state.pressure_kpa).max() > most_kpa:
+            pressure_kpa = machine.state.command.pressure_kpa
+            if np.abs(pressure_kpa - rounded.state.command.pressure_kpa).max() > most_kpa:
                 break
             arrived = machine.state.goal is None and not (kind == "dropping" and tick < 2 * _DROP_TICK)
-            if arrived or (machine.stopped and not machine.state.pressure_kpa.any()):
+            if arrived or (machine.stopped and not pressure_kpa.any()):
                 break
-            row = run.send(machine.state.pressure_kpa)
+            row = run.send(pressure_kpa)
     n = controller.policy.spec.n_chambers
     about = {"schema_version": SCHEMA_VERSION, "policy_sha256": policy_sha256, "n": n}
     about["range"] = _ranges(controller).tolist()

@@ -17,13 +17,15 @@ import numpy as np
 
 from mjx_softarm._support.channel import End
 from mjx_softarm._support.errors import InputError
-from mjx_softarm.deploy.controller import Controller, State, Tick
+from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.drivers.names import Paced
-from mjx_softarm.deploy.ending import FAULT, Run
-from mjx_softarm.deploy.reachability import clamped
-from mjx_softarm.deploy.session import Orders, steer
+from mjx_softarm.deploy.ending import FAULT, LoopRun
+from mjx_softarm.deploy.goals import Orders
+from mjx_softarm.deploy.loop import LoopState, Tick
+from mjx_softarm.deploy.session import steer
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mechanics.excitation import circle_poses
+from mjx_softarm.policy.reachable import clamped
 from mjx_softarm.spec import ArmSpec
 from mjx_softarm.view.look import look_at
 from mjx_softarm.view.taken_poses import TakenPoses
@@ -89,7 +91,7 @@ class PagePilot:
             return Orders(goals=[self._clamped(asked["goal"])])
         return Orders()
 
-    def look(self, state: State, tick: Tick, row: dict[str, Any]) -> None:
+    def look(self, state: LoopState, tick: Tick, row: dict[str, Any]) -> None:
         """Show a tick on the page; grip or let go where the arm has arrived."""
         if tick.arrived and self._loads and (load_kg := self._loads.pop(0)) is not None:
             self._carry(load_kg)
@@ -97,7 +99,7 @@ class PagePilot:
             self.tell(self.demonstrations.take(state, row))
         self._doing = _doing(state, self._controller.policy.n_actions)
         self._goal = self._goal if state.goal is None else state.goal  # shown until the arm is sent elsewhere
-        look = look_at(row, tick.spring_m, self._payload_kg)._replace(goal=self._goal)
+        look = look_at(row, state.belief.spring_m, self._payload_kg)._replace(goal=self._goal)
         self._end.put(look=look, doing=self._doing, armed=self._armed, lines=tuple(self._said))
 
     def _carry(self, payload_kg: float) -> None:
@@ -122,12 +124,12 @@ def place_poses(spec: ArmSpec) -> np.ndarray:
     return np.concatenate([[side + lift, side, side + lift] for side in sides])
 
 
-def _doing(state: State, n_actions: int) -> str:
+def _doing(state: LoopState, n_actions: int) -> str:
     """Return what the arm does, as the predicate of a sentence."""
     if state.goal is not None:
-        return f"moves (action {max(state.n_actions, 1)} of {n_actions})"
-    if state.reference_m is None:
-        return "is being vented" if state.pressure_kpa.any() else "has no pressure"
+        return f"moves (action {max(state.strategy.n_actions, 1)} of {n_actions})"
+    if state.command.reference_m is None:
+        return "is being vented" if state.command.pressure_kpa.any() else "has no pressure"
     return "holds"
 
 
@@ -138,7 +140,7 @@ def live(
     ready: Callable[[str], None] = lambda url: None,
     save: Callable[[Log], None] | None = None,
     save_demonstrations: Callable[[Log], None] | None = None,
-) -> Run:
+) -> LoopRun:
     """Steer an arm from a page until something ends it; after a fault the page stays until Ctrl-C.
 
     Args:

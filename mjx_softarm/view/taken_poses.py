@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from mjx_softarm.control import saturated
-from mjx_softarm.deploy.controller import State
-from mjx_softarm.deploy.faults import still
+from mjx_softarm.deploy.belief import still
 from mjx_softarm.deploy.link import Recorder
+from mjx_softarm.deploy.loop import LoopState
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.sensing.pose import pose_error, pose_from_quaternion, quaternion_from_pose
@@ -28,7 +28,7 @@ class TakenPoses:
     def __len__(self) -> int:
         return len(self._rows)
 
-    def take(self, state: State, row: Mapping[str, Any]) -> str:
+    def take(self, state: LoopState, row: Mapping[str, Any]) -> str:
         """Keep the pose of a tick, if it can be learned from; return what came of it.
 
         Args:
@@ -50,15 +50,16 @@ class TakenPoses:
         """Return the poses as a log."""
         return self._rows.log("demonstrations", self._policy.sensor)
 
-    def _refused(self, state: State, readings: np.ndarray, pose: np.ndarray) -> str:
+    def _refused(self, state: LoopState, readings: np.ndarray, pose: np.ndarray) -> str:
         """Return why a pose cannot be learned from, or nothing."""
-        policy, reference_m = self._policy, state.reference_m
+        policy, belief, command = self._policy, state.belief, state.command
         low, high = np.sort(policy.actions[1:], axis=0)
-        if reference_m is None or state.goal is not None or not still(state.springs_m):
+        if command.reference_m is None or state.goal is not None or not still(belief.window.spring_m):
             return "got an arm that moves or has no pressure, expected one at rest"
-        if state.n_lost.any() or not np.isfinite(pose).all():
-            return f"spring {np.argmax(state.n_lost)}: got no reading, expected one"
-        mask = saturated(state.pressure_kpa, reference_m, state.spring_m, policy.gains, policy.tolerance_m)
+        if belief.lost.any() or not np.isfinite(pose).all():
+            return f"spring {np.argmax(belief.lost)}: got no reading, expected one"
+        held = command.pressure_kpa, command.reference_m, belief.spring_m
+        mask = saturated(*held, policy.gains, policy.tolerance_m)
         if mask.any():
             return f"chamber {np.argmax(mask)}: got its limit of pressure, its spring off the reference"
         outside = (readings < low) | (readings > high)

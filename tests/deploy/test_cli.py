@@ -36,7 +36,7 @@ ROOT = Path(__file__).resolve().parents[2]
             "mjx_softarm.deploy.loop:Nothing",
             "got no 'Nothing' in mjx_softarm.deploy.loop, expected an arm's class",
         ),
-        ("mjx_softarm.deploy.session:Run", "got no method read_sensors or write_pressures, expected"),
+        ("mjx_softarm.deploy.session:LoopRun", "got no method read_sensors or write_pressures, expected"),
     ],
 )
 def test_arm_that_cannot_be_had(name, message):

@@ -5,14 +5,14 @@ import dataclasses
 import numpy as np
 
 from calib.read.logs import read_log
-from mjx_softarm.deploy import acting, link
+from mjx_softarm.deploy import link
 from mjx_softarm.deploy.arm_io import Capture
-from mjx_softarm.deploy.controller import Controller, start
+from mjx_softarm.deploy.controller import LOOP, Controller
 from mjx_softarm.deploy.ending import MISSED, Ending
-from mjx_softarm.deploy.faults import Fault
-from mjx_softarm.deploy.loop import step, with_goal
-from mjx_softarm.deploy.session import LEAD_S, trace
-from mjx_softarm.deploy.way import on_the_way
+from mjx_softarm.deploy.goals import on_the_way
+from mjx_softarm.deploy.loop import start, step, with_goal
+from mjx_softarm.deploy.safety import Fault
+from mjx_softarm.deploy.session import trace
 from mjx_softarm.logs.schema import write_log
 from mjx_softarm.mdp.actions import N_ACTIONS
 from mjx_softarm.mdp.observation import layouts
@@ -112,20 +112,20 @@ def test_a_moving_goal_is_followed_and_its_end_is_an_arrival():
     goal = run.log.goal[run.ways[0]]
     assert len(goal) in (500, 501)
     np.testing.assert_allclose(goal[250], on_the_way(goals, 0.5), atol=1e-6)
-    ahead = on_the_way(goals, 0.5 + LEAD_S / 10.0)
+    ahead = on_the_way(goals, 0.5 + LOOP.lead_s / 10.0)
     expected_m = between(None, ahead, None, None)
     np.testing.assert_allclose(run.log.reference_m[run.ways[0]][250], expected_m, atol=1e-3)  # a tick apart
 
 
-def test_a_policy_of_motion_is_given_a_goal_two_actions_ahead(monkeypatch):
-    monkeypatch.setattr(acting, "MOVING_SHARE", 0.0)  # this arm's poses are not those of its references
+def test_a_policy_of_motion_is_given_a_goal_two_actions_ahead():
+    config = dataclasses.replace(LOOP, moving_share=0.0)  # this arm's poses are not those of its references
     arm, goals, asked = LinearArm(), np.array([GOALS[0], GOALS[1]]), []
 
     def plan(pose, goal, spring_m, sensed):
         asked.append((arm.tick, goal))
         return between(pose, goal, spring_m, sensed)
 
-    run = trace(arm, Controller.of(OF_MOTION, plan), goals, pace_s=10.0)
+    run = trace(arm, Controller.of(OF_MOTION, plan, config), goals, pace_s=10.0)
     begun = run.ways[0].start
     tick, goal = next(each for each in asked if each[0] > begun + 200)
     ahead = on_the_way(goals, ((tick - begun) * CONTROLLER.dt_s + 0.6) / 10.0)
@@ -155,12 +155,13 @@ def test_policy_itself_plans_by_default():
 
 def test_state_is_not_changed_in_place():
     state, _ = with_goal(CONTROLLER, start(CONTROLLER), GOALS[0])
-    arrays = [np.array(value, copy=True) for value in (state.law.integral_kpa, state.n_lost, state.springs_m)]
+    held = state.command.law.integral_kpa, state.watch.n_lost, state.belief.window.spring_m
+    arrays = [np.array(value, copy=True) for value in held]
     readings = LinearArm().read_sensors()
     first = step(CONTROLLER, state, readings, False)[0]
     second = step(CONTROLLER, state, readings, False)[0]
-    np.testing.assert_array_equal(first.pressure_kpa, second.pressure_kpa)
-    for before, after in zip(arrays, (state.law.integral_kpa, state.n_lost, state.springs_m), strict=True):
+    np.testing.assert_array_equal(first.command.pressure_kpa, second.command.pressure_kpa)
+    for before, after in zip(arrays, held, strict=True):
         np.testing.assert_array_equal(before, after)
 
 

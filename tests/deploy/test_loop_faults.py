@@ -5,15 +5,14 @@ import dataclasses
 import numpy as np
 import pytest
 
-from mjx_softarm.deploy import faults
-from mjx_softarm.deploy.controller import Controller
-from mjx_softarm.deploy.faults import Fault, Response
+from mjx_softarm.deploy import safety
+from mjx_softarm.deploy.controller import LOOP, Controller
 from mjx_softarm.deploy.link import VENT_KPA_PER_S
-from mjx_softarm.deploy.loop import MOVING_WINDOWS
-from mjx_softarm.deploy.reachability import Reachable, nearest
+from mjx_softarm.deploy.safety import Fault, Response
 from mjx_softarm.deploy.session import trace
 from mjx_softarm.mdp.actions import N_ACTIONS
 from mjx_softarm.mdp.rewards import RewardConfig
+from mjx_softarm.policy.reachable import Reachable, nearest
 from mjx_softarm.sensing.estimator import estimate
 from mjx_softarm.sensing.s2r import N_POSE_INPUTS, N_POSE_OUTPUTS, S2R, correct, extrapolation
 from tests.linear_arm import (
@@ -51,7 +50,7 @@ def test_chamber_lost_while_the_goal_moves_vents():
     arm = Leaking(500)
     run = trace(arm, Controller.of(POLICY, between), GOALS[:2], pace_s=30.0)
     assert run.status == 3 and run.counts()[Fault.CHAMBER_LOST] == 1 and len(run.arrivals) == 1
-    assert 500 + MOVING_WINDOWS * CONTROLLER.window < len(run.log.goal) < 1000
+    assert 500 + LOOP.moving_windows * CONTROLLER.window < len(run.log.goal) < 1000
     np.testing.assert_array_equal(arm.command_kpa, 0.0)
 
 
@@ -81,7 +80,7 @@ def test_arm_that_never_rests_is_counted():
 
     run = go(Swinging(), goals=GOALS[:1])
     assert run.counts()[Fault.NOT_SETTLED] == N_ACTIONS and len(run.arrivals) == 1
-    assert run.log.time_s[run.arrivals[0].row] >= N_ACTIONS * faults.SETTLE_TIMEOUT_S - 1.0
+    assert run.log.time_s[run.arrivals[0].row] >= N_ACTIONS * LOOP.settle_timeout_s - 1.0
 
 
 @pytest.mark.parametrize("goal", [FAR, np.full(6, np.nan), np.zeros(6)])
@@ -136,14 +135,14 @@ def test_missed_deadlines(refuse):
     arm = Slow(range(20, 29), refuse)
     run = go(arm)
     assert run.status == 3 and "arm late" in run.ending.cause
-    assert run.counts() == {Fault.MISSED_DEADLINE: faults.LATE_TICKS, Fault.ARM_LATE: 1}
+    assert run.counts() == {Fault.MISSED_DEADLINE: LOOP.late_ticks, Fault.ARM_LATE: 1}
     np.testing.assert_array_equal(arm.command_kpa, 0.0)
 
 
 def test_the_table_of_faults_names_each_response():
     for fault in Fault:
-        [line] = [line for line in faults.__doc__.splitlines() if line.strip().startswith(fault.name + " ")]
-        following = faults.__doc__.split(line)[1].split("\n")[1]
+        [line] = [line for line in safety.__doc__.splitlines() if line.strip().startswith(fault.name + " ")]
+        following = safety.__doc__.split(line)[1].split("\n")[1]
         word = {Response.SKIP: "skip"}.get(fault.response, fault.response.value)
         assert word in line[80:] + following[80:], fault
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mjx_softarm.deploy.controller import Controller
-from mjx_softarm.deploy.faults import Fault
+from mjx_softarm.deploy.safety import Fault
 from mjx_softarm.deploy.session import trace
 from mjx_softarm.mdp.observation import layouts
 from mjx_softarm.sensing.estimator import estimate

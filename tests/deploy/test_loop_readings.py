@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from mjx_softarm.deploy import faults
-from mjx_softarm.deploy.faults import Fault
+from mjx_softarm.deploy.controller import LOOP
+from mjx_softarm.deploy.safety import Fault
 from mjx_softarm.sensing.estimator import estimate
 from tests.linear_arm import POLICY, Blind, LinearArm, N, go, nan, read_m
 
@@ -30,9 +30,9 @@ def test_several_lost_readings_vent(spoil):
     arm = Blind(range(30, 100), spoil)
     run = go(arm)
     assert run.status == 3 and run.arrivals == () and "sensor lost" in run.ending.cause
-    assert run.counts() == {Fault.LOST_READING: faults.LOST_TICKS, Fault.SENSOR_LOST: 1}
+    assert run.counts() == {Fault.LOST_READING: LOOP.lost_ticks, Fault.SENSOR_LOST: 1}
     assert "spring4" in run.events[-1].message
-    assert len(run.log) == 30 + faults.LOST_TICKS
+    assert len(run.log) == 30 + LOOP.lost_ticks
     assert np.abs(arm.written[29]).max() > 1.0
     np.testing.assert_array_equal(arm.command_kpa, 0.0)
 

@@ -10,7 +10,6 @@ import pytest
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.arm_io import Capture
 from mjx_softarm.deploy.ending import DONE, MISSED
-from mjx_softarm.deploy.faults import Fault
 from mjx_softarm.deploy.measure import (
     along,
     figures,
@@ -20,6 +19,7 @@ from mjx_softarm.deploy.measure import (
     require_motion_capture,
     write_accuracy,
 )
+from mjx_softarm.deploy.safety import Fault
 from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.sensing.estimator import estimate
 from mjx_softarm.sensing.pose import quaternion_from_pose

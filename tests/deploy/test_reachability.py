@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from mjx_softarm.deploy.controller import start
-from mjx_softarm.deploy.loop import with_goal
-from mjx_softarm.deploy.reachability import clamped, nearest
+from mjx_softarm.deploy.loop import start, with_goal
+from mjx_softarm.policy.reachable import clamped, nearest
 from tests.linear_arm import CONTROLLER, FAR, GOALS, POLICY
 
 

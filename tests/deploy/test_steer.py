@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from mjx_softarm.deploy.ending import DONE, FAULT, Ending
-from mjx_softarm.deploy.faults import Fault
+from mjx_softarm.deploy.goals import Orders
 from mjx_softarm.deploy.link import VENT_KPA_PER_S
-from mjx_softarm.deploy.session import Orders, steer
+from mjx_softarm.deploy.safety import Fault
+from mjx_softarm.deploy.session import steer
 from tests.linear_arm import CONTROLLER, DT_S, FAR, GOALS, SPRINGS_M, Leaking, LinearArm, read_m
 
 
@@ -78,13 +79,13 @@ def test_vent_lets_the_pressures_go_and_a_goal_brings_them_back():
 @pytest.mark.parametrize("others", [{"hold": True}, {"goals": GOALS}])
 def test_the_safest_order_wins(others):
     _, pilot, _ = fly({0: Orders(goals=GOALS), 60: Orders(vent=True, **others)}, 61)
-    assert pilot.states[-1].goal is None and pilot.states[-1].reference_m is None
+    assert pilot.states[-1].goal is None and pilot.states[-1].command.reference_m is None
 
 
 def test_to_hold_an_arm_without_references_changes_nothing():
     """One that was never moved stays without pressure, and one that is being vented goes on."""
     _, pilot, run = fly({5: Orders(hold=True)}, 50)
-    assert pilot.states[-1].reference_m is None and not run.log.pressure_kpa.any()
+    assert pilot.states[-1].command.reference_m is None and not run.log.pressure_kpa.any()
     _, pilot, run = fly({0: Orders(goals=GOALS), 60: Orders(vent=True), 65: Orders(hold=True)}, 200)
     assert run.log.pressure_kpa[64].any() and not run.log.pressure_kpa[-1].any()
 

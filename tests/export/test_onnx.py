@@ -8,8 +8,8 @@ import pytest
 
 from mjx_softarm import ArmSpec
 from mjx_softarm._support.errors import InputError
-from mjx_softarm.deploy.controller import Controller, start
-from mjx_softarm.deploy.loop import step, with_goal
+from mjx_softarm.deploy.controller import Controller
+from mjx_softarm.deploy.loop import start, step, with_goal
 from mjx_softarm.export import computations
 from mjx_softarm.export.check import TOLERANCE, check
 from mjx_softarm.export.golden import FLAGS, N_SINGLE, read_golden
@@ -73,7 +73,9 @@ def test_lost_reading_holds_the_last_length(files, golden, controller):
     # The loop does not act while a reading is lost; with the same lengths read, it asks for the same.
     readings[3] = controller.policy.sensor.readings(last_m)[3]
     state, _ = with_goal(controller, start(controller), goal)
-    np.testing.assert_allclose(got[0], step(controller, state, readings, False)[0].reference_m, atol=1e-6)
+    np.testing.assert_allclose(
+        got[0], step(controller, state, readings, False)[0].command.reference_m, atol=1e-6
+    )
 
 
 def test_draw_wires_without_a_sim_to_real_network(tmp_path):

@@ -8,7 +8,7 @@ import subprocess
 import numpy as np
 import pytest
 
-from mjx_softarm.deploy.faults import Fault
+from mjx_softarm.deploy.safety import Fault
 from mjx_softarm.export.check import TOLERANCE, compare, without_memory
 from mjx_softarm.export.golden import BITS, FLAGS, N_SINGLE
 from mjx_softarm.export.write import export_onnx

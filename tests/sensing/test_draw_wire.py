@@ -11,8 +11,8 @@ from calib.read.logs import read_log
 from mjx_softarm import ArmSpec
 from mjx_softarm.deploy.arm_io import Capture
 from mjx_softarm.deploy.controller import Controller
-from mjx_softarm.deploy.faults import Fault
 from mjx_softarm.deploy.record import record
+from mjx_softarm.deploy.safety import Fault
 from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.logs.checks import LogError
 from mjx_softarm.logs.schema import write_log

@@ -10,11 +10,11 @@ import pytest
 
 from mjx_softarm import ArmSpec
 from mjx_softarm._support.channel import End
-from mjx_softarm.deploy.controller import Tick, start
-from mjx_softarm.deploy.loop import with_goal
-from mjx_softarm.deploy.session import Orders, steer
+from mjx_softarm.deploy.goals import Orders
+from mjx_softarm.deploy.loop import Tick, start, with_goal
+from mjx_softarm.deploy.session import steer
 from mjx_softarm.view.live import PagePilot, place_poses
-from tests.linear_arm import CONTROLLER, FAR, GOALS, REST_M, LinearArm, N
+from tests.linear_arm import CONTROLLER, FAR, GOALS, LinearArm
 
 
 @pytest.fixture
@@ -93,14 +93,14 @@ def test_picking_and_placing_hangs_a_mass_to_the_gripper_and_takes_it_off(inbox)
     goals = ask(pilot, inbox, place=True).goals[:6]
     state, row, held = start(CONTROLLER), {"time_s": 0.0}, []
     for goal in goals:
-        pilot.look(state._replace(goal=goal), Tick(np.full(N, REST_M), (), False), row)
-        pilot.look(state, Tick(np.full(N, REST_M), (), True), row)
+        pilot.look(state._replace(goal=goal), Tick((), False), row)
+        pilot.look(state, Tick((), True), row)
         held.append(inbox.shown[-1]["look"].payload_kg)
     assert loads == [held[1], 0.0] and held == [0.0, held[1], held[1], held[1], 0.0, 0.0] and held[1] > 0.1
     above, at, _, above_next, next_at, _ = place_poses(ArmSpec.default())
     assert above[2] > at[2] == next_at[2] < above_next[2] and at[0] > 50.0 > -50.0 > next_at[0]
     ask(pilot, inbox, goal=GOALS[0])  # somebody drags the goal in between
-    pilot.look(state, Tick(np.full(N, REST_M), (), True), row)
+    pilot.look(state, Tick((), True), row)
     assert len(loads) == 2
 
 

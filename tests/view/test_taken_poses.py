@@ -5,18 +5,25 @@ import re
 import numpy as np
 import pytest
 
-from mjx_softarm.deploy.controller import start
+from mjx_softarm.deploy.loop import start
 from mjx_softarm.logs.schema import write_log
 from mjx_softarm.view.taken_poses import TakenPoses
 from tests.linear_arm import CONTROLLER, HIGH_KPA, POLICY, REST_M, SENSOR, SPEC, N
 from train.demos.demonstrations import load_demonstrations
 
 POSE = np.array([20.0, -10.0, -600.0, 0.0, 5.0, 0.0])
-HOLDS = start(CONTROLLER)._replace(
-    reference_m=np.full(N, REST_M),
-    spring_m=np.full(N, REST_M),
-    springs_m=np.full((CONTROLLER.window, N), REST_M),
-)
+
+
+def held(window_m=REST_M, lost=False, goal=None, **command):
+    """A state of the loop that holds its springs."""
+    state, spring_m = start(CONTROLLER), np.full(N, REST_M)
+    window = state.belief.window._replace(spring_m=np.full((CONTROLLER.window, N), window_m))
+    belief = state.belief._replace(spring_m=spring_m, window=window, lost=np.full(N, False) | lost)
+    command = state.command._replace(**({"reference_m": spring_m} | command))
+    return state._replace(belief=belief, command=command, goal=goal)
+
+
+HOLDS = held()
 READINGS = SENSOR.readings(np.full(N, REST_M))
 
 
@@ -44,16 +51,16 @@ def test_poses_are_what_imitation_takes(tmp_path):
 @pytest.mark.parametrize(
     ("state", "others", "message"),
     [
-        (HOLDS._replace(reference_m=None), {}, "has no pressure, expected one at rest"),
-        (HOLDS._replace(goal=POSE), {}, "an arm that moves"),
+        (held(reference_m=None), {}, "has no pressure, expected one at rest"),
+        (held(goal=POSE), {}, "an arm that moves"),
         (
-            HOLDS._replace(springs_m=np.linspace(0.2, 0.21, 25)[:, None] + np.zeros(N)),
+            held(window_m=np.linspace(0.2, 0.21, 25)[:, None]),
             {},
             "an arm that moves",
         ),
-        (HOLDS._replace(n_lost=np.eye(N, dtype=int)[4]), {}, "spring 4: got no reading"),
+        (held(lost=np.eye(N, dtype=bool)[4]), {}, "spring 4: got no reading"),
         (
-            HOLDS._replace(pressure_kpa=HIGH_KPA * np.eye(N)[2], reference_m=REST_M + 0.01 * np.eye(N)[2]),
+            held(pressure_kpa=HIGH_KPA * np.eye(N)[2], reference_m=REST_M + 0.01 * np.eye(N)[2]),
             {},
             "chamber 2: got its limit of pressure",
         ),

@@ -14,9 +14,9 @@ import jax
 import numpy as np
 
 from mjx_softarm.deploy.arm_io import ArmIO
+from mjx_softarm.deploy.controller import LOOP
 from mjx_softarm.deploy.drive import Drive, Hold
 from mjx_softarm.deploy.ending import Ending, vent_at_end
-from mjx_softarm.deploy.faults import SETTLE_TIMEOUT_S
 from mjx_softarm.deploy.link import ArmFault, Recorder
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.sensing.pose import quaternion_from_pose, rotation_from_quaternion
@@ -145,7 +145,7 @@ class WaypointRecorder:
         off_m = self._drive.sensor.lengths(self._readings, 0.0).length_m - posture.spring_m
         worst = int(np.argmax(np.abs(off_m)))
         return ArmFault(
-            f"{name}: got no rest, expected it within {SETTLE_TIMEOUT_S:g} s; spring {worst} is "
+            f"{name}: got no rest, expected it within {LOOP.settle_timeout_s:g} s; spring {worst} is "
             f"{1e3 * off_m[worst]:+.1f} mm off, its chamber at {self._drive.link.pressure_kpa[worst]:.1f} kPa"
         )
 

@@ -11,7 +11,7 @@ from benchmarks.paper.scene import CALIBRATION
 from benchmarks.paper.summary import Results, Training, training_rows, trial_rows
 from benchmarks.paper.trials import trainings, trials
 from mjx_softarm import ArmSpec
-from mjx_softarm.deploy.faults import Fault
+from mjx_softarm.deploy.safety import Fault
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.policy.file import policy_from_actor

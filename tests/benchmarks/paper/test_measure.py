@@ -21,8 +21,8 @@ from benchmarks.paper.measure import (
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.arm_io import Capture
 from mjx_softarm.deploy.controller import Controller
-from mjx_softarm.deploy.ending import Arrival, Ending, Run
-from mjx_softarm.deploy.faults import Event, Fault
+from mjx_softarm.deploy.ending import Arrival, Ending, LoopRun
+from mjx_softarm.deploy.safety import Event, Fault
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.mechanics.pipe import APPLE_KG, BALL_KG
@@ -63,7 +63,7 @@ def test_errors_are_averaged_over_the_window_of_rest(make_arm_model):
     )
     arrival = Arrival(goals[1], goals[1] + [1.0, 0, 0, 0, 0, 0], n_rows - 1, 1)
     events = (Event(Fault.SATURATED, ""), Event(Fault.SATURATED, ""))
-    run = Run(log, (arrival,), events, np.array([1e-4] * 10), Ending())
+    run = LoopRun(log, (arrival,), events, np.array([1e-4] * 10), Ending())
     outcome = measure(run, controller, goals)
     assert np.allclose(outcome.error[1], [3, 4, 0, 10, 0, 0], atol=1e-6)
     assert np.isnan(outcome.error[0]).all() and np.isnan(outcome.arrival_s[0])

@@ -9,7 +9,7 @@ import pytest
 
 from mjx_softarm import ArmSpec
 from mjx_softarm.control import TOLERANCE_M, Gains, saturated
-from mjx_softarm.deploy.faults import lost_chambers
+from mjx_softarm.deploy.belief import lost_chambers
 from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.mjcf import build_model, spring_lengths
 from mjx_softarm.mechanics.params import ArmParams

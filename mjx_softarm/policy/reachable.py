@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from mjx_softarm._support.xp import Array, array_namespace
-from mjx_softarm.deploy.faults import Event, Fault
 from mjx_softarm.mdp.rewards import RewardConfig
-from mjx_softarm.policy.file import Policy
-from mjx_softarm.policy.reach import nearest_poses
 from mjx_softarm.sensing.pose import frame_from_pose, pose_from_frame, share_of_turn
 
 _CHUNK = 256  # poses whose distances to all others are computed at once
@@ -76,21 +72,3 @@ def _distances(reachable: Reachable, position: Array, rotation: Array) -> Array:
     away = xp.maximum(squares - 2.0 * position @ reachable.position.T, 0.0)
     cos = xp.clip(0.5 * (rotation @ reachable.rotation.T - 1.0), -1.0, 1.0)
     return xp.sqrt(away + (reachable.weight_per_deg * xp.rad2deg(xp.acos(cos))) ** 2)
-
-
-def refusals(policy: Policy, goals: Sequence[np.ndarray]) -> dict[int, Event]:
-    """Return which goals (6,) [mm, deg] are refused, since no pressures reach them; takes longer than a tick.
-
-    It is sharper than `mjx_softarm.deploy.loop.with_goal`, whose poses lie some 15 mm apart.
-    """
-    finite = [k for k, goal in enumerate(goals) if np.shape(goal) == (6,) and np.isfinite(goal).all()]
-    if not finite:
-        return {}
-    poses, errors = nearest_poses(policy, np.array([goals[k] for k in finite], float))
-    found = {}
-    for k, pose, error in zip(finite, poses, errors, strict=True):
-        if not error <= policy.reward.threshold:  # nor NaN
-            got, near = (", ".join(f"{value:.0f}" for value in values) for values in (goals[k], pose))
-            message = f"got {got}, expected a pose that the arm reaches; the nearest is {near} [mm, deg]"
-            found[k] = Event(Fault.GOAL_OUTSIDE, message)
-    return found

@@ -1,0 +1,193 @@
+"""Safety: the faults of an arm, how each is detected, and the control loop's response.
+
+    fault              detected by                                                      response
+    LOST_READING       a spring without a length this tick, or no readings in time      go on with the last
+    SENSOR_LOST        a spring lost in `lost_ticks` ticks in a row                     vent
+    SENSOR_STUCK       a spring that stands still, without its noise even, while its    vent
+                       chamber is driven or a spring of its section moves
+    CHAMBER_LOST       a chamber at its limit, its spring off the reference, and the    vent
+                       arm in the shape of one without that pressure: for a second, or
+                       for three while it moves
+    GOAL_OUTSIDE       a goal that no pressures bring the tip to, by the policy's       skip the goal
+                       models and its threshold of a goal; a pilot's goal further
+                       from all reachable poses than they are from each other
+    MISSED_DEADLINE    a tick longer than the period, or pressures not taken in time    go on
+    ARM_LATE           `late_ticks` of these in a row                                   vent
+    ARM_LOST           the driver cannot reach sensors or pumps, or refuses pressures   vent
+    NOT_SETTLED        springs neither on their references nor at rest at a limit       go on and act
+                       within `settle_timeout_s`
+    SATURATED          a chamber at its limit with its spring off the reference         go on
+    EXTRAPOLATION      the sim-to-real network asked far from its training rows         go on
+    LOAD_LOST          a new average of the payload begins lower: an object dropped     go on
+    OVERLOADED         a payload of more than `overload` times the largest              go on
+    LOAD_UNKNOWN       springs and pressures that no payload explains: the pose is      go on
+                       estimated from the springs alone, with the specified payload
+
+Names in backquotes are fields of `mjx_softarm.deploy.controller.LoopConfig`. To vent is to end the run and
+bring all pressures to zero along a ramp, as at every end of a run (`mjx_softarm.deploy.ending`). Every fault
+is counted; `Event.message` says what was seen and what was expected.
+
+`check` watches each tick. It may only vent: it neither plans nor drives.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from enum import Enum
+from typing import NamedTuple
+
+import numpy as np
+
+from mjx_softarm.deploy.belief import Belief
+from mjx_softarm.deploy.controller import Controller
+from mjx_softarm.sensing.load import HIGHEST, LOWEST
+
+
+class Response(Enum):
+    """Response of the control loop to a fault."""
+
+    GO_ON = "go on"
+    SKIP = "skip the goal"
+    VENT = "vent"
+
+
+class Fault(Enum):
+    """Kinds of faults and the response to each; the table stands in the module's docstring."""
+
+    response: Response
+
+    LOST_READING = "lost reading", Response.GO_ON
+    SENSOR_LOST = "sensor lost", Response.VENT
+    SENSOR_STUCK = "sensor stuck", Response.VENT
+    CHAMBER_LOST = "chamber lost its pressure", Response.VENT
+    GOAL_OUTSIDE = "goal outside the workspace", Response.SKIP
+    MISSED_DEADLINE = "missed deadline", Response.GO_ON
+    ARM_LATE = "arm late", Response.VENT
+    ARM_LOST = "arm lost", Response.VENT
+    NOT_SETTLED = "not settled", Response.GO_ON
+    SATURATED = "saturated", Response.GO_ON
+    EXTRAPOLATION = "extrapolation", Response.GO_ON
+    LOAD_LOST = "load lost", Response.GO_ON
+    OVERLOADED = "overloaded", Response.GO_ON
+    LOAD_UNKNOWN = "load unknown", Response.GO_ON
+
+    def __new__(cls, text: str, response: Response) -> Fault:
+        fault = object.__new__(cls)
+        fault._value_, fault.response = text, response
+        return fault
+
+
+class Event(NamedTuple):
+    """A fault that was found."""
+
+    fault: Fault
+    message: str
+
+    @property
+    def response(self) -> Response:
+        return self.fault.response
+
+    def __str__(self) -> str:
+        return f"{self.fault.value}: {self.message} -> {self.response.value}"
+
+
+class Watch(NamedTuple):
+    """Memory of the safety checks of n springs and chambers."""
+
+    n_late: int  # missed deadlines in a row
+    n_lost: np.ndarray  # (n,) lost readings in a row
+    n_suspect: np.ndarray  # (n,) ticks in a row in which a chamber seemed to have lost its pressure
+    load_kg: float  # payload of the last tick
+
+    @classmethod
+    def none(cls, controller: Controller) -> Watch:
+        """Return the memory before the first tick."""
+        counts = np.zeros(controller.policy.spec.n_chambers, int)
+        return cls(0, counts, counts, controller.policy.spec.mass.payload_kg)
+
+
+def check(
+    controller: Controller, watch: Watch, belief: Belief, late: bool
+) -> tuple[Watch, tuple[Event, ...]]:
+    """Return the memory and the faults of a tick.
+
+    Args:
+        controller: the policy.
+        watch: memory of the last tick.
+        belief: of this tick.
+        late: the last tick missed its deadline.
+    """
+    next_watch = Watch(
+        n_late=watch.n_late + 1 if late else 0,
+        n_lost=np.where(belief.lost, watch.n_lost + 1, 0),
+        n_suspect=np.where(belief.suspect, watch.n_suspect + 1, 0),
+        load_kg=belief.load.kg,
+    )
+    events = _of_time(controller, next_watch) + _of_sensors(controller, next_watch, belief)
+    if stop_of(events) is None:
+        events += _of_chambers(controller, next_watch, belief) + _of_payload(controller, watch, belief)
+    return next_watch, tuple(events)
+
+
+def stop_of(events: Iterable[Event]) -> Event | None:
+    """Return the first event that ends a run, if there is one."""
+    return next((event for event in events if event.response is Response.VENT), None)
+
+
+def _of_time(controller: Controller, watch: Watch) -> list[Event]:
+    late = f"took too long, expected at most {1e3 * controller.dt_s:g} ms"
+    missed = [Event(Fault.MISSED_DEADLINE, f"the last tick {late}")] if watch.n_late else []
+    if watch.n_late >= controller.config.late_ticks:
+        missed.append(Event(Fault.ARM_LATE, f"{watch.n_late} ticks in a row {late}"))
+    return missed
+
+
+def _of_sensors(controller: Controller, watch: Watch, belief: Belief) -> list[Event]:
+    config, seconds = controller.config, controller.window * controller.dt_s
+    events = [Event(Fault.LOST_READING, belief.why_lost)] if belief.lost.any() else []
+    gone = watch.n_lost >= config.lost_ticks
+    if gone.any():
+        message = f"{names('spring', gone)}: no length in {config.lost_ticks} ticks in a row"
+        events.append(Event(Fault.SENSOR_LOST, message))
+    elif belief.stuck.any():
+        message = (
+            f"{names('spring', belief.stuck)}: moved less than {1e3 * config.stuck_range_m:g} mm in "
+            f"{seconds:g} s, noise included, while the chamber was driven or the section moved"
+        )
+        events.append(Event(Fault.SENSOR_STUCK, message))
+    return events
+
+
+def _of_chambers(controller: Controller, watch: Watch, belief: Belief) -> list[Event]:
+    config = controller.config
+    n_windows = config.rest_windows if belief.at_rest else config.moving_windows
+    lost = watch.n_suspect >= n_windows * controller.window
+    if not lost.any():
+        return []
+    kpa = ", ".join(f"{value:.1f}" for value in belief.command.pressure_kpa[lost])
+    message = f"{names('chamber', lost)}: at {kpa} kPa, but the springs lie as they would without that"
+    return [Event(Fault.CHAMBER_LOST, message)]
+
+
+def _of_payload(controller: Controller, watch: Watch, belief: Belief) -> list[Event]:
+    """Return the faults of a payload that was estimated in this tick; `watch` is the last tick's."""
+    if belief.estimate_kg is None:
+        return []
+    mass, load = controller.policy.spec.mass, belief.load
+    most_kg, events = float(controller.policy.load_estimator.load_scale_kg), []
+    if not LOWEST * most_kg <= belief.estimate_kg <= HIGHEST * most_kg:
+        got = f"springs and pressures give {1e3 * belief.estimate_kg:.0f} g"
+        message = f"{got}, the pose is estimated from the springs alone, with {1e3 * mass.payload_kg:.0f} g"
+        events.append(Event(Fault.LOAD_UNKNOWN, message))
+    if load.began and load.kg < watch.load_kg:
+        message = f"{1e3 * load.believed_kg:.0f} g, from {1e3 * watch.load_kg:.0f} g before"
+        events.append(Event(Fault.LOAD_LOST, message))
+    if load.kg > controller.config.overload * most_kg:
+        message = f"{1e3 * load.kg:.0f} g, expected at most {1e3 * most_kg:.0f} g"
+        events.append(Event(Fault.OVERLOADED, message))
+    return events
+
+
+def names(kind: str, mask: np.ndarray) -> str:
+    """Return the names of springs or chambers of a mask (n,)."""
+    return ", ".join(f"{kind}{k}" for k in np.flatnonzero(mask))

@@ -1,0 +1,288 @@
+"""Strategies: small classes that turn a belief and a goal into references of the springs. Pure; NumPy only.
+
+    policy     goal    strategy
+    at rest    fixed   `AtRest`      acts at once, then each time the springs have settled
+    in motion  fixed   `Timed`       acts every `Policy.action_s` seconds
+    at rest    moving  `Predicting`  acts several times in each tick, each time from a predicted pose
+    in motion  moving  `Chasing`     acts every `Policy.action_s` seconds
+
+A policy takes an arm as specified to a goal; one that observes the payload takes an arm with the estimated
+payload there. Whatever else is off leaves an error, which shows once the springs have settled. It is
+subtracted from the goal that the policy is given next: the *shift* of the goal.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from mjx_softarm.deploy.belief import Belief, pose_of
+from mjx_softarm.deploy.controller import Controller
+from mjx_softarm.deploy.safety import Event, Fault, names
+from mjx_softarm.mdp.observation import rate_ticks
+from mjx_softarm.mdp.rewards import scaled_error
+from mjx_softarm.policy.runtime import InMotion
+from mjx_softarm.sensing.load import Load
+from mjx_softarm.sensing.pose import pose_error
+
+
+class Strategy(Protocol):
+    """A way to find references, with its memory; each tick gives the next one."""
+
+    @property
+    def shift(self) -> np.ndarray:
+        """Shift (6,) [mm, deg] of the goal that the policy is given."""
+        ...
+
+    @property
+    def n_actions(self) -> int:
+        """Number of actions for this goal."""
+        ...
+
+    def references(self, belief: Belief, goal: np.ndarray) -> Choice:
+        """Return the references of a tick, if an action is due, towards a goal (6,) [mm, deg]."""
+        ...
+
+
+class Choice(NamedTuple):
+    """Results of a strategy in a tick."""
+
+    strategy: Strategy  # the next one
+    reference_m: np.ndarray | None = None  # (n,) None: the last ones stay
+    events: tuple[Event, ...] = ()
+    arrived: bool = False  # no further action is due
+
+
+def strategy_of(controller: Controller, shift: np.ndarray, moves: bool) -> Strategy:
+    """Return the strategy for a new goal, fixed or moving, that begins with a shift (6,) [mm, deg]."""
+    if controller.policy.action_s:
+        return (Chasing if moves else Timed)(controller, shift)
+    return (Predicting if moves else AtRest)(controller, shift)
+
+
+class AtRest(NamedTuple):
+    """Actions of a policy for arms at rest: at once, then whenever the springs have settled."""
+
+    controller: Controller
+    shift: np.ndarray  # (6,) [mm, deg]
+    n_actions: int = 0
+    acted_load: Load | None = None  # payload at the last action
+
+    def references(self, belief: Belief, goal: np.ndarray) -> Choice:
+        """Act or wait; arrive once the springs have settled after the last action.
+
+        An action that would lead away from the goal is tried with smaller shifts. Where none will do, the arm
+        has arrived.
+        """
+        policy, config = self.controller.policy, self.controller.config
+        # The first action does without a shift; the next ones correct what it leaves.
+        if not self.n_actions:
+            return self._act(belief, goal, [np.zeros(6)])
+        if _waits(self, belief, config.settle_timeout_s):
+            return Choice(self)
+
+        # Shifts that take all, or a share, of the error that the references leave.
+        shifts, allowed = [self.shift], None
+        if belief.settled:
+            pose, left = _left(self, belief, goal)
+            shifts = [_clipped(self.shift - share * left, config.shift_limit) for share in config.shares]
+            allowed = max(_error(self.controller, pose, goal), policy.reward.threshold)
+
+        # The next action, or the arrival after the last one.
+        events = _unsettled(self.controller, belief)
+        if self.n_actions == policy.n_actions:
+            return _arrive(self, shifts[0], events)
+        return self._act(belief, goal, shifts, events, allowed)
+
+    def _act(
+        self,
+        belief: Belief,
+        goal: np.ndarray,
+        shifts: list[np.ndarray],
+        events: tuple[Event, ...] = (),
+        allowed: float | None = None,
+    ) -> Choice:
+        """Take the first shift whose references leave a weighted error of at most `allowed`, if given."""
+        events += _extrapolated(belief)
+        for shift in shifts:
+            reference_m = _planned(self.controller, belief, belief.pose, goal + shift)
+            if allowed is not None:
+                pose = _made(self.controller, belief, reference_m, belief.load)
+                if _error(self.controller, pose, goal) > allowed:
+                    continue
+            return _acted(self, belief, reference_m, shift, events)
+        return _arrive(self, self.shift, events)
+
+
+class Timed(NamedTuple):
+    """Actions of a policy of motion: at regular times, whether the springs have settled or not."""
+
+    controller: Controller
+    shift: np.ndarray  # (6,) [mm, deg]
+    n_actions: int = 0
+    acted_load: Load | None = None  # payload at the last action
+
+    def references(self, belief: Belief, goal: np.ndarray) -> Choice:
+        """Act or wait; arrive once the springs have settled after the last action."""
+        policy, config = self.controller.policy, self.controller.config
+        shift, is_last = self.shift, self.n_actions == policy.n_actions
+        if self.n_actions:
+            if _waits(self, belief, config.settle_timeout_s if is_last else policy.action_s):
+                return Choice(self)
+            if belief.settled:
+                shift = _clipped(shift - _left(self, belief, goal)[1], config.shift_limit)
+            if is_last:
+                return _arrive(self, shift, _unsettled(self.controller, belief))
+        reference_m = _planned(self.controller, belief, belief.pose, goal + shift)
+        return _acted(self, belief, reference_m, shift, _extrapolated(belief))
+
+
+class Predicting(NamedTuple):
+    """Actions of a policy for arms at rest towards a moving goal: all of them in each tick.
+
+    The first one begins at the believed pose, each next one at the pose predicted for the last references.
+    """
+
+    controller: Controller
+    shift: np.ndarray  # (6,) [mm, deg]
+    n_actions: int = 0
+
+    def references(self, belief: Belief, goal: np.ndarray) -> Choice:
+        """Act several times; the last references count."""
+        pose, shift, reference_m = belief.pose, self.shift, belief.spring_m
+        for _ in range(self.controller.policy.n_actions):
+            reference_m = _planned(self.controller, belief, pose, goal + shift)
+            pose, _ = pose_of(self.controller, reference_m, belief.load)
+            left = pose_error(np.asarray(pose, float), goal)
+            shift = _clipped(shift - left, self.controller.config.shift_limit)
+        return Choice(self._replace(shift=shift, n_actions=self.n_actions + 1), reference_m)
+
+
+class Chasing(NamedTuple):
+    """Actions of a policy of motion towards a moving goal, each some time after the last.
+
+    The arm seldom settles between them, so each action shifts the goal by a small share of the tip's distance
+    from the goal's way.
+    """
+
+    controller: Controller
+    shift: np.ndarray  # (6,) [mm, deg]
+    n_actions: int = 0
+    due: tuple[np.ndarray, ...] = ()  # (6,) [mm, deg] each: the goal at the last actions, oldest first
+
+    def references(self, belief: Belief, goal: np.ndarray) -> Choice:
+        """Act or wait."""
+        config = self.controller.config
+        waited_s = belief.command.n_ticks * self.controller.dt_s
+        if belief.command.reference_m is not None and waited_s < self.controller.policy.action_s:
+            return Choice(self)
+        shift = self.shift
+        if len(self.due) == config.lead_actions:
+            beside = _beside(np.asarray(belief.pose, float), self.due[0], self.due[-1])
+            shift = _clipped(shift - config.moving_share * beside, config.shift_limit)
+        reference_m = _planned(self.controller, belief, belief.pose, goal + shift)
+        due = (*self.due, goal)[-config.lead_actions :]
+        return Choice(self._replace(shift=shift, n_actions=self.n_actions + 1, due=due), reference_m)
+
+
+def _waits(strategy: AtRest | Timed, belief: Belief, patience_s: float) -> bool:
+    """Return whether neither rest nor a patience [s] since the last action allow the next one."""
+    if belief.settled:
+        return bool(belief.suspect.any())  # whether a chamber is lost comes first
+    return belief.command.n_ticks * strategy.controller.dt_s < patience_s
+
+
+def _acted(
+    strategy: AtRest | Timed,
+    belief: Belief,
+    reference_m: np.ndarray,
+    shift: np.ndarray,
+    events: tuple[Event, ...],
+) -> Choice:
+    n_actions = strategy.n_actions + 1
+    after = strategy._replace(shift=shift, n_actions=n_actions, acted_load=belief.load)
+    return Choice(after, reference_m, events)
+
+
+def _arrive(strategy: AtRest | Timed, shift: np.ndarray, events: tuple[Event, ...]) -> Choice:
+    """Return the arrival, with the part of a shift (6,) [mm, deg] that the next goal keeps."""
+    kept = _clipped(shift, strategy.controller.config.kept_limit)
+    return Choice(strategy._replace(shift=kept), events=events, arrived=True)
+
+
+def _planned(controller: Controller, belief: Belief, pose: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Return the policy's references (n,) [m] from a pose (6,) towards a target (6,) [mm, deg]."""
+    lengths_m, last_m = belief.window.spring_m, belief.command.reference_m
+    before_m = lengths_m[-1 - min(rate_ticks(controller.policy.rate_hz), len(lengths_m) - 1)]
+    last_m = np.full_like(before_m, np.nan) if last_m is None else last_m
+    motion = InMotion(before_m, last_m, belief.command.law.integral_kpa)
+    observed = controller.sensed(pose, belief.spring_m, motion, belief.load.believed_kg)
+    return controller.plan(pose, target, belief.spring_m, observed)
+
+
+def _left(strategy: AtRest | Timed, belief: Belief, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pose (6,) that the references make, and the error (6,) [mm, deg] that a shift is to correct.
+
+    The payload's deflection is compensated once: by the policy's next action if it observes the payload, else
+    by the shift. So the error of a policy that observes it is told with the payload of its last action.
+    """
+    controller = strategy.controller
+    reference_m = belief.command.reference_m
+    assert reference_m is not None and strategy.acted_load is not None
+    pose = acted = _made(controller, belief, reference_m, belief.load)
+    if controller.observes_payload:
+        acted = _made(controller, belief, reference_m, strategy.acted_load)
+    return pose, pose_error(acted, goal)
+
+
+def _made(controller: Controller, belief: Belief, reference_m: np.ndarray, load: Load) -> np.ndarray:
+    """Return the pose (6,) [mm, deg] that references (n,) [m] make of an arm that rests on the last ones.
+
+    The lengths are the references: springs of an arm at rest may creep by some tenths of a millimetre. But
+    saturated chambers that are asked for more do not follow: there the lengths are the springs'.
+    """
+    asked_m, mean_m = belief.command.reference_m, belief.mean_m
+    stays = belief.saturated & ((reference_m - mean_m) * (asked_m - mean_m) > 0.0)
+    return np.asarray(pose_of(controller, np.where(stays, mean_m, reference_m), load)[0], float)
+
+
+def _error(controller: Controller, pose: np.ndarray, goal: np.ndarray) -> float:
+    """Return the weighted error of a pose (6,) at a goal (6,)."""
+    return float(np.linalg.norm(scaled_error(pose, goal, controller.policy.reward)))
+
+
+def _beside(pose: np.ndarray, was: np.ndarray, is_now: np.ndarray) -> np.ndarray:
+    """Return the error (6,) of a pose (6,) at a goal, without the part along the goal's way since then.
+
+    Along the way the tip may lag or lead, which is no offset.
+    """
+    left, along = pose_error(pose, was), pose_error(is_now, was)[:3]
+    left[:3] -= along * (left[:3] @ along) / max(along @ along, 1e-12)
+    return left
+
+
+def _clipped(shift: np.ndarray, limit: np.ndarray) -> np.ndarray:
+    return np.clip(shift, -limit, limit)
+
+
+def _extrapolated(belief: Belief) -> tuple[Event, ...]:
+    if not belief.away > 1.0:
+        return ()
+    message = f"{belief.away:.1f} times as far from the training rows as the network is believed"
+    return (Event(Fault.EXTRAPOLATION, message),)
+
+
+def _unsettled(controller: Controller, belief: Belief) -> tuple[Event, ...]:
+    """Return the faults of the springs as they stand before the next action."""
+    off_m, mask, events = belief.mean_m - belief.command.reference_m, belief.saturated, []
+    if not belief.settled:
+        worst = int(np.argmax(np.where(mask, 0.0, np.abs(off_m))))
+        off = f"{1e3 * off_m[worst]:+.1f} mm"
+        message = f"after {controller.config.settle_timeout_s:g} s, spring{worst} is {off} off its reference"
+        events.append(Event(Fault.NOT_SETTLED, message))
+    if mask.any():
+        off = ", ".join(f"{1e3 * value:+.1f}" for value in off_m[mask])
+        message = f"{names('chamber', mask)}: at the limit, spring {off} mm off its reference"
+        events.append(Event(Fault.SATURATED, message))
+    return tuple(events)
