@@ -1,89 +1,64 @@
 """The scripted expert: chamber pressures that bring the finger tips to waypoints.
 
-For each waypoint the expert seeks an equilibrium of the (calibrated) arm with the finger tips there, the body
-inside the pipe, chambers and springs away from their limits, and otherwise clear of the wall and close to the
-posture before. This is a least-squares problem in the nine pressures, with one-sided errors for the
-limits. A damped Gauss-Newton method solves it from many starts at once: around the posture before, and from a
-random pool. Of the solutions within all limits it prefers those whose straight path in pressures from the
-posture before is clear, and of these the nearest. If there is none, the gripper's orientation may be a little
-off.
+For each waypoint the expert seeks an equilibrium of the arm with the finger tips there, the body inside the
+pipe, and chambers and springs away from their limits. Weaker terms keep the body clear of the wall, and the
+pressures close to the previous posture's. This is a least-squares problem in the pressures, with one-sided
+errors for the limits. A damped Gauss-Newton method solves it from many starts, some of them near the previous
+posture. The expert takes a solution whose straight path in pressures from there is clear, and of several the
+nearest. Where there is no solution, it tries again with the gripper's orientation weighted less.
 
 With a sim-to-real network, poses and body are the real arm's, P_S2R; see `carry_body`.
 """
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
-from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
-from mjx_softarm._support import xla
 from mjx_softarm._support.errors import InputError
-from mjx_softarm._support.xp import array_namespace
 from mjx_softarm.mechanics.excitation import random_pressures
-from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.params import ArmParams
-from mjx_softarm.mechanics.pipe import CrossPipe, body_points, clearance
-from mjx_softarm.mechanics.settle import RESIDUAL_TOLERANCE, settle_pressures
-from mjx_softarm.sensing.pose import frame_from_pose, pose_from_frame
-from mjx_softarm.sensing.s2r import S2R, carry_body, correct
+from mjx_softarm.mechanics.pipe import CrossPipe
+from mjx_softarm.mechanics.settle import RESIDUAL_TOLERANCE
+from mjx_softarm.sensing.s2r import S2R
 from mjx_softarm.spec import ArmSpec
+from train.demos.posture import (
+    MARGIN_KPA,
+    MARGIN_M,
+    SPRING_MARGIN_M,
+    Posture,
+    PostureTarget,
+    angle_between,
+    look_many,
+    solve_many,
+)
 from train.demos.waypoints import Waypoint
 
-N_POOL, N_STARTS, N_STEPS = 4096, 32, 25
+N_POOL = 4096  # random pressures, of which those clear of the wall are kept
+N_STARTS = 32  # starts of the solver
 _BATCH = 256  # postures computed in one call
-N_JITTERED, JITTER_KPA = 8, 3.0  # starts around the posture before
-WAY = (0.25, 0.5, 0.75)  # shares of the path from the posture before at which clearance is checked
-WAY_CLEAR_M = 0.01  # more clearance than this counts the same
-MARGIN_M, SPRING_MARGIN_M = 0.004, 1e-3  # clearance of the body, distance of the springs to their limits
-MARGIN_KPA = 1.5  # distance of the chambers to their limits
-COMFORT_M, COMFORT_KPA = 0.02, 6.0  # more distance than these counts the same
+N_JITTERED, JITTER_KPA = 8, 3.0  # starts around the previous posture, and their spread
+WAY = (0.25, 0.5, 0.75)  # shares of the path from the previous posture at which clearance is checked
+WAY_CLEAR_M = 0.01  # more clearance than this on the path counts the same
 TOLERANCE_M, TOLERANCE_RAD = 5e-4, 0.01  # errors at which a waypoint counts as met
 EASED = 0.2  # weight of the orientation in a second try: its error may then be 5 times larger
 LIMIT_SHARE = 0.8  # share of a margin that must be kept: one-sided errors end a little inside of it
-
-# Errors that count as one.
-_POSITION_M, _TURN_RAD, _LIMIT_KPA, _LIMIT_M = 1e-4, 1e-3, 0.1, 1e-4
-_COMFORT_M, _COMFORT_KPA, _NEAR_KPA = 0.01, 3.0, 20.0
-_NO_WALL_M = 1.0  # clearance where there is no pipe
 
 
 class ExpertError(InputError):
     """A waypoint that cannot be met; the message names it, the best errors and the limits."""
 
 
-class Posture(NamedTuple):
-    """An arm at rest; each field may have leading axes."""
-
-    pressure_kpa: Any  # (n_chambers,)
-    spring_m: Any  # (n_chambers,) references to hold
-    pose: Any  # (6,) [mm, deg] pose of the tip, the real arm's where there is a network
-    finger_m: Any  # (3,)
-    rotation: Any  # (3, 3) orientation of the gripper
-    clearance_m: Any  # () clearance of the body
-    residual: Any  # () residual of the equilibrium [N, N m]
-
-
-class PostureTarget(NamedTuple):
-    """A problem to solve."""
-
-    finger_m: Any  # (3,)
-    rotation: Any  # (3, 3)
-    turn: Any  # (3,) 1 for each axis of the gripper whose rotation is fixed, else 0
-    bias_kpa: Any  # (n_chambers,) real arm's pressures less the simulated arm's
-    near_kpa: Any  # (n_chambers,) pressures to stay close to
-
-
 class Expert:
     """Solver for one arm, in one pipe or in open space."""
 
     def __init__(self, spec: ArmSpec, s2r: S2R | None = None, pipe: CrossPipe | None = None, seed: int = 0):
-        self.spec, self.s2r, self.pipe = spec, s2r, pipe
-        self._params = ArmParams.from_spec(spec)
+        self.spec, self.pipe = spec, pipe
+        arm = {"params": ArmParams.from_spec(spec), "s2r": s2r, "spec": spec, "pipe": pipe}
+        self._look, self._solve = (functools.partial(f, **arm) for f in (look_many, solve_many))
         self._rng = np.random.default_rng(seed)
         pool = self.look(random_pressures(spec, N_POOL, self._rng))
         self._pool = jax.tree.map(lambda x: x[self._slack(pool).min(axis=-1) >= 0.0], pool)
@@ -92,14 +67,11 @@ class Expert:
         """Return the postures at pressures (n, n_chambers) [kPa]."""
         n, n_batches = len(pressure_kpa), -(-len(pressure_kpa) // _BATCH)
         padded = np.resize(np.float32(pressure_kpa), (n_batches * _BATCH, self.spec.n_chambers))
-        parts = [
-            jax.device_get(_look_many(part, self._params, self.s2r, self.spec, self.pipe))
-            for part in np.split(padded, n_batches)
-        ]
+        parts = [jax.device_get(self._look(part)) for part in np.split(padded, n_batches)]
         return jax.tree.map(lambda *x: np.concatenate(x)[:n], *parts)
 
     def plan(self, waypoints: Sequence[Waypoint]) -> Posture:
-        """Return postures (n,) at waypoints, each near the one before.
+        """Return postures (n,) at waypoints, each near its predecessor.
 
         Raises:
             ExpertError: a waypoint cannot be met.
@@ -111,7 +83,7 @@ class Expert:
         return jax.tree.map(lambda *x: np.stack(x), *found)
 
     def target(self, waypoint: Waypoint) -> PostureTarget:
-        """Return the problem of a waypoint."""
+        """Return the target of a waypoint, for the arm as simulated."""
         zero = np.zeros(self.spec.n_chambers)
         return PostureTarget(np.asarray(waypoint.finger_m), np.eye(3), np.array(waypoint.turn), zero, zero)
 
@@ -123,18 +95,17 @@ class Expert:
         """
         target = jax.tree.map(np.float32, target._replace(near_kpa=before_kpa))
         starts = np.float32(self._starts(target))
-        # Solve from all starts; with the orientation eased if nothing meets it.
+        # Solve from all starts. If no solution meets the target, ease the orientation and solve again.
         for weight in (1.0, EASED) if target.turn.any() else (1.0,):
             eased = target._replace(turn=np.float32(weight) * target.turn)
-            ends = _solve_many(starts, eased, self._params, self.s2r, self.spec, self.pipe)
-            found = self.look(np.asarray(ends))
+            found = self.look(np.asarray(self._solve(starts, eased)))
             slack = self._slack(found, eased)
             met = np.flatnonzero((slack >= 0.0).all(axis=-1))
             if len(met):
                 break
         else:
             raise ExpertError(self._why(name, target, found, slack))
-        # Of the solutions, take the clearest path, then the nearest.
+        # Of the solutions, take those with the clearest path, and of these the nearest.
         way = [found.pressure_kpa[met] * share + before_kpa * (1.0 - share) for share in WAY]
         clear_m = self.look(np.concatenate(way)).clearance_m.reshape(len(WAY), -1).min(axis=0)
         far_kpa = np.linalg.norm(found.pressure_kpa[met] - before_kpa, axis=-1)
@@ -142,7 +113,7 @@ class Expert:
         return jax.tree.map(lambda x: x[best], found)
 
     def _starts(self, target: PostureTarget) -> np.ndarray:
-        """Return pressures (N_STARTS, n_chambers): around the posture before, and from the pool."""
+        """Return pressures (N_STARTS, n_chambers): around the previous posture, and from the pool."""
         low, high = self._limits_kpa()
         jitter = JITTER_KPA * self._rng.standard_normal((N_JITTERED, len(target.near_kpa)))
         jitter[0] = 0.0
@@ -180,7 +151,7 @@ class Expert:
         return np.nan_to_num(np.stack(demands, axis=-1), nan=-np.inf)
 
     def _why(self, name: str, target: PostureTarget, found: Posture, slack: np.ndarray) -> str:
-        """Return errors, clearance and tightest chamber of the best solution."""
+        """Return the text of an error: errors, clearance and tightest chamber of the best solution."""
         best = int(np.argmax(np.minimum(slack, 0.0).sum(axis=-1)))
         off_m, turn_rad = (value[best] for value in _off(found, target))
         low, high = self._limits_kpa()
@@ -200,101 +171,5 @@ class Expert:
 
 def _off(found: Posture, target: PostureTarget) -> tuple[np.ndarray, np.ndarray]:
     """Return the errors of the finger tips (n,) [m] and of the gripper's orientation (n,) [rad]."""
-    angle = target.turn * _angle(found.rotation, target.rotation)
+    angle = target.turn * angle_between(found.rotation, target.rotation)
     return np.linalg.norm(found.finger_m - target.finger_m, axis=-1), np.linalg.norm(angle, axis=-1)
-
-
-def _angle(rotation: Any, target: Any) -> Any:
-    """Return sines (..., 3) of the turn from rotations (..., 3, 3) to a target (3, 3), in gripper axes."""
-    xp = array_namespace(rotation)
-    turn = xp.swapaxes(rotation, -1, -2) @ target
-    axes = ((2, 1), (0, 2), (1, 0))
-    return 0.5 * xp.stack([turn[..., i, j] - turn[..., j, i] for i, j in axes], axis=-1)
-
-
-def _posture(pressure_kpa: Array, params: ArmParams, s2r: S2R | None, spec: ArmSpec, pipe: CrossPipe | None):
-    """Return a posture, and the clearance (k,) [m] of each point of the body; differentiable."""
-    with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
-        kinematics = chain_kinematics(params)
-        found = settle_pressures(kinematics, params.without_pressure_limits(), pressure_kpa)
-        frames = kinematics(found.q)
-        plates = frames.plate_position, frames.plate_rotation
-        pose = pose_from_frame(frames.tip_position, frames.tip_rotation)
-        if s2r is not None:
-            pose = correct(s2r, pose, found.spring_m)
-            plates = carry_body(*plates, pose)
-        position_m, rotation = frame_from_pose(pose)
-        points = body_points(*plates, spec)
-    wall_m = jnp.full(1, _NO_WALL_M) if pipe is None else clearance(pipe, points)
-    return Posture(
-        pressure_kpa=pressure_kpa,
-        spring_m=found.spring_m,
-        pose=pose,
-        finger_m=position_m - spec.mass.gripper_length_m * rotation[:, 2],
-        rotation=rotation,
-        clearance_m=jnp.min(wall_m),
-        residual=found.residual,
-    ), wall_m
-
-
-@xla.jit_at_first_call(uses_mjx=False, static_argnames=("spec", "pipe"))
-def _look_many(pressure_kpa: Array, params: ArmParams, s2r, spec: ArmSpec, pipe: CrossPipe | None):
-    return jax.vmap(lambda p: _posture(p, params, s2r, spec, pipe)[0])(pressure_kpa)
-
-
-@xla.jit_at_first_call(uses_mjx=False, static_argnames=("spec", "pipe"))
-def _solve_many(
-    starts_kpa, target: PostureTarget, params: ArmParams, s2r, spec: ArmSpec, pipe: CrossPipe | None
-):
-    """Return pressures (N_STARTS, n_chambers) after damped Gauss-Newton steps from each start."""
-    low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
-
-    def errors(pressure_kpa: Array) -> tuple[Array, Array]:
-        error = _errors(_posture(pressure_kpa, params, s2r, spec, pipe), target, spec)
-        return error, error
-
-    def model(pressure_kpa: Array) -> tuple[Array, Array]:
-        jacobian, error = jax.jacfwd(errors, has_aux=True)(pressure_kpa)
-        return error, jacobian
-
-    def step(_, state: Sequence[Array]):
-        trial, *best, damping = state
-        tried = (trial, *model(trial))
-        better = jnp.sum(tried[1] ** 2) < jnp.sum(best[1] ** 2)  # not where it is NaN
-        best = [jnp.where(better, new, old) for new, old in zip(tried, best, strict=True)]
-        damping = jnp.clip(damping * jnp.where(better, 0.2, 10.0), 1e-6, 1e6)
-        pressure, error, jacobian = best
-        hessian = jacobian.T @ jacobian
-        descent = jnp.linalg.solve(hessian + damping * jnp.diag(jnp.diag(hessian)), jacobian.T @ error)
-        return jnp.clip(pressure - descent, low, high), *best, damping
-
-    def solve(start):
-        error, jacobian = jax.eval_shape(model, start)
-        nothing = jnp.full(error.shape, jnp.inf), jnp.zeros(jacobian.shape)
-        return jax.lax.fori_loop(0, N_STEPS, step, (start, start, *nothing, jnp.float32(0.05)))[1]
-
-    return jax.vmap(solve)(starts_kpa)
-
-
-def _errors(posture: tuple[Posture, Array], target: PostureTarget, spec: ArmSpec) -> Array:
-    """Return the errors of a posture, each in its unit; limits count where they are violated."""
-    now, wall_m = posture
-    chambers, springs = spec.chambers, spec.springs
-    real_kpa = now.pressure_kpa + target.bias_kpa
-    room_kpa = jnp.concatenate([real_kpa - chambers.pressure_min_kpa, chambers.pressure_max_kpa - real_kpa])
-    room_m = jnp.concatenate([now.spring_m - springs.length_min_m, springs.length_max_m - now.spring_m])
-    within = [
-        (room_kpa - MARGIN_KPA) / _LIMIT_KPA,
-        (room_kpa - COMFORT_KPA) / _COMFORT_KPA,
-        (room_m - SPRING_MARGIN_M) / _LIMIT_M,
-        (wall_m - MARGIN_M) / _LIMIT_M,
-        (wall_m - COMFORT_M) / _COMFORT_M,
-    ]
-    return jnp.concatenate(
-        [
-            (now.finger_m - target.finger_m) / _POSITION_M,
-            target.turn * _angle(now.rotation, target.rotation) / _TURN_RAD,
-            *(jnp.minimum(value, 0.0) for value in within),
-            (now.pressure_kpa - target.near_kpa) / _NEAR_KPA,
-        ]
-    )

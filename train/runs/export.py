@@ -36,9 +36,11 @@ def export_run(run: Run, path: Path | None = None, params: Any = None) -> Path:
         RunError: the run has no checkpoint, or its learner's policy is not a network that the file can hold.
         SealedFileError: the file cannot be written.
     """
+    # Gather what the arm needs besides the run's config: the actor's parameters, networks and poses.
     if params is None:
         params = run.policy()
     model, distilled = arm_model(run.spec, run.s2r)
+    # Put all together; this checks the shapes of the parameters.
     env = run.config.env
     try:
         policy = policy_from_actor(

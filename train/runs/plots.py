@@ -130,6 +130,7 @@ def workspace_figure(workspace: Reached) -> Figure:
         ("tip error at the goals, from above", "x [mm]", "y [mm]"),
         (f"distribution over {len(error)} held-out goals", "tip error [mm]", "share of goals [%]"),
     )
+    # Maps of the error from the side and from above, the largest errors on top.
     order = np.argsort(error)
     top = max(1.0, float(np.quantile(error, 0.98)))
     colours: dict[str, Any] = {"c": error[order], "s": 5, "cmap": "viridis", "vmin": 0, "vmax": top}
@@ -137,6 +138,7 @@ def workspace_figure(workspace: Reached) -> Figure:
         points = panel.scatter(goal[order, x], goal[order, y], **colours)
         panel.set_aspect("equal")
     figure.colorbar(points, ax=above, label="mm", extend="max")
+    # Distribution, with its median and 95 %.
     axes.plot(np.sort(error), 100 * np.arange(1, len(error) + 1) / len(error), color=BLUE)
     for share, colour in ((50, GREY), (95, ORANGE)):
         at = float(np.quantile(error, share / 100))

@@ -75,9 +75,9 @@ def members_of(
     """Return the members of a sweep: each seed with each combination of the varied settings.
 
     Args:
-        config: settings that all members have.
+        config: settings that the members share.
         seeds: seeds.
-        vary: NAME=VALUE,VALUE,... for each setting that is varied.
+        vary: NAME=VALUE,VALUE,... for each varied setting.
 
     Returns:
         Configs by names such as `seed0-tqc.gamma=0.5`, and the names of the varied settings.
@@ -85,6 +85,7 @@ def members_of(
     Raises:
         ConfigError: a setting is unknown or cannot be varied, a value cannot be used or comes twice.
     """
+    # Read the values of each varied setting.
     values: dict[str, list[str]] = {}
     for assignment in vary:
         path, _, text = assignment.partition("=")
@@ -100,6 +101,7 @@ def members_of(
         if path in values:
             raise ConfigError(f"--vary {assignment}: got {path} again, expected all its values in one")
         values[path] = [value.strip() for value in text.split(",")]
+    # Make a config of each combination.
     members = {}
     for seed, *combination in itertools.product(seeds, *values.values()):
         own = [f"{path}={text}" for path, text in zip(values, combination, strict=True)]

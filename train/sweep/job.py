@@ -1,18 +1,18 @@
 """Several runs of one structure as one vmapped job: seeds, and settings that are plain numbers.
 
-The members of a sweep share everything that has a shape or decides what is computed. The settings that they
-differ in are traced: one compilation serves all members, and all values. `Job` is built anew inside the
-traced function, of a config that holds traced numbers, so that it need not know of sweeps.
+The members of a sweep share all that has a shape or decides what is computed. The settings in which they
+differ are traced: one compilation serves all members and all values. `Job` is built anew inside the traced
+function, from a config that holds traced numbers, and knows nothing of sweeps.
 
-The members' counts of environment steps are one number, not one for each: a branch on a number of each
-would compute both of its sides, so that warm-up would cost as much as learning.
+The members have one count of environment steps. A branch on a count of each member would compute both of its
+sides, and warm-up would cost as much as learning.
 """
 
 from __future__ import annotations
 
 import copy
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 import jax
@@ -22,29 +22,24 @@ from jax import Array
 from mjx_softarm._support import xla
 from mjx_softarm.env import Randomisation, ReachEnv
 from mjx_softarm.mdp.rewards import RewardConfig
-from train.agent.learner import Learner
 from train.config import LEARNER_GROUPS, TrainConfig
 from train.epoch.job import Job, TrainState
+from train.runs.task import learner_of
 
-
-def _numbers_of(group: str, config: Any) -> tuple[str, ...]:
-    return tuple(f"{group}.{field.name}" for field in dataclasses.fields(config))
+# Groups of settings of the environment that are plain numbers, and single ones.
+_ENV_GROUPS = {"env.reward": RewardConfig, "env.randomisation": Randomisation}
+_ENV_NUMBERS = ("env.saturation_tolerance_mm", "env.clearance_cost_per_mm", "env.clearance_margin_mm")
 
 
 def variable(config: TrainConfig) -> tuple[str, ...]:
-    """Return the names of the settings that are numbers in what is computed, and that the learner reads.
+    """Return the names of the settings in which members may differ: numbers that enter the computation.
 
-    The others decide what is computed, and on what shapes.
+    The other settings decide what is computed, and on what shapes.
     """
-    groups = LEARNER_GROUPS[config.learner]
-    return (
-        *(f"{group}.{name}" for group in groups for name in getattr(config, group).NUMBERS),
-        *_numbers_of("env.reward", RewardConfig),
-        *_numbers_of("env.randomisation", Randomisation),
-        "env.saturation_tolerance_mm",
-        "env.clearance_cost_per_mm",
-        "env.clearance_margin_mm",
-    )
+    names = {group: getattr(config, group).NUMBERS for group in LEARNER_GROUPS[config.learner]}
+    for group, kind in _ENV_GROUPS.items():
+        names[group] = tuple(field.name for field in dataclasses.fields(kind))
+    return (*(f"{group}.{name}" for group, own in names.items() for name in own), *_ENV_NUMBERS)
 
 
 _AXES = TrainState(**{**dict.fromkeys(TrainState._fields, cast(Any, 0)), "n_env_steps": cast(Any, None)})
@@ -71,23 +66,16 @@ class SweepJob:
     `n_env_steps`. `n_traces` counts how often the epoch was traced: once in a sweep.
     """
 
-    def __init__(
-        self,
-        configs: Sequence[TrainConfig],
-        varied: Sequence[str],
-        env: ReachEnv,
-        learner_of: Callable[[TrainConfig, ReachEnv], Learner],
-    ):
+    def __init__(self, configs: Sequence[TrainConfig], varied: Sequence[str], env: ReachEnv):
         """Prepare the functions; nothing is compiled yet.
 
         Args:
-            configs: of the members, which differ in their seeds and in the settings `varied` alone.
+            configs: configs of the members, which differ in their seeds and in the settings `varied` alone.
             varied: names of settings.
-            env: of the first member.
-            learner_of: config and environment of a member -> its learner.
+            env: environment of the first member.
         """
         self.config, self.env, self.n = configs[0], env, len(configs)
-        self.learner_of, self.learner = learner_of, learner_of(configs[0], env)
+        self.learner = learner_of(self.config, env)
         self.keys = jnp.stack([jax.random.PRNGKey(config.seed) for config in configs])
         self.numbers = {
             path: jnp.asarray([setting(config, path) for config in configs], jnp.float32) for path in varied
@@ -107,10 +95,6 @@ class SweepJob:
     def epoch(self, states: TrainState) -> tuple[TrainState, dict[str, Array]]:
         """Run an epoch of all members, with metrics (n,)."""
         return self._epoch_all(states, self.numbers)
-
-    def policy(self, states: TrainState, k: int) -> Any:
-        """Return the parameters of a member's policy."""
-        return self.learner.policy(self._take(states.learner, k))
 
     def member(self, states: TrainState, k: int) -> TrainState:
         """Return the state of one member, as an ordinary run has it."""
@@ -139,13 +123,13 @@ class SweepJob:
         for path, number in numbers.items():
             config = _with_number(config, path, number)
         env = with_env_config(self.env, config.env)
-        return Job(config, env, self.learner_of(config, env))
+        return Job(config, env, learner_of(config, env))
 
 
 def _with_number(config: Any, path: str, number: Array) -> Any:
-    """Return a copy of a config with a traced number; its checks, which need values, have passed before."""
+    """Return a copy of a config with a traced number; its checks need values, and have passed before."""
     name, _, rest = path.partition(".")
     changed = copy.copy(config)
     value = _with_number(getattr(config, name), rest, number) if rest else number
-    object.__setattr__(changed, name, value)  # it is frozen, and `replace` would check
+    object.__setattr__(changed, name, value)  # the class is frozen
     return changed

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -15,22 +16,11 @@ from rich.text import Text
 from mjx_softarm._support.provenance import provenance, write_json
 from train.runs import plots
 from train.runs.checkpoint import Run, RunError
+from train.runs.evaluate import Summary
 from train.sweep.job import setting
 from train.sweep.run import Sweep
 
-FIGURES = (
-    "median_mm",
-    "p95_mm",
-    "reached_share",
-    "saturated_share",
-    "even_median_mm",
-    "even_p95_mm",
-    "even_reached_share",
-    "circle_mean_mm",
-    "circle_max_mm",
-    "circle_saturated_chambers",
-)
-IN_MOTION = ("near_share", "near_median_s", "overshoot_median_mm", "overshoot_p95_mm")
+FIGURES = [field.name for field in dataclasses.fields(Summary) if field.name != "unsettled"]
 RESULTS_FILE, CURVES_FILE = "results.json", "learning_curves.png"
 
 # Columns of the table: figure, its heading, factor to the unit there, decimals.
@@ -48,8 +38,8 @@ def by_settings(runs: Sequence[Run], settings_of: Callable[[Run], dict[str, Any]
     """Return the figures of finished runs, grouped by settings.
 
     Args:
-        runs: trained to their end.
-        settings_of: settings that the runs of a group share.
+        runs: runs that were trained to their end.
+        settings_of: returns the settings by which a run is grouped.
 
     Returns:
         For each group `settings`, `runs` with their figures, and `over_seeds`: mean, least and greatest.
@@ -59,11 +49,13 @@ def by_settings(runs: Sequence[Run], settings_of: Callable[[Run], dict[str, Any]
     Raises:
         RunError: a run is not finished.
     """
+    # Group the figures of the runs.
     groups: dict[str, dict[str, Any]] = {}
     for run in runs:
         settings = settings_of(run)
         group = groups.setdefault(json.dumps(settings, sort_keys=True), {"settings": settings, "runs": []})
         group["runs"].append(_figures(run))
+    # Add means and ranges, of the further evaluations, too.
     for group in groups.values():
         rows = group["runs"]
         group["over_seeds"] = _spread(rows)
@@ -89,11 +81,12 @@ def _figures(run: Run) -> dict[str, Any]:
 
 
 def _spread(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
-    names = (*FIGURES, *(name for name in IN_MOTION if all(row.get(name) is not None for row in rows)))
-    values = {name: [row[name] for row in rows] for name in names}
+    """Return mean, least and greatest of the figures that all rows have."""
+    values = {name: [row.get(name) for row in rows] for name in FIGURES}
     return {
         name: {"mean": float(np.mean(x)), "min": float(np.min(x)), "max": float(np.max(x))}
         for name, x in values.items()
+        if None not in x
     }
 
 
@@ -140,6 +133,7 @@ def table(groups: Sequence[dict[str, Any]]) -> Table:
 
 def curves(sweep: Sweep) -> Figure:
     """Draw the held-out median over environment steps: a line for each setting, a band over its seeds."""
+    # Collect the evaluations of each run, by its settings.
     lines: dict[str, list[list[tuple[int, float]]]] = {}
     for run in sweep.runs:
         points = [
@@ -148,6 +142,7 @@ def curves(sweep: Sweep) -> Figure:
             if "evaluation/median_mm" in row
         ]
         lines.setdefault(_name(_varied(sweep, run)), []).append(points)
+    # Draw a line and a band for each setting; dashes tell more than ten of them apart.
     figure = Figure(figsize=(8, 5), layout="constrained")
     axes = figure.add_subplot()
     plots.dress(axes, "tip error on held-out goals, median", plots.STEPS, "mm")

@@ -1,6 +1,6 @@
 """Host side of a sweep: its folder, and the loop that trains all members at once.
 
-Each member has the folder of an ordinary run, so every command on a run works on a member. After a killed
+Each member has the folder of an ordinary run, and every command on a run works on a member. After a killed
 process the members may have checkpoints of different epochs; they continue from the newest common one.
 """
 
@@ -35,7 +35,7 @@ from train.runs.run import (
     shown_progress,
     timed_epoch,
 )
-from train.runs.task import Task, learner_of, task_of
+from train.runs.task import Task, task_of
 from train.sweep.job import SweepJob, with_env_config
 
 SWEEP_FILE = "sweep.json"
@@ -47,12 +47,7 @@ class Sweep:
 
     path: Path
     runs: tuple[Run, ...]
-    varied: tuple[str, ...]  # settings that the members differ in, besides their seeds
-
-    @property
-    def config(self) -> TrainConfig:
-        """Config of the first member, for settings that all members share."""
-        return self.runs[0].config
+    varied: tuple[str, ...]  # settings in which the members differ, besides their seeds
 
     @property
     def epoch(self) -> int:
@@ -72,18 +67,19 @@ def create(
     Args:
         path: folder to make.
         members: configs by the names of their folders.
-        varied: settings that the members differ in, besides their seeds.
+        varied: settings in which the members differ, besides their seeds.
         spec: the arm.
         s2r: sim-to-real network of the arm's calibration, if there is one.
 
     Raises:
         RunError: there is such a folder already, or it cannot be made.
     """
+    # Make the members' folders beside the final one, and rename the whole at the end.
     if path.exists():
         expected = f"a new folder; --resume {path} continues this one"
         raise RunError(f"--out: got {path}, which is there already, expected {expected}")
     part = path.with_name(path.name + ".part")
-    shutil.rmtree(part, ignore_errors=True)  # of a start that was interrupted
+    shutil.rmtree(part, ignore_errors=True)  # left by a start that was interrupted
     for name, config in members.items():
         Run.create(part / name, config, spec, s2r)
     data = {"members": list(members), "varied": list(varied), "provenance": provenance("train")}
@@ -108,7 +104,7 @@ def open_sweep(path: Path) -> Sweep:
     except OSError as error:
         raise RunError(f"{file}: got {error.strerror!r}, expected the folder of a sweep") from error
     except (ValueError, KeyError, TypeError) as error:
-        raise RunError(f"{file}: got {error!r}, expected what a sweep writes") from error
+        raise RunError(f"{file}: got {error!r}, expected the fields 'members' and 'varied'") from error
     return Sweep(path, tuple(Run.open(path / name) for name in members), varied)
 
 
@@ -118,11 +114,12 @@ def train(sweep: Sweep, console: Console) -> None:
     Raises:
         Interrupted: after Ctrl-C or a termination signal, once the states are saved.
     """
+    # Prepare the job, and the state after the newest common epoch.
     console.print("drawing goals from the reachable workspace ...")
     run = sweep.runs[0]
     env = ReachEnv(run.spec, run.config.env, run.s2r)
-    job = SweepJob([run.config for run in sweep.runs], sweep.varied, env, learner_of)
-    tasks, config, epoch = _tasks(sweep, env), sweep.config, sweep.epoch
+    job = SweepJob([run.config for run in sweep.runs], sweep.varied, env)
+    tasks, config, epoch = _tasks(sweep, env), run.config, sweep.epoch
     if epoch:
         console.print(f"continuing after epoch {epoch} of {config.n_epochs}")
     states = _start(sweep, job, epoch)
@@ -134,23 +131,26 @@ def train(sweep: Sweep, console: Console) -> None:
     ):
         boards = [stack.enter_context(open_board(run, states)) for run in sweep.runs]
         while epoch < config.n_epochs:
+            # Train an epoch; metrics without an axis of members are the same for all.
             states, metrics = timed_epoch(job, states)
             rows = [
                 {name: float(x[k] if np.ndim(x) else x) for name, x in metrics.items()} for k in range(job.n)
             ]
             epoch += 1
             stop, due, done = bool(asked), config.evaluates_after(epoch), counts(states)
+            # Evaluate, record and save each member as an ordinary run.
             for k, (run, board, row) in enumerate(zip(sweep.runs, boards, rows, strict=True)):
+                member = job.member(states, k) if due or stop else None
                 if due:
-                    row |= evaluation(run, tasks[run.config.env], job.policy(states, k))
+                    row |= evaluation(run, tasks[run.config.env], job.learner.policy(member.learner))
                 record(run, board, epoch, done, row)
-                if due or stop:
-                    run.save(epoch, job.member(states, k))
+                if member is not None:
+                    run.save(epoch, member)
             show(epoch, _line(rows), due)
             if stop and epoch < config.n_epochs:
                 raise Interrupted(f"stopped after epoch {epoch}; continue with --resume {sweep.path}")
     for k, run in enumerate(sweep.runs):
-        finish(run, tasks[run.config.env], job.policy(states, k))
+        finish(run, tasks[run.config.env], job.learner.policy(job.member(states, k).learner))
 
 
 def _tasks(sweep: Sweep, env: ReachEnv) -> dict[EnvConfig, Task]:
@@ -170,6 +170,7 @@ def _start(sweep: Sweep, job: SweepJob, epoch: int) -> TrainState:
 
 
 def _line(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return the text of an epoch: speeds, and the range of the medians if the members were evaluated."""
     n, row = len(rows), rows[0]
     env_steps, updates = row["speed/env_steps_per_s"], row["speed/updates_per_s"]
     text = f"{n} x {env_steps:.0f} env steps/s  {n} x {updates:.0f} updates/s"

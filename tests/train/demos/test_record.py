@@ -15,7 +15,7 @@ from mjx_softarm.sensing.pose import pose_from_frame, quaternion_from_pose
 from mjx_softarm.sensing.s2r import S2R_FILE, save_s2r
 from train.__main__ import main
 from train.demos.demonstrations import read_demonstrations
-from train.demos.expert import Posture
+from train.demos.posture import Posture
 from train.demos.record import CLOSE_M, WaypointRecorder
 from train.demos.waypoints import task
 
@@ -35,20 +35,17 @@ class BlindArm:
     """The nominal arm, always at rest, its chambers filling with a lag; nobody sees it."""
 
     def __init__(self):
-        self.time_s, self.n_ticks_left = 0.0, np.inf
+        self.time_s = 0.0
         self.pressure_kpa = np.zeros(SPEC.n_chambers)
         self.now = equilibrium()(np.float32(self.pressure_kpa))
 
     def read_sensors(self):
-        if self.n_ticks_left <= 0:
-            raise TimeoutError
         return SENSOR.readings(np.asarray(self.now.spring_m, float))
 
     def write_pressures(self, pressure_kpa):
         self.pressure_kpa = self.pressure_kpa + LAG * (pressure_kpa - self.pressure_kpa)
         self.now = equilibrium()(np.float32(self.pressure_kpa))
         self.time_s += DT_S
-        self.n_ticks_left -= 1
 
     @property
     def finger_m(self):
@@ -104,13 +101,6 @@ def test_blind_arm_is_logged_where_it_was_planned(expert, waypoints, plan, shift
     np.testing.assert_allclose(np.stack(seen), wanted_m - 1e-3 * shift_mm, atol=1.5e-3)
 
 
-def test_what_was_logged_before_readings_are_lost_stays(expert, waypoints, plan):
-    arm = IdealArm()
-    recorder = WaypointRecorder(arm, expert, lambda _: setattr(arm, "n_ticks_left", 20))
-    result = recorder.record(waypoints, plan)
-    assert len(result.log) == 1 and "got 3 lost readings in a row" in result.ending.cause
-
-
 def test_posture_that_saturates_the_arm_gives_way_to_another(expert, waypoints, plan):
     """The second posture asks for a spring that its chamber cannot make; the arm gets there all the same."""
     spring_m = plan.spring_m.copy()
@@ -120,27 +110,53 @@ def test_posture_that_saturates_the_arm_gives_way_to_another(expert, waypoints, 
     assert result.ending.status == 0 and result.off_m.max() < CLOSE_M
 
 
-def test_position_far_from_its_waypoint_is_not_logged(expert, waypoints, plan):
-    """Motion capture that does not follow: whatever is corrected, the arm seems to be elsewhere."""
+class Lost(IdealArm):
+    """Readings are lost some ticks after the first pose was logged."""
 
-    class Misplaced(IdealArm):
-        def motion_capture(self):
-            _, *others = super().motion_capture()
-            return Capture(np.array([0.05, 0.0, -0.5]), *others)
+    n_ticks_left = np.inf
 
-    result = WaypointRecorder(Misplaced(), expert).record(waypoints, plan)
-    assert len(result.log) == 0 and "home: got 7" in result.ending.cause
+    def read_sensors(self):
+        self.n_ticks_left -= 1
+        if self.n_ticks_left < 0:
+            raise TimeoutError
+        return super().read_sensors()
 
 
-def test_chamber_without_pressure_is_named(expert, waypoints, plan):
-    class Leaking(IdealArm):
-        def write_pressures(self, pressure_kpa):
-            super().write_pressures(np.where(np.arange(SPEC.n_chambers) == 4, 0.0, pressure_kpa))
+class Misplaced(IdealArm):
+    """Motion capture does not follow: whatever is corrected, the arm seems to be elsewhere."""
 
-    result = WaypointRecorder(Leaking(), expert).record(waypoints, plan)
-    assert len(result.log) == 0
-    assert "home: got no rest, expected it within 15 s; spring 4 is +" in result.ending.cause
-    assert "chamber at -40.0 kPa" in result.ending.cause
+    def motion_capture(self):
+        _, *others = super().motion_capture()
+        return Capture(np.array([0.05, 0.0, -0.5]), *others)
+
+
+class Leaking(IdealArm):
+    """One chamber holds no pressure."""
+
+    def write_pressures(self, pressure_kpa):
+        super().write_pressures(np.where(np.arange(SPEC.n_chambers) == 4, 0.0, pressure_kpa))
+
+
+@pytest.mark.parametrize(
+    ("kind", "n_logged", "causes"),
+    [
+        (Lost, 1, ["got 3 lost readings in a row"]),
+        (Misplaced, 0, ["home: got 7"]),
+        (
+            Leaking,
+            0,
+            ["home: got no rest, expected it within 15 s; spring 4 is +", "chamber at -40.0 kPa"],
+        ),
+    ],
+)
+def test_a_fault_ends_the_recording_and_what_was_logged_before_stays(
+    expert, waypoints, plan, kind, n_logged, causes
+):
+    arm = kind()
+    tell = lambda _: setattr(arm, "n_ticks_left", 20)  # noqa: E731
+    result = WaypointRecorder(arm, expert, tell).record(waypoints, plan)
+    assert len(result.log) == n_logged
+    assert all(cause in result.ending.cause for cause in causes)
 
 
 @pytest.fixture
@@ -179,7 +195,7 @@ def test_the_command_records_a_task_and_checks_its_file(command, tmp_path, monke
 
 def test_misuse_is_told_before_anything_moves(command, tmp_path):
     for args, message in (
-        ((*RECORD, tmp_path / "x.csv"), "got nothing, expected --task"),
+        ((*RECORD, tmp_path / "x.csv"), "--task {circle16,pipe300,pipe250}"),
         ((*RECORD, tmp_path / "no" / "x.csv", "--task", "pipe300"), "expected the name of a new file"),
         (("check", tmp_path / "none.csv"), "none.csv: got 'No such file"),
     ):

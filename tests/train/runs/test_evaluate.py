@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from train.runs import evaluate
-from train.runs.evaluate import N_ACTIONS, Evaluator, Reached, summarise, way_figures
+from train.runs.evaluate import Evaluator, Reached, summarise, way_figures
 
 pytestmark = pytest.mark.usefixtures("quick_compiler")
 
@@ -60,10 +60,18 @@ class Scripted:
 
 @pytest.fixture(scope="module")
 def evaluator(short_env):
+    """Evaluator that takes two actions to each goal, and tells as `near_s` how many were taken."""
+
+    def counted(env, learner, policy, state, goal, n_actions, take=evaluate.reach):
+        after, result = take(env, learner, policy, state, goal, n_actions)
+        return after, result._replace(near_s=after.pipeline_state.n_steps - state.pipeline_state.n_steps)
+
     goals = short_env.pool.pose[:64]
-    evaluator = Evaluator(short_env, Scripted(short_env, goals), n_goals=len(goals))
+    evaluator = Evaluator(short_env, Scripted(short_env, goals), n_goals=len(goals)).on(short_env, 2)
     evaluator.goals = jnp.concatenate([goals, goals])  # both sets
-    return evaluator
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(evaluate, "reach", counted)
+        yield evaluator
 
 
 @pytest.fixture
@@ -80,26 +88,13 @@ def test_a_policy_that_never_moves_is_as_far_as_the_goals_are(evaluator, actions
     assert figures.median_mm == pytest.approx(np.median(expected), abs=0.1)
     around = np.linalg.norm((np.asarray(circle.goal) - goals[0])[:, :3], axis=-1)
     np.testing.assert_allclose(circle.tip_error_mm, around, atol=0.1)
+    assert (workspace.near_s == 2).all() and (circle.near_s == 2).all()  # as many actions as asked for
 
 
 def test_an_arm_that_fails_on_the_way_counts_as_unsettled(evaluator, actions):
     figures, workspace, _ = evaluator(actions.at[3].set(jnp.nan))
-    assert N_ACTIONS > 1 and not workspace.settled[3] and workspace.settled.sum() == len(actions) - 1
+    assert not workspace.settled[3] and workspace.settled.sum() == len(actions) - 1
     assert figures.unsettled == 2 and figures.reached_share == 1 - 1 / len(actions)
-
-
-def test_as_many_actions_are_taken_as_asked_for(short_env, evaluator, actions, monkeypatch):
-    take = evaluate.reach
-
-    def counted(env, learner, policy, state, goal, n_actions):
-        after, result = take(env, learner, policy, state, goal, n_actions)
-        return after, result._replace(near_s=after.pipeline_state.n_steps - state.pipeline_state.n_steps)
-
-    monkeypatch.setattr(evaluate, "reach", counted)
-    few = evaluator.on(short_env, 2)
-    few.goals = evaluator.goals
-    _, workspace, circle = few(actions)
-    assert (workspace.near_s == 2).all() and (circle.near_s == 2).all()
 
 
 def test_when_a_tip_is_near_for_good_and_how_far_it_went_beyond():

@@ -12,8 +12,8 @@ from rich.console import Console
 from mjx_softarm.env import EnvConfig, Randomisation, ReachEnv
 from tests.train import small
 from tests.train.small import SHORT, new_job
+from tests.train.sweep.test_report import AT_REST
 from train.__main__ import main
-from train.agent.hindsight_tqc import HindsightTQC
 from train.config import ConfigError, override
 from train.presets import PRESETS
 from train.runs.checkpoint import Run, RunError
@@ -21,7 +21,7 @@ from train.runs.task import Task
 from train.sweep import run as sweep_run
 from train.sweep.command import members_of
 from train.sweep.job import SweepJob, setting, variable
-from train.sweep.report import CURVES_FILE, FIGURES, RESULTS_FILE, report
+from train.sweep.report import CURVES_FILE, RESULTS_FILE, report
 from train.sweep.run import create, open_sweep
 
 CONFIG = dataclasses.replace(
@@ -67,7 +67,7 @@ def members():
 
 @pytest.fixture(scope="module")
 def job(members, env):
-    return SweepJob(list(members.values()), VARIABLE, env, HindsightTQC)
+    return SweepJob(list(members.values()), VARIABLE, env)
 
 
 @pytest.fixture(scope="module")
@@ -130,7 +130,7 @@ class MadeUp:
         self.size = float(sum(np.abs(leaf).sum() for leaf in jax.tree.leaves(actor_params)))
 
     def to_dict(self):
-        return dict.fromkeys(FIGURES, self.size)
+        return dict.fromkeys(AT_REST, self.size)
 
 
 @pytest.fixture
@@ -146,7 +146,7 @@ def ready(job, monkeypatch):
         prepare=None,
     )
     monkeypatch.setattr(sweep_run, "ReachEnv", lambda spec, config, s2r: job.env)
-    monkeypatch.setattr(sweep_run, "SweepJob", lambda configs, varied, env, learner_of: job)
+    monkeypatch.setattr(sweep_run, "SweepJob", lambda configs, varied, env: job)
     monkeypatch.setattr(sweep_run, "task_of", lambda config, env: task)
 
 
@@ -248,5 +248,5 @@ def test_a_folder_that_is_no_sweep_is_named(tmp_path):
     with pytest.raises(RunError, match="sweep.json: got 'No such file.*expected the folder of a sweep"):
         open_sweep(tmp_path)
     (tmp_path / "sweep.json").write_text('{"members": 3}')
-    with pytest.raises(RunError, match="sweep.json: got .*, expected what a sweep writes"):
+    with pytest.raises(RunError, match="sweep.json: got .*, expected the fields"):
         open_sweep(tmp_path)
