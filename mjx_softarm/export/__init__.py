@@ -1,1 +1,1 @@
-"""The policy beyond Python: one ONNX graph, one C++ header, and golden rows that check any of them."""
+"""The policy beyond Python: ONNX graphs, a C++ header, and golden rows that check them."""

@@ -18,17 +18,15 @@ _DIFFERENT = 1  # exit status
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit status."""
-    about = (
-        "Exported policies beyond Python. Exit status: 0 all agree, 1 not all, 2 one could not be checked."
-    )
+    about = "Policies beyond Python. Exit status: 0 all agree, 1 some differ, 2 one could not be checked."
     return cli.main("python -m mjx_softarm.export", about, {"check": _check}, arguments)
 
 
 def _check(golden: tyro.conf.Positional[Path], runtimes: tyro.conf.Positional[tuple[Path, ...]]) -> int:
-    """Compare what policy files, graphs and programs answer with golden rows.
+    """Compare the answers of policy files, graphs and programs with golden rows.
 
     Args:
-        golden: the rows, policy_golden.csv of `--onnx` or golden.csv of `--cpp`
+        golden: golden rows, policy_golden.csv of `--onnx` or golden.csv of `--cpp`
         runtimes: policy.npz, policy.onnx, or a program that reads rows from its input and writes the outputs
     """
     if not runtimes:

@@ -1,4 +1,4 @@
-"""Golden rows answered by a policy file, an ONNX graph or a program, and how far the answers are off."""
+"""Comparison of golden rows with the answers of a policy file, an ONNX graph or a program."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from mjx_softarm.deploy.safety import Fault
 from mjx_softarm.export.golden import BITS, FLAGS, Golden, Machine, output_columns
 from mjx_softarm.policy.file import load_policy
 
-TOLERANCE = 1e-4  # of the range of an output; the law adds up the rounding of float32 references over time
-PROGRAM_VERSION = 2  # of the rows that a program reads and writes
+TOLERANCE = 1e-4  # share of an output's range; the law adds up rounding errors of float32 references
+PROGRAM_VERSION = 2  # version of the rows that a program reads and writes
 _TIMEOUT_S = 120.0
 
 
@@ -25,9 +25,9 @@ class Agreement(NamedTuple):
     """Comparison of answers with golden ones."""
 
     n_rows: int
-    error: float  # greatest, as a share of the output's range; infinite where a fault differs
-    column: str  # output in which it is
-    row: int  # counted from 0
+    error: float  # largest error, as a share of the output's range; infinite if a fault differs
+    column: str  # output with the largest error
+    row: int  # row with the largest error, from 0
 
     @property
     def holds(self) -> bool:
@@ -43,11 +43,11 @@ def check(golden: Golden, path: Path) -> Agreement:
     """Compare the answers of a runtime with golden ones.
 
     Args:
-        golden: the rows.
+        golden: golden rows.
         path: policy file `.npz`, graph `.onnx`, or a program that reads rows and writes their outputs.
 
     Raises:
-        InputError: the file is not what its name says, is of another policy, or the program failed.
+        InputError: the file cannot be read as such, is of another policy, or the program failed.
     """
     answer = {".npz": _by_numpy, ".onnx": _by_onnx}.get(path.suffix, _by_program)
     rows, outputs = answer(golden, path)
@@ -55,12 +55,12 @@ def check(golden: Golden, path: Path) -> Agreement:
 
 
 def compare(golden: Golden, rows: np.ndarray, outputs: dict[str, np.ndarray]) -> Agreement:
-    """Compare outputs, by the names of their columns, with those of some golden rows.
+    """Compare outputs with the outputs of some golden rows.
 
     Args:
-        golden: the rows.
-        rows (k,): indices of the rows answered.
-        outputs: arrays (k,) by column.
+        golden: golden rows.
+        rows (k,): indices of the answered rows.
+        outputs: arrays (k,) by the names of their columns.
     """
     names = output_columns(golden.about["n"])
     worst = Agreement(len(rows), 0.0, "none", 0)
@@ -119,10 +119,10 @@ def _by_onnx(golden: Golden, path: Path) -> tuple[np.ndarray, dict[str, np.ndarr
 
 
 def without_memory(golden: Golden, answer: Callable) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Return the golden rows that readings and goal decide, and their outputs by column.
+    """Return the golden rows that depend only on readings and goal, and their outputs by column.
 
     Args:
-        golden: the rows.
+        golden: golden rows.
         answer: readings (n,) and goal (6,), float32 -> outputs of `computations.answer`.
     """
     rows = np.flatnonzero(golden.inputs[:, FLAGS.index("restart")] > golden.inputs[:, FLAGS.index("checked")])
@@ -146,19 +146,21 @@ def without_memory(golden: Golden, answer: Callable) -> tuple[np.ndarray, dict[s
 def _checked(
     golden: Golden, outside: Callable[[np.ndarray], bool]
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Return the golden rows whose goals are checked, and their faults, GOAL_OUTSIDE by `outside`."""
+    """Return the golden rows with checked goals, and their faults; `outside` decides GOAL_OUTSIDE."""
     rows, bit = np.flatnonzero(golden.inputs[:, FLAGS.index("checked")]), BITS[Fault.GOAL_OUTSIDE]
     found = np.array([bit * outside(goal) for goal in golden.inputs[rows, -6:].astype(np.float32)], int)
     return rows, {"faults": golden.outputs[rows, 0].astype(int) & ~bit | found}
 
 
 def _by_program(golden: Golden, path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    # Run the program.
     lines = [" ".join(f"{value:.9g}" for value in row) for row in golden.inputs]
     try:
         command, text = [str(path.resolve())], "\n".join([*lines, ""])
         done = subprocess.run(command, input=text, capture_output=True, text=True, timeout=_TIMEOUT_S)
     except (OSError, subprocess.TimeoutExpired, UnicodeDecodeError) as error:
         raise InputError(f"{path}: got {error}, expected a program that runs") from error
+    # Check its first line, then read its answers.
     first, *rest = done.stdout.splitlines() or [""]
     words = [*first.split(), *("",) * 4]
     if done.returncode or words[:2] != ["mjx_softarm", str(PROGRAM_VERSION)]:

@@ -1,4 +1,4 @@
-"""Computations of a policy that other languages take over, recorded from the functions that Python runs."""
+"""Computations of a policy for other languages, recorded from the functions that Python runs."""
 
 from __future__ import annotations
 
@@ -48,20 +48,21 @@ def answer(
     pressure_kpa: Array,
     motion: InMotion,
 ) -> dict[str, Array]:
-    """Return the references that the loop takes from readings (n,) and a goal (6,) when it acts, and more.
+    """Return the loop's references for readings (n,) and a goal (6,), with pose, faults and payload.
 
-    A lost reading holds the last length (n,) [m] of its spring. References are NaN where the loop would give
-    none: a spring has neither a reading nor a last length, or the goal is outside the workspace. The payload
-    () [kg] is the caller's average of estimates at rest, each at its pressures (n,) [kPa]. `motion` matters
-    to a policy that observes it.
+    A lost reading holds the last length (n,) [m] of its spring. References are NaN if the loop would not act:
+    a spring has neither a reading nor a last length, or the goal is outside the workspace. The payload
+    () [kg] is the caller's average of estimates at rest, each from pressures (n,) [kPa]. Only policies that
+    observe motion use `motion`.
     """
+    # References of the policy.
     policy, xp = controller.policy, array_namespace(readings)
     reading = policy.sensor.lengths(readings, last_m)
     pose, away = tip_pose(policy, reading.length_m, load_kg)
     observed = sensed(policy, pose, reading.length_m, motion, load_kg)
     action = action_towards(policy, pose, xp.asarray(goal, dtype=np.float32), observed)
     reference = policy.actions.readings(action)
-    # A distance that is NaN is not within the limit, nor is a length that is NaN finite.
+    # NaN never counts as inside or finite.
     inside = _inside(controller, goal)
     acts = inside & xp.all(xp.isfinite(reading.length_m))
     return {
@@ -77,7 +78,7 @@ def answer(
 
 
 def check(controller: Controller) -> Computation:
-    """Record goal -> whether the loop refuses it before a run, the nearest pose and its weighted error."""
+    """Record goal -> refusal before a run, nearest pose and its weighted error."""
     policy, goal = controller.policy, symbol("goal", (6,))
     start = constant(reach.begin(policy, 1))
     search = repeat(lambda search: reach.improve(policy, goal[None], search), start, reach.N_STEPS)
@@ -87,7 +88,7 @@ def check(controller: Controller) -> Computation:
 
 
 def _inside(controller: Controller, goal: Array) -> Array:
-    """Return whether the loop takes a goal (6,) that it is given in a run."""
+    """Return whether the loop takes a goal (6,) in a run."""
     xp = array_namespace(goal)
     return xp.min(distances(controller.reachable, goal, controller.policy.reward)) <= 1.0
 
@@ -100,7 +101,8 @@ def actor(controller: Controller) -> Computation:
 
 
 def parts(controller: Controller) -> dict[str, Computation]:
-    """Record the functions that `mjx_softarm.deploy.loop` is made of, each by its name in C++."""
+    """Record the functions of which `mjx_softarm.deploy.loop` consists, by their names in C++."""
+    # Inputs.
     policy, n, window = controller.policy, controller.policy.spec.n_chambers, controller.window
     gains, tolerance_m, config = policy.gains, policy.tolerance_m, controller.config
     names = ("readings", "reference_m", "spring_m", "pressure_kpa")
@@ -110,16 +112,19 @@ def parts(controller: Controller) -> dict[str, Computation]:
     goal, pose, load_kg = symbol("goal", (6,)), symbol("pose", (6,), np.float32), symbol("load_kg", ())
     xp = readings.__array_namespace__()
 
+    # Belief.
     reading = policy.sensor.lengths(readings, spring_m)
     tip, away = tip_pose(policy, spring_m, load_kg)
     estimate_kg = estimate_load(
         policy.load_estimator, xp.mean(springs_m, axis=0), xp.mean(pressures_kpa, axis=0)
     )
+    # Policy and law.
     motion = _in_motion(n)
     observed = sensed(policy, pose, spring_m, motion, load_kg)
     action = action_towards(policy, pose, xp.asarray(goal, dtype=np.float32), observed)
     written_kpa, after = pressures(reference_m, spring_m, state, gains, controller.dt_s)
     law = {"written_kpa": written_kpa} | {f"next_{name}": value for name, value in after._asdict().items()}
+    # Faults, and the way that remains.
     mask = saturated(pressure_kpa, reference_m, spring_m, gains, tolerance_m)
     settled = on_reference(springs_m, reference_m, pressure_kpa, gains, tolerance_m)
     scaled = scaled_error(xp.asarray(pose, dtype=np.float64), goal, policy.reward)

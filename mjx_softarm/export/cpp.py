@@ -20,12 +20,14 @@ _TEMPLATES = {"softarm.hpp": "softarm.hpp.in"} | {
 
 def sources(controller: Controller, policy_sha256: str) -> dict[str, str]:
     """Return the text of each file by its name."""
+    # Functions and numbers of the policy.
     policy, config = controller.policy, controller.config
     numbers = Numbers(file_entries(policy))
     functions = [function(name, part, numbers) for name, part in parts(controller).items()]
     faults = [f"  {fault.name} = 1u << {k},  // {fault.response.value}" for k, fault in enumerate(Fault)]
     vents = [fault.name for fault in Fault if fault.response is Response.VENT]
     most_kg = float(policy.load_estimator.load_scale_kg)
+    # Values of the templates' marks.
     values = {
         "SHA256": policy_sha256,
         "N": policy.spec.n_chambers,
@@ -62,6 +64,7 @@ def sources(controller: Controller, policy_sha256: str) -> dict[str, str]:
         "MAX_KEPT": ", ".join(map(repr, config.kept_limit.tolist())),
         "GOAL": ", ".join(f"{value:.1f}" for value in policy.workspace[0]),
     }
+    # Fill the templates.
     texts = {}
     for name, template in _TEMPLATES.items():
         text = resources.files("mjx_softarm").joinpath(f"export/templates/{template}").read_text("utf-8")

@@ -1,8 +1,8 @@
 """Recorded computations as C++ functions: loops over arrays of fixed size, without allocation.
 
-An operation whose elements are read once is written into the expression that reads it; all others have an
-array of their own. `_places` finds a formula for the place of an element in an operand that is broadcast or
-indexed; where there is none, a table holds the places.
+An operation whose elements are read once is written into the expression that reads them; every other
+operation gets an array of its own. `_places` finds a formula for the place of an element in an operand that
+is broadcast or indexed. If there is no formula, a table holds the places.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _EXPRESSIONS = {
     "isfinite": "std::isfinite({})",
     **{name: f"std::{name}({{}})" for name in ("sqrt", "sin", "cos", "tanh", "floor")},
 }
-# Before the first element, and after each one.
+# Initial value of a reduction, and its statement for each element.
 _FOLDS = {
     "sum": ("0", "{} += {};"),
     "min": ("INFINITY", "{0} = least({0}, {1});"),
@@ -56,7 +56,7 @@ class Numbers:
     """Constant arrays of all functions, each once.
 
     Args:
-        names: names of arrays that have one; the others are numbered.
+        names: arrays with names; arrays without a name are numbered.
     """
 
     def __init__(self, names: Mapping[str, np.ndarray]):
@@ -71,12 +71,12 @@ class Numbers:
         return name
 
     def text(self) -> str:
-        """Return the definitions of all arrays that were named."""
+        """Return the definitions of all arrays that `name` was asked for."""
         return "\n".join(_definition(name, array) for name, array in self._used.items())
 
 
 def function(name: str, computation: Computation, numbers: Numbers) -> str:
-    """Return a computation as a function, its outputs after its inputs; those not looked at have no name."""
+    """Return a computation as a function of inputs, then outputs; unused inputs have no name."""
     read = set(ordered(computation.outputs.values()))
     takes = [
         f"const {_TYPES[item.dtype.name]}*" + (f" {item.option}" if item in read else "")
@@ -108,7 +108,7 @@ class _Body:
                 self._store(item, name)
 
     def _read_once(self, item: Symbol) -> bool:
-        """Return whether an operation on elements can stand where its result is read."""
+        """Return whether an operation can be written into the expression that reads its result."""
         if item.op not in _EXPRESSIONS | {"cast": ""} and item.op not in _VIEWS:
             return False
         if len(self._readers[item]) != 1:
@@ -164,7 +164,7 @@ class _Body:
         return _literal(first) if same else f"{self._numbers.name(value)}[{i}]"
 
     def _places(self, places: np.ndarray, i: str) -> str:
-        """Return the place of element `i` in an operand, given the places of all."""
+        """Return the expression of the place of element `i`, given the places of all elements."""
         flat = places.reshape(-1)
         count, start = np.arange(flat.size), int(flat[0])
         stride = int(flat[1]) - start if flat.size > 1 else 0
@@ -230,12 +230,12 @@ class _Body:
 
 
 def _one(text: str) -> str:
-    """Return an expression that may stand beside any operator."""
+    """Return an expression that can be an operand: in brackets unless it is a word."""
     return text if text.isalnum() else f"({text})"
 
 
 def _flat(*indices: tuple[str, int]) -> str:
-    """Return the place in flat order of indices, each with the size of its axis."""
+    """Return the expression of a place in flat order from indices, each with the size of its axis."""
     text = ""
     for name, size in indices:
         if size > 1:
@@ -253,7 +253,7 @@ def _key(array: np.ndarray) -> tuple:
 
 
 def _literal(value: Any) -> str:
-    """Return a NumPy number in C++, all digits of it."""
+    """Return a NumPy number as C++ writes it, with all digits."""
     if value.dtype.kind == "b":
         return "true" if value else "false"
     if value.dtype.kind == "i":

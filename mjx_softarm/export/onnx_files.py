@@ -1,7 +1,7 @@
 """A policy as ONNX graphs: numbers in float32, operators of opset 17 that every build of onnxruntime has.
 
-The graph's inputs, outputs and their meaning stand in its metadata, entry `mjx_softarm`, as JSON with numbers
-in full precision. The checksum of everything else is the entry `sha256`.
+The metadata entry `mjx_softarm` describes the graph's inputs and outputs, as JSON with numbers in full
+precision. The entry `sha256` is the checksum of everything else.
 """
 
 from __future__ import annotations
@@ -58,15 +58,17 @@ def write_onnx(path: Path, computation: Computation, about: Mapping[str, Any], d
 
     Args:
         path: the file.
-        computation: inputs become float32.
-        about: goes into the metadata; types that JSON has.
-        defaults: inputs that may be left out, by name, with their values.
+        computation: recorded computation; its inputs become float32.
+        about: description for the metadata, in types that JSON has.
+        defaults: values of optional inputs, by name.
     """
+    # Nodes and tensors.
     writer = _Writer()
     for name, result in computation.outputs.items():
         writer.node("Identity", [writer.name(result)], output=name)
     for name, value in defaults.items():
         writer.tensors[name] = numpy_helper.from_array(np.asarray(value, np.float32), name)
+    # Graph with typed inputs and outputs.
     graph = helper.make_graph(
         writer.nodes,
         "policy",
@@ -81,6 +83,7 @@ def write_onnx(path: Path, computation: Computation, about: Mapping[str, Any], d
         graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION, producer_name=ABOUT
     )
     onnx.checker.check_model(model, full_check=True)
+    # Metadata, with the checksum last.
     about = {"schema_version": SCHEMA_VERSION, **about}
     helper.set_model_props(model, {ABOUT: json.dumps(about)})
     helper.set_model_props(model, {ABOUT: json.dumps(about), SEAL: _digest(model)})
@@ -88,7 +91,7 @@ def write_onnx(path: Path, computation: Computation, about: Mapping[str, Any], d
 
 
 def read_onnx(path: Path) -> tuple[bytes, dict[str, Any]]:
-    """Return a graph's bytes, for onnxruntime, and what its metadata tell.
+    """Return a graph's bytes, for onnxruntime, and its description.
 
     Raises:
         InputError: the file cannot be read, is incomplete, damaged, or of another program or version.
@@ -99,7 +102,7 @@ def read_onnx(path: Path) -> tuple[bytes, dict[str, Any]]:
         model = onnx.load_from_string(data)
     except OSError as error:
         raise InputError(f"{path}: got {error.strerror!r}, expected {expected}") from error
-    except Exception as error:  # protobuf's DecodeError is of the package that onnx happens to use
+    except Exception as error:  # the class of protobuf's DecodeError depends on the installed package
         raise InputError(f"{path}: got no ONNX graph, {len(data)} bytes, expected {expected}") from error
     entries = {item.key: item.value for item in model.metadata_props}
     if not entries.keys() >= {ABOUT, SEAL}:
@@ -114,7 +117,7 @@ def read_onnx(path: Path) -> tuple[bytes, dict[str, Any]]:
 
 
 def _digest(model: onnx.ModelProto) -> str:
-    """Return the SHA-256 of all of a model but its checksum."""
+    """Return the SHA-256 of a model without its checksum."""
     bare = onnx.ModelProto()
     bare.CopyFrom(model)
     kept = [item for item in bare.metadata_props if item.key != SEAL]
@@ -124,16 +127,16 @@ def _digest(model: onnx.ModelProto) -> str:
 
 
 class _Writer:
-    """Nodes and tensors of a graph in the making."""
+    """Nodes and tensors of a graph."""
 
     def __init__(self, prefix: str = "v", tensors: dict[str, onnx.TensorProto] | None = None) -> None:
         self.nodes: list[onnx.NodeProto] = []
-        self.tensors = {} if tensors is None else tensors  # shared with the graph around
+        self.tensors = {} if tensors is None else tensors  # a loop's body shares those of its graph
         self._names: dict[Symbol, str] = {}
         self._prefix = prefix
 
     def name(self, item: Symbol) -> str:
-        """Return the name of a symbol's value, once all nodes that it needs are there."""
+        """Return the name of a symbol's value; write the nodes that it needs."""
         for needed in ordered([item]):
             if needed not in self._names:
                 self._names[needed] = self._write(needed)
@@ -205,12 +208,12 @@ class _Writer:
         return self.node("Loop", [self.tensor(np.int64(n)), self.tensor(np.bool_(True)), start], body=body)
 
     def _isfinite(self, item: Symbol, x: str) -> str:
-        """x - x is NaN, unequal to itself, where x is not finite."""
+        """Compare x - x with itself: it is NaN, which equals nothing, if x is not finite."""
         zero = self.node("Sub", [x, x])
         return self.node("Equal", [zero, zero])
 
     def _arctan2(self, item: Symbol, y: str, x: str) -> str:
-        """ONNX has the arctangent of one number: half a turn is added where x < 0."""
+        """Take ONNX's arctangent of y / x, and add half a turn where x < 0."""
         zero, none = self.tensor(np.float32(0.0)), self.node("Equal", [x, self.tensor(np.float32(0.0))])
         slope = self.node("Div", [y, self.node("Where", [none, self.tensor(np.float32(1.0)), x])])
         half_turn = [self.tensor(np.float32(sign * np.pi)) for sign in (-1.0, 1.0)]

@@ -1,19 +1,19 @@
 """Recorded computations: NumPy functions called on symbols, kept as operations for other languages.
 
-Sensors, estimator, networks, maps, law and faults are written once, in the functions of whatever library
-their arrays bring along (`mjx_softarm._support.xp`). A `Symbol` is an array of known shape and type that
-brings this module along: such a function, called on symbols, returns the symbols of its results, and each
-symbol knows the operation and the operands that it comes from. Shapes and types are NumPy's own: every
-operation is tried on arrays of ones.
+Sensors, estimator, networks, maps, law and faults are written once, with the functions of their arrays'
+library (`mjx_softarm._support.xp`). A `Symbol` is an array of known shape and type whose library is this
+module. A function called on symbols returns symbols, and each symbol knows its operation and its operands.
+NumPy itself decides shapes and types: every operation is tried on arrays of ones.
 
-The operations are NumPy's functions of the same name, elementwise but for
+The operations are NumPy's functions of the same name. All are elementwise except
 
-    input, constant                  `option`: the name; nothing
-    cast, reshape                    nothing: type and shape are the symbol's
+    input                            `option`: its name
+    constant                         `value`: its array
+    cast, reshape                    type and shape are the symbol's
     index                            `option`: places (shape) of the elements in the flat operand
-    concat, sum, min, max, all, any  `option`: the axis, or the axes as a tuple
+    concat, sum, min, max, all, any  `option`: the axis, or a tuple of axes
     matmul                           as NumPy's
-    repeat                           `option`: a `Repeat`; the operand is what it begins with
+    repeat                           `option`: a `Repeat`; the operand is the start
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ class Symbol:
     shape: tuple[int, ...]
     dtype: np.dtype
     option: Any = None
-    value: np.ndarray | None = None  # of a constant
+    value: np.ndarray | None = None  # array of a constant
 
-    __array_ufunc__ = None  # lets NumPy arrays leave operators to this class
+    __array_ufunc__ = None  # NumPy arrays leave operators to this class
 
     def __array_namespace__(self) -> Any:
         return _NAMESPACE
@@ -85,7 +85,7 @@ class Symbol:
 
 
 class Repeat(NamedTuple):
-    """A computation of a symbol from one of its own kind, done n times over."""
+    """A computation from a symbol to another of the same shape and type, repeated n times."""
 
     before: Symbol
     after: Symbol
@@ -122,7 +122,7 @@ def constant(value: Any, dtype: Any = None) -> Symbol:
 
 
 def elementwise(name: str, *operands: Any) -> Symbol:
-    """Record an operation on elements; bare numbers take the type of the arrays, as in NumPy."""
+    """Record an elementwise operation; plain numbers take the arrays' type, as in NumPy."""
     like = _tried(name, *operands)
     values = operands[1:] if name == "where" else operands
     common = np.result_type(*(_one(value) for value in values))
@@ -142,7 +142,7 @@ def repeat(step: Callable[[Symbol], Symbol], start: Symbol, n: int) -> Symbol:
 
 
 def ordered(results: Iterable[Symbol]) -> list[Symbol]:
-    """Return all symbols that results come from, and these, each after its operands."""
+    """Return the results and all symbols that they depend on, each after its operands."""
     found: dict[Symbol, None] = {}
 
     def visit(item: Symbol) -> None:
@@ -217,7 +217,7 @@ _OWN = {
 
 
 class _Namespace:
-    """NumPy's functions, on symbols; on arrays and numbers alone they are NumPy's."""
+    """NumPy's functions on symbols; without symbols they are NumPy's own."""
 
     def __getitem__(self, name: str) -> Callable[..., Any]:
         return getattr(self, name)
@@ -240,7 +240,7 @@ class _Namespace:
 
 
 def _flat(operands: Iterable[Any]) -> Iterator[Any]:
-    """Yield operands, and those in lists of operands."""
+    """Yield operands, and the elements of lists of operands."""
     for operand in operands:
         yield from operand if isinstance(operand, list | tuple) else (operand,)
 

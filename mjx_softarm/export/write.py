@@ -12,7 +12,8 @@ from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.export import computations
 from mjx_softarm.export.cpp import sources
-from mjx_softarm.export.golden import make_golden, write_golden
+from mjx_softarm.export.golden import write_golden
+from mjx_softarm.export.golden_cases import make_golden
 from mjx_softarm.mdp.observation import RATE_S
 from mjx_softarm.policy.file import Policy, action_layout, load_policy
 
@@ -21,7 +22,7 @@ FRAME = "base frame: z up, the arm hangs towards -z; angles intrinsic Z-Y-X, zer
 
 
 def export_onnx(policy_path: Path) -> list[Path]:
-    """Write the graphs of a policy beside it, with golden rows; return the files.
+    """Write a policy's graphs and golden rows beside its file; return the written files.
 
     Raises:
         InputError: the policy cannot be read, the package onnx is missing, or a file cannot be written.
@@ -31,6 +32,7 @@ def export_onnx(policy_path: Path) -> list[Path]:
     except ImportError as error:
         expected = "pip install -e '.[onnx]' in the checkout"
         raise InputError(f"--onnx: got no {error.name}, expected {expected}") from error
+    # Inputs that may be left out, with their defaults.
     controller, sha256 = _open(policy_path)
     n = controller.policy.spec.n_chambers
     about = describe(controller.policy, sha256)
@@ -45,6 +47,7 @@ def export_onnx(policy_path: Path) -> list[Path]:
     if controller.policy.observation == "motion":
         unknown = np.full(n, np.nan)
         never |= computations.InMotion(unknown, unknown, np.zeros(n))._asdict()
+    # Write the graphs and the golden rows.
     write_onnx(whole, computations.graph(controller), {"kind": "policy", **about}, never)
     write_onnx(actor, computations.actor(controller), {"kind": "actor", **about}, {})
     write_onnx(check, computations.check(controller), {"kind": "check of goals", **about}, {})
@@ -54,7 +57,7 @@ def export_onnx(policy_path: Path) -> list[Path]:
 
 
 def export_cpp(policy_path: Path, folder: Path) -> list[Path]:
-    """Write a policy as C++ sources into a folder, with golden rows; return the files.
+    """Write a policy as C++ sources and golden rows into a folder; return the written files.
 
     Raises:
         InputError: the policy cannot be read.
@@ -71,7 +74,7 @@ def export_cpp(policy_path: Path, folder: Path) -> list[Path]:
 
 
 def describe(policy: Policy, sha256: str) -> dict[str, Any]:
-    """Return what a user of a graph needs to know: units, frames, names, the arm and its numbers."""
+    """Return a graph's description for its users: units, frames, names, the arm and its numbers."""
     sensor, n = policy.sensor, policy.spec.n_chambers
     lengths = {"unit": "m", "names": [f"spring{k}" for k in range(n)]}
     readings = {"unit": sensor.unit, "names": list(action_layout(policy.spec))}

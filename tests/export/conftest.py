@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mjx_softarm.deploy.controller import Controller
-from mjx_softarm.export import golden as golden_rows
+from mjx_softarm.export import golden_cases
 from mjx_softarm.mdp.observation import layouts
 from mjx_softarm.policy.file import load_policy, save_policy
 from mjx_softarm.sensing.s2r import N_POSE_INPUTS, N_POSE_OUTPUTS, S2R
@@ -64,8 +64,8 @@ def carrying_policy(spec=SPEC):
 def few_golden_rows(run_ticks=30):
     """Golden rows made in here are few; runs end after so many ticks."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(golden_rows, "N_SINGLE", 40)
-        patch.setattr(golden_rows, "_RUN_TICKS", run_ticks)
+        patch.setattr(golden_cases, "N_SINGLE", 40)
+        patch.setattr(golden_cases, "_RUN_TICKS", run_ticks)
         yield
 
 
@@ -84,4 +84,4 @@ def controller(policy_file):
 
 @pytest.fixture(scope="session")
 def golden(controller, policy_file):
-    return golden_rows.make_golden(controller, hashlib.sha256(policy_file.read_bytes()).hexdigest())
+    return golden_cases.make_golden(controller, hashlib.sha256(policy_file.read_bytes()).hexdigest())

@@ -12,10 +12,10 @@ import pytest
 from mjx_softarm import ArmSpec
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.controller import Controller
-from mjx_softarm.export import golden as golden_rows
+from mjx_softarm.export import golden_cases
 from mjx_softarm.export.check import TOLERANCE, check
 from mjx_softarm.export.cpp import sources
-from mjx_softarm.export.golden import FLAGS
+from mjx_softarm.export.golden import FLAGS, Machine
 from mjx_softarm.mdp.observation import OBS_SIZE
 from tests.export.conftest import busy_policy, carrying_policy, few_golden_rows, moving_policy
 from tests.linear_arm import N
@@ -60,7 +60,7 @@ def agreeing_rows(policy, folder, run_ticks):
         (folder / name).write_text(text)
     compile_("-O1", folder / "rows.cpp", "-o", folder / "rows")
     with few_golden_rows(run_ticks):
-        golden = golden_rows.make_golden(controller, "ab")
+        golden = golden_cases.make_golden(controller, "ab")
     agreement = check(golden, folder / "rows")
     assert agreement.n_rows > 100 and agreement.error < TOLERANCE, agreement
     return golden
@@ -77,7 +77,7 @@ def test_rows_of_a_policy_that_observes_the_payload_agree(tmp_path):
     blind = dataclasses.replace(
         policy, layers=((weight * (np.arange(len(weight)) < OBS_SIZE)[:, None], bias), *others)
     )
-    machine = golden_rows.Machine(Controller.of(blind))
+    machine = Machine(Controller.of(blind))
     off_m = np.array([machine.answer(row) for row in golden.inputs]) - golden.outputs
     assert np.nanmax(np.abs(off_m[:, 2 + N : 2 + 2 * N])) > 1e-3  # so a payload was estimated, and counts
 
