@@ -1,4 +1,4 @@
-"""Commands `python -m train demos record | check`: demonstrations from an arm, and what a file has."""
+"""Commands `python -m train demos record | check`: demonstrations from an arm, and the contents of a file."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Record(ArmOptions):
         waypoints, pipe = task(self.task, spec)
         expert = Expert(spec, s2r, pipe)
         plan = expert.plan(waypoints)
-        # Record, and tell what came of it.
+        # Record, and report the poses and errors.
         tell, save = partial(_tell, console), partial(save_log, self.out)
         recorder = WaypointRecorder(arm, expert, tell, save)
         result = recorder.record(waypoints, plan)

@@ -1,9 +1,9 @@
-"""Demonstrations: static poses that an expert brought the arm to, each with the action that leads there.
+"""Demonstrations: static poses to which an expert brought the arm, each with the action that leads there.
 
 A file of demonstrations is a log (`mjx_softarm.logs.schema`) of rows at rest, with the sensors' readings, the
-tip's pose, and the id of the sequence that a row belongs to. A row's action is its own readings: as spring
-references they lead to the row's pose from any start. So a row's pose is the goal of its action, and every
-other pose may be its start. With so few rows, a fault in one of them refuses the file.
+tip's pose, and the id of a sequence. A row's action is its own readings: as spring references they lead to
+the row's pose from any start. The row's pose is the goal of this action, and every other pose may be its
+start. A file has few rows, and a fault in one of them refuses it.
 
 Source: the paper's representation of demonstration data, g' = the pose of s_{t+1}.
 """
@@ -39,7 +39,7 @@ def load_demonstrations(path: str | Path, spec: ArmSpec) -> Demonstrations:
 
     Args:
         path: CSV, or npz by the end of its name.
-        spec: the arm that is to learn from them.
+        spec: the arm that learns from the file.
 
     Raises:
         LogError: the file cannot be used; the message has a line for each finding.
@@ -63,7 +63,7 @@ def read_demonstrations(path: str | Path, spec: ArmSpec) -> tuple[Log, list[Find
 def from_log(log: Log, spec: ArmSpec) -> Demonstrations:
     """Return the demonstrations of checked rows."""
     actions = ActionMap.from_spec(spec).from_readings(log.readings)
-    assert log.sequence is not None  # it is `NEEDED`
+    assert log.sequence is not None  # one of `NEEDED`
     positions = pose_from_quaternion(log.tip_m, log.tip_quaternion)
     return Demonstrations(
         positions.astype(np.float32), actions.astype(np.float32), log.sequence.astype(np.int32)

@@ -109,7 +109,7 @@ def solve_many(
         # Keep the trial where it is better, and then trust the linear model more.
         trial, *best, damping = state
         tried = (trial, *model(trial))
-        better = jnp.sum(tried[1] ** 2) < jnp.sum(best[1] ** 2)  # not where it is NaN
+        better = jnp.sum(tried[1] ** 2) < jnp.sum(best[1] ** 2)  # false where the trial is NaN
         best = [jnp.where(better, new, old) for new, old in zip(tried, best, strict=True)]
         damping = jnp.clip(damping * jnp.where(better, 0.2, 10.0), 1e-6, 1e6)
         # Take the damped Gauss-Newton step from the best pressures so far.

@@ -1,7 +1,7 @@
 """Tasks as waypoints of the finger tips, one short move after the other.
 
-The paper gives the operations and the number of poses, not where they are. Here the circle is at the height
-that the arm reaches best; waypoints in a pipe are evenly spaced along its axes from container to container.
+The paper gives the operations and the number of poses, but no positions. Here the circle is at the height
+that the arm reaches best. Waypoints in a pipe are evenly spaced along its axes, from container to container.
 """
 
 from __future__ import annotations

@@ -58,8 +58,8 @@ class Summary:
     reached_share: float  # goals with the norm of e below theta and no chamber saturated
     saturated_share: float  # goals at which a chamber is saturated
     even_median_mm: float  # median at the goals that are uniform in volume
-    even_p95_mm: float  # 95 % at these goals
-    even_reached_share: float  # reached share of these goals
+    even_p95_mm: float  # 95 % at the goals that are uniform in volume
+    even_reached_share: float  # reached share of the goals that are uniform in volume
     unsettled: int  # arms that did not settle, at all goals and on the circle
     circle_mean_mm: float
     circle_max_mm: float

@@ -22,7 +22,7 @@ from train.sweep.job import setting, variable
 from train.sweep.report import CURVES_FILE, RESULTS_FILE, report
 from train.sweep.run import create, open_sweep, train
 
-_WIDTH = 160  # of the table where it is printed elsewhere than to a terminal
+_WIDTH = 160  # width of the table where the output is no terminal
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +38,7 @@ class SweepCommand(NewRunOptions):
     seeds: cli.Integers = (0,)
     """seeds of each setting"""
     vary: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME=VALUE,...")] = ()
-    """train with each of these values, e.g. tqc.gamma=0.5,0.9; with several, with each combination"""
+    """train with each of these values, e.g. tqc.gamma=0.5,0.9; given several times, with each combination"""
 
     @classmethod
     def default(cls, arguments: Sequence[str]) -> Self:

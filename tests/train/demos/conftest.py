@@ -6,6 +6,7 @@ import pytest
 from mjx_softarm.mechanics.pipe import CrossPipe
 from mjx_softarm.sensing.s2r import N_POSE_INPUTS, N_POSE_OUTPUTS, S2R
 from train.demos.expert import Expert
+from train.demos.waypoints import SQUARE, Waypoint, task
 
 SHIFT_MM = (4.0, -3.0, 2.0)
 
@@ -36,3 +37,15 @@ def shifting_s2r(spec):
 def expert(spec, shifting_s2r):
     """The paper's arm in the 300 mm pipe, believed to be off by `shift_mm`."""
     return Expert(spec, shifting_s2r, CrossPipe.of_mm(300))
+
+
+@pytest.fixture(scope="session")
+def waypoints(spec):
+    """From home into the right container, and straight down half of the way to the bottom."""
+    picked = task("pipe300", spec).waypoints[:5]
+    return (*picked, Waypoint("down", np.array([0.0, 0.0, -0.72]), SQUARE))
+
+
+@pytest.fixture(scope="session")
+def plan(expert, waypoints):
+    return expert.plan(waypoints)

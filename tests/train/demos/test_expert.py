@@ -17,18 +17,6 @@ from train.demos.waypoints import FREE, SQUARE, TASKS, Waypoint, circle, task
 PIPE = CrossPipe.of_mm(300)
 
 
-@pytest.fixture(scope="module")
-def waypoints(spec):
-    """From home into the right container, and straight down half of the way to the bottom."""
-    picked = task("pipe300", spec).waypoints[:5]
-    return (*picked, Waypoint("down", np.array([0.0, 0.0, -0.72]), SQUARE))
-
-
-@pytest.fixture(scope="module")
-def plan(expert, waypoints):
-    return expert.plan(waypoints)
-
-
 def hold(spec, reference_m):
     """C MuJoCo at rest under the sensor-space law."""
     rest, model = stepped_to_rest(fast_model(), reference_m, FAST_GAINS), build_model(spec)

@@ -61,16 +61,6 @@ class IdealArm(BlindArm):
         return Capture(tip_m, quaternion_from_pose(pose), tip_m[None])
 
 
-@pytest.fixture(scope="module")
-def waypoints():
-    return task("pipe300", SPEC).waypoints[:4]
-
-
-@pytest.fixture(scope="module")
-def plan(expert, waypoints):
-    return expert.plan(waypoints)
-
-
 def fingers_m(log):
     """Return the finger tips (rows, 3) [m] of a log: 100 mm below the tip, along its axis."""
     x, y, z, w = (log.tip_quaternion[:, k] for k in (1, 2, 3, 0))
@@ -81,9 +71,9 @@ def fingers_m(log):
 def test_recorded_positions_are_the_waypoints(expert, waypoints, plan, shift_mm):
     told = []
     arm = IdealArm()
-    result = WaypointRecorder(arm, expert, told.append).record(waypoints, plan, sequence=3)
+    result = WaypointRecorder(arm, expert, told.append).record(waypoints[:4], plan, sequence=3)
     assert result.ending.status == 0 and len(result.log) == len(told) == 4
-    wanted_m = np.stack([waypoint.finger_m for waypoint in waypoints])
+    wanted_m = np.stack([waypoint.finger_m for waypoint in waypoints[:4]])
     off_m = np.linalg.norm(fingers_m(result.log) - wanted_m, axis=1)
     assert off_m.max() < CLOSE_M < 1e-3 * np.linalg.norm(shift_mm)  # uncorrected, it is off by the shift
     np.testing.assert_allclose(result.off_m, off_m, atol=1e-6)
@@ -180,14 +170,14 @@ RECORD = ("record", "--arm", "a:B", "--out")
 def test_the_command_records_a_task_and_checks_its_file(command, tmp_path, monkeypatch, waypoints):
     whole = functools.partial(task, "pipe300")
     monkeypatch.setattr(
-        "train.demos.command.task", lambda name, spec: whole(spec)._replace(waypoints=waypoints)
+        "train.demos.command.task", lambda name, spec: whole(spec)._replace(waypoints=waypoints[:4])
     )
     out = tmp_path / "demos.csv"
     status, told = command(*RECORD, out, "--task", "pipe300")
     assert status == 0, told
     assert f"demonstrations: {out}, 4 poses" in told and "furthest from its waypoint: " in told
     log, _ = read_demonstrations(out, SPEC)
-    wanted_m = np.stack([waypoint.finger_m for waypoint in waypoints])
+    wanted_m = np.stack([waypoint.finger_m for waypoint in waypoints[:4]])
     assert np.linalg.norm(fingers_m(log) - wanted_m, axis=1).max() < CLOSE_M
     status, told = command("check", out)
     assert status == 0 and "poses: 4" in told and "sequences: 1: 0 with 4" in told
