@@ -1,7 +1,7 @@
-"""Arms that ship, by the same commands: recorded and calibrated from their own rod twins, trained, measured.
+"""Arms that ship: recorded and calibrated from their own rod twins, trained, measured.
 
-The commands are those of `docs/your-arm.md`. Each arm is measured at a grid of goals over its workspace, the
-paper's around its circle, too.
+The commands are those of `docs/your-arm.md`. Each arm is measured at a grid of goals over its workspace, and
+the paper's arm also around its circle.
 """
 
 from __future__ import annotations
@@ -31,7 +31,9 @@ def measure(
     points: int = 40,
     keep: cli.MaybePath = None,
 ) -> dict[str, Any]:
-    """Calibrate, train and measure arms on rod twins with seed 0.
+    """How well do the arms that ship follow goals, from recording to measurement, by the same commands?
+
+    Each is recorded, calibrated, trained and measured on a rod twin with seed 0.
 
     Args:
         arms: the package's names of arms
@@ -45,6 +47,7 @@ def measure(
 
 
 def _measure(arm: str, folder: Path, poses: int, steps: int | None, points: int) -> dict[str, Any]:
+    # Record, calibrate, train and export.
     folder.mkdir(parents=True)
     twin, log, calibration = f"twin:rod:0@{arm}", folder / "poses.csv", folder / "calibration"
     run, policy = folder / "run", folder / "run/policy.npz"
@@ -54,6 +57,7 @@ def _measure(arm: str, folder: Path, poses: int, steps: int | None, points: int)
     distrusted = run_command("calib", "run", log, "--spec", arm, "--out", calibration)
     run_command(*train, *(("--total-env-steps", steps) if steps else ()))
     run_command("train", "export", run)
+    # Measure the policy on the twin.
     options = {"grid": ["--goals", "grid", "--points", points]}
     if arm == "paper":
         options["circle"] = ["--goals", "circle"]
@@ -76,7 +80,7 @@ FIGURES = {
 
 
 def _figures(arm: str, folder: Path, distrusted: int) -> dict[str, Any]:
-    """Return what the arm is, and what its calibration says of itself."""
+    """Return figures of the arm's specification and of its calibration's report."""
     spec = ArmSpec.of(Path(arm))
     parts = json.loads((folder / "calibration/report.json").read_text())["parts"]
     chambers, network = (parts[title]["figures"] for title in ("Chambers", "Sim-to-real network"))

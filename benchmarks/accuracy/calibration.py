@@ -1,4 +1,4 @@
-"""Accuracy of calibration on a planted arm with known numbers, that of `python -m calib demo`.
+"""Accuracy of calibration on a planted arm whose numbers are known.
 
 Errors are on contiguous blocks of rows that took no part in the fit. See `logs` for real arms.
 """
@@ -19,7 +19,7 @@ from mjx_softarm import ArmSpec
 
 
 def measure() -> dict[str, Any]:
-    """Measure errors of calibrated springs and chambers on a planted arm.
+    """How exactly does calibration find the numbers of a planted arm?
 
     The arm is that of `python -m calib demo`, whose geometry differs from the simulator's; tips are in mm.
     """

@@ -1,7 +1,6 @@
 """Held-out figures of finished training runs, grouped by their settings, with the spread over seeds.
 
-Evaluations that `python -m train evaluate` wrote into a run's folder, with a payload or in motion, are among
-them.
+Evaluations in a run's folder by `python -m train evaluate`, with a payload or in motion, are included.
 """
 
 from __future__ import annotations
@@ -18,8 +17,8 @@ from train.runs.checkpoint import Run
 from train.sweep.report import by_settings
 
 
-class Target(NamedTuple):
-    """A target: a figure's mean over seeds, and what it may be."""
+class FigureTarget(NamedTuple):
+    """A bound of a figure's mean over seeds."""
 
     figure: str
     limit: float
@@ -29,23 +28,23 @@ class Target(NamedTuple):
 
 TARGETS = {  # of presets
     "analytic": (
-        Target("median_mm", 0.5),
-        Target("p95_mm", 1.5),
-        Target("reached_share", 0.98, at_least=True),
-        Target("circle_mean_mm", 0.4),
-        Target("even_median_mm", 0.8),
-        Target("even_p95_mm", 4.0),
+        FigureTarget("median_mm", 0.5),
+        FigureTarget("p95_mm", 1.5),
+        FigureTarget("reached_share", 0.98, at_least=True),
+        FigureTarget("circle_mean_mm", 0.4),
+        FigureTarget("even_median_mm", 0.8),
+        FigureTarget("even_p95_mm", 4.0),
     ),
-    "quick": (Target("median_mm", 2.0),),
+    "quick": (FigureTarget("median_mm", 2.0),),
     "motion-analytic": (
-        Target("median_mm", 3.0),
-        Target("near_median_s", 1.2, spread="evaluation-in-motion-12x0.5s_over_seeds"),
+        FigureTarget("median_mm", 3.0),
+        FigureTarget("near_median_s", 1.2, spread="evaluation-in-motion-12x0.5s_over_seeds"),
     ),
 }
 
 
 def measure(runs: tuple[Path, ...]) -> dict[str, Any]:
-    """Report tip errors of finished runs, and their spread over the seeds of the same settings.
+    """How exact are finished runs in simulation, over the seeds of the same settings?
 
     Args:
         runs: folders of finished runs

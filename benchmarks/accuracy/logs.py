@@ -1,8 +1,8 @@
 """Accuracy of calibration on public logs of real soft arms.
 
-The logs: `asl_trunk`, a trunk of three segments and six motors (StanfordASL/trunk-stack), and `asu_softarm`,
-a pneumatic arm of two sections with draw wires (ASU-RISE-Lab/4-chamber-softarm-control). Errors are on
-contiguous blocks of rows that took no part in the fit.
+`asl_trunk` is a trunk of three segments and six motors (StanfordASL/trunk-stack), `asu_softarm` a pneumatic
+arm of two sections with draw wires (ASU-RISE-Lab/4-chamber-softarm-control). Errors are on contiguous blocks
+of rows that took no part in the fit.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from benchmarks.accuracy.foreign_logs import read_asu, read_trunk
-from benchmarks.accuracy.response import fit_response
 from calib.fit.blocks import held_out_blocks
 from calib.fit.lines import fit_line
 from calib.fit.network import fit_network
@@ -28,7 +27,9 @@ SEEDS = (0, 1, 2)
 
 
 def measure(data: Path) -> dict[str, Any]:
-    """Measure errors [mm] of calibration on public logs of real arms.
+    """How well do calibrated lines and the sim-to-real network predict logs of real arms?
+
+    Errors are in mm.
 
     Args:
         data: folder with `asl_trunk` and `asu_softarm`.
@@ -38,7 +39,6 @@ def measure(data: Path) -> dict[str, Any]:
     """
     return {
         "draw wires to section length, RMS": {name: wires(data, name) for name in ASU_LOGS},
-        "pressures to section length, RMS": {name: sections(data, name) for name in ASU_LOGS},
         "trunk, 3D RMSE": {
             **{f"_1, seed {seed}": trunk_errors(data, "1", _blocks(seed)) for seed in SEEDS},
             "_11, last fifth": trunk_errors(data, "11", lambda n: np.arange(n) >= 0.8 * n),
@@ -55,15 +55,6 @@ def wires(data: Path, name: str) -> dict[str, float]:
     rows = {"fresh rows": log.fresh, "fresh rows at rest": log.fresh & still}
     fits = {kind: fit_line(wire_m[chosen, None], length_m[chosen, None]) for kind, chosen in rows.items()}
     return {kind: 1e3 * float(fit.held_out_rms[0]) for kind, fit in fits.items()}
-
-
-def sections(data: Path, name: str) -> dict[str, float]:
-    """Return errors from section 1's pressures to its length, of a line and of the response in time."""
-    log = read_asu(data / ASU_LOGS[name])
-    length_m = log.section_m[log.fresh]
-    fit = fit_response(log.time_s[log.fresh], log.pressure_kpa[log.fresh, :3], length_m)
-    predictions = {"line": fit.line_held_out_m, "response": fit.held_out_m}
-    return {kind: 1e3 * float(np.sqrt(np.mean((x - length_m) ** 2))) for kind, x in predictions.items()}
 
 
 def still_rows(time_s: np.ndarray, x: np.ndarray) -> np.ndarray:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any
 
 import numpy as np
 
 from benchmarks.accuracy.arms import accuracy_of
-from benchmarks.harness.common import target
+from benchmarks.harness.common import grouped, target
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.policy.file import load_policy
 
@@ -25,29 +25,13 @@ WITHIN_MM, AROUND_S = 4.0, 20.0  # target: mean error [mm] on a circle that take
 STOPPING = {"mean [mm]": "translation_mm", "largest [mm]": "max_mm", "seconds": "seconds"}
 
 
-class _Chosen(NamedTuple):
-    """A policy and its arm."""
-
-    trained: str  # "at rest" or "in motion"
-    arm: str
-    file: Path
-
-    @classmethod
-    def of(cls, text: str) -> Self:
-        """Read ARM=FILE."""
-        arm, separator, file = text.partition("=")
-        if not separator:
-            raise InputError(f"--policies: got {text}, expected ARM=FILE, such as twin:0=policy.npz")
-        return cls("in motion" if load_policy(file).action_s else "at rest", arm, Path(file))
-
-
 def measure(
     policies: tuple[str, ...],
     seconds: tuple[float, ...] = (10.0, 20.0, 40.0),
     points: int = 80,
     stops: int = 40,
 ) -> dict[str, Any]:
-    """Follow a circle in time, and stop by stop, with policies for twins.
+    """How far is the tip off the circle in time and with stops, trained at rest and in motion?
 
     Args:
         policies: ARM=FILE of each, such as twin:0=runs/mine/policy.npz, as `python -m train export` wrote it
@@ -58,32 +42,48 @@ def measure(
     Raises:
         InputError: there are no policies, one cannot be measured, or means would be of different arms.
     """
-    if not policies:
-        raise InputError("--policies: got none, expected ARM=FILE of each policy")
-    chosen = [_Chosen.of(text) for text in policies]
-    arms = {of: sorted(each.arm for each in chosen if each.trained == of) for of in ("at rest", "in motion")}
-    if all(arms.values()) and arms["at rest"] != arms["in motion"]:
-        got = "; ".join(f"{of} {', '.join(names)}" for of, names in arms.items())
-        raise InputError(f"--policies: got {got}, expected the same arms of both, since means are compared")
     in_time, stopping = [], []
+    chosen = _chosen(policies)
     with tempfile.TemporaryDirectory() as folder:
-        for trained, arm, policy in chosen:
-            told = {"trained": trained, "arm": arm, "policy": str(policy)}
+        for told in chosen:
+            # In time, at each pace.
             for duration in seconds:
-                found = _measured(Path(folder), policy, arm, "--points", points, "--seconds", duration)
-                in_time.append({**told, "once around [s]": duration, **_named(IN_TIME, found)})
-            found = _measured(Path(folder), policy, arm, "--points", stops)
-            stopping.append({**told, **_named(STOPPING, found)})
-    means = {
-        "means in time": means_over(in_time, ("trained", "once around [s]"), IN_TIME),
-        "means stop by stop": means_over(stopping, ("trained",), STOPPING),
-    }
+                found = _measured(Path(folder), told, "--points", points, "--seconds", duration)
+                figures = {name: found[key] for name, key in IN_TIME.items()}
+                in_time.append({**told, "once around [s]": duration, **figures})
+            # Stop by stop.
+            found = _measured(Path(folder), told, "--points", stops)
+            stopping.append({**told, **{name: found[key] for name, key in STOPPING.items()}})
+    means_in_time = means_over(in_time, ("trained", "once around [s]"), IN_TIME)
     return {
-        "targets": targets(means["means in time"]),
-        **means,
+        "targets": targets(means_in_time),
+        "means in time": means_in_time,
+        "means stop by stop": means_over(stopping, ("trained",), STOPPING),
         "in time": in_time,
         "stop by stop": stopping,
     }
+
+
+def _chosen(policies: Sequence[str]) -> list[dict[str, str]]:
+    """Return how each policy was trained, its arm and its file.
+
+    Raises:
+        InputError: there are none, one is no ARM=FILE, or arms at rest and in motion differ.
+    """
+    if not policies:
+        raise InputError("--policies: got none, expected ARM=FILE of each policy")
+    chosen, arms = [], {"at rest": [], "in motion": []}
+    for text in policies:
+        arm, separator, file = text.partition("=")
+        if not separator:
+            raise InputError(f"--policies: got {text}, expected ARM=FILE, such as twin:0=policy.npz")
+        trained = "in motion" if load_policy(file).action_s else "at rest"
+        chosen.append({"trained": trained, "arm": arm, "policy": file})
+        arms[trained].append(arm)
+    if all(arms.values()) and sorted(arms["at rest"]) != sorted(arms["in motion"]):
+        got = "; ".join(f"{trained} {', '.join(sorted(names))}" for trained, names in arms.items())
+        raise InputError(f"--policies: got {got}, expected the same arms of both, since means are compared")
+    return chosen
 
 
 def targets(means: Sequence[dict[str, Any]]) -> list[dict[str, str]]:
@@ -103,30 +103,23 @@ def means_over(
     rows: Sequence[dict[str, Any]], keys: Sequence[str], names: Iterable[str]
 ) -> list[dict[str, Any]]:
     """Return a row of means for each combination of the keys' values, in the order of their first rows."""
-    groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
-    for row in rows:
-        groups.setdefault(tuple(row[key] for key in keys), []).append(row)
     return [
         dict(zip(keys, values, strict=True))
         | {"policies": len(group)}
         | {name: float(np.mean([row[name] for row in group])) for name in names}
-        for values, group in groups.items()
+        for values, group in grouped(rows, keys).items()
     ]
 
 
-def _measured(folder: Path, policy: Path, arm: str, *options: Any) -> dict[str, Any]:
+def _measured(folder: Path, told: dict[str, str], *options: Any) -> dict[str, Any]:
     """Return the figures of one measurement.
 
     Raises:
         InputError: a goal of it was refused or not measured.
     """
-    out = Path(tempfile.mkdtemp(dir=folder)) / "measured"
-    found = accuracy_of(policy, arm, out, *options)
+    out, arm, policy = Path(tempfile.mkdtemp(dir=folder)) / "measured", told["arm"], told["policy"]
+    found = accuracy_of(Path(policy), arm, out, *options)
     n_measured, n_goals = found["measured"], found["points"]
     if "way_mm" not in found and n_measured < n_goals:
         raise InputError(f"--policies: {arm}={policy}: got {n_measured} of {n_goals} goals, expected all")
     return found
-
-
-def _named(names: dict[str, str], found: dict[str, Any]) -> dict[str, Any]:
-    return {name: found[key] for name, key in names.items()}

@@ -1,8 +1,8 @@
-"""Poses at random against planned ones: what a calibration knows of an arm of other physics, and S2R's error.
+"""Calibrations of a rod, an arm of other physics, by random poses and by planned ones.
 
 Both calibrations of an arm share their first poses, which are random. The others are random, or chosen by
 `calib.plan` in rounds, each from the calibration before. S2R is judged on random poses that neither has seen.
-Rods are logged at rest without the time between.
+Rods are logged at rest, without the motion from pose to pose.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from mjx_softarm.spec import ArmSpec
 from mjx_softarm.twin.instruments import S2R_SESSION
 from mjx_softarm.twin.rod_twin import RodTwin
 
-N_FRAMES = 50  # that are averaged: a second
+N_FRAMES = 50  # averaged frames: a second
 TEST_SEED = 77
 
 
 def measure(
     rods: cli.Integers = (0, 1), poses: int = 500, first: int = 100, rounds: int = 1, tests: int = 300
 ) -> dict[str, Any]:
-    """Compare calibrations by random and by planned poses, on rods.
+    """Do planned poses calibrate an arm better than random ones?
 
     Args:
         rods: seeds of the rod twins
@@ -45,12 +45,15 @@ def measure(
 
 
 def _compare(seed: int, poses: int, first: int, rounds: int, tests: int) -> dict[str, Any]:
+    # The rod, and random poses that judge.
     spec = ArmSpec.default()
     arm = RodTwin(seed, spec, session=S2R_SESSION)
     judge = log_at_rest(arm, random_pressures(spec, tests, TEST_SEED))
+    # By random poses.
     pressure_kpa = random_pressures(spec, poses, seed)
     random = _figures(calibrate([log_at_rest(arm, pressure_kpa)], spec), judge)
     print(f"rod {seed}: random {random}", flush=True)
+    # By the first of them, and planned ones.
     logs = [log_at_rest(arm, pressure_kpa[:first])]
     for count in np.diff(np.linspace(first, poses, rounds + 1).round().astype(int)):
         known = calibrate(logs, spec)
@@ -86,7 +89,8 @@ def log_at_rest(arm: RodTwin, pressure_kpa: np.ndarray) -> Log:
 
 
 def _figures(calibration: Calibration, judge: Log) -> dict[str, Any]:
-    """Return what a calibration says of itself, and the errors of S2R at poses that it has not seen."""
+    """Return figures of a calibration's report, and the errors of S2R at poses that it has not seen."""
+    # Simulate the poses that judge, and correct them by the network.
     spec = calibration.spec
     parts = {section.title: section for section in calibration.sections}
     chambers, network = parts["Chambers"].data, parts["Sim-to-real network"].data
@@ -95,6 +99,7 @@ def _figures(calibration: Calibration, judge: Log) -> dict[str, Any]:
     real = pose_from_frame(poses.tip_m, poses.tip_rotation)
     pose, spring_m, real = (x[simulated.valid] for x in (simulated.pose, simulated.spring_m, real))
     corrected = pose if calibration.s2r is None else correct(calibration.s2r, pose, spring_m)
+    # Compare both with the measured poses.
     before, after = pose_errors(pose, real), pose_errors(corrected, real)
     return {
         "unknown directions": len(chambers["weak"]),

@@ -1,4 +1,4 @@
-"""Shared parts of the benchmarks: the machine, memory, targets, tables, and where results go.
+"""Shared parts of the benchmarks: the machine, targets, tables, and where results go.
 
 Figures are nested dictionaries of plain values, made for JSON. `show` prints any of them: a list of flat
 dictionaries becomes a table with their keys as its head, other values become a table of names and values.
@@ -9,9 +9,8 @@ from __future__ import annotations
 import os
 import platform
 import re
-import resource
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -59,18 +58,6 @@ def mesh_of_cores(n_arms: int) -> Mesh | None:
     return mesh_of(str(n)) if jax.default_backend() == "cpu" else None
 
 
-def peak_memory() -> dict[str, int]:
-    """Return the most memory [MB] that this process has needed: on the device if it tells, else resident."""
-    on_device = (jax.local_devices()[0].memory_stats() or {}).get("peak_bytes_in_use")
-    if on_device is not None:
-        return {"peak_device_mb": round(on_device / 1e6)}
-    status = Path("/proc/self/status")
-    if status.exists():  # getrusage would give the parent's, where that is larger
-        line = next(line for line in status.read_text("utf-8").splitlines() if line.startswith("VmHWM:"))
-        return {"peak_rss_mb": round(1024 * int(line.split()[1]) / 1e6)}
-    return {"peak_rss_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6)}  # bytes on macOS
-
-
 def target(text: str, measured: str, met: bool | None) -> dict[str, str]:
     """Return a row for a target; if `met` is None it could not be measured, and `measured` says why."""
     return {"target": text, "measured": measured, "verdict": VERDICT[met]}
@@ -81,6 +68,16 @@ def difference(found: Mapping[str, Any], expected: Mapping[str, Any]) -> str:
     names = [name for name in expected if found.get(name) != expected[name]]
     got, asked = (", ".join(f"{name} {values.get(name)}" for name in names) for values in (found, expected))
     return f"got {got}, expected {asked}" if names else ""
+
+
+def grouped(
+    rows: Iterable[Mapping[str, Any]], keys: Sequence[str]
+) -> dict[tuple[Any, ...], list[Mapping[str, Any]]]:
+    """Return rows by their values of some keys, in the order of the first row of each group."""
+    groups: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault(tuple(row[key] for key in keys), []).append(row)
+    return groups
 
 
 def status_of(figures: Mapping[str, Any]) -> int:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from benchmarks.harness.common import grouped
 from benchmarks.paper.engine import Settings, load_arrays
 from benchmarks.paper.kinds import Trial, learned_run
 from benchmarks.paper.measure import TrialOutcome, figures
@@ -132,9 +133,7 @@ def spread(values: Sequence[float]) -> dict[str, float]:
 
 def spreads(table: Sequence[Row]) -> list[dict[str, Any]]:
     """Return the spreads of each kind and variant over its runs, with the paper's numbers if it has any."""
-    groups: dict[tuple[str, int, str], list[Row]] = {}
-    for row in table:
-        groups.setdefault((row["kind"], row["load_g"], row["variant"]), []).append(row)
+    groups = grouped(table, ("kind", "load_g", "variant"))
     return [
         {
             "kind": kind,

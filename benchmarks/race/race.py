@@ -64,7 +64,7 @@ def race(
     only: Annotated[tuple[str, ...], cli.listed(_names, "NAME,NAME,...")] = CONTESTANTS,
     out: cli.MaybePath = None,
 ) -> int:
-    """Measure time and env steps to a tip error against the peers, half an hour for each seed.
+    """How long does learning take to a tip error, beside SBX and sb3-contrib? Half an hour a seed.
 
     Args:
         seeds: of training

@@ -19,7 +19,7 @@ TARGET_MM = 5
 FIRST = "ours-quick"
 
 
-class Target(NamedTuple):
+class PeerTarget(NamedTuple):
     """A peer's wall time to TARGET_MM, as a multiple of that of one of ours."""
 
     peer: str
@@ -28,9 +28,9 @@ class Target(NamedTuple):
 
 
 TARGETS = (
-    Target("sbx-hindsight", 5.0),
-    Target("sb3-contrib-hindsight", 15.0),
-    Target("sbx-hindsight", 20.0, "ours-analytic"),
+    PeerTarget("sbx-hindsight", 5.0),
+    PeerTarget("sb3-contrib-hindsight", 15.0),
+    PeerTarget("sbx-hindsight", 20.0, "ours-analytic"),
 )
 
 Result = Mapping[str, Any]  # of a contestant with a seed
@@ -85,7 +85,7 @@ def _row(result: Result, axis: str) -> dict[str, Any]:
     return row | {"best_mm": round(min(map(median_mm, points)), 2), "in_all": round(last)}
 
 
-def judge(wanted: Target, results: Sequence[Result]) -> dict[str, str]:
+def judge(wanted: PeerTarget, results: Sequence[Result]) -> dict[str, str]:
     """Judge a target: how many times our wall time a peer takes, median over seeds.
 
     A peer that was stopped before the level counts with the time that it had, which may show nothing.

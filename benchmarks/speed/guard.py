@@ -5,9 +5,9 @@
     python -m benchmarks.speed.guard      the worker: one process of a measurement
 
 A cost is the least time of some work over the least time of matrix products in the same process, because a
-disturbance only adds. A comparison takes the median of three processes. So does the tolerance: it is twice
-the largest distance of a median of three of the baseline's five from the median of all, and at least a tenth;
-a baseline with a tolerance above a quarter is refused. A loss of parallelism is not seen.
+disturbance only adds. A comparison takes the median of three processes. The baseline has five; its tolerance
+is twice the largest distance of a median of three of them from the median of all, and at least a tenth. A
+baseline with a tolerance above a quarter is refused. A loss of parallelism is not seen.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ Costs = Mapping[str, float]  # of one process, by the name of the work
 
 
 def main(store: bool = False) -> int:
-    """Compare speed with a stored baseline, in four minutes.
+    """Is anything slower than the stored baseline of this kind of machine? Takes four minutes.
 
     Exit status: 1 if something is slower, 2 without a result.
 
@@ -54,6 +54,7 @@ def main(store: bool = False) -> int:
     Raises:
         InputError: there is no baseline, a process failed, or the baseline is too uncertain to be stored.
     """
+    # The baseline of this kind of machine.
     kind, kinds = cpu_kind(), json.loads(FILE.read_text("utf-8"))["kinds"] if FILE.exists() else {}
     stored = kinds.get(kind, {})
     if not store and stored.get("sizes") != SIZES:
@@ -62,10 +63,12 @@ def main(store: bool = False) -> int:
         samples = [process_costs() for _ in range(N_STORED if store else N_PROCESSES)]
     except WorkerError as error:
         raise InputError(error.reason) from error
+    # Compare with it.
     if not store:
         rows = compare(stored["costs"], samples)
         show({"costs": rows}, f"guard, {kind}, baseline of commit {stored['commit']}")
         return WORSE if any(row["verdict"] == "WORSE" for row in rows) else 0
+    # Or store a new one, if it is certain enough.
     costs = baseline_of(samples)
     show({"costs": costs}, f"baseline of {kind}")
     if loose := [name for name, row in costs.items() if row["tolerance"] > MOST_TOLERANCE]:
@@ -111,7 +114,8 @@ def compare(baseline: Mapping[str, Mapping[str, Any]], samples: Sequence[Costs])
 
 
 def prepare() -> tuple[Facts, Callable[[], Facts]]:
-    """Compile everything in the worker; return seconds of compiling, and a function for those of the rest."""
+    """Compile in the worker; return the seconds of compiling, and a function that measures the other work."""
+    # A training job in one process, without a cache of compiled programs.
     jax.config.update("jax_platforms", "cpu")
     jax.config.update("jax_enable_compilation_cache", False)
     env, n_arms, n_steps = ReachEnv(config=EnvConfig(n_poses=1024)), SIZES["n_arms"], SIZES["n_env_steps"]
@@ -125,6 +129,7 @@ def prepare() -> tuple[Facts, Callable[[], Facts]]:
         jax.clear_caches()
         epochs.append(job.epoch.lower(states[0]).compile())
 
+    # Compile its epoch, and prepare the other work.
     compiling_s = min(_seconds(compile_epoch) for _ in range(SIZES["n_compiles"]))
     matrix = np.random.default_rng(0).normal(size=(SIZES["n_rows"],) * 2).astype(np.float32)
     solve, references = settle_function(env.spec), random_references(env.spec, n_arms).astype(np.float32)
@@ -133,13 +138,14 @@ def prepare() -> tuple[Facts, Callable[[], Facts]]:
         "settle": lambda: [solve(references) for _ in range(SIZES["n_settles"])],
         "epoch": lambda: states.append(epochs[0](states.pop())[0]) or states,
     }
+    # The first call of each does not count.
     for call in work.values():
         jax.block_until_ready(call())
     return {"compile": compiling_s}, lambda: {name: _seconds(call) for name, call in work.items()}
 
 
 def _seconds(call: Callable[[], Any]) -> float:
-    """Return the processor's seconds of a call, in which waiting for other programs does not count."""
+    """Return the processor time [s] of a call; waiting for other programs does not count."""
     start = time.process_time()
     jax.block_until_ready(call())
     return time.process_time() - start

@@ -1,12 +1,10 @@
 """Worker: this project's arms, compiled, on all cores.
 
-    python -m benchmarks.speed.jax_worker steps ENGINE MODE N_ARMS LINKS     environment steps
+    python -m benchmarks.speed.jax_worker steps ENGINE MODE N_ARMS           environment steps
     python -m benchmarks.speed.jax_worker settle ENGINE REFERENCES LINKS     settling alone
-    python -m benchmarks.speed.jax_worker start CACHE                        start of a training
 
-LINKS is a number of links per section, REFERENCES an npz file with references (n, n_chambers) [m] by name.
-CACHE is the folder of the compilation cache. The first two tell seconds to trace and to compile without a
-cache, and where the arms settled.
+REFERENCES is an npy file with references (n, n_chambers) [m], LINKS a number of links per section. Both tell
+where the arms settled.
 """
 
 from __future__ import annotations
@@ -19,9 +17,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.experimental.compilation_cache import compilation_cache
 
-from benchmarks.harness.common import mesh_of_cores, peak_memory
+from benchmarks.harness.common import mesh_of_cores
 from benchmarks.harness.rounds import Facts, serve
 from benchmarks.speed.truth import TOLD, settle_function
 from mjx_softarm._support import draws, xla
@@ -29,44 +26,28 @@ from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.env.gym import EPISODE_LENGTH
 from mjx_softarm.env.vector import VectorEnv
 from mjx_softarm.spec import ArmSpec
-from train.agent.hindsight_tqc import HindsightTQC
 from train.epoch.devices import split
-from train.epoch.job import Job
-from train.presets import PRESETS
 
 N_STEPS = {"quasistatic": 8, "dynamic": 1}  # environment steps of each arm in a call
 N_POSES = 1024
 N_TOLD = 256  # arms whose tips are told
-ROUND_S, SET_S = 1.0, 0.5  # least time of a round of steps, and of a round of each set of references
+ROUND_S = 1.0  # least time of a round
 
 
-def compile_timed(function: Callable, *arguments: Any) -> tuple[Callable, Facts]:
-    """Compile a jitted function without a cache; return the compiled function, and seconds by name."""
-    compilation_cache.reset_cache()
-    jax.config.update("jax_enable_compilation_cache", False)
-    jax.clear_caches()  # a part may have been traced for something else
-    start = time.perf_counter()
-    lowered = function.lower(*arguments)
-    traced = time.perf_counter()
-    compiled = lowered.compile()
-    times = {"tracing_s": traced - start, "compiling_s": time.perf_counter() - traced}
-    return compiled, {name: round(value, 2) for name, value in times.items()}
-
-
-def repeats_for(call: Callable[[], Any], round_s: float) -> int:
-    """Return the number of calls that take `round_s`; the first call, which may be slow, does not count."""
+def repeats_for(call: Callable[[], Any]) -> int:
+    """Return the number of calls that take `ROUND_S`; a first call, which compiles, does not count."""
     jax.block_until_ready(call())
     start = time.perf_counter()
     jax.block_until_ready(call())
-    return max(1, round(round_s / (time.perf_counter() - start)))
+    return max(1, round(ROUND_S / (time.perf_counter() - start)))
 
 
-def steps(engine: Any, mode: Any, n_arms: str, links: str) -> tuple[Facts, Callable[[], Facts]]:
+def steps(engine: Any, mode: Any, n_arms: str) -> tuple[Facts, Callable[[], Facts]]:
     """Prepare a rollout of n arms with random actions, which saturate about half of the chambers."""
     n, mesh = int(n_arms), mesh_of_cores(int(n_arms))
-    spec = ArmSpec.default().replace(structure={"links_per_section": int(links)})
-    xla.enable_compilation_cache()  # for the pool of poses, which is not measured
-    env = ReachEnv(spec, EnvConfig(engine=engine, mode=mode, n_poses=N_POSES))
+    # The arms, and their pool of poses; compilation is not measured.
+    xla.enable_compilation_cache()
+    env = ReachEnv(config=EnvConfig(engine=engine, mode=mode, n_poses=N_POSES))
     arms = VectorEnv(env, n, EPISODE_LENGTH, mesh)
 
     def rollout(state, key):
@@ -81,12 +62,15 @@ def steps(engine: Any, mode: Any, n_arms: str, links: str) -> tuple[Facts, Calla
             return jax.lax.scan(step, state, jax.random.split(key, N_STEPS[mode]))
 
     state, key = xla.jit(arms.reset, env.uses_mjx)(jax.random.PRNGKey(0)), jax.random.PRNGKey(1)
-    compiled, facts = compile_timed(xla.jit(rollout, env.uses_mjx), state, key)
-    repeats = repeats_for(lambda: compiled(state, key), ROUND_S)
+    # Choose how often the rollout is called in a round.
+    compiled = xla.jit(rollout, env.uses_mjx)
+    repeats = repeats_for(lambda: compiled(state, key))
+    # Tell where the arms of the first steps settled.
+    facts: Facts = {}
     if mode == "quasistatic":
         _, (*_, ends) = compiled(state, key)
         rows = (np.asarray(x, float).reshape(-1, x.shape[-1])[:N_TOLD] for x in ends)  # first step first
-        facts |= {name: x.tolist() for name, x in zip(TOLD, rows, strict=True)}
+        facts = {name: x.tolist() for name, x in zip(TOLD, rows, strict=True)}
 
     def work() -> Facts:
         start = time.perf_counter()
@@ -98,48 +82,33 @@ def steps(engine: Any, mode: Any, n_arms: str, links: str) -> tuple[Facts, Calla
             "env_steps_per_s": repeats * N_STEPS[mode] * n / spent,
             "unsettled": int(unsettled.sum()),
             "saturated_chambers": round(float(np.mean(saturated)), 2),
-            **peak_memory(),
         }
 
     return facts, work
 
 
 def settle(engine: str, references: str, links: str) -> tuple[Facts, Callable[[], Facts]]:
-    """Prepare one compiled function that settles each set of references."""
+    """Prepare a compiled function that settles references."""
     spec = ArmSpec.default().replace(structure={"links_per_section": int(links)})
-    with np.load(references) as stored:
-        sets = {name: stored[name].astype(np.float32) for name in stored.files}
-    first = next(iter(sets))
-    mesh = mesh_of_cores(len(sets[first]))
-    sets = jax.device_put(sets, split(mesh)) if mesh else jax.tree.map(jnp.asarray, sets)
-    function, facts = compile_timed(settle_function(spec, engine, mesh=mesh), sets[first])
-    repeats = repeats_for(lambda: function(sets[first]), SET_S)
+    reference_m = np.load(references).astype(np.float32)
+    mesh = mesh_of_cores(len(reference_m))
+    placed = jax.device_put(reference_m, split(mesh)) if mesh else jnp.asarray(reference_m)
+    function = settle_function(spec, engine, mesh=mesh)
+    repeats = repeats_for(lambda: function(placed))
 
     def work() -> Facts:
-        told = {}
-        for name, reference in sets.items():
-            start = time.perf_counter()
-            for _ in range(repeats):
-                found = function(reference)
-            found = jax.block_until_ready(found)
-            told[name] = {
-                "solves_per_s": repeats * len(reference) / (time.perf_counter() - start),
-                "tip_mm": (1e3 * np.asarray(found.tip_position_m, float)).tolist(),
-                "unsettled": int(np.sum(~np.asarray(found.settled))),
-            }
-        return told
+        start = time.perf_counter()
+        for _ in range(repeats):
+            found = function(placed)
+        found = jax.block_until_ready(found)
+        return {
+            "solves_per_s": repeats * len(reference_m) / (time.perf_counter() - start),
+            "tip_mm": (1e3 * np.asarray(found.tip_position_m, float)).tolist(),
+            "unsettled": int(np.sum(~np.asarray(found.settled))),
+        }
 
-    return facts, work
-
-
-def start(cache: str) -> tuple[Facts, Callable[[], Facts]]:
-    """Start a training up to a compiled epoch."""
-    xla.enable_compilation_cache(cache)
-    config, env = PRESETS["quick"], ReachEnv()
-    job = Job(config, env, HindsightTQC(config, env))
-    job.start(lambda: job.init(jax.random.PRNGKey(0)))
-    return {}, dict
+    return {}, work
 
 
 if __name__ == "__main__":
-    serve(lambda: {"steps": steps, "settle": settle, "start": start}[sys.argv[1]](*sys.argv[2:]))
+    serve(lambda: {"steps": steps, "settle": settle}[sys.argv[1]](*sys.argv[2:]))

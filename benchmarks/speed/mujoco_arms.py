@@ -1,12 +1,12 @@
 """Arms without this project's solver: C MuJoCo's threaded rollout, stepped in time until each arm settles.
 
-An environment step holds the references until no spring has moved by more than `REST_M` within `REST_S`,
-under the control law of `ReachEnv` at its rate and with the arm's own damping. Task, observation and reward
-are its own, too. JAX is not imported, so that processes start fast and stay small.
+An environment step holds the references until no spring has moved by more than `REST_M` within `REST_S`.
+Control law, rate, task, observation and reward are those of `ReachEnv`; the damping is the arm's own. JAX is
+not imported, so that processes start fast and stay small.
 
-That takes seconds of simulated time for each environment step: the arm swings until its damping has stopped
-it, and the law's integral action fills or empties a chamber no faster than its gains allow. Stopping earlier
-is cheaper but ends further from the equilibrium, so each rate comes with the error of where the arms stopped.
+An environment step takes seconds of simulated time: the arm swings until its damping has stopped it, and the
+law's gains limit how fast a chamber fills. Stopping earlier is cheaper but ends further from the equilibrium.
+So each rate has the error of the arms' resting place beside it.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class RestDetector:
         return done
 
 
-class Settled(NamedTuple):
+class SteppedRest(NamedTuple):
     """Arms after holding references."""
 
     pose: np.ndarray  # (n, 6) [mm, deg]
@@ -115,7 +115,7 @@ class SteppedArms:
             self.length_m[index] = _springs(data)
         self._law[:, arms] = control.LawState.at_rest(pressure_kpa, self.length_m[arms])
 
-    def settle(self, reference_m: np.ndarray, rest_m: float = REST_M) -> Settled:
+    def settle(self, reference_m: np.ndarray, rest_m: float = REST_M) -> SteppedRest:
         """Hold references (n, n_chambers) until each arm rests.
 
         Springs are read as a rollout leaves them, one time step old.
@@ -136,7 +136,7 @@ class SteppedArms:
             pose = pose_from_frame(tip.xpos, tip.xmat.reshape(3, 3))[None]
         else:
             pose = pose_from_quaternion(self._tip[:, :3], self._tip[:, 3:])
-        return Settled(pose, pressure_kpa, n_physics)
+        return SteppedRest(pose, pressure_kpa, n_physics)
 
     def _step(self, arms: slice | np.ndarray, pressure_kpa: np.ndarray) -> None:
         """Hold pressures (k, n_chambers) of some arms for a control period, and read springs and tips."""
@@ -187,7 +187,7 @@ class SteppedReach:
         self.goal[arms], self.n_taken[arms] = self._pool["pose"][goal], 0
         return observe(self._pool["pose"][start], self.goal[arms], self._scale, self._reward)
 
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Settled]:
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, SteppedRest]:
         """Act with all arms (n, n_chambers): observations, rewards, reached, over, where they are."""
         reference_m = self.reference_m(action)
         end = self.arms.settle(reference_m)

@@ -4,8 +4,8 @@
     python -m benchmarks.speed.mujoco_worker rollout FOLDER N_THREADS      MuJoCo's own threaded rollout
     python -m benchmarks.speed.mujoco_worker settle REFERENCES LINKS       equilibria of references
 
-FOLDER is made by `write_arm`. REFERENCES is an npz file with references (n, n_chambers) [m] by name, of
-which the first `N_STEPPED` of each are taken. All tell where the arms stopped.
+FOLDER is made by `write_arm`. REFERENCES is an npy file with references (n, n_chambers) [m]; the first
+`N_STEPPED` of them are taken. All tell where the arms stopped.
 """
 
 from __future__ import annotations
@@ -92,28 +92,24 @@ def rollout(folder: str, n_threads: str) -> tuple[Facts, Callable[[], Facts]]:
 
 
 def settle(references: str, links: str) -> tuple[Facts, Callable[[], Facts]]:
-    """Prepare arms that go from straight to each set of references, on all cores."""
+    """Prepare arms that go from straight to their references, on all cores."""
     from benchmarks.harness.common import n_cores  # imports packages that a peer's environment lacks
 
     spec = ArmSpec.default().replace(structure={"links_per_section": int(links)})
-    with np.load(references) as stored:
-        sets = {name: stored[name][:N_STEPPED] for name in stored.files}
-    n = len(next(iter(sets.values())))
+    reference_m = np.load(references)[:N_STEPPED]
+    n = len(reference_m)
     arms = SteppedArms(sensed_model(spec), spec, n, n_cores())
     straight, empty = np.zeros((n, arms.model.nq)), np.zeros((n, spec.n_chambers))
 
     def work() -> Facts:
-        told = {}
-        for name, reference in sets.items():
-            start = time.perf_counter()
-            arms.place(np.ones(n, bool), straight, empty)
-            end = arms.settle(reference)
-            told[name] = {
-                "solves_per_s": n / (time.perf_counter() - start),
-                "tip_mm": end.pose[:, :3].tolist(),
-                "mean_simulated_s": round(end.physics_steps * arms.model.opt.timestep / n, 2),
-            }
-        return told
+        start = time.perf_counter()
+        arms.place(np.ones(n, bool), straight, empty)
+        end = arms.settle(reference_m)
+        return {
+            "solves_per_s": n / (time.perf_counter() - start),
+            "tip_mm": end.pose[:, :3].tolist(),
+            "mean_simulated_s": round(end.physics_steps * arms.model.opt.timestep / n, 2),
+        }
 
     return {}, work
 

@@ -1,4 +1,4 @@
-"""The true equilibrium, the settled arm's distance from it, and references with chosen saturation.
+"""The true equilibrium, the settled arm's distance from it, and random references.
 
 The truth is the solution in double precision; `tests/mechanics/test_settle.py` holds it against C MuJoCo.
 """
@@ -79,18 +79,7 @@ def told_error(spec: ArmSpec, told: Sequence[Mapping[str, Any]]) -> dict[str, fl
     return error_figures(tip_mm, true_rest(spec, reference_m))
 
 
-def random_references(spec: ArmSpec, n: int, spread: float = 1.0, seed: int = 0) -> np.ndarray:
-    """Return random spring lengths (n, n_chambers) [m], which saturate more chambers the wider they spread.
-
-    Args:
-        spec: the arm.
-        n: number of arms.
-        spread: 1 draws uniformly from all lengths that may be commanded, 0.5 from a range half as wide about
-            the length at rest.
-        seed: seed of the draw.
-    """
-    springs = spec.springs
-    length = np.random.default_rng(seed).uniform(
-        springs.length_min_m, springs.length_max_m, (n, spec.n_chambers)
-    )
-    return springs.rest_length_m + spread * (length - springs.rest_length_m)
+def random_references(spec: ArmSpec, n: int) -> np.ndarray:
+    """Return spring lengths (n, n_chambers) [m], uniform over those that may be commanded."""
+    low_m, high_m = spec.springs.length_min_m, spec.springs.length_max_m
+    return np.random.default_rng(0).uniform(low_m, high_m, (n, spec.n_chambers))

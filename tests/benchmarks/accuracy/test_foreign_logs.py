@@ -71,18 +71,9 @@ def test_real_motion_has_next_to_no_outliers():
 
 
 @real
-@pytest.mark.parametrize(
-    ("name", "wire_mm", "line_mm", "share"),
-    [
-        ("apr5", 0.62, 4.40, 0.4),
-        ("apr4", 0.25, 4.32, 0.75),
-    ],  # two of apr4's folds are 5 mm off
-)
-def test_real_sections(name, wire_mm, line_mm, share):
+@pytest.mark.parametrize(("name", "wire_mm"), [("apr5", 0.62), ("apr4", 0.25)])
+def test_real_draw_wires(name, wire_mm):
     assert logs.wires(DATA, name)["fresh rows at rest"] <= wire_mm
-    errors = logs.sections(DATA, name)
-    assert errors["line"] == pytest.approx(line_mm, rel=0.02)
-    assert errors["response"] < share * errors["line"]
 
 
 def asu_table(n=60):

@@ -1,11 +1,7 @@
-"""Tables of figures, targets, memory."""
+"""Tables of figures, and targets."""
 
 import io
 import json
-import os
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 from rich.console import Console
@@ -67,19 +63,3 @@ def test_a_missed_target_ends_with_status_1_and_its_file_is_there(met, status, m
     figures = {"mm": 2.0, "targets": [target("1 mm", "0.5 mm", True), target("less", "2 mm", met)]}
     assert benchmarks._finish("settle", figures) == status
     assert json.loads((tmp_path / "settle.json").read_text())["figures"] == figures
-
-
-MEMORY = """
-import numpy as np
-from benchmarks.harness.common import peak_memory
-before = peak_memory()["peak_rss_mb"]
-held = np.ones(50_000_000)
-print(peak_memory()["peak_rss_mb"] - before)
-"""
-
-
-def test_peak_memory_grows_by_what_is_held():
-    run = [sys.executable, "-c", MEMORY]
-    environment = {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(Path(__file__).parents[3])}
-    done = subprocess.run(run, env=environment, capture_output=True, text=True, check=True)
-    assert 200 < int(done.stdout) < 600  # of 400

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from benchmarks.race.summary import Target, crossing, judge, summarise
+from benchmarks.race.summary import PeerTarget, crossing, judge, summarise
 
 
 def result(name, *errors_mm, seed=0):
@@ -28,7 +28,7 @@ def failed(name):
 
 
 SBX, SB3 = "sbx-hindsight", "sb3-contrib-hindsight"
-TQC = {SBX: Target(SBX, 5.0), SB3: Target(SB3, 15.0)}
+TQC = {SBX: PeerTarget(SBX, 5.0), SB3: PeerTarget(SB3, 15.0)}
 
 
 def judged(peer, *results):
@@ -85,7 +85,7 @@ def test_ours_is_the_preset_that_the_target_names():
 
 
 def test_a_target_of_another_learner_looks_at_that_learner_alone():
-    wanted = Target(SBX, 10.0, "ours-analytic")
+    wanted = PeerTarget(SBX, 10.0, "ours-analytic")
     results = [result("ours-quick", 9.0, 4.0), result(SBX, *[9.0] * 14, 4.0)]
     assert judge(wanted, results)["measured"] == "not raced: ours-analytic, seed 0"
     row = judge(wanted, [*results, result("ours-analytic", 4.0)])

@@ -1,11 +1,10 @@
-"""The settling benchmark's parts: truth, saturation, the goal by hand."""
+"""The settling benchmark's parts: truth, errors, rows of methods."""
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from benchmarks.speed import settle
-from benchmarks.speed.settle import SPREADS, TARGET_ARMS, speed_target
 from benchmarks.speed.truth import (
     Truth,
     error_figures,
@@ -27,13 +26,6 @@ def truth(tip_mm, settled=None):
     return Truth(tip_mm, np.ones(len(tip_mm), bool) if settled is None else np.array(settled), 0.5)
 
 
-def test_references_that_reach_further_saturate_more_chambers_from_none_to_most():
-    shares = [true_rest(SPEC, random_references(SPEC, N, reach)).share_at_limit for reach in SPREADS]
-    assert (np.diff(shares) > 0.02).all()
-    assert shares[0] < 0.01 and shares[-1] > 0.55
-    assert 1.0 in SPREADS  # the row of each number of links
-
-
 def test_errors_are_distances_to_the_truth_without_the_arms_that_have_none():
     found = np.array([[3.0, 4.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]])
     errors = error_figures(found, truth(np.zeros((3, 3)), settled=[True, True, False]))
@@ -51,29 +43,25 @@ def test_the_error_of_what_a_program_told_is_that_of_its_tips():
     assert told_error(SPEC, [{"arms": 2}]) == {}
 
 
-@pytest.mark.parametrize(
-    "measured, failed, verdict, told",
-    [
-        ({128: (9_000, 0.1), 512: (10_000, 0.5)}, [], "met", "10,000 with 512 arms, 0.5 mm"),
-        ({128: (9_999, 0.1)}, [], "NOT MET", "9,999 with 128 arms, 0.1 mm"),
-        ({128: (12_000, 0.51), 512: (3, 0.1)}, [], "NOT MET", "12,000 with 128 arms, 0.51 mm"),
-        ({128: (12_000, 0.2)}, ["b: gone"], "met", "12,000 with 128 arms, 0.2 mm; b: gone"),
-        ({}, ["a: no memory", "b: gone"], "NOT MET", "a: no memory; b: gone"),
-    ],
-)
-def test_the_target_asks_for_speed_and_precision_at_once(measured, failed, verdict, told):
-    rows = [{"arms": n, "env_steps_per_s": rate, "p95_mm": mm} for n, (rate, mm) in measured.items()]
-    row = speed_target([*rows, *({"failed": why} for why in failed)])
-    assert row["verdict"] == verdict and row["measured"] == told
-    assert 1024 in TARGET_ARMS
+def test_each_method_has_a_row_whether_it_was_measured_or_not(monkeypatch):
+    asked = []
 
+    def take_turns(workers, n_rounds):
+        asked.append([worker._command[3:5] for worker in workers])
+        told = [{"solves_per_s": rate, "tip_mm": [[0.0, 0.0, 2.0]] * 3} for rate in (10.0, 30.0, 20.0)]
+        return {workers[0].name: told}, {worker.name: "no memory" for worker in workers[1:]}
 
-def test_more_iterations_come_closer(monkeypatch):
-    monkeypatch.setattr(settle, "ITERATIONS", (2, 8))
-    reference = random_references(SMALL, 8)
-    few, many = settle.over_iterations(SMALL, reference, true_rest(SMALL, reference))
-    assert (few["iterations"], many["iterations"]) == (2, 8)
-    assert many["median_mm"] < 0.5 < few["max_mm"]
+    monkeypatch.setattr(settle, "take_turns", take_turns)
+    monkeypatch.setattr(settle, "true_rest", lambda *_: truth(np.zeros((4, 3))))
+    monkeypatch.setattr(settle, "MOST_LINKS_MJX", 2)
+    monkeypatch.setattr(settle, "LINKS", (2, 3))
+    rows = settle.measure()["over_links"]
+    assert [len(programs) for programs in asked] == [3, 2]
+    chain, mjx, stepping = rows[:3]
+    assert chain["solves_per_s"] == 20.0 and chain["median_mm"] == 2.0
+    assert chain["share_at_limit"] == 0.5
+    assert mjx["failed"] == stepping["failed"] == "no memory"
+    assert [row.get("skipped") for row in rows[3:]] == [None, settle.NO_MJX, None]
 
 
 def test_spread_arms_settle_as_on_one_device():

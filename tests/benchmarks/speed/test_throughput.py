@@ -6,7 +6,9 @@ import sys
 import numpy as np
 import pytest
 
+from benchmarks.harness.peers import PeerError
 from benchmarks.harness.rounds import ROOT
+from benchmarks.speed import throughput
 from benchmarks.speed.mujoco_arms import (
     REST_S,
     RestDetector,
@@ -17,7 +19,7 @@ from benchmarks.speed.mujoco_arms import (
     write_arm,
 )
 from benchmarks.speed.mujoco_worker import Step, timed
-from benchmarks.speed.throughput import MOVING_COLUMNS, moving_row, over_rounds, points, side_by_side
+from benchmarks.speed.throughput import MOVING_COLUMNS, moving_row, over_rounds, side_by_side
 from benchmarks.speed.truth import error_figures, random_references, true_rest
 from mjx_softarm import ArmSpec
 from mjx_softarm.env import EnvConfig, ReachEnv
@@ -114,22 +116,35 @@ def test_the_stepped_arms_need_no_jax():
 
 def test_rates_are_medians_over_rounds_and_arrays_are_left_out():
     rounds = [
-        {"env_steps_per_s": rate, "peak_rss_mb": rate + 1, "tip_mm": [[0.0]]}
-        for rate in (300.0, 100.4, 200.0)
+        {"env_steps_per_s": rate, "unsettled": int(rate), "tip_mm": [[0.0]]} for rate in (300.0, 100.4, 200.0)
     ]
-    assert over_rounds(rounds) == {"env_steps_per_s": 200, "peak_rss_mb": 201.0}
+    assert over_rounds(rounds) == {"env_steps_per_s": 200, "unsettled": 200}
     assert over_rounds([{"env_steps_per_s": 5.678}]) == {"env_steps_per_s": 5.68}
 
 
-def test_everything_asked_for_is_measured():
-    cpu = [point for group in points(on_gpu=False) for point in group]
-    assert len(set(cpu)) == len(cpu)
-    for engine, mode in (("chain", "quasistatic"), ("mjx", "quasistatic"), ("mjx", "dynamic")):
-        arms = {n for e, m, n, links in cpu if (e, m, links) == (engine, mode, 4)}
-        assert {1, 1024} <= arms and max(arms) == 1024
-        measured = {links for e, m, n, links in cpu if (e, m, n) == (engine, mode, 128)}
-        assert measured == ({2, 4, 6, 8, 10} if engine == "chain" else {2, 4, 6})
-    assert {n for group in points(on_gpu=True) for *_, n, _ in group} >= {1, 8192, 32_768}
+def test_everything_asked_for_is_measured(monkeypatch):
+    asked = []
+
+    def take_turns(workers, n_rounds):
+        asked.append([worker.name for worker in workers])
+        told = [{"env_steps_per_s": rate} for rate in (100.0, 300.0, 200.0)]
+        return {worker.name: told for worker in workers[:-1]}, {workers[-1].name: "no memory"}
+
+    def peer_python(library):
+        raise PeerError(f"{library}: no network")
+
+    monkeypatch.setattr(throughput, "take_turns", take_turns)
+    monkeypatch.setattr(throughput, "peer_python", peer_python)
+    monkeypatch.setattr(throughput, "write_arm", lambda *_: None)
+    found = throughput.measure()
+    over_arms = {(row["engine"], row["mode"], row["arms"]): row for row in found["over_arms"]}
+    programs = [("chain", "quasistatic"), ("mjx", "quasistatic"), ("mjx", "dynamic")]
+    assert over_arms.keys() == {(*program, n) for program in programs for n in (1, 128, 1024)}
+    assert over_arms["chain", "quasistatic", 1]["env_steps_per_s"] == 200
+    assert over_arms["mjx", "dynamic", 1]["failed"] == "no memory"
+    assert found["side_by_side"][-2]["skipped"] == "sb3-contrib: no network"
+    assert [row["skipped"] for row in found["simulated_time"][2:]] == ["soromox: no network"] * 2
+    assert [len(names) for names in asked] == [3, 3, 3, 3, 2]
 
 
 def test_rates_are_told_as_multiples_of_the_processes_beside_the_paper_s():
@@ -158,7 +173,7 @@ def test_a_round_of_steps_has_its_rate_and_the_simulated_time_of_a_step(monkeypa
 
 
 def test_programs_in_motion_are_told_by_simulated_seconds_and_this_project_s_by_the_time_of_a_step():
-    ours = moving_row({"program": "mjx", "env_steps_per_s": 1000, "compiling_s": 3.0, "failed": None})
+    ours = moving_row({"program": "mjx", "env_steps_per_s": 1000, "failed": None})
     peer = moving_row({"program": "peer", "step_ms": 0.75, "arms": 8, "simulated_s_per_s": 20.5})
     c = moving_row(
         {"program": "C", "step_ms": 5.0, "arms": 64, "env_steps_per_s": 40, "simulated_s_per_s": 160}
