@@ -54,11 +54,12 @@ def _view(
     """Show an arm in the browser and steer it there; or replay logs; or follow a run, or show a calibration.
 
     Args:
-        logs: of `deploy run` and `record`, CSV or npz, side by side; or the folder of a run or a calibration
-        log: file for the log of the steered run, CSV or npz
-        demos: file for demonstrations, poses taken on the page for `train imitate`, CSV or npz
-        html: file to write the logs to, as a page that plays without a server
+        logs: logs of `deploy run` and `record`, CSV or npz, side by side; or the folder of a run or
+        calibration log: file for the log of the steered run, CSV or npz demos: file for demonstrations,
+        poses taken on the page for `train imitate`, CSV or npz html: file to write the logs to, as a page
+        that plays without a server
     """
+    # Check the options before anything is opened.
     try:
         import viser  # noqa: F401
     except ImportError as error:
@@ -67,12 +68,14 @@ def _view(
         ) from error
     for option, path in (("--log", log), ("--demos", demos), ("--html", html)):
         check_file(option, path)
+    # Show a folder's errors, or replay logs.
     if any(path.is_dir() for path in logs):
         return _errors(logs, html, at)
     if logs:
         return _replay(logs, ArmSpec.of(spec), html, at)
     if html is not None:
         raise InputError("--html: got no log, expected one or more, which are then written")
+    # Drive an arm.
     from mjx_softarm.view.live import live
     from mjx_softarm.view.page import Setup
 

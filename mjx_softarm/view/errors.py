@@ -1,4 +1,4 @@
-"""Errors of poses in space: those of a training run as it goes on, or of a calibration."""
+"""Errors of poses in space, of a training run in progress or of a calibration."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ import viser
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.logs.pose_pairs import POSES_FILE, PosePairs, read_pose_pairs
 from mjx_softarm.spec import ARM_FILE, ArmSpec
-from mjx_softarm.view.look import look_at
+from mjx_softarm.view.look import Limits, look_at
 from mjx_softarm.view.panel import css, plot
 from mjx_softarm.view.stage import SATURATED, Stage, set_the_scene
 
-CONFIG_FILE, METRICS_FILE = "config.json", "metrics.jsonl"  # of a run
+CONFIG_FILE, METRICS_FILE = "config.json", "metrics.jsonl"  # files of a run
 CURVES = {"evaluation/median_mm": ("median", "#1f6fb4"), "evaluation/circle_mean_mm": ("circle", "#e07b28")}
 REFRESH_S = 1.0
-SCALE_MM = np.array([1.0, 2.0, 5.0, 10.0, 20.0])  # errors of these colours, those between in between
+SCALE_MM = np.array([1.0, 2.0, 5.0, 10.0, 20.0])  # errors of the colours in SCALE; colours between are mixed
 SCALE = np.array([(33, 145, 80), (140, 190, 60), (240, 200, 60), (240, 130, 40), (200, 30, 60)])
 _POINT_M, _LINE_M, _WARNED = 0.005, 0.0015, SATURATED
 
@@ -29,7 +29,7 @@ def spec_of(folder: Path) -> ArmSpec:
     """Return the arm of a run's or a calibration's folder.
 
     Raises:
-        InputError: the folder is neither.
+        InputError: the folder is not of a run or a calibration.
         SpecError: its specification cannot be used.
     """
     if (folder / ARM_FILE).exists():
@@ -48,10 +48,10 @@ def colours(error_mm: np.ndarray) -> np.ndarray:
 
 
 class Errors:
-    """Poses at their targets, coloured by their errors, with lines to the targets; and learning curves.
+    """A page with poses coloured by their errors, lines to their targets, and learning curves.
 
     Raises:
-        InputError: the folder is neither a run's nor a calibration's.
+        InputError: the folder is not of a run or a calibration.
     """
 
     def __init__(self, server: viser.ViserServer, folder: Path):
@@ -60,7 +60,7 @@ class Errors:
         spec = spec_of(folder)
         set_the_scene(server, spec)
         straight_m = np.full(spec.n_chambers, spec.geometry.section_length_m)
-        Stage(server.scene, spec).show(look_at({"time_s": 0.0}, straight_m))
+        Stage(server.scene, spec, Limits.of(spec)).show(look_at({"time_s": 0.0}, straight_m))
         self._text = server.gui.add_html("", order=0.0)
         self._sets = server.gui.add_folder("Poses", order=0.5)
         self._boxes: dict[str, viser.GuiCheckboxHandle] = {}
@@ -68,7 +68,7 @@ class Errors:
             self._curve = plot(server.gui, "tip error [mm] over env steps", list(CURVES.values()))
 
     def refresh(self) -> None:
-        """Show what the folder holds now, if it is another than before."""
+        """Show the folder's files if they have changed."""
         if self._changed(POSES_FILE):
             sets = read_pose_pairs(self._folder)
             with self._server.atomic():
@@ -82,7 +82,7 @@ class Errors:
             self._show_curves()
 
     def _changed(self, name: str) -> bool:
-        """Return whether a file is there and was written since this was asked last."""
+        """Return whether a file exists and was written since the last call."""
         path = self._folder / name
         written = path.stat().st_mtime_ns if path.exists() else None
         before, self._read[name] = self._read.get(name), written
@@ -106,7 +106,7 @@ class Errors:
             scene.remove_by_name(f"/{name}/warned")
 
     def _add_box(self, name: str) -> None:
-        """Add a check box that shows a set; the nodes below its frame are as visible as that is."""
+        """Add a check box that shows a set, by the visibility of its frame."""
         node = self._server.scene.add_frame(f"/{name}", show_axes=False)
         with self._sets:
             box = self._server.gui.add_checkbox(name, True)
@@ -141,7 +141,7 @@ def _row(name: str, pairs: PosePairs) -> str:
 
 
 def _rows(path: Path) -> list[dict[str, Any]]:
-    """Return the lines of a file of metrics; the last may be half written."""
+    """Return the lines of a file of metrics; a last line that is not complete is left out."""
     rows = []
     for line in path.read_text("utf-8").splitlines():
         try:
@@ -155,7 +155,7 @@ def follow_errors(server: viser.ViserServer, folder: Path) -> NoReturn:
     """Serve the errors of a folder until Ctrl-C.
 
     Raises:
-        InputError: as of `Errors`, or its poses cannot be read.
+        InputError: the folder is not of a run or a calibration, or its poses cannot be read.
     """
     page = Errors(server, folder)
     while True:

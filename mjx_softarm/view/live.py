@@ -1,7 +1,7 @@
-"""The loop's side of the live view: an arm that is steered from a page, and tells it of each tick.
+"""The loop's side of the live view: a page steers the arm and shows each tick.
 
-The page's server is a process of its own. Nothing that a browser does, or does not, takes time from the loop:
-a tick leaves its numbers in the channel and takes the orders that are there.
+The page's server is a separate process, so that no browser takes time from the loop: a tick puts its numbers
+into a channel and takes the orders from it.
 """
 
 from __future__ import annotations
@@ -34,16 +34,16 @@ if TYPE_CHECKING:
     from mjx_softarm.view.page import Setup
 
 READY_S = 60.0  # for the server to start
-N_LINES = 4  # of what the loop told last, on the page
-_ROUNDS = 100  # of the circle, and of picking and placing
-_LIFT_MM, _OBJECT_KG = 25.0, 0.22  # an apple, as in the paper's pipe
+N_LINES = 4  # number of the loop's last messages on the page
+_ROUNDS = 100  # rounds of the circle, and of picking and placing
+_LIFT_MM, _OBJECT_KG = 25.0, 0.22  # height of a lift; mass of an apple, as in the paper's pipe
 
 
 class PagePilot:
     """Orders from a page.
 
-    After Stop or Vent goals are ignored until somebody asks for motion anew, so that a page that goes on
-    sending goals undoes neither.
+    After Stop or Vent, goals are ignored until a user asks for motion again. So a page that keeps sending
+    goals cannot undo a stop.
     """
 
     def __init__(self, end: End, arm: Any, controller: Controller, tell: Callable[[str], None]):
@@ -53,11 +53,11 @@ class PagePilot:
         self._doing, self._goal = "waits", np.full(6, np.nan)
         self.demonstrations, self._takes = TakenPoses(controller.policy), False
         spec = controller.policy.spec
-        # Before the first tick, since it takes longer than one
+        # Clamped before the first tick, because it takes longer than a tick.
         self._circle = _ROUNDS * [self._clamped(goal) for goal in circle_poses(spec)]
         self._place = _ROUNDS * [self._clamped(goal) for goal in place_poses(spec)]
-        self._loads: list[float | None] = []  # to hang to the gripper at the arrivals to come
-        # A simulated arm begins by itself: it hits nobody.
+        self._loads: list[float | None] = []  # payloads [kg] to attach at the next arrivals; None: no change
+        # A simulated arm begins by itself, because it can hit nobody.
         self._first: dict[str, Any] = {"circle": True} if hasattr(arm, "time_s") else {}
 
     def tell(self, text: str) -> None:
@@ -66,7 +66,8 @@ class PagePilot:
         self._said.append(text)
 
     def orders(self) -> Orders:
-        """Return what the page asked for since the last tick."""
+        """Return the page's orders since the last tick."""
+        # Take the page's messages.
         asked = self._first | self._end.take()
         self._first = {}
         self._count_pages(asked.get("pages", self._n_pages))
@@ -76,9 +77,11 @@ class PagePilot:
         if self._end.closed.is_set() and not self._lost:
             self._lost = asked["hold"] = True
             self.tell("the page's server has ended; an arm under pressure holds, Ctrl-C vents it")
+        # Stop and Vent come before all else, and disarm.
         if "vent" in asked or "hold" in asked:
             self._armed, self._goal, self._loads = False, np.full(6, np.nan), []
             return Orders(vent="vent" in asked, hold=True)
+        # Goals count once a user has asked for motion.
         self._armed |= not asked.keys().isdisjoint(("circle", "follow", "place"))
         if not asked.keys().isdisjoint(("circle", "follow", "goal")):
             self._loads = []
@@ -92,18 +95,18 @@ class PagePilot:
         return Orders()
 
     def look(self, state: LoopState, tick: Tick, row: dict[str, Any]) -> None:
-        """Show a tick on the page; grip or let go where the arm has arrived."""
+        """Show a tick on the page; attach or release the object at arrivals."""
         if tick.arrived and self._loads and (load_kg := self._loads.pop(0)) is not None:
             self._carry(load_kg)
         if self._takes:
             self.tell(self.demonstrations.take(state, row))
         self._doing = _doing(state, self._controller.policy.n_actions)
-        self._goal = self._goal if state.goal is None else state.goal  # shown until the arm is sent elsewhere
+        self._goal = self._goal if state.goal is None else state.goal  # the last goal stays visible
         look = look_at(row, state.belief.spring_m, self._payload_kg)._replace(goal=self._goal)
         self._end.put(look=look, doing=self._doing, armed=self._armed, lines=tuple(self._said))
 
     def _carry(self, payload_kg: float) -> None:
-        """Hang a mass to the gripper of an arm that can; another arm's gripper is its user's."""
+        """Hang a mass to the gripper of a simulated arm; the user loads a real gripper."""
         if hasattr(self._arm, "attach"):
             self._arm.attach(payload_kg)
             self._payload_kg = payload_kg
@@ -118,7 +121,7 @@ class PagePilot:
 
 
 def place_poses(spec: ArmSpec) -> np.ndarray:
-    """Return goals (6, 6) [mm, deg]: above, at and above a place, then one across the circle."""
+    """Return goals (6, 6) [mm, deg]: above, at and above one place, then the same across the circle."""
     sides = circle_poses(spec)[[0, 20]]
     lift = np.array([0.0, 0.0, _LIFT_MM, 0.0, 0.0, 0.0])
     return np.concatenate([[side + lift, side, side + lift] for side in sides])
@@ -144,12 +147,12 @@ def live(
     """Steer an arm from a page until something ends it; after a fault the page stays until Ctrl-C.
 
     Args:
-        setup: of the page.
+        setup: settings of the page.
         arm: an `ArmIO`.
         tell: takes a line for each arrival and each fault.
         ready: takes the page's address.
         save: writes the run's log.
-        save_demonstrations: writes the poses that were taken, if there are any.
+        save_demonstrations: writes the taken poses, if there are any.
 
     Raises:
         InputError: the page cannot be served.
@@ -157,6 +160,7 @@ def live(
     """
     from mjx_softarm.view.page import serve
 
+    # Start the page's server.
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     process = context.Process(target=serve, args=(theirs, setup), daemon=True)
@@ -164,6 +168,7 @@ def live(
     theirs.close()
     end, controller = End(ours), Controller.of(setup.policy)
     try:
+        # Steer the arm, then save its poses and tell the end.
         ready(_address(end))
         pilot = PagePilot(end, arm, controller, tell)
         arm = Paced(arm) if hasattr(arm, "time_s") else arm

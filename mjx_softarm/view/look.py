@@ -1,4 +1,4 @@
-"""One moment of an arm, from a tick of the loop or a row of a log, as all pictures of it are made from."""
+"""One moment of an arm, from a tick of the loop or a row of a log, for all pictures."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from mjx_softarm.spec import ArmSpec
 
 
 class Look(NamedTuple):
-    """Numbers to show; NaN where one is not known."""
+    """Numbers to show; NaN if unknown."""
 
     time_s: float
     spring_m: np.ndarray  # (n,)
     reference_m: np.ndarray  # (n,)
     pressure_kpa: np.ndarray  # (n,)
-    estimate: np.ndarray  # (6,) [mm, deg] tip pose believed in
+    estimate: np.ndarray  # (6,) [mm, deg] estimated tip pose
     goal: np.ndarray  # (6,) [mm, deg]
-    seen: np.ndarray  # (6,) [mm, deg] tip pose by motion capture
+    seen: np.ndarray  # (6,) [mm, deg] tip pose from motion capture
     marker_m: np.ndarray  # (k, 3)
     payload_kg: float = 0.0
 
     @property
     def tip(self) -> np.ndarray:
-        """Tip pose (6,) to draw the arm with: the believed one, or the seen one where none is logged."""
+        """Tip pose (6,) for the picture: the estimated pose, or the seen pose if no estimate is logged."""
         return self.estimate if np.isfinite(self.estimate).all() else self.seen
 
     def error_mm(self, pose: np.ndarray) -> float:
@@ -43,19 +43,22 @@ class Limits(NamedTuple):
 
     gains: Gains
     spring_m: tuple[float, float]
+    tolerance_m: float  # largest error of a spring that counts as on its reference
 
     @classmethod
-    def of(cls, spec: ArmSpec) -> Limits:
-        return cls(Gains.from_spec(spec), (spec.springs.length_min_m, spec.springs.length_max_m))
+    def of(cls, spec: ArmSpec, tolerance_m: float = TOLERANCE_M) -> Limits:
+        """Return an arm's limits, with the tolerance of its policy if that is known."""
+        lengths_m = spec.springs.length_min_m, spec.springs.length_max_m
+        return cls(Gains.from_spec(spec), lengths_m, tolerance_m)
 
     def saturated(self, look: Look) -> np.ndarray:
-        """Return which chambers (n,) are at a limit with their springs off the references."""
+        """Mask (n,) the chambers at a limit whose springs are off their references."""
         gains = self.gains.measured()
-        return saturated(look.pressure_kpa, look.reference_m, look.spring_m, gains, TOLERANCE_M)
+        return saturated(look.pressure_kpa, look.reference_m, look.spring_m, gains, self.tolerance_m)
 
 
 def look_at(row: Mapping[str, Any], spring_m: np.ndarray, payload_kg: float = 0.0) -> Look:
-    """Return the look of a row as the loop logs it, or as a log has it, with its springs (n,) [m]."""
+    """Return the look of a row of the loop or of a log, with spring lengths (n,) [m]."""
     unknown, pose = np.full(len(spring_m), np.nan), np.full(6, np.nan)
     seen = pose
     if "tip_m" in row and "tip_quaternion" in row and np.isfinite(row["tip_quaternion"]).all():
@@ -74,7 +77,7 @@ def look_at(row: Mapping[str, Any], spring_m: np.ndarray, payload_kg: float = 0.
 
 
 def looks(log: Log, sensor: Sensor) -> Callable[[int], Look]:
-    """Return what makes the look of each row of a log.
+    """Return a function from the rows of a log to their looks.
 
     Raises:
         LogError: the log has neither readings of this sensor nor spring lengths.

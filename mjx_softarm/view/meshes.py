@@ -26,7 +26,7 @@ def fold(radius_m: float) -> Mesh:
 
 
 def coil(radius_m: float, wire_m: float, pitch_m: float, n: int = 13, n_wire: int = 4) -> Mesh:
-    """Return one turn of a spring, of height 1; its wire is round where that is stretched to the pitch."""
+    """Return one turn of a spring, of height 1; stretched to the pitch, its wire is round."""
     along, about = np.meshgrid(np.linspace(0, 2 * np.pi, n), 2 * np.pi * np.arange(n_wire) / n_wire)
     out = radius_m + wire_m * np.cos(about)
     height = along / (2 * np.pi) - 0.5 + wire_m / pitch_m * np.sin(about)
@@ -39,10 +39,11 @@ def coil(radius_m: float, wire_m: float, pitch_m: float, n: int = 13, n_wire: in
 
 
 def workspace_hull(point_m: np.ndarray) -> Mesh:
-    """Return the surface around points (m, 3) [m], which follows hollows wider than a tenth of its extent.
+    """Return the surface around points (m, 3) [m]; it follows hollows wider than a tenth of the extent.
 
     Source: Edelsbrunner, Muecke, "Three-dimensional alpha shapes", ACM Transactions on Graphics 13, 1994.
     """
+    # Keep the tetrahedra with small circumscribed spheres.
     corners = Delaunay(point_m).simplices  # (tetrahedra, 4)
     edge = point_m[corners[:, 1:]] - point_m[corners[:, :1]]
     square, across = np.sum(edge**2, axis=-1), np.cross(edge[:, [1, 2, 0]], edge[:, [2, 0, 1]])
@@ -51,9 +52,10 @@ def workspace_hull(point_m: np.ndarray) -> Mesh:
         2 * volume, 1e-18
     )
     corners = corners[radius_m < np.ptp(point_m, axis=0).max() / 10.0]
+    # Their surface consists of the faces of one tetrahedron alone.
     faces = np.concatenate([np.delete(corners, k, axis=1) for k in range(4)])
     _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
-    return Mesh(point_m, faces[first[count == 1]], process=False)  # the faces of one tetrahedron alone
+    return Mesh(point_m, faces[first[count == 1]], process=False)
 
 
 def gripper(spec: ArmSpec) -> Mesh:

@@ -1,4 +1,4 @@
-"""The page of the live view, served by a process of its own."""
+"""The page of the live view, served by a separate process."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from mjx_softarm.view.look import Limits, Look
 from mjx_softarm.view.panel import Panel, css
 from mjx_softarm.view.stage import GOAL, SATURATED, Stage, add_workspace, open_server, set_the_scene
 
-FRAME_S, BARS, TRACES = 0.02, 5, 10  # between frames; frames between bars, and between traces
-SILENT_S = 1.0  # after which the page says that the loop is not heard
-DRAG_S = 0.5  # after its last move for which the gizmo is the user's
+FRAME_S, BARS, TRACES = 0.02, 5, 10  # time between frames; frames between bars, and between traces
+SILENT_S = 1.0  # silence of the loop after which the page says so
+DRAG_S = 0.5  # time after a drag in which the gizmo follows the user alone
 _BLUE, _GREY = "#2463a8", "#868e96"
 _STOP, _VENT = (
     "Give up the goals, hold the arm where it is",
@@ -45,7 +45,7 @@ class Setup(NamedTuple):
 
 
 def serve(connection: Connection, setup: Setup) -> None:
-    """Serve the page until the loop's process ends; Ctrl-C is the loop's."""
+    """Serve the page until the loop's process ends; the loop handles Ctrl-C."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     end = End(connection)
     try:
@@ -61,22 +61,25 @@ def serve(connection: Connection, setup: Setup) -> None:
 
 
 class Page:
-    """One arm with its gizmo, buttons, bars and traces, the same for all who look."""
+    """One arm with gizmo, buttons, bars and traces, the same for all browsers."""
 
     def __init__(self, server: viser.ViserServer, end: End, setup: Setup):
         self._server, self._end = server, end
         self._known: dict[str, Any] = {"doing": "is not heard yet", "armed": False, "lines": ()}
         self._n_frames, self._heard_s, self._moved_s = 0, time.monotonic(), -DRAG_S
         self._at = np.full(6, np.nan)  # pose that the gizmo shows
+        # Picture of the arm.
         spec = setup.policy.spec
+        limits = Limits.of(spec, setup.policy.tolerance_m)
         set_the_scene(server, spec)
-        self._stage = Stage(server.scene, spec)
+        self._stage = Stage(server.scene, spec, limits)
         points, hull = add_workspace(server.scene, setup.policy.workspace)
         look = {"scale": 0.15, "depth_test": False, "visible": False}
         self._gizmo = server.scene.add_transform_controls("/gizmo", **look)
+        # Panel beside it.
         self._button("Stop", "hold", _STOP, "orange", viser.Icon.HAND_STOP)
         self._button("Vent", "vent", _VENT, "red", viser.Icon.WIND)
-        self._panel = Panel(server.gui, Limits.of(spec), spec.n_chambers)
+        self._panel = Panel(server.gui, limits, spec.n_chambers)
         with server.gui.add_folder("Move", order=0.5):
             self._button("Circle", "circle", _CIRCLE, None, viser.Icon.CIRCLE)
             self._button("Pick and place", "place", _PLACE, None, viser.Icon.ARROWS_EXCHANGE)
@@ -94,7 +97,7 @@ class Page:
         button = self._server.gui.add_button(label, hint=hint, color=colour, icon=icon, order=order)
 
         @button.on_click
-        async def _(_: Any) -> None:  # in the server's own thread: no queue of others stands before it
+        async def _(_: Any) -> None:  # in the server's own thread, so that it waits for nobody
             self._end.put(**{name: True})
 
     def _box(self, label: str, hint: str, node: viser.SceneNodeHandle) -> None:
@@ -123,7 +126,7 @@ class Page:
         self._server.on_client_disconnect(count)
 
     def refresh(self) -> None:
-        """Show the newest tick, if there is one."""
+        """Show the newest tick, if there is a new one."""
         news = self._end.take()
         self._known |= news
         if "look" in news:
@@ -143,7 +146,7 @@ class Page:
             self._panel.show_traces(look)
 
     def _show_gizmo(self, look: Look) -> None:
-        """Keep the gizmo, unless it is dragged, at the loop's goal, or where it was left, or at the tip."""
+        """Put the gizmo, unless a user drags it, at the loop's goal, where it was left, or at the tip."""
         armed = self._known["armed"]
         at = next((pose for pose in (look.goal, self._at) if armed and np.isfinite(pose).all()), look.tip)
         dragged = time.monotonic() - self._moved_s < DRAG_S

@@ -1,4 +1,4 @@
-"""The panel beside the picture: what goes on, bars of pressures and springs, traces."""
+"""The panel beside the picture: state of the arm, bars of pressures and springs, traces."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mjx_softarm.view.look import Limits, Look
 from mjx_softarm.view.stage import GOAL, SATURATED, SEEN, section_colour
 
 TRACE_S, TRACE_POINTS = 20.0, 200
-_WIDTH, _TOP, _FOOT = 300, 6, 66  # of the bars [px]
+_WIDTH, _TOP, _FOOT = 300, 6, 66  # width, top and foot of the bars [px]
 _MUTED = "#868e96"
 
 
@@ -23,7 +23,7 @@ class Panel:
 
     def __init__(self, gui: viser.GuiApi, limits: Limits, n: int):
         self._limits = limits
-        self._text = gui.add_html("", order=0.2)  # above whatever else there is but buttons
+        self._text = gui.add_html("", order=0.2)  # below the buttons, above all else
         with gui.add_folder("Chambers and springs"):
             self._bars = gui.add_html("")
         with gui.add_folder("Traces"):
@@ -38,7 +38,7 @@ class Panel:
         self._bars.content = bars(look, self._limits)
 
     def show_traces(self, look: Look) -> None:
-        """Add a moment to the traces; one before the last clears them."""
+        """Add a moment to the traces; an earlier moment than the last clears them."""
         if self._trace and look.time_s < self._trace[-1][0]:
             self._trace.clear()
         errors = look.error_mm(look.estimate), look.error_mm(look.seen)
@@ -67,12 +67,13 @@ class Panel:
 
 
 def bars(look: Look, limits: Limits) -> str:
-    """Return pressures between their limits, and springs beside their references, as HTML."""
+    """Return bars of pressures between their limits, and of springs beside their references, as HTML."""
     low, high = float(limits.gains.pressure_min_kpa), float(limits.gains.pressure_max_kpa)
     saturated, zero = limits.saturated(look), np.zeros(len(look.spring_m))
     kpa = _bars(
         look.pressure_kpa, zero, zero, (low, high), saturated, [f"{p:.0f}" for p in look.pressure_kpa]
     )
+    # Springs, then a note about saturated chambers.
     off = [f"{1e3 * (a - b):+.1f}" for a, b in zip(look.spring_m, look.reference_m, strict=True)]
     foot_m = np.full(len(zero), limits.spring_m[0])
     springs = _bars(look.spring_m, foot_m, look.reference_m, limits.spring_m, saturated, off)
@@ -91,13 +92,14 @@ def bars(look: Look, limits: Limits) -> str:
 
 
 def _bars(values, feet, marks, limits: tuple[float, float], warned: np.ndarray, words: Sequence[str]) -> str:
-    """Return bars from feet to values, with marks across them, as SVG; nothing is drawn for a NaN."""
+    """Return bars from feet to values, with marks across them, as SVG; a NaN has no bar."""
     wide, parts = _WIDTH / len(values), []
 
     def height(value: float) -> float:
         share = (np.clip(value, *limits) - limits[0]) / (limits[1] - limits[0])
         return _FOOT - share * (_FOOT - _TOP)
 
+    # For each chamber its frame, bar, mark and word.
     for k, (value, foot, mark) in enumerate(zip(values, feet, marks, strict=True)):
         x, edge = wide * k + 5, css(SATURATED) if warned[k] else "#dee2e6"
         size = f"width='{wide - 10:.1f}' height='{_FOOT - _TOP}' rx='2' stroke-width='{1 + warned[k]}'"

@@ -1,4 +1,4 @@
-"""Logs in the browser: scrubbed at any speed, side by side, or as one file that plays without a server."""
+"""Logs in the browser: played at any speed, side by side, or as one file that plays without a server."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from mjx_softarm.view.look import Limits, Look, looks
 from mjx_softarm.view.panel import Panel
 from mjx_softarm.view.stage import Stage, open_server, set_the_scene
 
-APART_M = 0.6  # bases of arms side by side
-FRAME_S, TRACES_S = 0.04, 0.2  # between frames, and between points of the traces
+APART_M = 0.6  # distance between the bases of arms side by side
+FRAME_S, TRACES_S = 0.04, 0.2  # time between frames, and between points of the traces
 SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4", "10", "30")
-SHARE_HZ, SHARE_FRAMES = 10.0, 600  # a longer log is shared faster than it was
+SHARE_HZ, SHARE_FRAMES = 10.0, 600  # frame rate; largest number of frames, so a longer log plays faster
 _BLUE = "#2463a8"
 
 
 class Track:
-    """One log on the common time line, which begins with its first row.
+    """One log on a time line that begins with its first row.
 
     Raises:
-        LogError: the log cannot be understood, or has nothing to draw an arm by.
-        InputError: it has no rows.
+        LogError: the log cannot be understood, or has neither readings nor spring lengths.
+        InputError: the log has no rows.
     """
 
     def __init__(self, path: Path, spec: ArmSpec):
@@ -45,7 +45,7 @@ class Track:
         self._look, self.end_s = looks(log, spec.spring_sensor), float(self._time_s[-1])
 
     def at(self, time_s: float) -> Look:
-        """Return the last look up to a time."""
+        """Return the last look before a time."""
         row = int(np.searchsorted(self._time_s, time_s, side="right")) - 1
         return self._look(max(row, 0))._replace(time_s=float(self._time_s[max(row, 0)]))
 
@@ -67,7 +67,7 @@ class ReplayPage:
         self._shown_s, self._end_s = -1.0, end_s
 
     def refresh(self, passed_s: float) -> None:
-        """Go on by a time [s] of the clock, and show the moment if it is another."""
+        """Advance by a time [s] of the clock; show the moment if it has changed."""
         if self._play.value:
             later_s = self._time.value + passed_s * float(self._speed.value)
             self._time.value = later_s if later_s <= self._end_s else 0.0
@@ -96,7 +96,7 @@ def replay(server: viser.ViserServer, spec: ArmSpec, tracks: Sequence[Track]) ->
 
 
 def share(path: Path, spec: ArmSpec, tracks: Sequence[Track]) -> int:
-    """Write a page that plays logs without a server; return how many times as fast as they were."""
+    """Write a page that plays logs without a server; return its speed, 1 or a larger integer."""
     end_s = max(track.end_s for track in tracks)
     speed = max(1, math.ceil(end_s * SHARE_HZ / SHARE_FRAMES))
     server = open_server("127.0.0.1", 8080, "")
@@ -114,10 +114,10 @@ def share(path: Path, spec: ArmSpec, tracks: Sequence[Track]) -> int:
 
 
 def _stages(server: viser.ViserServer, spec: ArmSpec, tracks: Sequence[Track]) -> list[Stage]:
-    """Set the scene, and return a stage for each log, named and side by side."""
+    """Set the scene; return a stage with a label for each log, side by side."""
     set_the_scene(server, spec, APART_M * (len(tracks) - 1))
     stages = []
     for k, track in enumerate(tracks):
-        stages.append(Stage(server.scene, spec, f"/arm{k}", (0.0, k * APART_M, 0.0)))
+        stages.append(Stage(server.scene, spec, Limits.of(spec), f"/arm{k}", (0.0, k * APART_M, 0.0)))
         server.scene.add_label(f"/arm{k}/name", track.name, position=(0.0, 0.0, 0.09))
     return stages

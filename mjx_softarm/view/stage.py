@@ -1,6 +1,6 @@
-"""One arm on viser's scene: bellows, rings, springs, gripper and payload, its tip, its goal and its trail.
+"""One arm in viser's scene: bellows, rings, springs, gripper, payload, tip, goal and trail.
 
-All copies of a part are one batched mesh, so that a frame is a few messages.
+All copies of a part are one batched mesh, so that a frame needs few messages.
 """
 
 from __future__ import annotations
@@ -36,17 +36,25 @@ _RING_M, _WIRE_M, _MOUNT_M = 0.005, 7e-4, (0.095, 0.04)  # height; radius; radiu
 
 
 class Stage:
-    """One arm; several may stand side by side.
+    """One arm in the scene; several arms can stand side by side.
 
     Args:
-        scene: of the server.
+        scene: scene of the server.
         spec: the arm.
-        name: of its node.
-        place_m: (3,) of its base.
+        limits: limits by which chambers are marked as saturated.
+        name: name of the arm's node.
+        place_m: (3,) place of the arm's base.
     """
 
-    def __init__(self, scene: viser.SceneApi, spec: ArmSpec, name: str = "/arm", place_m=(0.0, 0.0, 0.0)):
-        self._spec, self._limits = spec, Limits.of(spec)
+    def __init__(
+        self,
+        scene: viser.SceneApi,
+        spec: ArmSpec,
+        limits: Limits,
+        name: str = "/arm",
+        place_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ):
+        self._spec, self._limits = spec, limits
         self._trail: deque[np.ndarray] = deque(maxlen=_TRAIL_POINTS)
         self._marked: np.ndarray | None = None  # (n,) chambers drawn as saturated
         scene.add_frame(name, show_axes=False, position=place_m)
@@ -65,13 +73,17 @@ class Stage:
             looks = {"point_size": size_m, "point_shape": "circle", "visible": False}
             return scene.add_point_cloud(f"{name}/{path}", np.zeros((1, 3)), colour, **looks)
 
-        self._spring_m = np.full(spec.n_chambers, spec.geometry.section_length_m)  # as drawn last
+        # Bellows, rings and springs.
+        self._spring_m = np.full(
+            spec.n_chambers, spec.geometry.section_length_m
+        )  # lengths in the last picture
         rest = shape(spec, self._spring_m, np.full(6, np.nan))
         turn = meshes.coil(1.6 * SPRING_WIDTH_M, _WIRE_M, spec.geometry.section_length_m / COILS)
         solid("mount", meshes.disc(*_MOUNT_M), _MOUNT, position=(0.0, 0.0, _MOUNT_M[1] / 2))
         self._rings = copies("rings", meshes.disc(ring_radius_m(spec), _RING_M), rest.rings, _RING)
         self._folds = copies("bellows", meshes.fold(spec.geometry.chamber_diameter_m / 2), rest.folds, _RING)
         self._coils = copies("springs", turn, rest.coils, _SPRING)
+        # Tip, seen tip and goal, each with a gripper; payload, markers and trail.
         self._tip = scene.add_frame(f"{name}/tip", show_axes=False)
         self._seen = scene.add_frame(f"{name}/seen", show_axes=False)
         self._goal = scene.add_frame(f"{name}/goal", show_axes=False)
@@ -108,7 +120,7 @@ class Stage:
             self._path.points, self._path.visible = np.array(self._trail), True
 
     def _mark(self, saturated: np.ndarray) -> None:
-        """Colour the bellows; only when that changes is it sent."""
+        """Colour the bellows; send a message only if the colours change."""
         if self._marked is None or not np.array_equal(saturated, self._marked):
             self._marked = saturated
             own = np.array([section_colour(k) for k in range(len(saturated))])
@@ -122,18 +134,14 @@ def section_colour(chamber: int) -> tuple[int, int, int]:
 
 
 def add_workspace(scene: viser.SceneApi, pose: np.ndarray) -> tuple[viser.SceneNodeHandle, ...]:
-    """Add the reachable poses (m, 6) [mm, deg], the deeper the darker, and their hull; both hidden."""
+    """Add the reachable poses (m, 6) [mm, deg], darker with depth, and their hull; both hidden."""
     depth = (pose[:, 2:3].max() - pose[:, 2:3]) / max(float(np.ptp(pose[:, 2])), 1.0)
     colours = (depth * (38, 84, 160) + (1 - depth) * (120, 200, 235)).astype(np.uint8)
     looks = {"point_size": 0.004, "point_shape": "circle", "visible": False}
     points = scene.add_point_cloud("/workspace", 1e-3 * pose[:, :3], colours, **looks)
-    surface, looks = (
-        meshes.workspace_hull(1e-3 * pose[:, :3].astype(float)),
-        {"opacity": 0.2, "side": "double"},
-    )
-    hull = scene.add_mesh_simple(
-        "/hull", surface.vertices, surface.faces, color=_HULL, visible=False, cast_shadow=False, **looks
-    )
+    surface = meshes.workspace_hull(1e-3 * pose[:, :3].astype(float))
+    looks = {"color": _HULL, "opacity": 0.2, "side": "double", "visible": False, "cast_shadow": False}
+    hull = scene.add_mesh_simple("/hull", surface.vertices, surface.faces, **looks)
     return points, hull
 
 
@@ -141,7 +149,7 @@ def open_server(host: str, port: int, label: str) -> viser.ViserServer:
     """Return a server that prints nothing.
 
     Raises:
-        OSError: it cannot listen there.
+        OSError: the server cannot listen at this address.
     """
     with contextlib.redirect_stdout(None):
         return viser.ViserServer(host, port, label=label, verbose=False)
@@ -153,7 +161,7 @@ def set_the_scene(server: viser.ViserServer, spec: ArmSpec, width_m: float = 0.0
     server.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(36, 99, 168))
     server.scene.set_up_direction("+z")
     server.scene.configure_default_lights(cast_shadow=False)
-    server.scene.configure_environment_map(None)  # it would bleach the colours
+    server.scene.configure_environment_map(None)  # the default map bleaches the colours
     server.scene.add_light_ambient("/light", intensity=1.2)
     middle, floor = (0.0, width_m / 2, -0.55 * length_m), (0.0, width_m / 2, -1.3 * length_m)
     lines = {"cell_size": 0.1, "cell_color": (228, 231, 236), "section_color": (205, 210, 217)}

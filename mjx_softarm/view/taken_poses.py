@@ -15,7 +15,7 @@ from mjx_softarm.logs.schema import Log
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.sensing.pose import pose_error, pose_from_quaternion, quaternion_from_pose
 
-APART = np.repeat([1.0, 1.0], 3)  # [mm, deg] from the pose that was taken last, in any of them
+APART = np.repeat([1.0, 1.0], 3)  # [mm, deg] smallest difference from the last taken pose, in one number
 
 
 class TakenPoses:
@@ -29,11 +29,11 @@ class TakenPoses:
         return len(self._rows)
 
     def take(self, state: LoopState, row: Mapping[str, Any]) -> str:
-        """Keep the pose of a tick, if it can be learned from; return what came of it.
+        """Keep the pose of a tick if training can use it; return a message.
 
         Args:
-            state: of the loop after the tick.
-            row: that the tick logged; its tip is believed where motion capture sees none.
+            state: state of the loop after the tick.
+            row: log row of the tick. Without motion capture its estimate is the pose.
         """
         seen = np.isfinite(row.get("tip_quaternion", np.nan)).all()
         pose = pose_from_quaternion(row["tip_m"], row["tip_quaternion"]) if seen else row["estimate"]
@@ -51,7 +51,8 @@ class TakenPoses:
         return self._rows.log("demonstrations", self._policy.sensor)
 
     def _refused(self, state: LoopState, readings: np.ndarray, pose: np.ndarray) -> str:
-        """Return why a pose cannot be learned from, or nothing."""
+        """Return the reason to refuse a pose, or an empty text."""
+        # The arm must be at rest, with all readings, no chamber saturated.
         policy, belief, command = self._policy, state.belief, state.command
         low, high = np.sort(policy.actions[1:], axis=0)
         if command.reference_m is None or state.goal is not None or not still(belief.window.spring_m):
@@ -62,6 +63,7 @@ class TakenPoses:
         mask = saturated(*held, policy.gains, policy.tolerance_m)
         if mask.any():
             return f"chamber {np.argmax(mask)}: got its limit of pressure, its spring off the reference"
+        # The pose must be an action, and a new one.
         outside = (readings < low) | (readings > high)
         if outside.any():
             k = int(np.argmax(outside))
