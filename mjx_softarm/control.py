@@ -1,7 +1,7 @@
-"""The sensor-space law: spring lengths and their references -> chamber pressures.
+"""Sensor-space law: spring lengths and their references -> chamber pressures.
 
-One law for training, twin and deployed arm. Each chamber has a law on its own spring. A spring shorter than
-its reference asks for more pressure:
+Training, twin and deployed arm share it. Each chamber regulates its own spring; a spring shorter than its
+reference gets more pressure:
 
     r'  = r + (reference - r) dt / (reference_s + dt)     reference on its way
     l'  = l + (length - l) / 2                            smoothed length
@@ -10,20 +10,20 @@ its reference asks for more pressure:
     p   = clip(i' + kp e - kd (l' - l) / dt, p_min, p_max)
 
 A new reference is approached in some `reference_s` seconds, about as fast as the pump can fill the chambers:
-a jump would wind up the integral while they fill. The rate of the length damps the arm's swing. Lengths are
-read at 50 Hz, so their rate is smoothed over two ticks or so.
+a jump would wind up the integral while they fill. The length's rate damps the arm's swing; it is smoothed
+over about two ticks, since lengths are read at 50 Hz.
 
-The integral is clamped to the pressures there are, so it never winds up: however long a chamber has
-been at its limit, it leaves it in the very tick in which the error changes sign.
+The integral is clamped to the pressure limits, so it never winds up: a chamber leaves its limit in the tick
+    in
+which the error changes sign.
 
-At rest (r' = reference, l' = length, i' = i) each chamber is in one of three states, in each of which p = i:
+At rest (r' = reference, l' = length, i' = i) p = i, and each chamber is in one of three states:
 
     p_min <= p <= p_max and e = 0    it tracks its reference
     p = p_max           and e > 0    it can push no further
     p = p_min           and e < 0    it can pull no further
 
-No gain and no time is in there: they say how the arm comes to rest, not where.
-`mjx_softarm.mechanics.settle` solves for exactly this rest.
+This rest depends on neither gains nor times. `mjx_softarm.mechanics.settle` solves for it.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ from mjx_softarm._support.xp import Array, array_namespace
 from mjx_softarm.spec import ArmSpec
 
 AT_LIMIT_KPA = 0.2  # distance to a limit at which a measured, noisy pressure counts as at it
-TOLERANCE_M = 1e-3  # greatest error of a spring that counts as on its reference, unless a run says otherwise
+TOLERANCE_M = 1e-3  # greatest error of a spring that counts as on its reference; a run may set another
 
 
 class Gains(NamedTuple):
-    """Numbers of the law; each is () or (n,)."""
+    """Gains and limits of the law; each is () or (n,)."""
 
     kp_kpa_per_m: Array
     ki_kpa_per_ms: Array  # kPa per metre and second
@@ -54,7 +54,7 @@ class Gains(NamedTuple):
         return cls(law.kp_kpa_per_m, law.ki_kpa_per_ms, law.kd_kpa_s_per_m, law.reference_s, *limits_kpa)
 
     def measured(self) -> Gains:
-        """Return the gains with limits AT_LIMIT_KPA within their own, for pressures that were measured."""
+        """Return the gains with limits tighter by AT_LIMIT_KPA, for measured pressures."""
         low, high = self.pressure_min_kpa + AT_LIMIT_KPA, self.pressure_max_kpa - AT_LIMIT_KPA
         return self._replace(pressure_min_kpa=low, pressure_max_kpa=high)
 
@@ -87,10 +87,13 @@ def pressures(
     Returns:
         Pressures (..., n) [kPa] within the limits, and the next state.
     """
+    # Reference on its way, smoothed length
     xp = array_namespace(reference_m, length_m, *state, *gains)
     low, high = gains.pressure_min_kpa, gains.pressure_max_kpa
     on_its_way_m = state.reference_m + (reference_m - state.reference_m) * (dt_s / (gains.reference_s + dt_s))
     smooth_m = 0.5 * (state.length_m + length_m)
+
+    # Integral and pressure, within the limits
     error_m = on_its_way_m - length_m
     integral_kpa = xp.clip(state.integral_kpa + gains.ki_kpa_per_ms * dt_s * error_m, low, high)
     damping_kpa = gains.kd_kpa_s_per_m / dt_s * (smooth_m - state.length_m)
@@ -103,8 +106,8 @@ def saturated(
 ) -> Array:
     """Return which chambers (..., n) cannot reach their reference: bool.
 
-    A chamber is saturated at its greatest pressure with its spring too short, or at its least pressure with
-    its spring too long, by more than the tolerance. At a limit but on its reference, it is not.
+    A chamber is saturated if it is at its greatest pressure with its spring too short, or at its least
+    pressure with its spring too long, by more than the tolerance.
 
     Args:
         pressure_kpa (..., n) [kPa]: as `pressures` gives them.

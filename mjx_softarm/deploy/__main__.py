@@ -79,20 +79,23 @@ def _run(
     duration: float = np.inf,
     stay: bool = False,
 ) -> int:
-    """Bring the tip to goals; errors are by motion capture where there is any.
+    """Bring the tip to goals; errors are by motion capture if the arm has it.
 
     Args:
-        goal: pose of the tip [mm, deg] in the base frame; again for a further one
-        log: file for the run's log, CSV, npz or MCAP, by the end of its name
+        goal: pose of the tip [mm, deg] in the base frame; give the option again for a further one
+        log: file for the run's log; its suffix chooses CSV, npz or MCAP
         duration: [s] of the arm after which the run ends
         stay: hold the last goal, until Ctrl-C or the end of the duration
     """
+    # Checks, before the arm moves
     if not goal:
         raise InputError("--goal: got nothing, expected the pose of the tip, X,Y,Z,YAW,PITCH,ROLL")
     if not duration > 0.0:
         raise InputError(f"--duration: got {duration:g}, expected a number > 0")
     controller = _controller(policy)
     check_file("--log", log)
+
+    # The run, its log and its faults
     limit_s = None if np.isinf(duration) else duration
     save = partial(save_log, log) if log else lambda log: None
     goals = list(map(np.array, goal))
@@ -136,6 +139,7 @@ def _measure(
         points: of the circle, or of the grid at most
         seconds: pass all goals without a stop in so long [s], from the first to the last
     """
+    # Checks, before the arm moves
     if seconds is not None and not (0.0 < seconds < np.inf and goals != "grid"):
         raise InputError(f"--seconds: got {seconds:g} with --goals {goals}, expected > 0, and not a grid")
     if points < 1:
@@ -146,6 +150,8 @@ def _measure(
         raise InputError(f"--out: got {out}, which is there already, expected a new folder")
     driver = open_arm(arm)
     require_motion_capture(driver, f"--arm: {arm}")
+
+    # The run, stop by stop or in time
     out.mkdir(parents=True)
     save = partial(save_log, out / "log.npz")
     if seconds is None:
@@ -156,6 +162,8 @@ def _measure(
     if not run.arrivals:
         _summary(run)
         return run.status
+
+    # Figures, written and printed
     accuracy = measure(run, controller, poses)
     found = figures(accuracy, run.counts()) | {
         "reached": sum(arrival.reached for arrival in run.arrivals),
@@ -198,12 +206,15 @@ def _record(
         seed: seed of the poses
         transients: log every tick, not the static poses alone
     """
+    # Checks, before the arm moves
     if poses < 1:
         raise InputError(f"--poses: got {poses}, expected at least 1")
     arm_spec = ArmSpec.of(spec)
     check_file("--out", out)
     if out.exists():
         raise InputError(f"--out: got {out}, which is there already, expected a new file")
+
+    # The recording and its results
     targets_kpa = read_plan(plan, arm_spec) if plan else growing(random_pressures(arm_spec, poses, seed))
     result = record(open_arm(arm), arm_spec, targets_kpa, transients, _tell, partial(save_log, out))
     if not len(result.log):

@@ -6,11 +6,10 @@ A driver is a class without arguments. Of an arm with n springs and n chambers (
     write_pressures((n,))            needed    pressures to regulate to [kPa]
     pressures() -> (n,)              optional  pressures measured [kPa], logged in place of those commanded
     motion_capture() -> Capture      optional  tip (3,), (4,), markers (m, 3), springs (n,); for calibration
-    time_s                           optional  clock [s] of a simulated arm, which nobody waits for
+    time_s                           optional  clock [s] of a simulated arm, for which no tick waits
 
-`mjx_softarm.deploy.drivers` has drivers over serial and UDP that need only your numbers.
-
-Whatever else a driver raises ends the run as a fault: the arm is vented and the log is written.
+`mjx_softarm.deploy.drivers` has drivers over serial and UDP that need only your numbers. An exception other
+than those named below ends the run as a fault: the arm is vented and the log is written.
 """
 
 from __future__ import annotations
@@ -23,19 +22,17 @@ import numpy as np
 class ArmIO(Protocol):
     """Sensors and pumps of one arm with n springs and n chambers, both numbered as in the model.
 
-    The control loop calls `read_sensors`, then `write_pressures`, once per tick of the policy's
-    `rate_hz`, from one thread. Neither repeats a failed exchange by itself, nor puts old or made-up values in
-    its place: whether the arm stops is for the loop to say.
+    The control loop calls `read_sensors`, then `write_pressures`, once per tick of the policy's `rate_hz`,
+    from one thread. Neither repeats a failed exchange, nor puts old or made-up values in its place: the loop
+    decides whether the arm stops.
     """
 
     def read_sensors(self) -> np.ndarray:
-        """Return what the springs' sensors read (n,), float64, each read after the last call.
+        """Return the readings (n,), float64, of the springs' sensors, each taken after the last call.
 
-        In the unit of the specification's sensor: frequencies [Hz] of coils, voltages [V] of draw wires.
-
-        Blocks until the readings are there, for less than one tick. They are raw: not calibrated, not
-        filtered, not clipped. A single spring that could not be read is NaN; `Sensor.lengths` reports
-        it as a fault.
+        The unit is that of the specification's sensor: frequencies [Hz] of coils, voltages [V] of draw wires.
+        Readings are raw: not calibrated, not filtered, not clipped. A spring that could not be read is NaN.
+        The call blocks until the readings are there, for less than one tick.
 
         Raises:
             TimeoutError: the readings did not come within a tick.
@@ -44,10 +41,9 @@ class ArmIO(Protocol):
         ...
 
     def write_pressures(self, pressure_kpa: np.ndarray) -> None:
-        """Set what the chambers' pressures are regulated to.
+        """Set the pressures that the chambers are regulated to, until the next call.
 
-        Returns once the values are handed over, without waiting for the chambers to fill; they hold until the
-        next call.
+        The call returns once the values are handed over; it does not wait for the chambers to fill.
 
         Args:
             pressure_kpa (n,) [kPa]: relative to the atmosphere, negative for vacuum.
@@ -77,10 +73,10 @@ class Capture(NamedTuple):
 
 
 class MotionCapture(Protocol):
-    """Motion capture of an arm, for calibration logs and to verify; no controller may look at it."""
+    """Motion capture of an arm, for calibration and for measurements; no controller may use it."""
 
     def motion_capture(self) -> Capture:
-        """Return where tip and markers are now.
+        """Return the places of tip and markers.
 
         Raises:
             OSError: this frame is missing; it becomes a gap in the log.

@@ -30,60 +30,46 @@ class Window(NamedTuple):
     pressure_kpa: np.ndarray  # (ticks, n) in force
     chamber_kpa: np.ndarray  # (ticks, n) measured, or in force where none was measured
 
-    def with_tick(self, rows: tuple[np.ndarray, ...], most: int) -> Window:
-        """Return the window with another tick, of at most so many."""
-        return Window(*(np.concat([old[1 - most :], new[None]]) for old, new in zip(self, rows, strict=True)))
-
 
 class Belief(NamedTuple):
     """Belief about an arm with n springs and chambers."""
 
+    command: Command  # in force as the readings were taken
+    window: Window
     spring_m: np.ndarray  # (n,) lengths, the last good ones; NaN before the first
     lost: np.ndarray  # (n,) bool: a spring without a reading in this tick
-    why_lost: str  # message of the sensors
     stuck: np.ndarray  # (n,) bool: a spring that stands stock-still where it should not
     suspect: np.ndarray  # (n,) bool: a chamber without whose pressure the springs would lie as they do
-    window: Window
-    command: Command  # in force as the readings were taken
-    mean_m: np.ndarray  # (n,) mean lengths over the window
-    at_rest: bool  # nothing has moved for a window; one after the last action, at the earliest
-    settled: bool  # at rest with each spring on its reference, or its chamber at a limit
-    saturated: np.ndarray  # (n,) bool: a chamber at its limit with its spring off the reference
+    saturated: np.ndarray  # (n,) bool: a chamber at its limit with its spring, in the mean, off the reference
     load: Load  # payload
-    estimate_kg: float | None  # payload of this tick's window alone; None: none was estimated
-    n_unweighed: int  # ticks since the payload was last estimated
     pose: np.ndarray  # (6,) [mm, deg] of the tip; NaN before the first lengths
-    away: float  # distance of the pose from the sim-to-real network's training rows, over the limit
+    away: float = 0.0  # distance of the pose from the sim-to-real network's training rows, over the limit
+    at_rest: bool = False  # nothing has moved for a window; one after the last action, at the earliest
+    settled: bool = False  # at rest with each spring on its reference, or its chamber at a limit
+    why_lost: str = ""  # message of the sensors
+    estimate_kg: float | None = None  # payload by this tick's window alone; None: not estimated in this tick
+    n_unweighed: int = 0  # ticks since the payload was last estimated
 
     @classmethod
     def none(cls, controller: Controller) -> Belief:
         """Return the belief before the first tick."""
-        n, nan = controller.policy.spec.n_chambers, np.full(controller.policy.spec.n_chambers, np.nan)
-        no, load = np.zeros(n, bool), Load(controller.policy.spec.mass.payload_kg)
-        window, command = Window(*(np.empty((0, n)) for _ in Window._fields)), Command.none(n)
-        return cls(
-            nan,
-            no,
-            "",
-            no,
-            no,
-            window,
-            command,
-            nan,
-            False,
-            False,
-            no,
-            load,
-            None,
-            0,
-            np.full(6, np.nan),
-            0.0,
+        n, load = controller.policy.spec.n_chambers, Load(controller.policy.spec.mass.payload_kg)
+        window, no, nan = (
+            Window(*(np.empty((0, n)) for _ in Window._fields)),
+            np.zeros(n, bool),
+            np.full(n, np.nan),
         )
+        return cls(Command.none(n), window, nan, no, no, no, no, load, np.full(6, np.nan))
 
     @property
     def known(self) -> bool:
         """Whether each spring has been read once."""
         return not np.isnan(self.spring_m).any()
+
+    @property
+    def mean_m(self) -> np.ndarray:
+        """Mean lengths (n,) [m] over the window."""
+        return self.window.spring_m.mean(axis=0)
 
 
 def believe(
@@ -93,79 +79,44 @@ def believe(
     readings: np.ndarray | None,
     measured_kpa: np.ndarray | None = None,
 ) -> Belief:
-    """Return the belief of a tick.
+    """Return the belief of a tick from the last one and the command in force; arguments as of `loop.step`."""
+    policy, config, size = controller.policy, controller.config, controller.window
+    gains, tolerance_m = policy.gains, policy.tolerance_m
+    in_force_kpa, asked_m = command.pressure_kpa, command.reference_m
 
-    Args:
-        controller: the policy.
-        last: belief of the last tick.
-        command: in force.
-        readings (n,): of the sensors, or None where none came in time.
-        measured_kpa (n,) [kPa]: of the chambers; NaN, or None for all, where only those in force are known.
-    """
-    policy, config, most = controller.policy, controller.config, controller.window
-    pressure_kpa, reference_m = command.pressure_kpa, command.reference_m
-    no = np.zeros(len(pressure_kpa), bool)
-
-    # Lengths
+    # Lengths, and the window that ends with them
     spring_m, lost, why = read_lengths(policy.sensor, readings, last.spring_m)
-    chamber_kpa = (
-        pressure_kpa
-        if measured_kpa is None
-        else np.where(np.isfinite(measured_kpa), measured_kpa, pressure_kpa)
+    seen_kpa = np.full_like(in_force_kpa, np.nan) if measured_kpa is None else measured_kpa
+    tick = spring_m, in_force_kpa, np.where(np.isfinite(seen_kpa), seen_kpa, in_force_kpa)
+    rows = (np.concat([old[1 - size :], new[None]]) for old, new in zip(last.window, tick, strict=True))
+    belief = Belief.none(controller)._replace(
+        command=command, window=Window(*rows), spring_m=spring_m, lost=lost, why_lost=why, load=last.load
     )
-    window = last.window.with_tick((spring_m, pressure_kpa, chamber_kpa), most)
-    mean_m, full = window.spring_m.mean(axis=0), len(window.spring_m) == most
-    known = not np.isnan(spring_m).any()
+    springs_m, mean_m = belief.window.spring_m, belief.mean_m
 
-    # Rest
-    at_rest = full and command.n_ticks >= most and bool(still(window.spring_m, config))
-    settled, blocked, suspect = False, no, no
-    if reference_m is not None and known:
-        told = reference_m, pressure_kpa, policy.gains, policy.tolerance_m
-        settled = at_rest and bool(on_reference(window.spring_m, *told))
-        blocked = saturated(pressure_kpa, reference_m, mean_m, policy.gains, policy.tolerance_m)
-        seen = pressure_kpa, reference_m, spring_m
-        suspect = lost_chambers(policy.spring_model, policy.gains, *seen, policy.tolerance_m, config)
-    stuck = stuck_springs(window.spring_m, window.pressure_kpa, config) if full else no
+    # Rest, and trust in sensors and chambers
+    if len(springs_m) == size:
+        at_rest = command.n_ticks >= size and bool(still(springs_m, config))
+        stuck = stuck_springs(springs_m, belief.window.pressure_kpa, config)
+        belief = belief._replace(at_rest=at_rest, stuck=stuck)
+    if asked_m is not None and belief.known:
+        on = belief.at_rest and bool(on_reference(springs_m, asked_m, in_force_kpa, gains, tolerance_m))
+        mask = saturated(in_force_kpa, asked_m, mean_m, gains, tolerance_m)
+        suspect = saturated(in_force_kpa, asked_m, spring_m, gains, tolerance_m)
+        if suspect.any():
+            suspect &= as_without(policy.spring_model, in_force_kpa, spring_m, config)
+        belief = belief._replace(settled=on, saturated=mask, suspect=suspect)
 
     # Payload, of windows that do not overlap
-    load, estimate_kg, n_unweighed = last.load, None, last.n_unweighed + 1
-    if at_rest and n_unweighed >= most and not (lost | stuck | suspect).any():
-        load, estimate_kg = _weighed(policy, load, mean_m, window.chamber_kpa.mean(axis=0))
-        n_unweighed = 0
+    belief = belief._replace(n_unweighed=last.n_unweighed + 1)
+    doubtful = belief.lost | belief.stuck | belief.suspect
+    if belief.at_rest and belief.n_unweighed >= size and not doubtful.any():
+        load, estimate_kg = _weighed(policy, last.load, mean_m, belief.window.chamber_kpa.mean(axis=0))
+        belief = belief._replace(load=load, estimate_kg=estimate_kg, n_unweighed=0)
 
     # Pose
-    pose, away = pose_of(controller, spring_m, load)
-    return Belief(
-        spring_m,
-        lost,
-        why,
-        stuck,
-        suspect,
-        window,
-        command,
-        mean_m,
-        at_rest,
-        settled,
-        blocked,
-        load,
-        estimate_kg,
-        n_unweighed,
-        pose,
-        away,
-    )
-
-
-def pose_of(controller: Controller, spring_m: np.ndarray, load: Load) -> tuple[np.ndarray, float]:
-    """Return the tip pose of springs (n,) [m] with a payload.
-
-    Returns:
-        Pose (6,) [mm, deg], NaN where a length is; `s2r.extrapolation` of it, 0 without a network.
-    """
-    if np.isnan(spring_m).any():
-        return np.full(6, np.nan), 0.0
-    pose, away = controller.tip(spring_m, load.believed_kg)
-    return pose, float(away)
+    pose, away = pose_of(controller, spring_m, belief.load)
+    return belief._replace(pose=pose, away=away)
 
 
 def _weighed(policy: Policy, load: Load, mean_m: np.ndarray, mean_kpa: np.ndarray) -> tuple[Load, float]:
@@ -178,6 +129,17 @@ def _weighed(policy: Policy, load: Load, mean_m: np.ndarray, mean_kpa: np.ndarra
     if LOWEST * most_kg <= estimate_kg <= HIGHEST * most_kg:
         return averaged(load, estimate_kg, most_kg), estimate_kg
     return Load(policy.spec.mass.payload_kg), estimate_kg
+
+
+def pose_of(controller: Controller, spring_m: np.ndarray, load: Load) -> tuple[np.ndarray, float]:
+    """Return the tip pose (6,) [mm, deg] of springs (n,) [m] with a payload, NaN where a length is.
+
+    Beside it stands `s2r.extrapolation` of the pose, 0 without a network.
+    """
+    if np.isnan(spring_m).any():
+        return np.full(6, np.nan), 0.0
+    pose, away = controller.tip(spring_m, load.believed_kg)
+    return pose, float(away)
 
 
 def read_lengths(
@@ -204,12 +166,7 @@ def on_reference(
 ) -> Array:
     """Return whether each spring is on its reference, in the mean of a window, or its chamber at a limit.
 
-    Args:
-        springs_m (ticks, n) [m]: lengths over the window.
-        reference_m (n,) [m]: asked of the springs.
-        pressure_kpa (n,) [kPa]: commanded.
-        gains: with the limits.
-        tolerance_m: greatest error of a spring that counts as on its reference.
+    Lengths (ticks, n) and references (n,) in metres, commanded pressures (n,) in kPa.
     """
     xp = array_namespace(springs_m, reference_m, pressure_kpa)
     off_m = xp.abs(xp.mean(springs_m, axis=0) - reference_m)
@@ -220,10 +177,7 @@ def on_reference(
 def stuck_springs(spring_m: np.ndarray, pressure_kpa: np.ndarray, config: LoopConfig = LOOP) -> np.ndarray:
     """Return which springs (n,) stand stock-still where they should not.
 
-    Args:
-        spring_m (ticks, n) [m]: lengths of the last ticks.
-        pressure_kpa (ticks, n) [kPa]: pressures commanded in these ticks.
-        config: thresholds.
+    Lengths [m] and commanded pressures [kPa] are those of the last ticks (ticks, n).
     """
     suspects = stock_still(spring_m, config)
     return suspects & asked_to_move(spring_m, pressure_kpa, config) if suspects.any() else suspects
@@ -248,36 +202,13 @@ def _range(values: Array) -> Array:
     return xp.max(values, axis=0) - xp.min(values, axis=0)
 
 
-def lost_chambers(
-    model: SpringModel,
-    gains: Gains,
-    pressure_kpa: np.ndarray,
-    reference_m: np.ndarray,
-    spring_m: np.ndarray,
-    tolerance_m: float,
-    config: LoopConfig = LOOP,
-) -> np.ndarray:
-    """Return which chambers (n,) of an arm at rest, or nearly so, have lost their pressure.
-
-    A chamber at its limit with its spring off the reference is saturated, or it no longer holds pressure.
-    Then the arm has the shape that it would have without that pressure: the springs' deviations from the
-    model are, for the most part, a good share of what the pressure's absence makes of them.
-
-    Args:
-        model: lengths to expect at pressures.
-        gains: with the limits.
-        pressure_kpa (n,) [kPa]: commanded.
-        reference_m (n,) [m]: asked of the springs.
-        spring_m (n,) [m]: read.
-        tolerance_m: greatest error of a spring that counts as on its reference.
-        config: thresholds.
-    """
-    suspects = saturated(pressure_kpa, reference_m, spring_m, gains, tolerance_m)
-    return suspects & as_without(model, pressure_kpa, spring_m, config) if suspects.any() else suspects
-
-
 def as_without(model: SpringModel, pressure_kpa: Array, spring_m: Array, config: LoopConfig = LOOP) -> Array:
-    """Return for which chambers (n,) the springs lie as they would without that chamber's pressure."""
+    """Return for which chambers (n,) the springs lie as they would without that chamber's pressure.
+
+    The springs' deviations from the model's lengths are then, for the most part, a good share of the
+    deviations that the pressure's absence makes. A chamber at its limit with its spring off the reference
+    either is saturated or, if the springs lie so, no longer holds pressure.
+    """
     xp, own = array_namespace(pressure_kpa, spring_m), np.eye(len(pressure_kpa), dtype=bool)
     pressures_kpa = xp.concat([pressure_kpa[None], xp.where(own, 0.0, pressure_kpa)])  # (1 + n, n)
     springs_m = expected_springs(model, pressures_kpa)

@@ -1,8 +1,7 @@
-"""Drive an arm by any law, tick by tick, until its springs are at rest. NumPy only: for real arms, too.
+"""Drives of an arm to rest, without a policy. NumPy only.
 
-A law takes spring lengths to the pressures to write next. Here are a ramp of the pressures themselves, and
-the sensor-space law on references that move there along a ramp, all in step, so that the arm bends from one
-shape to the next by way of those between.
+A law turns spring lengths into the next pressures. `ramp` moves the pressures themselves. `Hold` is the
+sensor-space law on references that move in step: the arm passes the shapes between the first and the last.
 """
 
 from __future__ import annotations
@@ -19,18 +18,17 @@ from mjx_softarm.deploy.controller import LOOP
 from mjx_softarm.deploy.link import VENT_KPA_PER_S, ArmFault, Link
 from mjx_softarm.spec import ArmSpec
 
-RAMP_M_PER_S = 0.03  # of the reference that has furthest to go
-# A spring is on its reference when its error's running mean is this small: errors of springs add up along the
-# arm to thirty times as much at its tip. The noise of such a mean is a tenth of it.
-HELD_M, MEAN_S = 1e-4, 0.2
+RAMP_M_PER_S = 0.03  # speed of the reference with the longest way
+HELD_M = 1e-4  # largest mean error of a held spring; ten times the mean's noise, 3 mm at the tip at worst
+MEAN_S = 0.2  # time constant of that running mean
 
-# Spring lengths (n,) [m], None where one was lost, and pressures in force (n,) [kPa] -> pressures to write,
-# and whether the law has reached its target.
+# Law: spring lengths (n,) [m], None if one was lost, and pressures in force (n,) [kPa]
+# -> pressures to write, and whether the target is reached.
 Law = Callable[[np.ndarray | None, np.ndarray], tuple[np.ndarray, bool]]
 
 
 def ramp(target_kpa: np.ndarray, dt_s: float) -> Law:
-    """Return the law that reaches pressures (n,) [kPa] along a ramp that is safe for the arm."""
+    """Return the law that takes the pressures to targets (n,) [kPa] as slowly as venting does."""
     step_kpa = VENT_KPA_PER_S * dt_s
 
     def law(_spring_m: np.ndarray | None, in_force_kpa: np.ndarray) -> tuple[np.ndarray, bool]:
@@ -41,20 +39,22 @@ def ramp(target_kpa: np.ndarray, dt_s: float) -> Law:
 
 
 class Hold:
-    """Sensor-space law, from the springs as they are first read to references (n,) [m]."""
+    """Sensor-space law from the first lengths to references (n,) [m]."""
 
     def __init__(self, gains: Gains, reference_m: np.ndarray, dt_s: float):
         self._gains, self._goal_m, self._dt_s = gains, np.asarray(reference_m, float), dt_s
         self.reference_m: np.ndarray | None = None  # on its way; None before the first reading
         self._state: Any = None
-        self._off_m: Any = np.inf  # running mean
+        self._off_m: Any = np.inf  # (n,) running mean of the error
 
     def __call__(self, spring_m: np.ndarray | None, in_force_kpa: np.ndarray) -> tuple[np.ndarray, bool]:
+        # The first lengths are the first references; a lost reading changes nothing.
         if spring_m is None:
             return in_force_kpa, False
         if self.reference_m is None:
             self.reference_m, self._state = spring_m, LawState.at_rest(in_force_kpa, spring_m)
             self._off_m = spring_m - self._goal_m
+        # References a tick further, pressures, running mean of the error
         left_m = self._goal_m - self.reference_m
         steps = np.abs(left_m).max() / (RAMP_M_PER_S * self._dt_s)
         self.reference_m = self.reference_m + left_m / max(1.0, steps)
@@ -66,12 +66,12 @@ class Hold:
 
 
 class Drive:
-    """Drive of one arm, which is without pressure at first, as its driver gives it.
+    """Drive of one arm.
 
     Args:
-        arm: sensors and pumps.
+        arm: without pressure, as its driver gives it.
         spec: the arm, for its rate and its sensors.
-        on_tick: takes what there is to log of every tick.
+        on_tick: takes the row of each tick.
     """
 
     def __init__(self, arm: ArmIO, spec: ArmSpec, on_tick: Callable[[dict], None] = lambda row: None):
@@ -85,17 +85,17 @@ class Drive:
     def to_rest(
         self, law: Law, held: Callable[[], bool] = lambda: True, timeout_s: float = LOOP.settle_timeout_s
     ) -> dict | None:
-        """Drive until the springs are at rest where the law wants them.
+        """Drive until the springs are at rest and the law has reached its target.
 
-        Where the arm has motion capture, it is given another window to see the arm at rest.
+        Motion capture that misses the arm at rest gets one more window.
 
         Args:
-            law: takes the arm there.
-            held: returns whether the arm has been there for long enough.
-            timeout_s: longest time that this may take.
+            law: spring lengths to pressures.
+            held: returns whether the arm has been at the target for long enough.
+            timeout_s: longest time.
 
         Returns:
-            What there is to log of the last tick; None if it took longer.
+            The row of the last tick; None after a timeout.
 
         Raises:
             ArmFault: the arm cannot be reached, or too many readings were lost in a row.

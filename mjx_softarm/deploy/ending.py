@@ -1,6 +1,6 @@
-"""The one end of all that drives an arm, and the results of a run of the control loop.
+"""End of a drive, alike for runs and recordings, and the results of a run.
 
-At the end pressures are ramped to zero and the log is written, whatever happened.
+Whatever ends a drive, the pressures are ramped to zero and the log is written.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from mjx_softarm.deploy.link import Link, describe
 from mjx_softarm.deploy.safety import Event, Fault
 from mjx_softarm.logs.schema import Log, write_log
 
-# Exit statuses; after a signal, 128 and its number.
+# Exit statuses; that of a signal is 128 + its number.
 DONE, MISSED, NOT_WRITTEN, FAULT, INTERRUPTED = 0, 1, 2, 3, 130
-_INTERRUPTS = {"drive": 0, "vent": 1, "save": 2}  # Ctrl-C so far that a step goes on after
+_INTERRUPTS = {"drive": 0, "vent": 1, "save": 2}  # number of Ctrl-C so far that a step survives
 
 
 class Terminated(BaseException):
@@ -43,12 +43,12 @@ class Ending(NamedTuple):
 
 
 class Arrival(NamedTuple):
-    """A goal towards which no further action was due."""
+    """An arrival: the springs have settled after the last action towards a goal."""
 
     goal: np.ndarray  # (6,) [mm, deg]
-    estimate: np.ndarray  # (6,) [mm, deg] pose believed in
+    estimate: np.ndarray  # (6,) [mm, deg] believed pose
     row: int  # index of the log's row
-    index: int  # of the goal among those asked for
+    index: int  # index of the goal in the list of goals
     reached: bool = True  # within the policy's threshold of a goal, by motion capture if there is any
 
 
@@ -64,14 +64,14 @@ class LoopRun(NamedTuple):
     ways: tuple[slice, ...] = ()  # rows of the log in which the goal moved
 
     def counts(self) -> dict[Fault, int]:
-        """Return how often each fault came."""
+        """Return the number of events of each fault."""
         return dict(Counter(event.fault for event in self.events))
 
     @property
     def status(self) -> int:
-        """Exit status: that of the ending, or of a goal that was not reached, or was refused.
+        """Exit status of the ending; after a good one `MISSED` if a goal was not reached or was refused.
 
-        Goals of a pilot do not count.
+        A pilot's goals do not count.
         """
         n_reached = sum(arrival.reached for arrival in self.arrivals)
         return self.ending.status or (MISSED if n_reached < self.n_goals else DONE)
@@ -80,16 +80,15 @@ class LoopRun(NamedTuple):
 def vent_at_end(
     body: Callable[[], Any], link: Link, tell: Callable[[str], Any], save: Callable[[], Any] = lambda: None
 ) -> Ending:
-    """Run `body`, vent the arm and save the log, whatever happens on the way.
+    """Run `body`, then vent the arm and save the log, whatever happens.
 
-    Any exception, Ctrl-C, SIGTERM and SIGHUP end the body. While the arm is vented and the log written, they
-    are noted and change nothing, but for a second Ctrl-C, which ends the venting. Nothing is told before the
-    arm is vented and the log written, since a terminal may block.
+    Any exception, Ctrl-C, SIGTERM and SIGHUP end the body. During venting and saving they are noted and
+    change nothing; only a second Ctrl-C ends the venting. Lines are told last, since a terminal may block.
 
     Args:
         body: drives the arm.
         link: the arm.
-        tell: takes a line for each error; what it raises is ignored.
+        tell: takes a line for each error; its own exceptions are ignored.
         save: writes the log.
     """
     finish = _Finish({"drive": body, "vent": link.vent, "save": save})
@@ -102,7 +101,7 @@ def vent_at_end(
 
 
 class _Finish:
-    """Steps that run one after the other, whatever each of them raises."""
+    """Steps that run one after the other, even after one that raises."""
 
     def __init__(self, steps: dict[str, Callable[[], Any]]):
         self._steps, self._running = steps, ""
@@ -133,7 +132,7 @@ class _Finish:
         self._signals.append(number)
 
     def _attempt(self, step: str) -> BaseException | None:
-        """Return what a step raised; a signal may come at any place in here, even as another error does."""
+        """Return the exception of a step; a signal may come anywhere in here, even with another error."""
         try:
             try:
                 self._running = step
@@ -186,12 +185,12 @@ def _signals(handler: Callable[[int, Any], None]) -> Iterator[None]:
 
 
 def save_log(path: Path, log: Log) -> None:
-    """Write a log; where that fails, write it to the folder for temporary files, so that no row is lost.
+    """Write a log; if that fails, write it to the folder for temporary files.
 
-    There it has its own format, or npz where it was the format that failed.
+    The second file has the same format, or npz if the format was the reason.
 
     Raises:
-        OSError: it could not be written to `path`; the message names the file that it is in.
+        OSError: the log could not be written to `path`; the message names the second file.
     """
     try:
         write_log(path, log)

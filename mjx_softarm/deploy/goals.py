@@ -15,41 +15,10 @@ from mjx_softarm.sensing.pose import pose_error
 Note = Callable[[Sequence[Event]], None]
 
 
-class Goals(Protocol):
-    """Source of a run's goals."""
-
-    n_goals: int  # number of goals asked for; 0 with a pilot
-    n_taken: int  # goals taken from the source so far
-    ways: Sequence[slice]  # rows of the log in which the goal moved
-
-    def advance(self, state: LoopState, now_s: float, row: int, note: Note) -> LoopState | None:
-        """Return the state with the goal of a tick; None where the run is over.
-
-        Args:
-            state: after the last tick.
-            now_s: time.
-            row: of the log.
-            note: takes why goals were refused.
-        """
-        ...
-
-    def shown(self, state: LoopState, now_s: float) -> np.ndarray | None:
-        """Return the goal (6,) [mm, deg] of the log."""
-        ...
-
-
 class ListedGoals:
-    """Goals (6,) [mm, deg] one after the other.
+    """Goals one after the other, as `follow` takes them; those of `refused`, by index, are skipped."""
 
-    Args:
-        controller: the policy.
-        goals: poses.
-        refused: goals that are skipped, by their index.
-        duration_s: time after which the run is over, wherever the arm is.
-        stay: hold the last goal, until something else ends the run.
-    """
-
-    ways = ()
+    ways = ()  # rows of the log in which the goal moved
 
     def __init__(
         self,
@@ -64,7 +33,14 @@ class ListedGoals:
         self.n_goals, self.n_taken = len(self._goals), 0
 
     def advance(self, state: LoopState, now_s: float, row: int, note: Note) -> LoopState | None:
-        """Take the next accepted goal once the last is done."""
+        """Return the state with the goal of a tick, None where the run is over.
+
+        Args:
+            state: after the last tick.
+            now_s: time.
+            row: of the log.
+            note: takes the refusals of goals.
+        """
         self._began_s = now_s if np.isnan(self._began_s) else self._began_s
         state = self.taken(state, note)
         over = self._duration_s is not None and now_s - self._began_s >= self._duration_s
@@ -81,9 +57,6 @@ class ListedGoals:
             self._accepted |= not events
             note(events)
         return state
-
-    def shown(self, state: LoopState, now_s: float) -> np.ndarray | None:
-        return state.goal
 
 
 class Orders(NamedTuple):
@@ -130,19 +103,11 @@ class OrderedGoals:
             state = state._replace(goal=None)
         return self._goals.taken(state, note)
 
-    def shown(self, state: LoopState, now_s: float) -> np.ndarray | None:
-        return state.goal
-
 
 class Way:
-    """A goal that moves past poses on straight lines, all as far apart in time, from stop to stop.
+    """A goal that moves past poses (p, 6), two or more, from stop to stop, as `trace` takes them.
 
-    Args:
-        controller: the policy.
-        goals (p, 6) [mm, deg]: poses, two or more.
-        stops (p,): bool; the first and the last are stops in any case.
-        pace_s: time from a pose to the next.
-        refused: poses that are out of reach, by their index; with any of them the way is not begun.
+    The way is not begun if any pose is refused.
     """
 
     def __init__(
@@ -158,7 +123,7 @@ class Way:
         self._lead_s = config.lead_actions * controller.policy.action_s or config.lead_s
         self._refused = refused
         self._stops = np.union1d(np.flatnonzero(stops), [0, len(goals) - 1])
-        self._began_s, self._leg, self._moves = 0.0, self._poses, False
+        self._began_s, self._leg = 0.0, self._poses
         self.n_goals, self.n_taken, self.ways = len(self._stops), 0, list[slice]()
 
     def advance(self, state: LoopState, now_s: float, row: int, note: Note) -> LoopState | None:
@@ -166,32 +131,26 @@ class Way:
         if self._refused:
             note(tuple(self._refused.values()))
             return None
+        if state.goal is None and self.n_taken == len(self._poses):
+            return None
+
+        # Leave a stop, or go to the first one.
         if state.goal is None:
-            if self.n_taken == len(self._poses):
-                return None
-            if not self.n_taken:
-                self.n_taken = 1
+            k = self.n_taken - 1
+            stop = int(self._stops[self._stops > k][0])
+            self.n_taken = stop + 1
+            if k < 0:
                 return self._stop(state, note)
-            self._begin(now_s, row)
-            return with_moving_goal(self._controller, state, self._at(now_s + self._lead_s), begins=True)
-        if not self._moves:
+            self._began_s, self._leg = now_s, self._poses[k : stop + 1]
+            self.ways.append(slice(row, row))
+        elif state.lead is None:
             return state
+
+        # Go on, or stop.
         self.ways[-1] = slice(self.ways[-1].start, row)
-        if now_s - self._began_s < self._leg_s:
-            return with_moving_goal(self._controller, state, self._at(now_s + self._lead_s), begins=False)
-        self._moves = False
-        return self._stop(state, note)
-
-    def shown(self, state: LoopState, now_s: float) -> np.ndarray | None:
-        """Return the moving goal itself, not the one ahead that the policy is given."""
-        return self._at(now_s) if self._moves else state.goal
-
-    def _begin(self, now_s: float, row: int) -> None:
-        """Let the goal leave a stop, at a row of the log."""
-        k = self.n_taken - 1
-        stop = int(self._stops[self._stops > k][0])
-        self._began_s, self._leg, self._moves, self.n_taken = now_s, self._poses[k : stop + 1], True, stop + 1
-        self.ways.append(slice(row, row))
+        if now_s - self._began_s >= self._pace_s * (len(self._leg) - 1):
+            return self._stop(state, note)
+        return with_moving_goal(self._controller, state, self._at(now_s), self._at(now_s + self._lead_s))
 
     def _stop(self, state: LoopState, note: Note) -> LoopState | None:
         """Return the state with the next stop as its goal; None where it is refused."""
@@ -199,12 +158,12 @@ class Way:
         note(events)
         return None if events else state
 
-    @property
-    def _leg_s(self) -> float:
-        return self._pace_s * (len(self._leg) - 1)
-
     def _at(self, now_s: float) -> np.ndarray:
-        return on_the_way(self._leg, (now_s - self._began_s) / self._leg_s)
+        """Return the place (6,) [mm, deg] of the goal at a time."""
+        return on_the_way(self._leg, (now_s - self._began_s) / (self._pace_s * (len(self._leg) - 1)))
+
+
+Goals = ListedGoals | OrderedGoals | Way
 
 
 def on_the_way(goals: np.ndarray, share: float) -> np.ndarray:

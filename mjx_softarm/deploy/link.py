@@ -1,10 +1,10 @@
 """One arm behind its driver: guarded calls, the pressures in force, time, and the ramp to zero.
 
-Drivers are written by others, so that any of their methods may raise anything. Here every call names the
-method that failed, checks what came back, and keeps which pressures the arm has taken.
+Users write drivers, so any method may raise anything. Each call here names the method that failed, checks the
+answer, and keeps the pressures that the arm has taken.
 
-A simulated arm has a clock of its own, `time_s`, that passes as pressures are written; a run on it is as
-fast as the machine. A real arm has none: there the loop waits for each tick.
+A simulated arm has a clock of its own, `time_s`, which advances as pressures are written: a run is as fast as
+the computer. A real arm has none: the loop waits for each tick.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from mjx_softarm.deploy.controller import LOOP
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.sensing.sensors import Sensor
 
-VENT_KPA_PER_S = 20.0
-VENT_TRIES = 250  # failed writes in a row, some 5 s of them, after which the arm counts as not vented
+VENT_KPA_PER_S = 20.0  # ramp to zero; by hand
+VENT_TRIES = 250  # failed writes in a row after which the arm counts as not vented; some 5 s, by hand
 
 
 def vented(pressure_kpa: Array, dt_s: float) -> Array:
@@ -35,7 +35,7 @@ def vented(pressure_kpa: Array, dt_s: float) -> Array:
 
 
 class ArmFault(Exception):
-    """A fault after which the arm cannot be driven on; the message names the cause."""
+    """A fault that ends a drive; the message names the cause."""
 
 
 class Link:
@@ -52,9 +52,9 @@ class Link:
         self._n, self._dt_s, self._n_late = n, dt_s, 0
         self._simulated = hasattr(arm, "time_s")
         self.measures, self.sees = hasattr(arm, "pressures"), hasattr(arm, "motion_capture")
-        # Shapes of what is logged; those of markers are the first frame's.
+        # Shapes of logged arrays; those of markers come from the first frame.
         self._shapes: dict[str, tuple[int, ...]] = {"tip_m": (3,), "tip_quaternion": (4,)}
-        self._unsure = False  # whether the arm may have taken the last pressures, though it did not say so
+        self._unsure = False  # the arm may have taken the last pressures, but has not confirmed them
         self.pressure_kpa = np.zeros(n)  # in force
 
     def now(self) -> float:
@@ -71,7 +71,7 @@ class Link:
         return time_s
 
     def wait_until(self, time_s: float) -> None:
-        """Sleep; a simulated arm is never waited for."""
+        """Sleep until a time [s]; return at once for a simulated arm."""
         if not self._simulated:
             time.sleep(max(0.0, time_s - time.monotonic()))
 
@@ -79,7 +79,7 @@ class Link:
         """Return the readings (n,), or None where they did not come in time.
 
         Raises:
-            ArmFault: the sensors cannot be reached, or there is another number of them.
+            ArmFault: the sensors cannot be reached, or their number is another.
         """
         try:
             readings = self._call("read_sensors", lambda: np.array(self._arm.read_sensors(), float))
@@ -110,12 +110,12 @@ class Link:
         return True
 
     def look(self, time_s: float) -> dict[str, Any]:
-        """Return what there is to log besides the readings; nothing of motion capture that missed a frame.
+        """Return time, pressures and motion capture, the latter unless it missed a frame.
 
-        The pressures are those commanded, if the arm measures none.
+        The pressures are the commanded ones if the arm measures none.
 
         Raises:
-            ArmFault: a method failed, or gave arrays of another shape than before.
+            ArmFault: a method failed, or the shape of an array changed.
         """
         row: dict[str, Any] = {"time_s": time_s, "pressure_kpa": self.pressure_kpa}
         if self.measures:
@@ -128,7 +128,7 @@ class Link:
         return row
 
     def vent(self) -> None:
-        """Ramp all pressures to zero; needs the pumps alone, and tries writes again that fail.
+        """Ramp all pressures to zero, and repeat writes that fail; needs the pumps alone.
 
         Raises:
             ArmFault: the pumps took no pressures for VENT_TRIES ticks.
@@ -156,7 +156,7 @@ class Link:
         return {name: np.array(value, float) for name, value in seen._asdict().items() if value is not None}
 
     def _call(self, name: str, method: Callable[[], Any], timeouts: bool = True) -> Any:
-        """Call the driver; a TimeoutError passes where the caller can go on without an answer."""
+        """Call the driver; a TimeoutError passes if the caller can go on without an answer."""
         try:
             return method()
         except Exception as error:
@@ -172,10 +172,10 @@ class Link:
 
 
 def describe(error: BaseException) -> str:
-    """Return an error's message, with its type and place where it is none of the documented ones."""
+    """Return an error's message, with type and place unless it is a documented one."""
     try:
         text = str(error)
-    except Exception:  # a driver's own, whose text cannot be made
+    except Exception:  # the driver's own exception cannot make its text
         text = ""
     if isinstance(error, (ArmFault, OSError, ValueError)) and text:
         return text
@@ -185,7 +185,7 @@ def describe(error: BaseException) -> str:
 
 
 class Recorder:
-    """Rows of a log in the making; with `kept`, only so many of the newest. Its length counts all."""
+    """Rows of a growing log; at most `kept` of the newest. Its length counts all rows."""
 
     def __init__(self, kept: int | None = None) -> None:
         self._rows: deque[dict[str, Any]] = deque(maxlen=kept)
@@ -204,10 +204,7 @@ class Recorder:
         return [self._rows[k] for k in range(-min(n, len(self._rows)), 0)]
 
     def log(self, source: str, sensor: Sensor) -> Log:
-        """Return the log so far of an arm with this sensor; NaN where a row has no value.
-
-        Time is counted from the first row.
-        """
+        """Return the log so far, of an arm with this sensor; NaN for missing values."""
         shapes = {name: np.shape(value) for row in reversed(self._rows) for name, value in row.items()}
         arrays = {
             name: np.array([row.get(name, np.full(shape, np.nan)) for row in self._rows], float)

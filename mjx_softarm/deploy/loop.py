@@ -35,6 +35,9 @@ class LoopState(NamedTuple):
     watch: Watch
     strategy: Strategy
     goal: np.ndarray | None = None  # (6,) [mm, deg]
+    lead: np.ndarray | None = (
+        None  # (6,) [mm, deg] place of a moving goal some time ahead; None: the goal stands
+    )
 
 
 class Tick(NamedTuple):
@@ -51,9 +54,9 @@ class Tick(NamedTuple):
 
 def start(controller: Controller) -> LoopState:
     """Return the state before the first tick, of an arm without pressure."""
-    command = Command.none(controller.policy.spec.n_chambers)
+    belief, none = Belief.none(controller), np.zeros(controller.policy.spec.n_chambers, int)
     strategy = strategy_of(controller, np.zeros(6), moves=False)
-    return LoopState(command, Belief.none(controller), Watch.none(controller), strategy)
+    return LoopState(belief.command, belief, Watch(0, none, none, belief.load.kg), strategy)
 
 
 def step(
@@ -84,7 +87,8 @@ def step(
     # References, if each spring was read
     arrived = False
     if state.goal is not None and belief.known and not belief.lost.any():
-        strategy, reference_m, found, arrived = state.strategy.references(belief, state.goal)
+        goal = state.goal if state.lead is None else state.lead
+        strategy, reference_m, found, arrived = state.strategy.references(belief, goal)
         state = state._replace(strategy=strategy, goal=None if arrived else state.goal)
         if reference_m is not None:
             state = state._replace(command=state.command._replace(reference_m=reference_m, n_ticks=0))
@@ -128,13 +132,17 @@ def with_goal(
         far = f"{text} is {away:.1f} times as far from the nearest reachable pose as a goal may be"
         return state, (Event(Fault.GOAL_OUTSIDE, f"{far}; that pose is {near} [mm, deg]"),)
     strategy = strategy_of(controller, state.strategy.shift, moves=False)
-    return state._replace(goal=goal, strategy=strategy, command=state.command._replace(n_ticks=0)), ()
+    command = state.command._replace(n_ticks=0)
+    return state._replace(goal=goal, lead=None, strategy=strategy, command=command), ()
 
 
-def with_moving_goal(controller: Controller, state: LoopState, goal: np.ndarray, begins: bool) -> LoopState:
-    """Return the state with the place (6,) [mm, deg] of a moving goal, all of whose way is reachable."""
+def with_moving_goal(
+    controller: Controller, state: LoopState, goal: np.ndarray, lead: np.ndarray
+) -> LoopState:
+    """Return the state with the places (6,) [mm, deg] of a moving goal, now and ahead; all are reachable."""
+    begins = state.lead is None
     strategy = strategy_of(controller, state.strategy.shift, moves=True) if begins else state.strategy
-    return state._replace(goal=goal, strategy=strategy)
+    return state._replace(goal=goal, lead=lead, strategy=strategy)
 
 
 def hold(state: LoopState) -> LoopState:

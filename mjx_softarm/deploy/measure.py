@@ -1,6 +1,6 @@
-"""Accuracy of a policy on an arm: errors at goals, judged by motion capture. NumPy only.
+"""Accuracy of a policy on an arm: errors at goals by motion capture. NumPy only.
 
-Motion capture is noisy: an error is the mean over the window in which the springs had settled.
+Each error is the mean over the window in which the springs had settled, since motion capture is noisy.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.sensing.pose import frame_from_pose, pose_error, pose_from_frame, rotation_about, seen_error
 
-LOOKS, LOOK_S = 50, 0.02  # frames of motion capture tried before an arm moves, and the time between two
-MOST_LAG_S = 3.0  # of a tip behind a moving goal
+LOOKS, LOOK_S = 50, 0.02  # number of frames tried before an arm moves; time between two of them
+MOST_LAG_S = 3.0  # largest lag of a tip behind a moving goal that is looked for
 POSE_NAMES = ("x_mm", "y_mm", "z_mm", "yaw_deg", "pitch_deg", "roll_deg")
 GOAL_COLUMNS = ("x [mm]", "y [mm]", "z [mm]", "yaw [deg]", "pitch [deg]", "roll [deg]")
 
 
 class Accuracy(NamedTuple):
-    """Outcome at p goals, of an arm with n chambers; NaN where a goal was missed."""
+    """Errors at p goals of an arm with n chambers; NaN where a goal was missed."""
 
     goal: np.ndarray  # (p, 6) [mm, deg]
     error: np.ndarray  # (p, 6) [mm, deg] of the tip by motion capture
-    believed: np.ndarray  # (p, 6) [mm, deg] pose that the loop estimated, less the goal
-    saturated: np.ndarray  # (p, n) bool: chamber at a limit with its spring off the reference, on arrival
+    believed: np.ndarray  # (p, 6) [mm, deg] believed pose minus the goal
+    saturated: np.ndarray  # (p, n) bool: a chamber at its limit with its spring off the reference, on arrival
     arrival_s: np.ndarray  # (p,)
-    load_estimate_g: np.ndarray  # (p,) payload that the loop believed in, on arrival
+    load_estimate_g: np.ndarray  # (p,) believed payload on arrival
 
 
 def read_goals(name: str, policy: Policy, n: int) -> np.ndarray:
@@ -63,9 +63,9 @@ def read_goals(name: str, policy: Policy, n: int) -> np.ndarray:
 
 
 def grid_poses(workspace: np.ndarray, n: int) -> np.ndarray:
-    """Return up to n of the workspace's poses (m, 6) [mm, deg], one in each cell of a grid of positions.
+    """Return up to n of the workspace's poses (m, 6) [mm, deg], one in each cell of a cubic grid.
 
-    The grid is cubic, the finest with at most n cells that hold a pose; the pose is that nearest the middle.
+    The grid is the finest with at most n cells that hold a pose. Each cell gives the pose nearest its middle.
     """
     low, high = workspace[:, :3].min(axis=0), workspace[:, :3].max(axis=0)
     chosen = np.zeros(1, int)
@@ -82,10 +82,10 @@ def grid_poses(workspace: np.ndarray, n: int) -> np.ndarray:
 
 
 def require_motion_capture(arm: Any, where: str) -> None:
-    """Look, for a second at most, before an arm moves.
+    """Check for a second at most that motion capture sees the tip.
 
     Raises:
-        InputError: motion capture does not see the tip; the message begins with `where`.
+        InputError: it does not; the message begins with `where`.
     """
     why = f"{where}: got an arm without the method motion_capture"
     for _ in range(LOOKS if hasattr(arm, "motion_capture") else 0):
@@ -111,7 +111,8 @@ def measure(run: LoopRun, controller: Controller, goals: np.ndarray) -> Accuracy
     arrival_s, load_estimate_g = np.full((2, len(goals)), np.nan)
     if log.tip_m is None or log.tip_quaternion is None:
         raise InputError(f"motion capture: got no frame in {len(log)} ticks, expected the tip")
-    # Means over the window that ends with each arrival.
+
+    # Means over the window that ends with each arrival
     for arrival in run.arrivals:
         point = arrival.index
         assert log.pressure_kpa is not None and log.reference_m is not None
@@ -131,15 +132,12 @@ def measure(run: LoopRun, controller: Controller, goals: np.ndarray) -> Accuracy
 
 
 def figures(accuracy: Accuracy, events: Mapping[Fault, int]) -> dict[str, Any]:
-    """Return the figures of an accuracy, errors over the goals that were measured, NaN without any.
+    """Return the figures of an accuracy, NaN if no goal was measured.
 
-    A goal is measured if the tip arrived and was seen, however far off.
-    Rotation is the norm of the errors of yaw, pitch and roll.
-
-    Args:
-        accuracy: errors and saturation.
-        events: how often each fault was reported.
+    A goal is measured if the tip arrived and was seen, at any distance. Rotation is the norm of the errors of
+    yaw, pitch and roll. `events` has the number of events of each fault.
     """
+    # Errors at the goals that were measured
     measured = np.isfinite(accuracy.error).all(axis=1)
     n_measured = int(measured.sum())
     error, believed = (
@@ -148,6 +146,7 @@ def figures(accuracy: Accuracy, events: Mapping[Fault, int]) -> dict[str, Any]:
     )
     away, turned = np.linalg.norm(error[:, :3], axis=1), np.linalg.norm(error[:, 3:], axis=1)
     per_point = accuracy.saturated.sum(axis=1)
+
     return {
         "points": len(accuracy.goal),
         "measured": n_measured,
@@ -172,8 +171,8 @@ def along(run: LoopRun, dt_s: float) -> dict[str, float]:
     """Return the tip's distances from a moving goal by motion capture, NaN where it was not seen.
 
     Returns:
-        Mean, 95 % and largest distance [mm] at the same time; the lag [s] for which the mean is least, of
-        those up to `MOST_LAG_S`, and the mean with this lag.
+        Mean, 95 % and largest distance [mm] of tip and goal at the same time; the lag [s], up to
+        `MOST_LAG_S`, with the least mean distance, and this mean.
 
     Raises:
         InputError: motion capture saw nothing.
@@ -202,11 +201,12 @@ def along(run: LoopRun, dt_s: float) -> dict[str, float]:
 
 
 def write_accuracy(folder: Path, accuracy: Accuracy, found: Mapping[str, Any]) -> str:
-    """Write `accuracy.json`, and `accuracy.png` where matplotlib is there; return what is missing, or "".
+    """Write `accuracy.json` and, with matplotlib, `accuracy.png`; return why there is no picture, or "".
 
     Raises:
-        OSError: they cannot be written.
+        OSError: a file cannot be written.
     """
+    # Figures and the error at each goal
     points = [
         {"goal": goal.tolist(), "error": error.tolist() if np.isfinite(error).all() else None}
         for goal, error in zip(accuracy.goal, accuracy.error, strict=True)
@@ -214,6 +214,8 @@ def write_accuracy(folder: Path, accuracy: Accuracy, found: Mapping[str, Any]) -
     numbers = {name: None if value != value else value for name, value in found.items()}
     text = json.dumps({**numbers, "at": points}, indent=2, allow_nan=False)
     (folder / "accuracy.json").write_text(f"{text}\n", "utf-8")
+
+    # Goals and tips from above and from the side; shares of the goals below an error
     try:
         from matplotlib.figure import Figure
     except ImportError:

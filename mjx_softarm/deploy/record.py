@@ -1,9 +1,9 @@
-"""Record random safe poses of an arm for calibration. NumPy only: the arm need not be known yet.
+"""Record static poses of an arm for calibration. NumPy only; the arm need not be calibrated.
 
-The pressures are drawn as those of the poses that policies are trained on; from one set to the next goes a
-ramp, and each is held until calibration takes the arm for at rest (`mjx_softarm.logs.rest`). A pose is
-logged as the mean over the last second of its hold, or, with `transients`, every tick is. The columns are the
-control loop's without references, goals and estimates.
+A ramp leads from one set of pressures to the next. Each set is held until the arm is at rest by calibration's
+rule (`mjx_softarm.logs.rest`). A pose is logged as the mean over the last second of its hold; with
+`transients`, each tick is logged. The columns are those of the control loop's log without references, goals
+and estimates.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ class PoseRecording(NamedTuple):
     """Results of a recording."""
 
     log: Log
-    n_poses: int  # that came to rest
-    n_unsettled: int  # that were not seen at rest within TIMEOUT_S; not logged, transients apart
+    n_poses: int  # number of poses at rest
+    n_unsettled: int  # number of poses not seen at rest within TIMEOUT_S; logged only with transients
     ending: Ending
 
 
@@ -51,9 +51,9 @@ def record(
     Args:
         arm: without pressure, as its driver gives it.
         spec: the arm, for its rate, its limits and the range of its sensors.
-        targets_kpa (m, n) [kPa]: one set of pressures after the other.
+        targets_kpa (m, n) [kPa]: sets of pressures, in order.
         transients: log every tick instead of the static poses.
-        tell: takes a line of progress now and then.
+        tell: takes lines of progress.
         save: writes the log, if it has rows, once the arm is vented.
     """
     rows, hold, rest = Recorder(), _Hold(), []
@@ -69,11 +69,14 @@ def record(
     def run() -> None:
         nonlocal told_s
         for k, target_kpa in enumerate(targets_kpa, 1):
+            # Drive to the pressures, check the arm, log the pose.
             hold.ticks.clear()
             rest.append(drive.to_rest(ramp(target_kpa, drive.dt_s), hold.is_long, TIMEOUT_S) is not None)
             hold.check(drive, target_kpa if rest[-1] else None)
             if rest[-1] and not transients:
                 rows.add(_mean(hold.last_second()))
+
+            # Tell the progress.
             now_s = time.monotonic()
             if now_s - told_s >= PROGRESS_S or k == len(targets_kpa):
                 left_min = (now_s - began_s) / k * (len(targets_kpa) - k) / 60
@@ -88,23 +91,23 @@ def record(
 
 
 class _Hold:
-    """Rows since the pressures were last elsewhere, as calibration cuts holds out of a log of all ticks."""
+    """Rows at one set of pressures, cut as calibration cuts holds out of a log of all ticks."""
 
     def __init__(self) -> None:
         self.rows: list[dict[str, Any]] = []
-        self.ticks: list[dict[str, Any]] = []  # of this pose
+        self.ticks: list[dict[str, Any]] = []  # all rows of this pose, the ramp's too
 
     def add(self, row: dict[str, Any], seen: bool) -> None:
-        """Take the row of a tick, and whether motion capture, if there is any, saw the tip."""
+        """Take the row of a tick; `seen` is False where motion capture missed the tip."""
         self.ticks.append(row)
         if not seen or not all(np.isfinite(row[name]).all() for name in NEEDED if name in row):
-            return  # calibration leaves such a row out, too
+            return  # as calibration does
         if self.rows and leaves(row["pressure_kpa"], self.rows[0]["pressure_kpa"]):
             self.rows.clear()
         self.rows.append(row)
 
     def last_second(self) -> list[dict[str, Any]]:
-        """Return the rows of the last second, which are averaged."""
+        """Return the rows of the last second."""
         since_s = self.rows[-1]["time_s"] - WINDOW_S - ROUNDING_S
         return [row for row in self.rows if row["time_s"] >= since_s]
 
@@ -119,10 +122,10 @@ class _Hold:
         return not moves(*(np.array([row[name] for row in rows]) for name in ("time_s", "tip_m")))
 
     def check(self, drive: Drive, target_kpa: np.ndarray | None) -> None:
-        """Stop where a pose shows that the arm is faulty.
+        """Check sensors and chambers by the rows of a pose.
 
         Raises:
-            ArmFault: a sensor stood stock-still, or a chamber at rest does not have its pressure.
+            ArmFault: a sensor stood stock-still, or a chamber at rest lacks its pressure.
         """
         kpa = np.array([row["pressure_kpa"] for row in self.ticks])
         readings = np.array([row["readings"] for row in self.ticks])
@@ -140,7 +143,7 @@ class _Hold:
 
 
 def _mean(rows: Sequence[dict[str, Any]]) -> dict[str, np.ndarray]:
-    """Return the mean of rows at rest over the numbers that are there; NaN where there is none."""
+    """Return the mean of rows at rest over their finite numbers; NaN where there is none."""
     shapes = {name: np.shape(value) for row in rows for name, value in row.items()}
     values = {
         name: np.array([row.get(name, np.full(shape, np.nan)) for row in rows])

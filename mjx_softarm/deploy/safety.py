@@ -99,24 +99,11 @@ class Watch(NamedTuple):
     n_suspect: np.ndarray  # (n,) ticks in a row in which a chamber seemed to have lost its pressure
     load_kg: float  # payload of the last tick
 
-    @classmethod
-    def none(cls, controller: Controller) -> Watch:
-        """Return the memory before the first tick."""
-        counts = np.zeros(controller.policy.spec.n_chambers, int)
-        return cls(0, counts, counts, controller.policy.spec.mass.payload_kg)
-
 
 def check(
     controller: Controller, watch: Watch, belief: Belief, late: bool
 ) -> tuple[Watch, tuple[Event, ...]]:
-    """Return the memory and the faults of a tick.
-
-    Args:
-        controller: the policy.
-        watch: memory of the last tick.
-        belief: of this tick.
-        late: the last tick missed its deadline.
-    """
+    """Return the memory and the faults of a tick; `late` where the last one missed its deadline."""
     next_watch = Watch(
         n_late=watch.n_late + 1 if late else 0,
         n_lost=np.where(belief.lost, watch.n_lost + 1, 0),

@@ -163,7 +163,7 @@ class _Session:
     def _tick(self, begin_s: float) -> bool:
         """Return whether the arm took the pressures in time."""
         # Read the arm.
-        goal = self.goals.shown(self.state, begin_s)
+        goal = self.state.goal
         readings = self.link.read()
         row = self.link.look(begin_s)
         row["readings"] = self.nothing if readings is None else readings

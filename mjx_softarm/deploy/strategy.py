@@ -13,7 +13,7 @@ subtracted from the goal that the policy is given next: the *shift* of the goal.
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,38 +27,13 @@ from mjx_softarm.sensing.load import Load
 from mjx_softarm.sensing.pose import pose_error
 
 
-class Strategy(Protocol):
-    """A way to find references, with its memory; each tick gives the next one."""
-
-    @property
-    def shift(self) -> np.ndarray:
-        """Shift (6,) [mm, deg] of the goal that the policy is given."""
-        ...
-
-    @property
-    def n_actions(self) -> int:
-        """Number of actions for this goal."""
-        ...
-
-    def references(self, belief: Belief, goal: np.ndarray) -> Choice:
-        """Return the references of a tick, if an action is due, towards a goal (6,) [mm, deg]."""
-        ...
-
-
 class Choice(NamedTuple):
-    """Results of a strategy in a tick."""
+    """Results of a strategy's tick."""
 
-    strategy: Strategy  # the next one
+    strategy: Strategy  # with its next memory
     reference_m: np.ndarray | None = None  # (n,) None: the last ones stay
     events: tuple[Event, ...] = ()
     arrived: bool = False  # no further action is due
-
-
-def strategy_of(controller: Controller, shift: np.ndarray, moves: bool) -> Strategy:
-    """Return the strategy for a new goal, fixed or moving, that begins with a shift (6,) [mm, deg]."""
-    if controller.policy.action_s:
-        return (Chasing if moves else Timed)(controller, shift)
-    return (Predicting if moves else AtRest)(controller, shift)
 
 
 class AtRest(NamedTuple):
@@ -184,6 +159,16 @@ class Chasing(NamedTuple):
         reference_m = _planned(self.controller, belief, belief.pose, goal + shift)
         due = (*self.due, goal)[-config.lead_actions :]
         return Choice(self._replace(shift=shift, n_actions=self.n_actions + 1, due=due), reference_m)
+
+
+Strategy = AtRest | Timed | Predicting | Chasing
+
+
+def strategy_of(controller: Controller, shift: np.ndarray, moves: bool) -> Strategy:
+    """Return the strategy for a new goal, fixed or moving, that begins with a shift (6,) [mm, deg]."""
+    if controller.policy.action_s:
+        return (Chasing if moves else Timed)(controller, shift)
+    return (Predicting if moves else AtRest)(controller, shift)
 
 
 def _waits(strategy: AtRest | Timed, belief: Belief, patience_s: float) -> bool:

@@ -8,8 +8,8 @@ Derive a class with your numbers, and give it as `--arm my_arm:Arm`:
         port, baud = "/dev/ttyACM0", 921600
         n = 9
 
-The microcontroller answers each request once, by a line that repeats its letter and number (K counts up) and
-ends in a line feed, over UDP too, and keeps the pressures until the next `P`:
+The microcontroller answers each request once, by a line that repeats its letter and number (K counts up).
+Lines end in a line feed, over UDP, too. It keeps the pressures until the next `P`:
 
     request         answer                      meaning
     R K             R K r0 ... r8 p0 ... p8     readings in the sensor's unit, taken since the request (nan:
@@ -17,9 +17,8 @@ ends in a line feed, over UDP too, and keeps the pressures until the next `P`:
     P K p0 ... p8   P K                         pressures [kPa] taken
     any             E K text                    refused, and why
 
-An answer with another number is passed over: it is that of a request given up, and its values are old. An
-answer that was cut or garbled counts as none. A microcontroller should vent by itself when no `P` came for a
-second, which no driver can do for it.
+An answer with another number belongs to an earlier request: it is skipped. A cut or garbled answer counts as
+none. The microcontroller should vent by itself after a second without `P`: no driver can do that for it.
 """
 
 from __future__ import annotations
@@ -31,11 +30,11 @@ import numpy as np
 
 
 class LineArm:
-    """Driver of an arm that answers lines; its subclasses carry the lines.
+    """Driver of an arm that answers lines; subclasses send and receive them.
 
     Attributes:
         n: number of springs and of chambers.
-        timeout_s: time [s] for a request and its answer; the two of a tick must fit into its period.
+        timeout_s: longest time for a request and its answer; a tick has two of them.
     """
 
     n = 9
@@ -47,13 +46,13 @@ class LineArm:
 
     def read_sensors(self) -> np.ndarray:
         """Return the readings (n,); see `ArmIO`."""
-        self._measured_kpa = np.full(self.n, np.nan)  # until they came
+        self._measured_kpa = np.full(self.n, np.nan)
         values = self._ask("R", 2 * self.n)
         self._measured_kpa = values[self.n :]
         return values[: self.n]
 
     def pressures(self) -> np.ndarray:
-        """Return the pressures (n,) [kPa] that came with the last readings; NaN where those did not come."""
+        """Return the pressures (n,) [kPa] that came with the last readings, NaN if none came."""
         return self._measured_kpa
 
     def write_pressures(self, pressure_kpa: np.ndarray) -> None:
@@ -64,26 +63,29 @@ class LineArm:
         """Send a line, its end included.
 
         Raises:
-            TimeoutError: it could not be sent within `timeout_s`.
+            TimeoutError: the line could not be sent within `timeout_s`.
         """
         raise NotImplementedError
 
     def receive(self, timeout_s: float) -> bytes:
-        """Return the next line, its end included, or nothing where none ended within the timeout [s]."""
+        """Return the next line, its end included, or nothing after the timeout [s]."""
         raise NotImplementedError
 
     def _ask(self, letter: str, size: int, values: Sequence[float] | np.ndarray = ()) -> np.ndarray:
         """Send a request and return the numbers (size,) of its answer.
 
         Raises:
-            TimeoutError: no answer came in time, or it is not of so many numbers.
+            TimeoutError: no answer came in time, or it has another number of values.
             ValueError: the arm refused it.
             OSError: the arm cannot be reached.
         """
+        # Request
         end_s = time.monotonic() + self.timeout_s
         self._count += 1
         request = " ".join([letter, str(self._count), *(f"{value:.6g}" for value in values)])
         self.send(f"{request}\n".encode("ascii"))
+
+        # Its answer; answers to earlier requests are skipped.
         while (left_s := end_s - time.monotonic()) > 0.0:
             line = self.receive(left_s).decode("ascii", "replace")
             head, count, *words = line.split() if line.endswith("\n") and len(line.split()) > 1 else ("", "")

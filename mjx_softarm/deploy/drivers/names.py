@@ -15,26 +15,27 @@ import numpy as np
 
 from mjx_softarm._support.errors import InputError
 
-_TWIN = "mjx_softarm.twin.names"  # imported by name and where it is asked for alone: it needs MuJoCo
+_TWIN = "mjx_softarm.twin.names"  # imported only when asked for, since it needs MuJoCo
 _METHODS = ("read_sensors", "write_pressures")
 
 
 class ArmError(InputError):
-    """A name of which no arm can be had; the message says why."""
+    """A name that opens no arm; the message says why."""
 
 
 def open_arm(name: str) -> Any:
     """Open an arm: an `ArmIO`, maybe with `pressures`, `motion_capture` or a clock of its own, `time_s`.
 
     Args:
-        name: `twin:SEED`, or in a pipe `twin:SEED:pipe300` or `twin:SEED:pipe250`; `twin:rod:SEED`, or of
-            another arm `twin:rod:SEED@ARM`; each with a payload as `twin:SEED:500g`; or
-            `package.module:Class`, whose class takes no
-            arguments; modules in the working directory are found.
+        name: `twin:SEED`; in a pipe, `twin:SEED:pipe300` or `twin:SEED:pipe250`; a rod, `twin:rod:SEED` or,
+            of
+            another arm, `twin:rod:SEED@ARM`; each with a payload as in `twin:SEED:500g`. Or
+            `package.module:Class`, a class without arguments; modules may be in the working directory.
 
     Raises:
-        ArmError: the name is malformed, nothing of this name can be imported, or it is no arm.
+        ArmError: the name is malformed, cannot be imported, or is no arm.
     """
+    # A twin
     module_name, _, item = name.partition(":")
     if not module_name or not item:
         raise ArmError(f"--arm: got {name!r}, expected twin:SEED or package.module:Class")
@@ -46,6 +47,8 @@ def open_arm(name: str) -> Any:
             raise ArmError(f"--arm: got {error}, expected {expected}") from error
         except (ValueError, FloatingPointError) as error:
             raise ArmError(f"--arm: {error}") from error
+
+    # A driver's class
     if (here := os.getcwd()) not in sys.path:
         sys.path.insert(0, here)
     try:
@@ -76,7 +79,7 @@ class Paced:
         return getattr(self._arm, name)
 
     def write_pressures(self, pressure_kpa: np.ndarray) -> None:
-        """Let a control period pass, then wait until it has; time lost before is not made up for."""
+        """Drive a control period and wait for its end; a late period delays all later ones."""
         self._arm.write_pressures(pressure_kpa)
         left_s = self._began_s + self._arm.time_s - time.monotonic()
         self._began_s -= min(left_s, 0.0)

@@ -7,7 +7,7 @@ from typing import Any
 
 from mjx_softarm.deploy.drivers import LineArm
 
-START_S = 5.0  # many boards begin anew when their port is opened, and take about 2 s
+START_S = 5.0  # longest start of a board; many restart as their port is opened, in about 2 s
 
 
 class SerialArm(LineArm):
@@ -15,7 +15,7 @@ class SerialArm(LineArm):
 
     Attributes:
         port: name of the port.
-        baud: bits per second. A tick's lines have some 350 characters: 115200 is too slow for 50 Hz.
+        baud: bits per second; 115200 is too slow for 50 Hz, since a tick's lines have some 350 characters.
     """
 
     port = "/dev/ttyACM0"

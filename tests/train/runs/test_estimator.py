@@ -9,7 +9,7 @@ import pytest
 
 from mjx_softarm import ArmSpec
 from mjx_softarm.control import TOLERANCE_M, Gains, saturated
-from mjx_softarm.deploy.belief import lost_chambers
+from mjx_softarm.deploy.belief import as_without
 from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.mjcf import build_model, spring_lengths
 from mjx_softarm.mechanics.params import ArmParams
@@ -119,12 +119,9 @@ def arms_at_rest(reference_m, payload_kg, dead):
 
 def found(distilled, end, commanded_kpa, reference_m):
     spring_m = end.spring_m + 4e-5 * np.random.default_rng(9).standard_normal(end.spring_m.shape)
-    return np.array(
-        [
-            lost_chambers(distilled.spring_model, Gains.from_spec(SPEC), *rows, TOLERANCE_M)
-            for rows in zip(commanded_kpa, reference_m, spring_m, strict=True)
-        ]
-    )
+    suspect = saturated(commanded_kpa, reference_m, spring_m, Gains.from_spec(SPEC), TOLERANCE_M)
+    rows = zip(commanded_kpa, spring_m, strict=True)
+    return suspect & np.array([as_without(distilled.spring_model, *row) for row in rows])
 
 
 @pytest.mark.parametrize("payload_kg", [0.0, 1.0])
