@@ -64,7 +64,7 @@ SHIPPED = Path(__file__).parent / "shipped/paper.npz"  # for the paper's arm; it
 
 @dataclass(frozen=True, eq=False)
 class Policy:
-    """A trained policy and all that its actions depend on; the module's docstring lists the entries."""
+    """A trained policy with all numbers that its actions depend on; the module lists the entries."""
 
     layers: tuple[Layer, ...]  # actor: observation to actions before tanh
     obs_scale: ObsScale
@@ -96,7 +96,7 @@ class Policy:
 
 
 class ArmModel(NamedTuple):
-    """Networks and poses that the arm's computer needs besides the specification."""
+    """Networks and poses of an arm that its computer needs besides the specification."""
 
     workspace: np.ndarray  # (m, 6) poses [mm, deg]
     estimator: PoseEstimator
@@ -151,7 +151,7 @@ def policy_from_actor(
 
 
 def _layers_from_flax(actor_params: Mapping[str, Any], n_actions: int) -> tuple[Layer, ...]:
-    """Return the actor's layers without its standard deviations; the one place that knows flax's names."""
+    """Return the actor's layers without its standard deviations; only this function knows flax's names."""
     dense = actor_params.get("params", {})
     names = [*(f"hidden_{k}" for k in range(len(dense) - 1)), "head"]
     if set(dense) != set(names):
@@ -166,8 +166,8 @@ def save_policy(path: str | Path, policy: Policy) -> None:
 
     Raises:
         SealedFileError: the policy is not valid, such as a weight that is not finite, or the file cannot be
-            written. A file that was there before is then still there.
-        TypeError: the provenance holds something that JSON has not.
+            written. An older file stays.
+        TypeError: the provenance holds a value that JSON does not have.
     """
     arrays = file_entries(policy)
     _unpack(arrays, str(path))
@@ -178,8 +178,8 @@ def load_policy(path: str | Path) -> Policy:
     """Read a policy and check all of it.
 
     Raises:
-        SealedFileError: the file cannot be read, is incomplete, damaged, of another program or of another
-            version, or an entry is missing, unknown, or of the wrong type, shape or range.
+        SealedFileError: the file cannot be read, is incomplete, damaged, of another program or version, or
+            an entry is missing, unknown, or has a wrong type, shape or range.
     """
     return _unpack(archive.read_sealed(Path(path), KIND, "python -m train export"), str(path))
 
@@ -212,6 +212,7 @@ def file_entries(policy: Policy) -> dict[str, np.ndarray]:
 
 
 def _unpack(arrays: Mapping[str, np.ndarray], source: str) -> Policy:
+    # Refuse other schemas first, since their entries may differ.
     entries = Entries(arrays, source)
     version = entries.take("schema_version", np.integer, ())
     if version != SCHEMA_VERSION:
@@ -223,6 +224,7 @@ def _unpack(arrays: Mapping[str, np.ndarray], source: str) -> Policy:
         spec = ArmSpec.from_dict(entries.table("spec_json"), f"{source}: spec_json")
     except SpecError as error:
         raise SealedFileError(str(error)) from error
+    # Take every entry with its type and shape.
     n = spec.n_chambers
     observation = entries.take("observation", np.str_, ())
     obs_layout = entries.take("obs_layout", np.str_, (None,))
@@ -250,6 +252,7 @@ def _unpack(arrays: Mapping[str, np.ndarray], source: str) -> Policy:
         n_actions=entries.take("n_actions", np.integer, ()),
         action_s=entries.take("action_s", np.float64, ()),
     )
+    # Check the numbers.
     layout = layouts(n).get(observation, ())
     limits = policy.sensor.lengths(np.stack(policy.actions[1:]))  # (2, n)
     readable = (limits.fault == SensorFault.OK.value) & (limits.length_m[0] < limits.length_m[1])

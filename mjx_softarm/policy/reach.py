@@ -1,9 +1,9 @@
-"""Nearest poses that an arm can take to goals, by the policy file's models of the arm as specified.
+"""Reachable poses nearest to goals, by the policy file's models of the arm.
 
-The nearest pose to a goal is searched over the pressures between their limits: pressures give springs, these
-the tip. Levenberg-Marquardt steps, from several starts at once; pressures at a limit that would leave it are
-held there. Poses that the arm reaches in simulation are found to about 0.4 mm. `begin`, `improve` and
-`nearest_of` take the symbols of `mjx_softarm.export` as well as NumPy's arrays.
+The search runs over the pressures between their limits: pressures give spring lengths, spring lengths give
+the tip pose. It takes Levenberg-Marquardt steps from several starts at once, and holds a pressure at its
+limit if a step would leave the range. Poses that the arm reaches in simulation are found to about 0.4 mm.
+`begin`, `improve` and `nearest_of` take NumPy arrays and the symbols of `mjx_softarm.export`.
 
 Source: Kanzow, Yamashita, Fukushima, "Levenberg-Marquardt methods with strong local convergence properties
 for solving nonlinear equations with convex constraints", J. Comput. Appl. Math. 172, 2004.
@@ -21,8 +21,8 @@ from mjx_softarm.sensing.pose import frame_from_pose, pose_from_frame
 from mjx_softarm.sensing.s2r import apply_correction, correction, inputs
 
 N_STARTS, N_STEPS = 4, 20
-_DIFFERENCE = 1e-3  # of the range of pressures
-_EASE, _STIFFEN = 0.2, 8.0  # factors of the damping after a step that helped, and after one that did not
+_DIFFERENCE = 1e-3  # step of the finite differences, as a share of the range of pressures
+_EASE, _STIFFEN = 0.2, 8.0  # factors of the damping after a step that helped, and after a step that did not
 _LEAST_DAMPING, _MOST_DAMPING = 1e-6, 1e3
 
 
@@ -43,6 +43,7 @@ def begin(policy: Policy, k: int) -> np.ndarray:
 
 def improve(policy: Policy, goal: Array, search: Array) -> Array:
     """Take one Levenberg-Marquardt step of a search (k * N_STARTS, n + 1) towards goals (k, 6) [mm, deg]."""
+    # Error of each row and its slope by finite differences.
     xp, n = array_namespace(goal, search), policy.spec.n_chambers
     share, damping = search[:, :n], search[:, n]
     target = _target(policy, goal, len(share))  # (rows, 12)
@@ -50,8 +51,10 @@ def improve(policy: Policy, goal: Array, search: Array) -> Array:
     beside = _at(policy, share[:, None] + _DIFFERENCE * np.eye(n)) - target[:, None]  # (rows, n, 12)
     slope = (beside - error[:, None]) / _DIFFERENCE
     gradient = xp.sum(slope * error[:, None], axis=-1)  # (rows, n)
+    # Pressures at a limit that would leave their range do not move.
     free = ~(((share <= 0.0) & (gradient > 0.0)) | ((share >= 1.0) & (gradient < 0.0)))
     slope, gradient = xp.where(free[..., None], slope, 0.0), xp.where(free, gradient, 0.0)
+    # Take the step where it helps; else only raise the damping.
     curvature = slope @ xp.swapaxes(slope, 1, 2) + damping[:, None, None] * np.eye(n)
     tried = xp.clip(share - _solved(curvature, gradient), 0.0, 1.0)
     helped = xp.sum((_at(policy, tried) - target) ** 2, axis=-1) < xp.sum(error**2, axis=-1)
@@ -89,12 +92,12 @@ def _at(policy: Policy, share: Array) -> Array:
 
 
 def _target(policy: Policy, goal: Array, n_rows: int) -> Array:
-    """Return the `_features` (n_rows, 12) of goals (k, 6), each for the same number of rows."""
+    """Return the `_features` (n_rows, 12) of goals (k, 6), each repeated for n_rows / k rows."""
     return _features(policy, *frame_from_pose(goal))[np.arange(n_rows) * len(goal) // n_rows]
 
 
 def _features(policy: Policy, position_m: Array, axes: Array) -> Array:
-    """Return 12 numbers (..., 12) whose differences are weighted errors, of a turn as its angle if small."""
+    """Return numbers (..., 12) of poses; the norm of a difference is the weighted error, for small turns."""
     xp = array_namespace(position_m, axes)
     axes = axes / xp.sqrt(xp.sum(axes**2, axis=-2))[..., None, :]
     turn = policy.reward.weight_per_deg * np.degrees(1.0) / np.sqrt(2.0) * axes

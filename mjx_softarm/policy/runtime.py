@@ -1,7 +1,7 @@
-"""The policy in NumPy: spring lengths, payload -> pose of the tip; pose, goal -> references of the springs.
+"""The policy in NumPy: spring lengths and payload give the tip's pose; pose and goal give references.
 
-Observation, sensors and networks are the functions that training uses. The functions here take JAX arrays
-and the symbols of `mjx_softarm.export` as well.
+Observation, sensors and networks are the functions of training. All functions here also take JAX arrays and
+the symbols of `mjx_softarm.export`.
 """
 
 from __future__ import annotations
@@ -23,28 +23,29 @@ from mjx_softarm.sensing.s2r import apply_correction, correction, distance, inpu
 class Reference(NamedTuple):
     """Spring references of the policy."""
 
-    readings: np.ndarray  # (..., n) of the sensors
-    length_m: np.ndarray  # (..., n) the same, as calibrated lengths: the reference of `control.pressures`
+    readings: np.ndarray  # (..., n) references as readings of the sensors
+    length_m: np.ndarray  # (..., n) references as calibrated lengths, for `control.pressures`
 
 
 class InMotion(NamedTuple):
     """Earlier lengths, references and integral of an arm in motion."""
 
-    before_m: Array  # (n,) lengths `rate_ticks` before; NaN if not known, as of an arm at rest
-    last_reference_m: Array  # (n,) references of the last action; NaN before the first
-    integral_kpa: Array  # (n,) of the sensor-space law
+    before_m: Array  # (n,) lengths `rate_ticks` earlier; NaN if not known, for example at rest
+    last_reference_m: Array  # (n,) references of the last action; NaN before the first action
+    integral_kpa: Array  # (n,) integral of the sensor-space law
 
 
 def tip_pose(policy: Policy, spring_m: Array, load_kg: Array | float) -> tuple[Array, Array]:
     """Return the tip pose of springs and a payload.
 
     Args:
-        policy: with the networks.
-        spring_m (n,) [m]: lengths.
+        policy: policy with the networks.
+        spring_m (n,) [m]: spring lengths.
         load_kg () [kg]: payload.
 
     Returns:
-        Pose (6,) [mm, deg], and `s2r.extrapolation` of it, or 0.
+        Pose (6,) [mm, deg], and its distance from the calibration as a share of the limit, or 0 without a
+        sim-to-real network.
     """
     frame = estimate_frame(policy.estimator, spring_m, load_kg)
     if policy.s2r is None:
@@ -57,14 +58,14 @@ def tip_pose(policy: Policy, spring_m: Array, load_kg: Array | float) -> tuple[A
 def sensed(
     policy: Policy, pose: Array, spring_m: Array, motion: InMotion, load_kg: Array | float
 ) -> Array | None:
-    """Return what a policy observes besides pose and goal: (k,) float32, or nothing.
+    """Return the entries (k,) that a policy observes besides pose and goal, float32; None if there are none.
 
     Args:
-        policy: one of any kind of observation.
-        pose (6,) [mm, deg]: of the tip, as `tip_pose` of the springs.
-        spring_m (n,) [m]: lengths.
-        motion: of the arm; a policy that does not observe it ignores it.
-        load_kg () [kg]: estimated payload, brought to those that the policy knows if it observes it.
+        policy: policy of any kind of observation.
+        pose (6,) [mm, deg]: tip pose, as `tip_pose` gives it.
+        spring_m (n,) [m]: spring lengths.
+        motion: earlier lengths, references and integral; used by policies that observe motion.
+        load_kg () [kg]: estimated payload; clipped to the range of training for policies that observe it.
     """
     xp = array_namespace(spring_m)
     if policy.observation == "pose":
@@ -88,7 +89,8 @@ def actor_output(policy: Policy, observation: Array) -> Array:
 def action_towards(policy: Policy, pose: Array, goal: Array, sensed: Array | None = None) -> Array:
     """Return the action (..., n) in [-1, 1] from a pose towards a goal (..., 6) [mm, deg], all float32.
 
-    `sensed` (..., k) is what the policy observes besides pose and goal, if it does.
+    `sensed` (..., k) holds the entries that the policy observes besides pose and goal, as `sensed` gives
+    them.
     """
     scale = ObsScale(*(np.asarray(value, np.float32) for value in policy.obs_scale))
     observation = observe(pose, goal, scale, policy.reward)
@@ -98,7 +100,7 @@ def action_towards(policy: Policy, pose: Array, goal: Array, sensed: Array | Non
 
 
 class PolicyRunner:
-    """The deterministic policy, as evaluated in training. It has no state.
+    """The deterministic policy, as training evaluates it; without state.
 
     Example: `PolicyRunner(load_policy("policy.npz")).act(pose, goal).length_m`.
     """
@@ -110,36 +112,35 @@ class PolicyRunner:
         """Return the spring references that bring the tip from a pose towards a goal.
 
         Args:
-            pose (..., 6) [mm, deg]: of the tip; see `mjx_softarm.sensing.pose`.
-            goal (..., 6) [mm, deg]: target of the tip; the leading axes broadcast against the pose's.
-            sensed (..., k): of the function `sensed`, for a policy that observes more; its leading
-                axes are broadcast to those of the poses.
+            pose (..., 6) [mm, deg]: tip pose; see `mjx_softarm.sensing.pose`.
+            goal (..., 6) [mm, deg]: target of the tip; leading axes broadcast with those of the pose.
+            sensed (..., k): entries from the function `sensed`, for a policy that observes them; leading axes
+                broadcast to those of the poses.
 
         Returns:
             Readings (..., n) and lengths (..., n) [m], both within the policy's limits.
 
         Raises:
-            ValueError: as `action` does.
+            ValueError: see `action`.
         """
         actions = self.policy.actions
         readings = actions.readings(self.action(pose, goal, sensed))  # (..., n)
         return Reference(readings, actions.sensor.lengths(readings).length_m)
 
     def action(self, pose: ArrayLike, goal: ArrayLike, sensed: ArrayLike | None = None) -> np.ndarray:
-        """Return the action (..., n) in [-1, 1], float32, that `act` maps to readings; arguments as there.
+        """Return the action (..., n) in [-1, 1], float32; arguments as those of `act`.
 
         Raises:
-            ValueError: pose or goal has the wrong shape or is not finite, or the actor overflows; what it
-                asks for would be springs without a length. `sensed` is missing, or is not observed, or has
-                the wrong shape.
+            ValueError: pose or goal has a wrong shape or is not finite, the actor overflows, or `sensed` is
+                missing, not observed, or has a wrong shape.
         """
         pose, goal = np.broadcast_arrays(_six("pose", pose), _six("goal", goal))
         n_more = len(self.policy.obs_layout) - OBS_SIZE
         if (None if sensed is None else np.shape(sensed)[-1:]) != ((n_more,) if n_more else None):
             came = "None" if sensed is None else f"shape {np.shape(sensed)}"
             expected = f"(..., {n_more})" if n_more else "None"
-            what = self.policy.observation
-            raise ValueError(f"sensed: got {came}, expected {expected}: the policy observes the {what}")
+            kind = self.policy.observation
+            raise ValueError(f"sensed: got {came}, expected {expected}: the policy observes the {kind}")
         if sensed is not None:
             sensed = np.broadcast_to(np.asarray(sensed, np.float32), (*pose.shape[:-1], n_more))
         action = action_towards(self.policy, pose, goal, sensed)

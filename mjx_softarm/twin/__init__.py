@@ -1,1 +1,1 @@
-"""Digital twins: simulated stand-ins for an arm that hide their parameters."""
+"""Digital twins: simulated arms with hidden parameters, in place of a real arm."""

@@ -1,11 +1,11 @@
-"""The twin: a simulated stand-in for the physical arm, reached through `ArmIO` and logs alone.
+"""The twin: a simulated arm in place of a real one, reached only through `ArmIO` and logs.
 
-A finer model than training's, with parts that are off, chambers with hysteresis, joints with friction, air
-that has to be pumped and sensors that are noisy. Training and calibration never import it. Its parameters
-are drawn from one integer seed and stay private; `describe` tells how they are distributed.
+Its model is finer than training's: inexact parts, chambers with hysteresis, joints with friction, pumped
+air and noisy sensors. Training and calibration never import it. Its parameters are drawn from one integer
+seed and stay private; `describe` tells their distributions.
 
-Clock: simulated time passes only in `write_pressures`, which advances it by one control period of the
-specification. So a loop that reads, computes and writes runs at that rate however fast the machine is.
+Clock: simulated time passes only in `write_pressures`, by one control period of the specification. So a loop
+that reads, computes and writes runs at the control rate on any machine.
 """
 
 from __future__ import annotations
@@ -45,18 +45,18 @@ from mjx_softarm.twin.model import (
 from mjx_softarm.twin.pipe import WallForce, contact_force, is_container
 from mjx_softarm.twin.pneumatics import Pneumatics
 
-# Chambers: four stops of equal force; 3 % of the elastic force of a chamber at its shortest.
+# Chambers: four stops of equal force; together 3 % of the elastic force of the shortest chamber.
 HYSTERESIS_LIMIT_N = 1.5
 HYSTERESIS_STROKES_M = (0.003, 0.006, 0.012, 0.024)
-# Joints of a link (slide, hinges): Coulomb friction and the displacement at which it slides.
+# Joints of a link (slide, hinges): Coulomb friction, and the displacement at which the joint slides.
 FRICTION_LIMIT = (0.3, 0.01, 0.01)  # [N, N m, N m]
 FRICTION_STROKE = (2e-4, 5e-3, 5e-3)  # [m, rad, rad]
 
-REST_S = 4.0  # hanging at atmospheric pressure before time starts
+REST_S = 4.0  # time for which the arm hangs at atmospheric pressure before its clock starts
 
 
 class Twin:
-    """One arm and its pump, sensors and cameras; an `ArmIO` and a `MotionCapture`.
+    """One arm with its pump, sensors and cameras; an `ArmIO` and a `MotionCapture`.
 
     Example: `twin = Twin(7)`, then `twin.read_sensors()` and `twin.write_pressures(p)` in turn.
     """
@@ -73,13 +73,14 @@ class Twin:
         """Hang the arm up, unpressurised, and wait until it is at rest.
 
         Args:
-            seed: chooses the twin, 0 or greater.
-            spec: the nominal arm that the twin deviates from, the paper's by default; its payload is ignored.
-            payload_kg: attached from the start.
-            session: chooses the noise.
-            build: how far from ideal.
-            pipe: around the arm, in the motion capture's frame; without one the arm touches nothing.
+            seed: integer >= 0 that chooses the twin.
+            spec: nominal arm that the twin deviates from, by default the paper's; its payload is ignored.
+            payload_kg: payload at the start.
+            session: integer that chooses the noise.
+            build: scales of the deviations from an ideal arm.
+            pipe: pipe around the arm, in the motion capture's frame; without a pipe the arm touches nothing.
         """
+        # Draw the parts and compile the model.
         spec = spec or ArmSpec.default()
         self._parts = draw_parts(seed, spec, build)
         self._build = build
@@ -91,6 +92,7 @@ class Twin:
         self._wall_force = WallForce(0.0, 0.0)
         self._base_m = self._parts.base_position_m
         self._base_rotation = rotation_matrix(self._parts.base_tilt_rad)
+        # Start clock, losses and air.
         self._steps = round(1.0 / (spec.control.rate_hz * self._model.opt.timestep))
         self.time_s = 0.0
         mujoco.mj_step1(self._model, self._data)
@@ -101,6 +103,7 @@ class Twin:
         )
         now_m, timestep_s = chamber_lengths(self._data), self._model.opt.timestep
         self._air = Pneumatics(area, slope, spec.geometry.section_length_m, now_m, timestep_s)
+        # Let the arm come to rest.
         self.attach(payload_kg)
         for _ in range(round(REST_S * spec.control.rate_hz)):
             self.write_pressures(np.zeros(spec.n_chambers))
@@ -117,7 +120,7 @@ class Twin:
         self._hysteresis = StopOperators(limit / strokes, limit, chamber_lengths(self._data))
 
     def read_sensors(self) -> np.ndarray:
-        """Return what the springs' sensors read now (n,), noisy and in the converter's steps; see `ArmIO`."""
+        """Return readings (n,) of the springs' sensors: noisy, in steps of the converter; see `ArmIO`."""
         sensor = self._parts.sensor
         true = sensor.readings(spring_lengths(self._data))
         noisy = true + self._draw(sensor.noise, len(true))
@@ -129,18 +132,18 @@ class Twin:
         self._wall_force = WallForce(0.0, 0.0)
         for _ in range(self._steps):
             self._step()
-        if self._data.warning.number.any():  # MuJoCo would start anew by itself
+        if self._data.warning.number.any():  # MuJoCo would reset the state by itself
             raise FloatingPointError(
                 f"twin: got an unstable state at {self.time_s:g} s, expected a stable one"
             )
         self.time_s += self._steps * self._model.opt.timestep
 
     def pressures(self) -> np.ndarray:
-        """Return pressures (n,) [kPa] that the regulators' sensors measure in the chambers now."""
+        """Return pressures (n,) [kPa] in the chambers, as the regulators' sensors measure them."""
         return self._air.pressure_kpa + self._draw(PRESSURE_NOISE_KPA, len(self._air.pressure_kpa))
 
     def motion_capture(self) -> Capture:
-        """Return the tip and the rings at each third of a section, from the first to the tip."""
+        """Return the tip, and markers on the rings at each third of a section, from the base to the tip."""
         spec, data = self._parts.spec, self._data
         n_markers = MARKERS_PER_SECTION * spec.structure.n_sections
         thirds = np.arange(1, n_markers + 1) * spec.structure.links_per_section / MARKERS_PER_SECTION
@@ -157,10 +160,10 @@ class Twin:
         return Capture(tip_m + noise_m[0], quaternion, marker_m + noise_m[1:], spring_m)
 
     def attach(self, payload_kg: float) -> None:
-        """Hang a payload to the finger tips, in place of what hung there.
+        """Hang a payload to the finger tips, in place of an earlier payload.
 
         Raises:
-            ValueError: a mass that is negative or not finite.
+            ValueError: the mass is negative or not finite.
         """
         payload_kg = checked_payload(payload_kg)
         body = self._model.body("payload").id
@@ -174,10 +177,10 @@ class Twin:
         self.attach(0.0)
 
     def wall_force_n(self) -> WallForce:
-        """Return how hard the arm pressed against the pipe at most in the last control period.
+        """Return the largest contact forces in the last control period.
 
         Returns:
-            Sums [N] of the normal contact forces of the walls, and of the containers; zeros without a pipe.
+            Sums [N] of the normal forces on the walls, and on the containers; zeros without a pipe.
         """
         return self._wall_force
 
@@ -185,16 +188,16 @@ class Twin:
         """Return a `mjx_softarm.mechanics.render.Renderer` of this twin, for `draw`.
 
         Raises:
-            RenderError: there is no OpenGL to draw with.
+            RenderError: OpenGL is missing.
         """
         from mjx_softarm.mechanics.render import Renderer
 
         return Renderer(self._model, width, height)
 
     def draw(self, renderer: Any) -> np.ndarray:
-        """Draw the twin as it is now: RGB, (height, width, 3) uint8.
+        """Return a picture of the twin: RGB, (height, width, 3) uint8.
 
-        A pipe is drawn cut open, seen from the front, along +y; a payload as a ball at the finger tips.
+        A pipe is cut open and seen from the front, along +y. A payload is a ball at the finger tips.
         """
         from mjx_softarm.mechanics.render import Camera
 
@@ -206,7 +209,7 @@ class Twin:
         )
 
     def describe(self) -> dict[str, Any]:
-        """Return how the twins are distributed, for reports: nothing about the one that was drawn."""
+        """Return the distributions of the twins' parts, for reports; nothing about this twin's own parts."""
         sensor = self._parts.sensor
         return {
             "gap": self._build.gap,
@@ -226,7 +229,7 @@ class Twin:
         }
 
     def _step(self) -> None:
-        """Take one time step; lengths and positions in the data are those of its end."""
+        """Take one time step; afterwards the data hold the lengths and positions at its end."""
         data, n = self._data, len(self._parts.hysteresis)
         length_m = chamber_lengths(data)
         data.ctrl[:n] = self._air.step(length_m)

@@ -1,12 +1,11 @@
-"""Rate-independent hysteresis: springs in series with Coulomb sliders, many of them in parallel.
+"""Rate-independent hysteresis: several stop operators in parallel, each a spring in series with a slider.
 
-Each of these stop operators follows the displacement x elastically until its force reaches its limit, then
-slides:
+A stop operator follows the displacement x elastically until its force reaches its limit, then slides:
 
     f'  = clip(f + k (x' - x), -limit, limit)
 
-Their sum is the Prandtl-Ishlinskii model. It is passive: what a slider takes up it never gives back, and what
-a spring stores it gives back once. A single stop is Coulomb friction with an elastic start.
+The sum of the forces is the Prandtl-Ishlinskii model. It is passive: a slider only dissipates energy, and a
+spring returns the energy that it stored. A single stop is Coulomb friction with an elastic start.
 
 Source: Brokate, Sprekels, "Hysteresis and Phase Transitions", Springer 1996, chapter 2.
 """
@@ -23,9 +22,9 @@ class StopOperators:
         """Start without force.
 
         Args:
-            stiffness (n, m): of each spring, force per displacement.
-            limit (n, m): greatest force of each slider.
-            x (n,): displacements now.
+            stiffness (n, m): stiffness of each spring, force per displacement.
+            limit (n, m): largest force of each slider.
+            x (n,): displacements at the start.
         """
         self._stiffness, self._low, self._high = stiffness, -limit, limit
         self._x = np.array(x, float)

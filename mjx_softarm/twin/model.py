@@ -1,13 +1,13 @@
 """The twin's body: a perturbed arm, drawn from a seed, as a MuJoCo model.
 
-Training's model has four links per section and ideal parts. The twin has ten, and each part is off by its own
-draw from `Tolerances`: chambers, rings and holes, the sections' mounting, the base, masses, springs. All
-standard deviations are multiplied by one number, `GAP`.
+Training's model has four links per section and ideal parts. The twin has ten links per section, and each
+part deviates by its own draw from `Tolerances`: chambers, rings and holes, the sections' mounting, the
+base, masses, springs. One number, `GAP`, multiplies all standard deviations.
 
-How `GAP` was set: spring lengths that bring the tip of training's model to the 40 points of the paper's
-circle within 0.01 mm were given to the sensor-space law on the twins 0 to 5, springs calibrated, no S2R.
-Their mean tip error is 21 mm; so large is the paper's root mean square. It is not touched again. The
-experiments use three of these twins.
+How `GAP` was set: the sensor-space law on twins 0 to 5, with calibrated springs and no sim-to-real network,
+was given the spring lengths that bring training's model to the 40 points of the paper's circle within 0.01
+mm. The mean tip error is 21 mm, the root mean square that the paper reports. `GAP` has not been changed
+since.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from mjx_softarm.twin.pipe import add_pipe
 
 GAP = 1.9
 LINKS_PER_SECTION = 10
-MAX_TIMESTEP_S = 0.005  # the tip within 0.13 mm RMS of 0.00125 s, over 30 s of random commands
+MAX_TIMESTEP_S = 0.005  # tip within 0.13 mm RMS of steps of 0.00125 s, over 30 s of random commands
 
 
 @dataclass(frozen=True)
 class Tolerances:
-    """Standard deviations at a gap of 1; relative where no unit is named."""
+    """Standard deviations at a gap of 1; a field without a unit is relative."""
 
     chamber_stiffness: float = 0.03  # per chamber
     chamber_area: float = 0.015  # per chamber
@@ -46,16 +46,16 @@ class Tolerances:
     gripper_mass: float = 0.02
     hole_angle_deg: float = 2.0  # per chamber, and per spring
     hole_radius_m: float = 0.0015  # per chamber, and per spring
-    ring_offset_m: float = 0.002  # per section and axis: the rings' centre off the section's axis
-    section_twist_deg: float = 1.75  # per section, against the one above
-    base_tilt_deg: float = 0.9  # per axis, against the frame of the motion capture
+    ring_offset_m: float = 0.002  # per section and axis: offset of the rings' centre from the section's axis
+    section_twist_deg: float = 1.75  # per section, against the section above
+    base_tilt_deg: float = 0.9  # per axis, against motion capture's frame
     base_offset_m: float = 0.003  # per axis
     spring_beta: float = 0.01  # per spring
     spring_delta_m: float = 0.00075  # per spring
 
 
 class Build(NamedTuple):
-    """Distance of the twin from an ideal arm; tests set some of these to zero."""
+    """Scales of the twin's deviations from an ideal arm; tests set some of them to zero."""
 
     gap: float = GAP  # scale of the tolerances
     losses: float = 1.0  # scale of hysteresis and joint friction
@@ -69,8 +69,8 @@ AS_BUILT = Build()
 class Parts(NamedTuple):
     """Random parts of one twin."""
 
-    spec: ArmSpec  # chambers, springs, masses
-    sensor: Sensor  # with the springs' own beta and delta
+    spec: ArmSpec  # specification with the drawn chambers, springs and masses
+    sensor: Sensor  # sensors with the drawn beta and delta of each spring
     hole_m: dict[str, np.ndarray]  # "chamber", "spring" -> (n, 2) in the section's frame
     twist_rad: np.ndarray  # (n_sections,)
     backbone: np.ndarray  # (n_sections,) factor of the stiffness
@@ -81,7 +81,7 @@ class Parts(NamedTuple):
 
 
 def draw_parts(seed: int, spec: ArmSpec, build: Build) -> Parts:
-    """Draw the parts of the twin of a seed; the scales of noise and losses do not change them."""
+    """Draw the parts of a twin from its seed; they do not depend on the scales of noise and losses."""
     rng = np.random.default_rng(seed)
     std = scaled_tolerances(build.gap)
     n, n_sections = spec.n_chambers, spec.structure.n_sections
@@ -92,6 +92,7 @@ def draw_parts(seed: int, spec: ArmSpec, build: Build) -> Parts:
     def per_chamber(value, deviation: float) -> tuple[float, ...]:
         return tuple(np.array(spec.per_chamber(value)) * (1.0 + off(deviation, n)))
 
+    # Chambers, springs and masses.
     chambers, sensor = spec.chambers, spec.sensor
     area_factor = 1.0 + off(std.chamber_area, n)
     delta_m = np.array(spec.per_chamber(sensor.delta_m)) + off(std.spring_delta_m, n)
@@ -108,6 +109,7 @@ def draw_parts(seed: int, spec: ArmSpec, build: Build) -> Parts:
         mass={"gripper_kg": spec.mass.gripper_kg * (1.0 + off(std.gripper_mass)), "payload_kg": 0.0},
     )
     beta = np.array(per_chamber(sensor.beta, std.spring_beta))
+    # Holes in the rings, and the base.
     ring_m = np.repeat(off(std.ring_offset_m, n_sections, 2), N_CHAMBERS_PER_SECTION, axis=0)
     angle = np.radians(spec.geometry.first_chamber_deg) + 2 * np.pi * np.arange(n) / N_CHAMBERS_PER_SECTION
     hole_m = {}
@@ -118,7 +120,8 @@ def draw_parts(seed: int, spec: ArmSpec, build: Build) -> Parts:
         turned = angle + np.radians(off(std.hole_angle_deg, n))
         on_circle = np.stack([np.cos(turned), np.sin(turned)], axis=-1)
         hole_m[kind] = (radius_m + off(std.hole_radius_m, n))[:, None] * on_circle + ring_m
-    tilt_rad = np.radians(off(std.base_tilt_deg, 3)) * [1.0, 1.0, 0.0]  # about z: the first section's twist
+    # The base is not turned about z, because the twist of the first section does it.
+    tilt_rad = np.radians(off(std.base_tilt_deg, 3)) * [1.0, 1.0, 0.0]
     return Parts(
         spec=perturbed,
         sensor=dataclasses.replace(spec.spring_sensor, beta=beta, delta_m=delta_m),
@@ -138,16 +141,18 @@ def scaled_tolerances(gap: float) -> Tolerances:
 
 
 def build_twin(parts: Parts, pipe: CrossPipe | None = None) -> mujoco.MjModel:
-    """Compile the model, in the frame of the arm's own base, maybe inside a pipe; see `twin_pipe`.
+    """Compile the model in the frame of the arm's own base, with a pipe if there is one.
 
     Besides the objects of `mjx_softarm.mechanics.mjcf` it has an actuator `loss{i}` on each chamber's
-    tendon, whose control is a force [N]. Pressures are not clipped: that is for the regulators.
+    tendon, whose control is a force [N]. Pressures are not clipped, because the regulators do it.
     """
+    # Time step, and gravity in the tilted base.
     spec, per_section = parts.spec, parts.spec.structure.links_per_section
     mjspec = build_spec(spec)
     period_s = 1.0 / spec.control.rate_hz
     mjspec.option.timestep = period_s / math.ceil(period_s / MAX_TIMESTEP_S - 1e-9)
     mjspec.option.gravity = -GRAVITY_M_S2 * rotation_matrix(parts.base_tilt_rad)[2]
+    # Masses, stiffnesses and twists of the links.
     for link in range(spec.n_links):
         section, first = divmod(link, per_section)
         body = mjspec.body(f"link{link}")
@@ -159,6 +164,7 @@ def build_twin(parts: Parts, pipe: CrossPipe | None = None) -> mujoco.MjModel:
         if first == 0:
             half = parts.twist_rad[section] / 2
             body.quat = [np.cos(half), 0.0, 0.0, np.sin(half)]
+    # Holes, and actuators for the losses.
     for chamber in range(spec.n_chambers):
         _mount(mjspec, chamber, parts, per_section)
         mjspec.actuator(f"chamber{chamber}").ctrllimited = False
@@ -170,7 +176,7 @@ def build_twin(parts: Parts, pipe: CrossPipe | None = None) -> mujoco.MjModel:
 
 
 def _mount(mjspec: mujoco.MjSpec, chamber: int, parts: Parts, per_section: int) -> None:
-    """Move the holes of a chamber and of its spring; the section's first plate is not twisted with it."""
+    """Move the holes of a chamber and of its spring; the section's twist does not turn its first plate."""
     section = chamber // N_CHAMBERS_PER_SECTION
     cos, sin = np.cos(parts.twist_rad[section]), np.sin(parts.twist_rad[section])
     for kind, hole_m in parts.hole_m.items():

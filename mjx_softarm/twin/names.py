@@ -15,10 +15,10 @@ ROD = "rod"
 def twin_of(name: str) -> Twin | RodTwin:
     """Make the twin of a name: `SEED`, `SEED:PIPE`, `rod:SEED`, `rod:SEED@ARM`; with a payload `SEED:500g`.
 
-    Rods are of any arm, as `--spec` names it; the others have the losses of the paper's arm.
+    Rods can be of any arm, named as for `--spec`; other twins are of the paper's arm.
 
     Raises:
-        ValueError: the name is malformed, there is no such arm, or the arm does not fit into the pipe.
+        ValueError: the name is malformed, the arm is unknown, or the arm does not fit into the pipe.
     """
     name, payload_kg = _without_payload(name)
     if name.startswith(f"{ROD}:"):

@@ -1,12 +1,12 @@
-"""The pipe around the twin: walls and containers that its rings and its gripper touch, and how hard.
+"""The pipe around the twin: walls and containers, and the forces of their contacts with rings and gripper.
 
-Walls are planks: the sides of a prism around each of the two cylinders. Where these meet, a wall of the
-vertical pipe ends at |z - centre| = |x|, and so does one of the horizontal pipe, since at the same y both are
-as far from their axes. The prisms lie outside the cylinders, by 0.9 % of the radius at their edges, so what
-is clear of the pipe touches no plank.
+Walls are planks: the sides of a prism around each of the two cylinders. At their intersection both walls
+end at |z - centre| = |x|, because at the same y both are equally far from their axes. The prisms lie
+outside the cylinders, by 0.9 % of the radius at the edges, so a body with clearance in the pipe touches no
+plank.
 
-The arm touches as a row of balls as wide as the rings. Near the tip a ball would reach past the gripper, so
-the last rings are rounded rims instead. Only arm and pipe touch: nothing of the arm touches the arm.
+The arm's contact bodies are balls as wide as the rings. Near the tip a ball would reach past the gripper, so
+the last rings are rounded rims instead. The arm touches the pipe, never itself.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ from mjx_softarm.mechanics.body import gripper_boxes, rim_points, ring_radius_m
 from mjx_softarm.mechanics.pipe import CrossPipe
 from mjx_softarm.spec import ArmSpec
 
-N_PLANKS = 24  # around a branch; with a multiple of four none lies across the plane of the two axes
+N_PLANKS = 24  # planks around a branch; a multiple of four puts none across the plane of the two axes
 THICKNESS_M = 0.04
-OVERLAP_M = 0.02  # of a plank, behind its neighbours' faces: what presses in at a seam gets out inwards
+OVERLAP_M = 0.02  # overlap of planks behind their faces: a body in a seam is pushed inwards
 RIM_ROUNDING_M = 0.01
-FLOOR_BELOW_M = 0.05  # a container's floor, below the finger tips: room for what they hold
-LEDGE_M = 0.02  # between the crossing and the floors left and right
-END_HEIGHT_M = 0.05  # a side container's outer end, which stands at the outlet, above its floor
+FLOOR_BELOW_M = 0.05  # height of the finger tips above a container's floor: room for an object
+LEDGE_M = 0.02  # distance of the left and right floors from the crossing
+END_HEIGHT_M = 0.05  # height of a side container's outer end, at the outlet, above its floor
 SHEET_M = 0.02  # thickness of floors and ends
 
-# Contacts. Friction as of plastics on each other. The time constant is three of the twin's time steps (MuJoCo
-# wants two or more); impedances near 1 let a wall yield to a load at rest by less than 1 mm.
+# Contacts: friction of plastics; a time constant of three time steps (MuJoCo wants two or more); impedances
+# near 1, with which a wall yields to a load at rest by less than 1 mm.
 FRICTION = 0.4
 TIME_CONSTANT_S = 0.015
 IMPEDANCE = (0.95, 0.99, 0.001, 0.5, 2.0)
 
-WALL, CONTAINER = "wall", "container"  # how the names of their geometries begin
-_UNSEEN = 3  # a group that pictures leave out
+WALL, CONTAINER = "wall", "container"  # prefixes of the names of geometries
+_UNSEEN = 3  # group of geometries that pictures leave out
 _WALL_COLOUR = [0.56, 0.58, 0.62, 1.0]
 _CONTAINER_COLOURS = {
     "left": [0.25, 0.50, 0.80, 1.0],
@@ -59,15 +59,15 @@ def add_pipe(
     """Add a pipe to an arm's model and let the arm touch it.
 
     Args:
-        mjspec: from `mjx_softarm.mechanics.mjcf.build_spec`, in the frame of the arm's own base.
-        pipe: in the base frame, which is the motion capture's.
-        spec: of the arm.
+        mjspec: model from `mjx_softarm.mechanics.mjcf.build_spec`, in the frame of the arm's own base.
+        pipe: pipe in the base frame, which is motion capture's frame.
+        spec: the arm.
         base_m (3,) [m], base_rotation (3, 3): the arm's own base in the base frame.
     """
     off = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     mjspec.option.disableflags &= ~int(off)
     mjspec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC  # the first force of a contact is the normal one
-    mjspec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE  # faster: most joints move most contacts
+    mjspec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE  # faster, because most joints move most contacts
     for name, corner_m, colour, group in (*_walls(pipe), *_containers(pipe)):
         mesh = mjspec.add_mesh(name=name, uservert=((corner_m - base_m) @ base_rotation).ravel())
         solid = mjspec.worldbody.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name)
@@ -77,13 +77,14 @@ def add_pipe(
 
 
 def _walls(pipe: CrossPipe):
-    """Yield (name, corners (8, 3) [m], colour, group) of planks; pictures leave out the half at y < 0."""
+    """Yield (name, corners (8, 3) [m], colour, group) of planks; pictures leave out the half with y < 0."""
     branches = {  # length, and the branch's (across, y, along) -> (x, y, z) from the centre
         "up": (pipe.top_z_m - pipe.centre_z_m, lambda a, y, s: (a, y, s)),
         "down": (pipe.branch_m, lambda a, y, s: (a, y, -s)),
         "right": (pipe.branch_m, lambda a, y, s: (s, y, a)),
         "left": (pipe.branch_m, lambda a, y, s: (-s, y, a)),
     }
+    # A plank's corners across the wall, then at its two ends along the branch.
     reach = pipe.radius_m * np.tan(np.pi / N_PLANKS) + OVERLAP_M
     depth, aside = (x.ravel() for x in np.meshgrid([0.0, THICKNESS_M], [-reach, reach]))
     centre = np.array([0.0, 0.0, pipe.centre_z_m])
@@ -100,9 +101,9 @@ def _walls(pipe: CrossPipe):
 
 
 def _containers(pipe: CrossPipe):
-    """Yield (name, corners (k, 3) [m], colour, group) of the floors, and of the outer ends left and right."""
+    """Yield (name, corners (k, 3) [m], colour, group) of the floors, and of the left and right outer ends."""
     at = pipe.containers()
-    width = np.sqrt(pipe.radius_m**2 - (pipe.drop_m + FLOOR_BELOW_M) ** 2)  # half of it
+    width = np.sqrt(pipe.radius_m**2 - (pipe.drop_m + FLOOR_BELOW_M) ** 2)  # half the floor's width
     for side in ("left", "right"):
         outwards, floor_z = np.sign(at[side][0]), at[side][2] - FLOOR_BELOW_M
         for part, x, z in (
@@ -117,11 +118,11 @@ def _containers(pipe: CrossPipe):
 
 
 def _add_skin(mjspec: mujoco.MjSpec, spec: ArmSpec) -> None:
-    """Add what the arm touches with: balls or rims at the rings, and the gripper as it is drawn."""
+    """Add the arm's contact bodies: balls or rims at the rings, and the gripper's boxes."""
     radius = ring_radius_m(spec)
     rim = rim_points(radius - RIM_ROUNDING_M)
     for link in range(spec.n_links):
-        below = (spec.n_links - 1 - link) * spec.link_length_m  # the tip, below this link's ring
+        below = (spec.n_links - 1 - link) * spec.link_length_m  # depth of the tip below this link's ring
         ring = mjspec.geom(f"ring{link + 1}").pos
         centres, size = (ring + rim, RIM_ROUNDING_M) if below < radius else (ring[None], radius)
         for k, centre in enumerate(centres):
@@ -139,12 +140,12 @@ def _make_solid(geom: mujoco.MjsGeom, contype: int, conaffinity: int) -> None:
 
 
 def is_container(model: mujoco.MjModel) -> np.ndarray:
-    """Return which geoms (ngeom,) are containers."""
+    """Mask (ngeom,) the geometries of containers."""
     return np.array([model.geom(k).name.startswith(CONTAINER) for k in range(model.ngeom)])
 
 
 def contact_force(data: mujoco.MjData, container: np.ndarray) -> WallForce:
-    """Return the forces of the time step in the data; `container` is from `is_container`."""
+    """Return the contact forces of the last time step; `container` is from `is_container`."""
     if data.ncon == 0:
         return WallForce(0.0, 0.0)
     contact = data.contact

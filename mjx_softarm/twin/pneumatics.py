@@ -20,9 +20,9 @@ class Pneumatics:
         Args:
             area_m2 (n,) [m^2]: effective areas at the length `rest_m`.
             slope_m (n,) [m]: d area / d length.
-            rest_m: length at which the areas are given.
-            length_m (n,) [m]: lengths now.
-            timestep_s: of `step`; the dead time is rounded to whole steps.
+            rest_m: length of the effective areas.
+            length_m (n,) [m]: lengths at the start.
+            timestep_s: duration of a `step`; the dead time is rounded to whole steps.
         """
         self._bellows = area_m2, slope_m, rest_m
         self._timestep_s = timestep_s
@@ -32,15 +32,15 @@ class Pneumatics:
         self._under_way = deque([self._commanded_kpa] * (steps + 1), steps + 1)
 
     def volume_m3(self, length_m: np.ndarray) -> np.ndarray:
-        """Return volumes (n,) of chambers of lengths (n,)."""
+        """Return volumes (n,) [m^3] of chambers with lengths (n,) [m]."""
         return pneumatics.volume_m3(length_m, *self._bellows)
 
     def command(self, pressure_kpa: np.ndarray) -> None:
-        """Set what the pressures (n,) [kPa, relative to the atmosphere] are regulated to."""
+        """Command pressures (n,) [kPa], relative to the atmosphere."""
         self._commanded_kpa = np.array(pressure_kpa, float)
 
     def step(self, length_m: np.ndarray) -> np.ndarray:
-        """Take a time step in chambers (n,) [m] long; return pressures (n,) [kPa] above the atmosphere's."""
+        """Take a time step at lengths (n,) [m]; return pressures (n,) [kPa], relative to the atmosphere."""
         self._under_way.append(self._commanded_kpa)
         volume, command_kpa = self.volume_m3(length_m), self._under_way[0]
         self._gas_m3 = pneumatics.regulated(self._gas_m3, volume, command_kpa, self._timestep_s)

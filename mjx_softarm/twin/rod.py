@@ -1,21 +1,21 @@
 """A hanging arm as a geometrically exact rod: bending, torsion, shear and extension, with fibres along it.
 
-This is another mechanics than that of training, written without it: no links, hinges or tendons. The rod is
-cut into elements of constant strain: curvature and twist kappa, shear and extension nu, both in the element's
-own axes. With h an element's length, R_e the axes where it begins (turned by the joint, where a section
-begins) and exp the rotation by a vector,
+This mechanics is independent of training's: no links, hinges or tendons. The rod is cut into elements of
+constant strain: curvature and twist kappa, shear and extension nu, both in the element's own axes. h is the
+length of an element, R_e are the axes at its beginning (turned by the joint at the beginning of a section),
+and exp is the rotation by a vector:
 
     R_{e+1} = R_e exp(h kappa),    x_{e+1} = x_e + h R_e exp(h kappa / 2) nu,
 
-where nu = (0, 0, -1) at rest, as the arm hangs towards -z. Chambers and springs are fibres that are glued to
-the cross-sections, so each piece of one stretches by itself: a piece at r is h |nu + kappa x r| long, and
-lambda is that over h, times the section's length L. A chamber pulls with
+At rest nu = (0, 0, -1), because the arm hangs towards -z. Chambers and springs are fibres glued to the
+cross-sections, so each piece stretches by itself: a piece at r has the length h |nu + kappa x r|. lambda is
+this length divided by h, times the section's length L. A chamber pulls with
 
     f = k d (1 + c (d / L)^2) - p (A + A' (lambda - L)),    d = lambda - rest length,
 
-so it hardens. The motion is overdamped, without inertia: C dq/dt = -dV/dq with the potential V and damping
-C in proportion to the stiffness of the straight rod. A step is linearly implicit Euler's; where the rod comes
-to rest, dV/dq is zero whatever the step.
+so it hardens. The motion is overdamped, without inertia: C dq/dt = -dV/dq, with the potential V and the
+damping C in proportion to the stiffness of the straight rod. A step is a linearly implicit Euler step. At
+rest dV/dq is zero for every step size.
 
 Source: Simo, "A finite strain beam formulation", Comput. Methods Appl. Mech. Eng. 49 (1985); elements of
 constant strain as in Renda et al., "Discrete Cosserat approach", IEEE T-RO 34 (2018).
@@ -29,12 +29,12 @@ import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 GRAVITY_M_S2 = 9.81
-N_STRAINS = 6  # of an element: curvature x, y, twist [1/m], shear x, y, extension
+N_STRAINS = 6  # strains of an element: curvature x, y, twist [1/m], shear x, y, extension
 REST_STRAIN = np.array([0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
 CREEP_S = 0.25  # time constant of the damping
-LONGEST_S = 400.0  # steps on the way to rest
-REST_TOLERANCE = 1e-9  # largest entry of dV/dq [N m^2, N m]
-_CROSS = np.zeros((3, 9))  # from a vector to the matrix of its cross product
+LONGEST_S = 400.0  # longest step on the way to rest
+REST_TOLERANCE = 1e-9  # largest entry of dV/dq at rest [N m^2, N m]
+_CROSS = np.zeros((3, 9))  # maps a vector to the matrix of its cross product
 _CROSS[0, [5, 7]] = _CROSS[1, [6, 2]] = _CROSS[2, [1, 3]] = -1.0, 1.0
 
 
@@ -47,38 +47,34 @@ class RodParts(NamedTuple):
     torsion: np.ndarray  # (s,) G J [N m^2]
     shear: np.ndarray  # (s,) G A [N]
     extension: np.ndarray  # (s,) E A [N]
-    joint: np.ndarray  # (s, 3, 3) turn of each section against the end of the one above
-    chamber_hole_m: np.ndarray  # (s, 3, 2) x and y in the section's cross-sections
-    spring_hole_m: np.ndarray  # (s, 3, 2)
+    joint: np.ndarray  # (s, 3, 3) turn of each section against the end of the section above
+    chamber_hole_m: np.ndarray  # (s, 3, 2) x and y in the cross-sections
+    spring_hole_m: np.ndarray  # (s, 3, 2) x and y in the cross-sections
     stiffness: np.ndarray  # (s, 3) k [N/m] of the chambers
     hardening: np.ndarray  # (s, 3) c
-    rest_m: np.ndarray  # (s, 3) of the chambers
+    rest_m: np.ndarray  # (s, 3) rest lengths of the chambers
     area: np.ndarray  # (s, 3) A [N/kPa] at the section's length
     area_slope: np.ndarray  # (s, 3) A' [N/kPa/m]
     spring_stiffness: float  # [N/m]
     spring_rest_m: float
     tool_mass_kg: np.ndarray  # (2,) gripper and payload
-    tool_offset_m: np.ndarray  # (2,) below the rod's end
-    up: np.ndarray  # (3,) against gravity, in the axes of the rod's base
+    tool_offset_m: np.ndarray  # (2,) distances of gripper and payload below the rod's end
+    up: np.ndarray  # (3,) direction against gravity, in the axes of the rod's base
 
 
 class Shape(NamedTuple):
-    """Places along the rod, in the axes of its base."""
+    """Cross-sections at the ends of the elements, in the axes of the base; the first is the base."""
 
-    node_m: np.ndarray  # (n + 1, 3) ends of the elements, the first the base
-    rotation: np.ndarray  # (n + 1, 3, 3) columns are the axes of the cross-sections there
+    node_m: np.ndarray  # (n + 1, 3) centres
+    rotation: np.ndarray  # (n + 1, 3, 3) rotations, whose columns are the axes
 
 
 class Rod:
     """A rod with its strains `q` (n, 6), its only state."""
 
     def __init__(self, parts: RodParts, per_section: int):
-        """Lay out the rod, straight and without force.
-
-        Args:
-            parts: numbers of the rod.
-            per_section: elements in each section.
-        """
+        """Make a straight rod without force, with `per_section` elements in each section."""
+        # Joints and elasticity of each element.
         self.per_section = per_section
         self.length_m = parts.section_length_m / per_section
         n_sections = len(parts.bending)
@@ -86,25 +82,27 @@ class Rod:
         self._joint[::per_section] = parts.joint
         law = [parts.bending, parts.bending, parts.torsion, parts.shear, parts.shear, parts.extension]
         self._elastic = np.repeat(np.stack(law, axis=1), per_section, axis=0)  # (n, 6)
+        # Places of the fibres, and their constant derivatives.
         hole = np.zeros((n_sections, 6, 3))
         hole[:, :3, :2], hole[:, 3:, :2] = parts.chamber_hole_m, parts.spring_hole_m
         hole = np.repeat(hole, per_section, axis=0)
         # d(nu + kappa x r) / dq (n, 6 fibres, 3, 6 strains)
         self._along = np.concatenate([-_cross_matrix(hole), np.broadcast_to(np.eye(3), (*hole.shape, 3))], -1)
         self._square = np.swapaxes(self._along, -1, -2) @ self._along
+        # Rest state and damping.
         self.replace(parts)
         self.q = np.tile(REST_STRAIN, (n_sections * per_section, 1))
         stiffness = self._local(self.q, np.zeros((n_sections, 3)))[1]
         self._damping = CREEP_S * np.diagonal(stiffness, axis1=1, axis2=2).ravel()
 
     def replace(self, parts: RodParts) -> None:
-        """Take other masses, areas or stiffnesses; the strains stay."""
+        """Change masses, areas or stiffnesses of the parts; the strains stay."""
         self.parts = parts
         mass = np.repeat(parts.section_mass_kg / self.per_section, self.per_section)
-        self._node_kg = 0.5 * (mass + np.append(mass[1:], 0.0))  # (n,) half of each element, at its lower end
+        self._node_kg = 0.5 * (mass + np.append(mass[1:], 0.0))  # (n,) lumped at the lower ends
 
     def shape(self) -> Shape:
-        """Return the places of the rod's cross-sections."""
+        """Return the rod's cross-sections."""
         half, turn = (rotation_about(share * self.length_m * self.q[:, :3]) for share in (0.5, 1.0))
         return self._shape(half, turn)[0]
 
@@ -115,24 +113,24 @@ class Rod:
         return pieces.reshape(-1, self.per_section, 3).sum(axis=1).ravel()
 
     def step(self, pressure_kpa: np.ndarray, duration_s: float) -> float:
-        """Move for a while at pressures (3 s,) [kPa]; return the largest entry of dV/dq before."""
+        """Take a step at pressures (3 s,) [kPa]; return the largest entry of dV/dq before the step."""
         gradient, hessian = self._derivatives(pressure_kpa.reshape(-1, 3))
         factor = None
         while factor is None:
             np.fill_diagonal(hessian, hessian.diagonal() + self._damping / duration_s)
             try:
                 factor = cho_factor(hessian, check_finite=False)
-            except LinAlgError:  # not convex there: move less
+            except LinAlgError:  # the potential is not convex here: take a shorter step
                 duration_s *= 0.5
         change = cho_solve(factor, gradient.ravel(), check_finite=False)
         self.q = self.q - change.reshape(self.q.shape)
         return float(np.abs(gradient).max())
 
     def settle(self, pressure_kpa: np.ndarray) -> None:
-        """Move to rest at pressures (3 s,) [kPa], by way of a few seconds of motion.
+        """Move to rest at pressures (3 s,) [kPa], through some seconds of motion.
 
         Raises:
-            FloatingPointError: no rest is found.
+            FloatingPointError: the rod does not come to rest.
         """
         for k in range(200):
             if self.step(pressure_kpa, min(0.1 * 2.0**k, LONGEST_S)) < REST_TOLERANCE:
@@ -140,7 +138,7 @@ class Rod:
         raise FloatingPointError("the rod finds no rest")
 
     def _shape(self, half: np.ndarray, turn: np.ndarray) -> tuple[Shape, np.ndarray, np.ndarray]:
-        """Return the shape, and the axes (n, 3, 3) where each element begins, and in its middle."""
+        """Return the shape, and the axes (n, 3, 3) at the beginning and in the middle of each element."""
         rotation = [np.eye(3)]
         begin = []
         for joint, own in zip(self._joint, turn, strict=True):
@@ -174,7 +172,7 @@ class Rod:
         return gradient, hessian
 
     def _fibres(self, length_m: np.ndarray, pressure_kpa: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return pulls (s, per_section, 6) [N] of chambers and springs so stretched, and their slopes."""
+        """Return pulls (s, per_section, 6) [N] of fibres with these lengths, and their slopes [N/m]."""
         parts = self.parts
         chamber, spring = length_m[..., :3], length_m[..., 3:]
         stiffness, hardening, rest, area, area_slope = (
@@ -194,11 +192,12 @@ class Rod:
         gradient, local = self._local(self.q, pressure_kpa)
         fall, turn = self._weights()
         up = GRAVITY_M_S2 * self.parts.up
-        # Between two elements, d2V / dq_i dq_j = up . (turn_i x fall_j) with i nearer to the base
+        # Gravity between two elements: d2V / dq_i dq_j = up . (turn_i x fall_j), with i nearer to the base.
         n = len(self.q)
         lever = np.cross(up, turn).reshape(n * N_STRAINS, 3)
         matrix = (lever @ fall.reshape(-1, 3).T).reshape(n, N_STRAINS, n, N_STRAINS)
         matrix *= np.triu(np.ones((n, n)))[:, None, :, None]
+        # Make the matrix symmetric, and add the elements' own stiffness.
         own = np.arange(n)
         matrix[own, :, own] *= 0.5
         matrix = matrix.reshape(n * N_STRAINS, -1)
@@ -207,7 +206,11 @@ class Rod:
         return gradient + fall @ up, matrix.reshape(n * N_STRAINS, -1)
 
     def _weights(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return, by each strain (n, 6, 3): what all masses move together [kg m], and what turns below it."""
+        """Return derivatives (n, 6, 3) by the strains: moment of all masses [kg m], and rotation.
+
+        The rotation is that of the cross-sections below the element.
+        """
+        # Places of the masses, and the moment of all masses below each element.
         h, parts = self.length_m, self.parts
         bend = self.q[:, :3]
         half, turn = rotation_about(0.5 * h * bend), rotation_about(h * bend)
@@ -217,6 +220,7 @@ class Rod:
         moment = np.cumsum(below[::-1], axis=0)[::-1] + parts.tool_mass_kg @ tool
         mass = np.cumsum(self._node_kg[::-1])[::-1] + parts.tool_mass_kg.sum()
         hung = moment - mass[:, None] * node[1:]
+        # Turns of the part below an element, and shifts of its lower end.
         whole = h * np.swapaxes(begin @ _left_jacobian(h * bend), 1, 2)  # (n, 3 strains, 3)
         inner = 0.5 * h * np.swapaxes(begin @ _left_jacobian(0.5 * h * bend), 1, 2)
         reach = np.diff(node, axis=0)

@@ -1,13 +1,14 @@
-"""The rod twin: a stand-in of other physics than training's, behind the same `ArmIO` as `Twin`.
+"""The rod twin: an arm with other physics than training's, behind the same `ArmIO` as `Twin`.
 
-An arm of `mjx_softarm.twin.rod`: it bends, shears, twists and extends without joints, its chambers harden,
-its base is tilted, its sections are rolled against each other, motion capture's frame of the tip is turned
-against the last plate and off its middle. Regulators follow their commands with a lag; there is no pump, no
-hysteresis and no inertia. Readings, noise and clock are those of `Twin`. Parts are drawn from the seed.
+The arm is a rod of `mjx_softarm.twin.rod`: it bends, shears, twists and extends without joints. Its
+chambers harden, its base is tilted, its sections are rolled against each other, and motion capture's frame
+of the tip is turned against the last plate and offset from its centre. Regulators follow their commands
+with a lag. There is no pump, no hysteresis and no inertia. Readings, noise and clock are those of `Twin`.
+Parts are drawn from the seed.
 
-How `ROD_GAP` was set: it is the gap of `Twin`, with the same tolerances for base, roll and springs. With
-spring lengths that bring training's model to the paper's circle, as there, the tips of rods 100 to 105, which
-no experiment uses, are 15.9 mm and 6.7 deg off at a gap of 1.8 and 17.9 mm and 7.7 deg at 2.1.
+How `ROD_GAP` was set: it is the gap of `Twin`, with the same tolerances for base, roll and springs. At the
+spring lengths that bring training's model to the paper's circle, the tips of rods 100 to 105, which no
+experiment uses, are 15.9 mm and 6.7 deg off at a gap of 1.8, and 17.9 mm and 7.7 deg at 2.1.
 """
 
 from __future__ import annotations
@@ -36,17 +37,17 @@ from mjx_softarm.twin.instruments import (
 from mjx_softarm.twin.rod import CREEP_S, Rod, RodParts
 
 ROD_GAP = 1.9
-ELEMENTS_PER_SECTION = 6  # the tip within 0.2 mm of twelve
-REGULATOR_S = 0.1  # lag of the pressures
+ELEMENTS_PER_SECTION = 6  # tip within 0.2 mm of that with twelve elements
+REGULATOR_S = 0.1  # time constant of the pressures
 
 
 @dataclass(frozen=True)
 class RodTolerances:
-    """Distance from training's model at a gap of 1: standard deviations, and what all rods have."""
+    """Deviations from training's model at a gap of 1: values of all rods, then standard deviations."""
 
-    hardening: float = 0.5  # of all rods: half as stiff again, a section's length from rest
-    torsion_rad_per_nm: float = 0.08  # of all rods: of a section
-    shear_per_n: float = 6e-4  # of all rods
+    hardening: float = 0.5  # value of all rods: 50 % stiffer at a section's length from rest
+    torsion_rad_per_nm: float = 0.08  # value of all rods: compliance of a section
+    shear_per_n: float = 6e-4  # value of all rods: compliance
     chamber_stiffness: float = 0.04  # relative, per chamber
     chamber_area: float = 0.02  # relative, per chamber
     chamber_length_m: float = 0.001  # per chamber
@@ -54,18 +55,18 @@ class RodTolerances:
     section_mass: float = 0.03  # relative, per section
     hole_radius_m: float = 0.001  # per chamber, and per spring
     hole_angle_deg: float = 1.0  # per chamber, and per spring
-    section_roll_deg: float = 1.75  # per section, against the one above
+    section_roll_deg: float = 1.75  # per section, against the section above
     base_tilt_deg: float = 0.9  # per axis
     base_offset_m: float = 0.003  # per axis
     tip_turn_deg: float = 1.0  # per axis: motion capture's frame against the last plate
-    tip_offset_m: float = 0.001  # per axis
+    tip_offset_m: float = 0.001  # per axis: motion capture's frame against the last plate's centre
     spring_beta: float = 0.01  # relative, per spring
     spring_delta_m: float = 0.00075  # per spring
 
 
 @dataclass(frozen=True)
 class RodBuild:
-    """Distance of the rod twin from training's model; tests set some of these to zero."""
+    """Scales of the rod twin's deviations from training's model; tests set some of them to zero."""
 
     gap: float = ROD_GAP  # scale of the tolerances
     noise: float = 1.0  # scale of the noise of all sensors
@@ -101,7 +102,7 @@ class RodTwin:
         self._rod.settle(self._pressure_kpa)
 
     def read_sensors(self) -> np.ndarray:
-        """Return what the springs' sensors read now (n,), noisy and in the converter's steps; see `ArmIO`."""
+        """Return readings (n,) of the springs' sensors: noisy, in steps of the converter; see `ArmIO`."""
         true = self._sensor.readings(self._rod.spring_lengths())
         noisy = true + self._draw(self._sensor.noise, len(true))
         return np.round(noisy / self._sensor.resolution) * self._sensor.resolution
@@ -115,16 +116,16 @@ class RodTwin:
         self.time_s += period_s
 
     def settle(self, pressure_kpa: np.ndarray) -> None:
-        """Go to rest at pressures (n,) [kPa] at once; the clock stands still."""
+        """Move to rest at pressures (n,) [kPa] without time passing."""
         self._pressure_kpa = checked_pressures(pressure_kpa, self._spec)
         self._rod.settle(self._pressure_kpa)
 
     def pressures(self) -> np.ndarray:
-        """Return pressures (n,) [kPa] that the regulators' sensors measure in the chambers now."""
+        """Return pressures (n,) [kPa] in the chambers, as the regulators' sensors measure them."""
         return self._pressure_kpa + self._draw(PRESSURE_NOISE_KPA, len(self._pressure_kpa))
 
     def motion_capture(self) -> Capture:
-        """Return the tip, and the middle of the rod at each third of a section, from the first to the tip."""
+        """Return the tip, and markers in the rod at each third of a section, from the base to the tip."""
         n_markers = MARKERS_PER_SECTION * self._spec.structure.n_sections
         thirds = np.arange(1, n_markers + 1) * self._build.per_section // MARKERS_PER_SECTION
         node_m, rotation = self._rod.shape()
@@ -138,10 +139,10 @@ class RodTwin:
         return Capture(tip_m + noise_m[0], quaternion, marker_m + noise_m[1:], spring_m)
 
     def attach(self, payload_kg: float) -> None:
-        """Hang a payload to the finger tips, in place of what hung there.
+        """Hang a payload to the finger tips, in place of an earlier payload.
 
         Raises:
-            ValueError: a mass that is negative or not finite.
+            ValueError: the mass is negative or not finite.
         """
         parts = self._rod.parts
         masses = np.array([parts.tool_mass_kg[0], checked_payload(payload_kg)])
@@ -152,7 +153,7 @@ class RodTwin:
         self.attach(0.0)
 
     def describe(self) -> dict[str, Any]:
-        """Return how the rods are distributed, for reports: nothing about the one that was drawn."""
+        """Return the distributions of the rods' parts, for reports; nothing about this rod's own parts."""
         return {
             "gap": self._build.gap,
             "distances": dataclasses.asdict(_scaled(self._build.gap, self._spec)),
@@ -167,7 +168,7 @@ class RodTwin:
 
 
 def draw_rod(rng: np.random.Generator, spec: ArmSpec, std: RodTolerances, up: np.ndarray) -> RodParts:
-    """Draw the numbers of a rod; `up` (3,) is against gravity in the axes of its base."""
+    """Draw the numbers of a rod; `up` (3,) points against gravity, in the axes of its base."""
     s, length_m = spec.structure.n_sections, spec.geometry.section_length_m
     chambers, backbone = spec.chambers, spec.backbone
 
@@ -184,6 +185,7 @@ def draw_rod(rng: np.random.Generator, spec: ArmSpec, std: RodTolerances, up: np
     def each(value: float | tuple[float, ...]) -> np.ndarray:
         return np.reshape(spec.per_chamber(value), (s, -1))
 
+    # The order of the draws belongs to the seed: another order makes other rods.
     roll_rad = np.radians(_off(rng, std.section_roll_deg, s))
     area = factors(std.chamber_area, s, N_CHAMBERS_PER_SECTION)
     stiff = factors(std.backbone_stiffness, s)
@@ -226,7 +228,7 @@ def _off(rng: np.random.Generator, deviation: float, *shape: int) -> np.ndarray:
 
 
 def _scaled(gap: float, spec: ArmSpec) -> RodTolerances:
-    """Return the tolerances of an arm: lengths and compliances are in proportion to the paper's arm's."""
+    """Return an arm's tolerances: lengths and compliances scale with those of the paper's arm."""
     paper = ArmSpec.default()
     length = spec.geometry.section_length_m / paper.geometry.section_length_m
     bending = paper.backbone.bending_stiffness_nm_per_rad / spec.backbone.bending_stiffness_nm_per_rad
