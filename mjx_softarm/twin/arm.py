@@ -2,7 +2,7 @@
 
 Its model is finer than training's: inexact parts, chambers with hysteresis, joints with friction, pumped
 air and noisy sensors. Training and calibration never import it. Its parameters are drawn from one integer
-seed and stay private; `describe` tells their distributions.
+seed and stay private.
 
 Clock: simulated time passes only in `write_pressures`, by one control period of the specification. So a loop
 that reads, computes and writes runs at the control rate on any machine.
@@ -10,7 +10,6 @@ that reads, computes and writes runs at the control rate on any machine.
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import mujoco
@@ -20,28 +19,16 @@ from mjx_softarm.deploy.arm_io import Capture
 from mjx_softarm.mechanics.body import payload_radius_m
 from mjx_softarm.mechanics.mjcf import chamber_lengths, spring_lengths
 from mjx_softarm.mechanics.pipe import CrossPipe
-from mjx_softarm.pneumatics import PUMP_M3_PER_S, VALVE_S
 from mjx_softarm.spec import ArmSpec
 from mjx_softarm.twin.hysteresis import StopOperators
 from mjx_softarm.twin.instruments import (
-    CAPTURE_NOISE_DEG,
-    CAPTURE_NOISE_M,
     EVALUATION_SESSION,
     MARKERS_PER_SECTION,
-    PRESSURE_NOISE_KPA,
-    SPRING_NOISE_M,
-    WIDEST_DRAW,
+    InstrumentedArm,
     checked_payload,
     checked_pressures,
 )
-from mjx_softarm.twin.model import (
-    AS_BUILT,
-    Build,
-    build_twin,
-    draw_parts,
-    rotation_matrix,
-    scaled_tolerances,
-)
+from mjx_softarm.twin.model import AS_BUILT, Build, build_twin, draw_parts, rotation_matrix
 from mjx_softarm.twin.pipe import WallForce, contact_force, is_container
 from mjx_softarm.twin.pneumatics import Pneumatics
 
@@ -55,7 +42,7 @@ FRICTION_STROKE = (2e-4, 5e-3, 5e-3)  # [m, rad, rad]
 REST_S = 4.0  # time for which the arm hangs at atmospheric pressure before its clock starts
 
 
-class Twin:
+class Twin(InstrumentedArm):
     """One arm with its pump, sensors and cameras; an `ArmIO` and a `MotionCapture`.
 
     Example: `twin = Twin(7)`, then `twin.read_sensors()` and `twin.write_pressures(p)` in turn.
@@ -84,7 +71,7 @@ class Twin:
         spec = spec or ArmSpec.default()
         self._parts = draw_parts(seed, spec, build)
         self._build = build
-        self._noise = np.random.default_rng([session, seed])
+        super().__init__(self._parts.sensor, seed, session, build.noise)
         self._pipe = pipe
         self._model = build_twin(self._parts, pipe)
         self._data = mujoco.MjData(self._model)
@@ -119,13 +106,6 @@ class Twin:
         limit = scale * np.full(len(strokes), HYSTERESIS_LIMIT_N / len(strokes))
         self._hysteresis = StopOperators(limit / strokes, limit, chamber_lengths(self._data))
 
-    def read_sensors(self) -> np.ndarray:
-        """Return readings (n,) of the springs' sensors: noisy, in steps of the converter; see `ArmIO`."""
-        sensor = self._parts.sensor
-        true = sensor.readings(spring_lengths(self._data))
-        noisy = true + self._draw(sensor.noise, len(true))
-        return np.round(noisy / sensor.resolution) * sensor.resolution
-
     def write_pressures(self, pressure_kpa: np.ndarray) -> None:
         """Command pressures (n,) [kPa], then let one control period pass; see `ArmIO`."""
         self._air.command(checked_pressures(pressure_kpa, self._parts.spec))
@@ -138,9 +118,11 @@ class Twin:
             )
         self.time_s += self._steps * self._model.opt.timestep
 
-    def pressures(self) -> np.ndarray:
-        """Return pressures (n,) [kPa] in the chambers, as the regulators' sensors measure them."""
-        return self._air.pressure_kpa + self._draw(PRESSURE_NOISE_KPA, len(self._air.pressure_kpa))
+    def _lengths_m(self) -> np.ndarray:
+        return spring_lengths(self._data)
+
+    def _true_kpa(self) -> np.ndarray:
+        return self._air.pressure_kpa
 
     def motion_capture(self) -> Capture:
         """Return the tip, and markers on the rings at each third of a section, from the base to the tip."""
@@ -152,29 +134,21 @@ class Twin:
         marker_m = self._base_m + (data.xpos[bodies] - down) @ self._base_rotation.T
         tip = self._base_rotation @ data.site("tip").xmat.reshape(3, 3)
         tip_m = self._base_m + self._base_rotation @ data.site("tip").xpos
-        turn = rotation_matrix(np.radians(self._draw(CAPTURE_NOISE_DEG, 3)))
-        quaternion = np.zeros(4)
-        mujoco.mju_mat2Quat(quaternion, (turn @ tip).ravel())
-        noise_m = self._draw(CAPTURE_NOISE_M, n_markers + 1, 3)
-        spring_m = spring_lengths(data) + self._draw(SPRING_NOISE_M, spec.n_chambers)
-        return Capture(tip_m + noise_m[0], quaternion, marker_m + noise_m[1:], spring_m)
+
+        def turned(vector_rad: np.ndarray) -> np.ndarray:
+            quaternion = np.zeros(4)
+            mujoco.mju_mat2Quat(quaternion, (rotation_matrix(vector_rad) @ tip).ravel())
+            return quaternion
+
+        return self._seen(tip_m, turned, marker_m)
 
     def attach(self, payload_kg: float) -> None:
-        """Hang a payload to the finger tips, in place of an earlier payload.
-
-        Raises:
-            ValueError: the mass is negative or not finite.
-        """
         payload_kg = checked_payload(payload_kg)
         body = self._model.body("payload").id
         self._model.body_mass[body] = payload_kg
         self._model.body_inertia[body] = payload_kg * self._parts.spec.mass.gripper_length_m**2 / 12
         mujoco.mj_setConst(self._model, mujoco.MjData(self._model))
         mujoco.mj_step1(self._model, self._data)
-
-    def release(self) -> None:
-        """Remove the payload."""
-        self.attach(0.0)
 
     def wall_force_n(self) -> WallForce:
         """Return the largest contact forces in the last control period.
@@ -208,26 +182,6 @@ class Twin:
             payload_radius_m(payload_kg) if payload_kg else 0.0,
         )
 
-    def describe(self) -> dict[str, Any]:
-        """Return the distributions of the twins' parts, for reports; nothing about this twin's own parts."""
-        sensor = self._parts.sensor
-        return {
-            "gap": self._build.gap,
-            "standard deviations": dataclasses.asdict(scaled_tolerances(self._build.gap)),
-            "widest draw [standard deviations]": WIDEST_DRAW,
-            "links per section": self._build.links_per_section,
-            "hysteresis of a chamber [N]": self._build.losses * HYSTERESIS_LIMIT_N,
-            "friction of a link [N, N m, N m]": [self._build.losses * limit for limit in FRICTION_LIMIT],
-            f"{sensor.reading_name} noise [{sensor.unit}]": self._build.noise * sensor.noise,
-            "pressure noise [kPa]": self._build.noise * PRESSURE_NOISE_KPA,
-            "motion capture noise [mm, deg]": [
-                self._build.noise * value for value in (1e3 * CAPTURE_NOISE_M, CAPTURE_NOISE_DEG)
-            ],
-            "pump [L/min]": 6e4 * PUMP_M3_PER_S,
-            "valve [ms]": 1e3 * VALVE_S,
-            **({} if self._pipe is None else {"pipe": dataclasses.asdict(self._pipe)}),
-        }
-
     def _step(self) -> None:
         """Take one time step; afterwards the data hold the lengths and positions at its end."""
         data, n = self._data, len(self._parts.hysteresis)
@@ -240,6 +194,3 @@ class Twin:
             force = contact_force(data, self._container)
             self._wall_force = WallForce(*map(max, self._wall_force, force))
         mujoco.mj_step1(self._model, data)
-
-    def _draw(self, deviation: float, *shape: int) -> np.ndarray:
-        return self._build.noise * deviation * self._noise.standard_normal(shape)

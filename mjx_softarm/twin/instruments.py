@@ -1,9 +1,14 @@
-"""Sessions, noise and checks of commands that all kinds of twins share."""
+"""Noisy instruments and checks of commands that all kinds of twins share."""
 
 from __future__ import annotations
 
+import abc
+from collections.abc import Callable
+
 import numpy as np
 
+from mjx_softarm.deploy.arm_io import Capture
+from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.spec import ArmSpec
 
 # Data for a sim-to-real network and for its evaluation come from the same twin, but from different sessions:
@@ -17,6 +22,66 @@ SPRING_NOISE_M = 2**0.5 * CAPTURE_NOISE_M  # noise of the distance between two m
 PRESSURE_TOLERANCE_KPA = 1e-3  # tolerance beyond the limits, for rounding to float32
 MARKERS_PER_SECTION = 3
 WIDEST_DRAW = 2.0  # largest deviation of a part, in standard deviations; a worse part is not mounted
+
+
+class InstrumentedArm(abc.ABC):
+    """An arm with noisy sensors and cameras; an `ArmIO` and a `MotionCapture`.
+
+    Args:
+        sensor: the arm's own sensors.
+        seed: chooses the twin.
+        session: chooses the noise.
+        noise: scale of the noise.
+    """
+
+    def __init__(self, sensor: Sensor, seed: int, session: int, noise: float):
+        self._sensor, self._scale = sensor, noise
+        self._rng = np.random.default_rng([session, seed])
+        self.time_s = 0.0
+
+    @abc.abstractmethod
+    def _lengths_m(self) -> np.ndarray:
+        """Return the springs' true lengths (n,)."""
+
+    @abc.abstractmethod
+    def _true_kpa(self) -> np.ndarray:
+        """Return the chambers' true pressures (n,)."""
+
+    @abc.abstractmethod
+    def attach(self, payload_kg: float) -> None:
+        """Hang a payload to the finger tips, in place of an earlier payload.
+
+        Raises:
+            ValueError: the mass is negative or not finite.
+        """
+
+    def release(self) -> None:
+        """Remove the payload."""
+        self.attach(0.0)
+
+    def read_sensors(self) -> np.ndarray:
+        """Return readings (n,) of the springs' sensors: noisy, in steps of the converter; see `ArmIO`."""
+        true = self._sensor.readings(self._lengths_m())
+        noisy = true + self._draw(self._sensor.noise, len(true))
+        return np.round(noisy / self._sensor.resolution) * self._sensor.resolution
+
+    def pressures(self) -> np.ndarray:
+        """Return pressures (n,) [kPa] in the chambers, as the regulators' sensors measure them."""
+        kpa = self._true_kpa()
+        return kpa + self._draw(PRESSURE_NOISE_KPA, len(kpa))
+
+    def _seen(
+        self, tip_m: np.ndarray, turned: Callable[[np.ndarray], np.ndarray], marker_m: np.ndarray
+    ) -> Capture:
+        """Return tip (3,) and markers (k, 3) with noise; `turned` gives the tip's quaternion after a turn."""
+        quaternion = turned(np.radians(self._draw(CAPTURE_NOISE_DEG, 3)))
+        noise_m = self._draw(CAPTURE_NOISE_M, len(marker_m) + 1, 3)
+        length_m = self._lengths_m()
+        spring_m = length_m + self._draw(SPRING_NOISE_M, len(length_m))
+        return Capture(tip_m + noise_m[0], quaternion, marker_m + noise_m[1:], spring_m)
+
+    def _draw(self, deviation: float, *shape: int) -> np.ndarray:
+        return self._scale * deviation * self._rng.standard_normal(shape)
 
 
 def checked_pressures(pressure_kpa: np.ndarray, spec: ArmSpec) -> np.ndarray:

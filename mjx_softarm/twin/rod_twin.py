@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -24,17 +23,14 @@ from mjx_softarm.sensing.pose import quaternion_from_rotation, rotation_about
 from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
 from mjx_softarm.twin.instruments import (
-    CAPTURE_NOISE_DEG,
-    CAPTURE_NOISE_M,
     EVALUATION_SESSION,
     MARKERS_PER_SECTION,
-    PRESSURE_NOISE_KPA,
-    SPRING_NOISE_M,
     WIDEST_DRAW,
+    InstrumentedArm,
     checked_payload,
     checked_pressures,
 )
-from mjx_softarm.twin.rod import CREEP_S, Rod, RodParts
+from mjx_softarm.twin.rod import Rod, RodParts
 
 ROD_GAP = 1.9
 ELEMENTS_PER_SECTION = 6  # tip within 0.2 mm of that with twelve elements
@@ -73,7 +69,7 @@ class RodBuild:
     per_section: int = ELEMENTS_PER_SECTION
 
 
-class RodTwin:
+class RodTwin(InstrumentedArm):
     """One rod with regulators, sensors and cameras; an `ArmIO` and a `MotionCapture`."""
 
     def __init__(
@@ -86,26 +82,19 @@ class RodTwin:
     ):
         """Hang the arm up, unpressurised and at rest; arguments as those of `Twin`."""
         self._spec, self._build = spec or ArmSpec.default(), build or RodBuild()
-        self._noise = np.random.default_rng([session, seed])
         rng = np.random.default_rng(seed)
         std = _scaled(self._build.gap, self._spec)
         self._base_m = _off(rng, std.base_offset_m, 3)
         self._base_rotation = rotation_about(np.radians(_off(rng, std.base_tilt_deg, 3)) * [1.0, 1.0, 0.0])
         self._tip_m = _off(rng, std.tip_offset_m, 3)
         self._tip_turn = rotation_about(np.radians(_off(rng, std.tip_turn_deg, 3)))
-        self._sensor = _sensor(rng, self._spec, std)
+        super().__init__(_sensor(rng, self._spec, std), seed, session, self._build.noise)
         parts = draw_rod(rng, self._spec, std, self._base_rotation[2])
         self._rod = Rod(parts, self._build.per_section)
         self._pressure_kpa = np.zeros(self._spec.n_chambers)
         self.time_s = 0.0
         self.attach(payload_kg)
         self._rod.settle(self._pressure_kpa)
-
-    def read_sensors(self) -> np.ndarray:
-        """Return readings (n,) of the springs' sensors: noisy, in steps of the converter; see `ArmIO`."""
-        true = self._sensor.readings(self._rod.spring_lengths())
-        noisy = true + self._draw(self._sensor.noise, len(true))
-        return np.round(noisy / self._sensor.resolution) * self._sensor.resolution
 
     def write_pressures(self, pressure_kpa: np.ndarray) -> None:
         """Command pressures (n,) [kPa], then let one control period pass; see `ArmIO`."""
@@ -120,9 +109,11 @@ class RodTwin:
         self._pressure_kpa = checked_pressures(pressure_kpa, self._spec)
         self._rod.settle(self._pressure_kpa)
 
-    def pressures(self) -> np.ndarray:
-        """Return pressures (n,) [kPa] in the chambers, as the regulators' sensors measure them."""
-        return self._pressure_kpa + self._draw(PRESSURE_NOISE_KPA, len(self._pressure_kpa))
+    def _lengths_m(self) -> np.ndarray:
+        return self._rod.spring_lengths()
+
+    def _true_kpa(self) -> np.ndarray:
+        return self._pressure_kpa
 
     def motion_capture(self) -> Capture:
         """Return the tip, and markers in the rod at each third of a section, from the base to the tip."""
@@ -131,40 +122,17 @@ class RodTwin:
         node_m, rotation = self._rod.shape()
         marker_m = self._base_m + node_m[thirds] @ self._base_rotation.T
         tip_m = self._base_m + self._base_rotation @ (node_m[-1] + rotation[-1] @ self._tip_m)
-        turn = rotation_about(np.radians(self._draw(CAPTURE_NOISE_DEG, 3)))
-        tip = turn @ self._base_rotation @ rotation[-1] @ self._tip_turn
-        quaternion = quaternion_from_rotation(tip)
-        noise_m = self._draw(CAPTURE_NOISE_M, n_markers + 1, 3)
-        spring_m = self._rod.spring_lengths() + self._draw(SPRING_NOISE_M, self._spec.n_chambers)
-        return Capture(tip_m + noise_m[0], quaternion, marker_m + noise_m[1:], spring_m)
+
+        def turned(vector_rad: np.ndarray) -> np.ndarray:
+            turn = rotation_about(vector_rad) @ self._base_rotation
+            return quaternion_from_rotation(turn @ rotation[-1] @ self._tip_turn)
+
+        return self._seen(tip_m, turned, marker_m)
 
     def attach(self, payload_kg: float) -> None:
-        """Hang a payload to the finger tips, in place of an earlier payload.
-
-        Raises:
-            ValueError: the mass is negative or not finite.
-        """
         parts = self._rod.parts
         masses = np.array([parts.tool_mass_kg[0], checked_payload(payload_kg)])
         self._rod.replace(parts._replace(tool_mass_kg=masses))
-
-    def release(self) -> None:
-        """Remove the payload."""
-        self.attach(0.0)
-
-    def describe(self) -> dict[str, Any]:
-        """Return the distributions of the rods' parts, for reports; nothing about this rod's own parts."""
-        return {
-            "gap": self._build.gap,
-            "distances": dataclasses.asdict(_scaled(self._build.gap, self._spec)),
-            "widest draw [standard deviations]": WIDEST_DRAW,
-            "elements per section": self._build.per_section,
-            "creep, regulators [s]": [CREEP_S, REGULATOR_S],
-            "noise": f"{self._build.noise:g} times that of Twin",
-        }
-
-    def _draw(self, deviation: float, *shape: int) -> np.ndarray:
-        return self._build.noise * deviation * self._noise.standard_normal(shape)
 
 
 def draw_rod(rng: np.random.Generator, spec: ArmSpec, std: RodTolerances, up: np.ndarray) -> RodParts:

@@ -234,7 +234,7 @@ def test_survives_random_extremes_in_the_pipe(diameter_mm):
 
 def test_arms_in_pipes_by_name():
     arm = open_arm("twin:7:pipe250")
-    assert arm.describe()["pipe"]["diameter_m"] == 0.25 and "pipe" not in open_arm("twin:7").describe()
+    assert arm._pipe == CrossPipe.of_mm(250.0) and open_arm("twin:7")._pipe is None
     assert open_arm("twin:7:pipe300").wall_force_n() == (0.0, 0.0)
 
 

@@ -12,6 +12,7 @@ from benchmarks.paper.kinds import KINDS, Trial, learned_run, reach_run
 from benchmarks.paper.measure import TrialOutcome
 from mjx_softarm._support import cli
 from mjx_softarm.mechanics.excitation import circle_poses
+from mjx_softarm.mechanics.pipe import CrossPipe
 from mjx_softarm.policy.file import save_policy
 from mjx_softarm.policy.runtime import PolicyRunner
 from mjx_softarm.spec import ARM_FILE
@@ -121,7 +122,7 @@ def test_scene_is_the_twin_in_its_pipe(tmp_path, make_arm_model, monkeypatch):
         (tmp_path / learned_run(kind, 0, 0)).mkdir()
         save_policy(tmp_path / learned_run(kind, 0, 0) / "policy.npz", make_policy(make_arm_model))
     found = scene.scene_of(tmp_path, TINY, pipe_trial(kind="narrow"))
-    assert found.twin.describe()["pipe"]["diameter_m"] == 0.25
+    assert found.twin._pipe == CrossPipe.of_mm(250.0)
     assert len(found.goals) == len(found.names) == 37
     operations = [name for name in found.names if name.startswith(("pick", "place"))]
     assert operations == ["pick left", "place bottom", "pick right", "place left"]
@@ -129,7 +130,7 @@ def test_scene_is_the_twin_in_its_pipe(tmp_path, make_arm_model, monkeypatch):
     found = scene.scene_of(tmp_path, few, pipe_trial(kind="narrow"))
     assert len(found.goals) == 7 and found.names[-1] == "pick left"
     found = scene.scene_of(tmp_path, TINY, pipe_trial(kind="circle"))
-    assert "pipe" not in found.twin.describe()
+    assert found.twin._pipe is None
     assert np.array_equal(found.goals, circle_poses(SPEC, TINY.n_points).astype(float))
     rods = dataclasses.replace(TINY, arm="rod")
     assert isinstance(scene.scene_of(tmp_path, rods, pipe_trial(kind="circle")).twin, RodTwin)
