@@ -28,6 +28,7 @@ Shapes: B arms, O observation, A action.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -132,14 +133,17 @@ class Analytic:
             arms=self.arms.reset(key_arms),
         )
 
-    def adopt(self, state: AnalyticState, agent: Any) -> AnalyticState:
-        """Return the state with a donor's policy, of whatever learner; it may observe less.
+    def parts(self, state: AnalyticState) -> dict[str, Params]:
+        """Return the mean policy."""
+        return {"policy": state.mean_actor_params}
+
+    def adopt(self, state: AnalyticState, parts: Mapping[str, Params]) -> AnalyticState:
+        """Return the state with another run's policy, of any learner; it may observe less.
 
         Raises:
-            ValueError: the donor's networks have another size.
+            ValueError: the policy has another size.
         """
-        donor = getattr(agent, "agent", agent)  # of a run that imitated
-        params = widened(donor.mean_actor_params, self.env.observation_size)
+        params = widened(parts["policy"], self.env.observation_size)
         check_same_shapes("actor", params, state.actor_params)
         return state._replace(actor_params=params, mean_actor_params=jax.tree.map(jnp.copy, params))
 

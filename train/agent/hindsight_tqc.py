@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -23,20 +24,20 @@ class HindsightTQC:
         self.config, self.env = config, env
         self.tqc = tqc = TQC(env.observation_size, env.action_size, config.tqc, config.n_updates)
         self.init, self.act, self.policy, self.mode = tqc.init, tqc.act, tqc.policy, tqc.mode
+        self.parts = tqc.parts
 
-    def adopt(self, state: TQCState, agent: Any) -> TQCState:
-        """Return the state with a donor's networks and temperature.
+    def adopt(self, state: TQCState, parts: Mapping[str, Any]) -> TQCState:
+        """Return the state with another run's networks and temperature.
 
-        A run in motion takes the policy alone, of a donor at rest or in motion and by whatever learner. What
-        it observes besides pose and goal has no weight at first, and its critics begin anew.
+        A run in motion takes the policy alone, of a run at rest or in motion and of any learner. Entries of
+        the observation that the other policy lacks have no weight at first, and the critics begin anew.
 
         Raises:
-            ValueError: the donor has no such networks, or networks of another size.
+            ValueError: the other run has no such networks, or networks of another size.
         """
-        donor = getattr(agent, "agent", agent)  # of a run that imitated
         if self.config.env.moves:
-            return self.tqc.adopt_policy(state, donor.mean_actor_params)
-        return self.tqc.adopt(state, donor)
+            return self.tqc.adopt_policy(state, parts["policy"])
+        return self.tqc.adopt(state, parts)
 
     def update(self, state: TQCState, sample: Sample, key: Array) -> tuple[TQCState, dict[str, Array]]:
         """Take one gradient step of all networks on one relabelled batch."""

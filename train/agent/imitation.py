@@ -18,6 +18,7 @@ Shapes: B batch, O observation, A action, m demonstrated positions.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -112,20 +113,24 @@ class Imitation:
         metrics = {f"gail/{name}": x for name, x in (metrics | of_reward).items()}
         return ImitationState(agent, discriminator), losses | metrics
 
-    def adopt(self, state: ImitationState, agent: Any = None, reward: Any = None) -> ImitationState:
-        """Return the state with the networks of the state `agent` and the discriminator of `reward`.
+    def parts(self, state: ImitationState) -> dict[str, Any]:
+        """Return the parts of the wrapped learner, and the discriminator's parameters as `reward`."""
+        parts = self.learner.parts(state.agent)
+        return parts if state.discriminator is None else parts | {"reward": state.discriminator.params}
+
+    def adopt(self, state: ImitationState, parts: Mapping[str, Any]) -> ImitationState:
+        """Return the state with a learned reward, with networks of the wrapped learner, or with both.
 
         Raises:
-            ValueError: a donor has no such part, or one of another size.
+            ValueError: a part has another size, or the networks are not those of TQC.
         """
-        if agent is not None:
-            donor = getattr(agent, "agent", agent)  # of a run that imitated
-            state = state._replace(agent=self.learner.adopt(state.agent, donor))
-        if reward is not None:
-            if not isinstance(reward, ImitationState) or reward.discriminator is None:
-                raise ValueError("reward: got none, expected a run of `imitate` that learned one")
-            check_same_shapes("discriminator", reward.discriminator, state.discriminator)
-            state = state._replace(discriminator=reward.discriminator)
+        networks = {name: part for name, part in parts.items() if name != "reward"}
+        if networks:
+            state = state._replace(agent=self.learner.adopt(state.agent, networks))
+        if "reward" in parts:
+            assert state.discriminator is not None  # a learned reward without weight is refused before
+            check_same_shapes("discriminator", parts["reward"], state.discriminator.params)
+            state = state._replace(discriminator=state.discriminator._replace(params=parts["reward"]))
         return state
 
     def rewards(

@@ -4,15 +4,16 @@ An epoch steps the arms, stores their transitions and calls `update` some times 
 samples the replay as it is stored, or relabels it. A learner with `own_arms` steps these itself as it learns:
 an epoch of it is nothing but updates, without replay.
 
-Anything that has the methods of `Learner` can be handed to `train.epoch.job.Job`; nothing need inherit from
-it. On several devices, batches are spread over them and the learner's state is on all of them.
+Any object with the methods of `Learner` can be handed to `train.epoch.job.Job`; a class that inherits from
+`Learner` has `parts` and `adopt` already. On several devices, batches are spread over them, and the learner's
+state is on all of them.
 
 Shapes: O observation, A action.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -56,6 +57,21 @@ class Learner(Protocol):
         Export needs them named and shaped as those of `train.agent.networks.Actor`.
         """
         ...
+
+    def parts(self, state: Any) -> dict[str, Any]:
+        """Return trees of arrays by name that each checkpoint keeps for export and for other runs.
+
+        `policy` is the policy. A learned reward is called `reward`.
+        """
+        return {"policy": self.policy(state)}
+
+    def adopt(self, state: Any, parts: Mapping[str, Any]) -> Any:
+        """Return the state with parts of another run's learner in the place of its own.
+
+        Raises:
+            ValueError: a part is missing, has another size, or cannot be taken.
+        """
+        raise ValueError(f"got a donor of {', '.join(parts)}, expected none for this learner")
 
     def mode(self, policy: Any, obs: Array) -> Array:
         """Return the policy's deterministic actions (..., A) in [-1, 1] at observations (..., O)."""

@@ -10,6 +10,7 @@ Shapes: B batch, O observation, A action, C critics, M quantiles per critic, K k
 from __future__ import annotations
 
 import functools
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -91,6 +92,11 @@ class TQCState(NamedTuple):
     alpha_opt_state: optax.OptState
 
 
+# Fields of the state by the names of the parts that another run may begin with, beside the policy.
+_NETWORKS = {"actor": "actor_params", "critics": "critic_params", "targets": "target_params"}
+_NETWORKS |= {"log_alpha": "log_alpha"}
+
+
 class TQC:
     """Networks and optimisers of fixed structure, and pure functions of a `TQCState`.
 
@@ -129,17 +135,21 @@ class TQC:
             alpha_opt_state=self.alpha_optimizer.init(log_alpha),
         )
 
-    def adopt(self, state: TQCState, donor: Any) -> TQCState:
-        """Return the state with a donor's networks and temperature; the optimisers begin anew.
+    def parts(self, state: TQCState) -> dict[str, Params]:
+        """Return the networks and the temperature."""
+        networks = {name: getattr(state, field) for name, field in _NETWORKS.items()}
+        return {"policy": state.mean_actor_params, **networks}
+
+    def adopt(self, state: TQCState, parts: Mapping[str, Params]) -> TQCState:
+        """Return the state with another run's networks and temperature; the optimisers begin anew.
 
         Raises:
-            ValueError: the donor has no critics, or networks of another size.
+            ValueError: there are no critics, or networks of another size.
         """
-        if not isinstance(donor, TQCState):
+        if "critics" not in parts:
             raise ValueError("got a policy without critics, expected a run of TQC")
-        names = ("actor_params", "mean_actor_params", "critic_params", "target_params", "log_alpha")
-        given, own = ({name: getattr(each, name) for name in names} for each in (donor, state))
-        check_same_shapes("networks", given, own)
+        given = {"mean_actor_params": parts["policy"], **{f: parts[n] for n, f in _NETWORKS.items()}}
+        check_same_shapes("networks", given, {name: getattr(state, name) for name in given})
         return state._replace(**given)
 
     def adopt_policy(self, state: TQCState, given: Params) -> TQCState:

@@ -94,13 +94,6 @@ class Job:
         """Return a state structured as the run's."""
         return self.init(jax.random.PRNGKey(0))
 
-    def shapes(self) -> TrainState:
-        """Return the shapes of what `like` returns.
-
-        `init` stands at the top level here, since jax takes compiler options nowhere else.
-        """
-        return jax.eval_shape(self.init, jax.random.PRNGKey(0))
-
     def start(self, first: Callable[[], T]) -> T:
         """Return the result of `first`, such as a state, with the epoch compiled in another thread meanwhile.
 
@@ -108,7 +101,7 @@ class Job:
         """
         if self.mesh is not None or self.n_traces:
             return first()
-        shapes = self.shapes()
+        shapes = jax.eval_shape(self.init, jax.random.PRNGKey(0))
         with ThreadPoolExecutor(1) as beside:
             result = beside.submit(first)
             self.epoch = self.epoch.lower(shapes).compile()
@@ -121,6 +114,10 @@ class Job:
     def policy(self, state: TrainState) -> Any:
         """Return the parameters of the policy that is evaluated and exported."""
         return self.learner.policy(state.learner)
+
+    def parts(self, state: TrainState) -> dict[str, Any]:
+        """Return what a checkpoint keeps for export and for other runs; see `Learner.parts`."""
+        return self.learner.parts(state.learner)
 
     def thin(self, state: TrainState, share: float) -> TrainState:
         """Return the state with a random share of its replay; the state given is used up."""

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import functools
 import json
-import operator
 import os
 import shutil
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, cast
 
 import jax
-import numpy as np
 import orbax.checkpoint as ocp
 
 from mjx_softarm._support.errors import InputError
@@ -28,7 +24,6 @@ from train.epoch.devices import is_first_process, wait_for_all
 from train.epoch.job import TrainState
 
 N_KEPT = 2
-POLICY = "mean_actor_params"  # field of a learner's state that is evaluated and exported
 CHECKPOINTS, DEMONSTRATIONS_FILE = "checkpoints", "demonstrations.npz"
 
 
@@ -52,7 +47,6 @@ class Run:
         self.path, self.config, self.spec, self.s2r = path, config, spec, s2r
         options = ocp.CheckpointManagerOptions(max_to_keep=N_KEPT, enable_async_checkpointing=False)
         self._manager = ocp.CheckpointManager((path / CHECKPOINTS).resolve(), options=options)
-        self._reader = ocp.PyTreeCheckpointHandler()  # of single fields, which the manager cannot read
 
     @classmethod
     def create(
@@ -63,7 +57,7 @@ class Run:
         s2r: S2R | None = None,
         demonstrations: Log | None = None,
         begins_with: dict[str, Path] | None = None,
-        state: TrainState | None = None,
+        first: tuple[TrainState, dict[str, Any]] | None = None,
     ) -> Run:
         """Start a folder.
 
@@ -74,7 +68,7 @@ class Run:
             s2r: sim-to-real network of the arm's calibration, if there is one.
             demonstrations: rows of the file that is learned from.
             begins_with: folders of the runs that parts of the first state come from, by part.
-            state: that first state. The folder is a run's only once it holds it.
+            first: that first state and its parts. The folder is a run's only once it holds them.
 
         Raises:
             RunError: the folder already holds a run, or cannot be made.
@@ -94,8 +88,8 @@ class Run:
                 shutil.rmtree(path / CHECKPOINTS, ignore_errors=True)  # of a start that was interrupted
             wait_for_all(f"{path} is begun")
             run = cls(path, config, spec, s2r)
-            if state is not None:
-                run.save(0, state)
+            if first is not None:
+                run.save(0, *first)
             data = {
                 "train": to_dict(config),
                 "spec": spec.to_dict(),
@@ -165,9 +159,17 @@ class Run:
         temporary.write_text("".join(json.dumps(row) + "\n" for row in rows), "utf-8")
         os.replace(temporary, self.path / "metrics.jsonl")
 
-    def save(self, epoch: int, state: TrainState) -> None:
-        """Write a checkpoint; an interrupted write leaves the one before it in force."""
-        self._manager.save(epoch, args=ocp.args.StandardSave(state))
+    def save(self, epoch: int, state: TrainState, parts: dict[str, Any]) -> None:
+        """Write a checkpoint; an interrupted write leaves the one before it in force.
+
+        Args:
+            epoch: number of epochs done.
+            state: all that the run needs to go on.
+            parts: what export and other runs need of the learner; see `Learner.parts`.
+        """
+        both = {"state": state, "parts": jax.device_get(parts)}
+        saved = {name: ocp.args.StandardSave(item) for name, item in both.items()}
+        self._manager.save(epoch, args=ocp.args.Composite(**saved))
         self._manager.wait_until_finished()
 
     def restore(self, like: TrainState) -> tuple[int, TrainState]:
@@ -179,74 +181,34 @@ class Run:
         Raises:
             RunError: there is no checkpoint, or it is not structured so.
         """
-        epoch, shapes = self._newest(), jax.tree.map(_shape_somewhere, like)
-        try:
-            state = self._manager.restore(epoch, args=ocp.args.StandardRestore(shapes))
-        except ValueError as error:
-            raise self._of_another_version() from error
+        shapes = ocp.args.StandardRestore(jax.tree.map(_shape_somewhere, like))
+        epoch, state = self._newest("state", shapes)
         return epoch, cast(TrainState, state)
 
-    def restore_part(self, name: str, like: Any) -> Any:
-        """Return one field of the newest checkpoint's state as NumPy arrays, without reading the others.
-
-        Args:
-            name: name of the field.
-            like: its value, or shapes, structured as the run's.
+    def parts(self) -> dict[str, Any]:
+        """Return the newest checkpoint's parts of the learner as NumPy arrays; see `Learner.parts`.
 
         Raises:
-            RunError: there is no checkpoint, or it is not structured so.
+            RunError: there is no checkpoint, or it is another version's.
         """
-        try:
-            part = self._read([name], like)
-        except (ValueError, KeyError, TypeError) as error:
-            raise self._of_another_version() from error
-        # orbax returns a leaf that the checkpoint lacks as it was asked for, and others in their own shapes.
-        for got, expected in zip(jax.tree.leaves(part), jax.tree.leaves(like), strict=True):
-            if isinstance(got, jax.ShapeDtypeStruct) or got.shape != expected.shape:
-                raise self._of_another_version()
-        return part
+        return self._newest("parts", ocp.args.StandardRestore())[1]
 
     def policy(self) -> Any:
-        """Return the parameters of the newest checkpoint's policy as NumPy arrays; nothing else is read.
+        """Return the parameters of the newest checkpoint's policy as NumPy arrays; see `parts`."""
+        return self.parts()["policy"]
 
-        They are the field `POLICY` of the learner's state, or of the state that it wraps as `agent`.
-
-        Raises:
-            RunError: there is no checkpoint, or no such field in it.
-        """
-        learner = self._reader.metadata(self._newest_path)["learner"]
-        fields = ["agent", POLICY] if "agent" in learner else [POLICY]
-        try:
-            saved = functools.reduce(operator.getitem, fields, learner)
-        except (KeyError, TypeError) as error:
-            raise self._of_another_version() from error
-        return self._read(["learner", *fields], saved)
-
-    def _read(self, fields: Sequence[str], like: Any) -> Any:
-        """Return the value of nested fields of the newest checkpoint; `like` has its structure and shapes."""
-        shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), like)
-        wanted: Any = functools.reduce(lambda value, name: {name: value}, reversed(fields), shapes)
-        as_numpy = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), wanted)
-        arguments = ocp.args.PyTreeRestore(wanted, as_numpy, partial_restore=True)
-        return functools.reduce(
-            operator.getitem, fields, self._reader.restore(self._newest_path, args=arguments)
-        )
-
-    def _of_another_version(self) -> RunError:
-        return RunError(
-            f"{self.path}: got a checkpoint of other parts or sizes, expected this version's; "
-            "continue it with the commit that its config.json names"
-        )
-
-    @property
-    def _newest_path(self) -> Any:
-        return self._manager.directory / str(self._newest()) / "default"
-
-    def _newest(self) -> int:
+    def _newest(self, item: str, how: ocp.args.CheckpointArgs) -> tuple[int, Any]:
+        """Return the number of epochs behind the newest checkpoint, and an item of it."""
         epoch = self.latest_epoch
         if epoch is None:
             raise RunError(f"{self.path}: got no checkpoint, expected one; start the run anew")
-        return epoch
+        try:
+            return epoch, self._manager.restore(epoch, args=ocp.args.Composite(**{item: how}))[item]
+        except (ValueError, KeyError, FileNotFoundError) as error:
+            raise RunError(
+                f"{self.path}: got a checkpoint of other parts or sizes, expected this version's; "
+                "continue it with the commit that its config.json names"
+            ) from error
 
     def log(self, row: dict[str, Any]) -> None:
         """Append a line to `metrics.jsonl`."""

@@ -67,8 +67,8 @@ class Reach(NewRunOptions):
         path = self.out or runs.default_path("reach", self.preset, config.seed)
         if agent is None:
             return _train(Run.create(path, config, spec, s2r), task, console)
-        state = runs.begin_with(task, config.seed, agent=agent)
-        return _train(Run.create(path, config, spec, s2r, None, {"agent": agent.path}, state), task, console)
+        first = runs.begin_with(task, config.seed, {"agent": agent})
+        return _train(Run.create(path, config, spec, s2r, None, {"agent": agent.path}, first), task, console)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,9 +118,9 @@ class Imitate(NewRunOptions):
         if "agent" in opened:
             config = config.with_policy_of(opened["agent"].config)
         task = task_of(config, ReachEnv(spec, config.env, s2r), from_log(log, spec), mesh)
-        state = runs.begin_with(task, config.seed, **opened)
+        first = runs.begin_with(task, config.seed, opened)
         path = self.out or runs.default_path("imitate", self.preset, config.seed)
-        return _train(Run.create(path, config, spec, s2r, log, donors, state), task, console)
+        return _train(Run.create(path, config, spec, s2r, log, donors, first), task, console)
 
 
 def evaluate(

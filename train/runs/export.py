@@ -24,27 +24,24 @@ SEED = 0  # seed of the networks and of the workspace
 ERRORS = ("tip_mm", "turn_deg", "load_kg", "spring_mm")  # fields of `Distilled` that provenance keeps
 
 
-def export_run(run: Run, path: Path | None = None, params: Any = None) -> Path:
+def export_run(run: Run, path: Path | None = None) -> Path:
     """Write the policy of a run's newest checkpoint; return the file.
 
     Args:
         run: folder with config and checkpoint.
         path: file to write; `policy.npz` in the run by default.
-        params: parameters of the policy; by default those in the checkpoint.
 
     Raises:
         RunError: the run has no checkpoint, or its learner's policy is not a network that the file can hold.
         SealedFileError: the file cannot be written.
     """
-    # Gather what the arm needs besides the run's config: the actor's parameters, networks and poses.
-    if params is None:
-        params = run.policy()
+    # Gather the networks and poses that the arm needs.
     model, distilled = arm_model(run.spec, run.s2r)
     # Put all together; this checks the shapes of the parameters.
     env = run.config.env
     try:
         policy = policy_from_actor(
-            jax.device_get(params),
+            run.policy(),
             run.spec,
             env.reward,
             model,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -60,7 +60,7 @@ def train(run: Run, task: Task, console: Console) -> Any:
                     row |= evaluation(run, task, task.job.policy(state))
                 record(run, board, epoch, counts(state), row)
                 if due or stop:
-                    run.save(epoch, state)
+                    run.save(epoch, state, task.job.parts(state))
                 show(epoch, _line(task, row), due)
                 if stop and epoch < config.n_epochs:
                     raise Interrupted(f"stopped after epoch {epoch}; continue with --resume {run.path}")
@@ -112,28 +112,28 @@ def task_of_run(run: Run, mesh: Mesh | None = None) -> Task:
     return task_of(run.config, ReachEnv(run.spec, run.config.env, run.s2r), run.demonstrations(), mesh)
 
 
-def begin_with(task: Task, seed: int, **donors: Run) -> TrainState:
-    """Return the state that a new run begins with, parts of its learner being taken from other runs.
+def begin_with(task: Task, seed: int, donors: Mapping[str, Run]) -> tuple[TrainState, dict[str, Any]]:
+    """Return the state that a new run begins with, and its parts; some of these are another run's.
 
     Args:
         task: task of the new run.
         seed: seed of the new run.
-        donors: runs by what their learners give, such as `agent` or `reward`; see the learner's `adopt`.
+        donors: `agent`: run whose networks are taken; `reward`: run whose learned reward is taken.
 
     Raises:
         RunError: a donor has no such part, or one of another size.
     """
-    state = task.job.init(jax.random.PRNGKey(seed))
-    adopt = getattr(task.job.learner, "adopt", None)
-    for name, donor in donors.items():
-        if adopt is None:
-            raise RunError(f"{donor.path}: got a donor of {name}, expected none for this learner")
-        given = donor.restore_part("learner", task_of_run(donor).job.shapes().learner)
+    state, learner = task.job.init(jax.random.PRNGKey(seed)), task.job.learner
+    for option, donor in donors.items():
+        parts = {name: x for name, x in donor.parts().items() if (name == "reward") == (option == "reward")}
+        if not parts:
+            expected = "a run of `imitate` that learned one"
+            raise RunError(f"{donor.path}: {option}: got none, expected {expected}")
         try:
-            state = state._replace(learner=adopt(state.learner, **{name: given}))
+            state = state._replace(learner=learner.adopt(state.learner, parts))
         except ValueError as error:
             raise RunError(f"{donor.path}: {error}") from error
-    return task.job.place(state)
+    return (state := task.job.place(state)), task.job.parts(state)
 
 
 def open_board(run: Run, state: TrainState) -> SummaryWriter:

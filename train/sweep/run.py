@@ -145,7 +145,7 @@ def train(sweep: Sweep, console: Console) -> None:
                     row |= evaluation(run, tasks[run.config.env], job.learner.policy(member.learner))
                 record(run, board, epoch, done, row)
                 if member is not None:
-                    run.save(epoch, member)
+                    run.save(epoch, member, job.learner.parts(member.learner))
             show(epoch, _line(rows), due)
             if stop and epoch < config.n_epochs:
                 raise Interrupted(f"stopped after epoch {epoch}; continue with --resume {sweep.path}")

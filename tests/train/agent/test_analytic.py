@@ -101,13 +101,14 @@ def test_a_policy_is_adopted_and_may_observe_less(learner, start):
     own = jax.jit(wider.init)(jax.random.key(1))
     obs = np.random.default_rng(0).normal(size=(5, env.observation_size)).astype(np.float32)
     expected = learner.mode(learner.policy(start), obs[:, : learner.env.observation_size])
-    np.testing.assert_allclose(wider.mode(wider.policy(wider.adopt(own, start)), obs), expected, atol=1e-6)
+    adopted = wider.adopt(own, learner.parts(start))
+    np.testing.assert_allclose(wider.mode(wider.policy(adopted), obs), expected, atol=1e-6)
     smaller = Analytic(dataclasses.replace(CONFIG, hidden=(8,)), env, 4)
     with pytest.raises(ValueError, match="actor: got layers of"):
-        smaller.adopt(jax.eval_shape(smaller.init, jax.random.key(2)), start)
+        smaller.adopt(jax.eval_shape(smaller.init, jax.random.key(2)), learner.parts(start))
     carrying = Analytic(CONFIG, ReachEnv(SHORT, EnvConfig(n_poses=64, observation="payload")), 4)
     with pytest.raises(ValueError, match="actor: got layers of"):  # it observes other things, not less
-        wider.adopt(own, jax.jit(carrying.init)(jax.random.key(2)))
+        wider.adopt(own, carrying.parts(jax.jit(carrying.init)(jax.random.key(2))))
 
 
 @pytest.mark.parametrize(

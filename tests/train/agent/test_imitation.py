@@ -128,20 +128,21 @@ def test_parts_of_other_runs_are_taken(new):
     learner, reach = new(), new().learner
     state, donor = learner.init(jax.random.PRNGKey(0)), learner.init(jax.random.PRNGKey(1))
     same = lambda a, b: jax.tree.map(np.testing.assert_array_equal, a, b)  # noqa: E731
-    for agent in (donor, reach.init(jax.random.PRNGKey(2))):  # of `imitate` and of `reach`
-        taken = learner.adopt(state, agent=agent)
-        same(learner.policy(taken), (learner if agent is donor else reach).policy(agent))
+    shown = learner.parts(donor)
+    reward = shown.pop("reward")
+    for parts in (shown, reach.parts(reach.init(jax.random.PRNGKey(2)))):  # of `imitate` and of `reach`
+        taken = learner.adopt(state, parts)
+        same(reach.parts(taken.agent), parts)
         same(taken.discriminator, state.discriminator)
-    same(learner.adopt(state, reward=donor), state._replace(discriminator=donor.discriminator))
+    taken = learner.adopt(state, {"reward": reward})
+    same(taken.agent, state.agent)
+    same(taken.discriminator.params, donor.discriminator.params)
 
 
 def test_parts_that_do_not_fit_are_refused(new):
-    learner = new()
+    learner, narrow = new(), new(tqc=TQCConfig(hidden_actor=(8,)))
     state = learner.init(jax.random.PRNGKey(0))
-    other = new(tqc=TQCConfig(hidden_actor=(8,))).init(jax.random.PRNGKey(0))
     with pytest.raises(ValueError, match="networks: got layers of .* expected"):
-        learner.adopt(state, agent=other)
-    without = new(learned_weight=0.0, hand_made_weight=1.0).init(jax.random.PRNGKey(0))
-    for donor in (without, state.agent):
-        with pytest.raises(ValueError, match="reward: got none"):
-            learner.adopt(state, reward=donor)
+        learner.adopt(state, narrow.parts(narrow.init(jax.random.PRNGKey(0))))
+    without = new(learned_weight=0.0, hand_made_weight=1.0)
+    assert "reward" not in without.parts(without.init(jax.random.PRNGKey(0)))

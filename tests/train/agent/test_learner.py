@@ -13,13 +13,14 @@ from rich.console import Console
 from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.policy.file import load_policy
 from tests.train.small import SHORT
+from train.agent.learner import Learner
 from train.agent.networks import Actor
 from train.config import TrainConfig
 from train.runs import export
 from train.runs.checkpoint import Run, RunError
 from train.runs.estimator import Distilled
 from train.runs.evaluate import Evaluator
-from train.runs.run import train
+from train.runs.run import begin_with, train
 from train.runs.task import task_of
 
 CONFIG = TrainConfig(
@@ -38,7 +39,7 @@ CONFIG = TrainConfig(
 pytestmark = pytest.mark.usefixtures("quick_compiler")
 
 
-class Regression:
+class Regression(Learner):
     """A network fitted to the actions that led to the poses reached."""
 
     own_arms = 0
@@ -99,20 +100,28 @@ def quick_export(make_arm_model, monkeypatch):
 
 
 def test_the_exported_policy_acts_as_it_does(run, task, tmp_path, quick_export):
+    policy = load_policy(export.export_run(run, tmp_path / "policy.npz"))
     shapes = jax.eval_shape(task.job.init, jax.random.PRNGKey(0))
     params = task.job.policy(run.restore(shapes)[1])
-    policy = load_policy(export.export_run(run, tmp_path / "policy.npz", params))
     obs = np.random.default_rng(0).normal(size=(8, 18)).astype(np.float32)
     (first, bias), (head, head_bias) = policy.layers
     expected = np.tanh(np.maximum(obs @ first + bias, 0.0) @ head + head_bias)
     np.testing.assert_allclose(task.job.learner.mode(params, obs), expected, atol=1e-5)
 
 
-def test_a_policy_that_the_file_cannot_hold_is_refused(run, tmp_path, quick_export):
+def test_a_policy_that_the_file_cannot_hold_is_refused(run, tmp_path, quick_export, monkeypatch):
+    monkeypatch.setattr(run, "policy", lambda: {"params": {"other": {}}})
     with pytest.raises(RunError, match="got .*'other'.* expected hidden_0"):
-        export.export_run(run, tmp_path / "policy.npz", {"params": {"other": {}}})
-
-
-def test_a_checkpoint_of_another_learner_is_refused(run, tmp_path):
-    with pytest.raises(RunError, match=f"{run.path}: got a checkpoint of other parts or sizes"):
         export.export_run(run, tmp_path / "policy.npz")
+
+
+def test_a_checkpoint_of_another_learner_and_a_donor_are_refused(run, task):
+    other = task_of(CONFIG, task.job.env)
+    with pytest.raises(RunError, match=f"{run.path}: got a checkpoint of other parts or sizes"):
+        run.restore(other.job.like())
+    with pytest.raises(RunError, match=f"{run.path}: got a policy without critics"):
+        begin_with(other, 0, {"agent": run})
+    with pytest.raises(RunError, match=f"{run.path}: got a donor of policy, expected none"):
+        begin_with(task, 0, {"agent": run})
+    with pytest.raises(RunError, match=f"{run.path}: reward: got none, expected a run of `imitate`"):
+        begin_with(other, 0, {"reward": run})

@@ -107,7 +107,7 @@ def test_the_epoch_is_traced_once_and_the_replay_stays_where_it_is(jobs, trained
 def test_a_checkpoint_of_many_devices_continues_on_one(tmp_path, jobs, trained):
     state, _ = trained[str(N_DEVICES)]
     run = Run.create(tmp_path / "run", CONFIG, SHORT)
-    run.save(4, state)
+    run.save(4, state, jobs[str(N_DEVICES)].parts(state))
     expected = jax.device_get(state.learner.actor_params)
     for n, job in jobs.items():
         epoch, restored = run.restore(job.init(jax.random.PRNGKey(1)))
@@ -122,18 +122,16 @@ _RESTORE = """
 import sys, jax, numpy as np
 from pathlib import Path
 from train.runs.checkpoint import Run
-from train.agent.tqc import TQC
 run = Run.open(Path(sys.argv[1]))
 assert len(jax.devices()) == 1
-agent = TQC(18, 3, run.config.tqc, run.config.n_updates)
-params = run.restore_part("learner", jax.eval_shape(agent.init, jax.random.PRNGKey(0))).actor_params
-print(sum(float(np.abs(x).sum()) for x in jax.tree.leaves(params)))
+print(sum(float(np.abs(x).sum()) for x in jax.tree.leaves(run.policy())))
 """
 
 
-def test_a_policy_of_many_devices_is_read_where_there_is_one(tmp_path, trained):
+def test_a_policy_of_many_devices_is_read_where_there_is_one(tmp_path, jobs, trained):
     state, _ = trained[str(N_DEVICES)]
-    Run.create(tmp_path / "run", CONFIG, SHORT).save(4, state)
+    parts = jobs[str(N_DEVICES)].parts(state)
+    Run.create(tmp_path / "run", CONFIG, SHORT).save(4, state, parts)
     done = subprocess.run(
         [sys.executable, "-c", _RESTORE, str(tmp_path / "run")],
         env={**os.environ, "JAX_NUM_CPU_DEVICES": "1", "JAX_PLATFORMS": "cpu"},
@@ -141,7 +139,7 @@ def test_a_policy_of_many_devices_is_read_where_there_is_one(tmp_path, trained):
         text=True,
     )
     assert done.returncode == 0, done.stderr
-    leaves = jax.tree.leaves(jax.device_get(state.learner.actor_params))
+    leaves = jax.tree.leaves(jax.device_get(parts["policy"]))
     np.testing.assert_allclose(float(done.stdout), sum(np.abs(x).sum() for x in leaves), rtol=1e-5)
 
 

@@ -80,7 +80,7 @@ def test_a_checkpoint_that_is_missing_or_of_another_structure_is_refused(job, tm
     run, state = Run.create(tmp_path, CONFIG, job.env.spec), start(job)
     with pytest.raises(RunError, match="got no checkpoint"):
         run.restore(state)
-    run.save(0, state)
+    run.save(0, state, job.parts(state))
     for other in ({**state._asdict(), "more": state.key}, state._replace(key=state.arms.obs)):
         with pytest.raises(RunError, match=f"{tmp_path}: got a checkpoint of other parts or sizes"):
             run.restore(other)

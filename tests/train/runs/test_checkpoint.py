@@ -51,5 +51,5 @@ def test_the_policy_is_read_from_the_state_of_every_learner(tmp_path, short_env,
         with pytest.raises(RunError, match="got no checkpoint, expected one"):
             run.policy()
         own = jax.jit(learner.init)(jax.random.PRNGKey(0))
-        run.save(1, TrainState(None, own, None, (), zero, zero, zero, zero))
+        run.save(1, TrainState(None, own, None, (), zero, zero, zero, zero), learner.parts(own))
         jax.tree.map(np.testing.assert_array_equal, run.policy(), jax.device_get(learner.policy(own)))

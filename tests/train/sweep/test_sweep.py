@@ -150,11 +150,11 @@ def ready(job, monkeypatch):
     monkeypatch.setattr(sweep_run, "task_of", lambda config, env: task)
 
 
-def dying(run, epoch, state, save=Run.save):
+def dying(run, epoch, *rest, save=Run.save):
     """Saves until the second member is to be saved after the sixth epoch."""
     if epoch == 6 and run.config.seed == 3:
         raise KeyboardInterrupt
-    save(run, epoch, state)
+    save(run, epoch, *rest)
 
 
 def test_a_stopped_sweep_ends_with_the_same_bits(ready, job, members, tmp_path, monkeypatch):
