@@ -6,7 +6,9 @@ Source: the paper's reward equation. Its three cases become terms that add up:
     reached:     goal_bonus
     otherwise:  -error_cost ||e|| - step_cost N,    e = w (pose - goal).
 
-An environment may also charge for a body close to a wall, in all three cases; the paper has no such term.
+Two more terms, which the paper does not have, are charged in all three cases: `distance_cost` for the error,
+and an environment's cost of a body close to a wall. The cases hide the error of a saturated arm and of one
+near its goal. With `distance_cost` alone beside `saturation_cost`, the error always counts.
 """
 
 from __future__ import annotations
@@ -28,6 +30,7 @@ class RewardConfig:
     threshold: float = 0.03  # weighted error below which a goal is reached
     weight_per_mm: float = 0.0056  # weight of the tip's position
     weight_per_deg: float = 0.001  # weight of the tip's angles
+    distance_cost: float = 0.0  # cost of a weighted error of 1, in every case
 
 
 def scaled_error(pose: Array, goal: Array, config: RewardConfig) -> Array:
@@ -74,6 +77,7 @@ def reward(
         "error": xp.where(on_the_way, -config.error_cost * norm, 0.0),
         "steps": xp.where(on_the_way, -config.step_cost * n_steps, 0.0),
         "saturation": xp.where(saturated, -config.saturation_cost, 0.0),
+        "distance": -config.distance_cost * norm,
         "clearance": xp.zeros_like(norm) - clearance_cost,
     }
     return sum(terms.values()), reached, terms

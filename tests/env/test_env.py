@@ -141,7 +141,7 @@ def test_reward_done_and_metrics_are_those_of_the_paper_s_three_cases(env, spec,
     np.testing.assert_array_equal(arm.n_steps, n_steps + 1)
     tip_error = np.linalg.norm(np.asarray(arm.pose - arm.goal)[:, :3], axis=1)
     np.testing.assert_allclose(after.metrics["tip_error_mm"], tip_error, rtol=1e-5)
-    names = ("goal", "error", "steps", "saturation", "clearance")
+    names = ("goal", "error", "steps", "saturation", "distance", "clearance")
     terms = sum(after.metrics[f"reward_{name}"] for name in names)
     np.testing.assert_allclose(after.reward, terms, rtol=1e-6)
 

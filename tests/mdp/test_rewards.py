@@ -57,7 +57,18 @@ def test_saturation_overrules_all_else_even_a_reached_goal(mm):
     value, reached, terms = reward_of(away(mm), n_steps=3, saturated=True)
     assert value == -100.0
     assert not reached
-    assert terms == {"goal": 0.0, "error": 0.0, "steps": 0.0, "saturation": -100.0, "clearance": 0.0}
+    others = dict.fromkeys(("goal", "error", "steps", "distance", "clearance"), 0.0)
+    assert terms == {"saturation": -100.0, **others}
+
+
+@pytest.mark.parametrize(
+    ("mm", "saturated", "rest"), [(1.0, False, 100.0), (1.0, True, -100.0), (50.0, False, -2.9)]
+)
+def test_a_distance_costs_in_every_case(mm, saturated, rest):
+    config = RewardConfig(distance_cost=200.0)
+    value, _, terms = reward_of(away(mm), saturated=saturated, config=config)
+    assert terms["distance"] == pytest.approx(-200.0 * 0.0056 * mm)
+    assert value == pytest.approx(rest - 200.0 * 0.0056 * mm)
 
 
 def test_every_weight_of_the_config_counts():
