@@ -45,15 +45,22 @@ _MOVING = EnvConfig(
     randomisation=Randomisation(damping_spread=0.2, delay_max_s=0.005, friction_max_n=1.5),
 )
 
+# The error counts in every case. The paper's cases hide it within 5.4 mm of a goal and where a chamber is at a
+# limit: with them, the same number of steps ends at 2.0 mm instead of 1.25.
+_ALWAYS = RewardConfig(
+    goal_bonus=0.0, error_cost=0.0, step_cost=0.0, saturation_cost=10.0, distance_cost=200.0
+)
+
 PRESETS: dict[str, TrainConfig] = {
     # On a CPU a gradient step costs as much as many env steps, so there are eight of these to one of those,
     # and the batch is small.
     "quick": dataclasses.replace(
         _AT_REST,
-        total_env_steps=180_000,
+        total_env_steps=122_880,
         updates_per_env_step=0.125,
         batch_size=128,
-        replay_capacity=262_144,
+        replay_capacity=131_072,
+        env=EnvConfig(reward=_ALWAYS),
         evaluation_epochs=30,
     ),
     "analytic": _ANALYTIC,
