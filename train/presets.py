@@ -45,8 +45,8 @@ _MOVING = EnvConfig(
     randomisation=Randomisation(damping_spread=0.2, delay_max_s=0.005, friction_max_n=1.5),
 )
 
-# The error counts in every case. The paper's cases hide it within 5.4 mm of a goal and where a chamber is at a
-# limit: with them, the same number of steps ends at 2.0 mm instead of 1.25.
+# The error counts in every case. The paper's cases hide it within 5.4 mm of a goal, and where a chamber is at
+# a limit: with them the same number of steps ends at 2.0 mm instead of 1.25.
 _ALWAYS = RewardConfig(
     goal_bonus=0.0, error_cost=0.0, step_cost=0.0, saturation_cost=10.0, distance_cost=200.0
 )
