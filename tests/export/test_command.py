@@ -1,5 +1,7 @@
 """`python -m train export RUN --onnx --cpp DIR`: which files it writes, and what it refuses."""
 
+from types import SimpleNamespace
+
 import pytest
 
 from mjx_softarm.export.golden import read_golden
@@ -12,8 +14,9 @@ def test_files_of_an_export(policy_file, tmp_path, monkeypatch, capsys):
     pytest.importorskip("onnx", reason="the package onnx is not installed")
     policy = tmp_path / "policy.npz"
     policy.write_bytes(policy_file.read_bytes())
-    monkeypatch.setattr(command, "export_run", lambda run, out: policy)
-    monkeypatch.setattr(command.Run, "open", lambda path: None)
+    monkeypatch.setattr(command, "export_run", lambda run, arm, out: policy)
+    monkeypatch.setattr(command, "arm_model", lambda spec, s2r: None)
+    monkeypatch.setattr(command.Run, "open", lambda path: SimpleNamespace(spec=None, s2r=None))
     with few_golden_rows():
         assert command.export((tmp_path,), onnx=True, cpp=tmp_path / "cpp") == 0
     beside = {path.name for path in tmp_path.iterdir()}

@@ -24,6 +24,7 @@ from train.epoch import devices
 from train.options import NewRunOptions, named_preset, start
 from train.presets import IMITATION_PRESETS, PRESETS
 from train.runs import run as runs
+from train.runs.arm_model import arm_model
 from train.runs.checkpoint import Run, RunError
 from train.runs.evaluate import N_ACTIONS
 from train.runs.export import export_run
@@ -184,7 +185,8 @@ def export(folders: Runs, out: cli.MaybePath = None, onnx: bool = False, cpp: cl
         raise RunError(f"RUN: got {len(folders)}, expected {expected}")
     console = start()
     for path in folders:
-        policy = export_run(Run.open(path), out)
+        run = Run.open(path)
+        policy = export_run(run, arm_model(run.spec, run.s2r), out)
         console.print(f"policy: {policy}", highlight=False, soft_wrap=True)
         files = export_onnx(policy) if onnx else []
         for file in [*files, *(export_cpp(policy, cpp) if cpp else [])]:

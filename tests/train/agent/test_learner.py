@@ -16,10 +16,10 @@ from tests.train.small import SHORT
 from train.agent.learner import Learner
 from train.agent.networks import Actor
 from train.config import TrainConfig
-from train.runs import export
+from train.runs.arm_model import DistilledArm
 from train.runs.checkpoint import Run, RunError
-from train.runs.estimator import Distilled
 from train.runs.evaluate import Evaluator
+from train.runs.export import export_run
 from train.runs.run import begin_with, train
 from train.runs.task import task_of
 
@@ -93,14 +93,12 @@ def test_it_learns_in_the_epoch_and_is_evaluated(run):
 
 
 @pytest.fixture
-def quick_export(make_arm_model, monkeypatch):
-    model = make_arm_model(SHORT.n_chambers)
-    nothing = Distilled(*model[1:4], {}, {}, {}, {})
-    monkeypatch.setattr(export, "arm_model", lambda *arm: (model, nothing))
+def arm(make_arm_model):
+    return DistilledArm(make_arm_model(SHORT.n_chambers), {})
 
 
-def test_the_exported_policy_acts_as_it_does(run, task, tmp_path, quick_export):
-    policy = load_policy(export.export_run(run, tmp_path / "policy.npz"))
+def test_the_exported_policy_acts_as_it_does(run, task, tmp_path, arm):
+    policy = load_policy(export_run(run, arm, tmp_path / "policy.npz"))
     shapes = jax.eval_shape(task.job.init, jax.random.PRNGKey(0))
     params = task.job.policy(run.restore(shapes)[1])
     obs = np.random.default_rng(0).normal(size=(8, 18)).astype(np.float32)
@@ -109,10 +107,10 @@ def test_the_exported_policy_acts_as_it_does(run, task, tmp_path, quick_export):
     np.testing.assert_allclose(task.job.learner.mode(params, obs), expected, atol=1e-5)
 
 
-def test_a_policy_that_the_file_cannot_hold_is_refused(run, tmp_path, quick_export, monkeypatch):
+def test_a_policy_that_the_file_cannot_hold_is_refused(run, tmp_path, arm, monkeypatch):
     monkeypatch.setattr(run, "policy", lambda: {"params": {"other": {}}})
     with pytest.raises(RunError, match="got .*'other'.* expected hidden_0"):
-        export.export_run(run, tmp_path / "policy.npz")
+        export_run(run, arm, tmp_path / "policy.npz")
 
 
 def test_a_checkpoint_of_another_learner_and_a_donor_are_refused(run, task):
