@@ -1,10 +1,10 @@
-"""Films of a trial: the twin's model, drawn without a display, beside its path seen from one side."""
+"""Films of trials: the twin's model, drawn without a display, beside or above its path from one side."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from PIL import Image, ImageDraw
@@ -14,111 +14,100 @@ from benchmarks.paper.measure import WatchedTwin, captured_finger_tips, finger_t
 from benchmarks.paper.scene import Scene
 from mjx_softarm.mechanics.pipe import PIPES_MM, CrossPipe
 
-WIDTH, HEIGHT = 240, 320  # of each half [px]
+WIDTH, HEIGHT = 240, 320  # of a picture [px]
 LABEL_HEIGHT = 32  # of the text above a square side view [px]
 PERIOD_S = 1.0  # simulated time between two pictures
-MAX_FRAMES = 120
-FRAME_MS = 80
+MAX_FRAMES, FRAME_MS = 120, 80
 N_LOAD_FRAMES, LOAD_FRAME_MS = 70, 110  # of the film that has a column for each load
 N_COLOURS = 128
 INK, GREY, BLUE, ORANGE = (34, 34, 34), (154, 160, 166), (31, 111, 180), (224, 123, 40)
+FROM_ABOVE, FROM_FRONT = [0, 1], [0, 2]  # axes: to the right, upwards
 
 
 class SideView(NamedTuple):
-    """Drawing beside the pictures."""
+    """Text, goals and outlines of the drawing of a path."""
 
     title: str
     text: str
-    axes: tuple[int, int]  # of x, y, z: the one to the right, and the one upwards
+    axes: list[int]
     goals_mm: np.ndarray  # (p, 3)
-    lines_mm: tuple[np.ndarray, ...] = ()  # (k, 2) each, along these axes
+    lines_mm: tuple[np.ndarray, ...] = ()  # (k, 2) each, along the axes
 
 
-class TwinCamera:
-    """Pictures of a twin at equal times as it is driven, with what motion capture saw then."""
+class Filmed(NamedTuple):
+    """A filmed trial: pictures at equal times, the path (n, 3) [mm] at these times, and its side view."""
 
-    def __init__(self, twin: Any, renderer: Any):
-        self._twin, self._renderer, self._next_s = twin, renderer, 0.0
-        self.pictures: list[np.ndarray] = []
-        self.seen: list[Any] = []
-
-    def shoot(self) -> None:
-        """Take a picture, if it is time to."""
-        if self._twin.time_s >= self._next_s:
-            self._next_s += PERIOD_S
-            self.pictures.append(self._twin.draw(self._renderer))
-            self.seen.append(self._twin.motion_capture())
+    pictures: list[np.ndarray]
+    path_mm: np.ndarray
+    side: SideView
 
 
 def film_scene(path: Path, scene: Scene, trial: Trial) -> None:
     """Write the film of a trial: its pipe cut open from the front, or the circle from above."""
-    camera = _filmed(scene, trial)
-    diameter_mm = PIPES_MM.get(KINDS[trial.kind].task)
-    gripper_m = scene.controller.policy.spec.mass.gripper_length_m if diameter_mm else 0.0
-    path_mm = 1e3 * np.array(
-        [captured_finger_tips(seen.tip_m, seen.tip_quaternion, gripper_m) for seen in camera.seen]
-    )
-    goals_mm = 1e3 * finger_tips(scene.goals, gripper_m)
-    if diameter_mm:
-        lines, title = outline_mm(CrossPipe.of_mm(diameter_mm)), f"twin {trial.twin}, {diameter_mm} mm pipe"
-        side = SideView(title, "demonstrated (grey), finger tips", (0, 2), goals_mm, tuple(lines))
-    else:
-        title = f"twin {trial.twin}, {KINDS[trial.kind].title}"
-        side = SideView(title, "reference (grey) and tip, from above", (0, 1), goals_mm)
-    write_gif(path, frames(camera.pictures, path_mm, side))
+    title, text = f"twin {trial.twin}, {KINDS[trial.kind].title}", "reference (grey) and tip, from above"
+    lines, gripper_m, axes = (), 0.0, FROM_ABOVE
+    if diameter_mm := PIPES_MM.get(KINDS[trial.kind].task):
+        title, text = f"twin {trial.twin}, {diameter_mm} mm pipe", "demonstrated (grey), finger tips"
+        lines, axes = outline_mm(CrossPipe.of_mm(diameter_mm)), FROM_FRONT
+        gripper_m = scene.controller.policy.spec.mass.gripper_length_m
+    side = SideView(title, text, axes, 1e3 * finger_tips(scene.goals, gripper_m), lines)
+    write_gif(path, frames(_filmed(scene, trial, side, gripper_m)))
 
 
 def film_side_by_side(path: Path, scenes: Sequence[tuple[Scene, Trial]]) -> None:
     """Write the film of trials on the circle, at equal times: one column for each, titled by its load."""
     columns = []
     for scene, trial in scenes:
-        camera = _filmed(scene, trial)
-        path_mm = 1e3 * np.array([seen.tip_m for seen in camera.seen])
         title = f"{trial.load_g:,} g" if trial.load_g else "no load"
-        side = SideView(title, "reference (grey) and tip, from above", (0, 1), scene.goals[:, :3])
-        columns.append((camera.pictures, path_mm, side))
+        side = SideView(title, "reference (grey) and tip, from above", FROM_ABOVE, scene.goals[:, :3])
+        columns.append(_filmed(scene, trial, side))
     write_gif(path, side_by_side(columns), LOAD_FRAME_MS)
 
 
-def _filmed(scene: Scene, trial: Trial) -> TwinCamera:
-    """Run a trial; returns the camera that filmed it."""
+def _filmed(scene: Scene, trial: Trial, side: SideView, gripper_m: float = 0.0) -> Filmed:
+    """Run a trial, and take a picture of the twin in each period."""
+    pictures, tips_m = [], []
     with scene.twin.renderer(WIDTH, HEIGHT) as renderer:
-        camera = TwinCamera(scene.twin, renderer)
-        operate(WatchedTwin(scene.twin, camera.shoot), *scene[1:], trial.objects)
-    return camera
+
+        def shoot() -> None:
+            if scene.twin.time_s >= PERIOD_S * len(pictures):
+                pictures.append(scene.twin.draw(renderer))
+                seen = scene.twin.motion_capture()
+                tips_m.append(captured_finger_tips(seen.tip_m, seen.tip_quaternion, gripper_m))
+
+        operate(WatchedTwin(scene.twin, shoot), *scene[1:], trial.objects)
+    return Filmed(pictures, 1e3 * np.array(tips_m), side)
 
 
-def outline_mm(pipe: CrossPipe) -> list[np.ndarray]:
+def outline_mm(pipe: CrossPipe) -> tuple[np.ndarray, ...]:
     """Return the cross from the front: lines (k, 2) of x and z [mm]."""
     r, far, z = pipe.radius_m, pipe.branch_m, pipe.centre_z_m
     lines = []
     for side in (-1.0, 1.0):
         lines.append([(side * r, pipe.top_z_m), (side * r, z + r), (side * far, z + r)])
         lines.append([(side * far, z - r), (side * r, z - r), (side * r, z - far)])
-    return [1e3 * np.array(line) for line in lines]
+    return tuple(1e3 * np.array(line) for line in lines)
 
 
-def frames(pictures: list[np.ndarray], path_mm: np.ndarray, side: SideView) -> list[Image.Image]:
-    """Return at most `MAX_FRAMES` pictures, evenly spread, each beside the path (n, 3) up to its time."""
+def frames(filmed: Filmed) -> list[Image.Image]:
+    """Return at most `MAX_FRAMES` pictures, evenly spread, each beside the path up to its time."""
     images = []
-    for k in _spread(len(pictures), MAX_FRAMES):
-        height, width, _ = pictures[k].shape
+    for k in _spread(len(filmed.pictures), MAX_FRAMES):
+        height, width, _ = filmed.pictures[k].shape
         images.append(Image.new("RGB", (2 * width, height)))
-        images[-1].paste(Image.fromarray(pictures[k]), (0, 0))
-        images[-1].paste(_side_view((width, height), path_mm[: k + 1], side), (width, 0))
+        images[-1].paste(Image.fromarray(filmed.pictures[k]), (0, 0))
+        images[-1].paste(_side_view((width, height), filmed.path_mm[: k + 1], filmed.side), (width, 0))
     return images
 
 
-def side_by_side(
-    columns: Sequence[tuple[list[np.ndarray], np.ndarray, SideView]],
-) -> list[Image.Image]:
-    """Return frames with a column for each trial: its picture above its path (n, 3) up to the same time.
+def side_by_side(columns: Sequence[Filmed]) -> list[Image.Image]:
+    """Return frames with a column for each trial: its picture above its path up to the same time.
 
     A trial that ended before the others shows its last picture from then on.
     """
     images = []
-    for k in _spread(max(len(pictures) for pictures, _, _ in columns), N_LOAD_FRAMES):
-        height, width, _ = columns[0][0][0].shape
+    for k in _spread(max(len(column.pictures) for column in columns), N_LOAD_FRAMES):
+        height, width, _ = columns[0].pictures[0].shape
         size = (width, width + LABEL_HEIGHT)
         images.append(Image.new("RGB", (width * len(columns), height + size[1])))
         for left, (pictures, path_mm, side) in zip(range(0, images[-1].width, width), columns, strict=True):
@@ -134,12 +123,10 @@ def _spread(n: int, n_most: int) -> list[int]:
 
 def _side_view(size: tuple[int, int], path_mm: np.ndarray, side: SideView) -> Image.Image:
     """Draw a path (k, 3) from one side into a picture of some width and height [px]."""
-    width, height = size
-    image = Image.new("RGB", size, (255, 255, 255))
-    pen = ImageDraw.Draw(image)
     # Scale so that goals and lines fill 80 % of the picture.
-    axes = list(side.axes)
-    shown = np.concatenate([side.goals_mm[:, axes], *side.lines_mm])
+    (width, height), image = size, Image.new("RGB", size, (255, 255, 255))
+    pen = ImageDraw.Draw(image)
+    shown = np.concatenate([side.goals_mm[:, side.axes], *side.lines_mm])
     low, high = shown.min(axis=0), shown.max(axis=0)
     scale = 0.8 * min(np.array(size) / np.maximum(high - low, 1.0))
 
@@ -147,14 +134,15 @@ def _side_view(size: tuple[int, int], path_mm: np.ndarray, side: SideView) -> Im
         right, up = scale * (point_mm - 0.5 * (low + high))
         return 0.5 * width + right, 0.53 * height - up
 
+    # Outlines, text and goals, then the path with its end.
     for line in side.lines_mm:
         pen.line([at(point) for point in line], fill=GREY, width=2)
     pen.text((8, 8), side.title, fill=INK)
     pen.text((8, 22), side.text, fill=GREY)
-    for goal in side.goals_mm[:, axes]:
+    for goal in side.goals_mm[:, side.axes]:
         pen.circle(at(goal), 2, fill=GREY)
-    pen.line([at(point) for point in path_mm[:, axes]], fill=BLUE, width=1)
-    pen.circle(at(path_mm[-1, axes]), 4, fill=ORANGE)
+    pen.line([at(point) for point in path_mm[:, side.axes]], fill=BLUE, width=1)
+    pen.circle(at(path_mm[-1, side.axes]), 4, fill=ORANGE)
     return image
 
 

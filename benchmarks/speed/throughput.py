@@ -22,7 +22,7 @@ from benchmarks.harness.common import n_cores
 from benchmarks.harness.peers import PeerError, peer_python
 from benchmarks.harness.rounds import Facts, Worker, take_turns
 from benchmarks.speed.mujoco_arms import write_arm
-from benchmarks.speed.truth import ERROR, TOLD, told_error
+from benchmarks.speed.truth import TOLD, told_error
 from mjx_softarm.env import EnvConfig
 from mjx_softarm.spec import ArmSpec
 
@@ -31,8 +31,6 @@ PAPER_WORKERS, PAPER_STEP_S = 14, 0.03  # the paper's cost of an environment ste
 SUBPROC = "SubprocVecEnv"
 N_MOVING = 128  # arms in motion
 SOROMOX = {"explicit": "SoRoMoX, explicit", "implicit": "SoRoMoX, this project's implicit step"}
-MOVING_COLUMNS = ("program", "step_ms", "arms", "simulated_s_per_s")
-COLUMNS = ("program", "env_steps_per_s", "times_subproc", "simulated_s_per_env_step", *ERROR)
 
 Point = tuple[str, str, int]  # engine, mode, arms
 Peer = tuple[str, list[str], str]  # name, program, key of `PINS`
@@ -135,20 +133,19 @@ def _digits(rate: float) -> float | int:
 
 def side_by_side(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return rows with the paper's added, and each rate as a multiple of SubprocVecEnv's."""
-    program = f"the paper: {PAPER_WORKERS} workers, {PAPER_STEP_S} s a step, at most"
-    paper = {"program": program, "env_steps_per_s": round(PAPER_WORKERS / PAPER_STEP_S)}
     base = next((row.get("env_steps_per_s") for row in rows if SUBPROC in row["program"]), None)
     full = []
     for row in rows:
         rate = row.get("env_steps_per_s")
         full.append({**row, "times_subproc": _digits(rate / base) if rate and base else None})
-    return [{name: row.get(name) for name in (*COLUMNS, "skipped", "failed")} for row in [*full, paper]]
+    program = f"the paper: {PAPER_WORKERS} workers, {PAPER_STEP_S} s a step, at most"
+    return [*full, {"program": program, "env_steps_per_s": round(PAPER_WORKERS / PAPER_STEP_S)}]
 
 
 def moving_row(row: dict[str, Any]) -> dict[str, Any]:
-    """Return a row of `simulated_time`; the duration of an environment step is known."""
+    """Return a row of `simulated_time`: this project's rate is one of environment steps of known duration."""
+    if "env_steps_per_s" not in row or "simulated_s_per_s" in row:
+        return row
     config = EnvConfig()
-    if "env_steps_per_s" in row and "simulated_s_per_s" not in row:
-        rate = _digits(row["env_steps_per_s"] * config.dynamic_step_s)
-        row = {"arms": N_MOVING, "step_ms": 1e3 * config.simulation_step_s, **row, "simulated_s_per_s": rate}
-    return {name: row.get(name) for name in (*MOVING_COLUMNS, "skipped", "failed")}
+    rate = _digits(row["env_steps_per_s"] * config.dynamic_step_s)
+    return {**row, "arms": N_MOVING, "step_ms": 1e3 * config.simulation_step_s, "simulated_s_per_s": rate}

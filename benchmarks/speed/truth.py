@@ -24,7 +24,6 @@ from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.spec import ArmSpec
 
 QUANTILES = {"median_mm": 0.5, "p95_mm": 0.95, "max_mm": 1.0}
-ERROR = (*QUANTILES, "without_truth")  # columns of a table
 TOLD = ("reference_m", "tip_mm")  # facts that a worker tells of its settled arms
 
 

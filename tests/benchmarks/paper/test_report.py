@@ -103,8 +103,8 @@ def write(experiment, folder, results, filmed=False):
     """Write a report; returns its figures by the JSON file, and the names of all its files."""
     fill(folder, TINY)
     if filmed:
-        side = film.SideView("", "", (0, 1), circle_poses(SPEC, 3)[:, :3])
-        images = film.frames([np.zeros((20, 15, 3), np.uint8)] * 3, np.zeros((3, 3)), side)
+        side = film.SideView("", "", film.FROM_ABOVE, circle_poses(SPEC, 3)[:, :3])
+        images = film.frames(film.Filmed([np.zeros((20, 15, 3), np.uint8)] * 3, np.zeros((3, 3)), side))
         film.write_gif(folder / FILMS[experiment], images)
         film.write_gif(folder / loads_film(TINY), images)
     report.write_report(experiment, folder, folder / "out", TINY, results)

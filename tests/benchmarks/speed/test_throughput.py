@@ -19,7 +19,7 @@ from benchmarks.speed.mujoco_arms import (
     write_arm,
 )
 from benchmarks.speed.mujoco_worker import Step, timed
-from benchmarks.speed.throughput import MOVING_COLUMNS, moving_row, over_rounds, side_by_side
+from benchmarks.speed.throughput import moving_row, over_rounds, side_by_side
 from benchmarks.speed.truth import error_figures, random_references, true_rest
 from mjx_softarm import ArmSpec
 from mjx_softarm.env import EnvConfig, ReachEnv
@@ -155,7 +155,7 @@ def test_rates_are_told_as_multiples_of_the_processes_beside_the_paper_s():
             {"program": "C MuJoCo, rollout", "skipped": "no device"},
         ]
     )
-    assert [row["times_subproc"] for row in rows] == [100, 1.0, None, None]
+    assert [row.get("times_subproc") for row in rows] == [100, 1.0, None, None]
     assert rows[2]["skipped"] == "no device" and rows[1]["p95_mm"] == 0.5
     assert rows[3]["env_steps_per_s"] == 467  # the paper's
     assert side_by_side([{"program": "chain", "env_steps_per_s": 5000}])[0]["times_subproc"] is None
@@ -179,7 +179,6 @@ def test_programs_in_motion_are_told_by_simulated_seconds_and_this_project_s_by_
         {"program": "C", "step_ms": 5.0, "arms": 64, "env_steps_per_s": 40, "simulated_s_per_s": 160}
     )
     missing = moving_row({"program": "absent", "skipped": "no network"})
-    assert [row["simulated_s_per_s"] for row in (ours, peer, c, missing)] == [500, 20.5, 160, None]
+    assert [row["simulated_s_per_s"] for row in (ours, peer, c)] == [500, 20.5, 160]
     assert (ours["step_ms"], ours["arms"]) == (20.0, 128) and (c["step_ms"], c["arms"]) == (5.0, 64)
-    assert missing["skipped"] == "no network"
-    assert set(ours) == {*MOVING_COLUMNS, "skipped", "failed"}
+    assert missing == {"program": "absent", "skipped": "no network"}
