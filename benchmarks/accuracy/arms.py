@@ -13,19 +13,18 @@ import tempfile
 from pathlib import Path
 from typing import Annotated, Any
 
+from benchmarks.harness.common import names_of
 from mjx_softarm._support import cli
 from mjx_softarm._support.errors import InputError
-from mjx_softarm.spec import ArmSpec
 
 DONE = (0, 1)  # exit statuses after which there are results
 
 
-def _names(words: list[str]) -> tuple[str, ...]:
-    return tuple(words[0].split(","))
+ARMS = ("paper", "sopra", "stiff-flop")
 
 
 def measure(
-    arms: Annotated[tuple[str, ...], cli.listed(_names, "NAME,NAME,...")] = ("paper", "sopra", "stiff-flop"),
+    arms: Annotated[tuple[str, ...], names_of(ARMS)] = ARMS,
     poses: int = 300,
     steps: int | None = None,
     points: int = 40,
@@ -61,7 +60,7 @@ def _measure(arm: str, folder: Path, poses: int, steps: int | None, points: int)
     options = {"grid": ["--goals", "grid", "--points", points]}
     if arm == "paper":
         options["circle"] = ["--goals", "circle"]
-    figures = _figures(arm, folder, distrusted)
+    figures = _figures(folder, distrusted)
     for goals, given in options.items():
         accuracy = accuracy_of(policy, twin, folder / goals, *given)
         figures |= {f"{goals}, {what}": accuracy[key] for what, key in FIGURES.items()}
@@ -79,15 +78,11 @@ FIGURES = {
 }
 
 
-def _figures(arm: str, folder: Path, distrusted: int) -> dict[str, Any]:
-    """Return figures of the arm's specification and of its calibration's report."""
-    spec = ArmSpec.of(Path(arm))
+def _figures(folder: Path, distrusted: int) -> dict[str, Any]:
+    """Return figures of a calibration's report."""
     parts = json.loads((folder / "calibration/report.json").read_text())["parts"]
     chambers, network = (parts[title]["figures"] for title in ("Chambers", "Sim-to-real network"))
     return {
-        "length [mm]": 1e3 * spec.length_m,
-        "sections": spec.structure.n_sections,
-        "pressures [kPa]": f"{spec.chambers.pressure_min_kpa:g} to {spec.chambers.pressure_max_kpa:g}",
         "calibration's exit status": distrusted,
         "unknown directions": len(chambers["weak"]),
         "tip without S2R, held out [mm]": network["test_uncorrected"]["translation_mean_mm"],

@@ -104,14 +104,9 @@ def _figures(calibration: Calibration, judge: Log) -> dict[str, Any]:
     return {
         "unknown directions": len(chambers["weak"]),
         "least known direction [tolerances]": float(np.max(chambers["direction_widths"])),
-        "unknown directions, tip [mm]": float(np.max(chambers["weak_tip_mm"], initial=0.0)),
-        "calibrated tip, held out [mm]": chambers["held_out"]["translation_mean_mm"],
-        "calibrated tip, held out [deg]": chambers["held_out"]["rotation_mean_deg"],
         "S2R, its training [mm]": network["in_sample"]["translation_mean_mm"],
         "S2R, its held-out poses [mm]": network["test"]["translation_mean_mm"],
         "without S2R, random poses [mm]": before.translation_mean_mm,
         "S2R, random poses [mm]": after.translation_mean_mm,
-        "without S2R, random poses [deg]": before.rotation_mean_deg,
-        "S2R, random poses [deg]": after.rotation_mean_deg,
         "warnings": sum(len(section.warnings) for section in calibration.sections),
     }

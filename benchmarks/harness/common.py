@@ -19,7 +19,9 @@ from jax.sharding import Mesh
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
+from tyro.constructors import PrimitiveConstructorSpec
 
+from mjx_softarm._support import cli
 from mjx_softarm._support.provenance import provenance, write_json
 from train.epoch.devices import mesh_of
 
@@ -68,6 +70,19 @@ def difference(found: Mapping[str, Any], expected: Mapping[str, Any]) -> str:
     names = [name for name in expected if found.get(name) != expected[name]]
     got, asked = (", ".join(f"{name} {values.get(name)}" for name in names) for values in (found, expected))
     return f"got {got}, expected {asked}" if names else ""
+
+
+def names_of(known: Iterable[str]) -> PrimitiveConstructorSpec:
+    """Return how an option is read whose value is some known names with commas between them."""
+    known = tuple(known)
+
+    def read(words: list[str]) -> tuple[str, ...]:
+        names = tuple(dict.fromkeys(words[0].split(",")))
+        if unknown := [name for name in names if name not in known]:
+            raise ValueError(f"got {', '.join(unknown)}, expected some of {', '.join(known)}")
+        return names
+
+    return cli.listed(read, "NAME,NAME,...")
 
 
 def grouped(

@@ -27,11 +27,13 @@ def in_parallel(jobs: Sequence[Job]) -> dict[str, Any]:
     Raises:
         JobError: one failed; those under way are finished, the others are not begun.
     """
+    # Workers, each with a share of the cores.
     context = multiprocessing.get_context("spawn")
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_setaffinity") else []
     n, queue = min(N_WORKERS, len(cores) or 1), context.Queue()
     for k in range(n):
         queue.put(cores[k::n])
+    # All jobs, in the order of the list; the first that fails ends them.
     given: dict[str, Any] = {}
     pool = ProcessPoolExecutor(n, context, _settle_worker, (queue,))
     try:

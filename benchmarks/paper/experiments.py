@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from benchmarks.harness.common import RESULTS, show, status_of
+from benchmarks.harness.common import RESULTS, names_of, show, status_of
 from benchmarks.paper.engine import SMOKE, Settings, claim, run_stages
 from benchmarks.paper.kinds import BESIDE
 from benchmarks.paper.report import json_name, printed_rows, write_report
@@ -18,13 +18,6 @@ from benchmarks.paper.summary import load_results
 from benchmarks.paper.trials import FILMS, stages
 from mjx_softarm._support import cli
 from mjx_softarm._support.errors import InputError
-
-
-def _presets(words: list[str]) -> tuple[str, ...]:
-    names = tuple(dict.fromkeys(words[0].split(",")))
-    if unknown := [name for name in names if name not in BESIDE]:
-        raise ValueError(f"got {', '.join(unknown)}, expected some of {', '.join(BESIDE)}")
-    return names
 
 
 @dataclass(frozen=True)
@@ -58,7 +51,7 @@ class Paper:
     arm: Literal["twin", "rod"] = "twin"
     preset: Literal["quick", "analytic", "payload"] | None = None
     env_steps: int | None = None
-    beside: Annotated[tuple[str, ...], cli.listed(_presets, "NAME,NAME,...")] = ()
+    beside: Annotated[tuple[str, ...], names_of(BESIDE)] = ()
     out: cli.MaybePath = None
 
     def __call__(self) -> int:

@@ -1,4 +1,4 @@
-"""Films of trials: the twin's model, drawn without a display, beside or above its path from one side."""
+"""Films of trials: the twin's model, drawn without a display, above its path from one side."""
 
 from __future__ import annotations
 
@@ -17,9 +17,7 @@ from mjx_softarm.mechanics.pipe import PIPES_MM, CrossPipe
 WIDTH, HEIGHT = 240, 320  # of a picture [px]
 LABEL_HEIGHT = 32  # of the text above a square side view [px]
 PERIOD_S = 1.0  # simulated time between two pictures
-MAX_FRAMES, FRAME_MS = 120, 80
-N_LOAD_FRAMES, LOAD_FRAME_MS = 70, 110  # of the film that has a column for each load
-N_COLOURS = 128
+MAX_FRAMES, FRAME_MS, N_COLOURS = 100, 90, 128
 INK, GREY, BLUE, ORANGE = (34, 34, 34), (154, 160, 166), (31, 111, 180), (224, 123, 40)
 FROM_ABOVE, FROM_FRONT = [0, 1], [0, 2]  # axes: to the right, upwards
 
@@ -34,7 +32,7 @@ class SideView(NamedTuple):
     lines_mm: tuple[np.ndarray, ...] = ()  # (k, 2) each, along the axes
 
 
-class Filmed(NamedTuple):
+class Column(NamedTuple):
     """A filmed trial: pictures at equal times, the path (n, 3) [mm] at these times, and its side view."""
 
     pictures: list[np.ndarray]
@@ -42,30 +40,23 @@ class Filmed(NamedTuple):
     side: SideView
 
 
-def film_scene(path: Path, scene: Scene, trial: Trial) -> None:
-    """Write the film of a trial: its pipe cut open from the front, or the circle from above."""
-    title, text = f"twin {trial.twin}, {KINDS[trial.kind].title}", "reference (grey) and tip, from above"
+def film(path: Path, scenes: Sequence[tuple[Scene, Trial]]) -> None:
+    """Write the film of trials at equal times: one column for each."""
+    write_gif(path, frames([_filmed(*scene) for scene in scenes]))
+
+
+def _filmed(scene: Scene, trial: Trial) -> Column:
+    """Run a trial, and take a picture of the twin in each period."""
+    # The drawing: the pipe cut open from the front, or the circle from above.
+    load = f"{trial.load_g:,} g" if trial.load_g else "no load"
+    title, text = f"twin {trial.twin}, {load}", "reference (grey) and tip, from above"
     lines, gripper_m, axes = (), 0.0, FROM_ABOVE
     if diameter_mm := PIPES_MM.get(KINDS[trial.kind].task):
         title, text = f"twin {trial.twin}, {diameter_mm} mm pipe", "demonstrated (grey), finger tips"
         lines, axes = outline_mm(CrossPipe.of_mm(diameter_mm)), FROM_FRONT
         gripper_m = scene.controller.policy.spec.mass.gripper_length_m
     side = SideView(title, text, axes, 1e3 * finger_tips(scene.goals, gripper_m), lines)
-    write_gif(path, frames(_filmed(scene, trial, side, gripper_m)))
-
-
-def film_side_by_side(path: Path, scenes: Sequence[tuple[Scene, Trial]]) -> None:
-    """Write the film of trials on the circle, at equal times: one column for each, titled by its load."""
-    columns = []
-    for scene, trial in scenes:
-        title = f"{trial.load_g:,} g" if trial.load_g else "no load"
-        side = SideView(title, "reference (grey) and tip, from above", FROM_ABOVE, scene.goals[:, :3])
-        columns.append(_filmed(scene, trial, side))
-    write_gif(path, side_by_side(columns), LOAD_FRAME_MS)
-
-
-def _filmed(scene: Scene, trial: Trial, side: SideView, gripper_m: float = 0.0) -> Filmed:
-    """Run a trial, and take a picture of the twin in each period."""
+    # The pictures, and the path by motion capture.
     pictures, tips_m = [], []
     with scene.twin.renderer(WIDTH, HEIGHT) as renderer:
 
@@ -76,7 +67,7 @@ def _filmed(scene: Scene, trial: Trial, side: SideView, gripper_m: float = 0.0) 
                 tips_m.append(captured_finger_tips(seen.tip_m, seen.tip_quaternion, gripper_m))
 
         operate(WatchedTwin(scene.twin, shoot), *scene[1:], trial.objects)
-    return Filmed(pictures, 1e3 * np.array(tips_m), side)
+    return Column(pictures, 1e3 * np.array(tips_m), side)
 
 
 def outline_mm(pipe: CrossPipe) -> tuple[np.ndarray, ...]:
@@ -89,24 +80,13 @@ def outline_mm(pipe: CrossPipe) -> tuple[np.ndarray, ...]:
     return tuple(1e3 * np.array(line) for line in lines)
 
 
-def frames(filmed: Filmed) -> list[Image.Image]:
-    """Return at most `MAX_FRAMES` pictures, evenly spread, each beside the path up to its time."""
-    images = []
-    for k in _spread(len(filmed.pictures), MAX_FRAMES):
-        height, width, _ = filmed.pictures[k].shape
-        images.append(Image.new("RGB", (2 * width, height)))
-        images[-1].paste(Image.fromarray(filmed.pictures[k]), (0, 0))
-        images[-1].paste(_side_view((width, height), filmed.path_mm[: k + 1], filmed.side), (width, 0))
-    return images
-
-
-def side_by_side(columns: Sequence[Filmed]) -> list[Image.Image]:
-    """Return frames with a column for each trial: its picture above its path up to the same time.
+def frames(columns: Sequence[Column]) -> list[Image.Image]:
+    """Return at most `MAX_FRAMES` frames, evenly spread: each column's picture above its path until then.
 
     A trial that ended before the others shows its last picture from then on.
     """
-    images = []
-    for k in _spread(max(len(column.pictures) for column in columns), N_LOAD_FRAMES):
+    n, images = max(len(column.pictures) for column in columns), []
+    for k in np.unique(np.linspace(0, n - 1, min(MAX_FRAMES, n)).round().astype(int)).tolist():
         height, width, _ = columns[0].pictures[0].shape
         size = (width, width + LABEL_HEIGHT)
         images.append(Image.new("RGB", (width * len(columns), height + size[1])))
@@ -114,11 +94,6 @@ def side_by_side(columns: Sequence[Filmed]) -> list[Image.Image]:
             images[-1].paste(Image.fromarray(pictures[min(k, len(pictures) - 1)]), (left, 0))
             images[-1].paste(_side_view(size, path_mm[: k + 1], side), (left, height))
     return images
-
-
-def _spread(n: int, n_most: int) -> list[int]:
-    """Return at most `n_most` of n indices, evenly spread, the first and the last among them."""
-    return np.unique(np.linspace(0, n - 1, min(n_most, n)).round().astype(int)).tolist()
 
 
 def _side_view(size: tuple[int, int], path_mm: np.ndarray, side: SideView) -> Image.Image:
@@ -146,12 +121,12 @@ def _side_view(size: tuple[int, int], path_mm: np.ndarray, side: SideView) -> Im
     return image
 
 
-def write_gif(path: Path, images: list[Image.Image], frame_ms: int = FRAME_MS) -> None:
+def write_gif(path: Path, images: list[Image.Image]) -> None:
     """Write a film that repeats, with one palette for all its frames."""
     palette = images[len(images) // 2].quantize(N_COLOURS, Image.Quantize.MAXCOVERAGE)
     first, *others = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images)
     part = path.with_name(path.name + ".part")
     first.save(
-        part, format="GIF", save_all=True, append_images=others, duration=frame_ms, loop=0, optimize=True
+        part, format="GIF", save_all=True, append_images=others, duration=FRAME_MS, loop=0, optimize=True
     )
     part.replace(path)

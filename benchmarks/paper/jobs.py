@@ -135,17 +135,13 @@ def try_out(folder: Path, settings: Settings, trial: Trial) -> None:
     save_arrays(path, operate(*scene_of(folder, settings, trial), trial.objects, trial.moves))
 
 
-def film(folder: Path, settings: Settings, trials: tuple[Trial, ...], file: str) -> str:
-    """Film a trial, or several side by side; return why they cannot be drawn, or ""."""
-    from benchmarks.paper.film import film_scene, film_side_by_side
+def film_trials(folder: Path, settings: Settings, trials: tuple[Trial, ...], file: str) -> str:
+    """Film trials side by side; return why they cannot be drawn, or ""."""
+    from benchmarks.paper.film import film
     from mjx_softarm.mechanics.render import RenderError
 
-    scenes = [(scene_of(folder, settings, trial), trial) for trial in trials]
     try:
-        if len(scenes) == 1:
-            film_scene(folder / file, *scenes[0])
-        else:
-            film_side_by_side(folder / file, scenes)
+        film(folder / file, [(scene_of(folder, settings, trial), trial) for trial in trials])
     except RenderError as error:
         return str(error)
     return ""

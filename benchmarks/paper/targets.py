@@ -27,9 +27,11 @@ def check_targets(experiment: str, table: Sequence[Row], trainings: Sequence[Row
 
 
 def _open(table: Sequence[Row]) -> list[Check]:
+    # Runs with S2R without and with a load, with calibrated springs alone, and by gradient descent.
     unloaded, without, gradient = (_select(table, kind, "0 g") for kind in ("with", "without", "gradient"))
     told = [row for row in table if row["kind"] == "with"]
     heavy = [row for row in told if row["load_g"] == HEAVY_G]
+    # What the loop reports with 1 kg, saturated points, and missed goals.
     silent = sum(row["saturated_points"] > 0 and not row["saturation_events"] for row in heavy)
     reported = sum(row["saturation_events"] > 0 for row in heavy)
     reports = (
@@ -68,9 +70,11 @@ def _loaded(how: str, rows: Sequence[Row]) -> list[Check]:
 
 
 def _confined(table: Sequence[Row], trainings: Sequence[Row]) -> list[Check]:
+    # Runs in the wide pipe, in the narrow one, in motion and on the circle.
     shown, exchanged = _select(table, "pipe", "as shown"), _select(table, "pipe", "exchanged")
     narrow, circle = _select(table, "narrow", "as shown"), _select(table, "circle", "as shown")
     moving, without = _select(table, "moving", "as shown in motion"), _select(table, "quick", "0 g")
+    # Their time, their errors on the circle, and operations done by policies with both orders of objects.
     time = np.mean(_values(moving, "seconds")) / np.mean(_values(shown, "seconds"))
     mm, without_mm = _mean_mm(circle), _mean_mm(without)
     both_mm = f"{mm:.2f} mm with, {without_mm:.2f} mm without"

@@ -128,11 +128,11 @@ def _films(experiment: str, settings: Settings) -> list[WorkStage]:
         return []
     kind, objects = ("with", "") if experiment == "open" else ("pipe", "as shown")
     shown, file = Trial(kind, settings.twins[0], settings.seeds[0], objects), FILMS[experiment]
-    films = [WorkStage("film", (file,), jobs.film, ((shown,), file))]
+    films = [WorkStage("film", (file,), jobs.film_trials, ((shown,), file))]
     if experiment == "open" and (loads_g := _filmed_loads_g(settings)):
         loaded = (shown, *(shown._replace(load_g=load_g) for load_g in loads_g))
         file = loads_film(settings)
-        films.append(WorkStage("film of loads", (file,), jobs.film, (loaded, file)))
+        films.append(WorkStage("film of loads", (file,), jobs.film_trials, (loaded, file)))
     return films
 
 

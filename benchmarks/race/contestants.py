@@ -3,13 +3,10 @@
     python -m benchmarks.race.contestants NAME SEED STRETCH_S N_GOALS
 
 NAME is one of `CONTESTANTS`. Ours is the loop of `python -m train reach` without its files, with the preset
-analytic, or quick (TQC). The peers train on the project's Gymnasium environment through
-`learn`, with the settings of ours-quick wherever they have one. They have none for the temperature's own
-learning rate. Our learning rate falls along a half cosine over the preset's env steps, at which our training
-ends; theirs does so too, and begins anew.
-
-Hindsight: ours exchanges goals for the pose reached and for poses near it, and actions for the sensed ones;
-`benchmarks.race.hindsight` has the peers' own, for as large a share of a batch.
+quick (TQC) or analytic. The peers train through `learn` on the project's Gymnasium environment. They have the
+settings of quick, but for the temperature's learning rate, which they lack, and hindsight of their own, see
+`benchmarks.race.hindsight`. Learning rates fall along a half cosine over the preset's env steps. Our training
+then ends; the peers' rates begin anew.
 
 The clock counts from the program's start. It stands while the policy is evaluated and while PyTorch's threads
 are chosen. Start-up ends when a peer has done a first round of updates, and when ours has compiled.
@@ -53,9 +50,9 @@ class HeldOut:
 
         from mjx_softarm._support import xla
         from mjx_softarm.mechanics.workspace import HELD_OUT_SEED
-        from train.runs.evaluate import paths_of, start_keys, towards
+        from train.runs.evaluate import N_ACTIONS, paths_of, start_keys, towards
 
-        self.n_goals = n_goals
+        self.n_goals, self.n_actions = n_goals, N_ACTIONS
         self._paths = paths_of(env.sample_pool(n_goals, HELD_OUT_SEED).pose)  # (n_arms, k, 6)
         self._start = xla.jit(jax.vmap(env.reset), env.uses_mjx)(start_keys(len(self._paths)))
         self._towards = xla.jit(jax.vmap(functools.partial(towards, env)), env.uses_mjx)
@@ -63,12 +60,10 @@ class HeldOut:
 
     def tip_error_mm(self, policy: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
         """Return the tip error at each goal (n_goals,), after the last action."""
-        from train.runs.evaluate import N_ACTIONS
-
         state, errors = self._start, []
         for goals in np.moveaxis(self._paths, 1, 0):
             state = self._towards(state, goals)
-            for _ in range(N_ACTIONS):
+            for _ in range(self.n_actions):
                 state = self._step(state, policy(np.array(state.obs)))
             errors.append(state.metrics["tip_error_mm"])
         return np.stack(errors, axis=1).reshape(-1)[: self.n_goals]
@@ -108,6 +103,7 @@ def peer(name: str, seed: int) -> Contestant:
     from mjx_softarm.env.gym import SoftArmVectorEnv, as_sb3
     from train.presets import PRESETS
 
+    # Choose PyTorch's threads on a throwaway model; this time does not count.
     config, library = PRESETS["quick"], library_of(name)
     algorithm = importlib.import_module(library.replace("-", "_")).TQC
     start = time.perf_counter()
@@ -115,10 +111,11 @@ def peer(name: str, seed: int) -> Contestant:
         throwaway = filled_model(algorithm)
         choose_threads(lambda: throwaway.train(gradient_steps=32, batch_size=config.batch_size))
     uncounted_s = time.perf_counter() - start
+    # The arms, and the algorithm with our settings.
     arms, n_steps = SoftArmVectorEnv(config.n_arms, config.episode_length, config=config.env), 0
     model = algorithm(
         "MultiInputPolicy",
-        GoalEnvs(scaled(as_sb3(arms), config.tqc.reward_scale)),
+        GoalEnvs(as_sb3(arms), config.tqc.reward_scale),
         seed=seed,
         replay_buffer_class=HindsightBuffer,
         replay_buffer_kwargs={
@@ -131,6 +128,7 @@ def peer(name: str, seed: int) -> Contestant:
     )
     model.set_logger(Logger(None, []))  # or each call of `learn` would make a folder
 
+    # Train until the first updates are done.
     def learn(n: int, **more: Any) -> None:
         nonlocal n_steps
         model.learn(n, **more)
@@ -168,21 +166,6 @@ def settings_of(config: Any, n_steps: Callable[[], int]) -> dict[str, Any]:
     }
 
 
-def scaled(envs: Any, factor: float) -> Any:
-    """Return a Stable-Baselines3 vector environment with its rewards times a factor."""
-    from stable_baselines3.common.vec_env import VecEnvWrapper  # pyright: ignore[reportMissingImports]
-
-    class Scaled(VecEnvWrapper):
-        def reset(self):
-            return self.venv.reset()
-
-        def step_wait(self):
-            obs, rewards, dones, infos = self.venv.step_wait()
-            return obs, factor * rewards, dones, infos
-
-    return Scaled(envs)
-
-
 CONTESTANTS = ("ours-quick", "ours-analytic", "sbx-hindsight", "sb3-contrib-hindsight")
 
 
@@ -197,11 +180,13 @@ def prepare(
     """Return the facts and the rounds of a worker: each round is a stretch of training and an evaluation."""
     from mjx_softarm.env import ReachEnv
 
+    # Compile the evaluation.
     held_out = HeldOut(ReachEnv(), n_goals)
-    held_out.tip_error_mm(contestant.policy)  # compiles
+    held_out.tip_error_mm(contestant.policy)
     trained_s = 0.0
 
     def work() -> Facts:
+        # Train for a stretch of time.
         nonlocal trained_s
         start = time.perf_counter()
         while True:
@@ -211,6 +196,7 @@ def prepare(
             if ended or passed_s >= stretch_s:
                 break
         trained_s += passed_s
+        # Evaluate.
         median_mm = float(np.median(held_out.tip_error_mm(contestant.policy)))
         return {
             "wall_s": start_up_s + trained_s,

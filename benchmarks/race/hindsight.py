@@ -1,10 +1,9 @@
 """Hindsight for the peers: the arms in the form they need, and their own hindsight replay on it.
 
-Stable-Baselines3's `HerReplayBuffer` needs observations as a dictionary, and chooses which transitions get a
-goal that was reached later in their episode. It recomputes only the reward for the new goal. Here observed
-error, reward and termination are recomputed, and as many goals as in ours are near the pose that was reached.
-It cannot exchange actions: a transition that saturated, as nearly all random ones do, costs as much with its
-new goal as with its own.
+Stable-Baselines3's `HerReplayBuffer` needs observations as a dictionary. It chooses which transitions get a
+goal that was reached later in their episode, and recomputes their reward. Here the observed error and the
+termination are recomputed, too, and as many goals as in ours are near the pose that was reached. The buffer
+cannot exchange actions: a saturated transition costs as much with its new goal as with its own.
 """
 
 from __future__ import annotations
@@ -36,10 +35,10 @@ def with_goals(flat: np.ndarray) -> dict[str, np.ndarray]:
 
 
 class GoalEnvs(VecEnvWrapper):
-    """A vector environment of arms whose observations are dictionaries."""
+    """A vector environment of arms whose observations are dictionaries, with its rewards times a factor."""
 
-    def __init__(self, venv: VecEnv):
-        flat = venv.observation_space
+    def __init__(self, venv: VecEnv, reward_scale: float):
+        self._reward_scale, flat = reward_scale, venv.observation_space
         boxes = [
             (name, gymnasium.spaces.Box(flat.low[part], flat.high[part])) for name, part in SLICES.items()
         ]
@@ -55,7 +54,7 @@ class GoalEnvs(VecEnvWrapper):
         for info in infos:
             if "terminal_observation" in info:
                 info["terminal_observation"] = with_goals(info["terminal_observation"])
-        return with_goals(flat), reward, done, infos
+        return with_goals(flat), self._reward_scale * reward, done, infos
 
 
 class HindsightBuffer(HerReplayBuffer):
@@ -92,15 +91,18 @@ class HindsightBuffer(HerReplayBuffer):
         self, batch_indices: np.ndarray, env_indices: np.ndarray, env: Any = None
     ) -> DictReplayBufferSamples:
         """Return transitions with goals that were reached later, or near the pose reached."""
+        # Poses before and after, and goals that were reached later.
         where = batch_indices, env_indices
         reached = (poses["achieved_goal"][where] for poses in (self.observations, self.next_observations))
         scaled = (*reached, self._sample_goals(*where))
         before, after, goals = (poses * self._scale.scale + self._scale.centre for poses in scaled)
+        # Some goals are near the pose reached instead.
         draws = self._rng.random((2, len(after)), np.float32)
         near = draws[0] < self._hindsight.near_share / self.her_ratio
         direction = self._rng.standard_normal((len(after), 6), np.float32)
         offsets = near_offsets(jnp.asarray(draws[1]), jnp.asarray(direction), self._hindsight)
         goals = np.where(near[:, None], after + np.asarray(offsets), goals)
+        # Rewards, observations and termination for the new goals.
         cost = self._reward_scale * self._config.saturation_cost
         reward, reached, _ = rewards.reward(
             after,

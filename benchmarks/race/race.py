@@ -1,13 +1,10 @@
-"""Time until a policy reaches, against the peers: `python -m benchmarks race`.
+"""Wall time and env steps until the median tip error at held-out goals has come down to a level.
 
-Wall time and env steps until the median tip error at the held-out goals has come down to a level: ours, and
-TQC of SBX and of Stable-Baselines3-contrib on the same arms, goals and evaluation; `contestants` says how
-each trains. They run one after another, each in a process of its own with all cores. A level is reached
-where the line between two evaluations crosses it for the first time.
+The contestants are ours, and TQC of SBX and of Stable-Baselines3-contrib, on the same arms, goals and
+evaluation; `contestants` says how each trains. They run one after another, each in a process of its own with
+all cores. Ours with the presets quick and analytic go first; analytic trains to the finest level, or to its
+end. A peer is stopped when it has reached all levels that quick has, or when its targets are met.
 
-Ours with the presets quick and analytic go first. A peer is stopped when it has had as many times our time to
-5 mm as its targets ask for, since they are met then, or when it has reached all levels that quick has.
-Analytic trains to the finest level, or to its end.
 Results stay in the working folder: the same command continues an interrupted race, and seeds may be added.
 """
 
@@ -20,19 +17,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
-from benchmarks.harness.common import difference, machine_kind, save, show, status_of
+from benchmarks.harness.common import difference, machine_kind, names_of, save, show, status_of
 from benchmarks.harness.peers import PINS, PeerError, peer_python
 from benchmarks.harness.rounds import Facts, Worker, WorkerError
 from benchmarks.race.contestants import CONTESTANTS, library_of
-from benchmarks.race.summary import (
-    FIRST,
-    LEVELS_MM,
-    TARGET_MM,
-    TARGETS,
-    crossing,
-    median_mm,
-    summarise,
-)
+from benchmarks.race.summary import FIRST, LEVELS_MM, TARGET_MM, TARGETS, crossing, median_mm, summarise
 from mjx_softarm._support import cli
 from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.provenance import provenance, write_json
@@ -40,7 +29,7 @@ from mjx_softarm._support.provenance import provenance, write_json
 N_STRETCHES = 40  # of training between evaluations, up to a peer's limit
 
 
-class Limits(NamedTuple):
+class RaceLimits(NamedTuple):
     """End of a contestant's training, whichever comes first."""
 
     wall_s: float = math.inf  # start-up included, evaluations not
@@ -52,16 +41,9 @@ class RaceError(InputError):
     """A race that cannot be run in this folder; the message says why."""
 
 
-def _names(words: list[str]) -> tuple[str, ...]:
-    names = tuple(words[0].split(","))
-    if unknown := [name for name in names if name not in CONTESTANTS]:
-        raise ValueError(f"got {', '.join(unknown)}, expected some of {', '.join(CONTESTANTS)}")
-    return names
-
-
 def race(
     seeds: cli.Integers = (0,),
-    only: Annotated[tuple[str, ...], cli.listed(_names, "NAME,NAME,...")] = CONTESTANTS,
+    only: Annotated[tuple[str, ...], names_of(CONTESTANTS)] = CONTESTANTS,
     out: cli.MaybePath = None,
 ) -> int:
     """How long does learning take to a tip error, beside SBX and sb3-contrib? Half an hour a seed.
@@ -94,7 +76,7 @@ def run(folder: Path, seeds: Sequence[int], names: Sequence[str], n_goals: int =
     folder.mkdir(parents=True, exist_ok=True)
     results = []
     for seed in seeds:
-        first = _result(folder, FIRST, seed, Limits(), n_goals)
+        first = _result(folder, FIRST, seed, RaceLimits(), n_goals)
         ours = [first]
         results.append(first)
         for name in CONTESTANTS:
@@ -106,8 +88,8 @@ def run(folder: Path, seeds: Sequence[int], names: Sequence[str], n_goals: int =
     return results
 
 
-def limits_of(name: str, ours: Sequence[Facts]) -> Limits:
-    """Return a contestant's limits, by the curves of ours that raced before it, the first one's first."""
+def limits_of(name: str, ours: Sequence[Facts]) -> RaceLimits:
+    """Return a contestant's limits, by the curves of ours that raced before it, quick's first."""
     reached_mm = [level for level in LEVELS_MM if crossing(ours[0]["points"], level, "wall_s") is not None]
     times_s = {
         raced["contestant"]: crossing(raced["points"], TARGET_MM, "wall_s") or raced["points"][-1]["wall_s"]
@@ -121,17 +103,18 @@ def limits_of(name: str, ours: Sequence[Facts]) -> Limits:
         if wanted.peer == peer and wanted.ours in times_s
     )
     if name != peer:
-        return Limits(target_mm=min(LEVELS_MM), stretch_s=wall_s / N_STRETCHES)
-    return Limits(wall_s, min(reached_mm, default=0), wall_s / N_STRETCHES)
+        return RaceLimits(target_mm=min(LEVELS_MM), stretch_s=wall_s / N_STRETCHES)
+    return RaceLimits(wall_s, min(reached_mm, default=0), wall_s / N_STRETCHES)
 
 
 def _file(folder: Path, name: str, seed: int) -> Path:
     return folder / f"{name}-seed{seed}.json"
 
 
-def _result(folder: Path, name: str, seed: int, limits: Limits, n_goals: int) -> dict[str, Any]:
+def _result(folder: Path, name: str, seed: int, limits: RaceLimits, n_goals: int) -> dict[str, Any]:
     """Return the result of one contestant, measured now or before."""
     file, who = _file(folder, name, seed), f"{name}, seed {seed}"
+    # Take a result in the folder if it was measured under the same conditions.
     made = provenance("benchmarks")
     conditions: dict[str, Any] = {
         "n_goals": n_goals,
@@ -146,6 +129,7 @@ def _result(folder: Path, name: str, seed: int, limits: Limits, n_goals: int) ->
             raise RaceError(f"{file}: {differing}; choose another --out, or remove the file")
         print(f"{who}: measured before, in {file}")
         return result
+    # Measure a missing one; ours runs in this environment, a peer in its own.
     program = ["benchmarks.race.contestants", name, str(seed), str(limits.stretch_s), str(n_goals)]
     result = {"contestant": name, "seed": seed, "conditions": conditions}
     result |= {key: made[key] for key in ("commit", "uncommitted_changes")}
@@ -160,7 +144,7 @@ def _result(folder: Path, name: str, seed: int, limits: Limits, n_goals: int) ->
     return result
 
 
-def train(worker: Worker, limits: Limits) -> dict[str, Any]:
+def train(worker: Worker, limits: RaceLimits) -> dict[str, Any]:
     """Let a contestant train until its end or a limit; returns start-up time, time limit and curve."""
     limit_s = limits.wall_s if math.isfinite(limits.wall_s) else None
     until = f" up to {limit_s:.0f} s," if limit_s else ""

@@ -51,10 +51,9 @@ def _springs(data: mujoco.MjData) -> np.ndarray:
 
 
 class RestDetector:
-    """Detector of n settled arms: no spring has moved by more than `rest_m` within `REST_S`."""
+    """Detector of n settled arms: no spring has moved by more than `REST_M` within `REST_S`."""
 
-    def __init__(self, n: int, spec: ArmSpec, rest_m: float = REST_M):
-        self._rest_m = rest_m
+    def __init__(self, n: int, spec: ArmSpec):
         self._longest = round(LONGEST_S * spec.control.rate_hz)
         self._past_m = np.empty((round(REST_S * spec.control.rate_hz) + 1, n, spec.n_chambers))
         self._tick = 0
@@ -68,9 +67,9 @@ class RestDetector:
         if self._tick < len(self._past_m):
             return np.zeros(len(length_m), bool)
         oldest_m = self._past_m[self._tick % len(self._past_m), arms]
-        done = np.abs(length_m - oldest_m).max(axis=-1) <= self._rest_m
+        done = np.abs(length_m - oldest_m).max(axis=-1) <= REST_M
         if done.any():  # only then is the whole past worth its time
-            done[done] = np.ptp(self._past_m[:, arms][:, done], axis=0).max(axis=-1) <= self._rest_m
+            done[done] = np.ptp(self._past_m[:, arms][:, done], axis=0).max(axis=-1) <= REST_M
         return done
 
 
@@ -115,12 +114,12 @@ class SteppedArms:
             self.length_m[index] = _springs(data)
         self._law[:, arms] = control.LawState.at_rest(pressure_kpa, self.length_m[arms])
 
-    def settle(self, reference_m: np.ndarray, rest_m: float = REST_M) -> SteppedRest:
+    def settle(self, reference_m: np.ndarray) -> SteppedRest:
         """Hold references (n, n_chambers) until each arm rests.
 
         Springs are read as a rollout leaves them, one time step old.
         """
-        rest, moving, n_physics = RestDetector(self.n, self.spec, rest_m), np.arange(self.n), 0
+        rest, moving, n_physics = RestDetector(self.n, self.spec), np.arange(self.n), 0
         pressure_kpa = np.zeros_like(reference_m)
         while len(moving):
             arms = moving if len(moving) < self.n else slice(None)  # a slice copies nothing

@@ -2,17 +2,15 @@
 
     python -m benchmarks.speed.soromox_worker METHOD N_ARMS
 
-The arm is this project's as a piecewise-constant-strain robot: its lengths, masses, stiffnesses and dampers,
-one segment for each section. It bends and stretches; without torsion and shear, the stiffest motions, an
-explicit step may be three times as long. It has two Gauss points, for speed; the default is five. Each round
-holds random pressures, as forces on the segments, and has neither a control law nor valves. METHOD is
+The arm is this project's as a piecewise-constant-strain robot, one segment for each section. It bends and
+stretches; without torsion and shear, the stiffest motions, an explicit step may be three times as long. Each
+round holds random pressures, as forces on the segments, and has neither a control law nor valves. METHOD is
 
     explicit    Euler's step on SoRoMoX's accelerations, the longest that is stable. Its limit is 0.85 ms at
                 the fastest decay seen, 2,340 per second. Runge-Kutta methods allow 1.0 to 1.8 times that, at
                 two to six times the cost.
     implicit    the linearised midpoint rule of `mjx_softarm.mechanics.dynamics` on SoRoMoX's inertia and
-                forces. It is not SoRoMoX's own. Longer steps are stable too, but pressures change once in a
-                control period.
+                forces, with a control period's step. It is not SoRoMoX's own.
 
 Source: SoRoMoX, https://github.com/tud-phi/soromox.
 """
@@ -35,7 +33,7 @@ HELD_S = 0.5  # duration of a set of pressures, as of an environment step in mot
 N_STEPS = {"explicit": 667, "implicit": 25}  # in it; with 625 explicit ones, one arm in 128 diverged
 ROUND_S = 1.0  # least time of a round
 CHECKED_S = 2.0  # of random motion before the first round; every arm must stay finite
-N_GAUSS_POINTS = 2
+N_GAUSS_POINTS = 2  # for speed; the default is five
 BENDS_AND_STRETCHES = (False, True, True, True, False, False)  # torsion, bending, stretch, shear
 
 
@@ -115,6 +113,7 @@ def move(method: str, n_arms: str) -> tuple[Facts, Callable[[], Facts]]:
     jax.config.update("jax_num_cpu_devices", n_cores)  # XLA runs most of this on one core of a device
     from jax.sharding import Mesh, PartitionSpec
 
+    # A step of one arm, and one of all arms over the time that a set of pressures is held.
     spec, n, rng = ArmSpec.default(), int(n_arms), np.random.default_rng(0)
     step_s = HELD_S / N_STEPS[method]
     step = stepper(build_robot(spec), method, step_s)
@@ -125,6 +124,7 @@ def move(method: str, n_arms: str) -> tuple[Facts, Callable[[], Facts]]:
     mesh = Mesh(np.array(jax.devices()[: math.gcd(n, len(jax.devices()))]), ("arms",))
     split, many = PartitionSpec("arms"), jax.vmap(held)
     run = jax.jit(jax.shard_map(many, mesh=mesh, in_specs=split, out_specs=split, check_vma=False))
+    # Arms at rest.
     state = np.zeros((n, 6 * spec.structure.n_sections), np.float32)  # strains and their rates
     calls = 1
 
@@ -140,7 +140,8 @@ def move(method: str, n_arms: str) -> tuple[Facts, Callable[[], Facts]]:
             raise FloatingPointError(f"step: got {step_s:.2g} s, which diverges, expected a stable one")
         return {"simulated_s_per_s": rate}
 
-    for _ in range(round(CHECKED_S / HELD_S)):  # the first compiles
+    # Move for a while, and choose how many sets of pressures make a round; the first call compiles.
+    for _ in range(round(CHECKED_S / HELD_S)):
         rate = work()["simulated_s_per_s"]
     calls = max(1, round(ROUND_S * rate / (n * HELD_S)))
     return {"arms": n, "step_ms": round(1e3 * step_s, 2)}, work

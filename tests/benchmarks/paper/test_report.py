@@ -104,7 +104,7 @@ def write(experiment, folder, results, filmed=False):
     fill(folder, TINY)
     if filmed:
         side = film.SideView("", "", film.FROM_ABOVE, circle_poses(SPEC, 3)[:, :3])
-        images = film.frames(film.Filmed([np.zeros((20, 15, 3), np.uint8)] * 3, np.zeros((3, 3)), side))
+        images = film.frames([film.Column([np.zeros((20, 15, 3), np.uint8)] * 3, np.zeros((3, 3)), side)])
         film.write_gif(folder / FILMS[experiment], images)
         film.write_gif(folder / loads_film(TINY), images)
     report.write_report(experiment, folder, folder / "out", TINY, results)
@@ -169,50 +169,49 @@ class DrawnTwin:
         return open("/dev/null")
 
 
-def test_film_shows_the_pipe_and_the_path(tmp_path, monkeypatch):
-    def operate(twin, controller, goals, names, objects):
-        for _ in range(500):
-            twin.write_pressures(np.zeros(N))
+@pytest.fixture
+def filmed(monkeypatch):
+    """A function: scenes and the duration [s] of each trial by its load -> the frames of their film."""
 
-    written = {}
+    def run(scenes, seconds):
+        def operate(twin, controller, goals, names, objects):
+            for _ in range(50 * seconds[twin.load_g]):
+                twin.write_pressures(np.zeros(N))
+
+        written = []
+        monkeypatch.setattr(film, "operate", operate)
+        monkeypatch.setattr(film, "write_gif", lambda path, images: written.extend(images))
+        for scene, trial in scenes:
+            scene.twin.load_g = trial.load_g
+        film.film(None, scenes)
+        return written
+
+    return run
+
+
+def test_film_shows_the_pipe_and_the_path(filmed):
     names, goals = goals_of("pipe")
     controller = SimpleNamespace(policy=SimpleNamespace(spec=SPEC))
-    monkeypatch.setattr(film, "operate", operate)
-    monkeypatch.setattr(film, "write_gif", lambda path, images: written.update({path: images}))
-    film.film_scene(tmp_path / "pipe.gif", Scene(DrawnTwin(), controller, goals, names), pipe_trial())
-    images = written[tmp_path / "pipe.gif"]
+    images = filmed([(Scene(DrawnTwin(), controller, goals, names), pipe_trial())], {0: 10})
     assert [image.getpixel((0, 0))[0] for image in images] == list(range(len(images)))
     # The tip, at first straight below the crossing, then to the right; the wall on both sides.
-    orange = [(np.asarray(image) == (224, 123, 40)).all(axis=-1) for image in images]
+    below = [np.asarray(image)[film.HEIGHT :] for image in images]
+    orange = [(drawing == (224, 123, 40)).all(axis=-1) for drawing in below]
     across = np.array([np.argwhere(mask)[:, 1].mean() for mask in orange])
-    assert abs(across[0] - 360) < 1.0 and np.all(np.diff(across) > 0)
-    grey = (np.asarray(images[0])[:, 240:] == (154, 160, 166)).all(axis=-1)
+    assert abs(across[0] - 120) < 1.0 and np.all(np.diff(across) > 0)
+    grey = (below[0][film.LABEL_HEIGHT + 4 :] == (154, 160, 166)).all(axis=-1)
     assert grey[:, :120].sum() == pytest.approx(grey[:, 120:].sum(), rel=0.2)
-    assert grey.sum() > 28 * 21 + 500  # more than the goals' dots cover
+    assert grey.sum() > 28 * 21 + 300  # more than the goals' dots cover
 
 
-def test_film_of_loads_has_a_column_for_each_and_one_that_ended_waits(tmp_path, monkeypatch):
-    seconds = {0: 30, 500: 60, 1000: 60}
-
-    def operate(twin, controller, goals, names, objects):
-        for _ in range(50 * seconds[twin.load_g]):
-            twin.write_pressures(np.zeros(N))
-
-    written = {}
-    monkeypatch.setattr(film, "operate", operate)
-    monkeypatch.setattr(film, "write_gif", lambda path, images, frame_ms: written.update({path: images}))
+def test_film_of_loads_has_a_column_for_each_and_one_that_ended_waits(filmed):
     names, goals = goals_of("with")
-    scenes = []
-    for load_g in seconds:
-        twin = DrawnTwin()
-        twin.load_g = load_g
-        scenes.append((Scene(twin, None, goals, names), Trial("with", 0, 0, load_g=load_g)))
-    film.film_side_by_side(tmp_path / "loads.gif", scenes)
-    images = written[tmp_path / "loads.gif"]
-    assert len(images) <= film.N_LOAD_FRAMES
-    assert {image.size for image in images} == {
-        (3 * film.WIDTH, film.HEIGHT + film.WIDTH + film.LABEL_HEIGHT)
-    }
+    seconds = {0: 30, 500: 60, 1000: 60}
+    trials = [Trial("with", 0, 0, load_g=load_g) for load_g in seconds]
+    images = filmed([(Scene(DrawnTwin(), None, goals, names), trial) for trial in trials], seconds)
+    assert len(images) <= film.MAX_FRAMES
+    size = (3 * film.WIDTH, film.HEIGHT + film.WIDTH + film.LABEL_HEIGHT)
+    assert {image.size for image in images} == {size}
     times = np.array([[image.getpixel((240 * k, 0))[0] for k in range(3)] for image in images])
     assert np.all(np.diff(times[:, 1]) > 0) and np.array_equal(times[:, 1], times[:, 2])
     assert np.array_equal(times[:, 0], np.minimum(times[:, 1], times[:, 0].max()))

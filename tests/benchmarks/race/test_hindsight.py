@@ -21,12 +21,11 @@ class Played:
     """
 
     def __init__(self):
-        from benchmarks.race.contestants import scaled
         from benchmarks.race.hindsight import GoalEnvs, HindsightBuffer
 
         arms = SoftArmVectorEnv(N_ARMS, max_episode_steps=LIMIT, config=EnvConfig(n_poses=64))
         self.arm = arms.env
-        envs = GoalEnvs(scaled(as_sb3(arms), REWARD_SCALE))
+        envs = GoalEnvs(as_sb3(arms), REWARD_SCALE)
         self.buffer = HindsightBuffer(
             N_ROWS * N_ARMS,
             envs.observation_space,

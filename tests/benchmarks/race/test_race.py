@@ -19,7 +19,7 @@ from benchmarks.race.contestants import (
     prepare,
     settings_of,
 )
-from benchmarks.race.race import Limits, RaceError, limits_of, run, train
+from benchmarks.race.race import RaceError, RaceLimits, limits_of, run, train
 from benchmarks.race.threads import choose_threads
 from mjx_softarm.env import EnvConfig, ReachEnv
 from tests.train.small import SHORT
@@ -56,9 +56,9 @@ def fake(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     "limits, n_points",
     [
-        (Limits(93.0), 9),  # 3 + 10 k >= 93
-        (Limits(target_mm=20.0), 5),  # 100 / k <= 20
-        (Limits(), 30),  # ended
+        (RaceLimits(93.0), 9),  # 3 + 10 k >= 93
+        (RaceLimits(target_mm=20.0), 5),  # 100 / k <= 20
+        (RaceLimits(), 30),  # ended
     ],
 )
 def test_a_contestant_trains_until_its_limit_its_target_or_its_end(fake, limits, n_points):
@@ -147,10 +147,10 @@ def race_in(folder, seeds=(0,), n_goals=8):
 
 def test_peers_get_our_time_to_5_mm_as_often_as_the_target_asks_and_stop_where_ours_did(asked, tmp_path):
     results = race_in(tmp_path, (4,))
-    sbx, sb3 = (Limits(n * 29.5, 5, n * 29.5 / 40) for n in (20, 15))  # SBX: 5 times quick, 20 analytic
+    sbx, sb3 = (RaceLimits(n * 29.5, 5, n * 29.5 / 40) for n in (20, 15))  # SBX: 5 times quick, 20 analytic
     assert asked == {
-        "ours-quick, seed 4": Limits(),
-        "ours-analytic, seed 4": Limits(float("inf"), 1, 5 * 29.5 / 40),
+        "ours-quick, seed 4": RaceLimits(),
+        "ours-analytic, seed 4": RaceLimits(float("inf"), 1, 5 * 29.5 / 40),
         "sbx-hindsight, seed 4": sbx,
         "sb3-contrib-hindsight, seed 4": sb3,
     }
@@ -158,7 +158,7 @@ def test_peers_get_our_time_to_5_mm_as_often_as_the_target_asks_and_stop_where_o
     assert all("points" in one for one in results)
     # One that does not reach 5 mm: multiples of all its time.
     quick = {"contestant": "ours-quick", "points": POINTS[:2]}
-    assert limits_of("sbx-hindsight", [quick]) == Limits(5 * 22.0, 10, 5 * 22.0 / 40)
+    assert limits_of("sbx-hindsight", [quick]) == RaceLimits(5 * 22.0, 10, 5 * 22.0 / 40)
     # Each target has the time of its own preset.
     quick, analytic = ({"contestant": f"ours-{name}", "points": POINTS} for name in ("quick", "analytic"))
     analytic["points"] = [POINTS[2] | {"wall_s": 5.0}]

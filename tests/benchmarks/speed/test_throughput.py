@@ -10,6 +10,7 @@ from benchmarks.harness.peers import PeerError
 from benchmarks.harness.rounds import ROOT
 from benchmarks.speed import throughput
 from benchmarks.speed.mujoco_arms import (
+    REST_M,
     REST_S,
     RestDetector,
     SteppedArms,
@@ -62,11 +63,11 @@ def test_arms_stepped_in_time_rest_where_the_solver_says_alone_and_in_company(mo
 
 
 def test_an_arm_rests_when_no_spring_has_moved_for_long_enough():
-    rest = RestDetector(2, SPEC, rest_m=1e-3)
+    rest = RestDetector(2, SPEC)
     n_quiet = round(REST_S * SPEC.control.rate_hz)
     still, ticks = np.zeros(9), []
     for tick in range(3 * n_quiet):
-        moving = np.where(np.arange(9) == 4, 1.1e-3 * min(tick, 10), 0.0)  # the second arm stops later
+        moving = np.where(np.arange(9) == 4, 1.1 * REST_M * min(tick, 10), 0.0)  # the second arm stops later
         ticks.append(rest.after(np.stack([still, moving]), slice(None)))
     first = np.argmax(np.array(ticks), axis=0)
     assert first[0] == n_quiet and first[1] == n_quiet + 10

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.accuracy import logs
-from benchmarks.accuracy.foreign_logs import read_asu, read_trunk
+from benchmarks.accuracy.logs import read_asu, read_trunk
 from mjx_softarm.logs import checks
 from mjx_softarm.logs.checks import LogError
 
