@@ -101,7 +101,7 @@ def status_of(figures: Mapping[str, Any]) -> int:
 
 
 def show(figures: Mapping[str, Any], title: str = "", console: Console | None = None) -> None:
-    """Print figures as tables, but for curves, which are lists of points."""
+    """Print figures as tables."""
     console = console or Console(width=None if sys.stdout.isatty() else WIDTH)
     loose, nested = [], []
     for name, value in figures.items():
@@ -141,7 +141,7 @@ def _parts(value: Any) -> dict[str, Any]:
 
 
 def _print_table(console: Console, title: str, rows: Sequence[Mapping[str, Any]]) -> None:
-    names = list(dict.fromkeys(name for row in rows for name in row if not _is_curve(row[name])))
+    names = list(dict.fromkeys(name for row in rows for name in row))
     table = Table()
     for name in names:
         side = "right" if all(isinstance(row.get(name), int | float | None) for row in rows) else "left"
@@ -151,10 +151,6 @@ def _print_table(console: Console, title: str, rows: Sequence[Mapping[str, Any]]
     console.print()
     console.print(Text(title, "bold"))
     console.print(table)
-
-
-def _is_curve(value: Any) -> bool:
-    return isinstance(value, list) and bool(value) and isinstance(value[0], list | tuple)
 
 
 def _cell(value: Any) -> str:

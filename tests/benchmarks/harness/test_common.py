@@ -51,12 +51,6 @@ def test_other_dictionaries_are_titled_by_their_path_and_what_is_loose_comes_fir
     assert [line for line in text.splitlines() if line.startswith("settle")] == titles
 
 
-def test_curves_are_for_the_file_alone():
-    assert cells(shown({"runs": [{"seed": 0, "curve": [(512, 0.5), (1024, 0.7)], "few": [1, 2]}]})) == [
-        ["0", "[1, 2]"]
-    ]
-
-
 @pytest.mark.parametrize(("met", "status"), [(True, 0), (None, 0), (False, 1)])
 def test_a_missed_target_ends_with_status_1_and_its_file_is_there(met, status, monkeypatch, tmp_path):
     monkeypatch.setattr(common, "RESULTS", tmp_path)
