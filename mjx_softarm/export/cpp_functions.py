@@ -19,28 +19,19 @@ from mjx_softarm.export.symbols import REDUCTIONS, Symbol, ordered
 
 _TYPES = {"float64": "double", "float32": "float", "int32": "int", "int64": "int", "bool": "bool"}
 _VIEWS = ("reshape", "index")
+_BINARY = {"add": "+", "subtract": "-", "multiply": "*", "divide": "/", "less": "<", "less_equal": "<="}
+_BINARY |= {"greater": ">", "greater_equal": ">=", "equal": "==", "logical_and": "&&", "logical_or": "||"}
+_FUNCTIONS = {"arccos": "acos", "absolute": "fabs", "isfinite": "isfinite"}
+_FUNCTIONS |= {name: name for name in ("sqrt", "sin", "cos", "tanh", "floor")}
 _EXPRESSIONS = {
-    "add": "({} + {})",
-    "subtract": "({} - {})",
-    "multiply": "({} * {})",
-    "divide": "({} / {})",
     "negative": "(-{})",
-    "less": "({} < {})",
-    "less_equal": "({} <= {})",
-    "greater": "({} > {})",
-    "greater_equal": "({} >= {})",
-    "equal": "({} == {})",
-    "logical_and": "({} && {})",
-    "logical_or": "({} || {})",
     "logical_not": "(!{})",
     "where": "({} ? {} : {})",
     "maximum": "most({}, {})",
     "minimum": "least({}, {})",
+    **{name: f"({{}} {sign} {{}})" for name, sign in _BINARY.items()},
+    **{name: f"std::{name_cpp}({{}})" for name, name_cpp in _FUNCTIONS.items()},
     "arctan2": "std::atan2({}, {})",
-    "arccos": "std::acos({})",
-    "absolute": "std::fabs({})",
-    "isfinite": "std::isfinite({})",
-    **{name: f"std::{name}({{}})" for name in ("sqrt", "sin", "cos", "tanh", "floor")},
 }
 # Initial value of a reduction, and its statement for each element.
 _FOLDS = {

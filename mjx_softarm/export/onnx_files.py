@@ -24,32 +24,12 @@ OPSET, IR_VERSION = 17, 8
 ABOUT, SEAL = "mjx_softarm", "sha256"  # entries of the metadata
 SCHEMA_VERSION = 1
 
-_OPERATORS = {
-    "add": "Add",
-    "subtract": "Sub",
-    "multiply": "Mul",
-    "divide": "Div",
-    "negative": "Neg",
-    "sqrt": "Sqrt",
-    "sin": "Sin",
-    "cos": "Cos",
-    "arccos": "Acos",
-    "tanh": "Tanh",
-    "floor": "Floor",
-    "absolute": "Abs",
-    "maximum": "Max",
-    "minimum": "Min",
-    "less": "Less",
-    "less_equal": "LessOrEqual",
-    "greater": "Greater",
-    "greater_equal": "GreaterOrEqual",
-    "equal": "Equal",
-    "logical_and": "And",
-    "logical_or": "Or",
-    "logical_not": "Not",
-    "where": "Where",
-    "matmul": "MatMul",
-}
+_SAME = ("add", "sqrt", "sin", "cos", "tanh", "floor", "less", "greater", "equal", "where")
+_OPERATORS = {name: name.title() for name in _SAME}
+_OPERATORS |= {"subtract": "Sub", "multiply": "Mul", "divide": "Div", "negative": "Neg", "matmul": "MatMul"}
+_OPERATORS |= {"arccos": "Acos", "absolute": "Abs", "maximum": "Max", "minimum": "Min"}
+_OPERATORS |= {"less_equal": "LessOrEqual", "greater_equal": "GreaterOrEqual"}
+_OPERATORS |= {"logical_and": "And", "logical_or": "Or", "logical_not": "Not"}
 _TYPES = {"f": TensorProto.FLOAT, "i": TensorProto.INT32, "b": TensorProto.BOOL}  # by NumPy's kind
 
 

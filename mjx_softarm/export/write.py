@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.export import computations
 from mjx_softarm.export.cpp import sources
-from mjx_softarm.export.golden import write_golden
+from mjx_softarm.export.golden import Golden, write_golden
 from mjx_softarm.export.golden_cases import make_golden
 from mjx_softarm.mdp.observation import RATE_S
 from mjx_softarm.policy.file import Policy, action_layout, load_policy
@@ -52,7 +53,7 @@ def export_onnx(policy_path: Path) -> list[Path]:
     write_onnx(actor, computations.actor(controller), {"kind": "actor", **about}, {})
     write_onnx(check, computations.check(controller), {"kind": "check of goals", **about}, {})
     golden = policy_path.with_name(f"{policy_path.stem}_golden.csv")
-    write_golden(golden, make_golden(controller, sha256))
+    write_golden(golden, _golden(policy_path, sha256))
     return [whole, actor, check, golden]
 
 
@@ -69,7 +70,7 @@ def export_cpp(policy_path: Path, folder: Path) -> list[Path]:
     for name, text in sources(controller, sha256).items():
         files.append(folder / name)
         files[-1].write_text(text, "utf-8")
-    write_golden(folder / "golden.csv", make_golden(controller, sha256))
+    write_golden(folder / "golden.csv", _golden(policy_path, sha256))
     return [*files, folder / "golden.csv"]
 
 
@@ -117,6 +118,12 @@ def describe(policy: Policy, sha256: str) -> dict[str, Any]:
         "spec": policy.spec.to_dict(),
         "provenance": dict(policy.provenance),
     }
+
+
+@functools.lru_cache(maxsize=1)
+def _golden(policy_path: Path, sha256: str) -> Golden:
+    """Return a policy's golden rows; graphs and sources of one export share them."""
+    return make_golden(Controller.of(load_policy(policy_path)), sha256)
 
 
 def _open(policy_path: Path) -> tuple[Controller, str]:

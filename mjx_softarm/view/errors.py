@@ -74,7 +74,7 @@ class Errors:
             with self._server.atomic():
                 for name, pairs in sets.items():
                     self._show(name, pairs)
-            self._say("".join(_row(name, pairs) for name, pairs in sets.items()))
+            self._say("".join(_summary(name, pairs) for name, pairs in sets.items()))
         elif not self._boxes:
             missing = f"no {POSES_FILE} here: the logs had no poses, or an older version wrote this folder"
             self._say(f"<div>{'waiting for the first evaluation ...' if self._is_run else missing}</div>")
@@ -114,7 +114,7 @@ class Errors:
         self._boxes[name] = box
 
     def _show_curves(self) -> None:
-        rows = _rows(self._folder / METRICS_FILE)
+        rows = _metrics(self._folder / METRICS_FILE)
         evaluated = [row for row in rows if all(name in row for name in CURVES)]
         if evaluated:
             self._curve.data = tuple(
@@ -134,13 +134,13 @@ class Errors:
         )
 
 
-def _row(name: str, pairs: PosePairs) -> str:
+def _summary(name: str, pairs: PosePairs) -> str:
     median, most = np.quantile(pairs.error_mm, (0.5, 0.95))
     poses = f"{len(pairs.target)} poses, {pairs.warned.sum()} marked"
     return f"<div><b>{name}</b>: median {median:.2f} mm, 95 % {most:.2f} mm; {poses}</div>"
 
 
-def _rows(path: Path) -> list[dict[str, Any]]:
+def _metrics(path: Path) -> list[dict[str, Any]]:
     """Return the lines of a file of metrics; a last line that is not complete is left out."""
     rows = []
     for line in path.read_text("utf-8").splitlines():

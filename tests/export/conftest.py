@@ -8,6 +8,7 @@ import itertools
 import numpy as np
 import pytest
 
+from mjx_softarm import ArmSpec
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.export import golden_cases
 from mjx_softarm.mdp.observation import layouts
@@ -48,6 +49,14 @@ def busy_policy(spec=SPEC):
     return dataclasses.replace(policy, layers=layers(18, 12, N, scale=0.5), **networks)
 
 
+def draw_wire_policy():
+    """A busy policy of an arm with draw wires, without a sim-to-real network."""
+    spec = SPEC.to_dict()
+    spec["sensor"] = {"kind": "draw_wire", "m_per_v": 0.1, "voltage_min_v": 0.0, "voltage_max_v": 5.0}
+    spec["sensor"] |= {"beta": 1.0, "delta_m": 0.01}
+    return dataclasses.replace(busy_policy(ArmSpec.from_dict(spec, "test")), s2r=None)
+
+
 def moving_policy(spec=SPEC):
     """A busy policy that acts each 0.3 s on what it sees of the motion."""
     actor = layers(len(layouts(N)["motion"]), 12, N, scale=0.3)
@@ -63,9 +72,10 @@ def carrying_policy(spec=SPEC):
 @contextlib.contextmanager
 def few_golden_rows(run_ticks=30):
     """Golden rows made in here are few; runs end after so many ticks."""
+    few = {"N_SINGLE": 40, "N_CHECKED": 8, "_CANDIDATES": 60, "_RUN_TICKS": run_ticks}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(golden_cases, "N_SINGLE", 40)
-        patch.setattr(golden_cases, "_RUN_TICKS", run_ticks)
+        for name, number in few.items():
+            patch.setattr(golden_cases, name, number)
         yield
 
 

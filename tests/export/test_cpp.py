@@ -9,7 +9,6 @@ import subprocess
 import numpy as np
 import pytest
 
-from mjx_softarm import ArmSpec
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.export import golden_cases
@@ -17,12 +16,12 @@ from mjx_softarm.export.check import TOLERANCE, check
 from mjx_softarm.export.cpp import sources
 from mjx_softarm.export.golden import FLAGS, Machine
 from mjx_softarm.mdp.observation import OBS_SIZE
-from tests.export.conftest import busy_policy, carrying_policy, few_golden_rows, moving_policy
+from tests.export.conftest import carrying_policy, draw_wire_policy, few_golden_rows, moving_policy
 from tests.linear_arm import N
 
 pytestmark = pytest.mark.skipif(not shutil.which("g++"), reason="there is no compiler g++ here")
 STRICT = ("-std=c++17", "-Wall", "-Wextra", "-Werror")
-SANITIZED = ("-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+SANITIZED = ("-O0", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 MATH = {"sin", "cos", "tan", "tanh", "atan2", "acos", "floor", "sqrt"}
 
 
@@ -45,14 +44,6 @@ def test_rows_agree_under_sanitizers(folder, golden):
     assert agreement.n_rows == len(golden.inputs) and agreement.error < TOLERANCE, agreement
 
 
-def draw_wires():
-    """A policy of an arm with draw wires, without a sim-to-real network."""
-    spec = ArmSpec.default().to_dict()
-    spec["sensor"] = {"kind": "draw_wire", "m_per_v": 0.1, "voltage_min_v": 0.0, "voltage_max_v": 5.0}
-    spec["sensor"] |= {"beta": 1.0, "delta_m": 0.01}
-    return dataclasses.replace(busy_policy(ArmSpec.from_dict(spec, "test")), s2r=None)
-
-
 def agreeing_rows(policy, folder, run_ticks):
     """Rows of a policy, on which its C++ agrees; a run that is given its goal again is twice as long."""
     controller = Controller.of(policy)
@@ -67,7 +58,7 @@ def agreeing_rows(policy, folder, run_ticks):
 
 
 def test_rows_of_draw_wires_agree(tmp_path):
-    agreeing_rows(draw_wires(), tmp_path, run_ticks=30)
+    agreeing_rows(draw_wire_policy(), tmp_path, run_ticks=30)
 
 
 def test_rows_of_a_policy_that_observes_the_payload_agree(tmp_path):

@@ -1,6 +1,5 @@
 """ONNX graphs in onnxruntime."""
 
-import dataclasses
 import json
 
 import numpy as np
@@ -17,7 +16,7 @@ from mjx_softarm.export.golden_cases import N_SINGLE
 from mjx_softarm.export.write import export_onnx
 from mjx_softarm.policy.file import load_policy, save_policy
 from mjx_softarm.policy.runtime import PolicyRunner, actor_output
-from tests.export.conftest import busy_policy, carrying_policy, few_golden_rows, moving_policy
+from tests.export.conftest import carrying_policy, draw_wire_policy, few_golden_rows, moving_policy
 from tests.linear_arm import N
 
 onnx = pytest.importorskip("onnx", reason="the package onnx is not installed")
@@ -80,14 +79,10 @@ def test_lost_reading_holds_the_last_length(files, golden, controller):
 
 
 def test_draw_wires_without_a_sim_to_real_network(tmp_path):
-    sensor = {"kind": "draw_wire", "m_per_v": 0.1, "voltage_min_v": 0.0, "voltage_max_v": 5.0}
-    spec = ArmSpec.default().to_dict()
-    spec["sensor"] = {**sensor, "beta": 1.0, "delta_m": 0.01}
-    policy = dataclasses.replace(busy_policy(ArmSpec.from_dict(spec, "test")), s2r=None)
-    controller = Controller.of(policy)
+    controller = Controller.of(draw_wire_policy())
     onnx_files.write_onnx(tmp_path / "wires.onnx", computations.graph(controller), {}, {})
     session = ort.InferenceSession(tmp_path / "wires.onnx")
-    readings, goal = np.linspace(1.5, 2.0, N), policy.workspace[0].astype(float)
+    readings, goal = np.linspace(1.5, 2.0, N), controller.policy.workspace[0].astype(float)
     state, _ = with_goal(controller, start(controller), goal)
     state, _ = step(controller, state, readings, False)
     more = {"load_kg": np.zeros(()), "pressure_kpa": readings}

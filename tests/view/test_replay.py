@@ -1,9 +1,5 @@
 """Logs replayed and shared, without a browser."""
 
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -12,9 +8,8 @@ from mjx_softarm.logs.schema import write_log
 from tests.linear_arm import GOALS, SPEC, LinearArm, go
 
 pytest.importorskip("viser", reason="needs viser: pip install -e '.[view]'")
+from mjx_softarm.view.__main__ import main
 from mjx_softarm.view.replay import SHARE_HZ, ReplayPage, Track, share
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -63,17 +58,13 @@ def test_long_log_is_shared_faster(path, tmp_path, monkeypatch):
     assert "__VISER_EMBED_DATA__" in text and text.rstrip().endswith("</html>")
 
 
-def test_command_line(path, tmp_path):
-    def view(*words):
-        command = [sys.executable, "-m", "mjx_softarm.view", *map(str, words)]
-        return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
-
+def test_command_line(path, tmp_path, capsys):
     for words, message in (
         (("--html", tmp_path / "a.html"), "--html: got no log, expected one or more"),
         ((path, "--html", tmp_path / "no" / "a.html"), "expected a file in a folder that exists"),
         ((tmp_path / "no.csv",), "no.csv"),
     ):
-        done = view(*words)
-        assert done.returncode == 2 and message in done.stderr and done.stderr.count("\n") == 1
-    done = view(path, "--html", tmp_path / "a.html")
-    assert done.returncode == 0 and done.stdout.startswith(f"wrote {tmp_path / 'a.html'}, ")
+        assert main([*map(str, words)]) == 2
+        assert message in (error := capsys.readouterr().err) and error.count("\n") == 1
+    assert main([str(path), "--html", str(tmp_path / "a.html")]) == 0
+    assert capsys.readouterr().out.startswith(f"wrote {tmp_path / 'a.html'}, ")
