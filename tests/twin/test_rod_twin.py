@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 from mjx_softarm.deploy.drivers.names import ArmError, open_arm
 from mjx_softarm.deploy.record import record
 from mjx_softarm.twin import rod_twin
-from mjx_softarm.twin.instruments import S2R_SESSION
 from mjx_softarm.twin.rod_twin import RodBuild, RodTwin
 
 KPA = np.array([-12.0, 3, -20, -5, -30, 4, 2, -9, -14])
@@ -41,8 +40,6 @@ def test_payload_pulls_and_is_released(spec):
         hold(arm, np.zeros(9), 5.0)
         z.append(arm.motion_capture().tip_m[2])
     assert z[1] < z[0] - 5e-3 and z[2] == pytest.approx(z[0], abs=1e-5)
-    with pytest.raises(ValueError, match=r"payload_kg: got nan, expected a number >= 0"):
-        arm.attach(np.nan)
 
 
 def test_mount_and_tilt_show_with_the_arm_hanging():
@@ -65,19 +62,6 @@ def test_pressures_and_tip_follow_with_a_lag():
     assert arm.time_s == pytest.approx(8.1)
 
 
-def test_seed_chooses_the_rod_and_session_the_noise(spec):
-    def seen(*args, **options):
-        arm = hold(RodTwin(*args, build=COARSE, **options), KPA, 0.1)
-        return np.concatenate([arm.read_sensors(), arm.pressures(), arm.motion_capture().tip_m])
-
-    first = seen(7)
-    np.testing.assert_array_equal(first, seen(7))
-    assert (first != seen(8)).all()
-    other_day = seen(7, session=S2R_SESSION)
-    assert (first != other_day).all()
-    np.testing.assert_allclose(first[:9], other_day[:9], atol=10 * spec.spring_sensor.noise)
-
-
 def test_it_is_recorded_as_any_arm(spec):
     found = record(RodTwin(101, build=COARSE), spec, KPA[None])
     assert found.n_poses == 1 and found.ending.vented and not found.ending.cause
@@ -89,13 +73,6 @@ def test_it_has_a_name():
     for name in ("twin:rod:x", "twin:rod:", "twin:rod:3:pipe300"):
         with pytest.raises(ArmError, match=r"--arm: twin:rod:SEED: got '.*', expected an integer >= 0"):
             open_arm(name)
-
-
-def test_impossible_command_is_refused():
-    arm = RodTwin(101, build=COARSE)
-    with pytest.raises(ValueError, match=r"pressure_kpa\[2\]: got 20.1, expected -40 to 20 kPa"):
-        arm.write_pressures([0, 0, 20.1, 0, 0, 0, 0, 0, 0])
-    assert arm.time_s == 0.0
 
 
 def test_it_is_written_without_the_training_model():
