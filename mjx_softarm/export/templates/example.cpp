@@ -1,4 +1,4 @@
-// Brings the tip to a goal. Write the two functions below for your arm; all else is in softarm.hpp.
+// Brings the tip to a goal. Write the two functions below for your arm; softarm.hpp holds the rest.
 #include <chrono>
 #include <csignal>
 #include <cstdio>
@@ -9,19 +9,19 @@
 using softarm::kN;
 using Clock = std::chrono::steady_clock;
 
-// Reads the springs' sensors, NaN for a reading that did not come in time; false where they cannot be reached.
+// Reads the springs' sensors, NaN for a reading that is late or missing; returns false if they are not reached.
 static bool read_sensors(double* readings) {
   for (int k = 0; k < kN; ++k) readings[k] = NAN;
   return true;
 }
 
-// Sets what the chambers' pressures [kPa] are regulated to; false where the arm did not take them in time.
+// Commands the chambers' pressures [kPa]; returns false if the arm did not take them in time.
 static bool write_pressures(const double* pressure_kpa) {
   for (int k = 0; k < kN; ++k) std::printf("%.1f%c", pressure_kpa[k], k + 1 < kN ? ' ' : '\n');
   return true;
 }
 
-// Ctrl-C and SIGTERM vent the arm; a second one ends at once, with the arm under pressure.
+// Ctrl-C and SIGTERM vent the arm; a second signal ends at once, with the arm under pressure.
 static volatile std::sig_atomic_t ends = 0;
 static void end(int signal) {
   ends = 1;
