@@ -13,11 +13,10 @@ import numpy as np
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.safety import Fault
-from mjx_softarm.export.golden import BITS, FLAGS, Golden, Machine, output_columns
+from mjx_softarm.export.golden import BITS, FLAGS, PROGRAM_VERSION, Golden, Machine, output_columns
 from mjx_softarm.policy.file import load_policy
 
 TOLERANCE = 1e-4  # share of an output's range; the law adds up rounding errors of float32 references
-PROGRAM_VERSION = 2  # version of the rows that a program reads and writes
 _TIMEOUT_S = 120.0
 
 

@@ -8,6 +8,7 @@ from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.safety import Fault, Response
 from mjx_softarm.export.computations import parts
 from mjx_softarm.export.cpp_functions import Numbers, function
+from mjx_softarm.export.golden import FLAGS, PROGRAM_VERSION
 from mjx_softarm.mdp.observation import rate_ticks
 from mjx_softarm.policy.file import file_entries
 from mjx_softarm.policy.reach import N_STEPS, begin
@@ -30,6 +31,8 @@ def sources(controller: Controller, policy_sha256: str) -> dict[str, str]:
     # Values of the templates' marks.
     values = {
         "SHA256": policy_sha256,
+        "PROGRAM_VERSION": PROGRAM_VERSION,
+        "N_FLAGS": len(FLAGS),
         "N": policy.spec.n_chambers,
         "RATE": f"{policy.rate_hz:g}",
         "PERIOD": repr(controller.dt_s),

@@ -35,7 +35,8 @@ from mjx_softarm.deploy.link import vented
 from mjx_softarm.deploy.loop import in_force, refusals, start, step, with_goal
 from mjx_softarm.deploy.safety import Event, Fault
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 2  # version of the file
+PROGRAM_VERSION = 2  # version of the rows that a program reads and writes
 AXES = ("x", "y", "z", "yaw", "pitch", "roll")
 FLAGS = ("restart", "new_goal", "late", "taken", "lost", "checked")
 BITS = {fault: 1 << k for k, fault in enumerate(Fault)}

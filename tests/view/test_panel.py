@@ -17,6 +17,7 @@ def test_saturated_chambers_are_found_and_marked():
     row = {"time_s": 0.0, "pressure_kpa": kpa, "reference_m": reference_m}
     look, limits = look_at(row, np.full(N, REST_M)), Limits.of(SPEC)
     assert np.flatnonzero(limits.saturated(look)).tolist() == [2]
+    assert not Limits.of(SPEC, tolerance_m=0.02).saturated(look).any()
     drawn = panel.bars(look, limits)
     assert "saturated: chamber 2<" in drawn and drawn.count(panel.css((226, 38, 77))) == 3
     assert "-10.0</text>" in drawn

@@ -10,10 +10,10 @@ static void write(const double* values, int n) {
 }
 
 int main() {
-  std::printf("mjx_softarm 2 %s\n", softarm::kPolicySha256);
+  std::printf("mjx_softarm @PROGRAM_VERSION@ %s\n", softarm::kPolicySha256);
   std::fflush(stdout);
   softarm::Controller controller;
-  constexpr int n_flags = 6, n_inputs = n_flags + kN + 6;
+  constexpr int n_flags = @N_FLAGS@, n_inputs = n_flags + kN + 6;
   double row[n_inputs];
   float nearest[6];
   const double *readings = row + n_flags, *goal = readings + kN;
