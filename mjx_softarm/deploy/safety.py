@@ -32,7 +32,7 @@ is counted; `Event.message` says what was seen and what was expected.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from enum import Enum
 from typing import NamedTuple
 
@@ -110,9 +110,9 @@ def check(
         n_suspect=np.where(belief.suspect, watch.n_suspect + 1, 0),
         load_kg=belief.load.kg,
     )
-    events = _of_time(controller, next_watch) + _of_sensors(controller, next_watch, belief)
+    events = [*_of_time(controller, next_watch), *_of_sensors(controller, next_watch, belief)]
     if stop_of(events) is None:
-        events += _of_chambers(controller, next_watch, belief) + _of_payload(controller, watch, belief)
+        events += [*_of_chambers(controller, next_watch, belief), *_of_payload(controller, watch, belief)]
     return next_watch, tuple(events)
 
 
@@ -121,58 +121,51 @@ def stop_of(events: Iterable[Event]) -> Event | None:
     return next((event for event in events if event.response is Response.VENT), None)
 
 
-def _of_time(controller: Controller, watch: Watch) -> list[Event]:
+def _of_time(controller: Controller, watch: Watch) -> Iterator[Event]:
     late = f"took too long, expected at most {1e3 * controller.dt_s:g} ms"
-    missed = [Event(Fault.MISSED_DEADLINE, f"the last tick {late}")] if watch.n_late else []
+    if watch.n_late:
+        yield Event(Fault.MISSED_DEADLINE, f"the last tick {late}")
     if watch.n_late >= controller.config.late_ticks:
-        missed.append(Event(Fault.ARM_LATE, f"{watch.n_late} ticks in a row {late}"))
-    return missed
+        yield Event(Fault.ARM_LATE, f"{watch.n_late} ticks in a row {late}")
 
 
-def _of_sensors(controller: Controller, watch: Watch, belief: Belief) -> list[Event]:
-    config, seconds = controller.config, controller.window * controller.dt_s
-    events = [Event(Fault.LOST_READING, belief.why_lost)] if belief.lost.any() else []
-    gone = watch.n_lost >= config.lost_ticks
+def _of_sensors(controller: Controller, watch: Watch, belief: Belief) -> Iterator[Event]:
+    config, gone = controller.config, watch.n_lost >= controller.config.lost_ticks
+    if belief.lost.any():
+        yield Event(Fault.LOST_READING, belief.why_lost)
     if gone.any():
-        message = f"{names('spring', gone)}: no length in {config.lost_ticks} ticks in a row"
-        events.append(Event(Fault.SENSOR_LOST, message))
+        text = f"{names('spring', gone)}: no length in {config.lost_ticks} ticks in a row"
+        yield Event(Fault.SENSOR_LOST, text)
     elif belief.stuck.any():
-        message = (
-            f"{names('spring', belief.stuck)}: moved less than {1e3 * config.stuck_range_m:g} mm in "
-            f"{seconds:g} s, noise included, while the chamber was driven or the section moved"
-        )
-        events.append(Event(Fault.SENSOR_STUCK, message))
-    return events
+        text = f"{names('spring', belief.stuck)}: moved less than {1e3 * config.stuck_range_m:g} mm in "
+        text += f"{controller.window * controller.dt_s:g} s, noise included, while the chamber was driven or "
+        yield Event(Fault.SENSOR_STUCK, f"{text}the section moved")
 
 
-def _of_chambers(controller: Controller, watch: Watch, belief: Belief) -> list[Event]:
+def _of_chambers(controller: Controller, watch: Watch, belief: Belief) -> Iterator[Event]:
     config = controller.config
     n_windows = config.rest_windows if belief.at_rest else config.moving_windows
     lost = watch.n_suspect >= n_windows * controller.window
-    if not lost.any():
-        return []
-    kpa = ", ".join(f"{value:.1f}" for value in belief.command.pressure_kpa[lost])
-    message = f"{names('chamber', lost)}: at {kpa} kPa, but the springs lie as they would without that"
-    return [Event(Fault.CHAMBER_LOST, message)]
+    if lost.any():
+        kpa = ", ".join(f"{value:.1f}" for value in belief.command.pressure_kpa[lost])
+        text = f"{names('chamber', lost)}: at {kpa} kPa, but the springs lie as they would without that"
+        yield Event(Fault.CHAMBER_LOST, text)
 
 
-def _of_payload(controller: Controller, watch: Watch, belief: Belief) -> list[Event]:
-    """Return the faults of a payload that was estimated in this tick; `watch` is the last tick's."""
+def _of_payload(controller: Controller, watch: Watch, belief: Belief) -> Iterator[Event]:
+    """Yield the faults of a payload that was estimated in this tick; `watch` is the last tick's."""
     if belief.estimate_kg is None:
-        return []
-    mass, load = controller.policy.spec.mass, belief.load
-    most_kg, events = float(controller.policy.load_estimator.load_scale_kg), []
+        return
+    load, most_kg = belief.load, float(controller.policy.load_estimator.load_scale_kg)
     if not LOWEST * most_kg <= belief.estimate_kg <= HIGHEST * most_kg:
-        got = f"springs and pressures give {1e3 * belief.estimate_kg:.0f} g"
-        message = f"{got}, the pose is estimated from the springs alone, with {1e3 * mass.payload_kg:.0f} g"
-        events.append(Event(Fault.LOAD_UNKNOWN, message))
+        own_g = 1e3 * controller.policy.spec.mass.payload_kg
+        text = f"springs and pressures give {1e3 * belief.estimate_kg:.0f} g, the pose is estimated from the "
+        yield Event(Fault.LOAD_UNKNOWN, f"{text}springs alone, with {own_g:.0f} g")
     if load.began and load.kg < watch.load_kg:
-        message = f"{1e3 * load.believed_kg:.0f} g, from {1e3 * watch.load_kg:.0f} g before"
-        events.append(Event(Fault.LOAD_LOST, message))
+        text = f"{1e3 * load.believed_kg:.0f} g, from {1e3 * watch.load_kg:.0f} g before"
+        yield Event(Fault.LOAD_LOST, text)
     if load.kg > controller.config.overload * most_kg:
-        message = f"{1e3 * load.kg:.0f} g, expected at most {1e3 * most_kg:.0f} g"
-        events.append(Event(Fault.OVERLOADED, message))
-    return events
+        yield Event(Fault.OVERLOADED, f"{1e3 * load.kg:.0f} g, expected at most {1e3 * most_kg:.0f} g")
 
 
 def names(kind: str, mask: np.ndarray) -> str:

@@ -254,8 +254,8 @@ def _clipped(shift: np.ndarray, limit: np.ndarray) -> np.ndarray:
 def _extrapolated(belief: Belief) -> tuple[Event, ...]:
     if not belief.away > 1.0:
         return ()
-    message = f"{belief.away:.1f} times as far from the training rows as the network is believed"
-    return (Event(Fault.EXTRAPOLATION, message),)
+    text = f"{belief.away:.1f} times as far from the training rows as the network is believed"
+    return (Event(Fault.EXTRAPOLATION, text),)
 
 
 def _unsettled(controller: Controller, belief: Belief) -> tuple[Event, ...]:
@@ -263,11 +263,12 @@ def _unsettled(controller: Controller, belief: Belief) -> tuple[Event, ...]:
     off_m, mask, events = belief.mean_m - belief.command.reference_m, belief.saturated, []
     if not belief.settled:
         worst = int(np.argmax(np.where(mask, 0.0, np.abs(off_m))))
-        off = f"{1e3 * off_m[worst]:+.1f} mm"
-        message = f"after {controller.config.settle_timeout_s:g} s, spring{worst} is {off} off its reference"
-        events.append(Event(Fault.NOT_SETTLED, message))
+        text = (
+            f"after {controller.config.settle_timeout_s:g} s, spring{worst} is {1e3 * off_m[worst]:+.1f} mm"
+        )
+        events.append(Event(Fault.NOT_SETTLED, f"{text} off its reference"))
     if mask.any():
         off = ", ".join(f"{1e3 * value:+.1f}" for value in off_m[mask])
-        message = f"{names('chamber', mask)}: at the limit, spring {off} mm off its reference"
-        events.append(Event(Fault.SATURATED, message))
+        text = f"{names('chamber', mask)}: at the limit, spring {off} mm off its reference"
+        events.append(Event(Fault.SATURATED, text))
     return tuple(events)
