@@ -37,6 +37,7 @@ def run(reference_m, gains, n_ticks, compliance=UNCOUPLED):
 
 
 def test_one_tick_by_hand():
+    """Springs off their references; then a reference on its way and a spring that moves."""
     gains = Gains(100.0, 500.0, 0.0, 0.0, -40.0, 20.0)
     reference, length = np.array([0.21, 0.20, 0.60, 0.10]), np.array([0.20, 0.21, 0.20, 0.20])
     start = LawState.at_rest(np.array([1.0, 1.0, 19.0, -39.5]), length)
@@ -45,8 +46,6 @@ def test_one_tick_by_hand():
     np.testing.assert_allclose(state.integral_kpa, [1.1, 0.9, 20.0, -40.0])
     np.testing.assert_allclose(pressure, [2.1, -0.1, 20.0, -40.0])
 
-
-def test_one_tick_of_a_reference_on_its_way_and_a_moving_spring_by_hand():
     gains = Gains(100.0, 500.0, 10.0, 0.08, -40.0, 20.0)
     start = LawState(np.zeros(1), np.array([0.20]), np.array([0.198]))
     pressure, state = pressures(np.array([0.21]), np.array([0.20]), start, gains, 0.02)

@@ -9,6 +9,8 @@ Pure functions; NumPy only. Tests of windows take the symbols of `mjx_softarm.ex
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -31,9 +33,11 @@ class Window(NamedTuple):
     chamber_kpa: np.ndarray  # (ticks, n) measured, or in force where none was measured
 
 
-class Belief(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Belief:
     """Belief about an arm with n springs and chambers."""
 
+    controller: Controller  # with the arm's models
     command: Command  # in force as the readings were taken
     window: Window
     spring_m: np.ndarray  # (n,) lengths, the last good ones; NaN before the first
@@ -42,8 +46,6 @@ class Belief(NamedTuple):
     suspect: np.ndarray  # (n,) bool: a chamber without whose pressure the springs would lie as they do
     saturated: np.ndarray  # (n,) bool: a chamber at its limit with its spring, in the mean, off the reference
     load: Load  # payload
-    pose: np.ndarray  # (6,) [mm, deg] of the tip; NaN before the first lengths
-    away: float = 0.0  # distance of the pose from the sim-to-real network's training rows, over the limit
     at_rest: bool = False  # nothing has moved for a window; one after the last action, at the earliest
     settled: bool = False  # at rest with each spring on its reference, or its chamber at a limit
     why_lost: str = ""  # message of the sensors
@@ -59,7 +61,22 @@ class Belief(NamedTuple):
             np.zeros(n, bool),
             np.full(n, np.nan),
         )
-        return cls(Command.none(n), window, nan, no, no, no, no, load, np.full(6, np.nan))
+        return cls(controller, Command.none(n), window, nan, no, no, no, no, load)
+
+    @property
+    def pose(self) -> np.ndarray:
+        """Pose (6,) [mm, deg] of the tip, NaN before the first lengths."""
+        return self._tip[0]
+
+    @property
+    def away(self) -> float:
+        """Distance of the pose from the sim-to-real network's training rows, over the limit."""
+        return self._tip[1]
+
+    @cached_property
+    def _tip(self) -> tuple[np.ndarray, float]:
+        # Only when asked for: in most ticks after the pressures are written, for the log.
+        return pose_of(self.controller, self.spring_m, self.load)
 
     @property
     def known(self) -> bool:
@@ -89,8 +106,14 @@ def believe(
     seen_kpa = np.full_like(in_force_kpa, np.nan) if measured_kpa is None else measured_kpa
     tick = spring_m, in_force_kpa, np.where(np.isfinite(seen_kpa), seen_kpa, in_force_kpa)
     rows = (np.concat([old[1 - size :], new[None]]) for old, new in zip(last.window, tick, strict=True))
-    belief = Belief.none(controller)._replace(
-        command=command, window=Window(*rows), spring_m=spring_m, lost=lost, why_lost=why, load=last.load
+    belief = replace(
+        Belief.none(controller),
+        command=command,
+        window=Window(*rows),
+        spring_m=spring_m,
+        lost=lost,
+        why_lost=why,
+        load=last.load,
     )
     springs_m, mean_m = belief.window.spring_m, belief.mean_m
 
@@ -98,25 +121,22 @@ def believe(
     if len(springs_m) == size:
         at_rest = command.n_ticks >= size and bool(still(springs_m, config))
         stuck = stuck_springs(springs_m, belief.window.pressure_kpa, config)
-        belief = belief._replace(at_rest=at_rest, stuck=stuck)
+        belief = replace(belief, at_rest=at_rest, stuck=stuck)
     if asked_m is not None and belief.known:
         on = belief.at_rest and bool(on_reference(springs_m, asked_m, in_force_kpa, gains, tolerance_m))
         mask = saturated(in_force_kpa, asked_m, mean_m, gains, tolerance_m)
         suspect = saturated(in_force_kpa, asked_m, spring_m, gains, tolerance_m)
         if suspect.any():
             suspect &= as_without(policy.spring_model, in_force_kpa, spring_m, config)
-        belief = belief._replace(settled=on, saturated=mask, suspect=suspect)
+        belief = replace(belief, settled=on, saturated=mask, suspect=suspect)
 
     # Payload, of windows that do not overlap
-    belief = belief._replace(n_unweighed=last.n_unweighed + 1)
+    belief = replace(belief, n_unweighed=last.n_unweighed + 1)
     doubtful = belief.lost | belief.stuck | belief.suspect
     if belief.at_rest and belief.n_unweighed >= size and not doubtful.any():
         load, estimate_kg = _weighed(policy, last.load, mean_m, belief.window.chamber_kpa.mean(axis=0))
-        belief = belief._replace(load=load, estimate_kg=estimate_kg, n_unweighed=0)
-
-    # Pose
-    pose, away = pose_of(controller, spring_m, belief.load)
-    return belief._replace(pose=pose, away=away)
+        belief = replace(belief, load=load, estimate_kg=estimate_kg, n_unweighed=0)
+    return belief
 
 
 def _weighed(policy: Policy, load: Load, mean_m: np.ndarray, mean_kpa: np.ndarray) -> tuple[Load, float]:

@@ -55,7 +55,7 @@ class Tick(NamedTuple):
 def start(controller: Controller) -> LoopState:
     """Return the state before the first tick, of an arm without pressure."""
     belief, none = Belief.none(controller), np.zeros(controller.policy.spec.n_chambers, int)
-    strategy = strategy_of(controller, np.zeros(6), moves=False)
+    strategy = strategy_of(controller.policy, np.zeros(6), moves=False)
     return LoopState(belief.command, belief, Watch(0, none, none, belief.load.kg), strategy)
 
 
@@ -131,7 +131,7 @@ def with_goal(
         near = ", ".join(f"{value:.0f}" for value in pose)
         far = f"{text} is {away:.1f} times as far from the nearest reachable pose as a goal may be"
         return state, (Event(Fault.GOAL_OUTSIDE, f"{far}; that pose is {near} [mm, deg]"),)
-    strategy = strategy_of(controller, state.strategy.shift, moves=False)
+    strategy = strategy_of(controller.policy, state.strategy.shift, moves=False)
     command = state.command._replace(n_ticks=0)
     return state._replace(goal=goal, lead=None, strategy=strategy, command=command), ()
 
@@ -141,7 +141,7 @@ def with_moving_goal(
 ) -> LoopState:
     """Return the state with the places (6,) [mm, deg] of a moving goal, now and ahead; all are reachable."""
     begins = state.lead is None
-    strategy = strategy_of(controller, state.strategy.shift, moves=True) if begins else state.strategy
+    strategy = strategy_of(controller.policy, state.strategy.shift, moves=True) if begins else state.strategy
     return state._replace(goal=goal, lead=lead, strategy=strategy)
 
 

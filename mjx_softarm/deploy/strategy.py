@@ -18,10 +18,10 @@ from typing import NamedTuple
 import numpy as np
 
 from mjx_softarm.deploy.belief import Belief, pose_of
-from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.safety import Event, Fault, names
 from mjx_softarm.mdp.observation import rate_ticks
 from mjx_softarm.mdp.rewards import scaled_error
+from mjx_softarm.policy.file import Policy
 from mjx_softarm.policy.runtime import InMotion
 from mjx_softarm.sensing.load import Load
 from mjx_softarm.sensing.pose import pose_error
@@ -39,7 +39,6 @@ class Choice(NamedTuple):
 class AtRest(NamedTuple):
     """Actions of a policy for arms at rest: at once, then whenever the springs have settled."""
 
-    controller: Controller
     shift: np.ndarray  # (6,) [mm, deg]
     n_actions: int = 0
     acted_load: Load | None = None  # payload at the last action
@@ -50,11 +49,11 @@ class AtRest(NamedTuple):
         An action that would lead away from the goal is tried with smaller shifts. Where none will do, the arm
         has arrived.
         """
-        policy, config = self.controller.policy, self.controller.config
+        policy, config = belief.controller.policy, belief.controller.config
         # The first action does without a shift; the next ones correct what it leaves.
         if not self.n_actions:
             return self._act(belief, goal, [np.zeros(6)])
-        if _waits(self, belief, config.settle_timeout_s):
+        if _waits(belief, config.settle_timeout_s):
             return Choice(self)
 
         # Shifts that take all, or a share, of the error that the references leave.
@@ -62,12 +61,12 @@ class AtRest(NamedTuple):
         if belief.settled:
             pose, left = _left(self, belief, goal)
             shifts = [_clipped(self.shift - share * left, config.shift_limit) for share in config.shares]
-            allowed = max(_error(self.controller, pose, goal), policy.reward.threshold)
+            allowed = max(_error(belief, pose, goal), policy.reward.threshold)
 
         # The next action, or the arrival after the last one.
-        events = _unsettled(self.controller, belief)
+        events = _unsettled(belief)
         if self.n_actions == policy.n_actions:
-            return _arrive(self, shifts[0], events)
+            return _arrive(self, belief, shifts[0], events)
         return self._act(belief, goal, shifts, events, allowed)
 
     def _act(
@@ -81,35 +80,34 @@ class AtRest(NamedTuple):
         """Take the first shift whose references leave a weighted error of at most `allowed`, if given."""
         events += _extrapolated(belief)
         for shift in shifts:
-            reference_m = _planned(self.controller, belief, belief.pose, goal + shift)
+            reference_m = _planned(belief, belief.pose, goal + shift)
             if allowed is not None:
-                pose = _made(self.controller, belief, reference_m, belief.load)
-                if _error(self.controller, pose, goal) > allowed:
+                pose = _made(belief, reference_m, belief.load)
+                if _error(belief, pose, goal) > allowed:
                     continue
             return _acted(self, belief, reference_m, shift, events)
-        return _arrive(self, self.shift, events)
+        return _arrive(self, belief, self.shift, events)
 
 
 class Timed(NamedTuple):
     """Actions of a policy of motion: at regular times, whether the springs have settled or not."""
 
-    controller: Controller
     shift: np.ndarray  # (6,) [mm, deg]
     n_actions: int = 0
     acted_load: Load | None = None  # payload at the last action
 
     def references(self, belief: Belief, goal: np.ndarray) -> Choice:
         """Act or wait; arrive once the springs have settled after the last action."""
-        policy, config = self.controller.policy, self.controller.config
+        policy, config = belief.controller.policy, belief.controller.config
         shift, is_last = self.shift, self.n_actions == policy.n_actions
         if self.n_actions:
-            if _waits(self, belief, config.settle_timeout_s if is_last else policy.action_s):
+            if _waits(belief, config.settle_timeout_s if is_last else policy.action_s):
                 return Choice(self)
             if belief.settled:
                 shift = _clipped(shift - _left(self, belief, goal)[1], config.shift_limit)
             if is_last:
-                return _arrive(self, shift, _unsettled(self.controller, belief))
-        reference_m = _planned(self.controller, belief, belief.pose, goal + shift)
+                return _arrive(self, belief, shift, _unsettled(belief))
+        reference_m = _planned(belief, belief.pose, goal + shift)
         return _acted(self, belief, reference_m, shift, _extrapolated(belief))
 
 
@@ -119,18 +117,18 @@ class Predicting(NamedTuple):
     The first one begins at the believed pose, each next one at the pose predicted for the last references.
     """
 
-    controller: Controller
     shift: np.ndarray  # (6,) [mm, deg]
     n_actions: int = 0
 
     def references(self, belief: Belief, goal: np.ndarray) -> Choice:
         """Act several times; the last references count."""
-        pose, shift, reference_m = belief.pose, self.shift, belief.spring_m
-        for _ in range(self.controller.policy.n_actions):
-            reference_m = _planned(self.controller, belief, pose, goal + shift)
-            pose, _ = pose_of(self.controller, reference_m, belief.load)
+        controller, pose = belief.controller, belief.pose
+        shift, reference_m = self.shift, belief.spring_m
+        for _ in range(controller.policy.n_actions):
+            reference_m = _planned(belief, pose, goal + shift)
+            pose, _ = pose_of(controller, reference_m, belief.load)
             left = pose_error(np.asarray(pose, float), goal)
-            shift = _clipped(shift - left, self.controller.config.shift_limit)
+            shift = _clipped(shift - left, controller.config.shift_limit)
         return Choice(self._replace(shift=shift, n_actions=self.n_actions + 1), reference_m)
 
 
@@ -141,22 +139,21 @@ class Chasing(NamedTuple):
     from the goal's way.
     """
 
-    controller: Controller
     shift: np.ndarray  # (6,) [mm, deg]
     n_actions: int = 0
     due: tuple[np.ndarray, ...] = ()  # (6,) [mm, deg] each: the goal at the last actions, oldest first
 
     def references(self, belief: Belief, goal: np.ndarray) -> Choice:
         """Act or wait."""
-        config = self.controller.config
-        waited_s = belief.command.n_ticks * self.controller.dt_s
-        if belief.command.reference_m is not None and waited_s < self.controller.policy.action_s:
+        config = belief.controller.config
+        waited_s = belief.command.n_ticks * belief.controller.dt_s
+        if belief.command.reference_m is not None and waited_s < belief.controller.policy.action_s:
             return Choice(self)
         shift = self.shift
         if len(self.due) == config.lead_actions:
             beside = _beside(np.asarray(belief.pose, float), self.due[0], self.due[-1])
             shift = _clipped(shift - config.moving_share * beside, config.shift_limit)
-        reference_m = _planned(self.controller, belief, belief.pose, goal + shift)
+        reference_m = _planned(belief, belief.pose, goal + shift)
         due = (*self.due, goal)[-config.lead_actions :]
         return Choice(self._replace(shift=shift, n_actions=self.n_actions + 1, due=due), reference_m)
 
@@ -164,18 +161,18 @@ class Chasing(NamedTuple):
 Strategy = AtRest | Timed | Predicting | Chasing
 
 
-def strategy_of(controller: Controller, shift: np.ndarray, moves: bool) -> Strategy:
+def strategy_of(policy: Policy, shift: np.ndarray, moves: bool) -> Strategy:
     """Return the strategy for a new goal, fixed or moving, that begins with a shift (6,) [mm, deg]."""
-    if controller.policy.action_s:
-        return (Chasing if moves else Timed)(controller, shift)
-    return (Predicting if moves else AtRest)(controller, shift)
+    if policy.action_s:
+        return (Chasing if moves else Timed)(shift)
+    return (Predicting if moves else AtRest)(shift)
 
 
-def _waits(strategy: AtRest | Timed, belief: Belief, patience_s: float) -> bool:
+def _waits(belief: Belief, patience_s: float) -> bool:
     """Return whether neither rest nor a patience [s] since the last action allow the next one."""
     if belief.settled:
         return bool(belief.suspect.any())  # whether a chamber is lost comes first
-    return belief.command.n_ticks * strategy.controller.dt_s < patience_s
+    return belief.command.n_ticks * belief.controller.dt_s < patience_s
 
 
 def _acted(
@@ -190,14 +187,15 @@ def _acted(
     return Choice(after, reference_m, events)
 
 
-def _arrive(strategy: AtRest | Timed, shift: np.ndarray, events: tuple[Event, ...]) -> Choice:
+def _arrive(strategy: AtRest | Timed, belief: Belief, shift: np.ndarray, events: tuple[Event, ...]) -> Choice:
     """Return the arrival, with the part of a shift (6,) [mm, deg] that the next goal keeps."""
-    kept = _clipped(shift, strategy.controller.config.kept_limit)
+    kept = _clipped(shift, belief.controller.config.kept_limit)
     return Choice(strategy._replace(shift=kept), events=events, arrived=True)
 
 
-def _planned(controller: Controller, belief: Belief, pose: np.ndarray, target: np.ndarray) -> np.ndarray:
+def _planned(belief: Belief, pose: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Return the policy's references (n,) [m] from a pose (6,) towards a target (6,) [mm, deg]."""
+    controller = belief.controller
     lengths_m, last_m = belief.window.spring_m, belief.command.reference_m
     before_m = lengths_m[-1 - min(rate_ticks(controller.policy.rate_hz), len(lengths_m) - 1)]
     last_m = np.full_like(before_m, np.nan) if last_m is None else last_m
@@ -212,16 +210,15 @@ def _left(strategy: AtRest | Timed, belief: Belief, goal: np.ndarray) -> tuple[n
     The payload's deflection is compensated once: by the policy's next action if it observes the payload, else
     by the shift. So the error of a policy that observes it is told with the payload of its last action.
     """
-    controller = strategy.controller
     reference_m = belief.command.reference_m
     assert reference_m is not None and strategy.acted_load is not None
-    pose = acted = _made(controller, belief, reference_m, belief.load)
-    if controller.observes_payload:
-        acted = _made(controller, belief, reference_m, strategy.acted_load)
+    pose = acted = _made(belief, reference_m, belief.load)
+    if belief.controller.observes_payload:
+        acted = _made(belief, reference_m, strategy.acted_load)
     return pose, pose_error(acted, goal)
 
 
-def _made(controller: Controller, belief: Belief, reference_m: np.ndarray, load: Load) -> np.ndarray:
+def _made(belief: Belief, reference_m: np.ndarray, load: Load) -> np.ndarray:
     """Return the pose (6,) [mm, deg] that references (n,) [m] make of an arm that rests on the last ones.
 
     The lengths are the references: springs of an arm at rest may creep by some tenths of a millimetre. But
@@ -229,12 +226,12 @@ def _made(controller: Controller, belief: Belief, reference_m: np.ndarray, load:
     """
     asked_m, mean_m = belief.command.reference_m, belief.mean_m
     stays = belief.saturated & ((reference_m - mean_m) * (asked_m - mean_m) > 0.0)
-    return np.asarray(pose_of(controller, np.where(stays, mean_m, reference_m), load)[0], float)
+    return np.asarray(pose_of(belief.controller, np.where(stays, mean_m, reference_m), load)[0], float)
 
 
-def _error(controller: Controller, pose: np.ndarray, goal: np.ndarray) -> float:
+def _error(belief: Belief, pose: np.ndarray, goal: np.ndarray) -> float:
     """Return the weighted error of a pose (6,) at a goal (6,)."""
-    return float(np.linalg.norm(scaled_error(pose, goal, controller.policy.reward)))
+    return float(np.linalg.norm(scaled_error(pose, goal, belief.controller.policy.reward)))
 
 
 def _beside(pose: np.ndarray, was: np.ndarray, is_now: np.ndarray) -> np.ndarray:
@@ -258,14 +255,13 @@ def _extrapolated(belief: Belief) -> tuple[Event, ...]:
     return (Event(Fault.EXTRAPOLATION, text),)
 
 
-def _unsettled(controller: Controller, belief: Belief) -> tuple[Event, ...]:
+def _unsettled(belief: Belief) -> tuple[Event, ...]:
     """Return the faults of the springs as they stand before the next action."""
     off_m, mask, events = belief.mean_m - belief.command.reference_m, belief.saturated, []
     if not belief.settled:
         worst = int(np.argmax(np.where(mask, 0.0, np.abs(off_m))))
-        text = (
-            f"after {controller.config.settle_timeout_s:g} s, spring{worst} is {1e3 * off_m[worst]:+.1f} mm"
-        )
+        waited_s = belief.controller.config.settle_timeout_s
+        text = f"after {waited_s:g} s, spring{worst} is {1e3 * off_m[worst]:+.1f} mm"
         events.append(Event(Fault.NOT_SETTLED, f"{text} off its reference"))
     if mask.any():
         off = ", ".join(f"{1e3 * value:+.1f}" for value in off_m[mask])

@@ -1,5 +1,6 @@
 """Demonstrations that are taken from a steered arm, checked as they are taken."""
 
+import dataclasses
 import re
 
 import numpy as np
@@ -18,7 +19,9 @@ def held(window_m=REST_M, lost=False, goal=None, **command):
     """A state of the loop that holds its springs."""
     state, spring_m = start(CONTROLLER), np.full(N, REST_M)
     window = state.belief.window._replace(spring_m=np.full((CONTROLLER.window, N), window_m))
-    belief = state.belief._replace(spring_m=spring_m, window=window, lost=np.full(N, False) | lost)
+    belief = dataclasses.replace(
+        state.belief, spring_m=spring_m, window=window, lost=np.full(N, False) | lost
+    )
     command = state.command._replace(**({"reference_m": spring_m} | command))
     return state._replace(belief=belief, command=command, goal=goal)
 

@@ -58,8 +58,6 @@ def open_arm(name: str) -> Any:
     except AttributeError as error:
         raise ArmError(f"--arm {name}: got no {item!r} in {module_name}, expected an arm's class") from error
     missing = [method for method in _METHODS if not callable(getattr(kind, method, None))]
-    if missing == ["read_sensors"] and hasattr(kind, "read_frequencies"):
-        raise ArmError(f"--arm {name}: got a method read_frequencies, expected it to be named read_sensors")
     if missing:
         raise ArmError(f"--arm {name}: got no method {' or '.join(missing)}, expected those of deploy.ArmIO")
     try:

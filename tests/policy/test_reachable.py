@@ -1,0 +1,51 @@
+"""Distances of goals to reachable poses, and goals brought back into the workspace."""
+
+import numpy as np
+import pytest
+
+from mjx_softarm.deploy.loop import start, with_goal
+from mjx_softarm.mdp.rewards import RewardConfig
+from mjx_softarm.policy.reachable import Reachable, clamped, nearest
+from tests.linear_arm import CONTROLLER, FAR, GOALS, POLICY
+
+
+def away(goal):
+    return nearest(CONTROLLER.reachable, goal, POLICY.reward)[1]
+
+
+def near(goal):
+    return clamped(CONTROLLER.reachable, goal, POLICY.reward)
+
+
+def test_distance_to_reachable_poses():
+    reward = RewardConfig()
+    pose = np.array([[0, 0, -600, 0, 0, 0], [0, 0, -590, 0, 0, 0], [0, 30, -600, 0, 0, 0]], float)
+    found = Reachable.from_poses(pose, reward)
+    assert found.limit == pytest.approx(30 * reward.weight_per_mm)
+    near, distance = nearest(found, np.array([0, 60, -600, 0, 0, 0]), reward)
+    np.testing.assert_array_equal(near, pose[2])
+    assert distance == pytest.approx(1.0)
+    _, turned = nearest(found, np.array([0, 0, -600, 0, 0, 90]), reward)
+    assert turned == pytest.approx(90 * reward.weight_per_deg / found.limit)
+
+
+def test_goal_within_the_workspace_stays():
+    for goal in GOALS:
+        np.testing.assert_array_equal(near(goal), goal)
+
+
+def test_goal_outside_comes_back_and_is_accepted():
+    rng, state = np.random.default_rng(0), start(CONTROLLER)
+    far = GOALS[0] + rng.uniform(-1, 1, (50, 6)) * [900, 900, 900, 120, 60, 120]
+    for goal in [FAR, *far]:
+        assert with_goal(CONTROLLER, state, goal)[1] or away(goal) <= 1.0
+        accepted, events = with_goal(CONTROLLER, state, near(goal))
+        assert events == () and accepted.goal is not None
+
+
+def test_goal_is_left_on_the_way_from_the_nearest_pose():
+    pose, distance = nearest(CONTROLLER.reachable, FAR, POLICY.reward)
+    assert distance > 1.0
+    way, part = FAR[:3] - pose[:3], near(FAR)[:3] - pose[:3]
+    np.testing.assert_allclose(np.cross(way, part), 0.0, atol=1e-6 * (way @ way))
+    np.testing.assert_allclose(np.linalg.norm(part) / np.linalg.norm(way), 0.99 / distance, rtol=1e-6)
