@@ -147,6 +147,17 @@ def between(pose, goal, spring_m, sensed):
     return SPRINGS_M[0] + share * (SPRINGS_M[1] - SPRINGS_M[0])
 
 
+def asking(plan):
+    """A plan, and what it was asked in each action: pose, goal, springs, `sensed`."""
+    asked = []
+
+    def ask(*at):
+        asked.append(at)
+        return plan(*at)
+
+    return ask, asked
+
+
 CONTROLLER = Controller.of(POLICY, exact_plan)
 
 

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
@@ -172,10 +172,17 @@ def _measure(
     }
     if missing := write_accuracy(out, accuracy, found):
         print(missing)
+    _print_accuracy(found)
+    print(f"figures: {out / 'accuracy.json'}")
+    _summary(run)
+    return run.status
+
+
+def _print_accuracy(found: dict[str, Any]) -> None:
     for name, unit, most in (("translation", "mm", "max_mm"), ("rotation", "deg", "rotation_max_deg")):
         mean, high, most = found[f"{name}_{unit}"], found[f"{name}_95_{unit}"], found[most]
         print(f"{name} [{unit}]: mean {mean:.2f}, 95 % below {high:.2f}, at most {most:.2f}")
-    if run.ways:
+    if "way_s" in found:
         print(
             f"on the way, {found['way_s']:.0f} s [mm]: mean {found['way_mm']:.2f}, 95 % below "
             f"{found['way_95_mm']:.2f}, at most {found['way_max_mm']:.2f}; {found['lag_s']:.2f} s behind, "
@@ -183,9 +190,6 @@ def _measure(
         )
     n_saturated = found["saturated_points"]
     print(f"{found['measured']} of {found['points']} goals measured, {n_saturated} with a saturated chamber")
-    print(f"figures: {out / 'accuracy.json'}")
-    _summary(run)
-    return run.status
 
 
 def _record(
