@@ -18,7 +18,7 @@ from mjx_softarm._support import xla
 from mjx_softarm._support.mjx import mjx
 from mjx_softarm.env.vector import over_arms
 from mjx_softarm.mechanics import settle as solver
-from mjx_softarm.mechanics.kinematics import chain_kinematics, mjx_kinematics
+from mjx_softarm.mechanics.kinematics import MjxKinematics, chain_kinematics
 from mjx_softarm.mechanics.mjcf import build_model
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.spec import ArmSpec
@@ -40,11 +40,14 @@ def settle_function(
 ) -> Callable:
     """Return a jitted function, references (n, n_chambers) -> `Settled`, spread over a mesh of devices."""
     params = jax.tree.map(jnp.asarray, ArmParams.from_spec(spec, dtype))
+    n_at_once = solver.arms_at_once(spec.n_links)
     if engine == "mjx":
-        kinematics = mjx_kinematics(mjx.put_model(build_model(spec)))
+        kinematics = MjxKinematics(mjx.put_model(build_model(spec)))
     else:
         kinematics = chain_kinematics(params)
-    return xla.jit(over_arms(functools.partial(solver.settle, kinematics, params), mesh), engine == "mjx")
+    return xla.jit(
+        over_arms(lambda r: solver.settle(kinematics, params, r, n_at_once), mesh), engine == "mjx"
+    )
 
 
 @functools.lru_cache(maxsize=8)

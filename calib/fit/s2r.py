@@ -26,7 +26,7 @@ from mjx_softarm._support import xla
 from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.params import ArmParams
-from mjx_softarm.mechanics.settle import settle
+from mjx_softarm.mechanics.settle import arms_at_once, settle
 from mjx_softarm.mechanics.workspace import settle_many
 from mjx_softarm.sensing.pose import frame_from_pose, pose_from_frame
 from mjx_softarm.sensing.s2r import S2R, correct, correction_between, extrapolation, inputs
@@ -112,15 +112,16 @@ def simulate_poses(spec: ArmSpec, reference_m: np.ndarray) -> SimulatedPoses:
     limit = np.full(spec.n_chambers, PRESSURE_LIMIT_KPA, np.float32)
     params = params._replace(pressure_min_kpa=-limit, pressure_max_kpa=limit)
     padded = np.resize(reference, (-(-n // BATCH) * BATCH, spec.n_chambers))
-    found = [jax.device_get(_settle()(params, batch)) for batch in np.split(padded, len(padded) // BATCH)]
+    solver = _solver(arms_at_once(spec.n_links))
+    found = [jax.device_get(solver(params, batch)) for batch in np.split(padded, len(padded) // BATCH)]
     return jax.tree.map(lambda *columns: np.concatenate(columns)[:n], *found)
 
 
 @functools.cache
-def _settle():
+def _solver(n_at_once: int | None):
     def one(params: ArmParams, reference: jax.Array) -> SimulatedPoses:
         kinematics = chain_kinematics(params)
-        end: Any = settle(kinematics, params, reference)
+        end: Any = settle(kinematics, params, reference, n_at_once)
         pose = pose_from_frame(end.tip_position_m, end.tip_rotation)
         return SimulatedPoses(
             pose,

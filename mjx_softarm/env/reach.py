@@ -21,10 +21,10 @@ from mjx_softarm.mdp import observation as obs
 from mjx_softarm.mdp import rewards
 from mjx_softarm.mdp.actions import ActionMap
 from mjx_softarm.mechanics.dynamics import Motion, MotionResult, Moved, MovingArm, advance
-from mjx_softarm.mechanics.kinematics import chain_kinematics, mjx_kinematics
+from mjx_softarm.mechanics.kinematics import MjxKinematics, chain_kinematics
 from mjx_softarm.mechanics.mjcf import build_model
 from mjx_softarm.mechanics.params import PAYLOAD, ArmParams
-from mjx_softarm.mechanics.settle import Settled, SettleResult, settle
+from mjx_softarm.mechanics.settle import Settled, SettleResult, arms_at_once, settle
 from mjx_softarm.mechanics.workspace import Pool, sample_evenly, sample_workspace
 from mjx_softarm.sensing.pose import pose_from_frame
 from mjx_softarm.sensing.s2r import S2R, correct
@@ -89,6 +89,7 @@ class ReachEnv(Env):
         self.action_map = ActionMap(sensor, *(jnp.asarray(limit, jnp.float32) for limit in limits))
         self.walls = Walls(self.config.pipe_diameter_mm, self.spec, self.params, s2r)
         self.uses_mjx = self.config.engine == "mjx" or self.config.moves
+        self.n_at_once = arms_at_once(self.spec.n_links)
         self.model = mjx.put_model(build_model(self.spec)) if self.uses_mjx else None
         self._results = MotionResult if self.config.moves else SettleResult
         self._failures = {f"invalid_{r.name.lower()}": r.value for r in self._results if r.value != 0}
@@ -252,13 +253,13 @@ class ReachEnv(Env):
     def _move(self, arm: ArmState, reference_m: Array) -> tuple[Motion, Settled | Moved]:
         """Return the motion after an action that asks for true lengths, and the observables at its end."""
         params, config = self.params_of(arm), self.config
-        kinematics = mjx_kinematics(self.model) if config.engine == "mjx" else chain_kinematics(params)
+        kinematics = MjxKinematics(self.model) if config.engine == "mjx" else chain_kinematics(params)
         if config.moves:
             moving = MovingArm.of(self.model, kinematics, params, arm.moving)
             rate_hz = self.spec.control.rate_hz
             times_s = config.dynamic_step_s, 1.0 / rate_hz, config.simulation_step_s
             return advance(moving, arm.motion, reference_m, self.gains, *times_s)
-        end = settle(kinematics, params, reference_m)
+        end = settle(kinematics, params, reference_m, self.n_at_once)
         return Motion.at_rest(end.q, end.pressure_kpa, end.spring_m), end
 
     def _way(self, arm: ArmState, end: Settled | Moved, valid: Array) -> dict[str, Array]:

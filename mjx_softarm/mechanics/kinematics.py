@@ -3,7 +3,7 @@
 The arm is a chain of links. Each link joins a plate to the next one by a slide along the
 parent plate's -z (positive = extension) and two perpendicular hinges, x then y, half a link below;
 joint coordinates are `q (3 * n_links,)`, ordered (slide [m], hinge x [rad], hinge y [rad]) link by link.
-Both functions of this module return the same `Frames`; everything downstream is shared.
+Both engines return the same `Frames`; everything downstream is shared.
 
 Many arms at once come last in every shape, (..., *arms), where one instruction serves several of them;
 *arms is empty for one arm. A number that all of them share may have a 1 in their place.
@@ -11,8 +11,8 @@ Many arms at once come last in every shape, (..., *arms), where one instruction 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -38,60 +38,100 @@ class Frames(NamedTuple):
     tip_rotation: Array  # (3, 3, *arms)
 
 
-Kinematics = Callable[[Array], Frames]  # joint coordinates (nv, *arms) [m, rad, rad] -> Frames
+class Kinematics(Protocol):
+    """Kinematics of one engine: a pytree of the numbers that the frames depend on."""
+
+    arms_last: ClassVar[bool]  # takes many arms (nv, *arms) at once; else one arm (nv,)
+
+    def __call__(self, q: Array) -> Frames:
+        """Return the frames at joint coordinates (nv, *arms) [m, rad, rad]."""
+        ...
 
 
-def chain_kinematics(params: ArmParams) -> Kinematics:
-    """Return the closed-form kinematics of an arm, a pytree of the numbers that it depends on."""
-    return jax.tree_util.Partial(chain_frames, link_length_m=params.link_length_m, mount=params.mount)
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, eq=False)
+class ChainKinematics:
+    """Closed form: products of the links' rotations, sums of the links' vectors."""
+
+    arms_last: ClassVar[bool] = True
+
+    link_length_m: Array | float  # () or (*arms) distance of two plates at rest
+    mount: Mount = LEVEL
+
+    def __call__(self, q: Array) -> Frames:
+        arms = q.shape[1:]
+
+        def of_arms(x: Array | np.ndarray, *shape: int) -> Array:
+            """Return a number of the mount (*shape, *arms), from one that may be without arms."""
+            x = jnp.asarray(x, q.dtype)
+            if x.ndim == len(shape):
+                x = x.reshape(*shape, *[1] * len(arms))
+            return jnp.broadcast_to(x, (*shape, *arms))
+
+        # Rotations of the plates: each link turns the plate above it
+        slide, bend_x, bend_y = jnp.moveaxis(q.reshape(-1, DOFS_PER_LINK, *arms), 1, 0)  # (L, *arms) each
+        base = of_arms(self.mount.base_rotation, 3, 3)
+        local = _rotation_xy(bend_x, bend_y)  # (L, 3, 3, *arms)
+        chained = jax.lax.associative_scan(products, local)
+        rotation = jax.vmap(product, in_axes=(None, 0))(base, chained)
+        plate_rotation = jnp.concatenate([base[None], rotation])
+
+        # Positions: half a link and the slide to the hinges, half a link on to the next plate
+        parent, child = plate_rotation[:-1], plate_rotation[1:]
+        half = 0.5 * self.link_length_m
+        to_anchor = -(half + slide)[:, None] * parent[:, :, 2]
+        to_plate = to_anchor - half * child[:, :, 2]
+        start = of_arms(self.mount.base_position_m, 3)
+        plate_position = jnp.concatenate([start[None], start + jnp.cumsum(to_plate, axis=0)])
+
+        # Axes of the joints: the second hinge turns with the first
+        cos, sin = jnp.cos(bend_x)[:, None], jnp.sin(bend_x)[:, None]
+        axis_y = cos * parent[:, :, 1] + sin * parent[:, :, 2]
+        axis = jnp.stack([-parent[:, :, 2], parent[:, :, 0], axis_y], axis=1)
+        last = plate_rotation[-1]
+        return Frames(
+            plate_position,
+            plate_rotation,
+            axis,
+            anchor=plate_position[:-1] + to_anchor,
+            tip_position=plate_position[-1] + jnp.sum(last * of_arms(self.mount.tip_offset_m, 3), axis=1),
+            tip_rotation=product(last, of_arms(self.mount.tip_rotation, 3, 3)),
+        )
 
 
-def mjx_kinematics(model: mjx.Model) -> Kinematics:
-    """Return the kinematics of an MJX model, a pytree of the model's numbers."""
-    return jax.tree_util.Partial(mjx_frames, model)
+def chain_kinematics(params: ArmParams) -> ChainKinematics:
+    """Return the closed-form kinematics of an arm."""
+    return ChainKinematics(params.link_length_m, params.mount)
 
 
-def chain_frames(q: Array, link_length_m: Array | float, mount: Mount = LEVEL) -> Frames:
-    """Return the frames in closed form: products of the links' rotations, sums of the links' vectors.
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, eq=False)
+class MjxKinematics:
+    """`mjx.kinematics` of a compiled arm on the device."""
 
-    Args:
-        q (3 * n_links, *arms): joint coordinates [m, rad, rad].
-        link_length_m: distance of two plates at rest.
-        mount: of base and tip.
-    """
-    arms = q.shape[1:]
+    arms_last: ClassVar[bool] = False
 
-    def of_arms(x: Array | np.ndarray, *shape: int) -> Array:
-        """Return a number of the mount (*shape, *arms), from one that may be without arms."""
-        x = jnp.asarray(x, q.dtype)
-        if x.ndim == len(shape):
-            x = x.reshape(*shape, *[1] * len(arms))
-        return jnp.broadcast_to(x, (*shape, *arms))
+    model: mjx.Model  # from `mjx_softarm.mechanics.mjcf`: bodies are world and links, the last site the tip
 
-    slide, bend_x, bend_y = jnp.moveaxis(q.reshape(-1, DOFS_PER_LINK, *arms), 1, 0)  # (L, *arms) each
-    base = of_arms(mount.base_rotation, 3, 3)
-    local = _rotation_xy(bend_x, bend_y)  # (L, 3, 3, *arms)
-    chained = jax.lax.associative_scan(products, local)
-    rotation = jax.vmap(product, in_axes=(None, 0))(base, chained)
-    plate_rotation = jnp.concatenate([base[None], rotation])
-    parent, child = plate_rotation[:-1], plate_rotation[1:]
-    half = 0.5 * link_length_m
-    to_anchor = -(half + slide)[:, None] * parent[:, :, 2]
-    to_plate = to_anchor - half * child[:, :, 2]
-    start = of_arms(mount.base_position_m, 3)
-    plate_position = jnp.concatenate([start[None], start + jnp.cumsum(to_plate, axis=0)])
-    cos, sin = jnp.cos(bend_x)[:, None], jnp.sin(bend_x)[:, None]
-    axis_y = cos * parent[:, :, 1] + sin * parent[:, :, 2]
-    axis = jnp.stack([-parent[:, :, 2], parent[:, :, 0], axis_y], axis=1)
-    last = plate_rotation[-1]
-    return Frames(
-        plate_position,
-        plate_rotation,
-        axis,
-        anchor=plate_position[:-1] + to_anchor,
-        tip_position=plate_position[-1] + jnp.sum(last * of_arms(mount.tip_offset_m, 3), axis=1),
-        tip_rotation=product(last, of_arms(mount.tip_rotation, 3, 3)),
-    )
+    def __call__(self, q: Array) -> Frames:
+        n_links = len(q) // DOFS_PER_LINK
+        data = mjx.kinematics(self.model, mjx.make_data(self.model).replace(qpos=q))
+
+        # A body's origin is its hinges' anchor; its plate hangs half a link below
+        links = slice(1, n_links + 1)  # the world comes first
+        rotation = data.xmat[links].reshape(n_links, 3, 3)
+        anchor = data.xpos[links]
+        half = -self.model.geom_pos[1, 2]  # place of the first link's ring
+        position = anchor - half * rotation[:, :, 2]
+        base = rotation_from_quaternion(self.model.body_quat[1])
+        return Frames(
+            plate_position=jnp.concatenate([self.model.geom_pos[:1], position]),
+            plate_rotation=jnp.concatenate([base[None], rotation]),
+            axis=data.xaxis[: n_links * DOFS_PER_LINK].reshape(n_links, DOFS_PER_LINK, 3),
+            anchor=anchor,
+            tip_position=data.site_xpos[-1],
+            tip_rotation=data.site_xmat[-1].reshape(3, 3),
+        )
 
 
 def _rotation_xy(x: Array, y: Array) -> Array:
@@ -100,29 +140,3 @@ def _rotation_xy(x: Array, y: Array) -> Array:
     zero = jnp.zeros_like(x)
     rows = [[cy, zero, sy], [sx * sy, cx, -sx * cy], [-cx * sy, sx, cx * cy]]
     return jnp.stack([jnp.stack(row, axis=1) for row in rows], axis=1)
-
-
-def mjx_frames(model: mjx.Model, q: Array) -> Frames:
-    """Return the frames of `mjx.kinematics`, for a model that `mjx_softarm.mechanics.mjcf` built.
-
-    Args:
-        model: the compiled arm on the device; its first bodies are the world and the links in order, its
-            first geometries the rings, its last site the tip.
-        q (3 * n_links,): joint coordinates [m, rad, rad].
-    """
-    n_links = len(q) // DOFS_PER_LINK
-    data = mjx.kinematics(model, mjx.make_data(model).replace(qpos=q))
-    links = slice(1, n_links + 1)
-    rotation = data.xmat[links].reshape(n_links, 3, 3)
-    anchor = data.xpos[links]
-    half = -model.geom_pos[1, 2]
-    position = anchor - half * rotation[:, :, 2]
-    base = rotation_from_quaternion(model.body_quat[1])
-    return Frames(
-        plate_position=jnp.concatenate([model.geom_pos[:1], position]),
-        plate_rotation=jnp.concatenate([base[None], rotation]),
-        axis=data.xaxis[: n_links * DOFS_PER_LINK].reshape(n_links, DOFS_PER_LINK, 3),
-        anchor=anchor,
-        tip_position=data.site_xpos[-1],
-        tip_rotation=data.site_xmat[-1].reshape(3, 3),
-    )

@@ -25,7 +25,7 @@ from jax.custom_derivatives import zero_from_primal
 
 from mjx_softarm._support.small_matrices import eliminate, identity, products
 from mjx_softarm.mechanics.implicit import Equilibrium, PressureResponse, equilibrium_tangents
-from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK, Kinematics, chain_frames
+from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK, Kinematics
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.result import Result
 from mjx_softarm.mechanics.statics import statics
@@ -33,10 +33,11 @@ from mjx_softarm.mechanics.statics import statics
 MAX_ITERATIONS = 12
 ACTIVE_SET_GAIN_KPA_PER_M = 1000.0
 MAX_STEP = 0.5  # largest entry of a Newton step [m, rad]
-SMALL_STEP = 3e-4  # [m, rad]; the next error is of its square
+SMALL_STEP = 3e-4  # [m, rad]; Newton's method converges quadratically from here
 RESIDUAL_TOLERANCE = 2e-3  # [N, N m], against stiffnesses of 2 N m/rad and more
 TRACKING_TOLERANCE_M = 1e-4
-MAX_ARMS_ON_CPU = 128  # at once, of 36 joint coordinates; the numbers of more do not stay in its cache
+ARMS_IN_CACHE, CACHED_DOFS = 128, 36  # arms whose numbers a CPU's cache holds, and their joint coordinates
+ARMS_IN_VECTOR = 16  # arms that one CPU instruction serves
 
 
 class SettleResult(Result):
@@ -52,7 +53,7 @@ class SettleResult(Result):
 
 
 class Settled(NamedTuple):
-    """An arm at rest, or the last iterate where `result` says that none was found."""
+    """Equilibrium of an arm, or the last iterate where `result` is not `CONVERGED`."""
 
     q: Array  # (nv,) joint coordinates [m, rad, rad]
     pressure_kpa: Array  # (n_chambers,)
@@ -72,37 +73,57 @@ class Settled(NamedTuple):
 
 
 class _Iterate(NamedTuple):
+    """Iterate of Newton's method, and what the last step said of it."""
+
     q: Array  # (nv, *arms)
     pressure: Array  # (n_chambers, *arms) [kPa]
-    at_limit: Array  # (n_chambers, *arms) bool, the active set of the last step
-    response: PressureResponse  # before the last step
-    n_small: Array  # (*arms,) int, small steps without a change of the active set, since the last other one
-    stiffening: Array  # (*arms,) joint stiffness added, in parts of it, where the energy is not convex
+    at_limit: Array  # (n_chambers, *arms) bool, active set of the last step
+    response: PressureResponse  # at the iterate before the last step
+    n_small: Array  # (*arms,) int, number of small steps in a row with an unchanged active set
+    stiffening: Array  # (*arms,) added joint stiffness as a share of the arm's own, where V is not convex
     iteration: Array  # (*arms,) int
 
     def goes_on(self, n_small: int) -> Array:
-        """Return which arms need another step to have `n_small` small ones: (*arms,) bool."""
+        """Return which arms have made fewer than `n_small` small steps in a row: (*arms,) bool."""
         return (self.n_small < n_small) & (self.iteration < MAX_ITERATIONS + n_small - 1)
 
 
-@jax.custom_jvp
-def settle(kinematics: Kinematics, params: ArmParams, reference_m: Array) -> Settled:
+def arms_at_once(n_links: int) -> int | None:
+    """Return how many arms this machine settles fastest at once; None where more are always faster.
+
+    Ask where a program is built, since traced code should not depend on the machine.
+
+    Args:
+        n_links: links of each arm.
+    """
+    if jax.default_backend() != "cpu":
+        return None
+    in_cache = ARMS_IN_CACHE * min(1.0, (CACHED_DOFS / (DOFS_PER_LINK * n_links)) ** 2)
+    return ARMS_IN_VECTOR * max(1, round(in_cache / ARMS_IN_VECTOR))
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(3,))
+def settle(
+    kinematics: Kinematics, params: ArmParams, reference_m: Array, n_at_once: int | None = None
+) -> Settled:
     """Find the equilibrium under the sensor-space law, starting from the straight arm.
 
     Joint coordinates, pressures, springs and tip are differentiable in all arguments, forward and in reverse,
     by the implicit function theorem at the final active set (see `mjx_softarm.mechanics.implicit`). The other
-    fields have a zero derivative, and all fields have where the arm did not settle.
+    fields have a zero derivative. An arm that did not settle has a zero derivative in every field.
 
     Args:
-        kinematics: of either engine, `chain_kinematics(params)` or `mjx_kinematics(model)`.
+        kinematics: of either engine, `chain_kinematics(params)` or `MjxKinematics(model)`.
         params: numbers of the arm.
         reference_m (n_chambers,): spring lengths that the law tracks.
+        n_at_once: arms of a `jax.vmap` that settle at once, from `arms_at_once`; None is all of them.
     """
-    return _solver(n_small=1)(kinematics, params, reference_m)[0]
+    return _solver(1, n_at_once)(kinematics, params, reference_m)[0]
 
 
-def _settle_jvp(primals: tuple, tangents: tuple) -> tuple[Settled, Settled]:
-    found, end = _solver(n_small=2)(*primals)  # the second small step only brings the response up to date
+def _settle_jvp(n_at_once: int | None, primals: tuple, tangents: tuple) -> tuple[Settled, Settled]:
+    # A second small step brings the response, which is that before the last step, up to date
+    found, end = _solver(2, n_at_once)(*primals)
     with jax.default_matmul_precision("highest"):
         change = equilibrium_tangents(primals, tangents, end, found.settled)
     none = Settled(*(zero_from_primal(field, symbolic_zeros=True) for field in found))
@@ -112,14 +133,28 @@ def _settle_jvp(primals: tuple, tangents: tuple) -> tuple[Settled, Settled]:
 settle.defjvp(_settle_jvp, symbolic_zeros=True)
 
 
+def settle_pressures(
+    kinematics: Kinematics, params: ArmParams, pressure_kpa: Array, n_at_once: int | None = None
+) -> Settled:
+    """Find the equilibrium at given pressures (n_chambers,), clipped to the arm's limits.
+
+    The pressures become limits that leave no room, so this is `settle`, derivatives included.
+    """
+    pressure = jnp.clip(pressure_kpa, params.pressure_min_kpa, params.pressure_max_kpa)
+    pinned = params._replace(pressure_min_kpa=pressure, pressure_max_kpa=pressure)
+    return settle(kinematics, pinned, params.spring_rest_m, n_at_once)
+
+
 @functools.cache
-def _solver(n_small: int) -> Callable[[Kinematics, ArmParams, Array], tuple[Settled, Equilibrium]]:
-    """Return `_solve` for one arm; inside of it, `jax.vmap` puts the arms last, many of them in chunks."""
+def _solver(
+    n_small: int, n_at_once: int | None
+) -> Callable[[Kinematics, ArmParams, Array], tuple[Settled, Equilibrium]]:
+    """Return `_solve` for one arm; `jax.vmap` of it puts the arms last, in chunks of `n_at_once`."""
     solve = jax.custom_batching.custom_vmap(functools.partial(_solve, n_small))
 
     def many(n: int, batched: list[Any], *arguments: Any) -> tuple[Any, Any]:
-        if (at_once := _arms_at_once(n, arguments[1])) < n:
-            found = _solve_in_chunks(solve, n, -(-n // at_once), batched, arguments)
+        if n_at_once is not None and n_at_once < n:
+            found = _solve_in_chunks(solve, n, -(-n // n_at_once), batched, arguments)
         else:
             found = _solve_arms_last(n_small, n, batched, *arguments)
         return found, jax.tree.map(lambda _: True, found)
@@ -128,27 +163,18 @@ def _solver(n_small: int) -> Callable[[Kinematics, ArmParams, Array], tuple[Sett
     return solve
 
 
-def _arms_at_once(n: int, params: ArmParams) -> int:
-    """Return how many of n arms settle at once: on a CPU as many vectors of sixteen as its cache holds."""
-    if jax.default_backend() != "cpu":
-        return n
-    nv = params.link_mass_kg.shape[-1] * DOFS_PER_LINK
-    fit = MAX_ARMS_ON_CPU * min(1.0, (36 / nv) ** 2)
-    return 16 * max(1, round(fit / 16))
-
-
 def _solve_arms_last(
     n_small: int, n: int, batched: list[Any], kinematics: Kinematics, params: ArmParams, reference_m: Array
 ) -> tuple[Settled, Equilibrium]:
-    """Return what `_solve` finds of n arms; `batched` is true of arrays whose first axis is that of arms."""
+    """Return what `_solve` finds for n arms; `batched` is true for arrays whose first axis is the arms."""
 
     def arms_last(x: Any, own: bool) -> Array:
         return jnp.moveaxis(x, 0, -1) if own else jnp.asarray(x)[..., None]
 
     kinematics_own, params_own, reference_own = batched
-    if getattr(kinematics, "func", None) is chain_frames:
+    if kinematics.arms_last:
         kinematics = jax.tree.map(arms_last, kinematics, kinematics_own)
-    else:  # it takes one arm
+    else:
         axes = jax.tree.map(lambda own: 0 if own else None, kinematics_own)
         each = jax.vmap(lambda engine, q: engine(q), in_axes=(axes, -1), out_axes=-1)
         kinematics = functools.partial(each, kinematics)
@@ -161,7 +187,7 @@ def _solve_arms_last(
 def _solve_in_chunks(
     solve: Callable, n: int, n_chunks: int, batched: list[Any], arguments: tuple
 ) -> tuple[Settled, Equilibrium]:
-    """Return what `solve` finds of n arms, chunk after chunk; the last one repeats an arm to be as large."""
+    """Return what `solve` finds for n arms, chunk after chunk; the last chunk repeats its last arm."""
     arm = jnp.minimum(jnp.arange(n_chunks * -(-n // n_chunks)), n - 1).reshape(n_chunks, -1)
     own = tuple(batched)
 
@@ -178,8 +204,9 @@ def _solve(
 ) -> tuple[Settled, Equilibrium]:
     """Return the equilibrium after `n_small` small steps, and all that its derivative needs.
 
-    With references (n_chambers, *arms) all results have the arms last, and so have numbers of the arms.
+    With references (n_chambers, *arms), the kinematics, the parameters and all results have the arms last.
     """
+    # Start: the straight arm, its pressures as close to zero as the limits allow
     dtype, arms = params.link_length_m.dtype, reference_m.shape[1:]
     nv, n_chambers = params.link_mass_kg.shape[0] * DOFS_PER_LINK, params.area.shape[0]
     none = jnp.zeros((n_chambers, *arms), dtype)
@@ -195,6 +222,7 @@ def _solve(
         iteration=jnp.zeros(arms, int),
     )
 
+    # Iterate until no arm goes on; an arm that has ended keeps its numbers
     def go_on(it: _Iterate) -> _Iterate:
         new = _newton_step(it, kinematics, params, reference_m)
         goes_on = it.goes_on(n_small)
@@ -205,24 +233,16 @@ def _solve(
         return _report(end, kinematics, params, reference_m)
 
 
-def settle_pressures(kinematics: Kinematics, params: ArmParams, pressure_kpa: Array) -> Settled:
-    """Find the equilibrium at given pressures (n_chambers,), clipped to the arm's limits.
-
-    The pressures are limits that leave no room, so this is `settle`, derivatives included.
-    """
-    pressure = jnp.clip(pressure_kpa, params.pressure_min_kpa, params.pressure_max_kpa)
-    pinned = params._replace(pressure_min_kpa=pressure, pressure_max_kpa=pressure)
-    return settle(kinematics, pinned, params.spring_rest_m)
-
-
 def _active_set(pressure: Array, error_m: Array, params: ArmParams) -> tuple[Array, Array]:
     """Return the chambers to be held at a limit (n, *arms) bool, and each one's limit (n, *arms) [kPa]."""
     trial = pressure + ACTIVE_SET_GAIN_KPA_PER_M * error_m
     limit = jnp.clip(trial, params.pressure_min_kpa, params.pressure_max_kpa)
-    return (trial != limit) | params.pinned, limit  # pinned ones even where the error happens to be zero
+    # A pinned chamber is at its limit even where its error happens to be zero
+    return (trial != limit) | params.pinned, limit
 
 
 def _newton_step(it: _Iterate, kinematics: Kinematics, params: ArmParams, reference_m: Array) -> _Iterate:
+    """Return the iterate after one Newton step in joint coordinates and pressures together."""
     # Forces, springs and the active set at the iterate
     here = statics(kinematics(it.q), it.q, it.pressure, params)
     error = reference_m - here.springs.length
@@ -243,10 +263,11 @@ def _newton_step(it: _Iterate, kinematics: Kinematics, params: ArmParams, refere
     dp = eliminate(rows, residual[:, None])[:, 0]
     dq = (newton_step + jnp.sum(dq_dp * dp, axis=2)).reshape(it.q.shape)
 
-    # Step length; where the energy is not convex, or springs do not follow chambers: no step, stiffer joints
+    # Step length. Where V is not convex or springs do not follow chambers, elimination gave NaN: then the arm
+    # makes no step, and the next one has stiffer joints.
     largest = jnp.max(jnp.abs(dq), axis=0)
     scale = jnp.minimum(1.0, MAX_STEP / largest)
-    convex = jnp.all(jnp.isfinite(dq), axis=0)  # XLA's maximum passes over some NaN, with jax 0.12 on a CPU
+    convex = jnp.all(jnp.isfinite(dq), axis=0)  # `largest` may miss a NaN: XLA's maximum on a CPU, jax 0.12
     small = jnp.all(at_limit == it.at_limit, axis=0) & (largest < SMALL_STEP) & (it.stiffening == 0)
     return _Iterate(
         q=jnp.where(convex, it.q + scale * dq, it.q),
@@ -262,19 +283,21 @@ def _newton_step(it: _Iterate, kinematics: Kinematics, params: ArmParams, refere
 def _report(
     it: _Iterate, kinematics: Kinematics, params: ArmParams, reference_m: Array
 ) -> tuple[Settled, Equilibrium]:
+    """Return the last iterate as an equilibrium, with its errors and its result."""
     # Forces and springs at the end
     pressure = jnp.clip(it.pressure, params.pressure_min_kpa, params.pressure_max_kpa)
     frames = kinematics(it.q)
     here = statics(frames, it.q, pressure, params)
     residual = jnp.max(jnp.abs(here.gradient), axis=0)
 
-    # Errors of the law: of a chamber at a limit only those that would take it away from the limit
+    # Errors of the law: at a limit, only an error counts that would take the chamber away from it
     error = reference_m - here.springs.length
     at_limit = (pressure <= params.pressure_min_kpa) | (pressure >= params.pressure_max_kpa)
     outward = jnp.where(pressure >= params.pressure_max_kpa, error, -error)
     off = jnp.where(at_limit, jnp.maximum(-outward, 0.0), jnp.abs(error))
     tracking = jnp.max(jnp.where(params.pinned, 0.0, off), axis=0)
 
+    # Result, and all fields of the equilibrium
     good = (residual < RESIDUAL_TOLERANCE) & (tracking < TRACKING_TOLERANCE_M)
     finite = jnp.all(jnp.isfinite(here.gradient), axis=0) & jnp.all(jnp.isfinite(error), axis=0)
     result = jnp.select(

@@ -16,7 +16,7 @@ from mjx_softarm._support import xla
 from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.params import PAYLOAD, ArmParams
-from mjx_softarm.mechanics.settle import Settled, settle_pressures
+from mjx_softarm.mechanics.settle import Settled, arms_at_once, settle_pressures
 from mjx_softarm.sensing.pose import pose_from_frame
 from mjx_softarm.spec import ArmSpec, SpecError
 
@@ -46,16 +46,19 @@ class LoadedPool(NamedTuple):
 
 
 @functools.cache
-def _solver():
+def _solver(n_at_once: int | None):
+    """Return the compiled equilibria of arms with the same parameters, pressures (n, n_chambers)."""
+
     def solve(params: ArmParams, pressure_kpa: Array) -> Settled:
-        kinematics = chain_kinematics(params)
-        return settle_pressures(kinematics, params, pressure_kpa)
+        return settle_pressures(chain_kinematics(params), params, pressure_kpa, n_at_once)
 
     return xla.jit(jax.vmap(solve, in_axes=(None, 0)), uses_mjx=False)
 
 
 @functools.cache
-def _loaded_solver():
+def _loaded_solver(n_at_once: int | None):
+    """Return the compiled equilibria of arms that differ in payload, stiffness and area of each chamber."""
+
     def solve(
         params: ArmParams, pressure_kpa: Array, load_kg: Array, stiffness: Array, area: Array
     ) -> Settled:
@@ -64,18 +67,19 @@ def _loaded_solver():
             chamber_stiffness=params.chamber_stiffness * stiffness,
             area=params.area * area,
         )
-        return settle_pressures(chain_kinematics(params), params, pressure_kpa)
+        return settle_pressures(chain_kinematics(params), params, pressure_kpa, n_at_once)
 
     return xla.jit(jax.vmap(solve, in_axes=(None, 0, 0, 0, 0)), uses_mjx=False)
 
 
 def settle_many(spec: ArmSpec, pressure_kpa: np.ndarray) -> Settled:
     """Return equilibria at many pressures (n, n_chambers) [kPa], as NumPy arrays with a leading axis n."""
-    return _in_batches(_solver(), spec, pressure_kpa)
+    return _in_batches(_solver, spec, pressure_kpa)
 
 
-def _in_batches(solver: Callable[..., Settled], spec: ArmSpec, *columns: np.ndarray) -> Settled:
+def _in_batches(make_solver: Callable, spec: ArmSpec, *columns: np.ndarray) -> Settled:
     """Return equilibria of rows of columns (n, ...), as NumPy arrays with a leading axis n."""
+    solver = make_solver(arms_at_once(spec.n_links))
     params, n = ArmParams.from_spec(spec), len(columns[0])
     n_batches = -(-n // BATCH)
     padded = [np.resize(np.asarray(x, np.float32), (n_batches * BATCH, *x.shape[1:])) for x in columns]
@@ -120,7 +124,7 @@ def sample_loaded(spec: ArmSpec, load_kg: np.ndarray, spread: float, seed: int) 
     shape = len(load_kg), spec.n_chambers
     pressure_kpa = random_pressures(spec, shape[0], rng)
     factors = (rng.uniform(1.0 - spread, 1.0 + spread, shape) for _ in range(2))
-    found = _in_batches(_loaded_solver(), spec, pressure_kpa, load_kg, *factors)
+    found = _in_batches(_loaded_solver, spec, pressure_kpa, load_kg, *factors)
     rows = _chosen(spec, found, found.settled, shape[0] // CANDIDATES_PER_POSE, rng, replace=False)
     pool = _pool(found, rows)
     return LoadedPool(jnp.asarray(load_kg[rows], jnp.float32), pool.pressure_kpa, pool.spring_m, pool.pose)

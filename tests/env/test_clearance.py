@@ -8,7 +8,7 @@ import numpy as np
 from mjx_softarm import ArmSpec
 from mjx_softarm._support import xla
 from mjx_softarm.env import EnvConfig, ReachEnv
-from mjx_softarm.mechanics.kinematics import chain_frames
+from mjx_softarm.mechanics.kinematics import ChainKinematics
 from mjx_softarm.mechanics.pipe import CrossPipe, body_clearance
 
 MM = 1e-3
@@ -37,6 +37,6 @@ def test_in_motion_the_clearance_is_the_least_of_the_way():
 
 def plain_clearance_m(q):
     """The distance of the bodies of arms (n, nv) to the wall, from kinematics in closed form."""
-    frames = jax.vmap(lambda q: chain_frames(q, SHORT_ARM.link_length_m))(q)
+    frames = jax.vmap(ChainKinematics(SHORT_ARM.link_length_m))(q)
     plates = frames.plate_position, frames.plate_rotation
     return body_clearance(CrossPipe.of_mm(300.0), *plates, SHORT_ARM)

@@ -7,7 +7,7 @@ import numpy as np
 from mjx_softarm import ArmSpec
 from mjx_softarm._support import xla
 from mjx_softarm.env import EnvConfig, Randomisation, ReachEnv
-from mjx_softarm.mechanics.kinematics import chain_frames
+from mjx_softarm.mechanics.kinematics import ChainKinematics
 from mjx_softarm.mechanics.pipe import CrossPipe, body_clearance
 from mjx_softarm.sensing.pose import frame_from_pose
 from mjx_softarm.sensing.s2r import S2R
@@ -48,7 +48,7 @@ def test_with_a_network_every_pose_is_the_real_one_and_the_arm_underneath_the_sa
         np.testing.assert_allclose(seen.pose[:, 1] - arm.pose[:, 1], -4.0, atol=0.01)
         assert np.abs(seen.pose[:, 3:] - arm.pose[:, 3:]).max() > 1.0
         np.testing.assert_allclose(other.obs, real.observe(seen.pose, seen.goal), atol=1e-5)
-        frames = jax.vmap(lambda q: chain_frames(q, SHORT_ARM.link_length_m))(arm.motion.q)
+        frames = jax.vmap(ChainKinematics(SHORT_ARM.link_length_m))(arm.motion.q)
         share = jnp.array([0.0, 0.5, 1.0])[:, None]  # base, between the two links, tip
         plates_m = frames.plate_position + share * MM * (seen.pose - arm.pose)[:, None, :3]
         rotation = frames.plate_rotation.at[:, -1].set(frame_from_pose(seen.pose)[1])

@@ -17,7 +17,7 @@ import pytest
 from mjx_softarm import ArmSpec, control
 from mjx_softarm._support import xla
 from mjx_softarm._support.mjx import mjx
-from mjx_softarm.mechanics.kinematics import chain_kinematics, mjx_kinematics
+from mjx_softarm.mechanics.kinematics import MjxKinematics, chain_kinematics
 from mjx_softarm.mechanics.mjcf import build_model, spring_lengths
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.settle import settle
@@ -105,7 +105,7 @@ def first_rests(spec):
 def settled(engine, reference_m):
     """`settle` of many references with either engine."""
     if engine == "mjx":
-        params, kinematics = ArmParams.from_spec(COARSE), mjx_kinematics(mjx.put_model(build_model(COARSE)))
+        params, kinematics = ArmParams.from_spec(COARSE), MjxKinematics(mjx.put_model(build_model(COARSE)))
     else:
         kinematics = chain_kinematics(params := ArmParams.from_spec(SPEC))
     many = xla.jit(jax.vmap(lambda x: settle(kinematics, params, x)), uses_mjx=engine == "mjx")

@@ -10,7 +10,7 @@ import pytest
 from mjx_softarm import ArmSpec
 from mjx_softarm._support import xla
 from mjx_softarm._support.mjx import mjx
-from mjx_softarm.mechanics.kinematics import chain_kinematics, mjx_kinematics
+from mjx_softarm.mechanics.kinematics import MjxKinematics, chain_kinematics
 from mjx_softarm.mechanics.mjcf import build_model
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.settle import settle, settle_pressures
@@ -147,7 +147,7 @@ def test_both_engines_have_the_same_derivative():
         return xla.jit(jax.vmap(one), uses_mjx)(reference, turn)
 
     chain = slopes(chain_kinematics(params))
-    mjx_slope = slopes(mjx_kinematics(mjx.put_model(build_model(spec))), uses_mjx=True)
+    mjx_slope = slopes(MjxKinematics(mjx.put_model(build_model(spec))), uses_mjx=True)
     for name in SEEN:
         assert np.abs(chain[name]).max() > 1e-2
         assert np.quantile(relative_error(mjx_slope[name], chain[name]), 0.99) < 1e-2, name

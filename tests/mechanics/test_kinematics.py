@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from mjx_softarm import ArmSpec
 from mjx_softarm._support import xla
 from mjx_softarm._support.mjx import mjx
-from mjx_softarm.mechanics.kinematics import Frames, chain_frames, chain_kinematics, mjx_frames
+from mjx_softarm.mechanics.kinematics import ChainKinematics, Frames, MjxKinematics, chain_kinematics
 from mjx_softarm.mechanics.mjcf import build_model
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.workspace import settle_many
@@ -66,7 +66,7 @@ def assert_same_frames(got, expected, case):
 @functools.cache
 def chain(sections=3, links=4):
     length = arm(sections, links).link_length_m
-    return jax.jit(jax.vmap(functools.partial(chain_frames, link_length_m=length)))
+    return jax.jit(jax.vmap(ChainKinematics(length)))
 
 
 @pytest.mark.parametrize("structure", STRUCTURES, ids=str)
@@ -82,15 +82,17 @@ def test_the_chain_is_where_c_mujoco_puts_it(structure):
 
 def test_arms_that_come_last_are_those_that_come_first():
     length, q = arm(1, 2).link_length_m, random_q(arm(1, 2), 3)  # as many arms as a vector has components
-    last = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), jax.jit(chain_frames)(q.T, length))
-    assert_same_frames(last, jax.vmap(lambda q: chain_frames(q, length))(q), "3 arms")
+    last = jax.tree.map(
+        lambda x: jnp.moveaxis(x, -1, 0), jax.jit(lambda q, length: ChainKinematics(length)(q))(q.T, length)
+    )
+    assert_same_frames(last, jax.vmap(ChainKinematics(length))(q), "3 arms")
 
 
 @pytest.mark.parametrize("structure", [(3, 4), (1, 1)], ids=str)  # the compiler takes long over more
 def test_mjx_and_the_chain_agree(structure):
     model = mjx.put_model(compiled(*structure))
     q = random_q(arm(*structure), 64, seed=1)
-    frames = xla.jit(jax.vmap(lambda q: mjx_frames(model, q)))(q)
+    frames = xla.jit(jax.vmap(MjxKinematics(model)))(q)
     assert_same_frames(jax.device_get(frames), jax.device_get(chain(*structure)(q)), "64 arms")
 
 
@@ -104,7 +106,7 @@ def test_mjx_and_the_chain_agree(structure):
     ],
 )
 def test_one_link_by_hand(q, tip):
-    frames = chain_frames(jnp.array(q), 0.05)
+    frames = ChainKinematics(0.05)(jnp.array(q))
     np.testing.assert_allclose(frames.plate_position[1], tip, atol=1e-7)
 
 
@@ -140,7 +142,7 @@ def test_both_engines_mount_base_and_tip_alike():
     params = ArmParams.from_spec(mounted)
     q = np.float32(random_q(mounted, 1)[0])
     chain = jax.jit(chain_kinematics(params))(q)
-    other = xla.jit(lambda q: mjx_frames(mjx.put_model(build_model(mounted)), q), True)(q)
+    other = xla.jit(MjxKinematics(mjx.put_model(build_model(mounted))), True)(q)
     for name, a, b in zip(Frames._fields, chain, other, strict=True):
         np.testing.assert_allclose(a, b, atol=2e-6, err_msg=name)
     turned = Rotation.from_rotvec([20.0, -10.0, 5.0], degrees=True).as_matrix()

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mjx_softarm.mechanics.body import ring_radius_m
-from mjx_softarm.mechanics.kinematics import chain_frames
+from mjx_softarm.mechanics.kinematics import ChainKinematics
 from mjx_softarm.mechanics.pipe import RIM_POINTS, CrossPipe, body_clearance, body_points, clearance
 
 PIPE = CrossPipe.of_mm(300.0)
@@ -87,7 +87,7 @@ def test_body_turns_with_the_arm(spec):
 def frames(spec):
     """Bent arms (50,), in JAX."""
     q = jnp.array(np.random.default_rng(1).normal(0.0, 0.03, (50, 3 * spec.n_links)), jnp.float32)
-    return jax.vmap(lambda q: chain_frames(q, spec.link_length_m))(q)
+    return jax.vmap(ChainKinematics(spec.link_length_m))(q)
 
 
 def test_numpy_and_jax_agree(spec, frames):

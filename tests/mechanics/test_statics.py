@@ -11,7 +11,7 @@ from scipy import linalg, sparse
 
 from mjx_softarm import ArmSpec
 from mjx_softarm._support import xla
-from mjx_softarm.mechanics.kinematics import chain_frames
+from mjx_softarm.mechanics.kinematics import ChainKinematics
 from mjx_softarm.mechanics.mjcf import build_model
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.settle import RESIDUAL_TOLERANCE
@@ -58,7 +58,7 @@ def random_state(spec, seed, bend_rad=0.5):
 
 @jax.jit
 def _statics(q, pressure_kpa, params):
-    found = statics(chain_frames(q, params.link_length_m), q, pressure_kpa, params)
+    found = statics(ChainKinematics(params.link_length_m)(q), q, pressure_kpa, params)
     return found, found.hessian.dense()
 
 

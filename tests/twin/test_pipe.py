@@ -8,7 +8,7 @@ from scipy.spatial import ConvexHull
 
 from mjx_softarm import ArmSpec
 from mjx_softarm.deploy.drivers.names import open_arm
-from mjx_softarm.mechanics.kinematics import chain_frames
+from mjx_softarm.mechanics.kinematics import ChainKinematics
 from mjx_softarm.mechanics.mjcf import build_spec
 from mjx_softarm.mechanics.pipe import CrossPipe, body_clearance, clearance
 from mjx_softarm.mechanics.render import RenderError
@@ -68,7 +68,7 @@ def test_arm_touches_where_its_body_has_no_clearance(diameter_mm):
         [rng.uniform(-0.006, 0.002, (200, 3, 1)), rng.normal(0.0, 0.018, (200, 3, 2))], -1
     )
     q = np.repeat(section, spec.structure.links_per_section, axis=1).reshape(200, -1)
-    frames = jax.jit(jax.vmap(lambda q: chain_frames(q, spec.link_length_m)))(np.float32(q))
+    frames = jax.jit(jax.vmap(ChainKinematics(spec.link_length_m)))(np.float32(q))
     free_m = np.asarray(body_clearance(pipe, frames.plate_position, frames.plate_rotation, spec))
     model = build_twin(parts, pipe)
     data, wall = mujoco.MjData(model), (model.geom_bodyid == 0) & ~is_container(model)

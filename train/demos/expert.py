@@ -39,7 +39,7 @@ from train.demos.waypoints import Waypoint
 
 N_POOL = 4096  # random pressures, of which those clear of the wall are kept
 N_STARTS = 32  # starts of the solver
-_BATCH = 256  # postures computed in one call
+_BATCH = 128  # postures computed in one call
 N_JITTERED, JITTER_KPA = 8, 3.0  # starts around the previous posture, and their spread
 WAY = (0.25, 0.5, 0.75)  # shares of the path from the previous posture at which clearance is checked
 WAY_CLEAR_M = 0.01  # more clearance than this on the path counts the same
