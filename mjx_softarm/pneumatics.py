@@ -1,14 +1,12 @@
-"""Air in the chambers: a pump for each of them, and valves that answer late. NumPy and JAX.
+"""Air in the chambers: one pump per chamber, and valves with a delay. NumPy and JAX.
 
-A chamber holds ideal gas at constant temperature, p V = n R T. The amount n is counted as the volume it has
-at atmospheric pressure, so that a pump of so many litres per minute delivers just that. With the bellows'
-effective area A = area + slope (l - rest), its volume is V = area l + slope (l - rest)^2 / 2: V' = A, so
-that a closed chamber gives back as mechanical work exactly what was put into it.
+A chamber holds ideal gas at constant temperature, p V = n R T. The amount n is counted as its volume at
+atmospheric pressure, the unit of a pump's flow. With the bellows' effective area A = area + slope (l - rest),
+the volume is V = area l + slope (l - rest)^2 / 2. So V' = A, and a closed chamber conserves mechanical work.
 
-Each chamber's regulator asks for the flow that brings its pressure to the commanded one with the valve's
-switching time as time constant, and gets at most what its pump gives. Air that leaves a chamber is counted
-like air that enters: the pump makes both pressure and vacuum, and nothing vents past it. A command takes
-effect after the valve's switching time.
+Each chamber's regulator asks for the flow that brings the pressure to the command with the valve's switching
+time as time constant. The pump limits this flow in both directions: it makes both pressure and vacuum. A
+command takes effect after the valve's switching time.
 
 Source: the paper's section on the hardware: each chamber is controlled by a pump unit of 12 L/min, whose
 valves switch within 10 ms.
@@ -21,7 +19,7 @@ import math
 from mjx_softarm._support.xp import Array, array_namespace
 
 ATMOSPHERE_KPA = 101.325
-PUMP_M3_PER_S = 12e-3 / 60.0  # paper: 12 L/min, each chamber's own
+PUMP_M3_PER_S = 12e-3 / 60.0  # paper: 12 L/min for each chamber
 VALVE_S = 0.010  # paper: valves switch within 10 ms; dead time, and time constant of the regulator
 
 
@@ -38,18 +36,18 @@ def volume_m3(length_m: Array, area_m2: Array, slope_m: Array, rest_m: Array | f
 
 
 def gas_at(pressure_kpa: Array, volume_m3: Array) -> Array:
-    """Return the gas (...) [m^3 at atmospheric pressure] of volumes (...) at pressures (...) above it."""
+    """Return the gas (...) [m^3 at atmospheric pressure] in volumes (...) at gauge pressures (...) [kPa]."""
     return volume_m3 * (1.0 + pressure_kpa / ATMOSPHERE_KPA)
 
 
 def pressure_of(gas_m3: Array, volume_m3: Array) -> Array:
-    """Return the pressures (...) [kPa above the atmosphere's] of gas (...) in volumes (...)."""
+    """Return the gauge pressures (...) [kPa] of gas (...) in volumes (...)."""
     return ATMOSPHERE_KPA * (gas_m3 / volume_m3 - 1.0)
 
 
 def regulated(gas_m3: Array, volume_m3: Array, command_kpa: Array, dt_s: float) -> Array:
-    """Return the gas (...) after a time in which the regulators had commands (...) [kPa]."""
-    most_m3 = PUMP_M3_PER_S * dt_s
-    wanted_m3 = gas_at(command_kpa, volume_m3) - gas_m3
-    xp = array_namespace(wanted_m3)
-    return gas_m3 + xp.clip(-math.expm1(-dt_s / VALVE_S) * wanted_m3, -most_m3, most_m3)
+    """Return the gas (...) after a time dt_s in which the regulators had commands (...) [kPa]."""
+    limit_m3 = PUMP_M3_PER_S * dt_s
+    missing_m3 = gas_at(command_kpa, volume_m3) - gas_m3
+    xp = array_namespace(missing_m3)
+    return gas_m3 + xp.clip(-math.expm1(-dt_s / VALVE_S) * missing_m3, -limit_m3, limit_m3)

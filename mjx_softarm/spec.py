@@ -1,8 +1,7 @@
-"""The arm's specification: every physical number once, with its unit, read from TOML.
+"""Specification of an arm: every physical number once, with its unit, read from TOML.
 
-An `ArmSpec` is a tree of frozen dataclasses. The numbers live in a TOML file (the packaged
-`arms/paper.toml` is the arm of the paper and says where each number comes from); this module
-says which fields exist, what they mean and which values are allowed.
+An `ArmSpec` is a tree of frozen dataclasses: fields, their meaning, allowed values. A TOML file has the
+numbers; `arms/paper.toml` is the arm of the paper, with the source of each number.
 """
 
 from __future__ import annotations
@@ -33,12 +32,12 @@ from mjx_softarm.sensing.sensors import N_CHAMBERS_PER_SECTION, SENSORS, Sensor
 
 ARM_FILE = "arm.toml"  # in the folder of a calibration
 PAIRS = "pairs of chamber and spring"
-PAPER_S_ARM_KG = 4.7  # which carries up to 1 kg
+PAPER_S_ARM_KG = 4.7  # mass of the paper's arm, which carries up to 1 kg
 
 
 @dataclass(frozen=True)
 class Structure:
-    """Counts of sections and links. They fix array shapes, so a new value compiles anew."""
+    """Counts of sections and links. They fix array shapes, so a new value needs a new compilation."""
 
     n_sections: int = count()
     links_per_section: int = count()
@@ -66,7 +65,7 @@ class Mass:
 
     @property
     def largest_payload_kg(self) -> float:
-        """Payload on top of `payload_kg` to reckon with: 1 kg of the paper's arm, others in proportion."""
+        """Largest payload on top of `payload_kg`: 1 kg for the paper's arm, others by their mass."""
         return (self.arm_kg + self.gripper_kg) / PAPER_S_ARM_KG
 
 
@@ -95,7 +94,7 @@ class Backbone:
 
 @dataclass(frozen=True)
 class Springs:
-    """Springs whose lengths are sensed, and the range of lengths that may be commanded."""
+    """Springs with their sensed lengths, and the range of lengths that may be commanded."""
 
     stiffness_n_per_m: float = not_negative()
     damping_ns_per_m: float = not_negative()
@@ -117,25 +116,23 @@ class Control:
 
 @dataclass(frozen=True)
 class Mounting:
-    """How the arm hangs in the frame of motion capture, and how that frame's tip sits on the arm.
+    """Mount of the base in the frame of motion capture, and of the measured tip on the last plate.
 
-    Turns are rotation vectors. All are zero in an arm that is built and measured perfectly, and where a file
-    has no such table.
+    Turns are rotation vectors. All are zero in a perfect arm, and where a file has no such table.
     """
 
-    base_turn_deg: tuple[float, ...] = vector()  # of the base, in the base frame
-    base_offset_m: tuple[float, ...] = vector()  # of the base, in the base frame
-    section_roll_deg: tuple[float, ...] = numbers("sections")  # of its holes about its axis
-    tip_turn_deg: tuple[float, ...] = vector()  # of the measured tip's axes, in those of the last plate
-    tip_offset_m: tuple[float, ...] = vector()  # of the measured tip, in the axes of the last plate
+    base_turn_deg: tuple[float, ...] = vector()  # turn of the base, in the base frame
+    base_offset_m: tuple[float, ...] = vector()  # offset of the base, in the base frame
+    section_roll_deg: tuple[float, ...] = numbers("sections")  # roll of each section's holes about its axis
+    tip_turn_deg: tuple[float, ...] = vector()  # turn of the measured tip, in the axes of the last plate
+    tip_offset_m: tuple[float, ...] = vector()  # offset of the measured tip, in the axes of the last plate
 
 
 @dataclass(frozen=True)
 class Unmodelled:
-    """Pressures that hold the unloaded arm, measured less simulated: what the model of the chambers leaves.
+    """Residual pressures that hold the unloaded arm: measured minus simulated, linear in spring lengths.
 
-    Linear in the springs' lengths; nothing where a file has no such table. The simulation goes without, but a
-    payload is estimated from pressures, with this taken into account.
+    The simulation ignores them; the estimate of a payload from pressures subtracts them.
     """
 
     pressure_kpa: tuple[float, ...] = numbers("chambers")  # where springs have their sections' length
@@ -157,7 +154,7 @@ class ArmSpec:
     chambers: Chambers
     backbone: Backbone
     springs: Springs
-    sensor: Sensor = field(metadata={"kinds": SENSORS})  # without `kind` in a file: the first
+    sensor: Sensor = field(metadata={"kinds": SENSORS})  # the first kind where a file has none
     control: Control
     mounting: Mounting = Mounting()
     unmodelled: Unmodelled = Unmodelled()
@@ -185,16 +182,16 @@ class ArmSpec:
         return self.sensor.per_spring(self.n_chambers)
 
     def per_chamber(self, value: PerChamber) -> tuple[float, ...]:
-        """Return one number per chamber, however the field was written."""
+        """Return one number per chamber, from a field with one number or one per chamber."""
         return tuple(value) if isinstance(value, tuple) else (float(value),) * self.n_chambers
 
     @property
     def section_roll_deg(self) -> tuple[float, ...]:
-        """One number per section."""
+        """Roll of each section about its axis."""
         return self.mounting.section_roll_deg or (0.0,) * self.structure.n_sections
 
     def unmodelled_kpa(self, spring_m: np.ndarray) -> np.ndarray:
-        """Return measured less simulated pressures (..., n) [kPa] at springs (..., n) [m], unloaded."""
+        """Return the residual pressures (..., n) [kPa] of the unloaded arm at spring lengths (..., n) [m]."""
         n, table = self.n_chambers, self.unmodelled
         slope = np.reshape(table.slope_kpa_per_m or np.zeros(n * n), (n, n))
         stretched_m = spring_m - self.geometry.section_length_m
@@ -207,10 +204,10 @@ class ArmSpec:
 
     @classmethod
     def of(cls, path: Path | None) -> ArmSpec:
-        """Return the arm of a file or of the package's name for it, or the paper's arm where none is given.
+        """Return the arm of a file, or a shipped arm by its name; None is the paper's arm.
 
         Raises:
-            SpecError: there is no such arm, or as `from_toml` does.
+            SpecError: there is no such arm, or a field is not valid.
         """
         if path is None:
             return cls.default()
@@ -251,7 +248,7 @@ class ArmSpec:
         return data
 
     def to_toml(self, path: str | Path) -> None:
-        """Write the specification; `from_toml` of it gives an equal one."""
+        """Write the specification, so that `from_toml` gives an equal one."""
         Path(path).write_text(tomli_w.dumps(self.to_dict()), "utf-8")
 
     def replace(self, **groups: dict[str, Any] | str) -> ArmSpec:
@@ -272,6 +269,7 @@ class ArmSpec:
 
     def _check_together(self, source: str) -> None:
         """Refuse fields that contradict each other."""
+        # Lists have the right number of entries, lower limits are below upper ones
         counts = {
             "sections": self.structure.n_sections,
             "chambers": self.n_chambers,
@@ -288,7 +286,8 @@ class ArmSpec:
                 raise SpecError(
                     f"{source}: {group}.{low}: got {least!r}, expected less than {high} ({greatest!r})"
                 )
-        # Lengths that may be commanded must be lengths that the sensor can read.
+
+        # The sensor can read every length that may be commanded
         sensor = self.spring_sensor
         (low, high), unit = sensor.range, sensor.unit
         for name in ("length_min_m", "length_max_m"):

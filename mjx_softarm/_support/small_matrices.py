@@ -73,23 +73,18 @@ def _eliminate_many(n: int, batched: list[bool], matrix: Array, columns: Array) 
 
 
 @jax.custom_vjp
-def solve(matrix: Array, columns: Array) -> Array:
+def solve_approximate_gradient(matrix: Array, columns: Array) -> Array:
     """Multiply the inverse of a symmetric matrix (n, n) by columns (n, k), by `eliminate`.
 
-    Its gradient is by the columns; the matrix counts as a constant.
+    The gradient is approximate: it is by the columns alone, as if the matrix were a constant.
     """
     return eliminate(matrix, columns)
 
 
-def _solve_forward(matrix: Array, columns: Array) -> tuple[Array, Array]:
-    return eliminate(matrix, columns), matrix
-
-
-def _solve_backward(matrix: Array, d_found: Array) -> tuple[None, Array]:
-    return None, eliminate(matrix, d_found)
-
-
-solve.defvjp(_solve_forward, _solve_backward)
+solve_approximate_gradient.defvjp(
+    lambda matrix, columns: (eliminate(matrix, columns), matrix),
+    lambda matrix, d_found: (None, eliminate(matrix, d_found)),
+)
 
 
 def _eliminate_last(augmented: Array) -> Array:

@@ -11,7 +11,7 @@ def shipped_arm(name: str) -> str:
     """Return the TOML of an arm that the package describes.
 
     Raises:
-        SpecError: there is none of this name; the message says which there are.
+        SpecError: there is no arm of this name; the message lists the arms.
     """
     files = {file.name: file for file in resources.files(__name__).iterdir()}
     arms = {name.removesuffix(".toml"): file for name, file in files.items() if name.endswith(".toml")}

@@ -1,4 +1,4 @@
-"""Clearance of the arm's body to the pipe around it: at an instant, and on the way of an action."""
+"""Clearance of the arm's body to the pipe around it: at an instant, and along the path of an action."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from mjx_softarm.spec import ArmSpec
 
 
 class Walls:
-    """The pipe around an arm. Without one, distances to its wall are infinite."""
+    """Pipe around an arm. Without a pipe, distances are infinite."""
 
     def __init__(self, diameter_mm: float | None, spec: ArmSpec, params: ArmParams, s2r: S2R | None):
         self.pipe = None if diameter_mm is None else CrossPipe.of_mm(diameter_mm)
         self.spec, self.params, self.s2r = spec, params, s2r
 
     def clearance_mm(self, q: Array, pose: Array) -> Array:
-        """Return the distance () of the body at joint coordinates (nv,), whose tip has a pose (6,)."""
+        """Return the distance () of the body at joint coordinates (nv,), with its tip at a pose (6,)."""
         if self.pipe is None:
             return jnp.asarray(jnp.inf, q.dtype)
         frames = chain_kinematics(self.params)(q)
         return self._of_plates(self.pipe, frames.plate_position, frames.plate_rotation, pose)
 
     def least_mm(self, path: Path, pose: Array) -> Array:
-        """Return the least distance () on a path, its start left out, whose tips have poses (t, 6)."""
+        """Return the least distance () along a path whose tips have poses (t, 6), without its start."""
         if self.pipe is None or len(pose) == 1:  # nothing between start and end
             return jnp.asarray(jnp.inf, pose.dtype)
         plates = path.plate_position_m[1:], path.plate_rotation[1:]

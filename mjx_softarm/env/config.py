@@ -1,4 +1,4 @@
-"""Settings of the environment: how the arm is simulated, what differs from episode to episode, what pays."""
+"""Settings of the environment: simulation, observation, reward and randomisation."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from mjx_softarm.mechanics.workspace import HELD_OUT_SEED
 
 
 def _expect(config: Any, name: str, holds: bool, expected: str) -> None:
+    """Raise ValueError for the field `name` of a config unless a condition holds."""
     if not holds:
         value = getattr(config, name)
         raise ValueError(f"{type(config).__name__}.{name}: got {value!r}, expected {expected}")
@@ -27,12 +28,12 @@ class Randomisation:
 
     payload_max_kg: float | None = None
     """the payload is uniform from the spec's to this much more; None: the arm's largest for a policy that
-    observes the payload, else none"""
-    stiffness_spread: float = 0.0  # each chamber's stiffness is times 1 + uniform(-spread, spread)
+    observes the payload, else 0"""
+    stiffness_spread: float = 0.0  # each chamber's stiffness is multiplied by 1 + uniform(-spread, spread)
     sensor_noise_mm: float = 0.0  # standard deviation of each spring's reading, fixed within an episode
-    damping_spread: float = 0.0  # in motion, all dampers are times 1 + uniform(-spread, spread)
+    damping_spread: float = 0.0  # in motion, all dampers are multiplied by 1 + uniform(-spread, spread)
     delay_max_s: float = 0.0  # in motion, the valves' dead time is uniform from their own to this much more
-    friction_max_n: float = 0.0  # in motion, each chamber's dry friction is uniform from none to this
+    friction_max_n: float = 0.0  # in motion, each chamber's dry friction is uniform from 0 to this
 
     def __post_init__(self):
         for name in ("payload_max_kg", "sensor_noise_mm", "delay_max_s", "friction_max_n"):
@@ -46,26 +47,26 @@ class EnvConfig:
     """Simulation, reward and randomisation of `ReachEnv`."""
 
     engine: Annotated[Literal["chain", "mjx"], arg(aliases=["--engine"])] = "chain"
-    """kinematics: in closed form, or MJX's; all else is shared, the inertia in motion being MJX's"""
+    """kinematics: in closed form, or MJX's; both engines share all else"""
     mode: Annotated[Literal["quasistatic", "dynamic"], arg(aliases=["--mode"])] = "quasistatic"
-    """equilibrium of each action, or its motion"""
+    """an action leads to its equilibrium, or moves the arm for a while"""
     observation: Observation = "pose"
     """pose and goal; payload: also the payload; motion: also springs, their rates, the tip's velocity and the
     last action, in dynamic mode"""
-    goal_ends: bool = True  # a goal that is reached ends the episode; else it pays in every step
+    goal_ends: bool = True  # a reached goal ends the episode; else it gives its reward in every step
     reward: RewardConfig = field(default_factory=RewardConfig)
     randomisation: Randomisation = field(default_factory=Randomisation)
     saturation_tolerance_mm: float = 1e3 * TOLERANCE_M
     """spring error at which a chamber at its limit counts as saturated"""
     n_poses: int = 8192  # poses of the reachable workspace that starts and goals are drawn from
-    even_share: float = 0.0  # share of these that are uniform in volume, rim included
-    workspace_seed: int = 0  # seed of these poses
+    even_share: float = 0.0  # share of the poses that are uniform in volume, rim included
+    workspace_seed: int = 0  # seed of the poses
     dynamic_step_s: float = 0.5  # duration of one environment step in dynamic mode
     simulation_step_s: float = 0.02  # time step in dynamic mode, at most; no longer than a control period
     pipe_diameter_mm: Annotated[float | None, arg(aliases=["--pipe"])] = None
     """cross-shaped pipe around the arm, without contact"""
-    clearance_cost_per_mm: float = 0.0  # reward lost per mm by which the clearance falls below the margin
-    clearance_margin_mm: float = 10.0  # clearance of the body to the wall that costs nothing
+    clearance_cost_per_mm: float = 0.0  # cost per mm of clearance below the margin
+    clearance_margin_mm: float = 10.0  # clearance of the body to the wall from which there is no cost
 
     @property
     def moves(self) -> bool:
@@ -73,6 +74,7 @@ class EnvConfig:
         return self.mode == "dynamic"
 
     def __post_init__(self):
+        # Names
         for name, allowed in (
             ("engine", ("chain", "mjx")),
             ("mode", ("quasistatic", "dynamic")),
@@ -81,6 +83,8 @@ class EnvConfig:
             _expect(self, name, getattr(self, name) in allowed, f"one of {allowed}")
         known = self.moves or self.observation != "motion"
         _expect(self, "observation", known, "'pose' or 'payload' for arms at rest")
+
+        # Ranges of numbers
         for name in ("dynamic_step_s", "simulation_step_s"):
             _expect(self, name, 0 < getattr(self, name) < math.inf, "a finite number > 0")
         for item in fields(self.reward):
@@ -88,7 +92,7 @@ class EnvConfig:
             _expect(self.reward, item.name, 0 <= value < math.inf, "a finite number >= 0")
         cost, seed = "clearance_cost_per_mm", HELD_OUT_SEED
         if self.pipe_diameter_mm is not None:
-            CrossPipe.of_mm(self.pipe_diameter_mm)  # raises
+            CrossPipe.of_mm(self.pipe_diameter_mm)  # raises ValueError
         else:
             _expect(self, cost, not self.clearance_cost_per_mm, "0 without a pipe_diameter_mm")
         _expect(self, cost, 0 <= self.clearance_cost_per_mm < math.inf, "a finite number >= 0")

@@ -20,7 +20,7 @@ from mjx_softarm.env.state import PAYLOAD_SHARE, ArmState, EpisodeNoise, at_rest
 from mjx_softarm.mdp import observation as obs
 from mjx_softarm.mdp import rewards
 from mjx_softarm.mdp.actions import ActionMap
-from mjx_softarm.mechanics.dynamics import Motion, MotionResult, Moved, MovingArm, advance
+from mjx_softarm.mechanics.dynamics import Motion, MotionEnd, MotionResult, MovingArm, advance
 from mjx_softarm.mechanics.kinematics import MjxKinematics, chain_kinematics
 from mjx_softarm.mechanics.mjcf import build_model
 from mjx_softarm.mechanics.params import PAYLOAD, ArmParams
@@ -250,7 +250,7 @@ class ReachEnv(Env):
             info=state.info | info,
         )
 
-    def _move(self, arm: ArmState, reference_m: Array) -> tuple[Motion, Settled | Moved]:
+    def _move(self, arm: ArmState, reference_m: Array) -> tuple[Motion, Settled | MotionEnd]:
         """Return the motion after an action that asks for true lengths, and the observables at its end."""
         params, config = self.params_of(arm), self.config
         kinematics = MjxKinematics(self.model) if config.engine == "mjx" else chain_kinematics(params)
@@ -262,10 +262,10 @@ class ReachEnv(Env):
         end = settle(kinematics, params, reference_m, self.n_at_once)
         return Motion.at_rest(end.q, end.pressure_kpa, end.spring_m), end
 
-    def _way(self, arm: ArmState, end: Settled | Moved, valid: Array) -> dict[str, Array]:
+    def _way(self, arm: ArmState, end: Settled | MotionEnd, valid: Array) -> dict[str, Array]:
         """Return the clearance of `info` after an action, and the path of an arm that moved."""
         clearance_mm = self.walls.clearance_mm(arm.motion.q, arm.pose)
-        if not isinstance(end, Moved):
+        if not isinstance(end, MotionEnd):
             return {"clearance_mm": clearance_mm}
         tips = pose_from_frame(end.path.tip_position_m, end.path.tip_rotation)
         pose = self._observed_pose(tips, end.path.spring_m)  # (n_ticks, 6)
@@ -282,14 +282,14 @@ class ReachEnv(Env):
         observed = obs.observe(pose, goal, self.scale, self.config.reward)
         return observed if sensed is None else jnp.concatenate([observed, sensed], axis=-1)
 
-    def _sensed(self, arm: ArmState, end: ArmState | Settled | Moved, action: Array) -> Array | None:
+    def _sensed(self, arm: ArmState, end: ArmState | Settled | MotionEnd, action: Array) -> Array | None:
         """Return `ArmState.sensed` of an arm, at rest where `end` is not the end of a motion."""
         if self.config.observation == "pose":
             return None
         if self.config.observation == "payload":
             return obs.observe_payload(arm.payload_kg, self.spec)
         last_m, tip_mm, last_mm = end.spring_m, jnp.zeros(3), jnp.zeros(3)
-        if isinstance(end, Moved):
+        if isinstance(end, MotionEnd):
             before = max(self.n_ticks - obs.rate_ticks(self.spec.control.rate_hz), 0)
             last_m, tip_mm = end.path.spring_m[before], 1e3 * end.tip_position_m
             last_mm = 1e3 * end.path.tip_position_m[before]

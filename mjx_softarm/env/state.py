@@ -15,8 +15,7 @@ from mjx_softarm.pneumatics import VALVE_S
 from mjx_softarm.sensing.sensors import SENSORS
 
 for _sensor in SENSORS.values():
-    jax.tree_util.register_dataclass(_sensor)  # numbers are traced, the kind is static
-
+    jax.tree_util.register_dataclass(_sensor)  # its numbers are traced
 
 PAYLOAD_SHARE = 2  # index in `EpisodeNoise.uniform`
 
@@ -30,33 +29,33 @@ class EpisodeNoise(NamedTuple):
 
 
 class ArmState(NamedTuple):
-    """One arm between two actions."""
+    """State of one arm between two actions."""
 
     payload_kg: Array  # () payload of this episode
     chamber_stiffness: Array  # (n_chambers,) [N/m] stiffnesses of this episode
-    sensor_offset_m: Array  # (n_chambers,) reading less true length, in this episode
-    moving: MotionParams  # of this episode
+    sensor_offset_m: Array  # (n_chambers,) error of each spring's reading in this episode
+    moving: MotionParams  # parameters of motion in this episode
     motion: Motion  # joint coordinates, velocities, pressures
-    pose: Array  # (6,) [mm, deg] as observed: the real arm's where there is a sim-to-real network
+    pose: Array  # (6,) [mm, deg] observed pose: the real arm's if there is a sim-to-real network
     spring_m: Array  # (n_chambers,) true lengths
     pressure_kpa: Array  # (n_chambers,)
-    sensed: Array | None  # (k,) what is observed besides pose and goal; None is nothing
+    sensed: Array | None  # (k,) observations besides pose and goal; None if there are none
     goal: Array  # (6,) [mm, deg]
     n_steps: Array  # () actions taken in this episode
 
 
-def at_rest(rest: Pool) -> dict[str, Any]:
-    """Return the fields of `ArmState` that tell where an arm at rest at a row of a pool is."""
+def at_rest(equilibrium: Pool) -> dict[str, Any]:
+    """Return the fields of `ArmState` that an equilibrium, a row of a pool, fixes."""
     return {
-        "motion": Motion.at_rest(rest.q, rest.pressure_kpa, rest.spring_m),
-        "pose": rest.pose,
-        "spring_m": rest.spring_m,
-        "pressure_kpa": rest.pressure_kpa,
+        "motion": Motion.at_rest(equilibrium.q, equilibrium.pressure_kpa, equilibrium.spring_m),
+        "pose": equilibrium.pose,
+        "spring_m": equilibrium.spring_m,
+        "pressure_kpa": equilibrium.pressure_kpa,
     }
 
 
 def motion_params(spread: Randomisation, share: Array | None) -> MotionParams:
-    """Return the numbers that `EpisodeNoise.moving` fixes; the nominal ones for None."""
+    """Return the parameters that `EpisodeNoise.moving` fixes; None gives the nominal ones."""
     damping, delay, friction = jnp.array([0.5, 0.0, 0.0]) if share is None else share
     return MotionParams(
         damping=1.0 + spread.damping_spread * (2.0 * damping - 1.0),

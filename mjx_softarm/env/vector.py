@@ -16,10 +16,10 @@ from mjx_softarm.env import ReachEnv
 
 
 def over_arms(function: Callable, mesh: Mesh | None = None, n_shared: int = 0) -> Callable:
-    """Return the function of many arms, by their first axis, that a function of one arm makes.
+    """Return a function of one arm as a function of many arms, which have the first axis.
 
-    Its last `n_shared` arguments are the same for all arms. With a mesh of devices, each does its share of
-    the arms, which must be equal ones, and does not wait for the slowest arm of another.
+    All arms share the last `n_shared` arguments. With a mesh, each device takes an equal share of the arms,
+    and does not wait for the slowest arm of another device.
     """
 
     def of_all(*arguments: Any) -> Any:
@@ -40,12 +40,12 @@ class Outcome(NamedTuple):
     final_obs: Array  # (n, obs_size) the successor's observation, also where the episode ended
     reward: Array  # (n,)
     terminated: Array  # (n,) bool: goal reached; the value after it is zero
-    truncated: Array  # (n,) bool: time limit; the value after it is that of `final_obs`
-    valid: Array  # (n,) bool: the arm settled; learn from nothing else
+    truncated: Array  # (n,) bool: time limit reached; the value after it is that of `final_obs`
+    valid: Array  # (n,) bool: the simulation succeeded; else the step must not be learned from
 
 
 class VectorEnv:
-    """`n` independent arms; an arm whose episode ended starts a new one, with a new goal.
+    """Independent arms; an arm whose episode ended starts a new one, with a new goal.
 
     With a mesh of devices, each steps its share of the arms; see `over_arms`.
     """
@@ -71,11 +71,14 @@ class VectorEnv:
             The state to act on next (reset where an episode ended), the state that the action led to,
             and the outcome.
         """
+        # Act, and see whose episode is over
         after = over_arms(self.env.step, self.mesh)(state, action)
         valid = after.info["valid"]
         terminated = (after.done > 0) & valid
         truncated = (after.pipeline_state.n_steps >= self.episode_length) & ~terminated
         over = terminated | truncated | ~valid
+
+        # A new episode for those; metrics are those of the action
         fresh = self.reset(key)
         following = jax.tree.map(
             lambda new, old: jnp.where(over.reshape((-1,) + (1,) * (old.ndim - 1)), new, old), fresh, after

@@ -1,4 +1,4 @@
-"""The one map between actions and spring lengths: an action in [-1, 1] is a sensor reading, scaled linearly.
+"""Map between actions and spring lengths: an action in [-1, 1] is a sensor reading, scaled linearly.
 
     reading = low + (action + 1) / 2 (high - low)
 
@@ -17,15 +17,15 @@ from mjx_softarm._support.xp import Array, array_namespace
 from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.spec import ArmSpec
 
-N_ACTIONS = 4  # towards each goal, in evaluations and on the arm
+N_ACTIONS = 4  # actions towards each goal, in evaluations and on the arm
 
 
 class ActionMap(NamedTuple):
-    """Actions of n springs and what they ask for. NumPy and JAX."""
+    """Map between the actions of n springs, their readings and their lengths. NumPy and JAX."""
 
     sensor: Sensor
-    low: Array  # (n,) readings of the action -1
-    high: Array  # (n,) readings of the action 1
+    low: Array  # (n,) readings that the action -1 asks for
+    high: Array  # (n,) readings that the action 1 asks for
 
     @classmethod
     def from_spec(cls, spec: ArmSpec) -> ActionMap:

@@ -1,10 +1,10 @@
-"""The observation: pose, goal and scaled error, one function for training, twin and deployed arm.
+"""Observation: pose, goal and scaled error, one function for training, twin and deployed arm.
 
-A policy may observe more: the payload; or of an arm in motion the spring lengths and their rates, the tip's
-velocity, the law's integral, the last action.
+A policy may also observe the payload; or, in motion, the spring lengths and their rates, the tip's velocity,
+the law's integral and the last action.
 
-Source: the paper's state s = (P, g, e) in R^18. A fixed affine map brings pose and goal to
-the order of one; it changes only the numbers that a network sees.
+Source: the paper's state s = (P, g, e) in R^18. A fixed affine map brings pose and goal to the order of one,
+the range that networks learn in.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from mjx_softarm.spec import ArmSpec
 
 Observation = Literal["pose", "payload", "motion"]
 
-# Units are those before scaling: of pose and goal by `ObsScale`, of the error by the reward's weights.
+# Units before scaling; `ObsScale` scales pose and goal, the reward's weights scale the error.
 _AXES = ("x_mm", "y_mm", "z_mm", "yaw_deg", "pitch_deg", "roll_deg")
 OBS_LAYOUT = tuple(f"{part}_{axis}" for part in ("pose", "goal", "error") for axis in _AXES)
 OBS_SIZE = len(OBS_LAYOUT)
-GOAL = slice(6, 12)  # of the observation
-RATE_S = 0.1  # time over which lengths and positions give rates
-SPRING_M_PER_S, TIP_MM_PER_S = 0.1, 300.0  # speeds that are scaled to 1
+GOAL = slice(6, 12)  # entries of the goal in the observation
+RATE_S = 0.1  # time between the two lengths or positions of a rate
+SPRING_M_PER_S, TIP_MM_PER_S = 0.1, 300.0  # speeds that are observed as 1
 
 
 class ObsScale(NamedTuple):
@@ -43,7 +43,7 @@ class ObsScale(NamedTuple):
 
 
 def layouts(n_springs: int) -> dict[Observation, tuple[str, ...]]:
-    """Return the names of the entries of each kind of observation: pose, goal and what else is observed."""
+    """Return the names of all entries of each kind of observation."""
     springs, rates, integrals, actions = (
         [f"{name}_{k}" for k in range(n_springs)] for name in ("spring", "spring_rate", "integral", "action")
     )
@@ -61,7 +61,7 @@ def rate_ticks(rate_hz: float) -> int:
 
 
 def observe_payload(payload_kg: Array, spec: ArmSpec) -> Array:
-    """Return what a policy that knows the payload (...) [kg] observes of it: (..., 1), the largest is 1."""
+    """Return the observation (..., 1) of a payload (...) [kg]; the arm's largest payload is 1."""
     xp = array_namespace(payload_kg)
     return xp.asarray(payload_kg / spec.mass.largest_payload_kg, dtype=np.float32)[..., None]
 
@@ -75,25 +75,28 @@ def observe_motion(
     action: Array,
     spec: ArmSpec,
 ) -> Array:
-    """Return what a moving arm has to tell besides pose and goal, scaled to the order of one: (..., 4 n + 3).
+    """Return observations (..., 4 n + 3) that only exist in motion, scaled to the order of one.
 
     Args:
-        spring_m (..., n) [m]: lengths read.
-        last_spring_m (..., n) [m]: lengths read `rate_ticks` before.
+        spring_m (..., n) [m]: lengths that are read.
+        last_spring_m (..., n) [m]: lengths that were read `rate_ticks` before.
         tip_mm (..., 3) [mm]: position of the tip.
         last_tip_mm (..., 3) [mm]: position of the tip `rate_ticks` before.
-        integral_kpa (..., n) [kPa]: of the sensor-space law.
+        integral_kpa (..., n) [kPa]: integral of the sensor-space law.
         action (..., n): the last action, in [-1, 1].
-        spec: the arm, for its ranges of lengths and pressures and its control rate.
+        spec: the arm.
 
     Returns:
         Lengths, from -1 at the shortest to 1 at the longest; their rates; the tip's velocity; the integral,
         from -1 at the least to 1 at the greatest pressure; the action.
     """
+    # Ranges that are scaled to [-1, 1], and the time between the two lengths of a rate
     xp = array_namespace(spring_m, tip_mm, action)
     low, high = spec.springs.length_min_m, spec.springs.length_max_m
     least, greatest = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
     over_s = rate_ticks(spec.control.rate_hz) / spec.control.rate_hz
+
+    # Observations in their order
     lengths = (2.0 * spring_m - low - high) / (high - low)
     rates = (spring_m - last_spring_m) / (over_s * SPRING_M_PER_S)
     velocity = (tip_mm - last_tip_mm) / (over_s * TIP_MM_PER_S)

@@ -1,4 +1,4 @@
-"""The reward of reaching: one function for simulation, relabelling, twin and deployed arm.
+"""Reward of reaching a goal: one function for simulation, relabelling, twin and deployed arm.
 
 Source: the paper's reward equation. Its three cases become terms that add up:
 
@@ -6,9 +6,9 @@ Source: the paper's reward equation. Its three cases become terms that add up:
     reached:     goal_bonus
     otherwise:  -error_cost ||e|| - step_cost N,    e = w (pose - goal).
 
-Two more terms, which the paper does not have, are charged in all three cases: `distance_cost` for the error,
-and an environment's cost of a body close to a wall. The cases hide the error of a saturated arm and of one
-near its goal. With `distance_cost` alone beside `saturation_cost`, the error always counts.
+Two terms are added that the paper does not have: `distance_cost` for the error in all three cases, and an
+environment's cost of a body close to a wall. The three cases hide the error of a saturated arm, and of an arm
+near its goal. With `distance_cost` and `saturation_cost` alone, the error always counts.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from mjx_softarm.sensing.pose import pose_error
 
 @dataclass(frozen=True)
 class RewardConfig:
-    """The paper's weights; `threshold` is theta, about 5.4 mm with no rotation error."""
+    """Weights of the reward; `threshold` is the paper's theta, about 5.4 mm without a rotation error."""
 
     goal_bonus: float = 100.0  # reward of a goal that is reached
     error_cost: float = 10.0  # cost of a weighted error of 1
@@ -37,7 +37,7 @@ def scaled_error(pose: Array, goal: Array, config: RewardConfig) -> Array:
     """Return e = w (pose - goal), (..., 6) without unit, angles wrapped.
 
     Args:
-        pose (..., 6) [mm, deg]: of the tip, or a goal achieved in hindsight.
+        pose (..., 6) [mm, deg]: pose of the tip.
         goal (..., 6) [mm, deg]: target of the tip.
         config: the weights.
     """
@@ -57,16 +57,17 @@ def reward(
     """Compute the reward of a pose after an action.
 
     Args:
-        pose (..., 6) [mm, deg]: achieved after the action.
+        pose (..., 6) [mm, deg]: pose of the tip after the action.
         goal (..., 6) [mm, deg]: target of the tip.
         n_steps (...,): environment steps of the episode, this one included.
         saturated (...,) bool: any chamber at its pressure limit with its spring off its reference.
         config: the weights.
-        clearance_cost (...,): charged for a body close to a wall.
+        clearance_cost (...,): cost of a body close to a wall.
 
     Returns:
         Reward (...,); whether the goal is reached (...,) bool, which ends an episode; the terms by name.
     """
+    # The paper's three cases exclude each other
     xp = array_namespace(pose)
     norm = xp.sqrt(xp.sum(scaled_error(pose, goal, config) ** 2, axis=-1))
     close = norm < config.threshold

@@ -1,4 +1,4 @@
-"""The arm's outer shape, for what draws it, collides it or measures its distance to a wall.
+"""Outer shape of the arm, for drawing, collisions and distances to a wall.
 
 Rings, which hold the springs, are the widest part of a link; below the last one hangs the gripper, a palm
 and two fingers, all boxes.
@@ -14,7 +14,7 @@ from mjx_softarm.sensing.estimator import Frame, backbone
 from mjx_softarm.sensing.pose import quaternion_from_rotation
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
 
-FOLDS, COILS = 12, 20  # of a bellows, and of a spring
+FOLDS, COILS = 12, 20  # folds of a bellows, coils of a spring
 SPRING_WIDTH_M = 0.002  # radius of a spring, outside the circle that the springs stand on
 
 
@@ -24,7 +24,7 @@ def ring_radius_m(spec: ArmSpec) -> float:
 
 
 def hole_directions(spec: ArmSpec) -> np.ndarray:
-    """Return the direction (n, 2) of each chamber, and of its spring, from its section's axis: x and y."""
+    """Return the unit vector (n, 2), x and y, from the axis of its section to each chamber and its spring."""
     roll_deg = np.repeat(spec.section_roll_deg, N_CHAMBERS_PER_SECTION)
     first = np.radians(spec.geometry.first_chamber_deg + roll_deg)
     angle = first + 2 * np.pi * np.arange(spec.n_chambers) / N_CHAMBERS_PER_SECTION
@@ -57,24 +57,25 @@ class Copies(NamedTuple):
 
     position_m: np.ndarray  # (k, 3)
     quaternion: np.ndarray  # (k, 4) w, x, y, z
-    pitch_m: np.ndarray  # (k,) length along its own z, in which a mesh that is to be stretched has 1
+    pitch_m: np.ndarray  # (k,) length of a copy along its own z; the mesh has length 1
 
     @property
     def scales(self) -> np.ndarray:
-        """(k, 3) along the mesh's axes."""
+        """Scales (k, 3) along the axes of the mesh."""
         return np.stack([np.ones_like(self.pitch_m)] * 2 + [self.pitch_m], axis=-1)
 
 
 class ArmShape(NamedTuple):
-    """Places of all parts. Bellows and springs are numbered as in the model, each from its upper end."""
+    """Places of all drawn parts. Bellows and springs are ordered as in the model, each from its upper end."""
 
-    rings: Copies  # links_per_section to a section, below the base's own
-    folds: Copies  # FOLDS to a bellows
-    coils: Copies  # COILS to a spring
+    rings: Copies  # links_per_section in each section; the ring at the base is not among them
+    folds: Copies  # FOLDS in each bellows
+    coils: Copies  # COILS in each spring
 
 
 def shape(spec: ArmSpec, spring_m: np.ndarray, tip: np.ndarray) -> ArmShape:
     """Return the shape of an arm with springs (n,) [m] and its tip at a pose (6,) [mm, deg]."""
+    # Frames along the axis of each section, as shares of its length: rings, folds, coils
     geometry, directions = spec.geometry, hole_directions(spec)
     n_rings = spec.structure.links_per_section
     steps = [(np.arange(n) + 0.5) / n for n in (FOLDS, COILS)]
@@ -84,6 +85,8 @@ def shape(spec: ArmSpec, spring_m: np.ndarray, tip: np.ndarray) -> ArmShape:
         Frame(*(part[:, rows] for part in sections))
         for rows in np.split(np.arange(len(at)), [n_rings, n_rings + FOLDS])
     )
+
+    # Rings stand on the axis, folds and coils beside it
     centres = rings.position_m.reshape(-1, 3)
     return ArmShape(
         Copies(centres, quaternion_from_rotation(rings.rotation.reshape(-1, 3, 3)), np.ones(len(centres))),

@@ -1,10 +1,10 @@
 """The Hessian of a chain of sections, and systems with it, each solved at a cost linear in the sections.
 
 The joints of one section are coupled by the tendons that run through it, those of different sections by
-gravity alone: its second derivative by a joint i and one j further down is a product of two numbers of i with
-two of j (see `mjx_softarm.mechanics.statics`), so the block between two sections has rank two. Block
-elimination from the tip to the base keeps that form: the sections below act on a section as a reaction of
-rank two, as in the articulated-body algorithm for rigid chains.
+gravity alone. The second derivative of gravity by a joint i and a joint j further down is a product of two
+numbers of i with two numbers of j (see `mjx_softarm.mechanics.statics`), so the block between two sections
+has rank two. Block elimination from the tip to the base keeps that form: the sections below act on a section
+as a reaction of rank two, as in the articulated-body algorithm for rigid chains.
 
 Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, chapter 7 (articulated bodies).
 """
@@ -18,7 +18,7 @@ from jax import Array
 
 from mjx_softarm._support.small_matrices import block_diagonal, eliminate, identity, product
 
-RANK = 2  # of what couples two sections
+RANK = 2  # rank of the block between two sections
 
 
 class ChainHessian(NamedTuple):
@@ -50,8 +50,8 @@ class ChainHessian(NamedTuple):
         """Return the inverse times columns (n_sections, n, k, *arms); NaN if not positive definite."""
         # From the tip to the base: eliminate each section, and add its reaction to those above
         k, *arms = columns.shape[2:]
-        reaction = jnp.zeros((RANK, RANK, *arms), columns.dtype)  # of all sections further down
-        pull = jnp.zeros((RANK, k, *arms), columns.dtype)  # of their columns
+        reaction = jnp.zeros((RANK, RANK, *arms), columns.dtype)  # reaction of all sections further down
+        pull = jnp.zeros((RANK, k, *arms), columns.dtype)  # reaction of their columns
         reduced = []
         for own, above, below, column in reversed(list(zip(*self, columns, strict=True))):
             acted = product(above, reaction)
@@ -61,7 +61,7 @@ class ChainHessian(NamedTuple):
             reaction, pull = reaction + passed_on[:, :RANK], pull + passed_on[:, RANK:]
             reduced.append(solved)
         # From the base to the tip: substitute
-        motion = jnp.zeros_like(pull)  # of all sections further up
+        motion = jnp.zeros_like(pull)  # motion of all sections further up
         found = []
         for above, solved in zip(self.above, reversed(reduced), strict=True):
             found.append(solved[:, RANK:] - product(solved[:, :RANK], motion))

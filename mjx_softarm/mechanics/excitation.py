@@ -1,4 +1,4 @@
-"""Pressures and poses that take an arm over its workspace. NumPy alone: they drive a real arm, too."""
+"""Pressures and poses that take an arm over its workspace. NumPy alone, since they drive a real arm, too."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from mjx_softarm.spec import ArmSpec
 
-CIRCLE_DIAMETER_MM, CIRCLE_HEIGHT_MM = 160.0, -575.0  # of an arm of 600 mm, the paper's
+CIRCLE_DIAMETER_MM, CIRCLE_HEIGHT_MM = 160.0, -575.0  # on the paper's arm of 600 mm
 N_GROWING = 10  # poses from a first small motion to the full range
 
 
@@ -18,7 +18,7 @@ def random_pressures(spec: ArmSpec, n_poses: int, seed: int | np.random.Generato
     Args:
         spec: the arm.
         n_poses: how many sets.
-        seed: of the draw, or what draws it.
+        seed: seed of the draw, or a generator.
     """
     low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
     swing = np.cos(np.random.default_rng(seed).uniform(0.0, np.pi, (n_poses, spec.n_chambers)))
@@ -28,7 +28,7 @@ def random_pressures(spec: ArmSpec, n_poses: int, seed: int | np.random.Generato
 def circle_poses(spec: ArmSpec, n: int = 40) -> np.ndarray:
     """Return poses (n, 6) [mm, deg] along a horizontal circle below the base, the tip hanging straight down.
 
-    It is the paper's, as many times as large as the arm is longer. The paper gives diameter and number of
+    The circle of the paper is scaled with the length of the arm. The paper gives diameter and number of
     points but no height; at ours, its arm reaches every point with 2 kPa to spare in each chamber.
     """
     angle, zero, size = 2 * np.pi * np.arange(n) / n, np.zeros(n), spec.length_m / 0.6
@@ -38,6 +38,6 @@ def circle_poses(spec: ArmSpec, n: int = 40) -> np.ndarray:
 
 
 def growing(pressure_kpa: np.ndarray) -> np.ndarray:
-    """Scale the first of some sets of pressures (n_poses, n) [kPa], from a tenth to all of each."""
+    """Scale the first ten of pressures (n_poses, n) [kPa] by 0.1 to 1, so that motions begin small."""
     share = np.minimum(1.0, np.arange(1, len(pressure_kpa) + 1) / N_GROWING)
     return share[:, None] * pressure_kpa

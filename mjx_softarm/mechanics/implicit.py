@@ -1,4 +1,4 @@
-"""Derivative of the equilibrium by the implicit function theorem, at the active set it ended with.
+"""Derivative of the equilibrium by the implicit function theorem, at its final active set.
 
 An equilibrium (q, p) of `mjx_softarm.mechanics.settle` solves, for every chamber t,
 
@@ -13,13 +13,13 @@ the rows of S K where chambers track and of the identity where they are at a lim
 
     dp = R^-1 r,    dq = K dp - H^-1 d_x grad V,    r = dreference - d_x s + S H^-1 d_x grad V  or  dlimit.
 
-This is exact however many Newton steps led to the equilibrium. K and R^-1 are computed with the primal, so
-that derivatives in either direction are products with them; H^-1 is needed for the arm's numbers alone.
+This is exact however many Newton steps led to the equilibrium. K comes from the last Newton step, so that
+derivatives in either direction are products with K and R^-1; only the arm's numbers need H^-1.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -32,7 +32,7 @@ from mjx_softarm.mechanics.statics import Statics, statics
 
 
 class EquilibriumTangents(NamedTuple):
-    """Derivatives of the fields of the same names of `Settled`."""
+    """Derivatives of the fields of `Settled` that have these names."""
 
     q: Array  # (nv,)
     pressure_kpa: Array  # (n_chambers,)
@@ -49,7 +49,7 @@ class PressureResponse(NamedTuple):
 
 
 class Equilibrium(NamedTuple):
-    """An equilibrium, and what its derivative is made of."""
+    """Equilibrium with all that its derivative needs."""
 
     q: Array  # (nv,)
     pressure_kpa: Array  # (n_chambers,)
@@ -70,6 +70,7 @@ def equilibrium_tangents(
         end: the equilibrium.
         settled () bool: false for a zero derivative.
     """
+    # Derivatives at fixed joint coordinates and pressures
     _, params, reference = primals
     _, params_dot, reference_dot = tangents
     q, pressure_kpa, at_limit, frames, here, response = end
@@ -86,7 +87,7 @@ def equilibrium_tangents(
     low_dot = _array(params_dot.pressure_min_kpa, params.pressure_min_kpa)
     high_dot = _array(params_dot.pressure_max_kpa, params.pressure_max_kpa)
     tracking_dot = _array(reference_dot, reference)
-    dq_held = jnp.zeros_like(q)  # at held pressures
+    dq_held = jnp.zeros_like(q)  # joints' derivative at constant pressures
     if explicit is not None:
         every = jnp.eye(len(q), dtype=q.dtype).reshape(params.n_sections, -1, len(q))
         compliance = _masked(here.hessian.solve(every), settled).reshape(len(q), -1)  # H^-1
@@ -95,7 +96,7 @@ def equilibrium_tangents(
     limit_dot = jax.lax.select(at_high, high_dot, low_dot)
     right = jax.lax.select(at_limit, limit_dot, tracking_dot)
 
-    # Pressures, joints, and what follows from them
+    # Pressures and joints, then springs and tip
     dp = jnp.sum(inverse * right, axis=-1)
     dq = jnp.sum(dq_dp * dp, axis=-1) + dq_held
     tip_dot, rotation_dot = _tip_tangents(frames, dq)
@@ -118,6 +119,7 @@ class _Explicit(NamedTuple):
 
 def _explicit_tangents(primals: tuple, tangents: tuple, q: Array, pressure_kpa: Array) -> _Explicit | None:
     """Differentiate along the arm's numbers, pressure limits aside; None where none of them changes."""
+    # Numbers that change; all others stay constants of the differentiated function
     numbers, structure = jax.tree.flatten(_without_limits(primals))
     directions = jax.tree.leaves(_without_limits(tangents))
     changing = [k for k, direction in enumerate(directions) if not isinstance(direction, SymbolicZero)]
@@ -137,15 +139,18 @@ def _explicit_tangents(primals: tuple, tangents: tuple, q: Array, pressure_kpa: 
 
 
 def _without_limits(arguments: tuple) -> tuple:
+    """Return kinematics and parameters without pressure limits, which V does not contain."""
     kinematics, params, _ = arguments
     return kinematics, params._replace(pressure_min_kpa=None, pressure_max_kpa=None)
 
 
-def _array(tangent: Any, primal: Array) -> Array:
+def _array(tangent: Array | SymbolicZero, primal: Array) -> Array:
+    """Return a tangent, zeros for a symbolic zero."""
     return jnp.zeros_like(primal) if isinstance(tangent, SymbolicZero) else tangent
 
 
 def _masked(x: Array, settled: Array) -> Array:
+    """Return x, zeros for an arm that did not settle."""
     return jax.lax.select(settled, x, jnp.zeros_like(x))
 
 

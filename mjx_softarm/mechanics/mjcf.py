@@ -8,10 +8,12 @@ springs from 0 section by section. An actuator's control is its chamber's pressu
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import mujoco
 import numpy as np
 
+from mjx_softarm._support.xp import Array
 from mjx_softarm.mechanics.body import SPRING_WIDTH_M, gripper_boxes, payload_radius_m, ring_radius_m
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.statics import GRAVITY_M_S2
@@ -24,11 +26,12 @@ _RING_COLOUR = [0.25, 0.27, 0.30, 1.0]
 _SPRING_COLOUR = [0.75, 0.77, 0.80, 1.0]
 _GRIPPER_COLOUR = [0.15, 0.16, 0.18, 1.0]
 _RING_HALF_HEIGHT_M = 0.002
-_BELLOWS_DRAWN = 0.45  # of the outer diameter: the convolutions are not drawn
+_BELLOWS_DRAWN = 0.45  # drawn width as a share of the outer diameter: convolutions are not drawn
 
 
 def build_spec(spec: ArmSpec) -> mujoco.MjSpec:
     """Return the arm as an editable `mujoco.MjSpec`, for adding an environment before compiling."""
+    # Options of the simulation: a whole number of time steps in a control period, no contacts
     params = ArmParams.from_spec(spec, np.float64)
     mjspec = mujoco.MjSpec()
     mjspec.modelname = spec.name
@@ -37,11 +40,15 @@ def build_spec(spec: ArmSpec) -> mujoco.MjSpec:
     mjspec.option.timestep = period_s / steps_per_period(period_s)
     mjspec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     mjspec.option.disableflags = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+
+    # Light and sky
     mjspec.visual.global_.offwidth, mjspec.visual.global_.offheight = 1280, 960
     mjspec.visual.headlight.ambient = [0.45, 0.45, 0.45]
     mjspec.visual.headlight.diffuse = [0.55, 0.55, 0.55]
     sky = mjspec.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, width=64, height=384)
     sky.builtin, sky.rgb1, sky.rgb2 = mujoco.mjtBuiltin.mjBUILTIN_GRADIENT, [1.0] * 3, [0.82, 0.86, 0.9]
+
+    # The chain from the base to the tools, mounted as the specification says, then its tendons
     world = body = mjspec.worldbody
     _add_ring(world, 0, [0.0, 0.0, 0.0], spec)
     _add_holes(world, 0, 0, np.zeros(3), params, spec)
@@ -62,12 +69,12 @@ def steps_per_period(period_s: float) -> int:
     return math.ceil(period_s / MAX_TIMESTEP_S - 1e-9)
 
 
-def chamber_lengths(data):
+def chamber_lengths(data: Any) -> Array:
     """Return the chambers' lengths (n_chambers,) [m], a view, from the data of MuJoCo or MJX."""
     return data.ten_length[0::2]
 
 
-def spring_lengths(data):
+def spring_lengths(data: Any) -> Array:
     """Return the springs' lengths (n_chambers,) [m], a view, from the data of MuJoCo or MJX."""
     return data.ten_length[1::2]
 
@@ -79,13 +86,16 @@ def build_model(spec: ArmSpec) -> mujoco.MjModel:
 
 def _add_link(parent, link: int, params: ArmParams, spec: ArmSpec):
     """Add one link: a slide along the parent plate's -z, then hinges x and y half a link below it."""
+    # Body and its inertia, that of a solid cylinder about its centre
     half = spec.link_length_m / 2
     offset = -half if link == 0 else -2 * half
     body = parent.add_body(name=f"link{link}", pos=[0.0, 0.0, offset])
     mass, radius = float(params.link_mass_kg[link]), spec.geometry.spring_radius_m
-    sideways = mass * (3 * radius**2 + (2 * half) ** 2) / 12  # solid cylinder about its centre
+    sideways = mass * (3 * radius**2 + (2 * half) ** 2) / 12
     body.mass, body.ipos, body.explicitinertial = mass, [0.0, 0.0, 0.0], True
     body.inertia = [sideways, sideways, mass * radius**2 / 2]
+
+    # Joints: a section's backbone is `links_per_section` links in series
     section = spec.structure.links_per_section
     joints = (
         ("slide", mujoco.mjtJoint.mjJNT_SLIDE, [0.0, 0.0, -1.0], spec.backbone.axial_damping_ns_per_m),
@@ -96,6 +106,8 @@ def _add_link(parent, link: int, params: ArmParams, spec: ArmSpec):
         joint = body.add_joint(name=f"{name}{link}", type=kind, axis=axis)
         joint.stiffness = _polynomial(float(params.joint_stiffness[3 * link + k]))
         joint.damping = _polynomial(damping * section)
+
+    # Plate: its ring has the holes of two sections where one ends and the next begins
     plate = np.array([0.0, 0.0, -half])
     _add_ring(body, link + 1, plate, spec)
     for part in {link // section, min((link + 1) // section, spec.structure.n_sections - 1)}:
@@ -132,7 +144,7 @@ def _add_holes(body, plate: int, section: int, position, params: ArmParams, spec
 
 
 def _add_tools(last, params: ArmParams, spec: ArmSpec) -> None:
-    """Add gripper and payload below the last plate, and the tip where it is measured, at best the centre."""
+    """Add gripper and payload below the last plate, and the measured tip on it."""
     half, length = spec.link_length_m / 2, spec.mass.gripper_length_m
     tip = last.add_site(name="tip", size=[0.004] * 3, rgba=[0.9, 0.1, 0.1, 1.0])
     tip.pos = np.asarray(params.mount.tip_offset_m) - [0.0, 0.0, half]
@@ -170,6 +182,7 @@ def _add_chamber(mjspec: mujoco.MjSpec, index: int, params: ArmParams, spec: Arm
 
     The actuator's force on the tendon is pressure * (a + b length): MuJoCo's affine gain.
     """
+    # Tendons of chamber and spring through all rings of their section
     section, first = index // N_CHAMBERS_PER_SECTION, spec.structure.links_per_section
     lines = (
         ("chamber", params.chamber_stiffness, params.chamber_rest_m, spec.chambers.damping_ns_per_m),
@@ -186,6 +199,8 @@ def _add_chamber(mjspec: mujoco.MjSpec, index: int, params: ArmParams, spec: Arm
         tendon.rgba = colour if kind == "chamber" else _SPRING_COLOUR
         for plate in range(section * first, (section + 1) * first + 1):
             tendon.wrap_site(f"{kind}{index}_plate{plate}")
+
+    # Pressure actuator
     slope = float(params.area_slope[index])
     actuator = mjspec.add_actuator(name=f"chamber{index}", target=f"chamber{index}")
     actuator.trntype = mujoco.mjtTrn.mjTRN_TENDON

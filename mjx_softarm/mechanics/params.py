@@ -1,4 +1,4 @@
-"""Numbers of an arm as arrays, from its specification."""
+"""Parameters of an arm as arrays, from its specification."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PAYLOAD = 1  # index in ArmParams.tool_mass_kg
 
 
 class Mount(NamedTuple):
-    """Where the base hangs in the base frame, and where the tip sits on the last plate."""
+    """Frame of the base in the base frame, and frame of the tip on the last plate."""
 
     base_position_m: Array | np.ndarray  # (3,)
     base_rotation: Array | np.ndarray  # (3, 3)
@@ -30,14 +30,14 @@ LEVEL = Mount(
 
 
 class ArmParams(NamedTuple):
-    """Numbers of an arm as arrays, so that a new value needs no new compilation.
+    """Parameters of an arm as arrays, so that a new value needs no new compilation.
 
     Chambers and springs are ordered section by section, counter-clockwise within a section.
     """
 
     link_length_m: Array  # ()
-    chamber_site_m: Array  # (n_chambers, 2) holes of the chambers in their rings, x and y
-    spring_site_m: Array  # (n_chambers, 2)
+    chamber_site_m: Array  # (n_chambers, 2) x and y of the chambers' holes in their rings
+    spring_site_m: Array  # (n_chambers, 2) x and y of the springs' holes
     link_mass_kg: Array  # (n_links,) at the hinges' anchor
     tool_mass_kg: Array  # (2,) gripper and payload, below the last plate
     tool_offset_m: Array  # (2,)
@@ -73,6 +73,7 @@ class ArmParams(NamedTuple):
     @classmethod
     def from_spec(cls, spec: ArmSpec, dtype: np.typing.DTypeLike = np.float32) -> ArmParams:
         """Return the numbers of `spec`, in SI units but for the pressures [kPa]."""
+        # A section's backbone is `links_per_section` links in series
         n, per_section = spec.n_chambers, spec.structure.links_per_section
         on_circle = hole_directions(spec)
         axial = spec.backbone.axial_stiffness_n_per_m * per_section
@@ -100,6 +101,7 @@ class ArmParams(NamedTuple):
 
 
 def _mount(spec: ArmSpec, dtype: np.typing.DTypeLike) -> Mount:
+    """Return the mount of `spec`."""
     mounting = spec.mounting
     base, tip = (rotation_about(np.radians(turn)) for turn in (mounting.base_turn_deg, mounting.tip_turn_deg))
     values = (mounting.base_offset_m, base, mounting.tip_offset_m, tip)

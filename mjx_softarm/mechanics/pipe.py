@@ -1,8 +1,8 @@
-"""The cross-shaped pipe: its walls, its containers, and the clearance of the arm's body.
+"""Cross-shaped pipe: its walls, its containers, and the clearance of the arm's body.
 
 Two cylinders of one diameter cross below the arm's base: a vertical one, which the arm enters from above,
-and a horizontal one along x. All is in the base frame (z up, the arm hangs towards -z), in metres, for one
-point or many at once, in NumPy or JAX. The distance to the wall ignores that the pipe ends at its outlets.
+and a horizontal one along x. Positions are in the base frame (z up, the arm hangs towards -z). Functions take
+one point or many, in NumPy or JAX. The distance to the wall ignores that the pipe ends at its outlets.
 """
 
 from __future__ import annotations
@@ -16,25 +16,23 @@ from mjx_softarm._support.xp import Array, array_namespace
 from mjx_softarm.mechanics.body import gripper_boxes, rim_points, ring_radius_m
 from mjx_softarm.spec import ArmSpec
 
-# What the arm picks and places. Source: the paper's section on confined scenarios.
+# Objects that the arm picks and places. Source: the paper's section on confined scenarios.
 BALL_KG = 0.035  # a sponge ball
 APPLE_KG = 0.220
 PIPES_MM = {"pipe300": 300, "pipe250": 250}  # diameters
-RIM_POINTS = 16  # of a ring; the rim is at most 1 - cos(pi / 16) = 1.9 % of its radius beyond them
+RIM_POINTS = 16  # points of a ring; its rim is at most 1 - cos(pi / 16) = 1.9 % of its radius beyond them
 
 
 @dataclass(frozen=True)
 class CrossPipe:
-    """The pipe, in the base frame; its axes cross at x = y = 0."""
+    """Cross-shaped pipe in the base frame; its axes cross at x = y = 0."""
 
     diameter_m: float
     centre_z_m: float = -0.55
     branch_m: float = 0.3  # from the centre to the outlets left, right and at the bottom
     top_z_m: float = 0.0  # the outlet that the arm enters, level with its base
-    reach_m: float = (
-        0.06  # how far the finger tips reach into a branch: the nominal arm does with 5 mm to spare
-    )
-    drop_m: float = 0.05  # and how far below its axis, left and right
+    reach_m: float = 0.06  # depth of the containers in a branch; the nominal arm reaches 5 mm further
+    drop_m: float = 0.05  # height of a branch's axis over the left and the right container
 
     def __post_init__(self) -> None:
         if not 0.0 < self.radius_m < self.branch_m - self.reach_m:

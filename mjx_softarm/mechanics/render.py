@@ -30,7 +30,7 @@ _HEADLESS = ("egl", "osmesa")
 _ADVICE = "Install EGL or OSMesa (Debian: libegl1, libosmesa6) and set MUJOCO_GL=egl or MUJOCO_GL=osmesa"
 _MAX_GEOMS = 10_000
 _FOLDS_PER_LINK = 4  # convolutions of a bellows between two rings
-_CORE_RADIUS = 0.8  # of the bellows: what shows between its convolutions
+_CORE_RADIUS = 0.8  # radius between two convolutions as a share of the bellows'
 _MOUNT_RADIUS_M = 0.095
 _MOUNT_HALF_HEIGHT_M = 0.02
 _MOUNT_COLOUR = (0.55, 0.57, 0.60, 1.0)
@@ -47,19 +47,19 @@ class Camera:
 
     azimuth_deg: float = 35.0  # 0 looks along +x; grows counter-clockwise seen from above
     elevation_deg: float = -8.0  # negative looks down
-    height: float = 1.45  # seen at the arm's distance
-    centre: float = 0.57  # below the base, in the middle of the picture
+    height: float = 1.45  # height of the picture at the arm's distance
+    centre: float = 0.57  # depth below the base of the picture's middle
 
 
 class Renderer:
-    """Draws one model. Holds an OpenGL context until closed, so that a film opens only one."""
+    """Renderer of one model. It holds an OpenGL context until it is closed, so a film opens only one."""
 
     def __init__(self, model: mujoco.MjModel, width: int = 900, height: int = 1200):
         """Open the context.
 
         Args:
             model: from `mjx_softarm.mechanics.mjcf`, with or without an environment around the arm.
-            width, height: of the picture, in pixels.
+            width, height: size of the picture in pixels.
 
         Raises:
             RenderError: there is no OpenGL to draw with.
@@ -90,6 +90,8 @@ class Renderer:
             raise ValueError(f"q: got shape {q.shape}, expected ({self._model.nq},)")
         if not np.isfinite(q).all():
             raise ValueError("q: got numbers that are not finite, expected those of an arm that settled")
+
+        # Scene at these joint coordinates, then parts that MuJoCo does not draw by itself
         self._data.qpos[:] = q
         mujoco.mj_forward(self._model, self._data)
         view = self._camera(camera or Camera())
@@ -143,7 +145,7 @@ def _open_renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Ren
         if name in _HEADLESS:
             gl_context.GLContext = importlib.import_module(f"mujoco.{name}").GLContext
         return mujoco.Renderer(model, height, width, _MAX_GEOMS)
-    except Exception as error:  # each library has its own
+    except Exception as error:  # each OpenGL library raises errors of its own
         message = " ".join(f"{type(error).__name__}: {error}".split())
         raise RenderError(
             f"MUJOCO_GL: got {name!r} ({message}), expected OpenGL to draw with. {_ADVICE}"
@@ -152,9 +154,9 @@ def _open_renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Ren
 
 @functools.cache
 def _working_library() -> str:
-    """Return the first of the headless libraries that draws.
+    """Return the first headless library that draws.
 
-    Each is tried in a process of its own: a library that was loaded, even in vain, shuts out the others.
+    Each is tried in a process of its own: once one is loaded, even in vain, the others fail.
     """
     program = (
         "import mujoco; gl = mujoco.GLContext(8, 8); gl.make_current();"
@@ -179,6 +181,7 @@ def _is_error(line: str) -> bool:
 
 
 def _append(scene: mujoco.MjvScene, kind: mujoco.mjtGeom, size, position, rotation, rgba) -> None:
+    """Add a shape to a scene, unless the scene is full."""
     if scene.ngeom < scene.maxgeom:
         geom = scene.geoms[scene.ngeom]
         mujoco.mjv_initGeom(geom, kind, size, position, np.ravel(rotation), np.asarray(rgba, np.float32))
@@ -203,6 +206,7 @@ def _draw_bellows(scene: mujoco.MjvScene, model: mujoco.MjModel) -> None:
 
 
 def _draw_mount(scene: mujoco.MjvScene) -> None:
+    """Draw the disc from which the arm hangs."""
     size = np.array([_MOUNT_RADIUS_M, _MOUNT_HALF_HEIGHT_M, 0.0])
     position = np.array([0.0, 0.0, _MOUNT_HALF_HEIGHT_M])
     _append(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, size, position, np.eye(3), _MOUNT_COLOUR)

@@ -1,13 +1,12 @@
 """The quasi-static arm: spring references or pressures -> equilibrium under the sensor-space law.
 
-The law of `mjx_softarm.control` has integral action, so at rest each chamber either holds its spring at
-the reference or sits at a pressure limit. With V the potential of `mjx_softarm.mechanics.statics`, rest is
+The law of `mjx_softarm.control` has integral action, so at rest a chamber holds its spring at the reference
+or is at a pressure limit. With V the potential of `mjx_softarm.mechanics.statics`, rest is
 
     grad V(q; p) = 0,    s_t(q) = reference_t  or  p_t = limit   for every chamber t,
 
-a nonlinear complementarity problem in (q, p), solved by Newton's method on the active set: the chambers
-whose p + c (reference - s) leaves the limits are held there, the others track, and one linear
-system gives the step in q and p together.
+solved by Newton's method on the active set: chambers whose p + c (reference - s) leaves the limits are held
+there, the others track, and one linear system gives the step in q and p together.
 
 Source: primal-dual active set as semismooth Newton, Hintermueller, Ito, Kunisch, SIAM J. Optim. 13 (2002).
 """
@@ -23,15 +22,15 @@ import jax.numpy as jnp
 from jax import Array
 from jax.custom_derivatives import zero_from_primal
 
+from mjx_softarm._support.result import Result
 from mjx_softarm._support.small_matrices import eliminate, identity, products
 from mjx_softarm.mechanics.implicit import Equilibrium, PressureResponse, equilibrium_tangents
 from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK, Kinematics
 from mjx_softarm.mechanics.params import ArmParams
-from mjx_softarm.mechanics.result import Result
 from mjx_softarm.mechanics.statics import statics
 
 MAX_ITERATIONS = 12
-ACTIVE_SET_GAIN_KPA_PER_M = 1000.0
+ACTIVE_SET_GAIN_KPA_PER_M = 1000.0  # c
 MAX_STEP = 0.5  # largest entry of a Newton step [m, rad]
 SMALL_STEP = 3e-4  # [m, rad]; Newton's method converges quadratically from here
 RESIDUAL_TOLERANCE = 2e-3  # [N, N m], against stiffnesses of 2 N m/rad and more
@@ -44,10 +43,7 @@ class SettleResult(Result):
     """Results of `settle`."""
 
     CONVERGED = 0, "forces balance, and every spring is at its reference or its chamber at a limit"
-    OUT_OF_ITERATIONS = (
-        1,
-        "forces or springs are off by more than the tolerance after the last iteration",
-    )
+    OUT_OF_ITERATIONS = 1, "forces or springs are off by more than the tolerance after the last iteration"
     NOT_CONVEX = 2, "its energy is not convex there, so it buckles, or its springs do not follow its chambers"
     NOT_FINITE = 3, "a force or a length is not a finite number"
 
@@ -73,8 +69,6 @@ class Settled(NamedTuple):
 
 
 class _Iterate(NamedTuple):
-    """Iterate of Newton's method, and what the last step said of it."""
-
     q: Array  # (nv, *arms)
     pressure: Array  # (n_chambers, *arms) [kPa]
     at_limit: Array  # (n_chambers, *arms) bool, active set of the last step
@@ -88,13 +82,13 @@ class _Iterate(NamedTuple):
         return (self.n_small < n_small) & (self.iteration < MAX_ITERATIONS + n_small - 1)
 
 
+_Solution = tuple[Settled, Equilibrium]
+
+
 def arms_at_once(n_links: int) -> int | None:
-    """Return how many arms this machine settles fastest at once; None where more are always faster.
+    """Return how many arms of `n_links` links to settle at once on this machine; None is all of them.
 
-    Ask where a program is built, since traced code should not depend on the machine.
-
-    Args:
-        n_links: links of each arm.
+    Call this where a program is built, since traced code should not ask for the machine.
     """
     if jax.default_backend() != "cpu":
         return None
@@ -146,14 +140,12 @@ def settle_pressures(
 
 
 @functools.cache
-def _solver(
-    n_small: int, n_at_once: int | None
-) -> Callable[[Kinematics, ArmParams, Array], tuple[Settled, Equilibrium]]:
+def _solver(n_small: int, n_at_once: int | None) -> Callable[..., _Solution]:
     """Return `_solve` for one arm; `jax.vmap` of it puts the arms last, in chunks of `n_at_once`."""
     solve = jax.custom_batching.custom_vmap(functools.partial(_solve, n_small))
 
     def many(n: int, batched: list[Any], *arguments: Any) -> tuple[Any, Any]:
-        if n_at_once is not None and n_at_once < n:
+        if n_at_once and n_at_once < n:
             found = _solve_in_chunks(solve, n, -(-n // n_at_once), batched, arguments)
         else:
             found = _solve_arms_last(n_small, n, batched, *arguments)
@@ -165,7 +157,7 @@ def _solver(
 
 def _solve_arms_last(
     n_small: int, n: int, batched: list[Any], kinematics: Kinematics, params: ArmParams, reference_m: Array
-) -> tuple[Settled, Equilibrium]:
+) -> _Solution:
     """Return what `_solve` finds for n arms; `batched` is true for arrays whose first axis is the arms."""
 
     def arms_last(x: Any, own: bool) -> Array:
@@ -178,45 +170,37 @@ def _solve_arms_last(
         axes = jax.tree.map(lambda own: 0 if own else None, kinematics_own)
         each = jax.vmap(lambda engine, q: engine(q), in_axes=(axes, -1), out_axes=-1)
         kinematics = functools.partial(each, kinematics)
-    reference_m = arms_last(reference_m, reference_own)
-    reference_m = jnp.broadcast_to(reference_m, (*reference_m.shape[:-1], n))
+    reference_m = jnp.broadcast_to(arms_last(reference_m, reference_own), (reference_m.shape[-1], n))
     found = _solve(n_small, kinematics, jax.tree.map(arms_last, params, params_own), reference_m)
     return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), found)
 
 
 def _solve_in_chunks(
     solve: Callable, n: int, n_chunks: int, batched: list[Any], arguments: tuple
-) -> tuple[Settled, Equilibrium]:
+) -> _Solution:
     """Return what `solve` finds for n arms, chunk after chunk; the last chunk repeats its last arm."""
     arm = jnp.minimum(jnp.arange(n_chunks * -(-n // n_chunks)), n - 1).reshape(n_chunks, -1)
-    own = tuple(batched)
+    axes = jax.tree.map(lambda own: 0 if own else None, tuple(batched))
 
-    def chunk(arm: Array) -> tuple[Settled, Equilibrium]:
-        theirs = jax.tree.map(lambda x, own: jnp.asarray(x)[arm] if own else x, arguments, own)
-        return jax.vmap(solve, in_axes=jax.tree.map(lambda own: 0 if own else None, own))(*theirs)
+    def chunk(arm: Array) -> _Solution:
+        theirs = jax.tree.map(lambda x, own: jnp.asarray(x)[arm] if own else x, arguments, tuple(batched))
+        return jax.vmap(solve, in_axes=axes)(*theirs)
 
     found = jax.lax.map(chunk, arm)
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:n], found)
 
 
-def _solve(
-    n_small: int, kinematics: Kinematics, params: ArmParams, reference_m: Array
-) -> tuple[Settled, Equilibrium]:
-    """Return the equilibrium after `n_small` small steps, and all that its derivative needs.
-
-    With references (n_chambers, *arms), the kinematics, the parameters and all results have the arms last.
-    """
+def _solve(n_small: int, kinematics: Kinematics, params: ArmParams, reference_m: Array) -> _Solution:
+    """Return the equilibrium after `n_small` small steps and all that its derivative needs; arms are last."""
     # Start: the straight arm, its pressures as close to zero as the limits allow
     dtype, arms = params.link_length_m.dtype, reference_m.shape[1:]
     nv, n_chambers = params.link_mass_kg.shape[0] * DOFS_PER_LINK, params.area.shape[0]
-    none = jnp.zeros((n_chambers, *arms), dtype)
+    zeros = functools.partial(jnp.zeros, dtype=dtype)
     start = _Iterate(
-        q=jnp.zeros((nv, *arms), dtype),
-        pressure=jnp.clip(none, params.pressure_min_kpa, params.pressure_max_kpa),
-        at_limit=none.astype(bool),
-        response=PressureResponse(
-            jnp.zeros((nv, n_chambers, *arms), dtype), jnp.zeros((n_chambers, n_chambers, *arms), dtype)
-        ),
+        q=zeros((nv, *arms)),
+        pressure=jnp.clip(zeros((n_chambers, *arms)), params.pressure_min_kpa, params.pressure_max_kpa),
+        at_limit=jnp.zeros((n_chambers, *arms), bool),
+        response=PressureResponse(zeros((nv, n_chambers, *arms)), zeros((n_chambers, n_chambers, *arms))),
         n_small=jnp.zeros(arms, int),
         stiffening=jnp.zeros(arms, dtype),
         iteration=jnp.zeros(arms, int),
@@ -237,8 +221,7 @@ def _active_set(pressure: Array, error_m: Array, params: ArmParams) -> tuple[Arr
     """Return the chambers to be held at a limit (n, *arms) bool, and each one's limit (n, *arms) [kPa]."""
     trial = pressure + ACTIVE_SET_GAIN_KPA_PER_M * error_m
     limit = jnp.clip(trial, params.pressure_min_kpa, params.pressure_max_kpa)
-    # A pinned chamber is at its limit even where its error happens to be zero
-    return (trial != limit) | params.pinned, limit
+    return (trial != limit) | params.pinned, limit  # a pinned chamber even where its error is zero
 
 
 def _newton_step(it: _Iterate, kinematics: Kinematics, params: ArmParams, reference_m: Array) -> _Iterate:
@@ -263,8 +246,7 @@ def _newton_step(it: _Iterate, kinematics: Kinematics, params: ArmParams, refere
     dp = eliminate(rows, residual[:, None])[:, 0]
     dq = (newton_step + jnp.sum(dq_dp * dp, axis=2)).reshape(it.q.shape)
 
-    # Step length. Where V is not convex or springs do not follow chambers, elimination gave NaN: then the arm
-    # makes no step, and the next one has stiffer joints.
+    # Step length; where elimination gave NaN, the arm stays where it is, and its joints are stiffer from now
     largest = jnp.max(jnp.abs(dq), axis=0)
     scale = jnp.minimum(1.0, MAX_STEP / largest)
     convex = jnp.all(jnp.isfinite(dq), axis=0)  # `largest` may miss a NaN: XLA's maximum on a CPU, jax 0.12
@@ -280,9 +262,7 @@ def _newton_step(it: _Iterate, kinematics: Kinematics, params: ArmParams, refere
     )
 
 
-def _report(
-    it: _Iterate, kinematics: Kinematics, params: ArmParams, reference_m: Array
-) -> tuple[Settled, Equilibrium]:
+def _report(it: _Iterate, kinematics: Kinematics, params: ArmParams, reference_m: Array) -> _Solution:
     """Return the last iterate as an equilibrium, with its errors and its result."""
     # Forces and springs at the end
     pressure = jnp.clip(it.pressure, params.pressure_min_kpa, params.pressure_max_kpa)

@@ -1,15 +1,14 @@
-"""Potential energy of the arm in closed form: its gradient, its Hessian, its tendon lengths.
+"""Potential energy of the arm in closed form: gradient, Hessian, and lengths of the tendons.
 
 At given pressures p the arm is conservative. With l the chamber lengths and s the spring lengths,
 
     V(q) = gravity + backbone + sum k (l - l0)^2 / 2 + sum k_s (s - s0)^2 / 2 - sum p W(l),
 
 where W' = area_m2 + area_slope_m (l - L) is a chamber's effective area, L the section's length, so that p W
-is the work of its air. A tendon runs from ring to ring, so the piece of it inside a link depends on that
-link's three joints alone, and its length on those of its section; only gravity couples different sections.
+is the work of its air. A tendon runs from ring to ring, so a segment depends on the three joints of its link
+alone, and a length on the joints of its section. Only gravity couples sections.
 
-Many arms at once come last in every shape, (..., *arms), as in `mjx_softarm.mechanics.kinematics`; a number
-that all of them share has a 1 in their place.
+Many arms come last in every shape, (..., *arms), as in `mjx_softarm.mechanics.kinematics`.
 """
 
 from __future__ import annotations
@@ -31,10 +30,10 @@ GRAVITY_M_S2 = 9.81
 
 
 class Tendons(NamedTuple):
-    """Lengths of a set of tendons with their first and second derivatives, by the joints they depend on."""
+    """Lengths of a set of tendons with first and second derivatives, by the joints that they depend on."""
 
     length: Array  # (n_chambers, *arms) [m]
-    jacobian: Array  # (n_sections, 3 tendons, n, *arms) by the n joints of the tendons' section
+    jacobian: Array  # (n_sections, 3 tendons, n, *arms) by the n joints of a section
     link_hessian: Array  # (3 dofs, 3 dofs, 3 tendons, n_links, *arms) by the joints of a link
 
 
@@ -45,7 +44,7 @@ class Statics(NamedTuple):
     hessian: ChainHessian
     chambers: Tendons
     springs: Tendons
-    area: Array  # (n_chambers, *arms) [N/kPa] effective areas at these lengths
+    area: Array  # (n_chambers, *arms) [N/kPa] effective areas
 
     @property
     def push_per_kpa(self) -> Array:
@@ -55,7 +54,7 @@ class Statics(NamedTuple):
         return block_diagonal(jnp.swapaxes(push, 1, 2)).reshape(n_sections, n, -1, *arms)
 
 
-@jax.jit  # inlined where it is compiled; traced once for all of its callers
+@jax.jit  # traced once for all of its callers
 def statics(frames: Frames, q: Array, pressure_kpa: Array, params: ArmParams) -> Statics:
     """Return gradient and Hessian of V(q) at fixed pressures.
 
@@ -71,11 +70,12 @@ def statics(frames: Frames, q: Array, pressure_kpa: Array, params: ArmParams) ->
 def all_tendons(frames: Frames, params: ArmParams) -> Tendons:
     """Return the chambers' tendons and the springs', stacked: leaves (2, ...)."""
     sites = jnp.stack(jnp.broadcast_arrays(params.chamber_site_m, params.spring_site_m))
-    return jax.vmap(tendons, in_axes=(None, 0))(frames, sites)  # in one piece: fewer and larger operations
+    return jax.vmap(tendons, in_axes=(None, 0))(frames, sites)  # one call: fewer and larger operations
 
 
 def statics_of(both: Tendons, frames: Frames, q: Array, pressure_kpa: Array, params: ArmParams) -> Statics:
     """Return gradient and Hessian of V(q) as `statics`, with the tendons of `all_tendons` given."""
+    # Tension of each tendon, and its slope by the tendon's length: (2, n_sections, 3, *arms)
     chambers, springs = (jax.tree.map(lambda x, k=k: x[k], both) for k in range(2))
     area = params.area + params.area_slope * (chambers.length - params.section_length_m)
     tension = jnp.stack(
@@ -87,6 +87,8 @@ def statics_of(both: Tendons, frames: Frames, q: Array, pressure_kpa: Array, par
     of_chambers = params.chamber_stiffness - params.area_slope * pressure_kpa
     slope = jnp.stack([of_chambers, jnp.broadcast_to(params.spring_stiffness, of_chambers.shape)])
     slope = slope.reshape(tension.shape)
+
+    # Gradient and Hessian: gravity, joints and tendons
     weight, hessian = _gravity(frames, params)
     pull = jnp.sum(tension[:, :, :, None] * both.jacobian, axis=(0, 2))  # (n_sections, n, *arms)
     gradient = weight + params.joint_stiffness * q + pull.reshape(q.shape)
@@ -113,8 +115,8 @@ def _stretching(slope: Array, jacobian: Array) -> Array:
     """Return sum_t slope_t dl_t dl_t^T over the tendons of each section: (n_sections, n, n, *arms).
 
     Args:
-        slope (2, n_sections, 3, *arms): of the tensions by the lengths.
-        jacobian (2, n_sections, 3, n, *arms): of the lengths.
+        slope (2, n_sections, 3, *arms): derivatives of the tensions by the lengths.
+        jacobian (2, n_sections, 3, n, *arms): derivatives of the lengths by the joints.
     """
     rows, scaled = (jnp.concatenate(list(x), axis=1) for x in (jacobian, slope[:, :, :, None] * jacobian))
     return products(jnp.swapaxes(rows, 1, 2), scaled)
@@ -129,6 +131,7 @@ def tendons(frames: Frames, site_m: Array) -> Tendons:
         frames: plates and joints.
         site_m (n_chambers, 2, *arms): x and y of each tendon's hole in every ring of its section.
     """
+    # Segments of the tendons from the upper to the lower ring of each link
     n_links, n_sections = frames.axis.shape[0], site_m.shape[0] // N_CHAMBERS_PER_SECTION
     per_section, arms = n_links // n_sections, frames.axis.shape[3:]
     site = site_m.reshape(n_sections, N_CHAMBERS_PER_SECTION, *site_m.shape[1:])
@@ -140,19 +143,21 @@ def tendons(frames: Frames, site_m: Array) -> Tendons:
     length = jnp.sqrt(_dot(segment, segment))
     unit = [component / length for component in segment]
 
+    # Motion of the lower hole by each joint of its link, and the length's derivative
     anchor, axes = jnp.swapaxes(frames.anchor, 0, 1), jnp.moveaxis(frames.axis, 0, 2)  # (3 dofs, 3, n_links)
     lever = [low - at for low, at in zip(lower, anchor, strict=True)]
-    motion = [list(axes[0]), *(_cross(hinge, lever) for hinge in axes[1:])]  # of the hole, by each joint
-    along = [_dot(unit, moved) for moved in motion]  # d length / d q
+    hole_motion = [list(axes[0]), *(_cross(hinge, lever) for hinge in axes[1:])]
+    dlength_dq = [_dot(unit, motion) for motion in hole_motion]
 
     def second(i: int, j: int) -> Array:
         """Return the second derivative of the length by the i-th joint of a link and one not before it."""
-        curve = (_dot(motion[i], motion[j]) - along[i] * along[j]) / length
-        return curve if i == 0 else curve + _dot(unit, _cross(axes[i], motion[j]))
+        curve = (_dot(hole_motion[i], hole_motion[j]) - dlength_dq[i] * dlength_dq[j]) / length
+        return curve if i == 0 else curve + _dot(unit, _cross(axes[i], hole_motion[j]))
 
+    # Sums over the links of each section, in the order of the chambers
     dofs = range(DOFS_PER_LINK)
     upper_half = {(i, j): second(i, j) for i in dofs for j in dofs[i:]}
-    own = jnp.stack(along).reshape(DOFS_PER_LINK, N_CHAMBERS_PER_SECTION, n_sections, per_section, *arms)
+    own = jnp.stack(dlength_dq).reshape(DOFS_PER_LINK, N_CHAMBERS_PER_SECTION, n_sections, per_section, *arms)
     whole = length.reshape(N_CHAMBERS_PER_SECTION, n_sections, per_section, *arms).sum(2)
     return Tendons(
         length=jnp.swapaxes(whole, 0, 1).reshape(-1, *arms),
@@ -180,13 +185,16 @@ def _gravity(frames: Frames, params: ArmParams) -> tuple[Array, ChainHessian]:
     w = M a x (c - o) for a hinge: the gradient is g w_z; the second derivative by an earlier hinge i and
     a joint j is g (a_i x w_j)_z, and none by an earlier slide.
     """
+    # Mass and moment of all that hangs on each link, from the tip up
     arms, n_sections = frames.axis.shape[3:], params.n_sections
     last = frames.plate_rotation[-1]
     tool = frames.plate_position[-1] - params.tool_offset_m[:, None] * last[:, 2]  # (2, 3, *arms)
-    below_it = jax.lax.cumsum(params.link_mass_kg[:, None] * frames.anchor, reverse=True)  # (L, 3, *arms)
-    moment = below_it + jnp.sum(params.tool_mass_kg[:, None] * tool, axis=0)
+    links = jax.lax.cumsum(params.link_mass_kg[:, None] * frames.anchor, reverse=True)  # (L, 3, *arms)
+    moment = links + jnp.sum(params.tool_mass_kg[:, None] * tool, axis=0)
     mass = jax.lax.cumsum(params.link_mass_kg, reverse=True) + jnp.sum(params.tool_mass_kg, axis=0)
     hung = moment - mass[:, None] * frames.anchor
+
+    # Joint by joint: w, and the axis of a hinge
     slide, hinges = (jnp.moveaxis(axes, 2, 0) for axes in (frames.axis[:, :1], frames.axis[:, 1:]))
     turn = _cross(hinges, jnp.moveaxis(hung[:, None], 2, 0))  # (L, 2 hinges, *arms) each
 
@@ -196,6 +204,8 @@ def _gravity(frames: Frames, params: ArmParams) -> tuple[Array, ChainHessian]:
 
     w = [GRAVITY_M_S2 * by_section(mass[:, None] * slide[i], turn[i]) for i in range(3)]
     axis = [by_section(jnp.zeros_like(slide[i]), hinges[i]) for i in range(2)]  # a slide turns nothing
+
+    # Second derivatives in two factors; within a section they are written out
     above, below = jnp.stack([axis[0], -axis[1]], axis=2), jnp.stack([w[1], w[0]], axis=2)
     earlier_first = products(above, jnp.swapaxes(below, 1, 2))
     n = earlier_first.shape[1]

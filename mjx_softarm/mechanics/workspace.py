@@ -1,4 +1,4 @@
-"""Poses that the arm can reach: drawn at random, or all combinations of the chambers' extremes."""
+"""Poses that the arm can reach: random ones, or all combinations of the chambers' extreme pressures."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ HELD_OUT_SEED = 20_000  # seed of the goals that policies are evaluated on; trai
 
 
 class Pool(NamedTuple):
-    """Equilibria of the nominal arm, none of them saturated: every spring is at its reference."""
+    """Equilibria of the nominal arm at given pressures."""
 
     q: Array  # (n, nv) [m, rad, rad]
     pressure_kpa: Array  # (n, n_chambers)
@@ -37,7 +37,7 @@ class Pool(NamedTuple):
 
 
 class LoadedPool(NamedTuple):
-    """Equilibria of arms with payloads, whose chambers are not quite the nominal arm's."""
+    """Equilibria of arms with payloads, whose chambers differ a little from the nominal arm's."""
 
     load_kg: Array  # (n,) payload
     pressure_kpa: Array  # (n, n_chambers)
@@ -91,9 +91,9 @@ def _in_batches(make_solver: Callable, spec: ArmSpec, *columns: np.ndarray) -> S
 def sample_workspace(spec: ArmSpec, n: int, seed: int) -> Pool:
     """Draw poses spread over the whole reachable workspace.
 
-    Pressures follow the arcsine law between their limits, which favours the extremes where the workspace
-    ends; of twice as many candidates, `n` are drawn with weights that even out the number of tips per
-    voxel of 25 mm. Candidates that did not settle are left out.
+    Pressures follow the arcsine law between their limits, which favours the extremes, where the workspace
+    ends. Of twice as many candidates, `n` are drawn with weights that even out the number of tips per voxel
+    of 25 mm. Candidates that did not settle are left out.
 
     Args:
         spec: the arm.
@@ -109,12 +109,12 @@ def sample_workspace(spec: ArmSpec, n: int, seed: int) -> Pool:
 
 
 def sample_loaded(spec: ArmSpec, load_kg: np.ndarray, spread: float, seed: int) -> LoadedPool:
-    """Draw poses as `sample_workspace` does, of arms with payloads and chambers that are off.
+    """Draw poses as `sample_workspace` does, of arms with payloads and with chambers that deviate.
 
     Args:
-        spec: the arm; its payload is not looked at.
-        load_kg (m,) [kg]: payloads of the candidates, of which half are drawn.
-        spread: by which chambers' stiffness and area are off at most, as a share of the arm's.
+        spec: the arm; its own payload is replaced.
+        load_kg (m,) [kg]: payloads of the candidates; half of these are drawn.
+        spread: largest relative deviation of each chamber's stiffness and area.
         seed: of the draw; training and evaluation use different ones.
 
     Raises:
@@ -133,10 +133,10 @@ def sample_loaded(spec: ArmSpec, load_kg: np.ndarray, spread: float, seed: int) 
 def sample_evenly(spec: ArmSpec, n: int, seed: int) -> Pool:
     """Draw poses whose tips are uniform in volume over the reachable workspace, rim included.
 
-    Every voxel of 25 mm that a candidate reaches is equally likely, and every candidate within it. Of the ten
-    candidates per pose, half have random pressures and half lowest, zero or highest ones in random
-    combinations, which are the rim. Left out are candidates that did not settle, and those with a spring
-    beyond its limits, which no policy can ask for. A pose may come twice.
+    Voxels of 25 mm with a candidate are equally likely, and so are the candidates within a voxel. Of ten
+    candidates per pose, half have random pressures; the others combine lowest, zero and highest pressures at
+    random, which gives the rim. Candidates are left out that did not settle, or that have a spring beyond the
+    limits, which no policy can ask for. A pose may come twice.
 
     Args:
         spec: the arm.
@@ -159,10 +159,13 @@ def _chosen(
     spec: ArmSpec, found: Settled, usable: np.ndarray | Array, n: int, rng: np.random.Generator, replace: bool
 ) -> np.ndarray:
     """Draw rows (n,) of usable equilibria with weights that even out the number of tips per voxel."""
+    # Number of candidates in the voxel of each one
     tip_mm = np.where(usable[:, None], 1e3 * found.tip_position_m, 0.0)
     _, voxel, count = np.unique(
         np.floor(tip_mm / VOXEL_MM).astype(int), axis=0, return_inverse=True, return_counts=True
     )
+
+    # Draw with the inverse of that number
     weight = usable / count[voxel.ravel()]
     if np.count_nonzero(weight) < n:
         raise SpecError(
@@ -173,6 +176,7 @@ def _chosen(
 
 
 def _pool(found: Settled, chosen: np.ndarray) -> Pool:
+    """Return the chosen rows of equilibria with their poses."""
     pose = pose_from_frame(found.tip_position_m[chosen], found.tip_rotation[chosen])
     arrays = (found.q[chosen], found.pressure_kpa[chosen], found.spring_m[chosen], pose)
     return Pool(*map(jnp.asarray, arrays))

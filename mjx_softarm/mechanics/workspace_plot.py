@@ -1,4 +1,4 @@
-"""The picture of the reachable workspace beside the paper's."""
+"""Picture of the reachable workspace, with the paper's coverage."""
 
 from __future__ import annotations
 

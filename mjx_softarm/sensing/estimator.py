@@ -1,12 +1,10 @@
 """Estimators of an arm at rest: tip pose from spring lengths, spring lengths from pressures. NumPy and JAX.
 
-No sensor of the arm sees the tip. Its pose is estimated from the spring lengths: three springs give a
-section's length and bend, a section of constant curvature has a closed form, and the sections are in series.
-Real sections do not bend evenly, since the weight below pulls at them. A small network, distilled from the
-simulator, corrects each section's end. Its inputs are the springs and the direction of gravity at each
-section's end; its outputs are changes, which stay continuous where yaw and roll do not. A second one has the
-payload as an input, too (`mjx_softarm.sensing.load`), and gives changes per payload: without one, the first
-network is all there is.
+No sensor of the arm sees the tip. Three springs give a section's length and bend, a section of constant
+curvature has a closed form, and the sections are in series. Real sections do not bend evenly, since the
+weight below pulls at them. So a small network, distilled from the simulator, corrects each section's end. Its
+inputs are the springs and the direction of gravity at each section's end. A second network also has the
+payload as input (`mjx_softarm.sensing.load`); its output is multiplied by the payload.
 
 In the other direction, `expected_springs` predicts the spring lengths at given pressures without a payload.
 The control loop compares them with the readings to find a chamber that has lost its pressure.
@@ -31,24 +29,24 @@ from mjx_softarm.sensing.pose import (
 from mjx_softarm.sensing.sensors import N_CHAMBERS_PER_SECTION
 
 N_CHANGES = 6  # of a section's end: position [m], Gibbs vector (axis times the tangent of half the angle)
-_SMALL_BEND = 1e-8  # square [rad^2] below which a section counts as straight
+_SMALL_BEND = 1e-8  # square of a bend [rad^2] below which a section counts as straight
 
 
 class PoseEstimator(NamedTuple):
-    """Spring lengths and payload to tip pose, for n springs in n / 3 sections. All float32."""
+    """Networks from spring lengths and payload to the tip pose, for n springs. All float32."""
 
     layers: tuple[Layer, ...]  # normalised springs (n,) and downs (n,) -> changes (n_sections * N_CHANGES,)
-    load_layers: tuple[Layer, ...]  # the same and the normalised payload (1,) -> changes, per this payload
+    load_layers: tuple[Layer, ...]  # these inputs and the normalised payload (1,) -> changes per payload
     spring_site_m: Array  # (n, 2) holes of the springs in their rings, x and y
-    spring_centre_m: Array  # (n,) lengths that are normalised to 0,
-    spring_scale_m: Array  # (n,) and what is added to them for 1
+    spring_centre_m: Array  # (n,) lengths that are normalised to 0
+    spring_scale_m: Array  # (n,) difference of length that is normalised to 1
     load_centre_kg: Array  # () payload that is normalised to 0
-    load_scale_kg: Array  # () and what is added to it for 1
-    change_scale: Array  # (N_CHANGES,) [m, 1] of the network's outputs
+    load_scale_kg: Array  # () difference of payload that is normalised to 1
+    change_scale: Array  # (N_CHANGES,) [m, 1] units of the networks' outputs
 
 
 class SpringModel(NamedTuple):
-    """Pressures to spring lengths at rest. All float32."""
+    """Network from pressures to spring lengths at rest. All float32."""
 
     layers: tuple[Layer, ...]  # normalised pressures (n,) -> normalised springs (n,)
     pressure_centre_kpa: Array  # (n,)
@@ -65,12 +63,13 @@ class Frame(NamedTuple):
 
 
 def estimate(estimator: PoseEstimator, spring_m: Array, load_kg: Array | float) -> Array:
-    """Return the tip pose (..., 6) [mm, deg] of an arm at rest; arguments as of `estimate_frame`."""
+    """Return the tip pose (..., 6) [mm, deg] of an arm at rest, with the arguments of `estimate_frame`."""
     return pose_from_frame(*estimate_frame(estimator, spring_m, load_kg))
 
 
 def estimate_frame(estimator: PoseEstimator, spring_m: Array, load_kg: Array | float) -> Frame:
     """Return the tip frame of an arm at rest with springs (..., n) [m] and a payload (...) or () [kg]."""
+    # Sections of constant curvature, and inputs of the networks
     xp = array_namespace(spring_m, estimator.spring_site_m)
     spring_m = xp.asarray(spring_m, dtype=estimator.spring_site_m.dtype)
     even = constant_curvature(estimator.spring_site_m, spring_m)  # (..., n_sections)
@@ -78,6 +77,8 @@ def estimate_frame(estimator: PoseEstimator, spring_m: Array, load_kg: Array | f
     load = (xp.asarray(load_kg, dtype=spring_m.dtype) - estimator.load_centre_kg) / estimator.load_scale_kg
     load = (xp.zeros_like(normalised[..., 0]) + load)[..., None]  # (..., 1)
     shape = xp.concat([normalised, *_downs(even.rotation)], axis=-1)
+
+    # Changes of each section's end; position and Gibbs vector are continuous where yaw and roll are not
     changes = mlp(estimator.layers, shape)
     changes = changes + load * mlp(estimator.load_layers, xp.concat([shape, load], axis=-1))
     changes = changes.reshape(*changes.shape[:-1], -1, N_CHANGES) * estimator.change_scale  # (..., n / 3, 6)
@@ -99,17 +100,21 @@ def constant_curvature(spring_site_m: Array, spring_m: Array) -> Frame:
     Source: Webster, Jones, "Design and Kinematic Modeling of Constant Curvature Continuum Robots", 2010.
     """
     xp = array_namespace(spring_m, spring_site_m)
+    # Length and bend of each section; the arm turns towards its shorter springs by |bend|
     site = spring_site_m.reshape(-1, N_CHAMBERS_PER_SECTION, 2)
     spring = spring_m.reshape(*spring_m.shape[:-1], -1, N_CHAMBERS_PER_SECTION)
     length = xp.mean(spring, axis=-1)[..., None]  # (..., n_sections, 1)
-    # The arm turns towards its shorter springs by |bend|.
-    bend = (
-        -2.0 * xp.sum((spring - length)[..., None] * site, axis=-2) / xp.sum(site**2, axis=(-2, -1))[:, None]
-    )
+    moment = xp.sum((spring - length)[..., None] * site, axis=-2)
+    bend = -2.0 * moment / xp.sum(site**2, axis=(-2, -1))[:, None]
     square = xp.sum(bend**2, axis=-1)[..., None]
     angle = xp.sqrt(xp.where(square < _SMALL_BEND, _SMALL_BEND, square))
+
+    # Chord and turn of the arc
     half = xp.sin(0.5 * angle) / angle
-    aside, down = 2.0 * half**2, xp.sin(angle) / angle  # aside: (1 - cos) / angle^2, exact in float32 too
+    aside, down = (
+        2.0 * half**2,
+        xp.sin(angle) / angle,
+    )  # aside: (1 - cos) / angle^2, exact in float32
     position_m = length * xp.concat([aside * bend, -down], axis=-1)
     across = half * bend  # the axis of the turn is (bend y, -bend x, 0)
     quaternion = xp.concat(
@@ -127,7 +132,7 @@ def _downs(rotation: Array) -> list[Array]:
 
 
 def chain(sections: Frame) -> Frame:
-    """Return the last plate in the base frame of sections (..., n_sections) in series."""
+    """Return the frame of the last plate in the base frame, of sections (..., n_sections) in series."""
     position_m, rotation = sections.position_m[..., -1, :, None], sections.rotation[..., -1, :, :]
     for section in reversed(range(sections.position_m.shape[-2] - 1)):  # from the tip up to the base
         above = sections.rotation[..., section, :, :]
@@ -139,19 +144,19 @@ def chain(sections: Frame) -> Frame:
 def backbone(spring_site_m: np.ndarray, spring_m: np.ndarray, tip: np.ndarray, at: np.ndarray) -> Frame:
     """Return frames along the arm, which ends at the tip's pose. NumPy only.
 
-    Sections of constant curvature, as the springs tell, are in series. How far the tip is off their end is
-    spread over the arm, growing evenly from the base.
+    Sections of constant curvature are in series, as the springs tell. The tip's distance from their end is
+    spread over the arm: it grows evenly from the base.
 
     Args:
         spring_site_m (n, 2) [m]: holes of the springs.
         spring_m (n,) [m]: lengths.
-        tip (6,) [mm, deg]: pose; NaN leaves the end where the springs bring it.
-        at (k,): shares of each section's length, 1 among them.
+        tip (6,) [mm, deg]: pose; with NaN the arm ends where the springs bring it.
+        at (k,): places as shares of each section's length; one of them is 1.
 
     Returns:
         Positions (n_sections, k, 3) and rotations (n_sections, k, 3, 3) in the base frame.
     """
-    # Length and bend of a part of a section are the same part of its springs' lengths.
+    # Sections in series; a share of a section has the same share of its springs' lengths
     inner = constant_curvature(spring_site_m, at[:, None] * spring_m)  # (k, n_sections)
     end = int(np.argmax(at))
     frames, above_m, above = [], np.zeros(3), np.eye(3)
@@ -163,6 +168,8 @@ def backbone(spring_site_m: np.ndarray, spring_m: np.ndarray, tip: np.ndarray, a
     position_m, rotation = (np.stack(part) for part in zip(*frames, strict=True))  # (n_sections, k)
     if not np.isfinite(tip).all():
         return Frame(position_m, rotation)
+
+    # Spread the distance of the tip from their end
     tip_m, tip_rotation = frame_from_pose(np.asarray(tip, float))
     share = (np.arange(len(frames))[:, None] + at) / len(frames)  # of the way to the tip
     turn = share_of_turn(tip_rotation @ above.T, share)

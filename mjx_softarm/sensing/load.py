@@ -1,9 +1,9 @@
 """Payload of an arm at rest, estimated from springs and pressures, and averaged. NumPy and JAX.
 
-A payload bends and stretches the arm, and the sensor-space law holds its springs where they were: the springs
-alone do not show it, but the pressures that hold them do. A small network, distilled from equilibria of
-simulated arms whose chambers differ from the specification's by a few per cent, estimates the payload. A
-payload changes rarely, so estimates are averaged, until two in a row disagree with the average.
+A payload bends and stretches the arm, and the sensor-space law holds the springs where they were. So springs
+alone do not show a payload; springs and pressures do. A small network estimates the payload. It is distilled
+from equilibria of simulated arms whose chambers differ from the specification's by a few per cent. A payload
+changes rarely, so estimates are averaged, until two in a row disagree with the average.
 """
 
 from __future__ import annotations
@@ -14,47 +14,45 @@ from mjx_softarm._support.archive import Entries
 from mjx_softarm._support.mlp import Layer, mlp
 from mjx_softarm._support.xp import Array, array_namespace
 
-N_AVERAGED = 8  # estimates that the average is about
-JUMP = 0.25  # share of the largest payload by which an estimate disagrees with the average,
-N_JUMPS = 2  # so many of them in a row begin a new one
+N_AVERAGED = 8  # number of estimates in the moving average
+JUMP = 0.25  # distance from the average, as a share of the largest payload, that makes an estimate an outlier
+N_JUMPS = 2  # number of consecutive outliers that restart the average
 # Payloads in the network's data, as shares of the largest one: an estimate outside is no payload.
 LOWEST, HIGHEST = -0.5, 1.5
 
 
 class LoadEstimator(NamedTuple):
-    """Springs and pressures at rest to the payload. All float32."""
+    """Network from springs and pressures at rest to the payload. All float32."""
 
     layers: tuple[Layer, ...]  # normalised springs (n,) and pressures (n,) -> payload (1,), normalised
     spring_centre_m: Array  # (n,)
     spring_scale_m: Array  # (n,)
     pressure_centre_kpa: Array  # (n,)
     pressure_scale_kpa: Array  # (n,)
-    load_scale_kg: Array  # () the arm's largest payload, normalised to 1
+    load_scale_kg: Array  # () largest payload of the arm, normalised to 1
 
 
 class Load(NamedTuple):
-    """A payload, averaged over estimates."""
+    """Payload averaged over estimates."""
 
     kg: float
-    n_estimates: int = 0  # in the average, at most N_AVERAGED; 0: none yet, the payload is assumed
-    n_jumps: int = 0  # estimates in a row that disagreed with the average
-    began: bool = False  # the last estimate replaced another average
+    n_estimates: int = 0  # estimates in the average, at most N_AVERAGED; with 0 the payload is assumed
+    n_jumps: int = 0  # number of consecutive outliers
+    began: bool = False  # whether the last estimate restarted the average
 
     @property
     def believed_kg(self) -> float:
-        """Payload [kg] to reckon with."""
+        """Payload [kg], never negative."""
         return max(self.kg, 0.0)
 
 
 def estimate_load(estimator: LoadEstimator, spring_m: Array, pressure_kpa: Array) -> Array:
     """Return the payload (...) [kg] of an arm at rest with springs (..., n) [m] at pressures (..., n) [kPa].
 
-    It may be below 0 or above `load_scale_kg`, which is for the caller to judge.
+    The estimate may lie below 0 or above `load_scale_kg`; the caller judges it.
     """
-    xp, dtype = (
-        array_namespace(spring_m, pressure_kpa, estimator.load_scale_kg),
-        estimator.spring_scale_m.dtype,
-    )
+    xp = array_namespace(spring_m, pressure_kpa, estimator.load_scale_kg)
+    dtype = estimator.spring_scale_m.dtype
     springs = (xp.asarray(spring_m, dtype=dtype) - estimator.spring_centre_m) / estimator.spring_scale_m
     pressures = xp.asarray(pressure_kpa, dtype=dtype) - estimator.pressure_centre_kpa
     x = xp.concat([springs, pressures / estimator.pressure_scale_kpa], axis=-1)
@@ -62,7 +60,7 @@ def estimate_load(estimator: LoadEstimator, spring_m: Array, pressure_kpa: Array
 
 
 def averaged(load: Load, estimate_kg: float, largest_kg: float) -> Load:
-    """Return the average with another estimate, of an arm with this largest payload."""
+    """Return the average with one more estimate, for an arm with this largest payload."""
     disagrees = load.n_estimates > 0 and abs(estimate_kg - load.kg) > JUMP * largest_kg
     if disagrees and load.n_jumps + 1 < N_JUMPS:
         return load._replace(n_jumps=load.n_jumps + 1)
@@ -78,7 +76,6 @@ def take_load_estimator(entries: Entries, name: str, n_springs: int) -> LoadEsti
     Raises:
         SealedFileError: an entry is missing, or of the wrong type, shape or range.
     """
-    shapes = {item: (n_springs,) for item in LoadEstimator._fields if item != "layers"} | {
-        "load_scale_kg": ()
-    }
+    shapes: dict = {item: (n_springs,) for item in LoadEstimator._fields if item != "layers"}
+    shapes["load_scale_kg"] = ()
     return entries.network(name, LoadEstimator, shapes, 2 * n_springs, 1)

@@ -1,4 +1,4 @@
-"""Poses of the arm's tip, in the convention of the whole project.
+"""Poses of the arm's tip, in the convention of this project.
 
     pose (..., 6) = x, y, z [mm], yaw, pitch, roll [deg]
 
@@ -6,9 +6,9 @@ in the base frame: z up, the arm hangs towards -z. The angles are intrinsic Z-Y-
 columns of R = Rz(yaw) Ry(pitch) Rx(roll), and all three are zero where the arm hangs straight. Yaw and
 roll lie in [-180, 180], pitch in [-90, 90].
 
-Gimbal lock: where the tip's x axis is vertical, |pitch| = 90, yaw and roll turn about the same axis. There
-yaw is 0, roll takes the whole turn, and the yaw's gradient is 0; the pose still gives the rotation back.
-Close by, yaw and roll change as fast as 1 / cos(pitch), and so do their gradients.
+In gimbal lock (|pitch| = 90) yaw and roll turn about the same axis. There yaw is 0, its gradient is 0, and
+roll takes the whole turn; the pose still gives the rotation back. Close by, yaw and roll and their gradients
+change as fast as 1 / cos(pitch).
 """
 
 from __future__ import annotations
@@ -35,9 +35,8 @@ def pose_from_frame(position_m: Array, rotation: Array) -> Array:
         Pose (..., 6) [mm, deg].
     """
     xp = array_namespace(position_m, rotation)
-    (r00, r01, r02), (r10, r11, r12), (r20, _, _) = (
-        [rotation[..., row, column] for column in range(3)] for row in range(3)
-    )
+    rows = ([rotation[..., row, column] for column in range(3)] for row in range(3))
+    (r00, r01, r02), (r10, r11, r12), (r20, _, _) = rows
     locked = r00**2 + r10**2 < _LOCKED_COS**2
     yaw = xp.atan2(xp.where(locked, 0.0, r10), xp.where(locked, 1.0, r00))
     # Without its yaw the rotation is Ry(pitch) Rx(roll), whose entries are never all zero.
@@ -130,7 +129,7 @@ def pose_error(pose: Array, goal: Array) -> Array:
 
 
 def seen_error(tip_m: np.ndarray, tip_quaternion: np.ndarray, goal: np.ndarray) -> np.ndarray:
-    """Return the mean error (6,) [mm, deg] of tips (k, 3) [m] and (k, 4); NaN where none was seen."""
+    """Return the mean error (6,) [mm, deg] of the tips (k, 3) [m], (k, 4) that were seen; NaN if none was."""
     seen = np.isfinite(tip_m).all(axis=-1)
     if not seen.any():
         return np.full(6, np.nan)

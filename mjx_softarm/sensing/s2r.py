@@ -1,12 +1,11 @@
 """The sim-to-real network: simulated tip pose and spring lengths -> pose of the real tip.
 
-The network gives a correction, added to the simulated position and turned onto the simulated axes, so that
-zero outputs leave the simulation as it is. Inside, orientation is two columns of the rotation
-matrix going in and a Gibbs vector (axis times the tangent of half the angle) coming out: both are smooth at
-pitch 90, where yaw and roll are not.
+The network gives a correction of the simulated pose; zero outputs leave the simulation as it is. Orientation
+goes in as two columns of the rotation matrix, and comes out as a Gibbs vector (axis times the tangent of half
+the angle): both are smooth at pitch 90, where yaw and roll are not.
 
-Training in simulation visits arms far from the logged ones. There the network must not diverge: its
-inputs are held within the range of the training rows and its outputs within the range of their corrections.
+Training in simulation visits arms far from the logged ones. The network must not diverge there, so its inputs
+are clipped to the range of the training rows and its outputs to the range of their corrections.
 `extrapolation` tells how far away such an arm is.
 
 Source: Sim-to-Real Transfer in Meng et al., N_S2R: (P, L_spring) -> P_S2R.
@@ -25,20 +24,20 @@ from mjx_softarm._support.xp import Array, array_namespace
 from mjx_softarm.sensing.pose import frame_from_pose, pose_from_frame, rotation_from_quaternion
 
 N_POSE_INPUTS = 9  # position and two columns of the rotation
-N_POSE_OUTPUTS = 6  # change of the position, Gibbs vector
+N_POSE_OUTPUTS = 6  # change of the position and Gibbs vector
 KIND = "s2r"
 S2R_FILE = "s2r.npz"  # in the folder of a calibration, and of a run that was trained with it
 
 
 class S2R(NamedTuple):
-    """A network with the range it was trained in; n_in is 9 + n springs, n_out 6 for an arm. All float32."""
+    """Network and its training range; n_in is 9 + n springs, n_out is 6. All float32."""
 
     layers: tuple[Layer, ...]  # normalised inputs (n_in,) -> corrections (n_out,)
-    input_low: Array  # (n_in,) least and greatest of the training rows,
-    input_high: Array  # (n_in,) normalised to -1 and 1
-    output_low: Array  # (n_out,) the same of their corrections
-    output_high: Array  # (n_out,)
-    anchors: Array  # (n_anchors, n_in) normalised training rows that stand for all of them
+    input_low: Array  # (n_in,) least inputs of the training rows, normalised to -1
+    input_high: Array  # (n_in,) greatest inputs of the training rows, normalised to 1
+    output_low: Array  # (n_out,) least corrections of the training rows
+    output_high: Array  # (n_out,) greatest corrections of the training rows
+    anchors: Array  # (n_anchors, n_in) normalised training rows that represent all of them
     limit: Array  # () greatest believable distance to the nearest anchor
 
 
@@ -58,12 +57,9 @@ def correct(s2r: S2R, pose: Array, spring_m: Array) -> Array:
 
 
 def extrapolation(s2r: S2R, pose: Array, spring_m: Array) -> Array:
-    """Return the distance (...) to the training rows over its limit; above 1, do not trust the network.
+    """Return the distance (...) to the training rows as a multiple of its limit, for arguments of `correct`.
 
-    Args:
-        s2r: the network.
-        pose (..., 6) [mm, deg]: as for `correct`.
-        spring_m (..., n) [m]: as for `correct`.
+    Above 1, do not trust the network.
     """
     return distance(s2r, inputs(frame_from_pose(pose), spring_m)) / s2r.limit
 
@@ -76,7 +72,7 @@ def inputs(frame: tuple[Array, Array], spring_m: Array) -> Array:
 
 
 def correction(s2r: S2R, x: Array) -> Array:
-    """Return outputs (..., n_out) of inputs (..., n_in), never outside the range of the training rows."""
+    """Return the corrections (..., n_out) of inputs (..., n_in), within the range of the training rows."""
     xp = array_namespace(x, s2r.input_low)
     z = xp.clip(_normalised(s2r, x), -1.0, 1.0)
     return xp.clip(mlp(s2r.layers, z), s2r.output_low, s2r.output_high)
@@ -90,7 +86,7 @@ def distance(s2r: S2R, x: Array) -> Array:
 
 
 def apply_correction(frame: tuple[Array, Array], change: Array) -> tuple[Array, Array]:
-    """Move and turn a frame in the base frame; its axes come out scaled, which no angle depends on.
+    """Move and turn a frame in the base frame; this scales its axes, which changes no angle.
 
     Args:
         frame: origin (..., 3) [m] and axes (..., 3, 3).
@@ -103,7 +99,7 @@ def apply_correction(frame: tuple[Array, Array], change: Array) -> tuple[Array, 
 
 
 def correction_between(pose: Array, real_pose: Array) -> Array:
-    """Return the change (..., 6) that `apply_correction` needs to reach the real pose; below 180 degrees."""
+    """Return the change (..., 6) that makes `apply_correction` reach the real pose; turns below 180 deg."""
     xp = array_namespace(pose, real_pose)
     (start_m, start), (end_m, end) = frame_from_pose(pose), frame_from_pose(real_pose)
     turn = end @ xp.swapaxes(start, -1, -2)
@@ -118,14 +114,14 @@ def correction_between(pose: Array, real_pose: Array) -> Array:
 def carry_body(plate_position: Array, plate_rotation: Array, real_pose: Array) -> tuple[Array, Array]:
     """Estimate the plates of the real arm from the correction of its tip.
 
-    An approximation: a tilted base, the main cause of the offset, moves a plate the more the further down it
-    is. So each plate moves by a share of the tip's offset, by its place along the arm, and keeps
-    its direction; the last plate is that of the real tip. A shift of the base itself is not corrected there.
+    This is an approximation. Each plate moves by a share of the tip's offset that grows evenly along the arm,
+    as under a tilted base, the main cause of the offset, and keeps its direction. The last plate is that of
+    the real tip. A shift of the base itself is not corrected at the base.
 
     Args:
         plate_position (..., L + 1, 3) [m]: simulated, as in `mjx_softarm.mechanics.kinematics.Frames`.
         plate_rotation (..., L + 1, 3, 3): axes of these plates.
-        real_pose (..., 6) [mm, deg]: of the tip, from `correct`.
+        real_pose (..., 6) [mm, deg]: pose of the tip, from `correct`.
 
     Returns:
         Positions and rotations of the real arm's plates, in the same shapes.
@@ -139,11 +135,12 @@ def carry_body(plate_position: Array, plate_rotation: Array, real_pose: Array) -
 
 
 def _normalised(s2r: S2R, x: Array) -> Array:
+    """Scale inputs (..., n_in), so that those of the training rows lie in [-1, 1]."""
     return 2.0 * (x - s2r.input_low) / (s2r.input_high - s2r.input_low) - 1.0
 
 
 def save_s2r(path: str | Path, s2r: S2R) -> None:
-    """Check a network and write it, whole or not at all; the same network gives the same bytes.
+    """Check a network and write it, whole or not at all. Equal networks give equal bytes.
 
     Raises:
         SealedFileError: the network is not valid, such as a weight that is not finite, or the file cannot be

@@ -1,8 +1,8 @@
-"""The springs' sensors: readings <-> calibrated lengths, the range that is believed, and faults.
+"""Sensors of the springs: readings <-> calibrated lengths, believed range, and faults.
 
-A sensor is one class. Its fields are the section `[sensor]` of a specification, chosen by `kind`; its class
-variables name the reading in logs; its two maps between a reading and a raw length l are all that differs
-from one sensor to another. The calibration is the same for all of them:
+A sensor is one class. Its fields are the section `[sensor]` of a specification, chosen by `kind`. Its class
+variables describe the readings in logs. Its methods `raw_length` and `raw_reading` map between readings and
+raw lengths l. All sensors share the calibration
 
     L = beta l + delta
 
@@ -41,7 +41,7 @@ class SensorFault(IntEnum):
 
 
 class Reading(NamedTuple):
-    """Lengths, and which of them are true."""
+    """Lengths read by the sensors, and the fault of each."""
 
     length_m: Array  # (..., n), always finite
     fault: Array  # (..., n) int32, a `SensorFault`
@@ -56,11 +56,11 @@ class Sensor:
     """
 
     kind: ClassVar[str]  # `kind` in the specification
-    reading_name: ClassVar[str]  # of the columns of a log, and of an action's entries
-    units: ClassVar[Mapping[str, float]]  # of a log, with factors to the unit used inside, the first
-    range_fields: ClassVar[tuple[str, str]]  # fields that hold the least and the greatest believed reading
-    plausible: ClassVar[tuple[float, float]]  # a log's column with a median outside has another unit
-    spike: ClassVar[float]  # a reading that is off its neighbours by less is no outlier
+    reading_name: ClassVar[str]  # name of the readings in logs and actions
+    units: ClassVar[Mapping[str, float]]  # units of logs, as multiples of the first, which is used here
+    range_fields: ClassVar[tuple[str, str]]  # fields with the least and the greatest believed reading
+    plausible: ClassVar[tuple[float, float]]  # range of medians; a log's column outside has another unit
+    spike: ClassVar[float]  # least distance of an outlier from the readings before and after it
     noise: ClassVar[float]  # standard deviation of a twin's readings
     resolution: ClassVar[float]  # step of a twin's converter
 
@@ -85,33 +85,34 @@ class Sensor:
         return getattr(self, low), getattr(self, high)
 
     def raw_length(self, readings: Array) -> tuple[Array, Array]:
-        """Map believed readings (..., n) to raw lengths [m], finite, and whether there are such (bool)."""
+        """Map believed readings (..., n) to finite raw lengths [m], and to whether they exist (bool)."""
         raise NotImplementedError
 
     def raw_reading(self, raw_m: Array) -> tuple[Array, Array]:
-        """Map raw lengths (..., n) [m] to readings, finite, and whether there are such (bool)."""
+        """Map raw lengths (..., n) [m] to finite readings, and to whether they exist (bool)."""
         raise NotImplementedError
 
     def lengths(self, readings: Array, fallback_m: Array = 0.0) -> Reading:
         """Return the calibrated spring lengths of readings.
 
-        A reading that gives no length is reported in `fault`, never passed on: its length is `fallback_m`,
-        and no gradient flows through it. A control loop gives the last good lengths, so that one lost reading
-        holds its chamber for a tick; how many lost readings in a row stop the arm is for the loop to say. The
-        default, 0 m, is a length no spring has; use it where `fault` is looked at.
+        A reading that gives no length is reported in `fault`: its length is `fallback_m`, and no gradient
+        flows through it. A control loop passes the last good lengths, so that one lost reading holds its
+        chamber for a tick. The default of 0 m is a length that no spring has; use it where `fault` is read.
 
         Args:
-            readings (..., n) [unit]: any number at all.
+            readings (..., n) [unit]: any numbers, NaN and infinity among them.
             fallback_m () or (..., n) [m]: length of a faulty reading, finite.
         """
+        # Lengths; readings that are not believed are replaced, so that no NaN arises on their way
         xp = array_namespace(readings, fallback_m, *vars(self).values())
         low, high = self.range
         believed = (readings >= low) & (readings <= high)
         raw_m, exists = self.raw_length(xp.where(believed, readings, low))
         length_m = self.beta * raw_m + self.delta_m
 
+        # Faults; a later one overrules an earlier one
         fault = xp.zeros(length_m.shape, xp.int32)
-        for bad, code in (  # a later one overrules
+        for bad, code in (
             (length_m <= 0.0, SensorFault.NO_LENGTH),
             (~exists, SensorFault.NO_COIL),
             (readings > high, SensorFault.TOO_HIGH),
@@ -124,20 +125,18 @@ class Sensor:
     def readings(self, length_m: Array) -> Array:
         """Return the readings (..., n) [unit] of springs of calibrated length (..., n) [m].
 
-        A length that the sensor cannot have reads NaN; `lengths` reports such a reading.
+        A length that no reading has gives NaN; `lengths` reports such a reading.
         """
         xp = array_namespace(length_m, *vars(self).values())
         readings, exists = self.raw_reading((length_m - self.delta_m) / self.beta)
         return xp.where(exists, readings, math.nan)
 
     def describe_faults(self, readings: Array, fault: Array) -> str:
-        """Return a line for each faulty spring, "" where there is none.
-
-        A line names the spring as the model does, what was read and what was expected.
+        """Return a line for each faulty spring: its name in the model, what was read, what was expected.
 
         Args:
-            readings (n,) [unit]: of one arm.
-            fault (n,): as `lengths` reports.
+            readings (n,) [unit]: readings of one arm.
+            fault (n,): faults from `lengths`.
         """
         lines = []
         for index in np.flatnonzero(np.asarray(fault) != SensorFault.OK):
@@ -179,13 +178,13 @@ class Coil(Sensor):
     reading_name = "frequency"
     units = MappingProxyType({"Hz": 1.0, "kHz": 1e3, "MHz": 1e6})
     range_fields = ("frequency_min_hz", "frequency_max_hz")
-    plausible = (1e4, 1e7)  # the LDC1612 reads from 1 kHz, but no such coil is below 10
+    plausible = (1e4, 1e7)  # the LDC1612 reads from 1 kHz, but no such coil resonates below 10 kHz
     spike = 1e3
     noise = 300.0  # assumed: 0.04 mm of a spring 0.2 m long; far above the converter's own
     resolution = 40e6 / 2**28  # LDC1612 data sheet, TI SNOSCY9: 28 bits of a reference clock of 40 MHz
 
     capacitance_f: float | Array = positive()
-    compensation_h: float | Array = anything()  # in series with the coil; may be zero or negative
+    compensation_h: float | Array = anything()  # inductance in series with the coil; may be zero or negative
     turns: float | Array = positive()
     coil_radius_m: float | Array = positive()
     frequency_min_hz: float | Array = positive()
@@ -204,7 +203,7 @@ class Coil(Sensor):
         """Map frequencies to wire lengths; there is none where the compensation resonates without a coil."""
         xp = array_namespace(readings, *vars(self).values())
         inverse_h = self.inverse_inductance(readings)
-        coil_share = 1.0 - self.compensation_h * inverse_h  # of the total inductance
+        coil_share = 1.0 - self.compensation_h * inverse_h  # coil's share of the total inductance
         exists = coil_share > 0.0
         return self.coil_hm * inverse_h / xp.where(exists, coil_share, 1.0), exists
 

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_softarm._support.small_matrices import solve
+from mjx_softarm._support.small_matrices import solve_approximate_gradient as solve
 
 
 def test_solutions_and_gradients_of_symmetric_systems():
