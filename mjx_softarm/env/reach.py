@@ -1,7 +1,7 @@
 """One arm that reaches for poses: a brax environment with the paper's state, action and reward.
 
-An action is nine sensor readings, scaled to [-1, 1]; the sensor-space law turns them into pressures.
-`mode="quasistatic"` goes straight to the equilibrium; `mode="dynamic"` steps MJX's equation of motion, with
+An action is one sensor reading per spring, scaled to [-1, 1]; the sensor-space law turns it into pressures.
+`mode="quasistatic"` goes straight to the equilibrium. `mode="dynamic"` steps MJX's equation of motion, with
 chambers that fill, under the law at the control rate. Both have their kinematics from `engine`.
 """
 
@@ -37,57 +37,53 @@ class ReachEnv(Env):
     A pose is the tip's x, y, z [mm] and yaw, pitch, roll [deg] in the base frame, z up. For the paper's arm:
 
     Observation (18,), without unit, in the order of `mjx_softarm.mdp.observation.OBS_LAYOUT`:
-        0-5    pose of the tip, relative to the straight arm; positions divided by a third of its length,
-               angles by 90 deg
+        0-5    pose of the tip relative to the straight arm, in thirds of its length and units of 90 deg
         6-11   pose of the goal, scaled in this way, too
         12-17  error w (pose - goal), by the reward's weights per mm and per degree, angles wrapped
-        With `observation="payload"` the payload follows, as a share of the largest; with "motion" 39 more,
-        see `mjx_softarm.mdp.observation.observe_motion`
+        With `observation="payload"` the payload follows, as a share of the largest; with "motion" the 39
+        numbers of `mjx_softarm.mdp.observation.observe_motion`
 
-    Action (n_chambers,), each in [-1, 1]: readings of the springs' sensors to be reached, from that of the
-        shortest to that of the longest spring (`mjx_softarm.mdp.actions`). The sensor-space law then sets the
-        pressures.
-
-    Reward (), without unit: the sum of the terms of `mjx_softarm.mdp.rewards.reward`.
-
-    Done (): 1 where the goal is reached with no chamber saturated, or where the simulation failed.
+    Action (n_chambers,), each in [-1, 1]: sensor readings that the sensor-space law is to reach, from the
+        reading of the shortest to that of the longest spring (`mjx_softarm.mdp.actions`)
+    Reward (), without unit: the sum of the terms of `mjx_softarm.mdp.rewards.reward`
+    Done (): 1 where the goal is reached with no chamber saturated, or where the simulation failed
 
     Info:
-        valid () bool            the simulation succeeded; learn from no other step
-        saturated () bool        a chamber is at a pressure limit with its spring off its reference
-        blocked (n_chambers,)    which chambers are
-        clearance_mm ()          distance of the body to the pipe's wall, in motion the least in the control
-                                 periods of the action; infinite without a pipe
+        valid () bool            the simulation succeeded; do not learn from other steps
+        blocked (n_chambers,)    bool, chamber is at a pressure limit with its spring off its reference
+        saturated () bool        a chamber is blocked
+        clearance_mm ()          least distance of the body to the pipe's wall; infinite without a pipe
         path_mm (n_ticks, 3)     in motion: position of the tip at the start of each control period
 
     Metrics, each () float32:
         tip_error_mm             distance of the tip to the goal
         reached                  1 where the goal is reached
-        saturated_chambers       number of them
+        saturated_chambers       number of blocked chambers
         unsettled                1 where the step is not valid
-        invalid_REASON           1 for that reason, a code of `SettleResult`, or in motion of `MotionResult`
+        invalid_REASON           1 for this code of `SettleResult`, or in motion of `MotionResult`
         reward_TERM              terms of the reward: goal, error, steps, saturation, clearance
 
-    With a sim-to-real network, every pose that is observed, rewarded or drawn as a goal is the real arm's,
-    P_S2R, as the network predicts it from the simulated pose and the spring lengths; so is the body, whose
-    distance to a pipe's wall is measured.
+    With a sim-to-real network, all poses and the body are those of the real arm, P_S2R: the network predicts
+    them from the simulated pose and the spring lengths.
     """
 
     def __init__(self, spec: ArmSpec | None = None, config: EnvConfig | None = None, s2r: S2R | None = None):
-        self.spec = spec or ArmSpec.default()
-        self.config = config or EnvConfig()
-        self.s2r = s2r
+        self.spec, self.config, self.s2r = spec or ArmSpec.default(), config or EnvConfig(), s2r
         if self.config.dynamic_step_s < 1.0 / self.spec.control.rate_hz:
             raise ValueError(
                 f"EnvConfig.dynamic_step_s: got {self.config.dynamic_step_s}, expected at least one "
                 f"period of the control at control.rate_hz = {self.spec.control.rate_hz:g}"
             )
+
+        # Parameters, law, actions and observations
         self.params = jax.tree.map(jnp.asarray, ArmParams.from_spec(self.spec))
         self.scale = obs.ObsScale.from_spec(self.spec)
         self.gains = control.Gains.from_spec(self.spec)
         sensor, *limits = ActionMap.from_spec(self.spec)
         self.action_map = ActionMap(sensor, *(jnp.asarray(limit, jnp.float32) for limit in limits))
         self.walls = Walls(self.config.pipe_diameter_mm, self.spec, self.params, s2r)
+
+        # Simulation, and the poses that starts and goals are drawn from
         self.uses_mjx = self.config.engine == "mjx" or self.config.moves
         self.n_at_once = arms_at_once(self.spec.n_links)
         self.model = mjx.put_model(build_model(self.spec)) if self.uses_mjx else None
@@ -127,13 +123,14 @@ class ReachEnv(Env):
         return pool._replace(pose=self._observed_pose(pool.pose, pool.spring_m))
 
     def _training_pool(self) -> Pool:
-        """Draw the poses that starts and goals are drawn from."""
+        """Draw poses of the workspace, a share of them uniform in volume."""
         n_even = round(self.config.even_share * self.config.n_poses)
         counts = (self.config.n_poses - n_even, False), (n_even, True)
         parts = [self.sample_pool(n, self.config.workspace_seed, evenly) for n, evenly in counts if n]
         return jax.tree.map(lambda *part: jnp.concatenate(part), *parts)
 
     def _observed_pose(self, pose: Array, spring_m: Array) -> Array:
+        """Return the pose as it is observed: corrected, if there is a sim-to-real network."""
         if self.s2r is None:
             return pose
         with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
@@ -158,6 +155,7 @@ class ReachEnv(Env):
 
     def reset_from(self, noise: EpisodeNoise) -> State:
         """Start the episode that `noise` fixes."""
+        # Start and goal, and the arm of this episode
         share = noise.uniform
         start_row, goal_row = (self.config.n_poses * share[:2]).astype(jnp.int32)
         start = jax.tree.map(lambda x: x[start_row], self.pool)
@@ -175,24 +173,22 @@ class ReachEnv(Env):
             n_steps=jnp.zeros((), jnp.int32),
         )
         arm = self.put(arm, start)
+
+        # Metrics and info of an episode without a step
         zero = jnp.zeros(())
         names = ("tip_error_mm", "reached", "saturated_chambers", "unsettled", *self._failures)
         metrics = dict.fromkeys(names, zero)
         terms = rewards.reward(arm.pose, goal, arm.n_steps, jnp.array(False), self.config.reward)[2]
         metrics |= {f"reward_{name}": zero for name in terms}
-        info = {
-            "saturated": jnp.array(False),
-            "blocked": jnp.zeros(self.action_size, bool),
-            "valid": jnp.array(True),
-            "clearance_mm": self.walls.clearance_mm(start.q, start.pose),
-        }
+        info = {"saturated": jnp.array(False), "blocked": jnp.zeros(self.action_size, bool)}
+        info |= {"valid": jnp.array(True), "clearance_mm": self.walls.clearance_mm(start.q, start.pose)}
         if self.config.moves:
             info["path_mm"] = jnp.zeros((self.n_ticks, 3))
         return State(arm, self.observe(arm.pose, goal, arm.sensed), zero, zero, metrics, info)
 
-    def put(self, arm: ArmState, rest: Pool) -> ArmState:
+    def put(self, arm: ArmState, equilibrium: Pool) -> ArmState:
         """Return an arm at rest at an equilibrium, a row of a pool."""
-        arm = arm._replace(**at_rest(rest))
+        arm = arm._replace(**at_rest(equilibrium))
         return arm._replace(sensed=self._sensed(arm, arm, self.action_of(arm.spring_m + arm.sensor_offset_m)))
 
     def step(self, state: State, action: Array) -> State:
@@ -201,46 +197,45 @@ class ReachEnv(Env):
         An arm that did not settle, or is not finite, keeps its last pose, earns nothing and ends its episode;
         `info["valid"]` is then false, and the transition must not be learned from.
         """
+        # Move; a NaN in the action would ask for a length of 0
         arm: ArmState = state.pipeline_state
         reference = self.reference_m(action)
         motion, end = self._move(arm, reference - arm.sensor_offset_m)
-        finite = jnp.all(jnp.isfinite(action))  # a NaN would ask for a length of 0
-        result = jnp.where(finite, end.result, self._results.NOT_FINITE.value)
+        result = jnp.where(jnp.all(jnp.isfinite(action)), end.result, self._results.NOT_FINITE.value)
         valid = result == 0
-        moved = arm._replace(
+
+        # Next state; where the simulation failed, the arm keeps its last one
+        next_arm = arm._replace(
             motion=motion,
             pose=self._observed_pose(pose_from_frame(end.tip_position_m, end.tip_rotation), end.spring_m),
             spring_m=end.spring_m,
             pressure_kpa=end.pressure_kpa,
             n_steps=arm.n_steps + 1,
         )
-        moved = moved._replace(sensed=self._sensed(moved, end, action))
-        arm = jax.tree.map(lambda new, old: jnp.where(valid, new, old), moved, arm)
-        tolerance = 1e-3 * self.config.saturation_tolerance_mm
-        reading = arm.spring_m + arm.sensor_offset_m
-        held_kpa = arm.motion.law.integral_kpa  # pressures of a rest; in motion a limit may pass
+        next_arm = next_arm._replace(sensed=self._sensed(next_arm, end, action))
+        arm = jax.tree.map(lambda new, old: jnp.where(valid, new, old), next_arm, arm)
+
+        # Saturation, by the law's integral: in motion a pressure may be at a limit for a moment
+        tolerance, reading = 1e-3 * self.config.saturation_tolerance_mm, arm.spring_m + arm.sensor_offset_m
+        held_kpa = arm.motion.law.integral_kpa
         saturated = control.saturated(held_kpa, reference, reading, self.gains, tolerance) & valid
-        blocked, way = jnp.any(saturated), self._way(arm, end, valid)
-        cost = self.clearance_cost(way["clearance_mm"])
-        terms: dict[str, Array]
-        value, reached, terms = rewards.reward(
-            arm.pose, arm.goal, arm.n_steps, blocked, self.config.reward, cost
-        )
+        blocked = jnp.any(saturated)
+
+        # Reward
+        way = self._way(arm, end, valid)
+        cost, config = self.clearance_cost(way["clearance_mm"]), self.config.reward
+        value, reached, terms = rewards.reward(arm.pose, arm.goal, arm.n_steps, blocked, config, cost)
+
         metrics = {
             "tip_error_mm": jnp.linalg.norm(arm.pose[:3] - arm.goal[:3]),
-            "reached": (reached & valid).astype(jnp.float32),
-            "saturated_chambers": jnp.sum(saturated).astype(jnp.float32),
-            "unsettled": (~valid).astype(jnp.float32),
-            **{name: (result == code).astype(jnp.float32) for name, code in self._failures.items()},
-        } | {
-            f"reward_{name}": jnp.where(valid, term, 0.0).astype(jnp.float32) for name, term in terms.items()
+            "reached": reached & valid,
+            "saturated_chambers": jnp.sum(saturated),
+            "unsettled": ~valid,
+            **{name: result == code for name, code in self._failures.items()},
+            **{f"reward_{name}": jnp.where(valid, term, 0.0) for name, term in terms.items()},
         }
-        info = {
-            "saturated": blocked,
-            "blocked": saturated,
-            "valid": valid,
-            **way,
-        }
+        metrics = {name: jnp.asarray(x, jnp.float32) for name, x in metrics.items()}
+        info = {"saturated": blocked, "blocked": saturated, "valid": valid, **way}
         return state.replace(
             pipeline_state=arm,
             obs=self.observe(arm.pose, arm.goal, arm.sensed),
@@ -251,7 +246,7 @@ class ReachEnv(Env):
         )
 
     def _move(self, arm: ArmState, reference_m: Array) -> tuple[Motion, Settled | MotionEnd]:
-        """Return the motion after an action that asks for true lengths, and the observables at its end."""
+        """Move to true spring lengths (n_chambers,): return the motion and the observables at its end."""
         params, config = self.params_of(arm), self.config
         kinematics = MjxKinematics(self.model) if config.engine == "mjx" else chain_kinematics(params)
         if config.moves:
@@ -263,7 +258,7 @@ class ReachEnv(Env):
         return Motion.at_rest(end.q, end.pressure_kpa, end.spring_m), end
 
     def _way(self, arm: ArmState, end: Settled | MotionEnd, valid: Array) -> dict[str, Array]:
-        """Return the clearance of `info` after an action, and the path of an arm that moved."""
+        """Return the clearance and, in motion, the path of `info`."""
         clearance_mm = self.walls.clearance_mm(arm.motion.q, arm.pose)
         if not isinstance(end, MotionEnd):
             return {"clearance_mm": clearance_mm}
@@ -278,12 +273,12 @@ class ReachEnv(Env):
         return self.config.clearance_cost_per_mm * within_mm
 
     def observe(self, pose: Array, goal: Array, sensed: Array | None = None) -> Array:
-        """Return the observation (..., O) of pose and goal (..., 6) [mm, deg], and of `ArmState.sensed`."""
+        """Return the observation (..., O) of pose and goal (..., 6) [mm, deg] and of `ArmState.sensed`."""
         observed = obs.observe(pose, goal, self.scale, self.config.reward)
         return observed if sensed is None else jnp.concatenate([observed, sensed], axis=-1)
 
     def _sensed(self, arm: ArmState, end: ArmState | Settled | MotionEnd, action: Array) -> Array | None:
-        """Return `ArmState.sensed` of an arm, at rest where `end` is not the end of a motion."""
+        """Return `ArmState.sensed`; without a motion before it, the arm is at rest and its rates are zero."""
         if self.config.observation == "pose":
             return None
         if self.config.observation == "payload":
@@ -294,11 +289,11 @@ class ReachEnv(Env):
             last_m, tip_mm = end.path.spring_m[before], 1e3 * end.tip_position_m
             last_mm = 1e3 * end.path.tip_position_m[before]
         read_m, last_m = arm.spring_m + arm.sensor_offset_m, last_m + arm.sensor_offset_m
-        integral_kpa = arm.motion.law.integral_kpa
-        return obs.observe_motion(read_m, last_m, tip_mm, last_mm, integral_kpa, action, self.spec)
+        held_kpa = arm.motion.law.integral_kpa
+        return obs.observe_motion(read_m, last_m, tip_mm, last_mm, held_kpa, action, self.spec)
 
     def params_of(self, arm: ArmState) -> ArmParams:
-        """Return the numbers of an arm, with those of its episode in their places."""
+        """Return the parameters of an arm, with those of its episode in their places."""
         return self.params._replace(
             tool_mass_kg=self.params.tool_mass_kg.at[PAYLOAD].set(arm.payload_kg),
             chamber_stiffness=arm.chamber_stiffness,
