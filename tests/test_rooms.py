@@ -11,7 +11,6 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 # Rooms of a level may import those of the levels before, and others of their own level without a circle.
-# Imports for types alone do not count: a sensor is made from a specification, which holds one.
 LEVELS = (
     ("_support",),
     ("sensing", "arms"),
@@ -62,16 +61,11 @@ def files():
             yield room_of(".".join(path.relative_to(ROOT).with_suffix("").parts)), path
 
 
-def is_type_checking(node):
-    return isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
-
-
+TREES = [(room, path, ast.parse(path.read_text("utf-8"))) for room, path in files()]
 ARROWS = [
     (room, other, path)
-    for room, path in files()
-    for node in ast.parse(path.read_text("utf-8")).body
-    if not is_type_checking(node)
-    for name in imported(node, path)
+    for room, path, tree in TREES
+    for name in imported(tree, path)
     if (other := room_of(name))
 ]
 
@@ -95,15 +89,13 @@ def test_no_circle_between_rooms():
     assert set(graphlib.TopologicalSorter(graph).static_order()) >= set(LEVEL)
 
 
-def test_no_circle_between_modules():
-    """By what is imported as a module is imported, not by functions or for types alone."""
-    graph = {}
-    for _, path in files():
-        name = ".".join(path.relative_to(ROOT).with_suffix("").parts)
-        top = [node for node in ast.parse(path.read_text("utf-8")).body if not is_type_checking(node)]
-        taken = [node for node in top if isinstance(node, ast.Import | ast.ImportFrom)]
-        graph[name] = {found for node in taken for found in imported(node, path)}
-    graph = {name: found & graph.keys() for name, found in graph.items()}
+def test_no_circle_between_files():
+    """Imports in functions and imports for types count, too."""
+    taken = {
+        ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): imported(tree, path)
+        for _, path, tree in TREES
+    }
+    graph = {name: (set(found) & taken.keys()) - {name} for name, found in taken.items()}
     assert sum(map(len, graph.values())) > 200
     assert len(list(graphlib.TopologicalSorter(graph).static_order())) == len(graph)
 
@@ -121,10 +113,8 @@ def test_training_and_calibration_never_import_the_twin(room):
 
 @pytest.mark.parametrize("room", LIGHT)
 def test_light_rooms_name_no_simulator(room):
-    paths = [path for top, path in files() if top == room]
-    trees = {path: ast.parse(path.read_text("utf-8")) for path in paths}
-    names = {(path.name, name) for path, tree in trees.items() for name in imported(tree, path)}
-    assert paths and not {(path, name) for path, name in names if name.split(".")[0] in HEAVY}
+    names = {(path, name) for top, path, tree in TREES if top == room for name in imported(tree, path)}
+    assert names and not {(path, name) for path, name in names if name.split(".")[0] in HEAVY}
 
 
 LOADED = """
