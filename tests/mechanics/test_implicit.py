@@ -18,13 +18,14 @@ from mjx_softarm.mechanics.statics import statics
 
 SPEC = ArmSpec.default()
 SHORT = SPEC.replace(structure={"n_sections": 2, "links_per_section": 2})
-N = 512
+ONE = SPEC.replace(structure={"n_sections": 1, "links_per_section": 2})
+N = 128
 SEEN = ("q", "pressure_kpa", "spring_m", "tip_position_m", "tip_rotation")  # these have a derivative
 
 
-def references(seed=0):
-    """Spring lengths (N, 9) [m] that hold half of the chambers at a limit."""
-    return np.random.default_rng(seed).uniform(0.09, 0.285, (N, 9))
+def references(spec):
+    """Spring lengths (N, n_chambers) [m] that hold half of the chambers at a limit."""
+    return np.random.default_rng(0).uniform(0.09, 0.285, (N, spec.n_chambers))
 
 
 def seen(found):
@@ -59,22 +60,21 @@ def equilibrium_of_set(params, reference, q, pressure, at_limit, at_high):
     return dict(zip(SEEN, fields, strict=True)), jnp.max(jnp.abs(left))
 
 
-@functools.cache
-def directions():
-    """A change of the arm's numbers, each in parts of itself, and changes (N, 9) [m] of the references."""
+def directions(spec):
+    """Relative changes of the arm's parameters, and changes (N, n_chambers) [m] of the references."""
     rng = np.random.default_rng(1)
-    arm = jax.tree.map(lambda x: rng.normal(size=np.shape(x)), ArmParams.from_spec(SPEC, np.float64))
-    return arm, 0.01 * rng.normal(size=(N, 9))
+    arm = jax.tree.map(lambda x: rng.normal(size=np.shape(x)), ArmParams.from_spec(spec, np.float64))
+    return arm, 0.01 * rng.normal(size=(N, spec.n_chambers))
 
 
 @functools.cache
 def comparison():
     """Shares of the two directions -> settled arms, their derivative, and the quotient of differences."""
-    arm, turn = directions()
+    arm, turn = directions(SHORT)
 
     def compare(shares, reference, turn):
         def moved(step):
-            params = ArmParams.from_spec(SPEC, np.float64)
+            params = ArmParams.from_spec(SHORT, np.float64)
             params = jax.tree.map(lambda x, d: x * (1.0 + shares[1] * step * d), params, arm)
             return params, reference + shares[0] * step * turn
 
@@ -91,7 +91,7 @@ def comparison():
     @functools.cache
     def of(*shares):
         with jax.enable_x64(True):
-            return jax.device_get(jitted(np.array(shares), references(), turn))
+            return jax.device_get(jitted(np.array(shares), references(SHORT), turn))
 
     return of
 
@@ -113,7 +113,7 @@ def test_the_derivative_is_that_of_finite_differences_at_the_same_active_set(sha
 
 
 def test_reverse_mode_is_the_transpose_of_forward_mode():
-    params, reference = ArmParams.from_spec(SHORT), np.float32(references()[:8, :6])
+    params, reference = ArmParams.from_spec(SHORT), np.float32(references(SHORT)[:8])
     rng = np.random.default_rng(2)
     direction = jax.tree.map(lambda x: np.float32(x * rng.normal(size=np.shape(x))), params)
     turn = np.float32(0.01 * rng.normal(size=reference.shape))
@@ -136,9 +136,8 @@ def test_reverse_mode_is_the_transpose_of_forward_mode():
 
 
 def test_both_engines_have_the_same_derivative():
-    spec = SHORT.replace(structure={"n_sections": 1})
-    params = ArmParams.from_spec(spec)
-    reference, turn = np.float32(references()[:, :3]), np.float32(directions()[1][:, :3])
+    params = ArmParams.from_spec(ONE)
+    reference, turn = np.float32(references(ONE)), np.float32(directions(ONE)[1])
 
     def slopes(kinematics, uses_mjx=False):
         def one(reference, turn):
@@ -147,7 +146,7 @@ def test_both_engines_have_the_same_derivative():
         return xla.jit(jax.vmap(one), uses_mjx)(reference, turn)
 
     chain = slopes(chain_kinematics(params))
-    mjx_slope = slopes(MjxKinematics(mjx.put_model(build_model(spec))), uses_mjx=True)
+    mjx_slope = slopes(MjxKinematics(mjx.put_model(build_model(ONE))), uses_mjx=True)
     for name in SEEN:
         assert np.abs(chain[name]).max() > 1e-2
         assert np.quantile(relative_error(mjx_slope[name], chain[name]), 0.99) < 1e-2, name
@@ -159,25 +158,31 @@ def test_held_pressures_have_the_derivative_of_their_own_equilibrium():
         params = ArmParams.from_spec(SHORT, np.float64)
         kinematics = chain_kinematics(params)
         pressure = np.random.default_rng(3).uniform(-35.0, 15.0, 6)
-        slope = jax.jacfwd(lambda p: settle_pressures(kinematics, params, p).q)(pressure)
-        q = settle_pressures(kinematics, params, pressure).q
-        here = statics(kinematics(q), q, pressure, params)
-        expected = np.linalg.solve(here.hessian.dense(), here.push_per_kpa.reshape(-1, 6))
-        np.testing.assert_allclose(slope, expected, rtol=1e-9, atol=1e-12)
+
+        @jax.jit
+        def both(pressure):
+            slope = jax.jacfwd(lambda p: settle_pressures(kinematics, params, p).q)(pressure)
+            q = settle_pressures(kinematics, params, pressure).q
+            here = statics(kinematics(q), q, pressure, params)
+            return slope, jnp.linalg.solve(here.hessian.dense(), here.push_per_kpa.reshape(-1, 6))
+
+        np.testing.assert_allclose(*both(pressure), rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
-def test_an_arm_that_does_not_settle_has_a_zero_derivative(mode):
-    params = ArmParams.from_spec(SHORT.replace(backbone={"bending_stiffness_nm_per_rad": 1e-3}))
-    reference = np.float32(references()[:8, :6])
+def test_an_arm_that_does_not_settle_has_a_zero_derivative():
+    params = ArmParams.from_spec(ONE.replace(backbone={"bending_stiffness_nm_per_rad": 1e-3}))
+    reference = np.float32(references(ONE)[:8])
     reference[3, 0] = np.nan
 
     def fields(reference, spring_rest_m):
         return seen(chain_settle(params._replace(spring_rest_m=spring_rest_m), reference))
 
-    slopes = jax.jit(jax.vmap(mode(fields, argnums=(0, 1)), in_axes=(0, None)))
-    slope = slopes(reference, params.spring_rest_m)
-    found = jax.jit(jax.vmap(chain_settle, in_axes=(None, 0)))(params, reference)
-    assert not found.settled[3] and not found.settled.all()
+    @functools.partial(jax.vmap, in_axes=(0, None))
+    def slopes(*arguments):
+        modes = (mode(fields, argnums=(0, 1))(*arguments) for mode in (jax.jacfwd, jax.jacrev))
+        return chain_settle(params, arguments[0]), tuple(modes)
+
+    found, slope = jax.jit(slopes)(reference, params.spring_rest_m)
+    assert not found.settled[3] and found.settled.sum() < 7
     for x in jax.tree.leaves(slope):
         assert (x[~found.settled] == 0).all() and np.isfinite(x).all()

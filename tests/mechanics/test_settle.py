@@ -3,6 +3,7 @@
 import functools
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -229,42 +230,42 @@ def test_an_impossible_arm_is_reported_not_raised(arm, solve, targets):
 
 
 def softened(softer, reference_m, n_at_once=None):
-    """Settle an arm that has springs, holes and a mount of its own."""
+    """Tip, and its change with the reference, of an arm that has springs, holes and a mount of its own."""
     params = ArmParams.from_spec(SPEC.replace(**ARMS["one section of two links"]))
     params = params._replace(
         chamber_stiffness=params.chamber_stiffness / softer,
         chamber_site_m=params.chamber_site_m * softer**0.1,
         mount=params.mount._replace(tip_offset_m=params.mount.tip_offset_m + 0.01 * softer),
     )
-    return settle(chain_kinematics(params), params, reference_m, n_at_once)
+    kinematics = chain_kinematics(params)
+    found, change = jax.jvp(
+        lambda x: settle(kinematics, params, x, n_at_once), (reference_m,), (0.1 * reference_m,)
+    )
+    return jnp.stack([found.tip_position_m, change.tip_position_m])
 
 
-def test_many_arms_at_once_settle_as_each_does_alone_whatever_numbers_they_share():
-    softer, target = np.float32([1.0, 1.3]), np.float32(references(3)[:3])
-    alone = jax.jit(softened)
-    expected = np.array([[alone(x, y).tip_position_m for y in target] for x in softer])
-    own = jax.jit(jax.vmap(softened))(softer, target[[0, 2]])
-    np.testing.assert_allclose(own.tip_position_m, expected[[0, 1], [0, 2]], atol=1e-6)
-    shared = jax.jit(jax.vmap(jax.vmap(softened, (None, 0)), (0, None)))(softer, target)
-    np.testing.assert_allclose(shared.tip_position_m, expected, atol=1e-6)
+@functools.cache
+def softened_alone(softer, row):
+    return np.asarray(jax.jit(softened)(np.float32(softer), np.float32(references(3)[row])))
 
 
-def test_arms_in_chunks_settle_as_all_at_once_do():
-    softer, target = np.float32([1.0, 1.1, 1.2, 1.3, 1.4]), np.float32(references(3)[:3])
+@pytest.mark.parametrize("n_at_once", [None, 2])
+def test_many_arms_settle_as_each_does_alone_whatever_numbers_they_share(n_at_once):
+    """Five arms, one of them in the last chunk of two; their numbers are NumPy's."""
+    softer, row = np.float32([1.0, 1.1, 1.2, 1.3, 1.4]), np.array([0, 1, 2, 0, 1])
+    target = np.float32(references(3))
 
-    def tips(softer, target, n_at_once):
-        found, change = jax.jvp(lambda x: softened(softer, x, n_at_once), (target,), (0.1 * target,))
-        return found.tip_position_m, change.tip_position_m
+    def settle_all():
+        own = jax.vmap(lambda x, y: softened(x, y, n_at_once))(softer, target[row])
+        shared = jax.vmap(lambda x: jax.vmap(lambda y: softened(x, y, n_at_once))(target[:3]))(softer[:2])
+        return own, shared
 
-    def of_all(n_at_once):
-        own = jax.jit(jax.vmap(lambda x, y: tips(x, y, n_at_once)))(softer, np.tile(target, (2, 1))[:5])
-        return own, jax.jit(jax.vmap(lambda x: tips(x, target[0], n_at_once)))(softer)
-
-    expected, chunks = of_all(None), of_all(2)
-    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-6), chunks, expected)
-    assert "scan" in str(jax.make_jaxpr(jax.vmap(lambda x: tips(x, target[0], 2)))(softer))
-    eager = jax.vmap(lambda x: softened(x, target[0], 2))(softer)  # whose numbers are NumPy's
-    np.testing.assert_allclose(eager.tip_position_m, expected[1][0], atol=1e-6)
+    own, shared = jax.jit(settle_all)()
+    expected = [softened_alone(x, k) for x, k in zip(softer.tolist(), row, strict=True)]
+    np.testing.assert_allclose(own, expected, atol=1e-6)
+    expected = [[softened_alone(x, k) for k in range(3)] for x in softer[:2].tolist()]
+    np.testing.assert_allclose(shared, expected, atol=1e-6)
+    assert ("scan" in str(jax.make_jaxpr(settle_all)())) == (n_at_once is not None)
 
 
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="elsewhere more arms are always faster")
