@@ -87,19 +87,18 @@ class EnvConfig:
         # Ranges of numbers
         for name in ("dynamic_step_s", "simulation_step_s"):
             _expect(self, name, 0 < getattr(self, name) < math.inf, "a finite number > 0")
-        for item in fields(self.reward):
-            value = getattr(self.reward, item.name)
-            _expect(self.reward, item.name, 0 <= value < math.inf, "a finite number >= 0")
-        cost, seed = "clearance_cost_per_mm", HELD_OUT_SEED
-        if self.pipe_diameter_mm is not None:
-            CrossPipe.of_mm(self.pipe_diameter_mm)  # raises ValueError
-        else:
-            _expect(self, cost, not self.clearance_cost_per_mm, "0 without a pipe_diameter_mm")
-        _expect(self, cost, 0 <= self.clearance_cost_per_mm < math.inf, "a finite number >= 0")
+        amounts = [(self.reward, item.name) for item in fields(self.reward)]
+        amounts += [(self, "clearance_cost_per_mm"), (self, "saturation_tolerance_mm")]
+        for config, name in amounts:
+            _expect(config, name, 0 <= getattr(config, name) < math.inf, "a finite number >= 0")
         _expect(self, "clearance_margin_mm", math.isfinite(self.clearance_margin_mm), "a finite number")
-        tolerance = "saturation_tolerance_mm"
-        _expect(self, tolerance, 0 <= self.saturation_tolerance_mm < math.inf, "a finite number >= 0")
         _expect(self, "n_poses", self.n_poses >= 1, "at least 1")
         _expect(self, "even_share", 0 <= self.even_share <= 1, "0 to 1")
-        other = f"another: {seed} draws the goals of the evaluation"
-        _expect(self, "workspace_seed", self.workspace_seed != seed, other)
+        other = f"another: {HELD_OUT_SEED} draws the goals of the evaluation"
+        _expect(self, "workspace_seed", self.workspace_seed != HELD_OUT_SEED, other)
+
+        # Pipe
+        no_cost = self.pipe_diameter_mm is not None or not self.clearance_cost_per_mm
+        _expect(self, "clearance_cost_per_mm", no_cost, "0 without a pipe_diameter_mm")
+        if self.pipe_diameter_mm is not None:
+            CrossPipe.of_mm(self.pipe_diameter_mm)  # raises ValueError

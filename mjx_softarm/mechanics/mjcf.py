@@ -26,6 +26,7 @@ _RING_COLOUR = [0.25, 0.27, 0.30, 1.0]
 _SPRING_COLOUR = [0.75, 0.77, 0.80, 1.0]
 _GRIPPER_COLOUR = [0.15, 0.16, 0.18, 1.0]
 _RING_HALF_HEIGHT_M = 0.002
+_DRAWN_ONLY = {"mass": 0.0, "contype": 0, "conaffinity": 0}  # bodies have the masses; nothing touches
 _BELLOWS_DRAWN = 0.45  # drawn width as a share of the outer diameter: convolutions are not drawn
 
 
@@ -121,16 +122,9 @@ def _polynomial(linear: float) -> list[float]:
 
 
 def _add_ring(body, plate: int, position, spec: ArmSpec) -> None:
-    body.add_geom(
-        name=f"ring{plate}",
-        type=mujoco.mjtGeom.mjGEOM_CYLINDER,
-        size=[ring_radius_m(spec), _RING_HALF_HEIGHT_M, 0.0],
-        pos=position,
-        rgba=_RING_COLOUR,
-        mass=0.0,
-        contype=0,
-        conaffinity=0,
-    )
+    size = [ring_radius_m(spec), _RING_HALF_HEIGHT_M, 0.0]
+    kind = mujoco.mjtGeom.mjGEOM_CYLINDER
+    body.add_geom(name=f"ring{plate}", type=kind, size=size, pos=position, rgba=_RING_COLOUR, **_DRAWN_ONLY)
 
 
 def _add_holes(body, plate: int, section: int, position, params: ArmParams, spec: ArmSpec) -> None:
@@ -154,27 +148,13 @@ def _add_tools(last, params: ArmParams, spec: ArmSpec) -> None:
         mass = float(params.tool_mass_kg[k])
         tool.mass, tool.ipos, tool.explicitinertial = mass, [0.0, 0.0, 0.0], True
         tool.inertia = [mass * length**2 / 12] * 3
-        if name == "gripper":
-            _draw_gripper(tool, spec)
+        boxes = gripper_boxes(spec).items() if name == "gripper" else ()
+        for box, (size, position) in boxes:
+            drawn = {"type": mujoco.mjtGeom.mjGEOM_BOX, "rgba": _GRIPPER_COLOUR, **_DRAWN_ONLY}
+            tool.add_geom(name=f"gripper_{box}", size=size, pos=position, **drawn)
     if spec.mass.payload_kg > 0:
         size = [payload_radius_m(spec.mass.payload_kg), 0.0, 0.0]
-        tool.add_geom(
-            name="payload", size=size, rgba=[0.2, 0.6, 0.25, 1.0], mass=0.0, contype=0, conaffinity=0
-        )
-
-
-def _draw_gripper(body, spec: ArmSpec) -> None:
-    for name, (size, position) in gripper_boxes(spec).items():
-        body.add_geom(
-            name=f"gripper_{name}",
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            size=size,
-            pos=position,
-            rgba=_GRIPPER_COLOUR,
-            mass=0.0,
-            contype=0,
-            conaffinity=0,
-        )
+        tool.add_geom(name="payload", size=size, rgba=[0.2, 0.6, 0.25, 1.0], **_DRAWN_ONLY)
 
 
 def _add_chamber(mjspec: mujoco.MjSpec, index: int, params: ArmParams, spec: ArmSpec) -> None:

@@ -25,7 +25,7 @@ from mjx_softarm.mechanics.settle import settle
 SPEC = ArmSpec.default()
 COARSE = SPEC.replace(structure={"links_per_section": 2})  # for MJX, which compiles for long with more
 GAINS = control.Gains.from_spec(SPEC)
-N_COMMANDS, N_MANY = 64, 512
+N_COMMANDS, N_MANY = 64, 128
 POSITION_MM, ANGLE_DEG = 0.1, 0.1
 
 # Soonest at rest: one second a step, every damper worth four seconds of its spring, and strong gains.

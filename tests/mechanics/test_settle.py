@@ -163,7 +163,7 @@ def test_a_payload_pulls_the_arm_down_by_its_weight_over_the_stiffness():
     assert height[0] - height[1] == pytest.approx(3 * 0.5 * 9.81 / section, rel=1e-3)
 
 
-def test_half_a_kilogram_moves_held_arms_by_as_much_as_the_readme_says():
+def test_half_a_kilogram_moves_held_arms_by_as_much_as_the_page_of_limits_says():
     """Pressures before it from the middle three quarters of their range, so that no chamber meets a limit."""
     middle, share = 0.5 * (LOW_KPA + HIGH_KPA), 0.75
     loaded = SPEC.replace(mass={"payload_kg": 0.5})
