@@ -8,8 +8,8 @@ Both are the `ReachEnv` of `mjx_softarm.env`, compiled, with NumPy arrays going 
     pose (6,), goal (6,) [mm, deg]    after a reset and after a step
     is_success, valid (bool)          after a step, with the environment's metrics by name
 
-An arm that did not settle ends its episode as truncated, with the observation it had before, reward 0 and
-`valid` false: leave such a step out of a replay buffer.
+An arm that did not settle ends its episode as truncated, with its last observation, reward 0 and `valid`
+false: leave such a step out of a replay buffer.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ Info = dict[str, Any]
 
 
 class SoftArmVectorEnv(gymnasium.vector.VectorEnv):
-    """Arms that reach for poses, stepped together; an arm whose episode ends starts a new one in that step.
+    """Arms that reach for poses, stepped together; an episode that ends is followed by a new one at once.
 
     Args:
         num_envs: number of arms.
         max_episode_steps: actions after which an episode is truncated.
         arm: the paper's if None.
-        config: how the arm is simulated and rewarded, and what differs from episode to episode.
+        config: simulation, observation, reward and randomisation.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
@@ -81,14 +81,17 @@ class SoftArmVectorEnv(gymnasium.vector.VectorEnv):
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:
         """Act once with every arm, actions (num_envs, n_chambers) in [-1, 1].
 
-        Where an episode ends, the observation and the info are those of the next one, and the last ones of
-        the episode are in `final_obs` and `final_info`.
+        Where an episode ends, observation and info belong to the next episode; `final_obs` and `final_info`
+        are the last ones of the episode that ended.
         """
+        # Act
         if self._state is None:
             raise gymnasium.error.ResetNeeded("SoftArmVectorEnv.step: got no episode, expected reset first")
         actions = _as_actions(actions, self.action_space.shape)
         self._state, results = self._step_arms(self._state, actions, _new_key(self.np_random))
         obs, reward, terminated, truncated, started, last, final_obs = _to_numpy(results)
+
+        # Infos: of the next episode for arms whose episode is over, with the last ones of this episode beside
         over = terminated | truncated
         infos = _where(np.ones(self.num_envs, bool), started)
         infos |= _where(~over, {name: last[name] for name in last.keys() - started.keys()})
@@ -111,7 +114,7 @@ class SoftArmEnv(gymnasium.Env):
 
     Args:
         arm: the paper's if None.
-        config: how the arm is simulated and rewarded, and what differs from episode to episode.
+        config: simulation, observation, reward and randomisation.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": []}
@@ -148,6 +151,7 @@ def as_sb3(envs: SoftArmVectorEnv) -> VecEnv:
     """
     from stable_baselines3.common.vec_env import VecEnv  # pyright: ignore[reportMissingImports]
 
+    # Methods that reset and step, then methods for single arms, which are refused
     class SB3VecEnv(VecEnv):
         def __init__(self):
             super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)

@@ -78,7 +78,7 @@ class VectorEnv:
         truncated = (after.pipeline_state.n_steps >= self.episode_length) & ~terminated
         over = terminated | truncated | ~valid
 
-        # A new episode for those; metrics are those of the action
+        # New episodes where the last one is over; metrics are always those of the action
         fresh = self.reset(key)
         following = jax.tree.map(
             lambda new, old: jnp.where(over.reshape((-1,) + (1,) * (old.ndim - 1)), new, old), fresh, after

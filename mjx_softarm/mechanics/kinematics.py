@@ -5,8 +5,8 @@ parent plate's -z (positive = extension) and two perpendicular hinges, x then y,
 joint coordinates are `q (3 * n_links,)`, ordered (slide [m], hinge x [rad], hinge y [rad]) link by link.
 Both engines return the same `Frames`; everything downstream is shared.
 
-Many arms at once come last in every shape, (..., *arms), where one instruction serves several of them;
-*arms is empty for one arm. A number that all of them share may have a 1 in their place.
+Many arms come last in every shape, (..., *arms): one instruction then serves several arms. For one arm,
+*arms is empty. A number that all arms share may have a 1 in their place.
 """
 
 from __future__ import annotations

@@ -158,7 +158,7 @@ def _solver(n_small: int, n_at_once: int | None) -> Callable[..., _Solution]:
 def _solve_arms_last(
     n_small: int, n: int, batched: list[Any], kinematics: Kinematics, params: ArmParams, reference_m: Array
 ) -> _Solution:
-    """Return what `_solve` finds for n arms; `batched` is true for arrays whose first axis is the arms."""
+    """Return the solutions of n arms; `batched` is true for arrays that have the arms as first axis."""
 
     def arms_last(x: Any, own: bool) -> Array:
         return jnp.moveaxis(x, 0, -1) if own else jnp.asarray(x)[..., None]
@@ -178,7 +178,7 @@ def _solve_arms_last(
 def _solve_in_chunks(
     solve: Callable, n: int, n_chunks: int, batched: list[Any], arguments: tuple
 ) -> _Solution:
-    """Return what `solve` finds for n arms, chunk after chunk; the last chunk repeats its last arm."""
+    """Return the solutions of n arms, chunk after chunk; the last chunk repeats its last arm."""
     arm = jnp.minimum(jnp.arange(n_chunks * -(-n // n_chunks)), n - 1).reshape(n_chunks, -1)
     axes = jax.tree.map(lambda own: 0 if own else None, tuple(batched))
 
@@ -231,7 +231,7 @@ def _newton_step(it: _Iterate, kinematics: Kinematics, params: ArmParams, refere
     error = reference_m - here.springs.length
     at_limit, limit = _active_set(it.pressure, error, params)
 
-    # Joints: H dq = B dp - grad V, so that dq = newton_step + dq_dp dp
+    # Joints: H dq = B dp - grad V, hence dq = newton_step + dq_dp dp
     hessian = here.hessian.plus_diagonal(it.stiffening * params.joint_stiffness)
     push, arms = here.push_per_kpa, error.shape[1:]
     gradient = here.gradient.reshape(*push.shape[:2], 1, *arms)

@@ -4,8 +4,8 @@ At given pressures p the arm is conservative. With l the chamber lengths and s t
 
     V(q) = gravity + backbone + sum k (l - l0)^2 / 2 + sum k_s (s - s0)^2 / 2 - sum p W(l),
 
-where W' = area_m2 + area_slope_m (l - L) is a chamber's effective area, L the section's length, so that p W
-is the work of its air. A tendon runs from ring to ring, so a segment depends on the three joints of its link
+where W' = area_m2 + area_slope_m (l - L) is a chamber's effective area and L the section's length: p W is the
+work of the air. A tendon runs from ring to ring, so a segment depends on the three joints of its link
 alone, and a length on the joints of its section. Only gravity couples sections.
 
 Many arms come last in every shape, (..., *arms), as in `mjx_softarm.mechanics.kinematics`.
