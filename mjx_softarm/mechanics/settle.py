@@ -169,7 +169,7 @@ def _solve_arms_last(
     else:
         axes = jax.tree.map(lambda own: 0 if own else None, kinematics_own)
         each = jax.vmap(lambda engine, q: engine(q), in_axes=(axes, -1), out_axes=-1)
-        kinematics = functools.partial(each, kinematics)
+        kinematics = functools.partial(each, kinematics)  # pyright: ignore[reportAssignmentType]
     reference_m = jnp.broadcast_to(arms_last(reference_m, reference_own), (reference_m.shape[-1], n))
     found = _solve(n_small, kinematics, jax.tree.map(arms_last, params, params_own), reference_m)
     return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), found)
