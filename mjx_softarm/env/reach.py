@@ -61,7 +61,7 @@ class ReachEnv(Env):
         saturated_chambers       number of blocked chambers
         unsettled                1 where the step is not valid
         invalid_REASON           1 for this code of `SettleResult`, or in motion of `MotionResult`
-        reward_TERM              terms of the reward: goal, error, steps, saturation, clearance
+        reward_TERM              terms of the reward: goal, error, steps, saturation, distance, clearance
 
     With a sim-to-real network, all poses and the body are those of the real arm, P_S2R: the network predicts
     them from the simulated pose and the spring lengths.
