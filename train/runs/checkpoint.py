@@ -39,8 +39,8 @@ class Run:
     `poses.npz` (of the newest evaluation), `evaluation.json`, pictures, TensorBoard's event files and, once
     exported, `policy.npz`.
 
-    Where several processes train together, all of them open the folder, which they share, and save
-    checkpoints; the rest is written by the first alone.
+    Several processes that train together share the folder. All of them open it and save checkpoints. The
+    first process alone writes all else.
     """
 
     def __init__(self, path: Path, config: TrainConfig, spec: ArmSpec, s2r: S2R | None = None):
@@ -66,30 +66,33 @@ class Run:
             config: all settings.
             spec: the arm.
             s2r: sim-to-real network of the arm's calibration, if there is one.
-            demonstrations: rows of the file that is learned from.
-            begins_with: folders of the runs that parts of the first state come from, by part.
-            first: that first state and its parts. The folder is a run's only once it holds them.
+            demonstrations: rows of the file of demonstrations, if the run learns from one.
+            begins_with: folders of other runs whose parts the first state has, by part.
+            first: first state with its parts, if it is not drawn from the seed.
 
         Raises:
             RunError: the folder already holds a run, or cannot be made.
         """
+        # Refuse a folder with a run. All processes look before the first one writes.
         if (path / "config.json").exists():
             raise RunError(
                 f"{path}: got a folder with a run, expected a new one; continue it with --resume {path}"
             )
         wait_for_all(f"{path} is free")
         try:
+            # Write what a run begins with, over what a start that was interrupted has left.
             if is_first_process():
                 path.mkdir(parents=True, exist_ok=True)
                 if s2r is not None:
                     save_s2r(path / S2R_FILE, s2r)
                 if demonstrations is not None:
                     write_log(path / DEMONSTRATIONS_FILE, demonstrations)
-                shutil.rmtree(path / CHECKPOINTS, ignore_errors=True)  # of a start that was interrupted
+                shutil.rmtree(path / CHECKPOINTS, ignore_errors=True)
             wait_for_all(f"{path} is begun")
             run = cls(path, config, spec, s2r)
             if first is not None:
                 run.save(0, *first)
+            # Write the config last: with it the folder is a run.
             data = {
                 "train": to_dict(config),
                 "spec": spec.to_dict(),
@@ -179,7 +182,7 @@ class Run:
             like: a state, or its shapes, structured as the run's.
 
         Raises:
-            RunError: there is no checkpoint, or it is not structured so.
+            RunError: there is no checkpoint, or it has another structure.
         """
         shapes = ocp.args.StandardRestore(jax.tree.map(_shape_somewhere, like))
         epoch, state = self._newest("state", shapes)

@@ -82,11 +82,11 @@ def _figures(run: Run) -> dict[str, Any]:
 
 def _spread(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
     """Return mean, least and greatest of the figures that all rows have."""
-    values = {name: [row.get(name) for row in rows] for name in FIGURES}
+    names = [name for name in FIGURES if all(row.get(name) is not None for row in rows)]
+    values = {name: np.array([row[name] for row in rows]) for name in names}
     return {
-        name: {"mean": float(np.mean(x)), "min": float(np.min(x)), "max": float(np.max(x))}
+        name: {"mean": float(x.mean()), "min": float(x.min()), "max": float(x.max())}
         for name, x in values.items()
-        if None not in x
     }
 
 

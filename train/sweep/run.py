@@ -141,7 +141,7 @@ def train(sweep: Sweep, console: Console) -> None:
             # Evaluate, record and save each member as an ordinary run.
             for k, (run, board, row) in enumerate(zip(sweep.runs, boards, rows, strict=True)):
                 member = job.member(states, k) if due or stop else None
-                if due:
+                if member is not None and due:
                     row |= evaluation(run, tasks[run.config.env], job.learner.policy(member.learner))
                 record(run, board, epoch, done, row)
                 if member is not None:

@@ -43,6 +43,7 @@ OTHER_SETTINGS = """
     hindsight.near_min_mm=3.0 hindsight.near_max_mm=50.0 hindsight.mm_per_deg=2.0
     env.reward.goal_bonus=30.0 env.reward.error_cost=4.0 env.reward.step_cost=0.7
     env.reward.saturation_cost=20.0 env.reward.threshold=0.2 env.reward.weight_per_mm=0.003
+    env.reward.distance_cost=2.0
     env.reward.weight_per_deg=0.004 env.randomisation.payload_max_kg=0.3
     env.randomisation.stiffness_spread=0.2 env.randomisation.sensor_noise_mm=0.5
     env.randomisation.damping_spread=0.2 env.randomisation.delay_max_s=0.05
