@@ -56,12 +56,8 @@ class Belief:
     def none(cls, controller: Controller) -> Belief:
         """Return the belief before the first tick."""
         n, load = controller.policy.spec.n_chambers, Load(controller.policy.spec.mass.payload_kg)
-        window, no, nan = (
-            Window(*(np.empty((0, n)) for _ in Window._fields)),
-            np.zeros(n, bool),
-            np.full(n, np.nan),
-        )
-        return cls(controller, Command.none(n), window, nan, no, no, no, no, load)
+        no, window = np.zeros(n, bool), Window(*np.empty((3, 0, n)))
+        return cls(controller, Command.none(n), window, np.full(n, np.nan), no, no, no, no, load)
 
     @property
     def pose(self) -> np.ndarray:
@@ -106,21 +102,14 @@ def believe(
     seen_kpa = np.full_like(in_force_kpa, np.nan) if measured_kpa is None else measured_kpa
     tick = spring_m, in_force_kpa, np.where(np.isfinite(seen_kpa), seen_kpa, in_force_kpa)
     rows = (np.concat([old[1 - size :], new[None]]) for old, new in zip(last.window, tick, strict=True))
-    belief = replace(
-        Belief.none(controller),
-        command=command,
-        window=Window(*rows),
-        spring_m=spring_m,
-        lost=lost,
-        why_lost=why,
-        load=last.load,
-    )
-    springs_m, mean_m = belief.window.spring_m, belief.mean_m
+    window, no = Window(*rows), np.zeros(len(spring_m), bool)
+    belief = Belief(controller, command, window, spring_m, lost, no, no, no, last.load, why_lost=why)
+    springs_m, mean_m = window.spring_m, belief.mean_m
 
     # Rest, and trust in sensors and chambers
     if len(springs_m) == size:
         at_rest = command.n_ticks >= size and bool(still(springs_m, config))
-        stuck = stuck_springs(springs_m, belief.window.pressure_kpa, config)
+        stuck = stuck_springs(springs_m, window.pressure_kpa, config)
         belief = replace(belief, at_rest=at_rest, stuck=stuck)
     if asked_m is not None and belief.known:
         on = belief.at_rest and bool(on_reference(springs_m, asked_m, in_force_kpa, gains, tolerance_m))
@@ -134,7 +123,7 @@ def believe(
     belief = replace(belief, n_unweighed=last.n_unweighed + 1)
     doubtful = belief.lost | belief.stuck | belief.suspect
     if belief.at_rest and belief.n_unweighed >= size and not doubtful.any():
-        load, estimate_kg = _weighed(policy, last.load, mean_m, belief.window.chamber_kpa.mean(axis=0))
+        load, estimate_kg = _weighed(policy, last.load, mean_m, window.chamber_kpa.mean(axis=0))
         belief = replace(belief, load=load, estimate_kg=estimate_kg, n_unweighed=0)
     return belief
 

@@ -95,9 +95,8 @@ def steer(
     Without `save` the run may last for days: only the newest rows, arrivals and faults are kept.
     """
     source, kept = OrderedGoals(controller, pilot), None if save else _KEPT
-    return _Session(arm, controller, source, tell, look=pilot.look, kept=kept).to_end(
-        save or (lambda log: None)
-    )
+    session = _Session(arm, controller, source, tell, look=pilot.look, kept=kept)
+    return session.to_end(save or (lambda log: None))
 
 
 class _Session:

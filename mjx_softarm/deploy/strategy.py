@@ -85,7 +85,8 @@ class AtRest(NamedTuple):
                 pose = _made(belief, reference_m, belief.load)
                 if _error(belief, pose, goal) > allowed:
                     continue
-            return _acted(self, belief, reference_m, shift, events)
+            after = AtRest(shift, self.n_actions + 1, belief.load)
+            return Choice(after, reference_m, events)
         return _arrive(self, belief, self.shift, events)
 
 
@@ -108,7 +109,8 @@ class Timed(NamedTuple):
             if is_last:
                 return _arrive(self, belief, shift, _unsettled(belief))
         reference_m = _planned(belief, belief.pose, goal + shift)
-        return _acted(self, belief, reference_m, shift, _extrapolated(belief))
+        after = Timed(shift, self.n_actions + 1, belief.load)
+        return Choice(after, reference_m, _extrapolated(belief))
 
 
 class Predicting(NamedTuple):
@@ -129,7 +131,7 @@ class Predicting(NamedTuple):
             pose, _ = pose_of(controller, reference_m, belief.load)
             left = pose_error(np.asarray(pose, float), goal)
             shift = _clipped(shift - left, controller.config.shift_limit)
-        return Choice(self._replace(shift=shift, n_actions=self.n_actions + 1), reference_m)
+        return Choice(Predicting(shift, self.n_actions + 1), reference_m)
 
 
 class Chasing(NamedTuple):
@@ -155,7 +157,7 @@ class Chasing(NamedTuple):
             shift = _clipped(shift - config.moving_share * beside, config.shift_limit)
         reference_m = _planned(belief, belief.pose, goal + shift)
         due = (*self.due, goal)[-config.lead_actions :]
-        return Choice(self._replace(shift=shift, n_actions=self.n_actions + 1, due=due), reference_m)
+        return Choice(Chasing(shift, self.n_actions + 1, due), reference_m)
 
 
 Strategy = AtRest | Timed | Predicting | Chasing
@@ -173,18 +175,6 @@ def _waits(belief: Belief, patience_s: float) -> bool:
     if belief.settled:
         return bool(belief.suspect.any())  # whether a chamber is lost comes first
     return belief.command.n_ticks * belief.controller.dt_s < patience_s
-
-
-def _acted(
-    strategy: AtRest | Timed,
-    belief: Belief,
-    reference_m: np.ndarray,
-    shift: np.ndarray,
-    events: tuple[Event, ...],
-) -> Choice:
-    n_actions = strategy.n_actions + 1
-    after = strategy._replace(shift=shift, n_actions=n_actions, acted_load=belief.load)
-    return Choice(after, reference_m, events)
 
 
 def _arrive(strategy: AtRest | Timed, belief: Belief, shift: np.ndarray, events: tuple[Event, ...]) -> Choice:

@@ -89,7 +89,7 @@ def test_draw_wires_without_a_sim_to_real_network(tmp_path):
     feed = {"readings": readings, "goal": goal, "last_length_m": readings, **more}
     feed = {name: np.asarray(value, np.float32) for name, value in feed.items()}
     [reference_m] = session.run(["reference_m"], feed)
-    np.testing.assert_allclose(reference_m, state.reference_m, atol=1e-6)
+    np.testing.assert_allclose(reference_m, state.command.reference_m, atol=1e-6)
 
 
 def agreeing_graph(policy, path):
@@ -113,20 +113,20 @@ def test_a_policy_of_motion_is_told_of_the_motion(tmp_path):
     for spring_m in swing_m:
         before, readings = state, controller.policy.sensor.readings(spring_m)
         state, _ = step(controller, before, readings, False)
-        if state.n_actions == 2:
+        if state.strategy.n_actions == 2:
             break
-    assert before.n_actions == 1 and state.n_actions == 2
+    assert before.strategy.n_actions == 1 and state.strategy.n_actions == 2
     seen_m = controller.policy.sensor.lengths(controller.policy.sensor.readings(swing_m)).length_m
-    at = len(before.springs_m)
-    motion = {"before_m": seen_m[at - 5], "last_reference_m": before.reference_m}
-    feed = {"readings": readings, "goal": goal, "integral_kpa": before.law.integral_kpa} | motion
+    at = len(before.belief.window.spring_m)
+    motion = {"before_m": seen_m[at - 5], "last_reference_m": before.command.reference_m}
+    feed = {"readings": readings, "goal": goal, "integral_kpa": before.command.law.integral_kpa} | motion
     feed = {name: np.asarray(value, np.float32) for name, value in feed.items()}
     [reference_m] = ort.InferenceSession(whole).run(["reference_m"], feed)
-    np.testing.assert_allclose(reference_m, state.reference_m, atol=2e-6)
+    np.testing.assert_allclose(reference_m, state.command.reference_m, atol=2e-6)
     [blind_m] = ort.InferenceSession(whole).run(
         ["reference_m"], {name: feed[name] for name in ("readings", "goal")}
     )
-    assert np.abs(blind_m - state.reference_m).max() > 1e-4
+    assert np.abs(blind_m - state.command.reference_m).max() > 1e-4
 
 
 def test_a_policy_that_observes_the_payload_is_given_it_within_what_it_knows(tmp_path):
