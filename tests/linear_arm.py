@@ -147,12 +147,12 @@ def between(pose, goal, spring_m, sensed):
     return SPRINGS_M[0] + share * (SPRINGS_M[1] - SPRINGS_M[0])
 
 
-def asking(plan):
-    """A plan, and what it was asked in each action: pose, goal, springs, `sensed`."""
+def asking(plan, arm=None):
+    """A plan, and what it was asked in each action: pose, goal, springs, `sensed`, tick of an arm."""
     asked = []
 
     def ask(*at):
-        asked.append(at)
+        asked.append((*at, arm and arm.tick))
         return plan(*at)
 
     return ask, asked

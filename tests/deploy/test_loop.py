@@ -3,6 +3,7 @@
 import dataclasses
 
 import numpy as np
+import pytest
 
 from calib.read.logs import read_log
 from mjx_softarm.deploy import link
@@ -29,6 +30,7 @@ from tests.linear_arm import (
     SPEC,
     SPRINGS_M,
     LinearArm,
+    asking,
     between,
     exact_plan,
     go,
@@ -71,16 +73,12 @@ OF_MOTION = dataclasses.replace(POLICY, layers=(_WIDE,), observation="motion", a
 
 
 def test_a_policy_of_motion_acts_in_time_and_is_told_of_motion():
-    arm, asked = LinearArm(), []
-
-    def plan(pose, goal, spring_m, sensed):
-        asked.append((arm.tick, sensed))
-        return exact_plan(pose, goal, spring_m, sensed)
-
+    arm = LinearArm()
+    plan, asked = asking(exact_plan, arm)
     run = go(arm, goals=GOALS[:1], controller=Controller.of(OF_MOTION, plan))
     assert len(run.arrivals) == 1 and not run.events
-    np.testing.assert_array_equal([tick for tick, _ in asked], [0, 15, 30, 45])
-    first, second = asked[0][1], asked[1][1]
+    assert [tick for *_, tick in asked] == [0, 15, 30, 45]
+    first, second = asked[0][3], asked[1][3]
     np.testing.assert_array_equal(first[9:21], 0.0)  # no rate of the springs, nor of the tip
     middle = 0.5 * (SPEC.springs.length_min_m + SPEC.springs.length_max_m)
     half = 0.5 * (SPEC.springs.length_max_m - SPEC.springs.length_min_m)
@@ -105,6 +103,13 @@ def test_a_way_with_a_goal_out_of_reach_is_not_begun():
     np.testing.assert_array_equal(arm.written, 0.0)
 
 
+@pytest.mark.parametrize("goals", [[FAR, GOALS[0]], [GOALS[0], FAR]])
+def test_a_way_ends_at_a_stop_that_only_the_loop_refuses(goals, monkeypatch):
+    monkeypatch.setattr("mjx_softarm.deploy.session.refusals", lambda policy, goals: {})
+    run = trace(LinearArm(), CONTROLLER, np.array(goals), pace_s=1.0)
+    assert run.ending == Ending() and run.status == MISSED and run.counts() == {Fault.GOAL_OUTSIDE: 1}
+
+
 def test_a_moving_goal_is_followed_and_its_end_is_an_arrival():
     arm, goals = LinearArm(), np.array([GOALS[0], GOALS[1]])
     run = trace(arm, Controller.of(POLICY, between), goals, pace_s=10.0)
@@ -119,15 +124,11 @@ def test_a_moving_goal_is_followed_and_its_end_is_an_arrival():
 
 def test_a_policy_of_motion_is_given_a_goal_two_actions_ahead():
     config = dataclasses.replace(LOOP, moving_share=0.0)  # this arm's poses are not those of its references
-    arm, goals, asked = LinearArm(), np.array([GOALS[0], GOALS[1]]), []
-
-    def plan(pose, goal, spring_m, sensed):
-        asked.append((arm.tick, goal))
-        return between(pose, goal, spring_m, sensed)
-
+    arm, goals = LinearArm(), np.array([GOALS[0], GOALS[1]])
+    plan, asked = asking(between, arm)
     run = trace(arm, Controller.of(OF_MOTION, plan, config), goals, pace_s=10.0)
     begun = run.ways[0].start
-    tick, goal = next(each for each in asked if each[0] > begun + 200)
+    goal, tick = next((goal, tick) for _, goal, *_, tick in asked if tick > begun + 200)
     ahead = on_the_way(goals, ((tick - begun) * CONTROLLER.dt_s + 0.6) / 10.0)
     np.testing.assert_allclose(goal, ahead, atol=0.003 * np.max(np.abs(goals[1] - goals[0])))  # a tick apart
 

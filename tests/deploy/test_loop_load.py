@@ -142,7 +142,7 @@ def test_shift_ends_somewhere_and_the_next_goal_of_a_policy_of_motion_has_a_part
     far = GOAL + [0.0, 0.0, 40.0, 0.0, 0.0, 0.0]
     policy = dataclasses.replace(LOADED, action_s=action_s)
     follow(LinearArm(), Controller.of(policy, plan), [far, GOAL])
-    asked_mm = np.array([goal[2] for _, goal, _, _ in asked])
+    asked_mm = np.array([goal[2] for _, goal, *_ in asked])
     assert asked_mm[::4].tolist() == [far[2], GOAL[2] + kept_mm]
     assert np.abs(asked_mm[:4] - far[2]).max() == 25.0
 
@@ -163,7 +163,7 @@ def test_a_policy_of_motion_makes_up_for_an_offset_beside_the_way_but_not_for_it
     up = np.array([GOAL, GOAL + [0.0, 0.0, 30.0, 0.0, 0.0, 0.0]])
     run = trace(LinearArm(), Controller.of(of_motion, plan), up, pace_s=3.0)
     assert abs((run.log.estimate - run.log.goal)[run.ways[0], 2]).max() > 1.0
-    assert max(goal[2] for _, goal, _, _ in asked) < up[1, 2] + 1.0  # it lags by other than the two actions
+    assert max(goal[2] for _, goal, *_ in asked) < up[1, 2] + 1.0  # it lags by other than the two actions
 
 
 def test_saturated_chambers_shift_by_where_their_springs_are():
