@@ -59,14 +59,9 @@ def jit_at_first_call(uses_mjx: bool = True, **kwargs: Any) -> Callable[[Callabl
     return decorate
 
 
-def enable_compilation_cache(directory: str | Path | None = None) -> Path:
-    """Keep compiled programs on disk, so that a second start is fast.
-
-    Args:
-        directory: defaults to `$XDG_CACHE_HOME/mjx_softarm/xla`, or `~/.cache/mjx_softarm/xla`.
-    """
-    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    path = Path(directory) if directory else base / "mjx_softarm" / "xla"
+def enable_compilation_cache() -> Path:
+    """Keep compiled programs in `$XDG_CACHE_HOME/mjx_softarm/xla` or `~/.cache`, for a fast second start."""
+    path = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mjx_softarm" / "xla"
     path.mkdir(parents=True, exist_ok=True)
     jax.config.update("jax_compilation_cache_dir", str(path))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)

@@ -40,13 +40,13 @@ _DROP_TICK = 200  # tick at which the carried payload falls, and the goal is giv
 _WEIGHT_MAX_KPA = 8.0  # largest pressure that stands for a payload
 
 
-def make_golden(controller: Controller, policy_sha256: str, seed: int = 0) -> Golden:
+def make_golden(controller: Controller, policy_sha256: str) -> Golden:
     """Make rows with all faults of an arm, and let the loop answer them.
 
     Rows replay readings that do not depend on the answered pressures, so rounding errors add up. A run ends
     once the pressures of a policy with rounded weights differ too much.
     """
-    rng, machine = np.random.default_rng(seed), Machine(controller)
+    rng, machine = np.random.default_rng(0), Machine(controller)
     rounded, most_kpa = Machine(_rounded(controller)), _ROUNDED * _ranges(controller)[2]
     inputs, outputs = [], []
     # Rows without memory, and checked goals.

@@ -113,11 +113,11 @@ def symbol(name: str, shape: tuple[int, ...], dtype: Any = np.float64) -> Symbol
     return Symbol("input", (), shape, np.dtype(dtype), name)
 
 
-def constant(value: Any, dtype: Any = None) -> Symbol:
+def constant(value: Any) -> Symbol:
     """Return a number or an array as a symbol; a symbol as it is."""
     if isinstance(value, Symbol):
         return value
-    array = np.asarray(value, dtype)
+    array = np.asarray(value)
     return Symbol("constant", (), array.shape, array.dtype, value=array)
 
 

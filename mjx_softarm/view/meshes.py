@@ -25,8 +25,9 @@ def fold(radius_m: float) -> Mesh:
     return creation.revolve(profile, sections=18)
 
 
-def coil(radius_m: float, wire_m: float, pitch_m: float, n: int = 13, n_wire: int = 4) -> Mesh:
+def coil(radius_m: float, wire_m: float, pitch_m: float) -> Mesh:
     """Return one turn of a spring, of height 1; stretched to the pitch, its wire is round."""
+    n, n_wire = 13, 4  # points along the turn, and around the wire
     along, about = np.meshgrid(np.linspace(0, 2 * np.pi, n), 2 * np.pi * np.arange(n_wire) / n_wire)
     out = radius_m + wire_m * np.cos(about)
     height = along / (2 * np.pi) - 0.5 + wire_m / pitch_m * np.sin(about)
