@@ -99,7 +99,7 @@ def measure(
         for seed in seeds:
             loads += [{"commands": name, "seed": seed, **row} for row in trained.run(seed)]
     # Gradient descent, at some goals without one.
-    descent = Descent(spec, goals)
+    descent = Descent(ReachEnv(spec), goals)
     loads += [{"commands": SOLVER, "seed": seed, "load_g": 0, **descent.run(seed)} for seed in seeds]
     return {
         "settings": {"seeds": list(seeds), "env_steps": steps, "goals": goals},
@@ -161,11 +161,10 @@ def figures(off_mm: np.ndarray, n_saturated: np.ndarray) -> dict[str, float]:
 class Descent:
     """Gradient descent by the estimator of the policy that ships; it knows of no payload."""
 
-    def __init__(self, spec: ArmSpec, n_goals: int):
-        self.env = ReachEnv(spec, EnvConfig())
-        self.solve = gradient_descent(load_policy(SHIPPED))
-        self.step, self.reset = xla.jit(self.env.step), xla.jit(self.env.reset)
-        self.sets = [np.asarray(poses) for poses in goals_of(self.env, n_goals)]
+    def __init__(self, env: ReachEnv, n_goals: int):
+        self.env, self.solve = env, gradient_descent(load_policy(SHIPPED))
+        self.step, self.reset = xla.jit(env.step), xla.jit(env.reset)
+        self.sets = [np.asarray(poses) for poses in goals_of(env, n_goals)]
 
     def run(self, seed: int) -> dict[str, float]:
         """Return its figures at some goals of both sets, other ones for each seed, from a random pose."""

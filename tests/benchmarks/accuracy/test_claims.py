@@ -5,11 +5,11 @@ from types import SimpleNamespace
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from benchmarks.accuracy.claims import KINDS, N_SOLVED, Descent, PressureEnv, follow, means
-from mjx_softarm import ArmSpec
 from mjx_softarm._support import xla
-from mjx_softarm.env import EnvConfig, Randomisation
+from mjx_softarm.env import EnvConfig, Randomisation, ReachEnv
 from mjx_softarm.mdp import rewards
 from tests.train.small import SHORT
 from train.agent.analytic import Analytic
@@ -17,14 +17,30 @@ from train.config import override
 from train.presets import PRESETS
 
 
-def test_an_action_is_a_pressure_whatever_the_payload():
-    env, chambers = PressureEnv(SHORT, EnvConfig(n_poses=16)), SHORT.chambers
-    action = jnp.array([[-1.0, 0.0, 0.5], [0.2, 0.2, 0.2]])
+@pytest.fixture(scope="module")
+def arms(quick_compiler):
+    """An environment, two arms, and a function: arms, actions (2, 3) -> next arms, gradients of z."""
+    env = PressureEnv(SHORT, EnvConfig(n_poses=16))
     start = xla.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 2))
-    arm = start.pipeline_state
-    heavy = start.replace(pipeline_state=arm._replace(payload_kg=arm.payload_kg + 0.5))
-    step = xla.jit(jax.vmap(env.step))
-    free, loaded = step(start, action), step(heavy, action)
+
+    def height(action, state):
+        after = env.step(state, action)
+        return after.pipeline_state.pose[2], after
+
+    both = xla.jit(jax.vmap(jax.value_and_grad(height, has_aux=True)))
+
+    def step(state, action):
+        (_, after), slope = both(action, state)
+        return after, slope
+
+    return SimpleNamespace(env=env, start=start, step=step)
+
+
+def test_an_action_is_a_pressure_whatever_the_payload(arms):
+    action, chambers = jnp.array([[-1.0, 0.0, 0.5], [0.2, 0.2, 0.2]]), SHORT.chambers
+    arm = arms.start.pipeline_state
+    heavy = arms.start.replace(pipeline_state=arm._replace(payload_kg=arm.payload_kg + 0.5))
+    (free, _), (loaded, _) = arms.step(arms.start, action), arms.step(heavy, action)
     low, high = chambers.pressure_min_kpa, chambers.pressure_max_kpa
     for after in (free, loaded):
         asked = low + 0.5 * (action + 1.0) * (high - low)
@@ -34,7 +50,25 @@ def test_an_action_is_a_pressure_whatever_the_payload():
     assert (sunk_mm > 1.0).all()
 
 
-def test_a_payload_is_carried_and_observed_from_the_first_action_on():
+def test_pressures_cost_the_error_of_the_pose_alone(arms):
+    config = override(PRESETS["analytic"], KINDS["pressures"].settings)
+    action = jnp.array([-0.9, 0.0, 0.5])
+    after = jax.tree.map(lambda x: x[0], arms.step(arms.start, jnp.stack([action, action]))[0])
+    arm, reward = after.pipeline_state, arms.env.config.reward
+    error = rewards.scaled_error(arm.pose, arm.goal, reward)
+    cost = Analytic(config.analytic, arms.env, 1)._cost(action, after)
+    np.testing.assert_allclose(cost, jnp.linalg.norm(error) / reward.threshold, rtol=1e-5)
+
+
+def test_the_pose_has_a_gradient_by_the_pressures(arms):
+    more = 1e-2 * jnp.ones((2, 3))
+    ahead, behind = (arms.step(arms.start, sign * more)[0].pipeline_state.pose[:, 2] for sign in (1, -1))
+    _, slope = arms.step(arms.start, 0.0 * more)
+    assert (np.abs(ahead - behind) > 0.05).all()
+    np.testing.assert_allclose(jnp.sum(slope * 2.0 * more, axis=1), ahead - behind, rtol=0.02)
+
+
+def test_a_payload_is_carried_and_observed_from_the_first_action_on(quick_compiler):
     config = EnvConfig(n_poses=16, observation="payload", randomisation=Randomisation(payload_max_kg=1.0))
     env, chambers = PressureEnv(SHORT, config), SHORT.chambers
     as_heavy = SimpleNamespace(mode=lambda policy, obs: jnp.full(3, obs[-1]))
@@ -48,30 +82,10 @@ def test_a_payload_is_carried_and_observed_from_the_first_action_on():
     assert not np.allclose(light.pose, heavy.pose, atol=1.0)
 
 
-def test_pressures_cost_the_error_of_the_pose_alone():
-    env = PressureEnv(SHORT, EnvConfig(n_poses=16))
-    config = override(PRESETS["analytic"], KINDS["pressures"].settings)
-    action = jnp.array([-0.9, 0.0, 0.5])
-    after = xla.jit(env.step)(env.reset(jax.random.key(0)), action)
-    arm, reward = after.pipeline_state, env.config.reward
-    error = rewards.scaled_error(arm.pose, arm.goal, reward)
-    cost = Analytic(config.analytic, env, 1)._cost(action, after)
-    np.testing.assert_allclose(cost, jnp.linalg.norm(error) / reward.threshold, rtol=1e-5)
-
-
-def test_the_pose_has_a_gradient_by_the_pressures():
-    env = PressureEnv(SHORT, EnvConfig(n_poses=16))
-    state = env.reset(jax.random.key(0))
-    height = xla.jit(jax.grad(lambda action: env.step(state, action).pipeline_state.pose[2]))
-    slope, more = height(jnp.zeros(3)), 1e-2 * jnp.ones(3)
-    z = xla.jit(lambda action: env.step(state, action).pipeline_state.pose[2])
-    change = float(z(more) - z(-more))
-    assert abs(change) > 0.05
-    np.testing.assert_allclose(float(slope @ (2.0 * more)), change, rtol=0.02)
-
-
 def test_gradient_descent_goes_to_goals_of_both_sets(monkeypatch):
-    descent, asked = Descent(ArmSpec.default(), N_SOLVED + 10), []
+    descent, asked = Descent(ReachEnv(config=EnvConfig(n_poses=16)), 4), []
+    assert [len(poses) for poses in descent.sets] == [4, 4]
+    sets = [np.arange(first, first + 6.0 * (N_SOLVED + 10)).reshape(-1, 6) for first in (0.0, 1000.0)]
 
     def along(path, key):
         asked.append(path)
@@ -79,8 +93,9 @@ def test_gradient_descent_goes_to_goals_of_both_sets(monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(descent, "along", along)
+        patch.setattr(descent, "sets", sets)
         found = [descent.run(seed) for seed in (0, 1)]
-    for some, of_all in zip((asked[0][:N_SOLVED], asked[0][N_SOLVED:]), descent.sets, strict=True):
+    for some, of_all in zip((asked[0][:N_SOLVED], asked[0][N_SOLVED:]), sets, strict=True):
         assert len(np.unique(some, axis=0)) == N_SOLVED
         assert (some[:, None] == of_all).all(axis=-1).any(axis=1).all()
     assert found[0] == {"median_mm": 4.0, "mean_mm": 4.0, "p95_mm": 4.0, "saturated_percent": 50.0}
