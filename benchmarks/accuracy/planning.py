@@ -1,7 +1,7 @@
 """Calibrations of a rod, an arm of other physics, by random poses and by planned ones.
 
 Both calibrations of an arm share their first poses, which are random. The others are random, or chosen by
-`calib.plan` in rounds, each from the calibration before. S2R is judged on random poses that neither has seen.
+`calib.plan` from the calibration by the first ones. S2R is judged on random poses that neither has seen.
 Rods are logged at rest, without the motion from pose to pose.
 """
 
@@ -29,7 +29,7 @@ TEST_SEED = 77
 
 
 def measure(
-    rods: cli.Integers = (0, 1), poses: int = 500, first: int = 100, rounds: int = 1, tests: int = 300
+    rods: cli.Integers = (0, 1), poses: int = 500, first: int = 100, tests: int = 300
 ) -> dict[str, Any]:
     """Do planned poses calibrate an arm better than random ones?
 
@@ -37,14 +37,13 @@ def measure(
         rods: seeds of the rod twins
         poses: number of poses of each calibration
         first: number of random poses that both begin with
-        rounds: calibrations that plan the poses after these
         tests: number of random poses that judge
     """
     xla.enable_compilation_cache()
-    return {f"rod {seed}": _compare(seed, poses, first, rounds, tests) for seed in rods}
+    return {f"rod {seed}": _compare(seed, poses, first, tests) for seed in rods}
 
 
-def _compare(seed: int, poses: int, first: int, rounds: int, tests: int) -> dict[str, Any]:
+def _compare(seed: int, poses: int, first: int, tests: int) -> dict[str, Any]:
     # The rod, and random poses that judge.
     spec = ArmSpec.default()
     arm = RodTwin(seed, spec, session=S2R_SESSION)
@@ -55,11 +54,10 @@ def _compare(seed: int, poses: int, first: int, rounds: int, tests: int) -> dict
     print(f"rod {seed}: random {random}", flush=True)
     # By the first of them, and planned ones.
     logs = [log_at_rest(arm, pressure_kpa[:first])]
-    for count in np.diff(np.linspace(first, poses, rounds + 1).round().astype(int)):
-        known = calibrate(logs, spec)
-        assert known.recorded is not None  # as there are poses
-        print(f"rod {seed}: planning {count} poses", flush=True)
-        logs.append(log_at_rest(arm, plan(known.spec, known.recorded, int(count), seed).pressure_kpa))
+    known = calibrate(logs, spec)
+    assert known.recorded is not None  # as there are poses
+    print(f"rod {seed}: planning {poses - first} poses", flush=True)
+    logs.append(log_at_rest(arm, plan(known.spec, known.recorded, poses - first, seed).pressure_kpa))
     return {"random": random, "planned": _figures(calibrate(logs, spec), judge)}
 
 

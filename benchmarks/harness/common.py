@@ -103,16 +103,14 @@ def status_of(figures: Mapping[str, Any]) -> int:
 def show(figures: Mapping[str, Any], title: str = "", console: Console | None = None) -> None:
     """Print figures as tables."""
     console = console or Console(width=None if sys.stdout.isatty() else WIDTH)
-    loose, nested = [], []
-    for name, value in figures.items():
-        words = name.replace("_", " ")
-        if _parts(value):
-            nested.append((f"{title}, {words}" if title else words, value))
-        else:
-            loose.append({"figure": words, "value": value})
+    loose = {name: value for name, value in figures.items() if not _parts(value)}
     if loose:
-        _print_table(console, title, loose)
-    for path, value in nested:
+        rows = [{"figure": name.replace("_", " "), "value": value} for name, value in loose.items()]
+        _print_table(console, title, rows)
+    for name, value in figures.items():
+        if name in loose:
+            continue
+        path = ", ".join(filter(None, [title, name.replace("_", " ")]))
         if rows := _rows(value):
             _print_table(console, path, rows)
         else:

@@ -1,10 +1,8 @@
 """Gradient descent on the springs: the solver that the policy is compared with. NumPy only.
 
-From the measured springs, their lengths follow the negative gradient of the squared pose error; the pose is
-what estimator and sim-to-real network make of the springs. A degree weighs as much as a millimetre: with the
-reward's weights, which make it five times less, the search takes far longer to turn the tip. A step that does
-not reduce the error enough is halved. Lengths stay within the policy's range. The search knows no pressures,
-so nothing keeps it from shapes that the pump cannot make, and its result depends on its start.
+From the measured springs, lengths within the policy's range follow the negative gradient of the squared error
+of the estimated pose. A degree weighs as much as a millimetre: with the reward's weights, the search takes
+far longer to turn the tip. The search knows no pressures, so it may ask for shapes that the pump cannot make.
 
     Controller.of(policy, gradient_descent(policy))
 

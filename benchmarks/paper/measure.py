@@ -40,10 +40,8 @@ class TrialOutcome(NamedTuple):
     arrival_s: np.ndarray  # (p,)
     load_estimate_g: np.ndarray  # (p,) payload that the loop believed in, on arrival
     events: np.ndarray  # (faults,) how often the loop reported each of `Fault`
-    latency_s: np.ndarray  # (2,) median and 99.9 % of a tick's computing time
     time_s: np.ndarray  # (t,)
     wall_n: np.ndarray  # (t,) contact force of the walls, the largest within each tick
-    container_n: np.ndarray  # (t,) contact force of the containers
 
     @property
     def operation(self) -> np.ndarray:
@@ -133,9 +131,9 @@ def operate(
     """
     # Watch the twin's contact forces and its gripper.
     gripper_m = controller.policy.spec.mass.gripper_length_m
-    forces: list[tuple[float, float]] = []
+    forces_n: list[float] = []
     force = getattr(twin, "wall_force_n", lambda: (0.0, 0.0))  # a rod touches nothing
-    watched: Any = WatchedTwin(twin, lambda: forces.append(force()))
+    watched: Any = WatchedTwin(twin, lambda: forces_n.append(force()[0]))
     gripper = Gripper(watched, names, finger_tips(goals, gripper_m), objects, gripper_m)
     # Run the loop, with or without stops.
     stopped = ~(moves & np.char.startswith(names, "to "))
@@ -150,14 +148,13 @@ def operate(
         run = follow(watched, controller, goals, arrived=gripper.arrived)
     # Measure the run, and add the objects and the forces of each tick.
     outcome = measure(run, controller, goals[stops])
-    force_n = np.zeros((len(run.log), 2))
-    n = min(len(forces), len(force_n))  # a lost arm takes no more pressures; venting is not logged
-    force_n[:n] = np.reshape(forces[:n], (n, 2))
+    wall_n = np.zeros(len(run.log), np.float32)
+    n = min(len(forces_n), len(wall_n))  # a lost arm takes no more pressures; venting is not logged
+    wall_n[:n] = forces_n[:n]
     return outcome._replace(
         name=np.array(names)[stops],
         success=gripper.success[stops],
-        wall_n=force_n[:, 0].astype(np.float32),
-        container_n=force_n[:, 1].astype(np.float32),
+        wall_n=wall_n,
     )
 
 
@@ -177,10 +174,8 @@ def measure(run: LoopRun, controller: Controller, goals: np.ndarray) -> TrialOut
         name=np.full(len(goals), ""),
         success=np.zeros(len(goals), bool),
         events=np.array([counts.get(fault, 0) for fault in Fault]),
-        latency_s=np.quantile(run.latency_s, (0.5, 0.999)),
         time_s=log.time_s,
         wall_n=np.zeros(len(log), np.float32),
-        container_n=np.zeros(len(log), np.float32),
     )
 
 
@@ -193,7 +188,5 @@ def figures(outcome: TrialOutcome) -> dict[str, Any]:
         "done": int(outcome.success.sum()),
         "calm_percent": 100 * float(np.mean(outcome.wall_n < CALM_N)),
         "wall_max_n": float(outcome.wall_n.max()),
-        "container_max_n": float(outcome.container_n.max()),
         "seconds": float(outcome.time_s[-1]),
-        "latency_ms": [round(1e3 * float(value), 3) for value in outcome.latency_s],
     }

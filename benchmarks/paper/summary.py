@@ -20,7 +20,7 @@ Row = Mapping[str, Any]
 FIGURES = (  # with a spread over runs
     *("translation_mm", "rmse_mm", "max_mm", "x_mm", "y_mm", "z_mm", "yaw_deg", "pitch_deg", "roll_deg"),
     *("believed_mm", "saturated_points", "saturated_chambers_max", "saturation_events", "done"),
-    *("calm_percent", "wall_max_n", "container_max_n", "load_off_g", "seconds"),
+    *("calm_percent", "wall_max_n", "load_off_g", "seconds"),
 )
 LIGHT_G, HEAVY_G = 500, 1000
 N_OPERATIONS = 4

@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks.harness.common import target
-from benchmarks.race.contestants import CONTESTANTS
 
 LEVELS_MM = (10, 5, 3, 2, 1)
 TARGET_MM = 5
@@ -59,15 +58,14 @@ def median_mm(point: Point) -> float:
 def summarise(results: Sequence[Result]) -> dict[str, Any]:
     """Return times to each level with start-up and without, env steps, targets, failures and the curves."""
     ran = [result for result in results if "points" in result]
-    who = ("contestant", "seed")
     return {
         "wall_s": [_row(result, "wall_s") for result in ran],
         "wall_s_without_start_up": [_row(result, "trained_s") for result in ran],
         "env_steps": [_row(result, "env_steps") for result in ran],
         "targets": [judge(wanted, results) for wanted in TARGETS],
-        "not_raced": [name for name in CONTESTANTS if name not in {r["contestant"] for r in results}],
-        "failed": [{key: r[key] for key in (*who, "failed")} for r in results if "failed" in r],
-        "measured_at": [{key: r[key] for key in (*who, "commit", "uncommitted_changes")} for r in ran],
+        "failed": [
+            {key: r[key] for key in ("contestant", "seed", "failed")} for r in results if "failed" in r
+        ],
         "curves": results,
     }
 

@@ -57,10 +57,8 @@ def made_up(
         arrival_s=np.linspace(1.0, 0.25 * ticks, len(goal)),
         load_estimate_g=np.full(len(goal), float(estimate_g)),
         events=np.array([reported if fault is Fault.SATURATED else 0 for fault in Fault]),
-        latency_s=np.array([1e-4, 3e-4]),
         time_s=tick_s * np.arange(ticks),
         wall_n=np.where(np.arange(ticks) < pressed * ticks, 2.0, 0.0),
-        container_n=np.full(ticks, 5.0),
     )
     for point, chamber in saturated:
         outcome.saturated[point, chamber] = True

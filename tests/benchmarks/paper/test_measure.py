@@ -121,7 +121,7 @@ def test_figures_of_a_task_by_hand():
     assert np.allclose([row["x_mm"], row["y_mm"], row["z_mm"]], [28 / 25, 48 / 25, 48 / 25])
     assert np.isclose(row["translation_mm"], (4 + 24 * 3) / 25)
     assert np.isclose(row["calm_percent"], 97.0)
-    assert (row["wall_max_n"], row["container_max_n"]) == (2.0, 5.0)
+    assert row["wall_max_n"] == 2.0
     assert row["events"] == {Fault.SATURATED.value: 3}
 
 

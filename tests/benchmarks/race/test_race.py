@@ -165,13 +165,10 @@ def test_peers_get_our_time_to_5_mm_as_often_as_the_target_asks_and_stop_where_o
     assert limits_of("sbx-hindsight", [quick, analytic]).wall_s == 5 * 29.5  # 20 times 5 s are less
 
 
-def test_some_may_race_alone_and_the_others_and_those_that_failed_follow(
-    asked, monkeypatch, tmp_path, capsys
-):
+def test_some_may_race_alone_and_the_others_and_those_that_failed_follow(asked, monkeypatch, tmp_path):
     monkeypatch.setattr(race, "save", lambda *_: tmp_path / "race.json")
     assert main(["race", "--only", "sbx-hindsight", "--out", str(tmp_path)]) == 0  # it fails
     assert list(asked) == ["ours-quick, seed 0", "sbx-hindsight, seed 0"]
-    assert "['ours-analytic', 'sb3-contrib-hindsight']" in capsys.readouterr().out
     asked.clear()
     assert main(["race", "--out", str(tmp_path)]) == 1  # as fast as ours
     assert list(asked) == [f"{name}, seed 0" for name in CONTESTANTS if name != "ours-quick"]

@@ -62,7 +62,6 @@ def test_a_level_is_reached_where_the_line_between_two_evaluations_crosses_it_fi
 def test_a_target_is_judged_once_both_have_raced_with_all_seeds():
     results = [OURS_FAST, result(SBX, *SLOW)]
     assert judged(SBX, *results) == ("not within 25.17 times", "met")
-    assert summarise(results)["not_raced"] == ["ours-analytic", SB3]
     assert judged(SB3, *results) == (f"not raced: {SB3}, seed 0", "skipped")
     results.append(result("ours-quick", 4.0, seed=1))
     assert judged(SBX, *results) == (f"not raced: {SBX}, seed 1", "skipped")
@@ -127,6 +126,4 @@ def test_tables_have_a_row_for_each_contestant_with_start_up_and_without():
     assert figures["wall_s_without_start_up"][0]["to_10_mm"] == 15.0
     assert figures["env_steps"][0]["to_5_mm"] == 275.0
     assert [row["to_10_mm"] for row in figures["wall_s"][1:]] == ["not within 12"] * 2
-    who = ("contestant", "seed", "commit", "uncommitted_changes")
-    assert figures["measured_at"][1] == {name: results[1][name] for name in who}
     json.dumps(figures, allow_nan=False)
