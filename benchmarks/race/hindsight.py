@@ -103,14 +103,9 @@ class HindsightBuffer(HerReplayBuffer):
         offsets = near_offsets(jnp.asarray(draws[1]), jnp.asarray(direction), self._hindsight)
         goals = np.where(near[:, None], after + np.asarray(offsets), goals)
         # Rewards, observations and termination for the new goals.
-        cost = self._reward_scale * self._config.saturation_cost
-        reward, reached, _ = rewards.reward(
-            after,
-            goals,
-            n_steps=(batch_indices - self.ep_start[where]) % self.buffer_size + 1,
-            saturated=np.isclose(self.rewards[where], -cost),
-            config=self._config,
-        )
+        n_steps = (batch_indices - self.ep_start[where]) % self.buffer_size + 1
+        saturated = self._saturated(after, n_steps, where)
+        reward, reached, _ = rewards.reward(after, goals, n_steps, saturated, self._config)
         return DictReplayBufferSamples(
             observations=self._observed(before, goals),
             actions=self.to_torch(self.actions[where]),
@@ -118,6 +113,14 @@ class HindsightBuffer(HerReplayBuffer):
             dones=self.to_torch(reached[:, None].astype(np.float32)),
             rewards=self.to_torch((self._reward_scale * reward[:, None]).astype(np.float32)),
         )
+
+    def _saturated(self, after: np.ndarray, n_steps: np.ndarray, where: Any) -> np.ndarray:
+        """Return whether transitions saturated (n,): which of two rewards for their own goals was stored."""
+        own = self.observations["desired_goal"][where] * self._scale.scale + self._scale.centre
+        either = (np.full(len(after), saturated) for saturated in (True, False))
+        yes, no = (rewards.reward(after, own, n_steps, x, self._config)[0] for x in either)
+        stored = self.rewards[where] / self._reward_scale
+        return np.abs(stored - yes) < np.abs(stored - no)
 
     def _observed(self, poses: np.ndarray, goals: np.ndarray) -> dict[str, Any]:
         flat = obs.observe(poses, goals, self._scale, self._config)

@@ -108,13 +108,14 @@ def test_held_out_goals_are_evaluated_as_the_trainer_does_it(quick_compiler):
 
 
 def test_peers_have_the_quick_preset_s_settings():
-    n_steps = [0]
-    settings = settings_of(PRESETS["quick"], lambda: n_steps[0])
+    n_steps, config = [0], PRESETS["quick"]
+    settings = settings_of(config, lambda: n_steps[0])
     rate = settings.pop("learning_rate")
     names = ("buffer_size", "learning_starts", "batch_size", "tau", "gamma", "train_freq", "gradient_steps")
-    values = (262_144, 2048, 128, 0.005, 0.1, 1, 16, "auto_0.1", -30.0)
+    values = (config.replay_capacity, 2048, 128, 0.005, 0.1, 1, 16, "auto_0.1", -30.0)
     assert settings == dict(zip((*names, "ent_coef", "target_entropy"), values, strict=True))
-    rates = {0: 4e-3, 90_000: 2.04e-3, 179_999: 0.08e-3, 180_000: 4e-3, 270_000: 2.04e-3}
+    n = config.total_env_steps
+    rates = {0: 4e-3, n // 2: 2.04e-3, n - 1: 0.08e-3, n: 4e-3, n + n // 2: 2.04e-3}
     for n_steps[0], expected in rates.items():
         assert rate(1.0) == pytest.approx(expected, rel=1e-3)
 
