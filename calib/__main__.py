@@ -5,6 +5,7 @@ Exit status: 0 done, 1 done but not to be trusted, 2 not done, 130 interrupted.
 
 from __future__ import annotations
 
+import functools
 import os
 
 # XLA logs a page for every program that it takes from the cache.
@@ -99,16 +100,20 @@ def _run(
         seed: seed of all random draws
     """
     from calib.run import calibrate, refuse_existing, write_calibration
+    from calib.steps import STEPS, springs
     from mjx_softarm._support import xla
     from mjx_softarm._support.provenance import provenance
 
+    # Read the logs, and calibrate.
     _check_seed(seed)
     refuse_existing(out)
     arm = ArmSpec.of(spec)
     read, findings = _read(logs, arm, strict)
     xla.enable_compilation_cache()
-    springs = {"shared": shared_springs, "fit_compensation": fit_compensation}
-    calibration = calibrate(read, arm, seed, springs, lambda text: print(text, flush=True))
+    how = {"shared": shared_springs, "fit_compensation": fit_compensation}
+    steps = {**STEPS, "springs": functools.partial(springs, **how)}
+    calibration = calibrate(read, arm, seed, steps, lambda text: print(text, flush=True))
+    # Write the folder, and print the reasons not to trust it.
     write_calibration(out, calibration, [str(finding) for finding in findings], provenance("calib"))
     for section in calibration.sections:
         for warning in section.warnings:

@@ -1,9 +1,8 @@
 """Logs of a simulated arm with known parameters, to try the calibration without hardware.
 
-The planted arm differs from the specification in what the calibration fits: beta and delta of the springs;
-stiffness, area and length of the chambers; bending stiffness; damping. It also differs in what the
-calibration does not fit, so that the sim-to-real network has something to learn: the sites of chambers and
-springs, and finer links.
+The planted arm differs from the specification in numbers that the calibration fits: beta and delta of the
+springs; stiffness, area and length of the chambers; bending stiffness; damping. It also differs in the sites
+of chambers and springs, and has finer links: this is left to the sim-to-real network.
 """
 
 from __future__ import annotations
@@ -21,13 +20,13 @@ from mjx_softarm.mechanics.workspace import settle_many
 from mjx_softarm.sensing.pose import rotation_from_quaternion
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
 
-N_LENGTHS = 60  # of each spring on the ruler
+N_LENGTHS = 60  # lengths of each spring on the ruler
 N_POSES = 1200
-POSE_S = 5.0
-N_STEPS = 12
+POSE_S = 5.0  # time from pose to pose
+N_STEPS = 12  # steps of the pressures
 STEP_S = 4.0
 RULER_NOISE_M = 3e-4
-READING_NOISE_M = 1e-4  # of a spring, by its reading
+READING_NOISE_M = 1e-4  # noise of a reading, as a length of its spring
 TIP_NOISE_M = 3e-4
 TURN_NOISE_RAD = 2e-3
 PRESSURE_NOISE_KPA = 0.05
@@ -42,6 +41,7 @@ def planted_arm(spec: ArmSpec, seed: int) -> ArmSpec:
         values = np.array(spec.per_chamber(value))
         return tuple(values * (1.0 + rng.uniform(-spread, spread, spec.n_chambers)))
 
+    # Draw numbers that the calibration fits; turn and shift sites, which it does not fit.
     chambers, geometry, backbone = spec.chambers, spec.geometry, spec.backbone
     n = spec.n_chambers
     offset_m = np.array(spec.per_chamber(chambers.length_offset_m)) + rng.uniform(-4e-3, 4e-3, n)

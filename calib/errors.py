@@ -1,4 +1,4 @@
-"""Errors of a calibration, besides those of logs."""
+"""Errors of a calibration; `mjx_softarm.logs.checks` has the errors of logs."""
 
 from mjx_softarm._support.errors import InputError
 

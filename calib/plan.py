@@ -1,14 +1,13 @@
-"""Poses to record next: those that tell a calibration's unknown directions, then those far from any pose.
+"""Poses to record next: first poses that tell a calibration's unknown directions, then poses far from others.
 
-The information of poses at rest on the parameters x of `calib.fit.parameters` is the sum over the poses of
-J^T J, with J the derivatives of tip, rotation, springs and, if the calibration had them, of markers at the
-sections' ends by x over their scales, and of the prior's. Its
-inverse is the covariance. Poses are chosen one by one among candidates, the one that brings down the sum of
-the variances the most, each in units of its tolerance. Candidates have pressures at random, at the extremes,
-or alike within each section: a long straight arm and a short one tell a shift of the base from its tilt.
-Once no direction is expected to stay unknown, and for half of the poses in any case, they are drawn as for
-clustering (k-means++): by the square of the distance to the nearest pose, times the sim-to-real network's
-error there.
+The parameters x are those of `calib.fit.parameters`. J holds the derivatives of tip, rotation, springs and,
+if the calibration had them, markers by x, over the scales of their errors. The covariance of x is the inverse
+of the prior's precision plus the sum of J^T J over the poses. Poses are chosen one by one among candidates:
+each time the pose that reduces the sum of the variances most, in units of the tolerances. Candidates have
+pressures at random, at the extremes, or equal within each section: a long straight arm and a short one tell a
+shift of the base from its tilt. At least half of the poses, and all once every direction is expected to be
+known, are drawn as in k-means++: by the square of the distance to the nearest pose, times the error of the
+sim-to-real network there.
 
 Source: Fedorov, "Theory of Optimal Experiments", 1972 (A-optimal design); Arthur, Vassilvitskii, "k-means++",
 SODA 2007.
@@ -29,13 +28,12 @@ from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.mechanics.workspace import pressure_levels, settle_many
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
 
-KIND, RECORDED_FILE = "recorded", "recorded.npz"  # in the folder of a calibration
-SHARE_FAR = 0.5  # of the poses, at least, that are drawn by their distance
+KIND, RECORDED_FILE = "recorded", "recorded.npz"  # file in the folder of a calibration
+SHARE_FAR = 0.5  # least share of the poses that are drawn by their distance
 MAX_CANDIDATES = 1500
-# Fits' intervals over those of the information, which takes errors for independent and as large everywhere
-MARGIN = 2.0
-N_NEAREST = 8  # poses whose errors are averaged
-MAX_ERROR_RATIO = 2.0  # of such a mean to that of all poses
+MARGIN = 2.0  # intervals of fits over intervals of this covariance, which takes errors for independent
+N_NEAREST = 8  # nearest poses whose errors are averaged
+MAX_ERROR_RATIO = 2.0  # largest weight: mean error of the nearest poses over the mean of all
 
 
 class Recorded(NamedTuple):
@@ -43,16 +41,16 @@ class Recorded(NamedTuple):
 
     pressure_kpa: np.ndarray  # (n, n_chambers)
     payload_kg: np.ndarray  # (n,)
-    error_mm: np.ndarray  # (n,) of the tip, of the sim-to-real network where there is one
-    scale: np.ndarray  # (2, 3) robust errors, see `ChamberFit`; (2, 4) with markers
+    error_mm: np.ndarray  # (n,) error of the tip, with the sim-to-real network if there is one
+    scale: np.ndarray  # (2, 3) robust errors, see `calib.fit.chambers.ChamberFit`; (2, 4) with markers
 
 
 class Plan(NamedTuple):
-    """Poses to record, and what they are expected to tell."""
+    """Poses to record, and their expected benefit."""
 
-    pressure_kpa: np.ndarray  # (n, n_chambers), those of the information first
+    pressure_kpa: np.ndarray  # (n, n_chambers), the informative poses first
     n_informative: int
-    n_unknown: tuple[int, int]  # directions that are unknown now, and expected to be so with the plan
+    n_unknown: tuple[int, int]  # unknown directions now, and expected with the plan
 
 
 def save_recorded(path: Path, recorded: Recorded) -> None:
@@ -85,8 +83,9 @@ def plan(spec: ArmSpec, recorded: Recorded, n: int, seed: int) -> Plan:
         spec: calibrated arm.
         recorded: poses of its calibration.
         n: number of poses to choose.
-        seed: of the candidates and of the draw.
+        seed: seed of the candidates and of the draw.
     """
+    # Compute the covariance of the calibration.
     rng = np.random.default_rng(seed)
     candidates = _candidates(spec, min(20 * n, MAX_CANDIDATES), rng)
     rows = _derivatives(spec, recorded.pressure_kpa, recorded.payload_kg, recorded.scale)
@@ -94,9 +93,10 @@ def plan(spec: ArmSpec, recorded: Recorded, n: int, seed: int) -> Plan:
     prior = np.diag((tolerance / priors(spec)) ** 2)
     scaled = rows.reshape(-1, len(tolerance)) * tolerance
     covariance = np.linalg.inv(prior + scaled.T @ scaled)
+    before = n_unknown(covariance)
+    # Choose informative poses, then poses far from all others, which add to the information, too.
     payload = np.full(len(candidates), spec.mass.payload_kg)
     options = _derivatives(spec, candidates, payload, recorded.scale) * tolerance
-    before = n_unknown(covariance)
     chosen, covariance = choose_informative(options, covariance, n - round(SHARE_FAR * n))
     far = choose_far(spec, recorded, candidates, chosen, n - len(chosen), rng)
     left = options[far].reshape(-1, len(tolerance))
@@ -106,7 +106,7 @@ def plan(spec: ArmSpec, recorded: Recorded, n: int, seed: int) -> Plan:
 
 
 def n_unknown(covariance: np.ndarray) -> int:
-    """Return the number of directions known to less than the tolerance, 1 in the covariance's units."""
+    """Return the number of directions of a covariance (p, p), in units of tolerances, that are not known."""
     widths = MARGIN * QUANTILE * np.sqrt(np.linalg.eigvalsh(covariance))
     return int(np.count_nonzero(widths > 1.0))
 
@@ -116,19 +116,21 @@ def choose_informative(options: np.ndarray, covariance: np.ndarray, n: int) -> t
 
     Args:
         options (m, k, p): derivatives of each candidate's k measurements, in units of scales and tolerances.
-        covariance (p, p): of the parameters before, in units of their tolerances.
+        covariance (p, p): covariance of the parameters before, in units of their tolerances.
         n: greatest number of poses.
 
     Returns:
-        Indices of the chosen, and the covariance with them.
+        Indices of the chosen candidates, and the covariance with them.
     """
     chosen: list[int] = []
     left = np.ones(len(options), bool)
     while len(chosen) < n and n_unknown(covariance) > 0:
+        # Compute how much each candidate would reduce the sum of the variances.
         spread = options @ covariance  # (m, k, p)
         inner = np.eye(options.shape[1]) + spread @ np.swapaxes(options, 1, 2)
-        gain = np.trace(np.linalg.solve(inner, spread @ np.swapaxes(spread, 1, 2)), axis1=1, axis2=2)
-        best = int(np.argmax(np.where(left, gain, -np.inf)))
+        reduction = np.trace(np.linalg.solve(inner, spread @ np.swapaxes(spread, 1, 2)), axis1=1, axis2=2)
+        # Add the best candidate.
+        best = int(np.argmax(np.where(left, reduction, -np.inf)))
         chosen.append(best)
         left[best] = False
         covariance = covariance - spread[best].T @ np.linalg.solve(inner[best], spread[best])
@@ -144,11 +146,13 @@ def choose_far(
     rng: np.random.Generator,
 ) -> np.ndarray:
     """Draw n candidates (m, n_chambers) far from poses, recorded or taken; return their indices."""
+    # Weigh candidates by the errors of the poses nearest to them.
     span = spec.chambers.pressure_max_kpa - spec.chambers.pressure_min_kpa
     square = np.mean((candidates[:, None] - recorded.pressure_kpa) ** 2, axis=-1) / span**2
     near = np.argsort(square, axis=1)[:, :N_NEAREST]
     ratio = recorded.error_mm[near].mean(axis=1) / recorded.error_mm.mean()
     weight = np.clip(ratio, 1.0 / MAX_ERROR_RATIO, MAX_ERROR_RATIO)
+    # Draw by the square of the distance, anew after each pose.
     away = square.min(axis=1)
 
     def keep_away(k: int) -> np.ndarray:
@@ -165,22 +169,22 @@ def choose_far(
 
 
 def _candidates(spec: ArmSpec, n: int, rng: np.random.Generator) -> np.ndarray:
-    """Draw pressures (m, n_chambers) at which the arm settles: random, extreme, alike within sections."""
+    """Draw pressures (m, n_chambers) at which the arm settles: random, extreme, equal within sections."""
     third = -(-n // 3)
     extremes = rng.choice(pressure_levels(spec), (third, spec.n_chambers))
     of_section = random_pressures(spec, third, rng)[:, ::N_CHAMBERS_PER_SECTION]
-    alike = np.repeat(of_section, N_CHAMBERS_PER_SECTION, axis=1)
-    drawn = np.concatenate([random_pressures(spec, third, rng), extremes, alike])
+    equal = np.repeat(of_section, N_CHAMBERS_PER_SECTION, axis=1)
+    drawn = np.concatenate([random_pressures(spec, third, rng), extremes, equal])
     return drawn[settle_many(spec, drawn).settled]
 
 
 def _derivatives(
     spec: ArmSpec, pressure_kpa: np.ndarray, payload_kg: np.ndarray, scale: np.ndarray
 ) -> np.ndarray:
-    """Return derivatives (n, m, p) of measurements over their scales; zero without a rest."""
+    """Return derivatives (n, m, p) of measurements over their scales; zero where the arm does not settle."""
     rotation = np.asarray(settle_many(spec, pressure_kpa).tip_rotation)
-    guess, end_m = unmeasured(spec, pressure_kpa, payload_kg, rotation)
-    error, slope, _ = simulate(spec, guess, end_m, np.zeros(len(priors(spec))))
+    measured = unmeasured(spec, pressure_kpa, payload_kg, rotation)
+    error, slope, _ = simulate(spec, measured, np.zeros(len(priors(spec))))
     straight, kind = np.divmod(error_groups(spec, pressure_kpa), N_KINDS)
     seen = kind[0] < scale.shape[1]
     settled = np.isfinite(error[:, 0]) & np.isfinite(slope).all(axis=(1, 2))

@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 
 from calib import demo
-from calib.fit.chambers import calibrate_chambers
+from calib.fit.chambers import fit_chambers
 from calib.fit.sensors import fit_springs
 from calib.read.logs import read_log
+from calib.read.measurements import measure as measurements_of
 from mjx_softarm import ArmSpec
 
 
@@ -31,7 +32,7 @@ def measure() -> dict[str, Any]:
     assert springs.readings is not None and springs.spring_m is not None  # as the demo writes them
     lines = fit_springs(springs.readings, springs.spring_m, spec.spring_sensor)
     sensor = {"beta": tuple(map(float, lines.beta)), "delta_m": tuple(map(float, lines.delta_m))}
-    fit = calibrate_chambers(poses, spec.replace(sensor=sensor))
+    fit = fit_chambers(measurements_of([poses], spec), spec.replace(sensor=sensor))
     return {
         "beta, largest error [%]": 100 * _worst(lines.beta, planted.sensor.beta),
         "stiffness, largest error [%]": 100

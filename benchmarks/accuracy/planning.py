@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from calib.fit.s2r import pose_errors, simulate_poses
+from calib.fit.pose_errors import pose_errors
+from calib.fit.s2r import simulate_poses
 from calib.plan import plan
 from calib.read.static_poses import find_static_poses
 from calib.run import Calibration, calibrate
@@ -92,7 +93,7 @@ def _figures(calibration: Calibration, judge: Log) -> dict[str, Any]:
     spec = calibration.spec
     parts = {section.title: section for section in calibration.sections}
     chambers, network = parts["Chambers"].data, parts["Sim-to-real network"].data
-    poses, _ = find_static_poses([judge], spec)
+    poses = find_static_poses([judge], spec)[0].with_lengths(spec)
     simulated = simulate_poses(spec, poses.spring_m)
     real = pose_from_frame(poses.tip_m, poses.tip_rotation)
     pose, spring_m, real = (x[simulated.valid] for x in (simulated.pose, simulated.spring_m, real))

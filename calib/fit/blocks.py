@@ -1,12 +1,19 @@
 """Held-out rows of a log, in contiguous blocks.
 
-Neighbouring rows of a log are nearly equal, so a row held out alone has its neighbours in the training set,
-and any fit looks good on it. Here whole stretches of time are held out.
+Neighbouring rows of a log are nearly equal. A row held out alone has its neighbours in the training set, and
+any fit looks good on it; so whole stretches of time are held out.
 """
 
 from __future__ import annotations
 
 import numpy as np
+
+MIN_BLOCKS = 20  # least number of blocks of a log: blocks are shorter rather than fewer
+
+
+def block_rows(n: int, longest: int = 100) -> int:
+    """Return the number of rows in a block of a log of n rows."""
+    return max(min(longest, n // MIN_BLOCKS), 1)
 
 
 def held_out_blocks(n: int, share: float = 0.2, block: int = 100, seed: int = 0) -> np.ndarray:
@@ -37,9 +44,9 @@ def folds(
 ) -> np.ndarray:
     """Return the fold (n,) that holds out each row: every row once, in whole blocks, drawn at random.
 
-    Blocks are as in `held_out_blocks`. A log of fewer blocks than folds is cut into one block for each. With
-    `by` (n,), each fold gets blocks from the whole range of that quantity: of as many blocks as there are
-    folds, neighbours in its order, each goes to another fold.
+    Blocks are as in `held_out_blocks`. A log of fewer blocks than folds is cut into one block for each fold.
+    With `by` (n,), blocks are sorted by their mean of it, and each `n_folds` neighbours go to different
+    folds: every fold reaches over the whole range.
 
     Raises:
         ValueError: fewer than two folds, or fewer rows than folds.

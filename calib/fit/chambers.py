@@ -1,15 +1,15 @@
 """Stiffness, area and length of each chamber, and the arm's mounting, fitted to poses of the arm at rest.
 
-The simulated arm settles at the logged pressures; its chambers are changed until tip poses agree, and spring
-lengths and markers at the sections' ends where they were measured. Robust least squares
-(`calib.fit.leastsquares`) take the Jacobian from the implicit function theorem, see `calib.fit.equilibrium`.
-Straight arms, if there are enough of them, have errors of their own scale: the model fits them better. A
-first fit leaves out some poses, which judge it. The last fit begins where that one ended, and takes all.
+The simulated arm settles at the logged pressures. Robust least squares (`calib.fit.leastsquares`) change its
+chambers until tip poses agree, and spring lengths and markers at the sections' ends where there are any. The
+Jacobian comes from the implicit function theorem (`calib.fit.equilibrium`). Errors of straight arms have a
+scale of their own, as the model fits straight arms better. A first fit leaves out some poses, which judge it;
+the last fit begins from it and takes all poses.
 
-Masses are known and set the scale of all forces. The bending stiffness of the backbone is fitted too, as area
-and stiffness would otherwise absorb its error. Its axial stiffness and that of the springs cannot be fitted:
-they act in parallel with the chambers and only the sum is seen, so the chambers absorb their error. A weak
-prior keeps what the poses do not determine near the specification, and the warnings name it.
+Masses are known and set the scale of all forces. The bending stiffness of the backbone is fitted, too, as
+area and stiffness would otherwise absorb its error. Axial stiffness of backbone and springs acts in parallel
+with the chambers, which absorb its error. A weak prior keeps parameters that the poses do not determine near
+the specification; the warnings name them.
 """
 
 from __future__ import annotations
@@ -22,84 +22,50 @@ import numpy as np
 
 from calib.errors import FitError
 from calib.fit.blocks import held_out_blocks
-from calib.fit.equilibrium import N_KINDS, error_groups, simulate, tip_changes
+from calib.fit.equilibrium import N_KINDS, Measured, error_groups, simulate, tip_changes
 from calib.fit.leastsquares import NOT_CONVERGED, Problem, Solution, fit, principal, refine
 from calib.fit.markers import section_ends
 from calib.fit.parameters import half_widths, names, priors, spec_at, tolerances
-from calib.read.static_poses import StaticPoses, find_static_poses
-from mjx_softarm.logs.rest import HOLD_KPA
-from mjx_softarm.logs.schema import Log
+from calib.fit.pose_errors import PoseErrors, errors_of
+from calib.read.measurements import Measurements
+from calib.read.static_poses import StaticPoses
 from mjx_softarm.spec import ArmSpec
 
 MIN_POSES = 20
 ENOUGH_POSES = 100
-MIN_STRAIGHT = 20  # poses of straight arms whose errors have scales of their own
-HELD_OUT_SHARE = 0.2
+MIN_STRAIGHT = 20  # poses of straight arms from which their errors have scales of their own
 HELD_OUT_BLOCK = 5  # poses
-SCALE = (1e-3, 0.01, 1e-3, 1e-3)  # of tip [m], rotation [rad], springs [m] and markers [m]
-MIN_SCALE = (1e-4, 1e-3, 1e-4, 1e-4)
-MAX_RATIO = 2.0  # calibrated to specified value, and held-out to other errors
-TOLD_TURN_DEG = 1.0
-MAX_PRESSURE_GAP = 0.1  # share of the range that may be missing at either end
-
-
-@dataclass(frozen=True)
-class Errors:
-    """Errors of simulated against measured tips over n poses."""
-
-    n: int
-    translation_mean_mm: float
-    translation_95_mm: float
-    rotation_mean_deg: float
-    rotation_95_deg: float
-    spring_rms_mm: float | None  # None where no spring was measured
+SCALE = (1e-3, 0.01, 1e-3, 1e-3)  # first guess for tip [m], rotation [rad], springs [m] and markers [m]
+MIN_SCALE = (1e-4, 1e-3, 1e-4, 1e-4)  # least values of the same scales
+MAX_RATIO = 2.0  # warn from this ratio of calibrated to specified values, or of held-out to other errors
+TOLD_TURN_DEG = 1.0  # turn of the measured tip from which a note tells it
+MAX_PRESSURE_GAP = 0.1  # share of the pressure range that may be missing at either end
 
 
 @dataclass(frozen=True, eq=False)
 class ChamberFit:
     """Calibrated chambers and whether to trust them.
 
-    Attributes:
-        spec: calibrated arm: chambers, bending stiffness of the backbone, mounting, and the range of spring
-            lengths that may be commanded, which is the range measured at rest.
-        half_width_95: half-width of the 95 % interval of each fitted field of `spec.chambers` (n_chambers,),
-            of `spec.backbone` () and of `spec.mounting`.
-        direction_widths: half-widths of the 95 % intervals along the principal directions of the fit, in
-            units of the tolerances of `calib.fit.parameters`, largest first (p,).
-        weak: unknown directions, whose width is above 1, in words.
-        weak_tip_mm: how far each of these moves the simulated tip within its interval, at the pressures and
-            with the payload where it does so the most (`calib.fit.equilibrium`).
-        in_sample, held_out: errors of the first fit, in which the held-out poses took no part; `spec` is from
-            the last fit, to all poses.
-        in_sample_before, held_out_before: errors of the specification that the fit started from.
-        scale: robust errors of arms that bend and of straight ones (2, 3): tip [m], rotation [rad] and
-            springs [m], then (2, 4) markers [m] if there are any; a guess if too few arms are straight.
-        rows: number of rows of the logs, by use.
-        n_single: number of poses of one row, which cannot show whether the tip moved.
-        poses: static poses of the logs, in their order.
-        is_held_out: mask (n,) of the poses that judge.
-        tip_error_mm: tip error (n,) of the fit without the held-out poses; NaN where it did not settle.
-        chamber_m: chamber lengths (n, n_chambers) of the calibrated arm at each pose.
-        warnings: reasons not to trust the fit, each with its remedy; none is good.
+    The first fit does not know the held-out poses, the last fit is to all poses.
     """
 
-    spec: ArmSpec
-    half_width_95: Mapping[str, np.ndarray]
-    direction_widths: np.ndarray
-    weak: tuple[str, ...]
-    weak_tip_mm: np.ndarray
-    in_sample: Errors
-    held_out: Errors
-    in_sample_before: Errors
-    held_out_before: Errors
-    scale: np.ndarray
-    rows: Mapping[str, int]
-    n_single: int
-    poses: StaticPoses
-    is_held_out: np.ndarray
-    tip_error_mm: np.ndarray
-    chamber_m: np.ndarray
-    warnings: tuple[str, ...]
+    spec: ArmSpec  # arm of the last fit; springs may be commanded over the range measured at rest
+    half_width_95: Mapping[str, np.ndarray]  # half-widths of 95 % intervals, by fields of the specification
+    direction_widths: np.ndarray  # (p,) half-widths along principal directions, in tolerances
+    weak: tuple[str, ...]  # unknown directions, whose width is above 1, in words
+    weak_tip_mm: np.ndarray  # largest movement of the tip along each unknown direction, within its interval
+    in_sample: PoseErrors  # errors of the first fit at its own poses
+    held_out: PoseErrors  # errors of the first fit at held-out poses
+    in_sample_before: PoseErrors  # errors of the specification
+    held_out_before: PoseErrors  # errors of the specification
+    scale: np.ndarray  # (2, 3 or 4) robust errors of bent and straight arms, by `SCALE`
+    rows: Mapping[str, int]  # number of rows of the logs, by use
+    n_single: int  # poses of one row, which cannot show whether the tip moved
+    poses: StaticPoses  # in the order of the logs
+    is_held_out: np.ndarray  # (n,) bool
+    tip_error_mm: np.ndarray  # (n,) tip error of the first fit; NaN where the arm did not settle
+    chamber_m: np.ndarray  # (n, n_chambers) chamber lengths of the last fit
+    warnings: tuple[str, ...]  # reasons not to trust the fit, each with its remedy
 
     @property
     def has_markers(self) -> bool:
@@ -113,7 +79,7 @@ class ChamberFit:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Say whether motion capture's axes of the tip are off those of the last plate."""
+        """Say whether motion capture's axes of the tip differ from the axes of the last plate."""
         turn_deg = np.linalg.norm(self.spec.mounting.tip_turn_deg)
         if turn_deg < TOLD_TURN_DEG:
             return ()
@@ -123,34 +89,35 @@ class ChamberFit:
         )
 
 
-def calibrate_chambers(logs: Log | Sequence[Log], spec: ArmSpec, seed: int = 0) -> ChamberFit:
-    """Fit the chambers of an arm to its logs.
+def fit_chambers(measurements: Measurements, spec: ArmSpec, seed: int = 0) -> ChamberFit:
+    """Fit the chambers of an arm to its poses at rest.
 
     Args:
-        logs: logs with pressures and tip poses; readings or spring lengths help. `calib.read.static_poses`
-            tells which rows count.
+        measurements: poses at rest; readings, spring lengths and markers help.
         spec: arm as believed so far, its sensors already calibrated.
         seed: seed that chooses the held-out poses, in contiguous blocks.
 
     Raises:
-        FitError: a log without pressures or tip poses, or too few poses at rest.
-        SpecError: the calibrated values are not those of an arm.
+        FitError: too few poses at rest.
+        SpecError: no arm can have the calibrated values.
     """
-    poses, rows = find_static_poses([logs] if isinstance(logs, Log) else logs, spec)
+    poses, row_uses = measurements.poses.with_lengths(spec), measurements.row_uses
     if poses.n < MIN_POSES:
-        row_uses = ", ".join(f"{count} {use}" for use, count in rows.items())
+        uses = ", ".join(f"{count} {use}" for use, count in row_uses.items())
         raise FitError(
-            f"chambers: got {poses.n} poses at rest, expected {MIN_POSES} or more; "
-            f"rows of the logs: {row_uses}"
+            f"chambers: got {poses.n} poses at rest, expected {MIN_POSES} or more; rows of the logs: {uses}"
         )
-    held = np.ptp(poses.pressure_kpa, axis=0) < HOLD_KPA  # their noise would pass for changes
-    poses = poses._replace(pressure_kpa=np.where(held, poses.pressure_kpa.mean(axis=0), poses.pressure_kpa))
-    held_out = held_out_blocks(poses.n, HELD_OUT_SHARE, HELD_OUT_BLOCK, seed)
+    # Fit without the held-out poses, then, from there, to all poses.
+    held_out = held_out_blocks(poses.n, block=HELD_OUT_BLOCK, seed=seed)
     end_m, complaints = _section_ends(poses, spec)
-    judged, solution = _solutions(spec, poses, end_m, held_out)
-    before, _, _ = simulate(spec, poses, end_m, np.zeros_like(solution.x))
-    after, _, _ = simulate(spec, poses, end_m, judged.x)
-    _, _, chamber_m = simulate(spec, poses, end_m, solution.x)
+    measured = Measured(
+        poses.pressure_kpa, poses.payload_kg, poses.tip_m, poses.tip_rotation, poses.spring_m, end_m
+    )
+    judged, solution = _solutions(spec, measured, held_out)
+    # Judge the specification and the first fit, and name the directions that the last fit does not know.
+    before, _, _ = simulate(spec, measured, np.zeros_like(solution.x))
+    after, _, _ = simulate(spec, measured, judged.x)
+    _, _, chamber_m = simulate(spec, measured, solution.x)
     calibrated = _calibrated(spec, solution.x, poses)
     bent, straight = solution.scale.reshape(2, -1)
     widths, directions = principal(solution, tolerances(spec))
@@ -158,20 +125,19 @@ def calibrate_chambers(logs: Log | Sequence[Log], spec: ArmSpec, seed: int = 0) 
     change = (tolerances(spec)[:, None] * widths * directions)[:, unknown]
     weak_tip_mm = 1e3 * tip_changes(spec, solution.x, change)
     each = zip(widths[unknown], weak_tip_mm, directions.T[unknown], strict=True)
-    weak = tuple(_describe(*numbers, names(spec)) for numbers in each)
     found = ChamberFit(
         spec=calibrated,
         half_width_95=half_widths(calibrated, solution.half_width),
         direction_widths=widths,
-        weak=weak,
+        weak=tuple(_describe(*numbers, names(spec)) for numbers in each),
         weak_tip_mm=weak_tip_mm,
         in_sample=_errors(after[~held_out], spec),
         held_out=_errors(after[held_out], spec),
         in_sample_before=_errors(before[~held_out], spec),
         held_out_before=_errors(before[held_out], spec),
         scale=np.stack([bent, np.minimum(bent, straight)])[:, : 4 if np.isfinite(end_m).any() else 3],
-        rows=rows,
-        n_single=int(np.count_nonzero(poses.single)),
+        rows=row_uses,
+        n_single=int(np.count_nonzero(poses.n_rows == 1)),
         poses=poses,
         is_held_out=held_out,
         tip_error_mm=np.where(np.isinf(after[:, 0]), np.nan, 1e3 * np.linalg.norm(after[:, :3], axis=1)),
@@ -181,18 +147,15 @@ def calibrate_chambers(logs: Log | Sequence[Log], spec: ArmSpec, seed: int = 0) 
     return dataclasses.replace(found, warnings=complaints + _warnings(found, spec, solution))
 
 
-def _solutions(
-    spec: ArmSpec, poses: StaticPoses, end_m: np.ndarray, held_out: np.ndarray
-) -> tuple[Solution, Solution]:
+def _solutions(spec: ArmSpec, measured: Measured, held_out: np.ndarray) -> tuple[Solution, Solution]:
     """Return the fit without the held-out poses, which judge it, and the fit to all poses, begun from it."""
-    group = error_groups(spec, poses.pressure_kpa)
+    group = error_groups(spec, np.asarray(measured.pressure_kpa))
     if np.count_nonzero(group[~held_out, 0] >= N_KINDS) < MIN_STRAIGHT:
         group %= N_KINDS
-    all_of_them = Problem(priors(spec), group, np.tile(SCALE, 2), np.tile(MIN_SCALE, 2))
-    part = dataclasses.replace(all_of_them, group=group[~held_out])
-    some, some_end_m = poses.take(~held_out), end_m[~held_out]
-    judged = fit(lambda x: simulate(spec, some, some_end_m, x)[:2], part)
-    return judged, refine(lambda x: simulate(spec, poses, end_m, x)[:2], judged.x, all_of_them)
+    problem = Problem(priors(spec), group, np.tile(SCALE, 2), np.tile(MIN_SCALE, 2))
+    part, learned = dataclasses.replace(problem, group=group[~held_out]), measured.take(~held_out)
+    judged = fit(lambda x: simulate(spec, learned, x)[:2], part)
+    return judged, refine(lambda x: simulate(spec, measured, x)[:2], judged.x, problem)
 
 
 def _section_ends(poses: StaticPoses, spec: ArmSpec) -> tuple[np.ndarray, tuple[str, ...]]:
@@ -220,21 +183,15 @@ def _describe(width: float, tip_mm: float, vector: np.ndarray, names: Sequence[s
     return f"known to {width:.2f} times the tolerance, the tip to {tip_mm:.1f} mm: {' '.join(components)}"
 
 
-def _errors(error: np.ndarray, spec: ArmSpec) -> Errors:
+def _errors(error: np.ndarray, spec: ArmSpec) -> PoseErrors:
     settled = error[~np.isinf(error[:, 0])].reshape(-1, error.shape[1])
-    if len(settled) == 0:
-        return Errors(0, np.nan, np.nan, np.nan, np.nan, None)
+    sine = np.minimum(np.linalg.norm(settled[:, 3:6], axis=1), 1.0)
     tip_mm = 1e3 * np.linalg.norm(settled[:, :3], axis=1)
-    turn_deg = np.degrees(np.arcsin(np.minimum(np.linalg.norm(settled[:, 3:6], axis=1), 1.0)))
-    spring = settled[:, 6 : 6 + spec.n_chambers]
-    measured = np.isfinite(spring).any()
-    tip_95_mm, turn_95_deg = float(np.percentile(tip_mm, 95)), float(np.percentile(turn_deg, 95))
-    spring_rms_mm = 1e3 * float(np.sqrt(np.nanmean(spring**2))) if measured else None
-    tip, turn = (float(tip_mm.mean()), tip_95_mm), (float(turn_deg.mean()), turn_95_deg)
-    return Errors(len(settled), *tip, *turn, spring_rms_mm)
+    return errors_of(tip_mm, np.degrees(np.arcsin(sine)), settled[:, 6 : 6 + spec.n_chambers])
 
 
 def _warnings(found: ChamberFit, spec: ArmSpec, solution: Solution) -> tuple[str, ...]:
+    # Look at the fit and its poses.
     said = [] if solution.converged else [NOT_CONVERGED]
     if found.poses.n < ENOUGH_POSES:
         said.append(f"got {found.poses.n} poses at rest, expected {ENOUGH_POSES} or more: log more poses")
@@ -246,10 +203,11 @@ def _warnings(found: ChamberFit, spec: ArmSpec, solution: Solution) -> tuple[str
     if found.held_out.translation_mean_mm > MAX_RATIO * found.in_sample.translation_mean_mm:
         said.append(
             f"held-out tip error {found.held_out.translation_mean_mm:.2f} mm is more than {MAX_RATIO:g} "
-            f"times that of the other poses, {found.in_sample.translation_mean_mm:.2f} mm: log more poses"
+            f"times the error of the others, {found.in_sample.translation_mean_mm:.2f} mm: log more poses"
         )
     if not found.is_better:
         said.append("the specification itself is better on held-out poses, so it stays: log more poses")
+    # Look at the fitted numbers.
     stiffness, area = np.exp(np.abs(solution.x[: 2 * spec.n_chambers])).reshape(2, -1)
     for name, ratio in (("stiffness", stiffness), ("area", area)):
         if (far := np.flatnonzero(ratio > MAX_RATIO)).size:
@@ -260,8 +218,9 @@ def _warnings(found: ChamberFit, spec: ArmSpec, solution: Solution) -> tuple[str
     if found.weak:
         n_weak = len(found.weak)
         springs = ", with spring lengths" if np.isnan(found.poses.spring_m).any() else ""
-        remedy = f"record those of `python -m calib plan`{springs}"
+        remedy = f"record the poses of `python -m calib plan`{springs}"
         said.append("\n  ".join([f"{n_weak} unknown directions: {remedy}", *found.weak]))
+    # Look at the range of the pressures.
     low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
     gap = MAX_PRESSURE_GAP * (high - low)
     lowest, highest = found.poses.pressure_kpa.min(0), found.poses.pressure_kpa.max(0)

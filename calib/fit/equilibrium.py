@@ -1,7 +1,4 @@
-"""Static equilibrium of the arm as a differentiable function of its parameters, beside measured poses.
-
-It also gives errors of the parameters in millimetres of the tip, over the workspace.
-"""
+"""Static equilibrium of the arm as a differentiable function of its parameters, beside measured poses."""
 
 from __future__ import annotations
 
@@ -14,7 +11,6 @@ import numpy as np
 from jax import Array
 
 from calib.fit.parameters import marker_sites, with_numbers
-from calib.read.static_poses import StaticPoses
 from mjx_softarm._support import xla
 from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.mechanics.kinematics import Frames, chain_kinematics
@@ -25,13 +21,13 @@ from mjx_softarm.mechanics.workspace import pressure_levels
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
 
 BATCH = 128  # poses simulated together
-N_KINDS = 4  # of errors: tip, rotation, springs, markers
+N_KINDS = 4  # kinds of errors: tip, rotation, springs, markers
 N_WORKSPACE = 256  # poses over the workspace
-STRAIGHT = 0.2  # one chamber's excess over the section's others, as a share of the range, at most
+STRAIGHT = 0.2  # excess of a chamber over its section's others in a straight arm, as a share of the range
 
 
 class Measured(NamedTuple):
-    """Measurements of an arm at rest, for one pose; with a leading axis for several."""
+    """Measurements of an arm at one pose at rest, with a leading axis at several; NaN where not measured."""
 
     pressure_kpa: Array | np.ndarray  # (n_chambers,)
     payload_kg: Array | np.ndarray  # ()
@@ -40,21 +36,25 @@ class Measured(NamedTuple):
     spring_m: Array | np.ndarray  # (n_chambers,)
     end_m: Array | np.ndarray  # (n_sections, 3) markers on the sections' last plates
 
+    def take(self, poses: np.ndarray) -> Measured:
+        """Return some of the poses, chosen by indices or a mask (n,)."""
+        return Measured(*(value[poses] for value in self))
+
 
 def residuals(x: Array, params: ArmParams, measured: Measured) -> tuple[Array, Array, Array]:
     """Return simulated minus measured pose of one arm at rest.
 
     Args:
         x (p,): see `calib.fit.parameters`.
-        params: arm at x = 0, but for the payload.
+        params: arm at x = 0; its payload is not used.
         measured: measurements of one pose.
 
     Returns:
-        (6 + n_chambers + 3 n_sections,): tip [m]; rotation [rad], the axis times the sine of the angle;
-            springs [m]; markers at the sections' ends [m].
-        (): largest residual force [N, N m].
-        (n_chambers,) [m]: chamber lengths.
+        Errors (6 + n_chambers + 3 n_sections,) of the tip [m], the rotation [rad] as its axis times the sine
+        of the angle, the springs [m] and the markers at the sections' ends [m]; largest residual force () [N,
+        N m]; chamber lengths (n_chambers,) [m].
     """
+    # Settle the arm at the measured pressures.
     masses = jnp.stack([params.tool_mass_kg[0], measured.payload_kg])
     arm = with_numbers(x, params._replace(tool_mass_kg=masses))
     with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
@@ -66,6 +66,7 @@ def residuals(x: Array, params: ArmParams, measured: Measured) -> tuple[Array, A
         chamber_m = tendons(jax.lax.stop_gradient(frames), arm.chamber_site_m).length
         turn = measured.tip_rotation.T @ found.tip_rotation
         end_m = _section_ends(frames, marker_sites(x, len(found.spring_m)))
+    # Compare it with the measured pose.
     angle = 0.5 * jnp.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
     error = [
         found.tip_position_m - measured.tip_m,
@@ -79,8 +80,9 @@ def residuals(x: Array, params: ArmParams, measured: Measured) -> tuple[Array, A
 def error_groups(spec: ArmSpec, pressure_kpa: np.ndarray) -> np.ndarray:
     """Return the kind (n, m) of each of the `residuals` at pressures (n, n_chambers).
 
-    Tip 0, rotation 1, springs 2, markers 3, and 4 more for straight arms, whose sections each have nearly one
-    pressure: what the simulated arm lacks, such as torsion and shear, shows where the arm bends.
+    Kinds are tip 0, rotation 1, springs 2 and markers 3. Errors of straight arms, whose sections have nearly
+    one pressure each, have other kinds, `N_KINDS` more: the simulated arm has no torsion and shear, which act
+    where an arm bends.
     """
     kind = np.repeat(range(N_KINDS), [3, 3, spec.n_chambers, 3 * spec.structure.n_sections])
     circle = np.exp(2j * np.pi * np.arange(N_CHAMBERS_PER_SECTION) / N_CHAMBERS_PER_SECTION)
@@ -99,50 +101,38 @@ def _section_ends(frames: Frames, site_m: Array) -> Array:
 
 def unmeasured(
     spec: ArmSpec, pressure_kpa: np.ndarray, payload_kg: np.ndarray, tip_rotation: np.ndarray
-) -> tuple[StaticPoses, np.ndarray]:
-    """Return n poses to simulate that nobody measured, and their markers: zero but for the tip's axes."""
-    n = len(payload_kg)
-    poses = StaticPoses(
-        pressure_kpa=pressure_kpa,
-        payload_kg=payload_kg,
-        tip_m=np.zeros((n, 3)),
-        tip_rotation=tip_rotation,
-        spring_m=np.zeros((n, spec.n_chambers)),
-        marker_m=np.zeros((n, 0, 3)),
-        single=np.zeros(n, bool),
-    )
-    return poses, np.zeros((n, spec.structure.n_sections, 3))
+) -> Measured:
+    """Return n poses to simulate that nobody measured: zeros but for the axes of the tip."""
+    n, n_sections = len(payload_kg), spec.structure.n_sections
+    tip_m, spring_m, end_m = np.zeros((n, 3)), np.zeros((n, spec.n_chambers)), np.zeros((n, n_sections, 3))
+    return Measured(pressure_kpa, payload_kg, tip_m, tip_rotation, spring_m, end_m)
 
 
-def simulate(
-    spec: ArmSpec, poses: StaticPoses, end_m: np.ndarray, x: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def simulate(spec: ArmSpec, measured: Measured, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Simulate all poses at x.
 
     Args:
         spec: arm at x = 0.
-        poses: n measured poses.
-        end_m (n, n_sections, 3) [m]: markers at the sections' ends, NaN where not measured.
+        measured: n poses.
         x (p,): see `calib.fit.parameters`.
 
     Returns:
         Errors (n, m) of `residuals`, inf where the arm does not settle; their Jacobian (n, m, p); chamber
         lengths (n, n_chambers) [m].
     """
-    params = ArmParams.from_spec(spec)
-    fields = (poses.pressure_kpa, poses.payload_kg, poses.tip_m, poses.tip_rotation, poses.spring_m, end_m)
-    padded = -(-poses.n // BATCH) * BATCH
-    measured = Measured(*(np.resize(np.float32(f), (padded, *f.shape[1:])) for f in fields))
-    batches = [Measured(*(f[k : k + BATCH] for f in measured)) for k in range(0, padded, BATCH)]
+    params, n = ArmParams.from_spec(spec), len(measured.payload_kg)
+    padded = -(-n // BATCH) * BATCH
+    measured = Measured(*(np.resize(np.float32(f), (padded, *f.shape[1:])) for f in measured))
+    batches = [measured.take(np.arange(k, k + BATCH)) for k in range(0, padded, BATCH)]
     found = [jax.device_get(_jacobian()(np.float32(x), params, batch)) for batch in batches]
-    error, slope, settled, chamber_m = (np.concatenate(a)[: poses.n] for a in zip(*found, strict=True))
+    error, slope, settled, chamber_m = (np.concatenate(a)[:n] for a in zip(*found, strict=True))
     return np.where(settled[:, None], error.astype(float), np.inf), slope.astype(float), chamber_m
 
 
 def tip_changes(spec: ArmSpec, x: np.ndarray, change: np.ndarray) -> np.ndarray:
-    """Return how far changes of x move the tip at given pressures, to first order, where they do the most.
+    """Return the largest movement of the tip by changes of x, over the workspace and to first order.
 
-    Half of the poses have pressures at random and half at the extremes; every second one has the heaviest
+    Half of the poses have random pressures and half have extreme ones; every second pose has the heaviest
     payload.
 
     Args:
@@ -158,7 +148,7 @@ def tip_changes(spec: ArmSpec, x: np.ndarray, change: np.ndarray) -> np.ndarray:
     pressure_kpa = np.concatenate([random_pressures(spec, N_WORKSPACE - len(extremes), rng), extremes])
     payload_kg = np.where(np.arange(N_WORKSPACE) % 2, spec.mass.largest_payload_kg, 0.0)
     rotation = np.broadcast_to(np.eye(3), (N_WORKSPACE, 3, 3))
-    error, slope, _ = simulate(spec, *unmeasured(spec, pressure_kpa, payload_kg, rotation), x)
+    error, slope, _ = simulate(spec, unmeasured(spec, pressure_kpa, payload_kg, rotation), x)
     settled = np.isfinite(error[:, 0]) & np.isfinite(slope).all(axis=(1, 2))
     return np.linalg.norm(slope[settled, :3] @ change, axis=1).max(axis=0, initial=0.0)
 

@@ -1,9 +1,9 @@
 """Robust least squares with intervals, on `scipy.optimize.least_squares` with Huber's loss.
 
-The model returns errors and their Jacobian. The scales of the errors are estimated between rounds of the fit,
-one for each group of them, so that what fits worse weighs less. A weak prior keeps parameters at the start
-where the data do not determine them. The covariance is a sandwich whose clusters are the rows of errors: it
-adds up how the parameters change when one row is left out (jackknife, one Newton step).
+The model returns errors and their Jacobian. Each group of errors has a scale, estimated between rounds of the
+fit, so that a group that fits worse weighs less. A weak prior keeps parameters that the data do not determine
+at the start. The covariance is a sandwich whose clusters are the rows of errors: it adds up the changes of
+the parameters when one row is left out (jackknife, one Newton step).
 
 Source: Huber, "Robust Estimation of a Location Parameter", Ann. Math. Statist. 35 (1964), and "Robust
 Statistics" (1981), section 7; clusters: Bell and McCaffrey, Survey Methodology 28 (2002).
@@ -20,15 +20,14 @@ import numpy as np
 from scipy.optimize import least_squares
 
 NOT_CONVERGED = "the fit did not converge: start from a specification closer to the arm (--spec)"
-ROUNDS = ("linear", "huber", "huber")  # losses: the first with the given scales, the others with those found
-# Of a round: evaluations of the model; relative changes of the loss and of x, of which single precision gives
-# no less; SciPy's third test depends on the units of x.
+ROUNDS = ("linear", "huber", "huber")  # losses; the first round has the given scales
+# End of a round. Single precision allows no smaller changes; SciPy's third test depends on the units of x.
 TOLERANCES: dict[str, Any] = {"max_nfev": 15, "ftol": 1e-6, "xtol": 1e-4, "gtol": None}
-NEWTON_STEPS = 5  # at most, after the rounds: each round's scales are those of the round before
-SMALL_STEP = 0.1  # standard deviations that a converged fit is from its minimum, at most
+NEWTON_STEPS = 5  # at most, after the rounds, as each round has the scales of the round before
+SMALL_STEP = 0.1  # greatest distance of a converged fit from its minimum, in standard deviations
 NO_ANSWER = 30.0  # error, in scales, of a row for which the model has no answer
-SIGMA_PER_MEDIAN = 1.4826  # of the absolute value of a normal variable
-QUANTILE = 1.96  # of 95 % intervals
+SIGMA_PER_MEDIAN = 1.4826  # standard deviation of a normal variable over its median absolute value
+QUANTILE = 1.96  # half-width of a 95 % interval in standard deviations
 
 # x (p,) -> errors (n, m), NaN where not measured, inf in rows without an answer; Jacobian (n, m, p)
 Model = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
@@ -51,8 +50,8 @@ class Solution(NamedTuple):
     x: np.ndarray  # (p,)
     covariance: np.ndarray  # (p, p)
     scale: np.ndarray  # (n_groups,) standard deviations of the errors
-    newton_step: np.ndarray  # (p,) by which x is still off the minimum
-    decrement: float  # by which that step would bring the loss down
+    newton_step: np.ndarray  # (p,) from x to the minimum
+    decrement: float  # reduction of the loss by the Newton step
 
     @property
     def converged(self) -> bool:
@@ -89,14 +88,14 @@ def fit(model: Model, problem: Problem) -> Solution:
 
 
 def refine(model: Model, x: np.ndarray, problem: Problem) -> Solution:
-    """Take Newton steps to the minimum from an x (p,) close to it, such as that of a part of the rows."""
+    """Take Newton steps to the minimum from an x (p,) close to it, such as the fit to a part of the rows."""
     solution = solution_at(x, *model(x), problem)
     for _ in range(NEWTON_STEPS):
         if solution.converged:
             break
         x = solution.x + solution.newton_step
         found = model(x)
-        # Single precision hides how little the loss comes down close to the minimum; the gradient tells.
+        # Close to the minimum single precision hides changes of the loss, so the gradient decides.
         if not _covariance(*found, x, solution.scale, problem)[2] < solution.decrement:
             break
         solution = solution_at(x, *found, problem)
@@ -144,7 +143,7 @@ def _scaled(
 def _covariance(
     error: np.ndarray, jacobian: np.ndarray, x: np.ndarray, scale: np.ndarray, problem: Problem
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return the covariance (p, p), the Newton step (p,) and how far it would bring the loss down."""
+    """Return the covariance (p, p), the Newton step (p,) and the decrement of the loss by it."""
     error, slope = _scaled(error, jacobian, scale, problem)
     precision = np.diag(problem.prior**-2.0)
     inside = np.where(np.abs(error)[..., None] <= problem.huber, slope, 0.0)

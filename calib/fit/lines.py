@@ -1,30 +1,35 @@
-"""Robust straight lines y = slope x + offset, with intervals and held-out errors.
+"""Robust lines y = slope x / (1 - share x) + offset, straight without a share, with held-out errors.
 
-Optax's L-BFGS minimises Huber's loss, whose scale comes from the residuals, so that a few gross outliers
-hardly matter. Intervals take stretches of neighbouring rows as one piece of evidence each, since neighbouring
-rows of a log err alike.
+Optax's L-BFGS minimises Huber's loss, whose scale comes from the residuals: a few gross outliers hardly
+matter.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import functools
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+import optax
+from jax import Array
 
 from calib.errors import FitError
-from calib.fit.blocks import folds
-from calib.fit.huber_line import HUBER, descend, wire_length
-from calib.fit.leastsquares import Problem, solution_at
+from calib.fit.blocks import block_rows, folds
+from calib.fit.leastsquares import SIGMA_PER_MEDIAN, Problem, solution_at
+from mjx_softarm._support.xp import array_namespace
 
-DOWN_WEIGHTED = 2 * HUBER  # beyond it a row counts less than half
-PRIOR = 10.0  # of the parameters of normalised columns: next to nothing
-STRETCHES = 50  # of neighbouring rows, for the intervals
+HUBER = 1.345  # standard deviations of the noise; 95 % of the efficiency of least squares
+DOWN_WEIGHTED = 2 * HUBER  # error from which a row counts less than half
+ROUNDS = 5  # rounds of the fit; each finds the scale, then the parameters
+ITERATIONS = 40  # iterations of L-BFGS in a round
+PRIOR = 10.0  # standard deviation of standardised parameters: next to no prior
+STRETCHES = 50  # clusters of the intervals: neighbouring rows err alike
 STUDENT = 2.0096  # 97.5 % quantile for STRETCHES - 1 degrees of freedom
 MIN_ROWS = 50
-MIN_BLOCKS = 20  # of which folds are made: shorter blocks rather than fewer
-EDGE = 0.05  # of the range of the other rows, beyond which a held-out row is extrapolated to
-MAX_BEYOND = 0.02  # share of such rows that is worth a warning
+EDGE = 0.05  # share of the range of the other rows by which a held-out row may exceed it
+MAX_BEYOND = 0.02  # share of held-out rows beyond the range from which there is a warning
 
 
 class LineFit(NamedTuple):
@@ -36,51 +41,39 @@ class LineFit(NamedTuple):
     offset_interval: np.ndarray  # (k, 2)
     rms: np.ndarray  # (k,) over all rows, outliers too
     held_out_rms: np.ndarray  # (k,) over all rows, each predicted by a fit without its block
-    beyond: np.ndarray  # (k,) share of rows that this fit had to extrapolate to
+    beyond: np.ndarray  # (k,) share of rows that the fit without their block extrapolates to
     noise: np.ndarray  # (k,) robust standard deviation of the residuals
     n_rows: np.ndarray  # (k,)
     n_outliers: np.ndarray  # (k,) rows that count less than half
     warnings: tuple[str, ...]  # reasons not to trust the fit
+    share: float  # curvature of all lines
+    share_interval: tuple[float, float]  # 95 %; of no width where the share was not fitted
 
 
 def fit_line(
-    x: np.ndarray, y: np.ndarray, name: str = "column", shared: bool = False, block: int = 100, seed: int = 0
+    x: np.ndarray,
+    y: np.ndarray,
+    name: str = "column",
+    shared: bool = False,
+    block: int = 100,
+    seed: int = 0,
+    share: float = 0.0,
+    fit_share: bool = False,
 ) -> LineFit:
-    """Fit robust straight lines: one for each column, or one for all columns together.
+    """Fit robust lines, straight in x / (1 - share x): one for each column, or one for all columns together.
 
     Args:
-        x (n, k): predictors; an entry that is not finite is a missing one.
+        x (n, k): predictors; an entry that is not finite is a missing one; 1 at most with a share.
         y (n, k): targets; missing entries as in x.
         name: name of a column in messages; its number follows.
         shared: fit one slope and offset for all columns.
         block: rows that are held out together.
         seed: seed that chooses which blocks form a fold.
+        share: curvature of all lines, below 1, or the start of its fit.
+        fit_share: fit the curvature, too.
 
     Raises:
         FitError: the shapes differ, or a column has fewer than 3 rows or one value of x only.
-    """
-    return fit_curved_line(x, y, 0.0, False, name, shared, block, seed)[0]
-
-
-def fit_curved_line(
-    x: np.ndarray,
-    y: np.ndarray,
-    share: float,
-    fit_share: bool,
-    name: str,
-    shared: bool,
-    block: int,
-    seed: int,
-) -> tuple[LineFit, float, float]:
-    """Fit lines in x / (1 - share x); arguments as in `fit_line`.
-
-    Args:
-        x (n, k), y (n, k): predictors and targets.
-        share: the curvature, or where its fit starts; x is 1 at most, share below 1.
-        fit_share: fit the curvature, too, one for all columns.
-
-    Returns:
-        The lines; the share; the half-width of its 95 % interval.
     """
     x, y = np.asarray(x, float), np.asarray(y, float)
     if x.shape != y.shape or x.ndim != 2:
@@ -94,26 +87,18 @@ def fit_curved_line(
             raise FitError(
                 f"{name}{k}: got {column.sum()} rows with a reading and a length, expected 3 or more unlike"
             )
+    # Fit the lines, and predict each row by lines that have not seen its block.
     x, y = np.where(known, x, np.nan), np.where(known, y, np.nan)
     lines = _robust_lines(x, y, share, fit_share)
-    # Predict each row by a fit that has not seen its block.
-    held_out, beyond, fold = np.full_like(y, np.nan), np.zeros(y.shape, bool), _folds(x, block, seed)
-    for k in range(fold.max() + 1):
-        out = fold == k
-        if (known[~out].sum(axis=0) >= 2).all():  # else the warnings say that there are too few rows
-            others = _robust_lines(x, np.where(out[:, None], np.nan, y), share, fit_share)
-            held_out[out] = others.slope * wire_length(x[out], others.share) + others.offset
-            seen = np.where(known[~out], x[~out], np.nan)
-            low, high = np.nanmin(seen, axis=0), np.nanmax(seen, axis=0)
-            margin = EDGE * (high - low)
-            beyond[out] = (x[out] < low - margin) | (x[out] > high + margin)
-    wire = wire_length(x, lines.share)
+    held_out, beyond = _held_out(x, y, _folds(x, block, seed), share, fit_share)
+    # Compare all rows with the lines.
+    wire, sides = wire_length(x, lines.share), np.array([-1.0, 1.0])
     residual = y - lines.slope * wire - lines.offset
     fit = LineFit(
         slope=lines.slope,
         offset=lines.offset,
-        slope_interval=lines.slope[:, None] + lines.half_width[0][:, None] * [-1, 1],
-        offset_interval=lines.offset[:, None] + lines.half_width[1][:, None] * [-1, 1],
+        slope_interval=lines.slope[:, None] + lines.slope_width[:, None] * sides,
+        offset_interval=lines.offset[:, None] + lines.offset_width[:, None] * sides,
         rms=np.sqrt(np.nanmean(residual**2, 0)),
         held_out_rms=np.sqrt(np.nanmean((y - held_out) ** 2, 0)),
         beyond=beyond.sum(0) / known.sum(0),
@@ -121,11 +106,36 @@ def fit_curved_line(
         n_rows=known.sum(0),
         n_outliers=(np.abs(residual) > DOWN_WEIGHTED * lines.noise).sum(0),
         warnings=(),
+        share=lines.share,
+        share_interval=(lines.share - lines.share_width, lines.share + lines.share_width),
     )
-    fit = fit._replace(warnings=_warnings(fit, wire, f"all {name}s " if shared else name))
+    warnings = _warnings(fit, wire, f"all {name}s " if shared else name)
     if shared:
-        fit = LineFit(*(np.repeat(value, n_columns, axis=0) for value in fit[:-1]), warnings=fit.warnings)
-    return fit, lines.share, lines.share_half_width
+        fit = LineFit(*(np.repeat(v, n_columns, axis=0) if isinstance(v, np.ndarray) else v for v in fit))
+    return fit._replace(warnings=warnings)
+
+
+def wire_length(x: Any, share: Any) -> Any:
+    """Return the wire length, but for a factor, from x = w / w_max and share = I_comp w_max."""
+    xp = array_namespace(x, share)
+    return x / xp.maximum(1.0 - share * x, 1e-3)
+
+
+def _held_out(
+    x: np.ndarray, y: np.ndarray, fold: np.ndarray, share: float, fit_share: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Predict each row by a fit without its fold (n,); return also whether it is beyond that fit's rows."""
+    predicted, beyond, known = np.full_like(y, np.nan), np.zeros(y.shape, bool), np.isfinite(y)
+    for k in range(fold.max() + 1):
+        out = fold == k
+        if (known[~out].sum(axis=0) >= 2).all():  # else the warnings say that there are too few rows
+            others = _robust_lines(x, np.where(out[:, None], np.nan, y), share, fit_share)
+            predicted[out] = others.slope * wire_length(x[out], others.share) + others.offset
+            seen = x[~out]
+            low, high = np.nanmin(seen, axis=0), np.nanmax(seen, axis=0)
+            margin = EDGE * (high - low)
+            beyond[out] = (x[out] < low - margin) | (x[out] > high + margin)
+    return predicted, beyond
 
 
 def _folds(x: np.ndarray, block: int, seed: int) -> np.ndarray:
@@ -133,116 +143,138 @@ def _folds(x: np.ndarray, block: int, seed: int) -> np.ndarray:
     n = len(x)
     known = np.isfinite(x)
     centred = np.where(known, x - np.nanmean(x, axis=0), 0.0) / np.maximum(np.nanstd(x, axis=0), 1e-300)
-    block = max(min(block, n // MIN_BLOCKS), 1)
-    return folds(n, block, min(5, n), seed, centred.sum(axis=1) / np.maximum(known.sum(axis=1), 1))
+    return folds(
+        n, block_rows(n, block), min(5, n), seed, centred.sum(axis=1) / np.maximum(known.sum(axis=1), 1)
+    )
 
 
 class _Lines(NamedTuple):
-    """Robust lines y = slope x / (1 - share x) + offset."""
+    """Robust lines y = slope x / (1 - share x) + offset; widths are half of the 95 % intervals."""
 
     slope: np.ndarray  # (k,)
     offset: np.ndarray  # (k,)
-    half_width: np.ndarray  # (2, k) of the 95 % intervals of slope and offset
+    slope_width: np.ndarray  # (k,)
+    offset_width: np.ndarray  # (k,)
     noise: np.ndarray  # (k,) robust standard deviation of the residuals
     share: float
-    share_half_width: float  # 0 where it was not fitted
+    share_width: float  # 0 where it was not fitted
 
 
 def _robust_lines(x: np.ndarray, y: np.ndarray, share: float, fit_share: bool) -> _Lines:
     """Fit columns x, y (n, k), NaN where missing: each by itself, or together where they share a number."""
-    if not fit_share and x.shape[1] > 1:
-        each = [_robust_lines(x[:, [k]], y[:, [k]], share, False) for k in range(x.shape[1])]
-        slope, offset, half_width, noise, *_ = zip(*each, strict=True)
-        joined = (np.concatenate(slope), np.concatenate(offset), np.concatenate(half_width, axis=1))
-        return _Lines(*joined, np.concatenate(noise), share, 0.0)
     k = x.shape[1]
-    # Normalise the columns, and cut them into stretches: (n_stretches, n_rows, k).
-    wire = wire_length(x, share)
-    centre, y_centre = np.nanmean(wire, axis=0), np.nanmean(y, axis=0)
-    spread, y_spread = (np.maximum(np.nanstd(table, axis=0), 1e-300) for table in (wire, y))
-    x, y = (_stretches(table) for table in (x, (y - y_centre) / y_spread))
-
-    def model(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        slope, offset, now = p[:k], p[k : 2 * k], share + p[2 * k :].sum()
-        wire = wire_length(x, now)
-        z = (wire - centre) / spread
-        jacobian = np.zeros((*x.shape, len(p)))
-        for j in range(k):
-            jacobian[..., j, j], jacobian[..., j, k + j] = z[..., j], 1.0
-        if fit_share:
-            jacobian[..., -1] = slope * wire**2 / spread
-        error = slope * z + offset - y
-        return error.reshape(len(x), -1), jacobian.reshape(len(x), -1, len(p))
-
-    n_parameters = 2 * k + fit_share
+    if not fit_share and k > 1:
+        each = [_robust_lines(x[:, [j]], y[:, [j]], share, False) for j in range(k)]
+        columns = (np.concatenate(values) for values in list(zip(*each, strict=True))[:5])
+        return _Lines(*columns, share=share, share_width=0.0)
+    y_centre, y_spread = np.nanmean(y, axis=0), np.maximum(np.nanstd(y, axis=0), 1e-300)
+    with jax.enable_x64(True):
+        found = jax.device_get(_minimise(x, (y - y_centre) / y_spread, share, fit_share))
+    # Take stretches of neighbouring rows as clusters: (n, ...) to (n_stretches, rows * columns, ...).
+    p, error, jacobian, numbers, change = found
     problem = Problem(
-        prior=np.full(n_parameters, PRIOR),
-        group=np.tile(np.arange(k), x.shape[1]),
+        prior=np.full(len(p), PRIOR),
+        group=np.tile(np.arange(k), -(-len(x) // min(STRETCHES, len(x)))),
         scale=np.ones(k),
         min_scale=np.full(k, 1e-9),
         huber=HUBER,
     )
-    with jax.enable_x64(True):
-        start = np.asarray(descend(x.reshape(-1, k), y.reshape(-1, k), share, fit_share))
-    slope, offset = start[:k], start[k : 2 * k]
-    p = np.concatenate([slope * spread, offset + slope * centre, start[2 * k :]])
-    found = solution_at(p, *model(p), problem)
-    slope, offset = y_spread * found.x[:k] / spread, y_spread * found.x[k : 2 * k]
-    variance, lever = np.diag(found.covariance), centre / spread
-    both = np.diag(found.covariance[:k, k : 2 * k])
-    deviations = np.sqrt([variance[:k], variance[k : 2 * k] + lever**2 * variance[:k] - 2 * lever * both])
-    return _Lines(
-        slope,
-        y_centre + offset - slope * centre,
-        STUDENT * deviations * y_spread / [spread, np.ones(k)],
-        found.scale * y_spread,
-        share + float(found.x[2 * k :].sum()),
-        STUDENT * float(np.sqrt(variance[2 * k :].sum())),
+    solution = solution_at(p, _stretches(error), _stretches(jacobian), problem)
+    width = STUDENT * np.sqrt(np.einsum("ip,pq,iq->i", change, solution.covariance, change))
+    slope, offset, slope_width, offset_width = (
+        y_spread * values for values in (numbers[:k], numbers[k : 2 * k], width[:k], width[k : 2 * k])
     )
+    noise, share_width = y_spread * solution.scale, float(width[-1])
+    return _Lines(slope, y_centre + offset, slope_width, offset_width, noise, float(numbers[-1]), share_width)
 
 
 def _stretches(table: np.ndarray) -> np.ndarray:
-    """Cut (n, k) into stretches of neighbouring rows (n_stretches, n_rows, k), NaN at their ends."""
+    """Cut (n, k, ...) into stretches of neighbouring rows (n_stretches, n_rows k, ...), NaN at their ends."""
     pieces = np.array_split(table, min(STRETCHES, len(table)))
-    longest = len(pieces[0])
-    return np.stack([np.pad(p, ((0, longest - len(p)), (0, 0)), constant_values=np.nan) for p in pieces])
+    padded = np.full((len(pieces), len(pieces[0]), *table.shape[1:]), np.nan)
+    for row, piece in zip(padded, pieces, strict=True):
+        row[: len(piece)] = piece
+    return padded.reshape(len(pieces), -1, *table.shape[2:])
 
 
-def _warnings(fit: LineFit, x: np.ndarray, name: str) -> tuple[str, ...]:
+@functools.partial(jax.jit, static_argnames="fit_share")
+def _minimise(x: Array, y: Array, share: Array, fit_share: bool) -> tuple[Array, ...]:
+    """Minimise Huber's loss over slopes and offsets of standardised columns and, if fitted, the share.
+
+    Args:
+        x, y (n, k): columns, NaN where missing; y has unit spread.
+        share (): share, or start of its fit.
+        fit_share: whether to fit the share.
+
+    Returns:
+        Parameters (p,); errors (n, k), NaN where missing; their Jacobian (n, k, p); slopes, offsets and share
+        of the columns as they are (2 k + 1,); their derivatives (2 k + 1, p).
+    """
+    known = jnp.isfinite(x) & jnp.isfinite(y)
+    n, k = known.sum(axis=0), x.shape[1]
+    x, y = jnp.where(known, x, 0.0), jnp.where(known, y, 0.0)
+
+    def standardised(p: Array) -> tuple[Array, Array, Array]:
+        wire = wire_length(x, share + p[2 * k :].sum())
+        mean = jnp.sum(known * wire, axis=0) / n
+        spread = jnp.sqrt(jnp.maximum(jnp.sum(known * (wire - mean) ** 2, axis=0) / n, 1e-300))
+        return (wire - mean) / spread, mean, spread
+
+    def residual(p: Array) -> Array:
+        return jnp.where(known, p[:k] * standardised(p)[0] + p[k : 2 * k] - y, 0.0)
+
+    def numbers(p: Array) -> Array:
+        _, mean, spread = standardised(p)
+        slope = p[:k] / spread
+        return jnp.concatenate([slope, p[k : 2 * k] - slope * mean, share + p[2 * k :].sum(keepdims=True)])
+
+    def descend(p: Array, scale: Array) -> Array:
+        def loss(p: Array) -> Array:
+            huber = jnp.where(known, optax.losses.huber_loss(residual(p) / scale, delta=HUBER), 0.0)
+            return jnp.min(scale) ** 2 * jnp.sum(huber) / jnp.sum(n)
+
+        optimiser = optax.lbfgs(linesearch=optax.scale_by_backtracking_linesearch(20, store_grad=True))
+
+        def iterate(carry: tuple) -> tuple:
+            p, state, count, _ = carry
+            value, slope = optax.value_and_grad_from_state(loss)(p, state=state)
+            step, state = optimiser.update(slope, state, p, value=value, grad=slope, value_fn=loss)
+            return optax.apply_updates(p, step), state, count + 1, optax.tree.norm(slope)
+
+        start, goal = (p, optimiser.init(p), 0, jnp.inf), 1e-10 * jnp.min(scale)
+        return jax.lax.while_loop(lambda c: (c[2] < ITERATIONS) & (c[3] > goal), iterate, start)[0]
+
+    def next_round(count: Array, p: Array) -> Array:
+        size = jnp.nanmedian(jnp.where(known, jnp.abs(residual(p)), jnp.nan), axis=0)
+        return descend(p, jnp.where(count == 0, 1e3, jnp.maximum(SIGMA_PER_MEDIAN * size, 1e-9)))
+
+    # Least squares come first, then Huber's loss with the scale of the residuals of the round before.
+    p = jax.lax.fori_loop(0, ROUNDS, next_round, jnp.concatenate([jnp.ones(k), jnp.zeros(k + fit_share)]))
+    error = jnp.where(known, residual(p), jnp.nan)
+    return p, error, jax.jacfwd(residual)(p), numbers(p), jax.jacfwd(numbers)(p)
+
+
+def _warnings(fit: LineFit, wire: np.ndarray, name: str) -> tuple[str, ...]:
+    """Return reasons not to trust lines of wire lengths (n, k), each with its remedy."""
     found = []
     for k in range(len(fit.slope)):
-        range_y = abs(fit.slope[k]) * np.nanstd(x[:, k])
+        n, held_out, noise, rms = fit.n_rows[k], fit.held_out_rms[k], fit.noise[k], fit.rms[k]
+        range_y = abs(fit.slope[k]) * np.nanstd(wire[:, k])
         width = np.ptp(fit.slope_interval[k]) / 2 / abs(fit.slope[k])
-        for bad, reason in (
-            (
-                fit.n_rows[k] < MIN_ROWS,
-                f"got {fit.n_rows[k]} rows, expected {MIN_ROWS} or more: measure more",
+        reasons = {
+            f"got {n} rows, expected {MIN_ROWS} or more: measure more": n < MIN_ROWS,
+            f"lengths spread by {range_y:.3g} only, noise being {noise:.3g}, so slope and offset can hardly "
+            "be told apart: measure over the whole range": range_y < 5 * noise,
+            f"held-out error {held_out:.3g} extrapolates in {100 * fit.beyond[k]:.0f} % of rows: measure the "
+            "shortest and the longest lengths more than once, at different times": fit.beyond[k] > MAX_BEYOND,
+            f"held-out error {held_out:.3g}, on its own rows {rms:.3g}: measure more rows, in random order": (
+                not held_out < 1.5 * rms
             ),
-            (
-                range_y < 5 * fit.noise[k],
-                f"lengths spread by {range_y:.3g} only, noise being {fit.noise[k]:.3g}, so slope and offset "
-                "can hardly be told apart: measure over the whole range",
+            f"slope known to {100 * width:.2g} % only: measure more rows, over a wider range": (
+                not width < 0.02
             ),
-            (
-                fit.beyond[k] > MAX_BEYOND,
-                f"held-out error {fit.held_out_rms[k]:.3g} extrapolates in {100 * fit.beyond[k]:.0f} % of "
-                "rows: measure the shortest and the longest lengths more than once, at different times",
-            ),
-            (
-                not fit.held_out_rms[k] < 1.5 * fit.rms[k],
-                f"held-out error {fit.held_out_rms[k]:.3g}, on its own rows {fit.rms[k]:.3g}: "
-                "measure more rows, in random order",
-            ),
-            (
-                not width < 0.02,
-                f"slope known to {100 * width:.2g} % only: measure more rows, over a wider range",
-            ),
-            (
-                fit.n_outliers[k] > 0.1 * fit.n_rows[k],
-                f"{fit.n_outliers[k]} of {fit.n_rows[k]} rows are outliers of a straight line: "
-                "look for lengths of another spring or another time",
-            ),
-        ):
-            if bad:
-                found.append(f"{name}{k}: {reason}")
+            f"{fit.n_outliers[k]} of {n} rows are outliers of a straight line: look for lengths of another "
+            "spring or another time": fit.n_outliers[k] > 0.1 * n,
+        }
+        found += [f"{name}{k}: {reason}" for reason, holds in reasons.items() if holds]
     return tuple(found)

@@ -1,17 +1,16 @@
 """Markers along the arm: the sections' ends, which the fit uses, and length limits of the chambers.
 
-The markers sit on rings, evenly spaced from the base to the tip, as many in each section, the last on the
-tip's plate. So one of them is on the last plate of each section, wherever on it.
+Markers sit on rings, evenly spaced from the base to the tip, equally many in each section, the last on the
+tip's plate. So each section's last plate has a marker, anywhere on it.
 
-For lengths, at the most bent poses, they are taken to sit at one site of every ring. Three polynomials of
-fourth order X(s), Y(s), Z(s) run through them and through that site of the base. The rings turn with the
-curve without twisting about it, so any other site of the rings, such as that of a chamber, has a parallel
-curve. The length of a chamber is the length of its curve within its section.
+For lengths, at the most bent poses, markers are taken to sit at one site of every ring. Polynomials of fourth
+order X(s), Y(s), Z(s) run through them and through that site of the base. The rings turn with the curve
+without twisting about it, so any other site, such as that of a chamber, has a parallel curve. A chamber is as
+long as its curve within its section.
 
-A polynomial of fourth order is too smooth for three sections that bend independently, so the lengths are
-coarse: on simulated arms without noise they are off by 5 mm RMS with markers in the middle of the rings, by
-6 mm at the chambers and by 11 mm at the springs, and by tens of mm at worst. So these only check the fit. The
-range of a chamber follows from its pressure limits, stiffness and area; that of a spring, from measurements.
+Polynomials of fourth order are too smooth for three sections that bend independently. On simulated arms
+without noise the lengths are off by 5 mm RMS with markers in the middle of the rings, by 6 mm with markers at
+the chambers, by 11 mm at the springs, and by tens of mm at worst. So these lengths only check the fit.
 
 Source: Simulation Calibration and Validation in Meng et al.
 """
@@ -28,10 +27,10 @@ from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
 
 ORDER = 4
-N_SAMPLES = 50  # of a curve, per section
-N_POSES = 10  # that bend most
-MAX_OFF_PLATE_M = 0.01
-MIN_MARKERS = 5
+N_SAMPLES = 50  # points of a curve, per section
+N_POSES = 10  # most bent poses, at which lengths are computed
+MAX_OFF_PLATE_M = 0.01  # distance of the last marker from the tip's plate, at most
+MIN_MARKERS = 5  # markers that a curve needs
 
 
 class MarkerLimits(NamedTuple):
@@ -40,7 +39,7 @@ class MarkerLimits(NamedTuple):
     pose: np.ndarray  # (n,) indices of the poses, most bent first
     bending_deg: np.ndarray  # (n,) between the tip's plate and the base
     marker_site_m: np.ndarray  # (2,) site of the markers in the rings, x and y
-    length_m: np.ndarray  # (n, n_chambers) from the curves
+    length_m: np.ndarray  # (n, n_chambers) lengths of the curves
     simulated_m: np.ndarray  # (n, n_chambers) simulated by the calibrated arm at the same pressures
     residual_mm: np.ndarray  # (n,) RMS distance of the markers to the curve
     length_min_m: float
@@ -51,7 +50,7 @@ def section_ends(poses: StaticPoses, spec: ArmSpec) -> np.ndarray:
     """Return the markers on the sections' last plates (n, n_sections, 3) [m], NaN where not measured.
 
     Raises:
-        FitError: the sections do not have equally many, no pose has them, or the last is off the tip's plate.
+        FitError: the sections have unequal numbers, no pose has all, or the last is off the tip's plate.
     """
     n_markers, n_sections = poses.marker_m.shape[1], spec.structure.n_sections
     if n_markers == 0:
@@ -67,7 +66,7 @@ def section_ends(poses: StaticPoses, spec: ArmSpec) -> np.ndarray:
 
 
 def marker_limits(poses: StaticPoses, simulated_m: np.ndarray, spec: ArmSpec) -> MarkerLimits:
-    """Compute length limits from the most bent poses.
+    """Compute the range of the chambers' lengths at the most bent poses.
 
     Args:
         poses: static poses with markers that `section_ends` has accepted.
@@ -79,11 +78,13 @@ def marker_limits(poses: StaticPoses, simulated_m: np.ndarray, spec: ArmSpec) ->
     """
     if poses.marker_m.shape[1] < MIN_MARKERS:
         raise FitError(f"markers: got {poses.marker_m.shape[1]}, expected {MIN_MARKERS} or more")
+    # Choose the most bent poses.
     seen = np.flatnonzero(np.isfinite(poses.marker_m).all(axis=(1, 2)))
     site_m = _marker_site(poses.take(seen))
     bending_deg = np.degrees(np.arccos(np.clip(poses.tip_rotation[seen, 2, 2], -1.0, 1.0)))
     order = np.argsort(-bending_deg)[:N_POSES]
     pose = seen[order]
+    # Measure chambers along the curves through their markers.
     curves = [fit_curve(poses.marker_m[k], site_m) for k in pose]
     length_m = np.stack([chamber_lengths(curve, site_m, spec) for curve, _ in curves])
     return MarkerLimits(
@@ -107,7 +108,7 @@ def fit_curve(marker_m: np.ndarray, site_m: np.ndarray) -> tuple[np.ndarray, np.
 
     Returns:
         Coefficients (5, 3), highest power first, in the share s of the arm, 0 at the base and 1 at the tip;
-        residuals (n_markers + 1, 3) [m], that of the base first.
+        residuals (n_markers + 1, 3) [m], the base first.
     """
     points = np.vstack([[*site_m, 0.0], marker_m])
     share = np.linspace(0.0, 1.0, len(points))
@@ -123,11 +124,13 @@ def chamber_lengths(curve: np.ndarray, site_m: np.ndarray, spec: ArmSpec) -> np.
         site_m (2,) [m]: site of the markers in the rings.
         spec: arm, with the sites of the chambers.
     """
+    # Turn the rings with the curve.
     n_sections = spec.structure.n_sections
     share = np.linspace(0.0, 1.0, n_sections * N_SAMPLES + 1)
     points = _at(curve, share)
     slope = _at(curve[:-1] * np.arange(ORDER, 0, -1)[:, None], share)
     rotation = _untwisted(-slope / np.linalg.norm(slope, axis=1, keepdims=True))
+    # Add up the pieces of each chamber's curve in its section.
     beside = ArmParams.from_spec(spec, np.float64).chamber_site_m - site_m  # (n_chambers, 2)
     lines = points + np.einsum("sij,cj->csi", rotation[:, :, :2], beside)
     pieces = np.linalg.norm(np.diff(lines, axis=1), axis=2).reshape(spec.n_chambers, n_sections, N_SAMPLES)
@@ -141,7 +144,7 @@ def _at(curve: np.ndarray, share: np.ndarray) -> np.ndarray:
 
 
 def _untwisted(up: np.ndarray) -> np.ndarray:
-    """Return axes (n, 3, 3) of rings with normals (n, 3), each rotated the least from the one before."""
+    """Return axes (n, 3, 3) of rings with normals (n, 3), turned as little as possible from ring to ring."""
     rotation = np.eye(3)
     found = []
     for normal in up:

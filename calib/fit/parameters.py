@@ -1,12 +1,14 @@
 """Parameters of the fit to poses at rest: chambers, backbone and mounting, in one vector that starts at zero.
 
-For each chamber, x holds the logarithm of the ratio of its stiffness; that of its area; the change of the
-area's slope, in areas per section length; the change of its rest length, in section lengths. Then come the
-logarithm of the ratio of the backbone's bending stiffness, and the mounting: the base's turn about x and y
-and its offset, the roll of each section's holes, the turn of the measured tip and its offset within the last
-plate. The base's turn about z is the roll of all sections; an offset of the tip along the arm is one of the
-base. Last come the sites of the markers at the sections' ends within their plates, one by one, as a marker is
-stuck on by hand: nobody needs them, so any error of them is tolerated.
+Each entry is a change from the specification:
+
+- per chamber: logarithms of the ratios of stiffness and area; slope of the area, in areas per section length;
+  rest length, in section lengths
+- backbone: logarithm of the ratio of the bending stiffness
+- mounting: turn of the base about x and y, and its offset; roll of each section's holes; turn of the measured
+  tip, and its offset within the last plate. A turn of the base about z is a roll of all sections. An axial
+  offset of the tip cannot be told from an offset of the base.
+- sites of the markers at the sections' ends, each within its plate, since markers are stuck on by hand
 """
 
 from __future__ import annotations
@@ -26,7 +28,7 @@ from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
 # The four parameters of a chamber.
 FIELDS = ("stiffness_n_per_m", "area_m2", "area_slope_m", "length_offset_m")
 SHORT = dict(zip(FIELDS, ("stiffness", "area", "slope", "offset"), strict=True))
-BENDING = "bending_stiffness_nm_per_rad"  # of the backbone
+BENDING = "bending_stiffness_nm_per_rad"  # field of the backbone
 
 
 class Block(NamedTuple):
@@ -36,22 +38,22 @@ class Block(NamedTuple):
     per: str  # "chamber", "section", or "" for `n` of them
     n: int
     prior: float  # standard deviation about the start
-    tolerance: float  # known within it
+    tolerance: float  # error within which a parameter counts as known
 
 
 BLOCKS = (
-    Block("stiffness", "chamber", 0, 1.0, 0.05),  # a factor of e; 5 %
-    Block("area", "chamber", 0, 1.0, 0.05),
-    Block("slope", "chamber", 0, 1.0, 0.05),  # an area per section length; 5 % of it
-    Block("offset", "chamber", 0, 0.25, 0.005),  # a quarter of a section; 1 mm of 200 mm
-    Block(BENDING, "", 1, 1.0, 0.05),
-    Block("base turn", "", 2, 0.1, 0.01),  # 6 deg; 0.6 deg
+    Block("stiffness", "chamber", 0, 1.0, 0.05),  # prior a factor of e, tolerance 5 %
+    Block("area", "chamber", 0, 1.0, 0.05),  # prior a factor of e, tolerance 5 %
+    Block("slope", "chamber", 0, 1.0, 0.05),  # prior an area per section length
+    Block("offset", "chamber", 0, 0.25, 0.005),  # prior a quarter of a section, tolerance 1 mm of 200 mm
+    Block(BENDING, "", 1, 1.0, 0.05),  # prior a factor of e, tolerance 5 %
+    Block("base turn", "", 2, 0.1, 0.01),  # [rad] prior 6 deg, tolerance 0.6 deg
     Block("base offset", "", 3, 0.01, 0.002),  # [m]
-    Block("roll", "section", 0, 0.2, 0.01),  # 11 deg
-    Block("tip turn", "", 3, 0.5, 0.01),  # 29 deg
+    Block("roll", "section", 0, 0.2, 0.01),  # [rad] prior 11 deg
+    Block("tip turn", "", 3, 0.5, 0.01),  # [rad] prior 29 deg
     Block("tip offset", "", 2, 0.01, 0.002),  # [m]
-    Block("marker x", "section", 0, 0.05, 1.0),  # [m]
-    Block("marker y", "section", 0, 0.05, 1.0),
+    Block("marker x", "section", 0, 0.05, 1.0),  # [m] any error is tolerated: nobody needs the sites
+    Block("marker y", "section", 0, 0.05, 1.0),  # [m] any error is tolerated
 )
 
 
@@ -82,7 +84,7 @@ def _names(block: Block, n: int) -> Iterator[str]:
 
 
 def _split(x: Array | np.ndarray, n_chambers: int) -> dict[str, Any]:
-    """Return the blocks of x by name."""
+    """Return the blocks of x (p,) by name."""
     sizes = {"chamber": n_chambers, "section": n_chambers // N_CHAMBERS_PER_SECTION}
     found, start = {}, 0
     for block in BLOCKS:
@@ -97,8 +99,8 @@ def with_numbers(x: Array, params: ArmParams) -> ArmParams:
     bend = jnp.exp(by[BENDING][0])
     joints = params.joint_stiffness.reshape(-1, 3) * jnp.stack([jnp.ones_like(bend), bend, bend])
     roll = jnp.repeat(by["roll"], N_CHAMBERS_PER_SECTION)
-    zero = jnp.zeros(1, x.dtype)
-    mount = params.mount
+    mount, zero = params.mount, jnp.zeros(1, x.dtype)
+    base_turn = _turned(jnp.concatenate([by["base turn"], zero]))
     return params._replace(
         chamber_site_m=_rolled(params.chamber_site_m, roll),
         spring_site_m=_rolled(params.spring_site_m, roll),
@@ -109,9 +111,7 @@ def with_numbers(x: Array, params: ArmParams) -> ArmParams:
         chamber_rest_m=params.chamber_rest_m + by["offset"] * params.section_length_m,
         mount=mount._replace(
             base_position_m=mount.base_position_m + by["base offset"],
-            base_rotation=product(
-                _turned(jnp.concatenate([by["base turn"], zero])), jnp.asarray(mount.base_rotation)
-            ),
+            base_rotation=product(base_turn, jnp.asarray(mount.base_rotation)),
             tip_offset_m=mount.tip_offset_m + jnp.concatenate([by["tip offset"], zero]),
             tip_rotation=product(jnp.asarray(mount.tip_rotation), _turned(by["tip turn"])),
         ),
@@ -137,7 +137,8 @@ def _turned(gibbs: Array) -> Array:
 
 
 def spec_at(spec: ArmSpec, x: np.ndarray) -> ArmSpec:
-    """Return the specification at x (p,) where `spec` is that at x = 0."""
+    """Return the specification at x (p,) where `spec` is the specification at x = 0."""
+    # Change the chambers.
     by = _split(x, spec.n_chambers)
     old = {name: np.array(spec.per_chamber(getattr(spec.chambers, name))) for name in FIELDS}
     length_m, mounting = spec.geometry.section_length_m, spec.mounting
@@ -147,6 +148,7 @@ def spec_at(spec: ArmSpec, x: np.ndarray) -> ArmSpec:
         "area_slope_m": old["area_slope_m"] + by["slope"] * old["area_m2"] / length_m,
         "length_offset_m": old["length_offset_m"] + by["offset"] * length_m,
     }
+    # Turn and shift the mounting.
     base, tip = (rotation_about(np.radians(v)) for v in (mounting.base_turn_deg, mounting.tip_turn_deg))
     base = np.asarray(_turned(jnp.append(by["base turn"], 0.0)), float) @ base
     tip = tip @ np.asarray(_turned(jnp.asarray(by["tip turn"])), float)

@@ -1,10 +1,10 @@
-"""The sim-to-real network: (P, L_spring) -> P_S2R, fitted to a log.
+"""Sim-to-real network: simulated tip pose and spring lengths -> pose of the real tip, fitted to a log.
 
-As in the paper, the log gives spring lengths and real tip poses, the calibrated simulation gives its own
-poses at the same spring lengths, and a network learns the difference, which takes fewer rows than learning
-the real pose itself. It does not learn from the rows, which are few, but from a Gaussian process that was
-fitted to them and knows of sections (`calib.fit.section_process`): at the rows, and at many simulated arms
-all over the workspace. Contiguous blocks of rows take no part in either, and measure the error.
+As in the paper, the log gives spring lengths and real tip poses, the calibrated simulation its own poses at
+these spring lengths. The network learns the difference, which takes fewer rows than the real pose itself.
+Rows are few, so a Gaussian process that knows of sections (`calib.fit.section_process`) is fitted to them.
+The network learns its mean, at the rows and at simulated arms all over the workspace. Contiguous blocks of
+rows take part in neither, and measure the error.
 
 Source: Sim-to-Real Transfer in Meng et al.
 """
@@ -19,8 +19,9 @@ import jax
 import numpy as np
 
 from calib.errors import FitError
-from calib.fit.blocks import held_out_blocks
-from calib.fit.network import NetworkConfig, block_rows, fit_network
+from calib.fit.blocks import block_rows, held_out_blocks
+from calib.fit.network import NetworkConfig, fit_network
+from calib.fit.pose_errors import PoseErrors, pose_errors
 from calib.fit.section_process import SectionProcess, Sections, fit_process, predict, sections
 from mjx_softarm._support import xla
 from mjx_softarm.mechanics.excitation import random_pressures
@@ -32,13 +33,12 @@ from mjx_softarm.sensing.pose import frame_from_pose, pose_from_frame
 from mjx_softarm.sensing.s2r import S2R, correct, correction_between, extrapolation, inputs
 from mjx_softarm.spec import ArmSpec
 
-HELD_OUT_SHARE = 0.2
-MIN_ROWS = 200
+MIN_ROWS = 200  # rows below which there is a warning
 PRESSURE_LIMIT_KPA = 200.0  # limit of the simulated arm, beyond what any length of a real one needs
-MAX_TURN_DEG = 90.0
-MAX_HELD_OUT_RATIO = 3.0
-GOOD_SHARE = 0.1  # of the error without the network: less is good whatever the rows of the fit have
-BATCH = 512
+MAX_TURN_DEG = 90.0  # angle between real and simulated tips from which there is a warning
+MAX_HELD_OUT_RATIO = 3.0  # ratio of held-out to training errors from which there is a warning
+GOOD_SHARE = 0.1  # share of the error without the network below which there is no warning
+BATCH = 512  # poses simulated together
 N_POINTS = 24_000  # simulated arms at random pressures, at which the network learns the process
 
 
@@ -47,23 +47,13 @@ class SimulatedPoses(NamedTuple):
 
     pose: np.ndarray  # (n, 6) [mm, deg]
     spring_m: np.ndarray  # (n, n_chambers) lengths reached
-    pressure_kpa: np.ndarray  # (n, n_chambers) that hold them
+    pressure_kpa: np.ndarray  # (n, n_chambers) that hold these lengths
     valid: np.ndarray  # (n,) bool, whether the arm settled
     sections: Sections
 
     def take(self, rows: np.ndarray) -> SimulatedPoses:
         """Return some of the poses, chosen by indices or a mask (n,)."""
         return jax.tree.map(lambda values: values[rows], self)
-
-
-@dataclass(frozen=True)
-class PoseErrors:
-    """Distances between poses, mean and 95th percentile."""
-
-    translation_mean_mm: float
-    translation_95_mm: float
-    rotation_mean_deg: float
-    rotation_95_deg: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +65,7 @@ class S2RFit:
     in_sample: PoseErrors
     test: PoseErrors  # held-out rows
     test_uncorrected: PoseErrors
-    stop_epoch: tuple[int, ...]  # epoch at which each member stopped
+    stop_epoch: int  # epoch whose weights are the network's
     n_epochs: int
     flagged_share: float  # share of the held-out rows with extrapolation above 1
     warnings: tuple[str, ...]  # reasons not to trust it, each with its remedy
@@ -89,8 +79,8 @@ class S2RFit:
 def simulate_poses(spec: ArmSpec, reference_m: np.ndarray) -> SimulatedPoses:
     """Settle the simulated arm at spring lengths under the sensor-space law, without pressure limits.
 
-    The real arm had these lengths, so the simulated one must reach them too. Within its own pressure limits
-    it often cannot; its poses would then belong to other lengths, and hide the difference to be learned.
+    The real arm had these lengths, so the simulated arm must reach them, too. Its own pressure limits would
+    often keep it from them, and hide the difference to be learned.
 
     Args:
         spec: calibrated arm.
@@ -108,6 +98,7 @@ def simulate_poses(spec: ArmSpec, reference_m: np.ndarray) -> SimulatedPoses:
         raise FitError(
             f"spring lengths: row {row}, spring {k}: got {reference[row, k]}, expected a finite number"
         )
+    # Lift the pressure limits, and settle in batches of one size.
     n, params = len(reference), ArmParams.from_spec(spec)
     limit = np.full(spec.n_chambers, PRESSURE_LIMIT_KPA, np.float32)
     params = params._replace(pressure_min_kpa=-limit, pressure_max_kpa=limit)
@@ -123,13 +114,8 @@ def _solver(n_at_once: int | None):
         kinematics = chain_kinematics(params)
         end: Any = settle(kinematics, params, reference, n_at_once)
         pose = pose_from_frame(end.tip_position_m, end.tip_rotation)
-        return SimulatedPoses(
-            pose,
-            end.spring_m,
-            end.pressure_kpa,
-            end.settled,
-            sections(kinematics(end.q), params, end.spring_m),
-        )
+        at_sections = sections(kinematics(end.q), params, end.spring_m)
+        return SimulatedPoses(pose, end.spring_m, end.pressure_kpa, end.settled, at_sections)
 
     return xla.jit(jax.vmap(one, in_axes=(None, 0)), uses_mjx=False)
 
@@ -156,15 +142,17 @@ def fit_s2r(
     n = len(simulated.pose)
     if np.shape(pose_real) != (n, 6):
         raise FitError(f"sim-to-real: got {np.shape(pose_real)} measured poses, expected {(n, 6)}")
-    arrays = (simulated.pose, simulated.spring_m, pose_real)
-    pose_sim, spring_m, pose_real = (np.asarray(a, np.float64) for a in arrays)
-    held_out = held_out_blocks(n, HELD_OUT_SHARE, block_rows(n), seed)
-    x, y = inputs(frame_from_pose(pose_sim), spring_m), correction_between(pose_sim, pose_real)
     if (missing := np.flatnonzero(~np.isfinite(pose_real).all(axis=1))).size:
         raise FitError(f"sim-to-real: measured pose {missing[0]}: got nan, expected finite numbers")
+    arrays = (simulated.pose, simulated.spring_m, pose_real)
+    pose_sim, spring_m, pose_real = (np.asarray(a, np.float64) for a in arrays)
+    held_out = held_out_blocks(n, block=block_rows(n), seed=seed)
+    # Fit the process to the rows, and the network to the process.
+    x, y = inputs(frame_from_pose(pose_sim), spring_m), correction_between(pose_sim, pose_real)
     process = fit_process(simulated.sections.take(~held_out), y[~held_out])
     points = _points(spec, process, spring_m[~held_out], seed)
     fit = fit_network(x[~held_out], y[~held_out], seed, config, points)
+    # Judge it by the held-out rows.
     corrected = correct(fit.network, pose_sim, spring_m)
     errors = {
         "in_sample": pose_errors(corrected[~held_out], pose_real[~held_out]),
@@ -177,7 +165,7 @@ def fit_s2r(
         s2r=fit.network,
         held_out=held_out,
         **errors,
-        stop_epoch=tuple(map(int, fit.stop_epoch)),
+        stop_epoch=fit.stop_epoch,
         n_epochs=fit.n_epochs,
         flagged_share=float(flagged.mean()),
         warnings=tuple(_warnings(n, turn_deg, errors)),
@@ -187,7 +175,7 @@ def fit_s2r(
 def _points(
     spec: ArmSpec, process: SectionProcess, spring_m: np.ndarray, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return inputs of the network and means of a process at rows of springs, and all over the workspace."""
+    """Return inputs of the network and means of a process, at rows of springs and all over the workspace."""
     found = settle_many(spec, random_pressures(spec, N_POINTS, seed))
     over = np.clip(found.spring_m[found.settled], spring_m.min(axis=0), spring_m.max(axis=0))
     simulated = simulate_poses(spec, np.concatenate([spring_m, over]))
@@ -195,35 +183,24 @@ def _points(
     return inputs(frame_from_pose(settled.pose), settled.spring_m), predict(process, settled.sections)
 
 
-def pose_errors(pose: np.ndarray, real: np.ndarray) -> PoseErrors:
-    """Return distances of poses (n, 6) to real ones, and angles of the rotations between them."""
-    change = correction_between(pose, real)
-    distance_mm = np.linalg.norm(change[:, :3], axis=1)
-    angle_deg = 2.0 * np.rad2deg(np.arctan(np.linalg.norm(change[:, 3:], axis=1)))
-    both = ((values.mean(), np.percentile(values, 95.0)) for values in (distance_mm, angle_deg))
-    return PoseErrors(*(float(value) for pair in both for value in pair))
-
-
 def _warnings(n: int, turn_deg: np.ndarray, errors: dict[str, PoseErrors]) -> list[str]:
     found = []
     if n < MIN_ROWS:
         found.append(f"got {n} rows, expected {MIN_ROWS} or more for a network: log more poses")
-    if turn_deg.max() > MAX_TURN_DEG:
-        rows = int((turn_deg > MAX_TURN_DEG).sum())
+    if rows := np.count_nonzero(turn_deg > MAX_TURN_DEG):
         found.append(
             f"in {rows} of {n} rows the real tip is turned by more than {MAX_TURN_DEG:g} degrees against the "
             "simulated one: bring motion capture into the base frame"
         )
-    for name, unit in (("translation_mean_mm", "mm"), ("rotation_mean_deg", "deg")):
-        what = name.split("_")[0]
-        got, without, seen = (getattr(errors[e], name) for e in ("test", "test_uncorrected", "in_sample"))
+    for what, unit in (("translation", "mm"), ("rotation", "deg")):
+        got, without, seen = (
+            getattr(errors[e], f"{what}_mean_{unit}") for e in ("test", "test_uncorrected", "in_sample")
+        )
+        held_out = f"{what}: {got:.3g} {unit} on held-out rows"
         if got >= without:
-            left_out = ", so it is left out" if name.startswith("translation") else ""
-            found.append(
-                f"{what}: {got:.3g} {unit} on held-out rows, no better than {without:.3g} without the network"
-                f"{left_out}: log more poses"
-            )
+            left_out = ", so it is left out" if what == "translation" else ""
+            better = f"no better than {without:.3g} without the network{left_out}"
+            found.append(f"{held_out}, {better}: log more poses")
         if got > max(MAX_HELD_OUT_RATIO * seen, GOOD_SHARE * without):
-            far = f"far more than {seen:.3g} in training"
-            found.append(f"{what}: {got:.3g} {unit} on held-out rows, {far}: log more poses")
+            found.append(f"{held_out}, far more than {seen:.3g} in training: log more poses")
     return found

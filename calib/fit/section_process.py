@@ -27,21 +27,22 @@ from mjx_softarm.mechanics.kinematics import Frames
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION
 
-LENGTHS = (2.0, 3.0, 4.5, 7.0)  # of states; see `sections`
-NOISES = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1, 1.0)  # variances, in parts of those of a section
-MAX_GRID_ROWS = 200  # from which length and noise are chosen
-MAX_ROWS = 1_000
+LENGTHS = (2.0, 3.0, 4.5, 7.0)  # distances of states, see `sections`
+NOISES = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1, 1.0)  # variances over the variance of a section
+MAX_GRID_ROWS = 200  # rows by which length and noise are chosen
+MAX_ROWS = 1_000  # rows of the process
 N_OUTPUTS = 6  # shift [mm], Gibbs vector
 
 
 class Sections(NamedTuple):
-    """States of the s sections of simulated arms at rest, and what their middles do to the tip."""
+    """States of the s sections of simulated arms at rest, and the levers of their middles on the tip.
 
-    state: np.ndarray | Array  # (n, s, 9)
-    effect: (
-        np.ndarray | Array
-    )  # (n, s, 6, 6) shift [mm] and Gibbs vector times `lever_mm` to those of the tip
-    lever_mm: np.ndarray | Array  # (n,) half of a section's length: a turn by as many radians counts as 1 mm
+    A movement (6,) is a shift [mm] and a Gibbs vector times `lever_mm`.
+    """
+
+    state: np.ndarray | Array  # (n, s, 9), see `sections`
+    effect: np.ndarray | Array  # (n, s, 6, 6) tip's movement by a movement of a middle
+    lever_mm: np.ndarray | Array  # (n,) half of a section's length
 
     def take(self, rows: np.ndarray) -> Sections:
         """Return some of the arms, chosen by indices or a mask (n,)."""
@@ -52,8 +53,8 @@ class SectionProcess(NamedTuple):
     """Mean of a process given n rows."""
 
     rows: Sections
-    length: float
-    weight: np.ndarray  # (n, s, 6) of the rows, at their sections
+    length: float  # distance of states over which the correction changes
+    weight: np.ndarray  # (n, s, 6) weight of each row at its sections
 
 
 def sections(frames: Frames, params: ArmParams, spring_m: Array) -> Sections:
@@ -63,10 +64,11 @@ def sections(frames: Frames, params: ArmParams, spring_m: Array) -> Sections:
     the moment of the weights below, in units of the whole arm's weight half a section's length aside.
 
     Args:
-        frames: of the arm at rest.
-        params: its numbers.
-        spring_m (n_chambers,): its spring lengths.
+        frames: plates and joints of the arm at rest.
+        params: numbers of the arm.
+        spring_m (n_chambers,) [m]: spring lengths.
     """
+    # Find the plate in the middle of each section, and the moment of the weights below it.
     n_sections, length_m = params.n_sections, params.section_length_m
     per_section = params.link_mass_kg.shape[0] // n_sections
     middle = per_section * np.arange(n_sections) + per_section // 2
@@ -79,27 +81,24 @@ def sections(frames: Frames, params: ArmParams, spring_m: Array) -> Sections:
     moment = jnp.cross(lever_kgm, jnp.array([0.0, 0.0, 1.0])) / (0.5 * length_m * body_kg.sum())
     local = jnp.einsum("sij,si->sj", rotation, moment)
     own = spring_m.reshape(n_sections, N_CHAMBERS_PER_SECTION) / (0.25 * length_m)
+    # Let the middle move: the tip moves with it as one rigid body.
     lever_mm = 500.0 * length_m
     aside = 1000.0 * (frames.tip_position - position)[:, None, :]
     turned = jnp.cross(jnp.swapaxes(rotation, 1, 2), aside) * 2.0 / lever_mm  # (s, axis of the turn, shift)
-    effect = jnp.concatenate(
-        [
-            jnp.concatenate([rotation, jnp.swapaxes(turned, 1, 2)], axis=2),
-            jnp.concatenate([jnp.zeros_like(rotation), rotation], axis=2),
-        ],
-        axis=1,
-    )
+    shift = jnp.concatenate([rotation, jnp.swapaxes(turned, 1, 2)], axis=2)
+    turn = jnp.concatenate([jnp.zeros_like(rotation), rotation], axis=2)
+    effect = jnp.concatenate([shift, turn], axis=1)
     return Sections(jnp.concatenate([own, rotation[:, 2, :], local], axis=1), effect, lever_mm)
 
 
 def fit_process(rows: Sections, y: np.ndarray) -> SectionProcess:
     """Fit a process to the corrections y (n, 6) [mm, Gibbs vector] of n simulated tips.
 
-    Of more rows than `MAX_ROWS`, as many take part, evenly spread.
+    At most `MAX_ROWS` rows take part, evenly spread.
     """
     rows, y = _some(Sections(*(np.asarray(values, float) for values in rows)), y, MAX_ROWS)
     length, noise = _most_likely(*_some(rows, y, MAX_GRID_ROWS))
-    weight = _solve(_covariance(rows, rows, length), noise, _levelled(rows, y).ravel())[0]
+    weight = _solve(_covariance(rows, rows, length), noise, (y * _units(rows)).ravel())[0]
     at_sections = np.einsum("nsji,nj->nsi", rows.effect, weight.reshape(len(y), N_OUTPUTS))
     return SectionProcess(rows, length, at_sections)
 
@@ -119,8 +118,8 @@ def _some(rows: Sections, y: np.ndarray, n: int) -> tuple[Sections, np.ndarray]:
 
 
 def _most_likely(rows: Sections, y: np.ndarray) -> tuple[float, float]:
-    """Return length and noise."""
-    off, best = _levelled(rows, y).ravel(), (np.inf, 0.0, 0.0)
+    """Return the length and the noise of the grid that make the corrections most likely."""
+    off, best = (y * _units(rows)).ravel(), (np.inf, 0.0, 0.0)
     for length in LENGTHS:
         covariance = _covariance(rows, rows, length)
         for noise in NOISES:
@@ -132,7 +131,7 @@ def _most_likely(rows: Sections, y: np.ndarray) -> tuple[float, float]:
 
 
 def _solve(covariance: np.ndarray, noise: float, y: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the solution for y of the covariance with noise, and half the logarithm of the determinant."""
+    """Solve the covariance with noise for y; return also half the logarithm of its determinant."""
     factor = cholesky(covariance + noise * np.eye(len(y)), lower=True, check_finite=False)
     return cho_solve((factor, True), y, check_finite=False), float(np.log(np.diag(factor)).sum())
 
@@ -149,10 +148,6 @@ def _covariance(a: Sections, b: Sections, length: float) -> np.ndarray:
 def _likeness(a: np.ndarray | Array, b: np.ndarray | Array, length: float) -> np.ndarray:
     square = np.maximum((a**2).sum(axis=1)[:, None] + (b**2).sum(axis=1) - 2.0 * a @ b.T, 0.0)
     return 1.0 + np.exp(-square / (2.0 * length**2))
-
-
-def _levelled(rows: Sections, y: np.ndarray) -> np.ndarray:
-    return y * _units(rows)
 
 
 def _units(at: Sections) -> np.ndarray:

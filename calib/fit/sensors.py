@@ -1,11 +1,10 @@
-"""Calibration of the springs: L = beta l + delta, L a measured length and l that of a reading.
+"""Calibration of the springs: L = beta l + delta, L a measured length and l the raw length of a reading.
 
-A robust straight line for each spring, or one for all; see `calib.fit.lines`.
+Each spring has a robust line, or all have one; see `calib.fit.lines`.
 
-Lengths also tell something of the circuit: L = beta K w / (1 - I_comp w) + delta with w = C (2 pi f)^2 stays
-the same when C grows by a factor and beta and I_comp shrink by it. So C stays at its given value and beta
-answers for it; I_comp, one for all springs, can be fitted from the curvature of L against f^2 if the lengths
-reach far enough.
+Of a coil, L = beta K w / (1 - I_comp w) + delta with w = C (2 pi f)^2. This stays the same when C grows by a
+factor and beta and I_comp shrink by it, so C keeps its given value. The curvature of L against f^2 tells
+I_comp, one for all springs, if the lengths reach far enough.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from calib.errors import FitError
-from calib.fit.lines import fit_curved_line, fit_line
+from calib.fit.lines import fit_line
 from mjx_softarm.sensing.sensors import Coil, Sensor
 
 
@@ -26,7 +25,7 @@ class SpringFit(NamedTuple):
     delta_m: np.ndarray  # (n,)
     beta_interval: np.ndarray  # (n, 2)
     delta_interval_m: np.ndarray  # (n, 2)
-    compensation_h: float | None  # of coils, None where it was not fitted
+    compensation_h: float | None  # None where it was not fitted
     compensation_interval_h: tuple[float, float] | None
     rms_m: np.ndarray
     held_out_rms_m: np.ndarray
@@ -48,7 +47,7 @@ def fit_springs(
     """Calibrate springs from readings and the lengths that were measured at them.
 
     Args:
-        readings (n, n_springs): readings; those that are not believed are left out.
+        readings (n, n_springs): readings; readings outside the sensor's range are left out.
         length_m (n, n_springs): measured lengths, NaN where there is none.
         sensor: sensor that gave the readings; its beta and delta are not used.
         fit_compensation: fit I_comp, too, one for all springs; coils only.
@@ -62,40 +61,37 @@ def fit_springs(
     readings = np.asarray(readings, float)
     low, high = sensor.range
     believed = (readings >= low) & (readings <= high)
-    scale, compensation_h, compensation_interval = 1.0, None, None
+    scale, share, unit_h = 1.0, 0.0, 1.0
+    # Lengths are straight in raw lengths; with a compensation in w / (1 - I_comp w), the largest w being 1.
     if fit_compensation:
         if not isinstance(sensor, Coil):
             raise FitError(f"fit_compensation: got sensors of kind {sensor.kind}, expected {Coil.kind}")
         inverse_h = np.where(believed, sensor.inverse_inductance(readings), np.nan)
         unit_h = 1.0 / np.nanmax(inverse_h)  # I_comp beyond it would leave no coil
-        line, share, half = fit_curved_line(
-            inverse_h * unit_h, length_m, sensor.compensation_h / unit_h, True, "spring", shared, block, seed
-        )
-        scale, compensation_h = unit_h / sensor.coil_hm, share * unit_h
-        compensation_interval = ((share - half) * unit_h, (share + half) * unit_h)
-        warnings = (*line.warnings, *_compensation_warnings(compensation_interval, unit_h))
+        x, scale, share = inverse_h * unit_h, unit_h / sensor.coil_hm, sensor.compensation_h / unit_h
     else:
         raw_m, exists = sensor.raw_length(np.where(believed, readings, low))
-        line = fit_line(np.where(believed & exists, raw_m, np.nan), length_m, "spring", shared, block, seed)
-        warnings = line.warnings
+        x = np.where(believed & exists, raw_m, np.nan)
+    line = fit_line(x, length_m, "spring", shared, block, seed, share, fit_compensation)
+    low_h, high_h = (unit_h * bound for bound in line.share_interval)
+    warnings = _compensation_warnings(0.5 * (high_h - low_h), unit_h) if fit_compensation else ()
     return SpringFit(
         beta=line.slope * scale,
         delta_m=line.offset,
         beta_interval=line.slope_interval * scale,
         delta_interval_m=line.offset_interval,
-        compensation_h=compensation_h,
-        compensation_interval_h=compensation_interval,
+        compensation_h=line.share * unit_h if fit_compensation else None,
+        compensation_interval_h=(low_h, high_h) if fit_compensation else None,
         rms_m=line.rms,
         held_out_rms_m=line.held_out_rms,
         noise_m=line.noise,
         n_rows=line.n_rows,
         n_outliers=line.n_outliers,
-        warnings=warnings,
+        warnings=(*line.warnings, *warnings),
     )
 
 
-def _compensation_warnings(interval_h: tuple[float, float], unit_h: float) -> tuple[str, ...]:
-    width_h = (interval_h[1] - interval_h[0]) / 2
+def _compensation_warnings(width_h: float, unit_h: float) -> tuple[str, ...]:
     if width_h < 0.02 * unit_h:
         return ()
     return (

@@ -1,11 +1,11 @@
 """Damping of chambers and backbone, fitted to the tip's motion after the pressures changed.
 
-C MuJoCo is driven with the logged pressures, from the beginning of a stretch of the log to its end, and its
-tip is compared with the measured one. The first seconds do not count, as the arm's motion when the log began
-is unknown and decays meanwhile. Only two parameters are fitted, so their derivatives are differences of three
-parallel runs; derivatives through thousands of steps of MJX would cost far more and compile for minutes.
+C MuJoCo is driven with the logged pressures along a stretch of the log, and its tip is compared with the
+measured tip. The first seconds do not count: the arm's motion at the beginning is unknown, and decays.
+Derivatives by the two parameters are differences of three parallel runs, since derivatives through thousands
+of steps of MJX would compile for minutes.
 
-The damping of the springs and the axial damping of the backbone stay as specified: they act in parallel with
+The damping of the springs and the axial damping of the backbone stay as specified. They act in parallel with
 the chambers, which absorb their error.
 """
 
@@ -33,48 +33,35 @@ MAX_STEP_S = 0.05  # largest time between rows of a stretch
 SETTLING_S = 5.0  # start of a stretch that does not count
 MIN_COUNTED_S = 2.0
 MAX_TOTAL_S = 24.0  # length of all stretches together
-CLUSTER_S = 1.0  # errors within it are not independent
-HELD_OUT_SHARE = 0.2
+CLUSTER_S = 1.0  # errors within this time are not independent
 PRIOR = 1.0  # standard deviation of the logarithms: a factor of e
-DIFFERENCE = 0.01
-SCALE_M, MIN_SCALE_M = 2e-3, 1e-4
+DIFFERENCE = 0.01  # change of a logarithm between two runs
+SCALE_M, MIN_SCALE_M = 2e-3, 1e-4  # standard deviation of the tip: first guess, least value
 KNOWN = 0.2  # relative half-width of an interval up to which a damping counts as known
-MARGIN = 1.05  # by which the specification must be better than the fit to be worth a warning
-MAX_RATIO = 2.0  # held-out to other errors
+MARGIN = 1.05  # ratio of errors from which the specification counts as better than the fit
+MAX_RATIO = 2.0  # ratio of held-out to other errors from which there is a warning
 
 
 class Stretch(NamedTuple):
     """Part of a log without gaps, resampled at the control rate."""
 
-    pressure_kpa: np.ndarray  # (n, n_chambers) that act from a row to the next
+    pressure_kpa: np.ndarray  # (n, n_chambers), each row until the next
     tip_m: np.ndarray  # (n, 3)
     payload_kg: float
 
 
 @dataclass(frozen=True, eq=False)
 class DampingFit:
-    """Calibrated damping and whether to trust it.
-
-    Attributes:
-        spec: calibrated arm.
-        half_width_95: half-widths of the 95 % intervals of `chambers.damping_ns_per_m` and
-            `backbone.bending_damping_nms_per_rad`, by their names.
-        in_sample_rms_mm, held_out_rms_mm: RMS distance of simulated to measured tip; held-out seconds took
-            no part.
-        held_out_before_rms_mm: RMS distance with the specification that the fit started from.
-        n_stretches: number of stretches.
-        time_s: simulated time, the first seconds of each stretch included.
-        warnings: reasons not to trust the fit, each with its remedy; none is good.
-    """
+    """Calibrated damping and whether to trust it. Errors are RMS distances of simulated to measured tips."""
 
     spec: ArmSpec
-    half_width_95: Mapping[str, float]
-    in_sample_rms_mm: float
-    held_out_rms_mm: float
-    held_out_before_rms_mm: float
+    half_width_95: Mapping[str, float]  # half-widths of the 95 % intervals of the two dampings
+    in_sample_rms_mm: float  # seconds of the fit
+    held_out_rms_mm: float  # held-out seconds
+    held_out_before_rms_mm: float  # held-out seconds, with the specification of the start
     n_stretches: int
-    time_s: float
-    warnings: tuple[str, ...]
+    time_s: float  # simulated time, the first seconds of each stretch included
+    warnings: tuple[str, ...]  # reasons not to trust the fit, each with its remedy
 
     @property
     def is_better(self) -> bool:
@@ -82,16 +69,16 @@ class DampingFit:
         return self.held_out_rms_mm <= MARGIN * self.held_out_before_rms_mm
 
 
-def calibrate_damping(logs: Log | Sequence[Log], spec: ArmSpec, seed: int = 0) -> DampingFit:
-    """Fit the damping of chambers and backbone to the logs of a moving arm.
+def fit_damping(stretches: Sequence[Stretch], spec: ArmSpec, seed: int = 0) -> DampingFit:
+    """Fit the damping of chambers and backbone to the motion of an arm.
 
     Args:
-        logs: logs with pressures and tip positions; stretches sampled below 20 Hz are skipped.
+        stretches: parts of logs from `find_stretches`.
         spec: arm, its chambers already calibrated.
         seed: seed that chooses the held-out seconds.
 
     Raises:
-        FitError: the specified damping is zero, or no stretch of a log has changing pressures.
+        FitError: the specified damping is zero, or there is no stretch.
     """
     if not (spec.chambers.damping_ns_per_m > 0 and spec.backbone.bending_damping_nms_per_rad > 0):
         raise FitError(
@@ -99,14 +86,14 @@ def calibrate_damping(logs: Log | Sequence[Log], spec: ArmSpec, seed: int = 0) -
             f"backbone.bending_damping_nms_per_rad {spec.backbone.bending_damping_nms_per_rad:g}, "
             "expected both above 0"
         )
-    found = find_stretches([logs] if isinstance(logs, Log) else logs, spec)
-    if not found:
+    if not stretches:
         raise FitError(
             f"damping: got no stretch of {SETTLING_S + MIN_COUNTED_S:g} s sampled every {MAX_STEP_S:g} s or "
             "faster, expected one in which pressures change"
         )
-    n_clusters = len(_clusters(found, [s.tip_m for s in found], spec))
-    held_out = held_out_blocks(n_clusters, HELD_OUT_SHARE, 2, seed)
+    # Fit to the seconds that are not held out.
+    n_clusters = len(_clusters(stretches, [s.tip_m for s in stretches], spec))
+    held_out = held_out_blocks(n_clusters, block=2, seed=seed)
     problem = Problem(
         prior=np.full(2, PRIOR),
         group=np.zeros(3 * _rows(CLUSTER_S, spec), int),
@@ -115,11 +102,12 @@ def calibrate_damping(logs: Log | Sequence[Log], spec: ArmSpec, seed: int = 0) -
     )
 
     def model(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        error, slope = _errors(found, spec, x)
+        error, slope = _errors(stretches, spec, x)
         return error[~held_out], slope[~held_out]
 
     solution = fit(model, problem)
-    before, after = (_errors(found, spec, x)[0] for x in (np.zeros(2), solution.x))
+    # Judge the fit by the held-out seconds.
+    before, after = (_errors(stretches, spec, x)[0] for x in (np.zeros(2), solution.x))
     calibrated = damped(spec, solution.x)
     widths = solution.half_width
     done = DampingFit(
@@ -131,8 +119,8 @@ def calibrate_damping(logs: Log | Sequence[Log], spec: ArmSpec, seed: int = 0) -
         in_sample_rms_mm=_rms_mm(after[~held_out]),
         held_out_rms_mm=_rms_mm(after[held_out]),
         held_out_before_rms_mm=_rms_mm(before[held_out]),
-        n_stretches=len(found),
-        time_s=sum(len(s.tip_m) for s in found) / spec.control.rate_hz,
+        n_stretches=len(stretches),
+        time_s=sum(len(s.tip_m) for s in stretches) / spec.control.rate_hz,
         warnings=(),
     )
     return dataclasses.replace(done, warnings=_warnings(done, widths, solution.converged))
@@ -141,8 +129,8 @@ def calibrate_damping(logs: Log | Sequence[Log], spec: ArmSpec, seed: int = 0) -
 def find_stretches(logs: Sequence[Log], spec: ArmSpec) -> list[Stretch]:
     """Return densely sampled parts of logs in which pressures change, resampled at the control rate.
 
-    Pressures are held from row to row, positions interpolated. The stretches are in the order of the logs, as
-    many as `MAX_TOTAL_S` allows.
+    Pressures are held from row to row, positions interpolated. Stretches come in the order of the logs, until
+    they last `MAX_TOTAL_S` together.
     """
     found, left = [], _rows(MAX_TOTAL_S, spec)
     shortest = _rows(SETTLING_S + MIN_COUNTED_S, spec)
@@ -150,8 +138,10 @@ def find_stretches(logs: Sequence[Log], spec: ArmSpec) -> list[Stretch]:
         if log.pressure_kpa is None or log.tip_m is None or len(log) < 2:
             continue
         payload = np.full(len(log), spec.mass.payload_kg) if log.payload_kg is None else log.payload_kg
+        # Cut the log at gaps, and where the payload changes.
         cuts = np.flatnonzero((np.diff(log.time_s) > MAX_STEP_S) | (np.diff(payload) != 0)) + 1
         for rows in np.split(np.arange(len(log)), cuts):
+            # Resample the part, if it is long enough and its pressures change after the first seconds.
             time_s = log.time_s[rows]
             grid = np.arange(time_s[0], time_s[-1], 1.0 / spec.control.rate_hz)[:left]
             if len(grid) < shortest:
@@ -191,20 +181,20 @@ def simulate(stretch: Stretch, spec: ArmSpec) -> np.ndarray:
     return tip
 
 
-def _errors(found: list[Stretch], spec: ArmSpec, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _errors(stretches: Sequence[Stretch], spec: ArmSpec, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return simulated minus measured tip by clusters (n, m) [m], NaN-padded; Jacobian (n, m, 2)."""
     arms = [damped(spec, x + d) for d in (np.zeros(2), *(DIFFERENCE * np.eye(2)))]
     with ThreadPoolExecutor() as pool:  # MuJoCo steps without Python's lock
-        runs = list(pool.map(lambda job: simulate(*job), [(s, arm) for arm in arms for s in found]))
-    n = len(found)
-    here, *ahead = (_clusters(found, runs[k * n : (k + 1) * n], spec) for k in range(3))
+        runs = list(pool.map(lambda job: simulate(*job), [(s, arm) for arm in arms for s in stretches]))
+    n = len(stretches)
+    here, *ahead = (_clusters(stretches, runs[k * n : (k + 1) * n], spec) for k in range(3))
     return here, np.stack([(a - here) / DIFFERENCE for a in ahead], axis=-1)
 
 
-def _clusters(found: list[Stretch], tips: list[np.ndarray], spec: ArmSpec) -> np.ndarray:
+def _clusters(stretches: Sequence[Stretch], tips: list[np.ndarray], spec: ArmSpec) -> np.ndarray:
     """Return errors of the rows that count, one second a row; the last of a stretch is NaN-padded."""
     size, skip, parts = _rows(CLUSTER_S, spec), _rows(SETTLING_S, spec), []
-    for stretch, tip in zip(found, tips, strict=True):
+    for stretch, tip in zip(stretches, tips, strict=True):
         error = (tip - stretch.tip_m)[skip:]
         padded = np.full((-(-len(error) // size) * size, 3), np.nan)
         padded[: len(error)] = error

@@ -1,18 +1,15 @@
 """Reading of logs: checks, and reduction to the rows that can be believed.
 
-The schema is that of `mjx_softarm.logs.schema`. A file that cannot be understood (a column missing, a wrong
-unit) is refused. Otherwise each row is believed whole or dropped whole: for a NaN, a reading out of range, a
-time that does not increase, motion capture that was not renewed or is turned, an outlier. So a log that was
-read has no holes but in the references, goals and estimates of the control loop, which may have none, and its
-times show where rows are missing. Signs of quaternions are
-repaired; columns that never change, time gaps and unknown columns are only reported. Each finding tells how
-many rows it dropped.
+`mjx_softarm.logs.schema` defines the columns. A file that cannot be understood (a missing column, a wrong
+unit) is refused. Otherwise each row is kept or dropped whole. A row is dropped for a NaN, a reading out of
+range, a time that does not increase, motion capture that was not renewed or is turned, or an outlier; only
+references, goals and estimates of the control loop may be NaN. Signs of quaternions are repaired. Columns
+that never change, time gaps and unknown columns are only reported. Each finding tells how many rows it
+dropped.
 """
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -34,8 +31,7 @@ quaternion 1, 0, 0, 0 where the arm hangs straight.
 Chambers and the sim-to-real network are fitted to poses at rest: rows whose pressures have been held for 3 s.
 One row per pose will do if the rows are more than 3 s apart.
 """
-_FACTORS = {"readings": 1.25, "spring_m": 1.5, "tip_m": 1.5}  # between the ranges of two logs of one arm
-_NEEDED = ("readings", "spring_m", "pressure_kpa", "tip_m")  # one of them at least
+NEEDED = ("readings", "spring_m", "pressure_kpa", "tip_m")  # a log has one of these at least
 
 
 def read_log(path: str | Path, n_chambers: int = 9, strict: bool = False) -> tuple[Log, list[Finding]]:
@@ -52,7 +48,7 @@ def read_log(path: str | Path, n_chambers: int = 9, strict: bool = False) -> tup
     Raises:
         LogError: the log cannot be used or is refused; the message has a line for each finding.
     """
-    matrix, findings = read_matrix(path, n_chambers, one_of=_NEEDED)
+    matrix, findings = read_matrix(path, n_chambers, one_of=NEEDED)
     with np.errstate(over="ignore", invalid="ignore"):  # any number may stand in a file
         refuse(implausible(matrix))
         matrix, found = clean(matrix)
@@ -60,32 +56,6 @@ def read_log(path: str | Path, n_chambers: int = 9, strict: bool = False) -> tup
     if strict:
         refuse(findings)
     return matrix.log(), findings
-
-
-def same_arm(logs: Sequence[Log]) -> None:
-    """Refuse logs whose shared columns or ranges show that they are of different arms.
-
-    Raises:
-        LogError: the logs differ; the message names both files and the column.
-    """
-    for first, other in itertools.combinations(logs, 2):
-        file = f"{first.source} and {other.source}"
-        refuse([Finding(file, None, name, problem) for name, problem in _differences(first, other)])
-
-
-def _differences(first: Log, other: Log) -> Iterator[tuple[str, str]]:
-    for name in (*_NEEDED, "tip_quaternion", "marker_m"):
-        a, b = getattr(first, name), getattr(other, name)
-        if a is None or b is None:
-            continue  # springs on a ruler need no motion capture, poses no ruler
-        if a.shape[1:] != b.shape[1:]:
-            yield name, f"got {a.shape[1]} and {b.shape[1]} in a row, expected logs of one arm"
-        elif name in _FACTORS:
-            sizes = [np.linalg.norm(value, axis=1) if name == "tip_m" else value for value in (a, b)]
-            low, high = zip(*(np.percentile(size, [1, 99]) for size in sizes), strict=True)
-            if max(low) > _FACTORS[name] * min(high):
-                ranges = " and ".join(f"{low[k]:.4g} to {high[k]:.4g}" for k in range(2))
-                yield name, f"got {ranges}, expected ranges that meet in logs of one arm"
 
 
 def template(path: str | Path) -> str:

@@ -8,69 +8,102 @@ from typing import NamedTuple
 import numpy as np
 
 from calib.errors import FitError
-from mjx_softarm.logs.rest import NEEDED, holds, last_second, moves
+from mjx_softarm.logs.rest import HOLD_KPA, NEEDED, holds, last_second, moves
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.sensing.pose import rotation_from_quaternion
 from mjx_softarm.sensing.sensors import SensorFault
 from mjx_softarm.spec import ArmSpec
 
+POSE_COLUMNS = ("pressure_kpa", "tip_m", "tip_quaternion")  # needed in a log of poses
+
 
 class StaticPoses(NamedTuple):
-    """Poses of the arm at rest, in the order of the logs."""
+    """Poses of the arm at rest, in the order of the logs; a pose is the mean of some rows of a log."""
 
     pressure_kpa: np.ndarray  # (n, n_chambers)
     payload_kg: np.ndarray  # (n,)
     tip_m: np.ndarray  # (n, 3)
     tip_rotation: np.ndarray  # (n, 3, 3)
-    spring_m: np.ndarray  # (n, n_chambers), NaN where not measured
+    spring_m: np.ndarray  # (n, n_chambers), NaN where not measured; see `with_lengths`
     marker_m: np.ndarray  # (n, n_markers, 3), NaN where not measured
-    single: np.ndarray  # (n,) bool, whether it is one row, which cannot show whether the tip moved
+    readings: np.ndarray  # (n, n_max, n_chambers) of each row; NaN beyond `n_rows` and without sensors
+    n_rows: np.ndarray  # (n,) number of rows; one row cannot show whether the tip moved
 
     @property
     def n(self) -> int:
+        """Number of poses."""
         return len(self.payload_kg)
 
     def take(self, poses: np.ndarray) -> StaticPoses:
         """Return some of the poses, chosen by indices or a mask (n,)."""
         return StaticPoses(*(value[poses] for value in self))
 
+    def with_lengths(self, spec: ArmSpec) -> StaticPoses:
+        """Return the poses with the spring lengths that the sensors of `spec` read.
+
+        A length stays NaN if any of a pose's readings is faulty.
+        """
+        reading = spec.spring_sensor.lengths(self.readings)
+        length_m = np.where(reading.fault == SensorFault.OK, reading.length_m, np.nan)
+        counted = np.arange(length_m.shape[1]) < self.n_rows[:, None]
+        mean_m = np.sum(length_m, axis=1, where=counted[..., None]) / self.n_rows[:, None]
+        return self._replace(spring_m=np.where(np.isnan(self.spring_m), mean_m, self.spring_m))
+
 
 def find_static_poses(logs: Sequence[Log], spec: ArmSpec) -> tuple[StaticPoses, dict[str, int]]:
     """Find the static poses of all logs together.
 
     Args:
-        logs: each with pressures and tip poses; readings are those of the sensors of `spec` where a log
-            has no spring lengths.
-        spec: the arm; its payload is that of a log that does not say.
+        logs: each with pressures and tip poses.
+        spec: arm, calibrated or not; its payload is that of a log without a payload.
 
     Returns:
-        The poses, and the number of rows by use.
+        The poses, and the number of rows by use. A log with readings gives no spring lengths, but readings.
 
     Raises:
         FitError: a log has no pressures or tip poses, or another number of chambers.
+        LogError: a log has readings of another kind of sensor.
     """
     n_markers = max((log.marker_m.shape[1] for log in logs if log.marker_m is not None), default=0)
     row_uses = {"used": 0, "not finite": 0, "pressures not held long enough": 0, "tip still moving": 0}
-    poses = [pose for log in logs for pose in _static_poses_of(log, spec, n_markers, row_uses)]
-    shapes = ((spec.n_chambers,), (), (3,), (3, 3), (spec.n_chambers,), (n_markers, 3), ())
-    columns = zip(*poses, strict=True) if poses else [()] * len(shapes)
-    arrays = [np.reshape(list(c), (len(poses), *shape)) for c, shape in zip(columns, shapes, strict=True)]
-    return StaticPoses(*arrays[:-1], single=arrays[-1].astype(bool)), row_uses
+    found = [pose for log in logs for pose in _static_poses_of(log, spec, n_markers, row_uses)]
+    n, n_chambers = len(found), spec.n_chambers
+    # Stack the poses; pad the rows of readings.
+    *columns, rows = list(zip(*found, strict=True)) if found else [[]] * 7
+    shapes = ((n_chambers,), (), (3,), (3, 3), (n_chambers,), (n_markers, 3))
+    arrays = [np.reshape(list(c), (n, *shape)) for c, shape in zip(columns, shapes, strict=True)]
+    n_rows = np.array([len(readings) for readings in rows], int)
+    padded = np.full((n, n_rows.max(initial=0), n_chambers), np.nan)
+    for pose, readings in zip(padded, rows, strict=True):
+        pose[: len(readings)] = readings
+    poses = StaticPoses(*arrays, readings=padded, n_rows=n_rows)
+    # Give a chamber that was held in all poses one pressure: its noise would pass for changes.
+    if n:
+        held = np.ptp(poses.pressure_kpa, axis=0) < HOLD_KPA
+        poses.pressure_kpa[:, held] = poses.pressure_kpa[:, held].mean(axis=0)
+    return poses, row_uses
 
 
 def _static_poses_of(log: Log, spec: ArmSpec, n_markers: int, row_uses: dict[str, int]) -> list[tuple]:
+    """Return the fields of each pose of a log, its rows of readings last; count the rows by use."""
     _check(log, spec)
+    # Leave out rows that are not finite.
     payload = np.full(len(log), spec.mass.payload_kg) if log.payload_kg is None else log.payload_kg
     columns = [value for name in NEEDED if (value := getattr(log, name)) is not None]
     finite = np.all(np.isfinite(np.column_stack(columns)), axis=1)
     row_uses["not finite"] += int(np.count_nonzero(~finite))
     log, payload = log.take(finite), payload[finite]
     assert log.pressure_kpa is not None and log.tip_m is not None  # else `_check` raises
-    springs = spring_lengths(log, spec)
+    # Fill what the log does not have.
+    unknown = np.full((len(log), spec.n_chambers), np.nan)
+    readings = log.readings_of(spec.sensor)
+    springs = unknown if readings is not None or log.spring_m is None else log.spring_m
+    readings = unknown if readings is None else readings
     markers = np.full((len(log), n_markers, 3), np.nan)
     if log.marker_m is not None and log.marker_m.shape[1] == n_markers:
         markers = log.marker_m
     rotation = rotation_from_quaternion(log.tip_quaternion)
+    # Average the last second of each hold at whose end the tip rests.
     found = []
     for start, stop in holds(log.time_s, log.pressure_kpa, payload):
         rows = last_second(log.time_s, start, stop)
@@ -84,18 +117,9 @@ def _static_poses_of(log: Log, spec: ArmSpec, n_markers: int, row_uses: dict[str
         pressure, tip, turn, spring, marker = (
             np.mean(x[rows], axis=0) for x in (log.pressure_kpa, log.tip_m, rotation, springs, markers)
         )
-        kept = payload[rows[0]]  # the same in all, which a mean would round
-        found.append((pressure, kept, tip, nearest_rotation(turn), spring, marker, len(rows) == 1))
+        kept = payload[rows[0]]  # the payload of all rows, which a mean would round
+        found.append((pressure, kept, tip, nearest_rotation(turn), spring, marker, readings[rows]))
     return found
-
-
-def spring_lengths(log: Log, spec: ArmSpec) -> np.ndarray:
-    """Return spring lengths (n, n_chambers) [m]: from the readings, else as logged, else NaN."""
-    readings = log.readings_of(spec.sensor)
-    if readings is None:
-        return np.full((len(log), spec.n_chambers), np.nan) if log.spring_m is None else log.spring_m
-    reading = spec.spring_sensor.lengths(readings)
-    return np.where(reading.fault == SensorFault.OK, reading.length_m, np.nan)
 
 
 def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
@@ -106,7 +130,7 @@ def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
 
 
 def _check(log: Log, spec: ArmSpec) -> None:
-    for name in ("pressure_kpa", "tip_m", "tip_quaternion"):
+    for name in POSE_COLUMNS:
         if getattr(log, name) is None:
             raise FitError(f"{log.source}: {name}: got no such columns, expected pressures and tip poses")
     for name in ("pressure_kpa", "spring_m", "readings"):

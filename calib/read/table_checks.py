@@ -1,7 +1,7 @@
 """Checks of a log as a table: plausible units, and rows that can be believed.
 
-Rows are checked in three stages, each on the rows left by the one before: single rows (NaN, time, range);
-rows against the row before (motion capture that was not renewed or is turned); outliers.
+Rows are checked in three stages, each on the rows that the stage before kept: single rows (NaN, time, range);
+rows beside the row before (motion capture that was not renewed or is turned); outliers.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from mjx_softarm.sensing.sensors import SENSORS as KINDS
 class Plausible(NamedTuple):
     """Plausible values of a quantity of a soft arm a few decimetres long, in the first unit of `UNITS`."""
 
-    low: float  # least and greatest plausible value
-    high: float
-    least: float = 0.0  # size that the largest values reach, unless all are zero; 0: any size
+    low: float  # least plausible value
+    high: float  # greatest plausible value
+    least: float = 0.0  # size that the largest values reach, unless all values are zero
     spike: float = np.inf  # distance from its neighbours up to which a value is no outlier
 
 
-# A column whose median is outside has the wrong unit, or is another column; rows with single values outside
-# are dropped. The bounds tell mm, cm and m apart for such an arm, and Pa, kPa and bar. They cannot tell psi
+# A column whose median is outside has the wrong unit, or is another column; a row with a value outside is
+# dropped. The bounds tell mm from cm and m for such an arm, and Pa from kPa and bar. They cannot tell psi
 # from kPa, rad from deg, or one chamber from another.
 PLAUSIBLE: Mapping[str, Plausible] = MappingProxyType(
     {
-        "time": Plausible(5e-4, 19.0),  # of the steps, in the median: 2 kHz down to a pose every 19 s
-        "length": Plausible(0.03, 1.0, spike=1e-3),  # of a spring
-        "position": Plausible(-3.0, 3.0, least=0.1, spike=2e-3),  # of tip and markers, from the base
+        "time": Plausible(5e-4, 19.0),  # median step: 2 kHz down to a pose every 19 s
+        "length": Plausible(0.03, 1.0, spike=1e-3),  # length of a spring
+        "position": Plausible(-3.0, 3.0, least=0.1, spike=2e-3),  # tip and markers, from the base
         "pressure": Plausible(-105.0, 1000.0, least=0.5, spike=10.0),  # vacuum to ten bar
         "mass": Plausible(0.0, 5.0, least=1e-3),
         "number": Plausible(-1.1, 1.1),  # part of a unit quaternion
@@ -45,13 +45,14 @@ PLAUSIBLE: Mapping[str, Plausible] = MappingProxyType(
         **{kind.reading_name: Plausible(*kind.plausible, spike=kind.spike) for kind in KINDS.values()},
     }
 )
-BY_HAND_ROWS, BY_HAND_S = 300, 600.0  # so few rows may be poses recorded by hand, so far apart
-HANGS_BELOW_M = -0.05  # of the tip, in the median: the base frame's z is up and the arm hangs
-FROM_LOOP = ("reference_m", "goal", "estimate", "load_kg")  # logged by the control loop, which may have none
+BY_HAND_ROWS = 300  # fewer rows may be poses that were recorded by hand
+BY_HAND_S = 600.0  # longest median step of poses that were recorded by hand
+HANGS_BELOW_M = -0.05  # greatest median z of the tip, as z is up and the arm hangs
+FROM_LOOP = ("reference_m", "goal", "estimate", "load_kg")  # columns of the control loop; may hold NaN
 SENSORS = ("readings", "spring_m", "pressure_kpa", "tip_m", "marker_m")
 
 
-class Fault(NamedTuple):
+class RowFault(NamedTuple):
     """Rows with one fault."""
 
     column: str
@@ -62,8 +63,9 @@ class Fault(NamedTuple):
 
 
 def clean(matrix: LogMatrix) -> tuple[LogMatrix, list[Finding]]:
-    """Return the rows that can be believed, quaternion signs repaired, and all findings."""
+    """Return the rows that can be believed, with quaternion signs repaired, and all findings."""
     findings = [_finding(matrix, fault) for fault in _gaps(matrix)]
+    # Drop rows stage by stage.
     for stage in (_single_rows, _renewal, _neighbours):
         faults = [fault for fault in stage(matrix) if fault.mask.any()]
         findings += [_finding(matrix, fault) for fault in faults]
@@ -74,15 +76,16 @@ def clean(matrix: LogMatrix) -> tuple[LogMatrix, list[Finding]]:
         if len(matrix.row) < 2:
             left = f"got {len(matrix.row)} rows left, expected 2 at least"
             raise LogError([*findings, Finding(matrix.file, None, "", left)])
+    # Give neighbouring quaternions one sign.
     if quaternion := matrix.indices("tip_quaternion"):
         matrix.values[:, quaternion], flipped = checks.same_sign(matrix.values[:, quaternion])
         if flipped.any():
             problem = "sign flipped, repaired; expected neighbours of one sign"
-            findings.append(_finding(matrix, Fault("tip_qw..qz", problem, flipped, drops=False)))
+            findings.append(_finding(matrix, RowFault("tip_qw..qz", problem, flipped, drops=False)))
     return matrix, findings
 
 
-def _gaps(matrix: LogMatrix) -> Iterator[Fault]:
+def _gaps(matrix: LogMatrix) -> Iterator[RowFault]:
     """Find rows missing in the file, by its times."""
     time_s = matrix.values[:, 0]
     finite = np.flatnonzero(np.isfinite(time_s))
@@ -92,10 +95,10 @@ def _gaps(matrix: LogMatrix) -> Iterator[Fault]:
     if gap.any():
         steps_s = np.diff(time_s[ordered])
         expected = f"expected steps near {np.median(steps_s):.4g} s"
-        yield Fault("time", f"gap, longest {steps_s.max():.4g} s, {expected}", gap, drops=False)
+        yield RowFault("time", f"gap, longest {steps_s.max():.4g} s, {expected}", gap, drops=False)
 
 
-def _finding(matrix: LogMatrix, fault: Fault) -> Finding:
+def _finding(matrix: LogMatrix, fault: RowFault) -> Finding:
     rows = matrix.row[fault.mask]
     problem = f"{len(rows)} x {fault.problem}" if fault.counted else fault.problem
     n_dropped = len(rows) if fault.drops else 0
@@ -103,7 +106,7 @@ def _finding(matrix: LogMatrix, fault: Fault) -> Finding:
 
 
 def implausible(matrix: LogMatrix) -> list[Finding]:
-    """Find reasons to refuse the log: columns without numbers, or that contradict their header."""
+    """Find reasons to refuse the log: columns without numbers, or whose numbers contradict their header."""
     if len(matrix.row) < 2:
         return [Finding(matrix.file, None, "", f"got {len(matrix.row)} row, expected 2 at least")]
     problems = {}
@@ -169,58 +172,60 @@ def _shown(column: Column, value: float) -> str:
     return f"{value / UNITS[column.kind][column.unit]:.6g} {column.unit}".removesuffix(" 1")
 
 
-def _single_rows(matrix: LogMatrix) -> Iterator[Fault]:
+def _single_rows(matrix: LogMatrix) -> Iterator[RowFault]:
     for k, column in enumerate(matrix.columns):
         values = matrix.values[:, k]
         finite = np.isfinite(values)
         missing = np.isinf(values) if column.group in FROM_LOOP else ~finite
-        yield Fault(column.name, "NaN or inf, expected numbers", missing)
+        yield RowFault(column.name, "NaN or inf, expected numbers", missing)
         if column.kind == "time":
             late = np.zeros(len(values), bool)
             late[finite] = checks.late_rows(values[finite])
-            yield Fault("time", "repeated or going back, expected times that increase", late)
+            yield RowFault("time", "repeated or going back, expected times that increase", late)
             continue
         low, high, *_ = PLAUSIBLE[quantity(column)]
         outside = finite & ((values < low) | (values > high))
         if outside.any():
             expected = f"expected {_shown(column, low)} to {_shown(column, high)}"
             first = _shown(column, values[outside][0])
-            yield Fault(column.name, f"out of range, first {first}, {expected}", outside)
+            yield RowFault(column.name, f"out of range, first {first}, {expected}", outside)
 
 
-def _renewal(matrix: LogMatrix) -> Iterator[Fault]:
+def _renewal(matrix: LogMatrix) -> Iterator[RowFault]:
     everywhere = np.ones(len(matrix.row), bool)
     for k in matrix.indices("readings", "spring_m", "pressure_kpa"):
         if np.ptp(matrix.values[:, k]) == 0.0:
             always = _shown(matrix.columns[k], matrix.values[0, k])
             problem = f"got always {always}, expected a sensor that changes"
-            yield Fault(matrix.columns[k].name, problem, everywhere, drops=False, counted=False)
+            yield RowFault(matrix.columns[k].name, problem, everywhere, drops=False, counted=False)
     for name, axes in matrix.bodies():
         body = matrix.values[:, axes]
         if checks.moves(body):
-            # A quaternion that goes on shows that the tip was seen, though it is where it was.
+            # A quaternion that changes shows that the tip was seen, though its position stays.
             seen = matrix.indices("tip_quaternion") if name == "tip" else []
             stale = checks.stale_rows(matrix.values[:, [*axes, *seen]])
             problem = "equal to the row before, expected motion capture renewed in each row"
-            yield Fault(f"{name}_x..z", problem, stale)
+            yield RowFault(f"{name}_x..z", problem, stale)
         elif name == "tip":
             problem = "got a tip that never moves by 1 mm, expected one that moves"
-            yield Fault("tip_x..z", problem, everywhere, drops=False, counted=False)
+            yield RowFault("tip_x..z", problem, everywhere, drops=False, counted=False)
     if quaternion := matrix.indices("tip_quaternion"):
         values = matrix.values[:, quaternion]
         wrong = checks.not_unit_rows(values)
         first = f"{np.linalg.norm(values[wrong][:1]):.4g}"
-        yield Fault("tip_qw..qz", f"length not 1, first {first}, expected unit quaternions", wrong)
+        yield RowFault("tip_qw..qz", f"length not 1, first {first}, expected unit quaternions", wrong)
         turned = np.zeros(len(wrong), bool)
         turned[~wrong] = checks.turned_rows(values[~wrong])
         problem = "turned by 180 degrees between jumps, expected a continuous orientation"
-        yield Fault("tip_qw..qz", problem, turned)
+        yield RowFault("tip_qw..qz", problem, turned)
 
 
-def _neighbours(matrix: LogMatrix) -> Iterator[Fault]:
+def _neighbours(matrix: LogMatrix) -> Iterator[RowFault]:
     for k in matrix.indices(*SENSORS):
         column = matrix.columns[k]
         outlier = checks.outlier_rows(matrix.values[:, k], PLAUSIBLE[quantity(column)].spike)
         if outlier.any():
             first = _shown(column, matrix.values[outlier, k][0])
-            yield Fault(column.name, f"outlier, first {first}, expected a value like its neighbours", outlier)
+            yield RowFault(
+                column.name, f"outlier, first {first}, expected a value like its neighbours", outlier
+            )

@@ -10,21 +10,29 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from calib.fit.chambers import ChamberFit, Errors
+from calib.fit.chambers import ChamberFit
 from calib.fit.held_pressures import HeldPressures
 from calib.fit.markers import MarkerLimits
 from calib.fit.parameters import BENDING
-from calib.fit.s2r import PoseErrors, S2RFit
+from calib.fit.pose_errors import PoseErrors
+from calib.fit.s2r import S2RFit
 from calib.fit.sensors import SpringFit
 from calib.fit.transients import DampingFit
-from calib.report.page import Section, Table
+from calib.report.page import ReportTable, Section
 from mjx_softarm.sensing.s2r import correct
 
 _BINS = 40
 
 
 def springs(fit: SpringFit, calibrated_m: np.ndarray, length_m: np.ndarray) -> Section:
-    """Show beta and delta of each spring; lengths (n, n_springs) from calibrated sensors, and measured."""
+    """Show beta and delta of each spring.
+
+    Args:
+        fit: fitted springs.
+        calibrated_m (n, n_springs) [m]: lengths from the calibrated sensors.
+        length_m (n, n_springs) [m]: lengths measured at the same time.
+    """
+    # Tabulate the fit.
     half_beta = 0.5 * np.ptp(fit.beta_interval, axis=1)
     half_delta = 0.5 * np.ptp(fit.delta_interval_m, axis=1)
     rows = tuple(
@@ -33,6 +41,7 @@ def springs(fit: SpringFit, calibrated_m: np.ndarray, length_m: np.ndarray) -> S
         for k in range(len(fit.beta))
     )
     head = ("", "beta", "+-", "delta [mm]", "+- [mm]", "held-out RMS [mm]", "rows", "outliers")
+    # Draw the residuals.
     figure, axes = _figure()
     error_mm = 1e3 * (calibrated_m - length_m)
     for k in range(length_m.shape[1]):
@@ -42,7 +51,7 @@ def springs(fit: SpringFit, calibrated_m: np.ndarray, length_m: np.ndarray) -> S
         "Springs",
         "Measured lengths L against lengths l from the readings, L = beta l + delta, by Huber's loss. "
         "Intervals are 95 %; contiguous blocks of rows are held out.",
-        (Table(head, rows),),
+        (ReportTable(head, rows),),
         fit.warnings,
         _plain(fit),
         (("residuals of the lines", figure),),
@@ -51,6 +60,7 @@ def springs(fit: SpringFit, calibrated_m: np.ndarray, length_m: np.ndarray) -> S
 
 def chambers(fit: ChamberFit) -> Section:
     """Show stiffness, area and rest length of each chamber, the backbone, and the errors of the tip."""
+    # Tabulate the chambers, the backbone, the mounting and the errors.
     spec = fit.spec
     units = (
         ("stiffness_n_per_m", "stiffness [N/m]", 1.0),
@@ -68,13 +78,14 @@ def chambers(fit: ChamberFit) -> Section:
         rows.append((f"chamber {k}", *(number for pair in pairs for number in pair)))
     head = ("", *(text for _, title, _ in units for text in (title, "+-")))
     bending = spec.backbone.bending_stiffness_nm_per_rad
-    backbone = Table(("", "value", "+-"), ((BENDING, bending, float(fit.half_width_95[BENDING])),))
+    backbone = ReportTable(("", "value", "+-"), ((BENDING, bending, float(fit.half_width_95[BENDING])),))
     mounting = _mounting(fit)
     errors = _errors(
-        ("held-out poses, before", fit.held_out_before.n, fit.held_out_before),
-        ("held-out poses, calibrated", fit.held_out.n, fit.held_out),
-        ("poses of the fit, calibrated", fit.in_sample.n, fit.in_sample),
+        ("held-out poses, before", fit.held_out_before),
+        ("held-out poses, calibrated", fit.held_out),
+        ("poses of the fit, calibrated", fit.in_sample),
     )
+    # Draw the errors of the fit's poses and of the held-out ones.
     figure, axes = _figure()
     bins = np.linspace(0.0, np.nanquantile(fit.tip_error_mm, 0.99), _BINS).tolist()
     axes.hist(fit.tip_error_mm[~fit.is_held_out], bins, density=True, alpha=0.5, label="fit")
@@ -85,9 +96,9 @@ def chambers(fit: ChamberFit) -> Section:
         "Chambers",
         f"{fit.poses.n} poses at rest: simulated at the measured pressures against the measured tip and "
         "springs. Rest lengths are relative to the section's. Intervals are 95 %. "
-        "The fit is to all poses, the errors are those of a fit without the held-out ones. "
+        "The fit is to all poses; the errors are of a fit without the held-out poses. "
         f"Rows of the logs: {row_uses}.",
-        (Table(head, tuple(rows)), backbone, mounting, errors),
+        (ReportTable(head, tuple(rows)), backbone, mounting, errors),
         fit.warnings,
         _plain(fit, "spec", "poses", "is_held_out", "tip_error_mm", "chamber_m")
         | {"values": values | {BENDING: bending} | dataclasses.asdict(spec.mounting)},
@@ -96,7 +107,7 @@ def chambers(fit: ChamberFit) -> Section:
     )
 
 
-def _mounting(fit: ChamberFit) -> Table:
+def _mounting(fit: ChamberFit) -> ReportTable:
     """Return the table of the arm's mounting, with intervals."""
     rows = []
     for name, values in dataclasses.asdict(fit.spec.mounting).items():
@@ -107,11 +118,11 @@ def _mounting(fit: ChamberFit) -> Table:
             (f"{what} {label} [{unit}]", factor * value, float(factor * width))
             for label, value, width in zip(labels, values, fit.half_width_95[name], strict=True)
         ]
-    return Table(("", "value", "+-"), tuple(rows))
+    return ReportTable(("", "value", "+-"), tuple(rows))
 
 
 def with_markers(section: Section, limits: MarkerLimits) -> Section:
-    """Return the section of the chambers with their lengths from markers at the most bent poses."""
+    """Add the chambers' lengths at the most bent poses, measured by markers, to their section."""
     figure, axes = _figure()
     axes.plot(1e3 * limits.simulated_m.ravel(), 1e3 * limits.length_m.ravel(), ".")
     axes.plot(*2 * [1e3 * np.array([limits.length_min_m, limits.length_max_m])], "k:", lw=1)
@@ -119,7 +130,7 @@ def with_markers(section: Section, limits: MarkerLimits) -> Section:
     lengths = ("chambers at the most bent poses", 1e3 * limits.length_min_m, 1e3 * limits.length_max_m)
     simulated = (float(1e3 * f(limits.simulated_m)) for f in (np.min, np.max))
     rows = (lengths, ("simulated at the same poses", *simulated))
-    table = Table(("", "shortest [mm]", "longest [mm]"), rows)
+    table = ReportTable(("", "shortest [mm]", "longest [mm]"), rows)
     title = f"chambers at the {len(limits.pose)} most bent poses"
     return dataclasses.replace(
         section,
@@ -145,21 +156,26 @@ def damping(fit: DampingFit) -> Section:
         "Damping",
         f"{fit.n_stretches} stretches of the moving arm, {fit.time_s:.0f} s in all: MuJoCo driven with the "
         "measured pressures against the measured tip. Intervals are 95 %.",
-        (Table(("", "value", "+-"), rows), Table(("tip", "RMS [mm]"), errors)),
+        (ReportTable(("", "value", "+-"), rows), ReportTable(("tip", "RMS [mm]"), errors)),
         fit.warnings,
         _plain(fit, "spec") | {"values": values},
     )
 
 
 def s2r(fit: S2RFit, pose: np.ndarray, spring_m: np.ndarray, real: np.ndarray, n_unsettled: int) -> Section:
-    """Show distances of simulated poses (n, 6) to real ones, with and without the network.
+    """Show distances of simulated to real poses, with and without the network.
 
-    `n_unsettled` other poses took no part, as the simulated arm did not settle at their spring lengths.
+    Args:
+        fit: fitted network.
+        pose (n, 6) [mm, deg]: simulated poses.
+        spring_m (n, n_springs) [m]: their spring lengths.
+        real (n, 6) [mm, deg]: measured poses.
+        n_unsettled: number of other poses, at whose spring lengths the simulated arm did not settle.
     """
     errors = _errors(
-        ("held-out poses, simulated", int(fit.held_out.sum()), fit.test_uncorrected),
-        ("held-out poses, corrected", int(fit.held_out.sum()), fit.test),
-        ("poses of the fit, corrected", int((~fit.held_out).sum()), fit.in_sample),
+        ("held-out poses, simulated", fit.test_uncorrected),
+        ("held-out poses, corrected", fit.test),
+        ("poses of the fit, corrected", fit.in_sample),
     )
     corrected = correct(fit.s2r, pose, spring_m)
     figure, axes = _figure()
@@ -171,7 +187,7 @@ def s2r(fit: S2RFit, pose: np.ndarray, spring_m: np.ndarray, real: np.ndarray, n
         "Sim-to-real network",
         f"{len(pose)} poses at rest: the calibrated simulation settles at the logged lengths, and "
         f"the network learns the error of its tip. It flags {100 * fit.flagged_share:.1f} % of the held-out "
-        "poses as far from those it learned from. "
+        "poses as far from the poses that it learned. "
         f"At {n_unsettled} other poses the simulation found no rest; they took no part.",
         (errors,),
         fit.warnings,
@@ -181,7 +197,7 @@ def s2r(fit: S2RFit, pose: np.ndarray, spring_m: np.ndarray, real: np.ndarray, n
 
 
 def with_pressures(section: Section, held: HeldPressures) -> Section:
-    """Say in the network's section how far simulated pressures are off, before and after their fit."""
+    """Add the residual pressures, before and after their fit, to the network's section."""
     text = (
         f" The pressures that hold these poses are {held.before_kpa:.2f} kPa off the simulated ones (RMS, "
         f"held-out poses), and {held.after_kpa:.2f} kPa after a straight line in the springs' lengths, by "
@@ -191,12 +207,10 @@ def with_pressures(section: Section, held: HeldPressures) -> Section:
     return dataclasses.replace(section, text=section.text + text, data=section.data | data)
 
 
-def _errors(*rows: tuple[str, int, Errors | PoseErrors]) -> Table:
+def _errors(*rows: tuple[str, PoseErrors]) -> ReportTable:
     head = ("tip", "poses", "mean [mm]", "95 % [mm]", "mean turn [deg]")
-    shown = (
-        (what, n, e.translation_mean_mm, e.translation_95_mm, e.rotation_mean_deg) for what, n, e in rows
-    )
-    return Table(head, tuple(shown))
+    shown = ((what, e.n, e.translation_mean_mm, e.translation_95_mm, e.rotation_mean_deg) for what, e in rows)
+    return ReportTable(head, tuple(shown))
 
 
 def _plain(fit: Any, *left_out: str) -> dict[str, Any]:

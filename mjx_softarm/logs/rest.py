@@ -1,29 +1,29 @@
 """Poses at rest: the one rule by which arms are recorded and logs are read.
 
-A log is cut into holds: stretches in which no pressure leaves 1 kPa around its first value, the payload
-stays, and no two rows are more than 3 s apart. The last second of a hold counts, provided that
+A log is cut into holds: stretches in which each pressure stays within 1 kPa of its first value, the payload
+stays, and rows are at most 3 s apart. The last second of a hold counts, provided that
 
-- the hold had lasted for 3 s by then, three times the slowest time constant of the paper's arm. Where rows
-  are missing before a hold, the pressures are assumed to have been held meanwhile, as when one pose is
-  recorded after the other; so is a first row that is followed by such a gap;
+- the hold has lasted for 3 s by then, three times the slowest time constant of the paper's arm. In a gap
+  before a hold, or after its first row, the pressures are assumed to have been held: poses may be logged one
+  by one;
 - the tip moves by less than 1 mm/s, or by no more than its own noise can explain, and stays within 2 mm.
 
-Rows with a number missing in a column of NEEDED are left out. The rows that count are averaged to one pose,
-so that a long hold weighs no more than a short one.
+Rows with a missing number in a column of NEEDED are left out. Rows that count are averaged to one pose, so a
+long hold weighs no more than a short one.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-NEEDED = ("time_s", "payload_kg", "pressure_kpa", "tip_m", "tip_quaternion")  # columns, of those there are
+NEEDED = ("time_s", "payload_kg", "pressure_kpa", "tip_m", "tip_quaternion")  # finite in a row, where logged
 HOLD_KPA = 1.0  # a held pressure stays this close to its first value
-MIN_HOLD_S = 3.0  # before the rows that count
+MIN_HOLD_S = 3.0  # time that pressures are held before the rows that count
 WINDOW_S = 1.0  # end of a hold, whose rows count
-MAX_SPEED_M_S = 1e-3  # of a tip at rest
+MAX_SPEED_M_S = 1e-3  # greatest speed of a tip at rest
 MAX_SPREAD_M = 2e-3  # RMS distance to the mean position of a tip at rest
-SPEED_SIGMA = 3.0  # standard deviations by which noise may exceed the speed
-ROUNDING_S = 1e-6  # of logged times
+SPEED_SIGMA = 3.0  # standard deviations of the fitted speed that noise may add to it
+ROUNDING_S = 1e-6  # error of logged times
 
 
 def holds(time_s: np.ndarray, pressure_kpa: np.ndarray, payload_kg: np.ndarray) -> list[tuple[int, int]]:
@@ -40,7 +40,7 @@ def holds(time_s: np.ndarray, pressure_kpa: np.ndarray, payload_kg: np.ndarray) 
         later = breaks[np.searchsorted(breaks, start, side="right") :]
         end = int(later[0]) if len(later) else n
         stop, width = start + 1, 64
-        while stop < end:  # look further and further ahead
+        while stop < end:  # look ahead, twice as far each time
             ahead = pressure_kpa[stop : min(stop + width, end)]
             left = leaves(ahead, pressure_kpa[start])
             stop += int(np.argmax(left)) if left.any() else len(left)
@@ -59,7 +59,7 @@ def leaves(pressure_kpa: np.ndarray, first_kpa: np.ndarray) -> np.ndarray:
 
 def last_second(time_s: np.ndarray, start: int, stop: int) -> np.ndarray:
     """Return the rows that count of the hold from `start` to before `stop`, if any."""
-    gaps_s = np.diff(time_s[max(start - 1, 0) :][:2])  # the first row's is that to the next one
+    gaps_s = np.diff(time_s[max(start - 1, 0) :][:2])  # before the hold, or after the log's first row
     gap_s = gaps_s[0] if len(gaps_s) else 0.0
     since = time_s[start] - (gap_s if gap_s > MIN_HOLD_S else 0.0)
     rows = np.arange(start, stop)

@@ -33,7 +33,8 @@ def demo(tmp_path_factory):
 def calibrated(demo, tmp_path_factory):
     folder = tmp_path_factory.mktemp("calibrated") / "out"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(network, "OF_PROCESS", dataclasses.replace(network.OF_PROCESS, n_updates=2_000))
+        schedule = network.OF_PROCESS.schedule._replace(n_updates=2_000)
+        patch.setattr(network, "OF_PROCESS", dataclasses.replace(network.OF_PROCESS, schedule=schedule))
         status = main(["run", *demo, "--out", str(folder)])
     return status, folder
 

@@ -87,7 +87,7 @@ def test_calibration_finds_each_recorded_pose(tmp_path, transients):
     assert transients or (len(log) == row_uses["used"] == 6)
     spring_m = REST_M + poses.pressure_kpa @ GAIN_M_PER_KPA.T
     np.testing.assert_allclose(poses.pressure_kpa, targets_kpa, atol=1.0)
-    np.testing.assert_allclose(poses.spring_m, spring_m, atol=4e-5)
+    np.testing.assert_allclose(poses.with_lengths(SPEC).spring_m, spring_m, atol=4e-5)
     off_m = poses.tip_m + [0, 0, 0.6] - spring_m[:, :3]
     assert np.std(off_m) == pytest.approx(2e-4 / np.sqrt(43), rel=0.4)  # of 50 ticks, 43 seen
     np.testing.assert_allclose(np.abs(poses.tip_rotation[:, 1, 2]), 0.96, atol=1e-6)

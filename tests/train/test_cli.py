@@ -12,6 +12,7 @@ import jax
 import numpy as np
 import pytest
 
+from mjx_softarm._support.training import Schedule
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.logs.schema import Log, write_log
 from mjx_softarm.mechanics import workspace
@@ -97,7 +98,8 @@ def test_a_run_survives_kill_9_and_ends_with_the_same_bits(arm, tmp_path, monkey
     config = json.loads((whole / "config.json").read_text())
     assert {"python", "packages", "commit"} <= config["provenance"].keys()
 
-    smallest = {"N_TRAINING": 512, "N_HELD_OUT": 64, "N_STEPS": 10, "PAYLOADS": (0.0,)}
+    brief = Schedule(10, 4e-3, 256)
+    smallest = {"N_TRAINING": 512, "N_HELD_OUT": 64, "SCHEDULE": brief, "PAYLOADS": (0.0,)}
     for name, smaller in smallest.items():  # how exact it is, test_estimator asks
         monkeypatch.setattr(f"train.runs.estimator.{name}", smaller)
     assert main(["export", str(whole)]) == 0

@@ -1,25 +1,22 @@
 """Small networks for the arm's computer, distilled from the simulator: of load, pose and springs.
 
-Equilibria over the whole workspace are the data, held-out ones the test. `mjx_softarm.sensing.estimator` and
-`mjx_softarm.sensing.load` describe the networks. The load is estimated from springs and pressures, for arms
-whose chambers are off, since a calibration is not perfect either; the pose from springs and the load, for
-arms as specified. A pose from pressures would take a chamber that is off for a shape.
+Equilibria over the whole workspace are the data, held-out equilibria the test. The networks are described in
+`mjx_softarm.sensing.estimator` and `mjx_softarm.sensing.load`. The load network reads springs and pressures;
+it learns from arms whose chambers are off, since no calibration is perfect. The pose network reads springs
+and the load: from pressures it would mistake a chamber's error for a change of shape.
 """
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jax import Array
 
-from mjx_softarm._support import xla
-from mjx_softarm._support.mlp import Layer
+from mjx_softarm._support.training import Schedule, initial_layers, train_network
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.workspace import (
     CANDIDATES_PER_POSE,
@@ -42,11 +39,9 @@ from mjx_softarm.spec import ArmSpec
 
 N_TRAINING, N_HELD_OUT = 16_384, 2_048
 MORE_PRESSURE = 0.25  # share of the pressure range that is added at either end
-N_STEPS = 8_000
-BATCH = 256
-WIDTH = 128
-LEARNING_RATE = 4e-3  # at the start, with a cosine decay to zero
-PAYLOADS = (0.0, 0.25, 0.5, 1.0)  # at which errors are given, as shares of the largest
+WIDTH = 128  # width of the hidden layers
+SCHEDULE = Schedule(n_updates=8_000, learning_rate=4e-3, batch_size=256)
+PAYLOADS = (0.0, 0.25, 0.5, 1.0)  # shares of the largest payload at which errors are given
 CHAMBERS_OFF = 0.03  # share by which stiffness and area of a chamber may be off
 TURN_MM = 50.0  # tip distance that costs as much as a turn by one radian
 CHANGE_SCALE = 0.015  # scale of the network's outputs, in section lengths and half radians
@@ -61,43 +56,43 @@ class Error(NamedTuple):
 
 
 class Distilled(NamedTuple):
-    """The networks with their errors on held-out equilibria."""
+    """Networks with their errors on held-out equilibria, by payload [kg] on top of the specification's."""
 
     estimator: PoseEstimator
     load_estimator: LoadEstimator
     spring_model: SpringModel
-    tip_mm: dict[float, Error]  # with the load known, by payload [kg] on top of the specification's
-    turn_deg: dict[float, Error]
-    load_kg: dict[float, Error]  # of arms whose chambers are off
-    spring_mm: dict[float, Error]  # of the spring with the largest error
+    tip_mm: dict[float, Error]  # tip of the pose network with the true load
+    turn_deg: dict[float, Error]  # axes of the pose network with the true load
+    load_kg: dict[float, Error]  # load of arms whose chambers are off
+    spring_mm: dict[float, Error]  # spring with the largest error
 
 
 def distil(spec: ArmSpec, seed: int) -> Distilled:
-    """Return the networks of an arm; the same seed gives the same ones.
+    """Return the networks of an arm; the same seed gives the same networks.
 
     Args:
         spec: the arm, calibrated or not.
         seed: seed of the equilibria, the initial weights and the batches.
 
     Raises:
-        ValueError: the seed is the held-out one.
+        ValueError: the seed draws the held-out equilibria.
         SpecError: the arm settles at too few pressures.
     """
     if seed == HELD_OUT_SEED:
         raise ValueError(f"seed: got {seed}, which draws the held-out equilibria, expected another")
-    key = jax.random.key(seed)
-    key_pose, key_springs = jax.random.split(key)
-    key_bend, key_load = (jax.random.fold_in(key, k) for k in (2, 3))
+    keys = jax.random.split(jax.random.key(seed), 7)
+    # Learn the pose of the arm as specified, then how a load changes it.
     poses = _with_load(sample_workspace(_stronger(spec), N_TRAINING, seed), spec.mass.payload_kg)
     loaded = _as_measured(spec, sample_loaded(spec, _loads(spec, seed), CHAMBERS_OFF, seed))
-    estimator = _fit(_first_estimator(spec, poses, key_pose), _pose_loss, poses, key_pose)
-    estimator = _fit(estimator, _pose_loss, loaded, key_bend, "load_layers")
-    load_estimator = _fit(_first_load_estimator(spec, loaded, key_load), _load_loss, loaded, key_load)
+    estimator = _fit(_first_estimator(spec, poses, keys[0]), _pose_loss, poses, keys[1])
+    estimator = _fit(estimator, _pose_loss, loaded, keys[2], "load_layers")
+    # Learn the load of arms that are off, and the springs of the unloaded arm.
+    load_estimator = _fit(_first_load_estimator(spec, loaded, keys[3]), _load_loss, loaded, keys[4])
     unloaded = _as_measured(spec, sample_workspace(spec, N_TRAINING, seed))
-    springs = _fit(_first_spring_model(unloaded, key_springs), _spring_loss, unloaded, key_springs)
-    pose, load, springs = jax.tree.map(
-        lambda x: np.asarray(x, np.float32), (estimator, load_estimator, springs)
-    )
+    springs = _fit(_first_spring_model(unloaded, keys[5]), _spring_loss, unloaded, keys[6])
+    # Test them.
+    networks = (estimator, load_estimator, springs)
+    pose, load, springs = jax.tree.map(lambda x: np.asarray(x, np.float32), networks)
     return Distilled(pose, load, springs, *_errors(pose, load, springs, spec))
 
 
@@ -122,7 +117,7 @@ def _load_max_kg(spec: ArmSpec) -> float:
 
 
 def _stronger(spec: ArmSpec) -> ArmSpec:
-    """Return the arm with more pressure: a real one reaches spring lengths just beyond the simulated."""
+    """Return the arm with more pressure: a real arm reaches spring lengths just beyond the simulated ones."""
     low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
     more = MORE_PRESSURE * (high - low)
     chambers = {"pressure_min_kpa": max(low - more, -100.0), "pressure_max_kpa": high + more}
@@ -130,17 +125,16 @@ def _stronger(spec: ArmSpec) -> ArmSpec:
 
 
 def _first_estimator(spec: ArmSpec, pool: LoadedPool, key: Array) -> PoseEstimator:
-    n, n_sections = spec.n_chambers, spec.structure.n_sections
+    n, n_out = spec.n_chambers, N_CHANGES * spec.structure.n_sections
     scale = np.full(N_CHANGES, CHANGE_SCALE)
     scale[:3] *= spec.geometry.section_length_m
-    load_layers = _first_layers(jax.random.fold_in(key, 1), (2 * n + 1, WIDTH, WIDTH, N_CHANGES * n_sections))
+    load_layers = initial_layers(jax.random.fold_in(key, 1), (2 * n + 1, WIDTH, WIDTH, n_out))
     *hidden, (weight, bias) = load_layers
     return PoseEstimator(
-        layers=_first_layers(key, (2 * n, WIDTH, WIDTH, N_CHANGES * n_sections)),
-        load_layers=(*hidden, (0.1 * weight, bias)),
+        layers=initial_layers(key, (2 * n, WIDTH, WIDTH, n_out)),
+        load_layers=(*hidden, (0.1 * weight, bias)),  # a load changes little at first
         spring_site_m=jnp.asarray(ArmParams.from_spec(spec).spring_site_m),
-        spring_centre_m=jnp.mean(pool.spring_m, axis=0),
-        spring_scale_m=jnp.std(pool.spring_m, axis=0),
+        **_scaling("spring", "m", pool.spring_m),
         load_centre_kg=jnp.asarray(spec.mass.payload_kg),
         load_scale_kg=jnp.asarray(spec.mass.largest_payload_kg),
         change_scale=jnp.asarray(scale),
@@ -149,11 +143,9 @@ def _first_estimator(spec: ArmSpec, pool: LoadedPool, key: Array) -> PoseEstimat
 
 def _first_load_estimator(spec: ArmSpec, pool: LoadedPool, key: Array) -> LoadEstimator:
     return LoadEstimator(
-        layers=_first_layers(key, (2 * spec.n_chambers, WIDTH, WIDTH, 1)),
-        spring_centre_m=jnp.mean(pool.spring_m, axis=0),
-        spring_scale_m=jnp.std(pool.spring_m, axis=0),
-        pressure_centre_kpa=jnp.mean(pool.pressure_kpa, axis=0),
-        pressure_scale_kpa=jnp.std(pool.pressure_kpa, axis=0),
+        layers=initial_layers(key, (2 * spec.n_chambers, WIDTH, WIDTH, 1)),
+        **_scaling("spring", "m", pool.spring_m),
+        **_scaling("pressure", "kpa", pool.pressure_kpa),
         load_scale_kg=jnp.asarray(_load_max_kg(spec)),
     )
 
@@ -161,22 +153,18 @@ def _first_load_estimator(spec: ArmSpec, pool: LoadedPool, key: Array) -> LoadEs
 def _first_spring_model(pool: Pool, key: Array) -> SpringModel:
     n = pool.spring_m.shape[1]
     return SpringModel(
-        layers=_first_layers(key, (n, WIDTH, WIDTH, n)),
-        pressure_centre_kpa=jnp.mean(pool.pressure_kpa, axis=0),
-        pressure_scale_kpa=jnp.std(pool.pressure_kpa, axis=0),
-        spring_centre_m=jnp.mean(pool.spring_m, axis=0),
-        spring_scale_m=jnp.std(pool.spring_m, axis=0),
+        layers=initial_layers(key, (n, WIDTH, WIDTH, n)),
+        **_scaling("pressure", "kpa", pool.pressure_kpa),
+        **_scaling("spring", "m", pool.spring_m),
     )
 
 
-def _first_layers(key: Array, widths: tuple[int, ...]) -> tuple[Layer, ...]:
-    """Return random layers that preserve the magnitude of their input."""
-    layers = []
-    for k, (n_in, n_out) in enumerate(itertools.pairwise(widths)):
-        gain = np.sqrt(2.0 / n_in)  # He et al. 2015, arXiv:1502.01852
-        weight = gain * jax.random.normal(jax.random.fold_in(key, k), (n_in, n_out))
-        layers.append((weight, jnp.zeros(n_out)))
-    return tuple(layers)
+def _scaling(name: str, unit: str, values: Array) -> dict[str, Array]:
+    """Return the fields of a network that standardise a quantity (n, ...)."""
+    return {
+        f"{name}_centre_{unit}": jnp.mean(values, axis=0),
+        f"{name}_scale_{unit}": jnp.std(values, axis=0),
+    }
 
 
 def _pose_loss(estimator: PoseEstimator, pool: LoadedPool) -> Array:
@@ -202,22 +190,12 @@ def _spring_loss(model: SpringModel, pool: Pool) -> Array:
 def _fit(
     network: Any, loss: Callable[[Any, Any], Array], pool: Any, key: Array, layers: str = "layers"
 ) -> Any:
-    """Return the network with its field `layers` trained by Adam; its other fields stay."""
-    optimiser = optax.adam(optax.cosine_decay_schedule(LEARNING_RATE, N_STEPS))
+    """Return the network with its field `layers` trained; its other fields stay."""
 
-    def step(carry: tuple[Any, Any], key_batch: Array) -> tuple[tuple[Any, Any], None]:
-        weights, state = carry
-        rows = jax.random.randint(key_batch, (BATCH,), 0, len(pool.pose))
-        batch = jax.tree.map(lambda x: x[rows], pool)
-        gradient = jax.grad(lambda weights: loss(network._replace(**{layers: weights}), batch))(weights)
-        updates, state = optimiser.update(gradient, state)
-        return (optax.apply_updates(weights, updates), state), None
+    def loss_of(weights: Any, rows: Any) -> Array:
+        return loss(network._replace(**{layers: weights}), rows)
 
-    def run(weights: Any) -> Any:
-        keys = jax.random.split(key, N_STEPS)
-        return jax.lax.scan(step, (weights, optimiser.init(weights)), keys)[0][0]
-
-    weights = xla.jit(run, uses_mjx=False)(getattr(network, layers))
+    weights, _ = train_network(loss_of, getattr(network, layers), pool, SCHEDULE, key)
     return network._replace(**{layers: weights})
 
 
@@ -230,9 +208,9 @@ def _errors(
         payload_kg = share * spec.mass.largest_payload_kg
         load_kg = spec.mass.payload_kg + payload_kg
         loaded = spec.replace(mass={"payload_kg": load_kg})
-        pool = jax.tree.map(
-            np.asarray, _as_measured(spec, sample_workspace(loaded, N_HELD_OUT, HELD_OUT_SEED))
-        )
+        # Compare pose and springs with equilibria of the arm as specified.
+        held_out = _as_measured(spec, sample_workspace(loaded, N_HELD_OUT, HELD_OUT_SEED))
+        pool = jax.tree.map(np.asarray, held_out)
         position_m, rotation = frame_from_pose(pool.pose)
         guess = estimate_frame(estimator, pool.spring_m, load_kg)
         chord = np.sqrt(np.sum((guess.rotation - rotation) ** 2, axis=(-2, -1)) / 8)  # sin of half the angle
@@ -240,6 +218,7 @@ def _errors(
         tip_mm[payload_kg] = _error(1e3 * np.linalg.norm(guess.position_m - position_m, axis=-1))
         turn_deg[payload_kg] = _error(np.degrees(2.0 * np.arcsin(np.minimum(chord, 1.0))))
         spring_mm[payload_kg] = _error(1e3 * springs.max(axis=-1))
+        # Estimate the load of arms whose chambers are off.
         many_kg = np.full(CANDIDATES_PER_POSE * N_HELD_OUT, load_kg)
         off = _as_measured(spec, sample_loaded(loaded, many_kg, CHAMBERS_OFF, HELD_OUT_SEED))
         estimate_kg = np.asarray(estimate_load(load_estimator, off.spring_m, off.pressure_kpa))

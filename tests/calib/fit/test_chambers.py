@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from calib.fit.blocks import held_out_blocks
-from calib.fit.chambers import MIN_POSES, calibrate_chambers
+from calib.fit.chambers import MIN_POSES, fit_chambers
 from calib.fit.parameters import BENDING, FIELDS
+from calib.read.measurements import measure
 from mjx_softarm import ArmSpec
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mechanics import excitation
@@ -18,6 +19,13 @@ from mjx_softarm.mechanics.kinematics import ChainKinematics
 from mjx_softarm.mechanics.workspace import settle_many
 
 SPEC = ArmSpec.default()
+MOUNTING = {
+    "base_turn_deg": (2.0, -1.5, 0.0),
+    "base_offset_m": (3e-3, -2e-3, 2e-3),
+    "section_roll_deg": (3.0, -2.0, 4.0),
+    "tip_turn_deg": (-2.0, 1.5, 5.0),
+    "tip_offset_m": (1e-3, -2e-3, 0.0),
+}
 TIP_NOISE_M, TURN_NOISE_RAD, PRESSURE_NOISE_KPA, SPRING_NOISE_M = 5e-4, np.radians(0.3), 0.1, 5e-4
 
 
@@ -78,6 +86,10 @@ def pose_log(arm, n, seed, pressure_kpa=None, **changes):
     return dataclasses.replace(log, **changes)
 
 
+def calibrate_chambers(logs, spec):
+    return fit_chambers(measure([logs] if isinstance(logs, Log) else logs, spec), spec)
+
+
 def off_by(found, arm):
     """Largest relative errors of stiffness, area and slope, and largest error of the offsets [m]."""
     pairs = [[np.array(getattr(x.chambers, name)) for x in (found, arm)] for name in FIELDS]
@@ -92,8 +104,14 @@ def tip_error_mm(found, arm, n=200):
 
 
 @pytest.fixture(scope="module")
-def fitted():
-    return calibrate_chambers(pose_log(planted(), 200, seed=0), SPEC)
+def mounted():
+    """The planted arm on a tilted base, with rolled sections and skew axes of the tip."""
+    return planted().replace(mounting=MOUNTING)
+
+
+@pytest.fixture(scope="module")
+def fitted(mounted):
+    return calibrate_chambers(pose_log(mounted, 200, seed=0), SPEC)
 
 
 @pytest.fixture(scope="module")
@@ -101,15 +119,25 @@ def fitted_without_springs():
     return calibrate_chambers(pose_log(planted(), 200, seed=0, spring_m=None), SPEC)
 
 
-def test_planted_numbers_come_back(fitted):
-    stiffness, area, slope, offset_m = off_by(fitted.spec, planted())
+def test_planted_numbers_come_back(fitted, mounted):
+    stiffness, area, slope, offset_m = off_by(fitted.spec, mounted)
     assert stiffness < 0.05
     assert area < 0.05
     assert slope < 0.1
     assert offset_m < 1e-3  # of offsets up to 5 mm
     bending = fitted.spec.backbone.bending_stiffness_nm_per_rad
-    assert bending == pytest.approx(planted().backbone.bending_stiffness_nm_per_rad, rel=0.05)
+    assert bending == pytest.approx(mounted.backbone.bending_stiffness_nm_per_rad, rel=0.05)
     assert fitted.warnings == fitted.weak == ()
+
+
+def test_mounting_comes_back_with_intervals_and_a_turned_quaternion_is_told(fitted, fitted_without_springs):
+    """Neither chambers nor S2R have to carry a tilted base, rolled sections or skew axes of the tip."""
+    for name, planted_value in MOUNTING.items():
+        error = np.abs(np.array(getattr(fitted.spec.mounting, name)) - planted_value)
+        assert (error < (0.25 if name.endswith("_deg") else 7e-4)).all(), name
+        assert (error < 2.0 * fitted.half_width_95[name] + 1e-9).mean() > 0.6
+    assert fitted.held_out_before.rotation_mean_deg > 4.0 > 1.0 > fitted.held_out.rotation_mean_deg
+    assert "quaternion is 5." in fitted.notes[0] and fitted_without_springs.notes == ()
 
 
 def test_without_springs_stiffness_and_area_come_back_and_the_offsets_are_said_to_be_unknown(
@@ -175,10 +203,10 @@ def test_an_arm_of_two_sections_is_calibrated():
     assert any("markers: got 5, expected as many in each of 2 sections" in w for w in fit.warnings)
 
 
-def test_the_calibrated_tip_is_the_planted_arm_s(fitted, fitted_without_springs):
-    assert tip_error_mm(SPEC, planted()).mean() > 5.0
-    for fit in (fitted, fitted_without_springs):
-        assert tip_error_mm(fit.spec, planted()).mean() < 0.5
+def test_the_calibrated_tip_is_the_planted_arm_s(fitted, mounted, fitted_without_springs):
+    for fit, arm in ((fitted, mounted), (fitted_without_springs, planted())):
+        assert tip_error_mm(SPEC, arm).mean() > 5.0
+        assert tip_error_mm(fit.spec, arm).mean() < 0.5
 
 
 def test_held_out_error_is_that_of_the_noise(fitted):
@@ -201,7 +229,7 @@ def test_intervals_hold_the_planted_numbers_as_often_as_they_say():
     assert 0.9 < np.mean(inside) < 0.985
 
 
-def test_payload_hangs_at_the_gripper_row_by_row(fitted):
+def test_payload_hangs_at_the_gripper_row_by_row():
     """Half of the poses with 0.5 kg: taken into account it changes nothing, left out it bends the arm."""
     arm = planted()
     loaded = pose_log(arm.replace(mass={"payload_kg": 0.5}), 60, seed=2)
@@ -213,7 +241,7 @@ def test_payload_hangs_at_the_gripper_row_by_row(fitted):
     assert left_out.held_out.translation_mean_mm > 3.0
 
 
-def test_outliers_hardly_matter(fitted):
+def test_outliers_hardly_matter():
     log = pose_log(planted(), 200, seed=0)
     wrong = np.random.default_rng(0).choice(len(log), 10, replace=False)
     tip_m = log.tip_m.copy()
@@ -264,28 +292,3 @@ def test_a_chamber_that_never_changes_is_named_and_its_area_left_alone():
 def test_refuses_a_log_that_cannot_be_used(changes, message):
     with pytest.raises(ValueError, match=message):
         calibrate_chambers(pose_log(SPEC, 9, 0, **changes), SPEC)
-
-
-MOUNTING = {
-    "base_turn_deg": (2.0, -1.5, 0.0),
-    "base_offset_m": (3e-3, -2e-3, 2e-3),
-    "section_roll_deg": (3.0, -2.0, 4.0),
-    "tip_turn_deg": (-2.0, 1.5, 5.0),
-    "tip_offset_m": (1e-3, -2e-3, 0.0),
-}
-
-
-def test_mounting_comes_back_with_intervals_and_a_turned_quaternion_is_told():
-    """Neither chambers nor S2R have to carry a tilted base, rolled sections or skew axes of the tip."""
-    arm = planted().replace(mounting=MOUNTING)
-    fit = calibrate_chambers(pose_log(arm, 200, seed=0), SPEC)
-    for name, planted_value in MOUNTING.items():
-        error = np.abs(np.array(getattr(fit.spec.mounting, name)) - planted_value)
-        assert (error < (0.25 if name.endswith("_deg") else 7e-4)).all(), name
-        assert (error < 2.0 * fit.half_width_95[name] + 1e-9).mean() > 0.6
-    assert fit.held_out_before.rotation_mean_deg > 4.0 > 1.0 > fit.held_out.rotation_mean_deg
-    assert "quaternion is 5." in fit.notes[0] and not fit.warnings
-
-
-def test_a_hanging_quaternion_that_is_right_is_not_told(fitted):
-    assert fitted.notes == ()

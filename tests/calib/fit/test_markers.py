@@ -38,7 +38,7 @@ def poses_with_markers(arm, kind):
         length_m[k] = data.ten_length[0::2]
     poses = StaticPoses(
         pressure_kpa, np.zeros(N), np.float64(found.tip_position_m), np.float64(found.tip_rotation),
-        found.spring_m, marker_m, np.zeros(N, bool),
+        found.spring_m, marker_m, np.zeros((N, 1, 9)), np.ones(N, int),
     )  # fmt: skip
     return poses, length_m
 

@@ -9,8 +9,10 @@ import pytest
 
 from benchmarks.accuracy.logs import trunk_errors
 from calib.fit.blocks import held_out_blocks
-from calib.fit.network import NetworkConfig, fit_network
-from calib.fit.s2r import fit_s2r, pose_errors, simulate_poses
+from calib.fit.network import OF_ROWS, NetworkConfig, fit_network
+from calib.fit.pose_errors import pose_errors
+from calib.fit.s2r import fit_s2r, simulate_poses
+from mjx_softarm._support.training import Schedule
 from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.settle import settle
@@ -19,7 +21,7 @@ from mjx_softarm.sensing.pose import frame_from_pose, pose_from_frame
 from mjx_softarm.sensing.s2r import apply_correction, correct, correction, extrapolation
 
 N_ROWS, N_CLEAN = 1_000, 500
-BRIEF = NetworkConfig(hidden=(16,), n_members=2, n_updates=100)
+BRIEF = NetworkConfig((16,), Schedule(100, 0.01, 128))
 DATA = Path(__file__).parents[3].parent / "shared/data"
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason=f"no logs of a real trunk in {DATA}")
 
@@ -150,7 +152,7 @@ def test_refuses_what_does_not_fit_together(spec, arms):
 def test_a_constant_input_and_a_constant_output_do_no_harm():
     x = np.stack([np.linspace(0.0, 1.0, 300), np.full(300, 0.2)], axis=1)
     y = np.stack([x[:, 0] ** 2, np.full(300, 4.0)], axis=1)
-    fitted = correction(fit_network(x, y, 0, NetworkConfig(n_updates=500)).network, x)
+    fitted = correction(fit_network(x, y, 0, OF_ROWS).network, x)
     np.testing.assert_allclose(fitted[:, 1], 4.0, rtol=1e-6)
     assert np.sqrt(np.mean((fitted - y) ** 2)) < 0.02
 

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from calib.fit.transients import MAX_TOTAL_S, Stretch, calibrate_damping, damped, find_stretches, simulate
+from calib.fit.transients import MAX_TOTAL_S, Stretch, damped, find_stretches, fit_damping, simulate
 from mjx_softarm import ArmSpec
 from mjx_softarm.logs.schema import Log
 
@@ -39,7 +39,7 @@ def log():
 
 @pytest.fixture(scope="module")
 def fitted(log):
-    return calibrate_damping(log, SPEC)
+    return fit_damping(find_stretches([log], SPEC), SPEC)
 
 
 def test_planted_damping_comes_back(fitted):
@@ -61,7 +61,7 @@ def test_what_is_left_is_noise(fitted):
 
 def test_small_steps_are_said_not_to_tell_the_damping(log):
     calm = moving_log(SPEC, steps(12) * 0.02 - 10.0)
-    assert calibrate_damping(calm, SPEC).warnings
+    assert fit_damping(find_stretches([calm], SPEC), SPEC).warnings
 
 
 def test_a_slower_log_is_brought_to_the_control_rate_with_pressures_held(log):
@@ -94,6 +94,6 @@ def test_logs_without_motion_are_passed_by_and_no_damping_is_refused(log, change
     changed = dataclasses.replace(log, **changes)
     assert find_stretches([changed], SPEC) == [], why
     with pytest.raises(ValueError, match="got no stretch of 7 s"):
-        calibrate_damping(changed, SPEC)
+        fit_damping([], SPEC)
     with pytest.raises(ValueError, match="damping_ns_per_m 0 and .* expected both above 0"):
-        calibrate_damping(changed, SPEC.replace(chambers={"damping_ns_per_m": 0.0}))
+        fit_damping([], SPEC.replace(chambers={"damping_ns_per_m": 0.0}))

@@ -5,7 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from calib.read.logs import read_log, same_arm, template
+from calib.read.logs import read_log, template
+from calib.read.measurements import measure
 from mjx_softarm.logs.checks import LogError
 from mjx_softarm.logs.schema import UNITS, log_columns, log_table
 from tests.calib.read.arm_logs import N, arm_log, csv, planted
@@ -97,9 +98,9 @@ def test_template_is_valid_and_its_text_names_all_columns(tmp_path):
         template(path)
 
 
-def test_logs_of_one_arm_and_of_two():
+def test_logs_of_one_arm_and_of_two(spec):
     first = arm_log(source="a.csv")
-    same_arm([first, arm_log(seed=1, source="b.csv"), arm_log(seed=2, source="c.csv")])
+    measure([first, arm_log(seed=1, source="b.csv"), arm_log(seed=2, source="c.csv")], spec)
     for change, message in [
         ({"spring_m": 3.0 * first.spring_m}, "spring_m: got 0.1.* and 0.5"),
         ({"readings": 0.5 * first.readings}, "readings: "),
@@ -109,9 +110,9 @@ def test_logs_of_one_arm_and_of_two():
     ]:
         other = dataclasses.replace(first, source="b.csv", **change)
         with pytest.raises(LogError, match="a.csv and b.csv: " + message):
-            same_arm([first, first, other])
+            measure([first, first, other], spec)
     bare = dataclasses.replace(first, source="d.csv", marker_m=None, tip_m=None, tip_quaternion=None)
-    same_arm([bare, first])  # a log need not have everything
+    measure([bare, first], spec)  # a log need not have everything
 
 
 def test_too_few_rows_left_are_refused_with_the_reasons(file):

@@ -43,7 +43,7 @@ def test_each_hold_is_one_pose_averaged_over_its_last_second():
     np.testing.assert_allclose(poses.pressure_kpa[:, 0], [0.0, 10.0, -20.0], atol=0.1)
     np.testing.assert_allclose(poses.tip_m[:, 0], [0.0, 0.05, -0.1], atol=3e-4)  # noise of a row is 5e-4
     np.testing.assert_allclose(poses.tip_m[1], log.tip_m[449:500].mean(0), atol=1e-12)
-    assert not poses.single.any()
+    assert (poses.n_rows == 51).all()
     n = 3 * 51
     assert {use: m for use, m in row_uses.items() if m} == {
         "used": n,
@@ -68,7 +68,7 @@ def test_poses_logged_one_by_one_were_held_meanwhile():
     log = make_log(5.0 * np.arange(6), [0, 20, -40, 3, 3, 5], 0.1 * np.arange(6))
     poses, row_uses = find_static_poses([log], SPEC)
     np.testing.assert_array_equal(poses.pressure_kpa[:, 0], [0, 20, -40, 3, 3, 5])
-    assert poses.single.all()
+    assert (poses.n_rows == 1).all()
     assert row_uses["used"] == 6 and row_uses["pressures not held long enough"] == 0
     faster, _ = find_static_poses([make_log(2.0 * np.arange(6), [0, 20, -40, 3, 3, 5], np.zeros(6))], SPEC)
     assert faster.n == 0
@@ -95,7 +95,13 @@ def test_springs_are_read_from_frequencies_by_the_sensors_of_the_spec():
     length_m = np.full((750, 9), 0.18)
     hz = SPEC.spring_sensor.readings(length_m)
     poses, _ = find_static_poses([steps(readings=hz)], SPEC)
-    np.testing.assert_allclose(poses.spring_m, 0.18, rtol=1e-6)
+    assert np.isnan(poses.spring_m).all()
+    np.testing.assert_allclose(poses.with_lengths(SPEC).spring_m, 0.18, rtol=1e-6)
+    hz[460, 2] = 1.0
+    poses, _ = find_static_poses([steps(readings=hz)], SPEC)
+    assert np.argwhere(np.isnan(poses.with_lengths(SPEC).spring_m)).tolist() == [[1, 2]]
+    calibrated = SPEC.replace(sensor={"delta_m": SPEC.sensor.delta_m + 1e-3})
+    np.testing.assert_allclose(poses.with_lengths(calibrated).spring_m[0], 0.181, rtol=1e-6)
     assert np.isnan(find_static_poses([steps()], SPEC)[0].spring_m).all()
 
 

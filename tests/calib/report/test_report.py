@@ -6,7 +6,7 @@ from html.parser import HTMLParser
 import numpy as np
 from matplotlib.figure import Figure
 
-from calib.report.page import Section, Table, to_html, to_json
+from calib.report.page import ReportTable, Section, to_html, to_json
 
 PROVENANCE = {"commit": "0123abc", "packages": {"numpy": "2.0"}}
 
@@ -35,7 +35,7 @@ class Page(HTMLParser):
 
 
 def make_parts(warnings=()):
-    table = Table(("", "beta"), (("spring 0", np.float64(0.931234)), ("spring 1", np.int64(7))))
+    table = ReportTable(("", "beta"), (("spring 0", np.float64(0.931234)), ("spring 1", np.int64(7))))
     figure = Figure()
     figure.add_subplot().plot([0, 1])
     return (

@@ -25,10 +25,10 @@ SPEC = ArmSpec.default()
 N, N_ARMS = SPEC.n_chambers, 512
 
 
-def small(monkeypatch, n_steps):
+def small(monkeypatch, n_updates):
     monkeypatch.setattr(module, "N_TRAINING", 8192)
     monkeypatch.setattr(module, "N_HELD_OUT", 512)
-    monkeypatch.setattr(module, "N_STEPS", n_steps)
+    monkeypatch.setattr(module, "SCHEDULE", module.SCHEDULE._replace(n_updates=n_updates))
 
 
 @pytest.fixture(scope="module")
@@ -155,6 +155,7 @@ def test_all_of_the_training_is_worth_it():
 
 def test_a_payload_is_estimated_with_the_pressures_that_calibration_found(monkeypatch, distilled, pool):
     small(monkeypatch, 1000)
+    monkeypatch.setattr(module, "PAYLOADS", (0.0,))
     rng = np.random.default_rng(5)
     table = {"pressure_kpa": tuple(rng.normal(0, 2, N)), "slope_kpa_per_m": tuple(rng.normal(0, 100, N * N))}
     spec = SPEC.replace(unmodelled=table)

@@ -1,0 +1,161 @@
+"""Steps of a calibration: each turns measurements and a specification into a better one and a section.
+
+A step without data, or whose fit is worse on held-out data than its start, keeps the specification's values,
+and warns.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple, TypedDict
+
+import numpy as np
+
+from calib.fit.chambers import MIN_POSES, fit_chambers
+from calib.fit.held_pressures import fit_held_pressures
+from calib.fit.markers import MIN_MARKERS, marker_limits
+from calib.fit.s2r import fit_s2r, simulate_poses
+from calib.fit.sensors import fit_springs
+from calib.fit.transients import find_stretches, fit_damping
+from calib.read.measurements import Measurements
+from calib.report import sections
+from calib.report.page import Section
+from mjx_softarm.logs.pose_pairs import PosePairs
+from mjx_softarm.logs.rest import MIN_HOLD_S
+from mjx_softarm.sensing.pose import pose_from_frame
+from mjx_softarm.sensing.s2r import S2R, correct, extrapolation
+from mjx_softarm.spec import ArmSpec
+
+MIN_S2R_POSES = 60
+NOT_FITTED = "Not fitted: the specification's values stay."
+
+
+class Extras(TypedDict, total=False):
+    """Results beside the specification. A step adds some; a later step may replace them."""
+
+    scale: np.ndarray  # (2, 3) or (2, 4) robust errors, see `calib.fit.chambers.ChamberFit`
+    error_mm: np.ndarray  # (n,) tip error at each static pose
+    s2r: S2R
+    pairs: Mapping[str, PosePairs]  # measured and simulated poses, without and with the network
+
+
+class StepResult(NamedTuple):
+    """Result of a step."""
+
+    spec: ArmSpec  # arm with the numbers that the step fitted
+    section: Section  # section of the report
+    extras: Extras = Extras()
+
+
+Step = Callable[[Measurements, ArmSpec, int], StepResult]
+
+
+def springs(
+    measurements: Measurements,
+    spec: ArmSpec,
+    seed: int,
+    shared: bool = False,
+    fit_compensation: bool = False,
+) -> StepResult:
+    """Fit beta and delta of the springs' sensors; options as in `calib.fit.sensors.fit_springs`."""
+    pairs = [
+        (readings, log.spring_m)
+        for log in measurements.logs
+        if (readings := log.readings_of(spec.sensor)) is not None and log.spring_m is not None
+    ]
+    if not pairs:
+        needed = f"{NOT_FITTED} No log has both readings and measured spring lengths."
+        remedy = "beta and delta are not this arm's: log readings beside spring lengths on a ruler"
+        return StepResult(spec, Section("Springs", needed, warnings=(remedy,)))
+    readings, length_m = (np.concatenate(x) for x in zip(*pairs, strict=True))
+    fit = fit_springs(readings, length_m, spec.spring_sensor, fit_compensation, shared, seed=seed)
+    # Put the fitted numbers into the specification, and show the residuals.
+    sensor: dict[str, Any] = {"beta": tuple(map(float, fit.beta)), "delta_m": tuple(map(float, fit.delta_m))}
+    if fit.compensation_h is not None:
+        sensor["compensation_h"] = fit.compensation_h
+    spec = spec.replace(sensor=sensor)
+    calibrated = spec.spring_sensor.lengths(readings, np.nan)
+    return StepResult(spec, sections.springs(fit, calibrated.length_m, length_m))
+
+
+def chambers(measurements: Measurements, spec: ArmSpec, seed: int) -> StepResult:
+    """Fit stiffness, area and length of the chambers, the backbone and the mounting to poses at rest."""
+    n = measurements.poses.n
+    if n < MIN_POSES:
+        needed = f"{NOT_FITTED} {_few(MIN_POSES, 'pressures and tip poses', n, measurements.row_uses)}"
+        remedy = f"stiffness, area and length are not this arm's: log {MIN_POSES} poses at rest or more"
+        return StepResult(spec, Section("Chambers", needed, warnings=(remedy,)))
+    fit = fit_chambers(measurements, spec, seed)
+    section = sections.chambers(fit)
+    # Check the chambers' lengths by markers along the arm.
+    if fit.has_markers and fit.poses.marker_m.shape[1] >= MIN_MARKERS:
+        section = sections.with_markers(section, marker_limits(fit.poses, fit.chamber_m, fit.spec))
+    # Give a pose at which the simulated arm finds no rest the mean error.
+    known = np.isfinite(fit.tip_error_mm)
+    error_mm = np.where(known, fit.tip_error_mm, np.mean(fit.tip_error_mm[known]))
+    extras = Extras(scale=fit.scale, error_mm=error_mm)
+    return StepResult(fit.spec if fit.is_better else spec, section, extras)
+
+
+def damping(measurements: Measurements, spec: ArmSpec, seed: int) -> StepResult:
+    """Fit the damping of chambers and backbone to the moving arm."""
+    stretches = find_stretches(measurements.logs, spec)
+    if not stretches:
+        needed = "No log follows the moving arm; it decides how the arm swings, not where it rests."
+        return StepResult(spec, Section("Damping", f"{NOT_FITTED} {needed}"))
+    fit = fit_damping(stretches, spec, seed)
+    return StepResult(fit.spec if fit.is_better else spec, sections.damping(fit))
+
+
+def s2r(measurements: Measurements, spec: ArmSpec, seed: int) -> StepResult:
+    """Fit the sim-to-real network, and the pressures that hold the arm, to poses of the unloaded arm."""
+    # Settle the simulated arm at the spring lengths of these poses; with a payload its poses would differ.
+    poses = measurements.poses.with_lengths(spec)
+    unloaded = np.isclose(poses.payload_kg, spec.mass.payload_kg, rtol=0.0, atol=1e-6)
+    used = np.flatnonzero(np.isfinite(poses.spring_m).all(axis=1) & unloaded)
+    simulated = simulate_poses(spec, poses.spring_m[used]) if len(used) else None
+    n_settled = 0 if simulated is None else int(np.count_nonzero(simulated.valid))
+    n_unsettled = len(used) - n_settled
+    if simulated is None or n_settled < MIN_S2R_POSES:
+        what = f"pressures, spring lengths and tip poses, a payload of {spec.mass.payload_kg:g} kg"
+        uses = {**measurements.row_uses, "poses at which the simulated arm finds no rest": n_unsettled}
+        needed = f"Not fitted: {_few(MIN_S2R_POSES, what, n_settled, uses)}"
+        remedy = f"policies will be trained on simulated poses: log {MIN_S2R_POSES} poses at rest or more"
+        return StepResult(spec, Section("Sim-to-real network", needed, warnings=(remedy,)))
+    used, settled = used[simulated.valid], simulated.take(simulated.valid)
+    real = pose_from_frame(poses.tip_m[used], poses.tip_rotation[used])
+    # Fit the network from simulated to measured tips.
+    fit = fit_s2r(spec, settled, real, seed)
+    section = sections.s2r(fit, settled.pose, settled.spring_m, real, n_unsettled)
+    corrected, away = (f(fit.s2r, settled.pose, settled.spring_m) for f in (correct, extrapolation))
+    pairs = {
+        "simulated": PosePairs(real, settled.pose, np.zeros(len(real), bool)),
+        "with the network": PosePairs(real, corrected, away > 1.0),
+    }
+    # Give a pose that was not held out the mean error of the held-out poses.
+    error_mm = np.full(poses.n, fit.test.translation_mean_mm)
+    error_mm[used[fit.held_out]] = pairs["with the network"].error_mm[fit.held_out]
+    # Fit the pressures that hold the arm.
+    held = fit_held_pressures(spec, settled.spring_m, poses.pressure_kpa[used], settled.pressure_kpa, seed)
+    if held.is_better:
+        spec = spec.replace(unmodelled=dataclasses.asdict(held.unmodelled))
+    extras = Extras(pairs=pairs, error_mm=error_mm)
+    if fit.is_better:
+        extras["s2r"] = fit.s2r
+    return StepResult(spec, sections.with_pressures(section, held), extras)
+
+
+STEPS: Mapping[str, Step] = MappingProxyType(
+    {"springs": springs, "chambers": chambers, "damping": damping, "sim-to-real network": s2r}
+)
+
+
+def _few(n: int, what: str, n_found: int, row_uses: Mapping[str, int]) -> str:
+    """Say which poses are needed, and what became of the rows of the logs."""
+    uses = ", ".join(f"{count} {use}" for use, count in row_uses.items() if count)
+    return (
+        f"Got {n_found} poses at rest with {what}, expected {n} or more; pressures must have been held for "
+        f"{MIN_HOLD_S:g} s. Rows of the logs: {uses or 'none with all of these columns'}."
+    )

@@ -1,0 +1,96 @@
+"""Training of small networks: rows, a loss, a schedule of Adam, early stopping and a seed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax import Array
+
+from mjx_softarm._support import xla
+from mjx_softarm._support.mlp import Layer
+
+STOP_EVERY = 10  # distance of the rows that stop the training, by default
+
+Weights = Any  # a tree of arrays
+
+
+class Schedule(NamedTuple):
+    """Course of a training by Adam."""
+
+    n_updates: int
+    learning_rate: float  # first rate, which falls to zero along a half cosine
+    batch_size: int
+    weight_decay: float = 0.0  # per update and learning rate
+
+
+def initial_layers(key: Array, widths: Sequence[int]) -> tuple[Layer, ...]:
+    """Draw layers that preserve the magnitude of their input. Source: He et al. 2015, arXiv:1502.01852."""
+    keys = jax.random.split(key, len(widths) - 1)
+    return tuple(
+        (jnp.sqrt(2.0 / n_in) * jax.random.normal(key, (n_in, n_out)), jnp.zeros(n_out))
+        for key, n_in, n_out in zip(keys, widths[:-1], widths[1:], strict=True)
+    )
+
+
+def train_network(
+    loss: Callable[[Weights, Any], Array],
+    weights: Weights,
+    rows: Any,
+    schedule: Schedule,
+    key: Array,
+    stop: np.ndarray | None = None,
+) -> tuple[Weights, np.ndarray]:
+    """Minimise the mean loss of some rows; other rows choose the epoch whose weights are returned.
+
+    Args:
+        loss: mean loss () of weights on some rows.
+        weights: weights to start from, a tree of arrays.
+        rows: data, a tree of arrays (n, ...).
+        schedule: number of updates, learning rate, batch size and weight decay.
+        key: key of the order of the rows.
+        stop (n,) bool: rows that stop the training early and are not learned from; by default every tenth.
+
+    Returns:
+        Weights with the least loss on the stopping rows; losses (n_epochs,) on these rows.
+    """
+    # Split the rows into those that are learned and those that stop the training, and fill whole batches.
+    n = len(jax.tree.leaves(rows)[0])
+    stops = np.arange(n) % STOP_EVERY == 0 if stop is None else stop
+    learned = jax.tree.map(lambda x: jnp.asarray(x)[~stops], rows)
+    stopping = jax.tree.map(lambda x: jnp.asarray(x)[stops], rows)
+    n_learned = int(np.count_nonzero(~stops))
+    batch_size = min(schedule.batch_size, n_learned)
+    n_batches = n_learned // batch_size
+    n_epochs = -(-schedule.n_updates // n_batches)
+    decay = optax.cosine_decay_schedule(schedule.learning_rate, n_epochs * n_batches)
+    optimiser = optax.adamw(decay, weight_decay=schedule.weight_decay)
+
+    def run(weights: Weights, keys: Array, learned: Any, stopping: Any) -> tuple[Weights, Array]:
+        def update(carry: tuple[Weights, Any], chosen: Array) -> tuple[tuple[Weights, Any], None]:
+            weights, state = carry
+            batch = jax.tree.map(lambda x: x[chosen], learned)
+            step, state = optimiser.update(jax.grad(loss)(weights, batch), state, weights)
+            return (optax.apply_updates(weights, step), state), None
+
+        def epoch(carry: tuple, key: Array) -> tuple[tuple, Array]:
+            weights, state, best, least = carry
+            # Visit the rows once, in a random order.
+            shuffled = jax.random.permutation(key, n_learned)[: n_batches * batch_size]
+            batches = shuffled.reshape(n_batches, batch_size)
+            (weights, state), _ = jax.lax.scan(update, (weights, state), batches)
+            # Keep the weights if no epoch before was better.
+            value = loss(weights, stopping)
+            best = jax.tree.map(lambda new, old: jnp.where(value < least, new, old), weights, best)
+            return (weights, state, best, jnp.minimum(value, least)), value
+
+        start = (weights, optimiser.init(weights), weights, jnp.inf)
+        (_, _, best, _), losses = jax.lax.scan(epoch, start, keys)
+        return best, losses
+
+    keys = jax.random.split(key, n_epochs)
+    return jax.device_get(xla.jit(run, uses_mjx=False)(weights, keys, learned, stopping))
