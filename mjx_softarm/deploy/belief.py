@@ -1,4 +1,4 @@
-"""Belief about an arm: what its readings and pressures say of lengths, payload, pose, rest and trust.
+"""Belief about an arm, made of readings and pressures: lengths, payload, pose, rest, doubtful parts.
 
     readings                   -> spring lengths, the last good ones where a reading is lost
     springs, pressures at rest -> payload
@@ -43,7 +43,7 @@ class Belief:
     spring_m: np.ndarray  # (n,) lengths, the last good ones; NaN before the first
     lost: np.ndarray  # (n,) bool: a spring without a reading in this tick
     stuck: np.ndarray  # (n,) bool: a spring that stands stock-still where it should not
-    suspect: np.ndarray  # (n,) bool: a chamber without whose pressure the springs would lie as they do
+    suspect: np.ndarray  # (n,) bool: a chamber that seems to have lost its pressure
     saturated: np.ndarray  # (n,) bool: a chamber at its limit with its spring, in the mean, off the reference
     load: Load  # payload
     at_rest: bool = False  # nothing has moved for a window; one after the last action, at the earliest
@@ -76,7 +76,7 @@ class Belief:
 
     @property
     def known(self) -> bool:
-        """Whether each spring has been read once."""
+        """True once each spring has been read."""
         return not np.isnan(self.spring_m).any()
 
     @property
@@ -154,7 +154,7 @@ def pose_of(controller: Controller, spring_m: np.ndarray, load: Load) -> tuple[n
 def read_lengths(
     sensor: Sensor, readings: np.ndarray | None, last_m: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, str]:
-    """Return spring lengths (n,) [m], the last ones where a reading is lost; which are (n,); and why."""
+    """Return lengths (n,) [m], the last ones of lost readings; a mask (n,) of these; and the reason."""
     if readings is None:
         return last_m, np.ones(len(last_m), bool), "no readings within the tick"
     reading = sensor.lengths(readings)

@@ -32,24 +32,21 @@ class LoopConfig:
     # Shares of the error left, tried in turn. With the whole error alone, 91 of 918 positions in pipes were
     # left more than 8 mm off, and two of nine runs failed their tasks in the narrow pipe. With these, none.
     shares: tuple[float, ...] = (1.0, 0.5, 0.25)
-    # Share for each action towards a moving goal; by hand. Circle in 20 s on twins: 1.9 mm with it, 3.5 mm
-    # without.
+    # Share for each action towards a moving goal; by hand. Circle in 20 s on twins: 1.9 mm, 3.5 mm without.
     moving_share: float = 0.05
 
     # Lead of a moving goal.
     lead_s: float = 0.85  # policies at rest: springs of twins lag by it; tips are then at most 0.06 s late
     lead_actions: int = 2  # policies of motion; circle in 10 s on a twin: 3.1 mm with it, 23.6 mm without
 
-    # Payload. Twins that carried exactly the largest one were reported as overloaded in 8 of 9 runs with a
-    # smaller factor, and in 4 of 36 with this one (docs/results/paper-open.json).
-    overload: float = 1.4  # times the largest payload
+    # Overload, in largest payloads. Twins that carry exactly the largest are wrongly reported in 4 of 36 runs
+    # (docs/results/paper-open.json); with a smaller factor in 8 of 9.
+    overload: float = 1.4
 
     # Faults of time and sensors.
     lost_ticks: int = 3  # ticks in a row without a reading; by hand
     late_ticks: int = 5  # late ticks in a row; by hand
-    stuck_range_m: float = (
-        1e-5  # range of a stuck sensor's readings over a window; a live one's noise is more
-    )
+    stuck_range_m: float = 1e-5  # range of a stuck sensor over a window; a live one's noise is larger
     stuck_pressure_kpa: float = 2.0  # range of its chamber's pressure at which a live one moves; by hand
     stuck_neighbour_m: float = 2e-3  # motion of its section's springs at which a live one moves; by hand
 
@@ -84,9 +81,7 @@ class Controller:
 
     policy: Policy
     reachable: Reachable
-    tip: Callable[
-        [np.ndarray, float], tuple[np.ndarray, float]
-    ]  # `tip_pose` of springs (n,) [m], payload [kg]
+    tip: Callable[[np.ndarray, float], tuple[np.ndarray, float]]  # `policy.runtime.tip_pose`
     sensed: Callable[[np.ndarray, np.ndarray, InMotion, float], np.ndarray | None]  # `policy.runtime.sensed`
     plan: Plan  # pose and goal (6,), springs (n,) [m], `sensed` of `PolicyRunner.act` -> references (n,) [m]
     dt_s: float

@@ -60,15 +60,15 @@ class ListedGoals:
 
 
 class Orders(NamedTuple):
-    """Orders for the next tick; where there are several, the safest one counts."""
+    """Orders for the next tick; of several, the safest one counts."""
 
     vent: bool = False  # let the pressures go to zero; a later goal brings the arm up again
     hold: bool = False  # give up the goals and hold the springs where they are
-    goals: Sequence[np.ndarray] | None = None  # poses (6,) [mm, deg] in place of all others; None: as before
+    goals: Sequence[np.ndarray] | None = None  # poses (6,) [mm, deg] that replace all others; None: no change
 
 
 class Pilot(Protocol):
-    """Someone who steers an arm while the loop runs. Neither method may wait: both run within a tick."""
+    """Interface of a pilot, who steers an arm while the loop runs. Its methods run within a tick: none may wait."""
 
     def orders(self) -> Orders:
         """Return the orders since the last tick."""

@@ -24,8 +24,8 @@ from mjx_softarm.logs.schema import Log
 from mjx_softarm.mdp.rewards import scaled_error
 from mjx_softarm.sensing.pose import pose_error, seen_error
 
-_ROUNDING_S = 1e-6  # by which a simulated tick may be longer than the period
-_KEPT = 1000  # rows, arrivals and faults of a run without a log
+_ROUNDING_S = 1e-6  # rounding error of a simulated tick's duration
+_KEPT = 1000  # number of rows, arrivals and faults that a run without a log keeps
 
 
 def follow(
@@ -44,11 +44,11 @@ def follow(
         arm: without pressure, as its driver gives it.
         controller: the policy.
         goals: poses (6,) [mm, deg].
-        duration_s: vent after so long, wherever the arm is.
+        duration_s: time after which the arm is vented, wherever it is.
         tell: takes a line for each arrival and each fault.
         arrived: takes the index of each goal arrived at, as the arm rests there; a gripper may act.
         save: writes the log, once the arm is vented.
-        stay: hold the last goal, for as long as `duration_s` or until something else ends the run.
+        stay: hold the last goal until `duration_s` or something else ends the run.
     """
     goals = list(goals)
     refused = refusals(controller.policy, goals)  # before the arm moves: it takes longer than a tick
@@ -92,7 +92,7 @@ def steer(
 ) -> LoopRun:
     """Steer an `ArmIO` by a pilot's orders until something ends the run, then vent; arguments as of `follow`.
 
-    Without `save` the run may last for days: only the newest rows, arrivals and faults are kept.
+    Without `save` only the newest rows, arrivals and faults are kept: the run may last for days.
     """
     source, kept = OrderedGoals(controller, pilot), None if save else _KEPT
     session = _Session(arm, controller, source, tell, look=pilot.look, kept=kept)
@@ -198,7 +198,7 @@ class _Session:
         self.rows.add(row)
 
     def _note(self, events: Sequence[Event]) -> None:
-        """Count events; tell each but those that repeat the tick before, and those told at the end."""
+        """Count events, and tell those that are new in this tick; the end of the run tells why it vents."""
         for event in events:
             if event.fault not in self.last and event.response is not Response.VENT:
                 self.tell(self._at(event))
@@ -231,4 +231,4 @@ class _Session:
 
 
 class _Stopped(ArmFault):
-    """A fault that the loop found and counted, and that ends the run."""
+    """A fault that ends the run and is counted already."""

@@ -1,4 +1,4 @@
-"""Test of whether a goal is within the workspace, by poses that the simulated arm reached, and its models."""
+"""Workspace test of a goal: its distance to poses that the simulated arm reached."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from mjx_softarm._support.xp import Array, array_namespace
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.sensing.pose import frame_from_pose, pose_from_frame, share_of_turn
 
-_CHUNK = 256  # poses whose distances to all others are computed at once
-_INSIDE = 0.99  # of the limit: of a goal that was brought back into the workspace
+_CHUNK = 256  # number of poses whose distances to all others are computed at once
+_INSIDE = 0.99  # distance over the limit of a goal that was brought back into the workspace
 
 
 class Reachable(NamedTuple):
@@ -21,11 +21,11 @@ class Reachable(NamedTuple):
     position: np.ndarray  # (m, 3) weighted
     rotation: np.ndarray  # (m, 9)
     weight_per_deg: float
-    limit: float  # no pose is further from the nearest other one
+    limit: float  # largest distance of a pose to its nearest neighbour
 
     @classmethod
     def from_poses(cls, pose: np.ndarray, reward: RewardConfig) -> Reachable:
-        """Make it from poses (m, 6) [mm, deg] spread over the workspace, two thousand or more."""
+        """Compare poses (m, 6) [mm, deg] spread over the workspace, two thousand or more."""
         pose = np.asarray(pose, np.float64)
         position_m, rotation = frame_from_pose(pose)
         flat = rotation.reshape(len(pose), 9)
