@@ -68,7 +68,7 @@ class Orders(NamedTuple):
 
 
 class Pilot(Protocol):
-    """Interface of a pilot, who steers an arm while the loop runs. Its methods run within a tick: none may wait."""
+    """Interface of a pilot, who steers an arm while the loop runs. No method may wait: both run within a tick."""
 
     def orders(self) -> Orders:
         """Return the orders since the last tick."""
