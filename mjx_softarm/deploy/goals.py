@@ -68,7 +68,7 @@ class Orders(NamedTuple):
 
 
 class Pilot(Protocol):
-    """Interface of a pilot, who steers an arm while the loop runs. No method may wait: both run within a tick."""
+    """Interface of a pilot, who steers an arm while the loop runs. Both methods run in a tick: none may wait."""
 
     def orders(self) -> Orders:
         """Return the orders since the last tick."""
