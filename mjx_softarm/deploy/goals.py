@@ -68,7 +68,7 @@ class Orders(NamedTuple):
 
 
 class Pilot(Protocol):
-    """Interface of a pilot, who steers an arm while the loop runs. Both methods run in a tick: none may wait."""
+    """Interface of a pilot, who steers an arm. Both methods run within a tick: neither may wait."""
 
     def orders(self) -> Orders:
         """Return the orders since the last tick."""
