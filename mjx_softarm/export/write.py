@@ -76,9 +76,11 @@ def export_cpp(policy_path: Path, folder: Path) -> list[Path]:
 
 def describe(policy: Policy, sha256: str) -> dict[str, Any]:
     """Return a graph's description for its users: units, frames, names, the arm and its numbers."""
+    # Units and names that occur several times.
     sensor, n = policy.sensor, policy.spec.n_chambers
     lengths = {"unit": "m", "names": [f"spring{k}" for k in range(n)]}
     readings = {"unit": sensor.unit, "names": list(action_layout(policy.spec))}
+    # Inputs and outputs of all graphs, then the arm's numbers.
     return {
         "policy_sha256": sha256,
         "frame": FRAME,

@@ -147,6 +147,7 @@ def policy_from_actor(
         provenance=provenance,
         **settings,
     )
+    # Check the policy as if it had been read.
     return _unpack(file_entries(policy), "policy")
 
 
