@@ -55,17 +55,10 @@ def measure(runs: tuple[Path, ...]) -> dict[str, Any]:
     """
     if not runs:
         raise InputError("--runs: got none, expected folders of runs")
-    groups = [
-        {"preset": preset_of(group["settings"]), **group}
-        for group in by_settings([Run.open(folder) for folder in runs], _all_but_the_seed)
-    ]
+    opened = [Run.open(folder) for folder in runs]
+    found = by_settings(opened, lambda run: {k: x for k, x in to_dict(run.config).items() if k != "seed"})
+    groups = [{"preset": preset_of(group["settings"]), **group} for group in found]
     return {"targets": targets(groups), "groups": groups}
-
-
-def _all_but_the_seed(run: Run) -> dict[str, Any]:
-    settings = to_dict(run.config)
-    del settings["seed"]
-    return settings
 
 
 def preset_of(settings: Mapping[str, Any]) -> str | None:

@@ -57,31 +57,30 @@ def _compare(seed: int, poses: int, first: int, tests: int) -> dict[str, Any]:
     logs = [log_at_rest(arm, pressure_kpa[:first])]
     known = calibrate(logs, spec)
     assert known.recorded is not None  # as there are poses
-    print(f"rod {seed}: planning {poses - first} poses", flush=True)
     logs.append(log_at_rest(arm, plan(known.spec, known.recorded, poses - first, seed).pressure_kpa))
     return {"random": random, "planned": _figures(calibrate(logs, spec), judge)}
 
 
 def log_at_rest(arm: RodTwin, pressure_kpa: np.ndarray) -> Log:
     """Return a log of an arm at rest at pressures (n, n_chambers), each row the mean of a second."""
-    rows: dict[str, list[np.ndarray]] = {}
+    rows: list[dict[str, np.ndarray]] = []
     for pressure in pressure_kpa:
         arm.settle(pressure)
         frames = [arm.motion_capture() for _ in range(N_FRAMES)]
         quaternion = np.array([frame.tip_quaternion for frame in frames])
         quaternion = (quaternion * np.sign(quaternion @ quaternion[0])[:, None]).mean(axis=0)
-        seen = {
-            "readings": np.mean([arm.read_sensors() for _ in frames], axis=0),
-            "pressure_kpa": np.mean([arm.pressures() for _ in frames], axis=0),
-            "tip_m": np.mean([frame.tip_m for frame in frames], axis=0),
-            "tip_quaternion": quaternion / np.linalg.norm(quaternion),
-            "spring_m": np.mean(np.array([frame.spring_m for frame in frames], float), axis=0),
-            "marker_m": np.mean(np.array([frame.marker_m for frame in frames], float), axis=0),
-        }
-        for name, value in seen.items():
-            rows.setdefault(name, []).append(value)
+        rows.append(
+            {
+                "readings": np.mean([arm.read_sensors() for _ in frames], axis=0),
+                "pressure_kpa": np.mean([arm.pressures() for _ in frames], axis=0),
+                "tip_m": np.mean([frame.tip_m for frame in frames], axis=0),
+                "tip_quaternion": quaternion / np.linalg.norm(quaternion),
+                "spring_m": np.mean(np.array([frame.spring_m for frame in frames], float), axis=0),
+                "marker_m": np.mean(np.array([frame.marker_m for frame in frames], float), axis=0),
+            }
+        )
     n = len(pressure_kpa)
-    columns: Any = {name: np.array(values) for name, values in rows.items()}
+    columns: Any = {name: np.array([row[name] for row in rows]) for name in rows[0]}
     return Log(
         source="rod", row=np.arange(n) + 2, time_s=5.0 * np.arange(n), payload_kg=np.zeros(n), **columns
     )

@@ -109,16 +109,14 @@ class Worker:
 
 
 @contextlib.contextmanager
-def working(*workers: Worker) -> Iterator[None]:
-    """Start workers one after the other, and close them at the end."""
+def working(worker: Worker) -> Iterator[None]:
+    """Start a worker, and close it at the end."""
     try:
-        for worker in workers:
-            print(f"starting: {worker.name}", flush=True)
-            worker.start()
+        print(f"starting: {worker.name}", flush=True)
+        worker.start()
         yield
     finally:
-        for worker in workers:
-            worker.close()
+        worker.close()
 
 
 @contextlib.contextmanager

@@ -26,8 +26,7 @@ class Paper:
 
     The exit status is 1 if a target is missed.
 
-    Logs are recorded, arms calibrated, policies trained and tried, two jobs at a time. Results stay in the
-    working folder: the same command continues an interrupted benchmark, and twins or seeds may be added.
+    Results stay in the working folder: the same command continues, and twins or seeds may be added.
 
     Args:
         smoke: run everything, but tiny; says nothing about the arm
@@ -96,7 +95,6 @@ def run(experiment: str, folder: Path, pictures: Path, settings: Settings) -> di
     """
     claim(folder, settings)
     returned = run_stages(folder, settings, stages(experiment, settings))
-    for name in ("film", "film of loads"):
-        if no_film := returned.get(name):
-            print(f"no {name}: {no_film}")
+    if no_film := returned.get("film"):
+        print(f"no film: {no_film}")
     return write_report(experiment, folder, pictures, settings, load_results(folder, experiment, settings))

@@ -1,4 +1,4 @@
-"""Films of trials: the twin's model, drawn without a display, above its path from one side."""
+"""Film of a trial: the twin's model, drawn without a display, beside its path seen from one side."""
 
 from __future__ import annotations
 
@@ -15,11 +15,9 @@ from benchmarks.paper.scene import Scene
 from mjx_softarm.mechanics.pipe import PIPES_MM, CrossPipe
 
 WIDTH, HEIGHT = 240, 320  # of a picture [px]
-LABEL_HEIGHT = 32  # of the text above a square side view [px]
 PERIOD_S = 1.0  # simulated time between two pictures
-MAX_FRAMES, FRAME_MS, N_COLOURS = 100, 90, 128
+MAX_FRAMES, FRAME_MS, N_COLOURS = 120, 80, 128
 INK, GREY, BLUE, ORANGE = (34, 34, 34), (154, 160, 166), (31, 111, 180), (224, 123, 40)
-FROM_ABOVE, FROM_FRONT = [0, 1], [0, 2]  # axes: to the right, upwards
 
 
 class SideView(NamedTuple):
@@ -27,36 +25,14 @@ class SideView(NamedTuple):
 
     title: str
     text: str
-    axes: list[int]
+    axes: list[int]  # of x, y, z: the one to the right, and the one upwards
     goals_mm: np.ndarray  # (p, 3)
     lines_mm: tuple[np.ndarray, ...] = ()  # (k, 2) each, along the axes
 
 
-class Column(NamedTuple):
-    """A filmed trial: pictures at equal times, the path (n, 3) [mm] at these times, and its side view."""
-
-    pictures: list[np.ndarray]
-    path_mm: np.ndarray
-    side: SideView
-
-
-def film(path: Path, scenes: Sequence[tuple[Scene, Trial]]) -> None:
-    """Write the film of trials at equal times: one column for each."""
-    write_gif(path, frames([_filmed(*scene) for scene in scenes]))
-
-
-def _filmed(scene: Scene, trial: Trial) -> Column:
-    """Run a trial, and take a picture of the twin in each period."""
-    # The drawing: the pipe cut open from the front, or the circle from above.
-    load = f"{trial.load_g:,} g" if trial.load_g else "no load"
-    title, text = f"twin {trial.twin}, {load}", "reference (grey) and tip, from above"
-    lines, gripper_m, axes = (), 0.0, FROM_ABOVE
-    if diameter_mm := PIPES_MM.get(KINDS[trial.kind].task):
-        title, text = f"twin {trial.twin}, {diameter_mm} mm pipe", "demonstrated (grey), finger tips"
-        lines, axes = outline_mm(CrossPipe.of_mm(diameter_mm)), FROM_FRONT
-        gripper_m = scene.controller.policy.spec.mass.gripper_length_m
-    side = SideView(title, text, axes, 1e3 * finger_tips(scene.goals, gripper_m), lines)
-    # The pictures, and the path by motion capture.
+def film(path: Path, scene: Scene, trial: Trial) -> None:
+    """Run a trial and write its film: the twin at equal times beside its path."""
+    side, gripper_m = _side(scene, trial)
     pictures, tips_m = [], []
     with scene.twin.renderer(WIDTH, HEIGHT) as renderer:
 
@@ -67,7 +43,18 @@ def _filmed(scene: Scene, trial: Trial) -> Column:
                 tips_m.append(captured_finger_tips(seen.tip_m, seen.tip_quaternion, gripper_m))
 
         operate(WatchedTwin(scene.twin, shoot), *scene[1:], trial.objects)
-    return Column(pictures, 1e3 * np.array(tips_m), side)
+    write_gif(path, frames(pictures, 1e3 * np.array(tips_m), side))
+
+
+def _side(scene: Scene, trial: Trial) -> tuple[SideView, float]:
+    """Return the pipe cut open from the front or the circle from above, and the gripper's length [m]."""
+    if diameter_mm := PIPES_MM.get(KINDS[trial.kind].task):
+        gripper_m = scene.controller.policy.spec.mass.gripper_length_m
+        goals_mm, lines = 1e3 * finger_tips(scene.goals, gripper_m), outline_mm(CrossPipe.of_mm(diameter_mm))
+        title, text = f"twin {trial.twin}, {diameter_mm} mm pipe", "demonstrated (grey), finger tips"
+        return SideView(title, text, [0, 2], goals_mm, lines), gripper_m
+    title, text = f"twin {trial.twin}, {KINDS[trial.kind].title}", "reference (grey) and tip, from above"
+    return SideView(title, text, [0, 1], scene.goals[:, :3]), 0.0
 
 
 def outline_mm(pipe: CrossPipe) -> tuple[np.ndarray, ...]:
@@ -80,19 +67,14 @@ def outline_mm(pipe: CrossPipe) -> tuple[np.ndarray, ...]:
     return tuple(1e3 * np.array(line) for line in lines)
 
 
-def frames(columns: Sequence[Column]) -> list[Image.Image]:
-    """Return at most `MAX_FRAMES` frames, evenly spread: each column's picture above its path until then.
-
-    A trial that ended before the others shows its last picture from then on.
-    """
-    n, images = max(len(column.pictures) for column in columns), []
+def frames(pictures: Sequence[np.ndarray], path_mm: np.ndarray, side: SideView) -> list[Image.Image]:
+    """Return at most `MAX_FRAMES` pictures, evenly spread, each beside the path (n, 3) up to its time."""
+    n, images = len(pictures), []
     for k in np.unique(np.linspace(0, n - 1, min(MAX_FRAMES, n)).round().astype(int)).tolist():
-        height, width, _ = columns[0].pictures[0].shape
-        size = (width, width + LABEL_HEIGHT)
-        images.append(Image.new("RGB", (width * len(columns), height + size[1])))
-        for left, (pictures, path_mm, side) in zip(range(0, images[-1].width, width), columns, strict=True):
-            images[-1].paste(Image.fromarray(pictures[min(k, len(pictures) - 1)]), (left, 0))
-            images[-1].paste(_side_view(size, path_mm[: k + 1], side), (left, height))
+        height, width, _ = pictures[k].shape
+        images.append(Image.new("RGB", (2 * width, height)))
+        images[-1].paste(Image.fromarray(pictures[k]), (0, 0))
+        images[-1].paste(_side_view((width, height), path_mm[: k + 1], side), (width, 0))
     return images
 
 

@@ -135,13 +135,13 @@ def try_out(folder: Path, settings: Settings, trial: Trial) -> None:
     save_arrays(path, operate(*scene_of(folder, settings, trial), trial.objects, trial.moves))
 
 
-def film_trials(folder: Path, settings: Settings, trials: tuple[Trial, ...], file: str) -> str:
-    """Film trials side by side; return why they cannot be drawn, or ""."""
+def film_trial(folder: Path, settings: Settings, trial: Trial, file: str) -> str:
+    """Film a trial; return why it cannot be drawn, or ""."""
     from benchmarks.paper.film import film
     from mjx_softarm.mechanics.render import RenderError
 
     try:
-        film(folder / file, [(scene_of(folder, settings, trial), trial) for trial in trials])
+        film(folder / file, scene_of(folder, settings, trial), trial)
     except RenderError as error:
         return str(error)
     return ""

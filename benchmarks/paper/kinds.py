@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import NamedTuple
 
 EVALUATION_FILE, POLICY_FILE = "evaluation.json", "policy.npz"
@@ -86,5 +85,5 @@ def run_of(trial: Trial) -> str:
     """Return the run folder of a trial's policy, or of the one that its solver takes the arm from."""
     if trial.kind == "specified":
         return reach_run(None, trial.seed)
-    shared = trial.kind in ("without", "with", "gradient")
-    return (reach_run if shared else partial(learned_run, trial.kind))(trial.twin, trial.seed)
+    own = f"{trial.kind}-" if trial.kind not in ("without", "with", "gradient") else ""
+    return own + reach_run(trial.twin, trial.seed)

@@ -141,9 +141,8 @@ def operate(
     stops = np.flatnonzero(stopped)
     if moves:
         run = trace(watched, controller, goals, PACE_S, stopped, arrived=gripper.arrived)
-        indices = (int(np.searchsorted(stops, arrival.index)) for arrival in run.arrivals)
-        at = tuple(a._replace(index=k) for a, k in zip(run.arrivals, indices, strict=True))
-        run = run._replace(arrivals=at)
+        at = (a._replace(index=int(np.searchsorted(stops, a.index))) for a in run.arrivals)
+        run = run._replace(arrivals=tuple(at))
     else:
         run = follow(watched, controller, goals, arrived=gripper.arrived)
     # Measure the run, and add the objects and the forces of each tick.

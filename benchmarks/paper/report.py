@@ -1,4 +1,4 @@
-"""Report of an experiment: JSON, a picture, films, and a table to print."""
+"""Report of an experiment: JSON, a picture, a film, and a table to print."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from benchmarks.paper.plots import circle_figure
 from benchmarks.paper.scene import CALIBRATION
 from benchmarks.paper.summary import Results, Row, spreads, training_rows, trial_rows
 from benchmarks.paper.targets import check_targets
-from benchmarks.paper.trials import FILMS, loads_film
+from benchmarks.paper.trials import FILMS
 from mjx_softarm._support.provenance import provenance, write_json
 
 DPI, N_COLOURS = 110, 64
@@ -46,20 +46,18 @@ def _label(experiment: str, settings: Settings) -> str:
 def write_report(
     experiment: str, folder: Path, pictures: Path, settings: Settings, results: Results
 ) -> dict[str, Any]:
-    """Write JSON file, picture and films of an experiment to the folder `pictures`; return the figures."""
+    """Write JSON file, picture and film of an experiment to the folder `pictures`; return the figures."""
     # The JSON file.
     data = figures_of(experiment, folder, settings, results)
     pictures.mkdir(parents=True, exist_ok=True)
     finite = json.loads(json.dumps(data), parse_constant=lambda _: None)  # JSON has no NaN
     write_json(pictures / json_name(experiment, settings), {"figures": finite, **provenance("benchmarks")})
-    # The picture and the films.
-    prefix, films = PREFIXES[_label(experiment, settings)], {FILMS[experiment]: FILMS[experiment]}
+    # The picture and the film.
+    prefix, film = PREFIXES[_label(experiment, settings)], FILMS[experiment]
     if experiment == "open":
         _save_picture(pictures / f"{prefix}-circle.png", circle_figure(results.outcomes, settings.arm))
-        films[loads_film(settings)] = "loads.gif"
-    for film, name in films.items():
-        if (folder / film).exists():
-            shutil.copyfile(folder / film, pictures / f"{prefix}-{name}")
+    if (folder / film).exists():
+        shutil.copyfile(folder / film, pictures / f"{prefix}-{film}")
     return data
 
 

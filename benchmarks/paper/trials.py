@@ -29,7 +29,6 @@ from benchmarks.paper.kinds import (
 from benchmarks.paper.scene import CALIBRATION, demonstrations_path
 
 FILMS = {"open": "circle.gif", "confined": "pipe.gif"}
-FILMED_LOADS_G = (500, 1000)  # in open space, beside the unloaded arm
 
 PolicyKey = tuple[str, int, int]  # kind, twin, seed
 
@@ -123,26 +122,10 @@ def _confined_learning(settings: Settings) -> list[list[WorkStage]]:
 
 
 def _films(experiment: str, settings: Settings) -> list[WorkStage]:
-    """Return the stages that film the first twin: one trial, and in open space one beside loads."""
-    if settings.arm == "rod":  # a rod cannot be drawn
-        return []
+    """Return the stage that films a trial on the first twin; a rod cannot be drawn."""
     kind, objects = ("with", "") if experiment == "open" else ("pipe", "as shown")
     shown, file = Trial(kind, settings.twins[0], settings.seeds[0], objects), FILMS[experiment]
-    films = [WorkStage("film", (file,), jobs.film_trials, ((shown,), file))]
-    if experiment == "open" and (loads_g := _filmed_loads_g(settings)):
-        loaded = (shown, *(shown._replace(load_g=load_g) for load_g in loads_g))
-        file = loads_film(settings)
-        films.append(WorkStage("film of loads", (file,), jobs.film_trials, (loaded, file)))
-    return films
-
-
-def loads_film(settings: Settings) -> str:
-    """Return the name of the film of loads in the folder; it names them, since loads may be added."""
-    return "-".join(["loads", *map(str, _filmed_loads_g(settings))]) + ".gif"
-
-
-def _filmed_loads_g(settings: Settings) -> list[int]:
-    return [load_g for load_g in settings.loads_g if load_g in FILMED_LOADS_G]
+    return [WorkStage("film", (file,), jobs.film_trial, (shown, file))] * (settings.arm == "twin")
 
 
 def _reach(twin: int | None, seed: int) -> WorkStage:

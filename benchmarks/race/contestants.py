@@ -29,6 +29,7 @@ from benchmarks.harness.rounds import Facts, serve
 
 START = time.perf_counter()
 
+CONTESTANTS = ("ours-quick", "ours-analytic", "sbx-hindsight", "sb3-contrib-hindsight")
 CHUNK = 512  # env steps in a call of `learn`
 
 
@@ -164,9 +165,6 @@ def settings_of(config: Any, n_steps: Callable[[], int]) -> dict[str, Any]:
         "ent_coef": f"auto_{tqc.initial_alpha}",
         "target_entropy": tqc.target_entropy,
     }
-
-
-CONTESTANTS = ("ours-quick", "ours-analytic", "sbx-hindsight", "sb3-contrib-hindsight")
 
 
 def library_of(name: str) -> str:

@@ -92,10 +92,8 @@ def baseline_of(samples: Sequence[Costs]) -> dict[str, dict[str, Any]]:
     baseline = {}
     for name in WORK:
         costs = [sample[name] for sample in samples]
-        cost, medians = (
-            float(np.median(costs)),
-            np.median([*itertools.combinations(costs, N_PROCESSES)], axis=1),
-        )
+        cost = float(np.median(costs))
+        medians = np.median([*itertools.combinations(costs, N_PROCESSES)], axis=1)
         tolerance = max(LEAST_TOLERANCE, MARGIN * float(np.max(np.abs(medians / cost - 1.0))))
         baseline[name] = {"cost": cost, "tolerance": tolerance, "processes": costs}
     return baseline

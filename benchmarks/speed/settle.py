@@ -63,7 +63,7 @@ def _methods_rows(links: int) -> list[dict[str, Any]]:
 
 
 def method_figures(rounds: Sequence[Facts], truth: Truth) -> dict[str, Any]:
-    """Return figures of a method's rounds; it may have taken the first of the references alone."""
-    tip_mm = np.array(rounds[-1]["tip_mm"])
-    first = Truth(truth.tip_mm[: len(tip_mm)], truth.settled[: len(tip_mm)], truth.share_at_limit)
+    """Return figures of a method's rounds; it may have taken the first n of the references alone."""
+    tip_mm, n = np.array(rounds[-1]["tip_mm"]), len(rounds[-1]["tip_mm"])
+    first = Truth(truth.tip_mm[:n], truth.settled[:n], truth.share_at_limit)
     return {**error_figures(tip_mm, first), **over_rounds(rounds)}

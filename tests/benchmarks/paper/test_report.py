@@ -21,7 +21,7 @@ from benchmarks.paper.summary import (
     steps_to_success,
     trial_rows,
 )
-from benchmarks.paper.trials import FILMS, loads_film, trainings, trials
+from benchmarks.paper.trials import FILMS, trainings, trials
 from mjx_softarm.mechanics.excitation import circle_poses
 from tests.benchmarks.paper.made_up import (
     SPEC,
@@ -103,10 +103,9 @@ def write(experiment, folder, results, filmed=False):
     """Write a report; returns its figures by the JSON file, and the names of all its files."""
     fill(folder, TINY)
     if filmed:
-        side = film.SideView("", "", film.FROM_ABOVE, circle_poses(SPEC, 3)[:, :3])
-        images = film.frames([film.Column([np.zeros((20, 15, 3), np.uint8)] * 3, np.zeros((3, 3)), side)])
+        side = film.SideView("", "", [0, 1], circle_poses(SPEC, 3)[:, :3])
+        images = film.frames([np.zeros((20, 15, 3), np.uint8)] * 3, np.zeros((3, 3)), side)
         film.write_gif(folder / FILMS[experiment], images)
-        film.write_gif(folder / loads_film(TINY), images)
     report.write_report(experiment, folder, folder / "out", TINY, results)
     written = json.loads((folder / "out" / f"paper-{experiment}.json").read_text("utf-8"))
     assert "commit" in written
@@ -117,7 +116,7 @@ def write(experiment, folder, results, filmed=False):
 def test_open_results_are_written_and_nothing_is_hidden(tmp_path):
     results = good_results("open", TINY, {Trial("with", 0, 0): made_up("with", missed=range(6))})
     figures, files = write("open", tmp_path, results, filmed=True)
-    assert files == {"paper-open.json", "paper-circle.gif", "paper-circle.png", "paper-loads.gif"}
+    assert files == {"paper-open.json", "paper-circle.gif", "paper-circle.png"}
     assert (tmp_path / "out" / "paper-circle.gif").read_bytes()[:6] == b"GIF89a"
     assert figures["targets"][0]["measured"] == "nan mm, 6 points missed in 1 of 2 runs"
     assert figures["targets"][0]["verdict"] == "NOT MET"
@@ -169,50 +168,23 @@ class DrawnTwin:
         return open("/dev/null")
 
 
-@pytest.fixture
-def filmed(monkeypatch):
-    """A function: scenes and the duration [s] of each trial by its load -> the frames of their film."""
+def test_film_shows_the_pipe_and_the_path(tmp_path, monkeypatch):
+    def operate(twin, controller, goals, names, objects):
+        for _ in range(500):
+            twin.write_pressures(np.zeros(N))
 
-    def run(scenes, seconds):
-        def operate(twin, controller, goals, names, objects):
-            for _ in range(50 * seconds[twin.load_g]):
-                twin.write_pressures(np.zeros(N))
-
-        written = []
-        monkeypatch.setattr(film, "operate", operate)
-        monkeypatch.setattr(film, "write_gif", lambda path, images: written.extend(images))
-        for scene, trial in scenes:
-            scene.twin.load_g = trial.load_g
-        film.film(None, scenes)
-        return written
-
-    return run
-
-
-def test_film_shows_the_pipe_and_the_path(filmed):
+    written = {}
     names, goals = goals_of("pipe")
     controller = SimpleNamespace(policy=SimpleNamespace(spec=SPEC))
-    images = filmed([(Scene(DrawnTwin(), controller, goals, names), pipe_trial())], {0: 10})
+    monkeypatch.setattr(film, "operate", operate)
+    monkeypatch.setattr(film, "write_gif", lambda path, images: written.update({path: images}))
+    film.film(tmp_path / "pipe.gif", Scene(DrawnTwin(), controller, goals, names), pipe_trial())
+    images = written[tmp_path / "pipe.gif"]
     assert [image.getpixel((0, 0))[0] for image in images] == list(range(len(images)))
     # The tip, at first straight below the crossing, then to the right; the wall on both sides.
-    below = [np.asarray(image)[film.HEIGHT :] for image in images]
-    orange = [(drawing == (224, 123, 40)).all(axis=-1) for drawing in below]
+    orange = [(np.asarray(image) == (224, 123, 40)).all(axis=-1) for image in images]
     across = np.array([np.argwhere(mask)[:, 1].mean() for mask in orange])
-    assert abs(across[0] - 120) < 1.0 and np.all(np.diff(across) > 0)
-    grey = (below[0][film.LABEL_HEIGHT + 4 :] == (154, 160, 166)).all(axis=-1)
+    assert abs(across[0] - 360) < 1.0 and np.all(np.diff(across) > 0)
+    grey = (np.asarray(images[0])[:, 240:] == (154, 160, 166)).all(axis=-1)
     assert grey[:, :120].sum() == pytest.approx(grey[:, 120:].sum(), rel=0.2)
-    assert grey.sum() > 28 * 21 + 300  # more than the goals' dots cover
-
-
-def test_film_of_loads_has_a_column_for_each_and_one_that_ended_waits(filmed):
-    names, goals = goals_of("with")
-    seconds = {0: 30, 500: 60, 1000: 60}
-    trials = [Trial("with", 0, 0, load_g=load_g) for load_g in seconds]
-    images = filmed([(Scene(DrawnTwin(), None, goals, names), trial) for trial in trials], seconds)
-    assert len(images) <= film.MAX_FRAMES
-    size = (3 * film.WIDTH, film.HEIGHT + film.WIDTH + film.LABEL_HEIGHT)
-    assert {image.size for image in images} == {size}
-    times = np.array([[image.getpixel((240 * k, 0))[0] for k in range(3)] for image in images])
-    assert np.all(np.diff(times[:, 1]) > 0) and np.array_equal(times[:, 1], times[:, 2])
-    assert np.array_equal(times[:, 0], np.minimum(times[:, 1], times[:, 0].max()))
-    assert times[:, 0].max() == pytest.approx(30, abs=1)
+    assert grey.sum() > 28 * 21 + 500  # more than the goals' dots cover
