@@ -79,29 +79,23 @@ class Pilot(Protocol):
         ...
 
 
-class OrderedGoals:
+class OrderedGoals(ListedGoals):
     """Goals that a pilot orders; they are not counted, and only the pilot ends the run."""
 
-    n_goals, ways = 0, ()
-
     def __init__(self, controller: Controller, pilot: Pilot):
-        self._controller, self._pilot = controller, pilot
-        self._goals = ListedGoals(controller, (), {})
-
-    @property
-    def n_taken(self) -> int:
-        return self._goals.n_taken
+        super().__init__(controller, (), {})
+        self._pilot = pilot
 
     def advance(self, state: LoopState, now_s: float, row: int, note: Note) -> LoopState:
         """Obey the orders since the last tick."""
         orders = self._pilot.orders()
         if orders.vent or orders.hold:
-            self._goals = ListedGoals(self._controller, (), {})
+            self._goals, self.n_taken = [], 0
             state = release(state) if orders.vent else hold(state)
         elif orders.goals is not None:
-            self._goals = ListedGoals(self._controller, orders.goals, {})
+            self._goals, self.n_taken = list(orders.goals), 0
             state = state._replace(goal=None)
-        return self._goals.taken(state, note)
+        return self.taken(state, note)
 
 
 class Way:
@@ -163,7 +157,7 @@ class Way:
         return on_the_way(self._leg, (now_s - self._began_s) / (self._pace_s * (len(self._leg) - 1)))
 
 
-Goals = ListedGoals | OrderedGoals | Way
+Goals = ListedGoals | Way
 
 
 def on_the_way(goals: np.ndarray, share: float) -> np.ndarray:
