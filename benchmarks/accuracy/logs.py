@@ -34,9 +34,7 @@ WIRE_M_PER_V = 1.0 / 5.0  # draw-wire encoders: 5 V at 1 m, up to an offset that
 
 
 def measure(data: Path) -> dict[str, Any]:
-    """How well do calibrated lines and the sim-to-real network predict logs of real arms?
-
-    Errors are in mm.
+    """How well do calibrated lines and the sim-to-real network predict logs of real arms, in mm?
 
     Args:
         data: folder with `asl_trunk` and `asu_softarm`.

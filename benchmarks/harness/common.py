@@ -160,7 +160,7 @@ def _cell(value: Any) -> str:
 
 
 def save(name: str, figures: dict[str, Any]) -> Path:
-    """Write figures with what they depend on to `docs/results/NAME.json`."""
+    """Write figures with machine, versions, command and commit to `docs/results/NAME.json`."""
     RESULTS.mkdir(exist_ok=True)
     path = RESULTS / f"{name}.json"
     write_json(path, {"figures": figures, **provenance("benchmarks")})

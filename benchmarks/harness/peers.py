@@ -1,7 +1,7 @@
 """Virtual environments of the libraries that this project is compared with, made on first use.
 
-Each has the peer and the simulator's packages in the versions that run here, so that all contestants train
-on the same environment, and other simulators read the same arm. They lie beside the checkout's own `.venv`,
+Each has the peer, and the simulator's packages in the versions that run here: all contestants train on the
+same environment, and other simulators read the same arm. They lie beside the checkout's own `.venv`,
 as `.venv-PEER`. A file in each lists its packages: an incomplete environment, or one of other packages, is
 made anew.
 

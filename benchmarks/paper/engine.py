@@ -92,7 +92,7 @@ def run_stages(folder: Path, settings: Settings, groups: Sequence[Sequence[WorkS
     """Run the stages that are not done, group by group.
 
     Returns:
-        Stage name -> what its function returned, for those that ran.
+        Results of the functions that ran, by the name of the stage.
 
     Raises:
         JobError: a stage failed.
@@ -122,7 +122,7 @@ def load_arrays(kind: Any, path: Path) -> Any:
     """
     with np.load(path) as file:
         if missing := [name for name in kind._fields if name not in file]:
-            why = f"got no {', '.join(missing)}, expected what this version writes"
+            why = f"got no {', '.join(missing)}, expected the arrays of this version"
             raise JobError(f"{path}: {why}; remove the file, or choose another --out")
         return kind(**{name: file[name] for name in kind._fields})
 

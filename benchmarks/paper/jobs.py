@@ -1,6 +1,6 @@
 """The stages' functions; one raises a `JobError` if a command or a recording fails.
 
-Each runs in a process of its own, so it imports what it needs by itself.
+Each runs in a process of its own, and imports its packages by itself.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ def _reach(run: Path, seed: int, *options: Any) -> None:
 def demonstrate(folder: Path, settings: Settings, twin: int, task: str) -> None:
     """Record a task's demonstrations on a twin."""
     file = folder / demonstrations_path(twin, task)
-    part = file.with_name(f"part-{file.name}")  # a recording that ends early keeps what it has
+    part = file.with_name(f"part-{file.name}")  # a recording that ends early keeps its part
     part.unlink(missing_ok=True)
     arm = f"twin:{twin}:{task}" if task in PIPES_MM else f"twin:{twin}"
     options = ["--arm", arm, "--task", task, "--calibration", str(file.parent / CALIBRATION)]

@@ -48,7 +48,7 @@ def circle_figure(outcomes: Mapping[Trial, TrialOutcome], arm: str) -> Figure:
 
 
 def _make_square(panel: Any) -> None:
-    """Give x and y of a panel, and of those that share them, ranges of one length about their middles."""
+    """Give x and y of a panel, and of panels with shared axes, ranges of one length about their middles."""
     limits = np.array([panel.get_xlim(), panel.get_ylim()])
     half = 0.5 * np.ptp(limits, axis=1).max() * np.array([-1.0, 1.0])
     x, y = limits.mean(axis=1, keepdims=True) + half

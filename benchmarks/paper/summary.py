@@ -53,7 +53,7 @@ class Results(NamedTuple):
 
 
 def load_results(folder: Path, experiment: str, settings: Settings) -> Results:
-    """Read what an experiment's stages left in the folder."""
+    """Read the results of an experiment's stages from the folder."""
     items = trainings(settings) if experiment == "confined" else []
     return Results(
         outcomes={

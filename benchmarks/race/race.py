@@ -50,7 +50,7 @@ def race(
 
     Args:
         seeds: of training
-        only: contestants, beside ours-quick and what was measured before
+        only: contestants, beside ours-quick and those with results in the folder
         out: working folder; None: runs/race
 
     Raises:

@@ -71,7 +71,7 @@ def summarise(results: Sequence[Result]) -> dict[str, Any]:
 
 
 def _row(result: Result, axis: str) -> dict[str, Any]:
-    """Return what a contestant needed for each level; a level that it did not reach says within what."""
+    """Return a contestant's time or env steps to each level; for a missed level, the limit that it had."""
     points = result["points"]
     last = points[-1][axis]
     row = {key: result[key] for key in ("contestant", "seed")}

@@ -9,8 +9,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-OBS_SIZE, ACTION_SIZE = 18, 9
-N_STORED = 100_000
+OBS_SIZE, ACTION_SIZE, N_STORED = 18, 9, 100_000
 
 
 class BlankEnv(gymnasium.Env):

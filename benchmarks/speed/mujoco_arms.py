@@ -152,7 +152,7 @@ class SteppedArms:
 
 
 def write_arm(folder: Path, spec: ArmSpec, n_poses: int = 1024) -> None:
-    """Write what `SteppedReach` needs: specification, model, and poses to start at and to reach."""
+    """Write the inputs of `SteppedReach`: specification, model, and poses to start at and to reach."""
     from mjx_softarm.mechanics.workspace import sample_workspace  # imports JAX
 
     spec.to_toml(folder / ARM_FILE)

@@ -82,6 +82,6 @@ def told_error(spec: ArmSpec, told: Sequence[Mapping[str, Any]]) -> dict[str, fl
 
 
 def random_references(spec: ArmSpec, n: int) -> np.ndarray:
-    """Return spring lengths (n, n_chambers) [m], uniform over those that may be commanded."""
+    """Return spring lengths (n, n_chambers) [m], uniform over the range that may be commanded."""
     low_m, high_m = spec.springs.length_min_m, spec.springs.length_max_m
     return np.random.default_rng(0).uniform(low_m, high_m, (n, spec.n_chambers))

@@ -36,13 +36,18 @@ def test_the_target_is_for_one_pace_however_trained():
     assert found[0]["target"] == "trained at rest, once around in 20 s: mean at most 4 mm"
 
 
-def test_no_policies_and_one_that_cannot_be_measured_are_named(tmp_path):
+def test_policies_that_cannot_be_measured_or_compared_are_named(monkeypatch):
     with pytest.raises(InputError, match="--policies: got none, expected ARM=FILE"):
         measure(())
     with pytest.raises(InputError, match="--policies: got policy.npz, expected ARM=FILE, such as"):
         measure(("policy.npz",))
     with pytest.raises(InputError, match="absent.npz: got 'No such file"):  # before any is measured
         measure((f"twin:0={SHIPPED}", "twin:0=absent.npz"))
+    moving = dataclasses.replace(load_policy(SHIPPED), action_s=0.5)
+    policies = {"still": load_policy(SHIPPED), "moving": moving}
+    monkeypatch.setattr(path, "load_policy", policies.__getitem__)
+    with pytest.raises(InputError, match="got at rest twin:0; in motion twin:1, expected the same arms"):
+        measure(("twin:0=still", "twin:1=moving"))
 
 
 def test_a_measurement_that_lacks_a_goal_is_an_error(monkeypatch):
@@ -54,12 +59,3 @@ def test_a_measurement_that_lacks_a_goal_is_an_error(monkeypatch):
         monkeypatch.setattr(arms, "run_command", run_command)
         with pytest.raises(InputError, match=f"twin:0=.*: got {got}, expected all"):
             measure((f"twin:0={SHIPPED}",))
-
-
-def test_means_of_different_arms_are_refused(monkeypatch):
-    moving = dataclasses.replace(load_policy(SHIPPED), action_s=0.5)
-    monkeypatch.setattr(
-        path, "load_policy", lambda file: moving if file == "moving" else load_policy(SHIPPED)
-    )
-    with pytest.raises(InputError, match="got at rest twin:0; in motion twin:1, expected the same arms"):
-        measure(("twin:0=still", "twin:1=moving"))

@@ -25,12 +25,7 @@ def made(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "name, package",
-    [
-        ("sbx", "sbx-rl"),
-        ("sb3-contrib", "sb3-contrib"),
-        ("soromox", "soromox"),
-    ],
+    "name, package", [("sbx", "sbx-rl"), ("sb3-contrib", "sb3-contrib"), ("soromox", "soromox")]
 )
 def test_every_requirement_is_pinned_and_the_simulator_s_are_those_that_run_here(name, package):
     requirements = dict(requirement.split("==") for requirement in peer_packages(name))

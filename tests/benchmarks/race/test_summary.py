@@ -101,7 +101,7 @@ def test_failures_are_told_and_only_that_of_ours_is_a_target_not_met():
     assert summarise(results)["failed"] == results[-2:]
 
 
-def test_the_median_over_seeds_is_what_counts():
+def test_the_median_over_seeds_counts():
     results = []
     for seed, n in enumerate((6, 3, 7)):  # evaluations until 4 mm
         results += [result("ours-quick", 4.0, seed=seed), result(SBX, *[9.0] * n, 4.0, seed=seed)]

@@ -2,6 +2,7 @@
 
 from types import SimpleNamespace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -60,7 +61,7 @@ def pendulum(inertia, damping, stiffness):
 @pytest.mark.parametrize("method, tolerance", [("explicit", 0.03), ("implicit", 1e-3)])
 def test_a_step_follows_an_oscillator(method, tolerance):
     robot, state, n = pendulum(2.0, 0.0, 8.0), jnp.array([0.5, 0.0]), 200
-    step = stepper(robot, method, 0.5 / n)
+    step = jax.jit(stepper(robot, method, 0.5 / n))
     for _ in range(n):
         state = step(state, jnp.array([1.0]))  # it balances the weight
     exact = np.array([0.5 * np.cos(1.0), -1.0 * np.sin(1.0)])  # angular rate 2 over 0.5 s
@@ -71,7 +72,7 @@ def test_the_implicit_step_rests_where_an_explicit_one_diverges():
     robot = pendulum(1e-3, 2.0, 10.0)  # decays 2,000 times a second
     ends = {}
     for method in N_STEPS:
-        step, state = stepper(robot, method, 0.02), jnp.zeros(2)
+        step, state = jax.jit(stepper(robot, method, 0.02)), jnp.zeros(2)
         for _ in range(1000):
             state = step(state, jnp.array([6.0]))
         ends[method] = np.asarray(state)

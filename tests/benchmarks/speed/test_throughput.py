@@ -42,6 +42,11 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
+def env():
+    return ReachEnv(SPEC, EnvConfig(n_poses=16))
+
+
+@pytest.fixture(scope="module")
 def reference():
     return random_references(SPEC, N)
 
@@ -80,8 +85,8 @@ def test_an_arm_rests_when_no_spring_has_moved_for_long_enough():
     assert first[0] == n_quiet and first[1] == n_quiet + 10
 
 
-def test_the_stepped_environment_is_the_project_s(folder):
-    env, envs = ReachEnv(SPEC, EnvConfig(n_poses=16)), SteppedReach(str(folder), 1, 0, 0, episode_length=2)
+def test_the_stepped_environment_is_the_project_s(folder, env):
+    envs = SteppedReach(str(folder), 1, 0, 0, episode_length=2)
     obs = envs.reset(np.ones(1, bool))
     action = np.random.default_rng(0).uniform(-1.0, 1.0, 9).astype(np.float32)
     np.testing.assert_allclose(envs.reference_m(action), env.reference_m(action), atol=1e-6)
@@ -102,13 +107,13 @@ def test_as_a_gymnasium_environment_it_tells_costs_and_where_it_stopped(folder):
     assert info["n_physics"] > 100
 
 
-def test_arms_that_reach_their_goals_are_told_from_those_whose_time_is_over(folder):
+def test_arms_that_reach_their_goals_are_told_from_those_whose_time_is_over(folder, env):
     envs = SteppedReach(str(folder), N, 1, seed=0, episode_length=2)
     envs.reset(np.ones(N, bool))
     with np.load(folder / "pool.npz") as pool:
         envs.goal[:] = pool["pose"][:N]
         spring_m = pool["spring_m"][:N]
-    action = np.array(ReachEnv(SPEC, EnvConfig(n_poses=16)).action_of(spring_m.astype(np.float32)))
+    action = np.array(env.action_of(spring_m.astype(np.float32)))
     action[1] = 1.0  # the longest springs: not at its goal
     _, value, reached, over, _ = envs.step(action)
     assert (value[[0, 2, 3]] == 100.0).all() and value[1] < 0.0
