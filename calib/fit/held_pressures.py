@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from calib.fit.blocks import held_out_blocks
+from calib.fit.leastsquares import ridge
 from mjx_softarm.spec import ArmSpec, Unmodelled
 
 HELD_OUT_BLOCK = 5  # poses
@@ -43,20 +44,16 @@ def fit_held_pressures(
         simulated_kpa (m, n) [kPa]: pressures that hold the simulated arm at these lengths.
         seed: seed that chooses the contiguous blocks of held-out rows.
     """
-    # Standardise the lengths.
     left_kpa = np.asarray(measured_kpa, float) - simulated_kpa
     stretched_m = np.asarray(spring_m, float) - spec.geometry.section_length_m
     held_out = held_out_blocks(len(left_kpa), block=HELD_OUT_BLOCK, seed=seed)
+    # Fit to the rows that are not held out, in standardised lengths, as the prior acts on these.
     scale_m = np.maximum(stretched_m.std(axis=0), 1e-6)
-    design = np.column_stack([np.ones(len(left_kpa)), stretched_m / scale_m])
-    # Solve the ridge regression, and bring its slopes back to kPa/m.
-    known = design[~held_out]
-    ridge = RIDGE * np.diag([0.0, *np.ones(len(scale_m))])
-    weights = np.linalg.solve(known.T @ known + ridge, known.T @ left_kpa[~held_out])  # (1 + n, n)
-    found = Unmodelled(
-        tuple(map(float, weights[0])), tuple(map(float, (weights[1:] / scale_m[:, None]).T.ravel()))
-    )
-    after_kpa = left_kpa - design @ weights
+    slope, offset_kpa = ridge((stretched_m / scale_m)[~held_out], left_kpa[~held_out], RIDGE)
+    slope = slope / scale_m[:, None]  # [kPa/m]
+    # Judge the function by the held-out rows.
+    after_kpa = left_kpa - stretched_m @ slope - offset_kpa
+    found = Unmodelled(tuple(map(float, offset_kpa)), tuple(map(float, slope.T.ravel())))
     return HeldPressures(found, _rms(left_kpa[held_out]), _rms(after_kpa[held_out]))
 
 

@@ -115,6 +115,18 @@ def solution_at(x: np.ndarray, error: np.ndarray, jacobian: np.ndarray, problem:
     return Solution(x, covariance, scale, newton_step, decrement)
 
 
+def ridge(x: np.ndarray, y: np.ndarray, strength: float) -> tuple[np.ndarray, np.ndarray]:
+    """Fit y (n, m) as a linear function of x (n, k), with a prior as strong as some rows without a slope.
+
+    Returns:
+        Slopes (k, m) and offsets (m,).
+    """
+    x_mean, y_mean = x.mean(axis=0), y.mean(axis=0)
+    x, y = x - x_mean, y - y_mean
+    slope = np.linalg.solve(x.T @ x + strength * np.eye(x.shape[1]), x.T @ y)
+    return slope, y_mean - x_mean @ slope
+
+
 def principal(solution: Solution, tolerance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return directions of x from the least known to the best known.
 

@@ -18,6 +18,7 @@ from scipy.linalg import block_diag
 
 from calib.errors import FitError
 from calib.fit.blocks import block_rows, held_out_blocks
+from calib.fit.leastsquares import ridge
 from mjx_softarm._support.mlp import Layer, mlp
 from mjx_softarm._support.training import Schedule, initial_layers, train_network
 from mjx_softarm.sensing.s2r import S2R
@@ -82,7 +83,7 @@ def fit_network(
     if points is not None:
         z, y, stop = np.clip(normalised(points[0]), -1.0, 1.0), points[1], None
     # Fit a linear map, then a network to its residual.
-    linear = _line(z, y)
+    linear, _ = ridge(z, y, RIDGE)
     left = y - z @ linear
     centre, spread = left.mean(axis=0), left.std(axis=0)
     spread = np.where(spread > 0.0, spread, 1.0)
@@ -118,12 +119,6 @@ def _bounds(x: np.ndarray, y: np.ndarray) -> dict[str, np.ndarray]:
     output_low, output_high = (f(y, axis=0).astype(np.float32) for f in (np.min, np.max))
     inputs = {"input_low": low - margin, "input_high": high + margin}
     return inputs | {"output_low": output_low, "output_high": output_high}
-
-
-def _line(z: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return weights (n_in, n_out) of the linear map from inputs to outputs, without its offset."""
-    z, y = z - z.mean(axis=0), y - y.mean(axis=0)
-    return np.linalg.solve(z.T @ z + RIDGE * np.eye(z.shape[1]), z.T @ y)
 
 
 def _with_line(

@@ -142,7 +142,7 @@ def test_logs_without_poses_or_ruler_say_what_is_missing(demo, tmp_path, capsys)
 def test_poses_that_were_not_held_are_said_not_to_be_at_rest(demo, tmp_path, capsys):
     log, _ = read_log(demo[1])
     path = tmp_path / "fast.csv"
-    write_log(path, log.__class__(**{**vars(log), "time_s": 0.4 * log.time_s}))  # a pose every 2 s
+    write_log(path, dataclasses.replace(log, time_s=0.4 * log.time_s))  # a pose every 2 s
     assert main(["run", str(path), "--out", str(tmp_path / "out")]) == 1
     page = (tmp_path / "out" / "report.html").read_text()
     fate = f"Rows of the logs: {len(log)} pressures not held long enough."
@@ -154,8 +154,8 @@ def test_check_takes_the_arm_s_number_of_chambers(demo, tmp_path, capsys):
     six = ArmSpec.default().replace(structure={"n_sections": 2})
     six.to_toml(tmp_path / "six.toml")
     log, _ = read_log(demo[0])
-    changes = {"readings": log.readings[:, :6], "spring_m": log.spring_m[:, :6]}
-    write_log(tmp_path / "six.csv", log.__class__(**{**vars(log), **changes}))
+    six_columns = dataclasses.replace(log, readings=log.readings[:, :6], spring_m=log.spring_m[:, :6])
+    write_log(tmp_path / "six.csv", six_columns)
     assert main(["check", str(tmp_path / "six.csv")]) == 2
     assert main(["check", str(tmp_path / "six.csv"), "--spec", str(tmp_path / "six.toml")]) == 0
 
@@ -184,7 +184,7 @@ def test_bad_and_missing_files_and_other_arms_are_refused_in_a_line_and_nothing_
     short = log.take(np.arange(20))
     other, bad = tmp_path / "other.csv", tmp_path / "bad.csv"
     bad.write_bytes(b"time [s];pressure0 [kPa]\n0;1\n1;2\n")
-    write_log(other, short.__class__(**{**vars(short), "tip_m": 3.0 * short.tip_m}))
+    write_log(other, dataclasses.replace(short, tip_m=3.0 * short.tip_m))
     for arguments, words in (
         ([str(tmp_path)], str(tmp_path)),
         ([str(bad)], str(bad)),
@@ -203,7 +203,7 @@ def test_strict_refuses_a_log_with_a_fault(demo, tmp_path, capsys):
     readings = log.readings.copy()
     readings[7, 3] = np.nan
     path = tmp_path / "log.csv"
-    write_log(path, log.__class__(**{**vars(log), "readings": readings}))
+    write_log(path, dataclasses.replace(log, readings=readings))
     assert main(["check", str(path)]) == 1
     assert "frequency3" in capsys.readouterr().out
     assert main(["check", "--strict", str(path)]) == 2
