@@ -27,6 +27,7 @@ ITERATIONS = 40  # iterations of L-BFGS in a round
 PRIOR = 10.0  # standard deviation of standardised parameters: next to no prior
 STRETCHES = 50  # clusters of the intervals: neighbouring rows err alike
 STUDENT = 2.0096  # 97.5 % quantile for STRETCHES - 1 degrees of freedom
+PADDED_ROWS = 1_024  # tables are padded to a multiple of it
 MIN_ROWS = 50
 EDGE = 0.05  # share of the range of the other rows by which a held-out row may exceed it
 MAX_BEYOND = 0.02  # share of held-out rows beyond the range from which there is a warning
@@ -167,19 +168,22 @@ def _robust_lines(x: np.ndarray, y: np.ndarray, share: float, fit_share: bool) -
         each = [_robust_lines(x[:, [j]], y[:, [j]], share, False) for j in range(k)]
         columns = (np.concatenate(values) for values in list(zip(*each, strict=True))[:5])
         return _Lines(*columns, share=share, share_width=0.0)
-    y_centre, y_spread = np.nanmean(y, axis=0), np.maximum(np.nanstd(y, axis=0), 1e-300)
+    # Pad the columns with missing rows, so that tables of several lengths share a compiled program.
+    n, y_centre, y_spread = len(x), np.nanmean(y, axis=0), np.maximum(np.nanstd(y, axis=0), 1e-300)
+    table = np.stack([x, (y - y_centre) / y_spread])
+    table = np.pad(table, ((0, 0), (0, -n % PADDED_ROWS), (0, 0)), constant_values=np.nan)
     with jax.enable_x64(True):
-        found = jax.device_get(_minimise(x, (y - y_centre) / y_spread, share, fit_share))
-    # Take stretches of neighbouring rows as clusters: (n, ...) to (n_stretches, rows * columns, ...).
+        found = jax.device_get(_minimise(*table, share, fit_share))
     p, error, jacobian, numbers, change = found
+    # Take stretches of neighbouring rows as clusters: (n, ...) to (n_stretches, rows * columns, ...).
     problem = Problem(
         prior=np.full(len(p), PRIOR),
-        group=np.tile(np.arange(k), -(-len(x) // min(STRETCHES, len(x)))),
+        group=np.tile(np.arange(k), -(-n // min(STRETCHES, n))),
         scale=np.ones(k),
         min_scale=np.full(k, 1e-9),
         huber=HUBER,
     )
-    solution = solution_at(p, _stretches(error), _stretches(jacobian), problem)
+    solution = solution_at(p, _stretches(error[:n]), _stretches(jacobian[:n]), problem)
     width = STUDENT * np.sqrt(np.einsum("ip,pq,iq->i", change, solution.covariance, change))
     slope, offset, slope_width, offset_width = (
         y_spread * values for values in (numbers[:k], numbers[k : 2 * k], width[:k], width[k : 2 * k])
