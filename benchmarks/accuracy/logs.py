@@ -29,6 +29,7 @@ ASU_LOGS = {name: f"asu_softarm/{name}_data_collect_1.txt" for name in ("apr5", 
 TRUNK_LOG = "asl_trunk/observations_controlled_{}.csv"
 STILL_M, STILL_S = 2e-3, 0.5  # the wires lag motion capture by a tenth of a second
 SEEDS = (0, 1, 2)
+N_NETWORKS = 5  # networks whose mean is judged, so that no one seed decides
 N_BODIES = 3
 WIRE_M_PER_V = 1.0 / 5.0  # draw-wire encoders: 5 V at 1 m, up to an offset that differs from day to day
 
@@ -104,9 +105,10 @@ def _trunk(data: Path, log: str, history: bool) -> tuple[np.ndarray, np.ndarray,
 
 
 def _trunk_errors(x: np.ndarray, tip_mm: np.ndarray, train: np.ndarray, test: np.ndarray) -> dict[str, float]:
-    """Return errors on rows `test` (n,) of polynomials and the network, fitted to rows `train` (n,)."""
+    """Return errors on rows `test` (n,) of polynomials and the mean network, fitted to rows `train` (n,)."""
     linear, quadratic, cubic = (polynomial(x, tip_mm, train, degree) for degree in (1, 2, 3))
-    network = linear + correction(fit_network(x[train], (tip_mm - linear)[train], seed=0).network, x)
+    fits = [fit_network(x[train], (tip_mm - linear)[train], seed) for seed in range(N_NETWORKS)]
+    network = linear + np.mean([correction(fit.network, x) for fit in fits], axis=0)
     predictions = {"linear": linear, "quadratic": quadratic, "cubic": cubic, "network": network}
     return {
         name: float(np.sqrt(np.mean(np.sum((predicted - tip_mm)[test] ** 2, axis=1))))
