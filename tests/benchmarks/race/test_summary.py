@@ -9,16 +9,9 @@ from benchmarks.race.summary import PeerTarget, crossing, judge, summarise
 
 def result(name, *errors_mm, seed=0):
     """A contestant with a point each 10 s."""
-    points = [
-        {
-            "wall_s": 2.0 + 10 * k,
-            "trained_s": 10.0 * k,
-            "env_steps": 100 * k,
-            "updates": k,
-            "median_mm": error,
-        }
-        for k, error in enumerate(errors_mm, 1)
-    ]
+    names = ("wall_s", "trained_s", "env_steps", "updates", "median_mm")
+    values = [(2.0 + 10 * k, 10.0 * k, 100 * k, k, error) for k, error in enumerate(errors_mm, 1)]
+    points = [dict(zip(names, point, strict=True)) for point in values]
     who = {"contestant": name, "seed": seed, "commit": "a1b2", "uncommitted_changes": False}
     return {**who, "start_up_s": 2.0, "limit_s": None, "points": points}
 
@@ -59,40 +52,35 @@ def test_a_level_is_reached_where_the_line_between_two_evaluations_crosses_it_fi
     assert found is None if expected is None else found == pytest.approx(expected)
 
 
-def test_a_target_is_judged_once_both_have_raced_with_all_seeds():
-    results = [OURS_FAST, result(SBX, *SLOW)]
-    assert judged(SBX, *results) == ("not within 25.17 times", "met")
-    assert judged(SB3, *results) == (f"not raced: {SB3}, seed 0", "skipped")
-    results.append(result("ours-quick", 4.0, seed=1))
-    assert judged(SBX, *results) == (f"not raced: {SBX}, seed 1", "skipped")
-    assert judged(SBX, *results, result(SBX, 9.0, 4.0, seed=1))[1] == "met"
+QUICK, LATER = result("ours-quick", 6.0, 4.0), result("ours-quick", 4.0, seed=1)  # 5 mm at 17 s; at 12 s
+ANALYTIC = result("ours-analytic", 4.0)
 
 
-def test_a_target_is_the_peer_s_time_over_ours():
-    ours = result("ours-quick", 6.0, 4.0)  # 5 mm at 17 s
-    assert judged(SBX, ours, result(SBX, *[9.0] * 8, 6.0, 4.0)) == ("5.71 times", "met")  # 97 s
-    assert judged(SBX, ours, result(SBX, 9.0, 9.0, 6.0, 4.0)) == ("2.18 times", "NOT MET")  # 37 s
-    assert judged(SBX, ours, result(SBX, 9.0, 9.0, 6.0)) == ("not within 1.88 times", "skipped")
-
-
-def test_ours_is_the_preset_that_the_target_names():
-    results = [result("ours-quick", 9.0, 9.0, 4.0), result(SBX, *[9.0] * 14, 4.0)]
-    for more in ([], [result("ours-analytic", 4.0)]):
-        assert judged(SBX, *results, *more)[0] == "5.00 times"  # 150 s and 30 s
-    told = "ours did not reach it with seed 0"
-    assert judged(SBX, result("ours-quick", 6.0), result(SBX, *SLOW)) == (told, "NOT MET")
+@pytest.mark.parametrize(
+    ("results", "told"),
+    [
+        ([QUICK, result(SBX, *[9.0] * 8, 6.0, 4.0)], ("5.71 times", "met")),  # 97 s
+        ([QUICK, result(SBX, 9.0, 9.0, 6.0, 4.0), ANALYTIC], ("2.18 times", "NOT MET")),  # 37 s
+        ([QUICK, result(SBX, 9.0, 9.0, 6.0)], ("not within 1.88 times", "skipped")),
+        ([OURS_FAST, result(SBX, *SLOW)], ("not within 25.17 times", "met")),
+        ([OURS_FAST, result(SBX, *SLOW), LATER], (f"not raced: {SBX}, seed 1", "skipped")),
+        ([result("ours-quick", 6.0), result(SBX, *SLOW)], ("ours did not reach it with seed 0", "NOT MET")),
+        ([failed("ours-quick")], ("ours-quick, seed 0: no network", "NOT MET")),
+    ],
+)
+def test_a_target_is_the_peer_s_time_over_ours_once_both_have_raced_with_all_seeds(results, told):
+    assert judged(SBX, *results) == told
 
 
 def test_a_target_of_another_learner_looks_at_that_learner_alone():
     wanted = PeerTarget(SBX, 10.0, "ours-analytic")
     results = [result("ours-quick", 9.0, 4.0), result(SBX, *[9.0] * 14, 4.0)]
     assert judge(wanted, results)["measured"] == "not raced: ours-analytic, seed 0"
-    row = judge(wanted, [*results, result("ours-analytic", 4.0)])
+    row = judge(wanted, [*results, ANALYTIC])
     assert (row["measured"], row["verdict"]) == ("12.50 times", "met")  # 150 s and 12 s
 
 
 def test_failures_are_told_and_only_that_of_ours_is_a_target_not_met():
-    assert judged(SBX, failed("ours-quick")) == ("ours-quick, seed 0: no network", "NOT MET")
     verdicts = [row["verdict"] for row in summarise([failed("ours-quick")])["targets"]]
     assert verdicts == ["NOT MET", "NOT MET", "skipped"]
     results = [OURS_FAST, result(SBX, *SLOW), failed(SB3), failed("ours-analytic")]
