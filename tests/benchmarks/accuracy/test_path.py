@@ -8,10 +8,13 @@ import pytest
 from benchmarks.accuracy import arms, path
 from benchmarks.accuracy.path import means_over, measure, targets
 from mjx_softarm._support.errors import InputError
+from mjx_softarm.deploy.__main__ import main
 from mjx_softarm.policy.file import SHIPPED, load_policy
 
 
-def test_a_policy_is_measured_in_time_and_at_stops():
+def test_a_policy_is_measured_in_time_and_at_stops(monkeypatch):
+    # In this process, whose imports are done.
+    monkeypatch.setattr(arms, "run_command", lambda _, *words: main([str(word) for word in words]))
     figures = measure((f"twin:0={SHIPPED}",), seconds=(4.0,), points=4, stops=2)
     [in_time], [stopping] = figures["in time"], figures["stop by stop"]
     assert json.dumps(figures) and in_time["trained"] == stopping["trained"] == "at rest"

@@ -21,11 +21,14 @@ from benchmarks.race.contestants import (
 )
 from benchmarks.race.race import RaceError, RaceLimits, limits_of, run, train
 from benchmarks.race.threads import choose_threads
+from mjx_softarm._support import xla
 from mjx_softarm.env import EnvConfig, ReachEnv
+from mjx_softarm.mdp.actions import N_ACTIONS
+from mjx_softarm.mechanics.workspace import HELD_OUT_SEED
 from tests.train.small import SHORT
 from train.agent.tqc import TQC
 from train.presets import PRESETS
-from train.runs.evaluate import Evaluator
+from train.runs import evaluate
 
 FAKE = '''
 """A contestant whose curve is known: 100 mm / round, 10 s and 1,000 env steps each; or it stops by itself."""
@@ -96,15 +99,19 @@ def test_time_counts_in_training_and_stands_while_the_policy_is_evaluated(monkey
     assert (work()["wall_s"], work()["ended"]) == (13.0, True)
 
 
-def test_held_out_goals_are_evaluated_as_the_trainer_does_it(quick_compiler):
+def test_held_out_goals_are_evaluated_as_the_trainer_does_it(quick_compiler, monkeypatch):
+    monkeypatch.setattr(evaluate, "PATH", 6)
     env = ReachEnv(SHORT, EnvConfig(n_poses=16))
     agent = TQC(env.observation_size, env.action_size)
     params = agent.init(jax.random.PRNGKey(3)).actor_params
-    evaluator = Evaluator(env, agent, n_goals=12)
-    _, reached, _ = evaluator(params)
-    found = HeldOut(env, 12).tip_error_mm(lambda obs: np.asarray(agent.mode(params, obs)))
+    held_out = HeldOut(env, 12)
+    found = held_out.tip_error_mm(lambda obs: np.asarray(agent.mode(params, obs)))
+    paths = evaluate.paths_of(env.sample_pool(12, HELD_OUT_SEED).pose)
+    follow = jax.vmap(evaluate.follower(env, agent, N_ACTIONS), in_axes=(None, 0, 0))
+    reached = xla.jit(follow)(params, paths, evaluate.start_keys(2))
     assert np.ptp(found) > 10.0
-    np.testing.assert_allclose(found, reached.tip_error_mm[:12], atol=0.01)  # of the first set
+    expected = np.linalg.norm((reached.pose - reached.goal)[..., :3], axis=-1)
+    np.testing.assert_allclose(found, expected.reshape(-1), atol=0.01)
 
 
 def test_peers_have_the_quick_preset_s_settings():
