@@ -11,7 +11,8 @@ import pytest
 from calib.fit.blocks import held_out_blocks
 from calib.fit.chambers import MIN_POSES, fit_chambers
 from calib.fit.parameters import BENDING, FIELDS
-from calib.read.measurements import measure
+from calib.read.measurements import Measurements, measure
+from calib.read.static_poses import find_static_poses
 from mjx_softarm import ArmSpec
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mechanics import excitation
@@ -290,5 +291,6 @@ def test_a_chamber_that_never_changes_is_named_and_its_area_left_alone():
     ],
 )
 def test_refuses_a_log_that_cannot_be_used(changes, message):
+    log = pose_log(SPEC, 9, 0, **changes)
     with pytest.raises(ValueError, match=message):
-        calibrate_chambers(pose_log(SPEC, 9, 0, **changes), SPEC)
+        fit_chambers(Measurements((log,), *find_static_poses([log], SPEC)), SPEC)
