@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any, Self
 
+import tyro
 from rich.console import Console
 
 from mjx_softarm._support import cli, xla
 from mjx_softarm.sensing.s2r import S2R, S2R_FILE, load_s2r
 from mjx_softarm.spec import ARM_FILE, ArmSpec
-from train.config import ConfigError
+from train.agent.registry import LEARNERS, name_of
+from train.config import ConfigError, TrainConfig
+from train.presets import PRESETS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +42,7 @@ class ArmOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class NewRunOptions(ArmOptions):
-    """Options of what makes a folder, or continues one."""
+    """Options of a command that makes a folder, or continues one."""
 
     out: cli.MaybePath = None
     """new folder; None: a name in runs/ after the preset"""
@@ -53,9 +56,31 @@ class NewRunOptions(ArmOptions):
             ConfigError: there are some; the message names them.
         """
         names = _differing(self, new, ("resume", "devices", "config"))
-        if names := [*names, *_differing(getattr(self, "config", None), getattr(new, "config", None))]:
-            told = ", ".join(f"--{name}" for name in names)
+        names += _differing(getattr(self, "config", None), getattr(new, "config", None))
+        if names:
+            told = ", ".join(f"--{name}" for name in dict.fromkeys(names))
             raise ConfigError(f"--resume {self.resume}: got {told} too, expected none: its own settings hold")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReachOptions(NewRunOptions):
+    """Options of a command that trains policies which reach poses of the workspace."""
+
+    preset: Annotated[str, cli.one_of(PRESETS)] = "quick"
+    """settings to begin with; the defaults below are this preset's"""
+    learner: Annotated[str, cli.one_of(n for n, e in LEARNERS.items() if not e.from_demonstrations)] = "tqc"
+    """learner; where it is not the preset's, it begins with its own defaults"""
+    config: Annotated[TrainConfig, tyro.conf.arg(name="")]
+
+    @classmethod
+    def default(cls, arguments: Sequence[str]) -> Self:
+        preset = named(arguments, "--preset", PRESETS, "quick")
+        config = PRESETS[preset]
+        own = name_of(config.learner)
+        learner = named(arguments, "--learner", LEARNERS, own)
+        if learner != own:
+            config = dataclasses.replace(config, learner=LEARNERS[learner].config())
+        return cls(preset=preset, learner=learner, config=config)
 
 
 def _differing(one: Any, other: Any, ignored: Sequence[str] = ()) -> list[str]:
@@ -63,11 +88,11 @@ def _differing(one: Any, other: Any, ignored: Sequence[str] = ()) -> list[str]:
     return [name for name in names if name not in ignored and getattr(one, name) != getattr(other, name)]
 
 
-def named_preset(arguments: Sequence[str], presets: Mapping[str, Any], default: str) -> str:
-    """Return the preset that the words of a command line name, or the default where they name none."""
+def named(arguments: Sequence[str], option: str, names: Iterable[str], default: str) -> str:
+    """Return the name that an option has among the words of a command line, or the default without one."""
     words = [part for word in arguments for part in word.split("=", 1)]
-    name = dict(itertools.pairwise(words)).get("--preset", default)
-    return name if name in presets else default  # an unknown one is refused as all options are read
+    name = dict(itertools.pairwise(words)).get(option, default)
+    return name if name in names else default  # an unknown one is refused as all options are read
 
 
 def start() -> Console:

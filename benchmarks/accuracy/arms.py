@@ -54,7 +54,7 @@ def _measure(arm: str, folder: Path, poses: int, steps: int | None, points: int)
     train = ["train", "reach", "--preset", "analytic", "--calibration", calibration, "--out", run]
     run_command(*record)
     distrusted = run_command("calib", "run", log, "--spec", arm, "--out", calibration)
-    run_command(*train, *(("--total-env-steps", steps) if steps else ()))
+    run_command(*train, *(("--learner.total-env-steps", steps) if steps else ()))
     run_command("train", "export", run)
     # Measure the policy on the twin.
     options = {"grid": ["--goals", "grid", "--points", points]}

@@ -33,11 +33,12 @@ from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.settle import settle_pressures
 from mjx_softarm.mechanics.workspace import HELD_OUT_SEED
 from mjx_softarm.policy.file import SHIPPED, load_policy
+from train.agent.registry import World, learner_of
 from train.config import TrainConfig, override
 from train.presets import PRESETS
 from train.runs import evaluate
 from train.runs.evaluate import N_GOALS, Reached, paths_of, start_keys, towards
-from train.runs.task import learner_of, task_of
+from train.runs.task import task_of
 
 LOADS_G = (0, 250, 500, 1000)
 SOLVER, N_SOLVED = "gradient descent", 50  # goals of each set, for each seed
@@ -65,11 +66,11 @@ class PolicyKind(NamedTuple):
 
 # Learning rates are each kind's best of 2e-3, 5e-4 and 1e-4 in runs of 65,536 env steps: the least held-out
 # medians in the mean over payloads, with a seed that is not used again. Chosen at commit e54133e.
-FAST, SLOW = "analytic.learning_rate=2e-3", "analytic.learning_rate=5e-4"
+FAST, SLOW = "learner.learning_rate=2e-3", "learner.learning_rate=5e-4"
 LARGEST_KG = ArmSpec.default().mass.largest_payload_kg
 LOADED = f"env.randomisation.payload_max_kg={LARGEST_KG}"
 OBSERVED = "env.observation=payload"
-NO_TERM = "analytic.saturation_cost_per_mm=0"
+NO_TERM = "learner.saturation_cost_per_mm=0"
 KINDS = {
     "spring lengths": PolicyKind((FAST,)),
     "no saturation term": PolicyKind((SLOW, NO_TERM)),
@@ -92,7 +93,7 @@ def measure(
         arms: of a gradient step
     """
     spec, loads = ArmSpec.default(), []
-    base = override(PRESETS["analytic"], [f"total_env_steps={steps}", f"n_arms={arms}"])
+    base = override(PRESETS["analytic"], [f"learner.total_env_steps={steps}", f"learner.n_arms={arms}"])
     # Policies, at all goals with each payload.
     for name, kind in KINDS.items():
         trained = PolicyTrial(kind, override(base, kind.settings), spec, goals)
@@ -118,13 +119,13 @@ class PolicyTrial:
         self.paths = paths_of(jnp.concatenate(goals_of(env, n_goals)))
         self.keys = start_keys(len(self.paths))
         self._job = task_of(config, kind.env(spec, config.env)).job
-        one = functools.partial(follow, env, learner_of(config, env))
+        one = functools.partial(follow, env, learner_of(config.learner, World(env)))
         self._follow = xla.jit(jax.vmap(one, in_axes=(None, None, 0, 0)))
 
     def run(self, seed: int) -> list[dict[str, Any]]:
         """Train one policy; return its figures with each payload."""
         state = self._job.start(lambda: self._job.init(jax.random.PRNGKey(seed)))
-        while int(state.n_env_steps) < self.config.total_env_steps:
+        for _ in range(self.config.learner.n_epochs):
             state, _ = self._job.epoch(state)
         policy = jax.device_get(self._job.policy(state))
         return [{"load_g": load_g, **self._figures(policy, load_g)} for load_g in LOADS_G]

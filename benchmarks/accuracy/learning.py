@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from benchmarks.harness.common import target
 from mjx_softarm._support.errors import InputError
-from train.config import LEARNER_GROUPS, to_dict
+from train.config import to_dict
 from train.presets import PRESETS
 from train.runs.checkpoint import Run
 from train.sweep.report import by_settings
@@ -62,15 +62,9 @@ def measure(runs: tuple[Path, ...]) -> dict[str, Any]:
 
 
 def preset_of(settings: Mapping[str, Any]) -> str | None:
-    """Return the preset that has these settings, as far as its learner reads them; None where none has."""
-    return next((name for name, of in PRESETS.items() if _read(to_dict(of)) == _read(settings)), None)
-
-
-def _read(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings without the seed and without groups that the learner does not read."""
-    read = LEARNER_GROUPS[settings["learner"]]
-    unread = {group for groups in LEARNER_GROUPS.values() for group in groups if group not in read}
-    return {name: value for name, value in settings.items() if name not in {"seed", *unread}}
+    """Return the preset that has these settings, whatever the seed; None where none has."""
+    known = {name: {**to_dict(config), "seed": None} for name, config in PRESETS.items()}
+    return next((name for name, own in known.items() if own == {**settings, "seed": None}), None)
 
 
 def targets(groups: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:

@@ -51,12 +51,13 @@ class Settings:
         return {name: value for name, value in self.as_json().items() if name not in MORE}
 
 
+_FEW = ("learner.total_env_steps=512", "learner.n_arms=16", "learner.updates_per_env_step=0.25")
 SMOKE = Settings(
     twins=(0,),
     seeds=(0,),
     preset="quick",
-    training=("total_env_steps=512", "warmup_env_steps=256", "n_arms=16", "updates_per_env_step=0.25"),
-    imitation=("total_env_steps=512", "warmup_env_steps=128", "n_arms=16", "updates_per_env_step=0.25"),
+    training=(*_FEW, "learner.warmup_env_steps=256"),
+    imitation=(*_FEW, "learner.warmup_env_steps=128"),
     n_poses=80,
     n_points=4,
     n_positions=7,  # up to the first object

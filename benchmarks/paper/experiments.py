@@ -78,7 +78,7 @@ class Paper:
         if self.beside and (self.smoke or self.only == "confined"):
             got = ",".join(self.beside)
             raise InputError(f"--beside: got {got}, expected none with --smoke or --only confined")
-        training = (f"total_env_steps={self.env_steps}",) if self.env_steps else None
+        training = (f"learner.total_env_steps={self.env_steps}",) if self.env_steps else None
         given = {"twins": self.twins, "seeds": self.seeds, "loads_g": self.loads}
         given |= {"preset": self.preset, "training": training}
         chosen = {name: value for name, value in given.items() if value is not None}

@@ -64,12 +64,12 @@ def load_results(folder: Path, experiment: str, settings: Settings) -> Results:
 
 
 def _load_training(run: Path) -> Training:
-    from train.config import ImitationConfig, from_dict
+    from train.config import from_dict
 
     config = from_dict(json.loads((run / "config.json").read_text("utf-8"))["train"])
-    assert isinstance(config, ImitationConfig)
     lines = (run / "metrics.jsonl").read_text("utf-8").splitlines()
-    return Training([json.loads(line) for line in lines], tuple(end for end in config.stage_epochs if end))
+    ends = tuple(end for end in config.learner.milestones if end)
+    return Training([json.loads(line) for line in lines], ends)
 
 
 def trial_rows(results: Results) -> list[dict[str, Any]]:

@@ -21,7 +21,7 @@ import math
 import sys
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -87,11 +87,15 @@ def ours(name: str, seed: int) -> Contestant:
         nonlocal state
         state, _ = jax.block_until_ready(job.epoch(state))
 
+    def done() -> tuple[int, int]:
+        epoch = int(state.n_epochs)
+        return config.learner.n_env_steps(epoch), config.learner.n_updates(epoch)
+
     return Contestant(
         train,
         policy=lambda obs: np.asarray(act(job.policy(state), obs)),
-        done=lambda: (int(state.n_env_steps), int(state.n_updates)),
-        limit=config.total_env_steps,
+        done=done,
+        limit=config.learner.total_env_steps,
     )
 
 
@@ -102,30 +106,32 @@ def peer(name: str, seed: int) -> Contestant:
     from benchmarks.race.hindsight import GoalEnvs, HindsightBuffer, with_goals
     from benchmarks.race.threads import choose_threads, filled_model
     from mjx_softarm.env.gym import SoftArmVectorEnv, as_sb3
+    from train.agent.tqc import TQCConfig
     from train.presets import PRESETS
 
     # Choose PyTorch's threads on a throwaway model; this time does not count.
     config, library = PRESETS["quick"], library_of(name)
+    ours = cast(TQCConfig, config.learner)
     algorithm = importlib.import_module(library.replace("-", "_")).TQC
     start = time.perf_counter()
     if library == "sb3-contrib":
         throwaway = filled_model(algorithm)
-        choose_threads(lambda: throwaway.train(gradient_steps=32, batch_size=config.batch_size))
+        choose_threads(lambda: throwaway.train(gradient_steps=32, batch_size=ours.batch_size))
     uncounted_s = time.perf_counter() - start
     # The arms, and the algorithm with our settings.
-    arms, n_steps = SoftArmVectorEnv(config.n_arms, config.episode_length, config=config.env), 0
+    arms, n_steps = SoftArmVectorEnv(ours.n_arms, ours.episode_length, config=config.env), 0
     model = algorithm(
         "MultiInputPolicy",
-        GoalEnvs(as_sb3(arms), config.tqc.reward_scale),
+        GoalEnvs(as_sb3(arms), ours.reward_scale),
         seed=seed,
         replay_buffer_class=HindsightBuffer,
         replay_buffer_kwargs={
             "arm": arms.env,
-            "hindsight": config.hindsight,
-            "reward_scale": config.tqc.reward_scale,
+            "hindsight": ours.hindsight,
+            "reward_scale": ours.reward_scale,
             "seed": seed,
         },
-        **settings_of(config, lambda: n_steps),
+        **settings_of(ours, lambda: n_steps),
     )
     model.set_logger(Logger(None, []))  # or each call of `learn` would make a folder
 
@@ -135,7 +141,7 @@ def peer(name: str, seed: int) -> Contestant:
         model.learn(n, **more)
         n_steps = model.num_timesteps
 
-    learn(model.learning_starts + config.n_arms)
+    learn(model.learning_starts + ours.n_arms)
     return Contestant(
         train=lambda: learn(CHUNK, reset_num_timesteps=False),
         policy=lambda obs: model.predict(with_goals(obs), deterministic=True)[0],
@@ -144,24 +150,23 @@ def peer(name: str, seed: int) -> Contestant:
     )
 
 
-def settings_of(config: Any, n_steps: Callable[[], int]) -> dict[str, Any]:
+def settings_of(tqc: Any, n_steps: Callable[[], int]) -> dict[str, Any]:
     """Return our settings by the names that TQC of Stable-Baselines3 and SBX has; `n_steps` counts theirs."""
-    tqc = config.tqc
     low = tqc.learning_rate_end
 
     def learning_rate(_: float) -> float:
-        share = (n_steps() % config.total_env_steps) / config.total_env_steps
+        share = (n_steps() % tqc.total_env_steps) / tqc.total_env_steps
         return tqc.learning_rate * (low + (1 - low) * 0.5 * (1 + math.cos(math.pi * share)))
 
     return {
         "learning_rate": learning_rate,
-        "buffer_size": config.replay_capacity,
-        "learning_starts": config.warmup_env_steps,
-        "batch_size": config.batch_size,
+        "buffer_size": tqc.replay_capacity,
+        "learning_starts": tqc.warmup_env_steps,
+        "batch_size": tqc.batch_size,
         "tau": tqc.tau,
         "gamma": tqc.gamma,
         "train_freq": 1,
-        "gradient_steps": config.n_updates_per_vector_step,
+        "gradient_steps": tqc.n_updates_per_vector_step,
         "ent_coef": f"auto_{tqc.initial_alpha}",
         "target_entropy": tqc.target_entropy,
     }

@@ -17,7 +17,7 @@ import itertools
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import jax
 import numpy as np
@@ -29,6 +29,7 @@ from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.provenance import provenance, write_json
 from mjx_softarm.env import EnvConfig, ReachEnv
 from train.agent.hindsight_tqc import HindsightTQC
+from train.agent.tqc import TQCConfig
 from train.epoch.job import Job
 from train.presets import PRESETS
 
@@ -119,7 +120,7 @@ def prepare() -> tuple[Facts, Callable[[], Facts]]:
     env, n_arms, n_steps = ReachEnv(config=EnvConfig(n_poses=1024)), SIZES["n_arms"], SIZES["n_env_steps"]
     settings: Any = {"n_arms": n_arms, "vector_steps_per_epoch": n_steps, "batch_size": SIZES["batch_size"]}
     settings |= {"updates_per_env_step": SIZES["n_updates"] / n_steps / n_arms, "warmup_env_steps": 0}
-    config = dataclasses.replace(PRESETS["quick"], env=env.config, **settings)
+    config = dataclasses.replace(cast(TQCConfig, PRESETS["quick"].learner), **settings)
     job, epochs = Job(config, env, HindsightTQC(config, env)), []
     states = [job.init(jax.random.PRNGKey(0))]
 

@@ -1,13 +1,16 @@
 """Learning from demonstrations on a short arm, which compiles in seconds."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from mjx_softarm.env import EnvConfig, ReachEnv
-from tests.train.small import CONFIG, SETTINGS, SHORT
+from tests.train.small import CONFIG, LEARNER, SHORT
 from train.agent.gail import GailConfig
 from train.agent.hindsight import HindsightConfig
-from train.config import ImitationConfig, Stage
+from train.agent.imitation import GoalStage, ImitationConfig
+from train.config import TrainConfig
 from train.demos.demonstrations import Demonstrations
 
 N_POSITIONS = 6
@@ -16,15 +19,13 @@ N_POSITIONS = 6
 @pytest.fixture(scope="session")
 def imitation_config():
     """Eight epochs of two stages; goals are rebalanced after every third epoch."""
-    return ImitationConfig(
-        **SETTINGS,
-        env=CONFIG.env,
-        tqc=CONFIG.tqc,
-        hindsight=HindsightConfig(0.0, 0.0),
+    learner = ImitationConfig(
+        **dataclasses.asdict(LEARNER) | {"hindsight": HindsightConfig(0.0, 0.0)},
         gail=GailConfig(hidden=(16,)),
-        stages=(Stage(share=0.5, every=2), Stage(share=0.5, kept=0.25)),
+        stages=(GoalStage(share=0.5, every=2), GoalStage(share=0.5, kept=0.25)),
         rebalance_env_steps=48,
     )
+    return TrainConfig(learner=learner, env=CONFIG.env)
 
 
 @pytest.fixture(scope="session")

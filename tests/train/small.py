@@ -2,7 +2,7 @@
 
 from mjx_softarm.env import EnvConfig
 from mjx_softarm.spec import ArmSpec
-from train.agent.hindsight_tqc import HindsightTQC
+from train.agent.registry import World, learner_of
 from train.agent.tqc import TQCConfig
 from train.config import TrainConfig
 from train.epoch.job import Job
@@ -17,24 +17,16 @@ SETTINGS = {
     "replay_capacity": 64,
     "vector_steps_per_epoch": 2,
 }
-CONFIG = TrainConfig(
-    **SETTINGS,
-    env=EnvConfig(n_poses=256),
-    tqc=TQCConfig(hidden_actor=(16, 16), hidden_critic=(16, 16), learning_rate_end=0.1),
-)
+LEARNER = TQCConfig(**SETTINGS, hidden=(16, 16), hidden_critic=(16, 16), learning_rate_end=0.1)
+CONFIG = TrainConfig(learner=LEARNER, env=EnvConfig(n_poses=256))
 
 
 def new_job(config, env, **more):
-    return Job(config, env, HindsightTQC(config, env), **more)
+    return Job(config.learner, env, learner_of(config.learner, World(env)), **more)
 
 
 def flags(**changes):
-    """Options of a command that trains this short run for 16 epochs, with changes."""
-    networks = {"env.n_poses": 256, "tqc.hidden_actor": 16, "tqc.hidden_critic": 16}
-    short = {
-        "total_env_steps": 256,
-        "updates_per_env_step": 1,
-        "replay_capacity": 128,
-        "evaluation_epochs": 4,
-    }
-    return [f"--{name}={value}" for name, value in {**SETTINGS, **networks, **short, **changes}.items()]
+    """Options of a command that trains this short run for 16 epochs; changes are settings of the learner."""
+    short = {"hidden": 16, "hidden_critic": 16, "total_env_steps": 256, "updates_per_env_step": 1}
+    learner = {**SETTINGS, **short, "replay_capacity": 128, **changes}
+    return ["--env.n-poses=256", *(f"--learner.{name}={value}" for name, value in learner.items())]

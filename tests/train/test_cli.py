@@ -66,7 +66,7 @@ main(sys.argv[1:])
 def test_a_run_survives_kill_9_and_ends_with_the_same_bits(arm, tmp_path, monkeypatch):
     workspace._solver.cache_clear()  # others may have compiled it with other options than the process below
     whole, killed = tmp_path / "whole", tmp_path / "killed"
-    command = ["reach", *flags(), "--spec", arm, "--out"]
+    command = ["reach", *flags(), "--evaluation-epochs=4", "--spec", arm, "--out"]
     assert main([*command, str(whole)]) == 0
     like_here = {
         "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
@@ -109,7 +109,7 @@ def test_a_run_survives_kill_9_and_ends_with_the_same_bits(arm, tmp_path, monkey
 def test_ctrl_c_saves_and_says_how_to_go_on(arm, tmp_path, monkeypatch, capsys):
     out = tmp_path / "stopped"
     monkeypatch.setattr(Run, "log", send_in_epoch_6(signal.SIGINT))
-    assert main(["reach", *flags(), "--spec", arm, "--out", str(out)]) == 130
+    assert main(["reach", *flags(), "--evaluation-epochs=4", "--spec", arm, "--out", str(out)]) == 130
     assert "continue with" in " ".join(capsys.readouterr().out.split())
     assert Run.open(out).latest_epoch == len(Run.open(out).metrics()) == 7
 
@@ -134,20 +134,26 @@ def test_a_folder_has_one_trainer_at_a_time(tmp_path):
 @pytest.mark.parametrize(
     "arguments, message",
     [
-        (["reach", "--tqc.gama", "1"], "Unrecognized options: --tqc.gama, 1"),
+        (["reach", "--learner.gama", "1"], "Unrecognized options: --learner.gama, 1"),
         (["reach", "--preset", "slow"], "choice 'slow' for argument '--preset'. Expected one of ('quick', "),
-        (["reach", "--n-arms", "1.5"], "--n-arms: invalid literal for int() with base 10: '1.5'"),
+        (
+            ["reach", "--learner.n-arms", "1.5"],
+            "--learner.n-arms: invalid literal for int() with base 10: '1.5'",
+        ),
         (["imitate"], "FILE: got nothing, expected the demonstrations"),
-        (["imitate", "absent.npz", "--stages", "0.5,1"], "--stages: got '0.5,1', expected SHARE,EVERY,KEPT"),
-        (["sweep", "--vary", "tqc.gamma"], "--vary: got 'tqc.gamma', expected NAME=VALUE,..."),
+        (
+            ["imitate", "absent.npz", "--learner.stages", "0.5,1"],
+            "--learner.stages: got '0.5,1', expected SHARE,EVERY,KEPT",
+        ),
+        (["sweep", "--vary", "learner.gamma"], "--vary: got 'learner.gamma', expected NAME=VALUE,..."),
         (
             ["reach", "--engine=fast"],
             "'fast' for argument '--engine/--env.engine'. Expected one of ('chain', 'mjx')",
         ),
         (["reach", "--seed", "-1"], "seed: got -1, expected at least 0"),
         (
-            ["reach", "--updates-per-env-step", "inf"],
-            "updates_per_env_step: got inf, expected a finite",
+            ["reach", "--learner.updates-per-env-step", "inf"],
+            "learner.updates_per_env_step: got inf, expected a finite",
         ),
         (["demos", "record", "--task", "circle16"], "Missing from python -m train demos record"),
         (["export"], "RUN: got 0, expected one folder of a run or more"),
@@ -157,11 +163,11 @@ def test_a_folder_has_one_trainer_at_a_time(tmp_path):
             "absent/config.json: got 'No such file or directory', expected the folder of a run",
         ),
         (
-            ["reach", "--resume", "absent", "--seed", "1", "--tqc.gamma", "0.4", "--out", "run"],
-            "--resume absent: got --out, --seed, --tqc too, expected none: its own settings hold",
+            ["reach", "--resume", "absent", "--seed", "1", "--learner.gamma", "0.4", "--out", "run"],
+            "--resume absent: got --out, --learner, --seed too, expected none: its own settings hold",
         ),
         (["reach", "--env.workspace-seed", "20000"], "20000 draws the goals of the evaluation"),
-        (["reach", "--hindsight.near-min-mm", "0"], "near_min_mm"),
+        (["reach", "--learner.hindsight.near-min-mm", "0"], "near_min_mm"),
         (["evaluate", "absent", "--payload", "-1"], "--payload: got -1, expected a finite number >= 0"),
         (["evaluate", "absent", "--actions", "3"], "--actions: got 3 without --in-motion, expected"),
         (
@@ -205,9 +211,9 @@ def test_imitation_resumes_across_stages_and_hands_its_reward_on(
     arm, demonstrations, tmp_path, monkeypatch, capsys
 ):
     # 8 epochs, the second stage from the fourth
-    changes = {"total_env_steps": 128, "evaluation_epochs": 2, "rebalance_env_steps": 48, "gail.hidden": 16}
-    stages = ["--stages", "0.5,2,1", "0.5,1,0.5"]
-    imitate = ["imitate", demonstrations, *flags(**changes), *stages, "--spec", arm, "--out"]
+    changes = {"total_env_steps": 128, "rebalance_env_steps": 48, "gail.hidden": 16}
+    settings = ["--evaluation-epochs=2", "--learner.stages", "0.5,2,1", "0.5,1,0.5", "--spec", arm]
+    imitate = ["imitate", demonstrations, *flags(**changes), *settings, "--out"]
     whole, killed, narrow = (tmp_path / name for name in ("whole", "killed", "narrow"))
     assert main([*imitate, str(whole)]) == 0
     assert all((whole / name).exists() for name in IMITATION_PICTURES)
@@ -227,15 +233,17 @@ def test_imitation_resumes_across_stages_and_hands_its_reward_on(
     assert figures[0] == figures[1] and len(figures[0]["error_mm"]) == 6
 
     capsys.readouterr()
-    assert main([*imitate, str(narrow), "--preset", "frozen"]) == 2
-    assert "frozen: got true, expected --reward RUN" in capsys.readouterr().err
+    assert main([*imitate, str(narrow), "--learner.frozen"]) == 2
+    assert "learner.frozen: got true, expected --reward RUN" in capsys.readouterr().err
+    assert main([*imitate, str(narrow), "--learner.learned-weight=0", "--reward", str(whole)]) == 2
+    assert "learner.learned_weight: got 0 with --reward" in capsys.readouterr().err
     assert not narrow.exists()
-    other = flags(**changes, **{"tqc.hidden_actor": 8})  # the agent's layers are taken all the same
-    frozen = ["imitate", demonstrations, *other, *stages, "--spec", arm, "--preset", "frozen"]
+    other = flags(**changes, hidden=8)  # the agent's layers are taken all the same
     donors = ["--agent", str(whole), "--reward", str(whole)]
-    assert main([*frozen, *donors, "--out", str(narrow)]) == 0
+    assert main(["imitate", demonstrations, *other, *settings, *donors, "--out", str(narrow)]) == 0
     kept = [Run.open(run).parts()["reward"] for run in (whole, narrow)]
     jax.tree.map(np.testing.assert_array_equal, *kept)
     begun = json.loads((narrow / "config.json").read_text())["begins_with"]
     assert begun == {"agent": str(whole), "reward": str(whole)}
-    assert [Run.open(run).config.tqc.hidden_actor for run in (whole, narrow)] == [(16,), (16,)]
+    learners = [Run.open(run).config.learner for run in (whole, narrow)]
+    assert [(each.hidden, each.frozen) for each in learners] == [((16,), False), ((16,), True)]

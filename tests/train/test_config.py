@@ -5,14 +5,16 @@ import json
 
 import pytest
 
+from train.agent.analytic import AnalyticConfig
+from train.agent.tqc import TQCConfig
 from train.config import ConfigError, TrainConfig, from_dict, override, to_dict
 from train.presets import IMITATION_PRESETS, PRESETS
 
 
 def test_overrides_reach_every_level_and_leave_the_preset_alone():
     before = PRESETS["quick"]
-    after = override(before, ["seed=3", "tqc.gamma=0.25", "tqc.hidden_actor=[64, 32]", "env.engine=mjx"])
-    got = (after.seed, after.tqc.gamma, after.tqc.hidden_actor, after.env.engine)
+    after = override(before, ["seed=3", "learner.gamma=0.25", "learner.hidden=[64, 32]", "env.engine=mjx"])
+    got = (after.seed, after.learner.gamma, after.learner.hidden, after.env.engine)
     assert got == (3, 0.25, (64, 32), "mjx")
     assert override(after, ["env.reward.threshold=1"]).env.reward.threshold == 1.0
     assert before.seed == 0 and before.env.engine == "chain"
@@ -23,19 +25,19 @@ def test_overrides_reach_every_level_and_leave_the_preset_alone():
     [
         ("seed", "seed: got 'seed', expected NAME=VALUE"),
         ("sed=1", "sed: got 'sed=1', expected NAME=VALUE for one of learner, seed"),
-        ("tqc.gama=1", "expected NAME=VALUE for one of hidden_actor"),
+        ("learner.gama=1", "expected NAME=VALUE for one of name, hidden"),
         ("seed.x=1", "seed.x: got 'seed.x=1'"),
         ("seed=one", "seed: got 'one', expected int"),
         ("seed=1.5", "seed: got 1.5, expected int"),
-        ("n_arms=0", "n_arms: got 0, expected at least 1"),
+        ("learner.n_arms=0", "learner.n_arms: got 0, expected at least 1"),
         ("env.engine=fast", "env.engine: got 'fast', expected"),
-        ("tqc.gamma=2", "TQCConfig.gamma"),
-        ("hindsight.reached_share=0.9", "reached_share"),
+        ("learner.gamma=2", "learner.gamma: got 2.0, expected a number in [0, 1]"),
+        ("learner.hindsight.reached_share=0.9", "learner.hindsight.reached_share"),
         (
-            "updates_per_env_step=0.001",
+            "learner.updates_per_env_step=0.001",
             "expected a finite number of at least one update per step of all",
         ),
-        ("replay_capacity=10", "replay_capacity: got 10, expected at least n_arms = 128"),
+        ("learner.replay_capacity=10", "learner.replay_capacity: got 10, expected at least n_arms = 128"),
     ],
 )
 def test_a_setting_that_cannot_be_is_named(assignment, message):
@@ -63,34 +65,46 @@ def test_presets_survive_json(config):
 
 def test_json_with_a_setting_too_many_is_refused_and_a_missing_one_has_its_default():
     data = to_dict(TrainConfig())
-    with pytest.raises(ConfigError, match="config.tqc: got .* expected the settings"):
-        from_dict({**data, "tqc": {**data["tqc"], "extra": 1}})
-    older = {name: value for name, value in data.items() if name != "episode_length"}
-    assert from_dict(older) == TrainConfig()
+    with pytest.raises(ConfigError, match="config.learner: got .* expected the settings"):
+        from_dict({**data, "learner": {**data["learner"], "extra": 1}})
+    with pytest.raises(ConfigError, match="config.learner.name: got 'ppo', expected one of tqc, analytic"):
+        from_dict({**data, "learner": {"name": "ppo"}})
+    assert from_dict({"learner": {"name": "tqc"}}) == TrainConfig()
 
 
 def test_an_epoch_count_covers_the_steps_asked_for():
-    config = TrainConfig(
+    config = TQCConfig(
         total_env_steps=10_001, n_arms=100, vector_steps_per_epoch=10, updates_per_env_step=0.5
     )
-    assert (config.n_epochs, config.n_updates_per_vector_step, config.n_updates) == (11, 50, 11 * 10 * 50)
+    assert (config.n_epochs, config.n_env_steps(11), config.n_decay_updates) == (11, 11_000, 11 * 10 * 50)
+
+
+def test_updates_are_counted_from_the_end_of_warm_up():
+    config = TQCConfig(n_arms=100, warmup_env_steps=1_201, vector_steps_per_epoch=10)
+    assert [config.n_updates(epoch) for epoch in (1, 2, 3)] == [0, 7 * 100, 17 * 100]
+    assert AnalyticConfig().n_updates(3) == 3 * 256
+    assert config.n_env_steps(epoch := 2**33) == 1_000 * epoch
 
 
 def test_each_stages_end_is_evaluated(imitation_config):
-    config = dataclasses.replace(imitation_config, total_env_steps=160, evaluation_epochs=4)  # 10 epochs
+    learner = dataclasses.replace(imitation_config.learner, total_env_steps=160)  # 10 epochs
+    config = dataclasses.replace(imitation_config, learner=learner, evaluation_epochs=4)
     assert [epoch for epoch in range(1, 11) if config.evaluates_after(epoch)] == [4, 5, 8, 10]
 
 
 @pytest.mark.parametrize(
     ("assignment", "message"),
     [
-        ('stages=[{"part": 1.0}]', "settings"),
-        ('stages=[{"share": 0.5, "every": 1, "kept": 1.0}]', "add up to 0.5, expected 1"),
-        ('stages=[{"share": 1.0, "every": 0, "kept": 1.0}]', "every: got 0"),
-        ("expert_share=1.0", "expert_share: got 1.0"),
-        ("learned_weight=0", "expected some reward"),
-        ("learned_weight=-1", "expected numbers >= 0"),
-        ("rebalance_env_steps=-1", "rebalance_env_steps: got -1"),
+        ('learner.stages=[{"part": 1.0}]', "settings"),
+        (
+            'learner.stages=[{"share": 0.5, "every": 1, "kept": 1.0}]',
+            "expected shares that add up to 1, not 0.5",
+        ),
+        ('learner.stages=[{"share": 1.0, "every": 0, "kept": 1.0}]', "every: got 0"),
+        ("learner.expert_share=1.0", "expert_share: got 1.0"),
+        ("learner.learned_weight=0", "hand_made_weight: got 0.0, expected a number >= 0, and more"),
+        ("learner.learned_weight=-1", "expected a number >= 0"),
+        ("learner.rebalance_env_steps=-1", "rebalance_env_steps: got -1"),
     ],
 )
 def test_a_bad_setting_of_imitation_is_named(imitation_config, assignment, message):

@@ -43,7 +43,7 @@ from mjx_softarm._support.mjx import State
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.env.vector import VectorEnv, over_arms
 from mjx_softarm.mdp import rewards
-from train.agent.learner import Sample, check_same_shapes
+from train.agent.learner import Explored, Learner, LearnerConfig, Sample, check_same_shapes, check_settings
 from train.agent.networks import Actor, mode, widened
 
 Params = Any  # a flax parameter tree
@@ -53,15 +53,17 @@ EARLY = (
 
 
 @dataclass(frozen=True)
-class AnalyticConfig:
+class AnalyticConfig(LearnerConfig):
     """Hyperparameters of learning through the simulation. Raises ValueError naming a bad field."""
 
-    # See TQCConfig.
-    NUMBERS = ("learning_rate", "learning_rate_half", "max_gradient_norm", "mean_share", "new_share")
-    NUMBERS += ("saturation_cost_per_mm",)
+    VARIABLE = ("learning_rate", "learning_rate_half", "max_gradient_norm", "mean_share", "new_share")
+    VARIABLE += ("saturation_cost_per_mm",)
 
-    hidden: tuple[int, ...] = (256, 256, 256, 256)  # width of each hidden layer of the policy
-    learning_rate: float = 2e-3  # of Adam
+    hidden: tuple[int, ...] = (256, 256, 256, 256)  # widths of the policy's hidden layers
+    n_arms: int = 64  # arms of a gradient step
+    total_env_steps: int = 64 * 98_304  # actions of all arms together; each arm takes one per gradient step
+    vector_steps_per_epoch: int = 256  # gradient steps between two reports
+    learning_rate: float = 2e-3  # learning rate at first (Adam)
     learning_rate_half: float = 3_000.0  # gradient steps after which half of it is left, after twice a third
     max_gradient_norm: float = 1.0  # a longer gradient is shortened to this
     mean_share: float = 0.1  # share of the gradient steps so far over which the mean policy averages
@@ -70,6 +72,7 @@ class AnalyticConfig:
     horizon: int = 1  # actions that a gradient step looks ahead; more than one for arms in motion
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         required = {
             "learning_rate": (self.learning_rate >= 0.0, "a number >= 0"),
             "learning_rate_half": (self.learning_rate_half > 0.0, "a number > 0"),
@@ -79,9 +82,7 @@ class AnalyticConfig:
             "saturation_cost_per_mm": (self.saturation_cost_per_mm >= 0.0, "a number >= 0"),
             "horizon": (self.horizon >= 1, "a whole number >= 1"),
         }
-        for name, (holds, expected) in required.items():
-            if not holds:
-                raise ValueError(f"AnalyticConfig.{name}: got {getattr(self, name)}, expected {expected}")
+        check_settings("learner", self, required)
 
 
 class AnalyticState(NamedTuple):
@@ -102,20 +103,21 @@ class _Ahead(NamedTuple):
     valid: Array  # () bool: the arm settled after each
 
 
-class Analytic:
+class Analytic(Learner):
     """`Learner` by the gradient of the simulation; it uses no replay.
 
     Args:
         config: hyperparameters.
         env: the arm.
-        n_arms: arms of a gradient step.
         mesh: devices over which the arms are spread.
     """
 
-    def __init__(self, config: AnalyticConfig, env: ReachEnv, n_arms: int, mesh: Mesh | None = None):
-        self.config, self.env, self.mesh, self.own_arms = config, env, mesh, n_arms
+    own_arms = True
+
+    def __init__(self, config: AnalyticConfig, env: ReachEnv, mesh: Mesh | None = None):
+        self.config, self.env, self.mesh = config, env, mesh
         self.actor: Any = Actor(env.action_size, config.hidden)
-        self.arms = VectorEnv(env, n_arms, episode_length=1, mesh=mesh)
+        self.arms = VectorEnv(env, config.n_arms, episode_length=1, mesh=mesh)
         self.optimizer = optax.chain(
             optax.clip_by_global_norm(config.max_gradient_norm),
             optax.adam(lambda n_steps: config.learning_rate / (1.0 + n_steps / config.learning_rate_half)),
@@ -133,10 +135,6 @@ class Analytic:
             arms=self.arms.reset(key_arms),
         )
 
-    def parts(self, state: AnalyticState) -> dict[str, Params]:
-        """Return the mean policy."""
-        return {"policy": state.mean_actor_params}
-
     def adopt(self, state: AnalyticState, parts: Mapping[str, Params]) -> AnalyticState:
         """Return the state with another run's policy, of any learner; it may observe less.
 
@@ -147,9 +145,9 @@ class Analytic:
         check_same_shapes("actor", params, state.actor_params)
         return state._replace(actor_params=params, mean_actor_params=jax.tree.map(jnp.copy, params))
 
-    def act(self, state: AnalyticState, obs: Array, key: Array) -> Array:
+    def act(self, state: AnalyticState, obs: Array, key: Array) -> Explored:
         """Return the policy's actions (..., A) at obs (..., O): nothing needs to be explored."""
-        return self.mode(state.actor_params, obs)
+        return Explored(self.mode(state.actor_params, obs))
 
     def policy(self, state: AnalyticState) -> Params:
         """Return the parameters of the mean policy."""
@@ -165,14 +163,14 @@ class Analytic:
         """Take one gradient step, and one action of all arms."""
         # Act H times; the gradient of each arm's loss with respect to each of its actions.
         look_ahead = jax.value_and_grad(self._loss, has_aux=True)
-        changes = jnp.zeros((self.own_arms, self.config.horizon, self.env.action_size))
+        changes = jnp.zeros((self.arms.n, self.config.horizon, self.env.action_size))
         ahead: _Ahead
         d_action: Array  # (B, H, A)
         (loss, ahead), d_action = over_arms(look_ahead, self.mesh, 1)(changes, state.arms, state.actor_params)
 
         # Leave out arms that did not settle and gradients that are not finite, as at a pitch of 90 degrees.
         valid = ahead.valid & jnp.all(jnp.isfinite(d_action), axis=(1, 2))  # (B,)
-        d_action = jnp.where(valid[:, None, None], d_action, jnp.zeros_like(d_action)) / self.own_arms
+        d_action = jnp.where(valid[:, None, None], d_action, jnp.zeros_like(d_action)) / self.arms.n
         _, pull_back = jax.vjp(lambda params: self.mode(params, ahead.obs), state.actor_params)
         (gradient,) = pull_back(d_action)
         after = ahead.after
@@ -224,7 +222,7 @@ class Analytic:
     def _go_on(self, after: State, key: Array) -> State:
         """Return the arms as they stand, some of them with a new start and goal."""
         key_new, key_reset = jax.random.split(key)
-        new = draws.uniform(key_new, (self.own_arms,)) < self.config.new_share
+        new = draws.uniform(key_new, (self.arms.n,)) < self.config.new_share
         new |= ~after.info["valid"]
         fresh = self.arms.reset(key_reset)
         return jax.tree.map(

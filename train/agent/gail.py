@@ -23,6 +23,8 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
+from train.agent.learner import check_settings
+
 Logits = Callable[[Array, Array], Array]  # observations (..., O) and actions (..., A) -> (...), high: expert
 
 
@@ -36,11 +38,12 @@ class GailConfig:
     input_scale: float = 10.0  # factor on observations and actions, hence on the logit's slope
 
     def __post_init__(self) -> None:
-        if self.input_scale <= 0.0:
-            raise ValueError(f"GailConfig.input_scale: got {self.input_scale}, expected a number > 0")
-        for name in ("learning_rate", "gradient_penalty"):
-            if getattr(self, name) < 0.0:
-                raise ValueError(f"GailConfig.{name}: got {getattr(self, name)}, expected a number >= 0")
+        required = {
+            "learning_rate": (self.learning_rate >= 0.0, "a number >= 0"),
+            "gradient_penalty": (self.gradient_penalty >= 0.0, "a number >= 0"),
+            "input_scale": (self.input_scale > 0.0, "a number > 0"),
+        }
+        check_settings("learner.gail", self, required)
 
 
 class DiscriminatorState(NamedTuple):

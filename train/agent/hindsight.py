@@ -20,15 +20,14 @@ from jax import Array
 from mjx_softarm._support import draws
 from mjx_softarm.mdp import observation as obs
 from mjx_softarm.mdp import rewards
-from train.agent.learner import Experience
-from train.agent.tqc import Transition
+from train.agent.learner import Experience, Transition
 
 
 @dataclass(frozen=True)
 class HindsightConfig:
     """Shares of a batch that get another goal; the rest keeps its own."""
 
-    NUMBERS = ("reached_share", "near_share", "near_min_mm", "near_max_mm", "mm_per_deg")  # as in TQCConfig
+    VARIABLE = ("reached_share", "near_share", "near_min_mm", "near_max_mm", "mm_per_deg")
 
     reached_share: float = 0.5  # share whose goal becomes the pose reached
     near_share: float = 0.0  # share whose goal becomes a pose near the one reached
@@ -40,16 +39,16 @@ class HindsightConfig:
     def __post_init__(self):
         if min(self.reached_share, self.near_share) < 0 or self.reached_share + self.near_share > 1:
             raise ValueError(
-                f"HindsightConfig: got reached_share {self.reached_share} and near_share {self.near_share}, "
+                f"learner.hindsight.reached_share, near_share: got {self.reached_share}, {self.near_share}, "
                 "expected numbers >= 0 that add up to 1 at most"
             )
         if not 0 < self.near_min_mm <= self.near_max_mm:
             raise ValueError(
-                f"HindsightConfig: got near_min_mm {self.near_min_mm} and near_max_mm {self.near_max_mm}, "
+                f"learner.hindsight.near_min_mm, near_max_mm: got {self.near_min_mm}, {self.near_max_mm}, "
                 "expected 0 < near_min_mm <= near_max_mm"
             )
         if self.mm_per_deg <= 0:
-            raise ValueError(f"HindsightConfig.mm_per_deg: got {self.mm_per_deg}, expected > 0")
+            raise ValueError(f"learner.hindsight.mm_per_deg: got {self.mm_per_deg}, expected > 0")
 
 
 def relabel(
@@ -61,8 +60,10 @@ def relabel(
     *,
     goal_ends: bool,
     senses_action: bool,
-) -> Transition:
-    """Return a batch to learn from; with both shares zero, its rewards are those the environment gave.
+) -> tuple[Transition, Array]:
+    """Return a batch to learn from, and which of its rows (B,) have another goal.
+
+    With both shares zero, its rewards are those that the environment gave.
 
     Args:
         batch: B stored transitions.
@@ -71,7 +72,7 @@ def relabel(
         scale: of the observations.
         reward_config: weights of the reward.
         goal_ends: whether a goal that is reached ends an episode.
-        senses_action: whether what is sensed ends with the last action.
+        senses_action: whether the observation's last entries are the last action.
     """
     # Goals: own, reached, or near the pose reached.
     n = batch.saturated.shape[0]
@@ -93,13 +94,14 @@ def relabel(
     before, after = batch.sensed, batch.next_sensed
     if senses_action and after is not None:
         after = after.at[:, -action.shape[1] :].set(action)  # the last action, exchanged
-    return Transition(
+    transition = Transition(
         obs=_joined(obs.observe(batch.pose, goal, scale, reward_config), before),
         action=action,
         reward=reward,
         next_obs=_joined(obs.observe(batch.next_pose, goal, scale, reward_config), after),
         terminated=(done & goal_ends).astype(reward.dtype),
     )
+    return transition, reached | near
 
 
 def _joined(observation: Array, sensed: Array | None) -> Array:

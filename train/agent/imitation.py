@@ -1,15 +1,15 @@
 """Learner from demonstrations: a learned reward around TQC.
 
-An action of an arm at rest leads to the same pose from wherever it begins. So each demonstrated action is the
-expert's answer to its goal from any start, and the expert is put where the agent stood: the discriminator
-compares two actions for one observation, and nothing but the action can tell them apart. The expert's answers
-also take a share of each batch of the critics, with the same reward as all others.
+An action of an arm at rest leads to the same pose from every start. So a demonstrated action is the expert's
+answer to its goal from any start, and expert actions are stored with the agent's state: the discriminator
+compares two actions for one observation, and only the action can tell them apart. The expert's answers also
+take a share of each batch of the critics, with the same reward as all others.
 
 An arm in motion is still on its way when the next action comes. There the expert acts itself: a share of the
-arms' actions are the expert's answers to their goals, and the critics see what these led to. Where the expert
-acted, the discriminator compares it with what the agent would do there now.
+arms' actions are the expert's answers to their goals, and the critics see their results. Where the expert
+acted, the discriminator compares its action with the agent's present action.
 
-The learned reward is for goals that were asked for, not for those of hindsight, which the discriminator does
+The learned reward is for goals that were asked for, not for relabelled goals, which the discriminator does
 not know. Episodes end with the goal reached or by the clock, so a reward that is never positive rewards no
 delay.
 
@@ -18,25 +18,130 @@ Shapes: B batch, O observation, A action, m demonstrated positions.
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from dataclasses import dataclass, field
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
+from tyro.constructors import PrimitiveConstructorSpec
 
 from mjx_softarm._support import draws
-from mjx_softarm.env import ReachEnv
+from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.mdp import observation, rewards
-from train.agent.gail import DiscriminatorState, Gail
+from train.agent.gail import DiscriminatorState, Gail, GailConfig
 from train.agent.hindsight_tqc import HindsightTQC
-from train.agent.learner import Experience, Sample, check_same_shapes
-from train.agent.tqc import Transition
-from train.config import ImitationConfig
+from train.agent.learner import (
+    Experience,
+    Explored,
+    Learner,
+    Sample,
+    Transition,
+    check_same_shapes,
+    check_settings,
+)
+from train.agent.tqc import TQCConfig
 from train.demos.demonstrations import Demonstrations
 
-# Difference of observations that is rounding; hindsight moves a goal by a millimetre or more.
-SAME_GOAL = 1e-5
+
+@dataclass(frozen=True)
+class GoalStage:
+    """A part of the schedule of demonstrated goals."""
+
+    share: float = 1.0  # share of the run's environment steps
+    every: int = 1  # every n-th demonstrated pose is a goal; 1 is all of them
+    kept: float = 1.0  # share of the replay's transitions that is kept as the stage begins
+
+    def __post_init__(self) -> None:
+        required = {
+            "share": (0.0 < self.share <= 1.0, "more than 0 and at most 1"),
+            "every": (self.every >= 1, "at least 1"),
+            "kept": (0.0 <= self.kept <= 1.0, "0 to 1"),
+        }
+        check_settings("learner.stages", self, required)
+
+
+def _stages(words: list[str]) -> tuple[GoalStage, ...]:
+    stages = []
+    for word in words:
+        numbers = word.split(",")
+        if len(numbers) != 3:
+            raise ValueError(f"got {word!r}, expected SHARE,EVERY,KEPT")
+        stages.append(GoalStage(float(numbers[0]), int(numbers[1]), float(numbers[2])))
+    return tuple(stages)
+
+
+_STAGES_OPTION = PrimitiveConstructorSpec(
+    nargs="*",
+    metavar="SHARE,EVERY,KEPT",
+    instance_from_str=_stages,
+    is_instance=lambda value: isinstance(value, tuple),
+    str_from_instance=lambda stages: [f"{stage.share:.3g},{stage.every},{stage.kept:g}" for stage in stages],
+)
+
+
+@dataclass(frozen=True)
+class ImitationConfig(TQCConfig):
+    """Settings of learning from demonstrations, whose poses are the goals. Raises ValueError."""
+
+    gail: GailConfig = field(default_factory=GailConfig)
+    """discriminator"""
+    learned_weight: float = 1.0
+    """weight of the learned reward; with 0, only the poses of the demonstrations are used"""
+    hand_made_weight: float = 0.0
+    """weight of the environment's reward"""
+    frozen: bool = False
+    """keep the discriminator of another run as it is; only the poses of the demonstrations are used"""
+    expert_share: float = 0.25
+    """share of the critics' batches that is the expert's; in motion, share of the arms' actions"""
+    stages: Annotated[tuple[GoalStage, ...], _STAGES_OPTION] = (GoalStage(),)
+    """stages in order: share of the env steps (all add up to 1), every n-th pose is a goal, share of the
+    replay that is kept as the stage begins"""
+    rebalance_env_steps: int = 0
+    """env steps between two shifts of the goals towards those missed by most; 0 is never"""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        hand_made = self.hand_made_weight > 0 or self.hand_made_weight == 0 < self.learned_weight
+        total = sum(stage.share for stage in self.stages)
+        apart = len(set(self.stage_epochs)) == len(self.stages)
+        required = {
+            "expert_share": (0.0 <= self.expert_share < 1.0, "0 or more and less than 1"),
+            "learned_weight": (self.learned_weight >= 0, "a number >= 0"),
+            "hand_made_weight": (
+                hand_made,
+                "a number >= 0, and more where learned_weight is 0",
+            ),
+            "rebalance_env_steps": (self.rebalance_env_steps >= 0, "at least 0"),
+            "stages": (math.isclose(total, 1.0, abs_tol=1e-6), f"shares that add up to 1, not {total:g}"),
+            "stage_epochs": (apart, f"an epoch or more for each stage; there are {self.n_epochs}"),
+        }
+        check_settings("learner", self, required)
+
+    def check(self, env: EnvConfig) -> None:
+        """Raise ValueError where the policy observes the payload: a demonstrated action is right for one."""
+        if env.observation == "payload":
+            expected = "'pose' or 'motion' for demonstrations"
+            raise ValueError(f"env.observation: got 'payload', expected {expected}")
+
+    @property
+    def stage_epochs(self) -> tuple[int, ...]:
+        """Number of epochs before each stage."""
+        shares = [0.0, *itertools.accumulate(stage.share for stage in self.stages[:-1])]
+        return tuple(round(share * self.n_epochs) for share in shares)
+
+    @property
+    def milestones(self) -> tuple[int, ...]:
+        """Numbers of epochs at the ends of the stages."""
+        return self.stage_epochs
+
+    @property
+    def rebalance_epochs(self) -> int:
+        """Number of epochs between two shifts of the goals; 0 is never."""
+        return -(-self.rebalance_env_steps // (self.n_arms * self.vector_steps_per_epoch))
 
 
 class ImitationState(NamedTuple):
@@ -46,20 +151,17 @@ class ImitationState(NamedTuple):
     discriminator: DiscriminatorState | None  # None where no reward is learned or taken
 
 
-class Imitation:
-    """`Learner` that wraps another and replaces its rewards and some rows of its batches."""
+class Imitation(Learner):
+    """`Learner` that wraps TQC and replaces its rewards and some rows of its batches."""
 
-    own_arms = 0
-
-    def __init__(
-        self, learner: HindsightTQC, config: ImitationConfig, env: ReachEnv, demonstrations: Demonstrations
-    ):
-        self.learner, self.config, self.env = learner, config, env
+    def __init__(self, config: ImitationConfig, env: ReachEnv, demonstrations: Demonstrations):
+        self.learner, self.config, self.env = HindsightTQC(config, env), config, env
         self.positions = jnp.asarray(demonstrations.positions)  # (m, 6) [mm, deg]
         self.actions = jnp.asarray(demonstrations.actions)  # (m, A)
         self.gail = Gail(env.observation_size, env.action_size, config.gail)
         at_rest = not env.config.moves
         self.n_expert = round(at_rest * config.expert_share * config.batch_size)  # rows of a batch
+        self.mode = self.learner.mode
 
     def init(self, key: Array) -> ImitationState:
         """Return fresh networks."""
@@ -67,23 +169,20 @@ class Imitation:
         discriminator = self.gail.init(key_discriminator) if self.config.learned_weight else None
         return ImitationState(self.learner.init(key_agent), discriminator)
 
-    def act(self, state: ImitationState, obs: Array, key: Array) -> Array:
+    def act(self, state: ImitationState, obs: Array, key: Array) -> Explored:
         """Return the wrapped learner's exploring actions; in motion, some are the expert's."""
-        action = self.learner.act(state.agent, obs, key)
+        own = self.learner.act(state.agent, obs, key)
         if not self.env.config.moves:
-            return action
+            return own
         scale = self.env.scale
         goal = obs[..., observation.GOAL] * scale.scale + scale.centre
         by_expert = draws.uniform(jax.random.fold_in(key, 1), obs.shape[:-1]) < self.config.expert_share
-        return jnp.where(by_expert[..., None], self.actions[self._index_of(goal)], action)
+        expert = self.actions[self._index_of(goal)]
+        return Explored(jnp.where(by_expert[..., None], expert, own.action), by_expert)
 
     def policy(self, state: ImitationState) -> Any:
         """Return the wrapped learner's policy."""
         return self.learner.policy(state.agent)
-
-    def mode(self, policy: Any, obs: Array) -> Array:
-        """Return the wrapped learner's deterministic actions."""
-        return self.learner.mode(policy, obs)
 
     def update(
         self, state: ImitationState, sample: Sample, key: Array
@@ -92,23 +191,23 @@ class Imitation:
         key_sample, key_between, key_relabel, key_update = jax.random.split(key, 4)
         discriminator, metrics = state.discriminator, {}
 
-        # Batch: stored transitions, relabelled, at rest the first rows exchanged for the expert's.
+        # Batch: stored transitions, relabelled; at rest the first rows are exchanged for the expert's.
         stored = sample(key_sample)
         index = self._index_of(stored.goal)  # (B,)
-        batch = self.learner.transitions(stored, key_relabel)
+        batch, relabelled = self.learner.transitions(stored, key_relabel)
         if not self.env.config.moves:
             batch = self.with_expert(batch, stored, index)
+            relabelled = relabelled.at[: self.n_expert].set(False)
 
         # Discriminator: the expert's actions against the agent's, at the same observations.
-        start = self.env.observe(stored.pose, stored.goal, stored.sensed)  # (B, O)
         if discriminator is not None and not self.config.frozen:
-            expert = self.actions[index]  # (B, A)
-            agent = self.of_agent(state, stored, start, expert, key_between)
-            pairs = (start, expert), (start, agent)
+            start = self.env.observe(stored.pose, stored.goal, stored.sensed)  # (B, O)
+            agent = self.of_agent(state, stored, start, key_between)  # (B, A)
+            pairs = (start, self.actions[index]), (start, agent)
             discriminator, metrics = self.gail.update(discriminator, *pairs, key_between)
 
         # Agent: the batch with rewards of the updated discriminator.
-        reward, of_reward = self.rewards(batch, stored, start, discriminator)
+        reward, of_reward = self.rewards(batch, stored, relabelled, discriminator)
         agent, losses = self.learner.learn(state.agent, batch._replace(reward=reward), key_update)
         metrics = {f"gail/{name}": x for name, x in (metrics | of_reward).items()}
         return ImitationState(agent, discriminator), losses | metrics
@@ -134,7 +233,11 @@ class Imitation:
         return state
 
     def rewards(
-        self, batch: Transition, stored: Experience, start: Array, discriminator: DiscriminatorState | None
+        self,
+        batch: Transition,
+        stored: Experience,
+        relabelled: Array,
+        discriminator: DiscriminatorState | None,
     ) -> tuple[Array, dict[str, Array]]:
         """Return the rewards (B,) of a batch, and metrics.
 
@@ -143,46 +246,41 @@ class Imitation:
         Args:
             batch: made of `stored`, the expert's rows first.
             stored: B transitions.
-            start (B, O): their own observations.
-            discriminator: that gives the learned reward, if there is one.
+            relabelled (B,) bool: rows of the batch with a goal that was not asked for.
+            discriminator: discriminator that gives the learned reward, if there is one.
         """
         cost = stored.clearance_cost.at[: self.n_expert].set(0.0)  # (B,)
         reward = self.config.hand_made_weight * (batch.reward + cost) - cost  # (B,)
         if discriminator is None:
             return reward, {}
-        asked = jnp.max(jnp.abs(batch.obs - start), axis=-1) < SAME_GOAL  # (B,) not a goal of hindsight
         learned = self.gail.reward(discriminator.params, batch.obs, batch.action)  # (B,)
-        learned = jnp.where(asked, learned, 0.0)
-        mean = jnp.sum(learned) / jnp.maximum(jnp.sum(asked), 1)
+        learned = jnp.where(relabelled, 0.0, learned)
+        mean = jnp.sum(learned) / jnp.maximum(jnp.sum(~relabelled), 1)
         return reward + self.config.learned_weight * learned, {"reward": mean}
 
-    def of_agent(
-        self, state: ImitationState, stored: Experience, start: Array, expert: Array, key: Array
-    ) -> Array:
+    def of_agent(self, state: ImitationState, stored: Experience, start: Array, key: Array) -> Array:
         """Return the actions (B, A) of B transitions, the agent's present ones where the expert acted.
 
         Args:
-            state: of this learner.
+            state: state of this learner.
             stored: B transitions.
             start (B, O): their observations.
-            expert (B, A): the expert's answers to their goals.
             key: draws the agent's present actions.
         """
-        if not self.env.config.moves:
+        if stored.by_expert is None:
             return stored.action
-        of_expert = jnp.all(stored.action == expert, axis=-1)  # (B,)
-        own = self.learner.act(state.agent, start, jax.random.fold_in(key, 1))  # (B, A)
-        return jnp.where(of_expert[:, None], own, stored.action)
+        own = self.learner.act(state.agent, start, jax.random.fold_in(key, 1)).action  # (B, A)
+        return jnp.where(stored.by_expert[:, None], own, stored.action)
 
     def with_expert(self, batch: Transition, stored: Experience, index: Array) -> Transition:
         """Return a batch whose first rows are the expert's answers, from the same starts to the same goals.
 
-        `index` (B,) tells which demonstrated positions are the goals of the B transitions `stored`.
+        `index` (B,) gives the demonstrated positions that are the goals of the B transitions `stored`.
         """
         n = self.n_expert
         goal = self.positions[index[:n]]  # (n, 6)
         reward, reached, _ = rewards.reward(
-            goal, goal, stored.n_steps[:n], jnp.zeros(n, bool), self.config.env.reward
+            goal, goal, stored.n_steps[:n], jnp.zeros(n, bool), self.env.config.reward
         )
         expert = Transition(
             obs=self.env.observe(stored.pose[:n], goal),

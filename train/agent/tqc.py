@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import jax
@@ -20,25 +20,24 @@ import optax
 from jax import Array
 
 from mjx_softarm._support import draws
-from train.agent.learner import check_same_shapes
+from train.agent.hindsight import HindsightConfig
+from train.agent.learner import ReplayConfig, Transition, check_same_shapes, check_settings
 from train.agent.losses import actor_loss, alpha_loss, quantile_huber_loss, truncated_targets
 from train.agent.networks import Actor, Critics, mode, sample_action, squash, widened
 
 Params = Any  # a flax parameter tree
 
 
-GIVEN_LOG_STD = -4.0  # of the noise before tanh with which an actor that is given begins to explore
+GIVEN_LOG_STD = -4.0  # initial exploration noise of a pretrained actor: log standard deviation before tanh
 
 
 @dataclass(frozen=True)
-class TQCConfig:
+class TQCConfig(ReplayConfig):
     """Hyperparameters, by default stable-baselines3-contrib's. Raises ValueError naming a bad field."""
 
-    # Fields that may be traced numbers, so that members of a sweep may differ in them.
-    NUMBERS = ("learning_rate", "learning_rate_alpha", "gamma", "tau", "initial_alpha")
-    NUMBERS += ("target_entropy", "reward_scale")
+    VARIABLE = ("learning_rate", "learning_rate_alpha", "gamma", "tau", "initial_alpha", "target_entropy")
+    VARIABLE += ("reward_scale", *(f"hindsight.{name}" for name in HindsightConfig.VARIABLE))
 
-    hidden_actor: tuple[int, ...] = (256, 256)  # widths of the actor's hidden layers
     hidden_critic: tuple[int, ...] = (256, 256)  # widths of each critic's hidden layers
     n_critics: int = 2  # number of critics
     n_quantiles: int = 25  # quantiles per critic
@@ -52,8 +51,11 @@ class TQCConfig:
     initial_alpha: float = 1.0  # initial temperature
     target_entropy: float | None = None  # target entropy [nat]; None is minus the number of actions
     reward_scale: float = 1.0  # factor on every reward in the critics' targets
+    hindsight: HindsightConfig = field(default_factory=HindsightConfig)
+    """relabelled goals, as shares of a batch; the rest keeps its own goals"""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         required = {
             "hidden_critic": (len(self.hidden_critic) > 0, "at least one layer"),
             "n_critics": (self.n_critics > 0, "a positive number"),
@@ -64,19 +66,7 @@ class TQCConfig:
             "tau": (0.0 < self.tau <= 1.0, "a number in (0, 1]"),
             "initial_alpha": (self.initial_alpha > 0.0, "a positive number"),
         }
-        for name, (holds, expected) in required.items():
-            if not holds:
-                raise ValueError(f"TQCConfig.{name}: got {getattr(self, name)}, expected {expected}")
-
-
-class Transition(NamedTuple):
-    """A batch of steps. Truncation is absent by design: a step cut by the clock bootstraps like any other."""
-
-    obs: Array  # (B, O)
-    action: Array  # (B, A) in [-1, 1]
-    reward: Array  # (B,)
-    next_obs: Array  # (B, O) reached by the action, before any reset
-    terminated: Array  # (B,) float: 1 where the next value is zero, else 0
+        check_settings("learner", self, required)
 
 
 class TQCState(NamedTuple):
@@ -98,21 +88,15 @@ _NETWORKS |= {"log_alpha": "log_alpha"}
 
 
 class TQC:
-    """Networks and optimisers of fixed structure, and pure functions of a `TQCState`.
+    """Networks and optimisers of fixed structure, and pure functions of a `TQCState`."""
 
-    `n_updates` is the length of the learning rate's decay, needed where it decays.
-    """
-
-    def __init__(
-        self, obs_size: int, action_size: int, config: TQCConfig = TQCConfig(), n_updates: int | None = None
-    ) -> None:
+    def __init__(self, obs_size: int, action_size: int, config: TQCConfig = TQCConfig()) -> None:
         self.obs_size, self.action_size, self.config = obs_size, action_size, config
-        self.actor: Any = Actor(action_size, config.hidden_actor)
+        self.actor: Any = Actor(action_size, config.hidden)
         self.critics: Any = Critics(
             config.n_critics, config.n_quantiles, config.hidden_critic, config.layer_norm
         )
-        rate = _learning_rate(config, n_updates)
-        self.optimizer = optax.adam(rate)
+        self.optimizer = optax.adam(_learning_rate(config))
         self.alpha_optimizer = optax.adam(config.learning_rate_alpha)
         self.target_entropy = -float(action_size) if config.target_entropy is None else config.target_entropy
 
@@ -250,12 +234,11 @@ class TQC:
                 raise ValueError(f"Transition.{name}: got shape {value.shape}, expected {expected}")
 
 
-def _learning_rate(config: TQCConfig, n_updates: int | None) -> float | optax.Schedule:
+def _learning_rate(config: TQCConfig) -> float | optax.Schedule:
     if config.learning_rate_end == 1.0:
         return config.learning_rate
-    if n_updates is None:
-        raise ValueError("TQC: got n_updates None, expected a number, since learning_rate_end is not 1")
-    return optax.cosine_decay_schedule(config.learning_rate, n_updates, config.learning_rate_end)
+    decay = optax.cosine_decay_schedule
+    return decay(config.learning_rate, config.n_decay_updates, config.learning_rate_end)
 
 
 def _descend(

@@ -4,7 +4,7 @@ An episode goes from one position to another. Starts are all of them; goals of t
 them, those of later stages more. Between epochs, goals shift to the positions with the largest errors.
 
 An arm in motion needs more than a pose to begin with: it starts at rest under a demonstrated action. Half of
-the episodes start at the position that was shown before their goal, as the arm will go.
+the episodes start at the position that was shown before their goal, in the order of the demonstration.
 """
 
 from __future__ import annotations
@@ -21,12 +21,13 @@ from mjx_softarm._support import draws, xla
 from mjx_softarm._support.mjx import State
 from mjx_softarm.env import Randomisation, ReachEnv
 from mjx_softarm.mechanics.workspace import Pool
-from train.config import ConfigError, ImitationConfig
+from train.agent.imitation import ImitationConfig
+from train.config import ConfigError
 from train.demos.demonstrations import Demonstrations
 from train.epoch.job import Job, TrainState
 
-EVEN_SHARE = 0.5  # of the goals that are drawn evenly, however well they are reached
-NEXT_SHARE = 0.5  # of the episodes in motion that start at the position shown before their goal
+EVEN_SHARE = 0.5  # share of the goals that is drawn evenly, however well they are reached
+NEXT_SHARE = 0.5  # share of the episodes in motion that start at the position shown before their goal
 
 
 class DemonstratedGoals:
@@ -36,7 +37,7 @@ class DemonstratedGoals:
         self.config, self.env = config, env
         self.positions = jnp.asarray(demonstrations.positions)  # (m, 6) [mm, deg]
         self.before = jnp.asarray(shown_before(demonstrations.sequence))  # (m,)
-        self.rests = rests(env, demonstrations.actions) if env.config.moves else None
+        self.static_poses = static_poses(env, demonstrations.actions) if env.config.moves else None
 
     def init(self) -> Array:
         """Return the weights of the first stage."""
@@ -48,12 +49,12 @@ class DemonstratedGoals:
         arm, n = arms.pipeline_state, len(arms.obs)
         start = jax.random.randint(key_start, (n,), 0, len(self.positions))
         goal = jax.random.categorical(key_goal, jnp.log(state), shape=(n,))
-        if self.rests is None:
+        if self.static_poses is None:
             fresh = arm._replace(pose=self.positions[start], goal=self.positions[goal])
         else:
             follows = draws.uniform(jax.random.fold_in(key_start, 1), (n,)) < NEXT_SHARE
             start = jnp.where(follows, self.before[goal], start)
-            at_start = jax.tree.map(lambda x: x[start], self.rests)
+            at_start = jax.tree.map(lambda x: x[start], self.static_poses)
             fresh = jax.vmap(self.env.put)(arm, at_start)._replace(goal=self.positions[goal])
         new = arm.n_steps == 0
         arm = jax.tree.map(lambda x, y: jnp.where(new.reshape((-1,) + (1,) * (x.ndim - 1)), x, y), fresh, arm)
@@ -81,8 +82,8 @@ class DemonstratedGoals:
         return state._replace(goals=jnp.asarray(goal_weights(error_mm, self.of_stage(epoch))))
 
 
-def rests(env: ReachEnv, actions: np.ndarray) -> Pool:
-    """Return the rests of the nominal arm under actions (m, n_chambers) in [-1, 1].
+def static_poses(env: ReachEnv, actions: np.ndarray) -> Pool:
+    """Return the static poses of the nominal arm under actions (m, n_chambers) in [-1, 1].
 
     Raises:
         ConfigError: the arm does not come to rest under one of them.

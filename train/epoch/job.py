@@ -20,8 +20,8 @@ from mjx_softarm._support import draws, xla
 from mjx_softarm._support.mjx import State
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.env.vector import VectorEnv
-from train.agent.learner import Experience, Learner
-from train.config import ConfigError, TrainConfig
+from train.agent.learner import Experience, Explored, Learner, LearnerConfig
+from train.config import ConfigError
 from train.epoch import replay
 from train.epoch.devices import everywhere, split, spread
 
@@ -57,12 +57,10 @@ class TrainState(NamedTuple):
 
     arms: Any  # State of n_arms, None where the learner has its own
     learner: Any  # state of the learner
-    memory: Any  # Replay of Experience, None where the learner has its own arms
+    memory: Any  # Ring of Experience, None where the learner has its own arms
     goals: Any  # state of the goals' distribution
     key: Array
-    n_env_steps: Array  # () int32 actions taken, invalid ones included
-    n_updates: Array  # () int32 gradient steps taken
-    n_unsettled: Array  # () int32 arms that were masked and reset
+    n_epochs: Array  # () int32 epochs done; counts of env steps would overflow within hours
 
 
 class Job:
@@ -74,17 +72,19 @@ class Job:
 
     def __init__(
         self,
-        config: TrainConfig,
+        config: LearnerConfig,
         env: ReachEnv,
         learner: Learner,
         goals: Goals | None = None,
         mesh: Mesh | None = None,
     ):
-        self.config, self.env, self.learner, self.mesh = config, env, learner, mesh
+        self.config: Any = config  # a ReplayConfig where the learner has no arms of its own
+        self.env, self.learner, self.mesh = env, learner, mesh
         self.goals = goals or WorkspaceGoals()
-        self.arms = VectorEnv(env, config.n_arms, config.episode_length, mesh)
+        if not learner.own_arms:
+            self.arms = VectorEnv(env, config.n_arms, self.config.episode_length, mesh)
         self.n_traces = 0
-        self.sharding = None if mesh is None else _sharding(config, mesh, bool(learner.own_arms))
+        self.sharding = None if mesh is None else _sharding(self.config, mesh, learner.own_arms)
         results = None if mesh is None else (self.sharding, everywhere(mesh))
         self.init = xla.jit(self.first, env.uses_mjx, out_shardings=self.sharding)
         self.epoch = xla.jit(self.advance, env.uses_mjx, donate_argnums=0, out_shardings=results)
@@ -129,22 +129,15 @@ class Job:
         """Return the state that a run begins with; `init` is this, jitted."""
         key, key_arms, key_learner, key_goals = jax.random.split(key, 4)
         goals, arms, memory = self.goals.init(), None, None
+        learner = self.learner.init(key_learner)
         if not self.learner.own_arms:
+            # Arms at their first starts, and an empty replay of the transitions that they will make.
             arms = self.goals.begin(goals, self.arms.reset(key_arms), key_goals)
-            action = jnp.zeros((self.arms.n, self.env.action_size))
-            experience = jax.eval_shape(lambda: self._experience(arms, action, arms))
+            explored = jax.eval_shape(self.learner.act, learner, arms.obs, key)
+            experience = jax.eval_shape(self._experience, arms, explored, arms)
             one = jax.tree.map(lambda x: jnp.zeros(x.shape[1:], x.dtype), experience)
             memory = replay.create(one, self.config.replay_capacity)
-        return TrainState(
-            arms=arms,
-            learner=self.learner.init(key_learner),
-            memory=memory,
-            goals=goals,
-            key=key,
-            n_env_steps=jnp.zeros((), jnp.int32),
-            n_updates=jnp.zeros((), jnp.int32),
-            n_unsettled=jnp.zeros((), jnp.int32),
-        )
+        return TrainState(arms, learner, memory, goals, key, n_epochs=jnp.zeros((), jnp.int32))
 
     def advance(self, state: TrainState) -> tuple[TrainState, dict[str, Array]]:
         """Move every arm by `vector_steps_per_epoch` actions, with their updates; `epoch` is this, jitted.
@@ -155,54 +148,50 @@ class Job:
         self.n_traces += 1
         with draws.on(self.mesh):
             step = self._own_step if self.learner.own_arms else self._vector_step
-            state, metrics = jax.lax.scan(step, state, None, length=self.config.vector_steps_per_epoch)
+            n_steps = self.config.vector_steps_per_epoch
+            state, metrics = jax.lax.scan(step, state, jnp.arange(n_steps), length=n_steps)
         unsettled = jnp.sum(metrics.pop("env/unsettled")) * self.config.n_arms
+        state = state._replace(n_epochs=state.n_epochs + 1)
         return state, {**jax.tree.map(jnp.mean, metrics), "env/unsettled": unsettled}
 
     def _own_step(self, state: TrainState, _) -> tuple[TrainState, dict[str, Array]]:
         """Take one update of a learner that steps arms of its own."""
         key, key_update = jax.random.split(state.key)
         learner, metrics = self.learner.update(state.learner, _no_replay, key_update)
-        n_arms = self.learner.own_arms
-        n_unsettled = jnp.round(n_arms * metrics["env/unsettled"]).astype(jnp.int32)
-        state = state._replace(
-            learner=learner,
-            key=key,
-            n_env_steps=state.n_env_steps + n_arms,
-            n_updates=state.n_updates + 1,
-            n_unsettled=state.n_unsettled + n_unsettled,
-        )
-        return state, metrics
+        return state._replace(learner=learner, key=key), metrics
 
-    def _vector_step(self, state: TrainState, _) -> tuple[TrainState, dict[str, Array]]:
-        """Take one action of every arm, and the updates that follow it."""
+    def _vector_step(self, state: TrainState, step: Array) -> tuple[TrainState, dict[str, Array]]:
+        """Take one action of every arm, and the updates that follow it; `step` () counts within the epoch."""
         key, key_act, key_random, key_reset, key_updates, key_goals = jax.random.split(state.key, 6)
 
         # Act: uniformly at random during warm-up, then as the learner explores.
-        warmed_up = state.n_env_steps >= self.config.warmup_env_steps
-        explored = draws.uniform(key_random, (self.arms.n, self.env.action_size), minval=-1.0)
-        action = self.learner.act(state.learner, state.arms.obs, key_act)  # (n_arms, n_chambers)
-        action = jnp.where(warmed_up, action, explored)
+        warmed_up = self._warmed_up(state.n_epochs, step)
+        uniform = draws.uniform(key_random, (self.arms.n, self.env.action_size), minval=-1.0)
+        explored = self.learner.act(state.learner, state.arms.obs, key_act)
+        explored = Explored(
+            action=jnp.where(warmed_up, explored.action, uniform),  # (n_arms, n_chambers)
+            by_expert=None if explored.by_expert is None else warmed_up & explored.by_expert,
+        )
 
         # Step the arms; where an episode ended, begin the next one.
-        arms, after, outcome = self.arms.step(state.arms, action, key_reset)
+        arms, after, outcome = self.arms.step(state.arms, explored.action, key_reset)
         arms = self.goals.begin(state.goals, arms, key_goals)
 
         # Store what is valid and finite.
-        experience = self._experience(state.arms, action, after)
+        experience = self._experience(state.arms, explored, after)
         valid = outcome.valid & replay.finite_rows(experience)  # (n_arms,)
-        state = state._replace(
-            arms=arms,
-            memory=replay.add(state.memory, experience, valid),
-            key=key,
-            n_env_steps=state.n_env_steps + self.arms.n,
-            n_unsettled=state.n_unsettled + jnp.sum(~valid, dtype=jnp.int32),
-        )
+        memory = replay.add(state.memory, experience, valid)
+        state = state._replace(arms=arms, memory=memory, key=key)
 
         # Learn.
         state, losses = self.learn(state, key_updates, warmed_up)
         env_metrics = {f"env/{name}": jnp.mean(value) for name, value in after.metrics.items()}
         return state, env_metrics | losses
+
+    def _warmed_up(self, n_epochs: Array, step: Array) -> Array:
+        """Return whether warm-up is over before an action of all arms: () bool."""
+        epochs, steps = divmod(self.config.n_warmup_vector_steps, self.config.vector_steps_per_epoch)
+        return (n_epochs > epochs) | ((n_epochs == epochs) & (step >= steps))
 
     def learn(self, state: TrainState, key: Array, warmed_up: Array) -> tuple[TrainState, dict[str, Array]]:
         """Take the updates of one vector step, none before the end of warm-up.
@@ -225,19 +214,18 @@ class Job:
         shapes = jax.eval_shape(run, state.learner)[1]
         nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
         learner, metrics = jax.lax.cond(warmed_up, run, lambda learner: (learner, nothing), state.learner)
-        n_updates = state.n_updates + jnp.where(warmed_up, len(keys), 0)
-        return state._replace(learner=learner, n_updates=n_updates), metrics
+        return state._replace(learner=learner), metrics
 
-    def _experience(self, before: State, action: Array, after: State) -> Experience:
+    def _experience(self, before: State, explored: Explored, after: State) -> Experience:
         """Return the transitions of n arms as they are stored."""
         start, end = before.pipeline_state, after.pipeline_state
         sensed_action = self.env.action_of(end.spring_m + end.sensor_offset_m)
-        if self.config.env.moves:  # the arm moves on: the other references still count
-            sensed_action = jnp.where(after.info["blocked"], sensed_action, action)
+        if self.env.config.moves:  # the arm moves on: the other references still count
+            sensed_action = jnp.where(after.info["blocked"], sensed_action, explored.action)
         return Experience(
             pose=start.pose,
             goal=start.goal,
-            action=action,
+            action=explored.action,
             next_pose=end.pose,
             sensed_action=sensed_action,
             saturated=after.info["saturated"],
@@ -245,6 +233,7 @@ class Job:
             n_steps=end.n_steps,
             sensed=start.sensed,
             next_sensed=end.sensed,
+            by_expert=explored.by_expert,
         )
 
 
@@ -252,15 +241,15 @@ def _no_replay(key: Array) -> Experience:
     raise TypeError("sample: got a call, expected none by a learner that steps arms of its own")
 
 
-def _sharding(config: TrainConfig, mesh: Mesh, own_arms: bool) -> TrainState:
+def _sharding(config: Any, mesh: Mesh, own_arms: bool) -> TrainState:
     """Return where the parts of a state are, as a prefix of its tree."""
-    for name in ("n_arms", "replay_capacity", "batch_size"):
+    for name in ("n_arms", *(() if own_arms else ("replay_capacity", "batch_size"))):
         if getattr(config, name) % mesh.size:
             raise ConfigError(
-                f"{name}: got {getattr(config, name)}, expected a multiple of the {mesh.size} devices"
+                f"learner.{name}: got {getattr(config, name)}, expected a multiple of the {mesh.size} devices"
             )
     on_all, rows = cast(Any, everywhere(mesh)), split(mesh)  # in the places of arrays
     everything: dict[str, Any] = dict.fromkeys(TrainState._fields, on_all)
     everything["arms"] = None if own_arms else rows
-    everything["memory"] = None if own_arms else replay.Replay(data=rows, position=on_all, size=on_all)
+    everything["memory"] = None if own_arms else replay.Ring(data=rows, position=on_all, size=on_all)
     return TrainState(**everything)

@@ -17,7 +17,7 @@ from mjx_softarm._support import draws
 Items = Any  # a pytree of arrays sharing a leading axis
 
 
-class Replay(NamedTuple):
+class Ring(NamedTuple):
     """Ring of N = capacity slots, of which 0 ... size - 1 are filled."""
 
     data: Items  # leaves (N, ...)
@@ -25,7 +25,7 @@ class Replay(NamedTuple):
     size: Array  # () int32, filled slots
 
 
-def create(example_item: Items, capacity: int) -> Replay:
+def create(example_item: Items, capacity: int) -> Ring:
     """Return an empty ring.
 
     Args:
@@ -39,7 +39,7 @@ def create(example_item: Items, capacity: int) -> Replay:
         raise ValueError(f"Replay capacity: got {capacity}, expected at least 1")
     item = jax.eval_shape(lambda x: x, example_item)
     data = jax.tree.map(lambda leaf: jnp.zeros((capacity, *leaf.shape), leaf.dtype), item)
-    return Replay(data, position=jnp.zeros((), jnp.int32), size=jnp.zeros((), jnp.int32))
+    return Ring(data, position=jnp.zeros((), jnp.int32), size=jnp.zeros((), jnp.int32))
 
 
 def finite_rows(items: Items) -> Array:
@@ -55,7 +55,7 @@ def finite_rows(items: Items) -> Array:
     return jnp.all(jnp.stack(rows), axis=0)
 
 
-def add(replay: Replay, items: Items, valid: Array) -> Replay:
+def add(replay: Ring, items: Items, valid: Array) -> Ring:
     """Append the valid rows in order, over the oldest ones once the ring is full.
 
     Args:
@@ -76,14 +76,14 @@ def add(replay: Replay, items: Items, valid: Array) -> Replay:
     slot = jnp.where(valid, (replay.position + rank) % capacity, capacity)  # (B,)
     data = jax.tree.map(lambda ring, rows: ring.at[slot].set(rows, mode="drop"), replay.data, items)
     n_valid = jnp.sum(valid, dtype=jnp.int32)
-    return Replay(
+    return Ring(
         data,
         position=(replay.position + n_valid) % capacity,
         size=jnp.minimum(replay.size + n_valid, capacity),
     )
 
 
-def sample(replay: Replay, key: Array, batch_size: int) -> Items:
+def sample(replay: Ring, key: Array, batch_size: int) -> Items:
     """Draw items uniformly, with replacement, from the filled slots.
 
     The fill is known only at run time, so an empty ring cannot raise here: it yields zeros. Fill it first.
@@ -100,7 +100,7 @@ def sample(replay: Replay, key: Array, batch_size: int) -> Items:
     return jax.tree.map(lambda ring: ring[slot], replay.data)
 
 
-def thin(replay: Replay, key: Array, share: Array) -> Replay:
+def thin(replay: Ring, key: Array, share: Array) -> Ring:
     """Return the ring with a random share of its items, oldest first, for a stage with other goals.
 
     Args:
@@ -117,10 +117,10 @@ def thin(replay: Replay, key: Array, share: Array) -> Replay:
     kept = jnp.argsort(jnp.argsort(priority)) < n_kept  # (N,)
     order = jnp.argsort(jnp.where(kept, age, capacity + age))  # (N,)
     data = jax.tree.map(lambda leaf: leaf[order], replay.data)
-    return Replay(data, position=n_kept % capacity, size=n_kept)
+    return Ring(data, position=n_kept % capacity, size=n_kept)
 
 
-def _check(replay: Replay, items: Items, valid: Array) -> int:
+def _check(replay: Ring, items: Items, valid: Array) -> int:
     """Check structure, shapes and dtypes of what `add` gets; return the capacity."""
     expected_tree, got_tree = jax.tree.structure(replay.data), jax.tree.structure(items)
     if expected_tree != got_tree:

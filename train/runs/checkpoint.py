@@ -18,7 +18,8 @@ from mjx_softarm.logs.pose_pairs import PosePairs, write_pose_pairs
 from mjx_softarm.logs.schema import Log, write_log
 from mjx_softarm.sensing.s2r import S2R, S2R_FILE, load_s2r, save_s2r
 from mjx_softarm.spec import ArmSpec
-from train.config import ImitationConfig, TrainConfig, from_dict, to_dict
+from train.agent.registry import LEARNERS, name_of
+from train.config import TrainConfig, from_dict, to_dict
 from train.demos.demonstrations import Demonstrations, load_demonstrations
 from train.epoch.devices import is_first_process, wait_for_all
 from train.epoch.job import TrainState
@@ -134,7 +135,7 @@ class Run:
         Raises:
             RunError: its file cannot be read.
         """
-        if not isinstance(self.config, ImitationConfig):
+        if not LEARNERS[name_of(self.config.learner)].from_demonstrations:
             return None
         try:
             return load_demonstrations(self.path / DEMONSTRATIONS_FILE, self.spec)

@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Self, cast
 
 import tyro
 from jax.sharding import Mesh
@@ -18,11 +18,12 @@ from mjx_softarm._support import cli
 from mjx_softarm._support.provenance import write_json
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.export.write import export_cpp, export_onnx
-from train.config import ConfigError, ImitationConfig, TrainConfig
+from train.agent.imitation import ImitationConfig
+from train.config import ConfigError, TrainConfig
 from train.demos.demonstrations import from_log, read_demonstrations
 from train.epoch import devices
-from train.options import NewRunOptions, named_preset, start
-from train.presets import IMITATION_PRESETS, PRESETS
+from train.options import NewRunOptions, ReachOptions, named, start
+from train.presets import IMITATION_PRESETS
 from train.runs import run as runs
 from train.runs.arm_model import arm_model
 from train.runs.checkpoint import Run, RunError
@@ -39,20 +40,12 @@ Devices = Annotated[str | None, tyro.conf.DisallowNone, tyro.conf.arg(metavar="D
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reach(NewRunOptions):
+class Reach(ReachOptions):
     """Train a policy that reaches poses of the workspace."""
 
-    preset: Annotated[str, cli.one_of(PRESETS)] = "quick"
-    """settings to begin with; the defaults below are this preset's"""
-    config: Annotated[TrainConfig, tyro.conf.arg(name="")]
     agent: cli.MaybePath = None
     """run whose actor and critics this one begins with; in motion, whose policy. Its layers are taken, too"""
     devices: Devices = None
-
-    @classmethod
-    def default(cls, arguments: Sequence[str]) -> Self:
-        preset = named_preset(arguments, PRESETS, "quick")
-        return cls(preset=preset, config=PRESETS[preset])
 
     def __call__(self) -> int:
         console = start()
@@ -82,10 +75,9 @@ class Imitate(NewRunOptions):
     file: tyro.conf.Positional[cli.MaybePath] = None
     """demonstrations as `demos record` writes them"""
     preset: Annotated[str, cli.one_of(IMITATION_PRESETS)] = "pipe"
-    """settings to begin with. pipe: the learned reward; pipe-moving: likewise, on arms in motion; circle:
-    both, in two stages; hand-made: the environment's reward at the same goals; frozen: that and another run's
-    learned reward, with --reward"""
-    config: Annotated[ImitationConfig, tyro.conf.arg(name="")]
+    """settings to begin with. pipe: the learned reward; pipe-moving: the learned reward on arms in motion;
+    circle: the learned reward and the environment's, in two stages"""
+    config: Annotated[TrainConfig, tyro.conf.arg(name="")]
     agent: cli.MaybePath = None
     """run whose actor and critics this one begins with. The actor's layers are taken, too"""
     reward: cli.MaybePath = None
@@ -94,7 +86,7 @@ class Imitate(NewRunOptions):
 
     @classmethod
     def default(cls, arguments: Sequence[str]) -> Self:
-        preset = named_preset(arguments, IMITATION_PRESETS, "pipe")
+        preset = named(arguments, "--preset", IMITATION_PRESETS, "pipe")
         return cls(preset=preset, config=IMITATION_PRESETS[preset])
 
     def __call__(self) -> int:
@@ -105,13 +97,16 @@ class Imitate(NewRunOptions):
             return _resume(self.resume, mesh, console)
         if self.file is None:
             raise ConfigError("FILE: got nothing, expected the demonstrations, or --resume RUN")
-        config = dataclasses.replace(self.config, frozen=self.config.frozen or self.reward is not None)
-        if config.frozen and not self.reward:
+        learner = cast(ImitationConfig, self.config.learner)
+        learner = dataclasses.replace(learner, frozen=learner.frozen or self.reward is not None)
+        if learner.frozen and not self.reward:
+            expected = "--reward RUN, the run whose learned reward it takes"
+            raise ConfigError(f"learner.frozen: got true, expected {expected}")
+        if self.reward and not learner.learned_weight:
             raise ConfigError(
-                "frozen: got true, expected --reward RUN, the run whose learned reward it takes"
+                f"learner.learned_weight: got 0 with --reward {self.reward}, expected more, for its reward"
             )
-        if self.reward and not config.learned_weight:
-            raise ConfigError(f"--reward {self.reward}: got learned_weight 0, expected more, for its reward")
+        config = dataclasses.replace(self.config, learner=learner)
         spec, s2r = self.read_arm(console)
         log, _ = read_demonstrations(self.file, spec)
         donors = {name: path for name in ("agent", "reward") if (path := getattr(self, name))}

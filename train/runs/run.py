@@ -18,6 +18,7 @@ from tensorboardX import SummaryWriter
 
 from mjx_softarm._support.provenance import write_json
 from mjx_softarm.env import ReachEnv
+from train.agent.learner import LearnerConfig
 from train.config import TrainConfig
 from train.epoch.devices import any_process, is_first_process
 from train.epoch.job import TrainState
@@ -49,27 +50,27 @@ def train(run: Run, task: Task, console: Console) -> Any:
     with asked_to_stop() as asked:
         epoch, state = _begin(run, task, console)
         run.rewind(epoch)
-        with open_board(run, state) as board, shown_progress(config, epoch, console) as show:
-            while epoch < config.n_epochs:
-                state, metrics = timed_epoch(task.job, task.prepare(state, epoch))
+        with open_board(run, epoch) as board, shown_progress(config, epoch, console) as show:
+            while epoch < config.learner.n_epochs:
+                state, metrics = timed_epoch(task.job, task.prepare(state, epoch), config.learner, epoch)
                 row = {name: float(value) for name, value in metrics.items()}
                 epoch += 1
                 refuse_divergence(config, row["env/unsettled"])
                 stop, due = any_process(bool(asked)), config.evaluates_after(epoch)
                 if due:
                     row |= evaluation(run, task, task.job.policy(state))
-                record(run, board, epoch, counts(state), row)
+                record(run, board, epoch, row)
                 if due or stop:
                     run.save(epoch, state, task.job.parts(state))
                 show(epoch, _line(task, row), due)
-                if stop and epoch < config.n_epochs:
+                if stop and epoch < config.learner.n_epochs:
                     raise Interrupted(f"stopped after epoch {epoch}; continue with --resume {run.path}")
     return finish(run, task, task.job.policy(state))
 
 
 def refuse_divergence(config: TrainConfig, n_unsettled: float) -> None:
     """Raise RunError where most of an epoch's actions of arms in motion led to no finite state."""
-    n_actions = config.n_arms * config.vector_steps_per_epoch
+    n_actions = config.learner.n_env_steps(1)
     if config.env.moves and n_unsettled > n_actions / 2:
         raise RunError(
             f"env.simulation_step_s: got {config.env.simulation_step_s:g}, with which {n_unsettled:.0f} of "
@@ -88,7 +89,7 @@ def _begin(run: Run, task: Task, console: Console) -> tuple[int, TrainState]:
 
     epoch, state = task.job.start(first)
     if epoch:
-        console.print(f"continuing after epoch {epoch} of {run.config.n_epochs}")
+        console.print(f"continuing after epoch {epoch} of {run.config.learner.n_epochs}")
     return epoch, state
 
 
@@ -136,21 +137,22 @@ def begin_with(task: Task, seed: int, donors: Mapping[str, Run]) -> tuple[TrainS
     return (state := task.job.place(state)), task.job.parts(state)
 
 
-def open_board(run: Run, state: TrainState) -> SummaryWriter:
-    """Return TensorBoard's writer; events of a stopped run later than its checkpoint are dropped."""
-    steps = int(state.n_env_steps)
-    purge_step = steps + 1 if steps else None
+def open_board(run: Run, epoch: int) -> SummaryWriter:
+    """Return TensorBoard's writer; events of a stopped run later than an epoch are dropped."""
+    purge_step = run.config.learner.n_env_steps(epoch) + 1 if epoch else None
     return SummaryWriter(str(run.path), purge_step=purge_step, write_to_disk=is_first_process())
 
 
-def timed_epoch(job: Any, state: TrainState) -> tuple[TrainState, dict[str, Any]]:
+def timed_epoch(
+    job: Any, state: TrainState, learner: LearnerConfig, epoch: int
+) -> tuple[TrainState, dict[str, Any]]:
     """Return the next state of a job, or of a sweep's, and its metrics with the speeds of one run."""
-    start, before = time.perf_counter(), counts(state)
+    start = time.perf_counter()
     state, metrics = job.epoch(state)
     metrics = jax.device_get(metrics)
-    seconds = time.perf_counter() - start
-    speeds = {f"speed/{name}_per_s": (n - before[name]) / seconds for name, n in counts(state).items()}
-    return state, metrics | speeds
+    seconds, before = time.perf_counter() - start, counts(learner, epoch)
+    done = {name: n - before[name] for name, n in counts(learner, epoch + 1).items()}
+    return state, metrics | {f"speed/{name}_per_s": n / seconds for name, n in done.items()}
 
 
 def evaluation(run: Run, task: Task, policy: Any) -> dict[str, float]:
@@ -161,13 +163,14 @@ def evaluation(run: Run, task: Task, policy: Any) -> dict[str, float]:
     return {f"evaluation/{name}": x for name, x in figures.items() if not isinstance(x, tuple)}
 
 
-def counts(state: TrainState) -> dict[str, int]:
-    """Return one run's numbers of env steps and updates so far, named as in a row of metrics."""
-    return {"env_steps": int(state.n_env_steps), "updates": int(np.max(state.n_updates))}
+def counts(learner: LearnerConfig, epoch: int) -> dict[str, int]:
+    """Return the numbers of env steps and updates by the end of an epoch, named as in a row of metrics."""
+    return {"env_steps": learner.n_env_steps(epoch), "updates": learner.n_updates(epoch)}
 
 
-def record(run: Run, board: SummaryWriter, epoch: int, done: dict[str, int], row: dict[str, float]) -> None:
+def record(run: Run, board: SummaryWriter, epoch: int, row: dict[str, float]) -> None:
     """Add a row to the run's metrics and to TensorBoard's."""
+    done = counts(run.config.learner, epoch)
     run.log({"epoch": epoch, **done, **row})
     for name, value in row.items():
         board.add_scalar(name, np.float32(value), done["env_steps"])
@@ -190,12 +193,12 @@ def shown_progress(
     columns += (TextColumn("{task.fields[text]}"),)
     hidden = not console.is_terminal
     with Progress(*columns, console=console, speed_estimate_period=120, disable=hidden) as progress:
-        bar = progress.add_task("training", total=config.n_epochs, completed=epoch, text="")
+        bar = progress.add_task("training", total=config.learner.n_epochs, completed=epoch, text="")
 
         def show(epoch: int, text: str, due: bool) -> None:
             progress.update(bar, completed=epoch, text=text)
             if due and hidden:
-                console.print(f"epoch {epoch} of {config.n_epochs}: {text}", highlight=False)
+                console.print(f"epoch {epoch} of {config.learner.n_epochs}: {text}", highlight=False)
 
         yield show
 

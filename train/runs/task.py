@@ -7,17 +7,16 @@ epoch.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, cast
 
 from jax.sharding import Mesh
 from matplotlib.figure import Figure
 
 from mjx_softarm.env import ReachEnv
-from train.agent.analytic import Analytic
-from train.agent.hindsight_tqc import HindsightTQC
-from train.agent.imitation import Imitation
+from train.agent.imitation import ImitationConfig
 from train.agent.learner import Learner
-from train.config import ImitationConfig, TrainConfig
+from train.agent.registry import World, learner_of
+from train.config import TrainConfig
 from train.demos.demonstrations import Demonstrations
 from train.epoch.goals import DemonstratedGoals
 from train.epoch.job import Job, TrainState
@@ -50,13 +49,6 @@ class Task(NamedTuple):
     prepare: Callable[[TrainState, int], TrainState]  # state, epoch that follows -> state
 
 
-def learner_of(config: TrainConfig, env: ReachEnv, mesh: Mesh | None = None) -> Learner:
-    """Return the learner that a config of a reach run names."""
-    if config.learner == "analytic":
-        return Analytic(config.analytic, env, config.n_arms, mesh)
-    return HindsightTQC(config, env)
-
-
 def task_of(
     config: TrainConfig,
     env: ReachEnv,
@@ -69,17 +61,17 @@ def task_of(
     Args:
         config: of the run.
         env: of its arms.
-        demonstrations: to learn from; needed where the config is an `ImitationConfig`.
+        demonstrations: demonstrations to learn from, for a learner from demonstrations.
         mesh: devices to train on; None is one device.
         learner: another learner in the place of the config's.
 
     Raises:
         ConfigError: the run cannot be split evenly over the devices of the mesh.
     """
-    if isinstance(config, ImitationConfig):
-        assert demonstrations is not None
-        return _imitation(config, env, demonstrations, mesh, learner)
-    job = Job(config, env, learner or learner_of(config, env, mesh), mesh=mesh)
+    learner = learner or learner_of(config.learner, World(env, mesh, demonstrations))
+    if demonstrations is not None:
+        return _imitation(cast(ImitationConfig, config.learner), env, demonstrations, mesh, learner)
+    job = Job(config.learner, env, learner, mesh=mesh)
     return Task(
         job=job,
         title=f"{N_GOALS} held-out goals",
@@ -96,9 +88,8 @@ def _imitation(
     env: ReachEnv,
     demonstrations: Demonstrations,
     mesh: Mesh | None,
-    learner: Learner | None,
+    learner: Learner,
 ) -> Task:
-    learner = learner or Imitation(HindsightTQC(config, env), config, env, demonstrations)
     goals = DemonstratedGoals(config, env, demonstrations)
     job = Job(config, env, learner, goals, mesh)
     evaluate = PositionEvaluator(env, learner, demonstrations.positions, goals.of_stage(0))

@@ -7,15 +7,14 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated
 
 import tyro
 from rich.console import Console
 
 from mjx_softarm._support import cli
 from train.config import ConfigError, TrainConfig, override
-from train.options import NewRunOptions, named_preset, start
-from train.presets import PRESETS
+from train.options import ReachOptions, start
 from train.runs.lock import sole_trainer
 from train.runs.run import Interrupted, free_path
 from train.sweep.job import setting, variable
@@ -26,24 +25,16 @@ _WIDTH = 160  # width of the table where the output is no terminal
 
 
 @dataclass(frozen=True, kw_only=True)
-class SweepCommand(NewRunOptions):
+class SweepCommand(ReachOptions):
     """Train `reach` with several seeds and settings, all at once.
 
     --seeds and --vary replace the settings' own values.
     """
 
-    preset: Annotated[str, cli.one_of(PRESETS)] = "quick"
-    """settings to begin with; the defaults below are this preset's"""
-    config: Annotated[TrainConfig, tyro.conf.arg(name="")]
     seeds: cli.Integers = (0,)
     """seeds of each setting"""
     vary: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME=VALUE,...")] = ()
-    """train with each of these values, e.g. tqc.gamma=0.5,0.9; given several times, with each combination"""
-
-    @classmethod
-    def default(cls, arguments: Sequence[str]) -> Self:
-        preset = named_preset(arguments, PRESETS, "quick")
-        return cls(preset=preset, config=PRESETS[preset])
+    """train with each of these values, e.g. learner.gamma=0.5,0.9; several: with each combination"""
 
     def __call__(self) -> int:
         console = start()
@@ -80,7 +71,7 @@ def members_of(
         vary: NAME=VALUE,VALUE,... for each varied setting.
 
     Returns:
-        Configs by names such as `seed0-tqc.gamma=0.5`, and the names of the varied settings.
+        Configs by names such as `seed0-learner.gamma=0.5`, and the names of the varied settings.
 
     Raises:
         ConfigError: a setting is unknown or cannot be varied, a value cannot be used or comes twice.
@@ -94,9 +85,8 @@ def members_of(
         path = path.replace("-", "_")
         if path not in (numbers := variable(config)):
             raise ConfigError(
-                f"--vary {assignment}: got a setting that decides what is computed or on what shapes, or one "
-                f"that the learner {config.learner!r} does not read, expected NAME=VALUE,... for one of "
-                f"{', '.join(numbers)}"
+                f"--vary {assignment}: got a setting that decides what is computed or on what shapes, "
+                f"expected NAME=VALUE,... for one of {', '.join(numbers)}"
             )
         if path in values:
             raise ConfigError(f"--vary {assignment}: got {path} again, expected all its values in one")

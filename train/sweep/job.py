@@ -4,7 +4,7 @@ The members of a sweep share all that has a shape or decides what is computed. T
 differ are traced: one compilation serves all members and all values. `Job` is built anew inside the traced
 function, from a config that holds traced numbers, and knows nothing of sweeps.
 
-The members have one count of environment steps. A branch on a count of each member would compute both of its
+The members have one count of epochs. A branch on a count of each member would compute both of its
 sides, and warm-up would cost as much as learning.
 """
 
@@ -22,9 +22,9 @@ from jax import Array
 from mjx_softarm._support import xla
 from mjx_softarm.env import Randomisation, ReachEnv
 from mjx_softarm.mdp.rewards import RewardConfig
-from train.config import LEARNER_GROUPS, TrainConfig
+from train.agent.registry import World, learner_of
+from train.config import TrainConfig
 from train.epoch.job import Job, TrainState
-from train.runs.task import learner_of
 
 # Groups of settings of the environment that are plain numbers, and single ones.
 _ENV_GROUPS = {"env.reward": RewardConfig, "env.randomisation": Randomisation}
@@ -36,17 +36,17 @@ def variable(config: TrainConfig) -> tuple[str, ...]:
 
     The other settings decide what is computed, and on what shapes.
     """
-    names = {group: getattr(config, group).NUMBERS for group in LEARNER_GROUPS[config.learner]}
+    names = {"learner": config.learner.VARIABLE}
     for group, kind in _ENV_GROUPS.items():
         names[group] = tuple(field.name for field in dataclasses.fields(kind))
     return (*(f"{group}.{name}" for group, own in names.items() for name in own), *_ENV_NUMBERS)
 
 
-_AXES = TrainState(**{**dict.fromkeys(TrainState._fields, cast(Any, 0)), "n_env_steps": cast(Any, None)})
+_AXES = TrainState(**{**dict.fromkeys(TrainState._fields, cast(Any, 0)), "n_epochs": cast(Any, None)})
 
 
 def setting(config: Any, path: str) -> Any:
-    """Return the value of a setting such as `tqc.gamma`."""
+    """Return the value of a setting such as `learner.gamma`."""
     for name in path.split("."):
         config = getattr(config, name)
     return config
@@ -63,7 +63,7 @@ class SweepJob:
     """Fixed parts of the members, and functions that change the states of all of them.
 
     A state of a sweep is a `TrainState` whose arrays have an axis of n members in front, all but
-    `n_env_steps`. `n_traces` counts how often the epoch was traced: once in a sweep.
+    `n_epochs`. `n_traces` counts how often the epoch was traced: once in a sweep.
     """
 
     def __init__(self, configs: Sequence[TrainConfig], varied: Sequence[str], env: ReachEnv):
@@ -75,7 +75,7 @@ class SweepJob:
             env: environment of the first member.
         """
         self.config, self.env, self.n = configs[0], env, len(configs)
-        self.learner = learner_of(self.config, env)
+        self.learner = learner_of(self.config.learner, World(env))
         self.keys = jnp.stack([jax.random.PRNGKey(config.seed) for config in configs])
         self.numbers = {
             path: jnp.asarray([setting(config, path) for config in configs], jnp.float32) for path in varied
@@ -98,8 +98,8 @@ class SweepJob:
 
     def member(self, states: TrainState, k: int) -> TrainState:
         """Return the state of one member, as an ordinary run has it."""
-        own = self._take(states._replace(n_env_steps=None), k)
-        return own._replace(n_env_steps=states.n_env_steps)
+        own = self._take(states._replace(n_epochs=None), k)
+        return own._replace(n_epochs=states.n_epochs)
 
     def member_shapes(self) -> TrainState:
         """Return the shapes of a member's state."""
@@ -108,8 +108,8 @@ class SweepJob:
 
     def together(self, members: Sequence[TrainState]) -> TrainState:
         """Return the state of all members from the states of each."""
-        states = self._stack(*(own._replace(n_env_steps=None) for own in members))
-        return states._replace(n_env_steps=members[0].n_env_steps)
+        states = self._stack(*(own._replace(n_epochs=None) for own in members))
+        return states._replace(n_epochs=members[0].n_epochs)
 
     def _init(self, key: Array, numbers: Mapping[str, Array]) -> TrainState:
         return self._job(numbers).first(key)
@@ -123,7 +123,7 @@ class SweepJob:
         for path, number in numbers.items():
             config = _with_number(config, path, number)
         env = with_env_config(self.env, config.env)
-        return Job(config, env, learner_of(config, env))
+        return Job(config.learner, env, learner_of(config.learner, World(env)))
 
 
 def _with_number(config: Any, path: str, number: Array) -> Any:

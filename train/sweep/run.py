@@ -27,7 +27,6 @@ from train.runs.checkpoint import Run, RunError
 from train.runs.run import (
     Interrupted,
     asked_to_stop,
-    counts,
     evaluation,
     finish,
     open_board,
@@ -121,7 +120,7 @@ def train(sweep: Sweep, console: Console) -> None:
     job = SweepJob([run.config for run in sweep.runs], sweep.varied, env)
     tasks, config, epoch = _tasks(sweep, env), run.config, sweep.epoch
     if epoch:
-        console.print(f"continuing after epoch {epoch} of {config.n_epochs}")
+        console.print(f"continuing after epoch {epoch} of {config.learner.n_epochs}")
     states = _start(sweep, job, epoch)
     console.print("compiling (cached for the next start) ...")
     with (
@@ -129,25 +128,25 @@ def train(sweep: Sweep, console: Console) -> None:
         ExitStack() as stack,
         shown_progress(config, epoch, console) as show,
     ):
-        boards = [stack.enter_context(open_board(run, states)) for run in sweep.runs]
-        while epoch < config.n_epochs:
+        boards = [stack.enter_context(open_board(run, epoch)) for run in sweep.runs]
+        while epoch < config.learner.n_epochs:
             # Train an epoch; metrics without an axis of members are the same for all.
-            states, metrics = timed_epoch(job, states)
+            states, metrics = timed_epoch(job, states, config.learner, epoch)
             rows = [
                 {name: float(x[k] if np.ndim(x) else x) for name, x in metrics.items()} for k in range(job.n)
             ]
             epoch += 1
-            stop, due, done = bool(asked), config.evaluates_after(epoch), counts(states)
+            stop, due = bool(asked), config.evaluates_after(epoch)
             # Evaluate, record and save each member as an ordinary run.
             for k, (run, board, row) in enumerate(zip(sweep.runs, boards, rows, strict=True)):
                 member = job.member(states, k) if due or stop else None
                 if member is not None and due:
                     row |= evaluation(run, tasks[run.config.env], job.learner.policy(member.learner))
-                record(run, board, epoch, done, row)
+                record(run, board, epoch, row)
                 if member is not None:
                     run.save(epoch, member, job.learner.parts(member.learner))
             show(epoch, _line(rows), due)
-            if stop and epoch < config.n_epochs:
+            if stop and epoch < config.learner.n_epochs:
                 raise Interrupted(f"stopped after epoch {epoch}; continue with --resume {sweep.path}")
     for k, run in enumerate(sweep.runs):
         finish(run, tasks[run.config.env], job.learner.policy(job.member(states, k).learner))

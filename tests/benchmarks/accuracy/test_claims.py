@@ -56,7 +56,7 @@ def test_pressures_cost_the_error_of_the_pose_alone(arms):
     after = jax.tree.map(lambda x: x[0], arms.step(arms.start, jnp.stack([action, action]))[0])
     arm, reward = after.pipeline_state, arms.env.config.reward
     error = rewards.scaled_error(arm.pose, arm.goal, reward)
-    cost = Analytic(config.analytic, arms.env, 1)._cost(action, after)
+    cost = Analytic(config.learner, arms.env)._cost(action, after)
     np.testing.assert_allclose(cost, jnp.linalg.norm(error) / reward.threshold, rtol=1e-5)
 
 

@@ -42,13 +42,13 @@ def parsed(arguments):
 
 
 def test_training_starts_or_resumes_and_an_arm_s_policies_are_exported_at_once(tmp_path, commands):
-    settings = dataclasses.replace(TINY, preset="quick", training=("tqc.gamma=0.9",))
+    settings = dataclasses.replace(TINY, preset="quick", training=("learner.gamma=0.9",))
     run, work = tmp_path / reach_run(1, 2), (jobs.train_reach, tmp_path, settings, 1, 2)
     (start,) = commands(*work)
     options = parsed(start)
     assert (options.preset, options.config.seed, options.out) == ("quick", 2, run)
     assert options.calibration == tmp_path / "twin1" / "calibration"
-    assert options.config.tqc.gamma == 0.9
+    assert options.config.learner.gamma == 0.9
     run.mkdir()
     (run / "config.json").touch()
     (resume,) = commands(*work)
@@ -88,7 +88,7 @@ def test_learning_starts_with_what_it_builds_on_resumes_or_starts_anew(tmp_path,
     options = parsed(start)
     assert options.file == tmp_path / jobs.demonstrations_path(1, "pipe250")
     config = options.config
-    assert (options.preset, config.seed, options.out, config.env.pipe_diameter_mm) == ("frozen", 2, run, 250)
+    assert (options.preset, config.seed, options.out, config.env.pipe_diameter_mm) == ("pipe", 2, run, 250)
     assert options.reward == tmp_path / learned_run("pipe", 1, 2)
     (run / "checkpoints").mkdir(parents=True)
     (run / "config.json").touch()  # interrupted before it had the reward
@@ -108,10 +108,12 @@ def test_settings_of_each_kind_are_known(tmp_path, commands, kind):
     (arguments,) = commands(jobs.learn, tmp_path, SMOKE, kind, 0, 0)
     options = parsed(arguments)
     config = options.config
-    assert config.n_epochs == 2
-    assert config.stage_epochs == ((0, 1) if kind == "circle" else (0,))
+    assert config.learner.n_epochs == 2
+    assert config.learner.stage_epochs == ((0, 1) if kind == "circle" else (0,))
     assert (options.reward is not None) == (kind in ("narrow", "narrow-learned"))
-    assert (config.hand_made_weight > 0) == (kind in ("hand-made", "narrow", "narrow-hand-made", "circle"))
+    assert (config.learner.hand_made_weight > 0) == (
+        kind in ("hand-made", "narrow", "narrow-hand-made", "circle")
+    )
     assert config.env.pipe_diameter_mm == {"pipe300": 300, "pipe250": 250, "circle16": None}[KINDS[kind].task]
 
 

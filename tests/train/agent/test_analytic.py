@@ -12,8 +12,9 @@ from mjx_softarm.spec import ArmSpec
 from train.agent.analytic import Analytic, AnalyticConfig
 
 SHORT = ArmSpec.default().replace(structure={"n_sections": 1, "links_per_section": 2})
-CONFIG = AnalyticConfig(hidden=(32, 32))
 N_ARMS, N_UPDATES = 32, 150
+CONFIG = AnalyticConfig(hidden=(32, 32), n_arms=N_ARMS)
+FEW = dataclasses.replace(CONFIG, n_arms=4)
 
 pytestmark = pytest.mark.usefixtures("quick_compiler")
 
@@ -23,7 +24,7 @@ def learner():
     """Arms that differ in payload, stiffness and sensor bias."""
     randomisation = Randomisation(payload_max_kg=0.2, stiffness_spread=0.05, sensor_noise_mm=0.5)
     env = ReachEnv(SHORT, EnvConfig(n_poses=256, randomisation=randomisation))
-    return Analytic(CONFIG, env, N_ARMS)
+    return Analytic(CONFIG, env)
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +80,7 @@ def test_an_arm_that_does_not_settle_is_left_out_and_begins_anew(update, start):
 def test_the_gradient_of_moving_arms_looks_several_actions_ahead():
     """Against differences of the loss, for changes of the first and of the last of three actions."""
     env = ReachEnv(SHORT, EnvConfig(n_poses=64, mode="dynamic", dynamic_step_s=0.1, goal_ends=False))
-    learner = Analytic(dataclasses.replace(CONFIG, horizon=3), env, 4)
+    learner = Analytic(dataclasses.replace(FEW, horizon=3), env)
     state = jax.jit(learner.init)(jax.random.key(0))
     loss = jax.vmap(jax.value_and_grad(learner._loss, has_aux=True), in_axes=(0, 0, None))
     at = jax.jit(lambda changes: loss(changes, state.arms, state.actor_params))
@@ -97,16 +98,16 @@ def test_the_gradient_of_moving_arms_looks_several_actions_ahead():
 
 def test_a_policy_is_adopted_and_may_observe_less(learner, start):
     env = ReachEnv(SHORT, EnvConfig(n_poses=64, mode="dynamic", observation="motion"))
-    wider = Analytic(CONFIG, env, 4)
+    wider = Analytic(FEW, env)
     own = jax.jit(wider.init)(jax.random.key(1))
     obs = np.random.default_rng(0).normal(size=(5, env.observation_size)).astype(np.float32)
     expected = learner.mode(learner.policy(start), obs[:, : learner.env.observation_size])
     adopted = wider.adopt(own, learner.parts(start))
     np.testing.assert_allclose(wider.mode(wider.policy(adopted), obs), expected, atol=1e-6)
-    smaller = Analytic(dataclasses.replace(CONFIG, hidden=(8,)), env, 4)
+    smaller = Analytic(dataclasses.replace(FEW, hidden=(8,)), env)
     with pytest.raises(ValueError, match="actor: got layers of"):
         smaller.adopt(jax.eval_shape(smaller.init, jax.random.key(2)), learner.parts(start))
-    carrying = Analytic(CONFIG, ReachEnv(SHORT, EnvConfig(n_poses=64, observation="payload")), 4)
+    carrying = Analytic(FEW, ReachEnv(SHORT, EnvConfig(n_poses=64, observation="payload")))
     with pytest.raises(ValueError, match="actor: got layers of"):  # it observes other things, not less
         wider.adopt(own, carrying.parts(jax.jit(carrying.init)(jax.random.key(2))))
 
@@ -115,5 +116,5 @@ def test_a_policy_is_adopted_and_may_observe_less(learner, start):
     ("name", "value"), [("mean_share", 2.0), ("learning_rate_half", 0.0), ("new_share", -0.1)]
 )
 def test_a_setting_out_of_range_is_named(name, value):
-    with pytest.raises(ValueError, match=f"AnalyticConfig.{name}: got {value}"):
+    with pytest.raises(ValueError, match=f"learner.{name}: got {value}"):
         dataclasses.replace(CONFIG, **{name: value})

@@ -66,7 +66,7 @@ def test_an_update_descends_on_the_loss_and_its_penalty():
     ("name", "value"), [("learning_rate", -1.0), ("gradient_penalty", -1.0), ("input_scale", 0.0)]
 )
 def test_a_bad_setting_is_named(name, value):
-    with pytest.raises(ValueError, match=f"GailConfig.{name}: got"):
+    with pytest.raises(ValueError, match=f"learner.gail.{name}: got"):
         GailConfig(**{name: value})
 
 
@@ -79,7 +79,9 @@ def test_an_expert_is_recovered_from_its_actions_alone():
     n = 1600
     gail = Gail(2, 2, GailConfig(hidden=(64, 64), learning_rate=1e-3))
     config = TQCConfig(
-        hidden_actor=(64, 64),
+        n_arms=1,
+        total_env_steps=n,
+        hidden=(64, 64),
         hidden_critic=(64, 64),
         learning_rate=1e-3,
         learning_rate_end=0.02,
@@ -88,7 +90,8 @@ def test_an_expert_is_recovered_from_its_actions_alone():
         target_entropy=-6.0,
         reward_scale=10.0,
     )
-    tqc = TQC(2, 2, config, n_updates=n)
+    tqc = TQC(2, 2, config)
+    assert config.n_decay_updates == n
 
     def update(states, key):
         agent, discriminator = states

@@ -51,7 +51,10 @@ def relabelled(env, stored):
     def of(key=0, **shares):
         config = HindsightConfig(**shares)
         kept = {"goal_ends": True, "senses_action": False}
-        return many, relabel(many, jax.random.key(key), config, env.scale, env.config.reward, **kept)
+        batch, other = relabel(many, jax.random.key(key), config, env.scale, env.config.reward, **kept)
+        same = np.all(goal_of(env, batch.obs) == goal_of(env, env.observe(many.pose, many.goal)), axis=-1)
+        np.testing.assert_array_equal(other, ~same)
+        return many, batch
 
     return of
 
@@ -166,7 +169,7 @@ def test_what_is_sensed_follows_pose_and_goal_and_knows_the_action_exchanged(env
     moving = stored._replace(sensed=before, next_sensed=after)
     config = HindsightConfig(reached_share=1.0)
     kept = {"goal_ends": False, "senses_action": True}
-    batch = relabel(moving, jax.random.key(0), config, env.scale, env.config.reward, **kept)
+    batch, _ = relabel(moving, jax.random.key(0), config, env.scale, env.config.reward, **kept)
     np.testing.assert_array_equal(batch.obs[:, 18:], before)
     n_springs = batch.action.shape[1]
     np.testing.assert_array_equal(batch.next_obs[:, 18:-n_springs], after[:, :-n_springs])
@@ -175,6 +178,6 @@ def test_what_is_sensed_follows_pose_and_goal_and_knows_the_action_exchanged(env
     assert batch.reward.max() > 50.0 and not batch.terminated.any()  # reached, and it goes on
     carrying = stored._replace(sensed=before[:, :1], next_sensed=after[:, :1])
     kept["senses_action"] = False
-    batch = relabel(carrying, jax.random.key(0), config, env.scale, env.config.reward, **kept)
+    batch, _ = relabel(carrying, jax.random.key(0), config, env.scale, env.config.reward, **kept)
     np.testing.assert_array_equal(batch.obs[:, 18:], before[:, :1])
     np.testing.assert_array_equal(batch.next_obs[:, 18:], after[:, :1])

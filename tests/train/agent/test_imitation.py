@@ -7,10 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from train.agent.hindsight_tqc import HindsightTQC
 from train.agent.imitation import Imitation
 from train.agent.learner import Experience
-from train.agent.tqc import TQCConfig, Transition
+from train.agent.tqc import Transition
 
 B = 16
 
@@ -22,8 +21,7 @@ def new(imitation_config, short_env, shown):
     """Changes of the config -> a learner."""
 
     def make(**changes):
-        config = dataclasses.replace(imitation_config, **changes)
-        return Imitation(HindsightTQC(config, short_env), config, short_env, shown)
+        return Imitation(dataclasses.replace(imitation_config.learner, **changes), short_env, shown)
 
     return make
 
@@ -41,7 +39,7 @@ def stored(short_env, shown):
 def test_the_experts_rows_are_right_answers_to_their_goals(new, short_env, stored):
     """The arm reaches a row's goal with the expert's action of that row."""
     learner = new()
-    own = learner.learner.transitions(stored, jax.random.PRNGKey(0))
+    own, _ = learner.learner.transitions(stored, jax.random.PRNGKey(0))
     batch = learner.with_expert(own, stored, (jnp.arange(B) + 1) % 6)
     assert learner.n_expert == 4
     arms = jax.vmap(short_env.reset)(jax.random.split(jax.random.PRNGKey(4), 4))
@@ -62,7 +60,7 @@ def test_rewards_are_learned_for_goals_asked_for_and_clearance_is_always_charged
     elsewhere = short_env.observe(stored.pose, stored.goal + jnp.array([1.0, 0, 0, 0, 0, 0]))
     obs = jnp.where(hindsight[:, None], elsewhere, start)
     batch = Transition(obs, stored.action, jnp.where(expert, 100.0, given), obs, jnp.zeros(B))
-    rewards, _ = learner.rewards(batch, stored, start, discriminator)
+    rewards, _ = learner.rewards(batch, stored, hindsight, discriminator)
     learned = np.where(hindsight, 0.0, learner.gail.reward(discriminator.params, obs, stored.action))
     assert np.all(learned[:12] < 0.0)
     expected = np.where(expert, 0.5 * 100.0, 0.5 * -3.0 - stored.clearance_cost) + 2.0 * learned
@@ -86,19 +84,17 @@ def test_an_update_moves_the_discriminator_unless_it_is_frozen(new, stored, froz
 @pytest.fixture
 def moving(imitation_config, moving_env, shown):
     """A learner for arms in motion."""
-    config = dataclasses.replace(imitation_config, env=moving_env.config)
-    return Imitation(HindsightTQC(config, moving_env), config, moving_env, shown)
+    return Imitation(imitation_config.learner, moving_env, shown)
 
 
 def test_in_motion_the_expert_acts_for_a_share_of_the_arms(moving, moving_env, shown):
     state, row = moving.init(jax.random.PRNGKey(0)), jnp.arange(600) % 6
     pose, goal = (jnp.asarray(shown.positions)[(row + k) % 6] for k in (0, 1))
     obs = moving_env.observe(pose, goal, jnp.zeros((600, moving_env.observation_size - 18)))
-    action, own = (
-        each.act(state_, obs, jax.random.PRNGKey(1))
-        for each, state_ in ((moving, state), (moving.learner, state.agent))
-    )
-    expert = np.all(action == jnp.asarray(shown.actions)[(row + 1) % 6], axis=-1)
+    action, expert = moving.act(state, obs, jax.random.PRNGKey(1))
+    own, nobody = moving.learner.act(state.agent, obs, jax.random.PRNGKey(1))
+    assert nobody is None
+    np.testing.assert_array_equal(action[expert], jnp.asarray(shown.actions)[(row + 1) % 6][expert])
     np.testing.assert_array_equal(action[~expert], own[~expert])
     assert abs(np.mean(expert) - 0.25) < 4 * np.sqrt(0.25 * 0.75 / 600)
 
@@ -108,7 +104,7 @@ def test_in_motion_the_expert_s_actions_are_not_shown_as_the_agent_s(moving, mov
     sensed = jnp.zeros((B, moving_env.observation_size - 18))
     expert, by_expert = jnp.asarray(shown.actions)[(jnp.arange(B) + 1) % 6], jnp.arange(B) < 5
     action = jnp.where(by_expert[:, None], expert, stored.action)
-    stored = stored._replace(action=action, sensed=sensed, next_sensed=sensed)
+    stored = stored._replace(action=action, sensed=sensed, next_sensed=sensed, by_expert=by_expert)
     state, seen = moving.init(jax.random.PRNGKey(0)), {}
     learn, update = moving.learner.learn, moving.gail.update
     moving.learner.learn = lambda agent, batch, key: seen.update(batch=batch) or learn(agent, batch, key)
@@ -140,7 +136,7 @@ def test_parts_of_other_runs_are_taken(new):
 
 
 def test_parts_that_do_not_fit_are_refused(new):
-    learner, narrow = new(), new(tqc=TQCConfig(hidden_actor=(8,)))
+    learner, narrow = new(), new(hidden=(8,))
     state = learner.init(jax.random.PRNGKey(0))
     with pytest.raises(ValueError, match="networks: got layers of .* expected"):
         learner.adopt(state, narrow.parts(narrow.init(jax.random.PRNGKey(0))))

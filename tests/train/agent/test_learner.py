@@ -1,5 +1,6 @@
 """A user's own learner, handed to the epoch: trained, evaluated and exported like any other."""
 
+import dataclasses
 import io
 import json
 
@@ -13,8 +14,10 @@ from rich.console import Console
 from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.policy.file import load_policy
 from tests.train.small import SHORT
-from train.agent.learner import Learner
+from train.agent.learner import Explored, Learner, ReplayConfig
 from train.agent.networks import Actor
+from train.agent.registry import LEARNERS, Entry
+from train.agent.tqc import TQCConfig
 from train.config import TrainConfig
 from train.runs.arm_model import DistilledArm
 from train.runs.checkpoint import Run, RunError
@@ -23,7 +26,7 @@ from train.runs.export import export_run
 from train.runs.run import begin_with, train
 from train.runs.task import task_of
 
-CONFIG = TrainConfig(
+SETTINGS = ReplayConfig(
     n_arms=16,
     total_env_steps=512,
     updates_per_env_step=1.0,
@@ -31,9 +34,8 @@ CONFIG = TrainConfig(
     batch_size=64,
     replay_capacity=512,
     vector_steps_per_epoch=4,
-    evaluation_epochs=2,
-    env=EnvConfig(n_poses=256),
 )
+CONFIG = TrainConfig(learner=SETTINGS, evaluation_epochs=2, env=EnvConfig(n_poses=256))
 
 
 pytestmark = pytest.mark.usefixtures("quick_compiler")
@@ -41,8 +43,6 @@ pytestmark = pytest.mark.usefixtures("quick_compiler")
 
 class Regression(Learner):
     """A network fitted to the actions that led to the poses reached."""
-
-    own_arms = 0
 
     def __init__(self, env):
         self.env, self.network, self.optimizer = env, Actor(env.action_size, (16,)), optax.adam(1e-2)
@@ -53,7 +53,7 @@ class Regression(Learner):
 
     def act(self, state, obs, key):
         action = self.mode(state[0], obs)
-        return jnp.clip(action + 0.3 * jax.random.normal(key, action.shape), -1.0, 1.0)
+        return Explored(jnp.clip(action + 0.3 * jax.random.normal(key, action.shape), -1.0, 1.0))
 
     def policy(self, state):
         return state[0]
@@ -73,8 +73,17 @@ class Regression(Learner):
 @pytest.fixture(scope="module")
 def task():
     env = ReachEnv(SHORT, CONFIG.env)
-    task = task_of(CONFIG, env, learner=Regression(env))
+    task = task_of(CONFIG, env)
     return task._replace(evaluate=Evaluator(env, task.job.learner, n_goals=64))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def known():
+    """The learner stands in the registry."""
+    with pytest.MonkeyPatch.context() as patch:
+        entry = Entry(ReplayConfig, lambda config, world: Regression(world.env))
+        patch.setitem(LEARNERS, "regression", entry)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -114,7 +123,8 @@ def test_a_policy_that_the_file_cannot_hold_is_refused(run, tmp_path, arm, monke
 
 
 def test_a_checkpoint_of_another_learner_and_a_donor_are_refused(run, task):
-    other = task_of(CONFIG, task.job.env)
+    learner = TQCConfig(**dataclasses.asdict(SETTINGS))
+    other = task_of(dataclasses.replace(CONFIG, learner=learner), task.job.env)
     with pytest.raises(RunError, match=f"{run.path}: got a checkpoint of other parts or sizes"):
         run.restore(other.job.like())
     with pytest.raises(RunError, match=f"{run.path}: got a policy without critics"):

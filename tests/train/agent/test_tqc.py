@@ -14,7 +14,7 @@ from train.agent.tqc import TQC, TQCConfig, Transition
 B, OBS, ACTION, C, M, DROP = 4, 3, 2, 2, 5, 1
 K = C * (M - DROP)
 CONFIG = TQCConfig(
-    hidden_actor=(8,),
+    hidden=(8,),
     hidden_critic=(8, 8),
     n_critics=C,
     n_quantiles=M,
@@ -245,13 +245,13 @@ BAD |= {"gamma": 1.5, "tau": 0.0, "initial_alpha": 0.0}
 
 @pytest.mark.parametrize(("field", "value"), BAD.items())
 def test_config_names_the_field_out_of_range(field, value):
-    with pytest.raises(ValueError, match=rf"TQCConfig\.{field}: got .* expected"):
+    with pytest.raises(ValueError, match=rf"learner\.{field}: got .* expected"):
         TQCConfig(**{field: value})
 
 
 def test_a_given_policy_acts_as_before_whatever_it_did_not_observe():
     """Two more entries of the observation have no weight; the noise is small; the critics stay."""
-    settings = TQCConfig(hidden_actor=(8,), hidden_critic=(8,))
+    settings = TQCConfig(hidden=(8,), hidden_critic=(8,))
     donor, wider = (TQC(n, 2, settings) for n in (OBS_SIZE, OBS_SIZE + 2))
     given, own = (each.init(jax.random.key(k)) for k, each in enumerate((donor, wider)))
     adopted = wider.adopt_policy(own, given.mean_actor_params)

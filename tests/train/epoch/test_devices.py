@@ -18,22 +18,22 @@ from mjx_softarm.env import ReachEnv
 from tests.train import small
 from tests.train.small import SHORT, new_job
 from train.__main__ import main
-from train.agent.tqc import TQCConfig
 from train.config import ConfigError
 from train.epoch.devices import mesh_of, split
 from train.runs.checkpoint import Run
 
 N_DEVICES = 8
 CAPACITY = 4096  # larger than all else that has an axis
-CONFIG = dataclasses.replace(
-    small.CONFIG,
+LEARNER = dataclasses.replace(
+    small.LEARNER,
     n_arms=16,
     total_env_steps=256,
     warmup_env_steps=32,
     batch_size=32,
     replay_capacity=CAPACITY,
-    tqc=TQCConfig(hidden_actor=(16, 16), hidden_critic=(16, 16)),
+    learning_rate_end=1.0,
 )
+CONFIG = dataclasses.replace(small.CONFIG, learner=LEARNER)
 
 pytestmark = pytest.mark.skipif(
     len(jax.local_devices()) < N_DEVICES, reason=f"needs {N_DEVICES} devices, which a CPU can simulate"
@@ -64,7 +64,7 @@ def trained(jobs):
 
 def test_many_devices_compute_what_one_does(trained):
     (one, metrics_of_one), (many, metrics) = trained.values()
-    assert int(many.n_updates) == 4 * 16 * 2 / 2 - 16  # so the networks have moved
+    assert LEARNER.n_updates(int(many.n_epochs)) == 4 * 16 * 2 / 2 - 16  # so the networks have moved
     for name, value in metrics.items():
         np.testing.assert_allclose(value, metrics_of_one[name], rtol=1e-4, atol=1e-4, err_msg=name)
     close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-3)  # noqa: E731  # poses in mm
@@ -114,7 +114,7 @@ def test_a_checkpoint_of_many_devices_continues_on_one(tmp_path, jobs, trained):
         assert epoch == 4
         jax.tree.map(np.testing.assert_array_equal, jax.device_get(restored.learner.actor_params), expected)
         following, _ = job.epoch(restored)
-        assert int(following.n_updates) == int(state.n_updates) + 16, n
+        assert int(following.n_epochs) == 5, n
         assert job.n_traces == 1  # so it came back as the epoch expects it
 
 
@@ -145,8 +145,11 @@ def test_a_policy_of_many_devices_is_read_where_there_is_one(tmp_path, jobs, tra
 
 @pytest.mark.parametrize("name", ["n_arms", "replay_capacity", "batch_size"])
 def test_what_cannot_be_split_evenly_is_named(env, name):
-    config = dataclasses.replace(CONFIG, **{name: getattr(CONFIG, name) + 4})
-    with pytest.raises(ConfigError, match=f"^{name}: got .* expected a multiple of the {N_DEVICES}"):
+    learner = dataclasses.replace(LEARNER, **{name: getattr(LEARNER, name) + 4})
+    config = dataclasses.replace(CONFIG, learner=learner)
+    with pytest.raises(
+        ConfigError, match=rf"^learner\.{name}: got .* expected a multiple of the {N_DEVICES}"
+    ):
         new_job(config, env, mesh=mesh_of(str(N_DEVICES)))
 
 
@@ -158,13 +161,9 @@ def test_devices_that_are_not_there_are_refused(devices, capsys):
 
 LONGEST_S = 900  # of a process, compilation included
 SETTINGS = small.flags(
-    n_arms=16,
-    total_env_steps=512,
-    warmup_env_steps=32,
-    batch_size=32,
-    evaluation_epochs=2,
-    replay_capacity=4096,
+    n_arms=16, total_env_steps=512, warmup_env_steps=32, batch_size=32, replay_capacity=4096
 )
+SETTINGS += ["--evaluation-epochs=2"]
 
 
 def start(arguments, *devices):

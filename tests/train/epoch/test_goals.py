@@ -7,19 +7,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from train.agent.hindsight_tqc import HindsightTQC
 from train.agent.imitation import Imitation
 from train.config import ConfigError
 from train.epoch.devices import mesh_of
-from train.epoch.goals import DemonstratedGoals, goal_weights, rests, shown_before
+from train.epoch.goals import DemonstratedGoals, goal_weights, shown_before, static_poses
 from train.epoch.job import Job
 
 pytestmark = pytest.mark.usefixtures("quick_compiler")
 
 
 def new_job(config, env, shown, mesh=None):
-    learner = Imitation(HindsightTQC(config, env), config, env, shown)
-    return Job(config, env, learner, DemonstratedGoals(config, env, shown), mesh)
+    goals = DemonstratedGoals(config.learner, env, shown)
+    return Job(config.learner, env, Imitation(config.learner, env, shown), goals, mesh)
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +95,7 @@ def test_a_run_in_motion_is_traced_once_and_continues_bit_for_bit(moving_job):
 def test_actions_at_which_the_arm_does_not_settle_are_named(moving_env, shown):
     actions = shown.actions.at[2].set(np.nan)
     with pytest.raises(ConfigError, match="demonstrations: got rows 2, at which the arm does not settle"):
-        rests(moving_env, actions)
+        static_poses(moving_env, actions)
 
 
 def test_the_position_shown_before_is_of_the_same_sequence():

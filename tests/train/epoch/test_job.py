@@ -36,10 +36,11 @@ def test_every_engine_traces_its_epoch_once_and_counts_what_it_did(change):
     state = start(job)
     for _ in range(4):
         state, metrics = job.epoch(state)
-    assert job.n_traces == 1 and int(state.n_env_steps) == 4 * 2 * 8
-    # Warm-up lasts until 16 steps are stored: the update after the second vector step is the first.
-    assert int(state.n_updates) == 4 * (4 * 2 - 2)
-    assert int(state.memory.size) == 64 - int(state.n_unsettled) > 50
+    assert job.n_traces == 1 and int(state.n_epochs) == 4
+    assert 50 < int(state.memory.size) <= CONFIG.learner.n_env_steps(4) == 4 * 2 * 8
+    # Warm-up lasts until 16 steps are stored: the update after the third vector step is the first.
+    assert CONFIG.learner.n_updates(4) == 4 * (4 * 2 - 2)
+    assert int(state.learner.actor_opt_state[0].count) == 4 * (4 * 2 - 2)
     assert all(np.isfinite(value) for value in metrics.values())
 
 
@@ -57,9 +58,16 @@ def test_a_start_compiles_the_epoch_once_beside_what_comes_first(job):
 
 def test_warm_up_explores_uniformly_and_does_not_learn(job):
     state, metrics = job.epoch(start(job))
-    assert int(state.n_updates) == 0 and metrics["tqc/critic_loss"] == 0.0
+    assert CONFIG.learner.n_updates(1) == 0 and metrics["tqc/critic_loss"] == 0.0
     action = np.asarray(state.memory.data.action)[:16]
     assert np.abs(action).max() > 0.9 and abs(action.mean()) < 0.15
+
+
+@pytest.mark.parametrize("n_epochs", [1, 2**31 - 1])
+def test_after_warm_up_it_learns_however_long_it_has_run(job, n_epochs):
+    state, metrics = job.epoch(start(job)._replace(n_epochs=jnp.asarray(n_epochs, jnp.int32)))
+    assert metrics["tqc/critic_loss"] > 0.0
+    assert int(state.learner.actor_opt_state[0].count) == 2 * 4
 
 
 def test_an_arm_that_does_not_settle_is_reset_counted_and_never_stored(job):
@@ -68,7 +76,7 @@ def test_an_arm_that_does_not_settle_is_reset_counted_and_never_stored(job):
     poisoned = arm.chamber_stiffness.at[jnp.array([1, 5])].set(jnp.nan)
     arms = state.arms.replace(pipeline_state=arm._replace(chamber_stiffness=poisoned))
     state, metrics = job.epoch(state._replace(arms=arms))
-    assert int(state.n_unsettled) == 2 and metrics["env/unsettled"] == 2
+    assert metrics["env/unsettled"] == 2
     assert int(state.memory.size) == 2 * 8 - 2
     jax.tree.map(
         lambda x: np.testing.assert_array_equal(np.isfinite(x), True), jax.device_get(state.memory.data)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from mjx_softarm.spec import ArmSpec
-from train.agent.analytic import Analytic, AnalyticConfig
-from train.agent.hindsight_tqc import HindsightTQC
-from train.agent.imitation import Imitation
+from tests.train.small import LEARNER
+from train.agent.analytic import AnalyticConfig
+from train.agent.registry import World, learner_of
 from train.config import TrainConfig
 from train.epoch.job import TrainState
 from train.runs.checkpoint import Run, RunError
@@ -40,16 +40,16 @@ def test_metrics_later_than_the_checkpoint_are_forgotten(tmp_path):
 
 def test_the_policy_is_read_from_the_state_of_every_learner(tmp_path, short_env, imitation_config, shown):
     config, zero = imitation_config, jnp.zeros((), jnp.int32)
-    tqc = HindsightTQC(config, short_env)
-    learners = {
-        "tqc": tqc,
-        "analytic": Analytic(AnalyticConfig(hidden=(16,)), short_env, config.n_arms),
-        "imitation": Imitation(tqc, config, short_env, shown),
+    configs = {
+        "tqc": LEARNER,
+        "analytic": AnalyticConfig(hidden=(16,), n_arms=8),
+        "imitation": config.learner,
     }
-    for name, learner in learners.items():
+    for name, own_config in configs.items():
+        learner = learner_of(own_config, World(short_env, demonstrations=shown))
         run = Run.create(tmp_path / name, config, short_env.spec)
         with pytest.raises(RunError, match="got no checkpoint, expected one"):
             run.policy()
         own = jax.jit(learner.init)(jax.random.PRNGKey(0))
-        run.save(1, TrainState(None, own, None, (), zero, zero, zero, zero), learner.parts(own))
+        run.save(1, TrainState(None, own, None, (), zero, zero), learner.parts(own))
         jax.tree.map(np.testing.assert_array_equal, run.policy(), jax.device_get(learner.policy(own)))

@@ -10,7 +10,7 @@ from train.runs.checkpoint import RunError
 from train.runs.run import refuse_divergence
 
 MOVING = dataclasses.replace(CONFIG, env=EnvConfig(mode="dynamic", simulation_step_s=0.02))
-N_ACTIONS = MOVING.n_arms * MOVING.vector_steps_per_epoch
+N_ACTIONS = MOVING.learner.n_env_steps(1)
 
 
 def test_an_epoch_in_which_most_arms_diverge_ends_the_run_and_names_the_step():

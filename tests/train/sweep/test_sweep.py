@@ -34,13 +34,14 @@ CONFIG = dataclasses.replace(
         clearance_cost_per_mm=0.1,
         clearance_margin_mm=60.0,
     ),
-    tqc=dataclasses.replace(small.CONFIG.tqc, target_entropy=-9.0),
+    learner=dataclasses.replace(small.LEARNER, target_entropy=-9.0),
 )
 # Each setting that may be varied, at another value.
 OTHER_SETTINGS = """
-    tqc.learning_rate=1e-2 tqc.learning_rate_alpha=3e-2 tqc.gamma=0.7 tqc.tau=0.1 tqc.initial_alpha=0.3
-    tqc.target_entropy=-20.0 tqc.reward_scale=0.1 hindsight.reached_share=0.2 hindsight.near_share=0.6
-    hindsight.near_min_mm=3.0 hindsight.near_max_mm=50.0 hindsight.mm_per_deg=2.0
+    learner.learning_rate=1e-2 learner.learning_rate_alpha=3e-2 learner.gamma=0.7 learner.tau=0.1
+    learner.initial_alpha=0.3 learner.target_entropy=-20.0 learner.reward_scale=0.1
+    learner.hindsight.reached_share=0.2 learner.hindsight.near_share=0.6 learner.hindsight.near_min_mm=3.0
+    learner.hindsight.near_max_mm=50.0 learner.hindsight.mm_per_deg=2.0
     env.reward.goal_bonus=30.0 env.reward.error_cost=4.0 env.reward.step_cost=0.7
     env.reward.saturation_cost=20.0 env.reward.threshold=0.2 env.reward.weight_per_mm=0.003
     env.reward.distance_cost=2.0
@@ -96,7 +97,7 @@ def test_a_member_is_the_ordinary_run(members, job, trained):
         for name, value in expected.items():
             np.testing.assert_allclose(row[name][1], value, rtol=2e-4, atol=2e-5, err_msg=name)
     first, own = job.member(states, 0), job.member(states, 1)
-    assert int(own.n_updates) > 0 and int(own.n_env_steps) == N_EPOCHS * 2 * 8
+    assert int(own.n_epochs) == N_EPOCHS and config.learner.n_updates(N_EPOCHS) > 0
     assert jax.tree.map(shape_of, own) == jax.tree.map(shape_of, state)
     assert_close(own, state)
     with pytest.raises(AssertionError):  # the comparison can tell members apart
@@ -180,7 +181,7 @@ def test_a_stopped_sweep_ends_with_the_same_bits(ready, job, members, tmp_path, 
         assert rows[0] == rows[1] and [row["epoch"] for row in rows[0]] == list(range(1, 9))
         assert ["evaluation/median_mm" in row for row in rows[0]] == [False, True] * 4
     for sweep in (whole, resumed):
-        report(dataclasses.replace(sweep, varied=("tqc.gamma",)))  # all settings would fill the plot
+        report(dataclasses.replace(sweep, varied=("learner.gamma",)))  # all settings would fill the plot
     results = [json.loads((sweep.path / RESULTS_FILE).read_text())["groups"] for sweep in (whole, resumed)]
     assert results[0] == results[1] and len(results[0]) == 2
 
@@ -195,7 +196,15 @@ def test_a_sweep_as_a_user_runs_it(tmp_path, capsys):
     path = tmp_path / "whole"
     names = [f"seed{seed}-env.reward.goal_bonus={bonus}" for seed in (4, 5) for bonus in (50, 90)]
     options = ["--spec", str(arm), "--seeds", "4,5", "--vary", "env.reward.goal_bonus=50,90"]
-    command = ["sweep", *small.flags(**{"env.n_poses": 64}), *options, "--out", str(path)]
+    command = [
+        "sweep",
+        *small.flags(),
+        "--env.n-poses=64",
+        "--evaluation-epochs=4",
+        *options,
+        "--out",
+        str(path),
+    ]
     assert main(command) == 0
     results = json.loads((path / RESULTS_FILE).read_text())["groups"]
     assert [len(group["runs"]) for group in results] == [2, 2]
@@ -211,28 +220,36 @@ def test_a_sweep_as_a_user_runs_it(tmp_path, capsys):
 
 def test_members_are_the_product_of_seeds_and_values():
     members, varied = members_of(
-        override(PRESETS["quick"], ["n_arms=64"]), (0, 7), ["tqc.gamma=0.5, 0.9", "env.reward.goal_bonus=50"]
+        override(PRESETS["quick"], ["learner.n_arms=64"]),
+        (0, 7),
+        ["learner.gamma=0.5, 0.9", "env.reward.goal_bonus=50"],
     )
-    assert varied == ("tqc.gamma", "env.reward.goal_bonus")
-    got = {name: (c.seed, c.tqc.gamma, c.env.reward.goal_bonus, c.n_arms) for name, c in members.items()}
+    assert varied == ("learner.gamma", "env.reward.goal_bonus")
+    got = {
+        name: (c.seed, c.learner.gamma, c.env.reward.goal_bonus, c.learner.n_arms)
+        for name, c in members.items()
+    }
     assert got == {
-        "seed0-tqc.gamma=0.5-env.reward.goal_bonus=50": (0, 0.5, 50.0, 64),
-        "seed0-tqc.gamma=0.9-env.reward.goal_bonus=50": (0, 0.9, 50.0, 64),
-        "seed7-tqc.gamma=0.5-env.reward.goal_bonus=50": (7, 0.5, 50.0, 64),
-        "seed7-tqc.gamma=0.9-env.reward.goal_bonus=50": (7, 0.9, 50.0, 64),
+        "seed0-learner.gamma=0.5-env.reward.goal_bonus=50": (0, 0.5, 50.0, 64),
+        "seed0-learner.gamma=0.9-env.reward.goal_bonus=50": (0, 0.9, 50.0, 64),
+        "seed7-learner.gamma=0.5-env.reward.goal_bonus=50": (7, 0.5, 50.0, 64),
+        "seed7-learner.gamma=0.9-env.reward.goal_bonus=50": (7, 0.9, 50.0, 64),
     }
 
 
 @pytest.mark.parametrize(
     "vary, message",
     [
-        (["n_arms=64,128"], "--vary n_arms=64,128: .*decides what is computed.*one of tqc.learn"),
-        (["tqc.learning_rate_end=0.1,1"], "--vary tqc.learning_rate_end.*decides what is computed"),
-        (["tqc.gamma=0.5,1.5"], "TQCConfig.gamma.*1.5"),
-        (["tqc.target_entropy=null"], "--vary tqc.target_entropy: got None, expected numbers"),
-        (["tqc.gamma=0.5,"], "tqc.gamma: got '', expected float"),
-        (["tqc.gamma=0.5", "tqc.gamma=0.6"], "got tqc.gamma again"),
-        (["tqc.tau=0.1,0.10"], "--vary: got a value twice"),
+        (
+            ["learner.n_arms=64,128"],
+            "--vary learner.n_arms=64,128: .*decides what is computed.*one of learner.learn",
+        ),
+        (["learner.learning_rate_end=0.1,1"], "--vary learner.learning_rate_end.*decides what is computed"),
+        (["learner.gamma=0.5,1.5"], "learner.gamma: got 1.5"),
+        (["learner.target_entropy=null"], "--vary learner.target_entropy: got None, expected numbers"),
+        (["learner.gamma=0.5,"], "learner.gamma: got '', expected float"),
+        (["learner.gamma=0.5", "learner.gamma=0.6"], "got learner.gamma again"),
+        (["learner.tau=0.1,0.10"], "--vary: got a value twice"),
     ],
 )
 def test_what_cannot_be_varied_is_refused_by_name(vary, message):
