@@ -26,7 +26,8 @@ PAGES = [
     *sorted(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md")),
 ]
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["optional-dependencies"]
-ADDED = ("python -m benchmarks act",)  # of a benchmark that docs/extend.md adds; see test_extend.py
+# A benchmark and a learner that docs/extend.md adds; see test_extend.py.
+ADDED = ("python -m benchmarks act", "python -m train reach --learner restless")
 WORDS = {"LOGS": "a.csv", "POLICY": "policy.npz", "--goal=...": "--goal=0,0,-600,0,0,0"}  # stand for others
 
 
@@ -134,7 +135,7 @@ FEWER = (
     (r"(record --arm twin:7) ", r"\1 --poses 24 "),
     (
         r"(train (reach|imitate|sweep) .*--(preset|calibration).*)",
-        r"\1 --total-env-steps 2048 --env.n-poses 256",
+        r"\1 --learner.total-env-steps 2048 --env.n-poses 256",
     ),
 )
 LEFT_OUT = (

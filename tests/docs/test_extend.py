@@ -9,9 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from mjx_softarm import ArmSpec
-from tests.train.small import CONFIG, SHORT
-from train import presets
+from tests.train.small import CONFIG, SHORT, flags
 from train.runs.checkpoint import Run
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -61,7 +59,6 @@ def test_a_sensor(changed):
     program = """
 import tomllib
 import numpy as np
-from mjx_softarm import ArmSpec
 from mjx_softarm.mdp.actions import ActionMap
 from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.twin.arm import Twin
@@ -79,13 +76,15 @@ print(sensor.unit, readings.mean(), fault.any(), np.abs(back_m - length_m).max()
 
 
 @pytest.mark.slow
-def test_a_learner(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(ArmSpec, "default", lambda: SHORT)
-    monkeypatch.setitem(presets.PRESETS, "quick", CONFIG)
-    exec(compile(block("A learner", "python"), "my_learner.py", "exec"), {})
-    rows = Run.open(tmp_path / "runs/restless").metrics()
-    assert rows[-1]["env_steps"] == CONFIG.total_env_steps and "evaluation/median_mm" in rows[-1]
+def test_a_learner(changed):
+    folder = changed("A learner")
+    SHORT.to_toml(folder / "arm.toml")
+    command = block("A learner", "sh").split()[1:]
+    output(folder, *command, *flags(), "--spec=arm.toml", "--out=run")
+    run = Run(folder / "run", CONFIG, SHORT)
+    assert run.metrics()[-1]["env_steps"] == 256 and "evaluation/median_mm" in run.metrics()[-1]
+    learner = json.loads((run.path / "config.json").read_text())["train"]["learner"]
+    assert (learner["name"], learner["random_share"]) == ("restless", 0.2)
 
 
 def test_a_benchmark(changed):

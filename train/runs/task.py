@@ -54,7 +54,6 @@ def task_of(
     env: ReachEnv,
     demonstrations: Demonstrations | None = None,
     mesh: Mesh | None = None,
-    learner: Learner | None = None,
 ) -> Task:
     """Return the task of a run.
 
@@ -63,12 +62,11 @@ def task_of(
         env: of its arms.
         demonstrations: demonstrations to learn from, for a learner from demonstrations.
         mesh: devices to train on; None is one device.
-        learner: another learner in the place of the config's.
 
     Raises:
         ConfigError: the run cannot be split evenly over the devices of the mesh.
     """
-    learner = learner or learner_of(config.learner, World(env, mesh, demonstrations))
+    learner = learner_of(config.learner, World(env, mesh, demonstrations))
     if demonstrations is not None:
         return _imitation(cast(ImitationConfig, config.learner), env, demonstrations, mesh, learner)
     job = Job(config.learner, env, learner, mesh=mesh)
