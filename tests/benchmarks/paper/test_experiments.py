@@ -58,7 +58,7 @@ def test_both_experiments_or_one(tmp_path, monkeypatch, capsys):
     assert f"written: {tmp_path / 'paper-confined.json'}" in capsys.readouterr().out
     rods = ["--arm", "rod", "--loads", "500", "--preset", "analytic", "--env-steps", "64"]
     assert main(["paper", "--only", "open", *rods, *smoke]) == 0
-    assert chosen[-1] == ("rod", (500,), "analytic", ("total_env_steps=64",), ())
+    assert chosen[-1] == ("rod", (500,), "analytic", ("learner.total_env_steps=64",), ())
     assert f"written: {tmp_path / 'paper-rod.json'}" in capsys.readouterr().out
     beside = ["--beside", "quick,quick", "--out", str(tmp_path)]
     assert main(["paper", "--only", "open", *beside]) == 0

@@ -115,7 +115,7 @@ def test_held_out_goals_are_evaluated_as_the_trainer_does_it(quick_compiler, mon
 
 
 def test_peers_have_the_quick_preset_s_settings():
-    n_steps, config = [0], PRESETS["quick"]
+    n_steps, config = [0], PRESETS["quick"].learner
     settings = settings_of(config, lambda: n_steps[0])
     rate = settings.pop("learning_rate")
     names = ("buffer_size", "learning_starts", "batch_size", "tau", "gamma", "train_freq", "gradient_steps")
