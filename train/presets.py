@@ -75,19 +75,23 @@ PRESETS: dict[str, TrainConfig] = {
         ),
         evaluation_epochs=20,
     ),
-    # Half-second actions of arms in motion. A reached goal is rewarded after every action that ends there.
+    # Half-second actions of arms in motion. The discount sees the time that an arm takes to settle, and goals
+    # are poses that the episode reached later.
     "motion": TrainConfig(
         learner=dataclasses.replace(
             _TUNED,
-            learning_rate=2e-3,
-            total_env_steps=131_072,
+            gamma=0.85,
+            learning_rate=4e-3,
+            layer_norm=True,
+            hindsight=HindsightConfig(reached_share=0.2, near_share=0.3, n_later=3),
+            total_env_steps=393_216,
             episode_length=8,
-            updates_per_env_step=0.25,
+            updates_per_env_step=0.125,
             batch_size=128,
-            replay_capacity=131_072,
+            replay_capacity=393_216,
         ),
-        evaluation_epochs=16,
-        env=_MOVING,
+        evaluation_epochs=48,
+        env=dataclasses.replace(_MOVING, reward=_ALWAYS),
     ),
     # The same task through the gradient of the motion, from the policy of a run of `analytic` (--agent).
     "motion-analytic": TrainConfig(

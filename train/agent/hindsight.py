@@ -31,6 +31,7 @@ class HindsightConfig:
 
     reached_share: float = 0.5  # share whose goal becomes the pose reached
     near_share: float = 0.0  # share whose goal becomes a pose near the one reached
+    n_later: int = 0  # the pose reached, and half of those nearby, may come so many actions later
     near_min_mm: float = 1.0  # smallest distance of a near goal
     near_max_mm: float = 100.0  # largest distance of a near goal
     mm_per_deg: float = 1.0  # distance that goes with a turn of one degree of a near goal
@@ -47,6 +48,8 @@ class HindsightConfig:
                 f"learner.hindsight.near_min_mm, near_max_mm: got {self.near_min_mm}, {self.near_max_mm}, "
                 "expected 0 < near_min_mm <= near_max_mm"
             )
+        if self.n_later < 0:
+            raise ValueError(f"learner.hindsight.n_later: got {self.n_later}, expected at least 0")
         if self.mm_per_deg <= 0:
             raise ValueError(f"learner.hindsight.mm_per_deg: got {self.mm_per_deg}, expected > 0")
 
@@ -79,8 +82,13 @@ def relabel(
     (kind, distance), direction = draws.both(key, (2, n), (n, 6))
     reached = kind < config.reached_share
     near = ~reached & (kind < config.reached_share + config.near_share)
-    near_pose = batch.next_pose + near_offsets(distance, direction, config).astype(batch.next_pose.dtype)
-    goal = jnp.where(reached[:, None], batch.next_pose, jnp.where(near[:, None], near_pose, batch.goal))
+    pose = centre = batch.next_pose
+    if batch.later_pose is not None:
+        pose = batch.later_pose
+        half = kind < config.reached_share + config.near_share / 2
+        centre = jnp.where(half[:, None], pose, centre)
+    near_pose = centre + near_offsets(distance, direction, config).astype(centre.dtype)
+    goal = jnp.where(reached[:, None], pose, jnp.where(near[:, None], near_pose, batch.goal))
 
     # Actions: where a chamber saturated, the one that asks for the lengths it reached.
     sensed = (reached | near) & batch.saturated & config.exchange_actions
@@ -102,6 +110,21 @@ def relabel(
         terminated=(done & goal_ends).astype(reward.dtype),
     )
     return transition, reached | near
+
+
+def later_pose(now: Experience, later: Experience, ahead: Array) -> Array:
+    """Return the poses (B, 6) [mm, deg] that transitions reached some actions later in the same episode.
+
+    Args:
+        now: B transitions.
+        later: B transitions that may be of the same episodes.
+        ahead (B,): number of actions between the two.
+
+    A transition with the same goal, so many actions later, is of the same episode. Where `later` is of
+    another one, the pose is the one that the transition itself reached.
+    """
+    same = (later.n_steps == now.n_steps + ahead) & jnp.all(later.goal == now.goal, axis=-1)
+    return jnp.where(same[:, None], later.next_pose, now.next_pose)
 
 
 def _joined(observation: Array, sensed: Array | None) -> Array:

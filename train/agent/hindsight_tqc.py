@@ -42,7 +42,7 @@ class HindsightTQC(Learner):
     def update(self, state: TQCState, sample: Sample, key: Array) -> tuple[TQCState, dict[str, Array]]:
         """Take one gradient step of all networks on one relabelled batch."""
         key_sample, key_relabel, key_update = jax.random.split(key, 3)
-        batch, _ = self.transitions(sample(key_sample), key_relabel)
+        batch, _ = self.transitions(sample(key_sample, self.config.hindsight.n_later), key_relabel)
         return self.learn(state, batch, key_update)
 
     def transitions(self, stored: Experience, key: Array) -> tuple[Transition, Array]:

@@ -13,7 +13,7 @@ Shapes: O observation, A action.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple, Protocol
 
@@ -132,6 +132,7 @@ class Experience(NamedTuple):
     sensed: Array | None = None  # (..., k) observation without pose and goal; None where it has nothing else
     next_sensed: Array | None = None  # (..., k) the same after the action
     by_expert: Array | None = None  # (...,) bool: the action is a demonstrated one; None where none can be
+    later_pose: Array | None = None  # (..., 6) [mm, deg] after a later action of the episode; never stored
 
 
 class Transition(NamedTuple):
@@ -151,7 +152,12 @@ class Explored(NamedTuple):
     by_expert: Array | None = None  # (...,) bool: demonstrated actions; None where no action can be one
 
 
-Sample = Callable[[Array], Experience]  # key -> a batch of the replay, drawn uniformly with replacement
+class Sample(Protocol):
+    """Batches of the replay, drawn uniformly with replacement."""
+
+    def __call__(self, key: Array, n_later: int = 0) -> Experience:
+        """Return a batch; with the pose up to `n_later` actions later in the same episode, if not 0."""
+        ...
 
 
 class Learner(Protocol):

@@ -20,6 +20,7 @@ from mjx_softarm._support import draws, xla
 from mjx_softarm._support.mjx import State
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.env.vector import VectorEnv
+from train.agent.hindsight import later_pose
 from train.agent.learner import Experience, Explored, Learner, LearnerConfig
 from train.config import ConfigError
 from train.epoch import replay
@@ -201,8 +202,12 @@ class Job:
         """
         keys = jax.random.split(key, self.config.n_updates_per_vector_step)
 
-        def sample(key: Array) -> Experience:
-            return spread(self.mesh, replay.sample(state.memory, key, self.config.batch_size))
+        def sample(key: Array, n_later: int = 0) -> Experience:
+            size = self.config.batch_size
+            if not n_later:
+                return spread(self.mesh, replay.sample(state.memory, key, size))
+            now, later, ahead = replay.sample_ahead(state.memory, key, size, self.arms.n, n_later)
+            return spread(self.mesh, now._replace(later_pose=later_pose(now, later, ahead)))
 
         def run(learner: Any) -> tuple[Any, dict[str, Array]]:
             learner, metrics = jax.lax.scan(
@@ -237,7 +242,7 @@ class Job:
         )
 
 
-def _no_replay(key: Array) -> Experience:
+def _no_replay(key: Array, n_later: int = 0) -> Experience:
     raise TypeError("sample: got a call, expected none by a learner that steps arms of its own")
 
 

@@ -100,6 +100,33 @@ def sample(replay: Ring, key: Array, batch_size: int) -> Items:
     return jax.tree.map(lambda ring: ring[slot], replay.data)
 
 
+def sample_ahead(
+    replay: Ring, key: Array, batch_size: int, stride: int, n_ahead: int
+) -> tuple[Items, Items, Array]:
+    """Draw items as `sample` does, and beside each one an item that was added later.
+
+    Args:
+        replay: ring with at least one item.
+        key: PRNG key.
+        batch_size: number of items B.
+        stride: number of items that are added at once.
+        n_ahead: largest number of additions between an item and the one beside it.
+
+    Returns:
+        Pytrees of leaves (B, ...): items, and the items beside them; the number of additions between the two,
+        (B,) from 0 to `n_ahead`. Where so many have not come yet, or an addition left rows out, the item
+        beside is an unrelated one.
+    """
+    key_slot, key_ahead = jax.random.split(key)
+    slot = draws.integers(key_slot, batch_size, replay.size).astype(jnp.int32)
+    ahead = draws.integers(key_ahead, batch_size, jnp.asarray(n_ahead + 1)).astype(jnp.int32)
+    capacity = jax.tree.leaves(replay.data)[0].shape[0]
+    beside = (slot + ahead * stride) % capacity
+    items = jax.tree.map(lambda ring: ring[slot], replay.data)
+    later = jax.tree.map(lambda ring: ring[beside], replay.data)
+    return items, later, ahead
+
+
 def thin(replay: Ring, key: Array, share: Array) -> Ring:
     """Return the ring with a random share of its items, oldest first, for a stage with other goals.
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from train.agent.hindsight import HindsightConfig, relabel
+from train.agent.hindsight import HindsightConfig, later_pose, relabel
 from train.agent.learner import Experience
 from train.agent.tqc import Transition
 
@@ -141,6 +141,36 @@ def test_near_goals_earn_what_their_distance_says(env, relabelled):
     np.testing.assert_allclose(np.asarray(batch.reward)[clear], expected[clear], atol=2e-3)
     np.testing.assert_array_equal(np.asarray(batch.terminated)[clear], (norm < 0.03)[clear])
     assert 0.05 < np.mean(norm < 0.03) < 0.95
+
+
+def test_a_later_pose_is_the_goal_reached_and_the_centre_of_half_of_those_nearby(env, stored):
+    later = jnp.roll(stored.next_pose, 1, axis=0)
+    with_later = jax.tree.map(lambda x: jnp.concatenate([x] * N_COPIES), stored._replace(later_pose=later))
+
+    def goals(**shares):
+        config = HindsightConfig(**shares, near_min_mm=1e-3, near_max_mm=1e-3, mm_per_deg=1e3)
+        kept = {"goal_ends": True, "senses_action": False}
+        batch, _ = relabel(with_later, jax.random.key(0), config, env.scale, env.config.reward, **kept)
+        return np.asarray(goal_of(env, batch.obs)[:, :3])
+
+    own, other = np.asarray(with_later.next_pose[:, :3]), np.asarray(with_later.later_pose[:, :3])
+    np.testing.assert_allclose(goals(reached_share=1.0), other, atol=1e-3)
+    near = goals(reached_share=0.0, near_share=1.0)
+    by_later, by_own = (np.linalg.norm(near - pose, axis=1) < 0.01 for pose in (other, own))
+    assert (by_later | by_own).all()
+    assert abs(by_later.mean() - 0.5) < 0.05
+
+
+def test_a_later_pose_is_of_the_same_episode_or_the_transition_s_own(stored):
+    now = jax.tree.map(lambda x: x[:3], stored)
+    later = jax.tree.map(lambda x: x[3:6], stored)._replace(goal=now.goal, n_steps=now.n_steps + 2)
+    ahead = jnp.full(3, 2)
+    np.testing.assert_array_equal(later_pose(now, later, ahead), later.next_pose)
+    other_goal = later._replace(goal=later.goal.at[1, 5].add(1.0))
+    other_count = other_goal._replace(n_steps=later.n_steps.at[2].add(-1))
+    got = later_pose(now, other_count, ahead)
+    np.testing.assert_array_equal(got[0], later.next_pose[0])
+    np.testing.assert_array_equal(got[1:], now.next_pose[1:])
 
 
 def test_shares_are_kept_and_the_rest_is_as_it_was(env, transition, relabelled):

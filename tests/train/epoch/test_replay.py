@@ -121,3 +121,15 @@ def test_thinning_draws_every_item_alike():
     drawn = np.asarray(draw(jax.random.split(jax.random.PRNGKey(0), 2000)))
     share = np.bincount(drawn.ravel().astype(int), minlength=8) / len(drawn)
     np.testing.assert_allclose(share, 0.25, atol=4 * np.sqrt(0.25 * 0.75 / 2000))
+
+
+def test_an_item_ahead_is_the_same_row_of_a_later_addition():
+    """A ring that has wrapped around holds three additions; tags tell where items came from."""
+    ring = replay.create(EXAMPLE, 3 * BATCH)
+    for step in range(5):
+        ring = add(ring, rows(np.arange(BATCH) + step * BATCH), jnp.ones(BATCH, bool))
+    now, later, ahead = replay.sample_ahead(ring, jax.random.key(0), 1_000, stride=BATCH, n_ahead=2)
+    came = np.asarray(now.tag) // BATCH + np.asarray(ahead) < 5  # before the end of the last addition
+    np.testing.assert_array_equal(later.tag[came], (now.tag + BATCH * ahead)[came])
+    assert set(np.unique(now.tag)) == set(range(2 * BATCH, 5 * BATCH))
+    assert (np.bincount(ahead) > 250).all() and len(np.bincount(ahead)) == 3
