@@ -175,7 +175,7 @@ def journey(tmp_path, monkeypatch):
     for module, name, value in (
         (demo, "N_POSES", 80),
         (demo, "N_STEPS", 3),
-        (estimator, "N_STEPS", 200),
+        (estimator, "SCHEDULE", estimator.SCHEDULE._replace(n_updates=200)),
         (estimator, "N_TRAINING", 1024),
     ):
         monkeypatch.setattr(module, name, value)
