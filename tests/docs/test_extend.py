@@ -59,6 +59,7 @@ def test_a_sensor(changed):
     program = """
 import tomllib
 import numpy as np
+from mjx_softarm import ArmSpec
 from mjx_softarm.mdp.actions import ActionMap
 from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.twin.arm import Twin
