@@ -235,7 +235,8 @@ def test_imitation_resumes_across_stages_and_hands_its_reward_on(
     capsys.readouterr()
     assert main([*imitate, str(narrow), "--learner.frozen"]) == 2
     assert "learner.frozen: got true, expected --reward RUN" in capsys.readouterr().err
-    assert main([*imitate, str(narrow), "--learner.learned-weight=0", "--reward", str(whole)]) == 2
+    weights = ["--learner.learned-weight=0", "--learner.hand-made-weight=1"]
+    assert main([*imitate, str(narrow), *weights, "--reward", str(whole)]) == 2
     assert "learner.learned_weight: got 0 with --reward" in capsys.readouterr().err
     assert not narrow.exists()
     other = flags(**changes, hidden=8)  # the agent's layers are taken all the same
