@@ -35,7 +35,7 @@ TARGETS = {  # of presets
         FigureTarget("even_median_mm", 0.8),
         FigureTarget("even_p95_mm", 4.0),
     ),
-    "quick": (FigureTarget("median_mm", 2.0),),
+    "quick": (FigureTarget("median_mm", 1.5),),
     "motion-analytic": (
         FigureTarget("median_mm", 3.0),
         FigureTarget("near_median_s", 1.2, spread="evaluation-in-motion-12x0.5s_over_seeds"),
