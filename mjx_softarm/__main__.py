@@ -81,6 +81,7 @@ def _workspace(spec: cli.SpecFile = None, out: Path = Path(".")) -> int:
     Args:
         out: folder for workspace.png
     """
+    # Refuse an arm of too many chambers, and an environment that cannot draw.
     arm = ArmSpec.of(spec)
     if 3**arm.n_chambers > MAX_COMBINATIONS:
         raise InputError(
@@ -95,11 +96,13 @@ def _workspace(spec: cli.SpecFile = None, out: Path = Path(".")) -> int:
         ) from error
     from mjx_softarm.mechanics.workspace import extreme_poses
 
+    # Settle at all combinations.
     out.mkdir(parents=True, exist_ok=True)
     found = extreme_poses(arm)
     n, n_lost = len(found.settled), int(np.sum(~found.settled))
     if n_lost == n:
         raise InputError(f"{spec}: got an arm that settles at no combination of pressures, expected some")
+    # Draw the tips, and print how far they reach.
     tip_mm = 1e3 * np.asarray(found.tip_position_m, float)[found.settled]
     lateral, vertical = np.ptp(tip_mm[:, 1]), np.ptp(tip_mm[:, 2])
     plot.draw_workspace(out / "workspace.png", arm, tip_mm)

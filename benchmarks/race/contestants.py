@@ -78,11 +78,13 @@ def ours(name: str, seed: int) -> Contestant:
     from train.presets import PRESETS
     from train.runs.task import task_of
 
+    # The preset's job; its first state is made while its epoch compiles.
     config = dataclasses.replace(PRESETS[name.removeprefix("ours-")], seed=seed)
     job = task_of(config, ReachEnv(config=config.env)).job
     state = job.start(lambda: job.init(jax.random.PRNGKey(seed)))
     act = jax.jit(job.learner.mode)
 
+    # One round of training is one epoch.
     def train() -> None:
         nonlocal state
         state, _ = jax.block_until_ready(job.epoch(state))

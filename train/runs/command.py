@@ -44,7 +44,8 @@ class Reach(ReachOptions):
     """Train a policy that reaches poses of the workspace."""
 
     agent: cli.MaybePath = None
-    """run whose actor and critics this one begins with; in motion, whose policy. Its layers are taken, too"""
+    """run whose actor and critics this one begins with; in motion, only the policy. The widths of its hidden
+    layers are taken, too"""
     devices: Devices = None
 
     def __call__(self) -> int:
@@ -79,9 +80,9 @@ class Imitate(NewRunOptions):
     circle: the learned reward and the environment's, in two stages"""
     config: Annotated[TrainConfig, tyro.conf.arg(name="")]
     agent: cli.MaybePath = None
-    """run whose actor and critics this one begins with. The actor's layers are taken, too"""
+    """run whose actor and critics this one begins with. The widths of its hidden layers are taken, too"""
     reward: cli.MaybePath = None
-    """run whose learned reward this one takes, and leaves as it is"""
+    """run whose learned reward this one uses without training it"""
     devices: Devices = None
 
     @classmethod
@@ -97,6 +98,7 @@ class Imitate(NewRunOptions):
             return _resume(self.resume, mesh, console)
         if self.file is None:
             raise ConfigError("FILE: got nothing, expected the demonstrations, or --resume RUN")
+        # Settings of the learned reward, which may be another run's.
         learner = cast(ImitationConfig, self.config.learner)
         learner = dataclasses.replace(learner, frozen=learner.frozen or self.reward is not None)
         if learner.frozen and not self.reward:
@@ -107,12 +109,14 @@ class Imitate(NewRunOptions):
                 f"learner.learned_weight: got 0 with --reward {self.reward}, expected more, for its reward"
             )
         config = dataclasses.replace(self.config, learner=learner)
+        # The arm, the demonstrations, and the runs that the new one begins with.
         spec, s2r = self.read_arm(console)
         log, _ = read_demonstrations(self.file, spec)
         donors = {name: path for name in ("agent", "reward") if (path := getattr(self, name))}
         opened = {name: Run.open(path) for name, path in donors.items()}
         if "agent" in opened:
             config = config.with_policy_of(opened["agent"].config)
+        # The first state, and the run.
         task = task_of(config, ReachEnv(spec, config.env, s2r), from_log(log, spec), mesh)
         first = runs.begin_with(task, config.seed, opened)
         path = self.out or runs.default_path("imitate", self.preset, config.seed)
@@ -129,19 +133,21 @@ def evaluate(
 
     Args:
         run: folder of the run
-        payload: evaluate it with so much more than the specification's payload, at goals that the arm reaches
-            with it, without pictures [g]
-        in_motion: evaluate it on arms in motion, with actions of so many seconds, without pictures [s]
-        actions: towards each goal, in motion; None: 4
+        payload: mass to add to the specification's payload, at goals that the arm reaches with it; without
+            pictures [g]
+        in_motion: evaluate on arms in motion, with actions of this duration; without pictures [s]
+        actions: number of actions towards each goal, in motion; None: 4
 
     Raises:
-        ConfigError: a payload, or a number of actions, that cannot be.
+        ConfigError: the payload or the number of actions is out of range.
     """
+    # Check the options.
     if not 0.0 <= payload < math.inf:
         raise ConfigError(f"--payload: got {payload:g}, expected a finite number >= 0")
     if actions is not None and (actions < 1 or in_motion is None):
         where = " without --in-motion" if in_motion is None else ""
         raise ConfigError(f"--actions: got {actions}{where}, expected a positive number with --in-motion")
+    # Evaluate under the run's own conditions, with pictures, unless others are asked for.
     n_actions = actions or N_ACTIONS
     console = start()
     opened = Run.open(run)
@@ -149,6 +155,7 @@ def evaluate(
     if in_motion is None and not payload:
         _show(opened, task, runs.finish(opened, task, policy), console)
         return 0
+    # Name the other conditions in the table's title and in the file.
     config, how, name = opened.config.env, f"{n_actions} actions each", "evaluation"
     if payload:
         how, name = f"{how}, {payload:g} g", f"{name}-{payload:g}g"
@@ -158,6 +165,7 @@ def evaluate(
             f"{how}, {in_motion:g} s an action, in motion",
             f"{name}-in-motion-{n_actions}x{in_motion:g}s",
         )
+    # Evaluate under them.
     spec = opened.spec.replace(mass={"payload_kg": opened.spec.mass.payload_kg + 1e-3 * payload})
     summary, *_ = task.evaluate.on(ReachEnv(spec, config, opened.s2r), n_actions)(policy)
     _table(f"{task.title}, {how}", summary, console)

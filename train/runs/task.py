@@ -88,10 +88,12 @@ def _imitation(
     mesh: Mesh | None,
     learner: Learner,
 ) -> Task:
+    # Arms whose goals are demonstrated positions, and the evaluation at these.
     goals = DemonstratedGoals(config, env, demonstrations)
     job = Job(config, env, learner, goals, mesh)
     evaluate = PositionEvaluator(env, learner, demonstrations.positions, goals.of_stage(0))
 
+    # Before an epoch: begin a stage of goals, or shift the goals to the positions with the largest errors.
     def prepare(state: TrainState, epoch: int) -> TrainState:
         every = config.rebalance_epochs
         if every and epoch and epoch % every == 0 and epoch not in config.stage_epochs:
