@@ -41,7 +41,7 @@ def test_targets_are_those_of_the_groups_presets_for_means_over_seeds():
     never = moving | {"evaluation-in-motion-12x0.5s_over_seeds": spread(median_mm=1.0)}
     assert targets([never])[1]["verdict"] == "NOT MET"
     assert [row["verdict"] == "met" for row in found] == [False, False, True, False, False, True, True]
-    assert found[0]["target"] == "quick, over seeds, median mm: at most 2"
+    assert found[0]["target"] == "quick, over seeds, median mm: at most 1.5"
     assert found[3] == {
         "target": "analytic, over seeds, reached share: at least 0.98",
         "measured": "0.97",
