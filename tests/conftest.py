@@ -1,6 +1,9 @@
 """Fixtures that tests share: the paper's arm and its environment, built and compiled once."""
 
 import itertools
+import os
+
+os.environ["OPENBLAS_NUM_THREADS"] = "1"  # as many tests run at once as there are cores
 
 import jax
 import numpy as np

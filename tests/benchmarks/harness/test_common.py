@@ -33,11 +33,6 @@ def test_a_list_of_rows_is_a_table_with_a_column_for_every_name_in_any_row():
     assert ["1", "", "no [cuda] here"] in cells(text)
 
 
-def test_dictionaries_alike_are_a_table_with_their_names_in_front():
-    text = shown({"start": {"cold": {"total_s": 16.5, "n": 1}, "from_cache": {"total_s": 5.75, "n": 2}}})
-    assert cells(text) == [["cold", "16.5", "1"], ["from cache", "5.75", "2"]]
-
-
 def test_other_dictionaries_are_titled_by_their_path_and_what_is_loose_comes_first():
     figures = {
         "inner": {"deep_down": {"x": 1, "groups": [{"y": 2, "z": {"a": 1}}]}},

@@ -19,12 +19,6 @@ def test_three_twins_and_three_seeds():
     assert len(learned) == len(set(learned)) == 7 * 9
 
 
-def test_rods_are_not_filmed():
-    rods = dataclasses.replace(TINY, arm="rod")
-    names = [[stage.name for group in stages("open", x) for stage in group] for x in (TINY, rods)]
-    assert set(names[0]) - set(names[1]) == {"film"}
-
-
 def test_stages_leave_every_trial_s_result_and_come_after_what_they_need():
     settings = dataclasses.replace(TINY, beside=("quick",))
     for experiment in ("open", "confined"):

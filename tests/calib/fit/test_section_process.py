@@ -3,15 +3,31 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from calib.fit import section_process
 from calib.fit.section_process import NOISES, Sections, fit_process, predict, sections
+from mjx_softarm import ArmSpec
 from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.sensing.pose import frame_from_pose, pose_from_frame
 from mjx_softarm.sensing.s2r import apply_correction
 
 LEVER_MM = 100.0
+SPEC = ArmSpec.default()
+PARAMS = ArmParams.from_spec(SPEC)
+
+
+@pytest.fixture(autouse=True)
+def few_rows_choose(monkeypatch):
+    """Choose length and noise by fewer rows."""
+    monkeypatch.setattr(section_process, "MAX_GRID_ROWS", 60)
+
+
+@jax.jit
+def frames_and_sections(q):
+    frames = chain_kinematics(PARAMS)(q)
+    return frames, sections(frames, PARAMS, jnp.full(SPEC.n_chambers, 0.2))
 
 
 def drawn(n, seed, s=2):
@@ -78,22 +94,17 @@ def test_of_many_rows_some_take_part(monkeypatch):
     assert len(process.rows.state) == len(process.weight) == 50
 
 
-def test_the_effect_is_what_the_tip_does_when_a_section_shifts_and_turns(spec):
+def test_the_effect_is_what_the_tip_does_when_a_section_shifts_and_turns():
     """All below the middle of a section moves with it as a rigid body."""
-    params = ArmParams.from_spec(spec)
-    q = (
-        0.1
-        * jax.random.normal(jax.random.key(0), (3 * spec.n_links,))
-        * jnp.tile(jnp.array([0.1, 1, 1]), spec.n_links)
-    )
-    frames = chain_kinematics(params)(q)
-    found = sections(frames, params, jnp.full(spec.n_chambers, 0.2))
+    spread = np.tile([0.01, 0.1, 0.1], SPEC.n_links)
+    q = np.float32(spread * np.random.default_rng(0).normal(size=3 * SPEC.n_links))
+    frames, found = jax.device_get(frames_and_sections(q))
     own = 0.2 * np.array([1.0, -2.0, 0.5, 0.4, 0.3, -0.2])  # [mm], Gibbs vector * lever [mm]
-    lever_mm, middle = float(found.lever_mm), spec.structure.links_per_section // 2
-    np.testing.assert_allclose(lever_mm, 500.0 * spec.geometry.section_length_m)
+    lever_mm, middle = float(found.lever_mm), SPEC.structure.links_per_section // 2
+    np.testing.assert_allclose(lever_mm, 500.0 * SPEC.geometry.section_length_m)
     pose = np.asarray(pose_from_frame(frames.tip_position, frames.tip_rotation), float)
-    for s in range(spec.structure.n_sections):
-        plate = s * spec.structure.links_per_section + middle
+    for s in range(SPEC.structure.n_sections):
+        plate = s * SPEC.structure.links_per_section + middle
         centre_m, axes = (np.asarray(x[plate], float) for x in (frames.plate_position, frames.plate_rotation))
         shift = np.concatenate([axes @ own[:3], axes @ own[3:] / lever_mm])
         about = pose.copy()
@@ -112,13 +123,13 @@ def _turned(pose, gibbs):
     return turned @ position_m, turned @ rotation
 
 
-def test_a_state_holds_springs_vertical_and_moment(spec):
+def test_a_state_holds_springs_vertical_and_moment():
     """A straight hanging arm has no moment; one that is tilted has it about the axis of the tilt."""
-    params = ArmParams.from_spec(spec)
-    hanging = sections(chain_kinematics(params)(jnp.zeros(3 * spec.n_links)), params, jnp.full(9, 0.2))
+    straight = np.zeros(3 * SPEC.n_links, np.float32)
+    hanging = frames_and_sections(straight)[1]
     np.testing.assert_allclose(hanging.state[:, :3], 4.0, rtol=1e-6)
     np.testing.assert_allclose(hanging.state[:, 3:], [[0, 0, 1, 0, 0, 0]] * 3, atol=1e-6)
-    bent = jnp.zeros(3 * spec.n_links).at[1].set(0.3)
-    moments = np.asarray(sections(chain_kinematics(params)(bent), params, jnp.full(9, 0.2)).state[:, 6:])
+    bent = np.where(np.arange(len(straight)) == 1, np.float32(0.3), straight)
+    moments = np.asarray(frames_and_sections(bent)[1].state[:, 6:])
     assert np.all(np.abs(moments[:, 0]) > 10.0 * np.abs(moments[:, 1:]).max())
     assert np.all(np.diff(np.abs(moments[:, 0])) < 0.0)  # less weight below

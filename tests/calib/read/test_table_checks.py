@@ -111,19 +111,13 @@ def test_gaps_and_constant_columns_are_reported_alone(file):
     ("name", "unit", "said", "column"),
     [
         ("spring0", "m", "mm", "spring0"),
-        ("spring0", "mm", "cm", "spring0"),
         ("frequency0", "MHz", "Hz", "frequency0"),
-        ("frequency0", "Hz", "MHz", "frequency0"),
         ("pressure", "Pa", "kPa", "pressure0"),
         ("pressure", "kPa", "Pa", "pressure_kpa"),
-        ("pressure", "kPa", "bar", "pressure0"),
         ("tip_z", "m", "mm", "tip_z"),
         ("tip", "cm", "mm", "tip_m"),
-        ("tip_z", "mm", "m", "tip_z"),
         ("payload", "kg", "g", "payload_kg"),
-        ("payload", "g", "kg", "payload"),
         ("time", "ms", "s", "time"),
-        ("time", "s", "ms", "time"),
     ],
 )
 def test_wrong_unit_is_refused_by_name(text, name, unit, said, column):
