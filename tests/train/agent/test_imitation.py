@@ -39,11 +39,16 @@ def stored(short_env, shown):
 def test_the_experts_rows_are_right_answers_to_their_goals(new, short_env, stored):
     """The arm reaches a row's goal with the expert's action of that row."""
     learner = new()
-    own, _ = learner.learner.transitions(stored, jax.random.PRNGKey(0))
-    batch = learner.with_expert(own, stored, (jnp.arange(B) + 1) % 6)
+
+    @jax.jit
+    def answered(stored):
+        own, _ = learner.learner.transitions(stored, jax.random.PRNGKey(0))
+        batch = learner.with_expert(own, stored, (jnp.arange(B) + 1) % 6)
+        arms = jax.vmap(short_env.reset)(jax.random.split(jax.random.PRNGKey(4), 4))
+        return batch, jax.vmap(short_env.step)(arms, batch.action[:4])
+
+    batch, after = answered(stored)
     assert learner.n_expert == 4
-    arms = jax.vmap(short_env.reset)(jax.random.split(jax.random.PRNGKey(4), 4))
-    after = jax.vmap(short_env.step)(arms, batch.action[:4])
     np.testing.assert_allclose(after.pipeline_state.pose[:, :3], stored.goal[:4, :3], atol=0.01)
     expected = short_env.observe(after.pipeline_state.pose, stored.goal[:4])
     np.testing.assert_allclose(batch.next_obs[:4], expected, atol=1e-3)
@@ -53,7 +58,7 @@ def test_the_experts_rows_are_right_answers_to_their_goals(new, short_env, store
 
 def test_rewards_are_learned_for_goals_asked_for_and_clearance_is_always_charged(new, short_env, stored):
     learner = new(learned_weight=2.0, hand_made_weight=0.5)
-    discriminator = learner.init(jax.random.PRNGKey(0)).discriminator
+    discriminator = jax.jit(learner.init)(jax.random.PRNGKey(0)).discriminator
     given = -3.0 - stored.clearance_cost  # the environment's, costs included, of all rows but the expert's
     hindsight, expert = jnp.arange(B) >= 12, jnp.arange(B) < learner.n_expert
     start = short_env.observe(stored.pose, stored.goal)
@@ -70,7 +75,7 @@ def test_rewards_are_learned_for_goals_asked_for_and_clearance_is_always_charged
 @pytest.mark.parametrize("frozen", [False, True])
 def test_an_update_moves_the_discriminator_unless_it_is_frozen(new, stored, frozen):
     learner = new(frozen=frozen)
-    before = learner.init(jax.random.PRNGKey(0))
+    before = jax.jit(learner.init)(jax.random.PRNGKey(0))
     after, metrics = jax.jit(lambda state, key: learner.update(state, lambda _: stored, key))(
         before, jax.random.PRNGKey(1)
     )
@@ -88,7 +93,7 @@ def moving(imitation_config, moving_env, shown):
 
 
 def test_in_motion_the_expert_acts_for_a_share_of_the_arms(moving, moving_env, shown):
-    state, row = moving.init(jax.random.PRNGKey(0)), jnp.arange(600) % 6
+    state, row = jax.jit(moving.init)(jax.random.PRNGKey(0)), jnp.arange(600) % 6
     pose, goal = (jnp.asarray(shown.positions)[(row + k) % 6] for k in (0, 1))
     obs = moving_env.observe(pose, goal, jnp.zeros((600, moving_env.observation_size - 18)))
     action, expert = moving.act(state, obs, jax.random.PRNGKey(1))
@@ -105,11 +110,13 @@ def test_in_motion_the_expert_s_actions_are_not_shown_as_the_agent_s(moving, mov
     expert, by_expert = jnp.asarray(shown.actions)[(jnp.arange(B) + 1) % 6], jnp.arange(B) < 5
     action = jnp.where(by_expert[:, None], expert, stored.action)
     stored = stored._replace(action=action, sensed=sensed, next_sensed=sensed, by_expert=by_expert)
-    state, seen = moving.init(jax.random.PRNGKey(0)), {}
+    state, seen = jax.jit(moving.init)(jax.random.PRNGKey(0)), {}
     learn, update = moving.learner.learn, moving.gail.update
     moving.learner.learn = lambda agent, batch, key: seen.update(batch=batch) or learn(agent, batch, key)
     moving.gail.update = lambda s, e, a, key: seen.update(expert=e, agent=a) or update(s, e, a, key)
-    after, _ = moving.update(state, lambda _: stored, jax.random.PRNGKey(1))
+    after, seen = jax.jit(lambda *given: (moving.update(given[0], lambda _: given[1], given[2])[0], seen))(
+        state, stored, jax.random.PRNGKey(1)
+    )
     np.testing.assert_array_equal(seen["batch"].action, action)
     assert not np.array_equal(*(s.discriminator.params["params"]["head"]["kernel"] for s in (state, after)))
     (obs, answers), (obs_agent, own) = seen["expert"], seen["agent"]
@@ -122,7 +129,8 @@ def test_in_motion_the_expert_s_actions_are_not_shown_as_the_agent_s(moving, mov
 
 def test_parts_of_other_runs_are_taken(new):
     learner, reach = new(), new().learner
-    state, donor = learner.init(jax.random.PRNGKey(0)), learner.init(jax.random.PRNGKey(1))
+    init = jax.jit(learner.init)
+    state, donor = init(jax.random.PRNGKey(0)), init(jax.random.PRNGKey(1))
     same = lambda a, b: jax.tree.map(np.testing.assert_array_equal, a, b)  # noqa: E731
     shown = learner.parts(donor)
     reward = shown.pop("reward")
@@ -137,7 +145,7 @@ def test_parts_of_other_runs_are_taken(new):
 
 def test_parts_that_do_not_fit_are_refused(new):
     learner, narrow = new(), new(hidden=(8,))
-    state = learner.init(jax.random.PRNGKey(0))
+    state = jax.jit(learner.init)(jax.random.PRNGKey(0))
     with pytest.raises(ValueError, match="networks: got layers of .* expected"):
         learner.adopt(state, narrow.parts(narrow.init(jax.random.PRNGKey(0))))
     without = new(learned_weight=0.0, hand_made_weight=1.0)

@@ -7,7 +7,7 @@ import pytest
 
 from train.agent.networks import Actor, Critics, squash
 
-pytestmark = pytest.mark.usefixtures("strict")
+pytestmark = pytest.mark.usefixtures("strict", "quick_compiler")
 
 OBS, ACTION = 3, 2
 

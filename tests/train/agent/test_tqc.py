@@ -26,6 +26,9 @@ CONFIG = TQCConfig(
 )
 
 
+pytestmark = pytest.mark.usefixtures("quick_compiler")
+
+
 @pytest.fixture(autouse=True, scope="module")
 def strict():
     # Ranks only: optax's Adam raises a float to an integer power, which strict dtypes refuse.
@@ -103,21 +106,6 @@ def test_quantile_huber_loss_equals_loops_over_every_pair(quantiles_and_targets,
     loss = jax.jit(losses.quantile_huber_loss)(*floats(quantiles, targets))
     # 320 terms of order one in float32.
     assert loss == pytest.approx(quantile_huber_by_loops(quantiles, targets), rel=1e-5)
-
-
-def test_quantile_huber_gradient_equals_finite_differences(quantiles_and_targets, strict_dtypes):
-    quantiles, targets = quantiles_and_targets
-    gradient = jax.jit(jax.grad(losses.quantile_huber_loss, argnums=(0, 1)))
-    d_quantiles, d_targets = gradient(*floats(quantiles, targets))
-    h = 1e-5  # the loss is piecewise quadratic: a central difference is exact away from its corners
-    expected = np.zeros_like(quantiles)
-    for index in np.ndindex(quantiles.shape):
-        step = np.zeros_like(quantiles)
-        step[index] = h
-        above = quantile_huber_by_loops(quantiles + step, targets)
-        expected[index] = (above - quantile_huber_by_loops(quantiles - step, targets)) / (2 * h)
-    np.testing.assert_allclose(d_quantiles, expected, atol=1e-6)  # entries of order 1 / (B C M) = 0.025
-    np.testing.assert_array_equal(d_targets, 0.0)
 
 
 @pytest.mark.parametrize("n_drop", [0, 1, 4, 9])
@@ -253,7 +241,7 @@ def test_a_given_policy_acts_as_before_whatever_it_did_not_observe():
     """Two more entries of the observation have no weight; the noise is small; the critics stay."""
     settings = TQCConfig(hidden=(8,), hidden_critic=(8,))
     donor, wider = (TQC(n, 2, settings) for n in (OBS_SIZE, OBS_SIZE + 2))
-    given, own = (each.init(jax.random.key(k)) for k, each in enumerate((donor, wider)))
+    given, own = (jax.jit(each.init)(jax.random.key(k)) for k, each in enumerate((donor, wider)))
     adopted = wider.adopt_policy(own, given.mean_actor_params)
     obs = jax.random.normal(jax.random.key(2), (4, OBS_SIZE + 2))
     expected = donor.mode(given.mean_actor_params, obs[:, :OBS_SIZE])

@@ -77,15 +77,6 @@ def test_sample_is_uniform_over_the_filled_slots_and_only_those():
     np.testing.assert_allclose(counts[1:], n_draws * p, atol=5 * np.sqrt(n_draws * p * (1 - p)))
 
 
-def test_items_of_any_pytree_structure_are_stored_with_their_dtypes():
-    example = {"a": jax.ShapeDtypeStruct((), jnp.int8), "b": (jax.ShapeDtypeStruct((2, 3), jnp.bfloat16),)}
-    ring = replay.create(example, 3)
-    assert ring.data["a"].shape == (3,) and ring.data["a"].dtype == jnp.int8
-    assert ring.data["b"][0].shape == (3, 2, 3) and ring.data["b"][0].dtype == jnp.bfloat16
-    with pytest.raises(ValueError, match="got 0, expected at least 1"):
-        replay.create(example, 0)
-
-
 @pytest.mark.parametrize(
     ("items", "valid", "message"),
     [
