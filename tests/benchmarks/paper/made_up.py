@@ -79,31 +79,20 @@ def trained(kind, reaches_at=4, n=10, after_one=0.5, after_two=0.75):
     return Training(rows, (4,) if kind == "circle" else ())
 
 
+GOOD_MM = {"specified": 5.0, "without": 4.0, "gradient": 2.0, "with": 1.25, "payload": 1.0}
+GOOD_MM |= {"quick": 1.25, "circle": 1.0}
+
+
 def good_results(experiment, settings=FULL, changed=None):
     """Results that meet every target, but for what is changed: trial or training -> outcome or course."""
     outcomes = {}
     for trial in trials(experiment, settings):
-        error_mm = {
-            "specified": 5.0,
-            "without": 4.0,
-            "gradient": 2.0,
-            "with": 1.25,
-            "payload": 1.0,
-            "quick": 1.25,
-            "circle": 1.0,
-        }.get(trial.kind)
         hit = trial.kind == "gradient" or trial.load_g == 1000
-        outcomes[trial] = (
-            made_up(trial.kind, tick_s=0.1 if trial.moves else 0.25)
-            if error_mm is None
-            else made_up(
-                trial.kind,
-                (error_mm, 0, 0, -0.5),
-                [(1, 2)] if hit else [],
-                2 * hit,
-                estimate_g=trial.load_g,
-            )
-        )
+        if trial.kind in GOOD_MM:
+            error, saturated = (GOOD_MM[trial.kind], 0, 0, -0.5), [(1, 2)] if hit else []
+            outcomes[trial] = made_up(trial.kind, error, saturated, 2 * hit, estimate_g=trial.load_g)
+        else:
+            outcomes[trial] = made_up(trial.kind, tick_s=0.1 if trial.moves else 0.25)
     items = trainings(settings) if experiment == "confined" else []
     found = {item: trained(item[0], reaches_at=8 if item[0] == "hand-made" else 4) for item in items}
     changed = changed or {}

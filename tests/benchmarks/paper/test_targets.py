@@ -45,6 +45,7 @@ UNLOADED, AT_1_KG = Trial("with", 0, 0), Trial("with", 0, 0, load_g=1000)
 RATIO = "translation with calibrated springs over that with S2R, at least 2"
 FREE = "with S2R, unloaded: no saturated"
 ANGLES = [f"with S2R, mean {angle} at most 3 deg" for angle in ("yaw", "pitch", "roll")]
+ALL_UNLOADED = [TRANSLATION, *ANGLES, RATIO, "payload, estimated", FREE, REACHED]
 
 
 @pytest.mark.parametrize(
@@ -52,30 +53,12 @@ ANGLES = [f"with S2R, mean {angle} at most 3 deg" for angle in ("yaw", "pitch", 
     [
         (UNLOADED, made_up("with", (7.0,)), [TRANSLATION, RATIO]),
         (Trial("without", 0, 0), made_up("without", (0.9,)), [RATIO]),
-        (
-            UNLOADED._replace(load_g=500),
-            made_up("with", (4.0,), estimate_g=500),
-            ["500 g, mean translation at"],
-        ),
-        (AT_1_KG, made_up("with", (7.0,), estimate_g=1000), ["1 kg, mean translation at most 4 mm"]),
-        (
-            AT_1_KG,
-            made_up("with", (1.0,), estimate_g=300),
-            ["payload, estimated, mean error at all loads at most"],
-        ),
+        (UNLOADED._replace(load_g=500), made_up("with", (4.0,), estimate_g=500), ["500 g, mean transl"]),
         (AT_1_KG, made_up("with", (12.1,)), ["1 kg, mean", "1 kg, largest", "payload, estimated, mean"]),
-        (
-            AT_1_KG,
-            made_up("with", (1.0,), [(0, 0)], estimate_g=1000),
-            ["1 kg, saturation detected and reported"],
-        ),
+        (AT_1_KG, made_up("with", (1.0,), [(0, 0)], estimate_g=1000), ["1 kg, saturation detected"]),
         (Trial("with", 1, 0), made_up("with", (1.0,), [(2, 8)]), [FREE]),
         (UNLOADED, made_up("with", (1.0, 0, 0, 0, -7.0)), ANGLES[1:2]),
-        (
-            UNLOADED,
-            made_up("with", (0.1,), missed=[2]),
-            [TRANSLATION, *ANGLES, RATIO, "payload, estimated", FREE, REACHED],
-        ),
+        (UNLOADED, made_up("with", (0.1,), missed=[2]), ALL_UNLOADED),
     ],
 )
 def test_open_targets_that_are_missed_are_named(trial, outcome, missed):
@@ -104,14 +87,12 @@ def test_gradient_descent_without_saturation_misses_its_target():
     ("changed", "missed"),
     [
         ({FIRST: made_up("pipe", (38.0, 0, 0))}, [X]),  # (8 + 38) / 9 = 5.1
-        ({FIRST: made_up("pipe", (0, -30.0, 0))}, [Y]),  # (16 + 30) / 9 = 5.1
-        ({FIRST: made_up("pipe", (0, 0, 22.0))}, [Z]),  # (24 + 22) / 9 = 5.1
+        ({FIRST: made_up("pipe", (0, -30.0, 22.0))}, [Y, Z]),  # (16 + 30) / 9 = (24 + 22) / 9 = 5.1
         ({FIRST: made_up("pipe", fails=(0,)), EXCHANGED: made_up("pipe", fails=(3,))}, [BOTH]),
         ({pipe_trial(t, kind="narrow"): made_up("narrow", fails=(2,)) for t in range(3)}, [TASKS]),
         ({EXCHANGED: made_up("pipe", pressed=0.02)}, [CALM]),
         ({MOVED._replace(twin=t): made_up("pipe", fails=(2,), tick_s=0.1) for t in range(2)}, [MOVING]),
         ({MOVED: made_up("pipe", tick_s=0.4)}, [TIME]),  # (8 * 0.1 + 0.4) / 9 = 0.13
-        ({MOVED: made_up("pipe", pressed=0.02, tick_s=0.1)}, [CALM_MOVING]),
         ({pipe_trial(1, 1, kind="narrow"): made_up("narrow", pressed=0.02)}, [CALM_NARROW]),
         ({pipe_trial(kind="circle"): made_up("circle", (9.0, 0, 0))}, [CIRCLE]),  # 8 * 1 + 9 > 9 * 1.25
         ({("circle", 1, 2): trained("circle", after_one=0.5, after_two=0.375)}, [KEPT]),
