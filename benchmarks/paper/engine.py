@@ -20,6 +20,7 @@ import numpy as np
 
 from benchmarks.harness.common import difference
 from benchmarks.harness.parallel import JobError, in_parallel
+from mjx_softarm._support.files import replacing
 from mjx_softarm._support.provenance import write_json
 
 SETTINGS_FILE = "settings.json"
@@ -109,10 +110,8 @@ def run_stages(folder: Path, settings: Settings, groups: Sequence[Sequence[WorkS
 
 def save_arrays(path: Path, arrays: Any) -> None:
     """Write a named tuple of arrays whole or not at all."""
-    part = path.with_name(path.name + ".part")
-    with part.open("wb") as file:
+    with replacing(path) as part, part.open("wb") as file:
         np.savez_compressed(file, **arrays._asdict())
-    part.replace(path)
 
 
 def load_arrays(kind: Any, path: Path) -> Any:

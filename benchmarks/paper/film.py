@@ -12,6 +12,7 @@ from PIL import Image, ImageDraw
 from benchmarks.paper.kinds import KINDS, Trial
 from benchmarks.paper.measure import WatchedTwin, captured_finger_tips, finger_tips, operate
 from benchmarks.paper.scene import Scene
+from mjx_softarm._support.files import replacing
 from mjx_softarm.mechanics.pipe import PIPES_MM, CrossPipe
 
 WIDTH, HEIGHT = 240, 320  # of a picture [px]
@@ -107,8 +108,6 @@ def write_gif(path: Path, images: list[Image.Image]) -> None:
     """Write a film that repeats, with one palette for all its frames."""
     palette = images[len(images) // 2].quantize(N_COLOURS, Image.Quantize.MAXCOVERAGE)
     first, *others = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images)
-    part = path.with_name(path.name + ".part")
-    first.save(
-        part, format="GIF", save_all=True, append_images=others, duration=FRAME_MS, loop=0, optimize=True
-    )
-    part.replace(path)
+    repeats = {"save_all": True, "append_images": others, "duration": FRAME_MS, "loop": 0}
+    with replacing(path) as part:
+        first.save(part, format="GIF", optimize=True, **repeats)

@@ -21,6 +21,7 @@ import numpy as np
 
 from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.fields import FLOAT32_MAX
+from mjx_softarm._support.files import replacing
 from mjx_softarm._support.mlp import Layer
 
 # Exceptions of NumPy and zipfile on archives that are damaged or that they do not read.
@@ -44,15 +45,11 @@ def write_sealed(path: Path, arrays: Mapping[str, Any], kind: str) -> None:
     Raises:
         SealedFileError: the file cannot be written.
     """
-    part = path.with_name(path.name + ".part")
     try:
-        part.write_bytes(sealed(arrays, kind))
-        part.replace(path)
+        with replacing(path) as part:
+            part.write_bytes(sealed(arrays, kind))
     except OSError as error:
         raise SealedFileError(f"{path}: got {error.strerror!r}, expected to write a file") from error
-    finally:
-        if part.exists():  # `unlink(missing_ok=True)` fails where the parent is no folder
-            part.unlink()
 
 
 def read_sealed(path: Path, kind: str, made_by: str) -> dict[str, np.ndarray]:

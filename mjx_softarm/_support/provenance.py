@@ -13,6 +13,8 @@ from typing import Any
 
 import jax
 
+from mjx_softarm._support.files import replacing
+
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "orbax-checkpoint", "numpy")
 
 
@@ -45,6 +47,5 @@ def _git(*arguments: str) -> str | None:
 
 def write_json(path: Path, data: Any) -> None:
     """Write a JSON file whole or not at all."""
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_text(json.dumps(data, indent=2) + "\n", "utf-8")
-    os.replace(temporary, path)
+    with replacing(path) as part:
+        part.write_text(json.dumps(data, indent=2) + "\n", "utf-8")

@@ -6,7 +6,6 @@ The npz file `POSES_FILE` of a folder holds named sets: `<set>.target` and `<set
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -15,6 +14,7 @@ import numpy as np
 
 from mjx_softarm._support.archive import ZIP_ERRORS
 from mjx_softarm._support.errors import InputError
+from mjx_softarm._support.files import replacing
 
 POSES_FILE = "poses.npz"
 
@@ -39,10 +39,8 @@ def write_pose_pairs(folder: Path, sets: Mapping[str, PosePairs]) -> None:
         OSError: the file cannot be written.
     """
     arrays = {f"{name}.{field}": x for name, pairs in sets.items() for field, x in pairs._asdict().items()}
-    part = folder / f"{POSES_FILE}.part"
-    with part.open("wb") as file:
+    with replacing(folder / POSES_FILE) as part, part.open("wb") as file:
         np.savez_compressed(file, **arrays)
-    os.replace(part, folder / POSES_FILE)
 
 
 def read_pose_pairs(folder: Path) -> dict[str, PosePairs]:

@@ -8,7 +8,6 @@ a file may use. `mjx_softarm.logs.files` reads logs.
 from __future__ import annotations
 
 import dataclasses
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from mjx_softarm._support.files import replacing
 from mjx_softarm.logs import mcap_file
 from mjx_softarm.logs.checks import Finding, LogError
 from mjx_softarm.sensing.sensors import SENSORS, Coil, Sensor
@@ -147,15 +147,10 @@ def write_log(path: str | Path, log: Log) -> None:
     path = Path(path)
     columns, table = log_table(log)
     headers = [column.header for column in columns]
-    part = path.with_name(path.name + ".part")
-    try:
-        with part.open("wb") as file:
-            if path.suffix == ".npz":
-                np.savez(file, columns=np.array(headers), table=table)
-            elif path.suffix == mcap_file.SUFFIX:
-                mcap_file.write_mcap(file, [(c.group, c.name, c.unit) for c in columns], table)
-            else:
-                np.savetxt(file, table, "%.9g", ",", header=",".join(headers), comments="")
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
+    with replacing(path) as part, part.open("wb") as file:
+        if path.suffix == ".npz":
+            np.savez(file, columns=np.array(headers), table=table)
+        elif path.suffix == mcap_file.SUFFIX:
+            mcap_file.write_mcap(file, [(c.group, c.name, c.unit) for c in columns], table)
+        else:
+            np.savetxt(file, table, "%.9g", ",", header=",".join(headers), comments="")

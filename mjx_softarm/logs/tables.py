@@ -1,15 +1,10 @@
-"""Tables of numbers from CSV and npz files, or an error that names the line and the column.
-
-NumPy's fast reader reads well-formed text. If it fails, or if line numbers are in doubt, the file is read
-again line by line to find the error.
-"""
+"""Tables of numbers from CSV and npz files, or an error that names the line and the column."""
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -81,19 +76,34 @@ def _read_csv(path: Path, names: Sequence[str] | None) -> Table:
         found = [text for mark, text in _OTHER_DELIMITERS.items() if mark in first]
         got = f"{found[0]} between the columns" if found else f"one column, {first[:60]!r}"
         raise _error(path, f"got {got}, expected columns parted by commas, and decimal points", 1)
-    try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "loadtxt: input contained no data")  # `_read_lines` refuses it
-            options: Any = {"delimiter": ",", "comments": None, "encoding": "utf-8-sig"}
-            values = np.loadtxt(path, skiprows=n_header, ndmin=2, **options)
-    except ValueError:
-        return _read_lines(path, names, n_header)
-    if values.shape != (
-        _count_lines(path) - n_header,
-        len(names),
-    ):  # blank lines, or a short header
-        return _read_lines(path, names, n_header)
-    return Table(names, values, np.arange(len(values)) + 1 + n_header)
+    # Lines: blank ones are skipped, empty cells are NaN, any other text is an error.
+    values, row = [], []
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
+        for number, line in enumerate(file, 1):
+            if number <= n_header or not line.strip():
+                continue
+            cells = line.rstrip("\r\n").split(",")
+            if len(cells) != len(names):
+                raise _error(path, _ragged(line, len(cells), len(names)), number)
+            try:
+                values.append(np.fromiter(map(float, cells), float, len(cells)))
+            except ValueError:
+                values.append(_with_empty_cells(path, names, cells, number))
+            row.append(number)
+    if not values:
+        raise _error(path, "got a header and no rows, expected at least 2 rows")
+    return Table(names, np.stack(values), np.array(row))
+
+
+def _with_empty_cells(path: Path, names: tuple[str, ...], cells: list[str], line: int) -> np.ndarray:
+    numbers = np.full(len(cells), np.nan)
+    for k, cell in enumerate(cells):
+        try:
+            numbers[k] = float(cell) if cell.strip() else np.nan
+        except ValueError:
+            problem = f"got {cell.strip()[:40]!r}, expected a number"
+            raise _error(path, problem, line, names[k]) from None
+    return numbers
 
 
 def _check_text(path: Path, head: bytes) -> None:
@@ -111,38 +121,6 @@ def _check_text(path: Path, head: bytes) -> None:
         got = f"byte 0x{head[error.start]:02x} at {error.start}"
         line = head.count(b"\n", 0, error.start) + 1
         raise _error(path, f"got {got}, expected UTF-8 text or npz", line) from error
-
-
-def _count_lines(path: Path) -> int:
-    n, last = 0, b"\n"
-    with path.open("rb") as file:
-        while chunk := file.read(1 << 22):
-            n, last = n + chunk.count(b"\n"), chunk[-1:]
-    return n + (last != b"\n")
-
-
-def _read_lines(path: Path, names: tuple[str, ...], n_header: int) -> Table:
-    """Read line by line: blank lines are skipped, empty cells are NaN, any other text is an error."""
-    values, row = [], []
-    with path.open(encoding="utf-8-sig", errors="replace") as file:
-        for number, line in enumerate(file, 1):
-            if number <= n_header or not line.strip():
-                continue
-            cells = line.rstrip("\r\n").split(",")
-            if len(cells) != len(names):
-                raise _error(path, _ragged(line, len(cells), len(names)), number)
-            numbers = []
-            for name, cell in zip(names, cells, strict=True):
-                try:
-                    numbers.append(float(cell) if cell.strip() else np.nan)
-                except ValueError:
-                    problem = f"got {cell.strip()[:40]!r}, expected a number"
-                    raise _error(path, problem, number, name) from None
-            values.append(np.array(numbers))
-            row.append(number)
-    if not values:
-        raise _error(path, "got a header and no rows, expected at least 2 rows")
-    return Table(names, np.stack(values), np.array(row))
 
 
 def _ragged(line: str, n_cells: int, n_names: int) -> str:

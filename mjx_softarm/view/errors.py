@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import time
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import numpy as np
 import viser
 
 from mjx_softarm._support.errors import InputError
+from mjx_softarm._support.files import read_json_lines
 from mjx_softarm.logs.pose_pairs import POSES_FILE, PosePairs, read_pose_pairs
 from mjx_softarm.spec import ARM_FILE, ArmSpec
 from mjx_softarm.view.look import Limits, look_at
@@ -114,7 +115,7 @@ class Errors:
         self._boxes[name] = box
 
     def _show_curves(self) -> None:
-        rows = _metrics(self._folder / METRICS_FILE)
+        rows = read_json_lines(self._folder / METRICS_FILE)
         evaluated = [row for row in rows if all(name in row for name in CURVES)]
         if evaluated:
             self._curve.data = tuple(
@@ -138,17 +139,6 @@ def _summary(name: str, pairs: PosePairs) -> str:
     median, most = np.quantile(pairs.error_mm, (0.5, 0.95))
     poses = f"{len(pairs.target)} poses, {pairs.warned.sum()} marked"
     return f"<div><b>{name}</b>: median {median:.2f} mm, 95 % {most:.2f} mm; {poses}</div>"
-
-
-def _metrics(path: Path) -> list[dict[str, Any]]:
-    """Return the lines of a file of metrics; a last line that is not complete is left out."""
-    rows = []
-    for line in path.read_text("utf-8").splitlines():
-        try:
-            rows.append(json.loads(line))
-        except json.JSONDecodeError:
-            break
-    return rows
 
 
 def follow_errors(server: viser.ViserServer, folder: Path) -> NoReturn:

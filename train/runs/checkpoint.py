@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from pathlib import Path
 from typing import Any, cast
@@ -12,6 +11,7 @@ import jax
 import orbax.checkpoint as ocp
 
 from mjx_softarm._support.errors import InputError
+from mjx_softarm._support.files import read_json_lines, replacing
 from mjx_softarm._support.provenance import provenance, write_json
 from mjx_softarm.logs.files import LogError
 from mjx_softarm.logs.pose_pairs import PosePairs, write_pose_pairs
@@ -159,9 +159,8 @@ class Run:
         if not is_first_process():
             return
         rows = [row for row in self.metrics() if row["epoch"] <= epoch]
-        temporary = self.path / "metrics.jsonl.part"
-        temporary.write_text("".join(json.dumps(row) + "\n" for row in rows), "utf-8")
-        os.replace(temporary, self.path / "metrics.jsonl")
+        with replacing(self.path / "metrics.jsonl") as part:
+            part.write_text("".join(json.dumps(row) + "\n" for row in rows), "utf-8")
 
     def save(self, epoch: int, state: TrainState, parts: dict[str, Any]) -> None:
         """Write a checkpoint; an interrupted write leaves the one before it in force.
@@ -232,14 +231,7 @@ class Run:
 
     def metrics(self) -> list[dict[str, Any]]:
         """Return the lines of `metrics.jsonl`, up to the first incomplete one."""
-        rows = []
-        file = self.path / "metrics.jsonl"
-        for line in file.read_text("utf-8").splitlines() if file.exists() else []:
-            try:
-                rows.append(json.loads(line))
-            except json.JSONDecodeError:
-                break
-        return rows
+        return read_json_lines(self.path / "metrics.jsonl")
 
 
 def _shape_somewhere(x: Any) -> jax.ShapeDtypeStruct:
