@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from mjx_softarm._support import cli
-from mjx_softarm._support.errors import InputError
+from mjx_softarm._support.errors import InputError, needing
 from mjx_softarm.arms import shipped_arm
 from mjx_softarm.spec import ArmSpec
 
@@ -88,12 +88,8 @@ def _workspace(spec: cli.SpecFile = None, out: Path = Path(".")) -> int:
             f"{spec}: got 3^{arm.n_chambers} combinations of pressures, expected {MAX_COMBINATIONS:,} at most"
         )
     _import_mujoco()
-    try:
+    with needing("sim", "drawing"):
         from mjx_softarm.mechanics import workspace_plot as plot
-    except ImportError as error:
-        raise InputError(
-            f"drawing: got {error}, expected matplotlib and scipy: pip install -e '.[sim]' in the checkout"
-        ) from error
     from mjx_softarm.mechanics.workspace import extreme_poses
 
     # Settle at all combinations.

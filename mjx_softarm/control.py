@@ -9,13 +9,9 @@ reference gets more pressure:
     i'  = clip(i + ki e dt, p_min, p_max)                 integral, in kPa
     p   = clip(i' + kp e - kd (l' - l) / dt, p_min, p_max)
 
-A new reference is approached in some `reference_s` seconds, about as fast as the pump can fill the chambers:
-a jump would wind up the integral while they fill. The length's rate damps the arm's swing; it is smoothed
-over about two ticks, since lengths are read at 50 Hz.
-
-The integral is clamped to the pressure limits, so it never winds up: a chamber leaves its limit in the tick
-    in
-which the error changes sign.
+A new reference is approached about as fast as the pump can fill the chambers: a jump would wind up the
+integral. The length's rate damps the arm's swing; it is smoothed over about two ticks of 50 Hz. The integral
+is clamped to the pressure limits, so a chamber leaves its limit in the tick in which the error changes sign.
 
 At rest (r' = reference, l' = length, i' = i) p = i, and each chamber is in one of three states:
 

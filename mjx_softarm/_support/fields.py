@@ -27,9 +27,7 @@ class Rule:
     low: float = -math.inf
     high: float = math.inf
     low_open: bool = False
-    per: str = (
-        ""  # parts of the arm with a number each, such as "chambers"; without `length`, one for all may do
-    )
+    per: str = ""  # parts of the arm with a number each, such as "chambers"; one for all without `length`
     length: int | None = None  # length of a field that must be a list; 0: it depends on the arm
 
     @property

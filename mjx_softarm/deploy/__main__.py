@@ -15,7 +15,7 @@ import numpy as np
 import tyro
 
 from mjx_softarm._support import cli
-from mjx_softarm._support.errors import InputError
+from mjx_softarm._support.errors import InputError, needing
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.drivers.names import open_arm
 from mjx_softarm.deploy.ending import MISSED, LoopRun, save_log
@@ -245,7 +245,8 @@ def check_file(option: str, path: Path | None) -> None:
     if path is not None and path.is_dir():
         raise InputError(f"{option}: got {path}, a folder, expected a file")
     if path is not None and path.suffix == mcap_file.SUFFIX:
-        mcap_file.require_mcap(option)
+        with needing("mcap", option):
+            import mcap  # noqa: F401
 
 
 if __name__ == "__main__":

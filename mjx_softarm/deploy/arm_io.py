@@ -8,8 +8,9 @@ A driver is a class without arguments. Of an arm with n springs and n chambers (
     motion_capture() -> Capture      optional  tip (3,), (4,), markers (m, 3), springs (n,); for calibration
     time_s                           optional  clock [s] of a simulated arm, for which no tick waits
 
+No controller uses motion capture; an OSError of `motion_capture` is a missed frame, a gap in the log.
 `mjx_softarm.deploy.drivers` has drivers over serial and UDP that need only your numbers. An exception other
-than those named below ends the run as a fault: the arm is vented and the log is written.
+than those named here ends the run as a fault: the arm is vented and the log is written.
 """
 
 from __future__ import annotations
@@ -70,15 +71,3 @@ class Capture(NamedTuple):
     tip_quaternion: np.ndarray
     marker_m: np.ndarray
     spring_m: np.ndarray | None = None
-
-
-class MotionCapture(Protocol):
-    """Motion capture of an arm, for calibration and for measurements; no controller may use it."""
-
-    def motion_capture(self) -> Capture:
-        """Return the places of tip and markers.
-
-        Raises:
-            OSError: this frame is missing; it becomes a gap in the log.
-        """
-        ...

@@ -19,6 +19,7 @@ from mjx_softarm._support.xp import Array, array_namespace
 from mjx_softarm.control import Gains, saturated
 from mjx_softarm.deploy.controller import LOOP, Command, Controller, LoopConfig
 from mjx_softarm.policy.file import Policy
+from mjx_softarm.policy.runtime import tip_pose
 from mjx_softarm.sensing.estimator import SpringModel, expected_springs
 from mjx_softarm.sensing.load import HIGHEST, LOWEST, Load, averaged, estimate_load
 from mjx_softarm.sensing.sensors import Sensor, SensorFault
@@ -147,7 +148,7 @@ def pose_of(controller: Controller, spring_m: np.ndarray, load: Load) -> tuple[n
     """
     if np.isnan(spring_m).any():
         return np.full(6, np.nan), 0.0
-    pose, away = controller.tip(spring_m, load.believed_kg)
+    pose, away = tip_pose(controller.policy, spring_m, load.believed_kg)
     return pose, float(away)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +11,7 @@ import numpy as np
 from mjx_softarm.control import LawState
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.policy.reachable import Reachable
-from mjx_softarm.policy.runtime import InMotion, PolicyRunner, sensed, tip_pose
+from mjx_softarm.policy.runtime import PolicyRunner
 
 
 @dataclass(frozen=True)
@@ -77,12 +76,10 @@ Plan = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None], np.ndar
 
 @dataclass(frozen=True, eq=False)
 class Controller:
-    """A policy made ready for the loop, with its three maps: to poses, to observations and to references."""
+    """A policy made ready for the loop."""
 
     policy: Policy
     reachable: Reachable
-    tip: Callable[[np.ndarray, float], tuple[np.ndarray, float]]  # `policy.runtime.tip_pose`
-    sensed: Callable[[np.ndarray, np.ndarray, InMotion, float], np.ndarray | None]  # `policy.runtime.sensed`
     plan: Plan  # pose and goal (6,), springs (n,) [m], `sensed` of `PolicyRunner.act` -> references (n,) [m]
     dt_s: float
     window: int  # ticks
@@ -96,8 +93,6 @@ class Controller:
         return cls(
             policy=policy,
             reachable=Reachable.from_poses(policy.workspace, policy.reward),
-            tip=partial(tip_pose, policy),
-            sensed=partial(sensed, policy),
             plan=plan or (lambda pose, goal, _, sensed: runner.act(pose, goal, sensed).length_m),
             dt_s=1.0 / policy.rate_hz,
             window=max(2, round(config.window_s * policy.rate_hz)),

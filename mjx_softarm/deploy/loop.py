@@ -35,9 +35,7 @@ class LoopState(NamedTuple):
     watch: Watch
     strategy: Strategy
     goal: np.ndarray | None = None  # (6,) [mm, deg]
-    lead: np.ndarray | None = (
-        None  # (6,) [mm, deg] place of a moving goal some time ahead; None: the goal stands
-    )
+    lead: np.ndarray | None = None  # (6,) [mm, deg] place of a moving goal ahead; None: the goal stands
 
 
 class Tick(NamedTuple):

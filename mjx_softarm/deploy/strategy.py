@@ -22,7 +22,7 @@ from mjx_softarm.deploy.safety import Event, Fault, names
 from mjx_softarm.mdp.observation import rate_ticks
 from mjx_softarm.mdp.rewards import scaled_error
 from mjx_softarm.policy.file import Policy
-from mjx_softarm.policy.runtime import InMotion
+from mjx_softarm.policy.runtime import InMotion, sensed
 from mjx_softarm.sensing.load import Load
 from mjx_softarm.sensing.pose import pose_error
 
@@ -190,7 +190,7 @@ def _planned(belief: Belief, pose: np.ndarray, target: np.ndarray) -> np.ndarray
     before_m = lengths_m[-1 - min(rate_ticks(controller.policy.rate_hz), len(lengths_m) - 1)]
     last_m = np.full_like(before_m, np.nan) if last_m is None else last_m
     motion = InMotion(before_m, last_m, belief.command.law.integral_kpa)
-    observed = controller.sensed(pose, belief.spring_m, motion, belief.load.believed_kg)
+    observed = sensed(controller.policy, pose, belief.spring_m, motion, belief.load.believed_kg)
     return controller.plan(pose, target, belief.spring_m, observed)
 
 

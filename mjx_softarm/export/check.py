@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjx_softarm._support.errors import InputError
+from mjx_softarm._support.errors import InputError, needing
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.safety import Fault
 from mjx_softarm.export.golden import BITS, FLAGS, PROGRAM_VERSION, Golden, Machine, output_columns
@@ -92,13 +92,10 @@ def _by_numpy(golden: Golden, path: Path) -> tuple[np.ndarray, dict[str, np.ndar
 
 
 def _by_onnx(golden: Golden, path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    try:
+    with needing("onnx", str(path)):
         import onnxruntime
 
         from mjx_softarm.export.onnx_files import read_onnx
-    except ImportError as error:
-        expected = "pip install -e '.[onnx]' in the checkout"
-        raise InputError(f"{path}: got no {error.name}, expected {expected}") from error
     data, about = read_onnx(path)
     _same_policy(path, about["policy_sha256"], golden)
     options = onnxruntime.SessionOptions()

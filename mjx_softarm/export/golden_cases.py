@@ -22,9 +22,8 @@ from mjx_softarm.sensing.load import estimate_load
 
 N_SINGLE, N_CHECKED = 1000, 40  # numbers of rows
 
-_ROUNDED = (
-    1e-5  # rounding at which a run ends, as a share of the pressures' range; others may round ten times worse
-)
+# Rounding at which a run ends, as a share of the pressures' range; others may round ten times worse.
+_ROUNDED = 1e-5
 _SPREAD_M = 2e-3  # standard deviation of the springs in single rows from the model, as by payloads
 _OUTSIDE, _LOST = 0.1, 0.1  # shares of single rows with a goal outside, and with a lost reading
 _LAG, _NOISE_M = 0.15, 4e-5  # share of the way to the commanded pressure per tick; noise of lengths

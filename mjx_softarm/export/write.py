@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from mjx_softarm._support.errors import InputError
+from mjx_softarm._support.errors import needing
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.export import computations
 from mjx_softarm.export.cpp import sources
@@ -28,11 +28,8 @@ def export_onnx(policy_path: Path) -> list[Path]:
     Raises:
         InputError: the policy cannot be read, the package onnx is missing, or a file cannot be written.
     """
-    try:
+    with needing("onnx", "--onnx"):
         from mjx_softarm.export.onnx_files import write_onnx
-    except ImportError as error:
-        expected = "pip install -e '.[onnx]' in the checkout"
-        raise InputError(f"--onnx: got no {error.name}, expected {expected}") from error
     # Inputs that may be left out, with their defaults.
     controller, sha256 = _open(policy_path)
     n = controller.policy.spec.n_chambers

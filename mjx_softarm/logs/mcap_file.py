@@ -14,24 +14,8 @@ from typing import BinaryIO
 
 import numpy as np
 
-from mjx_softarm._support.errors import InputError
-
 SUFFIX = ".mcap"
 _PROFILE, _ENCODING, _LIBRARY = "", "json", "mjx_softarm"
-
-
-def require_mcap(where: str) -> None:
-    """Refuse a log of this format where the package that writes it is missing.
-
-    Raises:
-        InputError: the package is missing; the message begins with `where`.
-    """
-    try:
-        import mcap  # noqa: F401
-    except ImportError as error:
-        raise InputError(
-            f"{where}: got no {error.name}, expected pip install -e '.[mcap]' in the checkout"
-        ) from error
 
 
 def write_mcap(file: BinaryIO, columns: Sequence[tuple[str, str, str]], table: np.ndarray) -> None:

@@ -43,7 +43,7 @@ REST_S = 4.0  # time for which the arm hangs at atmospheric pressure before its 
 
 
 class Twin(InstrumentedArm):
-    """One arm with its pump, sensors and cameras; an `ArmIO` and a `MotionCapture`.
+    """One arm with its pump, sensors and cameras; an `ArmIO` with motion capture.
 
     Example: `twin = Twin(7)`, then `twin.read_sensors()` and `twin.write_pressures(p)` in turn.
     """

@@ -25,7 +25,7 @@ WIDEST_DRAW = 2.0  # largest deviation of a part, in standard deviations; a wors
 
 
 class InstrumentedArm(abc.ABC):
-    """An arm with noisy sensors and cameras; an `ArmIO` and a `MotionCapture`.
+    """An arm with noisy sensors and cameras; an `ArmIO` with motion capture.
 
     Args:
         sensor: the arm's own sensors.

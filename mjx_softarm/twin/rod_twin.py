@@ -70,7 +70,7 @@ class RodBuild:
 
 
 class RodTwin(InstrumentedArm):
-    """One rod with regulators, sensors and cameras; an `ArmIO` and a `MotionCapture`."""
+    """One rod with regulators, sensors and cameras; an `ArmIO` with motion capture."""
 
     def __init__(
         self,

@@ -15,7 +15,7 @@ from typing import Annotated
 import tyro
 
 from mjx_softarm._support import cli
-from mjx_softarm._support.errors import InputError
+from mjx_softarm._support.errors import InputError, needing
 from mjx_softarm.deploy.__main__ import Arm, PolicyFile, check_file
 from mjx_softarm.deploy.drivers.names import open_arm
 from mjx_softarm.deploy.ending import save_log
@@ -54,18 +54,14 @@ def _view(
     """Show an arm in the browser and steer it there; or replay logs; or follow a run, or show a calibration.
 
     Args:
-        logs: logs of `deploy run` and `record`, CSV or npz, side by side; or the folder of a run or
-        calibration log: file for the log of the steered run, CSV or npz demos: file for demonstrations,
-        poses taken on the page for `train imitate`, CSV or npz html: file to write the logs to, as a page
-        that plays without a server
+        logs: logs of `deploy run` and `record`, CSV or npz, side by side; or a run's or calibration's folder
+        log: file for the log of the steered run, CSV or npz
+        demos: file for demonstrations, poses taken on the page for `train imitate`, CSV or npz
+        html: file to write the logs to, as a page that plays without a server
     """
     # Check the options before anything is opened.
-    try:
+    with needing("view", "view"):
         import viser  # noqa: F401
-    except ImportError as error:
-        raise InputError(
-            f"view: got {error}, expected viser: pip install -e '.[view]' in the checkout"
-        ) from error
     for option, path in (("--log", log), ("--demos", demos), ("--html", html)):
         check_file(option, path)
     # Show a folder's errors, or replay logs.

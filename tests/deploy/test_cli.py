@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from calib.read.logs import read_log
+from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.__main__ import main
-from mjx_softarm.deploy.drivers.names import ArmError, Paced, open_arm
+from mjx_softarm.deploy.drivers.names import Paced, open_arm
 from mjx_softarm.logs.pressure_plan import write_plan
 from mjx_softarm.policy.file import SHIPPED, load_policy, save_policy
 from tests.linear_arm import DT_S, FAR, POLICY, REST_M, SENSOR, LinearArm, N
@@ -40,7 +41,7 @@ ROOT = Path(__file__).resolve().parents[2]
     ],
 )
 def test_arm_that_cannot_be_had(name, message):
-    with pytest.raises(ArmError, match=message):
+    with pytest.raises(InputError, match=message):
         open_arm(name)
 
 

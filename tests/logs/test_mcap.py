@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mjx_softarm._support.errors import InputError
-from mjx_softarm.logs.mcap_file import require_mcap
+from mjx_softarm.deploy.__main__ import check_file
 from mjx_softarm.logs.schema import log_table, write_log
 from tests.linear_arm import GOALS, LinearArm, go
 
@@ -36,9 +36,9 @@ def test_reader_finds_every_number_with_its_unit(tmp_path):
     np.testing.assert_allclose(got, np.where(np.isinf(table), np.nan, table), rtol=1e-12, atol=1e-9)
 
 
-def test_missing_package_is_told_before_the_arm_moves(monkeypatch):
+def test_missing_package_is_told_before_the_arm_moves(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "mcap", None)
     with pytest.raises(
         InputError, match=r"--log: got no mcap, expected pip install -e '.\[mcap\]' in the checkout"
     ):
-        require_mcap("--log")
+        check_file("--log", tmp_path / "run.mcap")

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mjx_softarm.deploy.drivers.names import ArmError, open_arm
+from mjx_softarm._support.errors import InputError
+from mjx_softarm.deploy.drivers.names import open_arm
 from mjx_softarm.deploy.record import record
 from mjx_softarm.twin import rod_twin
 from mjx_softarm.twin.rod_twin import RodBuild, RodTwin
@@ -71,7 +72,7 @@ def test_it_is_recorded_as_any_arm(spec):
 def test_it_has_a_name():
     assert isinstance(open_arm("twin:rod:3"), RodTwin)
     for name in ("twin:rod:x", "twin:rod:", "twin:rod:3:pipe300"):
-        with pytest.raises(ArmError, match=r"--arm: twin:rod:SEED: got '.*', expected an integer >= 0"):
+        with pytest.raises(InputError, match=r"--arm: twin:rod:SEED: got '.*', expected an integer >= 0"):
             open_arm(name)
 
 
@@ -90,5 +91,5 @@ def test_it_is_of_any_arm_as_unlike_as_the_paper_s_in_proportion():
     share = short._rod.parts.bending / short._rod.parts.torsion
     np.testing.assert_allclose(share, paper._rod.parts.bending / paper._rod.parts.torsion, rtol=1e-6)
     assert open_arm("twin:rod:0@sopra").read_sensors().shape == (6,)
-    with pytest.raises(ArmError, match="nobody: got no such arm"):
+    with pytest.raises(InputError, match="nobody: got no such arm"):
         open_arm("twin:rod:0@nobody")

@@ -13,40 +13,34 @@ from typing import Any
 
 import numpy as np
 
-from mjx_softarm._support.errors import InputError
+from mjx_softarm._support.errors import InputError, needing
 
 _TWIN = "mjx_softarm.twin.names"  # imported only when asked for, since it needs MuJoCo
 _METHODS = ("read_sensors", "write_pressures")
-
-
-class ArmError(InputError):
-    """A name that opens no arm; the message says why."""
 
 
 def open_arm(name: str) -> Any:
     """Open an arm: an `ArmIO`, maybe with `pressures`, `motion_capture` or a clock of its own, `time_s`.
 
     Args:
-        name: `twin:SEED`; in a pipe, `twin:SEED:pipe300` or `twin:SEED:pipe250`; a rod, `twin:rod:SEED` or,
-            of
-            another arm, `twin:rod:SEED@ARM`; each with a payload as in `twin:SEED:500g`. Or
+        name: `twin:SEED`; in a pipe, `twin:SEED:pipe300` or `twin:SEED:pipe250`; a rod, `twin:rod:SEED`, or
+            `twin:rod:SEED@ARM` of another arm; each with a payload as in `twin:SEED:500g`. Or
             `package.module:Class`, a class without arguments; modules may be in the working directory.
 
     Raises:
-        ArmError: the name is malformed, cannot be imported, or is no arm.
+        InputError: the name is malformed, cannot be imported, or is no arm.
     """
     # A twin
     module_name, _, item = name.partition(":")
     if not module_name or not item:
-        raise ArmError(f"--arm: got {name!r}, expected twin:SEED or package.module:Class")
+        raise InputError(f"--arm: got {name!r}, expected twin:SEED or package.module:Class")
     if module_name == "twin":
+        with needing("sim", "--arm"):
+            twins = importlib.import_module(_TWIN)
         try:
-            return importlib.import_module(_TWIN).twin_of(item)
-        except ImportError as error:
-            expected = "MuJoCo for the twin: pip install -e '.[sim]' in the checkout"
-            raise ArmError(f"--arm: got {error}, expected {expected}") from error
+            return twins.twin_of(item)
         except (ValueError, FloatingPointError) as error:
-            raise ArmError(f"--arm: {error}") from error
+            raise InputError(f"--arm: {error}") from error
 
     # A driver's class
     if (here := os.getcwd()) not in sys.path:
@@ -54,17 +48,18 @@ def open_arm(name: str) -> Any:
     try:
         kind = getattr(importlib.import_module(module_name), item)
     except ImportError as error:
-        raise ArmError(f"--arm {name}: got {error}, expected a module that can be imported") from error
+        raise InputError(f"--arm {name}: got {error}, expected a module that can be imported") from error
     except AttributeError as error:
-        raise ArmError(f"--arm {name}: got no {item!r} in {module_name}, expected an arm's class") from error
-    missing = [method for method in _METHODS if not callable(getattr(kind, method, None))]
-    if missing:
-        raise ArmError(f"--arm {name}: got no method {' or '.join(missing)}, expected those of deploy.ArmIO")
+        got = f"no {item!r} in {module_name}"
+        raise InputError(f"--arm {name}: got {got}, expected an arm's class") from error
+    if missing := [method for method in _METHODS if not callable(getattr(kind, method, None))]:
+        got = f"no method {' or '.join(missing)}"
+        raise InputError(f"--arm {name}: got {got}, expected those of deploy.ArmIO")
     try:
         return kind()
     except (ImportError, OSError, TypeError, ValueError) as error:
         got = f"{type(error).__name__}: {error}"
-        raise ArmError(f"--arm {name}: got {got}; expected an arm that opens") from error
+        raise InputError(f"--arm {name}: got {got}; expected an arm that opens") from error
 
 
 class Paced:

@@ -10,8 +10,9 @@ import tty
 import numpy as np
 import pytest
 
+from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.drivers import serial_line
-from mjx_softarm.deploy.drivers.names import ArmError, open_arm
+from mjx_softarm.deploy.drivers.names import open_arm
 from mjx_softarm.deploy.drivers.serial_line import SerialArm
 from mjx_softarm.deploy.drivers.udp import UdpArm
 from mjx_softarm.deploy.record import record
@@ -207,6 +208,6 @@ def test_recording_over_the_line(line, monkeypatch):
 def test_port_that_is_not_there_is_named():
     pytest.importorskip("serial")
     with pytest.raises(
-        ArmError, match="SerialArm: got SerialException: .*ttyACM0.*; expected an arm that opens"
+        InputError, match="SerialArm: got SerialException: .*ttyACM0.*; expected an arm that opens"
     ):
         open_arm("mjx_softarm.deploy.drivers.serial_line:SerialArm")
