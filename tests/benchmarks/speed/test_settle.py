@@ -4,16 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.speed import settle
-from benchmarks.speed.truth import (
-    Truth,
-    error_figures,
-    random_references,
-    settle_function,
-)
-from mjx_softarm import ArmSpec
+from benchmarks.speed.truth import Truth, error_figures, random_references, settle_function
+from tests.train.small import SHORT
 from train.epoch.devices import mesh_of
-
-SMALL = ArmSpec.default().replace(structure={"links_per_section": 2})
 
 
 def truth(tip_mm, settled=None):
@@ -48,8 +41,8 @@ def test_each_method_has_a_row_whether_it_was_measured_or_not(monkeypatch):
     assert [row.get("skipped") for row in rows[3:]] == [None, settle.NO_MJX, None]
 
 
-def test_spread_arms_settle_as_on_one_device():
-    reference = jnp.asarray(random_references(SMALL, 8), jnp.float32)
-    one, spread = (settle_function(SMALL, mesh=mesh)(reference) for mesh in (None, mesh_of("2")))
+def test_spread_arms_settle_as_on_one_device(quick_compiler):
+    reference = jnp.asarray(random_references(SHORT, 8), jnp.float32)
+    one, spread = (settle_function(SHORT, mesh=mesh)(reference) for mesh in (None, mesh_of("2")))
     assert len(spread.q.sharding.device_set) == 2
     np.testing.assert_allclose(spread.q, one.q, atol=1e-5)

@@ -41,13 +41,7 @@ def test_numbers_that_a_specification_lacks_are_zeros():
     assert (SPEC.replace(unmodelled={"pressure_kpa": (1.0,) * N}).unmodelled_kpa(spring_m) == 1.0).all()
 
 
-REFUSED = (
-    ("pressure_kpa", 2, "one for each of the 9 chambers"),
-    ("slope_kpa_per_m", N, "one for each of the 81 pairs of chamber and spring"),
-)
-
-
-@pytest.mark.parametrize(("name", "n", "expected"), REFUSED)
-def test_a_specification_says_how_many_numbers_it_needs(name, n, expected):
-    with pytest.raises(SpecError, match=f"unmodelled.{name}: got {n} numbers, expected {expected}"):
-        SPEC.replace(unmodelled={name: (1.0,) * n})
+@pytest.mark.parametrize(("name", "expected"), [("pressure_kpa", "9 cham"), ("slope_kpa_per_m", "81 pairs")])
+def test_a_specification_says_how_many_numbers_it_needs(name, expected):
+    with pytest.raises(SpecError, match=f"unmodelled.{name}: got 2 numbers, expected .* the {expected}"):
+        SPEC.replace(unmodelled={name: (1.0,) * 2})
