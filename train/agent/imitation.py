@@ -192,7 +192,7 @@ class Imitation(Learner):
         discriminator, metrics = state.discriminator, {}
 
         # Batch: stored transitions, relabelled; at rest the first rows are exchanged for the expert's.
-        stored = sample(key_sample)
+        stored = sample(key_sample, self.config.hindsight.n_later)
         index = self._index_of(stored.goal)  # (B,)
         batch, relabelled = self.learner.transitions(stored, key_relabel)
         if not self.env.config.moves:

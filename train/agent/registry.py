@@ -45,6 +45,10 @@ LEARNERS = {
     ),
 }
 
+# A config's type tells its learner, in `name_of` and in a run's JSON.
+if len({entry.config for entry in LEARNERS.values()}) < len(LEARNERS):
+    raise TypeError("LEARNERS: got two learners with one type of config, expected a type of its own for each")
+
 
 def name_of(config: LearnerConfig) -> str:
     """Return the name of the learner that a config is for."""

@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 from mjx_softarm.env import ReachEnv
 from train.agent.imitation import ImitationConfig
 from train.agent.learner import Learner
-from train.agent.registry import World, learner_of
-from train.config import TrainConfig
+from train.agent.registry import LEARNERS, World, learner_of, name_of
+from train.config import ConfigError, TrainConfig
 from train.demos.demonstrations import Demonstrations
 from train.epoch.goals import DemonstratedGoals
 from train.epoch.job import Job, TrainState
@@ -58,16 +58,21 @@ def task_of(
     """Return the task of a run.
 
     Args:
-        config: of the run.
-        env: of its arms.
+        config: settings of the run.
+        env: environment of its arms.
         demonstrations: demonstrations to learn from, for a learner from demonstrations.
         mesh: devices to train on; None is one device.
 
     Raises:
-        ConfigError: the run cannot be split evenly over the devices of the mesh.
+        ConfigError: the learner needs demonstrations and has none, or the run cannot be split evenly over the
+            devices of the mesh.
     """
+    name = name_of(config.learner)
+    if LEARNERS[name].from_demonstrations and demonstrations is None:
+        raise ConfigError(f"learner: got {name!r} without demonstrations, expected a file of them")
     learner = learner_of(config.learner, World(env, mesh, demonstrations))
-    if demonstrations is not None:
+    if LEARNERS[name].from_demonstrations:
+        assert demonstrations is not None
         return _imitation(cast(ImitationConfig, config.learner), env, demonstrations, mesh, learner)
     job = Job(config.learner, env, learner, mesh=mesh)
     return Task(

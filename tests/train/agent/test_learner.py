@@ -14,11 +14,12 @@ from rich.console import Console
 from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.policy.file import load_policy
 from tests.train.small import SHORT
+from train.agent.imitation import ImitationConfig
 from train.agent.learner import Explored, Learner, ReplayConfig
 from train.agent.networks import Actor
 from train.agent.registry import LEARNERS, Entry
 from train.agent.tqc import TQCConfig
-from train.config import TrainConfig
+from train.config import ConfigError, TrainConfig
 from train.runs.arm_model import DistilledArm
 from train.runs.checkpoint import Run, RunError
 from train.runs.evaluate import Evaluator
@@ -133,3 +134,9 @@ def test_a_checkpoint_of_another_learner_and_a_donor_are_refused(run, task):
         begin_with(task, 0, {"agent": run})
     with pytest.raises(RunError, match=f"{run.path}: reward: got none, expected a run of `imitate`"):
         begin_with(other, 0, {"reward": run})
+
+
+def test_a_learner_from_demonstrations_needs_some(task):
+    imitation = dataclasses.replace(CONFIG, learner=ImitationConfig(total_env_steps=4_096))
+    with pytest.raises(ConfigError, match="learner: got 'imitation' without demonstrations, expected a file"):
+        task_of(imitation, task.job.env)
