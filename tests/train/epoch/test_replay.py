@@ -10,7 +10,7 @@ import pytest
 
 from train.epoch import replay
 
-pytestmark = pytest.mark.usefixtures("strict")
+pytestmark = pytest.mark.usefixtures("strict", "quick_compiler")
 
 
 class Item(NamedTuple):
@@ -22,7 +22,7 @@ CAPACITY, BATCH = 7, 5
 EXAMPLE = Item(jnp.zeros((), jnp.int32), jnp.zeros(2))
 
 
-add = jax.jit(replay.add)
+add, thin = jax.jit(replay.add), jax.jit(replay.thin)
 
 
 def rows(tags):
@@ -87,7 +87,9 @@ def test_sample_is_uniform_over_the_filled_slots_and_only_those():
         ((jnp.zeros(5),), np.ones(5, bool), "got structure"),
     ],
 )
-def test_add_names_what_does_not_fit(items, valid, message):
+def test_what_does_not_fit_is_named(items, valid, message):
+    with pytest.raises(ValueError, match="got 0, expected at least 1"):
+        replay.create(EXAMPLE, 0)
     with pytest.raises(ValueError, match=message):
         replay.add(replay.create(EXAMPLE, CAPACITY), items, valid)
 
@@ -96,19 +98,19 @@ def test_add_names_what_does_not_fit(items, valid, message):
 def test_a_thinner_ring_keeps_a_share_oldest_first(n_added):
     ring = replay.create(jnp.zeros(()), 10)
     for k in range(n_added):
-        ring = replay.add(ring, jnp.array([float(k)]), jnp.array([True]))
-    thin = replay.thin(ring, jax.random.PRNGKey(0), 0.5)
-    n = int(thin.size)
-    kept = np.asarray(thin.data[:n])
-    assert n == min(n_added, 10) // 2 and int(thin.position) == n
+        ring = add(ring, jnp.array([float(k)]), jnp.array([True]))
+    thinner = thin(ring, jax.random.PRNGKey(0), 0.5)
+    n = int(thinner.size)
+    kept = np.asarray(thinner.data[:n])
+    assert n == min(n_added, 10) // 2 and int(thinner.position) == n
     assert np.all(np.diff(kept) > 0) and set(kept) <= set(range(max(0, n_added - 10), n_added))
-    again = replay.add(thin, jnp.array([99.0]), jnp.array([True]))
+    again = add(thinner, jnp.array([99.0]), jnp.array([True]))
     np.testing.assert_array_equal(again.data[: n + 1], [*kept, 99.0])
 
 
 def test_thinning_draws_every_item_alike():
-    ring = replay.add(replay.create(jnp.zeros(()), 8), jnp.arange(8.0), jnp.ones(8, bool))
-    draw = jax.vmap(lambda key: replay.thin(ring, key, 0.25).data[:2])
+    ring = add(replay.create(jnp.zeros(()), 8), jnp.arange(8.0), jnp.ones(8, bool))
+    draw = jax.jit(jax.vmap(lambda key: replay.thin(ring, key, 0.25).data[:2]))
     drawn = np.asarray(draw(jax.random.split(jax.random.PRNGKey(0), 2000)))
     share = np.bincount(drawn.ravel().astype(int), minlength=8) / len(drawn)
     np.testing.assert_allclose(share, 0.25, atol=4 * np.sqrt(0.25 * 0.75 / 2000))
@@ -119,7 +121,8 @@ def test_an_item_ahead_is_the_same_row_of_a_later_addition():
     ring = replay.create(EXAMPLE, 3 * BATCH)
     for step in range(5):
         ring = add(ring, rows(np.arange(BATCH) + step * BATCH), jnp.ones(BATCH, bool))
-    now, later, ahead = replay.sample_ahead(ring, jax.random.key(0), 1_000, stride=BATCH, n_ahead=2)
+    draw = functools.partial(replay.sample_ahead, batch_size=1_000, stride=BATCH, n_ahead=2)
+    now, later, ahead = jax.jit(draw)(ring, jax.random.key(0))
     came = np.asarray(now.tag) // BATCH + np.asarray(ahead) < 5  # before the end of the last addition
     np.testing.assert_array_equal(later.tag[came], (now.tag + BATCH * ahead)[came])
     assert set(np.unique(now.tag)) == set(range(2 * BATCH, 5 * BATCH))
