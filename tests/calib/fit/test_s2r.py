@@ -13,9 +13,7 @@ from calib.fit.network import OF_ROWS, NetworkConfig, fit_network
 from calib.fit.pose_errors import pose_errors
 from calib.fit.s2r import fit_s2r, simulate_poses
 from mjx_softarm._support.training import Schedule
-from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.params import ArmParams
-from mjx_softarm.mechanics.settle import settle
 from mjx_softarm.mechanics.workspace import sample_workspace
 from mjx_softarm.sensing.pose import frame_from_pose, pose_from_frame
 from mjx_softarm.sensing.s2r import apply_correction, correct, correction, extrapolation
@@ -53,19 +51,31 @@ def arms(spec):
         tool_mass_kg=nominal.tool_mass_kg + np.array([0.0, 0.2]),
     )
     planted = jax.tree.map(lambda a: np.asarray(a, np.float32), planted)
-    kinematics = chain_kinematics(planted)
     reference = sample_workspace(spec, N_ROWS + N_CLEAN, seed=5).spring_m
-    real = jax.jit(jax.vmap(lambda r: settle(kinematics, planted, r)))(reference)
-    simulated = simulate_poses(spec, np.asarray(real.spring_m))
-    keep = np.asarray(real.settled) & simulated.valid
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("calib.fit.s2r.ArmParams.from_spec", lambda _: planted)
+        real = simulate_poses(spec, reference)
+    simulated = simulate_poses(spec, real.spring_m)
+    keep = real.valid & simulated.valid
     assert keep.mean() > 0.99
-    true = np.asarray(jax.vmap(pose_from_frame)(real.tip_position_m, real.tip_rotation), np.float64)
-    return simulated.take(keep), true[keep]
+    return simulated.take(keep), real.pose[keep].astype(float)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_points():
+    """Fewer simulated arms and rows by which the process is chosen."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("calib.fit.s2r.N_POINTS", 2048)
+        patch.setattr("calib.fit.section_process.MAX_GRID_ROWS", 60)
+        yield
 
 
 @pytest.fixture(scope="module")
 def fit(spec, arms):
-    return fit_s2r(spec, first(arms, N_ROWS), measured(arms[1][:N_ROWS], np.random.default_rng(2)))
+    real = measured(arms[1][:N_ROWS], np.random.default_rng(2))
+    return fit_s2r(
+        spec, first(arms, N_ROWS), real, config=NetworkConfig((64, 64), Schedule(3_000, 4e-3, 512))
+    )
 
 
 def first(arms, n):
