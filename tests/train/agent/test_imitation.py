@@ -76,7 +76,7 @@ def test_rewards_are_learned_for_goals_asked_for_and_clearance_is_always_charged
 def test_an_update_moves_the_discriminator_unless_it_is_frozen(new, stored, frozen):
     learner = new(frozen=frozen)
     before = jax.jit(learner.init)(jax.random.PRNGKey(0))
-    after, metrics = jax.jit(lambda state, key: learner.update(state, lambda _: stored, key))(
+    after, metrics = jax.jit(lambda state, key: learner.update(state, lambda *_: stored, key))(
         before, jax.random.PRNGKey(1)
     )
     heads = [state.discriminator.params["params"]["head"]["kernel"] for state in (before, after)]
@@ -114,7 +114,7 @@ def test_in_motion_the_expert_s_actions_are_not_shown_as_the_agent_s(moving, mov
     learn, update = moving.learner.learn, moving.gail.update
     moving.learner.learn = lambda agent, batch, key: seen.update(batch=batch) or learn(agent, batch, key)
     moving.gail.update = lambda s, e, a, key: seen.update(expert=e, agent=a) or update(s, e, a, key)
-    after, seen = jax.jit(lambda *given: (moving.update(given[0], lambda _: given[1], given[2])[0], seen))(
+    after, seen = jax.jit(lambda *given: (moving.update(given[0], lambda *_: given[1], given[2])[0], seen))(
         state, stored, jax.random.PRNGKey(1)
     )
     np.testing.assert_array_equal(seen["batch"].action, action)
