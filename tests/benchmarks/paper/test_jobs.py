@@ -70,11 +70,7 @@ def test_further_policies_have_a_preset_of_their_own_or_no_network(tmp_path, com
     assert parsed(start).config.env == dataclasses.replace(PRESETS["payload"].env, n_poses=64)  # alike
     (start,) = commands(jobs.train_other, tmp_path, settings, "chambers", 1, 2)
     options = parsed(start)
-    assert (options.preset, options.spec, options.calibration) == (
-        "analytic",
-        calibration / ARM_FILE,
-        None,
-    )
+    assert (options.preset, options.spec, options.calibration) == ("analytic", calibration / ARM_FILE, None)
     assert options.config.env.n_poses == 64 and options.out == tmp_path / learned_run("chambers", 1, 2)
     (options.out).mkdir()
     (options.out / "config.json").touch()

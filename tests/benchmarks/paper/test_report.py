@@ -1,18 +1,13 @@
-"""Summary, report, pictures and film: nothing of made-up results is hidden."""
+"""Summary, report and pictures: nothing of made-up results is hidden."""
 
-import dataclasses
-import io
 import json
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from PIL import Image
 
-from benchmarks.paper import film, plots, report
+from benchmarks.paper import film, report
 from benchmarks.paper.engine import save_arrays
 from benchmarks.paper.kinds import KINDS, Trial, learned_run
-from benchmarks.paper.scene import Scene
 from benchmarks.paper.summary import (
     first_stage_success,
     load_off_g,
@@ -26,7 +21,6 @@ from mjx_softarm.mechanics.excitation import circle_poses
 from tests.benchmarks.paper.made_up import (
     SPEC,
     TINY,
-    N,
     fill,
     goals_of,
     good_results,
@@ -134,56 +128,3 @@ def test_confined_results_are_written_and_nothing_is_hidden(tmp_path):
     assert [row["verdict"] for row in figures["targets"]].count("NOT MET") == 7
     assert len(figures["trainings"]) == len(trainings(TINY))
     assert [row["x_mm"] is None for row in figures["runs"]].count(True) == 3
-
-
-@pytest.mark.parametrize(("n_twins", "height"), [(1, 2.0), (3, 0.5)])
-def test_circle_s_titles_are_whole_whatever_its_shape(n_twins, height):
-    results = good_results("open", dataclasses.replace(TINY, twins=tuple(range(n_twins))))
-    for outcome in results.outcomes.values():
-        outcome.goal[:, 1] *= height
-    buffer = io.BytesIO()
-    plots.circle_figure(results.outcomes, "rod").savefig(buffer, format="png", dpi=report.DPI)
-    shade = np.asarray(Image.open(buffer).convert("L"))
-    for border in (shade[0], shade[-1], shade[:, 0], shade[:, -1]):
-        assert border.min() == 255  # white
-
-
-class DrawnTwin:
-    """A twin whose pictures show the time, and whose tip goes to the right."""
-
-    time_s = 0.0
-
-    def write_pressures(self, pressure_kpa):
-        self.time_s += 0.02
-
-    def draw(self, renderer):
-        return np.full((320, 240, 3), round(self.time_s), np.uint8)
-
-    def motion_capture(self):
-        tip_m = np.array([0.01 * self.time_s, 0.0, -0.45])
-        return SimpleNamespace(tip_m=tip_m, tip_quaternion=np.array([1.0, 0.0, 0.0, 0.0]))
-
-    def renderer(self, width, height):
-        return open("/dev/null")
-
-
-def test_film_shows_the_pipe_and_the_path(tmp_path, monkeypatch):
-    def operate(twin, controller, goals, names, objects):
-        for _ in range(500):
-            twin.write_pressures(np.zeros(N))
-
-    written = {}
-    names, goals = goals_of("pipe")
-    controller = SimpleNamespace(policy=SimpleNamespace(spec=SPEC))
-    monkeypatch.setattr(film, "operate", operate)
-    monkeypatch.setattr(film, "write_gif", lambda path, images: written.update({path: images}))
-    film.film(tmp_path / "pipe.gif", Scene(DrawnTwin(), controller, goals, names), pipe_trial())
-    images = written[tmp_path / "pipe.gif"]
-    assert [image.getpixel((0, 0))[0] for image in images] == list(range(len(images)))
-    # The tip, at first straight below the crossing, then to the right; the wall on both sides.
-    orange = [(np.asarray(image) == (224, 123, 40)).all(axis=-1) for image in images]
-    across = np.array([np.argwhere(mask)[:, 1].mean() for mask in orange])
-    assert abs(across[0] - 360) < 1.0 and np.all(np.diff(across) > 0)
-    grey = (np.asarray(images[0])[:, 240:] == (154, 160, 166)).all(axis=-1)
-    assert grey[:, :120].sum() == pytest.approx(grey[:, 120:].sum(), rel=0.2)
-    assert grey.sum() > 28 * 21 + 500  # more than the goals' dots cover

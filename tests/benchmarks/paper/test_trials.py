@@ -28,14 +28,11 @@ def test_stages_leave_every_trial_s_result_and_come_after_what_they_need():
         assert len(names) == len(set(names)) and len(at) == sum(len(s.results) for g in groups for s in g)
         for trial in trials(experiment, settings):
             run = f"{trial.kind}-twin{trial.twin}-seed0"
-            policies = {
-                "with": ["twin{}-seed0"],
-                "gradient": ["twin{}-seed0"],
-                "specified": ["nominal-seed0"],
-                "without": ["twin{}-seed0", "nominal-seed0"],
-            }.get(trial.kind, [run])
-            for folder in policies:
-                assert at[f"{folder.format(trial.twin)}/policy.npz"] < at[trial.result]
+            with_s2r, nominal = f"twin{trial.twin}-seed0", "nominal-seed0"
+            policies = {"with": [with_s2r], "gradient": [with_s2r], "specified": [nominal]}
+            policies["without"] = [with_s2r, nominal]
+            for folder in policies.get(trial.kind, [run]):
+                assert at[f"{folder}/policy.npz"] < at[trial.result]
             own = f"twin{trial.twin}-seed0" if experiment == "open" else f"quick-twin{trial.twin}-seed0"
             assert at[f"twin{trial.twin}/calibration"] < at[f"{own}/policy.npz"]
         if experiment == "confined":

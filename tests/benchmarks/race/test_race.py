@@ -12,13 +12,7 @@ from benchmarks.__main__ import main
 from benchmarks.harness.peers import PINS
 from benchmarks.harness.rounds import Worker, WorkerError
 from benchmarks.race import race
-from benchmarks.race.contestants import (
-    CONTESTANTS,
-    Contestant,
-    HeldOut,
-    prepare,
-    settings_of,
-)
+from benchmarks.race.contestants import CONTESTANTS, Contestant, HeldOut, prepare, settings_of
 from benchmarks.race.race import RaceError, RaceLimits, limits_of, run, train
 from benchmarks.race.threads import choose_threads
 from mjx_softarm._support import xla

@@ -17,10 +17,7 @@ UNREADABLE = {
         "tip_y: got no number in the whole col",
     ),
     "semicolons": (simple(moving(9)).replace(",", ";"), "line 1: .*got semicolons"),
-    "semicolons in rows": (
-        simple([r.replace(",", ";") for r in moving(9)]),
-        "2: got 1 cells and semicolons",
-    ),
+    "semicolons in rows": (simple([r.replace(",", ";") for r in moving(9)]), "2: got 1 cells and semicolons"),
     "decimal commas": (simple([r.replace(".", ",") for r in moving(9)]), "2: got 8 cells .decimal commas"),
     "UTF-16": (simple(moving(9)).encode("utf-16"), "UTF-16 text, expected UTF-8"),
     "UTF-16 without mark": (simple(moving(9)).encode("utf-16-le"), "UTF-16 text, expected UTF-8"),

@@ -80,5 +80,4 @@ def test_json_has_the_same_figures_and_says_whether_to_trust_them():
 def test_a_note_is_shown_and_costs_no_trust():
     part = Section("Chambers", "Fitted.", notes=("a quaternion is off",))
     assert "a quaternion is off" in Page(to_html("x", (part,), [], {})).texts["p"]
-    data = to_json((part,), [], {})
-    assert data["trustworthy"] is True and data["parts"]["Chambers"]["notes"] == ["a quaternion is off"]
+    assert to_json((part,), [], {})["trustworthy"] is True
