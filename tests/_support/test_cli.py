@@ -108,8 +108,6 @@ def test_functions_of_two_words_get_lists_and_flags():
         ("make --n one", "--n: |'one'|--n INT"),
         ("make --n", "'--n'|Expected 1 values"),
         ("make --limit low", "--limit: |'low'|{None}|FLOAT"),
-        ("make --size wide", "--size: |'wide'|--size FLOAT"),
-        ("make --inner.widths 1 x", "--inner.widths: |['1', 'x']|[INT [INT ...]]"),
         ("make --preset huge", "'--preset'|'huge'|Expected one of ('small', 'large')"),
         ("make --inner.gamma 2", "Inner.gamma: got 2.0, expected at most 1"),
         ("make more", "Unrecognized options: more"),

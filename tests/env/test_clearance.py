@@ -15,7 +15,7 @@ MM = 1e-3
 SHORT_ARM = ArmSpec.default().replace(structure={"n_sections": 1, "links_per_section": 2})
 
 
-def test_in_motion_the_clearance_is_the_least_of_the_way():
+def test_in_motion_the_clearance_is_the_least_of_the_way(quick_compiler):
     """That of an action of six control periods against six actions of one, and the arm in the end."""
     config = EnvConfig(n_poses=64, mode="dynamic", dynamic_step_s=0.12, pipe_diameter_mm=300.0)
     long, short = (
@@ -25,7 +25,10 @@ def test_in_motion_the_clearance_is_the_least_of_the_way():
     actions = jax.random.uniform(jax.random.PRNGKey(1), (16, long.action_size), minval=-1.0, maxval=1.0)
     start = xla.jit(jax.vmap(long.reset))(keys)
     end = xla.jit(jax.vmap(long.step), long.uses_mjx)(start, actions)
-    now, step = start.replace(info=jax.vmap(short.reset)(keys).info), xla.jit(jax.vmap(short.step), True)
+    now, step = (
+        start.replace(info=xla.jit(jax.vmap(short.reset))(keys).info),
+        xla.jit(jax.vmap(short.step), True),
+    )
     way = [(now := step(now, actions)).info["clearance_mm"] for _ in range(6)]
     np.testing.assert_allclose(end.pipeline_state.pose, now.pipeline_state.pose, atol=0.01)
     least_mm = np.min(way, axis=0)

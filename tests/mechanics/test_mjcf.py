@@ -40,10 +40,6 @@ def section_at_rest(*pressure_kpa):
     return 1e3 * np.linalg.norm(tip.xpos), np.rad2deg(angle)
 
 
-def names(count, name):
-    return [name(k).name for k in range(count)]
-
-
 @pytest.mark.parametrize("pressure_kpa, length_mm", [(LOW_KPA, 105.0), (FREE_KPA, 200.0), (HIGH_KPA, 235.0)])
 def test_one_section_has_the_paper_s_lengths(pressure_kpa, length_mm):
     length, angle = section_at_rest(pressure_kpa, pressure_kpa, pressure_kpa)
@@ -82,27 +78,6 @@ def test_springs_and_pressure_limits(model):
     np.testing.assert_array_equal(model.tendon_lengthspring[springs], 0.2)
     np.testing.assert_array_equal(model.actuator_ctrlrange, [[LOW_KPA, HIGH_KPA]] * 9)
     assert model.actuator_ctrllimited.all()
-
-
-def test_every_object_has_its_name_and_place(model):
-    links = range(12)
-    bodies = ["world", *(f"link{k}" for k in links), "gripper", "payload"]
-    assert names(model.nbody, model.body) == bodies
-    joints = [f"{kind}{k}" for k in links for kind in ("slide", "bend_x", "bend_y")]
-    assert names(model.njnt, model.joint) == joints
-    tendons = [f"{kind}{k}" for k in range(9) for kind in ("chamber", "spring")]
-    assert names(model.ntendon, model.tendon) == tendons
-    assert names(model.nu, model.actuator) == [f"chamber{k}" for k in range(9)]
-    geoms = [f"ring{k}" for k in range(13)] + ["gripper_palm", "gripper_finger0", "gripper_finger1"]
-    assert names(model.ngeom, model.geom) == geoms
-    holes = {
-        f"{kind}{3 * section + k}_plate{plate}"
-        for section, k, kind in itertools.product(range(3), range(3), ("chamber", "spring"))
-        for plate in range(4 * section, 4 * section + 5)
-    }
-    sites = names(model.nsite, model.site)
-    assert set(sites) == holes | {"tip"} and len(sites) == len(holes) + 1
-    assert model.ntendon == 18 and model.nu == 9 and model.nv == 36
 
 
 def test_the_free_arm_hangs_straight_with_its_chambers_around_it(spec, model):

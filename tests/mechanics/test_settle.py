@@ -19,8 +19,8 @@ from mjx_softarm.mechanics.settle import (
     SettleResult,
     arms_at_once,
     settle,
-    settle_pressures,
 )
+from mjx_softarm.mechanics.workspace import settle_many
 
 SPEC = ArmSpec.default()
 LOW_KPA, HIGH_KPA = SPEC.chambers.pressure_min_kpa, SPEC.chambers.pressure_max_kpa
@@ -28,20 +28,17 @@ N = 128  # arms a batch, always, so that little is compiled
 
 
 @functools.cache
-def solver(solve):
-    def one(params, target):
-        return solve(chain_kinematics(params), params, target)
-
-    return jax.jit(jax.vmap(one, in_axes=(None, 0)))
+def solver():
+    return jax.jit(jax.vmap(lambda params, x: settle(chain_kinematics(params), params, x), in_axes=(None, 0)))
 
 
 def settled(solve, target, spec=SPEC, params=None):
     """Settled arms, one for each row of targets, as NumPy arrays."""
-    params = ArmParams.from_spec(spec) if params is None else params
-    batch = np.resize(np.float32(target), (N, np.shape(target)[1]))
     with jax.numpy_dtype_promotion("strict"):
-        found = solver(solve)(params, batch)
-    return jax.tree.map(lambda x: np.asarray(x)[: len(target)], found)
+        if solve is settle_many:
+            return settle_many(spec, target)
+        found = solver()(ArmParams.from_spec(spec) if params is None else params, np.float32(target))
+    return jax.tree.map(np.asarray, found)
 
 
 def references(n_chambers=9, seed=0):
@@ -83,7 +80,7 @@ ARMS = {
 
 
 @pytest.mark.parametrize("arm", ARMS)
-@pytest.mark.parametrize("solve, targets", [(settle, references), (settle_pressures, pressures)])
+@pytest.mark.parametrize("solve, targets", [(settle, references), (settle_many, pressures)])
 def test_c_mujoco_finds_the_settled_arm_in_balance(arm, solve, targets):
     spec = SPEC.replace(**ARMS[arm])
     found = settled(solve, targets(spec.n_chambers), spec)
@@ -117,7 +114,7 @@ def test_half_the_chambers_at_a_limit_take_a_handful_of_steps():
 
 def test_the_springs_that_pressures_give_ask_for_these_pressures():
     pressure = 0.9 * pressures()  # within the limits
-    there = settled(settle_pressures, pressure)
+    there = settled(settle_many, pressure)
     back = settled(settle, there.spring_m)
     assert back.settled.all() and not back.at_limit.any()
     np.testing.assert_allclose(back.pressure_kpa, pressure, atol=0.02)
@@ -127,7 +124,7 @@ def test_the_springs_that_pressures_give_ask_for_these_pressures():
 def test_pressures_beyond_the_limits_are_clipped_to_them():
     beyond = np.where(pressures() > -10.0, 60.0, -101.0)
     limit = np.clip(beyond, LOW_KPA, HIGH_KPA)
-    clipped, at_limit = settled(settle_pressures, beyond), settled(settle_pressures, limit)
+    clipped, at_limit = settled(settle_many, beyond), settled(settle_many, limit)
     np.testing.assert_array_equal(clipped.pressure_kpa, limit)
     np.testing.assert_array_equal(clipped.q, at_limit.q)
     assert clipped.settled.all()
@@ -137,14 +134,14 @@ def test_pressures_are_kept_where_the_springs_happen_to_be_at_rest():
     # A single link at rest has every spring at exactly its rest length, which is nothing to be tracked here.
     spec = SPEC.replace(structure={"n_sections": 1, "links_per_section": 1})
     pressure = np.random.default_rng(0).uniform(0.0, HIGH_KPA, (N, 3))
-    found = settled(settle_pressures, pressure, spec)
+    found = settled(settle_many, pressure, spec)
     np.testing.assert_allclose(found.pressure_kpa, pressure, rtol=1e-6)
     assert found.settled.all()
     assert imbalance(spec, found).max() < RESIDUAL_TOLERANCE
 
 
 def test_full_pressure_lengthens_and_vacuum_shortens():
-    found = settled(settle_pressures, np.repeat([[LOW_KPA], [0.0], [HIGH_KPA]], 9, axis=1))
+    found = settled(settle_many, np.repeat([[LOW_KPA], [0.0], [HIGH_KPA]], 9, axis=1))
     shortest, free, longest = -found.tip_position_m[:, 2]
     assert shortest == pytest.approx(0.355, abs=0.01)  # 3 x 105 mm and the weight's stretch
     assert free == pytest.approx(0.632, abs=0.01)
@@ -155,7 +152,7 @@ def test_full_pressure_lengthens_and_vacuum_shortens():
 def test_a_payload_pulls_the_arm_down_by_its_weight_over_the_stiffness():
     pressure = np.zeros((1, 9))
     height = [
-        settled(settle_pressures, pressure, SPEC.replace(mass={"payload_kg": kg})).tip_position_m[0, 2]
+        settled(settle_many, pressure, SPEC.replace(mass={"payload_kg": kg})).tip_position_m[0, 2]
         for kg in (0.0, 0.5)
     ]
     chambers, springs = SPEC.chambers.stiffness_n_per_m, SPEC.springs.stiffness_n_per_m
@@ -168,8 +165,8 @@ def test_half_a_kilogram_moves_held_arms_by_as_much_as_the_page_of_limits_says()
     middle, share = 0.5 * (LOW_KPA + HIGH_KPA), 0.75
     loaded = SPEC.replace(mass={"payload_kg": 0.5})
     pressure = middle + share * (pressures() - middle)
-    free = settled(settle_pressures, pressure)
-    held, sagged = settled(settle, free.spring_m, loaded), settled(settle_pressures, pressure, loaded)
+    free = settled(settle_many, pressure)
+    held, sagged = settled(settle, free.spring_m, loaded), settled(settle_many, pressure, loaded)
 
     def shift_mm(other):
         shift_m = np.linalg.norm(other.tip_position_m - free.tip_position_m, axis=1)
@@ -178,11 +175,11 @@ def test_half_a_kilogram_moves_held_arms_by_as_much_as_the_page_of_limits_says()
     assert free.settled.all() and sagged.settled.all() and held.settled.all() and not held.at_limit.any()
     np.testing.assert_allclose(shift_mm(held), [2.0, 3.5], rtol=0.1)
     np.testing.assert_allclose(shift_mm(sagged), [17.0, 30.0], rtol=0.1)
-    anywhere = settled(settle, settled(settle_pressures, pressures()).spring_m, loaded)
+    anywhere = settled(settle, settled(settle_many, pressures()).spring_m, loaded)
     assert anywhere.at_limit.any(axis=1).mean() > 0.5
 
 
-@pytest.mark.parametrize("solve, targets", [(settle, references), (settle_pressures, pressures)])
+@pytest.mark.parametrize("solve, targets", [(settle, references), (settle_many, pressures)])
 def test_one_target_that_is_not_a_number_fails_alone(solve, targets):
     target = targets()
     good = settled(solve, target)
@@ -213,7 +210,7 @@ IMPOSSIBLE = {
 }
 
 
-@pytest.mark.parametrize("solve, targets", [(settle, references), (settle_pressures, pressures)])
+@pytest.mark.parametrize("solve, targets", [(settle, references), (settle_many, pressures)])
 @pytest.mark.parametrize("arm", IMPOSSIBLE)
 def test_an_impossible_arm_is_reported_not_raised(arm, solve, targets):
     spec = SPEC.replace(**IMPOSSIBLE[arm])
@@ -276,7 +273,7 @@ def test_a_cpu_settles_fewer_arms_at_once_the_more_links_they_have(links, n):
 
 def test_new_numbers_need_no_new_compilation():
     settled(settle, references())
-    n_compiled = solver(settle)._cache_size()
+    n_compiled = solver()._cache_size()
     found = settled(settle, references(seed=1), SPEC.replace(mass={"payload_kg": 0.1}))
     assert found.settled.all()
-    assert solver(settle)._cache_size() == n_compiled
+    assert solver()._cache_size() == n_compiled

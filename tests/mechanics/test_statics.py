@@ -1,16 +1,14 @@
-"""The closed-form statics against C MuJoCo's forces and against automatic differentiation of the energy."""
+"""The closed-form statics against C MuJoCo's forces, their slope, and its tendons."""
 
 import functools
 
 import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 from scipy import linalg, sparse
 
 from mjx_softarm import ArmSpec
-from mjx_softarm._support import xla
 from mjx_softarm.mechanics.kinematics import ChainKinematics
 from mjx_softarm.mechanics.mjcf import build_model
 from mjx_softarm.mechanics.params import ArmParams
@@ -138,65 +136,6 @@ def test_single_precision_is_far_finer_than_what_counts_as_settled():
         gradient = solved(spec, q, pressure, np.float32).gradient
         assert gradient.dtype == np.float32
         np.testing.assert_allclose(gradient, -force, atol=RESIDUAL_TOLERANCE / 5)
-
-
-def energy(q, pressure_kpa, spec):
-    """V(q) as the module's head defines it, link by link, from the specification alone."""
-    per_section = spec.structure.links_per_section
-    half = spec.link_length_m / 2
-    angle = np.deg2rad(spec.geometry.first_chamber_deg) + 2 * np.pi / 3 * np.arange(3)
-    circle = np.stack([np.cos(angle), np.sin(angle), np.zeros(3)], axis=1)
-    down = np.array([0.0, 0.0, -1.0])
-    length = {"chamber": [0.0] * spec.n_chambers, "spring": [0.0] * spec.n_chambers}
-    radius = {"chamber": spec.geometry.chamber_radius_m, "spring": spec.geometry.spring_radius_m}
-    total, place, turn = 0.0, np.zeros(3), np.eye(3)
-    for link in range(spec.n_links):
-        slide, x, y = q[3 * link : 3 * link + 3]
-        total += 0.5 * spec.backbone.axial_stiffness_n_per_m * per_section * slide**2
-        total += 0.5 * spec.backbone.bending_stiffness_nm_per_rad * per_section * (x**2 + y**2)
-        above, above_turn = place, turn
-        place = place + turn @ ((half + slide) * down)
-        total += 9.81 * spec.mass.arm_kg / spec.n_links * place[2]
-        about_x = jnp.array([[1, 0, 0], [0, jnp.cos(x), -jnp.sin(x)], [0, jnp.sin(x), jnp.cos(x)]])
-        about_y = jnp.array([[jnp.cos(y), 0, jnp.sin(y)], [0, 1, 0], [-jnp.sin(y), 0, jnp.cos(y)]])
-        turn = turn @ about_x @ about_y
-        place = place + turn @ (half * down)
-        for k in range(3):
-            for kind in length:
-                hole = radius[kind] * circle[k]
-                piece = place + turn @ hole - above - above_turn @ hole
-                length[kind][3 * (link // per_section) + k] += jnp.sqrt(piece @ piece)
-    gripper = place + turn @ (0.5 * spec.mass.gripper_length_m * down)
-    payload = place + turn @ (spec.mass.gripper_length_m * down)
-    total += 9.81 * (spec.mass.gripper_kg * gripper[2] + spec.mass.payload_kg * payload[2])
-    free = spec.geometry.section_length_m
-    chambers = zip(
-        *(
-            spec.per_chamber(getattr(spec.chambers, name))
-            for name in ("area_m2", "area_slope_m", "stiffness_n_per_m", "length_offset_m")
-        ),
-        strict=True,
-    )
-    for k, (area, slope, stiffness, offset) in enumerate(chambers):
-        chamber, spring = length["chamber"][k], length["spring"][k]
-        stretch = chamber - free
-        total += 0.5 * stiffness * (stretch - offset) ** 2
-        total += 0.5 * spec.springs.stiffness_n_per_m * (spring - spec.springs.rest_length_m) ** 2
-        total -= 1e3 * pressure_kpa[k] * (area * stretch + 0.5 * slope * stretch**2)
-    return total
-
-
-def test_gradient_and_hessian_are_the_energy_s_derivatives():
-    spec = odd_arm(2, 2)
-    # A serial chain like MJX's, which compiles sooner with MJX's options.
-    derivatives = xla.jit(lambda q, p: (jax.grad(energy)(q, p, spec), jax.hessian(energy)(q, p, spec)))
-    for seed in range(5):
-        q, pressure = random_state(spec, seed)
-        with jax.enable_x64(True), jax.numpy_dtype_promotion("standard"):
-            gradient, hessian = jax.device_get(derivatives(q, pressure))
-        found = solved(spec, q, pressure)
-        np.testing.assert_allclose(found.gradient, gradient, atol=1e-11 * np.abs(gradient).max())
-        np.testing.assert_allclose(found.hessian, hessian, atol=1e-11 * np.abs(hessian).max())
 
 
 def test_parameters_are_the_specification_s_in_base_units():

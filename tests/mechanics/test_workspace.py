@@ -26,7 +26,7 @@ from mjx_softarm.mechanics.workspace import (
 from mjx_softarm.mechanics.workspace_plot import outline
 
 SPEC = ArmSpec.default()
-SMALL = SPEC.replace(name="small", structure={"n_sections": 1})
+SMALL = SPEC.replace(name="small", structure={"n_sections": 1, "links_per_section": 2})
 LOW_KPA, HIGH_KPA = SPEC.chambers.pressure_min_kpa, SPEC.chambers.pressure_max_kpa
 PAPER_LATERAL_MM, PAPER_VERTICAL_MM = 400.0, 350.0
 
@@ -96,9 +96,7 @@ def test_a_seed_gives_the_same_poses_again_and_another_seed_others():
 def test_an_arm_that_never_settles_is_refused_with_the_count():
     limp = {"axial_stiffness_n_per_m": 1.0, "bending_stiffness_nm_per_rad": 0.01}
     spec = SPEC.replace(name="limp", chambers={"stiffness_n_per_m": 1.0}, backbone=limp)
-    with pytest.raises(
-        ValueError, match=r"limp: got an arm that settles at 0 of 128 .* expected at 64 or more"
-    ):
+    with pytest.raises(ValueError, match=r"limp: got an arm that settles at 0 of 128 .* at 64 or more"):
         sample_workspace(spec, 64, seed=0)
 
 
@@ -233,11 +231,6 @@ def test_a_mistake_is_told_in_one_line_with_exit_code_2(arguments, expected, tmp
     code, printed, complaint = run(*arguments)
     assert code == 2 and printed == ""
     assert expected in complaint and complaint.count("\n") == 1
-
-
-def test_a_pressure_that_is_no_number_is_told_with_its_option():
-    code, printed, complaint = run("picture", "--pressures", "much")
-    assert (code, printed) == (2, "") and "--pressures" in complaint and "['much']" in complaint
 
 
 def test_an_arm_with_too_many_combinations_is_refused(tmp_path):

@@ -71,7 +71,7 @@ def test_actions_are_voltages_and_lead_where_they_say(quick_compiler):
 
 
 def test_recorded_voltages_calibrate_the_wires(tmp_path):
-    targets_kpa = np.random.default_rng(0).uniform(-20.0, 10.0, (60, 9))
+    targets_kpa = np.random.default_rng(0).uniform(-20.0, 10.0, (20, 9))
     log = record(WireArm(), SPEC.replace(springs={"length_min_m": 0.1}), targets_kpa).log
     log = dataclasses.replace(log, tip_m=None, tip_quaternion=None, marker_m=None)
     write_log(tmp_path / "springs.csv", log)

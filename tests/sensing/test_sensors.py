@@ -48,16 +48,6 @@ def test_default_sensor_at_the_free_length():
     np.testing.assert_allclose(params.readings(np.full(9, 0.200)), np.full(9, 4.010e6), rtol=1e-4)
 
 
-def test_printed_formula_with_the_derivation_s_factor():
-    spec = make_spec()
-    sensor, f = spec.sensor, np.full(9, 3.5e6)
-    numerator = 4 * math.pi**3 * sensor.capacitance_f * sensor.turns**2 * np.array(sensor.beta) * f**2
-    numerator *= 1.26e-6 * sensor.coil_radius_m**2
-    denominator = 1 - 4 * math.pi**2 * sensor.capacitance_f * sensor.compensation_h * f**2
-    expected = numerator / denominator + np.array(sensor.delta_m)
-    np.testing.assert_allclose(spec.spring_sensor.lengths(f).length_m, expected)
-
-
 @pytest.mark.parametrize("compensation_h", COMPENSATIONS_H)
 def test_float64_follows_the_equations_both_ways(compensation_h):
     spec = make_spec(compensation_h)

@@ -133,31 +133,6 @@ def test_forces_carry_the_weight_of_what_lies_in_the_pipe(at, wall, container):
     np.testing.assert_allclose(force, 2.0 * 9.81 * np.array([wall, container]), rtol=2e-3, atol=1e-9)
 
 
-def test_known_loads_in_place_of_the_walls_hold_the_arm_where_it_is(pressed):
-    """Statics: without a pipe, the contacts' forces as external loads give the same equilibrium."""
-    free = Twin(3, build=QUIET)
-    free._data.xfrc_applied[: free._model.nbody] = pressed._data.xfrc_applied
-    data, normal_n = pressed._data, 0.0
-    mujoco.mj_step2(pressed._model, data)  # forces of the contacts as they are now
-    for k in range(data.ncon):
-        contact, force = data.contact[k], np.zeros(6)
-        mujoco.mj_contactForce(pressed._model, data, k, force)
-        normal_n += force[0]
-        bodies = pressed._model.geom_bodyid[contact.geom]
-        body, sign = bodies.max(), np.sign(bodies[1] - bodies[0])  # the force is the one on the second
-        push_n = sign * contact.frame.reshape(3, 3).T @ force[:3]
-        free._data.xfrc_applied[body, :3] += push_n
-        free._data.xfrc_applied[body, 3:] += np.cross(contact.pos - data.xipos[body], push_n)
-    hold(free, 12.0)
-    untouched = Twin(3, build=QUIET)
-    push(untouched, "link14", [6.0, 19.0, 0.0])
-    hold(untouched, 12.0)
-    expected_m = pressed.motion_capture().tip_m
-    assert normal_n == pytest.approx(pressed.wall_force_n().wall, rel=0.02) and normal_n > 3.0
-    np.testing.assert_allclose(free.motion_capture().tip_m, expected_m, atol=5e-4)
-    assert np.linalg.norm(untouched.motion_capture().tip_m - expected_m) > 0.02
-
-
 def test_wall_yields_little_to_a_load_at_rest(pressed):
     assert pressed._data.ncon > 0 and pressed.wall_force_n().container == 0.0
     assert -1e-3 < pressed._data.contact.dist.min() < 0.0

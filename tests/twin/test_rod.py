@@ -1,14 +1,10 @@
 """The rod against closed forms of beams and bars, against finer rods, and against the equilibrium solver."""
 
-import ast
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.optimize import brentq
 
 from mjx_softarm.mechanics.workspace import settle_many
-from mjx_softarm.twin import rod as rod_module
 from mjx_softarm.twin.rod import GRAVITY_M_S2, Rod, RodParts
 
 LENGTH_M = 0.2
@@ -148,9 +144,3 @@ def test_an_ideal_rod_agrees_with_the_training_model(spec):
         arm.settle(kpa)
         np.testing.assert_allclose(arm.motion_capture().tip_m, tip_m, atol=3e-3)
         np.testing.assert_allclose(arm._rod.spring_lengths(), spring_m, atol=2e-3)
-
-
-def test_the_rod_is_written_without_the_training_model():
-    tree = ast.parse(Path(rod_module.__file__).read_text("utf-8"))
-    imported = [node for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom)]
-    assert imported and "mjx_softarm" not in "".join(map(ast.unparse, imported))

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.drivers.names import open_arm
 from mjx_softarm.deploy.record import record
-from mjx_softarm.twin import rod_twin
+from mjx_softarm.twin import rod, rod_twin
 from mjx_softarm.twin.rod_twin import RodBuild, RodTwin
 
 KPA = np.array([-12.0, 3, -20, -5, -30, 4, 2, -9, -14])
@@ -76,10 +76,12 @@ def test_it_has_a_name():
             open_arm(name)
 
 
-def test_it_is_written_without_the_training_model():
-    tree = ast.parse(Path(rod_twin.__file__).read_text("utf-8"))
+@pytest.mark.parametrize("module", [rod, rod_twin])
+def test_it_is_written_without_the_training_model(module):
+    tree = ast.parse(Path(module.__file__).read_text("utf-8"))
     imported = " ".join(ast.unparse(n) for n in ast.walk(tree) if isinstance(n, ast.Import | ast.ImportFrom))
-    assert "mechanics" not in imported and "mujoco" not in imported
+    assert imported and "mechanics" not in imported and "mujoco" not in imported
+    assert module is rod_twin or "mjx_softarm" not in imported
 
 
 def test_it_is_of_any_arm_as_unlike_as_the_paper_s_in_proportion():

@@ -56,11 +56,7 @@ def test_poses_are_what_imitation_takes(tmp_path):
     [
         (held(reference_m=None), {}, "has no pressure, expected one at rest"),
         (held(goal=POSE), {}, "an arm that moves"),
-        (
-            held(window_m=np.linspace(0.2, 0.21, 25)[:, None]),
-            {},
-            "an arm that moves",
-        ),
+        (held(window_m=np.linspace(0.2, 0.21, 25)[:, None]), {}, "an arm that moves"),
         (held(lost=np.eye(N, dtype=bool)[4]), {}, "spring 4: got no reading"),
         (
             held(pressure_kpa=HIGH_KPA * np.eye(N)[2], reference_m=REST_M + 0.01 * np.eye(N)[2]),
