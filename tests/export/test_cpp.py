@@ -49,7 +49,7 @@ def agreeing_rows(policy, folder, run_ticks):
     controller = Controller.of(policy)
     for name, text in sources(controller, "ab").items():
         (folder / name).write_text(text)
-    compile_("-O1", folder / "rows.cpp", "-o", folder / "rows")
+    compile_("-O0", folder / "rows.cpp", "-o", folder / "rows")
     with few_golden_rows(run_ticks):
         golden = golden_cases.make_golden(controller, "ab")
     agreement = check(golden, folder / "rows")
@@ -142,7 +142,7 @@ def test_example_that_is_ended_vents_until_the_arm_has_taken_it(folder, golden, 
     assert not ramp[-4:].any() and ramp[-5] > 0.0  # three times refused
 
 
-@pytest.mark.parametrize("option", ["-ffast-math", "-Ofast", "-ffinite-math-only"])
+@pytest.mark.parametrize("option", ["-Ofast", "-ffinite-math-only"])
 def test_header_refuses_mathematics_without_nan(folder, option):
     with pytest.raises(AssertionError, match="tells lost readings by NaN"):
         compile_("-fsyntax-only", option, folder / "rows.cpp")

@@ -18,6 +18,8 @@ from mjx_softarm.policy.runtime import InMotion
 from tests.export.conftest import few_golden_rows
 from tests.linear_arm import N
 
+pytestmark = pytest.mark.usefixtures("quick_compiler")
+
 
 def test_rows_meet_faults_and_vent(golden, controller):
     faults = golden.outputs[:, 0].astype(int)

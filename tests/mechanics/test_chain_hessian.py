@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_softarm._support.small_matrices import block_diagonal, eliminate, product, products
+from mjx_softarm._support.small_matrices import eliminate
 from mjx_softarm.mechanics.chain_hessian import ChainHessian
 
 N_ARMS, N, K = 5, 6, 4
@@ -100,17 +100,3 @@ def test_a_pivot_that_is_not_positive_gives_nan_and_its_neighbours_do_not(n, whi
     found = jax.vmap(eliminate)(matrix, np.ones((3, n, 2), np.float32))
     assert np.isnan(found[1]).all() and np.isnan(eliminate(matrix[1], np.ones((n, 2), np.float32))).all()
     np.testing.assert_allclose(found[::2], 0.5)
-
-
-def test_small_products_and_block_diagonals():
-    a, b = np.arange(12.0, dtype=np.float32).reshape(2, 2, 3), np.ones((2, 3, 4), np.float32)
-    np.testing.assert_allclose(products(a, b), a @ b)
-    np.testing.assert_allclose(product(arms_last(a), arms_last(b)), arms_last(a @ b))
-    long = np.arange(20.0, dtype=np.float32).reshape(2, 2, 5)
-    np.testing.assert_allclose(
-        product(arms_last(long), arms_last(long.swapaxes(1, 2)))[..., 1], long[1] @ long[1].T
-    )
-    expected = np.array([[0, 1, 2, 0, 0, 0], [3, 4, 5, 0, 0, 0], [0, 0, 0, 6, 7, 8], [0, 0, 0, 9, 10, 11]])
-    np.testing.assert_array_equal(block_diagonal(a), expected)
-    many = block_diagonal(np.stack([a, 2.0 * a], axis=-1))
-    np.testing.assert_array_equal(many, np.stack([expected, 2.0 * expected], axis=-1))

@@ -86,35 +86,6 @@ def test_arms_that_come_last_are_those_that_come_first():
     assert_same_frames(last, chain(1, 2)(q), "3 arms")
 
 
-def test_one_link_by_hand():
-    by_hand = [
-        ([0.01, 0.0, 0.0], [0.0, 0.0, -0.21]),  # longer
-        ([0.0, np.pi / 2, 0.0], [0.0, 0.1, -0.1]),  # about x, towards +y
-        ([0.0, 0.0, np.pi / 2], [-0.1, 0.0, -0.1]),  # about y, towards -x
-        ([0.01, np.pi / 2, np.pi / 2], [-0.1, 0.0, -0.11]),  # x turns y's axis to +z
-    ]
-    q, tip = map(np.float32, zip(*by_hand, strict=True))
-    np.testing.assert_allclose(chain(1, 1)(q).plate_position[:, 1], tip, atol=1e-7)
-
-
-def test_axes_and_anchors_give_c_mujoco_s_jacobian_of_the_tip():
-    model, data = compiled(), mujoco.MjData(compiled())
-    jacobian, turning = np.zeros((2, 3, model.nv))
-    q = random_q(arm(), 20, seed=2)
-    frames = jax.device_get(chain()(q))
-    for k in range(len(q)):
-        data.qpos[:] = q[k]
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        mujoco.mj_jacSite(model, data, jacobian, turning, model.site("tip").id)
-        axis, anchor, tip = frames.axis[k], frames.anchor[k], frames.plate_position[k, -1]
-        moves = np.cross(axis, (tip - anchor)[:, None])
-        moves[:, 0] = axis[:, 0]  # a slide moves along its axis and turns nothing
-        turns = axis * [[0.0], [1.0], [1.0]]
-        np.testing.assert_allclose(moves.reshape(-1, 3).T, jacobian, atol=2e-6)
-        np.testing.assert_allclose(turns.reshape(-1, 3).T, turning, atol=2e-6)
-
-
 MOUNTING = {
     "base_turn_deg": (20.0, -10.0, 5.0),
     "base_offset_m": (0.01, -0.02, 0.03),
