@@ -123,20 +123,26 @@ static bool write_pressures(const double* pressure_kpa) {
 """
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_example_that_is_ended_vents_until_the_arm_has_taken_it(folder, golden, tmp_path, number):
+@pytest.fixture(scope="module")
+def driven(folder, golden):
+    """The example with readings of an arm that refuses the first zeros."""
     row = golden.inputs[np.flatnonzero(np.isfinite(golden.outputs).all(axis=1))[0]]
     text = (folder / "example.cpp").read_text()
     first, last = text.index("// Reads the springs' sensors"), text.index("// Ctrl-C")
     reads = READS.replace("READINGS", ", ".join(map(repr, row[len(FLAGS) : -6].tolist())))
-    (tmp_path / "example.cpp").write_text(text[:first] + reads + text[last:])
-    compile_(f"-I{folder}", tmp_path / "example.cpp", "-o", tmp_path / "example")
-    with subprocess.Popen([tmp_path / "example"], stderr=subprocess.PIPE, text=True) as done:
+    (folder / "driven.cpp").write_text(text[:first] + reads + text[last:])
+    compile_(folder / "driven.cpp", "-o", folder / "driven")
+    return folder / "driven"
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_example_that_is_ended_vents_until_the_arm_has_taken_it(driven, number):
+    with subprocess.Popen([driven], stderr=subprocess.PIPE, text=True) as done:
         assert done.stderr is not None
-        driven = [float(done.stderr.readline()) for _ in range(8)]
+        before = [float(done.stderr.readline()) for _ in range(8)]
         done.send_signal(number)
         ramp = np.array([float(line) for line in done.stderr])
-    assert done.returncode == 0 and driven[-1] > 0.0
+    assert done.returncode == 0 and before[-1] > 0.0
     falls = -np.diff(ramp[np.argmax(ramp) :])
     assert ((falls >= 0.0) & (falls < 0.4 + 1e-9)).all()  # 20 kPa/s
     assert not ramp[-4:].any() and ramp[-5] > 0.0  # three times refused
