@@ -9,6 +9,7 @@ from mjx_softarm._support.small_matrices import eliminate
 from mjx_softarm.mechanics.chain_hessian import ChainHessian
 
 N_ARMS, N, K = 5, 6, 4
+alone, each = jax.jit(eliminate), jax.jit(jax.vmap(eliminate))
 
 
 @pytest.fixture(autouse=True)
@@ -47,7 +48,7 @@ def dense(hessian):
 def test_a_system_with_the_hessian_is_that_with_the_dense_matrix(n_sections):
     hessian, columns = chain(n_sections)
     assert np.linalg.eigvalsh(dense(hessian)).min() > 0
-    np.testing.assert_allclose(jax.vmap(ChainHessian.dense)(hessian), dense(hessian), atol=1e-6)
+    np.testing.assert_allclose(jax.jit(jax.vmap(ChainHessian.dense))(hessian), dense(hessian), atol=1e-6)
     found = jax.jit(jax.vmap(ChainHessian.solve))(hessian, columns)
     wanted = np.linalg.solve(dense(hessian), columns.reshape(N_ARMS, -1, K).astype(float))
     np.testing.assert_allclose(found, wanted.reshape(found.shape), atol=1e-5 * np.abs(wanted).max())
@@ -83,12 +84,12 @@ def test_elimination_of_rows_of_which_some_are_the_identity_s(n):
     given = rng.uniform(size=(8, n)) < 0.5
     matrix = np.where(given[..., None], np.eye(n, dtype=np.float32), matrix)
     columns = np.float32(rng.normal(size=(8, n, 3)))
-    found = np.asarray(jax.jit(jax.vmap(eliminate))(matrix, columns))
+    found = np.asarray(each(matrix, columns))
     np.testing.assert_allclose(found, np.linalg.solve(matrix, columns), atol=1e-5)
     np.testing.assert_array_equal(found[given], columns[given])
-    at_once = jax.jit(eliminate)(arms_last(matrix), arms_last(columns))
+    at_once = alone(arms_last(matrix), arms_last(columns))
     np.testing.assert_allclose(at_once, arms_last(found), atol=1e-6)
-    shared = jax.vmap(eliminate, in_axes=(None, 0))(matrix[0], columns)
+    shared = jax.jit(jax.vmap(eliminate, in_axes=(None, 0)))(matrix[0], columns)
     np.testing.assert_allclose(shared, np.linalg.solve(matrix[0], columns), atol=1e-5)
 
 
@@ -97,6 +98,7 @@ def test_elimination_of_rows_of_which_some_are_the_identity_s(n):
 def test_a_pivot_that_is_not_positive_gives_nan_and_its_neighbours_do_not(n, which, value):
     matrix = np.stack(3 * [2.0 * np.eye(n, dtype=np.float32)])
     matrix[1, which, which] = value
-    found = jax.vmap(eliminate)(matrix, np.ones((3, n, 2), np.float32))
-    assert np.isnan(found[1]).all() and np.isnan(eliminate(matrix[1], np.ones((n, 2), np.float32))).all()
+    columns = np.ones((3, n, 2), np.float32)
+    found = each(matrix, columns)
+    assert np.isnan(found[1]).all() and np.isnan(alone(matrix[1], columns[1])).all()
     np.testing.assert_allclose(found[::2], 0.5)
