@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from mjx_softarm._support.errors import InputError
 from mjx_softarm.control import Gains, LawState, pressures
-from mjx_softarm.deploy.drivers.names import ArmError, open_arm
+from mjx_softarm.deploy.drivers.names import open_arm
 from mjx_softarm.mechanics.mjcf import chamber_lengths, spring_lengths
 from mjx_softarm.mechanics.workspace import settle_many
 from mjx_softarm.twin.arm import Twin
@@ -199,5 +200,5 @@ def test_payload_in_a_name():
     in_pipe = open_arm("twin:7:pipe300:220g")
     lower_m = open_arm("twin:7:pipe300").motion_capture().tip_m - in_pipe.motion_capture().tip_m
     assert lower_m[2] > 1e-3 and in_pipe._pipe is not None
-    with pytest.raises(ArmError, match="twin: got an unstable state"):
+    with pytest.raises(InputError, match="twin: got an unstable state"):
         open_arm("twin:3:99999999g")
