@@ -99,7 +99,7 @@ def _run(
     limit_s = None if np.isinf(duration) else duration
     save = partial(save_log, log) if log else lambda log: None
     goals = list(map(np.array, goal))
-    run = follow(open_arm(arm), controller, goals, limit_s, _tell, save=save, stay=stay)
+    run = follow(open_arm(arm), controller, goals, limit_s, tell, save=save, stay=stay)
     if log and run.ending.status != cli.ERROR:
         print(f"log: {log}, {len(run.log)} rows")
     _summary(run)
@@ -108,7 +108,7 @@ def _run(
 
 def _controller(policy: Path) -> Controller:
     if policy == SHIPPED:
-        _tell("policy: the package's own, for the paper's arm as specified; for an arm of yours train one")
+        tell("policy: the package's own, for the paper's arm as specified; for an arm of yours train one")
     return Controller.of(load_policy(policy))
 
 
@@ -155,10 +155,10 @@ def _measure(
     out.mkdir(parents=True)
     save = partial(save_log, out / "log.npz")
     if seconds is None:
-        run = follow(driver, controller, poses, tell=_tell, save=save)
+        run = follow(driver, controller, poses, tell=tell, save=save)
     else:
         pace_s = seconds / max(len(poses) - 1, 1)
-        run = trace(driver, controller, poses, pace_s, tell=_tell, save=save)
+        run = trace(driver, controller, poses, pace_s, tell=tell, save=save)
     if not run.arrivals:
         _summary(run)
         return run.status
@@ -220,7 +220,7 @@ def _record(
 
     # The recording and its results
     targets_kpa = read_plan(plan, arm_spec) if plan else growing(random_pressures(arm_spec, poses, seed))
-    result = record(open_arm(arm), arm_spec, targets_kpa, transients, _tell, partial(save_log, out))
+    result = record(open_arm(arm), arm_spec, targets_kpa, transients, tell, partial(save_log, out))
     if not len(result.log):
         print(f"no pose was logged: {result.ending.cause or 'none came to rest'}", file=sys.stderr)
         return result.ending.status or MISSED
@@ -234,7 +234,8 @@ def _record(
     return result.ending.status
 
 
-def _tell(text: str) -> None:
+def tell(text: str) -> None:
+    """Print a line at once."""
     print(text, flush=True)
 
 

@@ -184,26 +184,16 @@ def on_reference(
     return xp.all((off_m < tolerance_m) | at_limit)
 
 
-def stuck_springs(spring_m: np.ndarray, pressure_kpa: np.ndarray, config: LoopConfig = LOOP) -> np.ndarray:
-    """Return which springs (n,) stand stock-still where they should not.
+def stuck_springs(spring_m: Array, pressure_kpa: Array, config: LoopConfig = LOOP) -> Array:
+    """Return which springs (n,) stand stock-still, noise included, where they should move.
 
-    Lengths [m] and commanded pressures [kPa] are those of the last ticks (ticks, n).
+    They should move if their chamber was driven or a spring of their section moved. Lengths [m] and commanded
+    pressures [kPa] are those of the last ticks (ticks, n).
     """
-    suspects = stock_still(spring_m, config)
-    return suspects & asked_to_move(spring_m, pressure_kpa, config) if suspects.any() else suspects
-
-
-def stock_still(spring_m: Array, config: LoopConfig = LOOP) -> Array:
-    """Return which springs (n,) did not move, nor show any noise, over a window (ticks, n) [m]."""
-    return _range(spring_m) < config.stuck_range_m
-
-
-def asked_to_move(spring_m: Array, pressure_kpa: Array, config: LoopConfig = LOOP) -> Array:
-    """Return which springs (n,) should have moved: the chamber was driven or the section moved."""
-    xp, moved_m = array_namespace(spring_m), _range(spring_m)
-    section_m = xp.max(moved_m.reshape(-1, N_CHAMBERS_PER_SECTION), axis=1)[:, None]  # (n_sections, 1)
+    xp, driven = array_namespace(spring_m), _range(pressure_kpa) > config.stuck_pressure_kpa
+    section_m = xp.max(_range(spring_m).reshape(-1, N_CHAMBERS_PER_SECTION), axis=1)[:, None]  # (sections, 1)
     near_m = (section_m + np.zeros(N_CHAMBERS_PER_SECTION)).reshape(-1)  # (n,)
-    return (_range(pressure_kpa) > config.stuck_pressure_kpa) | (near_m > config.stuck_neighbour_m)
+    return (_range(spring_m) < config.stuck_range_m) & (driven | (near_m > config.stuck_neighbour_m))
 
 
 def _range(values: Array) -> Array:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import time
 import traceback
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
@@ -184,6 +184,15 @@ def describe(error: BaseException) -> str:
     return ": ".join(filter(None, [type(error).__name__, text])) + where
 
 
+def stacked(rows: Collection[dict[str, Any]]) -> dict[str, np.ndarray]:
+    """Return the values (n, ...) of n rows by name; NaN where a row has none."""
+    shapes = {name: np.shape(value) for row in rows for name, value in row.items()}
+    return {
+        name: np.array([row.get(name, np.full(shape, np.nan)) for row in rows], float)
+        for name, shape in shapes.items()
+    }
+
+
 class Recorder:
     """Rows of a growing log; at most `kept` of the newest. Its length counts all rows."""
 
@@ -205,11 +214,7 @@ class Recorder:
 
     def log(self, source: str, sensor: Sensor) -> Log:
         """Return the log so far, of an arm with this sensor; NaN for missing values."""
-        shapes = {name: np.shape(value) for row in reversed(self._rows) for name, value in row.items()}
-        arrays = {
-            name: np.array([row.get(name, np.full(shape, np.nan)) for row in self._rows], float)
-            for name, shape in (shapes or {"time_s": ()}).items()
-        }
+        arrays = stacked(self._rows) or {"time_s": np.empty(0)}
         arrays["time_s"] = arrays["time_s"] - arrays["time_s"][:1]
         row = np.arange(2, len(self._rows) + 2)
         return Log(source=source, row=row, reading_name=sensor.reading_name, **arrays)

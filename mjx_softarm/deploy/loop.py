@@ -124,7 +124,7 @@ def with_goal(
     text = ", ".join(f"{value:g}" for value in goal)
     if goal.shape != (6,) or not np.isfinite(goal).all():
         return state, (Event(Fault.GOAL_OUTSIDE, f"got {text}, expected six finite numbers"),)
-    pose, away = nearest(controller.reachable, goal, controller.policy.reward)
+    pose, away = nearest(controller.reachable, goal)
     if away > 1.0:
         near = ", ".join(f"{value:.0f}" for value in pose)
         far = f"{text} is {away:.1f} times as far from the nearest reachable pose as a goal may be"

@@ -19,7 +19,7 @@ from mjx_softarm.deploy.belief import stuck_springs
 from mjx_softarm.deploy.controller import LOOP
 from mjx_softarm.deploy.drive import Drive, ramp
 from mjx_softarm.deploy.ending import Ending, vent_at_end
-from mjx_softarm.deploy.link import ArmFault, Recorder
+from mjx_softarm.deploy.link import ArmFault, Recorder, stacked
 from mjx_softarm.logs.checks import same_sign
 from mjx_softarm.logs.rest import MIN_HOLD_S, NEEDED, ROUNDING_S, WINDOW_S, leaves, moves
 from mjx_softarm.logs.schema import Log
@@ -144,11 +144,7 @@ class _Hold:
 
 def _mean(rows: Sequence[dict[str, Any]]) -> dict[str, np.ndarray]:
     """Return the mean of rows at rest over their finite numbers; NaN where there is none."""
-    shapes = {name: np.shape(value) for row in rows for name, value in row.items()}
-    values = {
-        name: np.array([row.get(name, np.full(shape, np.nan)) for row in rows])
-        for name, shape in shapes.items()
-    }
+    values = stacked(rows)
     if "tip_quaternion" in values:
         mean = same_sign(values["tip_quaternion"])[0].mean(axis=0)
         values["tip_quaternion"] = mean[None] / np.linalg.norm(mean)

@@ -74,9 +74,7 @@ def trace(
         goals (p, 6) [mm, deg]: poses; between two of them the goal moves on a straight line.
         pace_s: time from a goal to the next.
         stops (p,): bool; the first and the last goal are stops in any case.
-        tell: takes a line for each arrival and each fault.
-        arrived: takes the index of each stop arrived at, as the arm rests there; a gripper may act.
-        save: writes the log, once the arm is vented.
+        tell, arrived, save: as of `follow`, for stops.
     """
     refused = refusals(controller.policy, list(goals))
     way = Way(controller, goals, np.broadcast_to(stops, len(goals)), pace_s, refused)

@@ -8,7 +8,7 @@ import numpy as np
 
 from mjx_softarm._support.xp import Array, array_namespace
 from mjx_softarm.control import LawState, pressures, saturated
-from mjx_softarm.deploy.belief import as_without, asked_to_move, on_reference, still, stock_still
+from mjx_softarm.deploy.belief import as_without, on_reference, still, stuck_springs
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.link import vented
 from mjx_softarm.export.symbols import Symbol, constant, repeat, symbol
@@ -90,7 +90,7 @@ def check(controller: Controller) -> Computation:
 def _inside(controller: Controller, goal: Array) -> Array:
     """Return whether the loop takes a goal (6,) in a run."""
     xp = array_namespace(goal)
-    return xp.min(distances(controller.reachable, goal, controller.policy.reward)) <= 1.0
+    return xp.min(distances(controller.reachable, goal)) <= 1.0
 
 
 def actor(controller: Controller) -> Computation:
@@ -129,7 +129,6 @@ def parts(controller: Controller) -> dict[str, Computation]:
     settled = on_reference(springs_m, reference_m, pressure_kpa, gains, tolerance_m)
     scaled = scaled_error(xp.asarray(pose, dtype=np.float64), goal, policy.reward)
     weighted = xp.sqrt(xp.sum(scaled * scaled))
-    stuck = stock_still(springs_m, config) & asked_to_move(springs_m, pressures_kpa, config)
     without = as_without(policy.spring_model, pressure_kpa, spring_m, config)
     search = symbol("search", reach.begin(policy, 1).shape)
     found, error = reach.nearest_of(policy, goal[None], search)
@@ -153,7 +152,7 @@ def parts(controller: Controller) -> dict[str, Computation]:
         "still": of(springs_m, holds=still(springs_m, config)),
         "on_reference": of(springs_m, reference_m, pressure_kpa, holds=settled),
         "saturated": of(pressure_kpa, reference_m, spring_m, mask=mask),
-        "stuck": of(springs_m, pressures_kpa, mask=stuck),
+        "stuck": of(springs_m, pressures_kpa, mask=stuck_springs(springs_m, pressures_kpa, config)),
         "as_without": of(pressure_kpa, spring_m, mask=without),
     }
 

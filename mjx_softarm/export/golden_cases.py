@@ -114,7 +114,7 @@ def _checked_rows(controller: Controller, rng: np.random.Generator) -> Iterator[
     goals = rng.choice(policy.workspace, _CANDIDATES) + rng.normal(
         0.0, [5.0] * 3 + [30.0] * 3, (_CANDIDATES, 6)
     )
-    goals = goals[[nearest(controller.reachable, goal, policy.reward)[1] < 0.98 for goal in goals]]
+    goals = goals[[nearest(controller.reachable, goal)[1] < 0.98 for goal in goals]]
     errors = np.array([nearest_poses(policy, goals + shift)[1] for shift in (0.0, _SHIFT)])
     least, most = errors.min(axis=0) / policy.reward.threshold, errors.max(axis=0) / policy.reward.threshold
     readings = policy.sensor.readings(expected_springs(policy.spring_model, np.zeros(n)))
@@ -129,7 +129,7 @@ def _goal(controller: Controller, rng: np.random.Generator, outside: bool) -> np
     while True:
         goal = rng.choice(policy.workspace) + rng.normal(0.0, [2.0] * 3 + [1.0] * 3)
         goal = goal + outside * rng.normal(0.0, [300.0] * 3 + [0.0] * 3)
-        away = nearest(controller.reachable, goal, policy.reward)[1]
+        away = nearest(controller.reachable, goal)[1]
         if away > 1.02 if outside else away < 0.98:
             return goal
 

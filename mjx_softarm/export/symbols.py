@@ -11,7 +11,7 @@ The operations are NumPy's functions of the same name. All are elementwise excep
     constant                         `value`: its array
     cast, reshape                    type and shape are the symbol's
     index                            `option`: places (shape) of the elements in the flat operand
-    concat, sum, min, max, all, any  `option`: the axis, or a tuple of axes
+    concat, sum, min, max, all       `option`: the axis, or a tuple of axes
     matmul                           as NumPy's
     repeat                           `option`: a `Repeat`; the operand is the start
 """
@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-REDUCTIONS = ("sum", "min", "max", "all", "any")
+REDUCTIONS = ("sum", "min", "max", "all")
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ class Reachable(NamedTuple):
     pose: np.ndarray  # (m, 6) [mm, deg]
     position: np.ndarray  # (m, 3) weighted
     rotation: np.ndarray  # (m, 9)
-    weight_per_deg: float
+    reward: RewardConfig
     limit: float  # largest distance of a pose to its nearest neighbour
 
     @classmethod
@@ -29,7 +29,7 @@ class Reachable(NamedTuple):
         pose = np.asarray(pose, np.float64)
         position_m, rotation = frame_from_pose(pose)
         flat = rotation.reshape(len(pose), 9)
-        found = cls(pose, 1e3 * reward.weight_per_mm * position_m, flat, reward.weight_per_deg, 0.0)
+        found = cls(pose, 1e3 * reward.weight_per_mm * position_m, flat, reward, 0.0)
         nearest = []
         for start in range(0, len(pose), _CHUNK):
             rows = np.arange(start, min(start + _CHUNK, len(pose)))
@@ -39,24 +39,24 @@ class Reachable(NamedTuple):
         return found._replace(limit=float(np.concatenate(nearest).max()))
 
 
-def nearest(reachable: Reachable, goal: np.ndarray, reward: RewardConfig) -> tuple[np.ndarray, float]:
+def nearest(reachable: Reachable, goal: np.ndarray) -> tuple[np.ndarray, float]:
     """Return the reachable pose (6,) [mm, deg] nearest to a goal (6,), and its distance over the limit."""
-    distance = distances(reachable, np.asarray(goal, np.float64), reward)
+    distance = distances(reachable, np.asarray(goal, np.float64))
     index = int(np.argmin(distance))
     return reachable.pose[index], float(distance[index])
 
 
-def distances(reachable: Reachable, goal: Array, reward: RewardConfig) -> Array:
+def distances(reachable: Reachable, goal: Array) -> Array:
     """Return the distances (m,) of a goal (6,) [mm, deg] to the reachable poses, over the limit."""
     position_m, rotation = frame_from_pose(goal)
-    position = 1e3 * reward.weight_per_mm * position_m
+    position = 1e3 * reachable.reward.weight_per_mm * position_m
     return _distances(reachable, position[None], rotation.reshape(1, 9))[0] / reachable.limit
 
 
-def clamped(reachable: Reachable, goal: np.ndarray, reward: RewardConfig) -> np.ndarray:
+def clamped(reachable: Reachable, goal: np.ndarray) -> np.ndarray:
     """Return a goal (6,) [mm, deg] within the limit: itself, or on the way to it from the nearest pose."""
     goal = np.asarray(goal, np.float64)
-    pose, away = nearest(reachable, goal, reward)
+    pose, away = nearest(reachable, goal)
     if away <= 1.0:
         return goal
     share = _INSIDE / away
@@ -71,4 +71,4 @@ def _distances(reachable: Reachable, position: Array, rotation: Array) -> Array:
     squares = xp.sum(position**2, axis=1)[:, None] + np.sum(reachable.position**2, axis=1)
     away = xp.maximum(squares - 2.0 * position @ reachable.position.T, 0.0)
     cos = xp.clip(0.5 * (rotation @ reachable.rotation.T - 1.0), -1.0, 1.0)
-    return xp.sqrt(away + (reachable.weight_per_deg * xp.rad2deg(xp.acos(cos))) ** 2)
+    return xp.sqrt(away + (reachable.reward.weight_per_deg * xp.rad2deg(xp.acos(cos))) ** 2)

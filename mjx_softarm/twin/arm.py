@@ -22,13 +22,15 @@ from mjx_softarm.mechanics.pipe import CrossPipe
 from mjx_softarm.spec import ArmSpec
 from mjx_softarm.twin.hysteresis import StopOperators
 from mjx_softarm.twin.instruments import (
+    AS_BUILT,
     EVALUATION_SESSION,
     MARKERS_PER_SECTION,
+    Build,
     InstrumentedArm,
     checked_payload,
     checked_pressures,
 )
-from mjx_softarm.twin.model import AS_BUILT, Build, build_twin, draw_parts, rotation_matrix
+from mjx_softarm.twin.model import build_twin, draw_parts, rotation_matrix
 from mjx_softarm.twin.pipe import WallForce, contact_force, is_container
 from mjx_softarm.twin.pneumatics import Pneumatics
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,6 +23,26 @@ SPRING_NOISE_M = 2**0.5 * CAPTURE_NOISE_M  # noise of the distance between two m
 PRESSURE_TOLERANCE_KPA = 1e-3  # tolerance beyond the limits, for rounding to float32
 MARKERS_PER_SECTION = 3
 WIDEST_DRAW = 2.0  # largest deviation of a part, in standard deviations; a worse part is not mounted
+
+
+GAP = 1.9  # scale of the tolerances; the modules of the twins say how it was set
+
+
+class Build(NamedTuple):
+    """Scales of a twin's deviations from an ideal arm; tests set some of them to zero."""
+
+    gap: float = GAP  # scale of the tolerances
+    losses: float = 1.0  # scale of hysteresis and joint friction; a rod has neither
+    noise: float = 1.0  # scale of the noise of all sensors
+    per_section: int | None = None  # links or elements per section; None: the twin's own number
+
+
+AS_BUILT = Build()
+
+
+def drawn(rng: np.random.Generator, deviation: float, *shape: int) -> np.ndarray:
+    """Draw deviations of parts by their standard deviation; parts beyond `WIDEST_DRAW` are clipped to it."""
+    return deviation * np.clip(rng.standard_normal(shape), -WIDEST_DRAW, WIDEST_DRAW)
 
 
 class InstrumentedArm(abc.ABC):

@@ -15,6 +15,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import mujoco
@@ -25,10 +26,9 @@ from mjx_softarm.mechanics.pipe import CrossPipe
 from mjx_softarm.mechanics.statics import GRAVITY_M_S2
 from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
-from mjx_softarm.twin.instruments import WIDEST_DRAW
+from mjx_softarm.twin.instruments import Build, drawn
 from mjx_softarm.twin.pipe import add_pipe
 
-GAP = 1.9
 LINKS_PER_SECTION = 10
 MAX_TIMESTEP_S = 0.005  # tip within 0.13 mm RMS of steps of 0.00125 s, over 30 s of random commands
 
@@ -54,18 +54,6 @@ class Tolerances:
     spring_delta_m: float = 0.00075  # per spring
 
 
-class Build(NamedTuple):
-    """Scales of the twin's deviations from an ideal arm; tests set some of them to zero."""
-
-    gap: float = GAP  # scale of the tolerances
-    losses: float = 1.0  # scale of hysteresis and joint friction
-    noise: float = 1.0  # scale of the noise of all sensors
-    links_per_section: int = LINKS_PER_SECTION
-
-
-AS_BUILT = Build()
-
-
 class Parts(NamedTuple):
     """Random parts of one twin."""
 
@@ -84,10 +72,7 @@ def draw_parts(seed: int, spec: ArmSpec, build: Build) -> Parts:
     """Draw the parts of a twin from its seed; they do not depend on the scales of noise and losses."""
     rng = np.random.default_rng(seed)
     std = scaled_tolerances(build.gap)
-    n, n_sections = spec.n_chambers, spec.structure.n_sections
-
-    def off(deviation: float, *shape: int) -> np.ndarray:
-        return deviation * np.clip(rng.standard_normal(shape), -WIDEST_DRAW, WIDEST_DRAW)
+    n, n_sections, off = spec.n_chambers, spec.structure.n_sections, partial(drawn, rng)
 
     def per_chamber(value, deviation: float) -> tuple[float, ...]:
         return tuple(np.array(spec.per_chamber(value)) * (1.0 + off(deviation, n)))
@@ -98,7 +83,7 @@ def draw_parts(seed: int, spec: ArmSpec, build: Build) -> Parts:
     delta_m = np.array(spec.per_chamber(sensor.delta_m)) + off(std.spring_delta_m, n)
     offset_m = np.array(spec.per_chamber(chambers.length_offset_m)) + off(std.chamber_length_m, n)
     perturbed = spec.replace(
-        structure={"links_per_section": build.links_per_section},
+        structure={"links_per_section": build.per_section or LINKS_PER_SECTION},
         chambers={
             "stiffness_n_per_m": per_chamber(chambers.stiffness_n_per_m, std.chamber_stiffness),
             "area_m2": tuple(area_factor * spec.per_chamber(chambers.area_m2)),

@@ -6,9 +6,9 @@ of the tip is turned against the last plate and offset from its centre. Regulato
 with a lag. There is no pump, no hysteresis and no inertia. Readings, noise and clock are those of `Twin`.
 Parts are drawn from the seed.
 
-How `ROD_GAP` was set: it is the gap of `Twin`, with the same tolerances for base, roll and springs. At the
-spring lengths that bring training's model to the paper's circle, the tips of rods 100 to 105, which no
-experiment uses, are 15.9 mm and 6.7 deg off at a gap of 1.8, and 17.9 mm and 7.7 deg at 2.1.
+The gap is that of `Twin`, and the tolerances for base, roll and springs are the same. At the spring lengths
+that bring training's model to the paper's circle, the tips of rods 100 to 105, which no experiment uses,
+are 15.9 mm and 6.7 deg off at a gap of 1.8, and 17.9 mm and 7.7 deg at 2.1.
 """
 
 from __future__ import annotations
@@ -23,16 +23,17 @@ from mjx_softarm.sensing.pose import quaternion_from_rotation, rotation_about
 from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
 from mjx_softarm.twin.instruments import (
+    AS_BUILT,
     EVALUATION_SESSION,
     MARKERS_PER_SECTION,
-    WIDEST_DRAW,
+    Build,
     InstrumentedArm,
     checked_payload,
     checked_pressures,
+    drawn,
 )
 from mjx_softarm.twin.rod import Rod, RodParts
 
-ROD_GAP = 1.9
 ELEMENTS_PER_SECTION = 6  # tip within 0.2 mm of that with twelve elements
 REGULATOR_S = 0.1  # time constant of the pressures
 
@@ -60,15 +61,6 @@ class RodTolerances:
     spring_delta_m: float = 0.00075  # per spring
 
 
-@dataclass(frozen=True)
-class RodBuild:
-    """Scales of the rod twin's deviations from training's model; tests set some of them to zero."""
-
-    gap: float = ROD_GAP  # scale of the tolerances
-    noise: float = 1.0  # scale of the noise of all sensors
-    per_section: int = ELEMENTS_PER_SECTION
-
-
 class RodTwin(InstrumentedArm):
     """One rod with regulators, sensors and cameras; an `ArmIO` with motion capture."""
 
@@ -78,19 +70,20 @@ class RodTwin(InstrumentedArm):
         spec: ArmSpec | None = None,
         payload_kg: float = 0.0,
         session: int = EVALUATION_SESSION,
-        build: RodBuild | None = None,
+        build: Build = AS_BUILT,
     ):
         """Hang the arm up, unpressurised and at rest; arguments as those of `Twin`."""
-        self._spec, self._build = spec or ArmSpec.default(), build or RodBuild()
+        self._spec = spec or ArmSpec.default()
+        self._per_section = build.per_section or ELEMENTS_PER_SECTION
         rng = np.random.default_rng(seed)
-        std = _scaled(self._build.gap, self._spec)
-        self._base_m = _off(rng, std.base_offset_m, 3)
-        self._base_rotation = rotation_about(np.radians(_off(rng, std.base_tilt_deg, 3)) * [1.0, 1.0, 0.0])
-        self._tip_m = _off(rng, std.tip_offset_m, 3)
-        self._tip_turn = rotation_about(np.radians(_off(rng, std.tip_turn_deg, 3)))
-        super().__init__(_sensor(rng, self._spec, std), seed, session, self._build.noise)
+        std = _scaled(build.gap, self._spec)
+        self._base_m = drawn(rng, std.base_offset_m, 3)
+        self._base_rotation = rotation_about(np.radians(drawn(rng, std.base_tilt_deg, 3)) * [1.0, 1.0, 0.0])
+        self._tip_m = drawn(rng, std.tip_offset_m, 3)
+        self._tip_turn = rotation_about(np.radians(drawn(rng, std.tip_turn_deg, 3)))
+        super().__init__(_sensor(rng, self._spec, std), seed, session, build.noise)
         parts = draw_rod(rng, self._spec, std, self._base_rotation[2])
-        self._rod = Rod(parts, self._build.per_section)
+        self._rod = Rod(parts, self._per_section)
         self._pressure_kpa = np.zeros(self._spec.n_chambers)
         self.time_s = 0.0
         self.attach(payload_kg)
@@ -118,7 +111,7 @@ class RodTwin(InstrumentedArm):
     def motion_capture(self) -> Capture:
         """Return the tip, and markers in the rod at each third of a section, from the base to the tip."""
         n_markers = MARKERS_PER_SECTION * self._spec.structure.n_sections
-        thirds = np.arange(1, n_markers + 1) * self._build.per_section // MARKERS_PER_SECTION
+        thirds = np.arange(1, n_markers + 1) * self._per_section // MARKERS_PER_SECTION
         node_m, rotation = self._rod.shape()
         marker_m = self._base_m + node_m[thirds] @ self._base_rotation.T
         tip_m = self._base_m + self._base_rotation @ (node_m[-1] + rotation[-1] @ self._tip_m)
@@ -141,20 +134,20 @@ def draw_rod(rng: np.random.Generator, spec: ArmSpec, std: RodTolerances, up: np
     chambers, backbone = spec.chambers, spec.backbone
 
     def factors(deviation: float, *shape: int) -> np.ndarray:
-        return 1.0 + _off(rng, deviation, *shape)
+        return 1.0 + drawn(rng, deviation, *shape)
 
     def holes(radius_m: float) -> np.ndarray:
         first = np.radians(spec.geometry.first_chamber_deg)
         angle = first + 2 * np.pi * np.arange(N_CHAMBERS_PER_SECTION) / N_CHAMBERS_PER_SECTION
-        angle = angle + np.radians(_off(rng, std.hole_angle_deg, s, N_CHAMBERS_PER_SECTION))
-        radius = radius_m + _off(rng, std.hole_radius_m, s, N_CHAMBERS_PER_SECTION)
+        angle = angle + np.radians(drawn(rng, std.hole_angle_deg, s, N_CHAMBERS_PER_SECTION))
+        radius = radius_m + drawn(rng, std.hole_radius_m, s, N_CHAMBERS_PER_SECTION)
         return radius[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
     def each(value: float | tuple[float, ...]) -> np.ndarray:
         return np.reshape(spec.per_chamber(value), (s, -1))
 
     # The order of the draws belongs to the seed: another order makes other rods.
-    roll_rad = np.radians(_off(rng, std.section_roll_deg, s))
+    roll_rad = np.radians(drawn(rng, std.section_roll_deg, s))
     area = factors(std.chamber_area, s, N_CHAMBERS_PER_SECTION)
     stiff = factors(std.backbone_stiffness, s)
     return RodParts(
@@ -172,7 +165,7 @@ def draw_rod(rng: np.random.Generator, spec: ArmSpec, std: RodTolerances, up: np
         hardening=np.full((s, N_CHAMBERS_PER_SECTION), std.hardening),
         rest_m=length_m
         + each(chambers.length_offset_m)
-        + _off(rng, std.chamber_length_m, s, N_CHAMBERS_PER_SECTION),
+        + drawn(rng, std.chamber_length_m, s, N_CHAMBERS_PER_SECTION),
         area=1e3 * each(chambers.area_m2) * area,
         area_slope=1e3 * each(chambers.area_slope_m) * area,
         spring_stiffness=spec.springs.stiffness_n_per_m,
@@ -186,13 +179,9 @@ def draw_rod(rng: np.random.Generator, spec: ArmSpec, std: RodTolerances, up: np
 def _sensor(rng: np.random.Generator, spec: ArmSpec, std: RodTolerances) -> Sensor:
     """Draw the sensors, with the springs' own beta and delta."""
     sensor = spec.spring_sensor
-    beta = sensor.beta * (1.0 + _off(rng, std.spring_beta, spec.n_chambers))
-    delta_m = sensor.delta_m + _off(rng, std.spring_delta_m, spec.n_chambers)
+    beta = sensor.beta * (1.0 + drawn(rng, std.spring_beta, spec.n_chambers))
+    delta_m = sensor.delta_m + drawn(rng, std.spring_delta_m, spec.n_chambers)
     return dataclasses.replace(sensor, beta=beta, delta_m=delta_m)
-
-
-def _off(rng: np.random.Generator, deviation: float, *shape: int) -> np.ndarray:
-    return deviation * np.clip(rng.standard_normal(shape), -WIDEST_DRAW, WIDEST_DRAW)
 
 
 def _scaled(gap: float, spec: ArmSpec) -> RodTolerances:

@@ -10,17 +10,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from mjx_softarm._support import cli
 from mjx_softarm._support.errors import InputError, needing
-from mjx_softarm.deploy.__main__ import Arm, PolicyFile, check_file
+from mjx_softarm.deploy.__main__ import Arm, PolicyFile, check_file, tell
 from mjx_softarm.deploy.drivers.names import open_arm
 from mjx_softarm.deploy.ending import save_log
 from mjx_softarm.policy.file import SHIPPED, load_policy
 from mjx_softarm.spec import ArmSpec
+
+if TYPE_CHECKING:
+    import viser
 
 PROGRAM, HERE = "python -m mjx_softarm.view", "127.0.0.1"
 
@@ -78,44 +81,42 @@ def _view(
     read, io = load_policy(policy), open_arm(arm)
     setup = Setup(read, arm, at.host, at.port, hasattr(io, "attach"), demos is not None)
     saves = [partial(save_log, path) if path else None for path in (log, demos)]
-    return live(setup, io, _tell, partial(_welcome, at.host), *saves).status
+    return live(setup, io, tell, partial(_welcome, at.host), *saves).status
 
 
 def _replay(logs: tuple[Path, ...], spec: ArmSpec, html: Path | None, at: Address) -> int:
     from mjx_softarm.view.replay import Track, replay, share
-    from mjx_softarm.view.stage import open_server
 
     tracks = [Track(path, spec) for path in logs]
     if html is not None:
         speed = share(html, spec, tracks)
-        _tell(f"wrote {html}, {html.stat().st_size / 1e6:.1f} MB" + f", {speed} times as fast" * (speed > 1))
+        tell(f"wrote {html}, {html.stat().st_size / 1e6:.1f} MB" + f", {speed} times as fast" * (speed > 1))
         return 0
-    server = open_server(at.host, at.port, ", ".join(track.name for track in tracks))
-    _tell(f"open http://{at.host}:{server.get_port()}; Ctrl-C ends")
-    return replay(server, spec, tracks)
+    return replay(_served(at, ", ".join(track.name for track in tracks)), spec, tracks)
 
 
 def _errors(folders: tuple[Path, ...], html: Path | None, at: Address) -> int:
     from mjx_softarm.view.errors import follow_errors, spec_of
-    from mjx_softarm.view.stage import open_server
 
     folder, *others = folders
     if others or html is not None:
         raise InputError(f"LOGS: got {folder} and more, expected one folder without --html, or logs")
     spec_of(folder)
-    server = open_server(at.host, at.port, folder.name)
-    _tell(f"open http://{at.host}:{server.get_port()}; Ctrl-C ends")
-    return follow_errors(server, folder)
+    return follow_errors(_served(at, folder.name), folder)
+
+
+def _served(at: Address, label: str) -> viser.ViserServer:
+    from mjx_softarm.view.stage import open_server
+
+    server = open_server(at.host, at.port, label)
+    tell(f"open http://{at.host}:{server.get_port()}; Ctrl-C ends")
+    return server
 
 
 def _welcome(host: str, url: str) -> None:
-    _tell(f"open {url}; Ctrl-C vents the arm and ends")
+    tell(f"open {url}; Ctrl-C vents the arm and ends")
     if host not in (HERE, "localhost"):
-        _tell(f"--host {host}: everybody who reaches this address can move the arm; there is no password")
-
-
-def _tell(text: str) -> None:
-    print(text, flush=True)
+        tell(f"--host {host}: everybody who reaches this address can move the arm; there is no password")
 
 
 if __name__ == "__main__":

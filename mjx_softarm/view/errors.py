@@ -15,7 +15,7 @@ from mjx_softarm._support.files import read_json_lines
 from mjx_softarm.logs.pose_pairs import POSES_FILE, PosePairs, read_pose_pairs
 from mjx_softarm.spec import ARM_FILE, ArmSpec
 from mjx_softarm.view.look import Limits, look_at
-from mjx_softarm.view.panel import css, plot
+from mjx_softarm.view.panel import MUTED, css, plot
 from mjx_softarm.view.stage import SATURATED, Stage, set_the_scene
 
 CONFIG_FILE, METRICS_FILE = "config.json", "metrics.jsonl"  # files of a run
@@ -130,8 +130,8 @@ class Errors:
         self._text.content = (
             "<div style='padding:0.5em 0.8em;font-size:12px;line-height:1.5'>"
             f"{rows}<div style='margin-top:0.5em;{bar}'></div>"
-            f"<div style='display:flex;justify-content:space-between;color:#868e96'>{marks}</div>"
-            f"<div style='color:#868e96'>error [mm]; diamonds: {about}</div></div>"
+            f"<div style='display:flex;justify-content:space-between;color:{MUTED}'>{marks}</div>"
+            f"<div style='color:{MUTED}'>error [mm]; diamonds: {about}</div></div>"
         )
 
 

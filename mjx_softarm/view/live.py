@@ -112,7 +112,7 @@ class PagePilot:
             self._payload_kg = payload_kg
 
     def _clamped(self, goal: np.ndarray) -> np.ndarray:
-        return clamped(self._controller.reachable, goal, self._controller.policy.reward)
+        return clamped(self._controller.reachable, goal)
 
     def _count_pages(self, n_pages: int) -> None:
         if n_pages == 0 < self._n_pages:

@@ -14,13 +14,12 @@ from mjx_softarm._support.channel import End
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.sensing.pose import pose_from_quaternion, quaternion_from_pose
 from mjx_softarm.view.look import Limits, Look
-from mjx_softarm.view.panel import Panel, css
+from mjx_softarm.view.panel import BLUE, MUTED, Panel, css
 from mjx_softarm.view.stage import GOAL, SATURATED, Stage, add_workspace, open_server, set_the_scene
 
 FRAME_S, BARS, TRACES = 0.02, 5, 10  # time between frames; frames between bars, and between traces
 SILENT_S = 1.0  # silence of the loop after which the page says so
 DRAG_S = 0.5  # time after a drag in which the gizmo follows the user alone
-_BLUE, _GREY = "#2463a8", "#868e96"
 _STOP, _VENT = (
     "Give up the goals, hold the arm where it is",
     "Let the pressures go to zero; what it carries sinks",
@@ -167,6 +166,6 @@ class Page:
         elif silent_s > SILENT_S:
             title, colour = f"The loop was not heard for {silent_s:.0f} s", red
         else:
-            colours = {"moves": _BLUE, "holds": css(GOAL)}
-            title, colour = f"The arm {doing}", colours.get(doing.split()[0], _GREY)
+            colours = {"moves": BLUE, "holds": css(GOAL)}
+            title, colour = f"The arm {doing}", colours.get(doing.split()[0], MUTED)
         self._panel.show_text(title, colour, self._known.get("look"), lines[::-1])

@@ -15,7 +15,7 @@ from mjx_softarm.view.stage import GOAL, SATURATED, SEEN, section_colour
 
 TRACE_S, TRACE_POINTS = 20.0, 200
 _WIDTH, _TOP, _FOOT = 300, 6, 66  # width, top and foot of the bars [px]
-_MUTED = "#868e96"
+BLUE, MUTED = "#2463a8", "#868e96"
 
 
 class Panel:
@@ -79,13 +79,13 @@ def bars(look: Look, limits: Limits) -> str:
     springs = _bars(look.spring_m, foot_m, look.reference_m, limits.spring_m, saturated, off)
     names = ", ".join(map(str, np.flatnonzero(saturated)))
     note, colour = (
-        (f"saturated: chamber {names}", css(SATURATED)) if names else ("no chamber saturated", _MUTED)
+        (f"saturated: chamber {names}", css(SATURATED)) if names else ("no chamber saturated", MUTED)
     )
     line = "<div style='padding:0.2em 1em;font-size:11px;color:{}'>{}</div>"
     return (
-        line.format(_MUTED, f"pressures, {low:g} to {high:g} kPa")
+        line.format(MUTED, f"pressures, {low:g} to {high:g} kPa")
         + kpa
-        + line.format(_MUTED, "springs beside their references, off by mm")
+        + line.format(MUTED, "springs beside their references, off by mm")
         + springs
         + line.format(colour, note)
     )
@@ -113,7 +113,7 @@ def _bars(values, feet, marks, limits: tuple[float, float], warned: np.ndarray, 
             line = f"<line x1='{x - 1:.1f}' x2='{right:.1f}' y1='{y:.1f}' y2='{y:.1f}' stroke='#343a40'"
             parts.append(f"{line} stroke-width='1.5'/>")
         at = f"x='{x + wide / 2 - 5:.1f}' y='{_FOOT + 11}' font-size='9' text-anchor='middle'"
-        parts.append(f"<text {at} fill='{_MUTED}'>{words[k].replace('nan', '?')}</text>")
+        parts.append(f"<text {at} fill='{MUTED}'>{words[k].replace('nan', '?')}</text>")
     box = f"viewBox='0 0 {_WIDTH} {_FOOT + 14}' style='width:100%;padding:0 0.6em'"
     return f"<svg {box}>{''.join(parts)}</svg>"
 

@@ -17,14 +17,13 @@ from mjx_softarm.logs.checks import late_rows
 from mjx_softarm.logs.files import read_matrix
 from mjx_softarm.spec import ArmSpec
 from mjx_softarm.view.look import Limits, Look, looks
-from mjx_softarm.view.panel import Panel
+from mjx_softarm.view.panel import BLUE, Panel
 from mjx_softarm.view.stage import Stage, open_server, set_the_scene
 
 APART_M = 0.6  # distance between the bases of arms side by side
 FRAME_S, TRACES_S = 0.04, 0.2  # time between frames, and between points of the traces
 SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4", "10", "30")
 SHARE_HZ, SHARE_FRAMES = 10.0, 600  # frame rate; largest number of frames, so a longer log plays faster
-_BLUE = "#2463a8"
 
 
 class Track:
@@ -82,7 +81,7 @@ class ReplayPage:
                     if traced:
                         panel.show_bars(look)
                         panel.show_traces(look)
-                        panel.show_text(f"{look.time_s:.2f} s of {track.end_s:.1f} s", _BLUE, look)
+                        panel.show_text(f"{look.time_s:.2f} s of {track.end_s:.1f} s", BLUE, look)
 
 
 def replay(server: viser.ViserServer, spec: ArmSpec, tracks: Sequence[Track]) -> NoReturn:

@@ -147,7 +147,7 @@ DRIVER = """
 from calib.demo import planted_arm
 from mjx_softarm import ArmSpec
 from mjx_softarm.twin.arm import Twin
-from mjx_softarm.twin.model import Build
+from mjx_softarm.twin.instruments import Build
 
 class Arm(Twin):
     def __init__(self):

@@ -6,15 +6,15 @@ import pytest
 from mjx_softarm.deploy.loop import start, with_goal
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.policy.reachable import Reachable, clamped, nearest
-from tests.linear_arm import CONTROLLER, FAR, GOALS, POLICY
+from tests.linear_arm import CONTROLLER, FAR, GOALS
 
 
 def away(goal):
-    return nearest(CONTROLLER.reachable, goal, POLICY.reward)[1]
+    return nearest(CONTROLLER.reachable, goal)[1]
 
 
 def near(goal):
-    return clamped(CONTROLLER.reachable, goal, POLICY.reward)
+    return clamped(CONTROLLER.reachable, goal)
 
 
 def test_distance_to_reachable_poses():
@@ -22,10 +22,10 @@ def test_distance_to_reachable_poses():
     pose = np.array([[0, 0, -600, 0, 0, 0], [0, 0, -590, 0, 0, 0], [0, 30, -600, 0, 0, 0]], float)
     found = Reachable.from_poses(pose, reward)
     assert found.limit == pytest.approx(30 * reward.weight_per_mm)
-    near, distance = nearest(found, np.array([0, 60, -600, 0, 0, 0]), reward)
+    near, distance = nearest(found, np.array([0, 60, -600, 0, 0, 0]))
     np.testing.assert_array_equal(near, pose[2])
     assert distance == pytest.approx(1.0)
-    _, turned = nearest(found, np.array([0, 0, -600, 0, 0, 90]), reward)
+    _, turned = nearest(found, np.array([0, 0, -600, 0, 0, 90]))
     assert turned == pytest.approx(90 * reward.weight_per_deg / found.limit)
 
 
@@ -44,7 +44,7 @@ def test_goal_outside_comes_back_and_is_accepted():
 
 
 def test_goal_is_left_on_the_way_from_the_nearest_pose():
-    pose, distance = nearest(CONTROLLER.reachable, FAR, POLICY.reward)
+    pose, distance = nearest(CONTROLLER.reachable, FAR)
     assert distance > 1.0
     way, part = FAR[:3] - pose[:3], near(FAR)[:3] - pose[:3]
     np.testing.assert_allclose(np.cross(way, part), 0.0, atol=1e-6 * (way @ way))

@@ -11,11 +11,11 @@ from mjx_softarm.deploy.drivers.names import open_arm
 from mjx_softarm.mechanics.mjcf import chamber_lengths, spring_lengths
 from mjx_softarm.mechanics.workspace import settle_many
 from mjx_softarm.twin.arm import Twin
-from mjx_softarm.twin.instruments import PRESSURE_NOISE_KPA
-from mjx_softarm.twin.model import Build, build_twin, draw_parts
+from mjx_softarm.twin.instruments import PRESSURE_NOISE_KPA, Build
+from mjx_softarm.twin.model import build_twin, draw_parts
 from mjx_softarm.twin.rod_twin import RodTwin
 
-IDEAL = Build(gap=0.0, losses=0.0, noise=0.0, links_per_section=4)  # training's model, moving
+IDEAL = Build(gap=0.0, losses=0.0, noise=0.0, per_section=4)  # training's model, moving
 PRESSURES_KPA = np.array(
     [
         [0, 0, 0, 0, 0, 0, 0, 0, 0],

@@ -7,14 +7,13 @@ import pytest
 
 from mjx_softarm import ArmSpec
 from mjx_softarm.twin.arm import Twin
-from mjx_softarm.twin.instruments import EVALUATION_SESSION, S2R_SESSION
-from mjx_softarm.twin.model import Build
-from mjx_softarm.twin.rod_twin import RodBuild, RodTwin
+from mjx_softarm.twin.instruments import EVALUATION_SESSION, S2R_SESSION, Build
+from mjx_softarm.twin.rod_twin import RodTwin
 
 KPA = np.array([-12.0, 3, -20, -5, -30, 4, 2, -9, -14])
 KINDS = {
-    "twin": (Twin, partial(Build, links_per_section=4)),
-    "rod": (RodTwin, partial(RodBuild, per_section=3)),
+    "twin": (Twin, partial(Build, per_section=4)),
+    "rod": (RodTwin, partial(Build, per_section=3)),
 }
 both_kinds = pytest.mark.parametrize(("make", "build"), KINDS.values(), ids=KINDS)
 

@@ -13,7 +13,8 @@ from mjx_softarm.mechanics.mjcf import build_spec
 from mjx_softarm.mechanics.pipe import CrossPipe, body_clearance, clearance
 from mjx_softarm.mechanics.render import RenderError
 from mjx_softarm.twin.arm import Twin
-from mjx_softarm.twin.model import Build, build_twin, draw_parts
+from mjx_softarm.twin.instruments import Build
+from mjx_softarm.twin.model import build_twin, draw_parts
 from mjx_softarm.twin.pipe import CONTAINER, N_PLANKS, _walls, add_pipe, contact_force, is_container
 
 PIPE = CrossPipe.of_mm(300.0)

@@ -133,14 +133,15 @@ def test_holding_pressures_ends_where_settle_does():
 
 def test_an_ideal_rod_agrees_with_the_training_model(spec):
     """Rigid in shear and torsion it is nearly training's chain, whose four links leave 3 mm."""
-    from mjx_softarm.twin.rod_twin import RodBuild, RodTwin
+    from mjx_softarm.twin.instruments import Build
+    from mjx_softarm.twin.rod_twin import RodTwin
 
     pressures = np.array(
         [[0.0] * 9, [-12, 3, -20, -5, -30, 4, 2, -9, -14], [5, -20, -8, -3, 8, -25, -15, 6, -6]]
     )
     expected = settle_many(spec, pressures)
     for kpa, tip_m, spring_m in zip(pressures, expected.tip_position_m, expected.spring_m, strict=True):
-        arm = RodTwin(0, build=RodBuild(gap=0.0, noise=0.0))
+        arm = RodTwin(0, build=Build(gap=0.0, noise=0.0))
         arm.settle(kpa)
         np.testing.assert_allclose(arm.motion_capture().tip_m, tip_m, atol=3e-3)
         np.testing.assert_allclose(arm._rod.spring_lengths(), spring_m, atol=2e-3)

@@ -11,10 +11,11 @@ from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.drivers.names import open_arm
 from mjx_softarm.deploy.record import record
 from mjx_softarm.twin import rod, rod_twin
-from mjx_softarm.twin.rod_twin import RodBuild, RodTwin
+from mjx_softarm.twin.instruments import Build
+from mjx_softarm.twin.rod_twin import RodTwin
 
 KPA = np.array([-12.0, 3, -20, -5, -30, 4, 2, -9, -14])
-COARSE = RodBuild(per_section=3)
+COARSE = Build(per_section=3)
 
 
 def hold(arm, pressure_kpa, duration_s):
@@ -27,14 +28,14 @@ def test_refinement_changes_little():
     """Half as many elements again, a heavy payload, every part off."""
     tips = []
     for per_section in (6, 9):
-        arm = RodTwin(101, payload_kg=1.0, build=RodBuild(noise=0.0, per_section=per_section))
+        arm = RodTwin(101, payload_kg=1.0, build=Build(noise=0.0, per_section=per_section))
         arm.settle(KPA)
         tips.append(arm.motion_capture().tip_m)
     assert np.linalg.norm(tips[0] - tips[1]) < 2.5e-4
 
 
 def test_payload_pulls_and_is_released(spec):
-    arm = RodTwin(101, build=RodBuild(noise=0.0, per_section=3))
+    arm = RodTwin(101, build=Build(noise=0.0, per_section=3))
     z = [arm.motion_capture().tip_m[2]]
     for change in (lambda: arm.attach(1.0), arm.release):
         change()
@@ -44,17 +45,17 @@ def test_payload_pulls_and_is_released(spec):
 
 
 def test_mount_and_tilt_show_with_the_arm_hanging():
-    straight = RodTwin(101, build=RodBuild(gap=0.0, noise=0.0, per_section=3)).motion_capture()
+    straight = RodTwin(101, build=Build(gap=0.0, noise=0.0, per_section=3)).motion_capture()
     np.testing.assert_allclose(straight.tip_quaternion, [1.0, 0.0, 0.0, 0.0], atol=1e-9)
     np.testing.assert_allclose(straight.tip_m[:2], 0.0, atol=1e-9)
-    off = RodTwin(101, build=RodBuild(noise=0.0, per_section=3)).motion_capture()
+    off = RodTwin(101, build=Build(noise=0.0, per_section=3)).motion_capture()
     turn = Rotation.from_quat(off.tip_quaternion, scalar_first=True)
     assert 1.0 < np.degrees(turn.magnitude()) < 20.0
     assert off.marker_m.shape == (9, 3)
 
 
 def test_pressures_and_tip_follow_with_a_lag():
-    arm = RodTwin(101, build=RodBuild(noise=0.0, per_section=3))
+    arm = RodTwin(101, build=Build(noise=0.0, per_section=3))
     hold(arm, KPA, rod_twin.REGULATOR_S)
     np.testing.assert_allclose(arm.pressures(), (1.0 - np.exp(-1.0)) * KPA, rtol=1e-6)
     early = arm.motion_capture().tip_m
