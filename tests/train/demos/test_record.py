@@ -71,13 +71,13 @@ def fingers_m(log):
 def test_recorded_positions_are_the_waypoints(expert, waypoints, plan, shift_mm):
     told = []
     arm = IdealArm()
-    result = WaypointRecorder(arm, expert, told.append).record(waypoints[:4], plan, sequence=3)
-    assert result.ending.status == 0 and len(result.log) == len(told) == 4
-    wanted_m = np.stack([waypoint.finger_m for waypoint in waypoints[:4]])
+    result = WaypointRecorder(arm, expert, told.append).record(waypoints[:3], plan, sequence=3)
+    assert result.ending.status == 0 and len(result.log) == len(told) == 3
+    wanted_m = np.stack([waypoint.finger_m for waypoint in waypoints[:3]])
     off_m = np.linalg.norm(fingers_m(result.log) - wanted_m, axis=1)
     assert off_m.max() < CLOSE_M < 1e-3 * np.linalg.norm(shift_mm)  # uncorrected, it is off by the shift
     np.testing.assert_allclose(result.off_m, off_m, atol=1e-6)
-    assert result.log.sequence.tolist() == [3.0] * 4
+    assert result.log.sequence.tolist() == [3.0] * 3
     assert np.abs(arm.pressure_kpa).max() < 10.0  # vented: falling with a lag
 
 
@@ -132,11 +132,7 @@ class Leaking(IdealArm):
     [
         (Lost, 1, ["got 3 lost readings in a row"]),
         (Misplaced, 0, ["home: got 7"]),
-        (
-            Leaking,
-            0,
-            ["home: got no rest, expected it within 15 s; spring 4 is +", "chamber at -40.0 kPa"],
-        ),
+        (Leaking, 0, ["home: got no rest, expected it within 15 s; spring 4 is +", "chamber at -40.0 kPa"]),
     ],
 )
 def test_a_fault_ends_the_recording_and_what_was_logged_before_stays(
@@ -170,17 +166,17 @@ RECORD = ("record", "--arm", "a:B", "--out")
 def test_the_command_records_a_task_and_checks_its_file(command, tmp_path, monkeypatch, waypoints):
     whole = functools.partial(task, "pipe300")
     monkeypatch.setattr(
-        "train.demos.command.task", lambda name, spec: whole(spec)._replace(waypoints=waypoints[:4])
+        "train.demos.command.task", lambda name, spec: whole(spec)._replace(waypoints=waypoints[:2])
     )
     out = tmp_path / "demos.csv"
     status, told = command(*RECORD, out, "--task", "pipe300")
     assert status == 0, told
-    assert f"demonstrations: {out}, 4 poses" in told and "furthest from its waypoint: " in told
+    assert f"demonstrations: {out}, 2 poses" in told and "furthest from its waypoint: " in told
     log, _ = read_demonstrations(out, SPEC)
-    wanted_m = np.stack([waypoint.finger_m for waypoint in waypoints[:4]])
+    wanted_m = np.stack([waypoint.finger_m for waypoint in waypoints[:2]])
     assert np.linalg.norm(fingers_m(log) - wanted_m, axis=1).max() < CLOSE_M
     status, told = command("check", out)
-    assert status == 0 and "poses: 4" in told and "sequences: 1: 0 with 4" in told
+    assert status == 0 and "poses: 2" in told and "sequences: 1: 0 with 2" in told
 
 
 def test_misuse_is_told_before_anything_moves(command, tmp_path):

@@ -89,6 +89,7 @@ def test_payload_is_estimated_and_then_the_pose(distilled, payload_kg):
 
 def test_same_seed_same_networks(monkeypatch):
     small(monkeypatch, 20)
+    monkeypatch.setattr(module, "N_TRAINING", 512)
     monkeypatch.setattr(module, "PAYLOADS", (0.0,))
     one, same = (jax.tree.leaves(distil(SPEC, 3)[:3]) for _ in range(2))
     assert all(x.dtype == np.float32 for x in one)
