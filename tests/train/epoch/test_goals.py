@@ -67,7 +67,7 @@ def test_an_episode_goes_from_one_demonstrated_position_to_another(job):
 def test_an_episode_in_motion_starts_at_rest_where_the_expert_held_the_arm(moving_job, shown):
     job = moving_job
     state = job.init(jax.random.PRNGKey(0))
-    many = jax.vmap(lambda key: job.goals.begin(state.goals, state.arms, key).pipeline_state)
+    many = jax.jit(jax.vmap(lambda key: job.goals.begin(state.goals, state.arms, key).pipeline_state))
     arm = jax.tree.map(
         lambda x: x.reshape(-1, *x.shape[2:]), many(jax.random.split(jax.random.PRNGKey(1), 64))
     )
@@ -116,6 +116,7 @@ def test_a_run_is_traced_once_and_continues_bit_for_bit_across_a_stage(job):
     continued_bit_for_bit(job)
 
 
+@pytest.mark.slow  # test_devices.py asks it of `reach`
 def test_many_devices_learn_as_one_does_across_a_stage_and_a_balance(imitation_config, short_env, shown, job):
     spread = new_job(imitation_config, short_env, shown, mesh_of("8"))
     figures = []
@@ -141,7 +142,7 @@ def test_goals_shift_to_the_positions_that_are_missed_by_most():
 
 def test_rebalanced_goals_are_drawn_by_their_weights(job):
     state = job.goals.rebalance(job.init(jax.random.PRNGKey(0)), 4, np.array([0.0, 0, 0, 0, 0, 10.0]))
-    arms = jax.vmap(lambda key: job.goals.begin(state.goals, state.arms, key))
+    arms = jax.jit(jax.vmap(lambda key: job.goals.begin(state.goals, state.arms, key)))
     goals = arms(jax.random.split(jax.random.PRNGKey(5), 500)).pipeline_state.goal.reshape(-1, 6)
     share = np.mean(indices(job, goals) == 5)
     assert abs(share - (0.5 / 6 + 0.5)) < 4 * np.sqrt(0.25 / len(goals))
