@@ -87,9 +87,7 @@ class Twin(InstrumentedArm):
         mujoco.mj_step1(self._model, self._data)
         self._start_losses()
         chambers = self._parts.spec.chambers
-        area, slope = (
-            np.array(spec.per_chamber(value)) for value in (chambers.area_m2, chambers.area_slope_m)
-        )
+        area, slope = np.array([*map(spec.per_chamber, (chambers.area_m2, chambers.area_slope_m))])
         now_m, timestep_s = chamber_lengths(self._data), self._model.opt.timestep
         self._air = Pneumatics(area, slope, spec.geometry.section_length_m, now_m, timestep_s)
         # Let the arm come to rest.

@@ -71,7 +71,7 @@ class Parts(NamedTuple):
 def draw_parts(seed: int, spec: ArmSpec, build: Build) -> Parts:
     """Draw the parts of a twin from its seed; they do not depend on the scales of noise and losses."""
     rng = np.random.default_rng(seed)
-    std = scaled_tolerances(build.gap)
+    std = Tolerances(**{name: build.gap * x for name, x in dataclasses.asdict(Tolerances()).items()})
     n, n_sections, off = spec.n_chambers, spec.structure.n_sections, partial(drawn, rng)
 
     def per_chamber(value, deviation: float) -> tuple[float, ...]:
@@ -98,10 +98,8 @@ def draw_parts(seed: int, spec: ArmSpec, build: Build) -> Parts:
     ring_m = np.repeat(off(std.ring_offset_m, n_sections, 2), N_CHAMBERS_PER_SECTION, axis=0)
     angle = np.radians(spec.geometry.first_chamber_deg) + 2 * np.pi * np.arange(n) / N_CHAMBERS_PER_SECTION
     hole_m = {}
-    for kind, radius_m in (
-        ("chamber", spec.geometry.chamber_radius_m),
-        ("spring", spec.geometry.spring_radius_m),
-    ):
+    radii_m = {"chamber": spec.geometry.chamber_radius_m, "spring": spec.geometry.spring_radius_m}
+    for kind, radius_m in radii_m.items():
         turned = angle + np.radians(off(std.hole_angle_deg, n))
         on_circle = np.stack([np.cos(turned), np.sin(turned)], axis=-1)
         hole_m[kind] = (radius_m + off(std.hole_radius_m, n))[:, None] * on_circle + ring_m
@@ -118,11 +116,6 @@ def draw_parts(seed: int, spec: ArmSpec, build: Build) -> Parts:
         base_position_m=off(std.base_offset_m, 3),
         base_tilt_rad=tilt_rad,
     )
-
-
-def scaled_tolerances(gap: float) -> Tolerances:
-    """Return the standard deviations at a gap."""
-    return Tolerances(**{name: gap * value for name, value in dataclasses.asdict(Tolerances()).items()})
 
 
 def build_twin(parts: Parts, pipe: CrossPipe | None = None) -> mujoco.MjModel:

@@ -20,16 +20,6 @@ from mjx_softarm.view.stage import GOAL, SATURATED, Stage, add_workspace, open_s
 FRAME_S, BARS, TRACES = 0.02, 5, 10  # time between frames; frames between bars, and between traces
 SILENT_S = 1.0  # silence of the loop after which the page says so
 DRAG_S = 0.5  # time after a drag in which the gizmo follows the user alone
-_STOP, _VENT = (
-    "Give up the goals, hold the arm where it is",
-    "Let the pressures go to zero; what it carries sinks",
-)
-_CIRCLE, _PLACE, _GIZMO, _TAKE = (
-    "Go round the paper's circle, point by point",
-    "Fetch a mass on one side, put it down on the other, and back",
-    "Follow the goal that is dragged in the picture",
-    "Take the pose at rest as a demonstration",
-)
 
 
 class Setup(NamedTuple):
@@ -76,22 +66,25 @@ class Page:
         look = {"scale": 0.15, "depth_test": False, "visible": False}
         self._gizmo = server.scene.add_transform_controls("/gizmo", **look)
         # Panel beside it.
-        self._button("Stop", "hold", _STOP, "orange", viser.Icon.HAND_STOP)
-        self._button("Vent", "vent", _VENT, "red", viser.Icon.WIND)
+        icon, button = viser.Icon, self._button
+        button("Stop", "hold", "Give up the goals, hold the arm where it is", icon.HAND_STOP, "orange")
+        button("Vent", "vent", "Let the pressures go to zero; what it carries sinks", icon.WIND, "red")
         self._panel = Panel(server.gui, limits, spec.n_chambers)
         with server.gui.add_folder("Move", order=0.5):
-            self._button("Circle", "circle", _CIRCLE, None, viser.Icon.CIRCLE)
-            self._button("Pick and place", "place", _PLACE, None, viser.Icon.ARROWS_EXCHANGE)
-            self._button("Drag the goal", "follow", _GIZMO, None, viser.Icon.ARROWS_MOVE)
+            button("Circle", "circle", "Go round the paper's circle, point by point", icon.CIRCLE)
+            hint = "Fetch a mass on one side, put it down on the other, and back"
+            button("Pick and place", "place", hint, icon.ARROWS_EXCHANGE)
+            hint = "Follow the goal that is dragged in the picture"
+            button("Drag the goal", "follow", hint, icon.ARROWS_MOVE)
             if setup.records:
-                self._button("Take the pose", "take", _TAKE, None, viser.Icon.CAMERA)
+                button("Take the pose", "take", "Take the pose at rest as a demonstration", icon.CAMERA)
             if setup.carries:
                 self._add_payload(round(1e3 * spec.mass.largest_payload_kg))
             self._box("reachable poses", "Goals are kept near them", points)
             self._box("reachable workspace", "The hull of the reachable poses", hull)
         self._listen()
 
-    def _button(self, label: str, name: str, hint: str, colour: Any, icon: Any) -> None:
+    def _button(self, label: str, name: str, hint: str, icon: Any, colour: Any = None) -> None:
         order = 0.0 if colour else None
         button = self._server.gui.add_button(label, hint=hint, color=colour, icon=icon, order=order)
 
@@ -158,11 +151,8 @@ class Page:
         doing, lines, red = self._known["doing"], self._known["lines"], css(SATURATED)
         if "ended" in self._known:
             vented = "vented" if self._known["vented"] else "NOT VENTED, it may be under pressure"
-            title, colour, lines = (
-                f"The run has ended; the arm is {vented}",
-                red,
-                [*lines, self._known["ended"]],
-            )
+            title, colour = f"The run has ended; the arm is {vented}", red
+            lines = [*lines, self._known["ended"]]
         elif silent_s > SILENT_S:
             title, colour = f"The loop was not heard for {silent_s:.0f} s", red
         else:

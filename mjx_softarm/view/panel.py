@@ -70,29 +70,23 @@ def bars(look: Look, limits: Limits) -> str:
     """Return bars of pressures between their limits, and of springs beside their references, as HTML."""
     low, high = float(limits.gains.pressure_min_kpa), float(limits.gains.pressure_max_kpa)
     saturated, zero = limits.saturated(look), np.zeros(len(look.spring_m))
-    kpa = _bars(
-        look.pressure_kpa, zero, zero, (low, high), saturated, [f"{p:.0f}" for p in look.pressure_kpa]
-    )
-    # Springs, then a note about saturated chambers.
+    # Words below the bars, and a note about saturated chambers.
+    kpa = [f"{p:.0f}" for p in look.pressure_kpa]
     off = [f"{1e3 * (a - b):+.1f}" for a, b in zip(look.spring_m, look.reference_m, strict=True)]
-    foot_m = np.full(len(zero), limits.spring_m[0])
-    springs = _bars(look.spring_m, foot_m, look.reference_m, limits.spring_m, saturated, off)
     names = ", ".join(map(str, np.flatnonzero(saturated)))
-    note, colour = (
-        (f"saturated: chamber {names}", css(SATURATED)) if names else ("no chamber saturated", MUTED)
-    )
+    note = f"saturated: chamber {names}" if names else "no chamber saturated"
     line = "<div style='padding:0.2em 1em;font-size:11px;color:{}'>{}</div>"
     return (
         line.format(MUTED, f"pressures, {low:g} to {high:g} kPa")
-        + kpa
+        + _bars(look.pressure_kpa, 0.0, zero, (low, high), saturated, kpa)
         + line.format(MUTED, "springs beside their references, off by mm")
-        + springs
-        + line.format(colour, note)
+        + _bars(look.spring_m, limits.spring_m[0], look.reference_m, limits.spring_m, saturated, off)
+        + line.format(css(SATURATED) if names else MUTED, note)
     )
 
 
-def _bars(values, feet, marks, limits: tuple[float, float], warned: np.ndarray, words: Sequence[str]) -> str:
-    """Return bars from feet to values, with marks across them, as SVG; a NaN has no bar."""
+def _bars(values, foot, marks, limits: tuple[float, float], warned: np.ndarray, words: Sequence[str]) -> str:
+    """Return bars from a foot to values, with marks across them, as SVG; a NaN has no bar."""
     wide, parts = _WIDTH / len(values), []
 
     def height(value: float) -> float:
@@ -100,7 +94,7 @@ def _bars(values, feet, marks, limits: tuple[float, float], warned: np.ndarray, 
         return _FOOT - share * (_FOOT - _TOP)
 
     # For each chamber its frame, bar, mark and word.
-    for k, (value, foot, mark) in enumerate(zip(values, feet, marks, strict=True)):
+    for k, (value, mark) in enumerate(zip(values, marks, strict=True)):
         x, edge = wide * k + 5, css(SATURATED) if warned[k] else "#dee2e6"
         size = f"width='{wide - 10:.1f}' height='{_FOOT - _TOP}' rx='2' stroke-width='{1 + warned[k]}'"
         parts.append(f"<rect x='{x:.1f}' y='{_TOP}' {size} fill='#f8f9fa' stroke='{edge}'/>")

@@ -74,11 +74,10 @@ class Stage:
             return scene.add_point_cloud(f"{name}/{path}", np.zeros((1, 3)), colour, **looks)
 
         # Bellows, rings and springs.
-        self._spring_m = np.full(
-            spec.n_chambers, spec.geometry.section_length_m
-        )  # lengths in the last picture
+        length_m = spec.geometry.section_length_m
+        self._spring_m = np.full(spec.n_chambers, length_m)  # lengths in the last picture
         rest = shape(spec, self._spring_m, np.full(6, np.nan))
-        turn = meshes.coil(1.6 * SPRING_WIDTH_M, _WIRE_M, spec.geometry.section_length_m / COILS)
+        turn = meshes.coil(1.6 * SPRING_WIDTH_M, _WIRE_M, length_m / COILS)
         solid("mount", meshes.disc(*_MOUNT_M), _MOUNT, position=(0.0, 0.0, _MOUNT_M[1] / 2))
         self._rings = copies("rings", meshes.disc(ring_radius_m(spec), _RING_M), rest.rings, _RING)
         self._folds = copies("bellows", meshes.fold(spec.geometry.chamber_diameter_m / 2), rest.folds, _RING)
