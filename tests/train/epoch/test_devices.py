@@ -35,9 +35,12 @@ LEARNER = dataclasses.replace(
 )
 CONFIG = dataclasses.replace(small.CONFIG, learner=LEARNER)
 
-pytestmark = pytest.mark.skipif(
-    len(jax.local_devices()) < N_DEVICES, reason=f"needs {N_DEVICES} devices, which a CPU can simulate"
-)
+pytestmark = [
+    pytest.mark.usefixtures("quick_compiler"),
+    pytest.mark.skipif(
+        len(jax.local_devices()) < N_DEVICES, reason=f"needs {N_DEVICES} devices, which a CPU can simulate"
+    ),
+]
 
 
 @pytest.fixture(scope="module")
