@@ -4,6 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from mjx_softarm.sensing.pose import (
@@ -14,6 +16,7 @@ from mjx_softarm.sensing.pose import (
     quaternion_from_pose,
     share_of_turn,
 )
+from tests.properties import few
 
 pytestmark = pytest.mark.usefixtures("strict")
 
@@ -115,6 +118,33 @@ def test_jax_gives_numpy_s_poses():
     quaternion = np.float32(ROTATIONS.as_quat(scalar_first=True))
     difference = pose_error(jax.jit(jax.vmap(pose_from_quaternion))(position, quaternion), expected)
     np.testing.assert_allclose(difference[~steep], 0.0, atol=1e-3)
+
+
+POSES = st.tuples(*[st.floats(-2e3, 2e3)] * 3, *[st.floats(-720.0, 720.0)] * 3).map(np.array)
+
+
+@few
+@given(pose=POSES)
+def test_a_pose_s_frame_and_quaternion_give_its_frame_again(pose):
+    position_m, rotation = frame_from_pose(pose)
+    for again in (
+        pose_from_frame(position_m, rotation),
+        pose_from_quaternion(position_m, quaternion_from_pose(pose)),
+    ):
+        np.testing.assert_allclose(frame_from_pose(again)[0], position_m, atol=1e-12)
+        np.testing.assert_allclose(frame_from_pose(again)[1], rotation, atol=3e-6)  # 1e-6 at gimbal lock
+        assert abs(again[3]) <= 180.0 and abs(again[4]) <= 90.0 and abs(again[5]) <= 180.0
+
+
+@few
+@given(pose=POSES, goal=POSES, turns=st.lists(st.integers(-5, 5), min_size=3, max_size=3))
+def test_pose_error_is_wrapped_and_does_not_depend_on_whole_turns(pose, goal, turns):
+    error = pose_error(pose, goal)
+    assert np.all((error[3:] >= -180.0) & (error[3:] < 180.0))
+    turned = pose_error(pose + 360.0 * np.array([0, 0, 0, *turns]), goal)
+    difference = (turned - error + [0, 0, 0, 180, 180, 180]) % 360.0 - [0, 0, 0, 180, 180, 180]
+    np.testing.assert_allclose(difference[3:], 0.0, atol=1e-9)
+    np.testing.assert_allclose(turned[:3], pose[:3] - goal[:3])
 
 
 @pytest.mark.parametrize("angle_deg", [0.0, 1e-6, 40.0, 179.0, -100.0])

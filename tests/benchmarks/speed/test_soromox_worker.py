@@ -68,6 +68,18 @@ def test_a_step_follows_an_oscillator(method, tolerance):
     np.testing.assert_allclose(state, exact, atol=tolerance)
 
 
+def test_the_implicit_step_rests_where_an_explicit_one_diverges():
+    robot = pendulum(1e-3, 2.0, 10.0)  # decays 2,000 times a second
+    ends = {}
+    for method in N_STEPS:
+        step, state = jax.jit(stepper(robot, method, 0.02)), jnp.zeros(2)
+        for _ in range(1000):
+            state = step(state, jnp.array([6.0]))
+        ends[method] = np.asarray(state)
+    np.testing.assert_allclose(ends["implicit"][0], 0.5, atol=1e-3)
+    assert not np.isfinite(ends["explicit"]).all()
+
+
 def test_the_implicit_step_is_as_long_as_mjx_s_and_every_method_has_a_row():
     assert HELD_S / N_STEPS["implicit"] == pytest.approx(EnvConfig().simulation_step_s)
     assert EnvConfig().dynamic_step_s == HELD_S and SOROMOX.keys() == N_STEPS.keys()

@@ -108,6 +108,21 @@ def test_quantile_huber_loss_equals_loops_over_every_pair(quantiles_and_targets,
     assert loss == pytest.approx(quantile_huber_by_loops(quantiles, targets), rel=1e-5)
 
 
+def test_quantile_huber_gradient_equals_finite_differences(quantiles_and_targets, strict_dtypes):
+    quantiles, targets = quantiles_and_targets
+    gradient = jax.jit(jax.grad(losses.quantile_huber_loss, argnums=(0, 1)))
+    d_quantiles, d_targets = gradient(*floats(quantiles, targets))
+    h = 1e-5  # the loss is piecewise quadratic: a central difference is exact away from its corners
+    expected = np.zeros_like(quantiles)
+    for index in np.ndindex(quantiles.shape):
+        step = np.zeros_like(quantiles)
+        step[index] = h
+        above = quantile_huber_by_loops(quantiles + step, targets)
+        expected[index] = (above - quantile_huber_by_loops(quantiles - step, targets)) / (2 * h)
+    np.testing.assert_allclose(d_quantiles, expected, atol=1e-6)  # entries of order 1 / (B C M) = 0.025
+    np.testing.assert_array_equal(d_targets, 0.0)
+
+
 @pytest.mark.parametrize("n_drop", [0, 1, 4, 9])
 def test_drop_largest_keeps_what_a_sort_keeps_also_with_ties(n_drop, strict_dtypes):
     rng = np.random.default_rng(n_drop)
