@@ -53,8 +53,10 @@ def _picture(
     arm = ArmSpec.of(spec)
     _check_pressures(arm, pressures)
     _import_mujoco()
+    from PIL import Image
+
     from mjx_softarm.mechanics.mjcf import build_model
-    from mjx_softarm.mechanics.render import Renderer, write_png
+    from mjx_softarm.mechanics.render import Renderer
     from mjx_softarm.mechanics.settle import SettleResult
     from mjx_softarm.mechanics.workspace import settle_many
 
@@ -67,7 +69,7 @@ def _picture(
         )
     with Renderer(build_model(arm)) as renderer:
         image = renderer.draw(np.asarray(found.q[0]))
-    write_png(out, image)
+    Image.fromarray(image).save(out, "PNG")
     x, y, z = 1e3 * found.tip_position_m[0]
     print(f"wrote {out}; tip at x {x:.1f}, y {y:.1f}, z {z:.1f} mm")
     return 0

@@ -55,7 +55,7 @@ def scene_of(folder: Path, settings: Settings, trial: Trial) -> Scene:
         spec, inside = controller.policy.spec, {"pipe": CrossPipe.of_mm(PIPES_MM[task])}
         demonstrations = load_demonstrations(folder / demonstrations_path(trial.twin, task), spec)
         goals = demonstrations.positions[: settings.n_positions].astype(float)
-        names = [waypoint.name for waypoint in task_of(task, spec).waypoints[: settings.n_positions]]
+        names = [waypoint.name for waypoint in task_of(task, spec)[0][: settings.n_positions]]
     else:
         goals = circle_poses(controller.policy.spec, settings.n_points).astype(float)
         names = [""] * len(goals)

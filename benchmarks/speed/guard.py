@@ -28,8 +28,7 @@ from benchmarks.speed.truth import random_references, settle_function
 from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.provenance import provenance, write_json
 from mjx_softarm.env import EnvConfig, ReachEnv
-from train.agent.hindsight_tqc import HindsightTQC
-from train.agent.tqc import TQCConfig
+from train.agent.tqc import HindsightTQC, TQCConfig
 from train.epoch.job import Job
 from train.presets import PRESETS
 

@@ -93,20 +93,14 @@ def fit_chambers(measurements: Measurements, spec: ArmSpec, seed: int = 0) -> Ch
     """Fit the chambers of an arm to its poses at rest.
 
     Args:
-        measurements: poses at rest; readings, spring lengths and markers help.
+        measurements: `MIN_POSES` poses at rest or more; readings, spring lengths and markers help.
         spec: arm as believed so far, its sensors already calibrated.
         seed: seed that chooses the held-out poses, in contiguous blocks.
 
     Raises:
-        FitError: too few poses at rest.
         SpecError: no arm can have the calibrated values.
     """
-    poses, row_uses = measurements.poses.with_lengths(spec), measurements.row_uses
-    if poses.n < MIN_POSES:
-        uses = ", ".join(f"{count} {use}" for use, count in row_uses.items())
-        raise FitError(
-            f"chambers: got {poses.n} poses at rest, expected {MIN_POSES} or more; rows of the logs: {uses}"
-        )
+    poses = measurements.poses.with_lengths(spec)
     # Fit without the held-out poses, then, from there, to all poses.
     held_out = held_out_blocks(poses.n, block=HELD_OUT_BLOCK, seed=seed)
     end_m, complaints = _section_ends(poses, spec)
@@ -136,7 +130,7 @@ def fit_chambers(measurements: Measurements, spec: ArmSpec, seed: int = 0) -> Ch
         in_sample_before=_errors(before[~held_out], spec),
         held_out_before=_errors(before[held_out], spec),
         scale=np.stack([bent, np.minimum(bent, straight)])[:, : 4 if np.isfinite(end_m).any() else 3],
-        rows=row_uses,
+        rows=measurements.row_uses,
         n_single=int(np.count_nonzero(poses.n_rows == 1)),
         poses=poses,
         is_held_out=held_out,

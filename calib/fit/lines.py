@@ -29,6 +29,7 @@ STRETCHES = 50  # clusters of the intervals: neighbouring rows err alike
 STUDENT = 2.0096  # 97.5 % quantile for STRETCHES - 1 degrees of freedom
 PADDED_ROWS = 1_024  # tables are padded to a multiple of it
 MIN_ROWS = 50
+BLOCK = 100  # rows of one spring that are held out together
 EDGE = 0.05  # share of the range of the other rows by which a held-out row may exceed it
 MAX_BEYOND = 0.02  # share of held-out rows beyond the range from which there is a warning
 
@@ -54,9 +55,7 @@ class LineFit(NamedTuple):
 def fit_line(
     x: np.ndarray,
     y: np.ndarray,
-    name: str = "column",
     shared: bool = False,
-    block: int = 100,
     seed: int = 0,
     share: float = 0.0,
     fit_share: bool = False,
@@ -66,9 +65,7 @@ def fit_line(
     Args:
         x (n, k): predictors; an entry that is not finite is a missing one; 1 at most with a share.
         y (n, k): targets; missing entries as in x.
-        name: name of a column in messages; its number follows.
         shared: fit one slope and offset for all columns.
-        block: rows that are held out together.
         seed: seed that chooses which blocks form a fold.
         share: curvature of all lines, below 1, or the start of its fit.
         fit_share: fit the curvature, too.
@@ -78,15 +75,15 @@ def fit_line(
     """
     x, y = np.asarray(x, float), np.asarray(y, float)
     if x.shape != y.shape or x.ndim != 2:
-        raise FitError(f"{name}s: got tables of shapes {x.shape} and {y.shape}, expected two of one shape")
-    n_columns = x.shape[1]
+        raise FitError(f"springs: got tables of shapes {x.shape} and {y.shape}, expected two of one shape")
+    n_columns, block = x.shape[1], BLOCK
     if shared:  # rows of one time stay neighbours
         x, y, block = x.reshape(-1, 1), y.reshape(-1, 1), block * n_columns
     known = np.isfinite(x) & np.isfinite(y)
     for k, column in enumerate(known.T):
         if column.sum() < 3 or np.ptp(x[column, k]) == 0 or np.ptp(y[column, k]) == 0:
             raise FitError(
-                f"{name}{k}: got {column.sum()} rows with a reading and a length, expected 3 or more unlike"
+                f"spring{k}: got {column.sum()} rows with a reading and a length, expected 3 or more unlike"
             )
     # Fit the lines, and predict each row by lines that have not seen its block.
     x, y = np.where(known, x, np.nan), np.where(known, y, np.nan)
@@ -110,7 +107,7 @@ def fit_line(
         share=lines.share,
         share_interval=(lines.share - lines.share_width, lines.share + lines.share_width),
     )
-    warnings = _warnings(fit, wire, f"all {name}s " if shared else name)
+    warnings = _warnings(fit, wire, "all springs " if shared else "spring")
     if shared:
         fit = LineFit(*(np.repeat(v, n_columns, axis=0) if isinstance(v, np.ndarray) else v for v in fit))
     return fit._replace(warnings=warnings)
@@ -144,9 +141,8 @@ def _folds(x: np.ndarray, block: int, seed: int) -> np.ndarray:
     n = len(x)
     known = np.isfinite(x)
     centred = np.where(known, x - np.nanmean(x, axis=0), 0.0) / np.maximum(np.nanstd(x, axis=0), 1e-300)
-    return folds(
-        n, block_rows(n, block), min(5, n), seed, centred.sum(axis=1) / np.maximum(known.sum(axis=1), 1)
-    )
+    by = centred.sum(axis=1) / np.maximum(known.sum(axis=1), 1)
+    return folds(by, block_rows(n, block), min(5, n), seed)
 
 
 class _Lines(NamedTuple):

@@ -69,15 +69,13 @@ def marker_limits(poses: StaticPoses, simulated_m: np.ndarray, spec: ArmSpec) ->
     """Compute the range of the chambers' lengths at the most bent poses.
 
     Args:
-        poses: static poses with markers that `section_ends` has accepted.
+        poses: static poses with `MIN_MARKERS` markers or more, which `section_ends` has accepted.
         simulated_m (n, n_chambers) [m]: chamber lengths of the calibrated arm at all poses.
         spec: the arm.
 
     Raises:
-        FitError: there are fewer than `MIN_MARKERS`, or the last is off the tip's plate.
+        FitError: the last is off the tip's plate.
     """
-    if poses.marker_m.shape[1] < MIN_MARKERS:
-        raise FitError(f"markers: got {poses.marker_m.shape[1]}, expected {MIN_MARKERS} or more")
     # Choose the most bent poses.
     seen = np.flatnonzero(np.isfinite(poses.marker_m).all(axis=(1, 2)))
     site_m = _marker_site(poses.take(seen))

@@ -16,7 +16,6 @@ import numpy as np
 from jax import Array
 from scipy.linalg import block_diag
 
-from calib.errors import FitError
 from calib.fit.blocks import block_rows, held_out_blocks
 from calib.fit.leastsquares import ridge
 from mjx_softarm._support.mlp import Layer, mlp
@@ -65,11 +64,7 @@ def fit_network(
         seed: seed of weights, batches and blocks.
         config: hidden layers and training; by default `OF_ROWS`, or `OF_PROCESS` with points.
         points: inputs (m, n_in) and outputs (m, n_out) without noise, which it learns in place of the rows.
-
-    Raises:
-        FitError: fewer than two rows, arrays that do not fit together, or a number that is not finite.
     """
-    _check(x, y)
     config = config or (OF_ROWS if points is None else OF_PROCESS)
     # Bring the inputs to -1 to 1, and choose anchors.
     bounds = _bounds(x, y)
@@ -98,17 +93,6 @@ def fit_network(
 def _loss(layers: tuple[Layer, ...], rows: tuple[Array, Array]) -> Array:
     x, y = rows
     return jnp.mean((mlp(layers, x) - y) ** 2)
-
-
-def _check(x: np.ndarray, y: np.ndarray) -> None:
-    if x.ndim != 2 or y.ndim != 2 or len(x) != len(y) or len(x) < 2:
-        tables = f"{x.shape} and {y.shape}"
-        raise FitError(f"network: got tables {tables}, expected as many rows in both, 2 or more")
-    for name, table in (("inputs", x), ("outputs", y)):
-        if not np.isfinite(table).all():
-            row, column = np.argwhere(~np.isfinite(table))[0]
-            where = f"{name}, row {row}, column {column}"
-            raise FitError(f"network: {where}: got {table[row, column]}, expected a finite number")
 
 
 def _bounds(x: np.ndarray, y: np.ndarray) -> dict[str, np.ndarray]:

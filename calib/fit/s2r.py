@@ -18,7 +18,6 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from calib.errors import FitError
 from calib.fit.blocks import block_rows, held_out_blocks
 from calib.fit.network import NetworkConfig, fit_network
 from calib.fit.pose_errors import PoseErrors, pose_errors
@@ -84,25 +83,13 @@ def simulate_poses(spec: ArmSpec, reference_m: np.ndarray) -> SimulatedPoses:
 
     Args:
         spec: calibrated arm.
-        reference_m (n, n_chambers) [m]: spring lengths of the real arm.
-
-    Raises:
-        FitError: a wrong number of columns, no row, or a length that is not finite.
+        reference_m (n, n_chambers) [m]: spring lengths of the real arm, finite, n at least 1.
     """
-    reference = np.asarray(reference_m, np.float32)
-    if reference.ndim != 2 or reference.shape[1] != spec.n_chambers or not len(reference):
-        expected = f"(n, {spec.n_chambers}) with n at least 1"
-        raise FitError(f"spring lengths: got an array {reference.shape}, expected {expected}")
-    if not np.isfinite(reference).all():
-        row, k = np.argwhere(~np.isfinite(reference))[0]
-        raise FitError(
-            f"spring lengths: row {row}, spring {k}: got {reference[row, k]}, expected a finite number"
-        )
     # Lift the pressure limits, and settle in batches of one size.
-    n, params = len(reference), ArmParams.from_spec(spec)
+    n, params = len(reference_m), ArmParams.from_spec(spec)
     limit = np.full(spec.n_chambers, PRESSURE_LIMIT_KPA, np.float32)
     params = params._replace(pressure_min_kpa=-limit, pressure_max_kpa=limit)
-    padded = np.resize(reference, (-(-n // BATCH) * BATCH, spec.n_chambers))
+    padded = np.resize(np.float32(reference_m), (-(-n // BATCH) * BATCH, spec.n_chambers))
     solver = _solver(arms_at_once(spec.n_links))
     found = [jax.device_get(solver(params, batch)) for batch in np.split(padded, len(padded) // BATCH)]
     return jax.tree.map(lambda *columns: np.concatenate(columns)[:n], *found)
@@ -135,15 +122,8 @@ def fit_s2r(
         pose_real (n, 6) [mm, deg]: measured poses in the base frame.
         seed: seed of all random draws.
         config: training settings.
-
-    Raises:
-        FitError: another number of measured poses, too few to hold some out, or one that is not finite.
     """
     n = len(simulated.pose)
-    if np.shape(pose_real) != (n, 6):
-        raise FitError(f"sim-to-real: got {np.shape(pose_real)} measured poses, expected {(n, 6)}")
-    if (missing := np.flatnonzero(~np.isfinite(pose_real).all(axis=1))).size:
-        raise FitError(f"sim-to-real: measured pose {missing[0]}: got nan, expected finite numbers")
     arrays = (simulated.pose, simulated.spring_m, pose_real)
     pose_sim, spring_m, pose_real = (np.asarray(a, np.float64) for a in arrays)
     held_out = held_out_blocks(n, block=block_rows(n), seed=seed)

@@ -41,7 +41,6 @@ def fit_springs(
     sensor: Sensor,
     fit_compensation: bool = False,
     shared: bool = False,
-    block: int = 100,
     seed: int = 0,
 ) -> SpringFit:
     """Calibrate springs from readings and the lengths that were measured at them.
@@ -52,7 +51,7 @@ def fit_springs(
         sensor: sensor that gave the readings; its beta and delta are not used.
         fit_compensation: fit I_comp, too, one for all springs; coils only.
         shared: fit one beta and delta for all springs.
-        block, seed: as in `fit_line`.
+        seed: seed that chooses which blocks of rows are held out together.
 
     Raises:
         FitError: the shapes differ, a spring has fewer than 3 rows or one reading only, or a compensation is
@@ -72,7 +71,7 @@ def fit_springs(
     else:
         raw_m, exists = sensor.raw_length(np.where(believed, readings, low))
         x = np.where(believed & exists, raw_m, np.nan)
-    line = fit_line(x, length_m, "spring", shared, block, seed, share, fit_compensation)
+    line = fit_line(x, length_m, shared, seed, share, fit_compensation)
     low_h, high_h = (unit_h * bound for bound in line.share_interval)
     warnings = _compensation_warnings(0.5 * (high_h - low_h), unit_h) if fit_compensation else ()
     return SpringFit(

@@ -73,23 +73,18 @@ def fit_damping(stretches: Sequence[Stretch], spec: ArmSpec, seed: int = 0) -> D
     """Fit the damping of chambers and backbone to the motion of an arm.
 
     Args:
-        stretches: parts of logs from `find_stretches`.
+        stretches: parts of logs from `find_stretches`, one or more.
         spec: arm, its chambers already calibrated.
         seed: seed that chooses the held-out seconds.
 
     Raises:
-        FitError: the specified damping is zero, or there is no stretch.
+        FitError: the specified damping is zero.
     """
     if not (spec.chambers.damping_ns_per_m > 0 and spec.backbone.bending_damping_nms_per_rad > 0):
         raise FitError(
             f"damping: got chambers.damping_ns_per_m {spec.chambers.damping_ns_per_m:g} and "
             f"backbone.bending_damping_nms_per_rad {spec.backbone.bending_damping_nms_per_rad:g}, "
             "expected both above 0"
-        )
-    if not stretches:
-        raise FitError(
-            f"damping: got no stretch of {SETTLING_S + MIN_COUNTED_S:g} s sampled every {MAX_STEP_S:g} s or "
-            "faster, expected one in which pressures change"
         )
     # Fit to the seconds that are not held out.
     n_clusters = len(_clusters(stretches, [s.tip_m for s in stretches], spec))

@@ -92,7 +92,7 @@ def template(path: str | Path) -> str:
     return schema_text(spec.n_chambers, n_sections)
 
 
-def schema_text(n_chambers: int = 9, n_markers: int = 3) -> str:
+def schema_text(n_chambers: int, n_markers: int) -> str:
     """Describe the columns that a log may have, from the schema."""
     lines = [_HELP, f"{'columns':<30} {'units':<26} plausible"]
     groups: dict[tuple[str, str], list[Column]] = {}

@@ -35,7 +35,6 @@ def measure(logs: Sequence[Log], spec: ArmSpec) -> Measurements:
 
     Raises:
         LogError: the logs are of different arms.
-        FitError: a log has another number of chambers.
     """
     for first, other in itertools.combinations(logs, 2):
         file = f"{first.source} and {other.source}"

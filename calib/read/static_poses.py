@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calib.errors import FitError
 from mjx_softarm.logs.rest import HOLD_KPA, NEEDED, holds, last_second, moves
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.sensing.pose import rotation_from_quaternion
@@ -61,7 +60,6 @@ def find_static_poses(logs: Sequence[Log], spec: ArmSpec) -> tuple[StaticPoses, 
         The poses, and the number of rows by use. A log with readings gives no spring lengths, but readings.
 
     Raises:
-        FitError: a log has no pressures or tip poses, or another number of chambers.
         LogError: a log has readings of another kind of sensor.
     """
     n_markers = max((log.marker_m.shape[1] for log in logs if log.marker_m is not None), default=0)
@@ -86,14 +84,13 @@ def find_static_poses(logs: Sequence[Log], spec: ArmSpec) -> tuple[StaticPoses, 
 
 def _static_poses_of(log: Log, spec: ArmSpec, n_markers: int, row_uses: dict[str, int]) -> list[tuple]:
     """Return the fields of each pose of a log, its rows of readings last; count the rows by use."""
-    _check(log, spec)
     # Leave out rows that are not finite.
     payload = np.full(len(log), spec.mass.payload_kg) if log.payload_kg is None else log.payload_kg
     columns = [value for name in NEEDED if (value := getattr(log, name)) is not None]
     finite = np.all(np.isfinite(np.column_stack(columns)), axis=1)
     row_uses["not finite"] += int(np.count_nonzero(~finite))
     log, payload = log.take(finite), payload[finite]
-    assert log.pressure_kpa is not None and log.tip_m is not None  # else `_check` raises
+    assert log.pressure_kpa is not None and log.tip_m is not None  # as `POSE_COLUMNS` asks
     # Fill what the log does not have.
     unknown = np.full((len(log), spec.n_chambers), np.nan)
     readings = log.readings_of(spec.sensor)
@@ -127,13 +124,3 @@ def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
     left, _, right = np.linalg.svd(matrix)
     left[..., :, 2] *= np.linalg.det(left @ right)[..., None]
     return left @ right
-
-
-def _check(log: Log, spec: ArmSpec) -> None:
-    for name in POSE_COLUMNS:
-        if getattr(log, name) is None:
-            raise FitError(f"{log.source}: {name}: got no such columns, expected pressures and tip poses")
-    for name in ("pressure_kpa", "spring_m", "readings"):
-        value = getattr(log, name)
-        if value is not None and value.shape[1] != spec.n_chambers:
-            raise FitError(f"{log.source}: {name}: got {value.shape[1]} columns, expected {spec.n_chambers}")

@@ -121,21 +121,6 @@ class MovingArm(NamedTuple):
         return cls(model, kinematics, params, own)
 
 
-class _Instant(NamedTuple):
-    """Geometry of the arm at joint coordinates."""
-
-    frames: Frames
-    tendons: Tendons  # of chambers and springs, leaves (2, ...)
-
-    @property
-    def chamber_m(self) -> Array:
-        return self.tendons.length[0]
-
-    @property
-    def spring_m(self) -> Array:
-        return self.tendons.length[1]
-
-
 def advance(
     arm: MovingArm,
     motion: Motion,
@@ -167,9 +152,10 @@ def advance(
 
     def tick(motion: Motion, _):
         """Run one control period: observe, let the law command pressures, take the time steps."""
-        now = _at(arm, motion.q)
-        seen = Path(now.spring_m, now.frames.plate_position, now.frames.plate_rotation)
-        command, law = control.pressures(reference_m, now.spring_m, motion.law, gains, period_s)
+        frames, lines = _at(arm, motion.q)
+        spring_m = lines.length[1]
+        seen = Path(spring_m, frames.plate_position, frames.plate_rotation)
+        command, law = control.pressures(reference_m, spring_m, motion.law, gains, period_s)
         motion = motion._replace(law=law)
         for k in range(n_steps):
             motion = _step(arm, motion, command, k, period_s / n_steps)
@@ -178,29 +164,28 @@ def advance(
     with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
         tick = jax.checkpoint(tick, prevent_cse=False)  # a gradient recomputes each tick to save memory
         end, path = jax.lax.scan(tick, motion, None, length=round(duration_s / period_s))
-        now = _at(arm, end.q)
+        frames, lines = _at(arm, end.q)
+        spring_m = lines.length[1]
 
     # Result: finite numbers, of an arm that has not diverged
     finite = jnp.all(jnp.isfinite(end.q)) & jnp.all(jnp.isfinite(end.velocity))
     finite &= jnp.all(jnp.isfinite(end.pressure_kpa))
-    result = jnp.where(
-        jnp.all(now.spring_m < LONGEST_M), MotionResult.FINITE.value, MotionResult.DIVERGED.value
-    )
+    result = jnp.where(jnp.all(spring_m < LONGEST_M), MotionResult.FINITE.value, MotionResult.DIVERGED.value)
     result = jnp.where(finite, result, MotionResult.NOT_FINITE.value)
     return end, MotionEnd(
         pressure_kpa=end.pressure_kpa,
-        spring_m=now.spring_m,
-        tip_position_m=now.frames.plate_position[-1],
-        tip_rotation=now.frames.plate_rotation[-1],
+        spring_m=spring_m,
+        tip_position_m=frames.plate_position[-1],
+        tip_rotation=frames.plate_rotation[-1],
         path=path,
         result=result.astype(jnp.int32),
     )
 
 
-def _at(arm: MovingArm, q: Array) -> _Instant:
-    """Return the geometry at joint coordinates (nv,)."""
+def _at(arm: MovingArm, q: Array) -> tuple[Frames, Tendons]:
+    """Return the frames at joint coordinates (nv,), and both kinds of tendons as `all_tendons` does."""
     frames = arm.kinematics(q)
-    return _Instant(frames, all_tendons(frames, arm.params))
+    return frames, all_tendons(frames, arm.params)
 
 
 def _step(arm: MovingArm, motion: Motion, command_kpa: Array, k: int, h: float) -> Motion:
@@ -209,14 +194,14 @@ def _step(arm: MovingArm, motion: Motion, command_kpa: Array, k: int, h: float) 
     v, params = motion.velocity, arm.params
     half_way = 0.5 * h * v  # (nv,)
     middle = motion._replace(q=motion.q + half_way)
-    now = _at(arm, middle.q)
-    jacobian = now.tendons.jacobian  # (2, n_sections, 3, n)
+    frames, lines = _at(arm, middle.q)
+    jacobian = lines.jacobian  # (2, n_sections, 3, n)
 
     def volume_m3(displacement: Array) -> Array:
         """Return the chambers' volumes (n_chambers,) at joint displacements (nv,) from the middle."""
         along = products(jacobian[0], displacement.reshape(params.n_sections, -1, 1)).reshape(-1)
         area = params.area / N_PER_KPA_M2, params.area_slope / N_PER_KPA_M2
-        return pneumatics.volume_m3(now.chamber_m + along, *area, params.section_length_m)
+        return pneumatics.volume_m3(lines.length[0] + along, *area, params.section_length_m)
 
     def fill(gas_m3: Array, volume: Array, half: int) -> Array:
         """Return the gas (n_chambers,) after a half step, counted from the start of the control period."""
@@ -232,8 +217,8 @@ def _step(arm: MovingArm, motion: Motion, command_kpa: Array, k: int, h: float) 
     pressure_kpa = pneumatics.pressure_of(gas_m3, middle_m3)
 
     # Forces in the middle and their derivatives
-    mass, bias = jax.lax.stop_gradient(_inertia(arm.model, now.frames, params, middle))
-    potential = statics_of(now.tendons, now.frames, middle.q, pressure_kpa, params)
+    mass, bias = jax.lax.stop_gradient(_inertia(arm.model, frames, params, middle))
+    potential = statics_of(lines, frames, middle.q, pressure_kpa, params)
     damping, stiffness = _dampers(arm, jacobian, v), potential.hessian.dense()
     # Stiffness of each closed chamber's gas (n_chambers,) [N/m], area^2 dp/dV
     gas = pneumatics.ATMOSPHERE_KPA / N_PER_KPA_M2 * gas_m3 * (potential.area / middle_m3) ** 2

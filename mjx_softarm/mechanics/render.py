@@ -1,7 +1,7 @@
 """Pictures of the arm: MuJoCo's renderer without a display, joint coordinates -> RGB.
 
     with Renderer(build_model(spec)) as renderer:
-        write_png("arm.png", renderer.draw(q))
+        Image.fromarray(renderer.draw(q)).save("arm.png")
 
 Drawing off screen needs EGL (a GPU, or Mesa on the CPU) or OSMesa (Mesa on the CPU). The environment
 variable `MUJOCO_GL` chooses one; while it is unset, EGL and OSMesa are tried in this order.
@@ -17,12 +17,10 @@ import re
 import subprocess
 import sys
 from dataclasses import dataclass
-from pathlib import Path
 
 import mujoco
 import numpy as np
 from mujoco.rendering.classic import gl_context
-from PIL import Image
 
 from mjx_softarm._support.errors import InputError
 
@@ -125,15 +123,6 @@ class Renderer:
         half_angle = np.radians(self._model.vis.global_.fovy) / 2
         view.distance = camera.height * self._arm_length_m / (2 * np.tan(half_angle))
         return view
-
-
-def write_png(path: str | Path, image: np.ndarray) -> None:
-    """Write an RGB image (height, width, 3) uint8 as PNG."""
-    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
-        raise ValueError(
-            f"image: got {image.dtype} of shape {image.shape}, expected uint8 of (height, width, 3)"
-        )
-    Image.fromarray(image).save(path, "PNG")
 
 
 def _open_renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Renderer:

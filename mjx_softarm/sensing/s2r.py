@@ -147,12 +147,12 @@ def save_s2r(path: str | Path, s2r: S2R) -> None:
             written. A file that was there before is then still there.
     """
     arrays = entries_of(KIND, s2r)
-    _unpack(arrays, str(path))
+    _unpack(arrays, str(path), len(s2r.input_low) - N_POSE_INPUTS)
     write_sealed(Path(path), arrays, KIND)
 
 
-def load_s2r(path: str | Path, n_springs: int | None = None) -> S2R:
-    """Read a network and check all of it; `n_springs` of None accepts any arm.
+def load_s2r(path: str | Path, n_springs: int) -> S2R:
+    """Read a network for an arm of n springs, and check all of it.
 
     Raises:
         SealedFileError: the file cannot be read, is incomplete, damaged, of another kind, or an entry is
@@ -161,15 +161,13 @@ def load_s2r(path: str | Path, n_springs: int | None = None) -> S2R:
     return _unpack(read_sealed(Path(path), KIND, "python -m calib run"), str(path), n_springs)
 
 
-def take_s2r(entries: Entries, name: str, n_springs: int | None = None) -> S2R:
-    """Take the network `name` from the entries of a file, checked; `n_springs` of None accepts any arm.
+def take_s2r(entries: Entries, name: str, n_springs: int) -> S2R:
+    """Take the network `name` for an arm of n springs from the entries of a file, checked.
 
     Raises:
         SealedFileError: an entry is missing, or of the wrong type, shape or range.
     """
-    n_inputs = None if n_springs is None else N_POSE_INPUTS + n_springs
-    low = entries.take(f"{name}.input_low", np.float32, (n_inputs,))
-    n_in, n_out = len(low), N_POSE_OUTPUTS
+    n_in, n_out = N_POSE_INPUTS + n_springs, N_POSE_OUTPUTS
     shapes: dict = dict.fromkeys(("input_low", "input_high"), (n_in,))
     shapes |= dict.fromkeys(("output_low", "output_high"), (n_out,))
     shapes |= {"anchors": (None, n_in), "limit": ()}
@@ -184,7 +182,7 @@ def take_s2r(entries: Entries, name: str, n_springs: int | None = None) -> S2R:
     return s2r
 
 
-def _unpack(arrays: dict[str, np.ndarray], source: str, n_springs: int | None = None) -> S2R:
+def _unpack(arrays: dict[str, np.ndarray], source: str, n_springs: int) -> S2R:
     entries = Entries(arrays, source)
     s2r = take_s2r(entries, KIND, n_springs)
     entries.finish(1)

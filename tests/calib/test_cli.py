@@ -55,7 +55,7 @@ def test_run_writes_the_whole_folder_and_nothing_beside_it(calibrated):
     assert [p.name for p in folder.parent.iterdir()] == ["out"]
     report = json.loads((folder / "report.json").read_text())
     assert status == (0 if report["trustworthy"] else 1)
-    load_s2r(folder / "s2r.npz")
+    load_s2r(folder / "s2r.npz", 9)
 
 
 def test_springs_are_the_planted_ones(calibrated):
@@ -112,7 +112,7 @@ def test_training_takes_the_folder(calibrated, trained_env, tmp_path):
 
     env, opened = trained_env(calibrated[1]), Run.open(tmp_path / "run")
     assert env.spec == opened.spec == ArmSpec.from_toml(calibrated[1] / "arm.toml")
-    network = load_s2r(calibrated[1] / "s2r.npz")
+    network = load_s2r(calibrated[1] / "s2r.npz", 9)
     for s2r in (env.s2r, opened.s2r):
         np.testing.assert_array_equal(s2r.anchors, network.anchors)
     plain = type(env)(env.spec, env.config)

@@ -135,7 +135,6 @@ def test_file_gives_the_network_back(tmp_path):
     for name in ("a.npz", "b.npz"):
         save_s2r(tmp_path / name, net)
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
-    jax.tree.map(np.testing.assert_array_equal, load_s2r(tmp_path / "a.npz"), net)
     jax.tree.map(np.testing.assert_array_equal, load_s2r(tmp_path / "a.npz", N_IN - 9), net)
     with pytest.raises(SealedFileError, match=rf"s2r.input_low: got float32 \({N_IN},\), expected"):
         load_s2r(tmp_path / "a.npz", N_IN - 12)
@@ -156,7 +155,7 @@ def test_bad_entries_are_named(tmp_path, entry, value, message):
     path = tmp_path / "s2r.npz"
     write_sealed(path, entries_of("s2r", network()) | {entry: value}, module.KIND)
     with pytest.raises(SealedFileError, match=message):
-        load_s2r(path)
+        load_s2r(path, N_IN - 9)
 
 
 def test_a_base_that_is_askew_moves_each_plate_by_its_share_of_the_tip_s_way():

@@ -43,8 +43,8 @@ from mjx_softarm._support.mjx import State
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.env.vector import VectorEnv, over_arms
 from mjx_softarm.mdp import rewards
-from train.agent.learner import Explored, Learner, LearnerConfig, Sample, check_same_shapes, check_settings
-from train.agent.networks import Actor, mode, widened
+from train.agent.learner import Explored, Learner, LearnerConfig, Sample, check_settings
+from train.agent.networks import Actor, check_same_shapes, mode, widened
 
 Params = Any  # a flax parameter tree
 EARLY = (

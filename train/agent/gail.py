@@ -109,7 +109,7 @@ class Gail:
             logits = functools.partial(self.network.apply, params)
             on_expert, on_agent = logits(*expert), logits(*agent)
             entropy = cross_entropy(on_expert, on_agent)
-            penalty = self.penalty(logits, *between)
+            penalty = gradient_penalty(logits, *between)
             accuracy = 0.5 * (jnp.mean(on_expert > 0.0) + jnp.mean(on_agent < 0.0))
             metrics = {"discriminator_loss": entropy, "gradient_penalty": penalty, "accuracy": accuracy}
             return entropy + self.config.gradient_penalty * penalty, metrics
@@ -117,10 +117,6 @@ class Gail:
         grads, metrics = jax.grad(loss, has_aux=True)(state.params)
         updates, opt_state = self.optimizer.update(grads, state.opt_state, state.params)
         return DiscriminatorState(optax.apply_updates(state.params, updates), opt_state), metrics
-
-    def penalty(self, logits: Logits, obs: Array, action: Array) -> Array:
-        """Return the gradient penalty at points (B, O), (B, A)."""
-        return gradient_penalty(logits, obs, action)
 
     def _scaled(self, obs: Array, action: Array) -> tuple[Array, Array]:
         return self.config.input_scale * obs, self.config.input_scale * action

@@ -20,7 +20,7 @@ from jax import Array
 from mjx_softarm._support import draws
 from mjx_softarm.mdp import observation as obs
 from mjx_softarm.mdp import rewards
-from train.agent.learner import Experience, Transition
+from train.agent.learner import Experience, Transition, check_settings
 
 
 @dataclass(frozen=True)
@@ -37,21 +37,20 @@ class HindsightConfig:
     mm_per_deg: float = 1.0  # distance that goes with a turn of one degree of a near goal
     exchange_actions: bool = True  # relabelled, a saturated action becomes the sensed one
 
-    def __post_init__(self):
-        if min(self.reached_share, self.near_share) < 0 or self.reached_share + self.near_share > 1:
-            raise ValueError(
-                f"learner.hindsight.reached_share, near_share: got {self.reached_share}, {self.near_share}, "
-                "expected numbers >= 0 that add up to 1 at most"
-            )
-        if not 0 < self.near_min_mm <= self.near_max_mm:
-            raise ValueError(
-                f"learner.hindsight.near_min_mm, near_max_mm: got {self.near_min_mm}, {self.near_max_mm}, "
-                "expected 0 < near_min_mm <= near_max_mm"
-            )
-        if self.n_later < 0:
-            raise ValueError(f"learner.hindsight.n_later: got {self.n_later}, expected at least 0")
-        if self.mm_per_deg <= 0:
-            raise ValueError(f"learner.hindsight.mm_per_deg: got {self.mm_per_deg}, expected > 0")
+    def __post_init__(self) -> None:
+        total = self.reached_share + self.near_share
+        required = {
+            "reached_share": (self.reached_share >= 0, "a number >= 0"),
+            "near_share": (
+                self.near_share >= 0 and total <= 1,
+                "a number >= 0, at most 1 - reached_share",
+            ),
+            "n_later": (self.n_later >= 0, "at least 0"),
+            "near_min_mm": (self.near_min_mm > 0, "a number > 0"),
+            "near_max_mm": (self.near_max_mm >= self.near_min_mm, "near_min_mm or more"),
+            "mm_per_deg": (self.mm_per_deg > 0, "a number > 0"),
+        }
+        check_settings("learner.hindsight", self, required)
 
 
 def relabel(

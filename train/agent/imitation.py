@@ -33,17 +33,9 @@ from mjx_softarm._support import draws
 from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.mdp import observation, rewards
 from train.agent.gail import DiscriminatorState, Gail, GailConfig
-from train.agent.hindsight_tqc import HindsightTQC
-from train.agent.learner import (
-    Experience,
-    Explored,
-    Learner,
-    Sample,
-    Transition,
-    check_same_shapes,
-    check_settings,
-)
-from train.agent.tqc import TQCConfig
+from train.agent.learner import Experience, Explored, Learner, Sample, Transition, check_settings
+from train.agent.networks import check_same_shapes
+from train.agent.tqc import HindsightTQC, TQCConfig
 from train.demos.demonstrations import Demonstrations
 
 

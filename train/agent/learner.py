@@ -17,7 +17,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple, Protocol
 
-import jax
 from jax import Array
 
 from mjx_softarm.env import EnvConfig
@@ -206,10 +205,3 @@ class Learner(Protocol):
             ValueError: a part is missing, has another size, or cannot be taken.
         """
         raise ValueError(f"got a donor of {', '.join(parts)}, expected none for this learner")
-
-
-def check_same_shapes(name: str, given: Any, own: Any) -> None:
-    """Raise ValueError where a donor's tree of arrays has other shapes than a run's own."""
-    got, expected = ([leaf.shape for leaf in jax.tree.leaves(tree)] for tree in (given, own))
-    if got != expected:
-        raise ValueError(f"{name}: got layers of {got}, expected {expected} as in the new run")

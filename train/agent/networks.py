@@ -6,7 +6,6 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from mjx_softarm._support import draws
 from mjx_softarm.mdp.observation import OBS_SIZE
 
 LOG_STD_MIN = -20.0
@@ -55,6 +54,13 @@ def widened(params: Any, obs_size: int) -> Any:
     unseen = max(0, obs_size - OBS_SIZE) if len(first["kernel"]) == OBS_SIZE else 0
     first["kernel"] = jnp.pad(first["kernel"], ((0, unseen), (0, 0)))
     return params
+
+
+def check_same_shapes(name: str, given: Any, own: Any) -> None:
+    """Raise ValueError where a donor's tree of arrays has other shapes than a run's own."""
+    got, expected = ([leaf.shape for leaf in jax.tree.leaves(tree)] for tree in (given, own))
+    if got != expected:
+        raise ValueError(f"{name}: got layers of {got}, expected {expected} as in the new run")
 
 
 class Critics(nn.Module):
@@ -123,11 +129,6 @@ def squash(mean: jax.Array, log_std: jax.Array, noise: jax.Array) -> tuple[jax.A
     log_gaussian = -0.5 * jnp.square(noise) - log_std - 0.5 * jnp.log(2.0 * jnp.pi)  # (..., A)
     log_jacobian = 2.0 * (jnp.log(2.0) - pre_squash - jax.nn.softplus(-2.0 * pre_squash))  # (..., A)
     return jnp.tanh(pre_squash), jnp.sum(log_gaussian - log_jacobian, axis=-1)
-
-
-def sample_action(mean: jax.Array, log_std: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Draw an action (..., A) in (-1, 1) and its log-density (...); see `squash`."""
-    return squash(mean, log_std, draws.normal(key, mean.shape))
 
 
 def mode(mean: jax.Array) -> jax.Array:

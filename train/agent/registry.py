@@ -12,10 +12,9 @@ from jax.sharding import Mesh
 
 from mjx_softarm.env import ReachEnv
 from train.agent.analytic import Analytic, AnalyticConfig
-from train.agent.hindsight_tqc import HindsightTQC
 from train.agent.imitation import Imitation, ImitationConfig
 from train.agent.learner import Learner, LearnerConfig
-from train.agent.tqc import TQCConfig
+from train.agent.tqc import HindsightTQC, TQCConfig
 from train.demos.demonstrations import Demonstrations
 
 

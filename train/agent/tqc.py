@@ -1,8 +1,8 @@
 """Truncated quantile critics: an off-policy actor-critic with a learned temperature.
 
 Kuznetsov et al. 2020, arXiv:2005.04269, on top of soft actor-critic, Haarnoja et al. 2018, arXiv:1812.05905.
-`TQC` joins the losses to networks and optimisers. Nothing here is jitted: wrap the outermost function,
-such as a scan of updates, and donate the state.
+`TQC` joins the losses to networks and optimisers; `HindsightTQC` updates them on relabelled batches of the
+replay. Nothing here is jitted: wrap the outermost function, such as a scan of updates, and donate the state.
 
 Shapes: B batch, O observation, A action, C critics, M quantiles per critic, K kept target quantiles.
 """
@@ -20,14 +20,21 @@ import optax
 from jax import Array
 
 from mjx_softarm._support import draws
-from train.agent.hindsight import HindsightConfig
-from train.agent.learner import ReplayConfig, Transition, check_same_shapes, check_settings
+from mjx_softarm.env import ReachEnv
+from train.agent.hindsight import HindsightConfig, relabel
+from train.agent.learner import (
+    Experience,
+    Explored,
+    Learner,
+    ReplayConfig,
+    Sample,
+    Transition,
+    check_settings,
+)
 from train.agent.losses import actor_loss, alpha_loss, quantile_huber_loss, truncated_targets
-from train.agent.networks import Actor, Critics, mode, sample_action, squash, widened
+from train.agent.networks import Actor, Critics, check_same_shapes, mode, squash, widened
 
 Params = Any  # a flax parameter tree
-
-
 GIVEN_LOG_STD = -4.0  # initial exploration noise of a pretrained actor: log standard deviation before tanh
 
 
@@ -125,11 +132,7 @@ class TQC:
         return {"policy": state.mean_actor_params, **networks}
 
     def adopt(self, state: TQCState, parts: Mapping[str, Params]) -> TQCState:
-        """Return the state with another run's networks and temperature; the optimisers begin anew.
-
-        Raises:
-            ValueError: there are no critics, or networks of another size.
-        """
+        """Return the state with another run's networks and temperature; the optimisers begin anew."""
         if "critics" not in parts:
             raise ValueError("got a policy without critics, expected a run of TQC")
         given = {"mean_actor_params": parts["policy"], **{f: parts[n] for n, f in _NETWORKS.items()}}
@@ -137,11 +140,7 @@ class TQC:
         return state._replace(**given)
 
     def adopt_policy(self, state: TQCState, given: Params) -> TQCState:
-        """Return the state with a given actor's means, which may observe less; it explores little at first.
-
-        Raises:
-            ValueError: the actor has layers of another size.
-        """
+        """Return the state with a given actor's means and little exploration; it may observe less."""
         actor = widened(given, self.obs_size)
         head = actor["params"]["head"]
         head["kernel"] = head["kernel"].at[:, self.action_size :].set(0.0)
@@ -151,7 +150,8 @@ class TQC:
 
     def act(self, state: TQCState, obs: Array, key: Array) -> Array:
         """Sample an action (..., A) in (-1, 1) at obs (..., O)."""
-        return sample_action(*self.actor.apply(state.actor_params, obs), key=key)[0]
+        mean, log_std = self.actor.apply(state.actor_params, obs)
+        return squash(mean, log_std, draws.normal(key, mean.shape))[0]
 
     def policy(self, state: TQCState) -> Params:
         """Return the parameters of the mean actor."""
@@ -232,6 +232,55 @@ class TQC:
             expected = (n, *sizes.get(name, ()))
             if value.shape != expected:
                 raise ValueError(f"Transition.{name}: got shape {value.shape}, expected {expected}")
+
+
+class HindsightTQC(Learner):
+    """`Learner` whose update has two parts, between which a wrapper can change the batch."""
+
+    def __init__(self, config: TQCConfig, env: ReachEnv):
+        self.config, self.env = config, env
+        self.tqc = tqc = TQC(env.observation_size, env.action_size, config)
+        self.init, self.policy, self.mode, self.parts = tqc.init, tqc.policy, tqc.mode, tqc.parts
+
+    def act(self, state: TQCState, obs: Array, key: Array) -> Explored:
+        """Sample actions (..., A) in (-1, 1) at obs (..., O)."""
+        return Explored(self.tqc.act(state, obs, key))
+
+    def adopt(self, state: TQCState, parts: Mapping[str, Any]) -> TQCState:
+        """Return the state with another run's networks and temperature.
+
+        A run in motion takes the policy alone, of a run at rest or in motion and of any learner. Entries of
+        the observation that the other policy lacks have no weight at first, and the critics begin anew.
+
+        Raises:
+            ValueError: the other run has no such networks, or networks of another size.
+        """
+        if self.env.config.moves:
+            return self.tqc.adopt_policy(state, parts["policy"])
+        return self.tqc.adopt(state, parts)
+
+    def update(self, state: TQCState, sample: Sample, key: Array) -> tuple[TQCState, dict[str, Array]]:
+        """Take one gradient step of all networks on one relabelled batch."""
+        key_sample, key_relabel, key_update = jax.random.split(key, 3)
+        batch, _ = self.transitions(sample(key_sample, self.config.hindsight.n_later), key_relabel)
+        return self.learn(state, batch, key_update)
+
+    def transitions(self, stored: Experience, key: Array) -> tuple[Transition, Array]:
+        """Relabel a batch of B stored transitions; also return which of them (B,) have another goal."""
+        return relabel(
+            stored,
+            key,
+            self.config.hindsight,
+            self.env.scale,
+            self.env.config.reward,
+            goal_ends=self.env.config.goal_ends,
+            senses_action=self.env.config.observation == "motion",
+        )
+
+    def learn(self, state: TQCState, batch: Transition, key: Array) -> tuple[TQCState, dict[str, Array]]:
+        """Take one gradient step on a batch; the metrics are those of `TQC.update`."""
+        state, metrics = self.tqc.update(state, batch, key)
+        return state, {f"tqc/{name}": x for name, x in metrics.items()}
 
 
 def _learning_rate(config: TQCConfig) -> float | optax.Schedule:

@@ -32,13 +32,6 @@ class Waypoint(NamedTuple):
     turn: tuple[float, float, float] = FREE  # 1 for each axis of the gripper whose rotation is fixed
 
 
-class WaypointTask(NamedTuple):
-    """Waypoints of one demonstration, and the pipe around the arm."""
-
-    waypoints: tuple[Waypoint, ...]
-    pipe: CrossPipe | None = None
-
-
 # Stops of a path, each with the number of moves to it; the path begins at "home".
 _PIPE300 = (("pick right", 4), ("place left", 7), ("pick bottom", 6), ("place right", 6), ("home", 4))
 _PIPE250 = (("pick left", 6), ("place bottom", 8), ("pick right", 8), ("place left", 8), ("home", 6))
@@ -46,12 +39,12 @@ _STOPS = {"pipe300": _PIPE300, "pipe250": _PIPE250}
 TASKS = ("circle16", *_STOPS)
 
 
-def task(name: str, spec: ArmSpec) -> WaypointTask:
-    """Return the task of this name, one of `TASKS`, for an arm with the gripper of `spec`."""
+def task(name: str, spec: ArmSpec) -> tuple[tuple[Waypoint, ...], CrossPipe | None]:
+    """Return the waypoints of one of `TASKS` for an arm with the gripper of `spec`, and its pipe."""
     if name == "circle16":
-        return WaypointTask(circle(16, spec))
+        return circle(16, spec), None
     pipe = CrossPipe.of_mm(PIPES_MM[name])
-    return WaypointTask(pick_and_place(pipe, _STOPS[name]), pipe)
+    return pick_and_place(pipe, _STOPS[name]), pipe
 
 
 def circle(n: int, spec: ArmSpec) -> tuple[Waypoint, ...]:

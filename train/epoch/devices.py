@@ -84,14 +84,6 @@ def is_first_process() -> bool:
     return jax.process_index() == 0
 
 
-def wait_for_all(what: str) -> None:
-    """Wait until all processes have come here."""
-    if jax.process_count() > 1:
-        multihost_utils.sync_global_devices(what)
-
-
 def any_process(value: bool) -> bool:
     """Return whether a value is true in any process."""
-    if jax.process_count() == 1:
-        return value
     return bool(np.any(multihost_utils.process_allgather(np.array(value))))

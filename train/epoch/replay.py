@@ -31,12 +31,7 @@ def create(example_item: Items, capacity: int) -> Ring:
     Args:
         example_item: pytree of one item (arrays or `jax.ShapeDtypeStruct`): structure, shapes and dtypes.
         capacity: number of slots N.
-
-    Raises:
-        ValueError: `capacity` is not positive.
     """
-    if capacity < 1:
-        raise ValueError(f"Replay capacity: got {capacity}, expected at least 1")
     item = jax.eval_shape(lambda x: x, example_item)
     data = jax.tree.map(lambda leaf: jnp.zeros((capacity, *leaf.shape), leaf.dtype), item)
     return Ring(data, position=jnp.zeros((), jnp.int32), size=jnp.zeros((), jnp.int32))
@@ -56,20 +51,14 @@ def finite_rows(items: Items) -> Array:
 
 
 def add(replay: Ring, items: Items, valid: Array) -> Ring:
-    """Append the valid rows in order, over the oldest ones once the ring is full.
+    """Return the ring with the valid rows appended in order, over the oldest ones once it is full.
 
     Args:
         replay: ring of N slots.
         items: pytree of leaves (B, ...), structured as the ring's, with B <= N.
         valid (B,) bool: rows to keep; the others never enter, and take no slot.
-
-    Returns:
-        The ring with the valid rows.
-
-    Raises:
-        ValueError: structure, shape or dtype of `items` or `valid` does not fit the ring, or B > N.
     """
-    capacity = _check(replay, items, valid)
+    capacity = _capacity(replay)
     # Each valid row takes the slot after the previous one's; an invalid row's slot lies outside the ring,
     # where a scatter in mode "drop" writes nothing. B <= N makes the slots distinct.
     rank = jnp.cumsum(valid, dtype=jnp.int32) - 1  # (B,) among the valid
@@ -86,7 +75,7 @@ def add(replay: Ring, items: Items, valid: Array) -> Ring:
 def sample(replay: Ring, key: Array, batch_size: int) -> Items:
     """Draw items uniformly, with replacement, from the filled slots.
 
-    The fill is known only at run time, so an empty ring cannot raise here: it yields zeros. Fill it first.
+    The number of filled slots is known only at run time, so an empty ring does not raise: it yields zeros.
 
     Args:
         replay: ring with at least one item.
@@ -103,27 +92,26 @@ def sample(replay: Ring, key: Array, batch_size: int) -> Items:
 def sample_ahead(
     replay: Ring, key: Array, batch_size: int, stride: int, n_ahead: int
 ) -> tuple[Items, Items, Array]:
-    """Draw items as `sample` does, and beside each one an item that was added later.
+    """Draw items as `sample` does, and for each one an item that was added later.
 
     Args:
         replay: ring with at least one item.
         key: PRNG key.
         batch_size: number of items B.
         stride: number of items that are added at once.
-        n_ahead: largest number of additions between an item and the one beside it.
+        n_ahead: largest number of additions between an item and its later item.
 
     Returns:
-        Pytrees of leaves (B, ...): items, and the items beside them; the number of additions between the two,
-        (B,) from 0 to `n_ahead`. Where so many have not come yet, or an addition left rows out, the item
-        beside is an unrelated one.
+        Pytrees of leaves (B, ...): items, and later items; the number of additions between the two, (B,) from
+        0 to `n_ahead`. Where the ring does not have that later item yet, or an addition left rows out, the
+        later item is an unrelated one.
     """
     key_slot, key_ahead = jax.random.split(key)
     slot = draws.integers(key_slot, batch_size, replay.size).astype(jnp.int32)
     ahead = draws.integers(key_ahead, batch_size, jnp.asarray(n_ahead + 1)).astype(jnp.int32)
-    capacity = jax.tree.leaves(replay.data)[0].shape[0]
-    beside = (slot + ahead * stride) % capacity
+    after = (slot + ahead * stride) % _capacity(replay)
     items = jax.tree.map(lambda ring: ring[slot], replay.data)
-    later = jax.tree.map(lambda ring: ring[beside], replay.data)
+    later = jax.tree.map(lambda ring: ring[after], replay.data)
     return items, later, ahead
 
 
@@ -135,7 +123,7 @@ def thin(replay: Ring, key: Array, share: Array) -> Ring:
         key: PRNG key.
         share (): share of the filled slots to keep, 0 to 1.
     """
-    capacity = jax.tree.leaves(replay.data)[0].shape[0]
+    capacity = _capacity(replay)
     age = (jnp.arange(capacity) - replay.position) % capacity  # oldest first, once the ring is full
     filled = jnp.arange(capacity) < replay.size
     n_kept = jnp.round(share * replay.size.astype(jnp.float32)).astype(jnp.int32)
@@ -147,21 +135,5 @@ def thin(replay: Ring, key: Array, share: Array) -> Ring:
     return Ring(data, position=n_kept % capacity, size=n_kept)
 
 
-def _check(replay: Ring, items: Items, valid: Array) -> int:
-    """Check structure, shapes and dtypes of what `add` gets; return the capacity."""
-    expected_tree, got_tree = jax.tree.structure(replay.data), jax.tree.structure(items)
-    if expected_tree != got_tree:
-        raise ValueError(f"Replay items: got structure {got_tree}, expected {expected_tree}")
-    if valid.ndim != 1 or valid.dtype != jnp.bool_:
-        raise ValueError(f"Replay valid: got {valid.shape} {valid.dtype}, expected (B,) bool")
-    capacity, batch = jax.tree.leaves(replay.data)[0].shape[0], valid.shape[0]
-    if batch > capacity:
-        raise ValueError(f"Replay add: got {batch} rows, expected at most {capacity}, the capacity")
-    rings, _ = jax.tree_util.tree_flatten_with_path(replay.data)
-    for (path, ring), rows in zip(rings, jax.tree.leaves(items), strict=True):
-        if rows.shape != (batch, *ring.shape[1:]) or rows.dtype != ring.dtype:
-            name, shape = jax.tree_util.keystr(path), (batch, *ring.shape[1:])
-            raise ValueError(
-                f"Replay items{name}: got {rows.shape} {rows.dtype}, expected {shape} {ring.dtype}"
-            )
-    return capacity
+def _capacity(replay: Ring) -> int:
+    return jax.tree.leaves(replay.data)[0].shape[0]

@@ -16,7 +16,6 @@ from train.runs.estimator import Distilled, distil
 
 N_WORKSPACE = 2048  # poses that stand for the workspace
 SEED = 0  # seed of the networks and of the workspace
-ERRORS = ("tip_mm", "turn_deg", "load_kg", "spring_mm")  # fields of `Distilled` with errors
 
 
 class DistilledArm(NamedTuple):
@@ -39,8 +38,8 @@ def arm_model(spec: ArmSpec, s2r: S2R | None) -> DistilledArm:
     distilled = _distil(spec)
     networks = distilled.estimator, distilled.load_estimator, distilled.spring_model
     errors = {
-        name: {f"{kg:g} kg": error._asdict() for kg, error in getattr(distilled, name).items()}
-        for name in ERRORS
+        name: {f"{kg:g} kg": error._asdict() for kg, error in by_payload.items()}
+        for name, by_payload in distilled.errors.items()
     }
     return DistilledArm(ArmModel(_workspace(spec, s2r), *networks, s2r), errors)
 

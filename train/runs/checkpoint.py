@@ -9,6 +9,7 @@ from typing import Any, cast
 
 import jax
 import orbax.checkpoint as ocp
+from jax.experimental.multihost_utils import sync_global_devices
 
 from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.files import read_json_lines, replacing
@@ -21,7 +22,7 @@ from mjx_softarm.spec import ArmSpec
 from train.agent.registry import LEARNERS, name_of
 from train.config import TrainConfig, from_dict, to_dict
 from train.demos.demonstrations import Demonstrations, load_demonstrations
-from train.epoch.devices import is_first_process, wait_for_all
+from train.epoch.devices import is_first_process
 from train.epoch.job import TrainState
 
 N_KEPT = 2
@@ -79,7 +80,7 @@ class Run:
             raise RunError(
                 f"{path}: got a folder with a run, expected a new one; continue it with --resume {path}"
             )
-        wait_for_all(f"{path} is free")
+        sync_global_devices(f"{path} is free")
         try:
             # Write what a run begins with, over what a start that was interrupted has left.
             if is_first_process():
@@ -89,7 +90,7 @@ class Run:
                 if demonstrations is not None:
                     write_log(path / DEMONSTRATIONS_FILE, demonstrations)
                 shutil.rmtree(path / CHECKPOINTS, ignore_errors=True)
-            wait_for_all(f"{path} is begun")
+            sync_global_devices(f"{path} is begun")
             run = cls(path, config, spec, s2r)
             if first is not None:
                 run.save(0, *first)

@@ -223,8 +223,8 @@ def _train(run: Run, task: Task, console: Console) -> int:
 
 def _show(run: Run, task: Task, summary: Any, console: Console) -> None:
     _table(f"{task.title}, {N_ACTIONS} actions each", summary, console)
-    for name in task.picture_names:
-        console.print(f"picture: {run.path / name}", highlight=False, soft_wrap=True)
+    for picture in sorted(run.path.glob("*.png")):
+        console.print(f"picture: {picture}", highlight=False, soft_wrap=True)
 
 
 def _table(title: str, summary: Any, console: Console) -> None:

@@ -56,15 +56,12 @@ class Error(NamedTuple):
 
 
 class Distilled(NamedTuple):
-    """Networks with their errors on held-out equilibria, by payload [kg] on top of the specification's."""
+    """Networks with their errors on held-out equilibria."""
 
     estimator: PoseEstimator
     load_estimator: LoadEstimator
     spring_model: SpringModel
-    tip_mm: dict[float, Error]  # tip of the pose network with the true load
-    turn_deg: dict[float, Error]  # axes of the pose network with the true load
-    load_kg: dict[float, Error]  # load of arms whose chambers are off
-    spring_mm: dict[float, Error]  # spring with the largest error
+    errors: dict[str, dict[float, Error]]  # by quantity and payload [kg], see `_errors`
 
 
 def distil(spec: ArmSpec, seed: int) -> Distilled:
@@ -93,7 +90,7 @@ def distil(spec: ArmSpec, seed: int) -> Distilled:
     # Test them.
     networks = (estimator, load_estimator, springs)
     pose, load, springs = jax.tree.map(lambda x: np.asarray(x, np.float32), networks)
-    return Distilled(pose, load, springs, *_errors(pose, load, springs, spec))
+    return Distilled(pose, load, springs, _errors(pose, load, springs, spec))
 
 
 def _with_load(pool: Pool, load_kg: float) -> LoadedPool:
@@ -201,9 +198,13 @@ def _fit(
 
 def _errors(
     estimator: PoseEstimator, load_estimator: LoadEstimator, spring_model: SpringModel, spec: ArmSpec
-) -> tuple[dict[float, Error], ...]:
-    """Return errors of tip [mm], axes [deg], load [kg] and springs [mm], by payload."""
-    tip_mm, turn_deg, load_off_kg, spring_mm = {}, {}, {}, {}
+) -> dict[str, dict[float, Error]]:
+    """Return errors by payload on top of the specification's.
+
+    `tip_mm` and `turn_deg` are errors of the pose network with the true load. `load_kg` is the error of arms
+    whose chambers are off, `spring_mm` the error of each arm's worst spring.
+    """
+    found = {name: {} for name in ("tip_mm", "turn_deg", "load_kg", "spring_mm")}
     for share in PAYLOADS:
         payload_kg = share * spec.mass.largest_payload_kg
         load_kg = spec.mass.payload_kg + payload_kg
@@ -215,15 +216,15 @@ def _errors(
         guess = estimate_frame(estimator, pool.spring_m, load_kg)
         chord = np.sqrt(np.sum((guess.rotation - rotation) ** 2, axis=(-2, -1)) / 8)  # sin of half the angle
         springs = np.abs(expected_springs(spring_model, pool.pressure_kpa) - pool.spring_m)
-        tip_mm[payload_kg] = _error(1e3 * np.linalg.norm(guess.position_m - position_m, axis=-1))
-        turn_deg[payload_kg] = _error(np.degrees(2.0 * np.arcsin(np.minimum(chord, 1.0))))
-        spring_mm[payload_kg] = _error(1e3 * springs.max(axis=-1))
+        found["tip_mm"][payload_kg] = _error(1e3 * np.linalg.norm(guess.position_m - position_m, axis=-1))
+        found["turn_deg"][payload_kg] = _error(np.degrees(2.0 * np.arcsin(np.minimum(chord, 1.0))))
+        found["spring_mm"][payload_kg] = _error(1e3 * springs.max(axis=-1))
         # Estimate the load of arms whose chambers are off.
         many_kg = np.full(CANDIDATES_PER_POSE * N_HELD_OUT, load_kg)
         off = _as_measured(spec, sample_loaded(loaded, many_kg, CHAMBERS_OFF, HELD_OUT_SEED))
         estimate_kg = np.asarray(estimate_load(load_estimator, off.spring_m, off.pressure_kpa))
-        load_off_kg[payload_kg] = _error(np.abs(estimate_kg - load_kg))
-    return tip_mm, turn_deg, load_off_kg, spring_mm
+        found["load_kg"][payload_kg] = _error(np.abs(estimate_kg - load_kg))
+    return found
 
 
 def _error(values: np.ndarray) -> Error:

@@ -16,8 +16,6 @@ from train.runs.positions import AtPositions
 INK, BLUE, ORANGE, GREY = "#222222", "#1f6fb4", "#e07b28", "#9aa0a6"
 DPI = 150
 STEPS = "environment steps"
-REACH_PICTURES = ("learning_curve.png", "circle.png", "workspace_error.png")
-IMITATION_PICTURES = ("learning_curve.png", "losses.png", "positions.png")
 
 
 def save(folder: Path, pictures: dict[str, Figure]) -> None:
@@ -28,14 +26,20 @@ def save(folder: Path, pictures: dict[str, Figure]) -> None:
 
 def reach_pictures(rows: list[dict[str, Any]], workspace: Reached, circle: Reached) -> dict[str, Figure]:
     """Return the pictures of a run on the workspace, by file name."""
-    figures = (learning_curve(rows), circle_figure(circle), workspace_figure(workspace))
-    return dict(zip(REACH_PICTURES, figures, strict=True))
+    return {
+        "learning_curve.png": learning_curve(rows),
+        "circle.png": circle_figure(circle),
+        "workspace_error.png": workspace_figure(workspace),
+    }
 
 
 def imitation_pictures(rows: list[dict[str, Any]], at: AtPositions) -> dict[str, Figure]:
     """Return the pictures of a run on demonstrated poses, by file name."""
-    figures = (imitation_curve(rows), losses(rows), positions_figure(at))
-    return dict(zip(IMITATION_PICTURES, figures, strict=True))
+    return {
+        "learning_curve.png": imitation_curve(rows),
+        "losses.png": losses(rows),
+        "positions.png": positions_figure(at),
+    }
 
 
 def dress(axes: Any, title: str, x: str, y: str) -> None:

@@ -7,7 +7,7 @@ epoch.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol, cast
+from typing import NamedTuple, cast
 
 from jax.sharding import Mesh
 from matplotlib.figure import Figure
@@ -21,20 +21,8 @@ from train.demos.demonstrations import Demonstrations
 from train.epoch.goals import DemonstratedGoals
 from train.epoch.job import Job, TrainState
 from train.runs import plots
-from train.runs.evaluate import N_ACTIONS, N_GOALS, Evaluator
+from train.runs.evaluate import N_GOALS, Evaluator
 from train.runs.positions import PositionEvaluator
-
-
-class Evaluation(Protocol):
-    """An evaluation of policies on arms of one environment."""
-
-    def __call__(self, policy: Any) -> tuple[Any, ...]:
-        """Return figures, which have `to_dict` and `rows`, then results."""
-        ...
-
-    def on(self, env: ReachEnv, n_actions: int = N_ACTIONS) -> Evaluation:
-        """Return the same evaluation on another environment."""
-        ...
 
 
 class Task(NamedTuple):
@@ -42,8 +30,7 @@ class Task(NamedTuple):
 
     job: Job
     title: str  # of the table of figures
-    evaluate: Evaluation
-    picture_names: tuple[str, ...]
+    evaluate: Evaluator | PositionEvaluator
     pictures: Callable[..., dict[str, Figure]]  # rows of metrics, results -> figures by name
     headline: Callable[[dict[str, float]], str]  # row of metrics with an evaluation -> a short text
     prepare: Callable[[TrainState, int], TrainState]  # state, epoch that follows -> state
@@ -79,7 +66,6 @@ def task_of(
         job=job,
         title=f"{N_GOALS} held-out goals",
         evaluate=Evaluator(env, job.learner),
-        picture_names=plots.REACH_PICTURES,
         pictures=plots.reach_pictures,
         headline=lambda row: f"held-out median {row['evaluation/median_mm']:.1f} mm",
         prepare=lambda state, epoch: state,
@@ -112,7 +98,6 @@ def _imitation(
         job=job,
         title=f"{len(demonstrations.positions)} demonstrated positions",
         evaluate=evaluate,
-        picture_names=plots.IMITATION_PICTURES,
         pictures=plots.imitation_pictures,
         headline=lambda row: (
             f"success at {100 * row['evaluation/success_share']:.0f} % of the positions, "

@@ -27,7 +27,7 @@ def goals_of(kind, n_points=6):
     """Names, and poses whose finger tips are at the waypoints, the gripper straight down."""
     if KINDS[kind].task in ("", "circle16"):
         return [""] * n_points, circle_poses(SPEC, n_points).astype(float)
-    waypoints = task(KINDS[kind].task, SPEC).waypoints
+    waypoints = task(KINDS[kind].task, SPEC)[0]
     goal = np.zeros((len(waypoints), 6))
     goal[:, :3] = 1e3 * (np.array([point.finger_m for point in waypoints]) + [0.0, 0.0, GRIPPER_M])
     return [point.name for point in waypoints], goal

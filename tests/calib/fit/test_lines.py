@@ -31,15 +31,15 @@ def test_shared_line_is_that_of_all_columns():
 def test_says_why_not_to_trust():
     rng = np.random.default_rng(0)
     x = 1.0 + 1e-3 * rng.standard_normal((30, 1))
-    reasons = " ".join(fit_line(x, x + 1e-3 * rng.standard_normal((30, 1)), "spring").warnings)
+    reasons = " ".join(fit_line(x, x + 1e-3 * rng.standard_normal((30, 1))).warnings)
     assert "spring0: got 30 rows" in reasons and "hardly be told apart" in reasons
 
 
 def test_refuses():
     with pytest.raises(ValueError, match=r"got tables of shapes \(5, 1\) and \(4, 1\)"):
         fit_line(np.zeros((5, 1)), np.zeros((4, 1)))
-    with pytest.raises(ValueError, match="wire0: got 9 rows with a reading and a length, expected 3 or more"):
-        fit_line(np.ones((9, 1)), np.arange(9.0)[:, None], "wire")
+    with pytest.raises(ValueError, match="spring0: got 9 rows with a reading and a length, expected 3"):
+        fit_line(np.ones((9, 1)), np.arange(9.0)[:, None])
 
 
 def test_plateaus_are_held_out_across_the_range_and_extrapolation_is_said():

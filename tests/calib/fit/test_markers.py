@@ -102,9 +102,3 @@ def test_refuses_markers_that_are_not_at_the_sections_ends(arm, change, message)
     poses, _ = poses_with_markers(arm, "chamber")
     with pytest.raises(ValueError, match=message):
         section_ends(poses._replace(marker_m=change(poses.marker_m)), SPEC)
-
-
-def test_refuses_too_few_markers_for_curves(arm):
-    poses, length_m = poses_with_markers(arm, "chamber")
-    with pytest.raises(ValueError, match="got 4, expected 5 or more"):
-        marker_limits(poses._replace(marker_m=poses.marker_m[:, :4]), length_m, SPEC)

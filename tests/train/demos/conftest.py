@@ -42,7 +42,7 @@ def expert(spec, shifting_s2r):
 @pytest.fixture(scope="session")
 def waypoints(spec):
     """From home into the right container, and straight down half of the way to the bottom."""
-    picked = task("pipe300", spec).waypoints[:5]
+    picked = task("pipe300", spec)[0][:5]
     return (*picked, Waypoint("down", np.array([0.0, 0.0, -0.72]), SQUARE))
 
 

@@ -77,23 +77,6 @@ def test_sample_is_uniform_over_the_filled_slots_and_only_those():
     np.testing.assert_allclose(counts[1:], n_draws * p, atol=5 * np.sqrt(n_draws * p * (1 - p)))
 
 
-@pytest.mark.parametrize(
-    ("items", "valid", "message"),
-    [
-        (rows(range(8)), np.ones(8, bool), "got 8 rows, expected at most 7"),
-        (rows(range(5)), np.ones(4, bool), r"items.*tag: got \(5,\)"),
-        (rows(range(5)), np.ones(5, np.float32), r"valid: got \(5,\) float32"),
-        (rows(range(5))._replace(tag=jnp.zeros(5)), np.ones(5, bool), r"tag: got .*float32"),
-        ((jnp.zeros(5),), np.ones(5, bool), "got structure"),
-    ],
-)
-def test_what_does_not_fit_is_named(items, valid, message):
-    with pytest.raises(ValueError, match="got 0, expected at least 1"):
-        replay.create(EXAMPLE, 0)
-    with pytest.raises(ValueError, match=message):
-        replay.add(replay.create(EXAMPLE, CAPACITY), items, valid)
-
-
 @pytest.mark.parametrize("n_added", [6, 13], ids=["partly filled", "wrapped"])
 def test_a_thinner_ring_keeps_a_share_oldest_first(n_added):
     ring = replay.create(jnp.zeros(()), 10)

@@ -53,20 +53,20 @@ def test_tips_are_those_of_c_mujoco(distilled, pool):
         frame = estimate_frame(distilled.estimator, spring_lengths(data), 0.0)
         away_mm.append(1e3 * np.linalg.norm(frame.position_m - data.site("tip").xpos))
     assert np.median(away_mm) < 1.5 and max(away_mm) < 10.0  # 0.6 and 2.2 mm after all of the training
-    assert np.median(away_mm) == pytest.approx(distilled.tip_mm[0.0].median, rel=0.25)
+    assert np.median(away_mm) == pytest.approx(distilled.errors["tip_mm"][0.0].median, rel=0.25)
 
 
 def test_springs_of_known_pressures(distilled, pool):
     off_mm = 1e3 * np.abs(expected_springs(distilled.spring_model, pool.pressure_kpa) - pool.spring_m).max(1)
     assert np.median(off_mm) < 5.0
-    assert np.median(off_mm) == pytest.approx(distilled.spring_mm[0.0].median, rel=0.25)
+    assert np.median(off_mm) == pytest.approx(distilled.errors["spring_mm"][0.0].median, rel=0.25)
 
 
 def test_errors_are_given_by_payload(distilled):
-    for errors in (distilled.tip_mm, distilled.turn_deg, distilled.load_kg, distilled.spring_mm):
+    for errors in distilled.errors.values():
         assert tuple(errors) == PAYLOADS
         assert all(0.0 < error.median < error.p95 < error.largest for error in errors.values())
-    medians = [distilled.spring_mm[payload_kg].median for payload_kg in PAYLOADS]
+    medians = [distilled.errors["spring_mm"][payload_kg].median for payload_kg in PAYLOADS]
     assert medians == sorted(medians)
 
 
@@ -149,7 +149,7 @@ def test_lost_chambers_are_found(distilled, pool, payload_kg, share):
 
 @pytest.mark.slow
 def test_all_of_the_training_is_worth_it():
-    errors = distil(SPEC, 0).tip_mm
+    errors = distil(SPEC, 0).errors["tip_mm"]
     assert errors[0.0].median < 0.8 and errors[0.0].p95 < 1.6  # 0.5 and 1.0 without the pressure beyond
     assert errors[0.5].median < 0.7 and errors[1.0].median < 0.7
 

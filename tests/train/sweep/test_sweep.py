@@ -142,7 +142,6 @@ def ready(job, monkeypatch):
         job=None,
         title="",
         evaluate=lambda actor_params: (MadeUp(actor_params),),
-        picture_names=(),
         pictures=lambda rows: {},
         headline=None,
         prepare=None,
