@@ -112,6 +112,10 @@ class Job:
         """Return the state on the devices where the epoch expects it, after something else has touched it."""
         return state if self.sharding is None else jax.device_put(state, self.sharding)
 
+    def member(self, state: TrainState, k: int) -> TrainState:
+        """Return the state of the k-th run, of the only one; a sweep's job has several."""
+        return state
+
     def policy(self, state: TrainState) -> Any:
         """Return the parameters of the policy that is evaluated and exported."""
         return self.learner.policy(state.learner)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -46,26 +46,77 @@ def train(run: Run, task: Task, console: Console) -> Any:
         Interrupted: after Ctrl-C or a termination signal, once the state is saved.
         RunError: arms in motion diverge.
     """
-    config = run.config
-    with asked_to_stop() as asked:
-        epoch, state = _begin(run, task, console)
+
+    def begin() -> tuple[int, TrainState]:
+        console.print("compiling (cached for the next start) ...")
+        epoch, state = task.job.start(first)
         run.rewind(epoch)
-        with open_board(run, epoch) as board, shown_progress(config, epoch, console) as show:
-            while epoch < config.learner.n_epochs:
-                state, metrics = timed_epoch(task.job, task.prepare(state, epoch), config.learner, epoch)
-                row = {name: float(value) for name, value in metrics.items()}
-                epoch += 1
-                refuse_divergence(config, row["env/unsettled"])
-                stop, due = any_process(bool(asked)), config.evaluates_after(epoch)
-                if due:
-                    row |= evaluation(run, task, task.job.policy(state))
+        return epoch, state
+
+    def first() -> tuple[int, TrainState]:
+        if run.latest_epoch is None:
+            return 0, task.job.init(jax.random.PRNGKey(run.config.seed))
+        return run.restore(task.job.like())
+
+    (summary,) = train_together(task.job, [(run, task)], begin, run.path, console)
+    return summary
+
+
+def train_together(
+    job: Any,
+    members: Sequence[tuple[Run, Task]],
+    begin: Callable[[], tuple[int, TrainState]],
+    path: Path,
+    console: Console,
+) -> list[Any]:
+    """Train all members of one job to their end: a single run, or the runs of a sweep.
+
+    Args:
+        job: job of the run, or of the sweep.
+        members: runs with their tasks.
+        begin: deletes what is later than the state to begin with; returns the number of epochs done, and the
+            state after them.
+        path: folder that `--resume` continues.
+        console: shows progress.
+
+    Returns:
+        Figures of each member's final policy.
+
+    Raises:
+        Interrupted: after Ctrl-C or a termination signal, once the state is saved.
+        RunError: arms in motion diverge.
+    """
+    (first, shared), learner = members[0], job.learner
+    config, n_epochs = first.config, first.config.learner.n_epochs
+    with asked_to_stop() as asked, ExitStack() as stack:
+        epoch, state = begin()
+        if epoch:
+            console.print(f"continuing after epoch {epoch} of {n_epochs}")
+        boards = [stack.enter_context(open_board(run, epoch)) for run, _ in members]
+        show = stack.enter_context(shown_progress(config, epoch, console))
+        while epoch < n_epochs:
+            # Train an epoch. Metrics without an axis of members are the same for all.
+            state, metrics = timed_epoch(job, shared.prepare(state, epoch), config.learner, epoch)
+            rows = [
+                {name: float(x[k] if np.ndim(x) else x) for name, x in metrics.items()}
+                for k in range(len(members))
+            ]
+            epoch += 1
+            stop, due = any_process(bool(asked)), config.evaluates_after(epoch)
+            # Evaluate, record and save each member.
+            for k, ((run, task), board, row) in enumerate(zip(members, boards, rows, strict=True)):
+                refuse_divergence(run.config, row["env/unsettled"])
+                own = job.member(state, k) if due or stop else None
+                if own is not None and due:
+                    row |= evaluation(run, task, learner.policy(own.learner))
                 record(run, board, epoch, row)
-                if due or stop:
-                    run.save(epoch, state, task.job.parts(state))
-                show(epoch, _line(task, row), due)
-                if stop and epoch < config.learner.n_epochs:
-                    raise Interrupted(f"stopped after epoch {epoch}; continue with --resume {run.path}")
-    return finish(run, task, task.job.policy(state))
+                if own is not None:
+                    run.save(epoch, own, learner.parts(own.learner))
+            show(epoch, _line(rows, shared), due)
+            if stop and epoch < n_epochs:
+                raise Interrupted(f"stopped after epoch {epoch}; continue with --resume {path}")
+    states = (job.member(state, k) for k in range(len(members)))
+    return [finish(*member, learner.policy(own.learner)) for member, own in zip(members, states, strict=True)]
 
 
 def refuse_divergence(config: TrainConfig, n_unsettled: float) -> None:
@@ -76,21 +127,6 @@ def refuse_divergence(config: TrainConfig, n_unsettled: float) -> None:
             f"env.simulation_step_s: got {config.env.simulation_step_s:g}, with which {n_unsettled:.0f} of "
             f"{n_actions} actions diverged, expected a shorter time step for this arm"
         )
-
-
-def _begin(run: Run, task: Task, console: Console) -> tuple[int, TrainState]:
-    """Return the number of epochs that a run has done, and its state after them."""
-    console.print("compiling (cached for the next start) ...")
-
-    def first() -> tuple[int, TrainState]:
-        if run.latest_epoch is None:
-            return 0, task.job.init(jax.random.PRNGKey(run.config.seed))
-        return run.restore(task.job.like())
-
-    epoch, state = task.job.start(first)
-    if epoch:
-        console.print(f"continuing after epoch {epoch} of {run.config.learner.n_epochs}")
-    return epoch, state
 
 
 def finish(run: Run, task: Task, policy: Any) -> Any:
@@ -176,12 +212,19 @@ def record(run: Run, board: SummaryWriter, epoch: int, row: dict[str, float]) ->
         board.add_scalar(name, np.float32(value), done["env_steps"])
 
 
-def _line(task: Task, row: dict[str, float]) -> str:
-    text = (
-        f"{row['speed/env_steps_per_s']:.0f} env steps/s  {row['speed/updates_per_s']:.0f} updates/s  "
-        f"success {100 * row['env/reached']:.0f} % of actions"
-    )
-    return f"{text}  {task.headline(row)}" if "evaluation/median_mm" in row else text
+def _line(rows: Sequence[dict[str, float]], task: Task) -> str:
+    """Return the text of an epoch: speeds, success, and figures if the members were evaluated."""
+    n, row = len(rows), rows[0]
+    each, reached = f"{n} x " if n > 1 else "", np.mean([row["env/reached"] for row in rows])
+    env_steps, updates = row["speed/env_steps_per_s"], row["speed/updates_per_s"]
+    text = f"{each}{env_steps:.0f} env steps/s  {each}{updates:.0f} updates/s"
+    text += f"  success {100 * reached:.0f} % of actions"
+    if "evaluation/median_mm" not in row:
+        return text
+    if n == 1:
+        return f"{text}  {task.headline(row)}"
+    medians = [row["evaluation/median_mm"] for row in rows]
+    return f"{text}  held-out medians {np.min(medians):.1f} to {np.max(medians):.1f} mm"
 
 
 @contextmanager

@@ -9,12 +9,9 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 from rich.console import Console
 
 from mjx_softarm._support.provenance import provenance, write_json
@@ -24,16 +21,7 @@ from mjx_softarm.spec import ArmSpec
 from train.config import TrainConfig
 from train.epoch.job import TrainState
 from train.runs.checkpoint import Run, RunError
-from train.runs.run import (
-    Interrupted,
-    asked_to_stop,
-    evaluation,
-    finish,
-    open_board,
-    record,
-    shown_progress,
-    timed_epoch,
-)
+from train.runs.run import train_together
 from train.runs.task import Task, task_of
 from train.sweep.job import SweepJob, with_env_config
 
@@ -112,68 +100,28 @@ def train(sweep: Sweep, console: Console) -> None:
 
     Raises:
         Interrupted: after Ctrl-C or a termination signal, once the states are saved.
+        RunError: arms in motion diverge.
     """
-    # Prepare the job, and the state after the newest common epoch.
     console.print("drawing goals from the reachable workspace ...")
     run = sweep.runs[0]
     env = ReachEnv(run.spec, run.config.env, run.s2r)
-    job = SweepJob([run.config for run in sweep.runs], sweep.varied, env)
-    tasks, config, epoch = _tasks(sweep, env), run.config, sweep.epoch
-    if epoch:
-        console.print(f"continuing after epoch {epoch} of {config.learner.n_epochs}")
-    states = _start(sweep, job, epoch)
-    console.print("compiling (cached for the next start) ...")
-    with (
-        asked_to_stop() as asked,
-        ExitStack() as stack,
-        shown_progress(config, epoch, console) as show,
-    ):
-        boards = [stack.enter_context(open_board(run, epoch)) for run in sweep.runs]
-        while epoch < config.learner.n_epochs:
-            # Train an epoch; metrics without an axis of members are the same for all.
-            states, metrics = timed_epoch(job, states, config.learner, epoch)
-            rows = [
-                {name: float(x[k] if np.ndim(x) else x) for name, x in metrics.items()} for k in range(job.n)
-            ]
-            epoch += 1
-            stop, due = bool(asked), config.evaluates_after(epoch)
-            # Evaluate, record and save each member as an ordinary run.
-            for k, (run, board, row) in enumerate(zip(sweep.runs, boards, rows, strict=True)):
-                member = job.member(states, k) if due or stop else None
-                if member is not None and due:
-                    row |= evaluation(run, tasks[run.config.env], job.learner.policy(member.learner))
-                record(run, board, epoch, row)
-                if member is not None:
-                    run.save(epoch, member, job.learner.parts(member.learner))
-            show(epoch, _line(rows), due)
-            if stop and epoch < config.learner.n_epochs:
-                raise Interrupted(f"stopped after epoch {epoch}; continue with --resume {sweep.path}")
-    for k, run in enumerate(sweep.runs):
-        finish(run, tasks[run.config.env], job.learner.policy(job.member(states, k).learner))
+    job, tasks = SweepJob([run.config for run in sweep.runs], sweep.varied, env), _tasks(sweep, env)
+
+    def begin() -> tuple[int, TrainState]:
+        epoch = sweep.epoch
+        for run in sweep.runs:
+            run.rewind(epoch)
+        console.print("compiling (cached for the next start) ...")
+        if not epoch:
+            return 0, job.init()
+        like = job.member_shapes()
+        return epoch, job.together([run.restore(like)[1] for run in sweep.runs])
+
+    members = [(run, tasks[run.config.env]) for run in sweep.runs]
+    train_together(job, members, begin, sweep.path, console)
 
 
 def _tasks(sweep: Sweep, env: ReachEnv) -> dict[EnvConfig, Task]:
     """Return the tasks that evaluate the members, one for each environment."""
     configs = {run.config.env: run.config for run in sweep.runs}
     return {own: task_of(config, with_env_config(env, own)) for own, config in configs.items()}
-
-
-def _start(sweep: Sweep, job: SweepJob, epoch: int) -> TrainState:
-    """Return the state after an epoch; later checkpoints and metrics of the members are deleted."""
-    for run in sweep.runs:
-        run.rewind(epoch)
-    if not epoch:
-        return job.init()
-    like = job.member_shapes()
-    return job.together([run.restore(like)[1] for run in sweep.runs])
-
-
-def _line(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return the text of an epoch: speeds, and the range of the medians if the members were evaluated."""
-    n, row = len(rows), rows[0]
-    env_steps, updates = row["speed/env_steps_per_s"], row["speed/updates_per_s"]
-    text = f"{n} x {env_steps:.0f} env steps/s  {n} x {updates:.0f} updates/s"
-    if "evaluation/median_mm" not in row:
-        return text
-    medians = [row["evaluation/median_mm"] for row in rows]
-    return f"{text}  held-out medians {np.min(medians):.1f} to {np.max(medians):.1f} mm"

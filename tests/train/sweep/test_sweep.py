@@ -144,7 +144,7 @@ def ready(job, monkeypatch):
         evaluate=lambda actor_params: (MadeUp(actor_params),),
         pictures=lambda rows: {},
         headline=None,
-        prepare=None,
+        prepare=lambda state, epoch: state,
     )
     monkeypatch.setattr(sweep_run, "ReachEnv", lambda spec, config, s2r: job.env)
     monkeypatch.setattr(sweep_run, "SweepJob", lambda configs, varied, env: job)
