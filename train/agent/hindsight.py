@@ -40,11 +40,8 @@ class HindsightConfig:
     def __post_init__(self) -> None:
         total = self.reached_share + self.near_share
         required = {
-            "reached_share": (self.reached_share >= 0, "a number >= 0"),
-            "near_share": (
-                self.near_share >= 0 and total <= 1,
-                "a number >= 0, at most 1 - reached_share",
-            ),
+            "reached_share": (self.reached_share >= 0 and total <= 1, "0 to 1 - near_share"),
+            "near_share": (self.near_share >= 0, "a number >= 0"),
             "n_later": (self.n_later >= 0, "at least 0"),
             "near_min_mm": (self.near_min_mm > 0, "a number > 0"),
             "near_max_mm": (self.near_max_mm >= self.near_min_mm, "near_min_mm or more"),

@@ -55,7 +55,7 @@ def test_the_table_has_mean_least_and_greatest_over_the_seeds(finished):
     assert [run["env_steps"] for run in first["runs"]] == [192, 192]
     groups = learning.measure(tuple(run.path for run in finished.runs))["groups"]
     assert [group["over_seeds"] for group in groups] == [first["over_seeds"], second["over_seeds"]]
-    assert groups[1]["settings"]["tqc"]["gamma"] == 0.9 and "seed" not in groups[1]["settings"]
+    assert groups[1]["settings"]["learner"]["gamma"] == 0.9 and "seed" not in groups[1]["settings"]
 
 
 def test_further_evaluations_are_told_where_all_seeds_have_them(finished):
