@@ -1,13 +1,11 @@
 """Poses to record next: first poses that tell a calibration's unknown directions, then poses far from others.
 
-The parameters x are those of `calib.fit.parameters`. J holds the derivatives of tip, rotation, springs and,
-if the calibration had them, markers by x, over the scales of their errors. The covariance of x is the inverse
-of the prior's precision plus the sum of J^T J over the poses. Poses are chosen one by one among candidates:
-each time the pose that reduces the sum of the variances most, in units of the tolerances. Candidates have
-pressures at random, at the extremes, or equal within each section: a long straight arm and a short one tell a
-shift of the base from its tilt. At least half of the poses, and all once every direction is expected to be
-known, are drawn as in k-means++: by the square of the distance to the nearest pose, times the error of the
-sim-to-real network there.
+The parameters x are those of `calib.fit.parameters`. J holds the derivatives of all measurements by x, over
+the scales of their errors. The covariance of x is the inverse of the prior's precision plus the sum of J^T J
+over the poses. Poses are chosen one by one among candidates, each time the pose that reduces the sum of the
+variances most, in units of the tolerances. At least half of the poses, and all once every direction is
+expected to be known, are drawn as in k-means++: by the square of the distance to the nearest pose, times the
+error of the sim-to-real network there.
 
 Source: Fedorov, "Theory of Optimal Experiments", 1972 (A-optimal design); Arthur, Vassilvitskii, "k-means++",
 SODA 2007.
@@ -169,7 +167,11 @@ def choose_far(
 
 
 def _candidates(spec: ArmSpec, n: int, rng: np.random.Generator) -> np.ndarray:
-    """Draw pressures (m, n_chambers) at which the arm settles: random, extreme, equal within sections."""
+    """Draw pressures (m, n_chambers) at which the arm settles: random, extreme, equal within sections.
+
+    With equal pressures a section is straight; long and short straight arms tell a shift of the base from a
+    tilt.
+    """
     third = -(-n // 3)
     extremes = rng.choice(pressure_levels(spec), (third, spec.n_chambers))
     of_section = random_pressures(spec, third, rng)[:, ::N_CHAMBERS_PER_SECTION]

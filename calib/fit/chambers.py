@@ -6,8 +6,7 @@ Jacobian comes from the implicit function theorem (`calib.fit.equilibrium`). Err
 scale of their own, as the model fits straight arms better. A first fit leaves out some poses, which judge it;
 the last fit begins from it and takes all poses.
 
-Masses are known and set the scale of all forces. The bending stiffness of the backbone is fitted, too, as
-area and stiffness would otherwise absorb its error. Axial stiffness of backbone and springs acts in parallel
+Masses are known and set the scale of all forces. Axial stiffness of backbone and springs acts in parallel
 with the chambers, which absorb its error. A weak prior keeps parameters that the poses do not determine near
 the specification; the warnings name them.
 """

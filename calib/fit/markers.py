@@ -8,9 +8,8 @@ order X(s), Y(s), Z(s) run through them and through that site of the base. The r
 without twisting about it, so any other site, such as that of a chamber, has a parallel curve. A chamber is as
 long as its curve within its section.
 
-Polynomials of fourth order are too smooth for three sections that bend independently. On simulated arms
-without noise the lengths are off by 5 mm RMS with markers in the middle of the rings, by 6 mm with markers at
-the chambers, by 11 mm at the springs, and by tens of mm at worst. So these lengths only check the fit.
+These polynomials are too smooth for three sections that bend independently: on simulated arms without noise
+the lengths are off by 5 to 11 mm RMS, and by tens of mm at worst. So they only check the fit.
 
 Source: Simulation Calibration and Validation in Meng et al.
 """

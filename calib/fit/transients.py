@@ -2,8 +2,6 @@
 
 C MuJoCo is driven with the logged pressures along a stretch of the log, and its tip is compared with the
 measured tip. The first seconds do not count: the arm's motion at the beginning is unknown, and decays.
-Derivatives by the two parameters are differences of three parallel runs, since derivatives through thousands
-of steps of MJX would compile for minutes.
 
 The damping of the springs and the axial damping of the backbone stay as specified. They act in parallel with
 the chambers, which absorb their error.
@@ -178,6 +176,7 @@ def simulate(stretch: Stretch, spec: ArmSpec) -> np.ndarray:
 
 def _errors(stretches: Sequence[Stretch], spec: ArmSpec, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return simulated minus measured tip by clusters (n, m) [m], NaN-padded; Jacobian (n, m, 2)."""
+    # Differences of three runs: derivatives through thousands of MJX's steps would compile for minutes.
     arms = [damped(spec, x + d) for d in (np.zeros(2), *(DIFFERENCE * np.eye(2)))]
     with ThreadPoolExecutor() as pool:  # MuJoCo steps without Python's lock
         runs = list(pool.map(lambda job: simulate(*job), [(s, arm) for arm in arms for s in stretches]))

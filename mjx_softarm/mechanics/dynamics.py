@@ -3,12 +3,10 @@
     M(q) dv/dt + c(q, v) + D v + dV/dq = 0,    dq/dt = v
 
 The mass matrix M and the bias c of the velocities are MJX's (`mjx.crb`, `mjx.rne`). The potential V at the
-chambers' pressures, with its gradient and Hessian K, and the dampers D have the closed form of
-`mjx_softarm.mechanics.statics`. Either engine gives the kinematics.
+chambers' pressures, its Hessian K, and the dampers D have the closed form of `mjx_softarm.mechanics.statics`.
 
-A step of length h takes the implicit midpoint rule, linearised about the middle as the velocity at the start
-predicts it, q + h/2 v. The rule is of second order, and stable however stiff a link is: a step may be as long
-as a control period. With all functions of q at the middle,
+A step of length h takes the implicit midpoint rule, linearised about the predicted middle q + h/2 v. The rule
+is of second order, and stable however stiff a link is. With all functions of q at the middle,
 
     (M + h/2 D + h^2/4 K) dv = -h (dV/dq + D v + c),    q' = q + h (v + dv / 2)
 

@@ -13,8 +13,8 @@ the rows of S K where chambers track and of the identity where they are at a lim
 
     dp = R^-1 r,    dq = K dp - H^-1 d_x grad V,    r = dreference - d_x s + S H^-1 d_x grad V  or  dlimit.
 
-This is exact however many Newton steps led to the equilibrium. K comes from the last Newton step, so that
-derivatives in either direction are products with K and R^-1; only the arm's numbers need H^-1.
+This is exact however many Newton steps led to the equilibrium. K comes from the last Newton step; only
+derivatives by the arm's numbers need H^-1.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class EquilibriumTangents(NamedTuple):
 
 
 class PressureResponse(NamedTuple):
-    """PressureResponse of joints and springs to the chambers' pressures, at the balance of forces."""
+    """Response of joints and springs to the chambers' pressures, at the balance of forces."""
 
     dq_dp: Array  # (nv, n_chambers) [m/kPa, rad/kPa], K
     dspring_dp: Array  # (n_chambers, n_chambers) [m/kPa], S K

@@ -1,27 +1,20 @@
 """Learning through the simulation: its own gradient teaches the policy.
 
 The pose at rest is a differentiable function of the spring references (`mjx_softarm.mechanics.implicit`), and
-so is the pose in motion, through all time steps. So the policy's parameters descend the error of the pose
-itself: no critic, no replay, no exploration. With a = pi(s) the action in state s, e(a) the scaled pose error
-after it, theta the tolerance of the goal and d_t(a) the distance of spring t from its reference [mm],
+so is the pose in motion, through all time steps. So the policy a = pi(s) descends the pose's own error:
 
-    loss = E[ ||e(a)|| / theta + c sum_t d_t(a) ].
+    loss = E[ ||e(a)|| / theta + c sum_t d_t(a) ]
 
-A chamber at a pressure limit does not follow its reference, so the first term has no gradient with respect
-to it; the second pulls the reference back to what the chamber can reach. At rest the law holds all other
-springs on their references; in motion, where it does not yet, springs of chambers at a limit count alone.
-There the loss is that after the last of the next `horizon` actions, and a fifth of the mean over all of them:
-the tip shall be there, and rather soon than late.
+with the scaled pose error e(a) after the action a, the goal's tolerance theta, and the distance d_t(a) of
+spring t from its reference [mm]. There is no critic, no replay and no exploration. A chamber at a pressure
+limit does not follow its reference, so the first term has no gradient there; the second pulls the reference
+back to a length that the chamber can reach.
 
-The learner has arms of its own that go on from where its actions led them, so it sees the states that the
-policy leads to, disturbances of the randomisation included. A part of them begins anew at each step. An
-environment's cost of clearance, where it has one, adds to the loss.
+The learner has arms of its own that go on from where its actions led them. So it sees the states that the
+policy leads to. Some of the arms begin anew at each step.
 
-Neither learning rate nor average depends on the length of the run, so that every policy on the way is as good
-as that of a shorter run: the rate falls as 1 / (1 + t / t_half) over the steps t, and the policy is an
-average of the newest ones, in which a share of all steps counts.
-
-Source of the average: Shamir, Zhang, "Stochastic Gradient Descent for Non-smooth Optimization", ICML 2013.
+Source of the average policy: Shamir, Zhang, "Stochastic Gradient Descent for Non-smooth Optimization", ICML
+2013.
 
 Shapes: B arms, O observation, A action.
 """
@@ -47,9 +40,7 @@ from train.agent.learner import Explored, Learner, LearnerConfig, Sample, check_
 from train.agent.networks import Actor, check_same_shapes, mode, widened
 
 Params = Any  # a flax parameter tree
-EARLY = (
-    0.2  # weight of the mean loss of all actions that a gradient step looks ahead, beside that of the last
-)
+EARLY = 0.2  # weight of the mean cost of all actions beside that of the last: the tip shall arrive soon
 
 
 @dataclass(frozen=True)
@@ -64,7 +55,7 @@ class AnalyticConfig(LearnerConfig):
     total_env_steps: int = 64 * 98_304  # actions of all arms together; each arm takes one per gradient step
     vector_steps_per_epoch: int = 256  # gradient steps between two reports
     learning_rate: float = 2e-3  # learning rate at first (Adam)
-    learning_rate_half: float = 3_000.0  # gradient steps after which half of it is left, after twice a third
+    learning_rate_half: float = 3_000.0  # gradient steps t_half of the rate's decay, 1 / (1 + t / t_half)
     max_gradient_norm: float = 1.0  # a longer gradient is shortened to this
     mean_share: float = 0.1  # share of the gradient steps so far over which the mean policy averages
     new_share: float = 0.33  # share of the arms that get a new start and goal after each step
@@ -89,22 +80,25 @@ class AnalyticState(NamedTuple):
     """All that an update changes."""
 
     actor_params: Params
-    mean_actor_params: Params  # average of the newest actor_params: the policy that comes of training
+    mean_actor_params: Params  # average of the newest actor_params: the policy that is evaluated
     opt_state: optax.OptState
     n_steps: Array  # () int32 gradient steps taken
     arms: State  # B
 
 
 class _Ahead(NamedTuple):
-    """Arms as they look ahead, for H actions."""
+    """One arm that looks ahead for H actions."""
 
-    after: State  # after the first of these
-    obs: Array  # (H, O) before each
-    valid: Array  # () bool: the arm settled after each
+    after: State  # state after the first action
+    obs: Array  # (H, O) observation before each action
+    valid: Array  # () bool: the arm settled after each action
 
 
 class Analytic(Learner):
     """`Learner` by the gradient of the simulation; it uses no replay.
+
+    Neither learning rate nor average depends on the length of the run, so every policy on the way is as
+    good as that of a shorter run.
 
     Args:
         config: hyperparameters.
@@ -161,14 +155,14 @@ class Analytic(Learner):
         self, state: AnalyticState, sample: Sample, key: Array
     ) -> tuple[AnalyticState, dict[str, Array]]:
         """Take one gradient step, and one action of all arms."""
-        # Act H times; the gradient of each arm's loss with respect to each of its actions.
+        # Act H times, and differentiate each arm's loss by each of its actions.
         look_ahead = jax.value_and_grad(self._loss, has_aux=True)
         changes = jnp.zeros((self.arms.n, self.config.horizon, self.env.action_size))
         ahead: _Ahead
         d_action: Array  # (B, H, A)
         (loss, ahead), d_action = over_arms(look_ahead, self.mesh, 1)(changes, state.arms, state.actor_params)
 
-        # Leave out arms that did not settle and gradients that are not finite, as at a pitch of 90 degrees.
+        # Leave out arms that did not settle, and gradients that are not finite, as at a pitch of 90 degrees.
         valid = ahead.valid & jnp.all(jnp.isfinite(d_action), axis=(1, 2))  # (B,)
         d_action = jnp.where(valid[:, None, None], d_action, jnp.zeros_like(d_action)) / self.arms.n
         _, pull_back = jax.vjp(lambda params: self.mode(params, ahead.obs), state.actor_params)
@@ -195,7 +189,7 @@ class Analytic(Learner):
         return next_state, env_metrics | {f"analytic/{name}": x for name, x in metrics.items()}
 
     def _loss(self, changes: Array, arm: State, params: Params) -> tuple[Array, _Ahead]:
-        """Return the loss of one arm that takes H actions of the policy, each changed a little: (H, A)."""
+        """Return the loss of one arm over H actions of the policy plus small changes (H, A)."""
 
         def act(arm: State, change: Array) -> tuple[State, tuple[Array, State, Array]]:
             action = self.mode(params, arm.obs) + change
@@ -214,13 +208,13 @@ class Analytic(Learner):
         error = rewards.scaled_error(end.pose, end.goal, config.reward)  # (6,)
         off = jnp.sqrt(jnp.sum(error**2) + 1e-12) / config.reward.threshold
         off_m = self.env.reference_m(action) - (end.spring_m + end.sensor_offset_m)  # (A,)
-        if config.moves:  # most of them are on their way
+        if config.moves:  # springs on their way are off their references, too: only blocked chambers count
             off_m = after.info["blocked"] * off_m
         cost = self.config.saturation_cost_per_mm * 1e3 * jnp.sum(jnp.abs(off_m))
         return off + cost + self.env.clearance_cost(after.info["clearance_mm"])
 
     def _go_on(self, after: State, key: Array) -> State:
-        """Return the arms as they stand, some of them with a new start and goal."""
+        """Return the arms, some of them with a new start and goal."""
         key_new, key_reset = jax.random.split(key)
         new = draws.uniform(key_new, (self.arms.n,)) < self.config.new_share
         new |= ~after.info["valid"]

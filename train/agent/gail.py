@@ -1,9 +1,9 @@
 """Discriminator that tells the expert's actions from the agent's, and the reward learned by it.
 
-The logit h(s, a, g) is high where the expert acts. It is trained by cross-entropy, expert 1 and agent 0, with
-a penalty that holds the length of its gradient near one between the two; the reward log sigmoid(h), never
-positive, is the paper's log(1 - D) with D the probability of the agent. As h moves with every update, a
-reward is never stored: it is computed when a batch is sampled.
+The logit h(s, a, g) is high where the expert acts. It is trained by cross-entropy, expert 1 and agent 0. A
+penalty holds the length of its gradient near one at points between both. The reward log sigmoid(h) is the
+paper's log(1 - D) with D the probability of the agent. It changes with every update, so it is computed
+when a batch is sampled.
 
 Source: Ho and Ermon 2016, arXiv:1606.03476; gradient penalty: Gulrajani et al. 2017, arXiv:1704.00028.
 
@@ -47,7 +47,7 @@ class GailConfig:
 
 
 class DiscriminatorState(NamedTuple):
-    """Parameters and optimiser state: all that an update changes."""
+    """Parameters and state of the optimiser."""
 
     params: Any
     opt_state: optax.OptState
@@ -93,9 +93,9 @@ class Gail:
         """Take one gradient step.
 
         Args:
-            state: of the discriminator.
-            expert, agent: observations (B, O) and actions (B, A); a pair of rows has the same goal, so that
-                the points between them have it too.
+            state: state of the discriminator.
+            expert, agent: observations (B, O) and actions (B, A). Row k of both has one goal, so the points
+                between them have this goal, too.
             key: draws the points between expert and agent, where the gradient is penalised.
 
         Returns:

@@ -1,13 +1,13 @@
 """Hindsight relabelling: a pose that was reached becomes the goal, sensed lengths become the action.
 
-Some transitions of a batch keep the goal they were made for. Some get the pose that they reached as their
-goal, and with it the goal bonus (the paper's relabelling). Some get a goal near that pose, at a distance
-drawn log-uniformly, which shows the critic how the reward falls off around a pose.
+Some transitions of a batch keep their goal. For some, the pose that they reached becomes the goal, with its
+goal bonus (the paper's relabelling). Some get a goal near that pose, at a distance drawn log-uniformly, which
+shows the critic how the reward falls off around a pose.
 
 A relabelled transition whose chambers had saturated also gets another action (hindsight action transitions,
-Levy et al., ICLR 2019). At rest it asks for the spring lengths that the arm ended at: they lead to the same
-equilibrium with no chamber off its reference. In motion only the references of the saturated chambers are
-exchanged for the lengths these ended at: the law holds such a chamber at its limit either way.
+Levy et al., ICLR 2019). At rest it asks for the spring lengths that the arm ended at, which lead to the same
+equilibrium without saturation. In motion only the references of the saturated chambers are exchanged: the law
+holds such a chamber at its limit either way.
 """
 
 from __future__ import annotations
@@ -31,7 +31,9 @@ class HindsightConfig:
 
     reached_share: float = 0.5  # share whose goal becomes the pose reached
     near_share: float = 0.0  # share whose goal becomes a pose near the one reached
-    n_later: int = 0  # the pose reached, and half of those nearby, may come so many actions later
+    n_later: int = (
+        0  # largest number of actions after which the reached pose, and half of the near ones, come
+    )
     near_min_mm: float = 1.0  # smallest distance of a near goal
     near_max_mm: float = 100.0  # largest distance of a near goal
     mm_per_deg: float = 1.0  # distance that goes with a turn of one degree of a near goal
@@ -70,7 +72,7 @@ def relabel(
         config: shares.
         scale: of the observations.
         reward_config: weights of the reward.
-        goal_ends: whether a goal that is reached ends an episode.
+        goal_ends: whether a reached goal ends an episode.
         senses_action: whether the observation's last entries are the last action.
     """
     # Goals: own, reached, or near the pose reached.
@@ -114,10 +116,10 @@ def later_pose(now: Experience, later: Experience, ahead: Array) -> Array:
     Args:
         now: B transitions.
         later: B transitions that may be of the same episodes.
-        ahead (B,): number of actions between the two.
+        ahead (B,): number of additions to the replay between the two.
 
-    A transition with the same goal, so many actions later, is of the same episode. Where `later` is of
-    another one, the pose is the one that the transition itself reached.
+    `later` is of the same episode if it has the same goal and `ahead` more actions. Else the pose is that of
+    the transition itself.
     """
     same = (later.n_steps == now.n_steps + ahead) & jnp.all(later.goal == now.goal, axis=-1)
     return jnp.where(same[:, None], later.next_pose, now.next_pose)

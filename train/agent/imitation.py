@@ -1,17 +1,14 @@
 """Learner from demonstrations: a learned reward around TQC.
 
-An action of an arm at rest leads to the same pose from every start. So a demonstrated action is the expert's
-answer to its goal from any start, and expert actions are stored with the agent's state: the discriminator
-compares two actions for one observation, and only the action can tell them apart. The expert's answers also
-take a share of each batch of the critics, with the same reward as all others.
+At rest an action leads to the same pose from every start. So a demonstrated action is the expert's answer to
+its goal from any start, and expert actions are stored with the agent's state: the discriminator compares two
+actions for one observation. The expert's answers also take a share of each batch of the critics.
 
-An arm in motion is still on its way when the next action comes. There the expert acts itself: a share of the
-arms' actions are the expert's answers to their goals, and the critics see their results. Where the expert
-acted, the discriminator compares its action with the agent's present action.
+In motion an arm is still on its way when the next action comes. There a share of the arms' actions are the
+expert's answers to their goals, and the discriminator compares these with the agent's present actions.
 
-The learned reward is for goals that were asked for, not for relabelled goals, which the discriminator does
-not know. Episodes end with the goal reached or by the clock, so a reward that is never positive rewards no
-delay.
+The learned reward is for goals that were asked for; the discriminator does not know relabelled goals. The
+reward is never positive, and an episode ends with the goal reached or by the clock, so delay earns nothing.
 
 Shapes: B batch, O observation, A action, m demonstrated positions.
 """

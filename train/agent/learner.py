@@ -1,11 +1,8 @@
 """The interface of a learner, and the settings that the epoch reads of every learner.
 
-An epoch steps the arms, stores their transitions and calls `update` some times after each action; the learner
-samples the replay as it is stored, or relabels it. A learner with `own_arms` steps these itself as it learns:
-its epoch consists of updates alone, without replay.
-
-A class that inherits from `Learner` has `parts` and `adopt` already. On several devices, batches are spread
-over them, and the learner's state is on all of them.
+An epoch steps the arms, stores their transitions and calls `update` some times after each action. A learner
+with `own_arms` steps these itself as it learns: its epoch consists of updates alone, without replay. On
+several devices, batches are spread over them, and the learner's state is on all of them.
 
 Shapes: O observation, A action.
 """

@@ -15,19 +15,14 @@ def quantile_huber_loss(quantiles: Array, targets: Array) -> Array:
 
     With delta = target_k - quantile_m, clip = delta limited to [-1, 1], tau_m = (m + 1/2) / M, a pair costs
     |tau_m - 1[delta < 0]| * Huber(delta), where Huber(delta) = clip * (delta - clip / 2) has the slope clip.
-    The loss is the mean over B, K, C and M, as in stable-baselines3-contrib; the paper sums over M. Targets
-    are constants. One pass over the pairs gives loss and slope, the slope attached by a term of value zero:
-    first derivatives are exact, second ones absent.
+    The loss () is the mean over B, K, C and M, as in stable-baselines3-contrib; the paper sums over M. First
+    derivatives are exact, second derivatives are zero.
 
     Args:
         quantiles (B, C, M): predictions.
-        targets (B, K): samples of the target distribution.
+        targets (B, K): samples of the target distribution, constants here.
 
-    Returns:
-        loss ().
-
-    Source:
-        Dabney et al. 2017, arXiv:1710.10044, eq. 10; Kuznetsov et al. 2020, section 3.
+    Source: Dabney et al. 2017, arXiv:1710.10044, eq. 10; Kuznetsov et al. 2020, section 3.
     """
     n_quantiles = quantiles.shape[-1]
     tau = (jnp.arange(n_quantiles, dtype=quantiles.dtype)[None, None, None, :] + 0.5) / n_quantiles
@@ -36,14 +31,13 @@ def quantile_huber_loss(quantiles: Array, targets: Array) -> Array:
     clip = jnp.clip(delta, -1.0, 1.0)  # (B, K, C, M)
     slope = jnp.where(clip < 0.0, 1.0 - tau, tau) * clip  # (B, K, C, M)
     loss = jnp.mean(slope * (delta - 0.5 * clip), axis=1)  # (B, C, M)
+    # One pass over the pairs gives loss and slope: a term of value zero has the slope as its derivative.
     return jnp.mean(loss - jnp.mean(slope, axis=1) * (quantiles - fixed))
 
 
 def drop_largest(samples: Array, n_drop: int) -> Array:
-    """Return rows (B, N) without their `n_drop` largest entries, in their order: (B, N - n_drop).
-
-    Finding a few maxima and closing the gaps costs a fraction of sorting the row.
-    """
+    """Return rows (B, N) without their `n_drop` largest entries, in their order: (B, N - n_drop)."""
+    # To find a few maxima and to close the gaps costs a fraction of sorting the row.
     dropped = jnp.sort(jax.lax.top_k(samples, n_drop)[1], axis=-1)  # (B, n_drop) columns, ascending
     n_kept_before = dropped - jnp.arange(n_drop)[None, :]  # (B, n_drop) kept columns left of each dropped one
     kept = jnp.arange(samples.shape[-1] - n_drop)[None, :]  # (1, N - n_drop) index among the kept
@@ -61,10 +55,10 @@ def truncated_targets(
     gamma: float,
     n_drop_per_critic: int,
 ) -> Array:
-    """Return samples of the soft target distribution, truncated from above against overestimation.
+    """Return samples (B, K) of the soft target distribution, without its largest against overestimation.
 
-    The C * M quantiles z of the target critics are pooled, the C * n_drop_per_critic largest dropped, and the
-    K others become y = reward + gamma * (1 - terminated) * (z - alpha * next_log_prob).
+    The C * M quantiles z of the target critics are pooled, and the C * n_drop_per_critic largest are dropped.
+    The K others become y = reward + gamma * (1 - terminated) * (z - alpha * next_log_prob), in no order.
 
     Args:
         next_quantiles (B, C, M): target critics at the next observation and the actor's action there.
@@ -75,11 +69,7 @@ def truncated_targets(
         gamma: discount factor.
         n_drop_per_critic: quantiles dropped per critic.
 
-    Returns:
-        targets (B, K), in no particular order.
-
-    Source:
-        Kuznetsov et al. 2020, section 3 (target distribution).
+    Source: Kuznetsov et al. 2020, section 3 (target distribution).
     """
     pooled = jnp.reshape(next_quantiles, (next_quantiles.shape[0], -1))  # (B, C * M)
     kept = drop_largest(pooled, next_quantiles.shape[1] * n_drop_per_critic)  # (B, K)
@@ -88,34 +78,26 @@ def truncated_targets(
 
 
 def actor_loss(log_prob: Array, quantiles: Array, alpha: Array) -> Array:
-    """Return the mean of alpha * log_prob - Q over the actor's actions; Q is the mean of all quantiles.
+    """Return the mean () of alpha * log_prob - Q over the actor's actions; Q is the mean of all quantiles.
 
     Args:
         log_prob (B,): log-density of the actions.
         quantiles (B, C, M): critics at those actions.
         alpha (): temperature.
 
-    Returns:
-        loss ().
-
-    Source:
-        Kuznetsov et al. 2020, section 3 (policy loss).
+    Source: Kuznetsov et al. 2020, section 3 (policy loss).
     """
     return jnp.mean(alpha * log_prob - jnp.mean(quantiles, axis=(1, 2)))
 
 
 def alpha_loss(log_alpha: Array, log_prob: Array, target_entropy: float) -> Array:
-    """Return the mean of -log_alpha * (log_prob + target_entropy); alpha rises while entropy is too low.
+    """Return the mean () of -log_alpha * (log_prob + target_entropy); alpha rises while entropy is too low.
 
     Args:
         log_alpha (): log temperature.
         log_prob (B,): log-density of the actor's actions, a constant here.
         target_entropy: target entropy [nat].
 
-    Returns:
-        loss ().
-
-    Source:
-        Haarnoja et al. 2018, arXiv:1812.05905, section 6; log_alpha in the place of alpha, as in its code.
+    Source: Haarnoja et al. 2018, arXiv:1812.05905, section 6; log_alpha in place of alpha, as in its code.
     """
     return -log_alpha * jnp.mean(jax.lax.stop_gradient(log_prob) + target_entropy)

@@ -1,11 +1,11 @@
 """Training on several devices: arms, replay and batches are spread over them, networks are on all of them.
 
-The devices form one axis. Arrays with a row for each arm and the slots of the replay are split along it. A
-batch is split once it is drawn, so that each device computes the gradients of its share and XLA adds them up.
-Arms settle on their device by themselves. The numbers are those of one device but for the order of sums.
+The devices form one axis. Arrays with a row for each arm, the replay's slots and each batch are split along
+it. A device computes the gradients of its share of a batch, and XLA adds them up. The results are those of
+one device but for the order of sums.
 
-Several processes, on one host or on many, form one such axis too, once they have met. All of them do the
-same; only the first writes, except for checkpoints, which all of them write to one folder.
+Several processes, on one host or on many, form one such axis, too, once they have met. All of them write
+checkpoints to one folder; the first process alone writes all else.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ AXIS = "devices"
 CLUSTER = "cluster"
 _MEETING = re.compile(r"([^/]+:\d+)/(\d+)/(\d+)")
 HELP = (
-    f"how many to train on; default: 1. Or those of several processes: {CLUSTER}, where SLURM, Open MPI, "
+    f"number of devices; default: 1. Or the devices of several processes: {CLUSTER}, where SLURM, Open MPI, "
     "Kubernetes or Cloud TPU started them, else HOST:PORT/K/N for the K-th of N, from 0, that meet there"
 )
 

@@ -1,9 +1,9 @@
 """Small networks for the arm's computer, distilled from the simulator: of load, pose and springs.
 
-Equilibria over the whole workspace are the data, held-out equilibria the test. The networks are described in
-`mjx_softarm.sensing.estimator` and `mjx_softarm.sensing.load`. The load network reads springs and pressures;
-it learns from arms whose chambers are off, since no calibration is perfect. The pose network reads springs
-and the load: from pressures it would mistake a chamber's error for a change of shape.
+The networks (`mjx_softarm.sensing.estimator`, `mjx_softarm.sensing.load`) learn equilibria over the whole
+workspace, and are tested on held-out ones. The load network learns from arms whose chambers are off, since no
+calibration is perfect. The pose network has no pressures as inputs: it would mistake a chamber's error for a
+change of shape.
 """
 
 from __future__ import annotations
