@@ -120,12 +120,8 @@ def simulate(spec: ArmSpec, measured: Measured, x: np.ndarray) -> tuple[np.ndarr
         Errors (n, m) of `residuals`, inf where the arm does not settle; their Jacobian (n, m, p); chamber
         lengths (n, n_chambers) [m].
     """
-    params, n = ArmParams.from_spec(spec), len(measured.payload_kg)
-    padded = -(-n // BATCH) * BATCH
-    measured = Measured(*(np.resize(np.float32(f), (padded, *f.shape[1:])) for f in measured))
-    batches = [measured.take(np.arange(k, k + BATCH)) for k in range(0, padded, BATCH)]
-    found = [jax.device_get(_jacobian()(np.float32(x), params, batch)) for batch in batches]
-    error, slope, settled, chamber_m = (np.concatenate(a)[:n] for a in zip(*found, strict=True))
+    simulated = functools.partial(_jacobian(), np.float32(x), ArmParams.from_spec(spec))
+    error, slope, settled, chamber_m = xla.in_batches(simulated, BATCH, measured)
     return np.where(settled[:, None], error.astype(float), np.inf), slope.astype(float), chamber_m
 
 

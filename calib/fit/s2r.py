@@ -86,13 +86,10 @@ def simulate_poses(spec: ArmSpec, reference_m: np.ndarray) -> SimulatedPoses:
         reference_m (n, n_chambers) [m]: spring lengths of the real arm, finite, n at least 1.
     """
     # Lift the pressure limits, and settle in batches of one size.
-    n, params = len(reference_m), ArmParams.from_spec(spec)
     limit = np.full(spec.n_chambers, PRESSURE_LIMIT_KPA, np.float32)
-    params = params._replace(pressure_min_kpa=-limit, pressure_max_kpa=limit)
-    padded = np.resize(np.float32(reference_m), (-(-n // BATCH) * BATCH, spec.n_chambers))
-    solver = _solver(arms_at_once(spec.n_links))
-    found = [jax.device_get(solver(params, batch)) for batch in np.split(padded, len(padded) // BATCH)]
-    return jax.tree.map(lambda *columns: np.concatenate(columns)[:n], *found)
+    params = ArmParams.from_spec(spec)._replace(pressure_min_kpa=-limit, pressure_max_kpa=limit)
+    settled = functools.partial(_solver(arms_at_once(spec.n_links)), params)
+    return xla.in_batches(settled, BATCH, reference_m)
 
 
 @functools.cache

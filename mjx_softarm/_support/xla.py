@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 
 # jaxlib 0.10 hands products and sums to the library YNNPACK. Learning is a third slower with it, and some
 # sums are wrong (see `small_matrices.product`).
@@ -44,6 +45,21 @@ def jit(function: Callable, uses_mjx: bool = True, **kwargs: Any) -> Callable:
     MJX's options are for programs with MJX alone: networks train about a tenth slower with them.
     """
     return jax.jit(function, compiler_options=compiler_options(uses_mjx), **kwargs)
+
+
+def in_batches(function: Callable[[Any], Any], size: int, rows: Any) -> Any:
+    """Return the results of a compiled function for all rows, as NumPy arrays, from batches of one size.
+
+    Args:
+        function: maps a tree of arrays (size, ...) to another.
+        size: rows of a batch; the last batch repeats the first rows.
+        rows: a tree of arrays (n, ...), n at least 1; they become float32.
+    """
+    n = len(jax.tree.leaves(rows)[0])
+    padded = jax.tree.map(lambda x: np.resize(np.float32(x), (-(-n // size) * size, *x.shape[1:])), rows)
+    batches = (jax.tree.map(lambda x, k=k: x[k : k + size], padded) for k in range(0, n, size))
+    parts = [jax.device_get(function(batch)) for batch in batches]
+    return jax.tree.map(lambda *x: np.concatenate(x)[:n], *parts)
 
 
 def jit_at_first_call(uses_mjx: bool = True, **kwargs: Any) -> Callable[[Callable], Callable]:

@@ -80,12 +80,8 @@ def settle_many(spec: ArmSpec, pressure_kpa: np.ndarray) -> Settled:
 def _in_batches(make_solver: Callable, spec: ArmSpec, *columns: np.ndarray) -> Settled:
     """Return equilibria of rows of columns (n, ...), as NumPy arrays with a leading axis n."""
     solver = make_solver(arms_at_once(spec.n_links))
-    params, n = ArmParams.from_spec(spec), len(columns[0])
-    n_batches = -(-n // BATCH)
-    padded = [np.resize(np.asarray(x, np.float32), (n_batches * BATCH, *x.shape[1:])) for x in columns]
-    batches = zip(*(np.split(x, n_batches) for x in padded), strict=True)
-    parts = [jax.device_get(solver(params, *batch)) for batch in batches]
-    return jax.tree.map(lambda *x: np.concatenate(x)[:n], *parts)
+    params = ArmParams.from_spec(spec)
+    return xla.in_batches(lambda batch: solver(params, *batch), BATCH, columns)
 
 
 def sample_workspace(spec: ArmSpec, n: int, seed: int) -> Pool:

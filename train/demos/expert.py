@@ -18,6 +18,7 @@ from collections.abc import Sequence
 import jax
 import numpy as np
 
+from mjx_softarm._support import xla
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.mechanics.params import ArmParams
@@ -65,10 +66,7 @@ class Expert:
 
     def look(self, pressure_kpa: np.ndarray) -> Posture:
         """Return the postures at pressures (n, n_chambers) [kPa]."""
-        n, n_batches = len(pressure_kpa), -(-len(pressure_kpa) // _BATCH)
-        padded = np.resize(np.float32(pressure_kpa), (n_batches * _BATCH, self.spec.n_chambers))
-        parts = [jax.device_get(self._look(part)) for part in np.split(padded, n_batches)]
-        return jax.tree.map(lambda *x: np.concatenate(x)[:n], *parts)
+        return xla.in_batches(self._look, _BATCH, pressure_kpa)
 
     def plan(self, waypoints: Sequence[Waypoint]) -> Posture:
         """Return postures (n,) at waypoints, each near its predecessor.

@@ -176,7 +176,7 @@ def evaluate(
 
 
 def export(folders: Runs, out: cli.MaybePath = None, onnx: bool = False, cpp: cli.MaybePath = None) -> int:
-    """Write policies, each as one npz file, and for other runtimes.
+    """Write policies as npz files, and for other runtimes.
 
     Args:
         out: file to write, for one run; None: policy.npz in its folder
@@ -198,7 +198,7 @@ def export(folders: Runs, out: cli.MaybePath = None, onnx: bool = False, cpp: cl
 
 
 def _mesh(text: str | None, console: Console) -> Mesh | None:
-    """Return the devices to train on, and keep the console of all processes but the first quiet."""
+    """Return the devices to train on; only the first process prints to the console."""
     mesh = devices.mesh_of(text)
     console.quiet = not devices.is_first_process()
     return mesh

@@ -174,7 +174,7 @@ def begin_with(task: Task, seed: int, donors: Mapping[str, Run]) -> tuple[TrainS
 
 
 def open_board(run: Run, epoch: int) -> SummaryWriter:
-    """Return TensorBoard's writer; events of a stopped run later than an epoch are dropped."""
+    """Return TensorBoard's writer; it drops a stopped run's events that are later than an epoch."""
     purge_step = run.config.learner.n_env_steps(epoch) + 1 if epoch else None
     return SummaryWriter(str(run.path), purge_step=purge_step, write_to_disk=is_first_process())
 
@@ -182,7 +182,7 @@ def open_board(run: Run, epoch: int) -> SummaryWriter:
 def timed_epoch(
     job: Any, state: TrainState, learner: LearnerConfig, epoch: int
 ) -> tuple[TrainState, dict[str, Any]]:
-    """Return the next state of a job, or of a sweep's, and its metrics with the speeds of one run."""
+    """Return the next state of a job, and its metrics with the speeds of each member."""
     start = time.perf_counter()
     state, metrics = job.epoch(state)
     metrics = jax.device_get(metrics)
@@ -192,7 +192,7 @@ def timed_epoch(
 
 
 def evaluation(run: Run, task: Task, policy: Any) -> dict[str, float]:
-    """Return the figures of a policy, named as in a row of metrics; its poses go into the run's folder."""
+    """Return the figures of a policy by their names in metrics; write its poses into the run's folder."""
     summary, *results = task.evaluate(policy)
     run.write_poses(*results)
     figures = summary.to_dict()
@@ -200,7 +200,7 @@ def evaluation(run: Run, task: Task, policy: Any) -> dict[str, float]:
 
 
 def counts(learner: LearnerConfig, epoch: int) -> dict[str, int]:
-    """Return the numbers of env steps and updates by the end of an epoch, named as in a row of metrics."""
+    """Return the numbers of env steps and updates by the end of an epoch, by their names in metrics."""
     return {"env_steps": learner.n_env_steps(epoch), "updates": learner.n_updates(epoch)}
 
 
@@ -231,7 +231,7 @@ def _line(rows: Sequence[dict[str, float]], task: Task) -> str:
 def shown_progress(
     config: TrainConfig, epoch: int, console: Console
 ) -> Iterator[Callable[[int, str, bool], None]]:
-    """Yield a function that shows an epoch with its text on a bar, or, if due, as a line of a file."""
+    """Yield a function of an epoch, its text and whether it was evaluated: it moves a bar or prints a line."""
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     columns += (TextColumn("{task.fields[text]}"),)
     hidden = not console.is_terminal
