@@ -231,7 +231,7 @@ def _line(rows: Sequence[dict[str, float]], task: Task) -> str:
 def shown_progress(
     config: TrainConfig, epoch: int, console: Console
 ) -> Iterator[Callable[[int, str, bool], None]]:
-    """Yield a function of an epoch, its text and whether it was evaluated: it moves a bar or prints a line."""
+    """Yield a function of epoch, text and whether it was evaluated: it moves a bar, or prints a line."""
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     columns += (TextColumn("{task.fields[text]}"),)
     hidden = not console.is_terminal
