@@ -49,57 +49,51 @@ class Reached(NamedTuple):
         return np.linalg.norm(np.asarray(self.pose - self.goal)[:, :3], axis=-1)
 
 
-@dataclass(frozen=True)
-class Summary:
-    """Figures of an evaluation, as tables show them."""
+def figure(label: str, unit: str, decimals: int = 0, **default: Any) -> Any:
+    """Return a field of `Figures`, which a table shows with label and unit; a share is shown in %."""
+    return dataclasses.field(metadata={"row": (label, unit, decimals)}, **default)
 
-    median_mm: float
-    p95_mm: float
-    reached_share: float  # goals with the norm of e below theta and no chamber saturated
-    saturated_share: float  # goals at which a chamber is saturated
-    even_median_mm: float  # median at the goals that are uniform in volume
-    even_p95_mm: float  # 95 % at the goals that are uniform in volume
-    even_reached_share: float  # reached share of the goals that are uniform in volume
-    unsettled: int  # arms that did not settle, at all goals and on the circle
-    circle_mean_mm: float
-    circle_max_mm: float
-    circle_saturated_chambers: int  # summed over the circle's points
-    near_share: float | None = None  # in motion: goals with the tip within NEAR_MM for good
-    near_median_s: float | None = None  # in motion: median of `near_s`; None if it is infinite
-    overshoot_median_mm: float | None = None  # in motion
-    overshoot_p95_mm: float | None = None  # in motion
+
+@dataclass(frozen=True)
+class Figures:
+    """Figures of an evaluation, as tables show them."""
 
     def to_dict(self) -> dict[str, Any]:
         """Return the figures that are not None."""
         return {name: value for name, value in dataclasses.asdict(self).items() if value is not None}
 
     def rows(self) -> list[tuple[str, str]]:
-        """Return the rows of a table: name, and value with its unit."""
-        return [
-            ("tip error, median", f"{self.median_mm:.2f} mm"),
-            ("tip error, 95 %", f"{self.p95_mm:.2f} mm"),
-            ("goals reached", f"{100 * self.reached_share:.1f} %"),
-            ("goals with a saturated chamber", f"{100 * self.saturated_share:.1f} %"),
-            ("uniform in volume: median", f"{self.even_median_mm:.2f} mm"),
-            ("uniform in volume: 95 %", f"{self.even_p95_mm:.2f} mm"),
-            ("uniform in volume: reached", f"{100 * self.even_reached_share:.1f} %"),
-            ("arms that did not settle", f"{self.unsettled}"),
-            ("circle, mean tip error", f"{self.circle_mean_mm:.2f} mm"),
-            ("circle, largest tip error", f"{self.circle_max_mm:.2f} mm"),
-            ("circle, saturated chambers", f"{self.circle_saturated_chambers}"),
-            *self._rows_of_motion(),
-        ]
+        """Return the rows of a table: label, and value with its unit."""
+        rows = []
+        for item in dataclasses.fields(self):
+            value = getattr(self, item.name)
+            if value is not None and "row" in item.metadata:
+                label, unit, decimals = item.metadata["row"]
+                rows.append((label, f"{value * (100 if unit == '%' else 1):.{decimals}f} {unit}".rstrip()))
+        return rows
 
-    def _rows_of_motion(self) -> list[tuple[str, str]]:
-        if self.near_share is None:
-            return []
-        after = "-" if self.near_median_s is None else f"{self.near_median_s:.2f} s"
-        return [
-            (f"within {NEAR_MM:g} mm for good", f"{100 * self.near_share:.1f} %"),
-            ("  after, in the median of all", after),
-            ("overshoot, median", f"{self.overshoot_median_mm:.1f} mm"),
-            ("overshoot, 95 %", f"{self.overshoot_p95_mm:.1f} mm"),
-        ]
+
+@dataclass(frozen=True)
+class Summary(Figures):
+    """Figures at the held-out goals and on the circle."""
+
+    median_mm: float = figure("tip error, median", "mm", 2)
+    p95_mm: float = figure("tip error, 95 %", "mm", 2)
+    # A goal is reached with the norm of e below theta and no chamber saturated.
+    reached_share: float = figure("goals reached", "%", 1)
+    saturated_share: float = figure("goals with a saturated chamber", "%", 1)
+    even_median_mm: float = figure("uniform in volume: median", "mm", 2)
+    even_p95_mm: float = figure("uniform in volume: 95 %", "mm", 2)
+    even_reached_share: float = figure("uniform in volume: reached", "%", 1)
+    unsettled: int = figure("arms that did not settle", "")  # at all goals and on the circle
+    circle_mean_mm: float = figure("circle, mean tip error", "mm", 2)
+    circle_max_mm: float = figure("circle, largest tip error", "mm", 2)
+    circle_saturated_chambers: int = figure("circle, saturated chambers", "")  # summed over the points
+    # In motion only. The time `near_s` is infinite for an arm that is never within NEAR_MM for good.
+    near_share: float | None = figure(f"within {NEAR_MM:g} mm for good", "%", 1, default=None)
+    near_median_s: float | None = figure("  after, in the median of all", "s", 2, default=None)
+    overshoot_median_mm: float | None = figure("overshoot, median", "mm", 1, default=None)
+    overshoot_p95_mm: float | None = figure("overshoot, 95 %", "mm", 1, default=None)
 
 
 class Evaluator:

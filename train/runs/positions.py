@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -14,7 +13,7 @@ from mjx_softarm._support import xla
 from mjx_softarm.env import ReachEnv
 from mjx_softarm.sensing.pose import pose_error
 from train.agent.learner import Learner
-from train.runs.evaluate import N_ACTIONS, Reached, follower, nominal, start_keys
+from train.runs.evaluate import N_ACTIONS, Figures, Reached, figure, follower, nominal, start_keys
 
 
 class AtPositions(NamedTuple):
@@ -25,39 +24,21 @@ class AtPositions(NamedTuple):
 
 
 @dataclass(frozen=True)
-class PositionSummary:
-    """Figures of an evaluation, as tables show them."""
+class PositionSummary(Figures):
+    """Figures at demonstrated positions."""
 
-    success_share: float
-    success_first_share: float  # share of success at the goals of the first stage
-    reached_share: float  # positions with the tip close enough, whatever chambers and wall say
-    median_mm: float  # tip error
-    max_mm: float  # largest tip error
-    x_mm: float  # mean absolute error along x
-    y_mm: float  # mean absolute error along y
-    z_mm: float  # mean absolute error along z
-    saturated_positions: int
-    outside_positions: int  # with part of the body beyond the pipe's wall, in motion on the way there
-    unsettled: int
+    success_share: float = figure("positions with success", "%", 1)
+    success_first_share: float = figure("positions of the first stage with success", "%", 1)
+    reached_share: float = figure("positions reached", "%", 1)  # whatever chambers and wall say
+    median_mm: float = figure("tip error, median", "mm", 2)
+    max_mm: float = figure("tip error, largest", "mm", 2)
+    x_mm: float = figure("mean absolute error in x", "mm", 2)
+    y_mm: float = figure("mean absolute error in y", "mm", 2)
+    z_mm: float = figure("mean absolute error in z", "mm", 2)
+    saturated_positions: int = figure("positions with a saturated chamber", "")
+    outside_positions: int = figure("positions with the body outside the pipe", "")  # also on the way there
+    unsettled: int = figure("arms that did not settle", "")
     error_mm: tuple[float, ...]  # tip error at each position
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the figures by name."""
-        return dataclasses.asdict(self)
-
-    def rows(self) -> list[tuple[str, str]]:
-        """Return the rows of a table: name, and value with its unit."""
-        return [
-            ("positions with success", f"{100 * self.success_share:.1f} %"),
-            ("positions of the first stage with success", f"{100 * self.success_first_share:.1f} %"),
-            ("positions reached", f"{100 * self.reached_share:.1f} %"),
-            ("tip error, median", f"{self.median_mm:.2f} mm"),
-            ("tip error, largest", f"{self.max_mm:.2f} mm"),
-            ("mean absolute error in x, y, z", f"{self.x_mm:.2f}, {self.y_mm:.2f}, {self.z_mm:.2f} mm"),
-            ("positions with a saturated chamber", f"{self.saturated_positions}"),
-            ("positions with the body outside the pipe", f"{self.outside_positions}"),
-            ("arms that did not settle", f"{self.unsettled}"),
-        ]
 
 
 class PositionEvaluator:
