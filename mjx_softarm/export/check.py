@@ -161,9 +161,8 @@ def _by_program(golden: Golden, path: Path) -> tuple[np.ndarray, dict[str, np.nd
     words = [*first.split(), *("",) * 4]
     if done.returncode or words[:2] != ["mjx_softarm", str(PROGRAM_VERSION)]:
         got = done.stderr.strip() or f"exit status {done.returncode}, first line {first!r}"
-        raise InputError(
-            f"{path}: got {got}, expected a program that answers rows of version {PROGRAM_VERSION}"
-        )
+        expected = f"a program that answers rows of version {PROGRAM_VERSION}"
+        raise InputError(f"{path}: got {got}, expected {expected}")
     _same_policy(path, words[2], golden)
     try:
         answers = np.array([line.split() for line in rest], float).reshape(golden.outputs.shape)

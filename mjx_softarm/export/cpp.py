@@ -14,9 +14,7 @@ from mjx_softarm.policy.file import file_entries
 from mjx_softarm.policy.reach import N_STEPS, begin
 from mjx_softarm.sensing.load import HIGHEST, JUMP, LOWEST, N_AVERAGED, N_JUMPS
 
-_TEMPLATES = {"softarm.hpp": "softarm.hpp.in"} | {
-    name: name for name in ("rows.cpp", "example.cpp", "CMakeLists.txt")
-}
+_TEMPLATES = ("softarm.hpp.in", "rows.cpp", "example.cpp", "CMakeLists.txt")
 
 
 def sources(controller: Controller, policy_sha256: str) -> dict[str, str]:
@@ -69,9 +67,9 @@ def sources(controller: Controller, policy_sha256: str) -> dict[str, str]:
     }
     # Fill the templates.
     texts = {}
-    for name, template in _TEMPLATES.items():
+    for template in _TEMPLATES:
         text = resources.files("mjx_softarm").joinpath(f"export/templates/{template}").read_text("utf-8")
         for key, value in values.items():
             text = text.replace(f"@{key}@", str(value))
-        texts[name] = text
+        texts[template.removesuffix(".in")] = text
     return texts

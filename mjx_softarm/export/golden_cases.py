@@ -111,9 +111,8 @@ def _single_rows(controller: Controller, rng: np.random.Generator) -> Iterator[n
 def _checked_rows(controller: Controller, rng: np.random.Generator) -> Iterator[np.ndarray]:
     """Yield goals inside the workspace: up to half of N_CHECKED beyond reach, and as many within."""
     policy, n = controller.policy, controller.policy.spec.n_chambers
-    goals = rng.choice(policy.workspace, _CANDIDATES) + rng.normal(
-        0.0, [5.0] * 3 + [30.0] * 3, (_CANDIDATES, 6)
-    )
+    goals = rng.choice(policy.workspace, _CANDIDATES)
+    goals = goals + rng.normal(0.0, [5.0] * 3 + [30.0] * 3, goals.shape)
     goals = goals[[nearest(controller.reachable, goal)[1] < 0.98 for goal in goals]]
     errors = np.array([nearest_poses(policy, goals + shift)[1] for shift in (0.0, _SHIFT)])
     least, most = errors.min(axis=0) / policy.reward.threshold, errors.max(axis=0) / policy.reward.threshold

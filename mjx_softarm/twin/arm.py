@@ -113,9 +113,8 @@ class Twin(InstrumentedArm):
         for _ in range(self._steps):
             self._step()
         if self._data.warning.number.any():  # MuJoCo would reset the state by itself
-            raise FloatingPointError(
-                f"twin: got an unstable state at {self.time_s:g} s, expected a stable one"
-            )
+            got = f"an unstable state at {self.time_s:g} s"
+            raise FloatingPointError(f"twin: got {got}, expected a stable one")
         self.time_s += self._steps * self._model.opt.timestep
 
     def _lengths_m(self) -> np.ndarray:

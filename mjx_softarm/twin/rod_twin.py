@@ -131,7 +131,7 @@ class RodTwin(InstrumentedArm):
 def draw_rod(rng: np.random.Generator, spec: ArmSpec, std: RodTolerances, up: np.ndarray) -> RodParts:
     """Draw the numbers of a rod; `up` (3,) points against gravity, in the axes of its base."""
     s, length_m = spec.structure.n_sections, spec.geometry.section_length_m
-    chambers, backbone = spec.chambers, spec.backbone
+    chambers, backbone, per_chamber = spec.chambers, spec.backbone, (s, N_CHAMBERS_PER_SECTION)
 
     def factors(deviation: float, *shape: int) -> np.ndarray:
         return 1.0 + drawn(rng, deviation, *shape)
@@ -139,8 +139,8 @@ def draw_rod(rng: np.random.Generator, spec: ArmSpec, std: RodTolerances, up: np
     def holes(radius_m: float) -> np.ndarray:
         first = np.radians(spec.geometry.first_chamber_deg)
         angle = first + 2 * np.pi * np.arange(N_CHAMBERS_PER_SECTION) / N_CHAMBERS_PER_SECTION
-        angle = angle + np.radians(drawn(rng, std.hole_angle_deg, s, N_CHAMBERS_PER_SECTION))
-        radius = radius_m + drawn(rng, std.hole_radius_m, s, N_CHAMBERS_PER_SECTION)
+        angle = angle + np.radians(drawn(rng, std.hole_angle_deg, *per_chamber))
+        radius = radius_m + drawn(rng, std.hole_radius_m, *per_chamber)
         return radius[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
     def each(value: float | tuple[float, ...]) -> np.ndarray:
@@ -148,7 +148,7 @@ def draw_rod(rng: np.random.Generator, spec: ArmSpec, std: RodTolerances, up: np
 
     # The order of the draws belongs to the seed: another order makes other rods.
     roll_rad = np.radians(drawn(rng, std.section_roll_deg, s))
-    area = factors(std.chamber_area, s, N_CHAMBERS_PER_SECTION)
+    area = factors(std.chamber_area, *per_chamber)
     stiff = factors(std.backbone_stiffness, s)
     return RodParts(
         section_length_m=length_m,
@@ -160,12 +160,9 @@ def draw_rod(rng: np.random.Generator, spec: ArmSpec, std: RodTolerances, up: np
         joint=np.stack([rotation_about(np.array([0.0, 0.0, roll])) for roll in roll_rad]),
         chamber_hole_m=holes(spec.geometry.chamber_radius_m),
         spring_hole_m=holes(spec.geometry.spring_radius_m),
-        stiffness=each(chambers.stiffness_n_per_m)
-        * factors(std.chamber_stiffness, s, N_CHAMBERS_PER_SECTION),
-        hardening=np.full((s, N_CHAMBERS_PER_SECTION), std.hardening),
-        rest_m=length_m
-        + each(chambers.length_offset_m)
-        + drawn(rng, std.chamber_length_m, s, N_CHAMBERS_PER_SECTION),
+        stiffness=each(chambers.stiffness_n_per_m) * factors(std.chamber_stiffness, *per_chamber),
+        hardening=np.full(per_chamber, std.hardening),
+        rest_m=length_m + each(chambers.length_offset_m) + drawn(rng, std.chamber_length_m, *per_chamber),
         area=1e3 * each(chambers.area_m2) * area,
         area_slope=1e3 * each(chambers.area_slope_m) * area,
         spring_stiffness=spec.springs.stiffness_n_per_m,

@@ -40,17 +40,15 @@ class SerialArm(LineArm):
             except TimeoutError as error:
                 if time.monotonic() > end_s:
                     self._serial.close()
-                    raise OSError(
-                        f"{self.port}: got no readings, expected some within {START_S:g} s; {error}"
-                    ) from error
+                    got = f"got no readings, expected some within {START_S:g} s; {error}"
+                    raise OSError(f"{self.port}: {got}") from error
 
     def send(self, line: bytes) -> None:
         try:
             self._serial.write(line)
         except self._late as error:
-            raise TimeoutError(
-                f"{self.port}: got a line stuck, expected it sent within {1e3 * self.timeout_s:g} ms"
-            ) from error
+            expected = f"it sent within {1e3 * self.timeout_s:g} ms"
+            raise TimeoutError(f"{self.port}: got a line stuck, expected {expected}") from error
 
     def receive(self, timeout_s: float) -> bytes:
         if b"\n" not in self._rest:
