@@ -69,8 +69,10 @@ def guarded(run: Callable[[], int]) -> int:
     """Run a command; return its exit status, 2 after an error that its user can put right, 130 on Ctrl-C."""
     try:
         return run()
-    except SystemExit as stop:  # tyro has printed help, or which option is wrong
-        return int(stop.code or 0)
+    except SystemExit as stop:
+        if stop.code is None or isinstance(stop.code, int):  # tyro has printed help, or which option is wrong
+            return stop.code or 0
+        text = stop.code  # of a program that ends itself with a message, such as a user's driver
     except InputError as error:
         text = str(error)
     except OSError as error:

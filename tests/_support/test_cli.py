@@ -138,6 +138,17 @@ def test_a_mistake_is_one_line_and_status_2(words, message, capsys):
     assert out == "" and err.startswith(f"error: {message}") and err.count("\n") == 1
 
 
+@pytest.mark.parametrize(
+    ("code", "status", "told"), [(None, 0, ""), (3, 3, ""), ("no serial port", 2, "error: no serial port\n")]
+)
+def test_a_program_that_ends_itself_keeps_its_status_or_its_message(code, status, told, capsys):
+    def ends() -> int:
+        raise SystemExit(code)
+
+    assert cli.guarded(ends) == status
+    assert capsys.readouterr().err == told
+
+
 def test_a_bug_is_not_taken_for_a_mistake_of_the_user():
     with pytest.raises(ValueError, match="a bug"):
         run("fail", "--how", "bug")

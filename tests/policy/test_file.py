@@ -176,7 +176,7 @@ def test_files_that_are_no_policy(tmp_path):
 
 def test_another_schema_is_named_before_anything_else(file):
     reseal(file, drop=["gains.kp_kpa_per_m", "observation"], schema_version=np.array(6))
-    expected = "expected 7; `python -m train export RUN` writes the policy anew"
+    expected = "expected 7: export the run again, or train it anew"
     assert refusal(file) == f"schema_version: got 6, {expected}"
 
 

@@ -125,7 +125,8 @@ class Run:
             raise RunError(f"{file}: got {error.strerror!r}, expected the folder of a run") from error
         except (ValueError, KeyError, TypeError) as error:
             raise RunError(
-                f"{file}: got a damaged config or another version's ({error}), expected this version's"
+                f"{file}: got a damaged config or another version's ({error}), expected this version's; "
+                "train it anew, or use the version that the file names"
             ) from error
         s2r = load_s2r(path / S2R_FILE, spec.n_chambers) if has_s2r else None
         return cls(path, config, spec, s2r)
