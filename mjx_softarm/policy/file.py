@@ -219,7 +219,7 @@ def _unpack(arrays: Mapping[str, np.ndarray], source: str) -> Policy:
     if version != SCHEMA_VERSION:
         entries.fail(
             "schema_version",
-            f"got {version}, expected {SCHEMA_VERSION}: export the run again, or train it anew if it is older",
+            f"got {version}, expected {SCHEMA_VERSION}: export the run again, or train it anew",
         )
     try:
         spec = ArmSpec.from_dict(entries.table("spec_json"), f"{source}: spec_json")
