@@ -1,8 +1,9 @@
-"""The base of all errors that a user can put right, and the error of a missing optional package."""
+"""Errors that a user can put right, and codes of how a simulation ended."""
 
 from __future__ import annotations
 
 import contextlib
+import enum
 from collections.abc import Iterator
 
 
@@ -22,3 +23,15 @@ def needing(extra: str, where: str) -> Iterator[None]:
     except ImportError as error:
         expected = f"pip install -e '.[{extra}]' in the checkout"
         raise InputError(f"{where}: got no {error.name}, expected {expected}") from error
+
+
+class Result(enum.IntEnum):
+    """A code of how a simulation ended, an int32 in arrays, with a text for messages."""
+
+    text: str
+
+    def __new__(cls, code: int, text: str) -> Result:
+        member = int.__new__(cls, code)
+        member._value_ = code
+        member.text = text
+        return member

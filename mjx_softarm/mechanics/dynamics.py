@@ -27,8 +27,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from mjx_softarm import control, pneumatics
+from mjx_softarm._support.errors import Result
 from mjx_softarm._support.mjx import mjx
-from mjx_softarm._support.result import Result
 from mjx_softarm._support.small_matrices import block_diagonal, products, solve_approximate_gradient
 from mjx_softarm.mechanics.kinematics import Frames, Kinematics
 from mjx_softarm.mechanics.params import ArmParams

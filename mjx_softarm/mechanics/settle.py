@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.custom_derivatives import zero_from_primal
 
-from mjx_softarm._support.result import Result
+from mjx_softarm._support.errors import Result
 from mjx_softarm._support.small_matrices import eliminate, identity, products
 from mjx_softarm.mechanics.implicit import Equilibrium, PressureResponse, equilibrium_tangents
 from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK, Kinematics
