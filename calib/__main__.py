@@ -140,6 +140,7 @@ def _plan(
     from mjx_softarm._support import xla
     from mjx_softarm.logs.pressure_plan import write_plan
 
+    # Refuse what cannot be planned.
     _check_seed(seed)
     if poses < 1:
         raise InputError(f"--poses: got {poses}, expected at least 1")
@@ -147,6 +148,7 @@ def _plan(
         raise InputError(f"--out: got {out}, which is there already, expected a new file")
     arm = ArmSpec.from_toml(calibration / ARM_FILE)
     recorded = load_recorded(calibration / RECORDED_FILE, arm.n_chambers)
+    # Choose the poses, and tell what they are for.
     xla.enable_compilation_cache()
     found = plan(arm, recorded, poses, seed)
     write_plan(out, found.pressure_kpa)

@@ -60,6 +60,7 @@ def _picture(
     from mjx_softarm.mechanics.settle import SettleResult
     from mjx_softarm.mechanics.workspace import settle_many
 
+    # Settle the arm, then draw it as it stands.
     pressure_kpa = np.broadcast_to(np.asarray(pressures), (1, arm.n_chambers))
     found = settle_many(arm, pressure_kpa)
     if not found.settled[0]:

@@ -69,6 +69,7 @@ def template(path: str | Path) -> str:
     """
     if Path(path).exists():
         raise FileExistsError(f"{path}: got a file that exists already, expected the name of a new one")
+    # Ten ticks of an arm that bends to and fro: springs, tip and markers are made up, but fit together.
     spec = ArmSpec.default()
     n_sections = spec.structure.n_sections
     phase = 2.0 * np.pi * (np.arange(10)[:, None] / 10.0 + np.arange(spec.n_chambers) / spec.n_chambers)

@@ -172,6 +172,7 @@ def s2r(fit: S2RFit, pose: np.ndarray, spring_m: np.ndarray, real: np.ndarray, n
         real (n, 6) [mm, deg]: measured poses.
         n_unsettled: number of other poses, at whose spring lengths the simulated arm did not settle.
     """
+    # The table of errors, and the histogram of the held-out ones.
     errors = _errors(
         ("held-out poses, simulated", fit.test_uncorrected),
         ("held-out poses, corrected", fit.test),

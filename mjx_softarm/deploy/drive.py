@@ -107,6 +107,7 @@ class Drive:
             if spring_m is None or not arrived:
                 springs_m = springs_m[:0]
                 continue
+            # At rest for a window, and seen so where the arm has motion capture.
             springs_m = np.vstack([springs_m, spring_m])[-self.window :]
             if len(springs_m) == self.window and still(springs_m) and held():
                 n_unseen += 1

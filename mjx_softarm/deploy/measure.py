@@ -187,6 +187,7 @@ def along(run: LoopRun, dt_s: float) -> dict[str, float]:
         each = [np.linalg.norm(tip[lag:] - goal[: len(goal) - lag], axis=1) for tip, goal in ways]
         return np.concatenate(each)
 
+    # The lag is the one by which the tip's way fits the goal's best.
     lags = range(min(round(MOST_LAG_S / dt_s), max(len(goal) for _, goal in ways) - 1) + 1)
     means = [float(np.nanmean(away_mm(lag))) for lag in lags]
     best, now = int(np.argmin(means)), away_mm(0)

@@ -101,10 +101,12 @@ class Gail:
         Returns:
             The next state, and scalar metrics: the loss without penalty, the penalty, the accuracy.
         """
+        # Points between expert and agent, where the gradient's norm should be 1.
         expert, agent = self._scaled(*expert), self._scaled(*agent)
         mix = jax.random.uniform(key, (expert[0].shape[0], 1))  # (B, 1)
         between = jax.tree.map(lambda e, a: mix * e + (1.0 - mix) * a, expert, agent)  # (B, O), (B, A)
 
+        # Cross-entropy with the penalty, and one step of the optimiser.
         def loss(params: Any) -> tuple[Array, dict[str, Array]]:
             logits = functools.partial(self.network.apply, params)
             on_expert, on_agent = logits(*expert), logits(*agent)

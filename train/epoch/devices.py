@@ -43,6 +43,7 @@ def mesh_of(devices: str | None) -> Mesh | None:
     """
     if devices is None or devices == "1":
         return None
+    # Devices of this process.
     if devices.isdecimal() and int(devices):
         n, found = int(devices), jax.local_devices()
         if len(found) < n:
@@ -50,6 +51,7 @@ def mesh_of(devices: str | None) -> Mesh | None:
             hint = "; the environment variable JAX_NUM_CPU_DEVICES makes more of a CPU" * on_cpu
             raise ConfigError(f"--devices: got {n}, expected at most {len(found)}, which there are{hint}")
         return Mesh(np.array(found[:n]), (AXIS,))
+    # Devices of several processes, which meet at an address or by the cluster's own means.
     meeting = _MEETING.fullmatch(devices)
     if not meeting and devices != CLUSTER:
         raise ConfigError(f"--devices: got {devices!r}, expected a number, {CLUSTER} or HOST:PORT/K/N")

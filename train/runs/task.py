@@ -61,6 +61,7 @@ def task_of(
     if LEARNERS[name].from_demonstrations:
         assert demonstrations is not None
         return _imitation(cast(ImitationConfig, config.learner), env, demonstrations, mesh, learner)
+    # Goals over the whole workspace, held-out ones for the evaluation.
     job = Job(config.learner, env, learner, mesh=mesh)
     return Task(
         job=job,
