@@ -109,7 +109,8 @@ def fit_line(
     )
     warnings = _warnings(fit, wire, "all springs " if shared else "spring")
     if shared:
-        fit = LineFit(*(np.repeat(v, n_columns, axis=0) if isinstance(v, np.ndarray) else v for v in fit))
+        arrays = {name: value for name, value in fit._asdict().items() if isinstance(value, np.ndarray)}
+        fit = fit._replace(**{name: np.repeat(value, n_columns, axis=0) for name, value in arrays.items()})
     return fit._replace(warnings=warnings)
 
 

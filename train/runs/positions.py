@@ -27,9 +27,10 @@ class AtPositions(NamedTuple):
 class PositionSummary(Figures):
     """Figures at demonstrated positions."""
 
+    error_mm: tuple[float, ...]  # tip error at each position
     success_share: float = figure("positions with success", "%", 1)
     success_first_share: float = figure("positions of the first stage with success", "%", 1)
-    reached_share: float = figure("positions reached", "%", 1)  # whatever chambers and wall say
+    reached_share: float = figure("positions reached", "%", 1)  # with or without saturation and contact
     median_mm: float = figure("tip error, median", "mm", 2)
     max_mm: float = figure("tip error, largest", "mm", 2)
     x_mm: float = figure("mean absolute error in x", "mm", 2)
@@ -38,7 +39,6 @@ class PositionSummary(Figures):
     saturated_positions: int = figure("positions with a saturated chamber", "")
     outside_positions: int = figure("positions with the body outside the pipe", "")  # also on the way there
     unsettled: int = figure("arms that did not settle", "")
-    error_mm: tuple[float, ...]  # tip error at each position
 
 
 class PositionEvaluator:
