@@ -141,6 +141,7 @@ IMITATION_PRESETS: dict[str, TrainConfig] = {
             stages=(GoalStage(share=1 / 3, every=2), GoalStage(share=2 / 3, kept=0.2)),
         ),
         evaluation_epochs=2,
+        env=EnvConfig(reward=_ALWAYS),  # that of `quick`, whose critics a run may begin with
     ),
     "pipe": TrainConfig(learner=_PIPE, evaluation_epochs=2),
     # Half-second actions in motion. Payloads as they are carried: they change how the arm moves.

@@ -102,3 +102,7 @@ def test_each_stages_end_is_evaluated(imitation_config):
 def test_a_bad_setting_of_imitation_is_named(imitation_config, assignment, message):
     with pytest.raises(ConfigError, match=message):
         override(imitation_config, [assignment])
+
+
+def test_the_circle_has_the_reward_of_the_critics_that_it_may_begin_with():
+    assert IMITATION_PRESETS["circle"].env.reward == PRESETS["quick"].env.reward
