@@ -30,7 +30,7 @@ def test_overrides_reach_every_level_and_leave_the_preset_alone():
         ("learner.n_arms=0", "learner.n_arms: got 0, expected at least 1"),
         ("learner.gamma=2", "learner.gamma: got 2.0, expected a number in [0, 1]"),
         ("learner.updates_per_env_step=0.001", "at least one update per step of all"),
-        ("learner.hindsight.near_min_mm=0", "learner.hindsight.near_min_mm, near_max_mm: got 0.0"),
+        ("learner.hindsight.near_min_mm=0", "learner.hindsight.near_min_mm: got 0.0"),
         ("learner.replay_capacity=10", "learner.replay_capacity: got 10, expected at least n_arms = 128"),
     ],
 )
