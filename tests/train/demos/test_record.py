@@ -164,10 +164,8 @@ RECORD = ("record", "--arm", "a:B", "--out")
 
 
 def test_the_command_records_a_task_and_checks_its_file(command, tmp_path, monkeypatch, waypoints):
-    whole = functools.partial(task, "pipe300")
-    monkeypatch.setattr(
-        "train.demos.command.task", lambda name, spec: whole(spec)._replace(waypoints=waypoints[:2])
-    )
+    _, pipe = task("pipe300", SPEC)
+    monkeypatch.setattr("train.demos.command.task", lambda name, spec: (waypoints[:2], pipe))
     out = tmp_path / "demos.csv"
     status, told = command(*RECORD, out, "--task", "pipe300")
     assert status == 0, told

@@ -32,6 +32,9 @@ def assert_equal(a, b):
 )
 def test_every_engine_traces_its_epoch_once_and_counts_what_it_did(job, change):
     config = dataclasses.replace(CONFIG, env=dataclasses.replace(CONFIG.env, **change))
+    if config.env.moves:  # with goals that the episode reached later
+        hindsight = dataclasses.replace(config.learner.hindsight, n_later=2)
+        config = dataclasses.replace(config, learner=dataclasses.replace(config.learner, hindsight=hindsight))
     if change:
         job = new_job(config, ReachEnv(SHORT, config.env))
     state = start(job)
