@@ -52,7 +52,7 @@ PRESETS: dict[str, TrainConfig] = {
             batch_size=128,
             replay_capacity=147_456,
         ),
-        evaluation_epochs=24,
+        evaluation_epochs=12,
         env=EnvConfig(reward=_ALWAYS),
     ),
     "analytic": TrainConfig(learner=AnalyticConfig(), evaluation_epochs=24, env=_EVEN),

@@ -189,6 +189,7 @@ def export(folders: Runs, out: cli.MaybePath = None, onnx: bool = False, cpp: cl
     console = start()
     for path in folders:
         run = Run.open(path)
+        console.print("distilling pose and payload estimators for this arm, about a minute ...")
         policy = export_run(run, arm_model(run.spec, run.s2r), out)
         console.print(f"policy: {policy}", highlight=False, soft_wrap=True)
         files = export_onnx(policy) if onnx else []

@@ -77,7 +77,7 @@ def _evaluations(
     steps = [row["env_steps"] for row in evaluated]
     for name, (colour, label) in lines.items():
         values = [factor * row[f"evaluation/{name}"] for row in evaluated]
-        axes.plot(steps, values, color=colour, label=label)
+        axes.plot(steps, values, "o-", markersize=3, color=colour, label=label)
     axes.legend(frameon=False, loc="upper right")
 
 
