@@ -32,10 +32,10 @@ def export_run(run: Run, arm: DistilledArm, path: Path | None = None) -> Path:
         "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     }
     # Put all together; this checks the shapes of the parameters.
-    env = run.config.env
+    env, params = run.config.env, run.policy()
     try:
         policy = policy_from_actor(
-            run.policy(),
+            params,
             run.spec,
             env.reward,
             arm.model,
