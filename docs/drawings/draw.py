@@ -39,6 +39,7 @@ def main() -> None:
 def draw_parts(spec: ArmSpec, image: np.ndarray) -> None:
     """Draw the arm's parts from the side, and the numbers of chambers and springs from above."""
     figure, (side, above) = plt.subplots(1, 2, figsize=(9, 4.6), width_ratios=(1, 1.6), layout="constrained")
+    # The rendered arm, its parts named beside it.
     side.imshow(image)
     side.axis("off")
     side.set_title("from the side, +y to the left")
@@ -53,6 +54,7 @@ def draw_parts(spec: ArmSpec, image: np.ndarray) -> None:
     for share, text in texts:
         side.annotate(text, (1.0, 1.0 - share), xycoords="axes fraction", va="center")
 
+    # A section's plate with chambers, springs and axes.
     params = ArmParams.from_spec(spec)
     above.add_patch(plt.Circle((0, 0), 1.2 * 1e3 * spec.geometry.spring_radius_m, fc="#ececf0", ec="#9090a0"))
     for k in range(3):

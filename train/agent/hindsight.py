@@ -31,7 +31,7 @@ class HindsightConfig:
 
     reached_share: float = 0.5  # share whose goal becomes the pose reached
     near_share: float = 0.0  # share whose goal becomes a pose near the one reached
-    n_later: int = 0  # a reached pose is one of up to so many actions later, also for half of the near ones
+    n_later: int = 0  # largest number of actions to a reached pose, and to half of the near ones
     near_min_mm: float = 1.0  # smallest distance of a near goal
     near_max_mm: float = 100.0  # largest distance of a near goal
     mm_per_deg: float = 1.0  # distance that goes with a turn of one degree of a near goal

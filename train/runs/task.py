@@ -54,15 +54,14 @@ def task_of(
         ConfigError: the learner needs demonstrations and has none, or the run cannot be split evenly over the
             devices of the mesh.
     """
-    name = name_of(config.learner)
-    if LEARNERS[name].from_demonstrations and demonstrations is None:
-        raise ConfigError(f"learner: got {name!r} without demonstrations, expected a file of them")
-    learner = learner_of(config.learner, World(env, mesh, demonstrations))
+    name, world = name_of(config.learner), World(env, mesh, demonstrations)
     if LEARNERS[name].from_demonstrations:
-        assert demonstrations is not None
-        return _imitation(cast(ImitationConfig, config.learner), env, demonstrations, mesh, learner)
+        if demonstrations is None:
+            raise ConfigError(f"learner: got {name!r} without demonstrations, expected a file of them")
+        own = cast(ImitationConfig, config.learner)
+        return _imitation(own, env, demonstrations, mesh, learner_of(own, world))
     # Goals over the whole workspace, held-out ones for the evaluation.
-    job = Job(config.learner, env, learner, mesh=mesh)
+    job = Job(config.learner, env, learner_of(config.learner, world), mesh=mesh)
     return Task(
         job=job,
         title=f"{N_GOALS} held-out goals",
