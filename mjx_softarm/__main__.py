@@ -77,7 +77,7 @@ def _picture(
 
 
 def _workspace(spec: cli.SpecFile = None, out: Path = Path(".")) -> int:
-    """Draw the reachable workspace, and compare its coverage of the YZ plane with the paper's.
+    """Draw the reachable workspace, and print its coverage of the YZ plane.
 
     The tip is computed at every combination of lowest, zero and highest pressure: 19,683 for nine chambers.
 
@@ -106,9 +106,11 @@ def _workspace(spec: cli.SpecFile = None, out: Path = Path(".")) -> int:
     lateral, vertical = np.ptp(tip_mm[:, 1]), np.ptp(tip_mm[:, 2])
     plot.draw_workspace(out / "workspace.png", arm, tip_mm)
     print(f"{n:,} combinations of pressures, {n_lost:,} not settled ({n_lost / n:.2%})")
-    print("coverage of the YZ plane   arm      paper")
-    print(f"  lateral (y)            {lateral:6.1f}   {plot.PAPER_LATERAL_MM:6.1f} mm")
-    print(f"  vertical (z)           {vertical:6.1f}   {plot.PAPER_VERTICAL_MM:6.1f} mm")
+    paper_mm = plot.paper_coverage_mm(arm)
+    beside = [f", paper {size_mm:.1f} mm" for size_mm in paper_mm] if paper_mm else ["", ""]
+    print("coverage of the YZ plane")
+    print(f"  lateral (y)   {lateral:6.1f} mm{beside[0]}")
+    print(f"  vertical (z)  {vertical:6.1f} mm{beside[1]}")
     print(f"wrote {out / 'workspace.png'}")
     return 0
 

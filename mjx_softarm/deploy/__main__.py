@@ -31,8 +31,9 @@ from mjx_softarm.deploy.record import record
 from mjx_softarm.deploy.session import follow, trace
 from mjx_softarm.logs import mcap_file
 from mjx_softarm.logs.pressure_plan import read_plan
+from mjx_softarm.logs.schema import ENDINGS
 from mjx_softarm.mechanics.excitation import growing, random_pressures
-from mjx_softarm.policy.file import SHIPPED, load_policy
+from mjx_softarm.policy.file import SHIPPED, Policy, load_policy
 from mjx_softarm.spec import ArmSpec
 
 _STATUS = """Exit status: 0 done; 1 done, but a goal was not reached, or was refused, or no pose was logged;
@@ -102,7 +103,7 @@ def _run(
     run = follow(open_arm(arm), controller, goals, limit_s, tell, save=save, stay=stay)
     if log and run.ending.status != cli.ERROR:
         print(f"log: {log}, {len(run.log)} rows")
-    _summary(run)
+    _summary(run, controller.policy)
     return run.status
 
 
@@ -112,7 +113,7 @@ def _controller(policy: Path) -> Controller:
     return Controller.of(load_policy(policy))
 
 
-def _summary(run: LoopRun) -> None:
+def _summary(run: LoopRun, policy: Policy) -> None:
     for fault, count in run.counts().items():
         print(f"fault: {fault.value}: {count} times, {fault.response.value}")
     if len(run.latency_s):
@@ -121,6 +122,18 @@ def _summary(run: LoopRun) -> None:
         print(f"from readings to pressures: median {median:.2f} ms, 99.9 % {high:.2f} ms of {n} ticks")
     reached = f"{sum(arrival.reached for arrival in run.arrivals)} of {run.n_goals} goals reached"
     print(f"{reached}; the arm is {'' if run.ending.vented else 'NOT '}vented")
+
+    # The error that a goal allows, and a reason for more
+    if all(arrival.reached for arrival in run.arrivals):
+        return
+    reward = policy.reward
+    mm, deg = (reward.threshold / weight for weight in (reward.weight_per_mm, reward.weight_per_deg))
+    print(f"reached: within {mm:.1f} mm without a rotation error, or within {deg:.0f} deg without a distance")
+    if not policy.calibrated:
+        print(
+            "the policy is not calibrated: it is expected to miss on an arm that differs from its "
+            "specification; record a log, run `python -m calib run`, train and export (docs/your-arm.md)"
+        )
 
 
 def _measure(
@@ -160,7 +173,7 @@ def _measure(
         pace_s = seconds / max(len(poses) - 1, 1)
         run = trace(driver, controller, poses, pace_s, tell=tell, save=save)
     if not run.arrivals:
-        _summary(run)
+        _summary(run, controller.policy)
         return run.status
 
     # Figures, written and printed
@@ -174,7 +187,7 @@ def _measure(
         print(missing)
     _print_accuracy(found)
     print(f"figures: {out / 'accuracy.json'}")
-    _summary(run)
+    _summary(run, controller.policy)
     return run.status
 
 
@@ -239,8 +252,10 @@ def tell(text: str) -> None:
     print(text, flush=True)
 
 
-def check_file(option: str, path: Path | None) -> None:
-    """Refuse a log that could not be written before the arm moves."""
+def check_file(option: str, path: Path | None, endings: Sequence[str] = ENDINGS) -> None:
+    """Refuse a file that could not be written, or whose ending names another format, before the arm moves."""
+    if path is not None and path.suffix and path.suffix not in endings:
+        raise InputError(f"{option}: got {path}, expected a name that ends in {' or '.join(endings)}")
     if path is not None and not path.parent.is_dir():
         raise InputError(f"{option}: got {path}, expected a file in a folder that exists")
     if path is not None and path.is_dir():

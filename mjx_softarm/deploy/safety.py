@@ -77,6 +77,9 @@ class Fault(Enum):
         return fault
 
 
+PAYLOAD_FAULTS = {Fault.OVERLOADED, Fault.LOAD_UNKNOWN}  # they last from one estimate of it to the next
+
+
 class Event(NamedTuple):
     """A fault that was found."""
 

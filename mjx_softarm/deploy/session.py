@@ -19,7 +19,7 @@ from mjx_softarm.deploy.ending import Arrival, LoopRun, vent_at_end
 from mjx_softarm.deploy.goals import Goals, ListedGoals, OrderedGoals, Pilot, Way
 from mjx_softarm.deploy.link import ArmFault, Link, Recorder
 from mjx_softarm.deploy.loop import LoopState, Tick, in_force, refusals, start, step
-from mjx_softarm.deploy.safety import Event, Fault, Response
+from mjx_softarm.deploy.safety import PAYLOAD_FAULTS, Event, Fault, Response
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mdp.rewards import scaled_error
 from mjx_softarm.sensing.pose import pose_error, seen_error
@@ -181,7 +181,7 @@ class _Session:
             self.state = in_force(self.state, self.link.pressure_kpa)
         finally:  # the row is kept even if the pressures were refused; logging comes after them
             self._log(row)
-            self._note(tick.events)
+            self._note(tick.events, self.state.belief.estimate_kg is not None)
             if tick.arrived:
                 self._arrive(row["goal"], row["estimate"])
             self.look(self.state, tick, row)
@@ -195,12 +195,16 @@ class _Session:
         row["reference_m"] = self.nothing if reference_m is None else reference_m
         self.rows.add(row)
 
-    def _note(self, events: Sequence[Event]) -> None:
-        """Count events, and tell those that are new in this tick; the end of the run tells why it vents."""
+    def _note(self, events: Sequence[Event], estimated: bool = False) -> None:
+        """Count events, and tell those that are new in this tick; the end of the run tells why it vents.
+
+        Faults of the payload last until it is next estimated; `estimated` says whether it was.
+        """
         for event in events:
             if event.fault not in self.last and event.response is not Response.VENT:
                 self.tell(self._at(event))
-        self.last = {event.fault for event in events}
+        lasting = set() if estimated else self.last & PAYLOAD_FAULTS
+        self.last = lasting | {event.fault for event in events}
         self.events.extend(events)
 
     def _arrive(self, goal: np.ndarray, estimate: np.ndarray) -> None:
@@ -208,11 +212,12 @@ class _Session:
         if np.isnan(error).any():
             error, how = pose_error(np.asarray(estimate, float), goal), "the springs"
         reward = self.controller.policy.reward
-        reached = bool(np.linalg.norm(scaled_error(goal + error, goal, reward)) < reward.threshold)
+        share = float(np.linalg.norm(scaled_error(goal + error, goal, reward))) / reward.threshold
+        reached = share < 1.0
         self.arrivals.append(Arrival(goal, estimate, len(self.rows) - 1, self.goals.n_taken - 1, reached))
         angles = ", ".join(f"{value:+.1f}" for value in error[3:])
         off = f"{np.linalg.norm(error[:3]):.1f} mm off by {how}; yaw, pitch, roll {angles} deg off"
-        missed = "" if reached else "; NOT REACHED"
+        missed = "" if reached else f"; NOT REACHED, {share:.1f} times the error that a goal allows"
         self.tell(self._at(f"goal {len(self.arrivals)}: {off}{missed}"))
         self.arrived(self.goals.n_taken - 1)
 

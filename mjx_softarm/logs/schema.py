@@ -34,6 +34,8 @@ UNITS: Mapping[str, Mapping[str, float]] = MappingProxyType(
         **{sensor.reading_name: sensor.units for sensor in SENSORS.values()},
     }
 )
+TABLES = (".csv", ".npz")  # endings of the logs that this project reads
+ENDINGS = (*TABLES, mcap_file.SUFFIX)  # endings of the logs that it writes
 _XYZ = ("x", "y", "z")
 _POSE = dict.fromkeys(_XYZ, ("pose_length", "mm")) | dict.fromkeys(("yaw", "pitch", "roll"), ("angle", "deg"))
 

@@ -1,4 +1,4 @@
-"""Picture of the reachable workspace, with the paper's coverage."""
+"""Picture of the reachable workspace, for the paper's arm with the coverage that the paper reports."""
 
 from __future__ import annotations
 
@@ -17,6 +17,11 @@ from mjx_softarm.spec import ArmSpec
 
 PAPER_LATERAL_MM, PAPER_VERTICAL_MM = 400.0, 350.0  # paper: coverage of the YZ plane
 _GAP_MM = 40.0  # tips closer than this belong to one region of the workspace
+
+
+def paper_coverage_mm(spec: ArmSpec) -> tuple[float, float] | None:
+    """Return the paper's lateral and vertical coverage [mm] of the YZ plane; None for another arm."""
+    return (PAPER_LATERAL_MM, PAPER_VERTICAL_MM) if spec == ArmSpec.default() else None
 
 
 def outline(points: np.ndarray, gap: float) -> np.ndarray:
@@ -58,7 +63,7 @@ def draw_workspace(path: Path, spec: ArmSpec, tip_mm: np.ndarray) -> None:
         plane = figure.add_axes((0.53, 0.1, 0.38, 0.76))
         scale = figure.add_axes((0.92, 0.1, 0.014, 0.76))
         _draw_space(space, tip_mm, distance)
-        _draw_plane(plane, tip_mm, distance)
+        _draw_plane(plane, tip_mm, distance, paper_coverage_mm(spec))
         colours = ScalarMappable(Normalize(distance.min(), distance.max()))
         figure.colorbar(colours, cax=scale, label="distance from the base [mm]")
         levels = f"{spec.chambers.pressure_min_kpa:g}, 0 or {spec.chambers.pressure_max_kpa:g} kPa"
@@ -79,8 +84,8 @@ def _draw_space(axes, tip_mm: np.ndarray, distance: np.ndarray) -> None:
         axis.labelpad = 8
 
 
-def _draw_plane(axes, tip_mm: np.ndarray, distance: np.ndarray) -> None:
-    """Draw the tips on the YZ plane, their outline, and the coverage beside the paper's."""
+def _draw_plane(axes, tip_mm: np.ndarray, distance: np.ndarray, paper_mm: tuple[float, float] | None) -> None:
+    """Draw the tips on the YZ plane, their outline, and the coverage, beside the paper's if it is given."""
     yz = tip_mm[:, 1:]
     axes.scatter(*yz.T, c=distance, s=4, alpha=0.5, linewidths=0)
     boundary = LineCollection(list(outline(yz, _GAP_MM)), colors="crimson", linewidths=1.6, capstyle="round")
@@ -93,18 +98,19 @@ def _draw_plane(axes, tip_mm: np.ndarray, distance: np.ndarray) -> None:
     (left, bottom), (right, top) = yz.min(0), yz.max(0)
     margin = 0.12 * max(right - left, top - bottom)
     axes.set(xlim=(left - margin, right + 2.2 * margin), ylim=(bottom - 2.2 * margin, top + margin))
-    _dimension(axes, (left, bottom - margin), (right, bottom - margin), right - left, PAPER_LATERAL_MM)
-    _dimension(axes, (right + margin, bottom), (right + margin, top), top - bottom, PAPER_VERTICAL_MM)
+    lateral_mm, vertical_mm = (f" (paper: {size:.0f})" for size in paper_mm) if paper_mm else ("", "")
+    _dimension(axes, (left, bottom - margin), (right, bottom - margin), right - left, lateral_mm)
+    _dimension(axes, (right + margin, bottom), (right + margin, top), top - bottom, vertical_mm)
 
 
-def _dimension(axes, start, end, size_mm: float, paper_mm: float) -> None:
-    """Draw a dimension line with its number and the paper's."""
+def _dimension(axes, start, end, size_mm: float, note: str) -> None:
+    """Draw a dimension line with its number and a note."""
     axes.annotate(
         "", start, end, arrowprops={"arrowstyle": "<->", "color": "0.2", "shrinkA": 0, "shrinkB": 0}
     )
     upright = start[0] == end[0]
     axes.annotate(
-        f"{size_mm:.0f} mm (paper: {paper_mm:.0f})",
+        f"{size_mm:.0f} mm{note}",
         ((start[0] + end[0]) / 2, (start[1] + end[1]) / 2),
         xytext=(5, 0) if upright else (0, -5),
         textcoords="offset points",

@@ -54,7 +54,7 @@ from mjx_softarm.sensing.estimator import PoseEstimator, SpringModel, take_estim
 from mjx_softarm.sensing.load import LoadEstimator, take_load_estimator
 from mjx_softarm.sensing.s2r import S2R, take_s2r
 from mjx_softarm.sensing.sensors import Sensor, SensorFault
-from mjx_softarm.spec import ArmSpec, SpecError
+from mjx_softarm.spec import ArmSpec, Mounting, SpecError
 
 SCHEMA_VERSION = 7
 
@@ -88,6 +88,11 @@ class Policy:
     def obs_layout(self) -> tuple[str, ...]:
         """Names of the observation's entries."""
         return layouts(self.spec.n_chambers)[self.observation]
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether the policy was trained on a calibration of its arm: with S2R, or with a fitted mounting."""
+        return self.s2r is not None or self.spec.mounting != Mounting()
 
     @property
     def sensor(self) -> Sensor:

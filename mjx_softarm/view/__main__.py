@@ -19,6 +19,7 @@ from mjx_softarm._support.errors import InputError, needing
 from mjx_softarm.deploy.__main__ import Arm, PolicyFile, check_file, tell
 from mjx_softarm.deploy.drivers.names import open_arm
 from mjx_softarm.deploy.ending import save_log
+from mjx_softarm.logs.schema import TABLES
 from mjx_softarm.policy.file import SHIPPED, load_policy
 from mjx_softarm.spec import ArmSpec
 
@@ -65,8 +66,9 @@ def _view(
     # Check the options before anything is opened.
     with needing("view", "view"):
         import viser  # noqa: F401
-    for option, path in (("--log", log), ("--demos", demos), ("--html", html)):
-        check_file(option, path)
+    check_file("--log", log)
+    check_file("--demos", demos, TABLES)
+    check_file("--html", html, (".html", ".htm"))
     # Show a folder's errors, or replay logs.
     if any(path.is_dir() for path in logs):
         return _errors(logs, html, at)

@@ -1,6 +1,7 @@
 """Arms by name, and the command line that drives them, without JAX in its process."""
 
 import json
+import re
 import subprocess
 import sys
 import time
@@ -134,6 +135,10 @@ def test_accuracy_is_measured_without_jax(folder):
     found = json.loads((folder / "a" / "accuracy.json").read_text())
     assert (found["points"], found["measured"], found["reached"]) == (1, 1, 0)
     assert "1 of 1 goals measured" in done.stdout and "0 of 1 goals reached" in done.stdout
+    times = float(re.search(r"NOT REACHED, (\S+) times the error that a goal allows", done.stdout)[1])
+    assert times > 1.0 and "reached: within 5.4 mm without a rotation error" in done.stdout
+    assert "the policy is not calibrated: it is expected to miss" in done.stdout
+    assert "python -m calib run" in done.stdout
     off_mm = np.linalg.norm(goal[:3] - [0.0, 0.0, -500.0])
     assert found["translation_mm"] == found["max_mm"] == pytest.approx(off_mm)
     assert found["saturated_points"] == 1 and len(read_log(folder / "a" / "log.npz")[0]) > 100
@@ -152,6 +157,14 @@ def test_command_line_tells_what_is_wrong(folder):
         (
             ("run", "policy.npz", "--arm", "driver:Arm", *goal, "--log", "no/a.csv"),
             "--log: got no/a.csv, expected a file in a folder",
+        ),
+        (
+            ("run", "policy.npz", "--arm", "driver:Arm", *goal, "--log", "a.xlsx"),
+            "--log: got a.xlsx, expected a name that ends in .csv or .npz or .mcap",
+        ),
+        (
+            ("record", "--arm", "driver:Arm", "--out", "a.txt"),
+            "--out: got a.txt, expected a name that ends in .csv or .npz or .mcap",
         ),
     ):
         done = command(folder, *args)

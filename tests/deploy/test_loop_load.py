@@ -199,6 +199,21 @@ def test_overload_and_what_no_payload_explains_are_reported(payload_kg, fault, l
     assert run.log.load_kg[-1] == pytest.approx(load_kg, abs=0.03 * (load_kg > 0.0))
 
 
+def test_a_fault_of_the_payload_is_told_once_until_the_payload_changes():
+    """The arm carries too much at the first and the last of three goals, and is counted each half second."""
+    lines, heights = [], (0.0, 10.0, 20.0)
+    goals = [GOAL + [0.0, 0.0, up_mm, 0.0, 0.0, 0.0] for up_mm in heights]
+    arm = LoadedArm(2.5)
+    loads_kg = iter((0.0, 2.5, 2.5))
+
+    def next_load(goal):
+        arm._payload_kg = next(loads_kg)
+
+    run = follow(arm, goals=goals, tell=lines.append, arrived=next_load)
+    told = [line for line in lines if "load unknown" in line]
+    assert len(told) == 2 and run.counts()[Fault.LOAD_UNKNOWN] > 6 and len(run.arrivals) == 3
+
+
 def test_measured_pressures_tell_more_than_those_in_force():
     lines, blind = [], []
     seen, unseen = follow(Honest(0.5), tell=lines.append), follow(Weak(0.5), tell=blind.append)

@@ -4,6 +4,7 @@ import contextlib
 import functools
 import io
 import itertools
+import re
 
 import matplotlib.image
 import mujoco
@@ -13,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from mjx_softarm import ArmSpec
 from mjx_softarm.__main__ import main
+from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.mechanics.mjcf import build_model, spring_lengths
 from mjx_softarm.mechanics.workspace import (
     BATCH,
@@ -188,17 +190,24 @@ def test_spec_writes_the_default_arm_with_its_sources_and_replaces_nothing(tmp_p
     assert ArmSpec.from_toml(path) == SPEC
 
 
-def test_workspace_draws_the_figure_and_prints_the_coverage(tmp_path):
+def test_workspace_draws_the_figure_and_prints_the_coverage(tmp_path, monkeypatch):
     SMALL.to_toml(tmp_path / "small.toml")
     code, printed, complaint = run("workspace", "--spec", tmp_path / "small.toml", "--out", tmp_path / "new")
     assert (code, complaint) == (0, "")
     assert "27 combinations of pressures, 0 not settled (0.00%)" in printed
     lateral, vertical = coverage_mm(extreme_poses(SMALL))
-    assert f"lateral (y)            {lateral:6.1f}    400.0 mm" in printed
-    assert f"vertical (z)           {vertical:6.1f}    350.0 mm" in printed
+    assert f"lateral (y)   {lateral:6.1f} mm\n" in printed
+    assert f"vertical (z)  {vertical:6.1f} mm\n" in printed
     image = matplotlib.image.imread(tmp_path / "new" / "workspace.png")
     crimson = np.abs(image[..., :3] - [0.863, 0.078, 0.235]).max(-1) < 0.05
     assert image.shape[1] > image.shape[0] > 600 and crimson.sum() > 500  # the boundary is there
+
+    # The paper's numbers stand beside its own arm alone, here at fewer pressures.
+    few = random_pressures(SPEC, 32, seed=0)
+    monkeypatch.setattr("mjx_softarm.mechanics.workspace.extreme_poses", lambda arm: settle_many(arm, few))
+    code, of_paper, _ = run("workspace", "--out", tmp_path)
+    assert code == 0 and "paper" not in printed
+    assert re.search("lateral .* mm, paper 400.0 mm\n.*vertical .* mm, paper 350.0 mm\n", of_paper)
 
 
 def test_picture_draws_the_arm_at_its_pressures(tmp_path):

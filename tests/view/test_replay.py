@@ -62,6 +62,9 @@ def test_command_line(path, tmp_path, capsys):
     for words, message in (
         (("--html", tmp_path / "a.html"), "--html: got no log, expected one or more"),
         ((path, "--html", tmp_path / "no" / "a.html"), "expected a file in a folder that exists"),
+        ((path, "--html", tmp_path / "a.xlsx"), "a.xlsx, expected a name that ends in .html or .htm"),
+        (("--log", tmp_path / "a.xlsx"), "a.xlsx, expected a name that ends in .csv or .npz or .mcap"),
+        (("--demos", tmp_path / "a.mcap"), "a.mcap, expected a name that ends in .csv or .npz"),
         ((tmp_path / "no.csv",), "no.csv"),
     ):
         assert main([*map(str, words)]) == 2

@@ -14,7 +14,7 @@ from rich.console import Console
 from mjx_softarm._support import cli
 from mjx_softarm.deploy.drivers import names
 from mjx_softarm.deploy.ending import DONE, MISSED, NOT_WRITTEN, save_log
-from mjx_softarm.logs.schema import Log
+from mjx_softarm.logs.schema import TABLES, Log
 from mjx_softarm.spec import ArmSpec
 from train.config import ConfigError
 from train.demos.demonstrations import from_log, read_demonstrations
@@ -41,6 +41,8 @@ class Record(ArmOptions):
             raise ConfigError(
                 f"--out: got {self.out}, expected the name of a new file in a folder that exists"
             )
+        if self.out.suffix and self.out.suffix not in TABLES:
+            raise ConfigError(f"--out: got {self.out}, expected a name that ends in {' or '.join(TABLES)}")
         # Plan all postures before the arm moves.
         spec, s2r = self.read_arm(console)
         arm = names.open_arm(self.arm)

@@ -181,6 +181,10 @@ def test_misuse_is_told_before_anything_moves(command, tmp_path):
     for args, message in (
         ((*RECORD, tmp_path / "x.csv"), "--task {circle16,pipe300,pipe250}"),
         ((*RECORD, tmp_path / "no" / "x.csv", "--task", "pipe300"), "expected the name of a new file"),
+        (
+            (*RECORD, tmp_path / "x.xlsx", "--task", "pipe300"),
+            "x.xlsx, expected a name that ends in .csv or .npz",
+        ),
         (("check", tmp_path / "none.csv"), "none.csv: got 'No such file"),
     ):
         status, told = command(*args)
