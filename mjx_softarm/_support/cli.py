@@ -139,9 +139,12 @@ def parse(command: Any, prog: str, arguments: Sequence[str]) -> Callable[[], Any
     """
     begin_with = {"default": command.default(arguments)} if hasattr(command, "default") else {}
     kind = command if inspect.isclass(command) else _later(command)
+    # Settings may begin as true: both forms then stand beside the text, --x and --no-x. A function's flags
+    # all begin as false, and need one form.
+    flags = () if inspect.isclass(command) else (tyro.conf.FlagCreatePairsOff,)
     try:
         return tyro.cli(  # pyright: ignore[reportReturnType, reportCallIssue]
-            kind, prog=prog, args=arguments, config=(tyro.conf.FlagCreatePairsOff,), **begin_with
+            kind, prog=prog, args=arguments, config=flags, **begin_with
         )
     except ValueError as error:
         raise InputError(str(error)) from error

@@ -60,7 +60,7 @@ PolicyFile = Annotated[
 Arm = Annotated[
     str,
     tyro.conf.arg(
-        help="yours: package.module:Class; simulated: twin:SEED, or twin:rod:SEED; twin:rod:SEED@ARM, of "
+        help="yours: package.module:Class; simulated: twin:SEED, or twin:rod:SEED; twin:SEED@ARM.toml, of "
         "another arm; twin:SEED:pipe300, in a pipe; twin:SEED:500g, with a payload"
     ),
 ]

@@ -30,10 +30,11 @@ from mjx_softarm.twin.instruments import (
     checked_payload,
     checked_pressures,
 )
-from mjx_softarm.twin.model import build_twin, draw_parts, rotation_matrix
+from mjx_softarm.twin.model import build_twin, draw_parts, length_ratio, rotation_matrix
 from mjx_softarm.twin.pipe import WallForce, contact_force, is_container
 from mjx_softarm.twin.pneumatics import Pneumatics
 
+# Losses of the paper's arm.
 # Chambers: four stops of equal force; together 3 % of the elastic force of the shortest chamber.
 HYSTERESIS_LIMIT_N = 1.5
 HYSTERESIS_STROKES_M = (0.003, 0.006, 0.012, 0.024)
@@ -85,7 +86,7 @@ class Twin(InstrumentedArm):
         self._steps = round(1.0 / (spec.control.rate_hz * self._model.opt.timestep))
         self.time_s = 0.0
         mujoco.mj_step1(self._model, self._data)
-        self._start_losses()
+        self._start_losses(spec)
         chambers = self._parts.spec.chambers
         area, slope = np.array([*map(spec.per_chamber, (chambers.area_m2, chambers.area_slope_m))])
         now_m, timestep_s = chamber_lengths(self._data), self._model.opt.timestep
@@ -96,13 +97,21 @@ class Twin(InstrumentedArm):
             self.write_pressures(np.zeros(spec.n_chambers))
         self.time_s = 0.0
 
-    def _start_losses(self) -> None:
+    def _start_losses(self, spec: ArmSpec) -> None:
+        """Start hysteresis and friction; they scale with the arm's lengths and stiffnesses."""
+        # Lengths, forces and torques of the nominal arm over those of the paper's
+        paper, length = ArmSpec.default(), length_ratio(spec)
+        stiffness = np.mean(spec.chambers.stiffness_n_per_m) / np.mean(paper.chambers.stiffness_n_per_m)
+        force = length * stiffness
+        torque = spec.backbone.bending_stiffness_nm_per_rad / paper.backbone.bending_stiffness_nm_per_rad
+        # Joints, then chambers
         per_link = self._model.nq // len(FRICTION_LIMIT)
-        limit = self._build.losses * np.tile(FRICTION_LIMIT, per_link)[:, None]
-        stroke = np.tile(FRICTION_STROKE, per_link)[:, None]
+        limit = np.array(FRICTION_LIMIT) * [force, torque, torque]
+        limit = self._build.losses * np.tile(limit, per_link)[:, None]
+        stroke = np.tile(np.array(FRICTION_STROKE) * [length, 1.0, 1.0], per_link)[:, None]
         self._friction = StopOperators(limit / stroke, limit, self._data.qpos)
-        strokes = np.array(HYSTERESIS_STROKES_M)
-        scale = self._build.losses * self._parts.hysteresis[:, None]
+        strokes = length * np.array(HYSTERESIS_STROKES_M)
+        scale = force * self._build.losses * self._parts.hysteresis[:, None]
         limit = scale * np.full(len(strokes), HYSTERESIS_LIMIT_N / len(strokes))
         self._hysteresis = StopOperators(limit / strokes, limit, chamber_lengths(self._data))
 

@@ -35,7 +35,10 @@ MAX_TIMESTEP_S = 0.005  # tip within 0.13 mm RMS of steps of 0.00125 s, over 30 
 
 @dataclass(frozen=True)
 class Tolerances:
-    """Standard deviations at a gap of 1; a field without a unit is relative."""
+    """Standard deviations of the paper's arm at a gap of 1; a field without a unit is relative.
+
+    Those of other arms are as large relative to their sections' length.
+    """
 
     chamber_stiffness: float = 0.03  # per chamber
     chamber_area: float = 0.015  # per chamber
@@ -71,7 +74,13 @@ class Parts(NamedTuple):
 def draw_parts(seed: int, spec: ArmSpec, build: Build) -> Parts:
     """Draw the parts of a twin from its seed; they do not depend on the scales of noise and losses."""
     rng = np.random.default_rng(seed)
-    std = Tolerances(**{name: build.gap * x for name, x in dataclasses.asdict(Tolerances()).items()})
+    length = length_ratio(spec)
+    std = Tolerances(
+        **{
+            name: build.gap * x * (length if name.endswith("_m") else 1.0)
+            for name, x in dataclasses.asdict(Tolerances()).items()
+        }
+    )
     n, n_sections, off = spec.n_chambers, spec.structure.n_sections, partial(drawn, rng)
 
     def per_chamber(value, deviation: float) -> tuple[float, ...]:
@@ -116,6 +125,11 @@ def draw_parts(seed: int, spec: ArmSpec, build: Build) -> Parts:
         base_position_m=off(std.base_offset_m, 3),
         base_tilt_rad=tilt_rad,
     )
+
+
+def length_ratio(spec: ArmSpec) -> float:
+    """Return the length of an arm's sections over that of the paper's arm."""
+    return spec.geometry.section_length_m / ArmSpec.default().geometry.section_length_m
 
 
 def build_twin(parts: Parts, pipe: CrossPipe | None = None) -> mujoco.MjModel:

@@ -13,23 +13,22 @@ ROD = "rod"
 
 
 def twin_of(name: str) -> Twin | RodTwin:
-    """Make the twin of a name: `SEED`, `SEED:PIPE`, `rod:SEED`, `rod:SEED@ARM`; with a payload `SEED:500g`.
+    """Make the twin of a name: `SEED` or `rod:SEED`, then `@ARM`, `:PIPE`, `:500g` where they are wanted.
 
-    Rods can be of any arm, named as for `--spec`; other twins are of the paper's arm.
+    The arm is named as for `--spec`, by default the paper's. A payload is given in grams. Rods have no pipe.
 
     Raises:
         ValueError: the name is malformed, the arm is unknown, or the arm does not fit into the pipe.
     """
     name, payload_kg = _without_payload(name)
     if name.startswith(f"{ROD}:"):
-        seed, at, arm = name.removeprefix(f"{ROD}:").partition("@")
-        number = _seed(seed, f"twin:{ROD}:SEED")
-        return RodTwin(number, ArmSpec.of(Path(arm)) if at else None, payload_kg)
-    seed, colon, pipe = name.partition(":")
-    number = _seed(seed, "twin:SEED")
+        number, spec = _seed_and_arm(name.removeprefix(f"{ROD}:"), f"twin:{ROD}:SEED")
+        return RodTwin(number, spec, payload_kg)
+    rest, colon, pipe = name.partition(":")
+    number, spec = _seed_and_arm(rest, "twin:SEED")
     if colon and pipe not in PIPES_MM:
-        raise ValueError(f"twin:{seed}:PIPE: got {pipe!r}, expected {' or '.join(PIPES_MM)}, or grams, 500g")
-    return Twin(number, payload_kg=payload_kg, pipe=CrossPipe.of_mm(PIPES_MM[pipe]) if pipe else None)
+        raise ValueError(f"twin:{rest}:PIPE: got {pipe!r}, expected {' or '.join(PIPES_MM)}, or grams, 500g")
+    return Twin(number, spec, payload_kg, pipe=CrossPipe.of_mm(PIPES_MM[pipe]) if pipe else None)
 
 
 def _without_payload(name: str) -> tuple[str, float]:
@@ -39,7 +38,11 @@ def _without_payload(name: str) -> tuple[str, float]:
     return (rest, 1e-3 * int(grams)) if rest and last != grams and grams.isdecimal() else (name, 0.0)
 
 
-def _seed(text: str, form: str) -> int:
-    if not text.isdecimal():
-        raise ValueError(f"{form}: got {text!r}, expected an integer >= 0")
-    return int(text)
+def _seed_and_arm(text: str, form: str) -> tuple[int, ArmSpec | None]:
+    """Return seed and arm of `SEED` or `SEED@ARM`; None is the paper's arm."""
+    seed, at, arm = text.partition("@")
+    if not seed.isdecimal():
+        raise ValueError(f"{form}: got {seed!r}, expected an integer >= 0")
+    if at and not arm:
+        raise ValueError(f"{form}@ARM: got no arm, expected one as for --spec")
+    return int(seed), ArmSpec.of(Path(arm)) if at else None

@@ -31,6 +31,8 @@ class Settings:
     n: int = 1
     size: float = 0.0
     limit: float | None = None
+    noisy: bool = True
+    """add noise"""
     inner: Inner = field(default_factory=Inner)
 
     def __post_init__(self):
@@ -170,3 +172,7 @@ def test_help_tells_every_option_and_imports_no_command(capsys, tmp_path, monkey
     assert all(
         text in told for text in ("--inner.gamma FLOAT", "discount", "file to write", "(default: 0.5)")
     )
+    # A setting that begins as true is shown by its own name, not by its opposite alone.
+    assert "--noisy, --no-noisy" in told and "add noise (default: True)" in told
+    assert run("make", "--no-noisy") == 0 and not RESULTS[0].settings.noisy
+    assert run("show", "files", "--help") == 0 and "--no-strict" not in capsys.readouterr().out

@@ -28,6 +28,7 @@ ROOT = Path(__file__).resolve().parents[2]
         ("twin:-1", "got '-1', expected an integer >= 0"),
         ("twin:0:pipe200", "twin:0:PIPE: got 'pipe200', expected pipe300 or pipe250, or grams"),
         ("twin:0:500", "twin:0:PIPE: got '500', expected pipe300 or pipe250, or grams, 500g"),
+        ("twin:rod:0@", "twin:rod:SEED@ARM: got no arm, expected one as for --spec"),
         ("twin:0:500g:pipe300", "twin:0:PIPE: got '500g:pipe300', expected"),
         ("no_such_module:Arm", "no_such_module:Arm: got No module named 'no_such_module', expected a module"),
         (

@@ -18,7 +18,7 @@ from mjx_softarm.logs.schema import Log, write_log
 from mjx_softarm.mechanics import workspace
 from mjx_softarm.mechanics.workspace import sample_workspace
 from mjx_softarm.sensing.pose import frame_from_pose, quaternion_from_pose
-from tests.train.small import SHORT, flags, new_job
+from tests.train.small import CONFIG, SHORT, flags, new_job
 from train.__main__ import main
 from train.runs.checkpoint import Run, RunError
 from train.runs.lock import sole_trainer
@@ -62,7 +62,7 @@ main(sys.argv[1:])
 """
 
 
-def test_a_run_survives_kill_9_and_ends_with_the_same_bits(arm, tmp_path, monkeypatch):
+def test_a_run_survives_kill_9_and_ends_with_the_same_bits(arm, tmp_path, monkeypatch, capsys):
     workspace._solver.cache_clear()  # others may have compiled it with other options than the process below
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     command = ["reach", *flags(), "--evaluation-epochs=4", "--spec", arm, "--out"]
@@ -76,7 +76,9 @@ def test_a_run_survives_kill_9_and_ends_with_the_same_bits(arm, tmp_path, monkey
     )
     assert process.returncode == -signal.SIGKILL and not (killed / "evaluation.json").exists()
     assert Run.open(killed).latest_epoch == 4 and len(Run.open(killed).metrics()) == 6
+    capsys.readouterr()
     assert main(["reach", "--resume", str(killed)]) == 0
+    assert "begins anew" not in capsys.readouterr().out
 
     (epoch, expected), (resumed_epoch, resumed) = final_state(whole), final_state(killed)
     assert epoch == resumed_epoch == 16
@@ -106,6 +108,18 @@ def test_a_run_survives_kill_9_and_ends_with_the_same_bits(arm, tmp_path, monkey
         monkeypatch.setattr(f"train.runs.estimator.{name}", smaller)
     assert main(["export", str(whole)]) == 0
     assert (whole / "policy.npz").exists()
+
+
+def test_resume_says_that_a_run_without_a_checkpoint_begins_anew(tmp_path, monkeypatch, capsys):
+    run = Run.create(tmp_path, CONFIG, SHORT)
+    monkeypatch.setattr("train.runs.run.task_of_run", lambda *_: None)
+    monkeypatch.setattr("train.runs.command._train", lambda *_: 0)
+    assert main(["reach", "--resume", str(tmp_path)]) == 0
+    assert f"{tmp_path}: no checkpoint yet, the run begins anew" in capsys.readouterr().out
+    for epoch in range(1, 21):
+        run.log({"epoch": epoch})
+    assert main(["reach", "--resume", str(tmp_path)]) == 2
+    assert "got no checkpoint of a run with 20 epochs" in capsys.readouterr().err
 
 
 def test_ctrl_c_saves_and_says_how_to_go_on(arm, tmp_path, monkeypatch, capsys):

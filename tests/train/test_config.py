@@ -6,6 +6,7 @@ import json
 import pytest
 
 from train.agent.analytic import AnalyticConfig
+from train.agent.registry import LEARNERS, check_configs
 from train.agent.tqc import TQCConfig
 from train.config import ConfigError, TrainConfig, from_dict, override, to_dict
 from train.presets import IMITATION_PRESETS, PRESETS
@@ -106,3 +107,9 @@ def test_a_bad_setting_of_imitation_is_named(imitation_config, assignment, messa
 
 def test_the_circle_has_the_reward_of_the_critics_that_it_may_begin_with():
     assert IMITATION_PRESETS["circle"].env.reward == PRESETS["quick"].env.reward
+
+
+def test_two_learners_with_one_type_of_config_are_refused():
+    """A run's JSON names its learner by that type."""
+    with pytest.raises(TypeError, match="got TQCConfig for tqc and mine, expected a type for each"):
+        check_configs({**LEARNERS, "mine": LEARNERS["tqc"]._replace(make=LEARNERS["analytic"].make)})

@@ -1,5 +1,7 @@
 """The twin against closed forms, hand calculations and the equilibrium solver."""
 
+from pathlib import Path
+
 import mujoco
 import numpy as np
 import pytest
@@ -10,11 +12,13 @@ from mjx_softarm.control import Gains, LawState, pressures
 from mjx_softarm.deploy.drivers.names import open_arm
 from mjx_softarm.mechanics.mjcf import chamber_lengths, spring_lengths
 from mjx_softarm.mechanics.workspace import settle_many
+from mjx_softarm.spec import ArmSpec
 from mjx_softarm.twin.arm import Twin
 from mjx_softarm.twin.instruments import PRESSURE_NOISE_KPA, Build
 from mjx_softarm.twin.model import build_twin, draw_parts
 from mjx_softarm.twin.rod_twin import RodTwin
 
+SOPRA = ArmSpec.of(Path("sopra"))
 IDEAL = Build(gap=0.0, losses=0.0, noise=0.0, per_section=4)  # training's model, moving
 PRESSURES_KPA = np.array(
     [
@@ -202,3 +206,28 @@ def test_payload_in_a_name():
     assert lower_m[2] > 1e-3 and in_pipe._pipe is not None
     with pytest.raises(InputError, match="twin: got an unstable state"):
         open_arm("twin:3:99999999g")
+
+
+@pytest.mark.parametrize("kind", ["", "rod:"])
+def test_a_twin_of_another_arm_by_name(kind, tmp_path):
+    SOPRA.to_toml(tmp_path / "mine.toml")
+    arm = open_arm(f"twin:{kind}7@{tmp_path / 'mine.toml'}")
+    np.testing.assert_array_equal(arm.read_sensors(), open_arm(f"twin:{kind}7@sopra").read_sensors())
+    straight_m = arm.motion_capture().tip_m[2]
+    assert straight_m == pytest.approx(-SOPRA.length_m, abs=0.02)
+    loaded = open_arm(f"twin:{kind}7@sopra:100g")
+    assert loaded.motion_capture().tip_m[2] < straight_m - 1e-3
+    with pytest.raises(InputError, match="absent.toml: got 'No such file or directory', expected a spec"):
+        open_arm(f"twin:{kind}7@absent.toml")
+
+
+def test_losses_of_a_small_arm_are_small():
+    """After full pressure and back, the tip is as near to where it was as the paper's, for its length."""
+    left = []
+    for spec in (ArmSpec.default(), SOPRA):
+        arm = Twin(7, spec, build=Build(noise=0.0))
+        before_m = arm.motion_capture().tip_m
+        for share in np.concatenate([np.linspace(0, 1, 100), np.linspace(1, 0, 100), np.zeros(150)]):
+            arm.write_pressures(np.full(spec.n_chambers, share * spec.chambers.pressure_max_kpa))
+        left.append(np.linalg.norm(arm.motion_capture().tip_m - before_m) / spec.length_m)
+    assert left[1] < 2.0 * left[0]

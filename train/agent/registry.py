@@ -5,7 +5,7 @@ A new learner is a file with its config and its class, and a line here.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from jax.sharding import Mesh
@@ -44,9 +44,18 @@ LEARNERS = {
     ),
 }
 
-# A config's type tells its learner, in `name_of` and in a run's JSON.
-if len({entry.config for entry in LEARNERS.values()}) < len(LEARNERS):
-    raise TypeError("LEARNERS: got two learners with one type of config, expected a type of its own for each")
+
+def check_configs(learners: Mapping[str, Entry]) -> None:
+    """Raise TypeError where two learners share a type of config: the type tells the learner in `name_of`."""
+    by_type: dict[type[LearnerConfig], str] = {}
+    for name, entry in learners.items():
+        if (other := by_type.setdefault(entry.config, name)) != name:
+            raise TypeError(
+                f"LEARNERS: got {entry.config.__name__} for {other} and {name}, expected a type for each"
+            )
+
+
+check_configs(LEARNERS)
 
 
 def name_of(config: LearnerConfig) -> str:

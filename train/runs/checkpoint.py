@@ -26,6 +26,8 @@ from train.epoch.devices import is_first_process
 from train.epoch.job import TrainState
 
 N_KEPT = 2
+# Codes that begin a message of TensorStore about files that are cut, changed or absent
+_DAMAGE = ("DATA_LOSS", "OUT_OF_RANGE", "NOT_FOUND", "FAILED_PRECONDITION")
 CHECKPOINTS, DEMONSTRATIONS_FILE = "checkpoints", "demonstrations.npz"
 
 
@@ -154,6 +156,21 @@ class Run:
         """Numbers of epochs behind the complete checkpoints."""
         return sorted(self._manager.all_steps())
 
+    def check_begins_anew(self) -> None:
+        """Check that a run without a checkpoint was stopped before its first one.
+
+        Raises:
+            RunError: it had a checkpoint: it began with another run's, or its metrics go further.
+        """
+        done = max((row["epoch"] for row in self.metrics()), default=0)
+        begins_with = json.loads((self.path / "config.json").read_text("utf-8")).get("begins_with")
+        # A process may have died after the metrics of an epoch and before its checkpoint.
+        if begins_with or any(map(self.config.evaluates_after, range(1, done))):
+            raise RunError(
+                f"{self.path / CHECKPOINTS}: got no checkpoint of a run with {done} epochs in metrics.jsonl, "
+                "expected one; bring the folder back, or train anew with another --out"
+            )
+
     def rewind(self, epoch: int) -> None:
         """Delete checkpoints and metrics later than an epoch, before the run continues from there."""
         for later in [saved for saved in self.epochs if saved > epoch]:
@@ -209,7 +226,17 @@ class Run:
             raise RunError(f"{self.path}: got no checkpoint, expected one; start the run anew")
         try:
             return epoch, self._manager.restore(epoch, args=ocp.args.Composite(**{item: how}))[item]
-        except (ValueError, KeyError, FileNotFoundError) as error:
+        except Exception as error:
+            folder = self.path / CHECKPOINTS / str(epoch)
+            if _is_damage(folder / item, error):
+                earlier = [saved for saved in self.epochs if saved < epoch]
+                remedy = f"; without {folder} the run goes back to epoch {earlier[-1]}" if earlier else ""
+                raise RunError(
+                    f"{folder / item}: got a damaged checkpoint ({str(error).splitlines()[0][:200]}), "
+                    f"expected it as it was written{remedy}"
+                ) from error
+            if not isinstance(error, (ValueError, KeyError)):
+                raise
             raise RunError(
                 f"{self.path}: got a checkpoint of other parts or sizes, expected this version's; "
                 "continue it with the commit that its config.json names"
@@ -234,6 +261,17 @@ class Run:
     def metrics(self) -> list[dict[str, Any]]:
         """Return the lines of `metrics.jsonl`, up to the first incomplete one."""
         return read_json_lines(self.path / "metrics.jsonl")
+
+
+def _is_damage(folder: Path, error: Exception) -> bool:
+    """Return whether the files of a checkpoint's item are damaged, rather than those of another version."""
+    chain = (error, error.__cause__)  # the reading of an array fails in a thread
+    unread = isinstance(error, (UnicodeDecodeError, json.JSONDecodeError, FileNotFoundError))
+    return (
+        unread
+        or not (folder / "_METADATA").exists()
+        or any(code in str(one) for one in chain if one is not None for code in _DAMAGE)
+    )
 
 
 def _shape_somewhere(x: Any) -> jax.ShapeDtypeStruct:

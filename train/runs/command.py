@@ -207,6 +207,9 @@ def _mesh(text: str | None, console: Console) -> Mesh | None:
 
 def _resume(path: Path, mesh: Mesh | None, console: Console) -> int:
     run = Run.open(path)
+    if run.latest_epoch is None:
+        run.check_begins_anew()
+        console.print(f"{path}: no checkpoint yet, the run begins anew", highlight=False, soft_wrap=True)
     return _train(run, runs.task_of_run(run, mesh), console)
 
 

@@ -41,6 +41,10 @@ class SweepCommand(ReachOptions):
         if self.resume:
             self.check_resume_alone(self.default([]))
             sweep = open_sweep(self.resume)
+            for run in (run for run in sweep.runs if run.latest_epoch is None):
+                run.check_begins_anew()
+            if not sweep.epoch:
+                console.print(f"{self.resume}: no checkpoint of all members yet, the sweep begins anew")
         else:
             members, varied = members_of(self.config, self.seeds, self.vary)
             spec, s2r = self.read_arm(console)

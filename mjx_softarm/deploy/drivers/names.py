@@ -1,6 +1,7 @@
 """Arms by name: `twin:SEED`, `twin:SEED:PIPE`, `twin:rod:SEED`, or your driver, `package.module:Class`.
 
-A twin's name that ends in `:500g` has a payload of 500 g.
+`twin:SEED@ARM` and `twin:rod:SEED@ARM` are twins of another arm, named as for `--spec`. A twin's name that
+ends in `:500g` has a payload of 500 g.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ def open_arm(name: str) -> Any:
     """Open an arm: an `ArmIO`, maybe with `pressures`, `motion_capture` or a clock of its own, `time_s`.
 
     Args:
-        name: `twin:SEED`; in a pipe, `twin:SEED:pipe300` or `twin:SEED:pipe250`; a rod, `twin:rod:SEED`, or
-            `twin:rod:SEED@ARM` of another arm; each with a payload as in `twin:SEED:500g`. Or
+        name: `twin:SEED`; a rod, `twin:rod:SEED`; of another arm, `twin:SEED@ARM`, `twin:rod:SEED@ARM`; in a
+            pipe, `twin:SEED:pipe300` or `twin:SEED:pipe250`; each with a payload as in `twin:SEED:500g`. Or
             `package.module:Class`, a class without arguments; modules may be in the working directory.
 
     Raises:

@@ -53,3 +53,55 @@ def test_the_policy_is_read_from_the_state_of_every_learner(tmp_path, short_env,
         own = jax.jit(learner.init)(jax.random.PRNGKey(0))
         run.save(1, TrainState(None, own, None, (), zero, zero), learner.parts(own))
         jax.tree.map(np.testing.assert_array_equal, run.policy(), jax.device_get(learner.policy(own)))
+
+
+@pytest.fixture
+def saved(tmp_path):
+    """A run with checkpoints of two epochs, and the shapes of its state."""
+    zero = jnp.zeros((), jnp.int32)
+    state = TrainState(None, {"weight": jnp.arange(64.0)}, None, (), zero, zero)
+    run = Run.create(tmp_path / "run", CONFIG, ArmSpec.default())
+    for epoch in (10, 20):
+        run.save(epoch, state, {"policy": {"weight": jnp.arange(64.0)}})
+    return run, jax.eval_shape(lambda: state)
+
+
+def cut(file):
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+
+
+@pytest.mark.parametrize("item", ["parts", "state"])
+@pytest.mark.parametrize("files", ["_METADATA", "manifest.ocdbt", "**/d/*"])
+@pytest.mark.parametrize("spoil", [cut, lambda file: file.unlink()])
+def test_a_damaged_checkpoint_is_called_so(saved, item, files, spoil):
+    run, like = saved
+    folder = run.path / "checkpoints/20" / item
+    for file in folder.glob(files):
+        spoil(file)
+    with pytest.raises(RunError, match=rf"{folder}: got a damaged checkpoint .*back to epoch 10"):
+        reopened = Run.open(run.path)
+        reopened.parts() if item == "parts" else reopened.restore(like)
+
+
+def test_a_checkpoint_of_other_sizes_is_called_another_version_s(saved):
+    run, like = saved
+    other = like._replace(learner={"other": like.learner["weight"]})
+    with pytest.raises(RunError, match="got a checkpoint of other parts or sizes"):
+        run.restore(other)
+
+
+def test_a_run_without_its_checkpoints_begins_anew_only_if_it_had_none(tmp_path):
+    run = Run.create(tmp_path, CONFIG, ArmSpec.default())
+    for epoch in range(1, CONFIG.evaluation_epochs + 1):
+        run.check_begins_anew()  # it may have died before the checkpoint of the last epoch
+        run.log({"epoch": epoch})
+    run.check_begins_anew()
+    run.log({"epoch": CONFIG.evaluation_epochs + 1})
+    with pytest.raises(RunError, match="got no checkpoint of a run with 11 epochs .*another --out"):
+        run.check_begins_anew()
+
+
+def test_a_run_that_began_with_another_s_policy_does_not_begin_anew_without_it(tmp_path):
+    run = Run.create(tmp_path, CONFIG, ArmSpec.default(), begins_with={"agent": tmp_path / "other"})
+    with pytest.raises(RunError, match="got no checkpoint of a run with 0 epochs"):
+        run.check_begins_anew()
