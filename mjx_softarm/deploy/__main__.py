@@ -28,7 +28,7 @@ from mjx_softarm.deploy.measure import (
     write_accuracy,
 )
 from mjx_softarm.deploy.record import record
-from mjx_softarm.deploy.session import follow, trace
+from mjx_softarm.deploy.session import check_arm, check_number, follow, trace
 from mjx_softarm.logs import mcap_file
 from mjx_softarm.logs.pressure_plan import read_plan
 from mjx_softarm.logs.schema import ENDINGS
@@ -95,12 +95,14 @@ def _run(
         raise InputError(f"--duration: got {duration:g}, expected a number > 0")
     controller = _controller(policy)
     check_file("--log", log)
+    driver = open_arm(arm)
+    check_arm(driver, controller, f"--arm {arm}")
 
     # The run, its log and its faults
     limit_s = None if np.isinf(duration) else duration
     save = partial(save_log, log) if log else lambda log: None
     goals = list(map(np.array, goal))
-    run = follow(open_arm(arm), controller, goals, limit_s, tell, save=save, stay=stay)
+    run = follow(driver, controller, goals, limit_s, tell, save=save, stay=stay)
     if log and run.ending.status != cli.ERROR:
         print(f"log: {log}, {len(run.log)} rows")
     _summary(run, controller.policy)
@@ -163,6 +165,7 @@ def _measure(
         raise InputError(f"--out: got {out}, which is there already, expected a new folder")
     driver = open_arm(arm)
     require_motion_capture(driver, f"--arm: {arm}")
+    check_arm(driver, controller, f"--arm {arm}")
 
     # The run, stop by stop or in time
     out.mkdir(parents=True)
@@ -231,9 +234,12 @@ def _record(
     if out.exists():
         raise InputError(f"--out: got {out}, which is there already, expected a new file")
 
+    driver = open_arm(arm)
+    check_number(driver, arm_spec, f"--arm {arm}")
+
     # The recording and its results
     targets_kpa = read_plan(plan, arm_spec) if plan else growing(random_pressures(arm_spec, poses, seed))
-    result = record(open_arm(arm), arm_spec, targets_kpa, transients, tell, partial(save_log, out))
+    result = record(driver, arm_spec, targets_kpa, transients, tell, partial(save_log, out))
     if not len(result.log):
         print(f"no pose was logged: {result.ending.cause or 'none came to rest'}", file=sys.stderr)
         return result.ending.status or MISSED

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.arm_io import ArmIO
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.ending import Arrival, LoopRun, vent_at_end
@@ -22,9 +23,15 @@ from mjx_softarm.deploy.loop import LoopState, Tick, in_force, refusals, start, 
 from mjx_softarm.deploy.safety import PAYLOAD_FAULTS, Event, Fault, Response
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mdp.rewards import scaled_error
+from mjx_softarm.sensing.estimator import expected_springs
 from mjx_softarm.sensing.pose import pose_error, seen_error
+from mjx_softarm.spec import ArmSpec
 
 _ROUNDING_S = 1e-6  # rounding error of a simulated tick's duration
+_OTHER_LENGTH = (
+    0.25  # deviation of the springs' mean, in section lengths, of another arm; by hand. 1 kg: 0.05
+)
+_ANOTHER = "is it another arm, or not yet switched on?"
 _KEPT = 1000  # number of rows, arrivals and faults that a run without a log keeps
 
 
@@ -95,6 +102,62 @@ def steer(
     source, kept = OrderedGoals(controller, pilot), None if save else _KEPT
     session = _Session(arm, controller, source, tell, look=pilot.look, kept=kept)
     return session.to_end(save or (lambda log: None))
+
+
+def check_number(arm: ArmIO, spec: ArmSpec, name: str) -> np.ndarray | None:
+    """Refuse an arm whose number of springs is not the specification's, before any pressure.
+
+    Returns:
+        Its readings (n,). None where it could not be read: the run then says why.
+
+    Raises:
+        InputError: the number is another; the message begins with `name`.
+    """
+    try:
+        readings = np.array(arm.read_sensors(), float)
+    except Exception:  # a driver may raise anything
+        return None
+    if readings.shape != (spec.n_chambers,):
+        raise InputError(
+            f"{name}: got {' x '.join(map(str, readings.shape))} readings, expected {spec.n_chambers}, of "
+            f"the {spec.structure.n_sections} sections of {spec.name!r}; {_ANOTHER}"
+        )
+    return readings
+
+
+def check_arm(arm: ArmIO, controller: Controller, name: str) -> None:
+    """Refuse an arm that is not the policy's, before any pressure: by number, range and lengths of springs.
+
+    Raises:
+        InputError: it is another; the message begins with `name`.
+    """
+    # Readings, given as many ticks as a run gives lost ones
+    policy, spec = controller.policy, controller.policy.spec
+    length_m = np.full(spec.n_chambers, np.nan)
+    for _ in range(controller.config.lost_ticks):
+        readings = check_number(arm, spec, name)
+        if readings is None:
+            return
+        length_m = policy.sensor.lengths(readings, np.nan).length_m
+        if np.isfinite(length_m).any() or not np.isfinite(readings).all():
+            break
+        time.sleep(0.0 if hasattr(arm, "time_s") else controller.dt_s)
+    else:
+        (low, high), unit = policy.sensor.range, policy.sensor.unit
+        raise InputError(
+            f"{name}: got readings of {readings.min():.4g} to {readings.max():.4g} {unit}, expected "
+            f"{low:.4g} to {high:.4g} {unit} as of the policy's arm {spec.name!r}; {_ANOTHER}"
+        )
+
+    # Mean length without pressure
+    if np.isfinite(length_m).any():
+        got_m = np.nanmean(length_m)
+        asked_m = np.mean(expected_springs(policy.spring_model, np.zeros(spec.n_chambers)))
+        if abs(got_m - asked_m) > _OTHER_LENGTH * spec.geometry.section_length_m:
+            raise InputError(
+                f"{name}: got springs of {1e3 * got_m:.0f} mm in the mean without pressure, expected "
+                f"{1e3 * asked_m:.0f} mm as of the policy's arm {spec.name!r}; {_ANOTHER}"
+            )
 
 
 class _Session:
@@ -217,7 +280,7 @@ class _Session:
         self.arrivals.append(Arrival(goal, estimate, len(self.rows) - 1, self.goals.n_taken - 1, reached))
         angles = ", ".join(f"{value:+.1f}" for value in error[3:])
         off = f"{np.linalg.norm(error[:3]):.1f} mm off by {how}; yaw, pitch, roll {angles} deg off"
-        missed = "" if reached else f"; NOT REACHED, {share:.1f} times the error that a goal allows"
+        missed = "" if reached else f"; NOT REACHED, {share:.2f} times the error that a goal allows"
         self.tell(self._at(f"goal {len(self.arrivals)}: {off}{missed}"))
         self.arrived(self.goals.n_taken - 1)
 

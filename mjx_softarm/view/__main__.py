@@ -17,8 +17,10 @@ import tyro
 from mjx_softarm._support import cli
 from mjx_softarm._support.errors import InputError, needing
 from mjx_softarm.deploy.__main__ import Arm, PolicyFile, check_file, tell
+from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.drivers.names import open_arm
 from mjx_softarm.deploy.ending import save_log
+from mjx_softarm.deploy.session import check_arm
 from mjx_softarm.logs.schema import TABLES
 from mjx_softarm.policy.file import SHIPPED, load_policy
 from mjx_softarm.spec import ArmSpec
@@ -81,6 +83,7 @@ def _view(
     from mjx_softarm.view.page import Setup
 
     read, io = load_policy(policy), open_arm(arm)
+    check_arm(io, Controller.of(read), f"--arm {arm}")
     setup = Setup(read, arm, at.host, at.port, hasattr(io, "attach"), demos is not None)
     saves = [partial(save_log, path) if path else None for path in (log, demos)]
     return live(setup, io, tell, partial(_welcome, at.host), *saves).status

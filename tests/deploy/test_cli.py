@@ -211,3 +211,32 @@ def test_a_plan_of_pressures_is_recorded(tmp_path):
     assert main(["record", "--arm", "twin:rod:101", "--plan", str(plan), "--out", str(out)]) == 0
     found = read_log(out, 9)[0]
     np.testing.assert_allclose(found.pressure_kpa, planned_kpa, atol=0.1)
+
+
+@pytest.mark.parametrize(
+    ("n", "reading", "message"),
+    [
+        (6, REST_M, r"got 6 readings, expected 9, of the 3 sections of 'paper'; is it another arm"),
+        (9, None, r"got readings of 1 to 1 Hz, expected 2e\+06 to 5.5e\+06 Hz as of the policy's arm"),
+        (
+            9,
+            0.3,
+            r"got springs of 300 mm in the mean without pressure, expected 200 mm as of the policy's arm",
+        ),
+    ],
+)
+def test_another_arm_than_the_policy_s_gets_no_pressure(n, reading, message, tmp_path, monkeypatch, capsys):
+    class Other(LinearArm):
+        def read_sensors(self):
+            return np.ones(n) if reading is None else SENSOR.readings(np.full(N, reading))[:n]
+
+        def write_pressures(self, pressure_kpa):
+            raise AssertionError("pressures were written")
+
+    save_policy(tmp_path / "policy.npz", POLICY)
+    monkeypatch.setattr("mjx_softarm.deploy.__main__.open_arm", lambda name: Other())
+    goal = "--goal=" + ",".join(map(str, POLICY.workspace[0]))
+    assert main(["run", str(tmp_path / "policy.npz"), "--arm", "its:Arm", goal]) == 2
+    assert re.search(f"error: --arm its:Arm: {message}", capsys.readouterr().err)
+    status = main(["record", "--arm", "its:Arm", "--out", str(tmp_path / "a.csv"), "--poses", "1"])
+    assert (status == 2) == (n != N)  # an arm that is to be calibrated may read other lengths

@@ -14,6 +14,7 @@ from rich.console import Console
 from mjx_softarm._support import cli
 from mjx_softarm.deploy.drivers import names
 from mjx_softarm.deploy.ending import DONE, MISSED, NOT_WRITTEN, save_log
+from mjx_softarm.deploy.session import check_number
 from mjx_softarm.logs.schema import TABLES, Log
 from mjx_softarm.spec import ArmSpec
 from train.config import ConfigError
@@ -46,6 +47,7 @@ class Record(ArmOptions):
         # Plan all postures before the arm moves.
         spec, s2r = self.read_arm(console)
         arm = names.open_arm(self.arm)
+        check_number(arm, spec, f"--arm {self.arm}")
         waypoints, pipe = task(self.task, spec)
         expert = Expert(spec, s2r, pipe)
         plan = expert.plan(waypoints)
