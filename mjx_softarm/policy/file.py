@@ -156,6 +156,11 @@ def policy_from_actor(
     return _unpack(file_entries(policy), "policy")
 
 
+def check_actor(actor_params: Mapping[str, Any], spec: ArmSpec) -> None:
+    """Raise ValueError where the parameters, as of `policy_from_actor`, are not those of an actor."""
+    _layers_from_flax(actor_params, spec.n_chambers)
+
+
 def _layers_from_flax(actor_params: Mapping[str, Any], n_actions: int) -> tuple[Layer, ...]:
     """Return the actor's layers without its standard deviations; only this function knows flax's names."""
     dense = actor_params.get("params", {})

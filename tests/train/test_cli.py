@@ -122,6 +122,16 @@ def test_resume_says_that_a_run_without_a_checkpoint_begins_anew(tmp_path, monke
     assert "got no checkpoint of a run with 20 epochs" in capsys.readouterr().err
 
 
+def test_export_reads_the_policy_before_it_distils(tmp_path, monkeypatch, capsys):
+    run = Run.create(tmp_path, CONFIG, SHORT)
+    monkeypatch.setattr("train.runs.command.arm_model", lambda *_: pytest.fail("distilled"))
+    assert main(["export", str(tmp_path)]) == 2
+    assert f"{tmp_path}: got no checkpoint, expected one" in capsys.readouterr().err
+    monkeypatch.setattr(Run, "policy", lambda run: {"params": {"other": {}}})
+    assert main(["export", str(tmp_path)]) == 2
+    assert f"{run.path}: actor parameters: got ['other']" in capsys.readouterr().err
+
+
 def test_ctrl_c_saves_and_says_how_to_go_on(arm, tmp_path, monkeypatch, capsys):
     out = tmp_path / "stopped"
     monkeypatch.setattr(Run, "log", send_in_epoch_6(signal.SIGINT))

@@ -28,7 +28,7 @@ from train.runs import run as runs
 from train.runs.arm_model import arm_model
 from train.runs.checkpoint import Run, RunError
 from train.runs.evaluate import N_ACTIONS
-from train.runs.export import export_run
+from train.runs.export import check_policy, export_run
 from train.runs.lock import sole_trainer
 from train.runs.task import Task, task_of
 
@@ -189,6 +189,7 @@ def export(folders: Runs, out: cli.MaybePath = None, onnx: bool = False, cpp: cl
     console = start()
     for path in folders:
         run = Run.open(path)
+        check_policy(run)  # before the networks are distilled, which takes a minute
         console.print("distilling pose and payload estimators for this arm, about a minute ...")
         policy = export_run(run, arm_model(run.spec, run.s2r), out)
         console.print(f"policy: {policy}", highlight=False, soft_wrap=True)

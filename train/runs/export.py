@@ -7,9 +7,21 @@ import json
 from pathlib import Path
 
 from mjx_softarm.mdp.actions import N_ACTIONS
-from mjx_softarm.policy.file import policy_from_actor, save_policy
+from mjx_softarm.policy.file import check_actor, policy_from_actor, save_policy
 from train.runs.arm_model import DistilledArm
 from train.runs.checkpoint import Run, RunError
+
+
+def check_policy(run: Run) -> None:
+    """Check that a run has a policy that can be exported.
+
+    Raises:
+        RunError: it has no checkpoint, or its policy is not a network that the file can hold.
+    """
+    try:
+        check_actor(run.policy(), run.spec)
+    except (ValueError, AttributeError) as error:
+        raise RunError(f"{run.path}: {error}") from error
 
 
 def export_run(run: Run, arm: DistilledArm, path: Path | None = None) -> Path:
