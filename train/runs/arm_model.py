@@ -2,20 +2,33 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import hashlib
+import json
+from collections import ChainMap
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
+import mjx_softarm
+from mjx_softarm._support.archive import Entries, SealedFileError, entries_of, read_sealed, write_sealed
 from mjx_softarm.mechanics.workspace import sample_evenly, sample_workspace
 from mjx_softarm.policy.file import ArmModel
+from mjx_softarm.sensing.estimator import take_estimator, take_spring_model
+from mjx_softarm.sensing.load import take_load_estimator
 from mjx_softarm.sensing.s2r import S2R, correct
 from mjx_softarm.spec import ArmSpec
+from train.runs import estimator
 from train.runs.estimator import Distilled, distil
 
 N_WORKSPACE = 2048  # poses that stand for the workspace
 SEED = 0  # seed of the networks and of the workspace
+ESTIMATORS_FILE, _KIND = "estimators.npz", "estimators"
+_NAMES = "estimator", "load_estimator", "spring_model"
 
 
 class DistilledArm(NamedTuple):
@@ -25,23 +38,68 @@ class DistilledArm(NamedTuple):
     errors: dict[str, Any]  # by name and payload, in types that JSON has
 
 
-def arm_model(spec: ArmSpec, s2r: S2R | None) -> DistilledArm:
+def arm_model(
+    spec: ArmSpec,
+    s2r: S2R | None,
+    folder: Path | None = None,
+    tell: Callable[[str], object] = lambda text: None,
+) -> DistilledArm:
     """Return the model of an arm, which is distilled once in a process.
 
     Args:
         spec: the arm, calibrated or not.
         s2r: sim-to-real network of its calibration, if there is one.
+        folder: keeps the networks in a file, which is used again for the same arm and the same code.
+        tell: takes a line before the networks are distilled.
 
     Raises:
         SpecError: the arm settles at too few pressures.
     """
-    distilled = _distil(spec)
-    networks = distilled.estimator, distilled.load_estimator, distilled.spring_model
-    errors = {
-        name: {f"{kg:g} kg": error._asdict() for kg, error in by_payload.items()}
-        for name, by_payload in distilled.errors.items()
-    }
+    file, key = folder and folder / ESTIMATORS_FILE, _key(spec)
+    if file and (kept := _read(file, key, spec.n_chambers)):
+        networks, errors = kept
+    else:
+        tell("distilling pose and payload estimators for this arm, about a minute ...")
+        distilled = _distil(spec)
+        networks = distilled.estimator, distilled.load_estimator, distilled.spring_model
+        errors = {
+            name: {f"{kg:g} kg": error._asdict() for kg, error in by_payload.items()}
+            for name, by_payload in distilled.errors.items()
+        }
+        if file:
+            entries = [entries_of(name, network) for name, network in zip(_NAMES, networks, strict=True)]
+            told = {"key": np.asarray(key), "errors_json": np.asarray(json.dumps(errors))}
+            with contextlib.suppress(SealedFileError):  # a folder to read only: the next export distils anew
+                write_sealed(file, dict(ChainMap(told, *entries)), _KIND)
     return DistilledArm(ArmModel(_workspace(spec, s2r), *networks, s2r), errors)
+
+
+def _read(file: Path, key: str, n: int) -> tuple[tuple[Any, Any, Any], dict[str, Any]] | None:
+    """Return the networks of a file with their errors; None where it is absent, damaged or of another key."""
+    try:
+        entries = Entries(read_sealed(file, _KIND, "python -m train export"), str(file))
+        if entries.take("key", np.str_, ()) != key:
+            return None
+        takers = take_estimator, take_load_estimator, take_spring_model
+        networks = tuple(take(entries, name, n) for take, name in zip(takers, _NAMES, strict=True))
+        return networks, entries.table("errors_json")
+    except SealedFileError:
+        return None
+
+
+def _key(spec: ArmSpec) -> str:
+    """Return a checksum of all that the networks depend on: the arm, the settings, versions and code."""
+    settings = [spec.to_dict(), SEED, estimator.N_TRAINING, estimator.N_HELD_OUT, estimator.SCHEDULE]
+    digest = hashlib.sha256(json.dumps([*settings, estimator.PAYLOADS, jax.__version__]).encode())
+    package = Path(mjx_softarm.__file__).parent
+    folders = (package / name for name in ("_support", "mechanics", "sensing"))
+    for source in (
+        package / "spec.py",
+        Path(estimator.__file__),
+        *(f for d in folders for f in d.glob("*.py")),
+    ):
+        digest.update(source.read_bytes())
+    return digest.hexdigest()
 
 
 def _workspace(spec: ArmSpec, s2r: S2R | None) -> np.ndarray:

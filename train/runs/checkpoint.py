@@ -41,7 +41,7 @@ class Run:
     `config.json` (settings, arm, calibration, versions, commit), `s2r.npz` (the calibration's sim-to-real
     network, if it has one), `demonstrations.npz` (if it learns from them), `checkpoints/`, `metrics.jsonl`,
     `poses.npz` (of the newest evaluation), `evaluation.json`, pictures, TensorBoard's event files and, once
-    exported, `policy.npz`.
+    exported, `policy.npz` and `estimators.npz`.
 
     Several processes that train together share the folder. All of them open it and save checkpoints. The
     first process alone writes all else.

@@ -190,8 +190,7 @@ def export(folders: Runs, out: cli.MaybePath = None, onnx: bool = False, cpp: cl
     for path in folders:
         run = Run.open(path)
         check_policy(run)  # before the networks are distilled, which takes a minute
-        console.print("distilling pose and payload estimators for this arm, about a minute ...")
-        policy = export_run(run, arm_model(run.spec, run.s2r), out)
+        policy = export_run(run, arm_model(run.spec, run.s2r, path, console.print), out)
         console.print(f"policy: {policy}", highlight=False, soft_wrap=True)
         files = export_onnx(policy) if onnx else []
         for file in [*files, *(export_cpp(policy, cpp) if cpp else [])]:

@@ -1,0 +1,42 @@
+"""The distilled networks of an arm, kept in the folder of a run."""
+
+import jax
+import numpy as np
+
+from mjx_softarm.policy.file import SHIPPED, load_policy
+from train.runs import arm_model
+from train.runs.estimator import Distilled, Error
+
+POLICY = load_policy(SHIPPED)
+
+
+def test_networks_are_distilled_again_only_for_another_arm_or_code(tmp_path, monkeypatch):
+    errors = {"tip_mm": {0.0: Error(1.0, 2.0, 3.0)}}
+    networks = POLICY.estimator, POLICY.load_estimator, POLICY.spring_model
+    told, file = [], tmp_path / arm_model.ESTIMATORS_FILE
+    monkeypatch.setattr(arm_model, "_distil", lambda spec: Distilled(*networks, errors))
+    monkeypatch.setattr(arm_model, "_workspace", lambda *_: POLICY.workspace)
+
+    def model(spec=POLICY.spec):
+        return arm_model.arm_model(spec, None, tmp_path, told.append)
+
+    first, again = model(), model()
+    jax.tree.map(np.testing.assert_array_equal, first.model[1:4], again.model[1:4])
+    assert first.errors == again.errors and len(told) == 1
+
+    other = POLICY.spec.replace(mass={"payload_kg": 0.1})
+    model(other), model(other)
+    assert len(told) == 2
+    file.write_bytes(file.read_bytes()[:-100])
+    model(other)
+    assert len(told) == 3
+    monkeypatch.setattr(arm_model.estimator, "N_TRAINING", 1)
+    model(other)
+    assert len(told) == 4
+
+
+def test_a_folder_to_read_only_changes_nothing(tmp_path, monkeypatch):
+    networks = POLICY.estimator, POLICY.load_estimator, POLICY.spring_model
+    monkeypatch.setattr(arm_model, "_distil", lambda spec: Distilled(*networks, {}))
+    monkeypatch.setattr(arm_model, "_workspace", lambda *_: POLICY.workspace)
+    assert arm_model.arm_model(POLICY.spec, None, tmp_path / "absent").errors == {}
