@@ -13,6 +13,7 @@ from mjx_softarm.mdp.observation import Observation
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.mechanics.pipe import CrossPipe
 from mjx_softarm.mechanics.workspace import HELD_OUT_SEED
+from mjx_softarm.spec import ArmSpec
 
 
 def _expect(config: Any, name: str, holds: bool, expected: str) -> None:
@@ -50,6 +51,8 @@ class EnvConfig:
     """kinematics: in closed form, or MJX's; both engines share all else"""
     mode: Annotated[Literal["quasistatic", "dynamic"], arg(aliases=["--mode"])] = "quasistatic"
     """an action leads to its equilibrium, or moves the arm for a while"""
+    links_per_section: int | None = None
+    """links of the simulated arm; None: those of the specification"""
     observation: Observation = "pose"
     """pose and goal; payload: also the payload; motion: also springs, their rates, the tip's velocity and the
     last action, in dynamic mode"""
@@ -73,6 +76,11 @@ class EnvConfig:
         """Whether the arm is in motion."""
         return self.mode == "dynamic"
 
+    def arm(self, spec: ArmSpec) -> ArmSpec:
+        """Return the arm as it is simulated."""
+        n = self.links_per_section
+        return spec if n is None else spec.replace(structure={"links_per_section": n})
+
     def __post_init__(self):
         # Names
         for name, allowed in (
@@ -93,6 +101,8 @@ class EnvConfig:
             _expect(config, name, 0 <= getattr(config, name) < math.inf, "a finite number >= 0")
         _expect(self, "clearance_margin_mm", math.isfinite(self.clearance_margin_mm), "a finite number")
         _expect(self, "n_poses", self.n_poses >= 1, "at least 1")
+        links = self.links_per_section
+        _expect(self, "links_per_section", links is None or links >= 1, "at least 1")
         _expect(self, "even_share", 0 <= self.even_share <= 1, "0 to 1")
         other = f"another: {HELD_OUT_SEED} draws the goals of the evaluation"
         _expect(self, "workspace_seed", self.workspace_seed != HELD_OUT_SEED, other)

@@ -68,7 +68,13 @@ class ReachEnv(Env):
     """
 
     def __init__(self, spec: ArmSpec | None = None, config: EnvConfig | None = None, s2r: S2R | None = None):
-        self.spec, self.config, self.s2r = spec or ArmSpec.default(), config or EnvConfig(), s2r
+        given, self.config, self.s2r = spec or ArmSpec.default(), config or EnvConfig(), s2r
+        self.spec = self.config.arm(given)
+        if s2r is not None and self.spec != given:
+            raise ValueError(
+                f"EnvConfig.links_per_section: got {self.config.links_per_section} with a sim-to-real "
+                f"network, expected {given.structure.links_per_section}, the links of the arm it corrects"
+            )
         if self.config.dynamic_step_s < 1.0 / self.spec.control.rate_hz:
             raise ValueError(
                 f"EnvConfig.dynamic_step_s: got {self.config.dynamic_step_s}, expected at least one "

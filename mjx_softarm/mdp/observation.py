@@ -23,7 +23,7 @@ Observation = Literal["pose", "payload", "motion"]
 _AXES = ("x_mm", "y_mm", "z_mm", "yaw_deg", "pitch_deg", "roll_deg")
 OBS_LAYOUT = tuple(f"{part}_{axis}" for part in ("pose", "goal", "error") for axis in _AXES)
 OBS_SIZE = len(OBS_LAYOUT)
-GOAL = slice(6, 12)  # entries of the goal in the observation
+POSE, GOAL, ERROR = slice(0, 6), slice(6, 12), slice(12, 18)  # entries of the observation
 RATE_S = 0.1  # time between the two lengths or positions of a rate
 SPRING_M_PER_S, TIP_MM_PER_S = 0.1, 300.0  # speeds that are observed as 1
 

@@ -1,11 +1,13 @@
 """Settings of the environment that are refused."""
 
+import dataclasses
 import math
 
 import pytest
 
 from mjx_softarm.env import EnvConfig, Randomisation
 from mjx_softarm.mdp.rewards import RewardConfig
+from mjx_softarm.spec import ArmSpec
 
 
 @pytest.mark.parametrize("word", [{"engine": "mujoco"}, {"mode": "static"}])
@@ -35,3 +37,13 @@ def test_an_arm_at_rest_observes_no_motion():
 def test_a_number_that_is_negative_or_not_finite_is_refused_by_name(kind, field, value):
     with pytest.raises(ValueError, match=rf"\.{field}: got {value}, expected a finite number >"):
         kind(**{field: value})
+
+
+def test_the_simulated_arm_may_have_fewer_links_than_the_specified_one():
+    spec = ArmSpec.default()
+    coarse = EnvConfig(links_per_section=2).arm(spec)
+    assert coarse.n_links == 2 * spec.structure.n_sections < spec.n_links
+    assert coarse.replace(structure=dataclasses.asdict(spec.structure)) == spec
+    assert EnvConfig().arm(spec) is spec
+    with pytest.raises(ValueError, match="links_per_section: got 0, expected at least 1"):
+        EnvConfig(links_per_section=0)

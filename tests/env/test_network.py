@@ -1,8 +1,11 @@
 """The environment with a sim-to-real network: what it shows is the real arm, what it simulates is not."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from mjx_softarm import ArmSpec
 from mjx_softarm._support import xla
@@ -34,6 +37,8 @@ def test_with_a_network_every_pose_is_the_real_one_and_the_arm_underneath_the_sa
         limit=np.float32(1.0),
     )
     plain, real = ReachEnv(SHORT_ARM, config), ReachEnv(SHORT_ARM, config, network)
+    with pytest.raises(ValueError, match="links_per_section: got 3 with a sim-to-real network, expected 2"):
+        ReachEnv(SHORT_ARM, dataclasses.replace(config, links_per_section=3), network)
     keys = jax.random.split(jax.random.PRNGKey(0), 16)
     actions = jax.random.uniform(jax.random.PRNGKey(1), (16, n_springs), minval=-0.5, maxval=0.5)
     starts = [xla.jit(jax.vmap(e.reset))(keys) for e in (plain, real)]

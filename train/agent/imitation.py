@@ -112,6 +112,7 @@ class ImitationConfig(TQCConfig):
 
     def check(self, env: EnvConfig) -> None:
         """Raise ValueError where the policy observes the payload: a demonstrated action is right for one."""
+        super().check(env)
         if env.observation == "payload":
             expected = "'pose' or 'motion' for demonstrations"
             raise ValueError(f"env.observation: got 'payload', expected {expected}")

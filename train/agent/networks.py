@@ -68,17 +68,26 @@ class Critics(nn.Module):
         n_quantiles: quantiles per critic M.
         hidden: width of each hidden layer of one critic, at least one.
         layer_norm: normalise each hidden layer before its ReLU.
+        cost_ahead: first weight of a predicted error of 1, summed over the predictions.
     """
 
     n_critics: int = 2
     n_quantiles: int = 25
     hidden: tuple[int, ...] = (256, 256)
     layer_norm: bool = False
+    cost_ahead: float = 40.0
 
     @nn.compact
-    def __call__(self, obs: jax.Array, action: jax.Array) -> jax.Array:
-        """Return the quantiles (..., C, M) of the return, unsorted, at obs (..., O) and action (..., A)."""
-        x = jnp.concatenate([obs, action], axis=-1)  # (..., O + A)
+    def __call__(self, obs: jax.Array, action: jax.Array, ahead: jax.Array | None = None) -> jax.Array:
+        """Return the quantiles (..., C, M) of the return, unsorted, at obs (..., O) and action (..., A).
+
+        With errors (..., K, 6) that are predicted after the action, the quantiles fall with their norms.
+        """
+        inputs = [obs, action]
+        if ahead is not None:
+            norms = jnp.sqrt(jnp.sum(ahead**2, axis=-1) + 1e-8)  # (..., K)
+            inputs += [ahead.reshape(*ahead.shape[:-2], -1), norms]
+        x = jnp.concatenate(inputs, axis=-1)  # (..., O + A, and 7 K)
         first = nn.Dense(self.n_critics * self.hidden[0], name="hidden_0")(x)  # (..., C * H_0)
         quantiles = []
         for c, x in enumerate(jnp.split(first, self.n_critics, axis=-1)):  # (..., H_0)
@@ -87,6 +96,10 @@ class Critics(nn.Module):
                 x = nn.Dense(width, name=f"critic_{c}_hidden_{i}")(x)  # (..., H_i)
                 x = self._activate(x, f"critic_{c}_norm_{i}")
             quantiles.append(nn.Dense(self.n_quantiles, name=f"critic_{c}_head")(x))  # (..., M)
+            if ahead is not None:
+                first = nn.initializers.constant(jnp.log(jnp.expm1(self.cost_ahead / norms.shape[-1])))
+                cost = nn.softplus(self.param(f"critic_{c}_cost", first, norms.shape[-1:]))  # (K,)
+                quantiles[c] -= jnp.sum(cost * norms, axis=-1, keepdims=True)
         return jnp.stack(quantiles, axis=-2)  # (..., C, M)
 
     def _activate(self, x: jax.Array, norm_name: str) -> jax.Array:

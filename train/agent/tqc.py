@@ -20,7 +20,7 @@ import optax
 from jax import Array
 
 from mjx_softarm._support import draws
-from mjx_softarm.env import ReachEnv
+from mjx_softarm.env import EnvConfig, ReachEnv
 from train.agent.hindsight import HindsightConfig, relabel
 from train.agent.learner import (
     Experience,
@@ -33,6 +33,7 @@ from train.agent.learner import (
 )
 from train.agent.losses import actor_loss, alpha_loss, quantile_huber_loss, truncated_targets
 from train.agent.networks import Actor, Critics, check_same_shapes, mode, squash, widened
+from train.agent.prediction import PredictiveCritics, Predictor
 
 Params = Any  # a flax parameter tree
 GIVEN_LOG_STD = -4.0  # initial exploration noise of a pretrained actor: log standard deviation before tanh
@@ -50,6 +51,7 @@ class TQCConfig(ReplayConfig):
     n_quantiles: int = 25  # quantiles per critic
     n_drop_per_critic: int = 2  # largest pooled target quantiles dropped, per critic
     layer_norm: bool = False  # layer normalisation in the critics
+    n_ahead: int = 0  # held actions whose predicted errors the critics observe, in motion; see `prediction`
     learning_rate: float = 3e-4  # learning rate of actor and critics (Adam)
     learning_rate_end: float = 1.0  # share of the learning rate left at the end of a half-cosine decay
     learning_rate_alpha: float = 3e-4  # learning rate of the temperature; 0 holds it at initial_alpha
@@ -66,6 +68,7 @@ class TQCConfig(ReplayConfig):
         required = {
             "hidden_critic": (len(self.hidden_critic) > 0, "at least one layer"),
             "n_critics": (self.n_critics > 0, "a positive number"),
+            "n_ahead": (self.n_ahead >= 0, "at least 0"),
             "n_drop_per_critic": (0 <= self.n_drop_per_critic < self.n_quantiles, "0 to n_quantiles - 1"),
             "learning_rate": (self.learning_rate >= 0.0, "a number >= 0"),
             "learning_rate_end": (0.0 <= self.learning_rate_end <= 1.0, "a number in [0, 1]"),
@@ -74,6 +77,12 @@ class TQCConfig(ReplayConfig):
             "initial_alpha": (self.initial_alpha > 0.0, "a positive number"),
         }
         check_settings("learner", self, required)
+
+    def check(self, env: EnvConfig) -> None:
+        """Raise ValueError where the learner cannot learn in an environment."""
+        super().check(env)
+        seen = self.n_ahead == 0 or env.observation == "motion"
+        check_settings("learner", self, {"n_ahead": (seen, "0 without env.observation 'motion'")})
 
 
 class TQCState(NamedTuple):
@@ -103,6 +112,8 @@ class TQC:
         self.critics: Any = Critics(
             config.n_critics, config.n_quantiles, config.hidden_critic, config.layer_norm
         )
+        if config.n_ahead:
+            self.critics = PredictiveCritics(self.critics, Predictor(config.hidden_critic), config.n_ahead)
         self.optimizer = optax.adam(_learning_rate(config))
         self.alpha_optimizer = optax.adam(config.learning_rate_alpha)
         self.target_entropy = -float(action_size) if config.target_entropy is None else config.target_entropy
@@ -218,7 +229,10 @@ class TQC:
 
     def _critic_loss(self, params: Params, batch: Transition, targets: Array) -> tuple[Array, Array]:
         quantiles = self.critics.apply(params, batch.obs, batch.action)  # (B, C, M)
-        return quantile_huber_loss(quantiles, targets), jnp.mean(quantiles)
+        loss = quantile_huber_loss(quantiles, targets)
+        if self.config.n_ahead:
+            loss += self.critics.loss(params, batch.obs, batch.action, batch.next_obs)
+        return loss, jnp.mean(quantiles)
 
     def _actor_loss(self, params: Params, state: TQCState, obs: Array, noise: Array) -> tuple[Array, Array]:
         action, log_prob = squash(*self.actor.apply(params, obs), noise=noise)  # (B, A), (B,)

@@ -48,7 +48,7 @@ class Run:
     """
 
     def __init__(self, path: Path, config: TrainConfig, spec: ArmSpec, s2r: S2R | None = None):
-        self.path, self.config, self.spec, self.s2r = path, config, spec, s2r
+        self.path, self.config, self.spec, self.s2r = path, config, config.env.arm(spec), s2r
         options = ocp.CheckpointManagerOptions(max_to_keep=N_KEPT, enable_async_checkpointing=False)
         self._manager = ocp.CheckpointManager((path / CHECKPOINTS).resolve(), options=options)
 
@@ -99,7 +99,7 @@ class Run:
             # Write the config last: with it the folder is a run.
             data = {
                 "train": to_dict(config),
-                "spec": spec.to_dict(),
+                "spec": run.spec.to_dict(),
                 "s2r": s2r is not None,
                 "begins_with": {name: str(folder) for name, folder in (begins_with or {}).items()},
                 "provenance": provenance("train"),

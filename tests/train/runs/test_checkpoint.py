@@ -1,10 +1,13 @@
 """The folder of a run: refused in words, its metrics forgotten with the epochs, its policy read alone."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mjx_softarm.env import EnvConfig
 from mjx_softarm.spec import ArmSpec
 from tests.train.small import LEARNER
 from train.agent.analytic import AnalyticConfig
@@ -26,6 +29,12 @@ def test_a_folder_that_is_no_run_is_named(tmp_path):
         Run.open(tmp_path)
     with pytest.raises(RunError, match="got a folder with a run, .*--resume"):
         Run.create(tmp_path, CONFIG, ArmSpec.default())
+
+
+def test_a_run_has_the_links_that_it_was_trained_with(tmp_path):
+    config = dataclasses.replace(CONFIG, env=EnvConfig(links_per_section=2))
+    Run.create(tmp_path, config, ArmSpec.default())
+    assert Run.open(tmp_path).spec.structure.links_per_section == 2
 
 
 def test_metrics_later_than_the_checkpoint_are_forgotten(tmp_path):

@@ -1,0 +1,93 @@
+"""Critics that observe a prediction: what teaches them, and what the prediction says of a known arm."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from mjx_softarm.env import EnvConfig
+from mjx_softarm.mdp.observation import ERROR, GOAL, OBS_SIZE, POSE
+from train.agent.networks import Critics
+from train.agent.prediction import PredictiveCritics, Predictor
+from train.agent.tqc import TQCConfig
+from train.config import TrainConfig
+
+B, ACTION, SENSED = 64, 2, 5
+OBS = OBS_SIZE + SENSED
+
+pytestmark = pytest.mark.usefixtures("quick_compiler")
+
+
+@pytest.fixture(scope="module")
+def critics():
+    return PredictiveCritics(Critics(2, 5, (16,)), Predictor((32,)), n_ahead=2)
+
+
+@pytest.fixture(scope="module")
+def batch():
+    """Transitions of an arm whose first three coordinates move by the action, and whose goals stay."""
+    rng = np.random.default_rng(0)
+    obs, action = rng.normal(0, 0.1, (B, OBS)), rng.uniform(-1, 1, (B, ACTION))
+    after = obs.copy()
+    for part in (POSE, ERROR):
+        after[:, part.start : part.start + ACTION] += 0.1 * action
+    after[:, -ACTION:] = action
+    return tuple(jnp.asarray(x, jnp.float32) for x in (obs, action, after))
+
+
+@pytest.fixture(scope="module")
+def params(critics, batch):
+    return critics.init(jax.random.key(0), *batch[:2])
+
+
+def test_the_loss_of_the_critics_does_not_teach_the_prediction(critics, params, batch):
+    obs, action, _ = batch
+    gradient = jax.grad(lambda params: jnp.sum(critics.apply(params, obs, action)))(params)
+    assert optax.tree.norm(gradient["predictor"]) == 0.0
+    assert optax.tree.norm(gradient["critics"]) > 0.0
+
+
+def test_the_loss_of_the_prediction_teaches_it_alone(critics, params, batch):
+    gradient = jax.grad(critics.loss)(params, *batch)
+    assert optax.tree.norm(gradient["critics"]) == 0.0
+    assert optax.tree.norm(gradient["predictor"]) > 0.0
+
+
+def test_a_taught_prediction_follows_the_arm_whatever_the_goal(critics, params, batch):
+    obs, action, after = batch
+    optimizer = optax.adam(1e-2)
+
+    def step(carry, _):
+        params, state = carry
+        change, state = optimizer.update(jax.grad(critics.loss)(params, *batch), state)
+        return (optax.apply_updates(params, change), state), None
+
+    start = (params, optimizer.init(params))
+    (taught, _), _ = jax.lax.scan(step, start, None, length=400)
+    assert critics.loss(taught, *batch) < 0.02 * critics.loss(params, *batch)
+    told = critics.after(taught["predictor"], obs, action)
+    moved = np.linalg.norm(after[:, ERROR] - obs[:, ERROR], axis=-1)
+    missed = np.linalg.norm(told[:, ERROR] - after[:, ERROR], axis=-1)
+    assert np.median(missed) < 0.1 * np.median(moved)
+    np.testing.assert_array_equal(told[:, GOAL], obs[:, GOAL])
+    np.testing.assert_array_equal(told[:, -ACTION:], action)
+    # Another goal changes the error, not what the arm does.
+    other = obs.at[:, GOAL].add(1.0).at[:, ERROR].add(-0.3)
+    elsewhere = critics.after(taught["predictor"], other, action)
+    np.testing.assert_allclose(elsewhere[:, ERROR] - told[:, ERROR], -0.3, atol=1e-6)
+
+
+def test_the_quantiles_change_with_the_action_by_the_prediction(critics, params, batch):
+    # The critics' own input is cut off; what remains comes through the predicted errors.
+    obs, action, _ = batch
+    first = params["critics"]["params"]["hidden_0"]["kernel"]
+    cut = jax.tree.map(lambda x: x, params)
+    cut["critics"]["params"]["hidden_0"]["kernel"] = first.at[OBS : OBS + ACTION].set(0.0)
+    slope = jax.grad(lambda action: jnp.sum(critics.apply(cut, obs, action)))(action)
+    assert jnp.all(jnp.linalg.norm(slope, axis=-1) > 0.0)
+
+
+def test_only_an_arm_in_motion_can_be_predicted():
+    with pytest.raises(ValueError, match=r"learner.n_ahead: got 4, expected 0 without env.observation"):
+        TrainConfig(learner=TQCConfig(n_ahead=4), env=EnvConfig())
