@@ -27,6 +27,7 @@ from train.epoch import replay
 from train.epoch.devices import everywhere, split, spread
 
 T = TypeVar("T")
+COUNTS = ("env/unsettled", "env/episodes", "env/successes")  # metrics summed over an epoch and its arms
 
 
 class Goals(Protocol):
@@ -148,16 +149,17 @@ class Job:
         """Move every arm by `vector_steps_per_epoch` actions, with their updates; `epoch` is this, jitted.
 
         Returns:
-            The next state; means over the epoch by name, and `env/unsettled`, the number of masked arms.
+            The next state; means over the epoch by name. Counts are `env/unsettled`, the masked arms, and
+            with a replay `env/episodes` that ended, `env/successes` that ended at their goals.
         """
         self.n_traces += 1
         with draws.on(self.mesh):
             step = self._own_step if self.learner.own_arms else self._vector_step
             n_steps = self.config.vector_steps_per_epoch
             state, metrics = jax.lax.scan(step, state, jnp.arange(n_steps), length=n_steps)
-        unsettled = jnp.sum(metrics.pop("env/unsettled")) * self.config.n_arms
+        counts = {name: jnp.sum(metrics.pop(name)) * self.config.n_arms for name in COUNTS if name in metrics}
         state = state._replace(n_epochs=state.n_epochs + 1)
-        return state, {**jax.tree.map(jnp.mean, metrics), "env/unsettled": unsettled}
+        return state, jax.tree.map(jnp.mean, metrics) | counts
 
     def _own_step(self, state: TrainState, _) -> tuple[TrainState, dict[str, Array]]:
         """Take one update of a learner that steps arms of its own."""
@@ -190,7 +192,9 @@ class Job:
 
         # Learn.
         state, losses = self.learn(state, key_updates, warmed_up)
-        env_metrics = {f"env/{name}": jnp.mean(value) for name, value in after.metrics.items()}
+        ended = outcome.terminated | outcome.truncated
+        of_arms = after.metrics | {"episodes": ended, "successes": ended & (after.metrics["reached"] > 0)}
+        env_metrics = {f"env/{name}": jnp.mean(value) for name, value in of_arms.items()}
         return state, env_metrics | losses
 
     def _warmed_up(self, n_epochs: Array, step: Array) -> Array:

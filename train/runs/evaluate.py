@@ -45,8 +45,8 @@ class Reached(NamedTuple):
 
     @property
     def tip_error_mm(self) -> np.ndarray:
-        """Distances (n,) of the tips to their goals."""
-        return np.linalg.norm(np.asarray(self.pose - self.goal)[:, :3], axis=-1)
+        """Distances (..., n) of the tips to their goals."""
+        return np.linalg.norm(np.asarray(self.pose - self.goal)[..., :3], axis=-1)
 
 
 def figure(label: str, unit: str, decimals: int = 0, **default: Any) -> Any:

@@ -214,17 +214,27 @@ def record(run: Run, board: SummaryWriter, epoch: int, row: dict[str, float]) ->
 
 def _line(rows: Sequence[dict[str, float]], task: Task) -> str:
     """Return the text of an epoch: speeds, success, and figures if the members were evaluated."""
-    n, row = len(rows), rows[0]
-    each, reached = f"{n} x " if n > 1 else "", np.mean([row["env/reached"] for row in rows])
+    n, row, each = len(rows), rows[0], f"{len(rows)} x " if len(rows) > 1 else ""
     env_steps, updates = row["speed/env_steps_per_s"], row["speed/updates_per_s"]
-    text = f"{each}{env_steps:.0f} env steps/s  {each}{updates:.0f} updates/s"
-    text += f"  success {100 * reached:.0f} % of actions"
+    text = f"{each}{env_steps:.0f} env steps/s  {each}{updates:.0f} updates/s  {_success(rows)}"
     if "evaluation/median_mm" not in row:
         return text
     if n == 1:
         return f"{text}  {task.headline(row)}"
     medians = [row["evaluation/median_mm"] for row in rows]
     return f"{text}  held-out medians {np.min(medians):.1f} to {np.max(medians):.1f} mm"
+
+
+def _success(rows: Sequence[dict[str, float]]) -> str:
+    """Return the text of the success in training, with exploration.
+
+    Ends of episodes count, as in an evaluation: in motion, earlier actions are on the way. A learner with
+    arms of its own has no episodes. There, all actions count.
+    """
+    if episodes := sum(row.get("env/episodes", 0.0) for row in rows):
+        successes = sum(row["env/successes"] for row in rows)
+        return f"exploring: success {100 * successes / episodes:.0f} % of episodes"
+    return f"success {100 * np.mean([row['env/reached'] for row in rows]):.0f} % of actions"
 
 
 @contextmanager

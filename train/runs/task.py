@@ -22,7 +22,7 @@ from train.epoch.goals import DemonstratedGoals
 from train.epoch.job import Job, TrainState
 from train.runs import plots
 from train.runs.evaluate import N_GOALS, Evaluator
-from train.runs.positions import PositionEvaluator
+from train.runs.positions import N_STARTS, PositionEvaluator
 
 
 class Task(NamedTuple):
@@ -82,7 +82,7 @@ def _imitation(
     # Arms whose goals are demonstrated positions, and the evaluation at these.
     goals = DemonstratedGoals(config, env, demonstrations)
     job = Job(config, env, learner, goals, mesh)
-    evaluate = PositionEvaluator(env, learner, demonstrations.positions, goals.of_stage(0))
+    evaluate = PositionEvaluator(env, learner, demonstrations, goals.of_stage(0))
 
     # Before an epoch: begin a stage of goals, or shift the goals to the positions with the largest errors.
     def prepare(state: TrainState, epoch: int) -> TrainState:
@@ -94,9 +94,10 @@ def _imitation(
             state = goals.begin_stage(job, state, epoch)
         return job.place(state)
 
+    starts = f" from {N_STARTS} starts" if env.config.moves else ""
     return Task(
         job=job,
-        title=f"{len(demonstrations.positions)} demonstrated positions",
+        title=f"{len(demonstrations.positions)} demonstrated positions{starts}",
         evaluate=evaluate,
         pictures=plots.imitation_pictures,
         headline=lambda row: (

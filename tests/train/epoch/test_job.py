@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from mjx_softarm.env import ReachEnv
+from mjx_softarm.mdp.rewards import RewardConfig
 from tests.train.small import CONFIG, SHORT, new_job
 from train.runs.checkpoint import Run, RunError
 
@@ -27,9 +28,15 @@ def assert_equal(a, b):
     jax.tree.map(np.testing.assert_array_equal, jax.device_get(a), jax.device_get(b))
 
 
-@pytest.mark.parametrize(
-    "change", [{}, {"engine": "mjx"}, {"mode": "dynamic", "dynamic_step_s": 0.04}], ids=str
-)
+MOVING = {
+    "mode": "dynamic",
+    "dynamic_step_s": 0.04,
+    "goal_ends": False,
+    "reward": RewardConfig(threshold=9.0),
+}
+
+
+@pytest.mark.parametrize("change", [{}, {"engine": "mjx"}, MOVING], ids=["chain", "mjx", "dynamic"])
 def test_every_engine_traces_its_epoch_once_and_counts_what_it_did(job, change):
     config = dataclasses.replace(CONFIG, env=dataclasses.replace(CONFIG.env, **change))
     if config.env.moves:  # with goals that the episode reached later
@@ -37,10 +44,18 @@ def test_every_engine_traces_its_epoch_once_and_counts_what_it_did(job, change):
         config = dataclasses.replace(config, learner=dataclasses.replace(config.learner, hindsight=hindsight))
     if change:
         job = new_job(config, ReachEnv(SHORT, config.env))
-    state = start(job)
-    for _ in range(4):
+    state, ended = start(job), np.zeros((4, 2))
+    for k in range(4):
         state, metrics = job.epoch(state)
+        ended[k] = metrics["env/episodes"], metrics["env/successes"]
     assert job.n_traces == 1 and int(state.n_epochs) == 4
+    # Episodes end at their goals, or after four actions. In motion these are near enough without saturation.
+    if config.env.moves:
+        np.testing.assert_array_equal(ended[:, 0], [0, 8, 0, 8])
+        last = np.asarray(state.memory.data.n_steps) == 4
+        assert ended[:, 1].sum() == np.count_nonzero(last & ~np.asarray(state.memory.data.saturated))
+    else:
+        assert ended[:, 0].sum() >= 8 and np.all(ended[:, 1] <= ended[:, 0])
     assert 50 < int(state.memory.size) <= CONFIG.learner.n_env_steps(4) == 4 * 2 * 8
     # Warm-up lasts until 16 steps are stored: the update after the third vector step is the first.
     assert CONFIG.learner.n_updates(4) == 4 * (4 * 2 - 2)
