@@ -69,14 +69,8 @@ class Path(NamedTuple):
     spring_m: Array  # (t, n_chambers) spring lengths
     plate_position_m: Array  # (t, L + 1, 3), as in `kinematics.Frames`
     plate_rotation: Array  # (t, L + 1, 3, 3)
-
-    @property
-    def tip_position_m(self) -> Array:
-        return self.plate_position_m[..., -1, :]
-
-    @property
-    def tip_rotation(self) -> Array:
-        return self.plate_rotation[..., -1, :, :]
+    tip_position_m: Array  # (t, 3) of the tip as mounted, which need not be the last plate's
+    tip_rotation: Array  # (t, 3, 3)
 
 
 class MotionEnd(NamedTuple):
@@ -152,7 +146,11 @@ def advance(
         """Run one control period: observe, let the law command pressures, take the time steps."""
         frames, lines = _at(arm, motion.q)
         spring_m = lines.length[1]
-        seen = Path(spring_m, frames.plate_position, frames.plate_rotation)
+        plates, tip = (
+            (frames.plate_position, frames.plate_rotation),
+            (frames.tip_position, frames.tip_rotation),
+        )
+        seen = Path(spring_m, *plates, *tip)
         command, law = control.pressures(reference_m, spring_m, motion.law, gains, period_s)
         motion = motion._replace(law=law)
         for k in range(n_steps):
@@ -173,8 +171,8 @@ def advance(
     return end, MotionEnd(
         pressure_kpa=end.pressure_kpa,
         spring_m=spring_m,
-        tip_position_m=frames.plate_position[-1],
-        tip_rotation=frames.plate_rotation[-1],
+        tip_position_m=frames.tip_position,
+        tip_rotation=frames.tip_rotation,
         path=path,
         result=result.astype(jnp.int32),
     )

@@ -14,6 +14,14 @@ from train.config import TrainConfig
 from train.demos.demonstrations import Demonstrations
 
 N_POSITIONS = 6
+# A base and a tip that are mounted askew, as on every calibrated arm.
+MOUNTED = SHORT.replace(
+    mounting={
+        "tip_offset_m": (0.002, -0.006, 0.0),
+        "tip_turn_deg": (1.0, -2.0, 4.0),
+        "base_offset_m": (0, 0.01, 0),
+    }
+)
 
 
 @pytest.fixture(scope="session")
@@ -30,7 +38,7 @@ def imitation_config():
 
 @pytest.fixture(scope="session")
 def short_env(imitation_config):
-    return ReachEnv(SHORT, imitation_config.env)
+    return ReachEnv(MOUNTED, imitation_config.env)
 
 
 @pytest.fixture(scope="session")
@@ -39,7 +47,7 @@ def moving_env():
     motion = EnvConfig(
         mode="dynamic", observation="motion", goal_ends=False, dynamic_step_s=0.04, n_poses=256
     )
-    return ReachEnv(SHORT, motion)
+    return ReachEnv(MOUNTED, motion)
 
 
 @pytest.fixture(scope="session")
