@@ -16,6 +16,7 @@ from mjx_softarm._support import cli
 # By name, the function that measures. It returns figures, or an exit status.
 BENCHMARKS = {
     "throughput": "benchmarks.speed.throughput:measure",
+    "motion-engines": "benchmarks.speed.motion:measure",
     "settle": "benchmarks.speed.settle:measure",
     "guard": "benchmarks.speed.guard:main",
     "calibration": "benchmarks.accuracy.calibration:measure",

@@ -9,8 +9,8 @@ round holds random pressures, as forces on the segments, and has neither a contr
     explicit    Euler's step on SoRoMoX's accelerations, the longest that is stable. Its limit is 0.85 ms at
                 the fastest decay seen, 2,340 per second. Runge-Kutta methods allow 1.0 to 1.8 times that, at
                 two to six times the cost.
-    implicit    the linearised midpoint rule of `mjx_softarm.mechanics.dynamics` on SoRoMoX's inertia and
-                forces, with a control period's step. It is not SoRoMoX's own.
+    implicit    the linearised midpoint rule of `mjx_softarm.mechanics.motion.midpoint` on SoRoMoX's inertia
+                and forces, with a control period's step. It is not SoRoMoX's own.
 
 Source: SoRoMoX, https://github.com/tud-phi/soromox.
 """

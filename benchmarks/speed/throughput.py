@@ -29,6 +29,7 @@ from mjx_softarm.spec import ArmSpec
 N_ROUNDS = 3
 PAPER_WORKERS, PAPER_STEP_S = 14, 0.03  # the paper's cost of an environment step
 SUBPROC = "SubprocVecEnv"
+MODES = ("quasistatic", "dynamic")
 N_MOVING = 128  # arms in motion
 SOROMOX = {"explicit": "SoRoMoX, explicit", "implicit": "SoRoMoX, this project's implicit step"}
 
@@ -39,8 +40,7 @@ Peer = tuple[str, list[str], str]  # name, program, key of `PINS`
 def points(on_gpu: bool) -> list[list[Point]]:
     """Return the points of `over_arms`, in groups that take turns: one for each number of arms."""
     arms = (1, 1024, 8192, 32_768) if on_gpu else (1, 128, 1024)
-    programs = (("chain", "quasistatic"), ("mjx", "quasistatic"), ("mjx", "dynamic"))
-    return [[(engine, mode, n) for engine, mode in programs] for n in arms]
+    return [[(engine, mode, n) for mode in MODES for engine in ("chain", "mjx")] for n in arms]
 
 
 def measure() -> dict[str, Any]:
@@ -79,7 +79,8 @@ def _in_motion(folder: str) -> list[dict[str, Any]]:
         (name, ["benchmarks.speed.soromox_worker", method, str(N_MOVING)], "soromox")
         for method, name in SOROMOX.items()
     ]
-    return programs_rows([_ours("mjx", "dynamic", N_MOVING), _rollout(folder, str(n_cores()))], peers)
+    ours = [_ours(engine, "dynamic", N_MOVING) for engine in ("chain", "mjx")]
+    return programs_rows([*ours, _rollout(folder, str(n_cores()))], peers)
 
 
 def _ours(engine: str, mode: str, n_arms: int) -> Worker:

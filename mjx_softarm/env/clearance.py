@@ -5,8 +5,8 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jax import Array
 
-from mjx_softarm.mechanics.dynamics import Path
 from mjx_softarm.mechanics.kinematics import chain_kinematics
+from mjx_softarm.mechanics.motion.state import Path
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.pipe import CrossPipe, body_clearance
 from mjx_softarm.sensing.s2r import S2R, carry_body

@@ -15,6 +15,8 @@ from mjx_softarm.mechanics.pipe import CrossPipe
 from mjx_softarm.mechanics.workspace import HELD_OUT_SEED
 from mjx_softarm.spec import ArmSpec
 
+Engine = Literal["chain", "mjx", "warp"]
+
 
 def _expect(config: Any, name: str, holds: bool, expected: str) -> None:
     """Raise ValueError for the field `name` of a config unless a condition holds."""
@@ -47,8 +49,9 @@ class Randomisation:
 class EnvConfig:
     """Simulation, reward and randomisation of `ReachEnv`."""
 
-    engine: Annotated[Literal["chain", "mjx"], arg(aliases=["--engine"])] = "chain"
-    """kinematics: in closed form, or MJX's; both engines share all else"""
+    engine: Annotated[Engine, arg(aliases=["--engine"])] = "chain"
+    """at rest, kinematics in closed form (chain) or by MJX; in motion, this project's own time step (chain),
+    `mjx.step` of the compiled model (mjx), or the same by MJX-Warp, which needs a GPU and warp-lang (warp)"""
     mode: Annotated[Literal["quasistatic", "dynamic"], arg(aliases=["--mode"])] = "quasistatic"
     """an action leads to its equilibrium, or moves the arm for a while"""
     links_per_section: int | None = None
@@ -84,11 +87,12 @@ class EnvConfig:
     def __post_init__(self):
         # Names
         for name, allowed in (
-            ("engine", ("chain", "mjx")),
+            ("engine", get_args(Engine)),
             ("mode", ("quasistatic", "dynamic")),
             ("observation", get_args(Observation)),
         ):
             _expect(self, name, getattr(self, name) in allowed, f"one of {allowed}")
+        _expect(self, "engine", self.moves or self.engine != "warp", "'chain' or 'mjx' for arms at rest")
         known = self.moves or self.observation != "motion"
         _expect(self, "observation", known, "'pose' or 'payload' for arms at rest")
 
@@ -106,6 +110,9 @@ class EnvConfig:
         _expect(self, "even_share", 0 <= self.even_share <= 1, "0 to 1")
         other = f"another: {HELD_OUT_SEED} draws the goals of the evaluation"
         _expect(self, "workspace_seed", self.workspace_seed != HELD_OUT_SEED, other)
+
+        no_friction = self.engine != "warp" or not self.randomisation.friction_max_n
+        _expect(self.randomisation, "friction_max_n", no_friction, "0 with the engine 'warp'")
 
         # Pipe
         no_cost = self.pipe_diameter_mm is not None or not self.clearance_cost_per_mm

@@ -1,8 +1,7 @@
 """One arm that reaches for poses: a brax environment with the paper's state, action and reward.
 
 An action is one sensor reading per spring, scaled to [-1, 1]; the sensor-space law turns it into pressures.
-`mode="quasistatic"` goes straight to the equilibrium. `mode="dynamic"` steps MJX's equation of motion, with
-chambers that fill, under the law at the control rate. Both have their kinematics from `engine`.
+`mode="quasistatic"` goes to the equilibrium at once; `mode="dynamic"` moves the arm, with chambers that fill.
 """
 
 from __future__ import annotations
@@ -13,16 +12,17 @@ from jax import Array
 
 from mjx_softarm import control
 from mjx_softarm._support import draws
-from mjx_softarm._support.mjx import Env, State, mjx
+from mjx_softarm._support.mjx import Env, State, put
 from mjx_softarm.env.clearance import Walls
 from mjx_softarm.env.config import EnvConfig
 from mjx_softarm.env.state import PAYLOAD_SHARE, ArmState, EpisodeNoise, at_rest, motion_params
 from mjx_softarm.mdp import observation as obs
 from mjx_softarm.mdp import rewards
 from mjx_softarm.mdp.actions import ActionMap
-from mjx_softarm.mechanics.dynamics import Motion, MotionEnd, MotionResult, MovingArm, advance
 from mjx_softarm.mechanics.kinematics import MjxKinematics, chain_kinematics
 from mjx_softarm.mechanics.mjcf import build_model
+from mjx_softarm.mechanics.motion import midpoint, mjx_step
+from mjx_softarm.mechanics.motion.state import Motion, MotionEnd, MotionResult, MovingArm
 from mjx_softarm.mechanics.params import PAYLOAD, ArmParams
 from mjx_softarm.mechanics.settle import Settled, SettleResult, arms_at_once, settle
 from mjx_softarm.mechanics.workspace import Pool, sample_evenly, sample_workspace
@@ -63,8 +63,7 @@ class ReachEnv(Env):
         invalid_REASON           1 for this code of `SettleResult`, or in motion of `MotionResult`
         reward_TERM              terms of the reward: goal, error, steps, saturation, distance, clearance
 
-    With a sim-to-real network, all poses and the body are those of the real arm, P_S2R: the network predicts
-    them from the simulated pose and the spring lengths.
+    With a sim-to-real network, poses and body are those it predicts of the real arm, P_S2R.
     """
 
     def __init__(self, spec: ArmSpec | None = None, config: EnvConfig | None = None, s2r: S2R | None = None):
@@ -90,9 +89,10 @@ class ReachEnv(Env):
         self.walls = Walls(self.config.pipe_diameter_mm, self.spec, self.params, s2r)
 
         # Simulation, and the poses that starts and goals are drawn from
-        self.uses_mjx = self.config.engine == "mjx" or self.config.moves
+        self.uses_mjx = self.config.engine != "chain" or self.config.moves
         self.n_at_once = arms_at_once(self.spec.n_links)
-        self.model = mjx.put_model(build_model(self.spec)) if self.uses_mjx else None
+        warp = self.config.engine == "warp"
+        self.model, self._data = put(build_model(self.spec), warp) if self.uses_mjx else (None, None)
         self._results = MotionResult if self.config.moves else SettleResult
         self._failures = {f"invalid_{r.name.lower()}": r.value for r in self._results if r.value != 0}
         self.pool = self._training_pool()
@@ -120,8 +120,8 @@ class ReachEnv(Env):
 
     @property
     def backend(self) -> str:
-        """Simulation that runs: "chain" or "mjx" kinematics of the equilibrium, or "mjx dynamic" steps."""
-        return "mjx dynamic" if self.config.moves else self.config.engine
+        """Simulation that runs: the engine, at rest or in motion."""
+        return f"{self.config.engine} dynamic" if self.config.moves else self.config.engine
 
     def sample_pool(self, n: int, seed: int, evenly: bool = False) -> Pool:
         """Draw n poses with `sample_workspace` or `sample_evenly`, and correct them to those observed."""
@@ -254,12 +254,12 @@ class ReachEnv(Env):
     def _move(self, arm: ArmState, reference_m: Array) -> tuple[Motion, Settled | MotionEnd]:
         """Move to true spring lengths (n_chambers,): return the motion and the observables at its end."""
         params, config = self.params_of(arm), self.config
-        kinematics = MjxKinematics(self.model) if config.engine == "mjx" else chain_kinematics(params)
         if config.moves:
-            moving = MovingArm.of(self.model, kinematics, params, arm.moving)
-            rate_hz = self.spec.control.rate_hz
-            times_s = config.dynamic_step_s, 1.0 / rate_hz, config.simulation_step_s
-            return advance(moving, arm.motion, reference_m, self.gains, *times_s)
+            moving = MovingArm(self.model, self._data, params, arm.moving)
+            times_s = config.dynamic_step_s, 1.0 / self.spec.control.rate_hz, config.simulation_step_s
+            engine = midpoint if config.engine == "chain" else mjx_step
+            return engine.advance(moving, arm.motion, reference_m, self.gains, *times_s)
+        kinematics = MjxKinematics(self.model) if config.engine == "mjx" else chain_kinematics(params)
         end = settle(kinematics, params, reference_m, self.n_at_once)
         return Motion.at_rest(end.q, end.pressure_kpa, end.spring_m), end
 

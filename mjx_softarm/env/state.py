@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from mjx_softarm.env.config import Randomisation
-from mjx_softarm.mechanics.dynamics import Motion, MotionParams
+from mjx_softarm.mechanics.motion.state import Motion, MotionParams
 from mjx_softarm.mechanics.workspace import Pool
 from mjx_softarm.pneumatics import VALVE_S
 from mjx_softarm.sensing.sensors import SENSORS

@@ -114,24 +114,27 @@ class MjxKinematics:
     model: mjx.Model  # from `mjx_softarm.mechanics.mjcf`: bodies are world and links, the last site the tip
 
     def __call__(self, q: Array) -> Frames:
-        n_links = len(q) // DOFS_PER_LINK
-        data = mjx.kinematics(self.model, mjx.make_data(self.model).replace(qpos=q))
+        return frames_of(self.model, mjx.kinematics(self.model, mjx.make_data(self.model).replace(qpos=q)))
 
-        # A body's origin is its hinges' anchor; its plate hangs half a link below
-        links = slice(1, n_links + 1)  # the world comes first
-        rotation = data.xmat[links].reshape(n_links, 3, 3)
-        anchor = data.xpos[links]
-        half = -self.model.geom_pos[1, 2]  # place of the first link's ring
-        position = anchor - half * rotation[:, :, 2]
-        base = rotation_from_quaternion(self.model.body_quat[1])
-        return Frames(
-            plate_position=jnp.concatenate([self.model.geom_pos[:1], position]),
-            plate_rotation=jnp.concatenate([base[None], rotation]),
-            axis=data.xaxis[: n_links * DOFS_PER_LINK].reshape(n_links, DOFS_PER_LINK, 3),
-            anchor=anchor,
-            tip_position=data.site_xpos[-1],
-            tip_rotation=data.site_xmat[-1].reshape(3, 3),
-        )
+
+def frames_of(model: mjx.Model, data: mjx.Data) -> Frames:
+    """Return the frames of one arm from MJX's data after its kinematics."""
+    # A body's origin is its hinges' anchor; its plate hangs half a link below
+    n_links = len(data.qpos) // DOFS_PER_LINK
+    links = slice(1, n_links + 1)  # the world comes first
+    rotation = data.xmat[links].reshape(n_links, 3, 3)
+    anchor = data.xpos[links]
+    half = -model.geom_pos[1, 2]  # place of the first link's ring
+    position = anchor - half * rotation[:, :, 2]
+    base = rotation_from_quaternion(model.body_quat[1])
+    return Frames(
+        plate_position=jnp.concatenate([model.geom_pos[:1], position]),
+        plate_rotation=jnp.concatenate([base[None], rotation]),
+        axis=data.xaxis[: n_links * DOFS_PER_LINK].reshape(n_links, DOFS_PER_LINK, 3),
+        anchor=anchor,
+        tip_position=data.site_xpos[-1],
+        tip_rotation=data.site_xmat[-1].reshape(3, 3),
+    )
 
 
 def _rotation_xy(x: Array, y: Array) -> Array:

@@ -12,6 +12,7 @@ from mjx_softarm.mechanics.body import hole_directions
 from mjx_softarm.sensing.pose import rotation_about
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
 
+N_PER_KPA_M2 = 1e3  # force of 1 kPa on 1 m^2
 PAYLOAD = 1  # index in ArmParams.tool_mass_kg
 
 

@@ -5,8 +5,10 @@ import math
 
 import pytest
 
-from mjx_softarm.env import EnvConfig, Randomisation
+from mjx_softarm._support.mjx import put
+from mjx_softarm.env import EnvConfig, Randomisation, ReachEnv
 from mjx_softarm.mdp.rewards import RewardConfig
+from mjx_softarm.mechanics.mjcf import build_model
 from mjx_softarm.spec import ArmSpec
 
 
@@ -21,6 +23,21 @@ def test_an_arm_at_rest_observes_no_motion():
     with pytest.raises(ValueError, match="got 'motion', expected 'pose' or 'payload' for arms at rest"):
         EnvConfig(observation="motion")
     assert EnvConfig(observation="motion", mode="dynamic").moves
+
+
+def test_warp_moves_arms_without_dry_friction_and_needs_a_gpu(spec):
+    with pytest.raises(ValueError, match="engine: got 'warp', expected 'chain' or 'mjx' for arms at rest"):
+        EnvConfig(engine="warp")
+    with pytest.raises(ValueError, match="friction_max_n: got 1.0, expected 0 with the engine 'warp'"):
+        EnvConfig(engine="warp", mode="dynamic", randomisation=Randomisation(friction_max_n=1.0))
+    with pytest.raises(RuntimeError, match="engine 'warp': got a cpu, expected a GPU"):
+        ReachEnv(spec, EnvConfig(engine="warp", mode="dynamic", n_poses=1))
+
+
+def test_warp_that_is_not_installed_is_told(spec, monkeypatch):
+    monkeypatch.setattr("jax.default_backend", lambda: "gpu")
+    with pytest.raises(RuntimeError, match=r"warp-lang is not installed.*expected `pip install warp-lang`"):
+        put(build_model(spec), warp=True)
 
 
 @pytest.mark.parametrize(

@@ -240,8 +240,10 @@ def test_engine_mjx_steps_like_engine_chain(few):
         np.testing.assert_array_equal(state.info["valid"], [True, True, True, False])
 
 
-def test_mode_dynamic_comes_to_rest_at_the_quasi_static_equilibrium(few):
-    env = ReachEnv(few.env.spec, dataclasses.replace(few.env.config, mode="dynamic", dynamic_step_s=1.0))
+@pytest.mark.parametrize("engine", ["chain", "mjx"])
+def test_mode_dynamic_comes_to_rest_at_the_quasi_static_equilibrium(few, engine):
+    moving = {"engine": engine, "mode": "dynamic", "dynamic_step_s": 1.0}
+    env = ReachEnv(few.env.spec, dataclasses.replace(few.env.config, **moving))
     fresh, step = compiled(env)
     # Reasons of failures are those of motion, and there is a path.
     before = few.before.replace(metrics=fresh.metrics, info=fresh.info)

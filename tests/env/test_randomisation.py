@@ -11,7 +11,7 @@ from mjx_softarm._support import xla
 from mjx_softarm.env import EnvConfig, Randomisation, ReachEnv
 from mjx_softarm.env.reach import PAYLOAD
 from mjx_softarm.env.state import motion_params
-from mjx_softarm.mechanics.dynamics import MotionParams
+from mjx_softarm.mechanics.motion.state import MotionParams
 from mjx_softarm.mechanics.params import ArmParams
 
 MM = 1e-3

@@ -33,7 +33,7 @@ from jax.sharding import Mesh
 
 from mjx_softarm._support import draws
 from mjx_softarm._support.mjx import State
-from mjx_softarm.env import ReachEnv
+from mjx_softarm.env import EnvConfig, ReachEnv
 from mjx_softarm.env.vector import VectorEnv, over_arms
 from mjx_softarm.mdp import rewards
 from train.agent.learner import Explored, Learner, LearnerConfig, Sample, check_settings
@@ -74,6 +74,11 @@ class AnalyticConfig(LearnerConfig):
             "horizon": (self.horizon >= 1, "a whole number >= 1"),
         }
         check_settings("learner", self, required)
+
+    def check(self, env: EnvConfig) -> None:
+        """Raise ValueError for MJX's own time step in motion: its gradient is neither tested nor cheap."""
+        usable = env.engine == "chain" or not env.moves
+        check_settings("env", env, {"engine": (usable, "'chain' in motion, for the gradient")})
 
 
 class AnalyticState(NamedTuple):

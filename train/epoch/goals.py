@@ -89,7 +89,12 @@ def static_poses(env: ReachEnv, actions: np.ndarray) -> Pool:
         ConfigError: the arm does not come to rest under one of them.
     """
     config = dataclasses.replace(
-        env.config, mode="quasistatic", observation="pose", n_poses=1, randomisation=Randomisation()
+        env.config,
+        engine="chain",
+        mode="quasistatic",
+        observation="pose",
+        n_poses=1,
+        randomisation=Randomisation(),
     )
     still = ReachEnv(env.spec, config, env.s2r)
     begin = still.reset(jax.random.PRNGKey(0))

@@ -1,4 +1,4 @@
-"""The arm in motion against C MuJoCo at 0.25 ms, whose chambers are filled by the twin's pneumatics."""
+"""Both engines in motion against C MuJoCo, whose chambers are filled by the twin's pneumatics."""
 
 from typing import NamedTuple
 
@@ -10,18 +10,12 @@ import pytest
 
 from mjx_softarm import ArmSpec, control
 from mjx_softarm._support import xla
-from mjx_softarm._support.mjx import mjx
-from mjx_softarm.mechanics.dynamics import (
-    CREEP_M_PER_S,
-    Motion,
-    MotionParams,
-    MotionResult,
-    MovingArm,
-    advance,
-)
+from mjx_softarm._support.mjx import put
 from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.mjcf import build_model, chamber_lengths, spring_lengths
-from mjx_softarm.mechanics.params import ArmParams
+from mjx_softarm.mechanics.motion import midpoint, mjx_step
+from mjx_softarm.mechanics.motion.state import CREEP_M_PER_S, Motion, MotionParams, MotionResult, MovingArm
+from mjx_softarm.mechanics.params import PAYLOAD, ArmParams
 from mjx_softarm.mechanics.statics import all_tendons
 from mjx_softarm.mechanics.workspace import settle_many
 from mjx_softarm.twin.pneumatics import Pneumatics
@@ -57,18 +51,18 @@ def references(spec, n):
     return np.repeat(asked, HOLD_TICKS, axis=1)
 
 
-def true_tips(spec, q, pressure_kpa, reference_m, friction_n=0.0):
+def true_tips(spec, q, pressure_kpa, reference_m, step_s=TRUE_STEP_S, model=None, before_step=None):
     """Tips (ticks, 3) [m] of C MuJoCo after each tick, with references (ticks, chambers).
 
-    With friction each chamber is pushed against the rate of its length, at each time step anew.
+    A function of the data may set forces or dampers before each time step.
     """
-    model = build_model(spec)
-    model.opt.timestep, model.actuator_ctrllimited[:] = TRUE_STEP_S, 0
+    model = model or build_model(spec)
+    model.opt.timestep, model.actuator_ctrllimited[:] = step_s, 0
     data = mujoco.MjData(model)
     data.qpos[:] = q
     mujoco.mj_step1(model, data)
     bellows = spec.chambers.area_m2, spec.chambers.area_slope_m, spec.geometry.section_length_m
-    air = Pneumatics(*bellows, chamber_lengths(data), TRUE_STEP_S)
+    air = Pneumatics(*bellows, chamber_lengths(data), step_s)
     air.command(pressure_kpa)
     for _ in range(2000):  # held until the chambers are full
         air.step(chamber_lengths(data))
@@ -76,56 +70,91 @@ def true_tips(spec, q, pressure_kpa, reference_m, friction_n=0.0):
     for reference in reference_m:
         command, law = control.pressures(reference, spring_lengths(data), law, GAINS, PERIOD_S)
         air.command(command)
-        for _ in range(round(PERIOD_S / TRUE_STEP_S)):
+        for _ in range(round(PERIOD_S / step_s)):
             data.ctrl[:] = air.step(chamber_lengths(data))
-            data.qfrc_applied[:] = dry_friction(data, friction_n) if friction_n else 0.0
+            if before_step:
+                before_step(data)
             mujoco.mj_step2(model, data)
             mujoco.mj_step1(model, data)
         tips.append(data.site("tip").xpos.copy())
     return np.array(tips)
 
 
-def dry_friction(data, friction_n):
-    """Forces (nv,) of chambers that are pushed against the rate of their length."""
-    jacobian = data.ten_J.reshape(-1, data.qpos.size)[0::2]  # dense: each tendon crosses all links
-    rate = data.ten_velocity[0::2]
-    return -jacobian.T @ (friction_n * rate / np.sqrt(rate**2 + CREEP_M_PER_S**2))
+def dry_friction(friction_n):
+    """Function that pushes each chamber against the rate of its length."""
+
+    def push(data):
+        jacobian = data.ten_J.reshape(-1, data.qpos.size)[0::2]  # dense: each tendon crosses all links
+        rate = data.ten_velocity[0::2]
+        data.qfrc_applied[:] = -jacobian.T @ (friction_n * rate / np.sqrt(rate**2 + CREEP_M_PER_S**2))
+
+    return push
 
 
-def mover(spec):
+def mover(spec, engine=midpoint, step_s=PERIOD_S):
     """Function of joint coordinates, pressures, references (ticks, chambers), own numbers: the results."""
-    model, params = mjx.put_model(build_model(spec)), jax.tree.map(jnp.asarray, ArmParams.from_spec(spec))
+    model, data = put(build_model(spec))
+    nominal = jax.tree.map(jnp.asarray, ArmParams.from_spec(spec))
 
-    def move(q, pressure_kpa, reference_m, own):
-        kinematics = chain_kinematics(params)
-        arm = MovingArm.of(model, kinematics, params, own)
-        start = Motion.at_rest(q, pressure_kpa, all_tendons(kinematics(q), params).length[1])
+    def move(q, pressure_kpa, reference_m, own, params):
+        arm = MovingArm(model, data, params, own)
+        start = Motion.at_rest(q, pressure_kpa, all_tendons(chain_kinematics(params)(q), params).length[1])
 
         def tick(motion, reference):
-            return advance(arm, motion, reference, GAINS, PERIOD_S, PERIOD_S, PERIOD_S)
+            return engine.advance(arm, motion, reference, GAINS, PERIOD_S, PERIOD_S, step_s)
 
         return jax.lax.scan(tick, start, reference_m)[1]
 
-    return xla.jit(jax.vmap(move, in_axes=(0, 0, 0, None)))
+    many = xla.jit(jax.vmap(move, in_axes=(0, 0, 0, None, None)))
+    return lambda *args, params=nominal: many(*args, params)
 
 
 @pytest.mark.parametrize("links", [2, pytest.param(4, marks=pytest.mark.slow)])
-def test_transients_are_those_of_c_mujoco(links):
+def test_transients_of_both_engines_are_those_of_c_mujoco(links):
     """Within 1 mm at 95 % over 2 s, with a random reference each half second."""
     spec = SPEC.replace(structure={"links_per_section": links})
     start, asked = starts(spec, N_ARMS), references(spec, N_ARMS)
-    moved = mover(spec)(*start, np.float32(asked), MotionParams())
     true = np.array([true_tips(spec, *each) for each in zip(*start, asked, strict=True)])
-    error_mm = 1e3 * np.linalg.norm(moved.tip_position_m - true, axis=-1)
-    assert (moved.result == MotionResult.FINITE.value).all()
     assert 1e3 * np.linalg.norm(np.diff(true, axis=1), axis=-1).sum(axis=1).mean() > 200.0  # mm on the way
-    assert np.percentile(error_mm, 95) < 1.0 and np.median(error_mm) < 0.5
+    for engine, step_s in ((midpoint, PERIOD_S), (mjx_step, 0.002)):
+        moved = mover(spec, engine, step_s)(*start, np.float32(asked), MotionParams())
+        error_mm = 1e3 * np.linalg.norm(moved.tip_position_m - true, axis=-1)
+        assert (moved.result == MotionResult.FINITE.value).all()
+        assert np.percentile(error_mm, 95) < 1.0 and np.median(error_mm) < 0.5
 
 
 @pytest.fixture(scope="module")
 def short():
     """Four small arms, references that change each half second, and the function that moves them."""
     return starts(SHORT_ARM, 4), np.float32(references(SHORT_ARM, 4)), mover(SHORT_ARM)
+
+
+def test_mjx_steps_as_c_mujoco_does():
+    """With an episode's payload, stiffness, damping and friction; MJX has float32, C MuJoCo float64."""
+    step_s, own = 0.005, MotionParams(damping=1.2, friction_n=1.5)
+    start, asked = starts(SHORT_ARM, 4), references(SHORT_ARM, 4)
+    nominal = ArmParams.from_spec(SHORT_ARM)
+    stiffness = np.float32(nominal.chamber_stiffness * [0.9, 1.0, 1.1])
+    masses = np.float32(nominal.tool_mass_kg + 0.3 * np.eye(2)[PAYLOAD])
+    params = nominal._replace(tool_mass_kg=masses, chamber_stiffness=stiffness)
+    moved = mover(SHORT_ARM, mjx_step, step_s)(*start, np.float32(asked), own, params=params)
+
+    model = build_model(SHORT_ARM)
+    model.body("payload").mass, model.tendon_stiffness[0::2] = masses[PAYLOAD], stiffness
+    model.dof_damping *= own.damping
+    damping = own.damping * model.tendon_damping
+
+    def set_dampers(data):
+        rate = data.ten_velocity[0::2]
+        model.tendon_damping[:] = damping
+        model.tendon_damping[0::2] += own.friction_n / np.sqrt(rate**2 + CREEP_M_PER_S**2)
+        mujoco.mj_fwdVelocity(model, data)
+
+    true = np.array(
+        [true_tips(SHORT_ARM, *each, step_s, model, set_dampers) for each in zip(*start, asked, strict=True)]
+    )
+    assert 1e3 * np.linalg.norm(np.diff(true, axis=1), axis=-1).sum(axis=1).mean() > 20.0  # mm on the way
+    np.testing.assert_allclose(moved.tip_position_m, true, atol=1e-5)
 
 
 def test_a_command_waits_for_the_valves(short):
@@ -143,7 +172,12 @@ def test_dry_friction_is_that_of_c_mujoco(short):
     moved, free = (
         np.asarray(move(*start, asked, MotionParams(friction_n=f)).tip_position_m) for f in (friction_n, 0.0)
     )
-    true = np.array([true_tips(SHORT_ARM, *each, friction_n) for each in zip(*start, asked, strict=True)])
+    true = np.array(
+        [
+            true_tips(SHORT_ARM, *each, before_step=dry_friction(friction_n))
+            for each in zip(*start, asked, strict=True)
+        ]
+    )
     off_mm, change_mm = (1e3 * np.linalg.norm(moved - x, axis=-1) for x in (true, free))
     assert np.percentile(change_mm, 95) > 3.0
     assert np.percentile(off_mm, 95) < 0.1 * np.percentile(change_mm, 95)
