@@ -25,6 +25,7 @@ BENCHMARKS = {
     "logs": "benchmarks.accuracy.logs:measure",
     "claims": "benchmarks.accuracy.claims:measure",
     "learning": "benchmarks.accuracy.learning:measure",
+    "film": "benchmarks.accuracy.film:film",
     "race": "benchmarks.race.race:race",
     "path": "benchmarks.accuracy.path:measure",
     "paper": "benchmarks.paper.experiments:Paper",
