@@ -79,10 +79,21 @@ class EnvConfig:
         """Whether the arm is in motion."""
         return self.mode == "dynamic"
 
-    def arm(self, spec: ArmSpec) -> ArmSpec:
-        """Return the arm as it is simulated."""
-        n = self.links_per_section
-        return spec if n is None else spec.replace(structure={"links_per_section": n})
+    def arm(self, spec: ArmSpec, corrected: bool = False) -> ArmSpec:
+        """Return the arm as it is simulated.
+
+        Args:
+            spec: the arm.
+            corrected: whether it has a sim-to-real network, which holds for its own links alone.
+
+        Raises:
+            ValueError: a corrected arm is to have other links.
+        """
+        own, n = spec.structure.links_per_section, self.links_per_section
+        if n is None or n == own:
+            return spec
+        _expect(self, "links_per_section", not corrected, f"{own}, as the sim-to-real network has")
+        return spec.replace(structure={"links_per_section": n})
 
     def __post_init__(self):
         # Names

@@ -67,13 +67,8 @@ class ReachEnv(Env):
     """
 
     def __init__(self, spec: ArmSpec | None = None, config: EnvConfig | None = None, s2r: S2R | None = None):
-        given, self.config, self.s2r = spec or ArmSpec.default(), config or EnvConfig(), s2r
-        self.spec = self.config.arm(given)
-        if s2r is not None and self.spec != given:
-            raise ValueError(
-                f"EnvConfig.links_per_section: got {self.config.links_per_section} with a sim-to-real "
-                f"network, expected {given.structure.links_per_section}, the links of the arm it corrects"
-            )
+        self.config, self.s2r = config or EnvConfig(), s2r
+        self.spec = self.config.arm(spec or ArmSpec.default(), corrected=s2r is not None)
         if self.config.dynamic_step_s < 1.0 / self.spec.control.rate_hz:
             raise ValueError(
                 f"EnvConfig.dynamic_step_s: got {self.config.dynamic_step_s}, expected at least one "
@@ -90,8 +85,7 @@ class ReachEnv(Env):
 
         # Simulation, and the poses that starts and goals are drawn from
         self.uses_mjx = self.config.engine != "chain" or self.config.moves
-        self.n_at_once = arms_at_once(self.spec.n_links)
-        warp = self.config.engine == "warp"
+        warp, self.n_at_once = self.config.engine == "warp", arms_at_once(self.spec.n_links)
         self.model, self._data = put(build_model(self.spec), warp) if self.uses_mjx else (None, None)
         self._results = MotionResult if self.config.moves else SettleResult
         self._failures = {f"invalid_{r.name.lower()}": r.value for r in self._results if r.value != 0}

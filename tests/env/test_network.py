@@ -37,7 +37,7 @@ def test_with_a_network_every_pose_is_the_real_one_and_the_arm_underneath_the_sa
         limit=np.float32(1.0),
     )
     plain, real = ReachEnv(SHORT_ARM, config), ReachEnv(SHORT_ARM, config, network)
-    with pytest.raises(ValueError, match="links_per_section: got 3 with a sim-to-real network, expected 2"):
+    with pytest.raises(ValueError, match="got 3, expected 2, as the sim-to-real network has"):
         ReachEnv(SHORT_ARM, dataclasses.replace(config, links_per_section=3), network)
     keys = jax.random.split(jax.random.PRNGKey(0), 16)
     actions = jax.random.uniform(jax.random.PRNGKey(1), (16, n_springs), minval=-0.5, maxval=0.5)
