@@ -100,8 +100,8 @@ PRESETS: dict[str, TrainConfig] = {
     # A first try: an arm of fewer links, which is simulated faster but ends some 4 mm elsewhere.
     "motion-quick": dataclasses.replace(
         _MOTION,
-        learner=dataclasses.replace(_MOTION.learner, total_env_steps=98_304, replay_capacity=98_304),
-        evaluation_epochs=16,
+        learner=dataclasses.replace(_MOTION.learner, total_env_steps=122_880, replay_capacity=122_880),
+        evaluation_epochs=20,
         env=dataclasses.replace(_MOTION.env, links_per_section=2),
     ),
     # The same task through the gradient of the motion, from the policy of a run of `analytic` (--agent).
