@@ -73,9 +73,10 @@ class PositionEvaluator:
     """Evaluate policies on m demonstrated positions, one after another; compiled once.
 
     At rest, a single arm without randomisation goes from position to position. Its second pass counts.
-    In motion, `N_STARTS` arms with the environment's randomisation begin at rest at different positions, and
-    go around once. After `n_actions` towards a position, each has to stay there for `HOLD_S`.
-    `first` (m,) bool tells the positions that are goals from the start.
+    In motion, `N_STARTS` arms with the environment's randomisation begin without velocity at different
+    positions, each in the equilibrium of the nominal arm, and go around once. After `n_actions` towards a
+    position, each has to stay there for `HOLD_S`. `first` (m,) bool tells the positions that are goals
+    from the start.
 
     Raises:
         ConfigError: in motion, the arm does not come to rest at a position.
@@ -112,9 +113,10 @@ class PositionEvaluator:
         return summarise(found, held, self.env.config.reward.threshold, self.first)
 
     def _around(self, n_actions: int) -> Callable[[Any, Array, Array], tuple[Reached, Array]]:
-        """Return the function of policy, first positions (k,) and keys (k,) that arms in motion go around by.
+        """Return a function that takes k arms around all positions.
 
-        It returns results (k, m), and whether the arms stayed (k, m).
+        Its arguments are the policy, first positions (k,) and keys (k,). It returns results (k, m), and
+        whether the arms stayed (k, m).
         """
         env, learner, goals = self.env, self.learner, jnp.asarray(self.positions)
         at_rest = static_poses(env, np.asarray(self.demonstrations.actions))
@@ -127,15 +129,16 @@ class PositionEvaluator:
             # The state after arriving counts, the body's clearance until the end.
             there = jax.tree.map(lambda x: x[n_actions - 1], way)
             there = there._replace(clearance_mm=jnp.min(way.clearance_mm), settled=jnp.all(way.settled))
-            near = (way.near_s == 0.0) & (way.scaled_error < env.config.reward.threshold)
+            near = (way.near_s == 0.0) & (way.scaled_error < env.config.reward.threshold) & way.settled
             return state, (there, jnp.all((near & (way.saturated_chambers == 0))[n_actions:]))
 
         def around(policy: Any, begin: Array, key: Array) -> tuple[Reached, Array]:
-            # Begin at rest at the position before, and bring the results into the order of the positions.
+            # Begin in the nominal arm's equilibrium at the position before the first.
             state, order = env.reset(key), (begin + jnp.arange(len(goals))) % len(goals)
             arm = env.put(state.pipeline_state, jax.tree.map(lambda x: x[order[-1]], at_rest))
             state = state.replace(pipeline_state=arm)
             _, found = jax.lax.scan(lambda state, goal: visit(policy, state, goal), state, goals[order])
+            # Bring the results into the order of the positions.
             return jax.tree.map(lambda x: jnp.roll(x, begin, axis=0), found)
 
         return jax.vmap(around, in_axes=(None, 0, 0))

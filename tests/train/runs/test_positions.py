@@ -84,6 +84,18 @@ def test_in_motion_an_arm_on_its_way_has_not_succeeded(moving_env, evaluator):
     assert len(np.unique(np.round(tip_mm, 2), axis=0)) == N_STARTS
 
 
+def test_an_arm_that_diverges_at_a_position_does_not_hold_it(moving_env, evaluator, monkeypatch):
+    """It keeps its last pose there; the policy says whether actions succeed."""
+    zero = jnp.zeros(())
+
+    def reach(env, learner, policy, state, goal, n_actions):
+        return state, Reached(goal, goal, zero, zero, policy > 0.0, zero, zero, zero, zero)
+
+    monkeypatch.setattr("train.runs.positions.reach", reach)
+    evaluate = evaluator(moving_env)
+    assert [evaluate(policy)[0].held_share for policy in (1.0, 0.0)] == [1.0, 0.0]
+
+
 def test_success_at_the_first_stages_positions_is_told_apart():
     zero, poses = np.zeros((1, 3)), np.zeros((1, 3, 6))
     reached = Reached(poses, poses, zero, zero, zero == 0, zero, np.array([[5.0, -1, -1]]), zero, zero)
