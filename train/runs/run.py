@@ -231,9 +231,10 @@ def _success(rows: Sequence[dict[str, float]]) -> str:
     Ends of episodes count, as in an evaluation: in motion, earlier actions are on the way. A learner with
     arms of its own has no episodes. There, all actions count.
     """
-    if episodes := sum(row.get("env/episodes", 0.0) for row in rows):
-        successes = sum(row["env/successes"] for row in rows)
-        return f"exploring: success {100 * successes / episodes:.0f} % of episodes"
+    if "env/episodes" in rows[0]:
+        episodes, successes = (sum(row[f"env/{name}"] for row in rows) for name in ("episodes", "successes"))
+        share = f"{100 * successes / episodes:.0f}" if episodes else "-"
+        return f"exploring: success {share} % of episodes"
     return f"success {100 * np.mean([row['env/reached'] for row in rows]):.0f} % of actions"
 
 
