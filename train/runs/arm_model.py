@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import hashlib
 import json
 from collections import ChainMap
@@ -29,6 +28,7 @@ N_WORKSPACE = 2048  # poses that stand for the workspace
 SEED = 0  # seed of the networks and of the workspace
 ESTIMATORS_FILE, _KIND = "estimators.npz", "estimators"
 _NAMES = "estimator", "load_estimator", "spring_model"
+_distilled: dict[str, Distilled] = {}  # by key, of this process
 
 
 class DistilledArm(NamedTuple):
@@ -50,7 +50,7 @@ def arm_model(
         spec: the arm, calibrated or not.
         s2r: sim-to-real network of its calibration, if there is one.
         folder: keeps the networks in a file, which is used again for the same arm and the same code.
-        tell: takes a line before the networks are distilled.
+        tell: takes a line before the networks are distilled, unless this process has them already.
 
     Raises:
         SpecError: the arm settles at too few pressures.
@@ -59,8 +59,10 @@ def arm_model(
     if file and (kept := _read(file, key, spec.n_chambers)):
         networks, errors = kept
     else:
-        tell("distilling pose and payload estimators for this arm, about a minute ...")
-        distilled = _distil(spec)
+        if key not in _distilled:
+            tell("distilling pose and payload estimators for this arm, about a minute ...")
+            _distilled[key] = distil(spec, SEED)
+        distilled = _distilled[key]
         networks = distilled.estimator, distilled.load_estimator, distilled.spring_model
         errors = {
             name: {f"{kg:g} kg": error._asdict() for kg, error in by_payload.items()}
@@ -88,7 +90,11 @@ def _read(file: Path, key: str, n: int) -> tuple[tuple[Any, Any, Any], dict[str,
 
 
 def _key(spec: ArmSpec) -> str:
-    """Return a checksum of all that the networks depend on: the arm, the settings, versions and code."""
+    """Return a checksum of the arm, the settings of its networks, JAX's version and the code that makes them.
+
+    The code is `train/runs/estimator.py`, `mjx_softarm/spec.py` and the modules of `_support`, `mechanics`
+    and `sensing`, without subfolders. Versions of other packages, and the device, are not part of it.
+    """
     settings = [spec.to_dict(), SEED, estimator.N_TRAINING, estimator.N_HELD_OUT, estimator.SCHEDULE]
     digest = hashlib.sha256(json.dumps([*settings, estimator.PAYLOADS, jax.__version__]).encode())
     package = Path(mjx_softarm.__file__).parent
@@ -108,8 +114,3 @@ def _workspace(spec: ArmSpec, s2r: S2R | None) -> np.ndarray:
     with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
         poses = [p.pose if s2r is None else correct(s2r, p.pose, p.spring_m) for p in halves]
     return np.concatenate(poses).astype(np.float32)
-
-
-@functools.cache
-def _distil(spec: ArmSpec) -> Distilled:
-    return distil(spec, SEED)

@@ -14,10 +14,12 @@ def test_networks_are_distilled_again_only_for_another_arm_or_code(tmp_path, mon
     errors = {"tip_mm": {0.0: Error(1.0, 2.0, 3.0)}}
     networks = POLICY.estimator, POLICY.load_estimator, POLICY.spring_model
     told, file = [], tmp_path / arm_model.ESTIMATORS_FILE
-    monkeypatch.setattr(arm_model, "_distil", lambda spec: Distilled(*networks, errors))
+    monkeypatch.setattr(arm_model, "distil", lambda spec, seed: Distilled(*networks, errors))
     monkeypatch.setattr(arm_model, "_workspace", lambda *_: POLICY.workspace)
 
     def model(spec=POLICY.spec):
+        """Return the model as another process makes it."""
+        monkeypatch.setattr(arm_model, "_distilled", {})
         return arm_model.arm_model(spec, None, tmp_path, told.append)
 
     first, again = model(), model()
@@ -37,6 +39,10 @@ def test_networks_are_distilled_again_only_for_another_arm_or_code(tmp_path, mon
 
 def test_a_folder_to_read_only_changes_nothing(tmp_path, monkeypatch):
     networks = POLICY.estimator, POLICY.load_estimator, POLICY.spring_model
-    monkeypatch.setattr(arm_model, "_distil", lambda spec: Distilled(*networks, {}))
+    monkeypatch.setattr(arm_model, "distil", lambda spec, seed: Distilled(*networks, {}))
     monkeypatch.setattr(arm_model, "_workspace", lambda *_: POLICY.workspace)
-    assert arm_model.arm_model(POLICY.spec, None, tmp_path / "absent").errors == {}
+    monkeypatch.setattr(arm_model, "_distilled", {})
+    told = []
+    for _ in range(2):  # the second time, the process has the networks
+        assert arm_model.arm_model(POLICY.spec, None, tmp_path / "absent", told.append).errors == {}
+    assert len(told) == 1
