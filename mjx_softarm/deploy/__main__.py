@@ -130,7 +130,10 @@ def _summary(run: LoopRun, policy: Policy) -> None:
         return
     reward = policy.reward
     mm, deg = (reward.threshold / weight for weight in (reward.weight_per_mm, reward.weight_per_deg))
-    print(f"reached: within {mm:.1f} mm without a rotation error, or within {deg:.0f} deg without a distance")
+    print(
+        f"a goal counts as reached within {mm:.1f} mm if the rotation is exact, or within {deg:.0f} deg "
+        "if the position is"
+    )
     if not policy.calibrated:
         print(
             "the policy is not calibrated: it is expected to miss on an arm that differs from its "

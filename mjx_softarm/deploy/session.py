@@ -28,10 +28,9 @@ from mjx_softarm.sensing.pose import pose_error, seen_error
 from mjx_softarm.spec import ArmSpec
 
 _ROUNDING_S = 1e-6  # rounding error of a simulated tick's duration
-_OTHER_LENGTH = (
-    0.25  # deviation of the springs' mean, in section lengths, of another arm; by hand. 1 kg: 0.05
-)
-_ANOTHER = "is it another arm, or not yet switched on?"
+# Deviation of the mean spring length of another arm, in section lengths; by hand. A payload of 1 kg: 0.05.
+_OTHER_LENGTH = 0.25
+_ANOTHER = "is it another arm, or not yet switched on"
 _KEPT = 1000  # number of rows, arrivals and faults that a run without a log keeps
 
 
@@ -120,7 +119,7 @@ def check_number(arm: ArmIO, spec: ArmSpec, name: str) -> np.ndarray | None:
     if readings.shape != (spec.n_chambers,):
         raise InputError(
             f"{name}: got {' x '.join(map(str, readings.shape))} readings, expected {spec.n_chambers}, of "
-            f"the {spec.structure.n_sections} sections of {spec.name!r}; {_ANOTHER}"
+            f"the {spec.structure.n_sections} sections of {spec.name!r}; {_ANOTHER}?"
         )
     return readings
 
@@ -146,7 +145,7 @@ def check_arm(arm: ArmIO, controller: Controller, name: str) -> None:
         (low, high), unit = policy.sensor.range, policy.sensor.unit
         raise InputError(
             f"{name}: got readings of {readings.min():.4g} to {readings.max():.4g} {unit}, expected "
-            f"{low:.4g} to {high:.4g} {unit} as of the policy's arm {spec.name!r}; {_ANOTHER}"
+            f"{low:.4g} to {high:.4g} {unit} as of the policy's arm {spec.name!r}; {_ANOTHER}?"
         )
 
     # Mean length without pressure
@@ -156,7 +155,8 @@ def check_arm(arm: ArmIO, controller: Controller, name: str) -> None:
         if abs(got_m - asked_m) > _OTHER_LENGTH * spec.geometry.section_length_m:
             raise InputError(
                 f"{name}: got springs of {1e3 * got_m:.0f} mm in the mean without pressure, expected "
-                f"{1e3 * asked_m:.0f} mm as of the policy's arm {spec.name!r}; {_ANOTHER}"
+                f"{1e3 * asked_m:.0f} mm as of the policy's arm {spec.name!r}; {_ANOTHER}, or still under "
+                "pressure?"
             )
 
 

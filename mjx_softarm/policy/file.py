@@ -91,7 +91,10 @@ class Policy:
 
     @property
     def calibrated(self) -> bool:
-        """Whether the policy was trained on a calibration of its arm: with S2R, or with a fitted mounting."""
+        """Whether the arm shows a sign of calibration: S2R, or a mounting that is not the default.
+
+        A mounting that somebody wrote into the arm's TOML counts as well.
+        """
         return self.s2r is not None or self.spec.mounting != Mounting()
 
     @property

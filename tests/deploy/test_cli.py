@@ -137,7 +137,7 @@ def test_accuracy_is_measured_without_jax(folder):
     assert (found["points"], found["measured"], found["reached"]) == (1, 1, 0)
     assert "1 of 1 goals measured" in done.stdout and "0 of 1 goals reached" in done.stdout
     times = float(re.search(r"NOT REACHED, (\S+) times the error that a goal allows", done.stdout)[1])
-    assert times > 1.0 and "reached: within 5.4 mm without a rotation error" in done.stdout
+    assert times > 1.0 and "reached within 5.4 mm if the rotation is exact" in done.stdout
     assert "the policy is not calibrated: it is expected to miss" in done.stdout
     assert "python -m calib run" in done.stdout
     off_mm = np.linalg.norm(goal[:3] - [0.0, 0.0, -500.0])
@@ -221,7 +221,8 @@ def test_a_plan_of_pressures_is_recorded(tmp_path):
         (
             9,
             0.3,
-            r"got springs of 300 mm in the mean without pressure, expected 200 mm as of the policy's arm",
+            r"got springs of 300 mm in the mean without pressure, expected 200 mm as of the policy's arm"
+            r".* or still under pressure\?",
         ),
     ],
 )

@@ -12,6 +12,7 @@ import tyro
 from rich.console import Console
 
 from mjx_softarm._support import cli
+from mjx_softarm.deploy.__main__ import check_file
 from mjx_softarm.deploy.drivers import names
 from mjx_softarm.deploy.ending import DONE, MISSED, NOT_WRITTEN, save_log
 from mjx_softarm.deploy.session import check_number
@@ -38,12 +39,9 @@ class Record(ArmOptions):
 
     def __call__(self) -> int:
         console = start()
-        if not self.out.parent.is_dir() or self.out.exists():
-            raise ConfigError(
-                f"--out: got {self.out}, expected the name of a new file in a folder that exists"
-            )
-        if self.out.suffix and self.out.suffix not in TABLES:
-            raise ConfigError(f"--out: got {self.out}, expected a name that ends in {' or '.join(TABLES)}")
+        check_file("--out", self.out, TABLES)
+        if self.out.exists():
+            raise ConfigError(f"--out: got {self.out}, which is there already, expected a new file")
         # Plan all postures before the arm moves.
         spec, s2r = self.read_arm(console)
         arm = names.open_arm(self.arm)
