@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from importlib.util import find_spec
 
 import pytest
 
@@ -34,6 +35,7 @@ def test_warp_moves_arms_without_dry_friction_and_needs_a_gpu(spec):
         ReachEnv(spec, EnvConfig(engine="warp", mode="dynamic", n_poses=1))
 
 
+@pytest.mark.skipif(find_spec("warp") is not None, reason="warp-lang is installed")
 def test_warp_that_is_not_installed_is_told(spec, monkeypatch):
     monkeypatch.setattr("jax.default_backend", lambda: "gpu")
     with pytest.raises(RuntimeError, match=r"warp-lang is not installed.*expected `pip install warp-lang`"):
