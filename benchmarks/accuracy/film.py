@@ -70,7 +70,7 @@ def _frames(run: Run) -> list[np.ndarray]:
                 tips.append(np.asarray(arm.pose[:3]))
             off_mm.append(float(state.metrics["tip_error_mm"]))
     trained = "in motion" if run.config.env.moves else "at rest"
-    told = f"after {SECONDS:g} s each: {np.mean(off_mm):.1f} mm off"
+    told = f"{np.mean(off_mm):.1f} mm off after {SECONDS:g} s"
     side = SideView(f"trained {trained}", told, [0, 2], np.asarray(goals[:, :3]))
     return [np.asarray(image) for image in frames(pictures, np.array(tips), side)]
 

@@ -26,6 +26,7 @@ class FigureTarget(NamedTuple):
     spread: str = "over_seeds"
 
 
+TWELVE = "evaluation-in-motion-12x0.5s_over_seeds"  # twelve actions of half a second
 TARGETS = {  # of presets
     "analytic": (
         FigureTarget("median_mm", 0.5),
@@ -36,9 +37,20 @@ TARGETS = {  # of presets
         FigureTarget("even_p95_mm", 4.0),
     ),
     "quick": (FigureTarget("median_mm", 1.5),),
+    "motion": (
+        FigureTarget("median_mm", 4.0),
+        FigureTarget("circle_mean_mm", 0.8),
+        FigureTarget("median_mm", 1.0, spread=TWELVE),
+        FigureTarget("saturated_share", 0.03, spread=TWELVE),
+        FigureTarget("near_median_s", 2.0, spread=TWELVE),
+    ),
+    "motion-quick": (
+        FigureTarget("circle_mean_mm", 1.5),
+        FigureTarget("median_mm", 1.5, spread=TWELVE),
+    ),
     "motion-analytic": (
         FigureTarget("median_mm", 3.0),
-        FigureTarget("near_median_s", 1.2, spread="evaluation-in-motion-12x0.5s_over_seeds"),
+        FigureTarget("near_median_s", 1.2, spread=TWELVE),
     ),
 }
 
