@@ -40,21 +40,25 @@ def film(runs: tuple[Path, ...], out: Path = Path("docs/results/motion.gif")) ->
     """
     if not runs:
         raise InputError("--runs: got none, expected folders of runs")
-    sides = [_frames(Run.open(folder)) for folder in runs]
+    opened = [Run.open(folder) for folder in runs]
+    goals = far_goals(_env(opened[0]).sample_pool(200, HELD_OUT_SEED).pose)
+    sides = [_frames(run, goals) for run in opened]
     write_gif(out, [Image.fromarray(np.concatenate(both, axis=1)) for both in zip(*sides, strict=True)])
     print(f"film: {out}")
     return 0
 
 
-def _frames(run: Run) -> list[np.ndarray]:
-    """Return the pictures of a run's arm, each beside the way of its tip so far."""
-    # An arm in motion that is seen more often than it is told what to do.
-    task, policy = task_of_run(run), run.policy()
+def _env(run: Run) -> ReachEnv:
+    """Return a run's arm in motion, which is seen more often than it is told what to do."""
     config = dataclasses.replace(run.config.env, mode="dynamic", dynamic_step_s=FRAME_S)
-    env, learner = nominal(ReachEnv(run.spec, config, run.s2r)), task.job.learner
+    return nominal(ReachEnv(run.spec, config, run.s2r))
+
+
+def _frames(run: Run, goals: Array) -> list[np.ndarray]:
+    """Return pictures of a run's arm on its way to goals (n, 6), each beside the way of its tip so far."""
+    env, learner, policy = _env(run), task_of_run(run).job.learner, run.policy()
     act = xla.jit(lambda obs: learner.mode(policy, obs))
     step, pictures, tips, off_mm = xla.jit(env.step), [], [], []
-    goals = far_goals(env.sample_pool(200, HELD_OUT_SEED).pose)
 
     # From goal to goal.
     state = env.reset(jax.random.PRNGKey(HELD_OUT_SEED))
@@ -79,12 +83,12 @@ def far_goals(poses: Array) -> Array:
     """Return `N_GOALS` of the poses (n, 6) [mm, deg] in their order, each far from the one before.
 
     Raises:
-        ValueError: the poses are too close to each other.
+        InputError: the poses are too close to each other.
     """
     chosen = [0]
     for row, pose in enumerate(poses):
         if len(chosen) < N_GOALS and jnp.linalg.norm(pose[:3] - poses[chosen[-1], :3]) > FAR_MM:
             chosen.append(row)
     if len(chosen) < N_GOALS:
-        raise ValueError(f"poses: got {len(chosen)} that are {FAR_MM:g} mm apart, expected {N_GOALS}")
+        raise InputError(f"poses: got {len(chosen)} that are {FAR_MM:g} mm apart, expected {N_GOALS}")
     return poses[jnp.array(chosen)]

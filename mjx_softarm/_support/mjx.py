@@ -7,11 +7,14 @@ lines are held back. Neither package has enough types to be checked, so type che
 from __future__ import annotations
 
 import contextlib
+import copy
 import io
 from typing import TYPE_CHECKING, Any
 
 import jax
 import mujoco
+
+from mjx_softarm._support.errors import InputError
 
 if TYPE_CHECKING:
     from mujoco import mjx
@@ -34,13 +37,18 @@ __all__ = ["Env", "State", "mjx", "put"]
 def put(model: mujoco.MjModel, warp: bool = False) -> tuple[mjx.Model, mjx.Data]:
     """Return a compiled model and its data on the device, for MJX in JAX or for MJX-Warp.
 
+    The actuators take any pressure: a closed chamber that is pressed together exceeds the limits of commands.
+
     Raises:
-        RuntimeError: MJX-Warp without a GPU or without warp-lang.
+        InputError: MJX-Warp without a GPU or without warp-lang.
     """
-    if warp and jax.default_backend() != "gpu":
-        raise RuntimeError(f"engine 'warp': got a {jax.default_backend()}, expected a GPU")
-    impl = "warp" if warp else "jax"
+    model = copy.copy(model)
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
+    if not warp:
+        return mjx.put_model(model), mjx.make_data(model)
+    if jax.default_backend() != "gpu":
+        raise InputError(f"engine 'warp': got a {jax.default_backend()}, expected a GPU")
     try:
-        return mjx.put_model(model, impl=impl), mjx.make_data(model, impl=impl)
+        return mjx.put_model(model, impl="warp"), mjx.make_data(model, impl="warp")
     except RuntimeError as error:
-        raise RuntimeError(f"engine {impl!r}: got {error!r}, expected `pip install warp-lang`") from error
+        raise InputError(f"engine 'warp': got {error!r}, expected `pip install warp-lang`") from error

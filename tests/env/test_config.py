@@ -6,6 +6,7 @@ from importlib.util import find_spec
 
 import pytest
 
+from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.mjx import put
 from mjx_softarm.env import EnvConfig, Randomisation, ReachEnv
 from mjx_softarm.mdp.rewards import RewardConfig
@@ -31,14 +32,14 @@ def test_warp_moves_arms_without_dry_friction_and_needs_a_gpu(spec):
         EnvConfig(engine="warp")
     with pytest.raises(ValueError, match="friction_max_n: got 1.0, expected 0 with the engine 'warp'"):
         EnvConfig(engine="warp", mode="dynamic", randomisation=Randomisation(friction_max_n=1.0))
-    with pytest.raises(RuntimeError, match="engine 'warp': got a cpu, expected a GPU"):
+    with pytest.raises(InputError, match="engine 'warp': got a cpu, expected a GPU"):
         ReachEnv(spec, EnvConfig(engine="warp", mode="dynamic", n_poses=1))
 
 
 @pytest.mark.skipif(find_spec("warp") is not None, reason="warp-lang is installed")
 def test_warp_that_is_not_installed_is_told(spec, monkeypatch):
     monkeypatch.setattr("jax.default_backend", lambda: "gpu")
-    with pytest.raises(RuntimeError, match=r"warp-lang is not installed.*expected `pip install warp-lang`"):
+    with pytest.raises(InputError, match=r"warp-lang is not installed.*expected `pip install warp-lang`"):
         put(build_model(spec), warp=True)
 
 

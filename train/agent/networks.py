@@ -10,6 +10,7 @@ from mjx_softarm.mdp.observation import OBS_SIZE
 
 LOG_STD_MIN = -20.0
 LOG_STD_MAX = 2.0
+COST_AHEAD = 40.0  # initial weight of a predicted error of 1, summed over the predictions
 
 
 class Actor(nn.Module):
@@ -68,14 +69,12 @@ class Critics(nn.Module):
         n_quantiles: quantiles per critic M.
         hidden: width of each hidden layer of one critic, at least one.
         layer_norm: normalise each hidden layer before its ReLU.
-        cost_ahead: first weight of a predicted error of 1, summed over the predictions.
     """
 
     n_critics: int = 2
     n_quantiles: int = 25
     hidden: tuple[int, ...] = (256, 256)
     layer_norm: bool = False
-    cost_ahead: float = 40.0
 
     @nn.compact
     def __call__(self, obs: jax.Array, action: jax.Array, ahead: jax.Array | None = None) -> jax.Array:
@@ -97,8 +96,8 @@ class Critics(nn.Module):
                 x = self._activate(x, f"critic_{c}_norm_{i}")
             quantiles.append(nn.Dense(self.n_quantiles, name=f"critic_{c}_head")(x))  # (..., M)
             if ahead is not None:
-                first = nn.initializers.constant(jnp.log(jnp.expm1(self.cost_ahead / norms.shape[-1])))
-                cost = nn.softplus(self.param(f"critic_{c}_cost", first, norms.shape[-1:]))  # (K,)
+                initial = nn.initializers.constant(jnp.log(jnp.expm1(COST_AHEAD / norms.shape[-1])))
+                cost = nn.softplus(self.param(f"critic_{c}_cost", initial, norms.shape[-1:]))  # (K,)
                 quantiles[c] -= jnp.sum(cost * norms, axis=-1, keepdims=True)
         return jnp.stack(quantiles, axis=-2)  # (..., C, M)
 

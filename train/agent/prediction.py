@@ -91,7 +91,7 @@ class PredictiveCritics:
         )
 
     def loss(self, params: dict[str, Params], obs: Array, action: Array, next_obs: Array) -> Array:
-        """Return the prediction's loss (): the mean square, or linear where an angle wraps."""
+        """Return the prediction's loss (): a square up to one unit, then linear, for angles that wrap."""
         off = self.after(params["predictor"], obs, action) - next_obs
         off = off.at[..., ERROR].divide(ERROR_UNIT)
         return LOSS_WEIGHT * 2.0 * jnp.mean(optax.huber_loss(off))

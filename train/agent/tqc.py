@@ -21,6 +21,7 @@ from jax import Array
 
 from mjx_softarm._support import draws
 from mjx_softarm.env import EnvConfig, ReachEnv
+from train.agent.descent import descend, learning_rate
 from train.agent.hindsight import HindsightConfig, relabel
 from train.agent.learner import (
     Experience,
@@ -114,7 +115,7 @@ class TQC:
         )
         if config.n_ahead:
             self.critics = PredictiveCritics(self.critics, Predictor(config.hidden_critic), config.n_ahead)
-        self.optimizer = optax.adam(_learning_rate(config))
+        self.optimizer = optax.adam(learning_rate(config, config.learning_rate, config.learning_rate_end))
         self.alpha_optimizer = optax.adam(config.learning_rate_alpha)
         self.target_entropy = -float(action_size) if config.target_entropy is None else config.target_entropy
 
@@ -178,7 +179,7 @@ class TQC:
         All three gradients are taken at the incoming state, so none waits for another's optimiser.
 
         Returns:
-            The next state, and scalar metrics: the three losses, alpha, entropy [nat], q_mean, target_mean.
+            The next state, and scalar metrics: the losses, alpha, entropy [nat], q_mean, target_mean.
 
         Raises:
             ValueError: a field of `batch` has the wrong shape.
@@ -191,14 +192,14 @@ class TQC:
         # Losses and gradients.
         critic_grad = jax.value_and_grad(self._critic_loss, has_aux=True)
         actor_grad = jax.value_and_grad(self._actor_loss, has_aux=True)
-        (loss_critic, q_mean), d_critic = critic_grad(state.critic_params, batch, targets)
+        (_, critic_metrics), d_critic = critic_grad(state.critic_params, batch, targets)
         (loss_actor, log_prob), d_actor = actor_grad(state.actor_params, state, batch.obs, noise)
         loss_alpha, d_alpha = jax.value_and_grad(alpha_loss)(state.log_alpha, log_prob, self.target_entropy)
 
         # Optimiser steps, and Polyak averages of their results.
-        critic = _descend(self.optimizer, d_critic, state.critic_opt_state, state.critic_params)
-        actor = _descend(self.optimizer, d_actor, state.actor_opt_state, state.actor_params)
-        temperature = _descend(self.alpha_optimizer, d_alpha, state.alpha_opt_state, state.log_alpha)
+        critic = descend(self.optimizer, d_critic, state.critic_opt_state, state.critic_params)
+        actor = descend(self.optimizer, d_actor, state.actor_opt_state, state.actor_params)
+        temperature = descend(self.alpha_optimizer, d_alpha, state.alpha_opt_state, state.log_alpha)
         next_state = TQCState(
             actor_params=actor[0],
             mean_actor_params=optax.incremental_update(actor[0], state.mean_actor_params, self.config.tau),
@@ -209,8 +210,8 @@ class TQC:
             critic_opt_state=critic[1],
             alpha_opt_state=temperature[1],
         )
-        losses = {"critic_loss": loss_critic, "actor_loss": loss_actor, "alpha_loss": loss_alpha}
-        means = {"entropy": -jnp.mean(log_prob), "q_mean": q_mean, "target_mean": jnp.mean(targets)}
+        losses = {"actor_loss": loss_actor, "alpha_loss": loss_alpha, **critic_metrics}
+        means = {"entropy": -jnp.mean(log_prob), "target_mean": jnp.mean(targets)}
         return next_state, {**losses, **means, "alpha": jnp.exp(state.log_alpha)}
 
     def _targets(self, state: TQCState, batch: Transition, noise: Array) -> Array:
@@ -227,12 +228,14 @@ class TQC:
             n_drop_per_critic=self.config.n_drop_per_critic,
         )
 
-    def _critic_loss(self, params: Params, batch: Transition, targets: Array) -> tuple[Array, Array]:
+    def _critic_loss(self, params: Params, batch: Transition, targets: Array) -> tuple[Array, Any]:
         quantiles = self.critics.apply(params, batch.obs, batch.action)  # (B, C, M)
         loss = quantile_huber_loss(quantiles, targets)
+        metrics = {"critic_loss": loss, "q_mean": jnp.mean(quantiles)}
         if self.config.n_ahead:
-            loss += self.critics.loss(params, batch.obs, batch.action, batch.next_obs)
-        return loss, jnp.mean(quantiles)
+            metrics["prediction_loss"] = self.critics.loss(params, batch.obs, batch.action, batch.next_obs)
+            loss += metrics["prediction_loss"]
+        return loss, metrics
 
     def _actor_loss(self, params: Params, state: TQCState, obs: Array, noise: Array) -> tuple[Array, Array]:
         action, log_prob = squash(*self.actor.apply(params, obs), noise=noise)  # (B, A), (B,)
@@ -295,17 +298,3 @@ class HindsightTQC(Learner):
         """Take one gradient step on a batch; the metrics are those of `TQC.update`."""
         state, metrics = self.tqc.update(state, batch, key)
         return state, {f"tqc/{name}": x for name, x in metrics.items()}
-
-
-def _learning_rate(config: TQCConfig) -> float | optax.Schedule:
-    if config.learning_rate_end == 1.0:
-        return config.learning_rate
-    decay = optax.cosine_decay_schedule
-    return decay(config.learning_rate, config.n_decay_updates, config.learning_rate_end)
-
-
-def _descend(
-    optimizer: optax.GradientTransformation, grads: Params, opt_state: optax.OptState, params: Params
-) -> tuple[Params, optax.OptState]:
-    updates, opt_state = optimizer.update(grads, opt_state, params)
-    return optax.apply_updates(params, updates), opt_state

@@ -48,7 +48,7 @@ class Run:
     """
 
     def __init__(self, path: Path, config: TrainConfig, spec: ArmSpec, s2r: S2R | None = None):
-        self.path, self.config, self.spec, self.s2r = path, config, config.env.arm(spec), s2r
+        self.path, self.config, self.spec, self.s2r = path, config, config.env.arm(spec, s2r is not None), s2r
         options = ocp.CheckpointManagerOptions(max_to_keep=N_KEPT, enable_async_checkpointing=False)
         self._manager = ocp.CheckpointManager((path / CHECKPOINTS).resolve(), options=options)
 

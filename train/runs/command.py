@@ -58,7 +58,11 @@ class Reach(ReachOptions):
         config = self.config.with_policy_of(agent.config) if agent else self.config
         spec, s2r = self.read_arm(console)
         console.print("drawing goals from the reachable workspace ...")
-        task = task_of(config, ReachEnv(spec, config.env, s2r), mesh=mesh)
+        env = ReachEnv(spec, config.env, s2r)
+        if env.spec != spec:
+            own, given = (arm.structure.links_per_section for arm in (env.spec, spec))
+            console.print(f"the arm has {own} links per section in this run, {given} in its specification")
+        task = task_of(config, env, mesh=mesh)
         path = self.out or runs.default_path("reach", self.preset, config.seed)
         if agent is None:
             return _train(Run.create(path, config, spec, s2r), task, console)

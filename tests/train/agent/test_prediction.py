@@ -8,7 +8,7 @@ import pytest
 
 from mjx_softarm.env import EnvConfig
 from mjx_softarm.mdp.observation import ERROR, GOAL, OBS_SIZE, POSE
-from train.agent.networks import Critics
+from train.agent.networks import COST_AHEAD, Critics
 from train.agent.prediction import PredictiveCritics, Predictor
 from train.agent.tqc import TQCConfig
 from train.config import TrainConfig
@@ -78,13 +78,19 @@ def test_a_taught_prediction_follows_the_arm_whatever_the_goal(critics, params, 
     np.testing.assert_allclose(elsewhere[:, ERROR] - told[:, ERROR], -0.3, atol=1e-6)
 
 
-def test_the_quantiles_change_with_the_action_by_the_prediction(critics, params, batch):
-    # The critics' own input is cut off; what remains comes through the predicted errors.
+def test_the_quantiles_fall_with_the_predicted_errors(critics, params, batch):
+    # Without the critics' own inputs, what remains is a constant less the weighted norms of the errors.
     obs, action, _ = batch
-    first = params["critics"]["params"]["hidden_0"]["kernel"]
-    cut = jax.tree.map(lambda x: x, params)
-    cut["critics"]["params"]["hidden_0"]["kernel"] = first.at[OBS : OBS + ACTION].set(0.0)
-    slope = jax.grad(lambda action: jnp.sum(critics.apply(cut, obs, action)))(action)
+    blind = jax.tree.map(lambda x: x, params)
+    first = blind["critics"]["params"]["hidden_0"]
+    first["kernel"] = jnp.zeros_like(first["kernel"])
+    ahead = critics.after(params["predictor"], obs, action)
+    errors = [ahead[:, ERROR], critics.after(params["predictor"], ahead, action)[:, ERROR]]
+    norms = sum(np.linalg.norm(error, axis=-1) for error in errors)  # of both actions
+    quantiles = critics.apply(blind, obs, action)  # (B, C, M)
+    fall = quantiles + COST_AHEAD / 2 * norms[:, None, None]
+    np.testing.assert_allclose(fall, np.broadcast_to(fall[:1], fall.shape), atol=1e-4)
+    slope = jax.grad(lambda action: jnp.sum(critics.apply(blind, obs, action)))(action)
     assert jnp.all(jnp.linalg.norm(slope, axis=-1) > 0.0)
 
 

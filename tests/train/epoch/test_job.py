@@ -30,6 +30,7 @@ def assert_equal(a, b):
 
 MOVING = {
     "mode": "dynamic",
+    "observation": "motion",
     "dynamic_step_s": 0.04,
     "goal_ends": False,
     "reward": RewardConfig(threshold=9.0),
@@ -39,9 +40,10 @@ MOVING = {
 @pytest.mark.parametrize("change", [{}, {"engine": "mjx"}, MOVING], ids=["chain", "mjx", "dynamic"])
 def test_every_engine_traces_its_epoch_once_and_counts_what_it_did(job, change):
     config = dataclasses.replace(CONFIG, env=dataclasses.replace(CONFIG.env, **change))
-    if config.env.moves:  # with goals that the episode reached later
+    if config.env.moves:  # with goals that the episode reached later, and critics that observe a prediction
         hindsight = dataclasses.replace(config.learner.hindsight, n_later=2)
-        config = dataclasses.replace(config, learner=dataclasses.replace(config.learner, hindsight=hindsight))
+        learner = dataclasses.replace(config.learner, hindsight=hindsight, n_ahead=2)
+        config = dataclasses.replace(config, learner=learner)
     if change:
         job = new_job(config, ReachEnv(SHORT, config.env))
     state, ended = start(job), np.zeros((4, 2))
@@ -51,6 +53,7 @@ def test_every_engine_traces_its_epoch_once_and_counts_what_it_did(job, change):
     assert job.n_traces == 1 and int(state.n_epochs) == 4
     # Episodes end at their goals, or after four actions. In motion these are near enough without saturation.
     if config.env.moves:
+        assert metrics["tqc/prediction_loss"] > 0.0
         np.testing.assert_array_equal(ended[:, 0], [0, 8, 0, 8])
         last = np.asarray(state.memory.data.n_steps) == 4
         assert ended[:, 1].sum() == np.count_nonzero(last & ~np.asarray(state.memory.data.saturated))

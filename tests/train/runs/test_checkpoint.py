@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mjx_softarm._support.errors import InputError
 from mjx_softarm.env import EnvConfig
 from mjx_softarm.spec import ArmSpec
 from tests.train.small import LEARNER
@@ -35,6 +36,8 @@ def test_a_run_has_the_links_that_it_was_trained_with(tmp_path):
     config = dataclasses.replace(CONFIG, env=EnvConfig(links_per_section=2))
     Run.create(tmp_path, config, ArmSpec.default())
     assert Run.open(tmp_path).spec.structure.links_per_section == 2
+    with pytest.raises(InputError, match="links_per_section: got 2, expected 4, as the sim-to-real network"):
+        Run(tmp_path, config, ArmSpec.default(), s2r=object())
 
 
 def test_metrics_later_than_the_checkpoint_are_forgotten(tmp_path):
