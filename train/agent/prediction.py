@@ -61,7 +61,9 @@ class PredictiveCritics:
     """
 
     def __init__(self, critics: Critics, predictor: Predictor, n_ahead: int):
-        self.critics, self.predictor, self.n_ahead = critics, predictor, n_ahead
+        self.critics: Any = critics  # flax's own types do not tell what a module returns
+        self.predictor: Any = predictor
+        self.n_ahead = n_ahead
 
     def init(self, key: Array, obs: Array, action: Array) -> dict[str, Params]:
         """Return fresh parameters for observations (B, O) and actions (B, A)."""

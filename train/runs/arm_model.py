@@ -83,8 +83,8 @@ def _read(file: Path, key: str, n: int) -> tuple[tuple[Any, Any, Any], dict[str,
         if entries.take("key", np.str_, ()) != key:
             return None
         takers = take_estimator, take_load_estimator, take_spring_model
-        networks = tuple(take(entries, name, n) for take, name in zip(takers, _NAMES, strict=True))
-        return networks, entries.table("errors_json")
+        first, second, third = (take(entries, name, n) for take, name in zip(takers, _NAMES, strict=True))
+        return (first, second, third), entries.table("errors_json")
     except SealedFileError:
         return None
 

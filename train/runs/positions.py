@@ -43,8 +43,10 @@ class AtPositions(NamedTuple):
     """Results of k arms at m demonstrated positions: n = k m rows, arm by arm, positions in their order."""
 
     reached: Reached
-    position: Array  # (n,) which position
-    success: Array  # (n,) bool: close enough, no chamber saturated, the body inside the pipe, in motion held
+    position: np.ndarray  # (n,) which position
+    success: (
+        np.ndarray
+    )  # (n,) bool: close enough, no chamber saturated, the body inside the pipe, in motion held
 
 
 @dataclass(frozen=True)
