@@ -90,8 +90,12 @@ class EnvConfig:
             corrected: whether it has a sim-to-real network, which holds for its own links alone.
 
         Raises:
-            InputError: a corrected arm is to have other links.
+            InputError: a corrected arm is to have other links, or an action is shorter than a control period.
         """
+        period_s = 1.0 / spec.control.rate_hz
+        _expect(
+            self, "dynamic_step_s", self.dynamic_step_s >= period_s, f"{period_s:g} or more, a control period"
+        )
         own, n = spec.structure.links_per_section, self.links_per_section
         if n is None or n == own:
             return spec

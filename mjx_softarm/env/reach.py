@@ -12,7 +12,6 @@ from jax import Array
 
 from mjx_softarm import control
 from mjx_softarm._support import draws
-from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.mjx import Env, State, put
 from mjx_softarm.env.clearance import Walls
 from mjx_softarm.env.config import EnvConfig
@@ -70,11 +69,6 @@ class ReachEnv(Env):
     def __init__(self, spec: ArmSpec | None = None, config: EnvConfig | None = None, s2r: S2R | None = None):
         self.config, self.s2r = config or EnvConfig(), s2r
         self.spec = self.config.arm(spec or ArmSpec.default(), corrected=s2r is not None)
-        if self.config.dynamic_step_s < 1.0 / self.spec.control.rate_hz:
-            raise InputError(
-                f"EnvConfig.dynamic_step_s: got {self.config.dynamic_step_s}, expected at least one "
-                f"period of the control at control.rate_hz = {self.spec.control.rate_hz:g}"
-            )
 
         # Parameters, law, actions and observations
         self.params = jax.tree.map(jnp.asarray, ArmParams.from_spec(self.spec))
