@@ -46,7 +46,7 @@ class AtPositions(NamedTuple):
     position: np.ndarray  # (n,) which position
     success: (
         np.ndarray
-    )  # (n,) bool: close enough, no chamber saturated, the body inside the pipe, in motion held
+    )  # (n,) bool: close enough, no chamber saturated, the body inside the pipe, held in motion
 
 
 @dataclass(frozen=True)
@@ -182,4 +182,4 @@ def summarise(
     )
     rows = jax.tree.map(lambda x: np.reshape(x, (-1, *x.shape[2:])), found)
     position = np.tile(np.arange(success.shape[1]), len(success))
-    return figures, AtPositions(rows, position, success.reshape(-1))
+    return figures, AtPositions(rows, position, np.asarray(success).reshape(-1))
