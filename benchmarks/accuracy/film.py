@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array
 from PIL import Image
 
+from benchmarks.accuracy.learning import open_runs
 from benchmarks.paper.film import HEIGHT, WIDTH, SideView, frames, write_gif
 from mjx_softarm._support import xla
 from mjx_softarm._support.errors import InputError
@@ -38,9 +39,7 @@ def film(runs: tuple[Path, ...], out: Path = Path("docs/results/motion.gif")) ->
         InputError: there are no folders.
         RunError: a folder holds no finished run.
     """
-    if not runs:
-        raise InputError("--runs: got none, expected folders of runs")
-    opened = [Run.open(folder) for folder in runs]
+    opened = open_runs(runs)
     goals = far_goals(_env(opened[0]).sample_pool(200, HELD_OUT_SEED).pose)
     sides = [_frames(run, goals) for run in opened]
     write_gif(out, [Image.fromarray(np.concatenate(both, axis=1)) for both in zip(*sides, strict=True)])

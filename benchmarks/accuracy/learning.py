@@ -65,12 +65,22 @@ def measure(runs: tuple[Path, ...]) -> dict[str, Any]:
         InputError: there are no folders.
         RunError: a folder holds no finished run.
     """
-    if not runs:
-        raise InputError("--runs: got none, expected folders of runs")
-    opened = [Run.open(folder) for folder in runs]
+    opened = open_runs(runs)
     found = by_settings(opened, lambda run: {k: x for k, x in to_dict(run.config).items() if k != "seed"})
     groups = [{"preset": preset_of(group["settings"]), **group} for group in found]
     return {"targets": targets(groups), "groups": groups}
+
+
+def open_runs(folders: tuple[Path, ...]) -> list[Run]:
+    """Open the folders of runs.
+
+    Raises:
+        InputError: there are no folders.
+        RunError: a folder holds no run.
+    """
+    if not folders:
+        raise InputError("--runs: got none, expected folders of runs")
+    return [Run.open(folder) for folder in folders]
 
 
 def preset_of(settings: Mapping[str, Any]) -> str | None:

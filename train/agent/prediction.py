@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
-from mjx_softarm.mdp.observation import ERROR, OBS_SIZE, POSE
+from mjx_softarm.mdp.observation import ERROR, GOAL, OBS_SIZE, POSE
 from train.agent.networks import Critics
 
 Params = Any  # a flax parameter tree
@@ -87,10 +87,8 @@ class PredictiveCritics:
         change = self.predictor.apply(predictor, obs, action)
         pose, error, sensed = jnp.split(change, (6, 12), axis=-1)
         known = (obs[..., OBS_SIZE : -action.shape[-1]] + sensed, action)
-        goal = obs[..., POSE.stop : ERROR.start]
-        return jnp.concatenate(
-            [obs[..., POSE] + pose, goal, obs[..., ERROR] + ERROR_UNIT * error, *known], axis=-1
-        )
+        moved = obs[..., POSE] + pose, obs[..., GOAL], obs[..., ERROR] + ERROR_UNIT * error
+        return jnp.concatenate([*moved, *known], axis=-1)
 
     def loss(self, params: dict[str, Params], obs: Array, action: Array, next_obs: Array) -> Array:
         """Return the prediction's loss (): a square up to one unit, then linear, for angles that wrap."""

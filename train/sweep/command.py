@@ -38,6 +38,7 @@ class SweepCommand(ReachOptions):
 
     def __call__(self) -> int:
         console = start()
+        # The members, of a folder or of these settings.
         if self.resume:
             self.check_resume_alone(self.default([]))
             sweep = open_sweep(self.resume)
@@ -51,6 +52,7 @@ class SweepCommand(ReachOptions):
             path = self.out or free_path(Path("runs") / f"sweep-{self.preset}")
             sweep = create(path, members, varied, spec, s2r)
         console.print(f"sweep: {sweep.path}, {len(sweep.runs)} members", highlight=False)
+        # Train all of them, and report.
         try:
             with sole_trainer(sweep.path):
                 train(sweep, console)

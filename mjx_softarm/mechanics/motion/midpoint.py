@@ -62,6 +62,7 @@ def advance(
     Returns:
         State and observables at the end.
     """
+    # The episode's arm
     n_steps = math.ceil(period_s / step_s - 1e-9)
     model = arm.loaded_model()
     weightless = model.opt.replace(gravity=jnp.zeros(3))  # the weights are in V
@@ -77,6 +78,7 @@ def advance(
             motion = _step(arm, motion, command, k, period_s / n_steps)
         return motion._replace(command_kpa=command), Path.at(frames, spring_m)
 
+    # All control periods, then a last look
     with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
         tick = jax.checkpoint(tick, prevent_cse=False)  # a gradient recomputes each tick to save memory
         end, path = jax.lax.scan(tick, motion, None, length=round(duration_s / period_s))

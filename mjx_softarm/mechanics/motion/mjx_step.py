@@ -66,7 +66,8 @@ def advance(
 
     def step(now: _Moving, k: Array) -> tuple[_Moving, Path]:
         """Take the k-th time step of a control period: observe, command, fill the chambers, step."""
-        # Lengths at the start of the step; XLA computes them once for this and for `mjx.step`
+        # Lengths at the start of the step; `mjx.step` computes them again, and it is not measured whether XLA
+        # merges the two
         data, spring_m, volume = _at(arm, model, now.q, now.velocity)
 
         # The law commands pressures at the start of a control period
