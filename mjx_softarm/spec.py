@@ -17,6 +17,7 @@ import tomli_w
 
 from mjx_softarm._support.fields import (
     PerChamber,
+    PerSection,
     SpecError,
     anything,
     check_counts,
@@ -28,10 +29,12 @@ from mjx_softarm._support.fields import (
     vector,
 )
 from mjx_softarm.arms import shipped_arm
-from mjx_softarm.sensing.sensors import N_CHAMBERS_PER_SECTION, SENSORS, Sensor
+from mjx_softarm.sensing.sensors import N_CHAMBERS_PER_SECTION as N_CHAMBERS_PER_SECTION
+from mjx_softarm.sensing.sensors import SENSORS, Sensor
 
 ARM_FILE = "arm.toml"  # in the folder of a calibration
 PAIRS = "pairs of chamber and spring"
+LEAST_CHAMBERS, MOST_CHAMBERS = 3, 12  # of a section
 PAPER_S_ARM_KG = 4.7  # mass of the paper's arm, which carries up to 1 kg
 
 
@@ -41,24 +44,30 @@ class Structure:
 
     n_sections: int = count()
     links_per_section: int = count()
+    chambers_per_section: int = count(default=3, high=MOST_CHAMBERS)
+    springs_per_section: int = count(default=0, low=0, high=MOST_CHAMBERS)  # 0: one beside each chamber
 
 
 @dataclass(frozen=True)
 class Geometry:
-    """Lengths of the unloaded arm at rest."""
+    """Lengths and angles of the unloaded arm at rest, each a number or one for each section.
 
-    section_length_m: float = positive()
-    chamber_radius_m: float = positive()
-    spring_radius_m: float = positive()
-    first_chamber_deg: float = anything(low=-360.0, high=360.0)
-    chamber_diameter_m: float = positive()
+    Chambers stand at equal angles, counter-clockwise from the first one seen from above, with springs beside
+    them. Where springs are fewer, the first chamber has one, and every k-th chamber from there.
+    """
+
+    section_length_m: PerSection = positive(per="sections")
+    chamber_radius_m: PerSection = positive(per="sections")
+    spring_radius_m: PerSection = positive(per="sections")
+    first_chamber_deg: PerSection = anything(per="sections", low=-360.0, high=360.0)
+    chamber_diameter_m: PerSection = positive(per="sections")
 
 
 @dataclass(frozen=True)
 class Mass:
-    """Masses. The arm's own mass is spread evenly over its links."""
+    """Masses. The arm's own mass is one number, spread evenly over all links, or one for each section."""
 
-    arm_kg: float = positive()
+    arm_kg: PerSection = positive(per="sections")
     gripper_kg: float = not_negative()
     gripper_length_m: float = positive()
     payload_kg: float = not_negative()
@@ -66,7 +75,8 @@ class Mass:
     @property
     def largest_payload_kg(self) -> float:
         """Largest payload on top of `payload_kg`: 1 kg for the paper's arm, others by their mass."""
-        return (self.arm_kg + self.gripper_kg) / PAPER_S_ARM_KG
+        arm_kg = sum(self.arm_kg) if isinstance(self.arm_kg, tuple) else self.arm_kg
+        return (arm_kg + self.gripper_kg) / PAPER_S_ARM_KG
 
 
 @dataclass(frozen=True)
@@ -76,7 +86,7 @@ class Chambers:
     area_m2: PerChamber = positive(per="chambers")
     area_slope_m: PerChamber = anything(per="chambers")
     stiffness_n_per_m: PerChamber = positive(per="chambers")
-    damping_ns_per_m: float = not_negative()
+    damping_ns_per_m: PerChamber = not_negative(per="chambers")
     length_offset_m: PerChamber = anything(per="chambers", low=-0.1, high=0.1)
     pressure_min_kpa: float = anything(low=-101.325)
     pressure_max_kpa: float = anything(low=-101.325)
@@ -86,21 +96,21 @@ class Chambers:
 class Backbone:
     """Stiffness and damping of one whole section besides its chambers and springs."""
 
-    axial_stiffness_n_per_m: float = positive()
-    bending_stiffness_nm_per_rad: float = positive()
-    axial_damping_ns_per_m: float = not_negative()
-    bending_damping_nms_per_rad: float = not_negative()
+    axial_stiffness_n_per_m: PerSection = positive(per="sections")
+    bending_stiffness_nm_per_rad: PerSection = positive(per="sections")
+    axial_damping_ns_per_m: PerSection = not_negative(per="sections")
+    bending_damping_nms_per_rad: PerSection = not_negative(per="sections")
 
 
 @dataclass(frozen=True)
 class Springs:
     """Springs with their sensed lengths, and the range of lengths that may be commanded."""
 
-    stiffness_n_per_m: float = not_negative()
-    damping_ns_per_m: float = not_negative()
-    rest_length_m: float = positive()
-    length_min_m: float = positive()
-    length_max_m: float = positive()
+    stiffness_n_per_m: PerSection = not_negative(per="sections")
+    damping_ns_per_m: PerSection = not_negative(per="sections")
+    rest_length_m: PerSection = positive(per="sections")
+    length_min_m: PerSection = positive(per="sections")
+    length_max_m: PerSection = positive(per="sections")
 
 
 @dataclass(frozen=True)
@@ -141,10 +151,11 @@ class Unmodelled:
 
 @dataclass(frozen=True)
 class ArmSpec:
-    """A pneumatic soft arm: sections in series, three chambers and three springs in each.
+    """A pneumatic soft arm: sections in series, with chambers and springs in each.
 
     Build one with `ArmSpec.default()`, `ArmSpec.from_toml(path)` or `spec.replace(...)`; each of
-    them validates. A field marked per chamber holds one number or a tuple of `n_chambers`.
+    them validates. A field marked per chamber holds one number or a tuple of `n_chambers`, one marked per
+    section a number or a tuple of `n_sections`.
     """
 
     name: str
@@ -162,11 +173,19 @@ class ArmSpec:
     @property
     def length_m(self) -> float:
         """Length of the unloaded arm at rest."""
-        return self.structure.n_sections * self.geometry.section_length_m
+        return sum(self.per_section(self.geometry.section_length_m))
 
     @property
     def n_chambers(self) -> int:
-        return N_CHAMBERS_PER_SECTION * self.structure.n_sections
+        return self.structure.chambers_per_section * self.structure.n_sections
+
+    @property
+    def springs_per_section(self) -> int:
+        return self.structure.springs_per_section or self.structure.chambers_per_section
+
+    @property
+    def n_springs(self) -> int:
+        return self.springs_per_section * self.structure.n_sections
 
     @property
     def n_links(self) -> int:
@@ -179,11 +198,29 @@ class ArmSpec:
     @property
     def spring_sensor(self) -> Sensor:
         """The sensor with one calibration per spring."""
-        return self.sensor.per_spring(self.n_chambers)
+        return self.sensor.per_spring(self.n_springs)
 
     def per_chamber(self, value: PerChamber) -> tuple[float, ...]:
         """Return one number per chamber, from a field with one number or one per chamber."""
         return tuple(value) if isinstance(value, tuple) else (float(value),) * self.n_chambers
+
+    def per_section(self, value: PerSection) -> tuple[float, ...]:
+        """Return one number per section, from a field with one number or one per section."""
+        return tuple(value) if isinstance(value, tuple) else (float(value),) * self.structure.n_sections
+
+    def at_chambers(self, value: PerSection) -> np.ndarray:
+        """Return the number of each chamber's section (n_chambers,)."""
+        return np.repeat(self.per_section(value), self.structure.chambers_per_section)
+
+    def at_springs(self, value: PerSection) -> np.ndarray:
+        """Return the number of each spring's section (n_springs,)."""
+        return np.repeat(self.per_section(value), self.springs_per_section)
+
+    @property
+    def section_mass_kg(self) -> tuple[float, ...]:
+        """Own mass of each section."""
+        n, arm_kg = self.structure.n_sections, self.mass.arm_kg
+        return arm_kg if isinstance(arm_kg, tuple) else (arm_kg / n,) * n
 
     @property
     def section_roll_deg(self) -> tuple[float, ...]:
@@ -191,10 +228,10 @@ class ArmSpec:
         return self.mounting.section_roll_deg or (0.0,) * self.structure.n_sections
 
     def unmodelled_kpa(self, spring_m: np.ndarray) -> np.ndarray:
-        """Return the residual pressures (..., n) [kPa] of the unloaded arm at spring lengths (..., n) [m]."""
+        """Return residual pressures (..., n_chambers) [kPa] at springs (..., n_springs) [m], unloaded."""
         n, table = self.n_chambers, self.unmodelled
-        slope = np.reshape(table.slope_kpa_per_m or np.zeros(n * n), (n, n))
-        stretched_m = spring_m - self.geometry.section_length_m
+        slope = np.reshape(table.slope_kpa_per_m or np.zeros(n * self.n_springs), (n, self.n_springs))
+        stretched_m = spring_m - self.at_springs(self.geometry.section_length_m)
         return np.asarray(table.pressure_kpa or np.zeros(n)) + stretched_m @ slope.T
 
     @classmethod
@@ -269,11 +306,26 @@ class ArmSpec:
 
     def _check_together(self, source: str) -> None:
         """Refuse fields that contradict each other."""
+        # Chambers bend a section in every direction, and each spring stands beside a chamber
+        structure = self.structure
+        if structure.chambers_per_section < LEAST_CHAMBERS:
+            raise SpecError(
+                f"{source}: structure.chambers_per_section: got {structure.chambers_per_section}, expected "
+                f"{LEAST_CHAMBERS} or more, since fewer chambers do not bend a section in every direction"
+            )
+        n, springs = structure.chambers_per_section, structure.springs_per_section
+        if springs and (springs < LEAST_CHAMBERS or n % springs):
+            raise SpecError(
+                f"{source}: structure.springs_per_section: got {springs}, expected 0 for one beside each "
+                f"chamber, or {LEAST_CHAMBERS} or more that divide the {n} chambers"
+            )
+
         # Lists have the right number of entries, lower limits are below upper ones
         counts = {
-            "sections": self.structure.n_sections,
+            "sections": structure.n_sections,
             "chambers": self.n_chambers,
-            PAIRS: self.n_chambers**2,
+            "springs": self.n_springs,
+            PAIRS: self.n_chambers * self.n_springs,
         }
         check_counts(self, counts, source, "")
         for group, low, high in (
@@ -282,7 +334,7 @@ class ArmSpec:
             ("sensor", *self.sensor.range_fields),
         ):
             least, greatest = (getattr(getattr(self, group), name) for name in (low, high))
-            if not least < greatest:
+            if not np.all(np.less(least, greatest)):
                 raise SpecError(
                     f"{source}: {group}.{low}: got {least!r}, expected less than {high} ({greatest!r})"
                 )
@@ -292,7 +344,7 @@ class ArmSpec:
         (low, high), unit = sensor.range, sensor.unit
         for name in ("length_min_m", "length_max_m"):
             length_m = getattr(self.springs, name)
-            readings = sensor.readings(np.full(self.n_chambers, length_m))
+            readings = sensor.readings(self.at_springs(length_m))
             if not (readable := (readings >= low) & (readings <= high)).all():
                 raise SpecError(
                     f"{source}: springs.{name}: got {length_m!r}, which reads {readings[~readable][0]:.6g} "

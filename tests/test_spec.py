@@ -78,24 +78,28 @@ def test_another_number_of_sections_needs_no_new_scalars(spec):
     assert spec.replace(structure={"n_sections": 2}).n_chambers == 6
     beta = {"beta": [0.93] * 9}
     text = message_of(spec.replace(sensor=beta).replace, structure={"n_sections": 2})
-    assert text == "replace: sensor.beta: got 9 numbers, expected one, or one for each of the 6 chambers"
+    assert text == "replace: sensor.beta: got 9 numbers, expected one, or one for each of the 6 springs"
 
 
 REFUSED = [
     # field, value, what the message expects
-    ("mass.arm_kg", "heavy", "a number > 0"),
-    ("mass.arm_kg", True, "a number > 0"),
-    ("mass.arm_kg", 0.0, "a number > 0"),
-    ("mass.arm_kg", math.nan, "a number > 0"),
-    ("mass.arm_kg", 10**400, "a number > 0"),
+    ("mass.gripper_length_m", "heavy", "a number > 0"),
+    ("mass.gripper_length_m", True, "a number > 0"),
+    ("mass.gripper_length_m", 0.0, "a number > 0"),
+    ("mass.arm_kg", math.nan, "a number > 0, or a list with one for each of the sections"),
+    ("mass.gripper_length_m", 10**400, "a number > 0"),
     ("mass.payload_kg", -0.1, "a number >= 0"),
     ("structure.n_sections", 3.0, "a whole number >= 1 and <= 100"),
     ("mass.arm_kg", 1e39, "sizes from 1.2e-38 to 3.4e+38, which float32 holds"),
-    ("geometry.first_chamber_deg", 361.0, "a number >= -360 and <= 360"),
+    ("mounting.base_turn_deg", [1.0], "a list of 3 numbers"),
     ("chambers.pressure_min_kpa", -102.0, "a number >= -101.325"),
-    ("chambers.length_offset_m", 0.2, "a number >= -0.1 and <= 0.1, or a list with one per chamber"),
-    ("sensor.beta", [0.93] * 8 + [math.nan], "a number > 0, or a list with one per chamber"),
-    ("sensor.beta", [0.93] * 8, "one, or one for each of the 9 chambers"),
+    (
+        "chambers.length_offset_m",
+        0.2,
+        "a number >= -0.1 and <= 0.1, or a list with one for each of the chambers",
+    ),
+    ("sensor.beta", [0.93] * 8 + [math.nan], "a number > 0, or a list with one for each of the springs"),
+    ("sensor.beta", [0.93] * 8, "one, or one for each of the 9 springs"),
     ("sensor.kind", "laser", "coil or draw_wire"),
     ("name", {"first": "arm"}, "a text"),
     ("mass", 4.7, "a table"),
@@ -107,6 +111,33 @@ def test_a_refused_value_is_named_with_file_field_and_expectation(data, path, va
     text = message_of(ArmSpec.from_dict, changed(data, path, value), "my.toml")
     got = f"{len(value)} numbers" if "each of the 9" in expected else repr(value)
     assert text == f"my.toml: {path}: got {got}, expected {expected}"
+
+
+@pytest.mark.parametrize(
+    "chambers, springs, field",
+    [(2, 0, "chambers"), (13, 0, "chambers"), (4, 3, "springs"), (4, 2, "springs"), (6, 12, "springs")],
+)
+def test_a_section_bends_in_every_direction_with_springs_beside_its_chambers(spec, chambers, springs, field):
+    counts = {"chambers_per_section": chambers, "springs_per_section": springs}
+    text = message_of(spec.replace, structure=counts)
+    assert text.startswith(f"replace: structure.{field}_per_section: got {counts[f'{field}_per_section']}, ")
+
+
+def test_sections_may_differ_and_have_fewer_springs_than_chambers(spec):
+    arm = spec.replace(
+        structure={"chambers_per_section": 6, "springs_per_section": 3},
+        geometry={"section_length_m": [0.2, 0.18, 0.15]},
+        mass={"arm_kg": [2.0, 1.5, 1.0]},
+    )
+    assert (arm.n_chambers, arm.n_springs) == (18, 9)
+    assert arm.length_m == pytest.approx(0.53)
+    assert arm.at_springs(arm.geometry.section_length_m).tolist() == [0.2] * 3 + [0.18] * 3 + [0.15] * 3
+    assert arm.section_mass_kg == (2.0, 1.5, 1.0)
+    assert ArmSpec.from_dict(arm.to_dict()) == arm
+    text = message_of(arm.replace, springs={"length_min_m": [0.08, 0.08, 0.3]})
+    assert text.startswith(
+        "replace: springs.length_min_m: got (0.08, 0.08, 0.3), expected less than length_max"
+    )
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,8 @@ from typing import Any
 
 from mjx_softarm._support.errors import InputError
 
-PerChamber = float | tuple[float, ...]
+PerChamber = float | tuple[float, ...]  # a number for all chambers, or one for each
+PerSection = float | tuple[float, ...]  # a number for all sections, or one for each
 MAX_COUNT = 100  # largest number of sections, and of links per section; more would not fit into memory
 FLOAT32_MIN, FLOAT32_MAX = 1.1754944e-38, 3.4028235e38  # smallest and largest normal float32
 
@@ -38,7 +39,7 @@ class Rule:
         high = "" if self.high == math.inf else f" and <= {self.high:g}" if low else f" <= {self.high:g}"
         if self.length is not None:
             return f"a list of {self.length} numbers" if self.length else "a list of numbers"
-        return noun + low + high + (", or a list with one per chamber" if self.per else "")
+        return noun + low + high + (f", or a list with one for each of the {self.per}" if self.per else "")
 
     def accepts(self, value: Any) -> bool:
         """Return whether a value is of the kind and in the range."""
@@ -59,9 +60,9 @@ def positive(per: str = "") -> Any:
     return field(metadata={"rule": Rule(low=0.0, low_open=True, per=per)})
 
 
-def not_negative() -> Any:
+def not_negative(per: str = "") -> Any:
     """Declare a number >= 0."""
-    return field(metadata={"rule": Rule(low=0.0)})
+    return field(metadata={"rule": Rule(low=0.0, per=per)})
 
 
 def anything(per: str = "", low: float = -math.inf, high: float = math.inf) -> Any:
@@ -79,9 +80,9 @@ def numbers(per: str) -> Any:
     return field(default=(), metadata={"rule": Rule(per=per, length=0)})
 
 
-def count() -> Any:
-    """Declare a count from 1."""
-    return field(metadata={"rule": Rule(kind=int, low=1, high=MAX_COUNT)})
+def count(default: Any = dataclasses.MISSING, low: int = 1, high: int = MAX_COUNT) -> Any:
+    """Declare a count in a range."""
+    return field(default=default, metadata={"rule": Rule(kind=int, low=low, high=high)})
 
 
 def read_fields(cls: type, data: Any, source: str, prefix: str) -> dict[str, Any]:

@@ -64,8 +64,8 @@ class Sensor:
     noise: ClassVar[float]  # standard deviation of a twin's readings
     resolution: ClassVar[float]  # step of a twin's converter
 
-    beta: PerChamber | Array = positive(per="chambers")
-    delta_m: PerChamber | Array = anything(per="chambers")
+    beta: PerChamber | Array = positive(per="springs")
+    delta_m: PerChamber | Array = anything(per="springs")
 
     def per_spring(self, n: int) -> Sensor:
         """Return the sensor with an array (n,), float64, for each field that has a number per spring."""
