@@ -1,7 +1,7 @@
 """Sensor-space law: spring lengths and their references -> chamber pressures.
 
-Training, twin and deployed arm share it. Each chamber regulates its own spring; a spring shorter than its
-reference gets more pressure:
+Training, twin and deployed arm share it. With three chambers a section and a spring beside each, a chamber
+regulates its own spring; a spring shorter than its reference gets more pressure:
 
     r'  = r + (reference - r) dt / (reference_s + dt)     reference on its way
     l'  = l + (length - l) / 2                            smoothed length
@@ -20,21 +20,57 @@ At rest (r' = reference, l' = length, i' = i) p = i, and each chamber is in one 
     p = p_min           and e < 0    it can pull no further
 
 This rest depends on neither gains nor times. `mjx_softarm.mechanics.settle` solves for it.
+
+**More chambers.** A section lengthens and bends in two directions. More than three chambers are redundant.
+A plane through the errors of a section's springs gives each chamber its error, C (r' - length). The part N i
+of the integral neither lengthens nor bends a section. With C and N from `Allocation`,
+
+    e   = C (r' - length) - YIELD_M_PER_KPA N i,    and C (l' - l) in place of l' - l.
+
+C and N have orthogonal ranges. Where no chamber is at a limit, both parts of e are zero at rest: the springs
+follow a plane through their references, and no pressure is spent on what neither lengthens nor bends the
+section. Where a chamber is at a limit, the others follow the references with redundant pressure.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
 from mjx_softarm._support.xp import Array, array_namespace
 from mjx_softarm.spec import ArmSpec
 
 AT_LIMIT_KPA = 0.2  # distance to a limit at which a measured, noisy pressure counts as at it
 TOLERANCE_M = 1e-3  # greatest error of a spring that counts as on its reference; a run may set another
+YIELD_M_PER_KPA = 1e-4  # length error that a chamber accepts for 1 kPa of redundant pressure less
+
+
+class Allocation(NamedTuple):
+    """Matrices between springs and chambers of an arm with more than three chambers a section."""
+
+    chamber_error: Array  # (n_chambers, n_springs) C, plane through the springs of a section, at its chambers
+    redundant: Array  # (n_chambers, n_chambers) N, projection to pressures that neither lengthen nor bend
+
+
+def allocation(spec: ArmSpec) -> Allocation | None:
+    """Return the matrices of an arm in float64; None where each section has three chambers.
+
+    A row of a section's matrix A is [1, x, y] for the direction of a chamber, or of a spring. Then
+    C = A_chambers pinv(A_springs) and N = 1 - A_chambers pinv(A_chambers). Turning a section changes neither.
+    """
+    n = spec.structure.chambers_per_section
+    if n == 3:
+        return None
+    angle = 2 * np.pi * np.arange(n) / n
+    chambers = np.stack([np.ones(n), np.cos(angle), np.sin(angle)], axis=-1)
+    springs = chambers[:: n // spec.springs_per_section]
+    section = chambers @ np.linalg.pinv(springs), np.eye(n) - chambers @ np.linalg.pinv(chambers)
+    return Allocation(*(np.kron(np.eye(spec.structure.n_sections), matrix) for matrix in section))
 
 
 class Gains(NamedTuple):
-    """Gains and limits of the law; each is () or (n,)."""
+    """Gains and limits of the law; each is () or (n_chambers,)."""
 
     kp_kpa_per_m: Array
     ki_kpa_per_ms: Array  # kPa per metre and second
@@ -42,12 +78,14 @@ class Gains(NamedTuple):
     reference_s: Array  # time constant with which a new reference is approached
     pressure_min_kpa: Array
     pressure_max_kpa: Array
+    allocation: Allocation | None = None  # None: each chamber regulates its own spring
 
     @classmethod
     def from_spec(cls, spec: ArmSpec) -> Gains:
         limits_kpa = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
         law = spec.control
-        return cls(law.kp_kpa_per_m, law.ki_kpa_per_ms, law.kd_kpa_s_per_m, law.reference_s, *limits_kpa)
+        gains = law.kp_kpa_per_m, law.ki_kpa_per_ms, law.kd_kpa_s_per_m, law.reference_s
+        return cls(*gains, *limits_kpa, allocation(spec))
 
     def measured(self) -> Gains:
         """Return the gains with limits tighter by AT_LIMIT_KPA, for measured pressures."""
@@ -58,13 +96,18 @@ class Gains(NamedTuple):
 class LawState(NamedTuple):
     """Memory of the law between two ticks."""
 
-    integral_kpa: Array  # (..., n) at rest, the pressures
-    reference_m: Array  # (..., n) on its way to the reference
-    length_m: Array  # (..., n) smoothed
+    integral_kpa: Array  # (..., n_chambers) at rest, the pressures
+    reference_m: Array  # (..., n_springs) on its way to the reference
+    length_m: Array  # (..., n_springs) smoothed
 
     @classmethod
     def at_rest(cls, pressure_kpa: Array, length_m: Array) -> LawState:
-        """Return the memory of a law that holds spring lengths (..., n) [m] at pressures (..., n) [kPa]."""
+        """Return the memory of a law that holds an arm at rest.
+
+        Args:
+            pressure_kpa (..., n_chambers) [kPa]: pressures that it holds.
+            length_m (..., n_springs) [m]: spring lengths at these pressures.
+        """
         return cls(pressure_kpa, length_m, length_m)
 
 
@@ -74,45 +117,70 @@ def pressures(
     """Compute one tick of the law.
 
     Args:
-        reference_m (..., n) [m]: spring lengths to reach.
-        length_m (..., n) [m]: spring lengths read, finite.
+        reference_m (..., n_springs) [m]: spring lengths to reach.
+        length_m (..., n_springs) [m]: spring lengths read, finite.
         state: after the last tick.
         gains: numbers of the law.
         dt_s: time since the last tick.
 
     Returns:
-        Pressures (..., n) [kPa] within the limits, and the next state.
+        Pressures (..., n_chambers) [kPa] within the limits, and the next state.
     """
     # Reference on its way, smoothed length
-    xp = array_namespace(reference_m, length_m, *state, *gains)
+    xp = array_namespace(reference_m, length_m, *state, *gains[:-1])
     low, high = gains.pressure_min_kpa, gains.pressure_max_kpa
     on_its_way_m = state.reference_m + (reference_m - state.reference_m) * (dt_s / (gains.reference_s + dt_s))
     smooth_m = 0.5 * (state.length_m + length_m)
 
+    # Error and rate at each chamber
+    error_m, change_m = on_its_way_m - length_m, smooth_m - state.length_m
+    if gains.allocation is not None:
+        error_m = allocated_error(error_m, state.integral_kpa, gains.allocation)
+        change_m = _times(gains.allocation.chamber_error, change_m)
+
     # Integral and pressure, within the limits
-    error_m = on_its_way_m - length_m
     integral_kpa = xp.clip(state.integral_kpa + gains.ki_kpa_per_ms * dt_s * error_m, low, high)
-    damping_kpa = gains.kd_kpa_s_per_m / dt_s * (smooth_m - state.length_m)
+    damping_kpa = gains.kd_kpa_s_per_m / dt_s * change_m
     pressure_kpa = xp.clip(integral_kpa + gains.kp_kpa_per_m * error_m - damping_kpa, low, high)
     return pressure_kpa, LawState(integral_kpa, on_its_way_m, smooth_m)
+
+
+def allocated_error(error_m: Array, pressure_kpa: Array, allocation: Allocation) -> Array:
+    """Return the error (..., n_chambers) [m] that each chamber closes.
+
+    Args:
+        error_m (..., n_springs) [m]: references less lengths of the springs.
+        pressure_kpa (..., n_chambers) [kPa]: pressures, whose redundant part is an error as well.
+        allocation: matrices of the arm.
+    """
+    redundant_kpa = _times(allocation.redundant, pressure_kpa)
+    return _times(allocation.chamber_error, error_m) - YIELD_M_PER_KPA * redundant_kpa
+
+
+def _times(matrix: Array, vector: Array) -> Array:
+    """Multiply a matrix (n, m) by vectors (..., m), in their precision."""
+    xp = array_namespace(matrix, vector)
+    return xp.sum(xp.asarray(matrix, dtype=vector.dtype) * vector[..., None, :], axis=-1)
 
 
 def saturated(
     pressure_kpa: Array, reference_m: Array, length_m: Array, gains: Gains, tolerance_m: float
 ) -> Array:
-    """Return which chambers (..., n) cannot reach their reference: bool.
+    """Return which chambers (..., n_chambers) cannot reach their reference: bool.
 
     A chamber is saturated if it is at its greatest pressure with its spring too short, or at its least
     pressure with its spring too long, by more than the tolerance.
 
     Args:
-        pressure_kpa (..., n) [kPa]: as `pressures` gives them.
-        reference_m (..., n) [m]: spring lengths to reach.
-        length_m (..., n) [m]: spring lengths read.
+        pressure_kpa (..., n_chambers) [kPa]: as `pressures` gives them.
+        reference_m (..., n_springs) [m]: spring lengths to reach.
+        length_m (..., n_springs) [m]: spring lengths read.
         gains: numbers of the law.
         tolerance_m: greatest error of a spring that counts as on its reference.
     """
     error_m = reference_m - length_m
+    if gains.allocation is not None:
+        error_m = allocated_error(error_m, pressure_kpa, gains.allocation)
     short = (pressure_kpa >= gains.pressure_max_kpa) & (error_m > tolerance_m)
     long = (pressure_kpa <= gains.pressure_min_kpa) & (error_m < -tolerance_m)
     return short | long

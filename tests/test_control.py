@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mjx_softarm import ArmSpec
-from mjx_softarm.control import Gains, LawState, pressures, saturated
+from mjx_softarm.control import YIELD_M_PER_KPA, Gains, LawState, allocated_error, pressures, saturated
 
 pytestmark = pytest.mark.usefixtures("strict")
 
@@ -83,6 +83,79 @@ def test_rest_of_coupled_springs_is_complementary_whatever_the_gains(gains):
     np.testing.assert_array_equal(flags, np.abs(error) > 1e-4)
 
 
+def redundant_arm(n_chambers, n_springs):
+    """Gains of an arm with so many chambers and springs a section, and its compliance [m/kPa]."""
+    counts = {"chambers_per_section": n_chambers, "springs_per_section": n_springs}
+    gains = Gains.from_spec(ArmSpec.default().replace(structure=counts))
+    angle = 2 * np.pi * np.arange(n_chambers) / n_chambers
+    plane = np.stack([np.ones(n_chambers), np.cos(angle), np.sin(angle)], axis=-1)
+    stretch = M_PER_KPA / n_chambers * np.diag([1.8, 3.3, 2.7])
+    section = plane[:: n_chambers // n_springs] @ stretch @ plane.T
+    return gains, np.kron(np.eye(3), section)
+
+
+def redundant_rest(gains, compliance, reference_m):
+    """Lengths and pressures of a redundant arm at rest."""
+    length = np.full(len(compliance), FREE_M)
+    state = LawState.at_rest(np.zeros(compliance.shape[1]), length)
+    for _ in range(8000):
+        pressure, state = pressures(reference_m, length, state, gains, DT_S)
+        length = plant(length, pressure, compliance)
+    np.testing.assert_allclose(pressure, state.integral_kpa, atol=1e-6)
+    return length, pressure
+
+
+def test_matrices_of_four_chambers_by_hand():
+    """Opposite pairs that disagree are the redundant pressure; its complement is each chamber's error."""
+    gains, _ = redundant_arm(4, 4)
+    redundant = 0.25 * np.array([[1, -1, 1, -1], [-1, 1, -1, 1]] * 2)
+    np.testing.assert_allclose(gains.allocation.redundant, np.kron(np.eye(3), redundant), atol=1e-12)
+    complement = np.eye(12) - gains.allocation.redundant
+    np.testing.assert_allclose(gains.allocation.chamber_error, complement, atol=1e-12)
+    assert GAINS.allocation is None
+
+
+@pytest.mark.parametrize("counts", [(4, 4), (6, 3), (6, 6)])
+def test_redundant_chambers_follow_references_with_the_least_pressures(counts):
+    gains, compliance = redundant_arm(*counts)
+    wanted_kpa = np.random.default_rng(7).uniform(-8.0, 5.0, compliance.shape[1])
+    reference = FREE_M + compliance @ wanted_kpa
+    length, pressure = redundant_rest(gains, compliance, reference)
+    np.testing.assert_allclose(length, reference, atol=1e-8)
+    least = np.linalg.lstsq(compliance, reference - FREE_M, rcond=None)[0]
+    np.testing.assert_allclose(gains.allocation.redundant @ pressure, 0.0, atol=1e-5)
+    np.testing.assert_allclose(pressure, least, atol=1e-3)
+
+
+@pytest.mark.parametrize("counts", [(4, 4), (6, 3)])
+@pytest.mark.parametrize("slow", [False, True])
+def test_rest_of_redundant_chambers_is_complementary_whatever_the_gains(counts, slow):
+    """Chambers within their limits close the error of the law; a chamber at a limit has it outward."""
+    gains, compliance = redundant_arm(*counts)
+    if slow:
+        gains = gains._replace(kp_kpa_per_m=0.0, ki_kpa_per_ms=100.0, kd_kpa_s_per_m=0.0)
+    rng = np.random.default_rng(3)
+    reference = FREE_M + rng.uniform(-0.25, 0.15, len(compliance))
+    length, pressure = redundant_rest(gains, compliance, reference)
+    error = allocated_error(reference - length, pressure, gains.allocation)
+    at_high, at_low = pressure >= HIGH, pressure <= LOW
+    assert at_high.any() and at_low.any() and (~at_high & ~at_low).any()
+    assert (error[at_high] >= 0).all() and (error[at_low] <= 0).all()
+    np.testing.assert_allclose(error[~at_high & ~at_low], 0.0, atol=1e-8)
+    flags = saturated(pressure, reference, length, gains, tolerance_m=1e-4)
+    np.testing.assert_array_equal(flags, np.abs(error) > 1e-4)
+
+
+def test_a_limit_is_made_up_for_with_redundant_pressure():
+    """Springs are off by fractions of a millimetre for each kPa of redundant pressure."""
+    gains, compliance = redundant_arm(4, 4)
+    reference = FREE_M + compliance @ np.tile([25.0, 0.0, 0.0, 0.0], 3)  # most of it by the first chamber
+    length, pressure = redundant_rest(gains._replace(pressure_max_kpa=17.0), compliance, reference)
+    assert (pressure[::4] == 17.0).all()
+    redundant_kpa = gains.allocation.redundant @ pressure
+    assert np.abs(reference - length).max() < 4 * YIELD_M_PER_KPA * np.abs(redundant_kpa).max()
+
+
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_long_saturation_is_left_at_once(sign):
     gains = GAINS._replace(reference_s=0.0)
@@ -124,21 +197,24 @@ def test_limits_that_float32_rounds_are_still_limits(to_library):
     assert saturated(pressure, reference, length, gains, 1e-3).all()
 
 
-def test_jax_vmapped_and_scanned_gives_numpy_s_pressures():
+@pytest.mark.parametrize("gains", [GAINS, redundant_arm(4, 4)[0], redundant_arm(6, 3)[0]], ids=[3, 4, 6])
+def test_jax_vmapped_and_scanned_gives_numpy_s_pressures(gains):
+    n_chambers, n_springs = (9, 9) if gains.allocation is None else gains.allocation.chamber_error.shape
     rng = np.random.default_rng(5)
-    reference = np.float32(rng.uniform(0.10, 0.26, (50, 6, 9)))  # ticks, arms, springs
-    length = np.float32(rng.uniform(0.10, 0.26, (50, 6, 9)))
+    reference = np.float32(rng.uniform(0.10, 0.26, (50, 6, n_springs)))  # ticks, arms, springs
+    length = np.float32(rng.uniform(0.10, 0.26, (50, 6, n_springs)))
 
     def tick(state, now):
-        pressure, state = jax.vmap(lambda r, x, s: pressures(r, x, s, GAINS, DT_S))(*now, state)
-        flags = jax.vmap(lambda p, r, x: saturated(p, r, x, GAINS, 1e-3))(pressure, *now)
+        pressure, state = jax.vmap(lambda r, x, s: pressures(r, x, s, gains, DT_S))(*now, state)
+        flags = jax.vmap(lambda p, r, x: saturated(p, r, x, gains, 1e-3))(pressure, *now)
         return state, (pressure, flags)
 
-    start = LawState.at_rest(jnp.zeros((6, 9)), jnp.asarray(length[0]))
+    start = LawState.at_rest(jnp.zeros((6, n_chambers)), jnp.asarray(length[0]))
     _, (got, flags) = jax.jit(lambda *now: jax.lax.scan(tick, start, now))(reference, length)
-    state = LawState.at_rest(np.zeros((6, 9), np.float32), length[0])
+    state = LawState.at_rest(np.zeros((6, n_chambers), np.float32), length[0])
     for k in range(50):
-        expected, state = pressures(reference[k], length[k], state, GAINS, DT_S)
+        expected, state = pressures(reference[k], length[k], state, gains, DT_S)
         np.testing.assert_allclose(got[k], expected, rtol=1e-6, atol=1e-6 * HIGH)
-        np.testing.assert_array_equal(flags[k], saturated(expected, reference[k], length[k], GAINS, 1e-3))
+        flagged = saturated(expected, reference[k], length[k], gains, 1e-3)
+        np.testing.assert_array_equal(flags[k], flagged)
     assert got.dtype == expected.dtype == np.float32
