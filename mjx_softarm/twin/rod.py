@@ -1,4 +1,4 @@
-"""A hanging arm as a geometrically exact rod: bending, torsion, shear and extension, with fibres along it.
+"""An arm as a geometrically exact rod: bending, torsion, shear and extension, with fibres along it.
 
 This mechanics is independent of training's: no links, hinges or tendons. The rod is cut into elements of
 constant strain: curvature and twist kappa, shear and extension nu, both in the element's own axes. h is the
@@ -7,13 +7,13 @@ and exp is the rotation by a vector:
 
     R_{e+1} = R_e exp(h kappa),    x_{e+1} = x_e + h R_e exp(h kappa / 2) nu,
 
-At rest nu = (0, 0, -1), because the arm hangs towards -z. Chambers and springs are fibres glued to the
-cross-sections, so each piece stretches by itself: a piece at r has the length h |nu + kappa x r|. lambda is
-this length divided by h, times the section's length L. A chamber pulls with
+At rest nu = (0, 0, -1), because the arm extends along -z of its base. Chambers and springs are fibres glued
+to the cross-sections, and each piece stretches by itself: a piece at r has the length h |nu + kappa x r|.
+lambda is this length divided by h, times the section's length L. A chamber pulls with
 
     f = k d (1 + c (d / L)^2) - p (A + A' (lambda - L)),    d = lambda - rest length,
 
-so it hardens. The motion is overdamped, without inertia: C dq/dt = -dV/dq, with the potential V and the
+which hardens. The motion is overdamped, without inertia: C dq/dt = -dV/dq, with the potential V and the
 damping C in proportion to the stiffness of the straight rod. A step is a linearly implicit Euler step. At
 rest dV/dq is zero for every step size.
 
@@ -39,24 +39,24 @@ _CROSS[0, [5, 7]] = _CROSS[1, [6, 2]] = _CROSS[2, [1, 3]] = -1.0, 1.0
 
 
 class RodParts(NamedTuple):
-    """Numbers of a rod of s sections with three chambers and three springs each."""
+    """Numbers of a rod of s sections with c chambers and k springs each."""
 
-    section_length_m: float
+    section_length_m: np.ndarray  # (s,)
     section_mass_kg: np.ndarray  # (s,)
     bending: np.ndarray  # (s,) E I [N m^2]
     torsion: np.ndarray  # (s,) G J [N m^2]
     shear: np.ndarray  # (s,) G A [N]
     extension: np.ndarray  # (s,) E A [N]
     joint: np.ndarray  # (s, 3, 3) turn of each section against the end of the section above
-    chamber_hole_m: np.ndarray  # (s, 3, 2) x and y in the cross-sections
-    spring_hole_m: np.ndarray  # (s, 3, 2) x and y in the cross-sections
-    stiffness: np.ndarray  # (s, 3) k [N/m] of the chambers
-    hardening: np.ndarray  # (s, 3) c
-    rest_m: np.ndarray  # (s, 3) rest lengths of the chambers
-    area: np.ndarray  # (s, 3) A [N/kPa] at the section's length
-    area_slope: np.ndarray  # (s, 3) A' [N/kPa/m]
-    spring_stiffness: float  # [N/m]
-    spring_rest_m: float
+    chamber_hole_m: np.ndarray  # (s, c, 2) x and y in the cross-sections
+    spring_hole_m: np.ndarray  # (s, k, 2) x and y in the cross-sections
+    stiffness: np.ndarray  # (s, c) [N/m] of the chambers
+    hardening: np.ndarray  # (s, c) share by which a chamber is stiffer at a section's length from rest
+    rest_m: np.ndarray  # (s, c) rest lengths of the chambers
+    area: np.ndarray  # (s, c) A [N/kPa] at the section's length
+    area_slope: np.ndarray  # (s, c) A' [N/kPa/m]
+    spring_stiffness: np.ndarray  # (s,) [N/m]
+    spring_rest_m: np.ndarray  # (s,)
     tool_mass_kg: np.ndarray  # (2,) gripper and payload
     tool_offset_m: np.ndarray  # (2,) distances of gripper and payload below the rod's end
     up: np.ndarray  # (3,) direction against gravity, in the axes of the rod's base
@@ -76,28 +76,36 @@ class Rod:
         """Make a straight rod without force, with `per_section` elements in each section."""
         # Joints and elasticity of each element.
         self.per_section = per_section
-        self.length_m = parts.section_length_m / per_section
-        n_sections = len(parts.bending)
+        self.length_m = np.repeat(parts.section_length_m / per_section, per_section)[:, None]  # (n, 1)
+        n_sections, n_chambers = parts.stiffness.shape
         self._joint = np.tile(np.eye(3), (n_sections * per_section, 1, 1))
         self._joint[::per_section] = parts.joint
         law = [parts.bending, parts.bending, parts.torsion, parts.shear, parts.shear, parts.extension]
         self._elastic = np.repeat(np.stack(law, axis=1), per_section, axis=0)  # (n, 6)
         # Places of the fibres, and their constant derivatives.
-        hole = np.zeros((n_sections, 6, 3))
-        hole[:, :3, :2], hole[:, 3:, :2] = parts.chamber_hole_m, parts.spring_hole_m
-        hole = np.repeat(hole, per_section, axis=0)
-        # d(nu + kappa x r) / dq (n, 6 fibres, 3, 6 strains)
+        hole = np.concatenate([parts.chamber_hole_m, parts.spring_hole_m], axis=1)
+        hole = np.repeat(np.pad(hole, ((0, 0), (0, 0), (0, 1))), per_section, axis=0)
+        # d(nu + kappa x r) / dq (n, c + k fibres, 3, 6 strains)
         self._along = np.concatenate([-_cross_matrix(hole), np.broadcast_to(np.eye(3), (*hole.shape, 3))], -1)
         self._square = np.swapaxes(self._along, -1, -2) @ self._along
         # Rest state and damping.
         self.replace(parts)
         self.q = np.tile(REST_STRAIN, (n_sections * per_section, 1))
-        stiffness = self._local(self.q, np.zeros((n_sections, 3)))[1]
+        stiffness = self._local(self.q, np.zeros((n_sections, n_chambers)))[1]
         self._damping = CREEP_S * np.diagonal(stiffness, axis1=1, axis2=2).ravel()
 
     def replace(self, parts: RodParts) -> None:
         """Change masses, areas or stiffnesses of the parts; the strains stay."""
         self.parts = parts
+
+        def each(value: np.ndarray) -> np.ndarray:
+            """Return numbers of the sections (s, ...) for each of their elements (n, m)."""
+            return np.repeat(value.reshape(len(parts.bending), -1), self.per_section, axis=0)
+
+        self._section_m = each(parts.section_length_m)
+        chambers = parts.stiffness, parts.hardening, parts.rest_m, parts.area, parts.area_slope
+        self._chamber_law = [each(value) for value in chambers]
+        self._spring_law = each(parts.spring_stiffness), each(parts.spring_rest_m)
         mass = np.repeat(parts.section_mass_kg / self.per_section, self.per_section)
         self._node_kg = 0.5 * (mass + np.append(mass[1:], 0.0))  # (n,) lumped at the lower ends
 
@@ -107,14 +115,14 @@ class Rod:
         return self._shape(half, turn)[0]
 
     def spring_lengths(self) -> np.ndarray:
-        """Return the lengths (3 s,) [m] of the springs."""
-        u = self._stretch(self.q)[:, 3:]
+        """Return the lengths (s k,) [m] of the springs."""
+        u = self._stretch(self.q)[:, self.parts.stiffness.shape[1] :]
         pieces = self.length_m * np.linalg.norm(u, axis=-1)
-        return pieces.reshape(-1, self.per_section, 3).sum(axis=1).ravel()
+        return pieces.reshape(-1, self.per_section, pieces.shape[1]).sum(axis=1).ravel()
 
     def step(self, pressure_kpa: np.ndarray, duration_s: float) -> float:
-        """Take a step at pressures (3 s,) [kPa]; return the largest entry of dV/dq before the step."""
-        gradient, hessian = self._derivatives(pressure_kpa.reshape(-1, 3))
+        """Take a step at pressures (s c,) [kPa]; return the largest entry of dV/dq before the step."""
+        gradient, hessian = self._derivatives(pressure_kpa.reshape(self.parts.stiffness.shape))
         factor = None
         while factor is None:
             np.fill_diagonal(hessian, hessian.diagonal() + self._damping / duration_s)
@@ -127,7 +135,7 @@ class Rod:
         return float(np.abs(gradient).max())
 
     def settle(self, pressure_kpa: np.ndarray) -> None:
-        """Move to rest at pressures (3 s,) [kPa], through some seconds of motion.
+        """Move to rest at pressures (s c,) [kPa], through some seconds of motion.
 
         Raises:
             FloatingPointError: the rod does not come to rest.
@@ -151,44 +159,46 @@ class Rod:
         return Shape(node, np.array(rotation)), begin, middle
 
     def _stretch(self, q: np.ndarray) -> np.ndarray:
-        """Return nu + kappa x r (n, 6 fibres, 3)."""
+        """Return nu + kappa x r (n, c + k fibres, 3)."""
         return (self._along @ q[:, None, :, None])[..., 0]
 
     def _local(self, q: np.ndarray, pressure_kpa: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return derivatives of the energy of backbone, chambers and springs: (n, 6) and (n, 6, 6)."""
-        parts, h = self.parts, self.length_m
-        u = self._stretch(q)
-        size = np.sqrt(np.sum(u**2, axis=-1))  # (n, 6)
-        section_m = parts.section_length_m * size.reshape(-1, self.per_section, 6)
-        tension, slope = (x.reshape(size.shape) for x in self._fibres(section_m, pressure_kpa[:, None]))
-        lead = (np.swapaxes(self._along, -1, -2) @ (u / size[..., None])[..., None])[..., 0]  # (n, 6, 6)
+        # Stretch of the fibres, their pulls and the pulls' slopes, each (n, c + k)
+        h, u = self.length_m, self._stretch(q)
+        size = np.sqrt(np.sum(u**2, axis=-1))
+        tension, slope = self._fibres(self._section_m * size, pressure_kpa)
+
+        # Derivatives of fibres, then of the backbone
+        lead = (np.swapaxes(self._along, -1, -2) @ (u / size[..., None])[..., None])[..., 0]  # (n, c + k, 6)
         gradient = h * np.sum(tension[..., None] * lead, axis=1)
         gradient += h * self._elastic * (q - REST_STRAIN)
         curve = h * tension / size
-        weight = h * parts.section_length_m * slope - curve
+        weight = h * self._section_m * slope - curve
         hessian = np.swapaxes(lead, 1, 2) @ (weight[..., None] * lead)
         hessian += np.sum(curve[..., None, None] * self._square, axis=1)
-        hessian += h * self._elastic[..., None] * np.eye(N_STRAINS)
+        hessian += h[..., None] * self._elastic[..., None] * np.eye(N_STRAINS)
         return gradient, hessian
 
     def _fibres(self, length_m: np.ndarray, pressure_kpa: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return pulls (s, per_section, 6) [N] of fibres with these lengths, and their slopes [N/m]."""
-        parts = self.parts
-        chamber, spring = length_m[..., :3], length_m[..., 3:]
-        stiffness, hardening, rest, area, area_slope = (
-            x[:, None] for x in (parts.stiffness, parts.hardening, parts.rest_m, parts.area, parts.area_slope)
-        )
+        """Return pulls (n, c + k) [N] of fibres with these lengths (n, c + k), and their slopes [N/m]."""
+        n_chambers, full_m = self.parts.stiffness.shape[1], self._section_m
+        chamber, spring = length_m[:, :n_chambers], length_m[:, n_chambers:]
+        stiffness, hardening, rest, area, area_slope = self._chamber_law
+        spring_stiffness, spring_rest = self._spring_law
+        kpa = np.repeat(pressure_kpa, self.per_section, axis=0)
+
+        # Chambers, then springs
         off = chamber - rest
-        harder = hardening * (off / parts.section_length_m) ** 2
-        effective = area + area_slope * (chamber - parts.section_length_m)
-        pull = stiffness * off * (1.0 + harder) - pressure_kpa * effective
-        slope = stiffness * (1.0 + 3.0 * harder) - pressure_kpa * area_slope
-        drawn = parts.spring_stiffness * (spring - parts.spring_rest_m)
-        constant = np.full_like(spring, parts.spring_stiffness)
+        harder = hardening * (off / full_m) ** 2
+        pull = stiffness * off * (1.0 + harder) - kpa * (area + area_slope * (chamber - full_m))
+        slope = stiffness * (1.0 + 3.0 * harder) - kpa * area_slope
+        drawn = spring_stiffness * (spring - spring_rest)
+        constant = np.broadcast_to(spring_stiffness, spring.shape)
         return np.concatenate([pull, drawn], -1), np.concatenate([slope, constant], -1)
 
     def _derivatives(self, pressure_kpa: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return dV/dq (n, 6) and its derivative (6 n, 6 n) at pressures (s, 3)."""
+        """Return dV/dq (n, 6) and its derivative (6 n, 6 n) at pressures (s, c)."""
         gradient, local = self._local(self.q, pressure_kpa)
         fall, turn = self._weights()
         up = GRAVITY_M_S2 * self.parts.up
@@ -221,10 +231,11 @@ class Rod:
         mass = np.cumsum(self._node_kg[::-1])[::-1] + parts.tool_mass_kg.sum()
         hung = moment - mass[:, None] * node[1:]
         # Turns of the part below an element, and shifts of its lower end.
-        whole = h * np.swapaxes(begin @ _left_jacobian(h * bend), 1, 2)  # (n, 3 strains, 3)
-        inner = 0.5 * h * np.swapaxes(begin @ _left_jacobian(0.5 * h * bend), 1, 2)
+        h3 = h[..., None]
+        whole = h3 * np.swapaxes(begin @ _left_jacobian(h * bend), 1, 2)  # (n, 3 strains, 3)
+        inner = 0.5 * h3 * np.swapaxes(begin @ _left_jacobian(0.5 * h * bend), 1, 2)
         reach = np.diff(node, axis=0)
-        aside = np.concatenate([np.cross(inner, reach[:, None]), h * np.swapaxes(middle, 1, 2)], axis=1)
+        aside = np.concatenate([np.cross(inner, reach[:, None]), h3 * np.swapaxes(middle, 1, 2)], axis=1)
         turns = np.concatenate([whole, np.zeros_like(whole)], axis=1)
         return mass[:, None, None] * aside + np.cross(turns, hung[:, None]), turns
 

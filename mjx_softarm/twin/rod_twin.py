@@ -18,10 +18,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mjx_softarm._support.fields import PerChamber, PerSection
 from mjx_softarm.deploy.arm_io import Capture
 from mjx_softarm.sensing.pose import quaternion_from_rotation, rotation_about
 from mjx_softarm.sensing.sensors import Sensor
-from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
+from mjx_softarm.spec import ArmSpec
 from mjx_softarm.twin.instruments import (
     AS_BUILT,
     EVALUATION_SESSION,
@@ -40,11 +41,14 @@ REGULATOR_S = 0.1  # time constant of the pressures
 
 @dataclass(frozen=True)
 class RodTolerances:
-    """Deviations from training's model at a gap of 1: values of all rods, then standard deviations."""
+    """Deviations from the specification at a gap of 1: values of all rods, then standard deviations.
+
+    Torsion and shear are arrays (n_sections,) where they have been scaled to an arm.
+    """
 
     hardening: float = 0.5  # value of all rods: 50 % stiffer at a section's length from rest
-    torsion_rad_per_nm: float = 0.08  # value of all rods: compliance of a section
-    shear_per_n: float = 6e-4  # value of all rods: compliance
+    torsion_rad_per_nm: float | np.ndarray = 0.08  # value of all rods: compliance of a section
+    shear_per_n: float | np.ndarray = 6e-4  # value of all rods: compliance
     chamber_stiffness: float = 0.04  # relative, per chamber
     chamber_area: float = 0.02  # relative, per chamber
     chamber_length_m: float = 0.001  # per chamber
@@ -77,10 +81,13 @@ class RodTwin(InstrumentedArm):
         self._per_section = build.per_section or ELEMENTS_PER_SECTION
         rng = np.random.default_rng(seed)
         std = _scaled(build.gap, self._spec)
-        self._base_m = drawn(rng, std.base_offset_m, 3)
-        self._base_rotation = rotation_about(np.radians(drawn(rng, std.base_tilt_deg, 3)) * [1.0, 1.0, 0.0])
-        self._tip_m = drawn(rng, std.tip_offset_m, 3)
-        self._tip_turn = rotation_about(np.radians(drawn(rng, std.tip_turn_deg, 3)))
+        mounting = self._spec.mounting
+        self._base_m = mounting.base_offset_m + drawn(rng, std.base_offset_m, 3)
+        tilt = rotation_about(np.radians(drawn(rng, std.base_tilt_deg, 3)) * [1.0, 1.0, 0.0])
+        self._base_rotation = rotation_about(np.radians(mounting.base_turn_deg)) @ tilt
+        self._tip_m = mounting.tip_offset_m + drawn(rng, std.tip_offset_m, 3)
+        tip_turn = rotation_about(np.radians(drawn(rng, std.tip_turn_deg, 3)))
+        self._tip_turn = rotation_about(np.radians(mounting.tip_turn_deg)) @ tip_turn
         super().__init__(_sensor(rng, self._spec, std), seed, session, build.noise)
         parts = draw_rod(rng, self._spec, std, self._base_rotation[2])
         self._rod = Rod(parts, self._per_section)
@@ -130,43 +137,51 @@ class RodTwin(InstrumentedArm):
 
 def draw_rod(rng: np.random.Generator, spec: ArmSpec, std: RodTolerances, up: np.ndarray) -> RodParts:
     """Draw the numbers of a rod; `up` (3,) points against gravity, in the axes of its base."""
-    s, length_m = spec.structure.n_sections, spec.geometry.section_length_m
-    chambers, backbone, per_chamber = spec.chambers, spec.backbone, (s, N_CHAMBERS_PER_SECTION)
+    # Numbers of sections (s,), and of chambers (s, c)
+    geometry, chambers, backbone = spec.geometry, spec.chambers, spec.backbone
+    s, n_chambers = spec.structure.n_sections, spec.structure.chambers_per_section
+    per_chamber = s, n_chambers
+
+    def of_section(value: PerSection) -> np.ndarray:
+        return np.array(spec.per_section(value))
+
+    def of_chamber(value: PerChamber) -> np.ndarray:
+        return np.reshape(spec.per_chamber(value), per_chamber)
 
     def factors(deviation: float, *shape: int) -> np.ndarray:
         return 1.0 + drawn(rng, deviation, *shape)
 
-    def holes(radius_m: float) -> np.ndarray:
-        first = np.radians(spec.geometry.first_chamber_deg)
-        angle = first + 2 * np.pi * np.arange(N_CHAMBERS_PER_SECTION) / N_CHAMBERS_PER_SECTION
-        angle = angle + np.radians(drawn(rng, std.hole_angle_deg, *per_chamber))
-        radius = radius_m + drawn(rng, std.hole_radius_m, *per_chamber)
+    def holes(radius_m: PerSection, n: int) -> np.ndarray:
+        """Draw places (s, n, 2) of n holes in each section at equal angles."""
+        first = np.radians(of_section(geometry.first_chamber_deg) + spec.section_roll_deg)[:, None]
+        angle = first + 2 * np.pi * np.arange(n) / n
+        angle = angle + np.radians(drawn(rng, std.hole_angle_deg, s, n))
+        radius = of_section(radius_m)[:, None] + drawn(rng, std.hole_radius_m, s, n)
         return radius[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
-    def each(value: float | tuple[float, ...]) -> np.ndarray:
-        return np.reshape(spec.per_chamber(value), (s, -1))
-
     # The order of the draws belongs to the seed: another order makes other rods.
+    length_m = of_section(geometry.section_length_m)
+    rest_m = length_m[:, None] + of_chamber(chambers.length_offset_m)
     roll_rad = np.radians(drawn(rng, std.section_roll_deg, s))
     area = factors(std.chamber_area, *per_chamber)
     stiff = factors(std.backbone_stiffness, s)
     return RodParts(
         section_length_m=length_m,
-        section_mass_kg=spec.mass.arm_kg / s * factors(std.section_mass, s),
-        bending=backbone.bending_stiffness_nm_per_rad * length_m * stiff,
-        torsion=length_m / max(std.torsion_rad_per_nm, 1e-4) * stiff,
-        shear=stiff / max(std.shear_per_n, 1e-6),
-        extension=backbone.axial_stiffness_n_per_m * length_m * stiff,
+        section_mass_kg=spec.section_mass_kg * factors(std.section_mass, s),
+        bending=of_section(backbone.bending_stiffness_nm_per_rad) * length_m * stiff,
+        torsion=length_m / np.maximum(std.torsion_rad_per_nm, 1e-4) * stiff,
+        shear=stiff / np.maximum(std.shear_per_n, 1e-6),
+        extension=of_section(backbone.axial_stiffness_n_per_m) * length_m * stiff,
         joint=np.stack([rotation_about(np.array([0.0, 0.0, roll])) for roll in roll_rad]),
-        chamber_hole_m=holes(spec.geometry.chamber_radius_m),
-        spring_hole_m=holes(spec.geometry.spring_radius_m),
-        stiffness=each(chambers.stiffness_n_per_m) * factors(std.chamber_stiffness, *per_chamber),
+        chamber_hole_m=holes(geometry.chamber_radius_m, n_chambers),
+        spring_hole_m=holes(geometry.spring_radius_m, spec.springs_per_section),
+        stiffness=of_chamber(chambers.stiffness_n_per_m) * factors(std.chamber_stiffness, *per_chamber),
         hardening=np.full(per_chamber, std.hardening),
-        rest_m=length_m + each(chambers.length_offset_m) + drawn(rng, std.chamber_length_m, *per_chamber),
-        area=1e3 * each(chambers.area_m2) * area,
-        area_slope=1e3 * each(chambers.area_slope_m) * area,
-        spring_stiffness=spec.springs.stiffness_n_per_m,
-        spring_rest_m=spec.springs.rest_length_m,
+        rest_m=rest_m + drawn(rng, std.chamber_length_m, *per_chamber),
+        area=1e3 * of_chamber(chambers.area_m2) * area,
+        area_slope=1e3 * of_chamber(chambers.area_slope_m) * area,
+        spring_stiffness=of_section(spec.springs.stiffness_n_per_m),
+        spring_rest_m=of_section(spec.springs.rest_length_m),
         tool_mass_kg=np.array([spec.mass.gripper_kg, 0.0]),
         tool_offset_m=spec.mass.gripper_length_m * np.array([0.5, 1.0]),
         up=up,
@@ -176,18 +191,24 @@ def draw_rod(rng: np.random.Generator, spec: ArmSpec, std: RodTolerances, up: np
 def _sensor(rng: np.random.Generator, spec: ArmSpec, std: RodTolerances) -> Sensor:
     """Draw the sensors, with the springs' own beta and delta."""
     sensor = spec.spring_sensor
-    beta = sensor.beta * (1.0 + drawn(rng, std.spring_beta, spec.n_chambers))
-    delta_m = sensor.delta_m + drawn(rng, std.spring_delta_m, spec.n_chambers)
+    beta = sensor.beta * (1.0 + drawn(rng, std.spring_beta, spec.n_springs))
+    delta_m = sensor.delta_m + drawn(rng, std.spring_delta_m, spec.n_springs)
     return dataclasses.replace(sensor, beta=beta, delta_m=delta_m)
 
 
 def _scaled(gap: float, spec: ArmSpec) -> RodTolerances:
     """Return an arm's tolerances: lengths and compliances scale with those of the paper's arm."""
     paper = ArmSpec.default()
-    length = spec.geometry.section_length_m / paper.geometry.section_length_m
-    bending = paper.backbone.bending_stiffness_nm_per_rad / spec.backbone.bending_stiffness_nm_per_rad
-    axial = paper.backbone.axial_stiffness_n_per_m / spec.backbone.axial_stiffness_n_per_m
-    factors = {"torsion_rad_per_nm": bending, "shear_per_n": axial / length}
+
+    def of_section(value: PerSection) -> np.ndarray:
+        return np.array(spec.per_section(value))
+
+    own, of_paper = spec.backbone, paper.backbone
+    length = np.mean(spec.geometry.section_length_m) / np.mean(paper.geometry.section_length_m)
+    section = of_section(spec.geometry.section_length_m) / np.mean(paper.geometry.section_length_m)
+    bending = np.mean(of_paper.bending_stiffness_nm_per_rad) / of_section(own.bending_stiffness_nm_per_rad)
+    axial = np.mean(of_paper.axial_stiffness_n_per_m) / of_section(own.axial_stiffness_n_per_m)
+    factors = {"torsion_rad_per_nm": bending, "shear_per_n": axial / section}
     return RodTolerances(
         **{
             name: gap * x * (length if name.endswith("_m") else factors.get(name, 1.0))

@@ -11,28 +11,32 @@ LENGTH_M = 0.2
 NONE = np.zeros(9)
 
 
-def bar(n_sections=1, tip_kg=0.01, up=(0.0, 0.0, 1.0), joints=None, **other):
+def holes(n_sections, n, radius_m=0.035):
+    """Places (n_sections, n, 2) at equal angles from +y."""
+    angle = np.pi / 2 + 2 * np.pi * np.arange(n) / n
+    return np.tile(radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=-1), (n_sections, 1, 1))
+
+
+def bar(n_sections=1, tip_kg=0.01, up=(0.0, 0.0, 1.0), joints=None, n_chambers=3, **other):
     """A rod without mass and without forces of chambers and springs, with a weight at its end."""
-    s, zeros = n_sections, np.zeros((n_sections, 3))
-    angle = np.pi / 2 + 2 * np.pi * np.arange(3) / 3
-    hole = np.tile(0.035 * np.stack([np.cos(angle), np.sin(angle)], axis=-1), (s, 1, 1))
+    s, zeros = n_sections, np.zeros((n_sections, n_chambers))
     numbers = {
-        "section_length_m": LENGTH_M,
+        "section_length_m": np.full(s, LENGTH_M),
         "section_mass_kg": np.zeros(s),
         "bending": np.full(s, 0.4),
         "torsion": np.full(s, 0.3),
         "shear": np.full(s, 50.0),
         "extension": np.full(s, 150.0),
         "joint": np.tile(np.eye(3), (s, 1, 1)) if joints is None else joints,
-        "chamber_hole_m": hole,
-        "spring_hole_m": hole,
+        "chamber_hole_m": holes(s, n_chambers),
+        "spring_hole_m": holes(s, 3),
         "stiffness": zeros,
         "hardening": zeros,
         "rest_m": zeros + LENGTH_M,
         "area": zeros,
         "area_slope": zeros,
-        "spring_stiffness": 0.0,
-        "spring_rest_m": LENGTH_M,
+        "spring_stiffness": np.zeros(s),
+        "spring_rest_m": np.full(s, LENGTH_M),
         "tool_mass_kg": np.array([0.0, tip_kg]),
         "tool_offset_m": np.zeros(2),
         "up": np.array(up),
@@ -42,7 +46,7 @@ def bar(n_sections=1, tip_kg=0.01, up=(0.0, 0.0, 1.0), joints=None, **other):
 
 def rest(parts, pressure_kpa=NONE, per_section=12):
     rod = Rod(parts, per_section)
-    rod.settle(pressure_kpa[: 3 * len(parts.bending)])
+    rod.settle(pressure_kpa[: parts.stiffness.size])
     return rod
 
 
@@ -56,9 +60,11 @@ def test_cantilever_bends_and_shears_as_timoshenkos_beam():
 
 
 def test_weight_stretches_a_hanging_bar():
-    shape = rest(bar(tip_kg=0.3)).shape()
-    stretched = LENGTH_M * (1.0 + 0.3 * GRAVITY_M_S2 / 150.0)
-    np.testing.assert_allclose(shape.node_m[-1], [0.0, 0.0, -stretched], atol=1e-9)
+    """Each of its sections by its own length and stiffness."""
+    length_m, extension = np.array([LENGTH_M, 0.1]), np.array([150.0, 80.0])
+    shape = rest(bar(2, tip_kg=0.3, section_length_m=length_m, extension=extension)).shape()
+    end_m = -np.cumsum(length_m * (1.0 + 0.3 * GRAVITY_M_S2 / extension))
+    np.testing.assert_allclose(shape.node_m[[12, 24]], np.outer(end_m, [0.0, 0.0, 1.0]), atol=1e-9)
 
 
 def test_lever_twists_a_bar():
@@ -72,21 +78,24 @@ def test_lever_twists_a_bar():
     assert np.sign(twist) == np.sign(shape.node_m[-1, 0] * shape.node_m[-1, 1]) * -1.0
 
 
-def test_chambers_harden():
-    """Three equal chambers without weight: one equation for the length."""
+@pytest.mark.parametrize("n_chambers", [3, 4, 6])
+def test_chambers_harden(n_chambers):
+    """Equal chambers and springs without weight: one equation for the length."""
     chambers = {"stiffness": 500.0, "hardening": 0.8, "area": 1.6, "area_slope": -4.0}
-    parts = bar(tip_kg=0.0, **{name: np.full((1, 3), value) for name, value in chambers.items()})
+    numbers = {name: np.full((1, n_chambers), value) for name, value in chambers.items()}
+    springs = {"spring_stiffness": np.array([54.0]), "spring_rest_m": np.array([0.18])}
+    parts = bar(tip_kg=0.0, n_chambers=n_chambers, **numbers, **springs)
     for kpa in (-35.0, 20.0):
-        rod = rest(parts, np.full(9, kpa))
+        rod = rest(parts, np.full(n_chambers, kpa))
 
         def force(d, kpa=kpa):
             chamber = 500.0 * d * (1.0 + 0.8 * (d / LENGTH_M) ** 2) - kpa * (1.6 - 4.0 * d)
-            return 150.0 * d / LENGTH_M + 3.0 * chamber
+            return 150.0 * d / LENGTH_M + n_chambers * chamber + 3 * 54.0 * (d + LENGTH_M - 0.18)
 
         length_m = LENGTH_M + brentq(force, -0.19, 0.19)
         assert abs(length_m - LENGTH_M) > 0.01
         np.testing.assert_allclose(rod.shape().node_m[-1], [0.0, 0.0, -length_m], atol=1e-8)
-        np.testing.assert_allclose(rod.spring_lengths(), length_m, atol=1e-8)
+        np.testing.assert_allclose(rod.spring_lengths(), np.full(3, length_m), atol=1e-8)
 
 
 def test_one_chamber_bends_to_a_circle():
@@ -103,9 +112,11 @@ def test_one_chamber_bends_to_a_circle():
 
 def test_derivatives_are_those_of_one_potential():
     """The gradient's derivative by differences is symmetric, and is the second derivative."""
-    parts = bar(2, tip_kg=0.5, up=(0.1, -0.2, 0.97), tool_offset_m=np.array([0.0, 0.1]))
-    parts = parts._replace(stiffness=np.full((2, 3), 500.0), area=np.full((2, 3), 1.6))
-    rod, pressure = Rod(parts, 2), np.random.default_rng(0).uniform(-20.0, 10.0, (2, 3))
+    shape, length_m = (2, 4), np.array([LENGTH_M, 0.12])
+    parts = bar(2, tip_kg=0.5, up=(0.1, -0.2, 0.97), tool_offset_m=np.array([0.0, 0.1]), n_chambers=4)
+    parts = parts._replace(stiffness=np.full(shape, 500.0), area=np.full(shape, 1.6))
+    parts = parts._replace(section_length_m=length_m, spring_stiffness=np.array([54.0, 30.0]))
+    rod, pressure = Rod(parts, 2), np.random.default_rng(0).uniform(-20.0, 10.0, shape)
     rod.q = rod.q + 0.3 * np.random.default_rng(1).normal(size=rod.q.shape)
     at, found = rod.q, rod._derivatives(pressure)[1]
     columns = []
