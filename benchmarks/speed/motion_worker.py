@@ -1,4 +1,6 @@
-"""Worker: `N_ARMS` arms in motion by one engine, on all cores.
+"""Worker: `N_ARMS` arms in motion by one engine, on one device, as training has it.
+
+With two devices of one CPU, XLA (jax 0.10.2) waits for ever in `mjx.step` of 4 links.
 
 python -m benchmarks.speed.motion_worker ENGINE STEP_MS LINKS
 """
@@ -14,7 +16,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.harness.common import mesh_of_cores
 from benchmarks.harness.rounds import Facts, serve
 from mjx_softarm._support import xla
 from mjx_softarm.env import EnvConfig, ReachEnv
@@ -29,17 +30,16 @@ N_TOLD, N_ACTIONS = 16, 4  # arms whose paths are told, over this many actions
 def prepare(engine: Any, step_ms: str, links: str) -> tuple[Facts, Callable[[], Facts]]:
     """Prepare steps of arms with random actions, which saturate about half of the chambers."""
     # Arms at rest, the same ones for each engine
-    mesh = mesh_of_cores(N_ARMS)
     spec = ArmSpec.default().replace(structure={"links_per_section": int(links)})
     config = EnvConfig(engine=engine, mode="dynamic", simulation_step_s=1e-3 * float(step_ms), n_poses=N_ARMS)
     env = ReachEnv(spec, config)
-    start = xla.jit(VectorEnv(env, N_ARMS, EPISODE_LENGTH, mesh).reset)(jax.random.PRNGKey(0))
+    start = xla.jit(VectorEnv(env, N_ARMS, EPISODE_LENGTH).reset)(jax.random.PRNGKey(0))
     shape = (N_ACTIONS, N_ARMS, env.action_size)
     actions = jnp.asarray(np.random.default_rng(0).uniform(-1.0, 1.0, shape), jnp.float32)
 
     # One step of all arms, compiled
     begin = time.perf_counter()
-    traced = xla.jit(over_arms(env.step, mesh)).lower(start, actions[0])
+    traced = xla.jit(over_arms(env.step)).lower(start, actions[0])
     middle = time.perf_counter()
     step = traced.compile()
     facts: Facts = {"tracing_s": round(middle - begin, 1)}
