@@ -10,6 +10,7 @@ that reads, computes and writes runs at the control rate on any machine.
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import mujoco
@@ -30,7 +31,7 @@ from mjx_softarm.twin.instruments import (
     checked_payload,
     checked_pressures,
 )
-from mjx_softarm.twin.model import build_twin, draw_parts, length_ratio, rotation_matrix
+from mjx_softarm.twin.model import build_twin, draw_parts, rotation_matrix
 from mjx_softarm.twin.pipe import WallForce, contact_force, is_container
 from mjx_softarm.twin.pneumatics import Pneumatics
 
@@ -81,16 +82,16 @@ class Twin(InstrumentedArm):
         self._container = is_container(self._model)
         self._wall_force = WallForce(0.0, 0.0)
         self._base_m = self._parts.base_position_m
-        self._base_rotation = rotation_matrix(self._parts.base_tilt_rad)
+        self._base_rotation = self._parts.base_rotation
         # Start clock, losses and air.
         self._steps = round(1.0 / (spec.control.rate_hz * self._model.opt.timestep))
         self.time_s = 0.0
         mujoco.mj_step1(self._model, self._data)
         self._start_losses(spec)
-        chambers = self._parts.spec.chambers
+        chambers, rest_m = self._parts.spec.chambers, spec.at_chambers(spec.geometry.section_length_m)
         area, slope = np.array([*map(spec.per_chamber, (chambers.area_m2, chambers.area_slope_m))])
         now_m, timestep_s = chamber_lengths(self._data), self._model.opt.timestep
-        self._air = Pneumatics(area, slope, spec.geometry.section_length_m, now_m, timestep_s)
+        self._air = Pneumatics(area, slope, rest_m, now_m, timestep_s)
         # Let the arm come to rest.
         self.attach(payload_kg)
         for _ in range(round(REST_S * spec.control.rate_hz)):
@@ -98,21 +99,28 @@ class Twin(InstrumentedArm):
         self.time_s = 0.0
 
     def _start_losses(self, spec: ArmSpec) -> None:
-        """Start hysteresis and friction; they scale with the arm's lengths and stiffnesses."""
-        # Lengths, forces and torques of the nominal arm over those of the paper's
-        paper, length = ArmSpec.default(), length_ratio(spec)
-        stiffness = np.mean(spec.chambers.stiffness_n_per_m) / np.mean(paper.chambers.stiffness_n_per_m)
-        force = length * stiffness
-        torque = spec.backbone.bending_stiffness_nm_per_rad / paper.backbone.bending_stiffness_nm_per_rad
-        # Joints, then chambers
-        per_link = self._model.nq // len(FRICTION_LIMIT)
-        limit = np.array(FRICTION_LIMIT) * [force, torque, torque]
-        limit = self._build.losses * np.tile(limit, per_link)[:, None]
-        stroke = np.tile(np.array(FRICTION_STROKE) * [length, 1.0, 1.0], per_link)[:, None]
+        """Start hysteresis and friction; they scale with the sections' lengths and stiffnesses."""
+        # Lengths, forces and torques of the nominal arm's sections over those of the paper's (n_sections,)
+        paper, n_sections = ArmSpec.default(), spec.structure.n_sections
+        length = spec.per_section(spec.geometry.section_length_m) / np.mean(paper.geometry.section_length_m)
+        chambers = np.reshape(spec.per_chamber(spec.chambers.stiffness_n_per_m), (n_sections, -1))
+        force = length * (chambers.mean(axis=1) / np.mean(paper.chambers.stiffness_n_per_m))
+        bending = spec.per_section(spec.backbone.bending_stiffness_nm_per_rad)
+        torque = bending / np.mean(paper.backbone.bending_stiffness_nm_per_rad)
+
+        # Joints (nq, 1), link by link
+        links, ones = self._parts.spec.structure.links_per_section, np.ones(n_sections)
+        limit = FRICTION_LIMIT * np.stack([force, torque, torque], axis=-1)
+        stroke = FRICTION_STROKE * np.stack([length, ones, ones], axis=-1)
+        limit, stroke = (np.repeat(x, links, axis=0).reshape(-1, 1) for x in (limit, stroke))
+        limit = self._build.losses * limit
         self._friction = StopOperators(limit / stroke, limit, self._data.qpos)
-        strokes = length * np.array(HYSTERESIS_STROKES_M)
-        scale = force * self._build.losses * self._parts.hysteresis[:, None]
-        limit = scale * np.full(len(strokes), HYSTERESIS_LIMIT_N / len(strokes))
+
+        # Chambers (n_chambers, stops)
+        at_chambers = functools.partial(np.repeat, repeats=spec.structure.chambers_per_section)
+        strokes = at_chambers(length)[:, None] * HYSTERESIS_STROKES_M
+        scale = (at_chambers(force) * self._build.losses * self._parts.hysteresis)[:, None]
+        limit = scale * np.full(len(HYSTERESIS_STROKES_M), HYSTERESIS_LIMIT_N / len(HYSTERESIS_STROKES_M))
         self._hysteresis = StopOperators(limit / strokes, limit, chamber_lengths(self._data))
 
     def write_pressures(self, pressure_kpa: np.ndarray) -> None:
@@ -135,10 +143,11 @@ class Twin(InstrumentedArm):
     def motion_capture(self) -> Capture:
         """Return the tip, and markers on the rings at each third of a section, from the base to the tip."""
         spec, data = self._parts.spec, self._data
-        n_markers = MARKERS_PER_SECTION * spec.structure.n_sections
-        thirds = np.arange(1, n_markers + 1) * spec.structure.links_per_section / MARKERS_PER_SECTION
+        links, n_sections = spec.structure.links_per_section, spec.structure.n_sections
+        thirds = np.arange(1, MARKERS_PER_SECTION * n_sections + 1) * links / MARKERS_PER_SECTION
         bodies = np.round(thirds).astype(int)  # link k is body k + 1, its ring at its lower end
-        down = 0.5 * spec.link_length_m * data.xmat[bodies, 2::3]
+        link_m = np.array(spec.per_section(spec.geometry.section_length_m))[(bodies - 1) // links] / links
+        down = 0.5 * link_m[:, None] * data.xmat[bodies, 2::3]
         marker_m = self._base_m + (data.xpos[bodies] - down) @ self._base_rotation.T
         tip = self._base_rotation @ data.site("tip").xmat.reshape(3, 3)
         tip_m = self._base_m + self._base_rotation @ data.site("tip").xpos

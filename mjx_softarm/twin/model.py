@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
@@ -21,11 +22,12 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
+from mjx_softarm._support.fields import PerChamber
 from mjx_softarm.mechanics.mjcf import build_spec
 from mjx_softarm.mechanics.pipe import CrossPipe
 from mjx_softarm.mechanics.statics import GRAVITY_M_S2
 from mjx_softarm.sensing.sensors import Sensor
-from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
+from mjx_softarm.spec import ArmSpec
 from mjx_softarm.twin.instruments import Build, drawn
 from mjx_softarm.twin.pipe import add_pipe
 
@@ -62,13 +64,13 @@ class Parts(NamedTuple):
 
     spec: ArmSpec  # specification with the drawn chambers, springs and masses
     sensor: Sensor  # sensors with the drawn beta and delta of each spring
-    hole_m: dict[str, np.ndarray]  # "chamber", "spring" -> (n, 2) in the section's frame
+    hole_m: dict[str, np.ndarray]  # "chamber": (n_chambers, 2), "spring": (n_springs, 2), in section frames
     twist_rad: np.ndarray  # (n_sections,)
     backbone: np.ndarray  # (n_sections,) factor of the stiffness
     link_mass: np.ndarray  # (n_links,) factor
-    hysteresis: np.ndarray  # (n,) factor
+    hysteresis: np.ndarray  # (n_chambers,) factor
     base_position_m: np.ndarray  # (3,)
-    base_tilt_rad: np.ndarray  # (3,) rotation vector
+    base_rotation: np.ndarray  # (3, 3)
 
 
 def draw_parts(seed: int, spec: ArmSpec, build: Build) -> Parts:
@@ -81,20 +83,22 @@ def draw_parts(seed: int, spec: ArmSpec, build: Build) -> Parts:
             for name, x in dataclasses.asdict(Tolerances()).items()
         }
     )
-    n, n_sections, off = spec.n_chambers, spec.structure.n_sections, partial(drawn, rng)
-
-    def per_chamber(value, deviation: float) -> tuple[float, ...]:
-        return tuple(np.array(spec.per_chamber(value)) * (1.0 + off(deviation, n)))
+    n, n_springs, n_sections = spec.n_chambers, spec.n_springs, spec.structure.n_sections
+    off = partial(drawn, rng)
 
     # Chambers, springs and masses.
-    chambers, sensor = spec.chambers, spec.sensor
+    chambers, sensor = spec.chambers, spec.spring_sensor
+
+    def scattered(value: PerChamber, deviation: float) -> tuple[float, ...]:
+        return tuple(np.array(spec.per_chamber(value)) * (1.0 + off(deviation, n)))
+
     area_factor = 1.0 + off(std.chamber_area, n)
-    delta_m = np.array(spec.per_chamber(sensor.delta_m)) + off(std.spring_delta_m, n)
+    delta_m = sensor.delta_m + off(std.spring_delta_m, n_springs)
     offset_m = np.array(spec.per_chamber(chambers.length_offset_m)) + off(std.chamber_length_m, n)
     perturbed = spec.replace(
         structure={"links_per_section": build.per_section or LINKS_PER_SECTION},
         chambers={
-            "stiffness_n_per_m": per_chamber(chambers.stiffness_n_per_m, std.chamber_stiffness),
+            "stiffness_n_per_m": scattered(chambers.stiffness_n_per_m, std.chamber_stiffness),
             "area_m2": tuple(area_factor * spec.per_chamber(chambers.area_m2)),
             "area_slope_m": tuple(area_factor * spec.per_chamber(chambers.area_slope_m)),
             "length_offset_m": tuple(offset_m),
@@ -102,34 +106,46 @@ def draw_parts(seed: int, spec: ArmSpec, build: Build) -> Parts:
         mounting={"base_turn_deg": (0.0,) * 3, "base_offset_m": (0.0,) * 3, "section_roll_deg": ()},
         mass={"gripper_kg": spec.mass.gripper_kg * (1.0 + off(std.gripper_mass)), "payload_kg": 0.0},
     )
-    beta = np.array(per_chamber(sensor.beta, std.spring_beta))
-    # Holes in the rings, and the base.
-    ring_m = np.repeat(off(std.ring_offset_m, n_sections, 2), N_CHAMBERS_PER_SECTION, axis=0)
-    angle = np.radians(spec.geometry.first_chamber_deg) + 2 * np.pi * np.arange(n) / N_CHAMBERS_PER_SECTION
-    hole_m = {}
-    radii_m = {"chamber": spec.geometry.chamber_radius_m, "spring": spec.geometry.spring_radius_m}
-    for kind, radius_m in radii_m.items():
-        turned = angle + np.radians(off(std.hole_angle_deg, n))
-        on_circle = np.stack([np.cos(turned), np.sin(turned)], axis=-1)
-        hole_m[kind] = (radius_m + off(std.hole_radius_m, n))[:, None] * on_circle + ring_m
+    beta = sensor.beta * (1.0 + off(std.spring_beta, n_springs))
+    hole_m = _draw_holes(off, spec, std)
     # The base is not turned about z, because the twist of the first section does it.
-    tilt_rad = np.radians(off(std.base_tilt_deg, 3)) * [1.0, 1.0, 0.0]
+    mounting, tilt_rad = spec.mounting, np.radians(off(std.base_tilt_deg, 3)) * [1.0, 1.0, 0.0]
     return Parts(
         spec=perturbed,
-        sensor=dataclasses.replace(spec.spring_sensor, beta=beta, delta_m=delta_m),
+        sensor=dataclasses.replace(sensor, beta=beta, delta_m=delta_m),
         hole_m=hole_m,
         twist_rad=np.radians(off(std.section_twist_deg, n_sections)),
         backbone=1.0 + off(std.backbone_stiffness, n_sections),
         link_mass=1.0 + off(std.link_mass, perturbed.n_links),
         hysteresis=1.0 + off(std.chamber_hysteresis, n),
-        base_position_m=off(std.base_offset_m, 3),
-        base_tilt_rad=tilt_rad,
+        base_position_m=mounting.base_offset_m + off(std.base_offset_m, 3),
+        base_rotation=rotation_matrix(np.radians(mounting.base_turn_deg)) @ rotation_matrix(tilt_rad),
     )
 
 
+def _draw_holes(off: Callable[..., np.ndarray], spec: ArmSpec, std: Tolerances) -> dict[str, np.ndarray]:
+    """Draw the places (n, 2) of the rings' holes for chambers and for springs."""
+    geometry, n_sections = spec.geometry, spec.structure.n_sections
+    ring_m = off(std.ring_offset_m, n_sections, 2)
+    first = np.radians(np.array(spec.per_section(geometry.first_chamber_deg)) + spec.section_roll_deg)
+    hole_m = {}
+    for kind, per_section, radius_m in (
+        ("chamber", spec.structure.chambers_per_section, geometry.chamber_radius_m),
+        ("spring", spec.springs_per_section, geometry.spring_radius_m),
+    ):
+        each, n = partial(np.repeat, repeats=per_section, axis=0), n_sections * per_section
+        angle = each(first) + 2 * np.pi * np.arange(n) / per_section
+        turned = angle + np.radians(off(std.hole_angle_deg, n))
+        on_circle = np.stack([np.cos(turned), np.sin(turned)], axis=-1)
+        radius = each(spec.per_section(radius_m)) + off(std.hole_radius_m, n)
+        hole_m[kind] = radius[:, None] * on_circle + each(ring_m)
+    return hole_m
+
+
 def length_ratio(spec: ArmSpec) -> float:
-    """Return the length of an arm's sections over that of the paper's arm."""
-    return spec.geometry.section_length_m / ArmSpec.default().geometry.section_length_m
+    """Return the mean length of an arm's sections over that of the paper's arm."""
+    paper = ArmSpec.default()
+    return float(np.mean(spec.geometry.section_length_m) / np.mean(paper.geometry.section_length_m))
 
 
 def build_twin(parts: Parts, pipe: CrossPipe | None = None) -> mujoco.MjModel:
@@ -143,7 +159,7 @@ def build_twin(parts: Parts, pipe: CrossPipe | None = None) -> mujoco.MjModel:
     mjspec = build_spec(spec)
     period_s = 1.0 / spec.control.rate_hz
     mjspec.option.timestep = period_s / math.ceil(period_s / MAX_TIMESTEP_S - 1e-9)
-    mjspec.option.gravity = -GRAVITY_M_S2 * rotation_matrix(parts.base_tilt_rad)[2]
+    mjspec.option.gravity = -GRAVITY_M_S2 * parts.base_rotation[2]
     # Masses, stiffnesses and twists of the links.
     for link in range(spec.n_links):
         section, first = divmod(link, per_section)
@@ -157,24 +173,25 @@ def build_twin(parts: Parts, pipe: CrossPipe | None = None) -> mujoco.MjModel:
             half = parts.twist_rad[section] / 2
             body.quat = [np.cos(half), 0.0, 0.0, np.sin(half)]
     # Holes, and actuators for the losses.
+    for kind, hole_m in parts.hole_m.items():
+        _mount(mjspec, kind, hole_m, parts)
     for chamber in range(spec.n_chambers):
-        _mount(mjspec, chamber, parts, per_section)
         mjspec.actuator(f"chamber{chamber}").ctrllimited = False
         loss = mjspec.add_actuator(name=f"loss{chamber}", target=f"chamber{chamber}")
         loss.trntype = mujoco.mjtTrn.mjTRN_TENDON
     if pipe is not None:
-        add_pipe(mjspec, pipe, spec, parts.base_position_m, rotation_matrix(parts.base_tilt_rad))
+        add_pipe(mjspec, pipe, spec, parts.base_position_m, parts.base_rotation)
     return mjspec.compile()
 
 
-def _mount(mjspec: mujoco.MjSpec, chamber: int, parts: Parts, per_section: int) -> None:
-    """Move the holes of a chamber and of its spring; the section's twist does not turn its first plate."""
-    section = chamber // N_CHAMBERS_PER_SECTION
-    cos, sin = np.cos(parts.twist_rad[section]), np.sin(parts.twist_rad[section])
-    for kind, hole_m in parts.hole_m.items():
-        x, y = hole_m[chamber]
+def _mount(mjspec: mujoco.MjSpec, kind: str, hole_m: np.ndarray, parts: Parts) -> None:
+    """Move the holes (n, 2) of chambers or springs; a section's twist does not turn its first plate."""
+    per_section = parts.spec.structure.links_per_section
+    sections = np.repeat(np.arange(len(parts.twist_rad)), len(hole_m) // len(parts.twist_rad))
+    for index, (section, (x, y)) in enumerate(zip(sections, hole_m, strict=True)):
+        cos, sin = np.cos(parts.twist_rad[section]), np.sin(parts.twist_rad[section])
         for k in range(per_section + 1):
-            site = mjspec.site(f"{kind}{chamber}_plate{section * per_section + k}")
+            site = mjspec.site(f"{kind}{index}_plate{section * per_section + k}")
             at = [cos * x - sin * y, sin * x + cos * y] if k == 0 else [x, y]
             site.pos = [*at, site.pos[2]]
 

@@ -13,14 +13,19 @@ class Pneumatics:
     """Pressures of n chambers, stepped in time."""
 
     def __init__(
-        self, area_m2: np.ndarray, slope_m: np.ndarray, rest_m: float, length_m: np.ndarray, timestep_s: float
+        self,
+        area_m2: np.ndarray,
+        slope_m: np.ndarray,
+        rest_m: np.ndarray | float,
+        length_m: np.ndarray,
+        timestep_s: float,
     ):
         """Start at atmospheric pressure, all valves closed on it.
 
         Args:
-            area_m2 (n,) [m^2]: effective areas at the length `rest_m`.
+            area_m2 (n,) [m^2]: effective areas at the lengths `rest_m`.
             slope_m (n,) [m]: d area / d length.
-            rest_m: length of the effective areas.
+            rest_m (n,) [m], or one number: lengths of the effective areas.
             length_m (n,) [m]: lengths at the start.
             timestep_s: duration of a `step`; the dead time is rounded to whole steps.
         """
