@@ -16,6 +16,7 @@ from mjx_softarm.policy.file import ArmModel
 from mjx_softarm.sensing.estimator import N_CHANGES, PoseEstimator, SpringModel
 from mjx_softarm.sensing.load import LoadEstimator
 from mjx_softarm.sensing.s2r import N_POSE_INPUTS, N_POSE_OUTPUTS, S2R
+from tests.arms import FOUR_CHAMBERS, OTHER_ARMS, SIX_CHAMBERS, TAPERED
 
 jax.config.update("jax_num_cpu_devices", 8)  # most tests use one of them
 N_ARMS = 512  # in each call of `reset` and `step`: another number would compile anew
@@ -45,6 +46,30 @@ def strict():
 @pytest.fixture(scope="session")
 def spec():
     return ArmSpec.default()
+
+
+@pytest.fixture(scope="session")
+def four_chamber_arm():
+    """Four chambers a section, a spring beside each."""
+    return FOUR_CHAMBERS
+
+
+@pytest.fixture(scope="session")
+def six_chamber_arm():
+    """Six chambers a section, a spring beside every second one."""
+    return SIX_CHAMBERS
+
+
+@pytest.fixture(scope="session")
+def tapered_arm():
+    """Three chambers a section; sections that differ in length, radii, angle, mass and stiffness."""
+    return TAPERED
+
+
+@pytest.fixture(scope="session", params=OTHER_ARMS)
+def other_arm(request):
+    """Each of these three arms."""
+    return OTHER_ARMS[request.param]
 
 
 @pytest.fixture(scope="session")
@@ -80,10 +105,10 @@ def random_actions(env):
 
 @pytest.fixture(scope="session")
 def make_arm_model():
-    """Number of chambers -> networks of a policy file, with random weights that change little."""
+    """Specification -> networks of a policy file, with random weights that change little."""
 
-    def make(n: int, s2r: bool = False) -> ArmModel:
-        rng = np.random.default_rng(3)
+    def make(spec: ArmSpec, s2r: bool = False) -> ArmModel:
+        rng, n, n_sections = np.random.default_rng(3), spec.n_springs, spec.structure.n_sections
 
         def layers(*sizes):
             pairs = itertools.pairwise(sizes)
@@ -95,15 +120,14 @@ def make_arm_model():
         def row(value, size=n):
             return np.full(size, value, np.float32)
 
-        angle = np.pi / 2 + 2 * np.pi * np.arange(n) / 3
+        angle = np.pi / 2 + 2 * np.pi * np.arange(n).reshape(n_sections, -1) / spec.springs_per_section
         site_m = np.float32(0.067 * np.stack([np.cos(angle), np.sin(angle)], -1))
-        n_changes, kg = N_CHANGES * n // 3, np.float32([0.0, 1.0])
-        networks = layers(2 * n, 4, n_changes), layers(2 * n + 1, 4, n_changes)
+        n_in, n_changes, kg = n + 3 * n_sections, N_CHANGES * n_sections, np.float32([0.0, 1.0])
+        networks = layers(n_in, 4, n_changes), layers(n_in + 1, 4, n_changes)
         estimator = PoseEstimator(*networks, site_m, row(0.18), row(0.05), *kg, row(1e-3, 6))
-        load = LoadEstimator(
-            layers(2 * n, 4, 1), row(0.18), row(0.05), row(-10.0), row(30.0), np.float32(1.0)
-        )
-        springs = SpringModel(layers(n, 5, n), row(-10.0), row(30.0), row(0.18), row(0.05))
+        scaling, kpa = (row(0.18), row(0.05)), (row(-10.0, spec.n_chambers), row(30.0, spec.n_chambers))
+        load = LoadEstimator(layers(n + spec.n_chambers, 4, 1), *scaling, *kpa, np.float32(1.0))
+        springs = SpringModel(layers(spec.n_chambers, 5, n), *kpa, *scaling)
         poses = np.float32([[0, 0, -600, 0, 0, 0], [80, 0, -575, 0, 0, 0], [0, 100, -500, 10, 40, -30]])
         n_in = N_POSE_INPUTS + n
         s2r_network = S2R(

@@ -84,7 +84,7 @@ def nan(readings):
 def make_policy(spec=SPEC):
     """A policy whose estimator and spring model are exact for the linear arm; its actor is not looked at."""
     centre = np.zeros(N, np.float32)
-    angle = np.pi / 2 + 2 * np.pi * np.arange(N) / 3
+    angle = np.pi / 2 + 2 * np.pi * np.arange(N).reshape(3, 3) / 3
     site = SPEC.geometry.spring_radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     network = PoseEstimator(
         layers=((np.zeros((2 * N, 18), np.float32), np.zeros(18, np.float32)),),

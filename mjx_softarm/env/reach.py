@@ -88,7 +88,7 @@ class ReachEnv(Env):
 
     @property
     def observation_size(self) -> int:
-        return len(obs.layouts(self.action_size)[self.config.observation])
+        return len(obs.layouts(self.spec)[self.config.observation])
 
     @property
     def payload_max_kg(self) -> float:

@@ -11,8 +11,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
-
 from mjx_softarm._support.xp import Array, array_namespace
 from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.spec import ArmSpec
@@ -32,7 +30,7 @@ class ActionMap(NamedTuple):
         """Return the map of an arm, in float64."""
         sensor = spec.spring_sensor
         limits_m = spec.springs.length_min_m, spec.springs.length_max_m
-        return cls(sensor, *(sensor.readings(np.full(spec.n_chambers, limit_m)) for limit_m in limits_m))
+        return cls(sensor, *(sensor.readings(spec.at_springs(limit_m)) for limit_m in limits_m))
 
     def readings(self, action: Array) -> Array:
         """Return the readings (..., n) that actions (..., n) ask for; an action beyond [-1, 1] is clipped."""

@@ -42,11 +42,12 @@ class ObsScale(NamedTuple):
         return cls(centre, np.array([length_mm / 3] * 3 + [90.0] * 3, np.float32))
 
 
-def layouts(n_springs: int) -> dict[Observation, tuple[str, ...]]:
+def layouts(spec: ArmSpec) -> dict[Observation, tuple[str, ...]]:
     """Return the names of all entries of each kind of observation."""
-    springs, rates, integrals, actions = (
-        [f"{name}_{k}" for k in range(n_springs)] for name in ("spring", "spring_rate", "integral", "action")
+    springs, rates, actions = (
+        [f"{name}_{k}" for k in range(spec.n_springs)] for name in ("spring", "spring_rate", "action")
     )
+    integrals = [f"integral_{k}" for k in range(spec.n_chambers)]
     motion = *springs, *rates, *(f"velocity_{axis}" for axis in "xyz"), *integrals, *actions
     return {
         "pose": OBS_LAYOUT,
@@ -75,15 +76,15 @@ def observe_motion(
     action: Array,
     spec: ArmSpec,
 ) -> Array:
-    """Return observations (..., 4 n + 3) that only exist in motion, scaled to the order of one.
+    """Return observations (..., 3 n_springs + n_chambers + 3) of motion, scaled to the order of one.
 
     Args:
-        spring_m (..., n) [m]: lengths that are read.
-        last_spring_m (..., n) [m]: lengths that were read `rate_ticks` before.
+        spring_m (..., n_springs) [m]: lengths that are read.
+        last_spring_m (..., n_springs) [m]: lengths that were read `rate_ticks` before.
         tip_mm (..., 3) [mm]: position of the tip.
         last_tip_mm (..., 3) [mm]: position of the tip `rate_ticks` before.
-        integral_kpa (..., n) [kPa]: integral of the sensor-space law.
-        action (..., n): the last action, in [-1, 1].
+        integral_kpa (..., n_chambers) [kPa]: integral of the sensor-space law.
+        action (..., n_springs): the last action, in [-1, 1].
         spec: the arm.
 
     Returns:
@@ -92,12 +93,13 @@ def observe_motion(
     """
     # Ranges that are scaled to [-1, 1], and the time between the two lengths of a rate
     xp = array_namespace(spring_m, tip_mm, action)
-    low, high = spec.springs.length_min_m, spec.springs.length_max_m
+    shortest, longest = (spec.at_springs(x) for x in (spec.springs.length_min_m, spec.springs.length_max_m))
+    low, high, span = (xp.asarray(x, dtype=spring_m.dtype) for x in (shortest, longest, longest - shortest))
     least, greatest = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
     over_s = rate_ticks(spec.control.rate_hz) / spec.control.rate_hz
 
     # Observations in their order
-    lengths = (2.0 * spring_m - low - high) / (high - low)
+    lengths = (2.0 * spring_m - low - high) / span
     rates = (spring_m - last_spring_m) / (over_s * SPRING_M_PER_S)
     velocity = (tip_mm - last_tip_mm) / (over_s * TIP_MM_PER_S)
     integral = (2.0 * integral_kpa - least - greatest) / (greatest - least)

@@ -80,7 +80,8 @@ def shape(spec: ArmSpec, spring_m: np.ndarray, tip: np.ndarray) -> ArmShape:
     n_rings = spec.structure.links_per_section
     steps = [(np.arange(n) + 0.5) / n for n in (FOLDS, COILS)]
     at = np.concatenate([(np.arange(n_rings) + 1.0) / n_rings, *steps])
-    sections = backbone(geometry.spring_radius_m * directions, spring_m, tip, at)
+    site_m = (geometry.spring_radius_m * directions).reshape(spec.structure.n_sections, -1, 2)
+    sections = backbone(site_m, spring_m, tip, at)
     rings, folds, coils = (
         Frame(*(part[:, rows] for part in sections))
         for rows in np.split(np.arange(len(at)), [n_rings, n_rings + FOLDS])

@@ -1,7 +1,7 @@
 """A trained policy as one file: its entries, its writer and its reader. NumPy only.
 
-A sealed npz archive (`mjx_softarm._support.archive`). n is the number of chambers; numbers are float64,
-networks and the workspace float32.
+A sealed npz archive (`mjx_softarm._support.archive`) of an arm with n springs and c chambers; numbers are
+float64, networks and the workspace float32.
 
     schema_version       () int
     spec_json            ()           the arm trained for, as `ArmSpec.to_dict` gives it
@@ -15,7 +15,7 @@ networks and the workspace float32.
     reward.<field>       ()           `RewardConfig`: weights of the error, threshold of a goal
     action.low, .high    (n,)         readings that the actions -1 and 1 stand for, linear in between
     sensor.<field>       () or (n,)   the arm's `Sensor`: readings to lengths, and back
-    gains.<field>        () or (n,)   `Gains`: the sensor-space law and the pressure limits
+    gains.<field>        () or (c,)   `Gains`: the sensor-space law, without `allocation`, and pressure limits
     rate_hz              ()           rate of the sensor-space law
     n_actions            () int       actions towards each goal, as in the evaluation of the run
     action_s             ()           time between two actions in motion; 0: the policy acts on arms at rest
@@ -30,7 +30,8 @@ networks and the workspace float32.
 
 The arm's numbers stand beside `spec_json` because the actor was trained with them: a later version may derive
 others from the same specification. A new entry, or a new field of a class named here (`ArmSpec` included),
-makes a new schema: raise `SCHEMA_VERSION`. A file of another schema is refused: its run is exported again.
+makes a new schema: raise `SCHEMA_VERSION`. Files of the `READABLE` schemas are read; a file of another one is
+refused: its run is exported again.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ import numpy as np
 from mjx_softarm._support import archive
 from mjx_softarm._support.archive import Entries, SealedFileError, entries_of
 from mjx_softarm._support.mlp import Layer
-from mjx_softarm.control import TOLERANCE_M, Gains
+from mjx_softarm.control import TOLERANCE_M, Gains, allocation
 from mjx_softarm.mdp.actions import N_ACTIONS, ActionMap
 from mjx_softarm.mdp.observation import Observation, ObsScale, layouts
 from mjx_softarm.mdp.rewards import RewardConfig
@@ -56,9 +57,14 @@ from mjx_softarm.sensing.s2r import S2R, take_s2r
 from mjx_softarm.sensing.sensors import Sensor, SensorFault
 from mjx_softarm.spec import ArmSpec, Mounting, SpecError
 
-SCHEMA_VERSION = 7
+SCHEMA_VERSION = 8
+READABLE = (
+    7,
+    8,
+)  # in 7, `estimator.spring_site_m` is (n, 2), and each section has as many chambers as springs
 
 KIND = "policy"
+_LAW = Gains._fields[:-1]  # entries of the law; its allocation follows from the specification
 SHIPPED = Path(__file__).parent / "shipped/paper.npz"  # for the paper's arm; its card is beside it
 
 
@@ -87,7 +93,7 @@ class Policy:
     @property
     def obs_layout(self) -> tuple[str, ...]:
         """Names of the observation's entries."""
-        return layouts(self.spec.n_chambers)[self.observation]
+        return layouts(self.spec)[self.observation]
 
     @property
     def calibrated(self) -> bool:
@@ -115,7 +121,21 @@ class ArmModel(NamedTuple):
 
 def action_layout(spec: ArmSpec) -> tuple[str, ...]:
     """Name the action's entries: the reading of each spring, scaled from its two limits to [-1, 1]."""
-    return tuple(f"{spec.sensor.reading_name}{k}" for k in range(spec.n_chambers))
+    return tuple(f"{spec.sensor.reading_name}{k}" for k in range(spec.n_springs))
+
+
+def take_networks(entries: Entries, spec: ArmSpec) -> tuple[PoseEstimator, LoadEstimator, SpringModel]:
+    """Take the networks `estimator`, `load_estimator` and `spring_model` of an arm from a file's entries.
+
+    Raises:
+        SealedFileError: an entry is missing, or of the wrong type, shape or range.
+    """
+    counts = spec.n_chambers, spec.n_springs
+    return (
+        take_estimator(entries, "estimator", spec.structure.n_sections, spec.n_springs),
+        take_load_estimator(entries, "load_estimator", *counts),
+        take_spring_model(entries, "spring_model", *counts),
+    )
 
 
 def policy_from_actor(
@@ -144,7 +164,7 @@ def policy_from_actor(
             array has the wrong shape or is not finite.
     """
     policy = Policy(
-        layers=_layers_from_flax(actor_params, spec.n_chambers),
+        layers=_layers_from_flax(actor_params, spec.n_springs),
         obs_scale=ObsScale.from_spec(spec),
         reward=reward,
         actions=ActionMap.from_spec(spec),
@@ -161,7 +181,7 @@ def policy_from_actor(
 
 def check_actor(actor_params: Mapping[str, Any], spec: ArmSpec) -> None:
     """Raise ValueError where the parameters, as of `policy_from_actor`, are not those of an actor."""
-    _layers_from_flax(actor_params, spec.n_chambers)
+    _layers_from_flax(actor_params, spec.n_springs)
 
 
 def _layers_from_flax(actor_params: Mapping[str, Any], n_actions: int) -> tuple[Layer, ...]:
@@ -216,7 +236,8 @@ def file_entries(policy: Policy) -> dict[str, np.ndarray]:
     }
     entries |= archive.layer_entries("actor", policy.layers)
     entries |= {f"action.{name}": getattr(policy.actions, name) for name in ("low", "high")}
-    for name in ("obs_scale", "reward", "sensor", "gains"):
+    entries |= {f"gains.{name}": np.asarray(getattr(policy.gains, name), np.float64) for name in _LAW}
+    for name in ("obs_scale", "reward", "sensor"):
         numbers = entries_of(name, getattr(policy, name))
         entries |= {item: value.astype(np.float64) for item, value in numbers.items()}
     for name in ("estimator", "load_estimator", "spring_model", "s2r"):
@@ -229,21 +250,22 @@ def _unpack(arrays: Mapping[str, np.ndarray], source: str) -> Policy:
     # Refuse other schemas first, since their entries may differ.
     entries = Entries(arrays, source)
     version = entries.take("schema_version", np.integer, ())
-    if version != SCHEMA_VERSION:
+    if version not in READABLE:
+        readable = " or ".join(map(str, READABLE))
         entries.fail(
-            "schema_version",
-            f"got {version}, expected {SCHEMA_VERSION}: export the run again, or train it anew",
+            "schema_version", f"got {version}, expected {readable}: export the run again, or train it anew"
         )
     try:
         spec = ArmSpec.from_dict(entries.table("spec_json"), f"{source}: spec_json")
     except SpecError as error:
         raise SealedFileError(str(error)) from error
     # Take every entry with its type and shape.
-    n = spec.n_chambers
+    n = spec.n_springs
     observation = entries.take("observation", np.str_, ())
     obs_layout = entries.take("obs_layout", np.str_, (None,))
     names = entries.take("action_layout", np.str_, (n,))
     s2r_kind = entries.take("s2r_kind", np.str_, ())
+    estimator, load_estimator, spring_model = take_networks(entries, spec)
     policy = Policy(
         layers=entries.layers("actor", len(obs_layout), n),
         obs_scale=entries.group("obs_scale", ObsScale, (6,)),
@@ -252,12 +274,15 @@ def _unpack(arrays: Mapping[str, np.ndarray], source: str) -> Policy:
             entries.group("sensor", type(spec.sensor), (), (n,)),
             *(entries.take(f"action.{name}", np.float64, (n,)) for name in ("low", "high")),
         ),
-        gains=entries.group("gains", Gains, (), (n,)),
+        gains=Gains(
+            *(entries.take(f"gains.{name}", np.float64, (), (spec.n_chambers,)) for name in _LAW),
+            allocation=allocation(spec),
+        ),
         rate_hz=entries.take("rate_hz", np.float64, ()),
         workspace=entries.take("workspace", np.float32, (None, 6)),
-        estimator=take_estimator(entries, "estimator", n),
-        load_estimator=take_load_estimator(entries, "load_estimator", n),
-        spring_model=take_spring_model(entries, "spring_model", n),
+        estimator=estimator,
+        load_estimator=load_estimator,
+        spring_model=spring_model,
         s2r=take_s2r(entries, "s2r", n) if s2r_kind == "mlp" else None,
         spec=spec,
         provenance=entries.table("provenance_json"),
@@ -267,12 +292,12 @@ def _unpack(arrays: Mapping[str, np.ndarray], source: str) -> Policy:
         action_s=entries.take("action_s", np.float64, ()),
     )
     # Check the numbers.
-    layout = layouts(n).get(observation, ())
+    layout = layouts(spec).get(observation, ())
     limits = policy.sensor.lengths(np.stack(policy.actions[1:]))  # (2, n)
     readable = (limits.fault == SensorFault.OK.value) & (limits.length_m[0] < limits.length_m[1])
     low_kpa, high_kpa = policy.gains.pressure_min_kpa, policy.gains.pressure_max_kpa
     for name, holds, expected in (
-        ("observation", bool(layout), " or ".join(layouts(n))),
+        ("observation", bool(layout), " or ".join(layouts(spec))),
         ("obs_layout", np.array_equal(obs_layout, layout), list(layout)),
         ("action_layout", names == np.array(action_layout(spec)), list(action_layout(spec))),
         ("obs_scale.scale", policy.obs_scale.scale > 0.0, "numbers > 0"),

@@ -1,9 +1,9 @@
 """Estimators of an arm at rest: tip pose from spring lengths, spring lengths from pressures. NumPy and JAX.
 
-No sensor of the arm sees the tip. Three springs give a section's length and bend, a section of constant
-curvature has a closed form, and the sections are in series. Real sections do not bend evenly, since the
-weight below pulls at them. So a small network, distilled from the simulator, corrects each section's end. Its
-inputs are the springs and the direction of gravity at each section's end. A second network also has the
+No sensor of the arm sees the tip. Three or more springs give a section's length and bend, a section of
+constant curvature has a closed form, and the sections are in series. Real sections do not bend evenly, since
+the weight below pulls at them. So a small network, distilled from the simulator, corrects each section's end.
+Its inputs are the springs and the direction of gravity at each section's end. A second network also has the
 payload as input (`mjx_softarm.sensing.load`); its output is multiplied by the payload.
 
 In the other direction, `expected_springs` predicts the spring lengths at given pressures without a payload.
@@ -26,7 +26,6 @@ from mjx_softarm.sensing.pose import (
     rotation_from_quaternion,
     share_of_turn,
 )
-from mjx_softarm.sensing.sensors import N_CHAMBERS_PER_SECTION
 
 N_CHANGES = 6  # of a section's end: position [m], Gibbs vector (axis times the tangent of half the angle)
 _SMALL_BEND = 1e-8  # square of a bend [rad^2] below which a section counts as straight
@@ -37,7 +36,7 @@ class PoseEstimator(NamedTuple):
 
     layers: tuple[Layer, ...]  # normalised springs (n,) and downs (n,) -> changes (n_sections * N_CHANGES,)
     load_layers: tuple[Layer, ...]  # these inputs and the normalised payload (1,) -> changes per payload
-    spring_site_m: Array  # (n, 2) holes of the springs in their rings, x and y
+    spring_site_m: Array  # (n_sections, s, 2) holes of the s springs of each section in its rings, x and y
     spring_centre_m: Array  # (n,) lengths that are normalised to 0
     spring_scale_m: Array  # (n,) difference of length that is normalised to 1
     load_centre_kg: Array  # () payload that is normalised to 0
@@ -48,11 +47,11 @@ class PoseEstimator(NamedTuple):
 class SpringModel(NamedTuple):
     """Network from pressures to spring lengths at rest. All float32."""
 
-    layers: tuple[Layer, ...]  # normalised pressures (n,) -> normalised springs (n,)
-    pressure_centre_kpa: Array  # (n,)
-    pressure_scale_kpa: Array  # (n,)
-    spring_centre_m: Array  # (n,)
-    spring_scale_m: Array  # (n,)
+    layers: tuple[Layer, ...]  # normalised pressures (n_chambers,) -> normalised springs (n_springs,)
+    pressure_centre_kpa: Array  # (n_chambers,)
+    pressure_scale_kpa: Array  # (n_chambers,)
+    spring_centre_m: Array  # (n_springs,)
+    spring_scale_m: Array  # (n_springs,)
 
 
 class Frame(NamedTuple):
@@ -81,7 +80,7 @@ def estimate_frame(estimator: PoseEstimator, spring_m: Array, load_kg: Array | f
     # Changes of each section's end; position and Gibbs vector are continuous where yaw and roll are not
     changes = mlp(estimator.layers, shape)
     changes = changes + load * mlp(estimator.load_layers, xp.concat([shape, load], axis=-1))
-    changes = changes.reshape(*changes.shape[:-1], -1, N_CHANGES) * estimator.change_scale  # (..., n / 3, 6)
+    changes = changes.reshape(*changes.shape[:-1], -1, N_CHANGES) * estimator.change_scale
     quaternion = xp.concat([xp.ones_like(changes[..., :1]), changes[..., 3:]], axis=-1)
     turn = rotation_from_quaternion(quaternion / xp.sqrt(xp.sum(quaternion**2, axis=-1))[..., None])
     return chain(Frame(even.position_m + changes[..., :3], turn @ even.rotation))
@@ -91,8 +90,8 @@ def constant_curvature(spring_site_m: Array, spring_m: Array) -> Frame:
     """Return each section's end in the frame of its start, for sections of constant curvature.
 
     Args:
-        spring_site_m (n, 2) [m]: holes of the springs, three to a section, evenly on a circle.
-        spring_m (..., n) [m]: lengths.
+        spring_site_m (n_sections, s, 2) [m]: holes of the springs, three or more a section at equal angles.
+        spring_m (..., n_sections * s) [m]: lengths.
 
     Returns:
         Positions (..., n_sections, 3) and rotations (..., n_sections, 3, 3).
@@ -100,12 +99,12 @@ def constant_curvature(spring_site_m: Array, spring_m: Array) -> Frame:
     Source: Webster, Jones, "Design and Kinematic Modeling of Constant Curvature Continuum Robots", 2010.
     """
     xp = array_namespace(spring_m, spring_site_m)
-    # Length and bend of each section; the arm turns towards its shorter springs by |bend|
-    site = spring_site_m.reshape(-1, N_CHAMBERS_PER_SECTION, 2)
-    spring = spring_m.reshape(*spring_m.shape[:-1], -1, N_CHAMBERS_PER_SECTION)
+    # Length and bend by least squares over springs at equal angles
+    # (a section turns towards its shorter springs by |bend|)
+    spring = spring_m.reshape(*spring_m.shape[:-1], *spring_site_m.shape[:2])
     length = xp.mean(spring, axis=-1)[..., None]  # (..., n_sections, 1)
-    moment = xp.sum((spring - length)[..., None] * site, axis=-2)
-    bend = -2.0 * moment / xp.sum(site**2, axis=(-2, -1))[:, None]
+    moment = xp.sum((spring - length)[..., None] * spring_site_m, axis=-2)
+    bend = -2.0 * moment / xp.sum(spring_site_m**2, axis=(-2, -1))[:, None]
     square = xp.sum(bend**2, axis=-1)[..., None]
     angle = xp.sqrt(xp.where(square < _SMALL_BEND, _SMALL_BEND, square))
 
@@ -148,8 +147,8 @@ def backbone(spring_site_m: np.ndarray, spring_m: np.ndarray, tip: np.ndarray, a
     spread over the arm: it grows evenly from the base.
 
     Args:
-        spring_site_m (n, 2) [m]: holes of the springs.
-        spring_m (n,) [m]: lengths.
+        spring_site_m (n_sections, s, 2) [m]: holes of the springs.
+        spring_m (n_sections * s,) [m]: lengths.
         tip (6,) [mm, deg]: pose; with NaN the arm ends where the springs bring it.
         at (k,): places as shares of each section's length; one of them is 1.
 
@@ -177,33 +176,38 @@ def backbone(spring_site_m: np.ndarray, spring_m: np.ndarray, tip: np.ndarray, a
 
 
 def expected_springs(model: SpringModel, pressure_kpa: Array) -> Array:
-    """Return spring lengths (..., n) [m] at rest at pressures (..., n) [kPa], without a payload."""
+    """Return spring lengths (..., n_springs) [m] at rest at pressures (..., n_chambers) [kPa], unloaded."""
     xp = array_namespace(pressure_kpa, model.pressure_centre_kpa)
     pressure_kpa = xp.asarray(pressure_kpa, dtype=model.pressure_centre_kpa.dtype)
     normalised = (pressure_kpa - model.pressure_centre_kpa) / model.pressure_scale_kpa
     return model.spring_centre_m + model.spring_scale_m * mlp(model.layers, normalised)
 
 
-def take_estimator(entries: Entries, name: str, n_springs: int) -> PoseEstimator:
+def take_estimator(entries: Entries, name: str, n_sections: int, n_springs: int) -> PoseEstimator:
     """Take the estimator `name` from the entries of a file, checked.
 
     Raises:
         SealedFileError: an entry is missing, or of the wrong type, shape or range.
     """
-    n_sections = n_springs // N_CHAMBERS_PER_SECTION
     shapes: dict = dict.fromkeys(("spring_centre_m", "spring_scale_m"), (n_springs,))
-    shapes |= {"spring_site_m": (n_springs, 2), "change_scale": (N_CHANGES,)}
-    shapes |= dict.fromkeys(("load_centre_kg", "load_scale_kg"), ())
+    shapes |= {"change_scale": (N_CHANGES,)} | dict.fromkeys(("load_centre_kg", "load_scale_kg"), ())
     n_in, n_out = n_springs + 3 * n_sections, N_CHANGES * n_sections
-    load_layers = entries.layers(f"{name}.load", n_in + 1, n_out)
-    return entries.network(name, partial(PoseEstimator, load_layers=load_layers), shapes, n_in, n_out)
+    own = {
+        # Older files have one axis for the springs of all sections.
+        "spring_site_m": entries.take(
+            f"{name}.spring_site_m", np.float32, (n_sections, n_springs // n_sections, 2), (n_springs, 2)
+        ).reshape(n_sections, -1, 2),
+        "load_layers": entries.layers(f"{name}.load", n_in + 1, n_out),
+    }
+    return entries.network(name, partial(PoseEstimator, **own), shapes, n_in, n_out)
 
 
-def take_spring_model(entries: Entries, name: str, n_springs: int) -> SpringModel:
+def take_spring_model(entries: Entries, name: str, n_chambers: int, n_springs: int) -> SpringModel:
     """Take the spring model `name` from the entries of a file, checked.
 
     Raises:
         SealedFileError: an entry is missing, or of the wrong type, shape or range.
     """
-    shapes = {item: (n_springs,) for item in SpringModel._fields if item != "layers"}
-    return entries.network(name, SpringModel, shapes, n_springs, n_springs)
+    shapes = dict.fromkeys(("pressure_centre_kpa", "pressure_scale_kpa"), (n_chambers,))
+    shapes |= dict.fromkeys(("spring_centre_m", "spring_scale_m"), (n_springs,))
+    return entries.network(name, SpringModel, shapes, n_chambers, n_springs)

@@ -24,11 +24,11 @@ LOWEST, HIGHEST = -0.5, 1.5
 class LoadEstimator(NamedTuple):
     """Network from springs and pressures at rest to the payload. All float32."""
 
-    layers: tuple[Layer, ...]  # normalised springs (n,) and pressures (n,) -> payload (1,), normalised
-    spring_centre_m: Array  # (n,)
-    spring_scale_m: Array  # (n,)
-    pressure_centre_kpa: Array  # (n,)
-    pressure_scale_kpa: Array  # (n,)
+    layers: tuple[Layer, ...]  # normalised springs and pressures -> normalised payload (1,)
+    spring_centre_m: Array  # (n_springs,)
+    spring_scale_m: Array  # (n_springs,)
+    pressure_centre_kpa: Array  # (n_chambers,)
+    pressure_scale_kpa: Array  # (n_chambers,)
     load_scale_kg: Array  # () largest payload of the arm, normalised to 1
 
 
@@ -47,9 +47,12 @@ class Load(NamedTuple):
 
 
 def estimate_load(estimator: LoadEstimator, spring_m: Array, pressure_kpa: Array) -> Array:
-    """Return the payload (...) [kg] of an arm at rest with springs (..., n) [m] at pressures (..., n) [kPa].
+    """Return the payload (...) [kg] of an arm at rest; it may lie below 0 or above `load_scale_kg`.
 
-    The estimate may lie below 0 or above `load_scale_kg`; the caller judges it.
+    Args:
+        estimator: the network.
+        spring_m (..., n_springs) [m]: spring lengths.
+        pressure_kpa (..., n_chambers) [kPa]: pressures of the chambers.
     """
     xp = array_namespace(spring_m, pressure_kpa, estimator.load_scale_kg)
     dtype = estimator.spring_scale_m.dtype
@@ -70,12 +73,13 @@ def averaged(load: Load, estimate_kg: float, largest_kg: float) -> Load:
     return Load(load.kg + (estimate_kg - load.kg) / n, n)
 
 
-def take_load_estimator(entries: Entries, name: str, n_springs: int) -> LoadEstimator:
+def take_load_estimator(entries: Entries, name: str, n_chambers: int, n_springs: int) -> LoadEstimator:
     """Take the estimator `name` from the entries of a file, checked.
 
     Raises:
         SealedFileError: an entry is missing, or of the wrong type, shape or range.
     """
-    shapes: dict = {item: (n_springs,) for item in LoadEstimator._fields if item != "layers"}
+    shapes: dict = dict.fromkeys(("spring_centre_m", "spring_scale_m"), (n_springs,))
+    shapes |= dict.fromkeys(("pressure_centre_kpa", "pressure_scale_kpa"), (n_chambers,))
     shapes["load_scale_kg"] = ()
-    return entries.network(name, LoadEstimator, shapes, 2 * n_springs, 1)
+    return entries.network(name, LoadEstimator, shapes, n_springs + n_chambers, 1)

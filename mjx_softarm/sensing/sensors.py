@@ -51,7 +51,7 @@ class Reading(NamedTuple):
 class Sensor:
     """One kind of length sensor, calibrated for each of n springs.
 
-    In a specification, beta and delta are one number or one per chamber; `per_spring` spreads them to arrays
+    In a specification, beta and delta are one number or one per spring; `per_spring` spreads them to arrays
     (n,). NumPy and JAX take it alike; `mjx_softarm.env` registers it as a pytree whose leaves are the fields.
     """
 
@@ -96,8 +96,8 @@ class Sensor:
         """Return the calibrated spring lengths of readings.
 
         A reading that gives no length is reported in `fault`: its length is `fallback_m`, and no gradient
-        flows through it. A control loop passes the last good lengths, so that one lost reading holds its
-        chamber for a tick. The default of 0 m is a length that no spring has; use it where `fault` is read.
+        flows through it. A control loop passes the last good lengths, so that one lost reading holds the
+        arm for a tick. The default of 0 m is a length that no spring has; use it where `fault` is read.
 
         Args:
             readings (..., n) [unit]: any numbers, NaN and infinity among them.

@@ -68,7 +68,7 @@ def test_acts_at_once_and_then_at_rest():
     assert np.diff([tick for tick, _ in asked]).min() >= CONTROLLER.window or len(GOALS) > 1
 
 
-_WIDE = (np.zeros((len(layouts(9)["motion"]), 9), np.float32), np.zeros(9, np.float32))
+_WIDE = (np.zeros((len(layouts(SPEC)["motion"]), 9), np.float32), np.zeros(9, np.float32))
 OF_MOTION = dataclasses.replace(POLICY, layers=(_WIDE,), observation="motion", action_s=0.3)
 
 

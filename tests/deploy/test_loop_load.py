@@ -11,7 +11,7 @@ from mjx_softarm.deploy.safety import Fault
 from mjx_softarm.deploy.session import trace
 from mjx_softarm.mdp.observation import layouts
 from mjx_softarm.sensing.estimator import estimate
-from tests.linear_arm import GAIN_M_PER_KPA, POLICY, REST_M, LinearArm, N, asking, go, read_m
+from tests.linear_arm import GAIN_M_PER_KPA, POLICY, REST_M, SPEC, LinearArm, N, asking, go, read_m
 
 STRETCH_M_PER_KG = 0.004  # of each spring, at held pressures
 SINK_M_PER_KG = 0.005  # of each section's end, at held springs
@@ -82,7 +82,7 @@ def test_payload_is_estimated_at_rest_and_believed_in_the_pose(payload_kg):
     assert run.counts() == {}
 
 
-_WIDE = (np.zeros((len(layouts(N)["payload"]), N), np.float32), np.zeros(N, np.float32))
+_WIDE = (np.zeros((len(layouts(SPEC)["payload"]), N), np.float32), np.zeros(N, np.float32))
 CARRYING = dataclasses.replace(LOADED, layers=(_WIDE,), observation="payload")
 
 

@@ -59,13 +59,13 @@ def draw_wire_policy():
 
 def moving_policy(spec=SPEC):
     """A busy policy that acts each 0.3 s on what it sees of the motion."""
-    actor = layers(len(layouts(N)["motion"]), 12, N, scale=0.3)
+    actor = layers(len(layouts(SPEC)["motion"]), 12, N, scale=0.3)
     return dataclasses.replace(busy_policy(spec), layers=actor, observation="motion", action_s=0.3)
 
 
 def carrying_policy(spec=SPEC):
     """A busy policy that observes the payload."""
-    actor = layers(len(layouts(N)["payload"]), 12, N, scale=0.5)
+    actor = layers(len(layouts(SPEC)["payload"]), 12, N, scale=0.5)
     return dataclasses.replace(busy_policy(spec), layers=actor, observation="payload")
 
 

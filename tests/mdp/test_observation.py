@@ -22,12 +22,24 @@ def test_a_moving_arm_by_hand(to_library):
     integral = np.r_[LEAST_KPA, GREATEST_KPA, np.full(7, 0.5 * (LEAST_KPA + GREATEST_KPA))]
     given = (to_library(np.float32(x)) for x in (spring, last, tip, last_tip, integral, action))
     observed = np.asarray(observe_motion(*given, SPEC))
-    assert observed.shape == (len(layouts(9)["motion"]) - OBS_SIZE,)
+    assert observed.shape == (len(layouts(SPEC)["motion"]) - OBS_SIZE,)
     np.testing.assert_allclose(observed[:9], [-1.0, 1.0, *np.zeros(7)], atol=1e-5)
     np.testing.assert_allclose(observed[9:18], [0.2, *np.zeros(8)], atol=1e-4)  # of 100 mm/s
     np.testing.assert_allclose(observed[18:21], [0.0, 0.2, 0.0], atol=1e-4)  # of 300 mm/s
     np.testing.assert_allclose(observed[21:30], [-1.0, 1.0, *np.zeros(7)], atol=1e-6)
     np.testing.assert_array_equal(observed[30:], np.float32(action))
+
+
+def test_a_moving_arm_of_other_sections(other_arm):
+    """Lengths are scaled by their section's limits; springs and pressures may differ in number."""
+    n_springs, n_chambers = other_arm.n_springs, other_arm.n_chambers
+    longest = np.float32(other_arm.at_springs(other_arm.springs.length_max_m))
+    nothing, zero = np.zeros(3, np.float32), np.zeros(n_springs, np.float32)
+    integral = np.full(n_chambers, GREATEST_KPA, np.float32)
+    observed = observe_motion(longest, longest, nothing, nothing, integral, zero, other_arm)
+    expected = np.concatenate([zero + 1, zero, nothing, np.ones(n_chambers), zero])
+    np.testing.assert_allclose(observed, expected, atol=1e-5)
+    assert len(layouts(other_arm)["motion"]) == OBS_SIZE + len(expected)
 
 
 @pytest.mark.parametrize("to_library", [float, jnp.asarray])
@@ -38,4 +50,4 @@ def test_a_payload_is_observed_as_a_share_of_the_arm_s_largest(to_library):
     half = SPEC.replace(mass={"arm_kg": SPEC.mass.arm_kg / 2, "gripper_kg": SPEC.mass.gripper_kg / 2})
     np.testing.assert_allclose(observe_payload(to_library(0.35), half), [0.7], rtol=1e-6)
     assert observe_payload(np.zeros(3), SPEC).shape == (3, 1)
-    assert layouts(9)["payload"][OBS_SIZE:] == ("payload_kg",)
+    assert layouts(SPEC)["payload"][OBS_SIZE:] == ("payload_kg",)

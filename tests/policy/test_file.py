@@ -14,7 +14,7 @@ from hypothesis.extra import numpy as npst
 
 from mjx_softarm import ArmSpec
 from mjx_softarm._support.archive import SealedFileError, sealed
-from mjx_softarm.control import Gains
+from mjx_softarm.control import Gains, allocation
 from mjx_softarm.mdp.observation import OBS_LAYOUT, layouts
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.policy import file as export
@@ -22,8 +22,9 @@ from mjx_softarm.policy.file import load_policy, policy_from_actor, save_policy
 from tests.properties import few
 
 PROVENANCE = {"commit": "0123abc", "created": "2025-01-31", "packages": {"numpy": "2.0"}, "seed": 7}
-# Digest of the names that schema 7 stores and of the fields of its specification.
-SCHEMA_7 = "7ac87ea4"
+# Digest of the names that schema 8 stores and of the fields of its specification.
+SCHEMA_8 = "96a1efb0"
+TWO_SECTIONS = ArmSpec.default().replace(structure={"n_sections": 2})
 
 
 def make_params(hidden=(7, 5), n_actions=9, n_obs=18):
@@ -43,7 +44,7 @@ def make_policy(make_arm_model):
 
     def make(**changes):
         spec = ArmSpec.default().replace(sensor={"beta": tuple(np.linspace(0.9, 0.98, 9))})
-        model = make_arm_model(9, s2r=True)
+        model = make_arm_model(spec, s2r=True)
         policy = policy_from_actor(make_params(), spec, RewardConfig(threshold=0.025), model, PROVENANCE)
         return dataclasses.replace(policy, **changes)
 
@@ -104,24 +105,49 @@ def test_parts_are_those_of_the_arm(file):
 
 def test_file_is_plain_npz_with_named_layouts(file):
     arrays = arrays_of(file)
-    assert arrays["schema_version"] == 7 and arrays["s2r_kind"] == "mlp"
+    assert arrays["schema_version"] == 8 and arrays["s2r_kind"] == "mlp"
     parts, axes = ("pose", "goal", "error"), ("x_mm", "y_mm", "z_mm", "yaw_deg", "pitch_deg", "roll_deg")
     assert arrays["obs_layout"].tolist() == [f"{part}_{axis}" for part in parts for axis in axes]
     assert arrays["action_layout"].tolist() == [f"frequency{k}" for k in range(9)]
 
 
+def test_file_of_schema_7_is_read(file):
+    """The springs of all sections had one axis."""
+    policy = load_policy(file)
+    site_m = arrays_of(file)["estimator.spring_site_m"]
+    reseal(file, schema_version=np.asarray(7), **{"estimator.spring_site_m": site_m.reshape(9, 2)})
+    assert_same(load_policy(file), policy)
+
+
 def test_actor_with_one_layer_and_arm_with_two_sections(tmp_path, make_arm_model):
-    spec = ArmSpec.default().replace(structure={"n_sections": 2})
-    policy = policy_from_actor(make_params((), 6), spec, RewardConfig(), make_arm_model(6), {})
+    policy = policy_from_actor(
+        make_params((), 6), TWO_SECTIONS, RewardConfig(), make_arm_model(TWO_SECTIONS), {}
+    )
     save_policy(tmp_path / "policy.npz", policy)
     assert_same(load_policy(tmp_path / "policy.npz"), policy)
 
 
+def test_other_arms_are_kept(tmp_path, make_arm_model, other_arm):
+    """Actions, readings and lengths are per spring, pressures and the law per chamber."""
+    n_obs, path = len(layouts(other_arm)["motion"]), tmp_path / "policy.npz"
+    params, model = make_params((), other_arm.n_springs, n_obs), make_arm_model(other_arm, s2r=True)
+    policy = policy_from_actor(params, other_arm, RewardConfig(), model, {}, observation="motion")
+    save_policy(path, policy)
+    again = load_policy(path)
+    assert_same(again, policy)
+    assert again.spec == other_arm and len(again.actions.low) == other_arm.n_springs
+    expected = allocation(other_arm)
+    assert (again.gains.allocation is None) == (expected is None)
+    for one, other in zip(again.gains.allocation or (), expected or (), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
 @pytest.mark.parametrize("observation", ["payload", "motion"])
 def test_what_a_policy_observes_is_kept(tmp_path, make_arm_model, observation):
-    names = layouts(9)[observation]
+    names = layouts(ArmSpec.default())[observation]
     params, path = make_params(n_obs=len(names)), tmp_path / "policy.npz"
-    spec, model = ArmSpec.default(), make_arm_model(9)
+    spec = ArmSpec.default()
+    model = make_arm_model(spec)
     save_policy(path, policy_from_actor(params, spec, RewardConfig(), model, {}, observation=observation))
     assert load_policy(path).observation == observation
     assert tuple(arrays_of(path)["obs_layout"]) == load_policy(path).obs_layout == names
@@ -129,21 +155,23 @@ def test_what_a_policy_observes_is_kept(tmp_path, make_arm_model, observation):
 
 @pytest.mark.parametrize("names", [["hidden_0"], ["hidden_1", "head"], ["hidden_0", "head", "norm_0"], []])
 def test_parameters_of_another_network_are_refused(names, make_arm_model):
-    dense, model = make_params()["params"]["hidden_0"], make_arm_model(9)
+    dense, model = make_params()["params"]["hidden_0"], make_arm_model(ArmSpec.default())
     params = {"params": dict.fromkeys(names, dense)}
     with pytest.raises(ValueError, match=r"expected hidden_0, hidden_1, \.\.\. and head"):
         policy_from_actor(params, ArmSpec.default(), RewardConfig(), model, {})
 
 
 def test_networks_of_another_arm_are_refused(make_arm_model):
+    spec = ArmSpec.default()
+    model, another = make_arm_model(spec, s2r=True), make_arm_model(TWO_SECTIONS, s2r=True)
     for part in ("estimator", "load_estimator", "spring_model", "s2r"):
-        model = make_arm_model(9, s2r=True)._replace(**{part: getattr(make_arm_model(6, s2r=True), part)})
+        mixed = model._replace(**{part: getattr(another, part)})
         with pytest.raises(SealedFileError, match=rf"policy: {part}\.[\w.]+: got float32 \("):
-            policy_from_actor(make_params(), ArmSpec.default(), RewardConfig(), model, {})
+            policy_from_actor(make_params(), spec, RewardConfig(), mixed, {})
     with pytest.raises(SealedFileError, match=r"actor.2.bias: got float32 \(6,\), expected float32 \(9,\)"):
-        policy_from_actor(make_params(n_actions=3), ArmSpec.default(), RewardConfig(), make_arm_model(9), {})
+        policy_from_actor(make_params(n_actions=3), spec, RewardConfig(), model, {})
     with pytest.raises(SealedFileError, match=r"actor.0.weight: got float32 \(20, 7\), expected float32 "):
-        policy_from_actor(make_params(n_obs=20), ArmSpec.default(), RewardConfig(), make_arm_model(9), {})
+        policy_from_actor(make_params(n_obs=20), spec, RewardConfig(), model, {})
 
 
 @settings(few, max_examples=150)
@@ -176,7 +204,7 @@ def test_files_that_are_no_policy(tmp_path):
 
 def test_another_schema_is_named_before_anything_else(file):
     reseal(file, drop=["gains.kp_kpa_per_m", "observation"], schema_version=np.array(6))
-    expected = "expected 7: export the run again, or train it anew"
+    expected = "expected 7 or 8: export the run again, or train it anew"
     assert refusal(file) == f"schema_version: got 6, {expected}"
 
 
@@ -211,7 +239,7 @@ def test_every_entry_is_required_and_its_type_shape_and_numbers_are_checked(file
         ({"rate_hz": np.array(0.0)}, "rate_hz: got 0.0, expected a number > 0"),
         ({"n_actions": np.array(0)}, "n_actions: got 0, expected a whole number > 0"),
         ({"s2r_kind": np.array("tree")}, "s2r_kind: got tree, expected mlp or none"),
-        ({"s2r_kind": np.array("none")}, "s2r.0.bias: got an unknown entry, expected those of schema 7"),
+        ({"s2r_kind": np.array("none")}, "s2r.0.bias: got an unknown entry, expected those of schema 8"),
         ({"workspace": np.zeros((0, 6), np.float32)}, "workspace: got float32 (0, 6), expected "),
         ({"estimator__spring_scale_m": np.zeros(9, np.float32)}, "estimator.spring_scale_m: got [0.0, "),
         ({"provenance_json": np.array("[1]")}, "provenance_json: got '[1]', expected a JSON object"),
@@ -250,12 +278,12 @@ def test_failed_write_keeps_the_old_file_and_leaves_nothing(file, make_policy, m
     assert file.read_bytes() == before
 
 
-def test_schema_7_stays_as_it_is(file, make_policy):
+def test_schema_8_stays_as_it_is(file, make_policy):
     groups = make_policy().spec.to_dict().items()
     fields = [f"{name}.{item}" for name, group in groups if isinstance(group, dict) for item in group]
     names = "\n".join(sorted([*arrays_of(file), *fields]))
     digest = hashlib.sha256(names.encode()).hexdigest()[:8]
-    assert digest == SCHEMA_7, "other entries, or other fields of ArmSpec: raise export.SCHEMA_VERSION"
+    assert digest == SCHEMA_8, "other entries, or other fields of ArmSpec: raise export.SCHEMA_VERSION"
 
 
 def test_the_policy_that_ships_is_one_of_this_version_for_the_paper_s_arm():

@@ -51,7 +51,7 @@ def actor_params():
 @pytest.fixture(scope="module")
 def file(spec, actor_params, make_arm_model, tmp_path_factory):
     path = tmp_path_factory.mktemp("export") / "policy.npz"
-    save_policy(path, policy_from_actor(actor_params, spec, RewardConfig(), make_arm_model(9), {}))
+    save_policy(path, policy_from_actor(actor_params, spec, RewardConfig(), make_arm_model(spec), {}))
     return path
 
 

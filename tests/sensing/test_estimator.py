@@ -21,13 +21,13 @@ from mjx_softarm.sensing.pose import frame_from_pose
 
 N, RADIUS_M = 9, 0.067
 ANGLE = np.radians(90.0) + 2 * np.pi * np.arange(N) / 3
-SITE_M = RADIUS_M * np.stack([np.cos(ANGLE), np.sin(ANGLE)], axis=-1)
+SITE_M = RADIUS_M * np.stack([np.cos(ANGLE), np.sin(ANGLE)], axis=-1).reshape(3, 3, 2)
 STRAIGHT_M = np.full(N, 0.2, np.float32)
 
 
 def springs_of(length_m, towards_rad, bend_rad):
     """Springs (3,) of one section that bends evenly: each is an arc at its own distance from the centre."""
-    along_m = SITE_M[:3] @ [np.cos(towards_rad), np.sin(towards_rad)]
+    along_m = SITE_M[0] @ [np.cos(towards_rad), np.sin(towards_rad)]
     return length_m - bend_rad * along_m
 
 
@@ -62,6 +62,23 @@ def test_section_of_constant_curvature(bend_rad, towards_rad):
     np.testing.assert_allclose(section.position_m[0], position_m, atol=1e-9)
     np.testing.assert_allclose(section.rotation[0], rotation, atol=1e-9)
     np.testing.assert_allclose(section.position_m[1:], [[0, 0, -0.2]] * 2, atol=1e-12)
+
+
+@pytest.mark.parametrize("n_springs", [3, 4, 6])
+def test_springs_give_a_section_by_least_squares(n_springs):
+    """A plane through noisy lengths, solved by NumPy; sections of other radii and angles."""
+    rng = np.random.default_rng(n_springs)
+    radius_m, first_rad = np.array([0.075, 0.05]), np.array([1.5, -0.4])
+    angle = first_rad[:, None] + 2 * np.pi * np.arange(n_springs) / n_springs
+    site_m = radius_m[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    spring_m = 0.2 + 0.03 * rng.normal(size=(2, n_springs))
+    got = constant_curvature(site_m, spring_m.ravel())
+    for section in range(2):
+        plane = np.column_stack([np.ones(n_springs), -site_m[section]])
+        length_m, *bend = np.linalg.lstsq(plane, spring_m[section], rcond=None)[0]
+        position_m, rotation = integrated(length_m, np.arctan2(bend[1], bend[0]), np.hypot(*bend))
+        np.testing.assert_allclose(got.position_m[section], position_m, atol=1e-8)
+        np.testing.assert_allclose(got.rotation[section], rotation, atol=1e-8)
 
 
 def test_sections_follow_one_another():
@@ -136,9 +153,12 @@ def test_nothing_jumps_through_gimbal_lock():
     assert np.abs(np.diff(frame.position_m, axis=0)).max() < 1e-3
 
 
-def test_expected_springs_by_hand():
-    weight = np.diag(np.arange(1.0, 10.0)).astype(np.float32)
-    one = np.ones(N, np.float32)
-    model = SpringModel(((weight, 0.5 * one),), -10 * one, 30 * one, 0.2 * one, 0.01 * one)
-    got = expected_springs(model, np.full((4, N), 20.0))
+@pytest.mark.parametrize("n_chambers", [9, 18])
+def test_expected_springs_by_hand(n_chambers):
+    """Spring k takes k + 1 times the pressure of its chamber, the first of one or two."""
+    weight = np.zeros((n_chambers, N), np.float32)
+    weight[:: n_chambers // N] = np.diag(np.arange(1.0, 10.0))
+    one, each = np.ones(N, np.float32), np.ones(n_chambers, np.float32)
+    model = SpringModel(((weight, 0.5 * one),), -10 * each, 30 * each, 0.2 * one, 0.01 * one)
+    got = expected_springs(model, np.full((4, n_chambers), 20.0))
     np.testing.assert_allclose(got, np.tile(0.2 + 0.01 * (np.arange(1.0, 10.0) + 0.5), (4, 1)), rtol=1e-6)

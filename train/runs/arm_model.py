@@ -16,9 +16,7 @@ import numpy as np
 import mjx_softarm
 from mjx_softarm._support.archive import Entries, SealedFileError, entries_of, read_sealed, write_sealed
 from mjx_softarm.mechanics.workspace import sample_evenly, sample_workspace
-from mjx_softarm.policy.file import ArmModel
-from mjx_softarm.sensing.estimator import take_estimator, take_spring_model
-from mjx_softarm.sensing.load import take_load_estimator
+from mjx_softarm.policy.file import ArmModel, take_networks
 from mjx_softarm.sensing.s2r import S2R, correct
 from mjx_softarm.spec import ArmSpec
 from train.runs import estimator
@@ -56,7 +54,7 @@ def arm_model(
         SpecError: the arm settles at too few pressures.
     """
     file, key = folder and folder / ESTIMATORS_FILE, _key(spec)
-    if file and (kept := _read(file, key, spec.n_chambers)):
+    if file and (kept := _read(file, key, spec)):
         networks, errors = kept
     else:
         if key not in _distilled:
@@ -76,15 +74,13 @@ def arm_model(
     return DistilledArm(ArmModel(_workspace(spec, s2r), *networks, s2r), errors)
 
 
-def _read(file: Path, key: str, n: int) -> tuple[tuple[Any, Any, Any], dict[str, Any]] | None:
+def _read(file: Path, key: str, spec: ArmSpec) -> tuple[tuple[Any, Any, Any], dict[str, Any]] | None:
     """Return the networks of a file with their errors; None where it is absent, damaged or of another key."""
     try:
         entries = Entries(read_sealed(file, _KIND, "python -m train export"), str(file))
         if entries.take("key", np.str_, ()) != key:
             return None
-        takers = take_estimator, take_load_estimator, take_spring_model
-        first, second, third = (take(entries, name, n) for take, name in zip(takers, _NAMES, strict=True))
-        return (first, second, third), entries.table("errors_json")
+        return take_networks(entries, spec), entries.table("errors_json")
     except SealedFileError:
         return None
 

@@ -44,7 +44,7 @@ SCHEDULE = Schedule(n_updates=8_000, learning_rate=4e-3, batch_size=256)
 PAYLOADS = (0.0, 0.25, 0.5, 1.0)  # shares of the largest payload at which errors are given
 CHAMBERS_OFF = 0.03  # share by which stiffness and area of a chamber may be off
 TURN_MM = 50.0  # tip distance that costs as much as a turn by one radian
-CHANGE_SCALE = 0.015  # scale of the network's outputs, in section lengths and half radians
+CHANGE_SCALE = 0.015  # scale of the network's outputs, in mean section lengths and half radians
 
 
 class Error(NamedTuple):
@@ -122,15 +122,17 @@ def _stronger(spec: ArmSpec) -> ArmSpec:
 
 
 def _first_estimator(spec: ArmSpec, pool: LoadedPool, key: Array) -> PoseEstimator:
-    n, n_out = spec.n_chambers, N_CHANGES * spec.structure.n_sections
+    n_sections = spec.structure.n_sections
+    n_in, n_out = spec.n_springs + 3 * n_sections, N_CHANGES * n_sections
     scale = np.full(N_CHANGES, CHANGE_SCALE)
-    scale[:3] *= spec.geometry.section_length_m
-    load_layers = initial_layers(jax.random.fold_in(key, 1), (2 * n + 1, WIDTH, WIDTH, n_out))
+    scale[:3] *= spec.length_m / n_sections
+    site_m = jnp.asarray(ArmParams.from_spec(spec).spring_site_m).reshape(n_sections, -1, 2)
+    load_layers = initial_layers(jax.random.fold_in(key, 1), (n_in + 1, WIDTH, WIDTH, n_out))
     *hidden, (weight, bias) = load_layers
     return PoseEstimator(
-        layers=initial_layers(key, (2 * n, WIDTH, WIDTH, n_out)),
+        layers=initial_layers(key, (n_in, WIDTH, WIDTH, n_out)),
         load_layers=(*hidden, (0.1 * weight, bias)),  # a load changes little at first
-        spring_site_m=jnp.asarray(ArmParams.from_spec(spec).spring_site_m),
+        spring_site_m=site_m,
         **_scaling("spring", "m", pool.spring_m),
         load_centre_kg=jnp.asarray(spec.mass.payload_kg),
         load_scale_kg=jnp.asarray(spec.mass.largest_payload_kg),
@@ -140,7 +142,7 @@ def _first_estimator(spec: ArmSpec, pool: LoadedPool, key: Array) -> PoseEstimat
 
 def _first_load_estimator(spec: ArmSpec, pool: LoadedPool, key: Array) -> LoadEstimator:
     return LoadEstimator(
-        layers=initial_layers(key, (2 * spec.n_chambers, WIDTH, WIDTH, 1)),
+        layers=initial_layers(key, (spec.n_springs + spec.n_chambers, WIDTH, WIDTH, 1)),
         **_scaling("spring", "m", pool.spring_m),
         **_scaling("pressure", "kpa", pool.pressure_kpa),
         load_scale_kg=jnp.asarray(_load_max_kg(spec)),
@@ -148,9 +150,9 @@ def _first_load_estimator(spec: ArmSpec, pool: LoadedPool, key: Array) -> LoadEs
 
 
 def _first_spring_model(pool: Pool, key: Array) -> SpringModel:
-    n = pool.spring_m.shape[1]
+    n_chambers, n_springs = pool.pressure_kpa.shape[1], pool.spring_m.shape[1]
     return SpringModel(
-        layers=initial_layers(key, (n, WIDTH, WIDTH, n)),
+        layers=initial_layers(key, (n_chambers, WIDTH, WIDTH, n_springs)),
         **_scaling("pressure", "kpa", pool.pressure_kpa),
         **_scaling("spring", "m", pool.spring_m),
     )

@@ -104,7 +104,7 @@ def test_it_learns_in_the_epoch_and_is_evaluated(run):
 
 @pytest.fixture
 def arm(make_arm_model):
-    return DistilledArm(make_arm_model(SHORT.n_chambers), {})
+    return DistilledArm(make_arm_model(SHORT), {})
 
 
 def test_the_exported_policy_acts_as_it_does(run, task, tmp_path, arm):
