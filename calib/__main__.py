@@ -173,7 +173,7 @@ def _read(paths: Sequence[Path], spec: ArmSpec, strict: bool) -> tuple[list[Log]
         raise InputError("LOG: got nothing, expected one log or more")
     logs, findings = [], []
     for path in paths:
-        log, found = read_log(path, spec.n_chambers, strict)
+        log, found = read_log(path, spec, strict)
         logs.append(log)
         findings += found
         for finding in found:

@@ -77,7 +77,7 @@ def springs(
         sensor["compensation_h"] = fit.compensation_h
     spec = spec.replace(sensor=sensor)
     calibrated = spec.spring_sensor.lengths(readings, np.nan)
-    return StepResult(spec, sections.springs(fit, calibrated.length_m, length_m))
+    return StepResult(spec, sections.springs(fit, calibrated.length_m, length_m, spec.springs_per_section))
 
 
 def chambers(measurements: Measurements, spec: ArmSpec, seed: int) -> StepResult:

@@ -50,7 +50,7 @@ def calibrate_twin(folder: Path, settings: Settings, twin: int) -> None:
             raise JobError(f"log of {n} poses: got a recording that ended early ({cause}), expected all")
         write_log(file, recording.log)
     # Calibrate from the file, as a user would.
-    log, findings = read_log(file, spec.n_chambers)
+    log, findings = read_log(file, spec)
     xla.enable_compilation_cache()
     calibration = calibrate([log], spec)
     write_calibration(here / CALIBRATION, calibration, [*map(str, findings)], provenance("benchmarks"))

@@ -34,12 +34,15 @@ One row per pose will do if the rows are more than 3 s apart.
 NEEDED = ("readings", "spring_m", "pressure_kpa", "tip_m")  # a log has one of these at least
 
 
-def read_log(path: str | Path, n_chambers: int = 9, strict: bool = False) -> tuple[Log, list[Finding]]:
+def read_log(
+    path: str | Path, spec: ArmSpec | None = None, strict: bool = False
+) -> tuple[Log, list[Finding]]:
     """Read a log, keep the rows that can be believed, and report the faults of the others.
 
     Args:
         path: CSV file, or npz file by its suffix.
-        n_chambers: number of chambers; a log of another number is refused.
+        spec: the arm, by default the paper's; a log of an arm with other numbers of chambers or springs is
+            refused.
         strict: refuse a log with any finding.
 
     Returns:
@@ -48,7 +51,7 @@ def read_log(path: str | Path, n_chambers: int = 9, strict: bool = False) -> tup
     Raises:
         LogError: the log cannot be used or is refused; the message has a line for each finding.
     """
-    matrix, findings = read_matrix(path, n_chambers, one_of=NEEDED)
+    matrix, findings = read_matrix(path, spec or ArmSpec.default(), one_of=NEEDED)
     with np.errstate(over="ignore", invalid="ignore"):  # any number may stand in a file
         refuse(implausible(matrix))
         matrix, found = clean(matrix)
@@ -72,8 +75,8 @@ def template(path: str | Path) -> str:
     # Ten ticks of an arm that bends to and fro: springs, tip and markers are made up, but fit together.
     spec = ArmSpec.default()
     n_sections = spec.structure.n_sections
-    phase = 2.0 * np.pi * (np.arange(10)[:, None] / 10.0 + np.arange(spec.n_chambers) / spec.n_chambers)
-    length_m = spec.geometry.section_length_m + 0.01 * np.sin(phase)
+    phase = 2.0 * np.pi * (np.arange(10)[:, None] / 10.0 + np.arange(spec.n_springs) / spec.n_springs)
+    length_m = spec.at_springs(spec.geometry.section_length_m) + 0.01 * np.sin(phase)
     bend = np.stack([np.zeros(10), np.sin(phase[:, 0]), np.cos(phase[:, 0])], axis=1)
     tip_m = [0.0, 0.0, -spec.length_m] + bend * [0.0, 0.03, 0.01]
     half = 0.1 * bend[:, 1]
@@ -90,15 +93,16 @@ def template(path: str | Path) -> str:
         payload_kg=np.zeros(10),
     )
     write_log(path, log)
-    return schema_text(spec.n_chambers, n_sections)
+    return schema_text(spec.n_chambers, spec.n_springs, n_sections)
 
 
-def schema_text(n_chambers: int, n_markers: int) -> str:
+def schema_text(n_chambers: int, n_springs: int, n_markers: int) -> str:
     """Describe the columns that a log may have, from the schema."""
     lines = [_HELP, f"{'columns':<30} {'units':<26} plausible"]
     groups: dict[tuple[str, str], list[Column]] = {}
     names = [sensor.reading_name for sensor in SENSORS.values()]
-    for column in dict.fromkeys(c for name in names for c in log_columns(n_chambers, n_markers, name)):
+    counts = n_chambers, n_springs, n_markers
+    for column in dict.fromkeys(c for name in names for c in log_columns(*counts, name)):
         groups.setdefault((column.group, column.kind), []).append(column)
     for columns in groups.values():
         first, last = columns[0], columns[-1]

@@ -23,9 +23,9 @@ class StaticPoses(NamedTuple):
     payload_kg: np.ndarray  # (n,)
     tip_m: np.ndarray  # (n, 3)
     tip_rotation: np.ndarray  # (n, 3, 3)
-    spring_m: np.ndarray  # (n, n_chambers), NaN where not measured; see `with_lengths`
+    spring_m: np.ndarray  # (n, n_springs), NaN where not measured; see `with_lengths`
     marker_m: np.ndarray  # (n, n_markers, 3), NaN where not measured
-    readings: np.ndarray  # (n, n_max, n_chambers) of each row; NaN beyond `n_rows` and without sensors
+    readings: np.ndarray  # (n, n_max, n_springs) of each row; NaN beyond `n_rows` and without sensors
     n_rows: np.ndarray  # (n,) number of rows; one row cannot show whether the tip moved
 
     @property
@@ -65,13 +65,13 @@ def find_static_poses(logs: Sequence[Log], spec: ArmSpec) -> tuple[StaticPoses, 
     n_markers = max((log.marker_m.shape[1] for log in logs if log.marker_m is not None), default=0)
     row_uses = {"used": 0, "not finite": 0, "pressures not held long enough": 0, "tip still moving": 0}
     found = [pose for log in logs for pose in _static_poses_of(log, spec, n_markers, row_uses)]
-    n, n_chambers = len(found), spec.n_chambers
+    n, n_springs = len(found), spec.n_springs
     # Stack the poses; pad the rows of readings.
     *columns, rows = list(zip(*found, strict=True)) if found else [[]] * 7
-    shapes = ((n_chambers,), (), (3,), (3, 3), (n_chambers,), (n_markers, 3))
+    shapes = ((spec.n_chambers,), (), (3,), (3, 3), (n_springs,), (n_markers, 3))
     arrays = [np.reshape(list(c), (n, *shape)) for c, shape in zip(columns, shapes, strict=True)]
     n_rows = np.array([len(readings) for readings in rows], int)
-    padded = np.full((n, n_rows.max(initial=0), n_chambers), np.nan)
+    padded = np.full((n, n_rows.max(initial=0), n_springs), np.nan)
     for pose, readings in zip(padded, rows, strict=True):
         pose[: len(readings)] = readings
     poses = StaticPoses(*arrays, readings=padded, n_rows=n_rows)
@@ -92,7 +92,7 @@ def _static_poses_of(log: Log, spec: ArmSpec, n_markers: int, row_uses: dict[str
     log, payload = log.take(finite), payload[finite]
     assert log.pressure_kpa is not None and log.tip_m is not None  # as `POSE_COLUMNS` asks
     # Fill what the log does not have.
-    unknown = np.full((len(log), spec.n_chambers), np.nan)
+    unknown = np.full((len(log), spec.n_springs), np.nan)
     readings = log.readings_of(spec.sensor)
     springs = unknown if readings is not None or log.spring_m is None else log.spring_m
     readings = unknown if readings is None else readings

@@ -24,13 +24,14 @@ from mjx_softarm.sensing.s2r import correct
 _BINS = 40
 
 
-def springs(fit: SpringFit, calibrated_m: np.ndarray, length_m: np.ndarray) -> Section:
+def springs(fit: SpringFit, calibrated_m: np.ndarray, length_m: np.ndarray, per_section: int) -> Section:
     """Show beta and delta of each spring.
 
     Args:
         fit: fitted springs.
         calibrated_m (n, n_springs) [m]: lengths from the calibrated sensors.
         length_m (n, n_springs) [m]: lengths measured at the same time.
+        per_section: springs of a section, which are a row of the figure.
     """
     # Tabulate the fit.
     half_beta = 0.5 * np.ptp(fit.beta_interval, axis=1)
@@ -41,12 +42,16 @@ def springs(fit: SpringFit, calibrated_m: np.ndarray, length_m: np.ndarray) -> S
         for k in range(len(fit.beta))
     )
     head = ("", "beta", "+-", "delta [mm]", "+- [mm]", "held-out RMS [mm]", "rows", "outliers")
-    # Draw the residuals.
-    figure, axes = _figure()
-    error_mm = 1e3 * (calibrated_m - length_m)
-    for k in range(length_m.shape[1]):
-        axes.plot(1e3 * length_m[:, k], error_mm[:, k], ".", ms=3, label=f"spring {k}")
-    _label(axes, "measured length [mm]", "calibrated minus measured [mm]")
+    # Draw the residuals of each spring.
+    n_rows = len(fit.beta) // per_section
+    figure = Figure(figsize=(7.5, 1.0 + 1.6 * n_rows), layout="constrained")
+    each = figure.subplots(n_rows, per_section, sharex=True, sharey=True, squeeze=False)
+    for k, axes in enumerate(each.flat):
+        axes.plot(1e3 * length_m[:, k], 1e3 * (calibrated_m - length_m)[:, k], ".", ms=2)
+        axes.set_title(f"spring {k}", fontsize="small")
+        axes.grid(alpha=0.3)
+    figure.supxlabel("measured length [mm]", fontsize="medium")
+    figure.supylabel("calibrated minus measured [mm]", fontsize="medium")
     return Section(
         "Springs",
         "Measured lengths L against lengths l from the readings, L = beta l + delta, by Huber's loss. "

@@ -18,6 +18,7 @@ from mjx_softarm.logs.checks import Finding, LogError
 from mjx_softarm.logs.schema import GROUPS, UNITS, Column, Log, log_columns
 from mjx_softarm.logs.tables import read_table
 from mjx_softarm.sensing.sensors import SENSORS
+from mjx_softarm.spec import ArmSpec
 
 _CELL = re.compile(r"(\w+)\s*(?:\[(.*)\])?")
 
@@ -58,7 +59,7 @@ class LogMatrix(NamedTuple):
 @np.errstate(over="ignore", invalid="ignore")  # a file may hold any number
 def read_matrix(
     path: str | Path,
-    n_chambers: int,
+    spec: ArmSpec,
     needed: Sequence[str] = (),
     one_of: Sequence[str] = (),
     reading_name: str | None = None,
@@ -67,7 +68,7 @@ def read_matrix(
 
     Args:
         path: CSV file, or an npz file with the suffix `.npz`.
-        n_chambers: number of the arm's chambers; a log of another arm is refused.
+        spec: the arm; a log of an arm with other numbers of chambers or springs is refused.
         needed: fields of `Log` whose columns are required, besides time.
         one_of: fields of `Log`; the columns of at least one are required.
         reading_name: name of the readings of the arm's sensors; by default the first name in the file.
@@ -83,7 +84,8 @@ def read_matrix(
     markers = [int(match[1]) for name in names if (match := re.fullmatch(r"marker(\d+)_[xyz]", name))]
     n_markers = min(1 + max(markers, default=-1), len(names))
     reading_name = reading_name or _reading_name(names)
-    known = {column.name: column for column in log_columns(n_chambers, n_markers, reading_name)}
+    columns = log_columns(spec.n_chambers, spec.n_springs, n_markers, reading_name)
+    known = {column.name: column for column in columns}
 
     # Refuse headers that do not fit the arm.
     if any(name[:1].isalpha() for name in names):
@@ -125,8 +127,9 @@ def _header_errors(
             expected = ", ".join(f"[{unit}]" for unit in UNITS[known[name].kind])
             yield name, f"got {'no unit' if unit is None else f'[{unit}]'}, expected one of {expected}"
         if name not in known and re.fullmatch(rf"({reading_name}|spring|pressure|reference)\d+", name):
-            n_chambers = sum(column.group == "spring_m" for column in known.values())
-            yield name, f"got this column, expected those of {n_chambers} chambers, numbered from 0"
+            part, group = ("chambers", "pressure_kpa") if name[:2] == "pr" else ("springs", "spring_m")
+            n = sum(column.group == group for column in known.values())
+            yield name, f"got this column, expected those of {n} {part}, numbered from 0"
     for group in {known[name].group for name in names if name in known}:
         columns = [name for name, column in known.items() if column.group == group]
         if missing := [name for name in columns if name not in names]:

@@ -55,21 +55,21 @@ class Column:
 
 
 def log_columns(
-    n_chambers: int, n_markers: int = 0, reading_name: str = Coil.reading_name
+    n_chambers: int, n_springs: int, n_markers: int = 0, reading_name: str = Coil.reading_name
 ) -> tuple[Column, ...]:
     """Return all columns that a log of an arm may have, in the order of the file."""
-    chambers, markers = range(n_chambers), range(n_markers)
+    chambers, springs, markers = range(n_chambers), range(n_springs), range(n_markers)
     reading_unit = next(iter(UNITS[reading_name]))
     return (
         Column("time_s", "time", "time", "s"),
-        *(Column("readings", f"{reading_name}{k}", reading_name, reading_unit) for k in chambers),
-        *(Column("spring_m", f"spring{k}", "length", "mm") for k in chambers),
+        *(Column("readings", f"{reading_name}{k}", reading_name, reading_unit) for k in springs),
+        *(Column("spring_m", f"spring{k}", "length", "mm") for k in springs),
         *(Column("pressure_kpa", f"pressure{k}", "pressure", "kPa") for k in chambers),
         *(Column("tip_m", f"tip_{axis}", "length", "mm") for axis in _XYZ),
         *(Column("tip_quaternion", f"tip_q{part}", "number", "1") for part in "wxyz"),
         *(Column("marker_m", f"marker{k}_{axis}", "length", "mm") for k in markers for axis in _XYZ),
         Column("payload_kg", "payload", "mass", "g"),
-        *(Column("reference_m", f"reference{k}", "length", "mm") for k in chambers),
+        *(Column("reference_m", f"reference{k}", "length", "mm") for k in springs),
         *(Column("goal", f"goal_{axis}", *_POSE[axis]) for axis in _POSE),
         *(Column("estimate", f"estimate_{axis}", *_POSE[axis]) for axis in _POSE),
         Column("load_kg", "load", "mass", "g"),
@@ -88,14 +88,14 @@ class Log:
     source: str  # file name, for messages
     row: np.ndarray  # (n,) line of the file for each row; the header is line 1
     time_s: np.ndarray  # (n,)
-    readings: np.ndarray | None = None  # (n, n_chambers) readings of the springs' sensors
-    spring_m: np.ndarray | None = None  # (n, n_chambers) spring lengths from another instrument
+    readings: np.ndarray | None = None  # (n, n_springs) readings of the springs' sensors
+    spring_m: np.ndarray | None = None  # (n, n_springs) spring lengths from another instrument
     pressure_kpa: np.ndarray | None = None  # (n, n_chambers) relative to the atmosphere
     tip_m: np.ndarray | None = None  # (n, 3)
     tip_quaternion: np.ndarray | None = None  # (n, 4) w, x, y, z
     marker_m: np.ndarray | None = None  # (n, n_markers, 3) from the base to the tip
     payload_kg: np.ndarray | None = None  # (n,)
-    reference_m: np.ndarray | None = None  # (n, n_chambers) references of the springs
+    reference_m: np.ndarray | None = None  # (n, n_springs) references of the springs
     goal: np.ndarray | None = None  # (n, 6) [mm, deg]
     estimate: np.ndarray | None = None  # (n, 6) [mm, deg] tip pose that the controller estimated
     load_kg: np.ndarray | None = None  # (n,) payload that the controller estimated
@@ -130,10 +130,11 @@ GROUPS = tuple(item.name for item in dataclasses.fields(Log) if item.name not in
 
 def log_table(log: Log) -> tuple[tuple[Column, ...], np.ndarray]:
     """Return the columns (k,) of a log, and its numbers (n, k) in the units of the columns."""
-    per_chamber = [getattr(log, name) for name in ("readings", "spring_m", "pressure_kpa", "reference_m")]
-    n_chambers = max((value.shape[1] for value in per_chamber if value is not None), default=0)
+    per_spring = [getattr(log, name) for name in ("readings", "spring_m", "reference_m")]
+    n_springs = max((value.shape[1] for value in per_spring if value is not None), default=0)
+    n_chambers = 0 if log.pressure_kpa is None else log.pressure_kpa.shape[1]
     n_markers = 0 if log.marker_m is None else log.marker_m.shape[1]
-    known = log_columns(n_chambers, n_markers, log.reading_name)
+    known = log_columns(n_chambers, n_springs, n_markers, log.reading_name)
     columns = tuple(column for column in known if getattr(log, column.group) is not None)
     present = [value for name in GROUPS if (value := getattr(log, name)) is not None]
     table = np.concatenate([np.reshape(value, (len(log), -1)) for value in present], axis=1)

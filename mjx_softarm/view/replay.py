@@ -35,7 +35,7 @@ class Track:
     """
 
     def __init__(self, path: Path, spec: ArmSpec):
-        log = read_matrix(path, spec.n_chambers, one_of=("readings", "spring_m"))[0].log()
+        log = read_matrix(path, spec, one_of=("readings", "spring_m"))[0].log()
         log = log.take(np.isfinite(log.time_s))
         log = log.take(~late_rows(log.time_s))
         if not len(log):

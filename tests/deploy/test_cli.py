@@ -209,7 +209,7 @@ def test_a_plan_of_pressures_is_recorded(tmp_path):
     planned_kpa = np.array([[-5.0, 3, -10, -5, 2, 4, 2, -9, -4], [-6.0, 2, -8, -4, 3, 3, 1, -8, -5]])
     write_plan(plan, planned_kpa)
     assert main(["record", "--arm", "twin:rod:101", "--plan", str(plan), "--out", str(out)]) == 0
-    found = read_log(out, 9)[0]
+    found = read_log(out)[0]
     np.testing.assert_allclose(found.pressure_kpa, planned_kpa, atol=0.1)
 
 

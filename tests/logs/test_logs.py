@@ -2,6 +2,7 @@
 
 import contextlib
 import csv
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +13,11 @@ from hypothesis.extra import numpy as npst
 from mjx_softarm.logs.checks import LogError
 from mjx_softarm.logs.files import read_matrix
 from mjx_softarm.logs.schema import Log, write_log
+from mjx_softarm.spec import ArmSpec
 from tests.properties import damaged, few
+
+STRUCTURE = {"chambers_per_section": 6, "springs_per_section": 3}
+ARM = ArmSpec.of(Path("sopra")).replace(structure=STRUCTURE)  # two sections: 12 chambers, 6 springs
 
 
 def small_log(**changes):
@@ -68,7 +73,12 @@ def numbers(*shape):
 @given(
     groups=st.fixed_dictionaries(
         {"readings": numbers(4, 6)},
-        optional={"spring_m": numbers(4, 6), "tip_m": numbers(4, 3), "goal": numbers(4, 6)},
+        optional={
+            "spring_m": numbers(4, 6),
+            "pressure_kpa": numbers(4, 12),
+            "tip_m": numbers(4, 3),
+            "goal": numbers(4, 6),
+        },
     ),
     reading_name=st.sampled_from(("frequency", "voltage")),
     name=st.sampled_from(("log.csv", "log.npz")),
@@ -76,12 +86,12 @@ def numbers(*shape):
 def test_any_log_is_written_and_read_again(tmp_path, groups, reading_name, name):
     log = Log("any", np.arange(4) + 2, 0.02 * np.arange(4), reading_name=reading_name, **groups)
     write_log(tmp_path / name, log)
-    matrix, findings = read_matrix(tmp_path / name, 6)
+    matrix, findings = read_matrix(tmp_path / name, ARM)
     again = matrix.log()
     assert not findings and again.reading_name == reading_name
     for group in ("time_s", *groups):
         np.testing.assert_allclose(getattr(again, group), getattr(log, group), rtol=1e-8)
-    assert again.pressure_kpa is None
+    assert again.payload_kg is None
 
 
 @settings(few, max_examples=200)
@@ -91,4 +101,4 @@ def test_a_damaged_log_is_read_or_refused(tmp_path, data, name):
     write_log(tmp_path / name, small_log())
     (tmp_path / name).write_bytes(data.draw(damaged((tmp_path / name).read_bytes())))
     with contextlib.suppress(LogError):
-        assert len(read_matrix(tmp_path / name, 6)[0].log()) > 0
+        assert len(read_matrix(tmp_path / name, ARM)[0].log()) > 0

@@ -38,7 +38,11 @@ UNREADABLE = {
     "unknown unit": (simple(moving(9), HEADER.replace("[s]", "[h]")), r"got \[h\], expected one of \[s\]"),
     "other arm": (
         simple(["0,1", "1,1"], "time [s],spring9 [mm]"),
-        "spring9: got this column, expected those of 9 chambers",
+        "spring9: got this column, expected those of 9 springs",
+    ),
+    "arm of more chambers": (
+        simple(["0,1", "1,1"], "time [s],pressure9 [kPa]"),
+        "pressure9: got this column, expected those of 9 chambers",
     ),
 }
 

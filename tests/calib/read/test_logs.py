@@ -92,7 +92,7 @@ def test_template_is_valid_and_its_text_names_all_columns(tmp_path):
     log, findings = read_log(path, strict=True)
     assert findings == [] and len(log) == 10
     assert not any(line.startswith("#") for line in path.read_text().splitlines())
-    groups = {(c.group, c.kind): c.name for c in reversed(log_columns(9, 3))}
+    groups = {(c.group, c.kind): c.name for c in reversed(log_columns(9, 9, 3))}
     assert all(f"\n{name} " in words for name in groups.values())
     with pytest.raises(FileExistsError, match="template.csv"):
         template(path)
