@@ -1,26 +1,32 @@
-"""Air in the chambers: one pump per chamber, and valves with a delay. NumPy and JAX.
+"""Air in the chambers, and the actuators that set its pressure. NumPy and JAX.
 
 A chamber holds ideal gas at constant temperature, p V = n R T. The amount n is counted as its volume at
 atmospheric pressure, the unit of a pump's flow. With the bellows' effective area A = area + slope (l - rest),
 the volume is V = area l + slope (l - rest)^2 / 2. So V' = A, and a closed chamber conserves mechanical work.
 
-Each chamber's regulator asks for the flow that brings the pressure to the command with the valve's switching
-time as time constant. The pump limits this flow in both directions: it makes both pressure and vacuum. A
-command takes effect after the valve's switching time.
+Each chamber has an actuator, a pump or a regulator, which acts on a command after a dead time. An actuator
+changes the amount of gas; a chamber that changes its length changes its pressure at once.
 
 Source: the paper's section on the hardware: each chamber is controlled by a pump unit of 12 L/min, whose
-valves switch within 10 ms.
+valves switch within 10 ms. Regulators: step responses in the logs of ASU-RISE-Lab/4-chamber-softarm-control.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import ClassVar
 
+import numpy as np
+
+from mjx_softarm._support.fields import PerChamber, Rule, anything, positive, rule_of
 from mjx_softarm._support.xp import Array, array_namespace
 
 ATMOSPHERE_KPA = 101.325
-PUMP_M3_PER_S = 12e-3 / 60.0  # paper: 12 L/min for each chamber
-VALVE_S = 0.010  # paper: valves switch within 10 ms; dead time, and time constant of the regulator
+LONGEST_DELAY_S = 2.0  # longest dead time of an actuator; the state of a motion holds the commands of this time
 
 
 def volume_m3(length_m: Array, area_m2: Array, slope_m: Array, rest_m: Array | float) -> Array:
@@ -45,9 +51,102 @@ def pressure_of(gas_m3: Array, volume_m3: Array) -> Array:
     return ATMOSPHERE_KPA * (gas_m3 / volume_m3 - 1.0)
 
 
-def regulated(gas_m3: Array, volume_m3: Array, command_kpa: Array, dt_s: float) -> Array:
-    """Return the gas (...) after a time dt_s in which the regulators had commands (...) [kPa]."""
-    limit_m3 = PUMP_M3_PER_S * dt_s
-    missing_m3 = gas_at(command_kpa, volume_m3) - gas_m3
-    xp = array_namespace(missing_m3)
-    return gas_m3 + xp.clip(-math.expm1(-dt_s / VALVE_S) * missing_m3, -limit_m3, limit_m3)
+@dataclass(frozen=True)
+class Actuators:
+    """One kind of actuator, one for each of n chambers: the table `[actuators]` of a specification.
+
+    `mjx_softarm.mechanics.motion.state` registers the kinds as pytrees.
+    """
+
+    kind: ClassVar[str]  # `kind` in the specification
+
+    @property
+    def delay_s(self) -> Array | float:
+        """Dead time () or (n,) of a command."""
+        raise NotImplementedError
+
+    @property
+    def rest_offset_kpa(self) -> Array | float | None:
+        """Pressure at rest less its command, () or (n,); None for none."""
+        return None
+
+    def fill(self, gas_m3: Array, volume_m3: Array, command_kpa: Array, dt_s: float) -> Array:
+        """Return the gas (..., n) after a time dt_s.
+
+        Args:
+            gas_m3 (..., n) [m^3]: gas at the start, as its volume at atmospheric pressure.
+            volume_m3 (..., n) [m^3]: volumes of the chambers.
+            command_kpa (..., n) [kPa]: commands in force; the dead time is over.
+            dt_s: duration.
+        """
+        raise NotImplementedError
+
+    def per_chamber(self, n: int) -> Actuators:
+        """Return the actuators with an array (n,), float64, for each field that has a number per chamber."""
+        names = [item.name for item in dataclasses.fields(self) if rule_of(item).per]
+        return dataclasses.replace(self, **{name: np.full(n, getattr(self, name), float) for name in names})
+
+
+@dataclass(frozen=True)
+class Pump(Actuators):
+    """A pump for each chamber, for pressure and for vacuum, behind valves.
+
+    It asks for the flow that brings the pressure to the command with the valves' switching time as time
+    constant. Its greatest flow limits both directions.
+    """
+
+    kind: ClassVar[str] = "pump"
+
+    flow_l_per_min: float = positive()
+    valve_s: float = positive()  # switching time of the valves: dead time, and time constant
+
+    @property
+    def delay_s(self) -> float:
+        return self.valve_s
+
+    def fill(self, gas_m3: Array, volume_m3: Array, command_kpa: Array, dt_s: float) -> Array:
+        limit_m3 = self.flow_l_per_min / 60e3 * dt_s
+        missing_m3 = gas_at(command_kpa, volume_m3) - gas_m3
+        xp = array_namespace(missing_m3)
+        return gas_m3 + xp.clip(-math.expm1(-dt_s / self.valve_s) * missing_m3, -limit_m3, limit_m3)
+
+
+@dataclass(frozen=True)
+class Regulator(Actuators):
+    """A pressure regulator for each chamber.
+
+    It brings the pressure p to the command c, with e = c + offset - p, d the deadband and T the lag:
+
+        p' = clip((e - clip(e, -d, d)) / T, -vent, fill)
+
+    Within the deadband the chamber is closed.
+    """
+
+    kind: ClassVar[str] = "regulator"
+
+    lag_s: PerChamber | Array = positive(per="chambers")  # time constant
+    dead_time_s: PerChamber | Array = anything(per="chambers", low=0.0, high=LONGEST_DELAY_S)
+    fill_kpa_per_s: PerChamber | Array = positive(per="chambers")  # greatest rate of a rising pressure
+    vent_kpa_per_s: PerChamber | Array = positive(per="chambers")  # greatest rate of a falling pressure
+    deadband_kpa: PerChamber | Array = anything(per="chambers", low=0.0)
+    offset_kpa: PerChamber | Array = field(default=0.0, metadata={"rule": Rule(per="chambers")})
+
+    @property
+    def delay_s(self) -> Array | float:
+        return self.dead_time_s
+
+    @property
+    def rest_offset_kpa(self) -> Array | float:
+        return self.offset_kpa
+
+    def fill(self, gas_m3: Array, volume_m3: Array, command_kpa: Array, dt_s: float) -> Array:
+        xp = array_namespace(gas_m3, volume_m3, command_kpa, *vars(self).values())
+        missing_kpa = command_kpa + self.offset_kpa - pressure_of(gas_m3, volume_m3)
+        outside_kpa = missing_kpa - xp.clip(missing_kpa, -self.deadband_kpa, self.deadband_kpa)
+        share = -xp.expm1(-dt_s / self.lag_s)
+        change_kpa = xp.clip(share * outside_kpa, -dt_s * self.vent_kpa_per_s, dt_s * self.fill_kpa_per_s)
+        return gas_m3 + volume_m3 * change_kpa / ATMOSPHERE_KPA
+
+
+ACTUATORS: Mapping[str, type[Actuators]] = MappingProxyType({cls.kind: cls for cls in (Pump, Regulator)})
+PAPER_PUMP = Pump(flow_l_per_min=12.0, valve_s=0.010)  # paper; actuators of a file without the table

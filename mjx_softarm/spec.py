@@ -29,6 +29,7 @@ from mjx_softarm._support.fields import (
     vector,
 )
 from mjx_softarm.arms import shipped_arm
+from mjx_softarm.pneumatics import ACTUATORS, PAPER_PUMP, Actuators
 from mjx_softarm.sensing.sensors import N_CHAMBERS_PER_SECTION as N_CHAMBERS_PER_SECTION
 from mjx_softarm.sensing.sensors import SENSORS, Sensor
 
@@ -169,6 +170,7 @@ class ArmSpec:
     control: Control
     mounting: Mounting = Mounting()
     unmodelled: Unmodelled = Unmodelled()
+    actuators: Actuators = field(default=PAPER_PUMP, metadata={"kinds": ACTUATORS})
 
     @property
     def length_m(self) -> float:
@@ -281,7 +283,8 @@ class ArmSpec:
     def to_dict(self) -> dict[str, Any]:
         """Return nested dictionaries, as a TOML file has them."""
         data = dataclasses.asdict(self)
-        data["sensor"] = {"kind": self.sensor.kind, **data["sensor"]}
+        for table in ("sensor", "actuators"):
+            data[table] = {"kind": getattr(self, table).kind, **data[table]}
         return data
 
     def to_toml(self, path: str | Path) -> None:

@@ -77,10 +77,9 @@ def true_path_mm(
     data.qpos[:] = q
     mujoco.mj_step1(model, data)
     area, slope = np.array([*map(spec.per_chamber, (spec.chambers.area_m2, spec.chambers.area_slope_m))])
-    air = Pneumatics(area, slope, spec.geometry.section_length_m, chamber_lengths(data), TRUE_STEP_S)
-    air.command(pressure_kpa)
-    for _ in range(round(0.5 / TRUE_STEP_S)):
-        air.step(chamber_lengths(data))
+    bellows = area, slope, spec.at_chambers(spec.geometry.section_length_m), chamber_lengths(data)
+    air = Pneumatics(*bellows, TRUE_STEP_S, spec.actuators.per_chamber(spec.n_chambers))
+    air.hold(pressure_kpa, chamber_lengths(data))
 
     # The law at the control rate, MuJoCo's time steps between
     law, tips = control.LawState.at_rest(pressure_kpa, spring_lengths(data).copy()), []

@@ -15,7 +15,7 @@ from mjx_softarm._support import draws
 from mjx_softarm._support.mjx import Env, State, put
 from mjx_softarm.env.clearance import Walls
 from mjx_softarm.env.config import EnvConfig
-from mjx_softarm.env.state import PAYLOAD_SHARE, ArmState, EpisodeNoise, at_rest, motion_params
+from mjx_softarm.env.state import PAYLOAD_SHARE, ArmState, EpisodeMotion, EpisodeNoise
 from mjx_softarm.mdp import observation as obs
 from mjx_softarm.mdp import rewards
 from mjx_softarm.mdp.actions import ActionMap
@@ -74,6 +74,7 @@ class ReachEnv(Env):
         self.params = jax.tree.map(jnp.asarray, ArmParams.from_spec(self.spec))
         self.scale = obs.ObsScale.from_spec(self.spec)
         self.gains = control.Gains.from_spec(self.spec)
+        self.episode_motion = EpisodeMotion(self.spec, self.config)
         sensor, *limits = ActionMap.from_spec(self.spec)
         self.action_map = ActionMap(sensor, *(jnp.asarray(limit, jnp.float32) for limit in limits))
         self.walls = Walls(self.config.pipe_diameter_mm, self.spec, self.params, s2r)
@@ -145,7 +146,8 @@ class ReachEnv(Env):
 
     def sample_noise(self, rng: Array, n: int) -> EpisodeNoise:
         """Draw the random numbers of n episodes: leaves (n, ...)."""
-        moving = draws.uniform(jax.random.fold_in(rng, 1), (n, 3)) if self.config.moves else None
+        key, shape = jax.random.fold_in(rng, 1), (n, self.episode_motion.n_draws)
+        moving = draws.uniform(key, shape) if self.config.moves else None
         return EpisodeNoise(*draws.both(rng, (n, 3 + self.action_size), (n, self.action_size)), moving)
 
     def reset_from(self, noise: EpisodeNoise) -> State:
@@ -161,8 +163,8 @@ class ReachEnv(Env):
             chamber_stiffness=self.params.chamber_stiffness
             * (1.0 + spread.stiffness_spread * (2.0 * share[3:] - 1.0)),
             sensor_offset_m=1e-3 * spread.sensor_noise_mm * noise.normal,
-            moving=motion_params(spread, noise.moving),
-            **at_rest(start),
+            moving=self.episode_motion.params(noise.moving),
+            **self.episode_motion.at_rest(start),
             sensed=None,
             goal=goal,
             n_steps=jnp.zeros((), jnp.int32),
@@ -183,7 +185,7 @@ class ReachEnv(Env):
 
     def put(self, arm: ArmState, equilibrium: Pool) -> ArmState:
         """Return an arm at rest at an equilibrium, a row of a pool."""
-        arm = arm._replace(**at_rest(equilibrium))
+        arm = arm._replace(**self.episode_motion.at_rest(equilibrium))
         return arm._replace(sensed=self._sensed(arm, arm, self.action_of(arm.spring_m + arm.sensor_offset_m)))
 
     def step(self, state: State, action: Array) -> State:

@@ -91,7 +91,8 @@ class Twin(InstrumentedArm):
         chambers, rest_m = self._parts.spec.chambers, spec.at_chambers(spec.geometry.section_length_m)
         area, slope = np.array([*map(spec.per_chamber, (chambers.area_m2, chambers.area_slope_m))])
         now_m, timestep_s = chamber_lengths(self._data), self._model.opt.timestep
-        self._air = Pneumatics(area, slope, rest_m, now_m, timestep_s)
+        actuators = spec.actuators.per_chamber(spec.n_chambers)
+        self._air = Pneumatics(area, slope, rest_m, now_m, timestep_s, actuators)
         # Let the arm come to rest.
         self.attach(payload_kg)
         for _ in range(round(REST_S * spec.control.rate_hz)):

@@ -1,12 +1,11 @@
-"""The twin's chambers as they fill; see `mjx_softarm.pneumatics`."""
+"""A twin's chambers as they fill; see `mjx_softarm.pneumatics`."""
 
 from __future__ import annotations
-
-from collections import deque
 
 import numpy as np
 
 from mjx_softarm import pneumatics
+from mjx_softarm.pneumatics import PAPER_PUMP, Actuators
 
 
 class Pneumatics:
@@ -19,22 +18,31 @@ class Pneumatics:
         rest_m: np.ndarray | float,
         length_m: np.ndarray,
         timestep_s: float,
+        actuators: Actuators = PAPER_PUMP,
     ):
-        """Start at atmospheric pressure, all valves closed on it.
+        """Start at atmospheric pressure, all actuators at rest on it.
 
         Args:
             area_m2 (n,) [m^2]: effective areas at the lengths `rest_m`.
             slope_m (n,) [m]: d area / d length.
             rest_m (n,) [m], or one number: lengths of the effective areas.
             length_m (n,) [m]: lengths at the start.
-            timestep_s: duration of a `step`; the dead time is rounded to whole steps.
+            timestep_s: duration of a `step`; dead times are rounded to whole steps.
+            actuators: pumps or regulators.
         """
         self._bellows = area_m2, slope_m, rest_m
-        self._timestep_s = timestep_s
-        self.pressure_kpa = self._commanded_kpa = np.zeros(len(length_m))
+        self._timestep_s, self._actuators = timestep_s, actuators
+        self._chamber = np.arange(len(length_m))
+        self._wait = np.round(np.full(len(length_m), actuators.delay_s) / timestep_s).astype(int)  # (n,) steps
+        self.hold(np.zeros(len(length_m)), length_m)
+
+    def hold(self, pressure_kpa: np.ndarray, length_m: np.ndarray) -> None:
+        """Be at rest at pressures (n,) [kPa] and lengths (n,) [m], under the commands that hold them."""
+        self.pressure_kpa = np.array(pressure_kpa, float)
         self._gas_m3 = pneumatics.gas_at(self.pressure_kpa, self.volume_m3(length_m))
-        steps = round(pneumatics.VALVE_S / timestep_s)
-        self._under_way = deque([self._commanded_kpa] * (steps + 1), steps + 1)
+        offset_kpa = self._actuators.rest_offset_kpa
+        self._commanded_kpa = self.pressure_kpa - (0.0 if offset_kpa is None else offset_kpa)
+        self._line = np.tile(self._commanded_kpa, (self._wait.max() + 1, 1))  # commands, newest first
 
     def volume_m3(self, length_m: np.ndarray) -> np.ndarray:
         """Return volumes (n,) [m^3] of chambers with lengths (n,) [m]."""
@@ -46,8 +54,9 @@ class Pneumatics:
 
     def step(self, length_m: np.ndarray) -> np.ndarray:
         """Take a time step at lengths (n,) [m]; return pressures (n,) [kPa], relative to the atmosphere."""
-        self._under_way.append(self._commanded_kpa)
-        volume, command_kpa = self.volume_m3(length_m), self._under_way[0]
-        self._gas_m3 = pneumatics.regulated(self._gas_m3, volume, command_kpa, self._timestep_s)
+        self._line[1:] = self._line[:-1]
+        self._line[0] = self._commanded_kpa
+        volume, command_kpa = self.volume_m3(length_m), self._line[self._wait, self._chamber]
+        self._gas_m3 = self._actuators.fill(self._gas_m3, volume, command_kpa, self._timestep_s)
         self.pressure_kpa = pneumatics.pressure_of(self._gas_m3, volume)
         return self.pressure_kpa

@@ -114,10 +114,17 @@ class Rod:
         half, turn = (rotation_about(share * self.length_m * self.q[:, :3]) for share in (0.5, 1.0))
         return self._shape(half, turn)[0]
 
+    def chamber_lengths(self) -> np.ndarray:
+        """Return the lengths (s c,) [m] of the chambers."""
+        return self._fibre_lengths(slice(None, self.parts.stiffness.shape[1]))
+
     def spring_lengths(self) -> np.ndarray:
         """Return the lengths (s k,) [m] of the springs."""
-        u = self._stretch(self.q)[:, self.parts.stiffness.shape[1] :]
-        pieces = self.length_m * np.linalg.norm(u, axis=-1)
+        return self._fibre_lengths(slice(self.parts.stiffness.shape[1], None))
+
+    def _fibre_lengths(self, fibres: slice) -> np.ndarray:
+        """Return the lengths (s m,) [m] of m fibres of each section."""
+        pieces = self.length_m * np.linalg.norm(self._stretch(self.q)[:, fibres], axis=-1)
         return pieces.reshape(-1, self.per_section, pieces.shape[1]).sum(axis=1).ravel()
 
     def step(self, pressure_kpa: np.ndarray, duration_s: float) -> float:

@@ -10,7 +10,7 @@ import pytest
 from mjx_softarm._support import xla
 from mjx_softarm.env import EnvConfig, Randomisation, ReachEnv
 from mjx_softarm.env.reach import PAYLOAD
-from mjx_softarm.env.state import motion_params
+from mjx_softarm.env.state import EpisodeMotion
 from mjx_softarm.mechanics.motion.state import MotionParams
 from mjx_softarm.mechanics.params import ArmParams
 
@@ -124,8 +124,21 @@ def test_a_payload_and_stiffer_chambers_ask_for_other_pressures_at_the_same_spri
     np.testing.assert_allclose(stiffened - nominal, stretch / area, rtol=1e-3)
 
 
-def test_numbers_of_motion_fill_their_bounds():
+def test_numbers_of_motion_fill_their_bounds(spec):
     spread = Randomisation(damping_spread=0.2, delay_max_s=0.005, friction_max_n=1.5)
-    np.testing.assert_allclose(motion_params(spread, jnp.zeros(3)), [0.8, 0.01, 0.0], rtol=1e-6)
-    np.testing.assert_allclose(motion_params(spread, jnp.ones(3)), [1.2, 0.015, 1.5], rtol=1e-6)
-    np.testing.assert_allclose(motion_params(spread, None), MotionParams())
+    episode = EpisodeMotion(spec, EnvConfig(mode="dynamic", randomisation=spread))
+    for share, bounds in ((0.0, [0.8, 0.01, 0.0]), (1.0, [1.2, 0.015, 1.5])):
+        np.testing.assert_allclose(episode.params(jnp.full(3, share))[:3], bounds, rtol=1e-6)
+    assert episode.params(None) == MotionParams()
+
+
+def test_numbers_of_regulators_fill_their_bounds(spec):
+    numbers = {"lag_s": 0.5, "dead_time_s": 0.2, "fill_kpa_per_s": 50.0, "vent_kpa_per_s": 20.0}
+    spec = spec.replace(actuators={"kind": "regulator", "deadband_kpa": 0.2, **numbers})
+    spread = Randomisation(regulator_spread=0.1)
+    episode = EpisodeMotion(spec, EnvConfig(mode="dynamic", randomisation=spread))
+    for share, factor in ((None, 1.0), (0.0, 0.9), (1.0, 1.1)):
+        own = episode.params(share if share is None else jnp.full(6, share))
+        drawn = {name: getattr(own.actuators, name) for name in numbers} | {"dead_time_s": own.delay_s}
+        for name, value in numbers.items():
+            np.testing.assert_allclose(drawn[name], factor * value, rtol=1e-6)

@@ -14,10 +14,18 @@ from mjx_softarm._support.mjx import put
 from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.mjcf import build_model, chamber_lengths, spring_lengths
 from mjx_softarm.mechanics.motion import midpoint, mjx_step
-from mjx_softarm.mechanics.motion.state import CREEP_M_PER_S, Motion, MotionParams, MotionResult, MovingArm
+from mjx_softarm.mechanics.motion.state import (
+    CREEP_M_PER_S,
+    Motion,
+    MotionParams,
+    MotionResult,
+    MovingArm,
+    n_earlier,
+)
 from mjx_softarm.mechanics.params import PAYLOAD, ArmParams
 from mjx_softarm.mechanics.statics import all_tendons
 from mjx_softarm.mechanics.workspace import settle_many
+from mjx_softarm.pneumatics import Regulator
 from mjx_softarm.twin.pneumatics import Pneumatics
 
 SPEC = ArmSpec.default()
@@ -62,10 +70,8 @@ def true_tips(spec, q, pressure_kpa, reference_m, step_s=TRUE_STEP_S, model=None
     data.qpos[:] = q
     mujoco.mj_step1(model, data)
     bellows = spec.chambers.area_m2, spec.chambers.area_slope_m, spec.geometry.section_length_m
-    air = Pneumatics(*bellows, chamber_lengths(data), step_s)
-    air.command(pressure_kpa)
-    for _ in range(2000):  # held until the chambers are full
-        air.step(chamber_lengths(data))
+    air = Pneumatics(*bellows, chamber_lengths(data), step_s, spec.actuators.per_chamber(spec.n_chambers))
+    air.hold(pressure_kpa, chamber_lengths(data))
     law, tips = control.LawState.at_rest(pressure_kpa, spring_lengths(data)), []
     for reference in reference_m:
         command, law = control.pressures(reference, spring_lengths(data), law, GAINS, PERIOD_S)
@@ -91,14 +97,15 @@ def dry_friction(friction_n):
     return push
 
 
-def mover(spec, engine=midpoint, step_s=PERIOD_S):
+def mover(spec, engine=midpoint, step_s=PERIOD_S, longest_delay_s=0.0):
     """Function of joint coordinates, pressures, references (ticks, chambers), own numbers: the results."""
     model, data = put(build_model(spec))
     nominal = jax.tree.map(jnp.asarray, ArmParams.from_spec(spec))
 
     def move(q, pressure_kpa, reference_m, own, params):
         arm = MovingArm(model, data, params, own)
-        start = Motion.at_rest(q, pressure_kpa, all_tendons(chain_kinematics(params)(q), params).length[1])
+        spring_m = all_tendons(chain_kinematics(params)(q), params).length[1]
+        start = Motion.at_rest(q, pressure_kpa, spring_m, n_earlier(longest_delay_s, PERIOD_S))
 
         def tick(motion, reference):
             return engine.advance(arm, motion, reference, GAINS, PERIOD_S, PERIOD_S, step_s)
@@ -171,6 +178,21 @@ def test_a_command_waits_for_the_valves(short):
     np.testing.assert_allclose(late[:, 0], start.pressure_kpa, atol=1e-2)
     assert np.abs(soon[:, 0] - start.pressure_kpa).max() > 0.3
     assert np.abs(late[:, 1] - start.pressure_kpa).max() > 0.3
+
+
+@pytest.mark.parametrize(("engine", "step_s", "most_mm"), [(midpoint, PERIOD_S, 0.3), (mjx_step, 0.005, 0.8)])
+def test_arms_behind_slow_regulators_move_as_c_mujoco_does(engine, step_s, most_mm):
+    """Commands wait for no, two and a half, and some four control periods."""
+    dead_time_s = (0.0, 0.05, 0.085)
+    numbers = {"lag_s": 0.3, "fill_kpa_per_s": 60.0, "vent_kpa_per_s": 25.0, "deadband_kpa": 0.2}
+    spec = SHORT_ARM.replace(actuators={"kind": "regulator", "dead_time_s": dead_time_s, **numbers})
+    start, asked = starts(spec, 4), references(spec, 4)
+    regulator = jax.tree.map(np.float32, spec.actuators.per_chamber(3))
+    own = MotionParams(delay_s=regulator.delay_s, actuators=regulator)
+    moved = mover(spec, engine, step_s, max(dead_time_s))(*start, np.float32(asked), own)
+    true = np.array([true_tips(spec, *each) for each in zip(*start, asked, strict=True)])
+    assert 1e3 * np.linalg.norm(np.diff(true, axis=1), axis=-1).sum(axis=1).mean() > 20.0  # mm on the way
+    assert 1e3 * np.percentile(np.linalg.norm(moved.tip_position_m - true, axis=-1), 95) < most_mm
 
 
 def test_dry_friction_is_that_of_c_mujoco(short):

@@ -30,7 +30,15 @@ from mjx_softarm import control, pneumatics
 from mjx_softarm._support.mjx import mjx
 from mjx_softarm._support.small_matrices import block_diagonal, products, solve_approximate_gradient
 from mjx_softarm.mechanics.kinematics import Frames, chain_kinematics
-from mjx_softarm.mechanics.motion.state import Motion, MotionEnd, MovingArm, Path, friction_damping
+from mjx_softarm.mechanics.motion.state import (
+    Motion,
+    MotionEnd,
+    MovingArm,
+    Path,
+    friction_damping,
+    in_force,
+    pushed,
+)
 from mjx_softarm.mechanics.params import N_PER_KPA_M2
 from mjx_softarm.mechanics.statics import Tendons, all_tendons, statics_of
 
@@ -75,8 +83,9 @@ def advance(
         command, law = control.pressures(reference_m, spring_m, motion.law, gains, period_s)
         motion = motion._replace(law=law)
         for k in range(n_steps):
-            motion = _step(arm, motion, command, k, period_s / n_steps)
-        return motion._replace(command_kpa=command), Path.at(frames, spring_m)
+            motion = _step(arm, motion, command, k, period_s / n_steps, period_s)
+        earlier = pushed(motion.earlier_kpa, motion.command_kpa)
+        return motion._replace(command_kpa=command, earlier_kpa=earlier), Path.at(frames, spring_m)
 
     # All control periods, then a last look
     with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
@@ -92,7 +101,9 @@ def _at(arm: MovingArm, q: Array) -> tuple[Frames, Tendons]:
     return frames, all_tendons(frames, arm.params)
 
 
-def _step(arm: MovingArm, motion: Motion, command_kpa: Array, k: int, h: float) -> Motion:
+def _step(
+    arm: MovingArm, motion: Motion, command_kpa: Array, k: int, h: float, period_s: float
+) -> Motion:
     """Take the k-th step, of length h [s], of a control period with commanded pressures (n_chambers,)."""
     # Middle of the step, as the velocity at its start predicts it
     v, params = motion.velocity, arm.params
@@ -109,10 +120,9 @@ def _step(arm: MovingArm, motion: Motion, command_kpa: Array, k: int, h: float) 
 
     def fill(gas_m3: Array, volume: Array, half: int) -> Array:
         """Return the gas (n_chambers,) after a half step, counted from the start of the control period."""
-        # Share of the half step after the valves' dead time, in which the new command is in force
-        new = jnp.clip(half + 1.0 - arm.own.delay_s / (0.5 * h), 0.0, 1.0)
-        command = motion.command_kpa + new * (command_kpa - motion.command_kpa)
-        return pneumatics.regulated(gas_m3, volume, command, 0.5 * h)
+        line = command_kpa, motion.command_kpa, motion.earlier_kpa
+        command = in_force(*line, half, 0.5 * h, arm.own.delay_s, period_s)
+        return arm.own.actuators.fill(gas_m3, volume, command, 0.5 * h)
 
     # Pressures in the middle of the step
     gas_m3 = pneumatics.gas_at(motion.pressure_kpa, volume_m3(-half_way))

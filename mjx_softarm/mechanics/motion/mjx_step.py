@@ -30,7 +30,15 @@ from mjx_softarm import control, pneumatics
 from mjx_softarm._support.mjx import mjx
 from mjx_softarm.mechanics.kinematics import frames_of
 from mjx_softarm.mechanics.mjcf import chamber_lengths, spring_lengths
-from mjx_softarm.mechanics.motion.state import Motion, MotionEnd, MovingArm, Path, friction_damping
+from mjx_softarm.mechanics.motion.state import (
+    Motion,
+    MotionEnd,
+    MovingArm,
+    Path,
+    friction_damping,
+    in_force,
+    pushed,
+)
 from mjx_softarm.mechanics.params import N_PER_KPA_M2
 
 JAX = mjx.Impl.JAX
@@ -45,6 +53,7 @@ class _Moving(NamedTuple):
     law: control.LawState
     before_kpa: Array  # (n_chambers,) command of the control period before
     command_kpa: Array  # (n_chambers,) command of this control period
+    earlier_kpa: Array | None  # (k, n_chambers) commands before those, newest first
 
 
 def advance(
@@ -72,13 +81,16 @@ def advance(
 
         # The law commands pressures at the start of a control period
         command, law = control.pressures(reference_m, spring_m, now.law, gains, period_s)
-        new = now._replace(law=law, before_kpa=now.command_kpa, command_kpa=command)
+        earlier = pushed(now.earlier_kpa, now.before_kpa)
+        line = {"before_kpa": now.command_kpa, "command_kpa": command, "earlier_kpa": earlier}
+        new = now._replace(law=law, **line)
         now = jax.tree.map(lambda x, y: jnp.where(k == 0, x, y), new, now)
 
-        # Share of the step after the valves' dead time, in which the new command is in force
-        share = jnp.clip(k + 1.0 - arm.own.delay_s / h, 0.0, 1.0)
-        told_kpa = now.before_kpa + share * (now.command_kpa - now.before_kpa)
-        gas_m3 = pneumatics.regulated(now.gas_m3, volume, told_kpa, h)
+        # The actuators act on the commands whose dead time is over
+        told_kpa = in_force(
+            now.command_kpa, now.before_kpa, now.earlier_kpa, k, h, arm.own.delay_s, period_s
+        )
+        gas_m3 = arm.own.actuators.fill(now.gas_m3, volume, told_kpa, h)
 
         # MJX's own step
         data = data.replace(ctrl=pneumatics.pressure_of(gas_m3, volume))
@@ -89,12 +101,16 @@ def advance(
     with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
         _, _, volume = _at(arm, model, motion.q, motion.velocity)
         gas_m3 = pneumatics.gas_at(motion.pressure_kpa, volume)
-        start = _Moving(*motion[:2], gas_m3, motion.law, motion.command_kpa, motion.command_kpa)
+        before, earlier = motion.command_kpa, motion.earlier_kpa
+        if earlier is not None:  # the first control period shifts them by one
+            before, earlier = earlier[0], jnp.concatenate([earlier[1:], earlier[-1:]])
+        start = _Moving(*motion[:2], gas_m3, motion.law, before, motion.command_kpa, earlier)
         of_period = jnp.tile(jnp.arange(n_steps), round(duration_s / period_s))
         end, path = jax.lax.scan(step, start, of_period)
         data, spring_m, volume = _at(arm, model, end.q, end.velocity)
     pressure_kpa = pneumatics.pressure_of(end.gas_m3, volume)
-    motion = Motion(end.q, end.velocity, end.law, pressure_kpa, end.command_kpa)
+    line = end.command_kpa, pushed(end.earlier_kpa, end.before_kpa)
+    motion = Motion(end.q, end.velocity, end.law, pressure_kpa, *line)
     path = jax.tree.map(lambda x: x[::n_steps], path)
     return motion, MotionEnd.of(motion, Path.at(frames_of(model, data), spring_m), path)
 

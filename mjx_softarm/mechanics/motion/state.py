@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
-from mjx_softarm import control, pneumatics
+from mjx_softarm import control
 from mjx_softarm._support.errors import Result
 from mjx_softarm._support.mjx import mjx
 from mjx_softarm.mechanics.kinematics import Frames
 from mjx_softarm.mechanics.params import ArmParams
+from mjx_softarm.pneumatics import PAPER_PUMP, Actuators, Pump, Regulator
 
 CREEP_M_PER_S = 0.005  # rate of a chamber's length below which its dry friction fades
 LONGEST_M = 1.0  # spring length that only a diverging simulation reaches
+
+# A pump's numbers are static: XLA folds them. A regulator's are traced: they differ between episodes.
+jax.tree_util.register_dataclass(Pump, [], [item.name for item in dataclasses.fields(Pump)])
+jax.tree_util.register_dataclass(Regulator)
 
 
 class MotionResult(Result):
@@ -32,13 +40,31 @@ class Motion(NamedTuple):
     velocity: Array  # (nv,) [m/s, rad/s, rad/s]
     law: control.LawState  # (n_chambers,) each
     pressure_kpa: Array  # (n_chambers,) in the chambers
-    command_kpa: Array  # (n_chambers,) that the valves act on
+    command_kpa: Array  # (n_chambers,) command of the last control period
+    earlier_kpa: Array | None = None  # (k, n_chambers) commands before it, newest first; see `n_earlier`
 
     @classmethod
-    def at_rest(cls, q: Array, pressure_kpa: Array, spring_m: Array) -> Motion:
-        """Return the state of an arm at rest at joint coordinates (nv,), with its pressures and springs."""
-        law = control.LawState.at_rest(pressure_kpa, spring_m)
-        return cls(q, jnp.zeros_like(q), law, pressure_kpa, pressure_kpa)
+    def at_rest(
+        cls,
+        q: Array,
+        pressure_kpa: Array,
+        spring_m: Array,
+        n_earlier: int = 0,
+        offset_kpa: Array | float | None = None,
+    ) -> Motion:
+        """Return the state of an arm at rest.
+
+        Args:
+            q (nv,): joint coordinates.
+            pressure_kpa (n_chambers,): pressures in the chambers.
+            spring_m (n_springs,): spring lengths.
+            n_earlier: number of commands before the last one.
+            offset_kpa (n_chambers,): pressures at rest less their commands; None for none.
+        """
+        command = pressure_kpa if offset_kpa is None else pressure_kpa - offset_kpa
+        earlier = jnp.tile(command, (n_earlier, 1)) if n_earlier else None
+        law = control.LawState.at_rest(command, spring_m)
+        return cls(q, jnp.zeros_like(q), law, pressure_kpa, command, earlier)
 
 
 class Path(NamedTuple):
@@ -83,8 +109,9 @@ class MotionParams(NamedTuple):
     """Parameters of an arm that only affect motion."""
 
     damping: Array | float = 1.0  # () factor of all dampers
-    delay_s: Array | float = pneumatics.VALVE_S  # () dead time of the valves, at most a control period
+    delay_s: Array | float = PAPER_PUMP.delay_s  # () or (n_chambers,) dead time of the actuators
     friction_n: Array | float = 0.0  # () dry friction of each chamber
+    actuators: Actuators = PAPER_PUMP
 
 
 class MovingArm(NamedTuple):
@@ -100,6 +127,51 @@ class MovingArm(NamedTuple):
         mass = jnp.concatenate([jnp.zeros(1), self.params.link_mass_kg, self.params.tool_mass_kg])
         scale = jnp.where(self.model.body_mass > 0, mass / jnp.maximum(self.model.body_mass, 1e-9), 0.0)
         return self.model.replace(body_mass=mass, body_inertia=self.model.body_inertia * scale[:, None])
+
+
+def n_earlier(delay_s: float, period_s: float) -> int:
+    """Return the number of commands before the last one that a dead time of up to delay_s keeps waiting."""
+    return max(math.ceil(delay_s / period_s - 1e-6) - 1, 0)
+
+
+def pushed(earlier_kpa: Array | None, command_kpa: Array) -> Array | None:
+    """Return the commands (k, n_chambers) before the last one, once command_kpa (n_chambers,) is among them."""
+    if earlier_kpa is None:
+        return None
+    return jnp.concatenate([command_kpa[None], earlier_kpa[:-1]])
+
+
+def in_force(
+    command_kpa: Array,
+    before_kpa: Array,
+    earlier_kpa: Array | None,
+    k: Array | int,
+    h: float,
+    delay_s: Array | float,
+    period_s: float,
+) -> Array:
+    """Return the mean command (n_chambers,) that actuators act on in an interval of a control period.
+
+    Args:
+        command_kpa (n_chambers,): command of this control period.
+        before_kpa (n_chambers,): command of the control period before.
+        earlier_kpa (m, n_chambers): commands before that one, newest first; None: none is in force any more.
+        k: index of the interval.
+        h: length of the interval, no longer than a control period.
+        delay_s () or (n_chambers,): dead time.
+        period_s: control period.
+    """
+    # Share of the interval after the dead time, in which the new command is in force
+    new = jnp.clip(k + 1.0 - delay_s / h, 0.0, 1.0)
+    if earlier_kpa is None:
+        return before_kpa + new * (command_kpa - before_kpa)
+
+    # Each command is in force from its dead time on; the oldest one was before all others
+    line = jnp.concatenate([command_kpa[None], before_kpa[None], earlier_kpa])
+    age_s = period_s * jnp.arange(len(line) - 1)[:, None]
+    left_s = jnp.broadcast_to(delay_s, command_kpa.shape)[None] - age_s
+    share = jnp.clip(k + 1.0 - left_s / h, 0.0, 1.0)  # (m + 1, n_chambers)
+    return line[-1] + jnp.sum(share * (line[:-1] - line[1:]), axis=0)
 
 
 def friction_damping(friction_n: Array | float, rate: Array) -> Array:
