@@ -26,7 +26,7 @@ from mjx_softarm._support.fields import PerChamber, Rule, anything, positive, ru
 from mjx_softarm._support.xp import Array, array_namespace
 
 ATMOSPHERE_KPA = 101.325
-LONGEST_DELAY_S = 2.0  # longest dead time of an actuator; the state of a motion holds the commands of this time
+LONGEST_DELAY_S = 2.0  # longest dead time; the state of an arm in motion holds the commands of this time
 
 
 def volume_m3(length_m: Array, area_m2: Array, slope_m: Array, rest_m: Array | float) -> Array:

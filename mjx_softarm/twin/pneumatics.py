@@ -33,7 +33,8 @@ class Pneumatics:
         self._bellows = area_m2, slope_m, rest_m
         self._timestep_s, self._actuators = timestep_s, actuators
         self._chamber = np.arange(len(length_m))
-        self._wait = np.round(np.full(len(length_m), actuators.delay_s) / timestep_s).astype(int)  # (n,) steps
+        delay_s = np.full(len(length_m), actuators.delay_s)
+        self._wait = np.round(delay_s / timestep_s).astype(int)  # (n,) steps
         self.hold(np.zeros(len(length_m)), length_m)
 
     def hold(self, pressure_kpa: np.ndarray, length_m: np.ndarray) -> None:

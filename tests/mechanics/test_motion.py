@@ -25,7 +25,6 @@ from mjx_softarm.mechanics.motion.state import (
 from mjx_softarm.mechanics.params import PAYLOAD, ArmParams
 from mjx_softarm.mechanics.statics import all_tendons
 from mjx_softarm.mechanics.workspace import settle_many
-from mjx_softarm.pneumatics import Regulator
 from mjx_softarm.twin.pneumatics import Pneumatics
 
 SPEC = ArmSpec.default()

@@ -101,9 +101,7 @@ def _at(arm: MovingArm, q: Array) -> tuple[Frames, Tendons]:
     return frames, all_tendons(frames, arm.params)
 
 
-def _step(
-    arm: MovingArm, motion: Motion, command_kpa: Array, k: int, h: float, period_s: float
-) -> Motion:
+def _step(arm: MovingArm, motion: Motion, command_kpa: Array, k: int, h: float, period_s: float) -> Motion:
     """Take the k-th step, of length h [s], of a control period with commanded pressures (n_chambers,)."""
     # Middle of the step, as the velocity at its start predicts it
     v, params = motion.velocity, arm.params

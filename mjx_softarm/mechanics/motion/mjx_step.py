@@ -87,9 +87,7 @@ def advance(
         now = jax.tree.map(lambda x, y: jnp.where(k == 0, x, y), new, now)
 
         # The actuators act on the commands whose dead time is over
-        told_kpa = in_force(
-            now.command_kpa, now.before_kpa, now.earlier_kpa, k, h, arm.own.delay_s, period_s
-        )
+        told_kpa = in_force(now.command_kpa, now.before_kpa, now.earlier_kpa, k, h, arm.own.delay_s, period_s)
         gas_m3 = arm.own.actuators.fill(now.gas_m3, volume, told_kpa, h)
 
         # MJX's own step
