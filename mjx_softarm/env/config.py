@@ -36,9 +36,9 @@ class Randomisation:
     stiffness_spread: float = 0.0  # each chamber's stiffness is multiplied by 1 + uniform(-spread, spread)
     sensor_noise_mm: float = 0.0  # standard deviation of each spring's reading, fixed within an episode
     damping_spread: float = 0.0  # in motion, all dampers are multiplied by 1 + uniform(-spread, spread)
-    delay_max_s: float = 0.0  # in motion, the dead time is uniform from the actuators' to this much more
+    delay_max_s: float = 0.0  # in motion, dead times are uniform from the actuators' to this much more
     regulator_spread: float = 0.0
-    """in motion, a regulator's lag, dead time and rates are each multiplied by 1 + uniform(-spread, spread)"""
+    """in motion, lag, dead time and rates of regulators are multiplied by 1 + uniform(-spread, spread)"""
     friction_max_n: float = 0.0  # in motion, each chamber's dry friction is uniform from 0 to this
 
     def __post_init__(self):

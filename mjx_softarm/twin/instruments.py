@@ -32,7 +32,7 @@ class Build(NamedTuple):
     """Scales of a twin's deviations from an ideal arm; tests set some of them to zero."""
 
     gap: float = GAP  # scale of the tolerances
-    losses: float = 1.0  # scale of hysteresis and joint friction; a rod has neither
+    losses: float = 1.0  # scale of hysteresis and joint friction; of a rod, scale of the regulators' deadband
     noise: float = 1.0  # scale of the noise of all sensors
     per_section: int | None = None  # links or elements per section; None: the twin's own number
 

@@ -2,8 +2,8 @@
 
 The arm is a rod of `mjx_softarm.twin.rod`: it bends, shears, twists and extends without joints. Its
 chambers harden, its base is tilted, its sections are rolled against each other, and motion capture's frame
-of the tip is turned against the last plate and offset from its centre. Regulators follow their commands
-with a lag. There is no pump, no hysteresis and no inertia. Readings, noise and clock are those of `Twin`.
+of the tip is turned against the last plate and offset from its centre. Its chambers have regulators, whatever
+the specification has. There is no hysteresis and no inertia. Readings, noise and clock are those of `Twin`.
 Parts are drawn from the seed.
 
 The gap is that of `Twin`, and the tolerances for base, roll and springs are the same. At the spring lengths
@@ -20,6 +20,7 @@ import numpy as np
 
 from mjx_softarm._support.fields import PerChamber, PerSection
 from mjx_softarm.deploy.arm_io import Capture
+from mjx_softarm.pneumatics import Regulator
 from mjx_softarm.sensing.pose import quaternion_from_rotation, rotation_about
 from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.spec import ArmSpec
@@ -33,10 +34,18 @@ from mjx_softarm.twin.instruments import (
     checked_pressures,
     drawn,
 )
+from mjx_softarm.twin.pneumatics import Pneumatics
 from mjx_softarm.twin.rod import Rod, RodParts
 
 ELEMENTS_PER_SECTION = 6  # tip within 0.2 mm of that with twelve elements
-REGULATOR_S = 0.1  # time constant of the pressures
+AIR_STEPS = 4  # time steps of the chambers' air in a control period
+# Bounds of a rod's regulators: about those of the public logs of a real arm, see `benchmarks regulators`.
+# Rates and deadband are in proportion to the arm's range of pressures. Lag and rates are those of a chamber
+# of constant length. A chamber expands as it fills: the pressures of the paper's arm change half as fast.
+LAG_S, DEAD_TIME_S = (0.15, 0.6), (0.05, 0.25)
+FILL_PER_S, VENT_PER_S = (1.4, 2.8), (0.8, 1.8)  # in ranges of pressure
+DEADBAND = (1 / 600, 4 / 600)  # in ranges of pressure; 0.1 to 0.4 kPa of the paper's arm
+CHAMBER_SPREAD = 0.1  # lag, dead time and rates of a chamber differ from the rod's by up to this share
 
 
 @dataclass(frozen=True)
@@ -91,29 +100,34 @@ class RodTwin(InstrumentedArm):
         super().__init__(_sensor(rng, self._spec, std), seed, session, build.noise)
         parts = draw_rod(rng, self._spec, std, self._base_rotation[2])
         self._rod = Rod(parts, self._per_section)
-        self._pressure_kpa = np.zeros(self._spec.n_chambers)
-        self.time_s = 0.0
+        self._period_s, self.time_s = 1.0 / self._spec.control.rate_hz, 0.0
+        bellows = [1e-3 * parts.area.ravel(), 1e-3 * parts.area_slope.ravel()]
+        bellows += [self._spec.at_chambers(self._spec.geometry.section_length_m), self._rod.chamber_lengths()]
+        regulator = draw_regulator(seed, self._spec, build.losses)
+        self._air = Pneumatics(*bellows, self._period_s / AIR_STEPS, regulator)
         self.attach(payload_kg)
-        self._rod.settle(self._pressure_kpa)
+        self.settle(np.zeros(self._spec.n_chambers))
 
     def write_pressures(self, pressure_kpa: np.ndarray) -> None:
         """Command pressures (n,) [kPa], then let one control period pass; see `ArmIO`."""
-        command = checked_pressures(pressure_kpa, self._spec)
-        period_s = 1.0 / self._spec.control.rate_hz
-        self._pressure_kpa += -np.expm1(-period_s / REGULATOR_S) * (command - self._pressure_kpa)
-        self._rod.step(self._pressure_kpa, period_s)
-        self.time_s += period_s
+        self._air.command(checked_pressures(pressure_kpa, self._spec))
+        length_m = self._rod.chamber_lengths()
+        for _ in range(AIR_STEPS):
+            self._air.step(length_m)
+        self._rod.step(self._air.pressure_kpa, self._period_s)
+        self.time_s += self._period_s
 
     def settle(self, pressure_kpa: np.ndarray) -> None:
         """Move to rest at pressures (n,) [kPa] without time passing."""
-        self._pressure_kpa = checked_pressures(pressure_kpa, self._spec)
-        self._rod.settle(self._pressure_kpa)
+        pressure_kpa = checked_pressures(pressure_kpa, self._spec)
+        self._rod.settle(pressure_kpa)
+        self._air.hold(pressure_kpa, self._rod.chamber_lengths())
 
     def _lengths_m(self) -> np.ndarray:
         return self._rod.spring_lengths()
 
     def _true_kpa(self) -> np.ndarray:
-        return self._pressure_kpa
+        return self._air.pressure_kpa
 
     def motion_capture(self) -> Capture:
         """Return the tip, and markers in the rod at each third of a section, from the base to the tip."""
@@ -185,6 +199,31 @@ def draw_rod(rng: np.random.Generator, spec: ArmSpec, std: RodTolerances, up: np
         tool_mass_kg=np.array([spec.mass.gripper_kg, 0.0]),
         tool_offset_m=spec.mass.gripper_length_m * np.array([0.5, 1.0]),
         up=up,
+    )
+
+
+def draw_regulator(seed: int, spec: ArmSpec, deadband: float = 1.0) -> Regulator:
+    """Draw the regulators of a rod, with random numbers of their own.
+
+    Args:
+        seed: seed of the rod.
+        spec: arm, for its chambers and its range of pressures.
+        deadband: factor of the deadband.
+    """
+    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1,)))
+    range_kpa = spec.chambers.pressure_max_kpa - spec.chambers.pressure_min_kpa
+
+    def each(bounds: tuple[float, float]) -> np.ndarray:
+        """Draw a number of the rod, and a number near it for each chamber (n,)."""
+        own = rng.uniform(*bounds)
+        return own * rng.uniform(1.0 - CHAMBER_SPREAD, 1.0 + CHAMBER_SPREAD, spec.n_chambers)
+
+    return Regulator(
+        lag_s=each(LAG_S),
+        dead_time_s=each(DEAD_TIME_S),
+        fill_kpa_per_s=range_kpa * each(FILL_PER_S),
+        vent_kpa_per_s=range_kpa * each(VENT_PER_S),
+        deadband_kpa=deadband * range_kpa * each(DEADBAND),
     )
 
 

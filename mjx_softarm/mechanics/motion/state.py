@@ -135,7 +135,7 @@ def n_earlier(delay_s: float, period_s: float) -> int:
 
 
 def pushed(earlier_kpa: Array | None, command_kpa: Array) -> Array | None:
-    """Return commands (k, n_chambers) of earlier control periods, command_kpa (n_chambers,) being the newest."""
+    """Return earlier commands (k, n_chambers) with command_kpa (n_chambers,) as their newest."""
     if earlier_kpa is None:
         return None
     return jnp.concatenate([command_kpa[None], earlier_kpa[:-1]])
