@@ -56,17 +56,24 @@ class Allocation(NamedTuple):
 def allocation(spec: ArmSpec) -> Allocation | None:
     """Return the matrices of an arm in float64; None where each section has three chambers.
 
-    A row of a section's matrix A is [1, x, y] for the direction of a chamber, or of a spring. Then
-    C = A_chambers pinv(A_springs) and N = 1 - A_chambers pinv(A_chambers). Turning a section changes neither.
+    With A of `planes`, C = A_chambers pinv(A_springs) and N = 1 - A_chambers pinv(A_chambers).
     """
     n = spec.structure.chambers_per_section
     if n == 3:
         return None
-    angle = 2 * np.pi * np.arange(n) / n
-    chambers = np.stack([np.ones(n), np.cos(angle), np.sin(angle)], axis=-1)
-    springs = chambers[:: n // spec.springs_per_section]
+    chambers, springs = planes(n), planes(spec.springs_per_section)
     section = chambers @ np.linalg.pinv(springs), np.eye(n) - chambers @ np.linalg.pinv(chambers)
     return Allocation(*(np.kron(np.eye(spec.structure.n_sections), matrix) for matrix in section))
+
+
+def planes(n: int) -> np.ndarray:
+    """Return a section's matrix A (n, 3): [1, x, y] for the direction of each chamber, or of each spring.
+
+    The directions are those of a section whose first chamber is on x; turning the section changes neither C
+    nor N.
+    """
+    angle = 2 * np.pi * np.arange(n) / n
+    return np.stack([np.ones(n), np.cos(angle), np.sin(angle)], axis=-1)
 
 
 class Gains(NamedTuple):
@@ -136,13 +143,18 @@ def pressures(
     error_m, change_m = on_its_way_m - length_m, smooth_m - state.length_m
     if gains.allocation is not None:
         error_m = allocated_error(error_m, state.integral_kpa, gains.allocation)
-        change_m = _times(gains.allocation.chamber_error, change_m)
+        change_m = at_chambers(change_m, gains.allocation)
 
     # Integral and pressure, within the limits
     integral_kpa = xp.clip(state.integral_kpa + gains.ki_kpa_per_ms * dt_s * error_m, low, high)
     damping_kpa = gains.kd_kpa_s_per_m / dt_s * change_m
     pressure_kpa = xp.clip(integral_kpa + gains.kp_kpa_per_m * error_m - damping_kpa, low, high)
     return pressure_kpa, LawState(integral_kpa, on_its_way_m, smooth_m)
+
+
+def at_chambers(error_m: Array, allocation: Allocation | None) -> Array:
+    """Return errors (..., n_chambers) [m] at the chambers from those of the springs (..., n_springs)."""
+    return error_m if allocation is None else _times(allocation.chamber_error, error_m)
 
 
 def allocated_error(error_m: Array, pressure_kpa: Array, allocation: Allocation) -> Array:
@@ -154,7 +166,7 @@ def allocated_error(error_m: Array, pressure_kpa: Array, allocation: Allocation)
         allocation: matrices of the arm.
     """
     redundant_kpa = _times(allocation.redundant, pressure_kpa)
-    return _times(allocation.chamber_error, error_m) - YIELD_M_PER_KPA * redundant_kpa
+    return at_chambers(error_m, allocation) - YIELD_M_PER_KPA * redundant_kpa
 
 
 def _times(matrix: Array, vector: Array) -> Array:

@@ -18,31 +18,46 @@ N, DT_S = SPEC.n_chambers, 1.0 / SPEC.control.rate_hz
 SENSOR = SPEC.spring_sensor
 LOW_KPA, HIGH_KPA = SPEC.chambers.pressure_min_kpa, SPEC.chambers.pressure_max_kpa
 REST_M = 0.2
-# A chamber lengthens its own spring and, by bending, shortens its section's others.
-GAIN_M_PER_KPA = np.kron(np.eye(3), np.full((3, 3), -3e-4) + 1.8e-3 * np.eye(3))
 NOISE_M = 4e-5
 LAG = 0.15  # of the way to the commanded pressure, per tick
+
+
+def gain_of(spec):
+    """Lengths of springs per pressure (n_springs, n_chambers) [m/kPa].
+
+    A chamber lengthens the springs beside it and, by bending, shortens its section's others.
+    """
+    n = spec.structure.chambers_per_section
+    angle = 2 * np.pi * np.arange(n) / n
+    near = np.cos(angle[:: n // spec.springs_per_section, None] - angle)
+    return np.kron(np.eye(spec.structure.n_sections), 3 / n * (3e-4 + 1.2e-3 * near))
+
+
+GAIN_M_PER_KPA = gain_of(SPEC)
 
 
 class LinearArm:
     """Springs that follow the pressures linearly, with a lag, on a clock of its own."""
 
-    def __init__(self, noise_m=NOISE_M, sensor=SENSOR):
-        self.time_s, self.noise_m, self.sensor = 0.0, noise_m, sensor
-        self.command_kpa = self.actual_kpa = np.zeros(N)
+    def __init__(self, noise_m=NOISE_M, sensor=None, spec=SPEC):
+        self.time_s, self.noise_m, self.sensor = 0.0, noise_m, sensor or spec.spring_sensor
+        self.command_kpa = self.actual_kpa = np.zeros(spec.n_chambers)
         self.written = []
         self._rng = np.random.default_rng(0)
+        self._rest_m, self._gain = spec.at_springs(spec.geometry.section_length_m), gain_of(spec)
 
     @property
     def spring_m(self):
-        return REST_M + GAIN_M_PER_KPA @ self.actual_kpa
+        return self._rest_m + self._gain @ self.actual_kpa
 
     @property
     def tick(self):
         return round(self.time_s / DT_S)
 
     def read_sensors(self):
-        return self.sensor.readings(self.spring_m + self.noise_m * self._rng.standard_normal(N))
+        return self.sensor.readings(
+            self.spring_m + self.noise_m * self._rng.standard_normal(len(self._rest_m))
+        )
 
     def write_pressures(self, pressure_kpa):
         self.command_kpa = np.array(pressure_kpa)
@@ -57,12 +72,13 @@ class LinearArm:
 class Leaking(LinearArm):
     """A chamber falls to atmospheric pressure."""
 
-    def __init__(self, tick):
-        super().__init__()
+    def __init__(self, tick, spec=SPEC):
+        super().__init__(spec=spec)
         self.leaks_from = tick
 
     def holds(self, pressure_kpa):
-        return np.where((np.arange(N) == 3) & (self.tick >= self.leaks_from), 0.0, pressure_kpa)
+        leaks = (np.arange(len(pressure_kpa)) == 3) & (self.tick >= self.leaks_from)
+        return np.where(leaks, 0.0, pressure_kpa)
 
 
 class Blind(LinearArm):
@@ -83,44 +99,49 @@ def nan(readings):
 
 def make_policy(spec=SPEC):
     """A policy whose estimator and spring model are exact for the linear arm; its actor is not looked at."""
-    centre = np.zeros(N, np.float32)
-    angle = np.pi / 2 + 2 * np.pi * np.arange(N).reshape(3, 3) / 3
-    site = SPEC.geometry.spring_radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    n, n_sections = spec.n_springs, spec.structure.n_sections
+    springs, chambers = np.zeros(n, np.float32), np.zeros(spec.n_chambers, np.float32)
+    rest_m, gain = spec.at_springs(spec.geometry.section_length_m), gain_of(spec)
+    n_in, n_out = n + 3 * n_sections, 6 * n_sections
+    first_rad = np.radians(spec.per_section(spec.geometry.first_chamber_deg))
+    angle = first_rad[:, None] + 2 * np.pi * np.arange(n // n_sections) * n_sections / n
+    radius_m = np.array(spec.per_section(spec.geometry.spring_radius_m))
+    site_m = radius_m[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     network = PoseEstimator(
-        layers=((np.zeros((2 * N, 18), np.float32), np.zeros(18, np.float32)),),
-        load_layers=((np.zeros((2 * N + 1, 18), np.float32), np.zeros(18, np.float32)),),
-        spring_site_m=site.astype(np.float32),
-        spring_centre_m=centre,
-        spring_scale_m=centre + 1,
+        layers=((np.zeros((n_in, n_out), np.float32), np.zeros(n_out, np.float32)),),
+        load_layers=((np.zeros((n_in + 1, n_out), np.float32), np.zeros(n_out, np.float32)),),
+        spring_site_m=site_m.astype(np.float32),
+        spring_centre_m=springs,
+        spring_scale_m=springs + 1,
         load_centre_kg=np.float32(0.0),
         load_scale_kg=np.float32(1.0),
         change_scale=np.ones(6, np.float32),
     )
     load = LoadEstimator(
-        layers=((np.zeros((2 * N, 1), np.float32), np.zeros(1, np.float32)),),
-        spring_centre_m=centre,
-        spring_scale_m=centre + 1,
-        pressure_centre_kpa=centre,
-        pressure_scale_kpa=centre + 1,
+        layers=((np.zeros((n + spec.n_chambers, 1), np.float32), np.zeros(1, np.float32)),),
+        spring_centre_m=springs,
+        spring_scale_m=springs + 1,
+        pressure_centre_kpa=chambers,
+        pressure_scale_kpa=chambers + 1,
         load_scale_kg=np.float32(1.0),
     )
     model = SpringModel(
-        layers=((GAIN_M_PER_KPA.astype(np.float32), np.zeros(N, np.float32)),),
-        pressure_centre_kpa=centre,
-        pressure_scale_kpa=centre + 1,
-        spring_centre_m=centre + np.float32(REST_M),
-        spring_scale_m=centre + 1,
+        layers=((gain.T.astype(np.float32), springs),),
+        pressure_centre_kpa=chambers,
+        pressure_scale_kpa=chambers + 1,
+        spring_centre_m=rest_m.astype(np.float32),
+        spring_scale_m=springs + 1,
     )
     rng = np.random.default_rng(1)
     return Policy(
-        layers=((np.zeros((18, N), np.float32), np.zeros(N, np.float32)),),
-        obs_scale=ObsScale(*(np.asarray(value, float) for value in ObsScale.from_spec(SPEC))),
+        layers=((np.zeros((18, n), np.float32), springs),),
+        obs_scale=ObsScale(*(np.asarray(value, float) for value in ObsScale.from_spec(spec))),
         reward=RewardConfig(),
         actions=ActionMap.from_spec(spec),
-        gains=Gains.from_spec(SPEC),
-        rate_hz=SPEC.control.rate_hz,
+        gains=Gains.from_spec(spec),
+        rate_hz=spec.control.rate_hz,
         spec=spec,
-        workspace=estimate(network, REST_M + rng.uniform(-30, 15, (2000, N)) @ GAIN_M_PER_KPA.T, 0.0),
+        workspace=estimate(network, rest_m + rng.uniform(-30, 15, (2000, spec.n_chambers)) @ gain.T, 0.0),
         estimator=network,
         load_estimator=load,
         spring_model=model,

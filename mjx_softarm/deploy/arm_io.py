@@ -1,10 +1,11 @@
 """Interface of an arm's driver, which a real arm and its twin both implement.
 
-A driver is a class without arguments. Of an arm with n springs and n chambers (9 of the paper's arm), it has
+A driver is a class without arguments. Of an arm with n springs and c chambers (9 each of the paper's arm) it
+has
 
     read_sensors() -> (n,)           needed    readings, in the unit of the specification's sensor
-    write_pressures((n,))            needed    pressures to regulate to [kPa]
-    pressures() -> (n,)              optional  pressures measured [kPa], logged in place of those commanded
+    write_pressures((c,))            needed    pressures to regulate to [kPa]
+    pressures() -> (c,)              optional  pressures measured [kPa], logged in place of those commanded
     motion_capture() -> Capture      optional  tip (3,), (4,), markers (m, 3), springs (n,); for calibration
     time_s                           optional  clock [s] of a simulated arm, for which no tick waits
 
@@ -21,7 +22,7 @@ import numpy as np
 
 
 class ArmIO(Protocol):
-    """Sensors and pumps of one arm with n springs and n chambers, both numbered as in the model.
+    """Sensors and pumps of one arm with n springs and c chambers, both numbered as in the model.
 
     The control loop calls `read_sensors`, then `write_pressures`, once per tick of the policy's `rate_hz`,
     from one thread. Neither repeats a failed exchange, nor puts old or made-up values in its place: the loop
@@ -47,7 +48,7 @@ class ArmIO(Protocol):
         The call returns once the values are handed over; it does not wait for the chambers to fill.
 
         Args:
-            pressure_kpa (n,) [kPa]: relative to the atmosphere, negative for vacuum.
+            pressure_kpa (c,) [kPa]: relative to the atmosphere, negative for vacuum.
 
         Raises:
             ValueError: wrong shape, not finite, or beyond what the hardware can stand; nothing was sent.

@@ -16,36 +16,35 @@ from typing import NamedTuple
 import numpy as np
 
 from mjx_softarm._support.xp import Array, array_namespace
-from mjx_softarm.control import Gains, saturated
+from mjx_softarm.control import Allocation, Gains, allocated_error, at_chambers, saturated
 from mjx_softarm.deploy.controller import LOOP, Command, Controller, LoopConfig
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.policy.runtime import tip_pose
 from mjx_softarm.sensing.estimator import SpringModel, expected_springs
 from mjx_softarm.sensing.load import HIGHEST, LOWEST, Load, averaged, estimate_load
 from mjx_softarm.sensing.sensors import Sensor, SensorFault
-from mjx_softarm.spec import N_CHAMBERS_PER_SECTION
 
 
 class Window(NamedTuple):
-    """Last ticks of an arm with n springs and chambers, the newest last."""
+    """Last ticks of an arm, the newest last."""
 
-    spring_m: np.ndarray  # (ticks, n) lengths
-    pressure_kpa: np.ndarray  # (ticks, n) in force
-    chamber_kpa: np.ndarray  # (ticks, n) measured, or in force where none was measured
+    spring_m: np.ndarray  # (ticks, n_springs) lengths
+    pressure_kpa: np.ndarray  # (ticks, n_chambers) in force
+    chamber_kpa: np.ndarray  # (ticks, n_chambers) measured, or in force where none was measured
 
 
 @dataclass(frozen=True, eq=False)
 class Belief:
-    """Belief about an arm with n springs and chambers."""
+    """Belief about an arm."""
 
     controller: Controller  # with the arm's models
     command: Command  # in force as the readings were taken
     window: Window
-    spring_m: np.ndarray  # (n,) lengths, the last good ones; NaN before the first
-    lost: np.ndarray  # (n,) bool: a spring without a reading in this tick
-    stuck: np.ndarray  # (n,) bool: a spring that stands stock-still where it should not
-    suspect: np.ndarray  # (n,) bool: a chamber that seems to have lost its pressure
-    saturated: np.ndarray  # (n,) bool: a chamber at its limit with its spring, in the mean, off the reference
+    spring_m: np.ndarray  # (n_springs,) lengths, the last good ones; NaN before the first
+    lost: np.ndarray  # (n_springs,) bool: a spring without a reading in this tick
+    stuck: np.ndarray  # (n_springs,) bool: a spring that stands stock-still where it should not
+    suspect: np.ndarray  # (n_chambers,) bool: a chamber that seems to have lost its pressure
+    saturated: np.ndarray  # (n_chambers,) bool: a chamber at its limit, off its reference in the mean
     load: Load  # payload
     at_rest: bool = False  # nothing has moved for a window; one after the last action, at the earliest
     settled: bool = False  # at rest with each spring on its reference, or its chamber at a limit
@@ -56,9 +55,13 @@ class Belief:
     @classmethod
     def none(cls, controller: Controller) -> Belief:
         """Return the belief before the first tick."""
-        n, load = controller.policy.spec.n_chambers, Load(controller.policy.spec.mass.payload_kg)
-        no, window = np.zeros(n, bool), Window(*np.empty((3, 0, n)))
-        return cls(controller, Command.none(n), window, np.full(n, np.nan), no, no, no, no, load)
+        spec = controller.policy.spec
+        n_springs, n_chambers = spec.n_springs, spec.n_chambers
+        window = Window(*(np.empty((0, n)) for n in (n_springs, n_chambers, n_chambers)))
+        springs, chambers = np.zeros(n_springs, bool), np.zeros(n_chambers, bool)
+        masks = springs, springs, chambers, chambers
+        unknown_m, load = np.full(n_springs, np.nan), Load(spec.mass.payload_kg)
+        return cls(controller, Command.none(spec), window, unknown_m, *masks, load)
 
     @property
     def pose(self) -> np.ndarray:
@@ -82,7 +85,7 @@ class Belief:
 
     @property
     def mean_m(self) -> np.ndarray:
-        """Mean lengths (n,) [m] over the window."""
+        """Mean lengths (n_springs,) [m] over the window."""
         return self.window.spring_m.mean(axis=0)
 
 
@@ -103,34 +106,36 @@ def believe(
     seen_kpa = np.full_like(in_force_kpa, np.nan) if measured_kpa is None else measured_kpa
     tick = spring_m, in_force_kpa, np.where(np.isfinite(seen_kpa), seen_kpa, in_force_kpa)
     rows = (np.concat([old[1 - size :], new[None]]) for old, new in zip(last.window, tick, strict=True))
-    window, no = Window(*rows), np.zeros(len(spring_m), bool)
-    belief = Belief(controller, command, window, spring_m, lost, no, no, no, last.load, why_lost=why)
+    window, spring, chamber = Window(*rows), np.zeros_like(last.stuck), np.zeros_like(last.suspect)
+    masks = lost, spring, chamber, chamber
+    belief = Belief(controller, command, window, spring_m, *masks, last.load, why_lost=why)
     springs_m, mean_m = window.spring_m, belief.mean_m
 
     # Rest, and trust in sensors and chambers
     if len(springs_m) == size:
         at_rest = command.n_ticks >= size and bool(still(springs_m, config))
-        stuck = stuck_springs(springs_m, window.pressure_kpa, config)
+        n_sections = policy.spec.structure.n_sections
+        stuck = stuck_springs(springs_m, window.pressure_kpa, n_sections, config)
         belief = replace(belief, at_rest=at_rest, stuck=stuck)
     if asked_m is not None and belief.known:
         on = belief.at_rest and bool(on_reference(springs_m, asked_m, in_force_kpa, gains, tolerance_m))
         mask = saturated(in_force_kpa, asked_m, mean_m, gains, tolerance_m)
         suspect = saturated(in_force_kpa, asked_m, spring_m, gains, tolerance_m)
         if suspect.any():
-            suspect &= as_without(policy.spring_model, in_force_kpa, spring_m, config)
+            suspect &= as_without(policy.spring_model, in_force_kpa, spring_m, config, gains.allocation)
         belief = replace(belief, settled=on, saturated=mask, suspect=suspect)
 
     # Payload, of windows that do not overlap
     belief = replace(belief, n_unweighed=last.n_unweighed + 1)
-    doubtful = belief.lost | belief.stuck | belief.suspect
-    if belief.at_rest and belief.n_unweighed >= size and not doubtful.any():
+    doubtful = belief.lost.any() or belief.stuck.any() or belief.suspect.any()
+    if belief.at_rest and belief.n_unweighed >= size and not doubtful:
         load, estimate_kg = _weighed(policy, last.load, mean_m, window.chamber_kpa.mean(axis=0))
         belief = replace(belief, load=load, estimate_kg=estimate_kg, n_unweighed=0)
     return belief
 
 
 def _weighed(policy: Policy, load: Load, mean_m: np.ndarray, mean_kpa: np.ndarray) -> tuple[Load, float]:
-    """Return the payload averaged with the estimate of mean springs and pressures (n,) at rest, and this.
+    """Return the payload averaged with the estimate of mean springs and pressures at rest, and this estimate.
 
     An estimate that is no payload leaves the specified one.
     """
@@ -142,7 +147,7 @@ def _weighed(policy: Policy, load: Load, mean_m: np.ndarray, mean_kpa: np.ndarra
 
 
 def pose_of(controller: Controller, spring_m: np.ndarray, load: Load) -> tuple[np.ndarray, float]:
-    """Return the tip pose (6,) [mm, deg] of springs (n,) [m] with a payload, NaN where a length is.
+    """Return the tip pose (6,) [mm, deg] of springs (n_springs,) [m] with a payload, NaN where a length is.
 
     Beside it stands `s2r.extrapolation` of the pose, 0 without a network.
     """
@@ -176,23 +181,40 @@ def on_reference(
 ) -> Array:
     """Return whether each spring is on its reference, in the mean of a window, or its chamber at a limit.
 
-    Lengths (ticks, n) and references (n,) in metres, commanded pressures (n,) in kPa.
+    Springs of an arm with redundant chambers cannot all be on any references: there the error that the law
+    closes at each chamber counts.
+
+    Args:
+        springs_m (ticks, n_springs) [m]: lengths of the last ticks.
+        reference_m (n_springs,) [m]: references.
+        pressure_kpa (n_chambers,) [kPa]: commanded pressures.
+        gains: numbers of the law.
+        tolerance_m: greatest error of a spring that counts as on its reference.
     """
     xp = array_namespace(springs_m, reference_m, pressure_kpa)
-    off_m = xp.abs(xp.mean(springs_m, axis=0) - reference_m)
+    off_m = xp.mean(springs_m, axis=0) - reference_m
+    if gains.allocation is not None:
+        off_m = allocated_error(-off_m, pressure_kpa, gains.allocation)
     at_limit = (pressure_kpa <= gains.pressure_min_kpa) | (pressure_kpa >= gains.pressure_max_kpa)
-    return xp.all((off_m < tolerance_m) | at_limit)
+    return xp.all((xp.abs(off_m) < tolerance_m) | at_limit)
 
 
-def stuck_springs(spring_m: Array, pressure_kpa: Array, config: LoopConfig = LOOP) -> Array:
-    """Return which springs (n,) stand stock-still, noise included, where they should move.
+def stuck_springs(spring_m: Array, pressure_kpa: Array, n_sections: int, config: LoopConfig = LOOP) -> Array:
+    """Return which springs (n_springs,) stand stock-still, noise included, where they should move.
 
-    They should move if their chamber was driven or a spring of their section moved. Lengths [m] and commanded
-    pressures [kPa] are those of the last ticks (ticks, n).
+    They should move if the chamber beside them was driven or a spring of their section moved.
+
+    Args:
+        spring_m (ticks, n_springs) [m]: lengths of the last ticks.
+        pressure_kpa (ticks, n_chambers) [kPa]: commanded pressures of these ticks.
+        n_sections: number of sections.
+        config: limits.
     """
-    xp, driven = array_namespace(spring_m), _range(pressure_kpa) > config.stuck_pressure_kpa
-    section_m = xp.max(_range(spring_m).reshape(-1, N_CHAMBERS_PER_SECTION), axis=1)[:, None]  # (sections, 1)
-    near_m = (section_m + np.zeros(N_CHAMBERS_PER_SECTION)).reshape(-1)  # (n,)
+    xp, n_springs = array_namespace(spring_m), spring_m.shape[1]
+    beside_kpa = pressure_kpa[:, :: pressure_kpa.shape[1] // n_springs]  # every k-th chamber has a spring
+    driven = _range(beside_kpa) > config.stuck_pressure_kpa
+    section_m = xp.max(_range(spring_m).reshape(n_sections, -1), axis=1)[:, None]  # (n_sections, 1)
+    near_m = (section_m + np.zeros(n_springs // n_sections)).reshape(-1)  # (n_springs,)
     return (_range(spring_m) < config.stuck_range_m) & (driven | (near_m > config.stuck_neighbour_m))
 
 
@@ -202,21 +224,36 @@ def _range(values: Array) -> Array:
     return xp.max(values, axis=0) - xp.min(values, axis=0)
 
 
-def as_without(model: SpringModel, pressure_kpa: Array, spring_m: Array, config: LoopConfig = LOOP) -> Array:
-    """Return for which chambers (n,) the springs lie as they would without that chamber's pressure.
+def as_without(
+    model: SpringModel,
+    pressure_kpa: Array,
+    spring_m: Array,
+    config: LoopConfig = LOOP,
+    allocation: Allocation | None = None,
+) -> Array:
+    """Return for which chambers (n_chambers,) the springs lie as they would without that chamber's pressure.
 
     The springs' deviations from the model's lengths are then, for the most part, a good share of the
     deviations that the pressure's absence makes. A chamber at its limit with its spring off the reference
-    either is saturated or, if the springs lie so, no longer holds pressure.
+    either is saturated or, if the springs lie so, no longer holds pressure. Redundant chambers make up for a
+    lost one: it is found once one of them is at its limit.
+
+    Args:
+        model: network of the unloaded arm.
+        pressure_kpa (n_chambers,) [kPa]: commanded pressures.
+        spring_m (n_springs,) [m]: lengths.
+        config: shares and effects that count.
+        allocation: matrices of an arm with redundant chambers.
     """
     xp, own = array_namespace(pressure_kpa, spring_m), np.eye(len(pressure_kpa), dtype=bool)
-    pressures_kpa = xp.concat([pressure_kpa[None], xp.where(own, 0.0, pressure_kpa)])  # (1 + n, n)
+    without_kpa = xp.where(own, 0.0, pressure_kpa)  # (n_chambers, n_chambers)
+    pressures_kpa = xp.concat([pressure_kpa[None], without_kpa])
     springs_m = expected_springs(model, pressures_kpa)
-    effect_m = springs_m[1:] - springs_m[0]  # (n chambers, n springs)
-    deviation_m = spring_m - springs_m[0]  # (n,)
-    share = effect_m @ deviation_m / xp.sum(effect_m**2, axis=1)  # (n,)
+    effect_m = springs_m[1:] - springs_m[0]  # (n_chambers, n_springs)
+    deviation_m = spring_m - springs_m[0]  # (n_springs,)
+    share = effect_m @ deviation_m / xp.sum(effect_m**2, axis=1)  # (n_chambers,)
     left_m = deviation_m - share[:, None] * effect_m
     explained = 1.0 - xp.sum(left_m**2, axis=1) / xp.sum(deviation_m**2)
-    own_m = xp.abs(share * xp.sum(xp.where(own, effect_m, 0.0), axis=1))
+    own_m = xp.abs(share * xp.sum(xp.where(own, at_chambers(effect_m, allocation), 0.0), axis=1))
     enough = (share > config.lost_share) & (explained > config.explained_share)
     return enough & (own_m > config.lost_effect_m)

@@ -12,6 +12,7 @@ from mjx_softarm.control import LawState
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.policy.reachable import Reachable
 from mjx_softarm.policy.runtime import PolicyRunner
+from mjx_softarm.spec import ArmSpec
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ class LoopConfig:
     # taken for one that leaks; 95 % of lost chambers are found, 85 % with 500 g.
     lost_share: float = 0.5  # least share of the pressure that the arm's shape lacks
     explained_share: float = 0.7  # least share of the springs' squared deviations that this explains
-    lost_effect_m: float = 0.01  # least change of the own spring; tolerances and payloads look like less
+    lost_effect_m: float = 0.01  # least change at the chamber; tolerances and payloads look like less
     # Windows in a row; by hand. Springs and pressures of an arm that moves come after their references.
     rest_windows: int = 2
     moving_windows: int = 6
@@ -80,7 +81,7 @@ class Controller:
 
     policy: Policy
     reachable: Reachable
-    plan: Plan  # pose and goal (6,), springs (n,) [m], `sensed` of `PolicyRunner.act` -> references (n,) [m]
+    plan: Plan  # pose and goal (6,), springs (n_springs,) [m], `sensed` of `PolicyRunner.act` -> references
     dt_s: float
     window: int  # ticks
     observes_payload: bool
@@ -102,14 +103,15 @@ class Controller:
 
 
 class Command(NamedTuple):
-    """References and pressures in force, for n springs and chambers."""
+    """References and pressures in force."""
 
-    reference_m: np.ndarray | None  # (n,) None: the pressures go to zero
+    reference_m: np.ndarray | None  # (n_springs,) None: the pressures go to zero
     n_ticks: int  # ticks since the references or the goal were new
-    law: LawState  # (n,) each; NaN lengths before the first reading
-    pressure_kpa: np.ndarray  # (n,)
+    law: LawState  # NaN lengths before the first reading
+    pressure_kpa: np.ndarray  # (n_chambers,)
 
     @classmethod
-    def none(cls, n: int) -> Command:
+    def none(cls, spec: ArmSpec) -> Command:
         """Return the command of an arm without pressure."""
-        return cls(None, 0, LawState.at_rest(np.zeros(n), np.full(n, np.nan)), np.zeros(n))
+        zero_kpa, unknown_m = np.zeros(spec.n_chambers), np.full(spec.n_springs, np.nan)
+        return cls(None, 0, LawState.at_rest(zero_kpa, unknown_m), zero_kpa)

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from mjx_softarm.control import Gains, LawState, pressures
+from mjx_softarm.control import Gains, LawState, at_chambers, pressures
 from mjx_softarm.deploy.arm_io import ArmIO
 from mjx_softarm.deploy.belief import read_lengths, still
 from mjx_softarm.deploy.controller import LOOP
@@ -22,13 +22,13 @@ RAMP_M_PER_S = 0.03  # speed of the reference with the longest way
 HELD_M = 1e-4  # largest mean error of a held spring; ten times the mean's noise, 3 mm at the tip at worst
 MEAN_S = 0.2  # time constant of that running mean
 
-# Law: spring lengths (n,) [m], None if one was lost, and pressures in force (n,) [kPa]
+# Law: spring lengths (n_springs,) [m], None if one was lost, and pressures in force (n_chambers,) [kPa]
 # -> pressures to write, and whether the target is reached.
 Law = Callable[[np.ndarray | None, np.ndarray], tuple[np.ndarray, bool]]
 
 
 def ramp(target_kpa: np.ndarray, dt_s: float) -> Law:
-    """Return the law that takes the pressures to targets (n,) [kPa] as slowly as venting does."""
+    """Return the law that takes the pressures to targets (n_chambers,) [kPa] as slowly as venting does."""
     step_kpa = VENT_KPA_PER_S * dt_s
 
     def law(_spring_m: np.ndarray | None, in_force_kpa: np.ndarray) -> tuple[np.ndarray, bool]:
@@ -39,13 +39,13 @@ def ramp(target_kpa: np.ndarray, dt_s: float) -> Law:
 
 
 class Hold:
-    """Sensor-space law from the first lengths to references (n,) [m]."""
+    """Sensor-space law from the first lengths to references (n_springs,) [m]."""
 
     def __init__(self, gains: Gains, reference_m: np.ndarray, dt_s: float):
         self._gains, self._goal_m, self._dt_s = gains, np.asarray(reference_m, float), dt_s
         self.reference_m: np.ndarray | None = None  # on its way; None before the first reading
         self._state: Any = None
-        self._off_m: Any = np.inf  # (n,) running mean of the error
+        self._off_m: Any = np.inf  # (n_springs,) running mean of the error
 
     def __call__(self, spring_m: np.ndarray | None, in_force_kpa: np.ndarray) -> tuple[np.ndarray, bool]:
         # The first lengths are the first references; a lost reading changes nothing.
@@ -62,7 +62,8 @@ class Hold:
             self.reference_m, spring_m, self._state, self._gains, self._dt_s
         )
         self._off_m = self._off_m + self._dt_s / MEAN_S * (spring_m - self._goal_m - self._off_m)
-        return pressure_kpa, steps <= 1.0 and bool(np.all(np.abs(self._off_m) < HELD_M))
+        held = np.abs(at_chambers(self._off_m, self._gains.allocation)) < HELD_M
+        return pressure_kpa, steps <= 1.0 and bool(np.all(held))
 
 
 class Drive:
@@ -76,10 +77,10 @@ class Drive:
 
     def __init__(self, arm: ArmIO, spec: ArmSpec, on_tick: Callable[[dict], None] = lambda row: None):
         self.on_tick = on_tick
-        self.sensor, self.gains = spec.spring_sensor, Gains.from_spec(spec)
+        self.spec, self.sensor, self.gains = spec, spec.spring_sensor, Gains.from_spec(spec)
         self.dt_s = 1.0 / spec.control.rate_hz
         self.window = max(2, round(LOOP.window_s * spec.control.rate_hz))
-        self.link = Link(arm, spec.n_chambers, self.dt_s)
+        self.link = Link(arm, spec, self.dt_s)
         self.n_lost = 0
 
     def to_rest(
@@ -101,7 +102,7 @@ class Drive:
             ArmFault: the arm cannot be reached, or too many readings were lost in a row.
         """
         n_unseen = 0
-        springs_m = np.empty((0, len(self.link.pressure_kpa)))
+        springs_m = np.empty((0, self.spec.n_springs))
         for _ in range(round(timeout_s / self.dt_s)):
             row, spring_m, arrived = self._tick(law)
             if spring_m is None or not arrived:
@@ -116,9 +117,9 @@ class Drive:
         return None
 
     def _tick(self, law: Law) -> tuple[dict, np.ndarray | None, bool]:
-        """Return the row, the spring lengths (n,) if none was lost, and whether the law has arrived."""
+        """Return the row, the spring lengths (n_springs,) if none was lost, whether the law has arrived."""
         begin_s = self.link.now()
-        nothing = np.full(len(self.link.pressure_kpa), np.nan)
+        nothing = np.full(self.spec.n_springs, np.nan)
         readings = self.link.read()
         row = self.link.look(begin_s)
         spring_m, lost, text = read_lengths(self.sensor, readings, nothing)

@@ -23,13 +23,14 @@ from mjx_softarm.deploy.arm_io import ArmIO
 from mjx_softarm.deploy.controller import LOOP
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.sensing.sensors import Sensor
+from mjx_softarm.spec import ArmSpec
 
 VENT_KPA_PER_S = 20.0  # ramp to zero; by hand
 VENT_TRIES = 250  # failed writes in a row after which the arm counts as not vented; some 5 s, by hand
 
 
 def vented(pressure_kpa: Array, dt_s: float) -> Array:
-    """Return pressures (n,) [kPa] a tick further along the ramp to zero."""
+    """Return pressures (n_chambers,) [kPa] a tick further along the ramp to zero."""
     step_kpa = VENT_KPA_PER_S * dt_s
     return pressure_kpa - array_namespace(pressure_kpa).clip(pressure_kpa, -step_kpa, step_kpa)
 
@@ -39,23 +40,23 @@ class ArmFault(Exception):
 
 
 class Link:
-    """An arm of n chambers, without pressure at first.
+    """An arm without pressure at first.
 
     Args:
         arm: the driver; `pressures`, `motion_capture` and `time_s` are used if it has them.
-        n: number of springs and of chambers.
+        spec: the arm, for its numbers of springs and chambers.
         dt_s: period of the control loop.
     """
 
-    def __init__(self, arm: ArmIO, n: int, dt_s: float):
+    def __init__(self, arm: ArmIO, spec: ArmSpec, dt_s: float):
         self._arm: Any = arm
-        self._n, self._dt_s, self._n_late = n, dt_s, 0
+        self._spec, self._dt_s, self._n_late = spec, dt_s, 0
         self._simulated = hasattr(arm, "time_s")
         self.measures, self.sees = hasattr(arm, "pressures"), hasattr(arm, "motion_capture")
         # Shapes of logged arrays; those of markers come from the first frame.
         self._shapes: dict[str, tuple[int, ...]] = {"tip_m": (3,), "tip_quaternion": (4,)}
         self._unsure = False  # the arm may have taken the last pressures, but has not confirmed them
-        self.pressure_kpa = np.zeros(n)  # in force
+        self.pressure_kpa = np.zeros(spec.n_chambers)  # in force
 
     def now(self) -> float:
         """Return the time [s].
@@ -76,7 +77,7 @@ class Link:
             time.sleep(max(0.0, time_s - time.monotonic()))
 
     def read(self) -> np.ndarray | None:
-        """Return the readings (n,), or None where they did not come in time.
+        """Return the readings (n_springs,), or None where they did not come in time.
 
         Raises:
             ArmFault: the sensors cannot be reached, or their number is another.
@@ -85,10 +86,10 @@ class Link:
             readings = self._call("read_sensors", lambda: np.array(self._arm.read_sensors(), float))
         except TimeoutError:
             return None
-        return self._shaped("read_sensors", readings, (self._n,))
+        return self._shaped("read_sensors", readings, (self._spec.n_springs,))
 
     def write(self, pressure_kpa: np.ndarray) -> bool:
-        """Command pressures (n,) [kPa]; return whether they were taken in time.
+        """Command pressures (n_chambers,) [kPa]; return whether they were taken in time.
 
         Raises:
             ArmFault: the pressures are not finite, the driver refuses them, or the pumps cannot be reached.
@@ -120,7 +121,7 @@ class Link:
         row: dict[str, Any] = {"time_s": time_s, "pressure_kpa": self.pressure_kpa}
         if self.measures:
             kpa = self._call("pressures", lambda: np.array(self._arm.pressures(), float), timeouts=False)
-            row["pressure_kpa"] = self._shaped("pressures", kpa, (self._n,))
+            row["pressure_kpa"] = self._shaped("pressures", kpa, (self._spec.n_chambers,))
         if self.sees:
             for name, value in self._call("motion_capture", self._frame).items():
                 shape = self._shapes.setdefault(name, value.shape)

@@ -52,9 +52,9 @@ class Tick(NamedTuple):
 
 def start(controller: Controller) -> LoopState:
     """Return the state before the first tick, of an arm without pressure."""
-    belief, none = Belief.none(controller), np.zeros(controller.policy.spec.n_chambers, int)
-    strategy = strategy_of(controller.policy, np.zeros(6), moves=False)
-    return LoopState(belief.command, belief, Watch(0, none, none, belief.load.kg), strategy)
+    belief, spec = Belief.none(controller), controller.policy.spec
+    watch = Watch(0, np.zeros(spec.n_springs, int), np.zeros(spec.n_chambers, int), belief.load.kg)
+    return LoopState(belief.command, belief, watch, strategy_of(controller.policy, np.zeros(6), moves=False))
 
 
 def step(
@@ -69,9 +69,9 @@ def step(
     Args:
         controller: the policy.
         state: after the last tick; its pressures are in force.
-        readings (n,): of the sensors, or None where none came in time.
+        readings (n_springs,): of the sensors, or None where none came in time.
         late: the last tick missed its deadline.
-        measured_kpa (n,) [kPa]: of the chambers; NaN, or None for all, where only those in force are known.
+        measured_kpa (n_chambers,) [kPa]: measured pressures; NaN, or None for all, where none was measured.
 
     Returns:
         The next state, whose pressures are to be written unless the tick says stop, and the tick.
@@ -112,7 +112,7 @@ def _pressed(controller: Controller, command: Command, spring_m: np.ndarray) -> 
 
 
 def in_force(state: LoopState, pressure_kpa: np.ndarray) -> LoopState:
-    """Return the state with the pressures (n,) [kPa] that the arm has taken."""
+    """Return the state with the pressures (n_chambers,) [kPa] that the arm has taken."""
     return state._replace(command=state.command._replace(pressure_kpa=pressure_kpa))
 
 

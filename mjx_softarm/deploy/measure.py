@@ -31,12 +31,12 @@ GOAL_COLUMNS = ("x [mm]", "y [mm]", "z [mm]", "yaw [deg]", "pitch [deg]", "roll 
 
 
 class Accuracy(NamedTuple):
-    """Errors at p goals of an arm with n chambers; NaN where a goal was missed."""
+    """Errors at p goals; NaN where a goal was missed."""
 
     goal: np.ndarray  # (p, 6) [mm, deg]
     error: np.ndarray  # (p, 6) [mm, deg] of the tip by motion capture
     believed: np.ndarray  # (p, 6) [mm, deg] believed pose minus the goal
-    saturated: np.ndarray  # (p, n) bool: a chamber at its limit with its spring off the reference, on arrival
+    saturated: np.ndarray  # (p, n_chambers) bool: a chamber at its limit, off its reference, on arrival
     arrival_s: np.ndarray  # (p,)
     load_estimate_g: np.ndarray  # (p,) believed payload on arrival
 

@@ -51,7 +51,7 @@ def record(
     Args:
         arm: without pressure, as its driver gives it.
         spec: the arm, for its rate, its limits and the range of its sensors.
-        targets_kpa (m, n) [kPa]: sets of pressures, in order.
+        targets_kpa (m, n_chambers) [kPa]: sets of pressures, in order.
         transients: log every tick instead of the static poses.
         tell: takes lines of progress.
         save: writes the log, if it has rows, once the arm is vented.
@@ -130,7 +130,8 @@ class _Hold:
         kpa = np.array([row["pressure_kpa"] for row in self.ticks])
         readings = np.array([row["readings"] for row in self.ticks])
         spring_m = drive.sensor.lengths(readings, np.nan).length_m
-        if (stuck := np.flatnonzero(stuck_springs(spring_m, kpa))).size:
+        stuck = np.flatnonzero(stuck_springs(spring_m, kpa, drive.spec.structure.n_sections))
+        if stuck.size:
             raise ArmFault(f"spring{stuck[0]}: got the same reading always, expected one that changes")
         if target_kpa is None:
             return

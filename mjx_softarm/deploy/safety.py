@@ -95,11 +95,11 @@ class Event(NamedTuple):
 
 
 class Watch(NamedTuple):
-    """Memory of the safety checks of n springs and chambers."""
+    """Memory of the safety checks."""
 
     n_late: int  # missed deadlines in a row
-    n_lost: np.ndarray  # (n,) lost readings in a row
-    n_suspect: np.ndarray  # (n,) ticks in a row in which a chamber seemed to have lost its pressure
+    n_lost: np.ndarray  # (n_springs,) lost readings in a row
+    n_suspect: np.ndarray  # (n_chambers,) ticks in a row in which a chamber seemed to have lost its pressure
     load_kg: float  # payload of the last tick
 
 

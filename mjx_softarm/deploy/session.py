@@ -28,7 +28,7 @@ from mjx_softarm.sensing.pose import pose_error, seen_error
 from mjx_softarm.spec import ArmSpec
 
 _ROUNDING_S = 1e-6  # rounding error of a simulated tick's duration
-# Deviation of the mean spring length of another arm, in section lengths; by hand. A payload of 1 kg: 0.05.
+# Deviation of another arm's mean spring length, in mean section lengths; by hand. A payload of 1 kg: 0.05.
 _OTHER_LENGTH = 0.25
 _ANOTHER = "is it another arm, or not yet switched on"
 _KEPT = 1000  # number of rows, arrivals and faults that a run without a log keeps
@@ -107,7 +107,7 @@ def check_number(arm: ArmIO, spec: ArmSpec, name: str) -> np.ndarray | None:
     """Refuse an arm whose number of springs is not the specification's, before any pressure.
 
     Returns:
-        Its readings (n,). None where it could not be read: the run then says why.
+        Its readings (n_springs,). None where it could not be read: the run then says why.
 
     Raises:
         InputError: the number is another; the message begins with `name`.
@@ -116,9 +116,9 @@ def check_number(arm: ArmIO, spec: ArmSpec, name: str) -> np.ndarray | None:
         readings = np.array(arm.read_sensors(), float)
     except Exception:  # a driver may raise anything
         return None
-    if readings.shape != (spec.n_chambers,):
+    if readings.shape != (spec.n_springs,):
         raise InputError(
-            f"{name}: got {' x '.join(map(str, readings.shape))} readings, expected {spec.n_chambers}, of "
+            f"{name}: got {' x '.join(map(str, readings.shape))} readings, expected {spec.n_springs}, of "
             f"the {spec.structure.n_sections} sections of {spec.name!r}; {_ANOTHER}?"
         )
     return readings
@@ -132,7 +132,7 @@ def check_arm(arm: ArmIO, controller: Controller, name: str) -> None:
     """
     # Readings, given as many ticks as a run gives lost ones
     policy, spec = controller.policy, controller.policy.spec
-    length_m = np.full(spec.n_chambers, np.nan)
+    length_m = np.full(spec.n_springs, np.nan)
     for _ in range(controller.config.lost_ticks):
         readings = check_number(arm, spec, name)
         if readings is None:
@@ -152,7 +152,7 @@ def check_arm(arm: ArmIO, controller: Controller, name: str) -> None:
     if np.isfinite(length_m).any():
         got_m = np.nanmean(length_m)
         asked_m = np.mean(expected_springs(policy.spring_model, np.zeros(spec.n_chambers)))
-        if abs(got_m - asked_m) > _OTHER_LENGTH * spec.geometry.section_length_m:
+        if abs(got_m - asked_m) > _OTHER_LENGTH * spec.length_m / spec.structure.n_sections:
             raise InputError(
                 f"{name}: got springs of {1e3 * got_m:.0f} mm in the mean without pressure, expected "
                 f"{1e3 * asked_m:.0f} mm as of the policy's arm {spec.name!r}; {_ANOTHER}, or still under "
@@ -176,8 +176,8 @@ class _Session:
         self.controller, self.goals = controller, goals
         self.tell, self.arrived, self.look = tell, arrived, look
         self.state = start(controller)
-        self.nothing = np.full(controller.policy.spec.n_chambers, np.nan)
-        self.link, self.rows = Link(arm, len(self.nothing), controller.dt_s), Recorder(kept)
+        self.nothing = np.full(controller.policy.spec.n_springs, np.nan)
+        self.link, self.rows = Link(arm, controller.policy.spec, controller.dt_s), Recorder(kept)
         self.arrivals: deque[Arrival] = deque(maxlen=kept)
         self.events: deque[Event] = deque(maxlen=kept)
         self.latency_s: deque[float] = deque(maxlen=kept)

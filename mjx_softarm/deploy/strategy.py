@@ -17,21 +17,26 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mjx_softarm._support.xp import Array, array_namespace
+from mjx_softarm.control import at_chambers, planes
 from mjx_softarm.deploy.belief import Belief, pose_of
 from mjx_softarm.deploy.safety import Event, Fault, names
 from mjx_softarm.mdp.observation import rate_ticks
 from mjx_softarm.mdp.rewards import scaled_error
 from mjx_softarm.policy.file import Policy
+from mjx_softarm.policy.reach import solved
 from mjx_softarm.policy.runtime import InMotion, sensed
 from mjx_softarm.sensing.load import Load
 from mjx_softarm.sensing.pose import pose_error
+
+_STAYING = 1e-4  # weight of a chamber that does not follow, beside the ones that do
 
 
 class Choice(NamedTuple):
     """Results of a strategy's tick."""
 
     strategy: Strategy  # with its next memory
-    reference_m: np.ndarray | None = None  # (n,) None: the last ones stay
+    reference_m: np.ndarray | None = None  # (n_springs,) None: the last ones stay
     events: tuple[Event, ...] = ()
     arrived: bool = False  # no further action is due
 
@@ -184,7 +189,7 @@ def _arrive(strategy: AtRest | Timed, belief: Belief, shift: np.ndarray, events:
 
 
 def _planned(belief: Belief, pose: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return the policy's references (n,) [m] from a pose (6,) towards a target (6,) [mm, deg]."""
+    """Return the policy's references (n_springs,) [m] from a pose (6,) towards a target (6,) [mm, deg]."""
     controller = belief.controller
     lengths_m, last_m = belief.window.spring_m, belief.command.reference_m
     before_m = lengths_m[-1 - min(rate_ticks(controller.policy.rate_hz), len(lengths_m) - 1)]
@@ -209,14 +214,42 @@ def _left(strategy: AtRest | Timed, belief: Belief, goal: np.ndarray) -> tuple[n
 
 
 def _made(belief: Belief, reference_m: np.ndarray, load: Load) -> np.ndarray:
-    """Return the pose (6,) [mm, deg] that references (n,) [m] make of an arm that rests on the last ones.
+    """Return the pose (6,) [mm, deg] of an arm at rest on its last references, moved to others."""
+    asked_m, policy = belief.command.reference_m, belief.controller.policy
+    assert asked_m is not None
+    spring_m = followed(reference_m, belief.mean_m, asked_m, belief.saturated, policy)
+    return np.asarray(pose_of(belief.controller, spring_m, load)[0], float)
+
+
+def followed(reference_m: Array, mean_m: Array, asked_m: Array, saturated: Array, policy: Policy) -> Array:
+    """Return the lengths (n_springs,) [m] that an arm at rest takes for new references. NumPy and symbols.
 
     The lengths are the references: springs of an arm at rest may creep by some tenths of a millimetre. But
-    saturated chambers that are asked for more do not follow: there the lengths are the springs'.
+    saturated chambers that are asked for more do not follow: there the lengths are the springs'. Of an arm
+    with redundant chambers, each section takes the plane that fits the chambers which follow, and the others
+    as far as these leave it open.
+
+    Args:
+        reference_m (n_springs,) [m]: new references.
+        mean_m (n_springs,) [m]: lengths at rest on the last references.
+        asked_m (n_springs,) [m]: the last references.
+        saturated (n_chambers,): bool.
+        policy: the arm.
     """
-    asked_m, mean_m = belief.command.reference_m, belief.mean_m
-    stays = belief.saturated & ((reference_m - mean_m) * (asked_m - mean_m) > 0.0)
-    return np.asarray(pose_of(belief.controller, np.where(stays, mean_m, reference_m), load)[0], float)
+    # Motion and error of each chamber
+    xp, allocation = array_namespace(reference_m, mean_m), policy.gains.allocation
+    move_m = at_chambers(reference_m - mean_m, allocation)
+    stays = saturated & (move_m * at_chambers(asked_m - mean_m, allocation) > 0.0)
+    if allocation is None:
+        return xp.where(stays, mean_m, reference_m)
+
+    # Planes by weighted least squares, at the springs
+    n_sections, n = policy.spec.structure.n_sections, policy.spec.structure.chambers_per_section
+    weight = xp.where(stays, _STAYING, 1.0).reshape(n_sections, 1, n)
+    across, along_m = planes(n).T, xp.where(stays, 0.0, move_m).reshape(n_sections, 1, n)
+    normal = xp.sum((weight * across)[:, :, None] * across, axis=-1)  # (n_sections, 3, 3)
+    plane = solved(normal, xp.sum(weight * across * along_m, axis=-1))  # (n_sections, 3)
+    return mean_m + xp.sum(plane[:, None] * planes(policy.spec.springs_per_section), axis=-1).reshape(-1)
 
 
 def _error(belief: Belief, pose: np.ndarray, goal: np.ndarray) -> float:
@@ -249,12 +282,14 @@ def _unsettled(belief: Belief) -> tuple[Event, ...]:
     """Return the faults of the springs as they stand before the next action."""
     off_m, mask, events = belief.mean_m - belief.command.reference_m, belief.saturated, []
     if not belief.settled:
-        worst = int(np.argmax(np.where(mask, 0.0, np.abs(off_m))))
+        beside = mask[:: len(mask) // len(off_m)]  # saturation of the chamber beside each spring
+        worst = int(np.argmax(np.where(beside, 0.0, np.abs(off_m))))
         waited_s = belief.controller.config.settle_timeout_s
         text = f"after {waited_s:g} s, spring{worst} is {1e3 * off_m[worst]:+.1f} mm"
         events.append(Event(Fault.NOT_SETTLED, f"{text} off its reference"))
     if mask.any():
-        off = ", ".join(f"{1e3 * value:+.1f}" for value in off_m[mask])
+        own_m = at_chambers(off_m, belief.controller.policy.gains.allocation)
+        off = ", ".join(f"{1e3 * value:+.1f}" for value in own_m[mask])
         text = f"{names('chamber', mask)}: at the limit, spring {off} mm off its reference"
         events.append(Event(Fault.SATURATED, text))
     return tuple(events)

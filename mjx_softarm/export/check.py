@@ -13,7 +13,7 @@ import numpy as np
 from mjx_softarm._support.errors import InputError, needing
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.safety import Fault
-from mjx_softarm.export.golden import BITS, FLAGS, PROGRAM_VERSION, Golden, Machine, output_columns
+from mjx_softarm.export.golden import BITS, FLAGS, PROGRAM_VERSION, Golden, Machine
 from mjx_softarm.policy.file import load_policy
 
 TOLERANCE = 1e-4  # share of an output's range; the law adds up rounding errors of float32 references
@@ -61,7 +61,7 @@ def compare(golden: Golden, rows: np.ndarray, outputs: dict[str, np.ndarray]) ->
         rows (k,): indices of the answered rows.
         outputs: arrays (k,) by the names of their columns.
     """
-    names = output_columns(golden.about["n"])
+    names = golden.output_columns()
     worst = Agreement(len(rows), 0.0, "none", 0)
     for name, got in outputs.items():
         column = names.index(name)
@@ -119,7 +119,7 @@ def without_memory(golden: Golden, answer: Callable) -> tuple[np.ndarray, dict[s
 
     Args:
         golden: golden rows.
-        answer: readings (n,) and goal (6,), float32 -> outputs of `computations.answer`.
+        answer: readings (n_springs,) and goal (6,), float32 -> outputs of `computations.answer`.
     """
     rows = np.flatnonzero(golden.inputs[:, FLAGS.index("restart")] > golden.inputs[:, FLAGS.index("checked")])
     answers = []
@@ -132,9 +132,9 @@ def without_memory(golden: Golden, answer: Callable) -> tuple[np.ndarray, dict[s
             Fault.EXTRAPOLATION: acts and result["extrapolation"] > 1.0,
         }
         faults = sum(BITS[fault] for fault, there in found.items() if there)
-        nothing = np.full(golden.about["n"], np.nan)
-        springs = nothing, result["reference_m"], result["length_m"]
-        answers.append(np.concat([[faults, 0.0], *springs, result["pose"]]))
+        nothing = np.full(golden.n_chambers, np.nan)
+        values = nothing, result["reference_m"], result["length_m"], result["pose"]
+        answers.append(np.concat([[faults, 0.0], *values]))
     outputs = _columns(golden, np.array(answers))
     return rows, {name: value for name, value in outputs.items() if not name.startswith("pressure")}
 
@@ -174,4 +174,4 @@ def _by_program(golden: Golden, path: Path) -> tuple[np.ndarray, dict[str, np.nd
 
 
 def _columns(golden: Golden, answers: np.ndarray) -> dict[str, np.ndarray]:
-    return dict(zip(output_columns(golden.about["n"]), answers.T, strict=True))
+    return dict(zip(golden.output_columns(), answers.T, strict=True))

@@ -11,6 +11,7 @@ from mjx_softarm.control import LawState, pressures, saturated
 from mjx_softarm.deploy.belief import as_without, on_reference, still, stuck_springs
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.link import vented
+from mjx_softarm.deploy.strategy import followed
 from mjx_softarm.export.symbols import Symbol, constant, repeat, symbol
 from mjx_softarm.mdp.rewards import scaled_error
 from mjx_softarm.policy import reach
@@ -19,6 +20,7 @@ from mjx_softarm.policy.runtime import InMotion, action_towards, actor_output, s
 from mjx_softarm.sensing.load import estimate_load
 from mjx_softarm.sensing.pose import pose_error
 from mjx_softarm.sensing.sensors import Reading, SensorFault
+from mjx_softarm.spec import ArmSpec
 
 
 class Computation(NamedTuple):
@@ -30,10 +32,11 @@ class Computation(NamedTuple):
 
 def graph(controller: Controller) -> Computation:
     """Record `answer`."""
-    n = controller.policy.spec.n_chambers
-    inputs = symbol("readings", (n,)), symbol("goal", (6,)), symbol("last_length_m", (n,))
-    inputs = *inputs, symbol("load_kg", ()), symbol("pressure_kpa", (n,))
-    motion = _in_motion(n)
+    spec = controller.policy.spec
+    springs, chambers = (spec.n_springs,), (spec.n_chambers,)
+    inputs = symbol("readings", springs), symbol("goal", (6,)), symbol("last_length_m", springs)
+    inputs = *inputs, symbol("load_kg", ()), symbol("pressure_kpa", chambers)
+    motion = _in_motion(spec)
     found = answer(controller, *inputs, motion)
     inputs += tuple(motion) if controller.policy.observation == "motion" else ()
     return Computation(inputs, {name: constant(value) for name, value in found.items()})
@@ -48,12 +51,12 @@ def answer(
     pressure_kpa: Array,
     motion: InMotion,
 ) -> dict[str, Array]:
-    """Return the loop's references for readings (n,) and a goal (6,), with pose, faults and payload.
+    """Return the loop's references for readings (n_springs,) and a goal (6,), with pose, faults and payload.
 
-    A lost reading holds the last length (n,) [m] of its spring. References are NaN if the loop would not act:
-    a spring has neither a reading nor a last length, or the goal is outside the workspace. The payload
-    () [kg] is the caller's average of estimates at rest, each from pressures (n,) [kPa]. Only policies that
-    observe motion use `motion`.
+    A lost reading holds the last length (n_springs,) [m] of its spring. References are NaN if the loop would
+    not act: a spring has neither a reading nor a last length, or the goal is outside the workspace. The
+    payload () [kg] is the caller's average of estimates at rest, each from pressures (n_chambers,) [kPa].
+    Only policies that observe motion use `motion`.
     """
     # References of the policy.
     policy, xp = controller.policy, array_namespace(readings)
@@ -94,7 +97,7 @@ def _inside(controller: Controller, goal: Array) -> Array:
 
 
 def actor(controller: Controller) -> Computation:
-    """Record the bare actor: observation (O,) -> action (n,) in [-1, 1]."""
+    """Record the bare actor: observation (O,) -> action (n_springs,) in [-1, 1]."""
     policy = controller.policy
     observation = symbol("observation", (len(policy.obs_layout),), np.float32)
     return Computation((observation,), {"action": actor_output(policy, observation)})
@@ -103,12 +106,20 @@ def actor(controller: Controller) -> Computation:
 def parts(controller: Controller) -> dict[str, Computation]:
     """Record the functions of which `mjx_softarm.deploy.loop` consists, by their names in C++."""
     # Inputs.
-    policy, n, window = controller.policy, controller.policy.spec.n_chambers, controller.window
+    policy, spec, window = controller.policy, controller.policy.spec, controller.window
     gains, tolerance_m, config = policy.gains, policy.tolerance_m, controller.config
-    names = ("readings", "reference_m", "spring_m", "pressure_kpa")
-    readings, reference_m, spring_m, pressure_kpa = (symbol(name, (n,)) for name in names)
-    state = LawState(*(symbol(f"last_{name}", (n,)) for name in LawState._fields))
-    springs_m, pressures_kpa = (symbol(name, (window, n)) for name in ("springs_m", "pressures_kpa"))
+    springs, chambers = (spec.n_springs,), (spec.n_chambers,)
+    names = ("readings", "reference_m", "spring_m", "mean_m", "asked_m")
+    readings, reference_m, spring_m, mean_m, asked_m = (symbol(name, springs) for name in names)
+    pressure_kpa, is_saturated = symbol("pressure_kpa", chambers), symbol("is_saturated", chambers, bool)
+    sizes = chambers, springs, springs  # integral, references and lengths of the law
+    state = LawState(
+        *(symbol(f"last_{name}", size) for name, size in zip(LawState._fields, sizes, strict=True))
+    )
+    springs_m, pressures_kpa = (
+        symbol("springs_m", (window, *springs)),
+        symbol("pressures_kpa", (window, *chambers)),
+    )
     goal, pose, load_kg = symbol("goal", (6,)), symbol("pose", (6,), np.float32), symbol("load_kg", ())
     xp = readings.__array_namespace__()
 
@@ -119,7 +130,7 @@ def parts(controller: Controller) -> dict[str, Computation]:
         policy.load_estimator, xp.mean(springs_m, axis=0), xp.mean(pressures_kpa, axis=0)
     )
     # Policy and law.
-    motion = _in_motion(n)
+    motion = _in_motion(spec)
     observed = sensed(policy, pose, spring_m, motion, load_kg)
     action = action_towards(policy, pose, xp.asarray(goal, dtype=np.float32), observed)
     written_kpa, after = pressures(reference_m, spring_m, state, gains, controller.dt_s)
@@ -129,7 +140,9 @@ def parts(controller: Controller) -> dict[str, Computation]:
     settled = on_reference(springs_m, reference_m, pressure_kpa, gains, tolerance_m)
     scaled = scaled_error(xp.asarray(pose, dtype=np.float64), goal, policy.reward)
     weighted = xp.sqrt(xp.sum(scaled * scaled))
-    without = as_without(policy.spring_model, pressure_kpa, spring_m, config)
+    stuck = stuck_springs(springs_m, pressures_kpa, spec.structure.n_sections, config)
+    without = as_without(policy.spring_model, pressure_kpa, spring_m, config, gains.allocation)
+    moved = reference_m, mean_m, asked_m, is_saturated
     search = symbol("search", reach.begin(policy, 1).shape)
     found, error = reach.nearest_of(policy, goal[None], search)
 
@@ -152,15 +165,17 @@ def parts(controller: Controller) -> dict[str, Computation]:
         "still": of(springs_m, holds=still(springs_m, config)),
         "on_reference": of(springs_m, reference_m, pressure_kpa, holds=settled),
         "saturated": of(pressure_kpa, reference_m, spring_m, mask=mask),
-        "stuck": of(springs_m, pressures_kpa, mask=stuck_springs(springs_m, pressures_kpa, config)),
+        "followed": of(*moved, lengths_m=followed(*moved, policy)),
+        "stuck": of(springs_m, pressures_kpa, mask=stuck),
         "as_without": of(pressure_kpa, spring_m, mask=without),
     }
 
 
-def _in_motion(n: int) -> InMotion:
-    return InMotion(*(symbol(name, (n,)) for name in InMotion._fields))
+def _in_motion(spec: ArmSpec) -> InMotion:
+    sizes = spec.n_springs, spec.n_springs, spec.n_chambers
+    return InMotion(*(symbol(name, (n,)) for name, n in zip(InMotion._fields, sizes, strict=True)))
 
 
 def _lost(reading: Reading) -> Array:
-    """Return which readings (n,) gave no length."""
+    """Return which readings (n_springs,) gave no length."""
     return reading.fault != SensorFault.OK.value

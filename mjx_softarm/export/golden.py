@@ -45,20 +45,27 @@ BITS = {fault: 1 << k for k, fault in enumerate(Fault)}
 class Golden(NamedTuple):
     """Rows with their answers."""
 
-    about: dict[str, Any]  # schema_version, policy_sha256, n, and the range of each output column
-    inputs: np.ndarray  # (rows, 6 + n + 6)
-    outputs: np.ndarray  # (rows, 2 + 3 n + 6)
+    about: dict[str, Any]  # schema_version, policy_sha256, n and n_chambers, the range of each output column
+    inputs: np.ndarray  # (rows, 6 + n_springs + 6)
+    outputs: np.ndarray  # (rows, 2 + n_chambers + 2 n_springs + 6)
 
+    @property
+    def n_springs(self) -> int:
+        return self.about["n"]
 
-def input_columns(n: int) -> list[str]:
-    """Return the names of a row's inputs."""
-    return [*FLAGS, *(f"reading{k}" for k in range(n)), *(f"goal_{axis}" for axis in AXES)]
+    @property
+    def n_chambers(self) -> int:
+        return self.about.get("n_chambers", self.about["n"])  # missing in older files
 
+    def input_columns(self) -> list[str]:
+        """Return the names of a row's inputs."""
+        return [*FLAGS, *(f"reading{k}" for k in range(self.n_springs)), *(f"goal_{axis}" for axis in AXES)]
 
-def output_columns(n: int) -> list[str]:
-    """Return the names of a row's outputs."""
-    springs = [f"{name}{k}" for name in ("pressure", "reference", "length") for k in range(n)]
-    return ["faults", "arrived", *springs, *(f"pose_{axis}" for axis in AXES)]
+    def output_columns(self) -> list[str]:
+        """Return the names of a row's outputs."""
+        pressures = [f"pressure{k}" for k in range(self.n_chambers)]
+        springs = [f"{name}{k}" for name in ("reference", "length") for k in range(self.n_springs)]
+        return ["faults", "arrived", *pressures, *springs, *(f"pose_{axis}" for axis in AXES)]
 
 
 class Machine:
@@ -73,7 +80,7 @@ class Machine:
         self._before_kpa = self.state.command.pressure_kpa
 
     def answer(self, row: np.ndarray) -> np.ndarray:
-        """Return the outputs (2 + 3 n + 6,) of inputs (6 + n + 6,)."""
+        """Return the outputs of inputs, with the columns of `Golden`."""
         restart, new_goal, late, taken, lost, checked = row[: len(FLAGS)] > 0.5
         # Follow the flags that say what happened before this tick.
         if restart:
@@ -109,10 +116,9 @@ class Machine:
 
 def write_golden(path: Path, golden: Golden) -> None:
     """Write rows as CSV, between a line of JSON and a checksum."""
-    n = golden.about["n"]
     table = np.concat([golden.inputs, golden.outputs], axis=1)
     lines = [",".join(f"{value:.9g}" for value in row) for row in table]
-    header = ",".join(input_columns(n) + output_columns(n))
+    header = ",".join(golden.input_columns() + golden.output_columns())
     text = "\n".join([f"# {json.dumps(golden.about)}", header, *lines, ""])
     path.write_text(f"{text}# {hashlib.sha256(text.encode()).hexdigest()}\n", "utf-8")
 
@@ -137,5 +143,5 @@ def read_golden(path: Path) -> Golden:
         got = f"schema_version: got {about.get('schema_version')}, expected {SCHEMA_VERSION}"
         raise InputError(f"{path}: {got}; export the run again")
     table = np.array([line.split(",") for line in lines], float)
-    n_inputs = len(input_columns(about["n"]))
+    n_inputs = len(FLAGS) + about["n"] + len(AXES)
     return Golden(about, table[:, :n_inputs], table[:, n_inputs:])

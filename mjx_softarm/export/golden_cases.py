@@ -68,9 +68,9 @@ def make_golden(controller: Controller, policy_sha256: str) -> Golden:
                 break
             row = run.send(pressure_kpa)
     # Scales of the outputs, for comparisons.
-    n = controller.policy.spec.n_chambers
-    about = {"schema_version": SCHEMA_VERSION, "policy_sha256": policy_sha256, "n": n}
-    about["range"] = _ranges(controller).tolist()
+    spec = controller.policy.spec
+    about = {"schema_version": SCHEMA_VERSION, "policy_sha256": policy_sha256}
+    about |= {"n": spec.n_springs, "n_chambers": spec.n_chambers, "range": _ranges(controller).tolist()}
     return Golden(about, np.array(inputs), np.array(outputs))
 
 
@@ -82,13 +82,13 @@ def _rounded(controller: Controller) -> Controller:
 
 
 def _ranges(controller: Controller) -> np.ndarray:
-    """Return the range (2 + 3 n + 6,) of each output; 0 for outputs that must be equal."""
+    """Return the range of each output; 0 for outputs that must be equal."""
     policy = controller.policy
-    n, ones = policy.spec.n_chambers, np.ones(policy.spec.n_chambers)
-    pressure_kpa = ones * policy.gains.pressure_max_kpa - ones * policy.gains.pressure_min_kpa
+    ones, chamber = np.ones(policy.spec.n_springs), np.ones(policy.spec.n_chambers)
+    pressure_kpa = chamber * policy.gains.pressure_max_kpa - chamber * policy.gains.pressure_min_kpa
     length_m = policy.actions.lengths(ones) - policy.actions.lengths(-ones)
     pose = np.concat([6.0 * policy.obs_scale.scale[:3], np.full(3, 360.0)])  # twice the arm's length
-    return np.concat([np.zeros(2), pressure_kpa, length_m, length_m, pose]).reshape(2 + 3 * n + 6)
+    return np.concat([np.zeros(2), pressure_kpa, length_m, length_m, pose])
 
 
 def _row(flags: tuple[int, ...], readings: np.ndarray, goal: np.ndarray) -> np.ndarray:
@@ -97,10 +97,11 @@ def _row(flags: tuple[int, ...], readings: np.ndarray, goal: np.ndarray) -> np.n
 
 
 def _single_rows(controller: Controller, rng: np.random.Generator) -> Iterator[np.ndarray]:
-    policy, n = controller.policy, controller.policy.spec.n_chambers
+    policy, n = controller.policy, controller.policy.spec.n_springs
     low, high = policy.sensor.range
+    limits_kpa = policy.gains.pressure_min_kpa, policy.gains.pressure_max_kpa
     for _ in range(N_SINGLE):
-        kpa = rng.uniform(policy.gains.pressure_min_kpa, policy.gains.pressure_max_kpa, n)
+        kpa = rng.uniform(*limits_kpa, policy.spec.n_chambers)
         spring_m = expected_springs(policy.spring_model, kpa) + rng.normal(0.0, _SPREAD_M, n)
         readings = policy.sensor.readings(spring_m)
         if rng.random() < _LOST:
@@ -137,9 +138,9 @@ def _rows_of_run(
     controller: Controller, kind: str, rng: np.random.Generator
 ) -> Generator[np.ndarray, np.ndarray, None]:
     """Yield the rows of a run with a fault; each `send` takes the pressures that the loop answered."""
-    policy, n = controller.policy, controller.policy.spec.n_chambers
-    actual_kpa, goal = np.zeros(n), _goal(controller, rng, outside=False)
-    leak, first, longest_m = np.ones(n), None, policy.actions.lengths(np.ones(n))
+    policy, spec, n = controller.policy, controller.policy.spec, controller.policy.spec.n_springs
+    actual_kpa, goal = np.zeros(spec.n_chambers), _goal(controller, rng, outside=False)
+    leak, first, longest_m = np.ones(spec.n_chambers), None, policy.actions.lengths(np.ones(n))
     carried = {"heavy": _HEAVY, "pressed": _PRESSED, "dropping": _CARRIED}.get(kind, 0.0)
     for tick in range(10**6):
         if kind == "dropping" and tick == _DROP_TICK:
@@ -179,6 +180,7 @@ def _weight_kpa(policy: Policy, pressure_kpa: np.ndarray, share: float) -> float
     An arm seems to carry this payload if each chamber has this much more pressure than its springs show.
     """
     model, less_kpa = policy.load_estimator, np.linspace(-_WEIGHT_MAX_KPA, _WEIGHT_MAX_KPA, 201)
-    spring_m = expected_springs(policy.spring_model, pressure_kpa - less_kpa[:, None])
-    estimate_kg = estimate_load(model, spring_m, np.broadcast_to(pressure_kpa, spring_m.shape))
+    shown_kpa = pressure_kpa - less_kpa[:, None]  # (201, n_chambers)
+    spring_m = expected_springs(policy.spring_model, shown_kpa)
+    estimate_kg = estimate_load(model, spring_m, np.broadcast_to(pressure_kpa, shown_kpa.shape))
     return float(less_kpa[np.argmin(np.abs(estimate_kg - share * model.load_scale_kg))])

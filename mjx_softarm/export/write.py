@@ -16,7 +16,7 @@ from mjx_softarm.export.cpp import sources
 from mjx_softarm.export.golden import Golden, write_golden
 from mjx_softarm.export.golden_cases import make_golden
 from mjx_softarm.mdp.observation import RATE_S
-from mjx_softarm.policy.file import Policy, action_layout, load_policy
+from mjx_softarm.policy.file import LAW, Policy, action_layout, load_policy
 
 _POSE = {"unit": ["mm"] * 3 + ["deg"] * 3, "names": ["x", "y", "z", "yaw", "pitch", "roll"]}
 FRAME = "base frame: z up, the arm hangs towards -z; angles intrinsic Z-Y-X, zero where it hangs straight"
@@ -32,19 +32,14 @@ def export_onnx(policy_path: Path) -> list[Path]:
         from mjx_softarm.export.onnx_files import write_onnx
     # Inputs that may be left out, with their defaults.
     controller, sha256 = _open(policy_path)
-    n = controller.policy.spec.n_chambers
-    about = describe(controller.policy, sha256)
+    spec, about = controller.policy.spec, describe(controller.policy, sha256)
     whole, actor, check = (
         policy_path.with_name(f"{policy_path.stem}{end}.onnx") for end in ("", "_actor", "_check")
     )
-    never = {
-        "last_length_m": np.full(n, np.nan),
-        "load_kg": controller.policy.spec.mass.payload_kg,
-        "pressure_kpa": np.full(n, np.nan),
-    }
+    unknown_m, unknown_kpa = np.full(spec.n_springs, np.nan), np.full(spec.n_chambers, np.nan)
+    never = {"last_length_m": unknown_m, "load_kg": spec.mass.payload_kg, "pressure_kpa": unknown_kpa}
     if controller.policy.observation == "motion":
-        unknown = np.full(n, np.nan)
-        never |= computations.InMotion(unknown, unknown, np.zeros(n))._asdict()
+        never |= computations.InMotion(unknown_m, unknown_m, np.zeros(spec.n_chambers))._asdict()
     # Write the graphs and the golden rows.
     write_onnx(whole, computations.graph(controller), {"kind": "policy", **about}, never)
     write_onnx(actor, computations.actor(controller), {"kind": "actor", **about}, {})
@@ -74,8 +69,8 @@ def export_cpp(policy_path: Path, folder: Path) -> list[Path]:
 def describe(policy: Policy, sha256: str) -> dict[str, Any]:
     """Return a graph's description for its users: units, frames, names, the arm and its numbers."""
     # Units and names that occur several times.
-    sensor, n = policy.sensor, policy.spec.n_chambers
-    lengths = {"unit": "m", "names": [f"spring{k}" for k in range(n)]}
+    sensor = policy.sensor
+    lengths = {"unit": "m", "names": [f"spring{k}" for k in range(policy.spec.n_springs)]}
     readings = {"unit": sensor.unit, "names": list(action_layout(policy.spec))}
     # Inputs and outputs of all graphs, then the arm's numbers.
     return {
@@ -113,7 +108,7 @@ def describe(policy: Policy, sha256: str) -> dict[str, Any]:
         "tolerance_m": policy.tolerance_m,
         "n_actions": policy.n_actions,
         "action_s": policy.action_s,
-        "gains": {name: np.asarray(value).tolist() for name, value in policy.gains._asdict().items()},
+        "gains": {name: np.asarray(getattr(policy.gains, name)).tolist() for name in LAW},
         "spec": policy.spec.to_dict(),
         "provenance": dict(policy.provenance),
     }

@@ -64,7 +64,7 @@ READABLE = (
 )  # in 7, `estimator.spring_site_m` is (n, 2), and each section has as many chambers as springs
 
 KIND = "policy"
-_LAW = Gains._fields[:-1]  # entries of the law; its allocation follows from the specification
+LAW = Gains._fields[:-1]  # entries of the law; its allocation follows from the specification
 SHIPPED = Path(__file__).parent / "shipped/paper.npz"  # for the paper's arm; its card is beside it
 
 
@@ -236,7 +236,7 @@ def file_entries(policy: Policy) -> dict[str, np.ndarray]:
     }
     entries |= archive.layer_entries("actor", policy.layers)
     entries |= {f"action.{name}": getattr(policy.actions, name) for name in ("low", "high")}
-    entries |= {f"gains.{name}": np.asarray(getattr(policy.gains, name), np.float64) for name in _LAW}
+    entries |= {f"gains.{name}": np.asarray(getattr(policy.gains, name), np.float64) for name in LAW}
     for name in ("obs_scale", "reward", "sensor"):
         numbers = entries_of(name, getattr(policy, name))
         entries |= {item: value.astype(np.float64) for item, value in numbers.items()}
@@ -275,7 +275,7 @@ def _unpack(arrays: Mapping[str, np.ndarray], source: str) -> Policy:
             *(entries.take(f"action.{name}", np.float64, (n,)) for name in ("low", "high")),
         ),
         gains=Gains(
-            *(entries.take(f"gains.{name}", np.float64, (), (spec.n_chambers,)) for name in _LAW),
+            *(entries.take(f"gains.{name}", np.float64, (), (spec.n_chambers,)) for name in LAW),
             allocation=allocation(spec),
         ),
         rate_hz=entries.take("rate_hz", np.float64, ()),

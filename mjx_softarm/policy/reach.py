@@ -56,7 +56,7 @@ def improve(policy: Policy, goal: Array, search: Array) -> Array:
     slope, gradient = xp.where(free[..., None], slope, 0.0), xp.where(free, gradient, 0.0)
     # Take the step where it helps; else only raise the damping.
     curvature = slope @ xp.swapaxes(slope, 1, 2) + damping[:, None, None] * np.eye(n)
-    tried = xp.clip(share - _solved(curvature, gradient), 0.0, 1.0)
+    tried = xp.clip(share - solved(curvature, gradient), 0.0, 1.0)
     helped = xp.sum((_at(policy, tried) - target) ** 2, axis=-1) < xp.sum(error**2, axis=-1)
     damping = xp.clip(damping * xp.where(helped, _EASE, _STIFFEN), _LEAST_DAMPING, _MOST_DAMPING)
     return xp.concat([xp.where(helped[:, None], tried, share), damping[:, None]], axis=1)
@@ -105,7 +105,7 @@ def _features(policy: Policy, position_m: Array, axes: Array) -> Array:
     return xp.concat([position, turn.reshape(*turn.shape[:-2], 9)], axis=-1)
 
 
-def _solved(matrix: Array, column: Array) -> Array:
+def solved(matrix: Array, column: Array) -> Array:
     """Solve positive definite systems (rows, n, n) for columns (rows, n), by Gauss-Jordan elimination."""
     xp, n = array_namespace(matrix, column), matrix.shape[-1]
     left = xp.concat([matrix, column[..., None]], axis=-1)  # (rows, n, n + 1 - k)

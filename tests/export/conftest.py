@@ -14,7 +14,7 @@ from mjx_softarm.export import golden_cases
 from mjx_softarm.mdp.observation import layouts
 from mjx_softarm.policy.file import load_policy, save_policy
 from mjx_softarm.sensing.s2r import N_POSE_INPUTS, N_POSE_OUTPUTS, S2R
-from tests.linear_arm import GAIN_M_PER_KPA, REST_M, SPEC, N, make_policy
+from tests.linear_arm import SPEC, N, gain_of, make_policy
 
 
 def layers(*sizes, scale):
@@ -27,7 +27,8 @@ def layers(*sizes, scale):
 
 def busy_policy(spec=SPEC):
     """The linear arm's policy with an actor, an estimator and a sim-to-real network that change much."""
-    policy, n_in = make_policy(spec), N_POSE_INPUTS + N
+    policy, n, n_sections = make_policy(spec), spec.n_springs, spec.structure.n_sections
+    n_in = N_POSE_INPUTS + n
     s2r = S2R(
         layers(n_in, 8, N_POSE_OUTPUTS, scale=0.3),
         *(np.full(n_in, value, np.float32) for value in (-1.0, 1.0)),
@@ -36,17 +37,17 @@ def busy_policy(spec=SPEC):
         limit=np.float32(0.335),
     )
     estimator = policy.estimator._replace(
-        layers=layers(2 * N, 6, 18, scale=0.2),
-        load_layers=layers(2 * N + 1, 6, 18, scale=0.2),
+        layers=layers(n + 3 * n_sections, 6, 6 * n_sections, scale=0.2),
+        load_layers=layers(n + 3 * n_sections + 1, 6, 6 * n_sections, scale=0.2),
         change_scale=np.full(6, 0.01, np.float32),
     )
     # 1 kPa less in every chamber than its springs show is half a kilogram
-    own = np.linalg.inv(GAIN_M_PER_KPA).mean(axis=0)
-    weight = 0.5 * np.concat([own, np.full(N, -1.0 / N)])[:, None]
-    bias = -0.5 * np.array([own.sum() * REST_M])
+    own = np.linalg.pinv(gain_of(spec)).mean(axis=0)
+    weight = 0.5 * np.concat([own, np.full(spec.n_chambers, -1.0 / spec.n_chambers)])[:, None]
+    bias = -0.5 * np.array([own @ spec.at_springs(spec.geometry.section_length_m)])
     load = policy.load_estimator._replace(layers=((np.float32(weight), np.float32(bias)),))
     networks = {"estimator": estimator, "load_estimator": load, "s2r": s2r}
-    return dataclasses.replace(policy, layers=layers(18, 12, N, scale=0.5), **networks)
+    return dataclasses.replace(policy, layers=layers(18, 12, n, scale=0.5), **networks)
 
 
 def draw_wire_policy():
@@ -59,13 +60,13 @@ def draw_wire_policy():
 
 def moving_policy(spec=SPEC):
     """A busy policy that acts each 0.3 s on what it sees of the motion."""
-    actor = layers(len(layouts(SPEC)["motion"]), 12, N, scale=0.3)
+    actor = layers(len(layouts(spec)["motion"]), 12, spec.n_springs, scale=0.3)
     return dataclasses.replace(busy_policy(spec), layers=actor, observation="motion", action_s=0.3)
 
 
 def carrying_policy(spec=SPEC):
     """A busy policy that observes the payload."""
-    actor = layers(len(layouts(SPEC)["payload"]), 12, N, scale=0.5)
+    actor = layers(len(layouts(spec)["payload"]), 12, spec.n_springs, scale=0.5)
     return dataclasses.replace(busy_policy(spec), layers=actor, observation="payload")
 
 

@@ -16,7 +16,13 @@ from mjx_softarm.export.check import TOLERANCE, check
 from mjx_softarm.export.cpp import sources
 from mjx_softarm.export.golden import FLAGS, Machine
 from mjx_softarm.mdp.observation import OBS_SIZE
-from tests.export.conftest import carrying_policy, draw_wire_policy, few_golden_rows, moving_policy
+from tests.export.conftest import (
+    busy_policy,
+    carrying_policy,
+    draw_wire_policy,
+    few_golden_rows,
+    moving_policy,
+)
 from tests.linear_arm import N
 
 pytestmark = pytest.mark.skipif(not shutil.which("g++"), reason="there is no compiler g++ here")
@@ -55,6 +61,11 @@ def agreeing_rows(policy, folder, run_ticks):
     agreement = check(golden, folder / "rows")
     assert agreement.n_rows > 100 and agreement.error < TOLERANCE, agreement
     return golden
+
+
+def test_rows_of_other_arms_agree(tmp_path, other_arm):
+    """Redundant chambers share the law's allocation; sections differ."""
+    agreeing_rows(busy_policy(other_arm), tmp_path, run_ticks=100)
 
 
 def test_rows_of_draw_wires_agree(tmp_path):
@@ -108,15 +119,15 @@ def test_example_vents_an_arm_that_gives_no_readings(folder):
 
 READS = """
 static bool read_sensors(double* readings) {
-  static const double at_rest[kN] = {READINGS};
+  static const double at_rest[kSprings] = {READINGS};
   static int tick = 0;
-  for (int k = 0; k < kN; ++k) readings[k] = at_rest[k] * (1.0 + 1e-3 * (tick % 2));
+  for (int k = 0; k < kSprings; ++k) readings[k] = at_rest[k] * (1.0 + 1e-3 * (tick % 2));
   return ++tick > 0;
 }
 static bool write_pressures(const double* pressure_kpa) {
   static int refused = 0;
   double most = 0.0;
-  for (int k = 0; k < kN; ++k) most = std::fmax(most, std::fabs(pressure_kpa[k]));
+  for (int k = 0; k < kChambers; ++k) most = std::fmax(most, std::fabs(pressure_kpa[k]));
   std::fprintf(stderr, "%.17g\\n", most);
   return most > 0.0 || ++refused > 3;
 }

@@ -11,7 +11,7 @@ from mjx_softarm.deploy.safety import Fault
 from mjx_softarm.export import computations, golden_cases
 from mjx_softarm.export.__main__ import main
 from mjx_softarm.export.check import TOLERANCE, check, compare, without_memory
-from mjx_softarm.export.golden import BITS, FLAGS, output_columns, read_golden, write_golden
+from mjx_softarm.export.golden import BITS, FLAGS, read_golden, write_golden
 from mjx_softarm.export.golden_cases import N_SINGLE
 from mjx_softarm.policy import reach
 from mjx_softarm.policy.runtime import InMotion
@@ -87,7 +87,7 @@ def test_command_checks_a_policy_file(golden, policy_file, tmp_path, capsys):
     )
     assert main(["check", str(tmp_path / "golden.csv"), str(policy_file)]) == 0
     assert "150 rows agree" in capsys.readouterr().out
-    column = np.arange(golden.outputs.shape[1]) == output_columns(N).index("reference1")
+    column = np.arange(golden.outputs.shape[1]) == golden.output_columns().index("reference1")
     other = golden._replace(inputs=golden.inputs[:20], outputs=golden.outputs[:20] + 1e-3 * column)
     write_golden(tmp_path / "golden.csv", other)
     assert main(["check", str(tmp_path / "golden.csv"), str(policy_file)]) == 1

@@ -93,6 +93,19 @@ def test_draw_wires_without_a_sim_to_real_network(tmp_path):
     agreeing_graph(draw_wire_policy(), tmp_path / "wires.npz")
 
 
+def test_other_arms(tmp_path, other_arm):
+    """References and lengths are per spring, pressures and the law's integral per chamber."""
+    _, whole = agreeing_graph(moving_policy(other_arm), tmp_path / "other.npz")
+    golden = read_golden(tmp_path / "other_golden.csv")
+    assert check(golden, tmp_path / "other_check.onnx").error == 0.0
+    assert check(golden, tmp_path / "other.npz").holds
+    session = ort.InferenceSession(whole)
+    items = *session.get_inputs(), *session.get_overridable_initializers(), *session.get_outputs()
+    size = {item.name: item.shape for item in items}
+    assert size["readings"] == size["before_m"] == size["reference_m"] == [other_arm.n_springs]
+    assert size["pressure_kpa"] == size["integral_kpa"] == [other_arm.n_chambers]
+
+
 def test_a_policy_of_motion_is_told_of_the_motion(tmp_path):
     """Without what it saw before, it answers as at its first action; with it, as the loop at its second."""
     controller, whole = agreeing_graph(moving_policy(), tmp_path / "moving.npz")

@@ -9,7 +9,8 @@ Derive a class with your numbers, and give it as `--arm my_arm:Arm`:
         n = 9
 
 The microcontroller answers each request once, by a line that repeats its letter and number (K counts up).
-Lines end in a line feed, over UDP, too. It keeps the pressures until the next `P`:
+Lines end in a line feed, over UDP, too. It keeps the pressures until the next `P`. Of the paper's arm, with 9
+springs and 9 chambers:
 
     request         answer                      meaning
     R K             R K r0 ... r8 p0 ... p8     readings in the sensor's unit, taken since the request (nan:
@@ -33,11 +34,13 @@ class LineArm:
     """Driver of an arm that answers lines; subclasses send and receive them.
 
     Attributes:
-        n: number of springs and of chambers.
+        n: number of chambers.
+        n_springs: number of springs; 0: one for each chamber.
         timeout_s: longest time for a request and its answer; a tick has two of them.
     """
 
     n = 9
+    n_springs = 0
     timeout_s = 0.008
 
     def __init__(self) -> None:
@@ -45,11 +48,11 @@ class LineArm:
         self._measured_kpa = np.full(self.n, np.nan)
 
     def read_sensors(self) -> np.ndarray:
-        """Return the readings (n,); see `ArmIO`."""
+        """Return the readings (n_springs,); see `ArmIO`."""
         self._measured_kpa = np.full(self.n, np.nan)
-        values = self._ask("R", 2 * self.n)
-        self._measured_kpa = values[self.n :]
-        return values[: self.n]
+        n_springs = self.n_springs or self.n
+        readings, self._measured_kpa = np.split(self._ask("R", n_springs + self.n), [n_springs])
+        return readings
 
     def pressures(self) -> np.ndarray:
         """Return the pressures (n,) [kPa] that came with the last readings, NaN if none came."""

@@ -6,18 +6,18 @@
 
 #include "softarm.hpp"
 
-using softarm::kN;
+using softarm::kChambers, softarm::kSprings;
 using Clock = std::chrono::steady_clock;
 
 // Reads the springs' sensors, NaN for a reading that is late or missing; returns false if they are not reached.
 static bool read_sensors(double* readings) {
-  for (int k = 0; k < kN; ++k) readings[k] = NAN;
+  for (int k = 0; k < kSprings; ++k) readings[k] = NAN;
   return true;
 }
 
 // Commands the chambers' pressures [kPa]; returns false if the arm did not take them in time.
 static bool write_pressures(const double* pressure_kpa) {
-  for (int k = 0; k < kN; ++k) std::printf("%.1f%c", pressure_kpa[k], k + 1 < kN ? ' ' : '\n');
+  for (int k = 0; k < kChambers; ++k) std::printf("%.1f%c", pressure_kpa[k], k + 1 < kChambers ? ' ' : '\n');
   return true;
 }
 
@@ -39,7 +39,7 @@ int main() {
   bool late = false, taken = true;
   softarm::Tick tick{};
   for (auto next = Clock::now() + period; !(tick.vented && taken); next += period) {
-    double readings[kN];
+    double readings[kSprings];
     if (!read_sensors(readings)) controller.vent(softarm::ARM_LOST);
     if (ends) controller.vent();
     tick = controller.tick(readings, late, taken);

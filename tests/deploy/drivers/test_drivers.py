@@ -16,6 +16,7 @@ from mjx_softarm.deploy.drivers.names import open_arm
 from mjx_softarm.deploy.drivers.serial_line import SerialArm
 from mjx_softarm.deploy.drivers.udp import UdpArm
 from mjx_softarm.deploy.record import record
+from tests.arms import SIX_CHAMBERS
 from tests.linear_arm import REST_M, SPEC, LinearArm, N, read_m
 
 TIMEOUT_S = 0.5  # this machine may be busy
@@ -120,6 +121,16 @@ def test_values_go_over_the_line(line):
         np.testing.assert_allclose(controller.arm.command_kpa, kpa, rtol=1e-5)
         np.testing.assert_allclose(arm.read_sensors(), controller.arm.read_sensors(), rtol=1e-8)
         np.testing.assert_allclose(arm.pressures(), controller.arm.actual_kpa, rtol=1e-8)
+
+
+def test_lines_of_fewer_springs_than_chambers(line):
+    arm, controller = line
+    controller.arm, arm.n, arm.n_springs = LinearArm(noise_m=0.0, spec=SIX_CHAMBERS), 18, 9
+    kpa = np.linspace(-40.0, 20.0, 18)
+    arm.write_pressures(kpa)
+    np.testing.assert_allclose(controller.arm.command_kpa, kpa, rtol=1e-5)
+    np.testing.assert_allclose(arm.read_sensors(), controller.arm.read_sensors(), rtol=1e-8)
+    np.testing.assert_allclose(arm.pressures(), controller.arm.actual_kpa, rtol=1e-8)
 
 
 def test_old_answers_are_passed_over(line):
