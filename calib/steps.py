@@ -16,9 +16,11 @@ import numpy as np
 from calib.fit.chambers import MIN_POSES, fit_chambers
 from calib.fit.held_pressures import fit_held_pressures
 from calib.fit.markers import MIN_MARKERS, marker_limits
+from calib.fit.motion.actuators import fit_actuators
+from calib.fit.motion.damping import find_stretches, fit_damping
+from calib.fit.motion.tracks import find_tracks
 from calib.fit.s2r import fit_s2r, simulate_poses
 from calib.fit.sensors import fit_springs
-from calib.fit.transients import find_stretches, fit_damping
 from calib.read.measurements import Measurements
 from calib.report import sections
 from calib.report.page import Section
@@ -99,6 +101,16 @@ def chambers(measurements: Measurements, spec: ArmSpec, seed: int) -> StepResult
     return StepResult(fit.spec if fit.is_better else spec, section, extras)
 
 
+def actuators(measurements: Measurements, spec: ArmSpec, seed: int) -> StepResult:
+    """Fit pumps or regulators to commanded and measured pressures."""
+    tracks = find_tracks(measurements.logs, spec)
+    if not tracks:
+        needed = "No log has commanded and measured pressures at the control rate."
+        return StepResult(spec, Section("Actuators", f"{NOT_FITTED} {needed}"))
+    fit = fit_actuators(tracks, spec, seed)
+    return StepResult(fit.spec, sections.actuators(fit))
+
+
 def damping(measurements: Measurements, spec: ArmSpec, seed: int) -> StepResult:
     """Fit the damping of chambers and backbone to the moving arm."""
     stretches = find_stretches(measurements.logs, spec)
@@ -148,7 +160,13 @@ def s2r(measurements: Measurements, spec: ArmSpec, seed: int) -> StepResult:
 
 
 STEPS: Mapping[str, Step] = MappingProxyType(
-    {"springs": springs, "chambers": chambers, "damping": damping, "sim-to-real network": s2r}
+    {
+        "springs": springs,
+        "chambers": chambers,
+        "actuators": actuators,
+        "damping": damping,
+        "sim-to-real network": s2r,
+    }
 )
 
 

@@ -13,12 +13,14 @@ from matplotlib.figure import Figure
 from calib.fit.chambers import ChamberFit
 from calib.fit.held_pressures import HeldPressures
 from calib.fit.markers import MarkerLimits
+from calib.fit.motion.actuators import ActuatorFit
+from calib.fit.motion.damping import DampingFit
 from calib.fit.parameters import BENDING
 from calib.fit.pose_errors import PoseErrors
 from calib.fit.s2r import S2RFit
 from calib.fit.sensors import SpringFit
-from calib.fit.transients import DampingFit
 from calib.report.page import ReportTable, Section
+from mjx_softarm.pneumatics import Regulator
 from mjx_softarm.sensing.s2r import correct
 
 _BINS = 40
@@ -142,6 +144,38 @@ def with_markers(section: Section, limits: MarkerLimits) -> Section:
         tables=(*section.tables, table),
         data=section.data | {"markers": _plain(limits)},
         figures=(*section.figures, (title, figure)),
+    )
+
+
+def actuators(fit: ActuatorFit) -> Section:
+    """Show the numbers of the actuators and the errors of the pressures."""
+    found, n = fit.spec.actuators, fit.spec.n_chambers
+    each = {name: np.broadcast_to(value, n) for name, value in dataclasses.asdict(found).items()}
+    widths = fit.half_width_95 if isinstance(found, Regulator) else {}
+    rows = []
+    for k in range(n):
+        pairs = ((value[k], widths[name][k]) if widths else (value[k],) for name, value in each.items())
+        numbers = [x for pair in pairs for x in pair]
+        rows.append((f"chamber {k}", *map(float, [*numbers, fit.chamber_rms_kpa[k]])))
+    titles = [text for name in each for text in ((name, "+-") if widths else (name,))]
+    errors = (
+        ("held-out seconds, command taken for the pressure", fit.held_out_rms_kpa["command"]),
+        ("held-out seconds, before", fit.held_out_rms_kpa["specification"]),
+        ("held-out seconds, pump", fit.held_out_rms_kpa["pump"]),
+        ("held-out seconds, regulator", fit.held_out_rms_kpa["regulator"]),
+        (f"seconds of the fit, {fit.chosen}", fit.in_sample_rms_kpa),
+    )
+    return Section(
+        "Actuators",
+        f"{fit.n_tracks} tracks of commanded and measured pressures, {fit.time_s:.0f} s in all: "
+        f"{found.kind}s driven with the commands against the measured pressures. Intervals are 95 %. "
+        f"The law's ki is {fit.spec.control.ki_kpa_per_ms:.0f} kPa/(m s).",
+        (
+            ReportTable(("", *titles, "held-out RMS [kPa]"), tuple(rows)),
+            ReportTable(("pressures", "RMS [kPa]"), errors),
+        ),
+        fit.warnings,
+        _plain(fit, "spec") | {"kind": found.kind, "values": _json(dataclasses.asdict(found))},
     )
 
 

@@ -113,7 +113,7 @@ class Link:
     def look(self, time_s: float) -> dict[str, Any]:
         """Return time, pressures and motion capture, the latter unless it missed a frame.
 
-        The pressures are the commanded ones if the arm measures none.
+        The pressures are the commanded ones if the arm measures none; otherwise the row has both.
 
         Raises:
             ArmFault: a method failed, or the shape of an array changed.
@@ -122,6 +122,7 @@ class Link:
         if self.measures:
             kpa = self._call("pressures", lambda: np.array(self._arm.pressures(), float), timeouts=False)
             row["pressure_kpa"] = self._shaped("pressures", kpa, (self._spec.n_chambers,))
+            row["commanded_kpa"] = self.pressure_kpa
         if self.sees:
             for name, value in self._call("motion_capture", self._frame).items():
                 shape = self._shapes.setdefault(name, value.shape)

@@ -126,8 +126,9 @@ def _header_errors(
         if name in known and unit not in UNITS[known[name].kind]:
             expected = ", ".join(f"[{unit}]" for unit in UNITS[known[name].kind])
             yield name, f"got {'no unit' if unit is None else f'[{unit}]'}, expected one of {expected}"
-        if name not in known and re.fullmatch(rf"({reading_name}|spring|pressure|reference)\d+", name):
-            part, group = ("chambers", "pressure_kpa") if name[:2] == "pr" else ("springs", "spring_m")
+        of_chamber = re.fullmatch(r"(pressure|commanded)\d+", name)
+        if name not in known and (of_chamber or re.fullmatch(rf"({reading_name}|spring|reference)\d+", name)):
+            part, group = ("chambers", "pressure_kpa") if of_chamber else ("springs", "spring_m")
             n = sum(column.group == group for column in known.values())
             yield name, f"got this column, expected those of {n} {part}, numbered from 0"
     for group in {known[name].group for name in names if name in known}:

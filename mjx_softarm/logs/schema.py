@@ -65,6 +65,7 @@ def log_columns(
         *(Column("readings", f"{reading_name}{k}", reading_name, reading_unit) for k in springs),
         *(Column("spring_m", f"spring{k}", "length", "mm") for k in springs),
         *(Column("pressure_kpa", f"pressure{k}", "pressure", "kPa") for k in chambers),
+        *(Column("commanded_kpa", f"commanded{k}", "pressure", "kPa") for k in chambers),
         *(Column("tip_m", f"tip_{axis}", "length", "mm") for axis in _XYZ),
         *(Column("tip_quaternion", f"tip_q{part}", "number", "1") for part in "wxyz"),
         *(Column("marker_m", f"marker{k}_{axis}", "length", "mm") for k in markers for axis in _XYZ),
@@ -91,6 +92,7 @@ class Log:
     readings: np.ndarray | None = None  # (n, n_springs) readings of the springs' sensors
     spring_m: np.ndarray | None = None  # (n, n_springs) spring lengths from another instrument
     pressure_kpa: np.ndarray | None = None  # (n, n_chambers) relative to the atmosphere
+    commanded_kpa: np.ndarray | None = None  # (n, n_chambers) commands in force, where pressures are measured
     tip_m: np.ndarray | None = None  # (n, 3)
     tip_quaternion: np.ndarray | None = None  # (n, 4) w, x, y, z
     marker_m: np.ndarray | None = None  # (n, n_markers, 3) from the base to the tip
@@ -132,7 +134,8 @@ def log_table(log: Log) -> tuple[tuple[Column, ...], np.ndarray]:
     """Return the columns (k,) of a log, and its numbers (n, k) in the units of the columns."""
     per_spring = [getattr(log, name) for name in ("readings", "spring_m", "reference_m")]
     n_springs = max((value.shape[1] for value in per_spring if value is not None), default=0)
-    n_chambers = 0 if log.pressure_kpa is None else log.pressure_kpa.shape[1]
+    per_chamber = [log.pressure_kpa, log.commanded_kpa]
+    n_chambers = max((value.shape[1] for value in per_chamber if value is not None), default=0)
     n_markers = 0 if log.marker_m is None else log.marker_m.shape[1]
     known = log_columns(n_chambers, n_springs, n_markers, log.reading_name)
     columns = tuple(column for column in known if getattr(log, column.group) is not None)

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from calib.fit.transients import MAX_TOTAL_S, Stretch, damped, find_stretches, fit_damping, simulate
+from calib.fit.motion.damping import MAX_TOTAL_S, Stretch, damped, find_stretches, fit_damping, simulate
 from mjx_softarm import ArmSpec
 from mjx_softarm.logs.schema import Log
 

@@ -1,0 +1,1 @@
+"""Fits to the arm in motion: its actuators, then its damping."""

@@ -1,0 +1,109 @@
+"""Actuators from commanded and measured pressures, with planted pumps and regulators."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from calib.fit.motion.actuators import fit_actuators
+from calib.fit.motion.tracks import find_tracks
+from calib.read.measurements import measure
+from calib.steps import actuators
+from mjx_softarm.deploy.record import record
+from mjx_softarm.logs.schema import Log
+from mjx_softarm.mechanics.excitation import random_pressures
+from mjx_softarm.pneumatics import Pump, Regulator
+from mjx_softarm.twin.instruments import Build
+from mjx_softarm.twin.pneumatics import Pneumatics
+from mjx_softarm.twin.rod_twin import RodTwin, draw_regulator
+
+TIME_S, PERIOD_S, STEPS = 60.0, 0.02, 4
+FACTORS = np.linspace(0.9, 1.1, 3)
+REGULATOR = Regulator(
+    0.3 * FACTORS, 0.15, 60.0, 25.0 * FACTORS[::-1], 0.2, offset_kpa=np.array([0.0, 1.0, -1.0])
+)
+STILL = 1  # chamber whose command never changes
+
+
+@pytest.fixture(scope="module")
+def short(spec):
+    """One section, whose chambers are held at their length."""
+    return spec.replace(structure={"n_sections": 1})
+
+
+def log_of(spec, plant, seed=0):
+    """A log of a plant under random steps, in chambers that lengthen and shorten."""
+    rng, n = np.random.default_rng(seed), round(TIME_S / PERIOD_S)
+    command = np.repeat(rng.uniform(-30.0, 15.0, (n // 100, 3)), 100, axis=0)
+    command[:, STILL] = 2.0
+    length_m = 0.2 + 0.02 * np.sin(np.arange(n)[:, None] * PERIOD_S + np.arange(3.0))
+    chambers = spec.chambers
+    bellows = np.full(3, chambers.area_m2), np.full(3, chambers.area_slope_m), 0.2, length_m[0]
+    air = Pneumatics(*bellows, PERIOD_S / STEPS, plant.per_chamber(3))
+    measured = np.zeros((n, 3))
+    for k in range(n - 1):
+        air.command(command[k])
+        for part in range(STEPS):
+            air.step(length_m[k] + (part + 1) / STEPS * (length_m[k + 1] - length_m[k]))
+        measured[k + 1] = air.pressure_kpa
+    in_force = np.concatenate([np.zeros((1, 3)), command[:-1]])
+    radii = spec.geometry.spring_radius_m / spec.geometry.chamber_radius_m
+    mean_m = length_m.mean(axis=1, keepdims=True)
+    return Log(
+        source="planted",
+        row=np.arange(n) + 2,
+        time_s=PERIOD_S * np.arange(n),
+        spring_m=mean_m + radii * (length_m - mean_m),
+        pressure_kpa=measured + 0.05 * rng.standard_normal((n, 3)),
+        commanded_kpa=in_force,
+    )
+
+
+def test_planted_regulators_are_found(short):
+    fit = fit_actuators(find_tracks([log_of(short, REGULATOR)], short), short)
+    found = fit.spec.actuators
+    assert found.kind == fit.chosen == "regulator" and not fit.warnings
+    moved = np.arange(3) != STILL
+    for name in ("lag_s", "dead_time_s", "fill_kpa_per_s", "vent_kpa_per_s"):
+        true = np.full(3, getattr(REGULATOR, name))
+        np.testing.assert_allclose(
+            np.array(getattr(found, name))[moved], true[moved], rtol=0.07, err_msg=name
+        )
+        np.testing.assert_allclose(getattr(found, name)[STILL], true.mean(), rtol=0.15, err_msg=name)
+    np.testing.assert_allclose(found.offset_kpa, REGULATOR.offset_kpa, atol=0.25)
+    rms = fit.held_out_rms_kpa
+    assert rms["regulator"] < 0.3 < 2.0 < min(rms["command"], rms["pump"], rms["specification"])
+    law = short.control
+    assert fit.spec.control.ki_kpa_per_ms == pytest.approx(law.kp_kpa_per_m / 0.45, rel=0.1)
+
+
+def test_the_specification_s_pump_stays_where_it_fits(short):
+    fit = fit_actuators(find_tracks([log_of(short, short.actuators)], short), short)
+    assert fit.chosen == "specification" and fit.spec == short
+    assert fit.held_out_rms_kpa["specification"] < 0.5 < fit.held_out_rms_kpa["command"]
+
+
+def test_a_weaker_pump_is_found(short):
+    fit = fit_actuators(find_tracks([log_of(short, Pump(3.0, 0.01))], short), short)
+    assert fit.chosen == "pump"
+    assert fit.spec.actuators.flow_l_per_min == pytest.approx(3.0, rel=0.05)
+
+
+def test_regulators_of_a_rod_are_found_in_a_recording_of_all_ticks(spec):
+    """Ramps do not show the greatest rates, of which the report warns."""
+    arm = RodTwin(101, spec, build=Build(per_section=3))
+    log = record(arm, spec, random_pressures(spec, 4, 0), transients=True).log
+    fit = fit_actuators(find_tracks([log], spec), spec)
+    true = draw_regulator(101, spec)
+    assert fit.chosen == "regulator" and fit.held_out_rms_kpa["regulator"] < 0.3
+    for name, tolerance in (("lag_s", 0.12), ("dead_time_s", 0.03)):
+        np.testing.assert_allclose(getattr(fit.spec.actuators, name), getattr(true, name), atol=tolerance)
+    assert any("log larger steps of the commands" in text for text in fit.warnings)
+
+
+def test_a_log_without_commands_or_of_poses_alone_says_so(short):
+    log = log_of(short, short.actuators)
+    rows = np.arange(0, len(log), 50)
+    for unfit in (dataclasses.replace(log, commanded_kpa=None), log.take(rows)):
+        spec, section, _ = actuators(measure([unfit], short), short, 0)
+        assert spec == short and "No log has commanded and measured pressures" in section.text
