@@ -60,8 +60,8 @@ class Errors:
         self._is_run = (folder / CONFIG_FILE).exists()
         spec = spec_of(folder)
         set_the_scene(server, spec)
-        straight_m = np.full(spec.n_chambers, spec.geometry.section_length_m)
-        Stage(server.scene, spec, Limits.of(spec)).show(look_at({"time_s": 0.0}, straight_m))
+        straight_m = spec.at_springs(spec.geometry.section_length_m)
+        Stage(server.scene, spec, Limits.of(spec)).show(look_at({"time_s": 0.0}, straight_m, spec))
         self._text = server.gui.add_html("", order=0.0)
         self._sets = server.gui.add_folder("Poses", order=0.5)
         self._boxes: dict[str, viser.GuiCheckboxHandle] = {}

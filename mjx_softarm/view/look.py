@@ -11,7 +11,6 @@ from mjx_softarm.control import TOLERANCE_M, Gains, saturated
 from mjx_softarm.logs.checks import Finding, LogError
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.sensing.pose import pose_error, pose_from_quaternion
-from mjx_softarm.sensing.sensors import Sensor
 from mjx_softarm.spec import ArmSpec
 
 
@@ -19,9 +18,9 @@ class Look(NamedTuple):
     """Numbers to show; NaN if unknown."""
 
     time_s: float
-    spring_m: np.ndarray  # (n,)
-    reference_m: np.ndarray  # (n,)
-    pressure_kpa: np.ndarray  # (n,)
+    spring_m: np.ndarray  # (n_springs,)
+    reference_m: np.ndarray  # (n_springs,)
+    pressure_kpa: np.ndarray  # (n_chambers,)
     estimate: np.ndarray  # (6,) [mm, deg] estimated tip pose
     goal: np.ndarray  # (6,) [mm, deg]
     seen: np.ndarray  # (6,) [mm, deg] tip pose from motion capture
@@ -42,32 +41,32 @@ class Limits(NamedTuple):
     """Limits of pressures and springs, for scales and marks."""
 
     gains: Gains
-    spring_m: tuple[float, float]
+    spring_m: tuple[np.ndarray, np.ndarray]  # (n_springs,) each
     tolerance_m: float  # largest error of a spring that counts as on its reference
+    n_sections: int
 
     @classmethod
     def of(cls, spec: ArmSpec, tolerance_m: float = TOLERANCE_M) -> Limits:
         """Return an arm's limits, with the tolerance of its policy if that is known."""
-        lengths_m = spec.springs.length_min_m, spec.springs.length_max_m
-        return cls(Gains.from_spec(spec), lengths_m, tolerance_m)
+        lengths_m = spec.at_springs(spec.springs.length_min_m), spec.at_springs(spec.springs.length_max_m)
+        return cls(Gains.from_spec(spec), lengths_m, tolerance_m, spec.structure.n_sections)
 
     def saturated(self, look: Look) -> np.ndarray:
-        """Mask (n,) the chambers at a limit whose springs are off their references."""
+        """Mask (n_chambers,) the chambers at a limit whose springs are off their references."""
         gains = self.gains.measured()
         return saturated(look.pressure_kpa, look.reference_m, look.spring_m, gains, self.tolerance_m)
 
 
-def look_at(row: Mapping[str, Any], spring_m: np.ndarray, payload_kg: float = 0.0) -> Look:
-    """Return the look of a row of the loop or of a log, with spring lengths (n,) [m]."""
-    unknown, pose = np.full(len(spring_m), np.nan), np.full(6, np.nan)
-    seen = pose
+def look_at(row: Mapping[str, Any], spring_m: np.ndarray, spec: ArmSpec, payload_kg: float = 0.0) -> Look:
+    """Return the look of a row of the loop or of a log of an arm, with spring lengths (n_springs,) [m]."""
+    seen = pose = np.full(6, np.nan)
     if "tip_m" in row and "tip_quaternion" in row and np.isfinite(row["tip_quaternion"]).all():
         seen = pose_from_quaternion(row["tip_m"], row["tip_quaternion"])
     return Look(
         time_s=float(row["time_s"]),
         spring_m=spring_m,
-        reference_m=row.get("reference_m", unknown),
-        pressure_kpa=row.get("pressure_kpa", unknown),
+        reference_m=row.get("reference_m", np.full(spec.n_springs, np.nan)),
+        pressure_kpa=row.get("pressure_kpa", np.full(spec.n_chambers, np.nan)),
         estimate=row.get("estimate", pose),
         goal=row.get("goal", pose),
         seen=seen,
@@ -76,12 +75,13 @@ def look_at(row: Mapping[str, Any], spring_m: np.ndarray, payload_kg: float = 0.
     )
 
 
-def looks(log: Log, sensor: Sensor) -> Callable[[int], Look]:
-    """Return a function from the rows of a log to their looks.
+def looks(log: Log, spec: ArmSpec) -> Callable[[int], Look]:
+    """Return a function from the rows of an arm's log to their looks.
 
     Raises:
-        LogError: the log has neither readings of this sensor nor spring lengths.
+        LogError: the log has neither readings of the arm's sensor nor spring lengths.
     """
+    sensor = spec.spring_sensor
     readings = log.readings_of(sensor)
     spring_m = log.spring_m if readings is None else sensor.lengths(readings, np.nan).length_m
     if spring_m is None:
@@ -90,4 +90,4 @@ def looks(log: Log, sensor: Sensor) -> Callable[[int], Look]:
     groups = ("time_s", "pressure_kpa", "tip_m", "tip_quaternion", "marker_m")
     names = (*groups, "payload_kg", "reference_m", "goal", "estimate")
     present = {name: value for name in names if (value := getattr(log, name)) is not None}
-    return lambda k: look_at({name: value[k] for name, value in present.items()}, spring_m[k])
+    return lambda k: look_at({name: value[k] for name, value in present.items()}, spring_m[k], spec)

@@ -11,7 +11,7 @@ import viser
 from viser import uplot
 
 from mjx_softarm.view.look import Limits, Look
-from mjx_softarm.view.stage import GOAL, SATURATED, SEEN, section_colour
+from mjx_softarm.view.stage import GOAL, SATURATED, SEEN, section_colours
 
 TRACE_S, TRACE_POINTS = 20.0, 200
 _WIDTH, _TOP, _FOOT = 300, 6, 66  # width, top and foot of the bars [px]
@@ -21,7 +21,7 @@ BLUE, MUTED = "#2463a8", "#868e96"
 class Panel:
     """Text, bars and traces of one arm."""
 
-    def __init__(self, gui: viser.GuiApi, limits: Limits, n: int):
+    def __init__(self, gui: viser.GuiApi, limits: Limits, n_chambers: int):
         self._limits = limits
         self._text = gui.add_html("", order=0.2)  # below the buttons, above all else
         with gui.add_folder("Chambers and springs"):
@@ -29,8 +29,9 @@ class Panel:
         with gui.add_folder("Traces"):
             lines = ("believed", css(GOAL)), ("seen", css(SEEN))
             self._errors = plot(gui, "tip error [mm], violet: seen", lines)
-            colours = [(f"chamber {k}", css(section_colour(k))) for k in range(n)]
-            self._pressures = plot(gui, "pressures [kPa]", colours)
+            colours = section_colours(n_chambers, limits.n_sections)
+            lines = [(f"chamber {k}", css(colour)) for k, colour in enumerate(colours)]
+            self._pressures = plot(gui, "pressures [kPa]", lines)
         self._trace: deque[tuple] = deque(maxlen=TRACE_POINTS)
 
     def show_bars(self, look: Look) -> None:
@@ -68,46 +69,62 @@ class Panel:
 
 def bars(look: Look, limits: Limits) -> str:
     """Return bars of pressures between their limits, and of springs beside their references, as HTML."""
-    low, high = float(limits.gains.pressure_min_kpa), float(limits.gains.pressure_max_kpa)
-    saturated, zero = limits.saturated(look), np.zeros(len(look.spring_m))
+    saturated, zero = limits.saturated(look), np.zeros(len(look.pressure_kpa))
+    low_kpa, high_kpa = zero + limits.gains.pressure_min_kpa, zero + limits.gains.pressure_max_kpa
+    beside = saturated[:: len(saturated) // len(look.spring_m)]  # of the chambers with a spring beside them
+    springs = limits.spring_m[0], look.spring_m, look.reference_m
     # Words below the bars, and a note about saturated chambers.
     kpa = [f"{p:.0f}" for p in look.pressure_kpa]
     off = [f"{1e3 * (a - b):+.1f}" for a, b in zip(look.spring_m, look.reference_m, strict=True)]
     names = ", ".join(map(str, np.flatnonzero(saturated)))
     note = f"saturated: chamber {names}" if names else "no chamber saturated"
     line = "<div style='padding:0.2em 1em;font-size:11px;color:{}'>{}</div>"
+    colours = [section_colours(len(mask), limits.n_sections) for mask in (saturated, beside)]
     return (
-        line.format(MUTED, f"pressures, {low:g} to {high:g} kPa")
-        + _bars(look.pressure_kpa, 0.0, zero, (low, high), saturated, kpa)
+        line.format(MUTED, f"pressures, {low_kpa.min():g} to {high_kpa.max():g} kPa")
+        + _bars((zero, look.pressure_kpa, zero), (low_kpa, high_kpa), saturated, kpa, colours[0])
         + line.format(MUTED, "springs beside their references, off by mm")
-        + _bars(look.spring_m, limits.spring_m[0], look.reference_m, limits.spring_m, saturated, off)
+        + _bars(springs, limits.spring_m, beside, off, colours[1])
         + line.format(css(SATURATED) if names else MUTED, note)
     )
 
 
-def _bars(values, foot, marks, limits: tuple[float, float], warned: np.ndarray, words: Sequence[str]) -> str:
-    """Return bars from a foot to values, with marks across them, as SVG; a NaN has no bar."""
-    wide, parts = _WIDTH / len(values), []
+def _bars(
+    levels: tuple[np.ndarray, np.ndarray, np.ndarray],
+    limits: tuple[np.ndarray, np.ndarray],
+    warned: np.ndarray,
+    words: Sequence[str],
+    colours: Sequence[tuple[int, int, int]],
+) -> str:
+    """Return n bars from feet to values, with marks across them, as SVG; a NaN has no bar.
 
-    def height(value: float) -> float:
-        share = (np.clip(value, *limits) - limits[0]) / (limits[1] - limits[0])
-        return _FOOT - share * (_FOOT - _TOP)
+    Args:
+        levels (n,) each: feet, values and marks.
+        limits (n,) each: levels at the bottom and the top of the frames.
+        warned (n,): bool, bars with a frame in another colour.
+        words (n,): texts below the bars.
+        colours (n,): colours of the bars.
+    """
+    wide, parts = _WIDTH / len(words), []
+    gap = min(10.0, wide / 3)  # between two frames
+    inset = gap / 5  # between a frame and its bar
 
-    # For each chamber its frame, bar, mark and word.
-    for k, (value, mark) in enumerate(zip(values, marks, strict=True)):
-        x, edge = wide * k + 5, css(SATURATED) if warned[k] else "#dee2e6"
-        size = f"width='{wide - 10:.1f}' height='{_FOOT - _TOP}' rx='2' stroke-width='{1 + warned[k]}'"
+    # For each bar its frame, bar, mark and word.
+    shares = [(np.clip(level, *limits) - limits[0]) / (limits[1] - limits[0]) for level in levels]
+    for k, heights in enumerate(_FOOT - np.stack(shares, axis=-1) * (_FOOT - _TOP)):
+        foot, value, mark = heights
+        x, edge = wide * k + gap / 2, css(SATURATED) if warned[k] else "#dee2e6"
+        size = f"width='{wide - gap:.1f}' height='{_FOOT - _TOP}' rx='2' stroke-width='{1 + warned[k]}'"
         parts.append(f"<rect x='{x:.1f}' y='{_TOP}' {size} fill='#f8f9fa' stroke='{edge}'/>")
         if np.isfinite(value):
-            top, low = sorted((height(value), height(foot)))
-            size = f"width='{wide - 14:.1f}' height='{max(low - top, 1.0):.1f}'"
-            parts.append(f"<rect x='{x + 2:.1f}' y='{top:.1f}' {size} fill='{css(section_colour(k))}'/>")
+            top, low = sorted((value, foot))
+            size = f"width='{wide - gap - 2 * inset:.1f}' height='{max(low - top, 1.0):.1f}'"
+            parts.append(f"<rect x='{x + inset:.1f}' y='{top:.1f}' {size} fill='{css(colours[k])}'/>")
         if np.isfinite(mark):
-            y, right = height(mark), x + wide - 9
-            line = f"<line x1='{x - 1:.1f}' x2='{right:.1f}' y1='{y:.1f}' y2='{y:.1f}' stroke='#343a40'"
-            parts.append(f"{line} stroke-width='1.5'/>")
-        at = f"x='{x + wide / 2 - 5:.1f}' y='{_FOOT + 11}' font-size='9' text-anchor='middle'"
-        parts.append(f"<text {at} fill='{MUTED}'>{words[k].replace('nan', '?')}</text>")
+            line = f"<line x1='{x - 1:.1f}' x2='{x + wide - gap + 1:.1f}' y1='{mark:.1f}' y2='{mark:.1f}'"
+            parts.append(f"{line} stroke='#343a40' stroke-width='1.5'/>")
+        at = f"x='{wide * (k + 0.5):.1f}' y='{_FOOT + 11}' font-size='{min(9.0, wide / 2):.3g}'"
+        parts.append(f"<text {at} text-anchor='middle' fill='{MUTED}'>{words[k].replace('nan', '?')}</text>")
     box = f"viewBox='0 0 {_WIDTH} {_FOOT + 14}' style='width:100%;padding:0 0.6em'"
     return f"<svg {box}>{''.join(parts)}</svg>"
 

@@ -41,7 +41,7 @@ class Track:
         if not len(log):
             raise InputError(f"{path}: got no rows, expected some")
         self.name, self._time_s = path.name, log.time_s - log.time_s[0]
-        self._look, self.end_s = looks(log, spec.spring_sensor), float(self._time_s[-1])
+        self._look, self.end_s = looks(log, spec), float(self._time_s[-1])
 
     def at(self, time_s: float) -> Look:
         """Return the last look before a time."""

@@ -22,7 +22,7 @@ from mjx_softarm.mechanics.body import (
     shape,
 )
 from mjx_softarm.sensing.pose import quaternion_from_pose
-from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
+from mjx_softarm.spec import ArmSpec
 from mjx_softarm.view import meshes
 from mjx_softarm.view.look import Limits, Look
 
@@ -56,7 +56,7 @@ class Stage:
     ):
         self._spec, self._limits = spec, limits
         self._trail: deque[np.ndarray] = deque(maxlen=_TRAIL_POINTS)
-        self._marked: np.ndarray | None = None  # (n,) chambers drawn as saturated
+        self._marked: np.ndarray | None = None  # (n_chambers,) bool, chambers drawn as saturated
         scene.add_frame(name, show_axes=False, position=place_m)
 
         def solid(path: str, mesh: meshes.Mesh, colour, **options: Any):
@@ -74,8 +74,8 @@ class Stage:
             return scene.add_point_cloud(f"{name}/{path}", np.zeros((1, 3)), colour, **looks)
 
         # Bellows, rings and springs.
-        length_m = spec.geometry.section_length_m
-        self._spring_m = np.full(spec.n_chambers, length_m)  # lengths in the last picture
+        length_m = spec.length_m / spec.structure.n_sections
+        self._spring_m = spec.at_springs(spec.geometry.section_length_m)  # lengths in the last picture
         rest = shape(spec, self._spring_m, np.full(6, np.nan))
         turn = meshes.coil(1.6 * SPRING_WIDTH_M, _WIRE_M, length_m / COILS)
         solid("mount", meshes.disc(*_MOUNT_M), _MOUNT, position=(0.0, 0.0, _MOUNT_M[1] / 2))
@@ -122,14 +122,14 @@ class Stage:
         """Colour the bellows; send a message only if the colours change."""
         if self._marked is None or not np.array_equal(saturated, self._marked):
             self._marked = saturated
-            own = np.array([section_colour(k) for k in range(len(saturated))])
+            own = np.array(section_colours(len(saturated), self._limits.n_sections))
             colour = np.where(saturated[:, None], SATURATED, own).astype(np.uint8)
             self._folds.batched_colors = np.repeat(colour, FOLDS, axis=0)
 
 
-def section_colour(chamber: int) -> tuple[int, int, int]:
-    """Return the colour of a chamber's section."""
-    return SECTION_COLOURS[chamber // N_CHAMBERS_PER_SECTION % len(SECTION_COLOURS)]
+def section_colours(n: int, n_sections: int) -> list[tuple[int, int, int]]:
+    """Return the colours of n chambers or springs, by their sections."""
+    return [SECTION_COLOURS[k * n_sections // n % len(SECTION_COLOURS)] for k in range(n)]
 
 
 def add_workspace(scene: viser.SceneApi, pose: np.ndarray) -> tuple[viser.SceneNodeHandle, ...]:

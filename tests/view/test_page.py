@@ -9,7 +9,7 @@ import pytest
 
 from mjx_softarm._support.channel import End
 from mjx_softarm.view.look import look_at
-from tests.linear_arm import GOALS, POLICY, REST_M, N
+from tests.linear_arm import GOALS, POLICY, REST_M, SPEC, N
 
 pytest.importorskip("viser", reason="needs viser: pip install -e '.[view]'")
 import msgspec
@@ -97,7 +97,7 @@ def test_client_that_reads_nothing_holds_up_no_frame(server, page):
     row = {"time_s": 0.0, "goal": GOALS[0], "estimate": GOALS[0]}
     spent_s = []
     for k in range(100):
-        look = look_at(row, np.full(N, REST_M + 1e-5 * k))._replace(time_s=0.02 * k)
+        look = look_at(row, np.full(N, REST_M + 1e-5 * k), SPEC)._replace(time_s=0.02 * k)
         loop.put(look=look, doing="holds", armed=True, lines=())
         time.sleep(0.002)
         began = time.perf_counter()

@@ -1,5 +1,7 @@
 """Looks of a log, and the bars against what they show."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -15,14 +17,33 @@ def test_saturated_chambers_are_found_and_marked():
     kpa[[2, 7]] = HIGH_KPA - 0.1  # as measured
     reference_m[2] += 0.01  # chamber 7 is on its reference
     row = {"time_s": 0.0, "pressure_kpa": kpa, "reference_m": reference_m}
-    look, limits = look_at(row, np.full(N, REST_M)), Limits.of(SPEC)
+    look, limits = look_at(row, np.full(N, REST_M), SPEC), Limits.of(SPEC)
     assert np.flatnonzero(limits.saturated(look)).tolist() == [2]
     assert not Limits.of(SPEC, tolerance_m=0.02).saturated(look).any()
     drawn = panel.bars(look, limits)
     assert "saturated: chamber 2<" in drawn and drawn.count(panel.css((226, 38, 77))) == 3
     assert "-10.0</text>" in drawn
-    nothing = look_at({"time_s": 0.0}, np.full(N, np.nan))
+    nothing = look_at({"time_s": 0.0}, np.full(N, np.nan), SPEC)
     assert "nan" not in panel.bars(nothing, limits)
+
+
+def test_bars_of_other_arms(other_arm):
+    """A bar for each chamber and for each spring, in the colour of its section."""
+    panel = pytest.importorskip("mjx_softarm.view.panel", reason="needs viser", exc_type=ImportError)
+    n, every = other_arm.n_chambers, other_arm.n_chambers // other_arm.n_springs
+    reference_m = other_arm.at_springs(other_arm.geometry.section_length_m)
+    kpa, spring_m = np.zeros(n), reference_m - 0.02 * (np.arange(other_arm.n_springs) == 0)
+    kpa[0] = HIGH_KPA
+    row = {"time_s": 0.0, "pressure_kpa": kpa, "reference_m": reference_m}
+    look, limits = look_at(row, spring_m, other_arm), Limits.of(other_arm)
+    assert np.flatnonzero(limits.saturated(look)).tolist() == [0]
+    drawn = panel.bars(look, limits)
+    assert drawn.count("</text>") == n + n // every and "-20.0</text>" in drawn
+    last = panel.css(panel.section_colours(n, 3)[-1])
+    assert drawn.count(f"fill='{last}'") == (n + n // every) // 3
+    assert not re.search(r"(width|height)='-", drawn)
+    unknown = look_at({"time_s": 0.0}, reference_m, other_arm)
+    assert len(unknown.pressure_kpa) == n and not limits.saturated(unknown).any()
 
 
 def test_looks_of_a_log():
@@ -30,9 +51,9 @@ def test_looks_of_a_log():
     readings = SENSOR.readings(spring_m)
     readings[1, 3] = np.nan
     log = Log("x.csv", np.arange(2, 6), np.arange(4.0), readings=readings, goal=np.zeros((4, 6)))
-    at = looks(log, SENSOR)
+    at = looks(log, SPEC)
     np.testing.assert_allclose(at(2).spring_m, spring_m[2])
     assert np.flatnonzero(np.isnan(at(1).spring_m)).tolist() == [3]
     assert at(2).time_s == 2.0 and np.isnan(at(2).estimate).all() and not at(2).goal.any()
     with pytest.raises(LogError, match=r"x\.csv: got neither frequency0\.\. nor spring0\.\., expected"):
-        looks(Log("x.csv", np.arange(2, 6), np.arange(4.0)), SENSOR)
+        looks(Log("x.csv", np.arange(2, 6), np.arange(4.0)), SPEC)
