@@ -15,7 +15,7 @@ LEVELS = (
     ("_support",),
     ("sensing", "arms"),
     ("spec", "pneumatics"),
-    ("mechanics", "control", "logs"),
+    ("mechanics", "control", "logs", "posture"),
     ("mdp",),
     ("env", "policy"),
     ("deploy", "twin"),

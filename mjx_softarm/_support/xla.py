@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 # jaxlib 0.10 hands products and sums to the library YNNPACK. Learning is a third slower with it, and some
@@ -60,6 +61,27 @@ def in_batches(function: Callable[[Any], Any], size: int, rows: Any) -> Any:
     batches = (jax.tree.map(lambda x, k=k: x[k : k + size], padded) for k in range(0, n, size))
     parts = [jax.device_get(function(batch)) for batch in batches]
     return jax.tree.map(lambda *x: np.concatenate(x)[:n], *parts)
+
+
+def in_chunks(function: Callable, n: int, n_chunks: int, batched: Any, arguments: tuple) -> Any:
+    """Return the results of a traced function for n rows, chunk after chunk; the last repeats its last row.
+
+    Args:
+        function: maps one row of the arguments to a tree of arrays; `jax.vmap` takes it over a chunk.
+        n: number of rows.
+        n_chunks: number of chunks.
+        batched: tree like the arguments, true for arrays that have the rows as first axis.
+        arguments: trees of arrays.
+    """
+    row = jnp.minimum(jnp.arange(n_chunks * -(-n // n_chunks)), n - 1).reshape(n_chunks, -1)
+    axes = jax.tree.map(lambda own: 0 if own else None, tuple(batched))
+
+    def chunk(row: jax.Array) -> Any:
+        theirs = jax.tree.map(lambda x, own: jnp.asarray(x)[row] if own else x, arguments, tuple(batched))
+        return jax.vmap(function, in_axes=axes)(*theirs)
+
+    found = jax.lax.map(chunk, row)
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:n], found)
 
 
 def jit_at_first_call(uses_mjx: bool = True, **kwargs: Any) -> Callable[[Callable], Callable]:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jax import Array
 
+from mjx_softarm._support.errors import InputError
 from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.motion.state import Path
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.pipe import CrossPipe, body_clearance
+from mjx_softarm.posture import hangs
 from mjx_softarm.sensing.s2r import S2R, carry_body
 from mjx_softarm.spec import ArmSpec
 
@@ -17,6 +19,11 @@ class Walls:
     """Pipe around an arm. Without a pipe, distances are infinite."""
 
     def __init__(self, diameter_mm: float | None, spec: ArmSpec, params: ArmParams, s2r: S2R | None):
+        if diameter_mm is not None and not hangs(spec):
+            raise InputError(
+                f"pipe_diameter_mm: got {diameter_mm:g} for the arm {spec.name!r}, whose base is turned by "
+                f"{spec.mounting.base_turn_deg} deg, expected an arm that hangs: pipes are entered from above"
+            )
         self.pipe = None if diameter_mm is None else CrossPipe.of_mm(diameter_mm)
         self.spec, self.params, self.s2r = spec, params, s2r
 

@@ -15,6 +15,8 @@ import numpy as np
 
 from mjx_softarm._support.xp import Array, array_namespace
 from mjx_softarm.mdp.rewards import RewardConfig, scaled_error
+from mjx_softarm.posture import straight_pose
+from mjx_softarm.sensing.pose import pose_error
 from mjx_softarm.spec import ArmSpec
 
 Observation = Literal["pose", "payload", "motion"]
@@ -31,15 +33,14 @@ SPRING_M_PER_S, TIP_MM_PER_S = 0.1, 300.0  # speeds that are observed as 1
 class ObsScale(NamedTuple):
     """Affine map of poses and goals."""
 
-    centre: Array  # (6,) [mm, deg]
+    centre: Array  # (6,) [mm, deg] pose of the straight, unloaded arm
     scale: Array  # (6,) [mm, deg]
 
     @classmethod
     def from_spec(cls, spec: ArmSpec) -> ObsScale:
         """Return the map that centres on the unloaded tip and scales a third of the arm, or 90 deg, to 1."""
-        length_mm = 1e3 * spec.length_m
-        centre = np.array([0.0, 0.0, -length_mm, 0.0, 0.0, 0.0], np.float32)
-        return cls(centre, np.array([length_mm / 3] * 3 + [90.0] * 3, np.float32))
+        scale = np.array([1e3 * spec.length_m / 3] * 3 + [90.0] * 3, np.float32)
+        return cls(straight_pose(spec).astype(np.float32), scale)
 
 
 def layouts(spec: ArmSpec) -> dict[Observation, tuple[str, ...]]:
@@ -107,7 +108,10 @@ def observe_motion(
 
 
 def observe(pose: Array, goal: Array, scale: ObsScale, config: RewardConfig) -> Array:
-    """Return the observation (..., 18) of pose and goal (..., 6) [mm, deg]: scaled pose, scaled goal, e."""
+    """Return the observation (..., 18) of pose and goal (..., 6) [mm, deg]: scaled pose, scaled goal, e.
+
+    Angles are taken from the straight arm's: an upright arm moves about a roll of 180 degrees.
+    """
     xp = array_namespace(pose)
-    scaled = [(value - scale.centre) / scale.scale for value in (pose, goal)]
+    scaled = [pose_error(value, scale.centre) / scale.scale for value in (pose, goal)]
     return xp.concat([*scaled, scaled_error(pose, goal, config)], axis=-1)

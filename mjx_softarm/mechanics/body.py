@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mjx_softarm.posture import base_rotation
 from mjx_softarm.sensing.estimator import Frame, backbone
 from mjx_softarm.sensing.pose import quaternion_from_rotation
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
@@ -81,7 +82,8 @@ def shape(spec: ArmSpec, spring_m: np.ndarray, tip: np.ndarray) -> ArmShape:
     steps = [(np.arange(n) + 0.5) / n for n in (FOLDS, COILS)]
     at = np.concatenate([(np.arange(n_rings) + 1.0) / n_rings, *steps])
     site_m = (geometry.spring_radius_m * directions).reshape(spec.structure.n_sections, -1, 2)
-    sections = backbone(site_m, spring_m, tip, at)
+    base = Frame(np.array(spec.mounting.base_offset_m), base_rotation(spec))
+    sections = backbone(base, site_m, spring_m, tip, at)
     rings, folds, coils = (
         Frame(*(part[:, rows] for part in sections))
         for rows in np.split(np.arange(len(at)), [n_rings, n_rings + FOLDS])

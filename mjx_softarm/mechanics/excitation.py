@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from mjx_softarm.posture import turned_poses
 from mjx_softarm.spec import ArmSpec
 
 CIRCLE_DIAMETER_MM, CIRCLE_HEIGHT_MM = 160.0, -575.0  # on the paper's arm of 600 mm
@@ -26,15 +27,16 @@ def random_pressures(spec: ArmSpec, n_poses: int, seed: int | np.random.Generato
 
 
 def circle_poses(spec: ArmSpec, n: int = 40) -> np.ndarray:
-    """Return poses (n, 6) [mm, deg] along a horizontal circle below the base, the tip hanging straight down.
+    """Return poses (n, 6) [mm, deg] on a circle around the straight arm's axis, the tip along the axis.
 
-    The circle of the paper is scaled with the length of the arm. The paper gives diameter and number of
-    points but no height; at ours, its arm reaches every point with 2 kPa to spare in each chamber.
+    The circle of the paper is horizontal below a hanging arm; it is scaled with the length of the arm, and
+    turned with its posture. The paper gives diameter and number of points but no height; at ours, its arm
+    reaches every point with 2 kPa to spare in each chamber.
     """
-    angle, zero, size = 2 * np.pi * np.arange(n) / n, np.zeros(n), spec.length_m / 0.6
+    angle, size = 2 * np.pi * np.arange(n) / n, spec.length_m / 0.6
     radius, height = 0.5 * CIRCLE_DIAMETER_MM * size, np.full(n, CIRCLE_HEIGHT_MM * size)
-    columns = [radius * np.cos(angle), radius * np.sin(angle), height, zero, zero, zero]
-    return np.stack(columns, axis=-1).astype(np.float32)
+    at = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=-1)
+    return turned_poses(spec, at).astype(np.float32)
 
 
 def growing(pressure_kpa: np.ndarray) -> np.ndarray:

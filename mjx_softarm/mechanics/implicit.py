@@ -13,6 +13,11 @@ the rows of S K where chambers track and of the identity where they are at a lim
 
     dp = R^-1 r,    dq = K dp - H^-1 d_x grad V,    r = dreference - d_x s + S H^-1 d_x grad V  or  dlimit.
 
+Where the law holds an arm that would buckle at constant pressures, V has the springs l (s - reference)^2 / 2
+of the law's gain l as well, where chambers track. They are at rest, but the joints answer to them at once:
+
+    dq = K dp + H^-1 S^T l (dreference - d_x s) - H^-1 d_x grad V,    with r less S times the last two terms.
+
 This is exact however many Newton steps led to the equilibrium. K comes from the last Newton step; only
 derivatives by the arm's numbers need H^-1.
 """
@@ -26,7 +31,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.custom_derivatives import SymbolicZero
 
-from mjx_softarm._support.small_matrices import eliminate
+from mjx_softarm._support.small_matrices import block_diagonal, eliminate
 from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK, Frames
 from mjx_softarm.mechanics.statics import Statics, statics
 
@@ -57,6 +62,26 @@ class Equilibrium(NamedTuple):
     frames: Frames
     statics: Statics
     response: PressureResponse
+    law_response: Array  # (nv, n_chambers) joints by references, zeros unless the law holds the arm
+
+
+def law_response(here: Statics, held: Array, law_stiffness: Array) -> Array:
+    """Return `Equilibrium.law_response` (nv, n_chambers, *arms), for the gains of chambers that are held.
+
+    Args:
+        here: at the equilibrium, the gains included.
+        held (n_chambers, *arms): bool.
+        law_stiffness (n_chambers, *arms) [N/m]: the law's gains.
+    """
+    n_sections, _, n, *arms = here.springs.jacobian.shape
+
+    def solve() -> Array:
+        gain = jnp.where(held, law_stiffness, 0.0).reshape(n_sections, -1, 1, *arms)
+        columns = block_diagonal(jnp.swapaxes(gain * here.springs.jacobian, 1, 2))
+        return here.hessian.solve(columns.reshape(n_sections, n, -1, *arms)).reshape(-1, *held.shape)
+
+    none = jnp.zeros((n_sections * n, *held.shape), here.gradient.dtype)
+    return jax.lax.cond(jnp.any(held), solve, lambda: none)  # hanging arms are seldom held
 
 
 def equilibrium_tangents(
@@ -73,7 +98,7 @@ def equilibrium_tangents(
     # Derivatives at fixed joint coordinates and pressures
     _, params, reference = primals
     _, params_dot, reference_dot = tangents
-    q, pressure_kpa, at_limit, frames, here, response = end
+    q, pressure_kpa, at_limit, frames, here, response, by_law = end
     explicit = _explicit_tangents(primals, tangents, q, pressure_kpa)
 
     # Inverse of the chambers' equations
@@ -87,12 +112,15 @@ def equilibrium_tangents(
     low_dot = _array(params_dot.pressure_min_kpa, params.pressure_min_kpa)
     high_dot = _array(params_dot.pressure_max_kpa, params.pressure_max_kpa)
     tracking_dot = _array(reference_dot, reference)
-    dq_held = jnp.zeros_like(q)  # joints' derivative at constant pressures
+    if explicit is not None:
+        tracking_dot = tracking_dot - explicit.spring_m
+    # Joints at constant pressures; the law's gain, where it holds the arm, answers to references at once
+    dq_held = jnp.sum(_masked(by_law, settled) * tracking_dot, axis=-1)
     if explicit is not None:
         every = jnp.eye(len(q), dtype=q.dtype).reshape(params.n_sections, -1, len(q))
         compliance = _masked(here.hessian.solve(every), settled).reshape(len(q), -1)  # H^-1
-        dq_held = -jnp.sum(compliance * explicit.gradient, axis=-1)
-        tracking_dot = tracking_dot - explicit.spring_m - _along(here.springs.jacobian, dq_held)
+        dq_held = dq_held - jnp.sum(compliance * explicit.gradient, axis=-1)
+    tracking_dot = tracking_dot - _along(here.springs.jacobian, dq_held)
     limit_dot = jax.lax.select(at_high, high_dot, low_dot)
     right = jax.lax.select(at_limit, limit_dot, tracking_dot)
 

@@ -9,8 +9,9 @@ import numpy as np
 from jax import Array
 
 from mjx_softarm.mechanics.body import hole_directions
+from mjx_softarm.posture import base_rotation, check_posture
 from mjx_softarm.sensing.pose import rotation_about
-from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
+from mjx_softarm.spec import LEAST_CHAMBERS, N_CHAMBERS_PER_SECTION, ArmSpec
 
 N_PER_KPA_M2 = 1e3  # force of 1 kPa on 1 m^2
 PAYLOAD = 1  # index in ArmParams.tool_mass_kg
@@ -49,6 +50,7 @@ class ArmParams(NamedTuple):
     area_slope: Array  # (n_chambers,) [N/kPa/m]
     spring_stiffness: Array  # (n_chambers,) [N/m]
     spring_rest_m: Array  # (n_chambers,)
+    law_stiffness: Array  # (n_springs,) [N/m] of a spring, by the law's gain; zeros if chambers are redundant
     pressure_min_kpa: Array  # (n_chambers,)
     pressure_max_kpa: Array  # (n_chambers,)
     mount: Mount
@@ -70,6 +72,18 @@ class ArmParams(NamedTuple):
         """Return the arm with limits that no pressure meets."""
         limit = jnp.full_like(self.area, jnp.inf)
         return self._replace(pressure_min_kpa=-limit, pressure_max_kpa=limit)
+
+    def answering(self, held: Array, reference_m: Array) -> ArmParams:
+        """Return the arm with the law's proportional gain as springs about the references, where `held`.
+
+        This changes no equilibrium at which these springs are on their references, but it may make it stable.
+        """
+        stiffness = self.spring_stiffness + self.law_stiffness
+        pull = self.spring_stiffness * self.spring_rest_m + self.law_stiffness * reference_m
+        return self._replace(
+            spring_stiffness=jnp.where(held, stiffness, self.spring_stiffness),
+            spring_rest_m=jnp.where(held, pull / stiffness, self.spring_rest_m),
+        )
 
     @classmethod
     def from_spec(cls, spec: ArmSpec, dtype: np.typing.DTypeLike = np.float32) -> ArmParams:
@@ -94,6 +108,7 @@ class ArmParams(NamedTuple):
             "area_slope": 1e3 * np.array(spec.per_chamber(spec.chambers.area_slope_m)),
             "spring_stiffness": np.full(n, spec.springs.stiffness_n_per_m),
             "spring_rest_m": np.full(n, spec.springs.rest_length_m),
+            "law_stiffness": _law_stiffness(spec),
             "pressure_min_kpa": np.full(n, spec.chambers.pressure_min_kpa),
             "pressure_max_kpa": np.full(n, spec.chambers.pressure_max_kpa),
         }
@@ -101,9 +116,19 @@ class ArmParams(NamedTuple):
         return cls(**numbers, mount=_mount(spec, dtype))  # type: ignore
 
 
+def _law_stiffness(spec: ArmSpec) -> np.ndarray:
+    """Return the forces per length (n_springs,) [N/m] with which the law answers to errors at once.
+
+    A redundant chamber answers to several springs, whose errors need not vanish at rest: there it is zero.
+    """
+    if spec.structure.chambers_per_section > LEAST_CHAMBERS:
+        return np.zeros(spec.n_springs)
+    return spec.control.kp_kpa_per_m * N_PER_KPA_M2 * np.array(spec.per_chamber(spec.chambers.area_m2))
+
+
 def _mount(spec: ArmSpec, dtype: np.typing.DTypeLike) -> Mount:
-    """Return the mount of `spec`."""
-    mounting = spec.mounting
-    base, tip = (rotation_about(np.radians(turn)) for turn in (mounting.base_turn_deg, mounting.tip_turn_deg))
-    values = (mounting.base_offset_m, base, mounting.tip_offset_m, tip)
+    """Return the mount of `spec`; raise SpecError where `check_posture` does."""
+    check_posture(spec)
+    mounting, tip = spec.mounting, rotation_about(np.radians(spec.mounting.tip_turn_deg))
+    values = (mounting.base_offset_m, base_rotation(spec), mounting.tip_offset_m, tip)
     return Mount(*(np.asarray(value, dtype) for value in values))

@@ -46,7 +46,7 @@ class Camera:
     azimuth_deg: float = 35.0  # 0 looks along +x; grows counter-clockwise seen from above
     elevation_deg: float = -8.0  # negative looks down
     height: float = 1.45  # height of the picture at the arm's distance
-    centre: float = 0.57  # depth below the base of the picture's middle
+    centre: float = 0.57  # distance of the picture's middle from the base, along the straight arm
 
 
 class Renderer:
@@ -67,7 +67,9 @@ class Renderer:
         self._model.vis.quality.offsamples = 8
         self._data = mujoco.MjData(self._model)
         mujoco.mj_kinematics(self._model, self._data)
-        self._arm_length_m = -float(self._data.body("gripper").xpos[2])
+        base = self._data.geom("ring0")
+        self._base_m, self._base_rotation = base.xpos.copy(), base.xmat.reshape(3, 3).copy()
+        self._arm_length_m = float(np.linalg.norm(self._data.body("gripper").xpos - self._base_m))
         self._option = mujoco.MjvOption()
         self._option.sitegroup[:] = 0
         self._renderer: mujoco.Renderer | None = _open_renderer(self._model, width, height)
@@ -96,7 +98,7 @@ class Renderer:
         self._renderer.update_scene(self._data, view, self._option)
         scene = self._renderer.scene
         _draw_bellows(scene, self._model)
-        _draw_mount(scene)
+        _draw_mount(scene, self._base_m, self._base_rotation)
         if payload_radius_m > 0.0:
             held = self._data.body("payload").xpos
             ball, size = mujoco.mjtGeom.mjGEOM_SPHERE, np.full(3, payload_radius_m)
@@ -119,7 +121,7 @@ class Renderer:
     def _camera(self, camera: Camera) -> mujoco.MjvCamera:
         view = mujoco.MjvCamera()
         view.azimuth, view.elevation = camera.azimuth_deg, camera.elevation_deg
-        view.lookat[:] = [0.0, 0.0, -camera.centre * self._arm_length_m]
+        view.lookat[:] = self._base_m - camera.centre * self._arm_length_m * self._base_rotation[:, 2]
         half_angle = np.radians(self._model.vis.global_.fovy) / 2
         view.distance = camera.height * self._arm_length_m / (2 * np.tan(half_angle))
         return view
@@ -194,11 +196,11 @@ def _draw_bellows(scene: mujoco.MjvScene, model: mujoco.MjModel) -> None:
             _append(scene, mujoco.mjtGeom.mjGEOM_ELLIPSOID, size, position, rotation, tube.rgba)
 
 
-def _draw_mount(scene: mujoco.MjvScene) -> None:
-    """Draw the disc from which the arm hangs."""
+def _draw_mount(scene: mujoco.MjvScene, base_m: np.ndarray, base_rotation: np.ndarray) -> None:
+    """Draw the disc that the arm is mounted on, behind its base at (3,) [m] with the axes (3, 3)."""
     size = np.array([_MOUNT_RADIUS_M, _MOUNT_HALF_HEIGHT_M, 0.0])
-    position = np.array([0.0, 0.0, _MOUNT_HALF_HEIGHT_M])
-    _append(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, size, position, np.eye(3), _MOUNT_COLOUR)
+    position = base_m + _MOUNT_HALF_HEIGHT_M * base_rotation[:, 2]
+    _append(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, size, position, base_rotation, _MOUNT_COLOUR)
 
 
 def _add_light(scene: mujoco.MjvScene, azimuth: float) -> None:

@@ -8,6 +8,9 @@ or is at a pressure limit. With V the potential of `mjx_softarm.mechanics.static
 solved by Newton's method on the active set: chambers whose p + c (reference - s) leaves the limits are held
 there, the others track, and one linear system gives the step in q and p together.
 
+An arm that would buckle at constant pressures may stand under the law, whose proportional gain answers to a
+spring's error at once. Where V is not convex, this gain takes part as springs about the references.
+
 Source: primal-dual active set as semismooth Newton, Hintermueller, Ito, Kunisch, SIAM J. Optim. 13 (2002).
 """
 
@@ -22,9 +25,10 @@ import jax.numpy as jnp
 from jax import Array
 from jax.custom_derivatives import zero_from_primal
 
+from mjx_softarm._support import xla
 from mjx_softarm._support.errors import Result
 from mjx_softarm._support.small_matrices import eliminate, identity, products
-from mjx_softarm.mechanics.implicit import Equilibrium, PressureResponse, equilibrium_tangents
+from mjx_softarm.mechanics.implicit import Equilibrium, PressureResponse, equilibrium_tangents, law_response
 from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK, Kinematics
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.statics import statics
@@ -74,7 +78,9 @@ class _Iterate(NamedTuple):
     at_limit: Array  # (n_chambers, *arms) bool, active set of the last step
     response: PressureResponse  # at the iterate before the last step
     n_small: Array  # (*arms,) int, number of small steps in a row with an unchanged active set
+    held: Array  # (*arms,) bool, V has not been convex at some step: the law's gain takes part
     stiffening: Array  # (*arms,) added joint stiffness as a share of the arm's own, where V is not convex
+    convex: Array  # (*arms,) bool, V was convex at the last step without added joint stiffness
     iteration: Array  # (*arms,) int
 
     def goes_on(self, n_small: int) -> Array:
@@ -146,7 +152,7 @@ def _solver(n_small: int, n_at_once: int | None) -> Callable[..., _Solution]:
 
     def many(n: int, batched: list[Any], *arguments: Any) -> tuple[Any, Any]:
         if n_at_once and n_at_once < n:
-            found = _solve_in_chunks(solve, n, -(-n // n_at_once), batched, arguments)
+            found = xla.in_chunks(solve, n, -(-n // n_at_once), batched, arguments)
         else:
             found = _solve_arms_last(n_small, n, batched, *arguments)
         return found, jax.tree.map(lambda _: True, found)
@@ -175,21 +181,6 @@ def _solve_arms_last(
     return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), found)
 
 
-def _solve_in_chunks(
-    solve: Callable, n: int, n_chunks: int, batched: list[Any], arguments: tuple
-) -> _Solution:
-    """Return the solutions of n arms, chunk after chunk; the last chunk repeats its last arm."""
-    arm = jnp.minimum(jnp.arange(n_chunks * -(-n // n_chunks)), n - 1).reshape(n_chunks, -1)
-    axes = jax.tree.map(lambda own: 0 if own else None, tuple(batched))
-
-    def chunk(arm: Array) -> _Solution:
-        theirs = jax.tree.map(lambda x, own: jnp.asarray(x)[arm] if own else x, arguments, tuple(batched))
-        return jax.vmap(solve, in_axes=axes)(*theirs)
-
-    found = jax.lax.map(chunk, arm)
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:n], found)
-
-
 def _solve(n_small: int, kinematics: Kinematics, params: ArmParams, reference_m: Array) -> _Solution:
     """Return the equilibrium after `n_small` small steps and all that its derivative needs; arms are last."""
     # Start: the straight arm, its pressures as close to zero as the limits allow
@@ -202,7 +193,9 @@ def _solve(n_small: int, kinematics: Kinematics, params: ArmParams, reference_m:
         at_limit=jnp.zeros((n_chambers, *arms), bool),
         response=PressureResponse(zeros((nv, n_chambers, *arms)), zeros((n_chambers, n_chambers, *arms))),
         n_small=jnp.zeros(arms, int),
+        held=jnp.zeros(arms, bool),
         stiffening=jnp.zeros(arms, dtype),
+        convex=jnp.ones(arms, bool),
         iteration=jnp.zeros(arms, int),
     )
 
@@ -227,7 +220,7 @@ def _active_set(pressure: Array, error_m: Array, params: ArmParams) -> tuple[Arr
 def _newton_step(it: _Iterate, kinematics: Kinematics, params: ArmParams, reference_m: Array) -> _Iterate:
     """Return the iterate after one Newton step in joint coordinates and pressures together."""
     # Forces, springs and the active set at the iterate
-    here = statics(kinematics(it.q), it.q, it.pressure, params)
+    here = statics(kinematics(it.q), it.q, it.pressure, params.answering(it.held & ~it.at_limit, reference_m))
     error = reference_m - here.springs.length
     at_limit, limit = _active_set(it.pressure, error, params)
 
@@ -246,18 +239,22 @@ def _newton_step(it: _Iterate, kinematics: Kinematics, params: ArmParams, refere
     dp = eliminate(rows, residual[:, None])[:, 0]
     dq = (newton_step + jnp.sum(dq_dp * dp, axis=2)).reshape(it.q.shape)
 
-    # Step length; where elimination gave NaN, the arm stays where it is, and its joints are stiffer from now
+    # Step length; where elimination gave NaN, the arm stays. If any chamber tracks, the law's gain takes part
+    # from now on; if it does already, or none tracks, the joints are stiffer for a step
     largest = jnp.max(jnp.abs(dq), axis=0)
     scale = jnp.minimum(1.0, MAX_STEP / largest)
-    convex = jnp.all(jnp.isfinite(dq), axis=0)  # `largest` may miss a NaN: XLA's maximum on a CPU, jax 0.12
-    small = jnp.all(at_limit == it.at_limit, axis=0) & (largest < SMALL_STEP) & (it.stiffening == 0)
+    finite = jnp.all(jnp.isfinite(dq), axis=0)  # `largest` may miss a NaN: XLA's maximum on a CPU, jax 0.12
+    convex = finite & (it.stiffening == 0)
+    small = jnp.all(at_limit == it.at_limit, axis=0) & (largest < SMALL_STEP) & convex
     return _Iterate(
-        q=jnp.where(convex, it.q + scale * dq, it.q),
-        pressure=jnp.where(convex, it.pressure + scale * dp, it.pressure),
+        q=jnp.where(finite, it.q + scale * dq, it.q),
+        pressure=jnp.where(finite, it.pressure + scale * dp, it.pressure),
         at_limit=at_limit,
         response=PressureResponse(dq_dp.reshape(it.response.dq_dp.shape), dspring_dp),
         n_small=jnp.where(small, it.n_small + 1, 0),
-        stiffening=jnp.where(convex, 0.0, 4.0 * it.stiffening + 4.0),
+        held=it.held | ~finite,
+        stiffening=jnp.where(finite | ~(it.held | jnp.all(at_limit, axis=0)), 0.0, 4.0 * it.stiffening + 4.0),
+        convex=convex,
         iteration=it.iteration + 1,
     )
 
@@ -267,7 +264,8 @@ def _report(it: _Iterate, kinematics: Kinematics, params: ArmParams, reference_m
     # Forces and springs at the end
     pressure = jnp.clip(it.pressure, params.pressure_min_kpa, params.pressure_max_kpa)
     frames = kinematics(it.q)
-    here = statics(frames, it.q, pressure, params)
+    held = it.held & ~it.at_limit
+    here = statics(frames, it.q, pressure, params.answering(held, reference_m))
     residual = jnp.max(jnp.abs(here.gradient), axis=0)
 
     # Errors of the law: at a limit, only an error counts that would take the chamber away from it
@@ -277,11 +275,12 @@ def _report(it: _Iterate, kinematics: Kinematics, params: ArmParams, reference_m
     off = jnp.where(at_limit, jnp.maximum(-outward, 0.0), jnp.abs(error))
     tracking = jnp.max(jnp.where(params.pinned, 0.0, off), axis=0)
 
-    # Result, and all fields of the equilibrium
-    good = (residual < RESIDUAL_TOLERANCE) & (tracking < TRACKING_TOLERANCE_M)
-    finite = jnp.all(jnp.isfinite(here.gradient), axis=0) & jnp.all(jnp.isfinite(error), axis=0)
+    # Result, and all fields of the equilibrium; forces balance in an arm that is about to buckle, too
+    good = (residual < RESIDUAL_TOLERANCE) & (tracking < TRACKING_TOLERANCE_M) & it.convex
+    numbers = here.gradient, error, params.law_stiffness
+    finite = functools.reduce(jnp.logical_and, (jnp.all(jnp.isfinite(x), axis=0) for x in numbers))
     result = jnp.select(
-        [~finite, good, it.stiffening > 0],
+        [~finite, good, ~it.convex],
         [SettleResult.NOT_FINITE.value, SettleResult.CONVERGED.value, SettleResult.NOT_CONVEX.value],
         SettleResult.OUT_OF_ITERATIONS.value,
     )
@@ -297,4 +296,5 @@ def _report(it: _Iterate, kinematics: Kinematics, params: ArmParams, reference_m
         result=result.astype(jnp.int32),
         iterations=it.iteration,
     )
-    return found, Equilibrium(it.q, pressure, at_limit, frames, here, it.response)
+    by_law = law_response(here, held, params.law_stiffness)
+    return found, Equilibrium(it.q, pressure, at_limit, frames, here, it.response, by_law)

@@ -58,10 +58,11 @@ from mjx_softarm.sensing.sensors import Sensor, SensorFault
 from mjx_softarm.spec import ArmSpec, Mounting, SpecError
 
 SCHEMA_VERSION = 8
-READABLE = (
-    7,
-    8,
-)  # in 7, `estimator.spring_site_m` is (n, 2), and each section has as many chambers as springs
+READABLE = (7, 8)
+# In 7, `estimator.spring_site_m` is (n, 2), each section has as many chambers as springs, and the arm hangs
+ADDED_IN_8 = {
+    f"estimator.{name}": PoseEstimator._field_defaults[name] for name in ("base_position_m", "base_rotation")
+}
 
 KIND = "policy"
 LAW = Gains._fields[:-1]  # entries of the law; its allocation follows from the specification
@@ -248,8 +249,10 @@ def file_entries(policy: Policy) -> dict[str, np.ndarray]:
 
 def _unpack(arrays: Mapping[str, np.ndarray], source: str) -> Policy:
     # Refuse other schemas first, since their entries may differ.
+    version = Entries(arrays, source).take("schema_version", np.integer, ())
+    arrays = ADDED_IN_8 | dict(arrays) if version < SCHEMA_VERSION else arrays
     entries = Entries(arrays, source)
-    version = entries.take("schema_version", np.integer, ())
+    entries.take("schema_version", np.integer, ())
     if version not in READABLE:
         readable = " or ".join(map(str, READABLE))
         entries.fail(

@@ -34,7 +34,9 @@ _SMALL_BEND = 1e-8  # square of a bend [rad^2] below which a section counts as s
 class PoseEstimator(NamedTuple):
     """Networks from spring lengths and payload to the tip pose, for n springs. All float32."""
 
-    layers: tuple[Layer, ...]  # normalised springs (n,) and downs (n,) -> changes (n_sections * N_CHANGES,)
+    layers: tuple[
+        Layer, ...
+    ]  # normalised springs (n,) and ups (3 n_sections,) -> changes (n_sections * N_CHANGES,)
     load_layers: tuple[Layer, ...]  # these inputs and the normalised payload (1,) -> changes per payload
     spring_site_m: Array  # (n_sections, s, 2) holes of the s springs of each section in its rings, x and y
     spring_centre_m: Array  # (n,) lengths that are normalised to 0
@@ -42,6 +44,8 @@ class PoseEstimator(NamedTuple):
     load_centre_kg: Array  # () payload that is normalised to 0
     load_scale_kg: Array  # () difference of payload that is normalised to 1
     change_scale: Array  # (N_CHANGES,) [m, 1] units of the networks' outputs
+    base_position_m: Array = np.zeros(3, np.float32)  # origin of the arm's own base in the base frame (z up)
+    base_rotation: Array = np.eye(3, dtype=np.float32)  # axes of the arm's own base
 
 
 class SpringModel(NamedTuple):
@@ -75,7 +79,7 @@ def estimate_frame(estimator: PoseEstimator, spring_m: Array, load_kg: Array | f
     normalised = (spring_m - estimator.spring_centre_m) / estimator.spring_scale_m
     load = (xp.asarray(load_kg, dtype=spring_m.dtype) - estimator.load_centre_kg) / estimator.load_scale_kg
     load = (xp.zeros_like(normalised[..., 0]) + load)[..., None]  # (..., 1)
-    shape = xp.concat([normalised, *_downs(even.rotation)], axis=-1)
+    shape = xp.concat([normalised, *_ups(estimator.base_rotation, even.rotation)], axis=-1)
 
     # Changes of each section's end; position and Gibbs vector are continuous where yaw and roll are not
     changes = mlp(estimator.layers, shape)
@@ -83,7 +87,12 @@ def estimate_frame(estimator: PoseEstimator, spring_m: Array, load_kg: Array | f
     changes = changes.reshape(*changes.shape[:-1], -1, N_CHANGES) * estimator.change_scale
     quaternion = xp.concat([xp.ones_like(changes[..., :1]), changes[..., 3:]], axis=-1)
     turn = rotation_from_quaternion(quaternion / xp.sqrt(xp.sum(quaternion**2, axis=-1))[..., None])
-    return chain(Frame(even.position_m + changes[..., :3], turn @ even.rotation))
+    tip = chain(Frame(even.position_m + changes[..., :3], turn @ even.rotation))
+
+    # From the arm's own base to the base frame
+    base = estimator.base_rotation
+    position_m = (base @ tip.position_m[..., None])[..., 0] + estimator.base_position_m
+    return Frame(position_m, base @ tip.rotation)
 
 
 def constant_curvature(spring_site_m: Array, spring_m: Array) -> Frame:
@@ -122,16 +131,16 @@ def constant_curvature(spring_site_m: Array, spring_m: Array) -> Frame:
     return Frame(position_m, rotation_from_quaternion(quaternion))
 
 
-def _downs(rotation: Array) -> list[Array]:
-    """Return the base's z axis (..., 3) in the frame of each section's end."""
-    downs = [rotation[..., 0, 2:, :]]
-    for section in range(1, rotation.shape[-3]):
-        downs.append(downs[-1] @ rotation[..., section, :, :])
-    return [down[..., 0, :] for down in downs]
+def _ups(base_rotation: Array, rotation: Array) -> list[Array]:
+    """Return the direction against gravity (..., 3) in the frame of each section's end."""
+    ups = [base_rotation[2:]]
+    for section in range(rotation.shape[-3]):
+        ups.append(ups[-1] @ rotation[..., section, :, :])
+    return [up[..., 0, :] for up in ups[1:]]
 
 
 def chain(sections: Frame) -> Frame:
-    """Return the frame of the last plate in the base frame, of sections (..., n_sections) in series."""
+    """Return the frame of the last plate in the axes of the base, of sections (..., n_sections) in series."""
     position_m, rotation = sections.position_m[..., -1, :, None], sections.rotation[..., -1, :, :]
     for section in reversed(range(sections.position_m.shape[-2] - 1)):  # from the tip up to the base
         above = sections.rotation[..., section, :, :]
@@ -140,13 +149,16 @@ def chain(sections: Frame) -> Frame:
     return Frame(position_m[..., 0], rotation)
 
 
-def backbone(spring_site_m: np.ndarray, spring_m: np.ndarray, tip: np.ndarray, at: np.ndarray) -> Frame:
+def backbone(
+    base: Frame, spring_site_m: np.ndarray, spring_m: np.ndarray, tip: np.ndarray, at: np.ndarray
+) -> Frame:
     """Return frames along the arm, which ends at the tip's pose. NumPy only.
 
     Sections of constant curvature are in series, as the springs tell. The tip's distance from their end is
     spread over the arm: it grows evenly from the base.
 
     Args:
+        base: frame (3,) [m], (3, 3) of the arm's own base.
         spring_site_m (n_sections, s, 2) [m]: holes of the springs.
         spring_m (n_sections * s,) [m]: lengths.
         tip (6,) [mm, deg]: pose; with NaN the arm ends where the springs bring it.
@@ -158,7 +170,7 @@ def backbone(spring_site_m: np.ndarray, spring_m: np.ndarray, tip: np.ndarray, a
     # Sections in series; a share of a section has the same share of its springs' lengths
     inner = constant_curvature(spring_site_m, at[:, None] * spring_m)  # (k, n_sections)
     end = int(np.argmax(at))
-    frames, above_m, above = [], np.zeros(3), np.eye(3)
+    frames, above_m, above = [], *base
     for section in range(inner.position_m.shape[1]):
         position_m = above_m + inner.position_m[:, section] @ above.T
         rotation = above @ inner.rotation[:, section]
@@ -190,7 +202,8 @@ def take_estimator(entries: Entries, name: str, n_sections: int, n_springs: int)
         SealedFileError: an entry is missing, or of the wrong type, shape or range.
     """
     shapes: dict = dict.fromkeys(("spring_centre_m", "spring_scale_m"), (n_springs,))
-    shapes |= {"change_scale": (N_CHANGES,)} | dict.fromkeys(("load_centre_kg", "load_scale_kg"), ())
+    shapes |= {"change_scale": (N_CHANGES,), "base_position_m": (3,), "base_rotation": (3, 3)}
+    shapes |= dict.fromkeys(("load_centre_kg", "load_scale_kg"), ())
     n_in, n_out = n_springs + 3 * n_sections, N_CHANGES * n_sections
     own = {
         # Older files have one axis for the springs of all sections.

@@ -2,9 +2,10 @@
 
     pose (..., 6) = x, y, z [mm], yaw, pitch, roll [deg]
 
-in the base frame: z up, the arm hangs towards -z. The angles are intrinsic Z-Y-X, so the tip's axes are the
-columns of R = Rz(yaw) Ry(pitch) Rx(roll), and all three are zero where the arm hangs straight. Yaw and
-roll lie in [-180, 180], pitch in [-90, 90].
+in the base frame, whose z axis points up: an arm hangs towards -z, unless its base is turned
+(`mjx_softarm.posture`). The angles are intrinsic Z-Y-X, so the tip's axes are the columns of
+R = Rz(yaw) Ry(pitch) Rx(roll), and all three are zero where the arm hangs straight. Yaw and roll lie in
+[-180, 180], pitch in [-90, 90].
 
 In gimbal lock (|pitch| = 90) yaw and roll turn about the same axis. There yaw is 0, its gradient is 0, and
 roll takes the whole turn; the pose still gives the rotation back. Close by, yaw and roll and their gradients

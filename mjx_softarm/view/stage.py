@@ -21,7 +21,8 @@ from mjx_softarm.mechanics.body import (
     ring_radius_m,
     shape,
 )
-from mjx_softarm.sensing.pose import quaternion_from_pose
+from mjx_softarm.posture import base_rotation, posture
+from mjx_softarm.sensing.pose import quaternion_from_pose, quaternion_from_rotation
 from mjx_softarm.spec import ArmSpec
 from mjx_softarm.view import meshes
 from mjx_softarm.view.look import Limits, Look
@@ -78,7 +79,10 @@ class Stage:
         self._spring_m = spec.at_springs(spec.geometry.section_length_m)  # lengths in the last picture
         rest = shape(spec, self._spring_m, np.full(6, np.nan))
         turn = meshes.coil(1.6 * SPRING_WIDTH_M, _WIRE_M, length_m / COILS)
-        solid("mount", meshes.disc(*_MOUNT_M), _MOUNT, position=(0.0, 0.0, _MOUNT_M[1] / 2))
+        base = base_rotation(spec)
+        behind = base @ (0.0, 0.0, _MOUNT_M[1] / 2) + spec.mounting.base_offset_m
+        turned = quaternion_from_rotation(base)
+        solid("mount", meshes.disc(*_MOUNT_M), _MOUNT, position=behind, wxyz=turned)
         self._rings = copies("rings", meshes.disc(ring_radius_m(spec), _RING_M), rest.rings, _RING)
         self._folds = copies("bellows", meshes.fold(spec.geometry.chamber_diameter_m / 2), rest.folds, _RING)
         self._coils = copies("springs", turn, rest.coils, _SPRING)
@@ -162,9 +166,11 @@ def set_the_scene(server: viser.ViserServer, spec: ArmSpec, width_m: float = 0.0
     server.scene.configure_default_lights(cast_shadow=False)
     server.scene.configure_environment_map(None)  # the default map bleaches the colours
     server.scene.add_light_ambient("/light", intensity=1.2)
-    middle, floor = (0.0, width_m / 2, -0.55 * length_m), (0.0, width_m / 2, -1.3 * length_m)
+    beside, axis = np.array([0.0, width_m / 2, 0.0]), -posture(spec)[:, 2]
+    middle = beside + 0.55 * length_m * axis
+    floor = beside - [0.0, 0.0, (1.3 if axis[2] < 0.5 else 0.1) * length_m]  # an upright arm stands on it
     lines = {"cell_size": 0.1, "cell_color": (228, 231, 236), "section_color": (205, 210, 217)}
     server.scene.add_grid("/floor", 1.6, 1.6 + width_m, position=floor, section_size=0.4, **lines)
     away_m = 1.35 * length_m + 1.2 * width_m
-    server.initial_camera.position = (away_m, width_m / 2 - 0.5 * away_m, -0.3 * length_m)
+    server.initial_camera.position = middle + [away_m, -0.5 * away_m, 0.25 * length_m]
     server.initial_camera.look_at = middle

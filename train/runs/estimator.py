@@ -126,7 +126,8 @@ def _first_estimator(spec: ArmSpec, pool: LoadedPool, key: Array) -> PoseEstimat
     n_in, n_out = spec.n_springs + 3 * n_sections, N_CHANGES * n_sections
     scale = np.full(N_CHANGES, CHANGE_SCALE)
     scale[:3] *= spec.length_m / n_sections
-    site_m = jnp.asarray(ArmParams.from_spec(spec).spring_site_m).reshape(n_sections, -1, 2)
+    params = ArmParams.from_spec(spec)
+    site_m = jnp.asarray(params.spring_site_m).reshape(n_sections, -1, 2)
     load_layers = initial_layers(jax.random.fold_in(key, 1), (n_in + 1, WIDTH, WIDTH, n_out))
     *hidden, (weight, bias) = load_layers
     return PoseEstimator(
@@ -137,6 +138,8 @@ def _first_estimator(spec: ArmSpec, pool: LoadedPool, key: Array) -> PoseEstimat
         load_centre_kg=jnp.asarray(spec.mass.payload_kg),
         load_scale_kg=jnp.asarray(spec.mass.largest_payload_kg),
         change_scale=jnp.asarray(scale),
+        base_position_m=jnp.asarray(params.mount.base_position_m),
+        base_rotation=jnp.asarray(params.mount.base_rotation),
     )
 
 

@@ -1,0 +1,107 @@
+"""Arms that stand: what buckles says so, and what the law holds is where C MuJoCo's arm comes to rest."""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from benchmarks.speed.mujoco_arms import SteppedArms, sensed_model
+from benchmarks.speed.truth import random_references
+from mjx_softarm import ArmSpec, control
+from mjx_softarm.mechanics.kinematics import chain_kinematics
+from mjx_softarm.mechanics.params import ArmParams
+from mjx_softarm.mechanics.settle import SettleResult, settle
+from mjx_softarm.mechanics.statics import statics
+from mjx_softarm.mechanics.workspace import settle_many
+
+N = 16
+UP = {"base_turn_deg": (180.0, 0.0, 0.0)}
+# It stands by itself; with 10 g it buckles at half of all pressures, with 30 g at nearly all.
+STANDING = ArmSpec.of(Path("stiff-flop")).replace(mounting=UP)
+
+
+def loaded(payload_kg):
+    return STANDING.replace(mass={"payload_kg": payload_kg})
+
+
+def least_curvature(spec, found, rows):
+    """The least eigenvalue of the potential's Hessian at constant pressures, by the joints' own stiffness."""
+    params = jax.tree.map(jnp.asarray, ArmParams.from_spec(spec, np.float64))
+
+    def curvature(q, pressure):
+        hessian = statics(chain_kinematics(params)(q), q, pressure, params).hessian.dense()
+        root = jnp.sqrt(params.joint_stiffness)
+        return jnp.linalg.eigvalsh(hessian / root / root[:, None])[0]
+
+    return np.array([curvature(*map(jnp.float64, x)) for x in zip(found.q[rows], found.pressure_kpa[rows])])
+
+
+def settled(spec, reference_m, dtype=np.float64):
+    params = jax.tree.map(jnp.asarray, ArmParams.from_spec(spec, dtype))
+    solve = jax.jit(jax.vmap(lambda target: settle(chain_kinematics(params), params, target)))
+    return jax.device_get(solve(jnp.asarray(reference_m, dtype)))
+
+
+def stepped_mm(spec, reference_m, seconds):
+    """Tips (n, 3) of C MuJoCo's arms that held references under the law from straight."""
+    arms = SteppedArms(sensed_model(spec), spec, len(reference_m), 1)
+    for _ in range(round(seconds * spec.control.rate_hz)):
+        law = control.LawState(*arms._law)
+        command = reference_m, arms.length_m, law, arms.gains, arms.period_s
+        pressure_kpa, arms._law[:] = control.pressures(*command)
+        arms._step(slice(None), pressure_kpa)
+    return 1e3 * arms._tip[:, :3]
+
+
+def test_no_arm_that_would_buckle_settles_at_constant_pressures():
+    spec = loaded(0.01)
+    rng = np.random.default_rng(0)
+    low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
+    pressures = np.vstack([np.zeros((1, 9)), rng.uniform(low, high, (127, 9))])
+    found = settle_many(spec, pressures)
+    assert found.result[0] == SettleResult.NOT_CONVEX
+    assert 0.2 < found.settled.mean() < 0.9
+    with jax.enable_x64(True):
+        assert (least_curvature(spec, found, found.settled) > 0.0).all()
+
+
+def test_the_law_holds_arms_that_would_buckle_where_c_mujoco_holds_them():
+    spec = loaded(0.01)
+    reference_m = random_references(spec, N)
+    found = settled(spec, reference_m, np.float32)
+    assert found.settled.all()
+    with jax.enable_x64(True):
+        assert (least_curvature(spec, found, slice(None)) < 0.0).mean() > 0.3
+    away = np.linalg.norm(1e3 * found.tip_position_m - stepped_mm(spec, reference_m, 12.0), axis=1)
+    assert away.max() < 0.05
+
+
+def test_the_paper_s_arm_is_too_heavy_to_stand_and_says_so():
+    spec = ArmSpec.default().replace(mounting=UP)
+    found = settled(spec, random_references(spec, N), np.float32)
+    assert set(found.result) <= {SettleResult.NOT_CONVEX, SettleResult.OUT_OF_ITERATIONS}
+
+
+@pytest.mark.parametrize("of", ["reference", "stiffness"])
+def test_derivatives_of_arms_that_the_law_holds_are_those_of_differences(of):
+    with jax.enable_x64(True):
+        params = jax.tree.map(jnp.asarray, ArmParams.from_spec(loaded(0.03), np.float64))
+        reference_m = jnp.asarray(random_references(STANDING, 4))
+
+        def tips(change):
+            arm, target = params, reference_m
+            if of == "reference":
+                target = reference_m + 1e-3 * change
+            else:
+                arm = params._replace(chamber_stiffness=params.chamber_stiffness * (1.0 + 0.01 * change))
+            return jax.vmap(lambda x: settle(chain_kinematics(arm), arm, x))(target)
+
+        found = tips(jnp.zeros(9))
+        assert found.settled.any() and not (least_curvature(loaded(0.03), found, found.settled) > 0.0).any()
+        direction, step = jnp.asarray(np.random.default_rng(1).normal(size=9)), 1e-4
+        _, slope = jax.jvp(lambda x: tips(x).tip_position_m, (jnp.zeros(9),), (direction,))
+        ahead, back = (tips(sign * step * direction).tip_position_m for sign in (1.0, -1.0))
+        expected = (ahead - back) / (2 * step)
+    np.testing.assert_allclose(slope[found.settled], expected[found.settled], rtol=1e-3, atol=1e-6)
