@@ -68,5 +68,6 @@ def test_a_straight_tip_in_gimbal_lock_is_refused_with_another_turn_of_the_same_
         ArmParams.from_spec(spec, np.float64).chamber_site_m.reshape(-1, 2),
         ArmParams.from_spec(SPEC, np.float64).chamber_site_m.reshape(-1, 2),
     ]
-    in_base = [base_rotation(arm)[:, :2] @ hole.T for arm, hole in zip((spec, turned(turn_deg)), holes)]
+    arms = zip((spec, turned(turn_deg)), holes, strict=True)
+    in_base = [base_rotation(arm)[:, :2] @ hole.T for arm, hole in arms]
     np.testing.assert_allclose(in_base[0], in_base[1], atol=1e-6)

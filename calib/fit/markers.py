@@ -23,6 +23,7 @@ import numpy as np
 from calib.errors import FitError
 from calib.read.static_poses import StaticPoses
 from mjx_softarm.mechanics.params import ArmParams
+from mjx_softarm.posture import posture
 from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
 
 ORDER = 4
@@ -78,11 +79,13 @@ def marker_limits(poses: StaticPoses, simulated_m: np.ndarray, spec: ArmSpec) ->
     # Choose the most bent poses.
     seen = np.flatnonzero(np.isfinite(poses.marker_m).all(axis=(1, 2)))
     site_m = _marker_site(poses.take(seen))
-    bending_deg = np.degrees(np.arccos(np.clip(poses.tip_rotation[seen, 2, 2], -1.0, 1.0)))
+    axes = posture(spec)
+    along = poses.tip_rotation[seen, :, 2] @ axes[:, 2]
+    bending_deg = np.degrees(np.arccos(np.clip(along, -1.0, 1.0)))
     order = np.argsort(-bending_deg)[:N_POSES]
     pose = seen[order]
     # Measure chambers along the curves through their markers.
-    curves = [fit_curve(poses.marker_m[k], site_m) for k in pose]
+    curves = [fit_curve(poses.marker_m[k] @ axes, site_m) for k in pose]  # as if the arm hung
     length_m = np.stack([chamber_lengths(curve, site_m, spec) for curve, _ in curves])
     return MarkerLimits(
         pose=pose,

@@ -5,9 +5,9 @@ Each entry is a change from the specification:
 - per chamber: logarithms of the ratios of stiffness and area; slope of the area, in areas per section length;
   rest length, in section lengths
 - backbone: logarithm of the ratio of the bending stiffness
-- mounting: turn of the base about x and y, and its offset; roll of each section's holes; turn of the measured
-  tip, and its offset within the last plate. A turn of the base about z is a roll of all sections. An axial
-  offset of the tip cannot be told from an offset of the base.
+- mounting: turn of the base about its own x and y, and its offset; roll of each section's holes; turn of the
+  measured tip, and its offset within the last plate. A turn of the base about its own z is a roll of all
+  sections. An axial offset of the tip cannot be told from an offset of the base.
 - sites of the markers at the sections' ends, each within its plate, since markers are stuck on by hand
 """
 
@@ -111,7 +111,7 @@ def with_numbers(x: Array, params: ArmParams) -> ArmParams:
         chamber_rest_m=params.chamber_rest_m + by["offset"] * params.section_length_m,
         mount=mount._replace(
             base_position_m=mount.base_position_m + by["base offset"],
-            base_rotation=product(base_turn, jnp.asarray(mount.base_rotation)),
+            base_rotation=product(jnp.asarray(mount.base_rotation), base_turn),
             tip_offset_m=mount.tip_offset_m + jnp.concatenate([by["tip offset"], zero]),
             tip_rotation=product(jnp.asarray(mount.tip_rotation), _turned(by["tip turn"])),
         ),
@@ -150,7 +150,7 @@ def spec_at(spec: ArmSpec, x: np.ndarray) -> ArmSpec:
     }
     # Turn and shift the mounting.
     base, tip = (rotation_about(np.radians(v)) for v in (mounting.base_turn_deg, mounting.tip_turn_deg))
-    base = np.asarray(_turned(jnp.append(by["base turn"], 0.0)), float) @ base
+    base = base @ np.asarray(_turned(jnp.append(by["base turn"], 0.0)), float)
     tip = tip @ np.asarray(_turned(jnp.asarray(by["tip turn"])), float)
     turned = {
         "base_turn_deg": np.degrees(rotation_vector(base)),

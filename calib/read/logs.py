@@ -51,9 +51,10 @@ def read_log(
     Raises:
         LogError: the log cannot be used or is refused; the message has a line for each finding.
     """
-    matrix, findings = read_matrix(path, spec or ArmSpec.default(), one_of=NEEDED)
+    spec = spec or ArmSpec.default()
+    matrix, findings = read_matrix(path, spec, one_of=NEEDED)
     with np.errstate(over="ignore", invalid="ignore"):  # any number may stand in a file
-        refuse(implausible(matrix))
+        refuse(implausible(matrix, spec))
         matrix, found = clean(matrix)
     findings += found
     if strict:

@@ -16,7 +16,9 @@ from mjx_softarm.logs import checks
 from mjx_softarm.logs.checks import Finding, LogError
 from mjx_softarm.logs.files import LogMatrix
 from mjx_softarm.logs.schema import UNITS, Column
+from mjx_softarm.posture import hangs, posture
 from mjx_softarm.sensing.sensors import SENSORS as KINDS
+from mjx_softarm.spec import ArmSpec
 
 
 class Plausible(NamedTuple):
@@ -47,7 +49,7 @@ PLAUSIBLE: Mapping[str, Plausible] = MappingProxyType(
 )
 BY_HAND_ROWS = 300  # fewer rows may be poses that were recorded by hand
 BY_HAND_S = 600.0  # longest median step of poses that were recorded by hand
-HANGS_BELOW_M = -0.05  # greatest median z of the tip, as z is up and the arm hangs
+ALONG_M = 0.05  # least median distance of the tip from the base, along the straight arm
 FROM_LOOP = ("reference_m", "goal", "estimate", "load_kg")  # columns of the control loop; may hold NaN
 SENSORS = ("readings", "spring_m", "pressure_kpa", "tip_m", "marker_m")
 
@@ -105,8 +107,8 @@ def _finding(matrix: LogMatrix, fault: RowFault) -> Finding:
     return Finding(matrix.file, (int(rows[0]), int(rows[-1])), fault.column, problem, n_dropped)
 
 
-def implausible(matrix: LogMatrix) -> list[Finding]:
-    """Find reasons to refuse the log: columns without numbers, or whose numbers contradict their header."""
+def implausible(matrix: LogMatrix, spec: ArmSpec) -> list[Finding]:
+    """Find reasons to refuse the log: columns without numbers, or that contradict their header or the arm."""
     if len(matrix.row) < 2:
         return [Finding(matrix.file, None, "", f"got {len(matrix.row)} row, expected 2 at least")]
     problems = {}
@@ -115,10 +117,13 @@ def implausible(matrix: LogMatrix) -> list[Finding]:
     for group in dict.fromkeys(column.group for column in matrix.columns[1:]):
         problems[group] = _implausible_size(matrix, group)
     if tip := matrix.indices("tip_m"):
-        z_m = _typical(matrix.values[:, tip[2]])
-        if z_m > HANGS_BELOW_M:
-            expected = f"below {HANGS_BELOW_M} m, as z is up and the arm hangs from the base"
-            problems["tip_z"] = problems["tip_z"] or f"got a median of {z_m:.3g} m, expected {expected}"
+        along_m = _typical(matrix.values[:, tip] @ -posture(spec)[:, 2])
+        if along_m < ALONG_M:
+            turn_deg = spec.mounting.base_turn_deg
+            points = "hangs from the base" if hangs(spec) else f"is turned by {turn_deg} deg"
+            got = f"got a median of {along_m:.3g} m along the straight arm"
+            expected = f"{ALONG_M} m or more, as z is up and the arm {points}"
+            problems["tip_z"] = problems["tip_z"] or f"{got}, expected {expected}"
     return [Finding(matrix.file, None, name, problem) for name, problem in problems.items() if problem]
 
 

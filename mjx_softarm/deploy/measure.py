@@ -22,6 +22,7 @@ from mjx_softarm.deploy.safety import Fault
 from mjx_softarm.logs.tables import read_table
 from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.policy.file import Policy
+from mjx_softarm.posture import posture
 from mjx_softarm.sensing.pose import frame_from_pose, pose_error, pose_from_frame, rotation_about, seen_error
 
 LOOKS, LOOK_S = 50, 0.02  # number of frames tried before an arm moves; time between two of them
@@ -44,14 +45,14 @@ class Accuracy(NamedTuple):
 def read_goals(name: str, policy: Policy, n: int) -> np.ndarray:
     """Return goals (p, 6) [mm, deg] by name: `circle` and `grid` of at most n poses, or a CSV file.
 
-    Around the circle the last plate hangs straight down, with motion capture's frame on it as calibrated.
+    Around the circle the last plate is that of the straight arm, with motion capture's frame as calibrated.
 
     Raises:
         InputError: there is no such file, or its columns are not `GOAL_COLUMNS`.
     """
     if name == "circle":
         position_m, _ = frame_from_pose(circle_poses(policy.spec, n).astype(float))
-        turn = rotation_about(np.radians(policy.spec.mounting.tip_turn_deg))
+        turn = posture(policy.spec) @ rotation_about(np.radians(policy.spec.mounting.tip_turn_deg))
         return np.asarray(pose_from_frame(position_m, np.broadcast_to(turn, (n, 3, 3))))
     if name == "grid":
         return grid_poses(policy.workspace, n)

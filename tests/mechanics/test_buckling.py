@@ -35,7 +35,8 @@ def least_curvature(spec, found, rows):
         root = jnp.sqrt(params.joint_stiffness)
         return jnp.linalg.eigvalsh(hessian / root / root[:, None])[0]
 
-    return np.array([curvature(*map(jnp.float64, x)) for x in zip(found.q[rows], found.pressure_kpa[rows])])
+    arms = zip(found.q[rows], found.pressure_kpa[rows], strict=True)
+    return np.array([curvature(*map(jnp.float64, arm)) for arm in arms])
 
 
 def settled(spec, reference_m, dtype=np.float64):

@@ -20,6 +20,7 @@ from mjx_softarm.logs.checks import Finding, not_unit_rows
 from mjx_softarm.logs.files import LogMatrix, read_matrix, refuse
 from mjx_softarm.logs.schema import UNITS, Column, Log
 from mjx_softarm.mdp.actions import ActionMap
+from mjx_softarm.posture import hangs, posture
 from mjx_softarm.sensing.pose import pose_from_quaternion
 from mjx_softarm.spec import ArmSpec
 
@@ -87,9 +88,10 @@ def _out_of_range(matrix: LogMatrix, spec: ArmSpec) -> Iterator[Finding]:
             yield _finding(matrix, row, column.name, f"{got}, expected {low} to {high}, the arm's range")
     tip_m = matrix.values[:, matrix.indices("tip_m")]
     reach_m = spec.structure.n_sections * spec.springs.length_max_m
-    for row in np.flatnonzero((np.linalg.norm(tip_m, axis=1) > reach_m) | (tip_m[:, 2] > 0.0)):
+    behind, side = tip_m @ posture(spec)[:, 2] > 0.0, "below" if hangs(spec) else "before"
+    for row in np.flatnonzero((np.linalg.norm(tip_m, axis=1) > reach_m) | behind):
         got = ", ".join(f"{1e3 * value:.4g}" for value in tip_m[row])
-        expected = f"a tip below the base and within {1e3 * reach_m:.4g} mm of it"
+        expected = f"a tip {side} the base and within {1e3 * reach_m:.4g} mm of it"
         yield _finding(matrix, row, "tip_x..z", f"got {got} mm, expected {expected}")
     quaternion = matrix.values[:, matrix.indices("tip_quaternion")]
     for row in np.flatnonzero(not_unit_rows(quaternion)):
