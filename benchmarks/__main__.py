@@ -23,6 +23,7 @@ BENCHMARKS = {
     "planning": "benchmarks.accuracy.planning:measure",
     "arms": "benchmarks.accuracy.arms:measure",
     "logs": "benchmarks.accuracy.logs:measure",
+    "regulators": "benchmarks.accuracy.regulators:measure",
     "claims": "benchmarks.accuracy.claims:measure",
     "learning": "benchmarks.accuracy.learning:measure",
     "film": "benchmarks.accuracy.film:film",

@@ -154,6 +154,7 @@ class AsuLog(NamedTuple):
 
     time_s: np.ndarray  # (n,)
     pressure_kpa: np.ndarray  # (n, 6) measured in section 1, then section 2, relative to the atmosphere
+    commanded_kpa: np.ndarray  # (n, 6) desired in the same chambers
     wire_m: np.ndarray  # (n, 4) draw wires from the base: section 1 left, 1 right, 2 right, 2 left
     position_m: np.ndarray  # (n, 3, 3) base, middle, tip
     quaternion: np.ndarray  # (n, 3, 4) w, x, y, z as logged
@@ -185,11 +186,13 @@ def read_asu(path: Path) -> AsuLog:
     axes = ("x", "y", "z", "qx", "qy", "qz", "qw")
     bodies = [f"{body}_{axis}" for body in range(N_BODIES) for axis in axes]
     values = _columns(path, ["time", *pressures, *(f"wire{k}" for k in range(4)), *bodies], header=False)
-    pressure_psi = values[:, 1:13].reshape(-1, 2, 2, 3)[:, :, 1]
+    # (n, sections, desired and measured, 3) -> (n, desired and measured, 6)
+    psi = np.swapaxes(values[:, 1:13].reshape(-1, 2, 2, 3), 1, 2).reshape(-1, 2, 6)
     body = values[:, 17:].reshape(-1, N_BODIES, 7)
     return AsuLog(
         time_s=values[:, 0],
-        pressure_kpa=UNITS["pressure"]["psi"] * pressure_psi.reshape(-1, 6),
+        pressure_kpa=UNITS["pressure"]["psi"] * psi[:, 1],
+        commanded_kpa=UNITS["pressure"]["psi"] * psi[:, 0],
         wire_m=WIRE_M_PER_V * values[:, 13:17],
         position_m=body[..., :3],
         quaternion=body[..., [6, 3, 4, 5]],
