@@ -18,7 +18,7 @@ from mjx_softarm._support import cli
 from mjx_softarm._support.errors import InputError
 
 DONE = (0, 1)  # exit statuses after which there are results
-
+N_MOVING = 8  # poses of a log of all ticks, to which the regulators are fitted
 
 ARMS = ("paper", "sopra", "stiff-flop")
 
@@ -48,12 +48,14 @@ def measure(
 def _measure(arm: str, folder: Path, poses: int, steps: int | None, points: int) -> dict[str, Any]:
     # Record, calibrate, train and export.
     folder.mkdir(parents=True)
-    twin, log, calibration = f"twin:rod:0@{arm}", folder / "poses.csv", folder / "calibration"
+    twin, calibration = f"twin:rod:0@{arm}", folder / "calibration"
+    logs = folder / "poses.csv", folder / "moving.csv"
     run, policy = folder / "run", folder / "run/policy.npz"
-    record = ["mjx_softarm.deploy", "record", "--arm", twin, "--spec", arm, "--poses", poses, "--out", log]
+    record = ["mjx_softarm.deploy", "record", "--arm", twin, "--spec", arm]
     train = ["train", "reach", "--preset", "analytic", "--calibration", calibration, "--out", run]
-    run_command(*record)
-    distrusted = run_command("calib", "run", log, "--spec", arm, "--out", calibration)
+    run_command(*record, "--poses", poses, "--out", logs[0])
+    run_command(*record, "--poses", N_MOVING, "--transients", "--out", logs[1])
+    distrusted = run_command("calib", "run", *logs, "--spec", arm, "--out", calibration)
     run_command(*train, *(("--learner.total-env-steps", steps) if steps else ()))
     run_command("train", "export", run)
     # Measure the policy on the twin.

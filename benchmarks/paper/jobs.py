@@ -5,6 +5,7 @@ Each runs in a process of its own, and imports its packages by itself.
 
 from __future__ import annotations
 
+import itertools
 import os
 import shutil
 from pathlib import Path
@@ -20,10 +21,13 @@ from mjx_softarm.spec import ARM_FILE
 
 # Presets that differ in the payload alone: a run beside the experiment's own gets the same further settings.
 ALIKE = {"analytic", "payload"}
+MOVING, N_MOVING = "moving.npz", 8  # log of a rod in motion, and its number of poses
 
 
 def calibrate_twin(folder: Path, settings: Settings, twin: int) -> None:
-    """Record a twin's log, unless it exists, and calibrate the twin by it.
+    """Record a twin's logs, unless they exist, and calibrate the twin by them.
+
+    A rod's regulators are slow; they are fitted to a second log, of all ticks between a few poses.
 
     Raises:
         JobError: the recording ended early.
@@ -40,19 +44,21 @@ def calibrate_twin(folder: Path, settings: Settings, twin: int) -> None:
 
     here, spec = folder / f"twin{twin}", ArmSpec.default()
     here.mkdir(parents=True, exist_ok=True)
-    file = here / "log.npz"
-    # Record random static poses.
-    if not file.exists():
+    n_of_logs = {"log.npz": settings.n_poses} | ({MOVING: N_MOVING} if settings.arm == "rod" else {})
+    # Record random poses.
+    for name, n in n_of_logs.items():
+        if (here / name).exists():
+            continue
         arm = stand_in(settings)(twin, spec, session=S2R_SESSION)
-        recording = record(arm, spec, random_pressures(spec, settings.n_poses, seed=twin))
+        recording = record(arm, spec, random_pressures(spec, n, seed=twin), transients=name == MOVING)
         if cause := recording.ending.cause:
-            n = settings.n_poses
             raise JobError(f"log of {n} poses: got a recording that ended early ({cause}), expected all")
-        write_log(file, recording.log)
-    # Calibrate from the file, as a user would.
-    log, findings = read_log(file, spec)
+        write_log(here / name, recording.log)
+    # Calibrate from the files, as a user would.
+    logs, findings = zip(*(read_log(here / name, spec) for name in n_of_logs), strict=True)
+    findings = [*itertools.chain(*findings)]
     xla.enable_compilation_cache()
-    calibration = calibrate([log], spec)
+    calibration = calibrate(logs, spec)
     write_calibration(here / CALIBRATION, calibration, [*map(str, findings)], provenance("benchmarks"))
 
 

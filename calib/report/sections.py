@@ -175,7 +175,8 @@ def actuators(fit: ActuatorFit) -> Section:
             ReportTable(("pressures", "RMS [kPa]"), errors),
         ),
         fit.warnings,
-        _plain(fit, "spec") | {"kind": found.kind, "values": _json(dataclasses.asdict(found))},
+        _plain(fit, "spec", "notes") | {"kind": found.kind, "values": _json(dataclasses.asdict(found))},
+        notes=fit.notes,
     )
 
 

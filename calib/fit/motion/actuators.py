@@ -41,7 +41,7 @@ KNOWN = 0.3  # relative half-width of an interval up to which a number counts as
 MARGIN, SMALL_KPA = 1.05, 0.1  # ratio and difference of errors up to which the simpler actuators are better
 MAX_RATIO = 2.0  # ratio of held-out to other errors from which there is a warning
 _SHARED = ("lag_s", "dead_time_s", "fill_kpa_per_s", "vent_kpa_per_s", "deadband_kpa")
-_OWN = _SHARED[:4]  # numbers that differ between chambers
+_OWN, _RATES = _SHARED[:4], _SHARED[2:4]  # numbers that differ between chambers; greatest rates
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +56,8 @@ class ActuatorFit:
     chamber_rms_kpa: np.ndarray  # (c,) held-out seconds of each chamber
     n_tracks: int
     time_s: float
-    warnings: tuple[str, ...]  # reasons not to trust the fit, each with its remedy
+    warnings: tuple[str, ...] = ()  # reasons not to trust the fit, each with its remedy
+    notes: tuple[str, ...] = ()  # numbers that the logs do not show
 
 
 def fit_actuators(tracks: Sequence[Track], spec: ArmSpec, seed: int = 0) -> ActuatorFit:
@@ -93,9 +94,8 @@ def fit_actuators(tracks: Sequence[Track], spec: ArmSpec, seed: int = 0) -> Actu
         chamber_rms_kpa=np.array([_rms(error[own[:, k], k]) for k in range(spec.n_chambers)]),
         n_tracks=len(tracks),
         time_s=sum(len(track.pressure_kpa) for track in tracks) / spec.control.rate_hz,
-        warnings=(),
     )
-    return dataclasses.replace(done, warnings=_warnings(done, solution))
+    return dataclasses.replace(done, warnings=_warnings(done, solution), notes=_notes(done))
 
 
 def with_actuators(spec: ArmSpec, actuators: Actuators) -> ArmSpec:
@@ -230,12 +230,11 @@ def _rms(error: np.ndarray) -> float:
 
 def _warnings(done: ActuatorFit, solution: Solution) -> tuple[str, ...]:
     said = [] if solution.converged else [NOT_CONVERGED]
-    actuators = done.spec.actuators
-    if isinstance(actuators, Regulator):
-        for name in _OWN:
-            share = float(np.median(done.half_width_95[name] / np.array(getattr(actuators, name))))
-            if share > KNOWN:
-                said.append(f"{name} is known to {100 * share:.0f} % only: log larger steps of the commands")
+    said += [
+        f"{name} is known to {100 * share:.0f} % only: log larger steps of the commands"
+        for name, share in _uncertain(done).items()
+        if name not in _RATES
+    ]
     held_out = done.held_out_rms_kpa[done.chosen]
     if held_out > MAX_RATIO * done.in_sample_rms_kpa:
         said.append(
@@ -243,3 +242,20 @@ def _warnings(done: ActuatorFit, solution: Solution) -> tuple[str, ...]:
             f"seconds, {done.in_sample_rms_kpa:.2f} kPa: log for longer"
         )
     return tuple(said)
+
+
+def _notes(done: ActuatorFit) -> tuple[str, ...]:
+    return tuple(
+        f"{name} is known to {100 * share:.0f} % only: the commands changed more slowly"
+        for name, share in _uncertain(done).items()
+        if name in _RATES
+    )
+
+
+def _uncertain(done: ActuatorFit) -> dict[str, float]:
+    """Return the numbers whose relative half-widths, medians of all chambers, exceed `KNOWN`."""
+    actuators = done.spec.actuators
+    if not isinstance(actuators, Regulator):
+        return {}
+    shares = {name: float(np.median(done.half_width_95[name] / getattr(actuators, name))) for name in _OWN}
+    return {name: share for name, share in shares.items() if share > KNOWN}

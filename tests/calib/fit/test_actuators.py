@@ -62,7 +62,7 @@ def log_of(spec, plant, seed=0):
 def test_planted_regulators_are_found(short):
     fit = fit_actuators(find_tracks([log_of(short, REGULATOR)], short), short)
     found = fit.spec.actuators
-    assert found.kind == fit.chosen == "regulator" and not fit.warnings
+    assert found.kind == fit.chosen == "regulator" and not fit.warnings + fit.notes
     moved = np.arange(3) != STILL
     for name in ("lag_s", "dead_time_s", "fill_kpa_per_s", "vent_kpa_per_s"):
         true = np.full(3, getattr(REGULATOR, name))
@@ -90,7 +90,7 @@ def test_a_weaker_pump_is_found(short):
 
 
 def test_regulators_of_a_rod_are_found_in_a_recording_of_all_ticks(spec):
-    """Ramps do not show the greatest rates, of which the report warns."""
+    """Ramps do not show the greatest rates, and the report says so."""
     arm = RodTwin(101, spec, build=Build(per_section=3))
     log = record(arm, spec, random_pressures(spec, 4, 0), transients=True).log
     fit = fit_actuators(find_tracks([log], spec), spec)
@@ -98,7 +98,8 @@ def test_regulators_of_a_rod_are_found_in_a_recording_of_all_ticks(spec):
     assert fit.chosen == "regulator" and fit.held_out_rms_kpa["regulator"] < 0.3
     for name, tolerance in (("lag_s", 0.12), ("dead_time_s", 0.03)):
         np.testing.assert_allclose(getattr(fit.spec.actuators, name), getattr(true, name), atol=tolerance)
-    assert any("log larger steps of the commands" in text for text in fit.warnings)
+    assert not fit.warnings and "fill_kpa_per_s is known to" in fit.notes[0]
+    assert actuators(measure([log], spec), spec, 0).section.notes == fit.notes
 
 
 def test_a_log_without_commands_or_of_poses_alone_says_so(short):
