@@ -23,25 +23,31 @@ SIX_CHAMBERS = _PAPER.replace(
     geometry={"chamber_diameter_m": 0.034},
     chambers=_chambers(3 / 6),
 )
+_WIDTHS = 1.1, 1.0, 0.85  # widths of the tapered arm's sections; areas and stiffnesses go with their squares
+
+
+def _tapered(value, power=2, each=1):
+    """A number of the paper's arm times a power of each section's width, for so many parts of each."""
+    return tuple(value * width**power for width in _WIDTHS for _ in range(each))
+
+
 TAPERED = _PAPER.replace(
     name="tapered",
     geometry={
         "section_length_m": (0.22, 0.2, 0.17),
-        "chamber_radius_m": (0.04, 0.035, 0.03),
-        "spring_radius_m": (0.075, 0.067, 0.058),
+        "chamber_radius_m": _tapered(0.035, 1),
+        "spring_radius_m": _tapered(0.067, 1),
         "first_chamber_deg": (90.0, 150.0, 80.0),
-        "chamber_diameter_m": (0.066, 0.06, 0.051),
+        "chamber_diameter_m": _tapered(0.06, 1),
     },
-    mass={"arm_kg": (1.8, 1.4, 1.05)},
-    chambers={
-        "area_m2": (0.00196,) * 3 + (0.00162,) * 3 + (0.00117,) * 3,
-        "area_slope_m": (-0.0045,) * 3 + (-0.0041,) * 3 + (-0.0034,) * 3,
-    },
+    mass={"arm_kg": (1.7, 1.4, 1.0)},
+    chambers={name: _tapered(value, each=3) for name, value in _chambers(1.0).items()},
     backbone={
-        "axial_stiffness_n_per_m": (850.0, 850.0, 800.0),
-        "bending_stiffness_nm_per_rad": (1.4, 1.1, 0.8),
+        "axial_stiffness_n_per_m": _tapered(_PAPER.backbone.axial_stiffness_n_per_m),
+        "bending_stiffness_nm_per_rad": _tapered(_PAPER.backbone.bending_stiffness_nm_per_rad, 4),
     },
     springs={
+        "stiffness_n_per_m": _tapered(_PAPER.springs.stiffness_n_per_m),
         "rest_length_m": (0.22, 0.2, 0.17),
         "length_min_m": (0.094, 0.085, 0.072),
         "length_max_m": (0.302, 0.275, 0.234),

@@ -103,72 +103,105 @@ def actor(controller: Controller) -> Computation:
     return Computation((observation,), {"action": actor_output(policy, observation)})
 
 
+class _Inputs(NamedTuple):
+    """Inputs of the loop's functions."""
+
+    readings: Symbol  # (n_springs,)
+    spring_m: Symbol  # (n_springs,)
+    reference_m: Symbol  # (n_springs,)
+    pressure_kpa: Symbol  # (n_chambers,)
+    springs_m: Symbol  # (window, n_springs)
+    pressures_kpa: Symbol  # (window, n_chambers)
+    goal: Symbol  # (6,)
+    pose: Symbol  # (6,)
+    load_kg: Symbol  # ()
+
+    @classmethod
+    def of(cls, controller: Controller) -> _Inputs:
+        spec, window = controller.policy.spec, controller.window
+        springs, chambers = (spec.n_springs,), (spec.n_chambers,)
+        shapes = springs, springs, springs, chambers, (window, *springs), (window, *chambers), (6,), (6,), ()
+        doubles = cls(*(symbol(name, shape) for name, shape in zip(cls._fields, shapes, strict=True)))
+        return doubles._replace(pose=symbol("pose", (6,), np.float32))
+
+
 def parts(controller: Controller) -> dict[str, Computation]:
     """Record the functions of which `mjx_softarm.deploy.loop` consists, by their names in C++."""
-    # Inputs.
-    policy, spec, window = controller.policy, controller.policy.spec, controller.window
-    gains, tolerance_m, config = policy.gains, policy.tolerance_m, controller.config
-    springs, chambers = (spec.n_springs,), (spec.n_chambers,)
-    names = ("readings", "reference_m", "spring_m", "mean_m", "asked_m")
-    readings, reference_m, spring_m, mean_m, asked_m = (symbol(name, springs) for name in names)
-    pressure_kpa, is_saturated = symbol("pressure_kpa", chambers), symbol("is_saturated", chambers, bool)
-    sizes = chambers, springs, springs  # integral, references and lengths of the law
-    state = LawState(
-        *(symbol(f"last_{name}", size) for name, size in zip(LawState._fields, sizes, strict=True))
-    )
-    springs_m, pressures_kpa = (
-        symbol("springs_m", (window, *springs)),
-        symbol("pressures_kpa", (window, *chambers)),
-    )
-    goal, pose, load_kg = symbol("goal", (6,)), symbol("pose", (6,), np.float32), symbol("load_kg", ())
-    xp = readings.__array_namespace__()
+    at = _Inputs.of(controller)
+    return _acting_parts(controller, at) | _judging_parts(controller, at) | _search_parts(controller, at)
 
+
+def _acting_parts(controller: Controller, at: _Inputs) -> dict[str, Computation]:
+    """Record lengths, payload, pose, references and pressures."""
     # Belief.
-    reading = policy.sensor.lengths(readings, spring_m)
-    tip, away = tip_pose(policy, spring_m, load_kg)
-    estimate_kg = estimate_load(
-        policy.load_estimator, xp.mean(springs_m, axis=0), xp.mean(pressures_kpa, axis=0)
-    )
-    # Policy and law.
-    motion = _in_motion(spec)
-    observed = sensed(policy, pose, spring_m, motion, load_kg)
-    action = action_towards(policy, pose, xp.asarray(goal, dtype=np.float32), observed)
-    written_kpa, after = pressures(reference_m, spring_m, state, gains, controller.dt_s)
+    policy, xp = controller.policy, array_namespace(at.readings)
+    reading = policy.sensor.lengths(at.readings, at.spring_m)
+    tip, away = tip_pose(policy, at.spring_m, at.load_kg)
+    means = xp.mean(at.springs_m, axis=0), xp.mean(at.pressures_kpa, axis=0)
+    # Policy.
+    motion = _in_motion(policy.spec)
+    observed = sensed(policy, at.pose, at.spring_m, motion, at.load_kg)
+    action = action_towards(policy, at.pose, xp.asarray(at.goal, dtype=np.float32), observed)
+    # Law.
+    sizes = policy.spec.n_chambers, policy.spec.n_springs, policy.spec.n_springs
+    state = LawState(*(symbol(f"last_{name}", (n,)) for name, n in zip(LawState._fields, sizes, strict=True)))
+    written_kpa, after = pressures(at.reference_m, at.spring_m, state, policy.gains, controller.dt_s)
     law = {"written_kpa": written_kpa} | {f"next_{name}": value for name, value in after._asdict().items()}
-    # Faults, and the way that remains.
-    mask = saturated(pressure_kpa, reference_m, spring_m, gains, tolerance_m)
-    settled = on_reference(springs_m, reference_m, pressure_kpa, gains, tolerance_m)
-    scaled = scaled_error(xp.asarray(pose, dtype=np.float64), goal, policy.reward)
-    weighted = xp.sqrt(xp.sum(scaled * scaled))
-    stuck = stuck_springs(springs_m, pressures_kpa, spec.structure.n_sections, config)
-    without = as_without(policy.spring_model, pressure_kpa, spring_m, config, gains.allocation)
-    moved = reference_m, mean_m, asked_m, is_saturated
-    search = symbol("search", reach.begin(policy, 1).shape)
-    found, error = reach.nearest_of(policy, goal[None], search)
-
-    def of(*inputs: Symbol, **outputs: Symbol) -> Computation:
-        return Computation(inputs, outputs)
-
+    acting = at.pose, at.goal, at.spring_m, *motion, at.load_kg
     return {
-        "lengths": of(readings, spring_m, length_m=reading.length_m, lost=_lost(reading)),
-        "estimated_load": of(springs_m, pressures_kpa, kg=estimate_kg),
-        "left": of(pose, goal, off=pose_error(xp.asarray(pose, dtype=np.float64), goal), error=weighted),
-        "tip": of(spring_m, load_kg, tip=tip, away=constant(away)),
-        "references": of(pose, goal, spring_m, *motion, load_kg, asked_m=policy.actions.lengths(action)),
-        "law": of(reference_m, spring_m, *state, **law),
-        "vented": of(pressure_kpa, next_kpa=vented(pressure_kpa, controller.dt_s)),
-        "inside": of(goal, holds=_inside(controller, goal)),
-        "search_begin": of(search=constant(reach.begin(policy, 1))),
-        "search_step": of(goal, search, next=reach.improve(policy, goal[None], search)),
-        "search_end": of(search, goal, nearest=found[0], error=error[0]),
-        "mean_length": of(springs_m, mean_m=xp.mean(springs_m, axis=0)),
-        "still": of(springs_m, holds=still(springs_m, config)),
-        "on_reference": of(springs_m, reference_m, pressure_kpa, holds=settled),
-        "saturated": of(pressure_kpa, reference_m, spring_m, mask=mask),
-        "followed": of(*moved, lengths_m=followed(*moved, policy)),
-        "stuck": of(springs_m, pressures_kpa, mask=stuck),
-        "as_without": of(pressure_kpa, spring_m, mask=without),
+        "lengths": _of(at.readings, at.spring_m, length_m=reading.length_m, lost=_lost(reading)),
+        "mean_length": _of(at.springs_m, mean_m=means[0]),
+        "estimated_load": _of(
+            at.springs_m, at.pressures_kpa, kg=estimate_load(policy.load_estimator, *means)
+        ),
+        "tip": _of(at.spring_m, at.load_kg, tip=tip, away=constant(away)),
+        "references": _of(*acting, asked_m=policy.actions.lengths(action)),
+        "law": _of(at.reference_m, at.spring_m, *state, **law),
+        "vented": _of(at.pressure_kpa, next_kpa=vented(at.pressure_kpa, controller.dt_s)),
     }
+
+
+def _judging_parts(controller: Controller, at: _Inputs) -> dict[str, Computation]:
+    """Record rest, faults, and the way that remains."""
+    # Rest and faults.
+    policy, config = controller.policy, controller.config
+    gains, tolerance_m, xp = policy.gains, policy.tolerance_m, array_namespace(at.pose)
+    settled = on_reference(at.springs_m, at.reference_m, at.pressure_kpa, gains, tolerance_m)
+    mask = saturated(at.pressure_kpa, at.reference_m, at.spring_m, gains, tolerance_m)
+    stuck = stuck_springs(at.springs_m, at.pressures_kpa, policy.spec.structure.n_sections, config)
+    without = as_without(policy.spring_model, at.pressure_kpa, at.spring_m, config, gains.allocation)
+    # Error of a pose, and lengths that references make.
+    pose = xp.asarray(at.pose, dtype=np.float64)
+    scaled = scaled_error(pose, at.goal, policy.reward)
+    weighted = xp.sqrt(xp.sum(scaled * scaled))
+    mean_m, asked_m = (symbol(name, at.spring_m.shape) for name in ("mean_m", "asked_m"))
+    moved = at.reference_m, mean_m, asked_m, symbol("is_saturated", at.pressure_kpa.shape, bool)
+    return {
+        "still": _of(at.springs_m, holds=still(at.springs_m, config)),
+        "on_reference": _of(at.springs_m, at.reference_m, at.pressure_kpa, holds=settled),
+        "saturated": _of(at.pressure_kpa, at.reference_m, at.spring_m, mask=mask),
+        "stuck": _of(at.springs_m, at.pressures_kpa, mask=stuck),
+        "as_without": _of(at.pressure_kpa, at.spring_m, mask=without),
+        "left": _of(at.pose, at.goal, off=pose_error(pose, at.goal), error=weighted),
+        "followed": _of(*moved, lengths_m=followed(*moved, policy)),
+    }
+
+
+def _search_parts(controller: Controller, at: _Inputs) -> dict[str, Computation]:
+    """Record the tests of a goal: among reachable poses, and by a search."""
+    policy, goal, start = controller.policy, at.goal, constant(reach.begin(controller.policy, 1))
+    search = symbol("search", start.shape)
+    found, error = reach.nearest_of(policy, goal[None], search)
+    return {
+        "inside": _of(goal, holds=_inside(controller, goal)),
+        "search_begin": _of(search=start),
+        "search_step": _of(goal, search, next=reach.improve(policy, goal[None], search)),
+        "search_end": _of(search, goal, nearest=found[0], error=error[0]),
+    }
+
+
+def _of(*inputs: Symbol, **outputs: Symbol) -> Computation:
+    return Computation(inputs, outputs)
 
 
 def _in_motion(spec: ArmSpec) -> InMotion:

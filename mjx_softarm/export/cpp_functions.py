@@ -173,11 +173,13 @@ class _Body:
         a, b = item.operands
         n_rows, n_inner = (1, *a.shape)[-2:] if b.ndim > 2 else (a.size // a.shape[-1], a.shape[-1])
         n_columns = 1 if b.ndim == 1 else b.shape[-1]
-        n_batch = math.prod(a.shape[:-2]) if b.ndim > 2 else 1
-        if n_batch != math.prod(b.shape[:-2]):
+        n_batch = math.prod(b.shape[:-2])
+        n_own = n_batch if b.ndim > 2 and a.ndim > 2 else 1  # a single left matrix serves the whole batch
+        if b.ndim > 2 and n_own != math.prod(a.shape[:-2]):
             raise NotImplementedError(f"matmul: got {a.shape} and {b.shape}, expected equal leading axes")
         batch, row, inner, column = ("b", n_batch), ("r", n_rows), ("k", n_inner), ("c", n_columns)
-        x, weight = self._value(a, _flat(batch, row, inner)), self._value(b, _flat(batch, inner, column))
+        x = self._value(a, _flat(("b", n_own), row, inner))
+        weight = self._value(b, _flat(batch, inner, column))
         target = f"{name}[{_flat(batch, row, column)}]"
         outside, columns = "".join(map(_for, (batch, row))), _for(column)
         self.lines += [

@@ -40,7 +40,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -51,8 +51,9 @@ from mjx_softarm.control import TOLERANCE_M, Gains, allocation
 from mjx_softarm.mdp.actions import N_ACTIONS, ActionMap
 from mjx_softarm.mdp.observation import Observation, ObsScale, layouts
 from mjx_softarm.mdp.rewards import RewardConfig
-from mjx_softarm.sensing.estimator import PoseEstimator, SpringModel, take_estimator, take_spring_model
-from mjx_softarm.sensing.load import LoadEstimator, take_load_estimator
+from mjx_softarm.policy.networks import ArmModel, take_networks
+from mjx_softarm.sensing.estimator import PoseEstimator, SpringModel
+from mjx_softarm.sensing.load import LoadEstimator
 from mjx_softarm.sensing.s2r import S2R, take_s2r
 from mjx_softarm.sensing.sensors import Sensor, SensorFault
 from mjx_softarm.spec import ArmSpec, Mounting, SpecError
@@ -110,33 +111,9 @@ class Policy:
         return self.actions.sensor
 
 
-class ArmModel(NamedTuple):
-    """Networks and poses of an arm that its computer needs besides the specification."""
-
-    workspace: np.ndarray  # (m, 6) poses [mm, deg]
-    estimator: PoseEstimator
-    load_estimator: LoadEstimator
-    spring_model: SpringModel
-    s2r: S2R | None
-
-
 def action_layout(spec: ArmSpec) -> tuple[str, ...]:
     """Name the action's entries: the reading of each spring, scaled from its two limits to [-1, 1]."""
     return tuple(f"{spec.sensor.reading_name}{k}" for k in range(spec.n_springs))
-
-
-def take_networks(entries: Entries, spec: ArmSpec) -> tuple[PoseEstimator, LoadEstimator, SpringModel]:
-    """Take the networks `estimator`, `load_estimator` and `spring_model` of an arm from a file's entries.
-
-    Raises:
-        SealedFileError: an entry is missing, or of the wrong type, shape or range.
-    """
-    counts = spec.n_chambers, spec.n_springs
-    return (
-        take_estimator(entries, "estimator", spec.structure.n_sections, spec.n_springs),
-        take_load_estimator(entries, "load_estimator", *counts),
-        take_spring_model(entries, "spring_model", *counts),
-    )
 
 
 def policy_from_actor(
@@ -266,7 +243,7 @@ def _unpack(arrays: Mapping[str, np.ndarray], source: str) -> Policy:
     n = spec.n_springs
     observation = entries.take("observation", np.str_, ())
     obs_layout = entries.take("obs_layout", np.str_, (None,))
-    names = entries.take("action_layout", np.str_, (n,))
+    entries.take("action_layout", np.str_, (n,))
     s2r_kind = entries.take("s2r_kind", np.str_, ())
     estimator, load_estimator, spring_model = take_networks(entries, spec)
     policy = Policy(
@@ -294,15 +271,22 @@ def _unpack(arrays: Mapping[str, np.ndarray], source: str) -> Policy:
         n_actions=entries.take("n_actions", np.integer, ()),
         action_s=entries.take("action_s", np.float64, ()),
     )
-    # Check the numbers.
-    layout = layouts(spec).get(observation, ())
+    _check_numbers(policy, arrays, entries)
+    entries.finish(SCHEMA_VERSION)
+    return policy
+
+
+def _check_numbers(policy: Policy, arrays: Mapping[str, np.ndarray], entries: Entries) -> None:
+    """Refuse a policy whose numbers, by the entries of its file, do not fit together."""
+    layout = layouts(policy.spec).get(policy.observation, ())
     limits = policy.sensor.lengths(np.stack(policy.actions[1:]))  # (2, n)
     readable = (limits.fault == SensorFault.OK.value) & (limits.length_m[0] < limits.length_m[1])
     low_kpa, high_kpa = policy.gains.pressure_min_kpa, policy.gains.pressure_max_kpa
+    actions = action_layout(policy.spec)
     for name, holds, expected in (
-        ("observation", bool(layout), " or ".join(layouts(spec))),
-        ("obs_layout", np.array_equal(obs_layout, layout), list(layout)),
-        ("action_layout", names == np.array(action_layout(spec)), list(action_layout(spec))),
+        ("observation", bool(layout), " or ".join(layouts(policy.spec))),
+        ("obs_layout", np.array_equal(arrays["obs_layout"], layout), list(layout)),
+        ("action_layout", arrays["action_layout"] == np.array(actions), list(actions)),
         ("obs_scale.scale", policy.obs_scale.scale > 0.0, "numbers > 0"),
         ("action.low", readable, "readings that have a length, less than that of action.high"),
         ("gains.pressure_min_kpa", np.less(low_kpa, high_kpa), "less than gains.pressure_max_kpa"),
@@ -310,9 +294,7 @@ def _unpack(arrays: Mapping[str, np.ndarray], source: str) -> Policy:
         ("tolerance_m", policy.tolerance_m > 0.0, "a number > 0"),
         ("n_actions", policy.n_actions > 0, "a whole number > 0"),
         ("action_s", 0.0 <= policy.action_s < np.inf, "a finite number >= 0"),
-        ("s2r_kind", s2r_kind in ("mlp", "none"), "mlp or none"),
+        ("s2r_kind", arrays["s2r_kind"] in ("mlp", "none"), "mlp or none"),
     ):
         if not np.all(holds):
             entries.fail(name, f"got {arrays[name].tolist()}, expected {expected}")
-    entries.finish(SCHEMA_VERSION)
-    return policy

@@ -16,7 +16,7 @@ import numpy as np
 import mjx_softarm
 from mjx_softarm._support.archive import Entries, SealedFileError, entries_of, read_sealed, write_sealed
 from mjx_softarm.mechanics.workspace import sample_evenly, sample_workspace
-from mjx_softarm.policy.file import ArmModel, take_networks
+from mjx_softarm.policy.networks import ArmModel, take_networks
 from mjx_softarm.sensing.s2r import S2R, correct
 from mjx_softarm.spec import ArmSpec
 from train.runs import estimator
