@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from mjx_softarm.control import planes
 from mjx_softarm.posture import turned_poses
 from mjx_softarm.spec import ArmSpec
 
@@ -12,9 +13,11 @@ N_GROWING = 10  # poses from a first small motion to the full range
 
 
 def random_pressures(spec: ArmSpec, n_poses: int, seed: int | np.random.Generator) -> np.ndarray:
-    """Draw pressures (n_poses, n) [kPa] by the arcsine law between the arm's limits.
+    """Draw pressures (n_poses, n_chambers) [kPa] by the arcsine law between the arm's limits.
 
-    It favours the extremes, where the workspace ends.
+    It favours the extremes, where the workspace ends. More than three independent chambers seldom push one
+    way together. So every second set of such an arm has, in each section, a plane through the pressures of
+    three directions; the other sets tell the chambers apart.
 
     Args:
         spec: the arm.
@@ -22,8 +25,23 @@ def random_pressures(spec: ArmSpec, n_poses: int, seed: int | np.random.Generato
         seed: seed of the draw, or a generator.
     """
     low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
-    swing = np.cos(np.random.default_rng(seed).uniform(0.0, np.pi, (n_poses, spec.n_chambers)))
+    rng, n = np.random.default_rng(seed), spec.structure.chambers_per_section
+    swing = np.cos(rng.uniform(0.0, np.pi, (n_poses, spec.n_chambers)))
+    if n > 3:
+        swing[::2] = _plane_swings(n, len(swing[::2]) * spec.structure.n_sections, rng).reshape(
+            -1, spec.n_chambers
+        )
     return low + (high - low) * 0.5 * (1.0 + swing)
+
+
+def _plane_swings(n: int, k: int, rng: np.random.Generator) -> np.ndarray:
+    """Draw swings (k, n) in [-1, 1] of k sections of n chambers, each a plane through three directions."""
+    three = (
+        np.cos(rng.uniform(0.0, np.pi, (k, 3))) @ np.linalg.pinv(planes(3)).T
+    )  # mean, slopes along x and y
+    angle = 2 * np.pi * np.arange(n) / n + rng.uniform(0.0, 2 * np.pi, (k, 1))
+    swing = three[:, :1] + three[:, 1:2] * np.cos(angle) + three[:, 2:] * np.sin(angle)
+    return np.clip(swing, -1.0, 1.0)
 
 
 def circle_poses(spec: ArmSpec, n: int = 40) -> np.ndarray:
