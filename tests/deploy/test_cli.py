@@ -210,7 +210,7 @@ def test_a_plan_of_pressures_is_recorded(tmp_path):
     write_plan(plan, planned_kpa)
     assert main(["record", "--arm", "twin:rod:101", "--plan", str(plan), "--out", str(out)]) == 0
     found = read_log(out)[0]
-    np.testing.assert_allclose(found.pressure_kpa, planned_kpa, atol=0.1)
+    np.testing.assert_allclose(found.pressure_kpa, planned_kpa, atol=0.45)  # the rod's largest deadband
 
 
 @pytest.mark.parametrize(
