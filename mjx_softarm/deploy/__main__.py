@@ -25,6 +25,7 @@ from mjx_softarm.deploy.measure import (
     measure,
     read_goals,
     require_motion_capture,
+    whole_goal,
     write_accuracy,
 )
 from mjx_softarm.deploy.record import record
@@ -44,7 +45,7 @@ _ABOUT = f"A policy on an arm.\n\n{_STATUS}"
 
 def _goal(words: list[str]) -> tuple[float, ...]:
     goal = tuple(map(float, words[0].split(",")))
-    if len(goal) != 6:
+    if len(goal) not in (3, 6):
         raise ValueError(f"got {len(goal)} numbers, expected x,y,z,yaw,pitch,roll")
     return goal
 
@@ -83,7 +84,8 @@ def _run(
     """Bring the tip to goals; errors are by motion capture if the arm has it.
 
     Args:
-        goal: pose of the tip [mm, deg] in the base frame; give the option again for a further one
+        goal: pose of the tip [mm, deg] in the base frame, or X,Y,Z for a policy of positions; give the option
+            again for a further one
         log: file for the run's log; its suffix chooses CSV, npz or MCAP
         duration: [s] of the arm after which the run ends
         stay: hold the last goal, until Ctrl-C or the end of the duration
@@ -94,6 +96,7 @@ def _run(
     if not duration > 0.0:
         raise InputError(f"--duration: got {duration:g}, expected a number > 0")
     controller = _controller(policy)
+    goals = [whole_goal(one, controller.policy, "--goal") for one in goal]
     check_file("--log", log)
     driver = open_arm(arm)
     check_arm(driver, controller, f"--arm {arm}")
@@ -101,7 +104,6 @@ def _run(
     # The run, its log and its faults
     limit_s = None if np.isinf(duration) else duration
     save = partial(save_log, log) if log else lambda log: None
-    goals = list(map(np.array, goal))
     run = follow(driver, controller, goals, limit_s, tell, save=save, stay=stay)
     if log and run.ending.status != cli.ERROR:
         print(f"log: {log}, {len(run.log)} rows")
@@ -129,9 +131,10 @@ def _summary(run: LoopRun, policy: Policy) -> None:
     if all(arrival.reached for arrival in run.arrivals):
         return
     reward = policy.reward
-    mm, deg = (reward.threshold / weight for weight in (reward.weight_per_mm, reward.weight_per_deg))
+    largest = max(reward.weights[:3]), max(reward.weights[3:])
+    mm, deg = (f"{reward.threshold / weight:.2g}" if weight else "any" for weight in largest)
     print(
-        f"a goal counts as reached within {mm:.1f} mm if the rotation is exact, or within {deg:.0f} deg "
+        f"a goal counts as reached within {mm} mm if the rotation is exact, or within {deg} deg "
         "if the position is"
     )
     if not policy.calibrated:
@@ -184,7 +187,7 @@ def _measure(
 
     # Figures, written and printed
     accuracy = measure(run, controller, poses)
-    found = figures(accuracy, run.counts()) | {
+    found = figures(accuracy, run.counts(), controller.policy.reward.asked) | {
         "reached": sum(arrival.reached for arrival in run.arrivals),
         "seconds": float(run.log.time_s[-1]),
         **(along(run, controller.dt_s) if run.ways else {}),
@@ -200,6 +203,8 @@ def _measure(
 def _print_accuracy(found: dict[str, Any]) -> None:
     for name, unit, most in (("translation", "mm", "max_mm"), ("rotation", "deg", "rotation_max_deg")):
         mean, high, most = found[f"{name}_{unit}"], found[f"{name}_95_{unit}"], found[most]
+        if np.isnan(mean):  # goals do not ask for it
+            continue
         print(f"{name} [{unit}]: mean {mean:.2f}, 95 % below {high:.2f}, at most {most:.2f}")
     if "way_s" in found:
         print(

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,7 +22,7 @@ from mjx_softarm.deploy.safety import Fault
 from mjx_softarm.logs.tables import read_table
 from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.policy.file import Policy
-from mjx_softarm.posture import posture
+from mjx_softarm.posture import posture, straight_pose
 from mjx_softarm.sensing.pose import frame_from_pose, pose_error, pose_from_frame, rotation_about, seen_error
 
 LOOKS, LOOK_S = 50, 0.02  # number of frames tried before an arm moves; time between two of them
@@ -48,7 +48,8 @@ def read_goals(name: str, policy: Policy, n: int) -> np.ndarray:
     Around the circle the last plate is that of the straight arm, with motion capture's frame as calibrated.
 
     Raises:
-        InputError: there is no such file, or its columns are not `GOAL_COLUMNS`.
+        InputError: there is no such file, or its columns are not `GOAL_COLUMNS`, or the first three of these
+            for a policy whose goals have no rotation.
     """
     if name == "circle":
         position_m, _ = frame_from_pose(circle_poses(policy.spec, n).astype(float))
@@ -57,10 +58,25 @@ def read_goals(name: str, policy: Policy, n: int) -> np.ndarray:
     if name == "grid":
         return grid_poses(policy.workspace, n)
     table = read_table(name)
-    if table.names != GOAL_COLUMNS or not np.isfinite(table.values).all():
+    known = table.names in (GOAL_COLUMNS, GOAL_COLUMNS[:3])
+    if not known or not np.isfinite(table.values).all():
         expected = f"numbers in the columns {','.join(GOAL_COLUMNS)}"
         raise InputError(f"{name}: got {','.join(table.names)}, expected {expected}")
-    return table.values
+    return np.array([whole_goal(goal, policy, name) for goal in table.values])
+
+
+def whole_goal(goal: Sequence[float], policy: Policy, where: str) -> np.ndarray:
+    """Return a goal (6,) [mm, deg] that is given as such, or by its position (3,); then angles do not matter.
+
+    Raises:
+        InputError: it is a position, and the policy's goals have a rotation; the message begins with `where`.
+    """
+    if len(goal) == 3 and any(policy.reward.asked[3:]):
+        raise InputError(
+            f"{where}: got a position alone, expected X,Y,Z,YAW,PITCH,ROLL: only a policy that was trained "
+            "with --env.reward.axes 1 1 1 0 0 0 takes positions"
+        )
+    return np.append(goal, straight_pose(policy.spec)[3:]) if len(goal) == 3 else np.array(goal)
 
 
 def grid_poses(workspace: np.ndarray, n: int) -> np.ndarray:
@@ -132,11 +148,18 @@ def measure(run: LoopRun, controller: Controller, goals: np.ndarray) -> Accuracy
     return Accuracy(goals, error, believed, mask, arrival_s, load_estimate_g)
 
 
-def figures(accuracy: Accuracy, events: Mapping[Fault, int]) -> dict[str, Any]:
+def figures(
+    accuracy: Accuracy, events: Mapping[Fault, int], asked: Sequence[bool] = (True,) * 6
+) -> dict[str, Any]:
     """Return the figures of an accuracy, NaN if no goal was measured.
 
-    A goal is measured if the tip arrived and was seen, at any distance. Rotation is the norm of the errors of
-    yaw, pitch and roll. `events` has the number of events of each fault.
+    A goal is measured if the tip arrived and was seen, at any distance. Translation is the norm of the errors
+    of x, y and z, rotation that of yaw, pitch and roll; both leave out axes that goals do not ask for.
+
+    Args:
+        accuracy: of a run.
+        events: number of events of each fault.
+        asked: which of x, y, z, yaw, pitch and roll goals ask for.
     """
     # Errors at the goals that were measured
     measured = np.isfinite(accuracy.error).all(axis=1)
@@ -145,7 +168,7 @@ def figures(accuracy: Accuracy, events: Mapping[Fault, int]) -> dict[str, Any]:
         values[measured] if n_measured else np.full((1, 6), np.nan)
         for values in (accuracy.error, accuracy.believed)
     )
-    away, turned = np.linalg.norm(error[:, :3], axis=1), np.linalg.norm(error[:, 3:], axis=1)
+    away, turned = _norms(error, asked)
     per_point = accuracy.saturated.sum(axis=1)
 
     return {
@@ -159,13 +182,20 @@ def figures(accuracy: Accuracy, events: Mapping[Fault, int]) -> dict[str, Any]:
         "rotation_95_deg": float(np.quantile(turned, 0.95)),
         "rotation_max_deg": float(turned.max()),
         **dict(zip(POSE_NAMES, np.abs(error).mean(axis=0).tolist(), strict=True)),
-        "believed_mm": float(np.linalg.norm(believed[:, :3], axis=1).mean()),
+        "believed_mm": float(_norms(believed, asked)[0].mean()),
         "load_estimate_g": float(accuracy.load_estimate_g[measured].mean()) if n_measured else np.nan,
         "saturated_points": int(np.count_nonzero(per_point)),
         "saturated_chambers_max": int(per_point.max()),
         "saturation_events": int(events.get(Fault.SATURATED, 0)),
         "events": {fault.value: int(n) for fault, n in events.items() if n},
     }
+
+
+def _norms(error: np.ndarray, asked: Sequence[bool]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the norms (p,) of translation and rotation of errors (p, 6) on the asked axes, NaN for none."""
+    square = np.where(asked, error, 0.0) ** 2
+    away, turned = np.sqrt(square[:, :3].sum(axis=1)), np.sqrt(square[:, 3:].sum(axis=1))
+    return away if any(asked[:3]) else away * np.nan, turned if any(asked[3:]) else turned * np.nan
 
 
 def along(run: LoopRun, dt_s: float) -> dict[str, float]:

@@ -22,12 +22,11 @@ from mjx_softarm.control import at_chambers, planes
 from mjx_softarm.deploy.belief import Belief, pose_of
 from mjx_softarm.deploy.safety import Event, Fault, names
 from mjx_softarm.mdp.observation import rate_ticks
-from mjx_softarm.mdp.rewards import scaled_error
+from mjx_softarm.mdp.rewards import RewardConfig, asked_error, scaled_error
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.policy.reach import solved
 from mjx_softarm.policy.runtime import InMotion, sensed
 from mjx_softarm.sensing.load import Load
-from mjx_softarm.sensing.pose import pose_error
 
 _STAYING = 1e-4  # weight of a chamber that does not follow, beside the ones that do
 
@@ -134,7 +133,7 @@ class Predicting(NamedTuple):
         for _ in range(controller.policy.n_actions):
             reference_m = _planned(belief, pose, goal + shift)
             pose, _ = pose_of(controller, reference_m, belief.load)
-            left = pose_error(np.asarray(pose, float), goal)
+            left = asked_error(np.asarray(pose, float), goal, controller.policy.reward)
             shift = _clipped(shift - left, controller.config.shift_limit)
         return Choice(Predicting(shift, self.n_actions + 1), reference_m)
 
@@ -158,7 +157,8 @@ class Chasing(NamedTuple):
             return Choice(self)
         shift = self.shift
         if len(self.due) == config.lead_actions:
-            beside = _beside(np.asarray(belief.pose, float), self.due[0], self.due[-1])
+            reward = belief.controller.policy.reward
+            beside = _beside(np.asarray(belief.pose, float), self.due[0], self.due[-1], reward)
             shift = _clipped(shift - config.moving_share * beside, config.shift_limit)
         reference_m = _planned(belief, belief.pose, goal + shift)
         due = (*self.due, goal)[-config.lead_actions :]
@@ -210,7 +210,7 @@ def _left(strategy: AtRest | Timed, belief: Belief, goal: np.ndarray) -> tuple[n
     pose = acted = _made(belief, reference_m, belief.load)
     if belief.controller.observes_payload:
         acted = _made(belief, reference_m, strategy.acted_load)
-    return pose, pose_error(acted, goal)
+    return pose, asked_error(acted, goal, belief.controller.policy.reward)
 
 
 def _made(belief: Belief, reference_m: np.ndarray, load: Load) -> np.ndarray:
@@ -257,12 +257,12 @@ def _error(belief: Belief, pose: np.ndarray, goal: np.ndarray) -> float:
     return float(np.linalg.norm(scaled_error(pose, goal, belief.controller.policy.reward)))
 
 
-def _beside(pose: np.ndarray, was: np.ndarray, is_now: np.ndarray) -> np.ndarray:
+def _beside(pose: np.ndarray, was: np.ndarray, is_now: np.ndarray, reward: RewardConfig) -> np.ndarray:
     """Return the error (6,) of a pose (6,) at a goal, without the part along the goal's way since then.
 
     Along the way the tip may lag or lead, which is no offset.
     """
-    left, along = pose_error(pose, was), pose_error(is_now, was)[:3]
+    left, along = asked_error(pose, was, reward), asked_error(is_now, was, reward)[:3]
     left[:3] -= along * (left[:3] @ along) / max(along @ along, 1e-12)
     return left
 

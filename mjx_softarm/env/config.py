@@ -119,10 +119,13 @@ class EnvConfig:
         # Ranges of numbers
         for name in ("dynamic_step_s", "simulation_step_s"):
             _expect(self, name, 0 < getattr(self, name) < math.inf, "a finite number > 0")
-        amounts = [(self.reward, item.name) for item in fields(self.reward)]
+        amounts = [(self.reward, item.name) for item in fields(self.reward) if item.name != "axes"]
         amounts += [(self, "clearance_cost_per_mm"), (self, "saturation_tolerance_mm")]
         for config, name in amounts:
             _expect(config, name, 0 <= getattr(config, name) < math.inf, "a finite number >= 0")
+        axes = self.reward.axes
+        weighed = len(axes) == 6 and all(0 <= axis < math.inf for axis in axes) and any(self.reward.asked)
+        _expect(self.reward, "axes", weighed, "six finite numbers >= 0, some more than 0")
         _expect(self, "clearance_margin_mm", math.isfinite(self.clearance_margin_mm), "a finite number")
         _expect(self, "n_poses", self.n_poses >= 1, "at least 1")
         links = self.links_per_section

@@ -197,11 +197,14 @@ def as_sb3(envs: SoftArmVectorEnv) -> VecEnv:
 def spaces(env: ReachEnv) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
     """Return the spaces of observations and actions; no section stretches to twice its length at rest."""
     rest_mm = 1e3 * env.spec.length_m
-    limit = 1.01 * np.array([2 * rest_mm] * 3 + [180.0] * 3)  # of a pose
-    reward = env.config.reward
-    weight = np.array([reward.weight_per_mm] * 3 + [reward.weight_per_deg] * 3)
-    error = weight * np.array([2.0] * 3 + [1.0] * 3) * limit  # positions differ by twice as much, angles wrap
-    low, high = ((limit_ - env.scale.centre) / env.scale.scale for limit_ in (-limit, limit))
+    limit = 1.01 * np.array(
+        [2 * rest_mm] * 3 + [180.0] * 3
+    )  # of a pose; its angles are from the straight arm's
+    centre = np.append(env.scale.centre[:3], np.zeros(3))
+    error = (
+        np.array(env.config.reward.weights) * np.array([2.0] * 3 + [1.0] * 3) * limit
+    )  # positions differ by twice as much, angles wrap
+    low, high = ((limit_ - centre) / env.scale.scale for limit_ in (-limit, limit))
     more = np.full(env.observation_size - OBS_SIZE, np.inf)  # payload, or speeds: no bounds are known
     low, high = (
         np.concatenate(part).astype(np.float32)

@@ -13,12 +13,11 @@ from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.link import vented
 from mjx_softarm.deploy.strategy import followed
 from mjx_softarm.export.symbols import Symbol, constant, repeat, symbol
-from mjx_softarm.mdp.rewards import scaled_error
+from mjx_softarm.mdp.rewards import asked_error, scaled_error
 from mjx_softarm.policy import reach
 from mjx_softarm.policy.reachable import distances
 from mjx_softarm.policy.runtime import InMotion, action_towards, actor_output, sensed, tip_pose
 from mjx_softarm.sensing.load import estimate_load
-from mjx_softarm.sensing.pose import pose_error
 from mjx_softarm.sensing.sensors import Reading, SensorFault
 from mjx_softarm.spec import ArmSpec
 
@@ -182,7 +181,7 @@ def _judging_parts(controller: Controller, at: _Inputs) -> dict[str, Computation
         "saturated": _of(at.pressure_kpa, at.reference_m, at.spring_m, mask=mask),
         "stuck": _of(at.springs_m, at.pressures_kpa, mask=stuck),
         "as_without": _of(at.pressure_kpa, at.spring_m, mask=without),
-        "left": _of(at.pose, at.goal, off=pose_error(pose, at.goal), error=weighted),
+        "left": _of(at.pose, at.goal, off=asked_error(pose, at.goal, policy.reward), error=weighted),
         "followed": _of(*moved, lengths_m=followed(*moved, policy)),
     }
 

@@ -110,8 +110,11 @@ def observe_motion(
 def observe(pose: Array, goal: Array, scale: ObsScale, config: RewardConfig) -> Array:
     """Return the observation (..., 18) of pose and goal (..., 6) [mm, deg]: scaled pose, scaled goal, e.
 
-    Angles are taken from the straight arm's: an upright arm moves about a roll of 180 degrees.
+    Angles are taken from the straight arm's: an upright arm moves about a roll of 180 degrees. An axis of the
+    goal that is not asked for is not seen.
     """
     xp = array_namespace(pose)
-    scaled = [pose_error(value, scale.centre) / scale.scale for value in (pose, goal)]
-    return xp.concat([*scaled, scaled_error(pose, goal, config)], axis=-1)
+    here, there = (pose_error(value, scale.centre) / scale.scale for value in (pose, goal))
+    if not all(config.asked):
+        there = xp.where(np.array(config.asked), there, 0.0)
+    return xp.concat([here, there, scaled_error(pose, goal, config)], axis=-1)

@@ -13,10 +13,13 @@ near its goal. With `distance_cost` and `saturation_cost` alone, the error alway
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
+import numpy as np
+
 from mjx_softarm._support.xp import Array, array_namespace
-from mjx_softarm.sensing.pose import pose_error
+from mjx_softarm.sensing.pose import pose_error, pose_from_frame
 
 
 @dataclass(frozen=True)
@@ -31,6 +34,25 @@ class RewardConfig:
     weight_per_mm: float = 0.0056  # weight of the tip's position
     weight_per_deg: float = 0.001  # weight of the tip's angles
     distance_cost: float = 0.0  # cost of a weighted error of 1, in every case
+    axes: tuple[float, ...] = (1.0,) * 6
+    """factors of the weights of x, y, z, yaw, pitch and roll; 0 for an axis on which any value will do"""
+
+    @property
+    def weights(self) -> tuple[float, ...]:
+        """Weights of x, y, z [1/mm], yaw, pitch, roll [1/deg]."""
+        units = [self.weight_per_mm] * 3 + [self.weight_per_deg] * 3
+        return tuple(unit * factor for unit, factor in zip(units, self.axes, strict=True))
+
+    @property
+    def asked(self) -> tuple[bool, ...]:
+        """Which of x, y, z, yaw, pitch and roll a goal asks for."""
+        return tuple(weight > 0.0 for weight in self.weights)
+
+    @property
+    def turn_weight_per_deg(self) -> float | None:
+        """Weight of a turn about any axis; None where yaw, pitch and roll have different weights."""
+        yaw, *others = self.weights[3:]
+        return yaw if others == [yaw, yaw] else None
 
 
 def scaled_error(pose: Array, goal: Array, config: RewardConfig) -> Array:
@@ -42,8 +64,31 @@ def scaled_error(pose: Array, goal: Array, config: RewardConfig) -> Array:
         config: the weights.
     """
     xp = array_namespace(pose)
-    weight = xp.asarray([config.weight_per_mm] * 3 + [config.weight_per_deg] * 3, dtype=pose.dtype)
-    return weight * pose_error(pose, goal)
+    return xp.asarray(list(config.weights), dtype=pose.dtype) * pose_error(pose, goal)
+
+
+def asked_error(pose: Array, goal: Array, config: RewardConfig) -> Array:
+    """Return pose - goal (..., 6) [mm, deg], angles wrapped, zero on axes that the goal does not ask for."""
+    error = pose_error(pose, goal)
+    xp = array_namespace(error)
+    return error if all(config.asked) else xp.where(np.array(config.asked), error, 0.0)
+
+
+def weighted_position(position_m: Array, config: RewardConfig) -> Array:
+    """Return positions (..., 3) [m], weighted."""
+    xp = array_namespace(position_m)
+    return xp.asarray([1e3 * weight for weight in config.weights[:3]], dtype=position_m.dtype) * position_m
+
+
+def weighted_angles(rotation: Array, config: RewardConfig) -> Array:
+    """Return numbers (..., 6) of rotations (..., 3, 3), for different weights of yaw, pitch and roll.
+
+    The norm of a difference is the weighted error of the angles, for small errors.
+    """
+    xp = array_namespace(rotation)
+    angles = xp.deg2rad(pose_from_frame(rotation[..., 0], rotation)[..., 3:])  # at any position
+    per_rad = xp.asarray([weight * math.degrees(1.0) for weight in config.weights[3:]], dtype=angles.dtype)
+    return xp.concat([per_rad * xp.cos(angles), per_rad * xp.sin(angles)], axis=-1)
 
 
 def reward(

@@ -12,7 +12,7 @@ float64, networks and the workspace float32.
     actor.<k>.weight     (in, out)    layer k = 0, 1, ...; ReLU after each but the last
     actor.<k>.bias       (out,)       the last layer's outputs (n,) are the actions before tanh
     obs_scale.<field>    (6,)         `ObsScale`: centre and scale of poses and goals
-    reward.<field>       ()           `RewardConfig`: weights of the error, threshold of a goal
+    reward.<field>       () or (6,)   `RewardConfig`: weights of the error, threshold of a goal
     action.low, .high    (n,)         readings that the actions -1 and 1 stand for, linear in between
     sensor.<field>       () or (n,)   the arm's `Sensor`: readings to lengths, and back
     gains.<field>        () or (c,)   `Gains`: the sensor-space law, without `allocation`, and pressure limits
@@ -36,6 +36,7 @@ refused: its run is exported again.
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -61,7 +62,7 @@ from mjx_softarm.spec import ArmSpec, Mounting, SpecError
 SCHEMA_VERSION = 8
 READABLE = (7, 8)
 # In 7, `estimator.spring_site_m` is (n, 2), each section has as many chambers as springs, and the arm hangs
-ADDED_IN_8 = {
+ADDED_IN_8 = {"reward.axes": np.ones(6)} | {
     f"estimator.{name}": PoseEstimator._field_defaults[name] for name in ("base_position_m", "base_rotation")
 }
 
@@ -224,6 +225,13 @@ def file_entries(policy: Policy) -> dict[str, np.ndarray]:
     return {name: np.asarray(value) for name, value in entries.items()}
 
 
+def _take_reward(entries: Entries) -> RewardConfig:
+    """Take the weights of the reward, checked."""
+    names = [item.name for item in dataclasses.fields(RewardConfig) if item.name != "axes"]
+    numbers = {name: entries.take(f"reward.{name}", np.float64, ()) for name in names}
+    return RewardConfig(**numbers, axes=tuple(entries.take("reward.axes", np.float64, (6,)).tolist()))
+
+
 def _unpack(arrays: Mapping[str, np.ndarray], source: str) -> Policy:
     # Refuse other schemas first, since their entries may differ.
     version = Entries(arrays, source).take("schema_version", np.integer, ())
@@ -249,7 +257,7 @@ def _unpack(arrays: Mapping[str, np.ndarray], source: str) -> Policy:
     policy = Policy(
         layers=entries.layers("actor", len(obs_layout), n),
         obs_scale=entries.group("obs_scale", ObsScale, (6,)),
-        reward=entries.group("reward", RewardConfig, ()),
+        reward=_take_reward(entries),
         actions=ActionMap(
             entries.group("sensor", type(spec.sensor), (), (n,)),
             *(entries.take(f"action.{name}", np.float64, (n,)) for name in ("low", "high")),
@@ -281,6 +289,7 @@ def _check_numbers(policy: Policy, arrays: Mapping[str, np.ndarray], entries: En
     layout = layouts(policy.spec).get(policy.observation, ())
     limits = policy.sensor.lengths(np.stack(policy.actions[1:]))  # (2, n)
     readable = (limits.fault == SensorFault.OK.value) & (limits.length_m[0] < limits.length_m[1])
+    axes = policy.reward.axes
     low_kpa, high_kpa = policy.gains.pressure_min_kpa, policy.gains.pressure_max_kpa
     actions = action_layout(policy.spec)
     for name, holds, expected in (
@@ -288,6 +297,7 @@ def _check_numbers(policy: Policy, arrays: Mapping[str, np.ndarray], entries: En
         ("obs_layout", np.array_equal(arrays["obs_layout"], layout), list(layout)),
         ("action_layout", arrays["action_layout"] == np.array(actions), list(actions)),
         ("obs_scale.scale", policy.obs_scale.scale > 0.0, "numbers > 0"),
+        ("reward.axes", min(axes) >= 0.0 and max(axes) > 0.0, "numbers >= 0, one or more of them > 0"),
         ("action.low", readable, "readings that have a length, less than that of action.high"),
         ("gains.pressure_min_kpa", np.less(low_kpa, high_kpa), "less than gains.pressure_max_kpa"),
         ("rate_hz", policy.rate_hz > 0.0, "a number > 0"),

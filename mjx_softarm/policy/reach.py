@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from mjx_softarm._support.xp import Array, array_namespace
-from mjx_softarm.mdp.rewards import scaled_error
+from mjx_softarm.mdp.rewards import scaled_error, weighted_angles, weighted_position
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.sensing.estimator import estimate_frame, expected_springs
 from mjx_softarm.sensing.pose import frame_from_pose, pose_from_frame
@@ -46,9 +46,9 @@ def improve(policy: Policy, goal: Array, search: Array) -> Array:
     # Error of each row and its slope by finite differences.
     xp, n = array_namespace(goal, search), policy.spec.n_chambers
     share, damping = search[:, :n], search[:, n]
-    target = _target(policy, goal, len(share))  # (rows, 12)
+    target = _target(policy, goal, len(share))  # (rows, f)
     error = _at(policy, share) - target
-    beside = _at(policy, share[:, None] + _DIFFERENCE * np.eye(n)) - target[:, None]  # (rows, n, 12)
+    beside = _at(policy, share[:, None] + _DIFFERENCE * np.eye(n)) - target[:, None]  # (rows, n, f)
     slope = (beside - error[:, None]) / _DIFFERENCE
     gradient = xp.sum(slope * error[:, None], axis=-1)  # (rows, n)
     # Pressures at a limit that would leave their range do not move.
@@ -87,21 +87,23 @@ def _tip(policy: Policy, share: Array) -> tuple[Array, Array]:
 
 
 def _at(policy: Policy, share: Array) -> Array:
-    """Return the `_features` (..., 12) of the tip at shares (..., n) of the range of pressures."""
+    """Return the `_features` (..., f) of the tip at shares (..., n) of the range of pressures."""
     return _features(policy, *_tip(policy, share))
 
 
 def _target(policy: Policy, goal: Array, n_rows: int) -> Array:
-    """Return the `_features` (n_rows, 12) of goals (k, 6), each repeated for n_rows / k rows."""
+    """Return the `_features` (n_rows, f) of goals (k, 6), each repeated for n_rows / k rows."""
     return _features(policy, *frame_from_pose(goal))[np.arange(n_rows) * len(goal) // n_rows]
 
 
 def _features(policy: Policy, position_m: Array, axes: Array) -> Array:
-    """Return numbers (..., 12) of poses; the norm of a difference is the weighted error, for small turns."""
+    """Return numbers (..., f) of poses; the norm of a difference is the weighted error, for small turns."""
     xp = array_namespace(position_m, axes)
+    position, weight = weighted_position(position_m, policy.reward), policy.reward.turn_weight_per_deg
     axes = axes / xp.sqrt(xp.sum(axes**2, axis=-2))[..., None, :]
-    turn = policy.reward.weight_per_deg * np.degrees(1.0) / np.sqrt(2.0) * axes
-    position = 1e3 * policy.reward.weight_per_mm * position_m
+    if weight is None:
+        return xp.concat([position, weighted_angles(axes, policy.reward)], axis=-1)
+    turn = weight * np.degrees(1.0) / np.sqrt(2.0) * axes
     return xp.concat([position, turn.reshape(*turn.shape[:-2], 9)], axis=-1)
 
 

@@ -20,6 +20,7 @@ from mjx_softarm.deploy.measure import (
     write_accuracy,
 )
 from mjx_softarm.deploy.safety import Fault
+from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.mechanics.excitation import circle_poses
 from mjx_softarm.sensing.estimator import estimate
 from mjx_softarm.sensing.pose import quaternion_from_pose
@@ -110,6 +111,10 @@ def test_quantiles_and_rotation_by_hand():
     assert (numbers["translation_mm"], numbers["max_mm"]) == pytest.approx((10.5, 20.0))
     assert numbers["translation_95_mm"] == pytest.approx(19.05)
     assert (numbers["rotation_deg"], numbers["rotation_max_deg"]) == pytest.approx((3.0, 3.0))
+    # Axes that goals do not ask for are in neither
+    numbers = figures(found, {}, asked=(True, True, False, True, False, False))
+    assert (numbers["max_mm"], numbers["rotation_deg"]) == pytest.approx((12.0, 2.0))
+    assert np.isnan(figures(found, {}, asked=(True,) * 3 + (False,) * 3)["rotation_deg"])
 
 
 @pytest.mark.parametrize(
@@ -145,6 +150,16 @@ def test_goals_by_name(tmp_path):
     file.write_text("x,y,z\n1,2,3\n")
     with pytest.raises(InputError, match=r"goals.csv: got x,y,z, expected numbers in the columns x \[mm\]"):
         read_goals(str(file), POLICY, 1)
+
+
+def test_a_policy_of_positions_takes_positions_for_goals(tmp_path):
+    file = tmp_path / "goals.csv"
+    file.write_text("x [mm],y [mm],z [mm]\n80,0,-575\n")
+    with pytest.raises(InputError, match="got a position alone, expected X,Y,Z,YAW,PITCH,ROLL"):
+        read_goals(str(file), POLICY, 1)
+    positions = RewardConfig(axes=(1.0, 1.0, 1.0, 0.0, 0.0, 0.0))
+    [goal] = read_goals(str(file), dataclasses.replace(POLICY, reward=positions), 1)
+    np.testing.assert_array_equal(goal, [80, 0, -575, 0, 0, 0])
 
 
 def test_around_the_circle_the_plate_hangs_straight_not_the_frame_on_it():

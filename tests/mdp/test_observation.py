@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from mjx_softarm import ArmSpec
-from mjx_softarm.mdp.observation import OBS_SIZE, layouts, observe_motion, observe_payload
+from mjx_softarm.mdp.observation import OBS_SIZE, ObsScale, layouts, observe, observe_motion, observe_payload
+from mjx_softarm.mdp.rewards import RewardConfig
 
 SPEC = ArmSpec.default()
 LOW_M, HIGH_M = SPEC.springs.length_min_m, SPEC.springs.length_max_m
@@ -51,3 +52,13 @@ def test_a_payload_is_observed_as_a_share_of_the_arm_s_largest(to_library):
     np.testing.assert_allclose(observe_payload(to_library(0.35), half), [0.7], rtol=1e-6)
     assert observe_payload(np.zeros(3), SPEC).shape == (3, 1)
     assert layouts(SPEC)["payload"][OBS_SIZE:] == ("payload_kg",)
+
+
+def test_a_policy_of_positions_does_not_see_angles_of_goals():
+    rng, config = np.random.default_rng(0), RewardConfig(axes=(1.0, 1.0, 1.0, 0.0, 0.0, 0.0))
+    pose, goal = rng.uniform(-50.0, 50.0, (2, 6))
+    seen = observe(pose, goal, ObsScale.from_spec(SPEC), config)
+    other = observe(pose, np.append(goal[:3], rng.uniform(-90.0, 90.0, 3)), ObsScale.from_spec(SPEC), config)
+    np.testing.assert_array_equal(seen, other)
+    full = observe(pose, goal, ObsScale.from_spec(SPEC), RewardConfig())
+    np.testing.assert_array_equal(seen[:9], full[:9])

@@ -4,7 +4,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_softarm.mdp.rewards import RewardConfig, reward, scaled_error
+from mjx_softarm.mdp.rewards import (
+    RewardConfig,
+    asked_error,
+    reward,
+    scaled_error,
+    weighted_angles,
+    weighted_position,
+)
+from mjx_softarm.sensing.pose import frame_from_pose
 
 CONFIG = RewardConfig()
 HERE = np.array([10.0, -20.0, -500.0, 30.0, -40.0, 50.0])
@@ -93,3 +101,25 @@ def test_a_batch_in_jax_gives_what_numpy_gives_one_by_one():
         for name, term in terms.items():
             assert term[index] == pytest.approx(one[2][name], rel=1e-5)
     assert len({float(x) for x in value.ravel() if abs(x) == 100.0}) == 2  # both bonus and penalty occur
+
+
+POSITION = RewardConfig(axes=(1.0, 1.0, 1.0, 0.0, 0.0, 0.0))
+YAW = RewardConfig(axes=(1.0, 1.0, 1.0, 3.0, 1.0, 0.0))
+
+
+def test_axes_multiply_the_weights_and_0_leaves_an_axis_out():
+    goal = away(10.0, 0.0, 0.0, 10.0, 10.0, 10.0)
+    np.testing.assert_allclose(scaled_error(HERE, goal, YAW), [0.056, 0, 0, 0.03, 0.01, 0.0], atol=1e-12)
+    np.testing.assert_allclose(asked_error(HERE, goal, YAW), [10, 0, 0, 10, 10, 0], atol=1e-12)
+    value, reached, _ = reward_of(away(0.0, 0.0, 0.0, 90.0, 30.0, 170.0), config=POSITION)
+    assert reached and value == POSITION.goal_bonus
+
+
+def test_small_errors_of_weighted_angles_and_positions_are_the_scaled_error():
+    goal = away(3.0, -2.0, 1.0, 0.2, -0.1, 0.3)
+    (position_m, rotation), (goal_m, goal_rotation) = map(frame_from_pose, (HERE, goal))
+    moved = weighted_position(position_m, YAW) - weighted_position(goal_m, YAW)
+    turned = weighted_angles(rotation, YAW) - weighted_angles(goal_rotation, YAW)
+    expected = scaled_error(HERE, goal, YAW)
+    np.testing.assert_allclose(moved, expected[:3], atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(turned), np.linalg.norm(expected[3:]), rtol=1e-4)

@@ -23,7 +23,7 @@ from tests.properties import few
 
 PROVENANCE = {"commit": "0123abc", "created": "2025-01-31", "packages": {"numpy": "2.0"}, "seed": 7}
 # Digest of the names that schema 8 stores and of the fields of its specification.
-SCHEMA_8 = "88d9e704"
+SCHEMA_8 = "4c75e6b0"
 TWO_SECTIONS = ArmSpec.default().replace(structure={"n_sections": 2})
 
 

@@ -1,8 +1,11 @@
 """Nearest reachable poses on the linear arm, whose pressures give the tip in closed form."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
+from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.policy.reach import nearest_poses
 from mjx_softarm.sensing.estimator import estimate
 from tests.linear_arm import GAIN_M_PER_KPA, HIGH_KPA, LOW_KPA, POLICY, REST_M, N
@@ -35,3 +38,11 @@ def test_turns_that_no_pressures_give_are_told():
     turned = np.array([[0.0, 0.0, -600.0, 90.0, 0.0, 0.0]])  # an arm without torsion
     [near], [error] = nearest_poses(POLICY, turned)
     assert error > POLICY.reward.threshold and abs(near[3]) < 60.0
+
+
+def test_a_turn_that_is_not_asked_for_costs_nothing():
+    policy = dataclasses.replace(POLICY, reward=RewardConfig(axes=(1.0, 1.0, 1.0, 0.0, 1.0, 1.0)))
+    turned = np.array([[0.0, 0.0, -600.0, 90.0, 0.0, 0.0]])
+    [near], [error] = nearest_poses(policy, turned)
+    assert error < 0.1 * policy.reward.threshold
+    np.testing.assert_allclose(near[:3], [0.0, 0.0, -600.0], atol=0.6)

@@ -29,6 +29,17 @@ def test_distance_to_reachable_poses():
     assert turned == pytest.approx(90 * reward.weight_per_deg / found.limit)
 
 
+@pytest.mark.parametrize(
+    ("axes", "turn_deg"), [((1, 1, 1, 0, 0, 0), 0.0), ((1, 1, 1, 0, 1, 1), 0.0), ((1, 1, 1, 3, 1, 1), 6.0)]
+)
+def test_distance_weighs_the_axes_of_the_goal(axes, turn_deg):
+    pose = np.array([[0, 0, -600, 0, 0, 0], [0, 0, -590, 0, 0, 0], [0, 30, -600, 0, 0, 0]], float)
+    reward = RewardConfig(axes=tuple(map(float, axes)))
+    found = Reachable.from_poses(pose, reward)
+    _, distance = nearest(found, np.array([0, 0, -600, 2, 0, 0]))
+    assert distance * found.limit == pytest.approx(turn_deg * reward.weight_per_deg, rel=1e-3, abs=1e-6)
+
+
 def test_goal_within_the_workspace_stays():
     for goal in GOALS:
         np.testing.assert_array_equal(near(goal), goal)
