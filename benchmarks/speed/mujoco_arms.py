@@ -137,6 +137,18 @@ class SteppedArms:
             pose = pose_from_quaternion(self._tip[:, :3], self._tip[:, 3:])
         return SteppedRest(pose, pressure_kpa, n_physics)
 
+    def hold(self, reference_m: np.ndarray, seconds: float) -> np.ndarray:
+        """Hold references (n, n_springs) for a time; return the tips (ticks, n, 3) [mm] after each period."""
+        tips_mm = np.empty((round(seconds / self.period_s), self.n, 3))
+        for tick in range(len(tips_mm)):
+            law = control.LawState(*self._law)
+            pressure_kpa, self._law[:] = control.pressures(
+                reference_m, self.length_m, law, self.gains, self.period_s
+            )
+            self._step(slice(None), pressure_kpa)
+            tips_mm[tick] = 1e3 * self._tip[:, :3]
+        return tips_mm
+
     def _step(self, arms: slice | np.ndarray, pressure_kpa: np.ndarray) -> None:
         """Hold pressures (k, n_chambers) of some arms for a control period, and read springs and tips."""
         if self._rollout is None:

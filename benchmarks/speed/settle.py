@@ -3,7 +3,8 @@
 The methods are Newton's method with the closed-form chain, the same with MJX kinematics, and C MuJoCo stepped
 in time under the control law. Each is a process of its own, and they take turns round by round, on all cores;
 one that fails has a row that says why. Errors are distances of the tip from the solution in double precision,
-which `tests/mechanics/test_settle.py` compares with C MuJoCo stepped to rest.
+which `tests/mechanics/test_settle.py` compares with C MuJoCo stepped to rest. A second table has arms that
+hang, lie and stand.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.harness.rounds import Facts, Worker, take_turns
+from benchmarks.speed import postures
 from benchmarks.speed.throughput import N_ROUNDS, over_rounds
 from benchmarks.speed.truth import Truth, error_figures, random_references, true_rest
 from mjx_softarm.spec import ArmSpec
@@ -29,7 +31,8 @@ METHODS = ("chain", "mjx", "stepping")
 
 def measure() -> dict[str, Any]:
     """How fast and how exactly is an arm's equilibrium found?"""
-    return {"over_links": [row for links in LINKS for row in _methods_rows(links)]}
+    over_links = [row for links in LINKS for row in _methods_rows(links)]
+    return {"over_links": over_links, "postures": postures.rows()}
 
 
 def _methods_rows(links: int) -> list[dict[str, Any]]:

@@ -57,9 +57,14 @@ def _solver(spec: ArmSpec) -> Callable:
 
 def true_rest(spec: ArmSpec, reference_m: np.ndarray) -> Truth:
     """Return the equilibria of arms under the control law, at references (n, n_chambers) [m]."""
-    with jax.enable_x64(True):
-        found = jax.device_get(_solver(spec)(jnp.asarray(reference_m, np.float64)))
+    found = rest_of(spec, reference_m)
     return Truth(1e3 * found.tip_position_m, found.settled, float(np.mean(found.at_limit[found.settled])))
+
+
+def rest_of(spec: ArmSpec, reference_m: np.ndarray) -> solver.Settled:
+    """Return arms settled in double precision, at references (n, n_springs) [m]."""
+    with jax.enable_x64(True):
+        return jax.device_get(_solver(spec)(jnp.asarray(reference_m, np.float64)))
 
 
 def error_figures(tip_mm: np.ndarray, truth: Truth) -> dict[str, float]:

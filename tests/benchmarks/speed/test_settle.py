@@ -1,5 +1,7 @@
 """The settling benchmark's parts: truth, errors, rows of methods."""
 
+from types import SimpleNamespace
+
 import jax.numpy as jnp
 import numpy as np
 
@@ -32,6 +34,7 @@ def test_each_method_has_a_row_whether_it_was_measured_or_not(monkeypatch):
     monkeypatch.setattr(settle, "true_rest", lambda *_: truth(np.zeros((4, 3))))
     monkeypatch.setattr(settle, "MOST_LINKS_MJX", 2)
     monkeypatch.setattr(settle, "LINKS", (2, 3))
+    monkeypatch.setattr(settle.postures, "rows", list)
     rows = settle.measure()["over_links"]
     assert [len(programs) for programs in asked] == [3, 2]
     chain, mjx, stepping = rows[:3]
@@ -39,6 +42,20 @@ def test_each_method_has_a_row_whether_it_was_measured_or_not(monkeypatch):
     assert chain["share_at_limit"] == 0.5
     assert mjx["failed"] == stepping["failed"] == "no memory"
     assert [row.get("skipped") for row in rows[3:]] == [None, settle.NO_MJX, None]
+
+
+def test_arms_that_stand_are_counted_by_where_they_end(monkeypatch):
+    tips_mm = np.zeros((100, 4, 3))
+    tips_mm[:, 1] += [6.0, 0.0, 0.0]  # on another branch
+    tips_mm[-1, 2] += 1.0  # in motion
+    result = np.array([0, 0, 0, 2])
+    found = SimpleNamespace(tip_position_m=np.full((4, 3), 1e-5), settled=result == 0, result=result)
+    monkeypatch.setattr(settle.postures, "rest_of", lambda *_: found)
+    monkeypatch.setattr(settle.postures, "SteppedArms", lambda *_: SimpleNamespace(hold=lambda *_: tips_mm))
+    row = settle.postures.figures(SHORT)
+    assert (row["converged"], row["not_convex"]) == (3, 1)
+    assert (row["settled_and_rest"], row["elsewhere"], row["settled_but_moves"]) == (2, 1, 1)
+    assert row["rests_but_not_settled"] == 1 and row["max_mm"] == 0.0173
 
 
 def test_spread_arms_settle_as_on_one_device(quick_compiler):
