@@ -168,7 +168,7 @@ def in_force(
 
     # Each command is in force from its dead time on; the oldest one was before all others
     line = jnp.concatenate([command_kpa[None], before_kpa[None], earlier_kpa])
-    age_s = period_s * jnp.arange(len(line) - 1)[:, None]
+    age_s = period_s * jnp.arange(len(line) - 1, dtype=float)[:, None]
     left_s = jnp.broadcast_to(delay_s, command_kpa.shape)[None] - age_s
     share = jnp.clip(k + 1.0 - left_s / h, 0.0, 1.0)  # (m + 1, n_chambers)
     return line[-1] + jnp.sum(share * (line[:-1] - line[1:]), axis=0)
