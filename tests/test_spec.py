@@ -259,3 +259,23 @@ def test_an_arm_of_no_such_name_is_told_with_those_that_there_are(tmp_path):
         ArmSpec.of(Path("nobody"))
     with pytest.raises(SpecError, match="expected a specification"):
         ArmSpec.of(tmp_path / "nobody.toml")
+
+
+def test_actuators_are_the_paper_s_pumps_unless_a_file_says_otherwise(spec, data, tmp_path):
+    del data["actuators"]
+    assert ArmSpec.from_dict(data) == spec
+    numbers = {"lag_s": [0.3 + 0.01 * k for k in range(9)], "dead_time_s": 0.1, "deadband_kpa": 0.2}
+    numbers |= {"kind": "regulator", "fill_kpa_per_s": 60.0, "vent_kpa_per_s": 25.0}
+    regulated = spec.replace(actuators=numbers)
+    regulated.to_toml(tmp_path / "arm.toml")
+    assert ArmSpec.from_toml(tmp_path / "arm.toml") == regulated != spec
+    assert regulated.replace(actuators={"dead_time_s": 0.2}).actuators.lag_s == tuple(numbers["lag_s"])
+    for changes, told in (
+        (
+            {"lag_s": [0.3] * 8},
+            "lag_s: got 8 numbers, expected one, or one for each of the 9 chambers",
+        ),
+        ({"dead_time_s": 3.0}, "actuators.dead_time_s: got 3.0, expected a number >= 0 and <= 2"),
+        ({"kind": "bellows"}, "actuators.kind: got 'bellows', expected pump or regulator"),
+    ):
+        assert told in message_of(regulated.replace, actuators=changes)
