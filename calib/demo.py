@@ -141,7 +141,9 @@ def _look(arm: ArmSpec, model: mujoco.MjModel, data: mujoco.MjData, qpos: np.nda
     mujoco.mj_tendon(model, data)
     tip = data.site("tip")
     marker_m = np.stack([data.site(name).xpos for name in _marker_sites(arm)])
-    return _Seen(spring_lengths(data).copy(), tip.xpos.copy(), tip.xmat.reshape(3, 3).copy(), marker_m)
+    return _Seen(
+        spring_lengths(data, arm.n_chambers).copy(), tip.xpos.copy(), tip.xmat.reshape(3, 3).copy(), marker_m
+    )
 
 
 def _marker_sites(arm: ArmSpec) -> list[str]:

@@ -196,3 +196,14 @@ def saturated(
     short = (pressure_kpa >= gains.pressure_max_kpa) & (error_m > tolerance_m)
     long = (pressure_kpa <= gains.pressure_min_kpa) & (error_m < -tolerance_m)
     return short | long
+
+
+def blocked_springs(saturated: Array, gains: Gains) -> Array:
+    """Return which springs (..., n_springs) are kept off by saturated chambers (..., n_chambers): bool.
+
+    They are the chambers' own springs, or those whose errors redundant chambers share.
+    """
+    if gains.allocation is None:
+        return saturated
+    shared = abs(gains.allocation.chamber_error.T) > 1e-9  # (n_springs, n_chambers)
+    return (shared & saturated[..., None, :]).any(axis=-1)

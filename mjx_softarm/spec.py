@@ -194,8 +194,10 @@ class ArmSpec:
         return self.structure.n_sections * self.structure.links_per_section
 
     @property
-    def link_length_m(self) -> float:
-        return self.geometry.section_length_m / self.structure.links_per_section
+    def link_length_m(self) -> np.ndarray:
+        """Length of each link (n_links,) of the unloaded arm at rest."""
+        per_section = self.structure.links_per_section
+        return np.repeat(self.per_section(self.geometry.section_length_m), per_section) / per_section
 
     @property
     def spring_sensor(self) -> Sensor:

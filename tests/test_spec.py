@@ -61,7 +61,7 @@ def test_default_is_the_paper_s_arm(spec):
 
 def test_derived_counts_and_lengths(spec):
     assert (spec.n_chambers, spec.n_links) == (9, 3 * spec.structure.links_per_section)
-    assert spec.n_links * spec.link_length_m == pytest.approx(3 * spec.geometry.section_length_m)
+    assert spec.link_length_m == pytest.approx([0.05] * spec.n_links)
     assert spec.per_chamber(spec.sensor.beta) == (0.93,) * 9
     areas = tuple(1e-3 + 1e-5 * k for k in range(9))
     assert spec.per_chamber(spec.replace(chambers={"area_m2": areas}).chambers.area_m2) == areas

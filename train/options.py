@@ -35,7 +35,7 @@ class ArmOptions:
             raise ConfigError(f"--spec {self.spec}: got --calibration {self.calibration} too, expected one")
         spec, file = ArmSpec.from_toml(self.calibration / ARM_FILE), self.calibration / S2R_FILE
         if file.exists():
-            return spec, load_s2r(file, spec.n_chambers)
+            return spec, load_s2r(file, spec.n_springs)
         console.print(f"no {file}: training on simulated poses", highlight=False, soft_wrap=True)
         return spec, None
 

@@ -3,7 +3,7 @@
     python -m benchmarks.speed.jax_worker steps ENGINE MODE N_ARMS           environment steps
     python -m benchmarks.speed.jax_worker settle ENGINE REFERENCES LINKS     settling alone
 
-REFERENCES is an npy file with references (n, n_chambers) [m], LINKS a number of links per section. Both tell
+REFERENCES is an npy file with references (n, n_springs) [m], LINKS a number of links per section. Both tell
 where the arms settled.
 """
 

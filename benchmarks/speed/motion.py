@@ -68,7 +68,7 @@ def true_path_mm(
         spec: the arm.
         q (nv,) [m, rad, rad]: joint coordinates at the start, at rest.
         pressure_kpa (n_chambers,): pressures that hold the arm there.
-        reference_m (t, n_chambers): spring lengths that the law tracks in each control period.
+        reference_m (t, n_springs): spring lengths that the law tracks in each control period.
     """
     # The arm at rest, its chambers filled
     model, gains, period_s = build_model(spec), control.Gains.from_spec(spec), 1.0 / spec.control.rate_hz
@@ -77,18 +77,19 @@ def true_path_mm(
     data.qpos[:] = q
     mujoco.mj_step1(model, data)
     area, slope = np.array([*map(spec.per_chamber, (spec.chambers.area_m2, spec.chambers.area_slope_m))])
-    bellows = area, slope, spec.at_chambers(spec.geometry.section_length_m), chamber_lengths(data)
-    air = Pneumatics(*bellows, TRUE_STEP_S, spec.actuators.per_chamber(spec.n_chambers))
-    air.hold(pressure_kpa, chamber_lengths(data))
+    rest_m, n = spec.at_chambers(spec.geometry.section_length_m), spec.n_chambers
+    bellows = area, slope, rest_m, chamber_lengths(data, n)
+    air = Pneumatics(*bellows, TRUE_STEP_S, spec.actuators.per_chamber(n))
+    air.hold(pressure_kpa, chamber_lengths(data, n))
 
     # The law at the control rate, MuJoCo's time steps between
-    law, tips = control.LawState.at_rest(pressure_kpa, spring_lengths(data).copy()), []
+    law, tips = control.LawState.at_rest(pressure_kpa, spring_lengths(data, n).copy()), []
     for reference in reference_m:
         tips.append(1e3 * data.site("tip").xpos)
-        command, law = control.pressures(reference, spring_lengths(data).copy(), law, gains, period_s)
+        command, law = control.pressures(reference, spring_lengths(data, n).copy(), law, gains, period_s)
         air.command(command)
         for _ in range(round(period_s / TRUE_STEP_S)):
-            data.ctrl[:] = air.step(chamber_lengths(data))
+            data.ctrl[:] = air.step(chamber_lengths(data, n))
             mujoco.mj_step2(model, data)
             mujoco.mj_step1(model, data)
     return np.array(tips)

@@ -37,17 +37,17 @@ def sensed_model(spec: ArmSpec) -> mujoco.MjModel:
     from mjx_softarm.mechanics.mjcf import build_spec  # imports JAX
 
     mjspec = build_spec(spec)
-    for chamber in range(spec.n_chambers):
+    for spring in range(spec.n_springs):
         kind, of = mujoco.mjtSensor.mjSENS_TENDONPOS, mujoco.mjtObj.mjOBJ_TENDON
-        mjspec.add_sensor(type=kind, objtype=of, objname=f"spring{chamber}")
+        mjspec.add_sensor(type=kind, objtype=of, objname=f"spring{spring}")
     for kind in (mujoco.mjtSensor.mjSENS_FRAMEPOS, mujoco.mjtSensor.mjSENS_FRAMEQUAT):
         mjspec.add_sensor(type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname="tip")
     return mjspec.compile()
 
 
 def _springs(data: mujoco.MjData) -> np.ndarray:
-    """Return the spring lengths (n_chambers,) [m]; imports no JAX, as `mechanics.mjcf` does."""
-    return data.ten_length[1::2]
+    """Return the spring lengths (n_springs,) [m]; imports no JAX, as `mechanics.mjcf` does."""
+    return data.ten_length[data.ctrl.size :]
 
 
 class RestDetector:
@@ -55,11 +55,11 @@ class RestDetector:
 
     def __init__(self, n: int, spec: ArmSpec):
         self._longest = round(LONGEST_S * spec.control.rate_hz)
-        self._past_m = np.empty((round(REST_S * spec.control.rate_hz) + 1, n, spec.n_chambers))
+        self._past_m = np.empty((round(REST_S * spec.control.rate_hz) + 1, n, spec.n_springs))
         self._tick = 0
 
     def after(self, length_m: np.ndarray, arms: slice | np.ndarray) -> np.ndarray:
-        """Take the springs (k, n_chambers) of some arms after a period; return which arms are done (k,)."""
+        """Take the springs (k, n_springs) of some arms after a period; return which arms are done (k,)."""
         self._past_m[self._tick % len(self._past_m), arms] = length_m
         self._tick += 1
         if self._tick >= self._longest:
@@ -97,8 +97,9 @@ class SteppedArms:
         self._n_steps = round(self.period_s / model.opt.timestep)
         size = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)  # time, qpos, qvel
         self._state = np.zeros((n, size))
-        self.length_m = np.zeros((n, spec.n_chambers))
-        self._law = np.zeros((3, n, spec.n_chambers))  # a `control.LawState`
+        self.length_m = np.zeros((n, spec.n_springs))
+        sizes = spec.n_chambers, spec.n_springs, spec.n_springs
+        self._law = control.LawState(*(np.zeros((n, size)) for size in sizes))
         self._tip = np.zeros((n, 7))  # position and quaternion
         self.place(np.ones(n, bool), np.zeros((n, model.nq)), np.zeros((n, model.nu)))
 
@@ -112,21 +113,27 @@ class SteppedArms:
             data.qpos[:] = coordinates
             mujoco.mj_fwdPosition(self.model, data)
             self.length_m[index] = _springs(data)
-        self._law[:, arms] = control.LawState.at_rest(pressure_kpa, self.length_m[arms])
+        self._remember(arms, control.LawState.at_rest(pressure_kpa, self.length_m[arms]))
+
+    def _remember(self, arms: slice | np.ndarray, law: control.LawState) -> None:
+        """Keep the law's memory of some arms."""
+        for memory, new in zip(self._law, law, strict=True):
+            memory[arms] = new
 
     def settle(self, reference_m: np.ndarray) -> SteppedRest:
-        """Hold references (n, n_chambers) until each arm rests.
+        """Hold references (n, n_springs) until each arm rests.
 
         Springs are read as a rollout leaves them, one time step old.
         """
         rest, moving, n_physics = RestDetector(self.n, self.spec), np.arange(self.n), 0
-        pressure_kpa = np.zeros_like(reference_m)
+        pressure_kpa = np.zeros((self.n, self.spec.n_chambers))
         while len(moving):
             arms = moving if len(moving) < self.n else slice(None)  # a slice copies nothing
-            law = control.LawState(*self._law[:, arms])
-            pressure_kpa[arms], self._law[:, arms] = control.pressures(
+            law = control.LawState(*(memory[arms] for memory in self._law))
+            pressure_kpa[arms], law = control.pressures(
                 reference_m[arms], self.length_m[arms], law, self.gains, self.period_s
             )
+            self._remember(arms, law)
             self._step(arms, pressure_kpa[arms])
             n_physics += len(moving) * self._n_steps
             moving = moving[~rest.after(self.length_m[arms], arms)]
@@ -160,7 +167,7 @@ class SteppedArms:
                 self.model, self._data, self._state[arms], pressure_kpa[:, None], nstep=self._n_steps
             )
             self._state[arms] = state[:, -1]
-            self.length_m[arms], self._tip[arms] = np.split(sensed[:, -1], [self.spec.n_chambers], axis=1)
+            self.length_m[arms], self._tip[arms] = np.split(sensed[:, -1], [self.spec.n_springs], axis=1)
 
 
 def write_arm(folder: Path, spec: ArmSpec, n_poses: int = 1024) -> None:
@@ -199,7 +206,7 @@ class SteppedReach:
         return observe(self._pool["pose"][start], self.goal[arms], self._scale, self._reward)
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, SteppedRest]:
-        """Act with all arms (n, n_chambers): observations, rewards, reached, over, where they are."""
+        """Act with all arms (n, n_springs): observations, rewards, reached, over, where they are."""
         reference_m = self.reference_m(action)
         end = self.arms.settle(reference_m)
         self.n_taken += 1
@@ -216,10 +223,10 @@ class SteppedReachGym(gymnasium.Env):
 
     def __init__(self, folder: str, seed: int, episode_length: int):
         self._reach = SteppedReach(folder, 1, 0, seed, episode_length)
-        n_chambers = self._reach.arms.spec.n_chambers
+        n_springs = self._reach.arms.spec.n_springs
         self.timestep_s = self._reach.arms.model.opt.timestep
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (OBS_SIZE,), np.float32)
-        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (n_chambers,), np.float32)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (n_springs,), np.float32)
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
         """Start an episode; its random numbers continue the last one's."""

@@ -4,7 +4,7 @@
     python -m benchmarks.speed.mujoco_worker rollout FOLDER N_THREADS      MuJoCo's own threaded rollout
     python -m benchmarks.speed.mujoco_worker settle REFERENCES LINKS       equilibria of references
 
-FOLDER is made by `write_arm`. REFERENCES is an npy file with references (n, n_chambers) [m]; the first
+FOLDER is made by `write_arm`. REFERENCES is an npy file with references (n, n_springs) [m]; the first
 `N_STEPPED` of them are taken. All tell where the arms stopped.
 """
 
@@ -31,7 +31,7 @@ class Step(NamedTuple):
     """Cost of a step of all environments, and where it led."""
 
     n_physics: int  # time steps of all arms together
-    reference_m: np.ndarray  # (n_env, n_chambers)
+    reference_m: np.ndarray  # (n_env, n_springs)
     tip_mm: np.ndarray  # (n_env, 3)
 
 
@@ -82,7 +82,7 @@ def rollout(folder: str, n_threads: str) -> tuple[Facts, Callable[[], Facts]]:
     envs.reset(np.ones(n, bool))
 
     def step() -> Step:
-        action = rng.uniform(-1.0, 1.0, (n, envs.arms.spec.n_chambers))
+        action = rng.uniform(-1.0, 1.0, (n, envs.arms.spec.n_springs))
         _, _, reached, over, end = envs.step(action)
         envs.reset(reached | over)
         return Step(end.physics_steps, envs.reference_m(action), end.pose[:, :3])

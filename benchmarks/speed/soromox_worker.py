@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.harness.rounds import Facts, serve
+from mjx_softarm.mechanics.body import chamber_directions, holes_m
 from mjx_softarm.spec import ArmSpec
 
 HELD_S = 0.5  # duration of a set of pressures, as of an environment step in motion
@@ -37,27 +38,38 @@ N_GAUSS_POINTS = 2  # for speed; the default is five
 BENDS_AND_STRETCHES = (False, True, True, True, False, False)  # torsion, bending, stretch, shear
 
 
-def section_matrix(spec: ArmSpec, kind: str) -> np.ndarray:
-    """Return the matrix (6, 6) of a section's "stiffness" or "damping": torsion, bending, stretch, shear.
+def section_matrices(spec: ArmSpec, kind: str) -> np.ndarray:
+    """Return each section's "stiffness" or "damping" (n_sections, 6, 6): torsion, bending, stretch, shear.
 
     Torsion and shear, which the arm does not do, get the values of bending and stretch.
     """
-    radii = spec.geometry.chamber_radius_m, spec.geometry.spring_radius_m
+    # Chambers and springs of a section together, each row of (2, n_sections)
+    n, geometry = spec.structure.n_sections, spec.geometry
     per_m, per_rad = ("n_per_m", "nm_per_rad") if kind == "stiffness" else ("ns_per_m", "nms_per_rad")
-    rods = [np.mean(getattr(group, f"{kind}_{per_m}")) for group in (spec.chambers, spec.springs)]
-    axial = 3.0 * sum(rods) + getattr(spec.backbone, f"axial_{kind}_{per_m}")
-    bending = 1.5 * np.dot(rods, np.square(radii)) + getattr(spec.backbone, f"bending_{kind}_{per_rad}")
-    return spec.geometry.section_length_m**2 * np.diag([bending] * 3 + [axial] * 3)  # per strain
+    chambers = np.reshape(spec.per_chamber(getattr(spec.chambers, f"{kind}_{per_m}")), (n, -1)).sum(axis=1)
+    springs = spec.at_springs(getattr(spec.springs, f"{kind}_{per_m}")).reshape(n, -1).sum(axis=1)
+    radii = [spec.per_section(radius) for radius in (geometry.chamber_radius_m, geometry.spring_radius_m)]
+    rods = np.stack([chambers, springs])
+
+    # A rod at angle a bends by its stiffness times (r cos a)^2, half of r^2 on average
+    axial = rods.sum(axis=0) + spec.per_section(getattr(spec.backbone, f"axial_{kind}_{per_m}"))
+    bending = 0.5 * np.sum(rods * np.square(radii), axis=0)
+    bending = bending + spec.per_section(getattr(spec.backbone, f"bending_{kind}_{per_rad}"))
+    diagonal = np.stack([bending] * 3 + [axial] * 3, axis=-1)
+    per_strain = np.square(spec.per_section(geometry.section_length_m))[:, None] * diagonal
+    return per_strain[:, :, None] * np.eye(6)
 
 
 def random_forces(spec: ArmSpec, n: int, rng: np.random.Generator) -> np.ndarray:
     """Return the generalised forces (n, 3 * n_sections) of random pressures in the arm's range."""
     low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
-    force_n = 1e3 * np.mean(spec.chambers.area_m2) * rng.uniform(low, high, (n, spec.structure.n_sections, 3))
-    angle = np.deg2rad(spec.geometry.first_chamber_deg + 120.0 * np.arange(3))
-    radius_m = spec.geometry.chamber_radius_m
-    arms = np.stack([radius_m * np.sin(angle), -radius_m * np.cos(angle), np.ones(3)], axis=1)
-    return (spec.geometry.section_length_m * force_n @ arms).reshape(n, -1)
+    directions = chamber_directions(spec)  # (n_sections, c, 2)
+    pressure = rng.uniform(low, high, (n, *directions.shape[:2]))
+    force_n = 1e3 * np.reshape(spec.per_chamber(spec.chambers.area_m2), directions.shape[:2]) * pressure
+    x, y = np.moveaxis(holes_m(directions, spec.per_section(spec.geometry.chamber_radius_m)), -1, 0)
+    arms = np.stack([y, -x, np.ones_like(x)], axis=-1)  # (n_sections, c, 3)
+    length_m = np.array(spec.per_section(spec.geometry.section_length_m))[:, None]
+    return (length_m * np.einsum("nsc,sck->nsk", force_n, arms)).reshape(n, -1)
 
 
 def build_robot(spec: ArmSpec) -> Any:
@@ -66,19 +78,23 @@ def build_robot(spec: ArmSpec) -> Any:
     from soromox.systems.components import LinkSpec  # pyright: ignore[reportMissingImports]
 
     geometry, n = spec.geometry, spec.structure.n_sections
-    radius_m = geometry.chamber_radius_m + 0.5 * geometry.chamber_diameter_m
-    mass_kg = np.full(n, spec.mass.arm_kg / n)
+    radius_m = np.add(
+        spec.per_section(geometry.chamber_radius_m),
+        0.5 * np.array(spec.per_section(geometry.chamber_diameter_m)),
+    )
+    mass_kg = np.array(spec.section_mass_kg)
     mass_kg[-1] += spec.mass.gripper_kg + spec.mass.payload_kg
+    stiffness, damping = (section_matrices(spec, kind) for kind in ("stiffness", "damping"))
     links = [
         LinkSpec.circular(
-            length=geometry.section_length_m,
-            density=float(mass) / (math.pi * radius_m**2 * geometry.section_length_m),
-            radius=radius_m,
+            length=length_m,
+            density=float(mass_kg[k]) / (math.pi * float(radius_m[k]) ** 2 * length_m),
+            radius=float(radius_m[k]),
             reference_strain=[0.0, 0.0, 0.0, 1.0, 0.0, 0.0],
-            stiffness=section_matrix(spec, "stiffness"),
-            damping=section_matrix(spec, "damping"),
+            stiffness=stiffness[k],
+            damping=damping[k],
         )
-        for mass in mass_kg
+        for k, length_m in enumerate(spec.per_section(geometry.section_length_m))
     ]
     structure = PCSStructure(N_GAUSS_POINTS, list(BENDS_AND_STRETCHES) * n)
     return PCS.from_links(links, structure=structure, gravity=np.array([9.81, 0.0, 0.0]))

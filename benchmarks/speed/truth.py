@@ -38,7 +38,7 @@ class Truth(NamedTuple):
 def settle_function(
     spec: ArmSpec, engine: str = "chain", dtype: Any = np.float32, mesh: Mesh | None = None
 ) -> Callable:
-    """Return a jitted function, references (n, n_chambers) -> `Settled`, spread over a mesh of devices."""
+    """Return a jitted function, references (n, n_springs) -> `Settled`, spread over a mesh of devices."""
     params = jax.tree.map(jnp.asarray, ArmParams.from_spec(spec, dtype))
     n_at_once = solver.arms_at_once(spec.n_links)
     if engine == "mjx":
@@ -56,7 +56,7 @@ def _solver(spec: ArmSpec) -> Callable:
 
 
 def true_rest(spec: ArmSpec, reference_m: np.ndarray) -> Truth:
-    """Return the equilibria of arms under the control law, at references (n, n_chambers) [m]."""
+    """Return the equilibria of arms under the control law, at references (n, n_springs) [m]."""
     found = rest_of(spec, reference_m)
     return Truth(1e3 * found.tip_position_m, found.settled, float(np.mean(found.at_limit[found.settled])))
 
@@ -87,6 +87,6 @@ def told_error(spec: ArmSpec, told: Sequence[Mapping[str, Any]]) -> dict[str, fl
 
 
 def random_references(spec: ArmSpec, n: int) -> np.ndarray:
-    """Return spring lengths (n, n_chambers) [m], uniform over the range that may be commanded."""
-    low_m, high_m = spec.springs.length_min_m, spec.springs.length_max_m
-    return np.random.default_rng(0).uniform(low_m, high_m, (n, spec.n_chambers))
+    """Return spring lengths (n, n_springs) [m], uniform over the range that may be commanded."""
+    low_m, high_m = map(spec.at_springs, (spec.springs.length_min_m, spec.springs.length_max_m))
+    return np.random.default_rng(0).uniform(low_m, high_m, (n, spec.n_springs))

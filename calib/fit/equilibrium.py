@@ -63,7 +63,7 @@ def residuals(x: Array, params: ArmParams, measured: Measured) -> tuple[Array, A
             kinematics, arm.without_pressure_limits(), jnp.asarray(measured.pressure_kpa)
         )
         frames = kinematics(found.q)
-        chamber_m = tendons(jax.lax.stop_gradient(frames), arm.chamber_site_m).length
+        chamber_m = tendons(jax.lax.stop_gradient(frames), arm.chamber_site_m).length.reshape(-1)
         turn = measured.tip_rotation.T @ found.tip_rotation
         end_m = _section_ends(frames, marker_sites(x, len(found.spring_m)))
     # Compare it with the measured pose.

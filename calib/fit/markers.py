@@ -131,7 +131,7 @@ def chamber_lengths(curve: np.ndarray, site_m: np.ndarray, spec: ArmSpec) -> np.
     slope = _at(curve[:-1] * np.arange(ORDER, 0, -1)[:, None], share)
     rotation = _untwisted(-slope / np.linalg.norm(slope, axis=1, keepdims=True))
     # Add up the pieces of each chamber's curve in its section.
-    beside = ArmParams.from_spec(spec, np.float64).chamber_site_m - site_m  # (n_chambers, 2)
+    beside = ArmParams.from_spec(spec, np.float64).chamber_site_m.reshape(-1, 2) - site_m
     lines = points + np.einsum("sij,cj->csi", rotation[:, :, :2], beside)
     pieces = np.linalg.norm(np.diff(lines, axis=1), axis=2).reshape(spec.n_chambers, n_sections, N_SAMPLES)
     section = np.arange(spec.n_chambers) // N_CHAMBERS_PER_SECTION

@@ -98,17 +98,16 @@ def with_numbers(x: Array, params: ArmParams) -> ArmParams:
     by = _split(x, params.area.shape[0])
     bend = jnp.exp(by[BENDING][0])
     joints = params.joint_stiffness.reshape(-1, 3) * jnp.stack([jnp.ones_like(bend), bend, bend])
-    roll = jnp.repeat(by["roll"], N_CHAMBERS_PER_SECTION)
     mount, zero = params.mount, jnp.zeros(1, x.dtype)
     base_turn = _turned(jnp.concatenate([by["base turn"], zero]))
     return params._replace(
-        chamber_site_m=_rolled(params.chamber_site_m, roll),
-        spring_site_m=_rolled(params.spring_site_m, roll),
+        chamber_site_m=_rolled(params.chamber_site_m, by["roll"]),
+        spring_site_m=_rolled(params.spring_site_m, by["roll"]),
         joint_stiffness=joints.reshape(-1),
         chamber_stiffness=params.chamber_stiffness * jnp.exp(by["stiffness"]),
         area=params.area * jnp.exp(by["area"]),
-        area_slope=params.area_slope + by["slope"] * params.area / params.section_length_m,
-        chamber_rest_m=params.chamber_rest_m + by["offset"] * params.section_length_m,
+        area_slope=params.area_slope + by["slope"] * params.area / params.free_length_m,
+        chamber_rest_m=params.chamber_rest_m + by["offset"] * params.free_length_m,
         mount=mount._replace(
             base_position_m=mount.base_position_m + by["base offset"],
             base_rotation=product(jnp.asarray(mount.base_rotation), base_turn),
@@ -125,8 +124,8 @@ def marker_sites(x: Array, n_chambers: int) -> Array:
 
 
 def _rolled(site_m: Array, roll: Array) -> Array:
-    cos, sin = jnp.cos(roll), jnp.sin(roll)
-    x, y = site_m[:, 0], site_m[:, 1]
+    cos, sin = jnp.cos(roll)[:, None], jnp.sin(roll)[:, None]
+    x, y = site_m[..., 0], site_m[..., 1]  # (n_sections, k)
     return jnp.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
 
 

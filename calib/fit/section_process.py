@@ -69,7 +69,7 @@ def sections(frames: Frames, params: ArmParams, spring_m: Array) -> Sections:
         spring_m (n_chambers,) [m]: spring lengths.
     """
     # Find the plate in the middle of each section, and the moment of the weights below it.
-    n_sections, length_m = params.n_sections, params.section_length_m
+    n_sections, length_m = params.n_sections, params.section_length_m[0]
     per_section = params.link_mass_kg.shape[0] // n_sections
     middle = per_section * np.arange(n_sections) + per_section // 2
     position, rotation = frames.plate_position[middle], frames.plate_rotation[middle]

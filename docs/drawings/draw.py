@@ -58,10 +58,10 @@ def draw_parts(spec: ArmSpec, image: np.ndarray) -> None:
     params = ArmParams.from_spec(spec)
     above.add_patch(plt.Circle((0, 0), 1.2 * 1e3 * spec.geometry.spring_radius_m, fc="#ececf0", ec="#9090a0"))
     for k in range(3):
-        x, y = 1e3 * params.chamber_site_m[k]
+        x, y = 1e3 * params.chamber_site_m[0, k]
         above.add_patch(plt.Circle((x, y), 500 * spec.geometry.chamber_diameter_m, fc=COLOURS[0], alpha=0.75))
         above.text(x, y, f"{k}", ha="center", va="center", fontsize=16)
-        x, y = 1e3 * params.spring_site_m[k]
+        x, y = 1e3 * params.spring_site_m[0, k]
         above.plot(x, y, "o", ms=9, mfc="white", mec="black")
         above.text(1.32 * x, 1.32 * y, f"spring {k}", ha="center", va="center")
     for axis, (x, y) in {"x": (1, 0), "y": (0, 1)}.items():

@@ -79,7 +79,7 @@ class SoftArmVectorEnv(gymnasium.vector.VectorEnv):
         return _to_numpy(state.obs), _where(everywhere, _to_numpy(_reset_info(state)))
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:
-        """Act once with every arm, actions (num_envs, n_chambers) in [-1, 1].
+        """Act once with every arm, actions (num_envs, n_springs) in [-1, 1].
 
         Where an episode ends, observation and info belong to the next episode; `final_obs` and `final_info`
         are the last ones of the episode that ended.
@@ -134,7 +134,7 @@ class SoftArmEnv(gymnasium.Env):
         return _to_numpy(state.obs), _to_numpy(_reset_info(state))
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, Info]:
-        """Act once, action (n_chambers,) in [-1, 1]."""
+        """Act once, action (n_springs,) in [-1, 1]."""
         if self._state is None:
             raise gymnasium.error.ResetNeeded("SoftArmEnv.step: got no episode, expected reset first")
         self._state = state = self._step_arm(self._state, _as_actions(action, self.action_space.shape))

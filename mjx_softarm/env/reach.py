@@ -43,14 +43,14 @@ class ReachEnv(Env):
         With `observation="payload"` the payload follows, as a share of the largest; with "motion" the 39
         numbers of `mjx_softarm.mdp.observation.observe_motion`
 
-    Action (n_chambers,), each in [-1, 1]: sensor readings that the sensor-space law is to reach, from the
+    Action (n_springs,), each in [-1, 1]: sensor readings that the sensor-space law is to reach, from the
         reading of the shortest to that of the longest spring (`mjx_softarm.mdp.actions`)
     Reward (), without unit: the sum of the terms of `mjx_softarm.mdp.rewards.reward`
     Done (): 1 where the goal is reached with no chamber saturated, or where the simulation failed
 
     Info:
         valid () bool            the simulation succeeded; do not learn from other steps
-        blocked (n_chambers,)    bool, chamber is at a pressure limit with its spring off its reference
+        blocked (n_chambers,)    bool, chamber is at a pressure limit with its error not closed
         saturated () bool        a chamber is blocked
         clearance_mm ()          least distance of the body to the pipe's wall; infinite without a pipe
         path_mm (n_ticks, 3)     in motion: position of the tip at the start of each control period
@@ -106,7 +106,7 @@ class ReachEnv(Env):
 
     @property
     def action_size(self) -> int:
-        return self.spec.n_chambers
+        return self.spec.n_springs
 
     @property
     def backend(self) -> str:
@@ -133,11 +133,11 @@ class ReachEnv(Env):
             return correct(self.s2r, pose, spring_m)
 
     def reference_m(self, action: Array) -> Array:
-        """Return the spring lengths (..., n_chambers) [m] that an action in [-1, 1] asks for."""
+        """Return the spring lengths (..., n_springs) [m] that an action in [-1, 1] asks for."""
         return self.action_map.lengths(action)
 
     def action_of(self, length_m: Array) -> Array:
-        """Return the action in [-1, 1] that asks for spring lengths (..., n_chambers) [m]."""
+        """Return the action in [-1, 1] that asks for spring lengths (..., n_springs) [m]."""
         return self.action_map.from_lengths(length_m)
 
     def reset(self, rng: Array) -> State:
@@ -148,7 +148,8 @@ class ReachEnv(Env):
         """Draw the random numbers of n episodes: leaves (n, ...)."""
         key, shape = jax.random.fold_in(rng, 1), (n, self.episode_motion.n_draws)
         moving = draws.uniform(key, shape) if self.config.moves else None
-        return EpisodeNoise(*draws.both(rng, (n, 3 + self.action_size), (n, self.action_size)), moving)
+        shapes = (n, 3 + self.spec.n_chambers), (n, self.spec.n_springs)
+        return EpisodeNoise(*draws.both(rng, *shapes), moving)
 
     def reset_from(self, noise: EpisodeNoise) -> State:
         """Start the episode that `noise` fixes."""
@@ -177,7 +178,7 @@ class ReachEnv(Env):
         metrics = dict.fromkeys(names, zero)
         terms = rewards.reward(arm.pose, goal, arm.n_steps, jnp.array(False), self.config.reward)[2]
         metrics |= {f"reward_{name}": zero for name in terms}
-        info = {"saturated": jnp.array(False), "blocked": jnp.zeros(self.action_size, bool)}
+        info = {"saturated": jnp.array(False), "blocked": jnp.zeros(self.spec.n_chambers, bool)}
         info |= {"valid": jnp.array(True), "clearance_mm": self.walls.clearance_mm(start.q, start.pose)}
         if self.config.moves:
             info["path_mm"] = jnp.zeros((self.n_ticks, 3))
@@ -189,7 +190,7 @@ class ReachEnv(Env):
         return arm._replace(sensed=self._sensed(arm, arm, self.action_of(arm.spring_m + arm.sensor_offset_m)))
 
     def step(self, state: State, action: Array) -> State:
-        """Move to the references of `action` (n_chambers,) in [-1, 1]; `done` is 1 where the goal is reached.
+        """Move to the references of `action` (n_springs,) in [-1, 1]; `done` is 1 where the goal is reached.
 
         An arm that did not settle, or is not finite, keeps its last pose, earns nothing and ends its episode;
         `info["valid"]` is then false, and the transition must not be learned from.
@@ -243,7 +244,7 @@ class ReachEnv(Env):
         )
 
     def _move(self, arm: ArmState, reference_m: Array) -> tuple[Motion, Settled | MotionEnd]:
-        """Move to true spring lengths (n_chambers,): return the motion and the observables at its end."""
+        """Move to true spring lengths (n_springs,): return the motion and the observables at its end."""
         params, config = self.params_of(arm), self.config
         if config.moves:
             moving = MovingArm(self.model, self._data, params, arm.moving)

@@ -13,23 +13,35 @@ import numpy as np
 from mjx_softarm.posture import base_rotation
 from mjx_softarm.sensing.estimator import Frame, backbone
 from mjx_softarm.sensing.pose import quaternion_from_rotation
-from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
+from mjx_softarm.spec import ArmSpec
 
 FOLDS, COILS = 12, 20  # folds of a bellows, coils of a spring
 SPRING_WIDTH_M = 0.002  # radius of a spring, outside the circle that the springs stand on
 
 
-def ring_radius_m(spec: ArmSpec) -> float:
-    """Return the outer radius of a ring."""
-    return spec.geometry.spring_radius_m + SPRING_WIDTH_M
+def ring_radius_m(spec: ArmSpec) -> np.ndarray:
+    """Return the outer radii of the rings (n_links + 1,) [m] from the base; two sections share the larger."""
+    section = np.array(spec.per_section(spec.geometry.spring_radius_m))
+    of_links = np.repeat(section, spec.structure.links_per_section)
+    return np.maximum(np.append(of_links[0], of_links), np.append(of_links, of_links[-1])) + SPRING_WIDTH_M
 
 
-def hole_directions(spec: ArmSpec) -> np.ndarray:
-    """Return the unit vector (n, 2), x and y, from the axis of its section to each chamber and its spring."""
-    roll_deg = np.repeat(spec.section_roll_deg, N_CHAMBERS_PER_SECTION)
-    first = np.radians(spec.geometry.first_chamber_deg + roll_deg)
-    angle = first + 2 * np.pi * np.arange(spec.n_chambers) / N_CHAMBERS_PER_SECTION
+def chamber_directions(spec: ArmSpec) -> np.ndarray:
+    """Return the unit vectors (n_sections, c, 2), x and y, from the axis of a section to its chambers."""
+    n = spec.structure.chambers_per_section
+    first = np.radians(np.add(spec.per_section(spec.geometry.first_chamber_deg), spec.section_roll_deg))
+    angle = first[:, None] + 2 * np.pi * np.arange(spec.n_chambers).reshape(-1, n) / n
     return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+
+def spring_directions(spec: ArmSpec) -> np.ndarray:
+    """Return the unit vectors (n_sections, s, 2), x and y, from the axis of a section to its springs."""
+    return chamber_directions(spec)[:, :: spec.structure.chambers_per_section // spec.springs_per_section]
+
+
+def holes_m(directions: np.ndarray, radius_m: tuple[float, ...]) -> np.ndarray:
+    """Return holes (n_sections, k, 2) [m] in these directions on a circle of each section's radius."""
+    return np.array(radius_m)[:, None, None] * directions
 
 
 def rim_points(radius_m: float, n: int = 16) -> np.ndarray:
@@ -58,32 +70,33 @@ class Copies(NamedTuple):
 
     position_m: np.ndarray  # (k, 3)
     quaternion: np.ndarray  # (k, 4) w, x, y, z
+    width_m: np.ndarray  # (k,) size of a copy across its own z; the mesh has size 1
     pitch_m: np.ndarray  # (k,) length of a copy along its own z; the mesh has length 1
 
     @property
     def scales(self) -> np.ndarray:
         """Scales (k, 3) along the axes of the mesh."""
-        return np.stack([np.ones_like(self.pitch_m)] * 2 + [self.pitch_m], axis=-1)
+        return np.stack([self.width_m, self.width_m, self.pitch_m], axis=-1)
 
 
 class ArmShape(NamedTuple):
     """Places of all drawn parts. Bellows and springs are ordered as in the model, each from its upper end."""
 
-    rings: Copies  # links_per_section in each section; the ring at the base is not among them
-    folds: Copies  # FOLDS in each bellows
-    coils: Copies  # COILS in each spring
+    rings: Copies  # links_per_section in each section, their radii as widths; the base's is not among them
+    folds: Copies  # FOLDS in each bellows, its radius as width
+    coils: Copies  # COILS in each spring, of width 1
 
 
 def shape(spec: ArmSpec, spring_m: np.ndarray, tip: np.ndarray) -> ArmShape:
-    """Return the shape of an arm with springs (n,) [m] and its tip at a pose (6,) [mm, deg]."""
+    """Return the shape of an arm with springs (n_springs,) [m] and its tip at a pose (6,) [mm, deg]."""
     # Frames along the axis of each section, as shares of its length: rings, folds, coils
-    geometry, directions = spec.geometry, hole_directions(spec)
+    geometry = spec.geometry
     n_rings = spec.structure.links_per_section
     steps = [(np.arange(n) + 0.5) / n for n in (FOLDS, COILS)]
     at = np.concatenate([(np.arange(n_rings) + 1.0) / n_rings, *steps])
-    site_m = (geometry.spring_radius_m * directions).reshape(spec.structure.n_sections, -1, 2)
+    spring_site_m = holes_m(spring_directions(spec), spec.per_section(geometry.spring_radius_m))
     base = Frame(np.array(spec.mounting.base_offset_m), base_rotation(spec))
-    sections = backbone(base, site_m, spring_m, tip, at)
+    sections = backbone(base, spring_site_m, spring_m, tip, at)
     rings, folds, coils = (
         Frame(*(part[:, rows] for part in sections))
         for rows in np.split(np.arange(len(at)), [n_rings, n_rings + FOLDS])
@@ -91,19 +104,29 @@ def shape(spec: ArmSpec, spring_m: np.ndarray, tip: np.ndarray) -> ArmShape:
 
     # Rings stand on the axis, folds and coils beside it
     centres = rings.position_m.reshape(-1, 3)
+    upright = quaternion_from_rotation(rings.rotation.reshape(-1, 3, 3))
+    chamber_site_m = holes_m(chamber_directions(spec), spec.per_section(geometry.chamber_radius_m))
+    bellows_m = 0.5 * np.array(spec.per_section(geometry.chamber_diameter_m))
     return ArmShape(
-        Copies(centres, quaternion_from_rotation(rings.rotation.reshape(-1, 3, 3)), np.ones(len(centres))),
-        _beside(folds, geometry.chamber_radius_m * directions),
-        _beside(coils, geometry.spring_radius_m * directions),
+        Copies(centres, upright, ring_radius_m(spec)[1:], np.ones(len(centres))),
+        _beside(folds, chamber_site_m, bellows_m),
+        _beside(coils, spring_site_m, np.ones(len(bellows_m))),
     )
 
 
-def _beside(line: Frame, hole_m: np.ndarray) -> Copies:
-    """Return copies beside each section's axis (n_sections, k), through its holes (n, 2)."""
-    hole = hole_m.reshape(-1, N_CHAMBERS_PER_SECTION, 2)
-    aside = np.einsum("skij,shj->shki", line.rotation[..., :2], hole)
-    position_m = line.position_m[:, None] + aside  # (n_sections, 3, k, 3)
+def _beside(line: Frame, hole_m: np.ndarray, width_m: np.ndarray) -> Copies:
+    """Return copies beside each section's axis (n_sections, k), through its holes (n_sections, h, 2).
+
+    Copies of a section have the width (n_sections,) of that section.
+    """
+    aside = np.einsum("skij,shj->shki", line.rotation[..., :2], hole_m)
+    position_m = line.position_m[:, None] + aside  # (n_sections, h, k, 3)
+    n_holes, n_copies = position_m.shape[1:3]
     pitch_m = np.linalg.norm(np.diff(position_m, axis=2), axis=-1).mean(axis=-1)
-    n_copies = position_m.shape[2]
-    quaternion = np.repeat(quaternion_from_rotation(line.rotation)[:, None], N_CHAMBERS_PER_SECTION, axis=1)
-    return Copies(position_m.reshape(-1, 3), quaternion.reshape(-1, 4), np.repeat(pitch_m.ravel(), n_copies))
+    quaternion = np.repeat(quaternion_from_rotation(line.rotation)[:, None], n_holes, axis=1)
+    return Copies(
+        position_m.reshape(-1, 3),
+        quaternion.reshape(-1, 4),
+        np.repeat(width_m, n_holes * n_copies),
+        np.repeat(pitch_m.ravel(), n_copies),
+    )

@@ -18,6 +18,9 @@ of the law's gain l as well, where chambers track. They are at rest, but the joi
 
     dq = K dp + H^-1 S^T l (dreference - d_x s) - H^-1 d_x grad V,    with r less S times the last two terms.
 
+Redundant chambers close the errors of `mjx_softarm.mechanics.law_errors`: C S in place of S,
+C (dreference - d_x s) in place of dreference - d_x s, and C S K + YIELD_M_PER_KPA N in place of S K.
+
 This is exact however many Newton steps led to the equilibrium. K comes from the last Newton step; only
 derivatives by the arm's numbers need H^-1.
 """
@@ -33,6 +36,7 @@ from jax.custom_derivatives import SymbolicZero
 
 from mjx_softarm._support.small_matrices import block_diagonal, eliminate
 from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK, Frames
+from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.statics import Statics, statics
 
 
@@ -41,16 +45,16 @@ class EquilibriumTangents(NamedTuple):
 
     q: Array  # (nv,)
     pressure_kpa: Array  # (n_chambers,)
-    spring_m: Array  # (n_chambers,)
+    spring_m: Array  # (n_springs,)
     tip_position_m: Array  # (3,)
     tip_rotation: Array  # (3, 3)
 
 
 class PressureResponse(NamedTuple):
-    """Response of joints and springs to the chambers' pressures, at the balance of forces."""
+    """Response of joints and of the law's errors to the chambers' pressures, at the balance of forces."""
 
     dq_dp: Array  # (nv, n_chambers) [m/kPa, rad/kPa], K
-    dspring_dp: Array  # (n_chambers, n_chambers) [m/kPa], S K
+    closed_per_kpa: Array  # (n_chambers, n_chambers) [m/kPa] decrease of each chamber's error, S K
 
 
 class Equilibrium(NamedTuple):
@@ -62,25 +66,27 @@ class Equilibrium(NamedTuple):
     frames: Frames
     statics: Statics
     response: PressureResponse
-    law_response: Array  # (nv, n_chambers) joints by references, zeros unless the law holds the arm
+    law_response: Array  # (nv, n_springs) joints by references, zeros unless the law holds the arm
 
 
-def law_response(here: Statics, held: Array, law_stiffness: Array) -> Array:
-    """Return `Equilibrium.law_response` (nv, n_chambers, *arms), for the gains of chambers that are held.
+def law_response(here: Statics, held: Array, params: ArmParams) -> Array:
+    """Return `Equilibrium.law_response` (nv, n_springs, *arms), for the gains of chambers that are held.
 
     Args:
         here: at the equilibrium, the gains included.
         held (n_chambers, *arms): bool.
-        law_stiffness (n_chambers, *arms) [N/m]: the law's gains.
+        params: numbers of the arm.
     """
     n_sections, _, n, *arms = here.springs.jacobian.shape
+    none = jnp.zeros((n_sections * n, *here.springs.length.shape), here.gradient.dtype)
+    if params.allocation is not None:  # redundant chambers are not held
+        return none
 
     def solve() -> Array:
-        gain = jnp.where(held, law_stiffness, 0.0).reshape(n_sections, -1, 1, *arms)
+        gain = jnp.where(held, params.law_stiffness, 0.0).reshape(n_sections, -1, 1, *arms)
         columns = block_diagonal(jnp.swapaxes(gain * here.springs.jacobian, 1, 2))
         return here.hessian.solve(columns.reshape(n_sections, n, -1, *arms)).reshape(-1, *held.shape)
 
-    none = jnp.zeros((n_sections * n, *held.shape), here.gradient.dtype)
     return jax.lax.cond(jnp.any(held), solve, lambda: none)  # hanging arms are seldom held
 
 
@@ -90,7 +96,7 @@ def equilibrium_tangents(
     """Differentiate an equilibrium along a direction.
 
     Args:
-        primals: kinematics, params (`ArmParams`) and reference_m (n_chambers,) of `settle`.
+        primals: kinematics, params (`ArmParams`) and reference_m (n_springs,) of `settle`.
         tangents: the direction, of the same structure, with `SymbolicZero` where nothing changes.
         end: the equilibrium.
         settled () bool: false for a zero derivative.
@@ -104,7 +110,7 @@ def equilibrium_tangents(
     # Inverse of the chambers' equations
     dq_dp = _masked(response.dq_dp, settled)
     identity = jnp.eye(len(at_limit), dtype=q.dtype)
-    rows = jnp.where(at_limit[:, None], identity, _masked(response.dspring_dp, settled))
+    rows = jnp.where(at_limit[:, None], identity, _masked(response.closed_per_kpa, settled))
     inverse = _masked(eliminate(rows, identity), settled)
 
     # Right-hand side of each chamber's equation
@@ -121,6 +127,8 @@ def equilibrium_tangents(
         compliance = _masked(here.hessian.solve(every), settled).reshape(len(q), -1)  # H^-1
         dq_held = dq_held - jnp.sum(compliance * explicit.gradient, axis=-1)
     tracking_dot = tracking_dot - _along(here.springs.jacobian, dq_held)
+    if params.allocation is not None:
+        tracking_dot = params.allocation.chamber_error @ tracking_dot
     limit_dot = jax.lax.select(at_high, high_dot, low_dot)
     right = jax.lax.select(at_limit, limit_dot, tracking_dot)
 
@@ -140,7 +148,7 @@ class _Explicit(NamedTuple):
     """Derivatives by the arm's numbers at fixed joint coordinates and pressures."""
 
     gradient: Array  # (nv,) of V's gradient
-    spring_m: Array  # (n_chambers,)
+    spring_m: Array  # (n_springs,)
     tip_position_m: Array  # (3,)
     tip_rotation: Array  # (3, 3)
 
@@ -167,9 +175,9 @@ def _explicit_tangents(primals: tuple, tangents: tuple, q: Array, pressure_kpa: 
 
 
 def _without_limits(arguments: tuple) -> tuple:
-    """Return kinematics and parameters without pressure limits, which V does not contain."""
+    """Return kinematics and parameters without the numbers that V does not contain."""
     kinematics, params, _ = arguments
-    return kinematics, params._replace(pressure_min_kpa=None, pressure_max_kpa=None)
+    return kinematics, params._replace(pressure_min_kpa=None, pressure_max_kpa=None, allocation=None)
 
 
 def _array(tangent: Array | SymbolicZero, primal: Array) -> Array:
@@ -183,7 +191,7 @@ def _masked(x: Array, settled: Array) -> Array:
 
 
 def _along(jacobian: Array, dq: Array) -> Array:
-    """Multiply a tendons' Jacobian (n_sections, 3, n) by joint coordinates (nv,): (n_chambers,)."""
+    """Multiply the springs' Jacobian (n_sections, s, n) by joint coordinates (nv,): (n_springs,)."""
     return jnp.sum(jacobian * dq.reshape(jacobian.shape[0], 1, -1), axis=-1).reshape(-1)
 
 

@@ -55,7 +55,7 @@ class ChainKinematics:
 
     arms_last: ClassVar[bool] = True
 
-    link_length_m: Array | float  # () or (*arms) distance of two plates at rest
+    link_length_m: Array | np.ndarray  # (n_links, *arms) distance of a link's plates at rest
     mount: Mount = LEVEL
 
     def __call__(self, q: Array) -> Frames:
@@ -80,7 +80,7 @@ class ChainKinematics:
         parent, child = plate_rotation[:-1], plate_rotation[1:]
         half = 0.5 * self.link_length_m
         to_anchor = -(half + slide)[:, None] * parent[:, :, 2]
-        to_plate = to_anchor - half * child[:, :, 2]
+        to_plate = to_anchor - half[:, None] * child[:, :, 2]
         start = of_arms(self.mount.base_position_m, 3)
         plate_position = jnp.concatenate([start[None], start + jnp.cumsum(to_plate, axis=0)])
 
@@ -124,7 +124,7 @@ def frames_of(model: mjx.Model, data: mjx.Data) -> Frames:
     links = slice(1, n_links + 1)  # the world comes first
     rotation = data.xmat[links].reshape(n_links, 3, 3)
     anchor = data.xpos[links]
-    half = -model.geom_pos[1, 2]  # place of the first link's ring
+    half = -model.geom_pos[links, 2:]  # (n_links, 1) place of each link's ring; the base's ring comes first
     position = anchor - half * rotation[:, :, 2]
     base = rotation_from_quaternion(model.body_quat[1])
     return Frames(

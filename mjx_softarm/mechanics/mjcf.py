@@ -2,7 +2,8 @@
 
 Names: bodies `link{i}`, `gripper`, `payload`; joints `slide{i}`, `bend_x{i}`, `bend_y{i}`; tendons and
 actuators `chamber{i}`, tendons `spring{i}`; site `tip`. Links count from 0 at the base, chambers and
-springs from 0 section by section. An actuator's control is its chamber's pressure in kPa.
+springs from 0 section by section. All chambers come before all springs. An actuator's control is its
+chamber's pressure in kPa.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from mjx_softarm.mechanics.body import SPRING_WIDTH_M, gripper_boxes, payload_ra
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.statics import GRAVITY_M_S2
 from mjx_softarm.sensing.pose import quaternion_from_rotation
-from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
+from mjx_softarm.spec import ArmSpec
 
 MAX_TIMESTEP_S = 0.004
 _SECTION_COLOURS = ([0.85, 0.33, 0.24, 1.0], [0.95, 0.68, 0.25, 1.0], [0.25, 0.55, 0.80, 1.0])
@@ -52,7 +53,7 @@ def build_spec(spec: ArmSpec) -> mujoco.MjSpec:
     # The chain from the base to the tools, mounted as the specification says, then its tendons
     world = body = mjspec.worldbody
     _add_ring(world, 0, [0.0, 0.0, 0.0], spec)
-    _add_holes(world, 0, 0, np.zeros(3), params, spec)
+    _add_holes(world, 0, 0, np.zeros(3), params)
     for link in range(spec.n_links):
         body = _add_link(body, link, params, spec)
     _add_tools(body, params, spec)
@@ -62,6 +63,8 @@ def build_spec(spec: ArmSpec) -> mujoco.MjSpec:
         part.set_frame(base)
     for chamber in range(spec.n_chambers):
         _add_chamber(mjspec, chamber, params, spec)
+    for spring in range(spec.n_springs):
+        _add_spring(mjspec, spring, params, spec)
     return mjspec
 
 
@@ -70,14 +73,14 @@ def steps_per_period(period_s: float) -> int:
     return math.ceil(period_s / MAX_TIMESTEP_S - 1e-9)
 
 
-def chamber_lengths(data: Any) -> Array:
+def chamber_lengths(data: Any, n_chambers: int) -> Array:
     """Return the chambers' lengths (n_chambers,) [m], a view, from the data of MuJoCo or MJX."""
-    return data.ten_length[0::2]
+    return data.ten_length[:n_chambers]
 
 
-def spring_lengths(data: Any) -> Array:
-    """Return the springs' lengths (n_chambers,) [m], a view, from the data of MuJoCo or MJX."""
-    return data.ten_length[1::2]
+def spring_lengths(data: Any, n_chambers: int) -> Array:
+    """Return the springs' lengths (n_springs,) [m], a view, from the data of MuJoCo or MJX."""
+    return data.ten_length[n_chambers:]
 
 
 def build_model(spec: ArmSpec) -> mujoco.MjModel:
@@ -88,31 +91,35 @@ def build_model(spec: ArmSpec) -> mujoco.MjModel:
 def _add_link(parent, link: int, params: ArmParams, spec: ArmSpec):
     """Add one link: a slide along the parent plate's -z, then hinges x and y half a link below it."""
     # Body and its inertia, that of a solid cylinder about its centre
-    half = spec.link_length_m / 2
-    offset = -half if link == 0 else -2 * half
+    per_section = spec.structure.links_per_section
+    section = link // per_section
+    half = 0.5 * spec.link_length_m[link]
+    offset = -half if link == 0 else -half - 0.5 * spec.link_length_m[link - 1]
     body = parent.add_body(name=f"link{link}", pos=[0.0, 0.0, offset])
-    mass, radius = float(params.link_mass_kg[link]), spec.geometry.spring_radius_m
+    mass = float(params.link_mass_kg[link])
+    radius = spec.per_section(spec.geometry.spring_radius_m)[section]
     sideways = mass * (3 * radius**2 + (2 * half) ** 2) / 12
     body.mass, body.ipos, body.explicitinertial = mass, [0.0, 0.0, 0.0], True
     body.inertia = [sideways, sideways, mass * radius**2 / 2]
 
     # Joints: a section's backbone is `links_per_section` links in series
-    section = spec.structure.links_per_section
+    axial = spec.per_section(spec.backbone.axial_damping_ns_per_m)[section]
+    bending = spec.per_section(spec.backbone.bending_damping_nms_per_rad)[section]
     joints = (
-        ("slide", mujoco.mjtJoint.mjJNT_SLIDE, [0.0, 0.0, -1.0], spec.backbone.axial_damping_ns_per_m),
-        ("bend_x", mujoco.mjtJoint.mjJNT_HINGE, [1.0, 0.0, 0.0], spec.backbone.bending_damping_nms_per_rad),
-        ("bend_y", mujoco.mjtJoint.mjJNT_HINGE, [0.0, 1.0, 0.0], spec.backbone.bending_damping_nms_per_rad),
+        ("slide", mujoco.mjtJoint.mjJNT_SLIDE, [0.0, 0.0, -1.0], axial),
+        ("bend_x", mujoco.mjtJoint.mjJNT_HINGE, [1.0, 0.0, 0.0], bending),
+        ("bend_y", mujoco.mjtJoint.mjJNT_HINGE, [0.0, 1.0, 0.0], bending),
     )
     for k, (name, kind, axis, damping) in enumerate(joints):
         joint = body.add_joint(name=f"{name}{link}", type=kind, axis=axis)
         joint.stiffness = _polynomial(float(params.joint_stiffness[3 * link + k]))
-        joint.damping = _polynomial(damping * section)
+        joint.damping = _polynomial(damping * per_section)
 
     # Plate: its ring has the holes of two sections where one ends and the next begins
     plate = np.array([0.0, 0.0, -half])
     _add_ring(body, link + 1, plate, spec)
-    for part in {link // section, min((link + 1) // section, spec.structure.n_sections - 1)}:
-        _add_holes(body, link + 1, part, plate, params, spec)
+    for part in sorted({section, min((link + 1) // per_section, spec.structure.n_sections - 1)}):
+        _add_holes(body, link + 1, part, plate, params)
     return body
 
 
@@ -122,24 +129,23 @@ def _polynomial(linear: float) -> list[float]:
 
 
 def _add_ring(body, plate: int, position, spec: ArmSpec) -> None:
-    size = [ring_radius_m(spec), _RING_HALF_HEIGHT_M, 0.0]
+    size = [ring_radius_m(spec)[plate], _RING_HALF_HEIGHT_M, 0.0]
     kind = mujoco.mjtGeom.mjGEOM_CYLINDER
     body.add_geom(name=f"ring{plate}", type=kind, size=size, pos=position, rgba=_RING_COLOUR, **_DRAWN_ONLY)
 
 
-def _add_holes(body, plate: int, section: int, position, params: ArmParams, spec: ArmSpec) -> None:
+def _add_holes(body, plate: int, section: int, position, params: ArmParams) -> None:
     """Add the sites that the chambers and springs of `section` pass on a plate."""
-    for k in range(N_CHAMBERS_PER_SECTION):
-        index = section * N_CHAMBERS_PER_SECTION + k
-        for kind, at in (("chamber", params.chamber_site_m), ("spring", params.spring_site_m)):
-            body.add_site(
-                name=f"{kind}{index}_plate{plate}", pos=position + [*at[index], 0.0], size=[0.001] * 3
-            )
+    for kind, site_m in (("chamber", params.chamber_site_m), ("spring", params.spring_site_m)):
+        n = site_m.shape[1]
+        for k, at in enumerate(site_m[section]):
+            name = f"{kind}{section * n + k}_plate{plate}"
+            body.add_site(name=name, pos=position + [*at, 0.0], size=[0.001] * 3)
 
 
 def _add_tools(last, params: ArmParams, spec: ArmSpec) -> None:
     """Add gripper and payload below the last plate, and the measured tip on it."""
-    half, length = spec.link_length_m / 2, spec.mass.gripper_length_m
+    half, length = 0.5 * spec.link_length_m[-1], spec.mass.gripper_length_m
     tip = last.add_site(name="tip", size=[0.004] * 3, rgba=[0.9, 0.1, 0.1, 1.0])
     tip.pos = np.asarray(params.mount.tip_offset_m) - [0.0, 0.0, half]
     tip.quat = quaternion_from_rotation(params.mount.tip_rotation)
@@ -158,34 +164,42 @@ def _add_tools(last, params: ArmParams, spec: ArmSpec) -> None:
 
 
 def _add_chamber(mjspec: mujoco.MjSpec, index: int, params: ArmParams, spec: ArmSpec) -> None:
-    """Add a chamber's tendon, its pressure actuator, and the spring beside it.
+    """Add a chamber's tendon and its pressure actuator.
 
     The actuator's force on the tendon is pressure * (a + b length): MuJoCo's affine gain.
     """
-    # Tendons of chamber and spring through all rings of their section
-    section, first = index // N_CHAMBERS_PER_SECTION, spec.structure.links_per_section
-    lines = (
-        ("chamber", params.chamber_stiffness, params.chamber_rest_m, spec.chambers.damping_ns_per_m),
-        ("spring", params.spring_stiffness, params.spring_rest_m, spec.springs.damping_ns_per_m),
-    )
-    for kind, stiffness, rest, damping in lines:
-        tendon = mjspec.add_tendon(name=f"{kind}{index}")
-        tendon.stiffness = _polynomial(float(stiffness[index]))
-        tendon.damping = _polynomial(damping)
-        tendon.springlength = [float(rest[index])] * 2
-        drawn = _BELLOWS_DRAWN * spec.geometry.chamber_diameter_m
-        tendon.width = drawn if kind == "chamber" else SPRING_WIDTH_M
-        colour = _SECTION_COLOURS[section % len(_SECTION_COLOURS)]
-        tendon.rgba = colour if kind == "chamber" else _SPRING_COLOUR
-        for plate in range(section * first, (section + 1) * first + 1):
-            tendon.wrap_site(f"{kind}{index}_plate{plate}")
+    section = index // spec.structure.chambers_per_section
+    tendon = _add_tendon(mjspec, f"chamber{index}", section, spec)
+    tendon.stiffness = _polynomial(float(params.chamber_stiffness[index]))
+    tendon.damping = _polynomial(spec.per_chamber(spec.chambers.damping_ns_per_m)[index])
+    tendon.springlength = [float(params.chamber_rest_m[index])] * 2
+    tendon.width = _BELLOWS_DRAWN * spec.per_section(spec.geometry.chamber_diameter_m)[section]
+    tendon.rgba = _SECTION_COLOURS[section % len(_SECTION_COLOURS)]
 
     # Pressure actuator
     slope = float(params.area_slope[index])
     actuator = mjspec.add_actuator(name=f"chamber{index}", target=f"chamber{index}")
     actuator.trntype = mujoco.mjtTrn.mjTRN_TENDON
     actuator.gaintype = mujoco.mjtGain.mjGAIN_AFFINE
-    actuator.gainprm[:2] = [float(params.area[index]) - slope * spec.geometry.section_length_m, slope]
+    actuator.gainprm[:2] = [float(params.area[index]) - slope * params.section_length_m[section], slope]
     actuator.biastype = mujoco.mjtBias.mjBIAS_NONE
     actuator.ctrllimited = True
     actuator.ctrlrange = [float(params.pressure_min_kpa[index]), float(params.pressure_max_kpa[index])]
+
+
+def _add_spring(mjspec: mujoco.MjSpec, index: int, params: ArmParams, spec: ArmSpec) -> None:
+    """Add a spring's tendon."""
+    section = index // spec.springs_per_section
+    tendon = _add_tendon(mjspec, f"spring{index}", section, spec)
+    tendon.stiffness = _polynomial(float(params.spring_stiffness[index]))
+    tendon.damping = _polynomial(spec.per_section(spec.springs.damping_ns_per_m)[section])
+    tendon.springlength = [float(params.spring_rest_m[index])] * 2
+    tendon.width, tendon.rgba = SPRING_WIDTH_M, _SPRING_COLOUR
+
+
+def _add_tendon(mjspec: mujoco.MjSpec, name: str, section: int, spec: ArmSpec) -> mujoco.MjsTendon:
+    """Add a tendon through all rings of a section."""
+    tendon, per_section = mjspec.add_tendon(name=name), spec.structure.links_per_section
+    for plate in range(section * per_section, (section + 1) * per_section + 1):
+        tendon.wrap_site(f"{name}_plate{plate}")
+    return tendon

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from mjx_softarm.mechanics.body import hole_directions
+from mjx_softarm.control import Allocation, allocation
+from mjx_softarm.mechanics.body import chamber_directions, holes_m, spring_directions
 from mjx_softarm.posture import base_rotation, check_posture
 from mjx_softarm.sensing.pose import rotation_about
-from mjx_softarm.spec import LEAST_CHAMBERS, N_CHAMBERS_PER_SECTION, ArmSpec
+from mjx_softarm.spec import LEAST_CHAMBERS, ArmSpec
 
 N_PER_KPA_M2 = 1e3  # force of 1 kPa on 1 m^2
 PAYLOAD = 1  # index in ArmParams.tool_mass_kg
@@ -37,9 +39,10 @@ class ArmParams(NamedTuple):
     Chambers and springs are ordered section by section, counter-clockwise within a section.
     """
 
-    link_length_m: Array  # ()
-    chamber_site_m: Array  # (n_chambers, 2) x and y of the chambers' holes in their rings
-    spring_site_m: Array  # (n_chambers, 2) x and y of the springs' holes
+    link_length_m: Array  # (n_links,)
+    section_length_m: Array  # (n_sections,)
+    chamber_site_m: Array  # (n_sections, c, 2) x and y of the chambers' holes in their rings
+    spring_site_m: Array  # (n_sections, s, 2) x and y of the springs' holes
     link_mass_kg: Array  # (n_links,) at the hinges' anchor
     tool_mass_kg: Array  # (2,) gripper and payload, below the last plate
     tool_offset_m: Array  # (2,)
@@ -48,20 +51,22 @@ class ArmParams(NamedTuple):
     chamber_rest_m: Array  # (n_chambers,)
     area: Array  # (n_chambers,) [N/kPa]
     area_slope: Array  # (n_chambers,) [N/kPa/m]
-    spring_stiffness: Array  # (n_chambers,) [N/m]
-    spring_rest_m: Array  # (n_chambers,)
+    spring_stiffness: Array  # (n_springs,) [N/m]
+    spring_rest_m: Array  # (n_springs,)
     law_stiffness: Array  # (n_springs,) [N/m] of a spring, by the law's gain; zeros if chambers are redundant
     pressure_min_kpa: Array  # (n_chambers,)
     pressure_max_kpa: Array  # (n_chambers,)
     mount: Mount
-
-    @property
-    def section_length_m(self) -> Array:
-        return self.link_length_m * (self.link_mass_kg.shape[0] // self.n_sections)
+    allocation: Allocation | None = None  # of arms with redundant chambers, see `mjx_softarm.control`
 
     @property
     def n_sections(self) -> int:
-        return self.area.shape[0] // N_CHAMBERS_PER_SECTION
+        return self.section_length_m.shape[0]
+
+    @property
+    def free_length_m(self) -> Array:
+        """(n_chambers, *arms) length of each chamber's section at rest."""
+        return jnp.repeat(self.section_length_m, self.chamber_site_m.shape[1], axis=0)
 
     @property
     def pinned(self) -> Array:
@@ -77,7 +82,10 @@ class ArmParams(NamedTuple):
         """Return the arm with the law's proportional gain as springs about the references, where `held`.
 
         This changes no equilibrium at which these springs are on their references, but it may make it stable.
+        Redundant chambers are not held.
         """
+        if self.allocation is not None:
+            return self
         stiffness = self.spring_stiffness + self.law_stiffness
         pull = self.spring_stiffness * self.spring_rest_m + self.law_stiffness * reference_m
         return self._replace(
@@ -89,31 +97,35 @@ class ArmParams(NamedTuple):
     def from_spec(cls, spec: ArmSpec, dtype: np.typing.DTypeLike = np.float32) -> ArmParams:
         """Return the numbers of `spec`, in SI units but for the pressures [kPa]."""
         # A section's backbone is `links_per_section` links in series
-        n, per_section = spec.n_chambers, spec.structure.links_per_section
-        on_circle = hole_directions(spec)
-        axial = spec.backbone.axial_stiffness_n_per_m * per_section
-        bending = spec.backbone.bending_stiffness_nm_per_rad * per_section
+        geometry, backbone, chambers = spec.geometry, spec.backbone, spec.chambers
+        per_section, n = spec.structure.links_per_section, spec.n_chambers
+        axial = np.array(spec.per_section(backbone.axial_stiffness_n_per_m)) * per_section
+        bending = np.array(spec.per_section(backbone.bending_stiffness_nm_per_rad)) * per_section
+        joints = np.stack([axial, bending, bending], axis=-1)  # (n_sections, 3)
+
         values: dict[str, Any] = {
             "link_length_m": spec.link_length_m,
-            "chamber_site_m": spec.geometry.chamber_radius_m * on_circle,
-            "spring_site_m": spec.geometry.spring_radius_m * on_circle,
-            "link_mass_kg": np.full(spec.n_links, spec.mass.arm_kg / spec.n_links),
+            "section_length_m": spec.per_section(geometry.section_length_m),
+            "chamber_site_m": holes_m(chamber_directions(spec), spec.per_section(geometry.chamber_radius_m)),
+            "spring_site_m": holes_m(spring_directions(spec), spec.per_section(geometry.spring_radius_m)),
+            "link_mass_kg": np.repeat(spec.section_mass_kg, per_section) / per_section,
             "tool_mass_kg": [spec.mass.gripper_kg, spec.mass.payload_kg],
             "tool_offset_m": [spec.mass.gripper_length_m / 2, spec.mass.gripper_length_m],
-            "joint_stiffness": np.tile([axial, bending, bending], spec.n_links),
-            "chamber_stiffness": spec.per_chamber(spec.chambers.stiffness_n_per_m),
-            "chamber_rest_m": spec.geometry.section_length_m
-            + np.array(spec.per_chamber(spec.chambers.length_offset_m)),
-            "area": 1e3 * np.array(spec.per_chamber(spec.chambers.area_m2)),
-            "area_slope": 1e3 * np.array(spec.per_chamber(spec.chambers.area_slope_m)),
-            "spring_stiffness": np.full(n, spec.springs.stiffness_n_per_m),
-            "spring_rest_m": np.full(n, spec.springs.rest_length_m),
+            "joint_stiffness": np.repeat(joints, per_section, axis=0).ravel(),
+            "chamber_stiffness": spec.per_chamber(chambers.stiffness_n_per_m),
+            "chamber_rest_m": spec.at_chambers(geometry.section_length_m)
+            + np.array(spec.per_chamber(chambers.length_offset_m)),
+            "area": 1e3 * np.array(spec.per_chamber(chambers.area_m2)),
+            "area_slope": 1e3 * np.array(spec.per_chamber(chambers.area_slope_m)),
+            "spring_stiffness": spec.at_springs(spec.springs.stiffness_n_per_m),
+            "spring_rest_m": spec.at_springs(spec.springs.rest_length_m),
             "law_stiffness": _law_stiffness(spec),
-            "pressure_min_kpa": np.full(n, spec.chambers.pressure_min_kpa),
-            "pressure_max_kpa": np.full(n, spec.chambers.pressure_max_kpa),
+            "pressure_min_kpa": np.full(n, chambers.pressure_min_kpa),
+            "pressure_max_kpa": np.full(n, chambers.pressure_max_kpa),
         }
         numbers = {name: np.asarray(value, dtype) for name, value in values.items()}
-        return cls(**numbers, mount=_mount(spec, dtype))  # type: ignore
+        matrices = jax.tree.map(lambda matrix: matrix.astype(dtype), allocation(spec))
+        return cls(**numbers, mount=_mount(spec, dtype), allocation=matrices)  # type: ignore
 
 
 def _law_stiffness(spec: ArmSpec) -> np.ndarray:

@@ -94,14 +94,15 @@ def body_points(plate_position: Array, plate_rotation: Array, spec: ArmSpec) -> 
         (..., RIM_POINTS * (L + 1) + 24, 3) [m], in the frame of the plates.
     """
     xp = array_namespace(plate_position, plate_rotation)
-    rims = plate_position[..., None, :] + _turned(plate_rotation, rim_points(ring_radius_m(spec), RIM_POINTS))
+    circle = ring_radius_m(spec)[:, None, None] * rim_points(1.0, RIM_POINTS)  # (L + 1, RIM_POINTS, 3)
+    rims = plate_position[..., None, :] + _turned(plate_rotation, circle)
     corners = plate_position[..., -1:, :] + _turned(plate_rotation[..., -1, :, :], _gripper(spec))
     return xp.concat([rims.reshape(*rims.shape[:-3], -1, 3), corners], axis=-2)
 
 
 def _turned(rotation: Array, point: np.ndarray) -> Array:
-    """Turn points (k, 3) by (..., 3, 3): (..., k, 3); no matrix product, which a GPU would round."""
-    return (rotation[..., None, :, :] * point[:, None, :].astype(rotation.dtype)).sum(axis=-1)
+    """Turn points (..., k, 3) by (..., 3, 3): (..., k, 3); no matrix product, which a GPU would round."""
+    return (rotation[..., None, :, :] * point[..., None, :].astype(rotation.dtype)).sum(axis=-1)
 
 
 def body_clearance(pipe: CrossPipe, plate_position: Array, plate_rotation: Array, spec: ArmSpec) -> Array:

@@ -1,12 +1,13 @@
 """The quasi-static arm: spring references or pressures -> equilibrium under the sensor-space law.
 
-The law of `mjx_softarm.control` has integral action, so at rest a chamber holds its spring at the reference
-or is at a pressure limit. With V the potential of `mjx_softarm.mechanics.statics`, rest is
+The law of `mjx_softarm.control` has integral action, so at rest each chamber has closed its error or is at a
+pressure limit. With the potential V of `mjx_softarm.mechanics.statics` and the errors e of
+`mjx_softarm.mechanics.law_errors`, rest is
 
-    grad V(q; p) = 0,    s_t(q) = reference_t  or  p_t = limit   for every chamber t,
+    grad V(q; p) = 0,    e_t(q, p) = 0  or  p_t = limit   for every chamber t,
 
-solved by Newton's method on the active set: chambers whose p + c (reference - s) leaves the limits are held
-there, the others track, and one linear system gives the step in q and p together.
+solved by Newton's method on the active set: chambers whose p + c e leaves the limits are held there, the
+others track, and one linear system gives the step in q and p together.
 
 An arm that would buckle at constant pressures may stand under the law, whose proportional gain answers to a
 spring's error at once. Where V is not convex, this gain takes part as springs about the references.
@@ -30,6 +31,7 @@ from mjx_softarm._support.errors import Result
 from mjx_softarm._support.small_matrices import eliminate, identity, products
 from mjx_softarm.mechanics.implicit import Equilibrium, PressureResponse, equilibrium_tangents, law_response
 from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK, Kinematics
+from mjx_softarm.mechanics.law_errors import closed_errors, law_errors
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.statics import statics
 
@@ -57,12 +59,12 @@ class Settled(NamedTuple):
 
     q: Array  # (nv,) joint coordinates [m, rad, rad]
     pressure_kpa: Array  # (n_chambers,)
-    spring_m: Array  # (n_chambers,) spring lengths
+    spring_m: Array  # (n_springs,) spring lengths
     tip_position_m: Array  # (3,)
     tip_rotation: Array  # (3, 3)
     at_limit: Array  # (n_chambers,) bool, held at a pressure limit
     residual: Array  # () largest entry of grad V [N, N m]
-    tracking_error_m: Array  # () largest spring error of a chamber that is not at a limit
+    tracking_error_m: Array  # () largest error e of a chamber that is not at a limit
     result: Array  # () int32, a `SettleResult`
     iterations: Array  # () int
 
@@ -115,7 +117,7 @@ def settle(
     Args:
         kinematics: of either engine, `chain_kinematics(params)` or `MjxKinematics(model)`.
         params: numbers of the arm.
-        reference_m (n_chambers,): spring lengths that the law tracks.
+        reference_m (n_springs,): spring lengths that the law tracks.
         n_at_once: arms of a `jax.vmap` that settle at once, from `arms_at_once`; None is all of them.
     """
     return _solver(1, n_at_once)(kinematics, params, reference_m)[0]
@@ -210,19 +212,14 @@ def _solve(n_small: int, kinematics: Kinematics, params: ArmParams, reference_m:
         return _report(end, kinematics, params, reference_m)
 
 
-def _active_set(pressure: Array, error_m: Array, params: ArmParams) -> tuple[Array, Array]:
-    """Return the chambers to be held at a limit (n, *arms) bool, and each one's limit (n, *arms) [kPa]."""
-    trial = pressure + ACTIVE_SET_GAIN_KPA_PER_M * error_m
-    limit = jnp.clip(trial, params.pressure_min_kpa, params.pressure_max_kpa)
-    return (trial != limit) | params.pinned, limit  # a pinned chamber even where its error is zero
-
-
 def _newton_step(it: _Iterate, kinematics: Kinematics, params: ArmParams, reference_m: Array) -> _Iterate:
     """Return the iterate after one Newton step in joint coordinates and pressures together."""
     # Forces, springs and the active set at the iterate
     here = statics(kinematics(it.q), it.q, it.pressure, params.answering(it.held & ~it.at_limit, reference_m))
-    error = reference_m - here.springs.length
-    at_limit, limit = _active_set(it.pressure, error, params)
+    error = law_errors(reference_m - here.springs.length, it.pressure, params.allocation)
+    trial = it.pressure + ACTIVE_SET_GAIN_KPA_PER_M * error
+    limit = jnp.clip(trial, params.pressure_min_kpa, params.pressure_max_kpa)
+    at_limit = (trial != limit) | params.pinned  # a pinned chamber even where its error is zero
 
     # Joints: H dq = B dp - grad V, hence dq = newton_step + dq_dp dp
     hessian = here.hessian.plus_diagonal(it.stiffening * params.joint_stiffness)
@@ -231,11 +228,11 @@ def _newton_step(it: _Iterate, kinematics: Kinematics, params: ArmParams, refere
     solved = hessian.solve(jnp.concatenate([-gradient, push], axis=2))
     newton_step, dq_dp = solved[:, :, 0], solved[:, :, 1:]
 
-    # Pressures: each chamber closes its spring's error or goes to its limit
-    spring_response = products(here.springs.jacobian, solved).reshape(len(error), -1, *arms)
-    newton_spring, dspring_dp = spring_response[:, 0], spring_response[:, 1:]
-    rows = jnp.where(at_limit[:, None], identity(len(error), dspring_dp), dspring_dp)
-    residual = jax.lax.select(at_limit, limit - it.pressure, error - newton_spring)
+    # Pressures: each chamber closes its error or goes to its limit
+    spring_response = products(here.springs.jacobian, solved).reshape(len(reference_m), -1, *arms)
+    closed, closed_per_kpa = closed_errors(spring_response[:, 0], spring_response[:, 1:], params.allocation)
+    rows = jnp.where(at_limit[:, None], identity(len(error), closed_per_kpa), closed_per_kpa)
+    residual = jax.lax.select(at_limit, limit - it.pressure, error - closed)
     dp = eliminate(rows, residual[:, None])[:, 0]
     dq = (newton_step + jnp.sum(dq_dp * dp, axis=2)).reshape(it.q.shape)
 
@@ -250,7 +247,7 @@ def _newton_step(it: _Iterate, kinematics: Kinematics, params: ArmParams, refere
         q=jnp.where(finite, it.q + scale * dq, it.q),
         pressure=jnp.where(finite, it.pressure + scale * dp, it.pressure),
         at_limit=at_limit,
-        response=PressureResponse(dq_dp.reshape(it.response.dq_dp.shape), dspring_dp),
+        response=PressureResponse(dq_dp.reshape(it.response.dq_dp.shape), closed_per_kpa),
         n_small=jnp.where(small, it.n_small + 1, 0),
         held=it.held | ~finite,
         stiffening=jnp.where(finite | ~(it.held | jnp.all(at_limit, axis=0)), 0.0, 4.0 * it.stiffening + 4.0),
@@ -269,7 +266,7 @@ def _report(it: _Iterate, kinematics: Kinematics, params: ArmParams, reference_m
     residual = jnp.max(jnp.abs(here.gradient), axis=0)
 
     # Errors of the law: at a limit, only an error counts that would take the chamber away from it
-    error = reference_m - here.springs.length
+    error = law_errors(reference_m - here.springs.length, pressure, params.allocation)
     at_limit = (pressure <= params.pressure_min_kpa) | (pressure >= params.pressure_max_kpa)
     outward = jnp.where(pressure >= params.pressure_max_kpa, error, -error)
     off = jnp.where(at_limit, jnp.maximum(-outward, 0.0), jnp.abs(error))
@@ -296,5 +293,5 @@ def _report(it: _Iterate, kinematics: Kinematics, params: ArmParams, reference_m
         result=result.astype(jnp.int32),
         iterations=it.iteration,
     )
-    by_law = law_response(here, held, params.law_stiffness)
+    by_law = law_response(here, held, params)
     return found, Equilibrium(it.q, pressure, at_limit, frames, here, it.response, by_law)

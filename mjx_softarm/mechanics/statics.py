@@ -24,17 +24,23 @@ from mjx_softarm._support.small_matrices import block_diagonal, products
 from mjx_softarm.mechanics.chain_hessian import ChainHessian
 from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK, Frames
 from mjx_softarm.mechanics.params import ArmParams
-from mjx_softarm.spec import N_CHAMBERS_PER_SECTION
 
 GRAVITY_M_S2 = 9.81
 
 
 class Tendons(NamedTuple):
-    """Lengths of a set of tendons with first and second derivatives, by the joints that they depend on."""
+    """Lengths of t tendons a section with first and second derivatives, by the joints that they depend on."""
 
-    length: Array  # (n_chambers, *arms) [m]
-    jacobian: Array  # (n_sections, 3 tendons, n, *arms) by the n joints of a section
-    link_hessian: Array  # (3 dofs, 3 dofs, 3 tendons, n_links, *arms) by the joints of a link
+    length: Array  # (n_sections, t, *arms) [m]
+    jacobian: Array  # (n_sections, t, n, *arms) by the n joints of a section
+    link_hessian: Array  # (3 dofs, 3 dofs, t, n_links, *arms) by the joints of a link
+
+
+class Lines(NamedTuple):
+    """Lengths and Jacobians of the chambers, or of the springs."""
+
+    length: Array  # (n_chambers or n_springs, *arms) [m]
+    jacobian: Array  # (n_sections, c or s, n, *arms) by the n joints of a section
 
 
 class Statics(NamedTuple):
@@ -42,8 +48,8 @@ class Statics(NamedTuple):
 
     gradient: Array  # (nv, *arms) [N, N m]
     hessian: ChainHessian
-    chambers: Tendons
-    springs: Tendons
+    chambers: Lines
+    springs: Lines
     area: Array  # (n_chambers, *arms) [N/kPa] effective areas
 
     @property
@@ -68,45 +74,60 @@ def statics(frames: Frames, q: Array, pressure_kpa: Array, params: ArmParams) ->
 
 
 def all_tendons(frames: Frames, params: ArmParams) -> Tendons:
-    """Return the chambers' tendons and the springs', stacked: leaves (2, ...)."""
-    sites = jnp.stack(jnp.broadcast_arrays(params.chamber_site_m, params.spring_site_m))
-    return jax.vmap(tendons, in_axes=(None, 0))(frames, sites)  # one call: fewer and larger operations
+    """Return the tendons of each section: its chambers, then its springs."""
+    sites = params.chamber_site_m, params.spring_site_m
+    arms = jnp.broadcast_shapes(*(site.shape[3:] for site in sites))
+    both = [jnp.broadcast_to(site, (*site.shape[:3], *arms)) for site in sites]
+    return tendons(frames, jnp.concatenate(both, axis=1))  # one call: fewer and larger operations
+
+
+def chambers_and_springs(both: Tendons, params: ArmParams) -> tuple[Lines, Lines]:
+    """Return the chambers and the springs among the tendons of `all_tendons`."""
+    n, arms = params.chamber_site_m.shape[1], both.length.shape[2:]
+    parts = ((both.length[:, part], both.jacobian[:, part]) for part in (slice(None, n), slice(n, None)))
+    chambers, springs = (Lines(length.reshape(-1, *arms), jacobian) for length, jacobian in parts)
+    return chambers, springs
 
 
 def statics_of(both: Tendons, frames: Frames, q: Array, pressure_kpa: Array, params: ArmParams) -> Statics:
     """Return gradient and Hessian of V(q) as `statics`, with the tendons of `all_tendons` given."""
-    # Tension of each tendon, and its slope by the tendon's length: (2, n_sections, 3, *arms)
-    chambers, springs = (jax.tree.map(lambda x, k=k: x[k], both) for k in range(2))
-    area = params.area + params.area_slope * (chambers.length - params.section_length_m)
-    tension = jnp.stack(
-        [
-            params.chamber_stiffness * (chambers.length - params.chamber_rest_m) - area * pressure_kpa,
-            params.spring_stiffness * (springs.length - params.spring_rest_m),
-        ]
-    ).reshape(2, params.n_sections, N_CHAMBERS_PER_SECTION, *q.shape[1:])
+    # Tension of each tendon, and its slope by the tendon's length: (n_sections, c + s, *arms)
+    chambers, springs = chambers_and_springs(both, params)
+    area = params.area + params.area_slope * (chambers.length - params.free_length_m)
+    tension = joined(
+        params.chamber_stiffness * (chambers.length - params.chamber_rest_m) - area * pressure_kpa,
+        params.spring_stiffness * (springs.length - params.spring_rest_m),
+        params.n_sections,
+    )
     of_chambers = params.chamber_stiffness - params.area_slope * pressure_kpa
-    slope = jnp.stack([of_chambers, jnp.broadcast_to(params.spring_stiffness, of_chambers.shape)])
-    slope = slope.reshape(tension.shape)
+    of_springs = jnp.broadcast_to(params.spring_stiffness, springs.length.shape)
+    slope = joined(of_chambers, of_springs, params.n_sections)
 
     # Gradient and Hessian: gravity, joints and tendons
     weight, hessian = _gravity(frames, params)
-    pull = jnp.sum(tension[:, :, :, None] * both.jacobian, axis=(0, 2))  # (n_sections, n, *arms)
+    pull = jnp.sum(tension[:, :, None] * both.jacobian, axis=1)  # (n_sections, n, *arms)
     gradient = weight + params.joint_stiffness * q + pull.reshape(q.shape)
     own = hessian.own + _bending(tension, both.link_hessian) + _stretching(slope, both.jacobian)
     hessian = hessian._replace(own=own).plus_diagonal(params.joint_stiffness)
     return Statics(gradient, hessian, chambers, springs, area)
 
 
+def joined(of_chambers: Array, of_springs: Array, n_sections: int) -> Array:
+    """Join numbers (n_chambers, *arms) and (n_springs, *arms) by section: (n_sections, c + s, *arms)."""
+    parts = (x.reshape(n_sections, -1, *x.shape[1:]) for x in (of_chambers, of_springs))
+    return jnp.concatenate(list(parts), axis=1)
+
+
 def _bending(tension: Array, link_hessian: Array) -> Array:
-    """Sum tensions (2, n_sections, 3, *arms) times second derivatives of the lengths.
+    """Sum tensions (n_sections, t, *arms) times second derivatives of the lengths.
 
     Returns:
         (n_sections, n, n, *arms).
     """
-    n_sections, _, *arms = tension.shape[1:]
-    per_section = link_hessian.shape[4] // n_sections
-    per_link = jnp.repeat(jnp.swapaxes(tension, 1, 2), per_section, axis=2)  # (2, 3 tendons, n_links, *arms)
-    links = jnp.sum(per_link[:, None, None] * link_hessian, axis=(0, 3))  # (3 dofs, 3 dofs, n_links, *arms)
+    n_sections, _, *arms = tension.shape
+    per_section = link_hessian.shape[3] // n_sections
+    per_link = jnp.repeat(jnp.swapaxes(tension, 0, 1), per_section, axis=1)  # (t, n_links, *arms)
+    links = jnp.sum(per_link * link_hessian, axis=2)  # (3 dofs, 3 dofs, n_links, *arms)
     blocks = jnp.moveaxis(links, 2, 0).reshape(n_sections, per_section, *links.shape[:2], *arms)
     return jax.vmap(block_diagonal)(blocks)
 
@@ -115,27 +136,25 @@ def _stretching(slope: Array, jacobian: Array) -> Array:
     """Return sum_t slope_t dl_t dl_t^T over the tendons of each section: (n_sections, n, n, *arms).
 
     Args:
-        slope (2, n_sections, 3, *arms): derivatives of the tensions by the lengths.
-        jacobian (2, n_sections, 3, n, *arms): derivatives of the lengths by the joints.
+        slope (n_sections, t, *arms): derivatives of the tensions by the lengths.
+        jacobian (n_sections, t, n, *arms): derivatives of the lengths by the joints.
     """
-    rows, scaled = (jnp.concatenate(list(x), axis=1) for x in (jacobian, slope[:, :, :, None] * jacobian))
-    return products(jnp.swapaxes(rows, 1, 2), scaled)
+    return products(jnp.swapaxes(jacobian, 1, 2), slope[:, :, None] * jacobian)
 
 
 def tendons(frames: Frames, site_m: Array) -> Tendons:
     """Return lengths of tendons through holes in the rings, with derivatives.
 
-    Vectors are lists of three components (3 tendons, n_links, *arms): one instruction serves many links.
+    Vectors are lists of three components (t, n_links, *arms): one instruction serves many links.
 
     Args:
         frames: plates and joints.
-        site_m (n_chambers, 2, *arms): x and y of each tendon's hole in every ring of its section.
+        site_m (n_sections, t, 2, *arms): x and y of each tendon's hole in every ring of its section.
     """
     # Segments of the tendons from the upper to the lower ring of each link
-    n_links, n_sections = frames.axis.shape[0], site_m.shape[0] // N_CHAMBERS_PER_SECTION
-    per_section, arms = n_links // n_sections, frames.axis.shape[3:]
-    site = site_m.reshape(n_sections, N_CHAMBERS_PER_SECTION, *site_m.shape[1:])
-    x, y = jnp.swapaxes(jnp.repeat(site, per_section, axis=0), 0, 2)  # (3 tendons, n_links) each
+    (n_sections, t), n_links, arms = site_m.shape[:2], frames.axis.shape[0], frames.axis.shape[3:]
+    per_section = n_links // n_sections
+    x, y = jnp.swapaxes(jnp.repeat(site_m, per_section, axis=0), 0, 2)  # (t, n_links, *arms) each
     plate, ring = jnp.moveaxis(frames.plate_position, 0, 1), jnp.moveaxis(frames.plate_rotation, 0, 2)
     upper = [plate[i, :-1] + ring[i, 0, :-1] * x + ring[i, 1, :-1] * y for i in range(3)]
     lower = [plate[i, 1:] + ring[i, 0, 1:] * x + ring[i, 1, 1:] * y for i in range(3)]
@@ -154,16 +173,14 @@ def tendons(frames: Frames, site_m: Array) -> Tendons:
         curve = (_dot(hole_motion[i], hole_motion[j]) - dlength_dq[i] * dlength_dq[j]) / length
         return curve if i == 0 else curve + _dot(unit, _cross(axes[i], hole_motion[j]))
 
-    # Sums over the links of each section, in the order of the chambers
+    # Sums over the links of each section
     dofs = range(DOFS_PER_LINK)
     upper_half = {(i, j): second(i, j) for i in dofs for j in dofs[i:]}
-    own = jnp.stack(dlength_dq).reshape(DOFS_PER_LINK, N_CHAMBERS_PER_SECTION, n_sections, per_section, *arms)
-    whole = length.reshape(N_CHAMBERS_PER_SECTION, n_sections, per_section, *arms).sum(2)
+    own = jnp.stack(dlength_dq).reshape(DOFS_PER_LINK, t, n_sections, per_section, *arms)
+    whole = length.reshape(t, n_sections, per_section, *arms).sum(2)
     return Tendons(
-        length=jnp.swapaxes(whole, 0, 1).reshape(-1, *arms),
-        jacobian=jnp.swapaxes(jnp.moveaxis(own, 0, 3), 0, 1).reshape(
-            n_sections, N_CHAMBERS_PER_SECTION, -1, *arms
-        ),
+        length=jnp.swapaxes(whole, 0, 1),
+        jacobian=jnp.swapaxes(jnp.moveaxis(own, 0, 3), 0, 1).reshape(n_sections, t, -1, *arms),
         link_hessian=jnp.stack([jnp.stack([upper_half[min(i, j), max(i, j)] for j in dofs]) for i in dofs]),
     )
 

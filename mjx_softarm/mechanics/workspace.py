@@ -32,7 +32,7 @@ class Pool(NamedTuple):
 
     q: Array  # (n, nv) [m, rad, rad]
     pressure_kpa: Array  # (n, n_chambers)
-    spring_m: Array  # (n, n_chambers)
+    spring_m: Array  # (n, n_springs)
     pose: Array  # (n, 6) [mm, deg]
 
 
@@ -41,7 +41,7 @@ class LoadedPool(NamedTuple):
 
     load_kg: Array  # (n,) payload
     pressure_kpa: Array  # (n, n_chambers)
-    spring_m: Array  # (n, n_chambers)
+    spring_m: Array  # (n, n_springs)
     pose: Array  # (n, 6) [mm, deg]
 
 
@@ -146,7 +146,8 @@ def sample_evenly(spec: ArmSpec, n: int, seed: int) -> Pool:
     half = CANDIDATES_PER_EVEN_POSE * n // 2
     extremes = rng.choice(pressure_levels(spec), (half, spec.n_chambers))
     found = settle_many(spec, np.concatenate([random_pressures(spec, half, rng), extremes]))
-    in_range = (spec.springs.length_min_m <= found.spring_m) & (found.spring_m <= spec.springs.length_max_m)
+    shortest, longest = map(spec.at_springs, (spec.springs.length_min_m, spec.springs.length_max_m))
+    in_range = (shortest <= found.spring_m) & (found.spring_m <= longest)
     usable = found.settled & in_range.all(axis=-1)
     return _pool(found, _chosen(spec, found, usable, n, rng, replace=True))
 

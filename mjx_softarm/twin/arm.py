@@ -90,7 +90,7 @@ class Twin(InstrumentedArm):
         self._start_losses(spec)
         chambers, rest_m = self._parts.spec.chambers, spec.at_chambers(spec.geometry.section_length_m)
         area, slope = np.array([*map(spec.per_chamber, (chambers.area_m2, chambers.area_slope_m))])
-        now_m, timestep_s = chamber_lengths(self._data), self._model.opt.timestep
+        now_m, timestep_s = chamber_lengths(self._data, spec.n_chambers), self._model.opt.timestep
         actuators = spec.actuators.per_chamber(spec.n_chambers)
         self._air = Pneumatics(area, slope, rest_m, now_m, timestep_s, actuators)
         # Let the arm come to rest.
@@ -122,7 +122,8 @@ class Twin(InstrumentedArm):
         strokes = at_chambers(length)[:, None] * HYSTERESIS_STROKES_M
         scale = (at_chambers(force) * self._build.losses * self._parts.hysteresis)[:, None]
         limit = scale * np.full(len(HYSTERESIS_STROKES_M), HYSTERESIS_LIMIT_N / len(HYSTERESIS_STROKES_M))
-        self._hysteresis = StopOperators(limit / strokes, limit, chamber_lengths(self._data))
+        now_m = chamber_lengths(self._data, spec.n_chambers)
+        self._hysteresis = StopOperators(limit / strokes, limit, now_m)
 
     def write_pressures(self, pressure_kpa: np.ndarray) -> None:
         """Command pressures (n,) [kPa], then let one control period pass; see `ArmIO`."""
@@ -136,7 +137,7 @@ class Twin(InstrumentedArm):
         self.time_s += self._steps * self._model.opt.timestep
 
     def _lengths_m(self) -> np.ndarray:
-        return spring_lengths(self._data)
+        return spring_lengths(self._data, self._parts.spec.n_chambers)
 
     def _true_kpa(self) -> np.ndarray:
         return self._air.pressure_kpa
@@ -147,8 +148,7 @@ class Twin(InstrumentedArm):
         links, n_sections = spec.structure.links_per_section, spec.structure.n_sections
         thirds = np.arange(1, MARKERS_PER_SECTION * n_sections + 1) * links / MARKERS_PER_SECTION
         bodies = np.round(thirds).astype(int)  # link k is body k + 1, its ring at its lower end
-        link_m = np.array(spec.per_section(spec.geometry.section_length_m))[(bodies - 1) // links] / links
-        down = 0.5 * link_m[:, None] * data.xmat[bodies, 2::3]
+        down = 0.5 * spec.link_length_m[bodies - 1, None] * data.xmat[bodies, 2::3]
         marker_m = self._base_m + (data.xpos[bodies] - down) @ self._base_rotation.T
         tip = self._base_rotation @ data.site("tip").xmat.reshape(3, 3)
         tip_m = self._base_m + self._base_rotation @ data.site("tip").xpos
@@ -203,7 +203,7 @@ class Twin(InstrumentedArm):
     def _step(self) -> None:
         """Take one time step; afterwards the data hold the lengths and positions at its end."""
         data, n = self._data, len(self._parts.hysteresis)
-        length_m = chamber_lengths(data)
+        length_m = chamber_lengths(data, n)
         data.ctrl[:n] = self._air.step(length_m)
         data.ctrl[n:] = -self._hysteresis.move(length_m)
         data.qfrc_applied[:] = -self._friction.move(data.qpos)

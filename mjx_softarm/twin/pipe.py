@@ -119,12 +119,9 @@ def _containers(pipe: CrossPipe):
 
 def _add_skin(mjspec: mujoco.MjSpec, spec: ArmSpec) -> None:
     """Add the arm's contact bodies: balls or rims at the rings, and the gripper's boxes."""
-    radius = ring_radius_m(spec)
-    rim = rim_points(radius - RIM_ROUNDING_M)
-    links = spec.structure.links_per_section
-    link_m = np.repeat(spec.per_section(spec.geometry.section_length_m), links) / links
-    for link in range(spec.n_links):
-        below = link_m[link + 1 :].sum()  # depth of the tip below this link's ring
+    for link, radius in enumerate(ring_radius_m(spec)[1:]):
+        rim = rim_points(radius - RIM_ROUNDING_M)
+        below = spec.link_length_m[link + 1 :].sum()  # depth of the tip below this link's ring
         ring = mjspec.geom(f"ring{link + 1}").pos
         centres, size = (ring + rim, RIM_ROUNDING_M) if below < radius else (ring[None], radius)
         for k, centre in enumerate(centres):

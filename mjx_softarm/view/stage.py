@@ -18,7 +18,6 @@ from mjx_softarm.mechanics.body import (
     SPRING_WIDTH_M,
     Copies,
     payload_radius_m,
-    ring_radius_m,
     shape,
 )
 from mjx_softarm.posture import base_rotation, posture
@@ -83,8 +82,8 @@ class Stage:
         behind = base @ (0.0, 0.0, _MOUNT_M[1] / 2) + spec.mounting.base_offset_m
         turned = quaternion_from_rotation(base)
         solid("mount", meshes.disc(*_MOUNT_M), _MOUNT, position=behind, wxyz=turned)
-        self._rings = copies("rings", meshes.disc(ring_radius_m(spec), _RING_M), rest.rings, _RING)
-        self._folds = copies("bellows", meshes.fold(spec.geometry.chamber_diameter_m / 2), rest.folds, _RING)
+        self._rings = copies("rings", meshes.disc(1.0, _RING_M), rest.rings, _RING)
+        self._folds = copies("bellows", meshes.fold(1.0), rest.folds, _RING)
         self._coils = copies("springs", turn, rest.coils, _SPRING)
         # Tip, seen tip and goal, each with a gripper; payload, markers and trail.
         self._tip = scene.add_frame(f"{name}/tip", show_axes=False)

@@ -34,7 +34,7 @@ def compiled(sections=3, links=4):
 def random_q(spec, n, seed=0, bend_rad=0.8):
     """Joint coordinates of arms far more crooked than any that pressure makes: up to 45 deg a hinge."""
     rng = np.random.default_rng(seed)
-    half = spec.link_length_m / 2
+    half = spec.link_length_m.max() / 2
     q = rng.uniform([-half, -bend_rad, -bend_rad], [half, bend_rad, bend_rad], (n, spec.n_links, 3))
     return np.float32(q.reshape(n, -1))
 
@@ -81,7 +81,7 @@ def test_the_chain_is_where_c_mujoco_puts_it(structure):
 
 def test_arms_that_come_last_are_those_that_come_first():
     q = random_q(arm(1, 2), 3)  # as many arms as a vector has components
-    kinematics = ChainKinematics(arm(1, 2).link_length_m)
+    kinematics = ChainKinematics(arm(1, 2).link_length_m[:, None])
     last = jax.tree.map(lambda x: np.moveaxis(x, -1, 0), jax.jit(kinematics)(q.T))
     assert_same_frames(last, chain(1, 2)(q), "3 arms")
 

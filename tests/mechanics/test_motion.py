@@ -25,7 +25,7 @@ from mjx_softarm.mechanics.motion.state import (
     pushed,
 )
 from mjx_softarm.mechanics.params import PAYLOAD, ArmParams
-from mjx_softarm.mechanics.statics import all_tendons
+from mjx_softarm.mechanics.statics import all_tendons, chambers_and_springs
 from mjx_softarm.mechanics.workspace import settle_many
 from mjx_softarm.twin.pneumatics import Pneumatics
 
@@ -71,14 +71,15 @@ def true_tips(spec, q, pressure_kpa, reference_m, step_s=TRUE_STEP_S, model=None
     data.qpos[:] = q
     mujoco.mj_step1(model, data)
     bellows = spec.chambers.area_m2, spec.chambers.area_slope_m, spec.geometry.section_length_m
-    air = Pneumatics(*bellows, chamber_lengths(data), step_s, spec.actuators.per_chamber(spec.n_chambers))
-    air.hold(pressure_kpa, chamber_lengths(data))
-    law, tips = control.LawState.at_rest(pressure_kpa, spring_lengths(data)), []
+    n = spec.n_chambers
+    air = Pneumatics(*bellows, chamber_lengths(data, n), step_s, spec.actuators.per_chamber(n))
+    air.hold(pressure_kpa, chamber_lengths(data, n))
+    law, tips = control.LawState.at_rest(pressure_kpa, spring_lengths(data, n)), []
     for reference in reference_m:
-        command, law = control.pressures(reference, spring_lengths(data), law, GAINS, PERIOD_S)
+        command, law = control.pressures(reference, spring_lengths(data, n), law, GAINS, PERIOD_S)
         air.command(command)
         for _ in range(round(PERIOD_S / step_s)):
-            data.ctrl[:] = air.step(chamber_lengths(data))
+            data.ctrl[:] = air.step(chamber_lengths(data, n))
             if before_step:
                 before_step(data)
             mujoco.mj_step2(model, data)
@@ -91,8 +92,9 @@ def dry_friction(friction_n):
     """Function that pushes each chamber against the rate of its length."""
 
     def push(data):
-        jacobian = data.ten_J.reshape(-1, data.qpos.size)[0::2]  # dense: each tendon crosses all links
-        rate = data.ten_velocity[0::2]
+        chambers = slice(data.ctrl.size)
+        jacobian = data.ten_J.reshape(-1, data.qpos.size)[chambers]  # dense: each tendon crosses all links
+        rate = data.ten_velocity[chambers]
         data.qfrc_applied[:] = -jacobian.T @ (friction_n * rate / np.sqrt(rate**2 + CREEP_M_PER_S**2))
 
     return push
@@ -105,8 +107,8 @@ def mover(spec, engine=midpoint, step_s=PERIOD_S, longest_delay_s=0.0):
 
     def move(q, pressure_kpa, reference_m, own, params):
         arm = MovingArm(model, data, params, own)
-        spring_m = all_tendons(chain_kinematics(params)(q), params).length[1]
-        start = Motion.at_rest(q, pressure_kpa, spring_m, n_earlier(longest_delay_s, PERIOD_S))
+        _, springs = chambers_and_springs(all_tendons(chain_kinematics(params)(q), params), params)
+        start = Motion.at_rest(q, pressure_kpa, springs.length, n_earlier(longest_delay_s, PERIOD_S))
 
         def tick(motion, reference):
             return engine.advance(arm, motion, reference, GAINS, PERIOD_S, PERIOD_S, step_s)
@@ -154,15 +156,15 @@ def test_mjx_steps_as_c_mujoco_does():
     params = nominal._replace(tool_mass_kg=masses, chamber_stiffness=stiffness)
     moved = mover(SHORT_ARM, mjx_step, step_s)(*start, np.float32(asked), own, params=params)
 
-    model = build_model(SHORT_ARM)
-    model.body("payload").mass, model.tendon_stiffness[0::2] = masses[PAYLOAD], stiffness
+    model, chambers = build_model(SHORT_ARM), slice(SHORT_ARM.n_chambers)
+    model.body("payload").mass, model.tendon_stiffness[chambers] = masses[PAYLOAD], stiffness
     model.dof_damping *= own.damping
     damping = own.damping * model.tendon_damping
 
     def set_dampers(data):
-        rate = data.ten_velocity[0::2]
+        rate = data.ten_velocity[chambers]
         model.tendon_damping[:] = damping
-        model.tendon_damping[0::2] += own.friction_n / np.sqrt(rate**2 + CREEP_M_PER_S**2)
+        model.tendon_damping[chambers] += own.friction_n / np.sqrt(rate**2 + CREEP_M_PER_S**2)
         mujoco.mj_fwdVelocity(model, data)
 
     true = np.array(

@@ -16,7 +16,7 @@ R, Z = 0.15, -0.55
 
 def hanging(spec, centre_m=(0.0, 0.0), turn=None):
     """Plates of an arm without any bending, moved sideways and turned about the base."""
-    z = -spec.link_length_m * np.arange(spec.n_links + 1.0)
+    z = -spec.link_length_m[0] * np.arange(spec.n_links + 1.0)
     position = np.stack([np.full_like(z, centre_m[0]), np.full_like(z, centre_m[1]), z], axis=-1)
     rotation = np.eye(3) if turn is None else turn.as_matrix()
     return position @ rotation.T, np.broadcast_to(rotation, (len(z), 3, 3))
@@ -72,7 +72,7 @@ def test_body_of_a_straight_arm(spec):
 def test_rims_are_sampled_as_closely_as_documented(spec, angle):
     """A straight arm off the axis: the nearest point of a ring lies between two samples at worst."""
     position, rotation = hanging(spec, 0.05 * np.array([np.cos(angle), np.sin(angle)]))
-    at_base = body_clearance(PIPE, position[:2], rotation[:2], spec)
+    at_base = clearance(PIPE, body_points(position, rotation, spec)[: 2 * RIM_POINTS]).min()
     exact = R - 0.069 - 0.05
     assert exact - 1e-12 <= at_base <= exact + 0.069 * (1 - np.cos(np.pi / RIM_POINTS))
 

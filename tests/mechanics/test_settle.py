@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from mjx_softarm import ArmSpec
+from mjx_softarm.control import allocated_error, allocation
 from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.mjcf import build_model
 from mjx_softarm.mechanics.params import ArmParams
@@ -21,9 +22,11 @@ from mjx_softarm.mechanics.settle import (
     settle,
 )
 from mjx_softarm.mechanics.workspace import settle_many
+from tests.other_arms import FOUR, SIX, tapered
 
 SPEC = ArmSpec.default()
 LOW_KPA, HIGH_KPA = SPEC.chambers.pressure_min_kpa, SPEC.chambers.pressure_max_kpa
+ONE_SECTION = SPEC.replace(structure={"n_sections": 1})
 N = 128  # arms a batch, always, so that little is compiled
 
 
@@ -41,14 +44,14 @@ def settled(solve, target, spec=SPEC, params=None):
     return jax.tree.map(np.asarray, found)
 
 
-def references(n_chambers=9, seed=0):
-    """Spring lengths (N, n_chambers) over all that may be commanded."""
+def references(spec=SPEC, seed=0):
+    """Spring lengths (N, n_springs) over all that may be commanded."""
     low, high = SPEC.springs.length_min_m, SPEC.springs.length_max_m
-    return np.random.default_rng(seed).uniform(low, high, (N, n_chambers))
+    return np.random.default_rng(seed).uniform(low, high, (N, spec.n_springs))
 
 
-def pressures(n_chambers=9, seed=0):
-    return np.random.default_rng(seed).uniform(LOW_KPA, HIGH_KPA, (N, n_chambers))
+def pressures(spec=SPEC, seed=0):
+    return np.random.default_rng(seed).uniform(LOW_KPA, HIGH_KPA, (N, spec.n_chambers))
 
 
 def imbalance(spec, found):
@@ -75,6 +78,9 @@ ARMS = {
             "length_offset_m": tuple(0.001 * (k - 4) for k in range(9)),
         }
     },
+    "tapered": tapered(),
+    "four chambers": FOUR,
+    "six chambers, three springs": SIX,
 }
 
 
@@ -82,20 +88,24 @@ ARMS = {
 @pytest.mark.parametrize("solve, targets", [(settle, references), (settle_many, pressures)])
 def test_c_mujoco_finds_the_settled_arm_in_balance(arm, solve, targets):
     spec = SPEC.replace(**ARMS[arm])
-    found = settled(solve, targets(spec.n_chambers), spec)
+    found = settled(solve, targets(spec), spec)
     assert found.settled.all()
     left = imbalance(spec, found)
     assert left.max() < RESIDUAL_TOLERANCE
     np.testing.assert_allclose(found.residual, left, atol=RESIDUAL_TOLERANCE / 4)
 
 
-def test_every_chamber_tracks_or_is_at_the_limit_that_stops_it():
-    reference = references()
+@pytest.mark.parametrize("arm", ["the paper's", "four chambers", "six chambers, three springs"])
+def test_every_chamber_tracks_or_is_at_the_limit_that_stops_it(arm):
+    spec = SPEC.replace(**ARMS[arm])
+    reference, matrices = references(spec), allocation(spec)
     low, high = SPEC.springs.length_min_m, SPEC.springs.length_max_m
     corner = reference[: N // 4]  # the shortest and the longest that may be commanded
     reference[: N // 4] = np.where(corner < 0.5 * (low + high), low, high)
-    found = settled(settle, reference)
+    found = settled(settle, reference, spec)
     error = reference - found.spring_m
+    if matrices is not None:
+        error = allocated_error(error, found.pressure_kpa, matrices)
     at_high, at_low = found.pressure_kpa == HIGH_KPA, found.pressure_kpa == LOW_KPA
     np.testing.assert_array_equal(found.at_limit, at_high | at_low)
     assert ((found.pressure_kpa >= LOW_KPA) & (found.pressure_kpa <= HIGH_KPA)).all()
@@ -169,7 +179,22 @@ def test_one_target_that_is_not_a_number_fails_alone(solve, targets):
     np.testing.assert_array_equal(found.q[others], good.q[others])
 
 
-@pytest.mark.parametrize("name", ArmParams._fields)
+def test_redundant_chambers_within_their_limits_hold_a_plane_of_references_with_the_least_pressures():
+    """Springs at these references in C MuJoCo, too: the engines agree on the redundant pressures' place."""
+    spec = SPEC.replace(**FOUR)
+    there = settled(settle_many, 0.5 * pressures(spec), spec)
+    back = settled(settle, there.spring_m, spec)
+    matrices = allocation(spec)
+    assert back.settled.all() and not back.at_limit.any()
+    np.testing.assert_allclose(back.pressure_kpa @ matrices.redundant.T, 0.0, atol=2e-3)
+    off_m = there.spring_m - back.spring_m
+    np.testing.assert_allclose(off_m @ matrices.chamber_error.T, 0.0, atol=1e-5)
+    spread = np.linalg.norm(there.pressure_kpa, axis=1)
+    assert (np.linalg.norm(back.pressure_kpa, axis=1) < spread).mean() > 0.95
+    assert np.abs(there.pressure_kpa - back.pressure_kpa).max() > 5.0  # redundant pressure was given back
+
+
+@pytest.mark.parametrize("name", [name for name in ArmParams._fields if name != "allocation"])
 def test_parameters_that_are_not_numbers_settle_nothing(name):
     params = ArmParams.from_spec(SPEC)
     nothing = jax.tree.map(lambda x: np.full_like(x, np.nan), getattr(params, name))
@@ -222,13 +247,13 @@ def softened(softer, reference_m, n_at_once=None):
 
 @functools.cache
 def softened_alone(softer, row):
-    return np.asarray(jax.jit(softened)(np.float32(softer), np.float32(references(3)[row])))
+    return np.asarray(jax.jit(softened)(np.float32(softer), np.float32(references(ONE_SECTION)[row])))
 
 
 def test_many_arms_settle_as_each_does_alone_whatever_numbers_they_share():
     """Five arms, one of them in the last chunk of two; their numbers are NumPy's."""
     softer, row = np.float32([1.0, 1.1, 1.2, 1.3, 1.4]), np.array([0, 1, 2, 0, 1])
-    target = np.float32(references(3))
+    target = np.float32(references(ONE_SECTION))
 
     def settle_all():
         own = jax.vmap(lambda x, y: softened(x, y, 2))(softer, target[row])

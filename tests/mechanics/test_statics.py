@@ -48,7 +48,7 @@ def odd_arm(sections=3, links=4):
 def random_state(spec, seed, bend_rad=0.5):
     """Joint coordinates (nv,) and pressures (n_chambers,) of a crooked arm."""
     rng = np.random.default_rng(seed)
-    half = spec.link_length_m / 2
+    half = spec.link_length_m.max() / 2
     q = rng.uniform([-half, -bend_rad, -bend_rad], [half, bend_rad, bend_rad], (spec.n_links, 3))
     return q.ravel(), rng.uniform(-40.0, 20.0, spec.n_chambers)
 

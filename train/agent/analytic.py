@@ -31,6 +31,7 @@ import optax
 from jax import Array
 from jax.sharding import Mesh
 
+from mjx_softarm import control
 from mjx_softarm._support import draws
 from mjx_softarm._support.mjx import State
 from mjx_softarm.env import EnvConfig, ReachEnv
@@ -213,8 +214,8 @@ class Analytic(Learner):
         error = rewards.scaled_error(end.pose, end.goal, config.reward)  # (6,)
         off = jnp.sqrt(jnp.sum(error**2) + 1e-12) / config.reward.threshold
         off_m = self.env.reference_m(action) - (end.spring_m + end.sensor_offset_m)  # (A,)
-        if config.moves:  # springs on their way are off their references, too: only blocked chambers count
-            off_m = after.info["blocked"] * off_m
+        if config.moves:  # springs on their way are off their references, too: only blocked ones count
+            off_m = control.blocked_springs(after.info["blocked"], self.env.gains) * off_m
         cost = self.config.saturation_cost_per_mm * 1e3 * jnp.sum(jnp.abs(off_m))
         return off + cost + self.env.clearance_cost(after.info["clearance_mm"])
 

@@ -6,8 +6,9 @@ shows the critic how the reward falls off around a pose.
 
 A relabelled transition whose chambers had saturated also gets another action (hindsight action transitions,
 Levy et al., ICLR 2019). At rest it asks for the spring lengths that the arm ended at, which lead to the same
-equilibrium without saturation. In motion only the references of the saturated chambers are exchanged: the law
-holds such a chamber at its limit either way.
+equilibrium without saturation. (With redundant chambers it is the same but for redundant pressures, which
+hardly bend a section.) In motion only the references of the saturated chambers are exchanged: the law holds
+such a chamber at its limit either way.
 """
 
 from __future__ import annotations

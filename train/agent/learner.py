@@ -119,9 +119,9 @@ class Experience(NamedTuple):
 
     pose: Array  # (..., 6) [mm, deg]
     goal: Array  # (..., 6) [mm, deg]
-    action: Array  # (..., n_chambers) in [-1, 1]
+    action: Array  # (..., n_springs) in [-1, 1]
     next_pose: Array  # (..., 6) [mm, deg]
-    sensed_action: Array  # (..., n_chambers) action for the spring lengths reached; see `hindsight`
+    sensed_action: Array  # (..., n_springs) action for the spring lengths reached; see `hindsight`
     saturated: Array  # (...,) bool
     clearance_cost: Array  # (...,) cost of a body close to a wall
     n_steps: Array  # (...,) actions taken in the episode, this one included

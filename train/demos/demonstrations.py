@@ -31,7 +31,7 @@ class Demonstrations(NamedTuple):
     """m demonstrated poses; float32, ids int32."""
 
     positions: np.ndarray  # (m, 6) [mm, deg]
-    actions: np.ndarray  # (m, n_chambers) in [-1, 1] that lead to the poses
+    actions: np.ndarray  # (m, n_springs) in [-1, 1] that lead to the poses
     sequence: np.ndarray  # (m,)
 
 
@@ -87,7 +87,7 @@ def _out_of_range(matrix: LogMatrix, spec: ArmSpec) -> Iterator[Finding]:
             got = f"got {_shown(column, values[row])} {column.unit}"
             yield _finding(matrix, row, column.name, f"{got}, expected {low} to {high}, the arm's range")
     tip_m = matrix.values[:, matrix.indices("tip_m")]
-    reach_m = spec.structure.n_sections * spec.springs.length_max_m
+    reach_m = sum(spec.per_section(spec.springs.length_max_m))
     behind, side = tip_m @ posture(spec)[:, 2] > 0.0, "below" if hangs(spec) else "before"
     for row in np.flatnonzero((np.linalg.norm(tip_m, axis=1) > reach_m) | behind):
         got = ", ".join(f"{1e3 * value:.4g}" for value in tip_m[row])

@@ -136,7 +136,8 @@ class Expert:
         Demands are equilibrium and clearance and, with a target, pressures, springs, position, orientation.
         """
         springs = self.spec.springs
-        margin_m = np.minimum(found.spring_m - springs.length_min_m, springs.length_max_m - found.spring_m)
+        shortest, longest = map(self.spec.at_springs, (springs.length_min_m, springs.length_max_m))
+        margin_m = np.minimum(found.spring_m - shortest, longest - found.spring_m)
         demands = [1.0 - found.residual / RESIDUAL_TOLERANCE, found.clearance_m / MARGIN_M - LIMIT_SHARE]
         if target is not None:
             off_m, turn_rad = _off(found, target)

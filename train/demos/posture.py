@@ -34,7 +34,7 @@ class Posture(NamedTuple):
     """An arm at rest; each field may have leading axes."""
 
     pressure_kpa: Any  # (n_chambers,)
-    spring_m: Any  # (n_chambers,) references to hold
+    spring_m: Any  # (n_springs,) references to hold
     pose: Any  # (6,) [mm, deg] pose of the tip, the real arm's where there is a network
     finger_m: Any  # (3,) finger tips
     rotation: Any  # (3, 3) orientation of the gripper
@@ -129,10 +129,11 @@ def solve_many(
 def _errors(posture: tuple[Posture, Array], target: PostureTarget, spec: ArmSpec) -> Array:
     """Return the errors of a posture, each in its unit; limits count where they are violated."""
     now, wall_m = posture
-    chambers, springs = spec.chambers, spec.springs
+    chambers = spec.chambers
+    shortest, longest = map(spec.at_springs, (spec.springs.length_min_m, spec.springs.length_max_m))
     real_kpa = now.pressure_kpa + target.bias_kpa
     room_kpa = jnp.concatenate([real_kpa - chambers.pressure_min_kpa, chambers.pressure_max_kpa - real_kpa])
-    room_m = jnp.concatenate([now.spring_m - springs.length_min_m, springs.length_max_m - now.spring_m])
+    room_m = jnp.concatenate([now.spring_m - shortest, longest - now.spring_m])
     within = [
         (room_kpa - MARGIN_KPA) / _LIMIT_KPA,
         (room_kpa - COMFORT_KPA) / _COMFORT_KPA,

@@ -58,7 +58,7 @@ class WaypointRecorder:
         self.expert, self.tell, self._save = expert, tell, save
         self._drive = Drive(arm, expert.spec, self._tick)
         self._rows, self._off_m = Recorder(), []
-        self._readings = np.empty(0)  # (n_chambers,) of the newest tick
+        self._readings = np.empty(0)  # (n_springs,) of the newest tick
 
     def record(self, waypoints: Sequence[Waypoint], plan: Posture, sequence: int = 0) -> RecordedPoses:
         """Bring the finger tips to waypoints, log each, and vent; see `vent_at_end`.
@@ -144,10 +144,12 @@ class WaypointRecorder:
 
     def _not_at_rest(self, name: str, posture: Posture) -> ArmFault:
         off_m = self._drive.sensor.lengths(self._readings, 0.0).length_m - posture.spring_m
-        worst = int(np.argmax(np.abs(off_m)))
+        worst, spec = int(np.argmax(np.abs(off_m))), self.expert.spec
+        chamber = worst * (spec.n_chambers // spec.n_springs)  # beside the spring
+        kpa = self._drive.link.pressure_kpa[chamber]
         return ArmFault(
             f"{name}: got no rest, expected it within {LOOP.settle_timeout_s:g} s; spring {worst} is "
-            f"{1e3 * off_m[worst]:+.1f} mm off, its chamber at {self._drive.link.pressure_kpa[worst]:.1f} kPa"
+            f"{1e3 * off_m[worst]:+.1f} mm off, its chamber at {kpa:.1f} kPa"
         )
 
     def _tick(self, row: dict) -> None:

@@ -83,7 +83,7 @@ class DemonstratedGoals:
 
 
 def static_poses(env: ReachEnv, actions: np.ndarray) -> Pool:
-    """Return the static poses of the nominal arm under actions (m, n_chambers) in [-1, 1].
+    """Return the static poses of the nominal arm under actions (m, n_springs) in [-1, 1].
 
     Raises:
         ConfigError: the arm does not come to rest under one of them.

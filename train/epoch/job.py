@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.sharding import Mesh
 
+from mjx_softarm import control
 from mjx_softarm._support import draws, xla
 from mjx_softarm._support.mjx import State
 from mjx_softarm.env import ReachEnv
@@ -176,7 +177,7 @@ class Job:
         uniform = draws.uniform(key_random, (self.arms.n, self.env.action_size), minval=-1.0)
         explored = self.learner.act(state.learner, state.arms.obs, key_act)
         explored = Explored(
-            action=jnp.where(warmed_up, explored.action, uniform),  # (n_arms, n_chambers)
+            action=jnp.where(warmed_up, explored.action, uniform),  # (n_arms, n_springs)
             by_expert=None if explored.by_expert is None else warmed_up & explored.by_expert,
         )
 
@@ -234,7 +235,8 @@ class Job:
         start, end = before.pipeline_state, after.pipeline_state
         sensed_action = self.env.action_of(end.spring_m + end.sensor_offset_m)
         if self.env.config.moves:  # the arm moves on: the other references still count
-            sensed_action = jnp.where(after.info["blocked"], sensed_action, explored.action)
+            blocked = control.blocked_springs(after.info["blocked"], self.env.gains)
+            sensed_action = jnp.where(blocked, sensed_action, explored.action)
         return Experience(
             pose=start.pose,
             goal=start.goal,

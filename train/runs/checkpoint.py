@@ -130,7 +130,7 @@ class Run:
                 f"{file}: got a damaged config or another version's ({error}), expected this version's; "
                 "train it anew, or use the version that the file names"
             ) from error
-        s2r = load_s2r(path / S2R_FILE, spec.n_chambers) if has_s2r else None
+        s2r = load_s2r(path / S2R_FILE, spec.n_springs) if has_s2r else None
         return cls(path, config, spec, s2r)
 
     def demonstrations(self) -> Demonstrations | None:

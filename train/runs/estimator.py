@@ -127,7 +127,7 @@ def _first_estimator(spec: ArmSpec, pool: LoadedPool, key: Array) -> PoseEstimat
     scale = np.full(N_CHANGES, CHANGE_SCALE)
     scale[:3] *= spec.length_m / n_sections
     params = ArmParams.from_spec(spec)
-    site_m = jnp.asarray(params.spring_site_m).reshape(n_sections, -1, 2)
+    site_m = jnp.asarray(params.spring_site_m)
     load_layers = initial_layers(jax.random.fold_in(key, 1), (n_in + 1, WIDTH, WIDTH, n_out))
     *hidden, (weight, bias) = load_layers
     return PoseEstimator(

@@ -40,7 +40,7 @@ from mjx_softarm.mechanics.motion.state import (
     pushed,
 )
 from mjx_softarm.mechanics.params import N_PER_KPA_M2
-from mjx_softarm.mechanics.statics import Tendons, all_tendons, statics_of
+from mjx_softarm.mechanics.statics import Tendons, all_tendons, chambers_and_springs, joined, statics_of
 
 
 def advance(
@@ -61,7 +61,7 @@ def advance(
     Args:
         arm: numbers of the arm.
         motion: state at the start.
-        reference_m (n_chambers,): spring lengths that the law tracks.
+        reference_m (n_springs,): spring lengths that the law tracks.
         gains: numbers of the law.
         duration_s: a whole number of control periods.
         period_s: control period of the model's specification.
@@ -79,7 +79,8 @@ def advance(
     def tick(motion: Motion, _):
         """Run one control period: observe, let the law command pressures, take the time steps."""
         frames, lines = _at(arm, motion.q)
-        spring_m = lines.length[1]
+        _, springs = chambers_and_springs(lines, arm.params)
+        spring_m = springs.length
         command, law = control.pressures(reference_m, spring_m, motion.law, gains, period_s)
         motion = motion._replace(law=law)
         for k in range(n_steps):
@@ -92,7 +93,8 @@ def advance(
         tick = jax.checkpoint(tick, prevent_cse=False)  # a gradient recomputes each tick to save memory
         end, path = jax.lax.scan(tick, motion, None, length=round(duration_s / period_s))
         frames, lines = _at(arm, end.q)
-    return end, MotionEnd.of(end, Path.at(frames, lines.length[1]), path)
+        _, springs = chambers_and_springs(lines, arm.params)
+    return end, MotionEnd.of(end, Path.at(frames, springs.length), path)
 
 
 def _at(arm: MovingArm, q: Array) -> tuple[Frames, Tendons]:
@@ -108,13 +110,13 @@ def _step(arm: MovingArm, motion: Motion, command_kpa: Array, k: int, h: float, 
     half_way = 0.5 * h * v  # (nv,)
     middle = motion._replace(q=motion.q + half_way)
     frames, lines = _at(arm, middle.q)
-    jacobian = lines.jacobian  # (2, n_sections, 3, n)
+    chambers, _ = chambers_and_springs(lines, params)
 
     def volume_m3(displacement: Array) -> Array:
         """Return the chambers' volumes (n_chambers,) at joint displacements (nv,) from the middle."""
-        along = products(jacobian[0], displacement.reshape(params.n_sections, -1, 1)).reshape(-1)
+        along = products(chambers.jacobian, displacement.reshape(params.n_sections, -1, 1)).reshape(-1)
         area = params.area / N_PER_KPA_M2, params.area_slope / N_PER_KPA_M2
-        return pneumatics.volume_m3(lines.length[0] + along, *area, params.section_length_m)
+        return pneumatics.volume_m3(chambers.length + along, *area, params.free_length_m)
 
     def fill(gas_m3: Array, volume: Array, half: int) -> Array:
         """Return the gas (n_chambers,) after a half step, counted from the start of the control period."""
@@ -131,11 +133,11 @@ def _step(arm: MovingArm, motion: Motion, command_kpa: Array, k: int, h: float, 
     # Forces in the middle and their derivatives
     mass, bias = jax.lax.stop_gradient(_inertia(arm, frames, middle))
     potential = statics_of(lines, frames, middle.q, pressure_kpa, params)
-    damping, stiffness = _dampers(arm, jacobian, v), potential.hessian.dense()
+    damping, stiffness = _dampers(arm, lines.jacobian, v), potential.hessian.dense()
     # Stiffness of each closed chamber's gas (n_chambers,) [N/m], area^2 dp/dV
     gas = pneumatics.ATMOSPHERE_KPA / N_PER_KPA_M2 * gas_m3 * (potential.area / middle_m3) ** 2
-    pushed = jacobian[0] * gas.reshape(params.n_sections, -1, 1)
-    stiffness_of_gas = block_diagonal(products(jnp.swapaxes(jacobian[0], 1, 2), pushed))
+    pushed = chambers.jacobian * gas.reshape(params.n_sections, -1, 1)
+    stiffness_of_gas = block_diagonal(products(jnp.swapaxes(chambers.jacobian, 1, 2), pushed))
 
     # The linearised midpoint rule
     force = potential.gradient + bias + damping @ v
@@ -152,17 +154,18 @@ def _step(arm: MovingArm, motion: Motion, command_kpa: Array, k: int, h: float, 
 
 
 def _dampers(arm: MovingArm, jacobian: Array, v: Array) -> Array:
-    """Return the matrix (nv, nv) of all dampers and of dry friction, with Jacobians (2, n_sections, 3, n)."""
+    """Return the matrix (nv, nv) of dampers and dry friction; the Jacobian is (n_sections, c + s, n)."""
     # Dampers of chambers and springs
-    tendon = arm.model.tendon_damping.reshape(jacobian.shape[1], -1, 2)  # (n_sections, 3, 2)
-    rows = jnp.concatenate(list(jacobian), axis=1)  # (n_sections, 6, n)
-    scaled = jnp.concatenate([tendon[..., :1] * jacobian[0], tendon[..., 1:] * jacobian[1]], axis=1)
-    own = block_diagonal(products(jnp.swapaxes(rows, 1, 2), scaled))
+    n_sections, n_chambers = len(jacobian), len(arm.params.area)
+    of_chambers, of_springs = jnp.split(arm.model.tendon_damping, [n_chambers])
+    damping = joined(of_chambers, of_springs, n_sections)[..., None]
+    own = block_diagonal(products(jnp.swapaxes(jacobian, 1, 2), damping * jacobian))
 
     # Dry friction
-    rate = products(jacobian[0], v.reshape(len(tendon), -1, 1))  # (n_sections, 3, 1) [m/s]
+    chambers = jacobian[:, : n_chambers // n_sections]
+    rate = products(chambers, v.reshape(n_sections, -1, 1))  # (n_sections, c, 1) [m/s]
     secant = friction_damping(arm.own.friction_n, rate)
-    friction = block_diagonal(products(jnp.swapaxes(jacobian[0], 1, 2), secant * jacobian[0]))
+    friction = block_diagonal(products(jnp.swapaxes(chambers, 1, 2), secant * chambers))
     return arm.own.damping * (own + jnp.diag(arm.model.dof_damping)) + friction
 
 

@@ -116,9 +116,8 @@ def advance(
 def _episode_model(arm: MovingArm, h: float) -> mjx.Model:
     """Return the model with time step h [s] and the arm's own masses, stiffnesses and dampers."""
     model, params = arm.loaded_model(), arm.params
-    stiffness = jnp.stack([params.chamber_stiffness, params.spring_stiffness], axis=-1)
     return model.replace(
-        tendon_stiffness=stiffness.reshape(-1),  # a chamber and its spring in turn
+        tendon_stiffness=jnp.concatenate([params.chamber_stiffness, params.spring_stiffness]),
         tendon_damping=arm.own.damping * model.tendon_damping,
         dof_damping=arm.own.damping * model.dof_damping,
         opt=model.opt.replace(timestep=jnp.float32(h)),
@@ -126,20 +125,21 @@ def _episode_model(arm: MovingArm, h: float) -> mjx.Model:
 
 
 def _at(arm: MovingArm, model: mjx.Model, q: Array, velocity: Array) -> tuple[mjx.Data, Array, Array]:
-    """Return data at q and velocity (nv,), spring lengths [m] and chamber volumes [m^3] (n_chambers,)."""
+    """Return data at q and velocity (nv,), spring lengths (n_springs,) [m] and chamber volumes [m^3]."""
     data = mjx.kinematics(model, arm.data.replace(qpos=q, qvel=velocity))
     if model.impl == JAX:  # its tendons need the bodies' motion axes
         data = mjx.com_pos(model, data)
     data, params = mjx.tendon(model, data), arm.params
     area = params.area / N_PER_KPA_M2, params.area_slope / N_PER_KPA_M2
-    volume = pneumatics.volume_m3(chamber_lengths(data), *area, params.section_length_m)
-    return data, spring_lengths(data), volume
+    volume = pneumatics.volume_m3(chamber_lengths(data, len(params.area)), *area, params.free_length_m)
+    return data, spring_lengths(data, len(params.area)), volume
 
 
 def _with_friction(arm: MovingArm, model: mjx.Model, data: mjx.Data) -> mjx.Model:
     """Return the model with the chambers' dry friction in the damping of their tendons."""
     if model.impl != JAX:  # the configuration allows no friction there
         return model
-    rate = data._impl.ten_J[0::2] @ data.qvel  # (n_chambers,) [m/s]
+    n_chambers = len(arm.params.area)  # their tendons come first
+    rate = data._impl.ten_J[:n_chambers] @ data.qvel  # (n_chambers,) [m/s]
     friction = friction_damping(arm.own.friction_n, rate)
-    return model.replace(tendon_damping=model.tendon_damping.at[0::2].add(friction))
+    return model.replace(tendon_damping=model.tendon_damping.at[:n_chambers].add(friction))

@@ -38,7 +38,7 @@ class Motion(NamedTuple):
 
     q: Array  # (nv,) [m, rad, rad]
     velocity: Array  # (nv,) [m/s, rad/s, rad/s]
-    law: control.LawState  # (n_chambers,) each
+    law: control.LawState
     pressure_kpa: Array  # (n_chambers,) in the chambers
     command_kpa: Array  # (n_chambers,) command of the last control period
     earlier_kpa: Array | None = None  # (k, n_chambers) commands before it, newest first; see `n_earlier`
@@ -70,7 +70,7 @@ class Motion(NamedTuple):
 class Path(NamedTuple):
     """Observables of an arm at the start of each of t control periods."""
 
-    spring_m: Array  # (t, n_chambers) spring lengths
+    spring_m: Array  # (t, n_springs) spring lengths
     plate_position_m: Array  # (t, L + 1, 3), as in `kinematics.Frames`
     plate_rotation: Array  # (t, L + 1, 3, 3)
     tip_position_m: Array  # (t, 3)
@@ -87,7 +87,7 @@ class MotionEnd(NamedTuple):
     """Observables of an arm at the end of a motion, and its path there."""
 
     pressure_kpa: Array  # (n_chambers,) in the chambers
-    spring_m: Array  # (n_chambers,) spring lengths
+    spring_m: Array  # (n_springs,) spring lengths
     tip_position_m: Array  # (3,)
     tip_rotation: Array  # (3, 3)
     path: Path

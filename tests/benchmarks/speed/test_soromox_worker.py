@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.harness.peers import ROOT
 from benchmarks.harness.rounds import Worker, working
-from benchmarks.speed.soromox_worker import HELD_S, N_STEPS, random_forces, section_matrix, stepper
+from benchmarks.speed.soromox_worker import HELD_S, N_STEPS, random_forces, section_matrices, stepper
 from benchmarks.speed.throughput import SOROMOX
 from mjx_softarm import ArmSpec
 from mjx_softarm.env import EnvConfig
@@ -19,10 +19,10 @@ PYTHON = ROOT / ".venv-soromox" / "bin" / "python"
 
 
 def test_a_section_has_the_stiffness_that_the_specification_gives_by_hand():
-    strains = np.diag(section_matrix(SPEC, "stiffness")) / 0.2**2
+    strains = np.diag(section_matrices(SPEC, "stiffness")[0]) / 0.2**2
     np.testing.assert_allclose(strains[3], 3 * (506.7 + 54.0) + 851.4)  # stretch
     np.testing.assert_allclose(strains[1], 1.5 * (506.7 * 0.035**2 + 54.0 * 0.067**2) + 1.0814)  # bending
-    damping = np.diag(section_matrix(SPEC, "damping")) / 0.2**2
+    damping = np.diag(section_matrices(SPEC, "damping")[0]) / 0.2**2
     np.testing.assert_allclose(damping[3], 3 * (20.0 + 30.0) + 20.0)
     np.testing.assert_allclose(damping[1], 1.5 * (20.0 * 0.035**2 + 30.0 * 0.067**2) + 1.0)
 

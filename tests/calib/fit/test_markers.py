@@ -12,7 +12,7 @@ from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.workspace import settle_many
 
 SPEC = ArmSpec.default().replace(structure={"links_per_section": 6})  # markers are at thirds of a section
-SITE_M = ArmParams.from_spec(SPEC, np.float64).chamber_site_m
+SITE_M = ArmParams.from_spec(SPEC, np.float64).chamber_site_m.reshape(-1, 2)
 N = 60
 
 
@@ -35,7 +35,7 @@ def poses_with_markers(arm, kind):
         data.qpos[:] = q
         mujoco.mj_forward(model, data)
         marker_m[k] = [data.site(f"{kind}{3 * (j // 3)}_plate{2 * (j + 1)}").xpos for j in range(9)]
-        length_m[k] = data.ten_length[0::2]
+        length_m[k] = data.ten_length[: data.ctrl.size]
     poses = StaticPoses(
         pressure_kpa, np.zeros(N), np.float64(found.tip_position_m), np.float64(found.tip_rotation),
         found.spring_m, marker_m, np.zeros((N, 1, 9)), np.ones(N, int),

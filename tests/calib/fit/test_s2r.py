@@ -40,14 +40,14 @@ def arms(spec):
     rng = np.random.default_rng(1)
     nominal, n = ArmParams.from_spec(spec), spec.n_chambers
     turn = np.radians(rng.normal(0.0, 2.0, n))
-    x, y = nominal.spring_site_m.T
+    x, y = nominal.spring_site_m.reshape(-1, 2).T
     site = np.stack([np.cos(turn) * x - np.sin(turn) * y, np.sin(turn) * x + np.cos(turn) * y], axis=-1)
     planted = nominal._replace(
         chamber_stiffness=nominal.chamber_stiffness * rng.uniform(0.85, 1.15, n),
         area=nominal.area * rng.uniform(0.9, 1.1, n),
         chamber_rest_m=nominal.chamber_rest_m + rng.normal(0.0, 0.003, n),
         joint_stiffness=1.1 * nominal.joint_stiffness,
-        spring_site_m=site * (1.0 + rng.normal(0.0, 0.03, (n, 1))),
+        spring_site_m=(site * (1.0 + rng.normal(0.0, 0.03, (n, 1)))).reshape(3, 3, 2),
         tool_mass_kg=nominal.tool_mass_kg + np.array([0.0, 0.2]),
     )
     planted = jax.tree.map(lambda a: np.asarray(a, np.float32), planted)

@@ -30,7 +30,7 @@ def plates(model, data, spec):
     """Positions (L + 1, 3) and rotations (L + 1, 3, 3) of the rings: half a link below each link's hinges."""
     links = slice(1, spec.n_links + 1)
     rotation = data.xmat[links].reshape(-1, 3, 3)
-    position = data.xpos[links] - 0.5 * spec.link_length_m * rotation[:, :, 2]
+    position = data.xpos[links] - 0.5 * spec.link_length_m[:, None] * rotation[:, :, 2]
     return np.vstack([np.zeros((1, 3)), position]), np.concatenate([np.eye(3)[None], rotation])
 
 
