@@ -16,16 +16,16 @@ from mjx_softarm.mechanics.mjcf import build_model
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.settle import settle, settle_pressures
 from mjx_softarm.mechanics.statics import statics
-from tests.other_arms import FOUR, SIX, tapered
+from tests.arms import FOUR_CHAMBERS, SIX_CHAMBERS, TAPERED
 
 SPEC = ArmSpec.default()
 SHORT = SPEC.replace(structure={"n_sections": 2, "links_per_section": 2})
 ONE = SPEC.replace(structure={"n_sections": 1, "links_per_section": 2})
 DIFFERENTIATED = {
     "three": SHORT,
-    "tapered": SHORT.replace(**tapered(2)),
-    "four": ONE.replace(**FOUR),
-    "six": ONE.replace(**SIX),
+    "tapered": TAPERED.replace(structure={"links_per_section": 1}),
+    "four": FOUR_CHAMBERS.replace(structure={"n_sections": 1, "links_per_section": 2}),
+    "six": SIX_CHAMBERS.replace(structure={"n_sections": 1, "links_per_section": 2}),
 }
 N = 128
 pytestmark = pytest.mark.usefixtures("quick_compiler")

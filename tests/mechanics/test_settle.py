@@ -22,7 +22,7 @@ from mjx_softarm.mechanics.settle import (
     settle,
 )
 from mjx_softarm.mechanics.workspace import settle_many
-from tests.other_arms import FOUR, SIX, tapered
+from tests.arms import FOUR_CHAMBERS, OTHER_ARMS
 
 SPEC = ArmSpec.default()
 LOW_KPA, HIGH_KPA = SPEC.chambers.pressure_min_kpa, SPEC.chambers.pressure_max_kpa
@@ -66,7 +66,7 @@ def imbalance(spec, found):
     return np.array(left)
 
 
-ARMS = {
+CHANGES = {
     "the paper's": {},
     "loaded": {"mass": {"payload_kg": 1.0}},
     "overloaded": {"mass": {"payload_kg": 50.0}},
@@ -78,16 +78,14 @@ ARMS = {
             "length_offset_m": tuple(0.001 * (k - 4) for k in range(9)),
         }
     },
-    "tapered": tapered(),
-    "four chambers": FOUR,
-    "six chambers, three springs": SIX,
 }
+ARMS = {name: SPEC.replace(**changes) for name, changes in CHANGES.items()} | OTHER_ARMS
 
 
 @pytest.mark.parametrize("arm", ARMS)
 @pytest.mark.parametrize("solve, targets", [(settle, references), (settle_many, pressures)])
 def test_c_mujoco_finds_the_settled_arm_in_balance(arm, solve, targets):
-    spec = SPEC.replace(**ARMS[arm])
+    spec = ARMS[arm]
     found = settled(solve, targets(spec), spec)
     assert found.settled.all()
     left = imbalance(spec, found)
@@ -95,9 +93,9 @@ def test_c_mujoco_finds_the_settled_arm_in_balance(arm, solve, targets):
     np.testing.assert_allclose(found.residual, left, atol=RESIDUAL_TOLERANCE / 4)
 
 
-@pytest.mark.parametrize("arm", ["the paper's", "four chambers", "six chambers, three springs"])
+@pytest.mark.parametrize("arm", ["the paper's", "four", "six"])
 def test_every_chamber_tracks_or_is_at_the_limit_that_stops_it(arm):
-    spec = SPEC.replace(**ARMS[arm])
+    spec = ARMS[arm]
     reference, matrices = references(spec), allocation(spec)
     low, high = SPEC.springs.length_min_m, SPEC.springs.length_max_m
     corner = reference[: N // 4]  # the shortest and the longest that may be commanded
@@ -181,7 +179,7 @@ def test_one_target_that_is_not_a_number_fails_alone(solve, targets):
 
 def test_redundant_chambers_within_their_limits_hold_a_plane_of_references_with_the_least_pressures():
     """Springs at these references in C MuJoCo, too: the engines agree on the redundant pressures' place."""
-    spec = SPEC.replace(**FOUR)
+    spec = FOUR_CHAMBERS
     there = settled(settle_many, 0.5 * pressures(spec), spec)
     back = settled(settle, there.spring_m, spec)
     matrices = allocation(spec)
@@ -232,7 +230,7 @@ def test_an_impossible_arm_is_reported_not_raised(arm, solve, targets):
 
 def softened(softer, reference_m, n_at_once=None):
     """Tip, and its change with the reference, of an arm that has springs, holes and a mount of its own."""
-    params = ArmParams.from_spec(SPEC.replace(**ARMS["one section of two links"]))
+    params = ArmParams.from_spec(ARMS["one section of two links"])
     params = params._replace(
         chamber_stiffness=params.chamber_stiffness / softer,
         chamber_site_m=params.chamber_site_m * softer**0.1,
