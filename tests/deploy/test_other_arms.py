@@ -10,10 +10,11 @@ from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.drive import Drive, Hold
 from mjx_softarm.deploy.record import record
 from mjx_softarm.deploy.safety import Fault
-from mjx_softarm.deploy.session import check_number, follow
+from mjx_softarm.deploy.session import check_arm, check_number, follow
 from mjx_softarm.deploy.strategy import followed
 from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.sensing.estimator import estimate
+from mjx_softarm.twin.arm import Twin
 from tests.arms import FOUR_CHAMBERS, SIX_CHAMBERS
 from tests.linear_arm import Leaking, LinearArm, gain_of, make_policy
 
@@ -118,3 +119,17 @@ def test_another_number_of_springs_is_refused():
     """Readings are counted by springs, not by chambers."""
     with pytest.raises(InputError, match="test: got 12 readings, expected 9, of the 3 sections of 'six'"):
         check_number(LinearArm(spec=FOUR_CHAMBERS), SIX_CHAMBERS, "test")
+
+
+def test_twin_is_led_to_a_goal(other_arm):
+    """Springs that a twin has at some pressures, redundant ones among them, come back under the law."""
+    kpa = np.random.default_rng(0).uniform(-20.0, 0.0, other_arm.n_chambers)
+    pressed, twin = Twin(1, other_arm, 0.0), Twin(1, other_arm, 0.0)
+    for tick in range(150):
+        pressed.write_pressures(kpa * min(1.0, tick / 50))
+    spring_m = other_arm.spring_sensor.lengths(pressed.read_sensors()).length_m
+    controller = controller_of(other_arm, spring_m)
+    check_arm(twin, controller, "twin")
+    run = follow(twin, controller, [np.asarray(estimate(controller.policy.estimator, spring_m, 0.0), float)])
+    tip_m = run.log.tip_m[run.arrivals[0].row - 25 :].mean(axis=0)
+    assert not run.events and np.linalg.norm(tip_m - pressed.motion_capture().tip_m) < 2e-3
