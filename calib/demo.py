@@ -13,12 +13,13 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
+from mjx_softarm._support.fields import scaled
 from mjx_softarm.logs.schema import Log, write_log
 from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.mechanics.mjcf import build_model, spring_lengths, steps_per_period
 from mjx_softarm.mechanics.workspace import settle_many
 from mjx_softarm.sensing.pose import rotation_from_quaternion
-from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
+from mjx_softarm.spec import ArmSpec
 
 N_LENGTHS = 60  # lengths of each spring on the ruler
 N_POSES = 1200
@@ -37,31 +38,30 @@ def planted_arm(spec: ArmSpec, seed: int) -> ArmSpec:
     """Return the arm of the logs."""
     rng = np.random.default_rng(seed)
 
-    def each(value: float | tuple[float, ...], spread: float) -> tuple[float, ...]:
-        values = np.array(spec.per_chamber(value))
-        return tuple(values * (1.0 + rng.uniform(-spread, spread, spec.n_chambers)))
+    def each(values: tuple[float, ...] | np.ndarray, spread: float) -> tuple[float, ...]:
+        return tuple(np.array(values) * (1.0 + rng.uniform(-spread, spread, len(values))))
 
     # Draw numbers that the calibration fits; turn and shift sites, which it does not fit.
     chambers, geometry, backbone = spec.chambers, spec.geometry, spec.backbone
-    n = spec.n_chambers
-    offset_m = np.array(spec.per_chamber(chambers.length_offset_m)) + rng.uniform(-4e-3, 4e-3, n)
-    delta_m = np.array(spec.per_chamber(spec.sensor.delta_m)) + rng.uniform(-5e-3, 5e-3, n)
+    sensor, first_deg = spec.spring_sensor, np.add(geometry.first_chamber_deg, 1.5)
+    offset_m = spec.per_chamber(chambers.length_offset_m) + rng.uniform(-4e-3, 4e-3, spec.n_chambers)
+    delta_m = sensor.delta_m + rng.uniform(-5e-3, 5e-3, spec.n_springs)
     return spec.replace(
         name=f"{spec.name} planted {seed}",
         structure={"links_per_section": spec.structure.links_per_section + 2},
         geometry={
-            "chamber_radius_m": 1.02 * geometry.chamber_radius_m,
-            "spring_radius_m": 0.99 * geometry.spring_radius_m,
-            "first_chamber_deg": geometry.first_chamber_deg + 1.5,
+            "chamber_radius_m": scaled(geometry.chamber_radius_m, 1.02),
+            "spring_radius_m": scaled(geometry.spring_radius_m, 0.99),
+            "first_chamber_deg": first_deg.tolist(),
         },
-        backbone={"bending_stiffness_nm_per_rad": 1.1 * backbone.bending_stiffness_nm_per_rad},
+        backbone={"bending_stiffness_nm_per_rad": scaled(backbone.bending_stiffness_nm_per_rad, 1.1)},
         chambers={
-            "area_m2": each(chambers.area_m2, 0.08),
-            "stiffness_n_per_m": each(chambers.stiffness_n_per_m, 0.2),
+            "area_m2": each(spec.per_chamber(chambers.area_m2), 0.08),
+            "stiffness_n_per_m": each(spec.per_chamber(chambers.stiffness_n_per_m), 0.2),
             "length_offset_m": tuple(offset_m),
-            "damping_ns_per_m": 1.5 * chambers.damping_ns_per_m,
+            "damping_ns_per_m": scaled(chambers.damping_ns_per_m, 1.5),
         },
-        sensor={"beta": each(spec.sensor.beta, 0.05), "delta_m": tuple(delta_m)},
+        sensor={"beta": each(sensor.beta, 0.05), "delta_m": tuple(delta_m)},
     )
 
 
@@ -92,8 +92,8 @@ def write_demo(folder: Path, spec: ArmSpec, seed: int) -> list[Path]:
 
 
 def _springs(arm: ArmSpec, rng: np.random.Generator) -> Log:
-    low, high = arm.springs.length_min_m, arm.springs.length_max_m
-    length_m = np.linspace(low, high, N_LENGTHS)[:, None] * np.ones(arm.n_chambers)
+    low, high = map(arm.at_springs, (arm.springs.length_min_m, arm.springs.length_max_m))
+    length_m = np.linspace(low, high, N_LENGTHS)
     return Log(
         **_rows(2.0 * np.arange(N_LENGTHS)),
         readings=_readings(arm, length_m, rng),
@@ -141,9 +141,8 @@ def _look(arm: ArmSpec, model: mujoco.MjModel, data: mujoco.MjData, qpos: np.nda
     mujoco.mj_tendon(model, data)
     tip = data.site("tip")
     marker_m = np.stack([data.site(name).xpos for name in _marker_sites(arm)])
-    return _Seen(
-        spring_lengths(data, arm.n_chambers).copy(), tip.xpos.copy(), tip.xmat.reshape(3, 3).copy(), marker_m
-    )
+    spring_m = spring_lengths(data, arm.n_chambers).copy()
+    return _Seen(spring_m, tip.xpos.copy(), tip.xmat.reshape(3, 3).copy(), marker_m)
 
 
 def _marker_sites(arm: ArmSpec) -> list[str]:
@@ -152,7 +151,7 @@ def _marker_sites(arm: ArmSpec) -> list[str]:
     for section in range(arm.structure.n_sections):
         for third in range(1, MARKERS_PER_SECTION + 1):
             plate = section * per_section + round(third * per_section / MARKERS_PER_SECTION)
-            names.append(f"spring{N_CHAMBERS_PER_SECTION * section}_plate{plate}")
+            names.append(f"spring{arm.springs_per_section * section}_plate{plate}")
     return names
 
 

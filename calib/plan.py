@@ -22,9 +22,10 @@ from calib.fit.equilibrium import N_KINDS, error_groups, simulate, unmeasured
 from calib.fit.leastsquares import QUANTILE
 from calib.fit.parameters import priors, tolerances
 from mjx_softarm._support.archive import Entries, entries_of, read_sealed, write_sealed
+from mjx_softarm.control import allocation
 from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.mechanics.workspace import pressure_levels, settle_many
-from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
+from mjx_softarm.spec import ArmSpec
 
 KIND, RECORDED_FILE = "recorded", "recorded.npz"  # file in the folder of a calibration
 SHARE_FAR = 0.5  # least share of the poses that are drawn by their distance
@@ -146,7 +147,8 @@ def choose_far(
     """Draw n candidates (m, n_chambers) far from poses, recorded or taken; return their indices."""
     # Weigh candidates by the errors of the poses nearest to them.
     span = spec.chambers.pressure_max_kpa - spec.chambers.pressure_min_kpa
-    square = np.mean((candidates[:, None] - recorded.pressure_kpa) ** 2, axis=-1) / span**2
+    candidates, known = (_acting(spec, kpa) for kpa in (candidates, recorded.pressure_kpa))
+    square = np.mean((candidates[:, None] - known) ** 2, axis=-1) / span**2
     near = np.argsort(square, axis=1)[:, :N_NEAREST]
     ratio = recorded.error_mm[near].mean(axis=1) / recorded.error_mm.mean()
     weight = np.clip(ratio, 1.0 / MAX_ERROR_RATIO, MAX_ERROR_RATIO)
@@ -166,6 +168,12 @@ def choose_far(
     return np.array(found, int)
 
 
+def _acting(spec: ArmSpec, pressure_kpa: np.ndarray) -> np.ndarray:
+    """Return pressures (m, n_chambers) without the part that neither stretches nor bends a section."""
+    matrices = allocation(spec)
+    return pressure_kpa if matrices is None else pressure_kpa - pressure_kpa @ matrices.redundant
+
+
 def _candidates(spec: ArmSpec, n: int, rng: np.random.Generator) -> np.ndarray:
     """Draw pressures (m, n_chambers) at which the arm settles: random, extreme, equal within sections.
 
@@ -174,8 +182,8 @@ def _candidates(spec: ArmSpec, n: int, rng: np.random.Generator) -> np.ndarray:
     """
     third = -(-n // 3)
     extremes = rng.choice(pressure_levels(spec), (third, spec.n_chambers))
-    of_section = random_pressures(spec, third, rng)[:, ::N_CHAMBERS_PER_SECTION]
-    equal = np.repeat(of_section, N_CHAMBERS_PER_SECTION, axis=1)
+    per_section = spec.structure.chambers_per_section
+    equal = np.repeat(random_pressures(spec, third, rng)[:, ::per_section], per_section, axis=1)
     drawn = np.concatenate([random_pressures(spec, third, rng), extremes, equal])
     return drawn[settle_many(spec, drawn).settled]
 

@@ -30,7 +30,6 @@ from mjx_softarm._support.fields import (
 )
 from mjx_softarm.arms import shipped_arm
 from mjx_softarm.pneumatics import ACTUATORS, PAPER_PUMP, Actuators
-from mjx_softarm.sensing.sensors import N_CHAMBERS_PER_SECTION as N_CHAMBERS_PER_SECTION
 from mjx_softarm.sensing.sensors import SENSORS, Sensor
 
 ARM_FILE = "arm.toml"  # in the folder of a calibration

@@ -16,6 +16,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -24,7 +25,7 @@ from calib.fit.blocks import held_out_blocks
 from calib.fit.equilibrium import N_KINDS, Measured, error_groups, simulate, tip_changes
 from calib.fit.leastsquares import NOT_CONVERGED, Problem, Solution, fit, principal, refine
 from calib.fit.markers import section_ends
-from calib.fit.parameters import half_widths, names, priors, spec_at, tolerances
+from calib.fit.parameters import by_name, half_widths, names, priors, spec_at, tolerances
 from calib.fit.pose_errors import PoseErrors, errors_of
 from calib.read.measurements import Measurements
 from calib.read.static_poses import StaticPoses
@@ -120,7 +121,7 @@ def fit_chambers(measurements: Measurements, spec: ArmSpec, seed: int = 0) -> Ch
     each = zip(widths[unknown], weak_tip_mm, directions.T[unknown], strict=True)
     found = ChamberFit(
         spec=calibrated,
-        half_width_95=half_widths(calibrated, solution.half_width),
+        half_width_95=half_widths(calibrated, solution.covariance),
         direction_widths=widths,
         weak=tuple(_describe(*numbers, names(spec)) for numbers in each),
         weak_tip_mm=weak_tip_mm,
@@ -161,10 +162,15 @@ def _section_ends(poses: StaticPoses, spec: ArmSpec) -> tuple[np.ndarray, tuple[
 
 def _calibrated(spec: ArmSpec, x: np.ndarray, poses: StaticPoses) -> ArmSpec:
     """Return the specification with fitted chambers and the range of the measured spring lengths."""
-    springs = {}
+    springs: dict[str, Any] = {}
     if np.isfinite(poses.spring_m).any():
-        low, high = float(np.nanmin(poses.spring_m)), float(np.nanmax(poses.spring_m))
-        springs = {"length_min_m": low, "length_max_m": high}
+        low, high = np.nanmin(poses.spring_m, axis=0), np.nanmax(poses.spring_m, axis=0)
+        springs = {"length_min_m": float(low.min()), "length_max_m": float(high.max())}
+        limits = spec.springs.length_min_m, spec.springs.length_max_m
+        if any(isinstance(limit, tuple) for limit in limits):  # the sections have ranges of their own
+            by_section = (x.reshape(spec.structure.n_sections, -1) for x in (low, high))
+            shortest, longest = next(by_section).min(axis=1), next(by_section).max(axis=1)
+            springs = {"length_min_m": tuple(shortest.tolist()), "length_max_m": tuple(longest.tolist())}
     return spec_at(spec, x).replace(springs=springs)
 
 
@@ -180,7 +186,7 @@ def _errors(error: np.ndarray, spec: ArmSpec) -> PoseErrors:
     settled = error[~np.isinf(error[:, 0])].reshape(-1, error.shape[1])
     sine = np.minimum(np.linalg.norm(settled[:, 3:6], axis=1), 1.0)
     tip_mm = 1e3 * np.linalg.norm(settled[:, :3], axis=1)
-    return errors_of(tip_mm, np.degrees(np.arcsin(sine)), settled[:, 6 : 6 + spec.n_chambers])
+    return errors_of(tip_mm, np.degrees(np.arcsin(sine)), settled[:, 6 : 6 + spec.n_springs])
 
 
 def _warnings(found: ChamberFit, spec: ArmSpec, solution: Solution) -> tuple[str, ...]:
@@ -201,9 +207,10 @@ def _warnings(found: ChamberFit, spec: ArmSpec, solution: Solution) -> tuple[str
     if not found.is_better:
         said.append("the specification itself is better on held-out poses, so it stays: log more poses")
     # Look at the fitted numbers.
-    stiffness, area = np.exp(np.abs(solution.x[: 2 * spec.n_chambers])).reshape(2, -1)
-    for name, ratio in (("stiffness", stiffness), ("area", area)):
-        if (far := np.flatnonzero(ratio > MAX_RATIO)).size:
+    changes = by_name(solution.x, spec.structure)
+    for name in ("stiffness", "area"):
+        far = np.flatnonzero(np.exp(np.abs(changes[name])) > MAX_RATIO)
+        if far.size:
             said.append(
                 f"{name} of chambers {_list(far)} is {MAX_RATIO:g} times off the specification or more: "
                 "check the unit of pressure, the order of the columns, and the payload"

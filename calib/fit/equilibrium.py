@@ -18,12 +18,12 @@ from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.settle import RESIDUAL_TOLERANCE, settle_pressures
 from mjx_softarm.mechanics.statics import tendons
 from mjx_softarm.mechanics.workspace import pressure_levels
-from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
+from mjx_softarm.spec import ArmSpec
 
 BATCH = 128  # poses simulated together
 N_KINDS = 4  # kinds of errors: tip, rotation, springs, markers
 N_WORKSPACE = 256  # poses over the workspace
-STRAIGHT = 0.2  # excess of a chamber over its section's others in a straight arm, as a share of the range
+STRAIGHT = 0.2  # excess of one of three chambers over the others in a straight arm, as a share of the range
 
 
 class Measured(NamedTuple):
@@ -33,7 +33,7 @@ class Measured(NamedTuple):
     payload_kg: Array | np.ndarray  # ()
     tip_m: Array | np.ndarray  # (3,)
     tip_rotation: Array | np.ndarray  # (3, 3)
-    spring_m: Array | np.ndarray  # (n_chambers,)
+    spring_m: Array | np.ndarray  # (n_springs,)
     end_m: Array | np.ndarray  # (n_sections, 3) markers on the sections' last plates
 
     def take(self, poses: np.ndarray) -> Measured:
@@ -50,7 +50,7 @@ def residuals(x: Array, params: ArmParams, measured: Measured) -> tuple[Array, A
         measured: measurements of one pose.
 
     Returns:
-        Errors (6 + n_chambers + 3 n_sections,) of the tip [m], the rotation [rad] as its axis times the sine
+        Errors (6 + n_springs + 3 n_sections,) of the tip [m], the rotation [rad] as its axis times the sine
         of the angle, the springs [m] and the markers at the sections' ends [m]; largest residual force () [N,
         N m]; chamber lengths (n_chambers,) [m].
     """
@@ -65,7 +65,7 @@ def residuals(x: Array, params: ArmParams, measured: Measured) -> tuple[Array, A
         frames = kinematics(found.q)
         chamber_m = tendons(jax.lax.stop_gradient(frames), arm.chamber_site_m).length.reshape(-1)
         turn = measured.tip_rotation.T @ found.tip_rotation
-        end_m = _section_ends(frames, marker_sites(x, len(found.spring_m)))
+        end_m = _section_ends(frames, marker_sites(x, arm))
     # Compare it with the measured pose.
     angle = 0.5 * jnp.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
     error = [
@@ -84,11 +84,12 @@ def error_groups(spec: ArmSpec, pressure_kpa: np.ndarray) -> np.ndarray:
     one pressure each, have other kinds, `N_KINDS` more: the simulated arm has no torsion and shear, which act
     where an arm bends.
     """
-    kind = np.repeat(range(N_KINDS), [3, 3, spec.n_chambers, 3 * spec.structure.n_sections])
-    circle = np.exp(2j * np.pi * np.arange(N_CHAMBERS_PER_SECTION) / N_CHAMBERS_PER_SECTION)
-    off_centre = np.abs(pressure_kpa.reshape(len(pressure_kpa), -1, N_CHAMBERS_PER_SECTION) @ circle)
+    n = spec.structure.chambers_per_section
+    kind = np.repeat(range(N_KINDS), [3, 3, spec.n_springs, 3 * spec.structure.n_sections])
+    circle = np.exp(2j * np.pi * np.arange(n) / n)
+    off_centre = np.abs(pressure_kpa.reshape(len(pressure_kpa), -1, n) @ circle)
     span = spec.chambers.pressure_max_kpa - spec.chambers.pressure_min_kpa
-    straight = np.all(off_centre < STRAIGHT * span, axis=1, keepdims=True)
+    straight = np.all(off_centre < STRAIGHT * span * (n / 3), axis=1, keepdims=True)
     return kind + N_KINDS * straight
 
 
@@ -104,7 +105,7 @@ def unmeasured(
 ) -> Measured:
     """Return n poses to simulate that nobody measured: zeros but for the axes of the tip."""
     n, n_sections = len(payload_kg), spec.structure.n_sections
-    tip_m, spring_m, end_m = np.zeros((n, 3)), np.zeros((n, spec.n_chambers)), np.zeros((n, n_sections, 3))
+    tip_m, spring_m, end_m = np.zeros((n, 3)), np.zeros((n, spec.n_springs)), np.zeros((n, n_sections, 3))
     return Measured(pressure_kpa, payload_kg, tip_m, tip_rotation, spring_m, end_m)
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from calib.fit.blocks import held_out_blocks
 from calib.fit.leastsquares import ridge
+from mjx_softarm.control import allocation
 from mjx_softarm.spec import ArmSpec, Unmodelled
 
 HELD_OUT_BLOCK = 5  # poses
@@ -39,13 +40,14 @@ def fit_held_pressures(
 
     Args:
         spec: calibrated arm.
-        spring_m (m, n) [m]: lengths at rest, in the order of time.
-        measured_kpa (m, n) [kPa]: pressures that held the arm at these lengths.
-        simulated_kpa (m, n) [kPa]: pressures that hold the simulated arm at these lengths.
+        spring_m (m, n_springs) [m]: lengths at rest, in the order of time.
+        measured_kpa (m, n_chambers) [kPa]: pressures that held the arm at these lengths.
+        simulated_kpa (m, n_chambers) [kPa]: pressures that hold the simulated arm at these lengths.
         seed: seed that chooses the contiguous blocks of held-out rows.
     """
-    left_kpa = np.asarray(measured_kpa, float) - simulated_kpa
-    stretched_m = np.asarray(spring_m, float) - spec.geometry.section_length_m
+    spring_m = np.asarray(spring_m, float)
+    left_kpa = _without_redundant_part(np.asarray(measured_kpa, float), spring_m, spec) - simulated_kpa
+    stretched_m = spring_m - spec.at_springs(spec.geometry.section_length_m)
     held_out = held_out_blocks(len(left_kpa), block=HELD_OUT_BLOCK, seed=seed)
     # Fit to the rows that are not held out, in standardised lengths, as the prior acts on these.
     scale_m = np.maximum(stretched_m.std(axis=0), 1e-6)
@@ -55,6 +57,24 @@ def fit_held_pressures(
     after_kpa = left_kpa - stretched_m @ slope - offset_kpa
     found = Unmodelled(tuple(map(float, offset_kpa)), tuple(map(float, slope.T.ravel())))
     return HeldPressures(found, _rms(left_kpa[held_out]), _rms(after_kpa[held_out]))
+
+
+def _without_redundant_part(pressure_kpa: np.ndarray, spring_m: np.ndarray, spec: ArmSpec) -> np.ndarray:
+    """Return the pressures (m, n_chambers) that push alike and that the sensor-space law would hold.
+
+    The law holds no pressure that neither stretches nor bends a section, and poses of a log may.
+    """
+    matrices, chambers = allocation(spec), spec.chambers
+    if matrices is None:
+        return pressure_kpa
+    # Effective areas at the lengths of the chambers, which lie in the plane through their section's springs
+    stretched_m = spring_m @ matrices.chamber_error.T - spec.at_chambers(spec.geometry.section_length_m)
+    area = spec.per_chamber(chambers.area_m2) + stretched_m * spec.per_chamber(chambers.area_slope_m)
+
+    # The same forces and moments by pressures in the planes
+    plane = np.eye(spec.n_chambers) - matrices.redundant
+    push = plane @ (area * pressure_kpa)[..., None]
+    return (np.linalg.pinv(plane @ (area[..., None] * plane)) @ push)[..., 0]
 
 
 def _rms(values: np.ndarray) -> float:

@@ -1,14 +1,14 @@
 """Markers along the arm: the sections' ends, which the fit uses, and length limits of the chambers.
 
-Markers sit on rings, evenly spaced from the base to the tip, equally many in each section, the last on the
-tip's plate. So each section's last plate has a marker, anywhere on it.
+Markers sit on rings, equally many in each section and evenly spaced within it, the last on the tip's plate.
+Each section's last plate has a marker, anywhere on it.
 
 For lengths, at the most bent poses, markers are taken to sit at one site of every ring. Polynomials of fourth
 order X(s), Y(s), Z(s) run through them and through that site of the base. The rings turn with the curve
 without twisting about it, so any other site, such as that of a chamber, has a parallel curve. A chamber is as
 long as its curve within its section.
 
-These polynomials are too smooth for three sections that bend independently: on simulated arms without noise
+These polynomials are too smooth for sections that bend independently: on simulated arms without noise
 the lengths are off by 5 to 11 mm RMS, and by tens of mm at worst. So they only check the fit.
 
 Source: Simulation Calibration and Validation in Meng et al.
@@ -24,7 +24,7 @@ from calib.errors import FitError
 from calib.read.static_poses import StaticPoses
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.posture import posture
-from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
+from mjx_softarm.spec import ArmSpec
 
 ORDER = 4
 N_SAMPLES = 50  # points of a curve, per section
@@ -85,7 +85,8 @@ def marker_limits(poses: StaticPoses, simulated_m: np.ndarray, spec: ArmSpec) ->
     order = np.argsort(-bending_deg)[:N_POSES]
     pose = seen[order]
     # Measure chambers along the curves through their markers.
-    curves = [fit_curve(poses.marker_m[k] @ axes, site_m) for k in pose]  # as if the arm hung
+    share = section_shares(spec, poses.marker_m.shape[1] // spec.structure.n_sections)
+    curves = [fit_curve(poses.marker_m[k] @ axes, site_m, share) for k in pose]  # as if the arm hung
     length_m = np.stack([chamber_lengths(curve, site_m, spec) for curve, _ in curves])
     return MarkerLimits(
         pose=pose,
@@ -99,19 +100,30 @@ def marker_limits(poses: StaticPoses, simulated_m: np.ndarray, spec: ArmSpec) ->
     )
 
 
-def fit_curve(marker_m: np.ndarray, site_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def section_shares(spec: ArmSpec, n: int) -> np.ndarray:
+    """Return how far along the arm n places in each section are, 0 the base, 1 the end.
+
+    Returns:
+        Shares (n n_sections + 1,) of the arm's length, the base first.
+    """
+    length_m = spec.per_section(spec.geometry.section_length_m)
+    ends = np.concatenate([[0.0], np.cumsum(length_m)]) / np.sum(length_m)
+    return np.interp(np.arange(n * len(length_m) + 1) / n, np.arange(len(ends)), ends)
+
+
+def fit_curve(marker_m: np.ndarray, site_m: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Fit polynomials of fourth order through the markers of one pose.
 
     Args:
-        marker_m (n_markers, 3) [m]: evenly spaced along the arm, the last at the tip.
+        marker_m (n_markers, 3) [m]: markers along the arm, the last at the tip.
         site_m (2,) [m]: site of the markers in the rings, where the curve begins in the base.
+        share (n_markers + 1,): places of base and markers along the arm, from `section_shares`.
 
     Returns:
         Coefficients (5, 3), highest power first, in the share s of the arm, 0 at the base and 1 at the tip;
         residuals (n_markers + 1, 3) [m], the base first.
     """
     points = np.vstack([[*site_m, 0.0], marker_m])
-    share = np.linspace(0.0, 1.0, len(points))
     curve = np.polyfit(share, points, ORDER)
     return curve, points - _at(curve, share)
 
@@ -126,7 +138,7 @@ def chamber_lengths(curve: np.ndarray, site_m: np.ndarray, spec: ArmSpec) -> np.
     """
     # Turn the rings with the curve.
     n_sections = spec.structure.n_sections
-    share = np.linspace(0.0, 1.0, n_sections * N_SAMPLES + 1)
+    share = section_shares(spec, N_SAMPLES)
     points = _at(curve, share)
     slope = _at(curve[:-1] * np.arange(ORDER, 0, -1)[:, None], share)
     rotation = _untwisted(-slope / np.linalg.norm(slope, axis=1, keepdims=True))
@@ -134,7 +146,7 @@ def chamber_lengths(curve: np.ndarray, site_m: np.ndarray, spec: ArmSpec) -> np.
     beside = ArmParams.from_spec(spec, np.float64).chamber_site_m.reshape(-1, 2) - site_m
     lines = points + np.einsum("sij,cj->csi", rotation[:, :, :2], beside)
     pieces = np.linalg.norm(np.diff(lines, axis=1), axis=2).reshape(spec.n_chambers, n_sections, N_SAMPLES)
-    section = np.arange(spec.n_chambers) // N_CHAMBERS_PER_SECTION
+    section = np.arange(spec.n_chambers) // spec.structure.chambers_per_section
     return pieces.sum(axis=2)[np.arange(spec.n_chambers), section]
 
 

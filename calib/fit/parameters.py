@@ -4,11 +4,17 @@ Each entry is a change from the specification:
 
 - per chamber: logarithms of the ratios of stiffness and area; slope of the area, in areas per section length;
   rest length, in section lengths
-- backbone: logarithm of the ratio of the bending stiffness
+- backbone: logarithm of the ratio of the bending stiffness, one for all sections
 - mounting: turn of the base about its own x and y, and its offset; roll of each section's holes; turn of the
   measured tip, and its offset within the last plate. A turn of the base about its own z is a roll of all
   sections. An axial offset of the tip cannot be told from an offset of the base.
 - sites of the markers at the sections' ends, each within its plate, since markers are stuck on by hand
+
+A section stretches and bends: three degrees of freedom. Rest lengths of its chambers act through one force
+and two moments, stiffnesses through the entries of a symmetric matrix. Around a circle of chambers these are
+harmonics of order 0 and 1, and of order 0 to 2. Patterns of higher order, such as alternating rest lengths of
+four chambers, change nothing that can be measured. They stay zero: the parameters are the harmonics that act,
+and one number per chamber where all of them do.
 """
 
 from __future__ import annotations
@@ -20,14 +26,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from calib.fit.leastsquares import QUANTILE
+from mjx_softarm._support.fields import scaled
 from mjx_softarm._support.small_matrices import product
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.sensing.pose import rotation_about, rotation_from_quaternion, rotation_vector
-from mjx_softarm.spec import N_CHAMBERS_PER_SECTION, ArmSpec
+from mjx_softarm.spec import ArmSpec, Structure
 
 # The four parameters of a chamber.
 FIELDS = ("stiffness_n_per_m", "area_m2", "area_slope_m", "length_offset_m")
-SHORT = dict(zip(FIELDS, ("stiffness", "area", "slope", "offset"), strict=True))
 BENDING = "bending_stiffness_nm_per_rad"  # field of the backbone
 
 
@@ -39,13 +46,14 @@ class Block(NamedTuple):
     n: int
     prior: float  # standard deviation about the start
     tolerance: float  # error within which a parameter counts as known
+    order: int | None = None  # highest harmonic of a section's chambers that acts; None: all of them
 
 
 BLOCKS = (
-    Block("stiffness", "chamber", 0, 1.0, 0.05),  # prior a factor of e, tolerance 5 %
+    Block("stiffness", "chamber", 0, 1.0, 0.05, order=2),  # prior a factor of e, tolerance 5 %
     Block("area", "chamber", 0, 1.0, 0.05),  # prior a factor of e, tolerance 5 %
     Block("slope", "chamber", 0, 1.0, 0.05),  # prior an area per section length
-    Block("offset", "chamber", 0, 0.25, 0.005),  # prior a quarter of a section, tolerance 1 mm of 200 mm
+    Block("offset", "chamber", 0, 0.25, 0.005, order=1),  # prior a quarter, tolerance 1 mm of 200 mm
     Block(BENDING, "", 1, 1.0, 0.05),  # prior a factor of e, tolerance 5 %
     Block("base turn", "", 2, 0.1, 0.01),  # [rad] prior 6 deg, tolerance 0.6 deg
     Block("base offset", "", 3, 0.01, 0.002),  # [m]
@@ -57,45 +65,72 @@ BLOCKS = (
 )
 
 
-def size(block: Block, spec: ArmSpec) -> int:
-    """Return the number of parameters of a block."""
-    return {"chamber": spec.n_chambers, "section": spec.structure.n_sections, "": block.n}[block.per]
-
-
 def priors(spec: ArmSpec) -> np.ndarray:
     """Return standard deviations (p,) about the start."""
-    return np.concatenate([np.full(size(block, spec), block.prior) for block in BLOCKS])
+    return np.concatenate([np.full(_size(block, spec.structure), block.prior) for block in BLOCKS])
 
 
 def tolerances(spec: ArmSpec) -> np.ndarray:
     """Return errors (p,) within which parameters count as known."""
-    return np.concatenate([np.full(size(block, spec), block.tolerance) for block in BLOCKS])
+    return np.concatenate([np.full(_size(block, spec.structure), block.tolerance) for block in BLOCKS])
 
 
 def names(spec: ArmSpec) -> list[str]:
     """Return the name of each parameter."""
-    return [name for block in BLOCKS for name in _names(block, size(block, spec))]
+    return [name for block in BLOCKS for name in _names(block, spec.structure)]
 
 
-def _names(block: Block, n: int) -> Iterator[str]:
+def without_effect(spec: ArmSpec) -> list[str]:
+    """Return which fields of chambers have patterns around a section that change nothing."""
+    n = spec.structure.n_sections * spec.structure.chambers_per_section
+    each = zip(FIELDS, BLOCKS, strict=False)  # the first blocks are those of the chambers
+    return [field for field, block in each if _size(block, spec.structure) < n]
+
+
+def _size(block: Block, structure: Structure) -> int:
+    """Return the number of parameters of a block."""
+    n, c = structure.n_sections, structure.chambers_per_section
+    return {"chamber": n * _harmonics(block.order, c).shape[1], "section": n, "": block.n}[block.per]
+
+
+def _names(block: Block, structure: Structure) -> Iterator[str]:
+    n, c = _size(block, structure), structure.chambers_per_section
+    if block.per == "chamber" and n < structure.n_sections * c:
+        patterns = ["mean", *(f"{f}{k}" for k in range(1, c) for f in ("cos", "sin"))]
+        per_section = n // structure.n_sections
+        return (f"{block.name}{k // per_section} {patterns[k % per_section]}" for k in range(n))
     if block.per:
         return (f"{block.name}{k}" for k in range(n))
     return iter([block.name] if n == 1 else (f"{block.name} {axis}" for axis in "xyz"[:n]))
 
 
-def _split(x: Array | np.ndarray, n_chambers: int) -> dict[str, Any]:
-    """Return the blocks of x (p,) by name."""
-    sizes = {"chamber": n_chambers, "section": n_chambers // N_CHAMBERS_PER_SECTION}
-    found, start = {}, 0
+def _harmonics(order: int | None, n: int) -> np.ndarray:
+    """Return the patterns (n, m) of a section's n chambers up to an order; the identity where all act."""
+    if order is None or n <= 2 * order + 1:
+        return np.eye(n)
+    angle = 2 * np.pi * np.arange(n) / n
+    waves = [wave(k * angle) for k in range(1, order + 1) for wave in (np.cos, np.sin)]
+    return np.stack([np.ones(n), *waves], axis=-1)
+
+
+def by_name(x: Array | np.ndarray, structure: Structure) -> dict[str, Any]:
+    """Return the blocks of x (p, ...) by name, those of chambers with a number for each chamber."""
+    found, start, n = {}, 0, structure.n_sections
     for block in BLOCKS:
-        stop = start + sizes.get(block.per, block.n)
-        found[block.name], start = x[start:stop], stop
+        stop = start + _size(block, structure)
+        value = x[start:stop]
+        if block.per == "chamber" and stop - start < n * structure.chambers_per_section:
+            patterns = _harmonics(block.order, structure.chambers_per_section)
+            each = value.reshape(n, 1, patterns.shape[1], *value.shape[1:])
+            weight = patterns.reshape(*patterns.shape, *(1 for _ in value.shape[1:])).astype(value.dtype)
+            value = (weight * each).sum(axis=2).reshape(-1, *value.shape[1:])
+        found[block.name], start = value, stop
     return found
 
 
 def with_numbers(x: Array, params: ArmParams) -> ArmParams:
     """Return the arm at x (p,) where `params` is the arm at x = 0."""
-    by = _split(x, params.area.shape[0])
+    by = by_name(x, _structure_of(params))
     bend = jnp.exp(by[BENDING][0])
     joints = params.joint_stiffness.reshape(-1, 3) * jnp.stack([jnp.ones_like(bend), bend, bend])
     mount, zero = params.mount, jnp.zeros(1, x.dtype)
@@ -117,15 +152,21 @@ def with_numbers(x: Array, params: ArmParams) -> ArmParams:
     )
 
 
-def marker_sites(x: Array, n_chambers: int) -> Array:
+def marker_sites(x: Array, params: ArmParams) -> Array:
     """Return where the sections' end markers sit in their plates (n_sections, 3) [m] at x (p,)."""
-    by = _split(x, n_chambers)
+    by = by_name(x, _structure_of(params))
     return jnp.stack([by["marker x"], by["marker y"], jnp.zeros_like(by["marker x"])], axis=-1)
 
 
+def _structure_of(params: ArmParams) -> Structure:
+    n_sections, per_section, _ = params.chamber_site_m.shape
+    return Structure(n_sections, params.link_mass_kg.shape[0] // n_sections, per_section)
+
+
 def _rolled(site_m: Array, roll: Array) -> Array:
+    """Turn sites (n_sections, k, 2) by the rolls (n_sections,) of their sections."""
     cos, sin = jnp.cos(roll)[:, None], jnp.sin(roll)[:, None]
-    x, y = site_m[..., 0], site_m[..., 1]  # (n_sections, k)
+    x, y = site_m[..., 0], site_m[..., 1]
     return jnp.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
 
 
@@ -138,9 +179,9 @@ def _turned(gibbs: Array) -> Array:
 def spec_at(spec: ArmSpec, x: np.ndarray) -> ArmSpec:
     """Return the specification at x (p,) where `spec` is the specification at x = 0."""
     # Change the chambers.
-    by = _split(x, spec.n_chambers)
+    by = by_name(x, spec.structure)
     old = {name: np.array(spec.per_chamber(getattr(spec.chambers, name))) for name in FIELDS}
-    length_m, mounting = spec.geometry.section_length_m, spec.mounting
+    length_m, mounting = spec.at_chambers(spec.geometry.section_length_m), spec.mounting
     chambers = {
         "stiffness_n_per_m": old["stiffness_n_per_m"] * np.exp(by["stiffness"]),
         "area_m2": old["area_m2"] * np.exp(by["area"]),
@@ -158,7 +199,7 @@ def spec_at(spec: ArmSpec, x: np.ndarray) -> ArmSpec:
         "tip_turn_deg": np.degrees(rotation_vector(tip)),
         "tip_offset_m": mounting.tip_offset_m + np.append(by["tip offset"], 0.0),
     }
-    bending = spec.backbone.bending_stiffness_nm_per_rad * float(np.exp(by[BENDING][0]))
+    bending = scaled(spec.backbone.bending_stiffness_nm_per_rad, float(np.exp(by[BENDING][0])))
     return spec.replace(
         chambers={name: tuple(map(float, value)) for name, value in chambers.items()},
         backbone={BENDING: bending},
@@ -166,21 +207,25 @@ def spec_at(spec: ArmSpec, x: np.ndarray) -> ArmSpec:
     )
 
 
-def half_widths(spec: ArmSpec, width: np.ndarray) -> dict[str, np.ndarray]:
-    """Return half-widths by field, in its unit, of parameters known within `width` (p,).
+def half_widths(spec: ArmSpec, covariance: np.ndarray) -> dict[str, np.ndarray]:
+    """Return half-widths of 95 % intervals by field, in its unit.
 
     Args:
         spec: the fitted arm.
-        width (p,): half-widths of the parameters.
+        covariance (p, p): covariance of the parameters.
     """
-    by, length_m = _split(width, spec.n_chambers), spec.geometry.section_length_m
+    # A root of the covariance turns into half-widths row by row, whatever parameters a chamber's number sums
+    values, vectors = np.linalg.eigh(covariance)
+    root = by_name(QUANTILE * vectors * np.sqrt(np.maximum(values, 0.0)), spec.structure)
+    by = {name: np.linalg.norm(rows, axis=1) for name, rows in root.items()}
+    length_m = spec.at_chambers(spec.geometry.section_length_m)
     area = np.array(spec.per_chamber(spec.chambers.area_m2))
     return {
         "stiffness_n_per_m": np.array(spec.per_chamber(spec.chambers.stiffness_n_per_m)) * by["stiffness"],
         "area_m2": area * by["area"],
         "area_slope_m": area / length_m * by["slope"],
         "length_offset_m": length_m * by["offset"],
-        BENDING: np.array(spec.backbone.bending_stiffness_nm_per_rad * by[BENDING][0]),
+        BENDING: np.multiply(spec.backbone.bending_stiffness_nm_per_rad, by[BENDING][0]),
         "base_turn_deg": np.append(np.degrees(by["base turn"]), 0.0),
         "base_offset_m": by["base offset"],
         "section_roll_deg": np.degrees(by["roll"]),

@@ -45,7 +45,7 @@ class SimulatedPoses(NamedTuple):
     """Poses of the simulated arm at commanded spring lengths."""
 
     pose: np.ndarray  # (n, 6) [mm, deg]
-    spring_m: np.ndarray  # (n, n_chambers) lengths reached
+    spring_m: np.ndarray  # (n, n_springs) lengths reached
     pressure_kpa: np.ndarray  # (n, n_chambers) that hold these lengths
     valid: np.ndarray  # (n,) bool, whether the arm settled
     sections: Sections
@@ -83,7 +83,7 @@ def simulate_poses(spec: ArmSpec, reference_m: np.ndarray) -> SimulatedPoses:
 
     Args:
         spec: calibrated arm.
-        reference_m (n, n_chambers) [m]: spring lengths of the real arm, finite, n at least 1.
+        reference_m (n, n_springs) [m]: spring lengths of the real arm, finite, n at least 1.
     """
     # Lift the pressure limits, and settle in batches of one size.
     limit = np.full(spec.n_chambers, PRESSURE_LIMIT_KPA, np.float32)

@@ -16,6 +16,7 @@ Source: Rasmussen, Williams, "Gaussian Processes for Machine Learning", MIT Pres
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -25,7 +26,6 @@ from scipy.linalg import cho_solve, cholesky
 
 from mjx_softarm.mechanics.kinematics import Frames
 from mjx_softarm.mechanics.params import ArmParams
-from mjx_softarm.spec import N_CHAMBERS_PER_SECTION
 
 LENGTHS = (2.0, 3.0, 4.5, 7.0)  # distances of states, see `sections`
 NOISES = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1, 1.0)  # variances over the variance of a section
@@ -40,9 +40,9 @@ class Sections(NamedTuple):
     A movement (6,) is a shift [mm] and a Gibbs vector times `lever_mm`.
     """
 
-    state: np.ndarray | Array  # (n, s, 9), see `sections`
+    state: np.ndarray | Array  # (n, s, 6 + springs of a section), see `sections`
     effect: np.ndarray | Array  # (n, s, 6, 6) tip's movement by a movement of a middle
-    lever_mm: np.ndarray | Array  # (n,) half of a section's length
+    lever_mm: np.ndarray | Array  # (n,) half of the longest section's length
 
     def take(self, rows: np.ndarray) -> Sections:
         """Return some of the arms, chosen by indices or a mask (n,)."""
@@ -60,16 +60,17 @@ class SectionProcess(NamedTuple):
 def sections(frames: Frames, params: ArmParams, spring_m: Array) -> Sections:
     """Return states and effects (s, ...) of the sections of one arm.
 
-    A state holds spring lengths in quarters of a section's length, the vertical in the section's axes, and
-    the moment of the weights below, in units of the whole arm's weight half a section's length aside.
+    A state holds spring lengths in quarters of the section's length, the vertical in the section's axes, and
+    the moment of the weights below, in units of the whole arm's weight half the section's length aside. More
+    than three springs, which tell no more than three, weigh as much as three.
 
     Args:
         frames: plates and joints of the arm at rest.
         params: numbers of the arm.
-        spring_m (n_chambers,) [m]: spring lengths.
+        spring_m (n_springs,) [m]: spring lengths.
     """
     # Find the plate in the middle of each section, and the moment of the weights below it.
-    n_sections, length_m = params.n_sections, params.section_length_m[0]
+    n_sections, length_m = params.n_sections, params.section_length_m
     per_section = params.link_mass_kg.shape[0] // n_sections
     middle = per_section * np.arange(n_sections) + per_section // 2
     position, rotation = frames.plate_position[middle], frames.plate_rotation[middle]
@@ -78,11 +79,12 @@ def sections(frames: Frames, params: ArmParams, spring_m: Array) -> Sections:
     body_kg = jnp.concatenate([params.link_mass_kg, params.tool_mass_kg])
     below = np.arange(len(body_m)) >= middle[:, None]  # (s, bodies)
     lever_kgm = jnp.sum((below * body_kg)[..., None] * (body_m - position[:, None]), axis=1)
-    moment = jnp.cross(lever_kgm, jnp.array([0.0, 0.0, 1.0])) / (0.5 * length_m * body_kg.sum())
+    moment = jnp.cross(lever_kgm, jnp.array([0.0, 0.0, 1.0])) / (0.5 * length_m[:, None] * body_kg.sum())
     local = jnp.einsum("sij,si->sj", rotation, moment)
-    own = spring_m.reshape(n_sections, N_CHAMBERS_PER_SECTION) / (0.25 * length_m)
+    own = spring_m.reshape(n_sections, -1) / (0.25 * length_m[:, None])
+    own = own * math.sqrt(3 / own.shape[1])
     # Let the middle move: the tip moves with it as one rigid body.
-    lever_mm = 500.0 * length_m
+    lever_mm = 500.0 * jnp.max(length_m)
     aside = 1000.0 * (frames.tip_position - position)[:, None, :]
     turned = jnp.cross(jnp.swapaxes(rotation, 1, 2), aside) * 2.0 / lever_mm  # (s, axis of the turn, shift)
     shift = jnp.concatenate([rotation, jnp.swapaxes(turned, 1, 2)], axis=2)

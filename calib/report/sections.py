@@ -15,11 +15,12 @@ from calib.fit.held_pressures import HeldPressures
 from calib.fit.markers import MarkerLimits
 from calib.fit.motion.actuators import ActuatorFit
 from calib.fit.motion.damping import DampingFit
-from calib.fit.parameters import BENDING
+from calib.fit.parameters import BENDING, without_effect
 from calib.fit.pose_errors import PoseErrors
 from calib.fit.s2r import S2RFit
 from calib.fit.sensors import SpringFit
 from calib.report.page import ReportTable, Section
+from mjx_softarm._support.fields import PerSection
 from mjx_softarm.pneumatics import Regulator
 from mjx_softarm.sensing.s2r import correct
 
@@ -85,7 +86,7 @@ def chambers(fit: ChamberFit) -> Section:
         rows.append((f"chamber {k}", *(number for pair in pairs for number in pair)))
     head = ("", *(text for _, title, _ in units for text in (title, "+-")))
     bending = spec.backbone.bending_stiffness_nm_per_rad
-    backbone = ReportTable(("", "value", "+-"), ((BENDING, bending, float(fit.half_width_95[BENDING])),))
+    backbone = ReportTable(("", "value", "+-"), _per_part(BENDING, bending, fit.half_width_95[BENDING]))
     mounting = _mounting(fit)
     errors = _errors(
         ("held-out poses, before", fit.held_out_before),
@@ -99,12 +100,14 @@ def chambers(fit: ChamberFit) -> Section:
     axes.hist(fit.tip_error_mm[fit.is_held_out], bins, density=True, histtype="step", lw=2, label="held out")
     _label(axes, "simulated to measured tip [mm]", "density")
     row_uses = ", ".join(f"{count} {use}" for use, count in fit.rows.items() if count)
+    kept = " and ".join(title.split(" [")[0] for name, title, _ in units if name in without_effect(spec))
     return Section(
         "Chambers",
         f"{fit.poses.n} poses at rest: simulated at the measured pressures against the measured tip and "
         "springs. Rest lengths are relative to the section's. Intervals are 95 %. "
         "The fit is to all poses; the errors are of a fit without the held-out poses. "
-        f"Rows of the logs: {row_uses}.",
+        f"Rows of the logs: {row_uses}."
+        + (f" Patterns of {kept} that neither stretch nor bend a section stay as specified." if kept else ""),
         (ReportTable(head, tuple(rows)), backbone, mounting, errors),
         fit.warnings,
         _plain(fit, "spec", "poses", "is_held_out", "tip_error_mm", "chamber_m")
@@ -112,6 +115,13 @@ def chambers(fit: ChamberFit) -> Section:
         (("simulated to measured tip", figure),),
         fit.notes,
     )
+
+
+def _per_part(name: str, value: PerSection, width: Any) -> tuple[tuple[str, float, float], ...]:
+    """Return rows of a table: one for a number, one for each number of a list."""
+    if not isinstance(value, tuple):
+        return ((name, value, float(width)),)
+    return tuple((f"{name} {k}", x, float(w)) for k, (x, w) in enumerate(zip(value, width, strict=True)))
 
 
 def _mounting(fit: ChamberFit) -> ReportTable:
@@ -186,7 +196,7 @@ def damping(fit: DampingFit) -> Section:
         "damping_ns_per_m": fit.spec.chambers.damping_ns_per_m,
         "bending_damping_nms_per_rad": fit.spec.backbone.bending_damping_nms_per_rad,
     }
-    rows = tuple((name, values[name], float(fit.half_width_95[name])) for name in values)
+    rows = [row for name in values for row in _per_part(name, values[name], fit.half_width_95[name])]
     errors = (
         ("held-out seconds, before", fit.held_out_before_rms_mm),
         ("held-out seconds, calibrated", fit.held_out_rms_mm),
@@ -196,7 +206,7 @@ def damping(fit: DampingFit) -> Section:
         "Damping",
         f"{fit.n_stretches} stretches of the moving arm, {fit.time_s:.0f} s in all: MuJoCo driven with the "
         "measured pressures against the measured tip. Intervals are 95 %.",
-        (ReportTable(("", "value", "+-"), rows), ReportTable(("tip", "RMS [mm]"), errors)),
+        (ReportTable(("", "value", "+-"), tuple(rows)), ReportTable(("tip", "RMS [mm]"), errors)),
         fit.warnings,
         _plain(fit, "spec") | {"values": values},
     )

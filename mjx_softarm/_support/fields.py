@@ -85,6 +85,11 @@ def count(default: Any = dataclasses.MISSING, low: int = 1, high: int = MAX_COUN
     return field(default=default, metadata={"rule": Rule(kind=int, low=low, high=high)})
 
 
+def scaled(value: PerSection, factor: float) -> PerSection:
+    """Return a number, or each number of a list, times a factor."""
+    return tuple(factor * x for x in value) if isinstance(value, tuple) else factor * value
+
+
 def read_fields(cls: type, data: Any, source: str, prefix: str) -> dict[str, Any]:
     """Return the keyword arguments of `cls` from a table, each checked against its rule.
 

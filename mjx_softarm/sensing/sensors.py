@@ -25,7 +25,6 @@ import numpy as np
 from mjx_softarm._support.fields import PerChamber, anything, not_negative, positive, rule_of
 from mjx_softarm._support.xp import Array, array_namespace
 
-N_CHAMBERS_PER_SECTION = 3  # each chamber has one spring beside it
 MU_0_H_PER_M = 1.26e-6  # the paper's value of the vacuum permeability; beta absorbs the last digit
 
 

@@ -53,6 +53,19 @@ def test_far_poses_keep_away_from_those_recorded_and_go_where_the_error_is():
     assert np.mean(np.array(drawn) < 40) > 0.65
 
 
+def test_poses_that_differ_in_redundant_pressures_alone_are_not_far(four_chamber_arm):
+    """Of four chambers, equal pressures in opposite ones and others beside them move nothing."""
+    base = np.zeros((10, 12))
+    alternating, bent = base + 30.0 * np.tile([1.0, -1.0], 6), base + 10.0 * np.tile([1.0, 0.0, -1.0, 0.0], 3)
+    candidates = np.concatenate([alternating, bent]) + np.random.default_rng(0).normal(size=(20, 12))
+    recorded = Recorded(base, np.zeros(10), np.ones(10), np.ones(3))
+    drawn = [
+        choose_far(four_chamber_arm, recorded, candidates, np.array([], int), 1, np.random.default_rng(k))[0]
+        for k in range(40)
+    ]
+    assert np.mean(np.array(drawn) >= 10) > 0.9
+
+
 @pytest.fixture(scope="module")
 def recorded():
     rng = np.random.default_rng(0)

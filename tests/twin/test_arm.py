@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.control import Gains, LawState, pressures
 from mjx_softarm.deploy.drivers.names import open_arm
+from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.mechanics.mjcf import chamber_lengths, spring_lengths
 from mjx_softarm.mechanics.workspace import settle_many
 from mjx_softarm.spec import ArmSpec
@@ -65,6 +66,32 @@ def test_ideal_twin_rests_where_settle_says(spec):
             np.testing.assert_allclose(arm.motion_capture().tip_m, expected.tip_position_m[k], atol=2e-5)
             np.testing.assert_allclose(read_m, expected.spring_m[k], atol=2e-5)
             np.testing.assert_allclose(arm.pressures(), pressure, atol=1e-3)
+
+
+def test_ideal_twins_of_other_arms_rest_where_settle_says(other_arm):
+    """Four chambers a section, six with three springs, sections that differ; some pressures are redundant."""
+    pressure_kpa = 0.5 * random_pressures(other_arm, 1, 3)
+    expected = settle_many(other_arm, pressure_kpa)
+    arm = Twin(0, other_arm, build=IDEAL)
+    hold_pressures(arm, pressure_kpa[0], 12.0)
+    read_m = other_arm.spring_sensor.lengths(arm.read_sensors()).length_m
+    assert expected.settled.all()
+    np.testing.assert_allclose(arm.motion_capture().tip_m, expected.tip_position_m[0], atol=4e-5)
+    np.testing.assert_allclose(read_m, expected.spring_m[0], atol=2e-5)
+
+
+@pytest.mark.parametrize("kind", [Twin, RodTwin])
+def test_twins_of_other_arms_are_as_unlike_as_the_paper_s(kind, other_arm):
+    """Every chamber, spring and section has its own deviation; markers lie at thirds of each section."""
+    arm, ideal = (kind(3, other_arm, build=Build(gap=gap, noise=0.0)) for gap in (1.9, 0.0))
+    readings = arm.read_sensors()
+    assert readings.shape == (other_arm.n_springs,) and (readings != ideal.read_sensors()).all()
+    assert arm.pressures().shape == (other_arm.n_chambers,)
+    off_m = np.linalg.norm(arm.motion_capture().tip_m - ideal.motion_capture().tip_m)
+    assert 2e-3 < off_m < 0.05
+    length_m = np.diff(ideal.motion_capture().marker_m[2::3, 2], prepend=0.0)
+    stretched = -length_m / other_arm.per_section(other_arm.geometry.section_length_m)
+    np.testing.assert_allclose(stretched, 1.05, atol=0.05)  # by the weight below
 
 
 def test_twisted_mounting_turns_the_sections_and_stretches_nothing(spec):

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
+from mjx_softarm import ArmSpec
 from mjx_softarm.mechanics.workspace import settle_many
 from mjx_softarm.twin.rod import GRAVITY_M_S2, Rod, RodParts
+from tests.arms import OTHER_ARMS
 
 LENGTH_M = 0.2
 NONE = np.zeros(9)
@@ -48,6 +50,14 @@ def rest(parts, pressure_kpa=NONE, per_section=12):
     rod = Rod(parts, per_section)
     rod.settle(pressure_kpa[: parts.stiffness.size])
     return rod
+
+
+def as_planes(pressure_kpa, n):
+    """Pressures (k, 3 n) of sections with n chambers in the planes through those (k, 9) of three."""
+    three, many = (np.exp(2j * np.pi * np.arange(k) / k) for k in (3, n))
+    rows = np.linalg.inv(np.stack([np.ones(3), three.real, three.imag], axis=-1))
+    plane = np.stack([np.ones(n), many.real, many.imag], axis=-1) @ rows
+    return (pressure_kpa.reshape(-1, 3, 3) @ plane.T).reshape(len(pressure_kpa), -1)
 
 
 def test_cantilever_bends_and_shears_as_timoshenkos_beam():
@@ -142,17 +152,24 @@ def test_holding_pressures_ends_where_settle_does():
     np.testing.assert_allclose(rod.shape().node_m[-1], expected, atol=2e-6)
 
 
-def test_an_ideal_rod_agrees_with_the_training_model(spec):
-    """Rigid in shear and torsion it is nearly training's chain, whose four links leave 3 mm."""
+@pytest.mark.parametrize("name", ["paper", *OTHER_ARMS])
+def test_an_ideal_rod_agrees_with_the_training_model(name):
+    """Rigid in shear and torsion it is nearly training's chain, whose four links leave 3 mm.
+
+    The tapered arm has five, as its first section is longer and wider.
+    """
     from mjx_softarm.twin.instruments import Build
     from mjx_softarm.twin.rod_twin import RodTwin
 
+    spec = OTHER_ARMS.get(name, ArmSpec.default())
+    spec = spec.replace(structure={"links_per_section": 5 if name == "tapered" else 4})
     pressures = np.array(
         [[0.0] * 9, [-12, 3, -20, -5, -30, 4, 2, -9, -14], [5, -20, -8, -3, 8, -25, -15, 6, -6]]
     )
+    pressures = as_planes(pressures, spec.structure.chambers_per_section)
     expected = settle_many(spec, pressures)
     for kpa, tip_m, spring_m in zip(pressures, expected.tip_position_m, expected.spring_m, strict=True):
-        arm = RodTwin(0, build=Build(gap=0.0, noise=0.0))
+        arm = RodTwin(0, spec, build=Build(gap=0.0, noise=0.0))
         arm.settle(kpa)
         np.testing.assert_allclose(arm.motion_capture().tip_m, tip_m, atol=3e-3)
         np.testing.assert_allclose(arm._rod.spring_lengths(), spring_m, atol=2e-3)

@@ -21,6 +21,7 @@ import numpy as np
 from calib.errors import FitError
 from calib.fit.blocks import held_out_blocks
 from calib.fit.leastsquares import NOT_CONVERGED, Problem, fit
+from mjx_softarm._support.fields import PerSection, scaled
 from mjx_softarm.logs.rest import HOLD_KPA
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mechanics.mjcf import build_model, steps_per_period
@@ -53,7 +54,7 @@ class DampingFit:
     """Calibrated damping and whether to trust it. Errors are RMS distances of simulated to measured tips."""
 
     spec: ArmSpec
-    half_width_95: Mapping[str, float]  # half-widths of the 95 % intervals of the two dampings
+    half_width_95: Mapping[str, PerSection]  # half-widths of the 95 % intervals of the two dampings
     in_sample_rms_mm: float  # seconds of the fit
     held_out_rms_mm: float  # held-out seconds
     held_out_before_rms_mm: float  # held-out seconds, with the specification of the start
@@ -78,10 +79,11 @@ def fit_damping(stretches: Sequence[Stretch], spec: ArmSpec, seed: int = 0) -> D
     Raises:
         FitError: the specified damping is zero.
     """
-    if not (spec.chambers.damping_ns_per_m > 0 and spec.backbone.bending_damping_nms_per_rad > 0):
+    both = spec.chambers.damping_ns_per_m, spec.backbone.bending_damping_nms_per_rad
+    if not all(np.all(np.greater(damping, 0.0)) for damping in both):
         raise FitError(
-            f"damping: got chambers.damping_ns_per_m {spec.chambers.damping_ns_per_m:g} and "
-            f"backbone.bending_damping_nms_per_rad {spec.backbone.bending_damping_nms_per_rad:g}, "
+            f"damping: got chambers.damping_ns_per_m {both[0]!r} and "
+            f"backbone.bending_damping_nms_per_rad {both[1]!r}, "
             "expected both above 0"
         )
     # Fit to the seconds that are not held out.
@@ -106,8 +108,10 @@ def fit_damping(stretches: Sequence[Stretch], spec: ArmSpec, seed: int = 0) -> D
     done = DampingFit(
         spec=calibrated,
         half_width_95={
-            "damping_ns_per_m": float(widths[0] * calibrated.chambers.damping_ns_per_m),
-            "bending_damping_nms_per_rad": float(widths[1] * calibrated.backbone.bending_damping_nms_per_rad),
+            "damping_ns_per_m": scaled(calibrated.chambers.damping_ns_per_m, float(widths[0])),
+            "bending_damping_nms_per_rad": scaled(
+                calibrated.backbone.bending_damping_nms_per_rad, float(widths[1])
+            ),
         },
         in_sample_rms_mm=_rms_mm(after[~held_out]),
         held_out_rms_mm=_rms_mm(after[held_out]),
@@ -151,11 +155,11 @@ def find_stretches(logs: Sequence[Log], spec: ArmSpec) -> list[Stretch]:
 
 def damped(spec: ArmSpec, x: np.ndarray) -> ArmSpec:
     """Return the arm with the damping of chambers and backbone times exp(x), (2,)."""
-    chambers, bending = np.exp(x)
+    chambers, bending = map(float, np.exp(x))
     backbone = spec.backbone.bending_damping_nms_per_rad
     return spec.replace(
-        chambers={"damping_ns_per_m": float(chambers * spec.chambers.damping_ns_per_m)},
-        backbone={"bending_damping_nms_per_rad": float(bending * backbone)},
+        chambers={"damping_ns_per_m": scaled(spec.chambers.damping_ns_per_m, chambers)},
+        backbone={"bending_damping_nms_per_rad": scaled(backbone, bending)},
     )
 
 

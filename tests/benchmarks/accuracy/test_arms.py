@@ -1,11 +1,14 @@
-"""Commands that the benchmark of other arms runs: which exit statuses end it."""
+"""Commands of the benchmark of arms: exit statuses that end it, and what it leaves out the next time."""
 
 import contextlib
+import json
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
+from benchmarks.accuracy import arms
 from benchmarks.accuracy.arms import run_command
 from mjx_softarm._support.errors import InputError
 
@@ -21,3 +24,50 @@ def test_a_command_with_results_goes_on_with_its_status_and_one_that_failed_ends
     with contextlib.nullcontext() if status in (0, 1) else pytest.raises(InputError, match=told):
         assert run_command("calib", "run", 3) == status
     assert asked == [[sys.executable, "-m", "calib", "run", "3"]]
+
+
+def test_an_interrupted_arm_goes_on_and_a_refused_goal_misses_the_target(tmp_path, monkeypatch):
+    """Commands that only leave their results, the training interrupted once."""
+    asked, accuracy = (
+        [],
+        {"points": 4, "measured": 4, "max_mm": 5.0}
+        | dict.fromkeys(
+            ("reached", "translation_mm", "translation_95_mm", "rotation_deg", "saturated_points"), 2.0
+        ),
+    )
+    figures = {"Chambers": {"weak": []}}
+    figures["Sim-to-real network"] = {x: {"translation_mean_mm": 1.0} for x in ("test", "test_uncorrected")}
+    report = {"trustworthy": True, "parts": {title: {"figures": of} for title, of in figures.items()}}
+
+    def leave(*words):
+        asked.append(words[:2] if words[0] != "train" else words[:3])
+        path = Path(words[-1])
+        if words[1:3] == ("reach", "--resume"):
+            (path / "evaluation.json").write_text("{}")
+        elif words[1] == "reach":
+            path.mkdir()
+            (path / "config.json").write_text("{}")
+            raise KeyboardInterrupt
+        elif words[1] == "record":
+            path.touch()
+        elif words[1] == "export":
+            (path / "policy.npz").touch()
+        else:
+            path.mkdir()
+            name, what = ("report.json", report) if words[0] == "calib" else ("accuracy.json", accuracy)
+            (path / name).write_text(json.dumps(what))
+
+    monkeypatch.setattr(arms, "run_command", leave)
+    monkeypatch.setattr(arms, "write_circle", lambda file, policy, n: file.touch())
+    with pytest.raises(KeyboardInterrupt):
+        arms._measure("upright", tmp_path, 300, "analytic", None, 4)
+    assert [words[1] for words in asked] == ["record", "record", "run", "reach"]
+    for expected in (["reach", "export", "measure", "measure"], []):
+        asked.clear()
+        found = arms._measure("upright", tmp_path, 300, "analytic", None, 4)
+        assert [words[1] for words in asked] == expected
+    missed = found | {"circle, measured": 3}
+    far = found | {"circle, mean [mm]": 3.01}
+    rows = arms.targets([found, missed, far], ["a", "b", "c"])
+    assert [row["verdict"] for row in rows] == ["met", "NOT MET", "NOT MET"]
+    assert rows[1]["measured"] == "0.33% in the mean, 1 of 4 goals refused"

@@ -13,10 +13,13 @@ from calib.fit.chambers import fit_chambers
 from calib.fit.parameters import BENDING, FIELDS
 from calib.read.measurements import measure
 from mjx_softarm import ArmSpec
+from mjx_softarm._support.fields import scaled
+from mjx_softarm.control import allocation
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mechanics import excitation
 from mjx_softarm.mechanics.kinematics import ChainKinematics
 from mjx_softarm.mechanics.workspace import settle_many
+from tests.arms import OTHER_ARMS
 
 SPEC = ArmSpec.default()
 MOUNTING = {
@@ -29,26 +32,26 @@ MOUNTING = {
 TIP_NOISE_M, TURN_NOISE_RAD, PRESSURE_NOISE_KPA, SPRING_NOISE_M = 5e-4, np.radians(0.3), 0.1, 5e-4
 
 
-def planted(seed=0):
-    """An arm whose chambers and backbone are unlike those of SPEC."""
-    rng, chambers = np.random.default_rng(seed), SPEC.chambers
+def planted(seed=0, spec=SPEC):
+    """An arm whose chambers and backbone are unlike those of a specification."""
+    rng, chambers, n = np.random.default_rng(seed), spec.chambers, spec.n_chambers
 
     def off(value, spread):
-        return tuple(float(x) for x in value * (1.0 + rng.uniform(-spread, spread, 9)))
+        return tuple((spec.per_chamber(value) * (1.0 + rng.uniform(-spread, spread, n))).tolist())
 
-    return SPEC.replace(
+    return spec.replace(
         chambers={
             "stiffness_n_per_m": off(chambers.stiffness_n_per_m, 0.2),
             "area_m2": off(chambers.area_m2, 0.1),
             "area_slope_m": off(chambers.area_slope_m, 0.2),
-            "length_offset_m": tuple(float(x) for x in rng.uniform(-5e-3, 5e-3, 9)),
+            "length_offset_m": tuple(rng.uniform(-5e-3, 5e-3, n).tolist()),
         },
-        backbone={BENDING: 1.1 * SPEC.backbone.bending_stiffness_nm_per_rad},
+        backbone={BENDING: scaled(spec.backbone.bending_stiffness_nm_per_rad, 1.1)},
     )
 
 
-def random_pressures(n, seed):
-    swing = np.cos(np.random.default_rng(seed).uniform(0.0, np.pi, (n, 9)))
+def random_pressures(n, seed, spec=SPEC):
+    swing = np.cos(np.random.default_rng(seed).uniform(0.0, np.pi, (n, spec.n_chambers)))
     low, high = SPEC.chambers.pressure_min_kpa, SPEC.chambers.pressure_max_kpa
     return low + (high - low) * 0.5 * (1.0 + swing)
 
@@ -65,7 +68,7 @@ def quaternions(rotation, turn_rad):
 
 def pose_log(arm, n, seed, pressure_kpa=None, **changes):
     """One row every five seconds, each another pose at rest, with noise."""
-    pressure_kpa = random_pressures(n, seed) if pressure_kpa is None else pressure_kpa
+    pressure_kpa = random_pressures(n, seed, arm) if pressure_kpa is None else pressure_kpa
     n = len(pressure_kpa)
     found, rng = settle_many(arm, pressure_kpa), np.random.default_rng([seed, 1])
     assert found.settled.all()
@@ -77,7 +80,7 @@ def pose_log(arm, n, seed, pressure_kpa=None, **changes):
         source="poses.csv",
         row=np.arange(n) + 2,
         time_s=5.0 * np.arange(n),
-        spring_m=found.spring_m + noise(SPRING_NOISE_M, arm.n_chambers),
+        spring_m=found.spring_m + noise(SPRING_NOISE_M, arm.n_springs),
         pressure_kpa=pressure_kpa + noise(PRESSURE_NOISE_KPA, arm.n_chambers),
         tip_m=found.tip_position_m + noise(TIP_NOISE_M, 3),
         tip_quaternion=quaternions(found.tip_rotation, noise(TURN_NOISE_RAD, 3)),
@@ -99,7 +102,7 @@ def off_by(found, arm):
 
 def tip_error_mm(found, arm, n=200):
     """Distance of two arms' tips at pressures that no fit has seen, without noise."""
-    a, b = (settle_many(x, random_pressures(n, 99)).tip_position_m for x in (found, arm))
+    a, b = (settle_many(x, random_pressures(n, 99, x)).tip_position_m for x in (found, arm))
     return 1e3 * np.linalg.norm(a - b, axis=1)
 
 
@@ -138,6 +141,29 @@ def test_mounting_comes_back_with_intervals_and_a_turned_quaternion_is_told(fitt
         assert (error < 2.0 * fitted.half_width_95[name] + 1e-9).mean() > 0.6
     assert fitted.held_out_before.rotation_mean_deg > 4.0 > 1.0 > fitted.held_out.rotation_mean_deg
     assert "quaternion is 5." in fitted.notes[0] and fitted_without_springs.notes == ()
+
+
+@pytest.mark.parametrize("name", OTHER_ARMS)
+def test_arms_of_other_structure_come_back(name):
+    """From 80 poses, as well as the paper's arm; of redundant rest lengths only the part that acts.
+
+    Unknown directions, for which 80 poses are few, hardly move the tip.
+    """
+    spec = OTHER_ARMS[name].replace(structure={"links_per_section": 2})
+    arm = planted(spec=spec)
+    fit = calibrate_chambers(pose_log(arm, 80, seed=0), spec)
+    _, area, slope, _ = off_by(fit.spec, arm)
+    assert area < 0.05 and slope < 0.15 and fit.weak_tip_mm.max(initial=0.0) < 1.0
+    assert tip_error_mm(spec, arm).mean() > 4.0 > 0.7 > tip_error_mm(fit.spec, arm).mean()
+    assert fit.held_out.translation_mean_mm < 1e3 * 1.6 * TIP_NOISE_M * 1.5
+
+    # Rest lengths push with the chambers' stiffnesses: the same forces and moments by lengths in planes
+    matrices, stiffness = allocation(spec), np.diag(arm.chambers.stiffness_n_per_m)
+    plane = np.eye(spec.n_chambers) - (0.0 if matrices is None else matrices.redundant)
+    expected = np.linalg.pinv(plane @ stiffness @ plane) @ plane @ stiffness @ arm.chambers.length_offset_m
+    np.testing.assert_allclose(fit.spec.chambers.length_offset_m, expected, atol=1.5e-3)
+    low_m, high_m = fit.spec.springs.length_min_m, fit.spec.springs.length_max_m
+    assert isinstance(low_m, tuple) == isinstance(high_m, tuple) == (name == "tapered")
 
 
 def test_without_springs_stiffness_and_area_come_back_and_the_offsets_are_said_to_be_unknown(

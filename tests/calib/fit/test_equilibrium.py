@@ -38,3 +38,22 @@ def test_chambers_that_are_off_move_the_tip_as_those_of_such_an_arm(what):
         moved_m.append(away_m[low.settled & high.settled])
     expected = np.max(np.concatenate(moved_m))
     assert tip_changes(SPEC, x, far[:, None])[0] == pytest.approx(expected, rel=0.1)
+
+
+ALTERNATING = [(4, "length_offset_m", 2, 3), (6, "stiffness_n_per_m", 3, 8)]
+
+
+@pytest.mark.parametrize(("n_chambers", "field", "order", "n_more"), ALTERNATING)
+def test_patterns_that_are_no_parameters_move_nothing(n_chambers, field, order, n_more):
+    """Alternating rest lengths of four chambers, stiffnesses of six; a pattern of lower order does much."""
+    structure = {"n_sections": 1, "links_per_section": 2, "chambers_per_section": n_chambers}
+    spec = ArmSpec.default().replace(structure=structure)
+    size = 5e-3 if field == "length_offset_m" else 0.1 * spec.chambers.stiffness_n_per_m
+    pressure_kpa, tip_m = 0.5 * random_pressures(spec, 40, 0), []
+    for k in (0, order, order - 1):
+        off = (k > 0) * size * np.cos(2 * np.pi * k * np.arange(n_chambers) / n_chambers)
+        value = tuple((getattr(spec.chambers, field) + off).tolist())
+        tip_m.append(settle_many(spec.replace(chambers={field: value}), pressure_kpa).tip_position_m)
+    moved, more = (1e3 * np.linalg.norm(x - tip_m[0], axis=1).max() for x in tip_m[1:])
+    assert moved < 0.1 < 0.5 < more
+    assert len(names(spec)) == len(NAMES) + n_more

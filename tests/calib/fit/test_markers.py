@@ -4,12 +4,20 @@ import mujoco
 import numpy as np
 import pytest
 
-from calib.fit.markers import N_POSES, chamber_lengths, fit_curve, marker_limits, section_ends
+from calib.fit.markers import (
+    N_POSES,
+    chamber_lengths,
+    fit_curve,
+    marker_limits,
+    section_ends,
+    section_shares,
+)
 from calib.read.static_poses import StaticPoses
 from mjx_softarm import ArmSpec
 from mjx_softarm.mechanics.mjcf import build_model
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.workspace import settle_many
+from tests.arms import FOUR_CHAMBERS, TAPERED
 
 SPEC = ArmSpec.default().replace(structure={"links_per_section": 6})  # markers are at thirds of a section
 SITE_M = ArmParams.from_spec(SPEC, np.float64).chamber_site_m.reshape(-1, 2)
@@ -53,16 +61,19 @@ def bent(bend_rad, length_m, site_m):
 
 def test_a_straight_arm_has_its_length_everywhere():
     site = np.array([0.03, 0.02])
-    marker_m = np.outer(np.arange(1, 10) / 9, [0.0, 0.0, -0.63]) + [*site, 0.0]
-    curve, left = fit_curve(marker_m, site)
-    np.testing.assert_allclose(chamber_lengths(curve, site, SPEC), 0.21, rtol=1e-9)
-    assert np.abs(left).max() < 1e-12
+    for arm in (SPEC, TAPERED, FOUR_CHAMBERS):
+        share = section_shares(arm, 3)
+        marker_m = np.outer(share[1:], [0.0, 0.0, -1.05 * arm.length_m]) + [*site, 0.0]
+        curve, left = fit_curve(marker_m, site, share)
+        expected = 1.05 * arm.at_chambers(arm.geometry.section_length_m)
+        np.testing.assert_allclose(chamber_lengths(curve, site, arm), expected, rtol=1e-9)
+        assert np.abs(left).max() < 1e-12
 
 
 @pytest.mark.parametrize("site", [(0.0, 0.0), (0.0, 0.067), (0.03, -0.02)])
 def test_a_circle_s_chambers_differ_by_their_distance_from_its_centre(site):
     """A chamber y nearer to the centre of a bend by b is shorter by y b."""
-    curve, left = fit_curve(bent(1.2, 0.6, site), np.array(site))
+    curve, left = fit_curve(bent(1.2, 0.6, site), np.array(site), section_shares(SPEC, 3))
     expected = (0.6 - 1.2 * SITE_M[:, 1]) / 3
     np.testing.assert_allclose(chamber_lengths(curve, np.array(site), SPEC), expected, rtol=0.01)
     assert np.abs(left).max() < 3e-4
@@ -72,7 +83,7 @@ def test_a_circle_s_chambers_differ_by_their_distance_from_its_centre(site):
 def test_simulated_arms_are_met_as_coarsely_as_the_module_says(arm, kind, rms_m, residual_mm):
     poses, length_m = poses_with_markers(arm, kind)
     limits = marker_limits(poses, length_m, SPEC)
-    expected_site = getattr(ArmParams.from_spec(SPEC, np.float64), f"{kind}_site_m")[0]
+    expected_site = getattr(ArmParams.from_spec(SPEC, np.float64), f"{kind}_site_m")[0, 0]
     np.testing.assert_allclose(limits.marker_site_m, expected_site, atol=1e-6)
     assert len(limits.pose) == N_POSES
     assert (np.diff(limits.bending_deg) <= 0).all()
