@@ -46,10 +46,11 @@ class TrainConfig:
         self.learner.check(self.env)
 
     def with_policy_of(self, donor: TrainConfig) -> Self:
-        """Return these settings with hidden layers of the policy as in a run that it is taken from."""
-        return dataclasses.replace(
-            self, learner=dataclasses.replace(self.learner, hidden=donor.learner.hidden)
-        )
+        """Return these settings for a run that begins with another's policy, with its hidden layers."""
+        learner = dataclasses.replace(self.learner, hidden=donor.learner.hidden)
+        if type(learner) is TQCConfig and self.env.moves:
+            learner = dataclasses.replace(learner, from_policy=True)
+        return dataclasses.replace(self, learner=learner)
 
     def evaluates_after(self, epoch: int) -> bool:
         """Return whether an evaluation and a checkpoint follow the n-th epoch."""

@@ -53,6 +53,13 @@ def test_demonstrations_know_no_payload():
         override(IMITATION_PRESETS["pipe"], ["env.observation=payload"])
 
 
+@pytest.mark.parametrize("preset, keeps", [("motion", True), ("quick", False), ("motion-analytic", False)])
+def test_tqc_in_motion_keeps_to_the_policy_that_it_begins_with(preset, keeps):
+    donor = override(PRESETS["analytic"], ["learner.hidden=[32]"])
+    learner = PRESETS[preset].with_policy_of(donor).learner
+    assert learner.hidden == (32,) and getattr(learner, "from_policy", False) == keeps
+
+
 @pytest.mark.parametrize("config", [*PRESETS.values(), *IMITATION_PRESETS.values()])
 def test_presets_survive_json(config):
     assert from_dict(json.loads(json.dumps(to_dict(config)))) == config

@@ -140,6 +140,15 @@ class Transition(NamedTuple):
     next_obs: Array  # (B, O) reached by the action, before any reset
     terminated: Array  # (B,) float: 1 where the next value is zero, else 0
 
+    def check(self, obs_size: int, action_size: int) -> None:
+        """Raise ValueError naming a field of the wrong shape."""
+        n = self.obs.shape[0]
+        sizes = {"obs": (obs_size,), "action": (action_size,), "next_obs": (obs_size,)}
+        for name, value in self._asdict().items():
+            expected = (n, *sizes.get(name, ()))
+            if value.shape != expected:
+                raise ValueError(f"Transition.{name}: got shape {value.shape}, expected {expected}")
+
 
 class Explored(NamedTuple):
     """Actions that explore."""

@@ -9,7 +9,6 @@ Shapes: B batch, O observation, A action, C critics, M quantiles per critic, K k
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -21,6 +20,7 @@ from jax import Array
 
 from mjx_softarm._support import draws
 from mjx_softarm.env import EnvConfig, ReachEnv
+from train.agent import prior
 from train.agent.descent import descend, learning_rate
 from train.agent.hindsight import HindsightConfig, relabel
 from train.agent.learner import (
@@ -33,11 +33,10 @@ from train.agent.learner import (
     check_settings,
 )
 from train.agent.losses import actor_loss, alpha_loss, quantile_huber_loss, truncated_targets
-from train.agent.networks import Actor, Critics, check_same_shapes, mode, squash, widened
+from train.agent.networks import Actor, Critics, check_same_shapes, given_actor, mode, own_buffers, squash
 from train.agent.prediction import PredictiveCritics, Predictor
 
 Params = Any  # a flax parameter tree
-GIVEN_LOG_STD = -4.0  # initial exploration noise of a pretrained actor: log standard deviation before tanh
 
 
 @dataclass(frozen=True)
@@ -60,6 +59,7 @@ class TQCConfig(ReplayConfig):
     tau: float = 0.005  # Polyak rate of the target critics and of the mean actor, per update
     initial_alpha: float = 1.0  # initial temperature
     target_entropy: float | None = None  # target entropy [nat]; None is minus the number of actions
+    from_policy: bool = False  # whether a run in motion begins with a policy and keeps to it; see `prior`
     reward_scale: float = 1.0  # factor on every reward in the critics' targets
     hindsight: HindsightConfig = field(default_factory=HindsightConfig)
     """relabelled goals, as shares of a batch; the rest keeps its own goals"""
@@ -97,6 +97,7 @@ class TQCState(NamedTuple):
     actor_opt_state: optax.OptState
     critic_opt_state: optax.OptState
     alpha_opt_state: optax.OptState
+    given_params: Params | None = None  # actor that the run began with; None where it has no hold
 
 
 # Fields of the state by the names of the parts that another run may begin with, beside the policy.
@@ -115,15 +116,18 @@ class TQC:
         )
         if config.n_ahead:
             self.critics = PredictiveCritics(self.critics, Predictor(config.hidden_critic), config.n_ahead)
-        self.optimizer = optax.adam(learning_rate(config, config.learning_rate, config.learning_rate_end))
+        rate = learning_rate(config, config.learning_rate, config.learning_rate_end)
+        self.optimizer = self.actor_optimizer = optax.adam(rate)
         self.alpha_optimizer = optax.adam(config.learning_rate_alpha)
+        if config.from_policy:
+            self.actor_optimizer = optax.adam(prior.held_back(rate, prior.RATE_SHARE))
+            self.alpha_optimizer = optax.adam(prior.held_back(config.learning_rate_alpha))
         self.target_entropy = -float(action_size) if config.target_entropy is None else config.target_entropy
 
     def init(self, key: Array) -> TQCState:
         """Return fresh parameters; target critics and mean actor start as copies."""
         key_actor, key_critic = jax.random.split(key)
         obs = jnp.zeros((1, self.obs_size))
-        own_buffers = functools.partial(jax.tree.map, jnp.copy)  # so that a state can be donated
         actor_params = self.actor.init(key_actor, obs)
         critic_params = self.critics.init(key_critic, obs, jnp.zeros((1, self.action_size)))
         log_alpha = jnp.log(jnp.asarray(self.config.initial_alpha, obs.dtype))
@@ -133,9 +137,10 @@ class TQC:
             critic_params=critic_params,
             target_params=own_buffers(critic_params),
             log_alpha=log_alpha,
-            actor_opt_state=self.optimizer.init(actor_params),
+            actor_opt_state=self.actor_optimizer.init(actor_params),
             critic_opt_state=self.optimizer.init(critic_params),
             alpha_opt_state=self.alpha_optimizer.init(log_alpha),
+            given_params=own_buffers(actor_params) if self.config.from_policy else None,
         )
 
     def parts(self, state: TQCState) -> dict[str, Params]:
@@ -153,12 +158,10 @@ class TQC:
 
     def adopt_policy(self, state: TQCState, given: Params) -> TQCState:
         """Return the state with a given actor's means and little exploration; it may observe less."""
-        actor = widened(given, self.obs_size)
-        head = actor["params"]["head"]
-        head["kernel"] = head["kernel"].at[:, self.action_size :].set(0.0)
-        head["bias"] = head["bias"].at[self.action_size :].set(GIVEN_LOG_STD)
+        actor = given_actor(given, self.obs_size, self.action_size)
         check_same_shapes("actor", actor, state.actor_params)
-        return state._replace(actor_params=actor, mean_actor_params=jax.tree.map(jnp.copy, actor))
+        given = own_buffers(actor) if self.config.from_policy else None
+        return state._replace(actor_params=actor, mean_actor_params=own_buffers(actor), given_params=given)
 
     def act(self, state: TQCState, obs: Array, key: Array) -> Array:
         """Sample an action (..., A) in (-1, 1) at obs (..., O)."""
@@ -184,7 +187,7 @@ class TQC:
         Raises:
             ValueError: a field of `batch` has the wrong shape.
         """
-        self._check_shapes(batch)
+        batch.check(self.obs_size, self.action_size)
         # Targets of the critics, constants of the step.
         noise, next_noise = draws.normal(key, (2, *batch.action.shape))  # (B, A) each
         targets = self._targets(state, batch, next_noise)  # (B, K)
@@ -198,7 +201,7 @@ class TQC:
 
         # Optimiser steps, and Polyak averages of their results.
         critic = descend(self.optimizer, d_critic, state.critic_opt_state, state.critic_params)
-        actor = descend(self.optimizer, d_actor, state.actor_opt_state, state.actor_params)
+        actor = descend(self.actor_optimizer, d_actor, state.actor_opt_state, state.actor_params)
         temperature = descend(self.alpha_optimizer, d_alpha, state.alpha_opt_state, state.log_alpha)
         next_state = TQCState(
             actor_params=actor[0],
@@ -209,15 +212,15 @@ class TQC:
             actor_opt_state=actor[1],
             critic_opt_state=critic[1],
             alpha_opt_state=temperature[1],
+            given_params=state.given_params,
         )
         losses = {"actor_loss": loss_actor, "alpha_loss": loss_alpha, **critic_metrics}
         means = {"entropy": -jnp.mean(log_prob), "target_mean": jnp.mean(targets)}
         return next_state, {**losses, **means, "alpha": jnp.exp(state.log_alpha)}
 
     def _targets(self, state: TQCState, batch: Transition, noise: Array) -> Array:
-        next_action, next_log_prob = squash(  # (B, A), (B,)
-            *self.actor.apply(state.actor_params, batch.next_obs), noise=noise
-        )
+        next_actor = self.actor.apply(state.actor_params, batch.next_obs)
+        next_action, next_log_prob = squash(*next_actor, noise=noise)  # (B, A), (B,)
         return truncated_targets(
             self.critics.apply(state.target_params, batch.next_obs, next_action),  # (B, C, M)
             next_log_prob,
@@ -240,15 +243,12 @@ class TQC:
     def _actor_loss(self, params: Params, state: TQCState, obs: Array, noise: Array) -> tuple[Array, Array]:
         action, log_prob = squash(*self.actor.apply(params, obs), noise=noise)  # (B, A), (B,)
         quantiles = self.critics.apply(state.critic_params, obs, action)  # (B, C, M)
-        return actor_loss(log_prob, quantiles, jnp.exp(state.log_alpha)), log_prob
-
-    def _check_shapes(self, batch: Transition) -> None:
-        n = batch.obs.shape[0]
-        sizes = {"obs": (self.obs_size,), "action": (self.action_size,), "next_obs": (self.obs_size,)}
-        for name, value in batch._asdict().items():
-            expected = (n, *sizes.get(name, ()))
-            if value.shape != expected:
-                raise ValueError(f"Transition.{name}: got shape {value.shape}, expected {expected}")
+        loss = actor_loss(log_prob, quantiles, jnp.exp(state.log_alpha))
+        if state.given_params is not None:
+            actions = self.mode(params, obs), self.mode(state.given_params, obs)
+            n_updates = state.critic_opt_state[0].count
+            loss += prior.departure_cost(obs, *actions, n_updates / self.config.n_decay_updates)
+        return loss, log_prob
 
 
 class HindsightTQC(Learner):
