@@ -44,8 +44,8 @@ class Reach(ReachOptions):
     """Train a policy that reaches poses of the workspace."""
 
     agent: cli.MaybePath = None
-    """run whose actor and critics this one begins with; in motion, only the policy. The widths of its hidden
-    layers are taken, too"""
+    """run whose actor and critics this one begins with; in motion, only the policy, which TQC keeps to while
+    its critics learn. The widths of its hidden layers are taken, too"""
     devices: Devices = None
 
     def __call__(self) -> int:
