@@ -55,8 +55,8 @@ class Reach(ReachOptions):
             self.check_resume_alone(self.default([]))
             return _resume(self.resume, mesh, console)
         agent = Run.open(self.agent) if self.agent else None
-        if agent is None and getattr(self.config.learner, "from_policy", False):
-            raise ConfigError("learner.from_policy: got true, expected --agent RUN, the run with the policy")
+        if getattr(self.config.learner, "from_policy", False) and not (agent and self.config.env.moves):
+            raise ConfigError("learner.from_policy: got true, expected it only with --agent RUN, in motion")
         config = self.config.with_policy_of(agent.config) if agent else self.config
         spec, s2r = self.read_arm(console)
         console.print("drawing goals from the reachable workspace ...")
