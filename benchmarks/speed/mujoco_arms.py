@@ -129,12 +129,7 @@ class SteppedArms:
         pressure_kpa = np.zeros((self.n, self.spec.n_chambers))
         while len(moving):
             arms = moving if len(moving) < self.n else slice(None)  # a slice copies nothing
-            law = control.LawState(*(memory[arms] for memory in self._law))
-            pressure_kpa[arms], law = control.pressures(
-                reference_m[arms], self.length_m[arms], law, self.gains, self.period_s
-            )
-            self._remember(arms, law)
-            self._step(arms, pressure_kpa[arms])
+            pressure_kpa[arms] = self._tick(arms, reference_m[arms])
             n_physics += len(moving) * self._n_steps
             moving = moving[~rest.after(self.length_m[arms], arms)]
         if self._rollout is None:
@@ -148,13 +143,19 @@ class SteppedArms:
         """Hold references (n, n_springs) for a time; return the tips (ticks, n, 3) [mm] after each period."""
         tips_mm = np.empty((round(seconds / self.period_s), self.n, 3))
         for tick in range(len(tips_mm)):
-            law = control.LawState(*self._law)
-            pressure_kpa, self._law[:] = control.pressures(
-                reference_m, self.length_m, law, self.gains, self.period_s
-            )
-            self._step(slice(None), pressure_kpa)
+            self._tick(slice(None), reference_m)
             tips_mm[tick] = 1e3 * self._tip[:, :3]
         return tips_mm
+
+    def _tick(self, arms: slice | np.ndarray, reference_m: np.ndarray) -> np.ndarray:
+        """Run the law and a control period of some arms; return the pressures (k, n_chambers)."""
+        law = control.LawState(*(memory[arms] for memory in self._law))
+        pressure_kpa, law = control.pressures(
+            reference_m, self.length_m[arms], law, self.gains, self.period_s
+        )
+        self._remember(arms, law)
+        self._step(arms, pressure_kpa)
+        return pressure_kpa
 
     def _step(self, arms: slice | np.ndarray, pressure_kpa: np.ndarray) -> None:
         """Hold pressures (k, n_chambers) of some arms for a control period, and read springs and tips."""
