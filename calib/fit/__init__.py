@@ -1,1 +1,1 @@
-"""Fits: springs, chambers, damping and the sim-to-real network."""
+"""Fits: springs, chambers, actuators, damping and the sim-to-real network."""
