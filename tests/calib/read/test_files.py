@@ -78,7 +78,7 @@ def test_npz_of_other_things(tmp_path, columns, table, message):
         read_log(tmp_path / "a.npz")
 
 
-def test_folder_missing_file_and_missing_permission(tmp_path, monkeypatch):
+def test_folder_missing_file_and_missing_permission(spec, tmp_path, monkeypatch):
     for name, message in (("", "Is a directory"), ("no.csv", "No such file"), ("no.npz", "No such")):
         with pytest.raises(LogError, match=f"^{tmp_path / name}: .*{message}"):
             read_log(tmp_path / name)
@@ -88,7 +88,7 @@ def test_folder_missing_file_and_missing_permission(tmp_path, monkeypatch):
 
     monkeypatch.setattr("pathlib.Path.open", refuse)  # chmod does not stop a superuser
     with pytest.raises(LogError, match="a.csv: got .Permission denied., expected a log"):
-        read_log(tmp_path / "a.csv")
+        read_log(tmp_path / "a.csv", spec)
 
 
 def test_empty_cells_blank_lines_unknown_columns_and_marks_of_other_programs(text):
