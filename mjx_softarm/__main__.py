@@ -29,7 +29,7 @@ def _spec(arm: str = "paper", out: Path = Path("arm.toml"), force: bool = False)
     """Write an arm's specification, every number with its unit and its source, to start your own from.
 
     Args:
-        arm: paper, sopra or stiff-flop
+        arm: paper, sopra, stiff-flop or four-chamber
         out: file to write
         force: replace the file if there is one
     """

@@ -70,7 +70,7 @@ def test_derived_counts_and_lengths(spec):
 def test_the_largest_payload_is_a_kilogram_of_the_paper_s_arm_and_in_proportion_to_others(spec):
     assert spec.mass.largest_payload_kg == 1.0
     small = ArmSpec.of(Path("sopra")).mass
-    weight = (small.arm_kg + small.gripper_kg) / (spec.mass.arm_kg + spec.mass.gripper_kg)
+    weight = (sum(small.arm_kg) + small.gripper_kg) / (spec.mass.arm_kg + spec.mass.gripper_kg)
     assert small.largest_payload_kg == pytest.approx(weight)
 
 
@@ -244,7 +244,7 @@ def test_any_value_of_a_field_is_taken_or_refused_by_the_field_s_name(path, valu
         assert re.match(rf"replace: ({re.escape(path)}|springs\.|chambers\.|sensor\.)", str(error))
 
 
-@pytest.mark.parametrize("name", ["paper", "sopra", "stiff-flop"])
+@pytest.mark.parametrize("name", ["paper", "sopra", "stiff-flop", "four-chamber"])
 def test_arms_that_ship_have_names(name, tmp_path, monkeypatch):
     """A file of the same name comes first."""
     monkeypatch.chdir(tmp_path)
@@ -254,7 +254,7 @@ def test_arms_that_ship_have_names(name, tmp_path, monkeypatch):
 
 
 def test_an_arm_of_no_such_name_is_told_with_those_that_there_are(tmp_path):
-    expected = r"nobody: got no such arm, expected a file, or paper, sopra, stiff-flop"
+    expected = r"nobody: got no such arm, expected a file, or four-chamber, paper, sopra, stiff-flop"
     with pytest.raises(SpecError, match=expected):
         ArmSpec.of(Path("nobody"))
     with pytest.raises(SpecError, match="expected a specification"):

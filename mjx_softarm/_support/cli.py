@@ -198,7 +198,7 @@ SpecFile = Annotated[
     MaybePath,
     tyro.conf.arg(
         metavar="ARM.toml|NAME",
-        help="specification of the arm, or the package's name for one: paper, sopra, stiff-flop",
+        help="specification of the arm, or one of the package: paper, sopra, stiff-flop, four-chamber",
         help_behavior_hint="(default: the paper's arm)",
     ),
 ]

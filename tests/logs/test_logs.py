@@ -2,7 +2,6 @@
 
 import contextlib
 import csv
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,8 +15,8 @@ from mjx_softarm.logs.schema import Log, write_log
 from mjx_softarm.spec import ArmSpec
 from tests.properties import damaged, few
 
-STRUCTURE = {"chambers_per_section": 6, "springs_per_section": 3}
-ARM = ArmSpec.of(Path("sopra")).replace(structure=STRUCTURE)  # two sections: 12 chambers, 6 springs
+STRUCTURE = {"n_sections": 2, "chambers_per_section": 6, "springs_per_section": 3}
+ARM = ArmSpec.default().replace(structure=STRUCTURE)  # two sections: 12 chambers, 6 springs
 
 
 def small_log(**changes):

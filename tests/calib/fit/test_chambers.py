@@ -221,7 +221,8 @@ def test_what_bending_alone_does_to_an_arm_leaves_straight_poses_their_weight():
 
 def test_an_arm_of_two_sections_is_calibrated():
     spec = ArmSpec.of(Path("sopra"))
-    arm = spec.replace(chambers={"stiffness_n_per_m": 1.2 * spec.chambers.stiffness_n_per_m})
+    stiffer = tuple(1.2 * np.array(spec.chambers.stiffness_n_per_m))
+    arm = spec.replace(chambers={"stiffness_n_per_m": stiffer})
     pressure_kpa = excitation.random_pressures(arm, 60, np.random.default_rng(0))
     log = pose_log(arm, 60, 0, pressure_kpa, marker_m=np.zeros((60, 5, 3)))
     fit = calibrate_chambers(log, spec)
