@@ -21,6 +21,7 @@ from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.mjcf import build_model, spring_lengths
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.settle import settle
+from tests.arms import OTHER_ARMS
 
 SPEC = ArmSpec.default()
 SHORT_ARM = SPEC.replace(structure={"n_sections": 1, "links_per_section": 2})  # MJX compiles more slowly
@@ -45,9 +46,9 @@ class Rest(NamedTuple):
 
 
 def references(n, seed, spec=SPEC):
-    """Spring lengths (n, chambers) over all that may be commanded."""
-    low, high = SPEC.springs.length_min_m, SPEC.springs.length_max_m
-    return np.random.default_rng(seed).uniform(low, high, (n, spec.n_chambers))
+    """Spring lengths (n, springs) over all that may be commanded."""
+    low, high = map(spec.at_springs, (spec.springs.length_min_m, spec.springs.length_max_m))
+    return np.random.default_rng(seed).uniform(low, high, (n, spec.n_springs))
 
 
 def fast_model(spec=SPEC):
@@ -93,17 +94,17 @@ def stepped_to_rest(model, reference_m, gains, steps_per_tick=1, tolerance=1e-11
 @functools.cache
 def truth(n, seed, spec=SPEC):
     """Rests of C MuJoCo at random references."""
-    model = fast_model(spec)
-    rests = [stepped_to_rest(model, reference, FAST_GAINS) for reference in references(n, seed, spec)]
+    model, gains = fast_model(spec), FAST_GAINS._replace(allocation=control.allocation(spec))
+    rests = [stepped_to_rest(model, reference, gains) for reference in references(n, seed, spec)]
     return Rest(*map(np.stack, zip(*rests, strict=True)))
 
 
 @functools.cache
-def settled(n, seed):
+def settled(n, seed, spec=SPEC):
     """`settle` at the same references."""
-    kinematics = chain_kinematics(params := ArmParams.from_spec(SPEC))
+    kinematics = chain_kinematics(params := ArmParams.from_spec(spec))
     many = xla.jit(jax.vmap(lambda x: settle(kinematics, params, x)), uses_mjx=False)
-    return jax.device_get(many(np.float32(references(n, seed))))
+    return jax.device_get(many(np.float32(references(n, seed, spec))))
 
 
 def position_error_mm(a, b):
@@ -165,10 +166,19 @@ def at_q(q):
     return Rest(None, None, None, np.stack(position), np.stack(rotation), None)
 
 
-@pytest.mark.parametrize("n, seed", [(N, 0), pytest.param(4096, 1, marks=pytest.mark.slow)])
-def test_the_settled_arm_is_where_c_mujoco_comes_to_rest(n, seed):
-    reference, rest = references(n, seed), truth(n, seed)
-    found = settled(n, seed)
+@pytest.mark.parametrize(
+    "arm, n, seed",
+    [
+        ("paper", N, 0),
+        pytest.param("paper", 4096, 1, marks=pytest.mark.slow),
+        *((arm, 32, 0) for arm in OTHER_ARMS),
+    ],
+)
+def test_the_settled_arm_is_where_c_mujoco_comes_to_rest(arm, n, seed):
+    """Redundant chambers, too, whose pressures rest where the law takes them."""
+    spec = OTHER_ARMS.get(arm, SPEC)
+    reference, rest = references(n, seed, spec), truth(n, seed, spec)
+    found, matrices = settled(n, seed, spec), control.allocation(spec)
     error_mm = position_error_mm(found, rest)
     saturated = (rest.pressure_kpa <= GAINS.pressure_min_kpa) | (rest.pressure_kpa >= GAINS.pressure_max_kpa)
     assert rest.residual.max() < 1e-6 and 0.2 < saturated.mean() < 0.8
@@ -177,5 +187,8 @@ def test_the_settled_arm_is_where_c_mujoco_comes_to_rest(n, seed):
     assert angle_error_deg(found, rest)[found.settled].max() < ANGLE_DEG / 10
     assert np.abs(found.spring_m - rest.spring_m)[found.settled].max() < 1e-5
     assert np.abs(found.pressure_kpa - rest.pressure_kpa)[found.settled].max() < 0.02
-    assert np.abs(found.spring_m - reference)[~saturated].max() < 0.2e-3
+    off_m = reference - found.spring_m
+    if matrices is not None:
+        off_m = control.allocated_error(off_m, found.pressure_kpa, matrices)
+    assert np.abs(off_m)[~saturated].max() < 0.2e-3
     np.testing.assert_array_equal(found.at_limit, saturated)
