@@ -66,11 +66,13 @@ def imbalance(spec, found):
     return np.array(left)
 
 
+LIGHT = {"arm_kg": 0.4, "gripper_kg": 0.05}
 CHANGES = {
     "the paper's": {},
     "loaded": {"mass": {"payload_kg": 1.0}},
     "overloaded": {"mass": {"payload_kg": 50.0}},
     "one section of two links": {"structure": {"n_sections": 1, "links_per_section": 2}},
+    "light, lies": {"mounting": {"base_turn_deg": (90.0, 0.0, 0.0)}, "mass": LIGHT},
     "uneven": {
         "chambers": {
             "area_m2": tuple(1.62e-3 * (0.8 + 0.05 * k) for k in range(9)),
