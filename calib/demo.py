@@ -61,7 +61,7 @@ def planted_arm(spec: ArmSpec, seed: int) -> ArmSpec:
             "length_offset_m": tuple(offset_m),
             "damping_ns_per_m": scaled(chambers.damping_ns_per_m, 1.5),
         },
-        sensor={"beta": each(sensor.beta, 0.05), "delta_m": tuple(delta_m)},
+        sensor={"beta": each(np.asarray(sensor.beta), 0.05), "delta_m": tuple(delta_m)},
     )
 
 

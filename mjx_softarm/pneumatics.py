@@ -18,7 +18,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -140,11 +140,12 @@ class Regulator(Actuators):
         return self.offset_kpa
 
     def fill(self, gas_m3: Array, volume_m3: Array, command_kpa: Array, dt_s: float) -> Array:
+        own: Any = self  # numbers are () or (n,)
         xp = array_namespace(gas_m3, volume_m3, command_kpa, *vars(self).values())
-        missing_kpa = command_kpa + self.offset_kpa - pressure_of(gas_m3, volume_m3)
-        outside_kpa = missing_kpa - xp.clip(missing_kpa, -self.deadband_kpa, self.deadband_kpa)
-        share = -xp.expm1(-dt_s / self.lag_s)
-        change_kpa = xp.clip(share * outside_kpa, -dt_s * self.vent_kpa_per_s, dt_s * self.fill_kpa_per_s)
+        missing_kpa = command_kpa + own.offset_kpa - pressure_of(gas_m3, volume_m3)
+        outside_kpa = missing_kpa - xp.clip(missing_kpa, -own.deadband_kpa, own.deadband_kpa)
+        share = -xp.expm1(-dt_s / own.lag_s)
+        change_kpa = xp.clip(share * outside_kpa, -dt_s * own.vent_kpa_per_s, dt_s * own.fill_kpa_per_s)
         return gas_m3 + volume_m3 * change_kpa / ATMOSPHERE_KPA
 
 

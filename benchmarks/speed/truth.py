@@ -58,7 +58,9 @@ def _solver(spec: ArmSpec) -> Callable:
 def true_rest(spec: ArmSpec, reference_m: np.ndarray) -> Truth:
     """Return the equilibria of arms under the control law, at references (n, n_springs) [m]."""
     found = rest_of(spec, reference_m)
-    return Truth(1e3 * found.tip_position_m, found.settled, float(np.mean(found.at_limit[found.settled])))
+    settled = np.asarray(found.settled)
+    tip_mm = 1e3 * np.asarray(found.tip_position_m)
+    return Truth(tip_mm, settled, float(np.mean(found.at_limit[settled])))
 
 
 def rest_of(spec: ArmSpec, reference_m: np.ndarray) -> solver.Settled:

@@ -103,10 +103,12 @@ class Twin(InstrumentedArm):
         """Start hysteresis and friction; they scale with the sections' lengths and stiffnesses."""
         # Lengths, forces and torques of the nominal arm's sections over those of the paper's (n_sections,)
         paper, n_sections = ArmSpec.default(), spec.structure.n_sections
-        length = spec.per_section(spec.geometry.section_length_m) / np.mean(paper.geometry.section_length_m)
+        length = np.array(spec.per_section(spec.geometry.section_length_m)) / np.mean(
+            paper.geometry.section_length_m
+        )
         chambers = np.reshape(spec.per_chamber(spec.chambers.stiffness_n_per_m), (n_sections, -1))
         force = length * (chambers.mean(axis=1) / np.mean(paper.chambers.stiffness_n_per_m))
-        bending = spec.per_section(spec.backbone.bending_stiffness_nm_per_rad)
+        bending = np.array(spec.per_section(spec.backbone.bending_stiffness_nm_per_rad))
         torque = bending / np.mean(paper.backbone.bending_stiffness_nm_per_rad)
 
         # Joints (nq, 1), link by link

@@ -101,10 +101,13 @@ class RodTwin(InstrumentedArm):
         parts = draw_rod(rng, self._spec, std, self._base_rotation[2])
         self._rod = Rod(parts, self._per_section)
         self._period_s, self.time_s = 1.0 / self._spec.control.rate_hz, 0.0
-        bellows = [1e-3 * parts.area.ravel(), 1e-3 * parts.area_slope.ravel()]
-        bellows += [self._spec.at_chambers(self._spec.geometry.section_length_m), self._rod.chamber_lengths()]
+        area_m2, slope_m = 1e-3 * parts.area.ravel(), 1e-3 * parts.area_slope.ravel()
+        rest_m, now_m = (
+            self._spec.at_chambers(self._spec.geometry.section_length_m),
+            self._rod.chamber_lengths(),
+        )
         regulator = draw_regulator(seed, self._spec, build.losses)
-        self._air = Pneumatics(*bellows, self._period_s / AIR_STEPS, regulator)
+        self._air = Pneumatics(area_m2, slope_m, rest_m, now_m, self._period_s / AIR_STEPS, regulator)
         self.attach(payload_kg)
         self.settle(np.zeros(self._spec.n_chambers))
 
@@ -181,7 +184,7 @@ def draw_rod(rng: np.random.Generator, spec: ArmSpec, std: RodTolerances, up: np
     stiff = factors(std.backbone_stiffness, s)
     return RodParts(
         section_length_m=length_m,
-        section_mass_kg=spec.section_mass_kg * factors(std.section_mass, s),
+        section_mass_kg=np.array(spec.section_mass_kg) * factors(std.section_mass, s),
         bending=of_section(backbone.bending_stiffness_nm_per_rad) * length_m * stiff,
         torsion=length_m / np.maximum(std.torsion_rad_per_nm, 1e-4) * stiff,
         shear=stiff / np.maximum(std.shear_per_n, 1e-6),

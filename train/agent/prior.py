@@ -20,6 +20,8 @@ Shapes: B batch, O observation, A action.
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import optax
@@ -38,7 +40,7 @@ RATE_SHARE = 0.1  # learning rate of the actor over that of the critics
 def held_back(rate: float | optax.Schedule, share: float = 1.0) -> optax.Schedule:
     """Return a share of a learning rate, after a wait at zero and a rise."""
 
-    def at(n_updates: Array) -> Array:
+    def at(n_updates: Any) -> Any:
         full = rate(n_updates) if callable(rate) else rate
         return share * full * jnp.clip((n_updates - WAIT) / RISE, 0.0, 1.0)
 

@@ -246,7 +246,7 @@ class TQC:
         loss = actor_loss(log_prob, quantiles, jnp.exp(state.log_alpha))
         if state.given_params is not None:
             actions = self.mode(params, obs), self.mode(state.given_params, obs)
-            n_updates = state.critic_opt_state[0].count
+            n_updates = state.critic_opt_state[0].count  # type: ignore
             loss += prior.departure_cost(obs, *actions, n_updates / self.config.n_decay_updates)
         return loss, log_prob
 

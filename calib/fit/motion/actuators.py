@@ -180,7 +180,8 @@ def _fit(model: Model, prior: np.ndarray, rows: int) -> Solution:
     def jacobian(x: np.ndarray) -> np.ndarray:
         return np.concatenate([evaluate(x.tobytes())[1], np.diag(1.0 / prior)])
 
-    x = least_squares(errors, np.zeros(len(prior)), jacobian, x_scale=prior, **TOLERANCES).x
+    options: Any = {"jac": jacobian, "x_scale": prior, **TOLERANCES}
+    x = least_squares(errors, np.zeros(len(prior)), **options).x
     return solution_at(x, *model(x), problem)
 
 
@@ -211,7 +212,7 @@ def _plain(actuators: Actuators) -> dict[str, float | tuple[float, ...]]:
 
 def _half_widths(regulator: Regulator, solution: Solution) -> dict[str, np.ndarray]:
     """Return the half-widths (c,) of the numbers of a regulator, of shared and own parameters together."""
-    c, n = len(regulator.offset_kpa), len(_SHARED)
+    c, n = np.size(regulator.offset_kpa), len(_SHARED)
     covariance = solution.covariance
     widths = {}
     for k, name in enumerate(_SHARED):

@@ -148,13 +148,13 @@ def _volumes(log: Log, spec: ArmSpec) -> np.ndarray:
     """Return the volumes (n, c) [m^3] of the chambers from the lengths of their springs."""
     rest_m, chambers = spec.at_chambers(spec.geometry.section_length_m), spec.chambers
     area_m2, slope_m = (np.array(spec.per_chamber(x)) for x in (chambers.area_m2, chambers.area_slope_m))
-    length_m = np.broadcast_to(rest_m, log.pressure_kpa.shape)
+    length_m = np.broadcast_to(rest_m, (len(log.time_s), spec.n_chambers))
     readings, spring_m = log.readings_of(spec.sensor), log.spring_m
     if spring_m is None and readings is not None:
         spring_m = spec.spring_sensor.lengths(readings).length_m
     if spring_m is not None:
         length_m = spring_m @ _chambers_of_springs(spec).T
-    return pneumatics.volume_m3(length_m, area_m2, slope_m, rest_m)
+    return np.asarray(pneumatics.volume_m3(length_m, area_m2, slope_m, rest_m))
 
 
 def _chambers_of_springs(spec: ArmSpec) -> np.ndarray:
@@ -168,4 +168,4 @@ def _chambers_of_springs(spec: ArmSpec) -> np.ndarray:
     radii = zip(*map(spec.per_section, (geometry.chamber_radius_m, geometry.spring_radius_m)), strict=True)
     n = spec.structure.chambers_per_section, spec.springs_per_section
     sections = [plane(chamber, n[0]) @ np.linalg.pinv(plane(spring, n[1])) for chamber, spring in radii]
-    return block_diag(*sections)
+    return np.asarray(block_diag(*sections))

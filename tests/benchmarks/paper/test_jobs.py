@@ -158,7 +158,8 @@ def test_policy_goes_to_a_point_on_a_twin(tmp_path, make_arm_model, monkeypatch,
     monkeypatch.setattr("mjx_softarm.deploy.session.refusals", lambda policy, goals: {})
     settings, trial = dataclasses.replace(TINY, n_points=1, arm=arm), Trial("with", 0, 0, load_g=300)
     (tmp_path / reach_run(0, 0)).mkdir()
-    save_policy(tmp_path / reach_run(0, 0) / "policy.npz", make_policy(make_arm_model))
+    spec = SPEC.replace(control={"ki_kpa_per_ms": 1000.0})  # slow enough for the rod's regulators
+    save_policy(tmp_path / reach_run(0, 0) / "policy.npz", make_policy(make_arm_model, spec))
     jobs.try_out(tmp_path, settings, trial)
     outcome = load_arrays(TrialOutcome, tmp_path / trial.result)
     assert np.isfinite(outcome.error).all() and not outcome.operation.any()

@@ -93,5 +93,5 @@ def test_stretches_end_at_gaps_where_the_payload_changes_and_at_the_longest_time
 def test_logs_without_motion_are_passed_by_and_no_damping_is_refused(log, changes, why):
     changed = dataclasses.replace(log, **changes)
     assert find_stretches([changed], SPEC) == [], why
-    with pytest.raises(ValueError, match="damping_ns_per_m 0 and .* expected both above 0"):
+    with pytest.raises(ValueError, match="damping_ns_per_m 0.0 and .* expected both above 0"):
         fit_damping([], SPEC.replace(chambers={"damping_ns_per_m": 0.0}))
