@@ -154,7 +154,7 @@ def test_arms_of_other_structure_come_back(name):
     fit = calibrate_chambers(pose_log(arm, 80, seed=0), spec)
     _, area, slope, _ = off_by(fit.spec, arm)
     assert area < 0.05 and slope < 0.15 and fit.weak_tip_mm.max(initial=0.0) < 1.0
-    assert tip_error_mm(spec, arm).mean() > 4.0 > 0.7 > tip_error_mm(fit.spec, arm).mean()
+    assert tip_error_mm(spec, arm).mean() > 3.0 > 0.7 > tip_error_mm(fit.spec, arm).mean()
     assert fit.held_out.translation_mean_mm < 1e3 * 1.6 * TIP_NOISE_M * 1.5
 
     # Rest lengths push with the chambers' stiffnesses: the same forces and moments by lengths in planes
