@@ -12,7 +12,7 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
@@ -22,21 +22,34 @@ from mjx_softarm._support import cli
 from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.files import replacing
 from mjx_softarm.deploy.measure import GOAL_COLUMNS, read_goals
-from mjx_softarm.mechanics.workspace import settle_many
+from mjx_softarm.mechanics.excitation import CIRCLE_HEIGHT_MM
 from mjx_softarm.policy.file import load_policy
+from mjx_softarm.posture import posture
 from mjx_softarm.spec import ArmSpec
 
 DONE = (0, 1)  # exit statuses after which there are results
 N_MOVING = 8  # poses of a log of all ticks, to which the regulators are fitted
-UPRIGHT = {"mounting": {"base_turn_deg": (180.0, 0.0, 0.0)}}
-ARMS: dict[str, tuple[str, dict[str, Any]]] = {  # name -> arm that ships, and changes of its specification
-    "paper": ("paper", {}),
-    "sopra": ("sopra", {}),
-    "stiff-flop": ("stiff-flop", {}),
-    "four-chamber": ("four-chamber", {}),
-    "upright": ("paper", UPRIGHT),
-}
+HEIGHT = -1e-3 * CIRCLE_HEIGHT_MM / ArmSpec.default().length_m  # of the paper's circle, in lengths
 WITHIN = 0.005  # target: mean error on the circle, as a share of the arm's length
+
+
+class Arm(NamedTuple):
+    """An arm, and where its circle is: the paper's, scaled with the arm's length."""
+
+    ships: str  # name of an arm that the package describes
+    height: float  # middle of the circle from the base, along the straight arm, in lengths of the arm
+    changes: dict[str, Any] = {}
+
+
+# The paper's arm shortens by vacuum. Arms without vacuum only grow, and weight shortens an arm that stands.
+# Each circle is where its arm has most pressure to spare, as found by a search over heights.
+ARMS = {
+    "paper": Arm("paper", HEIGHT),
+    "sopra": Arm("sopra", 1.17),
+    "stiff-flop": Arm("stiff-flop", 1.14),
+    "four-chamber": Arm("four-chamber", 1.2),
+    "upright": Arm("paper", 0.9, {"mounting": {"base_turn_deg": (180.0, 0.0, 0.0)}}),
+}
 
 
 def measure(
@@ -88,8 +101,8 @@ def _measure(
     """Take an arm through all commands; leave out those whose results are there."""
     # The arm, and its stand-in
     folder.mkdir(parents=True, exist_ok=True)
-    ships, changes = ARMS[arm]
-    spec, file = ArmSpec.of(Path(ships)).replace(**changes), folder / "arm.toml"
+    chosen, file = ARMS[arm], folder / "arm.toml"
+    spec = ArmSpec.of(Path(chosen.ships)).replace(**chosen.changes)
     spec.to_toml(file)
     twin, calibration = f"twin:rod:0@{file}", folder / "calibration"
     run, policy = folder / "run", folder / "run/policy.npz"
@@ -114,7 +127,7 @@ def _measure(
     # Measure the policy on the twin
     circle = folder / "circle.csv"
     if not circle.exists():
-        write_circle(circle, policy, points)
+        write_circle(circle, policy, points, chosen.height)
     figures = {"length [mm]": 1e3 * spec.length_m, **_figures(folder)}
     for name, goals in (("circle", circle), ("grid", "grid")):
         out = folder / name
@@ -125,19 +138,11 @@ def _measure(
     return figures
 
 
-def write_circle(file: Path, policy: Path, n: int) -> None:
-    """Write n goals of a circle that the policy's arm can reach.
-
-    The paper's circle, scaled to the arm, is above the tip of a straight arm without pressures. An arm that
-    is never evacuated does not get there: its circle is as high as its tip with all pressures in the middle
-    of their range.
-    """
+def write_circle(file: Path, policy: Path, n: int, height: float) -> None:
+    """Write n goals of the circle at a height; see `Arm`."""
     known = load_policy(policy)
-    goals, chambers = read_goals("circle", known, n), known.spec.chambers
-    if chambers.pressure_min_kpa >= 0.0:
-        middle_kpa = 0.5 * (chambers.pressure_min_kpa + chambers.pressure_max_kpa)
-        rest = settle_many(known.spec, np.full((1, known.spec.n_chambers), middle_kpa))
-        goals[:, 2] = 1e3 * rest.tip_position_m[0, 2]
+    goals, up = read_goals("circle", known, n), posture(known.spec)[:, 2]
+    goals[:, :3] += 1e3 * known.spec.length_m * (HEIGHT - height) * up
     with replacing(file) as part:
         np.savetxt(part, goals, "%.9g", ",", header=",".join(GOAL_COLUMNS), comments="")
 
