@@ -33,22 +33,23 @@ HEIGHT = -1e-3 * CIRCLE_HEIGHT_MM / ArmSpec.default().length_m  # of the paper's
 WITHIN = 0.005  # target: mean error on the circle, as a share of the arm's length
 
 
-class Arm(NamedTuple):
+class TriedArm(NamedTuple):
     """An arm, and where its circle is: the paper's, scaled with the arm's length."""
 
     ships: str  # name of an arm that the package describes
     height: float  # middle of the circle from the base, along the straight arm, in lengths of the arm
-    changes: dict[str, Any] = {}
+    base_turn_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of its mounting
 
 
-# The paper's arm shortens by vacuum. Arms without vacuum only grow, and weight shortens an arm that stands.
-# Each circle is where its arm has most pressure to spare, as found by a search over heights.
+# The paper's arm shortens by vacuum. Arms without vacuum only grow: their circles are where they have most
+# pressure to spare, as found by a search over heights. An arm that stands must do so without pressure, before
+# it is calibrated: the paper's arm, of 4.7 kg, falls over.
 ARMS = {
-    "paper": Arm("paper", HEIGHT),
-    "sopra": Arm("sopra", 1.17),
-    "stiff-flop": Arm("stiff-flop", 1.14),
-    "four-chamber": Arm("four-chamber", 1.2),
-    "upright": Arm("paper", 0.9, {"mounting": {"base_turn_deg": (180.0, 0.0, 0.0)}}),
+    "paper": TriedArm("paper", HEIGHT),
+    "sopra": TriedArm("sopra", 1.17),
+    "stiff-flop": TriedArm("stiff-flop", 1.14),
+    "four-chamber": TriedArm("four-chamber", 1.2),
+    "upright": TriedArm("stiff-flop", 1.14, (180.0, 0.0, 0.0)),
 }
 
 
@@ -102,7 +103,7 @@ def _measure(
     # The arm, and its stand-in
     folder.mkdir(parents=True, exist_ok=True)
     chosen, file = ARMS[arm], folder / "arm.toml"
-    spec = ArmSpec.of(Path(chosen.ships)).replace(**chosen.changes)
+    spec = ArmSpec.of(Path(chosen.ships)).replace(mounting={"base_turn_deg": chosen.base_turn_deg})
     spec.to_toml(file)
     twin, calibration = f"twin:rod:0@{file}", folder / "calibration"
     run, policy = folder / "run", folder / "run/policy.npz"
@@ -139,7 +140,7 @@ def _measure(
 
 
 def write_circle(file: Path, policy: Path, n: int, height: float) -> None:
-    """Write n goals of the circle at a height; see `Arm`."""
+    """Write n goals of the circle at a height; see `TriedArm`."""
     known = load_policy(policy)
     goals, up = read_goals("circle", known, n), posture(known.spec)[:, 2]
     goals[:, :3] += 1e3 * known.spec.length_m * (HEIGHT - height) * up

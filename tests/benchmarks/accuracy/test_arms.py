@@ -60,11 +60,11 @@ def test_an_interrupted_arm_goes_on_and_a_refused_goal_misses_the_target(tmp_pat
     monkeypatch.setattr(arms, "run_command", leave)
     monkeypatch.setattr(arms, "write_circle", lambda file, policy, n: file.touch())
     with pytest.raises(KeyboardInterrupt):
-        arms._measure("upright", tmp_path, 300, "analytic", None, 4)
+        arms._measure("paper", tmp_path, 300, "analytic", None, 4)
     assert [words[1] for words in asked] == ["record", "record", "run", "reach"]
     for expected in (["reach", "export", "measure", "measure"], []):
         asked.clear()
-        found = arms._measure("upright", tmp_path, 300, "analytic", None, 4)
+        found = arms._measure("paper", tmp_path, 300, "analytic", None, 4)
         assert [words[1] for words in asked] == expected
     missed = found | {"circle, measured": 3}
     far = found | {"circle, mean [mm]": 3.01}
