@@ -16,7 +16,8 @@ from mjx_softarm._support import xla
 from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.params import PAYLOAD, ArmParams
-from mjx_softarm.mechanics.settle import Settled, arms_at_once, settle_pressures
+from mjx_softarm.mechanics.settle import Settled, arms_at_once, settle, settle_pressures
+from mjx_softarm.posture import hangs
 from mjx_softarm.sensing.pose import pose_from_frame
 from mjx_softarm.spec import ArmSpec, SpecError
 
@@ -56,18 +57,23 @@ def _solver(n_at_once: int | None):
 
 
 @functools.cache
-def _loaded_solver(n_at_once: int | None):
-    """Return the compiled equilibria of arms that differ in payload, stiffness and area of each chamber."""
+def _loaded_solver(n_at_once: int | None, by_law: bool = False):
+    """Return the compiled equilibria of arms that differ in payload, stiffness and area of each chamber.
+
+    They are at given pressures or, by the law, at the spring lengths that these give the arm unloaded.
+    """
 
     def solve(
         params: ArmParams, pressure_kpa: Array, load_kg: Array, stiffness: Array, area: Array
     ) -> Settled:
-        params = params._replace(
-            tool_mass_kg=jnp.asarray(params.tool_mass_kg).at[PAYLOAD].set(load_kg),
-            chamber_stiffness=params.chamber_stiffness * stiffness,
-            area=params.area * area,
-        )
-        return settle_pressures(chain_kinematics(params), params, pressure_kpa, n_at_once)
+        own = params._replace(chamber_stiffness=params.chamber_stiffness * stiffness, area=params.area * area)
+        loaded = own._replace(tool_mass_kg=jnp.asarray(own.tool_mass_kg).at[PAYLOAD].set(load_kg))
+        kinematics = chain_kinematics(own)
+        if not by_law:
+            return settle_pressures(kinematics, loaded, pressure_kpa, n_at_once)
+        unloaded = settle_pressures(kinematics, own, pressure_kpa, n_at_once)
+        found = settle(kinematics, loaded, unloaded.spring_m, n_at_once)
+        return found._replace(result=jnp.maximum(found.result, unloaded.result))
 
     return xla.jit(jax.vmap(solve, in_axes=(None, 0, 0, 0, 0)), uses_mjx=False)
 
@@ -107,6 +113,9 @@ def sample_workspace(spec: ArmSpec, n: int, seed: int) -> Pool:
 def sample_loaded(spec: ArmSpec, load_kg: np.ndarray, spread: float, seed: int) -> LoadedPool:
     """Draw poses as `sample_workspace` does, of arms with payloads and with chambers that deviate.
 
+    With a payload, an arm that lies or stands may buckle at constant pressures. Its law holds its springs, so
+    those of the unloaded arm are drawn.
+
     Args:
         spec: the arm; its own payload is replaced.
         load_kg (m,) [kg]: payloads of the candidates; half of these are drawn.
@@ -120,7 +129,8 @@ def sample_loaded(spec: ArmSpec, load_kg: np.ndarray, spread: float, seed: int) 
     shape = len(load_kg), spec.n_chambers
     pressure_kpa = random_pressures(spec, shape[0], rng)
     factors = (rng.uniform(1.0 - spread, 1.0 + spread, shape) for _ in range(2))
-    found = _in_batches(_loaded_solver, spec, pressure_kpa, load_kg, *factors)
+    solver = functools.partial(_loaded_solver, by_law=not hangs(spec))
+    found = _in_batches(solver, spec, pressure_kpa, load_kg, *factors)
     rows = _chosen(spec, found, found.settled, shape[0] // CANDIDATES_PER_POSE, rng, replace=False)
     pool = _pool(found, rows)
     return LoadedPool(jnp.asarray(load_kg[rows], jnp.float32), pool.pressure_kpa, pool.spring_m, pool.pose)

@@ -14,7 +14,7 @@ from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.settle import SettleResult, settle
 from mjx_softarm.mechanics.statics import statics
-from mjx_softarm.mechanics.workspace import settle_many
+from mjx_softarm.mechanics.workspace import sample_loaded, settle_many
 
 N = 16
 UP = {"base_turn_deg": (180.0, 0.0, 0.0)}
@@ -96,3 +96,13 @@ def test_derivatives_of_arms_that_the_law_holds_are_those_of_differences(of):
         ahead, back = (tips(sign * step * direction).tip_position_m for sign in (1.0, -1.0))
         expected = (ahead - back) / (2 * step)
     np.testing.assert_allclose(slope[found.settled], expected[found.settled], rtol=1e-3, atol=1e-6)
+
+
+def test_arms_that_stand_are_drawn_with_payloads_under_which_they_would_buckle():
+    pool = sample_loaded(STANDING, np.full(2 * N, 0.02), 0.0, seed=0)
+    found = settled(loaded(0.02), pool.spring_m, np.float32)
+    assert found.settled.mean() > 0.8
+    away_mm = 1e3 * found.tip_position_m - np.asarray(pool.pose)[:, :3]
+    assert np.abs(away_mm[found.settled]).max() < 0.1
+    with jax.enable_x64(True):
+        assert (least_curvature(loaded(0.02), found, found.settled) < 0.0).mean() > 0.3

@@ -26,6 +26,7 @@ from mjx_softarm.mechanics.workspace import (
     sample_loaded,
     sample_workspace,
 )
+from mjx_softarm.posture import hangs
 from mjx_softarm.sensing.estimator import (
     N_CHANGES,
     PoseEstimator,
@@ -215,8 +216,12 @@ def _errors(
         load_kg = spec.mass.payload_kg + payload_kg
         loaded = spec.replace(mass={"payload_kg": load_kg})
         # Compare pose and springs with equilibria of the arm as specified.
-        held_out = _as_measured(spec, sample_workspace(loaded, N_HELD_OUT, HELD_OUT_SEED))
-        pool = jax.tree.map(np.asarray, held_out)
+        many_kg = np.full(CANDIDATES_PER_POSE * N_HELD_OUT, load_kg)
+        if hangs(spec):
+            held_out = sample_workspace(loaded, N_HELD_OUT, HELD_OUT_SEED)
+        else:  # at constant pressures it may buckle
+            held_out = sample_loaded(spec, many_kg, 0.0, HELD_OUT_SEED)
+        pool = jax.tree.map(np.asarray, _as_measured(spec, held_out))
         position_m, rotation = frame_from_pose(pool.pose)
         guess = estimate_frame(estimator, pool.spring_m, load_kg)
         chord = np.sqrt(np.sum((guess.rotation - rotation) ** 2, axis=(-2, -1)) / 8)  # sin of half the angle
@@ -225,8 +230,7 @@ def _errors(
         found["turn_deg"][payload_kg] = _error(np.degrees(2.0 * np.arcsin(np.minimum(chord, 1.0))))
         found["spring_mm"][payload_kg] = _error(1e3 * springs.max(axis=-1))
         # Estimate the load of arms whose chambers are off.
-        many_kg = np.full(CANDIDATES_PER_POSE * N_HELD_OUT, load_kg)
-        off = _as_measured(spec, sample_loaded(loaded, many_kg, CHAMBERS_OFF, HELD_OUT_SEED))
+        off = _as_measured(spec, sample_loaded(spec, many_kg, CHAMBERS_OFF, HELD_OUT_SEED))
         estimate_kg = np.asarray(estimate_load(load_estimator, off.spring_m, off.pressure_kpa))
         found["load_kg"][payload_kg] = _error(np.abs(estimate_kg - load_kg))
     return found
