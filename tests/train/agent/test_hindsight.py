@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mjx_softarm.sensing.pose import pose_error
 from train.agent.hindsight import HindsightConfig, later_pose, relabel
 from train.agent.learner import Experience
 from train.agent.tqc import Transition
@@ -124,7 +125,7 @@ def test_near_goals_lie_at_log_uniform_distances_within_the_bounds(env, relabell
 
 def test_near_goals_are_turned_in_proportion(env, relabelled):
     per_mm = [
-        np.abs(np.asarray(goal_of(env, batch.obs) - many.next_pose))[:, 3:]
+        np.abs(np.asarray(pose_error(goal_of(env, batch.obs), many.next_pose)))[:, 3:]
         for many, batch in (relabelled(reached_share=0.0, near_share=1.0, mm_per_deg=x) for x in (1.0, 4.0))
     ]
     clear = per_mm[0] > 1.0  # above rounding
