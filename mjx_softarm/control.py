@@ -66,14 +66,27 @@ def allocation(spec: ArmSpec) -> Allocation | None:
     return Allocation(*(np.kron(np.eye(spec.structure.n_sections), matrix) for matrix in section))
 
 
-def planes(n: int) -> np.ndarray:
-    """Return a section's matrix A (n, 3): [1, x, y] for the direction of each chamber, or of each spring.
+def planes(n: int, radius: float = 1.0) -> np.ndarray:
+    """Return a section's matrix A (n, 3): [1, x, y] for the place of each chamber, or of each spring.
 
-    The directions are those of a section whose first chamber is on x; turning the section changes neither C
-    nor N.
+    The places are those of a section whose first chamber is on x; turning it changes neither C nor N.
     """
     angle = 2 * np.pi * np.arange(n) / n
-    return np.stack([np.ones(n), np.cos(angle), np.sin(angle)], axis=-1)
+    return np.stack([np.ones(n), radius * np.cos(angle), radius * np.sin(angle)], axis=-1)
+
+
+def chambers_of_springs(spec: ArmSpec) -> np.ndarray:
+    """Return the matrix (n_chambers, n_springs) from lengths of springs to lengths of chambers.
+
+    A chamber's length is that of the plane through its section's springs, at the chamber's own radius.
+    """
+    c, s, out = spec.structure.chambers_per_section, spec.springs_per_section, []
+    radii = map(spec.per_section, (spec.geometry.chamber_radius_m, spec.geometry.spring_radius_m))
+    for section, (chamber, spring) in enumerate(zip(*radii, strict=True)):
+        rows = np.zeros((c, spec.n_springs))
+        rows[:, section * s : (section + 1) * s] = planes(c, chamber) @ np.linalg.pinv(planes(s, spring))
+        out.append(rows)
+    return np.concatenate(out)
 
 
 class Gains(NamedTuple):

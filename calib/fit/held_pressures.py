@@ -13,7 +13,7 @@ import numpy as np
 
 from calib.fit.blocks import held_out_blocks
 from calib.fit.leastsquares import ridge
-from mjx_softarm.control import allocation
+from mjx_softarm.control import allocation, chambers_of_springs
 from mjx_softarm.spec import ArmSpec, Unmodelled
 
 HELD_OUT_BLOCK = 5  # poses
@@ -68,7 +68,7 @@ def _without_redundant_part(pressure_kpa: np.ndarray, spring_m: np.ndarray, spec
     if matrices is None:
         return pressure_kpa
     # Effective areas at the lengths of the chambers, which lie in the plane through their section's springs
-    stretched_m = spring_m @ matrices.chamber_error.T - spec.at_chambers(spec.geometry.section_length_m)
+    stretched_m = spring_m @ chambers_of_springs(spec).T - spec.at_chambers(spec.geometry.section_length_m)
     area = spec.per_chamber(chambers.area_m2) + stretched_m * spec.per_chamber(chambers.area_slope_m)
 
     # The same forces and moments by pressures in the planes

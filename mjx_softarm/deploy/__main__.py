@@ -46,7 +46,9 @@ _ABOUT = f"A policy on an arm.\n\n{_STATUS}"
 def _goal(words: list[str]) -> tuple[float, ...]:
     goal = tuple(map(float, words[0].split(",")))
     if len(goal) not in (3, 6):
-        raise ValueError(f"got {len(goal)} numbers, expected x,y,z,yaw,pitch,roll")
+        raise ValueError(
+            f"got {len(goal)} numbers, expected x,y,z,yaw,pitch,roll, or x,y,z for positions alone"
+        )
     return goal
 
 
@@ -131,12 +133,13 @@ def _summary(run: LoopRun, policy: Policy) -> None:
     if all(arrival.reached for arrival in run.arrivals):
         return
     reward = policy.reward
-    largest = max(reward.weights[:3]), max(reward.weights[3:])
-    mm, deg = (f"{reward.threshold / weight:.2g}" if weight else "any" for weight in largest)
-    print(
-        f"a goal counts as reached within {mm} mm if the rotation is exact, or within {deg} deg "
-        "if the position is"
-    )
+    for largest, unit, other in (
+        (max(reward.weights[:3]), "mm", "rotation"),
+        (max(reward.weights[3:]), "deg", "position"),
+    ):
+        if largest:
+            within = f"{reward.threshold / largest:.2g} {unit}"
+            print(f"a goal counts as reached within {within} if the {other} is exact")
     if not policy.calibrated:
         print(
             "the policy is not calibrated: it is expected to miss on an arm that differs from its "

@@ -60,7 +60,7 @@ def read_goals(name: str, policy: Policy, n: int) -> np.ndarray:
     table = read_table(name)
     known = table.names in (GOAL_COLUMNS, GOAL_COLUMNS[:3])
     if not known or not np.isfinite(table.values).all():
-        expected = f"numbers in the columns {','.join(GOAL_COLUMNS)}"
+        expected = f"numbers in the columns {','.join(GOAL_COLUMNS)}, or in the first three"
         raise InputError(f"{name}: got {','.join(table.names)}, expected {expected}")
     return np.array([whole_goal(goal, policy, name) for goal in table.values])
 
@@ -181,7 +181,7 @@ def figures(
         "rotation_deg": float(turned.mean()),
         "rotation_95_deg": float(np.quantile(turned, 0.95)),
         "rotation_max_deg": float(turned.max()),
-        **dict(zip(POSE_NAMES, np.abs(error).mean(axis=0).tolist(), strict=True)),
+        **dict(zip(POSE_NAMES, np.where(asked, np.abs(error).mean(axis=0), np.nan).tolist(), strict=True)),
         "believed_mm": float(_norms(believed, asked)[0].mean()),
         "load_estimate_g": float(accuracy.load_estimate_g[measured].mean()) if n_measured else np.nan,
         "saturated_points": int(np.count_nonzero(per_point)),

@@ -278,8 +278,10 @@ class _Session:
         share = float(np.linalg.norm(scaled_error(goal + error, goal, reward))) / reward.threshold
         reached = share < 1.0
         self.arrivals.append(Arrival(goal, estimate, len(self.rows) - 1, self.goals.n_taken - 1, reached))
-        angles = ", ".join(f"{value:+.1f}" for value in error[3:])
-        off = f"{np.linalg.norm(error[:3]):.1f} mm off by {how}; yaw, pitch, roll {angles} deg off"
+        asked = np.where(reward.asked, error, 0.0)
+        off = f"{np.linalg.norm(asked[:3]):.1f} mm off by {how}"
+        if any(reward.asked[3:]):
+            off += f"; yaw, pitch, roll {', '.join(f'{value:+.1f}' for value in asked[3:])} deg off"
         missed = "" if reached else f"; NOT REACHED, {share:.2f} times the error that a goal allows"
         self.tell(self._at(f"goal {len(self.arrivals)}: {off}{missed}"))
         self.arrived(self.goals.n_taken - 1)

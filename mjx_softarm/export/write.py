@@ -17,9 +17,10 @@ from mjx_softarm.export.golden import Golden, write_golden
 from mjx_softarm.export.golden_cases import make_golden
 from mjx_softarm.mdp.observation import RATE_S
 from mjx_softarm.policy.file import LAW, Policy, action_layout, load_policy
+from mjx_softarm.posture import straight_pose
 
 _POSE = {"unit": ["mm"] * 3 + ["deg"] * 3, "names": ["x", "y", "z", "yaw", "pitch", "roll"]}
-FRAME = "base frame: z up, the arm hangs towards -z; angles intrinsic Z-Y-X, zero where it hangs straight"
+FRAME = "base frame: z up; angles intrinsic Z-Y-X; the tip of the straight arm is at {}"
 
 
 def export_onnx(policy_path: Path) -> list[Path]:
@@ -75,7 +76,7 @@ def describe(policy: Policy, sha256: str) -> dict[str, Any]:
     # Inputs and outputs of all graphs, then the arm's numbers.
     return {
         "policy_sha256": sha256,
-        "frame": FRAME,
+        "frame": FRAME.format(", ".join(f"{value:g}" for value in straight_pose(policy.spec))),
         "inputs": {
             "readings": readings,
             "goal": _POSE,

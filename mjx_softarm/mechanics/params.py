@@ -11,6 +11,7 @@ from jax import Array
 
 from mjx_softarm.control import Allocation, allocation
 from mjx_softarm.mechanics.body import chamber_directions, holes_m, spring_directions
+from mjx_softarm.pneumatics import Regulator
 from mjx_softarm.posture import base_rotation, check_posture
 from mjx_softarm.sensing.pose import rotation_about
 from mjx_softarm.spec import LEAST_CHAMBERS, ArmSpec
@@ -131,9 +132,11 @@ class ArmParams(NamedTuple):
 def _law_stiffness(spec: ArmSpec) -> np.ndarray:
     """Return the forces per length (n_springs,) [N/m] with which the law answers to errors at once.
 
-    A redundant chamber answers to several springs, whose errors need not vanish at rest: there it is zero.
+    A redundant chamber answers to several springs, whose errors need not vanish at rest, and a regulator
+    answers too late to hold an arm: there they are zero.
     """
-    if spec.structure.chambers_per_section > LEAST_CHAMBERS:
+    redundant = spec.structure.chambers_per_section > LEAST_CHAMBERS
+    if redundant or isinstance(spec.actuators, Regulator):
         return np.zeros(spec.n_springs)
     return spec.control.kp_kpa_per_m * N_PER_KPA_M2 * np.array(spec.per_chamber(spec.chambers.area_m2))
 

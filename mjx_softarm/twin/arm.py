@@ -43,7 +43,7 @@ HYSTERESIS_STROKES_M = (0.003, 0.006, 0.012, 0.024)
 FRICTION_LIMIT = (0.3, 0.01, 0.01)  # [N, N m, N m]
 FRICTION_STROKE = (2e-4, 5e-3, 5e-3)  # [m, rad, rad]
 
-REST_S = 4.0  # time for which the arm hangs at atmospheric pressure before its clock starts
+REST_S = 4.0  # time for which the arm rests at atmospheric pressure before its clock starts
 
 
 class Twin(InstrumentedArm):

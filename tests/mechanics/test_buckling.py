@@ -106,3 +106,10 @@ def test_arms_that_stand_are_drawn_with_payloads_under_which_they_would_buckle()
     assert np.abs(away_mm[found.settled]).max() < 0.1
     with jax.enable_x64(True):
         assert (least_curvature(loaded(0.02), found, found.settled) < 0.0).mean() > 0.3
+
+
+def test_the_law_holds_no_arm_behind_regulators(spec):
+    regulator = {"kind": "regulator", "lag_s": 0.3, "dead_time_s": 0.1, "deadband_kpa": 0.0}
+    rates = {"fill_kpa_per_s": 100.0, "vent_kpa_per_s": 100.0}
+    assert (ArmParams.from_spec(spec).law_stiffness > 0).all()
+    assert not ArmParams.from_spec(spec.replace(actuators=regulator | rates)).law_stiffness.any()

@@ -107,7 +107,7 @@ def with_actuators(spec: ArmSpec, actuators: Actuators) -> ArmSpec:
     """
     own = _plain(actuators)
     spec = spec.replace(actuators={"kind": actuators.kind, **own})
-    if not isinstance(actuators, Regulator):
+    if not isinstance(actuators, Regulator) or spec.control.kp_kpa_per_m == 0.0:
         return spec
     slowest = spec.control.kp_kpa_per_m / float(np.mean(actuators.lag_s) + np.mean(actuators.dead_time_s))
     return spec.replace(control={"ki_kpa_per_ms": min(spec.control.ki_kpa_per_ms, slowest)})

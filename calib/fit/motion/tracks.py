@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from mjx_softarm import pneumatics
+from mjx_softarm.control import chambers_of_springs
 from mjx_softarm.logs.rest import HOLD_KPA
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.pneumatics import Actuators
@@ -151,21 +151,8 @@ def _volumes(log: Log, spec: ArmSpec) -> np.ndarray:
     length_m = np.broadcast_to(rest_m, (len(log.time_s), spec.n_chambers))
     readings, spring_m = log.readings_of(spec.sensor), log.spring_m
     if spring_m is None and readings is not None:
-        spring_m = spec.spring_sensor.lengths(readings).length_m
+        free_m = spec.at_springs(spec.geometry.section_length_m)  # of a spring without a believed reading
+        spring_m = spec.spring_sensor.lengths(readings, free_m).length_m
     if spring_m is not None:
-        length_m = spring_m @ _chambers_of_springs(spec).T
+        length_m = spring_m @ chambers_of_springs(spec).T
     return np.asarray(pneumatics.volume_m3(length_m, area_m2, slope_m, rest_m))
-
-
-def _chambers_of_springs(spec: ArmSpec) -> np.ndarray:
-    """Return the matrix (c, springs) from springs to chambers: a plane through the springs of a section."""
-
-    def plane(radius_m: float, n: int) -> np.ndarray:
-        angle = 2 * np.pi * np.arange(n) / n
-        return np.stack([np.ones(n), radius_m * np.cos(angle), radius_m * np.sin(angle)], axis=-1)
-
-    geometry = spec.geometry
-    radii = zip(*map(spec.per_section, (geometry.chamber_radius_m, geometry.spring_radius_m)), strict=True)
-    n = spec.structure.chambers_per_section, spec.springs_per_section
-    sections = [plane(chamber, n[0]) @ np.linalg.pinv(plane(spring, n[1])) for chamber, spring in radii]
-    return np.asarray(block_diag(*sections))

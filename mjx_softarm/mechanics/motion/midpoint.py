@@ -136,8 +136,8 @@ def _step(arm: MovingArm, motion: Motion, command_kpa: Array, k: int, h: float, 
     damping, stiffness = _dampers(arm, lines.jacobian, v), potential.hessian.dense()
     # Stiffness of each closed chamber's gas (n_chambers,) [N/m], area^2 dp/dV
     gas = pneumatics.ATMOSPHERE_KPA / N_PER_KPA_M2 * gas_m3 * (potential.area / middle_m3) ** 2
-    pushed = chambers.jacobian * gas.reshape(params.n_sections, -1, 1)
-    stiffness_of_gas = block_diagonal(products(jnp.swapaxes(chambers.jacobian, 1, 2), pushed))
+    pull = chambers.jacobian * gas.reshape(params.n_sections, -1, 1)
+    stiffness_of_gas = block_diagonal(products(jnp.swapaxes(chambers.jacobian, 1, 2), pull))
 
     # The linearised midpoint rule
     force = potential.gradient + bias + damping @ v

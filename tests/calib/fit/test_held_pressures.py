@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calib.fit.held_pressures import fit_held_pressures
-from mjx_softarm.control import allocation
+from mjx_softarm.control import allocation, chambers_of_springs
 from mjx_softarm.spec import ArmSpec, SpecError
 
 SPEC = ArmSpec.default()
@@ -38,7 +38,8 @@ def test_pressures_that_move_nothing_are_no_residual(four_chamber_arm):
     plane = np.eye(n) - allocation(spec).redundant
     simulated_kpa = rng.uniform(-20.0, 20.0, (200, n)) @ plane
     spring_m = 0.2 + rng.uniform(-0.02, 0.04, (200, n)) @ plane
-    area_m2 = area_m2 + spec.chambers.area_slope_m * (spring_m - 0.2)
+    chamber_m = spring_m @ chambers_of_springs(spec).T
+    area_m2 = area_m2 + spec.chambers.area_slope_m * (chamber_m - 0.2)
     force = np.repeat(rng.uniform(-5.0, 5.0, (200, 3)), 4, axis=1) * np.tile([1.0, -1.0], n // 2)
     measured_kpa = simulated_kpa + 1.2e-3 * force / area_m2
     fit = fit_held_pressures(spec, spring_m, measured_kpa, simulated_kpa)
