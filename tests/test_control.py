@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 from mjx_softarm import ArmSpec
-from mjx_softarm.control import YIELD_M_PER_KPA, Gains, LawState, allocated_error, pressures, saturated
+from mjx_softarm.control import (
+    YIELD_M_PER_KPA,
+    Gains,
+    LawState,
+    allocated_error,
+    blocked_springs,
+    pressures,
+    saturated,
+)
 
 pytestmark = pytest.mark.usefixtures("strict")
 
@@ -218,3 +226,19 @@ def test_jax_vmapped_and_scanned_gives_numpy_s_pressures(gains):
         flagged = saturated(expected, reference[k], length[k], gains, 1e-3)
         np.testing.assert_array_equal(flags[k], flagged)
     assert got.dtype == expected.dtype == np.float32
+
+
+def test_a_saturated_chamber_blocks_the_springs_whose_errors_it_has():
+    """Its own; all four of a section; of three springs, its own or all, as one of six chambers stands."""
+    flags = np.zeros(9, bool)
+    flags[4] = True
+    np.testing.assert_array_equal(blocked_springs(flags, GAINS), flags)
+    four, six = (redundant_arm(*counts)[0] for counts in ((4, 4), (6, 3)))
+    flags = np.zeros((2, 12), bool)
+    flags[0, 5] = True
+    expected = np.zeros((2, 12), bool)
+    expected[0, 4:8] = True
+    np.testing.assert_array_equal(blocked_springs(flags, four), expected)
+    beside, opposite = np.eye(18, dtype=bool)[[6, 7]]  # of the second section
+    np.testing.assert_array_equal(np.flatnonzero(blocked_springs(beside, six)), [3])
+    np.testing.assert_array_equal(np.flatnonzero(blocked_springs(jnp.asarray(opposite), six)), [3, 4, 5])
