@@ -46,7 +46,7 @@ class RewardConfig:
     @property
     def asked(self) -> tuple[bool, ...]:
         """Which of x, y, z, yaw, pitch and roll a goal asks for."""
-        return tuple(weight > 0.0 for weight in self.weights)
+        return tuple(axis > 0.0 for axis in self.axes)
 
     @property
     def turn_weight_per_deg(self) -> float | None:

@@ -38,7 +38,8 @@ def variable(config: TrainConfig) -> tuple[str, ...]:
     """
     names = {"learner": config.learner.VARIABLE}
     for group, kind in _ENV_GROUPS.items():
-        names[group] = tuple(field.name for field in dataclasses.fields(kind))
+        numbers = (field for field in dataclasses.fields(kind) if not isinstance(field.default, tuple))
+        names[group] = tuple(field.name for field in numbers)
     return (*(f"{group}.{name}" for group, own in names.items() for name in own), *_ENV_NUMBERS)
 
 

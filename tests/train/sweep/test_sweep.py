@@ -48,7 +48,7 @@ OTHER_SETTINGS = """
     env.reward.weight_per_deg=0.004 env.randomisation.payload_max_kg=0.3
     env.randomisation.stiffness_spread=0.2 env.randomisation.sensor_noise_mm=0.5
     env.randomisation.damping_spread=0.2 env.randomisation.delay_max_s=0.05
-    env.randomisation.friction_max_n=2.0
+    env.randomisation.friction_max_n=2.0 env.randomisation.regulator_spread=0.1
     env.saturation_tolerance_mm=5.0 env.clearance_cost_per_mm=0.3 env.clearance_margin_mm=90.0
 """
 OTHER = OTHER_SETTINGS.split()
