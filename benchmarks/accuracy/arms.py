@@ -12,44 +12,28 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
-
-import numpy as np
+from typing import Annotated, Any
 
 from benchmarks.harness.common import names_of, target
 from benchmarks.harness.parallel import in_parallel
 from mjx_softarm._support import cli
 from mjx_softarm._support.errors import InputError
-from mjx_softarm._support.files import replacing
-from mjx_softarm.deploy.measure import GOAL_COLUMNS, read_goals
-from mjx_softarm.mechanics.excitation import CIRCLE_HEIGHT_MM
-from mjx_softarm.policy.file import load_policy
-from mjx_softarm.posture import posture
 from mjx_softarm.spec import ArmSpec
 
 DONE = (0, 1)  # exit statuses after which there are results
 N_MOVING = 8  # poses of a log of all ticks, to which the regulators are fitted
-HEIGHT = -1e-3 * CIRCLE_HEIGHT_MM / ArmSpec.default().length_m  # of the paper's circle, in lengths
 WITHIN = 0.005  # target: mean error on the circle, as a share of the arm's length
 
 
-class TriedArm(NamedTuple):
-    """An arm, and where its circle is: the paper's, scaled with the arm's length."""
-
-    ships: str  # name of an arm that the package describes
-    height: float  # middle of the circle from the base, along the straight arm, in lengths of the arm
-    base_turn_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of its mounting
-
-
-# The paper's arm shortens by vacuum. Arms without vacuum only grow: their circles are where they have most
-# pressure to spare, as found by a search over heights. An arm that stands must do so without pressure, before
-# it is calibrated: the paper's arm, of 4.7 kg, falls over.
+# Arms that ship, and the turn of their bases. An arm that stands must do so without pressure, before it is
+# calibrated: the paper's arm, of 4.7 kg, falls over.
+HANGS, STANDS = (0.0, 0.0, 0.0), (180.0, 0.0, 0.0)
 ARMS = {
-    "paper": TriedArm("paper", HEIGHT),
-    "sopra": TriedArm("sopra", 1.17),
-    "stiff-flop": TriedArm("stiff-flop", 1.14),
-    "four-chamber": TriedArm("four-chamber", 1.2),
-    "upright": TriedArm("stiff-flop", 1.14, (180.0, 0.0, 0.0)),
+    "paper": ("paper", HANGS),
+    "sopra": ("sopra", HANGS),
+    "stiff-flop": ("stiff-flop", HANGS),
+    "four-chamber": ("four-chamber", HANGS),
+    "upright": ("stiff-flop", STANDS),
 }
 
 
@@ -102,8 +86,8 @@ def _measure(
     """Take an arm through all commands; leave out those whose results are there."""
     # The arm, and its stand-in
     folder.mkdir(parents=True, exist_ok=True)
-    chosen, file = ARMS[arm], folder / "arm.toml"
-    spec = ArmSpec.of(Path(chosen.ships)).replace(mounting={"base_turn_deg": chosen.base_turn_deg})
+    (ships, turn_deg), file = ARMS[arm], folder / "arm.toml"
+    spec = ArmSpec.of(Path(ships)).replace(mounting={"base_turn_deg": turn_deg})
     spec.to_toml(file)
     twin, calibration = f"twin:rod:0@{file}", folder / "calibration"
     run, policy = folder / "run", folder / "run/policy.npz"
@@ -126,26 +110,14 @@ def _measure(
         run_command("train", "export", run)
 
     # Measure the policy on the twin
-    circle = folder / "circle.csv"
-    if not circle.exists():
-        write_circle(circle, policy, points, chosen.height)
     figures = {"length [mm]": 1e3 * spec.length_m, **_figures(folder)}
-    for name, goals in (("circle", circle), ("grid", "grid")):
+    for name in ("circle", "grid"):
         out = folder / name
         if not (out / "accuracy.json").exists():
-            accuracy_of(policy, twin, out, "--goals", goals, "--points", points)
+            accuracy_of(policy, twin, out, "--goals", name, "--points", points)
         accuracy = json.loads((out / "accuracy.json").read_text("utf-8"))
         figures |= {f"{name}, {what}": accuracy[key] for what, key in FIGURES.items()}
     return figures
-
-
-def write_circle(file: Path, policy: Path, n: int, height: float) -> None:
-    """Write n goals of the circle at a height; see `TriedArm`."""
-    known = load_policy(policy)
-    goals, up = read_goals("circle", known, n), posture(known.spec)[:, 2]
-    goals[:, :3] += 1e3 * known.spec.length_m * (HEIGHT - height) * up
-    with replacing(file) as part:
-        np.savetxt(part, goals, "%.9g", ",", header=",".join(GOAL_COLUMNS), comments="")
 
 
 FIGURES = {

@@ -9,6 +9,7 @@ from mjx_softarm.posture import turned_poses
 from mjx_softarm.spec import ArmSpec
 
 CIRCLE_DIAMETER_MM, CIRCLE_HEIGHT_MM = 160.0, -575.0  # on the paper's arm of 600 mm
+WITHOUT_VACUUM = 1.17  # depth of the circle in lengths of an arm whose chambers only lengthen it
 N_GROWING = 10  # poses from a first small motion to the full range
 
 
@@ -49,10 +50,13 @@ def circle_poses(spec: ArmSpec, n: int = 40) -> np.ndarray:
 
     The circle of the paper is horizontal below a hanging arm; it is scaled with the length of the arm, and
     turned with its posture. The paper gives diameter and number of points but no height; at ours, its arm
-    reaches every point with 2 kPa to spare in each chamber.
+    reaches every point with 2 kPa to spare in each chamber. An arm without vacuum is seldom shorter than at
+    rest, so its circle is lower; those that ship then have 8 kPa to spare.
     """
     angle, size = 2 * np.pi * np.arange(n) / n, spec.length_m / 0.6
-    radius, height = 0.5 * CIRCLE_DIAMETER_MM * size, np.full(n, CIRCLE_HEIGHT_MM * size)
+    evacuated = spec.chambers.pressure_min_kpa < 0.0
+    height_mm = CIRCLE_HEIGHT_MM * size if evacuated else -1e3 * WITHOUT_VACUUM * spec.length_m
+    radius, height = 0.5 * CIRCLE_DIAMETER_MM * size, np.full(n, height_mm)
     at = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=-1)
     return turned_poses(spec, at).astype(np.float32)
 

@@ -1,11 +1,18 @@
 """Random pressures of redundant chambers; the circle, the paper's for its arm, smaller for a smaller one."""
 
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from mjx_softarm import ArmSpec
 from mjx_softarm.control import planes
 from mjx_softarm.mechanics.excitation import circle_poses, random_pressures
+from mjx_softarm.mechanics.kinematics import chain_kinematics
+from mjx_softarm.mechanics.params import ArmParams
+from mjx_softarm.mechanics.settle import settle_pressures
 from tests.arms import FOUR_CHAMBERS, SIX_CHAMBERS
 
 
@@ -34,3 +41,24 @@ def test_the_circle_is_as_large_as_the_arm_is_long():
     np.testing.assert_array_equal(around[:, 2:], [[-575.0, 0.0, 0.0, 0.0]] * 8)
     half = spec.replace(geometry={"section_length_m": 0.5 * spec.geometry.section_length_m})
     np.testing.assert_allclose(circle_poses(half, 8), 0.5 * around, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name, base_deg", [("sopra", 0.0), ("stiff-flop", 180.0), ("four-chamber", 0.0)])
+def test_arms_without_vacuum_reach_their_circles(name, base_deg):
+    """A least-squares search finds pressures that hold each pose, all of them with some to spare."""
+    spec = ArmSpec.of(Path(name)).replace(mounting={"base_turn_deg": (base_deg, 0.0, 0.0)})
+    goals = circle_poses(spec, 4)
+    low, high = spec.chambers.pressure_min_kpa, spec.chambers.pressure_max_kpa
+    kpa, params = np.full((4, spec.n_chambers), 0.5 * (low + high)), ArmParams.from_spec(spec)
+
+    def tip(kpa):
+        found = settle_pressures(chain_kinematics(params), params, kpa)
+        return jnp.concatenate([1e3 * found.tip_position_m, 100.0 * found.tip_rotation[:2, 2]])
+
+    steps = jax.jit(jax.vmap(lambda x: (tip(x), jax.jacfwd(tip)(x))))
+    wanted = np.concatenate([goals[:, :3], np.zeros((4, 2))], axis=1)
+    for _ in range(8):
+        at, slope = steps(np.float32(kpa))
+        kpa = kpa + np.stack([np.linalg.pinv(s) @ off for s, off in zip(slope, wanted - at, strict=True)])
+    assert np.abs(wanted - steps(np.float32(kpa))[0]).max() < 0.1
+    assert kpa.min() > low + 5.0 and kpa.max() < high - 5.0
