@@ -39,7 +39,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mjx_softarm._support.xp import Array, array_namespace
-from mjx_softarm.spec import ArmSpec
+from mjx_softarm.spec import LEAST_CHAMBERS, ArmSpec
 
 AT_LIMIT_KPA = 0.2  # distance to a limit at which a measured, noisy pressure counts as at it
 TOLERANCE_M = 1e-3  # greatest error of a spring that counts as on its reference; a run may set another
@@ -59,7 +59,7 @@ def allocation(spec: ArmSpec) -> Allocation | None:
     With A of `planes`, C = A_chambers pinv(A_springs) and N = 1 - A_chambers pinv(A_chambers).
     """
     n = spec.structure.chambers_per_section
-    if n == 3:
+    if n == LEAST_CHAMBERS:
         return None
     chambers, springs = planes(n), planes(spec.springs_per_section)
     section = chambers @ np.linalg.pinv(springs), np.eye(n) - chambers @ np.linalg.pinv(chambers)

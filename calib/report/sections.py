@@ -159,6 +159,7 @@ def with_markers(section: Section, limits: MarkerLimits) -> Section:
 
 def actuators(fit: ActuatorFit) -> Section:
     """Show the numbers of the actuators and the errors of the pressures."""
+    # A row for each chamber: its numbers, with intervals where they were fitted, and its error
     found, n = fit.spec.actuators, fit.spec.n_chambers
     each = {name: np.broadcast_to(value, n) for name, value in dataclasses.asdict(found).items()}
     widths = fit.half_width_95 if isinstance(found, Regulator) else {}
@@ -168,6 +169,8 @@ def actuators(fit: ActuatorFit) -> Section:
         numbers = [x for pair in pairs for x in pair]
         rows.append((f"chamber {k}", *map(float, [*numbers, fit.chamber_rms_kpa[k]])))
     titles = [text for name in each for text in ((name, "+-") if widths else (name,))]
+
+    # Errors of each kind of actuator, then the section
     errors = (
         ("held-out seconds, command taken for the pressure", fit.held_out_rms_kpa["command"]),
         ("held-out seconds, before", fit.held_out_rms_kpa["specification"]),

@@ -197,13 +197,11 @@ def as_sb3(envs: SoftArmVectorEnv) -> VecEnv:
 def spaces(env: ReachEnv) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
     """Return the spaces of observations and actions; no section stretches to twice its length at rest."""
     rest_mm = 1e3 * env.spec.length_m
-    limit = 1.01 * np.array(
-        [2 * rest_mm] * 3 + [180.0] * 3
-    )  # of a pose; its angles are from the straight arm's
+    # Limits of a pose, whose angles are from the straight arm's
+    limit = 1.01 * np.array([2 * rest_mm] * 3 + [180.0] * 3)
     centre = np.append(env.scale.centre[:3], np.zeros(3))
-    error = (
-        np.array(env.config.reward.weights) * np.array([2.0] * 3 + [1.0] * 3) * limit
-    )  # positions differ by twice as much, angles wrap
+    # Positions differ by up to twice as much; angles wrap
+    error = np.array(env.config.reward.weights) * np.array([2.0] * 3 + [1.0] * 3) * limit
     low, high = ((limit_ - centre) / env.scale.scale for limit_ in (-limit, limit))
     more = np.full(env.observation_size - OBS_SIZE, np.inf)  # payload, or speeds: no bounds are known
     low, high = (

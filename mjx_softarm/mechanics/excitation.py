@@ -37,9 +37,8 @@ def random_pressures(spec: ArmSpec, n_poses: int, seed: int | np.random.Generato
 
 def _plane_swings(n: int, k: int, rng: np.random.Generator) -> np.ndarray:
     """Draw swings (k, n) in [-1, 1] of k sections of n chambers, each a plane through three directions."""
-    three = (
-        np.cos(rng.uniform(0.0, np.pi, (k, 3))) @ np.linalg.pinv(planes(3)).T
-    )  # mean, slopes along x and y
+    # Mean, and slopes along x and y (k, 3)
+    three = np.cos(rng.uniform(0.0, np.pi, (k, 3))) @ np.linalg.pinv(planes(3)).T
     angle = 2 * np.pi * np.arange(n) / n + rng.uniform(0.0, 2 * np.pi, (k, 1))
     swing = three[:, :1] + three[:, 1:2] * np.cos(angle) + three[:, 2:] * np.sin(angle)
     return np.clip(swing, -1.0, 1.0)

@@ -34,9 +34,8 @@ _SMALL_BEND = 1e-8  # square of a bend [rad^2] below which a section counts as s
 class PoseEstimator(NamedTuple):
     """Networks from spring lengths and payload to the tip pose, for n springs. All float32."""
 
-    layers: tuple[
-        Layer, ...
-    ]  # normalised springs (n,) and ups (3 n_sections,) -> changes (n_sections * N_CHANGES,)
+    # Normalised springs (n,) and ups (3 n_sections,) -> changes (n_sections * N_CHANGES,)
+    layers: tuple[Layer, ...]
     load_layers: tuple[Layer, ...]  # these inputs and the normalised payload (1,) -> changes per payload
     spring_site_m: Array  # (n_sections, s, 2) holes of the s springs of each section in its rings, x and y
     spring_centre_m: Array  # (n,) lengths that are normalised to 0

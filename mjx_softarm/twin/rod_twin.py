@@ -90,6 +90,8 @@ class RodTwin(InstrumentedArm):
         self._per_section = build.per_section or ELEMENTS_PER_SECTION
         rng = np.random.default_rng(seed)
         std = _scaled(build.gap, self._spec)
+
+        # Mounting of the base and of the tip, then sensors and the rod; the order belongs to the seed
         mounting = self._spec.mounting
         self._base_m = mounting.base_offset_m + drawn(rng, std.base_offset_m, 3)
         tilt = rotation_about(np.radians(drawn(rng, std.base_tilt_deg, 3)) * [1.0, 1.0, 0.0])
@@ -100,14 +102,16 @@ class RodTwin(InstrumentedArm):
         super().__init__(_sensor(rng, self._spec, std), seed, session, build.noise)
         parts = draw_rod(rng, self._spec, std, self._base_rotation[2])
         self._rod = Rod(parts, self._per_section)
+
+        # Chambers with air and regulators
         self._period_s, self.time_s = 1.0 / self._spec.control.rate_hz, 0.0
         area_m2, slope_m = 1e-3 * parts.area.ravel(), 1e-3 * parts.area_slope.ravel()
-        rest_m, now_m = (
-            self._spec.at_chambers(self._spec.geometry.section_length_m),
-            self._rod.chamber_lengths(),
-        )
+        rest_m = self._spec.at_chambers(self._spec.geometry.section_length_m)
+        now_m = self._rod.chamber_lengths()
         regulator = draw_regulator(seed, self._spec, build.losses)
         self._air = Pneumatics(area_m2, slope_m, rest_m, now_m, self._period_s / AIR_STEPS, regulator)
+
+        # At rest without pressure
         self.attach(payload_kg)
         self.settle(np.zeros(self._spec.n_chambers))
 

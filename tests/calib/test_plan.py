@@ -54,7 +54,7 @@ def test_far_poses_keep_away_from_those_recorded_and_go_where_the_error_is():
 
 
 def test_poses_that_differ_in_redundant_pressures_alone_are_not_far(four_chamber_arm):
-    """Of four chambers, equal pressures in opposite ones and others beside them move nothing."""
+    """Equal pressures in opposite chambers of four, and others in the chambers beside them, move nothing."""
     base = np.zeros((10, 12))
     alternating, bent = base + 30.0 * np.tile([1.0, -1.0], 6), base + 10.0 * np.tile([1.0, 0.0, -1.0, 0.0], 3)
     candidates = np.concatenate([alternating, bent]) + np.random.default_rng(0).normal(size=(20, 12))
