@@ -1,6 +1,6 @@
 """Specification of an arm: every physical number once, with its unit, read from TOML.
 
-An `ArmSpec` is a tree of frozen dataclasses: fields, their meaning, allowed values. A TOML file has the
+An `ArmSpec` is a tree of frozen dataclasses, the tables of `mjx_softarm.spec_tables`. A TOML file has the
 numbers; `arms/paper.toml` is the arm of the paper, with the source of each number.
 """
 
@@ -15,138 +15,25 @@ from typing import Any
 import numpy as np
 import tomli_w
 
-from mjx_softarm._support.fields import (
-    PerChamber,
-    PerSection,
-    SpecError,
-    anything,
-    check_counts,
-    count,
-    not_negative,
-    numbers,
-    positive,
-    read_fields,
-    vector,
-)
+from mjx_softarm._support.fields import PerChamber, PerSection, SpecError, check_counts, read_fields
 from mjx_softarm.arms import shipped_arm
 from mjx_softarm.pneumatics import ACTUATORS, PAPER_PUMP, Actuators
 from mjx_softarm.sensing.sensors import SENSORS, Sensor
+from mjx_softarm.spec_tables import (
+    LEAST_CHAMBERS,
+    PAIRS,
+    Backbone,
+    Chambers,
+    Control,
+    Geometry,
+    Mass,
+    Mounting,
+    Springs,
+    Structure,
+    Unmodelled,
+)
 
 ARM_FILE = "arm.toml"  # in the folder of a calibration
-PAIRS = "pairs of chamber and spring"
-LEAST_CHAMBERS, MOST_CHAMBERS = 3, 12  # of a section
-PAPER_S_ARM_KG = 4.7  # mass of the paper's arm, which carries up to 1 kg
-
-
-@dataclass(frozen=True)
-class Structure:
-    """Counts of sections and links. They fix array shapes, so a new value needs a new compilation."""
-
-    n_sections: int = count()
-    links_per_section: int = count()
-    chambers_per_section: int = count(default=3, high=MOST_CHAMBERS)
-    springs_per_section: int = count(default=0, low=0, high=MOST_CHAMBERS)  # 0: one beside each chamber
-
-
-@dataclass(frozen=True)
-class Geometry:
-    """Lengths and angles of the unloaded arm at rest, each a number or one for each section.
-
-    Chambers stand at equal angles, counter-clockwise from the first one seen from above, with springs beside
-    them. Where springs are fewer, the first chamber has one, and every k-th chamber from there.
-    """
-
-    section_length_m: PerSection = positive(per="sections")
-    chamber_radius_m: PerSection = positive(per="sections")
-    spring_radius_m: PerSection = positive(per="sections")
-    first_chamber_deg: PerSection = anything(per="sections", low=-360.0, high=360.0)
-    chamber_diameter_m: PerSection = positive(per="sections")
-
-
-@dataclass(frozen=True)
-class Mass:
-    """Masses. The arm's own mass is one number, spread evenly over all links, or one for each section."""
-
-    arm_kg: PerSection = positive(per="sections")
-    gripper_kg: float = not_negative()
-    gripper_length_m: float = positive()
-    payload_kg: float = not_negative()
-
-    @property
-    def largest_payload_kg(self) -> float:
-        """Largest payload on top of `payload_kg`: 1 kg for the paper's arm, others by their mass."""
-        arm_kg = sum(self.arm_kg) if isinstance(self.arm_kg, tuple) else self.arm_kg
-        return (arm_kg + self.gripper_kg) / PAPER_S_ARM_KG
-
-
-@dataclass(frozen=True)
-class Chambers:
-    """Bellows: force = pressure * (area_m2 + area_slope_m * (length - section length))."""
-
-    area_m2: PerChamber = positive(per="chambers")
-    area_slope_m: PerChamber = anything(per="chambers")
-    stiffness_n_per_m: PerChamber = positive(per="chambers")
-    damping_ns_per_m: PerChamber = not_negative(per="chambers")
-    length_offset_m: PerChamber = anything(per="chambers", low=-0.1, high=0.1)
-    pressure_min_kpa: float = anything(low=-101.325)
-    pressure_max_kpa: float = anything(low=-101.325)
-
-
-@dataclass(frozen=True)
-class Backbone:
-    """Stiffness and damping of one whole section besides its chambers and springs."""
-
-    axial_stiffness_n_per_m: PerSection = positive(per="sections")
-    bending_stiffness_nm_per_rad: PerSection = positive(per="sections")
-    axial_damping_ns_per_m: PerSection = not_negative(per="sections")
-    bending_damping_nms_per_rad: PerSection = not_negative(per="sections")
-
-
-@dataclass(frozen=True)
-class Springs:
-    """Springs with their sensed lengths, and the range of lengths that may be commanded."""
-
-    stiffness_n_per_m: PerSection = not_negative(per="sections")
-    damping_ns_per_m: PerSection = not_negative(per="sections")
-    rest_length_m: PerSection = positive(per="sections")
-    length_min_m: PerSection = positive(per="sections")
-    length_max_m: PerSection = positive(per="sections")
-
-
-@dataclass(frozen=True)
-class Control:
-    """Gains of the sensor-space law; see `mjx_softarm.control`."""
-
-    rate_hz: float = positive()
-    kp_kpa_per_m: float = not_negative()
-    ki_kpa_per_ms: float = positive()
-    kd_kpa_s_per_m: float = not_negative()
-    reference_s: float = not_negative()
-
-
-@dataclass(frozen=True)
-class Mounting:
-    """Mount of the base in the frame of motion capture, and of the measured tip on the last plate.
-
-    Turns are rotation vectors. All are zero in a perfect arm, and where a file has no such table.
-    """
-
-    base_turn_deg: tuple[float, ...] = vector()  # turn of the base, in the base frame
-    base_offset_m: tuple[float, ...] = vector()  # offset of the base, in the base frame
-    section_roll_deg: tuple[float, ...] = numbers("sections")  # roll of each section's holes about its axis
-    tip_turn_deg: tuple[float, ...] = vector()  # turn of the measured tip, in the axes of the last plate
-    tip_offset_m: tuple[float, ...] = vector()  # offset of the measured tip, in the axes of the last plate
-
-
-@dataclass(frozen=True)
-class Unmodelled:
-    """Residual pressures that hold the unloaded arm: measured minus simulated, linear in spring lengths.
-
-    The simulation ignores them; the estimate of a payload from pressures subtracts them.
-    """
-
-    pressure_kpa: tuple[float, ...] = numbers("chambers")  # where springs have their sections' length
-    slope_kpa_per_m: tuple[float, ...] = numbers(PAIRS)  # a row for each chamber, a column for each spring
 
 
 @dataclass(frozen=True)
@@ -167,8 +54,8 @@ class ArmSpec:
     springs: Springs
     sensor: Sensor = field(metadata={"kinds": SENSORS})  # the first kind where a file has none
     control: Control
-    mounting: Mounting = Mounting()
-    unmodelled: Unmodelled = Unmodelled()
+    mounting: Mounting = field(default_factory=Mounting)
+    unmodelled: Unmodelled = field(default_factory=Unmodelled)
     actuators: Actuators = field(default=PAPER_PUMP, metadata={"kinds": ACTUATORS})
 
     @property

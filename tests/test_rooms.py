@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[1]
 LEVELS = (
     ("_support",),
     ("sensing", "arms"),
-    ("spec", "pneumatics"),
+    ("spec", "spec_tables", "pneumatics"),
     ("mechanics", "control", "logs", "posture"),
     ("mdp",),
     ("env", "policy"),

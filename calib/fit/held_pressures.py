@@ -14,7 +14,8 @@ import numpy as np
 from calib.fit.blocks import held_out_blocks
 from calib.fit.leastsquares import ridge
 from mjx_softarm.control import allocation, chambers_of_springs
-from mjx_softarm.spec import ArmSpec, Unmodelled
+from mjx_softarm.spec import ArmSpec
+from mjx_softarm.spec_tables import Unmodelled
 
 HELD_OUT_BLOCK = 5  # poses
 RIDGE = 1.0  # prior: as strong as this many poses without a slope

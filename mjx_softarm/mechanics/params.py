@@ -14,7 +14,8 @@ from mjx_softarm.mechanics.body import chamber_directions, holes_m, spring_direc
 from mjx_softarm.pneumatics import Regulator
 from mjx_softarm.posture import base_rotation, check_posture
 from mjx_softarm.sensing.pose import rotation_about
-from mjx_softarm.spec import LEAST_CHAMBERS, ArmSpec
+from mjx_softarm.spec import ArmSpec
+from mjx_softarm.spec_tables import LEAST_CHAMBERS
 
 N_PER_KPA_M2 = 1e3  # force of 1 kPa on 1 m^2
 PAYLOAD = 1  # index in ArmParams.tool_mass_kg

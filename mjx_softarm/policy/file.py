@@ -57,7 +57,8 @@ from mjx_softarm.sensing.estimator import PoseEstimator, SpringModel
 from mjx_softarm.sensing.load import LoadEstimator
 from mjx_softarm.sensing.s2r import S2R, take_s2r
 from mjx_softarm.sensing.sensors import Sensor, SensorFault
-from mjx_softarm.spec import ArmSpec, Mounting, SpecError
+from mjx_softarm.spec import ArmSpec, SpecError
+from mjx_softarm.spec_tables import Mounting
 
 SCHEMA_VERSION = 8
 READABLE = (7, 8)
