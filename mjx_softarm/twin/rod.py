@@ -9,11 +9,13 @@ and exp is the rotation by a vector:
 
 At rest nu = (0, 0, -1), because the arm extends along -z of its base. Chambers and springs are fibres glued
 to the cross-sections, and each piece stretches by itself: a piece at r has the length h |nu + kappa x r|.
-lambda is this length divided by h, times the section's length L. A chamber pulls with
+lambda is this length divided by h, times the section's length L. With d = lambda - rest length and s = d / L,
+a chamber pulls with
 
-    f = k d (1 + c (d / L)^2) - p (A + A' (lambda - L)),    d = lambda - rest length,
+    f = k d (1 + b s + c s^2) - p (1 + g p) (A + A' (lambda - L)).
 
-which hardens. The motion is overdamped, without inertia: C dq/dt = -dV/dq, with the potential V and the
+It hardens with c, unlike in stretch and compression with b, and its effective area grows with pressure by g.
+The motion is overdamped, without inertia: C dq/dt = -dV/dq, with the potential V and the
 damping C in proportion to the stiffness of the straight rod. A step is a linearly implicit Euler step. At
 rest dV/dq is zero for every step size.
 
@@ -52,9 +54,11 @@ class RodParts(NamedTuple):
     spring_hole_m: np.ndarray  # (s, k, 2) x and y in the cross-sections
     stiffness: np.ndarray  # (s, c) [N/m] of the chambers
     hardening: np.ndarray  # (s, c) share by which a chamber is stiffer at a section's length from rest
+    skew: np.ndarray  # (s, c) b, positive where a chamber is stiffer in stretch than in compression
     rest_m: np.ndarray  # (s, c) rest lengths of the chambers
     area: np.ndarray  # (s, c) A [N/kPa] at the section's length
     area_slope: np.ndarray  # (s, c) A' [N/kPa/m]
+    area_growth: np.ndarray  # (s, c) g [1/kPa], growth of the area with pressure
     spring_stiffness: np.ndarray  # (s,) [N/m]
     spring_rest_m: np.ndarray  # (s,)
     tool_mass_kg: np.ndarray  # (2,) gripper and payload
@@ -103,8 +107,9 @@ class Rod:
             return np.repeat(value.reshape(len(parts.bending), -1), self.per_section, axis=0)
 
         self._section_m = each(parts.section_length_m)
-        chambers = parts.stiffness, parts.hardening, parts.rest_m, parts.area, parts.area_slope
+        chambers = parts.stiffness, parts.skew, parts.hardening, parts.rest_m, parts.area, parts.area_slope
         self._chamber_law = [each(value) for value in chambers]
+        self._growth = each(parts.area_growth)
         self._spring_law = each(parts.spring_stiffness), each(parts.spring_rest_m)
         mass = np.repeat(parts.section_mass_kg / self.per_section, self.per_section)
         self._node_kg = 0.5 * (mass + np.append(mass[1:], 0.0))  # (n,) lumped at the lower ends
@@ -191,15 +196,16 @@ class Rod:
         """Return pulls (n, c + k) [N] of fibres with these lengths (n, c + k), and their slopes [N/m]."""
         n_chambers, full_m = self.parts.stiffness.shape[1], self._section_m
         chamber, spring = length_m[:, :n_chambers], length_m[:, n_chambers:]
-        stiffness, hardening, rest, area, area_slope = self._chamber_law
+        stiffness, skew, hardening, rest, area, area_slope = self._chamber_law
         spring_stiffness, spring_rest = self._spring_law
         kpa = np.repeat(pressure_kpa, self.per_section, axis=0)
+        kpa = kpa * (1.0 + self._growth * kpa)  # as if the area were constant
 
         # Chambers, then springs
         off = chamber - rest
-        harder = hardening * (off / full_m) ** 2
-        pull = stiffness * off * (1.0 + harder) - kpa * (area + area_slope * (chamber - full_m))
-        slope = stiffness * (1.0 + 3.0 * harder) - kpa * area_slope
+        skewed, harder = skew * off / full_m, hardening * (off / full_m) ** 2
+        pull = stiffness * off * (1.0 + skewed + harder) - kpa * (area + area_slope * (chamber - full_m))
+        slope = stiffness * (1.0 + 2.0 * skewed + 3.0 * harder) - kpa * area_slope
         drawn = spring_stiffness * (spring - spring_rest)
         constant = np.broadcast_to(spring_stiffness, spring.shape)
         return np.concatenate([pull, drawn], -1), np.concatenate([slope, constant], -1)

@@ -1,14 +1,15 @@
 """The rod twin: an arm with other physics than training's, behind the same `ArmIO` as `Twin`.
 
-The arm is a rod of `mjx_softarm.twin.rod`: it bends, shears, twists and extends without joints. Its
-chambers harden, its base is tilted, its sections are rolled against each other, and motion capture's frame
-of the tip is turned against the last plate and offset from its centre. Its chambers have regulators, whatever
-the specification has. There is no hysteresis and no inertia. Readings, noise and clock are those of `Twin`.
-Parts are drawn from the seed.
+The arm is a rod of `mjx_softarm.twin.rod`: it bends, shears, twists and extends without joints. Each
+chamber hardens by a law of its own, and its effective area grows with pressure. The base is tilted, the
+sections are rolled against each other, and motion capture's frame of the tip is turned against the last plate
+and offset from its centre. Its chambers have regulators, whatever the specification has. There is no
+hysteresis and no inertia. Readings, noise and clock are those of `Twin`. Parts are drawn from the seed.
 
 The gap is that of `Twin`, and the tolerances for base, roll and springs are the same. At the spring lengths
-that bring training's model to the paper's circle, the tips of rods 100 to 105, which no experiment uses,
-are 15.9 mm and 6.7 deg off at a gap of 1.8, and 17.9 mm and 7.7 deg at 2.1.
+that bring training's model to the paper's circle, the tips of rods 100 to 105, which no experiment uses, are
+18.4 mm and 6.9 deg off. The chambers' laws hardly change these: they show in the pressures that hold a shape,
+and so in the payload.
 """
 
 from __future__ import annotations
@@ -45,6 +46,7 @@ AIR_STEPS = 4  # time steps of the chambers' air in a control period
 LAG_S, DEAD_TIME_S = (0.15, 0.6), (0.05, 0.25)
 FILL_PER_S, VENT_PER_S = (1.4, 2.8), (0.8, 1.8)  # in ranges of pressure
 DEADBAND = (1 / 600, 4 / 600)  # in ranges of pressure; 0.1 to 0.4 kPa of the paper's arm
+LAW_SPREAD = 0.6  # hardening and growth of a chamber differ from their means by up to this share
 CHAMBER_SPREAD = 0.1  # lag, dead time and rates of a chamber differ from the rod's by up to this share
 
 
@@ -55,11 +57,13 @@ class RodTolerances:
     Torsion and shear are arrays (n_sections,) where they have been scaled to an arm.
     """
 
-    hardening: float = 0.5  # value of all rods: 50 % stiffer at a section's length from rest
+    hardening: float = 0.5  # mean of the chambers: 50 % stiffer at a section's length from rest
+    area_growth: float = 0.05  # mean of the chambers: growth of the area over the range of pressure
     torsion_rad_per_nm: float | np.ndarray = 0.08  # value of all rods: compliance of a section
     shear_per_n: float | np.ndarray = 6e-4  # value of all rods: compliance
-    chamber_stiffness: float = 0.04  # relative, per chamber
-    chamber_area: float = 0.02  # relative, per chamber
+    skew: float = 0.15  # per chamber: stiffer in stretch, or in compression, a section's length from rest
+    chamber_stiffness: float = 0.05  # relative, per chamber
+    chamber_area: float = 0.03  # relative, per chamber
     chamber_length_m: float = 0.001  # per chamber
     backbone_stiffness: float = 0.06  # relative, per section
     section_mass: float = 0.03  # relative, per section
@@ -100,7 +104,7 @@ class RodTwin(InstrumentedArm):
         tip_turn = rotation_about(np.radians(drawn(rng, std.tip_turn_deg, 3)))
         self._tip_turn = rotation_about(np.radians(mounting.tip_turn_deg)) @ tip_turn
         super().__init__(_sensor(rng, self._spec, std), seed, session, build.noise)
-        parts = draw_rod(rng, self._spec, std, self._base_rotation[2])
+        parts = draw_rod(rng, seed, self._spec, std, self._base_rotation[2])
         self._rod = Rod(parts, self._per_section)
 
         # Chambers with air and regulators
@@ -156,8 +160,18 @@ class RodTwin(InstrumentedArm):
         self._rod.replace(parts._replace(tool_mass_kg=masses))
 
 
-def draw_rod(rng: np.random.Generator, spec: ArmSpec, std: RodTolerances, up: np.ndarray) -> RodParts:
-    """Draw the numbers of a rod; `up` (3,) points against gravity, in the axes of its base."""
+def draw_rod(
+    rng: np.random.Generator, seed: int, spec: ArmSpec, std: RodTolerances, up: np.ndarray
+) -> RodParts:
+    """Draw the numbers of a rod.
+
+    Args:
+        rng: random numbers, in the middle of the rod's draws.
+        seed: seed of the rod, for the random numbers of the chambers' laws.
+        spec: arm.
+        std: deviations.
+        up (3,): direction against gravity, in the axes of the rod's base.
+    """
     # Numbers of sections (s,), and of chambers (s, c)
     geometry, chambers, backbone = spec.geometry, spec.chambers, spec.backbone
     s, n_chambers = spec.structure.n_sections, spec.structure.chambers_per_section
@@ -180,6 +194,14 @@ def draw_rod(rng: np.random.Generator, spec: ArmSpec, std: RodTolerances, up: np
         radius = of_section(radius_m)[:, None] + drawn(rng, std.hole_radius_m, s, n)
         return radius[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
+    # Laws of the chambers, with random numbers of their own
+    laws = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(2,)))
+    range_kpa = spec.chambers.pressure_max_kpa - spec.chambers.pressure_min_kpa
+    hardening, growth = (
+        mean * laws.uniform(1.0 - LAW_SPREAD, 1.0 + LAW_SPREAD, per_chamber)
+        for mean in (std.hardening, std.area_growth / range_kpa)
+    )
+
     # The order of the draws belongs to the seed: another order makes other rods.
     length_m = of_section(geometry.section_length_m)
     rest_m = length_m[:, None] + of_chamber(chambers.length_offset_m)
@@ -197,10 +219,12 @@ def draw_rod(rng: np.random.Generator, spec: ArmSpec, std: RodTolerances, up: np
         chamber_hole_m=holes(geometry.chamber_radius_m, n_chambers),
         spring_hole_m=holes(geometry.spring_radius_m, spec.springs_per_section),
         stiffness=of_chamber(chambers.stiffness_n_per_m) * factors(std.chamber_stiffness, *per_chamber),
-        hardening=np.full(per_chamber, std.hardening),
+        hardening=hardening,
+        skew=drawn(laws, std.skew, *per_chamber),
         rest_m=rest_m + drawn(rng, std.chamber_length_m, *per_chamber),
         area=1e3 * of_chamber(chambers.area_m2) * area,
         area_slope=1e3 * of_chamber(chambers.area_slope_m) * area,
+        area_growth=growth,
         spring_stiffness=of_section(spec.springs.stiffness_n_per_m),
         spring_rest_m=of_section(spec.springs.rest_length_m),
         tool_mass_kg=np.array([spec.mass.gripper_kg, 0.0]),

@@ -34,9 +34,11 @@ def bar(n_sections=1, tip_kg=0.01, up=(0.0, 0.0, 1.0), joints=None, n_chambers=3
         "spring_hole_m": holes(s, 3),
         "stiffness": zeros,
         "hardening": zeros,
+        "skew": zeros,
         "rest_m": zeros + LENGTH_M,
         "area": zeros,
         "area_slope": zeros,
+        "area_growth": zeros,
         "spring_stiffness": np.zeros(s),
         "spring_rest_m": np.full(s, LENGTH_M),
         "tool_mass_kg": np.array([0.0, tip_kg]),
@@ -91,7 +93,8 @@ def test_lever_twists_a_bar():
 @pytest.mark.parametrize("n_chambers", [3, 4, 6])
 def test_chambers_harden(n_chambers):
     """Equal chambers and springs without weight: one equation for the length."""
-    chambers = {"stiffness": 500.0, "hardening": 0.8, "area": 1.6, "area_slope": -4.0}
+    law = {"stiffness": 500.0, "skew": 0.3, "hardening": 0.8}
+    chambers = law | {"area": 1.6, "area_slope": -4.0, "area_growth": 0.003}
     numbers = {name: np.full((1, n_chambers), value) for name, value in chambers.items()}
     springs = {"spring_stiffness": np.array([54.0]), "spring_rest_m": np.array([0.18])}
     parts = bar(tip_kg=0.0, n_chambers=n_chambers, **numbers, **springs)
@@ -99,7 +102,9 @@ def test_chambers_harden(n_chambers):
         rod = rest(parts, np.full(n_chambers, kpa))
 
         def force(d, kpa=kpa):
-            chamber = 500.0 * d * (1.0 + 0.8 * (d / LENGTH_M) ** 2) - kpa * (1.6 - 4.0 * d)
+            stretch = d / LENGTH_M
+            chamber = 500.0 * d * (1.0 + 0.3 * stretch + 0.8 * stretch**2)
+            chamber -= kpa * (1.0 + 0.003 * kpa) * (1.6 - 4.0 * d)
             return 150.0 * d / LENGTH_M + n_chambers * chamber + 3 * 54.0 * (d + LENGTH_M - 0.18)
 
         length_m = LENGTH_M + brentq(force, -0.19, 0.19)

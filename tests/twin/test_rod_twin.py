@@ -86,6 +86,15 @@ def test_regulators_are_those_of_the_seed_within_their_bounds(spec):
             assert low <= values.min() and values.max() <= high
 
 
+def test_each_chamber_hardens_by_its_own_law():
+    one, same, other = (RodTwin(seed, build=COARSE)._rod.parts for seed in (7, 7, 8))
+    for name in ("hardening", "skew", "area_growth"):
+        values = getattr(one, name)
+        np.testing.assert_array_equal(values, getattr(same, name))
+        assert len(np.unique(values)) == 9 and (values != getattr(other, name)).all()
+    assert (one.hardening > 0.3).all() and (one.area_growth > 0.0).all()
+
+
 def test_it_is_recorded_as_any_arm(spec):
     found = record(RodTwin(101, build=Build(losses=0.0, per_section=3)), spec, KPA[None])
     assert found.n_poses == 1 and found.ending.vented and not found.ending.cause
