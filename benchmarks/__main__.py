@@ -17,6 +17,7 @@ from mjx_softarm._support import cli
 BENCHMARKS = {
     "throughput": "benchmarks.speed.throughput:measure",
     "motion-engines": "benchmarks.speed.motion:measure",
+    "gpu": "benchmarks.speed.gpu:measure",
     "settle": "benchmarks.speed.settle:measure",
     "guard": "benchmarks.speed.guard:main",
     "calibration": "benchmarks.accuracy.calibration:measure",

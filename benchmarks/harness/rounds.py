@@ -15,6 +15,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -43,15 +44,21 @@ class Worker:
         program: module and arguments, as after `python -m`.
         python: the interpreter; this one if None.
         n_cores: number of this process's cores that it may use; all if None.
+        answer_s: longest silence; None stands for `ANSWER_S`.
 
     Raises:
-        WorkerError: in `start` and `round`, the program stopped or was silent for `ANSWER_S`.
+        WorkerError: in `start` and `round`, the program stopped or was silent for too long.
     """
 
     def __init__(
-        self, name: str, program: Sequence[str], python: Path | None = None, n_cores: int | None = None
+        self,
+        name: str,
+        program: Sequence[str],
+        python: Path | None = None,
+        n_cores: int | None = None,
+        answer_s: float | None = None,
     ):
-        self.name, self.facts = name, {}
+        self.name, self.facts, self._answer_s = name, {}, answer_s
         self._command = [str(python or sys.executable), "-m", *program]
         self._n_cores = n_cores
         self._process: Any = None
@@ -95,13 +102,14 @@ class Worker:
         self._process = None
 
     def _answer(self) -> Facts:
-        start, timer = time.perf_counter(), threading.Timer(ANSWER_S, self._process.kill)
+        limit_s = ANSWER_S if self._answer_s is None else self._answer_s
+        start, timer = time.perf_counter(), threading.Timer(limit_s, self._process.kill)
         timer.start()
         line = self._process.stdout.readline()
         timer.cancel()
         if not line:
             status = self._process.wait()
-            late = f" after {ANSWER_S:g} s in silence" if time.perf_counter() - start > ANSWER_S else ""
+            late = f" after {limit_s:g} s in silence" if time.perf_counter() - start > limit_s else ""
             self._said.seek(0)
             last = "\n".join(self._said.read().splitlines()[-15:])
             raise WorkerError(f"{self.name}: got status {status}{late}, expected a result:\n{last}")
@@ -135,28 +143,44 @@ def _few_cores(n: int | None) -> Iterator[None]:
         os.sched_setaffinity(0, cores)
 
 
-def take_turns(workers: Sequence[Worker], n_rounds: int) -> tuple[dict[str, list[Facts]], dict[str, str]]:
+def take_turns(
+    workers: Sequence[Worker], n_rounds: int, n_starting: int = 1
+) -> tuple[dict[str, list[Facts]], dict[str, str]]:
     """Start workers, do rounds, one of each worker in turn, and close them.
+
+    Args:
+        workers: the programs.
+        n_rounds: number of rounds.
+        n_starting: number of programs that prepare themselves at once.
 
     Returns:
         The rounds of each worker that did them all, and the reason of each that failed, by name.
     """
     rounds: dict[str, list[Facts]] = {worker.name: [] for worker in workers}
     failed: dict[str, str] = {}
+
+    def attempt(worker: Worker, work: Callable[[], Any]) -> None:
+        try:
+            work()
+        except WorkerError as error:
+            print(f"failed: {error}", flush=True)
+            failed[worker.name] = error.reason
+            worker.close()
+
+    def start(worker: Worker) -> None:
+        print(f"starting: {worker.name}", flush=True)
+        attempt(worker, worker.start)
+
     with contextlib.ExitStack() as stack:
-        for turn in range(-1, n_rounds):
+        # Start all workers, some at once.
+        for worker in workers:
+            stack.callback(worker.close)
+        with ThreadPoolExecutor(n_starting) as pool:
+            list(pool.map(start, workers))
+        # Do the rounds, one worker at a time.
+        for _ in range(n_rounds):
             for worker in (worker for worker in workers if worker.name not in failed):
-                try:
-                    if turn < 0:
-                        print(f"starting: {worker.name}", flush=True)
-                        stack.callback(worker.close)
-                        worker.start()
-                    else:
-                        rounds[worker.name].append(worker.round())
-                except WorkerError as error:
-                    print(f"failed: {error}", flush=True)
-                    failed[worker.name] = error.reason
-                    worker.close()
+                attempt(worker, lambda worker=worker: rounds[worker.name].append(worker.round()))
     return {name: told for name, told in rounds.items() if name not in failed}, failed
 
 

@@ -2,13 +2,15 @@
 
     python -m benchmarks.speed.jax_worker steps ENGINE MODE N_ARMS           environment steps
     python -m benchmarks.speed.jax_worker settle ENGINE REFERENCES LINKS     settling alone
+    python -m benchmarks.speed.jax_worker learn PRESET N_ARMS BATCH_SIZE     epochs of a learner
 
-REFERENCES is an npy file with references (n, n_springs) [m], LINKS a number of links per section. Both tell
-where the arms settled.
+REFERENCES is an npy file with references (n, n_springs) [m], LINKS a number of links per section. The first
+two tell where the arms settled. BATCH_SIZE is 0 for a learner without a replay.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 import time
 from collections.abc import Callable
@@ -27,11 +29,16 @@ from mjx_softarm.env.gym import EPISODE_LENGTH
 from mjx_softarm.env.vector import VectorEnv
 from mjx_softarm.spec import ArmSpec
 from train.epoch.devices import split
+from train.presets import PRESETS
+from train.runs.run import timed_epoch
+from train.runs.task import task_of
 
-N_STEPS = {"quasistatic": 8, "dynamic": 1}  # environment steps of each arm in a call
+N_STEPS = {"quasistatic": 8, "dynamic": 1}  # environment steps of each arm in a call, of up to `N_FEW` arms
+N_FEW = 8192  # more arms take one step in a call
 N_POSES = 1024
 N_TOLD = 256  # arms whose tips are told
 ROUND_S = 1.0  # least time of a round
+N_VECTOR_STEPS, N_UPDATES = 4, 16  # of an epoch of `learn`: actions of each arm, gradient steps after each
 
 
 def repeats_for(call: Callable[[], Any]) -> int:
@@ -45,6 +52,7 @@ def repeats_for(call: Callable[[], Any]) -> int:
 def steps(engine: Any, mode: Any, n_arms: str) -> tuple[Facts, Callable[[], Facts]]:
     """Prepare a rollout of n arms with random actions, which saturate about half of the chambers."""
     n, mesh = int(n_arms), mesh_of_cores(int(n_arms))
+    n_steps = N_STEPS[mode] if n <= N_FEW else 1
     # The arms, and their pool of poses; compilation is not measured.
     xla.enable_compilation_cache()
     env = ReachEnv(config=EnvConfig(engine=engine, mode=mode, n_poses=N_POSES))
@@ -59,7 +67,7 @@ def steps(engine: Any, mode: Any, n_arms: str) -> tuple[Facts, Callable[[], Fact
             return following, (after.metrics["unsettled"], after.metrics["saturated_chambers"], ends)
 
         with draws.on(mesh):
-            return jax.lax.scan(step, state, jax.random.split(key, N_STEPS[mode]))
+            return jax.lax.scan(step, state, jax.random.split(key, n_steps))
 
     state, key = xla.jit(arms.reset, env.uses_mjx)(jax.random.PRNGKey(0)), jax.random.PRNGKey(1)
     # Choose how often the rollout is called in a round.
@@ -79,7 +87,7 @@ def steps(engine: Any, mode: Any, n_arms: str) -> tuple[Facts, Callable[[], Fact
         _, (unsettled, saturated, _) = jax.block_until_ready(end)
         spent = time.perf_counter() - start
         return {
-            "env_steps_per_s": repeats * N_STEPS[mode] * n / spent,
+            "env_steps_per_s": repeats * n_steps * n / spent,
             "unsettled": int(unsettled.sum()),
             "saturated_chambers": round(float(np.mean(saturated)), 2),
         }
@@ -110,5 +118,31 @@ def settle(engine: str, references: str, links: str) -> tuple[Facts, Callable[[]
     return {}, work
 
 
+def learn(preset: str, n_arms: str, batch_size: str) -> tuple[Facts, Callable[[], Facts]]:
+    """Prepare epochs of a preset with other numbers of arms and of transitions in a batch."""
+    config, n, batch = PRESETS[preset], int(n_arms), int(batch_size)
+    # A short epoch. A learner from the replay warms up in the first action of all arms.
+    sizes: dict[str, Any] = {"n_arms": n, "vector_steps_per_epoch": N_VECTOR_STEPS}
+    if batch:
+        sizes |= {"batch_size": batch, "updates_per_env_step": N_UPDATES / n, "warmup_env_steps": n}
+        sizes |= {"replay_capacity": N_VECTOR_STEPS * n}
+    learner = dataclasses.replace(config.learner, **sizes)
+    job = task_of(dataclasses.replace(config, learner=learner), ReachEnv(config=config.env)).job
+    start = time.perf_counter()
+    state = job.start(lambda: job.init(jax.random.PRNGKey(0)))
+    state, _ = jax.block_until_ready(job.epoch(state))
+    facts = {"ready_s": round(time.perf_counter() - start, 1)}
+
+    def work() -> Facts:
+        nonlocal state
+        begin, rates = time.perf_counter(), []
+        while not rates or time.perf_counter() - begin < ROUND_S:
+            state, metrics = timed_epoch(job, state, learner, 1)
+            rates.append({name: metrics[f"speed/{name}_per_s"] for name in ("env_steps", "updates")})
+        return {f"{name}_per_s": float(np.median([rate[name] for rate in rates])) for name in rates[0]}
+
+    return facts, work
+
+
 if __name__ == "__main__":
-    serve(lambda: {"steps": steps, "settle": settle}[sys.argv[1]](*sys.argv[2:]))
+    serve(lambda: {"steps": steps, "settle": settle, "learn": learn}[sys.argv[1]](*sys.argv[2:]))
