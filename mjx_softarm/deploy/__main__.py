@@ -17,7 +17,7 @@ import tyro
 from mjx_softarm._support import cli
 from mjx_softarm._support.errors import InputError, needing
 from mjx_softarm.deploy.controller import Controller
-from mjx_softarm.deploy.drivers.names import open_arm
+from mjx_softarm.deploy.drivers.driven import Arms, finish
 from mjx_softarm.deploy.ending import MISSED, LoopRun, save_log
 from mjx_softarm.deploy.measure import (
     along,
@@ -60,13 +60,6 @@ PolicyFile = Annotated[
         help_behavior_hint="(default: the package's own, for the paper's arm)",
     ),
 ]
-Arm = Annotated[
-    str,
-    tyro.conf.arg(
-        help="yours: package.module:Class; simulated: twin:SEED, or twin:rod:SEED; twin:SEED@ARM.toml, of "
-        "another arm; twin:SEED:pipe300, in a pipe; twin:SEED:500g, with a payload"
-    ),
-]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -76,7 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(
-    arm: Arm,
+    on: Arms,
     goal: tyro.conf.UseAppendAction[tuple[Goal, ...]],
     policy: tyro.conf.Positional[PolicyFile] = SHIPPED,
     log: cli.MaybePath = None,
@@ -100,8 +93,8 @@ def _run(
     controller = _controller(policy)
     goals = [whole_goal(one, controller.policy, "--goal") for one in goal]
     check_file("--log", log)
-    driver = open_arm(arm)
-    check_arm(driver, controller, f"--arm {arm}")
+    driver = on.open(controller.policy.spec, tell)
+    check_arm(driver, controller, f"--arm {on.arm}")
 
     # The run, its log and its faults
     limit_s = None if np.isinf(duration) else duration
@@ -109,6 +102,7 @@ def _run(
     run = follow(driver, controller, goals, limit_s, tell, save=save, stay=stay)
     if log and run.ending.status != cli.ERROR:
         print(f"log: {log}, {len(run.log)} rows")
+    finish(driver, tell)
     _summary(run, controller.policy)
     return run.status
 
@@ -148,7 +142,7 @@ def _summary(run: LoopRun, policy: Policy) -> None:
 
 
 def _measure(
-    arm: Arm,
+    on: Arms,
     out: Path,
     policy: tyro.conf.Positional[PolicyFile] = SHIPPED,
     goals: Annotated[str, tyro.conf.arg(metavar="circle|grid|FILE")] = "circle",
@@ -172,9 +166,9 @@ def _measure(
     poses = read_goals(goals, controller.policy, points)
     if out.exists():
         raise InputError(f"--out: got {out}, which is there already, expected a new folder")
-    driver = open_arm(arm)
-    require_motion_capture(driver, f"--arm: {arm}")
-    check_arm(driver, controller, f"--arm {arm}")
+    driver = on.open(controller.policy.spec, tell)
+    require_motion_capture(driver, f"--arm: {on.arm}")
+    check_arm(driver, controller, f"--arm {on.arm}")
 
     # The run, stop by stop or in time
     out.mkdir(parents=True)
@@ -184,6 +178,7 @@ def _measure(
     else:
         pace_s = seconds / max(len(poses) - 1, 1)
         run = trace(driver, controller, poses, pace_s, tell=tell, save=save)
+    finish(driver, tell)
     if not run.arrivals:
         _summary(run, controller.policy)
         return run.status
@@ -220,7 +215,7 @@ def _print_accuracy(found: dict[str, Any]) -> None:
 
 
 def _record(
-    arm: Arm,
+    on: Arms,
     out: Path,
     spec: cli.SpecFile = None,
     poses: int = 500,
@@ -245,12 +240,13 @@ def _record(
     if out.exists():
         raise InputError(f"--out: got {out}, which is there already, expected a new file")
 
-    driver = open_arm(arm)
-    check_number(driver, arm_spec, f"--arm {arm}")
+    driver = on.open(arm_spec, tell)
+    check_number(driver, arm_spec, f"--arm {on.arm}")
 
     # The recording and its results
     targets_kpa = read_plan(plan, arm_spec) if plan else growing(random_pressures(arm_spec, poses, seed))
     result = record(driver, arm_spec, targets_kpa, transients, tell, partial(save_log, out))
+    finish(driver, tell)
     if not len(result.log):
         print(f"no pose was logged: {result.ending.cause or 'none came to rest'}", file=sys.stderr)
         return result.ending.status or MISSED

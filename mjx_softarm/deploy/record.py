@@ -27,6 +27,7 @@ from mjx_softarm.spec import ArmSpec
 
 TIMEOUT_S = LOOP.settle_timeout_s + MIN_HOLD_S + WINDOW_S
 PROGRESS_S = 10.0  # between lines of progress
+UNSEEN_POSES = 3  # poses in a row without a frame of motion capture after which it counts as gone; by hand
 
 
 class PoseRecording(NamedTuple):
@@ -96,6 +97,7 @@ class _Hold:
     def __init__(self) -> None:
         self.rows: list[dict[str, Any]] = []
         self.ticks: list[dict[str, Any]] = []  # all rows of this pose, the ramp's too
+        self._n_unseen = 0  # poses in a row without a frame of motion capture
 
     def add(self, row: dict[str, Any], seen: bool) -> None:
         """Take the row of a tick; `seen` is False where motion capture missed the tip."""
@@ -125,8 +127,16 @@ class _Hold:
         """Check sensors and chambers by the rows of a pose.
 
         Raises:
-            ArmFault: a sensor stood stock-still, or a chamber at rest lacks its pressure.
+            ArmFault: a sensor stood stock-still, a chamber at rest lacks its pressure, or motion capture is
+                gone.
         """
+        # Motion capture
+        unseen = drive.link.sees and not any("tip_m" in row for row in self.ticks)
+        self._n_unseen = self._n_unseen + 1 if unseen else 0
+        if self._n_unseen >= UNSEEN_POSES:
+            raise ArmFault(f"motion_capture: got no frame in {UNSEEN_POSES} poses, expected the tip in each")
+
+        # Sensors and chambers
         kpa = np.array([row["pressure_kpa"] for row in self.ticks])
         readings = np.array([row["readings"] for row in self.ticks])
         spring_m = drive.sensor.lengths(readings, np.nan).length_m

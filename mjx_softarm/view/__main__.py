@@ -16,9 +16,9 @@ import tyro
 
 from mjx_softarm._support import cli
 from mjx_softarm._support.errors import InputError, needing
-from mjx_softarm.deploy.__main__ import Arm, PolicyFile, check_file, tell
+from mjx_softarm.deploy.__main__ import PolicyFile, check_file, tell
 from mjx_softarm.deploy.controller import Controller
-from mjx_softarm.deploy.drivers.names import open_arm
+from mjx_softarm.deploy.drivers.driven import Arms, Driven, finish
 from mjx_softarm.deploy.ending import save_log
 from mjx_softarm.deploy.session import check_arm
 from mjx_softarm.logs.schema import TABLES
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     import viser
 
 PROGRAM, HERE = "python -m mjx_softarm.view", "127.0.0.1"
+TWIN = Driven("twin:7")
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _view(
     logs: tyro.conf.Positional[tuple[Path, ...]] = (),
     policy: PolicyFile = SHIPPED,
-    arm: Arm = "twin:7",
+    on: Arms = TWIN,
     log: cli.MaybePath = None,
     demos: cli.MaybePath = None,
     spec: cli.SpecFile = None,
@@ -82,11 +83,14 @@ def _view(
     from mjx_softarm.view.live import live
     from mjx_softarm.view.page import Setup
 
-    read, io = load_policy(policy), open_arm(arm)
-    check_arm(io, Controller.of(read), f"--arm {arm}")
-    setup = Setup(read, arm, at.host, at.port, hasattr(io, "attach"), demos is not None)
+    read = load_policy(policy)
+    io = on.open(read.spec, tell)
+    check_arm(io, Controller.of(read), f"--arm {on.arm}")
+    setup = Setup(read, on.arm, at.host, at.port, hasattr(io, "attach"), demos is not None)
     saves = [partial(save_log, path) if path else None for path in (log, demos)]
-    return live(setup, io, tell, partial(_welcome, at.host), *saves).status
+    status = live(setup, io, tell, partial(_welcome, at.host), *saves).status
+    finish(io, tell)
+    return status
 
 
 def _replay(logs: tuple[Path, ...], spec: ArmSpec, html: Path | None, at: Address) -> int:

@@ -235,7 +235,7 @@ def test_another_arm_than_the_policy_s_gets_no_pressure(n, reading, message, tmp
             raise AssertionError("pressures were written")
 
     save_policy(tmp_path / "policy.npz", POLICY)
-    monkeypatch.setattr("mjx_softarm.deploy.__main__.open_arm", lambda name: Other())
+    monkeypatch.setattr("mjx_softarm.deploy.drivers.driven.open_arm", lambda name: Other())
     goal = "--goal=" + ",".join(map(str, POLICY.workspace[0]))
     assert main(["run", str(tmp_path / "policy.npz"), "--arm", "its:Arm", goal]) == 2
     assert re.search(f"error: --arm its:Arm: {message}", capsys.readouterr().err)

@@ -112,6 +112,23 @@ def test_hidden_markers_cost_no_pose():
     np.testing.assert_allclose(result.log.spring_m[:, :3], result.log.tip_m, atol=3e-4)
 
 
+class Gone(Seen):
+    """Motion capture misses all frames from some time on."""
+
+    def motion_capture(self):
+        if self.time_s > 30.0:
+            raise OSError("the server is gone")
+        return super().motion_capture()
+
+
+def test_recording_ends_once_motion_capture_is_gone():
+    arm = Gone()
+    result = record(arm, SPEC, random_pressures(SPEC, 50, 3))
+    assert "motion_capture: got no frame in 3 poses, expected the tip in each" in result.ending.cause
+    assert 1 < result.n_poses < 10 and result.n_unsettled in (3, 4) and result.ending.status == 3
+    assert not arm.command_kpa.any()
+
+
 def test_first_poses_grow_from_small_to_full():
     targets_kpa = random_pressures(SPEC, 12, 3)
     np.testing.assert_allclose((growing(targets_kpa) / targets_kpa)[:, 0], [*np.arange(0.1, 1.1, 0.1), 1, 1])

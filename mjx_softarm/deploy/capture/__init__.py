@@ -1,0 +1,198 @@
+"""Motion capture without code: `--capture natnet:HOST:BODY` or `--capture qualisys:HOST:BODY`.
+
+BODY is the rigid body of the last plate. Options follow it, each after a comma:
+
+    base=BODY     a rigid body fixed to the base; without it the system's own origin is the base's middle
+    markers=NAME  markers along the arm, from the base to the tip: NatNet's marker set of this name, or
+                  Qualisys' labels NAME0, NAME1, ... in the order of their numbers
+    up=y          the system's y axis points up: NatNet's default, as in Motive; up=z is Qualisys' default
+
+The system's x axis has to be the base's. Create the bodies while the arm is straight, so that both have the
+system's axes then, and put their origins in the middle of the last plate and of the base: calibration fits
+the few millimetres and degrees that remain.
+
+The loop takes the newest frame of each tick and never waits for one. A frame is missed, which is a gap in the
+log, where none is new, it is late, or a body is not seen in it. The base does not move, so it keeps the place
+at which it was last seen. Frames are logged with the tick that takes them, not shifted by their latency.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from mjx_softarm._support.errors import InputError
+from mjx_softarm.deploy.arm_io import Capture
+from mjx_softarm.deploy.capture.natnet import NatNet
+from mjx_softarm.deploy.capture.qualisys import Qualisys
+from mjx_softarm.deploy.capture.system import UP, CaptureName, Source
+from mjx_softarm.deploy.link import describe
+from mjx_softarm.deploy.measure import LOOK_S, LOOKS
+from mjx_softarm.posture import straight_pose
+from mjx_softarm.sensing.pose import (
+    frame_from_pose,
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+    rotation_vector,
+)
+from mjx_softarm.spec import ArmSpec
+
+LATE_S = 0.05  # delay, beyond that of the fastest frames, of a frame that is late; by hand
+DRIFT = 1e-3  # largest difference of the two clocks' rates that is not taken for a delay; by hand
+LOST_S = 1.0  # time without a frame after which motion capture counts as lost; by hand
+# Largest distance of the tip from the end of the straight arm, in its lengths, and largest angle; by hand.
+# Wrong axes are 1.4 lengths and 90 degrees off.
+_NEAR, _TURNED_DEG = 0.5, 60.0
+_KINDS = {"natnet": NatNet, "qualisys": Qualisys}
+
+
+class Delay:
+    """Delay of frames beyond that of the fastest, on two clocks that need not agree."""
+
+    def __init__(self) -> None:
+        self._offset_s, self._frame_s, self._now_s = np.inf, -np.inf, 0.0
+
+    def of(self, frame_s: float, now_s: float) -> float:
+        """Return the delay [s] of a frame with a time [s] on its own clock, taken at a time [s] on ours."""
+        # After a while without frames the system may have begun anew, and its clock with it.
+        if frame_s < self._frame_s or now_s - self._now_s > LOST_S:
+            self._offset_s = np.inf
+        drifted_s = self._offset_s + DRIFT * (now_s - self._now_s)
+        self._offset_s, self._frame_s, self._now_s = min(drifted_s, now_s - frame_s), frame_s, now_s
+        return now_s - frame_s - self._offset_s
+
+
+class CapturedArm:
+    """An arm whose motion capture is a system in the network; all else is the arm's own driver's.
+
+    Args:
+        arm: the driver.
+        source: connection to the system.
+        name: which bodies and axes count.
+        tell: takes a line when the tip is lost for `LOST_S`, and when it is seen again.
+    """
+
+    def __init__(self, arm: Any, source: Source, name: CaptureName, tell: Callable[[str], None]):
+        self._arm, self._source, self._name, self._tell = arm, source, name, tell
+        self._delay, self._seen_s, self._lost = Delay(), time.monotonic(), False
+        self._base: tuple[np.ndarray, np.ndarray] | None = None if name.base else (np.zeros(3), np.eye(3))
+        self._n_asked, self._latency_s, self._delay_s = 0, [], []
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._arm, name)
+
+    def motion_capture(self) -> Capture:
+        """Return the newest frame.
+
+        Raises:
+            OSError: the frame is missed; the message says why.
+        """
+        self._n_asked += 1
+        now_s = time.monotonic()
+        try:
+            seen = self._take(now_s)
+        except OSError as error:
+            if now_s - self._seen_s > LOST_S and not self._lost:
+                self._lost = True
+                self._tell(f"motion capture: lost: {error}")
+            raise
+        if self._lost:
+            self._tell(f"motion capture: back after {now_s - self._seen_s:.1f} s")
+        self._seen_s, self._lost = now_s, False
+        return seen
+
+    def finish(self) -> str:
+        """End the connection; return a line about the frames."""
+        self._source.close()
+        line = f"motion capture: the tip was seen in {len(self._delay_s)} of {self._n_asked} ticks"
+        if not self._delay_s:
+            return line
+        known = np.array(self._latency_s)[np.isfinite(self._latency_s)]
+        sent = f"frames were sent {1e3 * known.mean():.1f} ms after the exposure, " if len(known) else ""
+        return f"{line}; {sent}at most {1e3 * max(self._delay_s):.0f} ms later than the fastest"
+
+    def _take(self, now_s: float) -> Capture:
+        name = self._name
+        frame = self._source.poll()
+        if frame is None:
+            raise TimeoutError(f"got no new frame from {name.host}")
+        delay_s = self._delay.of(frame.time_s, now_s)
+        self._base = frame.bodies.get(name.base, self._base)
+        if delay_s > LATE_S:
+            raise TimeoutError(f"got a frame {1e3 * delay_s:.0f} ms late, expected {1e3 * LATE_S:g} at most")
+        if self._base is None or name.body not in frame.bodies:
+            hidden = name.base if self._base is None else name.body
+            raise OSError(f"got a frame without the body {hidden!r}")
+
+        # From the system's frame to the base's, then from its axes to ours
+        (base_m, base_axes), (tip_m, tip_axes), up = self._base, frame.bodies[name.body], UP[name.up]
+        turned = up @ base_axes.T
+        self._latency_s.append(frame.latency_s)
+        self._delay_s.append(delay_s)
+        return Capture(
+            tip_m=turned @ (tip_m - base_m),
+            tip_quaternion=quaternion_from_rotation(turned @ tip_axes @ up.T),
+            marker_m=(frame.marker_m - base_m) @ turned.T,
+        )
+
+
+def with_capture(arm: Any, name: str | None, spec: ArmSpec, tell: Callable[[str], None]) -> Any:
+    """Return the arm with motion capture by name, or the arm itself without a name.
+
+    Args:
+        arm: the driver, without pressure.
+        name: `natnet:HOST:BODY` or `qualisys:HOST:BODY`, with options.
+        spec: the arm, for the place where its tip should be seen.
+        tell: takes lines about lost and found bodies.
+
+    Raises:
+        InputError: the name is malformed, the system cannot be reached, has no such body, does not see it,
+            or sees it far from the end of a straight arm.
+    """
+    if name is None:
+        return arm
+    read, where = CaptureName.read(name), f"--capture {name}"
+    if hasattr(arm, "motion_capture"):
+        raise InputError(
+            f"--capture: got {name} and an arm with its own motion capture, expected one of them"
+        )
+    try:
+        source = _KINDS[read.system](read)
+    except OSError as error:
+        raise InputError(f"{where}: {describe(error)}") from error
+    captured = CapturedArm(arm, source, read, tell)
+    try:
+        _check_place(_first(captured, where), spec, where)
+    except InputError:
+        source.close()
+        raise
+    return captured
+
+
+def _first(arm: CapturedArm, where: str) -> Capture:
+    """Return the first frame with the tip; look for a second at most."""
+    why = "got no frame"
+    for _ in range(LOOKS):
+        try:
+            return arm.motion_capture()
+        except OSError as error:
+            why = str(error)
+            time.sleep(LOOK_S)
+    raise InputError(f"{where}: {why}, expected one with the tip within {LOOKS * LOOK_S:g} s")
+
+
+def _check_place(seen: Capture, spec: ArmSpec, where: str) -> None:
+    """Refuse a tip that cannot be that of an arm without pressure: other axes, origin, unit or body."""
+    expected_m, expected_axes = frame_from_pose(straight_pose(spec))
+    off_m = np.linalg.norm(seen.tip_m - expected_m)
+    turn = expected_axes.T @ rotation_from_quaternion(seen.tip_quaternion)
+    turn_deg = np.degrees(np.linalg.norm(rotation_vector(turn)))
+    if off_m > _NEAR * spec.length_m or turn_deg > _TURNED_DEG:
+        got, expected = (", ".join(f"{1e3 * x:.0f}" for x in at_m) for at_m in (seen.tip_m, expected_m))
+        raise InputError(
+            f"{where}: got the tip at {got} mm, turned by {turn_deg:.0f} deg, expected it near {expected} "
+            "mm, the end of the straight arm: is the origin the base, and is up=y or up=z right?"
+        )

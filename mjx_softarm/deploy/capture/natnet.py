@@ -1,0 +1,161 @@
+"""Frames of OptiTrack's Motive over NatNet, by the package `natnet`. Positions are in metres.
+
+Motive streams to a multicast group or to each client that asks; both are tried. Switch *Broadcast Frame Data*
+and *Rigid Bodies* on in its streaming settings, *Marker Sets* for markers, and *Local Interface* to the
+network of this computer.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import io
+import math
+import socket
+import struct
+import time
+from typing import Any
+
+import numpy as np
+
+from mjx_softarm._support.errors import needing
+from mjx_softarm.deploy.capture.system import CaptureName, Frame, check_names
+from mjx_softarm.sensing.pose import rotation_from_quaternion
+
+COMMAND_PORT, DATA_PORT = 1510, 1511
+WAIT_S = 2.0  # longest wait for the server's answer, for its descriptions, and for the first frame
+AGAIN_S = 1.0  # time without a frame after which the server is asked again; it may have begun anew
+MOST = 20  # number of packets that one poll reads at most, so that a flood does not hold up the loop
+
+
+class _Enough(Exception):
+    """A poll has read as many packets as it may."""
+
+
+class NatNet:
+    """Connection to a NatNet server; see `Source`.
+
+    Raises:
+        InputError: the package is missing, or the server has no such body or marker set.
+        OSError: the server does not answer, or streams no frame.
+    """
+
+    def __init__(self, name: CaptureName):
+        with needing("capture", "--capture"):
+            self._package = importlib.import_module("natnet")
+        self._name = name
+        self._new: list[Any] = []  # frames that have come since the last poll
+        self._described: Any = None
+        self._first: Any = None  # the first frame's end, for the rate of the server's clock
+        self._asked_s = time.monotonic()
+        for multicast in (False, True):
+            self._client = self._connect(multicast)
+            if self._until(lambda: self._described and self._new):
+                break
+            self._client.shutdown()
+        else:
+            what = "no frame" if self._described else "no description of its bodies"
+            raise TimeoutError(f"got {what} from {name.host}, expected Motive to stream")
+
+        # Bodies by their number in frames, as the server describes them
+        described, where = self._described, f"--capture natnet:{name.host}"
+        self._bodies = {body.id_num: body.name for body in described.rigid_bodies}
+        sets = {found.name: len(found.marker_names) for found in described.marker_sets}
+        for body in (name.body, name.base):
+            check_names(where, "body", body, sorted(self._bodies.values()))
+        check_names(where, "marker set", name.markers, sorted(sets))
+        self._n_markers = sets.get(name.markers, 0)
+
+    def poll(self) -> Frame | None:
+        """Return the newest frame since the last call, None without one, at once; see `Source`."""
+        self._read()
+        now_s = time.monotonic()
+        if self._new:
+            frame, self._asked_s = self._new[-1], now_s
+            self._new.clear()
+            return self._frame(frame)
+        if now_s - self._asked_s > AGAIN_S:
+            self._client.send_request(self._client.NAT_CONNECT)
+            self._asked_s = now_s
+        return None
+
+    def close(self) -> None:
+        self._client.shutdown()
+
+    def _connect(self, multicast: bool) -> Any:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.connect(
+                (self._name.host, COMMAND_PORT)
+            )  # sends nothing; tells which of our addresses it is
+            local = probe.getsockname()[0]
+        client = self._package.NatNetClient(
+            self._name.host, local, command_port=COMMAND_PORT, data_port=DATA_PORT, use_multicast=multicast
+        )
+        client.on_data_frame_received_event.handlers.append(self._on_frame)
+        client.on_data_description_received_event.handlers.append(self._on_descriptions)
+        try:
+            client.connect(WAIT_S)
+        except TimeoutError as error:
+            raise TimeoutError(f"got no answer from {self._name.host}:{COMMAND_PORT}") from error
+        except self._package.NatNetError as error:
+            raise OSError(str(error)) from error
+        client.request_modeldef()
+        return client
+
+    def _until(self, done: Any) -> bool:
+        """Read packets until a condition holds; return False after `WAIT_S`."""
+        end_s = time.monotonic() + WAIT_S
+        while not done() and time.monotonic() < end_s:
+            self._read()
+            time.sleep(0.01)
+        return bool(done())
+
+    def _read(self) -> None:
+        """Read the packets that have come.
+
+        Raises:
+            OSError: a packet cannot be read, or the network is gone.
+        """
+        try:
+            with contextlib.redirect_stdout(io.StringIO()):  # the package prints each odd packet
+                self._client.update_sync()
+        except _Enough:
+            pass
+        except (struct.error, UnicodeDecodeError, TypeError, self._package.NatNetError) as error:
+            raise OSError(f"got a packet that cannot be read: {error}") from error
+
+    def _on_frame(self, frame: Any) -> None:
+        self._new.append(frame)
+        if len(self._new) >= MOST:
+            raise _Enough
+
+    def _on_descriptions(self, described: Any) -> None:
+        self._described = described
+
+    def _frame(self, frame: Any) -> Frame:
+        bodies = {
+            self._bodies.get(body.id_num, ""): (
+                np.array(body.pos),
+                np.asarray(rotation_from_quaternion(np.roll(body.rot, 1))),
+            )
+            for body in frame.rigid_bodies
+            if body.tracking_valid is not False  # None before NatNet 2.6
+        }
+        marker_m = np.full((self._n_markers, 3), np.nan)
+        for found in frame.marker_sets:
+            if found.model_name == self._name.markers and len(found.marker_pos_list) == self._n_markers:
+                marker_m = np.array(found.marker_pos_list).reshape(-1, 3)
+        marker_m[(marker_m == 0.0).all(axis=1)] = np.nan  # a hidden marker stands at the origin
+        return Frame(frame.suffix.timestamp, self._latency(frame.suffix), bodies, marker_m)
+
+    def _latency(self, end: Any) -> float:
+        """Return the time [s] from exposure to sending; NaN where the clock's rate is not known yet.
+
+        The package does not read the rate of the server's clock, so it is taken from two frames' times.
+        """
+        self._first = self._first or end
+        seconds = end.timestamp - self._first.timestamp
+        if end.stamp_transmit is None or seconds <= 0.1:
+            return math.nan
+        per_s = (end.stamp_transmit - self._first.stamp_transmit) / seconds
+        return (end.stamp_transmit - end.stamp_camera_mid_exposure) / per_s if per_s > 0.0 else math.nan

@@ -1,0 +1,98 @@
+"""A motion capture system: the option that names it, its frames, and what it has to offer."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from mjx_softarm._support.errors import InputError
+
+# From the system's axes to ours, whose z points up.
+UP = {"y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]), "z": np.eye(3)}
+_DEFAULT_UP = {"natnet": "y", "qualisys": "z"}
+
+
+class Frame(NamedTuple):
+    """A frame in the axes of its system.
+
+    Attributes:
+        time_s: time [s] on the system's clock.
+        latency_s: time [s] from the cameras' exposure to sending; NaN where the system does not tell it.
+        bodies: origin (3,) [m] and axes (3, 3), as columns, of each rigid body that is seen.
+        marker_m (n_markers, 3) [m]: NaN for a marker that is not seen.
+    """
+
+    time_s: float
+    latency_s: float
+    bodies: Mapping[str, tuple[np.ndarray, np.ndarray]]
+    marker_m: np.ndarray
+
+
+class Source(Protocol):
+    """A connection to a motion capture system."""
+
+    def poll(self) -> Frame | None:
+        """Return the newest frame since the last call, None without one, at once.
+
+        Raises:
+            OSError: the system cannot be reached, or its packets cannot be read.
+        """
+        ...
+
+    def close(self) -> None:
+        """End the connection."""
+        ...
+
+
+@dataclass(frozen=True)
+class CaptureName:
+    """Settings that the option `--capture` names."""
+
+    system: str
+    host: str
+    body: str
+    base: str = ""
+    markers: str = ""
+    up: str = ""
+
+    @classmethod
+    def read(cls, text: str) -> CaptureName:
+        """Read the option's text.
+
+        Raises:
+            InputError: it is malformed.
+        """
+        words, *options = text.split(",")
+        system, host, body, *_ = *words.split(":", 2), "", ""
+        named = {key: value for key, _, value in (option.partition("=") for option in options)}
+        if system not in _DEFAULT_UP or not host or not body or not named.keys() <= {"base", "markers", "up"}:
+            expected = "natnet:HOST:BODY or qualisys:HOST:BODY, maybe with ,base=BODY,markers=NAME,up=y|z"
+            raise InputError(f"--capture: got {text!r}, expected {expected}")
+        found = cls(system, host, body, **{"up": _DEFAULT_UP[system]} | named)
+        if found.up not in UP:
+            raise InputError(f"--capture: got up={found.up}, expected y or z")
+        return found
+
+
+def check_names(where: str, kind: str, asked: str, known: list[str]) -> None:
+    """Refuse a body or a marker set that the system does not have.
+
+    Raises:
+        InputError: it has none of this name.
+    """
+    if asked and asked not in known:
+        raise InputError(f"{where}: got no {kind} {asked!r}, expected one of {', '.join(known) or 'some'}")
+
+
+def numbered(prefix: str, labels: list[str]) -> list[int]:
+    """Return the places of the labels PREFIX0, PREFIX1, ..., in the order of their numbers."""
+    found = {
+        int(label[len(prefix) :]): k
+        for k, label in enumerate(labels)
+        if re.fullmatch(re.escape(prefix) + r"\d+", label)
+    }
+    return [found[number] for number in sorted(found)]
