@@ -139,7 +139,7 @@ def fit_s2r(
     flagged = extrapolation(fit.network, pose_sim[held_out], spring_m[held_out]) > 1.0
     turn_deg = 2.0 * np.rad2deg(np.arctan(np.linalg.norm(y[:, 3:], axis=1)))
     return S2RFit(
-        s2r=fit.network,
+        s2r=fit.network._replace(error_mm=np.float32(errors["test"].translation_mean_mm)),
         held_out=held_out,
         **errors,
         stop_epoch=fit.stop_epoch,

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,6 +17,7 @@ import tyro
 
 from mjx_softarm._support import cli
 from mjx_softarm._support.errors import InputError, needing
+from mjx_softarm.deploy.budget import budget, draw
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.drivers.driven import Arms, finish
 from mjx_softarm.deploy.ending import MISSED, LoopRun, save_log
@@ -32,7 +34,7 @@ from mjx_softarm.deploy.record import record
 from mjx_softarm.deploy.session import check_arm, check_number, follow, trace
 from mjx_softarm.logs import mcap_file
 from mjx_softarm.logs.pressure_plan import read_plan
-from mjx_softarm.logs.schema import ENDINGS
+from mjx_softarm.logs.schema import ENDINGS, Log
 from mjx_softarm.mechanics.excitation import growing, random_pressures
 from mjx_softarm.policy.file import SHIPPED, Policy, load_policy
 from mjx_softarm.spec import ArmSpec
@@ -148,16 +150,20 @@ def _measure(
     goals: Annotated[str, tyro.conf.arg(metavar="circle|grid|FILE")] = "circle",
     points: int = 16,
     seconds: float | None = None,
+    payload: float = 0.0,
 ) -> int:
-    """Measure a policy's accuracy on an arm with motion capture.
+    """Measure a policy's accuracy on an arm with motion capture, and say what makes the error.
 
     Args:
-        out: folder to write: the figures, a picture, the log
+        out: folder to write: the figures, pictures, the log
         goals: circle; grid, over the workspace; or a CSV file of poses
         points: of the circle, or of the grid at most
         seconds: pass all goals without a stop in so long [s], from the first to the last
+        payload: mass that hangs at the gripper, which the loop is not given [g]
     """
     # Checks, before the arm moves
+    if not 0.0 <= payload < np.inf:
+        raise InputError(f"--payload: got {payload:g}, expected a finite number >= 0")
     if seconds is not None and not (0.0 < seconds < np.inf and goals != "grid"):
         raise InputError(f"--seconds: got {seconds:g} with --goals {goals}, expected > 0, and not a grid")
     if points < 1:
@@ -172,7 +178,11 @@ def _measure(
 
     # The run, stop by stop or in time
     out.mkdir(parents=True)
-    save = partial(save_log, out / "log.npz")
+    payload_kg = controller.policy.spec.mass.payload_kg + 1e-3 * payload
+
+    def save(log: Log) -> None:
+        save_log(out / "log.npz", replace(log, payload_kg=np.full(len(log), payload_kg)))
+
     if seconds is None:
         run = follow(driver, controller, poses, tell=tell, save=save)
     else:
@@ -190,9 +200,16 @@ def _measure(
         "seconds": float(run.log.time_s[-1]),
         **(along(run, controller.dt_s) if run.ways else {}),
     }
+    split = budget(run, controller, payload_kg) if seconds is None else None
+    if split is not None:
+        found["budget"] = split.figures()
     if missing := write_accuracy(out, accuracy, found):
         print(missing)
+    elif split is not None:
+        draw(split, out / "budget.png")
     _print_accuracy(found)
+    if split is not None:
+        print("\n".join(split.lines()))
     print(f"figures: {out / 'accuracy.json'}")
     _summary(run, controller.policy)
     return run.status

@@ -16,7 +16,7 @@ import numpy as np
 from mjx_softarm._support.errors import InputError
 from mjx_softarm.control import saturated
 from mjx_softarm.deploy.controller import Controller
-from mjx_softarm.deploy.ending import LoopRun
+from mjx_softarm.deploy.ending import Arrival, LoopRun
 from mjx_softarm.deploy.link import describe
 from mjx_softarm.deploy.safety import Fault
 from mjx_softarm.logs.tables import read_table
@@ -122,30 +122,50 @@ def measure(run: LoopRun, controller: Controller, goals: np.ndarray) -> Accuracy
     Raises:
         InputError: motion capture saw nothing, or no tick was logged.
     """
-    log, policy, window = run.log, controller.policy, controller.window
+    policy = controller.policy
     error, believed = np.full((2, *goals.shape), np.nan)
     mask = np.zeros((len(goals), policy.spec.n_chambers), bool)
     arrival_s, load_estimate_g = np.full((2, len(goals)), np.nan)
+    for arrival in run.arrivals:
+        point, rest = arrival.index, at_rest(run, controller, arrival)
+        error[point], mask[point], load_estimate_g[point] = rest.error, rest.saturated, 1e3 * rest.load_kg
+        believed[point] = pose_error(np.asarray(arrival.estimate, float), arrival.goal)
+        arrival_s[point] = run.log.time_s[arrival.row]
+    return Accuracy(goals, error, believed, mask, arrival_s, load_estimate_g)
+
+
+class Rest(NamedTuple):
+    """Arm at rest on arrival at a goal: means over the window that ends with it."""
+
+    error: np.ndarray  # (6,) [mm, deg] of the tip by motion capture, NaN where it was not seen
+    spring_m: np.ndarray  # (n_springs,) lengths read
+    reference_m: np.ndarray  # (n_springs,)
+    load_kg: float  # believed payload
+    saturated: np.ndarray  # (n_chambers,) bool
+
+
+def at_rest(run: LoopRun, controller: Controller, arrival: Arrival) -> Rest:
+    """Return the arm at rest on an arrival of a run.
+
+    Raises:
+        InputError: motion capture saw nothing, or no tick was logged.
+    """
+    log, policy = run.log, controller.policy
     if log.tip_m is None or log.tip_quaternion is None:
         raise InputError(f"motion capture: got no frame in {len(log)} ticks, expected the tip")
-
-    # Means over the window that ends with each arrival
-    for arrival in run.arrivals:
-        point = arrival.index
-        assert log.pressure_kpa is not None and log.reference_m is not None
-        assert log.readings is not None and log.load_kg is not None
-        rows = slice(max(0, arrival.row + 1 - window), arrival.row + 1)
-        error[point] = seen_error(log.tip_m[rows], log.tip_quaternion[rows], arrival.goal)
-        believed[point] = pose_error(np.asarray(arrival.estimate, float), arrival.goal)
-        arrival_s[point], load_estimate_g[point] = log.time_s[arrival.row], 1e3 * log.load_kg[arrival.row]
-        mask[point] = saturated(
-            log.pressure_kpa[rows].mean(axis=0),
-            log.reference_m[arrival.row],
-            policy.sensor.lengths(log.readings[rows], np.nan).length_m.mean(axis=0),
-            policy.gains.measured(),
-            policy.tolerance_m,
-        )
-    return Accuracy(goals, error, believed, mask, arrival_s, load_estimate_g)
+    assert log.pressure_kpa is not None and log.reference_m is not None
+    assert log.readings is not None and log.load_kg is not None
+    rows = slice(max(0, arrival.row + 1 - controller.window), arrival.row + 1)
+    spring_m = policy.sensor.lengths(log.readings[rows], np.nan).length_m.mean(axis=0)
+    reference_m, law = log.reference_m[arrival.row], policy.gains.measured()
+    mean_kpa = log.pressure_kpa[rows].mean(axis=0)
+    return Rest(
+        seen_error(log.tip_m[rows], log.tip_quaternion[rows], arrival.goal),
+        spring_m,
+        reference_m,
+        float(log.load_kg[arrival.row]),
+        saturated(mean_kpa, reference_m, spring_m, law, policy.tolerance_m),
+    )
 
 
 def figures(

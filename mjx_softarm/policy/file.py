@@ -60,12 +60,13 @@ from mjx_softarm.sensing.sensors import Sensor, SensorFault
 from mjx_softarm.spec import ArmSpec, SpecError
 from mjx_softarm.spec_tables import Mounting
 
-SCHEMA_VERSION = 8
-READABLE = (7, 8)
+SCHEMA_VERSION = 9
+READABLE = (7, 8, 9)
 # In 7, `estimator.spring_site_m` is (n, 2), each section has as many chambers as springs, and the arm hangs
 ADDED_IN_8 = {"reward.axes": np.ones(6)} | {
     f"estimator.{name}": PoseEstimator._field_defaults[name] for name in ("base_position_m", "base_rotation")
 }
+ADDED_IN_9 = {"s2r.error_mm": S2R._field_defaults["error_mm"]}
 
 KIND = "policy"
 LAW = Gains._fields[:-1]  # entries of the law; its allocation follows from the specification
@@ -236,7 +237,9 @@ def _take_reward(entries: Entries) -> RewardConfig:
 def _unpack(arrays: Mapping[str, np.ndarray], source: str) -> Policy:
     # Refuse other schemas first, since their entries may differ.
     version = Entries(arrays, source).take("schema_version", np.integer, ())
-    arrays = ADDED_IN_8 | dict(arrays) if version < SCHEMA_VERSION else arrays
+    if version < SCHEMA_VERSION:
+        added = ADDED_IN_9 if arrays.get("s2r_kind") == "mlp" else {}
+        arrays = ADDED_IN_8 | added | dict(arrays)
     entries = Entries(arrays, source)
     entries.take("schema_version", np.integer, ())
     if version not in READABLE:

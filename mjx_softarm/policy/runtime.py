@@ -40,11 +40,11 @@ def tip_pose(policy: Policy, spring_m: Array, load_kg: Array | float) -> tuple[A
 
     Args:
         policy: policy with the networks.
-        spring_m (n,) [m]: spring lengths.
-        load_kg () [kg]: payload.
+        spring_m (..., n) [m]: spring lengths.
+        load_kg () or (...) [kg]: payload.
 
     Returns:
-        Pose (6,) [mm, deg], and its distance from the calibration as a share of the limit, or 0 without a
+        Pose (..., 6) [mm, deg], and its distance from the calibration as a share of the limit, or 0 without a
         sim-to-real network.
     """
     frame = estimate_frame(policy.estimator, spring_m, load_kg)

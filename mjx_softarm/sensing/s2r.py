@@ -39,6 +39,9 @@ class S2R(NamedTuple):
     output_high: Array  # (n_out,) greatest corrections of the training rows
     anchors: Array  # (n_anchors, n_in) normalised training rows that represent all of them
     limit: Array  # () greatest believable distance to the nearest anchor
+    error_mm: Array = np.float32(
+        0.0
+    )  # () mean error of the tip at held-out poses; 0 in older files: not known
 
 
 def correct(s2r: S2R, pose: Array, spring_m: Array) -> Array:
@@ -170,12 +173,13 @@ def take_s2r(entries: Entries, name: str, n_springs: int) -> S2R:
     n_in, n_out = N_POSE_INPUTS + n_springs, N_POSE_OUTPUTS
     shapes: dict = dict.fromkeys(("input_low", "input_high"), (n_in,))
     shapes |= dict.fromkeys(("output_low", "output_high"), (n_out,))
-    shapes |= {"anchors": (None, n_in), "limit": ()}
+    shapes |= {"anchors": (None, n_in), "limit": (), "error_mm": ()}
     s2r = entries.network(name, S2R, shapes, n_in, n_out)
     for item, holds, expected in (
         ("input_high", s2r.input_low < s2r.input_high, "more than input_low"),
         ("output_high", s2r.output_low <= s2r.output_high, "at least output_low"),
         ("limit", s2r.limit > 0.0, "a number > 0"),
+        ("error_mm", np.greater_equal(s2r.error_mm, 0.0), "a number >= 0"),
     ):
         if not np.all(holds):
             entries.fail(f"{name}.{item}", f"got {getattr(s2r, item)}, expected {expected}")
@@ -183,7 +187,7 @@ def take_s2r(entries: Entries, name: str, n_springs: int) -> S2R:
 
 
 def _unpack(arrays: dict[str, np.ndarray], source: str, n_springs: int) -> S2R:
-    entries = Entries(arrays, source)
+    entries = Entries({f"{KIND}.error_mm": S2R._field_defaults["error_mm"]} | arrays, source)  # older files
     s2r = take_s2r(entries, KIND, n_springs)
     entries.finish(1)
     return s2r

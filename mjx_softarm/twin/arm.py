@@ -75,7 +75,7 @@ class Twin(InstrumentedArm):
         spec = spec or ArmSpec.default()
         self._parts = draw_parts(seed, spec, build)
         self._build = build
-        super().__init__(self._parts.sensor, seed, session, build.noise)
+        super().__init__(self._parts.sensor, seed, session, build)
         self._pipe = pipe
         self._model = build_twin(self._parts, pipe)
         self._data = mujoco.MjData(self._model)

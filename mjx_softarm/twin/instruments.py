@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -35,9 +36,12 @@ class Build(NamedTuple):
     losses: float = 1.0  # scale of hysteresis and joint friction; of a rod, scale of the regulators' deadband
     noise: float = 1.0  # scale of the noise of all sensors
     per_section: int | None = None  # links or elements per section; None: the twin's own number
+    zero_m: float = 0.0  # size of the shift of each spring's zero; its sign is drawn from the seed
+    softening: float = 0.0  # share of their stiffness that the chambers have lost
 
 
 AS_BUILT = Build()
+AGED = Build(zero_m=1e-3, softening=0.05)  # the same arm, some months after its calibration
 
 
 def drawn(rng: np.random.Generator, deviation: float, *shape: int) -> np.ndarray:
@@ -52,11 +56,15 @@ class InstrumentedArm(abc.ABC):
         sensor: the arm's own sensors.
         seed: chooses the twin.
         session: chooses the noise.
-        noise: scale of the noise.
+        build: scales of the noise, and of the shift of the springs' zeros.
     """
 
-    def __init__(self, sensor: Sensor, seed: int, session: int, noise: float):
-        self._sensor, self._scale = sensor, noise
+    def __init__(self, sensor: Sensor, seed: int, session: int, build: Build):
+        up = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(2,))).integers(
+            2, size=np.size(sensor.delta_m)
+        )
+        shift_m = build.zero_m * (2 * up - 1)
+        self._sensor, self._scale = dataclasses.replace(sensor, delta_m=sensor.delta_m + shift_m), build.noise
         self._rng = np.random.default_rng([session, seed])
         self.time_s = 0.0
 

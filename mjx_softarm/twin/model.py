@@ -22,7 +22,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from mjx_softarm._support.fields import PerChamber
+from mjx_softarm._support.fields import PerChamber, scaled
 from mjx_softarm.mechanics.mjcf import build_spec
 from mjx_softarm.mechanics.pipe import CrossPipe
 from mjx_softarm.mechanics.statics import GRAVITY_M_S2
@@ -98,7 +98,9 @@ def draw_parts(seed: int, spec: ArmSpec, build: Build) -> Parts:
     perturbed = spec.replace(
         structure={"links_per_section": build.per_section or LINKS_PER_SECTION},
         chambers={
-            "stiffness_n_per_m": scattered(chambers.stiffness_n_per_m, std.chamber_stiffness),
+            "stiffness_n_per_m": scattered(
+                scaled(chambers.stiffness_n_per_m, 1.0 - build.softening), std.chamber_stiffness
+            ),
             "area_m2": tuple(area_factor * spec.per_chamber(chambers.area_m2)),
             "area_slope_m": tuple(area_factor * spec.per_chamber(chambers.area_slope_m)),
             "length_offset_m": tuple(offset_m),

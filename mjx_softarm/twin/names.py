@@ -7,13 +7,14 @@ from pathlib import Path
 from mjx_softarm.mechanics.pipe import PIPES_MM, CrossPipe
 from mjx_softarm.spec import ArmSpec
 from mjx_softarm.twin.arm import Twin
+from mjx_softarm.twin.instruments import AGED, AS_BUILT
 from mjx_softarm.twin.rod_twin import RodTwin
 
-ROD = "rod"
+ROD, _AGED = "rod", ":aged"
 
 
 def twin_of(name: str) -> Twin | RodTwin:
-    """Make the twin of a name: `SEED` or `rod:SEED`, then `@ARM`, `:PIPE`, `:500g` where they are wanted.
+    """Make the twin of a name: `SEED` or `rod:SEED`, then `@ARM`, `:PIPE`, `:aged`, `:500g` where wanted.
 
     The arm is named as for `--spec`, by default the paper's. A payload is given in grams. Rods have no pipe.
 
@@ -21,14 +22,16 @@ def twin_of(name: str) -> Twin | RodTwin:
         ValueError: the name is malformed, the arm is unknown, or the arm does not fit into the pipe.
     """
     name, payload_kg = _without_payload(name)
+    build = AGED if name.endswith(_AGED) else AS_BUILT
+    name = name.removesuffix(_AGED)
     if name.startswith(f"{ROD}:"):
         number, spec = _seed_and_arm(name.removeprefix(f"{ROD}:"), f"twin:{ROD}:SEED")
-        return RodTwin(number, spec, payload_kg)
+        return RodTwin(number, spec, payload_kg, build=build)
     rest, colon, pipe = name.partition(":")
     number, spec = _seed_and_arm(rest, "twin:SEED")
     if colon and pipe not in PIPES_MM:
         raise ValueError(f"twin:{rest}:PIPE: got {pipe!r}, expected {' or '.join(PIPES_MM)}, or grams, 500g")
-    return Twin(number, spec, payload_kg, pipe=CrossPipe.of_mm(PIPES_MM[pipe]) if pipe else None)
+    return Twin(number, spec, payload_kg, build=build, pipe=CrossPipe.of_mm(PIPES_MM[pipe]) if pipe else None)
 
 
 def _without_payload(name: str) -> tuple[str, float]:

@@ -103,8 +103,9 @@ class RodTwin(InstrumentedArm):
         self._tip_m = mounting.tip_offset_m + drawn(rng, std.tip_offset_m, 3)
         tip_turn = rotation_about(np.radians(drawn(rng, std.tip_turn_deg, 3)))
         self._tip_turn = rotation_about(np.radians(mounting.tip_turn_deg)) @ tip_turn
-        super().__init__(_sensor(rng, self._spec, std), seed, session, build.noise)
+        super().__init__(_sensor(rng, self._spec, std), seed, session, build)
         parts = draw_rod(rng, seed, self._spec, std, self._base_rotation[2])
+        parts = parts._replace(stiffness=(1.0 - build.softening) * parts.stiffness)
         self._rod = Rod(parts, self._per_section)
 
         # Chambers with air and regulators

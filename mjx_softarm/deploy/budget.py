@@ -1,0 +1,200 @@
+"""Error budget: the tip's distance from its goals, split into the parts that make it. NumPy only.
+
+The pose goes from the goal to the measured tip in steps. Each step puts the truth in the place of one
+ingredient, and what this changes is that ingredient's part:
+
+    goal -> pose of the references -> of the springs -> with the true payload -> without shifted zeros -> tip
+        policy                     law              payload                   springs                 models
+
+The last step is the error of the pose's models and of all that they do not know. It is divided by the squares
+of the models' held-out errors, which the policy file has: estimator, S2R, and the rest, such as hysteresis.
+
+The part of an ingredient is the component of its step along the tip's error: parts add up to the error, and
+an ingredient that compensates another has a negative part.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mjx_softarm.deploy.controller import Controller
+from mjx_softarm.deploy.ending import LoopRun
+from mjx_softarm.deploy.measure import at_rest
+from mjx_softarm.policy.file import Policy
+from mjx_softarm.policy.runtime import tip_pose
+from mjx_softarm.sensing.pose import pose_error
+
+AS_CALIBRATED = 1.5  # error of the models over their held-out error, up to which nothing has changed; by hand
+ZERO_M = 1e-3  # prior of the shift of a spring's zero; by hand
+STEP_M = 2e-4  # of the finite differences
+MM_PER_DEG = 0.9  # weight of a turn beside a distance, as for the networks of the pose
+TOLD_MM = 0.4  # shift of a spring's zero that the sentence names
+
+
+class Budget(NamedTuple):
+    """Parts of the mean tip error at the goals that were measured."""
+
+    parts_mm: Mapping[str, float]  # by ingredient; their sum is the mean tip error
+    shift_mm: np.ndarray  # (n_springs,) shifts of the springs' zeros; zeros where nothing has changed
+    believed_g: float  # mean payload that the loop believed
+    payload_g: float  # payload that hung at the gripper
+    off_mm: float  # mean over goals of the largest distance of a spring from its reference
+    n_saturated: int  # goals with a saturated chamber
+    calibrated: bool  # whether the policy has the calibration of an arm
+
+    @property
+    def total_mm(self) -> float:
+        """Mean tip error."""
+        return sum(self.parts_mm.values())
+
+    @property
+    def largest(self) -> str:
+        """Name of the largest part."""
+        return max(self.parts_mm, key=lambda name: self.parts_mm[name])
+
+    def lines(self) -> list[str]:
+        """Return the parts in a line, then the sentence that names the largest one and its remedy."""
+        parts = ", ".join(f"{name} {value:.2f}" for name, value in self.parts_mm.items())
+        share = f"{self.largest}, {self.parts_mm[self.largest]:.2f} of {self.total_mm:.2f} mm"
+        return [f"made by [mm]: {parts}", f"largest part: {share}: {_remedies(self)[self.largest]}"]
+
+    def figures(self) -> dict[str, Any]:
+        """Return parts, shifts and payloads as JSON has them."""
+        return {**self._asdict(), "shift_mm": self.shift_mm.tolist(), "largest": self.largest}
+
+
+def _remedies(found: Budget) -> dict[str, str]:
+    """Return cause and remedy of each part, in words."""
+    shifted = np.flatnonzero(np.abs(found.shift_mm) > TOLD_MM)
+    zeros = ", ".join(f"spring{k} {found.shift_mm[k]:+.1f}" for k in shifted) or "all by little"
+    again = "`python -m calib run LOG --since CALIBRATION` with this log, then `train export --calibration`"
+    off = f"springs end {found.off_mm:.1f} mm off their references"
+    return {
+        "policy": "its references miss the goals by its own models: train longer, or by the preset analytic",
+        "law": f"{off}, saturated at {found.n_saturated} goals: take goals further inside, or less payload"
+        if found.n_saturated
+        else f"{off} although no chamber is saturated: look for a leak or a slow regulator",
+        "payload": f"the loop believes {found.believed_g:.0f} g and {found.payload_g:.0f} g hang there "
+        f"(--payload): {again}",
+        "springs": f"zeros have shifted since the calibration, about [mm]: {zeros}: {again}",
+        "estimator": "the distilled pose is off its simulation: only a finer network would help",
+        "S2R": "as large as at the calibration's held-out poses: record the poses of `calib plan`",
+        "rest": "the pose changes as no spring shows, as by hysteresis, or the arm has changed: " + again
+        if found.calibrated
+        else "the policy does not know this arm: calibrate it and train (docs/your-arm.md)",
+    }
+
+
+def budget(run: LoopRun, controller: Controller, payload_kg: float) -> Budget | None:
+    """Return the budget of a run on an arm with motion capture; None if no goal was measured.
+
+    Args:
+        run: towards goals, stop by stop.
+        controller: its policy.
+        payload_kg: payload that hung at the gripper.
+    """
+    # The goals, and the arm at rest there, where motion capture saw it
+    policy = controller.policy
+    both = [(arrival.goal, at_rest(run, controller, arrival)) for arrival in run.arrivals]
+    both = [(goal, rest) for goal, rest in both if np.isfinite(rest.error).all()]
+    if not both:
+        return None
+    goal, seen = np.array([goal for goal, _ in both]), np.array([rest.error for _, rest in both])  # (p, 6)
+    spring_m, reference_m = (
+        np.array([getattr(rest, name) for _, rest in both]) for name in ("spring_m", "reference_m")
+    )
+    load_kg = np.array([rest.load_kg for _, rest in both])
+
+    # Poses with one more ingredient replaced by the truth each, then the models' error
+    cases = (reference_m, load_kg), (spring_m, load_kg), (spring_m, payload_kg)
+    off = [pose_error(tip_pose(policy, *case)[0].astype(float), goal) for case in cases]
+    steps = np.diff([np.zeros_like(goal), *off, seen], axis=0).swapaxes(0, 1)  # (p, 4, 6)
+
+    # The models' error, with the part that shifted zeros explain
+    shift_m, by_shift = _shift(policy, spring_m, pose_error(seen, off[-1]), payload_kg)
+    each = steps[..., :3] * policy.reward.asked[:3]
+    by_shift = by_shift[:, :3] * policy.reward.asked[:3]
+    each = np.concatenate([each[:, :3], by_shift[:, None], each[:, 3:] - by_shift[:, None]], axis=1)
+    error = each.sum(axis=1)
+    along = error / np.maximum(np.linalg.norm(error, axis=1), 1e-9)[:, None]
+    *parts, models = (float(x) for x in np.einsum("pki,pi->pk", each, along).mean(axis=0))
+
+    # The models' part, divided by their held-out errors
+    known = {"estimator": _estimator_mm(policy, payload_kg), "S2R": _s2r_mm(policy)}
+    size = max(float(np.mean(np.linalg.norm(each[:, -1], axis=1) ** 2)), sum(x**2 for x in known.values()))
+    shares = {name: models * value**2 / max(size, 1e-12) for name, value in known.items()}
+    named = dict(zip(("policy", "law", "payload", "springs"), parts, strict=True))
+    return Budget(
+        parts_mm=named | shares | {"rest": models - sum(shares.values())},
+        shift_mm=1e3 * shift_m,
+        believed_g=1e3 * float(load_kg.mean()),
+        payload_g=1e3 * payload_kg,
+        off_mm=1e3 * float(np.abs(spring_m - reference_m).max(axis=1).mean()),
+        n_saturated=sum(bool(rest.saturated.any()) for _, rest in both),
+        calibrated=policy.calibrated,
+    )
+
+
+def _estimator_mm(policy: Policy, payload_kg: float) -> float:
+    """Return the estimator's median error on held-out simulated arms with the nearest payload; 0: unknown."""
+    table = policy.provenance.get("estimator_errors", {}).get("tip_mm", {})
+    own_kg = payload_kg - policy.spec.mass.payload_kg
+    name = min(table, key=lambda text: abs(float(text.split()[0]) - own_kg), default=None)
+    return 0.0 if name is None else float(table[name]["median"])
+
+
+def _s2r_mm(policy: Policy) -> float:
+    return 0.0 if policy.s2r is None else float(policy.s2r.error_mm)
+
+
+def _shift(
+    policy: Policy, spring_m: np.ndarray, left: np.ndarray, payload_kg: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return shifts of the springs' zeros that explain the models' errors, and the errors that they explain.
+
+    Both are zero where the errors are no larger than at the calibration, or where that is not known.
+
+    Args:
+        policy: with the models.
+        spring_m (p, n) [m]: lengths as read.
+        left (p, 6) [mm, deg]: measured pose minus that of the models.
+        payload_kg: payload that hung at the gripper.
+
+    Returns:
+        Shifts (n,) [m]: true length minus length read; errors (p, 6) [mm, deg].
+    """
+    n = spring_m.shape[1]
+    expected_mm = float(np.hypot(_estimator_mm(policy, payload_kg), _s2r_mm(policy)))
+    away_mm = float(np.linalg.norm(left[:, :3], axis=1).mean())
+    if not _s2r_mm(policy) or away_mm < AS_CALIBRATED * expected_mm:
+        return np.zeros(n), np.zeros_like(left)
+
+    # Derivatives of the pose by finite differences, then least squares with a prior
+    pose = tip_pose(policy, spring_m, payload_kg)[0].astype(float)
+    beside = tip_pose(policy, spring_m[:, None] + STEP_M * np.eye(n), payload_kg)[0].astype(float)
+    slope = pose_error(beside, pose[:, None]) / STEP_M  # (p, n, 6) [mm/m, deg/m]
+    weight = np.array([1.0, 1.0, 1.0, *3 * (MM_PER_DEG,)]) * 3**0.5 / expected_mm  # per axis
+    rows = (slope * weight).swapaxes(1, 2).reshape(-1, n) * ZERO_M
+    normal = rows.T @ rows + np.eye(n)
+    shift_m = ZERO_M * np.linalg.solve(normal, rows.T @ (left * weight).ravel())
+    return shift_m, np.einsum("pnk,n->pk", slope, shift_m)
+
+
+def draw(found: Budget, path: Path) -> None:
+    """Draw the parts as bars, the largest first; needs matplotlib."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7, 2.8), layout="constrained")
+    axes = figure.subplots()
+    ordered = sorted(found.parts_mm.items(), key=lambda item: item[1])
+    names, values = [name for name, _ in ordered], [value for _, value in ordered]
+    colours = ["tab:red" if name == found.largest else "tab:blue" for name in names]
+    axes.bar_label(axes.barh(names, values, color=colours), fmt="%.2f", padding=3)
+    axes.set(xlabel=f"part of the mean tip error of {found.total_mm:.2f} mm [mm]")
+    axes.margins(x=0.12)
+    axes.axvline(0.0, color="black", lw=0.8)
+    figure.savefig(path, dpi=150)

@@ -1,0 +1,141 @@
+"""Error budgets of the linear arm, each with one planted cause."""
+
+import dataclasses
+import json
+import re
+
+import numpy as np
+import pytest
+
+from mjx_softarm.deploy.__main__ import main
+from mjx_softarm.deploy.arm_io import Capture
+from mjx_softarm.deploy.budget import budget
+from mjx_softarm.deploy.controller import Controller
+from mjx_softarm.deploy.measure import figures, measure
+from mjx_softarm.logs.files import read_matrix
+from mjx_softarm.policy.file import save_policy
+from mjx_softarm.policy.runtime import tip_pose
+from mjx_softarm.sensing.pose import quaternion_from_pose
+from mjx_softarm.sensing.s2r import N_POSE_INPUTS, N_POSE_OUTPUTS, S2R
+from tests.linear_arm import (
+    CONTROLLER,
+    GAIN_M_PER_KPA,
+    GOALS,
+    POLICY,
+    REST_M,
+    SENSOR,
+    LinearArm,
+    N,
+    go,
+)
+
+KG = 1.0
+SHIFT_M = 1e-3 * np.array([0.0, 1.0, 0.0, -1.0, 0.0, 1.0, 0.0, 0.0, -1.0])
+_edge, _out = np.ones(N_POSE_INPUTS + N, np.float32), np.ones(N_POSE_OUTPUTS, np.float32)
+NO_CHANGE = S2R(
+    layers=((np.zeros((len(_edge), len(_out)), np.float32), 0 * _out),),
+    input_low=-_edge,
+    input_high=_edge,
+    output_low=-_out,
+    output_high=_out,
+    anchors=_edge[None],
+    limit=np.float32(1e3),
+    error_mm=np.float32(0.4),
+)
+load = POLICY.estimator.load_layers[0]
+MOVED = POLICY.estimator._replace(load_layers=((load[0], load[1] + np.float32([0.003, 0, 0] * 6)),))
+ERRORS = {"tip_mm": {"0 kg": {"median": 0.3}, "1 kg": {"median": 9.0}}}
+KNOWN = dataclasses.replace(POLICY, s2r=NO_CHANGE, estimator=MOVED, provenance={"estimator_errors": ERRORS})
+WEAK = dataclasses.replace(KNOWN, gains=KNOWN.gains._replace(pressure_max_kpa=np.full(N, 8.0)))
+CIRCLE = np.random.default_rng(5).uniform(-20, 10, (8, N)) @ GAIN_M_PER_KPA.T + REST_M
+GOALS_OF_CIRCLE = tip_pose(KNOWN, CIRCLE, 0.0)[0].astype(float)
+
+
+def nearest_springs(pose, goal, spring_m, sensed):
+    return CIRCLE[int(np.argmin(np.abs(GOALS_OF_CIRCLE - goal).sum(axis=1)))]
+
+
+class Planted(LinearArm):
+    """The truth is the policy's model, but for what a test plants."""
+
+    def __init__(self, shift_m=0.0, payload_kg=0.0, off_mm=0.0, policy=KNOWN):
+        super().__init__(sensor=dataclasses.replace(SENSOR, delta_m=SENSOR.delta_m + shift_m))
+        self.payload_kg, self.off_mm, self.policy = payload_kg, off_mm, policy
+
+    def motion_capture(self):
+        pose = tip_pose(self.policy, self.spring_m, self.payload_kg)[0].astype(float)
+        tip_m = 1e-3 * (pose[:3] + self.off_mm)
+        return Capture(tip_m, quaternion_from_pose(pose), tip_m[None])
+
+
+def split(arm, plan=nearest_springs, payload_kg=0.0, policy=KNOWN):
+    controller = Controller.of(policy, plan)
+    run = go(arm, goals=GOALS_OF_CIRCLE, controller=controller)
+    found = budget(run, controller, payload_kg)
+    error_mm = figures(measure(run, controller, GOALS_OF_CIRCLE), run.counts())["translation_mm"]
+    assert found.total_mm == pytest.approx(error_mm, rel=1e-6)
+    return found
+
+
+def wrong_springs(*at):
+    return nearest_springs(*at) + 2e-3 * (np.arange(N) == 1)
+
+
+@pytest.mark.parametrize(
+    ("cause", "arm", "others", "words"),
+    [
+        ("policy", {}, {"plan": wrong_springs}, "train longer, or by the preset analytic"),
+        (
+            "law",
+            {},
+            {"policy": WEAK},
+            "springs end [0-9.]+ mm off their references, saturated at [1-8] goals",
+        ),
+        ("payload", {"payload_kg": KG}, {"payload_kg": KG}, "believes 0 g and 1000 g hang"),
+        ("springs", {"shift_m": SHIFT_M}, {}, r"spring1 \+[01]\.[0-9], spring3 -[01]\.[0-9]"),
+    ],
+)
+def test_a_planted_cause_is_the_largest_part(cause, arm, others, words):
+    found = split(Planted(**arm), **others)
+    assert found.largest == cause and found.parts_mm[cause] > 0.85 * found.total_mm > 0.5
+    parts, sentence = found.lines()
+    assert cause in parts and found.calibrated
+    assert re.search(words, sentence), sentence
+
+
+def test_shifts_of_the_springs_zeros_are_found_as_far_as_eight_goals_tell():
+    found = split(Planted(shift_m=SHIFT_M)).shift_mm
+    np.testing.assert_allclose(found, 1e3 * SHIFT_M, atol=0.6)
+    assert np.corrcoef(found, SHIFT_M)[0, 1] > 0.9
+
+
+def test_errors_as_at_the_calibration_are_the_models():
+    """Half a millimetre off: by the squares of 0.3 mm of the estimator and 0.4 mm of S2R, and no more."""
+    found = split(Planted(off_mm=np.array([0.3, 0.0, 0.4])))
+    assert not found.shift_mm.any() and found.parts_mm["rest"] == pytest.approx(0.0, abs=0.03)
+    assert found.parts_mm["S2R"] / found.parts_mm["estimator"] == pytest.approx(16 / 9)
+    assert found.largest == "S2R" and "record the poses of `calib plan`" in found.lines()[1]
+
+
+def test_an_arm_that_the_policy_does_not_know():
+    found = split(Planted(off_mm=np.array([3.0, 0.0, 4.0]), policy=POLICY), policy=POLICY)
+    assert found.largest == "rest" and found.parts_mm["rest"] == pytest.approx(5.0, abs=0.4)
+    assert not found.calibrated and "calibrate it and train" in found.lines()[1]
+
+
+def test_measure_tells_the_parts_and_logs_the_payload(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("matplotlib")
+    save_policy(tmp_path / "policy.npz", POLICY)
+    monkeypatch.setattr("mjx_softarm.deploy.__main__._controller", lambda path: CONTROLLER)
+    monkeypatch.setattr("mjx_softarm.deploy.__main__.open_arm", lambda name: Planted(policy=POLICY))
+    monkeypatch.setattr("mjx_softarm.deploy.__main__.read_goals", lambda *at: GOALS)
+    out = tmp_path / "out"
+    assert main(["measure", "--arm", "its:Arm", "--out", str(out), "--payload", "250"]) == 0
+    said = capsys.readouterr().out
+    assert "made by [mm]: policy " in said and "largest part: " in said
+    found = json.loads((out / "accuracy.json").read_text())
+    assert sum(found["budget"]["parts_mm"].values()) == pytest.approx(found["translation_mm"])
+    assert found["budget"]["payload_g"] == 250.0 and (out / "budget.png").stat().st_size > 0
+    log = read_matrix(out / "log.npz", POLICY.spec, one_of=())[0].log()
+    assert (log.payload_kg == 0.25).all()
+    assert main(["measure", "--arm", "its:Arm", "--out", str(out), "--payload", "-1"]) == 2
