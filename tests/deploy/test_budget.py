@@ -127,7 +127,7 @@ def test_measure_tells_the_parts_and_logs_the_payload(tmp_path, monkeypatch, cap
     pytest.importorskip("matplotlib")
     save_policy(tmp_path / "policy.npz", POLICY)
     monkeypatch.setattr("mjx_softarm.deploy.__main__._controller", lambda path: CONTROLLER)
-    monkeypatch.setattr("mjx_softarm.deploy.__main__.open_arm", lambda name: Planted(policy=POLICY))
+    monkeypatch.setattr("mjx_softarm.deploy.drivers.driven.open_arm", lambda name: Planted(policy=POLICY))
     monkeypatch.setattr("mjx_softarm.deploy.__main__.read_goals", lambda *at: GOALS)
     out = tmp_path / "out"
     assert main(["measure", "--arm", "its:Arm", "--out", str(out), "--payload", "250"]) == 0

@@ -122,7 +122,9 @@ def test_file_of_schema_7_is_read(file):
 def test_file_of_schema_8_does_not_know_the_error_of_its_network(file):
     policy = load_policy(file)
     reseal(file, drop=("s2r.error_mm",), schema_version=np.asarray(8))
-    assert_same(load_policy(file), dataclasses.replace(policy, s2r=policy.s2r._replace(error_mm=np.float32(0))))
+    assert_same(
+        load_policy(file), dataclasses.replace(policy, s2r=policy.s2r._replace(error_mm=np.float32(0)))
+    )
 
 
 def test_actor_with_one_layer_and_arm_with_two_sections(tmp_path, make_arm_model):

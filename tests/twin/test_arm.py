@@ -256,3 +256,16 @@ def test_losses_of_a_small_arm_are_small():
             arm.write_pressures(np.full(spec.n_chambers, share * spec.chambers.pressure_max_kpa))
         left.append(np.linalg.norm(arm.motion_capture().tip_m - before_m) / spec.length_m)
     assert left[1] < 2.0 * left[0]
+
+
+@pytest.mark.parametrize("kind", ["", "rod:"])
+def test_an_aged_twin_is_the_same_arm_with_shifted_zeros_and_softer_chambers(kind):
+    """The shift alone shows at no pressure; the load on softer chambers lengthens the springs a little."""
+    young, aged = (open_arm(f"twin:{kind}3{age}") for age in ("", ":aged"))
+    off_m = aged._sensor.delta_m - young._sensor.delta_m
+    np.testing.assert_allclose(np.abs(off_m), 1e-3, rtol=1e-9)
+    assert 0 < np.count_nonzero(off_m > 0.0) < 9
+    longer_m = aged._lengths_m() - young._lengths_m()
+    assert 0.0 < longer_m.mean() < 2e-3
+    assert np.array_equal(open_arm(f"twin:{kind}3:aged")._sensor.delta_m, aged._sensor.delta_m)
+    assert open_arm(f"twin:{kind}3:aged:100g").motion_capture().tip_m[2] < aged.motion_capture().tip_m[2]

@@ -16,7 +16,7 @@ Arm = Annotated[
     str,
     tyro.conf.arg(
         help="yours: package.module:Class; simulated: twin:SEED, or twin:rod:SEED; twin:SEED@ARM.toml, of "
-        "another arm; twin:SEED:pipe300, in a pipe; twin:SEED:500g, with a payload"
+        "another arm; twin:SEED:pipe300, in a pipe; twin:SEED:aged, later; twin:SEED:500g, with a payload"
     ),
 ]
 
