@@ -24,7 +24,7 @@ ROOT = Path(__file__).resolve().parents[2]
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("twin", "got 'twin', expected twin:SEED or package.module:Class"),
+        ("twin", "got 'twin', expected twin:SEED, wiring.toml or package.module:Class"),
         ("twin:-1", "got '-1', expected an integer >= 0"),
         ("twin:0:pipe200", "twin:0:PIPE: got 'pipe200', expected pipe300 or pipe250, or grams"),
         ("twin:0:500", "twin:0:PIPE: got '500', expected pipe300 or pipe250, or grams, 500g"),

@@ -15,8 +15,9 @@ from mjx_softarm.spec import ArmSpec
 Arm = Annotated[
     str,
     tyro.conf.arg(
-        help="yours: package.module:Class; simulated: twin:SEED, or twin:rod:SEED; twin:SEED@ARM.toml, of "
-        "another arm; twin:SEED:pipe300, in a pipe; twin:SEED:aged, later; twin:SEED:500g, with a payload"
+        help="yours: package.module:Class, or a file of hardware, wiring.toml; simulated: twin:SEED, or "
+        "twin:rod:SEED; twin:SEED@ARM.toml, of another arm; twin:SEED:pipe300, in a pipe; "
+        "twin:SEED:aged, later; twin:SEED:500g, with a payload"
     ),
 ]
 

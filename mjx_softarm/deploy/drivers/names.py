@@ -1,4 +1,4 @@
-"""Arms by name: `twin:SEED`, `twin:SEED:PIPE`, `twin:rod:SEED`, or your driver, `package.module:Class`.
+"""Arms by name: `twin:SEED`, `twin:SEED:PIPE`, `twin:rod:SEED`, `wiring.toml`, or `package.module:Class`.
 
 `twin:SEED@ARM` and `twin:rod:SEED@ARM` are twins of another arm, named as for `--spec`. A twin's name that
 ends in `:500g` has a payload of 500 g. With `:aged` before that, it is the same arm some months later: each
@@ -11,11 +11,13 @@ import importlib
 import os
 import sys
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mjx_softarm._support.errors import InputError, needing
+from mjx_softarm.deploy.drivers.wiring import wired
 
 _TWIN = "mjx_softarm.twin.names"  # imported only when asked for, since it needs MuJoCo
 _METHODS = ("read_sensors", "write_pressures")
@@ -27,16 +29,21 @@ def open_arm(name: str) -> Any:
     Args:
         name: `twin:SEED`; a rod, `twin:rod:SEED`; of another arm, `twin:SEED@ARM`, `twin:rod:SEED@ARM`; in a
             pipe, `twin:SEED:pipe300` or `twin:SEED:pipe250`; later, `twin:SEED:aged`; each with a payload as
-            in `twin:SEED:500g`. Or `package.module:Class`, a class without arguments; modules may be in the
-            working directory.
+            in `twin:SEED:500g`. Or a file of hardware and settings, `wiring.toml`
+            (`mjx_softarm.deploy.drivers.wiring`). Or `package.module:Class`, a class without arguments;
+            modules may be in the working directory.
 
     Raises:
         InputError: the name is malformed, cannot be imported, or is no arm.
     """
+    # Hardware by its settings
+    if name.endswith(".toml") and ":" not in name:
+        return wired(Path(name))
+
     # A twin
     module_name, _, item = name.partition(":")
     if not module_name or not item:
-        raise InputError(f"--arm: got {name!r}, expected twin:SEED or package.module:Class")
+        raise InputError(f"--arm: got {name!r}, expected twin:SEED, wiring.toml or package.module:Class")
     if module_name == "twin":
         with needing("sim", "--arm"):
             twins = importlib.import_module(_TWIN)

@@ -1,0 +1,121 @@
+"""Springs at LDC1612 or LDC1614 converters on I2C buses of a Linux computer; needs smbus2.
+
+Registers and formulas are those of the data sheets, Texas Instruments SNOSCY9 (LDC1612, LDC1614). A converter
+runs by itself on an external clock, and goes round its channels. A channel's reading is new if its conversion
+ended after the last call; otherwise, or with an error flag, the spring counts as not read. With two addresses
+on a bus, nine springs need several buses, or a multiplexer, whose ports Linux shows as buses (device tree
+overlay `i2c-mux,pca9548`).
+"""
+
+from __future__ import annotations
+
+import fcntl
+import importlib
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from mjx_softarm._support.errors import needing
+
+DATA_MSB, RCOUNT, SETTLECOUNT, CLOCK_DIVIDERS, DRIVE_CURRENT = 0x00, 0x08, 0x10, 0x14, 0x1E  # of channel 0
+STATUS, ERROR_CONFIG, CONFIG, MUX_CONFIG, RESET_DEV = 0x18, 0x19, 0x1A, 0x1B, 0x1C
+IDS = {0x7E: 0x5449, 0x7F: 0x3055}  # manufacturer and device, by register
+CLOCK_HZ = 40e6  # external clock
+CONVERSION_S = 0.004  # of one channel; by hand: a converter's two channels end twice within a tick
+SETTLE_S = 2e-5  # of a coil before its conversion; by hand: a Q factor of 40 at 2 MHz
+BUS_TIMEOUT = 1  # longest transfer, in steps of 10 ms
+I2C_TIMEOUT = 0x0702  # ioctl of Linux's i2c-dev
+
+
+class LdcSprings:
+    """Springs' frequencies [Hz], in the order of `channels`.
+
+    Args:
+        channels: bus, address (0x2A or 0x2B) and channel of each spring.
+        drive_current: setting 0 to 31 of the coils' current; the amplitude at a coil should be 1.2 to 1.8 V.
+        timeout_s: time after which no further converter is read in a call.
+
+    Raises:
+        ImportError: smbus2 is missing.
+        ValueError: the channels or the current are none.
+        OSError: a bus cannot be opened, or a converter is not there.
+    """
+
+    def __init__(
+        self, channels: Sequence[Sequence[int]], drive_current: int = 18, timeout_s: float = 0.008
+    ) -> None:
+        # Springs by converter
+        self._springs: dict[tuple[int, int], dict[int, int]] = {}
+        for spring, (bus, address, channel) in enumerate(channels):
+            self._springs.setdefault((bus, address), {})[channel] = spring
+        n_known = sum(map(len, self._springs.values()))
+        if n_known != len(channels) or not all({*at} <= {0, 1, 2, 3} for at in self._springs.values()):
+            raise ValueError(
+                f"channels: got {channels}, expected a channel 0 to 3 of its own for each spring"
+            )
+        if not 0 <= drive_current <= 31:
+            raise ValueError(f"drive_current: got {drive_current}, expected 0 to 31")
+        self._n, self._timeout_s = len(channels), timeout_s
+
+        # Buses, and converters set going
+        with needing("i2c", "springs"):
+            self._smbus: Any = importlib.import_module("smbus2")
+        self._buses: dict[int, Any] = {}
+        for bus in {bus for bus, _ in self._springs}:
+            self._buses[bus] = self._smbus.SMBus(bus)
+            fcntl.ioctl(self._buses[bus].fd, I2C_TIMEOUT, BUS_TIMEOUT)
+        for (bus, address), at in self._springs.items():
+            self._start(bus, address, sorted(at), drive_current)
+
+    def read_sensors(self) -> np.ndarray:
+        """Return the frequencies (n,) [Hz]; NaN for a spring that was not read."""
+        end_s = time.monotonic() + self._timeout_s
+        readings = np.full(self._n, np.nan)
+        for (bus, address), at in self._springs.items():
+            if time.monotonic() > end_s:
+                break
+            registers = [STATUS, *(DATA_MSB + 2 * channel + word for channel in at for word in (0, 1))]
+            try:
+                status, *words = self._read(bus, address, registers)
+            except OSError:  # this converter's springs are not read; all of them end the run
+                continue
+            for (channel, spring), high, low in zip(at.items(), words[::2], words[1::2], strict=True):
+                unread, errors = status >> (3 - channel) & 1, high >> 12
+                if unread and not errors:
+                    readings[spring] = ((high << 16) | low) * CLOCK_HZ / 2**28
+        return readings
+
+    def _start(self, bus: int, address: int, channels: Sequence[int], drive_current: int) -> None:
+        """Set a converter going round its channels."""
+        where = f"LDC1612 at bus {bus}, address {address:#x}"
+        try:
+            found = self._read(bus, address, list(IDS))
+        except OSError as error:
+            raise OSError(f"{where}: got {error.strerror or error}, expected an answer") from error
+        if found != [*IDS.values()]:
+            raise OSError(f"{where}: got ids {found}, expected {[*IDS.values()]}")
+        self._write(bus, address, RESET_DEV, 0x8000)  # into sleep mode
+        for channel in channels:
+            self._write(bus, address, RCOUNT + channel, round(CONVERSION_S * CLOCK_HZ / 16))
+            self._write(bus, address, SETTLECOUNT + channel, round(SETTLE_S * CLOCK_HZ / 16))
+            self._write(bus, address, CLOCK_DIVIDERS + channel, 0x1001)  # neither clock is divided
+            self._write(bus, address, DRIVE_CURRENT + channel, drive_current << 11)
+        self._write(bus, address, ERROR_CONFIG, 0xF800)  # errors are flagged beside the data
+        # One channel all the time, or channels 0 to 1, 2 or 3 in turn; inputs up to 10 MHz
+        sequence = 0x8000 | max(channels[-1] - 1, 0) << 13 if len(channels) > 1 else 0
+        self._write(bus, address, MUX_CONFIG, sequence | 0x020D)
+        # Awake, current as set, external clock
+        self._write(bus, address, CONFIG, (channels[0] if len(channels) == 1 else 0) << 14 | 0x1E01)
+
+    def _write(self, bus: int, address: int, register: int, value: int) -> None:
+        words = [register, value >> 8, value & 0xFF]
+        self._buses[bus].i2c_rdwr(self._smbus.i2c_msg.write(address, words))
+
+    def _read(self, bus: int, address: int, registers: Sequence[int]) -> list[int]:
+        """Return the words of registers, read in one transfer."""
+        asked = [self._smbus.i2c_msg.write(address, [register]) for register in registers]
+        words = [self._smbus.i2c_msg.read(address, 2) for _ in registers]
+        self._buses[bus].i2c_rdwr(*(part for pair in zip(asked, words, strict=True) for part in pair))
+        return [int.from_bytes(bytes(word), "big") for word in words]
