@@ -57,12 +57,16 @@ class CpxRegulators:
         # The terminal and its channels; setting them may take a second
         try:
             self._cpx: Any = terminal.CpxE(modules, SILENT_S, ip_address=host)
-            self._output = self._first_register("CpxE4AoUI", "outputs", N_OUT)
-            self._input = self._first_register("CpxE4AiUI", "inputs", N_IN)
         except (base.CpxConnectionError, ConnectionError, TypeError) as error:
             raise OSError(f"{host}: got {error}, expected a CPX-E terminal of type {modules}") from error
-        if self._output is None:
-            raise ValueError(f"modules: got {modules}, expected analogue outputs, NO, for {n} chambers")
+        try:
+            self._output = self._first_register("CpxE4AoUI", "outputs", N_OUT)
+            self._input = self._first_register("CpxE4AiUI", "inputs", N_IN)
+            if self._output is None:
+                raise ValueError(f"modules: got {modules}, expected analogue outputs, NO, for {n} chambers")
+        except Exception:
+            self._cpx.shutdown()
+            raise
         if self._input is not None:
             self.pressures = self._pressures  # an arm without this method measures none
 

@@ -1,5 +1,6 @@
 """Regulators at a CPX-E terminal: a stand-in that speaks Modbus TCP by its specification, faults included."""
 
+import contextlib
 import functools
 import socket
 import struct
@@ -46,23 +47,33 @@ class Terminal:
         self.parameters = dict.fromkeys(range(4096, 8192), 0)
         self.silent, self.refuses, self.delay_s, self.n_requests = False, False, 0.0, 0
         self.listener = socket.create_server(("127.0.0.1", 0))
-        self.port, self.client = self.listener.getsockname()[1], None
+        self.listener.settimeout(0.02)
+        self.port, self.ends = self.listener.getsockname()[1], threading.Event()
         self.thread = threading.Thread(target=self.serve, daemon=True)
         self.thread.start()
 
     def serve(self):
-        while True:
-            try:
-                self.client = self.listener.accept()[0]
-                while head := self.client.recv(7, socket.MSG_WAITALL):
-                    number, _, length, unit = struct.unpack(">HHHB", head)
-                    answer = self.answer(self.client.recv(length - 1, socket.MSG_WAITALL))
-                    time.sleep(self.delay_s)
-                    if not self.silent:
-                        self.client.sendall(struct.pack(">HHHB", number, 0, len(answer) + 1, unit) + answer)
-            except OSError:
-                if self.listener.fileno() < 0:
+        with self.listener:
+            while not self.ends.is_set():
+                with contextlib.suppress(OSError):
+                    client = self.listener.accept()[0]
+                    with client:
+                        self.talk(client)
+
+    def talk(self, client):
+        client.settimeout(0.02)
+        data = b""
+        while not self.ends.is_set():
+            with contextlib.suppress(TimeoutError):
+                if not (new := client.recv(4096)):
                     return
+                data += new
+            while len(data) >= 7 and len(data) >= (end := 6 + struct.unpack(">H", data[4:6])[0]):
+                number, unit = struct.unpack(">H4xB", data[:7])
+                answer, data = self.answer(data[7:end]), data[end:]
+                time.sleep(self.delay_s)
+                if not self.silent:
+                    client.sendall(struct.pack(">HHHB", number, 0, len(answer) + 1, unit) + answer)
 
     def answer(self, request):
         self.n_requests += 1
@@ -94,9 +105,8 @@ class Terminal:
             self.registers[CONTROL_IN] = word & 0x8000
 
     def close(self):
-        self.listener.close()
-        if self.client is not None:
-            self.client.close()
+        self.ends.set()
+        self.thread.join()
 
 
 @pytest.fixture
@@ -109,14 +119,16 @@ def terminal(monkeypatch, request):
 
 
 @pytest.fixture
-def opened(terminal, tmp_path, monkeypatch):
+def opened(terminal, tmp_path, monkeypatch, request):
     from mjx_softarm.deploy.drivers import wiring
 
     monkeypatch.setitem(wiring.DRIVERS["springs"], "ldc1612", lambda channels: None)
 
     def make(text=TOML):
         (tmp_path / "wiring.toml").write_text(text)
-        return open_arm(str(tmp_path / "wiring.toml"))
+        arm = open_arm(str(tmp_path / "wiring.toml"))
+        request.addfinalizer(arm._pressures._cpx.shutdown)
+        return arm
 
     return make
 
