@@ -197,13 +197,8 @@ class ArmSpec:
 
     def _check_together(self, source: str) -> None:
         """Refuse fields that contradict each other."""
-        # Chambers bend a section in every direction, and each spring stands beside a chamber
+        # Each spring stands beside a chamber
         structure = self.structure
-        if structure.chambers_per_section < LEAST_CHAMBERS:
-            raise SpecError(
-                f"{source}: structure.chambers_per_section: got {structure.chambers_per_section}, expected "
-                f"{LEAST_CHAMBERS} or more, since fewer chambers do not bend a section in every direction"
-            )
         n, springs = structure.chambers_per_section, structure.springs_per_section
         if springs and (springs < LEAST_CHAMBERS or n % springs):
             raise SpecError(

@@ -26,7 +26,7 @@ class Structure:
 
     n_sections: int = count()
     links_per_section: int = count()
-    chambers_per_section: int = count(default=3, high=MOST_CHAMBERS)
+    chambers_per_section: int = count(3, LEAST_CHAMBERS, MOST_CHAMBERS, "fewer bend a section in one plane")
     springs_per_section: int = count(default=0, low=0, high=MOST_CHAMBERS)  # 0: one beside each chamber
 
 

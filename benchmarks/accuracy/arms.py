@@ -100,17 +100,17 @@ def _measure(
     record = ("mjx_softarm.deploy", "record", "--arm", twin, "--spec", file)
     for log, options in logs.items():
         if not log.exists():
-            run_command(*record, "--poses", *options, "--out", log)
+            run_command(*record, "--poses", *options, "--out", log, makes=log)
     if not calibration.exists():
-        run_command("calib", "run", *logs, "--spec", file, "--out", calibration)
-    if (run / "config.json").exists() and not (run / "evaluation.json").exists():
-        run_command("train", "reach", "--resume", run)
-    elif not (run / "evaluation.json").exists():
+        report = calibration / "report.json"
+        run_command("calib", "run", *logs, "--spec", file, "--out", calibration, makes=report)
+    if not (run / "evaluation.json").exists():
         options = ("--learner.total-env-steps", steps) if steps else ()
-        arguments = ("--preset", preset, "--calibration", calibration, "--out", run)
-        run_command("train", "reach", *arguments, *options)
+        anew = ("--preset", preset, "--calibration", calibration, *options, "--out", run)
+        arguments = ("--resume", run) if (run / "config.json").exists() else anew
+        run_command("train", "reach", *arguments, makes=run / "evaluation.json")
     if not policy.exists():
-        run_command("train", "export", run)
+        run_command("train", "export", run, makes=policy)
 
     # Measure the policy on the twin
     figures = {"length [mm]": 1e3 * spec.length_m, **_figures(folder)}
@@ -151,24 +151,27 @@ def accuracy_of(policy: Path, arm: str, out: Path, *options: Any) -> dict[str, A
     """Measure a policy on an arm by `deploy measure`; return the figures, which stay in the new folder `out`.
 
     Raises:
-        InputError: the command failed, or no goal was arrived at.
+        InputError: the command failed, or arrived at no goal.
     """
-    run_command("mjx_softarm.deploy", "measure", policy, "--arm", arm, *options, "--out", out)
     file = out / "accuracy.json"
-    if not file.exists():
-        raise InputError(f"{arm}={policy}: got no measured goal, expected all")
+    run_command("mjx_softarm.deploy", "measure", policy, "--arm", arm, *options, "--out", out, makes=file)
     return json.loads(file.read_text("utf-8"))
 
 
-def run_command(*words: Any) -> int:
-    """Run a command of this project, its output shown; return its exit status.
+def run_command(*words: Any, makes: Path) -> None:
+    """Run a command of this project, its output shown.
+
+    Args:
+        words: of the command line, after `python -m`.
+        makes: file that the command writes. A command that ends with an exception has a status of `DONE`, too.
 
     Raises:
-        InputError: the command ended with none of `DONE`.
+        InputError: the command ended with none of `DONE`, or without the file.
     """
     command = [str(word) for word in words]
     status = subprocess.run([sys.executable, "-m", *command], check=False).returncode
+    asked = f"python -m {' '.join(command)}"
     if status not in DONE:
-        expected = " or ".join(map(str, DONE))
-        raise InputError(f"python -m {' '.join(command)}: got exit status {status}, expected {expected}")
-    return status
+        raise InputError(f"{asked}: got exit status {status}, expected {' or '.join(map(str, DONE))}")
+    if not makes.exists():
+        raise InputError(f"{asked}: got no file {makes}, expected its results")

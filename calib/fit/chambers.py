@@ -84,7 +84,7 @@ class ChamberFit:
         if turn_deg < TOLD_TURN_DEG:
             return ()
         return (
-            f"the tip's measured quaternion is {turn_deg:.1f} deg off with the arm hanging straight. The "
+            f"the tip's measured quaternion is {turn_deg:.1f} deg off with the arm straight. The "
             "calibration accounts for it. Zero it there, and calibrate anew, if angles are to be the plate's",
         )
 

@@ -30,6 +30,7 @@ class Rule:
     low_open: bool = False
     per: str = ""  # parts of the arm with a number each, such as "chambers"; one for all without `length`
     length: int | None = None  # length of a field that must be a list; 0: it depends on the arm
+    why: str = ""  # reason for the range
 
     @property
     def text(self) -> str:
@@ -39,7 +40,8 @@ class Rule:
         high = "" if self.high == math.inf else f" and <= {self.high:g}" if low else f" <= {self.high:g}"
         if self.length is not None:
             return f"a list of {self.length} numbers" if self.length else "a list of numbers"
-        return noun + low + high + (f", or a list with one for each of the {self.per}" if self.per else "")
+        each = f", or a list with one for each of the {self.per}" if self.per else ""
+        return noun + low + high + each + (f", since {self.why}" if self.why else "")
 
     def accepts(self, value: Any) -> bool:
         """Return whether a value is of the kind and in the range."""
@@ -80,9 +82,9 @@ def numbers(per: str) -> Any:
     return field(default=(), metadata={"rule": Rule(per=per, length=0)})
 
 
-def count(default: Any = dataclasses.MISSING, low: int = 1, high: int = MAX_COUNT) -> Any:
-    """Declare a count in a range."""
-    return field(default=default, metadata={"rule": Rule(kind=int, low=low, high=high)})
+def count(default: Any = dataclasses.MISSING, low: int = 1, high: int = MAX_COUNT, why: str = "") -> Any:
+    """Declare a count in a range, with the reason for it."""
+    return field(default=default, metadata={"rule": Rule(kind=int, low=low, high=high, why=why)})
 
 
 def scaled(value: PerSection, factor: float) -> PerSection:

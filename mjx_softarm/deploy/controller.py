@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from mjx_softarm.control import LawState
+from mjx_softarm.control import LawState, at_chambers
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.policy.reachable import Reachable
 from mjx_softarm.policy.runtime import PolicyRunner
+from mjx_softarm.sensing.estimator import expected_springs
 from mjx_softarm.spec import ArmSpec
+
+_STILL_RADIUS_M = 0.067  # distance of springs from the axis for which `LoopConfig.still_m` was chosen
 
 
 @dataclass(frozen=True)
@@ -20,8 +24,13 @@ class LoopConfig:
     """Heuristics of the control loop; "by hand" marks a number that no experiment chose."""
 
     # Rest. A twin is within 2 mm of its rest 4 s after an action, and creeps for some seconds more.
-    window_s: float = 0.5  # time over which springs are watched; by hand
-    still_m: float = 2e-4  # largest difference of the two half windows' means; 10 times such a mean's noise
+    window_s: float = 0.5  # least time over which springs are watched; by hand
+    # Window of an arm with a slow law, in its `response_s`. With half a second, an arm of 250 mm whose springs
+    # respond within 1.6 s was taken for at rest 1.7 mm off its goals.
+    window_share: float = 0.9
+    # Largest difference of the two half windows' means, of springs 67 mm from the axis; in proportion for
+    # others, whose change bends a section more. 10 times such a mean's noise.
+    still_m: float = 2e-4
     settle_timeout_s: float = 15.0  # longest wait for rest; by hand, well above those 4 s
 
     # Shift of the goal that the policy is given [mm], [deg].
@@ -36,7 +45,7 @@ class LoopConfig:
     moving_share: float = 0.05
 
     # Lead of a moving goal.
-    lead_s: float = 0.85  # policies at rest: springs of twins lag by it; tips are then at most 0.06 s late
+    lead_s: float | None = None  # policies at rest; None: `lag_s`, with which tips of twins are 0.06 s late
     lead_actions: int = 2  # policies of motion; circle in 10 s on a twin: 3.1 mm with it, 23.6 mm without
 
     # Overload, in largest payloads. Twins that carry exactly the largest are wrongly reported in 4 of 36 runs
@@ -85,21 +94,51 @@ class Controller:
     dt_s: float
     window: int  # ticks
     observes_payload: bool
+    lead_s: float  # time by which a moving goal is given ahead of its time
     config: LoopConfig
 
     @classmethod
     def of(cls, policy: Policy, plan: Plan | None = None, config: LoopConfig = LOOP) -> Controller:
         """Make a policy ready; `plan` replaces its actor, for another way to find references."""
-        runner = PolicyRunner(policy)
+        # Times and lengths of this arm
+        runner, response = PolicyRunner(policy), response_s(policy)
+        window_s = max(config.window_s, config.window_share * response)
+        lag_s = policy.spec.control.reference_s + response
+        lead_s = config.lead_actions * policy.action_s or (lag_s if config.lead_s is None else config.lead_s)
+        radius_m = float(np.mean(policy.spec.per_section(policy.spec.geometry.spring_radius_m)))
+        still_m = config.still_m * radius_m / _STILL_RADIUS_M
+
         return cls(
             policy=policy,
             reachable=Reachable.from_poses(policy.workspace, policy.reward),
             plan=plan or (lambda pose, goal, _, sensed: runner.act(pose, goal, sensed).length_m),
             dt_s=1.0 / policy.rate_hz,
-            window=max(2, round(config.window_s * policy.rate_hz)),
+            window=max(2, round(window_s * policy.rate_hz)),
             observes_payload=policy.observation == "payload",
-            config=config,
+            lead_s=lead_s,
+            config=dataclasses.replace(config, still_m=still_m),
         )
+
+
+def response_s(policy: Policy) -> float:
+    """Return the time constant [s] with which the law's integral moves the springs, in their slowest mode.
+
+    The integral changes by i' = ki e, and moves the springs by G i', with G the change of the lengths with the
+    pressures. So an eigenvalue g of G has the time constant 1 / (ki g), and springs lag by it behind
+    references that move steadily. The modes are the three of each section, at pressures in the middle.
+    """
+    # Change (n_chambers, n_chambers) of each chamber's length error with the pressures [m/kPa]
+    gains, n = policy.gains, policy.spec.n_chambers
+    low, high = (np.broadcast_to(np.asarray(x, float), n) for x in gains[4:6])
+    step_kpa = 0.05 * (high - low)
+    either = 0.5 * (low + high) + np.stack([1.0, -1.0])[:, None, None] * np.diag(step_kpa)
+    longer_m, shorter_m = at_chambers(expected_springs(policy.spring_model, either), gains.allocation)
+    change = (longer_m - shorter_m) / (2.0 * step_kpa[:, None])
+
+    # Its slowest mode
+    modes = np.sort(np.abs(np.linalg.eigvals(change)))[::-1]
+    slowest = float(modes[3 * policy.spec.structure.n_sections - 1])
+    return 1.0 / (float(np.mean(gains.ki_kpa_per_ms)) * slowest)
 
 
 class Command(NamedTuple):

@@ -112,9 +112,7 @@ class Way:
         pace_s: float,
         refused: Mapping[int, Event],
     ):
-        config = controller.config
         self._controller, self._poses, self._pace_s = controller, np.asarray(goals, float), pace_s
-        self._lead_s = config.lead_actions * controller.policy.action_s or config.lead_s
         self._refused = refused
         self._stops = np.union1d(np.flatnonzero(stops), [0, len(goals) - 1])
         self._began_s, self._leg = 0.0, self._poses
@@ -144,7 +142,7 @@ class Way:
         self.ways[-1] = slice(self.ways[-1].start, row)
         if now_s - self._began_s >= self._pace_s * (len(self._leg) - 1):
             return self._stop(state, note)
-        return with_moving_goal(self._controller, state, self._at(now_s), self._at(now_s + self._lead_s))
+        return with_moving_goal(self._controller, state, self._at(now_s), self._at(now_s + self._controller.lead_s))
 
     def _stop(self, state: LoopState, note: Note) -> LoopState | None:
         """Return the state with the next stop as its goal; None where it is refused."""

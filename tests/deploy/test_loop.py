@@ -117,7 +117,7 @@ def test_a_moving_goal_is_followed_and_its_end_is_an_arrival():
     goal = run.log.goal[run.ways[0]]
     assert len(goal) in (500, 501)
     np.testing.assert_allclose(goal[250], on_the_way(goals, 0.5), atol=1e-6)
-    ahead = on_the_way(goals, 0.5 + LOOP.lead_s / 10.0)
+    ahead = on_the_way(goals, 0.5 + CONTROLLER.lead_s / 10.0)
     expected_m = between(None, ahead, None, None)
     np.testing.assert_allclose(run.log.reference_m[run.ways[0]][250], expected_m, atol=1e-3)  # a tick apart
 

@@ -14,16 +14,20 @@ from mjx_softarm._support.errors import InputError
 
 
 @pytest.mark.parametrize("status", [0, 1, 2, 3, 130, -9])
-def test_a_command_with_results_goes_on_with_its_status_and_one_that_failed_ends_the_benchmark(
-    monkeypatch, status
-):
+def test_a_command_with_results_goes_on_and_one_that_failed_ends_the_benchmark(tmp_path, monkeypatch, status):
     asked = []
     done = subprocess.CompletedProcess([], status)
     monkeypatch.setattr(subprocess, "run", lambda command, check: asked.append(command) or done)
     told = f"python -m calib run 3: got exit status {status}, expected 0 or 1"
     with contextlib.nullcontext() if status in (0, 1) else pytest.raises(InputError, match=told):
-        assert run_command("calib", "run", 3) == status
+        run_command("calib", "run", 3, makes=tmp_path)
     assert asked == [[sys.executable, "-m", "calib", "run", "3"]]
+
+
+def test_a_command_that_ends_with_a_traceback_ends_the_benchmark(tmp_path):
+    """Python's own exit status is then 1, as that of a command with warnings."""
+    with pytest.raises(InputError, match="calib.absent: got no file .*report.json, expected its results"):
+        run_command("calib.absent", makes=tmp_path / "report.json")
 
 
 def test_an_interrupted_arm_goes_on_and_a_refused_goal_misses_the_target(tmp_path, monkeypatch):
@@ -39,7 +43,7 @@ def test_an_interrupted_arm_goes_on_and_a_refused_goal_misses_the_target(tmp_pat
     figures["Sim-to-real network"] = {x: {"translation_mean_mm": 1.0} for x in ("test", "test_uncorrected")}
     report = {"trustworthy": True, "parts": {title: {"figures": of} for title, of in figures.items()}}
 
-    def leave(*words):
+    def leave(*words, makes):
         asked.append(words[:2] if words[0] != "train" else words[:3])
         path = Path(words[-1])
         if words[1:3] == ("reach", "--resume"):
@@ -56,6 +60,7 @@ def test_an_interrupted_arm_goes_on_and_a_refused_goal_misses_the_target(tmp_pat
             path.mkdir()
             name, what = ("report.json", report) if words[0] == "calib" else ("accuracy.json", accuracy)
             (path / name).write_text(json.dumps(what))
+        assert makes.exists()
 
     monkeypatch.setattr(arms, "run_command", leave)
     with pytest.raises(KeyboardInterrupt):

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from calib.fit.motion.actuators import fit_actuators
+from calib.fit.motion.actuators import fit_actuators, with_actuators
 from calib.fit.motion.tracks import find_tracks
 from calib.read.measurements import measure
 from calib.steps import actuators
@@ -75,6 +75,26 @@ def test_planted_regulators_are_found(short):
     assert rms["regulator"] < 0.3 < 2.0 < min(rms["command"], rms["pump"], rms["specification"])
     law = short.control
     assert fit.spec.control.ki_kpa_per_ms == pytest.approx(law.kp_kpa_per_m / 0.45, rel=0.1)
+
+
+def test_a_law_without_a_proportional_gain_keeps_its_integral(short):
+    arm = short.replace(control={"kp_kpa_per_m": 0.0})
+    behind = with_actuators(arm, REGULATOR)
+    assert behind.control == arm.control and behind.actuators.kind == "regulator"
+
+
+def test_a_spring_without_a_reading_counts_as_free(short):
+    """A lost reading changes the volumes of that moment alone."""
+    log = log_of(short, REGULATOR)
+    readings = short.spring_sensor.readings(log.spring_m)
+    lost = readings.copy()
+    lost[7, 0] = np.nan
+    [whole], [track] = (
+        find_tracks([dataclasses.replace(log, spring_m=None, readings=x)], short) for x in (readings, lost)
+    )
+    assert np.isfinite(track.volume_m3).all()
+    changed = (track.volume_m3 != whole.volume_m3).any(axis=1)
+    assert np.flatnonzero(changed).tolist() == [7]
 
 
 def test_the_specification_s_pump_stays_where_it_fits(short):
