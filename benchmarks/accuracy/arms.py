@@ -163,7 +163,7 @@ def run_command(*words: Any, makes: Path) -> None:
 
     Args:
         words: of the command line, after `python -m`.
-        makes: file that the command writes. A command that ends with an exception has a status of `DONE`, too.
+        makes: file that the command writes. A command that ends with an exception has status 1, too.
 
     Raises:
         InputError: the command ended with none of `DONE`, or without the file.

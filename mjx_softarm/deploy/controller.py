@@ -9,13 +9,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mjx_softarm.control import LawState, at_chambers
+from mjx_softarm.control import LawState
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.policy.reachable import Reachable
 from mjx_softarm.policy.runtime import PolicyRunner
 from mjx_softarm.sensing.estimator import expected_springs
 from mjx_softarm.spec import ArmSpec
 
+_STEP = 0.05  # change of a pressure from which the springs' response is taken, in ranges of pressure
+_LEAST_MODE = 1e-3  # response of a mode, in that of the stiffest, below which chambers do not move it
 _STILL_RADIUS_M = 0.067  # distance of springs from the axis for which `LoopConfig.still_m` was chosen
 
 
@@ -25,8 +27,8 @@ class LoopConfig:
 
     # Rest. A twin is within 2 mm of its rest 4 s after an action, and creeps for some seconds more.
     window_s: float = 0.5  # least time over which springs are watched; by hand
-    # Window of an arm with a slow law, in its `response_s`. With half a second, an arm of 250 mm whose springs
-    # respond within 1.6 s was taken for at rest 1.7 mm off its goals.
+    # Window of an arm with a slow law, in the largest lag of its springs. With half a second, an arm of
+    # 250 mm whose springs lag by 1.6 s was taken for at rest 1.7 mm off its goals.
     window_share: float = 0.9
     # Largest difference of the two half windows' means, of springs 67 mm from the axis; in proportion for
     # others, whose change bends a section more. 10 times such a mean's noise.
@@ -45,7 +47,8 @@ class LoopConfig:
     moving_share: float = 0.05
 
     # Lead of a moving goal.
-    lead_s: float | None = None  # policies at rest; None: `lag_s`, with which tips of twins are 0.06 s late
+    # Policies at rest: time over which the rate of the references is taken, for `spring_lag_s`
+    rate_s: float = 0.2
     lead_actions: int = 2  # policies of motion; circle in 10 s on a twin: 3.1 mm with it, 23.6 mm without
 
     # Overload, in largest payloads. Twins that carry exactly the largest are wrongly reported in 4 of 36 runs
@@ -101,10 +104,12 @@ class Controller:
     def of(cls, policy: Policy, plan: Plan | None = None, config: LoopConfig = LOOP) -> Controller:
         """Make a policy ready; `plan` replaces its actor, for another way to find references."""
         # Times and lengths of this arm
-        runner, response = PolicyRunner(policy), response_s(policy)
-        window_s = max(config.window_s, config.window_share * response)
-        lag_s = policy.spec.control.reference_s + response
-        lead_s = config.lead_actions * policy.action_s or (lag_s if config.lead_s is None else config.lead_s)
+        runner, gains = PolicyRunner(policy), policy.gains
+        middle_kpa = 0.5 * (gains.pressure_min_kpa + gains.pressure_max_kpa)
+        slowest_s = float(np.abs(np.linalg.eigvals(spring_lag_s(policy, middle_kpa))).max())
+        window_s = max(config.window_s, config.window_share * slowest_s)
+        ahead_s = float(np.mean(gains.reference_s)) + 0.5 * config.rate_s
+        lead_s = config.lead_actions * policy.action_s or ahead_s
         radius_m = float(np.mean(policy.spec.per_section(policy.spec.geometry.spring_radius_m)))
         still_m = config.still_m * radius_m / _STILL_RADIUS_M
 
@@ -120,25 +125,27 @@ class Controller:
         )
 
 
-def response_s(policy: Policy) -> float:
-    """Return the time constant [s] with which the law's integral moves the springs, in their slowest mode.
+def spring_lag_s(policy: Policy, pressure_kpa: np.ndarray) -> np.ndarray:
+    """Return the matrix (n_springs, n_springs) [s] A of lags of the springs under the law.
 
-    The integral changes by i' = ki e, and moves the springs by G i', with G the change of the lengths with the
-    pressures. So an eigenvalue g of G has the time constant 1 / (ki g), and springs lag by it behind
-    references that move steadily. The modes are the three of each section, at pressures in the middle.
+    The law's integral changes by i' = ki C e, and moves the springs by G i', with G the change of lengths
+    with pressures, and C the law's allocation. So springs that move steadily with a rate x' are A x' behind
+    the law's reference, A = pinv(ki G C). Dead time and lag of the actuators do not matter: the integral has
+    moved on by them. Modes that chambers do not move have no lag.
+
+    Args:
+        policy: the arm.
+        pressure_kpa (n_chambers,) [kPa]: pressures, at which G is taken.
     """
-    # Change (n_chambers, n_chambers) of each chamber's length error with the pressures [m/kPa]
     gains, n = policy.gains, policy.spec.n_chambers
     low, high = (np.broadcast_to(np.asarray(x, float), n) for x in gains[4:6])
-    step_kpa = 0.05 * (high - low)
-    either = 0.5 * (low + high) + np.stack([1.0, -1.0])[:, None, None] * np.diag(step_kpa)
-    longer_m, shorter_m = at_chambers(expected_springs(policy.spring_model, either), gains.allocation)
-    change = (longer_m - shorter_m) / (2.0 * step_kpa[:, None])
-
-    # Its slowest mode
-    modes = np.sort(np.abs(np.linalg.eigvals(change)))[::-1]
-    slowest = float(modes[3 * policy.spec.structure.n_sections - 1])
-    return 1.0 / (float(np.mean(gains.ki_kpa_per_ms)) * slowest)
+    step_kpa = _STEP * (high - low)
+    either = pressure_kpa + np.stack([1.0, -1.0])[:, None, None] * np.diag(step_kpa)
+    longer_m, shorter_m = expected_springs(policy.spring_model, either)
+    change = (longer_m - shorter_m).T / (2.0 * step_kpa)  # (n_springs, n_chambers) [m/kPa]
+    if gains.allocation is not None:
+        change = change @ gains.allocation.chamber_error
+    return np.linalg.pinv(change * gains.ki_kpa_per_ms, rcond=_LEAST_MODE)
 
 
 class Command(NamedTuple):

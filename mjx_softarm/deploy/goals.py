@@ -142,7 +142,9 @@ class Way:
         self.ways[-1] = slice(self.ways[-1].start, row)
         if now_s - self._began_s >= self._pace_s * (len(self._leg) - 1):
             return self._stop(state, note)
-        return with_moving_goal(self._controller, state, self._at(now_s), self._at(now_s + self._controller.lead_s))
+        return with_moving_goal(
+            self._controller, state, self._at(now_s), self._at(now_s + self._controller.lead_s)
+        )
 
     def _stop(self, state: LoopState, note: Note) -> LoopState | None:
         """Return the state with the next stop as its goal; None where it is refused."""

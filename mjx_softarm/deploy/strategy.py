@@ -20,6 +20,7 @@ import numpy as np
 from mjx_softarm._support.xp import Array, array_namespace
 from mjx_softarm.control import at_chambers, planes
 from mjx_softarm.deploy.belief import Belief, pose_of
+from mjx_softarm.deploy.controller import spring_lag_s
 from mjx_softarm.deploy.safety import Event, Fault, names
 from mjx_softarm.mdp.observation import rate_ticks
 from mjx_softarm.mdp.rewards import RewardConfig, asked_error, scaled_error
@@ -121,21 +122,32 @@ class Predicting(NamedTuple):
     """Actions of a policy for arms at rest towards a moving goal: all of them in each tick.
 
     The first one begins at the believed pose, each next one at the pose predicted for the last references.
+    Their lengths are due half of `LoopConfig.rate_s` later. The references lead the lengths that are due by the
+    lag of the springs.
     """
 
     shift: np.ndarray  # (6,) [mm, deg]
     n_actions: int = 0
+    lengths_m: tuple[np.ndarray, ...] = ()  # (n_springs,) each, of the last ticks, oldest first
 
     def references(self, belief: Belief, goal: np.ndarray) -> Choice:
         """Act several times; the last references count."""
+        # Lengths at the goal
         controller, pose = belief.controller, belief.pose
-        shift, reference_m = self.shift, belief.spring_m
+        shift, length_m = self.shift, belief.spring_m
         for _ in range(controller.policy.n_actions):
-            reference_m = _planned(belief, pose, goal + shift)
-            pose, _ = pose_of(controller, reference_m, belief.load)
+            length_m = _planned(belief, pose, goal + shift)
+            pose, _ = pose_of(controller, length_m, belief.load)
             left = asked_error(np.asarray(pose, float), goal, controller.policy.reward)
             shift = _clipped(shift - left, controller.config.shift_limit)
-        return Choice(Predicting(shift, self.n_actions + 1), reference_m)
+
+        # Lengths due now, their rate, and the lag of springs that move so
+        n_ticks = 2 * max(1, round(0.5 * controller.config.rate_s / controller.dt_s))
+        lengths_m = (*self.lengths_m, length_m)[-n_ticks - 1 :]
+        rate = (lengths_m[-1] - lengths_m[0]) / (controller.dt_s * max(len(lengths_m) - 1, 1))
+        lag_s = spring_lag_s(controller.policy, belief.command.pressure_kpa)
+        reference_m = lengths_m[(len(lengths_m) - 1) // 2] + lag_s @ rate
+        return Choice(Predicting(shift, self.n_actions + 1, lengths_m), reference_m)
 
 
 class Chasing(NamedTuple):
