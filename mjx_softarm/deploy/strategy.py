@@ -122,8 +122,8 @@ class Predicting(NamedTuple):
     """Actions of a policy for arms at rest towards a moving goal: all of them in each tick.
 
     The first one begins at the believed pose, each next one at the pose predicted for the last references.
-    Their lengths are due half of `LoopConfig.rate_s` later. The references lead the lengths that are due by the
-    lag of the springs.
+    The lengths at the goal are due half of `LoopConfig.rate_s` later. The references lead the lengths that
+    are due by the lag of the springs.
     """
 
     shift: np.ndarray  # (6,) [mm, deg]

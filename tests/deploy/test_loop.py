@@ -126,9 +126,7 @@ def test_a_moving_goal_is_followed_and_its_end_is_an_arrival():
 def test_springs_of_a_moving_goal_are_on_time_however_slow_the_law(slower):
     spec = SPEC.replace(control={"ki_kpa_per_ms": SPEC.control.ki_kpa_per_ms / slower})
     policy = dataclasses.replace(POLICY, spec=spec, gains=Gains.from_spec(spec))
-    config = dataclasses.replace(
-        LOOP, max_shift=(0.0, 0.0)
-    )  # this arm's poses are not those of its references
+    config = dataclasses.replace(LOOP, max_shift=(0.0, 0.0))  # this arm's poses are not its references'
     run = trace(LinearArm(noise_m=0.0), Controller.of(policy, between, config), GOALS[:2], pace_s=10.0)
     rows = np.arange(run.ways[0].start, run.ways[0].stop)[300:480]
     due_m = [between(None, goal, None, None) for goal in run.log.goal[rows]]
