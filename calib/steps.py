@@ -17,7 +17,8 @@ from calib.fit.chambers import MIN_POSES, fit_chambers
 from calib.fit.held_pressures import fit_held_pressures
 from calib.fit.markers import MIN_MARKERS, marker_limits
 from calib.fit.motion.actuators import fit_actuators
-from calib.fit.motion.damping import find_stretches, fit_damping
+from calib.fit.motion.damping import FITTED, PRIOR, find_stretches, fit_damping
+from calib.fit.motion.shape import fit_shape
 from calib.fit.motion.tracks import find_tracks
 from calib.fit.s2r import fit_s2r, simulate_poses
 from calib.fit.sensors import fit_springs
@@ -117,8 +118,12 @@ def damping(measurements: Measurements, spec: ArmSpec, seed: int) -> StepResult:
     if not stretches:
         needed = "No log follows the moving arm; it decides how the arm swings, not where it rests."
         return StepResult(spec, Section("Damping", f"{NOT_FITTED} {needed}"))
-    fit = fit_damping(stretches, spec, seed)
-    return StepResult(fit.spec if fit.is_better else spec, sections.damping(fit))
+    # The lag of the shape shows the backbone's damping by itself
+    shape, prior = fit_shape(measurements.logs, spec), PRIOR
+    if shape is not None and shape.is_better:
+        spec, prior = shape.spec, FITTED
+    fit = fit_damping(stretches, spec, seed, prior)
+    return StepResult(fit.spec if fit.is_better else spec, sections.damping(fit, shape))
 
 
 def s2r(measurements: Measurements, spec: ArmSpec, seed: int) -> StepResult:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from mjx_softarm._support.fields import (
     PerChamber,
     PerSection,
@@ -17,6 +19,9 @@ from mjx_softarm._support.fields import (
 
 PAIRS = "pairs of chamber and spring"
 LEAST_CHAMBERS, MOST_CHAMBERS = 3, 12  # of a section
+# Lag of a section's shape over damping by stiffness of its backbone: chambers and weight stiffen it, too.
+# Of the paper's arm, simulated on the circle in 20 s.
+SHAPE_SHARE = 0.65
 PAPER_S_ARM_KG = 4.7  # mass of the paper's arm, which carries up to 1 kg
 
 
@@ -82,6 +87,12 @@ class Backbone:
     bending_stiffness_nm_per_rad: PerSection = positive(per="sections")
     axial_damping_ns_per_m: PerSection = not_negative(per="sections")
     bending_damping_nms_per_rad: PerSection = not_negative(per="sections")
+
+    @property
+    def shape_lag_s(self) -> float:
+        """Time constant with which a section's bend is shared out within it, a mean over the sections."""
+        stiffness, damping = self.bending_stiffness_nm_per_rad, self.bending_damping_nms_per_rad
+        return SHAPE_SHARE * float(np.mean(np.divide(damping, stiffness)))
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from calib.fit.held_pressures import HeldPressures
 from calib.fit.markers import MarkerLimits
 from calib.fit.motion.actuators import ActuatorFit
 from calib.fit.motion.damping import DampingFit
+from calib.fit.motion.shape import ShapeFit
 from calib.fit.parameters import BENDING, without_effect
 from calib.fit.pose_errors import PoseErrors
 from calib.fit.s2r import S2RFit
@@ -193,8 +194,8 @@ def actuators(fit: ActuatorFit) -> Section:
     )
 
 
-def damping(fit: DampingFit) -> Section:
-    """Show damping of chambers and backbone, and the errors of the moving tip."""
+def damping(fit: DampingFit, shape: ShapeFit | None = None) -> Section:
+    """Show damping of chambers and backbone, the lag of the shape, and the errors of the moving tip."""
     values = {
         "damping_ns_per_m": fit.spec.chambers.damping_ns_per_m,
         "bending_damping_nms_per_rad": fit.spec.backbone.bending_damping_nms_per_rad,
@@ -205,13 +206,17 @@ def damping(fit: DampingFit) -> Section:
         ("held-out seconds, calibrated", fit.held_out_rms_mm),
         ("seconds of the fit, calibrated", fit.in_sample_rms_mm),
     )
+    tables = [ReportTable(("", "value", "+-"), tuple(rows)), ReportTable(("tip", "RMS [mm]"), errors)]
+    if shape is not None:
+        lags = (("before", shape.before_s, shape.before_rms_mm), ("fitted", shape.lag_s, shape.rms_mm))
+        tables.append(ReportTable(("lag of the shape behind the springs", "s", "tip, RMS [mm]"), lags))
     return Section(
         "Damping",
         f"{fit.n_stretches} stretches of the moving arm, {fit.time_s:.0f} s in all: MuJoCo driven with the "
         "measured pressures against the measured tip. Intervals are 95 %.",
-        (ReportTable(("", "value", "+-"), tuple(rows)), ReportTable(("tip", "RMS [mm]"), errors)),
+        tuple(tables),
         fit.warnings,
-        _plain(fit, "spec") | {"values": values},
+        _plain(fit, "spec") | {"values": values, "shape": shape and _plain(shape, "spec")},
     )
 
 

@@ -11,13 +11,11 @@ import numpy as np
 
 from mjx_softarm.control import LawState
 from mjx_softarm.policy.file import Policy
+from mjx_softarm.policy.lag import spring_lag_s
 from mjx_softarm.policy.reachable import Reachable
 from mjx_softarm.policy.runtime import PolicyRunner
-from mjx_softarm.sensing.estimator import expected_springs
 from mjx_softarm.spec import ArmSpec
 
-_STEP = 0.05  # change of a pressure from which the springs' response is taken, in ranges of pressure
-_LEAST_MODE = 1e-3  # response of a mode, in that of the stiffest, below which chambers do not move it
 _STILL_RADIUS_M = 0.067  # distance of springs from the axis for which `LoopConfig.still_m` was chosen
 
 
@@ -123,29 +121,6 @@ class Controller:
             lead_s=lead_s,
             config=dataclasses.replace(config, still_m=still_m),
         )
-
-
-def spring_lag_s(policy: Policy, pressure_kpa: np.ndarray) -> np.ndarray:
-    """Return the matrix (n_springs, n_springs) [s] A of lags of the springs under the law.
-
-    The law's integral changes by i' = ki C e, and moves the springs by G i', with G the change of lengths
-    with pressures, and C the law's allocation. So springs that move steadily with a rate x' are A x' behind
-    the law's reference, A = pinv(ki G C). Dead time and lag of the actuators do not matter: the integral has
-    moved on by them. Modes that chambers do not move have no lag.
-
-    Args:
-        policy: the arm.
-        pressure_kpa (n_chambers,) [kPa]: pressures, at which G is taken.
-    """
-    gains, n = policy.gains, policy.spec.n_chambers
-    low, high = (np.broadcast_to(np.asarray(x, float), n) for x in gains[4:6])
-    step_kpa = _STEP * (high - low)
-    either = pressure_kpa + np.stack([1.0, -1.0])[:, None, None] * np.diag(step_kpa)
-    longer_m, shorter_m = expected_springs(policy.spring_model, either)
-    change = (longer_m - shorter_m).T / (2.0 * step_kpa)  # (n_springs, n_chambers) [m/kPa]
-    if gains.allocation is not None:
-        change = change @ gains.allocation.chamber_error
-    return np.linalg.pinv(change * gains.ki_kpa_per_ms, rcond=_LEAST_MODE)
 
 
 class Command(NamedTuple):

@@ -17,19 +17,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mjx_softarm._support.xp import Array, array_namespace
-from mjx_softarm.control import at_chambers, planes
+from mjx_softarm.control import at_chambers
 from mjx_softarm.deploy.belief import Belief, pose_of
-from mjx_softarm.deploy.controller import spring_lag_s
 from mjx_softarm.deploy.safety import Event, Fault, names
 from mjx_softarm.mdp.observation import rate_ticks
 from mjx_softarm.mdp.rewards import RewardConfig, asked_error, scaled_error
 from mjx_softarm.policy.file import Policy
-from mjx_softarm.policy.reach import solved
+from mjx_softarm.policy.lag import ShapeLag, spring_lag_s
+from mjx_softarm.policy.reach import followed
 from mjx_softarm.policy.runtime import InMotion, sensed
 from mjx_softarm.sensing.load import Load
-
-_STAYING = 1e-4  # weight of a chamber that does not follow, beside the ones that do
 
 
 class Choice(NamedTuple):
@@ -129,25 +126,30 @@ class Predicting(NamedTuple):
     shift: np.ndarray  # (6,) [mm, deg]
     n_actions: int = 0
     lengths_m: tuple[np.ndarray, ...] = ()  # (n_springs,) each, of the last ticks, oldest first
+    shape: ShapeLag = ShapeLag()  # of an arm with these lengths
+    behind: np.ndarray | float = 0.0  # (6,) [mm, deg] pose at rest with the last lengths less that in motion
 
     def references(self, belief: Belief, goal: np.ndarray) -> Choice:
         """Act several times; the last references count."""
-        # Lengths at the goal
-        controller, pose = belief.controller, belief.pose
+        # Lengths at the goal, of an arm whose shape lags
+        controller, policy, pose = belief.controller, belief.controller.policy, belief.pose
         shift, length_m = self.shift, belief.spring_m
-        for _ in range(controller.policy.n_actions):
+        goal = goal + self.behind
+        for _ in range(policy.n_actions):
             length_m = _planned(belief, pose, goal + shift)
             pose, _ = pose_of(controller, length_m, belief.load)
-            left = asked_error(np.asarray(pose, float), goal, controller.policy.reward)
+            left = asked_error(np.asarray(pose, float), goal, policy.reward)
             shift = _clipped(shift - left, controller.config.shift_limit)
+        shape = self.shape.after(policy, length_m, pose, controller.dt_s)
+        behind = shape.behind(policy, length_m, pose)
 
         # Lengths due now, their rate, and the lag of springs that move so
         n_ticks = 2 * max(1, round(0.5 * controller.config.rate_s / controller.dt_s))
         lengths_m = (*self.lengths_m, length_m)[-n_ticks - 1 :]
         rate = (lengths_m[-1] - lengths_m[0]) / (controller.dt_s * max(len(lengths_m) - 1, 1))
-        lag_s = spring_lag_s(controller.policy, belief.command.pressure_kpa)
+        lag_s = spring_lag_s(policy, belief.command.pressure_kpa)
         reference_m = lengths_m[(len(lengths_m) - 1) // 2] + lag_s @ rate
-        return Choice(Predicting(shift, self.n_actions + 1, lengths_m), reference_m)
+        return Choice(Predicting(shift, self.n_actions + 1, lengths_m, shape, behind), reference_m)
 
 
 class Chasing(NamedTuple):
@@ -160,21 +162,24 @@ class Chasing(NamedTuple):
     shift: np.ndarray  # (6,) [mm, deg]
     n_actions: int = 0
     due: tuple[np.ndarray, ...] = ()  # (6,) [mm, deg] each: the goal at the last actions, oldest first
+    shape: ShapeLag = ShapeLag()
 
     def references(self, belief: Belief, goal: np.ndarray) -> Choice:
         """Act or wait."""
-        config = belief.controller.config
-        waited_s = belief.command.n_ticks * belief.controller.dt_s
-        if belief.command.reference_m is not None and waited_s < belief.controller.policy.action_s:
-            return Choice(self)
+        config, policy, dt_s = belief.controller.config, belief.controller.policy, belief.controller.dt_s
+        shape = self.shape.after(policy, belief.spring_m, belief.pose, dt_s)
+        waited_s = belief.command.n_ticks * dt_s
+        if belief.command.reference_m is not None and waited_s < policy.action_s:
+            return Choice(self._replace(shape=shape))
+        # Act from the pose in motion
+        pose = belief.pose - shape.behind(policy, belief.spring_m, belief.pose)
         shift = self.shift
         if len(self.due) == config.lead_actions:
-            reward = belief.controller.policy.reward
-            beside = _beside(np.asarray(belief.pose, float), self.due[0], self.due[-1], reward)
+            beside = _beside(pose, self.due[0], self.due[-1], policy.reward)
             shift = _clipped(shift - config.moving_share * beside, config.shift_limit)
-        reference_m = _planned(belief, belief.pose, goal + shift)
+        reference_m = _planned(belief, pose, goal + shift)
         due = (*self.due, goal)[-config.lead_actions :]
-        return Choice(Chasing(shift, self.n_actions + 1, due), reference_m)
+        return Choice(Chasing(shift, self.n_actions + 1, due, shape), reference_m)
 
 
 Strategy = AtRest | Timed | Predicting | Chasing
@@ -231,37 +236,6 @@ def _made(belief: Belief, reference_m: np.ndarray, load: Load) -> np.ndarray:
     assert asked_m is not None
     spring_m = followed(reference_m, belief.mean_m, asked_m, belief.saturated, policy)
     return np.asarray(pose_of(belief.controller, spring_m, load)[0], float)
-
-
-def followed(reference_m: Array, mean_m: Array, asked_m: Array, saturated: Array, policy: Policy) -> Array:
-    """Return the lengths (n_springs,) [m] that an arm at rest takes for new references. NumPy and symbols.
-
-    The lengths are the references: springs of an arm at rest may creep by some tenths of a millimetre. But
-    saturated chambers that are asked for more do not follow: there the lengths are the springs'. Of an arm
-    with redundant chambers, each section takes the plane that fits the chambers which follow, and the others
-    as far as these leave it open.
-
-    Args:
-        reference_m (n_springs,) [m]: new references.
-        mean_m (n_springs,) [m]: lengths at rest on the last references.
-        asked_m (n_springs,) [m]: the last references.
-        saturated (n_chambers,): bool.
-        policy: the arm.
-    """
-    # Motion and error of each chamber
-    xp, allocation = array_namespace(reference_m, mean_m), policy.gains.allocation
-    move_m = at_chambers(reference_m - mean_m, allocation)
-    stays = saturated & (move_m * at_chambers(asked_m - mean_m, allocation) > 0.0)
-    if allocation is None:
-        return xp.where(stays, mean_m, reference_m)
-
-    # Planes by weighted least squares, at the springs
-    n_sections, n = policy.spec.structure.n_sections, policy.spec.structure.chambers_per_section
-    weight = xp.where(stays, _STAYING, 1.0).reshape(n_sections, 1, n)
-    across, along_m = planes(n).T, xp.where(stays, 0.0, move_m).reshape(n_sections, 1, n)
-    normal = xp.sum((weight * across)[:, :, None] * across, axis=-1)  # (n_sections, 3, 3)
-    plane = solved(normal, xp.sum(weight * across * along_m, axis=-1))  # (n_sections, 3)
-    return mean_m + xp.sum(plane[:, None] * planes(policy.spec.springs_per_section), axis=-1).reshape(-1)
 
 
 def _error(belief: Belief, pose: np.ndarray, goal: np.ndarray) -> float:

@@ -11,10 +11,10 @@ from mjx_softarm.control import LawState, pressures, saturated
 from mjx_softarm.deploy.belief import as_without, on_reference, still, stuck_springs
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.link import vented
-from mjx_softarm.deploy.strategy import followed
 from mjx_softarm.export.symbols import Symbol, constant, repeat, symbol
 from mjx_softarm.mdp.rewards import asked_error, scaled_error
 from mjx_softarm.policy import reach
+from mjx_softarm.policy.reach import followed
 from mjx_softarm.policy.reachable import distances
 from mjx_softarm.policy.runtime import InMotion, action_towards, actor_output, sensed, tip_pose
 from mjx_softarm.sensing.load import estimate_load

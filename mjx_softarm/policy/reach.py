@@ -1,4 +1,4 @@
-"""Reachable poses nearest to goals, by the policy file's models of the arm.
+"""Reachable poses nearest to goals, by the policy file's models of the arm; lengths of an arm at its limits.
 
 The search runs over the pressures between their limits: pressures give spring lengths, spring lengths give
 the tip pose. It takes Levenberg-Marquardt steps from several starts at once, and holds a pressure at its
@@ -14,6 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from mjx_softarm._support.xp import Array, array_namespace
+from mjx_softarm.control import at_chambers, planes
 from mjx_softarm.mdp.rewards import scaled_error, weighted_angles, weighted_position
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.sensing.estimator import estimate_frame, expected_springs
@@ -24,6 +25,7 @@ N_STARTS, N_STEPS = 4, 20
 _DIFFERENCE = 1e-3  # step of the finite differences, as a share of the range of pressures
 _EASE, _STIFFEN = 0.2, 8.0  # factors of the damping after a step that helped, and after a step that did not
 _LEAST_DAMPING, _MOST_DAMPING = 1e-6, 1e3
+_STAYING = 1e-4  # weight of a chamber that does not follow, beside the ones that do
 
 
 def nearest_poses(policy: Policy, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -116,3 +118,34 @@ def solved(matrix: Array, column: Array) -> Array:
         cleared = left[..., 1:] - left[..., :1] * row[:, None]
         left = xp.where(np.arange(n)[:, None] == k, row[:, None], cleared)
     return left[..., 0]
+
+
+def followed(reference_m: Array, mean_m: Array, asked_m: Array, saturated: Array, policy: Policy) -> Array:
+    """Return the lengths (n_springs,) [m] that an arm at rest takes for new references. NumPy and symbols.
+
+    The lengths are the references: springs of an arm at rest may creep by some tenths of a millimetre. But
+    saturated chambers that are asked for more do not follow: there the lengths are the springs'. Of an arm
+    with redundant chambers, each section takes the plane that fits the chambers which follow, and the others
+    as far as these leave it open.
+
+    Args:
+        reference_m (n_springs,) [m]: new references.
+        mean_m (n_springs,) [m]: lengths at rest on the last references.
+        asked_m (n_springs,) [m]: the last references.
+        saturated (n_chambers,): bool.
+        policy: the arm.
+    """
+    # Motion and error of each chamber
+    xp, allocation = array_namespace(reference_m, mean_m), policy.gains.allocation
+    move_m = at_chambers(reference_m - mean_m, allocation)
+    stays = saturated & (move_m * at_chambers(asked_m - mean_m, allocation) > 0.0)
+    if allocation is None:
+        return xp.where(stays, mean_m, reference_m)
+
+    # Planes by weighted least squares, at the springs
+    n_sections, n = policy.spec.structure.n_sections, policy.spec.structure.chambers_per_section
+    weight = xp.where(stays, _STAYING, 1.0).reshape(n_sections, 1, n)
+    across, along_m = planes(n).T, xp.where(stays, 0.0, move_m).reshape(n_sections, 1, n)
+    normal = xp.sum((weight * across)[:, :, None] * across, axis=-1)  # (n_sections, 3, 3)
+    plane = solved(normal, xp.sum(weight * across * along_m, axis=-1))  # (n_sections, 3)
+    return mean_m + xp.sum(plane[:, None] * planes(policy.spec.springs_per_section), axis=-1).reshape(-1)

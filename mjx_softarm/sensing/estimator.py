@@ -88,10 +88,18 @@ def estimate_frame(estimator: PoseEstimator, spring_m: Array, load_kg: Array | f
     turn = rotation_from_quaternion(quaternion / xp.sqrt(xp.sum(quaternion**2, axis=-1))[..., None])
     tip = chain(Frame(even.position_m + changes[..., :3], turn @ even.rotation))
 
-    # From the arm's own base to the base frame
-    base = estimator.base_rotation
-    position_m = (base @ tip.position_m[..., None])[..., 0] + estimator.base_position_m
-    return Frame(position_m, base @ tip.rotation)
+    return _from_base(Frame(estimator.base_position_m, estimator.base_rotation), tip)
+
+
+def even_pose(base: Frame, spring_site_m: Array, spring_m: Array) -> Array:
+    """Return the tip pose (..., 6) [mm, deg] with sections that bend evenly; arguments as of `backbone`."""
+    return pose_from_frame(*_from_base(base, chain(constant_curvature(spring_site_m, spring_m))))
+
+
+def _from_base(base: Frame, tip: Frame) -> Frame:
+    """Return a frame in the axes of the arm's own base in the base frame."""
+    position_m = (base.rotation @ tip.position_m[..., None])[..., 0] + base.position_m
+    return Frame(position_m, base.rotation @ tip.rotation)
 
 
 def constant_curvature(spring_site_m: Array, spring_m: Array) -> Frame:

@@ -9,7 +9,7 @@ from calib.read.logs import read_log
 from mjx_softarm.control import Gains
 from mjx_softarm.deploy import link
 from mjx_softarm.deploy.arm_io import Capture
-from mjx_softarm.deploy.controller import LOOP, Controller, spring_lag_s
+from mjx_softarm.deploy.controller import LOOP, Controller
 from mjx_softarm.deploy.ending import MISSED, Ending
 from mjx_softarm.deploy.goals import on_the_way
 from mjx_softarm.deploy.loop import start, step, with_goal
@@ -24,7 +24,6 @@ from tests.linear_arm import (
     CONTROLLER,
     DT_S,
     FAR,
-    GAIN_M_PER_KPA,
     GOALS,
     NOISE_M,
     POLICY,
@@ -32,7 +31,6 @@ from tests.linear_arm import (
     SPEC,
     SPRINGS_M,
     LinearArm,
-    N,
     asking,
     between,
     exact_plan,
@@ -133,11 +131,6 @@ def test_springs_of_a_moving_goal_are_on_time_however_slow_the_law(slower):
     behind_m = np.abs(read_m(run.log)[rows] - due_m)
     asked_m = np.abs(run.log.reference_m[rows] - due_m)
     assert behind_m.max() < 2e-4 < 1e-3 < asked_m.max()
-
-
-def test_the_lag_of_springs_is_that_of_the_law_s_integral():
-    lag_s = spring_lag_s(POLICY, np.zeros(N))
-    np.testing.assert_allclose(lag_s @ (SPEC.control.ki_kpa_per_ms * GAIN_M_PER_KPA), np.eye(N), atol=1e-4)
 
 
 def test_a_slow_or_narrow_arm_is_watched_for_longer_and_more_closely():

@@ -11,8 +11,8 @@ from mjx_softarm.deploy.drive import Drive, Hold
 from mjx_softarm.deploy.record import record
 from mjx_softarm.deploy.safety import Fault
 from mjx_softarm.deploy.session import check_arm, check_number, follow
-from mjx_softarm.deploy.strategy import followed
 from mjx_softarm.mechanics.excitation import random_pressures
+from mjx_softarm.policy.reach import followed
 from mjx_softarm.sensing.estimator import estimate
 from mjx_softarm.twin.arm import Twin
 from tests.arms import FOUR_CHAMBERS, SIX_CHAMBERS

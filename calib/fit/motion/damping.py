@@ -34,6 +34,7 @@ MIN_COUNTED_S = 2.0
 MAX_TOTAL_S = 24.0  # length of all stretches together
 CLUSTER_S = 1.0  # errors within this time are not independent
 PRIOR = 1.0  # standard deviation of the logarithms: a factor of e
+FITTED = 0.05  # that of a bending damping which is fitted already
 DIFFERENCE = 0.01  # change of a logarithm between two runs
 SCALE_M, MIN_SCALE_M = 2e-3, 1e-4  # standard deviation of the tip: first guess, least value
 KNOWN = 0.2  # relative half-width of an interval up to which a damping counts as known
@@ -68,13 +69,16 @@ class DampingFit:
         return self.held_out_rms_mm <= MARGIN * self.held_out_before_rms_mm
 
 
-def fit_damping(stretches: Sequence[Stretch], spec: ArmSpec, seed: int = 0) -> DampingFit:
+def fit_damping(
+    stretches: Sequence[Stretch], spec: ArmSpec, seed: int = 0, bending_prior: float = PRIOR
+) -> DampingFit:
     """Fit the damping of chambers and backbone to the motion of an arm.
 
     Args:
         stretches: parts of logs from `find_stretches`, one or more.
         spec: arm, its chambers already calibrated.
         seed: seed that chooses the held-out seconds.
+        bending_prior: standard deviation of the logarithm of the backbone's damping.
 
     Raises:
         FitError: the specified damping is zero.
@@ -90,7 +94,7 @@ def fit_damping(stretches: Sequence[Stretch], spec: ArmSpec, seed: int = 0) -> D
     n_clusters = len(_clusters(stretches, [s.tip_m for s in stretches], spec))
     held_out = held_out_blocks(n_clusters, block=2, seed=seed)
     problem = Problem(
-        prior=np.full(2, PRIOR),
+        prior=np.array([PRIOR, bending_prior]),
         group=np.zeros(3 * _rows(CLUSTER_S, spec), int),
         scale=np.array([SCALE_M]),
         min_scale=np.array([MIN_SCALE_M]),

@@ -1,0 +1,66 @@
+"""Lags of a moving arm: springs behind their references, the shape behind the springs. NumPy only."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from mjx_softarm.policy.file import Policy
+from mjx_softarm.sensing.estimator import Frame, even_pose, expected_springs
+from mjx_softarm.sensing.pose import pose_error
+
+_STEP = 0.05  # change of a pressure from which the springs' response is taken, in ranges of pressure
+_LEAST_MODE = 1e-3  # response of a mode, in that of the largest, below which chambers do not move it
+
+
+def spring_lag_s(policy: Policy, pressure_kpa: np.ndarray) -> np.ndarray:
+    """Return the matrix (n_springs, n_springs) [s] A of lags of the springs under the law.
+
+    The law's integral changes by i' = ki C e, and moves the springs by G i', with G the change of lengths
+    with pressures, and C the law's allocation. So springs that move steadily with a rate x' are A x' behind
+    the law's reference, A = pinv(ki G C). Dead time and lag of the actuators do not matter: the integral has
+    moved on by them. Modes that chambers do not move have no lag.
+
+    Args:
+        policy: the arm.
+        pressure_kpa (n_chambers,) [kPa]: pressures, at which G is taken.
+    """
+    gains, n = policy.gains, policy.spec.n_chambers
+    low, high = (np.broadcast_to(np.asarray(x, float), n) for x in gains[4:6])
+    step_kpa = _STEP * (high - low)
+    either = pressure_kpa + np.stack([1.0, -1.0])[:, None, None] * np.diag(step_kpa)
+    longer_m, shorter_m = expected_springs(policy.spring_model, either)
+    change = (longer_m - shorter_m).T / (2.0 * step_kpa)  # (n_springs, n_chambers) [m/kPa]
+    if gains.allocation is not None:
+        change = change @ gains.allocation.chamber_error
+    return np.linalg.pinv(change * gains.ki_kpa_per_ms, rcond=_LEAST_MODE)
+
+
+class ShapeLag(NamedTuple):
+    """Memory of how unevenly the sections of a moving arm bend.
+
+    The pose at rest with some springs differs from that of sections that bend evenly. In motion this
+    difference lags behind the springs, see `calib.fit.motion.shape`.
+    """
+
+    uneven: np.ndarray | None = None  # (6,) [mm, deg] difference that lags; None before the first pose
+
+    def after(self, policy: Policy, spring_m: np.ndarray, pose: np.ndarray, dt_s: float) -> ShapeLag:
+        """Return the memory a time dt_s later, with springs (n_springs,) [m] whose pose at rest is (6,)."""
+        uneven = self._at_rest(policy, spring_m, pose)
+        if self.uneven is None:
+            return ShapeLag(uneven)
+        lag_s = policy.spec.backbone.shape_lag_s
+        return ShapeLag(self.uneven + dt_s / (lag_s + dt_s) * pose_error(uneven, self.uneven))
+
+    def behind(self, policy: Policy, spring_m: np.ndarray, pose: np.ndarray) -> np.ndarray:
+        """Return the pose (6,) [mm, deg] at rest less that in motion; arguments as of `after`."""
+        uneven = self._at_rest(policy, spring_m, pose)
+        return np.zeros(6) if self.uneven is None else pose_error(uneven, self.uneven)
+
+    @staticmethod
+    def _at_rest(policy: Policy, spring_m: np.ndarray, pose: np.ndarray) -> np.ndarray:
+        own = policy.estimator
+        base = Frame(own.base_position_m, own.base_rotation)
+        return pose_error(np.asarray(pose, float), even_pose(base, own.spring_site_m, spring_m))
