@@ -87,19 +87,21 @@ def _run(
     spec: cli.SpecFile = None,
     strict: Strict = False,
     out: Path = Path("calibration"),
+    since: cli.MaybePath = None,
     shared_springs: bool = False,
     fit_compensation: bool = False,
     seed: int = 0,
 ) -> int:
-    """Calibrate springs, chambers, damping and the sim-to-real network.
+    """Calibrate springs, chambers, damping and the sim-to-real network; logs of `deploy` show later changes.
 
     Args:
         out: folder to write
+        since: calibration that goes on: the logs are later ones, and what has changed is all that is fitted
         shared_springs: fit one beta and one delta for all springs
         fit_compensation: fit the circuit's compensation inductance, too
         seed: seed of all random draws
     """
-    from calib.run import calibrate, refuse_existing, write_calibration
+    from calib.run import calibrate, go_on, load_calibration, refuse_existing, write_calibration
     from calib.steps import STEPS, springs
     from mjx_softarm._support import xla
     from mjx_softarm._support.provenance import provenance
@@ -107,12 +109,16 @@ def _run(
     # Read the logs, and calibrate.
     _check_seed(seed)
     refuse_existing(out)
-    arm = ArmSpec.of(spec)
+    if since and spec:
+        raise InputError(f"--spec: got {spec} and --since {since}, which has its own, expected one")
+    known = load_calibration(since) if since else None
+    arm = known.spec if known else ArmSpec.of(spec)
     read, findings = _read(logs, arm, strict)
     xla.enable_compilation_cache()
     how = {"shared": shared_springs, "fit_compensation": fit_compensation}
     steps = {**STEPS, "springs": functools.partial(springs, **how)}
-    calibration = calibrate(read, arm, seed, steps, lambda text: print(text, flush=True))
+    tell = functools.partial(print, flush=True)
+    calibration = go_on(known, read, seed, tell) if known else calibrate(read, arm, seed, steps, tell)
     # Write the folder, and print the reasons not to trust it.
     write_calibration(out, calibration, [str(finding) for finding in findings], provenance("calib"))
     for section in calibration.sections:
@@ -121,7 +127,8 @@ def _run(
         for note in section.notes:
             print(f"note: {section.title}: {note}")
     print(f"report: {out / 'report.html'}")
-    print(f"next: python -m train reach --preset analytic --calibration {out}")
+    after = "train export RUN" if since else "train reach --preset analytic"
+    print(f"next: python -m {after} --calibration {out}")
     return 1 if any(section.warnings for section in calibration.sections) else 0
 
 

@@ -12,20 +12,21 @@ The result is a folder that training takes:
 
 from __future__ import annotations
 
+import dataclasses
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from calib.plan import RECORDED_FILE, Recorded, save_recorded
+from calib.plan import RECORDED_FILE, Recorded, load_recorded, save_recorded
 from calib.read.measurements import measure
 from calib.report.page import Section, to_html, to_json
-from calib.steps import STEPS, Extras, Step
+from calib.steps import STEPS, Extras, Step, changes
 from mjx_softarm._support.provenance import write_json
-from mjx_softarm.logs.pose_pairs import PosePairs, write_pose_pairs
+from mjx_softarm.logs.pose_pairs import POSES_FILE, PosePairs, read_pose_pairs, write_pose_pairs
 from mjx_softarm.logs.schema import Log
-from mjx_softarm.sensing.s2r import S2R, S2R_FILE, save_s2r
+from mjx_softarm.sensing.s2r import S2R, S2R_FILE, load_s2r, save_s2r
 from mjx_softarm.spec import ARM_FILE, ArmSpec
 
 
@@ -49,6 +50,8 @@ def calibrate(
 ) -> Calibration:
     """Fit everything that the logs allow.
 
+    Logs of the control loop beside others are later ones: they show what has changed since the others.
+
     Args:
         logs: logs of one arm, see `calib.read.logs.read_log`.
         spec: arm as believed so far.
@@ -60,6 +63,10 @@ def calibrate(
         LogError: the logs are of different arms.
         FitError: the logs do not allow a fit.
     """
+    later = [log for log in logs if log.goal is not None]
+    if 0 < len(later) < len(logs):
+        first = calibrate([log for log in logs if log.goal is None], spec, seed, steps, progress)
+        return go_on(first, later, seed, progress)
     measurements = measure(logs, spec)
     report, extras = [], Extras()
     for name, step in steps.items():
@@ -73,6 +80,40 @@ def calibrate(
         poses = measurements.poses
         recorded = Recorded(poses.pressure_kpa, poses.payload_kg, extras["error_mm"], extras["scale"])
     return Calibration(spec, tuple(report), extras.get("s2r"), recorded, extras.get("pairs", {}))
+
+
+def go_on(
+    since: Calibration,
+    later: Sequence[Log],
+    seed: int = 0,
+    progress: Callable[[str], None] = lambda text: None,
+) -> Calibration:
+    """Return a calibration with what has changed since then, by later logs; arguments as of `calibrate`.
+
+    Raises:
+        LogError: the logs are of different arms.
+    """
+    progress("changes ...")
+    measurements = measure(later, since.spec, needed=("pressure_kpa",))
+    spec, section, _ = changes(measurements, since.spec, seed, since.s2r)
+    return dataclasses.replace(since, spec=spec, sections=(*since.sections, section))
+
+
+def load_calibration(folder: Path) -> Calibration:
+    """Read a calibration, without the sections of its report.
+
+    Raises:
+        InputError: a file is missing, damaged, or of another arm.
+    """
+    spec, s2r = ArmSpec.from_toml(folder / ARM_FILE), folder / S2R_FILE
+    recorded = folder / RECORDED_FILE
+    return Calibration(
+        spec,
+        (),
+        load_s2r(s2r, spec.n_springs) if s2r.exists() else None,
+        load_recorded(recorded, spec.n_chambers) if recorded.exists() else None,
+        read_pose_pairs(folder) if (folder / POSES_FILE).exists() else {},
+    )
 
 
 def refuse_existing(folder: Path) -> None:

@@ -14,6 +14,8 @@ from typing import Any, NamedTuple, TypedDict
 import numpy as np
 
 from calib.fit.chambers import MIN_POSES, fit_chambers
+from calib.fit.changes import MIN_POSES as MIN_LATER
+from calib.fit.changes import fit_changes
 from calib.fit.held_pressures import fit_held_pressures
 from calib.fit.markers import MIN_MARKERS, marker_limits
 from calib.fit.motion.actuators import fit_actuators
@@ -24,6 +26,7 @@ from calib.fit.s2r import fit_s2r, simulate_poses
 from calib.fit.sensors import fit_springs
 from calib.read.measurements import Measurements
 from calib.report import sections
+from calib.report.changes import CHANGES, changes_section
 from calib.report.page import Section
 from mjx_softarm.logs.pose_pairs import PosePairs
 from mjx_softarm.logs.rest import MIN_HOLD_S
@@ -162,6 +165,22 @@ def s2r(measurements: Measurements, spec: ArmSpec, seed: int) -> StepResult:
     if fit.is_better:
         extras["s2r"] = fit.s2r
     return StepResult(spec, sections.with_pressures(section, held), extras)
+
+
+def changes(measurements: Measurements, spec: ArmSpec, seed: int, s2r: S2R | None = None) -> StepResult:
+    """Fit what has changed since a calibration, whose S2R is given, to later poses of the unloaded arm."""
+    poses = measurements.poses.with_lengths(spec)
+    unloaded = np.isclose(poses.payload_kg, spec.mass.payload_kg, rtol=0.0, atol=1e-6)
+    poses = poses.take(np.isfinite(poses.spring_m).all(axis=1) & unloaded)
+    extras = Extras() if s2r is None else Extras(s2r=s2r)
+    if poses.n < MIN_LATER:
+        what = "pressures and spring lengths, without a payload"
+        needed = f"{NOT_FITTED} {_few(MIN_LATER, what, poses.n, measurements.row_uses)}"
+        remedy = f"what has changed is not known: measure {MIN_LATER} goals or more"
+        return StepResult(spec, Section(CHANGES, needed, warnings=(remedy,)), extras)
+    found = fit_changes(spec, s2r, poses, seed)
+    section = changes_section(found, 0.0 if s2r is None else float(s2r.error_mm))
+    return StepResult(found.spec if found.is_better else spec, section, extras)
 
 
 STEPS: Mapping[str, Step] = MappingProxyType(

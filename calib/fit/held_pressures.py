@@ -47,7 +47,7 @@ def fit_held_pressures(
         seed: seed that chooses the contiguous blocks of held-out rows.
     """
     spring_m = np.asarray(spring_m, float)
-    left_kpa = _without_redundant_part(np.asarray(measured_kpa, float), spring_m, spec) - simulated_kpa
+    left_kpa = without_redundant_part(np.asarray(measured_kpa, float), spring_m, spec) - simulated_kpa
     stretched_m = spring_m - spec.at_springs(spec.geometry.section_length_m)
     held_out = held_out_blocks(len(left_kpa), block=HELD_OUT_BLOCK, seed=seed)
     # Fit to the rows that are not held out, in standardised lengths, as the prior acts on these.
@@ -60,7 +60,7 @@ def fit_held_pressures(
     return HeldPressures(found, _rms(left_kpa[held_out]), _rms(after_kpa[held_out]))
 
 
-def _without_redundant_part(pressure_kpa: np.ndarray, spring_m: np.ndarray, spec: ArmSpec) -> np.ndarray:
+def without_redundant_part(pressure_kpa: np.ndarray, spring_m: np.ndarray, spec: ArmSpec) -> np.ndarray:
     """Return the pressures (m, n_chambers) that push alike and that the sensor-space law would hold.
 
     The law holds no pressure that neither stretches nor bends a section, and poses of a log may.

@@ -26,12 +26,13 @@ class Measurements(NamedTuple):
     row_uses: Mapping[str, int]  # number of rows of these logs, by use
 
 
-def measure(logs: Sequence[Log], spec: ArmSpec) -> Measurements:
+def measure(logs: Sequence[Log], spec: ArmSpec, needed: Sequence[str] = POSE_COLUMNS) -> Measurements:
     """Return logs of one arm with its poses at rest.
 
     Args:
         logs: logs, see `calib.read.logs.read_log`.
         spec: arm, calibrated or not; see `calib.read.static_poses.find_static_poses`.
+        needed: columns of a log whose poses count.
 
     Raises:
         LogError: the logs are of different arms.
@@ -39,7 +40,7 @@ def measure(logs: Sequence[Log], spec: ArmSpec) -> Measurements:
     for first, other in itertools.combinations(logs, 2):
         file = f"{first.source} and {other.source}"
         refuse([Finding(file, None, name, problem) for name, problem in _differences(first, other)])
-    with_poses = [log for log in logs if all(getattr(log, name) is not None for name in POSE_COLUMNS)]
+    with_poses = [log for log in logs if all(getattr(log, name) is not None for name in needed)]
     return Measurements(tuple(logs), *find_static_poses(with_poses, spec))
 
 

@@ -1,12 +1,19 @@
-"""Static poses of logs: the arm at rest (`mjx_softarm.logs.rest`), to which equilibria are fitted."""
+"""Static poses of logs: the arm at rest (`mjx_softarm.logs.rest`), to which equilibria are fitted.
+
+In a log of the control loop the pressures change until each arrival. There a pose is the window that ends
+with the arrival at a goal, if the springs are still over it by the loop's own rule. Windows after earlier
+actions do not count: 2 s after an action a twin's tip is 3 to 4 mm from its rest at the same springs.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from mjx_softarm.deploy.belief import still
+from mjx_softarm.deploy.controller import LOOP
 from mjx_softarm.logs.rest import HOLD_KPA, NEEDED, holds, last_second, moves
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.sensing.pose import rotation_from_quaternion
@@ -53,7 +60,7 @@ def find_static_poses(logs: Sequence[Log], spec: ArmSpec) -> tuple[StaticPoses, 
     """Find the static poses of all logs together.
 
     Args:
-        logs: each with pressures and tip poses.
+        logs: each with pressures, and with tip poses unless the tips may be NaN.
         spec: arm, calibrated or not; its payload is that of a log without a payload.
 
     Returns:
@@ -90,7 +97,7 @@ def _static_poses_of(log: Log, spec: ArmSpec, n_markers: int, row_uses: dict[str
     finite = np.all(np.isfinite(np.column_stack(columns)), axis=1)
     row_uses["not finite"] += int(np.count_nonzero(~finite))
     log, payload = log.take(finite), payload[finite]
-    assert log.pressure_kpa is not None and log.tip_m is not None  # as `POSE_COLUMNS` asks
+    assert log.pressure_kpa is not None
     # Fill what the log does not have.
     unknown = np.full((len(log), spec.n_springs), np.nan)
     readings = log.readings_of(spec.sensor)
@@ -99,24 +106,49 @@ def _static_poses_of(log: Log, spec: ArmSpec, n_markers: int, row_uses: dict[str
     markers = np.full((len(log), n_markers, 3), np.nan)
     if log.marker_m is not None and log.marker_m.shape[1] == n_markers:
         markers = log.marker_m
-    rotation = rotation_from_quaternion(log.tip_quaternion)
-    # Average the last second of each hold at whose end the tip rests.
+    tips, rotation = np.full((len(log), 3), np.nan), np.full((len(log), 3, 3), np.nan)
+    if log.tip_m is not None and log.tip_quaternion is not None:
+        tips, rotation = log.tip_m, rotation_from_quaternion(log.tip_quaternion)
+    # Average the rows at each rest.
     found = []
-    for start, stop in holds(log.time_s, log.pressure_kpa, payload):
-        rows = last_second(log.time_s, start, stop)
-        row_uses["pressures not held long enough"] += stop - start - len(rows)
-        if len(rows) == 0:
-            continue
-        if moves(log.time_s[rows], log.tip_m[rows]):
-            row_uses["tip still moving"] += len(rows)
-            continue
+    rests = _rests if log.goal is None else _rests_of_loop
+    for rows in rests(log, payload, spec, row_uses):
         row_uses["used"] += len(rows)
         pressure, tip, turn, spring, marker = (
-            np.mean(x[rows], axis=0) for x in (log.pressure_kpa, log.tip_m, rotation, springs, markers)
+            np.mean(x[rows], axis=0) for x in (log.pressure_kpa, tips, rotation, springs, markers)
         )
         kept = payload[rows[0]]  # the payload of all rows, which a mean would round
-        found.append((pressure, kept, tip, nearest_rotation(turn), spring, marker, readings[rows]))
+        turn = nearest_rotation(turn) if np.isfinite(turn).all() else turn
+        found.append((pressure, kept, tip, turn, spring, marker, readings[rows]))
     return found
+
+
+def _rests(log: Log, payload_kg: np.ndarray, spec: ArmSpec, row_uses: dict[str, int]) -> Iterator[np.ndarray]:
+    """Find the rows of each rest: the last second of a hold at whose end the tip rests."""
+    assert log.pressure_kpa is not None
+    for start, stop in holds(log.time_s, log.pressure_kpa, payload_kg):
+        rows = last_second(log.time_s, start, stop)
+        row_uses["pressures not held long enough"] += stop - start - len(rows)
+        moving = len(rows) > 0 and log.tip_m is not None and moves(log.time_s[rows], log.tip_m[rows])
+        row_uses["tip still moving"] += moving * len(rows)
+        if len(rows) > 0 and not moving:
+            yield rows
+
+
+def _rests_of_loop(
+    log: Log, payload_kg: np.ndarray, spec: ArmSpec, row_uses: dict[str, int]
+) -> Iterator[np.ndarray]:
+    """Find the rows of each rest in a log of the control loop: the window before its arrival at a goal."""
+    assert log.goal is not None
+    n, readings = round(LOOP.window_s * spec.control.rate_hz), log.readings_of(spec.sensor)
+    watched_m = log.spring_m if readings is None else spec.spring_sensor.lengths(readings, np.nan).length_m
+    ends = (log.goal[1:] != log.goal[:-1]).any(axis=1) & np.isfinite(log.goal[:-1, 0])
+    for last in [*np.flatnonzero(ends), len(log) - 1]:
+        rows = np.arange(max(last - n + 1, 0), last + 1)
+        if watched_m is not None and len(rows) == n and still(watched_m[rows]):
+            yield rows
+        else:
+            row_uses["tip still moving"] += len(rows)
 
 
 def nearest_rotation(matrix: np.ndarray) -> np.ndarray:

@@ -76,6 +76,28 @@ def test_each_step_brings_the_simulated_tip_closer_to_held_out_poses(calibrated)
     assert corrected["rotation_mean_deg"] < 0.8 * simulated["rotation_mean_deg"]
 
 
+def test_a_calibration_goes_on_with_a_later_log(demo, calibrated, tmp_path, capsys):
+    """Later, two springs read 1.5 mm less; the rest of the folder stays."""
+    before, later, out = calibrated[1], tmp_path / "later.npz", tmp_path / "new"
+    spec = ArmSpec.from_toml(before / "arm.toml")
+    log = read_log(demo[1], spec)[0].take(np.arange(60))
+    shift_m = 1.5e-3 * np.isin(np.arange(9), (1, 5))
+    length_m = spec.spring_sensor.lengths(log.readings).length_m
+    later_log = dataclasses.replace(log, readings=spec.spring_sensor.readings(length_m - shift_m))
+    write_log(later, later_log)
+    main(["run", str(later), "--since", str(before), "--out", str(out)])
+    said = capsys.readouterr().out
+    assert (
+        "note: Changes: zeros of the springs " in said and "next: python -m train export RUN --calib" in said
+    )
+    found_m = ArmSpec.from_toml(out / "arm.toml").spring_sensor.delta_m - spec.spring_sensor.delta_m
+    np.testing.assert_allclose(found_m, shift_m, atol=7e-4)
+    assert (out / "s2r.npz").read_bytes() == (before / "s2r.npz").read_bytes()
+    assert sorted(p.name for p in out.iterdir()) == sorted(p.name for p in before.iterdir())
+    both = ["run", str(later), "--since", str(before), "--spec", "paper", "--out", str(tmp_path / "other")]
+    assert main(both) == 2 and "--spec: got paper and --since" in capsys.readouterr().err
+
+
 def test_nothing_is_overwritten(demo, calibrated, capsys, tmp_path, monkeypatch):
     before = (calibrated[1] / "arm.toml").read_bytes()
     assert main(["run", *demo, "--out", str(calibrated[1])]) == 2

@@ -17,6 +17,7 @@ from mjx_softarm.env import ReachEnv
 from mjx_softarm.logs.schema import Log, write_log
 from mjx_softarm.mechanics import workspace
 from mjx_softarm.mechanics.workspace import sample_workspace
+from mjx_softarm.policy.file import load_policy
 from mjx_softarm.sensing.pose import frame_from_pose, quaternion_from_pose
 from tests.train.small import CONFIG, SHORT, flags, new_job
 from train.__main__ import main
@@ -108,6 +109,22 @@ def test_a_run_survives_kill_9_and_ends_with_the_same_bits(arm, tmp_path, monkey
         monkeypatch.setattr(f"train.runs.estimator.{name}", smaller)
     assert main(["export", str(whole)]) == 0
     assert (whole / "policy.npz").exists()
+
+    # Later, the springs' zeros have shifted, and the arm was seen at other lengths
+    first, later = load_policy(whole / "policy.npz"), tmp_path / "later"
+    later.mkdir()
+    shifted = {"delta_m": first.spec.sensor.delta_m + 0.002}
+    lengths = {"length_min_m": 0.1, "length_max_m": 0.25}
+    first.spec.replace(sensor=shifted, springs=lengths).to_toml(later / "arm.toml")
+    assert main(["export", str(whole), "--calibration", str(later)]) == 0
+    renewed = load_policy(whole / "policy-later.npz")
+    for now, before in zip(renewed.actions[1:], first.actions[1:], strict=True):
+        np.testing.assert_allclose(
+            renewed.sensor.lengths(now).length_m, first.sensor.lengths(before).length_m, atol=1e-9
+        )
+        assert (now != before).all()
+    jax.tree.map(np.testing.assert_array_equal, renewed.layers, first.layers)
+    assert "enough without training" in capsys.readouterr().out and (later / "estimators.npz").exists()
 
 
 def test_resume_says_that_a_run_without_a_checkpoint_begins_anew(tmp_path, monkeypatch, capsys):

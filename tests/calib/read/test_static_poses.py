@@ -9,6 +9,7 @@ from calib.read.static_poses import find_static_poses, nearest_rotation
 from mjx_softarm import ArmSpec
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.sensing.pose import rotation_from_quaternion
+from tests.linear_arm import CONTROLLER, SENSOR, LinearArm, go, read_m
 
 SPEC = ArmSpec.default()
 
@@ -123,3 +124,19 @@ def test_the_mean_of_two_rotations_is_halfway(seed):
         return rotation_from_quaternion(np.append(np.cos(angle / 2), np.sin(angle / 2) * axis))
 
     np.testing.assert_allclose(nearest_rotation(0.5 * (turn(0.1) + turn(0.5))), turn(0.3), atol=1e-12)
+
+
+def test_a_log_of_the_loop_has_a_pose_at_each_arrival():
+    """Without motion capture, tips are not known; the last goal ends with the log."""
+    run = go(LinearArm())
+    poses, row_uses = find_static_poses([run.log], SPEC)
+    assert poses.n == len(run.arrivals) == 2 and row_uses["used"] == 2 * CONTROLLER.window
+    for k, arrival in enumerate(run.arrivals):
+        rows = slice(arrival.row + 1 - CONTROLLER.window, arrival.row + 1)
+        np.testing.assert_allclose(poses.pressure_kpa[k], run.log.pressure_kpa[rows].mean(axis=0))
+        np.testing.assert_allclose(poses.with_lengths(SPEC).spring_m[k], read_m(run.log)[rows].mean(axis=0))
+    assert np.isnan(poses.tip_m).all() and np.isnan(poses.tip_rotation).all()
+    waiting = dataclasses.replace(
+        run.log, readings=SENSOR.readings(read_m(run.log) + 1e-4 * run.log.row[:, None])
+    )
+    assert find_static_poses([waiting], SPEC)[0].n == 0
