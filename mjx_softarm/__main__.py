@@ -1,8 +1,9 @@
-"""Command line: `python -m mjx_softarm spec | picture | workspace`."""
+"""Command line: `python -m mjx_softarm spec | picture | workspace | firmware`."""
 
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,13 +16,16 @@ from mjx_softarm.arms import shipped_arm
 from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.spec import ArmSpec
 
+FIRMWARE = Path(__file__).parent / "deploy" / "drivers" / "firmware" / "firmware.ino"
 MAX_COMBINATIONS, N_RANDOM = 1_000_000, 3**9  # of pressures; as many as those of the paper's arm
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit status."""
-    about = "A pneumatic soft arm in MuJoCo and JAX: its specification, its picture, its workspace."
-    commands = {"spec": _spec, "picture": _picture, "workspace": _workspace}
+    about = (
+        "A pneumatic soft arm in MuJoCo and JAX: its specification, its picture, its workspace, its board."
+    )
+    commands = {"spec": _spec, "picture": _picture, "workspace": _workspace, "firmware": _firmware}
     return cli.main("python -m mjx_softarm", about, commands, arguments)
 
 
@@ -112,6 +116,30 @@ def _workspace(spec: cli.SpecFile = None, out: Path = Path(".")) -> int:
     print(f"  lateral (y)   {lateral:6.1f} mm{beside[0]}")
     print(f"  vertical (z)  {vertical:6.1f} mm{beside[1]}")
     print(f"wrote {out / 'workspace.png'}")
+    return 0
+
+
+def _firmware(spec: cli.SpecFile = None, out: Path = Path("softarm")) -> int:
+    """Write the reference firmware of a microcontroller, with the numbers of an arm.
+
+    Args:
+        out: folder of the sketch, which has the folder's name
+    """
+    arm, sketch = ArmSpec.of(spec), out / f"{out.name}.ino"
+    if sketch.exists():
+        raise InputError(f"--out: got {sketch}, which exists already, expected a new folder")
+    numbers = {
+        "int N_SPRINGS": f"{arm.n_springs}",
+        "int N_CHAMBERS": f"{arm.n_chambers}",
+        "float MIN_KPA": f"{float(np.min(arm.chambers.pressure_min_kpa))}f",
+        "float MAX_KPA": f"{float(np.max(arm.chambers.pressure_max_kpa))}f",
+    }
+    text = FIRMWARE.read_text("utf-8")
+    for name, value in numbers.items():
+        text = re.sub(rf"(?<=constexpr {name} = )[^;]+", value, text)
+    out.mkdir(parents=True, exist_ok=True)
+    sketch.write_text(text, "utf-8")
+    print(f"wrote {sketch}; put in the pins and converters of your board before you compile it")
     return 0
 
 

@@ -13,13 +13,14 @@ Lines end in a line feed, over UDP, too. It keeps the pressures until the next `
 springs and 9 chambers:
 
     request         answer                      meaning
-    R K             R K r0 ... r8 p0 ... p8     readings in the sensor's unit, taken since the request (nan:
-                                                not read); pressures [kPa] measured, or else commanded
+    R K             R K r0 ... r8 p0 ... p8     readings in the sensor's unit, taken since the last request
+                                                (nan: not read); pressures [kPa] measured, or else commanded
     P K p0 ... p8   P K                         pressures [kPa] taken
     any             E K text                    refused, and why
 
 An answer with another number belongs to an earlier request: it is skipped. A cut or garbled answer counts as
 none. The microcontroller should vent by itself after a second without `P`: no driver can do that for it.
+`python -m mjx_softarm firmware` writes one that does, for LDC1612 converters and two valves a chamber.
 """
 
 from __future__ import annotations
