@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import enum
 from collections.abc import Iterator
+from pathlib import Path
 
 
 class InputError(ValueError):
@@ -21,8 +22,9 @@ def needing(extra: str, where: str) -> Iterator[None]:
     try:
         yield
     except ImportError as error:
-        expected = f"pip install -e '.[{extra}]' in the checkout"
-        raise InputError(f"{where}: got no {error.name}, expected {expected}") from error
+        checkout = (Path(__file__).resolve().parents[2] / "pyproject.toml").exists()
+        what = f"-e '.[{extra}]' in the checkout" if checkout else f"'mjx-softarm[{extra}]'"
+        raise InputError(f"{where}: got no {error.name}, expected pip install {what}") from error
 
 
 class Result(enum.IntEnum):

@@ -1,4 +1,4 @@
-"""Example driver over a serial port; needs pyserial (`pip install -e '.[serial]'` in the checkout)."""
+"""Example driver over a serial port; needs pyserial (extra `serial`)."""
 
 from __future__ import annotations
 
