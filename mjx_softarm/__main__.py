@@ -147,6 +147,9 @@ def _import_mujoco() -> None:
     """Import MuJoCo, which reads MUJOCO_GL as it is imported."""
     try:
         import mujoco  # noqa: F401
+    except ModuleNotFoundError as error:
+        with needing("sim", "drawing"):
+            raise error
     except (ImportError, AttributeError, RuntimeError) as error:
         asked = os.environ.get("MUJOCO_GL", "")
         raise InputError(

@@ -20,7 +20,7 @@ from typing import Annotated, Any
 import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
-from mjx_softarm._support.errors import InputError
+from mjx_softarm._support.errors import InputError, needing
 
 ERROR, INTERRUPTED = 2, 130  # exit statuses
 
@@ -97,7 +97,7 @@ def read(prog: str, commands: Mapping[str, Command], words: Sequence[str]) -> tu
         if group := [name.removeprefix(f"{first} ") for name in commands if name.startswith(f"{first} ")]:
             prog, first, commands = f"{prog} {first}", rest[0], dict.fromkeys(group, "")
         raise InputError(f"{prog}: got {first!r}, expected one of {', '.join(commands)}")
-    return name, parse(_load(commands[name]), f"{prog} {name}", words[len(name.split()) :])
+    return name, parse(_load(commands[name], prog), f"{prog} {name}", words[len(name.split()) :])
 
 
 def _line(command: Command) -> str:
@@ -114,11 +114,13 @@ def _line(command: Command) -> str:
     return (text or "").partition("\n")[0]
 
 
-def _load(command: Command) -> Callable[..., Any]:
+def _load(command: Command, prog: str) -> Callable[..., Any]:
+    """Return a command's function; those named by a text need the packages of training."""
     if not isinstance(command, str):
         return command
     module, _, name = command.partition(":")
-    return getattr(importlib.import_module(module), name)
+    with needing("train", prog):
+        return getattr(importlib.import_module(module), name)
 
 
 def parse(command: Any, prog: str, arguments: Sequence[str]) -> Callable[[], Any]:

@@ -38,7 +38,7 @@ class CpxRegulators:
         timeout_s: longest time for a request.
 
     Raises:
-        ImportError: festo-cpx-io is missing.
+        InputError: festo-cpx-io is missing.
         ValueError: the modules have too few channels, or do not stand side by side.
         OSError: the terminal cannot be reached.
     """
@@ -46,7 +46,7 @@ class CpxRegulators:
     def __init__(
         self, host: str, modules: str, n: int, range_kpa: Sequence[float], timeout_s: float = 0.006
     ) -> None:
-        with needing("festo", "pressures"):
+        with needing("festo", "cpx-e"):
             terminal = importlib.import_module("cpx_io.cpx_system.cpx_e.cpx_e")
             base = importlib.import_module("cpx_io.cpx_system.cpx_base")
             self._errors: Any = importlib.import_module("pymodbus.exceptions")

@@ -38,7 +38,7 @@ class LdcSprings:
         timeout_s: time after which no further converter is read in a call.
 
     Raises:
-        ImportError: smbus2 is missing.
+        InputError: smbus2 is missing.
         ValueError: the channels or the current are none.
         OSError: a bus cannot be opened, or a converter is not there.
     """
@@ -60,7 +60,7 @@ class LdcSprings:
         self._n, self._timeout_s = len(channels), timeout_s
 
         # Buses, and converters set going
-        with needing("i2c", "springs"):
+        with needing("i2c", "ldc1612"):
             self._smbus: Any = importlib.import_module("smbus2")
         self._buses: dict[int, Any] = {}
         for bus in {bus for bus, _ in self._springs}:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from typing import Any
 
+from mjx_softarm._support.errors import needing
 from mjx_softarm.deploy.drivers import LineArm
 
 START_S = 5.0  # longest start of a board; many restart as their port is opened, in about 2 s
@@ -22,8 +23,8 @@ class SerialArm(LineArm):
     baud = 921600
 
     def __init__(self) -> None:
-        import serial
-
+        with needing("serial", "serial line"):
+            import serial
         super().__init__()
         self._late: Any = serial.SerialTimeoutException
         self._rest = b""
