@@ -47,6 +47,7 @@ class LoopConfig:
     # Lead of a moving goal.
     # Policies at rest: time over which the rate of the references is taken, for `spring_lag_s`
     rate_s: float = 0.2
+    way_share_per_s: float = 0.3  # share of the error along and beside the way that the goal is corrected by
     lead_actions: int = 2  # policies of motion; circle in 10 s on a twin: 3.1 mm with it, 23.6 mm without
 
     # Overload, in largest payloads. Twins that carry exactly the largest are wrongly reported in 4 of 36 runs

@@ -23,7 +23,7 @@ from mjx_softarm.deploy.safety import Event, Fault, names
 from mjx_softarm.mdp.observation import rate_ticks
 from mjx_softarm.mdp.rewards import RewardConfig, asked_error, scaled_error
 from mjx_softarm.policy.file import Policy
-from mjx_softarm.policy.lag import ShapeLag, spring_lag_s
+from mjx_softarm.policy.lag import ShapeLag, WayError, spring_lag_s
 from mjx_softarm.policy.reach import followed
 from mjx_softarm.policy.runtime import InMotion, sensed
 from mjx_softarm.sensing.load import Load
@@ -128,13 +128,15 @@ class Predicting(NamedTuple):
     lengths_m: tuple[np.ndarray, ...] = ()  # (n_springs,) each, of the last ticks, oldest first
     shape: ShapeLag = ShapeLag()  # of an arm with these lengths
     behind: np.ndarray | float = 0.0  # (6,) [mm, deg] pose at rest with the last lengths less that in motion
+    way: WayError = WayError()
 
     def references(self, belief: Belief, goal: np.ndarray) -> Choice:
         """Act several times; the last references count."""
-        # Lengths at the goal, of an arm whose shape lags
+        # Lengths at the goal, of an arm whose shape lags and that has been beside its way
         controller, policy, pose = belief.controller, belief.controller.policy, belief.pose
         shift, length_m = self.shift, belief.spring_m
-        goal = goal + self.behind
+        way = self.way.after(goal, pose - self.behind, controller)
+        goal = goal + self.behind + way.correction
         for _ in range(policy.n_actions):
             length_m = _planned(belief, pose, goal + shift)
             pose, _ = pose_of(controller, length_m, belief.load)
@@ -149,7 +151,7 @@ class Predicting(NamedTuple):
         rate = (lengths_m[-1] - lengths_m[0]) / (controller.dt_s * max(len(lengths_m) - 1, 1))
         lag_s = spring_lag_s(policy, belief.command.pressure_kpa)
         reference_m = lengths_m[(len(lengths_m) - 1) // 2] + lag_s @ rate
-        return Choice(Predicting(shift, self.n_actions + 1, lengths_m, shape, behind), reference_m)
+        return Choice(Predicting(shift, self.n_actions + 1, lengths_m, shape, behind, way), reference_m)
 
 
 class Chasing(NamedTuple):
