@@ -1,31 +1,30 @@
 """What a GPU can do: environment steps and gradient steps a second at many sizes, and times to train.
 
 All programs prepare themselves at once and then take turns, so that the GPU is one program's while it is
-measured. A training is the command of `docs/train.md` with sizes for a GPU; its clock begins with its first
-epoch, and stands while the policy is evaluated.
+measured. A training is a sweep over seeds with sizes for a GPU. Its clock runs in its epochs alone: it stands
+while programs compile and policies are evaluated.
 """
 
 from __future__ import annotations
 
 import json
 import math
-import subprocess
-import sys
 import tempfile
-import time
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from benchmarks.accuracy.arms import run_command
 from benchmarks.harness.common import machine_kind, n_cores
 from benchmarks.harness.rounds import Worker, take_turns
 from benchmarks.speed.throughput import over_rounds
 from benchmarks.speed.truth import told_error
 from mjx_softarm._support import cli
 from mjx_softarm.spec import ArmSpec
-from train.runs.checkpoint import Run
+from train.sweep.run import open_sweep
 
 N_ROUNDS = 2
+FIGURES = ("median_mm", "p95_mm", "reached_share", "saturated_share", "circle_mean_mm")
 PREPARE_S = 240.0  # a program that compiles for longer is left out
 LEVELS_MM = (5.0, 2.0, 1.0)  # median errors at held-out goals that a training is timed to
 
@@ -44,26 +43,37 @@ LEARNERS = {
     "motion": ((128, 128), (1024, 1024)),
     "motion-analytic": ((64, 0), (1024, 0)),
 }
-# Presets, and options that suit a GPU
-TRAININGS: dict[str, tuple[str, ...]] = {}
+# Presets, their seeds, and options that suit a GPU: more arms, larger batches and a larger pool of goals
+TRAININGS = {
+    "quick": ("0", {}),
+    "analytic": (
+        "0,1",
+        {"learner.n-arms": 1024, "learner.total-env-steps": 25_165_824, "env.n-poses": 131_072},
+    ),
+    "motion": (
+        "0,1,2",
+        {
+            "learner.n-arms": 384,
+            "learner.total-env-steps": 491_520,
+            "learner.replay-capacity": 491_520,
+            "learner.updates-per-env-step": 1 / 3,
+            "learner.batch-size": 512,
+        },
+    ),
+}
 
 
-def measure(parts: tuple[str, ...] = ("speed", "trainings"), keep: cli.MaybePath = None) -> dict[str, Any]:
+def measure(keep: cli.MaybePath = None) -> dict[str, Any]:
     """What does a GPU do: steps a second of all engines at many sizes, and how long do trainings take?
 
     Args:
-        parts: of the benchmark: speed, trainings
         keep: folder for the runs; without one they are deleted
     """
-    figures: dict[str, Any] = {"device": machine_kind()}
-    if "speed" in parts:
-        figures |= {"rounds": N_ROUNDS, **speed()}
-    if "trainings" in parts:
-        with tempfile.TemporaryDirectory() as folder:
-            home = (keep or Path(folder)).absolute()
-            home.mkdir(parents=True, exist_ok=True)
-            figures["trainings"] = [training(preset, home / preset) for preset in TRAININGS]
-    return figures
+    with tempfile.TemporaryDirectory() as folder:
+        home = (keep or Path(folder)).absolute()
+        home.mkdir(parents=True, exist_ok=True)
+        trained = [row for preset in TRAININGS for row in training(preset, home / preset)]
+    return {"device": machine_kind(), "rounds": N_ROUNDS, **speed(), "trainings": trained}
 
 
 def speed() -> dict[str, list[dict[str, Any]]]:
@@ -98,19 +108,22 @@ def _worker(kind: str, point: tuple[Any, ...]) -> Worker:
     return Worker(f"{kind}: {', '.join(map(str, point))}", program, answer_s=PREPARE_S)
 
 
-def training(preset: str, run: Path) -> dict[str, Any]:
-    """Train once; return the figures of the final policy, and the times to each level of `LEVELS_MM`."""
-    command = ["train", "reach", "--preset", preset, *TRAININGS[preset], "--out", str(run)]
-    begin = time.perf_counter()
-    status = subprocess.run([sys.executable, "-m", *command], check=False).returncode
-    row = {"preset": preset, "options": " ".join(TRAININGS[preset])}
-    if status:
-        return {**row, "failed": f"exit status {status}"}
-    row |= times_to(Run.open(run).metrics())
-    figures = json.loads((run / "evaluation.json").read_text("utf-8"))
-    row["command_s"] = round(time.perf_counter() - begin, 1)
-    names = ("median_mm", "p95_mm", "reached_share", "saturated_share", "circle_mean_mm")
-    return row | {name: figures[name] for name in names}
+def training(preset: str, sweep: Path) -> list[dict[str, Any]]:
+    """Train with some seeds at once; return a row for each, with its times to each level of `LEVELS_MM`.
+
+    Raises:
+        InputError: the training failed.
+    """
+    seeds, options = TRAININGS[preset]
+    words = [str(word) for name, value in options.items() for word in (f"--{name}", value)]
+    command = ("train", "sweep", "--preset", preset, "--seeds", seeds, *words, "--out", sweep)
+    run_command(*command, makes=sweep / "results.json")
+    rows = []
+    for run in open_sweep(sweep).runs:
+        figures = json.loads((run.path / "evaluation.json").read_text("utf-8"))
+        row = {"preset": preset, "seed": run.config.seed, **times_to(run.metrics())}
+        rows.append(row | {name: figures[name] for name in FIGURES})
+    return rows
 
 
 def times_to(metrics: Sequence[Mapping[str, Any]]) -> dict[str, float | None]:
