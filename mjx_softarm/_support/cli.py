@@ -20,9 +20,11 @@ from typing import Annotated, Any
 import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
-from mjx_softarm._support.errors import InputError, needing
+from mjx_softarm._support.errors import InputError, missing
 
 ERROR, INTERRUPTED = 2, 130  # exit statuses
+# Packages of the extra `train` that modules import as they are loaded.
+TRAIN = {"brax", "flax", "jax", "jinja2", "matplotlib", "mujoco", "optax", "orbax", "rich", "scipy"}
 
 Command = Callable[..., Any] | str
 
@@ -78,6 +80,10 @@ def guarded(run: Callable[[], int]) -> int:
     except OSError as error:
         why = f"{error.filename}: got {error.strerror!r}, expected a file or folder that can be used"
         text = why if error.filename else str(error)
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] not in TRAIN:
+            raise
+        text = missing(error, "train")
     except KeyboardInterrupt:
         return INTERRUPTED
     print(f"error: {text}", file=sys.stderr)
@@ -97,7 +103,7 @@ def read(prog: str, commands: Mapping[str, Command], words: Sequence[str]) -> tu
         if group := [name.removeprefix(f"{first} ") for name in commands if name.startswith(f"{first} ")]:
             prog, first, commands = f"{prog} {first}", rest[0], dict.fromkeys(group, "")
         raise InputError(f"{prog}: got {first!r}, expected one of {', '.join(commands)}")
-    return name, parse(_load(commands[name], prog), f"{prog} {name}", words[len(name.split()) :])
+    return name, parse(_load(commands[name]), f"{prog} {name}", words[len(name.split()) :])
 
 
 def _line(command: Command) -> str:
@@ -114,13 +120,11 @@ def _line(command: Command) -> str:
     return (text or "").partition("\n")[0]
 
 
-def _load(command: Command, prog: str) -> Callable[..., Any]:
-    """Return a command's function; those named by a text need the packages of training."""
+def _load(command: Command) -> Callable[..., Any]:
     if not isinstance(command, str):
         return command
     module, _, name = command.partition(":")
-    with needing("train", prog):
-        return getattr(importlib.import_module(module), name)
+    return getattr(importlib.import_module(module), name)
 
 
 def parse(command: Any, prog: str, arguments: Sequence[str]) -> Callable[[], Any]:

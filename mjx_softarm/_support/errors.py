@@ -22,9 +22,14 @@ def needing(extra: str, where: str) -> Iterator[None]:
     try:
         yield
     except ImportError as error:
-        checkout = (Path(__file__).resolve().parents[2] / "pyproject.toml").exists()
-        what = f"-e '.[{extra}]' in the checkout" if checkout else f"'mjx-softarm[{extra}]'"
-        raise InputError(f"{where}: got no {error.name}, expected pip install {what}") from error
+        raise InputError(f"{where}: {missing(error, extra)}") from error
+
+
+def missing(error: ImportError, extra: str) -> str:
+    """Return the sentence for a package of an optional extra that cannot be imported."""
+    checkout = (Path(__file__).resolve().parents[2] / "pyproject.toml").exists()
+    what = f"-e '.[{extra}]' in the checkout" if checkout else f"'mjx-softarm[{extra}]'"
+    return f"got no {error.name}, expected pip install {what}"
 
 
 class Result(enum.IntEnum):

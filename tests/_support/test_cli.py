@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import pytest
 import tyro
 
-from mjx_softarm._support import cli
+from mjx_softarm._support import cli, errors
 from mjx_softarm._support.errors import InputError
 
 PRESETS = {"small": 1.0, "large": 9.0}
@@ -176,3 +176,16 @@ def test_help_tells_every_option_and_imports_no_command(capsys, tmp_path, monkey
     assert "--noisy, --no-noisy" in told and "add noise (default: True)" in told
     assert run("make", "--no-noisy") == 0 and not RESULTS[0].settings.noisy
     assert run("show", "files", "--help") == 0 and "--no-strict" not in capsys.readouterr().out
+
+
+def test_a_package_of_an_extra_is_named_where_it_is_missing(capsys, monkeypatch, tmp_path):
+    def run():
+        raise ModuleNotFoundError("No module named 'jax.numpy'", name="jax.numpy")
+
+    assert cli.guarded(run) == 2
+    assert "got no jax.numpy, expected pip install -e '.[train]' in the checkout" in capsys.readouterr().err
+    monkeypatch.setattr(errors, "__file__", str(tmp_path / "mjx_softarm/_support/errors.py"))
+    assert cli.guarded(run) == 2
+    assert "expected pip install 'mjx-softarm[train]'" in capsys.readouterr().err
+    with pytest.raises(ModuleNotFoundError):  # a bug of ours, or a user's
+        cli.guarded(lambda: __import__("no_such_module"))
