@@ -19,8 +19,14 @@ PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "o
 
 
 def provenance(program: str) -> dict[str, Any]:
-    """Return versions, machine and commit; changed files in docs/results do not count as uncommitted."""
-    versions, status = {}, _git("status", "--porcelain", "--", ":/", ":(top,exclude)docs/results")
+    """Return versions, machine and commit; changed files in docs/results do not count as uncommitted.
+
+    An installed package has no commit, not even where its environment lies within somebody's repository.
+    """
+    versions, commit, status = {}, None, None
+    if _git("ls-files", "--error-unmatch", Path(__file__).name) is not None:
+        commit = _git("rev-parse", "HEAD")
+        status = _git("status", "--porcelain", "--", ":/", ":(top,exclude)docs/results")
     for name in PACKAGES:
         try:
             versions[name] = metadata.version(name)
@@ -31,7 +37,7 @@ def provenance(program: str) -> dict[str, Any]:
         "packages": versions,
         "machine": {"platform": platform.platform(), "cpus": os.cpu_count(), "device": str(jax.devices()[0])},
         "command": " ".join(["python", "-m", program, *sys.argv[1:]]),
-        "commit": _git("rev-parse", "HEAD"),
+        "commit": commit,
         "uncommitted_changes": None if status is None else bool(status),
     }
 

@@ -30,6 +30,12 @@ def test_code_that_is_not_committed_is_told_and_other_results_are_not(checkout):
     assert provenance("a")["uncommitted_changes"] is True
 
 
+def test_another_repository_around_an_installed_package_is_not_told(checkout, monkeypatch):
+    (checkout / "installed.py").write_text("1")
+    monkeypatch.setattr(module, "__file__", str(checkout / "installed.py"))
+    assert provenance("a")["commit"] is None and provenance("a")["uncommitted_changes"] is None
+
+
 def test_without_a_repository_there_is_no_commit(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "__file__", str(tmp_path / "code.py"))
     monkeypatch.setenv("GIT_CEILING_DIRECTORIES", str(tmp_path.parent))
