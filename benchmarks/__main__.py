@@ -21,6 +21,8 @@ BENCHMARKS = {
     "settle": "benchmarks.speed.settle:measure",
     "guard": "benchmarks.speed.guard:main",
     "calibration": "benchmarks.accuracy.calibration:measure",
+    "changes": "benchmarks.accuracy.changes:measure",
+    "correction": "benchmarks.accuracy.correction:measure",
     "planning": "benchmarks.accuracy.planning:measure",
     "arms": "benchmarks.accuracy.arms:measure",
     "logs": "benchmarks.accuracy.logs:measure",

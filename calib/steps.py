@@ -13,9 +13,9 @@ from typing import Any, NamedTuple, TypedDict
 
 import numpy as np
 
+from calib.changes import MIN_POSES as MIN_LATER
+from calib.changes import fit_changes
 from calib.fit.chambers import MIN_POSES, fit_chambers
-from calib.fit.changes import MIN_POSES as MIN_LATER
-from calib.fit.changes import fit_changes
 from calib.fit.held_pressures import fit_held_pressures
 from calib.fit.markers import MIN_MARKERS, marker_limits
 from calib.fit.motion.actuators import fit_actuators

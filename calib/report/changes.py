@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.fit.changes import Changes
+from calib.changes import Changes
 from calib.report.page import ReportTable, Section
 
 CHANGES = "Changes"

@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from calib.fit.changes import fit_changes
+from calib.changes import fit_changes
 from calib.read.measurements import Measurements
 from calib.read.static_poses import StaticPoses
 from calib.report.changes import CHANGES, changes_section
