@@ -158,8 +158,8 @@ def accuracy_of(policy: Path, arm: str, out: Path, *options: Any) -> dict[str, A
     return json.loads(file.read_text("utf-8"))
 
 
-def run_command(*words: Any, makes: Path) -> None:
-    """Run a command of this project, its output shown.
+def run_command(*words: Any, makes: Path) -> int:
+    """Run a command of this project, its output shown; return its exit status, one of `DONE`.
 
     Args:
         words: of the command line, after `python -m`.
@@ -175,3 +175,4 @@ def run_command(*words: Any, makes: Path) -> None:
         raise InputError(f"{asked}: got exit status {status}, expected {' or '.join(map(str, DONE))}")
     if not makes.exists():
         raise InputError(f"{asked}: got no file {makes}, expected its results")
+    return status

@@ -43,8 +43,10 @@ def _measure(folder: Path, text: str, points: int) -> dict[str, Any]:
     circle = "--points", points
     first = accuracy_of(policy, arm, folder / "first", *circle)
     aged = accuracy_of(policy, f"{arm}:aged", folder / "aged", *circle)
-    run_command("calib", "run", folder / "aged/log.npz", "--since", calibration, "--out", later)
-    enough = run_command("train", "export", run, "--calibration", later, "--out", renewed) == 0
+    go_on = "calib", "run", folder / "aged/log.npz", "--since", calibration, "--out", later
+    run_command(*go_on, makes=later)
+    export = "train", "export", run, "--calibration", later, "--out", renewed
+    enough = run_command(*export, makes=renewed) == 0
     back = accuracy_of(renewed, f"{arm}:aged", folder / "back", *circle)
     changes = json.loads((later / "report.json").read_text("utf-8"))["parts"]["Changes"]["figures"]
     return {
