@@ -7,10 +7,10 @@ from typing import Any
 
 from benchmarks.accuracy.path import means_over
 from mjx_softarm._support.errors import InputError
+from mjx_softarm.deploy.accuracy.measure import figures, read_goals
+from mjx_softarm.deploy.accuracy.measure import measure as accuracy
 from mjx_softarm.deploy.controller import LOOP, Controller
 from mjx_softarm.deploy.drivers.names import open_arm
-from mjx_softarm.deploy.measure import figures, read_goals
-from mjx_softarm.deploy.measure import measure as accuracy
 from mjx_softarm.deploy.session import follow
 from mjx_softarm.policy.file import load_policy
 

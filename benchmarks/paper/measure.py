@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjx_softarm._support.errors import InputError
-from mjx_softarm.deploy import measure as accuracy
+from mjx_softarm.deploy.accuracy import measure as accuracy
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.ending import LoopRun
 from mjx_softarm.deploy.safety import Fault

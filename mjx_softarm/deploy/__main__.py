@@ -10,18 +10,15 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import tyro
 
 from mjx_softarm._support import cli
 from mjx_softarm._support.errors import InputError, needing
-from mjx_softarm.deploy.budget import budget, draw
-from mjx_softarm.deploy.controller import Controller
-from mjx_softarm.deploy.drivers.driven import Arms, finish
-from mjx_softarm.deploy.ending import MISSED, LoopRun, save_log
-from mjx_softarm.deploy.measure import (
+from mjx_softarm.deploy.accuracy.budget import budget, draw
+from mjx_softarm.deploy.accuracy.measure import (
     along,
     figures,
     measure,
@@ -30,13 +27,17 @@ from mjx_softarm.deploy.measure import (
     whole_goal,
     write_accuracy,
 )
+from mjx_softarm.deploy.accuracy.told import tell_accuracy, tell_run
+from mjx_softarm.deploy.controller import Controller
+from mjx_softarm.deploy.drivers.driven import Arms, finish
+from mjx_softarm.deploy.ending import MISSED, save_log
 from mjx_softarm.deploy.record import record
 from mjx_softarm.deploy.session import check_arm, check_number, follow, trace
 from mjx_softarm.logs import mcap_file
 from mjx_softarm.logs.pressure_plan import read_plan
 from mjx_softarm.logs.schema import ENDINGS, Log
 from mjx_softarm.mechanics.excitation import growing, random_pressures
-from mjx_softarm.policy.file import SHIPPED, Policy, load_policy
+from mjx_softarm.policy.file import SHIPPED, load_policy
 from mjx_softarm.spec import ArmSpec
 
 _STATUS = """Exit status: 0 done; 1 done, but a goal was not reached, or was refused, or no pose was logged;
@@ -105,7 +106,7 @@ def _run(
     if log and run.ending.status != cli.ERROR:
         print(f"log: {log}, {len(run.log)} rows")
     finish(driver, tell)
-    _summary(run, controller.policy)
+    tell_run(run, controller.policy)
     return run.status
 
 
@@ -113,34 +114,6 @@ def _controller(policy: Path) -> Controller:
     if policy == SHIPPED:
         tell("policy: the package's own, for the paper's arm as specified; for an arm of yours train one")
     return Controller.of(load_policy(policy))
-
-
-def _summary(run: LoopRun, policy: Policy) -> None:
-    for fault, count in run.counts().items():
-        print(f"fault: {fault.value}: {count} times, {fault.response.value}")
-    if len(run.latency_s):
-        median, high = 1e3 * np.quantile(run.latency_s, (0.5, 0.999))
-        n = len(run.latency_s)
-        print(f"from readings to pressures: median {median:.2f} ms, 99.9 % {high:.2f} ms of {n} ticks")
-    reached = f"{sum(arrival.reached for arrival in run.arrivals)} of {run.n_goals} goals reached"
-    print(f"{reached}; the arm is {'' if run.ending.vented else 'NOT '}vented")
-
-    # The error that a goal allows, and a reason for more
-    if all(arrival.reached for arrival in run.arrivals):
-        return
-    reward = policy.reward
-    for largest, unit, other in (
-        (max(reward.weights[:3]), "mm", "rotation"),
-        (max(reward.weights[3:]), "deg", "position"),
-    ):
-        if largest:
-            within = f"{reward.threshold / largest:.2g} {unit}"
-            print(f"a goal counts as reached within {within} if the {other} is exact")
-    if not policy.calibrated:
-        print(
-            "the policy is not calibrated: it is expected to miss on an arm that differs from its "
-            "specification; record a log, run `python -m calib run`, train and export (docs/your-arm.md)"
-        )
 
 
 def _measure(
@@ -190,7 +163,7 @@ def _measure(
         run = trace(driver, controller, poses, pace_s, tell=tell, save=save)
     finish(driver, tell)
     if not run.arrivals:
-        _summary(run, controller.policy)
+        tell_run(run, controller.policy)
         return run.status
 
     # Figures, written and printed
@@ -207,28 +180,12 @@ def _measure(
         print(missing)
     elif split is not None:
         draw(split, out / "budget.png")
-    _print_accuracy(found)
+    tell_accuracy(found)
     if split is not None:
         print("\n".join(split.lines()))
     print(f"figures: {out / 'accuracy.json'}")
-    _summary(run, controller.policy)
+    tell_run(run, controller.policy)
     return run.status
-
-
-def _print_accuracy(found: dict[str, Any]) -> None:
-    for name, unit, most in (("translation", "mm", "max_mm"), ("rotation", "deg", "rotation_max_deg")):
-        mean, high, most = found[f"{name}_{unit}"], found[f"{name}_95_{unit}"], found[most]
-        if np.isnan(mean):  # goals do not ask for it
-            continue
-        print(f"{name} [{unit}]: mean {mean:.2f}, 95 % below {high:.2f}, at most {most:.2f}")
-    if "way_s" in found:
-        print(
-            f"on the way, {found['way_s']:.0f} s [mm]: mean {found['way_mm']:.2f}, 95 % below "
-            f"{found['way_95_mm']:.2f}, at most {found['way_max_mm']:.2f}; {found['lag_s']:.2f} s behind, "
-            f"without that {found['way_without_lag_mm']:.2f}"
-        )
-    n_saturated = found["saturated_points"]
-    print(f"{found['measured']} of {found['points']} goals measured, {n_saturated} with a saturated chamber")
 
 
 def _record(

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from mjx_softarm.deploy.__main__ import main
+from mjx_softarm.deploy.accuracy.budget import budget
+from mjx_softarm.deploy.accuracy.measure import figures, measure
 from mjx_softarm.deploy.arm_io import Capture
-from mjx_softarm.deploy.budget import budget
 from mjx_softarm.deploy.controller import Controller
-from mjx_softarm.deploy.measure import figures, measure
 from mjx_softarm.logs.files import read_matrix
 from mjx_softarm.policy.file import save_policy
 from mjx_softarm.policy.runtime import tip_pose

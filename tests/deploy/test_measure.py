@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 
 from mjx_softarm._support.errors import InputError
-from mjx_softarm.deploy.arm_io import Capture
-from mjx_softarm.deploy.ending import DONE, MISSED
-from mjx_softarm.deploy.measure import (
+from mjx_softarm.deploy.accuracy.measure import (
     along,
     figures,
     grid_poses,
@@ -19,6 +17,8 @@ from mjx_softarm.deploy.measure import (
     require_motion_capture,
     write_accuracy,
 )
+from mjx_softarm.deploy.arm_io import Capture
+from mjx_softarm.deploy.ending import DONE, MISSED
 from mjx_softarm.deploy.safety import Fault
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.mechanics.excitation import circle_poses
@@ -84,7 +84,7 @@ class Dark(Seen):
 
 
 def test_motion_capture_is_looked_at_before_the_arm_moves(monkeypatch):
-    monkeypatch.setattr("mjx_softarm.deploy.measure.LOOK_S", 0.0)
+    monkeypatch.setattr("mjx_softarm.deploy.accuracy.measure.LOOK_S", 0.0)
     require_motion_capture(Dark(3), "--arm")
     unseen = Dark(0)
     unseen.off_mm = np.nan * OFF_MM

@@ -25,12 +25,12 @@ from typing import Any
 import numpy as np
 
 from mjx_softarm._support.errors import InputError
+from mjx_softarm.deploy.accuracy.measure import LOOK_S, LOOKS
 from mjx_softarm.deploy.arm_io import Capture
 from mjx_softarm.deploy.capture.natnet import NatNet
 from mjx_softarm.deploy.capture.qualisys import Qualisys
 from mjx_softarm.deploy.capture.system import UP, CaptureName, Source
 from mjx_softarm.deploy.link import describe
-from mjx_softarm.deploy.measure import LOOK_S, LOOKS
 from mjx_softarm.posture import straight_pose
 from mjx_softarm.sensing.pose import (
     frame_from_pose,

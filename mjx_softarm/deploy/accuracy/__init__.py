@@ -1,0 +1,1 @@
+"""Accuracy of a policy on an arm, what makes its error, and lines that tell both. NumPy only."""
