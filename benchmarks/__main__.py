@@ -33,6 +33,7 @@ BENCHMARKS = {
     "race": "benchmarks.race.race:race",
     "path": "benchmarks.accuracy.path:measure",
     "paper": "benchmarks.paper.experiments:Paper",
+    "traces": "benchmarks.paper.traces:measure",
 }
 
 
