@@ -21,7 +21,7 @@ from mjx_softarm.control import at_chambers
 from mjx_softarm.deploy.belief import Belief, pose_of
 from mjx_softarm.deploy.safety import Event, Fault, names
 from mjx_softarm.mdp.observation import rate_ticks
-from mjx_softarm.mdp.rewards import RewardConfig, asked_error, scaled_error
+from mjx_softarm.mdp.rewards import asked_error, scaled_error
 from mjx_softarm.policy.file import Policy
 from mjx_softarm.policy.lag import ShapeLag, WayError, spring_lag_s
 from mjx_softarm.policy.reach import followed
@@ -155,33 +155,26 @@ class Predicting(NamedTuple):
 
 
 class Chasing(NamedTuple):
-    """Actions of a policy of motion towards a moving goal, each some time after the last.
-
-    The arm seldom settles between them, so each action shifts the goal by a small share of the tip's distance
-    from the goal's way.
-    """
+    """Actions of a policy of motion towards a moving goal, each some time after the last."""
 
     shift: np.ndarray  # (6,) [mm, deg]
     n_actions: int = 0
-    due: tuple[np.ndarray, ...] = ()  # (6,) [mm, deg] each: the goal at the last actions, oldest first
     shape: ShapeLag = ShapeLag()
+    way: WayError = WayError()
 
     def references(self, belief: Belief, goal: np.ndarray) -> Choice:
         """Act or wait."""
-        config, policy, dt_s = belief.controller.config, belief.controller.policy, belief.controller.dt_s
-        shape = self.shape.after(policy, belief.spring_m, belief.pose, dt_s)
-        waited_s = belief.command.n_ticks * dt_s
-        if belief.command.reference_m is not None and waited_s < policy.action_s:
-            return Choice(self._replace(shape=shape))
-        # Act from the pose in motion
+        # The pose in motion, and its error on the way
+        controller, policy = belief.controller, belief.controller.policy
+        shape = self.shape.after(policy, belief.spring_m, belief.pose, controller.dt_s)
         pose = belief.pose - shape.behind(policy, belief.spring_m, belief.pose)
-        shift = self.shift
-        if len(self.due) == config.lead_actions:
-            beside = _beside(pose, self.due[0], self.due[-1], policy.reward)
-            shift = _clipped(shift - config.moving_share * beside, config.shift_limit)
-        reference_m = _planned(belief, pose, goal + shift)
-        due = (*self.due, goal)[-config.lead_actions :]
-        return Choice(Chasing(shift, self.n_actions + 1, due, shape), reference_m)
+        after = self._replace(shape=shape, way=self.way.after(goal, pose, controller))
+        # The action that is due
+        waited_s = belief.command.n_ticks * controller.dt_s
+        if belief.command.reference_m is not None and waited_s < policy.action_s:
+            return Choice(after)
+        reference_m = _planned(belief, pose, goal + self.shift + after.way.correction)
+        return Choice(after._replace(n_actions=self.n_actions + 1), reference_m)
 
 
 Strategy = AtRest | Timed | Predicting | Chasing
@@ -243,16 +236,6 @@ def _made(belief: Belief, reference_m: np.ndarray, load: Load) -> np.ndarray:
 def _error(belief: Belief, pose: np.ndarray, goal: np.ndarray) -> float:
     """Return the weighted error of a pose (6,) at a goal (6,)."""
     return float(np.linalg.norm(scaled_error(pose, goal, belief.controller.policy.reward)))
-
-
-def _beside(pose: np.ndarray, was: np.ndarray, is_now: np.ndarray, reward: RewardConfig) -> np.ndarray:
-    """Return the error (6,) of a pose (6,) at a goal, without the part along the goal's way since then.
-
-    Along the way the tip may lag or lead, which is no offset.
-    """
-    left, along = asked_error(pose, was, reward), asked_error(is_now, was, reward)[:3]
-    left[:3] -= along * (left[:3] @ along) / max(along @ along, 1e-12)
-    return left
 
 
 def _clipped(shift: np.ndarray, limit: np.ndarray) -> np.ndarray:

@@ -143,7 +143,9 @@ def test_a_slow_or_narrow_arm_is_watched_for_longer_and_more_closely():
 
 
 def test_a_policy_of_motion_is_given_a_goal_two_actions_ahead():
-    config = dataclasses.replace(LOOP, moving_share=0.0)  # this arm's poses are not those of its references
+    config = dataclasses.replace(
+        LOOP, way_share_per_s=0.0
+    )  # this arm's poses are not those of its references
     arm, goals = LinearArm(), np.array([GOALS[0], GOALS[1]])
     plan, asked = asking(between, arm)
     run = trace(arm, Controller.of(OF_MOTION, plan, config), goals, pace_s=10.0)

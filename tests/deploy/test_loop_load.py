@@ -147,7 +147,7 @@ def test_shift_ends_somewhere_and_the_next_goal_of_a_policy_of_motion_has_a_part
     assert np.abs(asked_mm[:4] - far[2]).max() == 25.0
 
 
-def test_a_policy_of_motion_makes_up_for_an_offset_beside_the_way_but_not_for_its_lag():
+def test_a_policy_of_motion_makes_up_for_an_offset_beside_the_way_and_for_its_lag():
     def plan(pose, goal, spring_m, sensed):
         off_mm = 8.0 if goal[0] > 1.0 else 0.0  # from the first stop on
         return plan_unloaded(pose, goal + [0.0, 0.0, off_mm, 0.0, 0.0, 0.0], spring_m, sensed)
@@ -156,14 +156,13 @@ def test_a_policy_of_motion_makes_up_for_an_offset_beside_the_way_but_not_for_it
     aside = np.array([GOAL, GOAL + [20.0, 0.0, 0.0, 0.0, 0.0, 0.0]])
     run = trace(LinearArm(), Controller.of(of_motion, plan), aside, pace_s=20.0)
     off_mm = (run.log.estimate - run.log.goal)[run.ways[0]]
-    assert abs(off_mm[150:250, 2]).max() > 4.0 and abs(off_mm[-300:, 2]).max() < 1.0
-    assert abs(off_mm[:, 0]).max() > 19.0  # this arm moves up and down alone, which is no offset either
+    assert abs(off_mm[100:250, 2]).max() > 4.0 and abs(off_mm[-300:, 2]).max() < 1.0
+    assert abs(off_mm[:, 0]).max() > 19.0  # this arm moves up and down alone
 
-    plan, asked = asking(plan_unloaded)
-    up = np.array([GOAL, GOAL + [0.0, 0.0, 30.0, 0.0, 0.0, 0.0]])
-    run = trace(LinearArm(), Controller.of(of_motion, plan), up, pace_s=3.0)
-    assert abs((run.log.estimate - run.log.goal)[run.ways[0], 2]).max() > 1.0
-    assert max(goal[2] for _, goal, *_ in asked) < up[1, 2] + 1.0  # it lags by other than the two actions
+    up = np.array([GOAL, GOAL + [0.0, 0.0, 60.0, 0.0, 0.0, 0.0]])
+    run = trace(LinearArm(), Controller.of(of_motion, plan_unloaded), up, pace_s=10.0)
+    off_mm = abs((run.log.estimate - run.log.goal)[run.ways[0], 2])
+    assert off_mm.max() > 1.0 and off_mm[300:450].mean() < 0.3  # it lags by other than the two actions
 
 
 def test_saturated_chambers_shift_by_where_their_springs_are():
