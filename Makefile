@@ -14,8 +14,12 @@ INSTALLED := .venv/.installed-$(EXTRAS)
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z.-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
-demo: $(INSTALLED)  ## train a small policy, show its figures, draw its pictures
+demo: $(INSTALLED)  ## train a small policy, show its figures, draw its pictures, play it on a simulated arm
 	$(BIN)/python -m train reach --preset quick
+	@run=$$(ls -dt runs/reach-quick-seed0* | head -1); $(BIN)/python -m train export "$$run" && \
+	{ $(BIN)/python -m mjx_softarm.deploy measure "$$run/policy.npz" --arm twin:0 --points 40 --seconds 20 \
+	  --out "$$run/twin" || [ $$? -eq 1 ]; } && \
+	$(BIN)/python -m mjx_softarm.view "$$run/twin/log.npz" --html "$$run/twin.html"
 
 # A file's tests share compiled functions, so they stay in one process.
 test: $(INSTALLED)  ## the tests, on up to four cores
