@@ -22,7 +22,7 @@ def log():
         "reference_m": reference_m,
     }
     return Log(
-        "made up", np.arange(4), np.arange(4) / 50.0, reference_m, pressure_kpa=pressure_kpa, **lengths
+        "made up", np.arange(4), np.arange(4) / 50.0, pressure_kpa=pressure_kpa, **lengths
     )
 
 
