@@ -21,9 +21,7 @@ def log():
         "spring_m": reference_m + 2e-3,
         "reference_m": reference_m,
     }
-    return Log(
-        "made up", np.arange(4), np.arange(4) / 50.0, pressure_kpa=pressure_kpa, **lengths
-    )
+    return Log("made up", np.arange(4), np.arange(4) / 50.0, pressure_kpa=pressure_kpa, **lengths)
 
 
 def test_a_lap_tells_its_chambers_at_limits_and_how_far_springs_are_off(log):
