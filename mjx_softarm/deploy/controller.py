@@ -25,9 +25,9 @@ class LoopConfig:
 
     # Rest. A twin is within 2 mm of its rest 4 s after an action, and creeps for some seconds more.
     window_s: float = 0.5  # least time over which springs are watched; by hand
-    # Window of an arm with a slow law, in the largest lag of its springs. With half a second, an arm of
-    # 250 mm whose springs lag by 1.6 s was taken for at rest 1.7 mm off its goals.
-    window_share: float = 0.9
+    # Window of an arm with a slow law, in the largest lag of its springs. With 0.9, `sopra` takes 16 s for a
+    # goal instead of 4 without both this and `still_m` in proportion, and believes its errors 1.7 mm smaller.
+    window_share: float = 0.5
     # Largest difference of the two half windows' means, of springs 67 mm from the axis; in proportion for
     # others, whose change bends a section more. 10 times such a mean's noise.
     still_m: float = 2e-4
