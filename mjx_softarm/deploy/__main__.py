@@ -30,9 +30,10 @@ from mjx_softarm.deploy.accuracy.measure import (
 from mjx_softarm.deploy.accuracy.told import tell_accuracy, tell_run
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.drivers.driven import Arms, finish
+from mjx_softarm.deploy.drivers.same_arm import check_arm, check_number
 from mjx_softarm.deploy.ending import MISSED, save_log
 from mjx_softarm.deploy.record import record
-from mjx_softarm.deploy.session import check_arm, check_number, follow, trace
+from mjx_softarm.deploy.session import follow, trace
 from mjx_softarm.logs import mcap_file
 from mjx_softarm.logs.pressure_plan import read_plan
 from mjx_softarm.logs.schema import ENDINGS, Log
@@ -63,6 +64,12 @@ PolicyFile = Annotated[
         help_behavior_hint="(default: the package's own, for the paper's arm)",
     ),
 ]
+GoOn = Annotated[
+    bool,
+    tyro.conf.arg(
+        help="go on without the first chamber that loses its pressure, with the others, instead of venting"
+    ),
+]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -78,6 +85,7 @@ def _run(
     log: cli.MaybePath = None,
     duration: float = np.inf,
     stay: bool = False,
+    go_on: GoOn = False,
 ) -> int:
     """Bring the tip to goals; errors are by motion capture if the arm has it.
 
@@ -102,7 +110,7 @@ def _run(
     # The run, its log and its faults
     limit_s = None if np.isinf(duration) else duration
     save = partial(save_log, log) if log else lambda log: None
-    run = follow(driver, controller, goals, limit_s, tell, save=save, stay=stay)
+    run = follow(driver, controller, goals, limit_s, tell, save=save, stay=stay, go_on=go_on)
     if log and run.ending.status != cli.ERROR:
         print(f"log: {log}, {len(run.log)} rows")
     finish(driver, tell)
@@ -124,6 +132,7 @@ def _measure(
     points: int = 16,
     seconds: float | None = None,
     payload: float = 0.0,
+    go_on: GoOn = False,
 ) -> int:
     """Measure a policy's accuracy on an arm with motion capture, and say what makes the error.
 
@@ -157,7 +166,7 @@ def _measure(
         save_log(out / "log.npz", replace(log, payload_kg=np.full(len(log), payload_kg)))
 
     if seconds is None:
-        run = follow(driver, controller, poses, tell=tell, save=save)
+        run = follow(driver, controller, poses, tell=tell, save=save, go_on=go_on)
     else:
         pace_s = seconds / max(len(poses) - 1, 1)
         run = trace(driver, controller, poses, pace_s, tell=tell, save=save)

@@ -24,6 +24,8 @@ from mjx_softarm.sensing.estimator import SpringModel, expected_springs
 from mjx_softarm.sensing.load import HIGHEST, LOWEST, Load, averaged, estimate_load
 from mjx_softarm.sensing.sensors import Sensor, SensorFault
 
+_NO_EFFECT_M2 = 1e-18
+
 
 class Window(NamedTuple):
     """Last ticks of an arm, the newest last."""
@@ -120,7 +122,9 @@ def believe(
     if asked_m is not None and belief.known:
         on = belief.at_rest and bool(on_reference(springs_m, asked_m, in_force_kpa, gains, tolerance_m))
         mask = saturated(in_force_kpa, asked_m, mean_m, gains, tolerance_m)
-        suspect = saturated(in_force_kpa, asked_m, spring_m, gains, tolerance_m)
+        # A chamber that is known to be lost has one pressure left
+        held = np.less(gains.pressure_min_kpa, gains.pressure_max_kpa)
+        suspect = held & saturated(in_force_kpa, asked_m, spring_m, gains, tolerance_m)
         if suspect.any():
             suspect &= as_without(policy.spring_model, in_force_kpa, spring_m, config, gains.allocation)
         belief = replace(belief, settled=on, saturated=mask, suspect=suspect)
@@ -251,7 +255,8 @@ def as_without(
     springs_m = expected_springs(model, pressures_kpa)
     effect_m = springs_m[1:] - springs_m[0]  # (n_chambers, n_springs)
     deviation_m = spring_m - springs_m[0]  # (n_springs,)
-    share = effect_m @ deviation_m / xp.sum(effect_m**2, axis=1)  # (n_chambers,)
+    size = xp.maximum(xp.sum(effect_m**2, axis=1), _NO_EFFECT_M2)  # zero where there is no pressure
+    share = effect_m @ deviation_m / size  # (n_chambers,)
     left_m = deviation_m - share[:, None] * effect_m
     explained = 1.0 - xp.sum(left_m**2, axis=1) / xp.sum(deviation_m**2)
     own_m = xp.abs(share * xp.sum(xp.where(own, at_chambers(effect_m, allocation), 0.0), axis=1))

@@ -46,6 +46,11 @@ class ListedGoals:
         over = self._duration_s is not None and now_s - self._began_s >= self._duration_s
         return None if over or (state.goal is None and not (self._stays and self._accepted)) else state
 
+    def go_on(self, controller: Controller, refused: Mapping[int, Event]) -> Event | None:
+        """Take another controller and its refusals; return the refusal of the goal that is being pursued."""
+        self._controller, self._refused = controller, refused
+        return refused.get(self.n_taken - 1)
+
     def taken(self, state: LoopState, note: Note) -> LoopState:
         """Return the state with the next accepted goal, if it has none."""
         while state.goal is None and self.n_taken < len(self._goals):

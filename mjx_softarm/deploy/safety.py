@@ -7,7 +7,8 @@
                        chamber is driven or a spring of its section moves
     CHAMBER_LOST       a chamber at its limit, its spring off the reference, and the    vent
                        arm in the shape of one without that pressure: for a second, or
-                       for three while it moves
+                       for three while it moves; a run that may go on without one
+                       chamber keeps it without pressure (`mjx_softarm.deploy.lost`)
     GOAL_OUTSIDE       a goal that no pressures bring the tip to, by the policy's       skip the goal
                        models and its threshold of a goal; a pilot's goal further
                        from all reachable poses than they are from each other
@@ -145,10 +146,15 @@ def _of_sensors(controller: Controller, watch: Watch, belief: Belief) -> Iterato
         yield Event(Fault.SENSOR_STUCK, f"{text}the section moved")
 
 
-def _of_chambers(controller: Controller, watch: Watch, belief: Belief) -> Iterator[Event]:
+def lost_chambers(controller: Controller, watch: Watch, belief: Belief) -> np.ndarray:
+    """Return which chambers (n_chambers,) have been suspected for so long that they count as lost."""
     config = controller.config
     n_windows = config.rest_windows if belief.at_rest else config.moving_windows
-    lost = watch.n_suspect >= n_windows * controller.window
+    return watch.n_suspect >= n_windows * controller.window
+
+
+def _of_chambers(controller: Controller, watch: Watch, belief: Belief) -> Iterator[Event]:
+    lost = lost_chambers(controller, watch, belief)
     if lost.any():
         kpa = ", ".join(f"{value:.1f}" for value in belief.command.pressure_kpa[lost])
         text = f"{names('chamber', lost)}: at {kpa} kPa, but the springs lie as they would without that"

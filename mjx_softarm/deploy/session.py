@@ -13,24 +13,19 @@ from typing import Any
 
 import numpy as np
 
-from mjx_softarm._support.errors import InputError
 from mjx_softarm.deploy.arm_io import ArmIO
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.ending import Arrival, LoopRun, vent_at_end
 from mjx_softarm.deploy.goals import Goals, ListedGoals, OrderedGoals, Pilot, Way
 from mjx_softarm.deploy.link import ArmFault, Link, Recorder
 from mjx_softarm.deploy.loop import LoopState, Tick, in_force, refusals, start, step
-from mjx_softarm.deploy.safety import PAYLOAD_FAULTS, Event, Fault, Response
+from mjx_softarm.deploy.lost import begun_again, without
+from mjx_softarm.deploy.safety import PAYLOAD_FAULTS, Event, Fault, Response, lost_chambers, names
 from mjx_softarm.logs.schema import Log
 from mjx_softarm.mdp.rewards import scaled_error
-from mjx_softarm.sensing.estimator import expected_springs
 from mjx_softarm.sensing.pose import pose_error, seen_error
-from mjx_softarm.spec import ArmSpec
 
 _ROUNDING_S = 1e-6  # rounding error of a simulated tick's duration
-# Deviation of another arm's mean spring length, in mean section lengths; by hand. A payload of 1 kg: 0.05.
-_OTHER_LENGTH = 0.25
-_ANOTHER = "is it another arm, or not yet switched on"
 _KEPT = 1000  # number of rows, arrivals and faults that a run without a log keeps
 
 
@@ -43,6 +38,7 @@ def follow(
     arrived: Callable[[int], None] = lambda goal: None,
     save: Callable[[Log], None] = lambda log: None,
     stay: bool = False,
+    go_on: bool = False,
 ) -> LoopRun:
     """Bring the tip to goals, one after the other, then vent; `vent_at_end` says what else ends a run.
 
@@ -55,11 +51,13 @@ def follow(
         arrived: takes the index of each goal arrived at, as the arm rests there; a gripper may act.
         save: writes the log, once the arm is vented.
         stay: hold the last goal until `duration_s` or something else ends the run.
+        go_on: go on without the first chamber that loses its pressure, by `mjx_softarm.deploy.lost`.
     """
     goals = list(goals)
     refused = refusals(controller.policy, goals)  # before the arm moves: it takes longer than a tick
     source = ListedGoals(controller, goals, refused, duration_s, stay)
-    return _Session(arm, controller, source, tell, arrived).to_end(save)
+    again = (lambda other: source.go_on(other, refusals(other.policy, goals))) if go_on else None
+    return _Session(arm, controller, source, tell, arrived, again=again).to_end(save)
 
 
 def trace(
@@ -103,63 +101,6 @@ def steer(
     return session.to_end(save or (lambda log: None))
 
 
-def check_number(arm: ArmIO, spec: ArmSpec, name: str) -> np.ndarray | None:
-    """Refuse an arm whose number of springs is not the specification's, before any pressure.
-
-    Returns:
-        Its readings (n_springs,). None where it could not be read: the run then says why.
-
-    Raises:
-        InputError: the number is another; the message begins with `name`.
-    """
-    try:
-        readings = np.array(arm.read_sensors(), float)
-    except Exception:  # a driver may raise anything
-        return None
-    if readings.shape != (spec.n_springs,):
-        raise InputError(
-            f"{name}: got {' x '.join(map(str, readings.shape))} readings, expected {spec.n_springs}, of "
-            f"the {spec.structure.n_sections} sections of {spec.name!r}; {_ANOTHER}?"
-        )
-    return readings
-
-
-def check_arm(arm: ArmIO, controller: Controller, name: str) -> None:
-    """Refuse an arm that is not the policy's, before any pressure: by number, range and lengths of springs.
-
-    Raises:
-        InputError: it is another; the message begins with `name`.
-    """
-    # Readings, given as many ticks as a run gives lost ones
-    policy, spec = controller.policy, controller.policy.spec
-    length_m = np.full(spec.n_springs, np.nan)
-    for _ in range(controller.config.lost_ticks):
-        readings = check_number(arm, spec, name)
-        if readings is None:
-            return
-        length_m = policy.sensor.lengths(readings, np.nan).length_m
-        if np.isfinite(length_m).any() or not np.isfinite(readings).all():
-            break
-        time.sleep(0.0 if hasattr(arm, "time_s") else controller.dt_s)
-    else:
-        (low, high), unit = policy.sensor.range, policy.sensor.unit
-        raise InputError(
-            f"{name}: got readings of {readings.min():.4g} to {readings.max():.4g} {unit}, expected "
-            f"{low:.4g} to {high:.4g} {unit} as of the policy's arm {spec.name!r}; {_ANOTHER}?"
-        )
-
-    # Mean length without pressure
-    if np.isfinite(length_m).any():
-        got_m = np.nanmean(length_m)
-        asked_m = np.mean(expected_springs(policy.spring_model, np.zeros(spec.n_chambers)))
-        if abs(got_m - asked_m) > _OTHER_LENGTH * spec.length_m / spec.structure.n_sections:
-            raise InputError(
-                f"{name}: got springs of {1e3 * got_m:.0f} mm in the mean without pressure, expected "
-                f"{1e3 * asked_m:.0f} mm as of the policy's arm {spec.name!r}; {_ANOTHER}, or still under "
-                "pressure?"
-            )
-
-
 class _Session:
     """A run: moves data between the arm, the loop, the goals and the log."""
 
@@ -172,9 +113,10 @@ class _Session:
         arrived: Callable[[int], None] = lambda goal: None,
         look: Callable[[LoopState, Tick, dict[str, Any]], None] = lambda state, tick, row: None,
         kept: int | None = None,
+        again: Callable[[Controller], Event | None] | None = None,
     ):
         self.controller, self.goals = controller, goals
-        self.tell, self.arrived, self.look = tell, arrived, look
+        self.tell, self.arrived, self.look, self.again = tell, arrived, look, again
         self.state = start(controller)
         self.nothing = np.full(controller.policy.spec.n_springs, np.nan)
         self.link, self.rows = Link(arm, controller.policy.spec, controller.dt_s), Recorder(kept)
@@ -248,9 +190,23 @@ class _Session:
             if tick.arrived:
                 self._arrive(row["goal"], row["estimate"])
             self.look(self.state, tick, row)
-        if tick.stop is not None:
+        if tick.stop is not None and not self._goes_on(tick.stop):
             raise _Stopped(self._at(f"{tick.stop.fault.value}: {tick.stop.message}"))
         return in_time
+
+    def _goes_on(self, stop: Event) -> bool:
+        """Go on without the chamber that was lost, if the run may and it is the first one."""
+        if self.again is None or stop.fault is not Fault.CHAMBER_LOST:
+            return False
+        lost = lost_chambers(self.controller, self.state.watch, self.state.belief)
+        self.tell(self._at(f"{stop.fault.value}: {stop.message} -> go on without {names('chamber', lost)}"))
+        self.controller = without(self.controller, lost)
+        refusal, self.again = self.again(self.controller), None
+        self.state = begun_again(self.controller, self.state)
+        if refusal:
+            self.state = self.state._replace(goal=None)
+            self._note((refusal,))
+        return True
 
     def _log(self, row: dict[str, Any]) -> None:
         belief, reference_m = self.state.belief, self.state.command.reference_m

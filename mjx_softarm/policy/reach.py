@@ -37,6 +37,17 @@ def nearest_poses(policy: Policy, goal: np.ndarray) -> tuple[np.ndarray, np.ndar
     return nearest_of(policy, goal, search)
 
 
+def nearest_springs(policy: Policy, goal: np.ndarray) -> np.ndarray:
+    """Return the spring lengths (n_springs,) [m] of the pose nearest to a goal (6,) [mm, deg]."""
+    goal = np.asarray(goal, float)[None]
+    search, n = begin(policy, 1), policy.spec.n_chambers
+    for _ in range(N_STEPS):
+        search = improve(policy, goal, search)
+    share = search[:, :n]
+    off = np.sum((_at(policy, share) - _target(policy, goal, len(share))) ** 2, axis=-1)
+    return np.asarray(_springs(policy, share[np.argmin(off)]), float)
+
+
 def begin(policy: Policy, k: int) -> np.ndarray:
     """Return the start of a search for k goals (k * N_STARTS, n + 1): shares of the pressures, damping."""
     start = np.random.default_rng(0).uniform(0.2, 0.8, (N_STARTS, policy.spec.n_chambers))
@@ -80,12 +91,17 @@ def nearest_of(policy: Policy, goal: Array, search: Array) -> tuple[Array, Array
 
 def _tip(policy: Policy, share: Array) -> tuple[Array, Array]:
     """Return the tip's position (..., 3) [m] and axes (..., 3, 3) at shares (..., n) of the pressures."""
-    low, high = policy.gains.pressure_min_kpa, policy.gains.pressure_max_kpa
-    spring_m = expected_springs(policy.spring_model, low + (high - low) * share)
+    spring_m = _springs(policy, share)
     frame = estimate_frame(policy.estimator, spring_m, policy.spec.mass.payload_kg)
     if policy.s2r is None:
         return frame
     return apply_correction(frame, correction(policy.s2r, inputs(frame, spring_m)))
+
+
+def _springs(policy: Policy, share: Array) -> Array:
+    """Return the spring lengths (..., n_springs) [m] at shares (..., n) of the pressures."""
+    low, high = policy.gains.pressure_min_kpa, policy.gains.pressure_max_kpa
+    return expected_springs(policy.spring_model, low + (high - low) * share)
 
 
 def _at(policy: Policy, share: Array) -> Array:

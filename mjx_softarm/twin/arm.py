@@ -129,7 +129,7 @@ class Twin(InstrumentedArm):
 
     def write_pressures(self, pressure_kpa: np.ndarray) -> None:
         """Command pressures (n,) [kPa], then let one control period pass; see `ArmIO`."""
-        self._air.command(checked_pressures(pressure_kpa, self._parts.spec))
+        self._air.command(self._taken(checked_pressures(pressure_kpa, self._parts.spec)))
         self._wall_force = WallForce(0.0, 0.0)
         for _ in range(self._steps):
             self._step()

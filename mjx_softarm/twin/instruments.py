@@ -38,6 +38,7 @@ class Build(NamedTuple):
     per_section: int | None = None  # links or elements per section; None: the twin's own number
     zero_m: float = 0.0  # size of the shift of each spring's zero; its sign is drawn from the seed
     softening: float = 0.0  # share of their stiffness that the chambers have lost
+    lost: int | None = None  # chamber that never has pressure, as if it had burst
 
 
 AS_BUILT = Build()
@@ -56,7 +57,7 @@ class InstrumentedArm(abc.ABC):
         sensor: the arm's own sensors.
         seed: chooses the twin.
         session: chooses the noise.
-        build: scales of the noise, and of the shift of the springs' zeros.
+        build: scale of the noise, shift of the springs' zeros, lost chamber.
     """
 
     def __init__(self, sensor: Sensor, seed: int, session: int, build: Build):
@@ -65,6 +66,7 @@ class InstrumentedArm(abc.ABC):
         )
         shift_m = build.zero_m * (2 * up - 1)
         self._sensor, self._scale = dataclasses.replace(sensor, delta_m=sensor.delta_m + shift_m), build.noise
+        self._lost = build.lost
         self._rng = np.random.default_rng([session, seed])
         self.time_s = 0.0
 
@@ -108,6 +110,10 @@ class InstrumentedArm(abc.ABC):
         length_m = self._lengths_m()
         spring_m = length_m + self._draw(SPRING_NOISE_M, len(length_m))
         return Capture(tip_m + noise_m[0], quaternion, marker_m + noise_m[1:], spring_m)
+
+    def _taken(self, pressure_kpa: np.ndarray) -> np.ndarray:
+        """Return the commands (n,) [kPa] that the regulators take; a lost chamber has none."""
+        return np.where(np.arange(len(pressure_kpa)) == self._lost, 0.0, pressure_kpa)
 
     def _draw(self, deviation: float, *shape: int) -> np.ndarray:
         return self._scale * deviation * self._rng.standard_normal(shape)

@@ -14,7 +14,7 @@ ROD, _AGED = "rod", ":aged"
 
 
 def twin_of(name: str) -> Twin | RodTwin:
-    """Make the twin of a name: `SEED` or `rod:SEED`, then `@ARM`, `:PIPE`, `:aged`, `:500g` where wanted.
+    """Make the twin of a name: `SEED` or `rod:SEED`, maybe with `@ARM`, `:PIPE`, `:aged`, `:lost4`, `:500g`.
 
     The arm is named as for `--spec`, by default the paper's. A payload is given in grams. Rods have no pipe.
 
@@ -22,7 +22,9 @@ def twin_of(name: str) -> Twin | RodTwin:
         ValueError: the name is malformed, the arm is unknown, or the arm does not fit into the pipe.
     """
     name, payload_kg = _without_payload(name)
-    build = AGED if name.endswith(_AGED) else AS_BUILT
+    rest, _, last = name.rpartition(":lost")
+    name, lost = (rest, int(last)) if rest and last.isdecimal() else (name, None)
+    build = (AGED if name.endswith(_AGED) else AS_BUILT)._replace(lost=lost)
     name = name.removesuffix(_AGED)
     if name.startswith(f"{ROD}:"):
         number, spec = _seed_and_arm(name.removeprefix(f"{ROD}:"), f"twin:{ROD}:SEED")

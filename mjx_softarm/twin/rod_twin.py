@@ -122,7 +122,7 @@ class RodTwin(InstrumentedArm):
 
     def write_pressures(self, pressure_kpa: np.ndarray) -> None:
         """Command pressures (n,) [kPa], then let one control period pass; see `ArmIO`."""
-        self._air.command(checked_pressures(pressure_kpa, self._spec))
+        self._air.command(self._taken(checked_pressures(pressure_kpa, self._spec)))
         length_m = self._rod.chamber_lengths()
         for _ in range(AIR_STEPS):
             self._air.step(length_m)
@@ -131,7 +131,7 @@ class RodTwin(InstrumentedArm):
 
     def settle(self, pressure_kpa: np.ndarray) -> None:
         """Move to rest at pressures (n,) [kPa] without time passing."""
-        pressure_kpa = checked_pressures(pressure_kpa, self._spec)
+        pressure_kpa = self._taken(checked_pressures(pressure_kpa, self._spec))
         self._rod.settle(pressure_kpa)
         self._air.hold(pressure_kpa, self._rod.chamber_lengths())
 

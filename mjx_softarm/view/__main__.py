@@ -19,8 +19,8 @@ from mjx_softarm._support.errors import InputError, needing
 from mjx_softarm.deploy.__main__ import PolicyFile, check_file, tell
 from mjx_softarm.deploy.controller import Controller
 from mjx_softarm.deploy.drivers.driven import Arms, Driven, finish
+from mjx_softarm.deploy.drivers.same_arm import check_arm
 from mjx_softarm.deploy.ending import save_log
-from mjx_softarm.deploy.session import check_arm
 from mjx_softarm.logs.schema import TABLES
 from mjx_softarm.policy.file import SHIPPED, load_policy
 from mjx_softarm.spec import ArmSpec

@@ -269,3 +269,14 @@ def test_an_aged_twin_is_the_same_arm_with_shifted_zeros_and_softer_chambers(kin
     assert 0.0 < longer_m.mean() < 2e-3
     assert np.array_equal(open_arm(f"twin:{kind}3:aged")._sensor.delta_m, aged._sensor.delta_m)
     assert open_arm(f"twin:{kind}3:aged:100g").motion_capture().tip_m[2] < aged.motion_capture().tip_m[2]
+
+
+@pytest.mark.parametrize("kind", ["", "rod:"])
+def test_a_twin_may_have_lost_a_chamber(kind):
+    whole, arm = (open_arm(f"twin:{kind}3{lost}") for lost in ("", ":lost4"))
+    for _ in range(100):
+        for twin in (whole, arm):
+            twin.write_pressures(np.full(9, -5.0))
+    others = np.arange(9) != 4
+    assert abs(arm._true_kpa()[4]) < 0.3 and (arm._true_kpa()[others] < -1.0).all()
+    assert np.argmax(np.abs(arm._lengths_m() - whole._lengths_m())) == 4
