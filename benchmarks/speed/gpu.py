@@ -1,8 +1,8 @@
 """What a GPU can do: environment steps and gradient steps a second at many sizes, and times to train.
 
-Programs prepare themselves beside each other and then take turns, so that the GPU is one program's while it is
-measured. A training is a sweep over seeds with sizes for a GPU. Its clock runs in its epochs alone: it stands
-while programs compile and policies are evaluated.
+Programs prepare themselves beside each other and then take turns, so that the GPU is one program's while it
+is measured. A training is a sweep over seeds with sizes for a GPU. Its clock runs in its epochs alone: it
+stands while programs compile and policies are evaluated.
 """
 
 from __future__ import annotations
