@@ -29,7 +29,7 @@ from mjx_softarm.sensing.s2r import S2R, correct, correction_between
 from mjx_softarm.spec import ArmSpec
 
 MIN_POSES = 8
-HELD_OUT_BLOCK = 4  # poses; the loop acts four times towards a goal, so neighbours are alike
+HELD_OUT_BLOCK = 4  # poses; neighbours on a circle are alike
 # Priors, by hand: shift of a zero; change of all stiffnesses, and of one beside the others; offsets of all
 # pressures, and of one beside the others.
 ZERO_M, STIFFNESS, OFFSET_KPA = 1e-3, (0.1, 0.02), (0.5, 0.5)
