@@ -5,9 +5,9 @@ an analogue output module (CPX-E-4AO-U-I), its measured pressure, if wired, goes
 (CPX-E-4AI-U-I). Chamber k is channel k of the modules of a kind, in their order; modules of a kind stand side
 by side. A tick takes one Modbus request for all set points and one for all measured pressures.
 
-If the computer falls silent, the terminal puts its outputs into their fail state after a second. By default
-this is 0 V, which is the strongest vacuum of a regulator whose range begins below zero: set the outputs' fail
-state to the voltage of the atmosphere in Festo's software.
+A second after the last request, also after a command's normal end, the terminal puts its outputs into their
+fail state. By default this is 0 V: the strongest vacuum of a regulator whose range begins below zero. In
+Festo's software set the fail state of each output to the voltage of 0 kPa: 5 V for -100 to 100 kPa.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ class CpxRegulators:
         modules: its type code, as printed on it, such as `60E-EP-3NO3NI`: three output and three input
             modules.
         n: number of chambers.
-        range_kpa: pressures [kPa] of all regulators at 0 and 10 V.
+        range_kpa: pressures [kPa] of all regulators at 0 and 10 V, with 0 kPa between them.
         timeout_s: longest time for a request.
 
     Raises:
         InputError: festo-cpx-io is missing.
-        ValueError: the modules have too few channels, or do not stand side by side.
+        ValueError: the range has no 0 kPa, the modules have too few channels, or do not stand side by side.
         OSError: the terminal cannot be reached.
     """
 
@@ -50,9 +50,9 @@ class CpxRegulators:
             terminal = importlib.import_module("cpx_io.cpx_system.cpx_e.cpx_e")
             base = importlib.import_module("cpx_io.cpx_system.cpx_base")
             self._errors: Any = importlib.import_module("pymodbus.exceptions")
+        if len(range_kpa) != 2 or not range_kpa[0] <= 0.0 <= range_kpa[1] or range_kpa[0] == range_kpa[1]:
+            raise ValueError(f"range_kpa: got {[*range_kpa]}, expected two rising numbers, 0 between them")
         self._n, (self._low_kpa, self._high_kpa) = n, range_kpa
-        if not self._low_kpa < self._high_kpa:
-            raise ValueError(f"range_kpa: got {[*range_kpa]}, expected two rising numbers")
 
         # The terminal and its channels; setting them may take a second
         try:
@@ -60,10 +60,15 @@ class CpxRegulators:
         except (base.CpxConnectionError, ConnectionError, TypeError) as error:
             raise OSError(f"{host}: got {error}, expected a CPX-E terminal of type {modules}") from error
         try:
-            self._output = self._first_register("CpxE4AoUI", "outputs", N_OUT)
-            self._input = self._first_register("CpxE4AiUI", "inputs", N_IN)
+            outputs, self._output = self._modules("CpxE4AoUI", "outputs", N_OUT)
+            inputs, self._input = self._modules("CpxE4AiUI", "inputs", N_IN)
             if self._output is None:
                 raise ValueError(f"modules: got {modules}, expected analogue outputs, NO, for {n} chambers")
+            # After power-up the set points are 0 V, which may be a vacuum: first 0 kPa, then the ranges.
+            self.write_pressures(np.zeros(n))
+            for modules_of_kind in filter(None, (outputs, inputs)):
+                for k in range(n):
+                    modules_of_kind[k // N_OUT].configure_channel_range(k % N_OUT, UP_TO_10_V)
         except Exception:
             self._cpx.shutdown()
             raise
@@ -93,23 +98,21 @@ class CpxRegulators:
         counts = np.array(words, np.uint16).view(np.int16).reshape(n_modules, N_IN)[:, :-1].ravel()[: self._n]
         return self._low_kpa + counts / COUNTS * (self._high_kpa - self._low_kpa)
 
-    def _first_register(self, kind: str, side: str, n_registers: int) -> int | None:
-        """Set the channels of modules of a kind to 0 to 10 V; return their first register, None without any.
+    def _modules(self, kind: str, side: str, n_registers: int) -> tuple[list[Any], int | None]:
+        """Return the chambers' modules of a kind, and their first register; None without any.
 
         Raises:
             ValueError: there are too few, or they do not stand side by side.
         """
         modules = [module for module in self._cpx.modules if type(module).__name__ == kind]
         if not modules:
-            return None
+            return [], None
         modules = modules[: -(-self._n // N_OUT)]
         registers = [getattr(module.system_entry_registers, side) for module in modules]
         if len(modules) * N_OUT < self._n or (np.diff(registers) != n_registers).any():
             expected = f"modules side by side for {self._n} chambers"
             raise ValueError(f"modules: got {len(modules)} of {kind} at {registers}, expected {expected}")
-        for channel in range(self._n):
-            modules[channel // N_OUT].configure_channel_range(channel % N_OUT, UP_TO_10_V)
-        return registers[0]
+        return modules, registers[0]
 
     def _asked(self, method: str, *args: Any, **options: Any) -> list[int]:
         """Send a request; return the registers of its answer.

@@ -45,6 +45,7 @@ class Terminal:
     def __init__(self):
         self.registers = np.zeros(65536, int)
         self.parameters = dict.fromkeys(range(4096, 8192), 0)
+        self.counts_at_ranges = []  # of the outputs, each time that a channel's range is set
         self.silent, self.refuses, self.delay_s, self.n_requests = False, False, 0.0, 0
         self.listener = socket.create_server(("127.0.0.1", 0))
         self.listener.settimeout(0.02)
@@ -100,6 +101,7 @@ class Terminal:
             number = word & 0x1FFF
             if word & 0x2000:
                 self.parameters[number] = int(self.registers[DATA_OUT])
+                self.counts_at_ranges.append(self.registers[OUTPUTS : OUTPUTS + 9].copy())
             elif word:
                 self.registers[DATA_IN] = self.parameters[number]
             self.registers[CONTROL_IN] = word & 0x8000
@@ -149,6 +151,14 @@ def test_pressures_go_to_the_terminal_and_come_back(opened, terminal):
     np.testing.assert_allclose(terminal.registers[OUTPUTS : OUTPUTS + 9], counts, atol=0.5)
     np.testing.assert_allclose(arm.pressures(), kpa, atol=200.0 / FULL)
     assert terminal.n_requests == 2
+
+
+@pytest.mark.parametrize(("range_kpa", "counts"), [((-100.0, 100.0), FULL // 2), ((-25.0, 75.0), FULL // 4)])
+def test_the_set_points_are_0_kpa_before_the_channels_have_ranges(range_kpa, counts, opened, terminal):
+    opened(TOML.replace("[-100.0, 100.0]", str([*range_kpa])))
+    assert len(terminal.counts_at_ranges) >= 9
+    for found in (*terminal.counts_at_ranges, terminal.registers[OUTPUTS : OUTPUTS + 9]):
+        np.testing.assert_array_equal(found, counts)
 
 
 def test_pressures_beyond_the_regulators_are_not_sent(opened, terminal):
@@ -206,7 +216,10 @@ def test_a_terminal_that_refuses_or_goes_ends_the_run(opened, terminal):
         ("3NO3NI", "NOLNONO3NI", "expected modules side by side"),
         ("3NO3NI", "3NI", "expected analogue outputs, NO, for 9 chambers"),
         ("60E-EP-3NO3NI", "60N-M", "expected a CPX-E terminal of type 60N-M"),
-        ("[-100.0, 100.0]", "[100.0, -100.0]", "expected two rising numbers"),
+        ("[-100.0, 100.0]", "[100.0, -100.0]", "expected two rising numbers, 0 between them"),
+        ("[-100.0, 100.0]", "[10.0, 100.0]", "expected two rising numbers, 0 between them"),
+        ("[-100.0, 100.0]", "[0.0, 0.0]", "expected two rising numbers, 0 between them"),
+        ("[-100.0, 100.0]", "[100.0]", r"range_kpa: got \[100.0\], expected two rising numbers"),
         ("n = 9", "m = 9", "unexpected keyword argument 'm'"),
     ],
 )
