@@ -47,6 +47,9 @@ class LdcSprings:
         self, channels: Sequence[Sequence[int]], drive_current: int = 18, timeout_s: float = 0.008
     ) -> None:
         # Springs by converter
+        for at in channels:
+            if not isinstance(at, Sequence) or [*map(type, at)] != [int, int, int]:
+                raise ValueError(f"channels: got {at}, expected bus, address and channel of each spring")
         self._springs: dict[tuple[int, int], dict[int, int]] = {}
         for spring, (bus, address, channel) in enumerate(channels):
             self._springs.setdefault((bus, address), {})[channel] = spring
