@@ -90,6 +90,11 @@ REFUSED = [
     ("mass.gripper_length_m", 10**400, "a number > 0"),
     ("mass.payload_kg", -0.1, "a number >= 0"),
     ("structure.n_sections", 3.0, "a whole number >= 1 and <= 100"),
+    (
+        "structure.chambers_per_section",
+        13,
+        "a whole number >= 3 (fewer bend a section in one plane) and <= 12",
+    ),
     ("mass.arm_kg", 1e39, "sizes from 1.2e-38 to 3.4e+38, which float32 holds"),
     ("mounting.base_turn_deg", [1.0], "a list of 3 numbers"),
     ("chambers.pressure_min_kpa", -102.0, "a number >= -101.325"),

@@ -30,18 +30,19 @@ class Rule:
     low_open: bool = False
     per: str = ""  # parts of the arm with a number each, such as "chambers"; one for all without `length`
     length: int | None = None  # length of a field that must be a list; 0: it depends on the arm
-    why: str = ""  # reason for the range
+    why: str = ""  # reason for the lower bound
 
     @property
     def text(self) -> str:
         """The rule in words."""
         noun = {int: "a whole number", float: "a number", str: "a text"}[self.kind]
         low = "" if self.low == -math.inf else f" {'>' if self.low_open else '>='} {self.low:g}"
+        low += f" ({self.why})" if self.why else ""
         high = "" if self.high == math.inf else f" and <= {self.high:g}" if low else f" <= {self.high:g}"
         if self.length is not None:
             return f"a list of {self.length} numbers" if self.length else "a list of numbers"
         each = f", or a list with one for each of the {self.per}" if self.per else ""
-        return noun + low + high + each + (f", since {self.why}" if self.why else "")
+        return noun + low + high + each
 
     def accepts(self, value: Any) -> bool:
         """Return whether a value is of the kind and in the range."""
@@ -83,7 +84,7 @@ def numbers(per: str) -> Any:
 
 
 def count(default: Any = dataclasses.MISSING, low: int = 1, high: int = MAX_COUNT, why: str = "") -> Any:
-    """Declare a count in a range, with the reason for it."""
+    """Declare a count in a range, with the reason for its lower bound."""
     return field(default=default, metadata={"rule": Rule(kind=int, low=low, high=high, why=why)})
 
 
