@@ -69,7 +69,8 @@ class CaptureName:
         words, *options = text.split(",")
         system, host, body, *_ = *words.split(":", 2), "", ""
         named = {key: value for key, _, value in (option.partition("=") for option in options)}
-        if system not in _DEFAULT_UP or not host or not body or not named.keys() <= {"base", "markers", "up"}:
+        named_well = named.keys() <= {"base", "markers", "up"} and all(named.values())
+        if system not in _DEFAULT_UP or not host or not body or not named_well:
             expected = "natnet:HOST:BODY or qualisys:HOST:BODY, maybe with ,base=BODY,markers=NAME,up=y|z"
             raise InputError(f"--capture: got {text!r}, expected {expected}")
         found = cls(system, host, body, **{"up": _DEFAULT_UP[system]} | named)
