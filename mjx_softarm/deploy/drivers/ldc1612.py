@@ -23,6 +23,10 @@ DATA_MSB, RCOUNT, SETTLECOUNT, CLOCK_DIVIDERS, DRIVE_CURRENT = 0x00, 0x08, 0x10,
 STATUS, ERROR_CONFIG, CONFIG, MUX_CONFIG, RESET_DEV = 0x18, 0x19, 0x1A, 0x1B, 0x1C
 IDS = {0x7E: 0x5449, 0x7F: 0x3055}  # manufacturer and device, by register
 CLOCK_HZ = 40e6  # external clock
+# Divider of both clocks, the coil's and the reference, in a converter with one channel. Its reference may be
+# 35 MHz at most, with several channels 40 MHz; a coil's clock has to be below a quarter of the reference
+# (SNOSCY9, "Clocking Architecture"). The reading is their ratio, which stays as it is.
+DIVIDER_OF_ONE = 2
 CONVERSION_S = 0.004  # of one channel; by hand: a converter's two channels end twice within a tick
 SETTLE_S = 2e-5  # of a coil before its conversion; by hand: a Q factor of 40 at 2 MHz
 BUS_TIMEOUT = 1  # longest transfer, in steps of 10 ms
@@ -100,10 +104,12 @@ class LdcSprings:
         if found != [*IDS.values()]:
             raise OSError(f"{where}: got ids {found}, expected {[*IDS.values()]}")
         self._write(bus, address, RESET_DEV, 0x8000)  # into sleep mode
+        divider = DIVIDER_OF_ONE if len(channels) == 1 else 1
+        steps_per_s = CLOCK_HZ / divider / 16
         for channel in channels:
-            self._write(bus, address, RCOUNT + channel, round(CONVERSION_S * CLOCK_HZ / 16))
-            self._write(bus, address, SETTLECOUNT + channel, round(SETTLE_S * CLOCK_HZ / 16))
-            self._write(bus, address, CLOCK_DIVIDERS + channel, 0x1001)  # neither clock is divided
+            self._write(bus, address, RCOUNT + channel, round(CONVERSION_S * steps_per_s))
+            self._write(bus, address, SETTLECOUNT + channel, round(SETTLE_S * steps_per_s))
+            self._write(bus, address, CLOCK_DIVIDERS + channel, divider << 12 | divider)
             self._write(bus, address, DRIVE_CURRENT + channel, drive_current << 11)
         self._write(bus, address, ERROR_CONFIG, 0xF800)  # errors are flagged beside the data
         # One channel all the time, or channels 0 to 1, 2 or 3 in turn; inputs up to 10 MHz

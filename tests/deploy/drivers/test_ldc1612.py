@@ -13,7 +13,7 @@ from mjx_softarm.deploy.drivers.names import open_arm
 
 CLOCK_HZ = 40e6
 AT = [(1, 0x2A, 0), (1, 0x2A, 1), (1, 0x2B, 1), (3, 0x2A, 0), (3, 0x2A, 1), (3, 0x2A, 2), (3, 0x2A, 3)]
-HZ = 1e6 * np.array([2.1, 3.3, 5.4, 2.5, 3.5, 4.5, 2.9])
+HZ = 1e6 * np.array([2.1, 3.3, 9.9, 2.5, 3.5, 4.5, 2.9])
 
 
 class Chip:
@@ -41,10 +41,14 @@ class Chip:
             self.registers[0x1A] & 0x0200 and self.registers[0x1A] & 0x1000
         )  # external clock, current as set
         for channel in {*self.channels()} & {*only} & {*self.hz}:
-            seconds = 16 * self.registers[0x08 + channel] / CLOCK_HZ
-            assert 0.001 < seconds < 0.01 and self.registers[0x14 + channel] == 0x1001
-            assert self.registers[0x10 + channel] >= 10 and self.registers[0x1E + channel] == 18 << 11
-            word = round(self.hz[channel] / CLOCK_HZ * 2**28) | (self.fault << 28)
+            # Clocks and their limits: table of the data sheet's "Clocking Architecture", external clock
+            dividers, several = self.registers[0x14 + channel], self.registers[0x1B] >> 15
+            reference_hz, coil_hz = CLOCK_HZ / (dividers & 0x3FF), self.hz[channel] / (dividers >> 12)
+            assert reference_hz <= (40e6 if several else 35e6) and coil_hz < reference_hz / 4
+            assert 16 * self.registers[0x08 + channel] / reference_hz == pytest.approx(0.004, rel=0.01)
+            assert 16 * self.registers[0x10 + channel] / reference_hz == pytest.approx(2e-5, rel=0.1)
+            assert self.registers[0x10 + channel] > 3 and self.registers[0x1E + channel] == 18 << 11
+            word = round(coil_hz / reference_hz * 2**28) | (self.fault << 28)
             if not self.registers[0x19] >> 11:  # errors are not flagged
                 word &= 2**28 - 1
             self.data[channel] = word

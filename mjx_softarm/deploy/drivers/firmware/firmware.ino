@@ -42,6 +42,9 @@ constexpr unsigned long BAUD = 921600;
 constexpr unsigned long SILENT_MS = 1000;  // time without a `P` after which the computer counts as gone
 constexpr float VENT_KPA_PER_S = 20.0f;    // as the computer vents
 constexpr float CLOCK_HZ = 40e6f;          // external clock of the converters
+// Divider of both clocks, coil and reference, of a converter with one coil: its reference may be 35 MHz at most,
+// with several coils 40 MHz (data sheet, "Clocking Architecture"). Their ratio, which is read, stays as it is.
+constexpr uint16_t DIVIDER_OF_ONE = 2;
 constexpr float CONVERSION_S = 0.004f;
 constexpr float SETTLE_S = 2e-5f;
 constexpr size_t LONGEST = 512;  // characters of a line
@@ -97,16 +100,18 @@ void startConverter(const Coil &coil) {
   if (!select(coil)) return;
   writeRegister(coil, RESET_DEV, 0x8000);  // into sleep mode
   int n = 0;
+  for (const Coil &other : COILS) n += sameChip(coil, other);
+  const uint16_t divider = n == 1 ? DIVIDER_OF_ONE : 1;
+  const float steps_per_s = CLOCK_HZ / divider / 16;
   uint8_t last = 0;
   for (const Coil &other : COILS) {
     if (!sameChip(coil, other)) continue;
     const uint8_t channel = other.channel;
-    writeRegister(coil, RCOUNT + channel, static_cast<uint16_t>(CONVERSION_S * CLOCK_HZ / 16));
-    writeRegister(coil, SETTLECOUNT + channel, static_cast<uint16_t>(SETTLE_S * CLOCK_HZ / 16));
-    writeRegister(coil, CLOCK_DIVIDERS + channel, 0x1001);  // neither clock is divided
+    writeRegister(coil, RCOUNT + channel, static_cast<uint16_t>(CONVERSION_S * steps_per_s));
+    writeRegister(coil, SETTLECOUNT + channel, static_cast<uint16_t>(SETTLE_S * steps_per_s));
+    writeRegister(coil, CLOCK_DIVIDERS + channel, static_cast<uint16_t>(divider << 12 | divider));
     writeRegister(coil, DRIVE + channel, static_cast<uint16_t>(DRIVE_CURRENT << 11));
     last = channel > last ? channel : last;
-    ++n;
   }
   writeRegister(coil, ERROR_CONFIG, 0xF800);  // errors are flagged beside the data
   // One channel all the time, or channels 0 to 1, 2 or 3 in turn; inputs up to 10 MHz; external clock

@@ -54,10 +54,15 @@ struct Chip {
     const int n = 2 + (registers[0x1B] >> 13 & 3), only = registers[0x1A] >> 14;
     for (const auto &coil : hz) {
       if (turns ? coil.first >= n : coil.first != only) continue;
-      if (registers[0x14 + coil.first] != 0x1001 || registers[0x1E + coil.first] != 18 << 11)
-        fail("converter: expected undivided clocks and a current of 18");
-      next_s = seconds() + 2 * 16 * registers[0x08 + coil.first] / 40e6;
-      data[coil.first] = static_cast<uint32_t>(std::lround(coil.second / 40e6 * (1 << 28))) | flags << 28;
+      if (registers[0x1E + coil.first] != 18 << 11) fail("converter: expected a current of 18");
+      const double reference_hz = 40e6 / (registers[0x14 + coil.first] & 0x3FF);
+      const double coil_hz = coil.second / (registers[0x14 + coil.first] >> 12);
+      if (reference_hz > (turns ? 40e6 : 35e6) || coil_hz >= reference_hz / 4)
+        fail("converter: expected a reference of 40 MHz at most, of one channel 35 MHz, and a coil below a quarter");
+      const double conversion_s = 16 * registers[0x08 + coil.first] / reference_hz;
+      if (std::abs(conversion_s - 0.004) > 1e-4) fail("converter: expected conversions of 4 ms");
+      next_s = seconds() + 2 * conversion_s;
+      data[coil.first] = static_cast<uint32_t>(std::lround(coil_hz / reference_hz * (1 << 28))) | flags << 28;
       registers[0x18] = static_cast<uint16_t>(registers[0x18] | 1 << (3 - coil.first));
     }
   }
