@@ -146,6 +146,7 @@ def _plan(
     from calib.plan import RECORDED_FILE, load_recorded, plan
     from mjx_softarm._support import xla
     from mjx_softarm.logs.pressure_plan import write_plan
+    from mjx_softarm.sensing.held_pressures import find_pressures
 
     # Refuse what cannot be planned.
     _check_seed(seed)
@@ -155,13 +156,18 @@ def _plan(
         raise InputError(f"--out: got {out}, which is there already, expected a new file")
     arm = ArmSpec.from_toml(calibration / ARM_FILE)
     recorded = load_recorded(calibration / RECORDED_FILE, arm.n_chambers)
+    held = find_pressures(calibration, arm.structure.n_sections, arm.n_springs, arm.n_chambers)
     # Choose the poses, and tell what they are for.
     xla.enable_compilation_cache()
-    found = plan(arm, recorded, poses, seed)
+    found = plan(arm, recorded, poses, seed, held)
     write_plan(out, found.pressure_kpa)
     now, then = found.n_unknown
-    print(f"{found.n_informative} poses for the fit, {poses - found.n_informative} for the network")
+    n_others = poses - found.n_informative - found.n_payload
+    print(f"{found.n_informative} poses for the fit, {found.n_payload} for the payload, {n_others} others")
     print(f"unknown directions, as far as the fitted model tells: {now} now, {then} with these poses")
+    if found.half_width_kg:
+        known_g, then_g = (f"{1e3 * kg:.0f} g" for kg in found.half_width_kg)
+        print(f"payload, known at half of the workspace's poses to {known_g} now, {then_g} with these poses")
     print(f"plan: {out}")
     print(f"next: python -m mjx_softarm.deploy record --plan {out} --arm ARM --spec SPEC --out LOG")
     return 0

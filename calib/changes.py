@@ -14,6 +14,7 @@ pressures without motion capture, are left out.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,6 +25,7 @@ from calib.fit.pose_errors import PoseErrors, errors_of
 from calib.fit.s2r import simulate_poses
 from calib.read.static_poses import StaticPoses
 from mjx_softarm.control import chambers_of_springs
+from mjx_softarm.sensing.held_pressures import HeldPressures, held_kpa
 from mjx_softarm.sensing.pose import pose_from_frame
 from mjx_softarm.sensing.s2r import S2R, correct, correction_between
 from mjx_softarm.spec import ArmSpec
@@ -61,7 +63,9 @@ class Changes:
         return self.after_kpa < self.before_kpa
 
 
-def fit_changes(spec: ArmSpec, s2r: S2R | None, poses: StaticPoses, seed: int = 0) -> Changes:
+def fit_changes(
+    spec: ArmSpec, s2r: S2R | None, poses: StaticPoses, seed: int = 0, held: HeldPressures | None = None
+) -> Changes:
     """Fit what has changed since a calibration.
 
     Args:
@@ -70,11 +74,13 @@ def fit_changes(spec: ArmSpec, s2r: S2R | None, poses: StaticPoses, seed: int = 
         poses: later poses of the unloaded arm, `MIN_POSES` or more, with spring lengths by the old zeros and
             pressures; tips are NaN without motion capture.
         seed: chooses the held-out poses.
+        held: residual pressures of the calibration, if there are some.
     """
     # A fit without the held-out poses, which judge it, then to all poses
     held_out = held_out_blocks(poses.n, block=HELD_OUT_BLOCK, seed=seed)
-    judged, found = (_fit(spec, s2r, poses.take(rows)) for rows in (~held_out, held_out | True))
-    before, after = (_model(spec, s2r, poses.take(held_out), x)[0] for x in (0.0 * judged.x, judged.x))
+    arm = _Calibrated(spec, s2r, held)
+    judged, found = (_fit(arm, poses.take(rows)) for rows in (~held_out, held_out | True))
+    before, after = (_model(arm, poses.take(held_out), x)[0] for x in (0.0 * judged.x, judged.x))
 
     # The arm as it is now
     n, n_chambers = spec.n_springs, spec.n_chambers
@@ -102,26 +108,33 @@ def fit_changes(spec: ArmSpec, s2r: S2R | None, poses: StaticPoses, seed: int = 
     )
 
 
-def _fit(spec: ArmSpec, s2r: S2R | None, poses: StaticPoses) -> Solution:
+class _Calibrated(NamedTuple):
+    """Arm as it was calibrated; see `fit_changes`."""
+
+    spec: ArmSpec
+    s2r: S2R | None
+    held: HeldPressures | None
+
+
+def _fit(arm: _Calibrated, poses: StaticPoses) -> Solution:
     """Fit x: shifts of the zeros [m], stiffness of all and of each chamber, offsets [kPa] likewise."""
-    n_chambers = spec.n_chambers
+    spec, s2r, n_chambers = arm.spec, arm.s2r, arm.spec.n_chambers
     tip_mm = max(MIN_TIP_MM, 0.0 if s2r is None else float(s2r.error_mm))
     scale = np.array([tip_mm, MIN_TURN_RAD, MIN_KPA])
     sizes = spec.n_springs, *2 * (1, n_chambers)
     prior = np.repeat([ZERO_M, *STIFFNESS, *OFFSET_KPA], sizes)
     group = np.repeat([0, 1, 2], [3, 3, n_chambers])
-    return fit(lambda x: _model(spec, s2r, poses, x), Problem(prior, group, scale, scale))
+    return fit(lambda x: _model(arm, poses, x), Problem(prior, group, scale, scale))
 
 
-def _model(
-    spec: ArmSpec, s2r: S2R | None, poses: StaticPoses, x: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _model(arm: _Calibrated, poses: StaticPoses, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return errors (m, 6 + n_chambers) [mm, rad, kPa] at x (p,), and derivatives (m, 6 + n_chambers, p).
 
     Errors are simulated less measured tips, and measured less simulated pressures; NaN where not measured,
     inf in the row of an arm that does not settle.
     """
     # Simulate the poses at their lengths, and with each spring a little longer.
+    spec, s2r, held = arm
     n, m = spec.n_springs, poses.n
     shift_m = x[:n] + STEP_M * np.concatenate([np.zeros((1, n)), np.eye(n)])  # (1 + n, n)
     spring_m = (poses.spring_m + shift_m[:, None]).reshape(-1, n)
@@ -132,7 +145,10 @@ def _model(
     real = np.tile(pose_from_frame(poses.tip_m, poses.tip_rotation), (1 + n, 1))
     tip = correction_between(real, np.asarray(pose, float)) * [1, 1, 1, 2, 2, 2]  # a turn is twice its Gibbs
     measured_kpa = without_redundant_part(np.tile(poses.pressure_kpa, (1 + n, 1)), spring_m, spec)
-    left_kpa = measured_kpa - found.pressure_kpa - spec.unmodelled_kpa(spring_m)
+    simulated_kpa = np.asarray(found.pressure_kpa, float)
+    if held is not None:
+        simulated_kpa = held_kpa(held, spring_m, simulated_kpa, np.zeros_like(simulated_kpa))
+    left_kpa = measured_kpa - simulated_kpa - spec.unmodelled_kpa(spring_m)
     error = np.concatenate([tip, left_kpa], axis=1)
     error = np.where(found.valid[:, None], error, np.inf).reshape(1 + n, m, -1)
 

@@ -3,9 +3,10 @@
 The parameters x are those of `calib.fit.parameters`. J holds the derivatives of all measurements by x, over
 the scales of their errors. The covariance of x is the inverse of the prior's precision plus the sum of J^T J
 over the poses. Poses are chosen one by one among candidates, each time the pose that reduces the sum of the
-variances most, in units of the tolerances. At least half of the poses, and all once every direction is
-expected to be known, are drawn as in k-means++: by the square of the distance to the nearest pose, times the
-error of the sim-to-real network there.
+variances most, in units of the tolerances, until every direction is expected to be known, but at most a
+third of the poses. As many and the poses that are left of this third are chosen to tell payloads
+(`calib.fit.payload`). The others are drawn as in k-means++: by the square of the distance to the nearest
+pose, times the error of the sim-to-real network there.
 
 Source: Fedorov, "Theory of Optimal Experiments", 1972 (A-optimal design); Arthur, Vassilvitskii, "k-means++",
 SODA 2007.
@@ -21,14 +22,16 @@ import numpy as np
 from calib.fit.equilibrium import N_KINDS, error_groups, simulate, unmeasured
 from calib.fit.leastsquares import QUANTILE
 from calib.fit.parameters import priors, tolerances
+from calib.fit.payload import choose_for_payload, informed, payload_half_widths, payload_poses
 from mjx_softarm._support.archive import Entries, entries_of, read_sealed, write_sealed
 from mjx_softarm.control import allocation
 from mjx_softarm.mechanics.excitation import random_pressures
 from mjx_softarm.mechanics.workspace import pressure_levels, settle_many
+from mjx_softarm.sensing.held_pressures import HeldPressures
 from mjx_softarm.spec import ArmSpec
 
 KIND, RECORDED_FILE = "recorded", "recorded.npz"  # file in the folder of a calibration
-SHARE_FAR = 0.5  # least share of the poses that are drawn by their distance
+SHARE_INFORMATIVE, SHARE_PAYLOAD = 1 / 3, 1 / 3  # greatest shares of the poses for directions, for payloads
 MAX_CANDIDATES = 1500
 MARGIN = 2.0  # intervals of fits over intervals of this covariance, which takes errors for independent
 N_NEAREST = 8  # nearest poses whose errors are averaged
@@ -47,9 +50,11 @@ class Recorded(NamedTuple):
 class Plan(NamedTuple):
     """Poses to record, and their expected benefit."""
 
-    pressure_kpa: np.ndarray  # (n, n_chambers), the informative poses first
+    pressure_kpa: np.ndarray  # (n, n_chambers): the informative poses, those for the payload, the others
     n_informative: int
+    n_payload: int
     n_unknown: tuple[int, int]  # unknown directions now, and expected with the plan
+    half_width_kg: tuple[float, float] | None  # median of a payload's 95 % intervals now, and expected
 
 
 def save_recorded(path: Path, recorded: Recorded) -> None:
@@ -75,7 +80,7 @@ def load_recorded(path: Path, n_chambers: int) -> Recorded:
     return found
 
 
-def plan(spec: ArmSpec, recorded: Recorded, n: int, seed: int) -> Plan:
+def plan(spec: ArmSpec, recorded: Recorded, n: int, seed: int, held: HeldPressures | None = None) -> Plan:
     """Choose poses to record.
 
     Args:
@@ -83,25 +88,37 @@ def plan(spec: ArmSpec, recorded: Recorded, n: int, seed: int) -> Plan:
         recorded: poses of its calibration.
         n: number of poses to choose.
         seed: seed of the candidates and of the draw.
+        held: residual pressures of its calibration, if there are some.
     """
     # Compute the covariance of the calibration.
     rng = np.random.default_rng(seed)
-    candidates = _candidates(spec, min(20 * n, MAX_CANDIDATES), rng)
+    candidates, spring_m = _candidates(spec, min(20 * n, MAX_CANDIDATES), rng)
     rows = _derivatives(spec, recorded.pressure_kpa, recorded.payload_kg, recorded.scale)
     tolerance = tolerances(spec)
     prior = np.diag((tolerance / priors(spec)) ** 2)
     scaled = rows.reshape(-1, len(tolerance)) * tolerance
     covariance = np.linalg.inv(prior + scaled.T @ scaled)
     before = n_unknown(covariance)
-    # Choose informative poses, then poses far from all others, which add to the information, too.
+    # Choose informative poses, then poses for the payload.
     payload = np.full(len(candidates), spec.mass.payload_kg)
     options = _derivatives(spec, candidates, payload, recorded.scale) * tolerance
-    chosen, covariance = choose_informative(options, covariance, n - round(SHARE_FAR * n))
+    informative, covariance = choose_informative(options, covariance, round(SHARE_INFORMATIVE * n))
+    telling, widths_kg = np.array([], int), None
+    if held is not None:
+        n_payload = round((SHARE_INFORMATIVE + SHARE_PAYLOAD) * n) - len(informative)
+        states = spring_m, candidates
+        at, known = payload_poses(spec), informed(held, *(x[informative] for x in states))
+        telling = choose_for_payload(known, at, *states, n_payload, informative)
+        then = informed(known, *(x[telling] for x in states))
+        widths_kg = tuple(float(np.median(payload_half_widths(x, at, 0.0))) for x in (held, then))
+    # Choose poses far from all others; all but the first add to the information, too.
+    chosen = np.concatenate([informative, telling])
     far = choose_far(spec, recorded, candidates, chosen, n - len(chosen), rng)
-    left = options[far].reshape(-1, len(tolerance))
+    left = options[np.concatenate([telling, far])].reshape(-1, len(tolerance))
     covariance = np.linalg.inv(np.linalg.inv(covariance) + left.T @ left)
-    pressure_kpa = candidates[np.concatenate([chosen, far]).astype(int)]
-    return Plan(pressure_kpa, len(chosen), (before, n_unknown(covariance)))
+    pressure_kpa = candidates[np.concatenate([chosen, far])]
+    unknown = before, n_unknown(covariance)
+    return Plan(pressure_kpa, len(informative), len(telling), unknown, widths_kg)
 
 
 def n_unknown(covariance: np.ndarray) -> int:
@@ -174,8 +191,10 @@ def _acting(spec: ArmSpec, pressure_kpa: np.ndarray) -> np.ndarray:
     return pressure_kpa if matrices is None else pressure_kpa - pressure_kpa @ matrices.redundant
 
 
-def _candidates(spec: ArmSpec, n: int, rng: np.random.Generator) -> np.ndarray:
+def _candidates(spec: ArmSpec, n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Draw pressures (m, n_chambers) at which the arm settles: random, extreme, equal within sections.
+
+    Beside them stand the spring lengths (m, n_springs) [m] that they make.
 
     With equal pressures a section is straight; long and short straight arms tell a shift of the base from a
     tilt.
@@ -185,7 +204,8 @@ def _candidates(spec: ArmSpec, n: int, rng: np.random.Generator) -> np.ndarray:
     per_section = spec.structure.chambers_per_section
     equal = np.repeat(random_pressures(spec, third, rng)[:, ::per_section], per_section, axis=1)
     drawn = np.concatenate([random_pressures(spec, third, rng), extremes, equal])
-    return drawn[settle_many(spec, drawn).settled]
+    found = settle_many(spec, drawn)
+    return drawn[found.settled], np.asarray(found.spring_m[found.settled], float)
 
 
 def _derivatives(

@@ -4,6 +4,7 @@ The result is a folder that training takes:
 
     arm.toml      the calibrated specification
     s2r.npz       the sim-to-real network, if there were poses to fit it to
+    pressures.npz residual pressures that hold the arm, if there were poses to fit them to
     recorded.npz  the poses, for `python -m calib plan`
     report.html   results with pictures, and whether to trust them
     report.json   the same for programs
@@ -26,6 +27,12 @@ from calib.steps import STEPS, Extras, Step, changes
 from mjx_softarm._support.provenance import write_json
 from mjx_softarm.logs.pose_pairs import POSES_FILE, PosePairs, read_pose_pairs, write_pose_pairs
 from mjx_softarm.logs.schema import Log
+from mjx_softarm.sensing.held_pressures import (
+    PRESSURES_FILE,
+    HeldPressures,
+    find_pressures,
+    save_pressures,
+)
 from mjx_softarm.sensing.s2r import S2R, S2R_FILE, load_s2r, save_s2r
 from mjx_softarm.spec import ARM_FILE, ArmSpec
 
@@ -37,6 +44,7 @@ class Calibration:
     spec: ArmSpec
     sections: tuple[Section, ...]
     s2r: S2R | None  # None where it was not fitted, or is no better than the simulation
+    held: HeldPressures | None  # None where they were not fitted, or are no better than the simulation
     recorded: Recorded | None  # None where the chambers were not fitted
     pairs: Mapping[str, PosePairs]  # measured and simulated poses, without and with the network
 
@@ -79,7 +87,9 @@ def calibrate(
     if "scale" in extras and "error_mm" in extras:
         poses = measurements.poses
         recorded = Recorded(poses.pressure_kpa, poses.payload_kg, extras["error_mm"], extras["scale"])
-    return Calibration(spec, tuple(report), extras.get("s2r"), recorded, extras.get("pairs", {}))
+    return Calibration(
+        spec, tuple(report), extras.get("s2r"), extras.get("held"), recorded, extras.get("pairs", {})
+    )
 
 
 def go_on(
@@ -95,7 +105,7 @@ def go_on(
     """
     progress("changes ...")
     measurements = measure(later, since.spec, needed=("pressure_kpa",))
-    spec, section, _ = changes(measurements, since.spec, seed, since.s2r)
+    spec, section, _ = changes(measurements, since.spec, seed, since.s2r, since.held)
     return dataclasses.replace(since, spec=spec, sections=(*since.sections, section))
 
 
@@ -111,6 +121,7 @@ def load_calibration(folder: Path) -> Calibration:
         spec,
         (),
         load_s2r(s2r, spec.n_springs) if s2r.exists() else None,
+        find_pressures(folder, spec.structure.n_sections, spec.n_springs, spec.n_chambers),
         load_recorded(recorded, spec.n_chambers) if recorded.exists() else None,
         read_pose_pairs(folder) if (folder / POSES_FILE).exists() else {},
     )
@@ -150,6 +161,8 @@ def write_calibration(
         calibration.spec.to_toml(part / ARM_FILE)
         if calibration.s2r is not None:
             save_s2r(part / S2R_FILE, calibration.s2r)
+        if calibration.held is not None:
+            save_pressures(part / PRESSURES_FILE, calibration.held)
         if calibration.recorded is not None:
             save_recorded(part / RECORDED_FILE, calibration.recorded)
         if calibration.pairs:

@@ -22,17 +22,21 @@ from calib.fit.motion.actuators import fit_actuators
 from calib.fit.motion.damping import FITTED, PRIOR, find_stretches, fit_damping
 from calib.fit.motion.shape import fit_shape
 from calib.fit.motion.tracks import find_tracks
+from calib.fit.payload import fit_payloads, payload_half_widths, payload_poses
 from calib.fit.s2r import fit_s2r, simulate_poses
 from calib.fit.sensors import fit_springs
 from calib.read.measurements import Measurements
 from calib.report import sections
 from calib.report.changes import CHANGES, changes_section
 from calib.report.page import Section
+from mjx_softarm.deploy.controller import LOOP
 from mjx_softarm.logs.pose_pairs import PosePairs
 from mjx_softarm.logs.rest import MIN_HOLD_S
+from mjx_softarm.sensing.held_pressures import HeldPressures
 from mjx_softarm.sensing.pose import pose_from_frame
 from mjx_softarm.sensing.s2r import S2R, correct, extrapolation
 from mjx_softarm.spec import ArmSpec
+from mjx_softarm.spec_tables import Unmodelled
 
 MIN_S2R_POSES = 60
 NOT_FITTED = "Not fitted: the specification's values stay."
@@ -44,6 +48,7 @@ class Extras(TypedDict, total=False):
     scale: np.ndarray  # (2, 3) or (2, 4) robust errors, see `calib.fit.chambers.ChamberFit`
     error_mm: np.ndarray  # (n,) tip error at each static pose
     s2r: S2R
+    held: HeldPressures  # residual pressures of the unloaded arm
     pairs: Mapping[str, PosePairs]  # measured and simulated poses, without and with the network
 
 
@@ -159,16 +164,35 @@ def s2r(measurements: Measurements, spec: ArmSpec, seed: int) -> StepResult:
     error_mm[used[fit.held_out]] = pairs["with the network"].error_mm[fit.held_out]
     # Fit the pressures that hold the arm.
     held = fit_held_pressures(spec, settled.spring_m, poses.pressure_kpa[used], settled.pressure_kpa, seed)
-    if held.is_better:
-        spec = spec.replace(unmodelled=dataclasses.asdict(held.unmodelled))
     extras = Extras(pairs=pairs, error_mm=error_mm)
     if fit.is_better:
         extras["s2r"] = fit.s2r
-    return StepResult(spec, sections.with_pressures(section, held), extras)
+    if not held.is_better:
+        return StepResult(spec, section, extras)
+    extras["held"] = process = fit_payloads(spec, held.held, poses)
+    spec = dataclasses.replace(spec, unmodelled=Unmodelled())  # which the process replaces
+    largest_kg = spec.mass.largest_payload_kg
+    width_kg = payload_half_widths(process, payload_poses(spec), largest_kg)
+    section = sections.with_pressures(section, held, width_kg, LOOP.load_known * largest_kg)
+    return StepResult(spec, section, extras)
 
 
-def changes(measurements: Measurements, spec: ArmSpec, seed: int, s2r: S2R | None = None) -> StepResult:
-    """Fit what has changed since a calibration, whose S2R is given, to later poses of the unloaded arm."""
+def changes(
+    measurements: Measurements,
+    spec: ArmSpec,
+    seed: int,
+    s2r: S2R | None = None,
+    held: HeldPressures | None = None,
+) -> StepResult:
+    """Fit what has changed since a calibration to later poses of the unloaded arm.
+
+    Args:
+        measurements: later poses.
+        spec: arm as calibrated.
+        seed: seed of all random draws.
+        s2r: sim-to-real network of the calibration, if there is one.
+        held: residual pressures of the calibration, if there are some.
+    """
     poses = measurements.poses.with_lengths(spec)
     unloaded = np.isclose(poses.payload_kg, spec.mass.payload_kg, rtol=0.0, atol=1e-6)
     poses = poses.take(np.isfinite(poses.spring_m).all(axis=1) & unloaded)
@@ -178,7 +202,7 @@ def changes(measurements: Measurements, spec: ArmSpec, seed: int, s2r: S2R | Non
         needed = f"{NOT_FITTED} {_few(MIN_LATER, what, poses.n, measurements.row_uses)}"
         remedy = f"what has changed is not known: measure {MIN_LATER} goals or more"
         return StepResult(spec, Section(CHANGES, needed, warnings=(remedy,)), extras)
-    found = fit_changes(spec, s2r, poses, seed)
+    found = fit_changes(spec, s2r, poses, seed, held)
     section = changes_section(found, 0.0 if s2r is None else float(s2r.error_mm))
     return StepResult(found.spec if found.is_better else spec, section, extras)
 

@@ -119,6 +119,7 @@ def make_policy(spec=SPEC):
     )
     load = LoadEstimator(
         layers=((np.zeros((n + spec.n_chambers, 1), np.float32), np.zeros(1, np.float32)),),
+        sd_layers=((np.zeros((n + spec.n_chambers, 1), np.float32), np.full(1, np.log(0.05), np.float32)),),
         spring_centre_m=springs,
         spring_scale_m=springs + 1,
         pressure_centre_kpa=chambers,

@@ -12,6 +12,7 @@ import tyro
 from rich.console import Console
 
 from mjx_softarm._support import cli, xla
+from mjx_softarm.sensing.held_pressures import HeldPressures, find_pressures
 from mjx_softarm.sensing.s2r import S2R, S2R_FILE, load_s2r
 from mjx_softarm.spec import ARM_FILE, ArmSpec
 from train.agent.registry import LEARNERS, name_of
@@ -38,6 +39,13 @@ class ArmOptions:
             return spec, load_s2r(file, spec.n_springs)
         console.print(f"no {file}: training on simulated poses", highlight=False, soft_wrap=True)
         return spec, None
+
+    def read_pressures(self, spec: ArmSpec) -> HeldPressures | None:
+        """Return the residual pressures of the arm's calibration, if there are some."""
+        if self.calibration is None:
+            return None
+        sizes = spec.structure.n_sections, spec.n_springs, spec.n_chambers
+        return find_pressures(self.calibration, *sizes)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,8 +1,7 @@
-"""Residual pressures of the unloaded arm: measured minus simulated, as a linear function of the springs.
+"""Fit of the residual pressures that hold the unloaded arm, measured minus simulated.
 
-Holes, rings and bellows are not where the specification has them, so a chamber's pressure depends a little on
-the springs beside it. Least squares fit a linear function of all springs' lengths to the residual. It matters
-to the payload, which is estimated from pressures: a kilogram is some 3 kPa in each chamber.
+Each section's process (`mjx_softarm.sensing.held_pressures`) takes the length and the noise of a grid that
+make the poses most likely; the covariance between its chambers has a closed form. Held-out poses judge it.
 """
 
 from __future__ import annotations
@@ -10,33 +9,46 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import cho_solve, cholesky
 
 from calib.fit.blocks import held_out_blocks
-from calib.fit.leastsquares import ridge
 from mjx_softarm.control import allocation, chambers_of_springs
+from mjx_softarm.sensing.held_pressures import (
+    POSE_FACTOR,
+    HeldPressures,
+    covariances,
+    kernel,
+    prior_factor,
+    residual,
+    sections_of,
+)
 from mjx_softarm.spec import ArmSpec
-from mjx_softarm.spec_tables import Unmodelled
 
 HELD_OUT_BLOCK = 5  # poses
-RIDGE = 1.0  # prior: as strong as this many poses without a slope
+LENGTHS = (1.5, 2.5, 4.0, 6.5, 10.0)  # distances of standardised states
+NOISES = (1e-5, 1e-4, 1e-3, 1e-2, 0.1, 1.0)  # variances over the variance of a section
+MAX_ROWS = 1_000  # poses of a process
+LEAST_KPA = 0.01  # least standard deviation of a chamber's residual
+LEAST_SCALE = 1e-6  # [m, kPa] of a spring or a pressure that never changes
 
 
-class HeldPressures(NamedTuple):
-    """Fitted function, and root-mean-square residual pressures of the held-out rows."""
+class PressureFit(NamedTuple):
+    """Process of the residual pressures, and root mean squares at held-out poses."""
 
-    unmodelled: Unmodelled
-    before_kpa: float  # residual without the function
-    after_kpa: float  # residual with the function
+    held: HeldPressures  # given all poses
+    before_kpa: float  # residual pressures
+    after_kpa: float  # residual pressures less the mean of a process that does not know them
+    expected_kpa: float  # standard deviation of that process
 
     @property
     def is_better(self) -> bool:
-        """Whether the function makes the residual of the held-out rows smaller."""
+        """Whether the process makes the residuals of held-out poses smaller."""
         return self.after_kpa < self.before_kpa
 
 
 def fit_held_pressures(
     spec: ArmSpec, spring_m: np.ndarray, measured_kpa: np.ndarray, simulated_kpa: np.ndarray, seed: int = 0
-) -> HeldPressures:
+) -> PressureFit:
     """Fit the residual pressures of the unloaded arm.
 
     Args:
@@ -44,20 +56,76 @@ def fit_held_pressures(
         spring_m (m, n_springs) [m]: lengths at rest, in the order of time.
         measured_kpa (m, n_chambers) [kPa]: pressures that held the arm at these lengths.
         simulated_kpa (m, n_chambers) [kPa]: pressures that hold the simulated arm at these lengths.
-        seed: seed that chooses the contiguous blocks of held-out rows.
+        seed: seed that chooses the contiguous blocks of held-out poses.
     """
-    spring_m = np.asarray(spring_m, float)
+    # Fit to the poses that are not held out, and judge by the others.
+    spring_m, simulated_kpa = np.asarray(spring_m, float), np.asarray(simulated_kpa, float)
     left_kpa = without_redundant_part(np.asarray(measured_kpa, float), spring_m, spec) - simulated_kpa
-    stretched_m = spring_m - spec.at_springs(spec.geometry.section_length_m)
     held_out = held_out_blocks(len(left_kpa), block=HELD_OUT_BLOCK, seed=seed)
-    # Fit to the rows that are not held out, in standardised lengths, as the prior acts on these.
-    scale_m = np.maximum(stretched_m.std(axis=0), 1e-6)
-    slope, offset_kpa = ridge((stretched_m / scale_m)[~held_out], left_kpa[~held_out], RIDGE)
-    slope = slope / scale_m[:, None]  # [kPa/m]
-    # Judge the function by the held-out rows.
-    after_kpa = left_kpa - stretched_m @ slope - offset_kpa
-    found = Unmodelled(tuple(map(float, offset_kpa)), tuple(map(float, slope.T.ravel())))
-    return HeldPressures(found, _rms(left_kpa[held_out]), _rms(after_kpa[held_out]))
+    judged = _process(spec, *(x[~held_out] for x in (spring_m, simulated_kpa, left_kpa)))
+    found = residual(judged, spring_m[held_out], simulated_kpa[held_out])
+    after_kpa = left_kpa[held_out] - found.mean_kpa.reshape(-1, spec.n_chambers)
+    variance = found.share[..., None] * np.diagonal(judged.covariance_kpa2, axis1=1, axis2=2)
+    # Fit to all poses.
+    process = _process(spec, spring_m, simulated_kpa, left_kpa)
+    return PressureFit(process, _rms(left_kpa[held_out]), _rms(after_kpa), float(np.sqrt(variance.mean())))
+
+
+def with_payloads(
+    held: HeldPressures,
+    spring_m: np.ndarray,
+    measured_kpa: np.ndarray,
+    light_kpa: np.ndarray,
+    effect_kpa: np.ndarray,
+) -> HeldPressures:
+    """Return a process whose factors are fitted to m poses with known payloads, by Bayes' rule.
+
+    Args:
+        held: process of the unloaded arm.
+        spring_m (m, n_springs) [m]: lengths at rest.
+        measured_kpa (m, n_chambers) [kPa]: pressures that held the arm at these lengths with its payloads.
+        light_kpa (m, n_chambers) [kPa]: pressures that hold the simulated arm there without a payload.
+        effect_kpa (m, n_chambers) [kPa]: change of these pressures by the payloads.
+    """
+    found = residual(held, spring_m, light_kpa)
+    left_kpa = measured_kpa - light_kpa - found.mean_kpa.reshape(light_kpa.shape)
+    noise = covariances(held, found.share)
+    k = np.arange(noise.shape[-1])
+    noise[:, k, k] += (POSE_FACTOR * effect_kpa) ** 2
+    weighed = effect_kpa[:, :, None] * np.linalg.inv(noise)  # (m, n, n)
+    prior = np.linalg.inv(held.factor_covariance)
+    covariance = np.linalg.inv(prior + np.sum(weighed * effect_kpa[:, None], axis=0))
+    mean = covariance @ (prior @ held.factor + np.einsum("mij,mj->i", weighed, left_kpa))
+    return held._replace(factor=mean, factor_covariance=covariance)
+
+
+def _process(
+    spec: ArmSpec, spring_m: np.ndarray, pressure_kpa: np.ndarray, left_kpa: np.ndarray
+) -> HeldPressures:
+    """Return the process given residuals (m, n_chambers); at most `MAX_ROWS` take part, evenly spread."""
+    chosen = np.linspace(0, len(spring_m) - 1, min(len(spring_m), MAX_ROWS)).round().astype(int)
+    n_sections = spec.structure.n_sections
+    state = sections_of(spring_m[chosen], pressure_kpa[chosen], n_sections)
+    centre, scale = state.mean(axis=0), np.maximum(state.std(axis=0), LEAST_SCALE)
+    state, left_kpa = (state - centre) / scale, left_kpa[chosen].reshape(len(chosen), n_sections, -1)
+    each = [_most_likely(state[:, s], left_kpa[:, s]) for s in range(n_sections)]
+    length, noise, covariance = (np.array(x) for x in zip(*each, strict=True))
+    own = prior_factor(spec.n_chambers)
+    return HeldPressures(state, centre, scale, left_kpa, length, noise, covariance, *own)
+
+
+def _most_likely(state: np.ndarray, left_kpa: np.ndarray) -> tuple[float, float, np.ndarray]:
+    """Return length, noise and covariance (c, c) that make a section's residuals (n, c) most likely."""
+    n, c = left_kpa.shape
+    best = (np.inf, 0.0, 0.0, np.eye(c))
+    for length in LENGTHS:
+        likeness = kernel(state, state, length)
+        for noise in NOISES:
+            factor = cholesky(likeness + noise * np.eye(n), lower=True, check_finite=False)
+            covariance = left_kpa.T @ cho_solve((factor, True), left_kpa) / n + LEAST_KPA**2 * np.eye(c)
+            unlikely = c * np.log(np.diag(factor)).sum() + 0.5 * n * np.linalg.slogdet(covariance)[1]
+            best = min(best, (float(unlikely), length, noise, covariance), key=lambda found: found[0])
+    return best[1:]
 
 
 def without_redundant_part(pressure_kpa: np.ndarray, spring_m: np.ndarray, spec: ArmSpec) -> np.ndarray:

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from calib.fit.chambers import ChamberFit
-from calib.fit.held_pressures import HeldPressures
+from calib.fit.held_pressures import PressureFit
 from calib.fit.markers import MarkerLimits
 from calib.fit.motion.actuators import ActuatorFit
 from calib.fit.motion.damping import DampingFit
@@ -255,15 +255,33 @@ def s2r(fit: S2RFit, pose: np.ndarray, spring_m: np.ndarray, real: np.ndarray, n
     )
 
 
-def with_pressures(section: Section, held: HeldPressures) -> Section:
-    """Add the residual pressures, before and after their fit, to the network's section."""
+def with_pressures(section: Section, held: PressureFit, width_kg: np.ndarray, known_kg: float) -> Section:
+    """Add the residual pressures, before and after their fit, to the network's section.
+
+    Args:
+        section: section of the network.
+        held: fitted residual pressures.
+        width_kg (m,) [kg]: half-widths of a payload's 95 % intervals over the workspace.
+        known_kg: half-width beyond which the control loop does not believe a payload.
+    """
     text = (
         f" The pressures that hold these poses are {held.before_kpa:.2f} kPa off the simulated ones (RMS, "
-        f"held-out poses), and {held.after_kpa:.2f} kPa after a straight line in the springs' lengths, by "
-        "which payloads are estimated."
+        f"held-out poses), and {held.after_kpa:.2f} kPa with a process of each section, which expects "
+        f"{held.expected_kpa:.2f} kPa."
     )
-    data = {"held_pressures_rms_kpa": {"simulated": held.before_kpa, "fitted": held.after_kpa}}
-    return dataclasses.replace(section, text=section.text + text, data=section.data | data)
+    figures = {"simulated": held.before_kpa, "fitted": held.after_kpa, "expected": held.expected_kpa}
+    # Tell how well payloads will be known.
+    half_g, most_g = (1e3 * float(np.quantile(width_kg, share)) for share in (0.5, 0.95))
+    text += (
+        f" So a payload will be known to {half_g:.0f} g (95 %) at half of the workspace's poses, and to "
+        f"{most_g:.0f} g at 95 % of them."
+    )
+    data = {"held_pressures_rms_kpa": figures, "payload_half_width_g": {"median": half_g, "p95": most_g}}
+    warnings = section.warnings
+    if most_g > 1e3 * known_kg:
+        remedy = "record the poses of `python -m calib plan`"
+        warnings += (f"payload: known to {most_g:.0f} g, expected {1e3 * known_kg:.0f} g: {remedy}",)
+    return dataclasses.replace(section, text=section.text + text, warnings=warnings, data=section.data | data)
 
 
 def _errors(*rows: tuple[str, PoseErrors]) -> ReportTable:

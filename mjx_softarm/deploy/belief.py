@@ -18,10 +18,9 @@ import numpy as np
 from mjx_softarm._support.xp import Array, array_namespace
 from mjx_softarm.control import Allocation, Gains, allocated_error, at_chambers, saturated
 from mjx_softarm.deploy.controller import LOOP, Command, Controller, LoopConfig
-from mjx_softarm.policy.file import Policy
 from mjx_softarm.policy.runtime import tip_pose
 from mjx_softarm.sensing.estimator import SpringModel, expected_springs
-from mjx_softarm.sensing.load import HIGHEST, LOWEST, Load, averaged, estimate_load
+from mjx_softarm.sensing.load import HIGHEST, LOWEST, Load, averaged, estimate_load, load_half_width
 from mjx_softarm.sensing.sensors import Sensor, SensorFault
 
 _NO_EFFECT_M2 = 1e-18
@@ -52,6 +51,7 @@ class Belief:
     settled: bool = False  # at rest with each spring on its reference, or its chamber at a limit
     why_lost: str = ""  # message of the sensors
     estimate_kg: float | None = None  # payload by this tick's window alone; None: not estimated in this tick
+    width_kg: float = 0.0  # half-width of the 95 % interval of `estimate_kg`
     n_unweighed: int = 0  # ticks since the payload was last estimated
 
     @classmethod
@@ -133,21 +133,31 @@ def believe(
     belief = replace(belief, n_unweighed=last.n_unweighed + 1)
     doubtful = belief.lost.any() or belief.stuck.any() or belief.suspect.any()
     if belief.at_rest and belief.n_unweighed >= size and not doubtful:
-        load, estimate_kg = _weighed(policy, last.load, mean_m, window.chamber_kpa.mean(axis=0))
-        belief = replace(belief, load=load, estimate_kg=estimate_kg, n_unweighed=0)
+        mean_kpa = window.chamber_kpa.mean(axis=0)
+        load, estimate_kg, width_kg = _weighed(controller, last.load, mean_m, mean_kpa)
+        belief = replace(belief, load=load, estimate_kg=estimate_kg, width_kg=width_kg, n_unweighed=0)
     return belief
 
 
-def _weighed(policy: Policy, load: Load, mean_m: np.ndarray, mean_kpa: np.ndarray) -> tuple[Load, float]:
+def _weighed(
+    controller: Controller, load: Load, mean_m: np.ndarray, mean_kpa: np.ndarray
+) -> tuple[Load, float, float]:
     """Return the payload averaged with the estimate of mean springs and pressures at rest, and this estimate.
 
-    An estimate that is no payload leaves the specified one.
+    An estimate that is no payload leaves the specified one, and so does a first one that is not known well.
+
+    Returns:
+        Payload; estimate [kg]; half-width [kg] of its interval.
     """
-    most_kg = float(policy.load_estimator.load_scale_kg)
-    estimate_kg = float(estimate_load(policy.load_estimator, mean_m, mean_kpa))
-    if LOWEST * most_kg <= estimate_kg <= HIGHEST * most_kg:
-        return averaged(load, estimate_kg, most_kg), estimate_kg
-    return Load(policy.spec.mass.payload_kg), estimate_kg
+    policy, model = controller.policy, controller.policy.load_estimator
+    most_kg = float(model.load_scale_kg)
+    estimate_kg = float(estimate_load(model, mean_m, mean_kpa))
+    width_kg = float(load_half_width(model, mean_m, mean_kpa))
+    if not LOWEST * most_kg <= estimate_kg <= HIGHEST * most_kg:
+        return Load(policy.spec.mass.payload_kg), estimate_kg, width_kg
+    if width_kg > controller.config.load_known * most_kg:
+        return load, estimate_kg, width_kg
+    return averaged(load, estimate_kg, width_kg, most_kg), estimate_kg, width_kg
 
 
 def pose_of(controller: Controller, spring_m: np.ndarray, load: Load) -> tuple[np.ndarray, float]:

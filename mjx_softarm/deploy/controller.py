@@ -49,9 +49,9 @@ class LoopConfig:
     # a policy of TQC in motion, which arrives early: 18.6 mm without, 6.5 mm with 0.3, 4.6 with this.
     way_share_per_s: float = 0.6
 
-    # Overload, in largest payloads. Twins that carry exactly the largest are wrongly reported in 4 of 36 runs
-    # (docs/results/paper-open.json); with a smaller factor in 8 of 9.
-    overload: float = 1.4
+    # Payload, in largest payloads; by hand.
+    load_known: float = 0.3  # greatest half-width of its 95 % interval with which it is believed
+    overload: float = 1.2  # least lower end of its interval that is an overload
 
     # Faults of time and sensors.
     lost_ticks: int = 3  # ticks in a row without a reading; by hand

@@ -20,9 +20,11 @@
     SATURATED          a chamber at its limit with its spring off the reference         go on
     EXTRAPOLATION      the sim-to-real network asked far from its training rows         go on
     LOAD_LOST          a new average of the payload begins lower: an object dropped     go on
-    OVERLOADED         a payload of more than `overload` times the largest              go on
-    LOAD_UNKNOWN       springs and pressures that no payload explains: the pose is      go on
-                       estimated from the springs alone, with the specified payload
+    OVERLOADED         a payload whose whole interval is above `overload` times the     go on
+                       largest
+    LOAD_UNKNOWN       springs and pressures that no payload explains, or a calibration go on
+                       that tells none better than `load_known`: the pose is estimated
+                       from the springs alone, with the payload believed before
 
 Names in backquotes are fields of `mjx_softarm.deploy.controller.LoopConfig`. To vent is to end the run and
 bring all pressures to zero along a ramp, as at every end of a run (`mjx_softarm.deploy.ending`). Every fault
@@ -166,15 +168,20 @@ def _of_payload(controller: Controller, watch: Watch, belief: Belief) -> Iterato
     if belief.estimate_kg is None:
         return
     load, most_kg = belief.load, float(controller.policy.load_estimator.load_scale_kg)
+    config, believed = controller.config, f"the pose is estimated with {1e3 * load.believed_kg:.0f} g"
     if not LOWEST * most_kg <= belief.estimate_kg <= HIGHEST * most_kg:
-        own_g = 1e3 * controller.policy.spec.mass.payload_kg
-        text = f"springs and pressures give {1e3 * belief.estimate_kg:.0f} g, the pose is estimated from the "
-        yield Event(Fault.LOAD_UNKNOWN, f"{text}springs alone, with {own_g:.0f} g")
+        text = f"springs and pressures give {1e3 * belief.estimate_kg:.0f} g, {believed}"
+        yield Event(Fault.LOAD_UNKNOWN, text)
+    elif belief.width_kg > config.load_known * most_kg:
+        text = f"payload not known better than {1e3 * belief.width_kg:.0f} g, expected "
+        text += f"{1e3 * config.load_known * most_kg:.0f} g: record the poses of `python -m calib plan`; "
+        yield Event(Fault.LOAD_UNKNOWN, text + believed)
     if load.began and load.kg < watch.load_kg:
         text = f"{1e3 * load.believed_kg:.0f} g, from {1e3 * watch.load_kg:.0f} g before"
         yield Event(Fault.LOAD_LOST, text)
-    if load.kg > controller.config.overload * most_kg:
-        yield Event(Fault.OVERLOADED, f"{1e3 * load.kg:.0f} g, expected at most {1e3 * most_kg:.0f} g")
+    if load.kg - load.half_width_kg > config.overload * most_kg:
+        told = f"{1e3 * load.kg:.0f} +- {1e3 * load.half_width_kg:.0f} g"
+        yield Event(Fault.OVERLOADED, f"{told}, expected at most {1e3 * most_kg:.0f} g")
 
 
 def names(kind: str, mask: np.ndarray) -> str:

@@ -17,7 +17,7 @@ from mjx_softarm.policy import reach
 from mjx_softarm.policy.reach import followed
 from mjx_softarm.policy.reachable import distances
 from mjx_softarm.policy.runtime import InMotion, action_towards, actor_output, sensed, tip_pose
-from mjx_softarm.sensing.load import estimate_load
+from mjx_softarm.sensing.load import estimate_load, load_half_width
 from mjx_softarm.sensing.sensors import Reading, SensorFault
 from mjx_softarm.spec import ArmSpec
 
@@ -76,6 +76,7 @@ def answer(
         "extrapolation": away,
         "goal_outside": ~inside,
         "load_estimate_kg": estimate_load(policy.load_estimator, reading.length_m, pressure_kpa),
+        "load_half_width_kg": load_half_width(policy.load_estimator, reading.length_m, pressure_kpa),
     }
 
 
@@ -151,7 +152,10 @@ def _acting_parts(controller: Controller, at: _Inputs) -> dict[str, Computation]
         "lengths": _of(at.readings, at.spring_m, length_m=reading.length_m, lost=_lost(reading)),
         "mean_length": _of(at.springs_m, mean_m=means[0]),
         "estimated_load": _of(
-            at.springs_m, at.pressures_kpa, kg=estimate_load(policy.load_estimator, *means)
+            at.springs_m,
+            at.pressures_kpa,
+            kg=estimate_load(policy.load_estimator, *means),
+            width_kg=load_half_width(policy.load_estimator, *means),
         ),
         "tip": _of(at.spring_m, at.load_kg, tip=tip, away=constant(away)),
         "references": _of(*acting, asked_m=policy.actions.lengths(action)),

@@ -57,6 +57,7 @@ def sources(controller: Controller, policy_sha256: str) -> dict[str, str]:
         "OWN_LOAD": repr(policy.spec.mass.payload_kg),
         "LEAST_LOAD": repr(LOWEST * most_kg),
         "GREATEST_LOAD": repr(HIGHEST * most_kg),
+        "LOAD_KNOWN": repr(config.load_known * most_kg),
         "OVERLOAD": repr(config.overload * most_kg),
         "JUMP": repr(JUMP * most_kg),
         "N_JUMPS": N_JUMPS,

@@ -22,7 +22,7 @@ _VIEWS = ("reshape", "index")
 _BINARY = {"add": "+", "subtract": "-", "multiply": "*", "divide": "/", "less": "<", "less_equal": "<="}
 _BINARY |= {"greater": ">", "greater_equal": ">=", "equal": "==", "logical_and": "&&", "logical_or": "||"}
 _FUNCTIONS = {"arccos": "acos", "absolute": "fabs", "isfinite": "isfinite"}
-_FUNCTIONS |= {name: name for name in ("sqrt", "sin", "cos", "tanh", "floor")}
+_FUNCTIONS |= {name: name for name in ("sqrt", "exp", "sin", "cos", "tanh", "floor")}
 _EXPRESSIONS = {
     "negative": "(-{})",
     "logical_not": "(!{})",

@@ -24,7 +24,7 @@ OPSET, IR_VERSION = 17, 8
 ABOUT, SEAL = "mjx_softarm", "sha256"  # entries of the metadata
 SCHEMA_VERSION = 1
 
-_SAME = ("add", "sqrt", "sin", "cos", "tanh", "floor", "less", "greater", "equal", "where")
+_SAME = ("add", "sqrt", "exp", "sin", "cos", "tanh", "floor", "less", "greater", "equal", "where")
 _OPERATORS = {name: name.title() for name in _SAME}
 _OPERATORS |= {"subtract": "Sub", "multiply": "Mul", "divide": "Div", "negative": "Neg", "matmul": "MatMul"}
 _OPERATORS |= {"arccos": "Acos", "absolute": "Abs", "maximum": "Max", "minimum": "Min"}

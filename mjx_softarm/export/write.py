@@ -103,6 +103,7 @@ def describe(policy: Policy, sha256: str) -> dict[str, Any]:
             "nearest": _POSE,
             "error": {"above": policy.reward.threshold, "means": "no pressures reach the goal"},
             "load_estimate_kg": {"unit": "kg", "nan": "without pressures"},
+            "load_half_width_kg": {"unit": "kg", "nan": "without pressures"},
             "action": {"names": readings["names"], "range": [-1.0, 1.0]},
         },
         "rate_hz": policy.rate_hz,

@@ -2,12 +2,15 @@
 
 A payload bends and stretches the arm, and the sensor-space law holds the springs where they were. So springs
 alone do not show a payload; springs and pressures do. A small network estimates the payload. It is distilled
-from equilibria of simulated arms whose chambers differ from the specification's by a few per cent. A payload
-changes rarely, so estimates are averaged, until two in a row disagree with the average.
+from equilibria of simulated arms whose pressures differ from the calibrated arm's as its calibration leaves
+them unknown. A second network gives the standard deviation of the estimate. A payload changes rarely, so
+estimates are averaged, until two in a row disagree with the average. Errors of neighbouring poses are alike:
+an average is taken to be known no better than its estimates.
 """
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 from mjx_softarm._support.archive import Entries
@@ -17,6 +20,8 @@ from mjx_softarm._support.xp import Array, array_namespace
 N_AVERAGED = 8  # number of estimates in the moving average
 JUMP = 0.25  # distance from the average, as a share of the largest payload, that makes an estimate an outlier
 N_JUMPS = 2  # number of consecutive outliers that restart the average
+QUANTILE = 1.96  # half-width of a 95 % interval in standard deviations
+LEAST_SHARE, MOST_SHARE = 1e-3, 3.0  # limits of a standard deviation, in largest payloads
 # Payloads in the network's data, as shares of the largest one: an estimate outside is no payload.
 LOWEST, HIGHEST = -0.5, 1.5
 
@@ -25,6 +30,7 @@ class LoadEstimator(NamedTuple):
     """Network from springs and pressures at rest to the payload. All float32."""
 
     layers: tuple[Layer, ...]  # normalised springs and pressures -> normalised payload (1,)
+    sd_layers: tuple[Layer, ...]  # the same inputs -> logarithm of its standard deviation (1,)
     spring_centre_m: Array  # (n_springs,)
     spring_scale_m: Array  # (n_springs,)
     pressure_centre_kpa: Array  # (n_chambers,)
@@ -39,6 +45,7 @@ class Load(NamedTuple):
     n_estimates: int = 0  # estimates in the average, at most N_AVERAGED; with 0 the payload is assumed
     n_jumps: int = 0  # number of consecutive outliers
     began: bool = False  # whether the last estimate restarted the average
+    half_width_kg: float = 0.0  # half-width of the 95 % interval, the mean of the estimates' own
 
     @property
     def believed_kg(self) -> float:
@@ -54,23 +61,35 @@ def estimate_load(estimator: LoadEstimator, spring_m: Array, pressure_kpa: Array
         spring_m (..., n_springs) [m]: spring lengths.
         pressure_kpa (..., n_chambers) [kPa]: pressures of the chambers.
     """
+    return estimator.load_scale_kg * mlp(estimator.layers, _inputs(estimator, spring_m, pressure_kpa))[..., 0]
+
+
+def load_half_width(estimator: LoadEstimator, spring_m: Array, pressure_kpa: Array) -> Array:
+    """Return the half-width (...) [kg] of the 95 % interval of `estimate_load`, with the same arguments."""
+    xp = array_namespace(spring_m, pressure_kpa, estimator.load_scale_kg)
+    share = xp.exp(mlp(estimator.sd_layers, _inputs(estimator, spring_m, pressure_kpa))[..., 0])
+    return QUANTILE * estimator.load_scale_kg * xp.clip(share, LEAST_SHARE, MOST_SHARE)
+
+
+def _inputs(estimator: LoadEstimator, spring_m: Array, pressure_kpa: Array) -> Array:
+    """Return the inputs (..., n_springs + n_chambers) of both networks, normalised."""
     xp = array_namespace(spring_m, pressure_kpa, estimator.load_scale_kg)
     dtype = estimator.spring_scale_m.dtype
     springs = (xp.asarray(spring_m, dtype=dtype) - estimator.spring_centre_m) / estimator.spring_scale_m
     pressures = xp.asarray(pressure_kpa, dtype=dtype) - estimator.pressure_centre_kpa
-    x = xp.concat([springs, pressures / estimator.pressure_scale_kpa], axis=-1)
-    return estimator.load_scale_kg * mlp(estimator.layers, x)[..., 0]
+    return xp.concat([springs, pressures / estimator.pressure_scale_kpa], axis=-1)
 
 
-def averaged(load: Load, estimate_kg: float, largest_kg: float) -> Load:
-    """Return the average with one more estimate, for an arm with this largest payload."""
+def averaged(load: Load, estimate_kg: float, half_width_kg: float, largest_kg: float) -> Load:
+    """Return the average with one more estimate and its half-width, for an arm with this largest payload."""
     disagrees = load.n_estimates > 0 and abs(estimate_kg - load.kg) > JUMP * largest_kg
     if disagrees and load.n_jumps + 1 < N_JUMPS:
         return load._replace(n_jumps=load.n_jumps + 1)
     if disagrees or load.n_estimates == 0:
-        return Load(estimate_kg, 1, began=disagrees)
+        return Load(estimate_kg, 1, 0, disagrees, half_width_kg)
     n = min(load.n_estimates + 1, N_AVERAGED)
-    return Load(load.kg + (estimate_kg - load.kg) / n, n)
+    width_kg = load.half_width_kg + (half_width_kg - load.half_width_kg) / n
+    return Load(load.kg + (estimate_kg - load.kg) / n, n, half_width_kg=width_kg)
 
 
 def take_load_estimator(entries: Entries, name: str, n_chambers: int, n_springs: int) -> LoadEstimator:
@@ -82,4 +101,6 @@ def take_load_estimator(entries: Entries, name: str, n_chambers: int, n_springs:
     shapes: dict = dict.fromkeys(("spring_centre_m", "spring_scale_m"), (n_springs,))
     shapes |= dict.fromkeys(("pressure_centre_kpa", "pressure_scale_kpa"), (n_chambers,))
     shapes["load_scale_kg"] = ()
-    return entries.network(name, LoadEstimator, shapes, n_springs + n_chambers, 1)
+    n_in = n_springs + n_chambers
+    kind = partial(LoadEstimator, sd_layers=entries.layers(f"{name}.sd", n_in, 1))
+    return entries.network(name, kind, shapes, n_in, 1)

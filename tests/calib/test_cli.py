@@ -47,7 +47,15 @@ def test_demo_logs_have_no_fault(demo, capsys):
 def test_run_writes_the_whole_folder_and_nothing_beside_it(calibrated):
     status, folder = calibrated
     assert status in (0, 1)
-    names = ["arm.toml", "poses.npz", "recorded.npz", "report.html", "report.json", "s2r.npz"]
+    names = [
+        "arm.toml",
+        "poses.npz",
+        "pressures.npz",
+        "recorded.npz",
+        "report.html",
+        "report.json",
+        "s2r.npz",
+    ]
     assert sorted(p.name for p in folder.iterdir()) == names
     pairs = read_pose_pairs(folder)
     network, alone = pairs["with the network"], pairs["simulated"]

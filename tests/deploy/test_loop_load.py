@@ -189,13 +189,24 @@ def test_object_that_drops_is_reported():
     ("payload_kg", "fault", "load_kg", "message"),
     [
         (1.45, Fault.OVERLOADED, 1.45, "expected at most 1000 g"),
-        (2.5, Fault.LOAD_UNKNOWN, 0.0, "from the springs alone, with 0 g"),
+        (2.5, Fault.LOAD_UNKNOWN, 0.0, "the pose is estimated with 0 g"),
     ],
 )
 def test_overload_and_what_no_payload_explains_are_reported(payload_kg, fault, load_kg, message):
     run = follow(LoadedArm(payload_kg))
     assert set(run.counts()) == {fault} and message in run.events[0].message
     assert run.log.load_kg[-1] == pytest.approx(load_kg, abs=0.03 * (load_kg > 0.0))
+
+
+def test_a_payload_that_the_calibration_does_not_tell_is_not_believed():
+    unsure = ((np.zeros((2 * N, 1), np.float32), np.full(1, np.log(0.2), np.float32)),)
+    model = LOADED.load_estimator._replace(sd_layers=unsure)
+    run = follow(
+        LoadedArm(0.6), Controller.of(dataclasses.replace(LOADED, load_estimator=model), plan_unloaded)
+    )
+    assert set(run.counts()) == {Fault.LOAD_UNKNOWN} and run.log.load_kg[-1] == 0.0
+    told = "payload not known better than 392 g, expected 300 g: record the poses of `python -m calib plan`"
+    assert told in run.events[0].message
 
 
 def test_a_fault_of_the_payload_is_told_once_until_the_payload_changes():

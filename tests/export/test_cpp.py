@@ -28,7 +28,7 @@ from tests.linear_arm import N
 pytestmark = pytest.mark.skipif(not shutil.which("g++"), reason="there is no compiler g++ here")
 STRICT = ("-std=c++17", "-Wall", "-Wextra", "-Werror")
 SANITIZED = ("-O0", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
-MATH = {"sin", "cos", "tan", "tanh", "atan2", "acos", "floor", "sqrt"}
+MATH = {"sin", "cos", "tan", "tanh", "atan2", "acos", "floor", "sqrt", "exp"}
 
 
 def compile_(*arguments):

@@ -19,11 +19,12 @@ from mjx_softarm.mdp.observation import OBS_LAYOUT, layouts
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.policy import file as export
 from mjx_softarm.policy.file import load_policy, policy_from_actor, save_policy
+from mjx_softarm.sensing.load import load_half_width
 from tests.properties import few
 
 PROVENANCE = {"commit": "0123abc", "created": "2025-01-31", "packages": {"numpy": "2.0"}, "seed": 7}
-# Digest of the names that schema 9 stores and of the fields of its specification.
-SCHEMA_9 = "20341334"
+# Digest of the names that schema 10 stores and of the fields of its specification.
+SCHEMA_10 = "91fb2258"
 TWO_SECTIONS = ArmSpec.default().replace(structure={"n_sections": 2})
 
 
@@ -105,7 +106,7 @@ def test_parts_are_those_of_the_arm(file):
 
 def test_file_is_plain_npz_with_named_layouts(file):
     arrays = arrays_of(file)
-    assert arrays["schema_version"] == 9 and arrays["s2r_kind"] == "mlp"
+    assert arrays["schema_version"] == 10 and arrays["s2r_kind"] == "mlp"
     parts, axes = ("pose", "goal", "error"), ("x_mm", "y_mm", "z_mm", "yaw_deg", "pitch_deg", "roll_deg")
     assert arrays["obs_layout"].tolist() == [f"{part}_{axis}" for part in parts for axis in axes]
     assert arrays["action_layout"].tolist() == [f"frequency{k}" for k in range(9)]
@@ -113,8 +114,9 @@ def test_file_is_plain_npz_with_named_layouts(file):
 
 def test_file_of_schema_7_is_read(file):
     """The springs of all sections had one axis."""
-    policy = load_policy(file)
     site_m = arrays_of(file)["estimator.spring_site_m"]
+    reseal(file, drop=("s2r.error_mm",), schema_version=np.asarray(8))
+    policy = load_policy(file)
     reseal(file, schema_version=np.asarray(7), **{"estimator.spring_site_m": site_m.reshape(9, 2)})
     assert_same(load_policy(file), policy)
 
@@ -122,9 +124,19 @@ def test_file_of_schema_7_is_read(file):
 def test_file_of_schema_8_does_not_know_the_error_of_its_network(file):
     policy = load_policy(file)
     reseal(file, drop=("s2r.error_mm",), schema_version=np.asarray(8))
-    assert_same(
-        load_policy(file), dataclasses.replace(policy, s2r=policy.s2r._replace(error_mm=np.float32(0)))
-    )
+    s2r = policy.s2r._replace(error_mm=np.float32(0))
+    model = load_policy(file).load_estimator
+    assert_same(load_policy(file), dataclasses.replace(policy, s2r=s2r, load_estimator=model))
+
+
+def test_file_of_schema_9_knows_each_payload_alike(file):
+    policy, errors = load_policy(file), [name for name in arrays_of(file) if ".sd." in name]
+    reseal(file, drop=errors, schema_version=np.asarray(9))
+    nine = load_policy(file)
+    half_width_kg = load_half_width(nine.load_estimator, np.full((2, 9), 0.2), np.zeros((2, 9)))
+    np.testing.assert_allclose(half_width_kg, 0.2 * policy.load_estimator.load_scale_kg, rtol=1e-6)
+    model = nine.load_estimator._replace(sd_layers=policy.load_estimator.sd_layers)
+    assert_same(dataclasses.replace(nine, load_estimator=model), policy)
 
 
 def test_actor_with_one_layer_and_arm_with_two_sections(tmp_path, make_arm_model):
@@ -212,7 +224,7 @@ def test_files_that_are_no_policy(tmp_path):
 
 def test_another_schema_is_named_before_anything_else(file):
     reseal(file, drop=["gains.kp_kpa_per_m", "observation"], schema_version=np.array(6))
-    expected = "expected 7 or 8 or 9: export the run again, or train it anew"
+    expected = "expected 7 or 8 or 9 or 10: export the run again, or train it anew"
     assert refusal(file) == f"schema_version: got 6, {expected}"
 
 
@@ -247,7 +259,7 @@ def test_every_entry_is_required_and_its_type_shape_and_numbers_are_checked(file
         ({"rate_hz": np.array(0.0)}, "rate_hz: got 0.0, expected a number > 0"),
         ({"n_actions": np.array(0)}, "n_actions: got 0, expected a whole number > 0"),
         ({"s2r_kind": np.array("tree")}, "s2r_kind: got tree, expected mlp or none"),
-        ({"s2r_kind": np.array("none")}, "s2r.0.bias: got an unknown entry, expected those of schema 9"),
+        ({"s2r_kind": np.array("none")}, "s2r.0.bias: got an unknown entry, expected those of schema 10"),
         ({"workspace": np.zeros((0, 6), np.float32)}, "workspace: got float32 (0, 6), expected "),
         ({"estimator__spring_scale_m": np.zeros(9, np.float32)}, "estimator.spring_scale_m: got [0.0, "),
         ({"provenance_json": np.array("[1]")}, "provenance_json: got '[1]', expected a JSON object"),
@@ -286,12 +298,12 @@ def test_failed_write_keeps_the_old_file_and_leaves_nothing(file, make_policy, m
     assert file.read_bytes() == before
 
 
-def test_schema_9_stays_as_it_is(file, make_policy):
+def test_schema_10_stays_as_it_is(file, make_policy):
     groups = make_policy().spec.to_dict().items()
     fields = [f"{name}.{item}" for name, group in groups if isinstance(group, dict) for item in group]
     names = "\n".join(sorted([*arrays_of(file), *fields]))
     digest = hashlib.sha256(names.encode()).hexdigest()[:8]
-    assert digest == SCHEMA_9, "other entries, or other fields of ArmSpec: raise export.SCHEMA_VERSION"
+    assert digest == SCHEMA_10, "other entries, or other fields of ArmSpec: raise export.SCHEMA_VERSION"
 
 
 def test_the_policy_that_ships_is_one_of_this_version_for_the_paper_s_arm():

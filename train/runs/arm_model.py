@@ -17,6 +17,7 @@ import mjx_softarm
 from mjx_softarm._support.archive import Entries, SealedFileError, entries_of, read_sealed, write_sealed
 from mjx_softarm.mechanics.workspace import sample_evenly, sample_workspace
 from mjx_softarm.policy.networks import ArmModel, take_networks
+from mjx_softarm.sensing.held_pressures import HeldPressures
 from mjx_softarm.sensing.s2r import S2R, correct
 from mjx_softarm.spec import ArmSpec
 from train.runs import estimator
@@ -41,6 +42,7 @@ def arm_model(
     s2r: S2R | None,
     folder: Path | None = None,
     tell: Callable[[str], object] = lambda text: None,
+    held: HeldPressures | None = None,
 ) -> DistilledArm:
     """Return the model of an arm, which is distilled once in a process.
 
@@ -49,17 +51,18 @@ def arm_model(
         s2r: sim-to-real network of its calibration, if there is one.
         folder: keeps the networks in a file, which is used again for the same arm and the same code.
         tell: takes a line before the networks are distilled, unless this process has them already.
+        held: residual pressures of its calibration, if there are some.
 
     Raises:
         SpecError: the arm settles at too few pressures.
     """
-    file, key = folder and folder / ESTIMATORS_FILE, _key(spec)
+    file, key = folder and folder / ESTIMATORS_FILE, _key(spec, held)
     if file and (kept := _read(file, key, spec)):
         networks, errors = kept
     else:
         if key not in _distilled:
             tell("distilling pose and payload estimators for this arm, about a minute ...")
-            _distilled[key] = distil(spec, SEED)
+            _distilled[key] = distil(spec, SEED, held)
         distilled = _distilled[key]
         networks = distilled.estimator, distilled.load_estimator, distilled.spring_model
         errors = {
@@ -85,14 +88,16 @@ def _read(file: Path, key: str, spec: ArmSpec) -> tuple[tuple[Any, Any, Any], di
         return None
 
 
-def _key(spec: ArmSpec) -> str:
-    """Return a checksum of the arm, the settings of its networks, JAX's version and the code that makes them.
+def _key(spec: ArmSpec, held: HeldPressures | None) -> str:
+    """Return a checksum of the arm with its residual pressures, of the networks' settings, JAX and the code.
 
     The code is `train/runs/estimator.py`, `mjx_softarm/spec.py` and the modules of `_support`, `mechanics`
     and `sensing`, without subfolders. Versions of other packages, and the device, are not part of it.
     """
     settings = [spec.to_dict(), SEED, estimator.N_TRAINING, estimator.N_HELD_OUT, estimator.SCHEDULE]
     digest = hashlib.sha256(json.dumps([*settings, estimator.PAYLOADS, jax.__version__]).encode())
+    for values in held or ():
+        digest.update(values.tobytes())
     package = Path(mjx_softarm.__file__).parent
     folders = (package / name for name in ("_support", "mechanics", "sensing"))
     for source in (

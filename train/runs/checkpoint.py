@@ -17,6 +17,12 @@ from mjx_softarm._support.provenance import provenance, write_json
 from mjx_softarm.logs.files import LogError
 from mjx_softarm.logs.pose_pairs import PosePairs, write_pose_pairs
 from mjx_softarm.logs.schema import Log, write_log
+from mjx_softarm.sensing.held_pressures import (
+    PRESSURES_FILE,
+    HeldPressures,
+    find_pressures,
+    save_pressures,
+)
 from mjx_softarm.sensing.s2r import S2R, S2R_FILE, load_s2r, save_s2r
 from mjx_softarm.spec import ArmSpec
 from train.agent.registry import LEARNERS, name_of
@@ -38,10 +44,11 @@ class RunError(InputError):
 class Run:
     """The folder of one run.
 
-    `config.json` (settings, arm, calibration, versions, commit), `s2r.npz` (the calibration's sim-to-real
-    network, if it has one), `demonstrations.npz` (if it learns from them), `checkpoints/`, `metrics.jsonl`,
-    `poses.npz` (of the newest evaluation), `evaluation.json`, pictures, TensorBoard's event files and, once
-    exported, `policy.npz` and `estimators.npz`.
+    `config.json` (settings, arm, calibration, versions, commit), `s2r.npz` and `pressures.npz` (the
+    calibration's sim-to-real network and residual pressures, if it has them), `demonstrations.npz` (if it
+    learns from them), `checkpoints/`, `metrics.jsonl`, `poses.npz` (of the newest evaluation),
+    `evaluation.json`, pictures, TensorBoard's event files and, once exported, `policy.npz` and
+    `estimators.npz`.
 
     Several processes that train together share the folder. All of them open it and save checkpoints. The
     first process alone writes all else.
@@ -62,6 +69,7 @@ class Run:
         demonstrations: Log | None = None,
         begins_with: dict[str, Path] | None = None,
         first: tuple[TrainState, dict[str, Any]] | None = None,
+        held: HeldPressures | None = None,
     ) -> Run:
         """Start a folder.
 
@@ -73,6 +81,7 @@ class Run:
             demonstrations: rows of the file of demonstrations, if the run learns from one.
             begins_with: folders of other runs whose parts the first state has, by part.
             first: first state with its parts, if it is not drawn from the seed.
+            held: residual pressures of the arm's calibration, if there are some.
 
         Raises:
             RunError: the folder already holds a run, or cannot be made.
@@ -89,6 +98,8 @@ class Run:
                 path.mkdir(parents=True, exist_ok=True)
                 if s2r is not None:
                     save_s2r(path / S2R_FILE, s2r)
+                if held is not None:
+                    save_pressures(path / PRESSURES_FILE, held)
                 if demonstrations is not None:
                     write_log(path / DEMONSTRATIONS_FILE, demonstrations)
                 shutil.rmtree(path / CHECKPOINTS, ignore_errors=True)
@@ -145,6 +156,15 @@ class Run:
             return load_demonstrations(self.path / DEMONSTRATIONS_FILE, self.spec)
         except LogError as error:
             raise RunError(str(error)) from error
+
+    def held_pressures(self) -> HeldPressures | None:
+        """Return the residual pressures of the arm's calibration, or None.
+
+        Raises:
+            SealedFileError: the file cannot be read.
+        """
+        spec = self.spec
+        return find_pressures(self.path, spec.structure.n_sections, spec.n_springs, spec.n_chambers)
 
     @property
     def latest_epoch(self) -> int | None:

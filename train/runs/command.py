@@ -60,6 +60,7 @@ class Reach(ReachOptions):
             raise ConfigError("learner.from_policy: got true, expected it only with --agent RUN, in motion")
         config = self.config.with_policy_of(agent.config) if agent else self.config
         spec, s2r = self.read_arm(console)
+        held = self.read_pressures(spec)
         console.print("drawing goals from the reachable workspace ...")
         env = ReachEnv(spec, config.env, s2r)
         if env.spec != spec:
@@ -68,9 +69,10 @@ class Reach(ReachOptions):
         task = task_of(config, env, mesh=mesh)
         path = self.out or runs.default_path("reach", self.preset, config.seed)
         if agent is None:
-            return _train(Run.create(path, config, spec, s2r), task, console)
+            return _train(Run.create(path, config, spec, s2r, held=held), task, console)
         first = runs.begin_with(task, config.seed, {"agent": agent})
-        return _train(Run.create(path, config, spec, s2r, None, {"agent": agent.path}, first), task, console)
+        run = Run.create(path, config, spec, s2r, None, {"agent": agent.path}, first, held)
+        return _train(run, task, console)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,7 +129,8 @@ class Imitate(NewRunOptions):
         task = task_of(config, ReachEnv(spec, config.env, s2r), from_log(log, spec), mesh)
         first = runs.begin_with(task, config.seed, opened)
         path = self.out or runs.default_path("imitate", self.preset, config.seed)
-        return _train(Run.create(path, config, spec, s2r, log, donors, first), task, console)
+        run = Run.create(path, config, spec, s2r, log, donors, first, self.read_pressures(spec))
+        return _train(run, task, console)
 
 
 def evaluate(
@@ -205,11 +208,14 @@ def export(
     for path in folders:
         run, file, keeps = Run.open(path), out, path
         check_policy(run)  # before the networks are distilled, which takes a minute
+        held = run.held_pressures()
         if calibration:
-            later = renewed(run, *ArmOptions(calibration=calibration).read_arm(console))
+            options = ArmOptions(calibration=calibration)
+            later = renewed(run, *options.read_arm(console))
             enough &= told_enough(run, later, console)
             run, file, keeps = later, out or path / f"policy-{calibration.name}.npz", calibration
-        policy = export_run(run, arm_model(run.spec, run.s2r, keeps, console.print), file)
+            held = options.read_pressures(run.spec)
+        policy = export_run(run, arm_model(run.spec, run.s2r, keeps, console.print, held), file)
         console.print(f"policy: {policy}", highlight=False, soft_wrap=True)
         files = export_onnx(policy) if onnx else []
         for file in [*files, *(export_cpp(policy, cpp) if cpp else [])]:

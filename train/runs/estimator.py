@@ -1,9 +1,10 @@
 """Small networks for the arm's computer, distilled from the simulator: of load, pose and springs.
 
 The networks (`mjx_softarm.sensing.estimator`, `mjx_softarm.sensing.load`) learn equilibria over the whole
-workspace, and are tested on held-out ones. The load network learns from arms whose chambers are off, since no
-calibration is perfect. The pose network has no pressures as inputs: it would mistake a chamber's error for a
-change of shape.
+workspace, and are tested on held-out ones. No calibration is perfect. So the load network learns from arms
+whose pressures differ from the calibrated arm's by draws of what its log leaves unknown
+(`mjx_softarm.sensing.held_pressures`), or whose chambers are off where there was no log. The pose network has
+no pressures as inputs: it would mistake a chamber's error for a change of shape.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from calib.fit.s2r import simulate_poses
 from mjx_softarm._support.training import Schedule, initial_layers, train_network
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.workspace import (
@@ -34,16 +36,25 @@ from mjx_softarm.sensing.estimator import (
     estimate_frame,
     expected_springs,
 )
-from mjx_softarm.sensing.load import HIGHEST, LOWEST, LoadEstimator, estimate_load
+from mjx_softarm.sensing.held_pressures import HeldPressures, held_kpa
+from mjx_softarm.sensing.load import (
+    HIGHEST,
+    LOWEST,
+    QUANTILE,
+    LoadEstimator,
+    estimate_load,
+    load_half_width,
+)
 from mjx_softarm.sensing.pose import frame_from_pose
 from mjx_softarm.spec import ArmSpec
 
-N_TRAINING, N_HELD_OUT = 16_384, 2_048
+N_TRAINING, N_JUDGING, N_HELD_OUT = 16_384, 4_096, 2_048
 MORE_PRESSURE = 0.25  # share of the pressure range that is added at either end
 WIDTH = 128  # width of the hidden layers
+SD_WIDTH = 32  # width of those of the payload's error
 SCHEDULE = Schedule(n_updates=8_000, learning_rate=4e-3, batch_size=256)
 PAYLOADS = (0.0, 0.25, 0.5, 1.0)  # shares of the largest payload at which errors are given
-CHAMBERS_OFF = 0.03  # share by which stiffness and area of a chamber may be off
+CHAMBERS_OFF = 0.03  # share by which stiffness and area of a chamber may be off without a log of the arm
 TURN_MM = 50.0  # tip distance that costs as much as a turn by one radian
 CHANGE_SCALE = 0.015  # scale of the network's outputs, in mean section lengths and half radians
 
@@ -65,12 +76,13 @@ class Distilled(NamedTuple):
     errors: dict[str, dict[float, Error]]  # by quantity and payload [kg], see `_errors`
 
 
-def distil(spec: ArmSpec, seed: int) -> Distilled:
+def distil(spec: ArmSpec, seed: int, held: HeldPressures | None = None) -> Distilled:
     """Return the networks of an arm; the same seed gives the same networks.
 
     Args:
         spec: the arm, calibrated or not.
         seed: seed of the equilibria, the initial weights and the batches.
+        held: residual pressures of its log, if there is one.
 
     Raises:
         ValueError: the seed draws the held-out equilibria.
@@ -81,27 +93,55 @@ def distil(spec: ArmSpec, seed: int) -> Distilled:
     keys = jax.random.split(jax.random.key(seed), 7)
     # Learn the pose of the arm as specified, then how a load changes it.
     poses = _with_load(sample_workspace(_stronger(spec), N_TRAINING, seed), spec.mass.payload_kg)
-    loaded = _as_measured(spec, sample_loaded(spec, _loads(spec, seed), CHAMBERS_OFF, seed))
+    loaded = _loaded(spec, held, _loads(spec, seed), seed)
     estimator = _fit(_first_estimator(spec, poses, keys[0]), _pose_loss, poses, keys[1])
     estimator = _fit(estimator, _pose_loss, loaded, keys[2], "load_layers")
     # Learn the load of arms that are off, and the springs of the unloaded arm.
     load_estimator = _fit(_first_load_estimator(spec, loaded, keys[3]), _load_loss, loaded, keys[4])
-    unloaded = _as_measured(spec, sample_workspace(spec, N_TRAINING, seed))
+    # The error is learned from poses that the load network does not know, on which it is larger.
+    others = _loaded(spec, held, _loads(spec, seed + 1)[: CANDIDATES_PER_POSE * N_JUDGING], seed + 1)
+    load_estimator = _fit(load_estimator, _load_sd_loss, others, jax.random.fold_in(keys[4], 1), "sd_layers")
+    unloaded = _as_measured(spec, held, sample_workspace(spec, N_TRAINING, seed))
     springs = _fit(_first_spring_model(unloaded, keys[5]), _spring_loss, unloaded, keys[6])
     # Test them.
     networks = (estimator, load_estimator, springs)
     pose, load, springs = jax.tree.map(lambda x: np.asarray(x, np.float32), networks)
-    return Distilled(pose, load, springs, _errors(pose, load, springs, spec))
+    return Distilled(pose, load, springs, _errors(pose, load, springs, spec, held))
 
 
 def _with_load(pool: Pool, load_kg: float) -> LoadedPool:
     return LoadedPool(jnp.full(len(pool.pose), load_kg), pool.pressure_kpa, pool.spring_m, pool.pose)
 
 
-def _as_measured(spec: ArmSpec, pool: Any) -> Any:
-    """Return poses with the pressures that hold the real arm there, as far as its calibration knows them."""
-    real_kpa = pool.pressure_kpa + spec.unmodelled_kpa(np.asarray(pool.spring_m))
-    return pool._replace(pressure_kpa=jnp.asarray(real_kpa, jnp.float32))
+def _as_measured(spec: ArmSpec, held: HeldPressures | None, pool: Any) -> Any:
+    """Return poses without a payload, with the pressures that hold the real arm as far as they are known."""
+    return _with_pressures(spec, held, pool, np.zeros_like(pool.pressure_kpa))
+
+
+def _loaded(spec: ArmSpec, held: HeldPressures | None, many_kg: np.ndarray, seed: int) -> LoadedPool:
+    """Draw poses of arms with payloads [kg], which are off as far as the calibration does not tell."""
+    pool = sample_loaded(spec, many_kg, CHAMBERS_OFF if held is None else 0.0, seed)
+    if held is None:
+        return _with_pressures(spec, None, pool, np.zeros_like(pool.pressure_kpa))
+    # The effect of the payload is the difference to the arm without it, held at the same springs.
+    light = simulate_poses(spec, np.asarray(pool.spring_m))
+    pool = jax.tree.map(lambda values: np.asarray(values)[light.valid], pool)
+    effect_kpa = pool.pressure_kpa - light.pressure_kpa[light.valid]
+    return _with_pressures(spec, held, pool, effect_kpa, np.random.default_rng([seed, 2]))
+
+
+def _with_pressures(
+    spec: ArmSpec,
+    held: HeldPressures | None,
+    pool: Any,
+    effect_kpa: np.ndarray,
+    rng: np.random.Generator | None = None,
+) -> Any:
+    """Return poses with the pressures that hold the real arm; see `held_kpa`."""
+    spring_m, kpa = np.asarray(pool.spring_m), np.asarray(pool.pressure_kpa)
+    if held is not None:
+        kpa = held_kpa(held, spring_m, kpa - effect_kpa, effect_kpa, rng)
+    return pool._replace(pressure_kpa=jnp.asarray(kpa + spec.unmodelled_kpa(spring_m), jnp.float32))
 
 
 def _loads(spec: ArmSpec, seed: int) -> np.ndarray:
@@ -145,8 +185,10 @@ def _first_estimator(spec: ArmSpec, pool: LoadedPool, key: Array) -> PoseEstimat
 
 
 def _first_load_estimator(spec: ArmSpec, pool: LoadedPool, key: Array) -> LoadEstimator:
+    n_in = spec.n_springs + spec.n_chambers
     return LoadEstimator(
-        layers=initial_layers(key, (spec.n_springs + spec.n_chambers, WIDTH, WIDTH, 1)),
+        layers=initial_layers(key, (n_in, WIDTH, WIDTH, 1)),
+        sd_layers=initial_layers(jax.random.fold_in(key, 1), (n_in, SD_WIDTH, SD_WIDTH, 1)),
         **_scaling("spring", "m", pool.spring_m),
         **_scaling("pressure", "kpa", pool.pressure_kpa),
         load_scale_kg=jnp.asarray(_load_max_kg(spec)),
@@ -185,6 +227,13 @@ def _load_loss(estimator: LoadEstimator, pool: LoadedPool) -> Array:
     return jnp.mean((off_kg / estimator.load_scale_kg) ** 2)
 
 
+def _load_sd_loss(estimator: LoadEstimator, pool: LoadedPool) -> Array:
+    """Return the negative log-likelihood of the payload's errors, less a constant."""
+    off_kg = estimate_load(estimator, pool.spring_m, pool.pressure_kpa) - pool.load_kg
+    sd_kg = load_half_width(estimator, pool.spring_m, pool.pressure_kpa) / QUANTILE
+    return jnp.mean(0.5 * (off_kg / sd_kg) ** 2 + jnp.log(sd_kg))
+
+
 def _spring_loss(model: SpringModel, pool: Pool) -> Array:
     """Return the mean square of the springs' errors [mm]."""
     return jnp.mean((1e3 * (expected_springs(model, pool.pressure_kpa) - pool.spring_m)) ** 2)
@@ -203,14 +252,19 @@ def _fit(
 
 
 def _errors(
-    estimator: PoseEstimator, load_estimator: LoadEstimator, spring_model: SpringModel, spec: ArmSpec
+    estimator: PoseEstimator,
+    load_estimator: LoadEstimator,
+    spring_model: SpringModel,
+    spec: ArmSpec,
+    held: HeldPressures | None,
 ) -> dict[str, dict[float, Error]]:
     """Return errors by payload on top of the specification's.
 
     `tip_mm` and `turn_deg` are errors of the pose network with the true load. `load_kg` is the error of arms
     whose chambers are off, `spring_mm` the error of each arm's worst spring.
     """
-    found = {name: {} for name in ("tip_mm", "turn_deg", "load_kg", "spring_mm")}
+    names = ("tip_mm", "turn_deg", "load_kg", "load_half_width_kg", "spring_mm")
+    found: dict[str, dict[float, Error]] = {name: {} for name in names}
     for share in PAYLOADS:
         payload_kg = share * spec.mass.largest_payload_kg
         load_kg = spec.mass.payload_kg + payload_kg
@@ -221,7 +275,7 @@ def _errors(
             held_out = sample_workspace(loaded, N_HELD_OUT, HELD_OUT_SEED)
         else:  # at constant pressures it may buckle
             held_out = sample_loaded(spec, many_kg, 0.0, HELD_OUT_SEED)
-        pool = jax.tree.map(np.asarray, _as_measured(spec, held_out))
+        pool = jax.tree.map(np.asarray, _as_measured(spec, held, held_out))
         position_m, rotation = frame_from_pose(pool.pose)
         guess = estimate_frame(estimator, pool.spring_m, load_kg)
         chord = np.sqrt(np.sum((guess.rotation - rotation) ** 2, axis=(-2, -1)) / 8)  # sin of half the angle
@@ -230,9 +284,11 @@ def _errors(
         found["turn_deg"][payload_kg] = _error(np.degrees(2.0 * np.arcsin(np.minimum(chord, 1.0))))
         found["spring_mm"][payload_kg] = _error(1e3 * springs.max(axis=-1))
         # Estimate the load of arms whose chambers are off.
-        off = _as_measured(spec, sample_loaded(spec, many_kg, CHAMBERS_OFF, HELD_OUT_SEED))
+        off = _loaded(spec, held, many_kg, HELD_OUT_SEED)
         estimate_kg = np.asarray(estimate_load(load_estimator, off.spring_m, off.pressure_kpa))
         found["load_kg"][payload_kg] = _error(np.abs(estimate_kg - load_kg))
+        widths_kg = load_half_width(load_estimator, off.spring_m, off.pressure_kpa)
+        found["load_half_width_kg"][payload_kg] = _error(np.asarray(widths_kg))
     return found
 
 

@@ -50,7 +50,7 @@ class SweepCommand(ReachOptions):
             members, varied = members_of(self.config, self.seeds, self.vary)
             spec, s2r = self.read_arm(console)
             path = self.out or free_path(Path("runs") / f"sweep-{self.preset}")
-            sweep = create(path, members, varied, spec, s2r)
+            sweep = create(path, members, varied, spec, s2r, self.read_pressures(spec))
         console.print(f"sweep: {sweep.path}, {len(sweep.runs)} members", highlight=False)
         # Train all of them, and report.
         try:

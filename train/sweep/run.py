@@ -16,6 +16,7 @@ from rich.console import Console
 
 from mjx_softarm._support.provenance import provenance, write_json
 from mjx_softarm.env import EnvConfig, ReachEnv
+from mjx_softarm.sensing.held_pressures import HeldPressures
 from mjx_softarm.sensing.s2r import S2R
 from mjx_softarm.spec import ArmSpec
 from train.config import TrainConfig
@@ -48,6 +49,7 @@ def create(
     varied: Sequence[str],
     spec: ArmSpec,
     s2r: S2R | None = None,
+    held: HeldPressures | None = None,
 ) -> Sweep:
     """Start the folder of a sweep, whole or not at all.
 
@@ -57,6 +59,7 @@ def create(
         varied: settings in which the members differ, besides their seeds.
         spec: the arm.
         s2r: sim-to-real network of the arm's calibration, if there is one.
+        held: residual pressures of the arm's calibration, if there are some.
 
     Raises:
         RunError: there is such a folder already, or it cannot be made.
@@ -68,7 +71,7 @@ def create(
     part = path.with_name(path.name + ".part")
     shutil.rmtree(part, ignore_errors=True)  # left by a start that was interrupted
     for name, config in members.items():
-        Run.create(part / name, config, spec, s2r)
+        Run.create(part / name, config, spec, s2r, held=held)
     data = {"members": list(members), "varied": list(varied), "provenance": provenance("train")}
     try:
         write_json(part / SWEEP_FILE, data)

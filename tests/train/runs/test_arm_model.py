@@ -14,7 +14,7 @@ def test_networks_are_distilled_again_only_for_another_arm_or_code(tmp_path, mon
     errors = {"tip_mm": {0.0: Error(1.0, 2.0, 3.0)}}
     networks = POLICY.estimator, POLICY.load_estimator, POLICY.spring_model
     told, file = [], tmp_path / arm_model.ESTIMATORS_FILE
-    monkeypatch.setattr(arm_model, "distil", lambda spec, seed: Distilled(*networks, errors))
+    monkeypatch.setattr(arm_model, "distil", lambda spec, seed, held: Distilled(*networks, errors))
     monkeypatch.setattr(arm_model, "_workspace", lambda *_: POLICY.workspace)
 
     def model(spec=POLICY.spec):
@@ -39,7 +39,7 @@ def test_networks_are_distilled_again_only_for_another_arm_or_code(tmp_path, mon
 
 def test_a_folder_to_read_only_changes_nothing(tmp_path, monkeypatch):
     networks = POLICY.estimator, POLICY.load_estimator, POLICY.spring_model
-    monkeypatch.setattr(arm_model, "distil", lambda spec, seed: Distilled(*networks, {}))
+    monkeypatch.setattr(arm_model, "distil", lambda spec, seed, held: Distilled(*networks, {}))
     monkeypatch.setattr(arm_model, "_workspace", lambda *_: POLICY.workspace)
     monkeypatch.setattr(arm_model, "_distilled", {})
     told = []

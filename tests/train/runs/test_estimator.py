@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from calib.fit.held_pressures import fit_held_pressures
 from mjx_softarm import ArmSpec
 from mjx_softarm.control import TOLERANCE_M, Gains, saturated
 from mjx_softarm.deploy.belief import as_without
@@ -16,7 +17,7 @@ from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.settle import settle
 from mjx_softarm.mechanics.workspace import HELD_OUT_SEED, sample_workspace
 from mjx_softarm.sensing.estimator import estimate_frame, expected_springs
-from mjx_softarm.sensing.load import estimate_load
+from mjx_softarm.sensing.load import estimate_load, load_half_width
 from mjx_softarm.sensing.pose import frame_from_pose
 from train.runs import estimator as module
 from train.runs.estimator import PAYLOADS, distil
@@ -154,15 +155,28 @@ def test_all_of_the_training_is_worth_it():
     assert errors[0.5].median < 0.7 and errors[1.0].median < 0.7
 
 
-def test_a_payload_is_estimated_with_the_pressures_that_calibration_found(monkeypatch, distilled, pool):
-    small(monkeypatch, 1000)
+def test_a_payload_is_estimated_within_its_interval_with_the_pressures_that_calibration_found(
+    monkeypatch, distilled, pool
+):
+    """Residual pressures are an offset, as older calibrations have it, and those of chambers that harden."""
+    small(monkeypatch, 3000)
     monkeypatch.setattr(module, "PAYLOADS", (0.0,))
-    rng = np.random.default_rng(5)
-    table = {"pressure_kpa": tuple(rng.normal(0, 2, N)), "slope_kpa_per_m": tuple(rng.normal(0, 100, N * N))}
-    spec = SPEC.replace(unmodelled=table)
-    held_kpa = pool.pressure_kpa + spec.unmodelled_kpa(pool.spring_m)
-    found = distil(spec, 0).load_estimator
-    estimate_kg = np.abs(
-        [estimate_load(estimator, pool.spring_m, held_kpa) for estimator in (distilled.load_estimator, found)]
-    )
-    assert np.median(estimate_kg[1]) < 0.08 < 0.15 < np.median(estimate_kg[0])
+    spec = SPEC.replace(unmodelled={"pressure_kpa": tuple(np.random.default_rng(5).normal(0, 2, N))})
+
+    def hardening(spring_m):
+        return 40.0 * ((spring_m - 0.2) / 0.2) ** 2 * np.linspace(-1.0, 1.0, N)
+
+    # Calibrate by half of the unloaded poses, and estimate payloads at the other half, and with a payload.
+    rows, others = (jax.tree.map(lambda x, k=k: x[k::2], pool) for k in range(2))
+    measured_kpa = rows.pressure_kpa + hardening(rows.spring_m)
+    held = fit_held_pressures(spec, rows.spring_m, measured_kpa, rows.pressure_kpa).held
+    found = distil(spec, 0, held).load_estimator
+    loaded = jax.device_get(sample_workspace(SPEC.replace(mass={"payload_kg": 0.5}), N_ARMS, 79))
+    for arms, payload_kg in ((others, 0.0), (loaded, 0.5)):
+        kpa = arms.pressure_kpa + hardening(arms.spring_m) + spec.unmodelled_kpa(arms.spring_m)
+        models = distilled.load_estimator, found
+        told_kg = np.array([estimate_load(model, arms.spring_m, kpa) for model in models])
+        off_kg = np.abs(told_kg - payload_kg)
+        assert np.median(off_kg[1]) < 0.08 and np.median(off_kg[0]) > 1.5 * np.median(off_kg[1])
+        half_width_kg = load_half_width(found, arms.spring_m, kpa)
+        assert np.mean(off_kg[1] < half_width_kg) > 0.9 and np.median(half_width_kg) < 0.3

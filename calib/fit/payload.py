@@ -1,0 +1,154 @@
+"""How well an arm's payload is told from springs and pressures, over the workspace.
+
+A payload m changes the pressures that hold given springs by m e. The residual pressures of the sections
+(`mjx_softarm.sensing.held_pressures`) have the covariances v_s V_s. By generalised least squares, the
+variance of the payload is the inverse of the information
+
+    I = sum_s e_s^T V_s^-1 e_s / v_s.
+
+Poses that are recorded make v_s smaller around them, whatever pressures are measured there. So poses can be
+chosen before they are recorded.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from calib.fit.held_pressures import with_payloads, without_redundant_part
+from calib.fit.s2r import simulate_poses
+from calib.read.static_poses import StaticPoses
+from mjx_softarm.mechanics.excitation import random_pressures
+from mjx_softarm.mechanics.workspace import settle_many
+from mjx_softarm.sensing.held_pressures import (
+    POSE_FACTOR,
+    HeldPressures,
+    covariances,
+    kernel,
+    residual,
+    sections_of,
+)
+from mjx_softarm.sensing.load import QUANTILE
+from mjx_softarm.spec import ArmSpec
+
+N_POSES, SEED = 400, 1  # poses over the workspace, and their seed
+LEAST_SHARE = 0.1  # least known payload that counts, in largest payloads
+
+
+class PayloadPoses(NamedTuple):
+    """Poses of the simulated arm over its workspace, and the effect of payloads on them."""
+
+    spring_m: np.ndarray  # (m, n_springs)
+    pressure_kpa: np.ndarray  # (m, n_chambers) that hold these springs without a payload
+    effect_kpa_per_kg: np.ndarray  # (m, n_chambers) change of these pressures by a payload
+
+
+def payload_poses(spec: ArmSpec, n: int = N_POSES, seed: int = SEED) -> PayloadPoses:
+    """Return poses at n random pressures, without those at which the arm does not settle."""
+    found = settle_many(spec, random_pressures(spec, n, seed))
+    spring_m, payload_kg = found.spring_m[found.settled], spec.mass.largest_payload_kg
+    loaded = spec.replace(mass={"payload_kg": spec.mass.payload_kg + payload_kg})
+    light, heavy = (simulate_poses(arm, spring_m) for arm in (spec, loaded))
+    both = light.valid & heavy.valid
+    effect = (heavy.pressure_kpa - light.pressure_kpa) / payload_kg
+    return PayloadPoses(spring_m[both], light.pressure_kpa[both], effect[both])
+
+
+def fit_payloads(spec: ArmSpec, held: HeldPressures, poses: StaticPoses) -> HeldPressures:
+    """Return a process whose factors are fitted to those of the poses that have a known payload."""
+    kg, own_kg = poses.payload_kg, spec.mass.payload_kg
+    least_kg = own_kg + LEAST_SHARE * spec.mass.largest_payload_kg
+    known = np.isfinite(poses.spring_m).all(axis=1) & (kg >= least_kg)
+    found = [np.empty((0, n)) for n in (spec.n_springs, *3 * (spec.n_chambers,))]
+    for payload_kg in np.unique(kg[known]):
+        rows = np.flatnonzero(known & (kg == payload_kg))
+        arms = (spec.replace(mass={"payload_kg": each_kg}) for each_kg in (own_kg, payload_kg))
+        light, heavy = (simulate_poses(arm, poses.spring_m[rows]) for arm in arms)
+        both = light.valid & heavy.valid
+        spring_m = poses.spring_m[rows]
+        measured_kpa = without_redundant_part(poses.pressure_kpa[rows], spring_m, spec)
+        kpa = measured_kpa, light.pressure_kpa, heavy.pressure_kpa - light.pressure_kpa
+        for k, values in enumerate((spring_m, *kpa)):
+            found[k] = np.concatenate([found[k], values[both]])
+    return with_payloads(held, *found) if len(found[0]) else held
+
+
+def payload_half_widths(held: HeldPressures, at: PayloadPoses, payload_kg: float) -> np.ndarray:
+    """Return half-widths (m,) [kg] of the 95 % intervals of a payload at poses."""
+    effect = held.factor * at.effect_kpa_per_kg
+    covariance = covariances(held, residual(held, at.spring_m, at.pressure_kpa).share)
+    own = held.factor_covariance + POSE_FACTOR**2 * np.eye(len(held.factor))
+    per_kg = at.effect_kpa_per_kg
+    covariance += payload_kg**2 * per_kg[:, :, None] * own * per_kg[:, None]
+    information = np.einsum("mi,mi->m", effect, np.linalg.solve(covariance, effect[..., None])[..., 0])
+    return QUANTILE / np.sqrt(information)
+
+
+def informed(held: HeldPressures, spring_m: np.ndarray, pressure_kpa: np.ndarray) -> HeldPressures:
+    """Return a process that knows k poses more, whose residuals are its own means there."""
+    if not len(spring_m):
+        return held
+    state = (sections_of(spring_m, pressure_kpa, held.state.shape[1]) - held.centre) / held.scale
+    mean_kpa = residual(held, spring_m, pressure_kpa).mean_kpa
+    return held._replace(
+        state=np.concatenate([held.state, state]), residual_kpa=np.concatenate([held.residual_kpa, mean_kpa])
+    )
+
+
+def choose_for_payload(
+    held: HeldPressures,
+    at: PayloadPoses,
+    spring_m: np.ndarray,
+    pressure_kpa: np.ndarray,
+    n: int,
+    taken: np.ndarray | None = None,
+) -> np.ndarray:
+    """Choose n poses to record that reduce the payload's mean variance most, one by one.
+
+    Args:
+        held: residual pressures known so far.
+        at: poses at which the payload is to be told.
+        spring_m (k, n_springs) [m]: spring lengths of the candidates.
+        pressure_kpa (k, n_chambers) [kPa]: pressures of the candidates.
+        n: number of poses.
+        taken: indices of candidates that are chosen already, and known to the process.
+
+    Returns:
+        Indices (n,) of candidates.
+    """
+    # Covariances (s, ...) of the sections' states given the recorded poses: candidates with all poses
+    options = np.concatenate([spring_m, at.spring_m]), np.concatenate([pressure_kpa, at.pressure_kpa])
+    states = (sections_of(*options, held.state.shape[1]) - held.centre) / held.scale
+    k, across = len(spring_m), []
+    for s, (length, noise) in enumerate(zip(held.length, held.noise, strict=True)):
+        rows, state = held.state[:, s], states[:, s]
+        factor = cho_factor(kernel(rows, rows, length) + noise * np.eye(len(rows)), lower=True)
+        known = kernel(rows, state, length)
+        across.append(kernel(state[:k], state, length) - known[:, :k].T @ cho_solve(factor, known))
+    covariance, strength = np.array(across), _strength(held, at)
+    share = residual(held, at.spring_m, at.pressure_kpa).share
+    own = np.arange(k)
+    chosen: list[int] = []
+    for _ in range(n):
+        # Variances (k, m, s) of the payload's poses with each candidate, then the best candidate
+        seen = covariance[:, own, own] + held.noise[:, None]  # (s, k)
+        less = covariance[:, :, k:] ** 2 / seen[..., None]  # (s, k, m)
+        after = np.maximum(share.T[:, None] - less, held.noise[:, None, None])
+        variance = 1.0 / np.sum(strength.T[:, None] / after, axis=0)  # (k, m)
+        variance = np.mean(variance, axis=1)
+        variance[[*chosen, *(() if taken is None else taken)]] = np.inf
+        best = int(np.argmin(variance))
+        chosen.append(best)
+        # Covariances given that one, too
+        share = after[:, best].T
+        covariance -= covariance[:, :, best, None] * (covariance[:, best] / seen[:, best, None])[:, None]
+    return np.array(chosen, int)
+
+
+def _strength(held: HeldPressures, at: PayloadPoses) -> np.ndarray:
+    """Return e_s^T V_s^-1 e_s (m, s) [1/kg^2]."""
+    effect = at.effect_kpa_per_kg.reshape(len(at.spring_m), *held.residual_kpa.shape[1:])
+    inverse = np.linalg.inv(held.covariance_kpa2)
+    return np.einsum("msi,sij,msj->ms", effect, inverse, effect)

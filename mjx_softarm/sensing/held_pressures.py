@@ -1,0 +1,167 @@
+"""Pressures that hold a calibrated arm at rest, less those of its simulation: a process for each section.
+
+Chambers harden, and their areas grow with pressure, as those of the simulation do not. How much depends on a
+section's own springs and pressures, whatever hangs below it. So the residual of the c chambers of a section
+is a Gaussian process of the section's state u: its spring lengths and simulated pressures, standardised. With
+the covariance V (c, c) between chambers,
+
+    cov(r(u), r(u')) = k(u, u') V,    k = 1 + u.u' + exp(-|u - u'|^2 / (2 l^2)) + noise where u = u'.
+
+A payload is told from pressures: about 4 kPa of the paper's arm for each kilogram. The mean of the process
+corrects them. Its variance tells how well a payload is known: it is large far from the poses of the log.
+
+A payload changes a chamber's pressure by a factor f of what the simulation says. The log of an unloaded arm
+does not tell f: with all stiffnesses, areas and masses greater by the same share, it would be the same log.
+Poses with a known payload do. f is normal, and a pose adds a deviation of its own.
+
+Source: Rasmussen, Williams, "Gaussian Processes for Machine Learning", MIT Press 2006, section 2.2.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from mjx_softarm._support.archive import Entries, entries_of, read_sealed, write_sealed
+
+# Standard deviations of the factors; by hand, from rods: of all chambers together, by masses and areas that
+# are off by some per cent; of each chamber; of each chamber at each pose.
+COMMON_FACTOR, OWN_FACTOR, POSE_FACTOR = 0.05, 0.1, 0.1
+KIND = "pressures"
+PRESSURES_FILE = "pressures.npz"  # in the folder of a calibration, and of a run that was trained with it
+
+
+class HeldPressures(NamedTuple):
+    """Residual pressures at n poses at rest of an arm with s sections, c chambers a section. All float64."""
+
+    state: np.ndarray  # (n, s, d) standardised springs and simulated pressures of the sections
+    centre: np.ndarray  # (s, d) [m, kPa] subtracted from springs and pressures
+    scale: np.ndarray  # (s, d) [m, kPa] divided by
+    residual_kpa: np.ndarray  # (n, s, c) measured minus simulated pressures
+    length: np.ndarray  # (s,) distance of states over which the residual changes
+    noise: np.ndarray  # (s,) variance of what no state explains, over V
+    covariance_kpa2: np.ndarray  # (s, c, c) V
+    factor: np.ndarray  # (s c,) mean of f
+    factor_covariance: np.ndarray  # (s c, s c) covariance of f
+
+
+class Residual(NamedTuple):
+    """Posterior of the residual pressures of m arms at rest without a payload."""
+
+    mean_kpa: np.ndarray  # (m, s, c)
+    share: np.ndarray  # (m, s) variance, noise included, over V
+
+
+def prior_factor(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean (n,) and covariance (n, n) of the factors of n chambers without a known payload."""
+    return np.ones(n), COMMON_FACTOR**2 + OWN_FACTOR**2 * np.eye(n)
+
+
+def held_kpa(
+    held: HeldPressures,
+    spring_m: np.ndarray,
+    light_kpa: np.ndarray,
+    effect_kpa: np.ndarray,
+    rng: np.random.Generator | None = None,
+) -> np.ndarray:
+    """Return the pressures (m, n_chambers) [kPa] that hold the real arm.
+
+    Args:
+        held: process of the arm.
+        spring_m (m, n_springs) [m]: spring lengths.
+        light_kpa (m, n_chambers) [kPa]: pressures that hold the simulated arm there without a payload.
+        effect_kpa (m, n_chambers) [kPa]: change of these pressures by the arm's payload.
+        rng: generator that draws for each arm what the log does not tell; without one, means are returned.
+    """
+    found = residual(held, spring_m, light_kpa)
+    left_kpa, factor = found.mean_kpa, held.factor
+    if rng is not None:
+        root, shape = np.linalg.cholesky(held.covariance_kpa2), light_kpa.shape
+        normal = rng.standard_normal(left_kpa.shape)
+        left_kpa = left_kpa + np.sqrt(found.share)[..., None] * np.einsum("sij,msj->msi", root, normal)
+        factor = rng.multivariate_normal(factor, held.factor_covariance, len(spring_m))
+        factor = factor + POSE_FACTOR * rng.standard_normal(shape)
+    return light_kpa + left_kpa.reshape(light_kpa.shape) + factor * effect_kpa
+
+
+def sections_of(spring_m: np.ndarray, pressure_kpa: np.ndarray, n_sections: int) -> np.ndarray:
+    """Return the springs [m] and pressures [kPa] (m, s, d) of each section, of arms (m, ...)."""
+    parts = [x.reshape(len(x), n_sections, x.shape[1] // n_sections) for x in (spring_m, pressure_kpa)]
+    return np.concatenate(parts, axis=-1).astype(float)
+
+
+def kernel(a: np.ndarray, b: np.ndarray, length: float) -> np.ndarray:
+    """Return k (n, m) between the states (n, d) and (m, d) of a section, without noise."""
+    inner = a @ b.T
+    square = np.maximum(np.sum(a**2, axis=1)[:, None] + np.sum(b**2, axis=1) - 2.0 * inner, 0.0)
+    return 1.0 + inner + np.exp(-square / (2.0 * length**2))
+
+
+def residual(held: HeldPressures, spring_m: np.ndarray, pressure_kpa: np.ndarray) -> Residual:
+    """Return the residual pressures of m arms at rest.
+
+    Args:
+        held: process of the arm.
+        spring_m (m, n_springs) [m]: spring lengths.
+        pressure_kpa (m, n_chambers) [kPa]: simulated pressures that hold these lengths.
+    """
+    n_sections = held.state.shape[1]
+    state = (sections_of(spring_m, pressure_kpa, n_sections) - held.centre) / held.scale
+    mean, share = np.empty((len(state), *held.residual_kpa.shape[1:])), np.empty(state.shape[:2])
+    for s in range(n_sections):
+        rows, length = held.state[:, s], held.length[s]
+        factor = cho_factor(kernel(rows, rows, length) + held.noise[s] * np.eye(len(rows)), lower=True)
+        across = kernel(rows, state[:, s], length)  # (n, m)
+        mean[:, s] = across.T @ cho_solve(factor, held.residual_kpa[:, s])
+        own = 2.0 + np.sum(state[:, s] ** 2, axis=1)
+        share[:, s] = own - np.sum(across * cho_solve(factor, across), axis=0) + held.noise[s]
+    return Residual(mean, np.maximum(share, held.noise))
+
+
+def covariances(held: HeldPressures, share: np.ndarray) -> np.ndarray:
+    """Return covariances (m, s c, s c) [kPa^2] of residual pressures with variances (m, s) over V."""
+    m, s = share.shape
+    blocks = share[:, :, None, None] * held.covariance_kpa2
+    c = blocks.shape[-1]
+    found = np.zeros((m, s, c, s, c))
+    found[:, np.arange(s), :, np.arange(s)] = np.swapaxes(blocks, 0, 1)
+    return found.reshape(m, s * c, s * c)
+
+
+def save_pressures(path: Path, held: HeldPressures) -> None:
+    """Write a process; raises as `write_sealed` does."""
+    write_sealed(path, entries_of(KIND, held), KIND)
+
+
+def find_pressures(folder: Path, n_sections: int, n_springs: int, n_chambers: int) -> HeldPressures | None:
+    """Read the process of an arm from a folder; None where the folder has none.
+
+    Raises:
+        SealedFileError: the file is damaged, or of another arm.
+    """
+    file = folder / PRESSURES_FILE
+    if not file.exists():
+        return None
+    entries = Entries(read_sealed(file, KIND, "python -m calib run"), str(file))
+    s, c = n_sections, n_chambers // n_sections
+    d = n_springs // n_sections + c
+    shapes: dict[str, tuple[int | None, ...]] = {
+        "state": (None, s, d),
+        "centre": (s, d),
+        "scale": (s, d),
+        "residual_kpa": (None, s, c),
+        "length": (s,),
+        "noise": (s,),
+        "covariance_kpa2": (s, c, c),
+        "factor": (n_chambers,),
+        "factor_covariance": (n_chambers, n_chambers),
+    }
+    arrays = {name: entries.take(f"{KIND}.{name}", np.float64, shape) for name, shape in shapes.items()}
+    held = HeldPressures(**arrays)
+    if len(held.state) != len(held.residual_kpa):
+        entries.fail(f"{KIND}.residual_kpa", f"got {len(held.residual_kpa)} rows, expected {len(held.state)}")
+    entries.finish(1)
+    return held
