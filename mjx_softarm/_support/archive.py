@@ -87,7 +87,7 @@ def read_sealed(path: Path, kind: str, made_by: str) -> dict[str, np.ndarray]:
 def sealed(arrays: Mapping[str, Any], kind: str) -> bytes:
     """Return the bytes of a file; mark and digest are the zip archive's comment."""
     buffer = io.BytesIO()
-    np.savez(buffer, **arrays)
+    np.savez_compressed(buffer, **arrays)
     with zipfile.ZipFile(buffer, "a") as archive:
         archive.comment = _mark(kind) + bytes(_N_DIGEST)
     content = buffer.getvalue()[:-_N_DIGEST]

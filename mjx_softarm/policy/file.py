@@ -74,6 +74,7 @@ OLD_LOAD_SD = 0.2 / QUANTILE  # largest payloads
 KIND = "policy"
 LAW = Gains._fields[:-1]  # entries of the law; its allocation follows from the specification
 SHIPPED = Path(__file__).parent / "shipped/paper.npz"  # for the paper's arm; its card is beside it
+SHIPPED_TWIN = SHIPPED.with_name("twin0.npz")  # calibrated to twin:0
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,6 +5,7 @@ Without a log, an arm is driven and steered from a page; Ctrl-C vents it and end
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,20 +17,20 @@ import tyro
 
 from mjx_softarm._support import cli
 from mjx_softarm._support.errors import InputError, needing
-from mjx_softarm.deploy.__main__ import PolicyFile, check_file, tell
+from mjx_softarm.deploy.__main__ import check_file, tell
 from mjx_softarm.deploy.controller import Controller
-from mjx_softarm.deploy.drivers.driven import Arms, Driven, finish
+from mjx_softarm.deploy.drivers.driven import Arm, Driven, finish
 from mjx_softarm.deploy.drivers.same_arm import check_arm
 from mjx_softarm.deploy.ending import save_log
 from mjx_softarm.logs.schema import TABLES
-from mjx_softarm.policy.file import SHIPPED, load_policy
+from mjx_softarm.policy.file import SHIPPED, SHIPPED_TWIN, load_policy
 from mjx_softarm.spec import ArmSpec
 
 if TYPE_CHECKING:
     import viser
 
 PROGRAM, HERE = "python -m mjx_softarm.view", "127.0.0.1"
-TWIN = Driven("twin:7")
+HINT = "try next: hang 500 g with the payload slider; the arm tells it, and corrects the circle"
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,28 @@ class Address:
     """port to listen on; the next free one, if it is taken"""
 
 
+@dataclass(frozen=True)
+class Steered(Driven):
+    """Arm that the page steers, and its policy."""
+
+    arm: Arm = "twin:0"
+    policy: Annotated[
+        cli.MaybePath,
+        tyro.conf.arg(
+            help="file that `python -m train export` wrote",
+            help_behavior_hint="(default: the package's own, calibrated to twin:0, or for the paper's arm)",
+        ),
+    ] = None
+    uncalibrated: bool = False
+    """drive twin:0 by the package's policy for the paper's arm, which was not calibrated to it"""
+
+    @property
+    def file(self) -> Path:
+        """File of the policy."""
+        calibrated = re.fullmatch(r"twin:0(:\w+)*", self.arm) and not self.uncalibrated
+        return self.policy or (SHIPPED_TWIN if calibrated else SHIPPED)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit status."""
     words = sys.argv[1:] if arguments is None else list(arguments)
@@ -50,8 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _view(
     logs: tyro.conf.Positional[tuple[Path, ...]] = (),
-    policy: PolicyFile = SHIPPED,
-    on: Arms = TWIN,
+    on: Annotated[Steered, tyro.conf.arg(name="")] = Steered(),
     log: cli.MaybePath = None,
     demos: cli.MaybePath = None,
     spec: cli.SpecFile = None,
@@ -83,10 +105,11 @@ def _view(
     from mjx_softarm.view.live import live
     from mjx_softarm.view.page import Setup
 
-    read = load_policy(policy)
+    read = load_policy(on.file)
     io = on.open(read.spec, tell)
     check_arm(io, Controller.of(read), f"--arm {on.arm}")
-    setup = Setup(read, on.arm, at.host, at.port, hasattr(io, "attach"), demos is not None)
+    hint = HINT if on.file == SHIPPED_TWIN else ""
+    setup = Setup(read, on.arm, at.host, at.port, hasattr(io, "attach"), demos is not None, hint)
     saves = [partial(save_log, path) if path else None for path in (log, demos)]
     status = live(setup, io, tell, partial(_welcome, at.host), *saves).status
     finish(io, tell)

@@ -26,6 +26,7 @@ class Look(NamedTuple):
     seen: np.ndarray  # (6,) [mm, deg] tip pose from motion capture
     marker_m: np.ndarray  # (k, 3)
     payload_kg: float = 0.0
+    load_kg: float = np.nan  # payload that the loop believes
 
     @property
     def tip(self) -> np.ndarray:
@@ -72,6 +73,7 @@ def look_at(row: Mapping[str, Any], spring_m: np.ndarray, spec: ArmSpec, payload
         seen=seen,
         marker_m=row.get("marker_m", np.empty((0, 3))),
         payload_kg=float(row.get("payload_kg", payload_kg)),
+        load_kg=float(row.get("load_kg", np.nan)),
     )
 
 
@@ -88,6 +90,6 @@ def looks(log: Log, spec: ArmSpec) -> Callable[[int], Look]:
         problem = f"got neither {sensor.reading_name}0.. nor spring0.., expected springs to draw the arm by"
         raise LogError([Finding(log.source, None, "", problem)])
     groups = ("time_s", "pressure_kpa", "tip_m", "tip_quaternion", "marker_m")
-    names = (*groups, "payload_kg", "reference_m", "goal", "estimate")
+    names = (*groups, "payload_kg", "load_kg", "reference_m", "goal", "estimate")
     present = {name: value for name in names if (value := getattr(log, name)) is not None}
     return lambda k: look_at({name: value[k] for name, value in present.items()}, spring_m[k], spec)

@@ -31,6 +31,7 @@ class Setup(NamedTuple):
     port: int
     carries: bool = False  # a payload can be attached to the arm
     records: bool = False  # poses can be taken as demonstrations
+    hint: str = ""  # line about what to try next
 
 
 def serve(connection: Connection, setup: Setup) -> None:
@@ -53,7 +54,7 @@ class Page:
     """One arm with gizmo, buttons, bars and traces, the same for all browsers."""
 
     def __init__(self, server: viser.ViserServer, end: End, setup: Setup):
-        self._server, self._end = server, end
+        self._server, self._end, self._hint = server, end, setup.hint
         self._known: dict[str, Any] = {"doing": "is not heard yet", "armed": False, "lines": ()}
         self._n_frames, self._heard_s, self._moved_s = 0, time.monotonic(), -DRAG_S
         self._at = np.full(6, np.nan)  # pose that the gizmo shows
@@ -158,4 +159,6 @@ class Page:
         else:
             colours = {"moves": BLUE, "holds": css(GOAL)}
             title, colour = f"The arm {doing}", colours.get(doing.split()[0], MUTED)
-        self._panel.show_text(title, colour, self._known.get("look"), lines[::-1])
+        self._panel.show_text(
+            title, colour, self._known.get("look"), [*filter(None, [self._hint]), *lines[::-1]]
+        )

@@ -306,7 +306,9 @@ def test_schema_10_stays_as_it_is(file, make_policy):
     assert digest == SCHEMA_10, "other entries, or other fields of ArmSpec: raise export.SCHEMA_VERSION"
 
 
-def test_the_policy_that_ships_is_one_of_this_version_for_the_paper_s_arm():
+def test_the_policies_that_ship_are_small_and_one_is_calibrated():
     policy = load_policy(export.SHIPPED)
     assert policy.spec == ArmSpec.default() and policy.s2r is None
-    assert export.SHIPPED.stat().st_size < 1e6
+    twin = load_policy(export.SHIPPED_TWIN)
+    assert twin.calibrated and twin.observation == "payload"
+    assert export.SHIPPED.stat().st_size + export.SHIPPED_TWIN.stat().st_size < 1.5e6

@@ -1,6 +1,7 @@
 """Looks of a log, and the bars against what they show."""
 
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,6 +26,18 @@ def test_saturated_chambers_are_found_and_marked():
     assert "-10.0</text>" in drawn
     nothing = look_at({"time_s": 0.0}, np.full(N, np.nan), SPEC)
     assert "nan" not in panel.bars(nothing, limits)
+
+
+def test_the_payload_that_the_loop_believes_is_told():
+    panel = pytest.importorskip("mjx_softarm.view.panel", reason="needs viser", exc_type=ImportError)
+    shown, row = SimpleNamespace(), {"time_s": 0.0, "estimate": np.zeros(6), "goal": np.zeros(6)}
+    page = SimpleNamespace(_text=shown)
+    for known, words in (({}, None), ({"load_kg": 0.412}, "payload <b>412 g</b>")):
+        panel.Panel.show_text(
+            page, "The arm holds", "", look_at(row | known, np.full(N, REST_M), SPEC), ["<try>"]
+        )
+        assert "&lt;try&gt;" in shown.content and ("payload" in shown.content) == bool(words)
+        assert words is None or words in shown.content
 
 
 def test_bars_of_other_arms(other_arm):
@@ -54,6 +67,11 @@ def test_looks_of_a_log():
     at = looks(log, SPEC)
     np.testing.assert_allclose(at(2).spring_m, spring_m[2])
     assert np.flatnonzero(np.isnan(at(1).spring_m)).tolist() == [3]
-    assert at(2).time_s == 2.0 and np.isnan(at(2).estimate).all() and not at(2).goal.any()
+    assert (
+        np.isnan(at(2).load_kg)
+        and at(2).time_s == 2.0
+        and np.isnan(at(2).estimate).all()
+        and not at(2).goal.any()
+    )
     with pytest.raises(LogError, match=r"x\.csv: got neither frequency0\.\. nor spring0\.\., expected"):
         looks(Log("x.csv", np.arange(2, 6), np.arange(4.0)), SPEC)
