@@ -131,8 +131,8 @@ def _firmware(spec: cli.SpecFile = None, out: Path = Path("softarm")) -> int:
     numbers = {
         "int N_SPRINGS": f"{arm.n_springs}",
         "int N_CHAMBERS": f"{arm.n_chambers}",
-        "float MIN_KPA": f"{float(np.min(arm.chambers.pressure_min_kpa))}f",
-        "float MAX_KPA": f"{float(np.max(arm.chambers.pressure_max_kpa))}f",
+        "float MIN_KPA": f"{arm.chambers.pressure_min_kpa}f",
+        "float MAX_KPA": f"{arm.chambers.pressure_max_kpa}f",
     }
     text = FIRMWARE.read_text("utf-8")
     for name, value in numbers.items():

@@ -62,7 +62,7 @@ def board(program, request):
 
     def change(*words):
         print(*words, file=process.stdin, flush=True)
-        return float(process.stdout.readline()) if words == ("time",) else None
+        return float(process.stdout.readline()) if words[0] in ("time", "kpa") else None
 
     request.addfinalizer(end)
     return arm, change
@@ -136,6 +136,27 @@ def test_a_leaking_chamber_shows_in_the_measured_pressures(board):
         arm.read_sensors()
     off = np.abs(arm.pressures() - 10.0)
     assert off[3] > 3.0 and np.delete(off, 3).max() < 1.5
+
+
+@pytest.mark.parametrize("count", [0, 9, 4090, 4095])
+def test_a_chamber_whose_sensor_s_wire_is_cut_is_closed(count, board):
+    arm, change = board
+    settled(arm, np.full(9, 10.0))
+    change("wire", 3, count)
+    before_kpa, began_s = change("kpa", 3), change("time")
+    while change("time") - began_s < 1.0:
+        arm.write_pressures(np.full(9, 15.0))
+        arm.read_sensors()
+    assert change("kpa", 3) == pytest.approx(before_kpa, abs=0.5)
+    np.testing.assert_allclose(np.delete(arm.pressures(), 3), 15.0, atol=1.5)
+
+
+def test_a_sensor_that_reads_above_the_limits_lets_no_supply_in(board):
+    arm, change = board
+    settled(arm, np.full(9, 10.0))
+    change("wire", 3, 3000)  # 46.5 kPa
+    time.sleep(0.1)
+    assert change("kpa", 3) < 10.5
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,12 @@
 // Reference firmware of an arm: LDC1612 converters read its springs, two valves a chamber hold its pressures.
 //
 // It answers the lines of `mjx_softarm.deploy.drivers` (`python -m pydoc mjx_softarm.deploy.drivers`) and keeps
-// the pressures between them. Without a `P` line for a second it lets all pressures go to zero. Nothing in
-// loop() waits. It needs a board with 3.3 V, some 40 pins and USB, such as a Teensy 4.1; begin with your numbers.
+// the pressures between them. Without a `P` line for a second it lets all pressures go to zero. It needs a board
+// with 3.3 V, some 40 pins and USB, such as a Teensy 4.1; begin with your numbers.
+//
+// Readings of nine springs take some 5 ms on I2C, and a bus that hangs may stop loop(): all valves are closed
+// before a transfer. A board without a timeout of its Wire stops for good then, and keeps its pressures: turn its
+// watchdog on. Wire the valves so that they are closed while the board starts.
 // `python -m mjx_softarm firmware --spec arm.toml` writes a copy with the numbers of your arm.
 
 #include <Arduino.h>
@@ -31,9 +35,12 @@ constexpr uint8_t DRIVE_CURRENT = 18;  // 0 to 31; the amplitude at a coil shoul
 constexpr uint8_t FILL_PIN[] = {0, 1, 2, 3, 4, 5, 6, 7, 8};
 constexpr uint8_t DRAIN_PIN[] = {9, 10, 11, 12, 24, 25, 28, 29, 30};
 constexpr uint8_t SENSOR_PIN[] = {14, 15, 16, 17, 20, 21, 22, 23, 26};
-constexpr float KPA_AT_0 = -100.0f;  // sensor's pressure at 0 V and at the converter's full range
+// Sensor's pressure at 0 V and at the converter's full range. Both lie beyond the limits, so that a cut wire,
+// which reads one of them, is no pressure of the arm.
+constexpr float KPA_AT_0 = -100.0f;
 constexpr float KPA_AT_FULL = 100.0f;
 constexpr int ADC_BITS = 12;
+constexpr int ADC_END = 20;  // counts from either end in which a sensor's wire counts as cut
 constexpr float DEADBAND_KPA = 0.3f;  // both valves are closed this close to the set point
 
 // ---- Numbers that fit most arms -------------------------------------------------------------------------
@@ -49,6 +56,9 @@ constexpr float CONVERSION_S = 0.004f;
 constexpr float SETTLE_S = 2e-5f;
 constexpr size_t LONGEST = 512;  // characters of a line
 
+constexpr float KPA_AT_END = (KPA_AT_FULL - KPA_AT_0) * ADC_END / ((1 << ADC_BITS) - 1);
+static_assert(KPA_AT_0 + KPA_AT_END < MIN_KPA, "KPA_AT_0: expected a sensor that reads pressures below MIN_KPA");
+static_assert(KPA_AT_FULL - KPA_AT_END > MAX_KPA, "KPA_AT_FULL: expected a sensor that reads pressures above MAX_KPA");
 static_assert(sizeof COILS / sizeof COILS[0] == N_SPRINGS, "COILS: expected one for each spring");
 static_assert(sizeof FILL_PIN == N_CHAMBERS, "FILL_PIN: expected one for each chamber");
 static_assert(sizeof DRAIN_PIN == N_CHAMBERS, "DRAIN_PIN: expected one for each chamber");
@@ -141,10 +151,22 @@ float measured(int chamber) {
   return KPA_AT_0 + share * (KPA_AT_FULL - KPA_AT_0);
 }
 
+void closeValves(int chamber) {
+  digitalWrite(FILL_PIN[chamber], LOW);
+  digitalWrite(DRAIN_PIN[chamber], LOW);
+}
+
 // Open the valve that leads towards the set point, or none; never both, which would join supply and vacuum.
+// Set points are within the limits, so a chamber above them is drained, and one below them is filled.
 void regulate() {
   for (int k = 0; k < N_CHAMBERS; ++k) {
-    const float error = target_kpa[k] - measured(k);
+    const float kpa = measured(k);
+    // A cut wire reads an end of the range whatever the pressure is: either valve would stay open for ever.
+    if (kpa <= KPA_AT_0 + KPA_AT_END || kpa >= KPA_AT_FULL - KPA_AT_END) {
+      closeValves(k);
+      continue;
+    }
+    const float error = target_kpa[k] - kpa;
     if (error <= DEADBAND_KPA) digitalWrite(FILL_PIN[k], LOW);
     if (error >= -DEADBAND_KPA) digitalWrite(DRAIN_PIN[k], LOW);
     if (error > DEADBAND_KPA) digitalWrite(FILL_PIN[k], HIGH);
@@ -177,6 +199,7 @@ void refuse(unsigned long number, const char *why) {
 }
 
 void answerReadings(unsigned long number) {
+  for (int k = 0; k < N_CHAMBERS; ++k) closeValves(k);  // until the transfers have ended
   Serial.print("R ");
   Serial.print(number);
   for (const Coil &coil : COILS) {
@@ -248,6 +271,7 @@ void setup() {
   for (int k = 0; k < N_CHAMBERS; ++k) {
     pinMode(FILL_PIN[k], OUTPUT);
     pinMode(DRAIN_PIN[k], OUTPUT);
+    closeValves(k);
     target_kpa[k] = 0.0f;
   }
   analogReadResolution(ADC_BITS);

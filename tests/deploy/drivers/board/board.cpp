@@ -3,7 +3,9 @@
 // usage: board FD SPEED. FD is an end of the line. Each loop() takes a millisecond of the board's time, which
 // goes SPEED times as fast as ours, or slower on a busy host. Lines on standard input change the hardware, or
 // ask for the board's time [s]:
-//   gone PORT ADDRESS   reset PORT ADDRESS   flag PORT ADDRESS BITS   leak CHAMBER   time
+//   gone PORT ADDRESS   reset PORT ADDRESS   flag PORT ADDRESS BITS   leak CHAMBER   wire CHAMBER COUNT
+// or ask for the time [s], or a chamber's pressure [kPa]:
+//   time   kpa CHAMBER
 
 #include "firmware.ino"
 
@@ -97,6 +99,7 @@ Chip *found(int address) {
 
 double kpa[N_CHAMBERS], at_s = 0.0;
 bool leaks[N_CHAMBERS];
+std::map<int, int> cut;  // counts that sensors with a cut wire read, whatever the pressure is
 std::map<int, int> levels;
 
 void flow() {
@@ -116,7 +119,9 @@ void change(const std::string &text) {
   int a = 0, b = 0, c = 0;
   words >> what >> a >> b >> c;
   if (what == "time") std::cout << seconds() << std::endl;
+  if (what == "kpa") flow(), std::cout << kpa[a] << std::endl;
   if (what == "leak") leaks[a] = true;
+  if (what == "wire") cut[a] = b;
   if (what == "gone") chips.at({a, b}).gone = true;
   if (what == "reset") chips.at({a, b}).reset();
   if (what == "flag") chips.at({a, b}).flags = c;
@@ -136,7 +141,8 @@ void digitalWrite(uint8_t pin, uint8_t level) {
 int analogRead(uint8_t pin) {
   flow();
   for (int k = 0; k < N_CHAMBERS; ++k)
-    if (SENSOR_PIN[k] == pin) return static_cast<int>(std::lround((kpa[k] + 100.0) / 200.0 * 4095));
+    if (SENSOR_PIN[k] == pin)
+      return cut.count(k) ? cut[k] : static_cast<int>(std::lround((kpa[k] + 100.0) / 200.0 * 4095));
   fail("analogRead: expected the pin of a sensor");
   return 0;
 }
@@ -165,6 +171,8 @@ void Bus::setClock(uint32_t) {}
 void Bus::beginTransmission(uint8_t address) { addressed = address, sent.clear(); }
 void Bus::write(uint8_t byte) { sent.push_back(static_cast<char>(byte)); }
 uint8_t Bus::endTransmission(bool) {
+  for (const auto &level : levels)
+    if (level.second) fail("valves: expected all closed during a transfer, which may hang");
   if (addressed == MULTIPLEXER) {
     for (port = 0; !(sent[0] >> port & 1); ++port) {
     }
