@@ -24,6 +24,7 @@ BENCHMARKS = {
     "changes": "benchmarks.accuracy.changes:measure",
     "correction": "benchmarks.accuracy.correction:measure",
     "planning": "benchmarks.accuracy.planning:measure",
+    "payload": "benchmarks.accuracy.payload:measure",
     "arms": "benchmarks.accuracy.arms:measure",
     "logs": "benchmarks.accuracy.logs:measure",
     "regulators": "benchmarks.accuracy.regulators:measure",

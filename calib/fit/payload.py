@@ -78,10 +78,7 @@ def fit_payloads(spec: ArmSpec, held: HeldPressures, poses: StaticPoses) -> Held
 def payload_half_widths(held: HeldPressures, at: PayloadPoses, payload_kg: float) -> np.ndarray:
     """Return half-widths (m,) [kg] of the 95 % intervals of a payload at poses."""
     effect = held.factor * at.effect_kpa_per_kg
-    covariance = covariances(held, residual(held, at.spring_m, at.pressure_kpa).share)
-    own = held.factor_covariance + POSE_FACTOR**2 * np.eye(len(held.factor))
-    per_kg = at.effect_kpa_per_kg
-    covariance += payload_kg**2 * per_kg[:, :, None] * own * per_kg[:, None]
+    covariance = _covariance(held, at, np.full(len(effect), payload_kg))
     information = np.einsum("mi,mi->m", effect, np.linalg.solve(covariance, effect[..., None])[..., 0])
     return QUANTILE / np.sqrt(information)
 
@@ -95,6 +92,41 @@ def informed(held: HeldPressures, spring_m: np.ndarray, pressure_kpa: np.ndarray
     return held._replace(
         state=np.concatenate([held.state, state]), residual_kpa=np.concatenate([held.residual_kpa, mean_kpa])
     )
+
+
+def told_payload(
+    spec: ArmSpec, held: HeldPressures, spring_m: np.ndarray, pressure_kpa: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return payloads (m,) [kg] of arms at rest, and half-widths (m,) of their 95 % intervals.
+
+    The covariance depends a little on the payload itself, so the estimate is repeated once.
+
+    Args:
+        spec: calibrated arm.
+        held: residual pressures of its calibration.
+        spring_m (m, n_springs) [m]: spring lengths.
+        pressure_kpa (m, n_chambers) [kPa]: measured pressures.
+    """
+    own_kg, largest_kg = spec.mass.payload_kg, spec.mass.largest_payload_kg
+    arms = (spec.replace(mass={"payload_kg": own_kg + kg}) for kg in (0.0, largest_kg))
+    light_kpa, heavy_kpa = (simulate_poses(arm, spring_m).pressure_kpa for arm in arms)
+    effect = (heavy_kpa - light_kpa) / largest_kg
+    found, at = residual(held, spring_m, light_kpa), PayloadPoses(spring_m, light_kpa, effect)
+    left_kpa = pressure_kpa - light_kpa - found.mean_kpa.reshape(light_kpa.shape)
+    payload_kg, variance = np.zeros(len(spring_m)), np.zeros(len(spring_m))
+    for _ in range(2):
+        weight = np.linalg.solve(_covariance(held, at, payload_kg), (held.factor * effect)[..., None])[..., 0]
+        variance = 1.0 / np.sum(weight * held.factor * effect, axis=1)
+        payload_kg = variance * np.sum(weight * left_kpa, axis=1)
+    return payload_kg, QUANTILE * np.sqrt(variance)
+
+
+def _covariance(held: HeldPressures, at: PayloadPoses, payload_kg: np.ndarray) -> np.ndarray:
+    """Return covariances (m, n, n) [kPa^2] of the pressures that hold arms with payloads (m,) [kg]."""
+    own = held.factor_covariance + POSE_FACTOR**2 * np.eye(len(held.factor))
+    effect = payload_kg[:, None] * at.effect_kpa_per_kg
+    share = residual(held, at.spring_m, at.pressure_kpa).share
+    return covariances(held, share) + effect[:, :, None] * own * effect[:, None]
 
 
 def choose_for_payload(
