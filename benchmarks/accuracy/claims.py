@@ -25,7 +25,7 @@ from benchmarks.harness.common import grouped
 from benchmarks.paper.gradient_descent import gradient_descent
 from mjx_softarm import ArmSpec
 from mjx_softarm._support import cli, xla
-from mjx_softarm._support.mjx import State
+from mjx_softarm._support.lazy import State
 from mjx_softarm.env import EnvConfig, Randomisation, ReachEnv
 from mjx_softarm.env.state import PAYLOAD_SHARE
 from mjx_softarm.mdp.actions import N_ACTIONS

@@ -28,7 +28,7 @@ PINS = {
 }
 # Packages that mjx_softarm, train.runs.evaluate and train.epoch.job import.
 SHARED = (
-    *("numpy", "tomli_w", "jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax"),
+    *("numpy", "tomli_w", "jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax"),
     *("gymnasium", "tyro"),
 )
 

@@ -15,7 +15,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from mjx_softarm._support import xla
-from mjx_softarm._support.mjx import mjx
+from mjx_softarm._support.lazy import mjx
 from mjx_softarm.env.vector import over_arms
 from mjx_softarm.mechanics import settle as solver
 from mjx_softarm.mechanics.kinematics import MjxKinematics, chain_kinematics

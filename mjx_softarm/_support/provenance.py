@@ -15,7 +15,7 @@ import jax
 
 from mjx_softarm._support.files import replacing
 
-PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "orbax-checkpoint", "numpy")
+PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-checkpoint", "numpy")
 
 
 def provenance(program: str) -> dict[str, Any]:

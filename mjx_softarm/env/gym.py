@@ -26,8 +26,8 @@ from gymnasium.vector.utils import batch_space
 from jax import Array
 
 from mjx_softarm._support import xla
-from mjx_softarm._support.mjx import State
 from mjx_softarm.env import EnvConfig, ReachEnv
+from mjx_softarm.env.state import State
 from mjx_softarm.env.vector import VectorEnv
 from mjx_softarm.mdp.observation import OBS_SIZE
 from mjx_softarm.spec import ArmSpec

@@ -12,10 +12,11 @@ from jax import Array
 
 from mjx_softarm import control
 from mjx_softarm._support import draws
-from mjx_softarm._support.mjx import Env, State, put
+from mjx_softarm._support.lazy import put
 from mjx_softarm.env.clearance import Walls
 from mjx_softarm.env.config import EnvConfig
-from mjx_softarm.env.state import PAYLOAD_SHARE, ArmState, EpisodeMotion, EpisodeNoise
+from mjx_softarm.env.poses import PosePool
+from mjx_softarm.env.state import PAYLOAD_SHARE, ArmState, EpisodeMotion, EpisodeNoise, State
 from mjx_softarm.mdp import observation as obs
 from mjx_softarm.mdp import rewards
 from mjx_softarm.mdp.actions import ActionMap
@@ -25,13 +26,13 @@ from mjx_softarm.mechanics.motion import midpoint, mjx_step
 from mjx_softarm.mechanics.motion.state import Motion, MotionEnd, MotionResult, MovingArm
 from mjx_softarm.mechanics.params import PAYLOAD, ArmParams
 from mjx_softarm.mechanics.settle import Settled, SettleResult, arms_at_once, settle
-from mjx_softarm.mechanics.workspace import Pool, sample_evenly, sample_workspace
+from mjx_softarm.mechanics.workspace import Pool
 from mjx_softarm.sensing.pose import pose_from_frame
 from mjx_softarm.sensing.s2r import S2R, correct
 from mjx_softarm.spec import ArmSpec
 
 
-class ReachEnv(Env):
+class ReachEnv:
     """A soft arm that reaches for poses of its workspace.
 
     A pose is the tip's x, y, z [mm] and yaw, pitch, roll [deg] in the base frame, z up. For the paper's arm:
@@ -85,7 +86,13 @@ class ReachEnv(Env):
         self.model, self._data = put(build_model(self.spec), warp) if self.uses_mjx else (None, None)
         self._results = MotionResult if self.config.moves else SettleResult
         self._failures = {f"invalid_{r.name.lower()}": r.value for r in self._results if r.value != 0}
-        self.pool = self._training_pool()
+        self.poses = PosePool(self.spec, self.config, self._observed_pose)
+        self.sample_pool = self.poses.sample
+
+    @property
+    def pool(self) -> Pool:
+        """Poses that starts and goals are drawn from, settled at the first use."""
+        return self.poses()
 
     @property
     def observation_size(self) -> int:
@@ -109,21 +116,13 @@ class ReachEnv(Env):
         return self.spec.n_springs
 
     @property
+    def unwrapped(self) -> ReachEnv:
+        return self
+
+    @property
     def backend(self) -> str:
         """Simulation that runs: the engine, at rest or in motion."""
         return f"{self.config.engine} dynamic" if self.config.moves else self.config.engine
-
-    def sample_pool(self, n: int, seed: int, evenly: bool = False) -> Pool:
-        """Draw n poses with `sample_workspace` or `sample_evenly`, and correct them to those observed."""
-        pool = (sample_evenly if evenly else sample_workspace)(self.spec, n, seed)
-        return pool._replace(pose=self._observed_pose(pool.pose, pool.spring_m))
-
-    def _training_pool(self) -> Pool:
-        """Draw poses of the workspace, a share of them uniform in volume."""
-        n_even = round(self.config.even_share * self.config.n_poses)
-        counts = (self.config.n_poses - n_even, False), (n_even, True)
-        parts = [self.sample_pool(n, self.config.workspace_seed, evenly) for n, evenly in counts if n]
-        return jax.tree.map(lambda *part: jnp.concatenate(part), *parts)
 
     def _observed_pose(self, pose: Array, spring_m: Array) -> Array:
         """Return the pose as it is observed: corrected, if there is a sim-to-real network."""
@@ -156,8 +155,9 @@ class ReachEnv(Env):
         # Start and goal, and the arm of this episode
         share = noise.uniform
         start_row, goal_row = (self.config.n_poses * share[:2]).astype(jnp.int32)
-        start = jax.tree.map(lambda x: x[start_row], self.pool)
-        goal = self.pool.pose[goal_row]
+        pool = self.pool
+        start = jax.tree.map(lambda x: x[start_row], pool)
+        goal = pool.pose[goal_row]
         spread = self.config.randomisation
         arm = ArmState(
             payload_kg=self.params.tool_mass_kg[PAYLOAD] + self.payload_max_kg * share[PAYLOAD_SHARE],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
@@ -19,6 +20,24 @@ from mjx_softarm.spec import ArmSpec
 
 for _sensor in SENSORS.values():
     jax.tree_util.register_dataclass(_sensor)  # its numbers are traced
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class State:
+    """State of an environment, with the fields of `brax.envs.State`; brax's wrappers take it as theirs."""
+
+    pipeline_state: Any  # `ArmState`
+    obs: Array
+    reward: Array
+    done: Array
+    metrics: dict[str, Array]
+    info: dict[str, Any]
+
+    def replace(self, **fields: Any) -> State:
+        """Return the state with other values of some fields."""
+        return dataclasses.replace(self, **fields)
+
 
 PAYLOAD_SHARE = 2  # index in `EpisodeNoise.uniform`
 

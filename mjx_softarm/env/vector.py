@@ -11,8 +11,8 @@ from jax import Array
 from jax.sharding import Mesh, PartitionSpec
 
 from mjx_softarm._support import draws
-from mjx_softarm._support.mjx import State
 from mjx_softarm.env import ReachEnv
+from mjx_softarm.env.state import State
 
 
 def over_arms(function: Callable, mesh: Mesh | None = None, n_shared: int = 0) -> Callable:

@@ -18,7 +18,7 @@ of the law's gain l as well, where chambers track. They are at rest, but the joi
 
     dq = K dp + H^-1 S^T l (dreference - d_x s) - H^-1 d_x grad V,    with r less S times the last two terms.
 
-Redundant chambers close the errors of `mjx_softarm.mechanics.law_errors`: C S in place of S,
+Redundant chambers close the errors of `mjx_softarm.mechanics.newton`: C S in place of S,
 C (dreference - d_x s) in place of dreference - d_x s, and C S K + YIELD_M_PER_KPA N in place of S K.
 
 This is exact however many Newton steps led to the equilibrium. K comes from the last Newton step; only
@@ -69,25 +69,23 @@ class Equilibrium(NamedTuple):
     law_response: Array  # (nv, n_springs) joints by references, zeros unless the law holds the arm
 
 
-def law_response(here: Statics, held: Array, params: ArmParams) -> Array:
-    """Return `Equilibrium.law_response` (nv, n_springs, *arms), for the gains of chambers that are held.
+def gain_columns(here: Statics, held: Array, params: ArmParams) -> Array:
+    """Return forces (n_sections, n, n_springs, *arms) on the joints by references, through the law's gains.
+
+    H^-1 times these forces is `Equilibrium.law_response`. They are zeros for redundant chambers, which are
+    not held.
 
     Args:
         here: at the equilibrium, the gains included.
-        held (n_chambers, *arms): bool.
+        held (n_chambers, *arms): bool, chambers whose gains take part.
         params: numbers of the arm.
     """
     n_sections, _, n, *arms = here.springs.jacobian.shape
-    none = jnp.zeros((n_sections * n, *here.springs.length.shape), here.gradient.dtype)
-    if params.allocation is not None:  # redundant chambers are not held
-        return none
-
-    def solve() -> Array:
-        gain = jnp.where(held, params.law_stiffness, 0.0).reshape(n_sections, -1, 1, *arms)
-        columns = block_diagonal(jnp.swapaxes(gain * here.springs.jacobian, 1, 2))
-        return here.hessian.solve(columns.reshape(n_sections, n, -1, *arms)).reshape(-1, *held.shape)
-
-    return jax.lax.cond(jnp.any(held), solve, lambda: none)  # hanging arms are seldom held
+    if params.allocation is not None:
+        return jnp.zeros((n_sections, n, *here.springs.length.shape), here.gradient.dtype)
+    gain = jnp.where(held, params.law_stiffness, 0.0).reshape(n_sections, -1, 1, *arms)
+    columns = block_diagonal(jnp.swapaxes(gain * here.springs.jacobian, 1, 2))
+    return columns.reshape(n_sections, n, -1, *arms)
 
 
 def equilibrium_tangents(

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from mjx_softarm._support.mjx import mjx
+from mjx_softarm._support.lazy import mjx
 from mjx_softarm._support.small_matrices import product, products
 from mjx_softarm.mechanics.params import LEVEL, ArmParams, Mount
 from mjx_softarm.sensing.pose import rotation_from_quaternion

@@ -11,9 +11,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import mujoco
 import numpy as np
 
+from mjx_softarm._support.lazy import mujoco
 from mjx_softarm._support.xp import Array
 from mjx_softarm.mechanics.body import SPRING_WIDTH_M, gripper_boxes, payload_radius_m, ring_radius_m
 from mjx_softarm.mechanics.params import ArmParams

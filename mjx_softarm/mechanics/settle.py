@@ -2,7 +2,7 @@
 
 The law of `mjx_softarm.control` has integral action, so at rest each chamber has closed its error or is at a
 pressure limit. With the potential V of `mjx_softarm.mechanics.statics` and the errors e of
-`mjx_softarm.mechanics.law_errors`, rest is
+`mjx_softarm.mechanics.newton`, rest is
 
     grad V(q; p) = 0,    e_t(q, p) = 0  or  p_t = limit   for every chamber t,
 
@@ -28,17 +28,11 @@ from jax.custom_derivatives import zero_from_primal
 
 from mjx_softarm._support import xla
 from mjx_softarm._support.errors import Result
-from mjx_softarm._support.small_matrices import eliminate, identity, products
-from mjx_softarm.mechanics.implicit import Equilibrium, PressureResponse, equilibrium_tangents, law_response
+from mjx_softarm.mechanics.implicit import Equilibrium, PressureResponse, equilibrium_tangents
 from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK, Kinematics
-from mjx_softarm.mechanics.law_errors import closed_errors, law_errors
+from mjx_softarm.mechanics.newton import End, Iterate, law_errors, newton_pass
 from mjx_softarm.mechanics.params import ArmParams
-from mjx_softarm.mechanics.statics import statics
 
-MAX_ITERATIONS = 12
-ACTIVE_SET_GAIN_KPA_PER_M = 1000.0  # c
-MAX_STEP = 0.5  # largest entry of a Newton step [m, rad]
-SMALL_STEP = 3e-4  # [m, rad]; Newton's method converges quadratically from here
 RESIDUAL_TOLERANCE = 2e-3  # [N, N m], against stiffnesses of 2 N m/rad and more
 TRACKING_TOLERANCE_M = 1e-4
 ARMS_IN_CACHE, CACHED_DOFS = 128, 36  # arms whose numbers a CPU's cache holds, and their joint coordinates
@@ -72,22 +66,6 @@ class Settled(NamedTuple):
     def settled(self) -> Array:
         """() bool, converged: residual and tracking error are finite and below tolerance."""
         return self.result == SettleResult.CONVERGED.value
-
-
-class _Iterate(NamedTuple):
-    q: Array  # (nv, *arms)
-    pressure: Array  # (n_chambers, *arms) [kPa]
-    at_limit: Array  # (n_chambers, *arms) bool, active set of the last step
-    response: PressureResponse  # at the iterate before the last step
-    n_small: Array  # (*arms,) int, number of small steps in a row with an unchanged active set
-    held: Array  # (*arms,) bool, V has not been convex at some step: the law's gain takes part
-    stiffening: Array  # (*arms,) added joint stiffness as a share of the arm's own, where V is not convex
-    convex: Array  # (*arms,) bool, V was convex at the last step without added joint stiffness
-    iteration: Array  # (*arms,) int
-
-    def goes_on(self, n_small: int) -> Array:
-        """Return which arms have made fewer than `n_small` small steps in a row: (*arms,) bool."""
-        return (self.n_small < n_small) & (self.iteration < MAX_ITERATIONS + n_small - 1)
 
 
 _Solution = tuple[Settled, Equilibrium]
@@ -177,7 +155,7 @@ def _solve_arms_last(
     else:
         axes = jax.tree.map(lambda own: 0 if own else None, kinematics_own)
         each = jax.vmap(lambda engine, q: engine(q), in_axes=(axes, -1), out_axes=-1)
-        kinematics = functools.partial(each, kinematics)  # pyright: ignore[reportAssignmentType]
+        kinematics = jax.tree_util.Partial(each, kinematics)  # pyright: ignore[reportAssignmentType]
     reference_m = jnp.broadcast_to(arms_last(reference_m, reference_own), (reference_m.shape[-1], n))
     found = _solve(n_small, kinematics, jax.tree.map(arms_last, params, params_own), reference_m)
     return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), found)
@@ -189,7 +167,7 @@ def _solve(n_small: int, kinematics: Kinematics, params: ArmParams, reference_m:
     dtype, arms = params.link_length_m.dtype, reference_m.shape[1:]
     nv, n_chambers = params.link_mass_kg.shape[0] * DOFS_PER_LINK, params.area.shape[0]
     zeros = functools.partial(jnp.zeros, dtype=dtype)
-    start = _Iterate(
+    start = Iterate(
         q=zeros((nv, *arms)),
         pressure=jnp.clip(zeros((n_chambers, *arms)), params.pressure_min_kpa, params.pressure_max_kpa),
         at_limit=jnp.zeros((n_chambers, *arms), bool),
@@ -201,68 +179,23 @@ def _solve(n_small: int, kinematics: Kinematics, params: ArmParams, reference_m:
         iteration=jnp.zeros(arms, int),
     )
 
-    # Iterate until no arm goes on; an arm that has ended keeps its numbers
-    def go_on(it: _Iterate) -> _Iterate:
-        new = _newton_step(it, kinematics, params, reference_m)
-        goes_on = it.goes_on(n_small)
-        return jax.tree.map(lambda x, old: jnp.where(goes_on, x, old), new, it)
-
+    # Iterate until no arm goes on, and once more: the last pass evaluates all arms where they have ended. A
+    # second program for the end would take as long to compile as the loop
+    one_pass = functools.partial(newton_pass, n_small, kinematics, params, reference_m)
     with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
-        end = jax.lax.while_loop(lambda it: jnp.any(it.goes_on(n_small)), go_on, start)
-        return _report(end, kinematics, params, reference_m)
+        shapes = jax.eval_shape(one_pass, start)[1]
+        nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+        _, it, end = jax.lax.while_loop(
+            lambda loop: loop[0],
+            lambda loop: (jnp.any(loop[1].goes_on(n_small)), *one_pass(loop[1])),
+            (jnp.array(True), start, nothing),
+        )
+        return _report(it, end, params, reference_m)
 
 
-def _newton_step(it: _Iterate, kinematics: Kinematics, params: ArmParams, reference_m: Array) -> _Iterate:
-    """Return the iterate after one Newton step in joint coordinates and pressures together."""
-    # Forces, springs and the active set at the iterate
-    here = statics(kinematics(it.q), it.q, it.pressure, params.answering(it.held & ~it.at_limit, reference_m))
-    error = law_errors(reference_m - here.springs.length, it.pressure, params.allocation)
-    trial = it.pressure + ACTIVE_SET_GAIN_KPA_PER_M * error
-    limit = jnp.clip(trial, params.pressure_min_kpa, params.pressure_max_kpa)
-    at_limit = (trial != limit) | params.pinned  # a pinned chamber even where its error is zero
-
-    # Joints: H dq = B dp - grad V, hence dq = newton_step + dq_dp dp
-    hessian = here.hessian.plus_diagonal(it.stiffening * params.joint_stiffness)
-    push, arms = here.push_per_kpa, error.shape[1:]
-    gradient = here.gradient.reshape(*push.shape[:2], 1, *arms)
-    solved = hessian.solve(jnp.concatenate([-gradient, push], axis=2))
-    newton_step, dq_dp = solved[:, :, 0], solved[:, :, 1:]
-
-    # Pressures: each chamber closes its error or goes to its limit
-    spring_response = products(here.springs.jacobian, solved).reshape(len(reference_m), -1, *arms)
-    closed, closed_per_kpa = closed_errors(spring_response[:, 0], spring_response[:, 1:], params.allocation)
-    rows = jnp.where(at_limit[:, None], identity(len(error), closed_per_kpa), closed_per_kpa)
-    residual = jax.lax.select(at_limit, limit - it.pressure, error - closed)
-    dp = eliminate(rows, residual[:, None])[:, 0]
-    dq = (newton_step + jnp.sum(dq_dp * dp, axis=2)).reshape(it.q.shape)
-
-    # Step length; where elimination gave NaN, the arm stays. If any chamber tracks, the law's gain takes part
-    # from now on; if it does already, or none tracks, the joints are stiffer for a step
-    largest = jnp.max(jnp.abs(dq), axis=0)
-    scale = jnp.minimum(1.0, MAX_STEP / largest)
-    finite = jnp.all(jnp.isfinite(dq), axis=0)  # `largest` may miss a NaN: XLA's maximum on a CPU, jax 0.12
-    convex = finite & (it.stiffening == 0)
-    small = jnp.all(at_limit == it.at_limit, axis=0) & (largest < SMALL_STEP) & convex
-    return _Iterate(
-        q=jnp.where(finite, it.q + scale * dq, it.q),
-        pressure=jnp.where(finite, it.pressure + scale * dp, it.pressure),
-        at_limit=at_limit,
-        response=PressureResponse(dq_dp.reshape(it.response.dq_dp.shape), closed_per_kpa),
-        n_small=jnp.where(small, it.n_small + 1, 0),
-        held=it.held | ~finite,
-        stiffening=jnp.where(finite | ~(it.held | jnp.all(at_limit, axis=0)), 0.0, 4.0 * it.stiffening + 4.0),
-        convex=convex,
-        iteration=it.iteration + 1,
-    )
-
-
-def _report(it: _Iterate, kinematics: Kinematics, params: ArmParams, reference_m: Array) -> _Solution:
+def _report(it: Iterate, end: End, params: ArmParams, reference_m: Array) -> _Solution:
     """Return the last iterate as an equilibrium, with its errors and its result."""
-    # Forces and springs at the end
-    pressure = jnp.clip(it.pressure, params.pressure_min_kpa, params.pressure_max_kpa)
-    frames = kinematics(it.q)
-    held = it.held & ~it.at_limit
-    here = statics(frames, it.q, pressure, params.answering(held, reference_m))
+    pressure, frames, here, by_law = end
     residual = jnp.max(jnp.abs(here.gradient), axis=0)
 
     # Errors of the law: at a limit, only an error counts that would take the chamber away from it
@@ -293,5 +226,4 @@ def _report(it: _Iterate, kinematics: Kinematics, params: ArmParams, reference_m
         result=result.astype(jnp.int32),
         iterations=it.iteration,
     )
-    by_law = law_response(here, held, params)
     return found, Equilibrium(it.q, pressure, at_limit, frames, here, it.response, by_law)

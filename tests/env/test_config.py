@@ -7,7 +7,7 @@ from importlib.util import find_spec
 import pytest
 
 from mjx_softarm._support.errors import InputError
-from mjx_softarm._support.mjx import put
+from mjx_softarm._support.lazy import put
 from mjx_softarm.env import EnvConfig, Randomisation, ReachEnv
 from mjx_softarm.mdp.rewards import RewardConfig
 from mjx_softarm.mechanics.mjcf import build_model

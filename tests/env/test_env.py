@@ -10,8 +10,8 @@ import pytest
 
 from mjx_softarm import ArmSpec
 from mjx_softarm._support import xla
-from mjx_softarm._support.mjx import State
 from mjx_softarm.env import EnvConfig, Randomisation, ReachEnv
+from mjx_softarm.env.state import State
 
 MM, KPA = 1e-3, 1.0
 SHORT_ARM = ArmSpec.default().replace(structure={"n_sections": 1, "links_per_section": 2})

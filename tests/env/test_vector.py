@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from brax.envs.base import State
 
+from mjx_softarm.env.state import State
 from mjx_softarm.env.vector import VectorEnv
 
 GO_ON, REACH, FAIL = 0.0, 1.0, 2.0

@@ -16,7 +16,7 @@ import pytest
 
 from mjx_softarm import ArmSpec, control
 from mjx_softarm._support import xla
-from mjx_softarm._support.mjx import mjx
+from mjx_softarm._support.lazy import mjx
 from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.mjcf import build_model, spring_lengths
 from mjx_softarm.mechanics.params import ArmParams

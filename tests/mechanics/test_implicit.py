@@ -9,7 +9,7 @@ import pytest
 
 from mjx_softarm import ArmSpec
 from mjx_softarm._support import xla
-from mjx_softarm._support.mjx import mjx
+from mjx_softarm._support.lazy import mjx
 from mjx_softarm.control import YIELD_M_PER_KPA
 from mjx_softarm.mechanics.kinematics import MjxKinematics, chain_kinematics
 from mjx_softarm.mechanics.mjcf import build_model

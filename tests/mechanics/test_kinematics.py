@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from mjx_softarm import ArmSpec
 from mjx_softarm._support import xla
-from mjx_softarm._support.mjx import mjx
+from mjx_softarm._support.lazy import mjx
 from mjx_softarm.mechanics.kinematics import ChainKinematics, Frames, MjxKinematics, chain_kinematics
 from mjx_softarm.mechanics.mjcf import build_model
 from mjx_softarm.mechanics.params import ArmParams

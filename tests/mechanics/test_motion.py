@@ -10,7 +10,7 @@ import pytest
 
 from mjx_softarm import ArmSpec, control
 from mjx_softarm._support import xla
-from mjx_softarm._support.mjx import put
+from mjx_softarm._support.lazy import put
 from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.mjcf import build_model, chamber_lengths, spring_lengths
 from mjx_softarm.mechanics.motion import midpoint, mjx_step

@@ -33,8 +33,8 @@ from jax.sharding import Mesh
 
 from mjx_softarm import control
 from mjx_softarm._support import draws
-from mjx_softarm._support.mjx import State
 from mjx_softarm.env import EnvConfig, ReachEnv
+from mjx_softarm.env.state import State
 from mjx_softarm.env.vector import VectorEnv, over_arms
 from mjx_softarm.mdp import rewards
 from train.agent.learner import Explored, Learner, LearnerConfig, Sample, check_settings

@@ -18,8 +18,8 @@ import numpy as np
 from jax import Array
 
 from mjx_softarm._support import draws, xla
-from mjx_softarm._support.mjx import State
 from mjx_softarm.env import Randomisation, ReachEnv
+from mjx_softarm.env.state import State
 from mjx_softarm.mechanics.workspace import Pool
 from train.agent.imitation import ImitationConfig
 from train.config import ConfigError

@@ -18,9 +18,10 @@ from jax.sharding import Mesh
 
 from mjx_softarm import control
 from mjx_softarm._support import draws, xla
-from mjx_softarm._support.mjx import State
 from mjx_softarm.env import ReachEnv
+from mjx_softarm.env.state import State
 from mjx_softarm.env.vector import VectorEnv
+from mjx_softarm.mechanics.workspace import Pool
 from train.agent.hindsight import later_pose
 from train.agent.learner import Experience, Explored, Learner, LearnerConfig
 from train.config import ConfigError
@@ -89,25 +90,43 @@ class Job:
         self.n_traces = 0
         self.sharding = None if mesh is None else _sharding(self.config, mesh, learner.own_arms)
         results = None if mesh is None else (self.sharding, everywhere(mesh))
-        self.init = xla.jit(self.first, env.uses_mjx, out_shardings=self.sharding)
-        self.epoch = xla.jit(self.advance, env.uses_mjx, donate_argnums=0, out_shardings=results)
+        self._init = xla.jit(self._drawing(self.first), env.uses_mjx, out_shardings=self.sharding)
+        self._epoch = xla.jit(
+            self._drawing(self.advance), env.uses_mjx, donate_argnums=0, out_shardings=results
+        )
         self._thin = xla.jit(replay.thin, env.uses_mjx, donate_argnums=0)
 
+    def init(self, key: Array) -> TrainState:
+        """Return the state that a run begins with."""
+        return self._init(key, self.env.pool)
+
+    def epoch(self, state: TrainState) -> tuple[TrainState, dict[str, Array]]:
+        """Return the state after an epoch, and its metrics; the state given is used up. See `advance`."""
+        return self._epoch(state, self.env.pool)
+
     def like(self) -> TrainState:
-        """Return a state structured as the run's."""
-        return self.init(jax.random.PRNGKey(0))
+        """Return a state structured as the run's, or its shapes."""
+        return self.init(jax.random.PRNGKey(0)) if self.mesh else self.shapes()
+
+    def shapes(self) -> TrainState:
+        """Return the shapes of a state."""
+        return jax.eval_shape(self._init, jax.random.PRNGKey(0), self.env.poses.shapes)
+
+    def compile_epoch(self) -> None:
+        """Compile the epoch before it is called. This needs no pool of poses, whose settling may go on."""
+        self._epoch = self._epoch.lower(self.shapes(), self.env.poses.shapes).compile()
 
     def start(self, first: Callable[[], T]) -> T:
-        """Return the result of `first`, such as a state, with the epoch compiled in another thread meanwhile.
+        """Return the result of `first`, such as a state, with the epoch compiled meanwhile.
 
-        With a mesh of devices the epoch is compiled when it is called first; a second call compiles nothing.
+        Another thread settles the pool of poses, an argument of the epoch, and calls `first`. With a mesh of
+        devices the epoch is compiled when it is called first; a second call compiles nothing.
         """
         if self.mesh is not None or self.n_traces:
             return first()
-        shapes = jax.eval_shape(self.init, jax.random.PRNGKey(0))
         with ThreadPoolExecutor(1) as beside:
-            result = beside.submit(first)
-            self.epoch = self.epoch.lower(shapes).compile()
+            result = beside.submit(lambda: (self.env.pool, first())[1])
+            self.compile_epoch()
             return result.result()
 
     def place(self, state: TrainState) -> TrainState:
@@ -131,6 +150,15 @@ class Job:
         key, key_thin = jax.random.split(state.key)
         memory = self._thin(state.memory, key_thin, jnp.asarray(share, jnp.float32))
         return state._replace(memory=memory, key=key)
+
+    def _drawing(self, function: Callable) -> Callable:
+        """Return a function of an argument and of the pool of poses that its environment draws from."""
+
+        def drawing(argument: Any, pool: Pool) -> Any:
+            with self.env.poses.given(pool):
+                return function(argument)
+
+        return drawing
 
     def first(self, key: Array) -> TrainState:
         """Return the state that a run begins with; `init` is this, jitted."""

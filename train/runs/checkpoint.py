@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import shutil
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import jax
-import orbax.checkpoint as ocp
 from jax.experimental.multihost_utils import sync_global_devices
 
 from mjx_softarm._support.errors import InputError
 from mjx_softarm._support.files import read_json_lines, replacing
+from mjx_softarm._support.lazy import LazyModule
 from mjx_softarm._support.provenance import provenance, write_json
 from mjx_softarm.logs.files import LogError
 from mjx_softarm.logs.pose_pairs import PosePairs, write_pose_pairs
@@ -30,6 +31,11 @@ from train.config import TrainConfig, from_dict, to_dict
 from train.demos.demonstrations import Demonstrations, load_demonstrations
 from train.epoch.devices import is_first_process
 from train.epoch.job import TrainState
+
+if TYPE_CHECKING:
+    import orbax.checkpoint as ocp
+else:
+    ocp = LazyModule("orbax.checkpoint")
 
 N_KEPT = 2
 # Codes that begin a message of TensorStore about files that are cut, changed or absent
@@ -56,8 +62,6 @@ class Run:
 
     def __init__(self, path: Path, config: TrainConfig, spec: ArmSpec, s2r: S2R | None = None):
         self.path, self.config, self.spec, self.s2r = path, config, config.env.arm(spec, s2r is not None), s2r
-        options = ocp.CheckpointManagerOptions(max_to_keep=N_KEPT, enable_async_checkpointing=False)
-        self._manager = ocp.CheckpointManager((path / CHECKPOINTS).resolve(), options=options)
 
     @classmethod
     def create(
@@ -144,6 +148,11 @@ class Run:
         s2r = load_s2r(path / S2R_FILE, spec.n_springs) if has_s2r else None
         return cls(path, config, spec, s2r)
 
+    @functools.cached_property
+    def _manager(self) -> ocp.CheckpointManager:
+        options = ocp.CheckpointManagerOptions(max_to_keep=N_KEPT, enable_async_checkpointing=False)
+        return ocp.CheckpointManager((self.path / CHECKPOINTS).resolve(), options=options)
+
     def demonstrations(self) -> Demonstrations | None:
         """Return the demonstrations that the run learns from, or None.
 
@@ -169,12 +178,12 @@ class Run:
     @property
     def latest_epoch(self) -> int | None:
         """Number of epochs behind the newest complete checkpoint, None if there is none."""
-        return self._manager.latest_step()
+        return max(self.epochs, default=None)
 
     @property
     def epochs(self) -> list[int]:
         """Numbers of epochs behind the complete checkpoints."""
-        return sorted(self._manager.all_steps())
+        return sorted(self._manager.all_steps()) if (self.path / CHECKPOINTS).exists() else []
 
     def check_begins_anew(self) -> None:
         """Check that a run without a checkpoint was stopped before its first one.

@@ -5,6 +5,7 @@ The first set has random pressures and is rarely near the rim; the second is uni
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import functools
 from collections.abc import Callable
@@ -17,8 +18,8 @@ import numpy as np
 from jax import Array
 
 from mjx_softarm._support import xla
-from mjx_softarm._support.mjx import State
 from mjx_softarm.env import Randomisation, ReachEnv
+from mjx_softarm.env.state import EpisodeMotion, State
 from mjx_softarm.mdp import rewards
 from mjx_softarm.mdp.actions import N_ACTIONS
 from mjx_softarm.mechanics.excitation import circle_poses
@@ -146,9 +147,11 @@ def start_keys(n_arms: int) -> Array:
 
 
 def nominal(env: ReachEnv) -> ReachEnv:
-    """Return the environment without randomisation."""
-    config = dataclasses.replace(env.config, randomisation=Randomisation(payload_max_kg=0.0))
-    return env if config == env.config else ReachEnv(env.spec, config, env.s2r)
+    """Return the environment without randomisation; it draws from the same pool of poses."""
+    other = copy.copy(env)
+    other.config = dataclasses.replace(env.config, randomisation=Randomisation(payload_max_kg=0.0))
+    other.episode_motion = EpisodeMotion(env.spec, other.config)
+    return other
 
 
 def towards(env: ReachEnv, state: State, goal: Array) -> State:

@@ -18,8 +18,8 @@ import numpy as np
 from jax import Array
 
 from mjx_softarm._support import xla
-from mjx_softarm._support.mjx import State
 from mjx_softarm.env import ReachEnv
+from mjx_softarm.env.state import State
 from mjx_softarm.sensing.pose import pose_error
 from train.agent.learner import Learner
 from train.demos.demonstrations import Demonstrations

@@ -22,7 +22,6 @@ from train.agent.learner import LearnerConfig
 from train.config import TrainConfig
 from train.epoch.devices import any_process, is_first_process
 from train.epoch.job import TrainState
-from train.runs import plots
 from train.runs.checkpoint import Run, RunError
 from train.runs.task import Task, task_of
 
@@ -131,6 +130,8 @@ def refuse_divergence(config: TrainConfig, n_unsettled: float) -> None:
 
 def finish(run: Run, task: Task, policy: Any) -> Any:
     """Evaluate a policy, write `evaluation.json` and the pictures; returns the figures."""
+    from train.runs import plots  # matplotlib takes half a second to import
+
     summary, *reached = task.evaluate(policy)
     if is_first_process():
         run.write_poses(*reached)

@@ -7,11 +7,11 @@ epoch.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple, cast
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 from jax.sharding import Mesh
-from matplotlib.figure import Figure
 
+from mjx_softarm._support.lazy import LazyModule
 from mjx_softarm.env import ReachEnv
 from train.agent.imitation import ImitationConfig
 from train.agent.learner import Learner
@@ -20,9 +20,15 @@ from train.config import ConfigError, TrainConfig
 from train.demos.demonstrations import Demonstrations
 from train.epoch.goals import DemonstratedGoals
 from train.epoch.job import Job, TrainState
-from train.runs import plots
 from train.runs.evaluate import N_GOALS, Evaluator
 from train.runs.positions import N_STARTS, PositionEvaluator
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from train.runs import plots
+else:
+    plots = LazyModule("train.runs.plots")
 
 
 class Task(NamedTuple):
@@ -66,7 +72,7 @@ def task_of(
         job=job,
         title=f"{N_GOALS} held-out goals",
         evaluate=Evaluator(env, job.learner),
-        pictures=plots.reach_pictures,
+        pictures=lambda *found: plots.reach_pictures(*found),
         headline=lambda row: f"held-out median {row['evaluation/median_mm']:.1f} mm",
         prepare=lambda state, epoch: state,
     )
@@ -99,7 +105,7 @@ def _imitation(
         job=job,
         title=f"{len(demonstrations.positions)} demonstrated positions{starts}",
         evaluate=evaluate,
-        pictures=plots.imitation_pictures,
+        pictures=lambda *found: plots.imitation_pictures(*found),
         headline=lambda row: (
             f"success at {100 * row['evaluation/success_share']:.0f} % of the positions, "
             f"median {row['evaluation/median_mm']:.1f} mm"

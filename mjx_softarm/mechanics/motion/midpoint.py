@@ -27,7 +27,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from mjx_softarm import control, pneumatics
-from mjx_softarm._support.mjx import mjx
+from mjx_softarm._support.lazy import mjx
 from mjx_softarm._support.small_matrices import block_diagonal, products, solve_approximate_gradient
 from mjx_softarm.mechanics.kinematics import Frames, chain_kinematics
 from mjx_softarm.mechanics.motion.state import (

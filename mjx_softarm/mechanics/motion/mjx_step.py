@@ -27,7 +27,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from mjx_softarm import control, pneumatics
-from mjx_softarm._support.mjx import mjx
+from mjx_softarm._support.lazy import mjx
 from mjx_softarm.mechanics.kinematics import frames_of
 from mjx_softarm.mechanics.mjcf import chamber_lengths, spring_lengths
 from mjx_softarm.mechanics.motion.state import (
@@ -40,8 +40,6 @@ from mjx_softarm.mechanics.motion.state import (
     pushed,
 )
 from mjx_softarm.mechanics.params import N_PER_KPA_M2
-
-JAX = mjx.Impl.JAX
 
 
 class _Moving(NamedTuple):
@@ -127,7 +125,7 @@ def _episode_model(arm: MovingArm, h: float) -> mjx.Model:
 def _at(arm: MovingArm, model: mjx.Model, q: Array, velocity: Array) -> tuple[mjx.Data, Array, Array]:
     """Return data at q and velocity (nv,), spring lengths (n_springs,) [m] and chamber volumes [m^3]."""
     data = mjx.kinematics(model, arm.data.replace(qpos=q, qvel=velocity))
-    if model.impl == JAX:  # its tendons need the bodies' motion axes
+    if model.impl == mjx.Impl.JAX:  # its tendons need the bodies' motion axes
         data = mjx.com_pos(model, data)
     data, params = mjx.tendon(model, data), arm.params
     area = params.area / N_PER_KPA_M2, params.area_slope / N_PER_KPA_M2
@@ -137,7 +135,7 @@ def _at(arm: MovingArm, model: mjx.Model, q: Array, velocity: Array) -> tuple[mj
 
 def _with_friction(arm: MovingArm, model: mjx.Model, data: mjx.Data) -> mjx.Model:
     """Return the model with the chambers' dry friction in the damping of their tendons."""
-    if model.impl != JAX:  # the configuration allows no friction there
+    if model.impl != mjx.Impl.JAX:  # the configuration allows no friction there
         return model
     n_chambers = len(arm.params.area)  # their tendons come first
     rate = data._impl.ten_J[:n_chambers] @ data.qvel  # (n_chambers,) [m/s]

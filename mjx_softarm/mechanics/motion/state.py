@@ -12,7 +12,7 @@ from jax import Array
 
 from mjx_softarm import control
 from mjx_softarm._support.errors import Result
-from mjx_softarm._support.mjx import mjx
+from mjx_softarm._support.lazy import mjx
 from mjx_softarm.mechanics.kinematics import Frames
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.pneumatics import PAPER_PUMP, Actuators, Pump, Regulator

@@ -99,7 +99,7 @@ def test_arms_step_and_start_anew_without_waiting_for_other_devices(jobs, traine
 def test_the_epoch_is_traced_once_and_the_replay_stays_where_it_is(jobs, trained):
     job = jobs[str(N_DEVICES)]
     assert job.n_traces == 1
-    program = job.epoch.lower(trained[str(N_DEVICES)][0]).compile().as_text()
+    program = job._epoch.lower(trained[str(N_DEVICES)][0], job.env.pool).compile().as_text()
     moves = [line for line in program.splitlines() if _MOVES.search(line)]
     shapes = [shape for line in moves for shape in re.findall(r"\w\[([\d,]+)\]", line)]
     assert moves and any("all-reduce" in line for line in moves)  # of gradients

@@ -1,37 +1,52 @@
-"""MJX and brax, imported in one place.
+"""Modules that are imported when they are first used, so that commands without them begin quickly.
 
-`mujoco.mjx` prints two lines at import if warp is not installed. Only the engine "warp" needs it, so these
-lines are held back. Neither package has enough types to be checked, so type checkers see `Any`.
+MuJoCo and MJX take more than a second, and arms at rest need neither. `mujoco.mjx` prints two lines at import
+if warp is not installed. Only the engine "warp" needs it, so these lines are held back. MJX has not enough
+types to be checked.
 """
 
 from __future__ import annotations
 
 import contextlib
 import copy
+import functools
+import importlib
 import io
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import jax
-import mujoco
 
 from mjx_softarm._support.errors import InputError
 
-if TYPE_CHECKING:
-    from mujoco import mjx
+__all__ = ["LazyModule", "mjx", "mujoco", "put"]
 
-    class Env(Any): ...
 
-    class State(Any): ...
+class LazyModule:
+    """Stand-in for a module: the first attribute that is asked for imports it."""
 
-else:
+    def __init__(self, name: str, load: Callable[[str], Any] = importlib.import_module):
+        self._name, self._load = name, load
+
+    def __getattr__(self, attribute: str) -> Any:
+        return getattr(self._load(self._name), attribute)
+
+
+@functools.cache
+def _import_quietly(name: str) -> Any:
     with contextlib.redirect_stdout(io.StringIO()) as said:
-        from brax.envs.base import Env, State
-        from mujoco import mjx
+        module = importlib.import_module(name)
     for line in said.getvalue().splitlines():
         if not line.startswith(("Failed to import warp:", "Failed to import mujoco_warp:")):
             print(line)
+    return module
 
-__all__ = ["Env", "State", "mjx", "put"]
+
+if TYPE_CHECKING:
+    import mujoco
+    from mujoco import mjx
+else:
+    mujoco, mjx = LazyModule("mujoco"), LazyModule("mujoco.mjx", _import_quietly)
 
 
 def put(model: mujoco.MjModel, warp: bool = False) -> tuple[mjx.Model, mjx.Data]:

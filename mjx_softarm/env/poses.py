@@ -1,0 +1,67 @@
+"""Poses that an environment draws starts and goals from."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextvars import ContextVar
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from mjx_softarm.env.config import EnvConfig
+from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK
+from mjx_softarm.mechanics.workspace import Pool, sample_evenly, sample_workspace
+from mjx_softarm.spec import ArmSpec
+
+
+class PosePool:
+    """Poses of the workspace, a share of them uniform in volume; they are settled at the first use.
+
+    A compiled function that takes them as an argument is compiled while they settle, and is the same program
+    for all pools of one size.
+
+    Args:
+        spec: the arm.
+        config: number of poses, share and seed.
+        observed: function from poses and spring lengths to the poses that are observed.
+    """
+
+    def __init__(self, spec: ArmSpec, config: EnvConfig, observed: Callable[[Array, Array], Array]):
+        self._spec, self._config, self._observed = spec, config, observed
+        self._settled, self._given = (
+            functools.cache(self._draw),
+            ContextVar[Pool | None]("pool", default=None),
+        )
+        sizes = DOFS_PER_LINK * spec.n_links, spec.n_chambers, spec.n_springs, 6
+        self.shapes = Pool(*(jax.ShapeDtypeStruct((config.n_poses, size), jnp.float32) for size in sizes))
+
+    def __call__(self) -> Pool:
+        """Return the poses."""
+        if (given := self._given.get()) is not None:
+            return given
+        with ThreadPoolExecutor(1) as elsewhere:  # the first use may be in a function that is traced
+            return elsewhere.submit(self._settled).result()
+
+    @contextlib.contextmanager
+    def given(self, pool: Pool) -> Iterator[None]:
+        """Return other poses, such as an argument of a traced function, meanwhile and in this thread."""
+        before = self._given.set(pool)
+        try:
+            yield
+        finally:
+            self._given.reset(before)
+
+    def sample(self, n: int, seed: int, evenly: bool = False) -> Pool:
+        """Draw n poses with `sample_workspace` or `sample_evenly`, as they are observed."""
+        pool = (sample_evenly if evenly else sample_workspace)(self._spec, n, seed)
+        return pool._replace(pose=self._observed(pool.pose, pool.spring_m))
+
+    def _draw(self) -> Pool:
+        n_even = round(self._config.even_share * self._config.n_poses)
+        counts = (self._config.n_poses - n_even, False), (n_even, True)
+        parts = [self.sample(n, self._config.workspace_seed, evenly) for n, evenly in counts if n]
+        return jax.tree.map(lambda *part: jnp.concatenate(part), *parts)
