@@ -19,6 +19,7 @@ BENCHMARKS = {
     "motion-engines": "benchmarks.speed.motion:measure",
     "gpu": "benchmarks.speed.gpu:measure",
     "settle": "benchmarks.speed.settle:measure",
+    "start": "benchmarks.speed.start:measure",
     "guard": "benchmarks.speed.guard:main",
     "calibration": "benchmarks.accuracy.calibration:measure",
     "changes": "benchmarks.accuracy.changes:measure",

@@ -27,14 +27,16 @@ class TrainConfig:
     learner: LearnerConfig = field(default_factory=TQCConfig)
     """settings of the learner"""
     seed: int = 0
-    """seed of networks, exploration, goals and batches; the pool of poses has env.workspace_seed"""
+    """seed of networks, exploration, goals, batches, and of poses that are drawn anew"""
     evaluation_epochs: int = 10
     """epochs between two evaluations and checkpoints"""
+    fresh_poses_epochs: int = 0
+    """epochs after which other poses take the place of env.n_poses, for starts and goals; 0: never"""
     env: EnvConfig = field(default_factory=EnvConfig)
     """environment"""
 
     def __post_init__(self) -> None:
-        for name, low in {"seed": 0, "evaluation_epochs": 1}.items():
+        for name, low in {"seed": 0, "evaluation_epochs": 1, "fresh_poses_epochs": 0}.items():
             if getattr(self, name) < low:
                 raise ConfigError(f"{name}: got {getattr(self, name)}, expected at least {low}")
         given_kg = self.env.randomisation.payload_max_kg

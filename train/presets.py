@@ -23,7 +23,7 @@ _TUNED = TQCConfig(
     hindsight=HindsightConfig(reached_share=0.25, near_share=0.5),
 )
 
-_EVEN = EnvConfig(n_poses=16_384, even_share=0.5)
+_EVEN = EnvConfig(n_poses=4_096, even_share=0.5)
 _MOVING = EnvConfig(
     mode="dynamic",
     observation="motion",
@@ -77,11 +77,12 @@ PRESETS: dict[str, TrainConfig] = {
         evaluation_epochs=12,
         env=EnvConfig(reward=_ALWAYS),
     ),
-    "analytic": TrainConfig(learner=AnalyticConfig(), evaluation_epochs=24, env=_EVEN),
+    "analytic": TrainConfig(learner=AnalyticConfig(), evaluation_epochs=24, fresh_poses_epochs=4, env=_EVEN),
     # The same for an arm that carries: the policy observes the payload, which the loop estimates.
     "payload": TrainConfig(
         learner=AnalyticConfig(),
         evaluation_epochs=24,
+        fresh_poses_epochs=4,
         env=dataclasses.replace(_EVEN, observation="payload"),
     ),
     # The paper's recipe: 14 workers, sb3-contrib's hyperparameters, of which one is a gradient step for each

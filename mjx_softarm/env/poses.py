@@ -14,7 +14,7 @@ from jax import Array
 
 from mjx_softarm.env.config import EnvConfig
 from mjx_softarm.mechanics.kinematics import DOFS_PER_LINK
-from mjx_softarm.mechanics.workspace import Pool, sample_evenly, sample_workspace
+from mjx_softarm.mechanics.workspace import Pool, Seed, sample_evenly, sample_workspace
 from mjx_softarm.spec import ArmSpec
 
 
@@ -33,7 +33,7 @@ class PosePool:
     def __init__(self, spec: ArmSpec, config: EnvConfig, observed: Callable[[Array, Array], Array]):
         self._spec, self._config, self._observed = spec, config, observed
         self._settled, self._given = (
-            functools.cache(self._draw),
+            functools.cache(lambda: self.draw(config.workspace_seed)),
             ContextVar[Pool | None]("pool", default=None),
         )
         sizes = DOFS_PER_LINK * spec.n_links, spec.n_chambers, spec.n_springs, 6
@@ -55,13 +55,14 @@ class PosePool:
         finally:
             self._given.reset(before)
 
-    def sample(self, n: int, seed: int, evenly: bool = False) -> Pool:
+    def draw(self, seed: Seed) -> Pool:
+        """Draw as many poses as the pool has."""
+        n_even = round(self._config.even_share * self._config.n_poses)
+        counts = (self._config.n_poses - n_even, False), (n_even, True)
+        parts = [self.sample(n, seed, evenly) for n, evenly in counts if n]
+        return jax.tree.map(lambda *part: jnp.concatenate(part), *parts)
+
+    def sample(self, n: int, seed: Seed, evenly: bool = False) -> Pool:
         """Draw n poses with `sample_workspace` or `sample_evenly`, as they are observed."""
         pool = (sample_evenly if evenly else sample_workspace)(self._spec, n, seed)
         return pool._replace(pose=self._observed(pool.pose, pool.spring_m))
-
-    def _draw(self) -> Pool:
-        n_even = round(self._config.even_share * self._config.n_poses)
-        counts = (self._config.n_poses - n_even, False), (n_even, True)
-        parts = [self.sample(n, self._config.workspace_seed, evenly) for n, evenly in counts if n]
-        return jax.tree.map(lambda *part: jnp.concatenate(part), *parts)

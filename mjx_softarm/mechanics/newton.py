@@ -6,7 +6,6 @@ close e = C (reference - s) - YIELD_M_PER_KPA N p, with the matrices C and N of 
 
 from __future__ import annotations
 
-import functools
 from typing import NamedTuple
 
 import jax
@@ -39,7 +38,7 @@ class Iterate(NamedTuple):
     convex: Array  # (*arms,) bool, V was convex at the last step without added joint stiffness
     iteration: Array  # (*arms,) int
 
-    def goes_on(self, n_small: int) -> Array:
+    def goes_on(self, n_small: Array) -> Array:
         """Return which arms have made fewer than `n_small` small steps in a row: (*arms,) bool."""
         return (self.n_small < n_small) & (self.iteration < MAX_ITERATIONS + n_small - 1)
 
@@ -53,9 +52,9 @@ class End(NamedTuple):
     law_response: Array  # (nv, n_springs, *arms) that of `Equilibrium`, in the last pass
 
 
-@functools.partial(jax.jit, static_argnums=0)  # traced once for the loop and the shapes of its results
+@jax.jit  # traced once for the loop, the shapes of its results, and both values of n_small
 def newton_pass(
-    n_small: int, kinematics: Kinematics, params: ArmParams, reference_m: Array, it: Iterate
+    n_small: Array, kinematics: Kinematics, params: ArmParams, reference_m: Array, it: Iterate
 ) -> tuple[Iterate, End]:
     """Return the next iterate, and forces and springs at the given one.
 

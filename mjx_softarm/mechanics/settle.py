@@ -181,7 +181,7 @@ def _solve(n_small: int, kinematics: Kinematics, params: ArmParams, reference_m:
 
     # Iterate until no arm goes on, and once more: the last pass evaluates all arms where they have ended. A
     # second program for the end would take as long to compile as the loop
-    one_pass = functools.partial(newton_pass, n_small, kinematics, params, reference_m)
+    one_pass = functools.partial(newton_pass, jnp.asarray(n_small), kinematics, params, reference_m)
     with jax.default_matmul_precision("highest"):  # a GPU would round products to 10 bits
         shapes = jax.eval_shape(one_pass, start)[1]
         nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)

@@ -28,6 +28,9 @@ VOXEL_MM = 25.0
 HELD_OUT_SEED = 20_000  # seed of the goals that policies are evaluated on; training uses other seeds
 
 
+Seed = int | tuple[int, ...]
+
+
 class Pool(NamedTuple):
     """Equilibria of the nominal arm at given pressures."""
 
@@ -90,7 +93,7 @@ def _in_batches(make_solver: Callable, spec: ArmSpec, *columns: np.ndarray) -> S
     return xla.in_batches(lambda batch: solver(params, *batch), BATCH, columns)
 
 
-def sample_workspace(spec: ArmSpec, n: int, seed: int) -> Pool:
+def sample_workspace(spec: ArmSpec, n: int, seed: Seed) -> Pool:
     """Draw poses spread over the whole reachable workspace.
 
     Pressures follow the arcsine law between their limits, which favours the extremes, where the workspace
@@ -136,7 +139,7 @@ def sample_loaded(spec: ArmSpec, load_kg: np.ndarray, spread: float, seed: int) 
     return LoadedPool(jnp.asarray(load_kg[rows], jnp.float32), pool.pressure_kpa, pool.spring_m, pool.pose)
 
 
-def sample_evenly(spec: ArmSpec, n: int, seed: int) -> Pool:
+def sample_evenly(spec: ArmSpec, n: int, seed: Seed) -> Pool:
     """Draw poses whose tips are uniform in volume over the reachable workspace, rim included.
 
     Voxels of 25 mm with a candidate are equally likely, and so are the candidates within a voxel. Of ten

@@ -71,7 +71,8 @@ class Job:
     """Fixed parts of a run, and the two functions that change its state: `init` and `epoch`.
 
     `n_traces` counts how often the epoch was traced: once in a run. With a mesh of devices, the state is
-    spread over them; see `train.epoch.devices`. Raises ConfigError for what cannot be split evenly.
+    spread over them; see `train.epoch.devices`. Raises ConfigError for what cannot be split evenly. `pool_of`
+    returns the poses of an epoch, by default always those of the environment.
     """
 
     def __init__(
@@ -81,10 +82,11 @@ class Job:
         learner: Learner,
         goals: Goals | None = None,
         mesh: Mesh | None = None,
+        pool_of: Callable[[int], Pool] | None = None,
     ):
         self.config: Any = config  # a ReplayConfig where the learner has no arms of its own
         self.env, self.learner, self.mesh = env, learner, mesh
-        self.goals = goals or WorkspaceGoals()
+        self.goals, self._pool_of = goals or WorkspaceGoals(), pool_of or (lambda epoch: env.pool)
         if not learner.own_arms:
             self.arms = VectorEnv(env, config.n_arms, self.config.episode_length, mesh)
         self.n_traces = 0
@@ -98,11 +100,11 @@ class Job:
 
     def init(self, key: Array) -> TrainState:
         """Return the state that a run begins with."""
-        return self._init(key, self.env.pool)
+        return self._init(key, self._pool_of(0))
 
     def epoch(self, state: TrainState) -> tuple[TrainState, dict[str, Array]]:
         """Return the state after an epoch, and its metrics; the state given is used up. See `advance`."""
-        return self._epoch(state, self.env.pool)
+        return self._epoch(state, self._pool_of(int(state.n_epochs)))
 
     def like(self) -> TrainState:
         """Return a state structured as the run's, or its shapes."""
@@ -119,13 +121,13 @@ class Job:
     def start(self, first: Callable[[], T]) -> T:
         """Return the result of `first`, such as a state, with the epoch compiled meanwhile.
 
-        Another thread settles the pool of poses, an argument of the epoch, and calls `first`. With a mesh of
-        devices the epoch is compiled when it is called first; a second call compiles nothing.
+        Another thread calls `first`; the pool of poses, an argument of the epoch, settles there. With a mesh
+        the epoch is compiled when it is called first; a second call compiles nothing.
         """
         if self.mesh is not None or self.n_traces:
             return first()
         with ThreadPoolExecutor(1) as beside:
-            result = beside.submit(lambda: (self.env.pool, first())[1])
+            result = beside.submit(first)
             self.compile_epoch()
             return result.result()
 

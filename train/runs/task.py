@@ -20,6 +20,7 @@ from train.config import ConfigError, TrainConfig
 from train.demos.demonstrations import Demonstrations
 from train.epoch.goals import DemonstratedGoals
 from train.epoch.job import Job, TrainState
+from train.epoch.poses import Poses
 from train.runs.evaluate import N_GOALS, Evaluator
 from train.runs.positions import N_STARTS, PositionEvaluator
 
@@ -67,7 +68,8 @@ def task_of(
         own = cast(ImitationConfig, config.learner)
         return _imitation(own, env, demonstrations, mesh, learner_of(own, world))
     # Goals over the whole workspace, held-out ones for the evaluation.
-    job = Job(config.learner, env, learner_of(config.learner, world), mesh=mesh)
+    poses = Poses(env, config)
+    job = Job(config.learner, env, learner_of(config.learner, world), mesh=mesh, pool_of=poses.at)
     return Task(
         job=job,
         title=f"{N_GOALS} held-out goals",

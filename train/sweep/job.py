@@ -22,9 +22,11 @@ from jax import Array
 from mjx_softarm._support import xla
 from mjx_softarm.env import Randomisation, ReachEnv
 from mjx_softarm.mdp.rewards import RewardConfig
+from mjx_softarm.mechanics.workspace import Pool
 from train.agent.registry import World, learner_of
 from train.config import TrainConfig
 from train.epoch.job import Job, TrainState
+from train.epoch.poses import Poses
 
 # Groups of settings of the environment that are plain numbers, and single ones.
 _ENV_GROUPS = {"env.reward": RewardConfig, "env.randomisation": Randomisation}
@@ -82,8 +84,9 @@ class SweepJob:
             path: jnp.asarray([setting(config, path) for config in configs], jnp.float32) for path in varied
         }
         self.n_traces = 0
-        init = jax.vmap(self._init, out_axes=_AXES)
-        epoch = jax.vmap(self._epoch, in_axes=(_AXES, 0), out_axes=(_AXES, 0))
+        self._pool_of = Poses(env, configs[0]).at  # all members share the poses of the first
+        init = jax.vmap(self._init, in_axes=(0, 0, None), out_axes=_AXES)
+        epoch = jax.vmap(self._epoch, in_axes=(_AXES, 0, None), out_axes=(_AXES, 0))
         self._init_all = xla.jit(init, env.uses_mjx)
         self._epoch_all = xla.jit(epoch, env.uses_mjx, donate_argnums=0)
         self._take = jax.jit(lambda tree, k: jax.tree.map(lambda x: x[k], tree))
@@ -91,11 +94,11 @@ class SweepJob:
 
     def init(self) -> TrainState:
         """Return the initial state of all members."""
-        return self._init_all(self.keys, self.numbers)
+        return self._init_all(self.keys, self.numbers, self._pool_of(0))
 
     def epoch(self, states: TrainState) -> tuple[TrainState, dict[str, Array]]:
         """Run an epoch of all members, with metrics (n,)."""
-        return self._epoch_all(states, self.numbers)
+        return self._epoch_all(states, self.numbers, self._pool_of(int(states.n_epochs)))
 
     def member(self, states: TrainState, k: int) -> TrainState:
         """Return the state of one member, as an ordinary run has it."""
@@ -104,7 +107,7 @@ class SweepJob:
 
     def member_shapes(self) -> TrainState:
         """Return the shapes of a member's state."""
-        states = jax.eval_shape(self._init_all, self.keys, self.numbers)
+        states = jax.eval_shape(self._init_all, self.keys, self.numbers, self.env.poses.shapes)
         return jax.eval_shape(self.member, states, 0)
 
     def together(self, members: Sequence[TrainState]) -> TrainState:
@@ -112,12 +115,16 @@ class SweepJob:
         states = self._stack(*(own._replace(n_epochs=None) for own in members))
         return states._replace(n_epochs=members[0].n_epochs)
 
-    def _init(self, key: Array, numbers: Mapping[str, Array]) -> TrainState:
-        return self._job(numbers).first(key)
+    def _init(self, key: Array, numbers: Mapping[str, Array], pool: Pool) -> TrainState:
+        with self.env.poses.given(pool):
+            return self._job(numbers).first(key)
 
-    def _epoch(self, state: TrainState, numbers: Mapping[str, Array]) -> tuple[TrainState, dict[str, Array]]:
+    def _epoch(
+        self, state: TrainState, numbers: Mapping[str, Array], pool: Pool
+    ) -> tuple[TrainState, dict[str, Array]]:
         self.n_traces += 1
-        return self._job(numbers).advance(state)
+        with self.env.poses.given(pool):
+            return self._job(numbers).advance(state)
 
     def _job(self, numbers: Mapping[str, Array]) -> Job:
         config = self.config
