@@ -12,9 +12,9 @@ from mjx_softarm import ArmSpec
 from mjx_softarm.control import allocated_error, allocation
 from mjx_softarm.mechanics.kinematics import chain_kinematics
 from mjx_softarm.mechanics.mjcf import build_model
+from mjx_softarm.mechanics.newton import MAX_ITERATIONS
 from mjx_softarm.mechanics.params import ArmParams
 from mjx_softarm.mechanics.settle import (
-    MAX_ITERATIONS,
     RESIDUAL_TOLERANCE,
     TRACKING_TOLERANCE_M,
     SettleResult,
