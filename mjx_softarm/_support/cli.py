@@ -24,7 +24,7 @@ from mjx_softarm._support.errors import InputError, missing
 
 ERROR, INTERRUPTED = 2, 130  # exit statuses
 # Packages of the extra `train` that modules import as they are loaded.
-TRAIN = {"brax", "flax", "jax", "jinja2", "matplotlib", "mujoco", "optax", "orbax", "rich", "scipy"}
+TRAIN = {"flax", "jax", "jinja2", "matplotlib", "mujoco", "optax", "orbax", "rich", "scipy"}
 
 Command = Callable[..., Any] | str
 
