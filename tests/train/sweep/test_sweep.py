@@ -121,7 +121,7 @@ def test_a_sweep_is_traced_once_and_warms_up_without_updates(job, trained):
     assert job.n_traces == 1
     assert (metrics[0]["tqc/critic_loss"] == 0).all() and (metrics[1]["tqc/critic_loss"] > 0).all()
     # A branch on a number of each member would have become a select, with both of its sides computed.
-    program = job._epoch_all.lower(states, job.numbers).as_text()
+    program = job._epoch_all.lower(states, job.numbers, job.env.pool).as_text()
     assert program.count("stablehlo.case") == 1
 
 
